@@ -1,0 +1,121 @@
+"""The pinhole camera: intrinsics in pixels, a metric pose, projection and rays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from seasonscapes.frames import LocalFrame, enu_from_geodetic, local_axes
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A calibrated pinhole view.
+
+    Parameters
+    ----------
+    width_px, height_px
+        Image size. Pixel centres lie at +0.5; row 0 is on top.
+    fx, fy, cx, cy
+        Focal lengths and principal point [px].
+    world_from_camera
+        Rigid transform ``(4, 4)`` float64 with OpenCV axes: x right, y down, z forward. World is east-north-up [m].
+    """
+
+    width_px: int
+    height_px: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    world_from_camera: np.ndarray
+
+    def __post_init__(self):
+        pose = np.asarray(self.world_from_camera, float)
+        if pose.shape != (4, 4) or not np.isfinite(pose).all():
+            raise ValueError(f"world_from_camera: got shape {pose.shape}, expected a finite (4, 4) matrix")
+        rotation = pose[:3, :3]
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0:
+            raise ValueError("world_from_camera: expected a right-handed rotation; the axes may be mirrored")
+        if min(self.width_px, self.height_px) < 1 or min(self.fx, self.fy) <= 0:
+            raise ValueError("Camera: image size and focal lengths must be positive")
+        object.__setattr__(self, "world_from_camera", pose)
+
+    @property
+    def position_m(self) -> np.ndarray:
+        """Projection centre ``(3,)`` east-north-up [m]."""
+        return self.world_from_camera[:3, 3]
+
+
+def rotation_from_angles(heading_deg: float, pitch_deg: float, roll_deg: float = 0.0) -> np.ndarray:
+    """``world_from_camera`` rotation ``(3, 3)`` with OpenCV axes.
+
+    Parameters
+    ----------
+    heading_deg
+        Azimuth of the optical axis, clockwise from true north [deg].
+    pitch_deg
+        Elevation of the optical axis, up positive [deg].
+    roll_deg
+        Turn about the optical axis; positive lowers the right-hand side of the camera [deg].
+    """
+    heading, pitch, roll = np.radians([heading_deg, pitch_deg, roll_deg])
+    forward = np.array([np.sin(heading) * np.cos(pitch), np.cos(heading) * np.cos(pitch), np.sin(pitch)])
+    right = np.array([np.cos(heading), -np.sin(heading), 0.0])
+    down = np.cross(forward, right)
+    right, down = np.cos(roll) * right + np.sin(roll) * down, -np.sin(roll) * right + np.cos(roll) * down
+    return np.stack([right, down, forward], axis=1)
+
+
+def camera_at(frame: LocalFrame, latitude_deg: float, longitude_deg: float, height_m: float, *,
+              heading_deg: float, pitch_deg: float = 0.0, roll_deg: float = 0.0, fov_deg: float = 60.0,
+              size_px: tuple[int, int] = (1536, 1024)) -> Camera:  # fmt: skip
+    """A camera with square pixels and a centred principal point at a WGS 84 place.
+
+    Parameters
+    ----------
+    height_m
+        Height of the projection centre in the scene's vertical datum [m].
+    heading_deg, pitch_deg, roll_deg
+        Angles against true north and the horizon **at the camera** (not at the frame's origin) [deg].
+    fov_deg
+        Horizontal field of view [deg].
+    size_px
+        Width and height [px].
+    """
+    if not 0.0 < fov_deg < 180.0:
+        raise ValueError(f"fov_deg: got {fov_deg}, expected 0 < fov < 180")
+    pose = np.eye(4)
+    pose[:3, :3] = local_axes(frame, latitude_deg, longitude_deg).T @ rotation_from_angles(
+        heading_deg, pitch_deg, roll_deg
+    )
+    pose[:3, 3] = enu_from_geodetic(frame, latitude_deg, longitude_deg, height_m)
+    width, height = size_px
+    focal = 0.5 * width / np.tan(np.radians(fov_deg) / 2.0)
+    return Camera(width, height, focal, focal, width / 2.0, height / 2.0, pose)
+
+
+def project(camera: Camera, position_m) -> tuple[np.ndarray, np.ndarray]:
+    """Pixel coordinates ``(..., 2)`` and depth along the optical axis ``(...)`` [m] of world points ``(..., 3)``.
+
+    Points at or behind the camera plane get NaN pixels.
+    """
+    pose = camera.world_from_camera
+    local = (np.asarray(position_m, float) - pose[:3, 3]) @ pose[:3, :3]
+    depth = local[..., 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = np.where(depth > 0, 1.0 / depth, np.nan)
+    pixel = np.stack([camera.fx * local[..., 0] * scale + camera.cx, camera.fy * local[..., 1] * scale + camera.cy], -1)
+    return pixel, depth
+
+
+def ray_directions(camera: Camera, pixel=None) -> np.ndarray:
+    """Unit world directions of pixels ``(..., 2)`` (x, y) as ``(..., 3)``; of all pixel centres when left out."""
+    if pixel is None:
+        x, y = np.meshgrid(np.arange(camera.width_px) + 0.5, np.arange(camera.height_px) + 0.5)
+    else:
+        x, y = np.moveaxis(np.asarray(pixel, float), -1, 0)
+    local = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], -1)
+    world = local @ camera.world_from_camera[:3, :3].T
+    return world / np.linalg.norm(world, axis=-1, keepdims=True)
