@@ -1,0 +1,204 @@
+"""Path tracing: the radiance that a camera sees, through the air, against the sky."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from seasonscapes.cameras.pinhole import Camera, ray_directions
+from seasonscapes.rendering.backend import to_numpy, use_backend
+from seasonscapes.rendering.gbuffer import GBuffer, mi_rays, trace_gbuffer
+from seasonscapes.rendering.scene import RenderScene, background
+
+# Samples in flight: about 1.2 GB of wavefront on the LLVM backend.
+LANES = 1 << 22
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class View:
+    """A rendered view.
+
+    Parameters
+    ----------
+    radiance
+        ``(H, W, 3)`` scene-linear photometric Rec.709 [cd/m²]: terrain through the air over the sky.
+    surface
+        ``(H, W, 3)`` radiance leaving the terrain, before the air, weighted by ``coverage`` [cd/m²].
+    coverage
+        ``(H, W)`` share of each pixel that terrain covers.
+    gbuffer
+        First surfaces at pixel centres.
+    """
+
+    radiance: np.ndarray
+    surface: np.ndarray
+    coverage: np.ndarray
+    gbuffer: GBuffer
+
+
+def mi_path_integrator(max_depth: int) -> Any:
+    """Mitsuba's path tracer. ``max_depth`` counts edges: 2 is direct light only. Lights are not seen directly."""
+    import mitsuba as mi
+
+    return mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": 64, "hide_emitters": True})
+
+
+def path_trace(scene: RenderScene, camera: Camera, *, spp: int = 64, seed: int = 0, max_depth: int = 6,
+               progress: Progress | None = None) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Radiance that leaves the terrain towards the camera ``(H, W, 3)`` [cd/m²] and coverage ``(H, W)``.
+
+    Box-filtered over the pixel and, on the LLVM backend, bit-identical for equal arguments whatever the number of
+    threads. Works through blocks of rows, so memory does not grow with image size.
+
+    Parameters
+    ----------
+    spp
+        Samples per pixel, at least 1.
+    seed
+        Any non-negative integer; equal seeds give equal images.
+    max_depth
+        Longest path in edges; 6 keeps four bounces between surfaces, 2 is direct light alone.
+    progress
+        Called with the share that is done.
+    """
+    if spp < 1 or max_depth < 2:
+        raise ValueError(f"spp and max_depth: got {spp} and {max_depth}, expected spp ≥ 1 and max_depth ≥ 2")
+    trace = _trace_block_scalar if use_backend().device == "scalar" else _trace_block
+    integrator = mi_path_integrator(max_depth)
+    rows = max(1, min(camera.height_px, LANES // (camera.width_px * spp)))
+    blocks = [(top, min(rows, camera.height_px - top)) for top in range(0, camera.height_px, rows)]
+    # Very wide or very deep blocks are also cut into passes of samples.
+    samples = max(1, min(spp, LANES // camera.width_px))
+    passes = [min(samples, spp - done) for done in range(0, spp, samples)]
+    seeds = np.random.SeedSequence(seed).generate_state(len(blocks) * len(passes))
+    image = np.zeros((camera.height_px, camera.width_px, 4), np.float32)
+    for b, (top, height) in enumerate(blocks):
+        for p, count in enumerate(passes):
+            part = trace(scene, camera, integrator, (top, height, count, int(seeds[b * len(passes) + p])))
+            image[top : top + height] += part * (count / spp)
+            if progress is not None:
+                progress((b * len(passes) + p + 1) / (len(blocks) * len(passes)))
+    return image[..., :3], np.clip(image[..., 3], 0.0, 1.0)
+
+
+def _trace_block(scene: RenderScene, camera: Camera, integrator: Any, block: tuple[int, int, int, int]) -> np.ndarray:
+    """One block of rows as ``(height, W, 4)``: mean radiance and coverage over its samples."""
+    import drjit as dr
+    import mitsuba as mi
+
+    top, height, spp, seed = block
+    sampler = mi.load_dict({"type": "independent", "sample_count": spp})
+    sampler.seed(seed, camera.width_px * height * spp)
+    index = dr.arange(mi.UInt32, camera.width_px * height * spp) // spp
+    row = index // camera.width_px
+    offset = sampler.next_2d()
+    x, y = mi.Float(index - row * camera.width_px) + offset.x, mi.Float(row + top) + offset.y
+    radiance, valid, _ = integrator.sample(scene.mi_scene, sampler, mi.RayDifferential3f(mi_rays(camera, x, y)))
+    channels = [dr.select(valid, channel, 0.0) for channel in radiance] + [dr.select(valid, mi.Float(1.0), 0.0)]
+    # A sample that is not finite would poison its pixel; a geometry that makes one is a bug worth seeing.
+    sums = [dr.block_sum(channel, spp) for channel in channels]
+    dr.eval(sums)
+    result = np.stack([to_numpy(channel) for channel in sums], axis=-1) / spp
+    if not np.isfinite(result).all():
+        raise FloatingPointError("path tracing gave values that are not finite; are albedo and light finite?")
+    return result.reshape(height, camera.width_px, 4)
+
+
+def _trace_block_scalar(scene: RenderScene, camera: Camera, integrator: Any,
+                        block: tuple[int, int, int, int]) -> np.ndarray:  # fmt: skip
+    """The same through Mitsuba's own sensor and film, as the scalar variant knows no lanes."""
+    import mitsuba as mi
+
+    if abs(camera.fx / camera.fy - 1.0) > 1e-6:
+        raise ValueError("the scalar variant renders square pixels only; install a libLLVM for other cameras")
+    top, height, spp, seed = block
+    pose = camera.world_from_camera @ np.diag([-1.0, -1.0, 1.0, 1.0])  # Mitsuba looks along +z with x to the left
+    sensor = mi.load_dict(
+        {
+            "type": "perspective",
+            "fov_axis": "x",
+            "fov": float(np.degrees(2.0 * np.arctan(0.5 * camera.width_px / camera.fx))),
+            "principal_point_offset_x": 0.5 - camera.cx / camera.width_px,
+            "principal_point_offset_y": 0.5 - camera.cy / camera.height_px,
+            "near_clip": 0.5,
+            "far_clip": 1.0e7,
+            "to_world": mi.ScalarTransform4f(pose),
+            "sampler": {"type": "independent", "sample_count": spp},
+            "film": {
+                "type": "hdrfilm",
+                "width": camera.width_px,
+                "height": camera.height_px,
+                "crop_offset_x": 0,
+                "crop_offset_y": top,
+                "crop_width": camera.width_px,
+                "crop_height": height,
+                "pixel_format": "rgba",
+                "component_format": "float32",
+                "rfilter": {"type": "box"},
+            },
+        }
+    )
+    return np.array(mi.render(scene.mi_scene, sensor=sensor, integrator=integrator, spp=spp, seed=seed), np.float32)
+
+
+def render_view(scene: RenderScene, camera: Camera, *, spp: int = 64, seed: int = 0, max_depth: int = 6,
+                progress: Progress | None = None) -> View:  # fmt: skip
+    """Path trace the terrain, look at it through the air, and put the sky behind it; see `path_trace`."""
+    surface, coverage = path_trace(scene, camera, spp=spp, seed=seed, max_depth=max_depth, progress=progress)
+    gbuffer = trace_gbuffer(scene, camera)
+    return View(through_air(scene, camera, surface, coverage, gbuffer), surface, coverage, gbuffer)
+
+
+def through_air(scene: RenderScene, camera: Camera, surface: np.ndarray, coverage: np.ndarray,
+                gbuffer: GBuffer) -> np.ndarray:  # fmt: skip
+    """Radiance ``(H, W, 3)`` at the camera of a terrain picture seen through the air, with the sky behind it.
+
+    Each pixel's air is that of its centre's distance, except along silhouettes, where 4 × 4 distances are averaged:
+    a far ridge and a near rock in one pixel have different air.
+    """
+    illumination = scene.illumination
+    direction = ray_directions(camera)
+    open_sky = (1.0 - coverage)[..., None]
+    image = surface.astype(np.float64)
+    if illumination.aerial_perspective is not None:
+        depth = np.where(np.isfinite(gbuffer.depth), gbuffer.depth, 0.0)
+        transmittance, airlight = illumination.aerial_perspective(depth, direction)
+        transmittance, airlight = np.array(transmittance, float), np.array(airlight, float)
+        row, column = np.nonzero(_silhouettes(gbuffer.depth) & (coverage > 0.0))
+        if row.size:
+            transmittance[row, column], airlight[row, column] = _air_of_subpixels(scene, camera, row, column)
+        image = image * transmittance + airlight * coverage[..., None]
+    if np.any(open_sky > 0.0):
+        pixel_angle_deg = float(np.degrees(1.0 / camera.fx))
+        rows = np.any(open_sky[..., 0] > 0.0, axis=1)
+        image[rows] += open_sky[rows] * background(illumination, direction[rows], pixel_angle_deg)
+    return image.astype(np.float32)
+
+
+def _silhouettes(depth: np.ndarray, ratio: float = 1.1) -> np.ndarray:
+    """Pixels beside a jump of distance by more than ``ratio``, ``(H, W)`` bool."""
+    finite = np.where(np.isfinite(depth), depth, 1e9)
+    padded = np.pad(np.log(np.maximum(finite, 1e-3)), 1, mode="edge")
+    neighbours = [padded[1:-1, :-2], padded[1:-1, 2:], padded[:-2, 1:-1], padded[2:, 1:-1]]
+    centre = padded[1:-1, 1:-1]
+    return np.max([np.abs(centre - other) for other in neighbours], axis=0) > np.log(ratio)
+
+
+def _air_of_subpixels(scene: RenderScene, camera: Camera, row: np.ndarray, column: np.ndarray, side: int = 4):
+    """Mean transmittance and airlight ``(N, 3)`` over the terrain-covered part of pixels, from side² distances each."""
+    offset = (np.arange(side) + 0.5) / side
+    dx, dy = (grid.ravel() for grid in np.meshgrid(offset, offset))
+    pixel = np.stack([column[:, None] + dx, row[:, None] + dy], axis=-1)
+    depth = trace_gbuffer(scene, camera, pixel).depth
+    hit = np.isfinite(depth)
+    transmittance, airlight = scene.illumination.aerial_perspective(np.where(hit, depth, 0.0), ray_directions(camera, pixel))
+    weight = hit / np.maximum(hit.sum(axis=1, keepdims=True), 1)
+    # No sub-ray met terrain: keep the coverage's rare sample unattenuated rather than black.
+    missed = ~hit.any(axis=1)
+    mean_transmittance = np.einsum("nk,nkc->nc", weight, transmittance)
+    mean_transmittance[missed] = 1.0
+    return mean_transmittance, np.einsum("nk,nkc->nc", weight, airlight)
