@@ -1,0 +1,208 @@
+"""Satellite and aerial images laid into a terrain's atlas."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+
+from seasonscapes.declaration import InputError
+from seasonscapes.frames import geodetic_from_enu
+from seasonscapes.images import linear_from_srgb
+from seasonscapes.terrain.raster import map_from_geodetic, read_raster
+from seasonscapes.terrain.surface import Raster, Terrain, Texture
+from seasonscapes.terrain.texels import texel_coordinates, texel_positions
+from seasonscapes.terrain.unwrap import Atlas
+
+ENCODINGS = ("srgb", "linear")
+# Longest footprint in pixels of the chosen mip level that is still resolved; longer ones are blurred.
+_MAX_ANISOTROPY = 8
+_CHUNK_TEXELS = 500_000
+
+
+def read_imagery(path: str | os.PathLike, *, bounds_deg: tuple[float, float, float, float] | None = None,
+                 bands: tuple[int, ...] | None = None, shrink: int = 1, encoding: str = "srgb",
+                 full_scale: float = 255.0) -> Raster:  # fmt: skip
+    """Read a colour image on a map as scene-linear Rec.709.
+
+    Parameters
+    ----------
+    path, bounds_deg, shrink
+        As in `read_raster`.
+    bands
+        Red, green and blue band numbers from 1; left out: the file's three colour bands, or its only one as grey.
+    encoding
+        ``srgb`` for pictures made for the eye, ``linear`` for reflectance.
+    full_scale
+        The number in the file that stands for 1.
+
+    Returns
+    -------
+    Raster
+        ``values`` ``(H, W, 3)`` float32, NaN where the image has no data or alpha is 0.
+
+    Raises
+    ------
+    InputError
+        As `read_raster`; neither one nor three colour bands; values that exceed ``full_scale``.
+    """
+    if encoding not in ENCODINGS:
+        raise ValueError(f"encoding: got {encoding!r}, expected one of {', '.join(ENCODINGS)}")
+    raster = read_raster(path, bounds_deg=bounds_deg, bands=bands, shrink=shrink)
+    count = raster.values.shape[2]
+    if count not in (1, 3):
+        raise InputError(path, "not a colour image", got=count, expected="one (grey) or three bands, and alpha",
+                         cure="name its red, green and blue bands")  # fmt: skip
+    values = raster.values / np.float32(full_scale)
+    if np.isfinite(values).any() and np.nanmax(values) > 1.0 + 1e-6 and encoding == "srgb":
+        raise InputError(path, "brighter than full scale", got=f"{np.nanmax(raster.values):g}",
+                         expected=f"at most {full_scale:g}", cure="state the image's full scale")  # fmt: skip
+    # A pixel that lacks one colour lacks them all.
+    values = np.where(np.isfinite(values).all(axis=2, keepdims=True), values, np.float32(np.nan))
+    if encoding == "srgb":
+        with np.errstate(invalid="ignore"):
+            values = linear_from_srgb(values)
+    return replace(raster, values=np.repeat(values, 3 // count, axis=2))
+
+
+def bake_imagery(terrain: Terrain, atlas: Atlas, image: Raster, *, gutter_px: int = 4) -> Texture:
+    """Resample an image in any CRS into the terrain's atlas.
+
+    Each texel is the mean of the image over the texel's footprint: a mip level chosen by its shorter side, sampled
+    along its longer side (McCormack et al. 1999, "Feline"), so that neither minification nor a steep face aliases.
+
+    Parameters
+    ----------
+    image
+        ``values`` ``(H, W, 3)``, scene-linear; NaN has no weight.
+    gutter_px
+        Texels around each chart that repeat its rim, so that bilinear look-ups never meet an empty texel.
+
+    Returns
+    -------
+    Texture
+        ``weight`` is the share of the footprint that the image covers, 0 outside it and outside the charts.
+
+    Raises
+    ------
+    InputError
+        The image covers none of the terrain.
+    """
+    positions, face_id = texel_positions(terrain, atlas.width_px, atlas.height_px)
+    values = np.zeros((atlas.height_px, atlas.width_px, 3), np.float32)
+    weight = np.zeros((atlas.height_px, atlas.width_px), np.float32)
+    pyramid = _pyramid(image.values)
+    footprint = _face_footprints(terrain, atlas, image)
+    texel = np.flatnonzero(face_id >= 0)
+    for start in range(0, len(texel), _CHUNK_TEXELS):
+        part = texel[start : start + _CHUNK_TEXELS]
+        pixel = _image_pixels(terrain, image, positions.reshape(-1, 3)[part])
+        rgb, share = _filtered(pyramid, pixel, footprint[face_id.ravel()[part]])
+        values.reshape(-1, 3)[part], weight.ravel()[part] = rgb, share
+    if not weight.any():
+        raise InputError("imagery", "the image covers none of the terrain", cure="check the CRS of both files")
+    return dilate(Texture(values, weight), face_id >= 0, gutter_px)
+
+
+def _image_pixels(terrain: Terrain, image: Raster, positions: np.ndarray) -> np.ndarray:
+    """Column and row ``(N, 2)`` in the image (0.5 at the first pixel's centre) of positions ``(N, 3)``."""
+    latitude, longitude, _ = geodetic_from_enu(terrain.frame, positions)
+    return np.stack(~image.transform * map_from_geodetic(image.crs, latitude, longitude), axis=-1)
+
+
+def _face_footprints(terrain: Terrain, atlas: Atlas, image: Raster) -> np.ndarray:
+    """Image pixels per texel for each face, ``(F, 2, 2)`` float32: columns are the texel's x and y sides."""
+    corners = np.empty((len(terrain.vertices), 2))
+    for start in range(0, len(corners), _CHUNK_TEXELS):
+        part = slice(start, start + _CHUNK_TEXELS)
+        corners[part] = _image_pixels(terrain, image, terrain.vertices[part])
+    pixel = corners[terrain.faces]
+    texel = texel_coordinates(terrain.uv, atlas.width_px, atlas.height_px)[terrain.faces]
+    p = np.stack([pixel[:, 1] - pixel[:, 0], pixel[:, 2] - pixel[:, 0]], axis=-1)
+    t = np.stack([texel[:, 1] - texel[:, 0], texel[:, 2] - texel[:, 0]], axis=-1)
+    determinant = t[:, 0, 0] * t[:, 1, 1] - t[:, 0, 1] * t[:, 1, 0]
+    adjugate = np.stack([t[:, 1, 1], -t[:, 0, 1], -t[:, 1, 0], t[:, 0, 0]], axis=-1).reshape(-1, 2, 2)
+    safe = np.where(determinant == 0.0, np.inf, determinant)
+    return (p @ adjugate / safe[:, None, None]).astype(np.float32)
+
+
+def _pyramid(values: np.ndarray) -> list[np.ndarray]:
+    """Levels ``(H, W, C + 1)`` of premultiplied colour and coverage, each half the one before, by exact box means."""
+    known = np.isfinite(values).all(axis=2, keepdims=True)
+    levels = [np.concatenate([np.where(known, values, 0.0), known], axis=2).astype(np.float32)]
+    while max(levels[-1].shape[:2]) > 1:
+        level = levels[-1]
+        level = np.pad(level, ((0, level.shape[0] % 2), (0, level.shape[1] % 2), (0, 0)))
+        levels.append(level.reshape(level.shape[0] // 2, 2, level.shape[1] // 2, 2, -1).mean(axis=(1, 3)))
+    return levels
+
+
+def _filtered(pyramid: list[np.ndarray], pixel: np.ndarray, footprint: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Colour ``(N, 3)`` and coverage ``(N,)`` over the footprints ``(N, 2, 2)`` at pixels ``(N, 2)``."""
+    u, s, _ = np.linalg.svd(footprint)
+    shorter = np.maximum(np.maximum(s[:, 1], s[:, 0] / _MAX_ANISOTROPY), 1.0)
+    taps = np.ceil(np.maximum(s[:, 0], 1.0) / shorter - 1e-3).astype(int)
+    level = np.minimum(np.log2(shorter), len(pyramid) - 1.0)
+    major = u[:, :, 0] * s[:, :1]
+    result = np.zeros((len(pixel), pyramid[0].shape[2]), np.float32)
+    base = np.floor(level).astype(int)
+    for count, lower in product(np.unique(taps), np.unique(base)):
+        chosen = np.flatnonzero((taps == count) & (base == lower))
+        if not len(chosen):
+            continue
+        blend = (level[chosen] - lower)[:, None].astype(np.float32)
+        for tap in range(count):
+            at = pixel[chosen] + ((tap + 0.5) / count - 0.5) * major[chosen]
+            sample = _bilinear(pyramid[lower], at / 2.0**lower) * (1.0 - blend)
+            if blend.any():
+                sample += _bilinear(pyramid[lower + 1], at / 2.0 ** (lower + 1)) * blend
+            result[chosen] += sample / count
+    share = result[:, -1]
+    rgb = np.where(share[:, None] > 1e-6, result[:, :-1] / np.maximum(share, 1e-6)[:, None], 0.0)
+    return rgb.astype(np.float32), np.where(share > 1e-6, np.minimum(share, 1.0), 0.0)
+
+
+def _bilinear(level: np.ndarray, pixel: np.ndarray) -> np.ndarray:
+    """Values ``(N, C)`` at pixels ``(N, 2)``; zero beyond the edge."""
+    height, width = level.shape[:2]
+    column, row = np.clip(np.nan_to_num(pixel, posinf=-9.0, neginf=-9.0) - 0.5, -2.0, [width + 1.0, height + 1.0]).T
+    column0, row0 = np.floor(column).astype(int), np.floor(row).astype(int)
+    fx, fy = (column - column0).astype(np.float32), (row - row0).astype(np.float32)
+    total = np.zeros((len(pixel), level.shape[2]), np.float32)
+    for r, wy in ((row0, 1.0 - fy), (row0 + 1, fy)):
+        for c, wx in ((column0, 1.0 - fx), (column0 + 1, fx)):
+            inside = (r >= 0) & (r < height) & (c >= 0) & (c < width)
+            weight = np.where(inside, wy * wx, np.float32(0.0))
+            total += weight[:, None] * level[np.clip(r, 0, height - 1), np.clip(c, 0, width - 1)]
+    return total
+
+
+def dilate(texture: Texture, covered: np.ndarray, gutter_px: int) -> Texture:
+    """Grow what is ``covered`` ``(H, W)`` by rings of texels that take the mean of their known neighbours."""
+    values, weight, known = texture.values.copy(), texture.weight.copy(), covered.copy()
+    for _ in range(gutter_px):
+        rim_row, rim_column = np.nonzero(_grown(known) & ~known)
+        if not len(rim_row):
+            break
+        total, total_weight, count = np.zeros((len(rim_row), 3)), np.zeros(len(rim_row)), np.zeros(len(rim_row))
+        for d_row, d_column in product((-1, 0, 1), repeat=2):
+            r, c = rim_row + d_row, rim_column + d_column
+            inside = (r >= 0) & (r < known.shape[0]) & (c >= 0) & (c < known.shape[1])
+            r, c = np.clip(r, 0, known.shape[0] - 1), np.clip(c, 0, known.shape[1] - 1)
+            use = inside & known[r, c]
+            total += np.where(use[:, None], values[r, c] * weight[r, c, None], 0.0)
+            total_weight += np.where(use, weight[r, c], 0.0)
+            count += use
+        values[rim_row, rim_column] = total / np.maximum(total_weight, 1e-12)[:, None]
+        weight[rim_row, rim_column] = total_weight / count
+        known[rim_row, rim_column] = True
+    return Texture(values, weight)
+
+
+def _grown(mask: np.ndarray) -> np.ndarray:
+    """A mask and its 8 neighbours."""
+    grown = np.pad(mask, 1)
+    grown = grown[:-2] | grown[1:-1] | grown[2:]
+    return grown[:, :-2] | grown[:, 1:-1] | grown[:, 2:]

@@ -1,0 +1,430 @@
+"""Map grids: windowed reading of any GDAL raster, holes, sampling, and the way from its map to WGS 84.
+
+Only the horizontal position is ever transformed. Heights stay in the raster's own vertical datum.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from affine import Affine
+
+from seasonscapes.declaration import InputError
+from seasonscapes.frames import LocalFrame
+from seasonscapes.terrain.surface import Raster
+
+# From the shore of the Dead Sea (-430 m) to above Mount Everest (8,849 m). Feet, centimetres, unmarked nodata and
+# colour bands mistaken for heights all fall outside somewhere.
+PLAUSIBLE_ELEVATION_M = (-500.0, 9000.0)
+DEFAULT_MAX_HOLE_SHARE = 0.25
+
+
+@dataclass(frozen=True)
+class FillReport:
+    """What `fill_nodata` had to make up.
+
+    Parameters
+    ----------
+    filled_cells
+        Number of cells without data.
+    share
+        Their share of the raster, in [0, 1].
+    holes
+        Number of connected holes (8 neighbours).
+    largest_hole_cells
+        Cells of the largest hole.
+    """
+
+    filled_cells: int
+    share: float
+    holes: int
+    largest_hole_cells: int
+
+
+# ---------------------------------------------------------------------------------------------- reading
+
+
+def read_elevation(path: str | os.PathLike, *, bounds_deg: tuple[float, float, float, float] | None = None,
+                   band: int | None = None) -> Raster:  # fmt: skip
+    """Read a raster of heights, one band, and check that they can be heights in metres.
+
+    Parameters
+    ----------
+    path, bounds_deg
+        As in `read_raster`.
+    band
+        Which band holds the heights, from 1; needed only where the file has several.
+
+    Returns
+    -------
+    Raster
+        ``values`` ``(H, W, 1)`` float32 [m], NaN where there is no data.
+
+    Raises
+    ------
+    InputError
+        As `read_raster`; several bands and none named; heights outside −500 … 9000 m.
+    """
+    raster = read_raster(path, bounds_deg=bounds_deg, bands=None if band is None else (band,))
+    count = raster.values.shape[2]
+    if count != 1:
+        raise InputError(path, "more than one band", got=count, expected="one band of heights",
+                         cure="name the band that holds the heights")  # fmt: skip
+    if np.isfinite(raster.values).any():
+        low, high = float(np.nanmin(raster.values)), float(np.nanmax(raster.values))
+        if low < PLAUSIBLE_ELEVATION_M[0] or high > PLAUSIBLE_ELEVATION_M[1]:
+            raise InputError(path, "heights that no place on land has", got=f"{low:g} … {high:g}",
+                             expected=f"{PLAUSIBLE_ELEVATION_M[0]:g} … {PLAUSIBLE_ELEVATION_M[1]:g} m",
+                             cure="check unit (metres), band, and that the file declares its nodata")  # fmt: skip
+    return raster
+
+
+def read_raster(path: str | os.PathLike, *, bounds_deg: tuple[float, float, float, float] | None = None,
+                bands: tuple[int, ...] | None = None, shrink: int = 1) -> Raster:  # fmt: skip
+    """Read a raster that GDAL knows (GeoTIFF, SRTM ``.hgt``, VRT mosaic …), or a window of it.
+
+    Parameters
+    ----------
+    bounds_deg
+        West, south, east, north in WGS 84 [deg]. Only the smallest window of whole pixels around them is read, with
+        one pixel to spare for interpolation, in the raster's own grid (nothing is resampled). Left out: all of it.
+    bands
+        Band numbers from 1; left out: all but an alpha band, which becomes NaN.
+    shrink
+        Average blocks of ``shrink`` × ``shrink`` pixels while reading; an image far finer than its use then never
+        lies in memory whole.
+
+    Returns
+    -------
+    Raster
+        ``values`` ``(H, W, C)`` float32 after the file's own scale and offset; NaN where the file has no data, masks
+        it, or alpha is 0.
+
+    Raises
+    ------
+    InputError
+        No such file, unreadable, no CRS or no placement on the map, degrees where metres are meant or the other way
+        round, a band that is not there, or a window that does not touch the raster.
+    """
+    import rasterio
+    from rasterio.errors import NotGeoreferencedWarning, RasterioError
+
+    if not os.fspath(path).startswith("/vsi") and not Path(path).is_file():
+        raise InputError(path, "no such file")
+    if shrink < 1:
+        raise ValueError(f"shrink: got {shrink}, expected at least 1")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            with rasterio.open(path) as source:
+                crs = _checked_crs(source, path)
+                bands = _checked_bands(source, bands, path)
+                window = _window(source, crs, bounds_deg, path)
+                values = _read_blocks(source, bands, window, shrink)
+                transform = source.window_transform(window) * Affine.scale(shrink)
+    except RasterioError as error:
+        raise InputError(path, f"not readable as a raster: {error}") from None
+    return Raster(values, transform, crs)
+
+
+def _checked_crs(source, path) -> str:
+    if source.crs is None:
+        raise InputError(path, "the raster has no CRS", cure="say which with: gdal_edit.py -a_srs EPSG:… FILE")
+    if source.transform == Affine.identity():
+        raise InputError(path, "the raster has a CRS but no placement on the map (geotransform)",
+                         cure="write one with: gdal_edit.py -a_ullr … FILE")  # fmt: skip
+    text = source.crs.to_string()
+    corners = np.array([source.transform * corner for corner in
+                        ((0, 0), (source.width, 0), (0, source.height), (source.width, source.height))])  # fmt: skip
+    extent = f"x {corners[:, 0].min():g} … {corners[:, 0].max():g}, y {corners[:, 1].min():g} … {corners[:, 1].max():g}"
+    pixel = max(abs(source.transform.a), abs(source.transform.b), abs(source.transform.d), abs(source.transform.e))
+    crs = _horizontal(text)
+    if crs.is_geographic:
+        # 0…360° longitudes are in use; half a pixel past the pole is how .hgt grids lie.
+        low, high = corners.min(0), corners.max(0)
+        if low[1] < -90.0 - pixel or high[1] > 90.0 + pixel or low[0] < -180.0 - pixel or high[0] > 360.0 + pixel:
+            raise InputError(path, f"coordinates beyond ±180°/±90° in the geographic CRS {text}", got=extent,
+                             expected="degrees", cure="the file's CRS is probably a projected one")  # fmt: skip
+    elif np.abs(corners).max() <= 360.0 and pixel < 1.0:
+        raise InputError(path, f"degrees where metres are meant, in the projected CRS {text}", got=extent,
+                         cure="the file's CRS is probably EPSG:4326")  # fmt: skip
+    return text
+
+
+def _checked_bands(source, bands, path) -> tuple[int, ...]:
+    if bands is None:
+        return tuple(band for band in source.indexes if band != _alpha_band(source))
+    for band in bands:
+        if band not in source.indexes:
+            raise InputError(path, "no such band", got=band, expected=f"1 … {source.count}")
+    return tuple(bands)
+
+
+def _alpha_band(source) -> int | None:
+    """The band that says where there is an image: by its colour interpretation, or by its own description."""
+    from rasterio.enums import ColorInterp
+
+    for band, kind, text in zip(source.indexes, source.colorinterp, source.descriptions, strict=True):
+        if kind == ColorInterp.alpha or (text or "").lower().startswith("alpha"):
+            return band
+    return None
+
+
+def _window(source, crs: str, bounds_deg, path):
+    from rasterio.windows import Window
+
+    if bounds_deg is None:
+        return Window(0, 0, source.width, source.height)
+    longitude, latitude = _boundary(*_checked_bounds(bounds_deg))
+    x, y = map_from_geodetic(crs, latitude, longitude)
+    column, row = ~source.transform * (x, y)
+    # Outward to whole pixels, and one pixel more so that bilinear interpolation reaches the bounds.
+    left, right = int(np.floor(column.min())) - 1, int(np.ceil(column.max())) + 1
+    top, bottom = int(np.floor(row.min())) - 1, int(np.ceil(row.max())) + 1
+    left, top = max(left, 0), max(top, 0)
+    right, bottom = min(right, source.width), min(bottom, source.height)
+    if right - left < 2 or bottom - top < 2:
+        extent = _bounds_deg(crs, source.transform, source.width, source.height)
+        raise InputError(path, "the raster does not reach the area asked for", got=_bounds_text(extent),
+                         expected=_bounds_text(bounds_deg))  # fmt: skip
+    return Window(left, top, right - left, bottom - top)
+
+
+def _checked_bounds(bounds_deg) -> tuple[float, float, float, float]:
+    west, south, east, north = bounds_deg
+    if not (west < east and -90.0 <= south < north <= 90.0):
+        raise ValueError(f"bounds_deg: got {bounds_deg}, expected west < east and south < north in degrees")
+    return west, south, east, north
+
+
+def _read_blocks(source, bands, window, shrink) -> np.ndarray:
+    """Read strip by strip, so that only the result is ever whole in memory."""
+    from rasterio.windows import Window
+
+    height, width = int(window.height) // shrink, int(window.width) // shrink
+    scale = np.array([source.scales[band - 1] for band in bands], np.float64)
+    offset = np.array([source.offsets[band - 1] for band in bands], np.float64)
+    values = np.empty((height, width, len(bands)), np.float32)
+    alpha = _alpha_band(source)
+    strip = max(1, 2**22 // max(1, width * shrink * len(bands)) // shrink)
+    for row in range(0, height, strip):
+        rows = min(strip, height - row)
+        part = Window(window.col_off, window.row_off + row * shrink, width * shrink, rows * shrink)
+        read = source.read(bands, window=part, masked=True)
+        block = np.where(np.ma.getmaskarray(read), np.nan, read.data.astype(np.float64))
+        if alpha is not None:
+            block[:, source.read(alpha, window=part) == 0] = np.nan
+        block = block.transpose(1, 2, 0) * scale + offset
+        if shrink > 1:
+            block = _nan_mean(block.reshape(rows, shrink, width, shrink, len(bands)), axes=(1, 3))
+        values[row : row + rows] = block
+    return values
+
+
+def _nan_mean(values: np.ndarray, axes) -> np.ndarray:
+    known = np.isfinite(values)
+    count = known.sum(axis=axes)
+    total = np.where(known, values, 0.0).sum(axis=axes)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+# ---------------------------------------------------------------------------------------------- map and WGS 84
+
+
+@lru_cache(maxsize=64)
+def _horizontal(crs: str):
+    """The horizontal part of a CRS: vertical parts must never move a height."""
+    from pyproj import CRS
+    from pyproj.exceptions import CRSError
+
+    try:
+        parsed = CRS.from_user_input(crs)
+    except CRSError:
+        raise InputError(crs, "not a coordinate reference system", expected="EPSG:n or WKT") from None
+    if parsed.is_compound:
+        parsed = parsed.sub_crs_list[0]
+    parsed = parsed.to_2d()
+    if not (parsed.is_geographic or parsed.is_projected):
+        raise InputError(crs, "a CRS that is not tied to the Earth", expected="a geographic or projected CRS")
+    return parsed
+
+
+@lru_cache(maxsize=64)
+def _transformer(crs: str):
+    from pyproj import Transformer
+    from pyproj.exceptions import ProjError
+
+    try:
+        # A ballpark transformation ignores the datum shift (about 100 m in Switzerland), silently.
+        return Transformer.from_crs(_horizontal(crs), "EPSG:4326", always_xy=True, allow_ballpark=False)
+    except ProjError as error:
+        raise InputError(crs, f"no accurate transformation to WGS 84: {error}") from None
+
+
+def geodetic_from_map(crs: str, x, y) -> tuple[np.ndarray, np.ndarray]:
+    """WGS 84 latitude and longitude [deg] of map coordinates ``(...)``; infinite where the projection has no answer."""
+    longitude, latitude = _transformer(crs).transform(np.asarray(x, float), np.asarray(y, float))
+    return np.asarray(latitude), np.asarray(longitude)
+
+
+def map_from_geodetic(crs: str, latitude_deg, longitude_deg) -> tuple[np.ndarray, np.ndarray]:
+    """Map coordinates x and y ``(...)`` of WGS 84 positions; infinite where the projection has no answer."""
+    x, y = _transformer(crs).transform(
+        np.asarray(longitude_deg, float), np.asarray(latitude_deg, float), direction="INVERSE"
+    )
+    return np.asarray(x), np.asarray(y)
+
+
+def _boundary(west, south, east, north, steps: int = 33) -> tuple[np.ndarray, np.ndarray]:
+    """Points along the sides of a box: the edges of a map rarely stay straight in another."""
+    t = np.linspace(0.0, 1.0, steps)
+    x, y = west + (east - west) * t, south + (north - south) * t
+    return (np.concatenate([x, x, np.full(steps, west), np.full(steps, east)]),
+            np.concatenate([np.full(steps, south), np.full(steps, north), y, y]))  # fmt: skip
+
+
+def _bounds_deg(crs, transform, width, height) -> tuple[float, float, float, float]:
+    latitude, longitude = geodetic_from_map(crs, *(transform * _boundary(0.0, 0.0, float(width), float(height))))
+    if not (np.isfinite(latitude).all() and np.isfinite(longitude).all()):
+        raise InputError(crs, "the raster's edge lies outside the area of its CRS", cure="the CRS is probably wrong")
+    return float(longitude.min()), float(latitude.min()), float(longitude.max()), float(latitude.max())
+
+
+def bounds_geographic(raster: Raster) -> tuple[float, float, float, float]:
+    """West, south, east, north of the raster's outer edges in WGS 84 [deg]."""
+    height, width = raster.values.shape[:2]
+    return _bounds_deg(raster.crs, raster.transform, width, height)
+
+
+def centre_frame(raster: Raster, *, height_m: float = 0.0, refraction_k: float = 0.0) -> LocalFrame:
+    """A `LocalFrame` whose origin is the middle of the raster."""
+    height, width = raster.values.shape[:2]
+    latitude, longitude = geodetic_from_map(raster.crs, *(raster.transform * (width / 2.0, height / 2.0)))
+    return LocalFrame(float(latitude), float(longitude), height_m, refraction_k)
+
+
+def _bounds_text(bounds_deg) -> str:
+    return "W {:.4f} S {:.4f} E {:.4f} N {:.4f}".format(*bounds_deg)
+
+
+def require_overlap(raster: Raster, other: Raster, *, where: str | os.PathLike, other_name: str = "elevation") -> None:
+    """Raise `InputError` about ``where`` (the file of ``raster``) unless the two rasters share ground."""
+    a, b = bounds_geographic(raster), bounds_geographic(other)
+    if max(a[0], b[0]) >= min(a[2], b[2]) or max(a[1], b[1]) >= min(a[3], b[3]):
+        raise InputError(where, f"does not overlap the {other_name} raster", got=_bounds_text(a),
+                         expected=_bounds_text(b), cure="check the CRS of both files")  # fmt: skip
+
+
+# ---------------------------------------------------------------------------------------------- values
+
+
+def sample_raster(raster: Raster, x, y) -> np.ndarray:
+    """Bilinear values ``(..., C)`` at map coordinates ``(...)``, exact at pixel centres.
+
+    NaN outside the raster and where any of the four pixels that count is NaN. The half pixel between the outermost
+    centres and the edge repeats the outermost values.
+    """
+    height, width = raster.values.shape[:2]
+    column, row = ~raster.transform * (np.asarray(x, float), np.asarray(y, float))
+    with np.errstate(invalid="ignore"):
+        inside = (column >= 0.0) & (column <= width) & (row >= 0.0) & (row <= height)
+    column = np.clip(np.where(inside, column, 0.0) - 0.5, 0.0, width - 1.0)
+    row = np.clip(np.where(inside, row, 0.0) - 0.5, 0.0, height - 1.0)
+    column0, row0 = np.minimum(column.astype(int), max(width - 2, 0)), np.minimum(row.astype(int), max(height - 2, 0))
+    column1, row1 = np.minimum(column0 + 1, width - 1), np.minimum(row0 + 1, height - 1)
+    fx, fy = (column - column0)[..., None], (row - row0)[..., None]
+    total = np.zeros(np.shape(column) + raster.values.shape[2:])
+    for r, wy in ((row0, 1.0 - fy), (row1, fy)):
+        for c, wx in ((column0, 1.0 - fx), (column1, fx)):
+            weight = wy * wx
+            # 0 · NaN would spread a hole to samples that do not touch it.
+            total += np.where(weight > 0.0, weight * raster.values[r, c], 0.0)
+    return np.where(inside[..., None], total, np.nan)
+
+
+def fill_nodata(raster: Raster, *, max_share: float = DEFAULT_MAX_HOLE_SHARE,
+                where: str | os.PathLike = "raster") -> tuple[Raster, FillReport]:  # fmt: skip
+    """Fill cells without data by the smoothest surface through their rims (discrete harmonic, ∇²z = 0).
+
+    A membrane neither overshoots nor invents peaks. Where a hole reaches the raster's edge the slope across that edge
+    is zero.
+
+    Parameters
+    ----------
+    max_share
+        Share of cells that may be made up.
+    where
+        Name of the file for the message.
+
+    Raises
+    ------
+    InputError
+        The raster is empty, or more than ``max_share`` of it is.
+    """
+    from scipy import ndimage
+
+    hole = ~np.isfinite(raster.values).all(axis=2)
+    cells = int(hole.sum())
+    if cells == 0:
+        return raster, FillReport(0, 0.0, 0, 0)
+    if cells == hole.size:
+        raise InputError(where, "no data at all in the area asked for", cure="check area and nodata value")
+    share = cells / hole.size
+    if share > max_share:
+        raise InputError(where, "too much of the area has no data", got=f"{100 * share:.1f} %",
+                         expected=f"at most {100 * max_share:g} %", cure="choose another area or raster")  # fmt: skip
+    labels, holes = ndimage.label(hole, structure=np.ones((3, 3), int))
+    largest = int(np.bincount(labels.ravel())[1:].max())
+    values = np.stack([_harmonic_fill(raster.values[..., c], hole) for c in range(raster.values.shape[2])], axis=2)
+    return replace(raster, values=values), FillReport(cells, share, holes, largest)
+
+
+def _harmonic_fill(values: np.ndarray, hole: np.ndarray) -> np.ndarray:
+    """Solve Laplace's equation on the hole's cells by conjugate gradients, from a coarse-to-fine first guess."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.linalg import LinearOperator, cg
+
+    height, width = values.shape
+    guess = _push_pull(np.where(hole, np.nan, values))
+    index = np.full(values.shape, -1, np.int64)
+    count = int(hole.sum())
+    index[hole] = np.arange(count)
+    row, column = np.nonzero(hole)
+    degree, known = np.zeros(count), np.zeros(count)
+    pairs = []
+    for d_row, d_column in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+        r, c = row + d_row, column + d_column
+        inside = (r >= 0) & (r < height) & (c >= 0) & (c < width)
+        degree += inside
+        r, c = np.clip(r, 0, height - 1), np.clip(c, 0, width - 1)
+        neighbour = index[r, c]
+        known += np.where(inside & (neighbour < 0), np.where(hole[r, c], 0.0, values[r, c]), 0.0)
+        linked = np.nonzero(inside & (neighbour >= 0))[0]
+        pairs.append((linked, neighbour[linked]))
+    i, j = (np.concatenate(part) for part in zip(*pairs, strict=True))
+    laplacian = coo_array((-np.ones(len(i)), (i, j)), shape=(count, count)).tocsr()
+    laplacian.setdiag(degree)
+    jacobi = LinearOperator((count, count), matvec=lambda v: v / degree)
+    # Heights are stored in float32 (0.2 mm at 4,000 m); a residual of a millimetre is far below any raster's error.
+    limit = 20 * (height + width)
+    solution, failed = cg(laplacian, known, x0=guess[hole], rtol=0.0, atol=1e-3, maxiter=limit, M=jacobi)
+    if failed:
+        raise ValueError(f"fill_nodata: conjugate gradients did not converge in {failed} steps")
+    filled = values.copy()
+    filled[hole] = solution
+    return filled
+
+
+def _push_pull(values: np.ndarray) -> np.ndarray:
+    """Fill NaN from the next coarser level of a mean pyramid (Grossman & Dally 1998)."""
+    if np.isfinite(values).all():
+        return values
+    height, width = values.shape
+    padded = np.pad(values, ((0, height % 2), (0, width % 2)), constant_values=np.nan)
+    coarse = _push_pull(_nan_mean(padded.reshape(padded.shape[0] // 2, 2, padded.shape[1] // 2, 2), axes=(1, 3)))
+    return np.where(np.isfinite(values), values, np.repeat(np.repeat(coarse, 2, 0), 2, 1)[:height, :width])

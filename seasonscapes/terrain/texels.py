@@ -1,0 +1,121 @@
+"""Which triangle covers which texel, and where on the ground a texel lies."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from seasonscapes.terrain.surface import Terrain
+
+_CHUNK_FACES = 1_000_000
+_CHUNK_TEXELS = 1_000_000
+
+
+def _spans(x: np.ndarray, y: np.ndarray, width: int, height: int) -> tuple[np.ndarray, ...]:
+    """Horizontal runs of texel centres inside triangles ``(N, 3)``: triangle, row, first column, end column.
+
+    Coordinates are shifted so that centres are whole numbers. Both triangles at an edge compute its crossing with a
+    row from the same two end points in the same order, and runs are half open: every centre inside a mesh belongs to
+    exactly one of its triangles.
+    """
+    order = np.lexsort((x, y), axis=1)
+    x, y = np.take_along_axis(x, order, 1), np.take_along_axis(y, order, 1)
+    first = np.clip(np.ceil(y[:, 0]), 0, height).astype(np.int64)
+    end = np.clip(np.ceil(y[:, 2]), 0, height).astype(np.int64)
+    count = np.maximum(end - first, 0)
+    triangle = np.repeat(np.arange(len(x)), count)
+    row = np.arange(len(triangle)) - np.repeat(np.cumsum(count) - count, count) + first[triangle]
+
+    def crossing(i, j):
+        # Rows only meet edges with y_i <= row < y_j, so the division is sound wherever the result is used.
+        xi, yi, xj, yj = x[triangle, i], y[triangle, i], x[triangle, j], y[triangle, j]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return xi + (row - yi) / (yj - yi) * (xj - xi)
+
+    short = np.where(row < y[triangle, 1], crossing(0, 1), crossing(1, 2))
+    long = crossing(0, 2)
+    left = np.clip(np.ceil(np.minimum(short, long)), 0, width).astype(np.int64)
+    right = np.clip(np.ceil(np.maximum(short, long)), 0, width).astype(np.int64)
+    keep = right > left
+    return triangle[keep], row[keep], left[keep], right[keep]
+
+
+def _covered(xy: np.ndarray, faces: np.ndarray, width: int, height: int):
+    """Pairs of flat texel index and face index, chunk by chunk."""
+    for start in range(0, len(faces), _CHUNK_FACES):
+        corners = np.asarray(xy[faces[start : start + _CHUNK_FACES]], np.float64) - 0.5
+        triangle, row, left, right = _spans(corners[..., 0], corners[..., 1], width, height)
+        length = right - left
+        ends = np.cumsum(length)
+        # A handful of huge triangles can cover all texels: cut the list of runs so that memory stays bounded.
+        cuts = np.searchsorted(ends, np.arange(0, ends[-1] if len(ends) else 0, 4 * _CHUNK_TEXELS)[1:])
+        for part in np.split(np.arange(len(length)), np.unique(cuts)):
+            n = length[part]
+            offset = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n)
+            yield np.repeat(row[part] * width + left[part], n) + offset, np.repeat(triangle[part] + start, n)
+
+
+def covering_faces(xy: np.ndarray, faces: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Index ``(height, width)`` int32 of the face that covers each texel centre, −1 where none does.
+
+    Parameters
+    ----------
+    xy
+        ``(V, 2)`` column and row in texels; the first texel's centre is (0.5, 0.5).
+    faces
+        ``(F, 3)`` vertex indices. Where faces overlap, the last one counts.
+    """
+    face_id = np.full(width * height, -1, np.int32)
+    for texel, face in _covered(xy, faces, width, height):
+        face_id[texel] = face
+    return face_id.reshape(height, width)
+
+
+def coverage_count(xy: np.ndarray, faces: np.ndarray, width: int, height: int) -> np.ndarray:
+    """How many faces cover each texel centre, ``(height, width)`` int32: 0 or 1 all over for an injective atlas."""
+    count = np.zeros(width * height, np.int32)
+    for texel, _ in _covered(xy, faces, width, height):
+        np.add.at(count, texel, 1)
+    return count.reshape(height, width)
+
+
+def texel_coordinates(uv: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Column and row ``(..., 2)`` float64 of UV coordinates; v = 1 is the upper edge of row 0."""
+    uv = np.asarray(uv, np.float64)
+    return np.stack([uv[..., 0] * width, (1.0 - uv[..., 1]) * height], axis=-1)
+
+
+def texel_positions(terrain: Terrain, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+    """Where on the surface each texel's centre lies.
+
+    Returns
+    -------
+    positions
+        ``(height, width, 3)`` float32 east-north-up [m]; NaN where no face covers the texel.
+    face_id
+        ``(height, width)`` int32, −1 where no face covers it.
+    """
+    xy = texel_coordinates(terrain.uv, width, height)
+    face_id = covering_faces(xy, terrain.faces, width, height)
+    positions = np.full((height, width, 3), np.nan, np.float32)
+    flat, texel = positions.reshape(-1, 3), np.flatnonzero(face_id >= 0)
+    for start in range(0, len(texel), _CHUNK_TEXELS):
+        part = texel[start : start + _CHUNK_TEXELS]
+        corners = terrain.faces[face_id.ravel()[part]]
+        centre = np.stack([part % width, part // width], axis=-1) + 0.5
+        weights = barycentric(xy[corners], centre)
+        flat[part] = np.einsum("nk,nkc->nc", weights, terrain.vertices[corners])
+    return positions, face_id
+
+
+def barycentric(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """Barycentric weights ``(N, 3)``, clipped to the triangle, of points ``(N, 2)`` in triangles ``(N, 3, 2)``."""
+    a, b, c = (corners[:, k] - point for k in range(3))
+    weights = np.stack([_cross(b, c), _cross(c, a), _cross(a, b)], axis=-1)
+    total = weights.sum(axis=1, keepdims=True)
+    weights = np.clip(weights / np.where(total == 0.0, 1.0, total), 0.0, 1.0)
+    weights[total[:, 0] == 0.0] = 1.0
+    return weights / weights.sum(axis=1, keepdims=True)
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
