@@ -52,7 +52,8 @@ def ray_by_hand(case, column, row):
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda c: f"{c[0]}-{c[2]:.0f}")
-def test_a_world_point_lands_on_the_same_pixel_through_panorama_and_view(case, rng=np.random.default_rng(1)):
+def test_a_world_point_lands_on_the_same_pixel_through_panorama_and_view(case):
+    rng = np.random.default_rng(1)
     panorama = make(*case)
     worst = 0.0
     for camera in split_panorama(panorama, fov_deg=85.0, overlap_deg=8.0):
@@ -66,7 +67,8 @@ def test_a_world_point_lands_on_the_same_pixel_through_panorama_and_view(case, r
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda c: f"{c[0]}-{c[2]:.0f}")
-def test_projection_inverts_directions(case, rng=np.random.default_rng(2)):
+def test_projection_inverts_directions(case):
+    rng = np.random.default_rng(2)
     panorama = make(*case)
     pixel = rng.uniform([0, 0], [panorama.width_px, panorama.height_px], (500, 2))
     again, distance = project_panorama(panorama, panorama.position_m + 777.0 * panorama_directions(panorama, pixel))
@@ -148,7 +150,8 @@ def test_a_picture_of_another_size_is_refused():
 
 
 @pytest.mark.parametrize("k1", [-0.2, 0.1, 0.0])
-def test_distortion_inverts_and_rectified_lines_are_straight(k1, rng=np.random.default_rng(3)):
+def test_distortion_inverts_and_rectified_lines_are_straight(k1):
+    rng = np.random.default_rng(3)
     camera = Camera(1920, 1080, 1428.0, 1428.0, 960.0, 540.0, np.eye(4))
     pixel = rng.uniform([0, 0], [1920, 1080], (500, 2))
     assert np.abs(distort(undistort(pixel, camera, k1), camera, k1) - pixel).max() < 1e-8

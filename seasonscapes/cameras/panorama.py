@@ -82,8 +82,10 @@ class Panorama:
         return abs(self.span_deg - 360.0) * self.width_px <= 2.0 * 360.0
 
 
-def panorama_from_angles(projection: Projection, size_px: tuple[int, int], *, horizontal_fov_deg: float,
-                         vertical_fov_deg: float, pose: np.ndarray, horizon_row_px: float | None = None) -> Panorama:  # fmt: skip
+def panorama_from_angles(
+    projection: Projection, size_px: tuple[int, int], *, horizontal_fov_deg: float, vertical_fov_deg: float,
+    pose: np.ndarray, horizon_row_px: float | None = None,
+) -> Panorama:  # fmt: skip
     """A panorama from its fields of view, its heading at the middle column.
 
     ``vertical_fov_deg`` is that of a lens centred on the horizon, as makers state it. `ValueError` outside (0, 360] and
@@ -242,7 +244,7 @@ def _source_coordinates(panorama: Panorama, camera: Camera, x: np.ndarray, y: np
 
 
 def _crop_linear(image: np.ndarray, panorama: Panorama, column: np.ndarray) -> tuple[np.ndarray, int]:
-    """The columns of the panorama that are needed, wrapped where it closes, as linear float32; and the first's index."""
+    """The columns of the panorama that are needed, wrapped where it closes, linear float32; the first one's index."""
     first, last = int(np.floor(column.min())) - 4, int(np.ceil(column.max())) + 4
     if panorama.full_circle:
         columns = np.mod(np.arange(first, last), panorama.width_px)
