@@ -43,11 +43,14 @@ def mi_rays(camera: Camera, x: Any, y: Any) -> Any:
     import drjit as dr
     import mitsuba as mi
 
-    rotation = camera.world_from_camera[:3, :3]
-    local = mi.Vector3f((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1.0)
-    columns = [mi.Vector3f(*map(float, rotation[:, axis])) for axis in range(3)]
-    direction = dr.normalize(columns[0] * local.x + columns[1] * local.y + columns[2] * local.z)
-    origin = mi.Point3f(*map(float, camera.position_m))
+    # Opaque: a literal would be compiled into the kernel, and every camera would wait for LLVM again.
+    def opaque(value: float) -> Any:
+        return dr.opaque(mi.Float, float(value))
+
+    columns = [mi.Vector3f(*map(opaque, camera.world_from_camera[:3, axis])) for axis in range(3)]
+    across, down = (x - opaque(camera.cx)) / opaque(camera.fx), (y - opaque(camera.cy)) / opaque(camera.fy)
+    direction = dr.normalize(columns[0] * across + columns[1] * down + columns[2])
+    origin = mi.Point3f(*map(opaque, camera.position_m))
     return mi.Ray3f(origin + direction * NEAR_M, direction)
 
 

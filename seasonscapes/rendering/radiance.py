@@ -92,11 +92,13 @@ def _trace_block(scene: RenderScene, camera: Camera, integrator: Any, block: tup
 
     top, height, spp, seed = block
     sampler = mi.load_dict({"type": "independent", "sample_count": spp})
-    sampler.seed(seed, camera.width_px * height * spp)
-    index = dr.arange(mi.UInt32, camera.width_px * height * spp) // spp
-    row = index // camera.width_px
+    # Opaque numbers keep one compiled kernel for all blocks, sizes and seeds.
+    sampler.seed(dr.opaque(mi.UInt32, seed), camera.width_px * height * spp)
+    index = dr.arange(mi.UInt32, camera.width_px * height * spp) // dr.opaque(mi.UInt32, spp)
+    width = dr.opaque(mi.UInt32, camera.width_px)
+    row = index // width
     offset = sampler.next_2d()
-    x, y = mi.Float(index - row * camera.width_px) + offset.x, mi.Float(row + top) + offset.y
+    x, y = mi.Float(index - row * width) + offset.x, mi.Float(row + dr.opaque(mi.UInt32, top)) + offset.y
     radiance, valid, _ = integrator.sample(scene.mi_scene, sampler, mi.RayDifferential3f(mi_rays(camera, x, y)))
     channels = [dr.select(valid, channel, 0.0) for channel in radiance] + [dr.select(valid, mi.Float(1.0), 0.0)]
     # A sample that is not finite would poison its pixel; a geometry that makes one is a bug worth seeing.
