@@ -101,6 +101,8 @@ def _trace_block(scene: RenderScene, camera: Camera, integrator: Any, block: tup
     x, y = mi.Float(index - row * width) + offset.x, mi.Float(row + dr.opaque(mi.UInt32, top)) + offset.y
     radiance, valid, _ = integrator.sample(scene.mi_scene, sampler, mi.RayDifferential3f(mi_rays(camera, x, y)))
     channels = [dr.select(valid, channel, 0.0) for channel in radiance] + [dr.select(valid, mi.Float(1.0), 0.0)]
+    # Evaluated together: summing an unevaluated channel would trace all the paths again for each of the four.
+    dr.eval(channels)
     # A sample that is not finite would poison its pixel; a geometry that makes one is a bug worth seeing.
     sums = [dr.block_sum(channel, spp) for channel in channels]
     dr.eval(sums)
