@@ -1,0 +1,214 @@
+"""The clear and hazy sky of every hour: radiance map, sun or moon, and the air between viewer and mountain.
+
+`atmosphere_tables` does the slow part once for an atmosphere; everything that knows a time is quick. Any luminary goes
+the same way: a direction and its spectral irradiance above the air as a share of the sun's (`irradiance`), and the skies
+of several luminaries add up.
+
+Polarisation is left out (a scalar theory errs by up to 5 % of a clear sky's radiance in single directions), and so are
+water vapour and oxygen, whose lines lie where the eye hardly sees.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from os import PathLike
+
+import numpy as np
+
+from seasonscapes.frames import angles_from_direction, equirectangular_directions
+from seasonscapes.images import atomic_path
+from seasonscapes.sky.aerial import AirBetween, SeenLight, air_between, observer_view, seen_sky, sky_radiance
+from seasonscapes.sky.air import Atmosphere, optics
+from seasonscapes.sky.ephemeris import refraction_deg, standard_pressure_hpa
+from seasonscapes.sky.illumination import Illumination, Luminary
+from seasonscapes.sky.paths import SUN_RADIUS_DEG, SunColumns, sun_transfer
+from seasonscapes.sky.scattering import AtmosphereTables, Moments, atmosphere_tables
+from seasonscapes.sky.spectrum import WAVELENGTHS_NM, rgb_from_transfer
+
+__all__ = [
+    "Atmosphere",
+    "AtmosphereTables",
+    "atmosphere_tables",
+    "illumination_from_atmosphere",
+    "load_tables",
+    "save_tables",
+    "sky_radiance_map",
+    "sun_luminary",
+    "true_elevation_deg",
+]
+
+# Below this normal illuminance a luminary casts no visible shadow [lx].
+_FAINTEST_LX = 1e-6
+
+
+def true_elevation_deg(atmosphere: Atmosphere, apparent_elevation_deg, height_m: float) -> np.ndarray:
+    """Elevation without refraction of a body that appears at an elevation [deg]: the inverse of the ephemeris' lift."""
+    apparent = np.asarray(apparent_elevation_deg, float)
+    if not atmosphere.refraction:
+        return apparent
+    true = np.concatenate([np.linspace(-90.0, -8.0, 10), np.linspace(-7.5, 3.0, 400), np.linspace(3.1, 90.0, 400)])
+    lifted = true + refraction_deg(true, pressure_hpa=float(standard_pressure_hpa(height_m)))
+    return np.interp(apparent, lifted, true)
+
+
+def sky_radiance_map(tables: AtmosphereTables, sun_direction, observer_height_m: float, *,
+                     shape: tuple[int, int] = (128, 256), irradiance=1.0) -> np.ndarray:  # fmt: skip
+    """Radiance of the whole sphere around an observer, without the sun's disc.
+
+    Parameters
+    ----------
+    sun_direction
+        Apparent unit vector ``(3,)`` towards the sun, or towards another luminary.
+    observer_height_m
+        In the heights of the atmosphere's ground [m]; lifted to a metre above that ground.
+    shape
+        Rows and columns of the equirectangular map.
+    irradiance
+        Spectral irradiance above the air over the sun's at 1 au, a number or ``(9,)`` bands.
+
+    Returns
+    -------
+    ndarray
+        ``shape + (3,)`` float32, photometric linear Rec.709 [cd/m²]. Below the horizon: the model's sunlit ground
+        through the air.
+    """
+    light, _ = _seen(tables, sun_direction, observer_height_m, irradiance)
+    return _map_of((light,), shape)
+
+
+def sun_luminary(tables: AtmosphereTables, sun_direction, observer_height_m: float, distance_au: float = 1.0, *,
+                 irradiance=1.0, angular_radius_deg: float | None = None) -> Luminary | None:  # fmt: skip
+    """The sun (or another luminary) as it shines through the air on a plane facing it.
+
+    The share of its disc below the horizon of the model's ground is taken away, so that it sets gradually; limb
+    darkening is left out.
+
+    Parameters
+    ----------
+    distance_au
+        Irradiance falls with its square, and the sun's disc with it.
+    irradiance
+        As in `sky_radiance_map`.
+    angular_radius_deg
+        Of a luminary other than the sun [deg].
+
+    Returns
+    -------
+    Luminary or None
+        ``None`` where it has set or gives less than a microlux.
+    """
+    direction = _unit(sun_direction)
+    radius = SUN_RADIUS_DEG / distance_au if angular_radius_deg is None else angular_radius_deg
+    transfer = _direct_transfer(tables, direction, observer_height_m, radius)
+    illuminance = rgb_from_transfer() @ (transfer * np.asarray(irradiance) / distance_au**2)
+    if illuminance.max() < _FAINTEST_LX:
+        return None
+    return Luminary(direction, illuminance, radius)
+
+
+def illumination_from_atmosphere(tables: AtmosphereTables, sun_direction, observer_height_m: float, *,
+                                 distance_au: float = 1.0, moon: tuple | None = None,
+                                 shape: tuple[int, int] = (128, 256)) -> Illumination:  # fmt: skip
+    """All the light of one instant for an observer: sun, sky, moon and aerial perspective.
+
+    Parameters
+    ----------
+    sun_direction
+        Apparent unit vector ``(3,)`` towards the sun.
+    observer_height_m
+        As in `sky_radiance_map`.
+    distance_au
+        Of the sun.
+    moon
+        Apparent direction ``(3,)``, irradiance above the air over the sun's at 1 au, and angular radius [deg] of the
+        moon; left out, there is none.
+    shape
+        Of the radiance map.
+    """
+    near_sun = np.full(WAVELENGTHS_NM.shape, 1.0 / distance_au**2)
+    sources = [(_unit(sun_direction), near_sun, SUN_RADIUS_DEG / distance_au)]
+    if moon is not None:
+        sources.append((_unit(moon[0]), np.broadcast_to(moon[1], WAVELENGTHS_NM.shape).astype(float), moon[2]))
+    seen, luminaries, illuminant = [], [], np.full(WAVELENGTHS_NM.shape, 1e-12)
+    for direction, irradiance, radius in sources:
+        light, true_rad = _seen(tables, direction, observer_height_m, irradiance)
+        seen.append((light, true_rad, irradiance))
+        luminaries.append(
+            sun_luminary(tables, direction, observer_height_m, irradiance=irradiance, angular_radius_deg=radius)
+        )
+        illuminant = illuminant + irradiance * _surface_transfer(tables, direction, observer_height_m, true_rad)
+    view = observer_view(tables, observer_height_m)
+    return Illumination(
+        sky_radiance=_map_of(tuple(light for light, _, _ in seen), shape),
+        sun=luminaries[0],
+        moon=luminaries[1] if moon is not None else None,
+        aerial_perspective=air_between(tables, view, tuple(seen), illuminant),
+        model={"kind": "atmosphere", "observer_height_m": float(observer_height_m), **asdict(tables.atmosphere)},
+    )
+
+
+def save_tables(path: str | PathLike, tables: AtmosphereTables) -> None:
+    """Write tables to one ``.npz`` file, atomically."""
+    with atomic_path(path) as temporary:
+        np.savez_compressed(
+            temporary, atmosphere=json.dumps(asdict(tables.atmosphere)), lowest_rad=tables.sun_columns.lowest_rad,
+            log_columns=tables.sun_columns.log_columns, log_mean=tables.moments.log_mean, ratio=tables.moments.ratio,
+            ground_irradiance=tables.moments.ground_irradiance,
+        )  # fmt: skip
+
+
+def load_tables(path: str | PathLike) -> AtmosphereTables:
+    """Tables of `save_tables`."""
+    with np.load(path, allow_pickle=False) as file:
+        fields = json.loads(str(file["atmosphere"]))
+        if isinstance(fields["ground_albedo"], list):
+            fields["ground_albedo"] = tuple(fields["ground_albedo"])
+        return AtmosphereTables(
+            Atmosphere(**fields),
+            SunColumns(file["lowest_rad"], file["log_columns"]),
+            Moments(file["log_mean"], file["ratio"], file["ground_irradiance"]),
+        )
+
+
+def _unit(direction) -> np.ndarray:
+    direction = np.asarray(direction, float)
+    if direction.shape != (3,) or not abs(np.linalg.norm(direction) - 1.0) < 1e-3:
+        raise ValueError(f"direction: got {direction}, expected a unit vector (3,)")
+    return direction / np.linalg.norm(direction)
+
+
+def _seen(tables: AtmosphereTables, direction, height_m: float, irradiance) -> tuple[SeenLight, float]:
+    direction = _unit(direction)
+    _, apparent_deg = angles_from_direction(direction)
+    true_rad = float(np.radians(true_elevation_deg(tables.atmosphere, apparent_deg, height_m)))
+    spectrum = np.broadcast_to(np.asarray(irradiance, float), WAVELENGTHS_NM.shape)
+    return seen_sky(tables, observer_view(tables, height_m), direction, true_rad, spectrum), true_rad
+
+
+def _map_of(lights: tuple[SeenLight, ...], shape: tuple[int, int]) -> np.ndarray:
+    """Pixel means over two by two directions, which settles the horizon's row and the sun's aureole."""
+    height, width = shape
+    directions = equirectangular_directions(2 * height, 2 * width)
+    radiance = sum(sky_radiance(light, directions) for light in lights)
+    return radiance.reshape(height, 2, width, 2, 3).mean(axis=(1, 3)).astype(np.float32)
+
+
+def _direct_transfer(tables: AtmosphereTables, direction: np.ndarray, height_m: float, radius_deg: float) -> np.ndarray:
+    _, apparent_deg = angles_from_direction(direction)
+    true_rad = np.radians(true_elevation_deg(tables.atmosphere, apparent_deg, height_m))
+    height = max(float(height_m), tables.atmosphere.ground_height_m)
+    return sun_transfer(
+        tables.atmosphere, tables.sun_columns, optics(tables.atmosphere), np.asarray(height), true_rad,
+        radius_deg=radius_deg,
+    )  # fmt: skip
+
+
+def _surface_transfer(tables: AtmosphereTables, direction: np.ndarray, height_m: float, true_rad: float) -> np.ndarray:
+    """Light on a steep grey surface near the observer: half of the sun, and the sky's ground irradiance."""
+    from seasonscapes.sky.scattering import sun_index
+
+    index, share = sun_index(np.sin(true_rad))
+    table = tables.moments.ground_irradiance
+    diffuse = table[index] * (1.0 - share) + table[index + 1] * share
+    return 0.5 * _direct_transfer(tables, direction, height_m, SUN_RADIUS_DEG) + diffuse

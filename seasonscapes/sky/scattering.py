@@ -1,0 +1,382 @@
+"""Light scattered more than once: its angular moments at every height and sun elevation, order by order.
+
+Bruneton & Neyret (2008), doi:10.1111/j.1467-8659.2008.01245.x, compute scattering order by order: the source
+``J[L](x, ω) = σ_s ∫ p(ω, ω') L(x, ω') dω'`` (their eq. 7) and the radiance it makes along rays, ``S[L]`` (their eq. 8),
+with light from the ground ``R[L]`` (eq. 6), so that ``L = L0 + (R + S)[L0] + (R + S)²[L0] + …`` (eq. 4). They tabulate
+``ΔJ`` and ``ΔS`` in four dimensions (their algorithm 4.1). Here only ``L``'s moments in real spherical harmonics about
+the local vertical are kept, ``Φ_lm(height, sun elevation)``: a phase function with Legendre moments χ_l turns them into
+the source exactly, ``J = σ_s Σ χ_l Φ_lm Y_lm``, and gas needs l ≤ 2 alone. Aerosol's forward peak is dealt with by
+delta-M scaling; the sun's first scattering keeps the full phase function elsewhere (Nakajima & Tanaka's 1988 TMS).
+
+All radiances are transfers: over the sun's spectral irradiance above the air [1/sr], in nine bands.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import factorial
+
+import numpy as np
+
+from seasonscapes.sky.air import (
+    TOP_HEIGHT_M,
+    Atmosphere,
+    Optics,
+    constituent_densities,
+    delta_scaled,
+    gas_moments,
+    optics,
+)
+from seasonscapes.sky.paths import (
+    Paths,
+    SunColumns,
+    equal_cells,
+    horizon_elevation_rad,
+    resampled,
+    sun_columns,
+    sun_transfer,
+    trace_rays,
+)
+from seasonscapes.sky.spectrum import WAVELENGTHS_NM
+
+HARMONIC_ORDER = 4
+_HEIGHTS, _AZIMUTHS, _CELLS = 20, 6, 24
+# Half a degree apart through twilight, where light falls by a factor of three a degree.
+SUN_ELEVATION_KNOTS_DEG = np.concatenate([
+    np.arange(-30.0, -20.0, 2.0), np.arange(-20.0, -12.0, 1.0), np.arange(-12.0, 3.0, 0.5), np.arange(3.0, 8.0, 1.0),
+    [8.0, 10.0, 13.0, 17.0, 22.0, 28.0, 36.0, 45.0, 55.0, 65.0, 76.0, 90.0],
+])  # fmt: skip
+_DARK = 1e-30
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Cells of rays that start at one height: everything about them that does not know the sun.
+
+    Parameters
+    ----------
+    height_m, turn_rad, elevation_rad
+        Of the cells' middles ``(K, S)``.
+    weight
+        ``(K, S, B)``: ∫ transmittance ds over each cell, as seen from the start [m].
+    end_transmittance
+        ``(K, B)`` to the end of the ray.
+    paths
+        The rays at the cells' edges.
+    """
+
+    height_m: np.ndarray
+    turn_rad: np.ndarray
+    elevation_rad: np.ndarray
+    weight: np.ndarray
+    end_transmittance: np.ndarray
+    paths: Paths
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Angular moments of diffuse light by height and sun elevation.
+
+    Parameters
+    ----------
+    log_mean
+        ``(P, J, B)`` logarithm of Φ_00.
+    ratio
+        ``(P, J, C, B)`` all moments over Φ_00; C runs over (l, m) with l ≤ `HARMONIC_ORDER`.
+    ground_irradiance
+        ``(J, B)`` diffuse irradiance of the ground, a transfer.
+    """
+
+    log_mean: np.ndarray
+    ratio: np.ndarray
+    ground_irradiance: np.ndarray
+
+
+@dataclass(frozen=True)
+class AtmosphereTables:
+    """All of an atmosphere that does not depend on time: columns towards the sun and multiply scattered light.
+
+    Parameters
+    ----------
+    atmosphere
+        What it was computed for.
+    sun_columns
+        See `SunColumns`.
+    moments
+        Light scattered at least once, summed over all orders.
+    """
+
+    atmosphere: Atmosphere
+    sun_columns: SunColumns
+    moments: Moments
+
+
+def harmonic_degrees(order: int = HARMONIC_ORDER) -> np.ndarray:
+    """Degree l of each real harmonic that is even about the sun's vertical plane, in their fixed order ``(C,)``."""
+    return np.array([degree for degree in range(order + 1) for _ in range(degree + 1)])
+
+
+def harmonics(x: np.ndarray, z: np.ndarray, order: int = HARMONIC_ORDER) -> np.ndarray:
+    """Real orthonormal spherical harmonics ``(..., C)`` even in y, of unit vectors with components x and z."""
+    across = 1.0 - z**2
+    # Re (x + iy)^m, and associated Legendre functions over sin^m, both by recurrence.
+    cosines = [np.ones_like(x), x]
+    for _ in range(2, order + 1):
+        cosines.append(2.0 * x * cosines[-1] - across * cosines[-2])
+    values = {}
+    for m in range(order + 1):
+        diagonal = float(np.prod(np.arange(1, 2 * m, 2))) if m else 1.0
+        values[m, m] = np.full_like(z, diagonal)
+        if m < order:
+            values[m + 1, m] = z * (2 * m + 1) * values[m, m]
+        for degree in range(m + 2, order + 1):
+            values[degree, m] = (
+                (2 * degree - 1) * z * values[degree - 1, m] - (degree + m - 1) * values[degree - 2, m]
+            ) / (degree - m)
+    out = []
+    for degree in range(order + 1):
+        for m in range(degree + 1):
+            norm = (2 * degree + 1) / (4 * np.pi) * factorial(degree - m) / factorial(degree + m) * (2 if m else 1)
+            out.append(np.sqrt(norm) * values[degree, m] * cosines[m])
+    return np.stack(out, axis=-1)
+
+
+def sample_cells(atmosphere: Atmosphere, scaled: Optics, paths: Paths, edges_m: np.ndarray) -> Samples:
+    """Cells between edges ``(K, S + 1)`` [m] along rays, with the transmittance-weighted length of each."""
+    middles = resampled(paths, 0.5 * (edges_m[:, 1:] + edges_m[:, :-1]))
+    ends = resampled(paths, edges_m)
+    length = np.diff(ends.distance_m, axis=1)
+    # Simpson's rule for the columns of a cell.
+    density = constituent_densities(atmosphere, ends.height_m)
+    mean = (density[..., 1:] + density[..., :-1] + 4.0 * constituent_densities(atmosphere, middles.height_m)) / 6.0
+    depth = np.einsum("cks,cb->ksb", mean * length, scaled.extinction)
+    total = np.concatenate([np.zeros_like(depth[:, :1]), np.cumsum(depth, axis=1)], axis=1)
+    transmittance = np.exp(-total)
+    weight = transmittance[:, :-1] * -np.expm1(-depth) / np.maximum(depth, 1e-9) * length[..., None]
+    return Samples(middles.height_m, middles.turn_rad, middles.elevation_rad, weight, transmittance[:, -1], ends)
+
+
+def local_sun(turn_rad, sun_elevation_rad, cos_azimuth) -> np.ndarray:
+    """Sine of the sun's elevation at points a turn about the Earth's centre away, towards an azimuth from the sun.
+
+    All arguments broadcast; the last is the cosine of the azimuth between ray and sun.
+    """
+    return np.cos(turn_rad) * np.sin(sun_elevation_rad) + np.sin(turn_rad) * np.cos(sun_elevation_rad) * cos_azimuth
+
+
+def scattering_per_m(atmosphere: Atmosphere, scaled: Optics, height_m: np.ndarray) -> np.ndarray:
+    """Scattering coefficients of gas and aerosol ``(2, ..., B)`` [1/m] at heights."""
+    density = constituent_densities(atmosphere, height_m)[:2]
+    return density[..., None] * scaled.scattering[:2].reshape(2, *(1,) * np.ndim(height_m), -1)
+
+
+def diffuse_source(tables_atmosphere: Atmosphere, scaled: Optics, moments: Moments, samples: Samples,
+                   geometry: tuple) -> np.ndarray:  # fmt: skip
+    """Source of scattered diffuse light ``J`` at samples under many suns and azimuths ``(K, S, Q, B)`` [1/(m sr)].
+
+    ``geometry`` is what `sun_geometry` gives for the samples.
+    """
+    index, share, basis = geometry
+    sigma = scattering_per_m(tables_atmosphere, scaled, samples.height_m)
+    degrees = harmonic_degrees()
+    # Phase moments of the mixture at each sample: (K, S, C, B).
+    chi = np.stack([gas_moments(HARMONIC_ORDER), scaled.aerosol_moments[: HARMONIC_ORDER + 1]])[:, degrees]
+    factor = np.einsum("aksb,ac->kscb", sigma, chi)
+    row, fr = height_index(tables_atmosphere, samples.height_m)
+    fr = fr[..., None, None]
+    log_mean = moments.log_mean[row] * (1.0 - fr) + moments.log_mean[row + 1] * fr
+    fr = fr[..., None]
+    ratio = moments.ratio[row] * (1.0 - fr) + moments.ratio[row + 1] * fr
+    ratio = (ratio * factor[:, :, None]).astype(np.float32)
+    k, s, knots = log_mean.shape[:3]
+    flat = (np.arange(k * s) * knots).reshape(k, s, 1) + index
+    log_mean, ratio = log_mean.reshape(k * s * knots, -1), ratio.reshape(k * s * knots, *ratio.shape[3:])
+    fs = share[..., None]
+    mean = np.exp(log_mean[flat] * (1.0 - fs) + log_mean[flat + 1] * fs)
+    low = np.einsum("ksqc,ksqcb->ksqb", basis, np.take(ratio, flat, axis=0), optimize=False)
+    high = np.einsum("ksqc,ksqcb->ksqb", basis, np.take(ratio, flat + 1, axis=0), optimize=False)
+    return np.maximum(low * (1.0 - fs) + high * fs, 0.0) * mean
+
+
+def sun_geometry(samples: Samples, start_elevation_rad: np.ndarray, sun_elevation_rad: np.ndarray,
+                 azimuth_rad: np.ndarray) -> tuple[np.ndarray, tuple]:  # fmt: skip
+    """Where the sun stands at each sample ``(K, S, Q)`` for Q pairs of sun elevation and azimuth from the sun.
+
+    Returns
+    -------
+    sun_sine
+        Sine of the sun's elevation at the samples ``(K, S, Q)``.
+    geometry
+        Knot index and share in the sun's elevation, and the harmonics of the ray's direction in the local frame.
+    """
+    sun, azimuth = np.asarray(sun_elevation_rad), np.asarray(azimuth_rad)
+    sine = local_sun(samples.turn_rad[..., None], sun, np.cos(azimuth))
+    index, share = sun_index(sine)
+    # Cosine between ray and sun, constant along the ray.
+    nu = np.sin(start_elevation_rad)[:, None] * np.sin(sun) + np.cos(start_elevation_rad)[:, None] * np.cos(
+        sun
+    ) * np.cos(azimuth)
+    z = np.sin(samples.elevation_rad)[..., None]
+    level = np.sqrt(np.maximum(1.0 - sine**2, 1e-8))
+    x = (nu[:, None, :] - z * sine) / level
+    bound = np.sqrt(np.maximum(1.0 - z**2, 0.0))
+    x = np.clip(x, -bound, bound)
+    return sine, (index, share, harmonics(x, np.broadcast_to(z, x.shape)).astype(np.float32))
+
+
+def sun_index(sine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Knot below and share towards the next, in `SUN_ELEVATION_KNOTS_DEG`, for sines of the sun's elevation."""
+    knots = np.sin(np.radians(SUN_ELEVATION_KNOTS_DEG))
+    position = np.interp(sine, knots, np.arange(len(knots)))
+    index = np.minimum(position.astype(np.int32), len(knots) - 2)
+    return index, (position - index).astype(np.float32)
+
+
+def height_index(atmosphere: Atmosphere, height_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Table row below and share towards the next, for heights [m]."""
+    share = (height_m - atmosphere.ground_height_m) / (TOP_HEIGHT_M - atmosphere.ground_height_m)
+    position = np.clip(share, 0.0, 1.0) ** (1.0 / 2.5) * (_HEIGHTS - 1)
+    index = np.minimum(position.astype(np.int32), _HEIGHTS - 2)
+    return index, position - index
+
+
+def table_heights_m(atmosphere: Atmosphere) -> np.ndarray:
+    """Heights of the table's rows ``(P,)`` [m]."""
+    thickness = TOP_HEIGHT_M - atmosphere.ground_height_m
+    return atmosphere.ground_height_m + thickness * np.linspace(0.0, 1.0, _HEIGHTS) ** 2.5
+
+
+def _directions(horizon_rad: float) -> tuple[np.ndarray, np.ndarray]:
+    """Elevations [rad] and solid-angle weights over sin(elevation) ``(K,)``: Gauss panels that meet at the horizon."""
+    edge = np.sin(horizon_rad)
+    panels = [(-1.0, edge, 4), (edge, edge + 0.25 * (1.0 - edge), 6), (edge + 0.25 * (1.0 - edge), 1.0, 5)]
+    sines, weights = [], []
+    for low, high, count in panels:
+        node, weight = np.polynomial.legendre.leggauss(count)
+        sines.append(0.5 * (high - low) * node + 0.5 * (high + low))
+        weights.append(0.5 * (high - low) * weight)
+    return np.arcsin(np.concatenate(sines)), np.concatenate(weights)
+
+
+@dataclass(frozen=True)
+class _Level:
+    """Rays from one table height under every sun: what every order reuses."""
+
+    samples: Samples
+    sines: np.ndarray  # of the rays' elevations (K,)
+    weights: np.ndarray  # solid angle (K, A)
+    basis: np.ndarray  # harmonics of the rays' directions (K, J, A, C)
+    geometry: tuple
+    sun_sine: np.ndarray
+    ground_index: tuple
+
+
+def _level(atmosphere: Atmosphere, scaled: Optics, height_m: float) -> _Level:
+    elevation, weight = _directions(float(horizon_elevation_rad(atmosphere, height_m)))
+    paths = trace_rays(atmosphere, height_m, elevation)
+    samples = sample_cells(atmosphere, scaled, paths, equal_cells(atmosphere, paths, _CELLS))
+    azimuth = (np.arange(_AZIMUTHS) + 0.5) * np.pi / _AZIMUTHS
+    sun = np.radians(SUN_ELEVATION_KNOTS_DEG)
+    suns, azimuths = (part.ravel() for part in np.meshgrid(sun, azimuth, indexing="ij"))
+    sun_sine, geometry = sun_geometry(samples, elevation, suns, azimuths)
+    x = np.cos(elevation)[:, None] * np.cos(azimuth)
+    basis = harmonics(x, np.broadcast_to(np.sin(elevation)[:, None], x.shape))
+    end_sine = local_sun(samples.paths.turn_rad[:, -1, None], suns, np.cos(azimuths))
+    weights = np.repeat(weight[:, None] * (2.0 * np.pi / _AZIMUTHS), _AZIMUTHS, axis=1)
+    return _Level(samples, np.sin(elevation), weights, basis, geometry, sun_sine, (*sun_index(end_sine), end_sine))
+
+
+def _first_radiance(atmosphere: Atmosphere, scaled: Optics, columns: SunColumns, level: _Level) -> np.ndarray:
+    """Sunlight scattered once ``(K, Q, B)`` [1/sr] along a level's rays, with the truncated phase function."""
+    samples = level.samples
+    arriving = sun_transfer(atmosphere, columns, scaled, samples.height_m[..., None], np.arcsin(level.sun_sine))
+    sun = np.radians(SUN_ELEVATION_KNOTS_DEG)
+    azimuth = (np.arange(_AZIMUTHS) + 0.5) * np.pi / _AZIMUTHS
+    nu = level.sines[:, None, None] * np.sin(sun)[:, None] + np.sqrt(1.0 - level.sines**2)[:, None, None] * np.cos(sun)[
+        :, None
+    ] * np.cos(azimuth)
+    nu = nu.reshape(len(level.sines), -1)
+    degrees = np.arange(HARMONIC_ORDER + 1)
+    phases = [
+        np.polynomial.legendre.legval(nu, (2 * degrees + 1) / (4 * np.pi) * moments)
+        for moments in (gas_moments(HARMONIC_ORDER), scaled.aerosol_moments[: HARMONIC_ORDER + 1])
+    ]
+    sigma = scattering_per_m(atmosphere, scaled, samples.height_m) * samples.weight
+    return sum(
+        np.einsum("ksb,ksqb->kqb", part, arriving) * phase[..., None] for part, phase in zip(sigma, phases, strict=True)
+    )
+
+
+def _project(level: _Level, radiance: np.ndarray) -> np.ndarray:
+    """Moments ``(J, C, B)`` of radiance ``(K, Q, B)`` along a level's rays."""
+    k, a = level.weights.shape
+    by_sun = radiance.reshape(k, -1, a, radiance.shape[-1])
+    return np.einsum("ka,kac,kjab->jcb", level.weights, level.basis, by_sun, optimize=True)
+
+
+def _irradiance(level: _Level, radiance: np.ndarray) -> np.ndarray:
+    """Irradiance from above ``(J, B)`` of radiance ``(K, Q, B)``."""
+    k, a = level.weights.shape
+    by_sun = radiance.reshape(k, -1, a, radiance.shape[-1])
+    return np.einsum("ka,k,kjab->jb", level.weights, np.maximum(level.sines, 0.0), by_sun, optimize=True)
+
+
+def as_moments(values: np.ndarray, ground_irradiance: np.ndarray) -> Moments:
+    """Pack plain moments ``(P, J, C, B)`` so that they interpolate well."""
+    mean = np.maximum(values[:, :, 0], _DARK)
+    return Moments(np.log(mean).astype(np.float32), (values / mean[:, :, None]).astype(np.float32), ground_irradiance)
+
+
+def atmosphere_tables(atmosphere: Atmosphere, *, tolerance: float = 2e-3, max_orders: int = 40) -> AtmosphereTables:
+    """Tabulate an atmosphere; some seconds, once for all times and places.
+
+    Parameters
+    ----------
+    tolerance
+        Orders are added until what is left of them, as a geometric series, falls below this share of the light; the
+        series' rest is added in closed form.
+    max_orders
+        Stop there in any case.
+    """
+    scaled = delta_scaled(optics(atmosphere), HARMONIC_ORDER)
+    columns = sun_columns(atmosphere)
+    levels = [_level(atmosphere, scaled, h) for h in table_heights_m(atmosphere)]
+    albedo = np.broadcast_to(np.asarray(atmosphere.ground_albedo, float), WAVELENGTHS_NM.shape) / np.pi
+    sun = np.radians(SUN_ELEVATION_KNOTS_DEG)
+    direct = sun_transfer(atmosphere, columns, scaled, atmosphere.ground_height_m, sun)
+    leaving = direct * np.maximum(np.sin(sun), 0.0)[:, None] * albedo
+    total, total_ground, current = 0.0, 0.0, None
+    for order in range(1, max_orders + 1):
+        values, ground = [], None
+        for level in levels:
+            if order == 1:
+                radiance = _first_radiance(atmosphere, scaled, columns, level)
+            else:
+                source = diffuse_source(atmosphere, scaled, current, level.samples, level.geometry)
+                radiance = np.einsum("ksb,ksqb->kqb", level.samples.weight, source)
+            radiance = radiance + _from_ground(level, leaving)
+            values.append(_project(level, radiance))
+            if ground is None:
+                ground = _irradiance(level, radiance)
+        values = np.stack(values)
+        total, total_ground = total + values, total_ground + ground
+        if order > 1:
+            # Later orders keep their shape and fall geometrically, band by band.
+            decay = np.clip(values[:, :, 0] / np.maximum(current_mean, _DARK), 0.0, 0.98)
+            rest = decay / (1.0 - decay)
+            if (rest * values[:, :, 0] < tolerance * total[:, :, 0] + _DARK).all():
+                total = total + rest[:, :, None] * values
+                total_ground = total_ground + rest[0] * ground
+                break
+        current, current_mean = as_moments(values, ground), values[:, :, 0]
+        leaving = ground * albedo
+    return AtmosphereTables(atmosphere, columns, as_moments(total, total_ground))
+
+
+def _from_ground(level: _Level, leaving: np.ndarray) -> np.ndarray:
+    """What the ground sends along a level's rays ``(K, Q, B)``, from its radiance by sun elevation ``(J, B)``."""
+    index, share, _ = level.ground_index
+    share = share[..., None]
+    seen = leaving[index] * (1.0 - share) + leaving[index + 1] * share
+    ends = np.where(level.samples.paths.ends_on_ground[:, None], level.samples.end_transmittance, 0.0)
+    return ends[:, None, :] * seen
