@@ -54,7 +54,10 @@ def hosek_illumination(sun_direction: np.ndarray, *, turbidity: float = 3.0, gro
     normal_illuminance = _sun_illuminance(parameters, np.asarray(sun_direction, float))
     sun = Luminary(np.asarray(sun_direction, float), normal_illuminance, SUN_ANGULAR_RADIUS_DEG)
     ground = diffuse_horizontal_illuminance(sky) + normal_illuminance * float(sun_direction[2])
-    sky[~above] = ground_albedo / np.pi * ground
+    # Beyond the modelled terrain the Earth goes on: haze the colour of the horizon, giving way to lit ground below it.
+    haze = np.exp(np.degrees(np.arcsin(directions[~above][:, 2])) / 4.0)[:, None]
+    horizon = np.broadcast_to(sky[shape[0] // 2 - 1], sky[shape[0] // 2 :].shape).reshape(-1, 3)
+    sky[~above] = haze * horizon + (1.0 - haze) * ground_albedo / np.pi * ground
     record = {"kind": "hosek", "turbidity": turbidity, "ground_albedo": ground_albedo}
     return Illumination(sky.astype(np.float32), sun, model=record)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import os
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -71,3 +73,41 @@ class Texture:
             object.__setattr__(self, "weight", np.ones(self.values.shape[:2], np.float32))
         if self.values.shape[:2] != self.weight.shape:
             raise ValueError(f"Texture: values {self.values.shape} and weight {self.weight.shape} differ in size")
+
+
+def save_terrain(terrain: Terrain, path: str | os.PathLike, *, note: dict | None = None) -> None:
+    """Write a terrain, and plain values that belong to it, to one ``.npz`` file."""
+    frame = np.array([getattr(terrain.frame, name) for name in LocalFrame.__dataclass_fields__], np.float64)
+    np.savez(path, vertices=terrain.vertices, faces=terrain.faces, uv=terrain.uv, frame=frame, note=json.dumps(note or {}))
+
+
+def load_terrain(path: str | os.PathLike) -> tuple[Terrain, dict]:
+    """The terrain and the note that `save_terrain` wrote."""
+    with np.load(path, allow_pickle=False) as stored:
+        frame = LocalFrame(*map(float, stored["frame"]))
+        return Terrain(stored["vertices"], stored["faces"], stored["uv"], frame), json.loads(str(stored["note"]))
+
+
+def save_texture(texture: Texture, path: str | os.PathLike) -> None:
+    """Write a texture to one ``.npz`` file; values keep float32, so a texture read back is the same to the bit."""
+    np.savez(path, values=texture.values, weight=texture.weight)
+
+
+def load_texture(path: str | os.PathLike) -> Texture:
+    """Read what `save_texture` wrote."""
+    with np.load(path, allow_pickle=False) as stored:
+        return Texture(stored["values"], stored["weight"])
+
+
+def sample_texture(values: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """Bilinear look-up of a texture ``(R, S, C)`` at ``uv`` ``(..., 2)``, clamped at its edge; NaN where uv is NaN."""
+    height, width = values.shape[:2]
+    known = np.isfinite(uv).all(axis=-1)
+    u, v = np.moveaxis(np.where(known[..., None], uv, 0.0), -1, 0)
+    column, row = np.clip(u * width - 0.5, 0.0, width - 1.0), np.clip((1.0 - v) * height - 0.5, 0.0, height - 1.0)
+    column0, row0 = np.minimum(column.astype(int), max(width - 2, 0)), np.minimum(row.astype(int), max(height - 2, 0))
+    column1, row1 = np.minimum(column0 + 1, width - 1), np.minimum(row0 + 1, height - 1)
+    fx, fy = (column - column0)[..., None], (row - row0)[..., None]
+    top = values[row0, column0] * (1.0 - fx) + values[row0, column1] * fx
+    bottom = values[row1, column0] * (1.0 - fx) + values[row1, column1] * fx
+    return np.where(known[..., None], top * (1.0 - fy) + bottom * fy, np.nan).astype(np.float32)

@@ -1,0 +1,7 @@
+"""``python -m seasonscapes``."""
+
+import sys
+
+from seasonscapes.cli import main
+
+sys.exit(main())

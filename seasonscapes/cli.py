@@ -1,0 +1,46 @@
+"""The command line. Verbs live in `seasonscapes.commands` and are imported only when called."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+
+from cyclopts import App
+
+from seasonscapes import __version__
+from seasonscapes.declaration import InputError
+
+app = App(
+    name="seasonscapes",
+    help="Light a real mountain landscape for any date and hour.",
+    version=__version__,
+    help_flags=["--help", "-h"],
+    help_format="plaintext",
+)
+app.command("seasonscapes.commands.render:render", help="Render a view of a place at a date and hour.")
+app.command("seasonscapes.commands.terrain:terrain", help="Build a place's terrain and report how good it is.")
+app.command("seasonscapes.commands.doctor:doctor", help="Say what this machine can do, and what is missing.")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one verb. Exit codes: 0 well, 2 the user's input, 130 interrupted; a bug shows its traceback (1)."""
+    tokens = sys.argv[1:] if arguments is None else arguments
+    try:
+        app(tokens, exit_on_error=True, print_error=True, result_action="return_value")
+    except InputError as error:
+        if "--json" in tokens:
+            print(json.dumps({"error": str(error)}))
+        print(f"seasonscapes: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("seasonscapes: interrupted; finished files are whole, nothing half was left", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        # The reader of our output went away (`| head`); that is not an error.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

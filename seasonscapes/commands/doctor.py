@@ -1,0 +1,81 @@
+"""``seasonscapes doctor``."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import os
+import platform
+import sys
+
+from seasonscapes import __version__
+from seasonscapes.commands.talk import finish
+from seasonscapes.rendering.backend import LLVM_CURE, choose_backend, cuda_devices, find_llvm, probe_in_child
+
+# What each extra of the package brings, by the module that shows it is there.
+EXTRAS = {
+    "gaussians": "torch",
+    "diffusion": "diffusers",
+    "poisson": "open3d",
+    "viewer": "viser",
+    "cluster": "distributed",
+    "data": "pystac_client",
+    "denoise": "pyoidn",
+    "metrics": "flip_evaluator",
+}
+
+
+def doctor(*, json: bool = False) -> None:
+    """Say what this machine can do: Python, renderer, libLLVM, extras, and a short test render.
+
+    Never crashes: the test render runs in a process of its own, and a libLLVM that would abort is named instead.
+
+    Parameters
+    ----------
+    json
+        Print one machine-readable record.
+    """
+    backend = choose_backend("auto")
+    library = find_llvm()
+    works, line = probe_in_child("auto")
+    extras = {name: importlib.util.find_spec(module) is not None for name, module in EXTRAS.items()}
+    versions = {name: _version(name) for name in ("mitsuba", "drjit", "numpy", "rasterio", "torch")}
+    record = {
+        "seasonscapes": __version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "cpus": os.cpu_count(),
+        "variant": backend.variant,
+        "reason": backend.reason,
+        "cuda_devices": cuda_devices(),
+        "libllvm": None if library is None else library.path,
+        "libllvm_version": None if library is None or not library.usable else ".".join(map(str, library.version)),
+        "libllvm_usable": library is not None and library.usable,
+        "versions": versions,
+        "extras": extras,
+        "test_render": works,
+        "test_render_note": line,
+    }
+    llvm = "not found" if library is None else library.path
+    if library is not None:
+        llvm += f" ({record['libllvm_version']})" if library.usable else " (too old: it would abort the process; not used)"
+    lines = [
+        f"seasonscapes  {__version__} on Python {record['python']}, {os.cpu_count()} CPUs, {record['platform']}",
+        f"renderer      {backend.variant}: {backend.reason}",
+        f"libLLVM       {llvm}",
+        "packages      " + ", ".join(f"{name} {version or 'absent'}" for name, version in versions.items()),
+        "extras        " + ", ".join(f"{name} {'yes' if there else 'no'}" for name, there in extras.items()),
+        f"test render   {'works' if works else 'FAILED'}: {line}",
+    ]
+    if backend.device == "scalar":
+        lines.append(f"advice        {LLVM_CURE}")
+    finish(record, lines, as_json=json)
+    if not works:
+        sys.exit(1)
+
+
+def _version(name: str) -> str | None:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
