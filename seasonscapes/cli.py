@@ -9,7 +9,7 @@ import sys
 from cyclopts import App
 
 from seasonscapes import __version__
-from seasonscapes.declaration import InputError
+from seasonscapes.errors import InputError
 
 app = App(
     name="seasonscapes",

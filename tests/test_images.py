@@ -1,0 +1,103 @@
+"""Files on disk, exposure, tone curve."""
+
+import json
+
+import colour
+import numpy as np
+import pytest
+
+from seasonscapes.images import (
+    atomic_path,
+    auto_exposure_ev100,
+    expose,
+    linear_from_srgb,
+    read_exr,
+    read_image_linear,
+    srgb_from_linear,
+    tone_curve,
+    write_exr,
+    write_png,
+)
+
+
+def test_srgb_agrees_with_colour_science():
+    values = np.linspace(0, 1, 1001)
+    np.testing.assert_allclose(srgb_from_linear(values), colour.models.eotf_inverse_sRGB(values), atol=1e-7)
+    np.testing.assert_allclose(linear_from_srgb(srgb_from_linear(values)), values, atol=2e-6)
+
+
+def test_exr_round_trip(tmp_path):
+    rng = np.random.default_rng(0)
+    layers = {
+        "": rng.random((5, 7, 3), np.float32) * 1e5,
+        "normal": rng.random((5, 7, 3), np.float32),
+        "uv": rng.random((5, 7, 2), np.float32),
+        "depth": np.full((5, 7), np.inf, np.float32),
+        "alpha": rng.random((5, 7), np.float32),
+    }
+    path = tmp_path / "a.exr"
+    write_exr(path, layers, header={"latitude": 46.5, "capDate": "2024:09:01 10:00:00", "camera": {"fx": 1000.25}})
+    found, header = read_exr(path)
+    assert found.keys() == layers.keys()
+    for name, values in layers.items():
+        np.testing.assert_array_equal(found[name], values)
+    assert header["latitude"] == pytest.approx(46.5)
+    assert json.loads(header["camera"]) == {"fx": 1000.25}
+
+
+def test_png_round_trip_with_metadata(tmp_path):
+    from PIL import Image
+
+    values = np.linspace(0, 1, 64 * 64 * 3).reshape(64, 64, 3).astype(np.float32)
+    path = tmp_path / "deep" / "a.png"
+    write_png(path, values, metadata={"seasonscapes": "{}"})
+    assert Image.open(path).text["seasonscapes"] == "{}"
+    assert np.abs(srgb_from_linear(read_image_linear(path)) - srgb_from_linear(values)).max() <= 1.01 / 255
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_a_failed_write_leaves_nothing_and_keeps_the_old(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    with pytest.raises(RuntimeError), atomic_path(path) as temporary:  # noqa: PT012
+        temporary.write_text("half")
+        raise RuntimeError
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_missing_and_broken_pictures_are_named(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        read_image_linear(tmp_path / "none.png")
+    (tmp_path / "bad.png").write_bytes(b"not a picture")
+    with pytest.raises(ValueError, match=r"bad\.png"):
+        read_image_linear(tmp_path / "bad.png")
+
+
+def test_auto_exposure_of_a_sunny_grey_card():
+    """18 % grey in 100,000 lx is 5,730 cd/m²: EV 15.5, the sunny-16 rule within half a stop."""
+    card = np.full((8, 8, 3), 0.18 / np.pi * 1e5)
+    assert auto_exposure_ev100(card) == pytest.approx(15.48, abs=0.01)
+    assert auto_exposure_ev100(4 * card) - auto_exposure_ev100(card) == pytest.approx(2.0)
+    with pytest.raises(ValueError, match="no positive luminance"):
+        auto_exposure_ev100(np.zeros((2, 2, 3)))
+
+
+def test_tone_curve_is_monotone_neutral_and_keeps_hue():
+    grey = np.repeat(np.geomspace(1e-3, 100, 400)[:, None], 3, 1)
+    out = tone_curve(grey)
+    assert np.all(np.diff(out[:, 0]) > -1e-6)
+    np.testing.assert_allclose(out, out[:, :1] * np.ones(3), atol=1e-6)
+    assert 0.0 <= out.min()
+    assert out.max() <= 1.0
+    colour_in = np.array([0.30, 0.20, 0.10])
+    toned = tone_curve(0.3 * colour_in)
+    np.testing.assert_allclose(toned / toned[0], colour_in / colour_in[0], rtol=1e-5)
+    bright = tone_curve(40.0 * colour_in)
+    assert bright.min() / bright.max() > 0.5, "very bright colours bleed to white"
+
+
+def test_metered_grey_becomes_middle_grey():
+    card = np.full((4, 4, 3), 0.18 / np.pi * 1e5)
+    shown = srgb_from_linear(tone_curve(expose(card, auto_exposure_ev100(card)))).mean()
+    assert 0.38 < shown < 0.52
