@@ -10,6 +10,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from seasonscapes.terrain.flow import Lattice, accumulate, incise, jittered_lattice, links_of, on_grid, route_flow, slump
+from seasonscapes.terrain.synthetic_ice import grow_ice
 from seasonscapes.terrain.noise import fractal_noise, warped_noise
 
 # Lines of the sketch: (east km, north km, elevation m) of their knots about the massif's centre.
@@ -34,6 +35,9 @@ _VALLEYS = [
     [(0.6, 0.1, 1900), (0.9, 1.2, 1500), (1.4, 2.3, 700)],
     [(-1.6, -0.9, 1900), (-2.6, 0.3, 1600), (-3.6, 0.9, 760)],
 ]  # fmt: skip
+
+
+LAKE_LEVEL_M = 566.0
 
 
 @dataclass(frozen=True)
@@ -173,17 +177,61 @@ def _sample(z: np.ndarray, spacing_m: float, lattice: Lattice) -> np.ndarray:
     return ndimage.map_coordinates(z, at, order=3, mode="nearest")
 
 
-def relief(half_m: float, spacing_m: float, seed: int) -> np.ndarray:
-    """Heights ``(H, W)`` [m] on the regular grid of ``spacing_m`` (one of the stages') reaching ``half_m``."""
+@dataclass(frozen=True)
+class Relief:
+    """What stands and what moves on the massif; all ``(H, W)`` on the regular grid, row 0 in the north.
+
+    Parameters
+    ----------
+    elevation
+        Visible surface: ice and lake surface included [m].
+    ice_m
+        Ice thickness [m], 0 where there is none.
+    catchment_m2
+        Area draining through each cell [m²].
+    shore_m
+        Horizontal distance from the lake's shore, negative on the water [m].
+    """
+
+    elevation: np.ndarray
+    ice_m: np.ndarray
+    catchment_m2: np.ndarray
+    shore_m: np.ndarray
+
+
+def _valley_floor(plan: _Sketch, lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
+    """Height of the nearest point of the main valleys' floors [m] and distance beyond the floor's edge [m]."""
+    warped = _warped(lattice, plan.seed)
+    points = plan.valleys[plan.valleys[:, 2] < 1000.0]
+    position = np.stack([warped.east_m, warped.north_m], -1)
+    distance, index = cKDTree(points[:, :2]).query(position, k=12)
+    weight = 1.0 / (distance + 60.0) ** 3
+    height = (weight * points[index, 2]).sum(-1) / weight.sum(-1)
+    half_width = np.interp(height, [560.0, 580.0, 700.0, 1000.0], [430.0, 400.0, 230.0, 60.0])
+    return height, distance[..., 0] - half_width
+
+
+def _grow_glaciers(bed: np.ndarray) -> np.ndarray:
+    """Ice thickness on the 60 m grid, computed at 120 m."""
+    coarse = cv2.GaussianBlur(bed, (0, 0), 1.0)[::2, ::2]
+    down, right = np.gradient(_lowpass(coarse, 240.0, 120.0), 120.0)
+    northness = down / np.sqrt(1.0 + down**2 + right**2)
+    ice = grow_ice(coarse, 120.0, 3050.0 - 250.0 * northness, rounds=350)
+    fine = jittered_lattice((bed.shape[0] - 1) // 2 * 60.0, 60.0, 0.0, np.random.default_rng(0))
+    return _sample(ice, 120.0, fine)
+
+
+def relief(half_m: float, spacing_m: float, seed: int) -> Relief:
+    """The massif on the regular grid of ``spacing_m`` (one of the stages') reaching ``half_m`` from its centre."""
     plan = _Sketch(_sampled_lines(_CRESTS, seed), _sampled_lines(_VALLEYS, seed + 1), seed)
-    z, previous = None, None
+    z, ice, previous = None, None, None
     for stage in _STAGES:
         if stage.spacing_m < spacing_m:
             break
-        rng = np.random.default_rng(seed + int(stage.spacing_m))
-        lattice = jittered_lattice(half_m + stage.margin_m, stage.spacing_m, 0.38, rng)
-        z = _draw(plan, _warped(lattice, seed))[0] if z is None else _sample(z, previous, lattice)
         spacing = stage.spacing_m
+        rng = np.random.default_rng(seed + int(spacing))
+        lattice = jittered_lattice(half_m + stage.margin_m, spacing, 0.38, rng)
+        z = _draw(plan, _warped(lattice, seed))[0] if z is None else _sample(z, previous, lattice)
         steep = np.clip(np.hypot(*np.gradient(z, spacing)), 0.1, 1.2)
         z = z + stage.noise_m * steep * _lowpass(rng.normal(0.0, 3.0, z.shape), 1.2 * spacing, spacing)
         z = _dissect(z, lattice, seed, stage)
@@ -192,7 +240,32 @@ def relief(half_m: float, spacing_m: float, seed: int) -> np.ndarray:
         if spacing == 60.0:
             routes = route_flow(z, links_of(lattice), lattice.border)
             z = _carve_troughs(z, accumulate(routes, np.full(z.shape, 3600.0)), 60.0)
+            floor, beyond = _valley_floor(plan, lattice)
+            z = np.where(beyond < 1500.0, _soft_minimum(z, floor + np.maximum(beyond, 0.0) ** 2 / 350.0, 40.0), z)
         z = on_grid(z, lattice)
+        if spacing == 60.0:
+            ice, ice_half = _grow_glaciers(z), (z.shape[0] - 1) // 2
         previous = spacing
     edge = (z.shape[0] - 1) // 2 - round(half_m / spacing_m)
-    return z[edge:-edge, edge:-edge]
+    z = z[edge:-edge, edge:-edge]
+    regular = jittered_lattice(half_m, spacing_m, 0.0, rng)
+    thickness = _sample_linear(ice, 60.0, regular)
+    surface = _sample_linear(ice, 60.0, regular)
+    base = _lowpass(z, 60.0, spacing_m)
+    covered = np.clip((thickness - 6.0) / 25.0, 0.0, 1.0)
+    z = np.maximum(z, z + covered * (base + thickness - z))
+    thickness = np.where(covered > 0.0, thickness, 0.0)
+    del surface, ice_half
+    floor, beyond = _valley_floor(plan, regular)
+    east = regular.east_m
+    shore = np.maximum(beyond + 60.0, np.maximum(east - 700.0, -4300.0 - east))
+    z = np.where(beyond < 0.0, np.maximum(_soft_minimum(z, floor + 6.0, 6.0), LAKE_LEVEL_M + 1.0), z)
+    z = np.where(shore < 0.0, LAKE_LEVEL_M, np.maximum(z, LAKE_LEVEL_M + np.minimum(0.03 * shore, 3.0)))
+    routes = route_flow(z, links_of(regular), regular.border)
+    return Relief(z, thickness, accumulate(routes, np.full(z.shape, spacing_m**2)), shore)
+
+
+def _sample_linear(values: np.ndarray, spacing_m: float, lattice: Lattice) -> np.ndarray:
+    half = (values.shape[0] - 1) / 2.0
+    at = np.stack([half - lattice.north_m / spacing_m, half + lattice.east_m / spacing_m])
+    return ndimage.map_coordinates(values, at, order=1, mode="nearest")

@@ -1,0 +1,222 @@
+"""The colour of the synthetic massif on any day of the year: reflectances known to the last digit.
+
+Reflectances are linear Rec.709, rounded from published spectra: rock, soil and vegetation from the ECOSTRESS library
+(Meerdink et al. 2019, doi:10.1016/j.rse.2019.05.015), snow and ice from Warren 2019 (doi:10.1098/rsta.2018.0161)
+and Cuffey & Paterson 2010 (table 5.2), larch and pasture in autumn from the same library's senescent leaves and straw.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from seasonscapes.terrain.noise import fractal_noise, spline_noise
+from seasonscapes.terrain.synthetic_cover import FOREST, Cover
+
+SEASONS = {"winter": 32, "spring": 135, "summer": 205, "autumn": 288}
+_YEAR = 365.25
+
+# Mean height [m] above which level ground is white, by day of year.
+_SNOW_LINE = ((1, 780), (32, 640), (60, 760), (91, 1250), (121, 1750), (152, 2250), (182, 2750), (213, 3050), (236, 3100),
+              (258, 2950), (288, 2550), (319, 1650), (345, 1000))  # fmt: skip
+# Reflectance of what changes colour, by day of year at 1,500 m.
+_TURNING = {
+    Cover.MEADOW: ((60, (0.150, 0.120, 0.060)), (110, (0.120, 0.115, 0.045)), (145, (0.058, 0.118, 0.026)),
+                   (205, (0.072, 0.110, 0.030)), (250, (0.105, 0.108, 0.036)), (288, (0.155, 0.110, 0.040)),
+                   (330, (0.165, 0.122, 0.058))),
+    Cover.FIELD: ((60, (0.130, 0.105, 0.062)), (110, (0.090, 0.110, 0.036)), (145, (0.055, 0.125, 0.026)),
+                  (205, (0.110, 0.125, 0.036)), (250, (0.130, 0.120, 0.045)), (288, (0.140, 0.110, 0.050)),
+                  (330, (0.130, 0.105, 0.062))),
+    Cover.LARCH: ((100, (0.075, 0.058, 0.042)), (135, (0.055, 0.085, 0.022)), (205, (0.040, 0.066, 0.019)),
+                  (262, (0.070, 0.078, 0.018)), (288, (0.260, 0.145, 0.018)), (312, (0.200, 0.100, 0.022)),
+                  (330, (0.085, 0.062, 0.040))),
+    Cover.BROADLEAF: ((95, (0.080, 0.066, 0.050)), (130, (0.052, 0.098, 0.018)), (205, (0.034, 0.068, 0.016)),
+                      (255, (0.050, 0.070, 0.016)), (285, (0.190, 0.100, 0.018)), (305, (0.170, 0.070, 0.022)),
+                      (325, (0.085, 0.066, 0.050))),
+    Cover.SHRUB: ((80, (0.085, 0.072, 0.045)), (150, (0.056, 0.078, 0.026)), (205, (0.052, 0.074, 0.026)),
+                  (260, (0.110, 0.068, 0.028)), (288, (0.135, 0.062, 0.028)), (325, (0.090, 0.070, 0.045))),
+}  # fmt: skip
+_STEADY = {
+    Cover.WATER: (0.014, 0.034, 0.038),
+    Cover.CONIFER: (0.022, 0.036, 0.017),
+    Cover.SCREE: (0.235, 0.222, 0.200),
+    Cover.ROCK: (0.205, 0.192, 0.172),
+    Cover.ICE: (0.400, 0.470, 0.520),
+    Cover.FIRN: (0.660, 0.690, 0.720),
+}
+# Share of full snow cover that stays in view from above: crowns shed and hide it.
+_SNOW_IN_VIEW = {Cover.CONIFER: 0.30, Cover.LARCH: 0.50, Cover.BROADLEAF: 0.55, Cover.SHRUB: 0.85, Cover.WATER: 0.0}
+_STRIP_ROWS = 160
+
+
+def snow_line_m(day_of_year: float) -> float:
+    """Mean height [m] of the snow line on level ground, continuous and periodic over the year."""
+    return float(_periodic(day_of_year, [(d, (h,)) for d, h in _SNOW_LINE])[..., 0])
+
+
+def _periodic(day, knots) -> np.ndarray:
+    """Monotone cubic interpolation (PCHIP) over the year: ``day (...)`` → ``(..., C)`` float32."""
+    from scipy.interpolate import PchipInterpolator
+
+    days = np.array([d for d, _ in knots], float)
+    values = np.array([v for _, v in knots], float)
+    days = np.concatenate([days[-3:] - _YEAR, days, days[:3] + _YEAR])
+    values = np.concatenate([values[-3:], values, values[:3]])
+    # A table of quarter days is exact enough for a colour and many times faster than splines per pixel.
+    table_days = np.arange(-0.25, _YEAR + 0.5, 0.25)
+    table = PchipInterpolator(days, values)(table_days)
+    day = np.mod(np.asarray(day, float), _YEAR)
+    return np.stack([np.interp(day, table_days, column) for column in table.T], -1).astype(np.float32)
+
+
+def _smoothstep(low, high, x):
+    t = np.clip((x - low) / (high - low), 0.0, 1.0)
+    return t * t * (3.0 - 2.0 * t)
+
+
+def _block(field: np.ndarray, rows: slice, upsample: int, interpolation=cv2.INTER_CUBIC) -> np.ndarray:
+    """Rows of the upsampled field; pixel corners stay where they are."""
+    if upsample == 1:
+        return field[rows].astype(np.float32)
+    low, high = max(rows.start - 4, 0), min(rows.stop + 4, field.shape[0])
+    size = (field.shape[1] * upsample, (high - low) * upsample)
+    big = cv2.resize(field[low:high].astype(np.float32), size, interpolation=interpolation)
+    return big[(rows.start - low) * upsample : (rows.stop - low) * upsample]
+
+
+def _positions(place, rows: slice, upsample: int) -> tuple[np.ndarray, np.ndarray]:
+    """East of the columns and north of the rows [m] about the place's centre."""
+    height, width = place.cover.shape
+    step = place.spacing_m / upsample
+    column = np.arange(width * upsample) + 0.5
+    row = np.arange(rows.start * upsample, rows.stop * upsample) + 0.5
+    return column * step - 0.5 * width * place.spacing_m, 0.5 * height * place.spacing_m - row * step
+
+
+def _snow(place, day: float, rows: slice, upsample: int) -> np.ndarray:
+    """Share of the ground under seasonal snow, ``(h, w)`` float32 in [0, 1]."""
+    east, north = _positions(place, rows, upsample)
+    z = _block(place.elevation.values[..., 0], rows, upsample)
+    slope, shade = (_block(f, rows, upsample, cv2.INTER_LINEAR) for f in (place.slope_deg, place.northness))
+    patches = fractal_noise(place.seed + 301, 420.0, east, north, octaves=7, gain=0.7)
+    hollow = _block(place.hollow_m, rows, upsample, cv2.INTER_LINEAR)
+    # Sun decides between slopes most when it is strong and low: least in midwinter, when all that falls stays.
+    contrast = 330.0 + 130.0 * np.sin(2.0 * np.pi * (day - 60.0) / _YEAR)
+    line = snow_line_m(day) - contrast * shade - 10.0 * np.clip(hollow, -12.0, 12.0) + 95.0 * patches
+    lies = _smoothstep(-90.0, 130.0, z - line)
+    # Walls steeper than about 55° shed it; ledges below the pixel keep some.
+    holds = 1.0 - _smoothstep(44.0, 60.0, slope - 4.0 * patches)
+    return lies * (0.06 + 0.94 * holds)
+
+
+def snow_fraction(place, day_of_year: float) -> np.ndarray:
+    """Share of each cell under seasonal snow, ``(H, W)`` float32 in [0, 1]; permanent firn and ice not counted."""
+    height = place.cover.shape[0]
+    return np.concatenate([_snow(place, day_of_year, rows, 1) for rows in _strips(height)])
+
+
+def _strips(height: int) -> list[slice]:
+    return [slice(start, min(start + _STRIP_ROWS, height)) for start in range(0, height, _STRIP_ROWS)]
+
+
+def _classes(place, rows: slice, upsample: int, grain: np.ndarray) -> np.ndarray:
+    """Cover at the finer scale: borders between classes are roughened by noise instead of being stairs."""
+    if upsample == 1:
+        return place.cover[rows]
+    best, chosen = np.full(grain.shape, -np.inf, np.float32), np.zeros(grain.shape, np.uint8)
+    for k, kind in enumerate(Cover):
+        if not (place.cover == kind).any():
+            continue
+        share = _block((place.cover == kind).astype(np.float32), rows, upsample, cv2.INTER_LINEAR)
+        jog = np.roll(grain, 37 * k, axis=1) if kind != Cover.WATER else 0.0
+        score = np.where(share > 0.02, share + 0.16 * jog, -1.0).astype(np.float32)
+        better = score > best
+        best, chosen = np.where(better, score, best), np.where(better, np.uint8(kind), chosen)
+    return chosen
+
+
+def _ground(place, day: float, rows: slice, upsample: int) -> tuple[np.ndarray, np.ndarray]:
+    """Reflectance ``(h, w, 3)`` without seasonal snow, and the classes ``(h, w)``."""
+    east, north = _positions(place, rows, upsample)
+    seed = place.seed
+    grain = fractal_noise(seed + 401, 60.0, east, north, octaves=4, gain=0.8)
+    broad = fractal_noise(seed + 411, 900.0, east, north, octaves=5, gain=0.6)
+    z = _block(place.elevation.values[..., 0], rows, upsample)
+    cover = _classes(place, rows, upsample, grain)
+    albedo = np.empty((*cover.shape, 3), np.float32)
+    # Spring climbs and autumn descends by about 3 days in 100 m (Hopkins 1918).
+    late = np.clip((z - 1500.0) * 0.022, -18.0, 22.0) + 4.0 * broad
+    spring = 0.5 + 0.5 * np.cos(2.0 * np.pi * (day - 120.0) / _YEAR)
+    local_day = day + late * (1.0 - 2.0 * spring)
+    for kind in Cover:
+        here = cover == kind
+        if not here.any():
+            continue
+        albedo[here] = _periodic(local_day[here], _TURNING[kind]) if kind in _TURNING else np.float32(_STEADY[kind])
+    _texture(albedo, cover, z, grain, broad, (east, north), seed)
+    return albedo, cover
+
+
+def _texture(albedo, cover, z, grain, broad, position, seed) -> None:
+    """Variation within a class, in place: crowns, tufts, strata, crevasses."""
+    east, north = position
+    contrast = {Cover.MEADOW: 0.16, Cover.CONIFER: 0.30, Cover.LARCH: 0.28, Cover.BROADLEAF: 0.26, Cover.SHRUB: 0.24,
+                Cover.SCREE: 0.12, Cover.ROCK: 0.20, Cover.ICE: 0.10, Cover.FIRN: 0.03, Cover.FIELD: 0.10}  # fmt: skip
+    gain = np.zeros(cover.shape, np.float32)
+    for kind, amount in contrast.items():
+        gain[cover == kind] = amount
+    factor = np.exp(gain * grain + np.where(np.isin(cover, (Cover.FIRN, Cover.ICE)), 0.02, 0.10) * broad)
+    tilt = 0.10 * east[None, :] - 0.06 * north[:, None]
+    strata = np.sin((z + tilt + 25.0 * broad) * (2.0 * np.pi / 130.0)) + 0.6 * np.sin((z + tilt) * (2.0 * np.pi / 47.0))
+    factor *= np.where(cover == Cover.ROCK, np.exp(0.13 * strata), 1.0)
+    albedo *= factor[..., None]
+    rusty = np.where(np.isin(cover, (Cover.ROCK, Cover.SCREE)), 0.06 * broad, 0.0)[..., None]
+    albedo *= np.exp(rusty * np.array([1.0, 0.0, -1.0], np.float32))
+    field = cover == Cover.FIELD
+    if field.any():
+        plots = np.sign(spline_noise(seed + 421, 260.0, east, north)) + np.sign(spline_noise(seed + 422, 190.0, east, north))
+        albedo[field] *= np.exp(0.16 * plots[field])[:, None]
+
+
+def alpine_albedo(place, day_of_year: float, *, upsample: int = 1) -> np.ndarray:
+    """Diffuse reflectance of the massif on a day, ``(H·upsample, W·upsample, 3)`` float32 linear Rec.709.
+
+    Parameters
+    ----------
+    place
+        The massif (`SyntheticPlace`).
+    day_of_year
+        1 = 1 January; fractions and any number of years are allowed, the result is periodic in 365.25 days.
+    upsample
+        Texels per cell along each axis: finer detail of crowns, tufts and blocks. The corners of the map stay.
+
+    Raises
+    ------
+    ValueError
+        ``upsample`` is not 1, 2, 4 or 8.
+    """
+    if upsample not in (1, 2, 4, 8):
+        raise ValueError(f"upsample: got {upsample}, expected 1, 2, 4 or 8")
+    height, width = place.cover.shape
+    result = np.empty((height * upsample, width * upsample, 3), np.float32)
+    for rows in _strips(height):
+        albedo, cover = _ground(place, day_of_year, rows, upsample)
+        snow = _snow(place, day_of_year, rows, upsample)
+        in_view = np.ones(cover.shape, np.float32)
+        for kind, share in _SNOW_IN_VIEW.items():
+            in_view[cover == kind] = share
+        east, north = _positions(place, rows, upsample)
+        age = 0.04 * fractal_noise(place.seed + 501, 200.0, east, north, octaves=3)
+        white = _snow_colour(day_of_year) + age[..., None] * 0.35
+        weight = (snow * in_view)[..., None]
+        result[rows.start * upsample : rows.stop * upsample] = albedo + weight * (white - albedo)
+    return np.clip(result, 0.01, 0.93)
+
+
+def _snow_colour(day: float) -> np.ndarray:
+    """Fresh in midwinter, coarse and dusty by July."""
+    return _periodic(day, [(20, (0.86, 0.87, 0.88)), (100, (0.80, 0.81, 0.82)), (190, (0.66, 0.67, 0.68)),
+                           (250, (0.70, 0.71, 0.72)), (300, (0.84, 0.85, 0.86))])  # fmt: skip
+
+
+__all__ = ["FOREST", "SEASONS", "alpine_albedo", "snow_fraction", "snow_line_m"]
