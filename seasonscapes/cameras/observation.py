@@ -297,5 +297,6 @@ def open_observation(row: ManifestRow, folder: Path, camera: Camera) -> Observat
         ) from None
     if image.shape[:2] != (camera.height_px, camera.width_px):
         raise InputError(path, "the picture has another size than its camera",
-                         got=f"{image.shape[1]} x {image.shape[0]}", expected=f"{camera.width_px} x {camera.height_px}")  # fmt: skip
+                         got=f"{image.shape[1]} x {image.shape[0]}",
+                         expected=f"{camera.width_px} x {camera.height_px}")  # fmt: skip
     return Observation(image, np.ones(image.shape[:2], bool), camera, row.time, row.webcam)

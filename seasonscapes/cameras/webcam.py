@@ -197,12 +197,16 @@ def draw_webcam_map(webcams: Sequence[Webcam], *, width_px: int = 1200, reach_m:
         outline = rim if half >= 180.0 else np.vstack([place, rim])
         cv2.fillPoly(shade, [np.array([at(p) for p in outline])], (150, 190, 235), cv2.LINE_AA)
     picture = cv2.addWeighted(shade, 0.5, picture, 0.5, 0.0)
+    written: list[tuple[int, int]] = []
     for webcam, place in zip(webcams, plan, strict=True):
         heading = np.radians(webcam_heading_deg(webcam))
         cv2.line(picture, at(place), at(place + reach_m * np.array([np.sin(heading), np.cos(heading)])), (30, 80, 170),
                  2, cv2.LINE_AA)  # fmt: skip
         cv2.circle(picture, at(place), 4, (190, 40, 30), -1, cv2.LINE_AA)
         x, y = at(place)
+        while any(abs(x - other[0]) < 110 and abs(y - other[1]) < 13 for other in written):
+            y += 6
+        written.append((x, y))
         cv2.putText(picture, webcam.id, (x + 6, y - 6), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (20, 20, 20), 1, cv2.LINE_AA)
     bar = 5000.0 if high[0] - low[0] > 20000.0 else 1000.0
     left = (low[0] + 0.03 * (high[0] - low[0]), low[1] + 0.03 * (high[1] - low[1]))

@@ -1,0 +1,211 @@
+"""Resection from matched points: known truths, stated errors, and every way in which matches can be wrong."""
+
+import csv
+
+import numpy as np
+import pytest
+
+from seasonscapes.calibration.evidence import Correspondences, Priors, read_points, take, write_points
+from seasonscapes.calibration.pose_model import angles_from_rotation
+from seasonscapes.calibration.rehearsal import point_trial, reproject, score_points
+from seasonscapes.calibration.resection import calibrate, leave_one_out, report_lines
+from seasonscapes.cameras.panorama import project_panorama
+from seasonscapes.cameras.pinhole import Camera, camera_at, project, rotation_from_angles
+from seasonscapes.declaration import InputError
+from seasonscapes.frames import LocalFrame, enu_from_geodetic
+
+FREE = Priors(horizontal_m=np.inf, vertical_m=np.inf)
+
+
+def test_angles_are_the_inverse_of_the_rotation():
+    rng = np.random.default_rng(0)
+    for heading, pitch, roll in zip(rng.uniform(0, 360, 50), rng.uniform(-80, 80, 50), rng.uniform(-170, 170, 50),
+                                    strict=True):  # fmt: skip
+        assert angles_from_rotation(rotation_from_angles(heading, pitch, roll)) == pytest.approx((heading, pitch, roll))
+
+
+@pytest.mark.parametrize("panoramic", [True, False])
+def test_the_solver_projects_as_the_cameras_do(panoramic):
+    trial = point_trial(np.random.default_rng(4), panoramic=panoramic)
+    independent = (project_panorama if panoramic else project)(trial.truth, trial.points.position_m)[0]
+    assert np.abs(reproject(trial) - independent).max() < 1e-7
+
+
+@pytest.mark.parametrize("panoramic", [True, False])
+@pytest.mark.parametrize("loss", ["cauchy", "l1", "squares"])
+def test_clean_matches_give_the_truth_to_the_last_digit(panoramic, loss):
+    trial = point_trial(np.random.default_rng(5), panoramic=panoramic, noise_px=0.0, outlier_share=0.0)
+    solved = calibrate(trial.start, trial.points, priors=FREE, loss=loss)
+    assert np.abs(solved.view.position_m - trial.truth.position_m).max() < 1e-3
+    assert np.abs(solved.view.world_from_camera - trial.truth.world_from_camera)[:3, :3].max() < 1e-6
+    assert solved.view.fy == pytest.approx(trial.truth.fy, rel=1e-6)
+
+
+def coverage(trials: int, seed: int) -> dict:
+    rng = np.random.default_rng(seed)
+    scores = [score_points(point_trial(rng, panoramic=i % 2 == 0), noise_px=1.0) for i in range(trials)]
+    return {"heading": np.array([s.heading_error_deg for s in scores]),
+            "focal": np.array([s.focal_error for s in scores]),
+            "inside": np.array([s.within_two_sigma for s in scores]),
+            "found": np.array([s.wrong_found for s in scores])}  # fmt: skip
+
+
+@pytest.mark.slow
+def test_200_trials_with_a_fifth_of_the_matches_wrong_keep_what_they_state():
+    got = coverage(200, 20261123)
+    assert np.median(got["heading"]) < 0.01
+    assert np.mean(got["heading"] < 0.02) > 0.88
+    assert np.mean(got["focal"] < 0.002) > 0.94
+    assert got["found"].mean() > 0.97
+    # 600 coordinates inside ± 2 sigma: 95.4 % expected; three binomial sigmas (of 200 independent trials) are 4.4 %.
+    assert 0.91 < got["inside"].mean() <= 0.99
+
+
+def test_a_start_40_degrees_off_does_no_harm():
+    for seed in range(6):
+        trial = point_trial(np.random.default_rng(seed), panoramic=seed % 2 == 0, heading_off_deg=40.0)
+        assert score_points(trial, noise_px=1.0).heading_error_deg < 0.06
+
+
+def test_a_radial_term_is_recovered_and_its_points_named():
+    from seasonscapes.cameras.lens import distort
+
+    trial = point_trial(np.random.default_rng(8), panoramic=False, count=40, noise_px=0.5, outlier_share=0.1)
+    pixel = distort(trial.points.pixel, trial.truth, -0.12)
+    solved = calibrate(trial.start, Correspondences(pixel, trial.points.position_m),
+                       priors=Priors(horizontal_m=20, vertical_m=20, k1=np.inf))  # fmt: skip
+    assert solved.k1 == pytest.approx(-0.12, abs=3.0 * solved.sigma["k1"])
+    assert solved.sigma["k1"] < 0.01
+    assert set(solved.outlier_names) == {str(i + 1) for i in np.flatnonzero(trial.wrong)}
+    assert any("set aside" in line for line in report_lines(solved))
+
+
+def test_an_unknown_held_fixed_stays_and_has_no_error():
+    trial = point_trial(np.random.default_rng(9), panoramic=False, outlier_share=0.0)
+    solved = calibrate(trial.start, trial.points, priors=Priors(horizontal_m=0.0, vertical_m=0.0, focal=0.0))
+    assert np.array_equal(solved.view.position_m, trial.start.position_m)
+    assert solved.view.fx == trial.start.fx
+    assert solved.sigma["east_m"] == solved.sigma["focal"] == 0.0
+
+
+def broken(points, how):
+    if how == "few":
+        return take(points, [0, 1])
+    if how == "mirror x":
+        return Correspondences(np.array([3072.0, 0.0]) + points.pixel * [-1, 1], points.position_m)
+    if how == "mirror y":
+        return Correspondences(np.array([0.0, 2048.0]) + points.pixel * [1, -1], points.position_m)
+    if how == "turned":
+        return Correspondences(np.array([3072.0, 2048.0]) - points.pixel, points.position_m)
+    if how == "reversed":
+        return Correspondences(points.pixel[::-1], points.position_m)
+    rng = np.random.default_rng(0)
+    return Correspondences(points.pixel, points.position_m[rng.permutation(len(points))])
+
+
+@pytest.mark.parametrize(("how", "message"), [
+    ("few", r"2 points for 4 unknowns without a prior: at least 3 are needed"),
+    ("mirror x", "mirrored"),
+    ("mirror y", "mirrored"),
+    ("turned", "on its head"),
+    ("reversed", "in reverse order"),
+    ("shuffled", "no pose in common|on its head|behind the camera"),
+])  # fmt: skip
+def test_matches_that_cannot_be_are_refused_with_a_reason(how, message):
+    for seed in (1, 2, 3):
+        trial = point_trial(np.random.default_rng(seed), panoramic=False, outlier_share=0.0)
+        with pytest.raises(ValueError, match=message):
+            calibrate(trial.start, broken(trial.points, how))
+
+
+def test_a_point_behind_the_camera_is_named():
+    trial = point_trial(np.random.default_rng(3), panoramic=False, outlier_share=0.0)
+    position = trial.points.position_m.copy()
+    position[4] = 2.0 * trial.truth.position_m - position[4]
+    with pytest.raises(ValueError, match="behind the camera: P5"):
+        calibrate(trial.start, Correspondences(trial.points.pixel, position, tuple(f"P{i + 1}" for i in range(12))))
+
+
+def test_nan_and_a_camera_below_ground_and_no_evidence_are_refused():
+    trial = point_trial(np.random.default_rng(3), outlier_share=0.0)
+    pixel = trial.points.pixel.copy()
+    pixel[2, 0] = np.nan
+    with pytest.raises(ValueError, match="point 3 holds NaN"):
+        Correspondences(pixel, trial.points.position_m)
+    height = trial.truth.position_m[2]
+    with pytest.raises(ValueError, match=r"the start puts the camera \d+ m below ground"):
+        calibrate(trial.start, trial.points, ground_m=lambda e, n: height + 100.0)
+    with pytest.raises(ValueError, match="neither points nor a skyline"):
+        calibrate(trial.start)
+    with pytest.raises(ValueError, match="must not be negative or NaN"):
+        Priors(focal=-1.0)
+
+
+def test_what_the_points_leave_open_is_said():
+    trial = point_trial(np.random.default_rng(3), panoramic=False, count=12, outlier_share=0.0, noise_px=0.0)
+    far = trial.truth.position_m + 1e7 * (trial.points.position_m - trial.truth.position_m)
+    with pytest.raises(ValueError, match=r"leaves (east_m|north_m|up_m) open"):
+        calibrate(trial.start, Correspondences(trial.points.pixel, far), priors=FREE, noise_px=1.0)
+
+
+def test_points_survive_their_file(tmp_path):
+    trial = point_trial(np.random.default_rng(3))
+    frame = LocalFrame(46.6, 8.0, 0.0, 0.13)
+    write_points(tmp_path / "p.csv", trial.points, frame)
+    again = read_points(tmp_path / "p.csv", frame)
+    assert again.names == trial.points.names
+    assert np.abs(again.position_m - trial.points.position_m).max() < 1e-3
+    text = (tmp_path / "p.csv").read_text()
+    for wrong, message in ((text.replace("height_m", "alt"), "'height_m' is missing"),
+                           (text + "x,1,2,nan,8,9\n", "line 14: not a point"),
+                           (text + "x,1\n", "line 14")):  # fmt: skip
+        (tmp_path / "p.csv").write_text(wrong)
+        with pytest.raises(InputError, match=message):
+            read_points(tmp_path / "p.csv", frame)
+
+
+def finse(folder):
+    from pyproj import Transformer
+
+    rows = list(csv.DictReader((folder / "finse-webcam" / "gcps.csv").read_text().splitlines()))
+    column = {
+        name: np.array([float(r[name]) for r in rows]) for name in ("x_img", "y_img", "x_world", "y_world", "z_world")
+    }
+    to_wgs84 = Transformer.from_crs(25832, 4326, always_xy=True, allow_ballpark=False)
+    longitude, latitude = to_wgs84.transform(column["x_world"], column["y_world"])
+    at = to_wgs84.transform(419169.2, 6718421.3)
+    frame = LocalFrame(at[1], at[0], 0.0, 0.13)
+    points = Correspondences(np.stack([column["x_img"], column["y_img"]], -1),
+                             enu_from_geodetic(frame, latitude, longitude, column["z_world"]),
+                             tuple(r["name"] for r in rows))  # fmt: skip
+    start = camera_at(frame, at[1], at[0], 1212.0, heading_deg=70.0, fov_deg=65.8, size_px=(1920, 1080))
+    return start, points
+
+
+@pytest.mark.data
+def test_finse_resection_with_one_radial_term(data_dir):
+    start, points = finse(data_dir)
+    priors = Priors(k1=np.inf)
+    solved = calibrate(start, points, priors=priors, loss="squares")
+    assert solved.rms_px < 5.55  # 5.51, the least-squares optimum of this model over all 45 points
+    assert solved.k1 == pytest.approx(-0.266, abs=0.01)
+    assert solved.values[0] == pytest.approx(61.0, abs=0.1)
+    without = leave_one_out(start, points, priors=priors, loss="squares")
+    assert np.sqrt(np.mean(np.sum(without**2, axis=1))) < 6.5  # 5.96
+    assert calibrate(start, points, priors=priors).inlier_rms_px < 4.6
+
+
+@pytest.mark.data
+def test_aletsch_resection(data_dir):
+    rows = list(csv.DictReader((data_dir / "aletsch-photo" / "gcps.csv").read_text().splitlines()))
+    frame = LocalFrame(46.4314217, 8.0932999, 0.0, 0.13)
+    column = {
+        name: np.array([float(r[name]) for r in rows]) for name in ("col_px", "row_px", "lat_deg", "lon_deg", "z_m")
+    }
+    points = Correspondences(np.stack([column["col_px"], column["row_px"]], -1),
+                             enu_from_geodetic(frame, column["lat_deg"], column["lon_deg"], column["z_m"]))  # fmt: skip
+    start: Camera = camera_at(frame, 46.4314217, 8.0932999, 2929.0, heading_deg=-63.37, pitch_deg=-11.3, fov_deg=63.08,
+                              size_px=(1024, 763))  # fmt: skip
+    solved = calibrate(start, points, priors=Priors(horizontal_m=100.0, vertical_m=100.0), loss="squares")
+    assert solved.rms_px < 8.0
+    assert solved.values[0] == pytest.approx(296.9, abs=0.3)
