@@ -3,23 +3,29 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
 
 import numpy as np
 
 from seasonscapes.declaration import InputError
-from seasonscapes.frames import geodetic_from_enu
+from seasonscapes.frames import LocalFrame, geodetic_from_enu
 from seasonscapes.images import linear_from_srgb
+from seasonscapes.terrain.atlas import Atlas
 from seasonscapes.terrain.raster import map_from_geodetic, read_raster
 from seasonscapes.terrain.surface import Raster, Terrain, Texture
 from seasonscapes.terrain.texels import texel_coordinates, texel_positions
-from seasonscapes.terrain.unwrap import Atlas
 
 ENCODINGS = ("srgb", "linear")
 # Longest footprint in pixels of the chosen mip level that is still resolved; longer ones are blurred.
 _MAX_ANISOTROPY = 8
-_CHUNK_TEXELS = 500_000
+_CHUNK = 250_000
+# Powers of east, north and up in the fitted map from the local frame to image pixels.
+_DEGREE = 6
+_EXPONENTS = [(i, j, k) for k, top in ((0, _DEGREE), (1, 3)) for i in range(top + 1) for j in range(top + 1 - i)]
+# Largest error of a fitted map [image pixels]; a tenth of what one could see.
+_MAX_FIT_ERROR_PX = 0.01
 
 
 def read_imagery(path: str | os.PathLike, *, bounds_deg: tuple[float, float, float, float] | None = None,
@@ -93,12 +99,12 @@ def bake_imagery(terrain: Terrain, atlas: Atlas, image: Raster, *, gutter_px: in
     positions, face_id = texel_positions(terrain, atlas.width_px, atlas.height_px)
     values = np.zeros((atlas.height_px, atlas.width_px, 3), np.float32)
     weight = np.zeros((atlas.height_px, atlas.width_px), np.float32)
-    pyramid = _pyramid(image.values)
-    footprint = _face_footprints(terrain, atlas, image)
+    pyramid, pixels_of = _pyramid(image.values), _pixel_map(terrain, image)
+    footprint = _face_footprints(terrain, atlas, pixels_of)
     texel = np.flatnonzero(face_id >= 0)
-    for start in range(0, len(texel), _CHUNK_TEXELS):
-        part = texel[start : start + _CHUNK_TEXELS]
-        pixel = _image_pixels(terrain, image, positions.reshape(-1, 3)[part])
+    for start in range(0, len(texel), _CHUNK):
+        part = texel[start : start + _CHUNK]
+        pixel = pixels_of(positions.reshape(-1, 3)[part])
         rgb, share = _filtered(pyramid, pixel, footprint[face_id.ravel()[part]])
         values.reshape(-1, 3)[part], weight.ravel()[part] = rgb, share
     if not weight.any():
@@ -106,26 +112,78 @@ def bake_imagery(terrain: Terrain, atlas: Atlas, image: Raster, *, gutter_px: in
     return dilate(Texture(values, weight), face_id >= 0, gutter_px)
 
 
-def _image_pixels(terrain: Terrain, image: Raster, positions: np.ndarray) -> np.ndarray:
-    """Column and row ``(N, 2)`` in the image (0.5 at the first pixel's centre) of positions ``(N, 3)``."""
-    latitude, longitude, _ = geodetic_from_enu(terrain.frame, positions)
+def image_pixels(frame: LocalFrame, image: Raster, positions: np.ndarray) -> np.ndarray:
+    """Column and row ``(N, 2)`` in a raster (0.5 at the first pixel's centre) of positions ``(N, 3)`` [m], exactly."""
+    latitude, longitude, _ = geodetic_from_enu(frame, positions)
     return np.stack(~image.transform * map_from_geodetic(image.crs, latitude, longitude), axis=-1)
 
 
-def _face_footprints(terrain: Terrain, atlas: Atlas, image: Raster) -> np.ndarray:
-    """Image pixels per texel for each face, ``(F, 2, 2)`` float32: columns are the texel's x and y sides."""
-    corners = np.empty((len(terrain.vertices), 2))
-    for start in range(0, len(corners), _CHUNK_TEXELS):
-        part = slice(start, start + _CHUNK_TEXELS)
-        corners[part] = _image_pixels(terrain, image, terrain.vertices[part])
-    pixel = corners[terrain.faces]
-    texel = texel_coordinates(terrain.uv, atlas.width_px, atlas.height_px)[terrain.faces]
-    p = np.stack([pixel[:, 1] - pixel[:, 0], pixel[:, 2] - pixel[:, 0]], axis=-1)
-    t = np.stack([texel[:, 1] - texel[:, 0], texel[:, 2] - texel[:, 0]], axis=-1)
-    determinant = t[:, 0, 0] * t[:, 1, 1] - t[:, 0, 1] * t[:, 1, 0]
-    adjugate = np.stack([t[:, 1, 1], -t[:, 0, 1], -t[:, 1, 0], t[:, 0, 0]], axis=-1).reshape(-1, 2, 2)
-    safe = np.where(determinant == 0.0, np.inf, determinant)
-    return (p @ adjugate / safe[:, None, None]).astype(np.float32)
+def _pixel_map(terrain: Terrain, image: Raster) -> Callable[[np.ndarray], np.ndarray]:
+    """`image_pixels` for many points: a polynomial in east and north, linear in up, or itself where that is not exact.
+
+    From one map to another over tens of kilometres everything is smooth; ten million calls of a projection library are
+    not needed to know it. The fit is accepted only if no point of a check within the terrain's box is off by more
+    than `_MAX_FIT_ERROR_PX`.
+    """
+    low, high = terrain.vertices.min(0).astype(np.float64), terrain.vertices.max(0).astype(np.float64)
+    middle, half = (low + high) / 2.0, np.maximum((high - low) / 2.0, 1.0)
+    nodes = np.cos((np.arange(16) + 0.5) * np.pi / 16.0)
+    e, n, u = (axis.ravel() for axis in np.meshgrid(nodes, nodes, (-1.0, 0.0, 1.0)))
+    target = image_pixels(terrain.frame, image, middle + half * np.stack([e, n, u], axis=-1))
+    if not np.isfinite(target).all():
+        return lambda positions: image_pixels(terrain.frame, image, positions)
+    basis = np.stack([e**i * n**j * u**k for i, j, k in _EXPONENTS], axis=-1)
+    coefficients = np.linalg.lstsq(basis, target, rcond=None)[0]
+
+    def fitted(positions):
+        e, n, u = ((positions - middle) / half).T
+        return np.stack([_polynomial(coefficients[:, axis], e, n, u) for axis in (0, 1)], axis=-1)
+
+    check = terrain.vertices[:: max(1, len(terrain.vertices) // 2000)]
+    if np.abs(fitted(check) - image_pixels(terrain.frame, image, check)).max() > _MAX_FIT_ERROR_PX:
+        return lambda positions: image_pixels(terrain.frame, image, positions)
+    return fitted
+
+
+def _polynomial(coefficients: np.ndarray, e: np.ndarray, n: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Σ c e^i n^j u^k over `_EXPONENTS` by Horner's rule, ``(N,)``."""
+    table = dict(zip(_EXPONENTS, coefficients, strict=True))
+    total = np.zeros_like(e)
+    for i in range(_DEGREE, -1, -1):
+        inner = np.zeros_like(e)
+        for j in range(_DEGREE - i, -1, -1):
+            inner *= n
+            inner += table[i, j, 0] + (table[i, j, 1] * u if (i, j, 1) in table else 0.0)
+        total *= e
+        total += inner
+    return total
+
+
+def _face_footprints(terrain: Terrain, atlas: Atlas, pixels_of) -> np.ndarray:
+    """Ellipse of image pixels under a texel of each face, ``(F, 4)`` float32: longer side (x, y), longer, shorter.
+
+    The lengths are the singular values of the map from texels to pixels.
+    """
+    footprint = np.empty((len(terrain.faces), 4), np.float32)
+    texel_of = texel_coordinates(terrain.uv, atlas.width_px, atlas.height_px)
+    for start in range(0, len(terrain.faces), _CHUNK):
+        faces = terrain.faces[start : start + _CHUNK]
+        p = np.moveaxis(pixels_of(terrain.vertices[faces].reshape(-1, 3)).reshape(-1, 3, 2), 1, 0)
+        t = np.moveaxis(texel_of[faces], 1, 0)
+        p1, p2, t1, t2 = p[1] - p[0], p[2] - p[0], t[1] - t[0], t[2] - t[0]
+        determinant = (t1[:, 0] * t2[:, 1] - t1[:, 1] * t2[:, 0])[:, None]
+        # A face without area in the atlas covers no texel; any finite number will do.
+        determinant = np.where(determinant == 0.0, np.inf, determinant)
+        x, y = (p1 * t2[:, 1:] - p2 * t1[:, 1:]) / determinant, (p2 * t1[:, :1] - p1 * t2[:, :1]) / determinant
+        a, b, c = (np.sum(x * x, 1), np.sum(x * y, 1), np.sum(y * y, 1))
+        largest = (a + c + np.sqrt((a - c) ** 2 + 4.0 * b * b)) / 2.0
+        # Eigenvector of the 2 × 2 Gram matrix, from whichever row does not vanish, carried to the image.
+        vector = np.where((a >= c)[:, None], np.stack([largest - c, b], 1), np.stack([b, largest - a], 1))
+        vector = vector / np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-300)
+        footprint[start : start + len(faces), :2] = x * vector[:, :1] + y * vector[:, 1:]
+        footprint[start : start + len(faces), 2] = np.sqrt(largest)
+        footprint[start : start + len(faces), 3] = np.sqrt(np.maximum(a + c - largest, 0.0))
+    return footprint
 
 
 def _pyramid(values: np.ndarray) -> list[np.ndarray]:
@@ -140,15 +198,14 @@ def _pyramid(values: np.ndarray) -> list[np.ndarray]:
 
 
 def _filtered(pyramid: list[np.ndarray], pixel: np.ndarray, footprint: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Colour ``(N, 3)`` and coverage ``(N,)`` over the footprints ``(N, 2, 2)`` at pixels ``(N, 2)``."""
-    u, s, _ = np.linalg.svd(footprint)
-    shorter = np.maximum(np.maximum(s[:, 1], s[:, 0] / _MAX_ANISOTROPY), 1.0)
-    taps = np.ceil(np.maximum(s[:, 0], 1.0) / shorter - 1e-3).astype(int)
-    level = np.minimum(np.log2(shorter), len(pyramid) - 1.0)
-    major = u[:, :, 0] * s[:, :1]
+    """Colour ``(N, 3)`` and coverage ``(N,)`` over the footprints ``(N, 4)`` at pixels ``(N, 2)``."""
+    major, longer, shorter = footprint[:, :2], footprint[:, 2], footprint[:, 3]
+    side = np.maximum(np.maximum(shorter, longer / _MAX_ANISOTROPY), 1.0)
+    taps = np.ceil(np.maximum(longer, 1.0) / side - 1e-3).astype(int)
+    level = np.clip(np.log2(side), 0.0, len(pyramid) - 1.0)
     result = np.zeros((len(pixel), pyramid[0].shape[2]), np.float32)
     base = np.floor(level).astype(int)
-    for count, lower in product(np.unique(taps), np.unique(base)):
+    for count, lower in product(range(1, taps.max() + 1), range(base.min(), base.max() + 1)):
         chosen = np.flatnonzero((taps == count) & (base == lower))
         if not len(chosen):
             continue

@@ -11,16 +11,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from seasonscapes.declaration import InputError
 from seasonscapes.frames import LocalFrame, enu_from_geodetic, geodetic_from_enu
+from seasonscapes.terrain.atlas import planar_uv
+from seasonscapes.terrain.poisson import largest_piece, poisson_surface
 from seasonscapes.terrain.raster import geodetic_from_map, map_from_geodetic
 from seasonscapes.terrain.surface import Raster, Terrain
 from seasonscapes.terrain.texels import covering_faces
-from seasonscapes.terrain.unwrap import planar_uv
 
 DEFAULT_MAX_ERROR_M = 5.0
 # Work in pieces of this many samples: the float64 temporaries of geodesy then stay below 200 MB.
 _CHUNK = 500_000
+# Samples that the Poisson surface is given past the rim.
+_MARGIN = 4
 
 
 @dataclass(frozen=True)
@@ -151,7 +153,24 @@ def grid_faces(height: int, width: int, *, mirrored: bool = False) -> np.ndarray
 
 
 def _poisson(raster: Raster, frame: LocalFrame, max_error_m: float) -> tuple[np.ndarray, np.ndarray]:
-    raise InputError("poisson", "not built yet")
+    """Screened Poisson surface of all samples, cut at the raster's rim."""
+    height, width = raster.values.shape[:2]
+    # Reconstruction bends at the rim of its points: give it a margin that continues the slope, then cut it off.
+    row, column = np.mgrid[-_MARGIN : height + _MARGIN, -_MARGIN : width + _MARGIN]
+    heights = np.pad(raster.values[..., 0].astype(np.float64), _MARGIN, mode="reflect", reflect_type="odd")
+    vertices, faces = poisson_surface(sample_positions(raster, frame, row, column, heights))
+    pixel = _pixel_coordinates(vertices, frame, raster) - 0.5
+    inside = ((pixel >= 0.0) & (pixel <= [width - 1, height - 1])).all(axis=1)
+    faces = largest_piece(faces[inside[faces].any(axis=1)], len(vertices))
+    if _plan_area(vertices, faces) < 0.0:
+        faces = faces[:, ::-1]
+    used, faces = np.unique(faces, return_inverse=True)
+    return vertices[used], faces.reshape(-1, 3).astype(np.uint32)
+
+
+def _plan_area(vertices: np.ndarray, faces: np.ndarray) -> float:
+    a, b, c = (vertices[faces[:, k], :2].astype(np.float64) for k in range(3))
+    return float(np.sum((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])) / 2.0
 
 
 MESHERS: dict[str, Callable[[Raster, LocalFrame, float], tuple[np.ndarray, np.ndarray]]] = {
@@ -168,7 +187,11 @@ def mesh_report(terrain: Terrain, raster: Raster) -> MeshReport:
     frame, straight up from the sample to the plane of that triangle.
     """
     height, width = raster.values.shape[:2]
-    face_id = covering_faces(_pixel_coordinates(terrain, raster), terrain.faces, width, height)
+    pixel = _pixel_coordinates(terrain.vertices, terrain.frame, raster)
+    # Samples on the rim lie exactly on the mesh's edge: widen by a thousandth of a pixel, more than float32 loses.
+    middle = np.array([width, height]) / 2.0
+    pixel = middle + (pixel - middle) * (1.0 + 2e-3 / max(height, width))
+    face_id = covering_faces(pixel, terrain.faces, width, height)
     square, worst, covered = 0.0, 0.0, 0
     for first, position in _row_strips(raster, terrain.frame):
         ids = face_id[first : first + len(position)]
@@ -190,17 +213,14 @@ def mesh_report(terrain: Terrain, raster: Raster) -> MeshReport:
     )
 
 
-def _pixel_coordinates(terrain: Terrain, raster: Raster) -> np.ndarray:
-    """Column and row ``(V, 2)`` of the vertices, 0.5 at the first pixel's centre."""
-    pixel = np.empty((len(terrain.vertices), 2))
+def _pixel_coordinates(vertices: np.ndarray, frame: LocalFrame, raster: Raster) -> np.ndarray:
+    """Column and row ``(V, 2)`` of vertices, 0.5 at the first pixel's centre."""
+    pixel = np.empty((len(vertices), 2))
     for first in range(0, len(pixel), _CHUNK):
         part = slice(first, first + _CHUNK)
-        latitude, longitude, _ = geodetic_from_enu(terrain.frame, terrain.vertices[part])
+        latitude, longitude, _ = geodetic_from_enu(frame, vertices[part])
         pixel[part] = np.stack(~raster.transform * map_from_geodetic(raster.crs, latitude, longitude), axis=-1)
-    # Samples on the rim lie exactly on the mesh's edge: widen by a few millionths of a pixel, more than float32 loses.
-    height, width = raster.values.shape[:2]
-    centre = np.array([width, height]) / 2.0
-    return centre + (pixel - centre) * (1.0 + 1e-3 / max(height, width))
+    return pixel
 
 
 def _height_above_plane(terrain: Terrain, faces: np.ndarray, position: np.ndarray) -> np.ndarray:

@@ -1,0 +1,137 @@
+"""The relief atlas: a top-down atlas whose texels move to where the surface is steep, without ever folding."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from seasonscapes.declaration import InputError
+from seasonscapes.terrain.atlas import Atlas, measure_atlas, plan_size, require_unfolded, singular_values
+from seasonscapes.terrain.surface import Terrain
+
+# One direct factorisation of a million unknowns takes about half a minute and 3 GB.
+MAX_FACES = 2_500_000
+
+
+def relief_atlas(terrain: Terrain, texel_m: float | None, max_side_px: int) -> tuple[Terrain, Atlas]:
+    """A convex-combination map of the surface onto a rectangle, weighted for little stretch.
+
+    The rim goes to the rim of the rectangle by its length on the surface. Every inner vertex is a weighted mean of its
+    neighbours with positive weights: by Tutte's theorem (Floater 1997, doi:10.1016/S0167-8396(96)00031-3) no face
+    can fold, whatever the weights. They are the mean value coordinates of the surface (Floater 2003,
+    doi:10.1016/S0167-8396(03)00002-5), nearly conformal, divided once by each neighbour's stretch, which draws texels
+    to cliffs (Yoshizawa, Belyaev & Seidel 2004, doi:10.1109/SMI.2004.1314507).
+
+    Raises
+    ------
+    InputError
+        More faces than `MAX_FACES`, a surface with holes or in pieces, or one so rugged that rounding folds a face.
+    """
+    if len(terrain.faces) > MAX_FACES:
+        raise InputError("atlas relief", f"too many faces to solve for: {len(terrain.faces)}",
+                         expected=f"at most {MAX_FACES}",
+                         cure="take the adaptive mesher with a larger error bound, or the planar atlas")  # fmt: skip
+    _, _, width, height = plan_size(terrain, texel_m, max_side_px)
+    rim = boundary_loop(terrain.faces, len(terrain.vertices))
+    uv = _rim_on_rectangle(terrain, rim)
+    i, j, weight = _mean_value_weights(terrain)
+    first = _solved(terrain, uv, rim, i, j, weight)
+    stretch, first_energy = _vertex_stretch(first, width, height)
+    second = _solved(terrain, uv, rim, i, j, weight / stretch[j])
+    _, second_energy = _vertex_stretch(second, width, height)
+    best = second if second_energy < first_energy else first
+    require_unfolded(best, "relief", cure="take the planar atlas, or a larger error bound of the mesher")
+    return best, measure_atlas(best, "relief", width, height)
+
+
+def boundary_loop(faces: np.ndarray, vertex_count: int) -> np.ndarray:
+    """Vertices along the one rim of a surface, counter-clockwise.
+
+    Raises
+    ------
+    InputError
+        The surface has no rim, several, or one that touches itself.
+    """
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+    forth, back = edges @ [vertex_count, 1], edges @ [1, vertex_count]
+    rim = edges[np.isin(forth, back, assume_unique=True, invert=True)]
+    following = dict(rim.tolist())
+    loop = [int(rim[0, 0])] if len(rim) else []
+    while loop and (after := following.get(loop[-1])) is not None and after != loop[0] and len(loop) <= len(rim):
+        loop.append(after)
+    if not loop or len(loop) != len(rim):
+        raise InputError("atlas relief", "the surface is not one piece without holes", cure="take the xatlas atlas")
+    return np.array(loop)
+
+
+def _rim_on_rectangle(terrain: Terrain, rim: np.ndarray) -> np.ndarray:
+    """UV ``(V, 2)`` with the rim on the unit square, by its length on the surface, and zeros within.
+
+    The raster's corners, where the rim turns most, go to the square's; the south-west one goes to (0, 0).
+    """
+    position = terrain.vertices[rim].astype(np.float64)
+    step = np.roll(position, -1, axis=0) - position
+    heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
+    turn = (heading - np.roll(heading, 1) + np.pi) % (2.0 * np.pi) - np.pi
+    corner = np.sort(np.argsort(turn)[-4:])
+    south_west = corner[np.argmin(position[corner, 0] + position[corner, 1])]
+    rim, step = np.roll(rim, -south_west), np.roll(step, -south_west, axis=0)
+    ends = [*np.sort((corner - south_west) % len(rim)), len(rim)]
+    length = np.linalg.norm(step, axis=1)
+    square = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0), (0.0, 0.0)])
+    uv = np.zeros((len(terrain.vertices), 2))
+    for side in range(4):
+        part = slice(ends[side], ends[side + 1])
+        share = (np.cumsum(length[part]) - length[part]) / length[part].sum()
+        uv[rim[part]] = square[side] + share[:, None] * (square[side + 1] - square[side])
+    return uv
+
+
+def _mean_value_weights(terrain: Terrain) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Directed edges i → j and their weights (tan α/2 + tan β/2) / |ij| on the surface, one entry for each face."""
+    i, j, weight = [], [], []
+    for k in range(3):
+        here, one, other = (terrain.faces[:, (k + turn) % 3].astype(np.int64) for turn in range(3))
+        a = terrain.vertices[one].astype(np.float64) - terrain.vertices[here]
+        b = terrain.vertices[other].astype(np.float64) - terrain.vertices[here]
+        length_a, length_b = np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1)
+        cosine = np.einsum("ij,ij->i", a, b) / (length_a * length_b)
+        # tan(θ/2) through |a × b| stays exact for needles, where 1 − cos θ would be lost.
+        half_tangent = np.linalg.norm(np.cross(a, b), axis=1) / (length_a * length_b * (1.0 + cosine))
+        i += [here, here]
+        j += [one, other]
+        weight += [half_tangent / length_a, half_tangent / length_b]
+    return np.concatenate(i), np.concatenate(j), np.concatenate(weight)
+
+
+def _solved(terrain: Terrain, uv: np.ndarray, rim: np.ndarray, i, j, weight) -> Terrain:
+    """The terrain with every inner vertex at the weighted mean of its neighbours."""
+    from scipy.sparse import coo_array, diags_array
+    from scipy.sparse.linalg import splu
+
+    count = len(uv)
+    inner = np.ones(count, bool)
+    inner[rim] = False
+    within = np.flatnonzero(inner)
+    if not len(within):
+        return replace(terrain, uv=uv.astype(np.float32))
+    matrix = coo_array((weight, (i, j)), shape=(count, count)).tocsr()[within]
+    matrix = diags_array(1.0 / matrix.sum(axis=1)) @ matrix
+    system = (diags_array(np.ones(len(within))) - matrix[:, within]).tocsc()
+    # Diagonally dominant: no pivoting is needed, and the symmetric ordering keeps the factors sparse.
+    factors = splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    solved = uv.copy()
+    solved[within] = factors.solve(matrix[:, rim] @ uv[rim])
+    return replace(terrain, uv=solved.astype(np.float32))
+
+
+def _vertex_stretch(terrain: Terrain, width: int, height: int) -> tuple[np.ndarray, float]:
+    """Mean-square stretch about each vertex ``(V,)`` over that of the whole, and that of the whole (their eq. 2)."""
+    longer, shorter, area = singular_values(terrain, width, height)
+    square = (longer**2 + shorter**2) / 2.0
+    corners, count = terrain.faces.ravel(), len(terrain.vertices)
+    total = np.bincount(corners, np.repeat(area * square, 3), count)
+    weight = np.bincount(corners, np.repeat(area, 3), count)
+    energy = float(np.sqrt((area * square).sum() / area.sum()))
+    return np.sqrt(total / np.maximum(weight, 1e-300)) / energy, energy
