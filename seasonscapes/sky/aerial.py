@@ -1,8 +1,8 @@
 """What one observer sees: scattered light along every ray, to the end of the air or up to a mountain.
 
 For each ray three sums are kept apart, sunlight scattered once by gas, once by aerosol, and everything else. Without
-their phase functions the first two are smooth in azimuth (Bruneton & Neyret 2008, § 4), so few azimuths do, and the sun's
-aureole is as sharp as its phase function wherever it is looked up.
+their phase functions the first two are smooth in azimuth (Bruneton & Neyret 2008, § 4), so few azimuths do, and the
+sun's aureole is as sharp as its phase function wherever it is looked up.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 from seasonscapes.frames import angles_from_direction
 from seasonscapes.sky.air import TOP_HEIGHT_M, aerosol_phase, constituent_densities, delta_scaled, gas_phase, optics
-from seasonscapes.sky.paths import equal_cells, horizon_elevation_rad, resampled, sun_transfer, trace_rays
+from seasonscapes.sky.paths import equal_cells, horizon_elevation_rad, sun_transfer, trace_rays
 from seasonscapes.sky.scattering import (
     HARMONIC_ORDER,
     AtmosphereTables,

@@ -1,8 +1,8 @@
 """The clear and hazy sky of every hour: radiance map, sun or moon, and the air between viewer and mountain.
 
 `atmosphere_tables` does the slow part once for an atmosphere; everything that knows a time is quick. Any luminary goes
-the same way: a direction and its spectral irradiance above the air as a share of the sun's (`irradiance`), and the skies
-of several luminaries add up.
+the same way: a direction and its spectral irradiance above the air as a share of the sun's (`irradiance`), and the
+skies of several luminaries add up.
 
 Polarisation is left out (a scalar theory errs by up to 5 % of a clear sky's radiance in single directions), and so are
 water vapour and oxygen, whose lines lie where the eye hardly sees.
@@ -18,12 +18,12 @@ import numpy as np
 
 from seasonscapes.frames import angles_from_direction, equirectangular_directions
 from seasonscapes.images import atomic_path
-from seasonscapes.sky.aerial import AirBetween, SeenLight, air_between, observer_view, seen_sky, sky_radiance
+from seasonscapes.sky.aerial import SeenLight, air_between, observer_view, seen_sky, sky_radiance
 from seasonscapes.sky.air import Atmosphere, optics
 from seasonscapes.sky.ephemeris import refraction_deg, standard_pressure_hpa
 from seasonscapes.sky.illumination import Illumination, Luminary
 from seasonscapes.sky.paths import SUN_RADIUS_DEG, SunColumns, sun_transfer
-from seasonscapes.sky.scattering import AtmosphereTables, Moments, atmosphere_tables
+from seasonscapes.sky.scattering import AtmosphereTables, Moments, atmosphere_tables, sun_index
 from seasonscapes.sky.spectrum import WAVELENGTHS_NM, rgb_from_transfer
 
 __all__ = [
@@ -206,8 +206,6 @@ def _direct_transfer(tables: AtmosphereTables, direction: np.ndarray, height_m: 
 
 def _surface_transfer(tables: AtmosphereTables, direction: np.ndarray, height_m: float, true_rad: float) -> np.ndarray:
     """Light on a steep grey surface near the observer: half of the sun, and the sky's ground irradiance."""
-    from seasonscapes.sky.scattering import sun_index
-
     index, share = sun_index(np.sin(true_rad))
     table = tables.moments.ground_irradiance
     diffuse = table[index] * (1.0 - share) + table[index + 1] * share

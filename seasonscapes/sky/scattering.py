@@ -82,7 +82,7 @@ class Moments:
     log_mean
         ``(P, J, B)`` logarithm of Φ_00.
     ratio
-        ``(P, J, C, B)`` all moments over Φ_00; C runs over (l, m) with l ≤ `HARMONIC_ORDER`.
+        ``(P, J, L, L, B)`` all moments over Φ_00, by l and m.
     ground_irradiance
         ``(J, B)`` diffuse irradiance of the ground, a transfer.
     """
@@ -111,34 +111,32 @@ class AtmosphereTables:
     moments: Moments
 
 
-def harmonic_degrees(order: int = HARMONIC_ORDER) -> np.ndarray:
-    """Degree l of each real harmonic that is even about the sun's vertical plane, in their fixed order ``(C,)``."""
-    return np.array([degree for degree in range(order + 1) for _ in range(degree + 1)])
-
-
-def harmonics(x: np.ndarray, z: np.ndarray, order: int = HARMONIC_ORDER) -> np.ndarray:
-    """Real orthonormal spherical harmonics ``(..., C)`` even in y, of unit vectors with components x and z."""
-    across = 1.0 - z**2
-    # Re (x + iy)^m, and associated Legendre functions over sin^m, both by recurrence.
+def azimuthal(x: np.ndarray, z: np.ndarray, order: int = HARMONIC_ORDER) -> np.ndarray:
+    """``Re (x + iy)^m = sin^m θ cos mφ`` of unit vectors for m up to ``order``, ``(..., order + 1)``."""
     cosines = [np.ones_like(x), x]
     for _ in range(2, order + 1):
-        cosines.append(2.0 * x * cosines[-1] - across * cosines[-2])
-    values = {}
+        cosines.append(2.0 * x * cosines[-1] - (1.0 - z**2) * cosines[-2])
+    return np.stack(cosines, axis=-1)
+
+
+def zonal(z: np.ndarray, order: int = HARMONIC_ORDER) -> np.ndarray:
+    """Orthonormal associated Legendre functions over ``sin^m θ``, ``(..., order + 1, order + 1)`` by l and m.
+
+    ``zonal(z)[..., l, m] * azimuthal(x, z)[..., m]`` are the real spherical harmonics that are even in y.
+    """
+    values = np.zeros((*np.shape(z), order + 1, order + 1))
     for m in range(order + 1):
-        diagonal = float(np.prod(np.arange(1, 2 * m, 2))) if m else 1.0
-        values[m, m] = np.full_like(z, diagonal)
-        if m < order:
-            values[m + 1, m] = z * (2 * m + 1) * values[m, m]
-        for degree in range(m + 2, order + 1):
-            values[degree, m] = (
-                (2 * degree - 1) * z * values[degree - 1, m] - (degree + m - 1) * values[degree - 2, m]
+        values[..., m, m] = float(np.prod(np.arange(1, 2 * m, 2)))
+        for degree in range(m + 1, order + 1):
+            before = values[..., degree - 2, m] if degree > m + 1 else 0.0
+            values[..., degree, m] = (
+                (2 * degree - 1) * z * values[..., degree - 1, m] - (degree + m - 1) * before
             ) / (degree - m)
-    out = []
     for degree in range(order + 1):
         for m in range(degree + 1):
-            norm = (2 * degree + 1) / (4 * np.pi) * factorial(degree - m) / factorial(degree + m) * (2 if m else 1)
-            out.append(np.sqrt(norm) * values[degree, m] * cosines[m])
-    return np.stack(out, axis=-1)
+            square = (2 * degree + 1) / (4 * np.pi) * factorial(degree - m) / factorial(degree + m) * (2 if m else 1)
+            values[..., degree, m] *= np.sqrt(square)
+    return values
 
 
 def sample_cells(atmosphere: Atmosphere, scaled: Optics, paths: Paths, edges_m: np.ndarray) -> Samples:
@@ -170,32 +168,38 @@ def scattering_per_m(atmosphere: Atmosphere, scaled: Optics, height_m: np.ndarra
     return density[..., None] * scaled.scattering[:2].reshape(2, *(1,) * np.ndim(height_m), -1)
 
 
-def diffuse_source(tables_atmosphere: Atmosphere, scaled: Optics, moments: Moments, samples: Samples,
+def diffuse_source(atmosphere: Atmosphere, scaled: Optics, moments: Moments, samples: Samples,
                    geometry: tuple) -> np.ndarray:  # fmt: skip
     """Source of scattered diffuse light ``J`` at samples under many suns and azimuths ``(K, S, Q, B)`` [1/(m sr)].
 
     ``geometry`` is what `sun_geometry` gives for the samples.
     """
-    index, share, basis = geometry
-    sigma = scattering_per_m(tables_atmosphere, scaled, samples.height_m)
-    degrees = harmonic_degrees()
-    # Phase moments of the mixture at each sample: (K, S, C, B).
-    chi = np.stack([gas_moments(HARMONIC_ORDER), scaled.aerosol_moments[: HARMONIC_ORDER + 1]])[:, degrees]
-    factor = np.einsum("aksb,ac->kscb", sigma, chi)
-    row, fr = height_index(tables_atmosphere, samples.height_m)
-    fr = fr[..., None, None]
+    index, share, cosines = geometry
+    row, fr = height_index(atmosphere, samples.height_m)
+    fr = fr.astype(np.float32)[..., None, None]
     log_mean = moments.log_mean[row] * (1.0 - fr) + moments.log_mean[row + 1] * fr
-    fr = fr[..., None]
+    fr = fr[..., None, None]
     ratio = moments.ratio[row] * (1.0 - fr) + moments.ratio[row + 1] * fr
-    ratio = (ratio * factor[:, :, None]).astype(np.float32)
-    k, s, knots = log_mean.shape[:3]
-    flat = (np.arange(k * s) * knots).reshape(k, s, 1) + index
-    log_mean, ratio = log_mean.reshape(k * s * knots, -1), ratio.reshape(k * s * knots, *ratio.shape[3:])
-    fs = share[..., None]
-    mean = np.exp(log_mean[flat] * (1.0 - fs) + log_mean[flat + 1] * fs)
-    low = np.einsum("ksqc,ksqcb->ksqb", basis, np.take(ratio, flat, axis=0), optimize=False)
-    high = np.einsum("ksqc,ksqcb->ksqb", basis, np.take(ratio, flat + 1, axis=0), optimize=False)
-    return np.maximum(low * (1.0 - fs) + high * fs, 0.0) * mean
+    # A sample's height and elevation fix all but the azimuth: sum over l here, once for all suns.
+    chi = np.stack([gas_moments(HARMONIC_ORDER), scaled.aerosol_moments[: HARMONIC_ORDER + 1]])
+    sigma = scattering_per_m(atmosphere, scaled, samples.height_m)
+    factor = np.einsum("aksb,al,kslm->kslmb", sigma, chi, zonal(np.sin(samples.elevation_rad)), optimize=True)
+    by_azimuth = np.einsum("kslmb,ksjlmb->ksjmb", factor.astype(np.float32), ratio)
+    k, s, knots, orders, bands = by_azimuth.shape
+    flat = (np.arange(k * s, dtype=np.int32) * knots).reshape(k, s, 1) + index
+    log_mean, by_azimuth = log_mean.reshape(-1, bands), by_azimuth.reshape(-1, orders, bands)
+    mean = np.exp(_mixed(log_mean, flat, share[..., None]))
+    shape = np.einsum("ksqm,ksqmb->ksqb", cosines, _mixed(by_azimuth, flat, share[..., None, None]))
+    return np.maximum(shape, 0.0) * mean
+
+
+def _mixed(table: np.ndarray, index: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Linear interpolation between a table's rows ``index`` and ``index + 1``."""
+    low, high = np.take(table, index, axis=0), np.take(table, index + 1, axis=0)
+    high -= low
+    high *= share
+    high += low
+    return high
 
 
 def sun_geometry(samples: Samples, start_elevation_rad: np.ndarray, sun_elevation_rad: np.ndarray,
@@ -207,21 +211,18 @@ def sun_geometry(samples: Samples, start_elevation_rad: np.ndarray, sun_elevatio
     sun_sine
         Sine of the sun's elevation at the samples ``(K, S, Q)``.
     geometry
-        Knot index and share in the sun's elevation, and the harmonics of the ray's direction in the local frame.
+        Knot index and share in the sun's elevation, and `azimuthal` of the ray's direction in the local frame.
     """
-    sun, azimuth = np.asarray(sun_elevation_rad), np.asarray(azimuth_rad)
-    sine = local_sun(samples.turn_rad[..., None], sun, np.cos(azimuth))
-    index, share = sun_index(sine)
+    sun, cos_azimuth = np.asarray(sun_elevation_rad), np.cos(azimuth_rad)
+    sine = local_sun(samples.turn_rad[..., None], sun, cos_azimuth)
     # Cosine between ray and sun, constant along the ray.
-    nu = np.sin(start_elevation_rad)[:, None] * np.sin(sun) + np.cos(start_elevation_rad)[:, None] * np.cos(
-        sun
-    ) * np.cos(azimuth)
+    start = start_elevation_rad[:, None]
+    nu = np.sin(start) * np.sin(sun) + np.cos(start) * np.cos(sun) * cos_azimuth
     z = np.sin(samples.elevation_rad)[..., None]
-    level = np.sqrt(np.maximum(1.0 - sine**2, 1e-8))
-    x = (nu[:, None, :] - z * sine) / level
+    x = (nu[:, None, :] - z * sine) / np.sqrt(np.maximum(1.0 - sine**2, 1e-8))
     bound = np.sqrt(np.maximum(1.0 - z**2, 0.0))
     x = np.clip(x, -bound, bound)
-    return sine, (index, share, harmonics(x, np.broadcast_to(z, x.shape)).astype(np.float32))
+    return sine, (*sun_index(sine), azimuthal(x, np.broadcast_to(z, x.shape)).astype(np.float32))
 
 
 def sun_index(sine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -265,7 +266,7 @@ class _Level:
     samples: Samples
     sines: np.ndarray  # of the rays' elevations (K,)
     weights: np.ndarray  # solid angle (K, A)
-    basis: np.ndarray  # harmonics of the rays' directions (K, J, A, C)
+    basis: np.ndarray  # harmonics of the rays' directions (K, A, L, L)
     geometry: tuple
     sun_sine: np.ndarray
     ground_index: tuple
@@ -280,7 +281,8 @@ def _level(atmosphere: Atmosphere, scaled: Optics, height_m: float) -> _Level:
     suns, azimuths = (part.ravel() for part in np.meshgrid(sun, azimuth, indexing="ij"))
     sun_sine, geometry = sun_geometry(samples, elevation, suns, azimuths)
     x = np.cos(elevation)[:, None] * np.cos(azimuth)
-    basis = harmonics(x, np.broadcast_to(np.sin(elevation)[:, None], x.shape))
+    z = np.broadcast_to(np.sin(elevation)[:, None], x.shape)
+    basis = zonal(z) * azimuthal(x, z)[..., None, :]
     end_sine = local_sun(samples.paths.turn_rad[:, -1, None], suns, np.cos(azimuths))
     weights = np.repeat(weight[:, None] * (2.0 * np.pi / _AZIMUTHS), _AZIMUTHS, axis=1)
     return _Level(samples, np.sin(elevation), weights, basis, geometry, sun_sine, (*sun_index(end_sine), end_sine))
@@ -308,10 +310,10 @@ def _first_radiance(atmosphere: Atmosphere, scaled: Optics, columns: SunColumns,
 
 
 def _project(level: _Level, radiance: np.ndarray) -> np.ndarray:
-    """Moments ``(J, C, B)`` of radiance ``(K, Q, B)`` along a level's rays."""
+    """Moments ``(J, L, L, B)`` of radiance ``(K, Q, B)`` along a level's rays."""
     k, a = level.weights.shape
     by_sun = radiance.reshape(k, -1, a, radiance.shape[-1])
-    return np.einsum("ka,kac,kjab->jcb", level.weights, level.basis, by_sun, optimize=True)
+    return np.einsum("ka,kalm,kjab->jlmb", level.weights, level.basis, by_sun, optimize=True)
 
 
 def _irradiance(level: _Level, radiance: np.ndarray) -> np.ndarray:
@@ -322,19 +324,20 @@ def _irradiance(level: _Level, radiance: np.ndarray) -> np.ndarray:
 
 
 def as_moments(values: np.ndarray, ground_irradiance: np.ndarray) -> Moments:
-    """Pack plain moments ``(P, J, C, B)`` so that they interpolate well."""
-    mean = np.maximum(values[:, :, 0], _DARK)
-    return Moments(np.log(mean).astype(np.float32), (values / mean[:, :, None]).astype(np.float32), ground_irradiance)
+    """Pack plain moments ``(P, J, L, L, B)`` so that they interpolate well."""
+    mean = np.maximum(values[:, :, 0, 0], _DARK)
+    ratio = values / mean[:, :, None, None]
+    return Moments(np.log(mean).astype(np.float32), ratio.astype(np.float32), ground_irradiance)
 
 
-def atmosphere_tables(atmosphere: Atmosphere, *, tolerance: float = 2e-3, max_orders: int = 40) -> AtmosphereTables:
+def atmosphere_tables(atmosphere: Atmosphere, *, tolerance: float = 0.02, max_orders: int = 40) -> AtmosphereTables:
     """Tabulate an atmosphere; some seconds, once for all times and places.
 
     Parameters
     ----------
     tolerance
-        Orders are added until what is left of them, as a geometric series, falls below this share of the light; the
-        series' rest is added in closed form.
+        Orders are added until what is left of them, as a geometric series, falls below this share of the light
+        everywhere; the series' rest is then added in closed form.
     max_orders
         Stop there in any case.
     """
@@ -343,34 +346,39 @@ def atmosphere_tables(atmosphere: Atmosphere, *, tolerance: float = 2e-3, max_or
     levels = [_level(atmosphere, scaled, h) for h in table_heights_m(atmosphere)]
     albedo = np.broadcast_to(np.asarray(atmosphere.ground_albedo, float), WAVELENGTHS_NM.shape) / np.pi
     sun = np.radians(SUN_ELEVATION_KNOTS_DEG)
-    direct = sun_transfer(atmosphere, columns, scaled, atmosphere.ground_height_m, sun)
+    direct = sun_transfer(atmosphere, columns, scaled, np.full(sun.shape, atmosphere.ground_height_m), sun)
     leaving = direct * np.maximum(np.sin(sun), 0.0)[:, None] * albedo
-    total, total_ground, current = 0.0, 0.0, None
-    for order in range(1, max_orders + 1):
-        values, ground = [], None
-        for level in levels:
-            if order == 1:
-                radiance = _first_radiance(atmosphere, scaled, columns, level)
-            else:
-                source = diffuse_source(atmosphere, scaled, current, level.samples, level.geometry)
-                radiance = np.einsum("ksb,ksqb->kqb", level.samples.weight, source)
-            radiance = radiance + _from_ground(level, leaving)
-            values.append(_project(level, radiance))
-            if ground is None:
-                ground = _irradiance(level, radiance)
-        values = np.stack(values)
+    radiances = [_first_radiance(atmosphere, scaled, columns, level) for level in levels]
+    values, ground = _gathered(levels, radiances, leaving)
+    total, total_ground = values, ground
+    for _ in range(1, max_orders):
+        before, moments, leaving = values[:, :, 0, 0], as_moments(values, ground), ground * albedo
+        radiances = (_next_radiance(atmosphere, scaled, moments, level) for level in levels)
+        values, ground = _gathered(levels, radiances, leaving)
         total, total_ground = total + values, total_ground + ground
-        if order > 1:
-            # Later orders keep their shape and fall geometrically, band by band.
-            decay = np.clip(values[:, :, 0] / np.maximum(current_mean, _DARK), 0.0, 0.98)
-            rest = decay / (1.0 - decay)
-            if (rest * values[:, :, 0] < tolerance * total[:, :, 0] + _DARK).all():
-                total = total + rest[:, :, None] * values
-                total_ground = total_ground + rest[0] * ground
-                break
-        current, current_mean = as_moments(values, ground), values[:, :, 0]
-        leaving = ground * albedo
-    return AtmosphereTables(atmosphere, columns, as_moments(total, total_ground))
+        # Later orders keep their shape and fall geometrically, band by band.
+        decay = np.clip(values[:, :, 0, 0] / np.maximum(before, _DARK), 0.0, 0.98)
+        rest = decay / (1.0 - decay)
+        if (rest * values[:, :, 0, 0] < tolerance * total[:, :, 0, 0] + _DARK).all():
+            break
+    total = total + rest[:, :, None, None] * values
+    return AtmosphereTables(atmosphere, columns, as_moments(total, total_ground + rest[0] * ground))
+
+
+def _gathered(levels: list[_Level], radiances, leaving: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """One order's moments ``(P, J, L, L, B)`` and ground irradiance ``(J, B)``, the ground's own light added."""
+    values, ground = [], None
+    for level, radiance in zip(levels, radiances, strict=True):
+        radiance = radiance + _from_ground(level, leaving)
+        values.append(_project(level, radiance))
+        ground = _irradiance(level, radiance) if ground is None else ground
+    return np.stack(values), ground
+
+
+def _next_radiance(atmosphere: Atmosphere, scaled: Optics, moments: Moments, level: _Level) -> np.ndarray:
+    """Light of one more order ``(K, Q, B)`` [1/sr] along a level's rays."""
+    source = diffuse_source(atmosphere, scaled, moments, level.samples, level.geometry)
+    return np.einsum("ksb,ksqb->kqb", level.samples.weight, source)
 
 
 def _from_ground(level: _Level, leaving: np.ndarray) -> np.ndarray:
