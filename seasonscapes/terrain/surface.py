@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import json
 import os
-import zipfile
-from dataclasses import astuple, dataclass, field
+from dataclasses import dataclass, field
 
 import numpy as np
 from affine import Affine
 
 from seasonscapes.frames import LocalFrame
-from seasonscapes.images import atomic_path
 
 
 @dataclass(frozen=True)
@@ -115,35 +113,3 @@ def sample_texture(values: np.ndarray, uv: np.ndarray) -> np.ndarray:
     top = values[row0, column0] * (1.0 - fx) + values[row0, column1] * fx
     bottom = values[row1, column0] * (1.0 - fx) + values[row1, column1] * fx
     return np.where(known[..., None], top * (1.0 - fy) + bottom * fy, np.nan).astype(np.float32)
-
-
-def save_terrain(path: str | os.PathLike, terrain: Terrain) -> None:
-    """Write a terrain to one ``.npz`` file, atomically."""
-    frame = np.array(astuple(terrain.frame), np.float64)
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        np.savez(file, vertices=terrain.vertices, faces=terrain.faces, uv=terrain.uv, frame=frame)
-
-
-def load_terrain(path: str | os.PathLike) -> Terrain:
-    """Read what `save_terrain` wrote; `FileNotFoundError`, or `ValueError` for anything else."""
-    arrays = _load_arrays(path, ("vertices", "faces", "uv", "frame"))
-    return Terrain(arrays["vertices"], arrays["faces"], arrays["uv"], LocalFrame(*arrays["frame"].tolist()))
-
-
-def save_texture(path: str | os.PathLike, texture: Texture) -> None:
-    """Write a texture to one ``.npz`` file, atomically."""
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        np.savez(file, values=texture.values, weight=texture.weight)
-
-
-def load_texture(path: str | os.PathLike) -> Texture:
-    """Read what `save_texture` wrote; `FileNotFoundError`, or `ValueError` for anything else."""
-    return Texture(**_load_arrays(path, ("values", "weight")))
-
-
-def _load_arrays(path: str | os.PathLike, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in names}
-    except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path}: not a file of {', '.join(names)} ({error})") from None
