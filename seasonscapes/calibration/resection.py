@@ -360,7 +360,8 @@ def _refuse_no_agreement(problem: Problem, chosen: np.ndarray, error: np.ndarray
     needed = max(3, int(np.ceil(_unknowns_from_data(problem) / 2)))
     limit = 0.04 * problem.start.width_px
     if problem.extra is None and (chosen.sum() < needed or np.median(error) > limit):
-        raise ValueError(f"the matches have no pose in common: {int(chosen.sum())} of {len(chosen)} agree, median error "
+        agree = f"{int(chosen.sum())} of {len(chosen)} agree"
+        raise ValueError(f"the matches have no pose in common: {agree}, median error "
                          f"{np.median(error):.0f} px; check their pairing and the camera's position")  # fmt: skip
 
 
@@ -398,14 +399,6 @@ def _covariance(problem: Problem, jacobian: np.ndarray) -> np.ndarray:
         raise ValueError(f"the evidence leaves {worst} open; add points elsewhere in the picture, or give it a prior")
     covariance = np.zeros((8, 8))
     covariance[np.ix_(free, free)] = np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
-    if len(problem.points):
-        # A position less certain than the farthest point is away says nothing.
-        reach = np.linalg.norm(problem.points.position_m - problem.origin[3:6], axis=1).max()
-        vague = np.flatnonzero(np.sqrt(np.diag(covariance)[3:6]) > reach)
-        if len(vague):
-            raise ValueError(
-                f"the evidence leaves {PARAMETERS[3 + vague[0]]} open; add near points, or give it a prior"
-            )
     return covariance
 
 
