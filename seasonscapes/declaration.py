@@ -52,10 +52,12 @@ def validate(table: dict, model: type[Model], *, where: str | Path) -> Model:
     try:
         return model.model_validate(table)
     except ValidationError as error:
-        raise _input_error(error.errors()[0], model, table, where) from None
+        # A misspelt key shows up twice, as unknown and as missing; the unknown one can name its cure.
+        errors = sorted(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
+        raise _input_error(errors[0], model, where) from None
 
 
-def _input_error(first: dict, model: type[BaseModel], table: dict, where: str | Path) -> InputError:
+def _input_error(first: dict, model: type[BaseModel], where: str | Path) -> InputError:
     location = [part for part in first["loc"] if not (isinstance(part, str) and part.startswith("function-"))]
     key = ".".join(f"[{part}]" if isinstance(part, int) else str(part) for part in location).replace(".[", "[")
     at = f"{where}: {key}" if key else f"{where}"

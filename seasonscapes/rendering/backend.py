@@ -116,8 +116,7 @@ def choose_backend(device: str = "auto") -> Backend:
     InputError
         When a device is asked for by name and cannot work here.
     """
-    if device not in ("auto", *VARIANTS):
-        raise InputError("--device", "unknown device", got=device, expected="auto, cuda, llvm or scalar")
+    _check_name(device)
     gpus = cuda_devices()
     if device == "cuda" and gpus == 0:
         raise InputError("--device", "no CUDA device found", got="cuda", cure="use --device llvm, or auto")
@@ -135,6 +134,11 @@ def choose_backend(device: str = "auto") -> Backend:
     return Backend("scalar", VARIANTS["scalar"], f"{problem}; slower, and nothing that needs gradients works", library)
 
 
+def _check_name(device: str) -> None:
+    if device not in ("auto", *VARIANTS):
+        raise InputError("--device", "unknown device", got=device, expected="auto, cuda, llvm or scalar")
+
+
 _active: Backend | None = None
 
 
@@ -150,6 +154,7 @@ def use_backend(device: str | None = None, *, gradients: bool = False) -> Backen
         device was already set in this process.
     """
     global _active
+    _check_name(device or "auto")
     if _active is None:
         chosen = choose_backend(device or os.environ.get("SEASONSCAPES_DEVICE", "auto"))
         if chosen.device == "llvm" and chosen.library is not None:
