@@ -58,7 +58,7 @@ def alpine_massif(*, seed: int = 1912, size_m: float = 12000.0, spacing_m: float
     size_m
         Side of the square between the outermost cell centres [m].
     spacing_m
-        Cell size [m]: 15, 30, 60 or 120. Coarser ones are the same mountains with less detail.
+        Cell size [m]: 15, 30 or 60. Coarser ones are the same mountains with less detail.
 
     Raises
     ------
@@ -68,8 +68,8 @@ def alpine_massif(*, seed: int = 1912, size_m: float = 12000.0, spacing_m: float
     from affine import Affine
     from pyproj import Transformer
 
-    if spacing_m not in (15.0, 30.0, 60.0, 120.0):
-        raise ValueError(f"spacing_m: got {spacing_m}, expected 15, 30, 60 or 120")
+    if spacing_m not in (15.0, 30.0, 60.0):
+        raise ValueError(f"spacing_m: got {spacing_m}, expected 15, 30 or 60")
     if not 2000.0 <= size_m <= 12000.0 or size_m % (2.0 * spacing_m):
         raise ValueError(f"size_m: got {size_m}, expected 2000 to 12000 and an even number of cells of {spacing_m} m")
     shape = relief(size_m / 2.0, spacing_m, seed)

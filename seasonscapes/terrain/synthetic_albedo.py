@@ -174,7 +174,9 @@ def _texture(albedo, cover, z, grain, broad, position, seed) -> None:
     albedo *= np.exp(rusty * np.array([1.0, 0.0, -1.0], np.float32))
     field = cover == Cover.FIELD
     if field.any():
-        plots = np.sign(spline_noise(seed + 421, 260.0, east, north)) + np.sign(spline_noise(seed + 422, 190.0, east, north))
+        plots = np.sign(spline_noise(seed + 421, 260.0, east, north)) + np.sign(
+            spline_noise(seed + 422, 190.0, east, north)
+        )
         albedo[field] *= np.exp(0.16 * plots[field])[:, None]
 
 

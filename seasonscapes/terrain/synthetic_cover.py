@@ -52,15 +52,17 @@ def ground_cover(relief: Relief, spacing_m: float, seed: int, east_m: np.ndarray
     cover[forest & (z < 1150.0 + 150.0 * large) & (small + 0.5 * large - north > 0.1)] = Cover.BROADLEAF
     cover[forest & (z > tree_line - 330.0 - 80.0 * small) & (small - 0.3 * large > -0.2)] = Cover.LARCH
     cover[(z > tree_line - 60.0) & (z < tree_line + 230.0) & (dense + 0.4 * small > 0.4)] = Cover.SHRUB
-    flat = (slope < 5.0) & (z < 1100.0) & (relief.shore_m > 40.0)
+    flat = (slope < 5.0) & (z < 1100.0) & (relief.floor.shore_m > 40.0)
     cover[flat & (large + 0.4 * small > -0.5)] = Cover.FIELD
     bare = (z - 2380.0 - 170.0 * large - 110.0 * small + 120.0 * north) / 250.0 + np.maximum(slope - 33.0, 0.0) / 6.0
     loose = (bare > 0.0) & (z > 1750.0)
     cover[loose] = Cover.SCREE
-    rocky = (slope - 42.0 - 3.5 * small) / 4.0 - np.clip(relative, -30.0, 30.0) / 25.0 + np.maximum(z - 2700.0, 0.0) / 900.0
+    rocky = (
+        (slope - 42.0 - 3.5 * small) / 4.0 - np.clip(relative, -30.0, 30.0) / 25.0 + np.maximum(z - 2700.0, 0.0) / 900.0
+    )
     cover[(rocky > 0.0) & (loose | (slope > 46.0 + 3.0 * small))] = Cover.ROCK
     firn = (z > 3080.0 - 260.0 * north + 70.0 * large + 60.0 * small) & (slope < 47.0 + 4.0 * small)
     cover[relief.ice_m > 0.0] = Cover.ICE
     cover[firn & ((relief.ice_m > 0.0) | (z > 3200.0))] = Cover.FIRN
-    cover[relief.shore_m < 0.0] = Cover.WATER
+    cover[relief.floor.shore_m < 0.0] = Cover.WATER
     return cover

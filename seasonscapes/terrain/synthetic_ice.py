@@ -21,7 +21,7 @@ def grow_ice(bed: np.ndarray, spacing_m: float, equilibrium_m: np.ndarray, *, ro
     holds = np.clip((1.1 - np.hypot(*np.gradient(bed, spacing_m))) / 0.45, 0.0, 1.0)
     for _ in range(rounds):
         surface = bed + thickness
-        balance = np.clip(0.009 * (surface - equilibrium_m), -14.0, 1.3)
+        balance = np.clip(0.010 * (surface - equilibrium_m), -16.0, 1.2)
         balance = np.where(balance > 0.0, balance * holds, balance)
         down = (surface[1:] - surface[:-1]) / spacing_m
         right = (surface[:, 1:] - surface[:, :-1]) / spacing_m
@@ -31,7 +31,10 @@ def grow_ice(bed: np.ndarray, spacing_m: float, equilibrium_m: np.ndarray, *, ro
         diffusivity = np.pad(np.float32(_FLUIDITY) * ice**5 * np.minimum(steep, 0.3), 1)
         across_rows = 0.5 * (diffusivity[1:-1, 1:] + diffusivity[1:-1, :-1])
         across_columns = 0.5 * (diffusivity[1:, 1:-1] + diffusivity[:-1, 1:-1])
-        flux_down, flux_right = np.pad(across_rows * down, ((1, 1), (0, 0))), np.pad(across_columns * right, ((0, 0), (1, 1)))
+        flux_down, flux_right = (
+            np.pad(across_rows * down, ((1, 1), (0, 0))),
+            np.pad(across_columns * right, ((0, 0), (1, 1))),
+        )
         change = (np.diff(flux_down, axis=0) + np.diff(flux_right, axis=1)) / spacing_m
         stiffness = diffusivity[1:, 1:] + diffusivity[1:, :-1] + diffusivity[:-1, 1:] + diffusivity[:-1, :-1]
         step = np.minimum(0.16 * spacing_m**2 / (stiffness + 1.0), 10.0)

@@ -1,0 +1,173 @@
+"""The plan of the synthetic massif: where its crests and valleys run, before anything has carved them.
+
+The composition is that of the Bernese Alps, drawn by hand: a main crest with three summits and a north wall above
+alpine benches, a deep valley with a lake along its foot, a trough from the south-west, névé basins in the south.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from seasonscapes.terrain.flow import Lattice
+from seasonscapes.terrain.noise import warped_noise
+
+LAKE_LEVEL_M = 566.0
+
+# Knots (east km, north km, elevation m) about the massif's centre.
+_CRESTS = (
+    # The main crest from the west-south-west, three summits, and the north-east arête.
+    ((-3.5, -4.3, 3050), (-2.6, -3.2, 4010), (-1.9, -2.7, 3500), (-0.7, -1.95, 4140), (0.3, -1.55, 3640),
+     (1.5, -0.75, 4020), (2.3, -0.2, 3350), (3.2, 0.35, 2600), (3.9, 0.85, 1900)),
+    ((-2.6, -3.2, 4010), (-2.5, -4.6, 3720), (-1.7, -5.7, 3560), (-1.1, -7.5, 3300)),
+    ((-2.5, -4.6, 3720), (-1.4, -4.4, 3480), (-0.7, -4.75, 3200)),
+    ((-0.7, -1.95, 4140), (-0.5, -2.8, 3640), (-0.2, -3.7, 3380)),
+    ((1.5, -0.75, 4020), (2.2, -1.9, 3520), (2.9, -3.3, 3740), (4.3, -4.2, 4000), (5.2, -5.6, 3500), (5.6, -7.5, 3200)),
+    ((2.9, -3.3, 3740), (2.3, -4.3, 3560), (2.0, -5.3, 3300), (1.9, -6.3, 2950)),
+    ((4.3, -4.2, 4000), (5.6, -3.0, 3560), (6.0, -1.5, 3660), (6.1, -0.1, 2900), (5.7, 0.9, 2000)),
+    # The spur with the meadow summit north of the wall.
+    ((0.3, -1.55, 3640), (0.1, -0.9, 2900), (-0.3, 0.0, 2120), (-1.0, 0.75, 2480), (-1.5, 1.5, 2240), (-1.9, 2.0, 1700)),
+    # Beyond the trough in the west, and beyond the lake in the north.
+    ((-7.5, -4.0, 2900), (-6.3, -2.2, 2780), (-6.0, -0.2, 2500), (-5.9, 1.2, 2300), (-5.6, 2.2, 1500)),
+    ((-7.5, 6.2, 1900), (-4.5, 6.3, 2020), (-2.0, 5.7, 2280), (0.4, 5.9, 2450), (2.4, 5.4, 2640), (4.8, 5.6, 2560),
+     (7.5, 5.0, 2700)),
+)  # fmt: skip
+_VALLEYS = (
+    # The main valley with the lake, then the trough that joins it.
+    ((7.5, 1.5, 1120), (5.4, 1.75, 1000), (3.6, 2.0, 820), (2.0, 2.45, 660), (1.0, 2.7, 590), (-0.6, 3.1, 566),
+     (-2.6, 3.35, 565), (-4.6, 3.5, 564), (-6.0, 3.9, 562), (-7.5, 4.3, 560)),
+    ((-4.2, 3.4, 566), (-4.1, 2.0, 640), (-4.25, 0.2, 740), (-4.5, -1.6, 860), (-4.6, -3.4, 1150), (-4.9, -4.9, 1750),
+     (-5.5, -7.5, 2500)),
+    # Névé basins and their glaciers.
+    ((-1.5, -3.4, 3280), (-0.7, -4.0, 3040), (0.3, -4.8, 2740), (1.0, -5.9, 2480), (1.4, -7.5, 2250)),
+    ((1.1, -2.1, 3200), (1.1, -3.2, 2960), (0.7, -4.6, 2720)),
+    ((3.3, -4.5, 3150), (2.9, -5.4, 2800), (2.4, -7.5, 2250)),
+    ((4.2, -2.9, 3150), (4.1, -1.9, 2700), (4.3, -0.7, 1950), (4.5, 0.5, 1250), (4.6, 1.7, 940)),
+    ((6.3, -4.3, 2700), (6.8, -6.0, 2200), (7.5, -7.5, 1900)),
+    ((7.2, -1.5, 2100), (7.4, 0.5, 1500), (7.5, 1.5, 1120)),
+    # The foot of the north wall, its benches and the ravines below them.
+    ((-2.6, -1.9, 2200), (-1.6, -1.1, 2120), (-0.7, -0.6, 2200)),
+    ((0.5, 0.0, 2130), (1.4, 0.5, 1920), (2.4, 1.0, 1600), (3.1, 1.4, 1250)),
+    ((0.6, 0.1, 2050), (0.9, 1.2, 1550), (1.4, 2.3, 700)),
+    ((-1.6, -1.1, 2050), (-2.6, 0.3, 1650), (-3.8, 0.9, 760)),
+    ((-3.5, -2.3, 1850), (-3.3, -1.2, 1720)),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Crest, valley and main valley points ``(P, 3)`` [m] about the centre, and the seed of the warp that bends their lines."""
+
+    crests: np.ndarray
+    valleys: np.ndarray
+    trunk: np.ndarray
+    seed: int
+
+
+def plan_of(seed: int) -> Plan:
+    """The plan with its knots moved a little by the seed."""
+    rng = np.random.default_rng(seed)
+    moved: dict[tuple, np.ndarray] = {}
+
+    def points_along(lines) -> np.ndarray:
+        points = []
+        for line in lines:
+            for knot in line:
+                if knot not in moved:
+                    # The lowest floors keep their heights: they hold the lake.
+                    shift = rng.uniform(-1.0, 1.0, 3) * (90.0, 90.0, 25.0 if knot[2] > 1300 else 0.0)
+                    moved[knot] = np.array([knot[0] * 1000.0, knot[1] * 1000.0, knot[2]]) + shift
+            knots = np.array([moved[knot] for knot in line])
+            along = np.append(0.0, np.cumsum(np.hypot(*np.diff(knots[:, :2], axis=0).T)))
+            at = np.arange(0.0, along[-1], 50.0)
+            points.append(np.stack([np.interp(at, along, knots[:, k]) for k in range(3)], -1))
+        return np.concatenate(points)
+
+    return Plan(points_along(_CRESTS), points_along(_VALLEYS), points_along(_VALLEYS[:1]), seed)
+
+
+def warped(lattice: Lattice, seed: int) -> Lattice:
+    """The lattice seen through a smooth random displacement."""
+    east, north = lattice.east_m, lattice.north_m
+    for octave, (wavelength, reach) in enumerate(((2600.0, 170.0), (1300.0, 110.0), (650.0, 60.0), (330.0, 30.0))):
+        shift = [warped_noise(seed + 11 + 2 * octave + k, wavelength, lattice.east_m, lattice.north_m) for k in (0, 1)]
+        east, north = east + reach * shift[0], north + reach * shift[1]
+    return Lattice(east, north, lattice.spacing_m)
+
+
+def _spread(points: np.ndarray, values: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Inverse-distance mean of values at points, and the distance to the nearest point [m]."""
+    distance, index = cKDTree(points[:, :2]).query(position, k=40)
+    weight = 1.0 / (distance + 20.0) ** 3
+    return (weight * values[index]).sum(-1) / weight.sum(-1), distance[..., 0]
+
+
+def sketched_heights(plan: Plan, lattice: Lattice) -> np.ndarray:
+    """Heights ``(H, W)`` [m] between the lines: valleys rise to crests along a hollow curve."""
+    bent = warped(lattice, plan.seed)
+    position = np.stack([bent.east_m, bent.north_m], -1)
+    low, to_valley = _spread(plan.valleys, plan.valleys[:, 2], position)
+    high, to_crest = _spread(plan.crests, plan.crests[:, 2], position)
+    share = to_valley / (to_valley + to_crest + 1e-3)
+    return low + (high - low) * (0.45 * share + 0.55 * share**2)
+
+
+def anchored(z: np.ndarray, lattice: Lattice, plan: Plan) -> np.ndarray:
+    """Bring crests back up and valleys back down to the plan's heights by a smooth correction."""
+    spacing = lattice.spacing_m
+    bent = warped(lattice, plan.seed)
+    position = np.stack([bent.east_m, bent.north_m], -1)
+    tree = cKDTree(position.reshape(-1, 2))
+    size = 2 * round(150.0 / spacing) + 1
+    reach = (z.shape[0] - 1) // 2 * spacing
+    corrections = []
+    for points, extreme in ((plan.valleys, ndimage.minimum_filter), (plan.crests, ndimage.maximum_filter)):
+        inside = np.abs(points[:, :2]).max(axis=1) < reach - 200.0
+        at = tree.query(points[inside, :2])[1]
+        error = points[inside, 2] - extreme(z, size).ravel()[at]
+        corrections.append(_spread(points[inside], error, position))
+    (low, to_valley), (high, to_crest) = corrections
+    share = to_valley / (to_valley + to_crest + 1e-3)
+    correction = (low + (high - low) * share).astype(np.float32)
+    return z + cv2.GaussianBlur(correction, (0, 0), 120.0 / spacing, borderType=cv2.BORDER_REPLICATE)
+
+
+@dataclass(frozen=True)
+class ValleyFloor:
+    """The flat ground of the main valleys.
+
+    Parameters
+    ----------
+    height
+        Of the nearest stretch of floor ``(H, W)`` [m].
+    beyond_m
+        Horizontal distance to the floor's edge, negative on the floor [m].
+    shore_m
+        Horizontal distance to the lake's shore, negative on the water [m]; rough beyond a few hundred metres.
+    """
+
+    height: np.ndarray
+    beyond_m: np.ndarray
+    shore_m: np.ndarray
+
+
+def valley_floor(plan: Plan, lattice: Lattice) -> ValleyFloor:
+    """Floors and lake on a lattice; they hang on the plan alone, so every spacing sees the same shore."""
+    bent = warped(lattice, plan.seed)
+    points = plan.valleys[plan.valleys[:, 2] < 1010.0]
+    distance, index = cKDTree(points[:, :2]).query(np.stack([bent.east_m, bent.north_m], -1), k=12)
+    weight = 1.0 / (distance + 60.0) ** 3
+    height = (weight * points[index, 2]).sum(-1) / weight.sum(-1)
+    half_width = np.interp(height, [560.0, 580.0, 700.0, 1010.0], [450.0, 420.0, 230.0, 40.0])
+    bays = sum(a * warped_noise(plan.seed + 71 + k, w, lattice.east_m, lattice.north_m)
+               for k, (w, a) in enumerate(((900.0, 60.0), (350.0, 30.0), (140.0, 12.0))))  # fmt: skip
+    beyond = distance[..., 0] - half_width
+    # The lake fills the main valley's floor between two deltas; its ends are round.
+    position = np.stack([bent.east_m, bent.north_m], -1)
+    to_trunk = cKDTree(plan.trunk[:, :2]).query(position)[0]
+    shore = to_trunk - 370.0 + 0.6 * bays + 330.0 * ((bent.east_m + 1700.0) / 2500.0) ** 6
+    return ValleyFloor(height, beyond + 0.5 * bays, np.clip(shore, -500.0, 3000.0))
