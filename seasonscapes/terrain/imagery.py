@@ -13,7 +13,8 @@ from seasonscapes.declaration import InputError
 from seasonscapes.frames import LocalFrame, geodetic_from_enu
 from seasonscapes.images import linear_from_srgb
 from seasonscapes.terrain.atlas import Atlas
-from seasonscapes.terrain.raster import map_from_geodetic, read_raster
+from seasonscapes.terrain.crs import raster_pixels
+from seasonscapes.terrain.raster import read_raster
 from seasonscapes.terrain.surface import Raster, Terrain, Texture
 from seasonscapes.terrain.texels import texel_coordinates, texel_positions
 
@@ -115,7 +116,7 @@ def bake_imagery(terrain: Terrain, atlas: Atlas, image: Raster, *, gutter_px: in
 def image_pixels(frame: LocalFrame, image: Raster, positions: np.ndarray) -> np.ndarray:
     """Column and row ``(N, 2)`` in a raster (0.5 at the first pixel's centre) of positions ``(N, 3)`` [m], exactly."""
     latitude, longitude, _ = geodetic_from_enu(frame, positions)
-    return np.stack(~image.transform * map_from_geodetic(image.crs, latitude, longitude), axis=-1)
+    return raster_pixels(image, latitude, longitude)
 
 
 def _pixel_map(terrain: Terrain, image: Raster) -> Callable[[np.ndarray], np.ndarray]:

@@ -13,8 +13,8 @@ import numpy as np
 
 from seasonscapes.frames import LocalFrame, enu_from_geodetic, geodetic_from_enu
 from seasonscapes.terrain.atlas import planar_uv
+from seasonscapes.terrain.crs import apply_affine, geodetic_from_map, raster_pixels
 from seasonscapes.terrain.poisson import largest_piece, poisson_surface
-from seasonscapes.terrain.raster import geodetic_from_map, map_from_geodetic
 from seasonscapes.terrain.surface import Raster, Terrain
 from seasonscapes.terrain.texels import covering_faces
 
@@ -91,7 +91,7 @@ def build_mesh(raster: Raster, frame: LocalFrame, *, mesher: str = "adaptive",
 
 def sample_positions(raster: Raster, frame: LocalFrame, row, column, height_m) -> np.ndarray:
     """East, north, up ``(N, 3)`` float64 [m] of points at pixel-centre indices ``(N,)`` with given heights ``(N,)``."""
-    x, y = raster.transform * (np.asarray(column, float) + 0.5, np.asarray(row, float) + 0.5)
+    x, y = apply_affine(raster.transform, np.asarray(column) + 0.5, np.asarray(row) + 0.5)
     latitude, longitude = geodetic_from_map(raster.crs, x, y)
     return enu_from_geodetic(frame, latitude, longitude, height_m)
 
@@ -219,7 +219,7 @@ def _pixel_coordinates(vertices: np.ndarray, frame: LocalFrame, raster: Raster) 
     for first in range(0, len(pixel), _CHUNK):
         part = slice(first, first + _CHUNK)
         latitude, longitude, _ = geodetic_from_enu(frame, vertices[part])
-        pixel[part] = np.stack(~raster.transform * map_from_geodetic(raster.crs, latitude, longitude), axis=-1)
+        pixel[part] = raster_pixels(raster, latitude, longitude)
     return pixel
 
 

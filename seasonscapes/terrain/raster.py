@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 import warnings
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,8 @@ from affine import Affine
 
 from seasonscapes.declaration import InputError
 from seasonscapes.frames import LocalFrame
+from seasonscapes.terrain.crs import apply_affine, geodetic_from_map, horizontal_crs, map_from_geodetic
+from seasonscapes.terrain.holes import harmonic_fill, nan_mean
 from seasonscapes.terrain.surface import Raster
 
 # From the shore of the Dead Sea (-430 m) to above Mount Everest (8,849 m). Feet, centimetres, unmarked nodata and
@@ -126,7 +127,7 @@ def read_raster(path: str | os.PathLike, *, bounds_deg: tuple[float, float, floa
                 bands = _checked_bands(source, bands, path)
                 window = _window(source, crs, bounds_deg, path)
                 values = _read_blocks(source, bands, window, shrink)
-                transform = source.window_transform(window) * Affine.scale(shrink)
+                transform = _window_transform(source.transform, window, shrink)
     except RasterioError as error:
         raise InputError(path, f"not readable as a raster: {error}") from None
     return Raster(values, transform, crs)
@@ -139,11 +140,11 @@ def _checked_crs(source, path) -> str:
         raise InputError(path, "the raster has a CRS but no placement on the map (geotransform)",
                          cure="write one with: gdal_edit.py -a_ullr … FILE")  # fmt: skip
     text = source.crs.to_string()
-    corners = np.array([source.transform * corner for corner in
-                        ((0, 0), (source.width, 0), (0, source.height), (source.width, source.height))])  # fmt: skip
+    width, height = source.width, source.height
+    corners = np.stack(apply_affine(source.transform, [0, width, 0, width], [0, 0, height, height]), axis=-1)
     extent = f"x {corners[:, 0].min():g} … {corners[:, 0].max():g}, y {corners[:, 1].min():g} … {corners[:, 1].max():g}"
     pixel = max(abs(source.transform.a), abs(source.transform.b), abs(source.transform.d), abs(source.transform.e))
-    crs = _horizontal(text)
+    crs = horizontal_crs(text)
     if crs.is_geographic:
         # 0…360° longitudes are in use; half a pixel past the pole is how .hgt grids lie.
         low, high = corners.min(0), corners.max(0)
@@ -182,7 +183,7 @@ def _window(source, crs: str, bounds_deg, path):
         return Window(0, 0, source.width, source.height)
     longitude, latitude = _boundary(*_checked_bounds(bounds_deg))
     x, y = map_from_geodetic(crs, latitude, longitude)
-    column, row = ~source.transform * (x, y)
+    column, row = apply_affine(~source.transform, x, y)
     # Outward to whole pixels, and one pixel more so that bilinear interpolation reaches the bounds.
     left, right = int(np.floor(column.min())) - 1, int(np.ceil(column.max())) + 1
     top, bottom = int(np.floor(row.min())) - 1, int(np.ceil(row.max())) + 1
@@ -200,6 +201,12 @@ def _checked_bounds(bounds_deg) -> tuple[float, float, float, float]:
     if not (west < east and -90.0 <= south < north <= 90.0):
         raise ValueError(f"bounds_deg: got {bounds_deg}, expected west < east and south < north in degrees")
     return west, south, east, north
+
+
+def _window_transform(transform: Affine, window, shrink: int) -> Affine:
+    a, b, _, d, e, _ = tuple(transform)[:6]
+    x, y = apply_affine(transform, window.col_off, window.row_off)
+    return Affine(a * shrink, b * shrink, float(x), d * shrink, e * shrink, float(y))
 
 
 def _read_blocks(source, bands, window, shrink) -> np.ndarray:
@@ -221,63 +228,12 @@ def _read_blocks(source, bands, window, shrink) -> np.ndarray:
             block[:, source.read(alpha, window=part) == 0] = np.nan
         block = block.transpose(1, 2, 0) * scale + offset
         if shrink > 1:
-            block = _nan_mean(block.reshape(rows, shrink, width, shrink, len(bands)), axes=(1, 3))
+            block = nan_mean(block.reshape(rows, shrink, width, shrink, len(bands)), axes=(1, 3))
         values[row : row + rows] = block
     return values
 
 
-def _nan_mean(values: np.ndarray, axes) -> np.ndarray:
-    known = np.isfinite(values)
-    count = known.sum(axis=axes)
-    total = np.where(known, values, 0.0).sum(axis=axes)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
-
-
-# ---------------------------------------------------------------------------------------------- map and WGS 84
-
-
-@lru_cache(maxsize=64)
-def _horizontal(crs: str):
-    """The horizontal part of a CRS: vertical parts must never move a height."""
-    from pyproj import CRS
-    from pyproj.exceptions import CRSError
-
-    try:
-        parsed = CRS.from_user_input(crs)
-    except CRSError:
-        raise InputError(crs, "not a coordinate reference system", expected="EPSG:n or WKT") from None
-    if parsed.is_compound:
-        parsed = parsed.sub_crs_list[0]
-    parsed = parsed.to_2d()
-    if not (parsed.is_geographic or parsed.is_projected):
-        raise InputError(crs, "a CRS that is not tied to the Earth", expected="a geographic or projected CRS")
-    return parsed
-
-
-@lru_cache(maxsize=64)
-def _transformer(crs: str):
-    from pyproj import Transformer
-    from pyproj.exceptions import ProjError
-
-    try:
-        # A ballpark transformation ignores the datum shift (about 100 m in Switzerland), silently.
-        return Transformer.from_crs(_horizontal(crs), "EPSG:4326", always_xy=True, allow_ballpark=False)
-    except ProjError as error:
-        raise InputError(crs, f"no accurate transformation to WGS 84: {error}") from None
-
-
-def geodetic_from_map(crs: str, x, y) -> tuple[np.ndarray, np.ndarray]:
-    """WGS 84 latitude and longitude [deg] of map coordinates ``(...)``; infinite where the projection has no answer."""
-    longitude, latitude = _transformer(crs).transform(np.asarray(x, float), np.asarray(y, float))
-    return np.asarray(latitude), np.asarray(longitude)
-
-
-def map_from_geodetic(crs: str, latitude_deg, longitude_deg) -> tuple[np.ndarray, np.ndarray]:
-    """Map coordinates x and y ``(...)`` of WGS 84 positions; infinite where the projection has no answer."""
-    x, y = _transformer(crs).transform(
-        np.asarray(longitude_deg, float), np.asarray(latitude_deg, float), direction="INVERSE"
-    )
-    return np.asarray(x), np.asarray(y)
+# ---------------------------------------------------------------------------------------------- extent
 
 
 def _boundary(west, south, east, north, steps: int = 33) -> tuple[np.ndarray, np.ndarray]:
@@ -289,7 +245,7 @@ def _boundary(west, south, east, north, steps: int = 33) -> tuple[np.ndarray, np
 
 
 def _bounds_deg(crs, transform, width, height) -> tuple[float, float, float, float]:
-    latitude, longitude = geodetic_from_map(crs, *(transform * _boundary(0.0, 0.0, float(width), float(height))))
+    latitude, longitude = geodetic_from_map(crs, *apply_affine(transform, *_boundary(0.0, 0.0, width, height)))
     if not (np.isfinite(latitude).all() and np.isfinite(longitude).all()):
         raise InputError(crs, "the raster's edge lies outside the area of its CRS", cure="the CRS is probably wrong")
     return float(longitude.min()), float(latitude.min()), float(longitude.max()), float(latitude.max())
@@ -304,7 +260,7 @@ def bounds_geographic(raster: Raster) -> tuple[float, float, float, float]:
 def centre_frame(raster: Raster, *, height_m: float = 0.0, refraction_k: float = 0.0) -> LocalFrame:
     """A `LocalFrame` whose origin is the middle of the raster."""
     height, width = raster.values.shape[:2]
-    latitude, longitude = geodetic_from_map(raster.crs, *(raster.transform * (width / 2.0, height / 2.0)))
+    latitude, longitude = geodetic_from_map(raster.crs, *apply_affine(raster.transform, width / 2.0, height / 2.0))
     return LocalFrame(float(latitude), float(longitude), height_m, refraction_k)
 
 
@@ -330,7 +286,7 @@ def sample_raster(raster: Raster, x, y) -> np.ndarray:
     centres and the edge repeats the outermost values.
     """
     height, width = raster.values.shape[:2]
-    column, row = ~raster.transform * (np.asarray(x, float), np.asarray(y, float))
+    column, row = apply_affine(~raster.transform, x, y)
     with np.errstate(invalid="ignore"):
         inside = (column >= 0.0) & (column <= width) & (row >= 0.0) & (row <= height)
     column = np.clip(np.where(inside, column, 0.0) - 0.5, 0.0, width - 1.0)
@@ -380,51 +336,5 @@ def fill_nodata(raster: Raster, *, max_share: float = DEFAULT_MAX_HOLE_SHARE,
                          expected=f"at most {100 * max_share:g} %", cure="choose another area or raster")  # fmt: skip
     labels, holes = ndimage.label(hole, structure=np.ones((3, 3), int))
     largest = int(np.bincount(labels.ravel())[1:].max())
-    values = np.stack([_harmonic_fill(raster.values[..., c], hole) for c in range(raster.values.shape[2])], axis=2)
+    values = np.stack([harmonic_fill(raster.values[..., c], hole) for c in range(raster.values.shape[2])], axis=2)
     return replace(raster, values=values), FillReport(cells, share, holes, largest)
-
-
-def _harmonic_fill(values: np.ndarray, hole: np.ndarray) -> np.ndarray:
-    """Solve Laplace's equation on the hole's cells by conjugate gradients, from a coarse-to-fine first guess."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.linalg import LinearOperator, cg
-
-    height, width = values.shape
-    guess = _push_pull(np.where(hole, np.nan, values))
-    index = np.full(values.shape, -1, np.int64)
-    count = int(hole.sum())
-    index[hole] = np.arange(count)
-    row, column = np.nonzero(hole)
-    degree, known = np.zeros(count), np.zeros(count)
-    pairs = []
-    for d_row, d_column in ((0, 1), (0, -1), (1, 0), (-1, 0)):
-        r, c = row + d_row, column + d_column
-        inside = (r >= 0) & (r < height) & (c >= 0) & (c < width)
-        degree += inside
-        r, c = np.clip(r, 0, height - 1), np.clip(c, 0, width - 1)
-        neighbour = index[r, c]
-        known += np.where(inside & (neighbour < 0), np.where(hole[r, c], 0.0, values[r, c]), 0.0)
-        linked = np.nonzero(inside & (neighbour >= 0))[0]
-        pairs.append((linked, neighbour[linked]))
-    i, j = (np.concatenate(part) for part in zip(*pairs, strict=True))
-    laplacian = coo_array((-np.ones(len(i)), (i, j)), shape=(count, count)).tocsr()
-    laplacian.setdiag(degree)
-    jacobi = LinearOperator((count, count), matvec=lambda v: v / degree)
-    # Heights are stored in float32 (0.2 mm at 4,000 m); a residual of a millimetre is far below any raster's error.
-    limit = 20 * (height + width)
-    solution, failed = cg(laplacian, known, x0=guess[hole], rtol=0.0, atol=1e-3, maxiter=limit, M=jacobi)
-    if failed:
-        raise ValueError(f"fill_nodata: conjugate gradients did not converge in {failed} steps")
-    filled = values.copy()
-    filled[hole] = solution
-    return filled
-
-
-def _push_pull(values: np.ndarray) -> np.ndarray:
-    """Fill NaN from the next coarser level of a mean pyramid (Grossman & Dally 1998)."""
-    if np.isfinite(values).all():
-        return values
-    height, width = values.shape
-    padded = np.pad(values, ((0, height % 2), (0, width % 2)), constant_values=np.nan)
-    coarse = _push_pull(_nan_mean(padded.reshape(padded.shape[0] // 2, 2, padded.shape[1] // 2, 2), axes=(1, 3)))
-    return np.where(np.isfinite(values), values, np.repeat(np.repeat(coarse, 2, 0), 2, 1)[:height, :width])
