@@ -73,6 +73,8 @@ class Priors:
         Field-of-view scale, relative. The width of a full circle is known; there it scales the rows alone.
     k1
         Radial term (perspective cameras only).
+    horizon_px
+        Row of a panorama's own horizon: a lens pitched on a level axis moves it (panoramas only).
     """
 
     heading_deg: float = np.inf
@@ -82,6 +84,7 @@ class Priors:
     vertical_m: float = 10.0
     focal: float = np.inf
     k1: float = 0.0
+    horizon_px: float = 0.0
 
     def __post_init__(self):
         if any(np.isnan(value) or value < 0 for value in self.sigmas):
@@ -89,13 +92,13 @@ class Priors:
 
     @property
     def sigmas(self) -> np.ndarray:
-        """In the order of `PARAMETERS`, ``(8,)``."""
+        """In the order of `PARAMETERS`, ``(9,)``."""
         return np.array([self.heading_deg, self.tilt_deg, self.roll_deg, self.horizontal_m, self.horizontal_m,
-                         self.vertical_m, self.focal, self.k1], float)  # fmt: skip
+                         self.vertical_m, self.focal, self.k1, self.horizon_px], float)  # fmt: skip
 
 
-# The unknowns of a calibration, in order. `focal` is the natural logarithm of the field-of-view scale.
-PARAMETERS = ("heading_deg", "tilt_deg", "roll_deg", "east_m", "north_m", "up_m", "focal", "k1")
+# The unknowns of a calibration, in order. `focal` is the logarithm of the field-of-view scale, `horizon_px` an offset.
+PARAMETERS = ("heading_deg", "tilt_deg", "roll_deg", "east_m", "north_m", "up_m", "focal", "k1", "horizon_px")
 
 
 def read_points(path: Path, frame: LocalFrame) -> Correspondences:

@@ -1,4 +1,4 @@
-"""A camera as eight numbers and back: the unknowns that every kind of evidence speaks about."""
+"""A camera as nine numbers and back: the unknowns that every kind of evidence speaks about."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ def angles_from_rotation(rotation: np.ndarray) -> tuple[float, float, float]:
 
 
 def values_of(view: View, axes: np.ndarray, k1: float = 0.0) -> np.ndarray:
-    """The unknowns ``(8,)`` of a view, in the order of `PARAMETERS`, with a field-of-view scale of one.
+    """The unknowns ``(9,)`` of a view, in the order of `PARAMETERS`, with a field-of-view scale of one.
 
     ``axes`` ``(3, 3)`` are the rows east, north, up of the camera's own horizon (`frames.local_axes`).
     """
     angles = angles_from_rotation(axes @ view.world_from_camera[:3, :3])
-    return np.array([*angles, *view.position_m, 0.0, k1])
+    return np.array([*angles, *view.position_m, 0.0, k1, 0.0])
 
 
 def _rotation(axes: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -58,7 +58,7 @@ def view_from_values(start: View, axes: np.ndarray, values: np.ndarray) -> View:
     pose[:3, :3] = _rotation(axes, values)
     pose[:3, 3] = values[3:6]
     wide, high = _scales(start, values[6])
-    return replace(start, fx=start.fx * wide, fy=start.fy * high, world_from_camera=pose)
+    return replace(start, fx=start.fx * wide, fy=start.fy * high, cy=start.cy + values[8], world_from_camera=pose)
 
 
 def project_values(start: View, axes: np.ndarray, values: np.ndarray, position_m: np.ndarray):
@@ -71,12 +71,12 @@ def project_values(start: View, axes: np.ndarray, values: np.ndarray, position_m
     centre = np.array([start.cx, start.cy])
     if isinstance(start, Panorama):
         pixel, distance = project_local(start, local)
-        return (pixel - centre) * [wide, high] + centre, distance > 0
+        return (pixel - centre) * [wide, high] + centre + [0.0, values[8]], distance > 0
     depth = local[:, 2]
     normal = local[:, :2] / np.maximum(depth, 0.02 * np.sqrt(np.sum(local**2, axis=1)))[:, None]
     if values[7]:
         normal = normal * _bend(np.sqrt(np.sum(normal**2, axis=1, keepdims=True)), values[7])
-    return normal * [start.fx * wide, start.fy * high] + centre, depth > 0
+    return normal * [start.fx * wide, start.fy * high] + centre + [0.0, values[8]], depth > 0
 
 
 def _bend(radius: np.ndarray, k1: float) -> np.ndarray:

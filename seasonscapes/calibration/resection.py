@@ -35,7 +35,7 @@ class Calibration:
     k1
         Radial term of the lens.
     values, covariance
-        Unknowns ``(8,)`` in the order of `PARAMETERS` and their covariance ``(8, 8)``; zero where held fixed.
+        Unknowns ``(9,)`` in the order of `PARAMETERS` and their covariance ``(9, 9)``; zero where held fixed.
     names, residual_px, outlier
         Of each matched point: name, projected minus observed ``(N, 2)`` [px], and whether it was set aside.
     noise_px
@@ -131,8 +131,8 @@ def calibrate(start: View, points: Correspondences | None = None, *, priors: Pri
     priors = priors or Priors()
     axes = np.eye(3) if axes is None else np.asarray(axes, float)
     sigmas = priors.sigmas
-    if not isinstance(start, Camera):
-        sigmas[7] = 0.0
+    # A panorama has no lens term, a photograph no horizon of its own apart from its tilt.
+    sigmas[8 if isinstance(start, Camera) else 7] = 0.0
     origin = values_of(start, axes, k1)
     if ground_m is not None:
         _refuse_below_ground(origin, ground_m, "the start")
@@ -231,7 +231,7 @@ def _minimise(problem: Problem, values: np.ndarray, noise: float, shape: Callabl
         return _residual_rows(problem, trial, noise, shape, keep)
 
     # Steps of comparable effect: a hundredth of a degree, metres, a thousandth.
-    scale = np.array([0.1, 0.1, 0.1, 10.0, 10.0, 10.0, 0.01, 0.02])[free]
+    scale = np.array([0.1, 0.1, 0.1, 10.0, 10.0, 10.0, 0.01, 0.02, 5.0])[free]
     solved = least_squares(
         rows, values[free], x_scale=scale, xtol=tolerance, ftol=tolerance, gtol=tolerance, max_nfev=200
     )
@@ -397,7 +397,7 @@ def _covariance(problem: Problem, jacobian: np.ndarray) -> np.ndarray:
     if eigenvalues[0] < 1e-11:
         worst = PARAMETERS[free[int(np.argmax(np.abs(vectors[:, 0])))]]
         raise ValueError(f"the evidence leaves {worst} open; add points elsewhere in the picture, or give it a prior")
-    covariance = np.zeros((8, 8))
+    covariance = np.zeros((9, 9))
     covariance[np.ix_(free, free)] = np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
     return covariance
 
