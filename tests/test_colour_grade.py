@@ -51,7 +51,8 @@ def test_each_number_does_what_it_says():
 
 @pytest.mark.parametrize(("numbers", "message"), [
     ({"contrast": 1.5}, "contrast = 1.5"), ({"exposure_ev": float("nan")}, "exposure_ev = nan"),
-    ({"contrast": -0.5, "highlights_ev": -2.0, "shadows_ev": 2.0}, "fold the tone curve"), ({"middle_grey": 0.0}, "middle_grey"),
+    ({"contrast": -0.5, "highlights_ev": -2.0, "shadows_ev": 2.0}, "fold the tone curve"),
+    ({"middle_grey": 0.0}, "middle_grey"),
 ])  # fmt: skip
 def test_grades_that_cannot_be_undone_are_refused(numbers, message):
     with pytest.raises(ValueError, match=message):

@@ -193,7 +193,7 @@ def fit_response(encoded: np.ndarray, light: np.ndarray, *, knots: int = 12, smo
     ValueError
         Fewer than 20 usable pairs in a channel, or pairs that do not rise together.
     """
-    from scipy.interpolate import PchipInterpolator
+    from scipy.interpolate import CubicSpline
     from scipy.optimize import least_squares
 
     grid, out = np.linspace(0.0, 1.0, 1024), []
@@ -208,14 +208,14 @@ def fit_response(encoded: np.ndarray, light: np.ndarray, *, knots: int = 12, smo
         target = np.log(y[use]) - np.log(np.maximum(linear_from_srgb(x[use]).astype(float), 1e-9))
         if np.corrcoef(np.log(y[use]), x[use])[0, 1] < 0.3:
             raise ValueError("fit_response: encoded values and light do not rise together; the pairs may be mismatched")
-        basis = PchipInterpolator(at, np.eye(knots), axis=0)(np.clip(x[use], at[0], at[-1]))
+        basis = CubicSpline(at, np.eye(knots), bc_type="natural")(np.clip(x[use], at[0], at[-1]))
         # Errors are made in the encoded value; a step of it is worth its share of the logarithm (gamma about 2.2).
         weight = np.clip(x[use], at[0], at[-1]) / 2.2
         basis, target = basis * weight[:, None], target * weight
         bend = np.diff(np.eye(knots), 2, axis=0) * np.sqrt(use.sum()) * smoothness
         solved = least_squares(lambda c, b=basis, t=target, d=bend: np.concatenate([b @ c - t, d @ c]),
                                np.full(knots, np.median(target / weight)), loss="soft_l1", f_scale=0.02)  # fmt: skip
-        correction = np.exp(PchipInterpolator(at, solved.x)(np.clip(grid, at[0], at[-1])))
+        correction = np.exp(CubicSpline(at, solved.x, bc_type="natural")(np.clip(grid, at[0], at[-1])))
         curve = linear_from_srgb(grid).astype(float) * correction
         out.append(np.maximum.accumulate(curve) + np.arange(1024) * 1e-9 * curve[-1])
     top = max(curve[-1] for curve in out)
