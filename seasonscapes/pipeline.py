@@ -13,7 +13,15 @@ from seasonscapes import bundled
 from seasonscapes.declaration import InputError
 from seasonscapes.frames import LocalFrame, geodetic_from_enu
 from seasonscapes.scene import NamedCamera, SceneFile, camera_from_place, read_scene
-from seasonscapes.terrain.surface import Raster, Terrain, Texture, load_terrain, load_texture, save_terrain, save_texture
+from seasonscapes.terrain.surface import (
+    Raster,
+    Terrain,
+    Texture,
+    load_terrain,
+    load_texture,
+    save_terrain,
+    save_texture,
+)
 from seasonscapes.workspace import Workspace, build_once, file_hash
 
 if TYPE_CHECKING:
@@ -163,7 +171,12 @@ def _terrain(elevation: Raster, frame: LocalFrame, scene: SceneFile, options: Me
     factor = options.refine or refinement_factor(elevation.values[..., 0].size, spacing_m)
     bound = options.max_error_m or min(5.0, spacing_m / factor / 15.0)
     terrain = build_mesh(refine_raster(elevation, factor), frame, mesher=options.mesher, max_error_m=bound)
-    return unwrap(terrain, kind=options.atlas, texel_m=_texel_m(terrain, elevation, scene, options), max_side_px=options.max_side_px)
+    return unwrap(
+        terrain,
+        kind=options.atlas,
+        texel_m=_texel_m(terrain, elevation, scene, options),
+        max_side_px=options.max_side_px,
+    )
 
 
 def _save_terrain(built: tuple[Terrain, Atlas], path: Path) -> None:
@@ -208,14 +221,11 @@ def albedo_for(place: Place, date: datetime) -> Texture:
 
     inputs: dict[str, Any] = {"revision": REVISIONS["albedo"], "terrain": place.key}
     if place.synthetic is not None:
-        from seasonscapes.terrain.synthetic import albedo_raster
-
         day = date.timetuple().tm_yday
         inputs["day_of_year"] = day
-        detail_m = place.scene.elevation.synthetic.detail_m
         return build_once(place.workspace, f"{place.scene.name}/albedo-day{day:03d}", inputs, suffix=".npz",
                           save=save_texture, load=load_texture,
-                          build=lambda: bake_imagery(place.terrain, place.atlas, albedo_raster(place.synthetic, day, detail_m=detail_m)))  # fmt: skip
+                          build=lambda: bake_imagery(place.terrain, place.atlas, _synthetic_image(place, day)))  # fmt: skip
     imagery = place.scene.imagery
     if imagery is None:
         inputs["uniform"] = GREY_ALBEDO
@@ -224,6 +234,20 @@ def albedo_for(place: Place, date: datetime) -> Texture:
     inputs.update(imagery=imagery.model_copy(update={"file": Path(imagery.file).name}), hash=file_hash(imagery.file))
     return build_once(place.workspace, f"{place.scene.name}/albedo", inputs, suffix=".npz", save=save_texture,
                       load=load_texture, build=lambda: _baked_image(place))  # fmt: skip
+
+
+def _synthetic_image(place: Place, day_of_year: int) -> Raster:
+    """The truth of a synthetic place's albedo on its own finer grid."""
+    from affine import Affine
+
+    from seasonscapes.terrain.synthetic import alpine_albedo
+
+    # The albedo's own detail comes in powers of two of the massif's cells.
+    ratio = place.synthetic.spacing_m / place.scene.elevation.synthetic.detail_m
+    upsample = 2 ** int(np.clip(round(np.log2(ratio)), 0, 3))
+    values = alpine_albedo(place.synthetic, day_of_year, upsample=upsample)
+    elevation = place.synthetic.elevation
+    return Raster(values, elevation.transform * Affine.scale(1.0 / upsample), elevation.crs)
 
 
 # Without any image the ground is grey rock and meadow alike.

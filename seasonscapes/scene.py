@@ -52,7 +52,7 @@ class SyntheticElevation(Declaration):
     seed: int = Field(default=1912, ge=0)
     size_m: float = Field(default=12000.0, ge=1000.0, le=40000.0)
     spacing_m: float = Field(default=15.0, ge=2.0, le=500.0)
-    detail_m: float = Field(default=5.0, ge=0.5, le=500.0)
+    detail_m: float = Field(default=3.75, ge=0.5, le=500.0)
 
 
 class Elevation(Declaration):
@@ -135,13 +135,17 @@ class SceneFile(Declaration):
     def camera(self, name: str | None, *, where: str | Path = "--camera") -> NamedCamera:
         """The camera of that name, the first one when left out; `InputError` listing the names otherwise."""
         if not self.cameras:
-            raise InputError(where, f"the scene '{self.name}' names no camera", cure="give a place with --at LAT,LON,+ABOVE")
+            raise InputError(
+                where, f"the scene '{self.name}' names no camera", cure="give a place with --at LAT,LON,+ABOVE"
+            )
         if name is None:
             return self.cameras[0]
         for camera in self.cameras:
             if camera.name == name:
                 return camera
-        raise InputError(where, "no such camera", got=name, expected="one of " + ", ".join(c.name for c in self.cameras))
+        raise InputError(
+            where, "no such camera", got=name, expected="one of " + ", ".join(c.name for c in self.cameras)
+        )
 
 
 def read_scene(path: str | Path, *, allow_outside: bool = False) -> SceneFile:
@@ -174,7 +178,9 @@ def read_scene(path: str | Path, *, allow_outside: bool = False) -> SceneFile:
 
     updates: dict = {}
     if scene.elevation.file is not None:
-        updates["elevation"] = scene.elevation.model_copy(update={"file": resolved("elevation.file", scene.elevation.file)})
+        updates["elevation"] = scene.elevation.model_copy(
+            update={"file": resolved("elevation.file", scene.elevation.file)}
+        )
     if scene.imagery is not None:
         updates["imagery"] = scene.imagery.model_copy(update={"file": resolved("imagery.file", scene.imagery.file)})
     if scene.webcams is not None:

@@ -144,7 +144,9 @@ def test_doctor_names_an_unusable_libllvm(tmp_path, bad):
         if subprocess.run(["cc", "-shared", "-fPIC", "-o", path, source], check=False).returncode:
             pytest.skip("no C compiler to make an old library with")
     environment = {**os.environ, "DRJIT_LIBLLVM_PATH": str(path)}
-    done = subprocess.run([sys.executable, "-m", "seasonscapes", "doctor"], env=environment, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-m", "seasonscapes", "doctor"], env=environment, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     assert "libLLVM-14.so" in done.stdout
     assert "scalar_rgb" in done.stdout
@@ -189,5 +191,7 @@ def test_version_and_help(capsys):
     for flag in ("--version", "--help"):
         done = subprocess.run([sys.executable, "-m", "seasonscapes", flag], capture_output=True, text=True, check=True)
         assert done.stdout.strip()
-    done = subprocess.run([sys.executable, "-m", "seasonscapes", "render", "--help"], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-m", "seasonscapes", "render", "--help"], capture_output=True, text=True, check=True
+    )
     assert "ISO 8601" in done.stdout

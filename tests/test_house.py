@@ -18,7 +18,7 @@ FLOORS = [
     ("nouns", {"scene", "terrain", "cameras"}),
     ("wall", {"rendering"}),
     ("stages", {"calibration", "texturing", "albedo", "relighting", "gaussians", "evaluation"}),
-    ("street", {"workspace", "pipeline", "cluster", "viewer", "annotator", "commands", "cli", "__main__"}),
+    ("street", {"workspace", "pipeline", "daylight", "cluster", "viewer", "annotator", "commands", "cli", "__main__"}),
 ]
 WALLS = {
     "mitsuba": {"rendering", "albedo"},
@@ -111,4 +111,15 @@ def test_help_loads_nothing_heavy():
     code = "import sys; from seasonscapes.cli import main\ntry:\n main(['--help'])\nexcept SystemExit: pass\nprint(sorted(sys.modules), file=sys.stderr)"
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     loaded = set(ast.literal_eval(done.stderr.strip().splitlines()[-1]))
-    assert not loaded & {"mitsuba", "drjit", "torch", "rasterio", "scipy", "skyfield", "colour", "cv2", "sklearn", "trimesh"}
+    assert not loaded & {
+        "mitsuba",
+        "drjit",
+        "torch",
+        "rasterio",
+        "scipy",
+        "skyfield",
+        "colour",
+        "cv2",
+        "sklearn",
+        "trimesh",
+    }

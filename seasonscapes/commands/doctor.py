@@ -58,7 +58,9 @@ def doctor(*, json: bool = False) -> None:
     }
     llvm = "not found" if library is None else library.path
     if library is not None:
-        llvm += f" ({record['libllvm_version']})" if library.usable else " (too old: it would abort the process; not used)"
+        llvm += (
+            f" ({record['libllvm_version']})" if library.usable else " (too old: it would abort the process; not used)"
+        )
     lines = [
         f"seasonscapes  {__version__} on Python {record['python']}, {os.cpu_count()} CPUs, {record['platform']}",
         f"renderer      {backend.variant}: {backend.reason}",

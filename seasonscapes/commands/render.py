@@ -28,8 +28,11 @@ def render(
     size: str = "1536x1024",
     spp: int = 64,
     max_depth: int = 6,
-    sky: str = "hosek",
+    sky: str = "clear",
     turbidity: float | None = None,
+    visibility_km: float | None = None,
+    ozone_du: float | None = None,
+    cloudiness: float | None = None,
     exposure: str = "auto",
     seed: int = 0,
     output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("out/render.png"),
@@ -64,9 +67,11 @@ def render(
     max_depth
         Longest light path; 2 is direct light only.
     sky
-        Sky model by name, or a file.
-    turbidity
-        Haze of the model: 1 pure air, 3 clear, 6 hazy.
+        A sky model's name (clear, alpine_winter, hazy, saharan_dust, overcast, hosek) or file.
+    turbidity, visibility_km, ozone_du
+        Replace the model's haze (turbidity 1 is pure air, 3 clear, 6 hazy; or how far one sees) and ozone column.
+    cloudiness
+        Share of the sky that clouds cover, 0 to 1.
     exposure
         auto, or an exposure value EV100 (15 is a sunny day).
     seed
@@ -87,21 +92,31 @@ def render(
     start = clock.perf_counter()
     suffix = output.suffix.lower()
     if suffix not in (".png", ".exr"):
-        raise InputError("--output", "unknown kind of picture", got=str(output), expected="a name that ends in .png or .exr")
+        raise InputError(
+            "--output", "unknown kind of picture", got=str(output), expected="a name that ends in .png or .exr"
+        )
     ev100 = parse_exposure(exposure)
     size_px = parse_size(size)
-    for name, value, low, high in (("--spp", spp, 1, 1 << 20), ("--max-depth", max_depth, 2, 1000), ("--seed", seed, 0, 2**32)):
+    for name, value, low, high in (
+        ("--spp", spp, 1, 1 << 20),
+        ("--max-depth", max_depth, 2, 1000),
+        ("--seed", seed, 0, 2**32),
+    ):
         if not low <= value <= high:
             raise InputError(name, "out of range", got=value, expected=f"{low} to {high}")
 
     from seasonscapes.civil_time import resolve_time
+    from seasonscapes.daylight import light_for
     from seasonscapes.images import auto_exposure_ev100, expose, tone_curve, write_png
     from seasonscapes.pipeline import MeshOptions, albedo_for, camera_for, find_scene, load_place
     from seasonscapes.rendering.backend import use_backend
     from seasonscapes.rendering.radiance import render_view
     from seasonscapes.rendering.scene import build_scene
+    from seasonscapes.sky.models import read_sky_model, with_overrides
     from seasonscapes.workspace import Workspace, default_workspace
 
+    model = with_overrides(read_sky_model(sky), turbidity=turbidity, visibility_km=visibility_km, ozone_du=ozone_du,
+                           cloudiness=cloudiness)  # fmt: skip
     backend = use_backend(device)
     place = load_place(find_scene(scene), Workspace(workspace) if workspace else default_workspace(),
                        options=MeshOptions(mesher, max_error_m, refine, atlas, texel_m), allow_outside=allow_outside)  # fmt: skip
@@ -109,7 +124,8 @@ def render(
     moment = resolve_time(time, view.latitude_deg, view.longitude_deg)
     say(moment.reading)
     pinhole = camera_for(place, view, size_px=size_px, where="--at" if at else "--camera")
-    light, sun = light_of(place, view, moment.utc, sky=sky, turbidity=turbidity)
+    light, instant = light_for(place, pinhole, model, moment.utc)
+    sun = {"azimuth_deg": float(instant.sun.azimuth_deg), "elevation_deg": float(instant.sun.elevation_deg)}
     say(f"sun at azimuth {sun['azimuth_deg']:.2f}°, elevation {sun['elevation_deg']:.2f}° (refracted)")
     albedo = albedo_for(place, moment.utc)
     built = build_scene(place.terrain, albedo.values, light)
@@ -156,7 +172,9 @@ def parse_exposure(text: str) -> float | None:
     return value
 
 
-def chosen_view(scene, camera: str | None, at: str | None, heading: float | None, pitch: float, fov: float) -> NamedCamera:
+def chosen_view(
+    scene, camera: str | None, at: str | None, heading: float | None, pitch: float, fov: float
+) -> NamedCamera:
     """The scene's camera of that name, or the view that ``--at`` describes."""
     if at is None:
         if heading is not None:
@@ -166,23 +184,16 @@ def chosen_view(scene, camera: str | None, at: str | None, heading: float | None
         raise InputError("--camera", "and --at name two views", cure="drop one of them")
     if heading is None:
         raise InputError("--heading", "missing", expected="the azimuth to look at, clockwise from north, in degrees")
-    for name, value, low, high in (("--heading", heading, -360.0, 360.0), ("--pitch", pitch, -90.0, 90.0), ("--fov", fov, 1.0, 169.0)):
+    for name, value, low, high in (
+        ("--heading", heading, -360.0, 360.0),
+        ("--pitch", pitch, -90.0, 90.0),
+        ("--fov", fov, 1.0, 169.0),
+    ):
         if not low <= value <= high:
             raise InputError(name, "out of range", got=value, expected=f"{low:g} to {high:g} degrees")
     latitude, longitude, height, above = parse_at(at)
     return NamedCamera(name="at", latitude_deg=latitude, longitude_deg=longitude, height_m=height, above_ground_m=above,
                        heading_deg=heading, pitch_deg=pitch, fov_deg=fov)  # fmt: skip
-
-
-def light_of(place, view: NamedCamera, utc, *, sky: str, turbidity: float | None):
-    """Illumination at the scene's origin and instant, and the sun's place as a plain record."""
-    from seasonscapes.rendering.hosek import hosek_illumination
-    from seasonscapes.sky.ephemeris import sun_position
-
-    position = sun_position(utc, place.frame.latitude_deg, place.frame.longitude_deg)
-    sun = {"azimuth_deg": float(position.azimuth_deg), "elevation_deg": float(position.elevation_deg)}
-    light = hosek_illumination(position.direction, turbidity=3.0 if turbidity is None else turbidity)
-    return light, sun
 
 
 def save_layers(path: Path, place, pinhole, view: NamedCamera, picture, albedo, record: dict) -> None:

@@ -75,7 +75,9 @@ def trace_rays(scene: RenderScene, origin_m: np.ndarray, direction: np.ndarray) 
     for values in (uv, normal, position):
         values[sky] = np.nan
     uv[:, 1] = 1.0 - uv[:, 1]
-    return GBuffer(distance.reshape(shape), uv.reshape(*shape, 2), normal.reshape(*shape, 3), position.reshape(*shape, 3))
+    return GBuffer(
+        distance.reshape(shape), uv.reshape(*shape, 2), normal.reshape(*shape, 3), position.reshape(*shape, 3)
+    )
 
 
 def _trace_lanes(scene: RenderScene, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:

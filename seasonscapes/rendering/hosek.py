@@ -46,7 +46,11 @@ def hosek_illumination(sun_direction: np.ndarray, *, turbidity: float = 3.0, gro
     if not 0.0 <= ground_albedo <= 1.0:
         raise InputError("ground_albedo", "not a reflectance", got=ground_albedo, expected="0 to 1")
     use_backend()
-    parameters = {"turbidity": float(turbidity), "albedo": float(ground_albedo), "sun_direction": list(map(float, sun_direction))}
+    parameters = {
+        "turbidity": float(turbidity),
+        "albedo": float(ground_albedo),
+        "sun_direction": list(map(float, sun_direction)),
+    }
     directions = equirectangular_directions(*shape)
     above = directions[..., 2] > 0.0
     sky = np.zeros((*shape, 3))

@@ -145,7 +145,9 @@ def relight(mi_terrain: Any, illumination: Illumination, *, max_height_m: float)
     return RenderScene(mi.load_dict(members), mi_terrain, illumination, max_height_m)
 
 
-def build_scene(terrain: Terrain, albedo: np.ndarray, illumination: Illumination, *, smooth: bool = True) -> RenderScene:
+def build_scene(
+    terrain: Terrain, albedo: np.ndarray, illumination: Illumination, *, smooth: bool = True
+) -> RenderScene:
     """Terrain with albedo ``(R, S, 3)`` or ``(3,)`` under a light; see `mi_mesh` and `relight`."""
     return relight(mi_mesh(terrain, albedo, smooth=smooth), illumination,
                    max_height_m=float(terrain.vertices[:, 2].max()))  # fmt: skip
@@ -165,12 +167,20 @@ def background(illumination: Illumination, direction: np.ndarray, pixel_angle_de
     """Radiance ``(..., 3)`` [cd/m²] of the open sky along unit directions ``(..., 3)``, with the discs of sun and moon.
 
     The disc's edge is spread over one pixel, so that it does not alias. With aerial perspective the sky is what that
-    gives at infinity (finer than the map); else it is the map.
+    gives at infinite distance, which is finer than the map, plus what the map knows beyond it (stars, clouds).
     """
-    if illumination.aerial_perspective is not None:
-        sky = illumination.aerial_perspective(np.full(direction.shape[:-1], np.inf), direction)[1].astype(np.float64)
+    sky_map = illumination.sky_radiance if illumination.visible_sky is None else illumination.visible_sky
+    air = illumination.aerial_perspective
+    if air is None:
+        sky = sample_equirectangular(sky_map, direction)
     else:
-        sky = sample_equirectangular(illumination.sky_radiance, direction)
+        height, width = sky_map.shape[:2]
+        grid = equirectangular_directions(height, width)
+        beyond = sky_map - air(np.full((height, width), np.inf), grid)[1]
+        # Below the horizon the map is a coarse picture of the ground, and the air's own is sharp.
+        beyond[height // 2 :] = beyond[height // 2 - 1]
+        sky = air(np.full(direction.shape[:-1], np.inf), direction)[1] + sample_equirectangular(beyond, direction)
+        sky = np.maximum(sky, 0.0)
     for luminary in (illumination.sun, illumination.moon):
         if luminary is None:
             continue

@@ -61,6 +61,9 @@ class Illumination:
         Directional sources; ``None`` where below the horizon or too faint.
     aerial_perspective
         The air between viewer and surface, or ``None`` for clear space.
+    visible_sky
+        The map that the viewer sees behind the terrain, where that is not ``sky_radiance``: a camera on a summit looks
+        at another sky than the one that lights the valley.
     model
         Name of the sky model and its parameters, for the record.
     """
@@ -69,6 +72,7 @@ class Illumination:
     sun: Luminary | None = None
     moon: Luminary | None = None
     aerial_perspective: AerialPerspective | None = None
+    visible_sky: np.ndarray | None = None
     model: dict = field(default_factory=dict)
 
 
