@@ -38,8 +38,9 @@ class _CloudedAir:
         return transmittance, self.share * airlight + (1.0 - transmittance) * self.airlight
 
 
-def with_clouds(clear: Illumination, cloudiness: float, source_direction: np.ndarray) -> Illumination:
-    """The light of one source under a sky whose share ``cloudiness`` is covered; 0 returns ``clear`` unchanged.
+def with_clouds(clear: Illumination, cloudiness: float, source_direction: np.ndarray, *,
+                transmission: float | None = None, colour: np.ndarray | None = None) -> Illumination:  # fmt: skip
+    """The light under a sky whose share ``cloudiness`` is covered; 0 returns ``clear`` unchanged.
 
     Global light falls as ``1 - (1 - t) c^3.4`` and its direct share as ``1 - c²``, the forms that Kasten & Czeplak
     (1980, Solar Energy 24, 177) found in ten years of hourly data, with their t = 0.25 at full cover replaced by
@@ -50,11 +51,14 @@ def with_clouds(clear: Illumination, cloudiness: float, source_direction: np.nda
     Parameters
     ----------
     clear
-        Illumination by one source (sun or moon) and its sky.
+        Illumination without clouds.
     cloudiness
         In [0, 1].
     source_direction
-        Towards that source, also when it is below the horizon, ``(3,)``.
+        Towards the body that lights the clouds, also when it is below the horizon, ``(3,)``.
+    transmission, colour
+        Of the closed layer: the share it lets through, and its linear Rec.709 at luminance 1 ``(3,)``. Left out, those
+        for the sun in ``source_direction``.
 
     Raises
     ------
@@ -67,14 +71,15 @@ def with_clouds(clear: Illumination, cloudiness: float, source_direction: np.nda
         return clear
     source_direction = np.asarray(source_direction, float)
     elevation_deg = float(np.degrees(np.arcsin(np.clip(source_direction[2], -1.0, 1.0))))
-    dimming = 1.0 - (1.0 - float(cloud_transmission(elevation_deg))) * cloudiness**3.4
+    transmission = float(cloud_transmission(elevation_deg)) if transmission is None else transmission
+    dimming = 1.0 - (1.0 - transmission) * cloudiness**3.4
     open_share, direct_share = 1.0 - cloudiness, dimming * (1.0 - cloudiness**2)
     direct = direct_horizontal_illuminance(clear.sun) + direct_horizontal_illuminance(clear.moon)
     diffuse = diffuse_horizontal_illuminance(clear.sky_radiance)
     # Luminance decides how much light the clouds send; they are grey, and lit by all of it.
     total = float(luminance(direct + diffuse)) * dimming
     from_clouds = total - float(luminance(direct)) * direct_share - float(luminance(diffuse)) * open_share
-    grey = max(from_clouds, 0.0) * overcast_rgb(elevation_deg)
+    grey = max(from_clouds, 0.0) * (overcast_rgb(elevation_deg) if colour is None else colour)
     height = clear.sky_radiance.shape[0]
     broken = overcast_sky_radiance(grey, height, ground_albedo=0.0, source_direction=source_direction)
     closed = overcast_sky_radiance(grey, height, ground_albedo=0.0)

@@ -1,0 +1,197 @@
+"""What a sky is, in numbers and as a picture of the dome."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any
+from zoneinfo import ZoneInfo
+
+import numpy as np
+
+from seasonscapes.frames import angles_from_direction, direction_from_angles, sample_equirectangular
+from seasonscapes.images import auto_exposure_ev100, expose, linear_from_srgb, srgb_from_linear, tone_curve
+from seasonscapes.sky.ephemeris import LunarPosition, SolarPosition, SunEvents, sun_events
+from seasonscapes.sky.illumination import (
+    Illumination,
+    Luminary,
+    diffuse_horizontal_illuminance,
+    global_horizontal_illuminance,
+    luminance,
+)
+
+
+def correlated_colour_temperature_k(rgb: np.ndarray) -> float | None:
+    """Correlated colour temperature [K] of linear Rec.709 light ``(3,)``; ``None`` where it means nothing.
+
+    Ohno (2013), doi:10.1080/15502724.2014.839020. Light farther than 0.05 from the Planckian locus in u'v', or bluer
+    than a black body of 100,000 K (twilight's zenith can be), has no correlated temperature.
+    """
+    import colour
+
+    xyz = np.asarray(colour.RGB_COLOURSPACES["ITU-R BT.709"].matrix_RGB_to_XYZ) @ np.asarray(rgb, float)
+    if not np.all(np.isfinite(xyz)) or xyz.sum() <= 0.0 or np.any(xyz < 0.0):
+        return None
+    uv = colour.UCS_to_uv(colour.XYZ_to_UCS(xyz))
+    kelvin, distance = colour.temperature.uv_to_CCT_Ohno2013(uv)
+    if not (1000.0 < kelvin < 99_000.0) or abs(distance) > 0.05:
+        return None
+    return float(kelvin)
+
+
+def sky_record(illumination: Illumination, time: datetime, sun: SolarPosition, moon: LunarPosition,
+               latitude_deg: float, longitude_deg: float, *, zone: str | None = None) -> dict[str, Any]:  # fmt: skip
+    """Everything about the light of an instant as plain numbers, ready for JSON.
+
+    Parameters
+    ----------
+    illumination
+        What `models.illuminate` gave for the instant.
+    time
+        Aware datetime.
+    sun, moon
+        Where they stand.
+    latitude_deg, longitude_deg
+        WGS 84 [deg], for the day's events.
+    zone
+        IANA name of the civil time that decides which day's events; UTC where left out.
+
+    Returns
+    -------
+    dict
+        ``illuminance_lx.direct_normal`` is that of the brighter body, named by ``direct_source``; ``null`` stands for
+        an event that does not happen, or a colour without a correlated temperature.
+    """
+    tz = ZoneInfo(zone or "UTC")
+    events = sun_events(time.astimezone(tz).date(), latitude_deg, longitude_deg, tz)
+    bodies = {"sun": illumination.sun, "moon": illumination.moon}
+    source = max((name for name, body in bodies.items() if body is not None), key=lambda name: _normal_lx(bodies[name]),
+                 default=None)  # fmt: skip
+    light = {
+        "direct_normal": np.zeros(3) if source is None else np.asarray(bodies[source].normal_illuminance_lx, float),
+        "diffuse_horizontal": diffuse_horizontal_illuminance(illumination.sky_radiance),
+        "global_horizontal": global_horizontal_illuminance(illumination),
+    }
+    return {
+        "time_utc": _iso(time),
+        "sun": {
+            "azimuth_deg": float(sun.azimuth_deg),
+            "elevation_deg": float(sun.elevation_deg),
+            "distance_au": float(sun.distance_au),
+        },
+        "moon": {
+            "azimuth_deg": float(moon.azimuth_deg),
+            "elevation_deg": float(moon.elevation_deg),
+            "illuminated_fraction": float(moon.illuminated_fraction),
+            "phase_angle_deg": float(moon.phase_angle_deg),
+            "waxing": bool(moon.waxing),
+            "distance_km": float(moon.distance_km),
+        },
+        "direct_source": source,
+        "illuminance_lx": {name: float(luminance(rgb)) for name, rgb in light.items()},
+        "illuminance_rgb": {name: [float(value) for value in rgb] for name, rgb in light.items()},
+        "cct_k": {name: correlated_colour_temperature_k(rgb) for name, rgb in light.items()},
+        **_event_times(events),
+        "model": illumination.model,
+    }
+
+
+def record_lines(record: dict[str, Any]) -> list[str]:
+    """The record of `sky_record` as a few lines for people."""
+    sun, moon, lux, kelvin = record["sun"], record["moon"], record["illuminance_lx"], record["cct_k"]
+
+    def clock(key: str) -> str:
+        return record[key][11:16] if record[key] else "never"
+
+    def colour_of(name: str) -> str:
+        return f"{kelvin[name]:,.0f} K" if kelvin[name] else "no colour temperature"
+
+    phase = f"{100.0 * moon['illuminated_fraction']:.0f} % lit, {'waxing' if moon['waxing'] else 'waning'}"
+    direct = f" ({record['direct_source']})" if record["direct_source"] else ""
+    return [
+        f"time     {record['time_utc']}",
+        f"sun      azimuth {sun['azimuth_deg']:.2f}°, elevation {sun['elevation_deg']:.2f}° (refracted)",
+        f"moon     azimuth {moon['azimuth_deg']:.2f}°, elevation {moon['elevation_deg']:.2f}°, {phase}",
+        f"day      sunrise {clock('sunrise_utc')}, noon {clock('solar_noon_utc')}, sunset {clock('sunset_utc')} UTC",
+        f"twilight civil {clock('civil_dawn_utc')} to {clock('civil_dusk_utc')}, "
+        f"nautical {clock('nautical_dawn_utc')} to {clock('nautical_dusk_utc')}, "
+        f"astronomical {clock('astronomical_dawn_utc')} to {clock('astronomical_dusk_utc')} UTC",
+        f"direct   {lux['direct_normal']:.4g} lx normal{direct}, {colour_of('direct_normal')}",
+        f"diffuse  {lux['diffuse_horizontal']:.4g} lx horizontal, {colour_of('diffuse_horizontal')}",
+        f"global   {lux['global_horizontal']:.4g} lx horizontal, {colour_of('global_horizontal')}",
+    ]
+
+
+def dome_radiance(illumination: Illumination, size_px: int = 512) -> np.ndarray:
+    """Equidistant fish-eye view of the upper half of the sky, ``(S, S, 3)`` [cd/m²]; NaN outside the horizon.
+
+    Laid out like a map: north up, **east to the right** (lying on one's back one would see east on the left). The
+    distance from the middle is in proportion to the angle from the zenith. Discs of sun and moon are not in it.
+    """
+    axis = (np.arange(size_px) + 0.5) * (2.0 / size_px) - 1.0
+    x, y = np.meshgrid(axis, -axis)
+    radius = np.hypot(x, y)
+    direction = direction_from_angles(np.degrees(np.arctan2(x, y)), 90.0 - 90.0 * np.minimum(radius, 1.0))
+    height = illumination.sky_radiance.shape[0]
+    # Keep the look-up clear of the rows below the horizon, whose ground would bleed into the rim.
+    direction[..., 2] = np.maximum(direction[..., 2], np.sin(np.radians(90.0 / height)))
+    sky = sample_equirectangular(illumination.sky_radiance, direction)
+    return np.where(radius[..., None] <= 1.0, sky, np.nan)
+
+
+def dome_picture(illumination: Illumination, size_px: int = 768, *, ev100: float | None = None) -> np.ndarray:
+    """`dome_radiance` developed for the screen with compass, elevation circles, sun and moon, ``(S, S, 3)`` in [0, 1].
+
+    Display-linear, ready for `images.write_png`. ``ev100`` left out, the dome's own brightness decides.
+    """
+    import cv2
+
+    margin = size_px // 14
+    inner = size_px - 2 * margin
+    dome = dome_radiance(illumination, inner)
+    inside = np.isfinite(dome[..., 0])
+    radiance = np.where(inside[..., None], dome, 0.0)
+    ev100 = auto_exposure_ev100(radiance, inside) if ev100 is None else ev100
+    canvas = np.full((size_px, size_px, 3), 0.02, np.float32)
+    shown = tone_curve(expose(radiance, ev100)).clip(0.0, 1.0)
+    window = canvas[margin : margin + inner, margin : margin + inner]
+    window[inside] = shown[inside]
+    encoded = np.round(255.0 * srgb_from_linear(canvas)).astype(np.uint8)  # putText draws on bytes only
+    middle, scale = size_px / 2.0, inner / 2.0
+    ink, thin = (235, 235, 235), max(1, size_px // 768)
+
+    def place(direction) -> tuple[int, int]:
+        azimuth, elevation = (np.radians(float(angle)) for angle in angles_from_direction(direction))
+        radius = scale * (1.0 - elevation / (np.pi / 2.0))
+        return round(middle + radius * np.sin(azimuth)), round(middle - radius * np.cos(azimuth))
+
+    def write(text: str, x: float, y: float, size: float) -> None:
+        (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size, thin)
+        at = (round(x - width / 2), round(y + height / 2))
+        cv2.putText(encoded, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, ink, thin, cv2.LINE_AA)
+
+    for elevation_deg in (0, 30, 60):
+        radius = scale * (1.0 - elevation_deg / 90.0)
+        cv2.circle(encoded, (round(middle), round(middle)), round(radius), ink, thin, cv2.LINE_AA)
+        if elevation_deg:
+            write(f"{elevation_deg}", middle + 0.7071 * radius, middle + 0.7071 * radius, size_px / 1900)
+    for name, (dx, dy) in {"N": (0, -1), "E": (1, 0), "S": (0, 1), "W": (-1, 0)}.items():
+        write(name, middle + dx * (scale + margin / 2), middle + dy * (scale + margin / 2), size_px / 900)
+    for body, colour in ((illumination.sun, (255, 190, 25)), (illumination.moon, (190, 215, 255))):
+        if body is not None and body.direction[2] > 0.0:
+            cv2.circle(encoded, place(body.direction), size_px // 90, colour, 2 * thin, cv2.LINE_AA)
+    return linear_from_srgb(encoded / 255.0)
+
+
+def _normal_lx(body: Luminary) -> float:
+    return float(luminance(body.normal_illuminance_lx))
+
+
+def _event_times(events: SunEvents) -> dict[str, str | None]:
+    names = ("sunrise", "sunset", "solar_noon", "civil_dawn", "civil_dusk", "nautical_dawn", "nautical_dusk",
+             "astronomical_dawn", "astronomical_dusk")  # fmt: skip
+    times = {name: getattr(events, name) for name in names}
+    return {f"{name}_utc": None if time is None else _iso(time) for name, time in times.items()}
+
+
+def _iso(time: datetime) -> str:
+    return time.astimezone(ZoneInfo("UTC")).isoformat(timespec="seconds").replace("+00:00", "Z")
