@@ -22,7 +22,7 @@ llvm:
 	@sh tools/llvm.sh
 
 demo: llvm $(STAMP)
-	$(BIN)/python -m seasonscapes.commands.demo out/demo
+	$(BIN)/seasonscapes demo -o out/demo
 
 test: llvm $(STAMP)
 	$(BIN)/python -m pytest -q

@@ -1,0 +1,162 @@
+"""``seasonscapes demo``: the embedded scene through a day, a night and a year, as contact sheets."""
+
+from __future__ import annotations
+
+import json as json_module
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from seasonscapes.commands.talk import finish, progress_bar, say
+
+YEAR = 2024  # its full moon of 18 September stands high through the night
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One picture of a sheet: caption, civil time, sky model."""
+
+    caption: str
+    time: str
+    sky: str = "clear"
+
+
+DAY_AND_YEAR = [
+    Panel("dawn, 18 September 06:40", f"{YEAR}-09-18T06:40"),
+    Panel("morning, 09:00", f"{YEAR}-09-18T09:00"),
+    Panel("noon, 13:20", f"{YEAR}-09-18T13:20"),
+    Panel("evening, 19:05", f"{YEAR}-09-18T19:05"),
+    Panel("winter noon, 20 January", f"{YEAR}-01-20T12:40", "alpine_winter"),
+    Panel("spring noon, 5 May", f"{YEAR}-05-05T13:25"),
+    Panel("summer noon, 20 July", f"{YEAR}-07-20T13:35"),
+    Panel("autumn noon, 20 October", f"{YEAR}-10-20T13:10"),
+]
+HOURS = [
+    Panel(f"{(datetime(YEAR, 9, 17, 12) + timedelta(hours=h)):%d %b %H:%M}", f"{datetime(YEAR, 9, 17, 12) + timedelta(hours=h):%Y-%m-%dT%H:%M}")
+    for h in range(24)
+]
+AIR = [
+    Panel(sky.replace("_", " "), f"{YEAR}-09-18T10:30", sky) for sky in ("clear", "hazy", "saharan_dust", "overcast")
+]
+
+
+def demo(
+    output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("out/demo"),
+    *,
+    camera: str | None = None,
+    size: str = "720x480",
+    spp: int = 64,
+    device: str = "auto",
+    workspace: Path | None = None,
+    json: bool = False,
+) -> None:
+    """Render the embedded scene into contact sheets: a day, four seasons, 24 hours under a full moon, four kinds of air.
+
+    Pictures that are already there, made with the same arguments, are kept: an interrupted demo goes on where it was.
+
+    Parameters
+    ----------
+    output
+        Folder for the pictures.
+    camera
+        A camera of the scene alpine; the first one when left out.
+    size, spp
+        Of the large panels; the hourly ones are half as wide.
+    device, workspace, json
+        As in `seasonscapes render`.
+    """
+    from seasonscapes.commands.talk import parse_size
+    from seasonscapes.pipeline import find_scene, load_place
+    from seasonscapes.rendering.backend import use_backend
+    from seasonscapes.workspace import Workspace, default_workspace
+
+    width, height = parse_size(size)
+    backend = use_backend(device)
+    say(f"demo: rendering on {backend.variant} ({backend.reason})")
+    say("demo: building the embedded scene (the first time takes a minute)")
+    place = load_place(find_scene("alpine"), Workspace(workspace) if workspace else default_workspace())
+    view = place.scene.camera(camera)
+    studio = _Studio(place, view, Path(output))
+    sheets = []
+    for name, panels, columns, shape in (
+        ("day-and-year", DAY_AND_YEAR, 4, (width, height)),
+        ("air", AIR, 2, (width, height)),
+        ("24-hours", HOURS, 6, (width // 2, height // 2)),
+    ):
+        pictures = []
+        with progress_bar(name) as progress:
+            for index, panel in enumerate(panels):
+                pictures.append(studio.picture(f"{name}-{index:02d}", panel, shape, spp))
+                progress((index + 1) / len(panels))
+        sheet = Path(output) / f"{name}.png"
+        contact_sheet(sheet, pictures, [panel.caption for panel in panels], columns=columns)
+        say(f"demo: {sheet}")
+        sheets.append(str(sheet))
+    finish({"sheets": sheets}, [f"{len(sheets)} contact sheets in {output}"], as_json=json)
+
+
+class _Studio:
+    """Keeps the built terrain between panels: only light, and with the date the albedo, change."""
+
+    def __init__(self, place, view, folder: Path):
+        self.place, self.view, self.folder = place, view, folder
+        self.day, self.mi_terrain = None, None
+
+    def picture(self, name: str, panel: Panel, size_px: tuple[int, int], spp: int) -> Path:
+        """Render one panel, or keep the one that is there."""
+        from PIL import Image
+
+        from seasonscapes import __version__
+
+        path = self.folder / f"{name}.png"
+        record = json_module.dumps({"panel": panel.__dict__, "size": size_px, "spp": spp, "version": __version__,
+                                    "view": self.view.model_dump(), "terrain": str(self.place.key)}, sort_keys=True)  # fmt: skip
+        if path.is_file() and Image.open(path).text.get("seasonscapes:panel") == record:
+            return path
+        self._render(path, panel, size_px, spp, record)
+        return path
+
+    def _render(self, path: Path, panel: Panel, size_px: tuple[int, int], spp: int, record: str) -> None:
+        from seasonscapes.civil_time import resolve_time
+        from seasonscapes.daylight import light_for
+        from seasonscapes.images import auto_exposure_ev100, expose, tone_curve, write_png
+        from seasonscapes.pipeline import albedo_for, camera_for
+        from seasonscapes.rendering.radiance import render_view
+        from seasonscapes.rendering.scene import mi_mesh, relight
+        from seasonscapes.sky.models import read_sky_model
+
+        place, view = self.place, self.view
+        time = resolve_time(panel.time, view.latitude_deg, view.longitude_deg).utc
+        camera = camera_for(place, view, size_px=size_px)
+        light, moment = light_for(place, camera, read_sky_model(panel.sky), time)
+        if self.day != time.timetuple().tm_yday:
+            self.day = time.timetuple().tm_yday
+            self.mi_terrain = mi_mesh(place.terrain, albedo_for(place, time).values)
+        scene = relight(self.mi_terrain, light, max_height_m=float(place.terrain.vertices[:, 2].max()))
+        picture = render_view(scene, camera, spp=spp)
+        ev100 = auto_exposure_ev100(picture.radiance)
+        say(f"demo: {path.name}  {panel.caption}; sun {moment.sun.elevation_deg:+.1f}°, EV {ev100:.1f}")
+        write_png(path, tone_curve(expose(picture.radiance, ev100)), metadata={"seasonscapes:panel": record})
+
+
+def contact_sheet(path: Path, pictures: list[Path], captions: list[str], *, columns: int) -> None:
+    """Pictures of one size side by side in rows, each with its caption beneath."""
+    import cv2
+    import numpy as np
+    from PIL import Image
+
+    from seasonscapes.images import write_png8
+
+    tiles = []
+    for picture, caption in zip(pictures, captions, strict=True):
+        image = np.asarray(Image.open(picture).convert("RGB"))
+        strip = np.full((26, image.shape[1], 3), 24, np.uint8)
+        cv2.putText(strip, caption, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (225, 225, 225), 1, cv2.LINE_AA)
+        tiles.append(np.vstack([image, strip]))
+    blank = np.full_like(tiles[0], 24)
+    tiles += [blank] * (-len(tiles) % columns)
+    rows = [np.hstack(tiles[start : start + columns]) for start in range(0, len(tiles), columns)]
+    write_png8(path, np.vstack(rows))
