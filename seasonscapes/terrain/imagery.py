@@ -100,7 +100,7 @@ def bake_imagery(terrain: Terrain, atlas: Atlas, image: Raster, *, gutter_px: in
     positions, face_id = texel_positions(terrain, atlas.width_px, atlas.height_px)
     values = np.zeros((atlas.height_px, atlas.width_px, 3), np.float32)
     weight = np.zeros((atlas.height_px, atlas.width_px), np.float32)
-    pyramid, pixels_of = _pyramid(image.values), _pixel_map(terrain, image)
+    pyramid, pixels_of = _pyramid(image.values), pixel_map(terrain, image)
     footprint = _face_footprints(terrain, atlas, pixels_of)
     texel = np.flatnonzero(face_id >= 0)
     for start in range(0, len(texel), _CHUNK):
@@ -119,7 +119,7 @@ def image_pixels(frame: LocalFrame, image: Raster, positions: np.ndarray) -> np.
     return raster_pixels(image, latitude, longitude)
 
 
-def _pixel_map(terrain: Terrain, image: Raster) -> Callable[[np.ndarray], np.ndarray]:
+def pixel_map(terrain: Terrain, image: Raster) -> Callable[[np.ndarray], np.ndarray]:
     """`image_pixels` for many points: a polynomial in east and north, linear in up, or itself where that is not exact.
 
     From one map to another over tens of kilometres everything is smooth; ten million calls of a projection library are
