@@ -305,6 +305,10 @@ def test_record_has_the_promised_keys(morning):
     assert record["astronomical_dawn_utc"].startswith("2024-09-01T02:59")
     assert record["cct_k"]["diffuse_horizontal"] == pytest.approx(6500.0, rel=0.02)
     assert record["cct_k"]["direct_normal"] < 6000.0
+    # Without a zone it is still the day at the place: at noon in Tokyo UTC has 03:00 of the same date, at 08:00 the
+    # day before.
+    early = datetime(2024, 8, 31, 23, tzinfo=UTC)
+    assert sky_record(light, early, sun, moon, 35.7, 139.7)["solar_noon_utc"].startswith("2024-09-01T02:4")
     lines = record_lines(record)
     assert all("\n" not in line for line in lines)
     assert "113.93" in " ".join(lines)

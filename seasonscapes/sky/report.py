@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datetime import datetime
+from datetime import datetime, timedelta, timezone
 from typing import Any
 from zoneinfo import ZoneInfo
 
@@ -53,7 +53,7 @@ def sky_record(illumination: Illumination, time: datetime, sun: SolarPosition, m
     latitude_deg, longitude_deg
         WGS 84 [deg], for the day's events.
     zone
-        IANA name of the civil time that decides which day's events; UTC where left out.
+        IANA name of the civil time that decides which day's events; local mean time where left out.
 
     Returns
     -------
@@ -61,7 +61,7 @@ def sky_record(illumination: Illumination, time: datetime, sun: SolarPosition, m
         ``illuminance_lx.direct_normal`` is that of the brighter body, named by ``direct_source``; ``null`` stands for
         an event that does not happen, or a colour without a correlated temperature.
     """
-    tz = ZoneInfo(zone or "UTC")
+    tz = ZoneInfo(zone) if zone else timezone(timedelta(minutes=round(4.0 * longitude_deg)))
     events = sun_events(time.astimezone(tz).date(), latitude_deg, longitude_deg, tz)
     bodies = {"sun": illumination.sun, "moon": illumination.moon}
     source = max((name for name, body in bodies.items() if body is not None), key=lambda name: _normal_lx(bodies[name]),
