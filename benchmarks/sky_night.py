@@ -51,6 +51,12 @@ class NightRow:
         """To the nearer fit, at least 1."""
         return float(min(max(factor, 1.0 / factor) for factor in self.factors))
 
+    @property
+    def factor_outside(self) -> float:
+        """By how much ours leaves the span between the two fits; 1 within it."""
+        low, high = sorted((self.supplement_lx, self.circular_lx))
+        return float(max(1.0, self.ours_lx / high, low / self.ours_lx))
+
 
 def night_rows(tables: AtmosphereTables | None = None, *, model: SkyModel | None = None) -> list[NightRow]:
     """Sun from +20° to -18° without a moon, full and half moon from 10° to 60° at midnight; sea level.
@@ -98,6 +104,7 @@ def night_numbers(rows: list[NightRow]) -> dict[str, float]:
 
     return {
         "twilight_factor_max": max(row.factor for row in rows),
+        "twilight_factor_outside_max": max(row.factor_outside for row in rows),
         "twilight_factor_supplement_max": worst(sun, 0),
         "twilight_factor_circular_max": worst([row for row in sun if row.altitude_deg >= -12], 1),
         "moon_factor_max": max(row.factor for row in moon),
