@@ -39,8 +39,8 @@ _TURNING = {
 _STEADY = {
     Cover.WATER: (0.014, 0.034, 0.038),
     Cover.CONIFER: (0.022, 0.036, 0.017),
-    Cover.SCREE: (0.235, 0.222, 0.200),
-    Cover.ROCK: (0.205, 0.192, 0.172),
+    Cover.SCREE: (0.240, 0.231, 0.214),
+    Cover.ROCK: (0.200, 0.193, 0.180),
     Cover.ICE: (0.400, 0.470, 0.520),
     Cover.FIRN: (0.660, 0.690, 0.720),
 }
@@ -161,14 +161,15 @@ def _texture(albedo, cover, z, grain, broad, position, seed) -> None:
     """Variation within a class, in place: crowns, tufts, strata, crevasses."""
     east, north = position
     contrast = {Cover.MEADOW: 0.16, Cover.CONIFER: 0.30, Cover.LARCH: 0.28, Cover.BROADLEAF: 0.26, Cover.SHRUB: 0.24,
-                Cover.SCREE: 0.12, Cover.ROCK: 0.20, Cover.ICE: 0.10, Cover.FIRN: 0.03, Cover.FIELD: 0.10}  # fmt: skip
+                Cover.SCREE: 0.12, Cover.ROCK: 0.24, Cover.ICE: 0.10, Cover.FIRN: 0.03, Cover.FIELD: 0.10}  # fmt: skip
     gain = np.zeros(cover.shape, np.float32)
     for kind, amount in contrast.items():
         gain[cover == kind] = amount
     factor = np.exp(gain * grain + np.where(np.isin(cover, (Cover.FIRN, Cover.ICE)), 0.02, 0.10) * broad)
-    tilt = 0.10 * east[None, :] - 0.06 * north[:, None]
-    strata = np.sin((z + tilt + 25.0 * broad) * (2.0 * np.pi / 130.0)) + 0.6 * np.sin((z + tilt) * (2.0 * np.pi / 47.0))
-    factor *= np.where(cover == Cover.ROCK, np.exp(0.13 * strata), 1.0)
+    # The same dip as the ledges of the relief.
+    level = z + 0.13 * east[None, :] - 0.09 * north[:, None] + 18.0 * broad
+    bands = np.sin(level * (2.0 * np.pi / 190.0)) + 0.7 * np.sin(level * (2.0 * np.pi / 92.0) + 1.0)
+    factor *= np.where(cover == Cover.ROCK, np.exp(0.13 * bands), 1.0)
     albedo *= factor[..., None]
     rusty = np.where(np.isin(cover, (Cover.ROCK, Cover.SCREE)), 0.06 * broad, 0.0)[..., None]
     albedo *= np.exp(rusty * np.array([1.0, 0.0, -1.0], np.float32))

@@ -40,29 +40,34 @@ def slope_and_northness(elevation: np.ndarray, spacing_m: float) -> tuple[np.nda
 def ground_cover(relief: Relief, spacing_m: float, seed: int, east_m: np.ndarray, north_m: np.ndarray) -> np.ndarray:
     """Cover classes ``(H, W)`` uint8."""
     z = relief.elevation
-    slope, north = slope_and_northness(cv2.GaussianBlur(z, (0, 0), 20.0 / spacing_m + 0.3), spacing_m)
+    slope, north = slope_and_northness(cv2.GaussianBlur(z, (0, 0), 12.0 / spacing_m + 0.2), spacing_m)
     large = fractal_noise(seed + 201, 1500.0, east_m, north_m, octaves=6, gain=0.6)
-    small = fractal_noise(seed + 231, 240.0, east_m, north_m, octaves=4, gain=0.65)
-    relative = cv2.GaussianBlur(z, (0, 0), 120.0 / spacing_m) - z  # positive in hollows [m]
+    small = fractal_noise(seed + 231, 240.0, east_m, north_m, octaves=4, gain=0.7)
+    hollow = cv2.GaussianBlur(z, (0, 0), 75.0 / spacing_m) - z  # positive in gullies [m]
     cover = np.full(z.shape, Cover.MEADOW, np.uint8)
-    tree_line = 1930.0 - 60.0 * north + 90.0 * large
-    dense = 1.1 * large + 0.7 * small + (slope - 21.0) / 9.0 + 0.9 * north - (z - 1200.0) / 1400.0
-    forest = (dense > 0.0) & (z < tree_line) & (slope < 50.0)
+    tree_line = 1930.0 - 70.0 * north + 80.0 * large + 25.0 * small
+    # Woods keep to what is too steep to mow; clearings and avalanche tracks stay open.
+    wooded = 1.0 * large + 0.55 * small + (slope - 22.0) / 9.0 + 0.8 * north - (z - 1300.0) / 1300.0
+    wooded -= np.where(z > 1250.0, np.clip(hollow - 9.0, 0.0, 12.0) / 8.0, 0.0)
+    forest = (wooded > 0.0) & (z < tree_line)
     cover[forest] = Cover.CONIFER
-    cover[forest & (z < 1150.0 + 150.0 * large) & (small + 0.5 * large - north > 0.1)] = Cover.BROADLEAF
-    cover[forest & (z > tree_line - 330.0 - 80.0 * small) & (small - 0.3 * large > -0.2)] = Cover.LARCH
-    cover[(z > tree_line - 60.0) & (z < tree_line + 230.0) & (dense + 0.4 * small > 0.4)] = Cover.SHRUB
-    flat = (slope < 5.0) & (z < 1100.0) & (relief.floor.shore_m > 40.0)
+    cover[forest & (z < 1130.0 + 140.0 * large) & (small + 0.5 * large - 0.8 * north > 0.2)] = Cover.BROADLEAF
+    cover[forest & (z > tree_line - 380.0 - 90.0 * small) & (small - 0.3 * large > -0.1)] = Cover.LARCH
+    brush = (z > tree_line - 80.0) & (z < tree_line + 260.0) & (wooded + 0.6 * small > 0.8)
+    brush |= forest & (hollow > 12.0) & (slope > 36.0)
+    cover[brush] = Cover.SHRUB
+    flat = (slope < 6.0) & (z < 1100.0) & (relief.floor.shore_m > 40.0)
     cover[flat & (large + 0.4 * small > -0.5)] = Cover.FIELD
-    bare = (z - 2380.0 - 170.0 * large - 110.0 * small + 120.0 * north) / 250.0 + np.maximum(slope - 33.0, 0.0) / 6.0
-    loose = (bare > 0.0) & (z > 1750.0)
-    cover[loose] = Cover.SCREE
-    rocky = (
-        (slope - 42.0 - 3.5 * small) / 4.0 - np.clip(relative, -30.0, 30.0) / 25.0 + np.maximum(z - 2700.0, 0.0) / 900.0
-    )
-    cover[(rocky > 0.0) & (loose | (slope > 46.0 + 3.0 * small))] = Cover.ROCK
-    firn = (z > 3080.0 - 260.0 * north + 70.0 * large + 60.0 * small) & (slope < 47.0 + 4.0 * small)
+    # Soil thins with height and steepness; below the tree line it holds on remarkably steep ground.
+    thin = (z - 2330.0 - 150.0 * large - 120.0 * small + 120.0 * north) / 230.0 + (slope - 36.0) / 7.0
+    thin = np.where(z < tree_line, np.minimum(thin, (slope - 47.0 - 3.0 * small) / 4.0), thin)
+    cover[thin > 0.0] = Cover.SCREE
+    firm = (slope - 38.5 - 3.0 * small) / 4.0 - np.clip(hollow, -12.0, 12.0) / 9.0 + np.maximum(z - 2700.0, 0.0) / 900.0
+    cover[(thin > 0.0) & ((firm > 0.0) | (slope > 47.0))] = Cover.ROCK
     cover[relief.ice_m > 0.0] = Cover.ICE
-    cover[firn & ((relief.ice_m > 0.0) | (z > 3200.0))] = Cover.FIRN
-    cover[relief.floor.shore_m < 0.0] = Cover.WATER
+    firn = z > 3060.0 - 260.0 * north + 70.0 * large + 60.0 * small - 6.0 * np.clip(hollow, -15.0, 15.0)
+    firn &= slope < 46.0 + 4.0 * small + 0.3 * np.clip(hollow, -10.0, 15.0)
+    cover[firn] = Cover.FIRN
+    river = (relief.catchment_m2 > 9e6) & (relief.ice_m <= 0.0) & (z < 1400.0)
+    cover[river | (relief.floor.shore_m < 0.0)] = Cover.WATER
     return cover

@@ -18,10 +18,11 @@ from seasonscapes.terrain.flow import (
     route_flow,
     slump,
 )
-from seasonscapes.terrain.noise import fractal_noise
+from seasonscapes.terrain.noise import fractal_noise, spline_noise
 from seasonscapes.terrain.synthetic_ice import grow_ice
 from seasonscapes.terrain.synthetic_plan import (
     LAKE_LEVEL_M,
+    Plan,
     ValleyFloor,
     anchored,
     plan_of,
@@ -40,15 +41,16 @@ class _Stage:
     noise_m: float
     keep_m: float  # uplift holds the shape above this wavelength
     cliff_deg: float
+    strata_m: float  # spacing of ledges, 0 for none
     sharpen: float  # gives back to arêtes what the change to a regular grid takes
     margin_m: float
 
 
 _STAGES = (
-    _Stage(120.0, 24, 40.0, 40.0, 800.0, 54.0, 0.9, 960.0),
-    _Stage(60.0, 8, 20.0, 14.0, 400.0, 58.0, 0.9, 480.0),
-    _Stage(30.0, 5, 8.0, 6.0, 200.0, 62.0, 0.8, 240.0),
-    _Stage(15.0, 3, 3.0, 2.5, 100.0, 66.0, 0.6, 120.0),
+    _Stage(120.0, 24, 40.0, 40.0, 800.0, 54.0, 0.0, 0.9, 960.0),
+    _Stage(60.0, 8, 24.0, 18.0, 400.0, 58.0, 0.0, 0.9, 480.0),
+    _Stage(30.0, 6, 18.0, 12.0, 220.0, 63.0, 190.0, 0.9, 240.0),
+    _Stage(15.0, 5, 11.0, 5.0, 120.0, 68.0, 92.0, 0.8, 120.0),
 )
 
 
@@ -95,8 +97,25 @@ def _carve_troughs(z: np.ndarray, area: np.ndarray, spacing_m: float) -> np.ndar
     return z
 
 
-def _dissect(z: np.ndarray, lattice: Lattice, seed: int, stage: _Stage) -> np.ndarray:
-    """Let rivers cut into a surface while uplift holds its shape at long wavelengths."""
+def _terraced(z: np.ndarray, lattice: Lattice, seed: int, period_m: float) -> np.ndarray:
+    """Ledges and steps of gently dipping strata on steep ground."""
+    spacing = lattice.spacing_m
+    steep = np.hypot(*np.gradient(z, spacing))
+    axis = (np.arange(z.shape[0]) - (z.shape[0] - 1) / 2.0) * spacing
+    fold = 70.0 * spline_noise(seed + 51, 4000.0, axis, -axis) + 14.0 * spline_noise(seed + 52, 500.0, axis, -axis)
+    level = (z + 0.13 * lattice.east_m - 0.09 * lattice.north_m + fold) / period_m
+    inside = level - np.floor(level)
+    step = inside * inside * (3.0 - 2.0 * inside)
+    strength = 0.55 * np.clip((steep - 0.7) / 0.5, 0.0, 1.0) * np.clip((z - 1100.0) / 600.0, 0.3, 1.0)
+    strength *= np.clip(0.6 + 0.5 * spline_noise(seed + 53 + int(period_m), 1200.0, axis, -axis), 0.0, 1.0)
+    return z + strength * period_m * (step - inside)
+
+
+def _dissect(z: np.ndarray, lattice: Lattice, seed: int, stage: _Stage, bare: np.ndarray) -> np.ndarray:
+    """Let rivers cut into a surface while uplift holds its shape at long wavelengths.
+
+    ``bare (H, W)`` in [0, 1] is how freely water reaches the rock: turf and ice protect it.
+    """
     spacing = stage.spacing_m
     outlets, links = lattice.border, links_of(lattice)
     cell_area = np.full(z.shape, spacing**2)
@@ -107,10 +126,39 @@ def _dissect(z: np.ndarray, lattice: Lattice, seed: int, stage: _Stage) -> np.nd
     for _ in range(stage.rounds):
         routes = route_flow(z, links, outlets)
         area = accumulate(routes, cell_area)
-        z = incise(z, routes, stage.strength_m * hardness * (area / 1e6) ** 0.45)
+        z = incise(z, routes, stage.strength_m * hardness * bare * (area / 1e6) ** 0.4)
         z = slump(z, links, limit, 2)
         z = z + _lowpass(held - z, stage.keep_m, spacing)
     return z
+
+
+def _talus(z: np.ndarray, catchment_m2: np.ndarray, spacing_m: float) -> np.ndarray:
+    """Cones of debris at the foot of couloirs, at the angle of repose (about 33°)."""
+    smooth = _lowpass(z, 25.0, spacing_m)
+    slope = np.hypot(*np.gradient(smooth, spacing_m))
+    concave = _lowpass(z, 75.0, spacing_m) - smooth
+    walls = cv2.dilate(slope.astype(np.float32), np.ones((2 * round(90.0 / spacing_m) + 1,) * 2, np.uint8))
+    open_ground = np.hypot(*np.gradient(_lowpass(z, 75.0, spacing_m), spacing_m)) < 0.8
+    foot = (concave > 3.0) & (slope > 0.4) & (slope < 0.85) & (walls > 1.25) & (z > 900.0) & (z < 3000.0) & open_ground
+    supply = np.where(foot & (catchment_m2 > 8e3) & (catchment_m2 < 6e5), catchment_m2, 0.0).astype(np.float32)
+    chief = cv2.dilate(supply, np.ones((2 * round(75.0 / spacing_m) + 1,) * 2, np.uint8))
+    piled, reach = z.copy(), round(255.0 / spacing_m)
+    axis = np.arange(-reach, reach + 1) * spacing_m
+    distance = np.hypot(axis[:, None], axis[None, :])
+    # Cones flatten outwards, where blocks roll far, and end in a low front.
+    drop = 0.70 * distance - 0.0004 * distance**2 + 0.006 * np.maximum(distance - 130.0, 0.0) ** 2
+    for row, column in zip(*np.nonzero((supply > 0.0) & (supply == chief)), strict=True):
+        if min(row, column) < reach or row >= z.shape[0] - reach or column >= z.shape[1] - reach:
+            continue
+        window = np.s_[row - reach : row + reach + 1, column - reach : column + reach + 1]
+        apex = z[row, column] + min(5.0 + 0.06 * np.sqrt(supply[row, column]), 28.0)
+        np.maximum(piled[window], apex - drop, out=piled[window])
+    return piled
+
+
+def _floor_on(floor: ValleyFloor, lattice: Lattice) -> ValleyFloor:
+    """The floors, known on a 60 m grid, at a lattice's points."""
+    return ValleyFloor(*(_sample(a, 60.0, lattice, order=1) for a in (floor.height, floor.beyond_m, floor.shore_m)))
 
 
 def _settled(z: np.ndarray, floor: ValleyFloor) -> np.ndarray:
@@ -153,13 +201,16 @@ def _glaciated(bed: np.ndarray, ice: tuple[np.ndarray, np.ndarray], lattice: Lat
     return np.where((thickness > 6.0) & (filled > 2.5), filled, 0.0)
 
 
-def _stage_surface(z: np.ndarray, lattice: Lattice, plan, stage: _Stage) -> np.ndarray:
+def _stage_surface(z: np.ndarray, lattice: Lattice, plan: Plan, floor: ValleyFloor, stage: _Stage,
+                   bare: np.ndarray) -> np.ndarray:  # fmt: skip
     """One stage of carving from heights on the jittered lattice to heights on the regular grid."""
     spacing = stage.spacing_m
     rng = np.random.default_rng(plan.seed + int(spacing) + 1)
+    if stage.strata_m:
+        z = z + bare * (_terraced(z, lattice, plan.seed, stage.strata_m) - z)
     steep = np.clip(np.hypot(*np.gradient(z, spacing)), 0.1, 1.2)
-    z = z + stage.noise_m * steep * _lowpass(rng.normal(0.0, 3.0, z.shape), 1.2 * spacing, spacing)
-    z = _dissect(z, lattice, plan.seed, stage)
+    z = z + stage.noise_m * bare * steep * _lowpass(rng.normal(0.0, 3.0, z.shape), 1.2 * spacing, spacing)
+    z = _dissect(z, lattice, plan.seed, stage, bare)
     if spacing >= 60.0:
         z = anchored(z, lattice, plan)
     if spacing == 60.0:
@@ -168,26 +219,42 @@ def _stage_surface(z: np.ndarray, lattice: Lattice, plan, stage: _Stage) -> np.n
     z = on_grid(z, lattice)
     above = np.maximum(z - _lowpass(z, 1.5 * spacing, spacing), 0.0)
     z = z + stage.sharpen * above * np.clip((z - 1700.0) / 900.0, 0.0, 1.0)
-    return _settled(z, valley_floor(plan, _regular((z.shape[0] - 1) // 2 * spacing, spacing)))
+    return _settled(z, _floor_on(floor, _regular((z.shape[0] - 1) // 2 * spacing, spacing)))
+
+
+def _bare(z: np.ndarray, spacing_m: float, ice: tuple[np.ndarray, np.ndarray] | None, lattice: Lattice) -> np.ndarray:
+    """How freely water reaches the rock, ``(H, W)`` in [0, 1]: little under turf, hardly at all under ice."""
+    if ice is None:
+        return np.ones_like(z)
+    steep = _lowpass(np.hypot(*np.gradient(z, spacing_m)), 60.0, spacing_m)
+    bare = np.clip(0.2 + (z - 1500.0) / 1100.0 + 1.4 * (steep - 0.8), 0.12, 1.0)
+    return bare * (1.0 - 0.92 * np.clip((_sample(ice[0], 60.0, lattice, order=1) - 30.0) / 50.0, 0.0, 1.0))
 
 
 def relief(half_m: float, spacing_m: float, seed: int) -> Relief:
     """The massif on the regular grid of ``spacing_m`` (one of the stages') reaching ``half_m`` from its centre."""
     plan = plan_of(seed)
+    floor = valley_floor(plan, _regular(half_m + 1020.0, 60.0))
     z = ice = None
     for stage in (stage for stage in _STAGES if stage.spacing_m >= spacing_m):
-        rng = np.random.default_rng(seed + int(stage.spacing_m))
-        lattice = jittered_lattice(half_m + stage.margin_m, stage.spacing_m, 0.38, rng)
-        z = sketched_heights(plan, lattice) if z is None else _sample(z, 2.0 * stage.spacing_m, lattice)
-        z = _stage_surface(z, lattice, plan, stage)
-        if stage.spacing_m == 60.0:
+        spacing = stage.spacing_m
+        rng = np.random.default_rng(seed + int(spacing))
+        lattice = jittered_lattice(half_m + stage.margin_m, spacing, 0.38, rng)
+        z = sketched_heights(plan, lattice) if z is None else _sample(z, 2.0 * spacing, lattice)
+        z = _stage_surface(z, lattice, plan, floor, stage, _bare(z, spacing, ice, lattice))
+        if spacing == 60.0:
             ice = _glaciers(z)
+            z = z + np.clip((ice[0] - 40.0) / 60.0, 0.0, 0.85) * (_lowpass(z, 110.0, spacing) - z)
+    if spacing_m < 60.0:
+        lattice = _regular((z.shape[0] - 1) // 2 * spacing_m, spacing_m)
+        routes = route_flow(z, links_of(lattice), lattice.border)
+        z = _talus(z, accumulate(routes, np.full(z.shape, spacing_m**2)), spacing_m)
     edge = (z.shape[0] - 1) // 2 - round(half_m / spacing_m)
     z = z[edge:-edge, edge:-edge]
     regular = _regular(half_m, spacing_m)
     thickness = _glaciated(z, ice, regular)
     z = z + thickness
-    floor = valley_floor(plan, regular)
+    floor = _floor_on(floor, regular)
     bank = LAKE_LEVEL_M + np.clip(0.04 * floor.shore_m, 0.0, 2.0)
     z = np.where(floor.shore_m < 0.0, LAKE_LEVEL_M, np.maximum(z, bank))
     routes = route_flow(z, links_of(regular), regular.border)
