@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "seasonscapes"
 # Lowest first; a module may import from its own floor or from below.
 FLOORS = [
-    ("words", {"errors", "declaration", "frames", "images", "bundled", "civil_time", ""}),
+    ("words", {"errors", "declaration", "frames", "images", "exposure", "bundled", "civil_time", ""}),
     ("sky", {"sky"}),
     ("nouns", {"scene", "terrain", "cameras"}),
     ("wall", {"rendering"}),

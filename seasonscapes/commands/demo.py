@@ -122,7 +122,8 @@ class _Studio:
     def _render(self, path: Path, panel: Panel, size_px: tuple[int, int], spp: int, record: str) -> None:
         from seasonscapes.civil_time import resolve_time
         from seasonscapes.daylight import light_for
-        from seasonscapes.images import auto_exposure_ev100, expose, tone_curve, write_png
+        from seasonscapes.exposure import develop, exposure_ev100
+        from seasonscapes.images import write_png
         from seasonscapes.pipeline import albedo_for, camera_for
         from seasonscapes.rendering.radiance import render_view
         from seasonscapes.rendering.scene import mi_mesh, relight
@@ -137,9 +138,9 @@ class _Studio:
             self.mi_terrain = mi_mesh(place.terrain, albedo_for(place, time).values)
         scene = relight(self.mi_terrain, light, max_height_m=float(place.terrain.vertices[:, 2].max()))
         picture = render_view(scene, camera, spp=spp)
-        ev100 = auto_exposure_ev100(picture.radiance)
+        ev100 = exposure_ev100(picture.radiance)
         say(f"demo: {path.name}  {panel.caption}; sun {moment.sun.elevation_deg:+.1f}°, EV {ev100:.1f}")
-        write_png(path, tone_curve(expose(picture.radiance, ev100)), metadata={"seasonscapes:panel": record})
+        write_png(path, develop(picture.radiance, ev100), metadata={"seasonscapes:panel": record})
 
 
 def contact_sheet(path: Path, pictures: list[Path], captions: list[str], *, columns: int) -> None:

@@ -73,7 +73,7 @@ def render(
     cloudiness
         Share of the sky that clouds cover, 0 to 1.
     exposure
-        auto, or an exposure value EV100 (15 is a sunny day).
+        auto (a camera), eye (a person who has adapted), or an exposure value EV100 (15 is a sunny day).
     seed
         Equal seeds give equal pictures.
     output
@@ -95,7 +95,9 @@ def render(
         raise InputError(
             "--output", "unknown kind of picture", got=str(output), expected="a name that ends in .png or .exr"
         )
-    ev100 = parse_exposure(exposure)
+    from seasonscapes.exposure import develop, exposure_ev100, parse_exposure
+
+    metering = parse_exposure(exposure)
     size_px = parse_size(size)
     for name, value, low, high in (
         ("--spp", spp, 1, 1 << 20),
@@ -107,7 +109,7 @@ def render(
 
     from seasonscapes.civil_time import resolve_time
     from seasonscapes.daylight import light_for
-    from seasonscapes.images import auto_exposure_ev100, expose, tone_curve, write_png
+    from seasonscapes.images import write_png
     from seasonscapes.pipeline import MeshOptions, albedo_for, camera_for, find_scene, load_place
     from seasonscapes.rendering.backend import use_backend
     from seasonscapes.rendering.radiance import render_view
@@ -131,7 +133,7 @@ def render(
     built = build_scene(place.terrain, albedo.values, light)
     with progress_bar("path tracing") as progress:
         picture = render_view(built, pinhole, spp=spp, seed=seed, max_depth=max_depth, progress=progress)
-    chosen_ev = auto_exposure_ev100(picture.radiance) if ev100 is None else ev100
+    chosen_ev = exposure_ev100(picture.radiance, metering)
     record: dict[str, Any] = {
         "output": str(output),
         "scene": place.scene.name,
@@ -151,25 +153,12 @@ def render(
     }
     if suffix == ".png":
         metadata = {"seasonscapes": json_module.dumps(record), "Copyright": place.scene.attribution}
-        write_png(output, tone_curve(expose(picture.radiance, chosen_ev)), metadata=metadata)
+        write_png(output, develop(picture.radiance, chosen_ev, eye=metering == "eye"), metadata=metadata)
     else:
         save_layers(output, place, pinhole, view, picture, albedo, record)
     record["seconds"] = round(clock.perf_counter() - start, 2)
     finish(record, [f"{output}  ({size_px[0]} × {size_px[1]}, {spp} samples per pixel, EV {chosen_ev:.1f}, "
                     f"{record['seconds']} s, {backend.variant})"], as_json=json)  # fmt: skip
-
-
-def parse_exposure(text: str) -> float | None:
-    """An EV100, or ``None`` for ``auto``."""
-    if text == "auto":
-        return None
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not -20.0 <= value <= 40.0:
-        raise InputError("--exposure", "not an exposure", got=text, expected="auto, or an EV100 between -20 and 40")
-    return value
 
 
 def chosen_view(
