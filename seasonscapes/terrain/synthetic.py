@@ -35,6 +35,8 @@ class SyntheticPlace:
         Steepness [deg] and northward component of the unit normal, float32.
     hollow_m
         Depth below the surroundings [m], float32: snow gathers there.
+    debris
+        Share of the glaciers under moraine, float32 in [0, 1].
     seed, spacing_m
         What it was made from.
     """
@@ -44,6 +46,7 @@ class SyntheticPlace:
     slope_deg: np.ndarray
     northness: np.ndarray
     hollow_m: np.ndarray
+    debris: np.ndarray
     seed: int
     spacing_m: float
 
@@ -82,7 +85,16 @@ def alpine_massif(*, seed: int = 1912, size_m: float = 12000.0, spacing_m: float
     z = shape.elevation.astype(np.float32)
     smooth = cv2.GaussianBlur(z, (0, 0), 90.0 / spacing_m)
     slope, northness = slope_and_northness(z, spacing_m)
-    return SyntheticPlace(Raster(z[..., None], transform, CRS), cover, slope, northness, smooth - z, seed, spacing_m)
+    return SyntheticPlace(
+        Raster(z[..., None], transform, CRS),
+        cover,
+        slope,
+        northness,
+        smooth - z,
+        shape.debris.astype(np.float32),
+        seed,
+        spacing_m,
+    )
 
 
 def save_place(place: SyntheticPlace, path: str | os.PathLike) -> None:
@@ -90,7 +102,7 @@ def save_place(place: SyntheticPlace, path: str | os.PathLike) -> None:
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         np.savez_compressed(file, elevation=place.elevation.values, transform=np.array(place.elevation.transform)[:6],
                             crs=place.elevation.crs, cover=place.cover, slope_deg=place.slope_deg,
-                            northness=place.northness, hollow_m=place.hollow_m, seed=place.seed,
+                            northness=place.northness, hollow_m=place.hollow_m, debris=place.debris, seed=place.seed,
                             spacing_m=place.spacing_m)  # fmt: skip
 
 
@@ -100,7 +112,7 @@ def load_place(path: str | os.PathLike) -> SyntheticPlace:
 
     with np.load(path) as held:
         raster = Raster(held["elevation"], Affine(*held["transform"]), str(held["crs"]))
-        maps = {name: held[name] for name in ("cover", "slope_deg", "northness", "hollow_m")}
+        maps = {name: held[name] for name in ("cover", "slope_deg", "northness", "hollow_m", "debris")}
         return SyntheticPlace(raster, **maps, seed=int(held["seed"]), spacing_m=float(held["spacing_m"]))
 
 

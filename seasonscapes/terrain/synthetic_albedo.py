@@ -153,6 +153,16 @@ def _ground(place, day: float, rows: slice, upsample: int) -> tuple[np.ndarray, 
         if not here.any():
             continue
         albedo[here] = _periodic(local_day[here], _TURNING[kind]) if kind in _TURNING else np.float32(_STEADY[kind])
+    ice = cover == Cover.ICE
+    if ice.any():
+        debris = _block(place.debris, rows, upsample, cv2.INTER_LINEAR)
+        dirt = np.clip(1.2 * debris + 0.35 * grain + 0.2 * broad - 0.45, 0.0, 0.8) + 0.30 * _smoothstep(2700.0, 1500.0, z)
+        dirt = np.clip(dirt, 0.0, 0.92)[ice, None]
+        # Crevasses and ogives lie across the flow, along the contours.
+        crevasse = np.sin(z * (2.0 * np.pi / 11.0) + 2.5 * grain + 3.0 * broad)[ice, None]
+        albedo[ice] = (albedo[ice] + dirt * (0.8 * np.float32(_STEADY[Cover.SCREE]) - albedo[ice])) * (
+            1.0 + 0.07 * crevasse
+        )
     _texture(albedo, cover, z, grain, broad, (east, north), seed)
     return albedo, cover
 

@@ -21,7 +21,7 @@ def grow_ice(bed: np.ndarray, spacing_m: float, equilibrium_m: np.ndarray, *, ro
     holds = np.clip((1.1 - np.hypot(*np.gradient(bed, spacing_m))) / 0.45, 0.0, 1.0)
     for _ in range(rounds):
         surface = bed + thickness
-        balance = np.clip(0.010 * (surface - equilibrium_m), -16.0, 1.2)
+        balance = np.clip(0.0085 * (surface - equilibrium_m), -14.0, 1.6)
         balance = np.where(balance > 0.0, balance * holds, balance)
         down = (surface[1:] - surface[:-1]) / spacing_m
         right = (surface[:, 1:] - surface[:, :-1]) / spacing_m

@@ -21,16 +21,16 @@ LAKE_LEVEL_M = 566.0
 # Knots (east km, north km, elevation m) about the massif's centre.
 _CRESTS = (
     # The main crest from the west-south-west, three summits, and the north-east arête.
-    ((-3.5, -4.3, 3050), (-2.6, -3.2, 4010), (-1.9, -2.7, 3500), (-0.7, -1.95, 4140), (0.3, -1.55, 3640),
-     (1.5, -0.75, 4020), (2.3, -0.2, 3350), (3.2, 0.35, 2600), (3.9, 0.85, 1900)),
-    ((-2.6, -3.2, 4010), (-2.5, -4.6, 3720), (-1.7, -5.7, 3560), (-1.1, -7.5, 3300)),
+    ((-3.5, -4.3, 3050), (-2.6, -3.2, 4180), (-1.8, -2.65, 3420), (-0.7, -1.95, 4290), (0.3, -1.55, 3520),
+     (1.5, -0.75, 4200), (2.3, -0.2, 3380), (3.2, 0.35, 2600), (3.9, 0.85, 1900)),
+    ((-2.6, -3.2, 4180), (-2.5, -4.6, 3720), (-1.7, -5.7, 3560), (-1.1, -7.5, 3300)),
     ((-2.5, -4.6, 3720), (-1.4, -4.4, 3480), (-0.7, -4.75, 3200)),
-    ((-0.7, -1.95, 4140), (-0.5, -2.8, 3640), (-0.2, -3.7, 3380)),
-    ((1.5, -0.75, 4020), (2.2, -1.9, 3520), (2.9, -3.3, 3740), (4.3, -4.2, 4000), (5.2, -5.6, 3500), (5.6, -7.5, 3200)),
-    ((2.9, -3.3, 3740), (2.3, -4.3, 3560), (2.0, -5.3, 3300), (1.9, -6.3, 2950)),
-    ((4.3, -4.2, 4000), (5.6, -3.0, 3560), (6.0, -1.5, 3660), (6.1, -0.1, 2900), (5.7, 0.9, 2000)),
+    ((-0.7, -1.95, 4290), (-0.5, -2.8, 3640), (-0.2, -3.7, 3380)),
+    ((1.5, -0.75, 4200), (2.2, -1.9, 3420), (2.9, -3.3, 3840), (4.3, -4.2, 4160), (5.2, -5.6, 3500), (5.6, -7.5, 3200)),
+    ((2.9, -3.3, 3840), (2.3, -4.3, 3560), (2.0, -5.3, 3300), (1.9, -6.3, 2950)),
+    ((4.3, -4.2, 4160), (5.6, -3.0, 3560), (6.0, -1.5, 3800), (6.1, -0.1, 2900), (5.7, 0.9, 2000)),
     # The spur with the meadow summit north of the wall.
-    ((0.3, -1.55, 3640), (0.1, -0.9, 2900), (-0.3, 0.0, 2120), (-1.0, 0.75, 2480), (-1.5, 1.5, 2240), (-1.9, 2.0, 1700)),
+    ((0.3, -1.55, 3520), (0.1, -0.9, 2900), (-0.3, 0.0, 2120), (-1.0, 0.75, 2480), (-1.5, 1.5, 2240), (-1.9, 2.0, 1700)),
     # Beyond the trough in the west, and beyond the lake in the north.
     ((-7.5, -4.0, 2900), (-6.3, -2.2, 2780), (-6.0, -0.2, 2500), (-5.9, 1.2, 2300), (-5.6, 2.2, 1500)),
     ((-7.5, 6.2, 1900), (-4.5, 6.3, 2020), (-2.0, 5.7, 2280), (0.4, 5.9, 2450), (2.4, 5.4, 2640), (4.8, 5.6, 2560),
@@ -38,15 +38,15 @@ _CRESTS = (
 )  # fmt: skip
 _VALLEYS = (
     # The main valley with the lake, then the trough that joins it.
-    ((7.5, 1.5, 1120), (5.4, 1.75, 1000), (3.6, 2.0, 820), (2.0, 2.45, 660), (1.0, 2.7, 590), (-0.6, 3.1, 566),
-     (-2.6, 3.35, 565), (-4.6, 3.5, 564), (-6.0, 3.9, 562), (-7.5, 4.3, 560)),
-    ((-4.2, 3.4, 566), (-4.1, 2.0, 640), (-4.25, 0.2, 740), (-4.5, -1.6, 860), (-4.6, -3.4, 1150), (-4.9, -4.9, 1750),
+    ((7.5, 1.5, 1120), (5.4, 1.75, 1000), (3.6, 2.0, 820), (2.0, 2.45, 660), (1.0, 2.7, 590), (-0.6, 3.1, 570),
+     (-2.6, 3.35, 570), (-4.6, 3.5, 570), (-6.0, 3.9, 566), (-7.5, 4.3, 562)),
+    ((-4.2, 3.4, 572), (-4.1, 2.0, 640), (-4.25, 0.2, 740), (-4.5, -1.6, 860), (-4.6, -3.4, 1150), (-4.9, -4.9, 1750),
      (-5.5, -7.5, 2500)),
     # Névé basins and their glaciers.
     ((-1.5, -3.4, 3280), (-0.7, -4.0, 3040), (0.3, -4.8, 2740), (1.0, -5.9, 2480), (1.4, -7.5, 2250)),
     ((1.1, -2.1, 3200), (1.1, -3.2, 2960), (0.7, -4.6, 2720)),
     ((3.3, -4.5, 3150), (2.9, -5.4, 2800), (2.4, -7.5, 2250)),
-    ((4.2, -2.9, 3150), (4.1, -1.9, 2700), (4.3, -0.7, 1950), (4.5, 0.5, 1250), (4.6, 1.7, 940)),
+    ((4.2, -3.2, 3150), (4.3, -2.2, 2850), (4.2, -1.2, 2350), (4.4, -0.2, 1800), (4.5, 0.8, 1250), (4.6, 1.7, 900)),
     ((6.3, -4.3, 2700), (6.8, -6.0, 2200), (7.5, -7.5, 1900)),
     ((7.2, -1.5, 2100), (7.4, 0.5, 1500), (7.5, 1.5, 1120)),
     # The foot of the north wall, its benches and the ravines below them.
@@ -73,7 +73,7 @@ def plan_of(seed: int) -> Plan:
     rng = np.random.default_rng(seed)
     moved: dict[tuple, np.ndarray] = {}
 
-    def points_along(lines) -> np.ndarray:
+    def points_along(lines, sag: float = 0.0) -> np.ndarray:
         points = []
         for line in lines:
             for knot in line:
@@ -84,10 +84,15 @@ def plan_of(seed: int) -> Plan:
             knots = np.array([moved[knot] for knot in line])
             along = np.append(0.0, np.cumsum(np.hypot(*np.diff(knots[:, :2], axis=0).T)))
             at = np.arange(0.0, along[-1], 50.0)
-            points.append(np.stack([np.interp(at, along, knots[:, k]) for k in range(3)], -1))
+            line_points = np.stack([np.interp(at, along, knots[:, k]) for k in range(3)], -1)
+            # Crests sag between summits like a rope, a twelfth of the span.
+            leg = np.clip(np.searchsorted(along, at, side="right") - 1, 0, len(along) - 2)
+            span = np.diff(along)[leg]
+            line_points[:, 2] -= sag * np.minimum(span, 1600.0) * np.sin(np.pi * (at - along[leg]) / span)
+            points.append(line_points)
         return np.concatenate(points)
 
-    return Plan(points_along(_CRESTS), points_along(_VALLEYS), points_along(_VALLEYS[:1]), seed)
+    return Plan(points_along(_CRESTS, sag=1.0 / 12.0), points_along(_VALLEYS), points_along(_VALLEYS[:1]), seed)
 
 
 def warped(lattice: Lattice, seed: int) -> Lattice:
@@ -162,7 +167,7 @@ def valley_floor(plan: Plan, lattice: Lattice) -> ValleyFloor:
     distance, index = cKDTree(points[:, :2]).query(np.stack([bent.east_m, bent.north_m], -1), k=12)
     weight = 1.0 / (distance + 60.0) ** 3
     height = (weight * points[index, 2]).sum(-1) / weight.sum(-1)
-    half_width = np.interp(height, [560.0, 580.0, 700.0, 1010.0], [450.0, 420.0, 230.0, 40.0])
+    half_width = np.interp(height, [560.0, 585.0, 700.0, 1010.0], [450.0, 420.0, 230.0, 40.0])
     bays = sum(a * warped_noise(plan.seed + 71 + k, w, lattice.east_m, lattice.north_m)
                for k, (w, a) in enumerate(((900.0, 60.0), (350.0, 30.0), (140.0, 12.0))))  # fmt: skip
     beyond = distance[..., 0] - half_width

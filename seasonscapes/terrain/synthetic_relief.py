@@ -18,7 +18,7 @@ from seasonscapes.terrain.flow import (
     route_flow,
     slump,
 )
-from seasonscapes.terrain.noise import fractal_noise, spline_noise
+from seasonscapes.terrain.noise import fractal_noise, spline_noise, warped_noise
 from seasonscapes.terrain.synthetic_ice import grow_ice
 from seasonscapes.terrain.synthetic_plan import (
     LAKE_LEVEL_M,
@@ -64,6 +64,8 @@ class Relief:
         Visible surface: ice and lake surface included [m].
     ice_m
         Ice thickness [m], 0 where there is none.
+    debris
+        Share of the ice under moraine, in [0, 1].
     catchment_m2
         Area draining through each cell [m²].
     floor
@@ -72,6 +74,7 @@ class Relief:
 
     elevation: np.ndarray
     ice_m: np.ndarray
+    debris: np.ndarray
     catchment_m2: np.ndarray
     floor: ValleyFloor
 
@@ -161,13 +164,14 @@ def _floor_on(floor: ValleyFloor, lattice: Lattice) -> ValleyFloor:
     return ValleyFloor(*(_sample(a, 60.0, lattice, order=1) for a in (floor.height, floor.beyond_m, floor.shore_m)))
 
 
-def _settled(z: np.ndarray, floor: ValleyFloor) -> np.ndarray:
+def _settled(z: np.ndarray, lattice: Lattice, floor: ValleyFloor, seed: int) -> np.ndarray:
     """Trough walls down to the valley floors, and sediment on these."""
     wall = floor.height + np.maximum(floor.beyond_m, 0.0) ** 2 / 300.0
     z = np.where(floor.beyond_m < 1500.0, _soft_minimum(z, wall, 40.0), z)
     fill = floor.height - 6.0 * np.clip(-floor.beyond_m / 300.0, 0.0, 1.0)
     weight = np.clip(-floor.beyond_m / 80.0, 0.0, 1.0)
-    return z + weight * (fill - z)
+    ripple = 1.3 * warped_noise(seed + 61, 330.0, lattice.east_m, lattice.north_m)
+    return z + weight * (fill + ripple - z)
 
 
 def _sample(z: np.ndarray, spacing_m: float, lattice: Lattice, order: int = 3) -> np.ndarray:
@@ -186,7 +190,7 @@ def _glaciers(bed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     coarse = cv2.GaussianBlur(bed, (0, 0), 1.0)[::2, ::2]
     down, right = np.gradient(_lowpass(coarse, 240.0, 120.0), 120.0)
     northness = down / np.sqrt(1.0 + down**2 + right**2)
-    ice = grow_ice(coarse, 120.0, 3080.0 - 260.0 * northness, rounds=350)
+    ice = grow_ice(coarse, 120.0, 3000.0 - 260.0 * northness, rounds=350)
     grid = _regular((bed.shape[0] - 1) // 2 * 60.0, 60.0)
     return tuple(_sample(_lowpass(a, 70.0, 120.0), 120.0, grid) for a in (ice, coarse + ice))
 
@@ -194,11 +198,47 @@ def _glaciers(bed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _glaciated(bed: np.ndarray, ice: tuple[np.ndarray, np.ndarray], lattice: Lattice) -> np.ndarray:
     """Ice thickness ``(H, W)`` [m] on a finer bed: deep ice is level across, thin ice lies on what is below."""
     thickness, surface = (_sample(a, 60.0, lattice) for a in ice)
-    deep = np.clip((thickness - 15.0) / 50.0, 0.0, 1.0)
-    down, right = np.gradient(bed, lattice.spacing_m)
-    clings = np.clip((1.25 - np.hypot(down, right)) / 0.3, 0.0, 1.0)
+    # Around a thick glacier even its thin spots are level: no pits over bumps of the coarse bed.
+    around = _lowpass(thickness, 150.0, lattice.spacing_m)
+    deep = np.clip((np.maximum(thickness, 0.9 * around) - 15.0) / 50.0, 0.0, 1.0)
+    steep = _lowpass(np.hypot(*np.gradient(bed, lattice.spacing_m)), 20.0, lattice.spacing_m)
+    clings = np.clip((1.1 + thickness / 60.0 - steep) / 0.3, 0.0, 1.0)
     filled = deep * (surface - bed) + (1.0 - deep) * 0.5 * thickness * clings
-    return np.where((thickness > 6.0) & (filled > 2.5), filled, 0.0)
+    filled = np.where(((thickness > 10.0) | (around > 35.0)) & (filled > 3.0), filled, 0.0)
+    # Scraps that no névé feeds have melted long ago.
+    label, count = ndimage.label(filled > 0.0, np.ones((3, 3)))
+    if not count:
+        return filled
+    numbers = np.arange(1, count + 1)
+    area = ndimage.sum_labels(np.ones_like(bed), label, numbers) * lattice.spacing_m**2
+    top = ndimage.maximum(bed, label, numbers)
+    lives = np.append(False, (area > 1.2e5) & (top > 2750.0))
+    return np.where(lives[label], filled, 0.0)
+
+
+def _moraines(ice: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Share of debris on the ice ``(H, W)`` of the 60 m grid, by tracing its way back up.
+
+    What flows down from névé is clean; what passed a rock wall below the snow line carries its fall.
+    """
+    thickness, surface = ice[0], _lowpass(ice[1], 150.0, 60.0)
+    down, right = np.gradient(surface, 60.0)
+    steep = np.hypot(down, right) + 1e-4
+    at = np.stack(np.nonzero(thickness > 10.0)).astype(float)
+    found, open_ = np.zeros(at.shape[1]), np.ones(at.shape[1], bool)
+    for _ in range(90):
+        here = at[:, open_]
+        state = [
+            ndimage.map_coordinates(a, here, order=1, mode="nearest")
+            for a in (thickness, surface, down / steep, right / steep)
+        ]
+        rock, snow = state[0] < 14.0, state[1] > 3020.0
+        found[np.flatnonzero(open_)[rock & ~snow]] = 1.0
+        at[:, open_] = here + 0.8 * np.stack(state[2:])
+        open_[np.flatnonzero(open_)[rock | snow]] = False
+    debris = np.zeros(thickness.shape, np.float32)
+    debris[thickness > 10.0] = found
+    return debris
 
 
 def _stage_surface(z: np.ndarray, lattice: Lattice, plan: Plan, floor: ValleyFloor, stage: _Stage,
@@ -211,7 +251,7 @@ def _stage_surface(z: np.ndarray, lattice: Lattice, plan: Plan, floor: ValleyFlo
     steep = np.clip(np.hypot(*np.gradient(z, spacing)), 0.1, 1.2)
     z = z + stage.noise_m * bare * steep * _lowpass(rng.normal(0.0, 3.0, z.shape), 1.2 * spacing, spacing)
     z = _dissect(z, lattice, plan.seed, stage, bare)
-    if spacing >= 60.0:
+    if spacing >= 30.0:
         z = anchored(z, lattice, plan)
     if spacing == 60.0:
         routes = route_flow(z, links_of(lattice), lattice.border)
@@ -219,7 +259,8 @@ def _stage_surface(z: np.ndarray, lattice: Lattice, plan: Plan, floor: ValleyFlo
     z = on_grid(z, lattice)
     above = np.maximum(z - _lowpass(z, 1.5 * spacing, spacing), 0.0)
     z = z + stage.sharpen * above * np.clip((z - 1700.0) / 900.0, 0.0, 1.0)
-    return _settled(z, _floor_on(floor, _regular((z.shape[0] - 1) // 2 * spacing, spacing)))
+    regular = _regular((z.shape[0] - 1) // 2 * spacing, spacing)
+    return _settled(z, regular, _floor_on(floor, regular), plan.seed)
 
 
 def _bare(z: np.ndarray, spacing_m: float, ice: tuple[np.ndarray, np.ndarray] | None, lattice: Lattice) -> np.ndarray:
@@ -255,7 +296,8 @@ def relief(half_m: float, spacing_m: float, seed: int) -> Relief:
     thickness = _glaciated(z, ice, regular)
     z = z + thickness
     floor = _floor_on(floor, regular)
-    bank = LAKE_LEVEL_M + np.clip(0.04 * floor.shore_m, 0.0, 2.0)
+    bank = LAKE_LEVEL_M + np.clip(0.04 * floor.shore_m, 0.0, 2.0) - 0.03 * np.maximum(floor.shore_m - 120.0, 0.0)
     z = np.where(floor.shore_m < 0.0, LAKE_LEVEL_M, np.maximum(z, bank))
     routes = route_flow(z, links_of(regular), regular.border)
-    return Relief(z, thickness, accumulate(routes, np.full(z.shape, spacing_m**2)), floor)
+    debris = np.clip(_sample(_moraines(ice), 60.0, regular, order=1), 0.0, 1.0)
+    return Relief(z, thickness, debris, accumulate(routes, np.full(z.shape, spacing_m**2)), floor)
