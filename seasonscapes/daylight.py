@@ -14,15 +14,18 @@ import numpy as np
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.pipeline import Place, camera_geodetic
 from seasonscapes.sky.air import Atmosphere
-from seasonscapes.sky.atmosphere import AtmosphereTables, atmosphere_tables, load_tables, save_tables
+from seasonscapes.sky.atmosphere import (
+    TABLES_REVISION,
+    AtmosphereTables,
+    atmosphere_tables,
+    load_tables,
+    save_tables,
+)
 from seasonscapes.sky.ephemeris import LunarPosition, SolarPosition, moon_position, sun_position
 from seasonscapes.sky.illuminate import illuminate
 from seasonscapes.sky.illumination import Illumination
 from seasonscapes.sky.models import SkyModel
 from seasonscapes.workspace import Workspace, build_once
-
-# Raised when the tables change for an equal atmosphere.
-TABLES_REVISION = 1
 
 
 @dataclass(frozen=True)

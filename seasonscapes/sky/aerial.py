@@ -13,12 +13,15 @@ from functools import lru_cache
 import numpy as np
 
 from seasonscapes.frames import angles_from_direction
-from seasonscapes.sky.air import TOP_HEIGHT_M, aerosol_phase, constituent_densities, delta_scaled, gas_phase, optics
-from seasonscapes.sky.paths import equal_cells, horizon_elevation_rad, sun_transfer, trace_rays
+from seasonscapes.images import REC709_LUMINANCE
+from seasonscapes.sky.air import TOP_HEIGHT_M, Atmosphere, delta_scaled, gas_phase, optics
+from seasonscapes.sky.aureole import spread_aerosol_phase
+from seasonscapes.sky.paths import equal_cells, horizon_elevation_rad, resampled, sun_transfer, towards_sun, trace_rays
 from seasonscapes.sky.scattering import (
     HARMONIC_ORDER,
     AtmosphereTables,
     Samples,
+    cell_columns,
     diffuse_source,
     local_sun,
     sample_cells,
@@ -69,16 +72,19 @@ class SeenLight:
     ----------
     luminary_direction
         Apparent unit vector towards the source ``(3,)``.
+    aerosol_depth
+        Vertical scattering depth of the aerosol for red, green and blue ``(3,)``.
     asymmetry
         Of the aerosol.
     horizon_rad
         As in `View`.
     parts
-        ``(K, A, 3, 3)``: by elevation and azimuth from the source, what gas and aerosol scatter once, over their phase
-        functions, and all else, as photometric RGB [cd/m²].
+        ``(K, A, 4, 3)``: by elevation and azimuth from the source, what gas and aerosol scatter once, over their phase
+        functions, and all else, as photometric RGB [cd/m²]; and the mean column of aerosol on the light's way.
     """
 
     luminary_direction: np.ndarray
+    aerosol_depth: np.ndarray
     asymmetry: float
     horizon_rad: float
     parts: np.ndarray
@@ -95,7 +101,7 @@ class AirBetween:
     depth_rgb
         ``(K, M, 3)`` minus the logarithm of the transmittance up to each of the fixed distances.
     lights
-        Sky of every luminary, with the parts up to each distance ``(K, A, M, 3, 3)``.
+        Sky of every luminary, with the parts up to each distance ``(K, A, M, 4, 3)``.
     """
 
     horizon_rad: float
@@ -124,7 +130,7 @@ class AirBetween:
         endless = np.isinf(depth)
         for light, near in self.lights:
             column, fa = _column_of(azimuth_deg, light.luminary_direction)
-            mixed = np.zeros((*depth.shape, 3, 3))
+            mixed = np.zeros((*depth.shape, 4, 3))
             for k, wk in ((0, 1.0 - fr), (1, fr)):
                 for a, wa in ((0, 1.0 - fa), (1, fa)):
                     for d, wd in ((0, 1.0 - fd), (1, fd)):
@@ -148,12 +154,15 @@ def _view(atmosphere, height_m: float) -> View:
     sky = sample_cells(atmosphere, scaled, paths, equal_cells(atmosphere, paths, _CELLS))
     edges = np.minimum(_DISTANCE_EDGES_M, paths.distance_m[:, -1:])
     near = sample_cells(atmosphere, scaled, paths, edges)
-    density = constituent_densities(atmosphere, near.paths.height_m)
-    middle = constituent_densities(atmosphere, near.height_m)
-    column = (density[..., 1:] + density[..., :-1] + 4.0 * middle) / 6.0 * np.diff(near.paths.distance_m, axis=1)
-    depth = np.einsum("cks,cb->ksb", column, plain.extinction)
+    depth = np.einsum(
+        "cks,cb->ksb", cell_columns(atmosphere, near.paths, resampled(paths, _middles(edges))), plain.extinction
+    )
     depth = np.concatenate([np.zeros_like(depth[:, :1]), np.cumsum(depth, axis=1)], axis=1)
     return View(height_m, horizon, elevation, sky, near, depth)
+
+
+def _middles(edges: np.ndarray) -> np.ndarray:
+    return 0.5 * (edges[:, 1:] + edges[:, :-1])
 
 
 def observer_view(tables: AtmosphereTables, height_m: float) -> View:
@@ -182,12 +191,13 @@ def seen_sky(tables: AtmosphereTables, view: View, luminary_direction: np.ndarra
     irradiance
         Spectral irradiance above the air over that of the sun at 1 au ``(B,)``.
     """
-    parts = _integrate(tables, view.sky, view.elevation_rad, true_elevation_rad)[:, :, -1]
-    parts[:, :, 2] += _ground(tables, view.sky, true_elevation_rad)
-    rgb = _azimuths_filled(parts) @ (rgb_from_transfer() * irradiance).T
+    bands = _integrate(tables, view.sky, view.elevation_rad, true_elevation_rad)[:, :, -1]
+    bands[:, :, 2] += _ground(tables, view.sky, true_elevation_rad)
+    parts = _as_rgb(_azimuths_filled(bands), irradiance)
     return SeenLight(
-        np.asarray(luminary_direction, float), tables.atmosphere.asymmetry, view.horizon_rad, rgb.astype(np.float32)
-    )
+        np.asarray(luminary_direction, float), _rgb_aerosol_depth(tables.atmosphere), tables.atmosphere.asymmetry,
+        view.horizon_rad, parts,
+    )  # fmt: skip
 
 
 def air_between(tables: AtmosphereTables, view: View, lights: tuple[tuple[SeenLight, float, np.ndarray], ...],
@@ -208,7 +218,7 @@ def air_between(tables: AtmosphereTables, view: View, lights: tuple[tuple[SeenLi
     for sky, elevation, irradiance in lights:
         parts = _integrate(tables, view.near, view.elevation_rad, elevation, cumulative=True)
         parts = np.concatenate([np.zeros_like(parts[:, :, :1]), parts], axis=2)
-        filled.append((sky, (_azimuths_filled(parts) @ (rgb_from_transfer() * irradiance).T).astype(np.float32)))
+        filled.append((sky, _as_rgb(_azimuths_filled(parts), irradiance)))
     return AirBetween(view.horizon_rad, depth_rgb, tuple(filled))
 
 
@@ -224,26 +234,51 @@ def sky_radiance(light: SeenLight, direction: np.ndarray) -> np.ndarray:
 
 
 def _with_phases(light: SeenLight, parts: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    cosine = np.clip(direction @ light.luminary_direction, -1.0, 1.0)[..., None]
-    gas, aerosol = gas_phase(cosine), aerosol_phase(cosine, light.asymmetry)
-    return parts[..., 0, :] * gas + parts[..., 1, :] * aerosol + parts[..., 2, :]
+    cosine = np.clip(direction @ light.luminary_direction, -1.0, 1.0)
+    depth = parts[..., 3, :] * light.aerosol_depth
+    aerosol = spread_aerosol_phase(cosine, depth, light.asymmetry, HARMONIC_ORDER)
+    return parts[..., 0, :] * gas_phase(cosine)[..., None] + parts[..., 1, :] * aerosol + parts[..., 2, :]
+
+
+def _rgb_aerosol_depth(atmosphere: Atmosphere) -> np.ndarray:
+    """Scattering depth ``(3,)`` at the middles of the three primaries."""
+    return np.interp([610.0, 550.0, 465.0], WAVELENGTHS_NM, optics(atmosphere).scattering[1])
+
+
+def _as_rgb(parts: np.ndarray, irradiance: np.ndarray) -> np.ndarray:
+    """Transfers and aerosol columns ``(..., 4, B)`` as `SeenLight` keeps them, ``(..., 4, 3)`` float32."""
+    rgb = parts[..., :3, :] @ (rgb_from_transfer() * irradiance).T
+    return np.concatenate([rgb, np.repeat(parts[..., 3:, :1], 3, axis=-1)], axis=-2).astype(np.float32)
 
 
 def _integrate(tables: AtmosphereTables, samples: Samples, elevation_rad: np.ndarray, sun_rad: float, *,
                cumulative: bool = False) -> np.ndarray:  # fmt: skip
-    """Transfers ``(K, A, M or 1, 3, B)``: gas and aerosol once (over their phase functions) and diffuse light."""
+    """Transfers ``(K, A, M or 1, 4, B)``: gas and aerosol once (over their phase functions) and diffuse light.
+
+    The fourth part is the mean column of aerosol along sun, scattering point and eye, the same in every band.
+    """
     atmosphere = tables.atmosphere
     plain = optics(atmosphere)
     scaled = delta_scaled(plain, HARMONIC_ORDER)
     azimuth = (np.arange(_AZIMUTHS) + 0.5) * np.pi / _AZIMUTHS
     sine, geometry = sun_geometry(samples, elevation_rad, np.full(_AZIMUTHS, sun_rad), azimuth)
-    arriving = sun_transfer(atmosphere, tables.sun_columns, scaled, samples.height_m[..., None], np.arcsin(sine))
+    column, share = towards_sun(atmosphere, tables.sun_columns, samples.height_m[..., None], np.arcsin(sine))
+    arriving = np.exp(-(column @ scaled.extinction)) * share[..., None]
     # Scattering with the full coefficient, attenuation with the scaled one: TMS.
     sigma = scattering_per_m(atmosphere, plain, samples.height_m) * samples.weight
+    aerosol = arriving * sigma[1][:, :, None]
     diffuse = diffuse_source(atmosphere, scaled, tables.moments, samples, geometry) * samples.weight[:, :, None]
-    terms = np.stack([arriving * sigma[0][:, :, None], arriving * sigma[1][:, :, None], diffuse], axis=3)
-    terms = terms.swapaxes(1, 2)
-    return np.cumsum(terms, axis=2) if cumulative else terms.sum(axis=2, keepdims=True)
+    # Weighed by the luminance that each cell scatters.
+    bright = aerosol @ (REC709_LUMINANCE @ rgb_from_transfer()) + 1e-30
+    passed = bright * (column[..., 1] + samples.aerosol_column[..., None])
+    terms = np.stack([arriving * sigma[0][:, :, None], aerosol, diffuse], axis=3).swapaxes(1, 2)
+    bright, passed = bright.swapaxes(1, 2), passed.swapaxes(1, 2)
+    if cumulative:
+        terms, bright, passed = np.cumsum(terms, axis=2), np.cumsum(bright, axis=2), np.cumsum(passed, axis=2)
+    else:
+        terms, bright, passed = (part.sum(axis=2, keepdims=True) for part in (terms, bright, passed))
+    mean = np.broadcast_to((passed / bright)[..., None, None], (*terms.shape[:3], 1, terms.shape[-1]))
+    return np.concatenate([terms, mean], axis=3)
 
 
 def _ground(tables: AtmosphereTables, samples: Samples, sun_rad: float) -> np.ndarray:

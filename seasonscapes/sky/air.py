@@ -53,7 +53,7 @@ class Atmosphere:
 
     aerosol_optical_depth_500nm: float = 0.10
     angstrom_exponent: float = 1.3
-    aerosol_scale_height_m: float = 1500.0
+    aerosol_scale_height_m: float = 2000.0
     single_scattering_albedo: float = 0.93
     asymmetry: float = 0.68
     ozone_du: float = 320.0
@@ -106,7 +106,7 @@ def visibility_extinction_per_m(visibility_m: float) -> float:
 
 
 def aerosol_optical_depth_from_visibility(visibility_m: float, *, height_m: float = 0.0, angstrom_exponent: float = 1.3,
-                                          aerosol_scale_height_m: float = 1500.0, ground_height_m: float = 0.0,
+                                          aerosol_scale_height_m: float = 2000.0, ground_height_m: float = 0.0,
                                           ) -> float:  # fmt: skip
     """Aerosol optical depth at 500 nm that gives a meteorological range at a height.
 

@@ -27,6 +27,7 @@ from seasonscapes.sky.scattering import AtmosphereTables, Moments, atmosphere_ta
 from seasonscapes.sky.spectrum import WAVELENGTHS_NM, rgb_from_transfer
 
 __all__ = [
+    "TABLES_REVISION",
     "Atmosphere",
     "AtmosphereTables",
     "atmosphere_tables",
@@ -38,6 +39,8 @@ __all__ = [
     "true_elevation_deg",
 ]
 
+# Raised whenever the tables of an equal atmosphere change.
+TABLES_REVISION = 2
 # Below this normal illuminance a luminary casts no visible shadow [lx].
 _FAINTEST_LX = 1e-6
 
@@ -152,15 +155,23 @@ def save_tables(path: str | PathLike, tables: AtmosphereTables) -> None:
     """Write tables to one ``.npz`` file, atomically."""
     with atomic_path(path) as temporary:
         np.savez_compressed(
-            temporary, atmosphere=json.dumps(asdict(tables.atmosphere)), lowest_rad=tables.sun_columns.lowest_rad,
+            temporary, revision=TABLES_REVISION, atmosphere=json.dumps(asdict(tables.atmosphere)), lowest_rad=tables.sun_columns.lowest_rad,
             log_columns=tables.sun_columns.log_columns, log_mean=tables.moments.log_mean, ratio=tables.moments.ratio,
             ground_irradiance=tables.moments.ground_irradiance,
         )  # fmt: skip
 
 
 def load_tables(path: str | PathLike) -> AtmosphereTables:
-    """Tables of `save_tables`."""
+    """Tables of `save_tables`.
+
+    Raises
+    ------
+    ValueError
+        For a file of another revision; compute it anew.
+    """
     with np.load(path, allow_pickle=False) as file:
+        if "revision" not in file or int(file["revision"]) != TABLES_REVISION:
+            raise ValueError(f"{path}: atmosphere tables of another revision than {TABLES_REVISION}")
         fields = json.loads(str(file["atmosphere"]))
         if isinstance(fields["ground_albedo"], list):
             fields["ground_albedo"] = tuple(fields["ground_albedo"])

@@ -154,35 +154,48 @@ def sun_columns(atmosphere: Atmosphere) -> SunColumns:
     return SunColumns(true[:, 0], table)
 
 
-def sun_transfer(atmosphere: Atmosphere, columns: SunColumns, optics: Optics, height_m, elevation_rad, *,
-                 radius_deg: float = SUN_RADIUS_DEG) -> np.ndarray:  # fmt: skip
-    """Share of the sun's normal irradiance that arrives at points, per band ``(..., B)``.
-
-    Beer's law along the refracted ray, times the brightening by refraction, times the share of the disc that stands
-    above the ground's horizon, seen from the middle of that share: the disc sets gradually.
+def towards_sun(atmosphere: Atmosphere, columns: SunColumns, height_m, elevation_rad, *,
+                radius_deg: float = SUN_RADIUS_DEG) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Columns of air between points and the sun, and how much of the sun's disc is there to be seen.
 
     Parameters
     ----------
     height_m, elevation_rad
         Of the points, and of the sun's centre as it would stand without refraction ``(...)``.
+
+    Returns
+    -------
+    columns
+        ``(..., 3)`` along the refracted ray, in units of the vertical columns.
+    share
+        ``(...)`` the part of the disc above the ground's horizon, times the brightening by refraction. The columns are
+        those towards the middle of that part: the disc sets gradually.
     """
     heights, elevations = columns.log_columns.shape[:2]
     above = np.clip((np.asarray(height_m) - atmosphere.ground_height_m) / _thickness_m(atmosphere), 0.0, 1.0)
     row = np.cbrt(above) * (heights - 1)
-    row0 = np.minimum(row.astype(int), heights - 2)
+    row0 = np.minimum(row.astype(np.int32), heights - 2)
     fr = row - row0
     lowest = columns.lowest_rad[row0] * (1.0 - fr) + columns.lowest_rad[row0 + 1] * fr
-    radius = np.radians(radius_deg)
-    visible, centre = _disc_above(np.asarray(elevation_rad) - lowest, radius)
+    visible, centre = _disc_above(np.asarray(elevation_rad) - lowest, np.radians(radius_deg))
     column = np.cbrt(np.clip(centre / (np.pi / 2 - lowest), 0.0, 1.0)) * (elevations - 1)
-    column0 = np.minimum(column.astype(int), elevations - 2)
+    column0 = np.minimum(column.astype(np.int32), elevations - 2)
     fc = (column - column0)[..., None]
     table, index = columns.log_columns.reshape(-1, 4), row0 * elevations + column0
     near = table[index] * (1.0 - fc) + table[index + 1] * fc
     far = table[index + elevations] * (1.0 - fc) + table[index + elevations + 1] * fc
     mixed = np.exp(near * (1.0 - fr)[..., None] + far * fr[..., None])
-    shown = np.exp(-(mixed[..., :3] @ optics.extinction))
-    return shown * (mixed[..., 3] * visible)[..., None]
+    return mixed[..., :3], mixed[..., 3] * visible
+
+
+def sun_transfer(atmosphere: Atmosphere, columns: SunColumns, optics: Optics, height_m, elevation_rad, *,
+                 radius_deg: float = SUN_RADIUS_DEG) -> np.ndarray:  # fmt: skip
+    """Share of the sun's normal irradiance that arrives at points, per band ``(..., B)``: Beer's law.
+
+    Parameters as in `towards_sun`.
+    """
+    column, share = towards_sun(atmosphere, columns, height_m, elevation_rad, radius_deg=radius_deg)
+    return np.exp(-(column @ optics.extinction)) * share[..., None]
 
 
 def _thickness_m(atmosphere: Atmosphere) -> float:

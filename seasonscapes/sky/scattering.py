@@ -39,12 +39,14 @@ from seasonscapes.sky.paths import (
 )
 from seasonscapes.sky.spectrum import WAVELENGTHS_NM
 
-HARMONIC_ORDER = 4
-_HEIGHTS, _AZIMUTHS, _CELLS = 20, 6, 24
-# Half a degree apart through twilight, where light falls by a factor of three a degree.
+# Delta-M takes aerosol's scattering within some 180°/L for unscattered. Along the horizon that is right only for narrow
+# peaks: with L = 4 the sky beside a setting sun comes out a fifth too bright, with 8 within a few per cent.
+HARMONIC_ORDER, LATER_ORDER = 8, 4
+_HEIGHTS, _AZIMUTHS, _CELLS = 14, 10, 24
+# Close through twilight, where light falls by a factor of three a degree.
 SUN_ELEVATION_KNOTS_DEG = np.concatenate([
-    np.arange(-30.0, -20.0, 2.0), np.arange(-20.0, -12.0, 1.0), np.arange(-12.0, 3.0, 0.5), np.arange(3.0, 8.0, 1.0),
-    [8.0, 10.0, 13.0, 17.0, 22.0, 28.0, 36.0, 45.0, 55.0, 65.0, 76.0, 90.0],
+    np.arange(-30.0, -18.0, 3.0), np.arange(-18.0, -12.0, 1.5), np.arange(-12.0, 3.0, 0.75),
+    [3.0, 4.5, 6.0, 8.0, 11.0, 15.0, 20.0, 27.0, 36.0, 47.0, 60.0, 74.0, 90.0],
 ])  # fmt: skip
 _DARK = 1e-30
 
@@ -59,6 +61,8 @@ class Samples:
         Of the cells' middles ``(K, S)``.
     weight
         ``(K, S, B)``: ∫ transmittance ds over each cell, as seen from the start [m].
+    aerosol_column
+        ``(K, S)`` from the start to the cells' middles, in vertical columns.
     end_transmittance
         ``(K, B)`` to the end of the ray.
     paths
@@ -69,6 +73,7 @@ class Samples:
     turn_rad: np.ndarray
     elevation_rad: np.ndarray
     weight: np.ndarray
+    aerosol_column: np.ndarray
     end_transmittance: np.ndarray
     paths: Paths
 
@@ -129,9 +134,9 @@ def zonal(z: np.ndarray, order: int = HARMONIC_ORDER) -> np.ndarray:
         values[..., m, m] = float(np.prod(np.arange(1, 2 * m, 2)))
         for degree in range(m + 1, order + 1):
             before = values[..., degree - 2, m] if degree > m + 1 else 0.0
-            values[..., degree, m] = (
-                (2 * degree - 1) * z * values[..., degree - 1, m] - (degree + m - 1) * before
-            ) / (degree - m)
+            values[..., degree, m] = ((2 * degree - 1) * z * values[..., degree - 1, m] - (degree + m - 1) * before) / (
+                degree - m
+            )
     for degree in range(order + 1):
         for m in range(degree + 1):
             square = (2 * degree + 1) / (4 * np.pi) * factorial(degree - m) / factorial(degree + m) * (2 if m else 1)
@@ -144,14 +149,23 @@ def sample_cells(atmosphere: Atmosphere, scaled: Optics, paths: Paths, edges_m: 
     middles = resampled(paths, 0.5 * (edges_m[:, 1:] + edges_m[:, :-1]))
     ends = resampled(paths, edges_m)
     length = np.diff(ends.distance_m, axis=1)
-    # Simpson's rule for the columns of a cell.
-    density = constituent_densities(atmosphere, ends.height_m)
-    mean = (density[..., 1:] + density[..., :-1] + 4.0 * constituent_densities(atmosphere, middles.height_m)) / 6.0
-    depth = np.einsum("cks,cb->ksb", mean * length, scaled.extinction)
+    column = cell_columns(atmosphere, ends, middles)
+    depth = np.einsum("cks,cb->ksb", column, scaled.extinction)
     total = np.concatenate([np.zeros_like(depth[:, :1]), np.cumsum(depth, axis=1)], axis=1)
     transmittance = np.exp(-total)
-    weight = transmittance[:, :-1] * -np.expm1(-depth) / np.maximum(depth, 1e-9) * length[..., None]
-    return Samples(middles.height_m, middles.turn_rad, middles.elevation_rad, weight, transmittance[:, -1], ends)
+    length = np.diff(ends.distance_m, axis=1)[..., None]
+    weight = transmittance[:, :-1] * -np.expm1(-depth) / np.maximum(depth, 1e-9) * length
+    aerosol = np.cumsum(column[1], axis=1) - 0.5 * column[1]
+    return Samples(
+        middles.height_m, middles.turn_rad, middles.elevation_rad, weight, aerosol, transmittance[:, -1], ends
+    )
+
+
+def cell_columns(atmosphere: Atmosphere, ends: Paths, middles: Paths) -> np.ndarray:
+    """Columns ``(3, K, S)`` of the constituents in each cell, by Simpson's rule."""
+    density = constituent_densities(atmosphere, ends.height_m)
+    mean = (density[..., 1:] + density[..., :-1] + 4.0 * constituent_densities(atmosphere, middles.height_m)) / 6.0
+    return mean * np.diff(ends.distance_m, axis=1)
 
 
 def local_sun(turn_rad, sun_elevation_rad, cos_azimuth) -> np.ndarray:
@@ -175,31 +189,37 @@ def diffuse_source(atmosphere: Atmosphere, scaled: Optics, moments: Moments, sam
     ``geometry`` is what `sun_geometry` gives for the samples.
     """
     index, share, cosines = geometry
-    row, fr = height_index(atmosphere, samples.height_m)
-    fr = fr.astype(np.float32)[..., None, None]
-    log_mean = moments.log_mean[row] * (1.0 - fr) + moments.log_mean[row + 1] * fr
-    fr = fr[..., None, None]
-    ratio = moments.ratio[row] * (1.0 - fr) + moments.ratio[row + 1] * fr
-    # A sample's height and elevation fix all but the azimuth: sum over l here, once for all suns.
-    chi = np.stack([gas_moments(HARMONIC_ORDER), scaled.aerosol_moments[: HARMONIC_ORDER + 1]])
-    sigma = scattering_per_m(atmosphere, scaled, samples.height_m)
-    factor = np.einsum("aksb,al,kslm->kslmb", sigma, chi, zonal(np.sin(samples.elevation_rad)), optimize=True)
-    by_azimuth = np.einsum("kslmb,ksjlmb->ksjmb", factor.astype(np.float32), ratio)
-    k, s, knots, orders, bands = by_azimuth.shape
-    flat = (np.arange(k * s, dtype=np.int32) * knots).reshape(k, s, 1) + index
-    log_mean, by_azimuth = log_mean.reshape(-1, bands), by_azimuth.reshape(-1, orders, bands)
-    mean = np.exp(_mixed(log_mean, flat, share[..., None]))
-    shape = np.einsum("ksqm,ksqmb->ksqb", cosines, _mixed(by_azimuth, flat, share[..., None, None]))
-    return np.maximum(shape, 0.0) * mean
+    orders, bands = moments.ratio.shape[2], moments.ratio.shape[-1]
+    cells = samples.height_m.size
+    # Interpolation, in height and in the sun's elevation, as products with matrices of hat functions; of the sun's knots
+    # only those that the samples need.
+    first, last = int(index.min()), int(index.max()) + 2
+    row, share_of_row = height_index(atmosphere, samples.height_m)
+    heights = _hats(row.ravel(), share_of_row.ravel(), len(moments.log_mean))
+    chi = np.stack([gas_moments(orders - 1), scaled.aerosol_moments[:orders]])
+    sigma = scattering_per_m(atmosphere, scaled, samples.height_m).reshape(2, cells, bands)
+    weight = np.einsum("axb,al->xlb", sigma, chi)
+    legendre = zonal(np.sin(samples.elevation_rad).ravel(), orders - 1)
+    columns = [(heights @ moments.log_mean[:, first:last].reshape(len(moments.log_mean), -1)).reshape(cells, -1, bands)]
+    for m in range(orders):
+        # A sample's height and elevation fix all but the azimuth: sum over l here, once for all suns.
+        block = moments.ratio[:, first:last, m:, m]
+        block = (heights @ block.reshape(len(block), -1)).reshape(cells, last - first, orders - m, bands)
+        factor = (weight[:, m:] * legendre[:, m:, m, None]).astype(np.float32)
+        columns.append(np.einsum("xlb,xjlb->xjb", factor, block))
+    suns = _hats(index.reshape(cells, -1) - first, share.reshape(cells, -1), last - first)
+    mixed = suns @ np.concatenate(columns, axis=-1)
+    mixed = mixed.reshape(*index.shape, orders + 1, bands)
+    shape = np.einsum("ksqm,ksqmb->ksqb", cosines[..., :orders], mixed[..., 1:, :])
+    return np.maximum(shape, 0.0) * np.exp(mixed[..., 0, :])
 
 
-def _mixed(table: np.ndarray, index: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Linear interpolation between a table's rows ``index`` and ``index + 1``."""
-    low, high = np.take(table, index, axis=0), np.take(table, index + 1, axis=0)
-    high -= low
-    high *= share
-    high += low
-    return high
+def _hats(index: np.ndarray, share: np.ndarray, count: int) -> np.ndarray:
+    """Matrix ``(..., count)`` of linear interpolation: ``1 - share`` at ``index`` and ``share`` at the next."""
+    matrix = np.zeros((*index.shape, count), np.float32)
+    np.put_along_axis(matrix, index[..., None], 1.0 - share[..., None], axis=-1)
+    np.put_along_axis(matrix, index[..., None] + 1, share[..., None], axis=-1)
+    return matrix
 
 
 def sun_geometry(samples: Samples, start_elevation_rad: np.ndarray, sun_elevation_rad: np.ndarray,
@@ -330,7 +350,7 @@ def as_moments(values: np.ndarray, ground_irradiance: np.ndarray) -> Moments:
     return Moments(np.log(mean).astype(np.float32), ratio.astype(np.float32), ground_irradiance)
 
 
-def atmosphere_tables(atmosphere: Atmosphere, *, tolerance: float = 0.02, max_orders: int = 40) -> AtmosphereTables:
+def atmosphere_tables(atmosphere: Atmosphere, *, tolerance: float = 0.1, max_orders: int = 40) -> AtmosphereTables:
     """Tabulate an atmosphere; some seconds, once for all times and places.
 
     Parameters
@@ -351,8 +371,10 @@ def atmosphere_tables(atmosphere: Atmosphere, *, tolerance: float = 0.02, max_or
     radiances = [_first_radiance(atmosphere, scaled, columns, level) for level in levels]
     values, ground = _gathered(levels, radiances, leaving)
     total, total_ground = values, ground
-    for _ in range(1, max_orders):
-        before, moments, leaving = values[:, :, 0, 0], as_moments(values, ground), ground * albedo
+    for order in range(2, max_orders + 1):
+        # Light that was scattered twice is smooth enough for a lower order.
+        source = values if order == 2 else values[:, :, : LATER_ORDER + 1, : LATER_ORDER + 1]
+        before, moments, leaving = values[:, :, 0, 0], as_moments(source, ground), ground * albedo
         radiances = (_next_radiance(atmosphere, scaled, moments, level) for level in levels)
         values, ground = _gathered(levels, radiances, leaving)
         total, total_ground = total + values, total_ground + ground
