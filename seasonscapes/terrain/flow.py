@@ -46,7 +46,7 @@ def jittered_lattice(half_m: float, spacing_m: float, jitter: float, rng: np.ran
 
 @dataclass(frozen=True)
 class Links:
-    """Lengths [m] of the steps between neighbours: one ``(h, w)`` array for each of four directions, with its slices."""
+    """Lengths [m] of the steps between neighbours: an ``(h, w)`` array for each of four directions, with its slices."""
 
     first: tuple
     second: tuple
@@ -178,7 +178,7 @@ def incise(elevation: np.ndarray, routes: FlowRoutes, rate_m: np.ndarray) -> np.
 
 
 def slump(elevation: np.ndarray, links: Links, limit: np.ndarray, rounds: int) -> np.ndarray:
-    """Let material slide where the step to a neighbour is steeper than ``limit`` ``(H, W)``, the tangent it can stand."""
+    """Let material slide where the step to a neighbour exceeds ``limit`` ``(H, W)``, the tangent it can stand."""
     z = elevation.copy()
     for _ in range(rounds):
         change = np.zeros_like(z)

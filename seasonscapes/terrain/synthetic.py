@@ -19,6 +19,7 @@ from seasonscapes.terrain.synthetic_relief import relief
 
 CENTRE_LATITUDE_DEG, CENTRE_LONGITUDE_DEG = 46.55, 7.98
 CRS = "EPSG:32632"
+_MAPS = ("cover", "slope_deg", "northness", "hollow_m", "debris", "shore_m")
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,8 @@ class SyntheticPlace:
         Depth below the surroundings [m], float32: snow gathers there.
     debris
         Share of the glaciers under moraine, float32 in [0, 1].
+    shore_m
+        Distance to the lake's shore, negative on the water [m], float32: the shore is finer than the cells.
     seed, spacing_m
         What it was made from.
     """
@@ -47,6 +50,7 @@ class SyntheticPlace:
     northness: np.ndarray
     hollow_m: np.ndarray
     debris: np.ndarray
+    shore_m: np.ndarray
     seed: int
     spacing_m: float
 
@@ -92,6 +96,7 @@ def alpine_massif(*, seed: int = 1912, size_m: float = 12000.0, spacing_m: float
         northness,
         smooth - z,
         shape.debris.astype(np.float32),
+        shape.floor.shore_m.astype(np.float32),
         seed,
         spacing_m,
     )
@@ -100,10 +105,9 @@ def alpine_massif(*, seed: int = 1912, size_m: float = 12000.0, spacing_m: float
 def save_place(place: SyntheticPlace, path: str | os.PathLike) -> None:
     """Write the place as one ``.npz``, atomically."""
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        maps = {name: getattr(place, name) for name in _MAPS}
         np.savez_compressed(file, elevation=place.elevation.values, transform=np.array(place.elevation.transform)[:6],
-                            crs=place.elevation.crs, cover=place.cover, slope_deg=place.slope_deg,
-                            northness=place.northness, hollow_m=place.hollow_m, debris=place.debris, seed=place.seed,
-                            spacing_m=place.spacing_m)  # fmt: skip
+                            crs=place.elevation.crs, seed=place.seed, spacing_m=place.spacing_m, **maps)  # fmt: skip
 
 
 def load_place(path: str | os.PathLike) -> SyntheticPlace:
@@ -112,7 +116,7 @@ def load_place(path: str | os.PathLike) -> SyntheticPlace:
 
     with np.load(path) as held:
         raster = Raster(held["elevation"], Affine(*held["transform"]), str(held["crs"]))
-        maps = {name: held[name] for name in ("cover", "slope_deg", "northness", "hollow_m", "debris")}
+        maps = {name: held[name] for name in _MAPS}
         return SyntheticPlace(raster, **maps, seed=int(held["seed"]), spacing_m=float(held["spacing_m"]))
 
 

@@ -12,20 +12,21 @@ import numpy as np
 
 from seasonscapes.terrain.noise import fractal_noise, spline_noise
 from seasonscapes.terrain.synthetic_cover import FOREST, Cover
+from seasonscapes.terrain.synthetic_plan import LEDGES_M, strata_level_m
 
 SEASONS = {"winter": 32, "spring": 135, "summer": 205, "autumn": 288}
 _YEAR = 365.25
 
 # Mean height [m] above which level ground is white, by day of year.
-_SNOW_LINE = ((1, 780), (32, 640), (60, 760), (91, 1250), (121, 1750), (152, 2250), (182, 2750), (213, 3050), (236, 3100),
-              (258, 2950), (288, 2550), (319, 1650), (345, 1000))  # fmt: skip
+_SNOW_LINE = ((1, 780), (32, 640), (60, 760), (91, 1250), (121, 1750), (152, 2250), (182, 2750), (213, 3050),
+              (236, 3100), (258, 2950), (288, 2550), (319, 1650), (345, 1000))  # fmt: skip
 # Reflectance of what changes colour, by day of year at 1,500 m.
 _TURNING = {
     Cover.MEADOW: ((60, (0.150, 0.120, 0.060)), (110, (0.120, 0.115, 0.045)), (145, (0.058, 0.118, 0.026)),
-                   (205, (0.072, 0.110, 0.030)), (250, (0.105, 0.108, 0.036)), (288, (0.155, 0.110, 0.040)),
+                   (205, (0.066, 0.112, 0.029)), (245, (0.080, 0.110, 0.032)), (288, (0.150, 0.110, 0.040)),
                    (330, (0.165, 0.122, 0.058))),
     Cover.FIELD: ((60, (0.130, 0.105, 0.062)), (110, (0.090, 0.110, 0.036)), (145, (0.055, 0.125, 0.026)),
-                  (205, (0.110, 0.125, 0.036)), (250, (0.130, 0.120, 0.045)), (288, (0.140, 0.110, 0.050)),
+                  (205, (0.080, 0.122, 0.032)), (250, (0.088, 0.118, 0.034)), (288, (0.120, 0.112, 0.042)),
                   (330, (0.130, 0.105, 0.062))),
     Cover.LARCH: ((100, (0.075, 0.058, 0.042)), (135, (0.055, 0.085, 0.022)), (205, (0.040, 0.066, 0.019)),
                   (262, (0.070, 0.078, 0.018)), (288, (0.260, 0.145, 0.018)), (312, (0.200, 0.100, 0.022)),
@@ -34,7 +35,7 @@ _TURNING = {
                       (255, (0.050, 0.070, 0.016)), (285, (0.190, 0.100, 0.018)), (305, (0.170, 0.070, 0.022)),
                       (325, (0.085, 0.066, 0.050))),
     Cover.SHRUB: ((80, (0.085, 0.072, 0.045)), (150, (0.056, 0.078, 0.026)), (205, (0.052, 0.074, 0.026)),
-                  (260, (0.110, 0.068, 0.028)), (288, (0.135, 0.062, 0.028)), (325, (0.090, 0.070, 0.045))),
+                  (255, (0.072, 0.070, 0.026)), (288, (0.130, 0.064, 0.028)), (325, (0.090, 0.070, 0.045))),
 }  # fmt: skip
 _STEADY = {
     Cover.WATER: (0.014, 0.034, 0.038),
@@ -105,7 +106,9 @@ def _snow(place, day: float, rows: slice, upsample: int) -> np.ndarray:
     line = snow_line_m(day) - contrast * shade - 10.0 * np.clip(hollow, -12.0, 12.0) + 95.0 * patches
     lies = _smoothstep(-90.0, 130.0, z - line)
     # Walls steeper than about 55° shed it; ledges below the pixel keep some.
-    holds = 1.0 - _smoothstep(44.0, 60.0, slope - 4.0 * patches)
+    level = strata_level_m(z, east, north, place.seed)
+    ledge = np.cos(level * (2.0 * np.pi / LEDGES_M[1]))
+    holds = 1.0 - _smoothstep(44.0, 60.0, slope - 5.0 * patches - (2.0 + 2.0 * np.roll(patches, 500, axis=1)) * ledge)
     return lies * (0.06 + 0.94 * holds)
 
 
@@ -123,29 +126,33 @@ def _classes(place, rows: slice, upsample: int, grain: np.ndarray) -> np.ndarray
     """Cover at the finer scale: borders between classes are roughened by noise instead of being stairs."""
     if upsample == 1:
         return place.cover[rows]
+    # On the lake's cells the land reaches on beneath, so that the shore alone decides.
+    cover = np.where(place.shore_m < 0.0, np.uint8(Cover.MEADOW), place.cover)
+    shore = _block(place.shore_m, rows, upsample, cv2.INTER_LINEAR)
     best, chosen = np.full(grain.shape, -np.inf, np.float32), np.zeros(grain.shape, np.uint8)
     for k, kind in enumerate(Cover):
-        if not (place.cover == kind).any():
+        if not (cover[rows] == kind).any():
             continue
-        share = _block((place.cover == kind).astype(np.float32), rows, upsample, cv2.INTER_LINEAR)
+        share = _block((cover == kind).astype(np.float32), rows, upsample, cv2.INTER_LINEAR)
         jog = np.roll(grain, 37 * k, axis=1) if kind != Cover.WATER else 0.0
         score = np.where(share > 0.02, share + 0.16 * jog, -1.0).astype(np.float32)
         better = score > best
         best, chosen = np.where(better, score, best), np.where(better, np.uint8(kind), chosen)
-    return chosen
+    # The lake's shore is known better than the cells.
+    return np.where(shore < 0.0, np.uint8(Cover.WATER), chosen)
 
 
 def _ground(place, day: float, rows: slice, upsample: int) -> tuple[np.ndarray, np.ndarray]:
     """Reflectance ``(h, w, 3)`` without seasonal snow, and the classes ``(h, w)``."""
     east, north = _positions(place, rows, upsample)
     seed = place.seed
-    grain = fractal_noise(seed + 401, 60.0, east, north, octaves=4, gain=0.8)
+    grain = fractal_noise(seed + 401, 60.0, east, north, octaves=3 + upsample.bit_length(), gain=0.8)
     broad = fractal_noise(seed + 411, 900.0, east, north, octaves=5, gain=0.6)
     z = _block(place.elevation.values[..., 0], rows, upsample)
     cover = _classes(place, rows, upsample, grain)
     albedo = np.empty((*cover.shape, 3), np.float32)
     # Spring climbs and autumn descends by about 3 days in 100 m (Hopkins 1918).
-    late = np.clip((z - 1500.0) * 0.022, -18.0, 22.0) + 4.0 * broad
+    late = np.clip((z - 1500.0) * 0.030, -25.0, 30.0) + 4.0 * broad
     spring = 0.5 + 0.5 * np.cos(2.0 * np.pi * (day - 120.0) / _YEAR)
     local_day = day + late * (1.0 - 2.0 * spring)
     for kind in Cover:
@@ -156,7 +163,7 @@ def _ground(place, day: float, rows: slice, upsample: int) -> tuple[np.ndarray, 
     ice = cover == Cover.ICE
     if ice.any():
         debris = _block(place.debris, rows, upsample, cv2.INTER_LINEAR)
-        dirt = np.clip(1.2 * debris + 0.35 * grain + 0.2 * broad - 0.45, 0.0, 0.8) + 0.30 * _smoothstep(2700.0, 1500.0, z)
+        dirt = np.clip(debris + 0.30 * grain + 0.45 * broad - 0.65, 0.0, 0.75) + 0.30 * _smoothstep(2700.0, 1500.0, z)
         dirt = np.clip(dirt, 0.0, 0.92)[ice, None]
         # Crevasses and ogives lie across the flow, along the contours.
         crevasse = np.sin(z * (2.0 * np.pi / 11.0) + 2.5 * grain + 3.0 * broad)[ice, None]
@@ -171,14 +178,13 @@ def _texture(albedo, cover, z, grain, broad, position, seed) -> None:
     """Variation within a class, in place: crowns, tufts, strata, crevasses."""
     east, north = position
     contrast = {Cover.MEADOW: 0.16, Cover.CONIFER: 0.30, Cover.LARCH: 0.28, Cover.BROADLEAF: 0.26, Cover.SHRUB: 0.24,
-                Cover.SCREE: 0.12, Cover.ROCK: 0.24, Cover.ICE: 0.10, Cover.FIRN: 0.03, Cover.FIELD: 0.10}  # fmt: skip
+                Cover.SCREE: 0.12, Cover.ROCK: 0.27, Cover.ICE: 0.10, Cover.FIRN: 0.03, Cover.FIELD: 0.10}  # fmt: skip
     gain = np.zeros(cover.shape, np.float32)
     for kind, amount in contrast.items():
         gain[cover == kind] = amount
     factor = np.exp(gain * grain + np.where(np.isin(cover, (Cover.FIRN, Cover.ICE)), 0.02, 0.10) * broad)
-    # The same dip as the ledges of the relief.
-    level = z + 0.13 * east[None, :] - 0.09 * north[:, None] + 18.0 * broad
-    bands = np.sin(level * (2.0 * np.pi / 190.0)) + 0.7 * np.sin(level * (2.0 * np.pi / 92.0) + 1.0)
+    level = strata_level_m(z, east, north, seed) + 8.0 * grain
+    bands = sum(np.sin(level * (2.0 * np.pi / period) + 0.8) for period in LEDGES_M)
     factor *= np.where(cover == Cover.ROCK, np.exp(0.13 * bands), 1.0)
     albedo *= factor[..., None]
     rusty = np.where(np.isin(cover, (Cover.ROCK, Cover.SCREE)), 0.06 * broad, 0.0)[..., None]

@@ -54,7 +54,7 @@ def ground_cover(relief: Relief, spacing_m: float, seed: int, east_m: np.ndarray
     cover[forest & (z < 1130.0 + 140.0 * large) & (small + 0.5 * large - 0.8 * north > 0.2)] = Cover.BROADLEAF
     cover[forest & (z > tree_line - 380.0 - 90.0 * small) & (small - 0.3 * large > -0.1)] = Cover.LARCH
     brush = (z > tree_line - 80.0) & (z < tree_line + 260.0) & (wooded + 0.6 * small > 0.8)
-    brush |= forest & (hollow > 12.0) & (slope > 36.0)
+    brush |= forest & (hollow > 12.0) & (slope > 36.0) & (z > 1250.0)
     cover[brush] = Cover.SHRUB
     flat = (slope < 6.0) & (z < 1100.0) & (relief.floor.shore_m > 40.0)
     cover[flat & (large + 0.4 * small > -0.5)] = Cover.FIELD

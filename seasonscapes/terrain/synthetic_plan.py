@@ -14,9 +14,10 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from seasonscapes.terrain.flow import Lattice
-from seasonscapes.terrain.noise import warped_noise
+from seasonscapes.terrain.noise import spline_noise, warped_noise
 
 LAKE_LEVEL_M = 566.0
+LEDGES_M = (190.0, 92.0)  # spacing of the strata's ledges
 
 # Knots (east km, north km, elevation m) about the massif's centre.
 _CRESTS = (
@@ -25,12 +26,13 @@ _CRESTS = (
      (1.5, -0.75, 4200), (2.3, -0.2, 3380), (3.2, 0.35, 2600), (3.9, 0.85, 1900)),
     ((-2.6, -3.2, 4180), (-2.5, -4.6, 3720), (-1.7, -5.7, 3560), (-1.1, -7.5, 3300)),
     ((-2.5, -4.6, 3720), (-1.4, -4.4, 3480), (-0.7, -4.75, 3200)),
-    ((-0.7, -1.95, 4290), (-0.5, -2.8, 3640), (-0.2, -3.7, 3380)),
+    ((-0.7, -1.95, 4290), (-0.4, -2.8, 3700), (0.1, -3.7, 3420)),
     ((1.5, -0.75, 4200), (2.2, -1.9, 3420), (2.9, -3.3, 3840), (4.3, -4.2, 4160), (5.2, -5.6, 3500), (5.6, -7.5, 3200)),
-    ((2.9, -3.3, 3840), (2.3, -4.3, 3560), (2.0, -5.3, 3300), (1.9, -6.3, 2950)),
+    ((2.9, -3.3, 3840), (2.3, -4.3, 3680), (2.0, -5.3, 3420), (1.9, -6.3, 3000)),
     ((4.3, -4.2, 4160), (5.6, -3.0, 3560), (6.0, -1.5, 3800), (6.1, -0.1, 2900), (5.7, 0.9, 2000)),
     # The spur with the meadow summit north of the wall.
-    ((0.3, -1.55, 3520), (0.1, -0.9, 2900), (-0.3, 0.0, 2120), (-1.0, 0.75, 2480), (-1.5, 1.5, 2240), (-1.9, 2.0, 1700)),
+    ((0.3, -1.55, 3520), (0.1, -0.9, 2900), (-0.3, 0.0, 2120), (-1.0, 0.75, 2480), (-1.5, 1.5, 2240),
+     (-1.9, 2.0, 1700)),
     # Beyond the trough in the west, and beyond the lake in the north.
     ((-7.5, -4.0, 2900), (-6.3, -2.2, 2780), (-6.0, -0.2, 2500), (-5.9, 1.2, 2300), (-5.6, 2.2, 1500)),
     ((-7.5, 6.2, 1900), (-4.5, 6.3, 2020), (-2.0, 5.7, 2280), (0.4, 5.9, 2450), (2.4, 5.4, 2640), (4.8, 5.6, 2560),
@@ -43,9 +45,9 @@ _VALLEYS = (
     ((-4.2, 3.4, 572), (-4.1, 2.0, 640), (-4.25, 0.2, 740), (-4.5, -1.6, 860), (-4.6, -3.4, 1150), (-4.9, -4.9, 1750),
      (-5.5, -7.5, 2500)),
     # Névé basins and their glaciers.
-    ((-1.5, -3.4, 3280), (-0.7, -4.0, 3040), (0.3, -4.8, 2740), (1.0, -5.9, 2480), (1.4, -7.5, 2250)),
-    ((1.1, -2.1, 3200), (1.1, -3.2, 2960), (0.7, -4.6, 2720)),
-    ((3.3, -4.5, 3150), (2.9, -5.4, 2800), (2.4, -7.5, 2250)),
+    ((-1.5, -3.4, 3160), (-0.7, -4.0, 2850), (0.3, -4.8, 2520), (1.0, -5.9, 2270), (1.4, -7.5, 2050)),
+    ((1.1, -2.1, 3050), (1.1, -3.2, 2760), (0.7, -4.6, 2500)),
+    ((3.3, -4.5, 2950), (2.9, -5.4, 2600), (2.4, -7.5, 2050)),
     ((4.2, -3.2, 3150), (4.3, -2.2, 2850), (4.2, -1.2, 2350), (4.4, -0.2, 1800), (4.5, 0.8, 1250), (4.6, 1.7, 900)),
     ((6.3, -4.3, 2700), (6.8, -6.0, 2200), (7.5, -7.5, 1900)),
     ((7.2, -1.5, 2100), (7.4, 0.5, 1500), (7.5, 1.5, 1120)),
@@ -60,7 +62,7 @@ _VALLEYS = (
 
 @dataclass(frozen=True)
 class Plan:
-    """Crest, valley and main valley points ``(P, 3)`` [m] about the centre, and the seed of the warp that bends their lines."""
+    """Crest, valley and main valley points ``(P, 3)`` [m] about the centre, and the seed of what bends their lines."""
 
     crests: np.ndarray
     valleys: np.ndarray
@@ -139,6 +141,17 @@ def anchored(z: np.ndarray, lattice: Lattice, plan: Plan) -> np.ndarray:
     share = to_valley / (to_valley + to_crest + 1e-3)
     correction = (low + (high - low) * share).astype(np.float32)
     return z + cv2.GaussianBlur(correction, (0, 0), 120.0 / spacing, borderType=cv2.BORDER_REPLICATE)
+
+
+def strata_level_m(z: np.ndarray, east_m: np.ndarray, north_m: np.ndarray, seed: int) -> np.ndarray:
+    """Height within the folded, gently dipping strata ``(H, W)`` [m]: ledges and bands of rock follow it.
+
+    ``east_m (W,)`` and ``north_m (H,)`` are the grid's axes, ``z (H, W)`` its heights [m].
+    """
+    fold = 70.0 * spline_noise(seed + 51, 4000.0, east_m, north_m) + 14.0 * spline_noise(
+        seed + 52, 500.0, east_m, north_m
+    )
+    return z + fold + 0.13 * east_m[None, :] - 0.09 * north_m[:, None]
 
 
 @dataclass(frozen=True)

@@ -22,11 +22,13 @@ from seasonscapes.terrain.noise import fractal_noise, spline_noise, warped_noise
 from seasonscapes.terrain.synthetic_ice import grow_ice
 from seasonscapes.terrain.synthetic_plan import (
     LAKE_LEVEL_M,
+    LEDGES_M,
     Plan,
     ValleyFloor,
     anchored,
     plan_of,
     sketched_heights,
+    strata_level_m,
     valley_floor,
 )
 
@@ -49,8 +51,8 @@ class _Stage:
 _STAGES = (
     _Stage(120.0, 24, 40.0, 40.0, 800.0, 54.0, 0.0, 0.9, 960.0),
     _Stage(60.0, 8, 24.0, 18.0, 400.0, 58.0, 0.0, 0.9, 480.0),
-    _Stage(30.0, 6, 18.0, 12.0, 220.0, 63.0, 190.0, 0.9, 240.0),
-    _Stage(15.0, 5, 11.0, 5.0, 120.0, 68.0, 92.0, 0.8, 120.0),
+    _Stage(30.0, 6, 18.0, 12.0, 220.0, 63.0, LEDGES_M[0], 0.9, 240.0),
+    _Stage(15.0, 5, 11.0, 5.0, 120.0, 68.0, LEDGES_M[1], 0.8, 120.0),
 )
 
 
@@ -105,8 +107,7 @@ def _terraced(z: np.ndarray, lattice: Lattice, seed: int, period_m: float) -> np
     spacing = lattice.spacing_m
     steep = np.hypot(*np.gradient(z, spacing))
     axis = (np.arange(z.shape[0]) - (z.shape[0] - 1) / 2.0) * spacing
-    fold = 70.0 * spline_noise(seed + 51, 4000.0, axis, -axis) + 14.0 * spline_noise(seed + 52, 500.0, axis, -axis)
-    level = (z + 0.13 * lattice.east_m - 0.09 * lattice.north_m + fold) / period_m
+    level = strata_level_m(z, axis, -axis, seed) / period_m
     inside = level - np.floor(level)
     step = inside * inside * (3.0 - 2.0 * inside)
     strength = 0.55 * np.clip((steep - 0.7) / 0.5, 0.0, 1.0) * np.clip((z - 1100.0) / 600.0, 0.3, 1.0)
@@ -296,8 +297,11 @@ def relief(half_m: float, spacing_m: float, seed: int) -> Relief:
     thickness = _glaciated(z, ice, regular)
     z = z + thickness
     floor = _floor_on(floor, regular)
-    bank = LAKE_LEVEL_M + np.clip(0.04 * floor.shore_m, 0.0, 2.0) - 0.03 * np.maximum(floor.shore_m - 120.0, 0.0)
-    z = np.where(floor.shore_m < 0.0, LAKE_LEVEL_M, np.maximum(z, bank))
+    # A beach: without it each cell of the shore would be a step.
+    rise = LAKE_LEVEL_M + 0.05 * floor.shore_m
+    near = np.clip(1.0 - floor.shore_m / 70.0, 0.0, 1.0)
+    z = np.maximum(z + near * (rise - z), rise - 0.08 * np.maximum(floor.shore_m - 100.0, 0.0))
+    z = np.where(floor.shore_m < 0.0, LAKE_LEVEL_M, z)
     routes = route_flow(z, links_of(regular), regular.border)
     debris = np.clip(_sample(_moraines(ice), 60.0, regular, order=1), 0.0, 1.0)
     return Relief(z, thickness, debris, accumulate(routes, np.full(z.shape, spacing_m**2)), floor)
