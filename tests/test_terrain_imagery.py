@@ -197,11 +197,21 @@ def test_pictures_are_decoded_to_linear_light(tmp_path):
     assert read_imagery(grey).values.shape == (2, 2, 3)
 
 
+def test_fine_pictures_are_averaged_in_linear_light(tmp_path):
+    """Black beside white is half the light, which is sRGB 188 and not 128."""
+    checker = (np.indices((8, 8)).sum(0) % 2 * 255).astype(np.uint8)
+    path = write_tiff(tmp_path / "a.tif", checker, Affine(10, 0, 2640000, 0, -10, 1160000), "EPSG:2056")
+    image = read_imagery(path, finest_m=20.0)
+    assert image.values.shape == (4, 4, 3)
+    np.testing.assert_allclose(image.values, 0.5, rtol=1e-6)
+    assert image.transform == Affine(20, 0, 2640000, 0, -20, 1160000)
+
+
 def test_images_that_are_no_colour_images_are_named(tmp_path):
     transform = Affine(10, 0, 2640000, 0, -10, 1160000)
     five = write_tiff(tmp_path / "five.tif", np.full((5, 2, 2), 300, np.uint16), transform, "EPSG:2056")
     with pytest.raises(InputError, match=r"five.tif: not a colour image; got 5; expected one \(grey\) or three bands"):
-        read_imagery(five)
+        read_imagery(five, full_scale=10_000.0)
     with pytest.raises(
         InputError, match=r"brighter than full scale; got '300'; expected at most 255; state the image's"
     ):

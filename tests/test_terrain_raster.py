@@ -145,7 +145,7 @@ def test_shrinking_while_reading_is_the_mean_of_blocks(tmp_path):
     values = rng.uniform(0, 100, (9, 11)).astype(np.float32)
     values[:3, :3] = -1
     path = write_tiff(tmp_path / "a.tif", values, LV95, "EPSG:2056", nodata=-1)
-    raster = read_raster(path, shrink=3)
+    raster = read_raster(path, finest_m=399.0)
     assert raster.values.shape == (3, 3, 1)
     assert np.isnan(raster.values[0, 0, 0])
     np.testing.assert_allclose(raster.values[2, 1, 0], values[6:9, 3:6].mean(), rtol=1e-6)
@@ -189,8 +189,8 @@ def test_missing_and_unreadable_files_and_bands_are_named(tmp_path):
         read_elevation(path, band=1, bounds_deg=(9.0, 46.0, 9.1, 46.1))
     with pytest.raises(ValueError, match="west < east"):
         read_elevation(path, band=1, bounds_deg=(9.1, 46.0, 9.0, 46.1))
-    with pytest.raises(ValueError, match="shrink"):
-        read_raster(path, shrink=0)
+    with pytest.raises(ValueError, match="finest_m: got 0, expected a positive size"):
+        read_raster(path, finest_m=0)
 
 
 def test_rasters_that_share_no_ground_are_refused():

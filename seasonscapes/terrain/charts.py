@@ -12,7 +12,7 @@ from seasonscapes.terrain.surface import Terrain
 _BLOCK_FACES = 1_000
 # Empty texels around each chart, so that its gutter meets no other chart's.
 PADDING_PX = 4
-MAX_FACES = 1_500_000
+MAX_FACES = 2_500_000
 
 
 def chart_atlas(terrain: Terrain, texel_m: float | None, max_side_px: int) -> tuple[Terrain, Atlas]:

@@ -30,14 +30,14 @@ _MAX_FIT_ERROR_PX = 0.01
 
 
 def read_imagery(path: str | os.PathLike, *, bounds_deg: tuple[float, float, float, float] | None = None,
-                 bands: tuple[int, ...] | None = None, shrink: int = 1, encoding: str = "srgb",
+                 bands: tuple[int, ...] | None = None, finest_m: float | None = None, encoding: str = "srgb",
                  full_scale: float = 255.0) -> Raster:  # fmt: skip
     """Read a colour image on a map as scene-linear Rec.709.
 
     Parameters
     ----------
-    path, bounds_deg, shrink
-        As in `read_raster`.
+    path, bounds_deg, finest_m
+        As in `read_raster`; half the size of a texel is fine enough for any use.
     bands
         Red, green and blue band numbers from 1; left out: the file's three colour bands, or its only one as grey.
     encoding
@@ -57,20 +57,24 @@ def read_imagery(path: str | os.PathLike, *, bounds_deg: tuple[float, float, flo
     """
     if encoding not in ENCODINGS:
         raise ValueError(f"encoding: got {encoding!r}, expected one of {', '.join(ENCODINGS)}")
-    raster = read_raster(path, bounds_deg=bounds_deg, bands=bands, shrink=shrink)
+
+    def decode(values):
+        if encoding == "linear":
+            return values / full_scale
+        brightest = np.max(values, initial=-np.inf, where=np.isfinite(values))
+        if brightest > full_scale:
+            raise InputError(path, "brighter than full scale", got=f"{brightest:g}", expected=f"at most {full_scale:g}",
+                             cure="state the image's full scale")  # fmt: skip
+        with np.errstate(invalid="ignore"):
+            return linear_from_srgb(values / full_scale)
+
+    raster = read_raster(path, bounds_deg=bounds_deg, bands=bands, finest_m=finest_m, decode=decode)
     count = raster.values.shape[2]
     if count not in (1, 3):
         raise InputError(path, "not a colour image", got=count, expected="one (grey) or three bands, and alpha",
                          cure="name its red, green and blue bands")  # fmt: skip
-    values = raster.values / np.float32(full_scale)
-    if np.isfinite(values).any() and np.nanmax(values) > 1.0 + 1e-6 and encoding == "srgb":
-        raise InputError(path, "brighter than full scale", got=f"{np.nanmax(raster.values):g}",
-                         expected=f"at most {full_scale:g}", cure="state the image's full scale")  # fmt: skip
     # A pixel that lacks one colour lacks them all.
-    values = np.where(np.isfinite(values).all(axis=2, keepdims=True), values, np.float32(np.nan))
-    if encoding == "srgb":
-        with np.errstate(invalid="ignore"):
-            values = linear_from_srgb(values)
+    values = np.where(np.isfinite(raster.values).all(axis=2, keepdims=True), raster.values, np.float32(np.nan))
     return replace(raster, values=np.repeat(values, 3 // count, axis=2))
 
 

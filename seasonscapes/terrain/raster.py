@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,7 +15,7 @@ import numpy as np
 from affine import Affine
 
 from seasonscapes.declaration import InputError
-from seasonscapes.frames import LocalFrame
+from seasonscapes.frames import LocalFrame, enu_from_geodetic
 from seasonscapes.terrain.crs import apply_affine, geodetic_from_map, horizontal_crs, map_from_geodetic
 from seasonscapes.terrain.holes import harmonic_fill, nan_mean
 from seasonscapes.terrain.surface import Raster
@@ -86,7 +87,8 @@ def read_elevation(path: str | os.PathLike, *, bounds_deg: tuple[float, float, f
 
 
 def read_raster(path: str | os.PathLike, *, bounds_deg: tuple[float, float, float, float] | None = None,
-                bands: tuple[int, ...] | None = None, shrink: int = 1) -> Raster:  # fmt: skip
+                bands: tuple[int, ...] | None = None, finest_m: float | None = None,
+                decode: Callable[[np.ndarray], np.ndarray] | None = None) -> Raster:  # fmt: skip
     """Read a raster that GDAL knows (GeoTIFF, SRTM ``.hgt``, VRT mosaic …), or a window of it.
 
     Parameters
@@ -96,9 +98,11 @@ def read_raster(path: str | os.PathLike, *, bounds_deg: tuple[float, float, floa
         one pixel to spare for interpolation, in the raster's own grid (nothing is resampled). Left out: all of it.
     bands
         Band numbers from 1; left out: all but an alpha band, which becomes NaN.
-    shrink
-        Average blocks of ``shrink`` × ``shrink`` pixels while reading; an image far finer than its use then never
-        lies in memory whole.
+    finest_m
+        Pixels smaller than this on the ground are averaged in whole square blocks, as large as fit into it, while
+        reading: an image far finer than its use [m] then never lies in memory whole.
+    decode
+        Applied to values before they are averaged (sRGB must be made linear first).
 
     Returns
     -------
@@ -117,8 +121,8 @@ def read_raster(path: str | os.PathLike, *, bounds_deg: tuple[float, float, floa
 
     if not os.fspath(path).startswith("/vsi") and not Path(path).is_file():
         raise InputError(path, "no such file")
-    if shrink < 1:
-        raise ValueError(f"shrink: got {shrink}, expected at least 1")
+    if finest_m is not None and not finest_m > 0.0:
+        raise ValueError(f"finest_m: got {finest_m}, expected a positive size")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
@@ -126,7 +130,8 @@ def read_raster(path: str | os.PathLike, *, bounds_deg: tuple[float, float, floa
                 crs = _checked_crs(source, path)
                 bands = _checked_bands(source, bands, path)
                 window = _window(source, crs, bounds_deg, path)
-                values = _read_blocks(source, bands, window, shrink)
+                shrink = 1 if finest_m is None else _shrink(source, crs, window, finest_m)
+                values = _read_blocks(source, bands, window, shrink, decode)
                 transform = _window_transform(source.transform, window, shrink)
     except RasterioError as error:
         raise InputError(path, f"not readable as a raster: {error}") from None
@@ -203,13 +208,24 @@ def _checked_bounds(bounds_deg) -> tuple[float, float, float, float]:
     return west, south, east, north
 
 
+def _shrink(source, crs: str, window, finest_m: float) -> int:
+    """How many pixels fit side by side into ``finest_m`` in the middle of the window; at least 2 blocks must remain."""
+    column, row = window.col_off + window.width / 2.0, window.row_off + window.height / 2.0
+    x, y = apply_affine(source.transform, column + np.array([0.0, 1.0, 0.0]), row + np.array([0.0, 0.0, 1.0]))
+    latitude, longitude = geodetic_from_map(crs, x, y)
+    place = enu_from_geodetic(LocalFrame(float(latitude[0]), float(longitude[0])), latitude, longitude, 0.0)
+    pixel_m = np.linalg.norm(place[1:], axis=1).max()
+    # The slack keeps an exact multiple exact.
+    return int(np.clip(np.floor(finest_m / pixel_m + 1e-6), 1, max(1, min(window.width, window.height) // 2)))
+
+
 def _window_transform(transform: Affine, window, shrink: int) -> Affine:
     a, b, _, d, e, _ = tuple(transform)[:6]
     x, y = apply_affine(transform, window.col_off, window.row_off)
     return Affine(a * shrink, b * shrink, float(x), d * shrink, e * shrink, float(y))
 
 
-def _read_blocks(source, bands, window, shrink) -> np.ndarray:
+def _read_blocks(source, bands, window, shrink, decode) -> np.ndarray:
     """Read strip by strip, so that only the result is ever whole in memory."""
     from rasterio.windows import Window
 
@@ -227,6 +243,8 @@ def _read_blocks(source, bands, window, shrink) -> np.ndarray:
         if alpha is not None:
             block[:, source.read(alpha, window=part) == 0] = np.nan
         block = block.transpose(1, 2, 0) * scale + offset
+        if decode is not None:
+            block = decode(block)
         if shrink > 1:
             block = nan_mean(block.reshape(rows, shrink, width, shrink, len(bands)), axes=(1, 3))
         values[row : row + rows] = block
