@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from seasonscapes.cameras.pinhole import Camera, ray_directions
-from seasonscapes.rendering.backend import to_numpy, use_backend
-from seasonscapes.rendering.gbuffer import GBuffer, mi_rays, trace_gbuffer
+from seasonscapes.rendering.backend import use_backend
+from seasonscapes.rendering.gbuffer import GBuffer, trace_gbuffer
 from seasonscapes.rendering.scene import RenderScene, background
 
-# Samples in flight: about 1.2 GB of wavefront on the LLVM backend.
-LANES = 1 << 22
+# Samples in flight: about 0.3 GB on the LLVM backend.
+LANES = 1 << 23
 Progress = Callable[[float], None]
 
 
@@ -41,7 +41,7 @@ class View:
 
 
 def mi_path_integrator(max_depth: int) -> Any:
-    """Mitsuba's path tracer. ``max_depth`` counts edges: 2 is direct light only. Lights are not seen directly."""
+    """Mitsuba's own path tracer, for the variant without lanes. ``max_depth`` counts edges. Lights are not seen."""
     import mitsuba as mi
 
     return mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": 64, "hide_emitters": True})
@@ -68,58 +68,42 @@ def path_trace(scene: RenderScene, camera: Camera, *, spp: int = 64, seed: int =
     if spp < 1 or max_depth < 2:
         raise ValueError(f"spp and max_depth: got {spp} and {max_depth}, expected spp ≥ 1 and max_depth ≥ 2")
     trace = _trace_block_scalar if use_backend().device == "scalar" else _trace_block
-    integrator = mi_path_integrator(max_depth)
     rows = max(1, min(camera.height_px, LANES // (camera.width_px * spp)))
     blocks = [(top, min(rows, camera.height_px - top)) for top in range(0, camera.height_px, rows)]
     # Very wide or very deep blocks are also cut into passes of samples.
     samples = max(1, min(spp, LANES // camera.width_px))
-    passes = [min(samples, spp - done) for done in range(0, spp, samples)]
-    seeds = np.random.SeedSequence(seed).generate_state(len(blocks) * len(passes))
+    passes = [(done, min(samples, spp - done)) for done in range(0, spp, samples)]
     image = np.zeros((camera.height_px, camera.width_px, 4), np.float32)
     for b, (top, height) in enumerate(blocks):
-        for p, count in enumerate(passes):
-            part = trace(scene, camera, integrator, (top, height, count, int(seeds[b * len(passes) + p])))
-            image[top : top + height] += part * (count / spp)
+        for p, (done, count) in enumerate(passes):
+            part = trace(scene, camera, (top, height, done, count), max_depth=max_depth, seed=seed)
+            # A sample that is not finite would poison its pixel; a geometry that makes one is a bug worth seeing.
+            if not np.isfinite(part).all():
+                raise FloatingPointError("path tracing gave values that are not finite; are albedo and light finite?")
+            image[top : top + height] += part / spp
             if progress is not None:
                 progress((b * len(passes) + p + 1) / (len(blocks) * len(passes)))
     return image[..., :3], np.clip(image[..., 3], 0.0, 1.0)
 
 
-def _trace_block(scene: RenderScene, camera: Camera, integrator: Any, block: tuple[int, int, int, int]) -> np.ndarray:
-    """One block of rows as ``(height, W, 4)``: mean radiance and coverage over its samples."""
-    import drjit as dr
-    import mitsuba as mi
+def _trace_block(scene: RenderScene, camera: Camera, block: tuple[int, int, int, int], *, max_depth: int,
+                 seed: int) -> np.ndarray:  # fmt: skip
+    """Sums over the samples of one block of rows as ``(height, W, 4)``: radiance and coverage."""
+    from seasonscapes.rendering.paths import trace_block  # imports Dr.Jit, whose library `use_backend` chooses first
 
-    top, height, spp, seed = block
-    sampler = mi.load_dict({"type": "independent", "sample_count": spp})
-    # Opaque numbers keep one compiled kernel for all blocks, sizes and seeds.
-    sampler.seed(dr.opaque(mi.UInt32, seed), camera.width_px * height * spp)
-    index = dr.arange(mi.UInt32, camera.width_px * height * spp) // dr.opaque(mi.UInt32, spp)
-    width = dr.opaque(mi.UInt32, camera.width_px)
-    row = index // width
-    offset = sampler.next_2d()
-    x, y = mi.Float(index - row * width) + offset.x, mi.Float(row + dr.opaque(mi.UInt32, top)) + offset.y
-    radiance, valid, _ = integrator.sample(scene.mi_scene, sampler, mi.RayDifferential3f(mi_rays(camera, x, y)))
-    channels = [dr.select(valid, channel, 0.0) for channel in radiance] + [dr.select(valid, mi.Float(1.0), 0.0)]
-    # Evaluated together: summing an unevaluated channel would trace all the paths again for each of the four.
-    dr.eval(channels)
-    # A sample that is not finite would poison its pixel; a geometry that makes one is a bug worth seeing.
-    sums = [dr.block_sum(channel, spp) for channel in channels]
-    dr.eval(sums)
-    result = np.stack([to_numpy(channel) for channel in sums], axis=-1) / spp
-    if not np.isfinite(result).all():
-        raise FloatingPointError("path tracing gave values that are not finite; are albedo and light finite?")
-    return result.reshape(height, camera.width_px, 4)
+    first, second = np.random.SeedSequence(seed).generate_state(2)
+    return trace_block(scene, camera, block, max_depth=max_depth, seed=(first, second))
 
 
-def _trace_block_scalar(scene: RenderScene, camera: Camera, integrator: Any,
-                        block: tuple[int, int, int, int]) -> np.ndarray:  # fmt: skip
+def _trace_block_scalar(scene: RenderScene, camera: Camera, block: tuple[int, int, int, int], *, max_depth: int,
+                        seed: int) -> np.ndarray:  # fmt: skip
     """The same through Mitsuba's own sensor and film, as the scalar variant knows no lanes."""
     import mitsuba as mi
 
     if abs(camera.fx / camera.fy - 1.0) > 1e-6:
         raise ValueError("the scalar variant renders square pixels only; install a libLLVM for other cameras")
-    top, height, spp, seed = block
+    top, height, first, count = block
+    block_seed = int(np.random.SeedSequence((seed, top, first)).generate_state(1)[0])
     pose = camera.world_from_camera @ np.diag([-1.0, -1.0, 1.0, 1.0])  # Mitsuba looks along +z with x to the left
     sensor = mi.load_dict(
         {
@@ -131,7 +115,7 @@ def _trace_block_scalar(scene: RenderScene, camera: Camera, integrator: Any,
             "near_clip": 0.5,
             "far_clip": 1.0e7,
             "to_world": mi.ScalarTransform4f(pose),
-            "sampler": {"type": "independent", "sample_count": spp},
+            "sampler": {"type": "independent", "sample_count": count},
             "film": {
                 "type": "hdrfilm",
                 "width": camera.width_px,
@@ -146,7 +130,9 @@ def _trace_block_scalar(scene: RenderScene, camera: Camera, integrator: Any,
             },
         }
     )
-    return np.array(mi.render(scene.mi_scene, sensor=sensor, integrator=integrator, spp=spp, seed=seed), np.float32)
+    integrator = mi_path_integrator(max_depth)
+    mean = mi.render(scene.mi_scene, sensor=sensor, integrator=integrator, spp=count, seed=block_seed)
+    return np.array(mean, np.float32) * count
 
 
 def render_view(scene: RenderScene, camera: Camera, *, spp: int = 64, seed: int = 0, max_depth: int = 6,
@@ -199,7 +185,9 @@ def _air_of_subpixels(scene: RenderScene, camera: Camera, row: np.ndarray, colum
     pixel = np.stack([column[:, None] + dx, row[:, None] + dy], axis=-1)
     depth = trace_gbuffer(scene, camera, pixel).depth
     hit = np.isfinite(depth)
-    transmittance, airlight = scene.illumination.aerial_perspective(np.where(hit, depth, 0.0), ray_directions(camera, pixel))
+    transmittance, airlight = scene.illumination.aerial_perspective(
+        np.where(hit, depth, 0.0), ray_directions(camera, pixel)
+    )
     weight = hit / np.maximum(hit.sum(axis=1, keepdims=True), 1)
     # No sub-ray met terrain: keep the coverage's rare sample unattenuated rather than black.
     missed = ~hit.any(axis=1)
