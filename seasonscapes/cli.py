@@ -21,6 +21,7 @@ app = App(
 app.command("seasonscapes.commands.render:render", help="Render a view of a place at a date and hour.")
 app.command("seasonscapes.commands.sky:sky", help="Tell the light of a place at an instant, and picture the dome.")
 app.command("seasonscapes.commands.terrain:terrain", help="Build a place's terrain and report how good it is.")
+app.command("seasonscapes.commands.webcams:webcams", help="List, check and map a scene's webcams and their pictures.")
 app.command("seasonscapes.commands.demo:demo", help="Picture the embedded scene through a day, a night and a year.")
 app.command("seasonscapes.commands.doctor:doctor", help="Say what this machine can do, and what is missing.")
 

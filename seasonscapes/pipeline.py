@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from seasonscapes.terrain.unwrap import Atlas
 
 # Raised when a stage's result changes for equal inputs, so that old artefacts are not taken for new ones.
-REVISIONS = {"place": 1, "terrain": 1, "albedo": 1}
+REVISIONS = {"place": 2, "terrain": 1, "albedo": 1}
 
 
 @dataclass(frozen=True)
@@ -97,6 +97,8 @@ def load_place(path: Path, workspace: Workspace, *, options: MeshOptions | None 
     """Read a scene file and its elevation, and build its terrain (or load it, where it was built before)."""
     options = options or MeshOptions()
     scene = read_scene(path, allow_outside=allow_outside)
+    if scene.elevation is None:
+        raise InputError(path, "names no elevation raster", cure="add a table [elevation] with file = \"dem.tif\"")
     elevation, fill, synthetic = _elevation(path, scene, workspace)
     frame = _frame(scene, elevation)
     source = scene.elevation.file

@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from seasonscapes.cameras.pinhole import Camera, camera_at
+from seasonscapes.cameras.webcam import Webcam
 from seasonscapes.declaration import Declaration, InputError, read_declaration
 from seasonscapes.frames import STANDARD_REFRACTION_K, LocalFrame
 
@@ -103,7 +104,10 @@ class NamedCamera(Declaration):
 
 
 class SceneFile(Declaration):
-    """A scene file. ``camera`` is an array of tables ``[[camera]]``."""
+    """A scene file. ``camera`` and ``webcam`` are arrays of tables, ``[[camera]]`` and ``[[webcam]]``.
+
+    A file without ``elevation`` tells where a place and its webcams are; terrain needs a raster.
+    """
 
     name: str = Field(pattern=r"^[a-z0-9][a-z0-9_-]*$")
     title: str = ""
@@ -112,23 +116,22 @@ class SceneFile(Declaration):
     refraction_k: float = Field(default=STANDARD_REFRACTION_K, ge=0.0, lt=0.9)
     origin: Origin | None = None
     area: Area | None = None
-    elevation: Elevation
+    elevation: Elevation | None = None
     imagery: Imagery | None = None
-    webcams: str | None = None
     cameras: list[NamedCamera] = Field(default_factory=list, alias="camera")
+    webcams: list[Webcam] = Field(default_factory=list, alias="webcam")
 
-    @field_validator("cameras")
-    @classmethod
-    def _unique(cls, cameras: list[NamedCamera]) -> list[NamedCamera]:
-        names = [camera.name for camera in cameras]
-        twice = next((name for name in names if names.count(name) > 1), None)
-        if twice is not None:
-            raise ValueError(f"two cameras are named '{twice}'")
-        return cameras
+    @model_validator(mode="after")
+    def _unique(self) -> SceneFile:
+        for kind, names in (("cameras", [c.name for c in self.cameras]), ("webcams", [w.id for w in self.webcams])):
+            twice = next((name for name in names if names.count(name) > 1), None)
+            if twice is not None:
+                raise ValueError(f"two {kind} are named '{twice}'")
+        return self
 
     @model_validator(mode="after")
     def _albedo_known(self) -> SceneFile:
-        if self.imagery is not None and self.elevation.synthetic is not None:
+        if self.imagery is not None and self.elevation is not None and self.elevation.synthetic is not None:
             raise ValueError("a synthetic place brings its own albedo: drop the table 'imagery'")
         return self
 
@@ -177,14 +180,12 @@ def read_scene(path: str | Path, *, allow_outside: bool = False) -> SceneFile:
         return name if virtual else str(target)
 
     updates: dict = {}
-    if scene.elevation.file is not None:
+    if scene.elevation is not None and scene.elevation.file is not None:
         updates["elevation"] = scene.elevation.model_copy(
             update={"file": resolved("elevation.file", scene.elevation.file)}
         )
     if scene.imagery is not None:
         updates["imagery"] = scene.imagery.model_copy(update={"file": resolved("imagery.file", scene.imagery.file)})
-    if scene.webcams is not None:
-        updates["webcams"] = resolved("webcams", scene.webcams)
     return scene.model_copy(update=updates)
 
 

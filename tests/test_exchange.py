@@ -36,7 +36,7 @@ from seasonscapes.declaration import InputError
 from seasonscapes.frames import LocalFrame, geodetic_from_enu
 
 FRAME = LocalFrame(46.6, 8.0, 1500.0, 0.13)
-BERNESE = Path(__file__).parents[1] / "scenes" / "bernese_webcams.toml"
+BERNESE = Path(__file__).parents[1] / "scenes" / "bernese_highlands.toml"
 
 
 def some_views(count=6):

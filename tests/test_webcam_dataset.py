@@ -33,7 +33,7 @@ from seasonscapes.cameras.webcam import (
 from seasonscapes.declaration import InputError
 from seasonscapes.frames import LocalFrame, angles_from_direction, enu_from_geodetic, local_axes
 
-BERNESE = Path(__file__).parents[1] / "scenes" / "bernese_webcams.toml"
+BERNESE = Path(__file__).parents[1] / "scenes" / "bernese_highlands.toml"
 FRAME = LocalFrame(46.6, 8.0, 1500.0)
 
 

@@ -18,7 +18,7 @@ from pydantic import Field, field_validator, model_validator
 
 from seasonscapes.cameras.panorama import Panorama, panorama_from_angles
 from seasonscapes.cameras.pinhole import Camera, rotation_from_angles
-from seasonscapes.declaration import Declaration, InputError, read_declaration
+from seasonscapes.declaration import Declaration, InputError, read_toml, validate
 from seasonscapes.frames import LocalFrame, enu_from_geodetic, local_axes
 
 
@@ -86,8 +86,12 @@ class WebcamFile(Declaration):
 
 
 def read_webcams(path: Path) -> tuple[Webcam, ...]:
-    """The ``[[webcam]]`` tables of a TOML file; `InputError` in one line for the first thing that is wrong."""
-    return tuple(read_declaration(path, WebcamFile).webcam)
+    """The ``[[webcam]]`` tables of a TOML file; `InputError` in one line for the first thing that is wrong.
+
+    The file may be a scene file: its other tables are `seasonscapes.scene`'s to judge.
+    """
+    tables = {key: value for key, value in read_toml(path).items() if key == "webcam"}
+    return tuple(validate(tables, WebcamFile, where=path).webcam)
 
 
 def find_webcam(webcams: Sequence[Webcam], webcam_id: str) -> Webcam:
