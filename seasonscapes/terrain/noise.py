@@ -18,8 +18,9 @@ def spline_noise(seed: int, wavelength_m: float, east_m: np.ndarray, north_m: np
     """
     step = 0.5 * wavelength_m
     rows, columns = _spline_basis(north_m / step), _spline_basis(east_m / step)
-    lattice = _lattice(seed, rows[1], columns[1])
-    return np.asarray(rows[0] @ (columns[0] @ lattice.T).T / _SPLINE_DEVIATION, np.float32)
+    lattice = (_lattice(seed, rows[1], columns[1]) / _SPLINE_DEVIATION).astype(np.float32)
+    across = np.ascontiguousarray((columns[0] @ lattice.T).T)
+    return rows[0] @ across
 
 
 def warped_noise(seed: int, wavelength_m: float, east_m: np.ndarray, north_m: np.ndarray) -> np.ndarray:
@@ -35,9 +36,16 @@ def warped_noise(seed: int, wavelength_m: float, east_m: np.ndarray, north_m: np
 
 def fractal_noise(seed: int, wavelength_m: float, east_m: np.ndarray, north_m: np.ndarray, *,
                   octaves: int, gain: float = 0.5) -> np.ndarray:  # fmt: skip
-    """Sum of octaves of `spline_noise`, unit variance, ``(H, W)`` float32."""
-    weights = gain ** np.arange(octaves)
-    total = sum(w * spline_noise(seed + 101 * k, wavelength_m / 2**k, east_m, north_m) for k, w in enumerate(weights))
+    """Sum of octaves of `spline_noise`, ``(H, W)`` float32; unit variance when the grid holds them all.
+
+    Octaves finer than the grid are left out: within a cell they average to nothing, sampled they would alias.
+    """
+    weights = (gain ** np.arange(octaves)).astype(np.float32)
+    finest = 1.4 * abs(float(east_m[1] - east_m[0]))
+    total = np.zeros((len(north_m), len(east_m)), np.float32)
+    for k, weight in enumerate(weights):
+        if wavelength_m / 2**k >= finest:
+            total += weight * spline_noise(seed + 101 * k, wavelength_m / 2**k, east_m, north_m)
     return total / np.float32(np.sqrt(np.sum(weights**2)))
 
 
@@ -51,7 +59,9 @@ def _spline_basis(position: np.ndarray) -> tuple[sparse.csr_array, range]:
     columns = (cell - 1 - first)[:, None] + np.arange(4)
     rows = np.repeat(np.arange(len(position)), 4)
     count = int(cell.max()) + 3 - first
-    basis = sparse.csr_array((weights.ravel(), (rows, columns.ravel())), shape=(len(position), count))
+    basis = sparse.csr_array(
+        (weights.ravel().astype(np.float32), (rows, columns.ravel())), shape=(len(position), count)
+    )
     return basis, range(first, first + count)
 
 

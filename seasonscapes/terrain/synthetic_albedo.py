@@ -46,7 +46,7 @@ _STEADY = {
     Cover.FIRN: (0.660, 0.690, 0.720),
 }
 # Share of full snow cover that stays in view from above: crowns shed and hide it.
-_SNOW_IN_VIEW = {Cover.CONIFER: 0.30, Cover.LARCH: 0.50, Cover.BROADLEAF: 0.55, Cover.SHRUB: 0.85, Cover.WATER: 0.0}
+_SNOW_IN_VIEW = {Cover.CONIFER: 0.24, Cover.LARCH: 0.45, Cover.BROADLEAF: 0.55, Cover.SHRUB: 0.85, Cover.WATER: 0.0}
 _STRIP_ROWS = 160
 
 

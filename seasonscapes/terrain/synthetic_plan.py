@@ -45,8 +45,8 @@ _VALLEYS = (
     ((-4.2, 3.4, 572), (-4.1, 2.0, 640), (-4.25, 0.2, 740), (-4.5, -1.6, 860), (-4.6, -3.4, 1150), (-4.9, -4.9, 1750),
      (-5.5, -7.5, 2500)),
     # Névé basins and their glaciers.
-    ((-1.5, -3.4, 3160), (-0.7, -4.0, 2850), (0.3, -4.8, 2520), (1.0, -5.9, 2270), (1.4, -7.5, 2050)),
-    ((1.1, -2.1, 3050), (1.1, -3.2, 2760), (0.7, -4.6, 2500)),
+    ((-1.5, -3.4, 3160), (-0.7, -4.0, 2850), (0.3, -4.8, 2640), (1.0, -5.9, 2430), (1.4, -7.5, 2200)),
+    ((1.1, -2.1, 3050), (1.1, -3.2, 2760), (0.7, -4.6, 2620)),
     ((3.3, -4.5, 2950), (2.9, -5.4, 2600), (2.4, -7.5, 2050)),
     ((4.2, -3.2, 3150), (4.3, -2.2, 2850), (4.2, -1.2, 2350), (4.4, -0.2, 1800), (4.5, 0.8, 1250), (4.6, 1.7, 900)),
     ((6.3, -4.3, 2700), (6.8, -6.0, 2200), (7.5, -7.5, 1900)),
@@ -108,7 +108,7 @@ def warped(lattice: Lattice, seed: int) -> Lattice:
 
 def _spread(points: np.ndarray, values: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Inverse-distance mean of values at points, and the distance to the nearest point [m]."""
-    distance, index = cKDTree(points[:, :2]).query(position, k=40)
+    distance, index = cKDTree(points[:, :2]).query(position, k=24)
     weight = 1.0 / (distance + 20.0) ** 3
     return (weight * values[index]).sum(-1) / weight.sum(-1), distance[..., 0]
 
@@ -123,24 +123,36 @@ def sketched_heights(plan: Plan, lattice: Lattice) -> np.ndarray:
     return low + (high - low) * (0.45 * share + 0.55 * share**2)
 
 
-def anchored(z: np.ndarray, lattice: Lattice, plan: Plan) -> np.ndarray:
-    """Bring crests back up and valleys back down to the plan's heights by a smooth correction."""
+def _in_place(points: np.ndarray, seed: int) -> np.ndarray:
+    """Where the plan's points ``(P, 3)`` come to lie once the warp has bent their lines, ``(P, 2)`` [m]."""
+    at = points[:, :2].copy()
+    for _ in range(4):
+        bent = warped(Lattice(at[:, 0], at[:, 1], 0.0), seed)
+        at += points[:, :2] - np.stack([bent.east_m, bent.north_m], -1)
+    return at
+
+
+def anchoring(z: np.ndarray, lattice: Lattice, plan: Plan) -> np.ndarray:
+    """What brings crests back up and valleys back down to the plan's heights.
+
+    A smooth correction ``(h, w)`` [m] on the 120 m grid that covers the lattice's ground.
+    """
     spacing = lattice.spacing_m
-    bent = warped(lattice, plan.seed)
-    position = np.stack([bent.east_m, bent.north_m], -1)
-    tree = cKDTree(position.reshape(-1, 2))
+    half = (z.shape[0] - 1) // 2
     size = 2 * round(150.0 / spacing) + 1
-    reach = (z.shape[0] - 1) // 2 * spacing
+    axis = np.arange(-(n := int(np.ceil(half * spacing / 120.0))), n + 1) * 120.0
+    position = np.stack(np.meshgrid(axis, -axis), -1)
     corrections = []
     for points, extreme in ((plan.valleys, ndimage.minimum_filter), (plan.crests, ndimage.maximum_filter)):
-        inside = np.abs(points[:, :2]).max(axis=1) < reach - 200.0
-        at = tree.query(points[inside, :2])[1]
-        error = points[inside, 2] - extreme(z, size).ravel()[at]
-        corrections.append(_spread(points[inside], error, position))
+        at = _in_place(points, plan.seed)
+        row, column = np.rint(half - at[:, 1] / spacing).astype(int), np.rint(half + at[:, 0] / spacing).astype(int)
+        inside = (np.abs(at).max(axis=1) < half * spacing - 200.0).nonzero()[0]
+        error = points[inside, 2] - extreme(z, size)[row[inside], column[inside]]
+        corrections.append(_spread(at[inside], error, position))
     (low, to_valley), (high, to_crest) = corrections
     share = to_valley / (to_valley + to_crest + 1e-3)
     correction = (low + (high - low) * share).astype(np.float32)
-    return z + cv2.GaussianBlur(correction, (0, 0), 120.0 / spacing, borderType=cv2.BORDER_REPLICATE)
+    return cv2.GaussianBlur(correction, (0, 0), 1.0, borderType=cv2.BORDER_REPLICATE)
 
 
 def strata_level_m(z: np.ndarray, east_m: np.ndarray, north_m: np.ndarray, seed: int) -> np.ndarray:

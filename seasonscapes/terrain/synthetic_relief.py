@@ -25,7 +25,7 @@ from seasonscapes.terrain.synthetic_plan import (
     LEDGES_M,
     Plan,
     ValleyFloor,
-    anchored,
+    anchoring,
     plan_of,
     sketched_heights,
     strata_level_m,
@@ -172,7 +172,8 @@ def _settled(z: np.ndarray, lattice: Lattice, floor: ValleyFloor, seed: int) -> 
     fill = floor.height - 6.0 * np.clip(-floor.beyond_m / 300.0, 0.0, 1.0)
     weight = np.clip(-floor.beyond_m / 80.0, 0.0, 1.0)
     ripple = 1.3 * warped_noise(seed + 61, 330.0, lattice.east_m, lattice.north_m)
-    return z + weight * (fill + ripple - z)
+    z = z + weight * (fill + ripple - z)
+    return np.where(floor.beyond_m < 100.0, np.maximum(z, floor.height - 8.0), z)
 
 
 def _sample(z: np.ndarray, spacing_m: float, lattice: Lattice, order: int = 3) -> np.ndarray:
@@ -253,7 +254,7 @@ def _stage_surface(z: np.ndarray, lattice: Lattice, plan: Plan, floor: ValleyFlo
     z = z + stage.noise_m * bare * steep * _lowpass(rng.normal(0.0, 3.0, z.shape), 1.2 * spacing, spacing)
     z = _dissect(z, lattice, plan.seed, stage, bare)
     if spacing >= 30.0:
-        z = anchored(z, lattice, plan)
+        z = z + _sample(anchoring(z, lattice, plan), 120.0, lattice)
     if spacing == 60.0:
         routes = route_flow(z, links_of(lattice), lattice.border)
         z = _carve_troughs(z, accumulate(routes, np.full(z.shape, spacing**2)), spacing)
