@@ -98,7 +98,7 @@ def load_place(path: Path, workspace: Workspace, *, options: MeshOptions | None 
     options = options or MeshOptions()
     scene = read_scene(path, allow_outside=allow_outside)
     if scene.elevation is None:
-        raise InputError(path, "names no elevation raster", cure="add a table [elevation] with file = \"dem.tif\"")
+        raise InputError(path, "names no elevation raster", cure='add a table [elevation] with file = "dem.tif"')
     elevation, fill, synthetic = _elevation(path, scene, workspace)
     frame = _frame(scene, elevation)
     source = scene.elevation.file
@@ -260,14 +260,14 @@ def _baked_image(place: Place) -> Texture:
     from dataclasses import replace
 
     from seasonscapes.terrain.imagery import bake_imagery, read_imagery
-    from seasonscapes.terrain.raster import bounds_geographic, require_overlap
+    from seasonscapes.terrain.raster import bounds_geographic
 
     imagery = place.scene.imagery
     bands = tuple(imagery.bands) if imagery.bands else None
-    image = read_imagery(imagery.file, bands=bands, encoding=imagery.encoding, full_scale=imagery.full_scale)
-    require_overlap(image, place.elevation, where=f"{place.path}: imagery.file")
+    # Imagery far finer than the texels is averaged while it is read.
     image = read_imagery(imagery.file, bounds_deg=bounds_geographic(place.elevation), bands=bands,
-                         encoding=imagery.encoding, full_scale=imagery.full_scale)  # fmt: skip
+                         finest_m=0.5 * place.atlas.texel_p50_m, encoding=imagery.encoding,
+                         full_scale=imagery.full_scale)  # fmt: skip
     texture = bake_imagery(place.terrain, place.atlas, image)
     values = np.clip(texture.values * imagery.reflectance_scale, 0.0, 0.95)
     seen = texture.weight > 0.0

@@ -104,7 +104,7 @@ def in_feet_and_a_half(values, profile):
 @pytest.mark.parametrize(("name", "change", "message"), [
     ("dem.tif", without_crs, "no CRS"),
     ("dem.tif", in_degrees, "degrees where metres"),
-    ("image.tif", elsewhere, r"imagery\.file: does not overlap"),
+    ("image.tif", elsewhere, r"image\.tif: the raster does not reach the area"),
     ("dem.tif", mostly_holes, "too much of the area has no data"),
     ("dem.tif", in_feet_and_a_half, "heights that no place on land has"),
 ])  # fmt: skip

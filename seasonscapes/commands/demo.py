@@ -35,7 +35,10 @@ DAY_AND_YEAR = [
     Panel("autumn noon, 20 October", f"{YEAR}-10-20T13:10"),
 ]
 HOURS = [
-    Panel(f"{(datetime(YEAR, 9, 17, 12) + timedelta(hours=h)):%d %b %H:%M}", f"{datetime(YEAR, 9, 17, 12) + timedelta(hours=h):%Y-%m-%dT%H:%M}")
+    Panel(
+        f"{(datetime(YEAR, 9, 17, 12) + timedelta(hours=h)):%d %b %H:%M}",
+        f"{datetime(YEAR, 9, 17, 12) + timedelta(hours=h):%Y-%m-%dT%H:%M}",
+    )
     for h in range(24)
 ]
 AIR = [

@@ -7,9 +7,10 @@ import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
-from seasonscapes.declaration import InputError
+from seasonscapes.errors import InputError
 
 
 def say(line: str) -> None:
@@ -41,6 +42,19 @@ def progress_bar(title: str) -> Iterator[Callable[[float], None]]:
     with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
         task = bar.add_task(title, total=1.0)
         yield lambda share: bar.update(task, completed=share)
+
+
+def check_range(flag: str, value: float, low: float, high: float) -> None:
+    """`InputError` about a flag whose value is not within [low, high]."""
+    if not low <= value <= high:
+        raise InputError(flag, "out of range", got=value, expected=f"{low:g} to {high:g}")
+
+
+def check_suffix(output: Path, suffixes: tuple[str, ...]) -> None:
+    """`InputError` about ``--output`` where its name does not end in one of the suffixes."""
+    if output.suffix.lower() not in suffixes:
+        raise InputError("--output", "unknown kind of file", got=str(output),
+                         expected="a name that ends in " + " or ".join(suffixes))  # fmt: skip
 
 
 def parse_size(text: str) -> tuple[int, int]:

@@ -100,7 +100,9 @@ def webcams(
         f"{verdicts.get(webcam.id, 'height unchecked')}{f'  {counts[webcam.id]} pictures' if rows else ''}"
         for webcam in place.webcams
     ]
-    lines.append(f"{len(place.webcams)} webcams" + (f", {len(rows)} pictures, {len(problems)} problems" if rows else ""))
+    lines.append(
+        f"{len(place.webcams)} webcams" + (f", {len(rows)} pictures, {len(problems)} problems" if rows else "")
+    )
     lines += [f"{problem.kind}: {problem.path}: {problem.detail}" for problem in problems[:50]]
     if len(problems) > 50:
         lines.append(f"… and {len(problems) - 50} more problems; --json lists all")
@@ -116,5 +118,7 @@ def _heights(place, source) -> list:
         return []
     bounds = place.area.bounds_deg if place.area is not None else None
     raster = read_elevation(source, bounds_deg=bounds)
-    x, y = map_from_geodetic(raster.crs, [w.latitude_deg for w in place.webcams], [w.longitude_deg for w in place.webcams])
+    x, y = map_from_geodetic(
+        raster.crs, [w.latitude_deg for w in place.webcams], [w.longitude_deg for w in place.webcams]
+    )
     return check_heights(place.webcams, sample_raster(raster, x, y)[..., 0])
