@@ -1,10 +1,10 @@
 """Scene files: what they may say, and the one line that each mistake earns."""
 
 import numpy as np
+import places
 import pytest
 import rasterio
 
-import places
 from seasonscapes.declaration import InputError
 from seasonscapes.pipeline import MeshOptions, camera_for, load_place
 from seasonscapes.scene import read_scene
