@@ -18,7 +18,7 @@ from seasonscapes.terrain.synthetic import (
     snow_line_m,
 )
 from seasonscapes.terrain.synthetic_cover import FOREST
-from seasonscapes.terrain.synthetic_ice import grow_ice
+from seasonscapes.terrain.synthetic_ice import grow_ice, mass_balance_m
 from seasonscapes.terrain.synthetic_plan import LAKE_LEVEL_M
 
 
@@ -327,10 +327,12 @@ def test_slumping_moves_but_neither_makes_nor_loses_rock():
 def test_ice_balances_snow_and_melt():
     """A valley glacier ends where its tongue has melted what its névé received, and stays there."""
     row, column = np.mgrid[0:60, 0:21]
-    bed = 3400.0 - 25.0 * row + (column - 10.0) ** 2 + 60.0 * np.maximum(4 - row, 0)
+    bed = 3400.0 - 25.0 * row + (column - 10.0) ** 2 + 30.0 * np.maximum(4 - row, 0)
     ice, longer = (grow_ice(bed, 100.0, np.full(bed.shape, 3150.0), rounds=n) for n in (1500, 3000))
-    assert np.abs(ice - longer).max() < 0.1
-    balance = np.clip(0.0085 * (bed + ice - 3150.0), -14.0, 1.6)
+    assert np.abs(ice - longer).max() < 0.5
+    # Slopes below 33° hold all their snow, so that the budget is what grow_ice itself applies.
+    assert np.hypot(*np.gradient(bed, 100.0)).max() < 0.65
+    balance = mass_balance_m(bed + ice, 3150.0)
     covered = ice > 0.0
     covered[[0, -1]] = covered[:, [0, -1]] = False
     assert ice.max() > 50.0

@@ -64,9 +64,15 @@ def ground_cover(relief: Relief, spacing_m: float, seed: int, east_m: np.ndarray
     cover[thin > 0.0] = Cover.SCREE
     firm = (slope - 38.5 - 3.0 * small) / 4.0 - np.clip(hollow, -12.0, 12.0) / 9.0 + np.maximum(z - 2700.0, 0.0) / 900.0
     cover[(thin > 0.0) & ((firm > 0.0) | (slope > 47.0))] = Cover.ROCK
+    # What the glaciers left in the last 150 years is still bare.
+    forefield = cv2.GaussianBlur((relief.ice_m > 0.0).astype(np.float32), (0, 0), 130.0 / spacing_m)
+    fresh = (forefield + 0.05 * small > 0.13) & (cover != Cover.ROCK) & (z > 1300.0)
+    cover[fresh] = Cover.SCREE
     cover[relief.ice_m > 0.0] = Cover.ICE
     firn = z > 3060.0 - 260.0 * north + 70.0 * large + 60.0 * small - 6.0 * np.clip(hollow, -15.0, 15.0)
-    firn &= slope < 46.0 + 4.0 * small + 0.3 * np.clip(hollow, -10.0, 15.0)
+    firn &= slope < 41.0 + 4.0 * small + 0.3 * np.clip(hollow, -10.0, 15.0)
+    # Wind keeps the crests bare.
+    firn &= hollow > -11.0 - 4.0 * small
     cover[firn] = Cover.FIRN
     river = (relief.catchment_m2 > 9e6) & (relief.ice_m <= 0.0) & (z < 1400.0)
     cover[river | (relief.floor.shore_m < 0.0)] = Cover.WATER

@@ -56,6 +56,9 @@ _STAGES = (
 )
 
 
+_BED_SCALE_M = 110.0  # ice is level across what is smaller
+
+
 @dataclass(frozen=True)
 class Relief:
     """What stands and what moves on the massif; all ``(H, W)`` on the regular grid, row 0 in the north.
@@ -188,24 +191,30 @@ def _regular(half_m: float, spacing_m: float) -> Lattice:
 
 
 def _glaciers(bed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Thickness and surface height ``(H, W)`` [m] of the ice on a 60 m bed, computed at 120 m."""
+    """Thickness and surface ``(H, W)`` [m] of the ice on a 60 m bed, computed at 120 m.
+
+    The surface is told from the smoothed bed, so that it follows when finer stages move that.
+    """
     coarse = cv2.GaussianBlur(bed, (0, 0), 1.0)[::2, ::2]
     down, right = np.gradient(_lowpass(coarse, 240.0, 120.0), 120.0)
     northness = down / np.sqrt(1.0 + down**2 + right**2)
     ice = grow_ice(coarse, 120.0, 3000.0 - 260.0 * northness, rounds=350)
     grid = _regular((bed.shape[0] - 1) // 2 * 60.0, 60.0)
-    return tuple(_sample(_lowpass(a, 70.0, 120.0), 120.0, grid) for a in (ice, coarse + ice))
+    thickness, surface = (_sample(_lowpass(a, 70.0, 120.0), 120.0, grid) for a in (ice, coarse + ice))
+    return thickness, surface - _lowpass(bed, _BED_SCALE_M, 60.0)
 
 
 def _glaciated(bed: np.ndarray, ice: tuple[np.ndarray, np.ndarray], lattice: Lattice) -> np.ndarray:
     """Ice thickness ``(H, W)`` [m] on a finer bed: deep ice is level across, thin ice lies on what is below."""
-    thickness, surface = (_sample(a, 60.0, lattice) for a in ice)
+    thickness, above_bed = (_sample(a, 60.0, lattice) for a in ice)
+    surface = above_bed + _lowpass(bed, _BED_SCALE_M, lattice.spacing_m)
     # Around a thick glacier even its thin spots are level: no pits over bumps of the coarse bed.
     around = _lowpass(thickness, 150.0, lattice.spacing_m)
     deep = np.clip((np.maximum(thickness, 0.9 * around) - 15.0) / 50.0, 0.0, 1.0)
     steep = _lowpass(np.hypot(*np.gradient(bed, lattice.spacing_m)), 20.0, lattice.spacing_m)
-    clings = np.clip((1.1 + thickness / 60.0 - steep) / 0.3, 0.0, 1.0)
-    filled = deep * (surface - bed) + (1.0 - deep) * 0.5 * thickness * clings
+    clings = np.clip((0.85 + thickness / 60.0 - steep) / 0.3, 0.0, 1.0)
+    hollow = np.clip(1.0 + (_lowpass(bed, 60.0, lattice.spacing_m) - bed) / 12.0, 0.0, 1.5)
+    filled = deep * (surface - bed) + (1.0 - deep) * 0.5 * thickness * clings * hollow
     filled = np.where(((thickness > 10.0) | (around > 35.0)) & (filled > 3.0), filled, 0.0)
     # Scraps that no névé feeds have melted long ago.
     label, count = ndimage.label(filled > 0.0, np.ones((3, 3)))
@@ -218,12 +227,12 @@ def _glaciated(bed: np.ndarray, ice: tuple[np.ndarray, np.ndarray], lattice: Lat
     return np.where(lives[label], filled, 0.0)
 
 
-def _moraines(ice: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+def _moraines(ice: tuple[np.ndarray, np.ndarray], surface: np.ndarray) -> np.ndarray:
     """Share of debris on the ice ``(H, W)`` of the 60 m grid, by tracing its way back up.
 
     What flows down from névé is clean; what passed a rock wall below the snow line carries its fall.
     """
-    thickness, surface = ice[0], _lowpass(ice[1], 150.0, 60.0)
+    thickness, surface = ice[0], _lowpass(surface, 150.0, 60.0)
     down, right = np.gradient(surface, 60.0)
     steep = np.hypot(down, right) + 1e-4
     at = np.stack(np.nonzero(thickness > 10.0)).astype(float)
@@ -278,7 +287,7 @@ def relief(half_m: float, spacing_m: float, seed: int) -> Relief:
     """The massif on the regular grid of ``spacing_m`` (one of the stages') reaching ``half_m`` from its centre."""
     plan = plan_of(seed)
     floor = valley_floor(plan, _regular(half_m + 1020.0, 60.0))
-    z = ice = None
+    z = ice = debris = None
     for stage in (stage for stage in _STAGES if stage.spacing_m >= spacing_m):
         spacing = stage.spacing_m
         rng = np.random.default_rng(seed + int(spacing))
@@ -287,7 +296,8 @@ def relief(half_m: float, spacing_m: float, seed: int) -> Relief:
         z = _stage_surface(z, lattice, plan, floor, stage, _bare(z, spacing, ice, lattice))
         if spacing == 60.0:
             ice = _glaciers(z)
-            z = z + np.clip((ice[0] - 40.0) / 60.0, 0.0, 0.85) * (_lowpass(z, 110.0, spacing) - z)
+            debris = _moraines(ice, _lowpass(z, _BED_SCALE_M, spacing) + ice[1])
+            z = z + np.clip((ice[0] - 40.0) / 60.0, 0.0, 0.85) * (_lowpass(z, _BED_SCALE_M, spacing) - z)
     if spacing_m < 60.0:
         lattice = _regular((z.shape[0] - 1) // 2 * spacing_m, spacing_m)
         routes = route_flow(z, links_of(lattice), lattice.border)
@@ -304,5 +314,5 @@ def relief(half_m: float, spacing_m: float, seed: int) -> Relief:
     z = np.maximum(z + near * (rise - z), rise - 0.08 * np.maximum(floor.shore_m - 100.0, 0.0))
     z = np.where(floor.shore_m < 0.0, LAKE_LEVEL_M, z)
     routes = route_flow(z, links_of(regular), regular.border)
-    debris = np.clip(_sample(_moraines(ice), 60.0, regular, order=1), 0.0, 1.0)
+    debris = np.clip(_sample(debris, 60.0, regular, order=1), 0.0, 1.0)
     return Relief(z, thickness, debris, accumulate(routes, np.full(z.shape, spacing_m**2)), floor)
