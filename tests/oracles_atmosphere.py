@@ -16,7 +16,7 @@ from seasonscapes.sky.spectrum import WAVELENGTHS_NM
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(40)
 _NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
-_CELLS = 64
+_CELLS, _LOBE_G = 64, 0.7
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def _next_vertex(walk: Walk, where, heading, random, *, first: bool):
     total = np.concatenate([np.zeros_like(depth[:, :1]), np.cumsum(depth, axis=1)], axis=1)
     scatter = np.einsum("cns,cb->nsb", density[:2], air.scattering[:2])
     guess = (scatter * np.exp(-0.5 * (total[:, 1:] + total[:, :-1]))).mean(axis=-1)
-    guess *= (_sunlit_guess(walk, points, radius) + 0.1) * length
+    guess *= (_sunlit_guess(walk, points, radius) + 0.01) * length
     guess += 1e-30
     share = guess / guess.sum(axis=1, keepdims=True)
     share = 0.95 * share + 0.05 / _CELLS
@@ -164,24 +164,34 @@ def _sunlit_guess(walk: Walk, points, radius) -> np.ndarray:
 
 
 def _new_direction(walk: Walk, where, heading, from_ground, random):
-    """A direction, its probability, and both phase functions towards it: half isotropic, half forward."""
+    """A direction, its probability, and both phase functions towards it.
+
+    From the air: isotropic, about the heading, or about the bright sky near the sun, one third each.
+    """
     count = len(where)
-    g = 0.75
-    share, u, v = random.random(count), random.random(count), random.random(count)
-    forward = (1.0 + g**2 - ((1.0 - g**2) / (1.0 - g + 2.0 * g * u)) ** 2) / (2.0 * g)
+    choice, u, turn = random.integers(0, 3, count), random.random(count), 2.0 * np.pi * random.random(count)
     up = where / np.linalg.norm(where, axis=1, keepdims=True)
-    axis = np.where(from_ground[:, None], up, heading)
-    cosine = np.where(from_ground, np.sqrt(u), np.where(share < 0.5, 2.0 * u - 1.0, forward))
-    new = _turned(axis, cosine, 2.0 * np.pi * v)
-    lobe = (1.0 - g**2) / (4.0 * np.pi * (1.0 + g**2 - 2.0 * g * cosine) ** 1.5)
-    pdf = np.where(from_ground, np.maximum(cosine, 1e-9) / np.pi, 0.5 / (4.0 * np.pi) + 0.5 * lobe)
-    return new, pdf, (gas_phase(cosine), aerosol_phase(cosine, walk.atmosphere.asymmetry))
+    bright = walk.sun + up * np.maximum(0.15 - up @ walk.sun, 0.0)[:, None]
+    bright /= np.linalg.norm(bright, axis=1, keepdims=True)
+    axis = np.where((choice == 2)[:, None], bright, heading)
+    axis = np.where(from_ground[:, None], up, axis)
+    peak = (1.0 + _LOBE_G**2 - ((1.0 - _LOBE_G**2) / (1.0 - _LOBE_G + 2.0 * _LOBE_G * u)) ** 2) / (2.0 * _LOBE_G)
+    cosine = np.where(from_ground, np.sqrt(u), np.where(choice == 0, 2.0 * u - 1.0, peak))
+    new = _turned(axis, cosine, turn)
+    scattering, to_bright = (new * heading).sum(axis=1), (new * bright).sum(axis=1)
+    mixture = (1.0 / (4.0 * np.pi) + _lobe(scattering) + _lobe(to_bright)) / 3.0
+    pdf = np.where(from_ground, np.maximum(cosine, 1e-9) / np.pi, mixture)
+    return new, pdf, (gas_phase(scattering), aerosol_phase(scattering, walk.atmosphere.asymmetry))
+
+
+def _lobe(cosine):
+    return (1.0 - _LOBE_G**2) / (4.0 * np.pi * (1.0 + _LOBE_G**2 - 2.0 * _LOBE_G * cosine) ** 1.5)
 
 
 def _turned(axis, cosine, turn):
     """Unit vectors at an angle from axes ``(N, 3)``."""
-    helper = np.where(np.abs(axis[:, 2:]) < 0.9, np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]))
-    side = np.cross(axis, helper)
+    other = np.where(np.abs(axis[:, 2:]) < 0.9, np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]))
+    side = np.cross(axis, other)
     side /= np.linalg.norm(side, axis=1, keepdims=True)
     other = np.cross(axis, side)
     sine = np.sqrt(np.maximum(1.0 - cosine**2, 0.0))

@@ -210,7 +210,7 @@ def constituent_densities(atmosphere: Atmosphere, height_m) -> np.ndarray:
     Gas counts from sea level up (pressure says how much there is); aerosol and ozone from the ground up.
     """
     height = np.asarray(height_m, float)
-    knots, gas, ozone = _standard_profiles()
+    knots, gas, ozone, _ = _standard_profiles()
     above_ground = np.maximum(height - atmosphere.ground_height_m, 0.0)
     scale, thickness = atmosphere.aerosol_scale_height_m, TOP_HEIGHT_M - atmosphere.ground_height_m
     if np.isinf(scale):
@@ -225,8 +225,7 @@ def refractivity(atmosphere: Atmosphere, height_m) -> tuple[np.ndarray, np.ndarr
     height = np.asarray(height_m, float)
     if not atmosphere.refraction:
         return np.zeros_like(height), np.zeros_like(height)
-    knots, gas, _ = _standard_profiles()
-    slope = np.gradient(gas, knots)
+    knots, gas, _, slope = _standard_profiles()
     sea_level = SEA_LEVEL_REFRACTIVITY * _gas_share(atmosphere)
     value = sea_level * np.exp(np.interp(height, knots, gas) - np.interp(0.0, knots, gas))
     return value, value * np.interp(height, knots, slope)
@@ -237,8 +236,8 @@ def _gas_share(atmosphere: Atmosphere) -> float:
 
 
 @cache
-def _standard_profiles() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Knots [m], log of the gas profile and the ozone profile, both normalised to unit columns [1/m].
+def _standard_profiles() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Knots [m], log of the gas profile, the ozone profile, both of unit columns [1/m], and the gas's log slope [1/m].
 
     Gas: density of the U.S. Standard Atmosphere 1976 (layers of constant lapse rate, table 4) continued above 84.852 km
     with a scale height of 5.7 km. Ozone: the mid-latitude number density of the same, table 17 (Krueger & Minzner).
@@ -273,4 +272,4 @@ def _standard_profiles() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     ]
     # fmt: on
     ozone = np.interp(knots, np.arange(len(ozone_e11_per_cm3)) * 2e3, ozone_e11_per_cm3)
-    return knots, log_gas, ozone / np.trapezoid(ozone, knots)
+    return knots, log_gas, ozone / np.trapezoid(ozone, knots), np.gradient(log_gas, knots)

@@ -40,7 +40,7 @@ __all__ = [
 ]
 
 # Raised whenever the tables of an equal atmosphere change.
-TABLES_REVISION = 2
+TABLES_REVISION = 3
 # Below this normal illuminance a luminary casts no visible shadow [lx].
 _FAINTEST_LX = 1e-6
 
@@ -155,8 +155,9 @@ def save_tables(path: str | PathLike, tables: AtmosphereTables) -> None:
     """Write tables to one ``.npz`` file, atomically."""
     with atomic_path(path) as temporary:
         np.savez_compressed(
-            temporary, revision=TABLES_REVISION, atmosphere=json.dumps(asdict(tables.atmosphere)), lowest_rad=tables.sun_columns.lowest_rad,
-            log_columns=tables.sun_columns.log_columns, log_mean=tables.moments.log_mean, ratio=tables.moments.ratio,
+            temporary, revision=TABLES_REVISION, atmosphere=json.dumps(asdict(tables.atmosphere)),
+            lowest_rad=tables.sun_columns.lowest_rad, log_columns=tables.sun_columns.log_columns,
+            log_mean=tables.moments.log_mean, ratio=tables.moments.ratio,
             ground_irradiance=tables.moments.ground_irradiance,
         )  # fmt: skip
 

@@ -13,7 +13,9 @@ All radiances are transfers: over the sun's spectral irradiance above the air [1
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from math import factorial
 
 import numpy as np
@@ -39,16 +41,18 @@ from seasonscapes.sky.paths import (
 )
 from seasonscapes.sky.spectrum import WAVELENGTHS_NM
 
-# Delta-M takes aerosol's scattering within some 180°/L for unscattered. Along the horizon that is right only for narrow
-# peaks: with L = 4 the sky beside a setting sun comes out a fifth too bright, with 8 within a few per cent.
-HARMONIC_ORDER, LATER_ORDER = 8, 4
-_HEIGHTS, _AZIMUTHS, _CELLS = 14, 10, 24
+# Delta-M takes aerosol's scattering within some 180°/L for unscattered. Along the horizon that is right only for
+# narrow peaks: with L = 4 the sky beside a setting sun comes out a fifth too bright, with 10 within a path tracer's
+# noise.
+HARMONIC_ORDER, LATER_ORDER = 10, 4
+_HEIGHTS, _AZIMUTHS, _CELLS = 14, 11, 24
 # Close through twilight, where light falls by a factor of three a degree.
 SUN_ELEVATION_KNOTS_DEG = np.concatenate([
     np.arange(-30.0, -18.0, 3.0), np.arange(-18.0, -12.0, 1.5), np.arange(-12.0, 3.0, 0.75),
     [3.0, 4.5, 6.0, 8.0, 11.0, 15.0, 20.0, 27.0, 36.0, 47.0, 60.0, 74.0, 90.0],
 ])  # fmt: skip
 _DARK = 1e-30
+_THREADS = 4
 
 
 @dataclass(frozen=True)
@@ -191,8 +195,8 @@ def diffuse_source(atmosphere: Atmosphere, scaled: Optics, moments: Moments, sam
     index, share, cosines = geometry
     orders, bands = moments.ratio.shape[2], moments.ratio.shape[-1]
     cells = samples.height_m.size
-    # Interpolation, in height and in the sun's elevation, as products with matrices of hat functions; of the sun's knots
-    # only those that the samples need.
+    # Interpolation, in height and in the sun's elevation, as products with matrices of hat functions; of the sun's
+    # knots only those that the samples need.
     first, last = int(index.min()), int(index.max()) + 2
     row, share_of_row = height_index(atmosphere, samples.height_m)
     heights = _hats(row.ravel(), share_of_row.ravel(), len(moments.log_mean))
@@ -363,38 +367,51 @@ def atmosphere_tables(atmosphere: Atmosphere, *, tolerance: float = 0.1, max_ord
     """
     scaled = delta_scaled(optics(atmosphere), HARMONIC_ORDER)
     columns = sun_columns(atmosphere)
-    levels = [_level(atmosphere, scaled, h) for h in table_heights_m(atmosphere)]
     albedo = np.broadcast_to(np.asarray(atmosphere.ground_albedo, float), WAVELENGTHS_NM.shape) / np.pi
     sun = np.radians(SUN_ELEVATION_KNOTS_DEG)
     direct = sun_transfer(atmosphere, columns, scaled, np.full(sun.shape, atmosphere.ground_height_m), sun)
-    leaving = direct * np.maximum(np.sin(sun), 0.0)[:, None] * albedo
-    radiances = [_first_radiance(atmosphere, scaled, columns, level) for level in levels]
-    values, ground = _gathered(levels, radiances, leaving)
-    total, total_ground = values, ground
-    for order in range(2, max_orders + 1):
-        # Light that was scattered twice is smooth enough for a lower order.
-        source = values if order == 2 else values[:, :, : LATER_ORDER + 1, : LATER_ORDER + 1]
-        before, moments, leaving = values[:, :, 0, 0], as_moments(source, ground), ground * albedo
-        radiances = (_next_radiance(atmosphere, scaled, moments, level) for level in levels)
-        values, ground = _gathered(levels, radiances, leaving)
-        total, total_ground = total + values, total_ground + ground
-        # Later orders keep their shape and fall geometrically, band by band.
-        decay = np.clip(values[:, :, 0, 0] / np.maximum(before, _DARK), 0.0, 0.98)
-        rest = decay / (1.0 - decay)
-        if (rest * values[:, :, 0, 0] < tolerance * total[:, :, 0, 0] + _DARK).all():
-            break
+    # Levels are independent within an order, and numpy lets go of the interpreter while it works.
+    with ThreadPoolExecutor(_THREADS) as pool:
+        levels = list(pool.map(lambda height: _level(atmosphere, scaled, height), table_heights_m(atmosphere)))
+        leaving = direct * np.maximum(np.sin(sun), 0.0)[:, None] * albedo
+        values, ground = _gathered(
+            pool.map(
+                lambda level: _received(level, _first_radiance(atmosphere, scaled, columns, level), leaving), levels
+            )
+        )
+        total, total_ground = values, ground
+        rest = np.zeros_like(values[:, :, 0, 0])
+        for order in range(2, max_orders + 1):
+            # Light that was scattered twice is smooth enough for a lower order.
+            source = values if order == 2 else values[:, :, : LATER_ORDER + 1, : LATER_ORDER + 1]
+            before, moments, leaving = values[:, :, 0, 0], as_moments(source, ground), ground * albedo
+            next_order = partial(_received_next, atmosphere, scaled, moments, leaving)
+            values, ground = _gathered(pool.map(next_order, levels))
+            total, total_ground = total + values, total_ground + ground
+            # Later orders keep their shape and fall geometrically, band by band.
+            decay = np.clip(values[:, :, 0, 0] / np.maximum(before, _DARK), 0.0, 0.98)
+            rest = decay / (1.0 - decay)
+            if (rest * values[:, :, 0, 0] < tolerance * total[:, :, 0, 0] + _DARK).all():
+                break
     total = total + rest[:, :, None, None] * values
     return AtmosphereTables(atmosphere, columns, as_moments(total, total_ground + rest[0] * ground))
 
 
-def _gathered(levels: list[_Level], radiances, leaving: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """One order's moments ``(P, J, L, L, B)`` and ground irradiance ``(J, B)``, the ground's own light added."""
-    values, ground = [], None
-    for level, radiance in zip(levels, radiances, strict=True):
-        radiance = radiance + _from_ground(level, leaving)
-        values.append(_project(level, radiance))
-        ground = _irradiance(level, radiance) if ground is None else ground
-    return np.stack(values), ground
+def _gathered(received) -> tuple[np.ndarray, np.ndarray]:
+    """Moments ``(P, J, L, L, B)`` of all levels, and the lowest level's irradiance ``(J, B)``."""
+    moments, irradiance = zip(*received, strict=True)
+    return np.stack(moments), irradiance[0]
+
+
+def _received(level: _Level, radiance: np.ndarray, leaving: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Moments ``(J, L, L, B)`` and irradiance ``(J, B)`` of radiance along a level's rays, the ground's light added."""
+    radiance = radiance + _from_ground(level, leaving)
+    return _project(level, radiance), _irradiance(level, radiance)
+
+
+def _received_next(atmosphere: Atmosphere, scaled: Optics, moments: Moments, leaving: np.ndarray, level: _Level):
+    """The same for light of one more order."""
+    return _received(level, _next_radiance(atmosphere, scaled, moments, level), leaving)
 
 
 def _next_radiance(atmosphere: Atmosphere, scaled: Optics, moments: Moments, level: _Level) -> np.ndarray:
