@@ -29,7 +29,7 @@ _TURNING = {
                   (205, (0.080, 0.122, 0.032)), (250, (0.088, 0.118, 0.034)), (288, (0.120, 0.112, 0.042)),
                   (330, (0.130, 0.105, 0.062))),
     Cover.LARCH: ((100, (0.075, 0.058, 0.042)), (135, (0.055, 0.085, 0.022)), (205, (0.040, 0.066, 0.019)),
-                  (262, (0.070, 0.078, 0.018)), (288, (0.260, 0.145, 0.018)), (312, (0.200, 0.100, 0.022)),
+                  (262, (0.070, 0.078, 0.018)), (288, (0.235, 0.155, 0.024)), (312, (0.190, 0.105, 0.024)),
                   (330, (0.085, 0.062, 0.040))),
     Cover.BROADLEAF: ((95, (0.080, 0.066, 0.050)), (130, (0.052, 0.098, 0.018)), (205, (0.034, 0.068, 0.016)),
                       (255, (0.050, 0.070, 0.016)), (285, (0.190, 0.100, 0.018)), (305, (0.170, 0.070, 0.022)),
@@ -108,7 +108,11 @@ def _snow(place, day: float, rows: slice, upsample: int) -> np.ndarray:
     # Walls steeper than about 55° shed it; ledges below the pixel keep some.
     level = strata_level_m(z, east, north, place.seed)
     ledge = np.cos(level * (2.0 * np.pi / LEDGES_M[1]))
-    holds = 1.0 - _smoothstep(44.0, 60.0, slope - 5.0 * patches - (2.0 + 2.0 * np.roll(patches, 500, axis=1)) * ledge)
+    holds = 1.0 - _smoothstep(
+        44.0,
+        60.0,
+        slope - 5.0 * patches - (1.2 + 2.2 * fractal_noise(place.seed + 311, 700.0, east, north, octaves=3)) * ledge,
+    )
     return lies * (0.06 + 0.94 * holds)
 
 
@@ -177,7 +181,7 @@ def _ground(place, day: float, rows: slice, upsample: int) -> tuple[np.ndarray, 
 def _texture(albedo, cover, z, grain, broad, position, seed) -> None:
     """Variation within a class, in place: crowns, tufts, strata, crevasses."""
     east, north = position
-    contrast = {Cover.MEADOW: 0.16, Cover.CONIFER: 0.30, Cover.LARCH: 0.28, Cover.BROADLEAF: 0.26, Cover.SHRUB: 0.24,
+    contrast = {Cover.MEADOW: 0.16, Cover.CONIFER: 0.42, Cover.LARCH: 0.36, Cover.BROADLEAF: 0.34, Cover.SHRUB: 0.24,
                 Cover.SCREE: 0.12, Cover.ROCK: 0.27, Cover.ICE: 0.10, Cover.FIRN: 0.03, Cover.FIELD: 0.10}  # fmt: skip
     gain = np.zeros(cover.shape, np.float32)
     for kind, amount in contrast.items():
@@ -229,7 +233,7 @@ def alpine_albedo(place, day_of_year: float, *, upsample: int = 1) -> np.ndarray
         white = _snow_colour(day_of_year) + age[..., None] * 0.35
         weight = (snow * in_view)[..., None]
         result[rows.start * upsample : rows.stop * upsample] = albedo + weight * (white - albedo)
-    return np.clip(result, 0.01, 0.93)
+    return np.clip(result, 0.01, 0.93, out=result)
 
 
 def _snow_colour(day: float) -> np.ndarray:

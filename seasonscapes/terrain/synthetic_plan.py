@@ -14,7 +14,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from seasonscapes.terrain.flow import Lattice
-from seasonscapes.terrain.noise import spline_noise, warped_noise
+from seasonscapes.terrain.noise import fractal_noise, spline_noise, warped_noise
 
 LAKE_LEVEL_M = 566.0
 LEDGES_M = (190.0, 92.0)  # spacing of the strata's ledges
@@ -160,9 +160,8 @@ def strata_level_m(z: np.ndarray, east_m: np.ndarray, north_m: np.ndarray, seed:
 
     ``east_m (W,)`` and ``north_m (H,)`` are the grid's axes, ``z (H, W)`` its heights [m].
     """
-    fold = 70.0 * spline_noise(seed + 51, 4000.0, east_m, north_m) + 14.0 * spline_noise(
-        seed + 52, 500.0, east_m, north_m
-    )
+    fold = 70.0 * spline_noise(seed + 51, 4000.0, east_m, north_m)
+    fold += 26.0 * fractal_noise(seed + 52, 900.0, east_m, north_m, octaves=3)
     return z + fold + 0.13 * east_m[None, :] - 0.09 * north_m[:, None]
 
 
