@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from seasonscapes.terrain.unwrap import Atlas
 
 # Raised when a stage's result changes for equal inputs, so that old artefacts are not taken for new ones.
-REVISIONS = {"place": 2, "terrain": 1, "albedo": 1}
+REVISIONS = {"place": 3, "terrain": 1, "albedo": 1}
 
 
 @dataclass(frozen=True)
