@@ -95,7 +95,7 @@ class Problem:
 
 def calibrate(start: View, points: Correspondences | None = None, *, priors: Priors | None = None,
               skyline: SkylineEvidence | None = None, loss: Loss = "cauchy", noise_px: float | None = None,
-              k1: float = 0.0, axes: np.ndarray | None = None,
+              k1: float = 0.0, axes: np.ndarray | None = None, guess: np.ndarray | None = None,
               ground_m: Callable[[float, float], float] | None = None) -> Calibration:  # fmt: skip
     """Solve for one view.
 
@@ -119,6 +119,8 @@ def calibrate(start: View, points: Correspondences | None = None, *, priors: Pri
         Radial term to start from.
     axes
         East, north and up of the camera's own horizon, rows ``(3, 3)``; the frame's when left out.
+    guess
+        Unknowns ``(9,)`` to begin from where they are better known than the start that the priors speak about.
     ground_m
         Height of the terrain in the frame at (east, north) [m].
 
@@ -138,7 +140,7 @@ def calibrate(start: View, points: Correspondences | None = None, *, priors: Pri
         _refuse_below_ground(origin, ground_m, "the start")
     if points is None and skyline is None:
         raise ValueError("calibrate: neither points nor a skyline given")
-    values = origin.copy()
+    values = origin.copy() if guess is None else np.array(guess, float)
     if points is not None and len(points):
         _refuse_too_few(len(points), sigmas, skyline is not None)
         rotation = rotation_among_pairs(start, k1, points)
