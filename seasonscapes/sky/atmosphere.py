@@ -11,6 +11,7 @@ water vapour and oxygen, whose lines lie where the eye hardly sees.
 from __future__ import annotations
 
 import json
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from os import PathLike
 
@@ -18,12 +19,13 @@ import numpy as np
 
 from seasonscapes.frames import angles_from_direction, equirectangular_directions
 from seasonscapes.images import atomic_path
-from seasonscapes.sky.aerial import SeenLight, air_between, observer_view, seen_sky, sky_radiance
+from seasonscapes.sky.aerial import air_between, airlight
 from seasonscapes.sky.air import Atmosphere, optics
 from seasonscapes.sky.ephemeris import refraction_deg, standard_pressure_hpa
 from seasonscapes.sky.illumination import Illumination, Luminary
 from seasonscapes.sky.paths import SUN_RADIUS_DEG, SunColumns, sun_transfer
 from seasonscapes.sky.scattering import AtmosphereTables, Moments, atmosphere_tables, sun_index
+from seasonscapes.sky.seen import SeenLight, observer_view, seen_sky, sky_radiance
 from seasonscapes.sky.spectrum import WAVELENGTHS_NM, rgb_from_transfer
 
 __all__ = [
@@ -76,7 +78,9 @@ def sky_radiance_map(tables: AtmosphereTables, sun_direction, observer_height_m:
         ``shape + (3,)`` float32, photometric linear Rec.709 [cd/m²]. Below the horizon: the model's sunlit ground
         through the air.
     """
-    light, _ = _seen(tables, sun_direction, observer_height_m, irradiance)
+    direction, view = _unit(sun_direction), observer_view(tables, observer_height_m)
+    true_rad = _true_rad(tables.atmosphere, direction, observer_height_m)
+    light = seen_sky(tables, view, direction, true_rad, _bands(irradiance))
     return _map_of((light,), shape)
 
 
@@ -129,24 +133,36 @@ def illumination_from_atmosphere(tables: AtmosphereTables, sun_direction, observ
     shape
         Of the radiance map.
     """
-    near_sun = np.full(WAVELENGTHS_NM.shape, 1.0 / distance_au**2)
-    sources = [(_unit(sun_direction), near_sun, SUN_RADIUS_DEG / distance_au)]
+    sources = [(_unit(sun_direction), _bands(1.0 / distance_au**2), SUN_RADIUS_DEG / distance_au)]
     if moon is not None:
-        sources.append((_unit(moon[0]), np.broadcast_to(moon[1], WAVELENGTHS_NM.shape).astype(float), moon[2]))
-    seen, luminaries, illuminant = [], [], np.full(WAVELENGTHS_NM.shape, 1e-12)
-    for direction, irradiance, radius in sources:
-        light, true_rad = _seen(tables, direction, observer_height_m, irradiance)
-        seen.append((light, true_rad, irradiance))
-        luminaries.append(
-            sun_luminary(tables, direction, observer_height_m, irradiance=irradiance, angular_radius_deg=radius)
-        )
-        illuminant = illuminant + irradiance * _surface_transfer(tables, direction, observer_height_m, true_rad)
+        sources.append((_unit(moon[0]), _bands(moon[1]), moon[2]))
     view = observer_view(tables, observer_height_m)
+    true_rad = [_true_rad(tables.atmosphere, direction, observer_height_m) for direction, _, _ in sources]
+    # numpy lets go of the interpreter while it works: sky and air of each luminary side by side.
+    with ThreadPoolExecutor(2) as pool:
+        skies = [
+            pool.submit(seen_sky, tables, view, direction, true, irradiance)
+            for (direction, irradiance, _), true in zip(sources, true_rad, strict=True)
+        ]
+        near = [
+            pool.submit(airlight, tables, view, true, irradiance)
+            for (_, irradiance, _), true in zip(sources, true_rad, strict=True)
+        ]
+        lights = tuple((sky.result(), air.result()) for sky, air in zip(skies, near, strict=True))
+        radiance = _map_of(tuple(light for light, _ in lights), shape)
+    luminaries = [
+        sun_luminary(tables, direction, observer_height_m, irradiance=irradiance, angular_radius_deg=radius)
+        for direction, irradiance, radius in sources
+    ]
+    illuminant = sum(
+        irradiance * _surface_transfer(tables, direction, observer_height_m, true)
+        for (direction, irradiance, _), true in zip(sources, true_rad, strict=True)
+    )
     return Illumination(
-        sky_radiance=_map_of(tuple(light for light, _, _ in seen), shape),
+        sky_radiance=radiance,
         sun=luminaries[0],
         moon=luminaries[1] if moon is not None else None,
-        aerial_perspective=air_between(tables, view, tuple(seen), illuminant),
+        aerial_perspective=air_between(view, lights, illuminant + 1e-12),
         model={"kind": "atmosphere", "observer_height_m": float(observer_height_m), **asdict(tables.atmosphere)},
     )
 
@@ -190,12 +206,13 @@ def _unit(direction) -> np.ndarray:
     return direction / np.linalg.norm(direction)
 
 
-def _seen(tables: AtmosphereTables, direction, height_m: float, irradiance) -> tuple[SeenLight, float]:
-    direction = _unit(direction)
+def _bands(irradiance) -> np.ndarray:
+    return np.broadcast_to(np.asarray(irradiance, float), WAVELENGTHS_NM.shape)
+
+
+def _true_rad(atmosphere: Atmosphere, direction: np.ndarray, height_m: float) -> float:
     _, apparent_deg = angles_from_direction(direction)
-    true_rad = float(np.radians(true_elevation_deg(tables.atmosphere, apparent_deg, height_m)))
-    spectrum = np.broadcast_to(np.asarray(irradiance, float), WAVELENGTHS_NM.shape)
-    return seen_sky(tables, observer_view(tables, height_m), direction, true_rad, spectrum), true_rad
+    return float(np.radians(true_elevation_deg(atmosphere, apparent_deg, height_m)))
 
 
 def _map_of(lights: tuple[SeenLight, ...], shape: tuple[int, int]) -> np.ndarray:
@@ -207,8 +224,7 @@ def _map_of(lights: tuple[SeenLight, ...], shape: tuple[int, int]) -> np.ndarray
 
 
 def _direct_transfer(tables: AtmosphereTables, direction: np.ndarray, height_m: float, radius_deg: float) -> np.ndarray:
-    _, apparent_deg = angles_from_direction(direction)
-    true_rad = np.radians(true_elevation_deg(tables.atmosphere, apparent_deg, height_m))
+    true_rad = _true_rad(tables.atmosphere, direction, height_m)
     height = max(float(height_m), tables.atmosphere.ground_height_m)
     return sun_transfer(
         tables.atmosphere, tables.sun_columns, optics(tables.atmosphere), np.asarray(height), true_rad,

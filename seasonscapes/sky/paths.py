@@ -62,15 +62,17 @@ def horizon_elevation_rad(atmosphere: Atmosphere, height_m) -> np.ndarray:
     return -np.arccos(np.minimum(index_ratio * ground / (radius + np.asarray(height_m, float)), 1.0))
 
 
-def trace_rays(atmosphere: Atmosphere, height_m, elevation_rad, *, through_ground: bool = False) -> Paths:
+def trace_rays(atmosphere: Atmosphere, height_m, elevation_rad, *, floor_m: float | None = None) -> Paths:
     """Trace rays ``(K,)`` from heights [m] at apparent elevations [rad] by the midpoint rule.
+
+    They end at the top of the air, or at a floor: the atmosphere's ground where left out.
 
     Ray equations in spherical air, ``s`` the arc length and ``n' = dn/dr``:
     ``dr/ds = sin e``, ``dψ/ds = cos e / r``, ``de/ds = cos e (1/r + n'/n)``.
     """
     height, elevation = (np.array(x, float) for x in np.broadcast_arrays(height_m, elevation_rad))
     centre = atmosphere.ground_radius_m - atmosphere.ground_height_m
-    ground = -np.inf if through_ground else atmosphere.ground_height_m
+    ground = atmosphere.ground_height_m if floor_m is None else floor_m
     distance, turn = np.zeros_like(height), np.zeros_like(height)
     states, on_ground = [(distance, height, turn, elevation)], np.zeros(height.shape, bool)
     alive = np.ones(height.shape, bool)
@@ -137,7 +139,7 @@ def sun_columns(atmosphere: Atmosphere) -> SunColumns:
     share = np.linspace(0.0, 1.0, SUN_ELEVATIONS)
     horizon = horizon_elevation_rad(atmosphere, heights)
     apparent = horizon[:, None] + (np.pi / 2 - horizon[:, None]) * share**3
-    paths = trace_rays(atmosphere, np.repeat(heights, len(share)), apparent.ravel(), through_ground=True)
+    paths = trace_rays(atmosphere, np.repeat(heights, len(share)), apparent.ravel(), floor_m=-np.inf)
     columns = np.zeros((3, paths.distance_m.shape[0]))
     for s in range(paths.distance_m.shape[1] - 1):
         step = paths.distance_m[:, s + 1] - paths.distance_m[:, s]

@@ -1,0 +1,259 @@
+"""What one observer sees of the sky: scattered light along whole rays, under any luminary.
+
+For each ray three sums are kept apart, light scattered once by gas, once by aerosol, and everything else. Without their
+phase functions the first two are smooth in azimuth (Bruneton & Neyret 2008, § 4), so few azimuths do, and the aureole
+is as sharp as its phase function wherever it is looked up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from seasonscapes.frames import angles_from_direction
+from seasonscapes.images import REC709_LUMINANCE
+from seasonscapes.sky.air import TOP_HEIGHT_M, Atmosphere, delta_scaled, gas_phase, optics
+from seasonscapes.sky.aureole import spread_aerosol_phase
+from seasonscapes.sky.paths import equal_cells, horizon_elevation_rad, resampled, sun_transfer, towards_sun, trace_rays
+from seasonscapes.sky.scattering import (
+    HARMONIC_ORDER,
+    AtmosphereTables,
+    Samples,
+    cell_columns,
+    diffuse_source,
+    local_sun,
+    sample_cells,
+    scattering_per_m,
+    sun_geometry,
+    sun_index,
+)
+from seasonscapes.sky.spectrum import WAVELENGTHS_NM, rgb_from_transfer
+
+_ABOVE, _BELOW, _AZIMUTHS, _AZIMUTHS_OUT, _CELLS = 44, 20, 12, 49, 36
+_SPACING_ABOVE, _SPACING_BELOW = 2.5, 3.0
+# Aerial perspective is tabulated up to these distances, and down to this far below the model's ground.
+DISTANCE_EDGES_M = np.concatenate([400e3 * np.linspace(0.0, 1.0, 41) ** 3, [520e3, 700e3, 950e3, 1300e3]])
+_CELLAR_M = 2000.0
+
+
+@dataclass(frozen=True)
+class View:
+    """The rays of an observer at one height, which do not know the time.
+
+    Parameters
+    ----------
+    height_m
+        Of the observer, at least a metre above the model's ground [m].
+    horizon_rad
+        Apparent elevation of the ground's horizon.
+    elevation_rad
+        ``(K,)``: from the nadir up to just below the horizon, then from just above it to the zenith.
+    sky
+        Cells along whole rays.
+    near
+        Cells between fixed distances, for aerial perspective.
+    near_depth
+        Optical depth ``(K, M, B)`` up to those distances, without any scaling.
+    """
+
+    height_m: float
+    horizon_rad: float
+    elevation_rad: np.ndarray
+    sky: Samples
+    near: Samples
+    near_depth: np.ndarray
+
+
+@dataclass(frozen=True)
+class SeenLight:
+    """Light of one luminary scattered towards an observer, ready to be looked up in any direction.
+
+    Parameters
+    ----------
+    luminary_direction
+        Apparent unit vector towards the source ``(3,)``.
+    aerosol_depth
+        Vertical scattering depth of the aerosol for red, green and blue ``(3,)``.
+    asymmetry
+        Of the aerosol.
+    horizon_rad
+        As in `View`.
+    parts
+        ``(K, A, 4, 3)``: by elevation and azimuth from the source, what gas and aerosol scatter once, over their phase
+        functions, and all else, as photometric RGB [cd/m²]; and the mean column of aerosol on the light's way.
+    """
+
+    luminary_direction: np.ndarray
+    aerosol_depth: np.ndarray
+    asymmetry: float
+    horizon_rad: float
+    parts: np.ndarray
+
+
+@lru_cache(maxsize=8)
+def _view(atmosphere, height_m: float) -> View:
+    horizon = float(horizon_elevation_rad(atmosphere, height_m))
+    up = np.linspace(0.0, 1.0, _ABOVE) ** _SPACING_ABOVE
+    down = np.linspace(1.0, 0.0, _BELOW) ** _SPACING_BELOW
+    gap = 1e-5
+    below, above = horizon - gap - (np.pi / 2 + horizon - gap) * down, horizon + gap + (np.pi / 2 - horizon - gap) * up
+    elevation = np.concatenate([below, above])
+    paths = trace_rays(atmosphere, height_m, elevation)
+    plain = optics(atmosphere)
+    scaled = delta_scaled(plain, HARMONIC_ORDER)
+    sky = sample_cells(atmosphere, scaled, paths, equal_cells(atmosphere, paths, _CELLS))
+    # A mountain may stand a little below the model's ground, as it does where that is a mean of hills and valleys.
+    deeper = trace_rays(atmosphere, height_m, elevation, floor_m=atmosphere.ground_height_m - _CELLAR_M)
+    edges = np.minimum(DISTANCE_EDGES_M, deeper.distance_m[:, -1:])
+    near = sample_cells(atmosphere, scaled, deeper, edges)
+    middles = resampled(deeper, 0.5 * (edges[:, 1:] + edges[:, :-1]))
+    depth = np.einsum("cks,cb->ksb", cell_columns(atmosphere, near.paths, middles), plain.extinction)
+    depth = np.concatenate([np.zeros_like(depth[:, :1]), np.cumsum(depth, axis=1)], axis=1)
+    return View(height_m, horizon, elevation, sky, near, depth)
+
+
+def observer_view(tables: AtmosphereTables, height_m: float) -> View:
+    """The rays of an observer at a height [m]; kept for the next call.
+
+    Raises
+    ------
+    ValueError
+        Above the top of the air.
+    """
+    if not height_m < TOP_HEIGHT_M:
+        raise ValueError(f"observer_height_m: got {height_m}, expected less than {TOP_HEIGHT_M:g}")
+    return _view(tables.atmosphere, float(max(height_m, tables.atmosphere.ground_height_m + 1.0)))
+
+
+def seen_sky(tables: AtmosphereTables, view: View, luminary_direction: np.ndarray, true_elevation_rad: float,
+             irradiance: np.ndarray) -> SeenLight:  # fmt: skip
+    """Sky of a luminary for an observer.
+
+    Parameters
+    ----------
+    luminary_direction
+        Apparent unit vector ``(3,)`` towards it.
+    true_elevation_rad
+        Its elevation without refraction.
+    irradiance
+        Spectral irradiance above the air over that of the sun at 1 au ``(B,)``.
+    """
+    bands = scattered_transfers(tables, view.sky, view.elevation_rad, true_elevation_rad)[:, :, -1]
+    bands[:, :, 2] += _ground(tables, view.sky, true_elevation_rad).astype(np.float32)
+    parts = as_rgb(azimuths_filled(bands), irradiance)
+    return SeenLight(
+        np.asarray(luminary_direction, float), _rgb_aerosol_depth(tables.atmosphere), tables.atmosphere.asymmetry,
+        view.horizon_rad, parts,
+    )  # fmt: skip
+
+
+def sky_radiance(light: SeenLight, direction: np.ndarray) -> np.ndarray:
+    """Radiance ``(..., 3)`` [cd/m²] of the sky, or of the ground through the air, in directions ``(..., 3)``."""
+    azimuth_deg, elevation_deg = angles_from_direction(direction)
+    row, fr = row_of(np.radians(elevation_deg), light.horizon_rad)
+    column, fa = column_of(azimuth_deg, light.luminary_direction)
+    fr, fa = fr[..., None, None], fa[..., None, None]
+    mixed = (light.parts[row, column] * (1.0 - fa) + light.parts[row, column + 1] * fa) * (1.0 - fr)
+    mixed += (light.parts[row + 1, column] * (1.0 - fa) + light.parts[row + 1, column + 1] * fa) * fr
+    return with_phases(light, mixed, direction)
+
+
+def with_phases(light: SeenLight, parts: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    cosine = np.clip(direction @ light.luminary_direction, -1.0, 1.0)
+    depth = parts[..., 3, :] * light.aerosol_depth
+    aerosol = spread_aerosol_phase(cosine, depth, light.asymmetry, HARMONIC_ORDER)
+    return parts[..., 0, :] * gas_phase(cosine)[..., None] + parts[..., 1, :] * aerosol + parts[..., 2, :]
+
+
+def _rgb_aerosol_depth(atmosphere: Atmosphere) -> np.ndarray:
+    """Scattering depth ``(3,)`` at the middles of the three primaries."""
+    return np.interp([610.0, 550.0, 465.0], WAVELENGTHS_NM, optics(atmosphere).scattering[1])
+
+
+def as_rgb(parts: np.ndarray, irradiance: np.ndarray) -> np.ndarray:
+    """Transfers and aerosol columns ``(..., 4, B)`` as `SeenLight` keeps them, ``(..., 4, 3)`` float32."""
+    rgb = parts[..., :3, :] @ (rgb_from_transfer() * irradiance).T.astype(np.float32)
+    return np.concatenate([rgb, np.repeat(parts[..., 3:, :1], 3, axis=-1)], axis=-2)
+
+
+def scattered_transfers(tables: AtmosphereTables, samples: Samples, elevation_rad: np.ndarray, sun_rad: float, *,
+                        cumulative: bool = False) -> np.ndarray:  # fmt: skip
+    """Transfers ``(K, A, M or 1, 4, B)``: gas and aerosol once (over their phase functions) and diffuse light.
+
+    The fourth part is the mean column of aerosol along sun, scattering point and eye, the same in every band.
+    """
+    atmosphere = tables.atmosphere
+    plain = optics(atmosphere)
+    scaled = delta_scaled(plain, HARMONIC_ORDER)
+    azimuth = (np.arange(_AZIMUTHS) + 0.5) * np.pi / _AZIMUTHS
+    sine, geometry = sun_geometry(samples, elevation_rad, np.full(_AZIMUTHS, sun_rad), azimuth)
+    column, share = towards_sun(atmosphere, tables.sun_columns, samples.height_m[..., None], np.arcsin(sine))
+    arriving = (np.exp(-(column @ scaled.extinction)) * share[..., None]).astype(np.float32)
+    # Scattering with the full coefficient, attenuation with the scaled one: TMS.
+    sigma = (scattering_per_m(atmosphere, plain, samples.height_m) * samples.weight).astype(np.float32)
+    aerosol = arriving * sigma[1][:, :, None]
+    diffuse = diffuse_source(atmosphere, scaled, tables.moments, samples, geometry)
+    diffuse *= samples.weight[:, :, None].astype(np.float32)
+    # Weighed by the luminance that each cell scatters.
+    bright = aerosol @ (REC709_LUMINANCE @ rgb_from_transfer()).astype(np.float32) + np.float32(1e-30)
+    passed = bright * (column[..., 1] + samples.aerosol_column[..., None]).astype(np.float32)
+    terms = np.stack([arriving * sigma[0][:, :, None], aerosol, diffuse], axis=3).swapaxes(1, 2)
+    bright, passed = bright.swapaxes(1, 2), passed.swapaxes(1, 2)
+    if cumulative:
+        terms, bright, passed = np.cumsum(terms, axis=2), np.cumsum(bright, axis=2), np.cumsum(passed, axis=2)
+    else:
+        terms, bright, passed = (part.sum(axis=2, keepdims=True) for part in (terms, bright, passed))
+    mean = np.broadcast_to((passed / bright)[..., None, None], (*terms.shape[:3], 1, terms.shape[-1]))
+    return np.concatenate([terms, mean], axis=3)
+
+
+def _ground(tables: AtmosphereTables, samples: Samples, sun_rad: float) -> np.ndarray:
+    """What the ground sends along rays that end on it ``(K, A, B)``."""
+    atmosphere = tables.atmosphere
+    scaled = delta_scaled(optics(atmosphere), HARMONIC_ORDER)
+    azimuth = (np.arange(_AZIMUTHS) + 0.5) * np.pi / _AZIMUTHS
+    sine = local_sun(samples.paths.turn_rad[:, -1, None], sun_rad, np.cos(azimuth))
+    index, share = sun_index(sine)
+    share = share[..., None]
+    table = tables.moments.ground_irradiance
+    direct = sun_transfer(atmosphere, tables.sun_columns, scaled, np.full(sine.shape, atmosphere.ground_height_m),
+                          np.arcsin(sine)) * np.maximum(sine, 0.0)[..., None]  # fmt: skip
+    irradiance = direct + table[index] * (1.0 - share) + table[index + 1] * share
+    albedo = np.broadcast_to(np.asarray(atmosphere.ground_albedo, float), WAVELENGTHS_NM.shape)
+    ends = np.where(samples.paths.ends_on_ground[:, None], samples.end_transmittance, 0.0)
+    return irradiance * ends[:, None, :] * albedo / np.pi
+
+
+def azimuths_filled(parts: np.ndarray) -> np.ndarray:
+    """Cosine series through the computed azimuths, at an even grid from 0 to π: ``(K, A, ...)`` → ``(K, A', ...)``."""
+    inner = (np.arange(_AZIMUTHS) + 0.5) * np.pi / _AZIMUTHS
+    outer = np.linspace(0.0, np.pi, _AZIMUTHS_OUT)
+    order = np.arange(_AZIMUTHS)
+    forward = np.cos(np.outer(order, inner)) * (2.0 / _AZIMUTHS)
+    forward[0] *= 0.5
+    return np.einsum(
+        "oa,ka...->ko...", (np.cos(np.outer(outer, order)) @ forward).astype(np.float32), parts, optimize=True
+    )
+
+
+def row_of(elevation_rad: np.ndarray, horizon_rad: float) -> tuple[np.ndarray, np.ndarray]:
+    """Row below and share towards the next in the tables of a `View`, never across the horizon."""
+    up = np.maximum(elevation_rad - horizon_rad, 0.0) / (np.pi / 2 - horizon_rad)
+    down = np.maximum(horizon_rad - elevation_rad, 0.0) / (np.pi / 2 + horizon_rad)
+    above = elevation_rad >= horizon_rad
+    high = np.minimum(up, 1.0) ** (1.0 / _SPACING_ABOVE) * (_ABOVE - 1)
+    low = (1.0 - np.minimum(down, 1.0) ** (1.0 / _SPACING_BELOW)) * (_BELOW - 1)
+    first, last = np.where(above, _BELOW, 0), np.where(above, _BELOW + _ABOVE - 2, _BELOW - 2)
+    position = np.where(above, _BELOW + high, low)
+    row = np.clip(position.astype(int), first, last)
+    return row, position - row
+
+
+def column_of(azimuth_deg: np.ndarray, luminary_direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    luminary_azimuth, _ = angles_from_direction(luminary_direction)
+    turn = np.abs((azimuth_deg - luminary_azimuth + 180.0) % 360.0 - 180.0)
+    position = turn * ((_AZIMUTHS_OUT - 1) / 180.0)
+    column = np.minimum(position.astype(int), _AZIMUTHS_OUT - 2)
+    return column, position - column
