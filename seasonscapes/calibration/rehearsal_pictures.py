@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 from affine import Affine
 
-from seasonscapes.calibration.horizon import horizon_from, terrain_height, terrain_profile
+from seasonscapes.calibration.horizon import horizon_from, terrain_height
 from seasonscapes.calibration.pose_model import values_of, view_from_values
-from seasonscapes.cameras.pinhole import Camera, camera_at, ray_directions
+from seasonscapes.calibration.terrain_view import look_at_rasters
+from seasonscapes.cameras.pinhole import Camera, camera_at
 from seasonscapes.frames import LocalFrame
 from seasonscapes.terrain.crs import geodetic_from_map
 from seasonscapes.terrain.surface import Raster
@@ -74,7 +75,8 @@ def picture_trial(rng: np.random.Generator, *, visibility_m: float | None = None
     pitch = elevation - rng.uniform(0.0, 0.25) * fov * size_px[1] / size_px[0]
     truth = camera_at(frame, *place, heading_deg=heading, pitch_deg=pitch, roll_deg=rng.normal(0, 0.7), fov_deg=fov,
                       size_px=size_px)  # fmt: skip
-    distance, normal, seen = _look(truth, raster, frame)
+    view = look_at_rasters(truth, [raster], frame, nearest_m=120.0, reach_m=40e3)
+    distance, normal, seen = view.distance_m, view.normal, view.position_m - truth.position_m
     covered = rng.uniform(0.0, 0.35) if covered is None else covered
     if visibility_m is None:
         visibility_m = float(np.exp(rng.uniform(np.log(20e3), np.log(150e3))))
@@ -115,39 +117,6 @@ def _outlook(raster: Raster, frame: LocalFrame, place, fov_deg: float, rng: np.r
     share = np.array([poor[(a + window) % 360].mean() for a in range(360)])
     chosen = int(rng.choice(np.argsort(share)[:60]))
     return float(chosen), float(np.median(elevation[(chosen + window) % 360]))
-
-
-def _look(camera: Camera, raster: Raster, frame: LocalFrame):
-    """Distance ``(H, W)`` (inf = sky), unit normals ``(H, W, 3)`` and position noise seeds, by marching every azimuth."""
-    direction = ray_directions(camera)
-    azimuth = np.degrees(np.arctan2(direction[..., 0], direction[..., 1]))
-    centre = np.degrees(np.arctan2(*camera.world_from_camera[:2, 2]))
-    azimuth = (azimuth - centre + 180.0) % 360.0 - 180.0
-    slope = direction[..., 2] / np.hypot(direction[..., 0], direction[..., 1])
-    rays = np.arange(azimuth.min() - 0.1, azimuth.max() + 0.1, 0.045)
-    steps = 120.0 * 1.0045 ** np.arange(1180)
-    points = terrain_profile([raster], frame, camera.position_m, rays + centre, steps) - camera.position_m
-    rise = np.nan_to_num(points[..., 2] / np.hypot(points[..., 0], points[..., 1]), nan=-np.inf)
-    highest = np.maximum.accumulate(rise, axis=1)
-    levels = np.arange(slope.min() - 0.002, slope.max() + 0.002, 0.0007)
-    # First step at which the running horizon passes each level: one sorted search an azimuth.
-    first = np.stack([np.searchsorted(row, levels) for row in highest])
-    column = ((azimuth - rays[0]) / 0.045).astype(np.float32)
-    level = ((slope - levels[0]) / 0.0007).astype(np.float32)
-    # Supersampling in level is the anti-aliasing of the skyline; distances themselves are taken from the nearest ray.
-    index = first[
-        np.clip(column + 0.5, 0, len(rays) - 1).astype(int), np.clip(level + 0.5, 0, len(levels) - 1).astype(int)
-    ]
-    sky = index >= len(steps)
-    index = np.minimum(index, len(steps) - 1)
-    ray = np.clip(column + 0.5, 1, len(rays) - 2).astype(int)
-    spot = points[ray, index]
-    across = points[ray + 1, index] - points[ray - 1, index]
-    along = points[ray, np.minimum(index + 1, len(steps) - 1)] - points[ray, np.maximum(index - 1, 0)]
-    normal = np.cross(along, -across)
-    normal = np.nan_to_num(normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9))
-    normal *= np.where(normal[..., 2:] < 0, -1.0, 1.0)
-    return np.where(sky, np.inf, steps[index]), normal, spot
 
 
 def _paint(distance, normal, spot, rng, visibility_m: float) -> np.ndarray:

@@ -141,7 +141,7 @@ def calibrate(start: View, points: Correspondences | None = None, *, priors: Pri
     if points is None and skyline is None:
         raise ValueError("calibrate: neither points nor a skyline given")
     values = origin.copy() if guess is None else np.array(guess, float)
-    if points is not None and len(points):
+    if points is not None and (len(points) or skyline is None):
         _refuse_too_few(len(points), sigmas, skyline is not None)
         rotation = rotation_among_pairs(start, k1, points)
         check_orientation(start, k1, points, rotation, axes)

@@ -1,0 +1,71 @@
+"""A calibration on disk: one JSON record that a person can read and a later stage can use."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from seasonscapes.calibration.evidence import PARAMETERS
+from seasonscapes.calibration.pose_model import View
+from seasonscapes.calibration.resection import Calibration
+from seasonscapes.cameras.exchange import read_json
+from seasonscapes.cameras.panorama import PROJECTIONS, Panorama
+from seasonscapes.cameras.pinhole import Camera
+from seasonscapes.declaration import InputError
+from seasonscapes.frames import LocalFrame, geodetic_from_enu
+from seasonscapes.images import atomic_path
+
+
+@dataclass(frozen=True)
+class CalibratedWebcam:
+    """What `read_calibration` gives: the webcam's id, its view, lens term, standard deviations and frame."""
+
+    webcam: str
+    view: View
+    k1: float
+    sigma: dict[str, float]
+    frame: LocalFrame
+
+
+def write_calibration(path: Path, webcam: str, calibration: Calibration, frame: LocalFrame) -> None:
+    """Write a calibration, atomically. Positions are also given in WGS 84, residuals with their names."""
+    view = calibration.view
+    latitude, longitude, height = (float(v) for v in geodetic_from_enu(frame, view.position_m))
+    record = {
+        "webcam": webcam,
+        "projection": view.projection if isinstance(view, Panorama) else "perspective",
+        "size_px": [view.width_px, view.height_px], "fx": view.fx, "fy": view.fy, "cx": view.cx, "cy": view.cy,
+        "k1": calibration.k1, "world_from_camera": view.world_from_camera.tolist(),
+        "latitude_deg": latitude, "longitude_deg": longitude, "height_m": height,
+        "angles_deg": dict(zip(("heading", "tilt", "roll"), calibration.values[:3].tolist(), strict=True)),
+        "sigma": calibration.sigma,
+        "frame": {"latitude_deg": frame.latitude_deg, "longitude_deg": frame.longitude_deg, "height_m": frame.height_m,
+                  "refraction_k": frame.refraction_k},
+        "points": [{"name": name, "residual_px": error.tolist(), "set_aside": bool(out)} for name, error, out in
+                   zip(calibration.names, calibration.residual_px, calibration.outlier, strict=True)],
+    }  # fmt: skip
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+
+
+def read_calibration(path: Path) -> CalibratedWebcam:
+    """Read what `write_calibration` wrote; `InputError` for anything else."""
+    record = read_json(path)
+    try:
+        numbers = [float(record[key]) for key in ("fx", "fy", "cx", "cy")]
+        pose, size = np.array(record["world_from_camera"], float), [int(v) for v in record["size_px"]]
+        projection = record["projection"]
+        sigma = {name: float(record["sigma"][name]) for name in PARAMETERS}
+        if projection == "perspective":
+            view: View = Camera(*size, *numbers, pose)
+        elif projection in PROJECTIONS:
+            view = Panorama(projection, *size, *numbers, pose)
+        else:
+            raise ValueError(f"projection {projection!r}")
+        frame = LocalFrame(**record["frame"])
+        return CalibratedWebcam(str(record["webcam"]), view, float(record["k1"]), sigma, frame)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(path, f"not a calibration record: {error!r}") from None

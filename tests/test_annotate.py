@@ -1,0 +1,216 @@
+"""The picker: its functions, its server's manners, and the page itself in headless Chromium from click to file."""
+
+import json
+import shutil
+import urllib.error
+import urllib.request
+from functools import partial
+
+import numpy as np
+import pytest
+
+from seasonscapes.calibration.evidence import Priors, read_points
+from seasonscapes.calibration.picker import PickSession, describe, pick, place_at, save, serve, solve, undo, where
+from seasonscapes.calibration.pose_model import project_values, values_of
+from seasonscapes.calibration.record import read_calibration
+from seasonscapes.calibration.rehearsal_pictures import picture_trial
+from seasonscapes.calibration.terrain_view import look_at_rasters, look_with, scaled_view
+from seasonscapes.declaration import InputError
+
+SIZE = (640, 427)
+
+
+@pytest.fixture(scope="module")
+def trial():
+    return picture_trial(np.random.default_rng(2), size_px=SIZE, covered=0.0, heading_off_deg=4.0)
+
+
+@pytest.fixture
+def session(trial, tmp_path):
+    look = partial(look_at_rasters, rasters=trial.rasters, frame=trial.frame, nearest_m=120.0)
+    return PickSession("HUT", trial.image, trial.start, trial.frame, look, tmp_path,
+                       priors=Priors(horizontal_m=10.0, vertical_m=10.0, focal=0.02))  # fmt: skip
+
+
+def true_pixel(trial, position):
+    return project_values(trial.truth, np.eye(3), values_of(trial.truth, np.eye(3)), position[None])[0][0]
+
+
+def good_places(session, trial, count):
+    """Terrain pixels whose point also lies in the photograph, spread over the picture."""
+    rng, found = np.random.default_rng(1), []
+    height, width = session.seen.distance_m.shape
+    while len(found) < count:
+        at = rng.uniform([5, 5], [width - 5, height - 5])
+        if not np.isfinite(session.seen.position_m[int(at[1]), int(at[0])]).all():
+            continue
+        pixel = true_pixel(trial, place_at(session, at))
+        if (
+            5 < pixel[0] < SIZE[0] - 5
+            and 5 < pixel[1] < SIZE[1] - 5
+            and all(np.abs(at - other).max() > 60 for other in found)
+        ):
+            found.append(at)
+    return found
+
+
+def test_what_is_picked_is_the_first_surface_and_the_sky_is_refused(session, trial):
+    y, x = np.argwhere(np.isfinite(session.seen.distance_m))[5000]
+    place = place_at(session, (x + 0.5, y + 0.5))
+    pixel, _ = project_values(session.shown, np.eye(3), values_of(session.shown, np.eye(3)), place[None])
+    assert np.abs(pixel[0] - [x + 0.5, y + 0.5]).max() < 1.0
+    sky = np.argwhere(~np.isfinite(session.seen.distance_m))[0]
+    with pytest.raises(ValueError, match="that is sky"):
+        pick(session, (5, 5), (sky[1], sky[0]))
+    assert where(session, (sky[1], sky[0])) is None
+    with pytest.raises(ValueError, match="outside the photograph"):
+        pick(session, (SIZE[0] + 9, 5), (x, y))
+    with pytest.raises(ValueError, match="no pair to take back"):
+        undo(session)
+
+
+def test_pairs_solve_to_the_truth_and_are_saved(session, trial):
+    for at in good_places(session, trial, 8):
+        pick(session, true_pixel(trial, place_at(session, at)), at)
+    before = [np.subtract(p["projected"], p["photo"]) for p in describe(session)["pairs"]]
+    solve(session)
+    after = [np.subtract(p["projected"], p["photo"]) for p in describe(session)["pairs"]]
+    assert np.abs(before).max() > 20.0
+    assert np.abs(after).max() < 0.05
+    heading = values_of(trial.truth, np.eye(3))[0]
+    assert session.solution.values[0] == pytest.approx(heading, abs=0.02)
+    points, record = save(session)
+    assert len(read_points(points, trial.frame)) == 8
+    again = read_calibration(record)
+    assert np.allclose(again.view.world_from_camera, session.solution.view.world_from_camera, atol=1e-12)
+    assert (again.webcam, again.frame) == ("HUT", trial.frame)
+    record.write_text(json.dumps({"webcam": "HUT"}))
+    with pytest.raises(InputError, match="not a calibration record"):
+        read_calibration(record)
+
+
+def test_a_renderer_can_take_the_marchers_place(session, trial):
+    """`look_with` hands over rays and takes a G-buffer: here the marcher's own, ray by ray."""
+    view = scaled_view(trial.start, 64)
+    seen = look_at_rasters(view, trial.rasters, trial.frame, nearest_m=120.0)
+
+    class Hit:
+        depth, normal, position = seen.distance_m, seen.normal, seen.position_m
+
+    given = {}
+
+    def trace(origin, direction):
+        given["shape"], given["unit"] = direction.shape, np.linalg.norm(direction, axis=-1)
+        return Hit
+
+    assert np.array_equal(look_with(view, trace).distance_m, seen.distance_m)
+    assert given["shape"] == (view.height_px, 64, 3)
+    assert np.allclose(given["unit"], 1.0)
+
+
+def test_the_server_answers_only_here_and_only_with_its_token(session):
+    server, address = serve(session)
+    try:
+        assert server.server_address[0] == "127.0.0.1"
+        root = address.split("?")[0]
+        assert b"<canvas" in urllib.request.urlopen(address).read()
+        for request in (root, root + "?token=wrong", urllib.request.Request(root + "state", b"{}"),
+                        urllib.request.Request(address, headers={"Host": "evil.example"})):  # fmt: skip
+            with pytest.raises(urllib.error.HTTPError) as error:
+                urllib.request.urlopen(request)
+            assert error.value.code == 403
+        token = {"X-Token": address.split("=")[1]}
+        for path, body, message in (("solve", b"{}", "at least 3 are needed"), ("pick", b"{}", "not a request"),
+                                    ("pick", b"[", "Expecting value")):  # fmt: skip
+            with pytest.raises(urllib.error.HTTPError) as error:
+                urllib.request.urlopen(urllib.request.Request(root + path, body, headers=token))
+            assert message in json.loads(error.value.read())["error"]
+    finally:
+        server.shutdown()
+
+
+@pytest.fixture
+def browser():
+    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
+    binary = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    driver = shutil.which("chromedriver")
+    if not binary or not driver:
+        pytest.skip("no Chromium with chromedriver found")
+    options = webdriver.ChromeOptions()
+    options.binary_location = binary
+    for flag in (
+        "--headless=new",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--disable-dev-shm-usage",
+        "--window-size=1400,700",
+    ):
+        options.add_argument(flag)
+    chrome = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
+    yield chrome
+    chrome.quit()
+
+
+def test_the_page_from_click_to_file_in_chromium(session, trial, browser):
+    from selenium.webdriver.common.action_chains import ActionChains
+    from selenium.webdriver.common.by import By
+    from selenium.webdriver.support.ui import WebDriverWait
+
+    def data(name):
+        return browser.execute_script(f"return document.body.dataset.{name}")
+
+    def until(condition):
+        WebDriverWait(browser, 60).until(lambda _: condition())
+
+    def click(pane, at):
+        x, y = browser.execute_script(f"return panes.{pane}.toScreen([{at[0]}, {at[1]}])")
+        canvas = browser.find_element(By.ID, pane)
+        middle = canvas.size["width"] / 2, canvas.size["height"] / 2
+        ActionChains(browser).move_to_element_with_offset(
+            canvas, round(x - middle[0]), round(y - middle[1])
+        ).click().perform()
+
+    def press(name):
+        browser.find_element(By.ID, name).click()
+
+    def message():
+        return browser.find_element(By.ID, "message").text
+
+    server, address = serve(session)
+    try:
+        browser.get(address)
+        until(lambda: data("photo") == "ready" and data("terrain") == "ready")
+        places = good_places(session, trial, 7)
+        for number, at in enumerate(places, 1):
+            click("photo", true_pixel(trial, place_at(session, at)))
+            until(lambda: "same feature in the terrain" in message())
+            click("terrain", at)
+            until(lambda n=number: data("pairs") == str(n))
+        # A click into the sky of the terrain is answered, not taken.
+        sky = np.argwhere(~np.isfinite(session.seen.distance_m))
+        y, x = sky[len(sky) // 3]
+        click("photo", (100, 100))
+        click("terrain", (x, y))
+        until(lambda: "that is sky" in message())
+        assert data("pairs") == "7"
+        press("undo")  # the half pair
+        press("undo")
+        until(lambda: data("pairs") == "6")
+        press("solve")
+        until(lambda: data("solved") == "true")
+        until(lambda: "heading" in message())
+        # Half a screen pixel of clicking is what remains.
+        error = abs(session.solution.values[0] - values_of(trial.truth, np.eye(3))[0])
+        assert error < 0.15
+        # Live reprojection: hovering shows where a point of the terrain falls in the photograph.
+        until(lambda: browser.execute_script("return panes.terrain.image.complete"))
+        ActionChains(browser).move_to_element_with_offset(browser.find_element(By.ID, "terrain"), 0, 40).perform()
+        until(lambda: browser.execute_script("return cursor !== null"))
+        press("save")
+        until(lambda: data("saved") == "yes")
+        assert read_calibration(session.folder / "HUT_calibration.json").webcam == "HUT"
+        assert len(read_points(session.folder / "HUT_points.csv", trial.frame)) == 6
+        browser.save_screenshot(str(session.folder / "page.png"))
+        assert (session.folder / "page.png").stat().st_size > 10_000
+    finally:
+        server.shutdown()
