@@ -13,8 +13,8 @@ from seasonscapes.rendering.backend import use_backend
 from seasonscapes.rendering.gbuffer import GBuffer, trace_gbuffer
 from seasonscapes.rendering.scene import RenderScene, background
 
-# Samples in flight: about 0.3 GB on the LLVM backend.
-LANES = 1 << 23
+# Samples in flight: about 50 MB on the LLVM backend; more are no faster.
+LANES = 1 << 22
 Progress = Callable[[float], None]
 
 
