@@ -206,6 +206,9 @@ def test_the_page_from_click_to_file_in_chromium(session, trial, browser):
         until(lambda: browser.execute_script("return panes.terrain.image.complete"))
         ActionChains(browser).move_to_element_with_offset(browser.find_element(By.ID, "terrain"), 0, 40).perform()
         until(lambda: browser.execute_script("return cursor !== null"))
+        stretched = "return Object.values(panes).some(p => p.canvas.width !== p.canvas.clientWidth || " \
+                    "p.canvas.height !== p.canvas.clientHeight)"  # fmt: skip
+        until(lambda: not browser.execute_script(stretched))
         press("save")
         until(lambda: data("saved") == "yes")
         assert read_calibration(session.folder / "HUT_calibration.json").webcam == "HUT"
