@@ -25,7 +25,7 @@ class Panel:
 
 
 DAY_AND_YEAR = [
-    Panel("dawn, 18 September 06:40", f"{YEAR}-09-18T06:40"),
+    Panel("dawn, 18 September 07:00", f"{YEAR}-09-18T07:00"),
     Panel("morning, 09:00", f"{YEAR}-09-18T09:00"),
     Panel("noon, 13:20", f"{YEAR}-09-18T13:20"),
     Panel("evening, 19:05", f"{YEAR}-09-18T19:05"),

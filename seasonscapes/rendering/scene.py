@@ -177,9 +177,13 @@ def background(illumination: Illumination, direction: np.ndarray, pixel_angle_de
         height, width = sky_map.shape[:2]
         grid = equirectangular_directions(height, width)
         beyond = sky_map - air(np.full((height, width), np.inf), grid)[1]
-        # Below the horizon the map is a coarse picture of the ground, and the air's own is sharp.
-        beyond[height // 2 :] = beyond[height // 2 - 1]
-        sky = air(np.full(direction.shape[:-1], np.inf), direction)[1] + sample_equirectangular(beyond, direction)
+        # Near the horizon the map is a coarse picture of a steep profile, so what it knows beyond the air is carried
+        # down from 4° above; below the horizon the air alone knows the ground.
+        lowest = height // 2 - 1 - int(np.ceil(4.0 * height / 180.0))
+        beyond[lowest + 1 :] = beyond[lowest]
+        above = np.clip(1.0 + np.degrees(np.arcsin(np.clip(direction[..., 2:], -1.0, 1.0))) / 2.0, 0.0, 1.0)
+        sky = air(np.full(direction.shape[:-1], np.inf), direction)[1]
+        sky = sky + above * sample_equirectangular(beyond, direction)
         sky = np.maximum(sky, 0.0)
     for luminary in (illumination.sun, illumination.moon):
         if luminary is None:
