@@ -22,6 +22,8 @@ app.command("seasonscapes.commands.render:render", help="Render a view of a plac
 app.command("seasonscapes.commands.sky:sky", help="Tell the light of a place at an instant, and picture the dome.")
 app.command("seasonscapes.commands.terrain:terrain", help="Build a place's terrain and report how good it is.")
 app.command("seasonscapes.commands.webcams:webcams", help="List, check and map a scene's webcams and their pictures.")
+app.command("seasonscapes.commands.calibrate:calibrate", help="Calibrate a webcam from matched points or the skyline.")
+app.command("seasonscapes.commands.calibrate:annotate", help="Match points of a photograph and the terrain on a local page.")
 app.command("seasonscapes.commands.demo:demo", help="Picture the embedded scene through a day, a night and a year.")
 app.command("seasonscapes.commands.doctor:doctor", help="Say what this machine can do, and what is missing.")
 

@@ -42,7 +42,8 @@ HOURS = [
     for h in range(24)
 ]
 AIR = [
-    Panel(sky.replace("_", " "), f"{YEAR}-09-18T10:30", sky) for sky in ("clear", "hazy", "saharan_dust", "overcast")
+    Panel(f"{sky.replace('_', ' ')} noon, 20 July", f"{YEAR}-07-20T13:35", sky)
+    for sky in ("clear", "hazy", "saharan_dust", "overcast")
 ]
 
 
