@@ -36,9 +36,10 @@ def observer(atmosphere: Atmosphere, height_m: float) -> np.ndarray:
     return np.array([0.0, 0.0, atmosphere.ground_radius_m - atmosphere.ground_height_m + height_m])
 
 
-def once_scattered(walk: Walk, position: np.ndarray, direction: np.ndarray, *, nodes: int = 600) -> np.ndarray:
-    """Sunlight scattered once, and sunlit ground, along one ray ``(3,)``: plain quadrature, ``(B,)``."""
-    edges, on_ground = _edges(walk, position[None], direction[None], cells=nodes)
+def once_scattered(walk: Walk, position: np.ndarray, direction: np.ndarray, *, nodes: int = 600,
+                   distance_m: float = np.inf) -> np.ndarray:  # fmt: skip
+    """Sunlight scattered once, and sunlit ground, along one ray ``(3,)`` up to a distance: quadrature, ``(B,)``."""
+    edges, on_ground = _edges(walk, position[None], direction[None], cells=nodes, distance_m=distance_m)
     middle, length = 0.5 * (edges[0, 1:] + edges[0, :-1]), np.diff(edges[0])
     points = position + middle[:, None] * direction
     heights = np.linalg.norm(points, axis=1) - walk.centre
@@ -55,22 +56,28 @@ def once_scattered(walk: Walk, position: np.ndarray, direction: np.ndarray, *, n
 
 
 def many_times_scattered(walk: Walk, position: np.ndarray, direction: np.ndarray, *, paths: int, seed: int,
-                         bounces: int = 14) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Mean and standard error ``(B,)`` of light scattered twice or more along one ray ``(3,)``, by random walks."""
+                         bounces: int = 14, distance_m: float = np.inf) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Mean and standard error ``(B,)`` of light scattered twice or more along one ray ``(3,)``, by random walks.
+
+    Its last scattering is nearer than ``distance_m``.
+    """
     random = np.random.default_rng(seed)
     batches = [
-        _walks(walk, position, direction, min(2048, paths), random, bounces) for _ in range(max(paths // 2048, 1))
+        _walks(walk, position, direction, min(2048, paths), random, bounces, distance_m)
+        for _ in range(max(paths // 2048, 1))
     ]
     samples = np.concatenate(batches)
     return samples.mean(axis=0), samples.std(axis=0) / np.sqrt(len(samples))
 
 
-def _walks(walk: Walk, position, direction, count: int, random, bounces: int) -> np.ndarray:
+def _walks(walk: Walk, position, direction, count: int, random, bounces: int, distance_m: float) -> np.ndarray:
     where, heading = np.tile(position, (count, 1)), np.tile(direction, (count, 1))
     throughput, light = np.ones((count, len(WAVELENGTHS_NM))), np.zeros((count, len(WAVELENGTHS_NM)))
     alive = np.arange(count)
     for bounce in range(bounces):
-        where, through, sigma, ground = _next_vertex(walk, where, heading, random, first=bounce == 0)
+        where, through, sigma, ground = _next_vertex(
+            walk, where, heading, random, distance_m=np.inf if bounce else distance_m
+        )
         if bounce:
             light[alive] += throughput * ground["radiance"]
             scattered = through * _source(walk, where, heading, None)
@@ -94,7 +101,9 @@ def _walks(walk: Walk, position, direction, count: int, random, bounces: int) ->
     return light
 
 
-def _edges(walk: Walk, where, heading, *, cells: int = _CELLS) -> tuple[np.ndarray, np.ndarray]:
+def _edges(
+    walk: Walk, where, heading, *, cells: int = _CELLS, distance_m: float = np.inf
+) -> tuple[np.ndarray, np.ndarray]:
     """Edges of cells ``(N, cells + 1)`` [m] along rays, denser where the ray is lowest, and whether it meets ground."""
     radius = np.linalg.norm(where, axis=1)
     along = (where * heading).sum(axis=1)
@@ -103,7 +112,7 @@ def _edges(walk: Walk, where, heading, *, cells: int = _CELLS) -> tuple[np.ndarr
     leave = -along + np.sqrt(np.maximum(top**2 - miss, 0.0))
     hits = (along < 0.0) & (miss < ground**2)
     end = np.where(hits, -along - np.sqrt(np.maximum(ground**2 - miss, 0.0)), leave)
-    end = np.maximum(end, 0.0)
+    end, hits = np.clip(end, 0.0, distance_m), hits & (end <= distance_m)
     lowest = np.clip(-along, 0.0, end)
     v = np.linspace(0.0, 1.0, cells + 1)
     # Half of the cells before the lowest point where there is a way to go to it.
@@ -114,14 +123,14 @@ def _edges(walk: Walk, where, heading, *, cells: int = _CELLS) -> tuple[np.ndarr
     return np.where(v < part, before, np.where(part == 1.0, end[:, None], after)), hits
 
 
-def _next_vertex(walk: Walk, where, heading, random, *, first: bool):
+def _next_vertex(walk: Walk, where, heading, random, *, distance_m: float):
     """A scattering vertex along each ray, chosen by a guess at what it will bring.
 
     Returns its position, transmittance over probability ``(N, B)``, the scattering coefficients ``(2, N, B)`` there,
     and for the ground its radiance seen from the start and whether the walk goes on from it.
     """
     count = len(where)
-    edges, hits = _edges(walk, where, heading)
+    edges, hits = _edges(walk, where, heading, distance_m=distance_m)
     middle, length = 0.5 * (edges[:, 1:] + edges[:, :-1]), np.diff(edges, axis=1)
     points = where[:, None] + middle[..., None] * heading[:, None]
     radius = np.linalg.norm(points, axis=-1)
@@ -152,7 +161,7 @@ def _next_vertex(walk: Walk, where, heading, random, *, first: bool):
     sigma = local[:2, :, None] * air.scattering[:2, None, :]
     ends = where + edges[:, -1:] * heading
     radiance = np.zeros_like(at_end)
-    if not first and hits.any():
+    if hits.any():
         radiance[hits] = at_end[hits] * _ground_radiance(walk, ends[hits])
     return new, through, sigma, {"taken": taken, "radiance": radiance}
 

@@ -101,8 +101,11 @@ def air_between(view: View, lights: tuple[tuple[SeenLight, np.ndarray], ...], il
         Transfer ``(B,)`` of the light by which surfaces are seen; it weighs the bands' transmittances.
     """
     weights = rgb_from_transfer() * illuminant
-    seen = np.exp(-view.near_depth) @ weights.T / weights.sum(axis=1)
-    return AirBetween(view.horizon_rad, -np.log(np.clip(seen, 1e-30, 1.0)).astype(np.float32), lights)
+    bands = np.exp(-view.near_depth)
+    # Far away only red is left, which lies outside Rec.709: a mean with negative weights, kept within the bands' own.
+    least, most = bands.min(axis=-1, keepdims=True), bands.max(axis=-1, keepdims=True)
+    seen = np.clip(bands @ weights.T / weights.sum(axis=1), np.maximum(least, 1e-30), most)
+    return AirBetween(view.horizon_rad, -np.log(seen).astype(np.float32), lights)
 
 
 def airlight(tables: AtmosphereTables, view: View, true_elevation_rad: float, irradiance: np.ndarray) -> np.ndarray:

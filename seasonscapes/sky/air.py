@@ -64,7 +64,7 @@ class Atmosphere:
 
     def __post_init__(self):
         bounds = {
-            "aerosol_optical_depth_500nm": (0.0, 5.0), "angstrom_exponent": (-1.0, 4.0),
+            "aerosol_optical_depth_500nm": (0.0, 50.0), "angstrom_exponent": (-1.0, 4.0),
             "aerosol_scale_height_m": (50.0, np.inf), "single_scattering_albedo": (0.0, 1.0), "asymmetry": (0.0, 0.85),
             "ozone_du": (0.0, 1000.0), "ground_height_m": (-500.0, 6000.0), "pressure_hpa": (0.0, 1100.0),
         }  # fmt: skip
@@ -272,4 +272,5 @@ def _standard_profiles() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray
     ]
     # fmt: on
     ozone = np.interp(knots, np.arange(len(ozone_e11_per_cm3)) * 2e3, ozone_e11_per_cm3)
-    return knots, log_gas, ozone / np.trapezoid(ozone, knots), np.gradient(log_gas, knots)
+    ozone /= np.trapezoid(ozone[above_sea], knots[above_sea])
+    return knots, log_gas, ozone, np.gradient(log_gas, knots)
