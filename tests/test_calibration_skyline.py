@@ -11,7 +11,7 @@ from seasonscapes.calibration.evidence import Correspondences, Priors
 from seasonscapes.calibration.horizon import horizon_from, terrain_height, terrain_profile
 from seasonscapes.calibration.overlay import draw_overlay, save_overlay
 from seasonscapes.calibration.pose_model import project_values, values_of, view_from_values
-from seasonscapes.calibration.rehearsal_pictures import picture_trial
+from seasonscapes.calibration.rehearsal_pictures import panorama_trial, picture_trial
 from seasonscapes.calibration.resection import calibrate
 from seasonscapes.calibration.skyline import Search, align_to_skyline, encoded_from_file
 from seasonscapes.cameras.pinhole import camera_at
@@ -140,6 +140,19 @@ def test_a_hazy_picture_with_a_roof_in_it_is_aligned_and_trusted(fit, trial):
     assert fit.reliable, fit.doubts
     assert heading_error(fit, trial) < 0.1
     assert fit.met > 0.8
+
+
+def test_a_full_panorama_finds_its_heading_its_horizon_row_and_its_lean():
+    trial = panorama_trial(np.random.default_rng(3), size_px=(2400, 280))
+    search = Search(
+        tilt_deg=3.0, priors=Priors(tilt_deg=1.0, roll_deg=1.0, horizontal_m=3.0, vertical_m=3.0, focal=0.02)
+    )
+    fit = align_to_skyline(trial.image, trial.start, trial.rasters, trial.frame, search=search)
+    assert fit.reliable, fit.doubts
+    assert heading_error(fit, trial) < 0.1
+    truth = values_of(trial.truth, fit.horizon.axes)
+    assert fit.calibration.values[1:3] == pytest.approx(truth[1:3], abs=0.1)
+    assert fit.calibration.view.cy == pytest.approx(trial.truth.cy, abs=1.5)
 
 
 @pytest.mark.slow

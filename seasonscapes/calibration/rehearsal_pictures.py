@@ -13,9 +13,10 @@ import numpy as np
 from affine import Affine
 
 from seasonscapes.calibration.horizon import horizon_from, terrain_height
-from seasonscapes.calibration.pose_model import values_of, view_from_values
+from seasonscapes.calibration.pose_model import View, values_of, view_from_values
 from seasonscapes.calibration.terrain_view import look_at_rasters
-from seasonscapes.cameras.pinhole import Camera, camera_at
+from seasonscapes.cameras.panorama import panorama_from_angles
+from seasonscapes.cameras.pinhole import camera_at, rotation_from_angles
 from seasonscapes.frames import LocalFrame
 from seasonscapes.terrain.crs import geodetic_from_map
 from seasonscapes.terrain.surface import Raster
@@ -31,8 +32,8 @@ class PictureTrial:
     image: np.ndarray
     mask: np.ndarray
     sky: np.ndarray
-    truth: Camera
-    start: Camera
+    truth: View
+    start: View
     rasters: tuple[Raster, ...]
     frame: LocalFrame
 
@@ -91,6 +92,25 @@ def picture_trial(rng: np.random.Generator, *, visibility_m: float | None = None
     return PictureTrial(
         image, mask, np.isinf(distance), truth, view_from_values(truth, np.eye(3), values), (known,), frame
     )
+
+
+def panorama_trial(rng: np.random.Generator, *, size_px: tuple[int, int] = (3600, 420)) -> PictureTrial:
+    """A full turn from one place; the start is off in heading, by some rows of the horizon and by a lean of its axis."""
+    raster = made_up_massif(rng)
+    frame, place = _viewpoint(raster, rng)
+    pose = np.eye(4)
+    pose[:3, :3] = rotation_from_angles(rng.uniform(0, 360), *rng.normal(0, 0.4, 2))
+    pose[:3, 3] = [0.0, 0.0, place[2]]
+    truth = panorama_from_angles("cylindrical", size_px, horizontal_fov_deg=360.0, vertical_fov_deg=41.0, pose=pose,
+                                 horizon_row_px=size_px[1] * rng.uniform(0.45, 0.55))  # fmt: skip
+    view = look_at_rasters(truth, [raster], frame, nearest_m=120.0, reach_m=40e3)
+    image = _paint(view.distance_m, view.normal, view.position_m - truth.position_m, rng, 60e3)
+    values = values_of(truth, np.eye(3))
+    values[:3] = values[0] + rng.uniform(-10, 10), 0.0, 0.0
+    values[8] = rng.uniform(-1.5, 1.5) * truth.fy * np.pi / 180.0
+    mask = np.ones(image.shape[:2], bool)
+    return PictureTrial(image, mask, np.isinf(view.distance_m), truth, view_from_values(truth, np.eye(3), values),
+                        (raster,), frame)  # fmt: skip
 
 
 def _viewpoint(raster: Raster, rng: np.random.Generator):

@@ -36,7 +36,7 @@ class Search:
     Parameters
     ----------
     heading_deg, tilt_deg, roll_deg
-        Half ranges [deg].
+        Half ranges [deg]. For a panorama ``tilt_deg`` is also how far its horizon may be off its row.
     focal
         Half range of the field-of-view scale, relative.
     terrain_sigma_m
@@ -165,7 +165,8 @@ def _azimuths(start: View, origin: np.ndarray, search: Search) -> np.ndarray:
 def _coarse(start: View, axes: np.ndarray, origin: np.ndarray, horizon: Horizon, boundary: BoundaryMap, search: Search):
     """Poses ``(P, 9)`` and their scores over the whole search at 0.4° or a coarser pixel.
 
-    A small tilt moves the whole line up or down: all tilts of a heading share one projection.
+    A small tilt moves the whole line up or down (in a panorama it is the horizon's row that moves): all tilts of a
+    heading share one projection.
     """
     per_degree = start.fy * np.pi / 180.0
     step = float(np.clip(3.0 / per_degree / boundary.scale, 0.12, 0.4))
@@ -177,7 +178,10 @@ def _coarse(start: View, axes: np.ndarray, origin: np.ndarray, horizon: Horizon,
     # Up in the picture by a degree of tilt.
     shift = np.round(tilts * per_degree * boundary.scale).astype(int)
     poses, scores = [], []
-    for roll in _steps(search.roll_deg, 1.0):
+    panoramic = isinstance(start, Panorama)
+    lifts = tilts[:, None] * (per_degree * np.eye(9)[8] if panoramic else np.eye(9)[1])
+    # Leaning the axis of a panorama bends its horizon into a wave; that is left to the climb.
+    for roll in np.zeros(1) if panoramic else _steps(search.roll_deg, 1.0):
         for scale in _steps(np.log1p(search.focal), 0.03):
             for heading in headings:
                 values = origin + np.array([heading, 0.0, roll, 0, 0, 0, scale, 0, 0])
@@ -187,7 +191,7 @@ def _coarse(start: View, axes: np.ndarray, origin: np.ndarray, horizon: Horizon,
                         start, axes, values, edges, boundary.coarse_edges, boundary.scale, shift
                     )
                 scores.append(score)
-                poses.append(values + tilts[:, None] * np.eye(9)[1])
+                poses.append(values + lifts)
     return np.concatenate(poses), np.concatenate(scores)
 
 
@@ -254,6 +258,8 @@ def _refine(start, axes, values, terrain, boundary, search, points):
         if evidence is None:
             return None
         priors = replace(search.priors, heading_deg=np.inf)
+        if isinstance(start, Panorama) and not priors.horizon_px:
+            priors = replace(priors, horizon_px=search.tilt_deg * start.fy * np.pi / 180.0)
         calibration = calibrate(start, points, priors=priors, axes=axes, k1=float(values[7]), guess=values,
                                 skyline=evidence, noise_px=None if points else 1.0)  # fmt: skip
         values = calibration.values
@@ -267,9 +273,11 @@ def _climb(start, axes, values, horizon, boundary, search) -> np.ndarray:
     """
     from scipy.optimize import minimize
 
-    spans = np.array([search.heading_deg, search.tilt_deg, search.roll_deg, 0, 0, 0, search.focal, 0, 0])
+    panoramic = isinstance(start, Panorama)
+    lift = search.tilt_deg if panoramic else 0.0
+    spans = np.array([search.heading_deg, search.tilt_deg, search.roll_deg, 0, 0, 0, search.focal, 0, lift])
     free = np.flatnonzero(spans > 0)
-    size = np.array([0.5, 0.4, 0.6, 0, 0, 0, 0.03, 0, 0])[free]
+    size = np.array([0.5, 0.4, 0.6, 0, 0, 0, 0.03, 0, 0.4 * start.fy * np.pi / 180.0])[free]
     keep = np.isfinite(horizon.skyline_elevation_deg)
     sky = _thinned(start, axes, values, horizon.skyline_m[keep], 600)
     edges = _thinned(start, axes, values, horizon.edges_m, 300) if len(horizon.edges_m) else horizon.edges_m
@@ -367,6 +375,8 @@ def _met(start, axes, values, horizon, boundary):
     """Share of visible horizon with a strong boundary within 3 px of a coarse pixel, less chance; and column share."""
     keep = np.isfinite(horizon.skyline_elevation_deg)
     pixel, front = project_values(start, axes, values, horizon.skyline_m[keep])
+    # A horizon above or below the frame of a flat panorama is neither met nor missed.
+    front = front & (pixel[:, 1] > 0) & (pixel[:, 1] < start.height_px)
     near, inside = _collect(start, boundary.near, boundary.scale, pixel, front)
     if inside.sum() < 20:
         return 0.0, 0.0
