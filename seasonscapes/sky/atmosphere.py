@@ -42,7 +42,7 @@ __all__ = [
 ]
 
 # Raised whenever the tables of an equal atmosphere change.
-TABLES_REVISION = 3
+TABLES_REVISION = 4
 # Below this normal illuminance a luminary casts no visible shadow [lx].
 _FAINTEST_LX = 1e-6
 
