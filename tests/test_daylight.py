@@ -1,0 +1,59 @@
+"""The light of a place: both daylight models agree by day, and the sun lights the land from where it stands."""
+
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+
+import places
+from seasonscapes.daylight import light_at, light_for, moment_at
+from seasonscapes.pipeline import camera_for, load_place
+from seasonscapes.sky.illumination import global_horizontal_illuminance, luminance
+from seasonscapes.sky.models import read_sky_model, with_overrides
+from seasonscapes.workspace import Workspace
+
+PLACE = (46.55, 7.98)
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory) -> Workspace:
+    return Workspace(tmp_path_factory.mktemp("work"))
+
+
+@pytest.mark.parametrize("time", ["2024-06-20T07:30", "2024-06-20T08:40", "2024-06-20T11:20"])
+def test_hosek_and_atmosphere_agree_by_day(workspace, time):
+    """Global illuminance at turbidity 3 with the sun at 30° to 67°: within 10 %.
+
+    The Hosek-Wilkie fit is one of a path tracer with another haze, so single directions differ by up to a factor of
+    1.6; what falls on the ground is what both must agree on.
+    """
+    moment = moment_at(datetime.fromisoformat(time).replace(tzinfo=UTC), *PLACE)
+    assert moment.sun.elevation_deg > 29.0
+    lux = [
+        luminance(global_horizontal_illuminance(light_at(with_overrides(read_sky_model(name), turbidity=3.0), moment, 0.0,
+                                                         workspace=workspace)))
+        for name in ("hosek", "clear")
+    ]  # fmt: skip
+    assert lux[0] / lux[1] == pytest.approx(1.0, abs=0.10)
+
+
+def test_tables_are_kept_in_the_workspace(workspace):
+    moment = moment_at(datetime(2024, 6, 20, 11, 0, tzinfo=UTC), *PLACE)
+    model = with_overrides(read_sky_model("clear"), turbidity=3.0)
+    first = light_at(model, moment, 500.0, workspace=workspace)
+    files = {path: path.stat().st_mtime_ns for path in workspace.folder.rglob("tables-*.npz")}
+    assert files
+    again = light_at(model, moment, 500.0, workspace=workspace)
+    np.testing.assert_array_equal(first.sky_radiance, again.sky_radiance)
+    assert files == {path: path.stat().st_mtime_ns for path in workspace.folder.rglob("tables-*.npz")}
+
+
+def test_light_of_a_place_is_lit_below_and_seen_from_the_camera(tmp_path, workspace):
+    place = load_place(places.write_place(tmp_path), workspace)
+    view = place.scene.camera(None).model_copy(update={"above_ground_m": None, "height_m": 4500.0})
+    camera = camera_for(place, view, size_px=(32, 24))
+    model = with_overrides(read_sky_model("clear"), turbidity=3.0)
+    light, moment = light_for(place, camera, model, datetime(2024, 9, 1, 10, 0, tzinfo=UTC))
+    np.testing.assert_allclose(light.sun.direction, moment.sun.direction, atol=1e-12)
+    zenith = luminance(light.sky_radiance[0].mean(axis=0)), luminance(light.visible_sky[0].mean(axis=0))
+    assert zenith[1] < 0.8 * zenith[0], "the zenith over a high camera is darker than over the land"
