@@ -17,6 +17,8 @@ from seasonscapes.rendering.sky_patches import SkyPatches, mi_patch_of
 LANES = 1 << 22
 # Mitsuba's math::RayEpsilon in single precision.
 RAY_EPSILON = float(np.finfo(np.float32).epsneg) * 1500.0
+# What a ray meets instead of a sender: nothing, or a surface that sends no light.
+OPEN, BLACK = -1, -2
 
 
 @dataclass(frozen=True)
@@ -32,31 +34,45 @@ class Occluder:
 
 @dataclass(frozen=True)
 class Points:
-    """Where rays begin and how surfaces lie there.
+    """Places on a surface.
 
     Parameters
     ----------
     origin
-        ``(N, 3)`` float32 ENU, lifted off the surface as Mitsuba's own rays are [m].
+        ``(..., 3)`` float32 ENU, lifted off the surface's outer side as Mitsuba lifts its rays [m].
     normal
-        ``(N, 3)`` float32 unit shading normals.
+        ``(..., 3)`` float32 unit shading normals.
+    outward
+        ``(..., 3)`` float32 unit geometric normals.
     albedo
-        ``(N, 3)`` float32; zero where the surface turns its back.
-    face
-        ``(N,)`` uint32 index of the face.
+        ``(..., 3)`` float32; zero where the surface was met from its back.
+    uv
+        ``(..., 2)`` float32 texture coordinates, v upwards.
     """
 
     origin: np.ndarray
     normal: np.ndarray
+    outward: np.ndarray
     albedo: np.ndarray
-    face: np.ndarray
+    uv: np.ndarray
 
     def __getitem__(self, key: Any) -> Points:
-        return Points(self.origin[key], self.normal[key], self.albedo[key], self.face[key])
+        return Points(*(getattr(self, name)[key] for name in self.__dataclass_fields__))
+
+    def reshape(self, *shape: int) -> Points:
+        """The same points with leading axes ``shape``."""
+        columns = (getattr(self, name) for name in self.__dataclass_fields__)
+        return Points(*(values.reshape(*shape, values.shape[-1]) for values in columns))
 
 
 def occluder(mi_terrain: Any) -> Occluder:
-    """The terrain of a `RenderScene` without its lights (sun and moon are polygons there, and would block)."""
+    """The terrain of a `RenderScene` without its lights (sun and moon are polygons there, and would block).
+
+    Raises
+    ------
+    ValueError
+        On the scalar variant, which has no lanes.
+    """
     if use_backend().device == "scalar":
         raise ValueError("daylight coefficients need a vectorised variant; install a libLLVM or use CUDA")
     import mitsuba as mi
@@ -64,8 +80,16 @@ def occluder(mi_terrain: Any) -> Occluder:
     return Occluder(mi.load_dict({"type": "scene", "terrain": mi_terrain}), mi_terrain)
 
 
-def mi_surface(interaction: Any, active: Any) -> tuple[Any, Any, Any, Any]:
-    """Origin of rays that leave the surface's outer side, shading normal, albedo and face of hit lanes.
+def front_side(interaction: Any, active: Any) -> Any:
+    """Lanes of an intersection that meet a surface from its front, by both its normals."""
+    import drjit as dr
+
+    towards = interaction.to_world(interaction.wi)
+    return active & (dr.dot(interaction.sh_frame.n, towards) > 0.0) & (dr.dot(interaction.n, towards) > 0.0)
+
+
+def surface_points(interaction: Any, active: Any) -> Points:
+    """The surfaces that lanes of an intersection met.
 
     The outer side is that of the geometric normal (terrain faces run counter-clockwise seen from above); seen from its
     back a surface is black, as Mitsuba's one-sided diffuse material is.
@@ -73,30 +97,31 @@ def mi_surface(interaction: Any, active: Any) -> tuple[Any, Any, Any, Any]:
     import drjit as dr
     import mitsuba as mi
 
-    front = active & (dr.dot(interaction.sh_frame.n, interaction.to_world(interaction.wi)) > 0.0)
-    front &= dr.dot(interaction.n, interaction.to_world(interaction.wi)) > 0.0
+    front = front_side(interaction, active)
     albedo = dr.select(front, interaction.bsdf().eval_diffuse_reflectance(interaction, front), mi.Color3f(0.0))
     # Mitsuba's own distance (Interaction::offset_p), so that contact shadows are the path tracer's.
     lift = (1.0 + dr.max(dr.abs(interaction.p))) * RAY_EPSILON
-    return interaction.p + interaction.n * lift, interaction.sh_frame.n, albedo, interaction.prim_index
+    lanes = (interaction.p + interaction.n * lift, interaction.sh_frame.n, interaction.n, albedo, interaction.uv)
+    dr.eval(lanes)
+    points = Points(*(np.ascontiguousarray(np.array(values).T) for values in lanes))
+    points.uv[:, 1] = 1.0 - points.uv[:, 1]
+    return points
 
 
-def cosine_points(index: Any, scramble_u: Any, scramble_v: Any) -> Any:
-    """Points of the unit square: the first two dimensions of Sobol's sequence, digits scrambled by exclusive or.
-
-    Any aligned run of 2ᵏ of them is stratified in every way that k binary digits can be (Sobol 1967; Kollig & Keller
-    2002, "Efficient multidimensional sampling", doi:10.1111/1467-8659.00706).
-    """
-    import drjit as dr
+def texture_at(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """Bilinear look-up ``(N, 3)`` of a texture ``(R, S, 3)`` at ``uv (N, 2)``, as the renderer's own texture does it."""
     import mitsuba as mi
 
-    u = dr.brev(index)
-    v = mi.UInt32(0)
-    direction = 1 << 31
-    for bit in range(16):
-        v ^= dr.select((index & (1 << bit)) != 0, mi.UInt32(direction), mi.UInt32(0))
-        direction ^= direction >> 1
-    return unit_square(u ^ scramble_u, v ^ scramble_v)
+    use_backend()
+    bitmap = mi.Texture2f(mi.TensorXf(np.ascontiguousarray(texture, np.float32)), wrap_mode=dr_clamp())
+    return np.array(bitmap.eval(mi.Point2f(uv[:, 0], 1.0 - uv[:, 1]))).T
+
+
+def dr_clamp() -> Any:
+    """Dr.Jit's name for extending a texture by its rim."""
+    import drjit as dr
+
+    return dr.WrapMode.Clamp
 
 
 def unit_square(u: Any, v: Any) -> Any:
@@ -108,59 +133,125 @@ def unit_square(u: Any, v: Any) -> Any:
     return mi.Point2f(*(dr.minimum(mi.Float(bits) * float(2.0**-32), top) for bits in (u, v)))
 
 
-def gather(terrain: Occluder, patches: SkyPatches, origin: np.ndarray, normal: np.ndarray, *, rays: int,
-           first: np.ndarray, scramble: np.ndarray, face_label: Any) -> np.ndarray:  # fmt: skip
-    """Where cosine-distributed rays of N points end.
+def scrambled_points(index: Any, scramble_u: Any, scramble_v: Any) -> Any:
+    """Points of the unit square: the first two dimensions of Sobol's sequence, digits scrambled by exclusive or.
+
+    Any aligned run of 2ᵏ of them is stratified in every way that k binary digits can be (Sobol 1967; Kollig & Keller
+    2002, "Efficient multidimensional sampling", doi:10.1111/1467-8659.00706).
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    second = mi.UInt32(0)
+    direction = 1 << 31
+    for bit in range(16):
+        second ^= dr.select((index & (1 << bit)) != 0, mi.UInt32(direction), mi.UInt32(0))
+        direction ^= direction >> 1
+    return unit_square(dr.brev(index) ^ scramble_u, second ^ scramble_v)
+
+
+@dataclass(frozen=True)
+class FaceLabels:
+    """Which sender a face belongs to, and from how far a group of senders will do; see `senders.cluster_faces`.
 
     Parameters
     ----------
-    origin, normal
-        ``(N, 3)`` float32.
+    mi_sender
+        ``mi.UInt32`` sender of every face.
+    count
+        M.
+    mi_reach_m
+        ``mi.Float`` of M lanes for each level of the tree over the senders.
+    """
+
+    mi_sender: Any
+    count: int
+    mi_reach_m: list[Any]
+
+
+def face_labels(sender: np.ndarray, reach_m: np.ndarray) -> FaceLabels:
+    """To the device: sender of every face ``(F,)`` and reach ``(levels, M)`` [m]."""
+    import drjit as dr
+    import mitsuba as mi
+
+    labels = FaceLabels(mi.UInt32(sender), reach_m.shape[1], [mi.Float(level) for level in reach_m])
+    dr.eval(labels.mi_sender, labels.mi_reach_m)
+    return labels
+
+
+def _node(labels: FaceLabels, hit: Any) -> Any:
+    """Node of the tree, root 1, that stands for what lanes of a preliminary intersection met."""
+    import drjit as dr
+    import mitsuba as mi
+
+    valid = hit.is_valid()
+    sender = dr.gather(mi.UInt32, labels.mi_sender, hit.prim_index, valid)
+    up = mi.UInt32(0)
+    for reach_m in labels.mi_reach_m:
+        up += dr.select(hit.t > dr.gather(mi.Float, reach_m, sender, valid), mi.UInt32(1), mi.UInt32(0))
+    return (sender + dr.opaque(mi.UInt32, labels.count)) >> up
+
+
+def gather(terrain: Occluder, patches: SkyPatches, points: Points, *, rays: int, first: np.ndarray,
+           scramble: np.ndarray, labels: FaceLabels) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Where cosine-distributed rays of N points go.
+
+    Parameters
+    ----------
+    points
+        N of them.
     rays
         K, rays from each point; a power of two keeps their stratification.
     first
         ``(N,)`` uint32 number of each point's first ray in its sequence, a multiple of ``rays``.
     scramble
         ``(N,)`` uint32; points with the same number share one sequence.
-    face_label
-        ``mi.UInt32`` label of every face.
+    labels
+        What to call the surfaces that rays meet.
 
     Returns
     -------
-    labels
-        ``(N, K)`` int32: the patch where the ray leaves, or P + the label of the face that it meets from its front, or
-        -1 where it meets a back side (from under the terrain's rim), which is black.
+    patch
+        ``(N, K)`` int32 patch of sky in whose direction the ray goes, whether it gets there or not.
+    met
+        ``(N, K)`` int32 node of the senders' tree that it meets; `OPEN` where it gets to the sky; `BLACK` where it goes into
+        its own surface or meets a back side (from under the terrain's rim).
     """
-    labels = np.empty((len(origin), rays), np.int32)
+    patch, met = (np.empty((len(points.origin), rays), np.int32) for _ in range(2))
     step = max(1, LANES // rays)
-    for start in range(0, len(origin), step):
+    for start in range(0, len(patch), step):
         part = slice(start, start + step)
-        labels[part] = _gather_block(terrain, patches, (origin[part], normal[part], first[part], scramble[part]),
-                                     rays, face_label).reshape(-1, rays)  # fmt: skip
-    return labels
+        keys = (first[part], scramble[part], labels)
+        patch[part], met[part] = _gather_block(terrain, patches, points[part], rays, keys)
+    return patch, met
 
 
-def _gather_block(terrain: Occluder, patches: SkyPatches, block: tuple, rays: int, face_label: Any) -> np.ndarray:
+def _gather_block(terrain: Occluder, patches: SkyPatches, points: Points, rays: int,
+                  keys: tuple) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     import drjit as dr
     import mitsuba as mi
 
-    origins, normals, first, scramble = block
-    count = len(origins)
+    first, scramble, labels = keys
+    count = len(points.origin)
     per_point = dr.opaque(mi.UInt32, rays)
     lane = dr.arange(mi.UInt32, count * rays)
     point = lane // per_point
     number = lane - point * per_point + dr.gather(mi.UInt32, mi.UInt32(first), point)
     scramble_u, scramble_v = mi.sample_tea_32(dr.gather(mi.UInt32, mi.UInt32(scramble), point), mi.UInt32(0x9E3779B9))
-    frame = mi.Frame3f(dr.gather(mi.Normal3f, mi.Normal3f(point3(normals)), point))
-    direction = frame.to_world(mi.warp.square_to_cosine_hemisphere(cosine_points(number, scramble_u, scramble_v)))
-    ray = mi.Ray3f(dr.gather(mi.Point3f, point3(origins), point), direction)
-    hit = terrain.mi_scene.ray_intersect_preliminary(ray)
-    interaction = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal)
+    frame = mi.Frame3f(dr.gather(mi.Normal3f, mi.Normal3f(point3(points.normal)), point))
+    direction = frame.to_world(mi.warp.square_to_cosine_hemisphere(scrambled_points(number, scramble_u, scramble_v)))
+    # Interpolated normals let some rays point into the facet; a path tracer finds those black.
+    outside = dr.dot(direction, dr.gather(mi.Normal3f, mi.Normal3f(point3(points.outward)), point)) > 0.0
+    ray = mi.Ray3f(dr.gather(mi.Point3f, point3(points.origin), point), direction)
+    hit = terrain.mi_scene.ray_intersect_preliminary(ray, active=outside)
+    interaction = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, outside)
     front = dr.dot(interaction.n, direction) < 0.0
-    label = mi.Int32(dr.gather(mi.UInt32, face_label, hit.prim_index, hit.is_valid())) + patches.size
-    label = dr.select(hit.is_valid(), dr.select(front, label, -1), mi.Int32(mi_patch_of(patches, direction)))
-    dr.eval(label)
-    return np.array(label)
+    label = mi.Int32(_node(labels, hit))
+    met = dr.select(hit.is_valid(), dr.select(front, label, BLACK), OPEN)
+    met = dr.select(outside, met, BLACK)
+    patch = mi.Int32(mi_patch_of(patches, direction))
+    dr.eval(patch, met)
+    return np.array(patch).reshape(count, rays), np.array(met).reshape(count, rays)
 
 
 def follow(terrain: Occluder, points: Points, seed: int) -> tuple[Points, np.ndarray]:
@@ -168,21 +259,10 @@ def follow(terrain: Occluder, points: Points, seed: int) -> tuple[Points, np.nda
     import drjit as dr
     import mitsuba as mi
 
-    count = len(points.origin)
-    square = unit_square(*mi.sample_tea_32(dr.arange(mi.UInt32, count), dr.opaque(mi.UInt32, seed)))
-    frame = mi.Frame3f(mi.Normal3f(point3(points.normal)))
-    direction = frame.to_world(mi.warp.square_to_cosine_hemisphere(square))
-    interaction = terrain.mi_scene.ray_intersect(mi.Ray3f(point3(points.origin), direction))
-    valid = interaction.is_valid()
-    surface = mi_surface(interaction, valid)
+    square = unit_square(*mi.sample_tea_32(dr.arange(mi.UInt32, len(points.origin)), dr.opaque(mi.UInt32, seed)))
+    direction = mi.Frame3f(mi.Normal3f(point3(points.normal))).to_world(mi.warp.square_to_cosine_hemisphere(square))
+    outside = dr.dot(direction, mi.Normal3f(point3(points.outward))) > 0.0
+    interaction = terrain.mi_scene.ray_intersect(mi.Ray3f(point3(points.origin), direction), active=outside)
+    valid = interaction.is_valid() & (dr.dot(interaction.n, direction) < 0.0)
     met = np.array(valid)
-    return surface_points(surface)[met], met
-
-
-def surface_points(surface: tuple[Any, Any, Any, Any]) -> Points:
-    """Lanes of `mi_surface` as numpy."""
-    import drjit as dr
-
-    dr.eval(surface)
-    origin, normal, albedo, face = (np.array(values) for values in surface)
-    return Points(*(np.ascontiguousarray(values.T) for values in (origin, normal, albedo)), face)
+    return surface_points(interaction, valid)[met], met

@@ -12,15 +12,25 @@ from seasonscapes.rendering.gather import Occluder
 from seasonscapes.rendering.gbuffer import GBuffer, trace_gbuffer
 from seasonscapes.rendering.radiance import View
 from seasonscapes.rendering.scene import RenderScene, background
-from seasonscapes.rendering.sky_patches import direction_weights, patch_radiance, sky_patches
-from seasonscapes.rendering.sun_visibility import SunRays, sees, sun_rays
-from seasonscapes.rendering.transport import SkyTransport, ViewCoefficients
-from seasonscapes.sky.illumination import AerialPerspective, Illumination, Luminary, luminance
+from seasonscapes.rendering.reception import (
+    ReadyReception,
+    ReadySenders,
+    arriving,
+    light_senders,
+    luminaries,
+    ready_reception,
+    ready_senders,
+)
+from seasonscapes.rendering.sun_visibility import SunRays, first_place_sees, incidence, sun_rays
+from seasonscapes.rendering.transport import ViewCoefficients, view_neighbours
+from seasonscapes.sky.illumination import AerialPerspective, Illumination, Luminary
 
-# A moon (or a setting sun) that is this much fainter than the rest of the light casts no shadow that could be seen.
-FAINT = 1e-4
 # A pixel is rough where distances within it differ by more than this ratio: more than one surface shows in it.
 _DEPTH_RATIO = 1.05
+# Cosines of incidence below which samples of a pixel may face either way.
+_GRAZING = 0.05
+# Interreflected light is smooth: its noise is spread over neighbouring pixels of one surface.
+_BOUNCE_STRIDES = (1,)
 
 
 @dataclass(frozen=True)
@@ -33,8 +43,8 @@ class ReadyView:
         As they were made or read.
     rays
         Shadow rays of all samples, pixel by pixel.
-    sky
-        Coefficients in single precision, in memory.
+    reception, senders
+        On the device.
     rough
         ``(n,)`` bool: pixels with silhouettes inside.
     silhouette
@@ -47,7 +57,8 @@ class ReadyView:
 
     coefficients: ViewCoefficients
     rays: SunRays
-    sky: SkyTransport
+    reception: ReadyReception
+    senders: ReadySenders
     rough: np.ndarray
     silhouette: tuple[np.ndarray, np.ndarray]
     gbuffer: GBuffer
@@ -68,10 +79,10 @@ def ready_view(terrain: Occluder, coefficients: ViewCoefficients) -> ReadyView:
     gbuffer = trace_gbuffer(scene, camera)
     centre_is_sky = ~np.isfinite(gbuffer.depth.reshape(-1)[coefficients.pixel])
     index = np.flatnonzero((farthest > nearest * 1.1) | centre_is_sky)
-    sky = coefficients.sky
-    sky = SkyTransport(sky.patches, np.asarray(sky.direct, np.float32), np.asarray(sky.direct_from_sky),
-                       np.asarray(sky.bounce, np.float32), np.asarray(sky.bounce_from_sky))  # fmt: skip
-    return ReadyView(coefficients, sun_rays(terrain, origin, disc=origin.shape[1]), sky, rough,
+    passes = [view_neighbours(coefficients, stride=stride, sharpness=64.0) for stride in _BOUNCE_STRIDES]
+    rays = sun_rays(terrain, origin, coefficients.sample_normal, coefficients.sample_outward, coefficients.sample_weight)
+    return ReadyView(coefficients, rays, ready_reception(coefficients.reception, passes),
+                     ready_senders(terrain, coefficients.senders), rough,
                      (index, np.where(shown, distance, np.inf)[index]), gbuffer,
                      ray_directions(camera).reshape(-1, 3))  # fmt: skip
 
@@ -91,23 +102,12 @@ def relight_view(ready: ReadyView, illumination: Illumination) -> View:
 
 def surface_radiance(ready: ReadyView, illumination: Illumination) -> np.ndarray:
     """Radiance ``(n, 3)`` [cd/m²] that leaves the terrain of each pixel that shows any, sky counting as black."""
-    patches = sky_patches(ready.sky.patches)
-    sky = patch_radiance(patches, illumination.sky_radiance)
-    faint = FAINT * float(luminance((sky * patches.solid_angle_sr[:, None]).sum(axis=0)))
-    arriving = ready.sky.direct @ (ready.sky.direct_from_sky.T @ sky).astype(np.float32)
-    distant = sky.copy()
-    for luminary in (illumination.sun, illumination.moon):
-        if luminary is None or luminance(luminary.normal_illuminance_lx) <= faint:
-            continue
-        light = np.asarray(luminary.normal_illuminance_lx, float)
-        # Interreflection takes the luminary as spread over the patches around it.
-        distant += np.outer(direction_weights(patches, luminary.direction) / patches.solid_angle_sr, light)
-        arriving += np.outer(sun_cosine(ready, luminary), light / np.pi).astype(np.float32)
-    bounced = (ready.sky.bounce_from_sky.T @ distant).astype(np.float32)
-    for channel in range(3):
-        arriving[:, channel] += ready.sky.bounce[channel] @ bounced[:, channel]
-    # A basis of few directions may dip below zero where almost nothing arrives.
-    return np.maximum(arriving, 0.0) * ready.coefficients.albedo
+    direct, bounced = arriving(ready.reception, *light_senders(ready.senders, illumination))
+    total = direct + bounced
+    for body in luminaries(illumination):
+        light = np.asarray(body.normal_illuminance_lx, np.float32) / np.float32(np.pi)
+        total += sun_cosine(ready, body)[:, None] * light
+    return total * ready.coefficients.albedo
 
 
 def sun_cosine(ready: ReadyView, luminary: Luminary) -> np.ndarray:
@@ -115,21 +115,15 @@ def sun_cosine(ready: ReadyView, luminary: Luminary) -> np.ndarray:
 
     One ray decides for a pixel whose neighbours agree with it; along shadow edges and silhouettes all samples do.
     """
-    coefficients = ready.coefficients
-    towards = np.asarray(luminary.direction, np.float32)
-    samples = coefficients.sample_weight.shape[1]
-    first = np.flatnonzero(coefficients.sample_normal[:, 0].astype(np.float32) @ towards > 0.0)
-    seen = np.zeros(len(coefficients.pixel), bool)
-    seen[first] = sees(ready.rays, luminary, first * samples)
-    cosine = coefficients.normal @ towards
-    mixed = np.flatnonzero(_disagree(ready, seen) | ready.rough | (seen & (cosine < 0.05)))
-    result = np.where(seen, cosine, 0.0).astype(np.float32)
-    result[mixed] = 0.0
-    weight = coefficients.sample_weight[mixed].astype(np.float32)
-    weight *= np.maximum(coefficients.sample_normal[mixed].astype(np.float32) @ towards, 0.0)
-    row, sample = np.nonzero(weight > 0.0)
-    weight[row, sample] *= sees(ready.rays, luminary, mixed[row] * samples + sample)
-    result[mixed] = weight.sum(axis=1)
+    cosine = np.maximum(ready.coefficients.normal @ np.asarray(luminary.direction, np.float32), 0.0)
+    seen = first_place_sees(ready.rays, luminary)
+    mixed = np.flatnonzero(_disagree(ready, seen) | ready.rough | (seen & (cosine < _GRAZING)))
+    result = np.where(seen, cosine, 0.0)
+    light, possible = incidence(ready.rays, luminary, mixed)
+    # The mean normal stems from many more samples than the rays do: only the share that is lit is taken from these.
+    sound = (cosine[mixed] > _GRAZING) & (possible > _GRAZING)
+    ratio = np.where(sound, cosine[mixed] / np.where(sound, possible, 1.0), 1.0)
+    result[mixed] = light * np.clip(ratio, 0.5, 2.0)
     return result
 
 

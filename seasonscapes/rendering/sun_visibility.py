@@ -1,4 +1,4 @@
-"""How much of the sun (or moon) the samples of a view see: exact shadow rays, many only where one is not enough."""
+"""How much of the sun (or moon) places on the terrain see: exact shadow rays to points of its disc."""
 
 from __future__ import annotations
 
@@ -17,30 +17,51 @@ LANES = 1 << 22
 
 @dataclass(frozen=True)
 class SunRays:
-    """Origins of shadow rays, on the device, ready to be sent anywhere.
+    """Places with normals on the device, S to a receiver, ready for a sun anywhere.
 
     Parameters
     ----------
     terrain
         What is in the way.
     mi_origin
-        ``mi.Point3f`` of N lanes.
-    disc
-        Number of points on the disc among which neighbouring lanes are shared out.
+        ``mi.Point3f`` of N · S lanes, receiver by receiver.
+    mi_normal, mi_outward
+        Shading and geometric normals, three ``mi.Float16`` each.
+    mi_weight
+        Share of each place in its receiver, ``mi.Float16``.
+    places
+        S.
     """
 
     terrain: Occluder
     mi_origin: Any
-    disc: int
+    mi_normal: list[Any]
+    mi_outward: list[Any]
+    mi_weight: Any
+    places: int
+
+    @property
+    def receivers(self) -> int:
+        """N."""
+        import drjit as dr
+
+        return dr.width(self.mi_weight) // self.places
 
 
-def sun_rays(terrain: Occluder, origin: np.ndarray, *, disc: int = 16) -> SunRays:
-    """Shadow rays from places ``(N, 3)``; every ``disc`` neighbours together cover the whole disc of sun or moon."""
+def sun_rays(terrain: Occluder, origin: np.ndarray, normal: np.ndarray, outward: np.ndarray,
+             weight: np.ndarray) -> SunRays:  # fmt: skip
+    """Shadow rays from places: ``(N, S, 3)`` origins and normals, ``(N, S)`` weights, 0 where there is no place."""
     import drjit as dr
+    import mitsuba as mi
 
-    mi_origin = point3(origin.reshape(-1, 3))
-    dr.eval(mi_origin)
-    return SunRays(terrain, mi_origin, disc)
+    mi_origin = point3(np.asarray(origin).reshape(-1, 3))
+    halves = [
+        [mi.Float16(np.ascontiguousarray(column, np.float16)) for column in np.asarray(values).reshape(-1, 3).T]
+        for values in (normal, outward)
+    ]
+    mi_weight = mi.Float16(np.ascontiguousarray(weight, np.float16).ravel())
+    dr.eval(mi_origin, halves, mi_weight)
+    return SunRays(terrain, mi_origin, *halves, mi_weight, weight.shape[1])
 
 
 def disc_directions(luminary: Luminary, count: int) -> np.ndarray:
@@ -56,31 +77,82 @@ def disc_directions(luminary: Luminary, count: int) -> np.ndarray:
     return direction / np.linalg.norm(direction, axis=1, keepdims=True)
 
 
-def sees(rays: SunRays, luminary: Luminary, lane: np.ndarray) -> np.ndarray:
-    """Whether the lanes ``(K,)`` of `SunRays` see their point of the disc, ``(K,)`` bool.
-
-    Which point a lane looks at is fixed: its number, scrambled so that neighbouring pixels differ.
-    """
-    import mitsuba as mi
-
-    disc = mi.Vector3f(point3(disc_directions(luminary, rays.disc)))
-    lane = np.asarray(lane, np.uint32)
-    seen = np.empty(len(lane), bool)
-    for start in range(0, len(lane), LANES):
-        part = lane[start : start + LANES]
-        seen[start : start + len(part)] = _sees_block(rays, disc, mi.UInt32(part))
-    return seen
-
-
-def _sees_block(rays: SunRays, disc: Any, lane: Any) -> np.ndarray:
+def first_place_sees(rays: SunRays, luminary: Luminary) -> np.ndarray:
+    """Whether the first place of each receiver faces and sees its point of the disc, ``(N,)`` bool."""
     import drjit as dr
     import mitsuba as mi
 
-    count = dr.opaque(mi.UInt32, rays.disc)
-    # Cells of neighbours get the points in the same order, but each cell begins at another.
-    turn, _ = mi.sample_tea_32(lane // count, mi.UInt32(0x51ED270B))
-    direction = dr.gather(mi.Vector3f, disc, (lane + turn) % count)
-    ray = mi.Ray3f(dr.gather(mi.Point3f, rays.mi_origin, lane), direction)
-    blocked = rays.terrain.mi_scene.ray_test(ray)
-    dr.eval(blocked)
-    return ~np.array(blocked)
+    seen = np.empty(rays.receivers, bool)
+    disc = _mi_disc(luminary, rays.places)
+    for start in range(0, len(seen), LANES):
+        count = min(LANES, len(seen) - start)
+        lane = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, start)
+        visible, _, _ = _visible(rays, disc, lane * dr.opaque(mi.UInt32, rays.places))
+        dr.eval(visible)
+        seen[start : start + count] = np.array(visible)
+    return seen
+
+
+def incidence(rays: SunRays, luminary: Luminary, receiver: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Weighted sums over the places of some receivers ``(K,)``: of cosine × visibility, and of the cosine alone."""
+    import drjit as dr
+    import mitsuba as mi
+
+    sums = np.empty((2, len(receiver)), np.float32)
+    disc = _mi_disc(luminary, rays.places)
+    step = max(1, LANES // rays.places)
+    for start in range(0, len(receiver), step):
+        chosen = mi.UInt32(receiver[start : start + step].astype(np.uint32))
+        number = dr.arange(mi.UInt32, dr.width(chosen) * rays.places)
+        places = dr.opaque(mi.UInt32, rays.places)
+        lane = dr.gather(mi.UInt32, chosen, number // places) * places + number % places
+        visible, cosine, weight = _visible(rays, disc, lane)
+        share = dr.fmax(cosine, 0.0) * weight
+        blocks = [dr.block_sum(values, rays.places) for values in (dr.select(visible, share, 0.0), share)]
+        dr.eval(blocks)
+        sums[:, start : start + dr.width(chosen)] = [np.array(values) for values in blocks]
+    return sums[0], sums[1]
+
+
+def cosine_seen(rays: SunRays, luminary: Luminary) -> np.ndarray:
+    """Cosine of incidence × visibility of every place ``(N, S)``, its own point of the disc each."""
+    import drjit as dr
+    import mitsuba as mi
+
+    lane = dr.arange(mi.UInt32, rays.receivers * rays.places)
+    visible, cosine, _ = _visible(rays, _mi_disc(luminary, rays.places), lane)
+    result = dr.select(visible, cosine, 0.0)
+    dr.eval(result)
+    return np.array(result).reshape(-1, rays.places)
+
+
+def _mi_disc(luminary: Luminary, places: int) -> tuple[Any, Any, Any]:
+    """Directions to points of the disc and their number, and the direction to its centre."""
+    import drjit as dr
+    import mitsuba as mi
+
+    count = max(places, 16)
+    centre = mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in luminary.direction))
+    return mi.Vector3f(point3(disc_directions(luminary, count))), dr.opaque(mi.UInt32, count), centre
+
+
+def _visible(rays: SunRays, disc: tuple[Any, Any, Any], lane: Any) -> tuple[Any, Any, Any]:
+    """Whether lanes of `SunRays` see the luminary, the cosine of incidence of its centre, and their weight.
+
+    Where the facet turns its back a path tracer's shadow ray starts inside the mountain, so that is dark here too.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    points, count, centre = disc
+    cosine, outward = (
+        sum(mi.Float(dr.gather(mi.Float16, column, lane)) * axis for column, axis in zip(columns, centre, strict=True))
+        for columns in (rays.mi_normal, rays.mi_outward)
+    )
+    weight = mi.Float(dr.gather(mi.Float16, rays.mi_weight, lane))
+    active = (cosine > 0.0) & (outward > 0.0) & (weight > 0.0)
+    # Places of a receiver take the disc's points in turn; each receiver begins with another one.
+    turn, _ = mi.sample_tea_32(lane // dr.opaque(mi.UInt32, rays.places), mi.UInt32(0x51ED270B))
+    direction = dr.gather(mi.Vector3f, points, (lane + turn) % count)
+    ray = mi.Ray3f(dr.gather(mi.Point3f, rays.mi_origin, lane, active), direction)
+    return active & ~rays.terrain.mi_scene.ray_test(ray, active), cosine, weight

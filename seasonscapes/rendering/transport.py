@@ -1,12 +1,12 @@
 """Daylight coefficients: light transport traced once, so that each hour costs a few shadow rays and small products.
 
-Light is linear. For every pixel (or texel) this keeps, per patch of sky, how much of that patch's radiance arrives
-directly and by interreflection (Tregenza & Waters 1983, "Daylight coefficients", doi:10.1177/096032718301500201), in two
-compact directional bases. Sun and moon are exact: shadow rays to points of their discs each time; only their
-interreflection goes through the patches.
+Light is linear. For every receiver, a pixel or a texel, this keeps how much of each sky patch's radiance arrives
+(Tregenza & Waters 1983, "Daylight coefficients", doi:10.1177/096032718301500201) in a compact basis of directions, and
+which parts of the terrain it sees. Sun and moon are exact: shadow rays to points of their discs each time, from the
+receivers and from the terrain that sends light on to them (`senders`).
 
-Radiance of a pixel = albedo / π · E, with the albedo of its visible surface kept apart: another albedo may be put in its
-place. Interreflection uses the albedo that the terrain had when the coefficients were made.
+Radiance of a pixel = albedo / π · E, with the albedo of its visible surface kept apart: another season's may be put in
+its place, and in the senders'.
 """
 
 from __future__ import annotations
@@ -18,15 +18,29 @@ from typing import Any
 import numpy as np
 
 from seasonscapes.cameras.pinhole import Camera
-from seasonscapes.rendering import bounces as between
-from seasonscapes.rendering.bounces import DirectionBasis, direction_basis, label_rows
-from seasonscapes.rendering.gather import Occluder, Points, gather, mi_surface, surface_points, unit_square
+from seasonscapes.rendering.direction_basis import DirectionBasis, direction_basis
+from seasonscapes.rendering.gather import LANES, OPEN, FaceLabels, Occluder, Points, face_labels, front_side, gather, surface_points, unit_square
 from seasonscapes.rendering.gbuffer import mi_rays
-from seasonscapes.rendering.sky_patches import SkyPatches, sky_patches
+from seasonscapes.rendering.senders import (
+    PLACES,
+    Reception,
+    Senders,
+    cluster_faces,
+    face_geometry,
+    pilot_hits,
+    sender_lists,
+)
+from seasonscapes.rendering.sky_patches import sky_patches
+from seasonscapes.rendering.smoothing import Neighbours, neighbours, smoothed
 from seasonscapes.sky.illumination import LUMINANCE_WEIGHTS
 
-# Receivers in work at a time: with 256 rays each their labels take 70 MB.
-BLOCK = 1 << 16
+# Receivers' rays in work at a time: their labels and weights take about 20 bytes each.
+BLOCK_RAYS = 1 << 23
+# How much direct skylight depends on the normal when pixels share it: a sky's aureole is some 20° wide.
+_DIRECT_SHARPNESS = 64.0
+_PILOTS = 1 << 18
+# Receivers, and rays from each, that the basis of directions is found from.
+_EXAMPLES, _EXAMPLE_RAYS = 4096, 512
 Progress = Callable[[float], None]
 
 
@@ -37,25 +51,30 @@ class Effort:
     Parameters
     ----------
     subpixels
-        Samples in each pixel, a square; shadow rays start from them.
+        S, samples in each pixel, a square; shadow rays start from them.
+    shades
+        Samples in each pixel for its mean albedo and normal, a square.
     rays
         Rays over the hemisphere of each receiver, a power of two.
     bounces
-        Surfaces between receiver and light, beyond the receiver itself: 4 equals ``max_depth=6`` of the path tracer.
-    clusters
-        M, senders of interreflected light, a power of two.
-    sky_rank, bounce_rank
-        Coefficients kept per receiver for direct sky, and per channel for interreflection.
+        Surfaces between receiver and light: 4 equals ``max_depth=6`` of the path tracer.
+    senders
+        M, parts of the terrain that pass light on, a power of two up to 32,768.
+    listed
+        K, senders kept for each receiver, even.
+    rank
+        r, coefficients kept per receiver for the sky.
     patches
         Subdivision of the sky, a name in `sky_patches.SUBDIVISIONS`.
     """
 
     subpixels: int = 16
+    shades: int = 64
     rays: int = 256
     bounces: int = 4
-    clusters: int = 8192
-    sky_rank: int = 64
-    bounce_rank: int = 32
+    senders: int = 32768
+    listed: int = 48
+    rank: int = 32
     patches: str = "reinhart"
 
     def __post_init__(self):
@@ -63,31 +82,8 @@ class Effort:
             raise ValueError("Effort: subpixels must be a square, rays a power of two, bounces not negative")
         if self.rays % self.subpixels:
             raise ValueError(f"Effort: {self.rays} rays cannot be shared evenly among {self.subpixels} subpixels")
-
-
-@dataclass(frozen=True)
-class SkyTransport:
-    """How N receivers answer to the sky, in two bases of directions.
-
-    Parameters
-    ----------
-    patches
-        Name of the subdivision.
-    direct
-        ``(N, r)`` float16; irradiance / π = ``direct @ (direct_from_sky.T @ sky)`` for patch radiances ``(P, 3)``.
-    direct_from_sky
-        ``(P, r)`` float32.
-    bounce
-        ``(3, N, q)`` float16, the same for interreflected light of each channel.
-    bounce_from_sky
-        ``(P, q)`` float32.
-    """
-
-    patches: str
-    direct: np.ndarray
-    direct_from_sky: np.ndarray
-    bounce: np.ndarray
-    bounce_from_sky: np.ndarray
+        if self.listed % 2 or not 0 < self.senders <= 32768:
+            raise ValueError("Effort: listed must be even and senders at most 32768")
 
 
 @dataclass(frozen=True)
@@ -108,12 +104,12 @@ class ViewCoefficients:
         ``(n, 3)`` float32 mean of the samples' normals, weighted by ``sample_weight``.
     sample_origin
         ``(n, S, 3)`` float32, where shadow rays begin [m]; samples on terrain come first.
-    sample_normal
-        ``(n, S, 3)`` float16.
+    sample_normal, sample_outward
+        ``(n, S, 3)`` float16 shading and geometric normals.
     sample_weight
         ``(n, S)`` float16 share of each sample in the pixel's reflected light, sum 1; 0 in the sky.
-    sky
-        Answer to the sky.
+    reception, senders
+        What arrives.
     seed, effort
         How they were made.
     """
@@ -125,27 +121,43 @@ class ViewCoefficients:
     normal: np.ndarray
     sample_origin: np.ndarray
     sample_normal: np.ndarray
+    sample_outward: np.ndarray
     sample_weight: np.ndarray
-    sky: SkyTransport
+    reception: Reception
+    senders: Senders
     seed: int
     effort: Effort
 
 
 @dataclass(frozen=True)
-class Senders:
-    """Interreflection prepared: the label of each face, what clusters send, and the two bases."""
+class PointCoefficients:
+    """All that N places on the terrain (texels) need to be lit anew.
 
-    face_label: Any
-    radiance: np.ndarray
-    bounce: DirectionBasis
-    direct: DirectionBasis
+    Parameters
+    ----------
+    points
+        The places, ``(N, ...)``.
+    reception, senders
+        What arrives.
+    """
+
+    points: Points
+    reception: Reception
+    senders: Senders
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """What all receivers of a terrain share while they are traced."""
+
+    labels: FaceLabels
+    basis: DirectionBasis
+    senders: Senders
 
 
 def trace_view(terrain: Occluder, camera: Camera, effort: Effort | None = None, *, seed: int = 0,
                progress: Progress | None = None) -> ViewCoefficients:  # fmt: skip
-    """Daylight coefficients of a view.
-
-    Memory beyond the result is bounded by `BLOCK`, whatever the size of the view.
+    """Daylight coefficients of a view. Memory beyond the result does not grow with the view.
 
     Parameters
     ----------
@@ -160,52 +172,133 @@ def trace_view(terrain: Occluder, camera: Camera, effort: Effort | None = None, 
         Where no pixel shows terrain.
     """
     effort = effort or Effort()
-    samples = _trace_samples(terrain, camera, effort.subpixels, seed)
     tell = progress or (lambda share: None)
-    tell(0.05)
-    receivers = Points(samples.sample_origin, samples.sample_normal, None, None)
-    pilot = np.random.default_rng(seed).permutation(len(samples.pixel))[: 1 << 17]
-    # Ray i of a pixel starts at sample i · S / K, so each sample has an aligned run of the sequence.
-    senders = prepare_senders(terrain, _first_samples(samples, pilot), effort, seed=seed)
-    tell(0.2)
-    sky = _trace_sky(terrain, senders, receivers, samples.sample_weight, samples.pixel.astype(np.uint32), effort, seed,
-                     lambda share: tell(0.2 + 0.8 * share))  # fmt: skip
-    return replace(samples, sky=sky, effort=effort)
-
-
-def _trace_samples(terrain: Occluder, camera: Camera, count: int, seed: int) -> ViewCoefficients:
-    """The view without its answer to the sky."""
-    rows = max(1, (1 << 22) // (camera.width_px * count))
-    parts = [_sample_rows(terrain, camera, (top, min(rows, camera.height_px - top)), count, seed)
-             for top in range(0, camera.height_px, rows)]  # fmt: skip
-    columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
-    if len(columns[0]) == 0:
+    pilot, hit = _camera_points(terrain, camera, (0, camera.height_px), 1, seed)
+    if not hit.any():
         raise ValueError("the camera sees no terrain")
-    return ViewCoefficients(camera, *columns, sky=None, seed=seed, effort=Effort(subpixels=count))  # type: ignore[arg-type]
+    prepared = prepare(terrain, pilot[hit], effort, seed=seed)
+    tell(0.1)
+    rows = max(1, BLOCK_RAYS // (camera.width_px * effort.rays))
+    parts = []
+    for top in range(0, camera.height_px, rows):
+        parts += _view_rows(terrain, prepared, camera, (top, min(rows, camera.height_px - top)), effort, seed)
+        tell(0.1 + 0.9 * min(1.0, (top + rows) / camera.height_px))
+    columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+    view = ViewCoefficients(camera, *columns[:8], Reception(*columns[8:]), prepared.senders, seed, effort)
+    direct = smoothed(view.reception.direct, view_neighbours(view, stride=1, sharpness=_DIRECT_SHARPNESS))
+    return replace(view, reception=replace(view.reception, direct=direct.astype(np.float16)))
 
 
-def _sample_rows(terrain: Occluder, camera: Camera, rows: tuple[int, int], count: int, seed: int) -> tuple:
-    """Pixel, coverage, albedo, normal, sample_origin, sample_normal, sample_weight of a block of rows."""
-    points, hit = _camera_points(terrain, camera, rows, count, seed)
-    shape = (rows[1] * camera.width_px, count)
-    hit = hit.reshape(shape)
+def view_neighbours(view: ViewCoefficients, *, stride: int, sharpness: float) -> Neighbours:
+    """Pixels of one surface around each of the n pixels; see `smoothing.neighbours`."""
+    camera = view.camera
+    position = view.sample_origin.mean(axis=1)
+    normal = view.normal / np.maximum(np.linalg.norm(view.normal, axis=1, keepdims=True), 1e-6)
+    size = np.linalg.norm(position - camera.position_m.astype(np.float32), axis=1) / np.float32(camera.fx)
+    return neighbours((camera.height_px, camera.width_px), view.pixel, (position, normal, size), stride=stride,
+                      sharpness=sharpness)  # fmt: skip
+
+
+def trace_points(terrain: Occluder, points: Points, effort: Effort | None = None, *, prepared: Preparation | None = None,
+                 seed: int = 0, first: int = 0, progress: Progress | None = None) -> PointCoefficients:  # fmt: skip
+    """Daylight coefficients of places on the terrain, such as texels.
+
+    Parameters
+    ----------
+    points
+        N places, as from `surface_at`.
+    prepared
+        From `prepare`, where many blocks of places of one terrain are traced one after the other.
+    first
+        Number of the first place among all of them, so that blocks do not repeat each other's noise.
+    """
+    effort = effort or Effort()
+    tell = progress or (lambda share: None)
+    prepared = prepared or prepare(terrain, points, effort, seed=seed)
+    step = max(1, BLOCK_RAYS // effort.rays)
+    parts = []
+    for start in range(0, len(points.origin), step):
+        block = points[start : start + step]
+        identity = np.arange(first + start, first + start + len(block.origin), dtype=np.uint32)
+        weight = np.ones((len(block.origin), 1), np.float32)
+        parts.append(_receive(terrain, prepared, block.reshape(-1, 1), (weight, identity), effort, seed))
+        tell(min(1.0, (start + step) / len(points.origin)))
+    columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+    return PointCoefficients(points, Reception(*columns), prepared.senders)
+
+
+def prepare(terrain: Occluder, pilot: Points, effort: Effort, *, seed: int = 0) -> Preparation:
+    """The basis of directions and the senders for receivers that are like ``pilot``, a sample of them."""
+    patches = sky_patches(effort.patches)
+    faces = face_geometry(terrain.mi_terrain)
+    choice = np.random.default_rng(seed).permutation(len(pilot.origin))
+    pilot = pilot[np.resize(choice, _PILOTS)]
+    none = face_labels(np.zeros(len(faces[0]), np.uint32), np.zeros((0, 1), np.float32))
+    few = pilot[:_EXAMPLES]
+    patch, met = gather(terrain, patches, few, rays=_EXAMPLE_RAYS, first=np.zeros(_EXAMPLES, np.uint32),
+                        scramble=np.arange(_EXAMPLES, dtype=np.uint32), labels=none)  # fmt: skip
+    rows = patch_sums(patch, np.where(met == OPEN, np.float32(1.0 / _EXAMPLE_RAYS), 0.0), np.eye(patches.size))
+    basis = direction_basis(rows, patches, effort.rank)
+    hits, weight = pilot_hits(terrain, pilot, max(effort.bounces, 1), seed)
+    if effort.bounces == 0 or len(weight) == 0:
+        nothing = Senders(few[:1].reshape(1, 1), _nothing(basis, effort), basis.from_sky, effort.patches, 0)
+        return Preparation(none, basis, nothing)
+    points, label, reach_m = cluster_faces(hits, weight, faces, effort.senders, seed=seed)
+    size = len(points.origin)
+    senders = Senders(points, _nothing(basis, effort), basis.from_sky, effort.patches, effort.bounces)
+    prepared = Preparation(face_labels(label, reach_m), basis, senders)
+    step = max(1, BLOCK_RAYS // effort.rays)
+    even = np.full((size, PLACES), 1.0 / PLACES, np.float32)
+    parts = [
+        _receive(terrain, prepared, points[i : i + step],
+                 (even[i : i + step], np.arange(i, min(i + step, size), dtype=np.uint32)), effort, seed)
+        for i in range(0, size, step)
+    ]  # fmt: skip
+    reception = Reception(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    return replace(prepared, senders=replace(senders, reception=reception))
+
+
+def _nothing(basis: DirectionBasis, effort: Effort) -> Reception:
+    return Reception(np.zeros((1, basis.into.shape[1]), np.float16), np.zeros((1, effort.listed), np.uint16),
+                     np.zeros(1, np.float16))  # fmt: skip
+
+
+def _view_rows(terrain: Occluder, prepared: Preparation, camera: Camera, rows: tuple[int, int], effort: Effort,
+               seed: int) -> list[tuple]:  # fmt: skip
+    """The columns of `ViewCoefficients` and of its `Reception` for a block of rows; empty where they show no terrain."""
+    points, hit, pixel = view_samples(terrain, camera, rows, effort.subpixels, seed)
+    if len(pixel) == 0:
+        return []
+    weight = sample_weights(points.albedo, hit)
+    shown = pixel - rows[0] * camera.width_px
+    albedo, normal, coverage = _moments(terrain, camera, rows, effort.shades, seed)
+    received = _receive(terrain, prepared, points, (weight, pixel.astype(np.uint32)), effort, seed)
+    return [(pixel, coverage[shown], albedo[shown], normal[shown], points.origin, points.normal.astype(np.float16),
+             points.outward.astype(np.float16), weight.astype(np.float16), *received)]  # fmt: skip
+
+
+def view_samples(terrain: Occluder, camera: Camera, rows: tuple[int, int], count: int,
+                 seed: int) -> tuple[Points, np.ndarray, np.ndarray]:  # fmt: skip
+    """Surfaces ``(n, S)`` under the samples of a block of rows, which are terrain ``(n, S)``, and the pixels ``(n,)``.
+
+    Only pixels that show terrain. Terrain comes first among the samples of a pixel; sky is black and repeats the place
+    of the first.
+    """
+    flat, hit = _camera_points(terrain, camera, rows, count, seed)
+    hit = hit.reshape(-1, count)
     shown = hit.any(axis=1)
     pixel = (np.flatnonzero(shown) + rows[0] * camera.width_px).astype(np.int32)
     hit = hit[shown]
-    # Terrain before sky, so that the first sample always is one.
-    order = np.argsort(~hit, axis=1, kind="stable")
-    origin, normal, albedo = (
-        np.take_along_axis(values.reshape(*shape, 3)[shown], order[..., None], axis=1)
-        for values in (points.origin, points.normal, points.albedo)
-    )
+    # The first one stands for the pixel where a single ray must do: any of them, by lot.
+    lot = np.random.default_rng((seed, rows[0])).random(hit.shape, np.float32)
+    order = np.argsort(np.where(hit, lot, 2.0), axis=1)
     hit = np.take_along_axis(hit, order, axis=1)
-    albedo, normal = np.where(hit[..., None], albedo, 0.0), np.where(hit[..., None], normal, 0.0)
-    origin = np.where(hit[..., None], origin, origin[:, :1])
-    weight = sample_weights(albedo, hit)
-    mean_normal = np.einsum("ns,nsc->nc", weight, normal)
-    return (pixel, hit.mean(axis=1).astype(np.float32), albedo.mean(axis=1).astype(np.float32),
-            mean_normal.astype(np.float32), origin.astype(np.float32), normal.astype(np.float16),
-            weight.astype(np.float16))  # fmt: skip
+    columns = {}
+    for name in Points.__dataclass_fields__:
+        values = getattr(flat, name).reshape(*shown.shape, count, -1)[shown]
+        values = np.take_along_axis(values, order[..., None], axis=1)
+        columns[name] = np.where(hit[..., None], values, 0.0 if name == "albedo" else values[:, :1])
+    return Points(**columns), hit, pixel
 
 
 def sample_weights(albedo: np.ndarray, hit: np.ndarray) -> np.ndarray:
@@ -218,116 +311,91 @@ def sample_weights(albedo: np.ndarray, hit: np.ndarray) -> np.ndarray:
 def _camera_points(terrain: Occluder, camera: Camera, rows: tuple[int, int], count: int,
                    seed: int) -> tuple[Points, np.ndarray]:  # fmt: skip
     """Surfaces under stratified samples of rows of pixels, samples of a pixel side by side, and which met terrain."""
+    interaction, _ = _mi_camera_rays(terrain, camera, rows, count, seed)
+    valid = interaction.is_valid()
+    return surface_points(interaction, valid), np.array(valid)
+
+
+def _mi_camera_rays(terrain: Occluder, camera: Camera, rows: tuple[int, int], count: int, seed: int) -> tuple[Any, int]:
+    """What stratified rays through a block of rows meet, ``count`` to a pixel side by side, and the number of pixels."""
     import drjit as dr
     import mitsuba as mi
 
     top, height = rows
-    side = round(count**0.5)
-    lane = dr.arange(mi.UInt32, camera.width_px * height * count)
-    index, sample = lane // dr.opaque(mi.UInt32, count), lane % dr.opaque(mi.UInt32, count)
-    width = dr.opaque(mi.UInt32, camera.width_px)
+    pixels = camera.width_px * height
+    lane = dr.arange(mi.UInt32, pixels * count)
+    per_pixel, side = dr.opaque(mi.UInt32, count), dr.opaque(mi.UInt32, round(count**0.5))
+    width, first = dr.opaque(mi.UInt32, camera.width_px), dr.opaque(mi.UInt32, top)
+    index, sample = lane // per_pixel, lane % per_pixel
     row, column = index // width, index % width
-    key = lane + dr.opaque(mi.UInt32, top) * width * dr.opaque(mi.UInt32, count)
+    key = lane + first * width * per_pixel
     jitter = unit_square(*mi.sample_tea_32(key, dr.opaque(mi.UInt32, seed)))
-    cell_y, cell_x = sample // dr.opaque(mi.UInt32, side), sample % dr.opaque(mi.UInt32, side)
-    across = dr.opaque(mi.Float, 1.0 / side)
-    x = mi.Float(column) + (mi.Float(cell_x) + jitter.x) * across
-    y = mi.Float(row + dr.opaque(mi.UInt32, top)) + (mi.Float(cell_y) + jitter.y) * across
-    interaction = terrain.mi_scene.ray_intersect(mi_rays(camera, x, y))
-    valid = interaction.is_valid()
-    surface = mi_surface(interaction, valid)
-    dr.eval(surface, valid)
-    return surface_points(surface), np.array(valid)
+    x = mi.Float(column) + (mi.Float(sample % side) + jitter.x) / mi.Float(side)
+    y = mi.Float(row + first) + (mi.Float(sample // side) + jitter.y) / mi.Float(side)
+    return terrain.mi_scene.ray_intersect(mi_rays(camera, x, y)), pixels
+
+
+def _moments(terrain: Occluder, camera: Camera, rows: tuple[int, int], count: int,
+             seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """Mean albedo ``(N, 3)``, mean normal weighted by luminous albedo ``(N, 3)`` and coverage ``(N,)`` of all pixels.
+
+    Nothing but these sums leaves the device, so that many samples may be taken.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    step = max(1, LANES // (camera.width_px * count))
+    parts = []
+    for top in range(rows[0], rows[0] + rows[1], step):
+        block = (top, min(step, rows[0] + rows[1] - top))
+        interaction, pixels = _mi_camera_rays(terrain, camera, block, count, seed)
+        valid = interaction.is_valid()
+        front = front_side(interaction, valid)
+        albedo = interaction.bsdf().eval_diffuse_reflectance(interaction, front)
+        albedo = dr.select(front, albedo, mi.Color3f(0.0))
+        # A little of every terrain sample's normal, so that black pixels have one too.
+        shade = dr.dot(albedo, mi.Color3f(*LUMINANCE_WEIGHTS.tolist())) + dr.select(valid, mi.Float(1e-6), 0.0)
+        lanes = [*albedo, *(shade * interaction.sh_frame.n), shade, dr.select(valid, mi.Float(1.0), 0.0)]
+        sums = [dr.block_sum(values, count) for values in lanes]
+        dr.eval(sums)
+        parts.append(np.stack([np.array(values) for values in sums], axis=-1))
+    total = np.concatenate(parts)
+    normal = total[:, 3:6] / np.maximum(total[:, 6:7], 1e-20)
+    return total[:, :3] / count, normal, total[:, 7] / count
 
 
 def view_albedo(terrain: Occluder, coefficients: ViewCoefficients) -> np.ndarray:
     """Mean albedo ``(n, 3)`` of the pixels for the albedo that the terrain has now (another season's)."""
-    samples = _trace_samples(terrain, coefficients.camera, coefficients.effort.subpixels, coefficients.seed)
-    return samples.albedo
+    camera, effort = coefficients.camera, coefficients.effort
+    return _moments(terrain, camera, (0, camera.height_px), effort.shades, coefficients.seed)[0][coefficients.pixel]
 
 
-def _first_samples(samples: ViewCoefficients, index: np.ndarray) -> Points:
-    normal = samples.sample_normal[index, 0].astype(np.float32)
-    return Points(samples.sample_origin[index, 0], normal, np.ones_like(normal), np.zeros(len(index), np.uint32))
+def _receive(terrain: Occluder, prepared: Preparation, points: Points, shares: tuple[np.ndarray, np.ndarray],
+             effort: Effort, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """Columns of `Reception` for N receivers with S places each.
 
-
-def prepare_senders(terrain: Occluder, pilot: Points, effort: Effort, *, seed: int = 0) -> Senders:
-    """Clusters that send interreflected light to receivers like ``pilot``, and bases of directions fit for them."""
-    import mitsuba as mi
-
-    patches = sky_patches(effort.patches)
-    faces = face_geometry(terrain.mi_terrain)
-    zero = mi.UInt32(np.zeros(len(faces[0]), np.uint32))
-    few = slice(0, 4096)
-    labels = gather(terrain, patches, pilot.origin[few], pilot.normal[few], rays=512,
-                    first=np.zeros(len(pilot.origin[few]), np.uint32),
-                    scramble=np.arange(len(pilot.origin[few]), dtype=np.uint32), face_label=zero)  # fmt: skip
-    rows = label_rows(labels, np.float32(1.0 / 512.0), patches.size).toarray()
-    direct = _unit_columns(direction_basis(rows, patches, effort.sky_rank), rows)
-    if effort.bounces == 0:
-        nothing = DirectionBasis(np.zeros((patches.size, 1)), np.zeros((patches.size, 1)))
-        return Senders(zero, np.zeros((3, 1, 1), np.float32), nothing, direct)
-    hits, weight = between.pilot_hits(terrain, pilot, effort.bounces, seed)
-    if len(weight) == 0:
-        nothing = DirectionBasis(np.zeros((patches.size, 1)), np.zeros((patches.size, 1)))
-        return Senders(zero, np.zeros((3, 1, 1), np.float32), nothing, direct)
-    clusters = between.build_clusters(hits, weight, faces, effort.clusters, seed=seed)
-    label = mi.UInt32(clusters.of_face)
-    radiance, basis = between.cluster_radiance(terrain, patches, clusters, label, bounces=effort.bounces,
-                                               rank=effort.bounce_rank, seed=seed)  # fmt: skip
-    scale = 1.0 / np.maximum(radiance.reshape(-1, radiance.shape[-1]).std(axis=0), 1e-12)
-    basis = DirectionBasis(basis.into * scale, basis.from_sky / scale)
-    return Senders(label, (radiance * scale).astype(np.float32), basis, direct)
-
-
-def _unit_columns(basis: DirectionBasis, rows: np.ndarray) -> DirectionBasis:
-    """The same basis with coefficients of about 1, where half precision is at its best."""
-    scale = 1.0 / np.maximum((rows @ basis.into).std(axis=0), 1e-12)
-    return DirectionBasis(basis.into * scale, basis.from_sky / scale)
-
-
-def face_geometry(mi_terrain: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Centroids and unit normals ``(F, 3)`` float32 of a mesh's faces."""
-    import mitsuba as mi
-
-    parameters = mi.traverse(mi_terrain)
-    vertices = np.array(parameters["vertex_positions"]).reshape(-1, 3)
-    corners = vertices[np.array(parameters["faces"]).reshape(-1, 3)]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
-    return corners.mean(axis=1).astype(np.float32), normal.astype(np.float32)
-
-
-def _trace_sky(terrain: Occluder, senders: Senders, receivers: Points, weight: np.ndarray, identity: np.ndarray,
-               effort: Effort, seed: int, tell: Progress) -> SkyTransport:  # fmt: skip
-    """Direct and interreflected answers of receivers with S places each, origins and normals ``(N, S, 3)``."""
-    patches = sky_patches(effort.patches)
+    ``shares`` are the weights of places ``(N, S)`` and a number ``(N,)`` that makes each receiver's rays its own.
+    """
+    weight, identity = shares
     count, places = weight.shape
     each = effort.rays // places
-    direct = np.empty((count, senders.direct.into.shape[1]), np.float16)
-    bounce = np.empty((3, count, senders.bounce.into.shape[1]), np.float16)
-    into = senders.direct.into.astype(np.float32)
-    for start in range(0, count, BLOCK):
-        part = slice(start, start + BLOCK)
-        shares = np.asarray(weight[part], np.float32)
-        n = len(shares)
-        labels = gather(
-            terrain, patches, receivers.origin[part].reshape(-1, 3),
-            np.asarray(receivers.normal[part], np.float32).reshape(-1, 3), rays=each,
-            first=np.tile(np.arange(places, dtype=np.uint32) * np.uint32(each), n),
-            scramble=np.repeat(identity[part] + np.uint32(seed * 7919 % 2**31), places), face_label=senders.face_label,
-        )  # fmt: skip
-        labels = labels.reshape(n, places * each)
-        ray_weight = np.repeat(shares / each, each, axis=1)
-        direct[part] = label_rows(labels, ray_weight, patches.size) @ into
-        arriving = label_rows(labels, ray_weight, senders.radiance.shape[1], first=patches.size)
-        for channel in range(3):
-            bounce[channel, part] = arriving @ senders.radiance[channel]
-        tell(min(1.0, (start + n) / count))
-    return SkyTransport(patches.name, direct, senders.direct.from_sky.astype(np.float32), bounce,
-                        senders.bounce.from_sky.astype(np.float32))  # fmt: skip
+    # Ray i of a receiver starts at place i · S / rays, so that each place has an aligned run of the sequence.
+    first = np.tile(np.arange(places, dtype=np.uint32) * np.uint32(each), count)
+    scramble = np.repeat(identity + np.uint32((seed * 747796405 + 1) % 2**32), places)
+    patch, met = gather(terrain, sky_patches(effort.patches), points.reshape(-1), rays=each, first=first,
+                        scramble=scramble, labels=prepared.labels)  # fmt: skip
+    patch, met = patch.reshape(count, -1), met.reshape(count, -1)
+    ray_weight = np.repeat(weight / np.float32(each), each, axis=1)
+    direct = patch_sums(patch, np.where(met == OPEN, ray_weight, 0.0), prepared.basis.into)
+    sender, share = sender_lists(met, ray_weight, effort.listed, seed=seed)
+    return direct.astype(np.float16), sender, share.astype(np.float16)
 
 
-def arriving_from_patches(sky: SkyTransport, radiance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients of patch radiances ``(P, 3)`` in the two bases: ``(r, 3)`` and ``(q, 3)`` float32."""
-    return (sky.direct_from_sky.T @ radiance).astype(np.float32), (sky.bounce_from_sky.T @ radiance).astype(np.float32)
+def patch_sums(index: np.ndarray, weight: np.ndarray, table: np.ndarray) -> np.ndarray:
+    """Weighted sums ``(N, r)`` of rows of ``table (P, r)``, those that ``index (N, K)`` names with ``weight (N, K)``."""
+    from scipy import sparse
+
+    count, each = index.shape
+    start = np.arange(0, count * each + 1, each, dtype=np.int32)
+    matrix = sparse.csr_array((weight.ravel(), index.ravel(), start), shape=(count, len(table)))
+    return matrix @ table
