@@ -52,7 +52,7 @@ def demo(
     *,
     camera: str | None = None,
     size: str = "720x480",
-    spp: int = 64,
+    spp: int = 32,
     device: str = "auto",
     workspace: Path | None = None,
     json: bool = False,

@@ -22,7 +22,7 @@ def render(
     time: str,
     view: ViewOptions | None = None,
     sky: SkyOptions | None = None,
-    spp: int = 64,
+    spp: int = 32,
     max_depth: int = 6,
     exposure: str = "auto",
     seed: int = 0,
@@ -40,7 +40,7 @@ def render(
     time
         ISO 8601, such as 2024-09-01T12:00. Without an offset it is civil time at the camera.
     spp
-        Samples per pixel.
+        Samples per pixel; powers of two are best.
     max_depth
         Longest light path; 2 is direct light only.
     exposure
