@@ -1,0 +1,65 @@
+# ---
+# jupyter:
+#   jupytext:
+#     formats: ipynb,py:percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # A tour: any date and hour of a place
+#
+# The embedded scene is a synthetic massif in the Bernese Oberland whose albedo is known for every day of the year.
+
+# %%
+from datetime import UTC, datetime
+
+import matplotlib.pyplot as plt
+
+from seasonscapes.daylight import light_at, light_for, moment_at
+from seasonscapes.exposure import develop, exposure_ev100
+from seasonscapes.images import srgb_from_linear
+from seasonscapes.pipeline import albedo_for, camera_for, find_scene, load_place
+from seasonscapes.rendering.radiance import render_view
+from seasonscapes.rendering.scene import build_scene
+from seasonscapes.sky.models import read_sky_model
+from seasonscapes.sky.report import dome_picture
+from seasonscapes.workspace import default_workspace
+
+# %% [markdown]
+# Terrain and camera. The first time builds the massif; later it is read from the workspace.
+
+# %%
+place = load_place(find_scene("alpine"), default_workspace())
+camera = camera_for(place, place.scene.camera("aerial"), size_px=(384, 256))
+print(f"{len(place.terrain.faces):,} triangles, texels of {place.atlas.texel_p50_m:.1f} m")
+
+# %% [markdown]
+# The sky of an evening in September, as a map of the dome.
+
+# %%
+evening = datetime(2024, 9, 18, 17, 5, tzinfo=UTC)
+moment = moment_at(evening, place.frame.latitude_deg, place.frame.longitude_deg)
+sky = light_at(read_sky_model("clear"), moment, 1500.0, workspace=place.workspace)
+plt.imshow(srgb_from_linear(dome_picture(sky, 400)))
+plt.title(f"sun at {moment.sun.elevation_deg:.1f}°")
+plt.axis("off");
+
+# %% [markdown]
+# The view at that hour: radiance in cd/m², developed as a camera would.
+
+# %%
+light, _ = light_for(place, camera, read_sky_model("clear"), evening)
+view = render_view(build_scene(place.terrain, albedo_for(place, evening).values, light), camera, spp=16)
+plt.figure(figsize=(9, 6))
+plt.imshow(srgb_from_linear(develop(view.radiance, exposure_ev100(view.radiance))))
+plt.axis("off");
+
+# %% [markdown]
+# What each pixel sees: distance along the ray, in kilometres.
+
+# %%
+plt.imshow(view.gbuffer.depth / 1000.0, cmap="viridis")
+plt.colorbar(label="km");
