@@ -74,7 +74,8 @@ class AirBetween:
             seen = with_phases(light, mixed, direction)
             seen[endless] = sky_radiance(light, direction[endless])
             airlight += seen
-        return transmittance, airlight
+        # Colours outside Rec.709 have a negative channel; no light of a picture may be negative.
+        return transmittance, np.maximum(airlight, 0.0)
 
 
 def _interpolated(table: np.ndarray, places: tuple[tuple[np.ndarray, np.ndarray], ...]) -> np.ndarray:
@@ -104,8 +105,8 @@ def air_between(view: View, lights: tuple[tuple[SeenLight, np.ndarray], ...], il
     bands = np.exp(-view.near_depth)
     # Far away only red is left, which lies outside Rec.709: a mean with negative weights, kept within the bands' own.
     least, most = bands.min(axis=-1, keepdims=True), bands.max(axis=-1, keepdims=True)
-    seen = np.clip(bands @ weights.T / weights.sum(axis=1), np.maximum(least, 1e-30), most)
-    return AirBetween(view.horizon_rad, -np.log(seen).astype(np.float32), lights)
+    seen = np.clip(bands @ weights.T / weights.sum(axis=1), least, most)
+    return AirBetween(view.horizon_rad, -np.log(np.maximum(seen, 1e-30)).astype(np.float32), lights)
 
 
 def airlight(tables: AtmosphereTables, view: View, true_elevation_rad: float, irradiance: np.ndarray) -> np.ndarray:

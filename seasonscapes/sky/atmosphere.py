@@ -53,7 +53,8 @@ def true_elevation_deg(atmosphere: Atmosphere, apparent_elevation_deg, height_m:
     if not atmosphere.refraction:
         return apparent
     true = np.concatenate([np.linspace(-90.0, -8.0, 10), np.linspace(-7.5, 3.0, 400), np.linspace(3.1, 90.0, 400)])
-    lifted = true + refraction_deg(true, pressure_hpa=float(standard_pressure_hpa(height_m)))
+    pressure_hpa = float(standard_pressure_hpa(min(height_m, 3e4)))  # whose formula ends there
+    lifted = true + refraction_deg(true, pressure_hpa=pressure_hpa)
     return np.interp(apparent, lifted, true)
 
 
@@ -220,7 +221,8 @@ def _map_of(lights: tuple[SeenLight, ...], shape: tuple[int, int]) -> np.ndarray
     height, width = shape
     directions = equirectangular_directions(2 * height, 2 * width)
     radiance = sum(sky_radiance(light, directions) for light in lights)
-    return radiance.reshape(height, 2, width, 2, 3).mean(axis=(1, 3)).astype(np.float32)
+    # Colours outside Rec.709 have a negative channel; no light of a map may be negative.
+    return np.maximum(radiance.reshape(height, 2, width, 2, 3).mean(axis=(1, 3)), 0.0).astype(np.float32)
 
 
 def _direct_transfer(tables: AtmosphereTables, direction: np.ndarray, height_m: float, radius_deg: float) -> np.ndarray:
