@@ -17,21 +17,15 @@ from seasonscapes.sky.atmosphere import (
     true_elevation_deg,
 )
 from seasonscapes.sky.aureole import spread_aerosol_phase
+from seasonscapes.sky.cells import sample_cells, scattering_per_m
 from seasonscapes.sky.illumination import (
     diffuse_horizontal_illuminance,
     direct_horizontal_illuminance,
     luminance,
 )
+from seasonscapes.sky.moments import HARMONIC_ORDER, SUN_ELEVATION_KNOTS_DEG, diffuse_source, sun_geometry
 from seasonscapes.sky.paths import sun_transfer, towards_sun, trace_rays
-from seasonscapes.sky.scattering import (
-    HARMONIC_ORDER,
-    SUN_ELEVATION_KNOTS_DEG,
-    AtmosphereTables,
-    diffuse_source,
-    sample_cells,
-    scattering_per_m,
-    sun_geometry,
-)
+from seasonscapes.sky.scattering import AtmosphereTables
 from seasonscapes.sky.seen import observer_view, seen_sky, sky_radiance
 from seasonscapes.sky.spectrum import RGB_FROM_XYZ, WAVELENGTHS_NM, rgb_from_transfer
 

@@ -23,8 +23,9 @@ from seasonscapes.sky.aerial import air_between, airlight
 from seasonscapes.sky.air import Atmosphere, optics
 from seasonscapes.sky.ephemeris import refraction_deg, standard_pressure_hpa
 from seasonscapes.sky.illumination import Illumination, Luminary
+from seasonscapes.sky.moments import Moments, sun_index
 from seasonscapes.sky.paths import SUN_RADIUS_DEG, SunColumns, sun_transfer
-from seasonscapes.sky.scattering import AtmosphereTables, Moments, atmosphere_tables, sun_index
+from seasonscapes.sky.scattering import AtmosphereTables, atmosphere_tables
 from seasonscapes.sky.seen import SeenLight, observer_view, seen_sky, sky_radiance
 from seasonscapes.sky.spectrum import WAVELENGTHS_NM, rgb_from_transfer
 

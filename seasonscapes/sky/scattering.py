@@ -16,89 +16,36 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from math import factorial
 
 import numpy as np
 
-from seasonscapes.sky.air import (
-    TOP_HEIGHT_M,
-    Atmosphere,
-    Optics,
-    constituent_densities,
-    delta_scaled,
-    gas_moments,
-    optics,
+from seasonscapes.sky.air import Atmosphere, Optics, delta_scaled, gas_moments, optics
+from seasonscapes.sky.cells import Samples, local_sun, sample_cells, scattering_per_m
+from seasonscapes.sky.moments import (
+    DARK,
+    HARMONIC_ORDER,
+    LATER_ORDER,
+    SUN_ELEVATION_KNOTS_DEG,
+    Moments,
+    as_moments,
+    azimuthal,
+    diffuse_source,
+    sun_geometry,
+    sun_index,
+    table_heights_m,
+    zonal,
 )
 from seasonscapes.sky.paths import (
-    Paths,
     SunColumns,
     equal_cells,
     horizon_elevation_rad,
-    resampled,
     sun_columns,
     sun_transfer,
     trace_rays,
 )
 from seasonscapes.sky.spectrum import WAVELENGTHS_NM
 
-# Delta-M takes aerosol's scattering within some 180°/L for unscattered. Along the horizon that is right only for
-# narrow peaks: with L = 4 the sky beside a setting sun comes out a fifth too bright, with 10 within a path tracer's
-# noise.
-HARMONIC_ORDER, LATER_ORDER = 10, 4
-_HEIGHTS, _AZIMUTHS, _CELLS = 14, 11, 24
-# Close through twilight, where light falls by a factor of three a degree.
-SUN_ELEVATION_KNOTS_DEG = np.concatenate([
-    np.arange(-30.0, -18.0, 3.0), np.arange(-18.0, -12.0, 1.5), np.arange(-12.0, 3.0, 0.75),
-    [3.0, 4.5, 6.0, 8.0, 11.0, 15.0, 20.0, 27.0, 36.0, 47.0, 60.0, 74.0, 90.0],
-])  # fmt: skip
-_DARK = 1e-30
-_THREADS = 4
-
-
-@dataclass(frozen=True)
-class Samples:
-    """Cells of rays that start at one height: everything about them that does not know the sun.
-
-    Parameters
-    ----------
-    height_m, turn_rad, elevation_rad
-        Of the cells' middles ``(K, S)``.
-    weight
-        ``(K, S, B)``: ∫ transmittance ds over each cell, as seen from the start [m].
-    aerosol_column
-        ``(K, S)`` from the start to the cells' middles, in vertical columns.
-    end_transmittance
-        ``(K, B)`` to the end of the ray.
-    paths
-        The rays at the cells' edges.
-    """
-
-    height_m: np.ndarray
-    turn_rad: np.ndarray
-    elevation_rad: np.ndarray
-    weight: np.ndarray
-    aerosol_column: np.ndarray
-    end_transmittance: np.ndarray
-    paths: Paths
-
-
-@dataclass(frozen=True)
-class Moments:
-    """Angular moments of diffuse light by height and sun elevation.
-
-    Parameters
-    ----------
-    log_mean
-        ``(P, J, B)`` logarithm of Φ_00.
-    ratio
-        ``(P, J, L, L, B)`` all moments over Φ_00, by l and m.
-    ground_irradiance
-        ``(J, B)`` diffuse irradiance of the ground, a transfer.
-    """
-
-    log_mean: np.ndarray
-    ratio: np.ndarray
-    ground_irradiance: np.ndarray
+_AZIMUTHS, _CELLS, _THREADS = 11, 24, 4
 
 
 @dataclass(frozen=True)
@@ -118,157 +65,6 @@ class AtmosphereTables:
     atmosphere: Atmosphere
     sun_columns: SunColumns
     moments: Moments
-
-
-def azimuthal(x: np.ndarray, z: np.ndarray, order: int = HARMONIC_ORDER) -> np.ndarray:
-    """``Re (x + iy)^m = sin^m θ cos mφ`` of unit vectors for m up to ``order``, ``(..., order + 1)``."""
-    cosines = [np.ones_like(x), x]
-    for _ in range(2, order + 1):
-        cosines.append(2.0 * x * cosines[-1] - (1.0 - z**2) * cosines[-2])
-    return np.stack(cosines, axis=-1)
-
-
-def zonal(z: np.ndarray, order: int = HARMONIC_ORDER) -> np.ndarray:
-    """Orthonormal associated Legendre functions over ``sin^m θ``, ``(..., order + 1, order + 1)`` by l and m.
-
-    ``zonal(z)[..., l, m] * azimuthal(x, z)[..., m]`` are the real spherical harmonics that are even in y.
-    """
-    values = np.zeros((*np.shape(z), order + 1, order + 1))
-    for m in range(order + 1):
-        values[..., m, m] = float(np.prod(np.arange(1, 2 * m, 2)))
-        for degree in range(m + 1, order + 1):
-            before = values[..., degree - 2, m] if degree > m + 1 else 0.0
-            values[..., degree, m] = ((2 * degree - 1) * z * values[..., degree - 1, m] - (degree + m - 1) * before) / (
-                degree - m
-            )
-    for degree in range(order + 1):
-        for m in range(degree + 1):
-            square = (2 * degree + 1) / (4 * np.pi) * factorial(degree - m) / factorial(degree + m) * (2 if m else 1)
-            values[..., degree, m] *= np.sqrt(square)
-    return values
-
-
-def sample_cells(atmosphere: Atmosphere, scaled: Optics, paths: Paths, edges_m: np.ndarray) -> Samples:
-    """Cells between edges ``(K, S + 1)`` [m] along rays, with the transmittance-weighted length of each."""
-    middles = resampled(paths, 0.5 * (edges_m[:, 1:] + edges_m[:, :-1]))
-    ends = resampled(paths, edges_m)
-    length = np.diff(ends.distance_m, axis=1)
-    column = cell_columns(atmosphere, ends, middles)
-    depth = np.einsum("cks,cb->ksb", column, scaled.extinction)
-    total = np.concatenate([np.zeros_like(depth[:, :1]), np.cumsum(depth, axis=1)], axis=1)
-    transmittance = np.exp(-total)
-    length = np.diff(ends.distance_m, axis=1)[..., None]
-    weight = transmittance[:, :-1] * -np.expm1(-depth) / np.maximum(depth, 1e-9) * length
-    aerosol = np.cumsum(column[1], axis=1) - 0.5 * column[1]
-    return Samples(
-        middles.height_m, middles.turn_rad, middles.elevation_rad, weight, aerosol, transmittance[:, -1], ends
-    )
-
-
-def cell_columns(atmosphere: Atmosphere, ends: Paths, middles: Paths) -> np.ndarray:
-    """Columns ``(3, K, S)`` of the constituents in each cell, by Simpson's rule."""
-    density = constituent_densities(atmosphere, ends.height_m)
-    mean = (density[..., 1:] + density[..., :-1] + 4.0 * constituent_densities(atmosphere, middles.height_m)) / 6.0
-    return mean * np.diff(ends.distance_m, axis=1)
-
-
-def local_sun(turn_rad, sun_elevation_rad, cos_azimuth) -> np.ndarray:
-    """Sine of the sun's elevation at points a turn about the Earth's centre away, towards an azimuth from the sun.
-
-    All arguments broadcast; the last is the cosine of the azimuth between ray and sun.
-    """
-    return np.cos(turn_rad) * np.sin(sun_elevation_rad) + np.sin(turn_rad) * np.cos(sun_elevation_rad) * cos_azimuth
-
-
-def scattering_per_m(atmosphere: Atmosphere, scaled: Optics, height_m: np.ndarray) -> np.ndarray:
-    """Scattering coefficients of gas and aerosol ``(2, ..., B)`` [1/m] at heights."""
-    density = constituent_densities(atmosphere, height_m)[:2]
-    return density[..., None] * scaled.scattering[:2].reshape(2, *(1,) * np.ndim(height_m), -1)
-
-
-def diffuse_source(atmosphere: Atmosphere, scaled: Optics, moments: Moments, samples: Samples,
-                   geometry: tuple) -> np.ndarray:  # fmt: skip
-    """Source of scattered diffuse light ``J`` at samples under many suns and azimuths ``(K, S, Q, B)`` [1/(m sr)].
-
-    ``geometry`` is what `sun_geometry` gives for the samples.
-    """
-    index, share, cosines = geometry
-    orders, bands = moments.ratio.shape[2], moments.ratio.shape[-1]
-    cells = samples.height_m.size
-    # Interpolation, in height and in the sun's elevation, as products with matrices of hat functions; of the sun's
-    # knots only those that the samples need.
-    first, last = int(index.min()), int(index.max()) + 2
-    row, share_of_row = height_index(atmosphere, samples.height_m)
-    heights = _hats(row.ravel(), share_of_row.ravel(), len(moments.log_mean))
-    chi = np.stack([gas_moments(orders - 1), scaled.aerosol_moments[:orders]])
-    sigma = scattering_per_m(atmosphere, scaled, samples.height_m).reshape(2, cells, bands)
-    weight = np.einsum("axb,al->xlb", sigma, chi)
-    legendre = zonal(np.sin(samples.elevation_rad).ravel(), orders - 1)
-    columns = [(heights @ moments.log_mean[:, first:last].reshape(len(moments.log_mean), -1)).reshape(cells, -1, bands)]
-    for m in range(orders):
-        # A sample's height and elevation fix all but the azimuth: sum over l here, once for all suns.
-        block = moments.ratio[:, first:last, m:, m]
-        block = (heights @ block.reshape(len(block), -1)).reshape(cells, last - first, orders - m, bands)
-        factor = (weight[:, m:] * legendre[:, m:, m, None]).astype(np.float32)
-        columns.append(np.einsum("xlb,xjlb->xjb", factor, block))
-    suns = _hats(index.reshape(cells, -1) - first, share.reshape(cells, -1), last - first)
-    mixed = suns @ np.concatenate(columns, axis=-1)
-    mixed = mixed.reshape(*index.shape, orders + 1, bands)
-    shape = np.einsum("ksqm,ksqmb->ksqb", cosines[..., :orders], mixed[..., 1:, :])
-    return np.maximum(shape, 0.0) * np.exp(mixed[..., 0, :])
-
-
-def _hats(index: np.ndarray, share: np.ndarray, count: int) -> np.ndarray:
-    """Matrix ``(..., count)`` of linear interpolation: ``1 - share`` at ``index`` and ``share`` at the next."""
-    matrix = np.zeros((*index.shape, count), np.float32)
-    np.put_along_axis(matrix, index[..., None], 1.0 - share[..., None], axis=-1)
-    np.put_along_axis(matrix, index[..., None] + 1, share[..., None], axis=-1)
-    return matrix
-
-
-def sun_geometry(samples: Samples, start_elevation_rad: np.ndarray, sun_elevation_rad: np.ndarray,
-                 azimuth_rad: np.ndarray) -> tuple[np.ndarray, tuple]:  # fmt: skip
-    """Where the sun stands at each sample ``(K, S, Q)`` for Q pairs of sun elevation and azimuth from the sun.
-
-    Returns
-    -------
-    sun_sine
-        Sine of the sun's elevation at the samples ``(K, S, Q)``.
-    geometry
-        Knot index and share in the sun's elevation, and `azimuthal` of the ray's direction in the local frame.
-    """
-    sun, cos_azimuth = np.asarray(sun_elevation_rad), np.cos(azimuth_rad)
-    sine = local_sun(samples.turn_rad[..., None], sun, cos_azimuth)
-    # Cosine between ray and sun, constant along the ray.
-    start = start_elevation_rad[:, None]
-    nu = np.sin(start) * np.sin(sun) + np.cos(start) * np.cos(sun) * cos_azimuth
-    z = np.sin(samples.elevation_rad)[..., None]
-    x = (nu[:, None, :] - z * sine) / np.sqrt(np.maximum(1.0 - sine**2, 1e-8))
-    bound = np.sqrt(np.maximum(1.0 - z**2, 0.0))
-    x = np.clip(x, -bound, bound)
-    return sine, (*sun_index(sine), azimuthal(x, np.broadcast_to(z, x.shape)).astype(np.float32))
-
-
-def sun_index(sine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Knot below and share towards the next, in `SUN_ELEVATION_KNOTS_DEG`, for sines of the sun's elevation."""
-    knots = np.sin(np.radians(SUN_ELEVATION_KNOTS_DEG))
-    position = np.interp(sine, knots, np.arange(len(knots)))
-    index = np.minimum(position.astype(np.int32), len(knots) - 2)
-    return index, (position - index).astype(np.float32)
-
-
-def height_index(atmosphere: Atmosphere, height_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Table row below and share towards the next, for heights [m]."""
-    share = (height_m - atmosphere.ground_height_m) / (TOP_HEIGHT_M - atmosphere.ground_height_m)
-    position = np.clip(share, 0.0, 1.0) ** (1.0 / 2.5) * (_HEIGHTS - 1)
-    index = np.minimum(position.astype(np.int32), _HEIGHTS - 2)
-    return index, position - index
-
-
-def table_heights_m(atmosphere: Atmosphere) -> np.ndarray:
-    """Heights of the table's rows ``(P,)`` [m]."""
-    thickness = TOP_HEIGHT_M - atmosphere.ground_height_m
-    return atmosphere.ground_height_m + thickness * np.linspace(0.0, 1.0, _HEIGHTS) ** 2.5
 
 
 def _directions(horizon_rad: float) -> tuple[np.ndarray, np.ndarray]:
@@ -347,13 +143,6 @@ def _irradiance(level: _Level, radiance: np.ndarray) -> np.ndarray:
     return np.einsum("ka,k,kjab->jb", level.weights, np.maximum(level.sines, 0.0), by_sun, optimize=True)
 
 
-def as_moments(values: np.ndarray, ground_irradiance: np.ndarray) -> Moments:
-    """Pack plain moments ``(P, J, L, L, B)`` so that they interpolate well."""
-    mean = np.maximum(values[:, :, 0, 0], _DARK)
-    ratio = values / mean[:, :, None, None]
-    return Moments(np.log(mean).astype(np.float32), ratio.astype(np.float32), ground_irradiance)
-
-
 def atmosphere_tables(atmosphere: Atmosphere, *, tolerance: float = 0.1, max_orders: int = 40) -> AtmosphereTables:
     """Tabulate an atmosphere; some seconds, once for all times and places.
 
@@ -389,9 +178,9 @@ def atmosphere_tables(atmosphere: Atmosphere, *, tolerance: float = 0.1, max_ord
             values, ground = _gathered(pool.map(next_order, levels))
             total, total_ground = total + values, total_ground + ground
             # Later orders keep their shape and fall geometrically, band by band.
-            decay = np.clip(values[:, :, 0, 0] / np.maximum(before, _DARK), 0.0, 0.98)
+            decay = np.clip(values[:, :, 0, 0] / np.maximum(before, DARK), 0.0, 0.98)
             rest = decay / (1.0 - decay)
-            if (rest * values[:, :, 0, 0] < tolerance * total[:, :, 0, 0] + _DARK).all():
+            if (rest * values[:, :, 0, 0] < tolerance * total[:, :, 0, 0] + DARK).all():
                 break
     total = total + rest[:, :, None, None] * values
     return AtmosphereTables(atmosphere, columns, as_moments(total, total_ground + rest[0] * ground))

@@ -16,19 +16,10 @@ from seasonscapes.frames import angles_from_direction
 from seasonscapes.images import REC709_LUMINANCE
 from seasonscapes.sky.air import TOP_HEIGHT_M, Atmosphere, delta_scaled, gas_phase, optics
 from seasonscapes.sky.aureole import spread_aerosol_phase
+from seasonscapes.sky.cells import Samples, cell_columns, local_sun, sample_cells, scattering_per_m
+from seasonscapes.sky.moments import HARMONIC_ORDER, diffuse_source, sun_geometry, sun_index
 from seasonscapes.sky.paths import equal_cells, horizon_elevation_rad, resampled, sun_transfer, towards_sun, trace_rays
-from seasonscapes.sky.scattering import (
-    HARMONIC_ORDER,
-    AtmosphereTables,
-    Samples,
-    cell_columns,
-    diffuse_source,
-    local_sun,
-    sample_cells,
-    scattering_per_m,
-    sun_geometry,
-    sun_index,
-)
+from seasonscapes.sky.scattering import AtmosphereTables
 from seasonscapes.sky.spectrum import WAVELENGTHS_NM, rgb_from_transfer
 
 _ABOVE, _BELOW, _AZIMUTHS, _AZIMUTHS_OUT, _CELLS = 44, 20, 12, 49, 36
