@@ -1,12 +1,15 @@
 """Light scattered more than once: its angular moments at every height and sun elevation, order by order.
 
-Bruneton & Neyret (2008), doi:10.1111/j.1467-8659.2008.01245.x, compute scattering order by order: the source
-``J[L](x, ω) = σ_s ∫ p(ω, ω') L(x, ω') dω'`` (their eq. 7) and the radiance it makes along rays, ``S[L]`` (their eq. 8),
-with light from the ground ``R[L]`` (eq. 6), so that ``L = L0 + (R + S)[L0] + (R + S)²[L0] + …`` (eq. 4). They tabulate
-``ΔJ`` and ``ΔS`` in four dimensions (their algorithm 4.1). Here only ``L``'s moments in real spherical harmonics about
-the local vertical are kept, ``Φ_lm(height, sun elevation)``: a phase function with Legendre moments χ_l turns them into
-the source exactly, ``J = σ_s Σ χ_l Φ_lm Y_lm``, and gas needs l ≤ 2 alone. Aerosol's forward peak is dealt with by
-delta-M scaling; the sun's first scattering keeps the full phase function elsewhere (Nakajima & Tanaka's 1988 TMS).
+After Bruneton & Neyret (2008), doi:10.1111/j.1467-8659.2008.01245.x, whose symbols are used: transmittance ``T``
+(their eq. 5), light that the ground sends back ``I[L]`` (eq. 6), the source of scattering
+``J[L](x, ω) = Σ β_s ∫ P(ω·ω') L(x, ω') dω'`` (eq. 7), and the equation to solve ``L = L0 + R[L] + S[L]`` (eq. 8) with
+``R[L] = T I[L]`` (eq. 10) and ``S[L] = ∫ T J[L]`` (eq. 11). It is solved as they do, by the series
+``L0 + (R + S)[L0] + (R + S)²[L0] + …`` (§ 4), one order of scattering after the other.
+
+They tabulate ``J`` and ``S`` in four dimensions. Here only the moments of ``L`` in real spherical harmonics about the
+local vertical are kept, ``Φ_lm(height, sun elevation)``: a phase function with Legendre moments χ_l turns them into
+the source exactly, ``J = β_s Σ χ_l Φ_lm Y_lm``, and gas needs l ≤ 2 alone. Aerosol's forward peak is dealt with by
+delta-M scaling; what the eye sees of light scattered once keeps the full phase function (see `aureole`).
 
 All radiances are transfers: over the sun's spectral irradiance above the air [1/sr], in nine bands.
 """
