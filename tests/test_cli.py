@@ -8,10 +8,10 @@ import sys
 import time
 
 import numpy as np
+import places
 import pytest
 from PIL import Image
 
-import places
 from seasonscapes.cli import main
 from seasonscapes.images import read_exr
 

@@ -5,9 +5,9 @@ import json
 
 import cv2
 import numpy as np
+import places
 import pytest
 
-import places
 from seasonscapes.cli import main
 
 WEBCAM = """

@@ -3,9 +3,9 @@
 from datetime import UTC, datetime
 
 import numpy as np
+import places
 import pytest
 
-import places
 from seasonscapes.daylight import light_at, light_for, moment_at
 from seasonscapes.pipeline import camera_for, load_place
 from seasonscapes.sky.illumination import global_horizontal_illuminance, luminance

@@ -88,7 +88,7 @@ def test_tone_curve_is_monotone_neutral_and_keeps_hue():
     out = tone_curve(grey)
     assert np.all(np.diff(out[:, 0]) > -1e-6)
     np.testing.assert_allclose(out, out[:, :1] * np.ones(3), atol=1e-6)
-    assert 0.0 <= out.min()
+    assert out.min() >= 0.0
     assert out.max() <= 1.0
     colour_in = np.array([0.30, 0.20, 0.10])
     toned = tone_curve(0.3 * colour_in)

@@ -60,4 +60,3 @@ def direction_basis(rows: np.ndarray, patches: SkyPatches, rank: int) -> Directi
     scale = 1.0 / np.maximum(np.asarray(rows @ into).std(axis=0), 1e-12)
     error = float(np.sqrt(power[rank:].sum() / max(power.sum(), 1e-300)))
     return DirectionBasis((into * scale).astype(np.float32), (inverse @ components / scale).astype(np.float32), error)
-

@@ -150,50 +150,8 @@ def scrambled_points(index: Any, scramble_u: Any, scramble_v: Any) -> Any:
     return unit_square(dr.brev(index) ^ scramble_u, second ^ scramble_v)
 
 
-@dataclass(frozen=True)
-class FaceLabels:
-    """Which sender a face belongs to, and from how far a group of senders will do; see `senders.cluster_faces`.
-
-    Parameters
-    ----------
-    mi_sender
-        ``mi.UInt32`` sender of every face.
-    count
-        M.
-    mi_reach_m
-        ``mi.Float`` of M lanes for each level of the tree over the senders.
-    """
-
-    mi_sender: Any
-    count: int
-    mi_reach_m: list[Any]
-
-
-def face_labels(sender: np.ndarray, reach_m: np.ndarray) -> FaceLabels:
-    """To the device: sender of every face ``(F,)`` and reach ``(levels, M)`` [m]."""
-    import drjit as dr
-    import mitsuba as mi
-
-    labels = FaceLabels(mi.UInt32(sender), reach_m.shape[1], [mi.Float(level) for level in reach_m])
-    dr.eval(labels.mi_sender, labels.mi_reach_m)
-    return labels
-
-
-def _node(labels: FaceLabels, hit: Any) -> Any:
-    """Node of the tree, root 1, that stands for what lanes of a preliminary intersection met."""
-    import drjit as dr
-    import mitsuba as mi
-
-    valid = hit.is_valid()
-    sender = dr.gather(mi.UInt32, labels.mi_sender, hit.prim_index, valid)
-    up = mi.UInt32(0)
-    for reach_m in labels.mi_reach_m:
-        up += dr.select(hit.t > dr.gather(mi.Float, reach_m, sender, valid), mi.UInt32(1), mi.UInt32(0))
-    return (sender + dr.opaque(mi.UInt32, labels.count)) >> up
-
-
 def gather(terrain: Occluder, patches: SkyPatches, points: Points, *, rays: int, first: np.ndarray,
-           scramble: np.ndarray, labels: FaceLabels) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+           scramble: np.ndarray, mi_label: Any) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Where cosine-distributed rays of N points go.
 
     Parameters
@@ -206,22 +164,22 @@ def gather(terrain: Occluder, patches: SkyPatches, points: Points, *, rays: int,
         ``(N,)`` uint32 number of each point's first ray in its sequence, a multiple of ``rays``.
     scramble
         ``(N,)`` uint32; points with the same number share one sequence.
-    labels
-        What to call the surfaces that rays meet.
+    mi_label
+        ``mi.UInt32`` sender of every face.
 
     Returns
     -------
     patch
         ``(N, K)`` int32 patch of sky in whose direction the ray goes, whether it gets there or not.
     met
-        ``(N, K)`` int32 node of the senders' tree that it meets; `OPEN` where it gets to the sky; `BLACK` where it goes into
+        ``(N, K)`` int32 sender that it meets; `OPEN` where it gets to the sky; `BLACK` where it goes into
         its own surface or meets a back side (from under the terrain's rim).
     """
     patch, met = (np.empty((len(points.origin), rays), np.int32) for _ in range(2))
     step = max(1, LANES // rays)
     for start in range(0, len(patch), step):
         part = slice(start, start + step)
-        keys = (first[part], scramble[part], labels)
+        keys = (first[part], scramble[part], mi_label)
         patch[part], met[part] = _gather_block(terrain, patches, points[part], rays, keys)
     return patch, met
 
@@ -231,7 +189,7 @@ def _gather_block(terrain: Occluder, patches: SkyPatches, points: Points, rays: 
     import drjit as dr
     import mitsuba as mi
 
-    first, scramble, labels = keys
+    first, scramble, mi_label = keys
     count = len(points.origin)
     per_point = dr.opaque(mi.UInt32, rays)
     lane = dr.arange(mi.UInt32, count * rays)
@@ -246,7 +204,7 @@ def _gather_block(terrain: Occluder, patches: SkyPatches, points: Points, rays: 
     hit = terrain.mi_scene.ray_intersect_preliminary(ray, active=outside)
     interaction = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, outside)
     front = dr.dot(interaction.n, direction) < 0.0
-    label = mi.Int32(_node(labels, hit))
+    label = mi.Int32(dr.gather(mi.UInt32, mi_label, hit.prim_index, hit.is_valid()))
     met = dr.select(hit.is_valid(), dr.select(front, label, BLACK), OPEN)
     met = dr.select(outside, met, BLACK)
     patch = mi.Int32(mi_patch_of(patches, direction))

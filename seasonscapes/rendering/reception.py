@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from seasonscapes.rendering.gather import Occluder
-from seasonscapes.rendering.senders import Reception, Senders, node_radiance
+from seasonscapes.rendering.senders import Reception, Senders
 from seasonscapes.rendering.sky_patches import patch_radiance, sky_patches
 from seasonscapes.rendering.smoothing import Neighbours, mi_neighbours, mi_smoothed
 from seasonscapes.rendering.sun_visibility import SunRays, cosine_seen, sun_rays
@@ -40,6 +40,17 @@ class ReadySenders:
     rays: SunRays
 
 
+@dataclass(frozen=True)
+class SenderLight:
+    """One light, as receivers meet it.
+
+    ``mi_sky`` is ``from_sky.T @ patch radiances``, r rows of three; ``mi_sent`` the radiance of M senders, rows of four.
+    """
+
+    mi_sky: Any
+    mi_sent: Any
+
+
 def ready_reception(reception: Reception, smoothing: list[Neighbours] | None = None) -> ReadyReception:
     """Copy to the device; half precision stays half."""
     import drjit as dr
@@ -60,38 +71,41 @@ def ready_senders(terrain: Occluder, senders: Senders) -> ReadySenders:
     return ReadySenders(senders, ready_reception(senders.reception), rays)
 
 
-def arriving(ready: ReadyReception, sky: np.ndarray, sent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Irradiance / π from the sky and from senders, ``(N, 3)`` each.
+def arriving(ready: ReadyReception, light: SenderLight) -> tuple[np.ndarray, np.ndarray]:
+    """Irradiance / π from the sky and from senders, ``(N, 3)`` float32 each."""
+    import drjit as dr
 
-    Parameters
-    ----------
-    sky
-        ``(r, 3)``: ``from_sky.T @ patch radiances``.
-    sent
-        ``(M, 3)`` radiance of the senders.
-    """
+    direct, bounced = mi_direct(ready, light.mi_sky), mi_bounced(ready, light.mi_sent)
+    dr.eval(direct, bounced)
+    first, second = (np.stack([np.array(channel) for channel in part], axis=-1) for part in (direct, bounced))
+    return first, second
+
+
+def mi_direct(ready: ReadyReception, mi_sky: Any) -> list[Any]:
+    """Irradiance / π from the sky: three lanes of N."""
     import drjit as dr
     import mitsuba as mi
 
-    mi_sky = mi.Float(np.ascontiguousarray(sky, np.float32).ravel())
-    # Four floats a row are one aligned load.
-    table = np.zeros((2 * len(sent), 4), np.float32)
-    table[:, :3] = node_radiance(sent)
-    mi_sent = mi.Float(table.ravel())
-    direct = [mi.Float(0.0)] * 3
+    total = [mi.Float(0.0)] * 3
     for k, column in enumerate(ready.mi_direct):
         wide = mi.Float(column)
-        direct = [dr.fma(wide, dr.gather(mi.Float, mi_sky, 3 * k + c), direct[c]) for c in range(3)]
+        total = [dr.fma(wide, dr.gather(mi.Float, mi_sky, 3 * k + c), total[c]) for c in range(3)]
+    # A basis of few directions may dip below zero where almost nothing arrives.
+    return [dr.fmax(channel, 0.0) for channel in total]
+
+
+def mi_bounced(ready: ReadyReception, mi_sent: Any) -> list[Any]:
+    """Irradiance / π from senders: three lanes of N."""
+    import drjit as dr
+    import mitsuba as mi
+
     total = mi.Vector4f(0.0)
     for pair in ready.mi_sender_pairs:
         total += dr.gather(mi.Vector4f, mi_sent, pair & 0xFFFF) + dr.gather(mi.Vector4f, mi_sent, pair >> 16)
-    # A basis of few directions may dip below zero where almost nothing arrives.
-    direct = [dr.fmax(channel, 0.0) for channel in direct]
     bounced = [total[c] * ready.mi_share for c in range(3)]
     for around in ready.mi_smoothing:
         bounced = mi_smoothed(bounced, around)
-    dr.eval(direct, bounced)
-    return tuple(np.stack([np.array(channel) for channel in part], axis=-1) for part in (direct, bounced))  # type: ignore[return-value]
+    return bounced
 
 
 def luminaries(illumination: Illumination) -> list[Luminary]:
@@ -103,21 +117,40 @@ def luminaries(illumination: Illumination) -> list[Luminary]:
     return [body for body in both if body is not None and luminance(body.normal_illuminance_lx) > faint]
 
 
-def light_senders(ready: ReadySenders, illumination: Illumination) -> tuple[np.ndarray, np.ndarray]:
-    """The sky in the basis of directions ``(r, 3)`` and the radiance of the senders ``(M, 3)`` [cd/m²] under a light."""
+def light_senders(ready: ReadySenders, illumination: Illumination) -> SenderLight:
+    """What sky and senders send under a light; further bounces by letting senders look at each other."""
+    import drjit as dr
+    import mitsuba as mi
+
     senders = ready.senders
     sky = patch_radiance(sky_patches(senders.patches), illumination.sky_radiance)
-    sky = (senders.from_sky.T @ sky).astype(np.float32)
+    mi_sky = mi.Float((senders.from_sky.T @ sky).astype(np.float32).ravel())
     if senders.bounces == 0:
-        return sky, np.zeros((1, 3), np.float32)
+        return SenderLight(mi_sky, mi.Float(np.zeros(4, np.float32)))
     albedo = senders.points.albedo
-    mean_albedo = albedo.mean(axis=1)
-    direct, _ = arriving(ready.reception, sky, np.zeros((len(albedo), 3), np.float32))
-    sent = direct * mean_albedo
+    sunlit = np.zeros((len(albedo), 3), np.float32)
     for body in luminaries(illumination):
-        cosine = cosine_seen(ready.rays, body)
-        sent += (cosine[..., None] * albedo).mean(axis=1) * (np.asarray(body.normal_illuminance_lx, np.float32) / np.pi)
-    total = sent
+        cosine = cosine_seen(ready.rays, body)[..., None]
+        sunlit += (cosine * albedo).mean(axis=1) * (np.asarray(body.normal_illuminance_lx, np.float32) / np.pi)
+    mean_albedo = [mi.Float(np.ascontiguousarray(column)) for column in albedo.mean(axis=1).T]
+    first = [mi.Float(np.ascontiguousarray(column)) for column in sunlit.T]
+    first = [
+        sun + shade * sky_
+        for sun, shade, sky_ in zip(first, mean_albedo, mi_direct(ready.reception, mi_sky), strict=True)
+    ]
+    mi_sent = _mi_rows(first)
     for _ in range(senders.bounces - 1):
-        total = sent + mean_albedo * arriving(ready.reception, 0.0 * sky, total)[1]
-    return sky, total.astype(np.float32)
+        again = mi_bounced(ready.reception, mi_sent)
+        mi_sent = _mi_rows([sent + a * b for sent, a, b in zip(first, mean_albedo, again, strict=True)])
+    dr.eval(mi_sent)
+    return SenderLight(mi_sky, mi_sent)
+
+
+def _mi_rows(channels: list[Any]) -> Any:
+    """Four floats a row, which one aligned load fetches."""
+    import drjit as dr
+    import mitsuba as mi
+
+    rows = dr.ravel(mi.Vector4f(*channels, 0.0))
+    dr.eval(rows)
+    return rows

@@ -11,7 +11,6 @@ from seasonscapes.cameras.pinhole import ray_directions
 from seasonscapes.rendering.gather import Occluder
 from seasonscapes.rendering.gbuffer import GBuffer, trace_gbuffer
 from seasonscapes.rendering.radiance import View
-from seasonscapes.rendering.scene import RenderScene, background
 from seasonscapes.rendering.reception import (
     ReadyReception,
     ReadySenders,
@@ -21,6 +20,7 @@ from seasonscapes.rendering.reception import (
     ready_reception,
     ready_senders,
 )
+from seasonscapes.rendering.scene import RenderScene, background
 from seasonscapes.rendering.sun_visibility import SunRays, first_place_sees, incidence, sun_rays
 from seasonscapes.rendering.transport import ViewCoefficients, view_neighbours
 from seasonscapes.sky.illumination import AerialPerspective, Illumination, Luminary
@@ -80,7 +80,9 @@ def ready_view(terrain: Occluder, coefficients: ViewCoefficients) -> ReadyView:
     centre_is_sky = ~np.isfinite(gbuffer.depth.reshape(-1)[coefficients.pixel])
     index = np.flatnonzero((farthest > nearest * 1.1) | centre_is_sky)
     passes = [view_neighbours(coefficients, stride=stride, sharpness=64.0) for stride in _BOUNCE_STRIDES]
-    rays = sun_rays(terrain, origin, coefficients.sample_normal, coefficients.sample_outward, coefficients.sample_weight)
+    rays = sun_rays(
+        terrain, origin, coefficients.sample_normal, coefficients.sample_outward, coefficients.sample_weight
+    )
     return ReadyView(coefficients, rays, ready_reception(coefficients.reception, passes),
                      ready_senders(terrain, coefficients.senders), rough,
                      (index, np.where(shown, distance, np.inf)[index]), gbuffer,
@@ -102,7 +104,7 @@ def relight_view(ready: ReadyView, illumination: Illumination) -> View:
 
 def surface_radiance(ready: ReadyView, illumination: Illumination) -> np.ndarray:
     """Radiance ``(n, 3)`` [cd/m²] that leaves the terrain of each pixel that shows any, sky counting as black."""
-    direct, bounced = arriving(ready.reception, *light_senders(ready.senders, illumination))
+    direct, bounced = arriving(ready.reception, light_senders(ready.senders, illumination))
     total = direct + bounced
     for body in luminaries(illumination):
         light = np.asarray(body.normal_illuminance_lx, np.float32) / np.float32(np.pi)

@@ -19,9 +19,6 @@ from seasonscapes.rendering.gather import Occluder, Points, follow
 
 # Unit normals that scatter more than this inside a cluster are parted before positions are.
 _NORMAL_SPREAD = 0.25
-# Angular radius and scatter of normals up to which a group of clusters passes for one sender (as lightcuts do: Walter et
-# al. 2005, doi:10.1145/1073204.1073318).
-_NODE_ANGLE, _NODE_NORMAL_SPREAD = 0.2, 0.35
 # Places within each cluster where light is gathered.
 PLACES = 4
 
@@ -35,8 +32,7 @@ class Reception:
     direct
         ``(N, r)`` float16; irradiance / π from the sky = ``direct @ (from_sky.T @ patch radiances)``.
     sender
-        ``(N, K)`` uint16 nodes of the tree over the senders (see `node_radiance`) that the receiver's rays met, each
-        with the same share of them: near surfaces by themselves, far ones in groups.
+        ``(N, K)`` uint16 senders that the receiver's rays met, each with the same share of them.
     share
         ``(N,)`` float16 share of the receiver's cosine-weighted hemisphere that is terrain.
     """
@@ -87,7 +83,7 @@ def pilot_hits(terrain: Occluder, points: Points, depth: int, seed: int) -> tupl
 
 
 def cluster_faces(hits: Points, weight: np.ndarray, faces: tuple[np.ndarray, np.ndarray], count: int, *,
-                  seed: int) -> tuple[Points, np.ndarray, np.ndarray]:  # fmt: skip
+                  seed: int) -> tuple[Points, np.ndarray]:  # fmt: skip
     """Divide space (position and normal) by medians of hits until ``count`` cells, a power of two, are left.
 
     Parameters
@@ -103,8 +99,6 @@ def cluster_faces(hits: Points, weight: np.ndarray, faces: tuple[np.ndarray, np.
         ``(M, PLACES, ...)`` of the hits, chosen in proportion to their weight.
     label
         ``(F,)`` uint32 cell of every face.
-    reach_m
-        ``(levels, M)`` float32: a ray at least this long may take the cell's ancestor 1, 2, … levels up for the cell.
     """
     # Cells need a few hits each, else they could not be represented.
     levels = max(0, int(np.log2(max(min(count, len(weight) / PLACES), 1))))
@@ -125,40 +119,7 @@ def cluster_faces(hits: Points, weight: np.ndarray, faces: tuple[np.ndarray, np.
         bounds = cut
     rng = np.random.default_rng(seed)
     chosen = [_systematic(weight[order[a:b]], PLACES, rng.random()) + a for a, b in itertools.pairwise(bounds)]
-    reach_m = _reach(key[order], np.array(bounds))
-    return hits[order[np.concatenate(chosen)]].reshape(len(chosen), PLACES), label, reach_m
-
-
-def _reach(key: np.ndarray, bounds: np.ndarray) -> np.ndarray:
-    """From how far each cell's ancestors look small, ``(levels, M)`` [m]; ``key`` are hits in the order of the cells."""
-    count = len(bounds) - 1
-    sums = np.add.reduceat(np.concatenate([key, key**2], axis=1, dtype=np.float64), bounds[:-1], axis=0)
-    number = np.diff(bounds).astype(float)
-    reach = []
-    for level in range(1, count.bit_length()):
-        sums, number = sums[0::2] + sums[1::2], number[0::2] + number[1::2]
-        mean, square = np.split(sums / number[:, None], 2, axis=1)
-        variance = np.maximum(square - mean**2, 0.0)
-        # Twice the deviation is the radius of a disc that is evenly filled.
-        radius = 2.0 * np.sqrt(variance[:, :3].sum(axis=1))
-        turned = np.sqrt(variance[:, 3:].sum(axis=1)) > _NODE_NORMAL_SPREAD
-        reach.append(np.repeat(np.where(turned, np.inf, radius / _NODE_ANGLE), 1 << level))
-    # An ancestor is only as good as those between it and the cell.
-    return np.maximum.accumulate(np.array(reach).reshape(-1, count), axis=0).astype(np.float32)
-
-
-def node_radiance(sent: np.ndarray) -> np.ndarray:
-    """Radiance ``(2 M, 3)`` of all nodes of the tree over M senders: node k has children 2 k and 2 k + 1, the root is 1.
-
-    Cells have about equal importance, so a node is the mean of its children.
-    """
-    count = len(sent)
-    nodes = np.zeros((2 * count, 3), np.float32)
-    nodes[count:] = sent
-    while count > 1:
-        count //= 2
-        nodes[count : 2 * count] = 0.5 * (nodes[2 * count : 4 * count : 2] + nodes[2 * count + 1 : 4 * count : 2])
-    return nodes
+    return hits[order[np.concatenate(chosen)]].reshape(len(chosen), PLACES), label
 
 
 def _split(key: np.ndarray, weight: np.ndarray, rows: np.ndarray) -> tuple[int, float, int]:

@@ -88,7 +88,10 @@ def mi_smoothed(channels: list[Any], mi_around: tuple[list[Any], list[Any]]) -> 
     result = [channel * mi.Float(weight[0]) for channel in channels]
     for k, other in enumerate(index):
         share = mi.Float(weight[k + 1])
-        result = [dr.fma(share, dr.gather(mi.Float, channel, other), sum_) for channel, sum_ in zip(channels, result, strict=True)]
+        result = [
+            dr.fma(share, dr.gather(mi.Float, channel, other), sum_)
+            for channel, sum_ in zip(channels, result, strict=True)
+        ]
     return result
 
 

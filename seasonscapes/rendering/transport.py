@@ -19,8 +19,7 @@ import numpy as np
 
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.rendering.direction_basis import DirectionBasis, direction_basis
-from seasonscapes.rendering.gather import LANES, OPEN, FaceLabels, Occluder, Points, face_labels, front_side, gather, surface_points, unit_square
-from seasonscapes.rendering.gbuffer import mi_rays
+from seasonscapes.rendering.gather import OPEN, Occluder, Points, gather
 from seasonscapes.rendering.senders import (
     PLACES,
     Reception,
@@ -32,7 +31,7 @@ from seasonscapes.rendering.senders import (
 )
 from seasonscapes.rendering.sky_patches import sky_patches
 from seasonscapes.rendering.smoothing import Neighbours, neighbours, smoothed
-from seasonscapes.sky.illumination import LUMINANCE_WEIGHTS
+from seasonscapes.rendering.view_samples import camera_points, pixel_moments, sample_weights, view_samples
 
 # Receivers' rays in work at a time: their labels and weights take about 20 bytes each.
 BLOCK_RAYS = 1 << 23
@@ -59,7 +58,7 @@ class Effort:
     bounces
         Surfaces between receiver and light: 4 equals ``max_depth=6`` of the path tracer.
     senders
-        M, parts of the terrain that pass light on, a power of two up to 32,768.
+        M, parts of the terrain that pass light on, a power of two up to 65,536.
     listed
         K, senders kept for each receiver, even.
     rank
@@ -70,10 +69,10 @@ class Effort:
 
     subpixels: int = 16
     shades: int = 64
-    rays: int = 256
+    rays: int = 512
     bounces: int = 4
-    senders: int = 32768
-    listed: int = 48
+    senders: int = 16384
+    listed: int = 64
     rank: int = 32
     patches: str = "reinhart"
 
@@ -82,8 +81,8 @@ class Effort:
             raise ValueError("Effort: subpixels must be a square, rays a power of two, bounces not negative")
         if self.rays % self.subpixels:
             raise ValueError(f"Effort: {self.rays} rays cannot be shared evenly among {self.subpixels} subpixels")
-        if self.listed % 2 or not 0 < self.senders <= 32768:
-            raise ValueError("Effort: listed must be even and senders at most 32768")
+        if self.listed % 2 or not 0 < self.senders <= 65536:
+            raise ValueError("Effort: listed must be even and senders at most 65536")
 
 
 @dataclass(frozen=True)
@@ -150,7 +149,7 @@ class PointCoefficients:
 class Preparation:
     """What all receivers of a terrain share while they are traced."""
 
-    labels: FaceLabels
+    mi_label: Any
     basis: DirectionBasis
     senders: Senders
 
@@ -173,7 +172,7 @@ def trace_view(terrain: Occluder, camera: Camera, effort: Effort | None = None, 
     """
     effort = effort or Effort()
     tell = progress or (lambda share: None)
-    pilot, hit = _camera_points(terrain, camera, (0, camera.height_px), 1, seed)
+    pilot, hit = camera_points(terrain, camera, (0, camera.height_px), 1, seed)
     if not hit.any():
         raise ValueError("the camera sees no terrain")
     prepared = prepare(terrain, pilot[hit], effort, seed=seed)
@@ -229,24 +228,26 @@ def trace_points(terrain: Occluder, points: Points, effort: Effort | None = None
 
 def prepare(terrain: Occluder, pilot: Points, effort: Effort, *, seed: int = 0) -> Preparation:
     """The basis of directions and the senders for receivers that are like ``pilot``, a sample of them."""
+    import mitsuba as mi
+
     patches = sky_patches(effort.patches)
     faces = face_geometry(terrain.mi_terrain)
     choice = np.random.default_rng(seed).permutation(len(pilot.origin))
     pilot = pilot[np.resize(choice, _PILOTS)]
-    none = face_labels(np.zeros(len(faces[0]), np.uint32), np.zeros((0, 1), np.float32))
+    none = mi.UInt32(np.zeros(len(faces[0]), np.uint32))
     few = pilot[:_EXAMPLES]
     patch, met = gather(terrain, patches, few, rays=_EXAMPLE_RAYS, first=np.zeros(_EXAMPLES, np.uint32),
-                        scramble=np.arange(_EXAMPLES, dtype=np.uint32), labels=none)  # fmt: skip
+                        scramble=np.arange(_EXAMPLES, dtype=np.uint32), mi_label=none)  # fmt: skip
     rows = patch_sums(patch, np.where(met == OPEN, np.float32(1.0 / _EXAMPLE_RAYS), 0.0), np.eye(patches.size))
     basis = direction_basis(rows, patches, effort.rank)
     hits, weight = pilot_hits(terrain, pilot, max(effort.bounces, 1), seed)
     if effort.bounces == 0 or len(weight) == 0:
         nothing = Senders(few[:1].reshape(1, 1), _nothing(basis, effort), basis.from_sky, effort.patches, 0)
         return Preparation(none, basis, nothing)
-    points, label, reach_m = cluster_faces(hits, weight, faces, effort.senders, seed=seed)
+    points, label = cluster_faces(hits, weight, faces, effort.senders, seed=seed)
     size = len(points.origin)
     senders = Senders(points, _nothing(basis, effort), basis.from_sky, effort.patches, effort.bounces)
-    prepared = Preparation(face_labels(label, reach_m), basis, senders)
+    prepared = Preparation(mi.UInt32(label), basis, senders)
     step = max(1, BLOCK_RAYS // effort.rays)
     even = np.full((size, PLACES), 1.0 / PLACES, np.float32)
     parts = [
@@ -271,103 +272,18 @@ def _view_rows(terrain: Occluder, prepared: Preparation, camera: Camera, rows: t
         return []
     weight = sample_weights(points.albedo, hit)
     shown = pixel - rows[0] * camera.width_px
-    albedo, normal, coverage = _moments(terrain, camera, rows, effort.shades, seed)
+    albedo, normal, coverage = pixel_moments(terrain, camera, rows, effort.shades, seed)
     received = _receive(terrain, prepared, points, (weight, pixel.astype(np.uint32)), effort, seed)
     return [(pixel, coverage[shown], albedo[shown], normal[shown], points.origin, points.normal.astype(np.float16),
              points.outward.astype(np.float16), weight.astype(np.float16), *received)]  # fmt: skip
 
 
-def view_samples(terrain: Occluder, camera: Camera, rows: tuple[int, int], count: int,
-                 seed: int) -> tuple[Points, np.ndarray, np.ndarray]:  # fmt: skip
-    """Surfaces ``(n, S)`` under the samples of a block of rows, which are terrain ``(n, S)``, and the pixels ``(n,)``.
-
-    Only pixels that show terrain. Terrain comes first among the samples of a pixel; sky is black and repeats the place
-    of the first.
-    """
-    flat, hit = _camera_points(terrain, camera, rows, count, seed)
-    hit = hit.reshape(-1, count)
-    shown = hit.any(axis=1)
-    pixel = (np.flatnonzero(shown) + rows[0] * camera.width_px).astype(np.int32)
-    hit = hit[shown]
-    # The first one stands for the pixel where a single ray must do: any of them, by lot.
-    lot = np.random.default_rng((seed, rows[0])).random(hit.shape, np.float32)
-    order = np.argsort(np.where(hit, lot, 2.0), axis=1)
-    hit = np.take_along_axis(hit, order, axis=1)
-    columns = {}
-    for name in Points.__dataclass_fields__:
-        values = getattr(flat, name).reshape(*shown.shape, count, -1)[shown]
-        values = np.take_along_axis(values, order[..., None], axis=1)
-        columns[name] = np.where(hit[..., None], values, 0.0 if name == "albedo" else values[:, :1])
-    return Points(**columns), hit, pixel
-
-
-def sample_weights(albedo: np.ndarray, hit: np.ndarray) -> np.ndarray:
-    """Each sample's share of its pixel's albedo ``(n, S)``, by luminance; equal shares where all are black."""
-    shade = albedo @ LUMINANCE_WEIGHTS.astype(np.float32)
-    shade = np.where((shade.sum(axis=1) > 0.0)[:, None], shade, hit)
-    return (shade / shade.sum(axis=1, keepdims=True)).astype(np.float32)
-
-
-def _camera_points(terrain: Occluder, camera: Camera, rows: tuple[int, int], count: int,
-                   seed: int) -> tuple[Points, np.ndarray]:  # fmt: skip
-    """Surfaces under stratified samples of rows of pixels, samples of a pixel side by side, and which met terrain."""
-    interaction, _ = _mi_camera_rays(terrain, camera, rows, count, seed)
-    valid = interaction.is_valid()
-    return surface_points(interaction, valid), np.array(valid)
-
-
-def _mi_camera_rays(terrain: Occluder, camera: Camera, rows: tuple[int, int], count: int, seed: int) -> tuple[Any, int]:
-    """What stratified rays through a block of rows meet, ``count`` to a pixel side by side, and the number of pixels."""
-    import drjit as dr
-    import mitsuba as mi
-
-    top, height = rows
-    pixels = camera.width_px * height
-    lane = dr.arange(mi.UInt32, pixels * count)
-    per_pixel, side = dr.opaque(mi.UInt32, count), dr.opaque(mi.UInt32, round(count**0.5))
-    width, first = dr.opaque(mi.UInt32, camera.width_px), dr.opaque(mi.UInt32, top)
-    index, sample = lane // per_pixel, lane % per_pixel
-    row, column = index // width, index % width
-    key = lane + first * width * per_pixel
-    jitter = unit_square(*mi.sample_tea_32(key, dr.opaque(mi.UInt32, seed)))
-    x = mi.Float(column) + (mi.Float(sample % side) + jitter.x) / mi.Float(side)
-    y = mi.Float(row + first) + (mi.Float(sample // side) + jitter.y) / mi.Float(side)
-    return terrain.mi_scene.ray_intersect(mi_rays(camera, x, y)), pixels
-
-
-def _moments(terrain: Occluder, camera: Camera, rows: tuple[int, int], count: int,
-             seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """Mean albedo ``(N, 3)``, mean normal weighted by luminous albedo ``(N, 3)`` and coverage ``(N,)`` of all pixels.
-
-    Nothing but these sums leaves the device, so that many samples may be taken.
-    """
-    import drjit as dr
-    import mitsuba as mi
-
-    step = max(1, LANES // (camera.width_px * count))
-    parts = []
-    for top in range(rows[0], rows[0] + rows[1], step):
-        block = (top, min(step, rows[0] + rows[1] - top))
-        interaction, pixels = _mi_camera_rays(terrain, camera, block, count, seed)
-        valid = interaction.is_valid()
-        front = front_side(interaction, valid)
-        albedo = interaction.bsdf().eval_diffuse_reflectance(interaction, front)
-        albedo = dr.select(front, albedo, mi.Color3f(0.0))
-        # A little of every terrain sample's normal, so that black pixels have one too.
-        shade = dr.dot(albedo, mi.Color3f(*LUMINANCE_WEIGHTS.tolist())) + dr.select(valid, mi.Float(1e-6), 0.0)
-        lanes = [*albedo, *(shade * interaction.sh_frame.n), shade, dr.select(valid, mi.Float(1.0), 0.0)]
-        sums = [dr.block_sum(values, count) for values in lanes]
-        dr.eval(sums)
-        parts.append(np.stack([np.array(values) for values in sums], axis=-1))
-    total = np.concatenate(parts)
-    normal = total[:, 3:6] / np.maximum(total[:, 6:7], 1e-20)
-    return total[:, :3] / count, normal, total[:, 7] / count
-
-
 def view_albedo(terrain: Occluder, coefficients: ViewCoefficients) -> np.ndarray:
     """Mean albedo ``(n, 3)`` of the pixels for the albedo that the terrain has now (another season's)."""
     camera, effort = coefficients.camera, coefficients.effort
-    return _moments(terrain, camera, (0, camera.height_px), effort.shades, coefficients.seed)[0][coefficients.pixel]
+    return pixel_moments(terrain, camera, (0, camera.height_px), effort.shades, coefficients.seed)[0][
+        coefficients.pixel
+    ]
 
 
 def _receive(terrain: Occluder, prepared: Preparation, points: Points, shares: tuple[np.ndarray, np.ndarray],
@@ -383,7 +299,7 @@ def _receive(terrain: Occluder, prepared: Preparation, points: Points, shares: t
     first = np.tile(np.arange(places, dtype=np.uint32) * np.uint32(each), count)
     scramble = np.repeat(identity + np.uint32((seed * 747796405 + 1) % 2**32), places)
     patch, met = gather(terrain, sky_patches(effort.patches), points.reshape(-1), rays=each, first=first,
-                        scramble=scramble, labels=prepared.labels)  # fmt: skip
+                        scramble=scramble, mi_label=prepared.mi_label)  # fmt: skip
     patch, met = patch.reshape(count, -1), met.reshape(count, -1)
     ray_weight = np.repeat(weight / np.float32(each), each, axis=1)
     direct = patch_sums(patch, np.where(met == OPEN, ray_weight, 0.0), prepared.basis.into)
