@@ -16,62 +16,91 @@ from seasonscapes.cameras.pinhole import Camera, ray_directions
 from seasonscapes.rendering.scene import background
 from seasonscapes.sky.illumination import AerialPerspective, Illumination
 
-_AIR_STEP_PX, _SLICES = 16, 32
-_SKY_STEP_PX = 4
+# Nodes are this far apart in angle and in pixels at most.
+_AIR_STEP_DEG, _AIR_STEP_PX, _SLICES = 1.2, 16, 32
+_SKY_STEP_DEG, _SKY_STEP_PX = 0.3, 4
 # Around a luminary the sky is as sharp as the aerosol's forward peak.
 _AUREOLE_DEG = 4.0
 
 
 @dataclass(frozen=True)
-class AirGrid:
-    """Nodes of a camera's view where air is asked.
+class AirPlaces:
+    """Where a view's n pixels of terrain lie in a grid at whose nodes the air is asked.
 
     Parameters
     ----------
     direction
         ``(h, w, 3)`` of the nodes' pixels.
     depth_m
-        ``(_SLICES,)``, a geometric sequence.
+        ``(_SLICES,)`` distances of the nodes, a geometric sequence.
+    mi_place
+        ``mi.Point3f`` of n lanes in the grid's texture.
+    several, mi_several, share
+        ``(k,)`` pixels that show several distances; ``k S`` lanes of their samples; ``(k, S)`` weights of these.
     """
 
     direction: np.ndarray
     depth_m: np.ndarray
+    mi_place: Any
+    several: np.ndarray
+    mi_several: Any
+    share: np.ndarray
+
+
+def _step_px(camera: Camera, most_deg: float, most_px: int) -> int:
+    return int(np.clip(np.radians(most_deg) * max(camera.fx, camera.fy), 1, most_px))
 
 
 def _nodes(camera: Camera, step: int) -> np.ndarray:
-    """Directions at every ``step``-th pixel corner, the last ones at or past the rim."""
-    x = np.arange(0, camera.width_px + step, step, dtype=float)
-    y = np.arange(0, camera.height_px + step, step, dtype=float)
+    """Directions at the centre of every ``step``-th pixel, the last ones past the rim."""
+    x = 0.5 + np.arange(0, camera.width_px + step, step)
+    y = 0.5 + np.arange(0, camera.height_px + step, step)
     return ray_directions(camera, np.stack(np.meshgrid(x, y), axis=-1))
 
 
-def air_grid(camera: Camera, nearest_m: float, farthest_m: float) -> AirGrid:
-    """A grid for the distances that a view shows [m]."""
-    low = max(nearest_m, 1.0)
-    return AirGrid(_nodes(camera, _AIR_STEP_PX), np.geomspace(low, max(farthest_m, 1.01 * low), _SLICES))
+def air_places(camera: Camera, pixel: np.ndarray, depth_m: np.ndarray,
+               several: tuple[np.ndarray, np.ndarray]) -> AirPlaces:  # fmt: skip
+    """For flat indices ``(n,)`` of pixels and their distances ``(n,)`` [m].
+
+    ``several`` are the numbers ``(k,)`` among the n of pixels whose air is averaged over samples, and those samples'
+    distances ``(k, S)``, infinite where they show no terrain.
+    """
+    index, distance_m = several
+    shown = np.isfinite(distance_m)
+    low, high = max(float(depth_m.min()), 1.0), float(max(depth_m.max(), distance_m[shown].max(initial=0.0)))
+    step = _step_px(camera, _AIR_STEP_DEG, _AIR_STEP_PX)
+    nodes, depths = _nodes(camera, step), np.geomspace(low, max(high, 1.01 * low), _SLICES)
+
+    def place(flat: np.ndarray, distance: np.ndarray) -> Any:
+        import mitsuba as mi
+
+        row, column = np.divmod(flat, camera.width_px)
+        share = np.log(np.maximum(distance, low) / low) / np.log(depths[-1] / low)
+        columns = ((column / step + 0.5) / nodes.shape[1],
+                   (row / step + 0.5) / nodes.shape[0], (share * (_SLICES - 1) + 0.5) / _SLICES)  # fmt: skip
+        return mi.Point3f(*(mi.Float(np.ascontiguousarray(values, np.float32)) for values in columns))
+
+    samples = np.repeat(pixel[index], distance_m.shape[1])
+    return AirPlaces(nodes, depths, place(pixel, depth_m), index,
+                     place(samples, np.where(shown, distance_m, low).ravel()),
+                     shown / np.maximum(shown.sum(axis=1, keepdims=True), 1))  # fmt: skip
 
 
-def grid_places(grid: AirGrid, pixel_xy: np.ndarray, depth_m: np.ndarray) -> Any:
-    """``mi.Point3f`` of N pixel positions ``(N, 2)`` (x, y) and distances ``(N,)`` [m] in the grid's texture."""
-    import mitsuba as mi
-
-    height, width = grid.direction.shape[:2]
-    share = np.log(np.maximum(depth_m, grid.depth_m[0]) / grid.depth_m[0]) / np.log(grid.depth_m[-1] / grid.depth_m[0])
-    across, down = pixel_xy[:, 0] / _AIR_STEP_PX, pixel_xy[:, 1] / _AIR_STEP_PX
-    columns = ((across + 0.5) / width, (down + 0.5) / height, (share * (_SLICES - 1) + 0.5) / _SLICES)
-    return mi.Point3f(*(mi.Float(np.ascontiguousarray(column, np.float32)) for column in columns))
-
-
-def mi_air(grid: AirGrid, air: AerialPerspective) -> Any:
-    """Transmittance and airlight at the nodes as a texture of six channels."""
+def air_at(places: AirPlaces, air: AerialPerspective) -> tuple[np.ndarray, np.ndarray]:
+    """Transmittance and airlight ``(n, 3)`` of the pixels."""
     import drjit as dr
     import mitsuba as mi
 
-    shape = (_SLICES, *grid.direction.shape[:2])
-    depth = np.broadcast_to(grid.depth_m[:, None, None], shape)
-    parts = air(depth, np.broadcast_to(grid.direction, (*shape, 3)))
-    values = np.concatenate(np.broadcast_arrays(*parts), axis=-1).astype(np.float32)
-    return mi.Texture3f(mi.TensorXf(np.ascontiguousarray(values)), wrap_mode=dr.WrapMode.Clamp)
+    shape = (_SLICES, *places.direction.shape[:2])
+    depth = np.broadcast_to(places.depth_m[:, None, None], shape)
+    parts = air(depth, np.broadcast_to(places.direction, (*shape, 3)))
+    nodes = np.concatenate([np.broadcast_to(part, (*shape, 3)) for part in parts], axis=-1).astype(np.float32)
+    texture = mi.Texture3f(mi.TensorXf(np.ascontiguousarray(nodes)), wrap_mode=dr.WrapMode.Clamp)
+    values = np.array(texture.eval(places.mi_place)).T.copy()
+    if len(places.several):
+        samples = np.array(texture.eval(places.mi_several)).T.reshape(*places.share.shape, 6)
+        values[places.several] = np.einsum("ks,ksc->kc", places.share, samples)
+    return values[:, :3], values[:, 3:]
 
 
 @dataclass(frozen=True)
@@ -80,6 +109,8 @@ class SkyGrid:
 
     Parameters
     ----------
+    pixel
+        ``(K,)`` flat index of each.
     node
         ``(h, w, 3)`` directions of the nodes.
     used
@@ -90,6 +121,7 @@ class SkyGrid:
         ``(K, 3)`` of the pixels themselves.
     """
 
+    pixel: np.ndarray
     node: np.ndarray
     used: np.ndarray
     corner: np.ndarray
@@ -99,10 +131,11 @@ class SkyGrid:
 
 def sky_grid(camera: Camera, pixel: np.ndarray) -> SkyGrid:
     """For the flat indices ``(K,)`` of pixels that show any open sky."""
-    node = _nodes(camera, _SKY_STEP_PX)
+    step = _step_px(camera, _SKY_STEP_DEG, _SKY_STEP_PX)
+    node = _nodes(camera, step)
     width = node.shape[1]
     row, column = np.divmod(pixel, camera.width_px)
-    across, down = (column + 0.5) / _SKY_STEP_PX, (row + 0.5) / _SKY_STEP_PX
+    across, down = column / step, row / step
     left, top = across.astype(np.int32), down.astype(np.int32)
     fx, fy = (across - left).astype(np.float32), (down - top).astype(np.float32)
     first = top * width + left
@@ -111,7 +144,7 @@ def sky_grid(camera: Camera, pixel: np.ndarray) -> SkyGrid:
     used = np.zeros(node.shape[0] * width, bool)
     used[corner] = True
     direction = ray_directions(camera, np.stack([column + 0.5, row + 0.5], axis=-1))
-    return SkyGrid(node, used, corner, share, direction.astype(np.float32))
+    return SkyGrid(pixel, node, used, corner, share, direction.astype(np.float32))
 
 
 def open_sky(grid: SkyGrid, illumination: Illumination, pixel_angle_deg: float) -> np.ndarray:

@@ -12,6 +12,7 @@ import numpy as np
 
 from seasonscapes.rendering.backend import point3, use_backend
 from seasonscapes.rendering.sky_patches import SkyPatches, mi_patch_of
+from seasonscapes.rendering.sobol import hashed, sobol_pair, uniform
 
 # Rays in flight in one launch of the kernel.
 LANES = 1 << 22
@@ -19,6 +20,8 @@ LANES = 1 << 22
 RAY_EPSILON = float(np.finfo(np.float32).epsneg) * 1500.0
 # What a ray meets instead of a sender: nothing, or a surface that sends no light.
 OPEN, BLACK = -1, -2
+# Names of what random numbers are for, as words for their hashes.
+_HEMISPHERE, _WALK = 101, 102
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,12 @@ class Points:
         """The same points with leading axes ``shape``."""
         columns = (getattr(self, name) for name in self.__dataclass_fields__)
         return Points(*(values.reshape(*shape, values.shape[-1]) for values in columns))
+
+
+def joined(parts: list[Points]) -> Points:
+    """All points of several sets, one after the other."""
+    columns = ([getattr(part, name) for part in parts] for name in Points.__dataclass_fields__)
+    return Points(*(np.concatenate(column) for column in columns))
 
 
 def occluder(mi_terrain: Any) -> Occluder:
@@ -124,32 +133,6 @@ def dr_clamp() -> Any:
     return dr.WrapMode.Clamp
 
 
-def unit_square(u: Any, v: Any) -> Any:
-    """``mi.Point2f`` in [0, 1)² from lanes of 32 random bits."""
-    import drjit as dr
-    import mitsuba as mi
-
-    top = float(np.float32(1.0) - np.finfo(np.float32).epsneg)
-    return mi.Point2f(*(dr.minimum(mi.Float(bits) * float(2.0**-32), top) for bits in (u, v)))
-
-
-def scrambled_points(index: Any, scramble_u: Any, scramble_v: Any) -> Any:
-    """Points of the unit square: the first two dimensions of Sobol's sequence, digits scrambled by exclusive or.
-
-    Any aligned run of 2ᵏ of them is stratified in every way that k binary digits can be (Sobol 1967; Kollig & Keller
-    2002, "Efficient multidimensional sampling", doi:10.1111/1467-8659.00706).
-    """
-    import drjit as dr
-    import mitsuba as mi
-
-    second = mi.UInt32(0)
-    direction = 1 << 31
-    for bit in range(16):
-        second ^= dr.select((index & (1 << bit)) != 0, mi.UInt32(direction), mi.UInt32(0))
-        direction ^= direction >> 1
-    return unit_square(dr.brev(index) ^ scramble_u, second ^ scramble_v)
-
-
 def gather(terrain: Occluder, patches: SkyPatches, points: Points, *, rays: int, first: np.ndarray,
            scramble: np.ndarray, mi_label: Any) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Where cosine-distributed rays of N points go.
@@ -159,7 +142,8 @@ def gather(terrain: Occluder, patches: SkyPatches, points: Points, *, rays: int,
     points
         N of them.
     rays
-        K, rays from each point; a power of two keeps their stratification.
+        K, rays from each point. An aligned run of 2ᵏ points of a Sobol sequence is stratified in every way that k
+        binary digits can be.
     first
         ``(N,)`` uint32 number of each point's first ray in its sequence, a multiple of ``rays``.
     scramble
@@ -195,9 +179,9 @@ def _gather_block(terrain: Occluder, patches: SkyPatches, points: Points, rays: 
     lane = dr.arange(mi.UInt32, count * rays)
     point = lane // per_point
     number = lane - point * per_point + dr.gather(mi.UInt32, mi.UInt32(first), point)
-    scramble_u, scramble_v = mi.sample_tea_32(dr.gather(mi.UInt32, mi.UInt32(scramble), point), mi.UInt32(0x9E3779B9))
+    key = hashed(dr.gather(mi.UInt32, mi.UInt32(scramble), point), _HEMISPHERE)
     frame = mi.Frame3f(dr.gather(mi.Normal3f, mi.Normal3f(point3(points.normal)), point))
-    direction = frame.to_world(mi.warp.square_to_cosine_hemisphere(scrambled_points(number, scramble_u, scramble_v)))
+    direction = frame.to_world(mi.warp.square_to_cosine_hemisphere(sobol_pair(key, number)))
     # Interpolated normals let some rays point into the facet; a path tracer finds those black.
     outside = dr.dot(direction, dr.gather(mi.Normal3f, mi.Normal3f(point3(points.outward)), point)) > 0.0
     ray = mi.Ray3f(dr.gather(mi.Point3f, point3(points.origin), point), direction)
@@ -212,15 +196,24 @@ def _gather_block(terrain: Occluder, patches: SkyPatches, points: Points, rays: 
     return np.array(patch).reshape(count, rays), np.array(met).reshape(count, rays)
 
 
-def follow(terrain: Occluder, points: Points, seed: int) -> tuple[Points, np.ndarray]:
-    """One cosine-distributed ray from each of N points: the surfaces met, and which points' rays met one ``(N,)``."""
+def follow(terrain: Occluder, points: Points, seed: int) -> tuple[Points, np.ndarray, np.ndarray]:
+    """One cosine-distributed ray from each of N points.
+
+    Returns
+    -------
+    points, face
+        The K surfaces met, and their faces ``(K,)`` uint32.
+    met
+        ``(N,)`` bool: which rays met one.
+    """
     import drjit as dr
     import mitsuba as mi
 
-    square = unit_square(*mi.sample_tea_32(dr.arange(mi.UInt32, len(points.origin)), dr.opaque(mi.UInt32, seed)))
+    key = hashed(hashed(dr.arange(mi.UInt32, len(points.origin)), dr.opaque(mi.UInt32, seed)), _WALK)
+    square = mi.Point2f(uniform(hashed(key, 0)), uniform(hashed(key, 1)))
     direction = mi.Frame3f(mi.Normal3f(point3(points.normal))).to_world(mi.warp.square_to_cosine_hemisphere(square))
     outside = dr.dot(direction, mi.Normal3f(point3(points.outward))) > 0.0
     interaction = terrain.mi_scene.ray_intersect(mi.Ray3f(point3(points.origin), direction), active=outside)
     valid = interaction.is_valid() & (dr.dot(interaction.n, direction) < 0.0)
     met = np.array(valid)
-    return surface_points(interaction, valid)[met], met
+    return surface_points(interaction, valid)[met], np.array(interaction.prim_index)[met], met

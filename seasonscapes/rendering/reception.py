@@ -11,7 +11,7 @@ from seasonscapes.rendering.gather import Occluder
 from seasonscapes.rendering.senders import Reception, Senders
 from seasonscapes.rendering.sky_patches import patch_radiance, sky_patches
 from seasonscapes.rendering.smoothing import Neighbours, mi_neighbours, mi_smoothed
-from seasonscapes.rendering.sun_visibility import SunRays, cosine_seen, sun_rays
+from seasonscapes.rendering.sun_visibility import SunRays, cosine_seen, numbered_turn, sun_rays
 from seasonscapes.sky.illumination import Illumination, Luminary, luminance
 
 # A moon (or a setting sun) that is this much fainter than the rest of the light casts no shadow that could be seen.
@@ -67,7 +67,9 @@ def ready_reception(reception: Reception, smoothing: list[Neighbours] | None = N
 def ready_senders(terrain: Occluder, senders: Senders) -> ReadySenders:
     """Senders ready for any light."""
     points = senders.points
-    rays = sun_rays(terrain, points.origin, points.normal, points.outward, np.ones(points.origin.shape[:2]))
+    shape = points.origin.shape[:2]
+    rays = sun_rays(terrain, (points.origin, points.normal, points.outward), np.ones(shape),
+                    numbered_turn(np.arange(shape[0])))  # fmt: skip
     return ReadySenders(senders, ready_reception(senders.reception), rays)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from seasonscapes.cameras.pinhole import ray_directions
+from seasonscapes.rendering.air_grid import AirPlaces, SkyGrid, air_at, air_places, open_sky, sky_grid
 from seasonscapes.rendering.gather import Occluder
 from seasonscapes.rendering.gbuffer import GBuffer, trace_gbuffer
 from seasonscapes.rendering.radiance import View
@@ -20,17 +20,21 @@ from seasonscapes.rendering.reception import (
     ready_reception,
     ready_senders,
 )
-from seasonscapes.rendering.scene import RenderScene, background
-from seasonscapes.rendering.sun_visibility import SunRays, first_place_sees, incidence, sun_rays
+from seasonscapes.rendering.scene import RenderScene
+from seasonscapes.rendering.sun_visibility import SunRays, first_place_sees, incidence, pixel_turn, sun_rays
 from seasonscapes.rendering.transport import ViewCoefficients, view_neighbours
-from seasonscapes.sky.illumination import AerialPerspective, Illumination, Luminary
+from seasonscapes.sky.illumination import Illumination, Luminary
 
 # A pixel is rough where distances within it differ by more than this ratio: more than one surface shows in it.
 _DEPTH_RATIO = 1.05
+# ... and by more than this one its air is averaged over its samples.
+_AIR_RATIO = 1.1
 # Cosines of incidence below which samples of a pixel may face either way.
 _GRAZING = 0.05
 # Interreflected light is smooth: its noise is spread over neighbouring pixels of one surface.
-_BOUNCE_STRIDES = (1,)
+_BOUNCE_STRIDES, _BOUNCE_SHARPNESS = (1,), 64.0
+# Pixels in work at a time where temporaries are wide.
+_BLOCK = 1 << 17
 
 
 @dataclass(frozen=True)
@@ -47,12 +51,14 @@ class ReadyView:
         On the device.
     rough
         ``(n,)`` bool: pixels with silhouettes inside.
-    silhouette
-        ``(k,)`` indices of those among the n whose air is averaged, and their samples' distances ``(k, S)`` [m].
     gbuffer
         First surfaces at pixel centres.
-    direction
-        ``(H W, 3)`` unit viewing directions.
+    coverage
+        ``(H, W)`` share of each pixel that is terrain.
+    air
+        Distances at which the air is asked.
+    sky
+        Directions in which the open sky is asked.
     """
 
     coefficients: ViewCoefficients
@@ -60,46 +66,55 @@ class ReadyView:
     reception: ReadyReception
     senders: ReadySenders
     rough: np.ndarray
-    silhouette: tuple[np.ndarray, np.ndarray]
     gbuffer: GBuffer
-    direction: np.ndarray
+    coverage: np.ndarray
+    air: AirPlaces
+    sky: SkyGrid
 
 
 def ready_view(terrain: Occluder, coefficients: ViewCoefficients) -> ReadyView:
     """Load coefficients (perhaps memory-mapped) into the form that `relight_view` uses. Done once for many lights."""
-    camera = coefficients.camera
-    origin = np.asarray(coefficients.sample_origin)
-    shown = np.asarray(coefficients.sample_weight) > 0.0
-    distance = np.linalg.norm(origin - camera.position_m.astype(np.float32), axis=2)
-    nearest = np.where(shown, distance, np.inf).min(axis=1)
-    farthest = np.where(shown, distance, 0.0).max(axis=1)
-    rough = (farthest > nearest * _DEPTH_RATIO) | (np.asarray(coefficients.coverage) < 1.0)
+    camera, pixel = coefficients.camera, coefficients.pixel
+    nearest, farthest, distance = _distances(coefficients)
+    coverage = np.zeros((camera.height_px, camera.width_px), np.float32)
+    coverage.reshape(-1)[pixel] = coefficients.coverage
+    rough = (farthest > nearest * _DEPTH_RATIO) | (coefficients.coverage < 1.0)
     # The bare terrain serves as the scene of a G-buffer: that looks at geometry alone.
     scene = RenderScene(terrain.mi_scene, terrain.mi_terrain, None, 0.0)  # type: ignore[arg-type]
     gbuffer = trace_gbuffer(scene, camera)
-    centre_is_sky = ~np.isfinite(gbuffer.depth.reshape(-1)[coefficients.pixel])
-    index = np.flatnonzero((farthest > nearest * 1.1) | centre_is_sky)
-    passes = [view_neighbours(coefficients, stride=stride, sharpness=64.0) for stride in _BOUNCE_STRIDES]
+    centre_m = gbuffer.depth.reshape(-1)[pixel]
+    several = np.flatnonzero((farthest > nearest * _AIR_RATIO) | ~np.isfinite(centre_m))
+    air = air_places(camera, pixel, np.where(np.isfinite(centre_m), centre_m, nearest), (several, distance[several]))
+    passes = [view_neighbours(coefficients, stride=stride, sharpness=_BOUNCE_SHARPNESS) for stride in _BOUNCE_STRIDES]
+    places = (coefficients.sample_origin, coefficients.sample_normal, coefficients.sample_outward)
     rays = sun_rays(
-        terrain, origin, coefficients.sample_normal, coefficients.sample_outward, coefficients.sample_weight
+        terrain, places, coefficients.sample_weight, pixel_turn(pixel, camera.width_px, coefficients.effort.subpixels)
     )
     return ReadyView(coefficients, rays, ready_reception(coefficients.reception, passes),
-                     ready_senders(terrain, coefficients.senders), rough,
-                     (index, np.where(shown, distance, np.inf)[index]), gbuffer,
-                     ray_directions(camera).reshape(-1, 3))  # fmt: skip
+                     ready_senders(terrain, coefficients.senders), rough, gbuffer, coverage, air,
+                     sky_grid(camera, np.flatnonzero(coverage.reshape(-1) < 1.0)))  # fmt: skip
+
+
+def _distances(coefficients: ViewCoefficients) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Nearest and farthest terrain in each pixel ``(n,)``, and of each sample ``(n, S)``, infinite in the sky [m]."""
+    position = coefficients.camera.position_m.astype(np.float32)
+    shown = np.asarray(coefficients.sample_weight) > 0.0
+    distance = np.empty(shown.shape, np.float32)
+    for start in range(0, len(shown), _BLOCK):
+        part = slice(start, start + _BLOCK)
+        distance[part] = np.linalg.norm(coefficients.sample_origin[part] - position, axis=2)
+    farthest = np.where(shown, distance, 0.0).max(axis=1)
+    distance[~shown] = np.inf
+    return distance.min(axis=1), farthest, distance
 
 
 def relight_view(ready: ReadyView, illumination: Illumination) -> View:
     """The view under a light; equals `radiance.render_view` in expectation, with the same number of bounces."""
     coefficients = ready.coefficients
-    camera = coefficients.camera
-    shape = (camera.height_px, camera.width_px)
-    surface_of_shown = surface_radiance(ready, illumination)
-    coverage, surface = np.zeros(shape, np.float32), np.zeros((*shape, 3), np.float32)
-    coverage.reshape(-1)[coefficients.pixel] = coefficients.coverage
-    surface.reshape(-1, 3)[coefficients.pixel] = surface_of_shown
-    radiance = _through_air(ready, illumination, surface_of_shown, coverage)
-    return View(radiance, surface, coverage, ready.gbuffer)
+    shown = surface_radiance(ready, illumination)
+    surface = np.zeros((*ready.coverage.shape, 3), np.float32)
+    surface.reshape(-1, 3)[coefficients.pixel] = shown
+    return View(_through_air(ready, illumination, shown), surface, ready.coverage, ready.gbuffer)
 
 
 def surface_radiance(ready: ReadyView, illumination: Illumination) -> np.ndarray:
@@ -140,36 +155,15 @@ def _disagree(ready: ReadyView, seen: np.ndarray) -> np.ndarray:
     return (brightest != darkest).reshape(-1)[pixel]
 
 
-def _through_air(ready: ReadyView, illumination: Illumination, surface: np.ndarray, coverage: np.ndarray) -> np.ndarray:
+def _through_air(ready: ReadyView, illumination: Illumination, surface: np.ndarray) -> np.ndarray:
     """Radiance ``(H, W, 3)`` at the camera; see `radiance.through_air`, whose distances are at hand here."""
     camera, pixel = ready.coefficients.camera, ready.coefficients.pixel
-    share = coverage.reshape(-1)
-    image = np.zeros((len(share), 3), np.float32)
-    terrain = surface
     if illumination.aerial_perspective is not None:
-        transmittance, airlight = _air(ready, illumination.aerial_perspective)
-        terrain = surface * transmittance + airlight * ready.coefficients.coverage[:, None]
-    image[pixel] = terrain
-    open_sky = np.flatnonzero(share < 1.0)
-    if open_sky.size:
-        pixel_angle_deg = float(np.degrees(1.0 / camera.fx))
-        sky = background(illumination, ready.direction[open_sky], pixel_angle_deg)
-        image[open_sky] += (1.0 - share[open_sky])[:, None] * sky
-    return image.reshape(*coverage.shape, 3)
-
-
-def _air(ready: ReadyView, air: AerialPerspective) -> tuple[np.ndarray, np.ndarray]:
-    """Transmittance and airlight ``(n, 3)``: of the centre's distance, averaged over samples along silhouettes."""
-    pixel = ready.coefficients.pixel
-    depth = ready.gbuffer.depth.reshape(-1)[pixel]
-    transmittance, airlight = air(np.where(np.isfinite(depth), depth, 0.0), ready.direction[pixel])
-    transmittance, airlight = np.array(transmittance, np.float32), np.array(airlight, np.float32)
-    index, distance = ready.silhouette
-    if index.size:
-        shown = np.isfinite(distance)
-        along = np.broadcast_to(ready.direction[pixel[index]][:, None], (*distance.shape, 3))
-        each = air(np.where(shown, distance, 0.0), along)
-        weight = shown / shown.sum(axis=1, keepdims=True)
-        for values, samples in zip((transmittance, airlight), each, strict=True):
-            values[index] = np.einsum("ks,ksc->kc", weight, samples)
-    return transmittance, airlight
+        transmittance, airlight = air_at(ready.air, illumination.aerial_perspective)
+        surface = surface * transmittance + airlight * ready.coefficients.coverage[:, None]
+    image = np.zeros((camera.height_px * camera.width_px, 3), np.float32)
+    image[pixel] = surface
+    if len(ready.sky.pixel):
+        sky = open_sky(ready.sky, illumination, float(np.degrees(1.0 / camera.fx)))
+        image[ready.sky.pixel] += (1.0 - ready.coverage.reshape(-1)[ready.sky.pixel])[:, None] * sky
+    return image.reshape(*ready.coverage.shape, 3)

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from seasonscapes.rendering.gather import Occluder, Points, follow
+from seasonscapes.rendering.gather import Occluder, Points, follow, joined
 
 # Unit normals that scatter more than this inside a cluster are parted before positions are.
 _NORMAL_SPREAD = 0.25
@@ -67,46 +67,47 @@ class Senders:
     bounces: int
 
 
-def pilot_hits(terrain: Occluder, points: Points, depth: int, seed: int) -> tuple[Points, np.ndarray]:
-    """Surfaces that random walks from points meet within ``depth`` bounces, and each one's throughput ``(K,)``."""
-    found, weights = [], []
+def pilot_hits(terrain: Occluder, points: Points, depth: int, seed: int) -> tuple[Points, np.ndarray, np.ndarray]:
+    """Surfaces that random walks from points meet within ``depth`` bounces, their faces and throughputs ``(K,)``."""
+    found, faces, weights = [points[:0]], [np.empty(0, np.uint32)], [np.empty(0, np.float32)]
     weight = np.ones(len(points.origin), np.float32)
     for bounce in range(depth):
-        points, met = follow(terrain, points, seed + bounce)
-        if len(points.origin) == 0:
+        points, face, met = follow(terrain, points, seed + bounce)
+        if len(face) == 0:
             break
         found.append(points)
+        faces.append(face)
         weights.append(weight[met])
         weight = weight[met] * points.albedo.mean(axis=1)
-    columns = [np.concatenate([getattr(part, name) for part in found]) for name in Points.__dataclass_fields__]
-    return Points(*columns), np.concatenate(weights)
+    return joined(found), np.concatenate(faces), np.concatenate(weights)
 
 
-def cluster_faces(hits: Points, weight: np.ndarray, faces: tuple[np.ndarray, np.ndarray], count: int, *,
+def cluster_faces(hits: tuple[Points, np.ndarray, np.ndarray], faces: tuple[np.ndarray, np.ndarray], count: int, *,
                   seed: int) -> tuple[Points, np.ndarray]:  # fmt: skip
-    """Divide space (position and normal) by medians of hits until ``count`` cells, a power of two, are left.
+    """Divide faces by position and normal, by medians of hits, into ``count`` groups, a power of two.
 
     Parameters
     ----------
-    hits, weight
-        What `pilot_hits` found.
+    hits
+        What `pilot_hits` found: surfaces, faces and throughputs.
     faces
         Centroids and unit normals of all faces, ``(F, 3)`` each.
 
     Returns
     -------
     points
-        ``(M, PLACES, ...)`` of the hits, chosen in proportion to their weight.
+        ``(M, PLACES, ...)`` of the hits on each group, chosen in proportion to their throughput. Groups that no hit
+        fell on repeat a neighbour's.
     label
-        ``(F,)`` uint32 cell of every face.
+        ``(F,)`` uint32 group of every face.
     """
-    # Cells need a few hits each, else they could not be represented.
-    levels = max(0, int(np.log2(max(min(count, len(weight) / PLACES), 1))))
-    key = np.concatenate([hits.origin, hits.outward], axis=1)
+    points, face, weight = hits
     face_key = np.concatenate(faces, axis=1)
-    order, bounds = np.arange(len(weight)), [0, len(weight)]
-    label = np.zeros(len(face_key), np.uint32)
-    every = np.arange(len(face_key))
+    # Whole faces are divided, not hits: a ray that meets a face must find its group without asking where it was met.
+    key = face_key[face]
+    levels = max(0, int(np.log2(max(min(count, len(face) / PLACES), 1))))
+    order, bounds = np.arange(len(face)), [0, len(face)]
+    label, every = np.zeros(len(face_key), np.uint32), np.arange(len(face_key))
     for _ in range(levels):
         axes, values, cut = [], [], [0]
         for start, end in itertools.pairwise(bounds):
@@ -117,21 +118,37 @@ def cluster_faces(hits: Points, weight: np.ndarray, faces: tuple[np.ndarray, np.
         side = face_key[every, np.array(axes)[label]] >= np.array(values, np.float32)[label]
         label = label * np.uint32(2) + side.astype(np.uint32)
         bounds = cut
-    rng = np.random.default_rng(seed)
-    chosen = [_systematic(weight[order[a:b]], PLACES, rng.random()) + a for a, b in itertools.pairwise(bounds)]
-    return hits[order[np.concatenate(chosen)]].reshape(len(chosen), PLACES), label
+    return points[_places(order, np.array(bounds), weight, seed)], label
 
 
 def _split(key: np.ndarray, weight: np.ndarray, rows: np.ndarray) -> tuple[int, float, int]:
-    """Sort ``rows`` in place along the axis of widest scatter: that axis, the value and the place of the weights' median."""
+    """Sort ``rows`` in place along the axis of widest scatter: that axis, a value near the weights' median, and where
+    in ``rows`` keys reach it."""
+    if len(rows) == 0:
+        return 0, np.inf, 0
     values = key[rows]
     spread = values.std(axis=0)
     normal = 3 + int(np.argmax(spread[3:]))
     axis = normal if spread[normal] > _NORMAL_SPREAD else int(np.argmax(spread[:3]))
     rows[:] = rows[np.argsort(values[:, axis], kind="stable")]
-    total = np.cumsum(weight[rows])
-    middle = int(np.clip(np.searchsorted(total, 0.5 * total[-1]), 1, len(rows) - 1))
-    return axis, float(key[rows[middle], axis]), middle
+    values, total = key[rows, axis], np.cumsum(weight[rows])
+    value = values[min(int(np.searchsorted(total, 0.5 * total[-1])), len(rows) - 1)]
+    if value == values[0]:
+        # Many hits on the first face: cut after it, so that neither side is empty where that can be.
+        value = values[min(int(np.searchsorted(values, value, side="right")), len(rows) - 1)]
+    return axis, float(value), int(np.searchsorted(values, value, side="left"))
+
+
+def _places(order: np.ndarray, bounds: np.ndarray, weight: np.ndarray, seed: int) -> np.ndarray:
+    """``(M, PLACES)`` of the hits in each group; ``bounds`` ``(M + 1,)`` in ``order``."""
+    rng = np.random.default_rng(seed)
+    filled = np.flatnonzero(np.diff(bounds) > 0)
+    places = np.empty((len(bounds) - 1, PLACES), np.intp)
+    for group in filled:
+        rows = order[bounds[group] : bounds[group + 1]]
+        places[group] = rows[_systematic(weight[rows], PLACES, rng.random())]
+    nearest = filled[np.clip(np.searchsorted(filled, np.arange(len(places))), 0, len(filled) - 1)]
+    return places[nearest]
 
 
 def _systematic(weight: np.ndarray, count: int, start: float) -> np.ndarray:
@@ -142,16 +159,17 @@ def _systematic(weight: np.ndarray, count: int, start: float) -> np.ndarray:
     )
 
 
-def sender_lists(met: np.ndarray, weight: np.ndarray, count: int, *, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def sender_lists(met: np.ndarray, weight: np.ndarray, count: int, *,
+                 start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """``count`` senders for each receiver out of those that its rays met ``(N, K)``, and the share of rays that met any.
 
     Systematic resampling along the rays' own (stratified) order: the expected number of times that a sender is listed
-    is in proportion to the weight of the rays that met it. ``weight`` ``(N, K)`` has sum 1 over each row.
+    is in proportion to the weight of the rays that met it. ``weight`` ``(N, K)`` has sum 1 over each row; ``start``
+    ``(N,)`` is where in [0, 1) each receiver's picks begin.
     """
     total = np.cumsum(np.where(met >= 0, weight, np.float32(0.0)), axis=1, dtype=np.float32)
     share = total[:, -1]
-    start = np.random.default_rng(seed).random((len(met), 1), np.float32)
-    at = (np.arange(count, dtype=np.float32) + start) / count * share[:, None]
+    at = (np.arange(count, dtype=np.float32) + start[:, None]) / count * share[:, None]
     # Rows side by side make one increasing sequence, which one search serves.
     offset = np.arange(len(met), dtype=np.float64)[:, None] * 2.0
     index = np.searchsorted((total + offset).ravel(), (at + offset).ravel(), side="right").reshape(at.shape)

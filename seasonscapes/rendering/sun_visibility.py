@@ -13,6 +13,7 @@ from seasonscapes.sky.illumination import Luminary
 
 # Lanes in one launch: more do not run faster, and memory stays bounded.
 LANES = 1 << 22
+_BAYER = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]])
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,8 @@ class SunRays:
         Shading and geometric normals, three ``mi.Float16`` each.
     mi_weight
         Share of each place in its receiver, ``mi.Float16``.
+    mi_turn
+        ``mi.UInt32`` of N lanes: the disc's point that each receiver begins with.
     places
         S.
     """
@@ -38,6 +41,7 @@ class SunRays:
     mi_normal: list[Any]
     mi_outward: list[Any]
     mi_weight: Any
+    mi_turn: Any
     places: int
 
     @property
@@ -48,20 +52,46 @@ class SunRays:
         return dr.width(self.mi_weight) // self.places
 
 
-def sun_rays(terrain: Occluder, origin: np.ndarray, normal: np.ndarray, outward: np.ndarray,
-             weight: np.ndarray) -> SunRays:  # fmt: skip
-    """Shadow rays from places: ``(N, S, 3)`` origins and normals, ``(N, S)`` weights, 0 where there is no place."""
+def sun_rays(terrain: Occluder, places: tuple[np.ndarray, np.ndarray, np.ndarray], weight: np.ndarray,
+             turn: np.ndarray) -> SunRays:  # fmt: skip
+    """Shadow rays from places.
+
+    Parameters
+    ----------
+    places
+        Origins, shading normals and geometric normals, ``(N, S, 3)`` each.
+    weight
+        ``(N, S)``, 0 where there is no place.
+    turn
+        ``(N,)`` any whole numbers. Places of a receiver take points of the disc in turn, beginning with this one:
+            neighbours that begin with different ones soon disagree in a penumbra, see `pixel_turn`.
+    """
     import drjit as dr
     import mitsuba as mi
 
+    origin, *normals = places
     mi_origin = point3(np.asarray(origin).reshape(-1, 3))
     halves = [
         [mi.Float16(np.ascontiguousarray(column, np.float16)) for column in np.asarray(values).reshape(-1, 3).T]
-        for values in (normal, outward)
+        for values in normals
     ]
     mi_weight = mi.Float16(np.ascontiguousarray(weight, np.float16).ravel())
-    dr.eval(mi_origin, halves, mi_weight)
-    return SunRays(terrain, mi_origin, *halves, mi_weight, weight.shape[1])
+    mi_turn = mi.UInt32((np.asarray(turn, np.int64) % 256).astype(np.uint32))
+    dr.eval(mi_origin, halves, mi_weight, mi_turn)
+    return SunRays(terrain, mi_origin, *halves, mi_weight, mi_turn, weight.shape[1])
+
+
+def pixel_turn(pixel: np.ndarray, width_px: int, places: int) -> np.ndarray:
+    """Point of the disc that each pixel begins with: every 4 × 4 pixels have sixteen different ones (Bayer's matrix)."""
+    row, column = np.divmod(pixel, width_px)
+    return _BAYER[row % 4, column % 4] * max(places // 16, 1)
+
+
+def numbered_turn(number: np.ndarray) -> np.ndarray:
+    """Points of the disc for receivers that have numbers instead of neighbours (Knuth's multiplicative hash)."""
+    return (np.asarray(number, np.uint64) * np.uint64(2654435761) % np.uint64(1 << 32) >> np.uint64(16)).astype(
+        np.int64
+    )
 
 
 def disc_directions(luminary: Luminary, count: int) -> np.ndarray:
@@ -108,22 +138,32 @@ def incidence(rays: SunRays, luminary: Luminary, receiver: np.ndarray) -> tuple[
         lane = dr.gather(mi.UInt32, chosen, number // places) * places + number % places
         visible, cosine, weight = _visible(rays, disc, lane)
         share = dr.fmax(cosine, 0.0) * weight
-        blocks = [dr.block_sum(values, rays.places) for values in (dr.select(visible, share, 0.0), share)]
+        lanes = [dr.select(visible, share, 0.0), share]
+        dr.eval(lanes)
+        blocks = [dr.block_sum(values, rays.places) for values in lanes]
         dr.eval(blocks)
         sums[:, start : start + dr.width(chosen)] = [np.array(values) for values in blocks]
     return sums[0], sums[1]
 
 
-def cosine_seen(rays: SunRays, luminary: Luminary) -> np.ndarray:
-    """Cosine of incidence × visibility of every place ``(N, S)``, its own point of the disc each."""
+def cosine_seen(rays: SunRays, luminary: Luminary, *, each: int = 1) -> np.ndarray:
+    """Cosine of incidence × visibility of every place ``(N, S)``, from ``each`` points of the disc."""
     import drjit as dr
     import mitsuba as mi
 
-    lane = dr.arange(mi.UInt32, rays.receivers * rays.places)
-    visible, cosine, _ = _visible(rays, _mi_disc(luminary, rays.places), lane)
-    result = dr.select(visible, cosine, 0.0)
-    dr.eval(result)
-    return np.array(result).reshape(-1, rays.places)
+    disc = _mi_disc(luminary, rays.places * each)
+    result = np.empty(rays.receivers * rays.places, np.float32)
+    step = max(1, LANES // each)
+    for start in range(0, len(result), step):
+        count = min(step, len(result) - start)
+        number = dr.arange(mi.UInt32, count * each)
+        place = number // dr.opaque(mi.UInt32, each)
+        again = (number - place * dr.opaque(mi.UInt32, each)) * dr.opaque(mi.UInt32, rays.places)
+        visible, cosine, _ = _visible(rays, disc, place + dr.opaque(mi.UInt32, start), again)
+        seen = dr.select(visible, cosine, 0.0)
+        dr.eval(seen)
+        result[start : start + count] = np.array(dr.block_sum(seen, each)) / each
+    return result.reshape(-1, rays.places)
 
 
 def _mi_disc(luminary: Luminary, places: int) -> tuple[Any, Any, Any]:
@@ -136,8 +176,10 @@ def _mi_disc(luminary: Luminary, places: int) -> tuple[Any, Any, Any]:
     return mi.Vector3f(point3(disc_directions(luminary, count))), dr.opaque(mi.UInt32, count), centre
 
 
-def _visible(rays: SunRays, disc: tuple[Any, Any, Any], lane: Any) -> tuple[Any, Any, Any]:
+def _visible(rays: SunRays, disc: tuple[Any, Any, Any], lane: Any, again: Any = 0) -> tuple[Any, Any, Any]:
     """Whether lanes of `SunRays` see the luminary, the cosine of incidence of its centre, and their weight.
+
+    ``again`` moves on to other points of the disc.
 
     Where the facet turns its back a path tracer's shadow ray starts inside the mountain, so that is dark here too.
     """
@@ -152,7 +194,9 @@ def _visible(rays: SunRays, disc: tuple[Any, Any, Any], lane: Any) -> tuple[Any,
     weight = mi.Float(dr.gather(mi.Float16, rays.mi_weight, lane))
     active = (cosine > 0.0) & (outward > 0.0) & (weight > 0.0)
     # Places of a receiver take the disc's points in turn; each receiver begins with another one.
-    turn, _ = mi.sample_tea_32(lane // dr.opaque(mi.UInt32, rays.places), mi.UInt32(0x51ED270B))
-    direction = dr.gather(mi.Vector3f, points, (lane + turn) % count)
+    places = dr.opaque(mi.UInt32, rays.places)
+    receiver = lane // places
+    turn = lane - receiver * places + dr.gather(mi.UInt32, rays.mi_turn, receiver) + again
+    direction = dr.gather(mi.Vector3f, points, turn % count)
     ray = mi.Ray3f(dr.gather(mi.Point3f, rays.mi_origin, lane, active), direction)
     return active & ~rays.terrain.mi_scene.ray_test(ray, active), cosine, weight

@@ -19,7 +19,7 @@ import numpy as np
 
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.rendering.direction_basis import DirectionBasis, direction_basis
-from seasonscapes.rendering.gather import OPEN, Occluder, Points, gather
+from seasonscapes.rendering.gather import OPEN, Occluder, Points, gather, joined
 from seasonscapes.rendering.senders import (
     PLACES,
     Reception,
@@ -199,7 +199,7 @@ def view_neighbours(view: ViewCoefficients, *, stride: int, sharpness: float) ->
 
 
 def trace_points(terrain: Occluder, points: Points, effort: Effort | None = None, *, prepared: Preparation | None = None,
-                 seed: int = 0, first: int = 0, progress: Progress | None = None) -> PointCoefficients:  # fmt: skip
+                 seed: int = 0, number: np.ndarray | None = None, progress: Progress | None = None) -> PointCoefficients:  # fmt: skip
     """Daylight coefficients of places on the terrain, such as texels.
 
     Parameters
@@ -208,17 +208,18 @@ def trace_points(terrain: Occluder, points: Points, effort: Effort | None = None
         N places, as from `surface_at`.
     prepared
         From `prepare`, where many blocks of places of one terrain are traced one after the other.
-    first
-        Number of the first place among all of them, so that blocks do not repeat each other's noise.
+    number
+        ``(N,)`` each place's number among all of them: blocks then give what all at once would. Left out: 0, 1, ….
     """
     effort = effort or Effort()
     tell = progress or (lambda share: None)
     prepared = prepared or prepare(terrain, points, effort, seed=seed)
+    number = np.arange(len(points.origin)) if number is None else number
     step = max(1, BLOCK_RAYS // effort.rays)
     parts = []
     for start in range(0, len(points.origin), step):
         block = points[start : start + step]
-        identity = np.arange(first + start, first + start + len(block.origin), dtype=np.uint32)
+        identity = number[start : start + step].astype(np.uint32)
         weight = np.ones((len(block.origin), 1), np.float32)
         parts.append(_receive(terrain, prepared, block.reshape(-1, 1), (weight, identity), effort, seed))
         tell(min(1.0, (start + step) / len(points.origin)))
@@ -235,16 +236,20 @@ def prepare(terrain: Occluder, pilot: Points, effort: Effort, *, seed: int = 0) 
     choice = np.random.default_rng(seed).permutation(len(pilot.origin))
     pilot = pilot[np.resize(choice, _PILOTS)]
     none = mi.UInt32(np.zeros(len(faces[0]), np.uint32))
-    few = pilot[:_EXAMPLES]
-    patch, met = gather(terrain, patches, few, rays=_EXAMPLE_RAYS, first=np.zeros(_EXAMPLES, np.uint32),
+    hits = pilot_hits(terrain, pilot, max(effort.bounces, 1), seed)
+    # Receivers and senders share one basis, so both serve as its examples.
+    half = _EXAMPLES // 2
+    some = joined(
+        [pilot[:half], hits[0][np.resize(np.arange(len(hits[1])), half)] if len(hits[1]) else pilot[half:_EXAMPLES]]
+    )
+    patch, met = gather(terrain, patches, some, rays=_EXAMPLE_RAYS, first=np.zeros(_EXAMPLES, np.uint32),
                         scramble=np.arange(_EXAMPLES, dtype=np.uint32), mi_label=none)  # fmt: skip
     rows = patch_sums(patch, np.where(met == OPEN, np.float32(1.0 / _EXAMPLE_RAYS), 0.0), np.eye(patches.size))
     basis = direction_basis(rows, patches, effort.rank)
-    hits, weight = pilot_hits(terrain, pilot, max(effort.bounces, 1), seed)
-    if effort.bounces == 0 or len(weight) == 0:
-        nothing = Senders(few[:1].reshape(1, 1), _nothing(basis, effort), basis.from_sky, effort.patches, 0)
+    if effort.bounces == 0 or len(hits[1]) == 0:
+        nothing = Senders(pilot[:1].reshape(1, 1), _nothing(basis, effort), basis.from_sky, effort.patches, 0)
         return Preparation(none, basis, nothing)
-    points, label = cluster_faces(hits, weight, faces, effort.senders, seed=seed)
+    points, label = cluster_faces(hits, faces, effort.senders, seed=seed)
     size = len(points.origin)
     senders = Senders(points, _nothing(basis, effort), basis.from_sky, effort.patches, effort.bounces)
     prepared = Preparation(mi.UInt32(label), basis, senders)
@@ -303,8 +308,16 @@ def _receive(terrain: Occluder, prepared: Preparation, points: Points, shares: t
     patch, met = patch.reshape(count, -1), met.reshape(count, -1)
     ray_weight = np.repeat(weight / np.float32(each), each, axis=1)
     direct = patch_sums(patch, np.where(met == OPEN, ray_weight, 0.0), prepared.basis.into)
-    sender, share = sender_lists(met, ray_weight, effort.listed, seed=seed)
+    sender, share = sender_lists(met, ray_weight, effort.listed, start=lots(identity, seed))
     return direct.astype(np.float16), sender, share.astype(np.float16)
+
+
+def lots(identity: np.ndarray, seed: int) -> np.ndarray:
+    """One number in [0, 1) for each receiver ``(N,)`` float32, whatever block it is in (Wellons' *lowbias32*)."""
+    bits = identity.astype(np.uint32) ^ np.uint32((seed * 2891336453 + 0x9E3779B9) % 2**32)
+    for shift, factor in ((16, 0x7FEB352D), (15, 0x846CA68B)):
+        bits = (bits ^ (bits >> np.uint32(shift))) * np.uint32(factor)
+    return ((bits ^ (bits >> np.uint32(16))) >> np.uint32(8)).astype(np.float32) * np.float32(2.0**-24)
 
 
 def patch_sums(index: np.ndarray, weight: np.ndarray, table: np.ndarray) -> np.ndarray:

@@ -7,9 +7,13 @@ from typing import Any
 import numpy as np
 
 from seasonscapes.cameras.pinhole import Camera
-from seasonscapes.rendering.gather import LANES, Occluder, Points, front_side, surface_points, unit_square
+from seasonscapes.rendering.gather import LANES, Occluder, Points, front_side, surface_points
 from seasonscapes.rendering.gbuffer import mi_rays
+from seasonscapes.rendering.sobol import hashed, sobol_pair
 from seasonscapes.sky.illumination import LUMINANCE_WEIGHTS
+
+# Name of what random numbers are for, as a word for their hashes.
+_PIXEL = 103
 
 
 def view_samples(terrain: Occluder, camera: Camera, rows: tuple[int, int], count: int,
@@ -59,14 +63,13 @@ def _mi_camera_rays(terrain: Occluder, camera: Camera, rows: tuple[int, int], co
     top, height = rows
     pixels = camera.width_px * height
     lane = dr.arange(mi.UInt32, pixels * count)
-    per_pixel, side = dr.opaque(mi.UInt32, count), dr.opaque(mi.UInt32, round(count**0.5))
-    width, first = dr.opaque(mi.UInt32, camera.width_px), dr.opaque(mi.UInt32, top)
-    index, sample = lane // per_pixel, lane % per_pixel
-    row, column = index // width, index % width
-    key = lane + first * width * per_pixel
-    jitter = unit_square(*mi.sample_tea_32(key, dr.opaque(mi.UInt32, seed)))
-    x = mi.Float(column) + (mi.Float(sample % side) + jitter.x) / mi.Float(side)
-    y = mi.Float(row + first) + (mi.Float(sample // side) + jitter.y) / mi.Float(side)
+    width = dr.opaque(mi.UInt32, camera.width_px)
+    index = lane // dr.opaque(mi.UInt32, count)
+    pixel = index + dr.opaque(mi.UInt32, top) * width
+    row = pixel // width
+    key = hashed(hashed(pixel, dr.opaque(mi.UInt32, seed)), _PIXEL)
+    place = sobol_pair(key, lane - index * dr.opaque(mi.UInt32, count))
+    x, y = mi.Float(pixel - row * width) + place.x, mi.Float(row) + place.y
     return terrain.mi_scene.ray_intersect(mi_rays(camera, x, y))
 
 

@@ -1,0 +1,124 @@
+"""Daylight coefficients on disk: a folder of plain arrays that are mapped, not read, and one JSON file about them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from seasonscapes.cameras.pinhole import Camera
+from seasonscapes.rendering.gather import Points
+from seasonscapes.rendering.senders import Reception, Senders
+from seasonscapes.rendering.transport import Effort, PointCoefficients, ViewCoefficients
+
+# A new number wherever the same inputs give other coefficients, or the files other names.
+REVISION = 1
+_KINDS = {
+    kind.__name__: kind for kind in (Camera, Points, Reception, Senders, Effort, PointCoefficients, ViewCoefficients)
+}
+Coefficients = ViewCoefficients | PointCoefficients
+
+
+def coefficients_key(*inputs: Any) -> str:
+    """Hash of all that coefficients depend on: arrays, records, numbers and text; 32 hexadecimal digits.
+
+    Pass the terrain's vertices and faces, the albedo, the camera or the points, the `Effort` and the seed.
+    """
+    digest = hashlib.blake2b(str(REVISION).encode(), digest_size=16)
+    for value in inputs:
+        _add(digest, value)
+    return digest.hexdigest()
+
+
+def _add(digest: Any, value: Any) -> None:
+    if is_dataclass(value) and not isinstance(value, type):
+        digest.update(type(value).__name__.encode())
+        for field in fields(value):
+            _add(digest, getattr(value, field.name))
+    elif isinstance(value, np.ndarray):
+        digest.update(f"{value.dtype.str}{value.shape}".encode())
+        digest.update(np.ascontiguousarray(value).data)
+    elif value is None or isinstance(value, (str, int, float, bool, np.integer, np.floating)):
+        digest.update(f"{type(value).__name__}:{value!r};".encode())
+    else:
+        raise ValueError(f"coefficients_key: cannot hash a {type(value).__name__}")
+
+
+@contextmanager
+def atomic_folder(path: str | os.PathLike) -> Iterator[Path]:
+    """A temporary folder beside ``path`` that takes its name only when the block ends well, replacing what was there."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}-", suffix=".part", dir=path.parent))
+    try:
+        yield temporary
+        umask = os.umask(0)
+        os.umask(umask)
+        temporary.chmod(0o777 & ~umask)
+        if path.exists():
+            # Folders cannot be exchanged in one step: the old one steps aside first, and is never half there.
+            aside = Path(tempfile.mkdtemp(prefix=f".{path.name}-", suffix=".old", dir=path.parent))
+            os.replace(path, aside)
+            os.replace(temporary, path)
+            shutil.rmtree(aside)
+        else:
+            os.replace(temporary, path)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def save_coefficients(path: str | os.PathLike, coefficients: Coefficients, *, key: str = "") -> None:
+    """Write to a folder, atomically; ``key`` from `coefficients_key` is kept for `load_coefficients` to check."""
+    with atomic_folder(path) as folder:
+        record = _write(folder, "", coefficients)
+        text = json.dumps({"revision": REVISION, "key": key, "coefficients": record}, indent=1)
+        (folder / "coefficients.json").write_text(text)
+
+
+def load_coefficients(path: str | os.PathLike, *, key: str | None = None) -> Coefficients:
+    """Read a folder of `save_coefficients`. Arrays stay on disk until they are used.
+
+    Raises
+    ------
+    FileNotFoundError
+        Where there is none.
+    ValueError
+        Where it was written by another revision, or for other inputs than ``key`` says.
+    """
+    folder = Path(path)
+    record = json.loads((folder / "coefficients.json").read_text())
+    if record["revision"] != REVISION:
+        raise ValueError(f"{folder}: coefficients of revision {record['revision']}, expected {REVISION}")
+    if key is not None and record["key"] != key:
+        raise ValueError(f"{folder}: coefficients of {record['key'] or 'unknown inputs'}, expected {key}")
+    return _read(folder, "", record["coefficients"])
+
+
+def _write(folder: Path, prefix: str, value: Any) -> Any:
+    if is_dataclass(value):
+        parts = {
+            field.name: _write(folder, f"{prefix}{field.name}.", getattr(value, field.name)) for field in fields(value)
+        }
+        return {"type": type(value).__name__, **parts}
+    if isinstance(value, np.ndarray):
+        np.save(folder / f"{prefix}npy", value)
+        return "array"
+    return value
+
+
+def _read(folder: Path, prefix: str, record: Any) -> Any:
+    if record == "array":
+        return np.load(folder / f"{prefix}npy", mmap_mode="r")
+    if isinstance(record, dict):
+        parts = {name: _read(folder, f"{prefix}{name}.", part) for name, part in record.items() if name != "type"}
+        return _KINDS[record["type"]](**parts)
+    return record

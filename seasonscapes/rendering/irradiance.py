@@ -1,0 +1,163 @@
+"""Irradiance of places on the terrain under any light: what texels of an atlas receive, sun, sky and bounce apart."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from seasonscapes.rendering.backend import point3
+from seasonscapes.rendering.gather import Occluder, Points, surface_points
+from seasonscapes.rendering.reception import (
+    ReadyReception,
+    ReadySenders,
+    SenderLight,
+    arriving,
+    light_senders,
+    luminaries,
+    ready_reception,
+    ready_senders,
+)
+from seasonscapes.rendering.sun_visibility import SunRays, cosine_seen, numbered_turn, sun_rays
+from seasonscapes.rendering.transport import Effort, PointCoefficients, prepare, trace_points
+from seasonscapes.sky.illumination import Illumination
+
+# Texels in work at a time: their coefficients take about 300 bytes each.
+BLOCK = 1 << 19
+# A ray finds the surface under a texel from this far above and below it.
+_SEARCH_M = 2.0
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class Irradiance:
+    """Illuminance on N places [lx], photometric linear Rec.709, ``(N, 3)`` float32 each.
+
+    Parameters
+    ----------
+    sun
+        Directly from sun and moon.
+    sky
+        Directly from the sky.
+    bounce
+        By way of other terrain.
+    """
+
+    sun: np.ndarray
+    sky: np.ndarray
+    bounce: np.ndarray
+
+    @property
+    def total(self) -> np.ndarray:
+        """All of it ``(N, 3)``."""
+        return self.sun + self.sky + self.bounce
+
+
+@dataclass(frozen=True)
+class ReadyPoints:
+    """Coefficients of places laid out for speed, for any number of lights."""
+
+    rays: SunRays
+    reception: ReadyReception
+    senders: ReadySenders
+
+
+def surface_at(terrain: Occluder, position_m: np.ndarray) -> tuple[Points, np.ndarray]:
+    """The surface at places ``(N, 3)`` ENU on it [m], such as `terrain.texels.texel_positions` gives.
+
+    A vertical ray finds the face, so that normals and albedo are the renderer's own.
+
+    Returns
+    -------
+    points
+        K of them, where a surface was found.
+    index
+        ``(K,)`` their numbers among the N. NaN places, and walls of overhangs, have none.
+    """
+    import mitsuba as mi
+
+    sound = np.isfinite(position_m).all(axis=1)
+    start = np.where(sound[:, None], position_m, 0.0) + np.array([0.0, 0.0, _SEARCH_M])
+    ray = mi.Ray3f(point3(start.astype(np.float32)), mi.Vector3f(0.0, 0.0, -1.0))
+    interaction = terrain.mi_scene.ray_intersect(ray)
+    found = interaction.is_valid() & (interaction.t < 2.0 * _SEARCH_M)
+    points = surface_points(interaction, found)
+    index = np.flatnonzero(sound & np.array(found))
+    return points[index], index
+
+
+def ready_points(terrain: Occluder, coefficients: PointCoefficients) -> ReadyPoints:
+    """Load coefficients (perhaps memory-mapped) into the form that `irradiance` uses."""
+    senders = ready_senders(terrain, coefficients.senders)
+    return ReadyPoints(
+        _rays(terrain, coefficients.points, np.arange(len(coefficients.points.origin))),
+        ready_reception(coefficients.reception),
+        senders,
+    )
+
+
+def _rays(terrain: Occluder, points: Points, number: np.ndarray) -> SunRays:
+    each = points.reshape(-1, 1)
+    weight = np.ones(each.origin.shape[:2], np.float32)
+    return sun_rays(terrain, (each.origin, each.normal, each.outward), weight, numbered_turn(number))
+
+
+def irradiance(ready: ReadyPoints, illumination: Illumination, *, light: SenderLight | None = None,
+               sun_rays_each: int = 4) -> Irradiance:  # fmt: skip
+    """Illuminance on the places under a light.
+
+    Parameters
+    ----------
+    light
+        From `reception.light_senders`, where one light serves many blocks of places of one terrain.
+    sun_rays_each
+        Shadow rays from each place to different points of the disc.
+    """
+    sky, bounce = arriving(ready.reception, light or light_senders(ready.senders, illumination))
+    sun = np.zeros_like(sky)
+    for body in luminaries(illumination):
+        sun += cosine_seen(ready.rays, body, each=sun_rays_each) * np.asarray(body.normal_illuminance_lx, np.float32)
+    return Irradiance(sun, np.float32(np.pi) * sky, np.float32(np.pi) * bounce)
+
+
+def irradiance_blocks(terrain: Occluder, position_m: np.ndarray, lights: Sequence[Illumination], effort: Effort | None = None, *,
+                      seed: int = 0, progress: Progress | None = None) -> Iterator[tuple[np.ndarray, Points, list]]:  # fmt: skip
+    """Irradiance of many places under a few lights, block by block: nothing is kept, so memory stays bounded.
+
+    Parameters
+    ----------
+    position_m
+        ``(N, 3)`` ENU; NaN where there is no surface.
+    lights
+        Held at once: a few dozen.
+
+    Yields
+    ------
+    index, points, irradiances
+        Which of the N ``(K,)``, their surfaces, and one `Irradiance` for each light. Places without a surface never come.
+
+    Raises
+    ------
+    ValueError
+        Where no place at all lies on the terrain.
+    """
+    effort = effort or Effort()
+    tell = progress or (lambda share: None)
+    sound = np.flatnonzero(np.isfinite(position_m).all(axis=1))
+    some = np.random.default_rng(seed).permutation(sound)[: 1 << 18]
+    pilot, found = surface_at(terrain, position_m[some])
+    if len(found) == 0:
+        raise ValueError("irradiance: no place lies on the terrain")
+    prepared = prepare(terrain, pilot, effort, seed=seed)
+    senders = ready_senders(terrain, prepared.senders)
+    sent = [light_senders(senders, light) for light in lights]
+    for start in range(0, len(sound), BLOCK):
+        part = sound[start : start + BLOCK]
+        points, found = surface_at(terrain, position_m[part])
+        if len(found):
+            traced = trace_points(terrain, points, effort, prepared=prepared, seed=seed, number=part[found])
+            ready = ReadyPoints(_rays(terrain, points, part[found]), ready_reception(traced.reception), senders)
+            results = [irradiance(ready, light, light=own) for light, own in zip(lights, sent, strict=True)]
+            yield part[found], points, results
+        tell(min(1.0, (start + BLOCK) / len(sound)))
