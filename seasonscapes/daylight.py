@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from datetime import datetime
+from functools import lru_cache
 
 import numpy as np
 
@@ -43,8 +44,9 @@ def moment_at(time: datetime, latitude_deg: float, longitude_deg: float, height_
                   moon_position(time, latitude_deg, longitude_deg, height_m))  # fmt: skip
 
 
+@lru_cache(maxsize=4)
 def tables_in(workspace: Workspace):
-    """Atmosphere tables by way of the workspace: computed once (tens of seconds), then read."""
+    """Atmosphere tables by way of the workspace: computed once (tens of seconds), read once a process."""
     held: dict[Atmosphere, AtmosphereTables] = {}
 
     def tables_of(atmosphere: Atmosphere) -> AtmosphereTables:
@@ -60,12 +62,12 @@ def tables_in(workspace: Workspace):
 
 
 def light_at(
-    model: SkyModel, moment: Moment, height_m: float, *, workspace: Workspace, map_height: int = 128
+    model: SkyModel, moment: Moment, height_m: float, *, workspace: Workspace, map_height: int = 128, with_air: bool = True
 ) -> Illumination:
     """The light of an instant for an observer at a height [m]; see `sky.illuminate`."""
     from seasonscapes.rendering.hosek import hosek_illumination
 
-    return illuminate(model, moment.sun, moment.moon, height_m=height_m, map_height=map_height,
+    return illuminate(model, moment.sun, moment.moon, height_m=height_m, map_height=map_height, with_air=with_air,
                       tables_of=tables_in(workspace), hosek=hosek_illumination)  # fmt: skip
 
 
@@ -78,7 +80,7 @@ def light_for(place: Place, camera: Camera, model: SkyModel, time: datetime) -> 
     heights = place.elevation.values
     ground_m = float(np.median(heights))
     moment = moment_at(time, place.frame.latitude_deg, place.frame.longitude_deg, ground_m)
-    on_land = light_at(model, moment, ground_m, workspace=place.workspace)
+    on_land = light_at(model, moment, ground_m, workspace=place.workspace, with_air=False)
     camera_m = camera_geodetic(place, camera)[2]
     from_camera = light_at(model, moment, camera_m, workspace=place.workspace)
     return replace(

@@ -117,8 +117,8 @@ def sun_luminary(tables: AtmosphereTables, sun_direction, observer_height_m: flo
 
 
 def illumination_from_atmosphere(tables: AtmosphereTables, sun_direction, observer_height_m: float, *,
-                                 distance_au: float = 1.0, moon: tuple | None = None,
-                                 shape: tuple[int, int] = (128, 256)) -> Illumination:  # fmt: skip
+                                 distance_au: float = 1.0, moon: tuple | None = None, shape: tuple[int, int] = (128, 256),
+                                 with_air: bool = True) -> Illumination:  # fmt: skip
     """All the light of one instant for an observer: sun, sky, moon and aerial perspective.
 
     Parameters
@@ -134,6 +134,8 @@ def illumination_from_atmosphere(tables: AtmosphereTables, sun_direction, observ
         moon; left out, there is none.
     shape
         Of the radiance map.
+    with_air
+        Whether to work out the aerial perspective too, the larger part of the time; without, it is ``None``.
     """
     sources = [(_unit(sun_direction), _bands(1.0 / distance_au**2), SUN_RADIUS_DEG / distance_au)]
     if moon is not None:
@@ -149,9 +151,11 @@ def illumination_from_atmosphere(tables: AtmosphereTables, sun_direction, observ
         near = [
             pool.submit(airlight, tables, view, true, irradiance)
             for (_, irradiance, _), true in zip(sources, true_rad, strict=True)
+            if with_air
         ]
-        lights = tuple((sky.result(), air.result()) for sky, air in zip(skies, near, strict=True))
-        radiance = _map_of(tuple(light for light, _ in lights), shape)
+        lights = tuple(sky.result() for sky in skies)
+        radiance = _map_of(lights, shape)
+        airs = tuple(air.result() for air in near)
     luminaries = [
         sun_luminary(tables, direction, observer_height_m, irradiance=irradiance, angular_radius_deg=radius)
         for direction, irradiance, radius in sources
@@ -164,7 +168,9 @@ def illumination_from_atmosphere(tables: AtmosphereTables, sun_direction, observ
         sky_radiance=radiance,
         sun=luminaries[0],
         moon=luminaries[1] if moon is not None else None,
-        aerial_perspective=air_between(view, lights, illuminant + 1e-12),
+        aerial_perspective=air_between(view, tuple(zip(lights, airs, strict=True)), illuminant + 1e-12)
+        if with_air
+        else None,
         model={"kind": "atmosphere", "observer_height_m": float(observer_height_m), **asdict(tables.atmosphere)},
     )
 

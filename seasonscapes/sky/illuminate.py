@@ -39,7 +39,7 @@ def tables_in_memory(atmosphere: Atmosphere) -> AtmosphereTables:
 
 
 def illuminate(model: SkyModel, sun: SolarPosition, moon: LunarPosition | None = None, *, height_m: float = 0.0,
-               map_height: int = 128, tables_of: TablesOf = tables_in_memory,
+               map_height: int = 128, with_air: bool = True, tables_of: TablesOf = tables_in_memory,
                hosek: HosekOf | None = None) -> Illumination:  # fmt: skip
     """All the light of one instant at one place under a sky model.
 
@@ -53,6 +53,8 @@ def illuminate(model: SkyModel, sun: SolarPosition, moon: LunarPosition | None =
         Of the observer [m].
     map_height
         Rows of the sky map; it has twice as many columns.
+    with_air
+        Without, atmosphere models leave out aerial perspective, the larger part of their time.
     tables_of
         Gives the tables of an atmosphere; the default computes them once a process, in tens of seconds.
     hosek
@@ -77,7 +79,7 @@ def illuminate(model: SkyModel, sun: SolarPosition, moon: LunarPosition | None =
         return _named(model, _clouded(model, clear, sun, None))
     if isinstance(model, AtmosphereModel):
         moon = _worth_having(sun, moon)
-        clear = _atmosphere(model, sun, moon, height_m, map_height, tables_of)
+        clear = _atmosphere(model, sun, moon, height_m, (map_height, with_air), tables_of)
         return _named(model, _clouded(model, clear, sun, moon))
     raise ValueError(f"model: got {type(model).__name__}, expected one of `models.KINDS`")
 
@@ -94,13 +96,14 @@ def _worth_having(sun: SolarPosition, moon: LunarPosition | None) -> LunarPositi
 
 
 def _atmosphere(model: AtmosphereModel, sun: SolarPosition, moon: LunarPosition | None, height_m: float,
-                map_height: int, tables_of: TablesOf) -> Illumination:  # fmt: skip
+                extent: tuple[int, bool], tables_of: TablesOf) -> Illumination:  # fmt: skip
+    map_height, with_air = extent
     source = None
     if moon is not None:
         source = (moon.direction, moon_to_sun_ratio(moon, WAVELENGTHS_NM), float(moon.angular_radius_deg))
     clear = illumination_from_atmosphere(
         tables_of(atmosphere_of(model)), sun.direction, height_m, distance_au=float(sun.distance_au), moon=source,
-        shape=(map_height, 2 * map_height),
+        shape=(map_height, 2 * map_height), with_air=with_air,
     )  # fmt: skip
     haze = model.aerosol.optical_depth_500nm * float(angstrom_ratio(model.aerosol.angstrom_exponent, 500.0, 550.0))
     night = night_sky_radiance(map_height, 2 * map_height, height_m=height_m, ground_albedo=model.ground.albedo,
