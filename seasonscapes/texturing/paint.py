@@ -1,0 +1,253 @@
+"""Photographs painted into the atlas: each texel from the cameras that see it, as radiance of the land [cd/m²]."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from seasonscapes.images import atomic_path
+from seasonscapes.rendering.gather import Occluder
+from seasonscapes.terrain.atlas import Atlas
+from seasonscapes.terrain.surface import Terrain, Texture
+from seasonscapes.texturing.harmonise import Harmony, air_to, equal_gains, harmonise, land_radiance
+from seasonscapes.texturing.shots import NEAR_M, ReadyShot, Shot, ready_shot, sample_shot
+from seasonscapes.texturing.tiles import TILE_PX, Tile, Tiling, sees_tile, tile_blocks, tile_surface, tiles_of, tiling
+from seasonscapes.texturing.visibility import by_ray, sight_of
+from seasonscapes.texturing.weights import sharpened, texel_weight
+
+MODES = ("weighted", "first")
+Progress = Callable[[float], None]
+# A texel that all cameras trust less than this is left to completion.
+_LEAST_WEIGHT = 1e-4
+
+
+@dataclass(frozen=True)
+class Painting:
+    """What cameras paint into an atlas.
+
+    Parameters
+    ----------
+    texture
+        Radiance ``(R, S, 3)`` [cd/m²] leaving the land, the air removed; relative where no sky gave a scale. ``weight``
+        is the greatest of the cameras' weights, 0 where none painted.
+    best
+        ``(R, S)`` int16 index of the camera with the greatest weight (of the one that painted, in mode ``first``), −1
+        where none did; it counts in the order of ``webcams``.
+    coverage
+        ``(R, S)`` uint8: how many cameras have a say.
+    webcams
+        Names of the shots that were used.
+    harmony
+        Their gains and haze, in that order.
+    skipped
+        A line for each shot that has nothing to say, and why.
+    """
+
+    texture: Texture
+    best: np.ndarray
+    coverage: np.ndarray
+    webcams: tuple[str, ...]
+    harmony: Harmony
+    skipped: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class PaintOptions:
+    """How to paint.
+
+    Parameters
+    ----------
+    mode
+        ``weighted`` blends by sharpened weights; ``first`` lets the first camera in order that sees a texel have it, as
+        the paper does.
+    fit_gains, fit_haze
+        Make cameras agree in exposure and white balance, and fit the haze before them.
+    guard
+        Keep away from silhouettes.
+    near_m
+        Leave out pixels that show terrain nearer than this [m].
+    tile_px
+        Side of the tiles that are worked on one after the other.
+    """
+
+    mode: str = "weighted"
+    fit_gains: bool = True
+    fit_haze: bool = True
+    guard: bool = True
+    near_m: float = NEAR_M
+    tile_px: int = TILE_PX
+
+    def __post_init__(self):
+        if self.mode not in MODES:
+            raise ValueError(f"PaintOptions: mode {self.mode!r}, expected one of {', '.join(MODES)}")
+
+
+def paint(shots: Sequence[Shot], terrain: Terrain, atlas: Atlas, occluder: Occluder, *, options: PaintOptions | None = None,
+          predicted: np.ndarray | None = None, rejects: Sequence[np.ndarray | None] | None = None,
+          radiance: float | None = None, resume: Path | None = None, progress: Progress | None = None) -> Painting:  # fmt: skip
+    """Paint observations of one time into an atlas.
+
+    Parameters
+    ----------
+    shots
+        In any order: in mode ``weighted`` it does not matter, in ``first`` it is the order of precedence.
+    occluder
+        The same terrain for rays (`gather.occluder`).
+    predicted
+        As in `harmonise`.
+    rejects
+        For each shot a mask ``(H, W)`` bool of pixels to leave out, or ``None``; see `foreground.foreground_mask`.
+    radiance
+        As in `harmonise`.
+    resume
+        A folder for finished tiles: a painting that was interrupted goes on from there. It belongs to these arguments
+        alone; the caller names it by them.
+    progress
+        Called with the share that is done.
+
+    Raises
+    ------
+    ValueError
+        No shot at all, or none that sees any of the terrain; the message says why for each.
+    """
+    options, tell = options or PaintOptions(), progress or (lambda share: None)
+    cut = tiling(terrain, atlas, tile_px=options.tile_px)
+    ready, skipped = prepare_shots(shots, occluder, cut, options, rejects=rejects, progress=lambda s: tell(0.2 * s))
+    if not ready:
+        raise ValueError("paint: no picture has anything to paint: " + "; ".join(skipped or ["no pictures"]))
+    if options.fit_gains:
+        harmony = harmonise(ready, occluder, predicted=predicted, fit_haze=options.fit_haze, radiance=radiance)
+    else:
+        harmony = equal_gains(ready, radiance=radiance or 1.0)
+    tell(0.3)
+    painting = _blank(atlas, ready, harmony, skipped)
+    tiles = list(tiles_of(cut))
+    for number, tile in enumerate(tiles):
+        _place(painting, tile, _kept_tile(resume, tile, lambda tile=tile: paint_tile(ready, occluder, cut, tile, harmony,
+                                                                                  options.mode)))  # fmt: skip
+        tell(0.3 + 0.7 * (number + 1) / len(tiles))
+    return painting
+
+
+def prepare_shots(shots: Sequence[Shot], occluder: Occluder, cut: Tiling, options: PaintOptions, *,
+                  rejects: Sequence[np.ndarray | None] | None = None,
+                  progress: Progress | None = None) -> tuple[list[ReadyShot], list[str]]:  # fmt: skip
+    """The shots that have something to paint, ready, and a line for each other one that says why it has not."""
+    tell = progress or (lambda share: None)
+    if rejects is not None and len(rejects) != len(shots):
+        raise ValueError(f"paint: {len(rejects)} masks for {len(shots)} shots")
+    pairs = list(zip(shots, rejects or [None] * len(shots), strict=True))
+    if options.mode == "weighted":
+        # A sum in another order would differ in its last bits.
+        pairs.sort(key=lambda pair: pair[0].key)
+    ready, skipped = [], []
+    for number, (shot, reject) in enumerate(pairs):
+        why = _unusable(shot)
+        if why is None:
+            prepared = ready_shot(shot, occluder, cut, near_m=options.near_m, reject=reject, guard=options.guard)
+            if not np.isfinite(prepared.depth_m).any():
+                why = "it sees none of the terrain"
+            elif not prepared.trust.any():
+                why = "no usable pixel shows terrain"
+            else:
+                ready.append(prepared)
+        if why is not None:
+            skipped.append(f"{shot.observation.webcam}: {why}")
+        tell((number + 1) / len(pairs))
+    return ready, skipped
+
+
+def _unusable(shot: Shot) -> str | None:
+    seen = shot.observation
+    if not seen.mask.any():
+        return "its mask leaves no pixel"
+    if not np.isfinite(seen.image[seen.mask]).all(axis=1).any():
+        return "its picture holds no finite value"
+    return None
+
+
+@dataclass(frozen=True)
+class _Painted:
+    """What of a tile is painted; arrays as in `Painting`."""
+
+    values: np.ndarray
+    weight: np.ndarray
+    best: np.ndarray
+    coverage: np.ndarray
+
+
+def paint_tile(ready: Sequence[ReadyShot], occluder: Occluder, cut: Tiling, tile: Tile, harmony: Harmony,
+               mode: str = "weighted") -> _Painted:  # fmt: skip
+    """One tile of a painting, from all shots that see any of it."""
+    size = tile.height * tile.width
+    total, most = np.zeros((size, 3)), np.zeros(size, np.float32)
+    weights, best, coverage = np.zeros(size), np.full(size, -1, np.int16), np.zeros(size, np.uint8)
+    those = [number for number, shot in enumerate(ready) if sees_tile(shot.blocks, tile)]
+    surface = tile_surface(cut, tile) if those else None
+    for number in those:
+        texel, value, weight = shot_texels(ready[number], number, occluder, surface, tile, harmony)
+        if mode == "first":
+            free = best[texel] < 0
+            texel, value, weight = texel[free], value[free], weight[free]
+        share = sharpened(weight)
+        total[texel] += share[:, None] * value
+        weights[texel] += share
+        better = weight > most[texel]
+        best[texel[better]] = number
+        most[texel[better]] = weight[better]
+        coverage[texel] += 1
+    painted = weights > 0.0
+    values = np.zeros((size, 3), np.float32)
+    values[painted] = total[painted] / weights[painted, None]
+    shape = (tile.height, tile.width)
+    return _Painted(values.reshape(*shape, 3), most.reshape(shape), best.reshape(shape), coverage.reshape(shape))
+
+
+def shot_texels(ready: ReadyShot, number: int, occluder: Occluder, surface, tile: Tile,
+                harmony: Harmony) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """What one shot has to say about a tile: flat texels ``(N,)``, radiance ``(N, 3)`` [cd/m²] and weight ``(N,)``."""
+    camera = ready.shot.observation.camera
+    surface = surface[tile_blocks(ready.blocks, tile, surface.texel)]
+    sight = sight_of(camera, surface)
+    index = np.flatnonzero(sight.inside)
+    surface, sight = surface[index], sight[index]
+    px_per_texel = camera.fx * surface.texel_m / np.maximum(sight.distance_m, 1e-3)
+    value, trust = sample_shot(ready, sight.pixel, px_per_texel)
+    weight = texel_weight(sight.cosine, px_per_texel) * trust
+    keep = np.flatnonzero(weight > _LEAST_WEIGHT)
+    # Rays last: only for texels that something could be painted into.
+    keep = keep[by_ray(occluder, camera, surface[keep], sight[keep])]
+    radiance, share = land_radiance(value[keep], number, air_to(ready, surface.position_m[keep]), harmony)
+    return surface.texel[keep], radiance, weight[keep] * share**2
+
+
+def _blank(atlas: Atlas, ready: Sequence[ReadyShot], harmony: Harmony, skipped: Sequence[str]) -> Painting:
+    shape = (atlas.height_px, atlas.width_px)
+    texture = Texture(np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32))
+    names = tuple(shot.shot.observation.webcam for shot in ready)
+    return Painting(texture, np.full(shape, -1, np.int16), np.zeros(shape, np.uint8), names, harmony, tuple(skipped))
+
+
+def _place(painting: Painting, tile: Tile, part: _Painted) -> None:
+    rows, columns = tile.window
+    painting.texture.values[rows, columns] = part.values
+    painting.texture.weight[rows, columns] = part.weight
+    painting.best[rows, columns] = part.best
+    painting.coverage[rows, columns] = part.coverage
+
+
+def _kept_tile(folder: Path | None, tile: Tile, build: Callable[[], _Painted]) -> _Painted:
+    """A tile from the folder of finished ones, or painted and put there."""
+    if folder is None:
+        return build()
+    path = folder / f"{tile.name}.npz"
+    if path.is_file():
+        with np.load(path, allow_pickle=False) as stored:
+            return _Painted(*(stored[name] for name in _Painted.__dataclass_fields__))
+    part = build()
+    with atomic_path(path) as temporary:
+        np.savez(temporary, **{name: getattr(part, name) for name in _Painted.__dataclass_fields__})
+    return part

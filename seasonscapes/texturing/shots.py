@@ -1,0 +1,197 @@
+"""Pictures made ready for painting: masked, guarded, and sampled at texels without aliasing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from seasonscapes.cameras.observation import Observation
+from seasonscapes.cameras.pinhole import ray_directions
+from seasonscapes.rendering.gather import Occluder
+from seasonscapes.rendering.gbuffer import trace_gbuffer
+from seasonscapes.rendering.scene import RenderScene
+from seasonscapes.sky.illumination import AerialPerspective
+from seasonscapes.texturing.silhouette import picture_mask, pose_sigma_px, silhouette_guard
+from seasonscapes.texturing.tiles import TexelSurface, Tiling, seen_blocks
+from seasonscapes.texturing.weights import exposure_trust
+
+# What is nearer than this is rather a roof or a tree than the terrain model's ground.
+NEAR_M = 60.0
+# Sky this close above the horizon tells the colour of the airlight.
+_HORIZON_DEG = 6.0
+_FEWEST_SKY_PX = 50
+# Least share of usable pixels under a sample.
+_LEAST_COVER = 0.75
+_ROW = 1024
+# Places of each shot that are compared with other shots.
+PROBES, _PROBE_SEED = 4000, 20240918
+
+
+@dataclass(frozen=True)
+class Shot:
+    """An observation, with what painting knows of its pose and of the air before it.
+
+    Parameters
+    ----------
+    observation
+        Its image is decoded sRGB in [0, 1] as a file holds it, of unknown exposure and white balance.
+    air
+        Between this camera and the land, at that time; ``None`` for clear space.
+    pose_sigma
+        Standard deviations with the names of a calibration record; missing ones count as exact.
+    """
+
+    observation: Observation
+    air: AerialPerspective | None = None
+    pose_sigma: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def key(self) -> tuple:
+        """What orders shots, so that a painting does not depend on the order that they came in."""
+        seen = self.observation
+        return seen.webcam, seen.time, seen.camera.world_from_camera.tobytes(), seen.camera.fx
+
+
+@dataclass(frozen=True)
+class ReadyShot:
+    """A shot laid out for sampling.
+
+    Parameters
+    ----------
+    shot
+        As it came.
+    depth_m
+        ``(H, W)`` float32 distance along the rays; infinite is sky.
+    trust
+        ``(H, W)`` float32: mask × guard × exposure.
+    levels
+        Pictures of half the size each, ``(h, w, 5)`` float32: colour × usable, usable, trust.
+    blocks
+        From `tiles.seen_blocks`.
+    sky_scale
+        ``(3,)`` picture value over radiance [1 / (cd/m²)] of the sky above the horizon; NaN where there is none to see.
+    probes
+        Some thousand places that the camera sees, in a random order.
+    probe_uv
+        ``(N, 2)`` their texture coordinates.
+    """
+
+    shot: Shot
+    depth_m: np.ndarray
+    trust: np.ndarray
+    levels: tuple[np.ndarray, ...]
+    blocks: np.ndarray
+    sky_scale: np.ndarray
+    probes: TexelSurface
+    probe_uv: np.ndarray
+
+
+def ready_shot(shot: Shot, terrain: Occluder, cut: Tiling, *, near_m: float = NEAR_M, reject: np.ndarray | None = None,
+               guard: bool = True) -> ReadyShot:  # fmt: skip
+    """Look at the land from a shot's camera and mark what of the picture can be trusted.
+
+    Parameters
+    ----------
+    near_m
+        Pixels that show terrain nearer than this are left out [m].
+    reject
+        ``(H, W)`` bool, pixels to leave out too (`foreground.foreground_mask`).
+    guard
+        Keep away from silhouettes.
+    """
+    seen = shot.observation
+    # The bare terrain serves as the scene of a G-buffer: that looks at geometry alone.
+    gbuffer = trace_gbuffer(RenderScene(terrain.mi_scene, terrain.mi_terrain, None, 0.0), seen.camera)  # type: ignore[arg-type]
+    depth = gbuffer.depth.astype(np.float32)
+    usable = picture_mask(seen.image, seen.mask, depth, near_m=near_m)
+    if reject is not None:
+        usable &= ~reject
+    image = np.where(usable[..., None], seen.image, 0.0).astype(np.float32)
+    trust = usable * exposure_trust(image)
+    if guard:
+        trust = trust * silhouette_guard(depth, pose_sigma_px(seen.camera, shot.pose_sigma, depth))
+    pixel = np.flatnonzero(trust > 0.5)
+    pixel = np.random.default_rng(_PROBE_SEED).permutation(pixel)[:PROBES]
+    side_m = _texel_side_m(cut)
+    probes = TexelSurface(pixel, np.full(len(pixel), -1, np.int32), gbuffer.position.reshape(-1, 3)[pixel].astype(float),
+                          gbuffer.normal.reshape(-1, 3)[pixel].astype(np.float32),
+                          np.full(len(pixel), side_m, np.float32))  # fmt: skip
+    return ReadyShot(shot, depth, trust.astype(np.float32), _levels(image, usable, trust), seen_blocks(gbuffer.uv, cut),
+                     _sky_scale(shot, depth), probes, gbuffer.uv.reshape(-1, 2)[pixel].astype(np.float32))  # fmt: skip
+
+
+def _texel_side_m(cut: Tiling) -> float:
+    """Side of a texel were the atlas used throughout [m]."""
+    extent = np.ptp(cut.terrain.vertices[:, :2], axis=0).astype(float)
+    return float(np.sqrt(extent[0] * extent[1] / (cut.width_px * cut.height_px)))
+
+
+def _levels(image: np.ndarray, usable: np.ndarray, trust: np.ndarray) -> tuple[np.ndarray, ...]:
+    levels = [np.dstack([image, usable.astype(np.float32), trust.astype(np.float32)]).astype(np.float32)]
+    while min(levels[-1].shape[:2]) >= 16 and len(levels) < 7:
+        height, width = levels[-1].shape[:2]
+        # Even sizes, so that a level is exactly twice as coarse as the one before.
+        even = levels[-1][: height // 2 * 2, : width // 2 * 2]
+        levels.append(even.reshape(height // 2, 2, width // 2, 2, 5).mean(axis=(1, 3)))
+    return tuple(levels)
+
+
+def _sky_scale(shot: Shot, depth_m: np.ndarray) -> np.ndarray:
+    seen = shot.observation
+    if shot.air is None:
+        return np.full(3, np.nan)
+    direction = ray_directions(seen.camera)
+    sky = ~np.isfinite(depth_m) & seen.mask & np.isfinite(seen.image).all(axis=2)
+    # A step away from the skyline, and nothing clipped.
+    sky = cv2.erode(sky.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool) & (seen.image.max(axis=2) < 0.96)
+    if not sky.any():
+        return np.full(3, np.nan)
+    elevation_deg = np.degrees(np.arcsin(np.clip(direction[..., 2], -1.0, 1.0)))
+    sky &= elevation_deg <= elevation_deg[sky].min() + _HORIZON_DEG
+    if np.count_nonzero(sky) < _FEWEST_SKY_PX:
+        return np.full(3, np.nan)
+    pixel = np.flatnonzero(sky)
+    pixel = pixel[:: max(1, len(pixel) // 4000)]
+    expected = shot.air(np.full(len(pixel), np.inf), direction.reshape(-1, 3)[pixel])[1]
+    found = seen.image.reshape(-1, 3)[pixel]
+    return np.median(found / np.maximum(expected, 1e-9), axis=0)
+
+
+def sample_shot(ready: ReadyShot, pixel: np.ndarray, px_per_texel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Picture values ``(N, 3)`` and trust ``(N,)`` at pixels ``(N, 2)``; a texel larger than a pixel gets the mean under it.
+
+    Trust is 0, and the value NaN, where less than three quarters of what lies under the texel is usable.
+    """
+    level = np.clip(np.log2(np.maximum(px_per_texel, 1.0)), 0.0, len(ready.levels) - 1.0)
+    below = np.minimum(level.astype(int), len(ready.levels) - 1)
+    mixed = np.zeros((len(pixel), 5), np.float32)
+    for number in np.unique(below):
+        index = np.flatnonzero(below == number)
+        share = (level[index] - number).astype(np.float32)[:, None]
+        value = _look_up(ready.levels[number], pixel[index], number)
+        blur = np.flatnonzero(share[:, 0] > 0.0)
+        if len(blur):
+            coarse = _look_up(ready.levels[min(number + 1, len(ready.levels) - 1)], pixel[index[blur]], number + 1)
+            value[blur] += share[blur] * (coarse - value[blur])
+        mixed[index] = value
+    cover = mixed[:, 3]
+    sound = cover >= _LEAST_COVER
+    with np.errstate(divide="ignore", invalid="ignore"):
+        value = np.where(sound[:, None], mixed[:, :3] / cover[:, None], np.nan)
+    return np.maximum(value, 0.0), np.where(sound, np.clip(mixed[:, 4], 0.0, 1.0), 0.0)
+
+
+def _look_up(level: np.ndarray, pixel: np.ndarray, number: int) -> np.ndarray:
+    """Bilinear values ``(N, 5)``. OpenCV's maps are pictures, so the list is folded into one."""
+    count = len(pixel)
+    rows = -(-count // _ROW)
+    place = np.zeros((rows * _ROW, 2), np.float32)
+    place[:count] = pixel / 2.0**number - 0.5
+    place = place.reshape(rows, _ROW, 2)
+    # A picture of five channels is one of four and one of one.
+    parts = [cv2.remap(level[..., part], place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+             for part in (slice(0, 4), slice(4, 5))]  # fmt: skip
+    return np.concatenate([part.reshape(rows * _ROW, -1)[:count] for part in parts], axis=1)
