@@ -19,11 +19,21 @@ app = App(
     help_format="plaintext",
 )
 app.command("seasonscapes.commands.render:render", help="Render a view of a place at a date and hour.")
+app.command("seasonscapes.commands.timelapse:timelapse", help="Film a view through hours or seasons.")
+app.command(
+    "seasonscapes.commands.lit:lit_texture", name="lit-texture", help="Export a place's texture as lit at an hour."
+)
+app.command(
+    "seasonscapes.commands.lit:irradiance",
+    help="Map what the sun and sky give the ground, at an hour or over a period.",
+)
 app.command("seasonscapes.commands.sky:sky", help="Tell the light of a place at an instant, and picture the dome.")
 app.command("seasonscapes.commands.terrain:terrain", help="Build a place's terrain and report how good it is.")
 app.command("seasonscapes.commands.webcams:webcams", help="List, check and map a scene's webcams and their pictures.")
 app.command("seasonscapes.commands.calibrate:calibrate", help="Calibrate a webcam from matched points or the skyline.")
-app.command("seasonscapes.commands.calibrate:annotate", help="Match points of a photograph and the terrain on a local page.")
+app.command(
+    "seasonscapes.commands.calibrate:annotate", help="Match points of a photograph and the terrain on a local page."
+)
 app.command("seasonscapes.commands.demo:demo", help="Picture the embedded scene through a day, a night and a year.")
 app.command("seasonscapes.commands.doctor:doctor", help="Say what this machine can do, and what is missing.")
 

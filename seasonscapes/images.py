@@ -138,7 +138,8 @@ def read_image_linear(path: str | os.PathLike) -> np.ndarray:
     return linear_from_srgb(encoded[..., ::-1].astype(np.float32) / top)
 
 
-def write_exr(path: str | os.PathLike, layers: Mapping[str, np.ndarray], *, header: Mapping | None = None) -> None:
+def write_exr(path: str | os.PathLike, layers: Mapping[str, np.ndarray], *, header: Mapping | None = None,
+              half: bool = False) -> None:  # fmt: skip
     """Write float32 layers to one OpenEXR file, atomically.
 
     Parameters
@@ -149,12 +150,14 @@ def write_exr(path: str | os.PathLike, layers: Mapping[str, np.ndarray], *, head
         ``position`` become ``.X .Y .Z`` and ``uv`` becomes ``.U .V``.
     header
         Attributes. Strings and floats are stored as such, everything else as JSON text.
+    half
+        Store half precision: values up to 65504, three digits.
     """
     import OpenEXR
 
     channels: dict[str, np.ndarray] = {}
     for name, values in layers.items():
-        values = np.ascontiguousarray(values, np.float32)
+        values = np.ascontiguousarray(values, np.float16 if half else np.float32)
         prefix = f"{name}." if name else ""
         if values.ndim == 2:
             channels[prefix + ("Z" if name == "depth" else "A" if name in ("mask", "alpha") else "Y")] = values

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from datetime import datetime
+from datetime import date, datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -236,6 +238,64 @@ def albedo_for(place: Place, date: datetime) -> Texture:
     inputs.update(imagery=imagery.model_copy(update={"file": Path(imagery.file).name}), hash=file_hash(imagery.file))
     return build_once(place.workspace, f"{place.scene.name}/albedo", inputs, suffix=".npz", save=save_texture,
                       load=load_texture, build=lambda: _baked_image(place))  # fmt: skip
+
+
+@dataclass(frozen=True)
+class DatedAlbedo:
+    """An albedo texture, the day it is of, and a name of its content."""
+
+    day: date
+    content: str
+    load: Callable[[], Texture]
+
+
+# A synthetic place's albedo is known for every day; films pass through those of these days of each month.
+_FILM_DAYS = (1, 16)
+
+
+def dated_albedos(place: Place, given: Sequence[tuple[str, str]] = ()) -> list[DatedAlbedo]:
+    """The albedos that a place wears through the year, by date.
+
+    Parameters
+    ----------
+    given
+        Pairs of date (ISO 8601) and file (of `terrain.surface.save_texture`) to use in place of the scene's own.
+
+    Raises
+    ------
+    InputError
+        For a date that is none, a file that is missing, or a texture that is not of this place's atlas.
+    """
+    if given:
+        return sorted((_given_albedo(place, day, Path(name)) for day, name in given), key=lambda each: each.day)
+    if place.synthetic is None:
+        moment = datetime(2024, 7, 1)
+        imagery = place.scene.imagery
+        content = "grey" if imagery is None else f"{imagery.model_dump_json()}:{file_hash(imagery.file)}"
+        return [DatedAlbedo(moment.date(), content, lambda: albedo_for(place, moment))]
+    moments = [datetime(2024, month, day) for month in range(1, 13) for day in _FILM_DAYS]
+    return [DatedAlbedo(each.date(), f"synthetic:{REVISIONS['albedo']}:{each.timetuple().tm_yday}",
+                        partial(albedo_for, place, each)) for each in moments]  # fmt: skip
+
+
+def _given_albedo(place: Place, day: str, path: Path) -> DatedAlbedo:
+    try:
+        when = date.fromisoformat(day)
+    except ValueError:
+        raise InputError("--albedo", "not a date", got=day,
+                         expected="DATE=FILE.npz, such as 2024-07-20=summer.npz") from None  # fmt: skip
+    if not path.is_file():
+        raise InputError("--albedo", "no such file", got=str(path))
+
+    def load() -> Texture:
+        texture = load_texture(path)
+        shape = (place.atlas.height_px, place.atlas.width_px)
+        if texture.values.shape[:2] != shape:
+            raise InputError(path, "this texture is of another atlas", got="{} × {} texels".format(*texture.values.shape[:2]),
+                             expected="{} × {}".format(*shape), cure="give the --atlas and --texel-m that it was made with")  # fmt: skip
+        return texture
+
+    return DatedAlbedo(when, file_hash(path), load)
 
 
 def _synthetic_image(place: Place, day_of_year: int) -> Raster:

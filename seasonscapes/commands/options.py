@@ -13,7 +13,7 @@ from seasonscapes.errors import InputError
 
 if TYPE_CHECKING:
     from seasonscapes.cameras.pinhole import Camera
-    from seasonscapes.pipeline import Place
+    from seasonscapes.pipeline import MeshOptions, Place
     from seasonscapes.scene import NamedCamera, SceneFile
     from seasonscapes.sky.models import SkyModel
     from seasonscapes.workspace import Workspace
@@ -45,12 +45,17 @@ class PlaceOptions:
 
         return default_workspace() if self.workspace is None else Workspace(self.workspace)
 
+    def mesh(self) -> MeshOptions:
+        """How to build the terrain."""
+        from seasonscapes.pipeline import MeshOptions
+
+        return MeshOptions(self.mesher, self.max_error_m, self.refine, self.atlas, self.texel_m)
+
     def load(self, scene: str) -> Place:
         """The place of a scene file or bundled scene."""
-        from seasonscapes.pipeline import MeshOptions, find_scene, load_place
+        from seasonscapes.pipeline import find_scene, load_place
 
-        mesh = MeshOptions(self.mesher, self.max_error_m, self.refine, self.atlas, self.texel_m)
-        return load_place(find_scene(scene), self.folder(), options=mesh, allow_outside=self.allow_outside)
+        return load_place(find_scene(scene), self.folder(), options=self.mesh(), allow_outside=self.allow_outside)
 
 
 @Parameter(name="*")

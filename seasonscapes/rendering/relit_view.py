@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from seasonscapes.rendering.air_grid import AirPlaces, SkyGrid, air_at, air_places, open_sky, sky_grid
-from seasonscapes.rendering.gather import Occluder
+from seasonscapes.rendering.gather import Occluder, texture_at
 from seasonscapes.rendering.gbuffer import GBuffer, trace_gbuffer
 from seasonscapes.rendering.radiance import View
 from seasonscapes.rendering.reception import (
@@ -106,6 +106,31 @@ def _distances(coefficients: ViewCoefficients) -> tuple[np.ndarray, np.ndarray, 
     farthest = np.where(shown, distance, 0.0).max(axis=1)
     distance[~shown] = np.inf
     return distance.min(axis=1), farthest, distance
+
+
+def with_albedo(ready: ReadyView, albedo: np.ndarray, senders_albedo: np.ndarray) -> ReadyView:
+    """The view with other colours on the same land (another season's).
+
+    Parameters
+    ----------
+    albedo
+        ``(n, 3)`` mean albedo of the pixels, as from `transport.view_albedo`.
+    senders_albedo
+        ``(M, PLACES, 3)`` of the places that pass light on, as from `senders_albedo`.
+    """
+    points = replace(ready.senders.senders.points, albedo=np.asarray(senders_albedo, np.float32))
+    senders = replace(ready.senders.senders, points=points)
+    coefficients = replace(ready.coefficients, albedo=np.asarray(albedo, np.float32), senders=senders)
+    return replace(ready, coefficients=coefficients, senders=replace(ready.senders, senders=senders))
+
+
+def senders_albedo(coefficients: ViewCoefficients, texture: np.ndarray) -> np.ndarray:
+    """Albedo ``(M, PLACES, 3)`` of the places that pass light on, for a texture ``(R, S, 3)``."""
+    points = coefficients.senders.points
+    # Zero marks a surface that was met from its back: that stays black in every season.
+    front = np.asarray(points.albedo).max(axis=-1, keepdims=True) > 0.0
+    values = texture_at(texture, np.asarray(points.uv).reshape(-1, 2)).reshape(points.albedo.shape)
+    return np.where(front, values, 0.0).astype(np.float32)
 
 
 def relight_view(ready: ReadyView, illumination: Illumination) -> View:

@@ -154,7 +154,10 @@ def build_scene(
 
 
 def set_albedo(scene: RenderScene, albedo: np.ndarray) -> None:
-    """Replace the texture of a scene in place by one of the same size ``(R, S, 3)``; geometry and light stay."""
+    """Replace the texture of a scene in place by one of the same size ``(R, S, 3)``; geometry and light stay.
+
+    Anything with an ``mi_terrain`` will do, such as a `gather.Occluder`.
+    """
     import mitsuba as mi
 
     parameters = mi.traverse(scene.mi_terrain)
