@@ -12,8 +12,8 @@ from seasonscapes.images import atomic_path
 from seasonscapes.rendering.gather import Occluder
 from seasonscapes.terrain.atlas import Atlas
 from seasonscapes.terrain.surface import Terrain, Texture
-from seasonscapes.texturing.harmonise import Harmony, air_to, equal_gains, harmonise, land_radiance
-from seasonscapes.texturing.shots import NEAR_M, ReadyShot, Shot, ready_shot, sample_shot
+from seasonscapes.texturing.harmonise import Harmony, equal_gains, harmonise, land_radiance
+from seasonscapes.texturing.shots import NEAR_M, ReadyShot, Shot, air_to, ready_shot, sample_shot
 from seasonscapes.texturing.tiles import TILE_PX, Tile, Tiling, sees_tile, tile_blocks, tile_surface, tiles_of, tiling
 from seasonscapes.texturing.visibility import by_ray, sight_of
 from seasonscapes.texturing.weights import sharpened, texel_weight
@@ -121,7 +121,7 @@ def paint(shots: Sequence[Shot], terrain: Terrain, atlas: Atlas, occluder: Occlu
     if options.fit_gains:
         harmony = harmonise(ready, occluder, predicted=predicted, fit_haze=options.fit_haze, radiance=radiance)
     else:
-        harmony = equal_gains(ready, radiance=radiance or 1.0)
+        harmony = equal_gains(ready, radiance=radiance)
     tell(0.3)
     painting = _blank(atlas, ready, harmony, skipped)
     tiles = list(tiles_of(cut))

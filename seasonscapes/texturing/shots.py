@@ -16,13 +16,13 @@ from seasonscapes.rendering.scene import RenderScene
 from seasonscapes.sky.illumination import AerialPerspective
 from seasonscapes.texturing.silhouette import picture_mask, pose_sigma_px, silhouette_guard
 from seasonscapes.texturing.tiles import TexelSurface, Tiling, seen_blocks
-from seasonscapes.texturing.weights import exposure_trust
+from seasonscapes.texturing.weights import BRIGHTEST, exposure_trust
 
 # What is nearer than this is rather a roof or a tree than the terrain model's ground.
 NEAR_M = 60.0
 # Sky this close above the horizon tells the colour of the airlight.
 _HORIZON_DEG = 6.0
-_FEWEST_SKY_PX = 50
+_FEWEST_SKY_PX, _MOST_CLIPPED = 50, 0.05
 # Least share of usable pixels under a sample.
 _LEAST_COVER = 0.75
 _ROW = 1024
@@ -71,8 +71,11 @@ class ReadyShot:
         Pictures of half the size each, ``(h, w, 5)`` float32: colour × usable, usable, trust.
     blocks
         From `tiles.seen_blocks`.
-    sky_scale
-        ``(3,)`` picture value over radiance [1 / (cd/m²)] of the sky above the horizon; NaN where there is none to see.
+    sky_value, sky_radiance
+        ``(3,)`` of the sky above the horizon: as the picture shows it, and by the sky model [cd/m²]; NaN where there is
+        no sky to see, or most of it is clipped.
+    median_value
+        ``(3,)`` median picture value of the land that can be trusted.
     probes
         Some thousand places that the camera sees, in a random order.
     probe_uv
@@ -84,7 +87,9 @@ class ReadyShot:
     trust: np.ndarray
     levels: tuple[np.ndarray, ...]
     blocks: np.ndarray
-    sky_scale: np.ndarray
+    sky_value: np.ndarray
+    sky_radiance: np.ndarray
+    median_value: np.ndarray
     probes: TexelSurface
     probe_uv: np.ndarray
 
@@ -119,8 +124,9 @@ def ready_shot(shot: Shot, terrain: Occluder, cut: Tiling, *, near_m: float = NE
     probes = TexelSurface(pixel, np.full(len(pixel), -1, np.int32), gbuffer.position.reshape(-1, 3)[pixel].astype(float),
                           gbuffer.normal.reshape(-1, 3)[pixel].astype(np.float32),
                           np.full(len(pixel), side_m, np.float32))  # fmt: skip
+    median = np.median(image.reshape(-1, 3)[pixel], axis=0) if len(pixel) else np.full(3, np.nan)
     return ReadyShot(shot, depth, trust.astype(np.float32), _levels(image, usable, trust), seen_blocks(gbuffer.uv, cut),
-                     _sky_scale(shot, depth), probes, gbuffer.uv.reshape(-1, 2)[pixel].astype(np.float32))  # fmt: skip
+                     *_horizon_sky(shot, depth), median, probes, gbuffer.uv.reshape(-1, 2)[pixel].astype(np.float32))  # fmt: skip
 
 
 def _texel_side_m(cut: Tiling) -> float:
@@ -139,25 +145,38 @@ def _levels(image: np.ndarray, usable: np.ndarray, trust: np.ndarray) -> tuple[n
     return tuple(levels)
 
 
-def _sky_scale(shot: Shot, depth_m: np.ndarray) -> np.ndarray:
-    seen = shot.observation
+def _horizon_sky(shot: Shot, depth_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Median colour of the lowest sky in the picture that is not clipped, and by the shot's air."""
+    seen, unknown = shot.observation, np.full(3, np.nan)
     if shot.air is None:
-        return np.full(3, np.nan)
+        return unknown, unknown
     direction = ray_directions(seen.camera)
     sky = ~np.isfinite(depth_m) & seen.mask & np.isfinite(seen.image).all(axis=2)
-    # A step away from the skyline, and nothing clipped.
-    sky = cv2.erode(sky.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool) & (seen.image.max(axis=2) < 0.96)
-    if not sky.any():
-        return np.full(3, np.nan)
-    elevation_deg = np.degrees(np.arcsin(np.clip(direction[..., 2], -1.0, 1.0)))
-    sky &= elevation_deg <= elevation_deg[sky].min() + _HORIZON_DEG
+    # A step away from the skyline, whose pixels show both.
+    sky = cv2.erode(sky.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
     if np.count_nonzero(sky) < _FEWEST_SKY_PX:
-        return np.full(3, np.nan)
+        return unknown, unknown
     pixel = np.flatnonzero(sky)
-    pixel = pixel[:: max(1, len(pixel) // 4000)]
-    expected = shot.air(np.full(len(pixel), np.inf), direction.reshape(-1, 3)[pixel])[1]
-    found = seen.image.reshape(-1, 3)[pixel]
-    return np.median(found / np.maximum(expected, 1e-9), axis=0)
+    elevation_deg = np.degrees(np.arcsin(np.clip(direction[..., 2].ravel()[pixel], -1.0, 1.0)))
+    found = seen.image.reshape(-1, 3)[pixel].astype(float)
+    clipped = found.max(axis=1) > BRIGHTEST
+    # The lowest band that is not clipped: what is left of a clipped one would be the darkest part of it.
+    for low in np.arange(elevation_deg.min(), elevation_deg.max(), 0.5 * _HORIZON_DEG):
+        band = np.flatnonzero((elevation_deg >= low) & (elevation_deg < low + _HORIZON_DEG))
+        if len(band) >= _FEWEST_SKY_PX and clipped[band].mean() <= _MOST_CLIPPED:
+            band = band[:: max(1, len(band) // 4000)]
+            expected = shot.air(np.full(len(band), np.inf), direction.reshape(-1, 3)[pixel[band]])[1]
+            return np.median(found[band], axis=0), np.maximum(np.median(expected, axis=0), 1e-9)
+    return unknown, unknown
+
+
+def air_to(ready: ReadyShot, position_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Transmittance and airlight ``(N, 3)`` of the shot's air up to places ``(N, 3)`` ENU."""
+    if ready.shot.air is None:
+        return np.ones(position_m.shape), np.zeros(position_m.shape)
+    offset = position_m - ready.shot.observation.camera.position_m
+    distance = np.linalg.norm(offset, axis=1)
+    return ready.shot.air(distance, offset / np.maximum(distance, 1e-6)[:, None])
 
 
 def sample_shot(ready: ReadyShot, pixel: np.ndarray, px_per_texel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,7 @@ _ENOUGH_PX = 1.5
 SHARPNESS = 4.0
 # Trust in pixels that are clipped or nearly black: they speak only where nothing else does.
 _CLIPPED_TRUST = 0.02
-_BRIGHTEST, _DARKEST = 0.96, 0.002
+BRIGHTEST, DARKEST = 0.9, 0.002
 
 
 def texel_weight(cosine: np.ndarray, px_per_texel: np.ndarray) -> np.ndarray:
@@ -29,7 +29,7 @@ def texel_weight(cosine: np.ndarray, px_per_texel: np.ndarray) -> np.ndarray:
 def exposure_trust(image: np.ndarray) -> np.ndarray:
     """Trust ``(H, W)`` float32 in the tones of a picture ``(H, W, 3)`` in [0, 1]: low where clipped or nearly black."""
     brightest = image.max(axis=2)
-    return np.where((brightest < _BRIGHTEST) & (brightest > _DARKEST), 1.0, _CLIPPED_TRUST).astype(np.float32)
+    return np.where((brightest < BRIGHTEST) & (brightest > DARKEST), 1.0, _CLIPPED_TRUST).astype(np.float32)
 
 
 def sharpened(weight: np.ndarray) -> np.ndarray:
