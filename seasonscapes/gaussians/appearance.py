@@ -1,0 +1,218 @@
+"""From a light to the colour of every Gaussian: physical shading, then an affine correction that a small network gives.
+
+    c = γ ĉ + β,   (γ − 1, β) = MLP([Gaussian embedding, time embedding, physical features, ĉ])
+
+The affine form is that of WildGaussians (Kulhanek et al. 2024, arXiv:2407.08447), whose ĉ is a free colour and whose
+time embedding a free vector for each photograph. Here ĉ is what physics says under this very sun and sky, the time
+embedding is a continuous function of the instant, and the last layer starts at zero: untrained, the model is physics.
+
+    ĉ = a · (Σ V(ω) (n·ω)⁺ E_ω + s E_sky + b E_bounce)
+
+with V the horizon's soft visibility. Colours are radiance × π over the luminance of the horizontal illuminance, so that
+noon and dusk are of one size. `KINDS` switches parts off for comparison.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import nn
+
+from seasonscapes.gaussians.transport import (
+    AZIMUTHS,
+    HORIZON_RANGE_RAD,
+    SOFTNESS_RAD,
+    LightState,
+    Transport,
+    bounce_terms,
+)
+from seasonscapes.sky.illumination import LUMINANCE_WEIGHTS
+
+# What the network is told. `code` is a free vector for each training time, as WildGaussians has; `sun` the time
+# embedding alone; `physical` no network at all; `full` everything.
+KINDS = ("code", "sun", "physical", "full")
+EMBEDDING, CODE, HIDDEN = 12, 32, 64
+TIME_FEATURES, PHYSICAL_FEATURES = 14, 8
+BODIES = 2
+
+
+@dataclass(frozen=True)
+class LightTensors:
+    """T light states as tensors: ``direction (T, 2, 3)``, ``illuminance (T, 2, 3)``, ``sky (T, r, 3)``,
+    ``bounce (T, 10, 3)``, ``features (T, 14)``; all but the first divided by the luminance of the horizontal illuminance."""
+
+    direction: torch.Tensor
+    illuminance: torch.Tensor
+    sky: torch.Tensor
+    bounce: torch.Tensor
+    features: torch.Tensor
+
+
+def light_tensors(states: Sequence[LightState]) -> LightTensors:
+    """Stack light states; bodies beyond two are left out, missing ones send nothing."""
+    rows = [_light_rows(state) for state in states]
+    return LightTensors(*(torch.as_tensor(np.stack(column), dtype=torch.float32) for column in zip(*rows, strict=True)))
+
+
+def _light_rows(state: LightState) -> tuple[np.ndarray, ...]:
+    direction, illuminance = np.zeros((BODIES, 3)), np.zeros((BODIES, 3))
+    direction[:, 2] = 1.0
+    count = min(len(state.bodies[0]), BODIES)
+    direction[:count], illuminance[:count] = state.bodies[0][:count], state.bodies[1][:count] / state.global_lx
+    terms = np.concatenate([bounce_terms(direction), np.zeros((BODIES, 1))], axis=1)
+    bounce = terms.T @ illuminance
+    bounce[-1] = state.sky_lx / state.global_lx
+    return direction, illuminance, state.sky * np.pi / state.global_lx, bounce, time_features(state)
+
+
+def time_features(state: LightState) -> np.ndarray:
+    """What an instant is, ``(14,)``: sun's direction, strength and colour, the sky's share and colour, the season."""
+    season = 2.0 * np.pi * state.day / 365.2425
+    body = state.bodies[0][0] if len(state.bodies[0]) else np.zeros(3)
+    strength = state.bodies[1][0] / state.global_lx if len(state.bodies[0]) else np.zeros(3)
+    sky = state.sky_lx / state.global_lx
+    return np.array([*body, float(body @ body > 0.0), np.log1p(strength @ LUMINANCE_WEIGHTS), strength[0] - strength[2],
+                     sky @ LUMINANCE_WEIGHTS, sky[2] - sky[0], (np.log10(state.global_lx) - 4.5) / 2.0,
+                     np.sin(season), np.cos(season), np.sin(2.0 * season), np.cos(2.0 * season), 1.0])  # fmt: skip
+
+
+def fourier_embedding(means: np.ndarray, size: int = EMBEDDING, *, seed: int = 0) -> np.ndarray:
+    """Sines and cosines of centres ``(N, size)``, as WildGaussians begins with: coarse places first, a little noise."""
+    centred = means - np.median(means, axis=0)
+    unit = 0.5 * centred / np.quantile(np.abs(centred), 0.97) + 0.5
+    waves = [wave(2.0 * np.pi * 2.0**octave * unit) for octave in range(-(-size // 6)) for wave in (np.sin, np.cos)]
+    noise = np.random.default_rng(seed).normal(0.0, 1e-4, (len(means), size))
+    return (np.concatenate(waves, axis=1)[:, :size] + noise).astype(np.float32)
+
+
+class Appearance(nn.Module):
+    """Colours of N Gaussians under a light.
+
+    Parameters
+    ----------
+    kind
+        One of `KINDS`.
+    albedo, around
+        ``(N, 3)`` of the discs, and of the land around them.
+    transport
+        Needed by ``physical`` and ``full``; for the others it only says how many there are.
+    embedding
+        ``(N, D)`` from `fourier_embedding`.
+    times
+        T, how many free codes ``code`` has.
+    """
+
+    def __init__(self, kind: str, albedo: np.ndarray, around: np.ndarray, transport: Transport, embedding: np.ndarray, *,
+                 times: int = 1, seed: int = 0):  # fmt: skip
+        super().__init__()
+        if kind not in KINDS:
+            raise ValueError(f"kind: got {kind!r}, expected one of {', '.join(KINDS)}")
+        count = len(albedo)
+        self.kind = kind
+        for name, values in (("albedo", albedo), ("around", around)):
+            self.register_buffer(name, torch.as_tensor(np.asarray(values, np.float32)))
+        low, high = HORIZON_RANGE_RAD
+        self.register_buffer("normals", torch.as_tensor(transport.normals))
+        self.register_buffer("horizon", torch.as_tensor(transport.horizon.reshape(-1)))
+        self.horizon_step, self.horizon_low = (high - low) / 255.0, low
+        self.register_buffer("sky", torch.as_tensor(transport.sky.astype(np.float32) * transport.sky_scale))
+        self.register_buffer("bounce", torch.as_tensor(transport.bounce.astype(np.float32)))
+        self.register_buffer("open_sky", torch.as_tensor(transport.open_sky))
+        # Logarithms of gains on colour, sky and bounce; the horizon's shift [0.01 rad] and logarithm of its softness.
+        self.log_colour = nn.Parameter(torch.zeros(count, 3))
+        self.log_gain = nn.Parameter(torch.zeros(count, 2))
+        self.edge = nn.Parameter(torch.tensor([0.0, np.log(SOFTNESS_RAD)], dtype=torch.float32).repeat(count, 1))
+        if kind != "physical":
+            generator = torch.Generator().manual_seed(seed)
+            self.embedding = nn.Parameter(torch.as_tensor(embedding, dtype=torch.float32))
+            if kind == "code":
+                self.codes = nn.Parameter(0.01 * torch.randn(times, CODE, generator=generator))
+            self.mlp = _network(self._inputs(embedding.shape[1]), generator)
+
+    def _inputs(self, embedding: int) -> int:
+        return (
+            embedding + 3 + {"code": CODE, "sun": TIME_FEATURES, "full": TIME_FEATURES + PHYSICAL_FEATURES}[self.kind]
+        )
+
+    def forward(self, index: torch.Tensor, time: torch.Tensor, lights: LightTensors,
+                code: torch.Tensor | None = None) -> torch.Tensor:  # fmt: skip
+        """Colours ``(n, 3)`` of Gaussians ``index (n,)`` at ``time (n,)``, or all at one time ``()``.
+
+        ``code (32,)`` takes the place of the codes of ``kind="code"``.
+        """
+        if self.kind in ("code", "sun"):
+            base = self.albedo[index] * self.log_colour[index].exp()
+            features: list[torch.Tensor] = []
+        else:
+            irradiance, features = self._physical(index, time, lights)
+            base = self.albedo[index] * self.log_colour[index].exp() * irradiance
+        if self.kind == "physical":
+            return base
+        if self.kind == "code":
+            known = self.codes[time] if code is None else code
+        else:
+            known = lights.features[time]
+        parts = [self.embedding[index], base, known.expand(len(index), -1), *features]
+        gamma, beta = self.mlp(torch.cat(parts, dim=1)).split(3, dim=1)
+        return ((1.0 + gamma) * base + 0.1 * beta).clamp(min=0.0)
+
+    def _physical(self, index: torch.Tensor, time: torch.Tensor, lights: LightTensors):
+        """Irradiance ``(n, 3)`` and features for the network, each ``(n, k)``."""
+        normals, gain = self.normals[index], self.log_gain[index].exp()
+        total, told = torch.zeros(len(index), 3), []
+        for body in range(BODIES):
+            direction, illuminance = lights.direction[time, body], lights.illuminance[time, body]
+            if body and not bool(illuminance.any()):
+                continue
+            cosine = (normals * direction).sum(1)
+            seen = self.visibility(index, direction) * cosine.clamp(min=0.0)
+            total = total + seen[:, None] * illuminance
+            if body == 0:
+                told = [seen[:, None], cosine[:, None]]
+        if time.ndim:
+            sky = torch.einsum("nr,nrc->nc", self.sky[index], lights.sky[time])
+            bounce = torch.einsum("nk,nkc->nc", self.bounce[index], lights.bounce[time])
+        else:
+            sky, bounce = self.sky[index] @ lights.sky[time], self.bounce[index] @ lights.bounce[time]
+        sky = sky.clamp(min=0.0) * gain[:, :1]
+        bounce = bounce.clamp(min=0.0) * self.around[index] * gain[:, 1:]
+        told += [self.open_sky[index, None], sky[:, 1:2], bounce[:, 1:2], normals]
+        return total + sky + bounce, told
+
+    def visibility(self, index: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
+        """Share ``(n,)`` of each disc that a direction ``(3,)`` or directions ``(n, 3)`` reach."""
+        elevation = torch.asin(direction[..., 2].clamp(-1.0, 1.0))
+        turn = torch.atan2(direction[..., 0], direction[..., 1]) * (AZIMUTHS / (2.0 * np.pi))
+        column = torch.floor(turn)
+        share, first = turn - column, index * AZIMUTHS
+        column = column.long()
+        left = self.horizon[first + column % AZIMUTHS].float()
+        right = self.horizon[first + (column + 1) % AZIMUTHS].float()
+        angle = (left + (right - left) * share) * self.horizon_step + self.horizon_low
+        shift, softness = self.edge[index].unbind(1)
+        return torch.sigmoid((elevation - angle - 0.01 * shift) / softness.exp())
+
+
+def _network(inputs: int, generator: torch.Generator) -> nn.Sequential:
+    layers = [nn.Linear(inputs, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, 6)]
+    for layer in layers[:-1:2]:
+        bound = (6.0 / layer.in_features) ** 0.5
+        with torch.no_grad():
+            layer.weight.copy_(bound * (2.0 * torch.rand(layer.weight.shape, generator=generator) - 1.0))
+            layer.bias.zero_()
+    nn.init.zeros_(layers[-1].weight)
+    nn.init.zeros_(layers[-1].bias)
+    return nn.Sequential(*layers)
+
+
+@torch.no_grad()
+def colours_at(appearance: Appearance, state: LightState, *, code: torch.Tensor | None = None) -> np.ndarray:
+    """Colours ``(N, 3)`` float32 of all Gaussians under a light; radiance is colour × ``state.global_lx`` / π."""
+    lights, time = light_tensors([state]), torch.zeros((), dtype=torch.long)
+    count = len(appearance.albedo)
+    parts = [appearance(torch.arange(start, min(start + 32768, count)), time, lights, code)
+             for start in range(0, count, 32768)]  # fmt: skip
+    return torch.cat(parts).numpy()
