@@ -96,7 +96,9 @@ def low_cameras(terrain: Terrain, count: int, size_px: tuple[int, int], seed: in
     return chosen
 
 
-def _camera(position: np.ndarray, heading_deg: float, pitch_deg: float, fov_deg: float, size: tuple[int, int]) -> Camera:
+def _camera(
+    position: np.ndarray, heading_deg: float, pitch_deg: float, fov_deg: float, size: tuple[int, int]
+) -> Camera:
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation_from_angles(heading_deg, pitch_deg), position
     focal = 0.5 * size[0] / np.tan(np.radians(fov_deg) / 2.0)

@@ -1,9 +1,11 @@
 """Albedo in closed form: robust least squares of all photographs' pixels over texels, with gains projected out.
 
 For photograph i and channel c let ``m(a) = T · M a + A`` be the radiance that albedo ``a`` would send to the camera
-(`forward`) and ``y`` the picture's linear values. With inverse gain h, ``h y = m(a)``: linear in both. The gain of each
-picture is eliminated (variable projection: Golub & Pereyra 1973, doi:10.1137/0710036), sky pixels joining its equation,
-since their radiance is known physics; that leaves one sparse linear system in ``a``, solved by conjugate gradients.
+(`forward`) and ``y`` the picture's linear values. With inverse gain h, ``h y = m(a)``: linear in both. Where a picture
+shows sky, h is the ratio of the sky's known radiance to the picture's; the gains of pictures without sky are eliminated
+(variable projection: Golub & Pereyra 1973, doi:10.1137/0710036), which leaves one sparse linear system in ``a``, solved
+by conjugate gradients. Projecting all gains, sky pixels among the equations, lets the scale of everything shrink: terrain
+pixels outnumber the sky's, and any misfit of theirs is least where all is dark.
 Residuals are weighed by what camera and model can promise, and re-weighted by Cauchy's function, so that houses, clouds'
 shadows and mistaken pixels fade.
 """
@@ -11,7 +13,7 @@ shadows and mistaken pixels fade.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -24,6 +26,8 @@ from seasonscapes.sky.illumination import Illumination
 Progress = Callable[[float], None]
 # Albedos of nature lie within these; fresh snow is 0.95 at most, lakes and conifers reflect 2 %.
 LOWEST, HIGHEST = 0.004, 0.98
+# Sky pixels that fix a gain, and how far they keep from sun and moon, whose glare and disc say nothing.
+_FEWEST_SKY, _GLARE_DEG = 100, 8.0
 
 
 @dataclass(frozen=True)
@@ -65,7 +69,7 @@ class Effort:
 
     rounds: int = 5
     iterations: int = 12
-    smoothness: float = 2e-4
+    smoothness: float = 2e-3
 
 
 @dataclass(frozen=True)
@@ -171,11 +175,11 @@ class _Rows:
     inverse_gain: np.ndarray  # (3,)
     suns: list[np.ndarray]
     weight: np.ndarray | None = None  # (n, 3)
-    sky_weight: np.ndarray | None = None  # (K, 3)
 
     @property
-    def free(self) -> bool:
-        return self.shot.gain is None
+    def projected(self) -> bool:
+        """Whether the gain is eliminated: neither given nor fixed by the sky."""
+        return self.shot.gain is None and len(self.sky_picture) < _FEWEST_SKY
 
 
 def solve_albedo(land: Land, shots: Sequence[Shot], *, trust: Trust = LINEAR, effort: Effort = Effort(),
@@ -234,8 +238,10 @@ def _rows(shot: Shot, trust: Trust, size: int) -> _Rows:
     terrain, sky = footprints.pixel, shot.seen.sky.pixel
     whole = whole_pixels(footprints) & usable[terrain]
     transmittance, airlight = air_between(shot.seen, shot.light, len(terrain))
-    sky = sky[usable[sky]]
-    chosen = np.isin(shot.seen.sky.pixel, sky)
+    chosen = usable[sky]
+    for body in luminaries(shot.light):
+        chosen &= shot.seen.sky.direction @ np.asarray(body.direction) < np.cos(np.radians(_GLARE_DEG))
+    sky = sky[chosen]
     radiance = sky_seen(shot.seen, shot.light)[chosen] if len(shot.seen.sky.pixel) else np.zeros((0, 3), np.float32)
     suns = [np.asarray(body.normal_illuminance_lx, np.float32) for body in luminaries(shot.light)]
     values = np.nan_to_num(picture[terrain].astype(np.float32))
@@ -244,6 +250,8 @@ def _rows(shot: Shot, trust: Trust, size: int) -> _Rows:
                  np.ones(3), suns)  # fmt: skip
     if shot.gain is not None:
         rows.inverse_gain = 1.0 / shot.gain
+    elif not rows.projected:
+        rows.inverse_gain = _median_ratio(rows.sky_radiance, rows.sky_picture)
     return rows
 
 
@@ -265,7 +273,7 @@ def _require_usable(rows: list[_Rows]) -> None:
     ]
     if len(dark) == len(rows):
         raise ValueError("solve_albedo: no photograph has any light")
-    anchored = any(not row.free or len(row.sky_picture) or row.airlight.max() > 0.0 for row in rows)
+    anchored = any(not row.projected or row.airlight.max() > 0.0 for row in rows)
     if not anchored:
         raise ValueError("solve_albedo: nothing fixes the exposure: give a gain, or photographs that show sky")
 
@@ -316,51 +324,42 @@ def _weigh(rows: list[_Rows], albedo: np.ndarray, trust: Trust, *, robust: bool)
     for row in rows:
         model, sun = _model(row, albedo)
         radiance = model + row.airlight
-        if row.free:
-            row.inverse_gain = _inverse_gain(row, radiance, trust)
+        if row.projected:
+            row.inverse_gain = _projected_gain(row, radiance)
         lit = row.shot.footprints.lit[row.shot.number] if row.suns else np.zeros(len(model))
         mixed = np.nan_to_num(4.0 * lit * (1.0 - lit)).astype(np.float32)[:, None]
         noise = row.noise * row.inverse_gain.astype(np.float32)
         floor = 1e-3 * float(np.median(radiance)) + 1e-9
         variance = (trust.model * radiance) ** 2 + (trust.edge * sun * mixed) ** 2 + noise**2 + floor**2
         row.weight = np.where(row.usable, 1.0 / variance, 0.0).astype(np.float32)
-        sky_noise = _picture_noise(row.sky_picture, trust) * row.inverse_gain.astype(np.float32)
-        sky_variance = (trust.sky * row.sky_radiance) ** 2 + sky_noise**2 + floor**2
-        row.sky_weight = (1.0 / sky_variance).astype(np.float32)
         if robust:
             h = row.inverse_gain.astype(np.float32)
             row.weight *= _cauchy((h * row.picture - radiance) * np.sqrt(row.weight), row.usable)
-            row.sky_weight *= _cauchy((h * row.sky_picture - row.sky_radiance) * np.sqrt(row.sky_weight), None)
 
 
-def _cauchy(normal: np.ndarray, usable: np.ndarray | None) -> np.ndarray:
+def _cauchy(normal: np.ndarray, usable: np.ndarray) -> np.ndarray:
     """Cauchy's weights of residuals that should have unit variance; one doubtful channel makes the pixel doubtful."""
     worst = np.abs(normal).max(axis=1, keepdims=True)
-    counted = worst if usable is None else worst[usable[:, 0]]
+    counted = worst[usable[:, 0]]
     # Where the promise was too bold, the spread found counts instead: 2.385 gives 95 % efficiency for normal errors.
     scale = max(1.0, float(np.median(counted)) / 1.4 if len(counted) else 1.0)
     return 1.0 / (1.0 + (worst / (2.385 * scale)) ** 2)
 
 
-def _inverse_gain(row: _Rows, radiance: np.ndarray, trust: Trust) -> np.ndarray:
-    """Radiance over picture value ``(3,)``: from the sky where there is some, else the terrain's median."""
-    result = np.empty(3)
-    for channel in range(3):
-        if len(row.sky_picture) >= 50:
-            picture, model = row.sky_picture[:, channel], row.sky_radiance[:, channel]
-        else:
-            keep = row.usable[:, channel]
-            picture, model = row.picture[keep, channel], radiance[keep, channel]
-        sound = picture > 0.0
-        result[channel] = float(np.median(model[sound] / picture[sound])) if sound.any() else 1.0
-    if row.weight is None or not len(row.sky_picture) >= 50:
-        return result
-    # Later rounds know terrain too.
-    h = result.astype(np.float32)
-    w, v = row.weight, row.sky_weight
-    top = (w * row.picture * radiance).sum(axis=0) + (v * row.sky_picture * row.sky_radiance).sum(axis=0)
-    bottom = (w * row.picture**2).sum(axis=0) + (v * row.sky_picture**2).sum(axis=0)
-    return np.where(bottom > 0.0, top / np.maximum(bottom, 1e-30), h).astype(float)
+def _median_ratio(top: np.ndarray, bottom: np.ndarray) -> np.ndarray:
+    """Median of top over positive bottom, channel by channel ``(3,)``."""
+    sound = [bottom[:, c] > 0.0 for c in range(3)]
+    return np.array([np.median(top[k, c] / bottom[k, c]) if k.any() else 1.0 for c, k in enumerate(sound)], float)
+
+
+def _projected_gain(row: _Rows, radiance: np.ndarray) -> np.ndarray:
+    """Inverse gain ``(3,)`` that fits terrain pixels best to a radiance."""
+    keep = row.usable[:, 0]
+    if row.weight is None:
+        return _median_ratio(radiance[keep], row.picture[keep])
+    bottom = (row.weight * row.picture**2).sum(axis=0)
+    top = (row.weight * row.picture * radiance).sum(axis=0)
+    return np.where(bottom > 0.0, top / np.maximum(bottom, 1e-30), row.inverse_gain).astype(float)
 
 
 # ---------------------------------------------------------------------------------------------- conjugate gradients
@@ -374,11 +373,9 @@ def _solve(rows: list[_Rows], start: np.ndarray, effort: Effort, shape: tuple[in
     bottoms = []
     for row in rows:
         diagonal += _squared_adjoint(row)
-        if row.free:
-            bottom = (row.weight * row.picture**2).sum(axis=0) + (row.sky_weight * row.sky_picture**2).sum(axis=0)
-            bottoms.append(np.maximum(bottom, 1e-30))
+        if row.projected:
+            bottoms.append(np.maximum((row.weight * row.picture**2).sum(axis=0), 1e-30))
             known = (row.weight * row.picture * row.airlight).sum(axis=0)
-            known += (row.sky_weight * row.sky_picture * row.sky_radiance).sum(axis=0)
             right = row.picture * (known / bottoms[-1]) - row.airlight
         else:
             bottoms.append(None)
@@ -449,8 +446,8 @@ def _assess(rows: list[_Rows], albedo: np.ndarray, trust: Trust) -> tuple[float,
     total, count, residuals = 0.0, 0, []
     for row in rows:
         radiance = _model(row, albedo)[0] + row.airlight
-        if row.free:
-            row.inverse_gain = _inverse_gain(row, radiance, trust)
+        if row.projected:
+            row.inverse_gain = _projected_gain(row, radiance)
         h = row.inverse_gain.astype(np.float32)
         floor = 1e-3 * float(np.median(radiance)) + 1e-9
         relative = (h * row.picture - radiance) / (radiance + floor)
@@ -474,8 +471,3 @@ def fill_nearest(values: np.ndarray, seen: np.ndarray) -> np.ndarray:
         return values
     row, column = distance_transform_edt(seen <= 0.0, return_distances=False, return_indices=True)
     return values[row, column]
-
-
-def with_lights(shots: Sequence[Shot], lights: Sequence[Illumination]) -> list[Shot]:
-    """The same photographs under other lights whose sun and moon stand where they stood (another haze)."""
-    return [replace(shot, light=light) for shot, light in zip(shots, lights, strict=True)]

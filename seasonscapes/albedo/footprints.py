@@ -16,8 +16,6 @@ import numpy as np
 
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.rendering.gather import Occluder
-from seasonscapes.rendering.gbuffer import trace_gbuffer
-from seasonscapes.rendering.scene import RenderScene
 from seasonscapes.rendering.sun_visibility import cosine_seen, pixel_turn, sun_rays
 from seasonscapes.rendering.view_samples import view_samples
 from seasonscapes.sky.illumination import Luminary
@@ -146,7 +144,7 @@ def _block_entries(terrain: Occluder, camera: Camera, shape: tuple[int, int], sa
             if number == 0:
                 facing = np.maximum(points.normal @ np.asarray(body.direction, np.float32), 0.0) * hit
                 with np.errstate(invalid="ignore", divide="ignore"):
-                    lit[t] = (seen * hit).sum(axis=1) / facing.sum(axis=1)
+                    lit[t] = np.clip((seen * hit).sum(axis=1) / facing.sum(axis=1), 0.0, 1.0)
     distance = np.linalg.norm(points.origin - camera.position_m.astype(np.float32), axis=2)
     nearest = np.where(hit, distance, np.inf).min(axis=1)
     farthest = np.where(hit, distance, 0.0).max(axis=1)
@@ -190,8 +188,3 @@ def seen_weight(footprints: Sequence[Footprints]) -> np.ndarray:
 def whole_pixels(footprints: Footprints, *, full: float = 0.999) -> np.ndarray:
     """Pixels ``(n,)`` bool that show terrain alone: sky in a pixel is brighter than any slope, and not sharp in a photograph."""
     return footprints.coverage >= full
-
-
-def view_gbuffer(terrain: Occluder, camera: Camera):
-    """The G-buffer of a bare terrain."""
-    return trace_gbuffer(RenderScene(terrain.mi_scene, terrain.mi_terrain, None, 0.0), camera)  # type: ignore[arg-type]
