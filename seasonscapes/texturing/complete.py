@@ -1,0 +1,141 @@
+"""Complete a painted texture: every texel that no camera saw gets a value and an honest σ."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from seasonscapes.terrain.surface import Texture
+from seasonscapes.texturing.detail import add_detail
+from seasonscapes.texturing.guided import guided_fill
+from seasonscapes.texturing.guides import Guides
+from seasonscapes.texturing.membrane import membrane_fill
+from seasonscapes.texturing.plan import from_plan, onto_plan
+from seasonscapes.texturing.push_pull import push_pull
+from seasonscapes.texturing.telea import telea_fill
+from seasonscapes.texturing.uncertainty import sigma_by_distance
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class Completed:
+    """A texture without holes.
+
+    Parameters
+    ----------
+    values
+        ``(R, S, 3)`` float32, finite everywhere; painted texels are the given ones to the bit.
+    sigma
+        Standard error ``(R, S)`` of the filled texels in the unit of ``values``, RMS over the channels; 0 where
+        painted (what painting itself gets wrong is not known here).
+    painted
+        ``(R, S)`` bool: seen by a camera.
+    """
+
+    values: np.ndarray
+    sigma: np.ndarray
+    painted: np.ndarray
+
+
+def membrane(values, painted, guides: Guides, *, fast: bool = False, seed: int = 0, progress: Progress | None = None):
+    """Laplace's equation between the painted texels; knows nothing of the land."""
+    return _unguided(membrane_fill, values, painted, guides, seed)
+
+
+def telea(values, painted, guides: Guides, *, fast: bool = False, seed: int = 0, progress: Progress | None = None):
+    """`cv2.inpaint` after Telea, the reference implementation's completion."""
+    return _unguided(partial(telea_fill, radius_px=1.0 if fast else 3.0), values, painted, guides, seed)
+
+
+def _unguided(fill: Callable, values: np.ndarray, painted: np.ndarray, guides: Guides, seed: int):
+    """A method that knows pictures only, on the plan where the atlas has several charts."""
+    if guides.plan is None:
+        return fill(values, painted), sigma_by_distance(fill, values, painted, seed=seed)
+    mean, count = onto_plan(guides.plan, values, painted)
+    picture = fill(mean, count > 0)
+    sigma = sigma_by_distance(fill, mean, count > 0, seed=seed)
+    taken = np.nan_to_num(from_plan(guides.plan, np.concatenate([picture, sigma[..., None]], -1)))
+    return taken[..., :-1], taken[..., -1]
+
+
+# A new method is one line: a function (values, painted, guides, *, fast, seed, progress) → (values, sigma) in
+# encoded colours (cube roots); only what it says of surface texels that are not painted is used.
+INPAINTERS: dict[str, Callable] = {"guided": guided_fill, "membrane": membrane, "telea": telea}
+
+
+def complete(texture: Texture, guides: Guides, *, method: str = "guided", detail: float = 0.0, fast: bool = False,
+             seed: int = 0, progress: Progress | None = None) -> Completed:  # fmt: skip
+    """Fill every texel that no camera saw.
+
+    Parameters
+    ----------
+    texture
+        Radiance or albedo; painted where ``weight`` is positive and the values are finite.
+    guides
+        From `guides.guides_for`, of the same size. Methods that do not look at the land use only its charts.
+    method
+        A name of `INPAINTERS`.
+    detail
+        Strength of synthesised grain in [0, 1]: 0 for albedo recovery, about 0.6 for pictures.
+    fast
+        Trade a little accuracy for time.
+    seed
+        Equal seeds give equal textures.
+    progress
+        Called with the share that is done.
+
+    Raises
+    ------
+    ValueError
+        An unknown method, guides of another size, a negative value among the painted ones, or no painted texel on
+        the surface.
+    """
+    if method not in INPAINTERS:
+        raise ValueError(f"method: got {method!r}, expected one of {', '.join(INPAINTERS)}")
+    if guides.surface.shape != texture.weight.shape:
+        raise ValueError(f"guides are {guides.surface.shape}, the texture {texture.weight.shape}")
+    if not 0.0 <= detail <= 1.0:
+        raise ValueError(f"detail: got {detail}, expected 0 to 1")
+    tell = progress or (lambda share: None)
+    painted = painted_texels(texture)
+    seen = painted & guides.surface
+    if not seen.any():
+        raise ValueError("complete: no painted texel on the surface: there is nothing to learn from")
+    if texture.values[painted].min() < 0.0:
+        raise ValueError("complete: negative values among the painted texels")
+    hole = guides.surface & ~painted
+    values = np.where(painted[..., None], texture.values, 0.0).astype(np.float32)
+    sigma = np.zeros(painted.shape, np.float32)
+    if hole.any():
+        scale = max(float(np.median(values[seen])), 1e-6 * float(values[seen].max()), 1e-12)
+        encoded = np.cbrt(values / np.float32(scale))
+        filled, spread = INPAINTERS[method](
+            encoded, seen, guides, fast=fast, seed=seed, progress=lambda s: tell(0.9 * s)
+        )
+        if detail > 0.0:
+            filled = add_detail(filled, seen, guides, strength=detail, seed=seed)
+        # No hidden texel is brighter than anything seen: cubes must not make suns of small errors.
+        lightness = np.clip(filled[hole], 0.0, float(encoded[seen].max()))
+        values[hole], sigma[hole] = scale * lightness**3, scale * _cubed_sigma(lightness, spread[hole])
+    beside = ~guides.surface & ~painted
+    if beside.any():
+        # Between charts nothing lies; a look-up at a chart's rim must still find its colour.
+        grown = push_pull(np.concatenate([values, sigma[..., None]], -1), (~beside).astype(np.float32))
+        values[beside], sigma[beside] = grown[beside][:, :3], grown[beside][:, 3]
+    tell(1.0)
+    return Completed(values, sigma, painted)
+
+
+def painted_texels(texture: Texture) -> np.ndarray:
+    """Where a camera's finite colour lies, ``(R, S)`` bool."""
+    return (texture.weight > 0.0) & np.isfinite(texture.values).all(axis=2)
+
+
+def _cubed_sigma(mean: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """Standard deviation ``(n,)`` of the cube of a normal variable, RMS over the channels of ``mean`` ``(n, 3)``."""
+    square, variance = mean**2, (sigma**2)[:, None]
+    return np.sqrt(np.mean(9.0 * square**2 * variance + 36.0 * square * variance**2 + 15.0 * variance**3, axis=1))

@@ -1,0 +1,183 @@
+"""Guided completion: what a texel looks like, learned from the texels that cameras saw and what the land tells of all.
+
+Trees on satellite colour, height, slope, aspect, curvature, sky in view and sun predict the hidden texels; the error
+that the prediction makes on seen texels is then carried a few texels into the holes, so that no seam is left.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from seasonscapes.texturing.guides import Guides
+from seasonscapes.texturing.plan import from_plan, onto_plan
+from seasonscapes.texturing.push_pull import propagate
+from seasonscapes.texturing.uncertainty import Spread, fit_spread, spatial_folds
+
+Progress = Callable[[float], None]
+
+SAMPLES = 40_000
+REACH_PX = 12.0
+_BLOCK = 200_000
+# Trees cannot ask "is it missing?" in every library version; a value that no guide takes says so.
+_MISSING = np.float32(-1.0e5)
+
+
+@dataclass(frozen=True)
+class Regression:
+    """A fitted regression from guides to encoded colour.
+
+    Parameters
+    ----------
+    boosted
+        Three boosted models of lightness and two colour differences, or ``None`` for the fast kind.
+    forest
+        Extremely randomised trees of all channels; their disagreement is part of σ.
+    """
+
+    boosted: tuple | None
+    forest: object
+
+
+def mixed(encoded: np.ndarray) -> np.ndarray:
+    """Lightness and two colour differences ``(..., 3)``: three nearly independent targets."""
+    r, g, b = np.moveaxis(encoded, -1, 0)
+    return np.stack([(r + g + b) / 3.0, r - g, b - g], -1)
+
+
+def unmixed(parts: np.ndarray) -> np.ndarray:
+    """Inverse of `mixed`."""
+    lightness, rg, bg = np.moveaxis(parts, -1, 0)
+    g = lightness - (rg + bg) / 3.0
+    return np.stack([rg + g, g, bg + g], -1)
+
+
+def fit_regression(guide: np.ndarray, encoded: np.ndarray, *, fast: bool = False, seed: int = 0) -> Regression:
+    """Fit guides ``(n, G)`` to encoded colours ``(n, 3)``."""
+    from sklearn.ensemble import HistGradientBoostingRegressor
+
+    forest = _forest(guide, encoded, seed, trees=30 if fast else 16)
+    if fast:
+        return Regression(None, forest)
+    boosted = []
+    for channel, (target, rounds) in enumerate(zip(mixed(encoded).T, (150, 60, 60), strict=True)):
+        model = HistGradientBoostingRegressor(max_iter=rounds, learning_rate=0.08, max_leaf_nodes=31, max_features=0.5,
+                                              min_samples_leaf=20, l2_regularization=1.0, early_stopping=False,
+                                              random_state=seed + channel)  # fmt: skip
+        boosted.append(model.fit(guide, target))
+    return Regression(tuple(boosted), forest)
+
+
+def _forest(guide: np.ndarray, encoded: np.ndarray, seed: int, *, trees: int):
+    from sklearn.ensemble import ExtraTreesRegressor
+
+    forest = ExtraTreesRegressor(trees, min_samples_leaf=5, max_features=0.5, n_jobs=1, random_state=seed)
+    return forest.fit(_said(guide), encoded)
+
+
+def _said(guide: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(np.where(np.isfinite(guide), guide, _MISSING), np.float32)
+
+
+def forest_mean_spread(forest, guide: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean ``(n, 3)`` over the trees and the standard deviation between them ``(n,)``, RMS over the channels."""
+    said = _said(guide)
+    total, square = np.zeros((len(said), 3)), np.zeros((len(said), 3))
+    for tree in forest.estimators_:
+        value = tree.tree_.predict(said).reshape(len(said), 3)
+        total += value
+        square += value**2
+    mean = total / len(forest.estimators_)
+    variance = np.maximum(square / len(forest.estimators_) - mean**2, 0.0)
+    return mean, np.sqrt(variance.mean(axis=1))
+
+
+def predict(regression: Regression, guide: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Encoded colours ``(n, 3)`` and the trees' spread ``(n,)`` of guides ``(n, G)``."""
+    mean, spread = forest_mean_spread(regression.forest, guide)
+    if regression.boosted is not None:
+        mean = unmixed(np.stack([model.predict(guide) for model in regression.boosted], -1))
+    return mean, spread
+
+
+def guided_fill(values: np.ndarray, painted: np.ndarray, guides: Guides, *, fast: bool = False, seed: int = 0,
+                progress: Progress | None = None) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Fill by regression and propagated residual; see `complete.complete` for arguments and result."""
+    tell = progress or (lambda share: None)
+    rng = np.random.default_rng(seed)
+    known = np.flatnonzero(painted & guides.surface)
+    table, flat = guides.values.reshape(-1, guides.values.shape[2]), values.reshape(-1, 3)
+    sample = rng.choice(known, min(SAMPLES, len(known)), replace=False)
+    guide, encoded = blinded(table[sample], guides, painted, rng), flat[sample].astype(np.float64)
+    regression = fit_regression(guide, encoded, fast=fast, seed=seed)
+    tell(0.2)
+    spread = _spread_of(guides, painted, (sample, guide, encoded), seed)
+    tell(0.35)
+    hole = guides.surface & ~painted
+    rim = _near(hole, painted & guides.surface, int(3 * REACH_PX), guides)
+    predicted = np.zeros_like(values, dtype=np.float32)
+    sigma = np.zeros(painted.shape, np.float32)
+    wanted = np.flatnonzero(hole | rim)
+    for start in range(0, len(wanted), _BLOCK):
+        part = wanted[start : start + _BLOCK]
+        colour, between = predict(regression, table[part])
+        predicted.reshape(-1, 3)[part] = colour
+        inside = hole.ravel()[part]
+        sigma.ravel()[part[inside]] = spread.sigma(table[part[inside]], colour[inside], between[inside])
+        tell(0.35 + 0.6 * min(1.0, (start + _BLOCK) / len(wanted)))
+    residual = np.where(rim[..., None], values - predicted, 0.0)
+    filled = np.where(hole[..., None], predicted + _carried(residual, rim, guides), values)
+    return filled.astype(np.float32), sigma
+
+
+def blinded(guide: np.ndarray, guides: Guides, painted: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Training guides, of which as many lose their satellite colours as hidden texels lack theirs.
+
+    Trees only learn what to do without an image if some of their samples are without it.
+    """
+    image = np.array([name.startswith("satellite") for name in guides.names])
+    if not image.any():
+        return guide
+    missing = ~np.isfinite(guides.values[..., image][guides.surface & ~painted]).all(axis=1)
+    share = float(missing.mean()) if len(missing) else 0.0
+    lacking = ~np.isfinite(guide[:, image]).all(axis=1)
+    # Where the image ends is no chance: texels without it are few among the seen ones, many among the hidden.
+    extra = min(0.5, share) - float(lacking.mean())
+    if extra <= 0.0:
+        return guide
+    blind = rng.random(len(guide)) < extra
+    return np.where(blind[:, None] & image, np.float32(np.nan), guide)
+
+
+def _spread_of(guides: Guides, painted: np.ndarray, sampled: tuple, seed: int) -> Spread:
+    sample, guide, encoded = sampled
+    row, column = np.unravel_index(sample, painted.shape)
+    place = np.stack([column, row], -1) if guides.plan is None else guides.plan.pixel.reshape(-1, 2)[sample]
+    fold = spatial_folds(place, painted, guides.surface & ~painted, seed)
+
+    def fit(rows):
+        forest = _forest(guide[rows], encoded[rows], seed, trees=16)
+        return lambda other: forest_mean_spread(forest, other)
+
+    return fit_spread(guide, encoded, fold, fit, seed=seed)
+
+
+def _near(hole: np.ndarray, known: np.ndarray, reach_px: int, guides: Guides) -> np.ndarray:
+    """Known texels within reach of a hole; all of them where charts lie apart."""
+    import cv2
+
+    if guides.plan is not None or not hole.any():
+        return known
+    side = 2 * reach_px + 1
+    return known & (cv2.dilate(hole.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
+
+
+def _carried(residual: np.ndarray, known: np.ndarray, guides: Guides) -> np.ndarray:
+    """The residual in the holes; by way of the plan where the atlas has several charts."""
+    if guides.plan is None:
+        # Painted texels far from any hole have no residual, but they are nobody's neighbours either.
+        return propagate(residual, known, reach_px=REACH_PX)
+    mean, count = onto_plan(guides.plan, residual, known)
+    return np.nan_to_num(from_plan(guides.plan, propagate(mean, count > 0, reach_px=REACH_PX)))

@@ -1,0 +1,105 @@
+"""Guides of a completion: for each texel what is known of it without any camera having seen it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from seasonscapes.terrain.atlas import Atlas
+from seasonscapes.terrain.surface import Terrain, Texture
+from seasonscapes.terrain.texels import texel_positions
+from seasonscapes.texturing.land import land_layers
+from seasonscapes.texturing.plan import Plan, from_plan, plan_heights, plan_of
+
+
+@dataclass(frozen=True)
+class Guides:
+    """What the land itself tells about each texel.
+
+    Parameters
+    ----------
+    values
+        ``(R, S, G)`` float32; NaN where unknown (beyond a satellite image, off the surface).
+    names
+        Of the G layers. Those that begin with ``satellite`` come from an image and may be missing in places.
+    surface
+        ``(R, S)`` bool: the texel lies on the land, not in the space between charts.
+    plan
+        Where the atlas has several charts: the texels' places on a top-down grid, so that what is propagated crosses
+        from chart to chart as the land does. ``None`` where the texture itself is one connected picture of the land.
+    """
+
+    values: np.ndarray
+    names: tuple[str, ...]
+    surface: np.ndarray
+    plan: Plan | None = None
+
+    def __post_init__(self):
+        if self.values.ndim != 3 or self.values.shape[2] != len(self.names):
+            raise ValueError(f"Guides: values {self.values.shape} and {len(self.names)} names")
+        if self.values.shape[:2] != self.surface.shape:
+            raise ValueError(f"Guides: values {self.values.shape} and surface {self.surface.shape} differ in size")
+
+
+def stack_guides(layers: Mapping[str, np.ndarray], satellite: Texture | None = None, *,
+                 plan: Plan | None = None, surface: np.ndarray | None = None) -> Guides:  # fmt: skip
+    """Guides from layers ``(R, S)`` and a satellite image in the same atlas.
+
+    Parameters
+    ----------
+    satellite
+        ``values`` ``(R, S, C)`` linear, of any scale; missing where ``weight`` is 0 or a value is not finite.
+    surface
+        Left out: where every layer is finite.
+    """
+    if not layers:
+        raise ValueError("stack_guides: no layers")
+    columns = [np.asarray(layer, np.float32) for layer in layers.values()]
+    names = list(layers)
+    if surface is None:
+        surface = np.isfinite(columns).all(axis=0)
+    if satellite is not None:
+        seen = (satellite.weight > 0.0) & np.isfinite(satellite.values).all(axis=2)
+        if seen.any():
+            for channel in range(satellite.values.shape[2]):
+                columns.append(np.where(seen, satellite.values[..., channel], np.nan).astype(np.float32))
+                names.append(f"satellite_{channel + 1}")
+    return Guides(np.stack(columns, -1), tuple(names), surface, plan)
+
+
+def guides_for(terrain: Terrain, atlas: Atlas, *, satellite: Texture | None = None, sun_direction=None, day_suns=None,
+               extra: Mapping[str, np.ndarray] | None = None) -> Guides:  # fmt: skip
+    """Guides for every texel of a terrain's atlas.
+
+    Parameters
+    ----------
+    satellite
+        An image baked into the atlas (`terrain.imagery.bake_imagery`), ``weight`` 0 where it does not reach.
+    sun_direction, day_suns
+        See `land_layers`.
+    extra
+        More layers ``(R, S)``, such as irradiance that a renderer has found.
+
+    Raises
+    ------
+    ValueError
+        A satellite image or an extra layer of another size than the atlas.
+    """
+    shape = (atlas.height_px, atlas.width_px)
+    for name, size in [("satellite", satellite.values.shape[:2] if satellite is not None else shape),
+                       *((name, layer.shape) for name, layer in (extra or {}).items())]:  # fmt: skip
+        if size != shape:
+            raise ValueError(f"guides_for: {name} is {size}, the atlas {shape}")
+    positions, face_id = texel_positions(terrain, atlas.width_px, atlas.height_px)
+    extent = np.ptp(terrain.vertices[:, :2], axis=0)
+    cell_m = float(max(extent[0] / atlas.width_px, extent[1] / atlas.height_px)) if atlas.kind == "planar" else (
+        atlas.texel_p50_m)  # fmt: skip
+    heights, spacing_m = plan_heights(terrain, cell_m)
+    plan = plan_of(terrain, positions, heights.shape[1], heights.shape[0])
+    layers = {}
+    for name, layer in land_layers(heights, spacing_m, sun_direction=sun_direction, day_suns=day_suns).items():
+        layers[name] = from_plan(plan, np.nan_to_num(layer, nan=float(np.nanmedian(layer)))[..., None])[..., 0]
+    layers |= extra or {}
+    return stack_guides(layers, satellite, plan=plan if atlas.charts > 1 else None, surface=face_id >= 0)
