@@ -42,19 +42,22 @@ BODIES = 2
 @dataclass(frozen=True)
 class LightTensors:
     """T light states as tensors: ``direction (T, 2, 3)``, ``illuminance (T, 2, 3)``, ``sky (T, r, 3)``,
-    ``bounce (T, 10, 3)``, ``features (T, 14)``; all but the first divided by the luminance of the horizontal illuminance."""
+    ``bounce (T, 10, 3)``, ``features (T, 14)``; all but the first divided by the luminance of the horizontal illuminance.
+    ``season (T,)`` says which of the dated albedos each time has."""
 
     direction: torch.Tensor
     illuminance: torch.Tensor
     sky: torch.Tensor
     bounce: torch.Tensor
     features: torch.Tensor
+    season: torch.Tensor
 
 
-def light_tensors(states: Sequence[LightState]) -> LightTensors:
-    """Stack light states; bodies beyond two are left out, missing ones send nothing."""
+def light_tensors(states: Sequence[LightState], seasons: Sequence[int] | None = None) -> LightTensors:
+    """Stack light states; bodies beyond two are left out, missing ones send nothing. Seasons left out are all 0."""
     rows = [_light_rows(state) for state in states]
-    return LightTensors(*(torch.as_tensor(np.stack(column), dtype=torch.float32) for column in zip(*rows, strict=True)))
+    columns = (torch.as_tensor(np.stack(column), dtype=torch.float32) for column in zip(*rows, strict=True))
+    return LightTensors(*columns, torch.as_tensor([0] * len(states) if seasons is None else list(seasons)))
 
 
 def _light_rows(state: LightState) -> tuple[np.ndarray, ...]:
@@ -96,7 +99,7 @@ class Appearance(nn.Module):
     kind
         One of `KINDS`.
     albedo, around
-        ``(N, 3)`` of the discs, and of the land around them.
+        ``(M, N, 3)`` of the discs at M dates, and of the land around them.
     transport
         Needed by ``physical`` and ``full``; for the others it only says how many there are.
     embedding
@@ -110,7 +113,7 @@ class Appearance(nn.Module):
         super().__init__()
         if kind not in KINDS:
             raise ValueError(f"kind: got {kind!r}, expected one of {', '.join(KINDS)}")
-        count = len(albedo)
+        count = albedo.shape[1]
         self.kind = kind
         for name, values in (("albedo", albedo), ("around", around)):
             self.register_buffer(name, torch.as_tensor(np.asarray(values, np.float32)))
@@ -121,10 +124,11 @@ class Appearance(nn.Module):
         self.register_buffer("sky", torch.as_tensor(transport.sky.astype(np.float32) * transport.sky_scale))
         self.register_buffer("bounce", torch.as_tensor(transport.bounce.astype(np.float32)))
         self.register_buffer("open_sky", torch.as_tensor(transport.open_sky))
-        # Logarithms of gains on colour, sky and bounce; the horizon's shift [0.01 rad] and logarithm of its softness.
+        # Logarithms of gains on colour, on sky and bounce; the horizon's shift [rad] and the logarithm of its softness.
         self.log_colour = nn.Parameter(torch.zeros(count, 3))
         self.log_gain = nn.Parameter(torch.zeros(count, 2))
-        self.edge = nn.Parameter(torch.tensor([0.0, np.log(SOFTNESS_RAD)], dtype=torch.float32).repeat(count, 1))
+        self.shift = nn.Parameter(torch.zeros(count))
+        self.log_softness = nn.Parameter(torch.full((count,), float(np.log(SOFTNESS_RAD))))
         if kind != "physical":
             generator = torch.Generator().manual_seed(seed)
             self.embedding = nn.Parameter(torch.as_tensor(embedding, dtype=torch.float32))
@@ -143,12 +147,12 @@ class Appearance(nn.Module):
 
         ``code (32,)`` takes the place of the codes of ``kind="code"``.
         """
-        if self.kind in ("code", "sun"):
-            base = self.albedo[index] * self.log_colour[index].exp()
-            features: list[torch.Tensor] = []
-        else:
+        season = lights.season[time]
+        base = self.albedo[season, index] * self.log_colour[index].exp()
+        features: list[torch.Tensor] = []
+        if self.kind in ("physical", "full"):
             irradiance, features = self._physical(index, time, lights)
-            base = self.albedo[index] * self.log_colour[index].exp() * irradiance
+            base = base * irradiance
         if self.kind == "physical":
             return base
         if self.kind == "code":
@@ -178,7 +182,7 @@ class Appearance(nn.Module):
         else:
             sky, bounce = self.sky[index] @ lights.sky[time], self.bounce[index] @ lights.bounce[time]
         sky = sky.clamp(min=0.0) * gain[:, :1]
-        bounce = bounce.clamp(min=0.0) * self.around[index] * gain[:, 1:]
+        bounce = bounce.clamp(min=0.0) * self.around[lights.season[time], index] * gain[:, 1:]
         told += [self.open_sky[index, None], sky[:, 1:2], bounce[:, 1:2], normals]
         return total + sky + bounce, told
 
@@ -192,8 +196,7 @@ class Appearance(nn.Module):
         left = self.horizon[first + column % AZIMUTHS].float()
         right = self.horizon[first + (column + 1) % AZIMUTHS].float()
         angle = (left + (right - left) * share) * self.horizon_step + self.horizon_low
-        shift, softness = self.edge[index].unbind(1)
-        return torch.sigmoid((elevation - angle - 0.01 * shift) / softness.exp())
+        return torch.sigmoid((elevation - angle - self.shift[index]) / self.log_softness[index].exp())
 
 
 def _network(inputs: int, generator: torch.Generator) -> nn.Sequential:
@@ -209,10 +212,13 @@ def _network(inputs: int, generator: torch.Generator) -> nn.Sequential:
 
 
 @torch.no_grad()
-def colours_at(appearance: Appearance, state: LightState, *, code: torch.Tensor | None = None) -> np.ndarray:
+def colours_at(appearance: Appearance, state: LightState, season: int = 0, *,
+               code: torch.Tensor | None = None) -> np.ndarray:  # fmt: skip
     """Colours ``(N, 3)`` float32 of all Gaussians under a light; radiance is colour × ``state.global_lx`` / π."""
-    lights, time = light_tensors([state]), torch.zeros((), dtype=torch.long)
-    count = len(appearance.albedo)
-    parts = [appearance(torch.arange(start, min(start + 32768, count)), time, lights, code)
-             for start in range(0, count, 32768)]  # fmt: skip
+    lights, time = light_tensors([state], [season]), torch.zeros((), dtype=torch.long)
+    count = appearance.albedo.shape[1]
+    parts = [
+        appearance(torch.arange(start, min(start + 32768, count)), time, lights, code)
+        for start in range(0, count, 32768)
+    ]
     return torch.cat(parts).numpy()

@@ -1,0 +1,331 @@
+"""Teach Gaussians what a path tracer knows, in two stages.
+
+1. On the surface: the radiance of (disc, time) pairs, from irradiance traced at the discs. No rasteriser, no hidden
+   discs, no blur; most of the learning happens here.
+2. In pictures: a short stage over cameras and times, 0.8 L1 + 0.2 D-SSIM in sRGB, through frozen sparse weights, so
+   that colours make up for the width of the splats. The first loss stays beside it, or what no camera sees would drift.
+
+Geometry is known and stays as it is. Every step draws from a generator seeded by (seed, stage, step): a run that was
+interrupted goes on from its checkpoint as if nothing had happened.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from seasonscapes.gaussians.appearance import CODE, Appearance, LightTensors, light_tensors
+from seasonscapes.gaussians.rasterise import ViewWeights
+from seasonscapes.gaussians.transport import LightState
+from seasonscapes.images import atomic_path
+
+Progress = Callable[[float], None]
+# Learning rates of the parameters; all fall to a tenth over each stage, and begin the second at `_SECOND` of these.
+RATES = {"log_colour": 2e-3, "log_gain": 5e-3, "shift": 1e-3, "log_softness": 1e-2, "embedding": 5e-3, "codes": 5e-3,
+         "mlp": 2e-3}  # fmt: skip
+_SECOND, _FALL = 0.5, 0.1
+# Relative squared error, but not of what is nearly black (Lehtinen et al. 2018, arXiv:1803.04189, § 3.2).
+_DARK = 0.02
+_SURFACE_SHARE = 0.5
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How long to learn.
+
+    Parameters
+    ----------
+    surface_steps, picture_steps
+        Steps of the two stages.
+    batch
+        (Disc, time) pairs in a step of the first.
+    checkpoint_every
+        Steps between checkpoints.
+    """
+
+    surface_steps: int = 2500
+    picture_steps: int = 240
+    batch: int = 6144
+    checkpoint_every: int = 250
+
+    def __post_init__(self):
+        if min(self.surface_steps, self.picture_steps) < 0 or min(self.batch, self.checkpoint_every) < 1:
+            raise ValueError("Schedule: steps must not be negative, batch and checkpoint_every at least 1")
+
+
+@dataclass(frozen=True)
+class Lessons:
+    """What is learned on the surface: T times of N discs.
+
+    Parameters
+    ----------
+    states
+        T light states.
+    seasons
+        T numbers of dated albedos.
+    colours
+        ``(T, N, 3)`` float32: radiance × π over the luminance of the horizontal illuminance.
+    """
+
+    states: Sequence[LightState]
+    seasons: Sequence[int]
+    colours: np.ndarray
+
+    def __post_init__(self):
+        if not len(self.states) == len(self.seasons) == len(self.colours) > 0:
+            raise ValueError(f"Lessons: got {len(self.states)} lights, {len(self.seasons)} seasons and "
+                             f"{len(self.colours)} sets of colours, expected one of each for every time")  # fmt: skip
+        if not np.isfinite(self.colours).all():
+            raise ValueError(f"Lessons: {int(np.sum(~np.isfinite(self.colours)))} colours are not finite")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A picture to learn from: a path-traced view, or a painted one.
+
+    Parameters
+    ----------
+    weights
+        Of its camera, from `rasterise.view_weights`; frames of one camera share them.
+    time
+        Its number among the lessons' times.
+    image
+        ``(H, W, 3)`` colours as in `Lessons`, of the surface, before the air.
+    mask
+        ``(H, W)`` bool, True = usable.
+    """
+
+    weights: ViewWeights
+    time: int
+    image: np.ndarray
+    mask: np.ndarray
+
+    def __post_init__(self):
+        if self.image.shape != (*self.mask.shape, 3) or self.mask.shape != (self.weights.height_px, self.weights.width_px):
+            raise ValueError(f"Frame: image {self.image.shape} and mask {self.mask.shape} do not fit the camera")
+        if not np.isfinite(self.image[self.mask]).all():
+            raise ValueError("Frame: the picture has usable pixels that are not finite")
+        if not self.mask.any() or self.weights.matrix.nnz == 0:
+            raise ValueError("Frame: no splat and no usable pixel in view; does the camera stand inside the mountain?")
+
+
+def lessons_from(states: Sequence[LightState], seasons: Sequence[int], albedo: np.ndarray,
+                 irradiance: np.ndarray) -> Lessons:  # fmt: skip
+    """Lessons from irradiance ``(T, N, 3)`` [lx] of discs with dated albedos ``(M, N, 3)``."""
+    colours = np.stack([
+        albedo[season] * received / np.float32(state.global_lx)
+        for state, season, received in zip(states, seasons, irradiance, strict=True)
+    ])  # fmt: skip
+    return Lessons(list(states), list(seasons), colours.astype(np.float32))
+
+
+def distil(appearance: Appearance, lessons: Lessons, frames: Sequence[Frame] = (), schedule: Schedule | None = None, *,
+           seed: int = 0, checkpoint: Path | None = None, progress: Progress | None = None) -> list[float]:  # fmt: skip
+    """Train an appearance in place; the loss of every step that was taken by this call.
+
+    Parameters
+    ----------
+    frames
+        Pictures for the second stage; without any it is left out.
+    checkpoint
+        A ``.safetensors`` file to save to, and to go on from where it exists.
+
+    Raises
+    ------
+    ValueError
+        A checkpoint of another run: kind, seed, sizes or schedule differ.
+    FloatingPointError
+        The loss is no longer finite.
+    """
+    schedule = schedule or Schedule()
+    if not frames:
+        schedule = replace(schedule, picture_steps=0)
+    optimiser = _optimiser(appearance)
+    run = {"kind": appearance.kind, "seed": seed, "schedule": asdict(schedule), "times": len(lessons.states)}
+    start = load_checkpoint(checkpoint, appearance, optimiser, run) if checkpoint and Path(checkpoint).is_file() else 0
+    lights = light_tensors(lessons.states, lessons.seasons)
+    targets = torch.as_tensor(lessons.colours)
+    pictures = [_picture(frame) for frame in frames]
+    total, losses = schedule.surface_steps + schedule.picture_steps, []
+    for step in range(start, total):
+        _set_rates(optimiser, step, schedule)
+        rng = np.random.default_rng([seed, step])
+        loss = surface_loss(appearance, lights, targets, schedule.batch, rng)
+        if step >= schedule.surface_steps:
+            picture = pictures[_turn(step - schedule.surface_steps, len(pictures), seed)]
+            loss = _SURFACE_SHARE * loss + picture_loss(appearance, lights, picture)
+        if not bool(torch.isfinite(loss)):
+            raise FloatingPointError(f"distilling: the loss of step {step} is {float(loss)}")
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        optimiser.step()
+        losses.append(float(loss))
+        if checkpoint and ((step + 1) % schedule.checkpoint_every == 0 or step + 1 == total):
+            save_checkpoint(checkpoint, appearance, optimiser, run, step + 1)
+        if progress is not None:
+            progress((step + 1) / total)
+    return losses
+
+
+def _turn(step: int, count: int, seed: int) -> int:
+    """Which picture a step of the second stage takes: all of them, shuffled anew each round."""
+    return int(np.random.default_rng([seed, 7, step // count]).permutation(count)[step % count])
+
+
+def _optimiser(appearance: Appearance) -> torch.optim.Adam:
+    groups: dict[str, list] = {}
+    for name, parameter in appearance.named_parameters():
+        groups.setdefault(name.split(".")[0], []).append(parameter)
+    return torch.optim.Adam([{"params": group, "lr": RATES[name], "name": name} for name, group in groups.items()],
+                            eps=1e-15, fused=True)  # fmt: skip
+
+
+def _set_rates(optimiser: torch.optim.Adam, step: int, schedule: Schedule) -> None:
+    second = step >= schedule.surface_steps
+    share = (step - schedule.surface_steps) / schedule.picture_steps if second else step / schedule.surface_steps
+    for group in optimiser.param_groups:
+        group["lr"] = RATES[group["name"]] * (_SECOND if second else 1.0) * _FALL**share
+
+
+def surface_loss(appearance: Appearance, lights: LightTensors, targets: torch.Tensor, batch: int,
+                 rng: np.random.Generator) -> torch.Tensor:  # fmt: skip
+    """Relative squared error of random (disc, time) pairs: unbiased even where targets are noisy."""
+    times, count, _ = targets.shape
+    index = torch.as_tensor(rng.integers(0, count, batch))
+    time = torch.as_tensor(rng.integers(0, times, batch))
+    value = appearance(index, time, lights)
+    return ((value - targets[time, index]) ** 2 / (value.detach() ** 2 + _DARK)).mean()
+
+
+@dataclass(frozen=True)
+class _Picture:
+    """A frame laid out for training: seen discs ``(n,)``, weights over them (rows sum to 1), and pixels in sRGB."""
+
+    discs: torch.Tensor
+    forward: object
+    backward: object
+    time: torch.Tensor
+    target: torch.Tensor
+    mask: torch.Tensor
+
+
+def _picture(frame: Frame) -> _Picture:
+    from scipy import sparse
+
+    matrix = frame.weights.matrix
+    discs = np.unique(matrix.indices)
+    number = np.zeros(matrix.shape[1], np.int32)
+    number[discs] = np.arange(len(discs), dtype=np.int32)
+    scale = 1.0 / np.maximum(frame.weights.coverage.ravel(), 1e-3)
+    data = matrix.data * np.repeat(scale, np.diff(matrix.indptr))
+    forward = sparse.csr_array((data.astype(np.float32), number[matrix.indices], matrix.indptr),
+                               shape=(matrix.shape[0], len(discs)))  # fmt: skip
+    mask = torch.as_tensor(frame.mask & (frame.weights.coverage > 0.5))
+    target = torch.where(mask[..., None], encoded(torch.as_tensor(np.nan_to_num(frame.image).astype(np.float32))), 0.0)
+    return _Picture(torch.as_tensor(discs.astype(np.int64)), forward, forward.T.tocsr(), torch.tensor(frame.time), target, mask)
+
+
+class _Product(torch.autograd.Function):
+    """A constant sparse matrix times a dense one."""
+
+    @staticmethod
+    def forward(context, values: torch.Tensor, picture: _Picture) -> torch.Tensor:
+        context.picture = picture
+        return torch.from_numpy(picture.forward @ values.detach().numpy())
+
+    @staticmethod
+    def backward(context, gradient: torch.Tensor):
+        return torch.from_numpy(context.picture.backward @ gradient.contiguous().numpy()), None
+
+
+def encoded(linear: torch.Tensor) -> torch.Tensor:
+    """sRGB of linear values; brighter than 1 goes on along the same curve, so that it still has a slope."""
+    linear = linear.clamp(min=0.0)
+    return torch.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clamp(min=1e-4) ** (1.0 / 2.4) - 0.055)
+
+
+def picture_loss(appearance: Appearance, lights: LightTensors, picture: _Picture) -> torch.Tensor:
+    """0.8 L1 + 0.2 D-SSIM of a frame in sRGB over its usable pixels."""
+    values = appearance(picture.discs, picture.time, lights)
+    image = encoded(_Product.apply(values, picture)).reshape(picture.target.shape)
+    image = torch.where(picture.mask[..., None], image, 0.0)
+    share = picture.mask.float().mean()
+    difference = (image - picture.target).abs().mean() / share
+    return 0.8 * difference + 0.2 * (1.0 - ssim_map(image, picture.target)).mean() / share
+
+
+def ssim_map(image: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
+    """Structural similarity ``(C, H, W)`` of pictures ``(H, W, C)`` (Wang et al. 2004, doi:10.1109/TIP.2003.819861)."""
+    offset = torch.arange(11.0) - 5.0
+    window = torch.exp(-(offset**2) / 4.5)
+    window = window / window.sum()
+    a, b = image.permute(2, 0, 1)[:, None], other.permute(2, 0, 1)[:, None]
+
+    def mean(values: torch.Tensor) -> torch.Tensor:
+        across = torch.nn.functional.conv2d(values, window[None, None, None, :], padding=(0, 5))
+        return torch.nn.functional.conv2d(across, window[None, None, :, None], padding=(5, 0))
+
+    mean_a, mean_b = mean(a), mean(b)
+    variance = mean(a * a) - mean_a**2 + mean(b * b) - mean_b**2
+    covariance = mean(a * b) - mean_a * mean_b
+    above = (2.0 * mean_a * mean_b + 1e-4) * (2.0 * covariance + 9e-4)
+    return (above / ((mean_a**2 + mean_b**2 + 1e-4) * (variance + 9e-4)))[:, 0]
+
+
+def fit_code(appearance: Appearance, lights: LightTensors, frame: Frame, *, steps: int = 128, rate: float = 0.1,
+             seed: int = 0) -> torch.Tensor:  # fmt: skip
+    """The free code ``(32,)`` of a picture that was not trained on, from its usable pixels (WildGaussians' protocol)."""
+    picture = _picture(frame)
+    code = torch.zeros(CODE, requires_grad=True)
+    optimiser = torch.optim.Adam([code], lr=rate)
+    rows = np.flatnonzero(picture.mask.numpy().ravel())
+    for step in range(steps):
+        # A few thousand pixels tell as much of 32 numbers as all do.
+        chosen = np.random.default_rng([seed, step]).choice(rows, min(1024, len(rows)), replace=False)
+        some = picture.forward[chosen]
+        seen, number = np.unique(some.indices, return_inverse=True)
+        weights = torch.sparse_csr_tensor(torch.from_numpy(some.indptr.astype(np.int64)), torch.from_numpy(number),
+                                          torch.from_numpy(some.data), size=(len(chosen), len(seen)))  # fmt: skip
+        values = appearance(picture.discs[torch.from_numpy(seen)], picture.time, lights, code)
+        loss = (encoded(weights @ values) - picture.target.reshape(-1, 3)[chosen]).abs().mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    return code.detach()
+
+
+def save_checkpoint(path: Path, appearance: Appearance, optimiser: torch.optim.Adam, run: dict, step: int) -> None:
+    """Parameters, the optimiser's memory and what run this is, in one file, atomically."""
+    from safetensors.torch import save_file
+
+    tensors = {f"value.{name}": parameter.detach() for name, parameter in appearance.named_parameters()}
+    names = {id(parameter): name for name, parameter in appearance.named_parameters()}
+    for parameter, memory in optimiser.state.items():
+        tensors |= {f"{key}.{names[id(parameter)]}": value.reshape(-1) if key == "step" else value
+                    for key, value in memory.items()}  # fmt: skip
+    with atomic_path(path) as temporary:
+        save_file(tensors, temporary, metadata={"run": json.dumps(run, sort_keys=True), "step": str(step)})
+
+
+def load_checkpoint(path: Path, appearance: Appearance, optimiser: torch.optim.Adam, run: dict) -> int:
+    """Put a checkpoint back and return how many steps it has behind it."""
+    from safetensors import safe_open
+
+    with safe_open(path, "pt") as file:
+        stored = file.metadata()
+        if json.loads(stored["run"]) != json.loads(json.dumps(run)):
+            raise ValueError(f"{path}: a checkpoint of another run ({stored['run']}); remove it or name another file")
+        for name, parameter in appearance.named_parameters():
+            value = file.get_tensor(f"value.{name}")
+            if value.shape != parameter.shape:
+                raise ValueError(f"{path}: {name} has shape {tuple(value.shape)}, expected {tuple(parameter.shape)}")
+            parameter.data.copy_(value)
+            optimiser.state[parameter] = {"step": file.get_tensor(f"step.{name}").reshape(()),
+                                          "exp_avg": file.get_tensor(f"exp_avg.{name}"),
+                                          "exp_avg_sq": file.get_tensor(f"exp_avg_sq.{name}")}  # fmt: skip
+        return int(stored["step"])
