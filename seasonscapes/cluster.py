@@ -37,7 +37,7 @@ def frames_on_cluster(cluster: str, assignment: Assignment, times: list[datetime
         For a cluster that cannot be reached, or a file that does not describe one.
     """
     with connected(cluster) as client:
-        yield from _results(client, assignment, times, exr_folder)
+        yield from frames_by(client, assignment, times, exr_folder)
 
 
 @contextmanager
@@ -99,7 +99,8 @@ def _slurm(path: Path) -> Any:
     return cluster
 
 
-def _results(client: Any, assignment: Assignment, times: list[datetime], exr_folder: str | None) -> Iterator[dict]:
+def frames_by(client: Any, assignment: Assignment, times: list[datetime], exr_folder: str | None) -> Iterator[dict]:
+    """The records of frames that a client's workers render, in the order in which they are done."""
     from distributed import as_completed
 
     pending = iter(times)

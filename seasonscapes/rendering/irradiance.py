@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -25,8 +26,7 @@ from seasonscapes.sky.illumination import Illumination
 
 # Texels in work at a time: their coefficients take about 300 bytes each.
 BLOCK = 1 << 19
-# A ray finds the surface under a texel from this far above and below it.
-_SEARCH_M = 2.0
+_ASIDE_M = np.array([0.05, 0.03, 0.0])
 Progress = Callable[[float], None]
 
 
@@ -63,10 +63,11 @@ class ReadyPoints:
     senders: ReadySenders
 
 
-def surface_at(terrain: Occluder, position_m: np.ndarray) -> tuple[Points, np.ndarray]:
+def surface_at(terrain: Occluder, position_m: np.ndarray, *, search_m: float = 2.0) -> tuple[Points, np.ndarray]:
     """The surface at places ``(N, 3)`` ENU on it [m], such as `terrain.texels.texel_positions` gives.
 
-    A vertical ray finds the face, so that normals and albedo are the renderer's own.
+    A vertical ray from ``search_m`` above finds the face within as much below, so that normals and albedo are the
+    renderer's own.
 
     Returns
     -------
@@ -75,16 +76,28 @@ def surface_at(terrain: Occluder, position_m: np.ndarray) -> tuple[Points, np.nd
     index
         ``(K,)`` their numbers among the N. NaN places, and walls of overhangs, have none.
     """
+    sound = np.isfinite(position_m).all(axis=1)
+    start = np.where(sound[:, None], position_m, 0.0) + np.array([0.0, 0.0, search_m])
+    points, found = _below(terrain, start, search_m)
+    found &= sound
+    # A ray through a vertex of the mesh may slip between its faces: those look again a hand's breadth beside it.
+    missed = np.flatnonzero(sound & ~found)
+    if len(missed):
+        again, hit = _below(terrain, start[missed] + _ASIDE_M, search_m)
+        for name in Points.__dataclass_fields__:
+            getattr(points, name)[missed[hit]] = getattr(again, name)[hit]
+        found[missed[hit]] = True
+    index = np.flatnonzero(found)
+    return points[index], index
+
+
+def _below(terrain: Occluder, start_m: np.ndarray, search_m: float) -> tuple[Points, np.ndarray]:
     import mitsuba as mi
 
-    sound = np.isfinite(position_m).all(axis=1)
-    start = np.where(sound[:, None], position_m, 0.0) + np.array([0.0, 0.0, _SEARCH_M])
-    ray = mi.Ray3f(point3(start.astype(np.float32)), mi.Vector3f(0.0, 0.0, -1.0))
+    ray = mi.Ray3f(point3(start_m.astype(np.float32)), mi.Vector3f(0.0, 0.0, -1.0))
     interaction = terrain.mi_scene.ray_intersect(ray)
-    found = interaction.is_valid() & (interaction.t < 2.0 * _SEARCH_M)
-    points = surface_points(interaction, found)
-    index = np.flatnonzero(sound & np.array(found))
-    return points[index], index
+    found = interaction.is_valid() & (interaction.t < 2.0 * search_m)
+    return surface_points(interaction, found), np.array(found)
 
 
 def ready_points(terrain: Occluder, coefficients: PointCoefficients) -> ReadyPoints:
@@ -103,7 +116,7 @@ def _rays(terrain: Occluder, points: Points, number: np.ndarray) -> SunRays:
     return sun_rays(terrain, (each.origin, each.normal, each.outward), weight, numbered_turn(number))
 
 
-def irradiance(ready: ReadyPoints, illumination: Illumination, *, light: SenderLight | None = None,
+def irradiance(ready: ReadyPoints, illumination: Illumination, light: SenderLight | None = None, *,
                sun_rays_each: int = 4) -> Irradiance:  # fmt: skip
     """Illuminance on the places under a light.
 
@@ -122,20 +135,24 @@ def irradiance(ready: ReadyPoints, illumination: Illumination, *, light: SenderL
 
 
 def irradiance_blocks(terrain: Occluder, position_m: np.ndarray, lights: Sequence[Illumination], effort: Effort | None = None, *,
-                      seed: int = 0, progress: Progress | None = None) -> Iterator[tuple[np.ndarray, Points, list]]:  # fmt: skip
-    """Irradiance of many places under a few lights, block by block: nothing is kept, so memory stays bounded.
+                      seed: int = 0, search_m: float = 2.0, progress: Progress | None = None,
+                      ) -> Iterator[tuple[np.ndarray, Points, Iterator[Irradiance]]]:  # fmt: skip
+    """Irradiance of many places under many lights, block by block: nothing is kept, so memory stays bounded.
 
     Parameters
     ----------
     position_m
         ``(N, 3)`` ENU; NaN where there is no surface.
     lights
-        Held at once: a few dozen.
+        Held at once, without their air if there are many.
+    search_m
+        See `surface_at`.
 
     Yields
     ------
     index, points, irradiances
-        Which of the N ``(K,)``, their surfaces, and one `Irradiance` for each light. Places without a surface never come.
+        Which of the N ``(K,)``, their surfaces, and one `Irradiance` for each light, worked out as they are asked for.
+        Places without a surface never come.
 
     Raises
     ------
@@ -146,7 +163,7 @@ def irradiance_blocks(terrain: Occluder, position_m: np.ndarray, lights: Sequenc
     tell = progress or (lambda share: None)
     sound = np.flatnonzero(np.isfinite(position_m).all(axis=1))
     some = np.random.default_rng(seed).permutation(sound)[: 1 << 18]
-    pilot, found = surface_at(terrain, position_m[some])
+    pilot, found = surface_at(terrain, position_m[some], search_m=search_m)
     if len(found) == 0:
         raise ValueError("irradiance: no place lies on the terrain")
     prepared = prepare(terrain, pilot, effort, seed=seed)
@@ -154,10 +171,9 @@ def irradiance_blocks(terrain: Occluder, position_m: np.ndarray, lights: Sequenc
     sent = [light_senders(senders, light) for light in lights]
     for start in range(0, len(sound), BLOCK):
         part = sound[start : start + BLOCK]
-        points, found = surface_at(terrain, position_m[part])
+        points, found = surface_at(terrain, position_m[part], search_m=search_m)
         if len(found):
             traced = trace_points(terrain, points, effort, prepared=prepared, seed=seed, number=part[found])
             ready = ReadyPoints(_rays(terrain, points, part[found]), ready_reception(traced.reception), senders)
-            results = [irradiance(ready, light, light=own) for light, own in zip(lights, sent, strict=True)]
-            yield part[found], points, results
+            yield part[found], points, map(partial(irradiance, ready), lights, sent)
         tell(min(1.0, (start + BLOCK) / len(sound)))
