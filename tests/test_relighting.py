@@ -257,19 +257,18 @@ def test_a_killed_worker_loses_nothing(hill):
     from seasonscapes.cluster import connected, frames_by
 
     times = hours(60, 7.0)
-    alone, together = replace(hill, seed=1), replace(hill, seed=2)
-    # Another seed, another folder; the pictures must not tell: use the same coefficients' seed for both.
-    alone = together = replace(hill, seed=5)
-    folder = frames_folder(alone, place_of(alone))
+    # A seed of its own: no other test's frames lie in this folder.
+    assignment = replace(hill, seed=5)
+    folder = frames_folder(assignment, place_of(assignment))
     for each in times:
-        render_frame(alone, each)
+        render_frame(assignment, each)
     expected = {path.name: load_frame(path)[0] for path in folder.iterdir()}
     for path in folder.iterdir():
         path.unlink()
     with connected("local:2") as client:
         victim = next(iter(client.run(os.getpid).values()))
         records = []
-        for record in frames_by(client, together, times, None):
+        for record in frames_by(client, assignment, times, None):
             records.append(record)
             if len(records) == 20:
                 os.kill(victim, signal.SIGKILL)
@@ -279,10 +278,11 @@ def test_a_killed_worker_loses_nothing(hill):
     assert found.keys() == expected.keys()
     for name, picture in found.items():
         np.testing.assert_array_equal(picture, expected[name])
-    assert not any(render_frame(together, each)["rendered"] for each in times)
+    assert not any(render_frame(assignment, each)["rendered"] for each in times)
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(120)
 def test_slurm_jobs_render(hill, tmp_path, monkeypatch):
     """A stand-in for sbatch runs the very job script that a cluster would get."""
     from seasonscapes.cluster import frames_on_cluster
@@ -290,8 +290,10 @@ def test_slurm_jobs_render(hill, tmp_path, monkeypatch):
     tools = tmp_path / "bin"
     tools.mkdir()
     sbatch = tools / "sbatch"
+    # The script's own file is gone as soon as sbatch answers, as it may be on a cluster.
     sbatch.write_text(
-        f'#!/bin/sh\ncp "$1" {tmp_path}/job.sh\nsetsid sh "$1" >{tmp_path}/job.log 2>&1 &\necho "Submitted batch job 7"\n'
+        f'#!/bin/sh\ncp "$1" {tmp_path}/job.sh\nsetsid sh {tmp_path}/job.sh >{tmp_path}/job.log 2>&1 &\n'
+        'echo "Submitted batch job 7"\n'
     )
     (tools / "scancel").write_text("#!/bin/sh\nexit 0\n")
     for tool in tools.iterdir():
@@ -374,15 +376,16 @@ def test_insolation_of_a_day(hill, tmp_path, capsys):
     import rasterio
 
     common = ["irradiance", hill.scene, "--workspace", hill.workspace, "--sky", "hosek", "--rays", "16", "--json"]
-    span = ["--from", "2024-06-21T03:00Z", "--to", "2024-06-21T20:00Z", "--every", "1h", "--spacing-m", "100"]
+    span = ["--from", "2024-06-21T04:00Z", "--to", "2024-06-21T19:00Z", "--every", "1h", "--spacing-m", "100"]
     assert main([*common, *span, "-o", str(tmp_path / "day.tif")]) == 0
     capsys.readouterr()
     with rasterio.open(tmp_path / "day.tif") as file:
         total, sunshine = file.read(1), file.read(6)
-    # The longest day at 46.5° N: 15 h 50 min of sun on open ground; some 8 kWh/m² under a clear sky.
-    assert 14.5 < np.nanmean(sunshine[1:4, 1:4]) < 16.6
+    # From half an hour after sunrise to half an hour before sunset on the longest day; some 8 kWh/m² under a clear sky.
+    assert 14.0 < np.nanmean(sunshine[1:4, 1:4]) <= 15.0
     assert 7.0 < np.nanmean(total[1:4, 1:4]) < 9.5
-    assert main([*common, "--from", "2024-06-21T22:00Z", "--to", "2024-06-21T23:00Z", "--every", "10min"]) == 2
+    night = ["--from", "2024-06-21T22:00Z", "--to", "2024-06-21T23:00Z", "--every", "10min"]
+    assert main([*common, *night]) == 2
     assert "below the horizon" in capsys.readouterr().err
     assert main(common) == 2
     assert "either an instant or a period" in capsys.readouterr().err
@@ -393,10 +396,10 @@ def test_lit_texture(hill, tmp_path, capsys):
 
     from seasonscapes.images import read_exr
 
-    common = ["lit-texture", hill.scene, "--workspace", hill.workspace, "--sky", "hosek", "--rays", "16", "--time",
+    common = ["lit-texture", hill.scene, "--workspace", hill.workspace, "--sky", "hosek", "--time",
               "2024-06-21T11:00Z", "--texel-m", "50"]  # fmt: skip
     for suffix in ("exr", "png", "glb"):
-        assert main([*common, "-o", str(tmp_path / f"lit.{suffix}")]) == 0
+        assert main([*common, "--rays", "16", "-o", str(tmp_path / f"lit.{suffix}")]) == 0
     layers, header = read_exr(tmp_path / "lit.exr")
     light = layers["sun"] + layers["sky"] + layers["bounce"]
     known = np.isfinite(light).all(axis=-1)
