@@ -13,7 +13,7 @@ shadows and mistaken pixels fade.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -471,3 +471,16 @@ def fill_nearest(values: np.ndarray, seen: np.ndarray) -> np.ndarray:
         return values
     row, column = distance_transform_edt(seen <= 0.0, return_distances=False, return_indices=True)
     return values[row, column]
+
+
+def pixel_weights(land: Land, shots: Sequence[Shot], fit: AlbedoFit, trust: Trust = LINEAR) -> list[np.ndarray]:
+    """Weights ``(n, 3)`` [1 / (cd/m²)²] that a fit's last round gives the terrain pixels of each photograph."""
+    size = land.shape[0] * land.shape[1]
+    albedo = fit.albedo.reshape(size, 3)
+    weights = []
+    for shot, gain in zip(shots, fit.gains, strict=True):
+        row = _rows(replace(shot, gain=np.asarray(gain, float)), trust, size)
+        row.ambient = ambient_on_texels(land, shot.light, fit.albedo)
+        _weigh([row], albedo, trust, robust=True)
+        weights.append(row.weight)
+    return weights
