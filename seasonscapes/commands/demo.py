@@ -41,6 +41,7 @@ HOURS = [
     )
     for h in range(24)
 ]
+FILM_START = f"{YEAR}-09-17T12:00"
 AIR = [
     Panel(f"{sky.replace('_', ' ')} noon, 20 July", f"{YEAR}-07-20T13:35", sky)
     for sky in ("clear", "hazy", "saharan_dust", "overcast")
@@ -57,7 +58,7 @@ def demo(
     workspace: Path | None = None,
     json: bool = False,
 ) -> None:
-    """Render the embedded scene into contact sheets: a day, four seasons, 24 hours under a full moon, four kinds of air.
+    """Render the embedded scene into contact sheets and a film: a day, four seasons, 24 hours under a full moon, four airs.
 
     Pictures that are already there, made with the same arguments, are kept: an interrupted demo goes on where it was.
 
@@ -99,7 +100,28 @@ def demo(
         contact_sheet(sheet, pictures, [panel.caption for panel in panels], columns=columns)
         say(f"demo: {sheet}")
         sheets.append(str(sheet))
-    finish({"sheets": sheets}, [f"{len(sheets)} contact sheets in {output}"], as_json=json)
+    film = _film(place, view, Path(output) / "24-hours.mp4", (width // 4 * 2, height // 4 * 2), device)
+    finish(
+        {"sheets": sheets, "film": str(film)}, [f"{len(sheets)} contact sheets and a film in {output}"], as_json=json
+    )
+
+
+def _film(place, view, path: Path, size_px: tuple[int, int], device: str) -> Path:
+    """A day and a night, every ten minutes; its undeveloped frames stay in the workspace for the next time."""
+    from seasonscapes.civil_time import resolve_time
+    from seasonscapes.commands.timelapse import WorkOptions, develop_film, render_frames
+    from seasonscapes.pipeline import MeshOptions
+    from seasonscapes.sky.models import read_sky_model
+    from seasonscapes.studio import Assignment
+
+    assignment = Assignment(str(place.path.resolve()), str(place.workspace.folder.resolve()), MeshOptions(), view, size_px,
+                            read_sky_model("clear"), season="nearest", base_day=FILM_START[:10], device=device)  # fmt: skip
+    start = resolve_time(FILM_START, view.latitude_deg, view.longitude_deg).utc
+    times = [start + index * timedelta(minutes=10) for index in range(145)]
+    render_frames(assignment, times, WorkOptions(), None)
+    develop_film(assignment, times, path, ("auto", 900.0, 24.0))
+    say(f"demo: {path}")
+    return path
 
 
 class _Studio:

@@ -174,10 +174,10 @@ def timelapse(
         base_day=_base_day(times), seed=seed, device=device, allow_outside=place.allow_outside,
     )  # fmt: skip
     mine = times if work.shard is None else shard(times, work.shard)
-    done = _render(assignment, mine, work, str(output.resolve()) if exr else None)
+    done = render_frames(assignment, mine, work, str(output.resolve()) if exr else None)
     record = {"scene": scene, "camera": chosen.name, "frames": len(mine), "rendered": done["rendered"]}
     if work.shard is None:
-        _develop(assignment, times, output, (metering, window_s, fps))
+        develop_film(assignment, times, output, (metering, window_s, fps))
         record["output"] = str(output)
         if not keep_frames:
             _sweep(assignment, times)
@@ -201,8 +201,8 @@ def _base_day(times: list[datetime]) -> str:
     return "2024-07-01" if times[-1] - times[0] > timedelta(days=180) else times[0].date().isoformat()
 
 
-def _render(assignment: Assignment, times: list[datetime], work: WorkOptions, exr_folder: str | None) -> dict:
-    """Render what is missing, here or on a cluster; how many were."""
+def render_frames(assignment: Assignment, times: list[datetime], work: WorkOptions, exr_folder: str | None) -> dict:
+    """Render those frames into the workspace that are missing there, here or on a cluster; how many were."""
     from seasonscapes.studio import held_studio, render_frame
 
     with progress_bar("light transport") as progress:
@@ -227,8 +227,8 @@ def _render(assignment: Assignment, times: list[datetime], work: WorkOptions, ex
     return {"rendered": rendered}
 
 
-def _develop(assignment: Assignment, times: list[datetime], output: Path, look: tuple) -> None:
-    """Expose all frames alike and write the film or its pictures."""
+def develop_film(assignment: Assignment, times: list[datetime], output: Path, look: tuple) -> None:
+    """Expose rendered frames as one film and write it, or its pictures; ``look`` is metering, window [s] and fps."""
     from seasonscapes.images import write_png
     from seasonscapes.relighting.film import write_film
 
