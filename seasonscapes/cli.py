@@ -34,6 +34,7 @@ app.command("seasonscapes.commands.calibrate:calibrate", help="Calibrate a webca
 app.command(
     "seasonscapes.commands.calibrate:annotate", help="Match points of a photograph and the terrain on a local page."
 )
+app.command("seasonscapes.commands.info:info", help="Print what a file is, and what it was made from.")
 app.command("seasonscapes.commands.demo:demo", help="Picture the embedded scene through a day, a night and a year.")
 app.command("seasonscapes.commands.doctor:doctor", help="Say what this machine can do, and what is missing.")
 

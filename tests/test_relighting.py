@@ -185,6 +185,14 @@ def test_timelapse_resumes_and_grows(hill, tmp_path, capsys):
     assert len(list((tmp_path / "folder").glob("*.png"))) == 7
     again = run(tmp_path / "film2.mp4", *span, "--every", "10min")
     assert again["rendered"] == 0
+    assert main(["info", str(tmp_path / "film2.mp4"), "--json"]) == 0
+    about = json.loads(capsys.readouterr().out)
+    assert (about["frames"], about["seasonscapes"]["camera"]) == (7, "south")
+    for kind in ("terrain-*.npz", "coefficients-*"):
+        assert main(["info", str(next((Path(hill.workspace) / "hill").glob(kind))), "--json"]) == 0
+        assert '"revision"' in capsys.readouterr().out
+    assert main(["info", hill.scene]) == 2
+    assert "carries no provenance" in capsys.readouterr().err
     # Without --keep-frames the undeveloped frames are gone when the film is there.
     assert run(tmp_path / "film3.mp4", *span, "--every", "10min")["rendered"] == 7
 
@@ -410,6 +418,10 @@ def test_lit_texture(hill, tmp_path, capsys):
     assert "KHR_materials_unlit" in model.materials[0].extensions
     assert len(model.images) == 1
     assert model.asset.extras["scene"] == hill.scene
+    for suffix in ("exr", "png", "glb"):
+        capsys.readouterr()
+        assert main(["info", str(tmp_path / f"lit.{suffix}"), "--json"]) == 0
+        assert "elevation_deg" in capsys.readouterr().out
     capsys.readouterr()
     assert main([*common, "--rays", "100", "-o", str(tmp_path / "x.png")]) == 2
     assert "power of two" in capsys.readouterr().err

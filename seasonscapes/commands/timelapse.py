@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json as json_module
 import re
 import time as clock
 from collections.abc import Iterator
@@ -242,11 +243,23 @@ def develop_film(assignment: Assignment, times: list[datetime], output: Path, lo
                 progress((index + 1) / len(times))
 
         if output.suffix.lower() == ".mp4":
-            write_film(output, told(), fps=fps)
+            about = film_record(assignment) | {"from_utc": times[0].isoformat(), "to_utc": times[-1].isoformat()}
+            write_film(output, told(), fps=fps, note=json_module.dumps(about))
             return
         for time, picture in zip(times, told(), strict=True):
+            about = film_record(assignment) | {"time_utc": time.isoformat()}
             write_png(output / f"{time:%Y%m%dT%H%M%S}Z.png", picture,
-                      metadata={"time_utc": time.isoformat()})  # fmt: skip
+                      metadata={"seasonscapes": json_module.dumps(about)})  # fmt: skip
+
+
+def film_record(assignment: Assignment) -> dict:
+    """What a film's file says of it."""
+    from seasonscapes import __version__
+    from seasonscapes.studio import held_studio
+
+    scene = held_studio(assignment).place.scene
+    return {"scene": scene.name, "camera": assignment.view.name, "sky": assignment.model.name, "season": assignment.season,
+            "seed": assignment.seed, "attribution": scene.attribution, "seasonscapes": __version__}  # fmt: skip
 
 
 def developed(

@@ -10,7 +10,9 @@ import numpy as np
 from seasonscapes.images import atomic_path, srgb_from_linear
 
 
-def write_film(path: Path, pictures: Iterable[np.ndarray], *, fps: float = 24.0, quality: int = 8) -> int:
+def write_film(
+    path: Path, pictures: Iterable[np.ndarray], *, fps: float = 24.0, quality: int = 8, note: str = ""
+) -> int:
     """Encode display-linear pictures ``(H, W, 3)`` in [0, 1] as an MP4 that browsers play; returns their number.
 
     Parameters
@@ -19,6 +21,8 @@ def write_film(path: Path, pictures: Iterable[np.ndarray], *, fps: float = 24.0,
         All of one size; odd rows and columns at the lower and right rim are dropped, as H.264 wants even sizes.
     quality
         0 to 10.
+    note
+        Kept in the file as its comment.
 
     Raises
     ------
@@ -36,7 +40,7 @@ def write_film(path: Path, pictures: Iterable[np.ndarray], *, fps: float = 24.0,
                     size = (width, height)
                     writer = imageio_ffmpeg.write_frames(
                         str(temporary), size, fps=fps, quality=quality, macro_block_size=2, codec="libx264",
-                        pix_fmt_out="yuv420p", output_params=["-movflags", "+faststart"],
+                        pix_fmt_out="yuv420p", output_params=["-movflags", "+faststart", "-metadata", f"comment={note}"],
                     )  # fmt: skip
                     writer.send(None)
                 if (width, height) != size:
