@@ -19,6 +19,8 @@ app = App(
     help_format="plaintext",
 )
 app.command("seasonscapes.commands.render:render", help="Render a view of a place at a date and hour.")
+app.command("seasonscapes.commands.paint:paint", help="Paint calibrated pictures of one time into the place's texture.")
+app.command("seasonscapes.commands.inpaint:inpaint", help="Complete a painted texture where no camera saw.")
 app.command("seasonscapes.commands.timelapse:timelapse", help="Film a view through hours or seasons.")
 app.command(
     "seasonscapes.commands.lit:lit_texture", name="lit-texture", help="Export a place's texture as lit at an hour."
