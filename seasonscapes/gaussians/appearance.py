@@ -34,7 +34,7 @@ from seasonscapes.sky.illumination import LUMINANCE_WEIGHTS
 # What the network is told. `code` is a free vector for each training time, as WildGaussians has; `sun` the time
 # embedding alone; `physical` no network at all; `full` everything.
 KINDS = ("code", "sun", "physical", "full")
-EMBEDDING, CODE, HIDDEN = 12, 32, 64
+EMBEDDING, CODE, HIDDEN = 6, 32, 64
 TIME_FEATURES, PHYSICAL_FEATURES = 14, 8
 BODIES = 2
 
@@ -42,7 +42,7 @@ BODIES = 2
 @dataclass(frozen=True)
 class LightTensors:
     """T light states as tensors: ``direction (T, 2, 3)``, ``illuminance (T, 2, 3)``, ``sky (T, r, 3)``,
-    ``bounce (T, 10, 3)``, ``features (T, 14)``; all but the first divided by the luminance of the horizontal illuminance.
+    ``bounce (T, 5, 3)``, ``features (T, 14)``; all but the first divided by the luminance of the horizontal illuminance.
     ``season (T,)`` says which of the dated albedos each time has."""
 
     direction: torch.Tensor
@@ -121,8 +121,8 @@ class Appearance(nn.Module):
         self.register_buffer("normals", torch.as_tensor(transport.normals))
         self.register_buffer("horizon", torch.as_tensor(transport.horizon.reshape(-1)))
         self.horizon_step, self.horizon_low = (high - low) / 255.0, low
-        self.register_buffer("sky", torch.as_tensor(transport.sky.astype(np.float32) * transport.sky_scale))
-        self.register_buffer("bounce", torch.as_tensor(transport.bounce.astype(np.float32)))
+        self.register_buffer("sky", torch.as_tensor(transport.sky * transport.sky_scale))
+        self.register_buffer("bounce", torch.as_tensor(transport.bounce * transport.bounce_scale))
         self.register_buffer("open_sky", torch.as_tensor(transport.open_sky))
         # Logarithms of gains on colour, on sky and bounce; the horizon's shift [rad] and the logarithm of its softness.
         self.log_colour = nn.Parameter(torch.zeros(count, 3))
@@ -131,7 +131,7 @@ class Appearance(nn.Module):
         self.log_softness = nn.Parameter(torch.full((count,), float(np.log(SOFTNESS_RAD))))
         if kind != "physical":
             generator = torch.Generator().manual_seed(seed)
-            self.embedding = nn.Parameter(torch.as_tensor(embedding, dtype=torch.float32))
+            self.embedding = nn.Parameter(torch.tensor(embedding, dtype=torch.float32))  # a copy: training changes it
             if kind == "code":
                 self.codes = nn.Parameter(0.01 * torch.randn(times, CODE, generator=generator))
             self.mlp = _network(self._inputs(embedding.shape[1]), generator)
@@ -155,10 +155,7 @@ class Appearance(nn.Module):
             base = base * irradiance
         if self.kind == "physical":
             return base
-        if self.kind == "code":
-            known = self.codes[time] if code is None else code
-        else:
-            known = lights.features[time]
+        known = lights.features[time] if self.kind != "code" else self.codes[time] if code is None else code
         parts = [self.embedding[index], base, known.expand(len(index), -1), *features]
         gamma, beta = self.mlp(torch.cat(parts, dim=1)).split(3, dim=1)
         return ((1.0 + gamma) * base + 0.1 * beta).clamp(min=0.0)

@@ -106,7 +106,10 @@ class Frame:
     mask: np.ndarray
 
     def __post_init__(self):
-        if self.image.shape != (*self.mask.shape, 3) or self.mask.shape != (self.weights.height_px, self.weights.width_px):
+        if self.image.shape != (*self.mask.shape, 3) or self.mask.shape != (
+            self.weights.height_px,
+            self.weights.width_px,
+        ):
             raise ValueError(f"Frame: image {self.image.shape} and mask {self.mask.shape} do not fit the camera")
         if not np.isfinite(self.image[self.mask]).all():
             raise ValueError("Frame: the picture has usable pixels that are not finite")
@@ -164,7 +167,7 @@ def distil(appearance: Appearance, lessons: Lessons, frames: Sequence[Frame] = (
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         optimiser.step()
-        losses.append(float(loss))
+        losses.append(float(loss.detach()))
         if checkpoint and ((step + 1) % schedule.checkpoint_every == 0 or step + 1 == total):
             save_checkpoint(checkpoint, appearance, optimiser, run, step + 1)
         if progress is not None:
@@ -227,7 +230,9 @@ def _picture(frame: Frame) -> _Picture:
                                shape=(matrix.shape[0], len(discs)))  # fmt: skip
     mask = torch.as_tensor(frame.mask & (frame.weights.coverage > 0.5))
     target = torch.where(mask[..., None], encoded(torch.as_tensor(np.nan_to_num(frame.image).astype(np.float32))), 0.0)
-    return _Picture(torch.as_tensor(discs.astype(np.int64)), forward, forward.T.tocsr(), torch.tensor(frame.time), target, mask)
+    return _Picture(
+        torch.as_tensor(discs.astype(np.int64)), forward, forward.T.tocsr(), torch.tensor(frame.time), target, mask
+    )
 
 
 class _Product(torch.autograd.Function):

@@ -26,7 +26,7 @@ from seasonscapes.cameras.pinhole import Camera
 ALPHA_CUT = 1.0 / 255.0
 ALPHA_MOST = 0.999
 # Variance of the pixel itself [px²], added to each splat so that the smallest do not fall between pixels; more only blurs.
-PIXEL_VARIANCE = 0.03
+PIXEL_VARIANCE = 0.02
 # Nothing is drawn nearer than this [m].
 NEAR_M = 1.0
 # What shines through less than this is not worth a weight.
@@ -256,21 +256,46 @@ def rasterise(splats: Splats, colours: torch.Tensor, camera: Camera, *, alpha_cu
 
 
 @torch.no_grad()
-def view_weights(splats: Splats, camera: Camera, *, pixel_variance: float = PIXEL_VARIANCE) -> ViewWeights:
-    """The sparse matrix of a view whose geometry is frozen; weights behind a closed front are left out."""
+def view_weights(splats: Splats, camera: Camera, *, subpixels: int = 1,
+                 pixel_variance: float = PIXEL_VARIANCE) -> ViewWeights:  # fmt: skip
+    """The sparse matrix of a view whose geometry is frozen; weights behind a closed front are left out.
+
+    Parameters
+    ----------
+    subpixels
+        Samples along a pixel's side: 2 makes edges and steep ground about 1 dB truer, at four times the work.
+    """
     from scipy import sparse
 
-    seen = project_splats(splats, camera, pixel_variance=pixel_variance)
-    pairs = blend_pairs(seen, camera.width_px, camera.height_px)
+    fine = camera if subpixels == 1 else _finer(camera, subpixels)
+    seen = project_splats(splats, fine, pixel_variance=pixel_variance)
+    pairs = blend_pairs(seen, fine.width_px, fine.height_px)
     columns = seen.index.to(torch.int32).index_select(0, pairs.splat).numpy()
-    weight = pairs.weight.numpy()
-    shape = (camera.width_px * camera.height_px, len(splats.means))
-    matrix = sparse.csr_array((weight, columns, pairs.start.numpy().astype(np.int32)), shape=shape)
+    weight, start = pairs.weight.numpy(), pairs.start.numpy()
     keep = weight > TRANSMITTANCE_CUT
-    if not keep.all():
-        kept = np.concatenate([[0], np.cumsum(keep)])[pairs.start.numpy()]
-        matrix = sparse.csr_array((weight[keep], columns[keep], kept.astype(np.int32)), shape=shape)
+    start = np.concatenate([[0], np.cumsum(keep, dtype=np.int64)])[start].astype(np.int32)
+    shape = (fine.width_px * fine.height_px, len(splats.means))
+    matrix = sparse.csr_array((weight[keep], columns[keep], start), shape=shape)
+    if subpixels > 1:
+        matrix = _pooled(matrix, camera, subpixels)
     return ViewWeights(matrix, camera.width_px, camera.height_px)
+
+
+def _finer(camera: Camera, times: int) -> Camera:
+    numbers = (camera.fx, camera.fy, camera.cx, camera.cy)
+    return Camera(camera.width_px * times, camera.height_px * times, *(times * number for number in numbers),
+                  camera.world_from_camera)  # fmt: skip
+
+
+def _pooled(matrix, camera: Camera, subpixels: int):
+    """Rows of the pixels from rows of their samples: means, entries of one splat added up."""
+    from scipy import sparse
+
+    width = camera.width_px * subpixels
+    row, column = np.divmod(np.arange(matrix.shape[0], dtype=np.int32), np.int32(width))
+    pixel = (row // subpixels) * np.int32(camera.width_px) + column // subpixels
+    entries = (matrix.data / np.float32(subpixels**2), (np.repeat(pixel, np.diff(matrix.indptr)), matrix.indices))
+    return sparse.coo_array(entries, shape=(camera.width_px * camera.height_px, matrix.shape[1])).tocsr()
 
 
 def splat_colours(weights: ViewWeights, colours: np.ndarray) -> np.ndarray:

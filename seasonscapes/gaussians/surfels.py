@@ -14,15 +14,32 @@ from seasonscapes.terrain.atlas import planar_uv
 from seasonscapes.terrain.surface import Terrain, sample_texture
 from seasonscapes.terrain.texels import barycentric, texel_coordinates, texel_positions
 
-# Standard deviations along the surface over the discs' distance. Below 0.55 holes open (without the pixel's own width); above 0.6 the picture blurs.
-SIGMA = 0.58
+# Standard deviations along the surface over the discs' distance. Below 0.5 holes open; above 0.55 the picture blurs.
+SIGMA = 0.52
 # Thickness over the distance: 3DGS readers refuse a zero, and a thick disc smears along grazing views.
-THICKNESS = 0.05
-OPACITY = 0.98
+THICKNESS = 0.03
+OPACITY = 0.995
 # Cliffs steeper than about 80° would need discs longer than the plan can tell.
 _MAX_STRETCH = 5.0
 # Places in each cell, a square, that albedo, normal and light are averaged over.
 SUBCELLS = 4
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The grid of cells that discs stand for: north-west corner and size of a cell [m], columns and rows."""
+
+    west_m: float
+    north_m: float
+    east_step_m: float
+    north_step_m: float
+    columns: int
+    rows: int
+
+    @property
+    def spacing_m(self) -> float:
+        """Mean distance of neighbours."""
+        return 0.5 * (self.east_step_m + self.north_step_m)
 
 
 @dataclass(frozen=True)
@@ -31,6 +48,8 @@ class Surfels:
 
     Parameters
     ----------
+    plan, cell
+        The grid, and each disc's flat index in it ``(N,)`` int32, rows from the north.
     means
         ``(N, 3)`` float32 ENU [m].
     quaternions
@@ -45,10 +64,10 @@ class Surfels:
         ``(N, S, 3)`` float32 points of each cell on the surface [m].
     uv
         ``(N, S, 2)`` float32 atlas coordinates of the places.
-    spacing_m
-        Distance of neighbours in plan.
     """
 
+    plan: Plan
+    cell: np.ndarray
     means: np.ndarray
     quaternions: np.ndarray
     log_scales: np.ndarray
@@ -56,7 +75,6 @@ class Surfels:
     normals: np.ndarray
     places: np.ndarray
     uv: np.ndarray
-    spacing_m: float
 
 
 def terrain_surfels(terrain: Terrain, spacing_m: float) -> Surfels:
@@ -75,7 +93,7 @@ def terrain_surfels(terrain: Terrain, spacing_m: float) -> Surfels:
     if not spacing_m > 0.0:
         raise ValueError(f"spacing_m: got {spacing_m}, expected a positive distance")
     extent = np.ptp(terrain.vertices[:, :2].astype(np.float64), axis=0)
-    width, height = (int(round(side / spacing_m)) for side in extent)
+    width, height = (round(float(side) / spacing_m) for side in extent)
     if min(width, height) < 1:
         raise ValueError(f"spacing_m: got {spacing_m}, but the terrain is {extent.min():.0f} m wide")
     positions, normals, uv = _cells(terrain, width, height)
@@ -83,20 +101,23 @@ def terrain_surfels(terrain: Terrain, spacing_m: float) -> Surfels:
     if not whole.any():
         raise ValueError("terrain_surfels: the terrain covers no cell")
     positions, normals, uv = positions[whole], normals[whole], uv[whole]
+    low, high = terrain.vertices[:, :2].min(axis=0), terrain.vertices[:, :2].max(axis=0)
+    plan = Plan(float(low[0]), float(high[1]), *(extent / [width, height]).tolist(), width, height)
+    means = positions.mean(axis=1, dtype=np.float64).astype(np.float32)
     mean_normal = normals.mean(axis=1)
-    axes, stretch = _disc_axes(mean_normal)
+    shape = disc_shapes(mean_normal, plan.spacing_m)
+    return Surfels(
+        plan, np.flatnonzero(whole).astype(np.int32), means, *shape, mean_normal.astype(np.float32), positions, uv
+    )
+
+
+def disc_shapes(normals: np.ndarray, spacing_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Quaternions, logarithms of scales and opacity logits of discs that lie on a surface with normals ``(N, 3)``."""
+    axes, stretch = _disc_axes(normals)
     scales = np.stack([SIGMA * stretch, np.full(len(stretch), SIGMA), np.full(len(stretch), THICKNESS)], axis=1)
     logit = np.log(OPACITY / (1.0 - OPACITY))
-    return Surfels(
-        positions.mean(axis=1, dtype=np.float64).astype(np.float32),
-        quaternions_from_axes(axes).astype(np.float32),
-        np.log(scales * float(np.mean(extent / [width, height]))).astype(np.float32),
-        np.full(len(stretch), logit, np.float32),
-        mean_normal.astype(np.float32),
-        positions,
-        uv,
-        float(np.mean(extent / [width, height])),
-    )
+    return (quaternions_from_axes(axes).astype(np.float32), np.log(scales * spacing_m).astype(np.float32),
+            np.full(len(stretch), logit, np.float32))  # fmt: skip
 
 
 def _cells(terrain: Terrain, width: int, height: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

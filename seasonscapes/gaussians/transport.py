@@ -21,8 +21,8 @@ from seasonscapes.sky.illumination import Illumination, Luminary, global_horizon
 
 AZIMUTHS = 64
 HORIZON_RANGE_RAD = (-0.02, 1.29)
-# Coefficients of the sky for each disc, and of light from other slopes: nine for the sun's direction, one for the sky.
-SKY_RANK, BOUNCE_TERMS = 8, 10
+# Coefficients of the sky for each disc, and of light from other slopes: four for the sun's direction, one for the sky.
+SKY_RANK, BOUNCE_TERMS = 8, 5
 # Albedo is averaged over this distance around a disc to know the colour of what others send it [m].
 AROUND_M = 300.0
 # A fresh table's edge is this soft [rad]: the sun's radius and half a step of the table.
@@ -47,7 +47,7 @@ class Transport:
     patches
         Subdivision of the sky, a name in `sky_patches.SUBDIVISIONS`.
     bounce
-        ``(N, 10)`` float16.
+        ``(N, 5)`` int8; times ``bounce_scale`` ``(5,)`` float32.
     open_sky
         ``(N,)`` float32 sky-view factor.
     """
@@ -59,12 +59,16 @@ class Transport:
     from_sky: np.ndarray
     patches: str
     bounce: np.ndarray
-    open_sky: np.ndarray
+    bounce_scale: np.ndarray
 
     @property
-    def bytes_each(self) -> int:
-        """Bytes that a disc takes for all this, normals and sky view counted as the two and one they can be packed in."""
-        return 2 + 1 + self.horizon.itemsize * self.horizon.shape[1] + self.sky.shape[1] + self.bounce.shape[1]
+    def open_sky(self) -> np.ndarray:
+        """Sky-view factor ``(N,)`` float32: irradiance under a white sky over π."""
+        from seasonscapes.rendering.sky_patches import sky_patches
+
+        white = np.where(sky_patches(self.patches).directions[:, 2] > 0.0, 1.0, 0.0)
+        weights = (self.sky_scale * (self.from_sky.T @ white)).astype(np.float32)
+        return np.clip(self.sky @ weights, 0.0, 1.0).astype(np.float32)
 
 
 def quantised_horizon(angle_rad: np.ndarray) -> np.ndarray:
@@ -73,11 +77,16 @@ def quantised_horizon(angle_rad: np.ndarray) -> np.ndarray:
     return np.clip(np.rint((angle_rad - low) * (255.0 / (high - low))), 0, 255).astype(np.uint8)
 
 
+def signed_bytes(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Columns ``(N, k)`` as int8, and the scale ``(k,)`` that brings them back."""
+    scale = np.maximum(np.abs(values).max(axis=0), 1e-9) / 127.0
+    return np.rint(values / scale).astype(np.int8), scale.astype(np.float32)
+
+
 def bounce_terms(direction: np.ndarray) -> np.ndarray:
-    """The nine polynomials of degree two of unit directions ``(..., 3)``, ``(..., 9)``: smooth light from all around."""
-    x, y, z = np.moveaxis(np.asarray(direction, np.float64), -1, 0)
-    one = np.ones_like(x)
-    return np.stack([one, x, y, z, x * y, x * z, y * z, x * x - y * y, 3.0 * z * z - 1.0], axis=-1)
+    """One and the components of unit directions ``(..., 3)``, ``(..., 4)``: light from all around varies no faster."""
+    direction = np.asarray(direction, np.float64)
+    return np.concatenate([np.ones((*direction.shape[:-1], 1)), direction], axis=-1)
 
 
 def trace_transport(occluder, surfels: Surfels, albedo: np.ndarray, *, rays: int = 128, seed: int = 0,
@@ -95,7 +104,6 @@ def trace_transport(occluder, surfels: Surfels, albedo: np.ndarray, *, rays: int
     """
     from seasonscapes.rendering.horizon import horizon_angles
     from seasonscapes.rendering.irradiance import irradiance, ready_points
-    from seasonscapes.rendering.sky_patches import sky_patches
 
     tell = progress or (lambda share: None)
     traced = centre_coefficients(occluder, surfels, rays=rays, rank=SKY_RANK, seed=seed)
@@ -104,16 +112,12 @@ def trace_transport(occluder, surfels: Surfels, albedo: np.ndarray, *, rays: int
     angle = horizon_angles(occluder, traced.points, azimuths=AZIMUTHS, low_rad=low, high_rad=high,
                            progress=lambda share: tell(0.4 + 0.4 * share))  # fmt: skip
     ready = ready_points(occluder, traced)
-    around = neighbourhood_mean(surfels, albedo).mean(axis=1)
+    around = neighbourhood_mean(surfels.means, albedo, surfels.plan.spacing_m).mean(axis=1)
     bounce = _bounce_coefficients(lambda light: irradiance(ready, light, sun_rays_each=1).bounce.mean(axis=1)) / around
-    direct = np.asarray(traced.reception.direct, np.float32)
-    scale = np.maximum(np.abs(direct).max(axis=0), 1e-9) / 127.0
-    from_sky = np.asarray(traced.senders.from_sky, np.float32)
-    white = np.where(sky_patches(traced.senders.patches).directions[:, 2] > 0.0, 1.0, 0.0)
     tell(1.0)
-    return Transport(surfels.normals, quantised_horizon(angle), np.rint(direct / scale).astype(np.int8),
-                     scale.astype(np.float32), from_sky, traced.senders.patches, bounce.T.astype(np.float16),
-                     np.clip(direct @ (from_sky.T @ white), 0.0, 1.0).astype(np.float32))  # fmt: skip
+    return Transport(surfels.normals, quantised_horizon(angle), *signed_bytes(traced.reception.direct.astype(np.float32)),
+                     np.asarray(traced.senders.from_sky, np.float32), traced.senders.patches,
+                     *signed_bytes(bounce.T))  # fmt: skip
 
 
 def centre_coefficients(occluder, surfels: Surfels, *, rays: int, rank: int, seed: int = 0):
@@ -128,7 +132,7 @@ def centre_coefficients(occluder, surfels: Surfels, *, rays: int, rank: int, see
 
 
 def _bounce_coefficients(bounced: Callable[[Illumination], np.ndarray]) -> np.ndarray:
-    """Least squares ``(10, N)`` of light from other slopes for unit suns all over the sky, then for a unit grey sky."""
+    """Least squares ``(5, N)`` of light from other slopes for unit suns all over the sky, then for a unit grey sky."""
     directions = [
         direction_from_angles(360.0 * k / count + 7.0 * elevation, elevation)
         for elevation, count in ((4.0, 8), (14.0, 10), (28.0, 10), (45.0, 8), (68.0, 4))
@@ -140,16 +144,16 @@ def _bounce_coefficients(bounced: Callable[[Illumination], np.ndarray]) -> np.nd
     return np.concatenate([coefficients, bounced(uniform_sky(1.0 / np.pi))[None]])
 
 
-def neighbourhood_mean(surfels: Surfels, albedo: np.ndarray) -> np.ndarray:
-    """Albedo ``(N, 3)`` averaged over the discs around each one in plan (a Gaussian of `AROUND_M`)."""
+def neighbourhood_mean(means: np.ndarray, albedo: np.ndarray, spacing_m: float) -> np.ndarray:
+    """Albedo ``(N, 3)`` of discs averaged over the others around them in plan (a Gaussian of `AROUND_M`)."""
     import cv2
 
-    cell = np.floor((surfels.means[:, :2] - surfels.means[:, :2].min(axis=0)) / surfels.spacing_m + 0.5).astype(int)
+    cell = np.floor((means[:, :2] - means[:, :2].min(axis=0)) / spacing_m + 0.5).astype(int)
     shape = cell.max(axis=0)[::-1] + 1
     grid, count = np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32)
     np.add.at(grid, (cell[:, 1], cell[:, 0]), albedo)
     np.add.at(count, (cell[:, 1], cell[:, 0]), 1.0)
-    sigma = AROUND_M / surfels.spacing_m
+    sigma = AROUND_M / spacing_m
     mean = cv2.GaussianBlur(grid, (0, 0), sigma) / np.maximum(cv2.GaussianBlur(count, (0, 0), sigma), 1e-6)[..., None]
     return np.maximum(mean[cell[:, 1], cell[:, 0]], 1e-3)
 

@@ -1,0 +1,474 @@
+"""Gaussians distilled from relit renders, against the conditioning of WildGaussians, on held-out hours.
+
+    python benchmarks/gaussians.py [--quick] [--seed N] [--json FILE] [--picture FILE]
+
+The scene is a massif of our own making (another one for every seed) under a clear sky. Discs learn from suns of a whole
+year seen by three cameras; they are judged on suns that they have not seen, on those cameras and on a fourth one.
+
+* Truth is the view relit from its daylight coefficients with the same bounces as path tracing, of which it has no noise;
+  one view is path traced too, and the difference of both is printed.
+* PSNR is that of sRGB pictures over pixels that are all terrain, before the air (which would flatter); exposure is
+  given by the horizontal illuminance, equal for all.
+* All contestants have the same discs, the same two stages, steps and pictures. ``code`` has a free vector for each
+  training time; for a held-out picture it is fitted to the left half and judged on the right one, as WildGaussians does
+  (it has then seen half of the answer). ``sun`` is the same network told where the sun stands.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import secrets
+import time
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+
+import numpy as np
+
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+SUMMER_DAY, SPRING_DAYS = 245.0, (115.0, 130.0, 145.0)
+
+
+@dataclass(frozen=True)
+class Sizes:
+    side: int = 320
+    picture_px: int = 256
+    suns: int = 32
+    held_out: int = 8
+    surface_steps: int = 2500
+    picture_steps: int = 288
+    code_fits: int = 8
+    speed_px: int = 512
+
+
+QUICK = Sizes(
+    side=160, picture_px=128, suns=16, held_out=4, surface_steps=800, picture_steps=96, code_fits=2, speed_px=256
+)
+
+
+class Scene:
+    """The massif, its light and its cameras."""
+
+    def __init__(self, seed: int, sizes: Sizes):
+        from seasonscapes.frames import LocalFrame
+        from seasonscapes.rendering.gather import occluder
+        from seasonscapes.rendering.scene import mi_mesh
+        from seasonscapes.terrain.mesh import build_mesh
+        from seasonscapes.terrain.synthetic import alpine_massif
+        from seasonscapes.terrain.unwrap import unwrap
+
+        self.sizes, self.rng = sizes, np.random.default_rng(seed)
+        self.place = alpine_massif(seed=seed, size_m=6000.0, spacing_m=15.0)
+        self.frame = LocalFrame(46.55, 7.98)
+        self.terrain, self.atlas = unwrap(build_mesh(self.place.elevation, self.frame, mesher="grid"), texel_m=7.5)
+        self.spacing_m = float(np.ptp(self.terrain.vertices[:, 0])) / sizes.side
+        self.mesh = mi_mesh(self.terrain, self.albedo(SUMMER_DAY))
+        self.occluder = occluder(self.mesh)
+        first = float(self.rng.uniform(0.0, 360.0))
+        self.cameras = [self.camera(first + turn) for turn in (0.0, 120.0, 240.0, 55.0)]
+
+    def albedo(self, day: float) -> np.ndarray:
+        from affine import Affine
+
+        from seasonscapes.terrain.imagery import bake_imagery
+        from seasonscapes.terrain.surface import Raster
+        from seasonscapes.terrain.synthetic import alpine_albedo
+
+        elevation = self.place.elevation
+        image = Raster(
+            alpine_albedo(self.place, day, upsample=2), elevation.transform * Affine.scale(0.5), elevation.crs
+        )
+        return bake_imagery(self.terrain, self.atlas, image).values
+
+    def camera(self, azimuth_deg: float):
+        """Looks at the middle from 7.5 km, from as low as it can without seeing the massif's underside."""
+        from seasonscapes.cameras.pinhole import Camera, ray_directions, rotation_from_angles
+        from seasonscapes.rendering.gbuffer import trace_gbuffer
+        from seasonscapes.rendering.scene import RenderScene
+
+        size = self.sizes.picture_px
+        azimuth, focal = np.radians(azimuth_deg), 0.5 * size / np.tan(np.radians(23.0))
+        for height in np.arange(4200.0, 9000.0, 400.0):
+            position = np.array([7500.0 * np.sin(azimuth), 7500.0 * np.cos(azimuth), height])
+            forward = np.array([0.0, 0.0, 1700.0]) - position
+            pitch = np.degrees(np.arctan2(forward[2], np.hypot(forward[0], forward[1])))
+            pose = np.eye(4)
+            pose[:3, :3] = rotation_from_angles(azimuth_deg + 180.0, pitch)
+            pose[:3, 3] = position
+            camera = Camera(size, size, focal, focal, size / 2.0, size / 2.0, pose)
+            seen = trace_gbuffer(RenderScene(self.occluder.mi_scene, self.mesh, None, 0.0), camera)
+            away = np.nansum(seen.normal * ray_directions(camera), axis=-1) > 0.0
+            if away.mean() < 1e-4:
+                return camera
+        raise SystemExit("no camera sees the massif from above alone; try another seed")
+
+    def lights(self, count: int, *, day: float | None = None):
+        """Random instants with the sun above 4°: lights, days of the year."""
+        from seasonscapes.daylight import light_at, moment_at
+        from seasonscapes.sky.models import read_sky_model
+        from seasonscapes.workspace import default_workspace
+
+        model, found, days = read_sky_model("clear"), [], []
+        while len(found) < count:
+            at = float(self.rng.integers(1, 366)) if day is None else day
+            moment = moment_at(datetime(2024, 1, 1, tzinfo=UTC) + timedelta(days=at - 1, hours=float(self.rng.uniform(4, 20))),
+                               self.frame.latitude_deg, self.frame.longitude_deg, 2000.0)  # fmt: skip
+            if moment.sun.elevation_deg > 4.0:
+                found.append(light_at(model, moment, 2000.0, workspace=default_workspace()))
+                days.append(at)
+        return found, days
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What a camera sees at T times: ``pictures (T, H, W, 3)`` in `Lessons`' unit, ``solid (H, W)`` all-terrain pixels."""
+
+    pictures: np.ndarray
+    solid: np.ndarray
+    sunny: np.ndarray
+    facing: np.ndarray
+
+
+def truth_of(scene: Scene, terrain, camera, lights, states, *, seed: int = 3) -> Truth:
+    from seasonscapes.rendering.relit_view import ready_view, relight_view
+    from seasonscapes.rendering.transport import Effort, trace_view
+
+    view = trace_view(terrain, camera, Effort(rays=256), seed=seed)
+    ready = ready_view(terrain, view)
+    solid = ready.coverage > 0.999
+    pictures, sunny, facing = [], [], []
+    for light, state in zip(lights, states, strict=True):
+        pictures.append(relight_view(ready, light).surface * np.float32(np.pi / state.global_lx))
+        shown, faced = shadow_truth(scene, terrain, ready.gbuffer, np.asarray(light.sun.direction))
+        sunny.append(shown)
+        facing.append(faced & solid)
+    return Truth(np.stack(pictures), solid, np.stack(sunny), np.stack(facing))
+
+
+def shadow_truth(scene: Scene, terrain, gbuffer, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which pixel centres see the sun, and which face it ``(H, W)``."""
+    from seasonscapes.rendering.gbuffer import occluded
+    from seasonscapes.rendering.scene import RenderScene
+
+    facing = np.nan_to_num(gbuffer.normal @ direction, nan=-1.0) > 0.0
+    bare = RenderScene(terrain.mi_scene, scene.mesh, None, 0.0)
+    shown = np.zeros(facing.shape, bool)
+    start = gbuffer.position[facing] + 0.5 * gbuffer.normal[facing]
+    shown[facing] = ~occluded(bare, start, np.broadcast_to(direction, start.shape))
+    return shown, facing
+
+
+def psnr(picture: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
+    from seasonscapes.images import srgb_from_linear
+
+    return float(-10.0 * np.log10(np.mean((srgb_from_linear(picture) - srgb_from_linear(truth))[mask] ** 2)))
+
+
+class Contest:
+    """Discs, lessons, frames and truth, and what each contestant makes of them."""
+
+    def __init__(self, scene: Scene, seed: int):
+        from seasonscapes.gaussians.distil import Frame, lessons_from
+        from seasonscapes.gaussians.rasterise import splats_from, view_weights
+        from seasonscapes.gaussians.surfels import surfel_albedo, terrain_surfels
+        from seasonscapes.gaussians.transport import light_state, neighbourhood_mean, surfel_irradiance, trace_transport
+
+        sizes, self.scene, self.seed = scene.sizes, scene, seed
+        self.seconds: dict[str, float] = {}
+        start = time.perf_counter()
+        self.surfels = terrain_surfels(scene.terrain, scene.spacing_m)
+        self.albedo = surfel_albedo(self.surfels, scene.albedo(SUMMER_DAY))
+        self.around = neighbourhood_mean(self.surfels.means, self.albedo, self.surfels.plan.spacing_m)
+        self.transport = trace_transport(scene.occluder, self.surfels, self.albedo, rays=64, seed=seed)
+        self.seconds["transport"] = time.perf_counter() - start
+        self.lights, days = scene.lights(sizes.suns + sizes.held_out)
+        self.states = [light_state(self.transport, light, day) for light, day in zip(self.lights, days, strict=True)]
+        self.suns = sizes.suns
+        start = time.perf_counter()
+        received = surfel_irradiance(scene.occluder, self.surfels, self.lights[: self.suns], rays=128, seed=seed)
+        self.lessons = lessons_from(self.states[: self.suns], [0] * self.suns, self.albedo[None], received)
+        self.seconds["lessons"] = time.perf_counter() - start
+        start = time.perf_counter()
+        self.truth = [truth_of(scene, scene.occluder, camera, self.lights, self.states) for camera in scene.cameras]
+        self.seconds["views"] = time.perf_counter() - start
+        self.weights = []
+        for camera in scene.cameras:
+            away = np.einsum("nc,nc->n", self.surfels.means - camera.position_m, self.surfels.normals) > 0.0
+            logits = np.where(away, -20.0, self.surfels.opacity_logits)
+            shape = (self.surfels.means, self.surfels.quaternions, self.surfels.log_scales, logits)
+            self.weights.append(view_weights(splats_from(*shape), camera, subpixels=2))
+        self.frames = [Frame(self.weights[v], t, self.truth[v].pictures[t], self.truth[v].solid)
+                       for v in range(3) for t in range(self.suns)]  # fmt: skip
+        self.held_out = range(self.suns, self.suns + sizes.held_out)
+
+    def appearance(self, kind: str):
+        from seasonscapes.gaussians.appearance import Appearance, fourier_embedding
+
+        return Appearance(kind, self.albedo[None], self.around[None], self.transport,
+                          fourier_embedding(self.surfels.means, seed=self.seed), times=self.suns, seed=self.seed)  # fmt: skip
+
+    def trained(self, kind: str):
+        from seasonscapes.gaussians.distil import Schedule, distil
+
+        sizes, appearance = self.scene.sizes, self.appearance(kind)
+        start = time.perf_counter()
+        distil(
+            appearance, self.lessons, self.frames, Schedule(sizes.surface_steps, sizes.picture_steps), seed=self.seed
+        )
+        self.seconds[kind] = time.perf_counter() - start
+        return appearance
+
+    def picture(self, view: int, colours: np.ndarray) -> np.ndarray:
+        from seasonscapes.gaussians.rasterise import splat_colours
+
+        return splat_colours(self.weights[view], colours) / np.maximum(self.weights[view].coverage, 1e-3)[..., None]
+
+    def score(self, appearance, times=None) -> tuple[float, float]:
+        """Mean PSNR of held-out times on the training cameras and on the unseen one."""
+        from seasonscapes.gaussians.appearance import colours_at
+
+        table = []
+        for t in self.held_out if times is None else times:
+            colours = colours_at(appearance, self.states[t])
+            table.append(
+                [psnr(self.picture(v, colours), self.truth[v].pictures[t], self.truth[v].solid) for v in range(4)]
+            )
+        mean = np.mean(table, axis=0)
+        return float(mean[:3].mean()), float(mean[3])
+
+    def score_code(self, appearance) -> tuple[float, float]:
+        """Free codes fitted to the left half, judged on the right; as many pictures as `Sizes.code_fits` says."""
+        from seasonscapes.gaussians.appearance import light_tensors
+        from seasonscapes.gaussians.distil import Frame, fit_code
+
+        lights, table = light_tensors(self.states), []
+        import torch
+
+        for t in list(self.held_out)[: self.scene.sizes.code_fits]:
+            row = []
+            for v in (0, 3):
+                truth = self.truth[v]
+                left = np.arange(truth.solid.shape[1])[None, :] < truth.solid.shape[1] // 2
+                frame = Frame(self.weights[v], t, truth.pictures[t], truth.solid & left)
+                code = fit_code(appearance, lights, frame, seed=self.seed)
+                with torch.no_grad():
+                    colours = appearance(torch.arange(len(self.albedo)), torch.tensor(t), lights, code).numpy()
+                row.append(psnr(self.picture(v, colours), truth.pictures[t], truth.solid & ~left))
+            table.append(row)
+        return tuple(np.mean(table, axis=0).tolist())
+
+    def score_pictures(self, share) -> float:
+        """Mean PSNR on the training cameras of pictures mixed from training ones by weights ``share(t) (suns,)``."""
+        values = [psnr(np.einsum("t,thwc->hwc", share(t), truth.pictures[: self.suns]), truth.pictures[t], truth.solid)
+                  for truth in self.truth[:3] for t in self.held_out]  # fmt: skip
+        return float(np.mean(values))
+
+    def sun_weights(self, power: float):
+        """Weights of training suns by their nearness to a held-out one; ``inf`` takes the nearest alone."""
+        directions = np.stack([state.bodies[0][0] for state in self.states])
+
+        def share(t: int) -> np.ndarray:
+            angle = np.arccos(np.clip(directions[: self.suns] @ directions[t], -1.0, 1.0))
+            if np.isinf(power):
+                return (np.arange(self.suns) == np.argmin(angle)).astype(np.float32)
+            nearest = np.argsort(angle)[:3]
+            weight = np.zeros(self.suns, np.float32)
+            weight[nearest] = 1.0 / np.maximum(angle[nearest], 1e-3) ** power
+            return weight / weight.sum()
+
+        return share
+
+    def shadow_iou(self, appearance) -> float:
+        """Intersection over union of cast shadows, of pixels that face the sun, over held-out times and all cameras."""
+        import torch
+
+        both = either = 0
+        for t in self.held_out:
+            direction = torch.as_tensor(self.states[t].bodies[0][0])
+            with torch.no_grad():
+                seen = appearance.visibility(torch.arange(len(self.albedo)), direction).numpy()
+            for v, truth in enumerate(self.truth):
+                dark = (self.picture(v, seen[:, None])[..., 0] < 0.5)[truth.facing[t]]
+                true = ~truth.sunny[t][truth.facing[t]]
+                both, either = both + int(np.sum(dark & true)), either + int(np.sum(dark | true))
+        return both / max(either, 1)
+
+
+def seasons(contest: Contest, appearance) -> dict[str, float]:
+    """A date between two dated albedos against these two, on the first camera at three hours each."""
+    import torch
+
+    from seasonscapes.gaussians.appearance import colours_at
+    from seasonscapes.gaussians.season import albedo_at
+    from seasonscapes.gaussians.surfels import surfel_albedo
+    from seasonscapes.gaussians.transport import light_state, neighbourhood_mean
+    from seasonscapes.rendering.gather import occluder
+    from seasonscapes.rendering.scene import mi_mesh
+
+    scene, surfels = contest.scene, contest.surfels
+    true = {day: scene.albedo(day) for day in SPRING_DAYS}
+    dated = np.stack([surfel_albedo(surfels, true[day]) for day in (SPRING_DAYS[0], SPRING_DAYS[2])])
+    result, held = {}, (appearance.albedo, appearance.around)
+    for number, day in enumerate(SPRING_DAYS):
+        lights, _ = scene.lights(3, day=day)
+        states = [light_state(contest.transport, light, day) for light in lights]
+        truth = truth_of(scene, occluder(mi_mesh(scene.terrain, true[day])), scene.cameras[0], lights, states)
+        guesses = {"": albedo_at(dated, np.array([SPRING_DAYS[0], SPRING_DAYS[2]]), day, surfels.means[:, 2])}
+        if number == 1:
+            guesses["_mean"] = dated.mean(axis=0)
+        for name, albedo in guesses.items():
+            around = neighbourhood_mean(surfels.means, albedo, surfels.plan.spacing_m)
+            appearance.albedo, appearance.around = torch.as_tensor(albedo)[None], torch.as_tensor(around)[None]
+            values = [psnr(contest.picture(0, colours_at(appearance, state)), picture, truth.solid)
+                      for state, picture in zip(states, truth.pictures, strict=True)]  # fmt: skip
+            result[f"season_{('seen', 'unseen', 'seen2')[number]}{name}_psnr_db"] = float(np.mean(values))
+    appearance.albedo, appearance.around = held
+    return result
+
+
+def speed(contest: Contest, appearance, target_db: float) -> dict[str, float]:
+    """Frames per second on two threads, and seconds of path tracing to the same error, on the first camera."""
+    from dataclasses import replace
+
+    from seasonscapes.gaussians.appearance import colours_at
+    from seasonscapes.gaussians.rasterise import choose_threads, splat_colours, splats_from, view_weights
+    from seasonscapes.rendering.radiance import path_trace
+    from seasonscapes.rendering.scene import relight
+
+    scene, small = contest.scene, contest.scene.cameras[0]
+    times = scene.sizes.speed_px / small.width_px
+    camera = replace(small, width_px=scene.sizes.speed_px, height_px=scene.sizes.speed_px, fx=small.fx * times,
+                     fy=small.fy * times, cx=small.cx * times, cy=small.cy * times)  # fmt: skip
+    surfels, t = contest.surfels, contest.held_out[0]
+    away = np.einsum("nc,nc->n", surfels.means - camera.position_m, surfels.normals) > 0.0
+    splats = splats_from(
+        surfels.means, surfels.quaternions, surfels.log_scales, np.where(away, -20.0, surfels.opacity_logits)
+    )
+    choose_threads(2)
+    colours = colours_at(appearance, contest.states[t])
+    moving = best(lambda: splat_colours(view_weights(splats, camera), colours))
+    fine = best(lambda: splat_colours(view_weights(splats, small, subpixels=2), colours))
+    relit = best(lambda: colours_at(appearance, contest.states[t]))
+    weights = view_weights(splats, camera)
+    still = best(lambda: splat_colours(weights, colours))
+    choose_threads(1)
+    lit = relight(scene.mesh, contest.lights[t], max_height_m=float(scene.terrain.vertices[:, 2].max()))
+    path_trace(lit, small, spp=4)
+    scale, truth = np.pi / contest.states[t].global_lx, contest.truth[0]
+    for spp in (4, 8, 16, 32, 64, 128):
+        start = time.perf_counter()
+        noisy, _ = path_trace(lit, small, spp=spp, seed=5)
+        seconds = time.perf_counter() - start
+        noisy_db = psnr(noisy * scale, truth.pictures[t], truth.solid)
+        if noisy_db >= target_db:
+            break
+    check, _ = path_trace(lit, small, spp=512, seed=6)
+    start = time.perf_counter()
+    path_trace(lit, camera, spp=spp, seed=7)
+    large = time.perf_counter() - start
+    return {"rasterise_ms": 1e3 * moving, "rasterise_fps": 1.0 / moving, "still_camera_ms": 1e3 * still,
+            "colours_ms": 1e3 * relit, "rasterise_2x2_small_ms": 1e3 * fine, "path_spp_of_equal_error": spp,
+            "path_psnr_db": noisy_db, "path_seconds_small": seconds, "path_seconds": large,
+            "speedup_vs_path": seconds / fine, "speedup_vs_path_still": large / still,
+            "truth_vs_path_psnr_db": psnr(check * scale, truth.pictures[t], truth.solid)}  # fmt: skip
+
+
+def best(call, rounds: int = 5) -> float:
+    call()
+    seconds = []
+    for _ in range(rounds):
+        start = time.perf_counter()
+        call()
+        seconds.append(time.perf_counter() - start)
+    return min(seconds)
+
+
+def contact_sheet(contest: Contest, appearance, path: str) -> None:
+    """Held-out hours in columns; path traced, splats, difference × 4 in rows; the unseen camera in the lower half."""
+    from PIL import Image
+
+    from seasonscapes.gaussians.appearance import colours_at
+    from seasonscapes.images import srgb_from_linear
+
+    rows = []
+    order = sorted(contest.held_out, key=lambda t: contest.states[t].global_lx)[:: max(1, len(contest.held_out) // 4)][
+        :4
+    ]
+    for v in (0, 3):
+        columns = []
+        for t in order:
+            truth = srgb_from_linear(contest.truth[v].pictures[t])
+            splats = srgb_from_linear(contest.picture(v, colours_at(appearance, contest.states[t])))
+            splats = splats * (contest.weights[v].coverage > 0.5)[..., None]
+            difference = np.clip(4.0 * np.abs(truth - splats), 0.0, 1.0)
+            columns.append(np.concatenate([truth, splats, difference], axis=0))
+        rows.append(np.concatenate(columns, axis=1))
+    sheet = np.concatenate(rows, axis=1)
+    Image.fromarray(np.rint(255.0 * np.clip(sheet, 0, 1)).astype(np.uint8)).save(path, quality=88)
+
+
+def packed_scores(contest: Contest, appearance) -> dict[str, float]:
+    """Bytes for each Gaussian on disk, and what packing costs in PSNR."""
+    from seasonscapes.gaussians.model import bytes_each, model_from, packed, unpacked
+    from seasonscapes.gaussians.render import appearance_of, learned_numbers
+
+    model = model_from(contest.surfels, contest.albedo[None], [SUMMER_DAY], contest.transport, kind="full",
+                       frame=contest.scene.frame, appearance=learned_numbers(appearance))  # fmt: skip
+    again = contest.score(appearance_of(unpacked(*packed(model))))
+    return {"bytes_per_gaussian": bytes_each(model), "packed_held_out_hour_psnr_db": again[0]}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="a small scene, within five minutes on two cores")
+    parser.add_argument("--seed", type=int, default=None)
+    parser.add_argument("--json", default=None)
+    parser.add_argument("--picture", default=None, help="write the contact sheet here")
+    arguments = parser.parse_args()
+    seed = secrets.randbelow(10_000) if arguments.seed is None else arguments.seed
+    from seasonscapes.gaussians.rasterise import choose_threads
+
+    choose_threads(1)
+    start = time.perf_counter()
+    contest = Contest(Scene(seed, QUICK if arguments.quick else Sizes()), seed)
+    result: dict[str, float] = {"seed": seed, "gaussians": len(contest.albedo), "suns": contest.suns,
+                                "nearest_sun_psnr_db": contest.score_pictures(contest.sun_weights(np.inf)),
+                                "blend_psnr_db": contest.score_pictures(contest.sun_weights(1.0))}  # fmt: skip
+
+    def tell(name: str, scores: tuple[float, float]) -> None:
+        result[f"{name}_psnr_db"], result[f"{name}_unseen_camera_psnr_db"] = scores
+        print(f"{name:20s} {scores[0]:6.2f} {scores[1]:6.2f}  [{time.perf_counter() - start:.0f} s]", flush=True)
+
+    print("prepared", {name: round(value, 1) for name, value in contest.seconds.items()}, flush=True)
+    print(f"nearest sun {result['nearest_sun_psnr_db']:.2f}, blend of three {result['blend_psnr_db']:.2f}")
+    tell("physical_untrained", contest.score(contest.appearance("physical")))
+    full = contest.trained("full")
+    tell("full", contest.score(full))
+    if arguments.picture:
+        contact_sheet(contest, full, arguments.picture)
+    result["shadow_iou"] = contest.shadow_iou(full)
+    result |= packed_scores(contest, full)
+    tell("sun", contest.score(contest.trained("sun")))
+    code = contest.trained("code")
+    tell("code", contest.score_code(code))
+    tell("physical", contest.score(contest.trained("physical")))
+    result |= seasons(contest, full)
+    result |= speed(contest, full, result["full_psnr_db"])
+    result["held_out_hour_psnr_db"] = result["full_psnr_db"]
+    result["unseen_camera_psnr_db"] = result["full_unseen_camera_psnr_db"]
+    result["margin_over_wildgaussians_db"] = result["full_psnr_db"] - max(result["code_psnr_db"], result["sun_psnr_db"])
+    result["train_seconds"] = contest.seconds["full"]
+    result["prepare_seconds"] = contest.seconds["transport"] + contest.seconds["lessons"] + contest.seconds["views"]
+    result["total_seconds"] = time.perf_counter() - start
+    for name, value in result.items():
+        print(f"{name:36s} {value:10.3f}")
+    if arguments.json:
+        with open(arguments.json, "w") as file:
+            json.dump(result, file, indent=1)
+
+
+if __name__ == "__main__":
+    main()

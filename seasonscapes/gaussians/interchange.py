@@ -1,0 +1,180 @@
+"""Gaussians for other programs: a baked 3DGS ``.ply``, a glTF, and the training views for other trainers.
+
+Other programs know no sun, so what goes out is one instant: display-referred sRGB colours as spherical harmonics of
+degree 0. Positions stay east-north-up metres.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC
+from pathlib import Path
+
+import numpy as np
+
+from seasonscapes.cameras.exchange import NamedView, write_colmap, write_transforms
+from seasonscapes.errors import InputError
+from seasonscapes.frames import LocalFrame
+from seasonscapes.gaussians.transport import LightState
+from seasonscapes.images import atomic_path
+
+# Y₀₀, the constant spherical harmonic.
+SH0 = 0.28209479177387814
+_COLUMNS = ("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",
+            "rot_0", "rot_1", "rot_2", "rot_3")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class BakedSplats:
+    """N Gaussians of one instant: ``means (N, 3)`` [m], ``quaternions (N, 4)`` wxyz, ``log_scales (N, 3)``,
+    ``opacity_logits (N,)`` and display-referred sRGB ``rgb (N, 3)`` in [0, 1], float32 each."""
+
+    means: np.ndarray
+    quaternions: np.ndarray
+    log_scales: np.ndarray
+    opacity_logits: np.ndarray
+    rgb: np.ndarray
+
+    def __post_init__(self):
+        if len(self.means) == 0:
+            raise ValueError("BakedSplats: there is no Gaussian to write")
+        for name in self.__dataclass_fields__:
+            values = getattr(self, name)
+            if len(values) != len(self.means) or not np.isfinite(values).all():
+                raise ValueError(f"BakedSplats: {name} has another length than means, or values that are not finite")
+
+
+def write_ply(path: Path, splats: BakedSplats) -> None:
+    """The ``.ply`` of 3D Gaussian splatting, 68 bytes a splat: log scales, logit opacity, wxyz, f_dc = (rgb − ½) / Y₀₀."""
+    table = np.zeros((len(splats.means), len(_COLUMNS)), "<f4")
+    table[:, 0:3], table[:, 6:9] = splats.means, (splats.rgb - 0.5) / SH0
+    table[:, 9], table[:, 10:13], table[:, 13:17] = splats.opacity_logits, splats.log_scales, splats.quaternions
+    header = ["ply", "format binary_little_endian 1.0", "comment east-north-up metres, sRGB", f"element vertex {len(table)}",
+              *(f"property float {name}" for name in _COLUMNS), "end_header"]  # fmt: skip
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        file.write(("\n".join(header) + "\n").encode("ascii"))
+        file.write(table.tobytes())
+
+
+def read_ply(path: Path) -> BakedSplats:
+    """Read a 3DGS ``.ply`` of binary little-endian floats; harmonics above degree 0 are left out."""
+    try:
+        data = Path(path).read_bytes()
+    except FileNotFoundError:
+        raise InputError(path, "no such file") from None
+    end = data.find(b"end_header\n")
+    lines = data[: max(end, 0)].decode("ascii", "replace").splitlines()
+    if end < 0 or "format binary_little_endian 1.0" not in lines:
+        raise InputError(path, "not a binary little-endian .ply")
+    count = next((int(line.split()[2]) for line in lines if line.startswith("element vertex")), 0)
+    names = [line.split()[2] for line in lines if line.startswith("property float")]
+    missing = [name for name in _COLUMNS if name not in names and not name.startswith("n")]
+    body = data[end + len(b"end_header\n") :]
+    if missing or len(body) < 4 * count * len(names):
+        raise InputError(path, "not a whole 3DGS .ply", got=f"no {missing[0]}" if missing else f"{len(body)} bytes")
+    table = np.frombuffer(body, "<f4", count * len(names)).reshape(count, len(names))
+
+    def columns(*wanted: str) -> np.ndarray:
+        return table[:, [names.index(name) for name in wanted]].copy()
+
+    return BakedSplats(columns("x", "y", "z"), columns("rot_0", "rot_1", "rot_2", "rot_3"),
+                       columns("scale_0", "scale_1", "scale_2"), columns("opacity")[:, 0],
+                       columns("f_dc_0", "f_dc_1", "f_dc_2") * np.float32(SH0) + np.float32(0.5))  # fmt: skip
+
+
+def write_gltf(path: Path, splats: BakedSplats, *, note: dict | None = None) -> None:
+    """A ``.glb`` with ``KHR_gaussian_splatting`` (Khronos release candidate of 2026): points for readers without it.
+
+    Scales are linear, opacity in [0, 1], quaternions xyzw; glTF has y up, to which a node turns the scene.
+    """
+    arrays = {
+        "POSITION": splats.means,
+        "COLOR_0": np.concatenate([_linear(splats.rgb), _sigmoid(splats.opacity_logits)[:, None]], axis=1),
+        "KHR_gaussian_splatting:ROTATION": np.roll(splats.quaternions, -1, axis=1),
+        "KHR_gaussian_splatting:SCALE": np.exp(splats.log_scales),
+        "KHR_gaussian_splatting:OPACITY": _sigmoid(splats.opacity_logits),
+        "KHR_gaussian_splatting:SH_DEGREE_0_COEF_0": (splats.rgb - 0.5) / SH0,
+    }
+    kinds = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+    body, views, accessors = b"", [], []
+    for name, values in arrays.items():
+        values = np.ascontiguousarray(values, "<f4")
+        accessor = {"bufferView": len(views), "componentType": 5126, "count": len(values),
+                    "type": kinds[values.shape[1] if values.ndim == 2 else 1]}  # fmt: skip
+        if name == "POSITION":
+            accessor |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
+        accessors.append(accessor)
+        views.append({"buffer": 0, "byteOffset": len(body), "byteLength": values.nbytes, "target": 34962})
+        body += values.tobytes()
+    primitive = {"mode": 0, "attributes": {name: index for index, name in enumerate(arrays)},
+                 "extensions": {"KHR_gaussian_splatting": {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}}}  # fmt: skip
+    root2 = float(np.sqrt(0.5))
+    document = {"asset": {"version": "2.0", "generator": "seasonscapes", "extras": note or {}},
+                "extensionsUsed": ["KHR_gaussian_splatting"], "scene": 0, "scenes": [{"nodes": [0]}],
+                "nodes": [{"name": "east-north-up", "mesh": 0, "rotation": [-root2, 0.0, 0.0, root2]}],
+                "meshes": [{"primitives": [primitive]}], "accessors": accessors, "bufferViews": views,
+                "buffers": [{"byteLength": len(body)}]}  # fmt: skip
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        file.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(body)))
+        file.write(struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(body), b"BIN\0") + body)
+
+
+def _sigmoid(values: np.ndarray) -> np.ndarray:
+    return 1.0 / (1.0 + np.exp(-values))
+
+
+def _linear(encoded: np.ndarray) -> np.ndarray:
+    from seasonscapes.images import linear_from_srgb
+
+    return linear_from_srgb(encoded)
+
+
+@dataclass(frozen=True)
+class TrainingView:
+    """A picture that others may train on: its camera, file and time in ``view``, and the light it was taken in."""
+
+    view: NamedView
+    light: LightState
+
+
+def write_training_views(folder: Path, views: Sequence[TrainingView], splats: BakedSplats, frame: LocalFrame) -> None:
+    """``transforms.json`` (nerfstudio), ``sparse/0/*.txt`` (COLMAP) and ``points.ply`` for other trainers.
+
+    Every frame of ``transforms.json`` tells ``timestamp_utc``, ``sun_enu`` (unit, towards the sun; absent by night),
+    ``sun_lx``, ``sky_lx`` and ``exposure`` (1 over the luminance of the horizontal illuminance [lx]); readers pass over
+    keys that they do not know. COLMAP's ``points3D.txt`` holds the discs' centres with their colours.
+
+    Raises
+    ------
+    ValueError
+        No view, or one without a time.
+    """
+    if not views:
+        raise ValueError("write_training_views: there is no view to write")
+    named = [each.view for each in views]
+    if any(view.time is None for view in named):
+        raise ValueError("write_training_views: a view has no time")
+    write_transforms(folder / "transforms.json", named, frame)
+    table = json.loads((folder / "transforms.json").read_text())
+    table["ply_file_path"] = "points.ply"
+    for record, each in zip(table["frames"], views, strict=True):
+        light = each.light
+        record["timestamp_utc"] = each.view.time.astimezone(UTC).isoformat().replace("+00:00", "Z")
+        record |= {"sky_lx": light.sky_lx.tolist(), "exposure": 1.0 / light.global_lx, "day_of_year": light.day}
+        if len(light.bodies[0]):
+            record |= {"sun_enu": light.bodies[0][0].tolist(), "sun_lx": light.bodies[1][0].tolist()}
+    with atomic_path(folder / "transforms.json") as temporary:
+        temporary.write_text(json.dumps(table, indent=1) + "\n")
+    write_colmap(folder / "sparse" / "0", named)
+    levels = np.rint(255.0 * np.clip(splats.rgb, 0.0, 1.0)).astype(int)
+    lines = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]"]
+    lines += [f"{number} {x:.3f} {y:.3f} {z:.3f} {r} {g} {b} 0"
+              for number, ((x, y, z), (r, g, b)) in enumerate(zip(splats.means, levels, strict=True), 1)]  # fmt: skip
+    with atomic_path(folder / "sparse" / "0" / "points3D.txt") as temporary:
+        temporary.write_text("\n".join(lines) + "\n")
+    write_ply(folder / "points.ply", splats)

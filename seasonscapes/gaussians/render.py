@@ -1,0 +1,148 @@
+"""A picture of a Gaussian model at an instant: colours for its light, splats, the air in between, the sky behind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from seasonscapes.cameras.pinhole import Camera
+from seasonscapes.gaussians.appearance import Appearance, colours_at, fourier_embedding
+from seasonscapes.gaussians.model import GaussianModel
+from seasonscapes.gaussians.rasterise import Splats, ViewWeights, splat_colours, splats_from, view_weights
+from seasonscapes.gaussians.transport import LightState, light_state, neighbourhood_mean
+from seasonscapes.sky.illumination import Illumination
+
+
+@dataclass(frozen=True)
+class SplatView:
+    """A rendered view, as `rendering.radiance.View`.
+
+    Parameters
+    ----------
+    radiance
+        ``(H, W, 3)`` [cd/m²]: splats through the air over the sky.
+    surface
+        ``(H, W, 3)`` radiance of the terrain before the air, weighted by ``coverage``.
+    coverage
+        ``(H, W)``.
+    depth
+        ``(H, W)`` mean distance of what is seen along the ray [m]; infinite where nothing is.
+    """
+
+    radiance: np.ndarray
+    surface: np.ndarray
+    coverage: np.ndarray
+    depth: np.ndarray
+
+
+def appearance_of(model: GaussianModel, *, albedo: np.ndarray | None = None, seed: int = 0) -> Appearance:
+    """The model's appearance as a torch module, ready to colour or to train on.
+
+    Parameters
+    ----------
+    albedo
+        ``(N, 3)`` to use in place of the model's own dates, such as `GaussianModel.albedo_on` gives.
+    """
+    own = model.albedo if albedo is None else albedo[None]
+    around = np.stack([neighbourhood_mean(model.means, one, model.plan.spacing_m) for one in own])
+    embedding = model.features if model.features.shape[1] else fourier_embedding(model.means)
+    codes = model.appearance.get("codes")
+    appearance = Appearance(model.kind, own, around, model.transport, embedding, seed=seed,
+                            times=1 if codes is None else len(codes))  # fmt: skip
+    for name, parameter in appearance.named_parameters():
+        if name != "embedding" and name in model.appearance:
+            parameter.data.copy_(torch.as_tensor(model.appearance[name]))
+    return appearance
+
+
+def learned_numbers(appearance: Appearance) -> dict[str, np.ndarray]:
+    """Everything that training may have changed, by name, as numpy; see `model.model_from`."""
+    return {name: parameter.detach().numpy().copy() for name, parameter in appearance.named_parameters()}
+
+
+def model_colours(model: GaussianModel, illumination: Illumination, day: float) -> tuple[np.ndarray, LightState]:
+    """Colours ``(N, 3)`` of a light on a day of the year, and its state: radiance is colour × ``global_lx`` / π.
+
+    Raises
+    ------
+    ValueError
+        A dark light; a model of free codes, which knows no other instants than its own.
+    """
+    if model.kind == "code":
+        raise ValueError("a model of free codes cannot be lit for another instant")
+    state = light_state(model.transport, illumination, day)
+    return colours_at(appearance_of(model, albedo=model.albedo_on(day)), state), state
+
+
+def splats_of(model: GaussianModel, *, seen_from: np.ndarray | None = None) -> Splats:
+    """The model's geometry as tensors; from a place ``(3,)``, discs that show it their backs are made transparent.
+
+    A terrain's back is inside the mountain: what faces away is hidden by what does not, and need not be drawn.
+    """
+    logits = model.opacity_logits
+    if seen_from is not None:
+        away = np.einsum("nc,nc->n", model.means - seen_from.astype(np.float32), model.transport.normals) > 0.0
+        logits = np.where(away, np.float32(-20.0), logits)
+    return splats_from(model.means, model.quaternions, model.log_scales, logits)
+
+
+def model_weights(model: GaussianModel, camera: Camera, *, subpixels: int = 2) -> ViewWeights:
+    """Weights of a camera, for any light; `ValueError` where no Gaussian is in view."""
+    weights = view_weights(splats_of(model, seen_from=camera.position_m), camera, subpixels=subpixels)
+    if weights.matrix.nnz == 0:
+        raise ValueError("the camera sees no Gaussian; does it look away, or stand inside the mountain?")
+    return weights
+
+
+def render_model(model: GaussianModel, camera: Camera, illumination: Illumination, day: float, *,
+                 weights: ViewWeights | None = None, colours: tuple[np.ndarray, LightState] | None = None,
+                 progress: Callable[[float], None] | None = None) -> SplatView:  # fmt: skip
+    """The model seen by a camera under a light.
+
+    Parameters
+    ----------
+    day
+        Of the year, for the season.
+    weights, colours
+        From `model_weights` and `model_colours`, where one of them serves many pictures.
+    """
+    tell = progress or (lambda share: None)
+    weights = weights or model_weights(model, camera)
+    tell(0.4)
+    values, state = colours or model_colours(model, illumination, day)
+    tell(0.7)
+    distance = np.linalg.norm(model.means - camera.position_m.astype(np.float32), axis=1)
+    layers = splat_colours(
+        weights, np.concatenate([values * np.float32(state.global_lx / np.pi), distance[:, None]], axis=1)
+    )
+    coverage = np.clip(weights.coverage, 0.0, 1.0)
+    # Discs meet with gaps of a few thousandths between them; the sky must not shine through a mountain.
+    solid = np.where(coverage > 0.9, 1.0, coverage / 0.9)
+    surface = layers[..., :3] * (solid / np.maximum(weights.coverage, 1e-6))[..., None]
+    depth = np.where(coverage > 1e-3, layers[..., 3] / np.maximum(weights.coverage, 1e-6), np.inf)
+    radiance = through_air(camera, illumination, surface, solid, depth)
+    tell(1.0)
+    return SplatView(radiance, surface.astype(np.float32), solid.astype(np.float32), depth.astype(np.float32))
+
+
+def through_air(camera: Camera, illumination: Illumination, surface: np.ndarray, coverage: np.ndarray,
+                depth: np.ndarray) -> np.ndarray:  # fmt: skip
+    """Radiance ``(H, W, 3)`` at the camera: the surface through the air of its distance, and the open sky behind."""
+    from seasonscapes.rendering.air_grid import air_at, air_places, open_sky, sky_grid
+
+    image = surface.reshape(-1, 3).astype(np.float32)
+    cover = coverage.ravel()
+    shown = np.flatnonzero((cover > 0.0) & np.isfinite(depth.ravel()))
+    if illumination.aerial_perspective is not None and len(shown):
+        none = (np.zeros(0, np.int64), np.zeros((0, 1), np.float32))
+        places = air_places(camera, shown, depth.ravel()[shown], none)
+        transmittance, airlight = air_at(places, illumination.aerial_perspective)
+        image[shown] = image[shown] * transmittance + airlight * cover[shown, None]
+    hole = np.flatnonzero(cover < 1.0)
+    if len(hole):
+        sky = open_sky(sky_grid(camera, hole), illumination, float(np.degrees(1.0 / camera.fx)))
+        image[hole] += (1.0 - cover[hole, None]) * sky
+    return image.reshape(surface.shape)
