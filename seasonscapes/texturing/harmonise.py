@@ -26,9 +26,9 @@ _HUBER = 1.5
 # How far a gain may lie from what the sky tells, from what the picture's mean tells, and from a prediction's [log].
 _SKY_SIGMA, _MEAN_SIGMA, _PREDICTED_SIGMA = 0.4, 1.0, 1.0
 # Webcams steepen contrast: logarithm of the exponent, and of the haze's.
-_CONTRAST, _CONTRAST_SIGMA, _HAZE_SIGMA = 0.1, 0.15, 0.7
-# Neighbouring places are not independent: so many of them count as one against the priors.
-_CLUSTER = 20.0
+_CONTRAST, _CONTRAST_SIGMA, _HAZE_SIGMA = 0.1, 0.05, 0.5
+# Neighbouring places are not independent: so many count as one, and those of one pair of cameras as no more than so many.
+_PLACES_AS_ONE, _PLACES_A_PAIR = 20.0, 20.0
 # The least share of a picture's value that the land itself must have.
 _LEAST_LAND = 0.08
 _STEPS, _FARTHEST_STEP = 15, 0.3
@@ -203,40 +203,41 @@ def _scatter(overlaps: Overlaps, harmony: Harmony) -> float:
 
 @dataclass(frozen=True)
 class _Side:
-    """One camera's part in a comparison, ``(N, 3)`` each; slopes are in the logarithms of gain, contrast and haze.
+    """One camera's part in a comparison, ``(N, 3)`` each.
 
-    ``steepness`` is the logarithm of how much the straightened tone curve spreads tones at this value.
+    ``steepness`` is the logarithm of how much straightening and clearing spread tones at this value; ``by_...`` are slopes
+    in the logarithms of gain, contrast and haze, of ``log_land`` and of ``steepness``.
     """
 
     log_land: np.ndarray
-    variance: np.ndarray
+    noise: np.ndarray
+    steepness: np.ndarray
     by_gain: np.ndarray
     by_contrast: np.ndarray
     by_haze: np.ndarray
-    steepness: np.ndarray
-    steepness_by_contrast: np.ndarray
+    steeper_by_contrast: np.ndarray
+    steeper_by_haze: np.ndarray
 
 
 def _side(samples: Samples, harmony: Harmony) -> _Side:
     tiny = 1e-3
     log_land, share = _land(samples, harmony)
-    bent = replace(harmony, contrast=harmony.contrast * np.exp(tiny))
-    by_contrast = (_land(samples, bent)[0] - log_land) / tiny
-    by_haze = (_land(samples, replace(harmony, haze=harmony.haze * np.exp(tiny)))[0] - log_land) / tiny
-    # Noise and rounding are even in encoded values, and grow with what the air hides.
-    slope = 2.4 / np.maximum(srgb_from_linear(samples.value) + 0.055, 0.02)
     steepness = _steepness(samples, harmony)
+    bent = replace(harmony, contrast=harmony.contrast * np.exp(tiny))
+    hazier = replace(harmony, haze=harmony.haze * np.exp(tiny))
+    # Noise and rounding are even in encoded values.
+    noise = _PICTURE_SIGMA * 2.4 / np.maximum(srgb_from_linear(samples.value) + 0.055, 0.02)
     # Without a sky to read it off, the airlight's gain is the land's own.
     tied = (harmony.log_sky_gain == harmony.log_gain)[samples.camera]
     by_gain = np.where(tied & (share > _LEAST_LAND), -1.0 / share, -1.0)
-    return _Side(log_land, (_PICTURE_SIGMA * slope / share) ** 2, by_gain, by_contrast, by_haze, steepness,
-                 (_steepness(samples, bent) - steepness) / tiny)  # fmt: skip
+    return _Side(log_land, noise, steepness, by_gain, *((_land(samples, other)[0] - log_land) / tiny for other in (bent, hazier)),
+                 *((_steepness(samples, other) - steepness) / tiny for other in (bent, hazier)))  # fmt: skip
 
 
 def _steepness(samples: Samples, harmony: Harmony) -> np.ndarray:
-    contrast, tiny = harmony.contrast[samples.camera][:, None], 1e-3
-    low, high = (straighten(samples.value * np.exp(sign * tiny), contrast) for sign in (-0.5, 0.5))
-    return np.log(np.maximum(np.log(high / low) / tiny, 1e-2))
+    tiny = 1e-3
+    low, high = (_land(replace(samples, value=samples.value * np.exp(sign * tiny)), harmony)[0] for sign in (-0.5, 0.5))
+    return np.log(np.clip((high - low) / tiny, 1e-2, 1.0 / _LEAST_LAND))
 
 
 def _gauss_newton(overlaps: Overlaps, expected: np.ndarray | None, harmony: Harmony, prior: tuple[np.ndarray, np.ndarray],
@@ -250,27 +251,28 @@ def _gauss_newton(overlaps: Overlaps, expected: np.ndarray | None, harmony: Harm
     left, right = _side(own, harmony), _side(other, harmony)
     error = left.log_land - right.log_land - harmony.log_gain[own.camera] + harmony.log_gain[other.camera]
     spread = np.exp(0.5 * (left.steepness + right.steepness))
-    variance = left.variance + right.variance + _LAND_SIGMA**2
     blocks = [
-        (error / spread, variance,
-         ((own.camera, left.by_gain / spread, (left.by_contrast - 0.5 * error * left.steepness_by_contrast) / spread),
-          (other.camera, -right.by_gain / spread, (-right.by_contrast - 0.5 * error * right.steepness_by_contrast) / spread)),
-         (left.by_haze - right.by_haze) / spread)
+        (error / spread,
+         (left.noise**2 * np.exp(2.0 * left.steepness) + right.noise**2 * np.exp(2.0 * right.steepness)) / spread**2 + _LAND_SIGMA**2,
+         ((own.camera, left.by_gain / spread, (left.by_contrast - 0.5 * error * left.steeper_by_contrast) / spread),
+          (other.camera, -right.by_gain / spread, (-right.by_contrast - 0.5 * error * right.steeper_by_contrast) / spread)),
+         (left.by_haze - right.by_haze - 0.5 * error * (left.steeper_by_haze + right.steeper_by_haze)) / spread,
+         _counts(own.camera * count + other.camera))
     ]  # fmt: skip
     if expected is not None:
-        side = _side(overlaps.alone, harmony)
         known = np.isfinite(expected).all(axis=1)
-        camera = overlaps.alone.camera[known]
-        apart, spread = side.log_land[known] - expected[known] - harmony.log_gain[camera], np.exp(side.steepness[known])
-        bent = (side.by_contrast[known] - apart * side.steepness_by_contrast[known]) / spread
-        blocks.append((apart / spread, side.variance[known] + _PREDICTED_SIGMA**2, ((camera, side.by_gain[known] / spread, bent),),
-                       side.by_haze[known] / spread))  # fmt: skip
+        side = _side(overlaps.alone[known], harmony)
+        camera, spread = overlaps.alone.camera[known], np.exp(side.steepness)
+        apart = side.log_land - expected[known] - harmony.log_gain[camera]
+        blocks.append((apart / spread, side.noise**2 + _PREDICTED_SIGMA**2,
+                       ((camera, side.by_gain / spread, (side.by_contrast - apart * side.steeper_by_contrast) / spread),),
+                       (side.by_haze - apart * side.steeper_by_haze) / spread, _counts(camera)))  # fmt: skip
     matrix, gradient = _priors(harmony, prior, count)
     for block in blocks:
         for colour in range(3):
             jacobian, weight, apart = _rows(block, colour, count)
-            matrix += (jacobian.T @ jacobian.multiply(weight[:, None])).toarray() / _CLUSTER
-            gradient += jacobian.T @ (weight * apart) / _CLUSTER
+            matrix += (jacobian.T @ jacobian.multiply(weight[:, None])).toarray()
+            gradient += jacobian.T @ (weight * apart)
     # A curve that all cameras share cannot be told from the land's own contrast: only their differences are fitted.
     shared = np.zeros(len(gradient))
     shared[3 * count : 4 * count] = 1e3
@@ -280,11 +282,17 @@ def _gauss_newton(overlaps: Overlaps, expected: np.ndarray | None, harmony: Harm
     return step
 
 
+def _counts(kind: np.ndarray) -> np.ndarray:
+    """As how many independent places each row ``(N,)`` counts: all of one kind together as no more than a few."""
+    _, number, members = np.unique(kind, return_inverse=True, return_counts=True)
+    return np.minimum(1.0 / _PLACES_AS_ONE, _PLACES_A_PAIR / members)[number]
+
+
 def _rows(block: tuple, colour: int, count: int) -> tuple:
     """Sparse Jacobian ``(N, 4 K + 1)``, weights and errors of one colour."""
     from scipy import sparse
 
-    error, variance, sides, haze = block
+    error, variance, sides, haze, counts = block
     rows = np.arange(len(error))
     entries = [(rows, np.full(len(rows), 4 * count), haze[:, colour])]
     for camera, gain, contrast in sides:
@@ -293,7 +301,7 @@ def _rows(block: tuple, colour: int, count: int) -> tuple:
     row, column, value = (np.concatenate(part) for part in zip(*entries, strict=True))
     jacobian = sparse.csr_array((value, (row, column)), shape=(len(rows), 4 * count + 1))
     apart, sigma = error[:, colour], np.sqrt(variance[:, colour])
-    weight = np.minimum(1.0, _HUBER / np.maximum(np.abs(apart / sigma), 1e-9)) / sigma**2
+    weight = np.minimum(1.0, _HUBER / np.maximum(np.abs(apart / sigma), 1e-9)) / sigma**2 * counts
     return jacobian, weight, apart
 
 

@@ -8,12 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from seasonscapes.rendering.gather import Occluder
-from seasonscapes.texturing.shots import ReadyShot, air_to, sample_shot
+from seasonscapes.texturing.shots import ReadyShot, air_to, sample_shot, seen_px
 from seasonscapes.texturing.tiles import TexelSurface
 from seasonscapes.texturing.visibility import by_ray, sight_of
 
 # Compared places are means over this many texels' sides, so that cameras of unlike resolution see alike.
 _FOOTPRINT_TEXELS = 4.0
+# Flatter than this a pixel covers so much land that two cameras do not see the same.
+_LEAST_COSINE = 0.25
+# Hardly a silhouette under the footprint.
+_LEAST_TRUST = 0.95
 # More than these tell no more.
 _MOST_PAIRS = 60_000
 
@@ -84,9 +88,9 @@ def _samples(ready: ReadyShot, number: int, places: TexelSurface) -> tuple[Sampl
     """What a shot shows of places, and where that is sound ``(N,)`` bool."""
     camera = ready.shot.observation.camera
     sight = sight_of(camera, places)
-    footprint = _FOOTPRINT_TEXELS * places.texel_m * camera.fx / np.maximum(sight.distance_m, 1.0)
+    footprint = _FOOTPRINT_TEXELS * seen_px(camera, places, sight)
     value, trust = sample_shot(ready, np.where(sight.inside[:, None], sight.pixel, 0.0), footprint)
-    sound = sight.inside & (trust > 0.5) & (value > 1e-4).all(axis=1)
+    sound = sight.inside & (sight.cosine > _LEAST_COSINE) & (trust > _LEAST_TRUST) & (value > 1e-4).all(axis=1)
     return Samples(np.full(len(value), number), value, *air_to(ready, places.position_m)), sound
 
 

@@ -13,7 +13,7 @@ from seasonscapes.rendering.gather import Occluder
 from seasonscapes.terrain.atlas import Atlas
 from seasonscapes.terrain.surface import Terrain, Texture
 from seasonscapes.texturing.harmonise import Harmony, equal_gains, harmonise, land_radiance
-from seasonscapes.texturing.shots import NEAR_M, ReadyShot, Shot, air_to, ready_shot, sample_shot
+from seasonscapes.texturing.shots import NEAR_M, ReadyShot, Shot, air_to, ready_shot, sample_shot, seen_px
 from seasonscapes.texturing.tiles import TILE_PX, Tile, Tiling, sees_tile, tile_blocks, tile_surface, tiles_of, tiling
 from seasonscapes.texturing.visibility import by_ray, sight_of
 from seasonscapes.texturing.weights import sharpened, texel_weight
@@ -215,7 +215,7 @@ def shot_texels(ready: ReadyShot, number: int, occluder: Occluder, surface, tile
     index = np.flatnonzero(sight.inside)
     surface, sight = surface[index], sight[index]
     px_per_texel = camera.fx * surface.texel_m / np.maximum(sight.distance_m, 1e-3)
-    value, trust = sample_shot(ready, sight.pixel, px_per_texel)
+    value, trust = sample_shot(ready, sight.pixel, seen_px(camera, surface, sight))
     weight = texel_weight(sight.cosine, px_per_texel) * trust
     keep = np.flatnonzero(weight > _LEAST_WEIGHT)
     # Rays last: only for texels that something could be painted into.

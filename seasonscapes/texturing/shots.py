@@ -9,13 +9,14 @@ import cv2
 import numpy as np
 
 from seasonscapes.cameras.observation import Observation
-from seasonscapes.cameras.pinhole import ray_directions
+from seasonscapes.cameras.pinhole import Camera, ray_directions
 from seasonscapes.rendering.gather import Occluder
 from seasonscapes.rendering.gbuffer import trace_gbuffer
 from seasonscapes.rendering.scene import RenderScene
 from seasonscapes.sky.illumination import AerialPerspective
 from seasonscapes.texturing.silhouette import picture_mask, pose_sigma_px, silhouette_guard
 from seasonscapes.texturing.tiles import TexelSurface, Tiling, seen_blocks
+from seasonscapes.texturing.visibility import Sight
 from seasonscapes.texturing.weights import BRIGHTEST, exposure_trust
 
 # What is nearer than this is rather a roof or a tree than the terrain model's ground.
@@ -177,6 +178,12 @@ def air_to(ready: ReadyShot, position_m: np.ndarray) -> tuple[np.ndarray, np.nda
     offset = position_m - ready.shot.observation.camera.position_m
     distance = np.linalg.norm(offset, axis=1)
     return ready.shot.air(distance, offset / np.maximum(distance, 1e-6)[:, None])
+
+
+def seen_px(camera: Camera, surface: TexelSurface, sight: Sight) -> np.ndarray:
+    """Pixels along the side ``(N,)`` of a square as large as each texel shows in the picture, foreshortened."""
+    straight_on = camera.fx * surface.texel_m / np.maximum(sight.distance_m, 1e-3)
+    return straight_on * np.sqrt(np.clip(sight.cosine, 0.0, 1.0))
 
 
 def sample_shot(ready: ReadyShot, pixel: np.ndarray, px_per_texel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
