@@ -71,18 +71,20 @@ def light_at(
                       tables_of=tables_in(workspace), hosek=hosek_illumination)  # fmt: skip
 
 
-def light_for(place: Place, camera: Camera, model: SkyModel, time: datetime) -> tuple[Illumination, Moment]:
+def light_for(place: Place, camera: Camera, model: SkyModel, time: datetime, *,
+              map_height: int = 128) -> tuple[Illumination, Moment]:  # fmt: skip
     """The light that falls on a place, seen by a camera.
 
     Sun, moon and sky are those at the terrain's median height, since they light the land; the sky behind it and the
-    air in between are those of the camera's own height.
+    air in between are those of the camera's own height. ``map_height`` are the rows of both maps.
     """
     heights = place.elevation.values
     ground_m = float(np.median(heights))
     moment = moment_at(time, place.frame.latitude_deg, place.frame.longitude_deg, ground_m)
-    on_land = light_at(model, moment, ground_m, workspace=place.workspace, with_air=False)
+    on_land = light_at(model, moment, ground_m, workspace=place.workspace, map_height=map_height,
+                       with_air=False)  # fmt: skip
     camera_m = camera_geodetic(place, camera)[2]
-    from_camera = light_at(model, moment, camera_m, workspace=place.workspace)
+    from_camera = light_at(model, moment, camera_m, workspace=place.workspace, map_height=map_height)
     return replace(
         on_land, aerial_perspective=from_camera.aerial_perspective, visible_sky=from_camera.sky_radiance
     ), moment

@@ -25,6 +25,9 @@ from seasonscapes.sky.models import SkyModel
 from seasonscapes.workspace import Workspace, build_once, content_key
 
 REVISION = 1
+# Rows of the sky's maps. Without clouds half as many as usual change no picture by more than about 0.1 % in the mean:
+# the coefficients average over patches of 7°, and behind the terrain the air itself is asked.
+_CLOUDY_ROWS, _CLEAR_ROWS = 128, 64
 Progress = Callable[[float], None]
 
 
@@ -210,7 +213,9 @@ def view_at(studio: Studio, time: datetime) -> tuple[Any, Any, Any]:
     """The lit view of an instant, its light, and where sun and moon stand."""
     from seasonscapes.rendering.relit_view import relight_view
 
-    light, moment = light_for(studio.place, studio.camera, studio.assignment.model, time)
+    model = studio.assignment.model
+    rows = _CLOUDY_ROWS if model.cloudiness > 0.0 else _CLEAR_ROWS
+    light, moment = light_for(studio.place, studio.camera, model, time, map_height=rows)
     return relight_view(dressed_view(studio, time.date()), light), light, moment
 
 
