@@ -84,14 +84,13 @@ class Scene:
         return bake_imagery(self.terrain, self.atlas, image).values
 
     def camera(self, azimuth_deg: float):
-        """Looks at the middle from 7.5 km, from as low as it can without seeing the massif's underside."""
-        from seasonscapes.cameras.pinhole import Camera, ray_directions, rotation_from_angles
-        from seasonscapes.rendering.gbuffer import trace_gbuffer
-        from seasonscapes.rendering.scene import RenderScene
+        """Looks at the middle from 7.5 km, from where it sees least of the cut massif's underside."""
+        from seasonscapes.cameras.pinhole import Camera, rotation_from_angles
 
         size = self.sizes.picture_px
         azimuth, focal = np.radians(azimuth_deg), 0.5 * size / np.tan(np.radians(23.0))
-        for height in np.arange(4200.0, 9000.0, 400.0):
+        found = []
+        for height in np.arange(4200.0, 6700.0, 400.0):
             position = np.array([7500.0 * np.sin(azimuth), 7500.0 * np.cos(azimuth), height])
             forward = np.array([0.0, 0.0, 1700.0]) - position
             pitch = np.degrees(np.arctan2(forward[2], np.hypot(forward[0], forward[1])))
@@ -99,11 +98,19 @@ class Scene:
             pose[:3, :3] = rotation_from_angles(azimuth_deg + 180.0, pitch)
             pose[:3, 3] = position
             camera = Camera(size, size, focal, focal, size / 2.0, size / 2.0, pose)
-            seen = trace_gbuffer(RenderScene(self.occluder.mi_scene, self.mesh, None, 0.0), camera)
-            away = np.nansum(seen.normal * ray_directions(camera), axis=-1) > 0.0
-            if away.mean() < 1e-4:
-                return camera
-        raise SystemExit("no camera sees the massif from above alone; try another seed")
+            found.append((self.underside(camera).mean(), height, camera))
+            if found[-1][0] < 1e-4:
+                break
+        return min(found, key=lambda entry: entry[:2])[2]
+
+    def underside(self, camera) -> np.ndarray:
+        """Pixels ``(H, W)`` that see a face from below, past the rim of the massif: there is no such place on Earth."""
+        from seasonscapes.cameras.pinhole import ray_directions
+        from seasonscapes.rendering.gbuffer import trace_gbuffer
+        from seasonscapes.rendering.scene import RenderScene
+
+        seen = trace_gbuffer(RenderScene(self.occluder.mi_scene, self.mesh, None, 0.0), camera)
+        return np.nansum(seen.normal * ray_directions(camera), axis=-1) > 0.0
 
     def lights(self, count: int, *, day: float | None = None):
         """Random instants with the sun above 4°: lights, days of the year."""
@@ -138,7 +145,10 @@ def truth_of(scene: Scene, terrain, camera, lights, states, *, seed: int = 3) ->
 
     view = trace_view(terrain, camera, Effort(rays=256), seed=seed)
     ready = ready_view(terrain, view)
-    solid = ready.coverage > 0.999
+    import cv2
+
+    below = cv2.dilate(scene.underside(camera).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    solid = (ready.coverage > 0.999) & ~below
     pictures, sunny, facing = [], [], []
     for light, state in zip(lights, states, strict=True):
         pictures.append(relight_view(ready, light).surface * np.float32(np.pi / state.global_lx))
@@ -172,9 +182,10 @@ class Contest:
 
     def __init__(self, scene: Scene, seed: int):
         from seasonscapes.gaussians.distil import Frame, lessons_from
-        from seasonscapes.gaussians.rasterise import splats_from, view_weights
+        from seasonscapes.gaussians.rasterise import view_weights
         from seasonscapes.gaussians.surfels import surfel_albedo, terrain_surfels
         from seasonscapes.gaussians.transport import light_state, neighbourhood_mean, surfel_irradiance, trace_transport
+        from seasonscapes.gaussians.views import facing
 
         sizes, self.scene, self.seed = scene.sizes, scene, seed
         self.seconds: dict[str, float] = {}
@@ -196,10 +207,7 @@ class Contest:
         self.seconds["views"] = time.perf_counter() - start
         self.weights = []
         for camera in scene.cameras:
-            away = np.einsum("nc,nc->n", self.surfels.means - camera.position_m, self.surfels.normals) > 0.0
-            logits = np.where(away, -20.0, self.surfels.opacity_logits)
-            shape = (self.surfels.means, self.surfels.quaternions, self.surfels.log_scales, logits)
-            self.weights.append(view_weights(splats_from(*shape), camera, subpixels=2))
+            self.weights.append(view_weights(facing(self.surfels, camera), camera, subpixels=2))
         self.frames = [Frame(self.weights[v], t, self.truth[v].pictures[t], self.truth[v].solid)
                        for v in range(3) for t in range(self.suns)]  # fmt: skip
         self.held_out = range(self.suns, self.suns + sizes.held_out)
@@ -334,7 +342,8 @@ def speed(contest: Contest, appearance, target_db: float) -> dict[str, float]:
     from dataclasses import replace
 
     from seasonscapes.gaussians.appearance import colours_at
-    from seasonscapes.gaussians.rasterise import choose_threads, splat_colours, splats_from, view_weights
+    from seasonscapes.gaussians.rasterise import choose_threads, splat_colours, view_weights
+    from seasonscapes.gaussians.views import facing
     from seasonscapes.rendering.radiance import path_trace
     from seasonscapes.rendering.scene import relight
 
@@ -343,10 +352,7 @@ def speed(contest: Contest, appearance, target_db: float) -> dict[str, float]:
     camera = replace(small, width_px=scene.sizes.speed_px, height_px=scene.sizes.speed_px, fx=small.fx * times,
                      fy=small.fy * times, cx=small.cx * times, cy=small.cy * times)  # fmt: skip
     surfels, t = contest.surfels, contest.held_out[0]
-    away = np.einsum("nc,nc->n", surfels.means - camera.position_m, surfels.normals) > 0.0
-    splats = splats_from(
-        surfels.means, surfels.quaternions, surfels.log_scales, np.where(away, -20.0, surfels.opacity_logits)
-    )
+    splats = facing(surfels, camera)
     choose_threads(2)
     colours = colours_at(appearance, contest.states[t])
     moving = best(lambda: splat_colours(view_weights(splats, camera), colours))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +13,9 @@ from seasonscapes.gaussians.model import GaussianModel
 from seasonscapes.gaussians.rasterise import Splats, ViewWeights, splat_colours, splats_from, view_weights
 from seasonscapes.gaussians.transport import LightState, light_state, neighbourhood_mean
 from seasonscapes.sky.illumination import Illumination
+
+# Coverage from which a pixel counts as all terrain.
+SOLID = 0.85
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,7 @@ def model_weights(model: GaussianModel, camera: Camera, *, subpixels: int = 2) -
 
 def render_model(model: GaussianModel, camera: Camera, illumination: Illumination, day: float, *,
                  weights: ViewWeights | None = None, colours: tuple[np.ndarray, LightState] | None = None,
-                 progress: Callable[[float], None] | None = None) -> SplatView:  # fmt: skip
+                 subpixels: int = 2, device: str = "cpu") -> SplatView:  # fmt: skip
     """The model seen by a camera under a light.
 
     Parameters
@@ -108,24 +110,33 @@ def render_model(model: GaussianModel, camera: Camera, illumination: Illuminatio
         Of the year, for the season.
     weights, colours
         From `model_weights` and `model_colours`, where one of them serves many pictures.
+    subpixels
+        Samples along a pixel's side, where ``weights`` are not given.
+    device
+        ``cpu``, or ``cuda`` through gsplat.
     """
-    tell = progress or (lambda share: None)
-    weights = weights or model_weights(model, camera)
-    tell(0.4)
     values, state = colours or model_colours(model, illumination, day)
-    tell(0.7)
     distance = np.linalg.norm(model.means - camera.position_m.astype(np.float32), axis=1)
-    layers = splat_colours(
-        weights, np.concatenate([values * np.float32(state.global_lx / np.pi), distance[:, None]], axis=1)
-    )
-    coverage = np.clip(weights.coverage, 0.0, 1.0)
-    # Discs meet with gaps of a few thousandths between them; the sky must not shine through a mountain.
-    solid = np.where(coverage > 0.9, 1.0, coverage / 0.9)
-    surface = layers[..., :3] * (solid / np.maximum(weights.coverage, 1e-6))[..., None]
-    depth = np.where(coverage > 1e-3, layers[..., 3] / np.maximum(weights.coverage, 1e-6), np.inf)
+    layers = np.concatenate([values * np.float32(state.global_lx / np.pi), distance[:, None]], axis=1)
+    if device == "cuda":
+        drawn, covered = _on_cuda(model, camera, layers)
+    else:
+        weights = weights or model_weights(model, camera, subpixels=subpixels)
+        drawn, covered = splat_colours(weights, layers), weights.coverage
+    # Discs meet with gaps of a few hundredths between them; the sky must not shine through a mountain.
+    solid = np.clip(covered / SOLID, 0.0, 1.0)
+    mean = drawn / np.maximum(covered, 1e-6)[..., None]
+    depth = np.where(covered > 1e-3, mean[..., 3], np.inf)
+    surface = mean[..., :3] * solid[..., None]
     radiance = through_air(camera, illumination, surface, solid, depth)
-    tell(1.0)
     return SplatView(radiance, surface.astype(np.float32), solid.astype(np.float32), depth.astype(np.float32))
+
+
+def _on_cuda(model: GaussianModel, camera: Camera, layers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    from seasonscapes.gaussians.rasterise_cuda import rasterise_cuda
+
+    drawn, covered = rasterise_cuda(splats_of(model, seen_from=camera.position_m), torch.from_numpy(layers), camera)
+    return drawn.detach().cpu().numpy(), covered.detach().cpu().numpy()
 
 
 def through_air(camera: Camera, illumination: Illumination, surface: np.ndarray, coverage: np.ndarray,
