@@ -9,10 +9,13 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+import places  # noqa: E402
+from PIL import Image  # noqa: E402
 from test_rendering import FRAME, heightfield, looking_down, sun_at  # noqa: E402
 
 from seasonscapes.cameras.exchange import NamedView, read_colmap, read_transforms  # noqa: E402
 from seasonscapes.cameras.pinhole import Camera, rotation_from_angles  # noqa: E402
+from seasonscapes.cli import app, main  # noqa: E402
 from seasonscapes.errors import InputError  # noqa: E402
 from seasonscapes.frames import equirectangular_directions  # noqa: E402
 from seasonscapes.gaussians.appearance import Appearance, colours_at, fourier_embedding  # noqa: E402
@@ -53,6 +56,9 @@ from seasonscapes.rendering.scene import mi_mesh, relight  # noqa: E402
 from seasonscapes.sky.illumination import Illumination, global_horizontal_illuminance  # noqa: E402
 
 choose_threads(1)
+for _verb in ("distill", "splat"):
+    if _verb not in list(app):
+        app.command(f"seasonscapes.commands.{_verb}:{_verb}")
 CAMERA = Camera(24, 20, 26.0, 24.0, 12.5, 9.5, np.eye(4))
 
 
@@ -184,7 +190,7 @@ def told(hill) -> Lessons:
 
 
 def test_discs_lie_on_the_terrain_and_close_it(hill):
-    terrain, surfels, *_ = hill
+    surfels = hill[1]
     assert len(surfels.means) == 24 * 24
     height = 160.0 * np.exp(-(surfels.means[:, 0] ** 2 + (surfels.means[:, 1] - 80.0) ** 2) / 180.0**2)
     assert np.abs(surfels.means[:, 2] - height).max() < 4.0
@@ -452,3 +458,65 @@ def test_cuda_says_what_is_missing():
         pytest.skip("a CUDA device is here: nothing is missing")
     with pytest.raises(InputError, match="no CUDA device found"):
         rasterise_cuda(*some_splats(3), CAMERA)
+
+
+@pytest.fixture(scope="module")
+def distilled(tmp_path_factory):
+    """The hill of the tests' places, distilled from the command line in seconds."""
+    folder = tmp_path_factory.mktemp("distil")
+    scene, model = places.write_place(folder / "scene"), folder / "hill.safetensors"
+    common = ["--sky", "hosek", "--workspace", str(folder / "work")]
+    small = ["--discs", "24", "--suns", "4", "--views", "1", "--view-px", "32", "--steps", "30", "--picture-steps", "4"]
+    exported = ["--export-views", str(folder / "views")]
+    assert main(["distill", str(scene), "-o", str(model), *small, *exported, *common]) == 0
+    return scene, model, common
+
+
+def test_distill_leaves_a_model_and_views(distilled):
+    _, model, _ = distilled
+    made = load_model(model)
+    assert made.note["scene"] == "hill"
+    assert not model.with_suffix(".checkpoint.safetensors").exists()
+    views, _ = read_transforms(model.parent / "views" / "transforms.json")
+    assert len(views) == 4
+    assert all((model.parent / "views" / view.file).is_file() for view in views)
+
+
+@pytest.mark.parametrize("suffix", ["png", "exr", "ply", "glb"])
+def test_splat_writes_what_is_asked_for(distilled, suffix, capsys):
+    scene, model, common = distilled
+    output = model.parent / f"noon.{suffix}"
+    arguments = ["splat", str(scene), "--model", str(model), "--time", "2024-09-01T12:00", "-o", str(output)]
+    assert main([*arguments, "--size", "64x48", "--json", *common]) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["time_utc"] == "2024-09-01T10:00:00+00:00"
+    assert output.stat().st_size > 1000
+    if suffix == "png":
+        pixels = np.asarray(Image.open(output), float)
+        assert pixels[:4].mean(axis=(0, 1))[2] > pixels[:4].mean(axis=(0, 1))[0], "the sky is blue"
+        assert pixels[-8:].mean(axis=(0, 1))[0] > pixels[-8:].mean(axis=(0, 1))[2], "the ground is not"
+
+
+@pytest.mark.parametrize(("arguments", "said"), [
+    (["--model", "none.safetensors"], "no such file"),
+    (["--device", "tpu"], "unknown device"),
+    (["-o", "a.jpg"], "unknown kind of file"),
+    (["--at", "46.551,7.98,800", "--heading", "0"], "stands below the ground"),
+    (["--at", "46.551,7.98,+3000", "--heading", "0", "--pitch", "80"], "sees no Gaussian"),
+])  # fmt: skip
+def test_splat_says_what_is_wrong(distilled, arguments, said, capsys):
+    scene, model, common = distilled
+    given = {"--model": str(model), "-o": str(model.parent / "a.png")}
+    given |= {flag: value for flag, value in zip(arguments[::2], arguments[1::2], strict=True) if flag in given}
+    rest = [word for pair in zip(arguments[::2], arguments[1::2], strict=True) if pair[0] not in given for word in pair]
+    flags = [word for pair in given.items() for word in pair]
+    assert main(["splat", str(scene), "--time", "2024-09-01T12:00", "--size", "32x24", *flags, *rest, *common]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_distill_says_what_is_wrong(tmp_path, capsys):
+    scene = places.write_place(tmp_path)
+    for arguments, said in ((["--kind", "magic"], "unknown kind"), (["--suns", "0"], "out of range"),
+                            (["--views", "0", "--export-views", "x"], "no views to export")):  # fmt: skip
+        assert main(["distill", str(scene), *arguments]) == 2
+        assert said in capsys.readouterr().err
