@@ -18,7 +18,7 @@ from seasonscapes.terrain.surface import Raster, Texture, load_texture, save_tex
 from seasonscapes.terrain.unwrap import unwrap
 from seasonscapes.texturing.complete import INPAINTERS, complete
 from seasonscapes.texturing.guides import guides_for, stack_guides
-from seasonscapes.texturing.land import horizon_tangent, land_layers, sun_seen
+from seasonscapes.texturing.land import horizon_tangent, land_layers, sun_margin_deg
 from seasonscapes.texturing.membrane import membrane_fill
 from seasonscapes.texturing.plan import from_plan, onto_plan
 from seasonscapes.texturing.push_pull import propagate, push_pull
@@ -82,11 +82,11 @@ def test_a_wall_throws_a_shadow_of_height_over_tangent():
     z[:, 150:] = 100.0
     elevation = np.radians(20.0)
     sun = np.array([np.cos(elevation), 0.0, np.sin(elevation)])
-    dark = np.flatnonzero(sun_seen(z, 10.0, sun)[30] < 0.5)
+    dark = np.flatnonzero(sun_margin_deg(z, 10.0, sun)[30] < 0.0)
     length_m = (150 - dark.min()) * 10.0
     assert length_m == pytest.approx(100.0 / np.tan(elevation), abs=25.0)
     assert dark.max() == 149
-    assert (sun_seen(z, 10.0, np.array([0.0, 0.6, -0.8])) == 0.0).all()
+    assert (land_layers(z, 10.0, sun_direction=[0.0, 0.6, -0.8])["sun"] == 0.0).all()
     tangent = horizon_tangent(z, 10.0, np.pi / 2.0, stride=1.03)[30, 100]
     assert tangent == pytest.approx(100.0 / 500.0, rel=0.05)
 
@@ -189,8 +189,9 @@ def test_controls_lower_the_score(filled):
     shuffled = guides.values.reshape(-1, len(guides.names))[np.random.default_rng(0).permutation(seen.size)]
     permuted = stack_guides(dict(zip(guides.names, shuffled.T.reshape(-1, *seen.shape), strict=True)))
     assert hidden_psnr(complete(painted(truth, seen), permuted, fast=True).values, truth, seen) < score - 5.0
-    moved = {name: guides.values[..., i] for i, name in enumerate(guides.names)}
-    moved |= {name: np.roll(moved[name], 23, axis=1) for name in ("sun", "sun_cosine")}
+    names = guides.names
+    moved = {name: guides.values[..., i] for i, name in enumerate(names)}
+    moved |= {name: np.roll(moved[name], 23, axis=1) for name in names if name.startswith("sun")}
     moved |= {name: np.zeros_like(moved[name]) for name in ("facing_east", "facing_north")}
     assert hidden_psnr(complete(painted(truth, seen), stack_guides(moved)).values, truth, seen) < score - 0.5
 

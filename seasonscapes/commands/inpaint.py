@@ -30,7 +30,7 @@ def inpaint(
     scene: str,
     *,
     time: str,
-    texture: Path = Path("out/painted.npz"),
+    texture: Path = Path("out/paint/painted.npz"),
     method: str = "guided",
     detail: float = 0.0,
     fast: bool = False,

@@ -120,7 +120,7 @@ def complete(texture: Texture, guides: Guides, *, method: str = "guided", detail
             filled = add_detail(filled, seen, guides, strength=detail, seed=seed)
         # No hidden texel is brighter than anything seen: cubes must not make suns of small errors.
         lightness = np.clip(filled[hole], 0.0, float(encoded[seen].max()))
-        values[hole], sigma[hole] = scale * lightness**3, scale * _cubed_sigma(lightness, spread[hole])
+        values[hole], sigma[hole] = scale * lightness**3, scale * spread[hole]
     beside = ~guides.surface & ~painted
     if beside.any():
         # Between charts nothing lies; a look-up at a chart's rim must still find its colour.
@@ -133,9 +133,3 @@ def complete(texture: Texture, guides: Guides, *, method: str = "guided", detail
 def painted_texels(texture: Texture) -> np.ndarray:
     """Where a camera's finite colour lies, ``(R, S)`` bool."""
     return (texture.weight > 0.0) & np.isfinite(texture.values).all(axis=2)
-
-
-def _cubed_sigma(mean: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """Standard deviation ``(n,)`` of the cube of a normal variable, RMS over the channels of ``mean`` ``(n, 3)``."""
-    square, variance = mean**2, (sigma**2)[:, None]
-    return np.sqrt(np.mean(9.0 * square**2 * variance + 36.0 * square * variance**2 + 15.0 * variance**3, axis=1))

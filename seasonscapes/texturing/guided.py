@@ -58,12 +58,12 @@ def fit_regression(guide: np.ndarray, encoded: np.ndarray, *, fast: bool = False
     """Fit guides ``(n, G)`` to encoded colours ``(n, 3)``."""
     from sklearn.ensemble import HistGradientBoostingRegressor
 
-    forest = _forest(guide, encoded, seed, trees=30 if fast else 16)
+    forest = _forest(guide, encoded, seed, trees=20 if fast else 12)
     if fast:
         return Regression(None, forest)
     boosted = []
-    for channel, (target, rounds) in enumerate(zip(mixed(encoded).T, (150, 60, 60), strict=True)):
-        model = HistGradientBoostingRegressor(max_iter=rounds, learning_rate=0.08, max_leaf_nodes=31, max_features=0.5,
+    for channel, (target, rounds) in enumerate(zip(mixed(encoded).T, (120, 50, 50), strict=True)):
+        model = HistGradientBoostingRegressor(max_iter=rounds, learning_rate=0.09, max_leaf_nodes=31, max_features=0.5,
                                               min_samples_leaf=20, l2_regularization=1.0, early_stopping=False,
                                               random_state=seed + channel)  # fmt: skip
         boosted.append(model.fit(guide, target))
@@ -116,7 +116,7 @@ def guided_fill(values: np.ndarray, painted: np.ndarray, guides: Guides, *, fast
     spread = _spread_of(guides, painted, (sample, guide, encoded), seed)
     tell(0.35)
     hole = guides.surface & ~painted
-    rim = _near(hole, painted & guides.surface, int(3 * REACH_PX), guides)
+    rim = _near(hole, painted & guides.surface, int(REACH_PX), guides)
     predicted = np.zeros_like(values, dtype=np.float32)
     sigma = np.zeros(painted.shape, np.float32)
     wanted = np.flatnonzero(hole | rim)
@@ -158,7 +158,7 @@ def _spread_of(guides: Guides, painted: np.ndarray, sampled: tuple, seed: int) -
     fold = spatial_folds(place, painted, guides.surface & ~painted, seed)
 
     def fit(rows):
-        forest = _forest(guide[rows], encoded[rows], seed, trees=16)
+        forest = _forest(guide[rows], encoded[rows], seed, trees=10)
         return lambda other: forest_mean_spread(forest, other)
 
     return fit_spread(guide, encoded, fold, fit, seed=seed)

@@ -12,6 +12,8 @@ _STRIDE = 1.35
 _SHADOW_STRIDE = 1.06
 # Half width of the soft edge of cast shadows [deg]: the sun's disc, and heights that are not exact.
 _PENUMBRA_DEG = 0.7
+# Margins beyond this say no more.
+_MARGIN_DEG = 15.0
 
 
 def land_layers(heights_m: np.ndarray, spacing_m: float, *, sun_direction=None, day_suns=None) -> dict[str, np.ndarray]:
@@ -25,7 +27,9 @@ def land_layers(heights_m: np.ndarray, spacing_m: float, *, sun_direction=None, 
         Cell size [m].
     sun_direction
         Unit vector ``(3,)`` east-north-up towards the sun of the picture. Gives ``sun``: cosine of incidence times
-        visibility, and ``sun_cosine`` alone.
+        visibility; ``sun_cosine`` alone, negative where the slope faces away; ``sun_margin``: the sun's height above
+        the land's horizon [deg]; ``sun_around``: the mean ``sun`` of the neighbourhood. A texel close to a shadow's
+        edge may lie on its other side; only the last two tell.
     day_suns
         ``(T, 3)`` sun directions of a day or a season, evenly spaced in time; those below the horizon count as dark.
         Gives ``insolation``: mean of cosine times visibility.
@@ -51,8 +55,12 @@ def land_layers(heights_m: np.ndarray, spacing_m: float, *, sun_direction=None, 
     layers |= _open_to(z, spacing_m, day_suns)
     if sun_direction is not None:
         sun = np.asarray(sun_direction, float)
-        cosine = np.maximum(sum(axis * float(s) for axis, s in zip(normal, sun, strict=True)), 0.0)
-        layers |= {"sun_cosine": cosine, "sun": cosine * sun_seen(z, spacing_m, sun)}
+        cosine = sum(axis * float(s) for axis, s in zip(normal, sun, strict=True))
+        margin = sun_margin_deg(z, spacing_m, sun)
+        seen = np.clip(margin / (2.0 * _PENUMBRA_DEG) + 0.5, 0.0, 1.0) * np.maximum(cosine, 0.0)
+        around = cv2.GaussianBlur(seen.astype(np.float32), (0, 0), 2.0, borderType=cv2.BORDER_REPLICATE)
+        layers |= {"sun_cosine": cosine, "sun_margin": np.clip(margin, -_MARGIN_DEG, _MARGIN_DEG), "sun": seen,
+                   "sun_around": around}  # fmt: skip
     return {name: np.where(known, layer, np.nan).astype(np.float32) for name, layer in layers.items()}
 
 
@@ -106,16 +114,18 @@ def horizon_tangent(z: np.ndarray, spacing_m: float, azimuth_rad: float, *, stri
     return tangent
 
 
-def sun_seen(z: np.ndarray, spacing_m: float, sun_direction: np.ndarray) -> np.ndarray:
-    """Share of the sun in view ``(H, W)`` in [0, 1], with a soft edge; 0 everywhere when it is down."""
+def sun_margin_deg(z: np.ndarray, spacing_m: float, sun_direction: np.ndarray) -> np.ndarray:
+    """How far the sun's centre stands above the land's horizon ``(H, W)`` [deg]; negative in cast shadow."""
     east, north, up = (float(x) for x in sun_direction)
     flat = float(np.hypot(east, north))
+    elevation_deg = float(np.degrees(np.arctan2(up, flat)))
     if up <= 0.0:
-        return np.zeros(z.shape, np.float32)
+        return np.full(z.shape, elevation_deg, np.float32)
     reach_m = min(float(np.ptp(z)) * flat / up, float(np.hypot(*z.shape)) * spacing_m) + spacing_m
+    # Land just above the sun decides as well how deep a shadow is.
+    reach_m *= 1.3
     tangent = horizon_tangent(z, spacing_m, float(np.arctan2(east, north)), stride=_SHADOW_STRIDE, reach_m=reach_m)
-    above = np.degrees(np.arctan2(up, flat)) - np.degrees(np.arctan(tangent))
-    return np.clip(above / (2.0 * _PENUMBRA_DEG) + 0.5, 0.0, 1.0).astype(np.float32)
+    return (elevation_deg - np.degrees(np.arctan(tangent))).astype(np.float32)
 
 
 def _open_to(z: np.ndarray, spacing_m: float, day_suns) -> dict[str, np.ndarray]:

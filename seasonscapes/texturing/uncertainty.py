@@ -19,14 +19,17 @@ class Spread:
     Parameters
     ----------
     model
-        From guides, predicted colour and the trees' spread to the mean squared error.
+        From guides, predicted colour and the trees' spread to the squared error, as a share of ``size``.
+    size
+        Mean squared error.
     """
 
     model: object
+    size: float
 
     def sigma(self, guide: np.ndarray, colour: np.ndarray, between: np.ndarray) -> np.ndarray:
-        """Standard error ``(n,)`` of encoded colours ``(n, 3)``, RMS over the channels."""
-        return np.sqrt(self.model.predict(_features(guide, colour, between))).astype(np.float32)
+        """Standard error ``(n,)`` of the cubes of colours ``(n, 3)``, RMS over the channels."""
+        return np.sqrt(self.size * self.model.predict(_features(guide, colour, between))).astype(np.float32)
 
 
 def _features(guide: np.ndarray, colour: np.ndarray, between: np.ndarray) -> np.ndarray:
@@ -56,7 +59,8 @@ def fit_spread(guide: np.ndarray, encoded: np.ndarray, fold: np.ndarray, fit: Ca
     Parameters
     ----------
     guide, encoded
-        ``(n, G)`` and ``(n, 3)``.
+        ``(n, G)`` and ``(n, 3)``, cube roots. Errors are those of the cubes: what is predicted dark and lies in the
+        sun after all is rare, and no error of cube roots would tell how far off it is.
     fold
         ``(n,)`` from `spatial_folds`.
     fit
@@ -72,12 +76,13 @@ def fit_spread(guide: np.ndarray, encoded: np.ndarray, fold: np.ndarray, fit: Ca
             colour[out], between[out] = 0.0, 0.0
             continue
         colour[out], between[out] = fit(~out)(guide[out])
-    square = np.mean((colour - encoded) ** 2, axis=1) + _TINY
-    # The gamma deviance fits the mean of a positive quantity whose scatter grows with it, as squared errors do.
-    model = HistGradientBoostingRegressor(loss="gamma", max_iter=60, learning_rate=0.08, max_leaf_nodes=6,
-                                          min_samples_leaf=200, l2_regularization=5.0, max_features=0.5,
+    square = np.mean((np.maximum(colour, 0.0) ** 3 - encoded**3) ** 2, axis=1) + _TINY
+    # Of the losses with a logarithmic link this one is steady where a few squares outweigh all others.
+    size = float(square.mean())
+    model = HistGradientBoostingRegressor(loss="poisson", max_iter=40, learning_rate=0.12, max_leaf_nodes=6,
+                                          min_samples_leaf=200, l2_regularization=1.0, max_features=0.5,
                                           early_stopping=False, random_state=seed)  # fmt: skip
-    return Spread(model.fit(_features(guide, colour, between), square))
+    return Spread(model.fit(_features(guide, colour, between), square / size), size)
 
 
 def sigma_by_distance(fill: Callable, values: np.ndarray, known: np.ndarray, *, seed: int = 0) -> np.ndarray:
@@ -89,7 +94,7 @@ def sigma_by_distance(fill: Callable, values: np.ndarray, known: np.ndarray, *, 
     Parameters
     ----------
     values, known
-        ``(H, W, C)`` and ``(H, W)``.
+        Cube roots ``(H, W, C)``, and ``(H, W)``. σ is that of the cubes.
     """
     if known.all():
         return np.zeros(known.shape, np.float32)
@@ -108,9 +113,9 @@ def sigma_by_distance(fill: Callable, values: np.ndarray, known: np.ndarray, *, 
     hidden = known & ~left
     if not hidden.any():
         # Too little is known to hide any of it: the error may be as large as the values.
-        return np.where(known, 0.0, np.sqrt(np.mean(values[known] ** 2))).astype(np.float32)
+        return np.where(known, 0.0, np.sqrt(np.mean(values[known] ** 6))).astype(np.float32)
     inner = cv2.distanceTransform((~left).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
-    error = np.mean((fill(values, left)[hidden] - values[hidden]) ** 2, axis=1)
+    error = np.mean((np.maximum(fill(values, left)[hidden], 0.0) ** 3 - values[hidden] ** 3) ** 2, axis=1)
     edges = np.unique(np.geomspace(1.0, most + 1.0, 12).round(1))
     bins = np.clip(np.searchsorted(edges, inner[hidden], side="right"), 0, len(edges) - 1)
     count = np.bincount(bins, minlength=len(edges))
