@@ -18,8 +18,8 @@ from seasonscapes.cameras.pinhole import Camera, rotation_from_angles  # noqa: E
 from seasonscapes.cli import app, main  # noqa: E402
 from seasonscapes.errors import InputError  # noqa: E402
 from seasonscapes.frames import equirectangular_directions  # noqa: E402
-from seasonscapes.gaussians.appearance import Appearance, colours_at, fourier_embedding  # noqa: E402
-from seasonscapes.gaussians.distil import Frame, Lessons, Schedule, distil, lessons_from  # noqa: E402
+from seasonscapes.gaussians.appearance import Appearance, colours_at, fourier_embedding, light_tensors  # noqa: E402
+from seasonscapes.gaussians.distil import Frame, Lessons, Schedule, distil, fit_code, lessons_from  # noqa: E402
 from seasonscapes.gaussians.interchange import (  # noqa: E402
     BakedSplats,
     TrainingView,
@@ -42,6 +42,7 @@ from seasonscapes.gaussians.rasterise_twin import rasterise_twin  # noqa: E402
 from seasonscapes.gaussians.render import learned_numbers, model_colours, model_weights, render_model  # noqa: E402
 from seasonscapes.gaussians.season import albedo_at  # noqa: E402
 from seasonscapes.gaussians.surfels import axes_from_quaternions, surfel_albedo, terrain_surfels  # noqa: E402
+from seasonscapes.gaussians.tiles import joined_shapes, select_tiles, tile_bounds, tile_discs, tile_tree  # noqa: E402
 from seasonscapes.gaussians.transport import (  # noqa: E402
     light_state,
     neighbourhood_mean,
@@ -520,3 +521,69 @@ def test_distill_says_what_is_wrong(tmp_path, capsys):
                             (["--views", "0", "--export-views", "x"], "no views to export")):  # fmt: skip
         assert main(["distill", str(scene), *arguments]) == 2
         assert said in capsys.readouterr().err
+
+
+def test_tiles_cover_the_land_once_and_are_fine_where_near():
+    terrain = heightfield(lambda e, n: 30.0 * np.sin(e / 60.0), side_m=1600.0, count=161)
+    tree = tile_tree(terrain, finest_m=3.2, discs=16)
+    assert tree.levels == 6
+    assert tree.spacing_m(5) == pytest.approx(1600.0 / 16 / 32)
+    camera = looking_down(900.0, size=64, view_m=2400.0)
+    tiles = select_tiles(tree, camera)
+    seen = np.zeros((32, 32), int)
+    for tile in tiles:
+        span = 32 >> tile.level
+        seen[tile.row * span : (tile.row + 1) * span, tile.column * span : (tile.column + 1) * span] += 1
+    assert np.all(seen == 1), "from above all of it is in view"
+    pose = np.eye(4)
+    pose[:3, :3] = rotation_from_angles(0.0, -15.0)
+    pose[:3, 3] = [0.0, -790.0, 80.0]
+    low = Camera(128, 96, 110.0, 110.0, 64.0, 48.0, pose)
+    tiles = select_tiles(tree, low)
+    near, far = (
+        [t.level for t in tiles if side(tile_bounds(tree, t)[1])] for side in (lambda n: n < -700, lambda n: n > 500)
+    )
+    assert min(near) == 5
+    assert max(far) < 5
+    made = [tile_discs(terrain, tree, tile) for tile in tiles]
+    shapes = joined_shapes(made, low)
+    assert len(shapes[0]) == sum(16 * 16 for _ in tiles)
+    pose[:3, 3] = 0.0
+    coverage = view_weights(splats_from(*shapes), replace(low, world_from_camera=pose), subpixels=2).coverage
+    assert coverage[40:90].min() > 0.75, "no crack between levels"
+    behind = replace(low, world_from_camera=looking_north(900.0, 50.0))
+    assert select_tiles(tree, behind) == []
+
+
+def test_a_tile_far_from_the_origin_keeps_its_millimetres():
+    far = heightfield(lambda e, n: 0.0 * e, side_m=100.0, count=3)
+    terrain = replace(far, vertices=far.vertices + np.float32([60_000.0, 0.0, 0.0]))
+    tree = tile_tree(terrain, finest_m=10.0, discs=10)
+    (made,) = [
+        tile_discs(terrain, tree, tile)
+        for tile in select_tiles(tree, replace(looking_down(), world_from_camera=above(60_000.0)))
+    ]
+    spacing = np.diff(np.sort(np.unique(made.surfels.means[:, 0].round(4))))
+    np.testing.assert_allclose(spacing, 10.0, atol=2e-3)
+    assert np.abs(made.surfels.means).max() < 60.0
+
+
+def above(east_m: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3] = rotation_from_angles(0.0, -90.0)
+    pose[:3, 3] = [east_m, 0.0, 1000.0]
+    return pose
+
+
+def test_a_free_code_is_found_for_a_new_picture(hill, told):
+    """WildGaussians' protocol: after fitting, the picture is nearer than with the code of another time."""
+    trained = appearance(hill, "code")
+    distil(trained, told, (), Schedule(150, 0, batch=512), seed=1)
+    weights = view_weights(splats_of_surfels(hill[1]), looking_down(size=32, view_m=900.0))
+    image = splat_colours(weights, told.colours[0]) / np.maximum(weights.coverage, 1e-3)[..., None]
+    lights = light_tensors(told.states)
+    code = fit_code(trained, lights, Frame(weights, 0, image, weights.coverage > 0.9), steps=40)
+    with torch.no_grad():
+        errors = [float((trained(torch.arange(576), torch.tensor(0), lights, one) - torch.as_tensor(told.colours[0])).abs().mean())
+                  for one in (code, trained.codes[2])]  # fmt: skip
+    assert errors[0] < 0.8 * errors[1]

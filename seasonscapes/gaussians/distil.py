@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from seasonscapes.gaussians.appearance import CODE, Appearance, LightTensors, light_tensors
+from seasonscapes.gaussians.appearance import Appearance, LightTensors, light_tensors
 from seasonscapes.gaussians.rasterise import ViewWeights
 from seasonscapes.gaussians.transport import LightState
 from seasonscapes.images import atomic_path
@@ -236,16 +236,16 @@ def _picture(frame: Frame) -> _Picture:
 
 
 class _Product(torch.autograd.Function):
-    """A constant sparse matrix times a dense one."""
+    """A constant sparse matrix times a dense one; the transpose is given too, as it serves many steps."""
 
     @staticmethod
-    def forward(context, values: torch.Tensor, picture: _Picture) -> torch.Tensor:
-        context.picture = picture
-        return torch.from_numpy(picture.forward @ values.detach().numpy())
+    def forward(context, values: torch.Tensor, matrix, transpose) -> torch.Tensor:
+        context.transpose = transpose
+        return torch.from_numpy(matrix @ values.detach().numpy())
 
     @staticmethod
     def backward(context, gradient: torch.Tensor):
-        return torch.from_numpy(context.picture.backward @ gradient.contiguous().numpy()), None
+        return torch.from_numpy(context.transpose @ gradient.contiguous().numpy()), None, None
 
 
 def encoded(linear: torch.Tensor) -> torch.Tensor:
@@ -257,7 +257,7 @@ def encoded(linear: torch.Tensor) -> torch.Tensor:
 def picture_loss(appearance: Appearance, lights: LightTensors, picture: _Picture) -> torch.Tensor:
     """0.8 L1 + 0.2 D-SSIM of a frame in sRGB over its usable pixels."""
     values = appearance(picture.discs, picture.time, lights)
-    image = encoded(_Product.apply(values, picture)).reshape(picture.target.shape)
+    image = encoded(_Product.apply(values, picture.forward, picture.backward)).reshape(picture.target.shape)
     image = torch.where(picture.mask[..., None], image, 0.0)
     share = picture.mask.float().mean()
     difference = (image - picture.target).abs().mean() / share
@@ -286,18 +286,19 @@ def fit_code(appearance: Appearance, lights: LightTensors, frame: Frame, *, step
              seed: int = 0) -> torch.Tensor:  # fmt: skip
     """The free code ``(32,)`` of a picture that was not trained on, from its usable pixels (WildGaussians' protocol)."""
     picture = _picture(frame)
-    code = torch.zeros(CODE, requires_grad=True)
+    # From the middle of the codes that were learned, where the network is at home.
+    code = appearance.codes.detach().mean(dim=0).requires_grad_()
     optimiser = torch.optim.Adam([code], lr=rate)
     rows = np.flatnonzero(picture.mask.numpy().ravel())
     for step in range(steps):
         # A few thousand pixels tell as much of 32 numbers as all do.
         chosen = np.random.default_rng([seed, step]).choice(rows, min(1024, len(rows)), replace=False)
         some = picture.forward[chosen]
-        seen, number = np.unique(some.indices, return_inverse=True)
-        weights = torch.sparse_csr_tensor(torch.from_numpy(some.indptr.astype(np.int64)), torch.from_numpy(number),
-                                          torch.from_numpy(some.data), size=(len(chosen), len(seen)))  # fmt: skip
-        values = appearance(picture.discs[torch.from_numpy(seen)], picture.time, lights, code)
-        loss = (encoded(weights @ values) - picture.target.reshape(-1, 3)[chosen]).abs().mean()
+        seen = np.unique(some.indices)
+        some = some[:, seen]
+        values = appearance(picture.discs[torch.from_numpy(seen).long()], picture.time, lights, code)
+        drawn = _Product.apply(values, some, some.T.tocsr())
+        loss = (encoded(drawn) - picture.target.reshape(-1, 3)[chosen]).abs().mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from seasonscapes.terrain.atlas import planar_uv
 from seasonscapes.terrain.surface import Terrain, sample_texture
 from seasonscapes.terrain.texels import barycentric, texel_coordinates, texel_positions
 
@@ -77,38 +76,49 @@ class Surfels:
     uv: np.ndarray
 
 
-def terrain_surfels(terrain: Terrain, spacing_m: float) -> Surfels:
+def terrain_surfels(terrain: Terrain, spacing_m: float, *,
+                    bounds_m: tuple[float, float, float, float] | None = None) -> Surfels:  # fmt: skip
     """One disc for each cell of a square plan that the terrain covers entirely.
 
     Parameters
     ----------
     spacing_m
         Side of a cell [m]; about one pixel on the ground is where the picture stops gaining.
+    bounds_m
+        West, south, east and north end of the plan; the terrain's own when left out.
 
     Raises
     ------
     ValueError
-        A spacing that is not positive, or a terrain smaller than one cell.
+        A spacing that is not positive, or a plan that holds no cell on the terrain.
     """
     if not spacing_m > 0.0:
         raise ValueError(f"spacing_m: got {spacing_m}, expected a positive distance")
-    extent = np.ptp(terrain.vertices[:, :2].astype(np.float64), axis=0)
-    width, height = (round(float(side) / spacing_m) for side in extent)
-    if min(width, height) < 1:
-        raise ValueError(f"spacing_m: got {spacing_m}, but the terrain is {extent.min():.0f} m wide")
-    positions, normals, uv = _cells(terrain, width, height)
+    corners = terrain.vertices[:, :2].astype(np.float64)
+    west, south, east, north = bounds_m or (*corners.min(axis=0), *corners.max(axis=0))
+    columns, rows = round(float(east - west) / spacing_m), round(float(north - south) / spacing_m)
+    if min(columns, rows) < 1:
+        raise ValueError(f"spacing_m: got {spacing_m}, but the plan is {min(east - west, north - south):.0f} m wide")
+    plan = Plan(float(west), float(north), float(east - west) / columns, float(north - south) / rows, columns, rows)
+    positions, normals, uv = _cells(_within(terrain, (west, south, east, north)), plan)
     whole = np.isfinite(positions).all(axis=(1, 2))
     if not whole.any():
         raise ValueError("terrain_surfels: the terrain covers no cell")
     positions, normals, uv = positions[whole], normals[whole], uv[whole]
-    low, high = terrain.vertices[:, :2].min(axis=0), terrain.vertices[:, :2].max(axis=0)
-    plan = Plan(float(low[0]), float(high[1]), *(extent / [width, height]).tolist(), width, height)
     means = positions.mean(axis=1, dtype=np.float64).astype(np.float32)
     mean_normal = normals.mean(axis=1)
     shape = disc_shapes(mean_normal, plan.spacing_m)
     return Surfels(
         plan, np.flatnonzero(whole).astype(np.int32), means, *shape, mean_normal.astype(np.float32), positions, uv
     )
+
+
+def _within(terrain: Terrain, bounds_m: tuple[float, float, float, float]) -> Terrain:
+    """The faces of a terrain whose boxes meet a rectangle, with all vertices (so that their normals stay)."""
+    west, south, east, north = bounds_m
+    x, y = terrain.vertices[:, 0][terrain.faces], terrain.vertices[:, 1][terrain.faces]
+    meet = (x.max(1) >= west) & (x.min(1) <= east) & (y.max(1) >= south) & (y.min(1) <= north)
+    return terrain if meet.all() else replace(terrain, faces=terrain.faces[meet])
 
 
 def disc_shapes(normals: np.ndarray, spacing_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -120,16 +130,19 @@ def disc_shapes(normals: np.ndarray, spacing_m: float) -> tuple[np.ndarray, np.n
             np.full(len(stretch), logit, np.float32))  # fmt: skip
 
 
-def _cells(terrain: Terrain, width: int, height: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Positions, normals and atlas coordinates ``(cells, S, ...)`` of places in the cells of a plan; NaN off the terrain."""
-    plan = replace(terrain, uv=planar_uv(terrain.vertices))
+def _cells(terrain: Terrain, plan: Plan) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Positions, normals and atlas coordinates ``(cells, S, ...)`` of places in a plan's cells; NaN off the terrain."""
+    width, height = plan.columns, plan.rows
+    low = np.array([plan.west_m, plan.north_m - height * plan.north_step_m])
+    flat = (terrain.vertices[:, :2] - low) / [width * plan.east_step_m, height * plan.north_step_m]
+    above = replace(terrain, uv=flat)
     columns, rows = width * SUBCELLS, height * SUBCELLS
-    positions, face_id = texel_positions(plan, columns, rows)
+    positions, face_id = texel_positions(above, columns, rows)
     normals, uv = np.zeros((rows * columns, 3), np.float32), np.zeros((rows * columns, 2), np.float32)
     covered = np.flatnonzero(face_id >= 0)
     corners = terrain.faces[face_id.ravel()[covered]]
     centre = np.stack([covered % columns, covered // columns], axis=-1) + 0.5
-    share = barycentric(texel_coordinates(plan.uv, columns, rows)[corners], centre)
+    share = barycentric(texel_coordinates(flat, columns, rows)[corners], centre)
     normal = np.einsum("nk,nkc->nc", share, vertex_normals(terrain)[corners])
     normals[covered] = normal / np.linalg.norm(normal, axis=1, keepdims=True)
     uv[covered] = np.einsum("nk,nkc->nc", share, terrain.uv[corners])
