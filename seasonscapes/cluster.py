@@ -6,6 +6,7 @@ record. A killed worker takes nothing with it: its frames are handed to others, 
 
 from __future__ import annotations
 
+import os
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -61,7 +62,25 @@ def connected(cluster: str) -> Iterator[Any]:
                 yield client
             return
         with _started(cluster) as started, Client(started) as client:
+            if cluster.startswith("local:"):
+                client.register_plugin(_own_cores(int(cluster.partition(":")[2])))
             yield client
+
+
+def _own_cores(workers: int) -> Any:
+    """Gives each of so many workers of this machine its own cores, so that their threads do not fight over all of them."""
+    from distributed import WorkerPlugin
+
+    class OwnCores(WorkerPlugin):
+        name = "own-cores"
+
+        def setup(self, worker: Any) -> None:
+            if not hasattr(os, "sched_setaffinity"):
+                return  # macOS, Windows: the system decides
+            cores = sorted(os.sched_getaffinity(os.getppid()))
+            os.sched_setaffinity(0, cores[int(worker.name) % len(cores) :: workers] or cores)
+
+    return OwnCores()
 
 
 def _started(cluster: str) -> Any:
