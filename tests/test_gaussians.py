@@ -365,16 +365,27 @@ def test_a_camera_that_sees_nothing_says_so(model):
 
 
 def test_snow_line_climbs_between_two_dates():
-    height = np.linspace(0.0, 1000.0, 101)
-    dated = np.stack([np.full((101, 3), 0.8), np.full((101, 3), 0.2)]).astype(np.float32)
-    between = albedo_at(dated, np.array([100.0, 140.0]), 120.0, height)[:, 0]
-    assert np.all(np.diff(between) >= -1e-6)
-    assert between[0] == pytest.approx(0.2)
-    assert between[-1] == pytest.approx(0.8)
-    assert between.mean() == pytest.approx(0.5, abs=0.02)
-    np.testing.assert_array_equal(albedo_at(dated, np.array([100.0, 140.0]), 140.0, height), dated[1])
+    """Snow above a line that lies 300 m lower in the shade, at 1,000 m on one date and at 2,000 m on the other."""
+    rng = np.random.default_rng(0)
+    height, shade = rng.uniform(0.0, 3000.0, 4000), rng.uniform(-0.6, 0.6, 4000)
+    normals = np.stack([np.zeros(4000), shade, np.sqrt(1.0 - shade**2)], axis=1)
+    places = np.concatenate([height[:, None] / 1000.0, normals, np.zeros((4000, 1))], axis=1)
+
+    def snowy(line_m: float) -> np.ndarray:
+        return np.repeat(np.where(height > line_m - 500.0 * shade, 0.8, 0.2)[:, None], 3, axis=1).astype(np.float32)
+
+    days, dated = np.array([100.0, 140.0]), np.stack([snowy(1000.0), snowy(2000.0)])
+    between = albedo_at(dated, days, 120.0, places)
+    error = np.abs(between - snowy(1500.0)).mean()
+    assert error < 0.5 * np.abs(dated.mean(axis=0) - snowy(1500.0)).mean()
+    np.testing.assert_array_equal(albedo_at(dated, days, 140.0, places), dated[1])
+    # Through the turn of the year it falls again, and small changes are simply mixed.
+    assert (
+        np.abs(albedo_at(dated, days, 300.0, places) - snowy(1500.0)).mean()
+        < 0.5 * np.abs(dated.mean(0) - snowy(1500.0)).mean()
+    )
     slow = np.stack([np.full((3, 3), 0.2), np.full((3, 3), 0.3)]).astype(np.float32)
-    np.testing.assert_allclose(albedo_at(slow, np.array([350.0, 355.0]), 351.0, np.arange(3.0)), 0.22, atol=1e-6)
+    np.testing.assert_allclose(albedo_at(slow, np.array([350.0, 355.0]), 351.0, np.zeros((3, 5))), 0.22, atol=1e-6)
 
 
 def baked(hill) -> BakedSplats:

@@ -14,7 +14,7 @@ import numpy as np
 
 from seasonscapes.errors import InputError
 from seasonscapes.frames import LocalFrame
-from seasonscapes.gaussians.season import albedo_at
+from seasonscapes.gaussians.season import albedo_at, snow_places
 from seasonscapes.gaussians.surfels import Plan, Surfels, disc_shapes
 from seasonscapes.gaussians.transport import Transport
 from seasonscapes.images import atomic_path
@@ -89,7 +89,10 @@ class GaussianModel:
 
     def albedo_on(self, day: float) -> np.ndarray:
         """Albedo ``(N, 3)`` of a day of the year; see `season.albedo_at`."""
-        return albedo_at(self.albedo, self.days, day, self.means[:, 2])
+        if len(self.days) == 1:
+            return self.albedo[0]
+        places = snow_places(self.means, self.transport.normals, self.plan.spacing_m)
+        return albedo_at(self.albedo, self.days, day, places)
 
 
 def model_from(surfels: Surfels, albedo: np.ndarray, days, transport: Transport, *, kind: str, frame: LocalFrame,
