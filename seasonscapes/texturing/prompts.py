@@ -1,0 +1,36 @@
+"""What to ask an image model for: the landscape of a date, an hour and a sky, in words."""
+
+from __future__ import annotations
+
+from datetime import datetime
+
+NEGATIVE = (
+    "lowres, worst quality, low quality, blurry, cropped, frame, text, watermark, people, oversaturated, painting"
+)
+# Months of the northern Alps, and what they look like.
+_SEASONS = ("deep winter, snow down to the valleys", "late winter, snow down to the valleys", "early spring, snow on the slopes, brown meadows in the valley", "spring, green valleys, snow on high slopes",
+            "late spring, fresh green meadows, snow on the summits", "early summer, green meadows, snow fields on the summits",
+            "high summer, green alpine meadows, grey rock, glaciers", "late summer, green alpine meadows, grey rock, glaciers",
+            "early autumn, yellowing meadows, grey rock", "autumn, golden larches, brown meadows, fresh snow on the summits",
+            "late autumn, brown meadows, snow on the slopes", "early winter, snow on the slopes")  # fmt: skip
+# From an elevation of the sun upwards [deg].
+_HOURS = ((-90.0, "at night under the stars"), (-12.0, "in deep twilight"), (-6.0, "at dusk"), (-0.8, "at sunrise, long shadows"),
+          (6.0, "in low warm sunlight, long shadows"), (20.0, "in bright daylight"))  # fmt: skip
+
+
+def prompt_for(time: datetime, latitude_deg: float, sun_elevation_deg: float, *, cloudiness: float = 0.0) -> str:
+    """A prompt for the landscape of an hour.
+
+    Parameters
+    ----------
+    time
+        Its month decides the season; south of the equator half a year later.
+    sun_elevation_deg
+        Decides the light.
+    cloudiness
+        0 to 1.
+    """
+    month = time.month if latitude_deg >= 0.0 else (time.month + 5) % 12 + 1
+    hour = next(words for low, words in reversed(_HOURS) if sun_elevation_deg >= low)
+    sky = "on a clear day" if cloudiness < 0.2 else "with some clouds" if cloudiness < 0.7 else "under an overcast sky"
+    return f"photograph of a landscape of high mountains in {_SEASONS[month - 1]}, {hour}, {sky}, natural colours, fine detail"
