@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from seasonscapes.albedo.footprints import Footprints, seen_weight, trace_footprints, whole_pixels
+from seasonscapes.albedo.footprints import Footprints, seen_weight, thinned_footprints, trace_footprints, whole_pixels
 from seasonscapes.albedo.forward import Land, Seen, air_between, ambient_on_texels, seen_by, sky_seen
 from seasonscapes.cameras.observation import Observation
 from seasonscapes.rendering.reception import luminaries
@@ -484,3 +484,19 @@ def pixel_weights(land: Land, shots: Sequence[Shot], fit: AlbedoFit, trust: Trus
         _weigh([row], albedo, trust, robust=True)
         weights.append(row.weight)
     return weights
+
+
+def thinned_shots(shots: Sequence[Shot], share: float, seed: int) -> list[Shot]:
+    """The same photographs with a share of their terrain pixels."""
+    if share >= 1.0:
+        return list(shots)
+    rng = np.random.default_rng(seed)
+    made: dict[int, tuple[Footprints, object]] = {}
+    result = []
+    for shot in shots:
+        if id(shot.footprints) not in made:
+            part = thinned_footprints(shot.footprints, rng.random(len(shot.footprints.pixel)) < share)
+            made[id(shot.footprints)] = part, replace(seen_by(part), sky=shot.seen.sky)
+        footprints, seen = made[id(shot.footprints)]
+        result.append(replace(shot, footprints=footprints, seen=seen))
+    return result

@@ -9,7 +9,7 @@ pixels is ever blurred.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -188,3 +188,17 @@ def seen_weight(footprints: Sequence[Footprints]) -> np.ndarray:
 def whole_pixels(footprints: Footprints, *, full: float = 0.999) -> np.ndarray:
     """Pixels ``(n,)`` bool that show terrain alone: sky in a pixel is brighter than any slope, and not sharp in a photograph."""
     return footprints.coverage >= full
+
+
+def thinned_footprints(footprints: Footprints, keep: np.ndarray) -> Footprints:
+    """The footprints of some of the pixels ``(n,)`` bool."""
+    count = np.diff(footprints.start)
+    entries = np.repeat(keep, count)
+    start = np.zeros(int(keep.sum()) + 1, np.int32)
+    np.cumsum(count[keep], out=start[1:])
+    return replace(
+        footprints, pixel=footprints.pixel[keep], coverage=footprints.coverage[keep], start=start,
+        texel=footprints.texel[entries], share=footprints.share[entries],
+        sunlit=[[values[entries] for values in bodies] for bodies in footprints.sunlit], lit=footprints.lit[:, keep],
+        distance_m=footprints.distance_m[keep], spread=footprints.spread[keep],
+    )  # fmt: skip

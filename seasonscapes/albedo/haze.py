@@ -13,9 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from seasonscapes.albedo.closed_form import LINEAR, AlbedoFit, Effort, Shot, Trust, solve_albedo
-from seasonscapes.albedo.footprints import Footprints
-from seasonscapes.albedo.forward import Land, seen_by
+from seasonscapes.albedo.closed_form import LINEAR, AlbedoFit, Effort, Shot, Trust, solve_albedo, thinned_shots
+from seasonscapes.albedo.forward import Land
 from seasonscapes.sky.illumination import AerialPerspective, Illumination, Luminary
 
 LightsOf = Callable[[float], Sequence[Illumination]]
@@ -96,7 +95,7 @@ def fit_visibility(land: Land, shots: Sequence[Shot], lights_of: LightsOf, *, vi
     nodes = sorted(map(float, visibilities_km))
     if len(nodes) < 3:
         raise ValueError("fit_visibility: three visibilities at least")
-    thin = _thinned(shots, share, seed)
+    thin = thinned_shots(shots, share, seed)
     lights: dict[float, Sequence[Illumination]] = {}
     costs: dict[float, float] = {}
     albedo = None if start is None else start.albedo
@@ -153,33 +152,3 @@ def _parabola_least(x: Sequence[float], y: Sequence[float]) -> float:
     if curve[0] <= 0.0:
         return x[int(np.argmin(y))]
     return float(-0.5 * curve[1] / curve[0] * x[0])
-
-
-def _thinned(shots: Sequence[Shot], share: float, seed: int) -> list[Shot]:
-    """The same photographs with a share of their terrain pixels."""
-    if share >= 1.0:
-        return list(shots)
-    rng = np.random.default_rng(seed)
-    made: dict[int, tuple[Footprints, object]] = {}
-    result = []
-    for shot in shots:
-        if id(shot.footprints) not in made:
-            part = thinned_footprints(shot.footprints, rng.random(len(shot.footprints.pixel)) < share)
-            made[id(shot.footprints)] = part, replace(seen_by(part), sky=shot.seen.sky)
-        footprints, seen = made[id(shot.footprints)]
-        result.append(replace(shot, footprints=footprints, seen=seen))
-    return result
-
-
-def thinned_footprints(footprints: Footprints, keep: np.ndarray) -> Footprints:
-    """The footprints of some of the pixels ``(n,)`` bool."""
-    count = np.diff(footprints.start)
-    entries = np.repeat(keep, count)
-    start = np.zeros(int(keep.sum()) + 1, np.int32)
-    np.cumsum(count[keep], out=start[1:])
-    return replace(
-        footprints, pixel=footprints.pixel[keep], coverage=footprints.coverage[keep], start=start,
-        texel=footprints.texel[entries], share=footprints.share[entries],
-        sunlit=[[values[entries] for values in bodies] for bodies in footprints.sunlit], lit=footprints.lit[:, keep],
-        distance_m=footprints.distance_m[keep], spread=footprints.spread[keep],
-    )  # fmt: skip

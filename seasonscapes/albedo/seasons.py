@@ -187,9 +187,29 @@ def prepare_pair(land: Land, first: DatedAlbedo, second: DatedAlbedo) -> SeasonP
     height, normal = land.position_m[:, 2], land.normal
     lines = [fit_snow_line(height, normal, s) for s in snow]
     bare, white = _bare_and_white(list(values), snow, height)
-    above = [height - line.height_m - line.by_north_m * normal[:, 1] - line.by_slope_m * _sine(normal) for line in lines]
-    return SeasonPair(first.day, second.day, values, bare, white, snow, np.stack(above).astype(np.float32),
-                      (lines[0].width_m, lines[1].width_m))  # fmt: skip
+    above = [
+        height - line.height_m - line.by_north_m * normal[:, 1] - line.by_slope_m * _sine(normal) for line in lines
+    ]
+    width = (lines[0].width_m, lines[1].width_m)
+    above = np.stack(above) + _own_offset_m(np.stack(above), snow, width)
+    return SeasonPair(first.day, second.day, values, bare, white, snow, above.astype(np.float32), width)
+
+
+def _own_offset_m(above_m: np.ndarray, snow: np.ndarray, width_m: tuple[float, float]) -> np.ndarray:
+    """By how much each texel ``(N,)`` lies higher for the snow than its height says (hollows, sheltered slopes) [m].
+
+    The least offset under which the line explains the snow that the texel had on both dates.
+    """
+    low, high = np.full(snow.shape, -np.inf), np.full(snow.shape, np.inf)
+    for k in (0, 1):
+        logit = np.log(np.clip(snow[k], 0.02, 0.98) / (1.0 - np.clip(snow[k], 0.02, 0.98)))
+        exact = width_m[k] * logit - above_m[k]
+        low[k] = np.where(snow[k] > 0.1, np.where(snow[k] > 0.9, 2.0 * width_m[k] - above_m[k], exact), -np.inf)
+        high[k] = np.where(snow[k] < 0.9, np.where(snow[k] < 0.1, -2.0 * width_m[k] - above_m[k], exact), np.inf)
+    least, most = low.max(axis=0), high.min(axis=0)
+    torn = least > most
+    middle = 0.5 * (np.where(torn, least, 0.0) + np.where(torn, most, 0.0))
+    return np.where(torn, middle, np.clip(0.0, least, np.maximum(least, most)))
 
 
 def _bare_and_white(values: list[np.ndarray], snow: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -211,10 +231,16 @@ def _typical(own: np.ndarray, own_is: np.ndarray, other: np.ndarray, other_is: n
     return np.median(own, axis=0)
 
 
-def albedo_between(land: Land, pair: SeasonPair, day: date) -> np.ndarray:
+def albedo_between(land: Land, pair: SeasonPair, day: date, *, line_share: float | None = None) -> np.ndarray:
     """The albedo texture ``(R, S, 3)`` of a day between a pair's dates.
 
     Bare ground and snow each change evenly (leaves turn, snow ages); which of the two shows is decided by the snow line.
+
+    Parameters
+    ----------
+    line_share
+        How much of its way from the first date's height to the second's the line has gone on that day, where it is known
+        (from a snow station, or a picture); left out, as much as of the time has passed.
 
     Raises
     ------
@@ -224,20 +250,21 @@ def albedo_between(land: Land, pair: SeasonPair, day: date) -> np.ndarray:
     way = _way(pair.first, pair.second, day)
     texture = np.zeros((land.shape[0] * land.shape[1], 3), np.float32)
     # What the model of two colours and a line does not explain of each date fades over.
-    rest = [pair.values[k] - _clothed(pair, float(k)) for k in (0, 1)]
-    texture[land.texel] = _clothed(pair, way) + (1.0 - way) * rest[0] + way * rest[1]
+    rest = [pair.values[k] - _clothed(pair, float(k), float(k)) for k in (0, 1)]
+    line = way if line_share is None else float(np.clip(line_share, 0.0, 1.0))
+    texture[land.texel] = _clothed(pair, way, line) + (1.0 - way) * rest[0] + way * rest[1]
     return np.clip(texture, 0.0, HIGHEST).reshape(*land.shape, 3)
 
 
-def _clothed(pair: SeasonPair, way: float) -> np.ndarray:
-    """Albedo ``(N, 3)`` of ground and snow where the line stands a share ``way`` of its way."""
+def _clothed(pair: SeasonPair, way: float, line: float) -> np.ndarray:
+    """Albedo ``(N, 3)`` of ground and snow after a share ``way`` of the time, the line a share ``line`` of its way on."""
     ground = (1.0 - way) * pair.bare[0] + way * pair.bare[1]
     snowy = (1.0 - way) * pair.white[0] + way * pair.white[1]
     ends = [_logistic(above / width) for above, width in zip(pair.above_m, pair.width_m, strict=True)]
-    above = (1.0 - way) * pair.above_m[0] + way * pair.above_m[1]
-    modelled = _logistic(above / ((1.0 - way) * pair.width_m[0] + way * pair.width_m[1]))
+    above = (1.0 - line) * pair.above_m[0] + line * pair.above_m[1]
+    modelled = _logistic(above / ((1.0 - line) * pair.width_m[0] + line * pair.width_m[1]))
     apart = [pair.snow[k] - ends[k] for k in (0, 1)]
-    snow = np.clip(modelled + (1.0 - way) * apart[0] + way * apart[1], 0.0, 1.0)
+    snow = np.clip(modelled + (1.0 - line) * apart[0] + line * apart[1], 0.0, 1.0)
     return ground + snow[:, None] * (snowy - ground)
 
 

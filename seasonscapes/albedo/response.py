@@ -1,0 +1,81 @@
+"""The camera's response curve: one strength of an S-curve, found where the photographs agree best under their light.
+
+Webcams lift bright and darken dark values on top of sRGB. The family here is the cubic that keeps both ends of the encoded
+range, ``(1 - s) e + s (3 e² - 2 e³)``; s = 0 is sRGB itself. What tells s apart from albedo is that one place is seen bright
+and dark, at many hours, and that the sky is known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from seasonscapes.albedo.closed_form import EIGHT_BIT, AlbedoFit, Effort, Shot, Trust, solve_albedo, thinned_shots
+from seasonscapes.albedo.forward import Land
+from seasonscapes.images import linear_from_srgb, srgb_from_linear
+
+_QUICK = Effort(rounds=3, iterations=8)
+STRENGTHS = (0.0, 0.2, 0.4, 0.6)
+
+
+@dataclass(frozen=True)
+class ResponseFit:
+    """The strength found, and the robust cost of every one that was tried."""
+
+    strength: float
+    costs: dict[float, float]
+
+
+def without_curve(linear: np.ndarray, strength: float) -> np.ndarray:
+    """Linear values ``(...)`` in [0, 1] of a picture that was decoded as plain sRGB but went through an S-curve."""
+    if strength == 0.0:
+        return linear
+    knots = np.linspace(0.0, 1.0, 4097)
+    curve = (1.0 - strength) * knots + strength * knots * knots * (3.0 - 2.0 * knots)
+    encoded = np.interp(srgb_from_linear(linear), curve, knots)
+    return linear_from_srgb(encoded)
+
+
+def with_response(shots: Sequence[Shot], strength: float) -> list[Shot]:
+    """The same photographs with the S-curve taken out."""
+    return [
+        replace(shot, observation=replace(shot.observation, image=without_curve(shot.observation.image, strength)))
+        for shot in shots
+    ]
+
+
+def fit_response(land: Land, shots: Sequence[Shot], *, strengths: Sequence[float] = STRENGTHS, trust: Trust = EIGHT_BIT,
+                 share: float = 0.2, start: AlbedoFit | None = None, seed: int = 0,
+                 progress: Callable[[float], None] | None = None) -> ResponseFit:  # fmt: skip
+    """The S-curve that all photographs share (one kind of webcam), by search over its strength.
+
+    Raises
+    ------
+    ValueError
+        Fewer than three strengths to try.
+    """
+    tell = progress or (lambda done: None)
+    if len(strengths) < 3:
+        raise ValueError("fit_response: three strengths at least")
+    thin = thinned_shots(shots, share, seed)
+    costs: dict[float, float] = {}
+
+    def cost_at(strength: float) -> float:
+        fit = solve_albedo(land, with_response(thin, strength), trust=trust, effort=_QUICK,
+                           start=None if start is None else start.albedo)  # fmt: skip
+        costs[strength] = fit.cost
+        tell(len(costs) / (len(strengths) + 1))
+        return fit.cost
+
+    values = [cost_at(float(s)) for s in strengths]
+    best = int(np.clip(np.argmin(values), 1, len(values) - 2))
+    x, y = np.array(strengths[best - 1 : best + 2], float), values[best - 1 : best + 2]
+    curve = np.polyfit(x, y, 2)
+    if curve[0] > 0.0:
+        guess = float(np.clip(-0.5 * curve[1] / curve[0], strengths[0], strengths[-1]))
+        if min(abs(guess - s) for s in costs) > 0.01:
+            cost_at(guess)
+    tell(1.0)
+    return ResponseFit(min(costs, key=costs.get), dict(sorted(costs.items())))
