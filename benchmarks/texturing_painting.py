@@ -22,11 +22,11 @@ HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
 sys.path.append(str(HERE.parent / "tests"))
 
-from albedo_scene import Truth, hours, lights_for, make_truth  # noqa: E402
+from albedo_scene import Truth, hours, lights_for, make_truth, terrain_and_albedo  # noqa: E402
 from oracles_visibility import BinnedTriangles  # noqa: E402
 
 from seasonscapes.evaluation.synthetic_webcams import Hour, SyntheticPicture, webcam_series  # noqa: E402
-from seasonscapes.evaluation.webcam_faults import CLEAN, TYPICAL, PoseSigmas  # noqa: E402
+from seasonscapes.evaluation.webcam_faults import TYPICAL, PoseSigmas, perturb_pose  # noqa: E402
 from seasonscapes.images import expose, srgb_from_linear  # noqa: E402
 from seasonscapes.rendering.gather import Occluder, occluder  # noqa: E402
 from seasonscapes.rendering.gbuffer import trace_gbuffer  # noqa: E402
@@ -35,12 +35,12 @@ from seasonscapes.rendering.scene import RenderScene, mi_mesh  # noqa: E402
 from seasonscapes.rendering.transport import Effort  # noqa: E402
 from seasonscapes.sky.models import read_sky_model, with_overrides  # noqa: E402
 from seasonscapes.terrain.atlas import measure_atlas  # noqa: E402
-from seasonscapes.terrain.surface import Terrain, Texture, sample_texture  # noqa: E402
+from seasonscapes.terrain.surface import Texture, sample_texture  # noqa: E402
 from seasonscapes.texturing.foreground import foreground_mask, predict_in_folds  # noqa: E402
 from seasonscapes.texturing.guides import guides_for  # noqa: E402
-from seasonscapes.texturing.paint import Painting, PaintOptions, paint  # noqa: E402
-from seasonscapes.texturing.shots import Shot  # noqa: E402
-from seasonscapes.texturing.tiles import TexelSurface, Tile, tile_surface, tiling  # noqa: E402
+from seasonscapes.texturing.paint import PaintOptions, paint  # noqa: E402
+from seasonscapes.texturing.shots import Shot, ready_shot  # noqa: E402
+from seasonscapes.texturing.tiles import Tile, tile_surface, tiling  # noqa: E402
 from seasonscapes.texturing.visibility import by_depth, by_faces, by_ray, sight_of  # noqa: E402
 from seasonscapes.workspace import default_workspace  # noqa: E402
 
@@ -56,6 +56,7 @@ class Stage:
     atlas: object
     terrain: Occluder
     lights: list
+    texel_m: float
     pictures: list[SyntheticPicture]
 
 
@@ -77,7 +78,7 @@ def make_stage(seed: int, *, quick: bool, foreground: bool = False, poses: PoseS
     ]  # fmt: skip
     height, width = truth.shape
     atlas = measure_atlas(truth.terrain, "planar", width, height)
-    return Stage(truth, atlas, occluder(mi_mesh(truth.terrain, truth.albedo)), lights, pictures)
+    return Stage(truth, atlas, occluder(mi_mesh(truth.terrain, truth.albedo)), lights, size["texel_m"], pictures)
 
 
 def shots_of(stage: Stage, **changes) -> list[Shot]:
@@ -154,17 +155,23 @@ def harmony(stage: Stage, *, seed: int, texels: int = 20_000) -> dict:
     """Painted texels against the truth: one gain for all, gains, gains and haze; and the paper's first-come order."""
     shots, terrain, rng = shots_of(stage), stage.truth.terrain, np.random.default_rng(seed)
     numbers, sample, truth = {}, None, None
+    raw = [replace(shot, air=None) for shot in shots]
     kinds = {"plain": PaintOptions(fit_gains=False), "harmonised": PaintOptions(), "no_haze_fit": PaintOptions(fit_haze=False),
              "first": PaintOptions(mode="first")}  # fmt: skip
     for name, options in kinds.items():
         start = time.process_time()
-        painting = paint(shots, terrain, stage.atlas, stage.terrain, options=options)
+        painting = paint(raw if name == "plain" else shots, terrain, stage.atlas, stage.terrain, options=options)
         seconds = time.process_time() - start
         if sample is None:
             painted = np.flatnonzero(painting.texture.weight.ravel() > 0.0)
             sample = np.sort(rng.permutation(painted)[:texels])
             truth = land_truth(stage, sample, seed=seed)
-        numbers[f"painted_{name}_db"] = decibels(painting.texture.values.reshape(-1, 3)[sample], truth)
+        got = painting.texture.values.reshape(-1, 3)[sample]
+        numbers[f"painted_{name}_absolute_db"] = decibels(got, truth)
+        # A picture's own exposure and tint are no fault of painting: the best gain for all texels together is taken out.
+        there = (got > 0.0).all(axis=1) & (truth > 0.0).all(axis=1)
+        level = np.exp(np.median(np.log(got[there] / truth[there]), axis=0))
+        numbers[f"painted_{name}_db"] = decibels(got[there] / level, truth[there])
         if name == "harmonised":
             said = painting.harmony
             gains = np.array([p.development.gains for p in stage.pictures])
@@ -175,3 +182,145 @@ def harmony(stage: Stage, *, seed: int, texels: int = 20_000) -> dict:
                         "painting_mtexel_camera_per_cpu_s": painting.best.size * len(shots) / 1e6 / seconds}  # fmt: skip
     numbers["harmonising_gain_db"] = numbers["painted_harmonised_db"] - numbers["painted_plain_db"]
     return numbers
+
+
+def reprojection(stage: Stage) -> dict:
+    """A clean picture painted, and looked at again by its own camera."""
+    decibel = []
+    for picture, light in zip(stage.pictures[:3], stage.lights, strict=False):
+        gain = 0.25 / float(np.percentile(picture.surface, 99.0))
+        image = np.clip(picture.surface * gain, 0.0, 1.0).astype(np.float32)
+        shot = Shot(replace(picture.observation, image=image, camera=picture.camera))
+        painting = paint([shot], stage.truth.terrain, stage.atlas, stage.terrain, options=PaintOptions(fit_gains=False))
+        covered = (
+            sample_texture((painting.texture.weight > 0)[..., None].astype(np.float32), picture.gbuffer.uv)[..., 0]
+            > 0.999
+        )
+        back = (
+            np.exp(painting.harmony.log_gain[0]) * sample_texture(painting.texture.values, picture.gbuffer.uv)[covered]
+        )
+        decibel.append(-10.0 * np.log10(np.mean((srgb_from_linear(back) - srgb_from_linear(image[covered])) ** 2)))
+    return {"reprojection_db": float(np.mean(decibel)), "reprojection_worst_db": float(np.min(decibel))}
+
+
+def two_ridges() -> dict:
+    """Texels that are painted behind a knife-edge ridge, by closed form; painting is given no guard."""
+    from test_painting import Land, camera_towards, texel_positions
+
+    ridges = Land(
+        lambda e, n: np.maximum(0.0, 100.0 - 0.5 * np.abs(n + 100.0)) + np.maximum(0.0, 160.0 - 0.5 * np.abs(n - 400.0))
+    )
+    eye = np.array([0.0, -550.0, 120.0])
+    shot = ridges.shot(camera_towards(eye, (0.0, 400.0, 80.0), fov_deg=80.0), "south")
+    painted = ridges.paint([shot], guard=False, fit_gains=False).texture.weight > 0.0
+    place, _ = texel_positions(ridges.terrain, ridges.atlas.width_px, ridges.atlas.height_px)
+    n, z = place[..., 1].astype(float), place[..., 2].astype(float)
+    hidden = np.zeros(n.shape, bool)
+    for crest_n, crest_z in ((-100.0, 100.0), (400.0, 160.0)):
+        beyond = n > crest_n + 1e-3
+        hidden |= beyond & (
+            eye[2] + (crest_n - eye[1]) / np.where(beyond, n - eye[1], 1.0) * (z - eye[2]) < crest_z - 0.05
+        )
+    return {
+        "two_ridge_leaks": int(np.count_nonzero(painted & hidden)),
+        "two_ridge_hidden": int(np.count_nonzero(hidden)),
+    }
+
+
+def guard(stage: Stage, *, seed: int, texels: int = 12_000) -> dict:
+    """Poses that are 0.2° off: painted texels with and without keeping away from silhouettes."""
+    rng = np.random.default_rng(seed)
+    sigmas = PoseSigmas(heading_deg=0.2, pitch_deg=0.1)
+    shots = [replace(shot, pose_sigma={"heading_deg": 0.2, "tilt_deg": 0.1},
+                     observation=replace(shot.observation, camera=perturb_pose(shot.observation.camera, sigmas, rng)[0]))
+             for shot in shots_of(stage)]  # fmt: skip
+    numbers, sample = {}, None
+    for name, kept in (("unguarded", False), ("guarded", True)):
+        painting = paint(shots, stage.truth.terrain, stage.atlas, stage.terrain, options=PaintOptions(guard=kept))
+        painted = painting.texture.weight.ravel() > 0.0
+        if sample is None:
+            sample = np.sort(rng.permutation(np.flatnonzero(painted))[:texels])
+            truth = land_truth(stage, sample, seed=seed)
+        there = painted[sample]
+        numbers[f"pose_{name}_db"] = decibels(painting.texture.values.reshape(-1, 3)[sample][there], truth[there])
+        numbers[f"pose_{name}_share"] = float(there.mean())
+    return numbers
+
+
+def rejection(stage: Stage, *, seed: int, texels: int = 12_000) -> dict:
+    """Houses and a mast before every webcam: how much of them is found, and what painting gains by it."""
+    from seasonscapes.texturing.guided import fit_regression, predict
+
+    terrain, shots = stage.truth.terrain, shots_of(stage)
+    first = paint(shots, terrain, stage.atlas, stage.terrain)
+    sun = stage.lights[0].sun
+    # The land in another season serves as the satellite's image.
+    summer = terrain_and_albedo(stage.truth.place, stage.truth.spacing_m, stage.texel_m, 190)[1]
+    guides = guides_for(
+        terrain, stage.atlas, satellite=Texture(summer), sun_direction=None if sun is None else sun.direction
+    )
+
+    def fit(guide, target):
+        regression = fit_regression(guide, target, fast=True, seed=seed)
+        return lambda other: predict(regression, other)[0]
+
+    expected = predict_in_folds(first.texture, guides.values, fit, seed=seed)
+    index = {name: k for k, name in enumerate(first.webcams)}
+    pictures = {picture.observation.webcam: picture for picture in stage.pictures}
+    cut, scene = tiling(terrain, stage.atlas), RenderScene(stage.terrain.mi_scene, stage.terrain.mi_terrain, None, 0.0)
+    rejects, found, false = [], [], []
+    for shot in shots:
+        camera, picture = shot.observation.camera, pictures[shot.observation.webcam]
+        uv = trace_gbuffer(scene, camera).uv
+        mask = foreground_mask(
+            ready_shot(shot, stage.terrain, cut), index[shot.observation.webcam], first.harmony, expected, uv
+        )
+        land = np.isfinite(uv).all(axis=2)
+        found.append((np.count_nonzero(mask & picture.foreground & land), np.count_nonzero(picture.foreground & land)))
+        false.append(
+            (np.count_nonzero(mask & ~picture.foreground & land), np.count_nonzero(~picture.foreground & land))
+        )
+        rejects.append(mask)
+    second = paint(shots, terrain, stage.atlas, stage.terrain, rejects=rejects)
+    oracle = paint(
+        shots, terrain, stage.atlas, stage.terrain, rejects=[pictures[s.observation.webcam].foreground for s in shots]
+    )
+    painted = np.flatnonzero(first.texture.weight.ravel() > 0.0)
+    sample = np.sort(np.random.default_rng(seed).permutation(painted)[:texels])
+    truth = land_truth(stage, sample, seed=seed)
+    ratio = lambda pairs: sum(a for a, _ in pairs) / max(sum(b for _, b in pairs), 1)  # noqa: E731
+    numbers = {"foreground_recall": ratio(found), "foreground_false_rejects": ratio(false)}
+    for name, painting in (("contaminated", first), ("rejected", second), ("known", oracle)):
+        there = painting.texture.weight.ravel()[sample] > 0.0
+        numbers[f"foreground_{name}_db"] = decibels(painting.texture.values.reshape(-1, 3)[sample][there], truth[there])
+    return numbers
+
+
+def measure(quick: bool, seed: int) -> dict:
+    """All numbers of painting, flat."""
+    stage = make_stage(seed, quick=quick)
+    numbers = visibility(stage, seed=seed, rays=400 if quick else 2000)
+    numbers |= two_ridges() | reprojection(stage) | harmony(stage, seed=seed) | guard(stage, seed=seed)
+    poses = PoseSigmas(heading_deg=0.05, pitch_deg=0.05, roll_deg=0.05, horizontal_m=1.0, vertical_m=1.0)
+    numbers |= rejection(make_stage(seed, quick=quick, foreground=True, poses=poses), seed=seed)
+    return {name: float(value) for name, value in numbers.items()}
+
+
+def main() -> None:
+    """Run by name; a table, and JSON where asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--seed", type=int, default=None)
+    parser.add_argument("--json", type=Path, default=None)
+    arguments = parser.parse_args()
+    seed = secrets.randbelow(2**31) if arguments.seed is None else arguments.seed
+    start = time.perf_counter()
+    numbers = measure(arguments.quick, seed) | {"seed": seed, "seconds": time.perf_counter() - start}
+    for name, value in numbers.items():
+        print(f"{name:<48} {value:12.4f}")
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps(numbers, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -18,7 +18,7 @@ from seasonscapes.images import linear_from_srgb, srgb_from_linear
 from seasonscapes.rendering.gather import Occluder
 from seasonscapes.terrain.surface import sample_texture
 from seasonscapes.texturing.overlaps import Overlaps, Samples, find_overlaps
-from seasonscapes.texturing.shots import ReadyShot
+from seasonscapes.texturing.shots import ReadyShot, horizon_radiance
 
 # Scatter of the logarithms of two cameras' views of one place, and of a picture's encoded values (noise, JPEG).
 _LAND_SIGMA, _PICTURE_SIGMA = 0.1, 0.012
@@ -28,10 +28,12 @@ _SKY_SIGMA, _MEAN_SIGMA, _PREDICTED_SIGMA = 0.4, 1.0, 1.0
 # Webcams steepen contrast: logarithm of the exponent, and of the haze's.
 _CONTRAST, _CONTRAST_SIGMA, _HAZE_SIGMA = 0.1, 0.05, 0.5
 # Neighbouring places are not independent: so many count as one, and those of one pair of cameras as no more than so many.
-_PLACES_AS_ONE, _PLACES_A_PAIR = 20.0, 20.0
+_PLACES_AS_ONE, _PLACES_A_PAIR = 20.0, 10.0
+# Radiance of the land over that of the horizon's sky, where no picture shows any sky.
+_LAND_OF_SKY = 0.25
 # The least share of a picture's value that the land itself must have.
 _LEAST_LAND = 0.08
-_STEPS, _FARTHEST_STEP = 15, 0.3
+_STEPS, _FARTHEST_STEP, _FIRST_HAZE = 15, 0.3, 0.6
 
 
 @dataclass(frozen=True)
@@ -131,7 +133,8 @@ def harmonise(shots: Sequence[ReadyShot], terrain: Occluder, *, predicted: np.nd
     fit_haze, fit_contrast
         Let them differ from the sky model's haze and from plain sRGB.
     radiance
-        Median radiance of the land [cd/m²], where no picture shows any sky; left out, 1: relative values.
+        Median radiance of the land [cd/m²], where no picture shows any sky; left out, a quarter of the horizon's by the
+        sky model, and 1 (relative values) without any.
 
     Returns
     -------
@@ -143,17 +146,20 @@ def harmonise(shots: Sequence[ReadyShot], terrain: Occluder, *, predicted: np.nd
     expected = None if predicted is None else _expected(predicted, overlaps.alone_uv)
     harmony = Harmony(np.zeros((count, 3)), np.zeros((count, 3)), np.ones(count), overlaps=len(overlaps.uv))
     harmony = replace(harmony, log_gain=_prior_gains(shots, harmony, radiance)[0])
-    harmony = _with_sky(shots, harmony)
+    harmony = _with_sky(shots, harmony, radiance)
     before = _scatter(overlaps, equal_gains(shots))
     free = np.concatenate([np.ones(3 * count, bool), np.full(count, fit_contrast), [fit_haze]])
     if fit_contrast:
         harmony = replace(harmony, contrast=np.full(count, np.exp(_CONTRAST)))
+    if fit_haze:
+        # Begin in clear air: where too much is taken away nothing is left that could tell so.
+        harmony = replace(harmony, haze=_FIRST_HAZE)
     for _ in range(_STEPS):
         prior = _prior_gains(shots, harmony, radiance)
         step = _gauss_newton(overlaps, expected, harmony, prior, free)
         # Gains are nearly linear; what bends the curve moves by little at a time.
         step[3 * count :] = np.clip(step[3 * count :], -_FARTHEST_STEP, _FARTHEST_STEP)
-        harmony = _with_sky(shots, _moved(harmony, step))
+        harmony = _with_sky(shots, _moved(harmony, step), radiance)
         if np.abs(step).max() < 1e-4:
             break
     return replace(harmony, scatter_before=before, scatter_after=_scatter(overlaps, harmony))
@@ -166,25 +172,28 @@ def _moved(harmony: Harmony, step: np.ndarray) -> Harmony:
                    haze=float(np.clip(harmony.haze * np.exp(step[-1]), 0.1, 10.0)))  # fmt: skip
 
 
-def _with_sky(shots: Sequence[ReadyShot], harmony: Harmony) -> Harmony:
-    """The same with the airlight's gains read off the straightened skies; the land's gains where there is no sky."""
-    sky = _sky_gains(shots, harmony)
-    return replace(harmony, log_sky_gain=np.where(np.isfinite(sky), sky, harmony.log_gain))
-
-
-def _sky_gains(shots: Sequence[ReadyShot], harmony: Harmony) -> np.ndarray:
-    value = np.array([ready.sky_value for ready in shots])
-    radiance = np.array([ready.sky_radiance for ready in shots])
-    return np.log(straighten(value, harmony.contrast[:, None]) / radiance)
+def _with_sky(shots: Sequence[ReadyShot], harmony: Harmony, radiance: float | None) -> Harmony:
+    """The same with the airlight's gains read off the straightened skies."""
+    return replace(harmony, log_sky_gain=_prior_gains(shots, harmony, radiance)[0])
 
 
 def _prior_gains(shots: Sequence[ReadyShot], harmony: Harmony, radiance: float | None) -> tuple[np.ndarray, np.ndarray]:
     """What each gain is by its own picture alone ``(K, 3)``, and how surely ``(K, 1)``."""
-    mean = np.log(straighten(np.array([ready.median_value for ready in shots]), harmony.contrast[:, None]))
-    sky = _sky_gains(shots, harmony)
-    known = np.isfinite(sky).all(axis=1)
+    contrast = harmony.contrast[:, None]
+    mean = np.log(straighten(np.array([ready.median_value for ready in shots]), contrast))
+    value, expected = (np.array([getattr(ready, name) for ready in shots]) for name in ("sky_value", "sky_radiance"))
+    seen = np.isfinite(value)
+    sky = np.where(seen, np.log(straighten(np.where(seen, value, 0.5), contrast) / np.where(seen, expected, 1.0)), 0.0)
+    known = seen.any(axis=1)
+    # A colour that is clipped has the gain of the others: white balance differs by little.
+    grey = sky.sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
+    sky = np.where(seen, sky, grey[:, None])
     # A picture without sky is taken for as bright a land as those with sky show.
-    offset = np.median((sky - mean)[known], axis=0) if known.any() else -np.log(radiance or 1.0)
+    if known.any():
+        offset = np.median((sky - mean)[known], axis=0)
+    else:
+        horizon = float(np.mean([horizon_radiance(ready.shot) for ready in shots]))
+        offset = -np.log(radiance or _LAND_OF_SKY * horizon or 1.0)
     return np.where(known[:, None], sky, mean + offset), np.where(known, _SKY_SIGMA, _MEAN_SIGMA)[:, None]
 
 
@@ -206,13 +215,12 @@ class _Side:
     """One camera's part in a comparison, ``(N, 3)`` each.
 
     ``steepness`` is the logarithm of how much straightening and clearing spread tones at this value; ``by_...`` are slopes
-    in the logarithms of gain, contrast and haze, of ``log_land`` and of ``steepness``.
+    in the logarithms of contrast and haze, of ``log_land`` and of ``steepness``.
     """
 
     log_land: np.ndarray
     noise: np.ndarray
     steepness: np.ndarray
-    by_gain: np.ndarray
     by_contrast: np.ndarray
     by_haze: np.ndarray
     steeper_by_contrast: np.ndarray
@@ -221,17 +229,15 @@ class _Side:
 
 def _side(samples: Samples, harmony: Harmony) -> _Side:
     tiny = 1e-3
-    log_land, share = _land(samples, harmony)
+    log_land, _ = _land(samples, harmony)
     steepness = _steepness(samples, harmony)
     bent = replace(harmony, contrast=harmony.contrast * np.exp(tiny))
     hazier = replace(harmony, haze=harmony.haze * np.exp(tiny))
     # Noise and rounding are even in encoded values.
     noise = _PICTURE_SIGMA * 2.4 / np.maximum(srgb_from_linear(samples.value) + 0.055, 0.02)
-    # Without a sky to read it off, the airlight's gain is the land's own.
-    tied = (harmony.log_sky_gain == harmony.log_gain)[samples.camera]
-    by_gain = np.where(tied & (share > _LEAST_LAND), -1.0 / share, -1.0)
-    return _Side(log_land, noise, steepness, by_gain, *((_land(samples, other)[0] - log_land) / tiny for other in (bent, hazier)),
-                 *((_steepness(samples, other) - steepness) / tiny for other in (bent, hazier)))  # fmt: skip
+    slopes = ((_land(samples, other)[0] - log_land) / tiny for other in (bent, hazier))
+    steeper = ((_steepness(samples, other) - steepness) / tiny for other in (bent, hazier))
+    return _Side(log_land, noise, steepness, *slopes, *steeper)
 
 
 def _steepness(samples: Samples, harmony: Harmony) -> np.ndarray:
@@ -251,12 +257,13 @@ def _gauss_newton(overlaps: Overlaps, expected: np.ndarray | None, harmony: Harm
     left, right = _side(own, harmony), _side(other, harmony)
     error = left.log_land - right.log_land - harmony.log_gain[own.camera] + harmony.log_gain[other.camera]
     spread = np.exp(0.5 * (left.steepness + right.steepness))
+    noise = left.noise**2 * np.exp(2.0 * left.steepness) + right.noise**2 * np.exp(2.0 * right.steepness)
+    half = 0.5 * error
     blocks = [
-        (error / spread,
-         (left.noise**2 * np.exp(2.0 * left.steepness) + right.noise**2 * np.exp(2.0 * right.steepness)) / spread**2 + _LAND_SIGMA**2,
-         ((own.camera, left.by_gain / spread, (left.by_contrast - 0.5 * error * left.steeper_by_contrast) / spread),
-          (other.camera, -right.by_gain / spread, (-right.by_contrast - 0.5 * error * right.steeper_by_contrast) / spread)),
-         (left.by_haze - right.by_haze - 0.5 * error * (left.steeper_by_haze + right.steeper_by_haze)) / spread,
+        (error / spread, noise / spread**2 + _LAND_SIGMA**2,
+         ((own.camera, -1.0 / spread, (left.by_contrast - half * left.steeper_by_contrast) / spread),
+          (other.camera, 1.0 / spread, (-right.by_contrast - half * right.steeper_by_contrast) / spread)),
+         (left.by_haze - right.by_haze - half * (left.steeper_by_haze + right.steeper_by_haze)) / spread,
          _counts(own.camera * count + other.camera))
     ]  # fmt: skip
     if expected is not None:
@@ -265,7 +272,7 @@ def _gauss_newton(overlaps: Overlaps, expected: np.ndarray | None, harmony: Harm
         camera, spread = overlaps.alone.camera[known], np.exp(side.steepness)
         apart = side.log_land - expected[known] - harmony.log_gain[camera]
         blocks.append((apart / spread, side.noise**2 + _PREDICTED_SIGMA**2,
-                       ((camera, side.by_gain / spread, (side.by_contrast - apart * side.steeper_by_contrast) / spread),),
+                       ((camera, -1.0 / spread, (side.by_contrast - apart * side.steeper_by_contrast) / spread),),
                        (side.by_haze - apart * side.steeper_by_haze) / spread, _counts(camera)))  # fmt: skip
     matrix, gradient = _priors(harmony, prior, count)
     for block in blocks:

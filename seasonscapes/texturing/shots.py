@@ -74,7 +74,7 @@ class ReadyShot:
         From `tiles.seen_blocks`.
     sky_value, sky_radiance
         ``(3,)`` of the sky above the horizon: as the picture shows it, and by the sky model [cd/m²]; NaN where there is
-        no sky to see, or most of it is clipped.
+        no sky to see, or where a colour is clipped.
     median_value
         ``(3,)`` median picture value of the land that can be trusted.
     probes
@@ -160,15 +160,29 @@ def _horizon_sky(shot: Shot, depth_m: np.ndarray) -> tuple[np.ndarray, np.ndarra
     pixel = np.flatnonzero(sky)
     elevation_deg = np.degrees(np.arcsin(np.clip(direction[..., 2].ravel()[pixel], -1.0, 1.0)))
     found = seen.image.reshape(-1, 3)[pixel].astype(float)
-    clipped = found.max(axis=1) > BRIGHTEST
-    # The lowest band that is not clipped: what is left of a clipped one would be the darkest part of it.
+    value, radiance = unknown.copy(), unknown.copy()
+    # The lowest band that is not clipped, colour by colour (a blue sky's red lasts longest): what is left of a clipped
+    # one would be the darkest part of it.
     for low in np.arange(elevation_deg.min(), elevation_deg.max(), 0.5 * _HORIZON_DEG):
         band = np.flatnonzero((elevation_deg >= low) & (elevation_deg < low + _HORIZON_DEG))
-        if len(band) >= _FEWEST_SKY_PX and clipped[band].mean() <= _MOST_CLIPPED:
-            band = band[:: max(1, len(band) // 4000)]
+        if len(band) < _FEWEST_SKY_PX:
+            continue
+        band = band[:: max(1, len(band) // 2000)]
+        fresh = np.isnan(value) & ((found[band] > BRIGHTEST).mean(axis=0) <= _MOST_CLIPPED)
+        if fresh.any():
             expected = shot.air(np.full(len(band), np.inf), direction.reshape(-1, 3)[pixel[band]])[1]
-            return np.median(found[band], axis=0), np.maximum(np.median(expected, axis=0), 1e-9)
-    return unknown, unknown
+            value[fresh] = np.median(found[band], axis=0)[fresh]
+            radiance[fresh] = np.maximum(np.median(expected, axis=0), 1e-9)[fresh]
+    return value, radiance
+
+
+def horizon_radiance(shot: Shot) -> float:
+    """Mean radiance of the sky at the horizon by a shot's air [cd/m²], 0 without any."""
+    if shot.air is None:
+        return 0.0
+    azimuth = np.radians(np.arange(0.0, 360.0, 30.0))
+    level = np.stack([np.sin(azimuth), np.cos(azimuth), np.full(azimuth.shape, np.sin(np.radians(2.0)))], axis=-1)
+    return float(np.mean(shot.air(np.full(len(level), np.inf), level)[1]))
 
 
 def air_to(ready: ReadyShot, position_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
