@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -135,7 +136,7 @@ def _measured(base: Any, lift: Any, knots: np.ndarray) -> Curve:
     """A curve with its table of arc lengths."""
     cuts = [knots] if lift is None else [knots, lift.x]
     ends = np.unique(
-        np.concatenate([*cuts, *(np.linspace(a, b, _PIECES + 1) for a, b in zip(knots, knots[1:], strict=False))])
+        np.concatenate([*cuts, *(np.linspace(a, b, _PIECES + 1) for a, b in pairwise(knots))])
     )
     bare = Curve(base, lift, knots, np.zeros((2, 2)))
     lengths = _lengths(bare.at_parameter, ends[:-1], ends[1:])

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
+from seasonscapes.commands.inpaint_path import DiffusionOptions, Effort
 from seasonscapes.commands.options import PlaceOptions, SkyOptions, ViewOptions
 from seasonscapes.commands.talk import check_range, check_suffix, finish, progress_bar, say
 from seasonscapes.errors import InputError
@@ -40,6 +41,7 @@ def inpaint(
     view: ViewOptions | None = None,
     sky: SkyOptions | None = None,
     place: PlaceOptions | None = None,
+    diffusion: DiffusionOptions | None = None,
     json: bool = False,
 ) -> None:
     """Complete a painted texture: give every texel that no camera saw a value, from what the land itself tells.
@@ -53,7 +55,8 @@ def inpaint(
     texture
         What ``seasonscapes paint`` wrote for this scene, with the same --atlas and --texel-m.
     method
-        guided (learns from satellite colour, relief and sun), membrane (smooth) or telea (from the rims inwards).
+        guided (learns from satellite colour, relief and sun), membrane (smooth), telea (from the rims inwards) or
+        diffusion (an image model along --path, then guided; needs weights and, in earnest, a GPU).
     detail
         Strength of synthesised grain: 0 for albedo recovery, about 0.6 for pictures.
     fast
@@ -76,15 +79,24 @@ def inpaint(
     from seasonscapes.images import atomic_path
     from seasonscapes.texturing.complete import INPAINTERS, complete
 
-    if method not in INPAINTERS:
-        raise InputError("--method", "unknown method", got=method, expected=", ".join(INPAINTERS))
+    if method not in (*INPAINTERS, "diffusion"):
+        raise InputError("--method", "unknown method", got=method, expected=", ".join([*INPAINTERS, "diffusion"]))
+    diffusion, told = diffusion or DiffusionOptions(), {}
+    if method == "diffusion":
+        diffusion.check()
     land = place.load(scene)
     moment = resolve_time(time, land.frame.latitude_deg, land.frame.longitude_deg)
     say(moment.reading)
     painted = read_painted(texture, land)
     guides = guides_of(land, moment.utc)
-    with progress_bar(f"completing ({method})") as progress:
-        completed = complete(painted, guides, method=method, detail=detail, fast=fast, seed=seed, progress=progress)
+    if method == "diffusion":
+        from seasonscapes.commands.inpaint_path import complete_along_path
+
+        effort = Effort(detail, fast, seed, sky.cloudiness or float(sky.sky == "overcast"))
+        completed, told = complete_along_path(land, painted, guides, moment.utc, diffusion, effort)
+    else:
+        with progress_bar(f"completing ({method})") as progress:
+            completed = complete(painted, guides, method=method, detail=detail, fast=fast, seed=seed, progress=progress)
     with atomic_path(output) as temporary:
         save_completed(completed, painted, temporary)
     pictures = []
@@ -99,7 +111,7 @@ def inpaint(
         "texels": int(guides.surface.sum()), "filled_share": share, "guides": list(guides.names),
         "sigma_median": float(_median(completed.sigma[hole])), "value_median": float(_median(completed.values[hole])),
         "figures": [str(path) for path in pictures], "seconds": round(clock.perf_counter() - start, 2),
-    }  # fmt: skip
+    } | told  # fmt: skip
     finish(record, [f"{output}  ({100 * share:.1f} % of {record['texels']:,} texels filled by {method}, median σ "
                     f"{record['sigma_median']:.3g} on {record['value_median']:.3g}, {record['seconds']} s)",
                     *record["figures"]], as_json=json)  # fmt: skip

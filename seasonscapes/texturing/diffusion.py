@@ -125,7 +125,7 @@ def load_painter(folder: Path | None, settings: DiffusionSettings, *, names: Wei
         Missing, wrong or half-downloaded weights, weights that do not fit each other, a missing extra, no such device.
     """
     names, machine = names or WeightNames(), machine or Machine()
-    places = {part: find_weights(folder, part, getattr(names, part)) for part in _parts(settings, image)}
+    places = {part: find_weights(folder, part, getattr(names, part)) for part in needed_parts(settings, image is not None)}
     _require_extra()
     device, dtype = _device_of(machine)
     pipe = _assembled(places, settings, dtype)
@@ -142,9 +142,10 @@ def load_painter(folder: Path | None, settings: DiffusionSettings, *, names: Wei
     return Painter(pipe, settings, embeds, device)
 
 
-def _parts(settings: DiffusionSettings, image: np.ndarray | None) -> list[str]:
+def needed_parts(settings: DiffusionSettings, with_image: bool) -> list[str]:
+    """Which parts of the weights these settings need: names of fields of `WeightNames`."""
     scales = {"depth": settings.depth_scale, "inpaint": settings.inpaint_scale,
-              "adapter": settings.image_scale if image is not None else 0.0}  # fmt: skip
+              "adapter": settings.image_scale if with_image else 0.0}  # fmt: skip
     parts = ["base", *(part for part, scale in scales.items() if scale > 0.0)]
     # The pipeline wants a ControlNet; with weight 0 it has no say.
     return parts if {"depth", "inpaint"} & set(parts) else [*parts, "inpaint"]

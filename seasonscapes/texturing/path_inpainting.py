@@ -182,7 +182,7 @@ def walk_path(walk: Walk, canvas: Canvas, inpaint: Inpaint, options: WalkOptions
     tell = progress or (lambda share: None)
     white = white_radiance(canvas.values, canvas.painted)
     count = len(walk.cameras)
-    for index, camera in enumerate(walk.cameras):
+    for index in range(count):
         step = _kept(folder, index)
         if step is None:
             step, pictures = _paint_view(walk, canvas, inpaint, options, index, white,

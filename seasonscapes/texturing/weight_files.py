@@ -6,6 +6,7 @@ A part has a hub name, ``owner/name``. It is looked for as a folder of that path
 
 from __future__ import annotations
 
+import hashlib
 import json
 import struct
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from pathlib import Path
 from seasonscapes.errors import InputError
 
 _ELSE = "or take --method guided, which needs no weights"
+_ENDS = 1 << 20
 _MODEL, _TEXT = "diffusion_pytorch_model", "model"
 
 
@@ -117,6 +119,22 @@ def _check_model(place: Path, part: str, name: str, kind: str, stem: str) -> Non
         )
     for file in weight_shards(place, stem, name):
         _check_whole(file, name)
+
+
+def fingerprint(place: Path, part: str, name: str) -> str:
+    """A short name of a part's content: sizes, and both ends of its files (all of gigabytes would take minutes)."""
+    files = [place / file for file in _PLAIN[part]]
+    for inner, _, stem in _LAYOUT[part]:
+        files += [place / inner / "config.json", *weight_shards(place / inner, stem, name)]
+    digest = hashlib.sha256()
+    for path in files:
+        size = path.stat().st_size
+        digest.update(f"{path.name}:{size};".encode())
+        with open(path, "rb") as file:
+            digest.update(file.read(_ENDS))
+            file.seek(max(size - _ENDS, 0))
+            digest.update(file.read(_ENDS))
+    return digest.hexdigest()[:16]
 
 
 def variant_of(place: Path, stem: str) -> str | None:
