@@ -62,10 +62,9 @@ class Stage:
 
 def make_stage(seed: int, *, quick: bool, foreground: bool = False, poses: PoseSigmas | None = None) -> Stage:
     """The pictures of a seed's massif, hour and faults."""
-    size = (
-        dict(size_m=6000.0, spacing_m=30.0, texel_m=6.0) if quick else dict(size_m=9000.0, spacing_m=25.0, texel_m=5.0)
-    )
-    truth = make_truth(seed, **size, cameras=6 if quick else 8, size_px=(480, 320) if quick else (720, 480))
+    texel_m = 6.0 if quick else 5.0
+    truth = make_truth(seed, size_m=6000.0 if quick else 9000.0, spacing_m=30.0, texel_m=texel_m, cameras=6 if quick else 8,
+                       size_px=(480, 320) if quick else (720, 480))  # fmt: skip
     rng = np.random.default_rng(seed)
     clock = float(rng.choice([8.5, 10.0, 13.5, 15.0]))
     sky = with_overrides(read_sky_model("clear"), visibility_km=SKY_KM)
@@ -78,7 +77,7 @@ def make_stage(seed: int, *, quick: bool, foreground: bool = False, poses: PoseS
     ]  # fmt: skip
     height, width = truth.shape
     atlas = measure_atlas(truth.terrain, "planar", width, height)
-    return Stage(truth, atlas, occluder(mi_mesh(truth.terrain, truth.albedo)), lights, size["texel_m"], pictures)
+    return Stage(truth, atlas, occluder(mi_mesh(truth.terrain, truth.albedo)), lights, texel_m, pictures)
 
 
 def shots_of(stage: Stage, **changes) -> list[Shot]:
@@ -187,7 +186,7 @@ def harmony(stage: Stage, *, seed: int, texels: int = 20_000) -> dict:
 def reprojection(stage: Stage) -> dict:
     """A clean picture painted, and looked at again by its own camera."""
     decibel = []
-    for picture, light in zip(stage.pictures[:3], stage.lights, strict=False):
+    for picture in stage.pictures[:3]:
         gain = 0.25 / float(np.percentile(picture.surface, 99.0))
         image = np.clip(picture.surface * gain, 0.0, 1.0).astype(np.float32)
         shot = Shot(replace(picture.observation, image=image, camera=picture.camera))
