@@ -33,15 +33,23 @@ from seasonscapes.gaussians.rasterise import (  # noqa: E402
     Splats,
     choose_threads,
     rasterise,
+    rotations,
     splat_colours,
     splats_from,
     view_weights,
 )
 from seasonscapes.gaussians.rasterise_cuda import rasterise_cuda  # noqa: E402
 from seasonscapes.gaussians.rasterise_twin import rasterise_twin  # noqa: E402
-from seasonscapes.gaussians.render import learned_numbers, model_colours, model_weights, render_model  # noqa: E402
+from seasonscapes.gaussians.render import (  # noqa: E402
+    CUTS,
+    draw_layers,
+    learned_numbers,
+    model_colours,
+    model_weights,
+    render_model,
+)
 from seasonscapes.gaussians.season import albedo_at  # noqa: E402
-from seasonscapes.gaussians.surfels import axes_from_quaternions, surfel_albedo, terrain_surfels  # noqa: E402
+from seasonscapes.gaussians.surfels import axes_from_quaternions, surfel_albedo, terrain_surfels, vertex_normals  # noqa: E402
 from seasonscapes.gaussians.tiles import joined_shapes, select_tiles, tile_bounds, tile_discs, tile_tree  # noqa: E402
 from seasonscapes.gaussians.transport import (  # noqa: E402
     light_state,
@@ -54,6 +62,7 @@ from seasonscapes.rendering.horizon import horizon_angles  # noqa: E402
 from seasonscapes.rendering.irradiance import surface_at  # noqa: E402
 from seasonscapes.rendering.radiance import path_trace  # noqa: E402
 from seasonscapes.rendering.scene import mi_mesh, relight  # noqa: E402
+from seasonscapes.rendering.splatting import ready_splats, splat_layers  # noqa: E402
 from seasonscapes.sky.illumination import Illumination, global_horizontal_illuminance  # noqa: E402
 
 choose_threads(1)
@@ -536,32 +545,33 @@ def test_distill_says_what_is_wrong(tmp_path, capsys):
 
 def test_tiles_cover_the_land_once_and_are_fine_where_near():
     terrain = heightfield(lambda e, n: 30.0 * np.sin(e / 60.0), side_m=1600.0, count=161)
-    tree = tile_tree(terrain, finest_m=3.2, discs=16)
-    assert tree.levels == 6
-    assert tree.spacing_m(5) == pytest.approx(1600.0 / 16 / 32)
+    tree = tile_tree(terrain, finest_m=6.3, discs=16)
+    assert tree.levels == 5
+    assert tree.spacing_m(4) == pytest.approx(1600.0 / 16 / 16)
     camera = looking_down(900.0, size=64, view_m=2400.0)
     tiles = select_tiles(tree, camera)
-    seen = np.zeros((32, 32), int)
+    seen = np.zeros((16, 16), int)
     for tile in tiles:
-        span = 32 >> tile.level
+        span = 16 >> tile.level
         seen[tile.row * span : (tile.row + 1) * span, tile.column * span : (tile.column + 1) * span] += 1
     assert np.all(seen == 1), "from above all of it is in view"
     pose = np.eye(4)
     pose[:3, :3] = rotation_from_angles(0.0, -15.0)
     pose[:3, 3] = [0.0, -790.0, 80.0]
-    low = Camera(128, 96, 110.0, 110.0, 64.0, 48.0, pose)
+    low = Camera(96, 72, 80.0, 80.0, 48.0, 36.0, pose)
     tiles = select_tiles(tree, low)
     near, far = (
         [t.level for t in tiles if side(tile_bounds(tree, t)[1])] for side in (lambda n: n < -700, lambda n: n > 500)
     )
-    assert min(near) == 5
-    assert max(far) < 5
-    made = [tile_discs(terrain, tree, tile) for tile in tiles]
+    assert min(near) == 4
+    assert max(far) < 4
+    normals = vertex_normals(terrain)
+    made = [tile_discs(terrain, tree, tile, normals=normals) for tile in tiles]
     shapes = joined_shapes(made, low)
     assert len(shapes[0]) == sum(16 * 16 for _ in tiles)
     pose[:3, 3] = 0.0
     coverage = view_weights(splats_from(*shapes), replace(low, world_from_camera=pose), subpixels=2).coverage
-    assert coverage[40:90].min() > 0.75, "no crack between levels"
+    assert coverage[30:68].min() > 0.75, "no crack between levels"
     behind = replace(low, world_from_camera=looking_north(900.0, 50.0))
     assert select_tiles(tree, behind) == []
 
@@ -589,12 +599,38 @@ def above(east_m: float) -> np.ndarray:
 def test_a_free_code_is_found_for_a_new_picture(hill, told):
     """WildGaussians' protocol: after fitting, the picture is nearer than with the code of another time."""
     trained = appearance(hill, "code")
-    distil(trained, told, (), Schedule(150, 0, batch=512), seed=1)
+    distil(trained, told, (), Schedule(80, 0, batch=512), seed=1)
     weights = view_weights(splats_of_surfels(hill[1]), looking_down(size=32, view_m=900.0))
     image = splat_colours(weights, told.colours[0]) / np.maximum(weights.coverage, 1e-3)[..., None]
     lights = light_tensors(told.states)
-    code = fit_code(trained, lights, Frame(weights, 0, image, weights.coverage > 0.9), steps=40)
+    code = fit_code(trained, lights, Frame(weights, 0, image, weights.coverage > 0.9), steps=30)
     with torch.no_grad():
         errors = [float((trained(torch.arange(576), torch.tensor(0), lights, one) - torch.as_tensor(told.colours[0])).abs().mean())
                   for one in (code, trained.codes[2])]  # fmt: skip
     assert errors[0] < 0.8 * errors[1]
+
+
+def test_fast_splatting_draws_the_same_picture():
+    """On the renderer's device; what the opacity cut leaves out may differ by rounding, four thousandths at most."""
+    splats, colours = some_splats(150, seed=6)
+    axes = rotations(splats.quaternions) * splats.log_scales.exp()[:, None, :]
+    ready = ready_splats(splats.means.numpy(), axes.numpy(), torch.sigmoid(splats.opacity_logits).numpy())
+    expected, covered = rasterise_twin(splats, colours, CAMERA)
+    image, coverage = splat_layers(ready, colours.numpy(), CAMERA, CUTS._replace(one_sided=False))
+    assert image.shape == (20, 24, 3)
+    assert np.abs(image - expected.numpy()).max() < 4.5e-3
+    assert np.abs(image - expected.numpy()).mean() < 1e-4
+    np.testing.assert_allclose(coverage, covered.numpy(), atol=4.5e-3)
+
+
+def test_backs_of_discs_are_not_drawn(hill, model):
+    """From above, with and without: the same picture; from below, none."""
+    camera = looking_down(size=48, view_m=900.0)
+    layers = model.albedo[0]
+    image, _ = draw_layers(model, camera, layers, subpixels=2)
+    weights = view_weights(splats_of_surfels(hill[1]), camera, subpixels=2)
+    np.testing.assert_allclose(image, splat_colours(weights, layers), atol=0.01)
+    pose = np.eye(4)
+    pose[:3, 3] = [0.0, 0.0, -800.0]
+    with pytest.raises(ValueError, match="sees no Gaussian"):
+        draw_layers(model, replace(camera, world_from_camera=pose), layers)

@@ -66,7 +66,7 @@ def splat(
     from seasonscapes.gaussians.model import load_model
     from seasonscapes.gaussians.rasterise import choose_threads
 
-    choose_threads(2)
+    choose_threads(1)
     metering, size_px, declared = parse_exposure(exposure), view.size_px(), sky.model()
     splats = load_model(model)
     land = place.load(scene)

@@ -1,8 +1,8 @@
 """Splats to pixels: project discs, find the pixels under each, blend front to back. One interface, three homes.
 
-* ``cpu``: here, in plain torch. Pairs of (pixel, splat) are listed exactly, row by row of each ellipse, then brought
+* training: here, in plain torch. Pairs of (pixel, splat) are listed exactly, row by row of each ellipse, then brought
   from depth order into pixel order by one counting sort. Gradients by autograd.
-* ``cuda``: gsplat, in `rasterise_cuda`.
+* pictures alone: `rendering.splatting`, several times faster; on CUDA gsplat, in `rasterise_cuda`.
 * the oracle: `rasterise_twin`, slow and obvious.
 
 Where the geometry is frozen a view is a sparse matrix, pixels × splats: `view_weights` makes it once, and every colour
@@ -267,7 +267,7 @@ def view_weights(splats: Splats, camera: Camera, *, subpixels: int = 1,
     """
     from scipy import sparse
 
-    fine = camera if subpixels == 1 else _finer(camera, subpixels)
+    fine = finer_camera(camera, subpixels)
     seen = project_splats(splats, fine, pixel_variance=pixel_variance)
     pairs = blend_pairs(seen, fine.width_px, fine.height_px)
     columns = seen.index.to(torch.int32).index_select(0, pairs.splat).numpy()
@@ -281,7 +281,8 @@ def view_weights(splats: Splats, camera: Camera, *, subpixels: int = 1,
     return ViewWeights(matrix, camera.width_px, camera.height_px)
 
 
-def _finer(camera: Camera, times: int) -> Camera:
+def finer_camera(camera: Camera, times: int) -> Camera:
+    """The same view with ``times`` as many pixels along each side."""
     numbers = (camera.fx, camera.fy, camera.cx, camera.cy)
     return Camera(camera.width_px * times, camera.height_px * times, *(times * number for number in numbers),
                   camera.world_from_camera)  # fmt: skip

@@ -10,12 +10,28 @@ import torch
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.gaussians.appearance import Appearance, colours_at, fourier_embedding
 from seasonscapes.gaussians.model import GaussianModel
-from seasonscapes.gaussians.rasterise import Splats, ViewWeights, splat_colours, splats_from, view_weights
+from seasonscapes.gaussians.rasterise import (
+    ALPHA_CUT,
+    ALPHA_MOST,
+    NEAR_M,
+    PIXEL_VARIANCE,
+    Splats,
+    ViewWeights,
+    finer_camera,
+    rotations,
+    splat_colours,
+    splats_from,
+    view_weights,
+)
 from seasonscapes.gaussians.transport import LightState, light_state, neighbourhood_mean
+from seasonscapes.rendering.backend import use_backend
+from seasonscapes.rendering.splatting import Cuts, ReadySplats, ready_splats, splat_layers
 from seasonscapes.sky.illumination import Illumination
 
 # Coverage from which a pixel counts as all terrain.
 SOLID = 0.85
+NOTHING_IN_VIEW = "the camera sees no Gaussian; does it look away, or stand inside the mountain?"
+CUTS = Cuts(ALPHA_CUT, ALPHA_MOST, PIXEL_VARIANCE, NEAR_M, one_sided=True)
 
 
 @dataclass(frozen=True)
@@ -95,7 +111,7 @@ def model_weights(model: GaussianModel, camera: Camera, *, subpixels: int = 2) -
     """Weights of a camera, for any light; `ValueError` where no Gaussian is in view."""
     weights = view_weights(splats_of(model, seen_from=camera.position_m), camera, subpixels=subpixels)
     if weights.matrix.nnz == 0:
-        raise ValueError("the camera sees no Gaussian; does it look away, or stand inside the mountain?")
+        raise ValueError(NOTHING_IN_VIEW)
     return weights
 
 
@@ -118,11 +134,10 @@ def render_model(model: GaussianModel, camera: Camera, illumination: Illuminatio
     values, state = colours or model_colours(model, illumination, day)
     distance = np.linalg.norm(model.means - camera.position_m.astype(np.float32), axis=1)
     layers = np.concatenate([values * np.float32(state.global_lx / np.pi), distance[:, None]], axis=1)
-    if device == "cuda":
-        drawn, covered = _on_cuda(model, camera, layers)
-    else:
-        weights = weights or model_weights(model, camera, subpixels=subpixels)
+    if weights is not None:
         drawn, covered = splat_colours(weights, layers), weights.coverage
+    else:
+        drawn, covered = draw_layers(model, camera, layers, subpixels=subpixels, device=device)
     # Discs meet with gaps of a few hundredths between them; the sky must not shine through a mountain.
     solid = np.clip(covered / SOLID, 0.0, 1.0)
     mean = drawn / np.maximum(covered, 1e-6)[..., None]
@@ -132,11 +147,40 @@ def render_model(model: GaussianModel, camera: Camera, illumination: Illuminatio
     return SplatView(radiance, surface.astype(np.float32), solid.astype(np.float32), depth.astype(np.float32))
 
 
-def _on_cuda(model: GaussianModel, camera: Camera, layers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    from seasonscapes.gaussians.rasterise_cuda import rasterise_cuda
+def draw_layers(model: GaussianModel, camera: Camera, layers: np.ndarray, *, subpixels: int = 1,
+                device: str = "cpu") -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Blend layers ``(N, C)`` of the Gaussians: picture ``(H, W, C)`` and coverage ``(H, W)``, the quickest way there is.
 
-    drawn, covered = rasterise_cuda(splats_of(model, seen_from=camera.position_m), torch.from_numpy(layers), camera)
-    return drawn.detach().cpu().numpy(), covered.detach().cpu().numpy()
+    ``cpu`` goes through the renderer's vector units (`rendering.splatting`), or through torch where it has none.
+
+    Raises
+    ------
+    ValueError
+        Where no Gaussian is in view.
+    """
+    if device == "cuda":
+        from seasonscapes.gaussians.rasterise_cuda import rasterise_cuda
+
+        drawn, covered = rasterise_cuda(splats_of(model, seen_from=camera.position_m), torch.from_numpy(layers), camera)
+        drawn, covered = drawn.detach().cpu().numpy(), covered.detach().cpu().numpy()
+    elif use_backend().device == "scalar":
+        weights = model_weights(model, camera, subpixels=subpixels)
+        drawn, covered = splat_colours(weights, layers), weights.coverage
+    else:
+        fine = finer_camera(camera, subpixels)
+        drawn, covered = splat_layers(ready_model(model), layers, fine, CUTS)
+        shape = (camera.height_px, subpixels, camera.width_px, subpixels)
+        drawn, covered = drawn.reshape(*shape, -1).mean((1, 3)), covered.reshape(shape).mean((1, 3))
+    if not covered.any():
+        raise ValueError(NOTHING_IN_VIEW)
+    return drawn, covered
+
+
+def ready_model(model: GaussianModel) -> ReadySplats:
+    """The model's geometry on the renderer's device, for `rendering.splatting.splat_layers`."""
+    splats = splats_of(model)
+    axes = rotations(splats.quaternions) * splats.log_scales.exp()[:, None, :]
+    return ready_splats(model.means, axes.numpy(), torch.sigmoid(splats.opacity_logits).numpy())
 
 
 def through_air(camera: Camera, illumination: Illumination, surface: np.ndarray, coverage: np.ndarray,

@@ -77,7 +77,8 @@ class Surfels:
 
 
 def terrain_surfels(terrain: Terrain, spacing_m: float, *,
-                    bounds_m: tuple[float, float, float, float] | None = None) -> Surfels:  # fmt: skip
+                    bounds_m: tuple[float, float, float, float] | None = None,
+                    normals: np.ndarray | None = None) -> Surfels:  # fmt: skip
     """One disc for each cell of a square plan that the terrain covers entirely.
 
     Parameters
@@ -86,6 +87,8 @@ def terrain_surfels(terrain: Terrain, spacing_m: float, *,
         Side of a cell [m]; about one pixel on the ground is where the picture stops gaining.
     bounds_m
         West, south, east and north end of the plan; the terrain's own when left out.
+    normals
+        ``(V, 3)`` from `vertex_normals`, where many plans of one terrain are made.
 
     Raises
     ------
@@ -100,7 +103,8 @@ def terrain_surfels(terrain: Terrain, spacing_m: float, *,
     if min(columns, rows) < 1:
         raise ValueError(f"spacing_m: got {spacing_m}, but the plan is {min(east - west, north - south):.0f} m wide")
     plan = Plan(float(west), float(north), float(east - west) / columns, float(north - south) / rows, columns, rows)
-    positions, normals, uv = _cells(_within(terrain, (west, south, east, north)), plan)
+    normals = vertex_normals(terrain) if normals is None else normals
+    positions, normals, uv = _cells(_within(terrain, (west, south, east, north)), plan, normals)
     whole = np.isfinite(positions).all(axis=(1, 2))
     if not whole.any():
         raise ValueError("terrain_surfels: the terrain covers no cell")
@@ -130,7 +134,7 @@ def disc_shapes(normals: np.ndarray, spacing_m: float) -> tuple[np.ndarray, np.n
             np.full(len(stretch), logit, np.float32))  # fmt: skip
 
 
-def _cells(terrain: Terrain, plan: Plan) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _cells(terrain: Terrain, plan: Plan, at_vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Positions, normals and atlas coordinates ``(cells, S, ...)`` of places in a plan's cells; NaN off the terrain."""
     width, height = plan.columns, plan.rows
     low = np.array([plan.west_m, plan.north_m - height * plan.north_step_m])
@@ -143,7 +147,7 @@ def _cells(terrain: Terrain, plan: Plan) -> tuple[np.ndarray, np.ndarray, np.nda
     corners = terrain.faces[face_id.ravel()[covered]]
     centre = np.stack([covered % columns, covered // columns], axis=-1) + 0.5
     share = barycentric(texel_coordinates(flat, columns, rows)[corners], centre)
-    normal = np.einsum("nk,nkc->nc", share, vertex_normals(terrain)[corners])
+    normal = np.einsum("nk,nkc->nc", share, at_vertices[corners])
     normals[covered] = normal / np.linalg.norm(normal, axis=1, keepdims=True)
     uv[covered] = np.einsum("nk,nkc->nc", share, terrain.uv[corners])
 

@@ -113,10 +113,10 @@ def _out_of_view(camera: Camera, low: np.ndarray, high: np.ndarray) -> bool:
     return any(bool(side.all()) for side in outside)
 
 
-def tile_discs(terrain: Terrain, tree: TileTree, tile: Tile) -> TileDiscs:
-    """Make the discs of a tile; `ValueError` where the terrain covers none of its cells."""
+def tile_discs(terrain: Terrain, tree: TileTree, tile: Tile, *, normals: np.ndarray | None = None) -> TileDiscs:
+    """Make the discs of a tile; `ValueError` where the terrain covers none of its cells. See `terrain_surfels`."""
     bounds = tile_bounds(tree, tile)
-    surfels = terrain_surfels(terrain, tree.spacing_m(tile.level), bounds_m=bounds)
+    surfels = terrain_surfels(terrain, tree.spacing_m(tile.level), bounds_m=bounds, normals=normals)
     origin = np.array([0.5 * (bounds[0] + bounds[2]), 0.5 * (bounds[1] + bounds[3]), tree.low_m])
     means = surfels.places.mean(axis=1, dtype=np.float64) - origin
     return TileDiscs(tile, origin, replace(surfels, means=means.astype(np.float32)))

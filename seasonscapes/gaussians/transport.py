@@ -27,6 +27,8 @@ SKY_RANK, BOUNCE_TERMS = 8, 5
 AROUND_M = 300.0
 # A fresh table's edge is this soft [rad]: the sun's radius and half a step of the table.
 SOFTNESS_RAD = 0.012
+# Parts of the terrain that pass light on: what discs receive from them is smooth.
+SENDERS = 4096
 Progress = Callable[[float], None]
 
 
@@ -128,7 +130,7 @@ def centre_coefficients(occluder, surfels: Surfels, *, rays: int, rank: int, see
     points, found = surface_at(occluder, surfels.places[:, surfels.places.shape[1] // 2 - 3])
     if len(found) != len(surfels.means):
         raise ValueError(f"{len(surfels.means) - len(found)} discs have no surface under them; is it the same terrain?")
-    return trace_points(occluder, points, Effort(rays=rays, rank=rank), seed=seed)
+    return trace_points(occluder, points, Effort(rays=rays, rank=rank, senders=SENDERS), seed=seed)
 
 
 def _bounce_coefficients(bounced: Callable[[Illumination], np.ndarray]) -> np.ndarray:

@@ -10,7 +10,7 @@ from seasonscapes.cameras.pinhole import Camera, rotation_from_angles
 from seasonscapes.gaussians.distil import Frame
 from seasonscapes.gaussians.rasterise import splats_from, view_weights
 from seasonscapes.gaussians.surfels import Surfels
-from seasonscapes.gaussians.transport import LightState
+from seasonscapes.gaussians.transport import SENDERS, LightState
 from seasonscapes.sky.illumination import Illumination
 from seasonscapes.terrain.surface import Terrain
 
@@ -48,7 +48,7 @@ def relit_frames(occluder, surfels: Surfels, cameras: Sequence[Camera], lights: 
 
     frames = []
     for number, camera in enumerate(cameras):
-        ready = ready_view(occluder, trace_view(occluder, camera, Effort(rays=256), seed=seed))
+        ready = ready_view(occluder, trace_view(occluder, camera, Effort(rays=256, senders=SENDERS), seed=seed))
         weights = view_weights(facing(surfels, camera), camera, subpixels=2)
         for time, light, state in lights:
             image = relight_view(ready, light).surface * np.float32(np.pi / state.global_lx)
