@@ -54,13 +54,15 @@ def _disagreement(ready: ReadyShot, number: int, harmony: Harmony, predicted: np
                   uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Logarithm of seen over predicted ``(H, W, 3)``, and where both are known."""
     camera = ready.shot.observation.camera
-    usable = ready.levels[0][..., 3] > 0.0
+    # Beside silhouettes a pixel shows two surfaces; the guard looks after those.
+    usable = (ready.levels[0][..., 3] > 0.0) & (ready.trust > 0.0)
     expected = sample_texture(predicted, uv)
     with np.errstate(invalid="ignore"):
         known = usable & (expected > 0.0).all(axis=2)
     apart = np.zeros((*usable.shape, 3), np.float32)
     place = camera.position_m + ray_directions(camera)[known] * ready.depth_m[known][:, None]
-    value = cv2.blur(ready.levels[0][..., :3], (3, 3))[known]
+    share = cv2.blur(usable.astype(np.float32), (3, 3))
+    value = cv2.blur(ready.levels[0][..., :3] * usable[..., None], (3, 3))[known] / share[known][:, None]
     seen, _ = land_radiance(value, number, air_to(ready, place), harmony)
     apart[known] = np.log(np.maximum(seen, 1e-6)) - np.log(expected[known])
     return apart, known
