@@ -393,7 +393,7 @@ def main() -> None:
     for key, value in record.items():
         print(f"{key:36s} {value:12.5g}")
     if arguments.json:
-        arguments.json.write_text(json.dumps(record, indent=1))
+        arguments.json.write_text(json.dumps(record, indent=1, default=float))
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ FLOORS = [
 WALLS = {
     "mitsuba": {"rendering", "albedo"},
     "drjit": {"rendering", "albedo"},
-    "torch": {"gaussians", "texturing.diffusion"},
+    "torch": {"gaussians", "texturing.diffusion", "evaluation.lpips"},
     "dask": {"cluster"},
     "distributed": {"cluster"},
     "dask_jobqueue": {"cluster"},
