@@ -201,10 +201,7 @@ def measure(quick: bool, seed: int, data: Path, figures: Path | None) -> dict[st
             hidden.append(judge(bed, figures))
             if number == 0 and bed.name.endswith("autumn"):
                 numbers |= held_out_view(bed, figures) | controls(bed)
-                if not quick:
-                    numbers |= cost(bed)
-                else:
-                    numbers |= cost(bed, 1000)
+                numbers |= cost(bed)
     numbers |= averaged(hidden, "massif")
     if data.is_dir():
         real = [judge(bed, figures) for bed in places.jungfrau(data, seed, {k: seasons[k] for k in chosen[-2:]})]
