@@ -1,0 +1,374 @@
+"""Albedo: linear parts against slow twins, recovery of a known truth, controls that must fail, and odd sets of pictures."""
+
+from dataclasses import replace
+from datetime import date
+
+import numpy as np
+import pytest
+from albedo_cases import Case, case, psnr
+
+from seasonscapes.albedo import closed_form, corrections, haze, response, seasons
+from seasonscapes.albedo.closed_form import EIGHT_BIT, Effort, Shot, make_shots, solve_albedo
+from seasonscapes.albedo.forward import ambient_on_texels, surface_radiance
+from seasonscapes.albedo.inverse import Extra, InverseOptions, refine_albedo
+from seasonscapes.albedo.mitsuba_pictures import SKY, differentiable_views, mi_picture
+from seasonscapes.albedo.painted import painted_radiance
+from seasonscapes.albedo.uncertainty import KnownAlbedo, known_albedo
+from seasonscapes.evaluation.webcam_faults import WebcamFaults, degrade
+from seasonscapes.frames import direction_from_angles
+from seasonscapes.images import linear_from_srgb
+from seasonscapes.rendering.hosek import hosek_illumination
+from seasonscapes.rendering.reception import luminaries
+
+QUICK = Effort(rounds=4, iterations=10)
+
+
+@pytest.fixture(scope="module")
+def place() -> Case:
+    return case()
+
+
+@pytest.fixture(scope="module")
+def shots(place) -> list[Shot]:
+    observations, lights = place.observations()
+    return make_shots(place.land, observations, lights, gains=[np.ones(3)] * len(observations))
+
+
+@pytest.fixture(scope="module")
+def clean(place, shots):
+    return solve_albedo(place.land, shots)
+
+
+def webcam_shots(place, shots, faults, seed=3) -> list[Shot]:
+    rng = np.random.default_rng(seed)
+    found = []
+    for shot in shots:
+        levels, _ = degrade(shot.observation.image, faults, rng)
+        found.append(
+            replace(shot, observation=replace(shot.observation, image=linear_from_srgb(levels / 255.0)), gain=None)
+        )
+    return found
+
+
+# ---------------------------------------------------------------------------------------------- linear parts
+
+
+def test_footprints_equal_path_tracing(place, shots):
+    """The true albedo through footprints and daylight of texels is what a path tracer sees."""
+    ratios = []
+    for shot in shots:
+        ambient = ambient_on_texels(place.land, shot.light, place.albedo)
+        seen = surface_radiance(shot.footprints, shot.number, (shot.light, ambient), place.albedo.reshape(-1, 3))
+        whole = shot.footprints.coverage > 0.999
+        ratios.append((seen / shot.observation.image.reshape(-1, 3)[shot.footprints.pixel])[whole])
+    ratios = np.concatenate(ratios)
+    assert np.median(ratios) == pytest.approx(1.0, abs=0.01)
+    assert np.median(np.abs(ratios - 1.0)) < 0.03
+
+
+def test_rows_are_means_of_the_texture(shots):
+    footprints = shots[0].footprints
+    ones = footprints.matrix(footprints.share) @ np.ones(footprints.shape[0] * footprints.shape[1], np.float32)
+    np.testing.assert_allclose(ones, footprints.coverage, rtol=1e-4)
+    for values in footprints.sunlit[0]:
+        assert (values <= footprints.share * 1.0001 + 1e-7).all(), "no cosine exceeds one"
+
+
+def test_adjoint_is_the_transpose(place, shots):
+    rng = np.random.default_rng(0)
+    row = closed_form._rows(shots[4], EIGHT_BIT, place.albedo.size // 3)
+    row.ambient = ambient_on_texels(place.land, shots[4].light, place.albedo)
+    a = rng.random((place.albedo.size // 3, 3), np.float32)
+    model, _ = closed_form._model(row, a)
+    r = rng.random(model.shape, np.float32)
+    left, right = (model.astype(float) * r).sum(), (a.astype(float) * closed_form._adjoint(row, r)).sum()
+    assert left == pytest.approx(right, rel=1e-5)
+
+
+# ---------------------------------------------------------------------------------------------- recovery
+
+
+def test_clean_pictures_give_the_albedo(place, clean):
+    seen = clean.seen >= 1.0
+    assert psnr(clean.albedo, place.albedo, seen) > 30.0
+    assert np.abs(clean.albedo - place.albedo)[seen].sum() / place.albedo[seen].sum() < 0.04
+    assert np.median(clean.albedo[seen] / place.albedo[seen]) == pytest.approx(1.0, abs=0.01)
+
+
+def test_never_sunlit_texels_are_as_good(place, shots, clean):
+    lit = np.zeros(place.albedo.shape[:2], bool).ravel()
+    for shot in shots:
+        for values in shot.footprints.sunlit[shot.number]:
+            lit |= np.bincount(shot.footprints.texel, values, len(lit)) > 0.0
+    shaded = (clean.seen >= 2.0) & ~lit.reshape(clean.seen.shape)
+    assert shaded.sum() > 20
+    assert np.abs(clean.albedo - place.albedo)[shaded].sum() / place.albedo[shaded].sum() < 0.08
+
+
+def test_webcam_pictures(place, shots):
+    fit = solve_albedo(
+        place.land, webcam_shots(place, shots, WebcamFaults(tone_strength=0.0)), trust=EIGHT_BIT, effort=QUICK
+    )
+    assert psnr(fit.albedo, place.albedo, fit.seen >= 1.0) > 24.0
+
+
+def test_corrections_are_far_behind(place, shots, clean):
+    painted = painted_radiance(shots, clean.gains)
+    normal = np.tile([0.0, 0.0, 1.0], (place.albedo.size // 3, 1))
+    normal[place.land.texel] = place.land.normal
+    seen, best = clean.seen >= 1.0, 0.0
+    for light, radiance in zip(place.lights, painted.values(), strict=True):
+        slopes = corrections.slopes_under(normal, light.sun.direction)
+        ground = luminaries(light)[0].normal_illuminance_lx * light.sun.direction[2]
+        for correct in corrections.CORRECTIONS.values():
+            guess = np.clip(np.nan_to_num(correct(radiance, slopes) * np.pi / ground, nan=0.2), 0.0, 1.0)
+            best = max(best, psnr(guess.reshape(place.albedo.shape), place.albedo, seen))
+    assert psnr(clean.albedo, place.albedo, seen) > best + 6.0
+
+
+@pytest.mark.parametrize("wrong", ["hour", "mirrored"])
+def test_wrong_light_is_clearly_worse(place, clean, wrong):
+    observations, lights = place.observations()
+    turned = {}
+    for light in place.lights:
+        azimuth = np.degrees(np.arctan2(light.sun.direction[0], light.sun.direction[1]))
+        elevation = np.degrees(np.arcsin(light.sun.direction[2]))
+        azimuth = azimuth + 16.0 if wrong == "hour" else -azimuth
+        turned[id(light)] = hosek_illumination(direction_from_angles(azimuth, elevation), shape=(64, 128))
+    lights = [turned[id(light)] for light in lights]
+    shots = make_shots(place.land, observations, lights, gains=[np.ones(3)] * len(lights))
+    fit = solve_albedo(place.land, shots, effort=QUICK)
+    seen = clean.seen >= 1.0
+    assert psnr(fit.albedo, place.albedo, seen) < psnr(clean.albedo, place.albedo, seen) - 8.0
+    assert np.median(fit.residual) > 2.0 * np.median(clean.residual), "and the residual tells"
+
+
+def test_response_curve_is_found(place, shots):
+    bent = webcam_shots(place, shots, WebcamFaults(tone_strength=0.4, exposure_sigma_ev=0.2))
+    found = response.fit_response(place.land, bent, share=0.5)
+    assert found.strength == pytest.approx(0.4, abs=0.15)
+    levels = np.linspace(0.0, 1.0, 50)
+    curve = 0.6 * levels + 0.4 * levels**2 * (3.0 - 2.0 * levels)
+    undone = response.without_curve(linear_from_srgb(curve), 0.4)
+    np.testing.assert_allclose(undone, linear_from_srgb(levels), atol=2e-4)
+
+
+# ---------------------------------------------------------------------------------------------- haze
+
+
+class Fog:
+    """Homogeneous air of a visibility, whose airlight is one colour."""
+
+    def __init__(self, visibility_km: float):
+        self.extinction = 3.912 / (1000.0 * visibility_km)
+
+    def __call__(self, depth_m, direction):
+        transmittance = np.exp(-self.extinction * np.where(np.isfinite(depth_m), depth_m, 1e9))[..., None] * np.ones(3)
+        return transmittance, (1.0 - transmittance) * np.array([5000.0, 6500.0, 8000.0])
+
+
+def test_visibility_is_found(place, shots):
+    true_km = 6.0
+    hazy = []
+    for shot in shots:
+        pixel = shot.footprints.pixel
+        image = shot.observation.image.copy()
+        transmittance, airlight = Fog(true_km)(shot.footprints.distance_m, None)
+        image.reshape(-1, 3)[pixel] = image.reshape(-1, 3)[pixel] * transmittance + airlight
+        hazy.append(replace(shot, observation=replace(shot.observation, image=image.astype(np.float32))))
+
+    def lights_of(visibility_km):
+        return [replace(shot.light, aerial_perspective=Fog(visibility_km)) for shot in shots]
+
+    found = haze.fit_visibility(place.land, hazy, lights_of, visibilities_km=(2.5, 4.0, 8.0, 16.0), share=0.5)
+    assert found.visibility_km == pytest.approx(true_km, rel=0.15)
+    mixed = haze.mixed_light(lights_of(4.0)[0], lights_of(8.0)[0], 0.5).aerial_perspective
+    between = 1.0 / (0.5 / 4.0 + 0.5 / 8.0)
+    depth, axis = np.array([3000.0]), np.array([[0.0, 1.0, 0.0]])
+    np.testing.assert_allclose(mixed(depth, axis)[0], Fog(between)(depth, axis)[0], rtol=1e-6)
+
+
+# ---------------------------------------------------------------------------------------------- odd sets of pictures
+
+
+def test_a_single_picture_still_answers(place, shots):
+    fit = solve_albedo(place.land, shots[6:7], effort=QUICK)
+    seen = fit.seen >= 1.0
+    assert seen.sum() > 100
+    assert psnr(fit.albedo, place.albedo, seen) > 22.0
+
+
+def test_all_clipped_is_an_error(place, shots):
+    white = [replace(s, observation=replace(s.observation, image=np.ones_like(s.observation.image))) for s in shots]
+    with pytest.raises(ValueError, match="all clipped"):
+        solve_albedo(place.land, white, trust=EIGHT_BIT)
+
+
+def test_night_is_an_error(place, shots):
+    dark = [replace(s, light=replace(s.light, sun=None, sky_radiance=0.0 * s.light.sky_radiance),
+                    footprints=replace(s.footprints, sunlit=[[] for _ in s.footprints.sunlit])) for s in shots]  # fmt: skip
+    with pytest.raises(ValueError, match="no photograph has any light"):
+        solve_albedo(place.land, dark)
+
+
+def test_nothing_fixes_the_exposure(place, shots):
+    blind = [replace(s, gain=None, observation=replace(s.observation, mask=mask_of_terrain(s))) for s in shots]
+    with pytest.raises(ValueError, match="nothing fixes the exposure"):
+        solve_albedo(place.land, blind)
+
+
+def mask_of_terrain(shot) -> np.ndarray:
+    mask = np.zeros(shot.observation.mask.size, bool)
+    mask[shot.footprints.pixel] = True
+    return mask.reshape(shot.observation.mask.shape)
+
+
+def test_contradicting_times_are_outvoted(place, shots, clean):
+    """A picture with another hour's name: the others outvote it, and its residual gives it away."""
+    swapped = list(shots)
+    swapped[0] = replace(shots[0], observation=replace(shots[0].observation, image=shots[9].observation.image))
+    fit = solve_albedo(place.land, swapped)
+    seen = clean.seen >= 1.0
+    assert psnr(fit.albedo, place.albedo, seen) > psnr(clean.albedo, place.albedo, seen) - 6.0
+    assert np.argmax(fit.residual) == 0
+
+
+# ---------------------------------------------------------------------------------------------- differentiable
+
+
+@pytest.mark.parametrize("name", ["albedo", "sun", "sky", "haze", "log_gain"])
+def test_gradients_equal_finite_differences(place, shots, name):
+    """Within 2 %, from independent random numbers."""
+    import drjit as dr
+    import mitsuba as mi
+
+    foggy = [replace(s, light=replace(s.light, aerial_perspective=Fog(8.0))) for s in shots[3:5]]
+    views = differentiable_views(place.terrain, place.albedo, foggy)
+
+    def value(x, seed):
+        tensor = mi.TensorXf(x, shape=(1, 1, 1))
+        unknowns = {
+            "albedo": lambda: mi.TensorXf(place.albedo) * tensor,
+            "log_gain": lambda: mi.TensorXf(np.zeros((2, 3), np.float32)) + mi.TensorXf(x, shape=(1, 1)),
+        }.get(name, lambda: x)()
+        return dr.mean(mi_picture(views, 0, {name: unknowns}, spp=96, seed=seed), axis=None) / 1000.0
+
+    at, step = (0.0 if name == "log_gain" else 1.0), 0.02
+    slope = [float(value(mi.Float(at + sign * step), 5).array[0]) for sign in (1.0, -1.0)]
+    x = mi.Float(at)
+    dr.enable_grad(x)
+    dr.backward(value(x, 6))
+    assert float(dr.grad(x)[0]) == pytest.approx((slope[0] - slope[1]) / (2.0 * step), rel=0.02)
+
+
+def test_refinement_saves_resumes_and_takes_extras(place, shots, clean, tmp_path):
+    poor = solve_albedo(place.land, shots, effort=Effort(rounds=1))
+    seen = clean.seen >= 1.0
+    told, file = [], tmp_path / "state.npz"
+    options = InverseOptions(unknowns=("albedo",), levels=(1,), iterations=24, check_every=8, spp=8)
+    done = refine_albedo(place.terrain, place.land, shots, poor, options=options, callbacks=[told.append], resume=file)
+    assert psnr(done.fit.albedo, place.albedo, seen) > psnr(poor.albedo, place.albedo, seen)
+    assert len(told) == len(done.history)
+    assert any("held_out" in record for record in done.history)
+    again = refine_albedo(place.terrain, place.land, shots, poor, options=options, resume=file)
+    assert len(again.history) == len(done.history), "a finished state has nothing left to do"
+    brighter = {SKY: Extra(np.array([1.3]), low=0.1, high=3.0, step=0.02)}
+    options = InverseOptions(unknowns=(), levels=(1,), iterations=20, check_every=5, spp=4)
+    found = refine_albedo(place.terrain, place.land, shots, clean, options=options, extra=brighter)
+    assert abs(found.values[SKY][0] - 1.0) < 0.2, "the sky's own scale is found again"
+
+
+def test_refinement_refuses(place, shots, clean):
+    with pytest.raises(ValueError, match="two photographs"):
+        refine_albedo(place.terrain, place.land, shots[:1], clean)
+    with pytest.raises(ValueError, match="colour"):
+        refine_albedo(place.terrain, place.land, shots, clean, options=InverseOptions(unknowns=("colour",)))
+
+
+# ---------------------------------------------------------------------------------------------- uncertainty, seasons
+
+
+def test_uncertainty_ranks_errors_and_gaps_are_marked(place, shots, clean):
+    known = known_albedo(place.land, shots, clean)
+    measured = known.source == 1
+    error = np.abs(known.albedo - place.albedo)[..., 1]
+    low, high = np.quantile(known.sigma[measured], [0.33, 0.67])
+    sure, unsure = measured & (known.sigma <= low), measured & (known.sigma >= high)
+    assert error[unsure].mean() > 2.0 * error[sure].mean()
+    gap = known.source == 2
+    assert gap.any()
+    assert np.isfinite(known.sigma[gap]).all()
+    median = np.abs(np.median(place.albedo[measured], axis=0) - place.albedo)[..., 1]
+    assert error[gap].mean() < median[gap].mean(), "completion beats one colour for all"
+    assert known.sunlit.max() >= 2
+    bare = known_albedo(place.land, shots, clean, complete=False)
+    assert (bare.source != 2).all()
+    assert np.isinf(bare.sigma[bare.source == 0]).all()
+
+
+def _hill_dates(line_a: float, line_b: float):
+    """A cone with snow above a line that is 200 m higher in the south, on two dates; its land, and albedo of any line."""
+    from types import SimpleNamespace
+
+    side = 60
+    row, column = np.divmod(np.arange(side * side), side)
+    east, north = (column - 30) * 50.0, (30 - row) * 50.0
+    away = np.maximum(np.hypot(east, north), 1.0)
+    normal = np.stack([0.5 * east / away, 0.5 * north / away, np.full(len(away), 0.866)], axis=1)
+    height = 3000.0 - 0.577 * away
+    land = SimpleNamespace(shape=(side, side), texel=np.arange(side * side), normal=normal,
+                           position_m=np.stack([east, north, height], axis=1))  # fmt: skip
+
+    def albedo(line_m):
+        share = 1.0 / (1.0 + np.exp(-np.clip((height - line_m + 400.0 * normal[:, 1]) / 25.0, -40, 40)))
+        bare = np.array([0.15, 0.12, 0.06])
+        return (bare + share[:, None] * (0.8 - bare)).reshape(side, side, 3).astype(np.float32)
+
+    def dated(day, line_m):
+        full = np.ones((side, side))
+        known = KnownAlbedo(
+            albedo(line_m), np.full((side, side), 0.01, np.float32), full.astype(np.uint8), full.astype(np.uint8)
+        )
+        return seasons.DatedAlbedo(day, known)
+
+    return land, albedo, dated(date(2024, 9, 10), line_a), dated(date(2024, 11, 9), line_b)
+
+
+def test_the_snow_line_moves():
+    land, albedo, first, second = _hill_dates(2900.0, 2300.0)
+    day = date(2024, 10, 10)
+    moved = seasons.albedo_of_day(land, [second, first], day)
+    faded = 0.5 * (first.known.albedo + second.known.albedo)
+    truth, all_of_it = albedo(2600.0), np.ones(land.shape, bool)
+    assert psnr(moved, truth, all_of_it) > psnr(faded, truth, all_of_it) + 8.0
+    for one in (first, second):
+        np.testing.assert_allclose(seasons.albedo_of_day(land, [first, second], one.day), one.known.albedo, atol=1e-5)
+    pair = seasons.prepare_pair(land, first, second)
+    late = seasons.albedo_between(land, pair, day, line_share=0.9)
+    assert seasons.snow_share(late).mean() > seasons.snow_share(moved).mean()
+    with pytest.raises(ValueError, match="not between"):
+        seasons.albedo_between(land, pair, date(2024, 3, 1))
+
+
+def test_dates_are_grouped_by_their_snow():
+    _, _, first, second = _hill_dates(2900.0, 2300.0)
+    _, _, same, _ = _hill_dates(2890.0, 2300.0)
+    same = replace(same, day=date(2024, 9, 20))
+    assert seasons.group_dates([first, second, same]) == [[0, 2], [1]]
+    shared = seasons.share_static([first, second])
+    static = np.abs(first.known.albedo - second.known.albedo).max(axis=2) < 0.01
+    assert (shared[0].known.sigma[static] < first.known.sigma[static]).mean() > 0.95, "evidence is joined"
+    changed = np.abs(first.known.albedo - second.known.albedo)[..., 1] > 0.2
+    np.testing.assert_array_equal(shared[0].known.albedo[changed], first.known.albedo[changed])
+
+
+def test_cosine_correction_is_exact_without_sky():
+    rng = np.random.default_rng(1)
+    normal = rng.normal(size=(500, 3)) * [0.3, 0.3, 0.0] + [0.0, 0.0, 1.0]
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    sun = np.array([0.0, 0.6, 0.8])
+    slopes = corrections.slopes_under(normal, sun)
+    lit = slopes.incidence > 0.2
+    radiance = 0.3 * np.maximum(slopes.incidence, 0.0)[:, None] * np.ones(3)
+    np.testing.assert_allclose(corrections.cosine(radiance, slopes)[lit], 0.3 * 0.8, rtol=1e-6)
+    np.testing.assert_allclose(corrections.c_correction(radiance, slopes)[lit], 0.3 * 0.8, rtol=0.05)
