@@ -13,6 +13,7 @@ from cyclopts import Parameter
 
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
 from seasonscapes.commands.talk import check_range, check_suffix, finish, progress_bar, say
+from seasonscapes.commands.timelapse import parse_dated
 from seasonscapes.errors import InputError
 
 YEAR = 2024
@@ -31,6 +32,7 @@ def distill(
     picture_steps: int = 240,
     kind: str = "full",
     export_views: Path | None = None,
+    albedo: list[str] | None = None,
     seed: int = 0,
     sky: SkyOptions | None = None,
     place: PlaceOptions | None = None,
@@ -60,6 +62,8 @@ def distill(
         full (physics and a network), physical (no network), or sun (a network alone, for comparison).
     export_views
         Also write these pictures for other trainers (nerfstudio, COLMAP) into this folder.
+    albedo
+        DATE=FILE.npz, may be repeated: recovered albedos instead of the scene's own colours.
     seed
         Equal seeds give equal models.
     json
@@ -86,7 +90,8 @@ def distill(
     choose_threads(1)
     model = sky.model()
     land = place.load(scene)
-    school = prepare_school(land, model, (discs, suns, dates, views, view_px), seed)
+    dated = dated_textures(land, [parse_dated(text) for text in albedo or ()], dates)
+    school = prepare_school(land, model, (discs, suns, views, view_px), dated, seed)
     surfels = school.surfels
     appearance = Appearance(kind, school.albedo, school.around, school.transport, fourier_embedding(surfels.means, seed=seed),
                             times=suns, seed=seed)  # fmt: skip
@@ -133,23 +138,33 @@ class School:
     cameras: list
 
 
-def prepare_school(land, model, counts: tuple[int, int, int, int, int], seed: int) -> School:
+def dated_textures(land, given: list[tuple[str, str]], dates: int) -> list[tuple[float, np.ndarray]]:
+    """Days of the year and the albedo textures ``(R, S, 3)`` of them: those given, or the scene's own."""
+    from seasonscapes.pipeline import albedo_for, dated_albedos
+
+    if given:
+        return [(float(each.day.timetuple().tm_yday), each.load().values) for each in dated_albedos(land, given)]
+    # A scene with one image has one albedo for the whole year.
+    days = np.linspace(15.0, 366.0 + 15.0, dates + 1)[:-1].round().tolist() if land.synthetic else [200.0]
+    return [
+        (day, albedo_for(land, datetime(YEAR, 1, 1, 12, tzinfo=UTC) + timedelta(days=day - 1)).values) for day in days
+    ]
+
+
+def prepare_school(
+    land, model, counts: tuple[int, int, int, int], dated: list[tuple[float, np.ndarray]], seed: int
+) -> School:
     """Trace what is to be learned. Each date has its own albedo, and with it its own light from other slopes."""
     from seasonscapes.gaussians.distil import lessons_from
     from seasonscapes.gaussians.surfels import surfel_albedo, terrain_surfels
     from seasonscapes.gaussians.transport import light_state, neighbourhood_mean, surfel_irradiance, trace_transport
     from seasonscapes.gaussians.views import overview_cameras, relit_frames
-    from seasonscapes.pipeline import albedo_for
     from seasonscapes.rendering.gather import occluder
     from seasonscapes.rendering.scene import mi_mesh
 
-    discs, suns, dates, views, view_px = counts
-    # A scene with one image has one albedo for the whole year.
-    days = (
-        [float(day) for day in np.linspace(15.0, 366.0 + 15.0, dates + 1)[:-1].round()] if land.synthetic else [200.0]
-    )
+    discs, suns, views, view_px = counts
+    days, textures = [day for day, _ in dated], [texture for _, texture in dated]
     surfels = terrain_surfels(land.terrain, float(np.ptp(land.terrain.vertices[:, :2], axis=0).max()) / discs)
-    textures = [albedo_for(land, datetime(YEAR, 1, 1, 12, tzinfo=UTC) + timedelta(days=day - 1)).values for day in days]
     albedo = np.stack([surfel_albedo(surfels, texture) for texture in textures])
     around = np.stack([neighbourhood_mean(surfels.means, one, surfels.plan.spacing_m) for one in albedo])
     seasons = [number % len(days) for number in range(suns)]
