@@ -93,13 +93,16 @@ def guides_for(terrain: Terrain, atlas: Atlas, *, satellite: Texture | None = No
         if size != shape:
             raise ValueError(f"guides_for: {name} is {size}, the atlas {shape}")
     positions, face_id = texel_positions(terrain, atlas.width_px, atlas.height_px)
-    extent = np.ptp(terrain.vertices[:, :2], axis=0)
-    cell_m = float(max(extent[0] / atlas.width_px, extent[1] / atlas.height_px)) if atlas.kind == "planar" else (
-        atlas.texel_p50_m)  # fmt: skip
+    # A planar atlas is itself the plan: with its own cell size the two coincide.
+    planar_m = float((np.ptp(terrain.vertices[:, :2], axis=0) / [atlas.width_px, atlas.height_px]).max())
+    cell_m = planar_m if atlas.kind == "planar" else atlas.texel_p50_m
     heights, spacing_m = plan_heights(terrain, cell_m)
     plan = plan_of(terrain, positions, heights.shape[1], heights.shape[0])
+    share = from_plan(plan, np.isfinite(heights).astype(np.float32)[..., None])[..., 0]
     layers = {}
     for name, layer in land_layers(heights, spacing_m, sun_direction=sun_direction, day_suns=day_suns).items():
-        layers[name] = from_plan(plan, np.nan_to_num(layer, nan=float(np.nanmedian(layer)))[..., None])[..., 0]
+        # At the rim of the land only cells with a height have a say.
+        sums = from_plan(plan, np.nan_to_num(layer)[..., None])[..., 0]
+        layers[name] = np.where(share > 0.0, sums / np.maximum(share, 1e-6), np.nan).astype(np.float32)
     layers |= extra or {}
     return stack_guides(layers, satellite, plan=plan if atlas.charts > 1 else None, surface=face_id >= 0)
