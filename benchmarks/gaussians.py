@@ -347,12 +347,12 @@ def speed(contest: Contest, appearance) -> dict[str, float]:
     import torch
 
     from seasonscapes.gaussians.appearance import colours_at
-    from seasonscapes.gaussians.rasterise import finer_camera, rotations, splat_colours, view_weights
+    from seasonscapes.gaussians.rasterise import rotations, splat_colours, view_weights
     from seasonscapes.gaussians.render import CUTS
     from seasonscapes.gaussians.views import facing
     from seasonscapes.rendering.radiance import path_trace
     from seasonscapes.rendering.scene import relight
-    from seasonscapes.rendering.splatting import ready_splats, splat_layers
+    from seasonscapes.rendering.splatting import finer_camera, ready_splats, splat_layers
 
     scene, surfels, t = contest.scene, contest.surfels, contest.held_out[0]
     camera = finer_camera(scene.cameras[0], scene.sizes.speed_px // scene.cameras[0].width_px)

@@ -20,7 +20,8 @@ import numpy as np
 import torch
 
 from seasonscapes.gaussians.appearance import Appearance, LightTensors, light_tensors
-from seasonscapes.gaussians.rasterise import ViewWeights
+from seasonscapes.gaussians.losses import Frame, SparseProduct, encoded, picture_loss, picture_of, surface_loss
+from seasonscapes.gaussians.rasterise import choose_threads
 from seasonscapes.gaussians.transport import LightState
 from seasonscapes.images import atomic_path
 
@@ -29,8 +30,6 @@ Progress = Callable[[float], None]
 RATES = {"log_colour": 2e-3, "log_gain": 5e-3, "shift": 1e-3, "log_softness": 1e-2, "embedding": 5e-3, "codes": 5e-3,
          "mlp": 2e-3}  # fmt: skip
 _SECOND, _FALL = 0.5, 0.1
-# Relative squared error, but not of what is nearly black (Lehtinen et al. 2018, arXiv:1803.04189, § 3.2).
-_DARK = 0.02
 _SURFACE_SHARE = 0.5
 
 
@@ -46,16 +45,19 @@ class Schedule:
         (Disc, time) pairs in a step of the first.
     checkpoint_every
         Steps between checkpoints.
+    threads
+        Of torch, chosen and not inherited; see `rasterise.choose_threads`.
     """
 
     surface_steps: int = 2500
     picture_steps: int = 240
     batch: int = 6144
     checkpoint_every: int = 250
+    threads: int = 1
 
     def __post_init__(self):
-        if min(self.surface_steps, self.picture_steps) < 0 or min(self.batch, self.checkpoint_every) < 1:
-            raise ValueError("Schedule: steps must not be negative, batch and checkpoint_every at least 1")
+        if min(self.surface_steps, self.picture_steps) < 0 or min(self.batch, self.checkpoint_every, self.threads) < 1:
+            raise ValueError("Schedule: steps must not be negative, batch, checkpoint_every and threads at least 1")
 
 
 @dataclass(frozen=True)
@@ -82,39 +84,6 @@ class Lessons:
                              f"{len(self.colours)} sets of colours, expected one of each for every time")  # fmt: skip
         if not np.isfinite(self.colours).all():
             raise ValueError(f"Lessons: {int(np.sum(~np.isfinite(self.colours)))} colours are not finite")
-
-
-@dataclass(frozen=True)
-class Frame:
-    """A picture to learn from: a path-traced view, or a painted one.
-
-    Parameters
-    ----------
-    weights
-        Of its camera, from `rasterise.view_weights`; frames of one camera share them.
-    time
-        Its number among the lessons' times.
-    image
-        ``(H, W, 3)`` colours as in `Lessons`, of the surface, before the air.
-    mask
-        ``(H, W)`` bool, True = usable.
-    """
-
-    weights: ViewWeights
-    time: int
-    image: np.ndarray
-    mask: np.ndarray
-
-    def __post_init__(self):
-        if self.image.shape != (*self.mask.shape, 3) or self.mask.shape != (
-            self.weights.height_px,
-            self.weights.width_px,
-        ):
-            raise ValueError(f"Frame: image {self.image.shape} and mask {self.mask.shape} do not fit the camera")
-        if not np.isfinite(self.image[self.mask]).all():
-            raise ValueError("Frame: the picture has usable pixels that are not finite")
-        if not self.mask.any() or self.weights.matrix.nnz == 0:
-            raise ValueError("Frame: no splat and no usable pixel in view; does the camera stand inside the mountain?")
 
 
 def lessons_from(states: Sequence[LightState], seasons: Sequence[int], albedo: np.ndarray,
@@ -146,14 +115,20 @@ def distil(appearance: Appearance, lessons: Lessons, frames: Sequence[Frame] = (
         The loss is no longer finite.
     """
     schedule = schedule or Schedule()
+    choose_threads(schedule.threads)
     if not frames:
         schedule = replace(schedule, picture_steps=0)
     optimiser = _optimiser(appearance)
-    run = {"kind": appearance.kind, "seed": seed, "schedule": asdict(schedule), "times": len(lessons.states)}
+    run = {
+        "kind": appearance.kind,
+        "seed": seed,
+        "schedule": asdict(replace(schedule, threads=1)),
+        "times": len(lessons.states),
+    }
     start = load_checkpoint(checkpoint, appearance, optimiser, run) if checkpoint and Path(checkpoint).is_file() else 0
     lights = light_tensors(lessons.states, lessons.seasons)
     targets = torch.as_tensor(lessons.colours)
-    pictures = [_picture(frame) for frame in frames]
+    pictures = [picture_of(frame) for frame in frames]
     total, losses = schedule.surface_steps + schedule.picture_steps, []
     for step in range(start, total):
         _set_rates(optimiser, step, schedule)
@@ -195,97 +170,10 @@ def _set_rates(optimiser: torch.optim.Adam, step: int, schedule: Schedule) -> No
         group["lr"] = RATES[group["name"]] * (_SECOND if second else 1.0) * _FALL**share
 
 
-def surface_loss(appearance: Appearance, lights: LightTensors, targets: torch.Tensor, batch: int,
-                 rng: np.random.Generator) -> torch.Tensor:  # fmt: skip
-    """Relative squared error of random (disc, time) pairs: unbiased even where targets are noisy."""
-    times, count, _ = targets.shape
-    index = torch.as_tensor(rng.integers(0, count, batch))
-    time = torch.as_tensor(rng.integers(0, times, batch))
-    value = appearance(index, time, lights)
-    return ((value - targets[time, index]) ** 2 / (value.detach() ** 2 + _DARK)).mean()
-
-
-@dataclass(frozen=True)
-class _Picture:
-    """A frame laid out for training: seen discs ``(n,)``, weights over them (rows sum to 1), and pixels in sRGB."""
-
-    discs: torch.Tensor
-    forward: object
-    backward: object
-    time: torch.Tensor
-    target: torch.Tensor
-    mask: torch.Tensor
-
-
-def _picture(frame: Frame) -> _Picture:
-    from scipy import sparse
-
-    matrix = frame.weights.matrix
-    discs = np.unique(matrix.indices)
-    number = np.zeros(matrix.shape[1], np.int32)
-    number[discs] = np.arange(len(discs), dtype=np.int32)
-    scale = 1.0 / np.maximum(frame.weights.coverage.ravel(), 1e-3)
-    data = matrix.data * np.repeat(scale, np.diff(matrix.indptr))
-    forward = sparse.csr_array((data.astype(np.float32), number[matrix.indices], matrix.indptr),
-                               shape=(matrix.shape[0], len(discs)))  # fmt: skip
-    mask = torch.as_tensor(frame.mask & (frame.weights.coverage > 0.5))
-    target = torch.where(mask[..., None], encoded(torch.as_tensor(np.nan_to_num(frame.image).astype(np.float32))), 0.0)
-    return _Picture(
-        torch.as_tensor(discs.astype(np.int64)), forward, forward.T.tocsr(), torch.tensor(frame.time), target, mask
-    )
-
-
-class _Product(torch.autograd.Function):
-    """A constant sparse matrix times a dense one; the transpose is given too, as it serves many steps."""
-
-    @staticmethod
-    def forward(context, values: torch.Tensor, matrix, transpose) -> torch.Tensor:
-        context.transpose = transpose
-        return torch.from_numpy(matrix @ values.detach().numpy())
-
-    @staticmethod
-    def backward(context, gradient: torch.Tensor):
-        return torch.from_numpy(context.transpose @ gradient.contiguous().numpy()), None, None
-
-
-def encoded(linear: torch.Tensor) -> torch.Tensor:
-    """sRGB of linear values; brighter than 1 goes on along the same curve, so that it still has a slope."""
-    linear = linear.clamp(min=0.0)
-    return torch.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clamp(min=1e-4) ** (1.0 / 2.4) - 0.055)
-
-
-def picture_loss(appearance: Appearance, lights: LightTensors, picture: _Picture) -> torch.Tensor:
-    """0.8 L1 + 0.2 D-SSIM of a frame in sRGB over its usable pixels."""
-    values = appearance(picture.discs, picture.time, lights)
-    image = encoded(_Product.apply(values, picture.forward, picture.backward)).reshape(picture.target.shape)
-    image = torch.where(picture.mask[..., None], image, 0.0)
-    share = picture.mask.float().mean()
-    difference = (image - picture.target).abs().mean() / share
-    return 0.8 * difference + 0.2 * (1.0 - ssim_map(image, picture.target)).mean() / share
-
-
-def ssim_map(image: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
-    """Structural similarity ``(C, H, W)`` of pictures ``(H, W, C)`` (Wang et al. 2004, doi:10.1109/TIP.2003.819861)."""
-    offset = torch.arange(11.0) - 5.0
-    window = torch.exp(-(offset**2) / 4.5)
-    window = window / window.sum()
-    a, b = image.permute(2, 0, 1)[:, None], other.permute(2, 0, 1)[:, None]
-
-    def mean(values: torch.Tensor) -> torch.Tensor:
-        across = torch.nn.functional.conv2d(values, window[None, None, None, :], padding=(0, 5))
-        return torch.nn.functional.conv2d(across, window[None, None, :, None], padding=(5, 0))
-
-    mean_a, mean_b = mean(a), mean(b)
-    variance = mean(a * a) - mean_a**2 + mean(b * b) - mean_b**2
-    covariance = mean(a * b) - mean_a * mean_b
-    above = (2.0 * mean_a * mean_b + 1e-4) * (2.0 * covariance + 9e-4)
-    return (above / ((mean_a**2 + mean_b**2 + 1e-4) * (variance + 9e-4)))[:, 0]
-
-
 def fit_code(appearance: Appearance, lights: LightTensors, frame: Frame, *, steps: int = 128, rate: float = 0.1,
              seed: int = 0) -> torch.Tensor:  # fmt: skip
     """The free code ``(32,)`` of a picture that was not trained on, from its usable pixels (WildGaussians' protocol)."""
-    picture = _picture(frame)
+    picture = picture_of(frame)
     # From the middle of the codes that were learned, where the network is at home.
     code = appearance.codes.detach().mean(dim=0).requires_grad_()
     optimiser = torch.optim.Adam([code], lr=rate)
@@ -297,7 +185,7 @@ def fit_code(appearance: Appearance, lights: LightTensors, frame: Frame, *, step
         seen = np.unique(some.indices)
         some = some[:, seen]
         values = appearance(picture.discs[torch.from_numpy(seen).long()], picture.time, lights, code)
-        drawn = _Product.apply(values, some, some.T.tocsr())
+        drawn = SparseProduct.apply(values, some, some.T.tocsr())
         loss = (encoded(drawn) - picture.target.reshape(-1, 3)[chosen]).abs().mean()
         optimiser.zero_grad()
         loss.backward()

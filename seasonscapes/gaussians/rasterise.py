@@ -21,6 +21,7 @@ import numpy as np
 import torch
 
 from seasonscapes.cameras.pinhole import Camera
+from seasonscapes.rendering.splatting import finer_camera
 
 # Opacity under which a splat is not drawn, as in 3DGS; 0 switches the cut off (and the speed with it).
 ALPHA_CUT = 1.0 / 255.0
@@ -279,13 +280,6 @@ def view_weights(splats: Splats, camera: Camera, *, subpixels: int = 1,
     if subpixels > 1:
         matrix = _pooled(matrix, camera, subpixels)
     return ViewWeights(matrix, camera.width_px, camera.height_px)
-
-
-def finer_camera(camera: Camera, times: int) -> Camera:
-    """The same view with ``times`` as many pixels along each side."""
-    numbers = (camera.fx, camera.fy, camera.cx, camera.cy)
-    return Camera(camera.width_px * times, camera.height_px * times, *(times * number for number in numbers),
-                  camera.world_from_camera)  # fmt: skip
 
 
 def _pooled(matrix, camera: Camera, subpixels: int):

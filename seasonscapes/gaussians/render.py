@@ -17,7 +17,6 @@ from seasonscapes.gaussians.rasterise import (
     PIXEL_VARIANCE,
     Splats,
     ViewWeights,
-    finer_camera,
     rotations,
     splat_colours,
     splats_from,
@@ -25,7 +24,7 @@ from seasonscapes.gaussians.rasterise import (
 )
 from seasonscapes.gaussians.transport import LightState, light_state, neighbourhood_mean
 from seasonscapes.rendering.backend import use_backend
-from seasonscapes.rendering.splatting import Cuts, ReadySplats, ready_splats, splat_layers
+from seasonscapes.rendering.splatting import Cuts, ReadySplats, finer_camera, ready_splats, splat_layers
 from seasonscapes.sky.illumination import Illumination
 
 # Coverage from which a pixel counts as all terrain.

@@ -40,6 +40,13 @@ class ReadySplats:
     count: int
 
 
+def finer_camera(camera: Camera, times: int) -> Camera:
+    """The same view with ``times`` as many pixels along each side."""
+    numbers = (camera.fx, camera.fy, camera.cx, camera.cy)
+    return Camera(camera.width_px * times, camera.height_px * times, *(times * number for number in numbers),
+                  camera.world_from_camera)  # fmt: skip
+
+
 def ready_splats(means: np.ndarray, axes: np.ndarray, opacity: np.ndarray) -> ReadySplats:
     """Copy to the device: ``means (N, 3)``, ``axes (N, 3, 3)`` with one axis of the ellipsoid a column, ``opacity (N,)``.
 
