@@ -39,6 +39,7 @@ from seasonscapes.albedo.corrections import CORRECTIONS, slopes_under  # noqa: E
 from seasonscapes.albedo.forward import sun_on_texels, trace_land  # noqa: E402
 from seasonscapes.albedo.haze import fit_visibility  # noqa: E402
 from seasonscapes.albedo.painted import painted_radiance  # noqa: E402
+from seasonscapes.albedo.response import fit_response, with_response  # noqa: E402
 from seasonscapes.cameras.observation import Observation  # noqa: E402
 from seasonscapes.evaluation.webcam_faults import WebcamFaults, degrade  # noqa: E402
 from seasonscapes.exposure import develop, exposure_ev100  # noqa: E402
@@ -254,10 +255,23 @@ def run(args) -> dict[str, float]:
     numbers["margin_over_best_correction_db"] = min(margins)
     clock.tell("webcam")
     if not args.quick:
+        curve(args, truth, land, times, pictures, shots, judge, table, numbers, clock)
         haze(args, truth, land, times, model, workspace, judge, table, numbers, clock)
     controls(truth, land, shots, times, model, workspace, judge, table, numbers, clock)
     print_table(table, judge)
     return numbers
+
+
+def curve(args, truth, land, times, pictures, shots, judge, table, numbers, clock) -> None:
+    """An unknown S-curve on top of all that webcams do."""
+    faults = WebcamFaults(tone_strength=0.4)
+    seen, _ = observations(truth, times, pictures, faults, args.seed + 3)
+    bent = [replace(shot, observation=one, gain=None) for shot, one in zip(shots, seen, strict=True)]
+    found = fit_response(land, bent, share=0.1)
+    numbers["curve_strength_error"] = abs(found.strength - faults.tone_strength)
+    fit = solve_albedo(land, with_response(bent, found.strength), trust=EIGHT_BIT)
+    score(table, numbers, "curve", judge.scores(fit.albedo), judge)
+    clock.tell("tone curve")
 
 
 def haze(args, truth, land, times, model, workspace, judge, table, numbers, clock) -> None:

@@ -29,7 +29,7 @@ from seasonscapes.terrain.texels import texel_positions
 
 Progress = Callable[[float], None]
 # Texels need fewer rays than pixels do: their neighbours are averaged by every footprint.
-TEXEL_EFFORT = Effort(subpixels=1, rays=256, listed=64, senders=8192, rank=32)
+TEXEL_EFFORT = Effort(subpixels=1, rays=512, listed=64, senders=8192, rank=32)
 
 
 @dataclass(frozen=True)

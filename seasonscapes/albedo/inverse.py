@@ -219,9 +219,9 @@ def _run_stage(task: _Task, state: State, first: int, callbacks: Sequence[Callba
             else:
                 worse, scale = worse + 1, 0.5 * scale
                 optimizer.set_learning_rate({name: scale * step for name, step in _steps(task, level).items()})
-            if resume is not None:
-                _save(state, resume)
         state.history.append(record)
+        if "held_out" in record and resume is not None:
+            _save(state, resume)
         for callback in callbacks:
             callback(state)
         if state.stop or worse >= 3:
