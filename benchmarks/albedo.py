@@ -212,9 +212,14 @@ def rivals(truth: Truth, land, shots, gains: np.ndarray, times, lights) -> dict[
 # ---------------------------------------------------------------------------------------------- the run
 
 
+def size_of(args) -> Size:
+    """What ``--quick`` chooses."""
+    return QUICK if args.quick else FULL
+
+
 def run(args) -> dict[str, float]:
     """All cases; a flat dictionary of numbers."""
-    size = QUICK if args.quick else FULL
+    size = size_of(args)
     workspace = default_workspace() if args.workspace is None else Workspace(args.workspace)
     numbers: dict[str, float] = {"seed": float(args.seed)}
     clock = Clock()
@@ -254,9 +259,8 @@ def run(args) -> dict[str, float]:
     margins.append(numbers["webcam_psnr_db"] - best)
     numbers["margin_over_best_correction_db"] = min(margins)
     clock.tell("webcam")
-    if not args.quick:
-        curve(args, truth, land, times, pictures, shots, judge, table, numbers, clock)
-        haze(args, truth, land, times, model, workspace, judge, table, numbers, clock)
+    curve(args, truth, land, times, pictures, shots, judge, table, numbers, clock)
+    haze(args, truth, land, times, model, workspace, judge, table, numbers, clock)
     controls(truth, land, shots, times, model, workspace, judge, table, numbers, clock)
     print_table(table, judge)
     return numbers
@@ -267,7 +271,7 @@ def curve(args, truth, land, times, pictures, shots, judge, table, numbers, cloc
     faults = WebcamFaults(tone_strength=0.4)
     seen, _ = observations(truth, times, pictures, faults, args.seed + 3)
     bent = [replace(shot, observation=one, gain=None) for shot, one in zip(shots, seen, strict=True)]
-    found = fit_response(land, bent, share=0.1)
+    found = fit_response(land, bent, share=0.2 if args.quick else 0.1)
     numbers["curve_strength_error"] = abs(found.strength - faults.tone_strength)
     fit = solve_albedo(land, with_response(bent, found.strength), trust=EIGHT_BIT)
     score(table, numbers, "curve", judge.scores(fit.albedo), judge)
@@ -282,7 +286,7 @@ def haze(args, truth, land, times, model, workspace, judge, table, numbers, cloc
 
     true = lights_of(TRUE_HAZE_KM)
     rows = [true[i : i + len(truth.cameras)] for i in range(0, len(true), len(truth.cameras))]
-    pictures = path_traced(truth, truth.albedo, rows, spp=FULL.spp, seed=args.seed + 5)
+    pictures = path_traced(truth, truth.albedo, rows, spp=size_of(args).spp, seed=args.seed + 5)
     seen, _ = observations(truth, times, pictures, WebcamFaults(tone_strength=0.0), args.seed + 2)
     shots = make_shots(land, seen, true)
     found = fit_visibility(land, shots, lights_of, trust=EIGHT_BIT)
