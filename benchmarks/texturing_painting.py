@@ -277,24 +277,23 @@ def rejection(stage: Stage, *, seed: int, texels: int = 12_000) -> dict:
         regression = fit_regression(guide, target, fast=True, seed=seed)
         return lambda other: predict(regression, other)[0]
 
-    expected = predict_in_folds(first.texture, guides.values, fit, seed=seed)
-    index = {name: k for k, name in enumerate(first.webcams)}
     pictures = {picture.observation.webcam: picture for picture in stage.pictures}
     cut, scene = tiling(terrain, stage.atlas), RenderScene(stage.terrain.mi_scene, stage.terrain.mi_terrain, None, 0.0)
-    rejects, found, false = [], [], []
-    for shot in shots:
-        camera, picture = shot.observation.camera, pictures[shot.observation.webcam]
-        uv = trace_gbuffer(scene, camera).uv
-        mask = foreground_mask(
-            ready_shot(shot, stage.terrain, cut), index[shot.observation.webcam], first.harmony, expected, uv
-        )
-        land = np.isfinite(uv).all(axis=2)
-        found.append((np.count_nonzero(mask & picture.foreground & land), np.count_nonzero(picture.foreground & land)))
-        false.append(
-            (np.count_nonzero(mask & ~picture.foreground & land), np.count_nonzero(~picture.foreground & land))
-        )
-        rejects.append(mask)
-    second = paint(shots, terrain, stage.atlas, stage.terrain, rejects=rejects)
+    ready = [ready_shot(shot, stage.terrain, cut) for shot in shots]
+    uvs = [trace_gbuffer(scene, shot.observation.camera).uv for shot in shots]
+    rejects, painting = [None] * len(shots), first
+    # What was found at first no longer teaches the regression.
+    for _ in range(2):
+        expected = predict_in_folds(painting.texture, guides.values, fit, seed=seed)
+        number = {name: k for k, name in enumerate(first.webcams)}
+        rejects = [foreground_mask(r, number[r.shot.observation.webcam], painting.harmony, expected, uv)
+                   for r, uv in zip(ready, uvs, strict=True)]  # fmt: skip
+        painting = paint(shots, terrain, stage.atlas, stage.terrain, rejects=rejects)
+    found, false = [], []
+    for shot, mask, uv in zip(shots, rejects, uvs, strict=True):
+        land, front = np.isfinite(uv).all(axis=2), pictures[shot.observation.webcam].foreground
+        found.append((np.count_nonzero(mask & front & land), np.count_nonzero(front & land)))
+        false.append((np.count_nonzero(mask & ~front & land), np.count_nonzero(~front & land)))
     oracle = paint(
         shots, terrain, stage.atlas, stage.terrain, rejects=[pictures[s.observation.webcam].foreground for s in shots]
     )
@@ -303,9 +302,9 @@ def rejection(stage: Stage, *, seed: int, texels: int = 12_000) -> dict:
     truth = land_truth(stage, sample, seed=seed)
     ratio = lambda pairs: sum(a for a, _ in pairs) / max(sum(b for _, b in pairs), 1)  # noqa: E731
     numbers = {"foreground_recall": ratio(found), "foreground_false_rejects": ratio(false)}
-    for name, painting in (("contaminated", first), ("rejected", second), ("known", oracle)):
-        there = painting.texture.weight.ravel()[sample] > 0.0
-        numbers[f"foreground_{name}_db"] = decibels(painting.texture.values.reshape(-1, 3)[sample][there], truth[there])
+    for name, result in (("contaminated", first), ("rejected", painting), ("known", oracle)):
+        there = result.texture.weight.ravel()[sample] > 0.0
+        numbers[f"foreground_{name}_db"] = decibels(result.texture.values.reshape(-1, 3)[sample][there], truth[there])
     return numbers
 
 

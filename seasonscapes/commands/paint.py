@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from seasonscapes.sky.models import SkyModel
     from seasonscapes.texturing.paint import Painting, PaintOptions
 
-# Raised when equal inputs give another painting.
-_REVISION = 1
+# Raised when equal inputs give another painting, or other synthetic pictures.
+_REVISION, _WEBCAMS_REVISION = 2, 1
 
 
 @Parameter(name="*")
@@ -143,7 +143,7 @@ def _sources(
                          cure="give its pictures with --manifest")  # fmt: skip
     cameras = chosen_cameras(land, pictures.leave_out, size_px)
     key = content_key(
-        {"place": land.key, "time": utc.isoformat(), "sky": model, "size": size_px, "revision": _REVISION}
+        {"place": land.key, "time": utc.isoformat(), "sky": model, "size": size_px, "revision": _WEBCAMS_REVISION}
     )
     folder = land.workspace.folder / land.scene.name / f"webcams-{key}"
     with progress_bar(f"photographing from {len(cameras)} webcams") as progress:

@@ -17,8 +17,10 @@ from seasonscapes.texturing.harmonise import Harmony, land_radiance
 from seasonscapes.texturing.shots import ReadyShot, air_to
 
 # Deviations that count, and the share of the 5 x 5 pixels around that must have them too.
-_OUTLIER, _COHERENT = 3.0, 0.5
+_OUTLIER, _COHERENT = 3.2, 0.5
 _PATCH = 5
+# Gaps of this share of the picture's width are closed; patches below this share of its area are chance.
+_CLOSED, _LEAST_AREA = 0.03, 5e-4
 _DEPTH_BINS = 8
 
 
@@ -46,8 +48,17 @@ def foreground_mask(ready: ReadyShot, number: int, harmony: Harmony, predicted: 
     far_off = (score > outlier).astype(np.float32)
     patch = (_PATCH, _PATCH)
     share = cv2.blur(far_off, patch) / np.maximum(cv2.blur(known.astype(np.float32), patch), 1e-3)
-    found = (share > _COHERENT) & known
-    return cv2.dilate(found.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+    return _solid((share > _COHERENT) & known)
+
+
+def _solid(found: np.ndarray) -> np.ndarray:
+    """What was found, its windows closed and its specks dropped, and a pixel wider."""
+    side = 2 * round(0.5 * _CLOSED * found.shape[1]) + 1
+    closed = cv2.morphologyEx(found.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((side, side), np.uint8))
+    _, label, statistics, _ = cv2.connectedComponentsWithStats(closed)
+    large = statistics[:, cv2.CC_STAT_AREA] >= _LEAST_AREA * found.size
+    large[0] = False
+    return cv2.dilate(large[label].astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
 
 
 def _disagreement(ready: ReadyShot, number: int, harmony: Harmony, predicted: np.ndarray,
