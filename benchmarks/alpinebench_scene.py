@@ -26,12 +26,13 @@ from seasonscapes.rendering.gbuffer import trace_gbuffer
 from seasonscapes.rendering.scene import RenderScene, mi_mesh
 from seasonscapes.rendering.transport import Effort
 from seasonscapes.sky.illumination import Illumination
-from seasonscapes.sky.models import read_sky_model, with_overrides
+from seasonscapes.sky.models import SkyModel, read_sky_model, with_overrides
 from seasonscapes.terrain.atlas import Atlas, measure_atlas
-from seasonscapes.terrain.surface import Terrain, Texture
+from seasonscapes.terrain.surface import Terrain
 from seasonscapes.workspace import default_workspace
 
-DATE, DAY_OF_YEAR, SATELLITE_DAY = "2024-09-11", 254, 205
+DATE, DAY_OF_YEAR = "2024-09-11", 254
+SATELLITE_DATE, SATELLITE_DAY = "2024-07-23", 205
 # GPS, compass and spirit level of an uncalibrated webcam; 12 points clicked to half a pixel, of which two are wrong.
 GPS = PoseSigmas(5.0, 5.0, 4.0, 1.0, 1.0, 0.02)
 CLICKS, WRONG, CLICK_PX = 12, 2, 0.5
@@ -71,14 +72,14 @@ class World:
     ----------
     terrain, atlas, bare
         The land and its rays.
-    albedo, satellite
-        Textures: that of the day, and that of a summer's day as an image from above would hold it.
+    albedo, summer
+        ``(R, S, 3)`` of the day that is photographed, and of a summer's day.
     painting, judged
         Cameras at their true poses.
     painted_hours, held_hours
         Times that webcams' pictures are used of, and times that they are not.
     lights
-        By time, of each camera, painting ones first.
+        By time, of each camera, painting ones first; under ``sky``.
     """
 
     seed: int
@@ -87,12 +88,13 @@ class World:
     atlas: Atlas
     bare: Occluder
     albedo: np.ndarray
-    satellite: Texture
+    summer: np.ndarray
     painting: list[Camera]
     judged: list[Camera]
     painted_hours: tuple[datetime, ...]
     held_hours: tuple[datetime, ...]
     lights: dict[datetime, list[Illumination]]
+    sky: SkyModel
 
     @property
     def hours(self) -> list[datetime]:
@@ -114,8 +116,8 @@ def make_world(seed: int, size: Size) -> World:
     painted_hours, held_hours = held_out_hours(times, 3)
     sky = with_overrides(read_sky_model("clear"), visibility_km=60.0)
     lights = lights_for(times, [*painting, *judged], sky, default_workspace())
-    return World(seed, size, terrain, atlas, bare, albedo, Texture(summer, np.ones(shape, np.float32)), painting, judged,
-                 painted_hours, held_hours, dict(zip(times, lights, strict=True)))  # fmt: skip
+    return World(seed, size, terrain, atlas, bare, albedo, summer, painting, judged,
+                 painted_hours, held_hours, dict(zip(times, lights, strict=True)), sky)  # fmt: skip
 
 
 def choose_cameras(terrain: Terrain, bare: Occluder, size: Size, seed: int) -> tuple[list[Camera], list[Camera]]:
