@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from seasonscapes.texturing.paint import Painting, PaintOptions
 
 # Raised when equal inputs give another painting, or other synthetic pictures.
-_REVISION, _WEBCAMS_REVISION = 2, 1
+_REVISION, _WEBCAMS_REVISION = 3, 1
 
 
 @Parameter(name="*")

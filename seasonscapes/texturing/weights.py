@@ -8,9 +8,10 @@ import numpy as np
 _ENOUGH_PX = 1.5
 # Blending weights are sharpened, so that the best picture decides and others only soften its rim.
 SHARPNESS = 4.0
-# Trust in pixels that are clipped or nearly black: they speak only where nothing else does.
-_CLIPPED_TRUST = 0.02
-BRIGHTEST, DARKEST = 0.9, 0.002
+# Trust in pixels near either end of the range: they speak only where nothing else does. Clipped ones never: snow would
+# turn yellow where only its blue is clipped.
+_EXTREME_TRUST = 0.02
+BRIGHTEST, DARKEST, _CLIPPED = 0.9, 0.002, 0.985
 
 
 def texel_weight(cosine: np.ndarray, px_per_texel: np.ndarray) -> np.ndarray:
@@ -27,9 +28,10 @@ def texel_weight(cosine: np.ndarray, px_per_texel: np.ndarray) -> np.ndarray:
 
 
 def exposure_trust(image: np.ndarray) -> np.ndarray:
-    """Trust ``(H, W)`` float32 in the tones of a picture ``(H, W, 3)`` in [0, 1]: low where clipped or nearly black."""
+    """Trust ``(H, W)`` float32 in the tones of a picture ``(H, W, 3)`` in [0, 1]: low near either end, 0 where clipped."""
     brightest = image.max(axis=2)
-    return np.where((brightest < BRIGHTEST) & (brightest > DARKEST), 1.0, _CLIPPED_TRUST).astype(np.float32)
+    trust = np.where((brightest < BRIGHTEST) & (brightest > DARKEST), 1.0, _EXTREME_TRUST)
+    return np.where(brightest < _CLIPPED, trust, 0.0).astype(np.float32)
 
 
 def sharpened(weight: np.ndarray) -> np.ndarray:
