@@ -213,10 +213,11 @@ class Contest:
         self.held_out = range(self.suns, self.suns + sizes.held_out)
 
     def appearance(self, kind: str):
-        from seasonscapes.gaussians.appearance import Appearance, fourier_embedding
+        from seasonscapes.gaussians.appearance import EMBEDDING, Appearance, fourier_embedding
 
+        size = 24 if kind in ("code", "sun") else EMBEDDING
         return Appearance(kind, self.albedo[None], self.around[None], self.transport,
-                          fourier_embedding(self.surfels.means, seed=self.seed), times=self.suns, seed=self.seed)  # fmt: skip
+                          fourier_embedding(self.surfels.means, size, seed=self.seed), times=self.suns, seed=self.seed)  # fmt: skip
 
     def trained(self, kind: str):
         from seasonscapes.gaussians.distil import Schedule, distil
@@ -436,6 +437,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="a small scene, within five minutes on two cores")
     parser.add_argument("--seed", type=int, default=None)
     parser.add_argument("--json", default=None)
+    parser.add_argument("--only", default="", help="contestants alone, such as sun,code; nothing else is measured")
     parser.add_argument("--picture", default=None, help="write the contact sheet here")
     arguments = parser.parse_args()
     seed = secrets.randbelow(10_000) if arguments.seed is None else arguments.seed
@@ -454,6 +456,11 @@ def main() -> None:
 
     print("prepared", {name: round(value, 1) for name, value in contest.seconds.items()}, flush=True)
     print(f"nearest sun {result['nearest_sun_psnr_db']:.2f}, blend of three {result['blend_psnr_db']:.2f}")
+    if arguments.only:
+        for kind in arguments.only.split(","):
+            trained = contest.trained(kind)
+            tell(kind, contest.score_code(trained) if kind == "code" else contest.score(trained))
+        return write_result(result, arguments.json)
     tell("physical_untrained", contest.score(contest.appearance("physical")))
     full = contest.trained("full")
     tell("full", contest.score(full))
@@ -473,10 +480,15 @@ def main() -> None:
     result["train_seconds"] = contest.seconds["full"]
     result["prepare_seconds"] = contest.seconds["transport"] + contest.seconds["lessons"] + contest.seconds["views"]
     result["total_seconds"] = time.perf_counter() - start
+    write_result(result, arguments.json)
+
+
+def write_result(result: dict[str, float], path: str | None) -> None:
+    """A table, and the same numbers as JSON."""
     for name, value in result.items():
         print(f"{name:36s} {value:10.3f}")
-    if arguments.json:
-        with open(arguments.json, "w") as file:
+    if path:
+        with open(path, "w") as file:
             json.dump(result, file, indent=1)
 
 

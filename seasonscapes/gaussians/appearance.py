@@ -34,7 +34,9 @@ from seasonscapes.sky.illumination import LUMINANCE_WEIGHTS
 # What the network is told. `code` is a free vector for each training time, as WildGaussians has; `sun` the time
 # embedding alone; `physical` no network at all; `full` everything.
 KINDS = ("code", "sun", "physical", "full")
-EMBEDDING, CODE, HIDDEN = 6, 32, 64
+EMBEDDING, CODE = 6, 32
+# Width of the network. Without physics it has everything to learn: WildGaussians' own sizes then, 24 for the embedding.
+HIDDEN = {"code": 128, "sun": 128, "full": 64}
 TIME_FEATURES, PHYSICAL_FEATURES = 14, 8
 BODIES = 2
 
@@ -134,7 +136,7 @@ class Appearance(nn.Module):
             self.embedding = nn.Parameter(torch.tensor(embedding, dtype=torch.float32))  # a copy: training changes it
             if kind == "code":
                 self.codes = nn.Parameter(0.01 * torch.randn(times, CODE, generator=generator))
-            self.mlp = _network(self._inputs(embedding.shape[1]), generator)
+            self.mlp = _network(self._inputs(embedding.shape[1]), HIDDEN[kind], generator)
 
     def _inputs(self, embedding: int) -> int:
         return (
@@ -158,7 +160,8 @@ class Appearance(nn.Module):
         known = lights.features[time] if self.kind != "code" else self.codes[time] if code is None else code
         parts = [self.embedding[index], base, known.expand(len(index), -1), *features]
         gamma, beta = self.mlp(torch.cat(parts, dim=1)).split(3, dim=1)
-        return ((1.0 + gamma) * base + 0.1 * beta).clamp(min=0.0)
+        # Physics leaves little to add; without it β carries half of the picture.
+        return ((1.0 + gamma) * base + (0.1 if self.kind == "full" else 1.0) * beta).clamp(min=0.0)
 
     def _physical(self, index: torch.Tensor, time: torch.Tensor, lights: LightTensors):
         """Irradiance ``(n, 3)`` and features for the network, each ``(n, k)``."""
@@ -196,8 +199,8 @@ class Appearance(nn.Module):
         return torch.sigmoid((elevation - angle - self.shift[index]) / self.log_softness[index].exp())
 
 
-def _network(inputs: int, generator: torch.Generator) -> nn.Sequential:
-    layers = [nn.Linear(inputs, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, 6)]
+def _network(inputs: int, width: int, generator: torch.Generator) -> nn.Sequential:
+    layers = [nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 6)]
     for layer in layers[:-1:2]:
         bound = (6.0 / layer.in_features) ** 0.5
         with torch.no_grad():
