@@ -134,10 +134,10 @@ def load_painter(folder: Path | None, settings: DiffusionSettings, *, names: Wei
         embeds = _adapted(pipe, places["adapter"], image, settings, device)
     if machine.offload and device != "cpu":
         pipe.enable_model_cpu_offload(device=device)
+        # Decoding a large picture at once needs more memory than all else; in tiles its colours are a little uneven.
+        pipe.vae.enable_tiling()
     else:
         pipe.to(device)
-    # Decoding 1024 × 1536 at once would need more memory than all else.
-    pipe.vae.enable_tiling()
     pipe.set_progress_bar_config(disable=True)
     return Painter(pipe, settings, embeds, device)
 
