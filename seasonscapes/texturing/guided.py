@@ -64,8 +64,8 @@ def fit_regression(guide: np.ndarray, encoded: np.ndarray, *, fast: bool = False
     if fast:
         return Regression(None, forest)
     boosted = []
-    for channel, (target, rounds) in enumerate(zip(mixed(encoded).T, (120, 50, 50), strict=True)):
-        model = HistGradientBoostingRegressor(max_iter=rounds, learning_rate=0.09, max_leaf_nodes=31, max_features=0.5,
+    for channel, (target, rounds) in enumerate(zip(mixed(encoded).T, (100, 40, 40), strict=True)):
+        model = HistGradientBoostingRegressor(max_iter=rounds, learning_rate=0.1, max_leaf_nodes=31, max_features=0.5,
                                               min_samples_leaf=20, l2_regularization=1.0, early_stopping=False,
                                               random_state=seed + channel)  # fmt: skip
         boosted.append(model.fit(guide, target))
