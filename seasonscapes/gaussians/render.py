@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from seasonscapes.cameras.pinhole import Camera
+from seasonscapes.cameras.pinhole import Camera, ray_directions
 from seasonscapes.gaussians.appearance import Appearance, colours_at, fourier_embedding
 from seasonscapes.gaussians.model import GaussianModel
 from seasonscapes.gaussians.rasterise import (
@@ -25,7 +25,7 @@ from seasonscapes.gaussians.rasterise import (
 from seasonscapes.gaussians.transport import LightState, light_state, neighbourhood_mean
 from seasonscapes.rendering.backend import use_backend
 from seasonscapes.rendering.splatting import Cuts, ReadySplats, finer_camera, ready_splats, splat_layers
-from seasonscapes.sky.illumination import Illumination
+from seasonscapes.sky.illumination import AerialPerspective, Illumination
 
 # Coverage from which a pixel counts as all terrain.
 SOLID = 0.85
@@ -185,18 +185,30 @@ def ready_model(model: GaussianModel) -> ReadySplats:
 def through_air(camera: Camera, illumination: Illumination, surface: np.ndarray, coverage: np.ndarray,
                 depth: np.ndarray) -> np.ndarray:  # fmt: skip
     """Radiance ``(H, W, 3)`` at the camera: the surface through the air of its distance, and the open sky behind."""
-    from seasonscapes.rendering.air_grid import air_at, air_places, open_sky, sky_grid
+    from seasonscapes.rendering.air_grid import open_sky, sky_grid
 
     image = surface.reshape(-1, 3).astype(np.float32)
     cover = coverage.ravel()
     shown = np.flatnonzero((cover > 0.0) & np.isfinite(depth.ravel()))
     if illumination.aerial_perspective is not None and len(shown):
-        none = (np.zeros(0, np.int64), np.zeros((0, 1), np.float32))
-        places = air_places(camera, shown, depth.ravel()[shown], none)
-        transmittance, airlight = air_at(places, illumination.aerial_perspective)
+        transmittance, airlight = _air(camera, illumination.aerial_perspective, shown, depth.ravel()[shown])
         image[shown] = image[shown] * transmittance + airlight * cover[shown, None]
     hole = np.flatnonzero(cover < 1.0)
     if len(hole):
         sky = open_sky(sky_grid(camera, hole), illumination, float(np.degrees(1.0 / camera.fx)))
         image[hole] += (1.0 - cover[hole, None]) * sky
     return image.reshape(surface.shape)
+
+
+def _air(
+    camera: Camera, air: AerialPerspective, pixel: np.ndarray, depth_m: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Transmittance and airlight ``(n, 3)`` of pixels: from a coarse grid, or one by one where there are no lanes."""
+    from seasonscapes.rendering.air_grid import air_at, air_places
+
+    if use_backend().device == "scalar":
+        row, column = np.divmod(pixel, camera.width_px)
+        transmittance, airlight = air(depth_m, ray_directions(camera, np.stack([column, row], axis=-1) + 0.5))
+        return np.asarray(transmittance, np.float32), np.asarray(airlight, np.float32)
+    none = (np.zeros(0, np.int64), np.zeros((0, 1), np.float32))
+    return air_at(air_places(camera, pixel, depth_m, none), air)
