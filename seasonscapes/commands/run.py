@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from seasonscapes.commands.options import PlaceOptions, SkyOptions, ViewOptions
-from seasonscapes.commands.talk import finish, say
+from seasonscapes.commands.talk import finish, progress_bar, say
 from seasonscapes.errors import InputError
 
 if TYPE_CHECKING:
@@ -195,66 +195,74 @@ def _moment(time: str) -> datetime:
 
 def _pictures(job: Job, land: Place, folder: Path) -> list[Path]:
     """A synthetic scene's photographs, or a copy of a real one's list that does not change while we work."""
-    from seasonscapes.cameras.observation import ManifestRow, read_manifest, write_manifest
+    from seasonscapes.cameras.observation import read_manifest, write_manifest
     from seasonscapes.commands.paint import chosen_cameras
     from seasonscapes.commands.talk import parse_size
-    from seasonscapes.commands.webcam_shots import make_webcams
+    from seasonscapes.commands.webcam_shots import make_webcam_series
 
     own = folder / "pictures"
-    rows: list[ManifestRow] = []
     if job.pictures.manifest is not None:
         base = job.pictures.manifest.parent.resolve()
         rows = [replace(row, path=str(base / row.path)) for row in read_manifest(job.pictures.manifest)]
         write_manifest(own / "manifest.csv", rows)
         return [own / "manifest.csv"]
     cameras = chosen_cameras(land, job.pictures.leave_out, parse_size(job.pictures.photo_size))
-    files = []
-    for time in job.times:
-        made = make_webcams(land, _moment(time), job.sky.model(), own / _stamp(time), cameras=cameras, seed=job.seed)
-        for row in read_manifest(made.manifest):
-            rows.append(replace(row, path=f"{_stamp(time)}/{row.path}"))
-            files += [own / rows[-1].path, own / _stamp(time) / f"{row.webcam}_calibration.json"]
-        say(f"run: pictures: {time}")
-    write_manifest(own / "manifest.csv", rows)
-    return [own / "manifest.csv", *files]
+    with progress_bar(f"photographing from {len(cameras)} webcams") as progress:
+        moments = [_moment(time) for time in job.times]
+        make_webcam_series(land, moments, job.sky.model(), own, cameras=cameras, seed=job.seed, progress=progress)
+    pictures = [own / row.path for row in read_manifest(own / "manifest.csv")]
+    return [own / "manifest.csv", *pictures, *(own / f"{name}_calibration.json" for name in cameras)]
 
 
 def _calibrate(job: Job, land: Place, folder: Path) -> list[Path]:
     """Real webcams bring their records. Synthetic ones are found by their skylines from a compass's guess."""
+    own = folder / "calibration"
+    if job.pictures.manifest is not None:
+        return _copied_records(job.pictures.calibrations, own)
+    files = _found_by_skyline(job, land, folder / "pictures", own)
+    if not files:
+        raise InputError("run", "no webcam could be calibrated", cure="choose --times with a clear skyline")
+    return files
+
+
+def _copied_records(source: Path, own: Path) -> list[Path]:
+    from seasonscapes.images import atomic_path
+
+    copies = []
+    for record in sorted(source.glob("*_calibration.json")):
+        with atomic_path(own / record.name) as temporary:
+            temporary.write_bytes(record.read_bytes())
+        copies.append(own / record.name)
+    if not copies:
+        raise InputError("--calibrations", "holds no record", got=str(source),
+                         cure="seasonscapes calibrate SCENE --webcam ... -o FOLDER")  # fmt: skip
+    return copies
+
+
+def _found_by_skyline(job: Job, land: Place, taken: Path, own: Path) -> list[Path]:
+    """Records of the webcams whose skyline can be trusted, from the picture in the middle of the times."""
     import numpy as np
 
     from seasonscapes.calibration.pose_model import values_of, view_from_values
     from seasonscapes.calibration.record import read_calibration, write_calibration
     from seasonscapes.calibration.skyline import align_to_skyline, encoded_from_file
-    from seasonscapes.images import atomic_path
+    from seasonscapes.cameras.observation import read_manifest
 
-    own = folder / "calibration"
-    if job.pictures.manifest is not None:
-        copies = []
-        for record in sorted(job.pictures.calibrations.glob("*_calibration.json")):
-            with atomic_path(own / record.name) as temporary:
-                temporary.write_bytes(record.read_bytes())
-            copies.append(own / record.name)
-        if not copies:
-            raise InputError("--calibrations", "holds no record", got=str(job.pictures.calibrations),
-                             cure="seasonscapes calibrate SCENE --webcam ... -o FOLDER")  # fmt: skip
-        return copies
-    taken = folder / "pictures" / _stamp(job.times[len(job.times) // 2])
+    middle = _moment(job.times[len(job.times) // 2])
+    photograph = {row.webcam: taken / row.path for row in read_manifest(taken / "manifest.csv") if row.time == middle}
     files = []
     for record in sorted(taken.glob("*_calibration.json")):
         pose = read_calibration(record)
         rng = np.random.default_rng([job.seed, zlib.crc32(pose.webcam.encode())])
         values = values_of(pose.view, np.eye(3))
         values[0] += rng.uniform(-_COMPASS_DEG, _COMPASS_DEG)
-        image = encoded_from_file(taken / f"{pose.webcam}.png")
-        fit = align_to_skyline(image, view_from_values(pose.view, np.eye(3), values), [land.elevation], pose.frame)
+        guess = view_from_values(pose.view, np.eye(3), values)
+        fit = align_to_skyline(encoded_from_file(photograph[pose.webcam]), guess, [land.elevation], pose.frame)
         if fit.calibration is None or fit.doubts:
             say(f"run: calibrate: {pose.webcam} is left out: {'; '.join(fit.doubts)}")
             continue
         write_calibration(own / record.name, pose.webcam, fit.calibration, pose.frame)
         files.append(own / record.name)
-    if not files:
-        raise InputError("run", "no webcam could be calibrated", cure="choose --times with a clear skyline")
     return files
 
 

@@ -145,6 +145,15 @@ def make_webcams(place: Place, time: datetime, model: SkyModel, folder: Path, *,
 
     Poses are off by what a good calibration leaves (0.01° and 0.5 m), and the records say so.
     """
+    return make_webcam_series(place, [time], model, folder, cameras=cameras, seed=seed, progress=progress)
+
+
+def make_webcam_series(place: Place, times: Sequence[datetime], model: SkyModel, folder: Path, *,
+                       cameras: dict[str, Camera], seed: int = 0, progress: Progress | None = None) -> Sources:  # fmt: skip
+    """`make_webcams` at several times; each webcam's light transport is traced once for all of them.
+
+    Pictures of a single time bear the webcam's name alone, those of several its name and time.
+    """
     from seasonscapes.cameras.observation import ManifestRow, write_manifest
     from seasonscapes.daylight import light_for
     from seasonscapes.evaluation.synthetic_webcams import Hour, webcam_series
@@ -154,17 +163,25 @@ def make_webcams(place: Place, time: datetime, model: SkyModel, folder: Path, *,
 
     tell = progress or (lambda share: None)
     sigmas = PoseSigmas(0.5, 0.5, 0.01, 0.01, 0.01)
+    albedos: dict[int, np.ndarray] = {}
     rows = []
     for number, (name, camera) in enumerate(cameras.items()):
-        picture, record = folder / f"{name}.png", folder / f"{name}_calibration.json"
-        if not (picture.is_file() and record.is_file()):
-            light, _ = light_for(place, camera, model, time)
-            hour = Hour(time, light, albedo_for(place, time).values)
-            made = webcam_series(place.terrain, name, camera, [hour], poses=sigmas, seed=seed,
-                                 progress=lambda share, n=number: tell((n + share) / len(cameras)))[0]  # fmt: skip
-            write_png8(picture, made.encoded)
-            _write_pose(record, name, made.observation.camera, sigmas, place.frame)
-        rows.append(ManifestRow(name, time, picture.name))
+        names = [f"{name}.png" if len(times) == 1 else f"{name}_{time:%Y%m%dT%H%M%SZ}.png" for time in times]
+        record = folder / f"{name}_calibration.json"
+        if not (record.is_file() and all((folder / each).is_file() for each in names)):
+            hours = []
+            for time in times:
+                day = time.timetuple().tm_yday
+                if day not in albedos:
+                    albedos[day] = albedo_for(place, time).values
+                hours.append(Hour(time, light_for(place, camera, model, time)[0], albedos[day]))
+            made = webcam_series(place.terrain, name, camera, hours, poses=sigmas, seed=seed,
+                                 progress=lambda share, n=number: tell((n + share) / len(cameras)))  # fmt: skip
+            for each, picture in zip(names, made, strict=True):
+                write_png8(folder / each, picture.encoded)
+            _write_pose(record, name, made[0].observation.camera, sigmas, place.frame)
+        rows += [ManifestRow(name, time, each) for time, each in zip(times, names, strict=True)]
+        tell((number + 1) / len(cameras))
     write_manifest(folder / "manifest.csv", rows)
     return Sources(folder / "manifest.csv", folder)
 
