@@ -1,6 +1,7 @@
 """Paths: exactly N views, passing their waypoints, twice differentiable, at constant speed, clear of the ground."""
 
 import json
+from itertools import pairwise
 
 import numpy as np
 import places
@@ -115,7 +116,7 @@ def test_smooth_turns_have_no_jerk_where_slerp_has():
     def jump(turn):
         """Largest change of the turning rate between neighbouring views [rad per view]."""
         rotations = [each.world_from_camera[:3, :3] for each in views_along(line, waypoints(), 2001, turn=turn)]
-        steps = [a.T @ b for a, b in zip(rotations[:-1], rotations[1:], strict=True)]
+        steps = [a.T @ b for a, b in pairwise(rotations)]
         rates = np.array([(m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]) for m in steps]) / 2.0
         return np.abs(np.diff(rates, axis=0)).max()
 
@@ -139,7 +140,7 @@ def test_look_at_keeps_the_place_in_the_middle_and_lenses_blend():
     for each in views:
         np.testing.assert_allclose(project(each, target)[0], [48.0, 32.0], atol=1e-6)
     assert views[-1].fx == pytest.approx(160.0)
-    assert all(a.fx <= b.fx + 1e-9 for a, b in zip(views[:-1], views[1:], strict=True))
+    assert all(a.fx <= b.fx + 1e-9 for a, b in pairwise(views))
     with pytest.raises(ValueError, match="straight above"):
         fly([camera([0, 0, 100]), camera([100, 0, 100])], 3, look_at_m=np.array([50.0, 0.0, 0.0]))
 
@@ -183,7 +184,7 @@ def test_a_path_is_lifted_over_a_hill_and_stays_smooth():
 
 
 def test_high_above_the_ground_nothing_is_lifted_and_off_the_land_there_is_none():
-    line = curve_through(places_of(waypoints()) + [0.0, 0.0, 2000.0])
+    line = curve_through(places_of(waypoints()) + np.array([0.0, 0.0, 2000.0]))
     same, most = cleared(line, hill, 60.0)
     assert same is line
     assert most == 0.0
@@ -209,7 +210,7 @@ def test_clearance_on_the_embedded_scene_by_rays(alpine, curve):
 
     def above(line):
         places_m = line.position(np.linspace(0.0, line.length_m, 4000))
-        high = places_m + [0.0, 0.0, 5000.0]
+        high = places_m + np.array([0.0, 0.0, 5000.0])
         down = np.broadcast_to([0.0, 0.0, -1.0], high.shape)
         return trace_rays(RenderScene(terrain.mi_scene, terrain.mi_terrain, None, 0.0), high, down).depth - 5000.0
 

@@ -16,6 +16,8 @@ from seasonscapes.errors import InputError
 
 _ELSE = "or take --method guided, which needs no weights"
 _ENDS = 1 << 20
+# As the format's own readers have it.
+_LONGEST_HEADER = 100_000_000
 _MODEL, _TEXT = "diffusion_pytorch_model", "model"
 
 
@@ -175,10 +177,12 @@ def _check_whole(path: Path, name: str) -> None:
     try:
         with open(path, "rb") as file:
             (length,) = struct.unpack("<Q", file.read(8))
+            if length > _LONGEST_HEADER:
+                raise ValueError(length)
             header = json.loads(file.read(length)) if length < size else {}
             ends = [tensor["data_offsets"][1] for key, tensor in header.items() if key != "__metadata__"]
             wanted = 8 + length + max(ends, default=0)
-    except (struct.error, json.JSONDecodeError, UnicodeDecodeError, TypeError, KeyError):
+    except (struct.error, ValueError, TypeError, KeyError):
         # A pointer of a version-control system that keeps large files elsewhere, or a page of an error.
         raise InputError(
             "--weights", f"{path} is no weights file", got=f"{size:,} bytes", cure=_how(None, name)
