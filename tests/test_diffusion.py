@@ -300,7 +300,7 @@ def test_wrong_and_half_downloaded_weights(weights, tmp_path):
 
     assert DEPTH in spoil(DEPTH, other_base)
     # Tensors that are whole but of another model.
-    spoil(BASE, lambda at: shutil.copy(at / DEPTH / name, at / unet))
+    assert "lacks" in spoil(f"{BASE}/unet", lambda at: shutil.copy(at / DEPTH / name, at / unet))
 
 
 def test_weights_by_shards_and_in_half_precision(weights, tmp_path):
@@ -431,7 +431,7 @@ def test_what_is_painted_is_what_the_model_gave(hill):
     canvas, steps = walked(hill, lambda view, tell: np.broadcast_to(green, view.picture.shape))
     white = white_radiance(canvas.values, canvas.painted)
     # But for rims, where a texel's pixels are painted ones too.
-    assert (np.abs(encode(steps[0].values, white) - green).max(axis=1) < 0.02).mean() > 0.8
+    assert np.median(np.abs(encode(steps[0].values, white) - green).max(axis=1)) < 1e-3
     # Composed: outside the hole (dilated for the model) the frame is the partial picture.
     shown = {}
 

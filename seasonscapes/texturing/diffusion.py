@@ -125,7 +125,9 @@ def load_painter(folder: Path | None, settings: DiffusionSettings, *, names: Wei
         Missing, wrong or half-downloaded weights, weights that do not fit each other, a missing extra, no such device.
     """
     names, machine = names or WeightNames(), machine or Machine()
-    places = {part: find_weights(folder, part, getattr(names, part)) for part in needed_parts(settings, image is not None)}
+    places = {
+        part: find_weights(folder, part, getattr(names, part)) for part in needed_parts(settings, image is not None)
+    }
     _require_extra()
     device, dtype = _device_of(machine)
     pipe = _assembled(places, settings, dtype)
@@ -214,10 +216,16 @@ def _read(kind: Any, place: Path, dtype: Any) -> Any:
     diffusers_made = kind.__module__.startswith("diffusers")
     stem, key = ("diffusion_pytorch_model", "torch_dtype") if diffusers_made else ("model", "dtype")
     try:
-        return kind.from_pretrained(place, variant=variant_of(place, stem), use_safetensors=True, local_files_only=True,
-                                    **{key: dtype}).eval()  # fmt: skip
+        model, report = kind.from_pretrained(place, variant=variant_of(place, stem), use_safetensors=True,
+                                             local_files_only=True, output_loading_info=True, **{key: dtype})  # fmt: skip
     except (SafetensorError, OSError, RuntimeError, ValueError) as error:
         raise InputError("--weights", f"{place} cannot be read: {_first_line(error)}") from None
+    # Tensors that a file lacks are left as they were made, at random: no picture would tell why.
+    lacking = [name for name in report["missing_keys"] if not name.endswith("position_ids")]
+    if lacking:
+        raise InputError("--weights", f"{place} lacks {len(lacking)} tensors of its model, such as {lacking[0]}",
+                         cure="these are the weights of something else")  # fmt: skip
+    return model.eval()
 
 
 def _check_fit(unet: Any, text: Any, nets: dict[str, Any], places: dict[str, Path]) -> None:
