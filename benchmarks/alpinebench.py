@@ -46,8 +46,10 @@ from alpinebench_scene import (  # noqa: E402
     take_pictures,
 )
 
-from seasonscapes.albedo.closed_form import EIGHT_BIT, LINEAR, AlbedoFit, make_shots, solve_albedo  # noqa: E402
+from seasonscapes.albedo.closed_form import AlbedoFit, solve_albedo  # noqa: E402
 from seasonscapes.albedo.forward import Land, ambient_on_texels, sun_on_texels, trace_land  # noqa: E402
+from seasonscapes.albedo.response import fit_response, with_response  # noqa: E402
+from seasonscapes.albedo.shots import EIGHT_BIT, LINEAR, make_shots  # noqa: E402
 from seasonscapes.evaluation.figures import comparison, steepest_window  # noqa: E402
 from seasonscapes.evaluation.lpips import load_lpips, missing_lpips  # noqa: E402
 from seasonscapes.evaluation.masks import land_mask  # noqa: E402
@@ -67,7 +69,6 @@ from seasonscapes.sky.illumination import Illumination, global_horizontal_illumi
 from seasonscapes.terrain.surface import Texture, sample_texture  # noqa: E402
 from seasonscapes.texturing.complete import complete  # noqa: E402
 from seasonscapes.texturing.guides import Guides, guides_for  # noqa: E402
-from seasonscapes.texturing.harmonise import straighten  # noqa: E402
 from seasonscapes.texturing.paint import Painting, PaintOptions, paint  # noqa: E402
 from seasonscapes.texturing.shots import Shot  # noqa: E402
 from seasonscapes.workspace import default_workspace  # noqa: E402
@@ -202,22 +203,21 @@ class Bench:
     ) -> np.ndarray:
         return complete(texture, guides or self.guides[at], method=method, fast=True, seed=self.world.seed).values
 
-    def solved(self, *, clean: bool = False, true_pose: bool = False, paintings: dict | None = None) -> AlbedoFit:
-        """Albedo from all painted hours' pictures, straightened where paintings tell their cameras' contrast."""
+    def solved(self, *, clean: bool = False, true_pose: bool = False, response: bool = True) -> AlbedoFit:
+        """Albedo from all painted hours' pictures; unless these are clean, their tone curve is searched for."""
         seen, lights, gains = [], [], []
         for at in self.world.painted_hours:
             for number, (one, _) in enumerate(
                 observed(self.pictures, self.world, at, clean=clean, true_pose=true_pose)
             ):
-                if paintings is not None:
-                    place = paintings[at].webcams.index(one.webcam)
-                    one = replace(one, image=straighten(one.image, paintings[at].harmony.contrast[place]))
                 if clean:
                     one = replace(one, image=self.pictures.painting[number][self.world.hours.index(at)].radiance)
                 seen.append(one)
                 lights.append(self.world.lights[at][number])
                 gains.append(np.ones(3) if clean else None)
         shots = make_shots(self.land, seen, lights, gains=gains, seed=self.world.seed)
+        if response and not clean:
+            shots = with_response(shots, fit_response(self.land, shots, seed=self.world.seed).strength)
         return solve_albedo(self.land, shots, trust=LINEAR if clean else EIGHT_BIT)
 
     def completed_albedo(self, fit: AlbedoFit) -> np.ndarray:
@@ -275,7 +275,7 @@ def stages(bench: Bench) -> tuple[dict[str, dict], dict]:
     fit = bench.solved(clean=True, true_pose=True)
     rows["albedo alone, clean + relight"] = judge.scores(judge.of_albedo(bench.completed_albedo(fit)), held)
     bench.clock.tell("albedo alone")
-    albedo_fit = bench.solved(paintings=paintings)
+    albedo_fit = bench.solved()
     albedo = bench.completed_albedo(albedo_fit)
     relit = judge.of_albedo(albedo)
     rows["all, held-out hours"] = judge.scores(relit, held)
@@ -293,7 +293,7 @@ def stages(bench: Bench) -> tuple[dict[str, dict], dict]:
 
 def satellite_view(bench: Bench) -> Callable:
     """The image from above, evenly lit, without air; its exposure is the best there is."""
-    judge, world = bench.judge, bench.world
+    judge = bench.judge
 
     def view(camera: int, at: datetime) -> np.ndarray:
         even = float(np.mean(global_horizontal_illuminance(judge.light(camera, at)))) / np.pi
@@ -356,6 +356,8 @@ def ablations(bench: Bench, whole: dict) -> tuple[dict[str, dict], dict[str, dic
         return judge.of_texture(whole["textures"][source] * np.float32(level), camera, at)
 
     late["no albedo (nearest painted hour)"] = judge.scores(nearest, held)
+    untold = bench.completed_albedo(bench.solved(response=False))
+    late["no tone curve searched"] = judge.scores(judge.of_albedo(untold), held)
     late["no painting (summer's image, relit)"] = judge.scores(summer, held)
     late["no aerial perspective"] = judge.scores(judge.of_albedo(whole["albedo"], air=False), held)
     late["satellite only, best exposure"] = judge.scores(satellite_view(bench), held)

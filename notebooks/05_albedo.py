@@ -1,0 +1,93 @@
+# ---
+# jupyter:
+#   jupytext:
+#     formats: ipynb,py:percent
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # Albedo: what the land is, without the light
+#
+# Pictures of several hours, the sun and the sky known, tell the land's albedo: shadows of one hour are sunlit in another.
+
+# %%
+from datetime import UTC, datetime
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from seasonscapes.albedo.closed_form import solve_albedo
+from seasonscapes.albedo.forward import trace_land
+from seasonscapes.albedo.shots import EIGHT_BIT, make_shots
+from seasonscapes.albedo.uncertainty import texel_sigma, times_sunlit
+from seasonscapes.daylight import light_for
+from seasonscapes.evaluation.surfaces import albedo_error
+from seasonscapes.evaluation.synthetic_webcams import Hour, webcam_series
+from seasonscapes.evaluation.webcam_faults import WebcamFaults
+from seasonscapes.images import srgb_from_linear
+from seasonscapes.pipeline import MeshOptions, albedo_for, camera_for, load_place
+from seasonscapes.rendering.transport import Effort
+from seasonscapes.sky.models import read_sky_model
+from seasonscapes.workspace import default_workspace
+
+# %% [markdown]
+# Two webcams, four hours, exposures and white balances unknown.
+
+# %%
+place = load_place(Path("small.toml"), default_workspace(), options=MeshOptions(texel_m=40.0))
+day, model = datetime(2024, 9, 11, tzinfo=UTC), read_sky_model("clear")
+truth = albedo_for(place, day).values
+effort = Effort(subpixels=4, shades=16, rays=64, senders=1024, listed=32, rank=24)
+observations, lights, shown = [], [], []
+for name in ("west", "south"):
+    camera = camera_for(place, place.scene.camera(name), size_px=(180, 120))
+    times = [day.replace(hour=hour) for hour in (7, 10, 13, 15)]
+    hours = [Hour(time, light_for(place, camera, model, time)[0], truth) for time in times]
+    pictures = webcam_series(place.terrain, name, camera, hours, faults=WebcamFaults(tone_strength=0.0), effort=effort)
+    observations += [picture.observation for picture in pictures]
+    lights += [hour.illumination for hour in hours]
+    shown.append(np.concatenate([picture.encoded for picture in pictures], axis=1))
+plt.figure(figsize=(14, 5))
+plt.imshow(np.concatenate(shown))
+_ = plt.axis("off")
+
+# %% [markdown]
+# Light on every texel and the texels under every pixel are traced; then albedo and gains follow from one robust, sparse
+# least-squares problem.
+
+# %%
+land = trace_land(place.terrain, truth.shape[:2], effort=Effort(subpixels=1, rays=64, listed=32, senders=1024, rank=24))
+shots = make_shots(land, observations, lights)
+fit = solve_albedo(land, shots, trust=EIGHT_BIT)
+seen = fit.seen >= 1.0
+print(albedo_error(truth, fit.albedo, seen))
+
+# %%
+figure, axes = plt.subplots(1, 3, figsize=(15, 5))
+for axis, (name, values) in zip(axes, {"truth": truth, "recovered": fit.albedo, "error × 4": 4 * np.abs(fit.albedo - truth)}.items(),
+                                strict=True):  # fmt: skip
+    axis.imshow(srgb_from_linear(values * seen[..., None]))
+    axis.set_title(name)
+    axis.axis("off")
+
+# %% [markdown]
+# How well it is known, and why: texels that no picture shows in sunlight are known worse.
+
+# %%
+figure, axes = plt.subplots(1, 2, figsize=(12, 5))
+sigma = texel_sigma(fit)
+shown = axes[0].imshow(np.where(np.isfinite(sigma), sigma, np.nan), vmax=0.1)
+figure.colorbar(shown, ax=axes[0], label="standard deviation")
+shown = axes[1].imshow(times_sunlit(shots))
+figure.colorbar(shown, ax=axes[1], label="pictures in sunlight")
+for axis in axes:
+    axis.axis("off")

@@ -1,0 +1,99 @@
+# ---
+# jupyter:
+#   jupytext:
+#     formats: ipynb,py:percent
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # Relighting: one view, any hour, any season
+#
+# Path tracing answers one instant at a time. Daylight coefficients are traced once for a view; each instant then is a
+# product of matrices and a few shadow rays, with the same bounces and without noise.
+
+# %%
+import time as clock
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from seasonscapes.daylight import light_for
+from seasonscapes.evaluation.masks import land_mask
+from seasonscapes.evaluation.metrics import score
+from seasonscapes.exposure import develop, exposure_ev100
+from seasonscapes.images import srgb_from_linear
+from seasonscapes.pipeline import albedo_for, camera_for, load_place
+from seasonscapes.rendering.gather import occluder
+from seasonscapes.rendering.radiance import render_view
+from seasonscapes.rendering.relit_view import ready_view, relight_view, senders_albedo, with_albedo
+from seasonscapes.rendering.scene import RenderScene, build_scene, mi_mesh, set_albedo
+from seasonscapes.rendering.transport import Effort, trace_view, view_albedo
+from seasonscapes.sky.models import read_sky_model
+from seasonscapes.workspace import default_workspace
+
+
+def shown(radiance: np.ndarray) -> np.ndarray:
+    return srgb_from_linear(develop(radiance, exposure_ev100(radiance)))
+
+
+# %% [markdown]
+# Trace the view once.
+
+# %%
+place = load_place(Path("small.toml"), default_workspace())
+camera = camera_for(place, place.scene.camera("unseen"), size_px=(270, 180))
+autumn = datetime(2024, 9, 18, tzinfo=UTC)
+land = occluder(mi_mesh(place.terrain, albedo_for(place, autumn).values))
+start = clock.perf_counter()
+coefficients = trace_view(land, camera, Effort(subpixels=4, shades=16, rays=128, senders=2048, listed=32, rank=24))
+ready = ready_view(land, coefficients)
+print(f"traced in {clock.perf_counter() - start:.1f} s")
+
+# %% [markdown]
+# A day. Each frame is exposed as a camera would.
+
+# %%
+model = read_sky_model("clear")
+hours = [autumn + timedelta(hours=hour) for hour in (6.0, 8.0, 11.0, 14.0, 16.5, 17.6)]
+lights = [light_for(place, camera, model, hour)[0] for hour in hours]
+start = clock.perf_counter()
+views = [relight_view(ready, light) for light in lights]
+print(f"{(clock.perf_counter() - start) / len(views):.2f} s a frame")
+figure, axes = plt.subplots(2, 3, figsize=(14, 6.5))
+for axis, hour, view in zip(axes.ravel(), hours, views, strict=True):
+    axis.imshow(shown(view.radiance))
+    axis.set_title(f"{hour:%H:%M} UTC")
+    axis.axis("off")
+
+# %% [markdown]
+# Against path tracing, over the land: what is left is its noise.
+
+# %%
+traced = render_view(build_scene(place.terrain, albedo_for(place, autumn).values, lights[2]), camera, spp=64)
+ev100 = exposure_ev100(traced.radiance)
+pair = [srgb_from_linear(develop(radiance, ev100)) for radiance in (traced.radiance, views[2].radiance)]
+print(score(*pair, land_mask(traced.gbuffer.depth)))
+
+# %% [markdown]
+# Seasons: the same coefficients with another day's colours.
+
+# %%
+figure, axes = plt.subplots(1, 3, figsize=(14, 3.4))
+for axis, (month, day) in zip(axes, ((2, 10), (5, 20), (7, 20)), strict=True):
+    noon = datetime(2024, month, day, 11, tzinfo=UTC)
+    colours = albedo_for(place, noon).values
+    set_albedo(RenderScene(land.mi_scene, land.mi_terrain, lights[0], 0.0), colours)
+    clothed = with_albedo(ready, view_albedo(land, coefficients), senders_albedo(coefficients, colours))
+    axis.imshow(shown(relight_view(clothed, light_for(place, camera, model, noon)[0]).radiance))
+    axis.set_title(f"{noon:%d %B}")
+    axis.axis("off")

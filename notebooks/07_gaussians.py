@@ -1,0 +1,107 @@
+# ---
+# jupyter:
+#   jupytext:
+#     formats: ipynb,py:percent
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # Gaussians: relit renders distilled into splats
+#
+# Discs on the terrain know their horizon, their share of the sky and their albedo, and learn what is left from lit
+# surfaces. They then answer for hours that they have not seen.
+
+# %%
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from seasonscapes.daylight import light_at, moment_at
+from seasonscapes.gaussians.appearance import Appearance, colours_at, fourier_embedding
+from seasonscapes.gaussians.distil import Schedule, distil, lessons_from
+from seasonscapes.gaussians.rasterise import choose_threads, splat_colours, view_weights
+from seasonscapes.gaussians.surfels import surfel_albedo, terrain_surfels
+from seasonscapes.gaussians.transport import light_state, neighbourhood_mean, surfel_irradiance, trace_transport
+from seasonscapes.gaussians.views import facing, overview_cameras
+from seasonscapes.images import srgb_from_linear
+from seasonscapes.pipeline import MeshOptions, albedo_for, load_place
+from seasonscapes.rendering.gather import occluder
+from seasonscapes.rendering.relit_view import ready_view, relight_view
+from seasonscapes.rendering.scene import mi_mesh
+from seasonscapes.rendering.transport import Effort, trace_view
+from seasonscapes.sky.models import read_sky_model
+from seasonscapes.workspace import default_workspace
+
+choose_threads(1)
+
+# %% [markdown]
+# Discs, one for every 75 m of ground, and how light reaches them.
+
+# %%
+place = load_place(Path("small.toml"), default_workspace(), options=MeshOptions(texel_m=25.0))
+day = datetime(2024, 9, 11, tzinfo=UTC)
+texture = albedo_for(place, day).values
+land = occluder(mi_mesh(place.terrain, texture))
+surfels = terrain_surfels(place.terrain, 75.0)
+albedo = surfel_albedo(surfels, texture)
+around = neighbourhood_mean(surfels.means, albedo, surfels.plan.spacing_m)
+transport = trace_transport(land, surfels, albedo, rays=64)
+print(f"{len(albedo):,} discs, mean sky-view factor {transport.open_sky.mean():.2f}")
+
+# %% [markdown]
+# Lessons: eight hours through the year.
+
+# %%
+model, at = read_sky_model("clear"), (place.frame.latitude_deg, place.frame.longitude_deg)
+
+
+def lit(time: datetime):
+    light = light_at(model, moment_at(time, *at), 2000.0, workspace=place.workspace)
+    return light, light_state(transport, light, float(time.timetuple().tm_yday))
+
+
+lessons_at = [datetime(2024, month, 11, hour, tzinfo=UTC)
+              for month, hour in ((1, 11), (3, 8), (4, 15), (5, 6), (6, 12), (7, 17), (9, 9), (10, 14))]  # fmt: skip
+lights, states = zip(*(lit(time) for time in lessons_at), strict=True)
+lessons = lessons_from(states, [0] * len(states), albedo[None], surfel_irradiance(land, surfels, lights, rays=64))
+appearance = Appearance(
+    "full", albedo[None], around[None], transport, fourier_embedding(surfels.means), times=len(states)
+)
+losses = distil(appearance, lessons, schedule=Schedule(surface_steps=250))
+plt.semilogy(np.convolve(losses, np.ones(20) / 20, "valid"))
+plt.xlabel("step")
+_ = plt.ylabel("loss")
+
+# %% [markdown]
+# An hour between the lessons, from a camera above: relit from daylight coefficients, and splatted. The error is over pixels
+# that are all land.
+
+# %%
+camera = overview_cameras(place.terrain, 1, size_px=160, first_deg=200.0)[0]
+light, state = lit(day + timedelta(hours=7.5))
+ready = ready_view(
+    land, trace_view(land, camera, Effort(subpixels=4, shades=16, rays=128, senders=2048, listed=32, rank=24))
+)
+truth = relight_view(ready, light).surface * np.float32(np.pi / state.global_lx)
+weights = view_weights(facing(surfels, camera), camera, subpixels=2)
+splats = splat_colours(weights, colours_at(appearance, state)) / np.maximum(weights.coverage, 1e-3)[..., None]
+pair = [srgb_from_linear(picture) for picture in (truth, splats)]
+solid = (ready.coverage > 0.999) & (weights.coverage > 0.5)
+print(f"{-10 * np.log10(np.mean((pair[0] - pair[1])[solid] ** 2)):.1f} dB")
+figure, axes = plt.subplots(1, 3, figsize=(14, 5))
+for axis, (name, picture) in zip(axes, {"relit": pair[0], "splats": pair[1] * solid[..., None],
+                                        "difference × 4": 4 * np.abs(pair[0] - pair[1]) * solid[..., None]}.items(),
+                                 strict=True):  # fmt: skip
+    axis.imshow(np.clip(picture, 0, 1))
+    axis.set_title(name)
+    axis.axis("off")
