@@ -431,7 +431,7 @@ def test_what_is_painted_is_what_the_model_gave(hill):
     canvas, steps = walked(hill, lambda view, tell: np.broadcast_to(green, view.picture.shape))
     white = white_radiance(canvas.values, canvas.painted)
     # But for rims, where a texel's pixels are painted ones too.
-    assert np.median(np.abs(encode(steps[0].values, white) - green).max(axis=1)) < 1e-3
+    assert np.median(np.abs(encode(steps[0].values, white) - green).max(axis=1)) < 0.02
     # Composed: outside the hole (dilated for the model) the frame is the partial picture.
     shown = {}
 

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from seasonscapes.pipeline import Place
+    from seasonscapes.terrain.surface import Texture
     from seasonscapes.texturing.complete import Completed
     from seasonscapes.texturing.diffusion import DiffusionSettings, Painter
     from seasonscapes.texturing.guides import Guides
@@ -134,7 +135,7 @@ class Effort:
     cloudiness: float = 0.0
 
 
-def complete_along_path(land: Place, painted: Any, guides: Guides, time: datetime, flags: DiffusionOptions,
+def complete_along_path(land: Place, painted: Texture, guides: Guides, time: datetime, flags: DiffusionOptions,
                         effort: Effort) -> tuple[Completed, dict[str, Any]]:  # fmt: skip
     """Paint along the path, complete what is left by guided, and film it; what was completed, and plain facts about it."""
     import numpy as np
@@ -153,17 +154,19 @@ def complete_along_path(land: Place, painted: Any, guides: Guides, time: datetim
         say(f"prompt: {prompt}")
     if painter.slow:
         say("on a CPU these weights take over an hour for each view of 1536 × 1024 with 50 steps; a GPU takes seconds")
-    with progress_bar("completing (guided)") as progress:
-        alone = complete(painted, guides, method="guided", fast=effort.fast, seed=effort.seed, progress=progress)
+
+    def guided(texture: Texture, detail: float, title: str) -> Completed:
+        with progress_bar(title) as progress:
+            return complete(texture, guides, detail=detail, fast=effort.fast, seed=effort.seed, progress=progress)
+
+    alone = guided(painted, 0.0, "completing (guided)") if flags.hybrid else None
     walk = Walk(painted, cameras, tiling(land.terrain, land.atlas), occluder(mi_mesh(land.terrain, np.full(3, 0.2))),
-                alone.values if flags.hybrid else None)  # fmt: skip
+                None if alone is None else alone.values)  # fmt: skip
     canvas = Canvas(painted)
     folder = _folder(land, painted, flags, effort, identity)
     told = _walked(walk, canvas, painter, flags, effort, folder, guides.surface)
-    with progress_bar("completing the rest (guided)") as progress:
-        rest = complete(canvas.texture(), guides, method="guided", detail=effort.detail, fast=effort.fast, seed=effort.seed,
-                        progress=progress)  # fmt: skip
-    completed = joined(rest, alone, canvas)
+    rest = guided(canvas.texture(), effort.detail, "completing the rest (guided)")
+    completed = joined(rest, alone or guided(painted, 0.0, "judging what was painted (guided)"), canvas)
     told |= {"prompt": prompt, "views_folder": str(folder), "weights": identity["weights"], "film": None}
     if flags.film is not None:
         told["film"] = _filmed(walk, canvas, completed.values, flags, effort)
@@ -226,7 +229,7 @@ def _guide_picture(path: Path) -> np.ndarray:
         raise InputError("--guide-image", str(error)) from None
 
 
-def _folder(land: Place, painted: Any, flags: DiffusionOptions, effort: Effort, identity: dict[str, Any]) -> Path:
+def _folder(land: Place, painted: Texture, flags: DiffusionOptions, effort: Effort, identity: dict[str, Any]) -> Path:
     """Where the views of exactly this run lie."""
     import hashlib
 
