@@ -34,12 +34,13 @@ sys.path.insert(0, str(HERE))
 
 from albedo_scene import Truth, hours, lights_for, make_truth, path_traced  # noqa: E402
 
-from seasonscapes.albedo.closed_form import EIGHT_BIT, LINEAR, AlbedoFit, make_shots, solve_albedo  # noqa: E402
+from seasonscapes.albedo.closed_form import AlbedoFit, solve_albedo  # noqa: E402
 from seasonscapes.albedo.corrections import CORRECTIONS, slopes_under  # noqa: E402
 from seasonscapes.albedo.forward import sun_on_texels, trace_land  # noqa: E402
 from seasonscapes.albedo.haze import fit_visibility  # noqa: E402
 from seasonscapes.albedo.painted import painted_radiance  # noqa: E402
 from seasonscapes.albedo.response import fit_response, with_response  # noqa: E402
+from seasonscapes.albedo.shots import EIGHT_BIT, LINEAR, make_shots  # noqa: E402
 from seasonscapes.cameras.observation import Observation  # noqa: E402
 from seasonscapes.evaluation.webcam_faults import WebcamFaults, degrade  # noqa: E402
 from seasonscapes.exposure import develop, exposure_ev100  # noqa: E402

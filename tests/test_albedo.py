@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from albedo_cases import Case, case, psnr
 
-from seasonscapes.albedo import closed_form, corrections, haze, response, seasons
-from seasonscapes.albedo.closed_form import EIGHT_BIT, Effort, Shot, make_shots, solve_albedo
+from seasonscapes.albedo import corrections, equations, haze, response, seasons
+from seasonscapes.albedo.closed_form import Effort, solve_albedo
 from seasonscapes.albedo.forward import ambient_on_texels, surface_radiance
 from seasonscapes.albedo.inverse import Extra, InverseOptions, refine_albedo
 from seasonscapes.albedo.mitsuba_pictures import SKY, differentiable_views, mi_picture
 from seasonscapes.albedo.painted import painted_radiance
+from seasonscapes.albedo.shots import EIGHT_BIT, Shot, make_shots
 from seasonscapes.albedo.uncertainty import KnownAlbedo, known_albedo
 from seasonscapes.evaluation.webcam_faults import WebcamFaults, degrade
 from seasonscapes.frames import direction_from_angles
@@ -76,12 +77,12 @@ def test_rows_are_means_of_the_texture(shots):
 
 def test_adjoint_is_the_transpose(place, shots):
     rng = np.random.default_rng(0)
-    row = closed_form._rows(shots[4], EIGHT_BIT, place.albedo.size // 3)
+    row = equations.rows_of(shots[4], EIGHT_BIT, place.albedo.size // 3)
     row.ambient = ambient_on_texels(place.land, shots[4].light, place.albedo)
     a = rng.random((place.albedo.size // 3, 3), np.float32)
-    model, _ = closed_form._model(row, a)
+    model, _ = equations.model_of(row, a)
     r = rng.random(model.shape, np.float32)
-    left, right = (model.astype(float) * r).sum(), (a.astype(float) * closed_form._adjoint(row, r)).sum()
+    left, right = (model.astype(float) * r).sum(), (a.astype(float) * equations.adjoint(row, r)).sum()
     assert left == pytest.approx(right, rel=1e-5)
 
 
@@ -139,7 +140,9 @@ def test_wrong_light_is_clearly_worse(place, clean, wrong):
     shots = make_shots(place.land, observations, lights, gains=[np.ones(3)] * len(lights))
     fit = solve_albedo(place.land, shots, effort=QUICK)
     seen = clean.seen >= 1.0
-    assert psnr(fit.albedo, place.albedo, seen) < psnr(clean.albedo, place.albedo, seen) - (4.0 if wrong == "hour" else 8.0)
+    assert psnr(fit.albedo, place.albedo, seen) < psnr(clean.albedo, place.albedo, seen) - (
+        4.0 if wrong == "hour" else 8.0
+    )
     assert np.median(fit.residual) > 2.0 * np.median(clean.residual), "and the residual tells"
 
 

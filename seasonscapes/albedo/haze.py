@@ -13,8 +13,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from seasonscapes.albedo.closed_form import LINEAR, AlbedoFit, Effort, Shot, Trust, solve_albedo, thinned_shots
+from seasonscapes.albedo.closed_form import AlbedoFit, Effort, solve_albedo
 from seasonscapes.albedo.forward import Land
+from seasonscapes.albedo.shots import LINEAR, Shot, Trust, thinned_shots
 from seasonscapes.sky.illumination import AerialPerspective, Illumination, Luminary
 
 LightsOf = Callable[[float], Sequence[Illumination]]

@@ -16,9 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from seasonscapes.albedo.closed_form import HIGHEST, LINEAR, LOWEST, AlbedoFit, Shot, Trust, pixel_weights
+from seasonscapes.albedo.closed_form import HIGHEST, LOWEST, AlbedoFit, pixel_weights
 from seasonscapes.albedo.forward import Land
 from seasonscapes.albedo.mitsuba_pictures import DifferentiableViews, differentiable_views, mi_picture
+from seasonscapes.albedo.shots import LINEAR, Shot, Trust
 from seasonscapes.images import atomic_path
 from seasonscapes.terrain.surface import Terrain
 

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from seasonscapes.albedo.closed_form import Shot
 from seasonscapes.albedo.forward import air_between
+from seasonscapes.albedo.shots import Shot
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.rendering.backend import use_backend
 from seasonscapes.rendering.scene import mi_mesh, relight

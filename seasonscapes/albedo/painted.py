@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from seasonscapes.albedo.closed_form import Shot
 from seasonscapes.albedo.footprints import whole_pixels
 from seasonscapes.albedo.forward import air_between
+from seasonscapes.albedo.shots import Shot
 
 
 def painted_radiance(shots: Sequence[Shot], gains: np.ndarray) -> dict:

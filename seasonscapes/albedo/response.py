@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from seasonscapes.albedo.closed_form import EIGHT_BIT, AlbedoFit, Effort, Shot, Trust, solve_albedo, thinned_shots
+from seasonscapes.albedo.closed_form import AlbedoFit, Effort, solve_albedo
 from seasonscapes.albedo.forward import Land
+from seasonscapes.albedo.shots import EIGHT_BIT, Shot, Trust, thinned_shots
 from seasonscapes.images import linear_from_srgb, srgb_from_linear
 
 _QUICK = Effort(rounds=3, iterations=8)

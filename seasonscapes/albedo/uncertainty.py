@@ -13,8 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from seasonscapes.albedo.closed_form import HIGHEST, LOWEST, AlbedoFit, Shot
+from seasonscapes.albedo.closed_form import HIGHEST, LOWEST, AlbedoFit
 from seasonscapes.albedo.forward import Land
+from seasonscapes.albedo.shots import Shot
 
 # What the gains, the haze and the sky leave unknown of every texel, relative.
 _COMMON = 0.01

@@ -18,8 +18,9 @@ from seasonscapes.errors import InputError
 if TYPE_CHECKING:
     import numpy as np
 
-    from seasonscapes.albedo.closed_form import AlbedoFit, Shot
+    from seasonscapes.albedo.closed_form import AlbedoFit
     from seasonscapes.albedo.forward import Land
+    from seasonscapes.albedo.shots import Shot
     from seasonscapes.albedo.uncertainty import KnownAlbedo
     from seasonscapes.cameras.observation import Observation
     from seasonscapes.pipeline import Place
@@ -186,10 +187,10 @@ def _lights(land: Place, observations: Sequence[Observation], model: SkyModel) -
 
 def _prepared(land: Place, observations: list[Observation], model: SkyModel, *, fit_haze: bool,
               fit_curve: bool) -> tuple[Land, list[Shot], dict[str, Any]]:  # fmt: skip
-    from seasonscapes.albedo.closed_form import EIGHT_BIT, make_shots
     from seasonscapes.albedo.forward import trace_land
     from seasonscapes.albedo.haze import fit_visibility
     from seasonscapes.albedo.response import fit_response, with_response
+    from seasonscapes.albedo.shots import EIGHT_BIT, make_shots
     from seasonscapes.sky.models import with_overrides
 
     facts: dict[str, Any] = {}
@@ -220,8 +221,9 @@ def _prepared(land: Place, observations: list[Observation], model: SkyModel, *, 
 
 
 def _solved(land: Place, traced: Land, shots: list[Shot], refine: int) -> tuple[AlbedoFit, KnownAlbedo]:
-    from seasonscapes.albedo.closed_form import EIGHT_BIT, solve_albedo
+    from seasonscapes.albedo.closed_form import solve_albedo
     from seasonscapes.albedo.inverse import InverseOptions, refine_albedo
+    from seasonscapes.albedo.shots import EIGHT_BIT
     from seasonscapes.albedo.uncertainty import known_albedo
 
     try:
