@@ -135,8 +135,6 @@ class Truth:
 
     pictures: np.ndarray
     solid: np.ndarray
-    sunny: np.ndarray
-    facing: np.ndarray
 
 
 def truth_of(scene: Scene, terrain, camera, lights, states, *, seed: int = 3) -> Truth:
@@ -149,13 +147,9 @@ def truth_of(scene: Scene, terrain, camera, lights, states, *, seed: int = 3) ->
 
     below = cv2.dilate(scene.underside(camera).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     solid = (ready.coverage > 0.999) & ~below
-    pictures, sunny, facing = [], [], []
-    for light, state in zip(lights, states, strict=True):
-        pictures.append(relight_view(ready, light).surface * np.float32(np.pi / state.global_lx))
-        shown, faced = shadow_truth(scene, terrain, ready.gbuffer, np.asarray(light.sun.direction))
-        sunny.append(shown)
-        facing.append(faced & solid)
-    return Truth(np.stack(pictures), solid, np.stack(sunny), np.stack(facing))
+    pictures = [relight_view(ready, light).surface * np.float32(np.pi / state.global_lx)
+                for light, state in zip(lights, states, strict=True)]  # fmt: skip
+    return Truth(np.stack(pictures), solid)
 
 
 def shadow_truth(scene: Scene, terrain, gbuffer, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -180,7 +174,7 @@ def psnr(picture: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
 class Contest:
     """Discs, lessons, frames and truth, and what each contestant makes of them."""
 
-    def __init__(self, scene: Scene, seed: int):
+    def __init__(self, scene: Scene, seed: int, *, learn: bool = True):
         from seasonscapes.gaussians.distil import Frame, lessons_from
         from seasonscapes.gaussians.rasterise import view_weights
         from seasonscapes.gaussians.surfels import surfel_albedo, terrain_surfels
@@ -197,7 +191,12 @@ class Contest:
         self.seconds["transport"] = time.perf_counter() - start
         self.lights, days = scene.lights(sizes.suns + sizes.held_out)
         self.states = [light_state(self.transport, light, day) for light, day in zip(self.lights, days, strict=True)]
-        self.suns = sizes.suns
+        self.suns, self.held_out = sizes.suns, range(sizes.suns, sizes.suns + sizes.held_out)
+        self.weights = []
+        for camera in scene.cameras:
+            self.weights.append(view_weights(facing(self.surfels, camera), camera, subpixels=2))
+        if not learn:
+            return
         start = time.perf_counter()
         received = surfel_irradiance(scene.occluder, self.surfels, self.lights[: self.suns], rays=128, seed=seed)
         self.lessons = lessons_from(self.states[: self.suns], [0] * self.suns, self.albedo[None], received)
@@ -205,12 +204,8 @@ class Contest:
         start = time.perf_counter()
         self.truth = [truth_of(scene, scene.occluder, camera, self.lights, self.states) for camera in scene.cameras]
         self.seconds["views"] = time.perf_counter() - start
-        self.weights = []
-        for camera in scene.cameras:
-            self.weights.append(view_weights(facing(self.surfels, camera), camera, subpixels=2))
         self.frames = [Frame(self.weights[v], t, self.truth[v].pictures[t], self.truth[v].solid)
                        for v in range(3) for t in range(self.suns)]  # fmt: skip
-        self.held_out = range(self.suns, self.suns + sizes.held_out)
 
     def appearance(self, kind: str):
         from seasonscapes.gaussians.appearance import EMBEDDING, Appearance, fourier_embedding
@@ -294,14 +289,20 @@ class Contest:
         """Intersection over union of cast shadows, of pixels that face the sun, over held-out times and all cameras."""
         import torch
 
-        both = either = 0
+        from seasonscapes.rendering.gbuffer import trace_gbuffer
+        from seasonscapes.rendering.scene import RenderScene
+
+        scene, both, either = self.scene, 0, 0
+        bare = RenderScene(scene.occluder.mi_scene, scene.mesh, None, 0.0)
+        seen_by = [(trace_gbuffer(bare, camera), ~scene.underside(camera)) for camera in scene.cameras]
         for t in self.held_out:
             direction = torch.as_tensor(self.states[t].bodies[0][0])
             with torch.no_grad():
                 seen = appearance.visibility(torch.arange(len(self.albedo)), direction).numpy()
-            for v, truth in enumerate(self.truth):
-                dark = (self.picture(v, seen[:, None])[..., 0] < 0.5)[truth.facing[t]]
-                true = ~truth.sunny[t][truth.facing[t]]
+            for v, (gbuffer, above) in enumerate(seen_by):
+                sunny, facing = shadow_truth(scene, scene.occluder, gbuffer, self.states[t].bodies[0][0])
+                asked = facing & above & (self.weights[v].coverage > 0.5)
+                dark, true = (self.picture(v, seen[:, None])[..., 0] < 0.5)[asked], ~sunny[asked]
                 both, either = both + int(np.sum(dark & true)), either + int(np.sum(dark | true))
         return both / max(either, 1)
 
@@ -345,7 +346,7 @@ def speed(contest: Contest, appearance) -> dict[str, float]:
     The error of path tracing falls with the square root of its samples, so the time to the splats' own error follows
     from one measurement.
     """
-    import torch
+    from dataclasses import replace
 
     from seasonscapes.gaussians.appearance import colours_at
     from seasonscapes.gaussians.rasterise import rotations, splat_colours, view_weights
@@ -369,21 +370,26 @@ def speed(contest: Contest, appearance) -> dict[str, float]:
     still = best(lambda: splat_colours(weights, colours))
     drawn, covered = splat_layers(ready, colours, camera, CUTS)
     lit = relight(scene.mesh, contest.lights[t], max_height_m=float(scene.terrain.vertices[:, 2].max()))
-    truth = truth_of(scene, scene.occluder, camera, [contest.lights[t]], [contest.states[t]])
+    # Errors are compared in the middle of the picture, 3/8 of its side; times are those of all of it.
+    side = camera.width_px * 3 // 8
+    edge = (camera.width_px - side) // 2
+    middle = replace(camera, width_px=side, height_px=side, cx=camera.cx - edge, cy=camera.cy - edge)
+    truth = truth_of(scene, scene.occluder, middle, [contest.lights[t]], [contest.states[t]])
+    part = slice(edge, edge + side)
     scale, spp = np.pi / contest.states[t].global_lx, 8
     path_trace(lit, camera, spp=spp)
     start = time.perf_counter()
     noisy, _ = path_trace(lit, camera, spp=spp, seed=5)
     seconds = (time.perf_counter() - start) / spp
-    splats_db = psnr(drawn / np.maximum(covered, 1e-3)[..., None], truth.pictures[0], truth.solid)
-    noisy_db = psnr(noisy * scale, truth.pictures[0], truth.solid)
+    shown = (drawn / np.maximum(covered, 1e-3)[..., None])[part, part]
+    splats_db = psnr(shown, truth.pictures[0], truth.solid)
+    noisy_db = psnr(noisy[part, part] * scale, truth.pictures[0], truth.solid)
     equal = spp * 10.0 ** ((splats_db - noisy_db) / 10.0)
-    check, _ = path_trace(lit, camera, spp=256, seed=6)
+    check, _ = path_trace(lit, middle, spp=256, seed=6)
     return {"frame_ms": 1e3 * moving, "frames_per_second": 1.0 / moving, "torch_frame_ms": 1e3 * in_torch,
             "still_camera_ms": 1e3 * still, "colours_ms": 1e3 * relit, "frame_psnr_db": splats_db,
             "path_8spp_psnr_db": noisy_db, "path_spp_of_equal_error": equal, "path_seconds_of_equal_error": equal * seconds,
             "speedup_vs_path": equal * seconds / moving, "speedup_vs_path_still_camera": equal * seconds / still,
-            "threads": float(torch.get_num_threads()),
             "truth_vs_path_psnr_db": psnr(check * scale, truth.pictures[0], truth.solid)}  # fmt: skip
 
 
@@ -437,7 +443,9 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="a small scene, within five minutes on two cores")
     parser.add_argument("--seed", type=int, default=None)
     parser.add_argument("--json", default=None)
-    parser.add_argument("--only", default="", help="contestants alone, such as sun,code; nothing else is measured")
+    parser.add_argument(
+        "--only", default="", help="some alone, of full, sun, code, physical, and of speed and shadow (both untrained)"
+    )
     parser.add_argument("--picture", default=None, help="write the contact sheet here")
     arguments = parser.parse_args()
     seed = secrets.randbelow(10_000) if arguments.seed is None else arguments.seed
@@ -445,22 +453,31 @@ def main() -> None:
 
     choose_threads(1)
     start = time.perf_counter()
-    contest = Contest(Scene(seed, QUICK if arguments.quick else Sizes()), seed)
-    result: dict[str, float] = {"seed": seed, "gaussians": len(contest.albedo), "suns": contest.suns,
-                                "nearest_sun_psnr_db": contest.score_pictures(contest.sun_weights(np.inf)),
-                                "blend_psnr_db": contest.score_pictures(contest.sun_weights(1.0))}  # fmt: skip
+    only = [name for name in arguments.only.split(",") if name]
+    contest = Contest(
+        Scene(seed, QUICK if arguments.quick else Sizes()), seed, learn=not only or bool({*only} - {"speed", "shadow"})
+    )
+    result: dict[str, float] = {"seed": seed, "gaussians": len(contest.albedo), "suns": contest.suns}
 
     def tell(name: str, scores: tuple[float, float]) -> None:
         result[f"{name}_psnr_db"], result[f"{name}_unseen_camera_psnr_db"] = scores
         print(f"{name:20s} {scores[0]:6.2f} {scores[1]:6.2f}  [{time.perf_counter() - start:.0f} s]", flush=True)
 
     print("prepared", {name: round(value, 1) for name, value in contest.seconds.items()}, flush=True)
-    print(f"nearest sun {result['nearest_sun_psnr_db']:.2f}, blend of three {result['blend_psnr_db']:.2f}")
-    if arguments.only:
-        for kind in arguments.only.split(","):
-            trained = contest.trained(kind)
-            tell(kind, contest.score_code(trained) if kind == "code" else contest.score(trained))
+    if only:
+        untrained = contest.appearance("physical")
+        for kind in only:
+            if kind == "speed":
+                result |= speed(contest, untrained)
+            elif kind == "shadow":
+                result["shadow_iou"] = contest.shadow_iou(untrained)
+            else:
+                trained = contest.trained(kind)
+                tell(kind, contest.score_code(trained) if kind == "code" else contest.score(trained))
         return write_result(result, arguments.json)
+    result["nearest_sun_psnr_db"] = contest.score_pictures(contest.sun_weights(np.inf))
+    result["blend_psnr_db"] = contest.score_pictures(contest.sun_weights(1.0))
+    print(f"nearest sun {result['nearest_sun_psnr_db']:.2f}, blend of three {result['blend_psnr_db']:.2f}", flush=True)
     tell("physical_untrained", contest.score(contest.appearance("physical")))
     full = contest.trained("full")
     tell("full", contest.score(full))
