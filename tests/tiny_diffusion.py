@@ -62,6 +62,24 @@ def adapter_state(unet, seed: int) -> dict:
     return state
 
 
+def as_published(base: Path) -> None:
+    """Name tensors as the published files of 2022 do: today's libraries must find them under their newer names."""
+    import torch
+    from safetensors.torch import load_file, save_file
+
+    text = base / "text_encoder/model.safetensors"
+    state = {f"text_model.{name.removeprefix('text_model.')}": tensor for name, tensor in load_file(text).items()}
+    save_file(state | {"text_model.embeddings.position_ids": torch.arange(77)[None]}, text, metadata={"format": "pt"})
+    vae = base / "vae/diffusion_pytorch_model.safetensors"
+    old = {".to_q.": ".query.", ".to_k.": ".key.", ".to_v.": ".value.", ".to_out.0.": ".proj_attn."}
+    state = {}
+    for name, tensor in load_file(vae).items():
+        for new, before in old.items():
+            name = name.replace(new, before) if ".attentions." in name else name
+        state[name] = tensor
+    save_file(state, vae, metadata={"format": "pt"})
+
+
 def write_tiny_weights(folder: Path) -> Path:
     """All weights of the default names under a folder, as ``<owner>/<name>``; returns the folder."""
     import torch
@@ -87,6 +105,7 @@ def write_tiny_weights(folder: Path) -> Path:
     base = folder / BASE
     for name, part in (("unet", unet), ("vae", vae), ("text_encoder", text), ("scheduler", scheduler)):
         part.save_pretrained(base / name)
+    as_published(base)
     write_tokenizer(base / "tokenizer")
     index = {"_class_name": "StableDiffusionPipeline", "_diffusers_version": "0.42.0", "safety_checker": [None, None],
              "feature_extractor": [None, None], "unet": ["diffusers", "UNet2DConditionModel"],
