@@ -29,8 +29,8 @@ from seasonscapes.sky.illumination import Illumination, Luminary
 _DEPTH_RATIO = 1.05
 # ... and by more than this one its air is averaged over its samples.
 _AIR_RATIO = 1.1
-# Cosines of incidence below which samples of a pixel may face either way.
-_GRAZING = 0.05
+# Cosines of incidence below which samples of a pixel may face either way, or bumps between them cast shadows.
+_GRAZING = 0.25
 # Interreflected light is smooth: its noise is spread over neighbouring pixels of one surface.
 _BOUNCE_STRIDES, _BOUNCE_SHARPNESS = (1,), 64.0
 # Pixels in work at a time where temporaries are wide.
