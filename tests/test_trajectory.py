@@ -113,14 +113,20 @@ def test_a_spline_is_twice_continuously_differentiable_by_arc_length(closed):
 def test_smooth_turns_have_no_jerk_where_slerp_has():
     line = curve_through(places_of(waypoints()))
 
-    def jump(turn):
+    ring = curve_through(places_of(waypoints()), closed=True)
+
+    def jump(turn, closed=False):
         """Largest change of the turning rate between neighbouring views [rad per view]."""
-        rotations = [each.world_from_camera[:3, :3] for each in views_along(line, waypoints(), 2001, turn=turn)]
+        known = [*waypoints(), waypoints()[0]] if closed else waypoints()
+        views = views_along(ring if closed else line, known, 1501, turn=turn, closed=closed)
+        rotations = [each.world_from_camera[:3, :3] for each in (views + views[:2] if closed else views)]
         steps = [a.T @ b for a, b in pairwise(rotations)]
         rates = np.array([(m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]) for m in steps]) / 2.0
         return np.abs(np.diff(rates, axis=0)).max()
 
     assert jump("smooth") < 0.05 * jump("slerp")
+    # Where the ends of a closed path meet, too.
+    assert jump("smooth", True) < 0.05 * jump("slerp", True)
 
 
 def test_a_level_horizon_stays_level_and_roll_is_blended():

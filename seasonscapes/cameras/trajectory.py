@@ -135,9 +135,7 @@ def curve_through(positions_m: np.ndarray, *, curve: str = "spline", closed: boo
 def _measured(base: Any, lift: Any, knots: np.ndarray) -> Curve:
     """A curve with its table of arc lengths."""
     cuts = [knots] if lift is None else [knots, lift.x]
-    ends = np.unique(
-        np.concatenate([*cuts, *(np.linspace(a, b, _PIECES + 1) for a, b in pairwise(knots))])
-    )
+    ends = np.unique(np.concatenate([*cuts, *(np.linspace(a, b, _PIECES + 1) for a, b in pairwise(knots))]))
     bare = Curve(base, lift, knots, np.zeros((2, 2)))
     lengths = _lengths(bare.at_parameter, ends[:-1], ends[1:])
     return Curve(base, lift, knots, np.stack([ends, np.concatenate([[0.0], np.cumsum(lengths)])]))
@@ -239,7 +237,12 @@ def views_along(line: Curve, waypoints: Sequence[Camera], count: int, *, turn: s
     if look_at_m is not None:
         rotations = _looking_at(places, np.asarray(look_at_m, float))
     else:
-        rotations = _turned(line.waypoints_at_m, [each.world_from_camera[:3, :3] for each in waypoints], s_m, turn)
+        known, at_m = [each.world_from_camera[:3, :3] for each in waypoints], line.waypoints_at_m
+        if closed:
+            # Once more before and after, so that the turning is as smooth where the ends meet.
+            at_m = np.concatenate([at_m[:-1] - line.length_m, at_m, at_m[1:] + line.length_m])
+            known = [*known[:-1], *known, *known[1:]]
+        rotations = _turned(at_m, known, s_m, turn)
     lenses = np.array([(each.fx, each.fy, each.cx, each.cy) for each in waypoints], float)
     size = np.array([(each.width_px, each.height_px) for each in waypoints], float)
     # Lenses in pictures of the first one's size.

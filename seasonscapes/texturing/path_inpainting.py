@@ -42,6 +42,8 @@ from seasonscapes.texturing.tiles import Tiling, sees_tile, tile_surface, tiles_
 Inpaint = Callable[[Conditions, Callable[[float], None]], np.ndarray]
 # Shots are trusted less where they are clipped; a model's white is no clipping.
 _HEADROOM = 0.85
+# Views with a smaller share of holes than this are asked first whether they can give any texel a value.
+_FEW_HOLES = 0.02
 _RED = np.array([1.0, 0.0, 0.0], np.float32)
 
 
@@ -205,7 +207,7 @@ def _paint_view(walk: Walk, canvas: Canvas, inpaint: Inpaint, options: WalkOptio
     sky = plain_sky(ray_directions(camera), cloudiness=options.cloudiness)
     shown = np.where(land[..., None], partial, sky)
     nothing = np.empty(0, np.int64), np.empty((0, 3), np.float32)
-    if not hole.any() or share < options.least_share:
+    if not hole.any() or share < options.least_share or _in_vain(walk, canvas, camera, shown, share, white):
         return Step(index, share, *nothing, _bytes(shown), True), {}
     wanted = hole | ~land if options.paint_sky else hole
     guess = _guessed(walk, gbuffer, shown, wanted, hole, white)
@@ -220,6 +222,11 @@ def _paint_view(walk: Walk, canvas: Canvas, inpaint: Inpaint, options: WalkOptio
     hidden = np.where(hole[..., None], np.float32(0.0), shown)
     pictures = {"partial": hidden, "mask": mask.astype(np.float32), "depth": depth}
     return Step(index, share, texels, values, _bytes(composed), False), pictures
+
+
+def _in_vain(walk: Walk, canvas: Canvas, camera: Camera, shown: np.ndarray, share: float, white: float) -> bool:
+    """Whether all that a view could paint lies beside silhouettes, where nothing is taken from it: hours for nothing."""
+    return share < _FEW_HOLES and len(back_project(walk, canvas, camera, shown, white)[0]) == 0
 
 
 def partial_view(walk: Walk, canvas: Canvas, gbuffer: GBuffer, options: WalkOptions,
