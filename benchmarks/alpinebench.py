@@ -9,6 +9,7 @@ land beyond 60 m, mode ``valid``. ``matched`` fits one factor for each colour fi
 
 * Painted hours: the painted and completed texture, seen from the judged webcam through the air.
 * Held-out hours: the albedo recovered from the painted hours' pictures, relit.
+* Distilled: Gaussians that learned from that albedo under suns of other days, seen at the held-out hours.
 * Each stage alone is given the truth of the stages before it. Ablations change one thing of the whole.
 * The satellite's image shows reflectance on a July forenoon with that hour's shades in it, as such images do, on the same
   texels. Satellite only is that image on the terrain without air, at the best exposure there is for each picture.
@@ -36,6 +37,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from albedo_scene import LATITUDE_DEG, LONGITUDE_DEG, hours, lights_for  # noqa: E402
 from alpinebench_scene import (  # noqa: E402
+    DAY_OF_YEAR,
     SATELLITE_DATE,
     SIZES,
     Pictures,
@@ -58,6 +60,7 @@ from seasonscapes.evaluation.surfaces import albedo_error  # noqa: E402
 from seasonscapes.evaluation.synthetic_webcams import SyntheticPicture  # noqa: E402
 from seasonscapes.evaluation.tables import by_distance, drop, table_lines  # noqa: E402
 from seasonscapes.exposure import develop, exposure_ev100  # noqa: E402
+from seasonscapes.frames import LocalFrame  # noqa: E402
 from seasonscapes.images import srgb_from_linear, write_png8  # noqa: E402
 from seasonscapes.rendering.gbuffer import trace_gbuffer  # noqa: E402
 from seasonscapes.rendering.radiance import through_air  # noqa: E402
@@ -75,6 +78,9 @@ from seasonscapes.workspace import default_workspace  # noqa: E402
 
 _TEXEL = Effort(subpixels=1, rays=64, listed=32, senders=1024, rank=24)
 _SUBPIXELS = 3
+# Days and hours that Gaussians learn from; the judged day is not among them.
+LESSONS = (("2024-01-15", 11.0), ("2024-03-10", 8.5), ("2024-04-20", 15.0), ("2024-05-12", 6.5), ("2024-06-18", 12.0),
+           ("2024-07-05", 17.0), ("2024-08-14", 9.5), ("2024-10-08", 13.5))  # fmt: skip
 NEAR_M = 60.0
 
 
@@ -231,6 +237,53 @@ class Bench:
         return self.painted(self.world.painted_hours[0], true_pose=True).texture.weight > 0.0
 
 
+class Splats:
+    """Gaussians distilled from an albedo under suns of other days; discs and their light transport are made once."""
+
+    def __init__(self, bench: Bench):
+        from seasonscapes.gaussians.rasterise import choose_threads
+        from seasonscapes.gaussians.surfels import surfel_albedo, terrain_surfels
+        from seasonscapes.gaussians.transport import light_state, trace_transport
+
+        choose_threads(1)
+        self.bench, world = bench, bench.world
+        self.surfels = terrain_surfels(world.terrain, world.size.disc_m)
+        set_albedo(bench.judge.scene, world.albedo)
+        self.transport = trace_transport(world.bare, self.surfels, surfel_albedo(self.surfels, world.albedo), rays=64,
+                                         seed=world.seed)  # fmt: skip
+        times = [hours(day, hour)[0] for day, hour in LESSONS]
+        self.lights = [row[0] for row in lights_for(times, world.painting[:1], world.sky, default_workspace())]
+        self.states = [light_state(self.transport, light, DAY_OF_YEAR) for light in self.lights]
+
+    def views(self, albedo: np.ndarray) -> Callable[[int, datetime], np.ndarray]:
+        """Views of the Gaussians that an albedo was distilled into."""
+        from seasonscapes.gaussians.appearance import Appearance, fourier_embedding
+        from seasonscapes.gaussians.distil import Schedule, distil, lessons_from
+        from seasonscapes.gaussians.model import model_from
+        from seasonscapes.gaussians.render import learned_numbers, model_weights, render_model
+        from seasonscapes.gaussians.surfels import surfel_albedo
+        from seasonscapes.gaussians.transport import neighbourhood_mean, surfel_irradiance
+
+        world, seed = self.bench.world, self.bench.world.seed
+        set_albedo(self.bench.judge.scene, albedo)
+        own = surfel_albedo(self.surfels, albedo)
+        around = neighbourhood_mean(self.surfels.means, own, self.surfels.plan.spacing_m)
+        received = surfel_irradiance(world.bare, self.surfels, self.lights, rays=64, seed=seed)
+        lessons = lessons_from(self.states, [0] * len(self.states), own[None], received)
+        appearance = Appearance("full", own[None], around[None], self.transport, fourier_embedding(self.surfels.means, seed=seed),
+                                times=len(self.states), seed=seed)  # fmt: skip
+        distil(appearance, lessons, schedule=Schedule(surface_steps=600), seed=seed)
+        model = model_from(self.surfels, own[None], [DAY_OF_YEAR], self.transport, kind="full",
+                           frame=LocalFrame(LATITUDE_DEG, LONGITUDE_DEG), appearance=learned_numbers(appearance))  # fmt: skip
+        weights = [model_weights(model, camera) for camera in world.judged]
+
+        def view(camera: int, at: datetime) -> np.ndarray:
+            light = self.bench.judge.light(camera, at)
+            return render_model(model, world.judged[camera], light, DAY_OF_YEAR, weights=weights[camera]).radiance
+
+        return view
+
+
 class Clock:
     """Processor and wall seconds between stages, on stderr."""
 
@@ -281,6 +334,10 @@ def stages(bench: Bench) -> tuple[dict[str, dict], dict]:
     rows["all, held-out hours"] = judge.scores(relit, held)
     rows["all, relit painted hours"] = judge.scores(relit, painted)
     bench.clock.tell("albedo, relit")
+    splats = Splats(bench)
+    rows["distil alone (true albedo)"] = judge.scores(splats.views(world.albedo), held)
+    rows["all, distilled, held-out hours"] = judge.scores(splats.views(albedo), held)
+    bench.clock.tell("distilled twice")
     return rows, {
         "paintings": paintings,
         "textures": textures,
@@ -406,6 +463,7 @@ def numbers_of(bench: Bench, rows: dict, painted_rows: dict, held_rows: dict, wh
         for name, row in table.items():
             numbers |= {f"{prefix}_{key_of(name)}_{key}": value for key, value in row.items()}
     full, held = rows["all, painted hours"], rows["all, held-out hours"]
+    numbers["distilled_psnr_db"] = rows["all, distilled, held-out hours"]["psnr_db"]
     numbers |= {"painted_view_psnr_db": full["psnr_db"], "painted_view_ssim": full["ssim"],
                 "painted_view_matched_psnr_db": full["matched_psnr_db"], "held_out_hour_psnr_db": held["psnr_db"],
                 "held_out_hour_ssim": held["ssim"], "held_out_hour_matched_psnr_db": held["matched_psnr_db"],

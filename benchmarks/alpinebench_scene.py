@@ -52,15 +52,16 @@ class Size:
     size_px: tuple[int, int]
     clock: tuple[float, ...]
     effort: Effort
+    disc_m: float
 
 
 _WEB = Effort(subpixels=4, shades=16, rays=64, senders=1024, listed=32, rank=24)
 _FINE = Effort(subpixels=4, shades=16, rays=128, senders=4096, listed=32, rank=24)
 SIZES = {
-    "quick": Size(5400.0, 30.0, 12.5, 2, 1, (384, 256), (7.0, 8.5, 10.0, 12.0, 14.0, 15.5), _WEB),
-    "tiny": Size(3000.0, 60.0, 30.0, 2, 1, (144, 96), (8.5, 10.0, 14.0), _WEB),
-    "small": Size(8010.0, 30.0, 10.0, 2, 1, (768, 512), tuple(np.arange(6.5, 16.1, 0.5625).tolist()), _FINE),
-    "medium": Size(12000.0, 30.0, 10.0, 14, 41, (768, 512), tuple(np.linspace(6.5, 16.0, 14).tolist()), _FINE),
+    "quick": Size(5400.0, 30.0, 18.0, 2, 1, (300, 200), (7.0, 8.5, 10.0, 12.0, 14.0, 15.5), _WEB, 36.0),
+    "tiny": Size(3000.0, 60.0, 30.0, 2, 1, (144, 96), (8.5, 10.0, 14.0), _WEB, 60.0),
+    "small": Size(8010.0, 30.0, 10.0, 2, 1, (768, 512), tuple(np.arange(6.5, 16.1, 0.5625).tolist()), _FINE, 30.0),
+    "medium": Size(12000.0, 30.0, 10.0, 14, 41, (768, 512), tuple(np.linspace(6.5, 16.0, 14).tolist()), _FINE, 30.0),
 }
 
 
