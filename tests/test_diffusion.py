@@ -203,7 +203,7 @@ def test_equal_seeds_give_equal_pictures(weights, painter):
     np.testing.assert_array_equal(load_painter(weights, SETTINGS, image=GUIDE)(view), painter(view))
 
 
-def test_progress_and_number_formats(weights):
+def test_progress_and_number_formats(weights, monkeypatch):
     shares = []
     small = load_painter(weights, replace(SETTINGS, strength=0.7), machine=Machine("cpu", "bfloat16"))
     found = small(made_up_view(), shares.append)
@@ -213,6 +213,8 @@ def test_progress_and_number_formats(weights):
     assert len(parts) == 5
     assert {parameter.dtype for part in parts for parameter in part.parameters()} == {torch.bfloat16}
     assert not small.slow
+    monkeypatch.setattr("seasonscapes.texturing.diffusion._LARGE", 1000)
+    assert small.slow
 
 
 def test_only_what_counts_is_looked_for(weights, tmp_path):

@@ -68,11 +68,11 @@ def test_waypoints_are_passed_with_their_own_view(curve):
     np.testing.assert_allclose(line.position(line.waypoints_at_m), places_of(waypoints()), atol=1e-6)
     # So many views that some fall on each waypoint: seen from there, the waypoint's own picture.
     for turn in ("smooth", "slerp"):
-        views = views_along(line, waypoints(), 1501, turn=turn)
+        views = views_along(line, waypoints(), 801, turn=turn)
         for known in waypoints():
             near = views[int(np.argmin(np.linalg.norm(places_of(views) - known.position_m, axis=1)))]
             apart = near.world_from_camera[:3, :3].T @ known.world_from_camera[:3, :3]
-            assert np.degrees(np.arccos(np.clip((np.trace(apart) - 1.0) / 2.0, -1.0, 1.0))) < 0.5
+            assert np.degrees(np.arccos(np.clip((np.trace(apart) - 1.0) / 2.0, -1.0, 1.0))) < 0.8
 
 
 @pytest.mark.parametrize("curve", CURVES)
@@ -118,7 +118,7 @@ def test_smooth_turns_have_no_jerk_where_slerp_has():
     def jump(turn, closed=False):
         """Largest change of the turning rate between neighbouring views [rad per view]."""
         known = [*waypoints(), waypoints()[0]] if closed else waypoints()
-        views = views_along(ring if closed else line, known, 1501, turn=turn, closed=closed)
+        views = views_along(ring if closed else line, known, 801, turn=turn, closed=closed)
         rotations = [each.world_from_camera[:3, :3] for each in (views + views[:2] if closed else views)]
         steps = [a.T @ b for a, b in pairwise(rotations)]
         rates = np.array([(m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]) for m in steps]) / 2.0

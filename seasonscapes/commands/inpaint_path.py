@@ -153,7 +153,7 @@ def complete_along_path(land: Place, painted: Texture, guides: Guides, time: dat
     if "prompt" not in flags.left_out():
         say(f"prompt: {prompt}")
     if painter.slow:
-        say("on a CPU these weights take over an hour for each view of 1536 × 1024 with 50 steps; a GPU takes seconds")
+        say("on a CPU these weights take over an hour for each view of 1536 × 1024 with 50 steps; use a GPU")
 
     def guided(texture: Texture, detail: float, title: str) -> Completed:
         with progress_bar(title) as progress:
