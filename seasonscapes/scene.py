@@ -52,7 +52,7 @@ class SyntheticElevation(Declaration):
     kind: Literal["alpine"] = "alpine"
     seed: int = Field(default=1912, ge=0)
     size_m: float = Field(default=12000.0, ge=1000.0, le=40000.0)
-    spacing_m: float = Field(default=15.0, ge=2.0, le=500.0)
+    spacing_m: Literal[15.0, 30.0, 60.0] = 15.0
     detail_m: float = Field(default=3.75, ge=0.5, le=500.0)
 
 
