@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from seasonscapes.albedo.closed_form import HIGHEST, LOWEST, AlbedoFit
+from seasonscapes.albedo.closed_form import HIGHEST, LOWEST, AlbedoFit, fill_nearest
 from seasonscapes.albedo.forward import Land
 from seasonscapes.albedo.shots import Shot
 
@@ -100,6 +100,9 @@ def known_albedo(
     if complete and gap.any():
         guess, spread = completion(land, fit.albedo, measured, gap, seed=seed)
         albedo[gap], sigma[gap], source[gap] = guess, spread, 2
+    if complete:
+        # Bilinear look-ups at the rim reach texels beyond the surface.
+        albedo = fill_nearest(albedo, (source > 0).astype(np.float32))
     return KnownAlbedo(albedo, sigma.astype(np.float32), times_sunlit(shots), source)
 
 
