@@ -299,9 +299,18 @@ class Clock:
 # ---------------------------------------------------------------------------------------------- the tables
 
 
+class Rows(dict):
+    """Scores by name; each is told as it is measured, so that a run that is interrupted has said what it knew."""
+
+    def __setitem__(self, name: str, row: dict[str, float]) -> None:
+        print(f"    {name}: {row['psnr_db']:.2f} dB, matched {row['matched_psnr_db']:.2f} dB, SSIM {row['ssim']:.3f}",
+              file=sys.stderr, flush=True)  # fmt: skip
+        super().__setitem__(name, row)
+
+
 def stages(bench: Bench) -> tuple[dict[str, dict], dict]:
     """Each stage given the truth of those before it, then all together; and what the whole made."""
-    world, judge, rows = bench.world, bench.judge, {}
+    world, judge, rows = bench.world, bench.judge, Rows()
     painted, held = world.painted_hours, world.held_hours
     true = {at: bench.true_texture(world.lights[at][0], world.albedo) for at in painted}
     rows["texels (true texture)"] = judge.scores(lambda c, at: judge.of_texture(true[at], c, at), painted)
@@ -376,7 +385,8 @@ def ablations(bench: Bench, whole: dict) -> tuple[dict[str, dict], dict[str, dic
     def refilled(method: str) -> dict:
         return {at: bench.completed(whole["paintings"][at].texture, at, method=method) for at in painted}
 
-    rows: dict[str, dict] = {"full": texture_scores(whole["textures"])}
+    rows = Rows()
+    rows["full"] = texture_scores(whole["textures"])
     summer = judge.of_albedo(bench.satellite.values)
     rows["no painting (summer's image, relit)"] = judge.scores(summer, painted)
     with mock.patch(
@@ -402,7 +412,8 @@ def ablations(bench: Bench, whole: dict) -> tuple[dict[str, dict], dict[str, dic
         lambda c, at: judge.matched(judge.of_texture(bare[at], c, at, air=False), c, at), painted
     )
     rows["satellite only, best exposure"] = judge.scores(satellite_view(bench), painted)
-    late: dict[str, dict] = {"full": judge.scores(whole["relit"], held)}
+    late = Rows()
+    late["full"] = judge.scores(whole["relit"], held)
 
     def nearest(camera: int, at: datetime) -> np.ndarray:
         source = min(painted, key=lambda other: abs(other - at))
