@@ -276,11 +276,12 @@ def a_year(frames: int, width_px: int) -> dict[str, float]:
     """Seconds of a year's film of the embedded scene, from frames spread over all its hours."""
     from seasonscapes.commands.timelapse import developed
     from seasonscapes.daylight import moment_at
-    from seasonscapes.pipeline import MeshOptions, find_scene, load_place
+    from seasonscapes.pipeline import MeshOptions, albedo_for, find_scene, load_place
     from seasonscapes.relighting.film import write_film
     from seasonscapes.scene import read_scene
     from seasonscapes.sky.models import read_sky_model
     from seasonscapes.studio import Assignment, held_studio, render_frame
+    from seasonscapes.terrain.surface import save_texture
     from seasonscapes.workspace import Workspace, default_workspace
 
     path = find_scene("alpine")
@@ -300,8 +301,13 @@ def a_year(frames: int, width_px: int) -> dict[str, float]:
         for each in (default_workspace().folder / "alpine").iterdir():
             if not each.name.startswith(("frames-", "coefficients-")):
                 (folder.folder / "alpine" / each.name).symlink_to(each)
+        # Two dated albedos, as a real place may have: each frame wears a blend of them.
+        dated = []
+        for day in (datetime(2024, 1, 16, tzinfo=UTC), datetime(2024, 7, 16, tzinfo=UTC)):
+            save_texture(albedo_for(place, day), Path(name) / f"{day:%m%d}.npz")
+            dated.append((day.date().isoformat(), str(Path(name) / f"{day:%m%d}.npz")))
         assignment = Assignment(str(path), name, MeshOptions(), read_scene(path).camera(None), (width_px, width_px * 2 // 3),
-                                read_sky_model("clear"))  # fmt: skip
+                                read_sky_model("clear"), albedo=tuple(dated))  # fmt: skip
         clock = {"coefficients": time.perf_counter()}
         held_studio(assignment)
         clock["frames"] = time.perf_counter()
