@@ -15,7 +15,7 @@ import numpy as np
 
 from seasonscapes.cameras.observation import Observation
 from seasonscapes.cameras.pinhole import Camera, ray_directions
-from seasonscapes.images import atomic_path, linear_from_srgb, write_png8
+from seasonscapes.images import linear_from_srgb
 from seasonscapes.rendering.gather import Occluder
 from seasonscapes.rendering.gbuffer import GBuffer, trace_gbuffer
 from seasonscapes.rendering.scene import RenderScene
@@ -34,6 +34,7 @@ from seasonscapes.texturing.conditions import (
 )
 from seasonscapes.texturing.harmonise import Harmony
 from seasonscapes.texturing.paint import shot_texels
+from seasonscapes.texturing.path_steps import Step, keep_step, kept_step, levels_of
 from seasonscapes.texturing.push_pull import push_pull
 from seasonscapes.texturing.shots import Shot, ready_shot
 from seasonscapes.texturing.tiles import Tiling, sees_tile, tile_surface, tiles_of
@@ -106,32 +107,6 @@ class WalkOptions:
             raise ValueError("WalkOptions: dilate_px must not be negative, and least_share between 0 and 1")
 
 
-@dataclass(frozen=True)
-class Step:
-    """One view, done.
-
-    Parameters
-    ----------
-    index
-        In the path.
-    hole_share
-        Share of the view's land that was a hole.
-    texels, values
-        Flat indices ``(N,)`` and radiance ``(N, 3)`` float32 [cd/m²] of the texels that it gave a value.
-    frame
-        ``(H, W, 3)`` uint8, the composed picture.
-    skipped
-        There was nothing to paint.
-    """
-
-    index: int
-    hole_share: float
-    texels: np.ndarray
-    values: np.ndarray
-    frame: np.ndarray
-    skipped: bool
-
-
 class Canvas:
     """The texture while it is being walked over: values, what is covered, and what the model gave."""
 
@@ -185,12 +160,12 @@ def walk_path(walk: Walk, canvas: Canvas, inpaint: Inpaint, options: WalkOptions
     white = white_radiance(canvas.values, canvas.painted)
     count = len(walk.cameras)
     for index in range(count):
-        step = _kept(folder, index)
+        step = kept_step(folder, index)
         if step is None:
             step, pictures = _paint_view(walk, canvas, inpaint, options, index, white,
                                          lambda share, index=index: tell((index + share) / count))  # fmt: skip
             if folder is not None:
-                _keep(folder, step, pictures)
+                keep_step(folder, step, pictures)
         canvas.superpose(step)
         tell((index + 1) / count)
         yield step
@@ -208,7 +183,7 @@ def _paint_view(walk: Walk, canvas: Canvas, inpaint: Inpaint, options: WalkOptio
     shown = np.where(land[..., None], partial, sky)
     nothing = np.empty(0, np.int64), np.empty((0, 3), np.float32)
     if not hole.any() or share < options.least_share or _in_vain(walk, canvas, camera, shown, share, white):
-        return Step(index, share, *nothing, _bytes(shown), True), {}
+        return Step(index, share, *nothing, levels_of(shown), True), {}
     wanted = hole | ~land if options.paint_sky else hole
     guess = _guessed(walk, gbuffer, shown, wanted, hole, white)
     mask = dilated(wanted, options.dilate_px)
@@ -221,7 +196,7 @@ def _paint_view(walk: Walk, canvas: Canvas, inpaint: Inpaint, options: WalkOptio
     texels, values = back_project(walk, canvas, camera, composed, white)
     hidden = np.where(hole[..., None], np.float32(0.0), shown)
     pictures = {"partial": hidden, "mask": mask.astype(np.float32), "depth": depth}
-    return Step(index, share, texels, values, _bytes(composed), False), pictures
+    return Step(index, share, texels, values, levels_of(composed), False), pictures
 
 
 def _in_vain(walk: Walk, canvas: Canvas, camera: Camera, shown: np.ndarray, share: float, white: float) -> bool:
@@ -281,40 +256,6 @@ def back_project(walk: Walk, canvas: Canvas, camera: Camera, picture: np.ndarray
     if not texels:
         return np.empty(0, np.int64), np.empty((0, 3), np.float32)
     return np.concatenate(texels), np.concatenate(values).astype(np.float32)
-
-
-def _bytes(picture: np.ndarray) -> np.ndarray:
-    return np.round(np.clip(picture, 0.0, 1.0) * 255.0).astype(np.uint8)
-
-
-def _record(folder: Path, index: int) -> Path:
-    return folder / f"view_{index:04d}.npz"
-
-
-def _picture(folder: Path, index: int, name: str) -> Path:
-    return folder / f"view_{index:04d}_{name}.png"
-
-
-def _keep(folder: Path, step: Step, pictures: dict[str, np.ndarray]) -> None:
-    """Pictures first, the record last: what has a record is whole."""
-    for name, picture in {**pictures, "result": step.frame}.items():
-        levels = picture if picture.dtype == np.uint8 else _bytes(picture)
-        write_png8(_picture(folder, step.index, name), levels)
-    with atomic_path(_record(folder, step.index)) as temporary:
-        np.savez(temporary, texels=step.texels, values=step.values, hole_share=step.hole_share, skipped=step.skipped)
-
-
-def _kept(folder: Path | None, index: int) -> Step | None:
-    if folder is None or not _record(folder, index).is_file():
-        return None
-    from PIL import Image
-
-    with Image.open(_picture(folder, index, "result")) as file:
-        frame = np.array(file)
-    with np.load(_record(folder, index), allow_pickle=False) as stored:
-        return Step(
-            index, float(stored["hole_share"]), stored["texels"], stored["values"], frame, bool(stored["skipped"])
-        )
 
 
 def frames_of(values: np.ndarray, cameras: Sequence[Camera], terrain: Occluder, white: float, *,
