@@ -21,10 +21,16 @@ app = App(
 app.command("seasonscapes.commands.render:render", help="Render a view of a place at a date and hour.")
 app.command("seasonscapes.commands.paint:paint", help="Paint calibrated pictures of one time into the place's texture.")
 app.command("seasonscapes.commands.inpaint:inpaint", help="Complete a painted texture where no camera saw.")
+app.command(
+    "seasonscapes.commands.path:path", help="Lay a path of views over a place, clear of the ground, with a map."
+)
+app.command("seasonscapes.commands.evaluate:evaluate", help="Score pictures against the truth, masked honestly.")
 app.command("seasonscapes.commands.albedo:albedo", help="Take the light out of a place's photographs.")
 app.command("seasonscapes.commands.run:run", help="From photographs to pictures of any hour, all stages, resumable.")
 app.command("seasonscapes.commands.distill:distill", help="Teach Gaussians the light of a place.")
-app.command("seasonscapes.commands.splat:splat", help="Render distilled Gaussians at any hour, or bake them for others.")
+app.command(
+    "seasonscapes.commands.splat:splat", help="Render distilled Gaussians at any hour, or bake them for others."
+)
 app.command("seasonscapes.commands.timelapse:timelapse", help="Film a view through hours or seasons.")
 app.command(
     "seasonscapes.commands.lit:lit_texture", name="lit-texture", help="Export a place's texture as lit at an hour."
