@@ -62,7 +62,13 @@ def tables_in(workspace: Workspace):
 
 
 def light_at(
-    model: SkyModel, moment: Moment, height_m: float, *, workspace: Workspace, map_height: int = 128, with_air: bool = True
+    model: SkyModel,
+    moment: Moment,
+    height_m: float,
+    *,
+    workspace: Workspace,
+    map_height: int = 128,
+    with_air: bool = True,
 ) -> Illumination:
     """The light of an instant for an observer at a height [m]; see `sky.illuminate`."""
     from seasonscapes.rendering.hosek import hosek_illumination

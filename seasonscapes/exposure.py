@@ -34,7 +34,9 @@ def parse_exposure(text: str) -> str | float:
     except ValueError:
         value = float("nan")
     if not -20.0 <= value <= 40.0:
-        raise InputError("--exposure", "not an exposure", got=text, expected="auto, eye, or an EV100 between -20 and 40")
+        raise InputError(
+            "--exposure", "not an exposure", got=text, expected="auto, eye, or an EV100 between -20 and 40"
+        )
     return value
 
 

@@ -20,7 +20,9 @@ def test_by_day_camera_and_meter_agree():
 @pytest.mark.parametrize("mode", ["auto", "eye"])
 def test_darker_scenes_look_darker_without_a_step(mode):
     """From a sunlit scene to starlight the picture darkens steadily, and never so far that nothing is left."""
-    levels = [develop(card(value), exposure_ev100(card(value), mode)).mean() for value in np.geomspace(5000.0, 1e-4, 300)]
+    levels = [
+        develop(card(value), exposure_ev100(card(value), mode)).mean() for value in np.geomspace(5000.0, 1e-4, 300)
+    ]
     assert np.all(np.diff(levels) < 1e-6)
     assert np.abs(np.diff(levels)).max() < 0.01
     assert levels[-1] < 0.4 * levels[0]

@@ -91,7 +91,9 @@ def test_equirectangular_map_round_trip():
     np.testing.assert_allclose(found, direction_from_angles([0.0, 359.9, 77.0], [3.0, -40.0, 60.0]), atol=1e-3)
 
 
-@pytest.mark.parametrize(("angles", "pixel_of_forward"), [((30.0, -10.0, 0.0), (300, 200)), ((200.0, 45.0, 20.0), (300, 200))])
+@pytest.mark.parametrize(
+    ("angles", "pixel_of_forward"), [((30.0, -10.0, 0.0), (300, 200)), ((200.0, 45.0, 20.0), (300, 200))]
+)
 def test_camera_looks_where_it_is_told(angles, pixel_of_forward):
     camera = camera_at(LocalFrame(46.55, 7.98), 46.55, 7.98, 100.0, heading_deg=angles[0], pitch_deg=angles[1],
                        roll_deg=angles[2], fov_deg=60.0, size_px=(600, 400))  # fmt: skip

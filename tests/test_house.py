@@ -18,7 +18,22 @@ FLOORS = [
     ("nouns", {"scene", "terrain", "cameras"}),
     ("wall", {"rendering"}),
     ("stages", {"calibration", "texturing", "albedo", "relighting", "gaussians", "evaluation"}),
-    ("street", {"workspace", "pipeline", "daylight", "studio", "ledger", "cluster", "viewer", "annotator", "commands", "cli", "__main__"}),
+    (
+        "street",
+        {
+            "workspace",
+            "pipeline",
+            "daylight",
+            "studio",
+            "ledger",
+            "cluster",
+            "viewer",
+            "annotator",
+            "commands",
+            "cli",
+            "__main__",
+        },
+    ),
 ]
 WALLS = {
     "mitsuba": {"rendering", "albedo"},

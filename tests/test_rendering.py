@@ -333,7 +333,9 @@ def test_scalar_and_llvm_agree():
         "print(json.dumps([view.radiance.mean((0, 1)).tolist(), float(view.gbuffer.depth.mean())]))\n"
     )
     results = [
-        json.loads(subprocess.run([sys.executable, "-c", code, device], capture_output=True, text=True, check=True).stdout)
+        json.loads(
+            subprocess.run([sys.executable, "-c", code, device], capture_output=True, text=True, check=True).stdout
+        )
         for device in ("scalar", "auto")
     ]
     np.testing.assert_allclose(results[0][0], results[1][0], rtol=0.01)

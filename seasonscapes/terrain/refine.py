@@ -41,10 +41,14 @@ def refine_raster(raster: Raster, factor: int) -> Raster:
         fine = np.arange((count - 1) * factor + 1) / factor
         values = PchipInterpolator(np.arange(count), values, axis=axis)(fine).astype(np.float32)
     # The first sample's centre stays at (0.5, 0.5) of the old grid.
-    transform = raster.transform * Affine.translation(0.5, 0.5) * Affine.scale(1.0 / factor) * Affine.translation(-0.5, -0.5)
+    transform = (
+        raster.transform * Affine.translation(0.5, 0.5) * Affine.scale(1.0 / factor) * Affine.translation(-0.5, -0.5)
+    )
     return replace(raster, values=values, transform=transform)
 
 
-def refinement_factor(samples: int, spacing_m: float, *, most_samples: int = 4_000_000, least_spacing_m: float = 10.0) -> int:
+def refinement_factor(
+    samples: int, spacing_m: float, *, most_samples: int = 4_000_000, least_spacing_m: float = 10.0
+) -> int:
     """1, 2 or 4: the largest that keeps the raster within a number of samples and above a spacing worth having [m]."""
     return max(k for k in (1, 2, 4) if k == 1 or (samples * k * k <= most_samples and spacing_m / k >= least_spacing_m))
