@@ -7,7 +7,7 @@ open the same studio and render the same frame to the digit.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, date, datetime
 from pathlib import Path
 from typing import Any
@@ -72,7 +72,19 @@ class Assignment:
 
 @dataclass
 class Studio:
-    """An opened assignment. ``dressed`` is the view in the colours it wore last, and which those were."""
+    """An opened assignment.
+
+    Parameters
+    ----------
+    dated, base
+        The place's dated albedos, and the one that the coefficients were traced with.
+    frames
+        Folder of its frames.
+    colours
+        Of the dated albedos that were worn so far, by number.
+    dressed
+        The view in the colours it wore last, and which those were.
+    """
 
     assignment: Assignment
     place: Place
@@ -80,15 +92,19 @@ class Studio:
     coefficients: Any
     terrain: Any
     ready: Any
-    key: str
+    dated: list[DatedAlbedo]
+    base: DatedAlbedo
+    frames: Path
+    colours: dict[int, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
     dressed: tuple[list, Any] | None = None
 
 
 def assignment_key(assignment: Assignment, place: Place) -> str:
-    """Name of all that decides a frame but its time."""
+    """Name of all that decides a frame but its time. Reads the albedo's files to name their content: ask once."""
+    dated = dated_albedos(place, assignment.albedo)
     inputs = {"revision": REVISION, "place": place.key, "view": assignment.view, "size": assignment.size_px,
-              "model": assignment.model, "albedo": [_named(each) for each in _dated(assignment, place)],
-              "base": _named(_base(assignment, place)), "season": assignment.season, "seed": assignment.seed}  # fmt: skip
+              "model": assignment.model, "albedo": [_named(each) for each in dated],
+              "base": _named(_base(assignment, dated)), "season": assignment.season, "seed": assignment.seed}  # fmt: skip
     return content_key(inputs)
 
 
@@ -96,13 +112,8 @@ def _named(dated: DatedAlbedo) -> dict:
     return {"date": dated.day.isoformat(), "content": dated.content}
 
 
-def _dated(assignment: Assignment, place: Place) -> list[DatedAlbedo]:
-    return dated_albedos(place, assignment.albedo)
-
-
-def _base(assignment: Assignment, place: Place) -> DatedAlbedo:
+def _base(assignment: Assignment, dated: list[DatedAlbedo]) -> DatedAlbedo:
     """The dated albedo that the coefficients are traced with."""
-    dated = _dated(assignment, place)
     day = date.fromisoformat(assignment.base_day)
     return dated[season_weights([each.day for each in dated], day, season="nearest")[0][0]]
 
@@ -126,18 +137,22 @@ def open_studio(assignment: Assignment, *, progress: Progress | None = None) -> 
     place = load_place(Path(assignment.scene), Workspace(Path(assignment.workspace)), options=assignment.options,
                        allow_outside=assignment.allow_outside)  # fmt: skip
     camera = camera_for(place, assignment.view, size_px=assignment.size_px)
-    key = assignment_key(assignment, place)
-    terrain = occluder(mi_mesh(place.terrain, _base(assignment, place).load().values))
-    coefficients = _coefficients(assignment, place, camera, terrain, progress)
-    return Studio(assignment, place, camera, coefficients, terrain, ready_view(terrain, coefficients), key)
+    dated = dated_albedos(place, assignment.albedo)
+    base = _base(assignment, dated)
+    terrain = occluder(mi_mesh(place.terrain, base.load().values))
+    coefficients = _coefficients(assignment, place, camera, (terrain, base), progress)
+    return Studio(assignment, place, camera, coefficients, terrain, ready_view(terrain, coefficients), dated, base,
+                  frames_folder(assignment, place))  # fmt: skip
 
 
-def _coefficients(assignment: Assignment, place: Place, camera: Camera, terrain: Any, progress: Progress | None) -> Any:
+def _coefficients(assignment: Assignment, place: Place, camera: Camera, clothed: tuple[Any, DatedAlbedo],
+                  progress: Progress | None) -> Any:  # fmt: skip
     from seasonscapes.rendering.coefficients_file import load_coefficients, save_coefficients
     from seasonscapes.rendering.transport import Effort, trace_view
 
+    terrain, base = clothed
     inputs = {"revision": REVISION, "place": place.key, "view": assignment.view, "size": assignment.size_px,
-              "albedo": _named(_base(assignment, place)), "effort": asdict(Effort()), "seed": assignment.seed}  # fmt: skip
+              "albedo": _named(base), "effort": asdict(Effort()), "seed": assignment.seed}  # fmt: skip
     key = content_key(inputs)
     folder = place.workspace.folder / f"{place.scene.name}/coefficients-{key}"
     if (folder / "coefficients.json").is_file():
@@ -162,12 +177,14 @@ def dressed_view(studio: Studio, day: date) -> Any:
     """The view in the colours of a day."""
     from seasonscapes.rendering.relit_view import with_albedo
 
-    dated = _dated(studio.assignment, studio.place)
-    weights = season_weights([each.day for each in dated], day, season=studio.assignment.season)
-    if len(dated) == 1:
+    weights = season_weights([each.day for each in studio.dated], day, season=studio.assignment.season)
+    if len(studio.dated) == 1:
         return studio.ready
     if studio.dressed is None or studio.dressed[0] != weights:
-        parts = [(_colours(studio, dated[index]), weight) for index, weight in weights]
+        for index, _ in weights:
+            if index not in studio.colours:
+                studio.colours[index] = _colours(studio, studio.dated[index])
+        parts = [(studio.colours[index], weight) for index, weight in weights]
         pixels, senders = (sum(weight * part[k] for part, weight in parts) for k in range(2))
         studio.dressed = (weights, with_albedo(studio.ready, pixels, senders))
     return studio.dressed[1]
@@ -181,7 +198,7 @@ def _colours(studio: Studio, dated: DatedAlbedo) -> tuple[np.ndarray, np.ndarray
 
     assignment, place = studio.assignment, studio.place
     inputs = {"revision": REVISION, "place": place.key, "view": assignment.view, "size": assignment.size_px,
-              "albedo": _named(dated), "base": _named(_base(assignment, place)),
+              "albedo": _named(dated), "base": _named(studio.base),
               "seed": assignment.seed}  # fmt: skip
 
     def build() -> tuple[np.ndarray, np.ndarray]:
@@ -230,7 +247,7 @@ def render_frame(assignment: Assignment, time: datetime, *, exr_folder: str | No
         Also write absolute radiance in full precision there.
     """
     studio = held_studio(assignment)
-    path = frames_folder(assignment, studio.place) / frame_name(time)
+    path = studio.frames / frame_name(time)
     copy = None if exr_folder is None else Path(exr_folder) / frame_name(time)
     if path.is_file() and (copy is None or copy.is_file()):
         return {"time_utc": time.isoformat(), "metered_ev100": frame_ev100(path), "rendered": False}

@@ -271,9 +271,9 @@ def developed(
     from seasonscapes.exposure import develop, exposure_ev100
     from seasonscapes.relighting.adaptation import adapted_ev100
     from seasonscapes.relighting.frame_file import frame_ev100, frame_name, load_frame
-    from seasonscapes.studio import frames_folder, held_studio
+    from seasonscapes.studio import held_studio
 
-    folder = frames_folder(assignment, held_studio(assignment).place)
+    folder = held_studio(assignment).frames
     paths = [folder / frame_name(time) for time in times]
     seconds = np.array([time.timestamp() for time in times])
     if metering == "auto":
@@ -289,9 +289,9 @@ def developed(
 def _sweep(assignment: Assignment, times: list[datetime]) -> None:
     """Remove the undeveloped frames of a film that is done."""
     from seasonscapes.relighting.frame_file import frame_name
-    from seasonscapes.studio import frames_folder, held_studio
+    from seasonscapes.studio import held_studio
 
-    folder = frames_folder(assignment, held_studio(assignment).place)
+    folder = held_studio(assignment).frames
     for time in times:
         (folder / frame_name(time)).unlink(missing_ok=True)
     if not any(folder.iterdir()):
