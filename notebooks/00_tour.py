@@ -45,7 +45,7 @@ moment = moment_at(evening, place.frame.latitude_deg, place.frame.longitude_deg)
 sky = light_at(read_sky_model("clear"), moment, 1500.0, workspace=place.workspace)
 plt.imshow(srgb_from_linear(dome_picture(sky, 400)))
 plt.title(f"sun at {moment.sun.elevation_deg:.1f}°")
-plt.axis("off")
+_ = plt.axis("off")
 # %% [markdown]
 # The view at that hour: radiance in cd/m², developed as a camera would.
 
@@ -54,10 +54,10 @@ light, _ = light_for(place, camera, read_sky_model("clear"), evening)
 view = render_view(build_scene(place.terrain, albedo_for(place, evening).values, light), camera, spp=16)
 plt.figure(figsize=(9, 6))
 plt.imshow(srgb_from_linear(develop(view.radiance, exposure_ev100(view.radiance))))
-plt.axis("off")
+_ = plt.axis("off")
 # %% [markdown]
 # What each pixel sees: distance along the ray, in kilometres.
 
 # %%
 plt.imshow(view.gbuffer.depth / 1000.0, cmap="viridis")
-plt.colorbar(label="km")
+_ = plt.colorbar(label="km")

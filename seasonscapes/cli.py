@@ -54,8 +54,11 @@ app.command("seasonscapes.commands.doctor:doctor", help="Say what this machine c
 def main(arguments: list[str] | None = None) -> int:
     """Run one verb. Exit codes: 0 well, 2 the user's input, 130 interrupted; a bug shows its traceback (1)."""
     tokens = sys.argv[1:] if arguments is None else arguments
+    from seasonscapes.commands.talk import interruptible
+
     try:
-        app(tokens, exit_on_error=True, print_error=True, result_action="return_value")
+        with interruptible():
+            app(tokens, exit_on_error=True, print_error=True, result_action="return_value")
     except InputError as error:
         if "--json" in tokens:
             print(json.dumps({"error": str(error)}))
