@@ -182,9 +182,9 @@ def _logged(folder: Path, name: str):
 
 
 def _stamp(time: str) -> str:
-    from datetime import datetime
+    from seasonscapes.relighting.frame_file import time_stamp
 
-    return f"{datetime.fromisoformat(time):%Y%m%dT%H%M%SZ}"
+    return time_stamp(_moment(time))
 
 
 def _moment(time: str) -> datetime:

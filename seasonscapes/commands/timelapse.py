@@ -232,6 +232,7 @@ def develop_film(assignment: Assignment, times: list[datetime], output: Path, lo
     """Expose rendered frames as one film and write it, or its pictures; ``look`` is metering, window [s] and fps."""
     from seasonscapes.images import write_png
     from seasonscapes.relighting.film import write_film
+    from seasonscapes.relighting.frame_file import time_stamp
 
     metering, window_s, fps = look
     pictures = developed(assignment, times, metering=metering, window_s=window_s)
@@ -248,7 +249,7 @@ def develop_film(assignment: Assignment, times: list[datetime], output: Path, lo
             return
         for time, picture in zip(times, told(), strict=True):
             about = film_record(assignment) | {"time_utc": time.isoformat()}
-            write_png(output / f"{time:%Y%m%dT%H%M%S}Z.png", picture,
+            write_png(output / f"{time_stamp(time)}.png", picture,
                       metadata={"seasonscapes": json_module.dumps(about)})  # fmt: skip
 
 

@@ -160,13 +160,14 @@ def make_webcam_series(place: Place, times: Sequence[datetime], model: SkyModel,
     from seasonscapes.evaluation.webcam_faults import PoseSigmas
     from seasonscapes.images import write_png8
     from seasonscapes.pipeline import albedo_for
+    from seasonscapes.relighting.frame_file import time_stamp
 
     tell = progress or (lambda share: None)
     sigmas = PoseSigmas(0.5, 0.5, 0.01, 0.01, 0.01)
     albedos: dict[int, np.ndarray] = {}
     rows = []
     for number, (name, camera) in enumerate(cameras.items()):
-        names = [f"{name}.png" if len(times) == 1 else f"{name}_{time:%Y%m%dT%H%M%SZ}.png" for time in times]
+        names = [f"{name}.png" if len(times) == 1 else f"{name}_{time_stamp(time)}.png" for time in times]
         record = folder / f"{name}_calibration.json"
         if not (record.is_file() and all((folder / each).is_file() for each in names)):
             hours = []

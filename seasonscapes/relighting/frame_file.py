@@ -39,6 +39,11 @@ def frame_ev100(path: Path) -> float:
         return float(file.header()["seasonscapes:metered_ev100"])
 
 
+def time_stamp(time: datetime) -> str:
+    """An aware UTC time as a file's stem: sorts by time, and does not depend on which other frames a film has."""
+    return f"{time:%Y%m%dT%H%M%S}Z"
+
+
 def frame_name(time: datetime) -> str:
-    """Of an aware UTC time: sorts by time, and does not depend on which other frames a film has."""
-    return f"{time:%Y%m%dT%H%M%S}Z.exr"
+    """The file of an aware UTC time's frame."""
+    return f"{time_stamp(time)}.exr"
