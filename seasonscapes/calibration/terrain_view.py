@@ -9,8 +9,7 @@ import numpy as np
 
 from seasonscapes.calibration.horizon import terrain_profile
 from seasonscapes.calibration.pose_model import View
-from seasonscapes.cameras.panorama import Panorama, panorama_directions
-from seasonscapes.cameras.pinhole import ray_directions
+from seasonscapes.cameras.panorama import view_directions
 from seasonscapes.frames import LocalFrame, geodetic_from_enu, local_axes
 from seasonscapes.terrain.surface import Raster
 
@@ -43,14 +42,9 @@ def scaled_view(view: View, width_px: int) -> View:
                    fy=view.fy * scale, cx=view.cx * scale, cy=view.cy * scale)  # fmt: skip
 
 
-def directions_of(view: View) -> np.ndarray:
-    """Unit directions of all pixel centres ``(H, W, 3)``."""
-    return panorama_directions(view) if isinstance(view, Panorama) else ray_directions(view)
-
-
 def look_with(view: View, trace: Callable) -> TerrainView:
     """A view by any ray caster: ``trace(origins, directions)`` gives ``depth``, ``normal`` and ``position`` (a G-buffer)."""
-    direction = directions_of(view)
+    direction = view_directions(view)
     hit = trace(np.broadcast_to(view.position_m, direction.shape), direction)
     normal = np.nan_to_num(np.asarray(hit.normal, float))
     return TerrainView(np.asarray(hit.depth, float), normal, np.asarray(hit.position, float))
@@ -66,7 +60,7 @@ def look_at_rasters(view: View, rasters: Sequence[Raster], frame: LocalFrame, *,
     position = view.position_m
     latitude, longitude, _ = geodetic_from_enu(frame, position)
     axes = local_axes(frame, float(latitude), float(longitude))
-    direction = directions_of(view) @ axes.T
+    direction = view_directions(view) @ axes.T
     azimuth = np.degrees(np.arctan2(direction[..., 0], direction[..., 1]))
     middle = azimuth[azimuth.shape[0] // 2, azimuth.shape[1] // 2]
     azimuth = (azimuth - middle + 180.0) % 360.0 - 180.0

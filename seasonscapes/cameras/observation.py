@@ -18,6 +18,7 @@ from zoneinfo import ZoneInfo
 
 import numpy as np
 
+from seasonscapes.cameras.panorama import Panorama
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.cameras.webcam import Webcam
 from seasonscapes.declaration import InputError
@@ -49,7 +50,7 @@ class Observation:
 
     image: np.ndarray
     mask: np.ndarray
-    camera: Camera
+    camera: Camera | Panorama
     time: datetime
     webcam: str
 
@@ -284,7 +285,7 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def open_observation(row: ManifestRow, folder: Path, camera: Camera) -> Observation:
+def open_observation(row: ManifestRow, folder: Path, camera: Camera | Panorama) -> Observation:
     """Open one picture of a perspective view; `InputError` where it is missing, damaged or of another size."""
     path = folder / row.path
     try:

@@ -138,6 +138,11 @@ def panorama_directions(panorama: Panorama, pixel=None) -> np.ndarray:
     return local @ panorama.world_from_camera[:3, :3].T
 
 
+def view_directions(view: Camera | Panorama, pixel=None) -> np.ndarray:
+    """Unit world directions ``(..., 3)`` of pixels ``(..., 2)`` (x, y) of either kind of view; see `panorama_directions`."""
+    return panorama_directions(view, pixel) if isinstance(view, Panorama) else ray_directions(view, pixel)
+
+
 def split_panorama(panorama: Panorama, *, fov_deg: float = 85.0, overlap_deg: float = 10.0,
                    size_px: tuple[int, int] | None = None, count: int | None = None) -> list[Camera]:  # fmt: skip
     """Perspective views that cover a panorama, evenly spread, sharing its position and axis.

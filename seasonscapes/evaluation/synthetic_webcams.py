@@ -10,6 +10,7 @@ from datetime import datetime
 import numpy as np
 
 from seasonscapes.cameras.observation import Observation
+from seasonscapes.cameras.panorama import Panorama
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.evaluation.webcam_faults import (
     TYPICAL,
@@ -69,7 +70,7 @@ class SyntheticPicture:
 
     observation: Observation
     encoded: np.ndarray
-    camera: Camera
+    camera: Camera | Panorama
     radiance: np.ndarray
     surface: np.ndarray
     foreground: np.ndarray
@@ -77,7 +78,7 @@ class SyntheticPicture:
     gbuffer: GBuffer
 
 
-def webcam_series(terrain: Terrain, webcam: str, camera: Camera, hours: Sequence[Hour], *, faults: WebcamFaults = TYPICAL,
+def webcam_series(terrain: Terrain, webcam: str, camera: Camera | Panorama, hours: Sequence[Hour], *, faults: WebcamFaults = TYPICAL,
                   poses: PoseSigmas | None = None, foreground: bool = False, effort: Effort = QUICK, seed: int = 0,
                   progress: Progress | None = None) -> list[SyntheticPicture]:  # fmt: skip
     """Pictures of one webcam at several hours. Its pose error and its foreground are the same in all of them.
@@ -87,7 +88,7 @@ def webcam_series(terrain: Terrain, webcam: str, camera: Camera, hours: Sequence
     webcam
         Its id; with ``seed`` it decides what is random, so that a webcam keeps its faults whichever others there are.
     camera
-        Where it truly is.
+        Where it truly is; a panorama is traced as one picture.
     poses
         How far off the pose is that the observations carry; left out, it is exact.
     effort

@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from seasonscapes.cameras.pinhole import Camera, rotation_from_angles
+from seasonscapes.calibration.pose_model import View, values_of, view_from_values
+from seasonscapes.cameras.pinhole import rotation_from_angles
 from seasonscapes.images import (
     METER_CONSTANT,
     REC709_LUMINANCE,
@@ -147,10 +148,11 @@ def untone(toned: np.ndarray, strength: float) -> np.ndarray:
     return np.interp(toned, tone(knots, strength), knots).astype(np.float32)
 
 
-def perturb_pose(camera: Camera, sigmas: PoseSigmas, rng: np.random.Generator) -> tuple[Camera, dict[str, float]]:
-    """A camera that is off by a random amount, and by how much: keys as the fields of `PoseSigmas`, and east, north, up.
+def perturb_pose(camera: View, sigmas: PoseSigmas, rng: np.random.Generator) -> tuple[View, dict[str, float]]:
+    """A view that is off by a random amount, and by how much: keys as the fields of `PoseSigmas`, and east, north, up.
 
-    Heading turns about the frame's up axis, pitch and roll about the camera's own axes.
+    Heading turns about the frame's up axis, pitch and roll about the camera's own axes. A full circle stays one: the
+    focal length of such a panorama changes in its rows alone.
     """
     draw = rng.normal(0.0, 1.0, 7)
     error = {"east_m": draw[0] * sigmas.horizontal_m, "north_m": draw[1] * sigmas.horizontal_m,
@@ -164,8 +166,10 @@ def perturb_pose(camera: Camera, sigmas: PoseSigmas, rng: np.random.Generator) -
     pose = camera.world_from_camera.copy()
     pose[:3, :3] = turn @ pose[:3, :3] @ nod
     pose[:3, 3] += [error["east_m"], error["north_m"], error["up_m"]]
-    scale = float(np.exp(error["log_focal"]))
-    return replace(camera, fx=camera.fx * scale, fy=camera.fy * scale, world_from_camera=pose), error
+    values = values_of(camera, np.eye(3))
+    values[6] = error["log_focal"]
+    scaled = view_from_values(camera, np.eye(3), values)
+    return replace(camera, fx=scaled.fx, fy=scaled.fy, world_from_camera=pose), error
 
 
 # Reflectances of what stands before webcams: roof tiles, slate, plaster, weathered wood, steel.
@@ -199,10 +203,11 @@ def add_foreground(radiance: np.ndarray, rng: np.random.Generator, *, houses: in
         _house(image, mask, float(middle), light, rng)
     if mast:
         x, top = int(rng.uniform(0.1, 0.9) * width), int(rng.uniform(0.15, 0.35) * height)
-        thick = max(2, round(0.004 * width))
+        size = min(width, 1.5 * height)  # see `_house`
+        thick = max(2, round(0.004 * size))
         _fill(image, mask, [(x, height), (x, top), (x + thick, top), (x + thick, height)], light * _STEEL)
         for rung in np.linspace(top, 0.5 * height, 3):
-            y, half = int(rung), int(0.02 * width)
+            y, half = int(rung), int(0.02 * size)
             _fill(image, mask, [(x - half, y), (x + half, y), (x + half, y + thick), (x - half, y + thick)],
                   light * _STEEL)  # fmt: skip
     return image, mask.astype(bool)
@@ -210,7 +215,8 @@ def add_foreground(radiance: np.ndarray, rng: np.random.Generator, *, houses: in
 
 def _house(image: np.ndarray, mask: np.ndarray, middle: float, light: float, rng: np.random.Generator) -> None:
     height, width = mask.shape
-    half = 0.5 * rng.uniform(0.08, 0.16) * width
+    # A panorama is wide because it shows more, not because it is nearer.
+    half = 0.5 * rng.uniform(0.08, 0.16) * min(width, 1.5 * height)
     eaves = height - rng.uniform(0.10, 0.22) * height
     ridge = eaves - rng.uniform(0.35, 0.6) * half
     shade = rng.uniform(0.25, 1.1, 2)  # sides turned to and from the light

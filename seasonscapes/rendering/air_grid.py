@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from seasonscapes.cameras.pinhole import Camera, ray_directions
+from seasonscapes.cameras.panorama import Panorama, view_directions
+from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.rendering.scene import background
 from seasonscapes.sky.illumination import AerialPerspective, Illumination
 
@@ -47,18 +48,18 @@ class AirPlaces:
     share: np.ndarray
 
 
-def _step_px(camera: Camera, most_deg: float, most_px: int) -> int:
+def _step_px(camera: Camera | Panorama, most_deg: float, most_px: int) -> int:
     return int(np.clip(np.radians(most_deg) * max(camera.fx, camera.fy), 1, most_px))
 
 
-def _nodes(camera: Camera, step: int) -> np.ndarray:
+def _nodes(camera: Camera | Panorama, step: int) -> np.ndarray:
     """Directions at the centre of every ``step``-th pixel, the last ones past the rim."""
     x = 0.5 + np.arange(0, camera.width_px + step, step)
     y = 0.5 + np.arange(0, camera.height_px + step, step)
-    return ray_directions(camera, np.stack(np.meshgrid(x, y), axis=-1))
+    return view_directions(camera, np.stack(np.meshgrid(x, y), axis=-1))
 
 
-def air_places(camera: Camera, pixel: np.ndarray, depth_m: np.ndarray,
+def air_places(camera: Camera | Panorama, pixel: np.ndarray, depth_m: np.ndarray,
                several: tuple[np.ndarray, np.ndarray]) -> AirPlaces:  # fmt: skip
     """For flat indices ``(n,)`` of pixels and their distances ``(n,)`` [m].
 
@@ -129,7 +130,7 @@ class SkyGrid:
     direction: np.ndarray
 
 
-def sky_grid(camera: Camera, pixel: np.ndarray) -> SkyGrid:
+def sky_grid(camera: Camera | Panorama, pixel: np.ndarray) -> SkyGrid:
     """For the flat indices ``(K,)`` of pixels that show any open sky."""
     step = _step_px(camera, _SKY_STEP_DEG, _SKY_STEP_PX)
     node = _nodes(camera, step)
@@ -143,7 +144,7 @@ def sky_grid(camera: Camera, pixel: np.ndarray) -> SkyGrid:
     share = np.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy])
     used = np.zeros(node.shape[0] * width, bool)
     used[corner] = True
-    direction = ray_directions(camera, np.stack([column + 0.5, row + 0.5], axis=-1))
+    direction = view_directions(camera, np.stack([column + 0.5, row + 0.5], axis=-1))
     return SkyGrid(pixel, node, used, corner, share, direction.astype(np.float32))
 
 

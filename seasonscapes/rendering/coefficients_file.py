@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from seasonscapes.cameras.panorama import Panorama
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.rendering.gather import Points
 from seasonscapes.rendering.senders import Reception, Senders
@@ -23,7 +24,8 @@ from seasonscapes.rendering.transport import Effort, PointCoefficients, ViewCoef
 # A new number wherever the same inputs give other coefficients, or the files other names.
 REVISION = 1
 _KINDS = {
-    kind.__name__: kind for kind in (Camera, Points, Reception, Senders, Effort, PointCoefficients, ViewCoefficients)
+    kind.__name__: kind
+    for kind in (Camera, Panorama, Points, Reception, Senders, Effort, PointCoefficients, ViewCoefficients)
 }
 Coefficients = ViewCoefficients | PointCoefficients
 

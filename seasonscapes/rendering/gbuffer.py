@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from seasonscapes.cameras.panorama import Panorama, view_directions
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.rendering.backend import point3, to_numpy, use_backend
 from seasonscapes.rendering.scene import RenderScene
@@ -38,7 +39,7 @@ class GBuffer:
     position: np.ndarray
 
 
-def mi_rays(camera: Camera, x: Any, y: Any) -> Any:
+def mi_rays(camera: Camera | Panorama, x: Any, y: Any) -> Any:
     """Mitsuba rays through pixel positions (lanes ``x``, ``y`` in pixels), normalised, with no far limit."""
     import drjit as dr
     import mitsuba as mi
@@ -49,16 +50,20 @@ def mi_rays(camera: Camera, x: Any, y: Any) -> Any:
 
     columns = [mi.Vector3f(*map(opaque, camera.world_from_camera[:3, axis])) for axis in range(3)]
     across, down = (x - opaque(camera.cx)) / opaque(camera.fx), (y - opaque(camera.cy)) / opaque(camera.fy)
-    direction = dr.normalize(columns[0] * across + columns[1] * down + columns[2])
+    if isinstance(camera, Panorama):
+        sine, cosine = dr.sincos(across)
+        # On a cylinder rows are linear in the tangent of elevation, on a sphere in elevation itself.
+        sink, level = (down, mi.Float(1.0)) if camera.projection == "cylindrical" else dr.sincos(down)
+        direction = dr.normalize((columns[0] * sine + columns[2] * cosine) * level + columns[1] * sink)
+    else:
+        direction = dr.normalize(columns[0] * across + columns[1] * down + columns[2])
     origin = mi.Point3f(*map(opaque, camera.position_m))
     return mi.Ray3f(origin + direction * NEAR_M, direction)
 
 
-def trace_gbuffer(scene: RenderScene, camera: Camera, pixel: np.ndarray | None = None) -> GBuffer:
+def trace_gbuffer(scene: RenderScene, camera: Camera | Panorama, pixel: np.ndarray | None = None) -> GBuffer:
     """The G-buffer at pixel positions ``(..., 2)`` (x, y); at all pixel centres, ``(H, W)``, when left out."""
-    from seasonscapes.cameras.pinhole import ray_directions
-
-    direction = ray_directions(camera, pixel)
+    direction = view_directions(camera, pixel)
     origin = np.broadcast_to(camera.position_m, direction.shape)
     return trace_rays(scene, origin, direction)
 

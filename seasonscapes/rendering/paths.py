@@ -13,6 +13,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from seasonscapes.cameras.panorama import Panorama
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.rendering.gbuffer import mi_rays
 from seasonscapes.rendering.scene import LUMINARY_DISTANCE_M, RenderScene
@@ -28,7 +29,7 @@ SURVIVAL = 2.0
 _PIXEL, _BOUNCE, _LOBE, _SURVIVAL, _LUMINARY = range(5)
 
 
-def trace_block(scene: RenderScene, camera: Camera, block: tuple[int, int, int, int], *, max_depth: int,
+def trace_block(scene: RenderScene, camera: Camera | Panorama, block: tuple[int, int, int, int], *, max_depth: int,
                 seed: tuple[int, int]) -> np.ndarray:  # fmt: skip
     """Sums over the samples of a block of rows, ``(height, W, 4)``: radiance [cd/m²] and samples that met terrain.
 

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from seasonscapes.cameras.pinhole import Camera, ray_directions
+from seasonscapes.cameras.panorama import Panorama, view_directions
+from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.rendering.backend import use_backend
 from seasonscapes.rendering.gbuffer import GBuffer, trace_gbuffer
 from seasonscapes.rendering.scene import RenderScene, background
@@ -47,7 +48,7 @@ def mi_path_integrator(max_depth: int) -> Any:
     return mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": 64, "hide_emitters": True})
 
 
-def path_trace(scene: RenderScene, camera: Camera, *, spp: int = 64, seed: int = 0, max_depth: int = 6,
+def path_trace(scene: RenderScene, camera: Camera | Panorama, *, spp: int = 64, seed: int = 0, max_depth: int = 6,
                progress: Progress | None = None) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Radiance that leaves the terrain towards the camera ``(H, W, 3)`` [cd/m²] and coverage ``(H, W)``.
 
@@ -86,7 +87,7 @@ def path_trace(scene: RenderScene, camera: Camera, *, spp: int = 64, seed: int =
     return image[..., :3], np.clip(image[..., 3], 0.0, 1.0)
 
 
-def _trace_block(scene: RenderScene, camera: Camera, block: tuple[int, int, int, int], *, max_depth: int,
+def _trace_block(scene: RenderScene, camera: Camera | Panorama, block: tuple[int, int, int, int], *, max_depth: int,
                  seed: int) -> np.ndarray:  # fmt: skip
     """Sums over the samples of one block of rows as ``(height, W, 4)``: radiance and coverage."""
     from seasonscapes.rendering.paths import trace_block  # imports Dr.Jit, whose library `use_backend` chooses first
@@ -95,11 +96,13 @@ def _trace_block(scene: RenderScene, camera: Camera, block: tuple[int, int, int,
     return trace_block(scene, camera, block, max_depth=max_depth, seed=(first, second))
 
 
-def _trace_block_scalar(scene: RenderScene, camera: Camera, block: tuple[int, int, int, int], *, max_depth: int,
+def _trace_block_scalar(scene: RenderScene, camera: Camera | Panorama, block: tuple[int, int, int, int], *, max_depth: int,
                         seed: int) -> np.ndarray:  # fmt: skip
     """The same through Mitsuba's own sensor and film, as the scalar variant knows no lanes."""
     import mitsuba as mi
 
+    if isinstance(camera, Panorama):
+        raise ValueError("the scalar variant renders pinhole cameras only; install a libLLVM for panoramas")
     if abs(camera.fx / camera.fy - 1.0) > 1e-6:
         raise ValueError("the scalar variant renders square pixels only; install a libLLVM for other cameras")
     top, height, first, count = block
@@ -135,7 +138,7 @@ def _trace_block_scalar(scene: RenderScene, camera: Camera, block: tuple[int, in
     return np.array(mean, np.float32) * count
 
 
-def render_view(scene: RenderScene, camera: Camera, *, spp: int = 64, seed: int = 0, max_depth: int = 6,
+def render_view(scene: RenderScene, camera: Camera | Panorama, *, spp: int = 64, seed: int = 0, max_depth: int = 6,
                 progress: Progress | None = None) -> View:  # fmt: skip
     """Path trace the terrain, look at it through the air, and put the sky behind it; see `path_trace`."""
     surface, coverage = path_trace(scene, camera, spp=spp, seed=seed, max_depth=max_depth, progress=progress)
@@ -143,7 +146,7 @@ def render_view(scene: RenderScene, camera: Camera, *, spp: int = 64, seed: int 
     return View(through_air(scene, camera, surface, coverage, gbuffer), surface, coverage, gbuffer)
 
 
-def through_air(scene: RenderScene, camera: Camera, surface: np.ndarray, coverage: np.ndarray,
+def through_air(scene: RenderScene, camera: Camera | Panorama, surface: np.ndarray, coverage: np.ndarray,
                 gbuffer: GBuffer) -> np.ndarray:  # fmt: skip
     """Radiance ``(H, W, 3)`` at the camera of a terrain picture seen through the air, with the sky behind it.
 
@@ -151,7 +154,7 @@ def through_air(scene: RenderScene, camera: Camera, surface: np.ndarray, coverag
     a far ridge and a near rock in one pixel have different air.
     """
     illumination = scene.illumination
-    direction = ray_directions(camera)
+    direction = view_directions(camera)
     open_sky = (1.0 - coverage)[..., None]
     image = surface.astype(np.float64)
     if illumination.aerial_perspective is not None:
@@ -178,7 +181,9 @@ def _silhouettes(depth: np.ndarray, ratio: float = 1.1) -> np.ndarray:
     return np.max([np.abs(centre - other) for other in neighbours], axis=0) > np.log(ratio)
 
 
-def _air_of_subpixels(scene: RenderScene, camera: Camera, row: np.ndarray, column: np.ndarray, side: int = 4):
+def _air_of_subpixels(
+    scene: RenderScene, camera: Camera | Panorama, row: np.ndarray, column: np.ndarray, side: int = 4
+):
     """Mean transmittance and airlight ``(N, 3)`` over the terrain-covered part of pixels, from side² distances each."""
     offset = (np.arange(side) + 0.5) / side
     dx, dy = (grid.ravel() for grid in np.meshgrid(offset, offset))
@@ -186,7 +191,7 @@ def _air_of_subpixels(scene: RenderScene, camera: Camera, row: np.ndarray, colum
     depth = trace_gbuffer(scene, camera, pixel).depth
     hit = np.isfinite(depth)
     transmittance, airlight = scene.illumination.aerial_perspective(
-        np.where(hit, depth, 0.0), ray_directions(camera, pixel)
+        np.where(hit, depth, 0.0), view_directions(camera, pixel)
     )
     weight = hit / np.maximum(hit.sum(axis=1, keepdims=True), 1)
     # No sub-ray met terrain: keep the coverage's rare sample unattenuated rather than black.

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from seasonscapes.cameras.pinhole import Camera, ray_directions
+from seasonscapes.cameras.panorama import Panorama, view_directions
+from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.rendering.backend import point3
 from seasonscapes.rendering.gather import Occluder
 from seasonscapes.rendering.gbuffer import NEAR_M
@@ -56,11 +57,11 @@ def _clear_block(terrain: Occluder, position_m: np.ndarray, normal: np.ndarray, 
     return ~np.array(terrain.mi_scene.ray_test(ray))
 
 
-def faces_met(terrain: Occluder, camera: Camera) -> np.ndarray:
+def faces_met(terrain: Occluder, camera: Camera | Panorama) -> np.ndarray:
     """Index ``(H, W)`` int64 of the face that each pixel centre's ray meets, −1 in the sky."""
     import mitsuba as mi
 
-    direction = ray_directions(camera).reshape(-1, 3).astype(np.float32)
+    direction = view_directions(camera).reshape(-1, 3).astype(np.float32)
     face = np.empty(len(direction), np.int64)
     for start in range(0, len(face), LANES):
         part = direction[start : start + LANES]

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from seasonscapes.cameras.panorama import Panorama
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.rendering.direction_basis import DirectionBasis, direction_basis
 from seasonscapes.rendering.gather import OPEN, Occluder, Points, gather, joined
@@ -113,7 +114,7 @@ class ViewCoefficients:
         How they were made.
     """
 
-    camera: Camera
+    camera: Camera | Panorama
     pixel: np.ndarray
     coverage: np.ndarray
     albedo: np.ndarray
@@ -154,7 +155,7 @@ class Preparation:
     senders: Senders
 
 
-def trace_view(terrain: Occluder, camera: Camera, effort: Effort | None = None, *, seed: int = 0,
+def trace_view(terrain: Occluder, camera: Camera | Panorama, effort: Effort | None = None, *, seed: int = 0,
                progress: Progress | None = None) -> ViewCoefficients:  # fmt: skip
     """Daylight coefficients of a view. Memory beyond the result does not grow with the view.
 
@@ -269,7 +270,7 @@ def _nothing(basis: DirectionBasis, effort: Effort) -> Reception:
                      np.zeros(1, np.float16))  # fmt: skip
 
 
-def _view_rows(terrain: Occluder, prepared: Preparation, camera: Camera, rows: tuple[int, int], effort: Effort,
+def _view_rows(terrain: Occluder, prepared: Preparation, camera: Camera | Panorama, rows: tuple[int, int], effort: Effort,
                seed: int) -> list[tuple]:  # fmt: skip
     """The columns of `ViewCoefficients` and of its `Reception` for a block of rows; empty where they show no terrain."""
     points, hit, pixel = view_samples(terrain, camera, rows, effort.subpixels, seed)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from seasonscapes.cameras.panorama import Panorama
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.rendering.gather import LANES, Occluder, Points, front_side, surface_points
 from seasonscapes.rendering.gbuffer import mi_rays
@@ -16,7 +17,7 @@ from seasonscapes.sky.illumination import LUMINANCE_WEIGHTS
 _PIXEL = 103
 
 
-def view_samples(terrain: Occluder, camera: Camera, rows: tuple[int, int], count: int,
+def view_samples(terrain: Occluder, camera: Camera | Panorama, rows: tuple[int, int], count: int,
                  seed: int) -> tuple[Points, np.ndarray, np.ndarray]:  # fmt: skip
     """Surfaces ``(n, S)`` under the samples of a block of rows, which are terrain ``(n, S)``, and the pixels ``(n,)``.
 
@@ -47,7 +48,7 @@ def sample_weights(albedo: np.ndarray, hit: np.ndarray) -> np.ndarray:
     return (shade / shade.sum(axis=1, keepdims=True)).astype(np.float32)
 
 
-def camera_points(terrain: Occluder, camera: Camera, rows: tuple[int, int], count: int,
+def camera_points(terrain: Occluder, camera: Camera | Panorama, rows: tuple[int, int], count: int,
                    seed: int) -> tuple[Points, np.ndarray]:  # fmt: skip
     """Surfaces under stratified samples of rows of pixels, samples of a pixel side by side, and which met terrain."""
     interaction = _mi_camera_rays(terrain, camera, rows, count, seed)
@@ -55,7 +56,7 @@ def camera_points(terrain: Occluder, camera: Camera, rows: tuple[int, int], coun
     return surface_points(interaction, valid), np.array(valid)
 
 
-def _mi_camera_rays(terrain: Occluder, camera: Camera, rows: tuple[int, int], count: int, seed: int) -> Any:
+def _mi_camera_rays(terrain: Occluder, camera: Camera | Panorama, rows: tuple[int, int], count: int, seed: int) -> Any:
     """What stratified rays through a block of rows meet, ``count`` to a pixel side by side, and the number of pixels."""
     import drjit as dr
     import mitsuba as mi
@@ -73,7 +74,7 @@ def _mi_camera_rays(terrain: Occluder, camera: Camera, rows: tuple[int, int], co
     return terrain.mi_scene.ray_intersect(mi_rays(camera, x, y))
 
 
-def pixel_moments(terrain: Occluder, camera: Camera, rows: tuple[int, int], count: int,
+def pixel_moments(terrain: Occluder, camera: Camera | Panorama, rows: tuple[int, int], count: int,
              seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Mean albedo ``(N, 3)``, mean normal weighted by luminous albedo ``(N, 3)`` and coverage ``(N,)`` of all pixels.
 
