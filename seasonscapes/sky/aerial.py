@@ -12,11 +12,10 @@ from seasonscapes.sky.seen import (
     DISTANCE_EDGES_M,
     SeenLight,
     View,
-    as_rgb,
     azimuths_filled,
     column_of,
     row_of,
-    scattered_transfers,
+    scattered_parts,
     sky_radiance,
     with_phases,
 )
@@ -36,7 +35,7 @@ class AirBetween:
     depth_rgb
         ``(K, M, 3)`` minus the logarithm of the transmittance up to each of the fixed distances.
     lights
-        Sky of every luminary, with its parts up to each distance ``(K, A, M, 4, 3)``.
+        Sky of every luminary, with its parts up to each distance ``(K, A, M, 10)``.
     """
 
     horizon_rad: float
@@ -110,7 +109,16 @@ def air_between(view: View, lights: tuple[tuple[SeenLight, np.ndarray], ...], il
 
 
 def airlight(tables: AtmosphereTables, view: View, true_elevation_rad: float, irradiance: np.ndarray) -> np.ndarray:
-    """Parts of a luminary's light up to each of the fixed distances ``(K, A, M, 4, 3)``; arguments of `seen_sky`."""
-    parts = scattered_transfers(tables, view.near, view.elevation_rad, true_elevation_rad, cumulative=True)
-    parts = np.concatenate([np.zeros_like(parts[:, :, :1]), parts], axis=2)
-    return as_rgb(azimuths_filled(parts), irradiance)
+    """Parts of a luminary's light up to each of the fixed distances ``(K, A, M, 10)``; arguments of `seen_sky`."""
+    return near_light(near_parts(tables, view, true_elevation_rad, rgb_from_transfer() * irradiance))
+
+
+def near_light(parts: np.ndarray) -> np.ndarray:
+    """`airlight` of what `near_parts` gives for a luminary's spectrum."""
+    filled = azimuths_filled(parts)
+    return np.concatenate([np.zeros_like(filled[:, :, :1]), filled], axis=2)
+
+
+def near_parts(tables: AtmosphereTables, view: View, true_elevation_rad: float, colours: np.ndarray) -> np.ndarray:
+    """Parts ``(K, A, M - 1, 3 C + 1)`` up to each of the fixed distances but the first, 0; see `scattered_parts`."""
+    return scattered_parts(tables, view.near, view.elevation_rad, true_elevation_rad, colours, cumulative=True)

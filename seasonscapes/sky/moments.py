@@ -79,27 +79,50 @@ def diffuse_source(atmosphere: Atmosphere, scaled: Optics, moments: Moments, sam
     index, share, cosines = geometry
     orders, bands = moments.ratio.shape[2], moments.ratio.shape[-1]
     cells = samples.height_m.size
-    # Interpolation, in height and in the sun's elevation, as products with matrices of hat functions; of the sun's
-    # knots only those that the samples need.
+    # Of the sun's knots only those that the samples need.
     first, last = int(index.min()), int(index.max()) + 2
-    row, share_of_row = height_index(atmosphere, samples.height_m)
-    heights = _hats(row.ravel(), share_of_row.ravel(), len(moments.log_mean))
+    order, columns = _by_cell(atmosphere, scaled, moments, samples, (first, last))
+    suns = _hats(index.reshape(cells, -1)[order] - first, share.reshape(cells, -1)[order], last - first)
+    mixed = (suns @ columns.swapaxes(1, 2)).reshape(*suns.shape[:2], orders + 1, bands)
+    cosines = cosines.reshape(cells, -1, cosines.shape[-1])[order, :, :orders]
+    shape = (cosines[..., None, :] @ mixed[..., 1:, :])[..., 0, :]
+    source = np.empty_like(shape)
+    source[order] = np.maximum(shape, 0.0) * np.exp(mixed[..., 0, :])
+    return source.reshape(*index.shape, bands)
+
+
+def _by_cell(atmosphere: Atmosphere, scaled: Optics, moments: Moments, samples: Samples,
+             knots: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """For cells in order of height, numbers ``(X,)`` and what they scatter under a range of the sun's knots.
+
+    The second array ``(X, (1 + L) B, J)`` holds the logarithm of Φ_00 and then, for each m, the sum over l of all that
+    a cell's height and the ray's elevation there fix: all but the azimuth.
+    """
+    first, last = knots
+    orders, bands, cells = moments.ratio.shape[2], moments.ratio.shape[-1], samples.height_m.size
     chi = np.stack([gas_moments(orders - 1), scaled.aerosol_moments[:orders]])
     sigma = scattering_per_m(atmosphere, scaled, samples.height_m).reshape(2, cells, bands)
-    weight = np.einsum("axb,al->xlb", sigma, chi)
-    legendre = zonal(np.sin(samples.elevation_rad).ravel(), orders - 1)
-    columns = [(heights @ moments.log_mean[:, first:last].reshape(len(moments.log_mean), -1)).reshape(cells, -1, bands)]
-    for m in range(orders):
-        # A sample's height and elevation fix all but the azimuth: sum over l here, once for all suns.
-        block = moments.ratio[:, first:last, m:, m]
-        block = (heights @ block.reshape(len(block), -1)).reshape(cells, last - first, orders - m, bands)
-        factor = (weight[:, m:] * legendre[:, m:, m, None]).astype(np.float32)
-        columns.append(np.einsum("xlb,xjlb->xjb", factor, block))
-    suns = _hats(index.reshape(cells, -1) - first, share.reshape(cells, -1), last - first)
-    mixed = suns @ np.concatenate(columns, axis=-1)
-    mixed = mixed.reshape(*index.shape, orders + 1, bands)
-    shape = np.einsum("ksqm,ksqmb->ksqb", cosines[..., :orders], mixed[..., 1:, :])
-    return np.maximum(shape, 0.0) * np.exp(mixed[..., 0, :])
+    weight = np.einsum("axb,al->bxl", sigma, chi).astype(np.float32)
+    legendre = zonal(np.sin(samples.elevation_rad).ravel(), orders - 1).astype(np.float32)
+    row, share = (part.ravel() for part in height_index(atmosphere, samples.height_m))
+    order = np.argsort(row, kind="stable")
+    hats = np.stack([1.0 - share, share], axis=-1).astype(np.float32)[order]
+    weight, legendre = weight[:, order], legendre[order]
+    columns = np.empty((cells, (orders + 1) * bands, last - first), np.float32)
+    ends = np.searchsorted(row[order], np.arange(len(moments.log_mean)))
+    # Cells between the same two heights of the table make one product of matrices for each m, all bands beside
+    # each other.
+    for p in np.flatnonzero(ends[1:] > ends[:-1]):
+        start, stop = ends[p], ends[p + 1]
+        part = slice(start, stop)
+        block = columns[part].reshape(stop - start, orders + 1, bands, -1)
+        np.einsum("xp,pjb->xbj", hats[part], moments.log_mean[p : p + 2, first:last], out=block[:, 0])
+        for m in range(orders):
+            factor = weight[:, part, None, m:] * legendre[part, None, m:, m] * hats[part, :, None]
+            table = moments.ratio[p : p + 2, first:last, m:, m].transpose(3, 0, 2, 1)
+            np.matmul(factor.reshape(bands, stop - start, -1), table.reshape(bands, -1, last - first),
+                      out=block[:, 1 + m].swapaxes(0, 1))  # fmt: skip
+    return order, columns
 
 
 def _hats(index: np.ndarray, share: np.ndarray, count: int) -> np.ndarray:

@@ -72,7 +72,7 @@ class SeenLight:
     horizon_rad
         As in `View`.
     parts
-        ``(K, A, 4, 3)``: by elevation and azimuth from the source, what gas and aerosol scatter once, over their phase
+        ``(K, A, 10)``: by elevation and azimuth from the source, what gas and aerosol scatter once, over their phase
         functions, and all else, as photometric RGB [cd/m²]; and the mean column of aerosol on the light's way.
     """
 
@@ -131,13 +131,24 @@ def seen_sky(tables: AtmosphereTables, view: View, luminary_direction: np.ndarra
     irradiance
         Spectral irradiance above the air over that of the sun at 1 au ``(B,)``.
     """
-    bands = scattered_transfers(tables, view.sky, view.elevation_rad, true_elevation_rad)[:, :, -1]
-    bands[:, :, 2] += _ground(tables, view.sky, true_elevation_rad).astype(np.float32)
-    parts = as_rgb(azimuths_filled(bands), irradiance)
+    return seen_light(tables, view, luminary_direction,
+                      sky_parts(tables, view, true_elevation_rad, rgb_from_transfer() * irradiance))  # fmt: skip
+
+
+def seen_light(tables: AtmosphereTables, view: View, luminary_direction: np.ndarray, parts: np.ndarray) -> SeenLight:
+    """`SeenLight` of what `sky_parts` gives for a luminary's spectrum."""
     return SeenLight(
         np.asarray(luminary_direction, float), _rgb_aerosol_depth(tables.atmosphere), tables.atmosphere.asymmetry,
-        view.horizon_rad, parts,
+        view.horizon_rad, azimuths_filled(parts),
     )  # fmt: skip
+
+
+def sky_parts(tables: AtmosphereTables, view: View, true_elevation_rad: float, colours: np.ndarray) -> np.ndarray:
+    """Parts ``(K, A, 3 C + 1)`` of the light along whole rays, the ground's included; see `scattered_parts`."""
+    parts = scattered_parts(tables, view.sky, view.elevation_rad, true_elevation_rad, colours)[:, :, -1]
+    count = len(colours)
+    parts[:, :, 2 * count : 3 * count] += (_ground(tables, view.sky, true_elevation_rad) @ colours.T).astype(np.float32)
+    return parts
 
 
 def sky_radiance(light: SeenLight, direction: np.ndarray) -> np.ndarray:
@@ -145,17 +156,18 @@ def sky_radiance(light: SeenLight, direction: np.ndarray) -> np.ndarray:
     azimuth_deg, elevation_deg = angles_from_direction(direction)
     row, fr = row_of(np.radians(elevation_deg), light.horizon_rad)
     column, fa = column_of(azimuth_deg, light.luminary_direction)
-    fr, fa = fr[..., None, None], fa[..., None, None]
+    fr, fa = fr[..., None], fa[..., None]
     mixed = (light.parts[row, column] * (1.0 - fa) + light.parts[row, column + 1] * fa) * (1.0 - fr)
     mixed += (light.parts[row + 1, column] * (1.0 - fa) + light.parts[row + 1, column + 1] * fa) * fr
     return with_phases(light, mixed, direction)
 
 
 def with_phases(light: SeenLight, parts: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Radiance ``(..., 3)`` [cd/m²] of parts ``(..., 10)`` that hold in directions ``(..., 3)``."""
     cosine = np.clip(direction @ light.luminary_direction, -1.0, 1.0)
-    depth = parts[..., 3, :] * light.aerosol_depth
+    depth = parts[..., 9:] * light.aerosol_depth
     aerosol = spread_aerosol_phase(cosine, depth, light.asymmetry, HARMONIC_ORDER)
-    return parts[..., 0, :] * gas_phase(cosine)[..., None] + parts[..., 1, :] * aerosol + parts[..., 2, :]
+    return parts[..., :3] * gas_phase(cosine)[..., None] + parts[..., 3:6] * aerosol + parts[..., 6:9]
 
 
 def _rgb_aerosol_depth(atmosphere: Atmosphere) -> np.ndarray:
@@ -163,17 +175,12 @@ def _rgb_aerosol_depth(atmosphere: Atmosphere) -> np.ndarray:
     return np.interp([610.0, 550.0, 465.0], WAVELENGTHS_NM, optics(atmosphere).scattering[1])
 
 
-def as_rgb(parts: np.ndarray, irradiance: np.ndarray) -> np.ndarray:
-    """Transfers and aerosol columns ``(..., 4, B)`` as `SeenLight` keeps them, ``(..., 4, 3)`` float32."""
-    rgb = parts[..., :3, :] @ (rgb_from_transfer() * irradiance).T.astype(np.float32)
-    return np.concatenate([rgb, np.repeat(parts[..., 3:, :1], 3, axis=-1)], axis=-2)
+def scattered_parts(tables: AtmosphereTables, samples: Samples, elevation_rad: np.ndarray, sun_rad: float,
+                    colours: np.ndarray, *, cumulative: bool = False) -> np.ndarray:  # fmt: skip
+    """Light ``(K, A, M or 1, 3 C + 1)`` that gas and aerosol scatter once, over their phase functions, and diffuse light.
 
-
-def scattered_transfers(tables: AtmosphereTables, samples: Samples, elevation_rad: np.ndarray, sun_rad: float, *,
-                        cumulative: bool = False) -> np.ndarray:  # fmt: skip
-    """Transfers ``(K, A, M or 1, 4, B)``: gas and aerosol once (over their phase functions) and diffuse light.
-
-    The fourth part is the mean column of aerosol along sun, scattering point and eye, the same in every band.
+    Of each in turn the C channels of ``colours`` ``(C, B)``, weights of the bands' transfers. The last part is the mean
+    column of aerosol along sun, scattering point and eye.
     """
     atmosphere = tables.atmosphere
     plain = optics(atmosphere)
@@ -188,16 +195,15 @@ def scattered_transfers(tables: AtmosphereTables, samples: Samples, elevation_ra
     diffuse = diffuse_source(atmosphere, scaled, tables.moments, samples, geometry)
     diffuse *= samples.weight[:, :, None].astype(np.float32)
     # Weighed by the luminance that each cell scatters.
-    bright = aerosol @ (REC709_LUMINANCE @ rgb_from_transfer()).astype(np.float32) + np.float32(1e-30)
+    weights, luminance = colours.T.astype(np.float32), (REC709_LUMINANCE @ rgb_from_transfer()).astype(np.float32)
+    bright = aerosol @ luminance + np.float32(1e-30)
     passed = bright * (column[..., 1] + samples.aerosol_column[..., None]).astype(np.float32)
-    terms = np.stack([arriving * sigma[0][:, :, None], aerosol, diffuse], axis=3).swapaxes(1, 2)
-    bright, passed = bright.swapaxes(1, 2), passed.swapaxes(1, 2)
-    if cumulative:
-        terms, bright, passed = np.cumsum(terms, axis=2), np.cumsum(bright, axis=2), np.cumsum(passed, axis=2)
-    else:
-        terms, bright, passed = (part.sum(axis=2, keepdims=True) for part in (terms, bright, passed))
-    mean = np.broadcast_to((passed / bright)[..., None, None], (*terms.shape[:3], 1, terms.shape[-1]))
-    return np.concatenate([terms, mean], axis=3)
+    once = arriving * sigma[0][:, :, None]
+    terms = [once @ weights, aerosol @ weights, diffuse @ weights, passed[..., None], bright[..., None]]
+    parts = np.concatenate(terms, axis=-1).swapaxes(1, 2)
+    parts = np.cumsum(parts, axis=2) if cumulative else parts.sum(axis=2, keepdims=True)
+    parts[..., -2] /= parts[..., -1]
+    return parts[..., :-1]
 
 
 def _ground(tables: AtmosphereTables, samples: Samples, sun_rad: float) -> np.ndarray:
@@ -224,9 +230,9 @@ def azimuths_filled(parts: np.ndarray) -> np.ndarray:
     order = np.arange(_AZIMUTHS)
     forward = np.cos(np.outer(order, inner)) * (2.0 / _AZIMUTHS)
     forward[0] *= 0.5
-    return np.einsum(
-        "oa,ka...->ko...", (np.cos(np.outer(outer, order)) @ forward).astype(np.float32), parts, optimize=True
-    )
+    series = (np.cos(np.outer(outer, order)) @ forward).astype(np.float32)
+    filled = series @ parts.reshape(len(parts), _AZIMUTHS, -1)
+    return filled.reshape(len(parts), _AZIMUTHS_OUT, *parts.shape[2:])
 
 
 def row_of(elevation_rad: np.ndarray, horizon_rad: float) -> tuple[np.ndarray, np.ndarray]:
