@@ -23,8 +23,8 @@ from seasonscapes.texturing.shots import ReadyShot, horizon_radiance
 # Scatter of the logarithms of two cameras' views of one place, and of a picture's encoded values (noise, JPEG).
 _LAND_SIGMA, _PICTURE_SIGMA = 0.1, 0.012
 _HUBER = 1.5
-# How far a gain may lie from what the sky tells, from what the picture's mean tells, and from a prediction's [log].
-_SKY_SIGMA, _MEAN_SIGMA, _PREDICTED_SIGMA = 0.4, 1.0, 1.0
+# How far a gain may lie from what the sky tells, and from what the picture's mean tells [log].
+_SKY_SIGMA, _MEAN_SIGMA = 0.4, 1.0
 # Webcams steepen contrast: logarithm of the exponent, and of the haze's.
 _CONTRAST, _CONTRAST_SIGMA, _HAZE_SIGMA = 0.1, 0.05, 0.5
 # Neighbouring places are not independent: so many count as one, and those of one pair of cameras as no more than so many.
@@ -122,14 +122,16 @@ def equal_gains(shots: Sequence[ReadyShot], *, radiance: float | None = None) ->
 
 
 def harmonise(shots: Sequence[ReadyShot], terrain: Occluder, *, predicted: np.ndarray | None = None,
-              fit_haze: bool = True, fit_contrast: bool = True, radiance: float | None = None) -> Harmony:  # fmt: skip
+              predicted_sigma: float = 1.0, fit_haze: bool = True, fit_contrast: bool = True, radiance: float | None = None) -> Harmony:  # fmt: skip
     """Fit gains, contrasts and haze over all places that two cameras see.
 
     Parameters
     ----------
     predicted
-        ``(R, S, 3)`` radiance [cd/m²] that a regression expects of the land (NaN where it does not know): ties cameras
-        together that share no place.
+        ``(R, S, 3)`` radiance [cd/m²] that is expected of the land (NaN where it is not known): ties cameras together
+        that share no place, and all of them to the absolute scale.
+    predicted_sigma
+        Standard error of its logarithm: about 1 for a regression from a satellite's image, 0.2 for a relit albedo.
     fit_haze, fit_contrast
         Let them differ from the sky model's haze and from plain sRGB.
     radiance
@@ -156,7 +158,7 @@ def harmonise(shots: Sequence[ReadyShot], terrain: Occluder, *, predicted: np.nd
         harmony = replace(harmony, haze=_FIRST_HAZE)
     for _ in range(_STEPS):
         prior = _prior_gains(shots, harmony, radiance)
-        step = _gauss_newton(overlaps, expected, harmony, prior, free)
+        step = _gauss_newton(overlaps, (expected, predicted_sigma), harmony, prior, free)
         # Gains are nearly linear; what bends the curve moves by little at a time.
         step[3 * count :] = np.clip(step[3 * count :], -_FARTHEST_STEP, _FARTHEST_STEP)
         harmony = _with_sky(shots, _moved(harmony, step), radiance)
@@ -246,13 +248,13 @@ def _steepness(samples: Samples, harmony: Harmony) -> np.ndarray:
     return np.log(np.clip((high - low) / tiny, 1e-2, 1.0 / _LEAST_LAND))
 
 
-def _gauss_newton(overlaps: Overlaps, expected: np.ndarray | None, harmony: Harmony, prior: tuple[np.ndarray, np.ndarray],
-                  free: np.ndarray) -> np.ndarray:  # fmt: skip
+def _gauss_newton(overlaps: Overlaps, told: tuple[np.ndarray | None, float], harmony: Harmony,
+                  prior: tuple[np.ndarray, np.ndarray], free: np.ndarray) -> np.ndarray:  # fmt: skip
     """One step of iteratively reweighted least squares (Huber): of gains (colour by colour), log contrasts, log haze.
 
     Differences are divided by how much the tone curves spread them: else curves that flatten everything would agree best.
     """
-    count = len(harmony.contrast)
+    count, (expected, predicted_sigma) = len(harmony.contrast), told
     own, other = overlaps.own, overlaps.other
     left, right = _side(own, harmony), _side(other, harmony)
     error = left.log_land - right.log_land - harmony.log_gain[own.camera] + harmony.log_gain[other.camera]
@@ -271,7 +273,7 @@ def _gauss_newton(overlaps: Overlaps, expected: np.ndarray | None, harmony: Harm
         side = _side(overlaps.alone[known], harmony)
         camera, spread = overlaps.alone.camera[known], np.exp(side.steepness)
         apart = side.log_land - expected[known] - harmony.log_gain[camera]
-        blocks.append((apart / spread, side.noise**2 + _PREDICTED_SIGMA**2,
+        blocks.append((apart / spread, side.noise**2 + predicted_sigma**2,
                        ((camera, -1.0 / spread, (side.by_contrast - apart * side.steeper_by_contrast) / spread),),
                        (side.by_haze - apart * side.steeper_by_haze) / spread, _counts(camera)))  # fmt: skip
     matrix, gradient = _priors(harmony, prior, count)

@@ -65,6 +65,8 @@ class PaintOptions:
         the paper does.
     fit_gains, fit_haze
         Make cameras agree in exposure and white balance, and fit the haze before them.
+    predicted_sigma
+        As in `harmonise`.
     guard
         Keep away from silhouettes.
     near_m
@@ -76,6 +78,7 @@ class PaintOptions:
     mode: str = "weighted"
     fit_gains: bool = True
     fit_haze: bool = True
+    predicted_sigma: float = 1.0
     guard: bool = True
     near_m: float = NEAR_M
     tile_px: int = TILE_PX
@@ -119,7 +122,8 @@ def paint(shots: Sequence[Shot], terrain: Terrain, atlas: Atlas, occluder: Occlu
     if not ready:
         raise ValueError("paint: no picture has anything to paint: " + "; ".join(skipped or ["no pictures"]))
     if options.fit_gains:
-        harmony = harmonise(ready, occluder, predicted=predicted, fit_haze=options.fit_haze, radiance=radiance)
+        harmony = harmonise(ready, occluder, predicted=predicted, predicted_sigma=options.predicted_sigma,
+                            fit_haze=options.fit_haze, radiance=radiance)  # fmt: skip
     else:
         harmony = equal_gains(ready, radiance=radiance)
     tell(0.3)
