@@ -14,6 +14,7 @@ from seasonscapes.sky.seen import (
     View,
     azimuths_filled,
     column_of,
+    interpolated,
     row_of,
     scattered_parts,
     sky_radiance,
@@ -66,28 +67,18 @@ class AirBetween:
         finite = np.minimum(depth_m, DISTANCE_EDGES_M[-1])
         cell = np.clip(np.searchsorted(DISTANCE_EDGES_M, finite, side="right") - 1, 0, len(DISTANCE_EDGES_M) - 2)
         fd = (finite - DISTANCE_EDGES_M[cell]) / (DISTANCE_EDGES_M[cell + 1] - DISTANCE_EDGES_M[cell])
-        transmittance = np.exp(-_interpolated(self.depth_rgb, ((row, fr), (cell, fd))))
+        transmittance = np.exp(-interpolated(self.depth_rgb, ((row, fr), (cell, fd))))
         airlight, endless = np.zeros(direction.shape), np.isinf(depth_m)
+        ending = ~endless
         for light, near in self.lights:
-            mixed = _interpolated(near, ((row, fr), column_of(azimuth_deg, light.luminary_direction), (cell, fd)))
-            seen = with_phases(light, mixed, direction)
-            seen[endless] = sky_radiance(light, direction[endless])
-            airlight += seen
+            airlight[endless] += sky_radiance(light, direction[endless])
+            column, fa = column_of(azimuth_deg, light.luminary_direction)
+            places = tuple((index[ending], share[ending]) for index, share in ((row, fr), (column, fa), (cell, fd)))
+            airlight[ending] += with_phases(
+                light, interpolated(near, places), direction[ending] @ light.luminary_direction
+            )
         # Colours outside Rec.709 have a negative channel; no light of a picture may be negative.
         return transmittance, np.maximum(airlight, 0.0)
-
-
-def _interpolated(table: np.ndarray, places: tuple[tuple[np.ndarray, np.ndarray], ...]) -> np.ndarray:
-    """Multilinear interpolation ``(N, ...)`` in a table's first axes, at pairs of index ``(N,)`` and share ``(N,)``."""
-    axes = len(places)
-    rows = table.reshape(int(np.prod(table.shape[:axes])), -1)
-    strides = np.cumprod((1, *table.shape[axes - 1 : 0 : -1]))[::-1]
-    base = sum(index * stride for (index, _), stride in zip(places, strides, strict=True))
-    out = np.zeros((len(base), rows.shape[1]), np.float32)
-    for corner in np.ndindex(*(2,) * axes):
-        weight = np.prod([share if up else 1.0 - share for up, (_, share) in zip(corner, places, strict=True)], axis=0)
-        out += np.take(rows, base + int(np.dot(corner, strides)), axis=0) * weight.astype(np.float32)[:, None]
-    return out.reshape(len(base), *table.shape[axes:])
 
 
 def air_between(view: View, lights: tuple[tuple[SeenLight, np.ndarray], ...], illuminant: np.ndarray) -> AirBetween:

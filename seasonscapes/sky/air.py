@@ -197,7 +197,8 @@ def aerosol_phase(cosine, asymmetry: float) -> np.ndarray:
 
 
 def _henyey_greenstein(cosine, g: float) -> np.ndarray:
-    return (1.0 - g**2) / (4.0 * np.pi * (1.0 + g**2 - 2.0 * g * np.asarray(cosine)) ** 1.5)
+    square = 1.0 + g**2 - 2.0 * g * np.asarray(cosine)
+    return (1.0 - g**2) / (4.0 * np.pi) / (square * np.sqrt(square))
 
 
 def _forward_lobe_g(asymmetry: float) -> float:

@@ -17,7 +17,7 @@ from os import PathLike
 
 import numpy as np
 
-from seasonscapes.frames import angles_from_direction, equirectangular_directions
+from seasonscapes.frames import angles_from_direction
 from seasonscapes.images import atomic_path
 from seasonscapes.sky.aerial import air_between, airlight
 from seasonscapes.sky.air import Atmosphere, optics
@@ -26,7 +26,7 @@ from seasonscapes.sky.illumination import Illumination, Luminary
 from seasonscapes.sky.moments import Moments, sun_index
 from seasonscapes.sky.paths import SUN_RADIUS_DEG, SunColumns, sun_transfer
 from seasonscapes.sky.scattering import AtmosphereTables, atmosphere_tables
-from seasonscapes.sky.seen import SeenLight, observer_view, seen_sky, sky_radiance
+from seasonscapes.sky.seen import SeenLight, observer_view, seen_sky, sky_radiance_grid
 from seasonscapes.sky.spectrum import WAVELENGTHS_NM, rgb_from_transfer
 
 __all__ = [
@@ -226,8 +226,9 @@ def _true_rad(atmosphere: Atmosphere, direction: np.ndarray, height_m: float) ->
 def _map_of(lights: tuple[SeenLight, ...], shape: tuple[int, int]) -> np.ndarray:
     """Pixel means over two by two directions, which settles the horizon's row and the sun's aureole."""
     height, width = shape
-    directions = equirectangular_directions(2 * height, 2 * width)
-    radiance = sum(sky_radiance(light, directions) for light in lights)
+    elevation_deg = 90.0 - (np.arange(2 * height) + 0.5) * (90.0 / height)
+    azimuth_deg = (np.arange(2 * width) + 0.5) * (180.0 / width)
+    radiance = sum(sky_radiance_grid(light, elevation_deg, azimuth_deg) for light in lights)
     # Colours outside Rec.709 have a negative channel; no light of a map may be negative.
     return np.maximum(radiance.reshape(height, 2, width, 2, 3).mean(axis=(1, 3)), 0.0).astype(np.float32)
 

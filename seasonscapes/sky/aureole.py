@@ -36,16 +36,18 @@ def spread_aerosol_phase(cosine: np.ndarray, depth: np.ndarray, asymmetry: float
     asymmetry, order
         Mean cosine, and the order L of the delta-M scaling.
     """
-    table = _lost(asymmetry, order)
+    table = _lost(asymmetry, order).ravel()
     column = np.sqrt(np.arccos(np.clip(cosine, -1.0, 1.0)) / np.pi) * (_ANGLES - 1)
     column0 = np.minimum(column.astype(np.int32), _ANGLES - 2)
-    fc = (column - column0)[..., None]
+    fc = (column - column0).astype(np.float32)[..., None]
     row = np.sqrt(np.clip(depth / _DEEPEST, 0.0, 1.0)) * (_DEPTHS - 1)
     row0 = np.minimum(row.astype(np.int32), _DEPTHS - 2)
-    fr, column0 = row - row0, column0[..., None]
-    lost = (table[row0, column0] * (1.0 - fc) + table[row0, column0 + 1] * fc) * (1.0 - fr)
-    lost += (table[row0 + 1, column0] * (1.0 - fc) + table[row0 + 1, column0 + 1] * fc) * fr
-    return aerosol_phase(cosine, asymmetry)[..., None] - lost
+    fr, place = (row - row0).astype(np.float32), row0 * _ANGLES + column0[..., None]
+    near, far = table.take(place), table.take(place + _ANGLES)
+    near += (table.take(place + 1) - near) * fc
+    far += (table.take(place + (_ANGLES + 1)) - far) * fc
+    near += (far - near) * fr
+    return aerosol_phase(cosine, asymmetry)[..., None] - near
 
 
 @lru_cache(maxsize=8)

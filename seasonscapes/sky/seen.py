@@ -12,7 +12,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from seasonscapes.frames import angles_from_direction
+from seasonscapes.frames import angles_from_direction, direction_from_angles
 from seasonscapes.images import REC709_LUMINANCE
 from seasonscapes.sky.air import TOP_HEIGHT_M, Atmosphere, delta_scaled, gas_phase, optics
 from seasonscapes.sky.aureole import spread_aerosol_phase
@@ -154,20 +154,43 @@ def sky_parts(tables: AtmosphereTables, view: View, true_elevation_rad: float, c
 def sky_radiance(light: SeenLight, direction: np.ndarray) -> np.ndarray:
     """Radiance ``(..., 3)`` [cd/m²] of the sky, or of the ground through the air, in directions ``(..., 3)``."""
     azimuth_deg, elevation_deg = angles_from_direction(direction)
+    row, column = row_of(np.radians(elevation_deg), light.horizon_rad), column_of(azimuth_deg, light.luminary_direction)
+    places = tuple((index.ravel(), share.ravel()) for index, share in (row, column))
+    parts = interpolated(light.parts, places).reshape(*direction.shape[:-1], light.parts.shape[-1])
+    return with_phases(light, parts, direction @ light.luminary_direction)
+
+
+def sky_radiance_grid(light: SeenLight, elevation_deg: np.ndarray, azimuth_deg: np.ndarray) -> np.ndarray:
+    """`sky_radiance` ``(R, C, 3)`` of R elevations crossed with C azimuths [deg]: each axis is interpolated once."""
     row, fr = row_of(np.radians(elevation_deg), light.horizon_rad)
     column, fa = column_of(azimuth_deg, light.luminary_direction)
-    fr, fa = fr[..., None], fa[..., None]
-    mixed = (light.parts[row, column] * (1.0 - fa) + light.parts[row, column + 1] * fa) * (1.0 - fr)
-    mixed += (light.parts[row + 1, column] * (1.0 - fa) + light.parts[row + 1, column + 1] * fa) * fr
-    return with_phases(light, mixed, direction)
+    fr, fa = fr[:, None, None].astype(np.float32), fa[:, None].astype(np.float32)
+    rows = light.parts[row] * (1.0 - fr) + light.parts[row + 1] * fr
+    parts = rows[:, column] * (1.0 - fa) + rows[:, column + 1] * fa
+    direction = direction_from_angles(azimuth_deg[None, :], elevation_deg[:, None])
+    return with_phases(light, parts, direction @ light.luminary_direction)
 
 
-def with_phases(light: SeenLight, parts: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Radiance ``(..., 3)`` [cd/m²] of parts ``(..., 10)`` that hold in directions ``(..., 3)``."""
-    cosine = np.clip(direction @ light.luminary_direction, -1.0, 1.0)
-    depth = parts[..., 9:] * light.aerosol_depth
+def interpolated(table: np.ndarray, places: tuple[tuple[np.ndarray, np.ndarray], ...]) -> np.ndarray:
+    """Multilinear interpolation ``(N, ...)`` in a table's first axes, at pairs of index ``(N,)`` and share ``(N,)``."""
+    axes = len(places)
+    rows = table.reshape(int(np.prod(table.shape[:axes])), -1)
+    strides = np.cumprod((1, *table.shape[axes - 1 : 0 : -1]))[::-1]
+    base = sum(index * stride for (index, _), stride in zip(places, strides, strict=True))
+    out = np.zeros((len(base), rows.shape[1]), np.float32)
+    for corner in np.ndindex(*(2,) * axes):
+        weight = np.prod([share if up else 1.0 - share for up, (_, share) in zip(corner, places, strict=True)], axis=0)
+        out += np.take(rows, base + int(np.dot(corner, strides)), axis=0) * weight.astype(np.float32)[:, None]
+    return out.reshape(len(base), *table.shape[axes:])
+
+
+def with_phases(light: SeenLight, parts: np.ndarray, cosine: np.ndarray) -> np.ndarray:
+    """Radiance ``(..., 3)`` [cd/m²] of parts ``(..., 10)`` at angles ``(...)`` from the source, given by their cosines."""
+    cosine = np.clip(cosine, -1.0, 1.0)
+    depth = parts[..., 9:] * light.aerosol_depth.astype(np.float32)
     aerosol = spread_aerosol_phase(cosine, depth, light.asymmetry, HARMONIC_ORDER)
-    return parts[..., :3] * gas_phase(cosine)[..., None] + parts[..., 3:6] * aerosol + parts[..., 6:9]
+    gas = gas_phase(cosine)[..., None].astype(np.float32)
+    return parts[..., :3] * gas + parts[..., 3:6] * aerosol + parts[..., 6:9]
 
 
 def _rgb_aerosol_depth(atmosphere: Atmosphere) -> np.ndarray:
