@@ -77,3 +77,77 @@ def test_a_stage_that_fails_leaves_the_others_whole(tmp_path):
     assert set(json.loads((tmp_path / "run.json").read_text())) == {"one", "two"}
     chain.made.clear()
     assert chain.run() == ["three"]
+
+
+def half_made(folder, letter, *, fail):
+    """A stage with a folder of its own, that keeps what is there already and may be killed after its first file."""
+
+    def build(run):
+        own = run / "own"
+        (own / "first.txt").is_file() or (own / "first.txt").write_text(letter)
+        if fail:
+            (own / ".second-x.part.txt").write_text("hal")
+            raise KeyboardInterrupt
+        (own / "second.txt").write_text((own / "first.txt").read_text() + "!")
+        return [own / "first.txt", own / "second.txt"]
+
+    run_stages(folder, [Stage("only", {"letter": letter}, (), build, "own")])
+
+
+def test_a_killed_stage_goes_on_only_with_what_it_would_make_again(tmp_path):
+    own = tmp_path / "own"
+    with pytest.raises(KeyboardInterrupt):
+        half_made(tmp_path, "a", fail=True)
+    (own / "first.txt").write_text("kept")
+    half_made(tmp_path, "a", fail=False)
+    assert (own / "second.txt").read_text() == "kept!"
+    assert not list(own.glob("*.part*")), "what a killed process was writing is swept away"
+    # Other inputs: nothing of the old is taken over, neither from a killed stage …
+    with pytest.raises(KeyboardInterrupt):
+        half_made(tmp_path, "b", fail=True)
+    half_made(tmp_path, "c", fail=False)
+    assert (own / "second.txt").read_text() == "c!"
+    # … nor from a finished one, nor files that somebody changed since.
+    (own / "first.txt").write_text("changed")
+    half_made(tmp_path, "c", fail=False)
+    assert (own / "second.txt").read_text() == "c!"
+    (own / "stray.txt").write_text("of another stage's past")
+    half_made(tmp_path, "d", fail=False)
+    assert not (own / "stray.txt").exists()
+
+
+def test_a_kill_between_any_two_steps_leaves_nothing_old(tmp_path, monkeypatch):
+    """Each write and removal of the ledger is killed once, where the stage had been finished and damaged."""
+    from seasonscapes import ledger
+
+    real = {name: getattr(ledger, name) for name in ("_write", "atomic_path")}
+    for killed in range(8):
+        folder = tmp_path / str(killed)
+        half_made(folder, "a", fail=False)
+        (folder / "own" / "first.txt").write_text("damaged")
+        count = [0]
+
+        def step(name, *arguments, killed=killed, count=count):
+            count[0] += 1
+            if count[0] > killed:
+                raise KeyboardInterrupt
+            return real[name](*arguments)
+
+        with monkeypatch.context() as patch:
+            for name in real:
+                patch.setattr(ledger, name, lambda *arguments, name=name: step(name, *arguments))
+            try:
+                half_made(folder, "a", fail=False)
+            except KeyboardInterrupt:
+                assert killed < 6
+        half_made(folder, "a", fail=False)
+        assert (folder / "own" / "second.txt").read_text() == "a!"
+        assert json.loads((folder / "run.json").read_text())["only"]["files"].keys() == {"own/first.txt", "own/second.txt"}
+
+
+def test_a_folder_that_no_run_has_made_is_left_alone(tmp_path):
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "mine.txt").write_text("precious")
+    with pytest.raises(InputError, match="no run has made"):
+        half_made(tmp_path, "a", fail=False)
+    assert (tmp_path / "own" / "mine.txt").read_text() == "precious"

@@ -102,7 +102,7 @@ def test_each_pixel_shows_the_place_that_projects_to_it(land, projection):
     assert within.min() > -0.05
     assert within.max() < 1.05
     # A place in the east (column 80 of 360 from a heading of 100°) is left of the middle by ten degrees.
-    east, _ = project_panorama(panorama, panorama.position_m + [500.0, 0.0, 0.0])
+    east, _ = project_panorama(panorama, panorama.position_m + np.array([500.0, 0.0, 0.0]))
     assert east[0] == pytest.approx(720 * (170.0 / 360.0), abs=2.0)
     assert (faces_met(bare, panorama) >= 0).mean() == pytest.approx(seen.mean(), abs=0.01)
 

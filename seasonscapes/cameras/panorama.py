@@ -14,7 +14,8 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from seasonscapes.cameras.pinhole import Camera, ray_directions
+from seasonscapes.cameras.pinhole import Camera, ray_directions, rotation_from_angles
+from seasonscapes.frames import LocalFrame, geodetic_from_enu, local_axes
 from seasonscapes.images import linear_from_srgb
 
 Projection = Literal["cylindrical", "equirectangular"]
@@ -100,6 +101,18 @@ def panorama_from_angles(
     fy = 0.5 * height / (np.tan(half) if projection == "cylindrical" else half)
     row = 0.5 * height if horizon_row_px is None else horizon_row_px
     return Panorama(projection, width, height, width / np.radians(horizontal_fov_deg), fy, 0.5 * width, row, pose)
+
+
+def level_panorama(camera: Camera, frame: LocalFrame, size_px: tuple[int, int]) -> Panorama:
+    """A full circle about a camera's place: a cylinder with square pixels, level there, its middle column at the heading."""
+    latitude, longitude, _ = geodetic_from_enu(frame, camera.position_m)
+    axes = local_axes(frame, float(latitude), float(longitude))
+    east, north, _ = axes @ camera.world_from_camera[:3, 2]
+    pose = camera.world_from_camera.copy()
+    pose[:3, :3] = axes.T @ rotation_from_angles(float(np.degrees(np.arctan2(east, north))), 0.0)
+    width, height = size_px
+    focal = width / (2.0 * np.pi)
+    return Panorama("cylindrical", width, height, focal, focal, 0.5 * width, 0.5 * height, pose)
 
 
 def project_panorama(panorama: Panorama, position_m) -> tuple[np.ndarray, np.ndarray]:

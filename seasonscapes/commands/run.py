@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import zlib
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from seasonscapes.commands.options import PlaceOptions, SkyOptions, ViewOptions
-from seasonscapes.commands.talk import finish, progress_bar, say
+from seasonscapes.commands.run_webcams import RunPictures, bring_pictures, bring_poses, picture_facts, record_facts
+from seasonscapes.commands.talk import finish, say
 from seasonscapes.errors import InputError
 
 if TYPE_CHECKING:
@@ -23,25 +23,6 @@ if TYPE_CHECKING:
 
 # Webcams resolve no finer where they look farther than some kilometres.
 _TEXEL_M = 20.0
-# By how much a compass turns the first guess of a synthetic webcam's heading, at most [deg].
-_COMPASS_DEG = 3.0
-
-
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
-class RunPictures:
-    """The photographs."""
-
-    manifest: Path | None = None
-    """The .csv of `seasonscapes webcams --manifest`; left out, a synthetic scene is photographed from its cameras."""
-    calibrations: Path = Path("out/calibration")
-    """Of a real scene: folder of the records of `seasonscapes calibrate`."""
-    masks: Path | None = None
-    """Folder of WEBCAM.png, black where something stands before the landscape."""
-    leave_out: str | None = None
-    """Of a synthetic scene: cameras that take no picture, with commas between."""
-    photo_size: str = "720x480"
-    """Of a synthetic scene's webcams."""
 
 
 @Parameter(name="*")
@@ -93,7 +74,7 @@ def run(
     """Take a scene from photographs to pictures of other hours and to Gaussians; goes on where it was.
 
     Stages: pictures, calibrate, paint, inpaint, albedo, relight, distil, splat. Each is made again only where its
-    arguments, what it reads or this program have changed; run.json in the folder keeps the account.
+    arguments, the content of what it reads or this program have changed; run.json in the folder keeps the account.
 
     Parameters
     ----------
@@ -126,15 +107,14 @@ def run(
     view.size_px()
     land = options.load(scene)
     view.chosen(land.scene)
-    if pictures.manifest is None and land.synthetic is None:
-        raise InputError("--manifest", "missing", expected="the .csv of seasonscapes webcams --manifest")
 
     def read(text: str, flag: str) -> tuple[str, ...]:
         parts = [part.strip() for part in text.split(",") if part.strip()]
         if not parts:
             raise InputError(flag, "no time in it", got=text)
         frame = land.frame
-        return tuple(resolve_time(part, frame.latitude_deg, frame.longitude_deg).utc.isoformat() for part in parts)
+        moments = {resolve_time(part, frame.latitude_deg, frame.longitude_deg).utc for part in parts}
+        return tuple(moment.isoformat() for moment in sorted(moments))
 
     job = Job(scene, read(times, "--times"), read(at_hours, "--at-hours"), pictures, effort, view, sky, options, seed)
     stages = stages_of(job, land)
@@ -150,27 +130,37 @@ def stages_of(job: Job, land: Place) -> list[Stage]:
     """The chain for a job, first stage first."""
     from seasonscapes.ledger import Stage
 
-    common = {"place": land.key, "sky": job.sky.model().model_dump(mode="json"), "seed": job.seed}
-    photos = {**common, "times": job.times, "pictures": _plain(job.pictures)}
-    looks = {**common, "hours": job.hours, "view": _plain(job.view)}
+    moments = [_moment(time) for time in job.times]
+    common = {"place": land.key, "imagery": _imagery(land), "sky": job.sky.model().model_dump(mode="json"),
+              "seed": job.seed, "times": job.times}  # fmt: skip
+    view = job.view.chosen(land.scene).model_dump(mode="json")
+    looks = {**common, "hours": job.hours, "view": view, "size": job.view.size_px()}
 
-    def stage(name: str, inputs: dict, needs: tuple[str, ...], build: Callable[..., list[Path]]) -> Stage:
-        return Stage(name, inputs, needs, lambda folder: build(job, land, folder))
+    def stage(
+        name: str, inputs: dict, needs: tuple[str, ...], build: Callable[..., list[Path]], own: str = ""
+    ) -> Stage:
+        return Stage(name, inputs, needs, lambda folder: build(job, land, folder), own or name)
 
     return [
-        stage("pictures", photos, (), _pictures),
-        stage("calibrate", common, ("pictures",), _calibrate),
+        stage("pictures", {**common, "pictures": picture_facts(job.pictures, land, moments)}, (), _pictures),
+        stage("calibrate", {**common, "records": record_facts(job.pictures, moments)}, ("pictures",), _calibrate, "calibration"),
         stage("paint", common, ("pictures", "calibrate"), _paint),
         stage("inpaint", common, ("paint",), _inpaint),
         stage("albedo", common, ("pictures", "calibrate"), _albedo),
         stage("relight", looks, ("albedo",), _relight),
-        stage("distil", {**common, "effort": _plain(job.effort)}, ("albedo",), _distil),
+        stage("distil", {**common, "effort": asdict(job.effort)}, ("albedo",), _distil, "gaussians"),
         stage("splat", looks, ("distil",), _splat),
-    ]
+    ]  # fmt: skip
 
 
-def _plain(options: Any) -> dict:
-    return {key: str(value) if isinstance(value, Path) else value for key, value in asdict(options).items()}
+def _imagery(land: Place) -> dict | None:
+    """The scene's image: what the file says of it, and its content."""
+    from seasonscapes.workspace import file_hash
+
+    imagery = land.scene.imagery
+    if imagery is None:
+        return None
+    return {**imagery.model_dump(mode="json", exclude={"file"}), "hash": file_hash(imagery.file)}
 
 
 @contextlib.contextmanager
@@ -194,83 +184,21 @@ def _moment(time: str) -> datetime:
 
 
 def _pictures(job: Job, land: Place, folder: Path) -> list[Path]:
-    """A synthetic scene's photographs, or a copy of a real one's list that does not change while we work."""
-    from seasonscapes.cameras.observation import read_manifest, write_manifest
-    from seasonscapes.commands.paint import chosen_cameras
-    from seasonscapes.commands.talk import parse_size
-    from seasonscapes.commands.webcam_shots import make_webcam_series
-
-    own = folder / "pictures"
-    if job.pictures.manifest is not None:
-        base = job.pictures.manifest.parent.resolve()
-        rows = [replace(row, path=str(base / row.path)) for row in read_manifest(job.pictures.manifest)]
-        write_manifest(own / "manifest.csv", rows)
-        return [own / "manifest.csv"]
-    cameras = chosen_cameras(land, job.pictures.leave_out, parse_size(job.pictures.photo_size))
-    with progress_bar(f"photographing from {len(cameras)} webcams") as progress:
-        moments = [_moment(time) for time in job.times]
-        make_webcam_series(land, moments, job.sky.model(), own, cameras=cameras, seed=job.seed, progress=progress)
-    pictures = [own / row.path for row in read_manifest(own / "manifest.csv")]
-    return [own / "manifest.csv", *pictures, *(own / f"{name}_calibration.json" for name in cameras)]
+    moments = [_moment(time) for time in job.times]
+    return bring_pictures(job.pictures, land, moments, (job.sky.model(), job.seed), folder / "pictures")
 
 
 def _calibrate(job: Job, land: Place, folder: Path) -> list[Path]:
-    """Real webcams bring their records. Synthetic ones are found by their skylines from a compass's guess."""
-    own = folder / "calibration"
-    if job.pictures.manifest is not None:
-        return _copied_records(job.pictures.calibrations, own)
-    files = _found_by_skyline(job, land, folder / "pictures", own)
-    if not files:
-        raise InputError("run", "no webcam could be calibrated", cure="choose --times with a clear skyline")
-    return files
-
-
-def _copied_records(source: Path, own: Path) -> list[Path]:
-    from seasonscapes.images import atomic_path
-
-    copies = []
-    for record in sorted(source.glob("*_calibration.json")):
-        with atomic_path(own / record.name) as temporary:
-            temporary.write_bytes(record.read_bytes())
-        copies.append(own / record.name)
-    if not copies:
-        raise InputError("--calibrations", "holds no record", got=str(source),
-                         cure="seasonscapes calibrate SCENE --webcam ... -o FOLDER")  # fmt: skip
-    return copies
-
-
-def _found_by_skyline(job: Job, land: Place, taken: Path, own: Path) -> list[Path]:
-    """Records of the webcams whose skyline can be trusted, from the picture in the middle of the times."""
-    import numpy as np
-
-    from seasonscapes.calibration.pose_model import values_of, view_from_values
-    from seasonscapes.calibration.record import read_calibration, write_calibration
-    from seasonscapes.calibration.skyline import align_to_skyline, encoded_from_file
-    from seasonscapes.cameras.observation import read_manifest
-
-    middle = _moment(job.times[len(job.times) // 2])
-    photograph = {row.webcam: taken / row.path for row in read_manifest(taken / "manifest.csv") if row.time == middle}
-    files = []
-    for record in sorted(taken.glob("*_calibration.json")):
-        pose = read_calibration(record)
-        rng = np.random.default_rng([job.seed, zlib.crc32(pose.webcam.encode())])
-        values = values_of(pose.view, np.eye(3))
-        values[0] += rng.uniform(-_COMPASS_DEG, _COMPASS_DEG)
-        guess = view_from_values(pose.view, np.eye(3), values)
-        fit = align_to_skyline(encoded_from_file(photograph[pose.webcam]), guess, [land.elevation], pose.frame)
-        if fit.calibration is None or fit.doubts:
-            say(f"run: calibrate: {pose.webcam} is left out: {'; '.join(fit.doubts)}")
-            continue
-        write_calibration(own / record.name, pose.webcam, fit.calibration, pose.frame)
-        files.append(own / record.name)
-    return files
+    moments = [_moment(time) for time in job.times]
+    return bring_poses(job.pictures, land, moments, job.seed, (folder / "pictures", folder / "calibration"))
 
 
 def _sources(job: Job, folder: Path) -> dict:
     return {
         "manifest": folder / "pictures" / "manifest.csv",
         "calibrations": folder / "calibration",
-        "masks": job.pictures.masks,
+        "masks": folder / "pictures" / "masks",
+        "within_min": job.pictures.within_min,
     }
 
 

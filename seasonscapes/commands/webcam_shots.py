@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -15,6 +15,7 @@ from seasonscapes.errors import InputError
 if TYPE_CHECKING:
     from seasonscapes.calibration.record import CalibratedWebcam
     from seasonscapes.cameras.observation import ManifestRow, Observation
+    from seasonscapes.cameras.panorama import Panorama
     from seasonscapes.cameras.pinhole import Camera
     from seasonscapes.frames import LocalFrame
     from seasonscapes.pipeline import Place
@@ -43,8 +44,11 @@ class Sources:
     masks: Path | None = None
 
 
-def rows_at(sources: Sources, time: datetime, *, within_min: float) -> list[ManifestRow]:
-    """The picture of each webcam that is nearest to a time; `InputError` where there is none within so many minutes."""
+def rows_at(sources: Sources, time: datetime, *, within_min: float, flag: str = "--time") -> list[ManifestRow]:
+    """The picture of each webcam that is nearest to a time; `InputError` where there is none within so many minutes.
+
+    ``flag`` is what the message calls the time.
+    """
     from seasonscapes.cameras.observation import read_manifest
 
     nearest: dict[str, ManifestRow] = {}
@@ -57,7 +61,7 @@ def rows_at(sources: Sources, time: datetime, *, within_min: float) -> list[Mani
         if rows:
             closest = min(rows, key=lambda row: abs(row.time - time))
             told = f"the nearest is {closest.webcam} at {closest.time.isoformat()}"
-        raise InputError("--time", f"no picture within {within_min:g} minutes", got=time.isoformat(), expected=told)
+        raise InputError(flag, f"no picture within {within_min:g} minutes", got=time.isoformat(), expected=told)
     return [nearest[name] for name in sorted(nearest)]
 
 
@@ -139,7 +143,8 @@ def pose_in_frame(world_from_camera: np.ndarray, own: LocalFrame, other: LocalFr
     return pose
 
 
-def make_webcams(place: Place, time: datetime, model: SkyModel, folder: Path, *, cameras: dict[str, Camera], seed: int = 0,
+def make_webcams(place: Place, time: datetime, model: SkyModel, folder: Path, *,
+                 cameras: Mapping[str, Camera | Panorama], seed: int = 0,
                  progress: Progress | None = None) -> Sources:  # fmt: skip
     """Photograph a synthetic place as webcams would, into files as real ones leave them. Finished pictures are kept.
 
@@ -149,7 +154,8 @@ def make_webcams(place: Place, time: datetime, model: SkyModel, folder: Path, *,
 
 
 def make_webcam_series(place: Place, times: Sequence[datetime], model: SkyModel, folder: Path, *,
-                       cameras: dict[str, Camera], seed: int = 0, progress: Progress | None = None) -> Sources:  # fmt: skip
+                       cameras: Mapping[str, Camera | Panorama], seed: int = 0,
+                       progress: Progress | None = None) -> Sources:  # fmt: skip
     """`make_webcams` at several times; each webcam's light transport is traced once for all of them.
 
     Pictures of a single time bear the webcam's name alone, those of several its name and time.
@@ -187,7 +193,7 @@ def make_webcam_series(place: Place, times: Sequence[datetime], model: SkyModel,
     return Sources(folder / "manifest.csv", folder)
 
 
-def _write_pose(path: Path, name: str, camera: Camera, sigmas, frame: LocalFrame) -> None:
+def _write_pose(path: Path, name: str, camera: Camera | Panorama, sigmas, frame: LocalFrame) -> None:
     from seasonscapes.calibration.pose_model import values_of
     from seasonscapes.calibration.record import write_calibration
     from seasonscapes.calibration.resection import Calibration
