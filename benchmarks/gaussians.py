@@ -311,23 +311,24 @@ def seasons(contest: Contest, appearance) -> dict[str, float]:
     """A date between two dated albedos against these two, on the first camera at three hours each."""
     import torch
 
+    from seasonscapes.albedo.seasons import albedo_at
     from seasonscapes.gaussians.appearance import colours_at
-    from seasonscapes.gaussians.season import albedo_at, snow_places
     from seasonscapes.gaussians.surfels import surfel_albedo
     from seasonscapes.gaussians.transport import light_state, neighbourhood_mean
     from seasonscapes.rendering.gather import occluder
     from seasonscapes.rendering.scene import mi_mesh
+    from seasonscapes.terrain.ground import ground_at
 
     scene, surfels = contest.scene, contest.surfels
     true = {day: scene.albedo(day) for day in SPRING_DAYS}
     dated = np.stack([surfel_albedo(surfels, true[day]) for day in (SPRING_DAYS[0], SPRING_DAYS[2])])
-    places = snow_places(surfels.means, surfels.normals, surfels.plan.spacing_m)
+    ground = ground_at(surfels.means, surfels.normals, surfels.plan.spacing_m)
     result, held = {}, (appearance.albedo, appearance.around)
     for number, day in enumerate(SPRING_DAYS):
         lights, _ = scene.lights(3, day=day)
         states = [light_state(contest.transport, light, day) for light in lights]
         truth = truth_of(scene, occluder(mi_mesh(scene.terrain, true[day])), scene.cameras[0], lights, states)
-        guesses = {"": albedo_at(dated, np.array([SPRING_DAYS[0], SPRING_DAYS[2]]), day, places)}
+        guesses = {"": albedo_at(dated, (SPRING_DAYS[0], SPRING_DAYS[2]), day, ground)}
         if number == 1:
             guesses["_mean"] = dated.mean(axis=0)
         for name, albedo in guesses.items():

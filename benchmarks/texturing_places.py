@@ -159,13 +159,12 @@ def massif(seed: int, seasons: dict, *, spacing_m: float = 30.0, cameras: int = 
                         np.random.default_rng(seed), cameras=cameras)  # fmt: skip
 
 
-def jungfrau(data: Path, seed: int, seasons: dict, *, cameras: int = 12) -> Iterator[Testbed]:
-    """The real Bernese Oberland: its real colours with the snow of a season laid over them, in that season's light."""
+def jungfrau_land(data: Path, rng: np.random.Generator) -> tuple[Raster, np.ndarray, Callable[[int], np.ndarray]]:
+    """The real Bernese Oberland: heights, its real colours, and these with the snow of a day of the year laid over them."""
     elevation = read_elevation(data / "jungfrau" / "dem_surface_100m.tif")
     photo = read_imagery(data / "jungfrau" / "swissimage_on_dem_100m.tif").values
     photo = np.where(np.isfinite(photo), photo, np.nanmedian(photo, axis=(0, 1))).astype(np.float32)
     z = elevation.values[..., 0]
-    rng = np.random.default_rng(seed)
     noise = cv2.GaussianBlur(rng.standard_normal(z.shape), (0, 0), 4.0)
     down, right = np.gradient(cv2.GaussianBlur(z, (0, 0), 1.0), 100.0)
 
@@ -177,6 +176,13 @@ def jungfrau(data: Path, seed: int, seasons: dict, *, cameras: int = 12) -> Iter
         ground = 0.5 * photo * (1.0 + autumn[..., None] * np.float32([0.7, 0.1, -0.4]))
         return (ground + snow[..., None] * (np.float32([0.8, 0.82, 0.84]) - ground)).astype(np.float32)
 
+    return elevation, photo, albedo_of
+
+
+def jungfrau(data: Path, seed: int, seasons: dict, *, cameras: int = 12) -> Iterator[Testbed]:
+    """The real Bernese Oberland in the light of several seasons."""
+    rng = np.random.default_rng(seed)
+    elevation, photo, albedo_of = jungfrau_land(data, rng)
     return lit_testbeds("jungfrau", albedo_of, elevation, seasons, rng, cameras=cameras, satellite=photo)
 
 

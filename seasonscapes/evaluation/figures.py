@@ -51,6 +51,14 @@ def comparison(pictures: Mapping[str, np.ndarray], *, mask: np.ndarray | None = 
     return np.concatenate(rows)
 
 
+def side_by_side(pictures: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Pictures ``(H, W, 3)`` in [0, 1] in one row, with their names above; `ValueError` where sizes differ."""
+    shown = [np.asarray(picture, np.float64) for picture in pictures.values()]
+    if len({picture.shape for picture in shown}) != 1:
+        raise ValueError(f"side_by_side: pictures of shapes {[picture.shape for picture in shown]}")
+    return _row(shown, list(pictures))
+
+
 def heat(values: np.ndarray) -> np.ndarray:
     """Colours ``(H, W, 3)`` of errors ``(H, W)`` in [0, 1]."""
     place = np.linspace(0.0, 1.0, len(_HEAT))

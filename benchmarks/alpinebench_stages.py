@@ -1,0 +1,281 @@
+"""AlpineBench's machinery: views of the judged webcams, the stages with what each is given, Gaussians, a clock."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from datetime import datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from albedo_scene import LATITUDE_DEG, LONGITUDE_DEG, hours, lights_for
+from alpinebench_scene import (
+    DAY_OF_YEAR,
+    SATELLITE_DATE,
+    SIZES,
+    Pictures,
+    World,
+    clean_gain,
+    make_world,
+    observed,
+    take_pictures,
+)
+
+from seasonscapes.albedo.closed_form import AlbedoFit, solve_albedo
+from seasonscapes.albedo.forward import Land, ambient_on_texels, sun_on_texels, trace_land
+from seasonscapes.albedo.response import fit_response, with_response
+from seasonscapes.albedo.shots import EIGHT_BIT, LINEAR, make_shots
+from seasonscapes.evaluation.masks import land_mask
+from seasonscapes.evaluation.metrics import score
+from seasonscapes.evaluation.synthetic_webcams import SyntheticPicture
+from seasonscapes.exposure import develop, exposure_ev100
+from seasonscapes.images import srgb_from_linear
+from seasonscapes.rendering.gbuffer import trace_gbuffer
+from seasonscapes.rendering.radiance import through_air
+from seasonscapes.rendering.relit_view import ReadyView, ready_view, relight_view, senders_albedo, with_albedo
+from seasonscapes.rendering.scene import RenderScene, set_albedo
+from seasonscapes.rendering.transport import Effort, trace_view, view_albedo
+from seasonscapes.sky.ephemeris import sun_position
+from seasonscapes.sky.illumination import Illumination, global_horizontal_illuminance
+from seasonscapes.terrain.surface import Texture, sample_texture
+from seasonscapes.texturing.complete import complete
+from seasonscapes.texturing.guides import Guides, guides_for
+from seasonscapes.texturing.paint import Painting, PaintOptions, paint
+from seasonscapes.texturing.shots import Shot
+from seasonscapes.workspace import default_workspace
+
+_TEXEL = Effort(subpixels=1, rays=64, listed=32, senders=1024, rank=24)
+_SUBPIXELS = 3
+# Days and hours that Gaussians learn from; the judged day is not among them.
+LESSONS = (("2024-01-15", 11.0), ("2024-03-10", 8.5), ("2024-04-20", 15.0), ("2024-05-12", 6.5), ("2024-06-18", 12.0),
+           ("2024-07-05", 17.0), ("2024-08-14", 9.5), ("2024-10-08", 13.5))  # fmt: skip
+NEAR_M = 60.0
+# How far off a relit albedo may be [log]; chosen on seeds 5 and 6.
+RELIT_SIGMA = 0.2
+
+
+class Judge:
+    """Judged webcams: their truth, and pictures of textures and of albedos from where they stand."""
+
+    def __init__(self, world: World, pictures: Pictures, lpips):
+        self.world, self.rows, self.lpips = world, pictures.judged, lpips
+        self.scene = RenderScene(world.bare.mi_scene, world.bare.mi_terrain, None, 0.0)
+        self.uv, self.coverage, self.ready = [], [], []
+        for number, camera in enumerate(world.judged):
+            offset = (np.arange(_SUBPIXELS) + 0.5) / _SUBPIXELS
+            across, down = np.meshgrid(offset, offset)
+            corner = np.stack(np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px)), axis=-1)
+            pixel = corner[..., None, :] + np.stack([across.ravel(), down.ravel()], axis=-1)
+            seen = trace_gbuffer(self.scene, camera, pixel)
+            self.uv.append(seen.uv)
+            self.coverage.append(np.isfinite(seen.depth).mean(axis=-1).astype(np.float32))
+            # Other random numbers than the truth's.
+            set_albedo(self.scene, world.albedo)
+            made = trace_view(world.bare, camera, world.size.effort, seed=world.seed + 1000 + number)
+            self.ready.append(ready_view(world.bare, made))
+
+    def light(self, camera: int, at: datetime) -> Illumination:
+        return self.world.lights[at][len(self.world.painting) + camera]
+
+    def truth(self, camera: int, at: datetime) -> SyntheticPicture:
+        return self.rows[camera][self.world.hours.index(at)]
+
+    def of_texture(self, radiance: np.ndarray, camera: int, at: datetime, *, air: bool = True) -> np.ndarray:
+        """The view ``(H, W, 3)`` [cd/m²] of a texture of radiance."""
+        surface = np.nan_to_num(sample_texture(radiance, self.uv[camera])).mean(axis=2)
+        light = self.light(camera, at)
+        light = light if air else replace(light, aerial_perspective=None)
+        stage = RenderScene(self.world.bare.mi_scene, self.world.bare.mi_terrain, light, 0.0)
+        return through_air(
+            stage, self.world.judged[camera], surface, self.coverage[camera], self.truth(camera, at).gbuffer
+        )
+
+    def clothed(self, albedo: np.ndarray, cameras: Sequence[int] | None = None) -> dict[int, ReadyView]:
+        """The views' light transport over a texture of albedo, by camera."""
+        set_albedo(self.scene, albedo)
+        chosen = range(len(self.ready)) if cameras is None else cameras
+        return {n: with_albedo(self.ready[n], view_albedo(self.world.bare, self.ready[n].coefficients),
+                               senders_albedo(self.ready[n].coefficients, albedo)) for n in chosen}  # fmt: skip
+
+    def of_albedo(self, albedo: np.ndarray, *, air: bool = True) -> Callable[[int, datetime], np.ndarray]:
+        """Views of a texture of albedo under any light."""
+        clothed = self.clothed(albedo)
+
+        def relit(camera: int, at: datetime) -> np.ndarray:
+            light = self.light(camera, at)
+            return relight_view(clothed[camera], light if air else replace(light, aerial_perspective=None)).radiance
+
+        return relit
+
+    def mask(self, camera: int) -> np.ndarray:
+        return land_mask(self.rows[camera][0].gbuffer.depth, near_m=NEAR_M)
+
+    def developed(self, radiance: np.ndarray, camera: int, at: datetime) -> np.ndarray:
+        """With the exposure of the truth, sRGB-encoded."""
+        ev100 = exposure_ev100(self.truth(camera, at).radiance)
+        return srgb_from_linear(np.clip(develop(np.maximum(radiance, 0.0), ev100), 0.0, 1.0))
+
+    def matched(self, radiance: np.ndarray, camera: int, at: datetime) -> np.ndarray:
+        """Radiance times one factor for each colour that brings it nearest to the truth, by the medians of ratios."""
+        true, mask = self.truth(camera, at).radiance, self.mask(camera)
+        kept = mask & (radiance > 0.0).all(axis=2) & (true > 0.0).all(axis=2)
+        return radiance * np.exp(np.median(np.log(true[kept] / radiance[kept]), axis=0))
+
+    def scores(self, view: Callable[[int, datetime], np.ndarray], times, *, most: int | None = None,
+               mode: str = "valid") -> dict[str, float]:  # fmt: skip
+        """Means over the (first) judged webcams and times, of the picture as it is and with its colours matched."""
+        found = []
+        for camera in range(len(self.rows))[:most]:
+            for at in times:
+                picture, mask = view(camera, at), self.mask(camera)
+                true = self.developed(self.truth(camera, at).radiance, camera, at)
+                one = score(true, self.developed(picture, camera, at), mask, mode=mode, lpips=self.lpips).record()
+                fair = score(
+                    true, self.developed(self.matched(picture, camera, at), camera, at), mask, mode=mode
+                ).record()
+                found.append(one | {"matched_psnr_db": fair["psnr_db"]})
+        return {name: float(np.mean([row[name] for row in found])) for name in found[0]}
+
+
+class Bench:
+    """The stages, each with what it is given."""
+
+    def __init__(self, seed: int, size: str, lpips, data: Path | None = None):
+        self.clock = Clock()
+        self.world = make_world(seed, SIZES[size], data)
+        self.clock.tell("world")
+        self.pictures = take_pictures(self.world)
+        self.clock.tell("webcams' pictures, calibrated")
+        self.judge = Judge(self.world, self.pictures, lpips)
+        self.clock.tell("judged views")
+        self.land: Land = trace_land(self.world.terrain, self.world.albedo.shape[:2], effort=_TEXEL, seed=seed)
+        self.clock.tell("daylight coefficients of texels")
+        self.satellite = Texture(self._from_above(), np.ones(self.world.albedo.shape[:2], np.float32))
+        self.guides = {at: self.guides_at(at) for at in self.world.painted_hours}
+        self.clock.tell("satellite and guides")
+
+    def _from_above(self) -> np.ndarray:
+        """Reflectance ``(R, S, 3)`` as a satellite's image holds it: the land's radiance over that of even white ground."""
+        (light,) = lights_for(
+            hours(SATELLITE_DATE, 10.5), self.world.painting[:1], self.world.sky, default_workspace()
+        )[0]
+        radiance = self.true_texture(light, self.world.summer)
+        return (np.pi * radiance / np.asarray(global_horizontal_illuminance(light), np.float32)).astype(np.float32)
+
+    def guides_at(self, at: datetime, *, satellite: bool = True, relit: np.ndarray | None = None) -> Guides:
+        day = [at.replace(hour=0, minute=0) + timedelta(hours=h) for h in range(24)]
+        suns = np.asarray(sun_position(day, LATITUDE_DEG, LONGITUDE_DEG).direction, float)
+        extra = {} if relit is None else {f"relit_{n}": relit[..., n] for n in range(3)}
+        return guides_for(self.world.terrain, self.world.atlas, satellite=self.satellite if satellite else None, extra=extra,
+                          sun_direction=sun_position(at, LATITUDE_DEG, LONGITUDE_DEG).direction, day_suns=suns)  # fmt: skip
+
+    def true_texture(self, light: Illumination, albedo: np.ndarray) -> np.ndarray:
+        """Radiance ``(R, S, 3)`` [cd/m²] that an albedo sends under a light."""
+        received = sun_on_texels(self.land, light) + ambient_on_texels(self.land, light, albedo)
+        return (albedo * received.reshape(albedo.shape) / np.pi).astype(np.float32)
+
+    def painted(self, at: datetime, options: PaintOptions | None = None, *, relit: np.ndarray | None = None, clean: bool = False,
+                true_pose: bool = False, air: bool = True) -> Painting:  # fmt: skip
+        """The webcams' pictures of an hour, in the texture; ``relit`` is what an albedo says that they show."""
+        lights = self.world.lights[at]
+        gain = clean_gain(self.pictures, self.world, at) if clean else None
+        shots = []
+        for seen, sigma, number in observed(self.pictures, self.world, at, gain=gain, true_pose=true_pose):
+            seen = replace(seen, image=np.clip(seen.image, 0.0, 1.0))
+            shots.append(Shot(seen, lights[number].aerial_perspective if air else None, sigma))
+        if relit is not None:
+            options = replace(options or PaintOptions(), predicted_sigma=RELIT_SIGMA)
+        return paint(shots, self.world.terrain, self.world.atlas, self.world.bare, options=options, predicted=relit)
+
+    def completed(
+        self, texture: Texture, at: datetime, *, method: str = "guided", guides: Guides | None = None
+    ) -> np.ndarray:
+        return complete(texture, guides or self.guides[at], method=method, fast=True, seed=self.world.seed).values
+
+    def solved(self, *, clean: bool = False, true_pose: bool = False, response: bool = True) -> AlbedoFit:
+        """Albedo from all painted hours' pictures; unless these are clean, their tone curve is searched for."""
+        seen, lights, gains = [], [], []
+        for at in self.world.painted_hours:
+            views = observed(self.pictures, self.world, at, gain=1.0 if clean else None, true_pose=true_pose)
+            for one, _, number in views:
+                seen.append(one)
+                lights.append(self.world.lights[at][number])
+                gains.append(np.ones(3) if clean else None)
+        shots = make_shots(self.land, seen, lights, gains=gains, seed=self.world.seed)
+        if response and not clean:
+            shots = with_response(shots, fit_response(self.land, shots, seed=self.world.seed).strength)
+        return solve_albedo(self.land, shots, trust=LINEAR if clean else EIGHT_BIT)
+
+    def completed_albedo(self, fit: AlbedoFit) -> np.ndarray:
+        """Seen texels' albedo, and what the land tells about the others."""
+        at = self.world.painted_hours[0]
+        texture = Texture(fit.albedo, (fit.seen >= 0.5).astype(np.float32))
+        return np.clip(self.completed(texture, at), 0.004, 0.98)
+
+    def seen_texels(self) -> np.ndarray:
+        """Texels ``(R, S)`` that painting at true poses reaches, at the first painted hour."""
+        return self.painted(self.world.painted_hours[0], true_pose=True).texture.weight > 0.0
+
+
+class Splats:
+    """Gaussians distilled from an albedo under suns of other days; discs and their light transport are made once."""
+
+    def __init__(self, bench: Bench):
+        from seasonscapes.gaussians.rasterise import choose_threads
+        from seasonscapes.gaussians.surfels import surfel_albedo, terrain_surfels
+        from seasonscapes.gaussians.transport import light_state, trace_transport
+
+        choose_threads(1)
+        self.bench, world = bench, bench.world
+        self.surfels = terrain_surfels(world.terrain, world.size.disc_m)
+        set_albedo(bench.judge.scene, world.albedo)
+        self.transport = trace_transport(world.bare, self.surfels, surfel_albedo(self.surfels, world.albedo), rays=64,
+                                         seed=world.seed)  # fmt: skip
+        times = [hours(day, hour)[0] for day, hour in LESSONS]
+        self.lights = [row[0] for row in lights_for(times, world.painting[:1], world.sky, default_workspace())]
+        self.states = [light_state(self.transport, light, DAY_OF_YEAR) for light in self.lights]
+
+    def views(self, albedo: np.ndarray) -> Callable[[int, datetime], np.ndarray]:
+        """Views of the Gaussians that an albedo was distilled into."""
+        from seasonscapes.gaussians.appearance import Appearance, fourier_embedding
+        from seasonscapes.gaussians.distil import Schedule, distil, lessons_from
+        from seasonscapes.gaussians.model import model_from
+        from seasonscapes.gaussians.render import learned_numbers, model_weights, render_model
+        from seasonscapes.gaussians.surfels import surfel_albedo
+        from seasonscapes.gaussians.transport import neighbourhood_mean, surfel_irradiance
+
+        world, seed = self.bench.world, self.bench.world.seed
+        set_albedo(self.bench.judge.scene, albedo)
+        own = surfel_albedo(self.surfels, albedo)
+        around = neighbourhood_mean(self.surfels.means, own, self.surfels.plan.spacing_m)
+        received = surfel_irradiance(world.bare, self.surfels, self.lights, rays=64, seed=seed)
+        lessons = lessons_from(self.states, [0] * len(self.states), own[None], received)
+        appearance = Appearance("full", own[None], around[None], self.transport, fourier_embedding(self.surfels.means, seed=seed),
+                                times=len(self.states), seed=seed)  # fmt: skip
+        distil(appearance, lessons, schedule=Schedule(surface_steps=600), seed=seed)
+        model = model_from(self.surfels, own[None], [DAY_OF_YEAR], self.transport, kind="full",
+                           frame=world.frame, appearance=learned_numbers(appearance))  # fmt: skip
+        weights = [model_weights(model, camera) for camera in world.judged]
+
+        def view(camera: int, at: datetime) -> np.ndarray:
+            light = self.bench.judge.light(camera, at)
+            return render_model(model, world.judged[camera], light, DAY_OF_YEAR, weights=weights[camera]).radiance
+
+        return view
+
+
+class Clock:
+    """Processor and wall seconds between stages, on stderr."""
+
+    def __init__(self):
+        self.cpu, self.wall, self.start = time.process_time(), time.perf_counter(), time.perf_counter()
+
+    def tell(self, what: str) -> None:
+        cpu, wall = time.process_time(), time.perf_counter()
+        print(f"  {what}: {cpu - self.cpu:.1f} CPU-s, {wall - self.wall:.1f} s", file=sys.stderr, flush=True)
+        self.cpu, self.wall = cpu, wall
