@@ -11,17 +11,20 @@
 # %% [markdown]
 # # A tour: any date and hour of a place
 #
-# The embedded scene is a synthetic massif in the Bernese Oberland whose albedo is known for every day of the year.
+# A corner of a synthetic massif in the Bernese Oberland, whose albedo is known for every day of the year. With
+# `find_scene("alpine")` instead of `Path("small.toml")` it is the whole embedded scene, which takes some minutes the first
+# time.
 
 # %%
 from datetime import UTC, datetime
+from pathlib import Path
 
 import matplotlib.pyplot as plt
 
 from seasonscapes.daylight import light_at, light_for, moment_at
 from seasonscapes.exposure import develop, exposure_ev100
 from seasonscapes.images import srgb_from_linear
-from seasonscapes.pipeline import albedo_for, camera_for, find_scene, load_place
+from seasonscapes.pipeline import albedo_for, camera_for, load_place
 from seasonscapes.rendering.radiance import render_view
 from seasonscapes.rendering.scene import build_scene
 from seasonscapes.sky.models import read_sky_model
@@ -32,8 +35,8 @@ from seasonscapes.workspace import default_workspace
 # Terrain and camera. The first time builds the massif; later it is read from the workspace.
 
 # %%
-place = load_place(find_scene("alpine"), default_workspace())
-camera = camera_for(place, place.scene.camera("aerial"), size_px=(384, 256))
+place = load_place(Path("small.toml"), default_workspace())
+camera = camera_for(place, place.scene.camera(None), size_px=(384, 256))
 print(f"{len(place.terrain.faces):,} triangles, texels of {place.atlas.texel_p50_m:.1f} m")
 
 # %% [markdown]

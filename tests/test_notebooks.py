@@ -11,8 +11,6 @@ import pytest
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
 NAMES = sorted(path.stem for path in FOLDER.glob("*.py"))
-# The tour shows the whole embedded scene, which takes minutes to build the first time; the others use small.toml.
-EXECUTED = [name for name in NAMES if name != "00_tour"]
 
 
 def test_all_are_there():
@@ -54,11 +52,11 @@ def executed():
         return done.returncode, done.stderr
 
     with ThreadPoolExecutor(2) as pool:
-        return dict(zip(EXECUTED, pool.map(execute, EXECUTED), strict=True))
+        return dict(zip(NAMES, pool.map(execute, NAMES), strict=True))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", EXECUTED)
+@pytest.mark.parametrize("name", NAMES)
 def test_executes(executed, name):
     code, error = executed[name]
     assert code == 0, error[-3000:]
