@@ -120,11 +120,15 @@ class Judge:
         ev100 = exposure_ev100(self.truth(camera, at).radiance)
         return srgb_from_linear(np.clip(develop(np.maximum(radiance, 0.0), ev100), 0.0, 1.0))
 
-    def matched(self, radiance: np.ndarray, camera: int, at: datetime) -> np.ndarray:
+    def matched(self, radiance: np.ndarray, true: np.ndarray, camera: int) -> np.ndarray:
         """Radiance times one factor for each colour that brings it nearest to the truth, by the medians of ratios."""
-        true, mask = self.truth(camera, at).radiance, self.mask(camera)
-        kept = mask & (radiance > 0.0).all(axis=2) & (true > 0.0).all(axis=2)
+        kept = self.mask(camera) & (radiance > 0.0).all(axis=2) & (true > 0.0).all(axis=2)
         return radiance * np.exp(np.median(np.log(true[kept] / radiance[kept]), axis=0))
+
+    def in_sight(self, texture: np.ndarray, true: np.ndarray, camera: int = 0) -> np.ndarray:
+        """A texture as it is, no air before it, before the truth's sky, at the exposure that is nearest to the truth."""
+        land = np.nan_to_num(sample_texture(texture, self.uv[camera])).mean(axis=2)
+        return np.where(self.coverage[camera][..., None] > 0.5, self.matched(land, true, camera), true)
 
     def scores(self, view: Callable[[int, datetime], np.ndarray], times, *, most: int | None = None,
                mode: str = "valid") -> dict[str, float]:  # fmt: skip
@@ -132,12 +136,11 @@ class Judge:
         found = []
         for camera in range(len(self.rows))[:most]:
             for at in times:
-                picture, mask = view(camera, at), self.mask(camera)
-                true = self.developed(self.truth(camera, at).radiance, camera, at)
-                one = score(true, self.developed(picture, camera, at), mask, mode=mode, lpips=self.lpips).record()
-                fair = score(
-                    true, self.developed(self.matched(picture, camera, at), camera, at), mask, mode=mode
-                ).record()
+                picture, mask, true = view(camera, at), self.mask(camera), self.truth(camera, at).radiance
+                shown = self.developed(true, camera, at)
+                one = score(shown, self.developed(picture, camera, at), mask, mode=mode, lpips=self.lpips).record()
+                fair = self.developed(self.matched(picture, true, camera), camera, at)
+                fair = score(shown, fair, mask, mode=mode).record()
                 found.append(one | {"matched_psnr_db": fair["psnr_db"]})
         return {name: float(np.mean([row[name] for row in found])) for name in found[0]}
 
