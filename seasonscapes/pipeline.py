@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from datetime import date, datetime
 from functools import partial
@@ -12,6 +12,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from seasonscapes import bundled
+from seasonscapes.albedo.seasons import (
+    DatedAlbedo,
+    albedo_between,
+    day_number,
+    line_share,
+    season_weights,
+    snow_turning,
+)
 from seasonscapes.declaration import InputError
 from seasonscapes.frames import LocalFrame, geodetic_from_enu
 from seasonscapes.scene import NamedCamera, SceneFile, camera_from_place, read_scene
@@ -33,7 +41,7 @@ if TYPE_CHECKING:
     from seasonscapes.terrain.unwrap import Atlas
 
 # Raised when a stage's result changes for equal inputs, so that old artefacts are not taken for new ones.
-REVISIONS = {"place": 3, "terrain": 1, "albedo": 1}
+REVISIONS = {"place": 3, "terrain": 1, "albedo": 1, "turning": 1}
 
 
 @dataclass(frozen=True)
@@ -240,15 +248,6 @@ def albedo_for(place: Place, date: datetime) -> Texture:
                       load=load_texture, build=lambda: _baked_image(place))  # fmt: skip
 
 
-@dataclass(frozen=True)
-class DatedAlbedo:
-    """An albedo texture, the day it is of, and a name of its content."""
-
-    day: date
-    content: str
-    load: Callable[[], Texture]
-
-
 # A synthetic place's albedo is known for every day; films pass through those of these days of each month.
 _FILM_DAYS = (1, 16)
 
@@ -276,6 +275,45 @@ def dated_albedos(place: Place, given: Sequence[tuple[str, str]] = ()) -> list[D
     moments = [datetime(2024, month, day) for month in range(1, 13) for day in _FILM_DAYS]
     return [DatedAlbedo(each.date(), f"synthetic:{REVISIONS['albedo']}:{each.timetuple().tm_yday}",
                         partial(albedo_for, place, each)) for each in moments]  # fmt: skip
+
+
+def turning_between(place: Place, first: DatedAlbedo, second: DatedAlbedo) -> Texture:
+    """When each texel changes between two dated albedos, see `albedo.seasons.snow_turning`; kept in the workspace."""
+    inputs = {"revision": REVISIONS["turning"], "terrain": place.key, "dated": [first.content, second.content]}
+
+    def build() -> Texture:
+        from seasonscapes.albedo.closed_form import fill_nearest
+        from seasonscapes.terrain.ground import texel_ground
+
+        shape = (place.atlas.height_px, place.atlas.width_px)
+        ground, texel = texel_ground(place.terrain, shape)
+        values, weight = np.zeros((shape[0] * shape[1], 3), np.float32), np.zeros(shape, np.float32)
+        weight.reshape(-1)[texel] = 1.0
+        values[texel] = snow_turning(ground, *(each.load().values.reshape(-1, 3)[texel] for each in (first, second)))
+        # Bilinear look-ups at the rim reach texels beyond the surface.
+        return Texture(fill_nearest(values.reshape(*shape, 3), weight), weight)
+
+    return build_once(place.workspace, f"{place.scene.name}/snow-turning", inputs, suffix=".npz", save=save_texture,
+                      load=load_texture, build=build)  # fmt: skip
+
+
+def albedo_of_day(place: Place, dated: Sequence[DatedAlbedo], day: date, *, season: str = "blended") -> Texture:
+    """The albedo texture that a place wears on a day, from dated ones; ``season`` as in `albedo.seasons.season_weights`.
+
+    On the dates themselves it is the dated texture to the bit.
+    """
+    weights = season_weights([each.day for each in dated], day, season=season)
+    textures = [dated[index].load() for index, _ in weights]
+    if len(weights) == 1:
+        return textures[0]
+    first, second = (dated[index] for index, _ in weights)
+    way, seen = weights[1][1], np.minimum(textures[0].weight, textures[1].weight)
+    if season == "snow-line":
+        turning = turning_between(place, first, second).values
+        line = line_share(*(day_number(each) for each in (first.day, second.day, day)))
+    else:
+        turning, line = np.zeros_like(textures[0].values), way
+    return Texture(albedo_between((textures[0].values, textures[1].values), turning, way, line), seen)
 
 
 def _given_albedo(place: Place, day: str, path: Path) -> DatedAlbedo:

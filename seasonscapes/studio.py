@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from seasonscapes.albedo.seasons import DatedAlbedo, albedo_between, day_number, line_share, season_weights
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.daylight import light_for
 from seasonscapes.exposure import exposure_ev100
-from seasonscapes.pipeline import DatedAlbedo, MeshOptions, Place, camera_for, dated_albedos, load_place
+from seasonscapes.pipeline import MeshOptions, Place, camera_for, dated_albedos, load_place, turning_between
 from seasonscapes.relighting.frame_file import frame_ev100, frame_name, save_frame
-from seasonscapes.relighting.seasons import season_weights
 from seasonscapes.scene import NamedCamera
 from seasonscapes.sky.models import SkyModel
 from seasonscapes.workspace import Workspace, build_once, content_key
@@ -44,7 +44,7 @@ class Assignment:
     albedo
         Pairs of date (ISO 8601) and texture file that replace the scene's own colours; empty: the scene's own.
     season
-        See `relighting.seasons`.
+        See `albedo.seasons`.
     base_day
         The season (ISO 8601) in whose colours the coefficients are traced: near the film's, since what a pixel's
         samples weigh depends a little on it.
@@ -82,6 +82,8 @@ class Studio:
         Folder of its frames.
     colours
         Of the dated albedos that were worn so far, by number.
+    turnings
+        When pixels, and what lights them, turn between the two dated albedos worn last, by their names.
     dressed
         The view in the colours it wore last, and which those were.
     """
@@ -96,6 +98,7 @@ class Studio:
     base: DatedAlbedo
     frames: Path
     colours: dict[int, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
+    turnings: dict[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
     dressed: tuple[list, Any] | None = None
 
 
@@ -184,10 +187,25 @@ def dressed_view(studio: Studio, day: date) -> Any:
         for index, _ in weights:
             if index not in studio.colours:
                 studio.colours[index] = _colours(studio, studio.dated[index])
-        parts = [(studio.colours[index], weight) for index, weight in weights]
-        pixels, senders = (sum(weight * part[k] for part, weight in parts) for k in range(2))
-        studio.dressed = (weights, with_albedo(studio.ready, pixels, senders))
+        studio.dressed = (weights, with_albedo(studio.ready, *_worn(studio, weights, day)))
     return studio.dressed[1]
+
+
+def _worn(studio: Studio, weights: list[tuple[int, float]], day: date) -> list[np.ndarray]:
+    """Albedo of the view's pixels and of what lights them, from the dated ones that clothe a day."""
+    parts = [studio.colours[index] for index, _ in weights]
+    if len(parts) == 1 or studio.assignment.season != "snow-line":
+        return [sum(weight * part[k] for part, (_, weight) in zip(parts, weights, strict=True)) for k in range(2)]
+    pair = [studio.dated[index] for index, _ in weights]
+    name = f"turning:{pair[0].content}:{pair[1].content}"
+    if name not in studio.turnings:
+        # When a place turns is a texture like any other, and averaged over pixels as colours are.
+        pixels, senders = _colours(studio, DatedAlbedo(pair[0].day, name, lambda: turning_between(studio.place, *pair)))
+        cover = np.maximum(studio.coefficients.coverage[:, None], 1e-3)
+        studio.turnings = {name: (pixels / cover, senders)}
+    line = line_share(*(day_number(each) for each in (pair[0].day, pair[1].day, day)))
+    return [albedo_between((parts[0][k], parts[1][k]), turning, weights[1][1], line)
+            for k, turning in enumerate(studio.turnings[name])]  # fmt: skip
 
 
 def _colours(studio: Studio, dated: DatedAlbedo) -> tuple[np.ndarray, np.ndarray]:

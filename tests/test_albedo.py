@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from albedo_cases import Case, case, psnr
 
-from seasonscapes.albedo import corrections, equations, haze, response, seasons
+from seasonscapes.albedo import corrections, equations, grouping, haze, response
 from seasonscapes.albedo.closed_form import Effort, solve_albedo
 from seasonscapes.albedo.forward import ambient_on_texels, surface_radiance
 from seasonscapes.albedo.inverse import Extra, InverseOptions, refine_albedo
@@ -309,60 +309,28 @@ def test_uncertainty_ranks_errors_and_gaps_are_marked(place, shots, clean):
     assert np.isinf(bare.sigma[bare.source == 0]).all()
 
 
-def _hill_dates(line_a: float, line_b: float):
-    """A cone with snow above a line that is 200 m higher in the south, on two dates; its land, and albedo of any line."""
-    from types import SimpleNamespace
-
+def _snow_above(line_m: float) -> KnownAlbedo:
+    """A cone with snow above a line that is 400 m higher in the south."""
     side = 60
     row, column = np.divmod(np.arange(side * side), side)
     east, north = (column - 30) * 50.0, (30 - row) * 50.0
     away = np.maximum(np.hypot(east, north), 1.0)
-    normal = np.stack([0.5 * east / away, 0.5 * north / away, np.full(len(away), 0.866)], axis=1)
-    height = 3000.0 - 0.577 * away
-    land = SimpleNamespace(shape=(side, side), texel=np.arange(side * side), normal=normal,
-                           position_m=np.stack([east, north, height], axis=1))  # fmt: skip
-
-    def albedo(line_m):
-        share = 1.0 / (1.0 + np.exp(-np.clip((height - line_m + 400.0 * normal[:, 1]) / 25.0, -40, 40)))
-        bare = np.array([0.15, 0.12, 0.06])
-        return (bare + share[:, None] * (0.8 - bare)).reshape(side, side, 3).astype(np.float32)
-
-    def dated(day, line_m):
-        full = np.ones((side, side))
-        known = KnownAlbedo(
-            albedo(line_m), np.full((side, side), 0.01, np.float32), full.astype(np.uint8), full.astype(np.uint8)
-        )
-        return seasons.DatedAlbedo(day, known)
-
-    return land, albedo, dated(date(2024, 9, 10), line_a), dated(date(2024, 11, 9), line_b)
-
-
-def test_the_snow_line_moves():
-    land, albedo, first, second = _hill_dates(2900.0, 2300.0)
-    day = date(2024, 10, 10)
-    moved = seasons.albedo_of_day(land, [second, first], day)
-    faded = 0.5 * (first.known.albedo + second.known.albedo)
-    truth, all_of_it = albedo(2600.0), np.ones(land.shape, bool)
-    assert psnr(moved, truth, all_of_it) > psnr(faded, truth, all_of_it) + 8.0
-    for one in (first, second):
-        np.testing.assert_allclose(seasons.albedo_of_day(land, [first, second], one.day), one.known.albedo, atol=1e-5)
-    pair = seasons.prepare_pair(land, first, second)
-    late = seasons.albedo_between(land, pair, day, line_share=0.9)
-    assert seasons.snow_share(late).mean() > seasons.snow_share(moved).mean()
-    with pytest.raises(ValueError, match="not between"):
-        seasons.albedo_between(land, pair, date(2024, 3, 1))
+    share = 1.0 / (1.0 + np.exp(-np.clip((3000.0 - 0.577 * away - line_m + 200.0 * north / away) / 25.0, -40, 40)))
+    bare = np.array([0.15, 0.12, 0.06])
+    albedo = (bare + share[:, None] * (0.8 - bare)).reshape(side, side, 3).astype(np.float32)
+    every = np.ones((side, side), np.uint8)
+    return KnownAlbedo(albedo, np.full((side, side), 0.01, np.float32), every, every)
 
 
 def test_dates_are_grouped_by_their_snow():
-    _, _, first, second = _hill_dates(2900.0, 2300.0)
-    _, _, same, _ = _hill_dates(2890.0, 2300.0)
-    same = replace(same, day=date(2024, 9, 20))
-    assert seasons.group_dates([first, second, same]) == [[0, 2], [1]]
-    shared = seasons.share_static([first, second])
-    static = np.abs(first.known.albedo - second.known.albedo).max(axis=2) < 0.01
-    assert (shared[0].known.sigma[static] < first.known.sigma[static]).mean() > 0.95, "evidence is joined"
-    changed = np.abs(first.known.albedo - second.known.albedo)[..., 1] > 0.2
-    np.testing.assert_array_equal(shared[0].known.albedo[changed], first.known.albedo[changed])
+    first, second, same = _snow_above(2900.0), _snow_above(2300.0), _snow_above(2890.0)
+    days = [date(2024, 9, 10), date(2024, 11, 9), date(2024, 9, 20)]
+    assert grouping.group_dates(days, [first, second, same]) == [[0, 2], [1]]
+    shared = grouping.share_static([first, second])
+    static = np.abs(first.albedo - second.albedo).max(axis=2) < 0.01
+    assert (shared[0].sigma[static] < first.sigma[static]).mean() > 0.95, "evidence is joined"
+    changed = np.abs(first.albedo - second.albedo)[..., 1] > 0.2
+    np.testing.assert_array_equal(shared[0].albedo[changed], first.albedo[changed])
 
 
 def test_cosine_correction_is_exact_without_sky():

@@ -48,8 +48,7 @@ from seasonscapes.gaussians.render import (  # noqa: E402
     model_weights,
     render_model,
 )
-from seasonscapes.gaussians.season import albedo_at  # noqa: E402
-from seasonscapes.gaussians.surfels import axes_from_quaternions, surfel_albedo, terrain_surfels, vertex_normals  # noqa: E402
+from seasonscapes.gaussians.surfels import axes_from_quaternions, surfel_albedo, terrain_surfels  # noqa: E402
 from seasonscapes.gaussians.tiles import joined_shapes, select_tiles, tile_bounds, tile_discs, tile_tree  # noqa: E402
 from seasonscapes.gaussians.transport import (  # noqa: E402
     light_state,
@@ -64,6 +63,7 @@ from seasonscapes.rendering.radiance import path_trace  # noqa: E402
 from seasonscapes.rendering.scene import mi_mesh, relight  # noqa: E402
 from seasonscapes.rendering.splatting import ready_splats, splat_layers  # noqa: E402
 from seasonscapes.sky.illumination import Illumination, global_horizontal_illuminance  # noqa: E402
+from seasonscapes.terrain.ground import vertex_normals  # noqa: E402
 
 choose_threads(1)
 for _verb in ("distill", "splat"):
@@ -371,30 +371,6 @@ def under_the_hill() -> Camera:
 def test_a_camera_that_sees_nothing_says_so(model):
     with pytest.raises(ValueError, match="sees no Gaussian"):
         model_weights(model, under_the_hill())
-
-
-def test_snow_line_climbs_between_two_dates():
-    """Snow above a line that lies 300 m lower in the shade, at 1,000 m on one date and at 2,000 m on the other."""
-    rng = np.random.default_rng(0)
-    height, shade = rng.uniform(0.0, 3000.0, 4000), rng.uniform(-0.6, 0.6, 4000)
-    normals = np.stack([np.zeros(4000), shade, np.sqrt(1.0 - shade**2)], axis=1)
-    places = np.concatenate([height[:, None] / 1000.0, normals, np.zeros((4000, 1))], axis=1)
-
-    def snowy(line_m: float) -> np.ndarray:
-        return np.repeat(np.where(height > line_m - 500.0 * shade, 0.8, 0.2)[:, None], 3, axis=1).astype(np.float32)
-
-    days, dated = np.array([100.0, 140.0]), np.stack([snowy(1000.0), snowy(2000.0)])
-    between = albedo_at(dated, days, 120.0, places)
-    error = np.abs(between - snowy(1500.0)).mean()
-    assert error < 0.5 * np.abs(dated.mean(axis=0) - snowy(1500.0)).mean()
-    np.testing.assert_array_equal(albedo_at(dated, days, 140.0, places), dated[1])
-    # Through the turn of the year it falls again, and small changes are simply mixed.
-    assert (
-        np.abs(albedo_at(dated, days, 300.0, places) - snowy(1500.0)).mean()
-        < 0.5 * np.abs(dated.mean(0) - snowy(1500.0)).mean()
-    )
-    slow = np.stack([np.full((3, 3), 0.2), np.full((3, 3), 0.3)]).astype(np.float32)
-    np.testing.assert_allclose(albedo_at(slow, np.array([350.0, 355.0]), 351.0, np.zeros((3, 5))), 0.22, atol=1e-6)
 
 
 def baked(hill) -> BakedSplats:

@@ -13,6 +13,7 @@ import numpy as np
 import places
 import pytest
 
+from seasonscapes.albedo.seasons import season_weights
 from seasonscapes.cli import main
 from seasonscapes.errors import InputError
 from seasonscapes.pipeline import MeshOptions, load_place
@@ -20,7 +21,6 @@ from seasonscapes.relighting.adaptation import adapted_ev100
 from seasonscapes.relighting.efficacy import efficacies_lm_w
 from seasonscapes.relighting.film import write_film
 from seasonscapes.relighting.frame_file import frame_ev100, load_frame, save_frame
-from seasonscapes.relighting.seasons import season_weights
 from seasonscapes.scene import read_scene
 from seasonscapes.sky.models import read_sky_model
 from seasonscapes.studio import Assignment, frames_folder, open_studio, render_frame, shard, view_at

@@ -1,27 +1,52 @@
-"""Dated albedo: which photographs share a season, what snow is, and how a snow line moves between dates.
+"""The year between dated albedos: which of them clothe a day, and how snow goes from one to the next.
 
-A cross-fade between a bare and a snowy date makes the whole mountain half white. In truth the line moves: each place turns
-at its own day. So the line's height at both dates is fitted (it depends on aspect), each texel is given the height at which
-it would be crossed, and on a day between a texel is white or bare by where the line stands then.
+A cross-fade between a snowy and a bare date makes the whole mountain half white. In truth the snow line moves: each
+place turns at its own day. Which places hold snow longest is told by the dates themselves, as a linear function of
+height, aspect, steepness and hollowness that best parts white places from bare ones on both; from one date to the other
+places that change much change in that order, each in a short part of the time. Small changes follow time.
+
+Everything is told of N places of any kind: texels, pixels of a view, Gaussians.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import date
 
 import numpy as np
 
-from seasonscapes.albedo.closed_form import HIGHEST
-from seasonscapes.albedo.forward import Land
-from seasonscapes.albedo.uncertainty import KnownAlbedo
+from seasonscapes.terrain.ground import Ground
+from seasonscapes.terrain.surface import Texture
 
+SEASONS = ("blended", "nearest", "snow-line")
+# A tropical year [days]; dates are compared by their place within it, whatever the year of the photograph.
+YEAR_DAYS = 365.2422
+# The snow line lies lowest some seven weeks after the shortest day.
+_LOWEST_LINE_DAY = 39.0
 # Snow is bright in blue as in red; rock, soil and leaves are not. Shares between these values of the test are mixtures.
 _SNOW_DARKEST, _SNOW_BRIGHTEST = 0.32, 0.60
-# Two dates belong to one season where fewer texels than this changed their snow, and fewer than that their colour.
-_SNOW_CHANGED, _COLOUR_CHANGED = 0.04, 0.12
-_YEAR_DAYS = 365.2422
+# A change of albedo that only snow makes.
+_SNOW_CHANGE = 0.12
+# Below this upward component of the normal snow slides off, whatever the date: such places tell nothing of the line.
+_STEEP_UP = 0.72
+# What is thought of height [km], normal (east, north, up) and hollowness [hm] before the dates are asked: one logit is
+# 30 m, and snow lies 300 m lower in the shade. It decides where they say nothing, as between all white and all bare.
+_THOUGHT = np.array([33.0, 0.0, 10.0, 0.0, 0.0])
+_TRUST = 1e-4
+# A place turns while the line crosses so many logits about it.
+_EDGE_LOGITS, _EDGE_LEAST, _EDGE_MOST = 6.0, 0.05, 1.0
+# Places that the line is fitted on: thousands tell seven numbers as well as millions.
+_MOST_PLACES = 40_000
+
+
+@dataclass(frozen=True)
+class DatedAlbedo:
+    """An albedo texture, the day it is of, and a name of its content."""
+
+    day: date
+    content: str
+    load: Callable[[], Texture]
 
 
 def snow_share(albedo: np.ndarray) -> np.ndarray:
@@ -35,261 +60,204 @@ def snow_share(albedo: np.ndarray) -> np.ndarray:
     return np.clip((least - _SNOW_DARKEST) / (_SNOW_BRIGHTEST - _SNOW_DARKEST), 0.0, 1.0)
 
 
-@dataclass(frozen=True)
-class DatedAlbedo:
-    """The albedo of a date."""
-
-    day: date
-    known: KnownAlbedo
+def day_number(day: date) -> float:
+    """Of the year, the first of January is 1."""
+    return float(day.timetuple().tm_yday)
 
 
-def group_dates(dated: Sequence[DatedAlbedo]) -> list[list[int]]:
-    """Dates that share a season, as lists of indices: consecutive in the year, with the same snow and the same colours.
-
-    Only texels measured on both dates are compared.
-    """
-    if not dated:
-        return []
-    order = sorted(range(len(dated)), key=lambda i: dated[i].day.timetuple().tm_yday)
-    groups = [[order[0]]]
-    for index in order[1:]:
-        if _same_season(dated[groups[-1][-1]].known, dated[index].known):
-            groups[-1].append(index)
-        else:
-            groups.append([index])
-    # The year is a circle: December may go on in January.
-    if len(groups) > 1 and _same_season(dated[groups[-1][-1]].known, dated[groups[0][0]].known):
-        groups[0] = groups.pop() + groups[0]
-    return groups
-
-
-def _same_season(a: KnownAlbedo, b: KnownAlbedo) -> bool:
-    both = (a.source == 1) & (b.source == 1)
-    if both.sum() < 20:
-        return False
-    snow = np.abs(snow_share(a.albedo[both]) - snow_share(b.albedo[both])) > 0.5
-    tolerance = 3.0 * np.hypot(a.sigma[both], b.sigma[both]) + 0.10 * a.albedo[both][:, 1]
-    colour = np.abs(a.albedo[both][:, 1] - b.albedo[both][:, 1]) > tolerance
-    return bool(snow.mean() < _SNOW_CHANGED and colour.mean() < _COLOUR_CHANGED)
-
-
-def share_static(dated: Sequence[DatedAlbedo]) -> list[DatedAlbedo]:
-    """Albedos of several dates with what did not change between them shared: its evidence is joined.
-
-    A texel measured on several dates, on all of which it agrees within twice its standard deviation, gets one mean
-    everywhere, weighted by information; and dates on which it was not measured get it where all others agree and the snow
-    that the completion expects is the same.
-    """
-    from dataclasses import replace
-
-    if len(dated) < 2:
-        return list(dated)
-    values = np.stack([one.known.albedo for one in dated])
-    sigma = np.stack([one.known.sigma for one in dated])
-    measured = np.stack([one.known.source == 1 for one in dated])
-    weight = np.where(measured, 1.0 / np.maximum(sigma, 1e-4) ** 2, 0.0)
-    total = weight.sum(axis=0)
-    mean = (weight[..., None] * values).sum(axis=0) / np.maximum(total, 1e-12)[..., None]
-    apart = np.where(measured, np.abs(values[..., 1] - mean[..., 1]) / np.maximum(sigma, 1e-4), 0.0).max(axis=0)
-    static = (measured.sum(axis=0) >= 2) & (apart < 2.0)
-    joined_sigma = 1.0 / np.sqrt(np.maximum(total, 1e-12))
-    result = []
-    for one, was in zip(dated, measured, strict=True):
-        same_snow = np.abs(snow_share(one.known.albedo) - snow_share(mean)) < 0.5
-        use = static & (was | same_snow)
-        known = replace(one.known, albedo=np.where(use[..., None], mean, one.known.albedo).astype(np.float32),
-                        sigma=np.where(use, joined_sigma, one.known.sigma).astype(np.float32),
-                        source=np.where(use, 1, one.known.source).astype(np.uint8))  # fmt: skip
-        result.append(replace(one, known=known))
-    return result
-
-
-@dataclass(frozen=True)
-class SnowLine:
-    """Where snow begins: at ``height_m + by_north_m · northness + by_slope_m · sin(slope)``, within ``width_m``.
-
-    ``rms`` is what the share of snow differs by from this. A date without snow has a line above the terrain, one that is
-    white all over a line below it.
-    """
-
-    height_m: float
-    by_north_m: float
-    by_slope_m: float
-    width_m: float
-    rms: float
-
-
-def fit_snow_line(height_m: np.ndarray, normal: np.ndarray, snow: np.ndarray) -> SnowLine:
-    """The snow line of texels ``(N,)`` with unit normals ``(N, 3)`` and snow shares ``(N,)``, by logistic regression.
-
-    Iteratively re-weighted least squares with a weak pull on the terms of aspect and slope.
-    """
-    low, high = float(height_m.min()), float(height_m.max())
-    share = float(snow.mean())
-    if share < 0.01 or share > 0.99:
-        edge = high + 500.0 if share < 0.5 else low - 500.0
-        return SnowLine(edge, 0.0, 0.0, 50.0, float(np.sqrt(np.mean((snow - (share > 0.5)) ** 2))))
-    unit = 200.0
-    x = np.stack([np.ones(len(snow)), (height_m - height_m.mean()) / unit, normal[:, 1], _sine(normal)], axis=1)
-    beta = np.array([np.log(share / (1.0 - share)), 1.0, 0.0, 0.0])
-    pull = np.diag([0.0, 0.01, 1.0, 1.0]) * len(snow) * 1e-3
-    for _ in range(30):
-        p = _logistic(x @ beta)
-        w = np.maximum(p * (1.0 - p), 1e-4)
-        step = np.linalg.solve(x.T @ (w[:, None] * x) + pull, x.T @ (snow - p) - pull @ beta)
-        beta = beta + np.clip(step, -2.0, 2.0)
-        if np.abs(step).max() < 1e-6:
-            break
-    rise = max(beta[1], 0.05) / unit
-    p = _logistic(x @ beta)
-    return SnowLine(float(height_m.mean() - beta[0] / rise), float(-beta[2] / rise), float(-beta[3] / rise),
-                    float(1.0 / rise), float(np.sqrt(np.mean((snow - p) ** 2))))  # fmt: skip
-
-
-def _sine(normal: np.ndarray) -> np.ndarray:
-    return np.sqrt(np.maximum(1.0 - normal[:, 2] ** 2, 0.0))
-
-
-@dataclass(frozen=True)
-class SeasonPair:
-    """Two dated albedos ready for any day between them, over the N texels of a `Land`.
+def season_weights(dates: Sequence[date], day: date, *, season: str = "blended") -> list[tuple[int, float]]:
+    """Which dated albedos to use on a day, and how much of each.
 
     Parameters
     ----------
-    first, second
-        The dates.
-    values
-        ``(2, N, 3)`` their albedos.
-    bare, white
-        ``(2, N, 3)`` each date's albedo of the texel without and with snow.
-    snow
-        ``(2, N)`` share of snow on each date.
-    above_m
-        ``(2, N)`` height of each texel above the line of each date [m].
-    width_m
-        Of the belt in which each date's snow thins out [m].
-    """
+    dates
+        Of the albedos, in any order and of any years: the year is a circle.
+    day
+        The date to clothe.
+    season
+        ``nearest``; or ``blended`` and ``snow-line``, the neighbours before and after, in proportion to how near they are.
 
-    first: date
-    second: date
-    values: np.ndarray
-    bare: np.ndarray
-    white: np.ndarray
-    snow: np.ndarray
-    above_m: np.ndarray
-    width_m: tuple[float, float]
-
-
-def prepare_pair(land: Land, first: DatedAlbedo, second: DatedAlbedo) -> SeasonPair:
-    """What is needed to tell the albedo of days between two dates."""
-    values = np.stack([one.known.albedo.reshape(-1, 3)[land.texel] for one in (first, second)])
-    snow = np.stack([snow_share(v) for v in values])
-    height, normal = land.position_m[:, 2], land.normal
-    lines = [fit_snow_line(height, normal, s) for s in snow]
-    bare, white = _bare_and_white(list(values), snow, height)
-    above = [
-        height - line.height_m - line.by_north_m * normal[:, 1] - line.by_slope_m * _sine(normal) for line in lines
-    ]
-    width = (lines[0].width_m, lines[1].width_m)
-    above = np.stack(above) + _own_offset_m(np.stack(above), snow, width)
-    return SeasonPair(first.day, second.day, values, bare, white, snow, above.astype(np.float32), width)
-
-
-def _own_offset_m(above_m: np.ndarray, snow: np.ndarray, width_m: tuple[float, float]) -> np.ndarray:
-    """By how much each texel ``(N,)`` lies higher for the snow than its height says (hollows, sheltered slopes) [m].
-
-    The least offset under which the line explains the snow that the texel had on both dates.
-    """
-    low, high = np.full(snow.shape, -np.inf), np.full(snow.shape, np.inf)
-    for k in (0, 1):
-        logit = np.log(np.clip(snow[k], 0.02, 0.98) / (1.0 - np.clip(snow[k], 0.02, 0.98)))
-        exact = width_m[k] * logit - above_m[k]
-        low[k] = np.where(snow[k] > 0.1, np.where(snow[k] > 0.9, 2.0 * width_m[k] - above_m[k], exact), -np.inf)
-        high[k] = np.where(snow[k] < 0.9, np.where(snow[k] < 0.1, -2.0 * width_m[k] - above_m[k], exact), np.inf)
-    least, most = low.max(axis=0), high.min(axis=0)
-    torn = least > most
-    middle = 0.5 * (np.where(torn, least, 0.0) + np.where(torn, most, 0.0))
-    return np.where(torn, middle, np.clip(0.0, least, np.maximum(least, most)))
-
-
-def _bare_and_white(values: list[np.ndarray], snow: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Albedo without and with snow of each texel on each date; what a date does not show comes from the other one, else
-    from the date's own texels of like height."""
-    bare, white = (np.empty((2, len(height), 3), np.float32) for _ in range(2))
-    for own, other in ((0, 1), (1, 0)):
-        for result, is_it in ((bare, snow < 0.3), (white, snow > 0.7)):
-            typical = _typical(values[own], is_it[own], values[other], is_it[other])
-            result[own] = np.where(is_it[own][:, None], values[own],
-                                   np.where(is_it[other][:, None], values[other], typical))  # fmt: skip
-    return bare, white
-
-
-def _typical(own: np.ndarray, own_is: np.ndarray, other: np.ndarray, other_is: np.ndarray) -> np.ndarray:
-    for values, kind in ((own, own_is), (other, other_is)):
-        if kind.any():
-            return np.median(values[kind], axis=0)
-    return np.median(own, axis=0)
-
-
-def albedo_between(land: Land, pair: SeasonPair, day: date, *, line_share: float | None = None) -> np.ndarray:
-    """The albedo texture ``(R, S, 3)`` of a day between a pair's dates.
-
-    Bare ground and snow each change evenly (leaves turn, snow ages); which of the two shows is decided by the snow line.
-
-    Parameters
-    ----------
-    line_share
-        How much of its way from the first date's height to the second's the line has gone on that day, where it is known
-        (from a snow station, or a picture); left out, as much as of the time has passed.
+    Returns
+    -------
+    list of (index, weight)
+        One or two of them, the earlier first; weights have sum 1.
 
     Raises
     ------
     ValueError
-        For a day that is not between the dates.
+        Without any date, or for an unknown season.
     """
-    way = _way(pair.first, pair.second, day)
-    texture = np.zeros((land.shape[0] * land.shape[1], 3), np.float32)
-    # What the model of two colours and a line does not explain of each date fades over.
-    rest = [pair.values[k] - _clothed(pair, float(k), float(k)) for k in (0, 1)]
-    line = way if line_share is None else float(np.clip(line_share, 0.0, 1.0))
-    texture[land.texel] = _clothed(pair, way, line) + (1.0 - way) * rest[0] + way * rest[1]
-    return np.clip(texture, 0.0, HIGHEST).reshape(*land.shape, 3)
+    if not dates:
+        raise ValueError("season_weights: no dated albedo")
+    if season not in SEASONS:
+        raise ValueError(f"season: got {season!r}, expected one of {', '.join(SEASONS)}")
+    preceding, following, way = neighbours([day_number(each) for each in dates], day_number(day))
+    if season == "nearest":
+        return [(following if way >= 0.5 else preceding, 1.0)]
+    return [(index, weight) for index, weight in ((preceding, 1.0 - way), (following, way)) if weight > 0.0]
 
 
-def _clothed(pair: SeasonPair, way: float, line: float) -> np.ndarray:
-    """Albedo ``(N, 3)`` of ground and snow after a share ``way`` of the time, the line a share ``line`` of its way on."""
-    ground = (1.0 - way) * pair.bare[0] + way * pair.bare[1]
-    snowy = (1.0 - way) * pair.white[0] + way * pair.white[1]
-    ends = [_logistic(above / width) for above, width in zip(pair.above_m, pair.width_m, strict=True)]
-    above = (1.0 - line) * pair.above_m[0] + line * pair.above_m[1]
-    modelled = _logistic(above / ((1.0 - line) * pair.width_m[0] + line * pair.width_m[1]))
-    apart = [pair.snow[k] - ends[k] for k in (0, 1)]
-    snow = np.clip(modelled + (1.0 - line) * apart[0] + line * apart[1], 0.0, 1.0)
-    return ground + snow[:, None] * (snowy - ground)
+def neighbours(days: Sequence[float], day: float) -> tuple[int, int, float]:
+    """The last of some days of the year before a day, the first after it, and the share of the time between them.
+
+    Both are the same, and the share 0, where the day is one of them or there is only one.
+    """
+    after = [(each - day) % YEAR_DAYS for each in days]
+    following = min(range(len(days)), key=lambda i: after[i])
+    before = [(day - each) % YEAR_DAYS for each in days]
+    preceding = min(range(len(days)), key=lambda i: before[i])
+    if following == preceding or before[preceding] == 0.0:
+        return preceding, preceding, 0.0
+    if after[following] == 0.0:
+        return following, following, 0.0
+    return preceding, following, before[preceding] / (after[following] + before[preceding])
 
 
-def _logistic(x: np.ndarray) -> np.ndarray:
-    return 1.0 / (1.0 + np.exp(-np.clip(x, -40.0, 40.0)))
+def line_share(first: float, second: float, day: float) -> float:
+    """How much of its way between two days of the year the snow line has gone on a day between them, by the climate.
+
+    Its height follows the year as a cosine whose least and greatest lie in the middle of February and of August (in the
+    south it is the other way round, which changes no share). Dates on which the cosine is about the same tell no
+    direction: between these it follows time.
+    """
+    way = ((day - first) % YEAR_DAYS) / max((second - first) % YEAR_DAYS, 1e-9)
+    start, end, now = (-np.cos(2.0 * np.pi * (each - _LOWEST_LINE_DAY) / YEAR_DAYS) for each in (first, second, day))
+    known = float(np.clip((abs(end - start) - 0.1) / 0.3, 0.0, 1.0))
+    if known == 0.0:
+        return float(way)
+    return float((1.0 - known) * way + known * np.clip((now - start) / (end - start), 0.0, 1.0))
 
 
-def _way(first: date, second: date, day: date) -> float:
-    start, span = _turn(first), (_turn(second) - _turn(first)) % _YEAR_DAYS
-    done = (_turn(day) - start) % _YEAR_DAYS
-    if span == 0.0 or done > span + 1e-9:
-        raise ValueError(f"albedo_between: {day} is not between {first} and {second}")
-    return float(done / span)
+def snow_turning(ground: Ground, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """When each place changes between two dates, for `albedo_between`.
+
+    Parameters
+    ----------
+    ground
+        N places.
+    first, second
+        ``(N, 3)`` albedo on the dates.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(N, 3)`` float32: whether the place turns with the snow (1 or 0), and that times the shares of the time at which
+        its turn begins and that it takes. Sums of places may be averaged, over a pixel or a footprint.
+    """
+    change = second.mean(axis=1) - first.mean(axis=1)
+    turning = np.zeros((len(change), 3), np.float32)
+    moving = np.abs(change) > _SNOW_CHANGE
+    if not moving.any():
+        return turning
+    holds = _features(ground) @ _holding(ground, (first, second), change)
+    # Melting begins where snow holds least, snowfall where it holds best.
+    for sign in (-1.0, 1.0):
+        these = np.flatnonzero(sign * change > _SNOW_CHANGE)
+        if len(these) == 0:
+            continue
+        low, high = np.percentile(holds[these], [3.0, 97.0])
+        span = max(float(high - low), 1e-9)
+        order = np.clip((holds[these] - low) / span, 0.0, 1.0)
+        edge = float(np.clip(_EDGE_LOGITS / span, _EDGE_LEAST, _EDGE_MOST))
+        turning[these, 0] = 1.0
+        turning[these, 1] = (order if sign < 0.0 else 1.0 - order) / (1.0 + edge)
+        turning[these, 2] = edge / (1.0 + edge)
+    return turning
 
 
-def _turn(day: date) -> float:
-    return float(day.timetuple().tm_yday - 1)
+def _features(ground: Ground) -> np.ndarray:
+    return np.concatenate([ground.height_m[:, None] / 1000.0, ground.normal, ground.hollow_m[:, None] / 100.0], axis=1)
 
 
-def albedo_of_day(land: Land, dated: Sequence[DatedAlbedo], day: date) -> np.ndarray:
-    """The albedo texture ``(R, S, 3)`` of any day from dated ones: between its two neighbours in the circle of the year."""
-    if not dated:
-        raise ValueError("albedo_of_day: no dated albedo")
-    after = min(dated, key=lambda one: (_turn(one.day) - _turn(day)) % _YEAR_DAYS)
-    before = min(dated, key=lambda one: (_turn(day) - _turn(one.day)) % _YEAR_DAYS)
-    if after is before:
-        return after.known.albedo
-    return albedo_between(land, prepare_pair(land, before, after), day)
+def _holding(ground: Ground, dated: tuple[np.ndarray, np.ndarray], change: np.ndarray) -> np.ndarray:
+    """How well snow holds, as a weight ``(5,)`` of each of a place's features, in logits.
+
+    Logistic regression of white or bare on both dates at once, which share all weights but have a line each
+    (proportional odds, McCullagh 1980), by iteratively re-weighted least squares with a weak pull to what is thought.
+    """
+    turns = np.abs(change) > _SNOW_CHANGE
+    told = np.flatnonzero((ground.normal[:, 2] > _STEEP_UP) | turns)
+    told = told[:: max(1, len(told) // _MOST_PLACES)]
+    part = Ground(ground.height_m[told], ground.normal[told], ground.hollow_m[told])
+    x = _features(part).astype(np.float64)
+    x -= x.mean(axis=0)
+    white = [np.where(turns[told], sign * change[told] > 0.0, snow_share(values[told]) > 0.5)
+             for sign, values in zip((-1.0, 1.0), dated, strict=True)]  # fmt: skip
+    y = np.concatenate(white).astype(np.float64)
+    ones, none = np.ones((len(x), 1)), np.zeros((len(x), 1))
+    rows = np.concatenate([np.concatenate([x, ones, none], axis=1), np.concatenate([x, none, ones], axis=1)])
+    thought = np.concatenate([_THOUGHT, np.zeros(2)])
+    pull = _TRUST * len(x) * np.diag(np.concatenate([np.maximum(x.var(axis=0), 1e-6), np.ones(2)]))
+    weight = np.zeros(7)
+
+    def misfit(weight: np.ndarray) -> float:
+        away, logit = weight - thought, rows @ weight
+        return float(np.sum(np.logaddexp(0.0, logit) - y * logit) + 0.5 * away @ pull @ away)
+
+    for _ in range(40):
+        p = 1.0 / (1.0 + np.exp(-np.clip(rows @ weight, -40.0, 40.0)))
+        slope = rows.T @ (y - p) - pull @ (weight - thought)
+        step = np.linalg.solve(rows.T @ ((p * (1.0 - p))[:, None] * rows) + pull, slope)
+        # Newton's step may overshoot where most places are sure; the sum to be least is convex.
+        while misfit(weight + step) > misfit(weight) and np.abs(step).max() > 1e-4:
+            step = 0.5 * step
+        weight = weight + step
+        if np.abs(step).max() < 1e-4:
+            break
+    return weight[:5].astype(np.float32)
+
+
+def albedo_between(dated: tuple[np.ndarray, np.ndarray], turning: np.ndarray, way: float, line: float) -> np.ndarray:
+    """Albedo ``(..., 3)`` of a day between two dates.
+
+    Parameters
+    ----------
+    dated
+        ``(..., 3)`` each, on the two dates.
+    turning
+        ``(..., 3)`` from `snow_turning`.
+    way
+        Share of the time that has passed: small changes follow it.
+    line
+        How much of its way from the first date's height to the second's the snow line has gone: `line_share`, or what a
+        snow station or a picture of the day says.
+
+    Raises
+    ------
+    ValueError
+        For a share that is not within 0 and 1.
+    """
+    if not (0.0 <= way <= 1.0 and 0.0 <= line <= 1.0):
+        raise ValueError(f"albedo_between: got shares {way} of the time and {line} of the line's way, expected 0 to 1")
+    first, second = dated
+    if way == line and way in (0.0, 1.0):
+        # To the bit, which weighted sums are not.
+        return second if way else first
+    moving, scale = np.clip(turning[..., 0], 0.0, 1.0), np.maximum(turning[..., 0], 1e-6)
+    own = np.clip((line - turning[..., 1] / scale) / np.maximum(turning[..., 2] / scale, 1e-6), 0.0, 1.0)
+    done = (moving * own + (1.0 - moving) * way)[..., None].astype(np.float32)
+    return ((1.0 - done) * first + done * second).astype(np.float32)
+
+
+def albedo_at(values: np.ndarray, days: Sequence[float], day: float, ground: Ground) -> np.ndarray:
+    """Albedo ``(N, 3)`` of places on a day of the year from dated ones, the snow line moving.
+
+    Parameters
+    ----------
+    values
+        ``(M, N, 3)``.
+    days
+        M days of the year of these; the year closes on itself.
+
+    Raises
+    ------
+    ValueError
+        No date, or a day that is not finite.
+    """
+    if len(days) == 0 or not np.isfinite(day):
+        raise ValueError(f"albedo_at: got {len(days)} dates and day {day}")
+    first, second, way = neighbours(days, day)
+    if first == second:
+        return values[first]
+    pair = (values[first], values[second])
+    return albedo_between(pair, snow_turning(ground, *pair), way, line_share(days[first], days[second], day))

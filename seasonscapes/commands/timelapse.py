@@ -120,7 +120,8 @@ def timelapse(
     scene
         A scene file, or the name of a bundled scene (alpine).
     season
-        How colours change with the date where there are several dated albedos: blended or nearest.
+        How colours change with the date where there are several dated albedos: blended (from one into the next), nearest,
+        or snow-line (snow climbs and comes down: each place turns at its own day; the rest is blended).
     albedo
         DATE=FILE.npz, may be repeated: recovered albedos of a date instead of the scene's own colours.
     exposure
@@ -145,9 +146,9 @@ def timelapse(
     start = clock.perf_counter()
     when, view, sky = when or WhenOptions(), view or ViewOptions(), sky or SkyOptions()
     work, place = work or WorkOptions(), place or PlaceOptions()
+    from seasonscapes.albedo.seasons import SEASONS
     from seasonscapes.exposure import parse_exposure
     from seasonscapes.pipeline import find_scene
-    from seasonscapes.relighting.seasons import SEASONS
     from seasonscapes.scene import read_scene
     from seasonscapes.studio import Assignment, shard
 
@@ -156,7 +157,7 @@ def timelapse(
         0.0 if smooth in ("0", "0s") else parse_duration("--smooth", smooth).total_seconds(),
     )
     if season not in SEASONS:
-        raise InputError("--season", "unknown", got=season, expected=" or ".join(SEASONS))
+        raise InputError("--season", "unknown", got=season, expected=", ".join(SEASONS))
     film = output.suffix.lower() == ".mp4"
     if not film and output.suffix:
         raise InputError(

@@ -12,12 +12,13 @@ from dataclasses import asdict, dataclass, field, fields
 
 import numpy as np
 
+from seasonscapes.albedo.seasons import albedo_at
 from seasonscapes.errors import InputError
 from seasonscapes.frames import LocalFrame
-from seasonscapes.gaussians.season import albedo_at, snow_places
 from seasonscapes.gaussians.surfels import Plan, Surfels, disc_shapes
 from seasonscapes.gaussians.transport import Transport
 from seasonscapes.images import atomic_path
+from seasonscapes.terrain.ground import ground_at
 
 FORMAT = "seasonscapes gaussians 1"
 # Learned numbers of each disc and the range that their bytes span; beyond it they are clipped.
@@ -88,11 +89,11 @@ class GaussianModel:
             raise ValueError(f"GaussianModel: days {self.days.tolist()} do not rise")
 
     def albedo_on(self, day: float) -> np.ndarray:
-        """Albedo ``(N, 3)`` of a day of the year; see `season.albedo_at`."""
+        """Albedo ``(N, 3)`` of a day of the year; see `albedo.seasons.albedo_at`."""
         if len(self.days) == 1:
             return self.albedo[0]
-        places = snow_places(self.means, self.transport.normals, self.plan.spacing_m)
-        return albedo_at(self.albedo, self.days, day, places)
+        ground = ground_at(self.means, self.transport.normals, self.plan.spacing_m)
+        return albedo_at(self.albedo, self.days, day, ground)
 
 
 def model_from(surfels: Surfels, albedo: np.ndarray, days, transport: Transport, *, kind: str, frame: LocalFrame,

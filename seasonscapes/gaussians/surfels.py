@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from seasonscapes.terrain.ground import vertex_normals
 from seasonscapes.terrain.surface import Terrain, sample_texture
 from seasonscapes.terrain.texels import barycentric, texel_coordinates, texel_positions
 
@@ -156,21 +157,6 @@ def _cells(terrain: Terrain, plan: Plan, at_vertices: np.ndarray) -> tuple[np.nd
         return split.reshape(height * width, SUBCELLS**2, -1)
 
     return by_cell(positions), by_cell(normals), by_cell(uv)
-
-
-def vertex_normals(terrain: Terrain) -> np.ndarray:
-    """Unit normals ``(V, 3)``: means of the faces around, weighted by their angles (Thürmer & Wüthrich 1998)."""
-    corner = terrain.vertices[terrain.faces].astype(np.float64)
-    face = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    face /= np.maximum(np.linalg.norm(face, axis=1, keepdims=True), 1e-30)
-    total = np.zeros((len(terrain.vertices), 3))
-    for k in range(3):
-        a, b = corner[:, (k + 1) % 3] - corner[:, k], corner[:, (k + 2) % 3] - corner[:, k]
-        cosine = np.einsum("nc,nc->n", a, b) / np.maximum(np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1), 1e-30)
-        angle = np.arccos(np.clip(cosine, -1.0, 1.0))
-        for axis in range(3):
-            total[:, axis] += np.bincount(terrain.faces[:, k], angle * face[:, axis], minlength=len(total))
-    return (total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)).astype(np.float32)
 
 
 def _disc_axes(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

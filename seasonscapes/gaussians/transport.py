@@ -18,6 +18,7 @@ import numpy as np
 from seasonscapes.frames import direction_from_angles
 from seasonscapes.gaussians.surfels import Surfels
 from seasonscapes.sky.illumination import Illumination, Luminary, global_horizontal_illuminance, uniform_sky
+from seasonscapes.terrain.ground import plan_blur
 
 AZIMUTHS = 64
 HORIZON_RANGE_RAD = (-0.02, 1.29)
@@ -149,21 +150,6 @@ def _bounce_coefficients(bounced: Callable[[Illumination], np.ndarray]) -> np.nd
 def neighbourhood_mean(means: np.ndarray, albedo: np.ndarray, spacing_m: float) -> np.ndarray:
     """Albedo ``(N, 3)`` of discs averaged over the others within some `AROUND_M`, never quite black."""
     return np.maximum(plan_blur(means, albedo, spacing_m, AROUND_M), 1e-3)
-
-
-def plan_blur(means: np.ndarray, values: np.ndarray, spacing_m: float, sigma_m: float) -> np.ndarray:
-    """Values ``(N, C)`` of discs averaged in plan, weighted by a Gaussian of ``sigma_m``."""
-    import cv2
-
-    cell = np.floor((means[:, :2] - means[:, :2].min(axis=0)) / spacing_m + 0.5).astype(int)
-    shape = cell.max(axis=0)[::-1] + 1
-    grid, count = np.zeros((*shape, values.shape[1]), np.float32), np.zeros(shape, np.float32)
-    np.add.at(grid, (cell[:, 1], cell[:, 0]), values)
-    np.add.at(count, (cell[:, 1], cell[:, 0]), 1.0)
-    sigma = sigma_m / spacing_m
-    wide = cv2.GaussianBlur(grid, (0, 0), sigma).reshape(grid.shape)
-    mean = wide / np.maximum(cv2.GaussianBlur(count, (0, 0), sigma), 1e-6)[..., None]
-    return mean[cell[:, 1], cell[:, 0]]
 
 
 @dataclass(frozen=True)

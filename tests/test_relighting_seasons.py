@@ -1,0 +1,224 @@
+"""Days between dated albedos: snow goes up and comes down the mountain and does not fade."""
+
+import json
+from datetime import UTC, date, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import places
+import pytest
+
+from seasonscapes.albedo.seasons import albedo_at, albedo_between, line_share, neighbours, snow_share, snow_turning
+from seasonscapes.cli import main
+from seasonscapes.pipeline import MeshOptions, albedo_of_day, dated_albedos, load_place
+from seasonscapes.scene import read_scene
+from seasonscapes.sky.models import read_sky_model
+from seasonscapes.studio import Assignment, dressed_view, open_studio
+from seasonscapes.terrain.ground import Ground, texel_ground
+from seasonscapes.terrain.surface import Texture, load_texture, save_texture
+from seasonscapes.workspace import Workspace
+
+BARE, WHITE = np.array([0.12, 0.14, 0.05], np.float32), np.array([0.80, 0.80, 0.82], np.float32)
+SNOWY, GREEN = date(2023, 4, 10), date(2023, 7, 19)
+DAYS = [SNOWY + timedelta(days=10 * k) for k in range(11)]
+BANDS_M = np.linspace(900.0, 2100.0, 7)
+
+
+def slopes(count: int, *, seed: int = 0) -> Ground:
+    """Places of a mountain that face all ways, up to 2,000 m."""
+    rng = np.random.default_rng(seed)
+    turn, tilt = rng.uniform(0.0, 2.0 * np.pi, count), np.radians(rng.uniform(5.0, 35.0, count))
+    normal = np.stack([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)], axis=1)
+    return Ground(rng.uniform(0.0, 3000.0, count), normal, np.zeros(count))
+
+
+def snow_above(ground: Ground, line_m: float, *, by_north_m: float = 500.0) -> np.ndarray:
+    white = ground.height_m > line_m - by_north_m * ground.normal[:, 1]
+    return np.where(white[:, None], WHITE, BARE).astype(np.float32)
+
+
+def half_done(values: np.ndarray) -> float:
+    """Share of places that are neither white nor bare."""
+    share = (values - BARE)[..., 1] / (WHITE - BARE)[1]
+    return float(np.mean((share > 0.15) & (share < 0.85)))
+
+
+@pytest.mark.parametrize(("first_m", "second_m"), [(1000.0, 2000.0), (2300.0, 900.0)])
+def test_the_line_moves_up_and_down(first_m, second_m):
+    ground = slopes(6000)
+    pair = (snow_above(ground, first_m), snow_above(ground, second_m))
+    turning = snow_turning(ground, *pair)
+    changed = np.any(pair[0] != pair[1], axis=1)
+    np.testing.assert_array_equal(turning[:, 0], changed)
+    for way in (0.25, 0.5, 0.75):
+        truth = snow_above(ground, first_m + way * (second_m - first_m))
+        moved = albedo_between(pair, turning, way, way)
+        faded = (1.0 - way) * pair[0] + way * pair[1]
+        assert np.mean((moved - truth) ** 2) < 0.12 * np.mean((faded - truth) ** 2)
+        assert half_done(moved) < 0.15 * changed.mean()
+    for way, end in enumerate(pair):
+        np.testing.assert_array_equal(albedo_between(pair, turning, float(way), float(way)), end)
+    # A line that was seen elsewhere than time says is believed.
+    late = albedo_between(pair, turning, 0.5, 0.9)
+    truth = snow_above(ground, first_m + 0.9 * (second_m - first_m))
+    assert np.mean((late - truth) ** 2) < 0.2 * np.mean((albedo_between(pair, turning, 0.5, 0.5) - truth) ** 2)
+    with pytest.raises(ValueError, match="expected 0 to 1"):
+        albedo_between(pair, turning, 1.2, 1.0)
+
+
+def test_what_no_snow_explains_follows_time():
+    ground = slopes(50)
+    summer, autumn = np.tile(BARE, (50, 1)), np.tile(BARE + np.float32(0.1), (50, 1))
+    turning = snow_turning(ground, summer, autumn)
+    assert not turning.any()
+    np.testing.assert_allclose(albedo_between((summer, autumn), turning, 0.3, 0.9), summer + 0.03, atol=1e-6)
+
+
+def test_where_dates_say_nothing_heights_decide():
+    """All white on one date and all bare on the other: valleys and south faces are free first."""
+    ground = slopes(3000)
+    pair = (np.tile(WHITE, (3000, 1)), np.tile(BARE, (3000, 1)))
+    half = snow_share(albedo_between(pair, snow_turning(ground, *pair), 0.5, 0.5))
+    assert np.corrcoef(half, ground.height_m)[0, 1] > 0.8
+    middle = np.abs(ground.height_m - 1500.0) < 200.0
+    north, south = (middle & (sign * ground.normal[:, 1] > 0.2) for sign in (1.0, -1.0))
+    assert half[north].mean() > half[south].mean() + 0.15
+
+
+def test_the_year_is_a_circle():
+    assert neighbours([100.0, 200.0], 150.0) == (0, 1, 0.5)
+    first, second, way = neighbours([100.0, 200.0], 20.0)
+    assert (first, second) == (1, 0)
+    assert way == pytest.approx(185.2422 / 265.2422)
+    assert neighbours([100.0, 200.0], 200.0) == (1, 1, 0.0)
+    assert neighbours([100.0], 10.0) == (0, 0, 0.0)
+
+
+def test_the_line_keeps_the_climate():
+    """From January to July snow stays low till April; the other way it waits for autumn; at the ends nothing jumps."""
+    assert line_share(15.0, 197.0, 60.0) < 0.05
+    assert 0.15 < line_share(15.0, 197.0, 106.0) < 0.4
+    assert line_share(197.0, 15.0, 240.0) < 0.05
+    # Dates of like climate tell no direction, and a month has no time for more than a straight line.
+    assert line_share(130.0, 310.0, 220.0) == pytest.approx(0.5, abs=0.02)
+    assert line_share(115.0, 145.0, 130.0) == pytest.approx(0.5, abs=0.02)
+    for first, second in ((15.0, 197.0), (197.0, 15.0), (60.0, 213.0), (335.0, 74.0), (258.0, 345.0)):
+        days = first + np.linspace(0.0, (second - first) % 365.2422, 40)
+        shares = np.array([line_share(first, second, day) for day in days])
+        assert shares[0] == 0.0
+        assert shares[-1] == pytest.approx(1.0, abs=1e-6)
+        assert np.diff(shares).min() > -0.03
+
+
+def test_albedo_at_knows_its_dates():
+    ground = slopes(4000)
+    days, dated = (100.0, 140.0), np.stack([snow_above(ground, 1000.0), snow_above(ground, 2000.0)])
+    between, truth = albedo_at(dated, days, 120.0, ground), snow_above(ground, 1500.0)
+    assert np.abs(between - truth).mean() < 0.3 * np.abs(dated.mean(axis=0) - truth).mean()
+    np.testing.assert_array_equal(albedo_at(dated, days, 140.0, ground), dated[1])
+    np.testing.assert_array_equal(albedo_at(dated[:1], days[:1], 300.0, ground), dated[0])
+    for wrong in ((dated[:0], (), 1.0), (dated, days, float("nan"))):
+        with pytest.raises(ValueError, match="albedo_at"):
+            albedo_at(*wrong, ground)
+
+
+# --------------------------------------------------------------------------------------------------- films of a place
+
+
+@pytest.fixture(scope="module")
+def mountain(tmp_path_factory) -> Assignment:
+    """A cone of 900 m, white on the tenth of April and green in July but for its summit, seen from the south."""
+    folder = tmp_path_factory.mktemp("mountain")
+    seen = places.SCENE.replace("46.5405", "46.5385").replace("120.0", "500.0").replace("-8.0", "3.0")
+    path = places.write_place(folder, seen)
+    axis = (np.arange(61) - 30) * 50.0
+    east, north = np.meshgrid(axis, -axis)
+    places.write_raster(folder / "dem.tif", 1900.0 - 0.6 * np.hypot(east, north), spacing_m=50.0)
+    place = load_place(path, Workspace(folder / "workspace"))
+    shape = (place.atlas.height_px, place.atlas.width_px)
+    ground, texel = texel_ground(place.terrain, shape)
+    pairs = []
+    for day, line_m in ((SNOWY, 1150.0), (GREEN, 1800.0)):
+        values = np.tile(BARE, (shape[0] * shape[1], 1))
+        values[texel] = snow_above(ground, line_m, by_north_m=150.0)
+        save_texture(Texture(values.reshape(*shape, 3)), folder / f"{day}.npz")
+        pairs.append((day.isoformat(), str(folder / f"{day}.npz")))
+    return Assignment(str(path), str(folder / "workspace"), MeshOptions(), read_scene(path).camera(None), (48, 32),
+                      read_sky_model("hosek"), albedo=tuple(pairs), season="snow-line",
+                      base_day=SNOWY.isoformat())  # fmt: skip
+
+
+def by_height(height_m: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Mean share of snow of each band of height."""
+    share, band = snow_share(values), np.digitize(height_m, BANDS_M)
+    return np.array([share[band == k].mean() for k in range(1, len(BANDS_M)) if np.any(band == k)])
+
+
+def test_textures_of_a_spring(mountain):
+    place = load_place(Path(mountain.scene), Workspace(Path(mountain.workspace)))
+    dated = dated_albedos(place, mountain.albedo)
+    ground, texel = texel_ground(place.terrain, (place.atlas.height_px, place.atlas.width_px))
+    film = [albedo_of_day(place, dated, day, season="snow-line").values.reshape(-1, 3)[texel] for day in DAYS]
+    faded = [albedo_of_day(place, dated, day, season="blended").values.reshape(-1, 3)[texel] for day in DAYS]
+    rows = np.array([by_height(ground.height_m, values) for values in film])
+    assert np.diff(rows, axis=1).min() > -0.02, "more snow the higher"
+    assert np.diff(rows, axis=0).max() <= 1e-6, "less snow the later"
+    assert rows[0].mean() > rows[-1].mean() + 0.4
+    changed = np.mean(np.any(film[0] != film[-1], axis=1))
+    assert max(half_done(values) for values in film) < 0.25 * changed
+    assert half_done(faded[5]) > 0.95 * changed
+    for number, (_, name) in ((0, mountain.albedo[0]), (-1, mountain.albedo[1])):
+        np.testing.assert_array_equal(film[number], load_texture(name).values.reshape(-1, 3)[texel])
+    # The lower edge of the snow climbs, as it does in truth, and does not thin out everywhere at once.
+    lowest = [np.percentile(ground.height_m[snow_share(values) > 0.5], 5.0) for values in film]
+    assert np.all(np.diff(lowest) >= 0.0)
+    assert np.diff(lowest)[1:-1].min() > 0.5 * np.diff(lowest)[1:-1].max()
+
+
+def test_a_film_of_a_spring(mountain):
+    """In the view's own pixels, as frames are lit."""
+    from dataclasses import replace
+
+    studio = open_studio(mountain)
+    land = studio.coefficients.coverage == 1.0
+    height_m = studio.coefficients.sample_origin[land][:, 0, 2]
+    film = [dressed_view(studio, day).coefficients.albedo[land] for day in DAYS]
+    rows = np.array([by_height(height_m, values) for values in film])
+    assert np.diff(rows, axis=0).max() <= 1e-6
+    assert np.diff(rows, axis=1).min() > -0.1
+    assert rows[0].mean() > rows[5].mean() + 0.1 > rows[-1].mean() + 0.2
+    faded = open_studio(replace(mountain, season="blended"))
+    middle = dressed_view(faded, DAYS[5]).coefficients.albedo[land]
+    assert half_done(film[5]) < 0.5 * half_done(middle)
+    # On the dates themselves both wear the very same.
+    for number in (0, -1):
+        np.testing.assert_array_equal(film[number], dressed_view(faded, DAYS[number]).coefficients.albedo[land])
+
+
+def test_timelapse_moves_the_snow_line(mountain, tmp_path, capsys):
+    common = ["timelapse", mountain.scene, "--workspace", mountain.workspace, "--sky", "hosek", "--size", "48x32", "--json"]  # fmt: skip
+    given = [part for day, name in mountain.albedo for part in ("--albedo", f"{day}={name}")]
+    when = ["--times", f"{SNOWY}T11:00Z,2023-05-20T11:00Z,{GREEN}T11:00Z"]
+    pictures = {}
+    for season in ("snow-line", "blended"):
+        output = tmp_path / season
+        assert main([*common, *given, *when, "--season", season, "--exposure", "15", "-o", str(output)]) == 0
+        assert json.loads(capsys.readouterr().out)["rendered"] == 3
+        pictures[season] = [path.read_bytes() for path in sorted(output.glob("*.png"))]
+    assert pictures["snow-line"][1] != pictures["blended"][1]
+    assert main([*common, *given, *when, "--season", "snowy", "-o", str(tmp_path / "x")]) == 2
+    assert "blended, nearest, snow-line" in capsys.readouterr().err
+
+
+def test_frames_of_a_day_have_its_line(mountain):
+    """The light moves through a day, the snow does not; another day has another line."""
+    from seasonscapes.studio import view_at
+
+    studio = open_studio(mountain)
+    times = [datetime(2023, month, 20, hour, tzinfo=UTC) for month, hour in ((5, 8), (5, 15), (6, 15))]
+    worn = []
+    for time in times:
+        view_at(studio, time)
+        worn.append(studio.dressed[1].coefficients.albedo)
+    np.testing.assert_array_equal(worn[0], worn[1])
+    assert snow_share(worn[2]).mean() < snow_share(worn[1]).mean()
