@@ -222,3 +222,36 @@ def test_frames_of_a_day_have_its_line(mountain):
         worn.append(studio.dressed[1].coefficients.albedo)
     np.testing.assert_array_equal(worn[0], worn[1])
     assert snow_share(worn[2]).mean() < snow_share(worn[1]).mean()
+
+
+def test_render_wears_dated_albedos(mountain, tmp_path, capsys):
+    from seasonscapes.images import read_exr
+
+    common = ["render", mountain.scene, "--workspace", mountain.workspace, "--sky", "hosek", "--size", "48x32", "--spp", "1",
+              *[part for day, name in mountain.albedo for part in ("--albedo", f"{day}={name}")]]  # fmt: skip
+    worn = {}
+    for season in ("snow-line", "blended", "nearest"):
+        assert main([*common, "--time", "2023-05-25T12:00Z", "--season", season, "-o", str(tmp_path / "a.exr")]) == 0
+        layers, header = read_exr(tmp_path / "a.exr")
+        land = np.isfinite(layers["depth"]) & (layers["depth"] < 1e6)
+        worn[season] = layers["albedo"][land]
+    record = json.loads(header["seasonscapes:provenance"])
+    assert [each["date"] for each in record["albedo"]] == [SNOWY.isoformat(), GREEN.isoformat()]
+    assert half_done(worn["snow-line"]) < 0.5 * half_done(worn["blended"])
+    assert snow_share(worn["nearest"]).mean() > snow_share(worn["snow-line"]).mean() > 0.02
+    capsys.readouterr()
+    assert main([*common, "--time", "2023-05-30T12:00Z", "--season", "snowy"]) == 2
+    assert "--season" in capsys.readouterr().err
+
+
+def test_distill_takes_dates_of_any_years(mountain):
+    from seasonscapes.commands.distill import dated_textures
+    from seasonscapes.errors import InputError
+
+    place = load_place(Path(mountain.scene), Workspace(Path(mountain.workspace)))
+    (_, snowy), (_, green) = mountain.albedo
+    found = dated_textures(place, [("2022-07-19", green), ("2023-04-10", snowy)], 4)
+    assert [day for day, _ in found] == [100.0, 200.0]
+    np.testing.assert_array_equal(found[0][1], load_texture(snowy).values)
+    with pytest.raises(InputError, match="twice"):
+        dated_textures(place, [("2022-07-19", green), ("2023-07-19", snowy)], 4)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time as clock
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -51,7 +52,7 @@ def distill(
     suns
         Instants to learn from, spread at random over the dates' days.
     dates
-        Dates of the year whose albedo is told apart.
+        Dates of the year whose albedo is told apart; with --albedo, these. Between them the snow line moves.
     views
         Cameras around the terrain that pictures to learn from are made for; 0 learns on the surface alone.
     view_px
@@ -140,10 +141,17 @@ class School:
 
 def dated_textures(land, given: list[tuple[str, str]], dates: int) -> list[tuple[float, np.ndarray]]:
     """Days of the year and the albedo textures ``(R, S, 3)`` of them: those given, or the scene's own."""
+    from seasonscapes.albedo.seasons import day_number
     from seasonscapes.pipeline import albedo_for, dated_albedos
 
     if given:
-        return [(float(each.day.timetuple().tm_yday), each.load().values) for each in dated_albedos(land, given)]
+        found = sorted(
+            ((day_number(each.day), each.load().values) for each in dated_albedos(land, given)),
+            key=lambda each: each[0],
+        )
+        if any(one[0] == other[0] for one, other in pairwise(found)):
+            raise InputError("--albedo", "names a day of the year twice", cure="give one albedo for each")
+        return found
     # A scene with one image has one albedo for the whole year.
     days = np.linspace(15.0, 366.0 + 15.0, dates + 1)[:-1].round().tolist() if land.synthetic else [200.0]
     return [

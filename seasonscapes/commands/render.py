@@ -13,6 +13,7 @@ from cyclopts import Parameter
 from seasonscapes import __version__
 from seasonscapes.commands.options import PlaceOptions, SkyOptions, ViewOptions
 from seasonscapes.commands.talk import check_range, check_suffix, finish, progress_bar, say
+from seasonscapes.commands.timelapse import check_season, parse_dated
 from seasonscapes.scene import NamedCamera
 
 
@@ -22,6 +23,8 @@ def render(
     time: str,
     view: ViewOptions | None = None,
     sky: SkyOptions | None = None,
+    albedo: list[str] | None = None,
+    season: str = "blended",
     spp: int = 32,
     max_depth: int = 6,
     exposure: str = "auto",
@@ -39,6 +42,10 @@ def render(
         A scene file, or the name of a bundled scene (alpine).
     time
         ISO 8601, such as 2024-09-01T12:00. Without an offset it is civil time at the camera.
+    albedo
+        DATE=FILE.npz, may be repeated: recovered albedos of a date instead of the scene's own colours.
+    season
+        Which of them clothe the time: blended, nearest or snow-line, as of timelapse.
     spp
         Samples per pixel; powers of two are best.
     max_depth
@@ -64,13 +71,15 @@ def render(
     from seasonscapes.daylight import light_for
     from seasonscapes.exposure import develop, exposure_ev100, parse_exposure
     from seasonscapes.images import write_png
-    from seasonscapes.pipeline import albedo_for
+    from seasonscapes.pipeline import albedo_for, albedo_of_day, dated_albedos
     from seasonscapes.rendering.backend import use_backend
     from seasonscapes.rendering.radiance import render_view
     from seasonscapes.rendering.scene import build_scene
     from seasonscapes.workspace import content_key
 
     metering, size_px, model = parse_exposure(exposure), view.size_px(), sky.model()
+    check_season(season)
+    given = [parse_dated(text) for text in albedo or ()]
     backend = use_backend(device)
     land = place.load(scene)
     chosen = view.chosen(land.scene)
@@ -80,9 +89,10 @@ def render(
     light, instant = light_for(land, camera, model, moment.utc)
     sun = {"azimuth_deg": float(instant.sun.azimuth_deg), "elevation_deg": float(instant.sun.elevation_deg)}
     say(f"sun at azimuth {sun['azimuth_deg']:.2f}°, elevation {sun['elevation_deg']:.2f}° (refracted)")
-    albedo = albedo_for(land, moment.utc)
+    dated = dated_albedos(land, given) if given else []
+    colours = albedo_of_day(land, dated, moment.utc.date(), season=season) if dated else albedo_for(land, moment.utc)
     with progress_bar("path tracing") as progress:
-        picture = render_view(build_scene(land.terrain, albedo.values, light), camera, spp=spp, seed=seed,
+        picture = render_view(build_scene(land.terrain, colours.values, light), camera, spp=spp, seed=seed,
                               max_depth=max_depth, progress=progress)  # fmt: skip
     ev100 = exposure_ev100(picture.radiance, metering)
     record: dict[str, Any] = {
@@ -93,6 +103,8 @@ def render(
         "time_reading": moment.reading,
         "sun": sun,
         "sky": light.model,
+        "albedo": [{"date": each.day.isoformat(), "content": each.content} for each in dated],
+        "season": season,
         "exposure_ev100": round(ev100, 3),
         "size_px": list(size_px),
         "spp": spp,
@@ -107,7 +119,7 @@ def render(
         metadata = {"seasonscapes": json_module.dumps(record), "Copyright": land.scene.attribution}
         write_png(output, develop(picture.radiance, ev100, eye=metering == "eye"), metadata=metadata)
     else:
-        save_layers(output, land, camera, chosen, picture, albedo, record)
+        save_layers(output, land, camera, chosen, picture, colours, record)
     record["seconds"] = round(clock.perf_counter() - start, 2)
     finish(record, [f"{output}  ({size_px[0]} × {size_px[1]}, {spp} samples per pixel, EV {ev100:.1f}, "
                     f"{record['seconds']} s, {backend.variant})"], as_json=json)  # fmt: skip

@@ -146,7 +146,6 @@ def timelapse(
     start = clock.perf_counter()
     when, view, sky = when or WhenOptions(), view or ViewOptions(), sky or SkyOptions()
     work, place = work or WorkOptions(), place or PlaceOptions()
-    from seasonscapes.albedo.seasons import SEASONS
     from seasonscapes.exposure import parse_exposure
     from seasonscapes.pipeline import find_scene
     from seasonscapes.scene import read_scene
@@ -156,8 +155,7 @@ def timelapse(
         parse_exposure(exposure),
         0.0 if smooth in ("0", "0s") else parse_duration("--smooth", smooth).total_seconds(),
     )
-    if season not in SEASONS:
-        raise InputError("--season", "unknown", got=season, expected=", ".join(SEASONS))
+    check_season(season)
     film = output.suffix.lower() == ".mp4"
     if not film and output.suffix:
         raise InputError(
@@ -186,6 +184,14 @@ def timelapse(
     record["seconds"] = round(clock.perf_counter() - start, 2)
     finish(record, [f"{record.get('output', 'shard ' + str(work.shard))}  ({len(mine)} frames, {done['rendered']} rendered now, "
                     f"{record['seconds']} s)"], as_json=json)  # fmt: skip
+
+
+def check_season(season: str) -> None:
+    """`InputError` for a way to change colours with the date that there is none of."""
+    from seasonscapes.albedo.seasons import SEASONS
+
+    if season not in SEASONS:
+        raise InputError("--season", "unknown", got=season, expected=", ".join(SEASONS))
 
 
 def parse_dated(text: str) -> tuple[str, str]:
