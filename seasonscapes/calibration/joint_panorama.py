@@ -44,16 +44,6 @@ class JointPanorama:
     focal_ratio: np.ndarray
     solution: Calibration | None
 
-    @property
-    def heading_spread_deg(self) -> float:
-        """Largest minus smallest heading offset inside the panorama [deg]."""
-        return float(np.ptp(self.heading_offset_deg))
-
-    @property
-    def focal_spread(self) -> float:
-        """Largest over smallest horizontal focal ratio."""
-        return float(self.focal_ratio[:, 0].max() / self.focal_ratio[:, 0].min())
-
 
 def joint_panoramas(webcams: Sequence[Webcam], refined: Sequence[ReferenceView], table: Sequence[ReferenceView],
                     frame: LocalFrame) -> list[JointPanorama]:  # fmt: skip

@@ -22,8 +22,8 @@ from seasonscapes.terrain.ground import plan_blur
 
 AZIMUTHS = 64
 HORIZON_RANGE_RAD = (-0.02, 1.29)
-# Coefficients of the sky for each disc, and of light from other slopes: four for the sun's direction, one for the sky.
-SKY_RANK, BOUNCE_TERMS = 8, 5
+# Coefficients of the sky for each disc.
+SKY_RANK = 8
 # Albedo is averaged over this distance around a disc to know the colour of what others send it [m].
 AROUND_M = 300.0
 # A fresh table's edge is this soft [rad]: the sun's radius and half a step of the table.

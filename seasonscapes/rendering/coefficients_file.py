@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shutil
@@ -30,31 +29,6 @@ _KINDS = {
 Coefficients = ViewCoefficients | PointCoefficients
 
 
-def coefficients_key(*inputs: Any) -> str:
-    """Hash of all that coefficients depend on: arrays, records, numbers and text; 32 hexadecimal digits.
-
-    Pass the terrain's vertices and faces, the albedo, the camera or the points, the `Effort` and the seed.
-    """
-    digest = hashlib.blake2b(str(REVISION).encode(), digest_size=16)
-    for value in inputs:
-        _add(digest, value)
-    return digest.hexdigest()
-
-
-def _add(digest: Any, value: Any) -> None:
-    if is_dataclass(value) and not isinstance(value, type):
-        digest.update(type(value).__name__.encode())
-        for field in fields(value):
-            _add(digest, getattr(value, field.name))
-    elif isinstance(value, np.ndarray):
-        digest.update(f"{value.dtype.str}{value.shape}".encode())
-        digest.update(np.ascontiguousarray(value).data)
-    elif value is None or isinstance(value, (str, int, float, bool, np.integer, np.floating)):
-        digest.update(f"{type(value).__name__}:{value!r};".encode())
-    else:
-        raise ValueError(f"coefficients_key: cannot hash a {type(value).__name__}")
-
-
 @contextmanager
 def atomic_folder(path: str | os.PathLike) -> Iterator[Path]:
     """A temporary folder beside ``path`` that takes its name only when the block ends well, replacing what was there."""
@@ -79,7 +53,7 @@ def atomic_folder(path: str | os.PathLike) -> Iterator[Path]:
 
 
 def save_coefficients(path: str | os.PathLike, coefficients: Coefficients, *, key: str = "") -> None:
-    """Write to a folder, atomically; ``key`` from `coefficients_key` is kept for `load_coefficients` to check."""
+    """Write to a folder, atomically; ``key``, a name of all that they depend on, is kept for `load_coefficients` to check."""
     with atomic_folder(path) as folder:
         record = _write(folder, "", coefficients)
         text = json.dumps({"revision": REVISION, "key": key, "coefficients": record}, indent=1)

@@ -197,8 +197,3 @@ def background(illumination: Illumination, direction: np.ndarray, pixel_angle_de
         solid_angle = 2.0 * np.pi * (1.0 - np.cos(np.radians(luminary.angular_radius_deg)))
         sky = sky + cover[..., None] * (np.asarray(luminary.normal_illuminance_lx) / solid_angle)
     return sky
-
-
-def environment_directions(height: int) -> np.ndarray:
-    """Directions of an equirectangular map of this height, twice as wide; see `frames.equirectangular_directions`."""
-    return equirectangular_directions(height, 2 * height)
