@@ -33,6 +33,7 @@ def inpaint(
     time: str,
     texture: Path = Path("out/paint/painted.npz"),
     method: str = "guided",
+    albedo: Path | None = None,
     detail: float = 0.0,
     fast: bool = False,
     seed: int = 0,
@@ -57,6 +58,8 @@ def inpaint(
     method
         guided (learns from satellite colour, relief and sun), membrane (smooth), telea (from the rims inwards) or
         diffusion (an image model along --path, then guided; needs weights and, in earnest, a GPU).
+    albedo
+        What ``seasonscapes albedo`` wrote for this scene: relit at this hour it is a further guide.
     detail
         Strength of synthesised grain: 0 for albedo recovery, about 0.6 for pictures.
     fast
@@ -88,7 +91,12 @@ def inpaint(
     moment = resolve_time(time, land.frame.latitude_deg, land.frame.longitude_deg)
     say(moment.reading)
     painted = read_painted(texture, land)
-    guides = guides_of(land, moment.utc)
+    relit = None
+    if albedo is not None:
+        from seasonscapes.commands.expected import expected_radiance
+
+        relit = expected_radiance(land, albedo, moment.utc, sky.model())
+    guides = guides_of(land, moment.utc, relit)
     if method == "diffusion":
         from seasonscapes.commands.inpaint_path import complete_along_path
 
@@ -149,8 +157,8 @@ def read_painted(path: Path, land: Place) -> Texture:
     return texture
 
 
-def guides_of(land: Place, moment: datetime) -> Guides:
-    """Relief, the sun of the hour and of the day, and the place's image, for every texel."""
+def guides_of(land: Place, moment: datetime, relit: Texture | None = None) -> Guides:
+    """Relief, the sun of the hour and of the day, the place's image, and a relit albedo, for every texel."""
     import numpy as np
 
     from seasonscapes.pipeline import albedo_for
@@ -165,8 +173,9 @@ def guides_of(land: Place, moment: datetime) -> Guides:
     at = (land.frame.latitude_deg, land.frame.longitude_deg)
     hours = [moment + timedelta(hours=h) for h in range(-12, 12)]
     day = np.asarray(sun_position(hours, *at).direction, float)
+    extra = {} if relit is None else {f"relit_{n + 1}": relit.values[..., n] for n in range(3)}
     return guides_for(land.terrain, land.atlas, satellite=satellite, sun_direction=sun_position(moment, *at).direction,
-                      day_suns=day)  # fmt: skip
+                      day_suns=day, extra=extra)  # fmt: skip
 
 
 def save_completed(completed: Completed, painted: Texture, path: Path) -> None:

@@ -53,6 +53,7 @@ def paint(
     mode: str = "weighted",
     near_m: float = 60.0,
     harmonise: bool = True,
+    albedo: Path | None = None,
     output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("out/paint"),
     sky: SkyOptions | None = None,
     place: PlaceOptions | None = None,
@@ -72,11 +73,15 @@ def paint(
         Leave out what is nearer than this in metres: roofs and trees rather than terrain.
     harmonise
         Make the cameras agree in exposure, white balance, contrast and haze.
+    albedo
+        What ``seasonscapes albedo`` wrote for this scene: relit at this hour it tells exposures and haze more surely than
+        the skies do.
     output
         Folder for painted.npz, painted.exr and pictures of texture, coverage and which camera.
     json
         Print one machine-readable record.
     """
+    from seasonscapes.commands.expected import RELIT_SIGMA, expected_radiance
     from seasonscapes.texturing.paint import MODES, PaintOptions
     from seasonscapes.texturing.painting_file import save_painting, write_figures
 
@@ -93,9 +98,15 @@ def paint(
     land = place.load(scene)
     moment = resolve_time(time, land.frame.latitude_deg, land.frame.longitude_deg)
     say(moment.reading)
+    if albedo is not None:
+        # A wrong file is refused before any picture is taken.
+        expected_radiance(land, albedo, moment.utc, model)
     sources = _sources(land, pictures, moment.utc, model, size_px)
-    options = PaintOptions(mode=mode, fit_gains=harmonise, fit_haze=harmonise, near_m=near_m)
-    painting, without = painting_for(land, sources, moment.utc, model, options, within_min=pictures.within_min)
+    options = PaintOptions(mode=mode, fit_gains=harmonise, fit_haze=harmonise, near_m=near_m,
+                           predicted_sigma=1.0 if albedo is None else RELIT_SIGMA)  # fmt: skip
+    painting, without = painting_for(
+        land, sources, moment.utc, model, options, within_min=pictures.within_min, albedo=albedo
+    )
     for line in (*painting.skipped, *(f"{name}: no calibration" for name in without)):
         say(f"left out: {line}")
     with atomic_path(output / "painted.npz") as temporary:
@@ -167,7 +178,7 @@ def chosen_cameras(land: Place, leave_out: str | None, size_px: tuple[int, int])
 
 
 def painting_for(land: Place, sources: Sources, utc: datetime, model: SkyModel, options: PaintOptions, *,
-                 within_min: float = 30.0) -> tuple[Painting, list[str]]:  # fmt: skip
+                 within_min: float = 30.0, albedo: Path | None = None) -> tuple[Painting, list[str]]:  # fmt: skip
     """The painting of a time, from the workspace where equal files were painted before; and webcams without calibration.
 
     An interrupted painting goes on from its finished tiles.
@@ -176,8 +187,9 @@ def painting_for(land: Place, sources: Sources, utc: datetime, model: SkyModel, 
 
     from seasonscapes.commands.webcam_shots import rows_at
     from seasonscapes.texturing.painting_file import load_painting, save_painting
-    from seasonscapes.workspace import build_once, content_key
+    from seasonscapes.workspace import build_once, content_key, file_hash
 
+    predicted = None if albedo is None else _predicted(land, albedo, utc, model)
     rows = rows_at(sources, utc, within_min=within_min)
     inputs = {
         "revision": _REVISION,
@@ -186,10 +198,12 @@ def painting_for(land: Place, sources: Sources, utc: datetime, model: SkyModel, 
         "options": options,
         "files": _hashes(sources, rows),
     }
+    if albedo is not None:
+        inputs["albedo"] = [file_hash(albedo), utc.isoformat()]
     tiles = land.workspace.folder / land.scene.name / f"tiles-{content_key(inputs)}"
     painting = build_once(land.workspace, f"{land.scene.name}/painting", inputs, suffix=".npz", save=save_painting,
                           load=load_painting,
-                          build=lambda: _painted(land, sources, rows, model, options, tiles))  # fmt: skip
+                          build=lambda: _painted(land, sources, rows, model, options, tiles, predicted))  # fmt: skip
     shutil.rmtree(tiles, ignore_errors=True)
     without = [row.webcam for row in rows if not (sources.calibrations / f"{row.webcam}_calibration.json").is_file()]
     return painting, without
@@ -209,7 +223,18 @@ def _hashes(sources: Sources, rows) -> list:
     return found
 
 
-def _painted(land: Place, sources: Sources, rows, model: SkyModel, options: PaintOptions, tiles: Path) -> Painting:
+def _predicted(land: Place, albedo: Path, utc: datetime, model: SkyModel):
+    """Radiance of the texels whose albedo was measured, NaN elsewhere."""
+    import numpy as np
+
+    from seasonscapes.commands.expected import expected_radiance
+
+    expected = expected_radiance(land, albedo, utc, model)
+    return np.where((expected.weight > 0.0)[..., None], expected.values, np.float32(np.nan))
+
+
+def _painted(land: Place, sources: Sources, rows, model: SkyModel, options: PaintOptions, tiles: Path,
+             predicted) -> Painting:  # fmt: skip
     import numpy as np
 
     from seasonscapes.commands.webcam_shots import shots_of
@@ -222,8 +247,7 @@ def _painted(land: Place, sources: Sources, rows, model: SkyModel, options: Pain
     terrain = occluder(mi_mesh(land.terrain, np.full(3, 0.2)))
     try:
         with progress_bar("painting") as progress:
-            return paint_shots(
-                shots, land.terrain, land.atlas, terrain, options=options, resume=tiles, progress=progress
-            )
+            return paint_shots(shots, land.terrain, land.atlas, terrain, options=options, predicted=predicted, resume=tiles,
+                               progress=progress)  # fmt: skip
     except ValueError as error:
         raise InputError(sources.manifest, str(error).removeprefix("paint: ")) from None

@@ -1,0 +1,57 @@
+"""What an albedo says that the land looks like at an hour: it ties photographs together and guides their completion."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from seasonscapes.commands.talk import progress_bar
+
+if TYPE_CHECKING:
+    from seasonscapes.pipeline import Place
+    from seasonscapes.sky.models import SkyModel
+    from seasonscapes.terrain.surface import Texture
+
+# Raised when equal inputs give another light.
+_REVISION = 1
+_RAYS = 64
+# How far off an albedo from photographs is, relit [log]; it then says more about a picture's exposure than its sky does.
+RELIT_SIGMA = 0.2
+
+
+def expected_radiance(land: Place, albedo: Path, utc: datetime, model: SkyModel) -> Texture:
+    """Radiance ``(R, S, 3)`` [cd/m²] that leaves every texel of an albedo file at an instant; kept in the workspace.
+
+    ``weight`` is the albedo's own: 0 where no photograph had measured it. `InputError` where the file is none of this
+    place's atlas.
+    """
+    from seasonscapes.pipeline import dated_albedos
+    from seasonscapes.terrain.surface import load_texture, save_texture
+    from seasonscapes.workspace import build_once
+
+    (dated,) = dated_albedos(land, [(utc.date().isoformat(), str(albedo))])
+    inputs = {"revision": _REVISION, "place": land.key, "albedo": dated.content, "time": utc.isoformat(), "sky": model}
+    return build_once(land.workspace, f"{land.scene.name}/expected", inputs, suffix=".npz", save=save_texture,
+                      load=load_texture, build=lambda: _relit(land, dated.load(), utc, model))  # fmt: skip
+
+
+def _relit(land: Place, texture: Texture, utc: datetime, model: SkyModel) -> Texture:
+    import numpy as np
+
+    from seasonscapes.daylight import light_at, moment_at
+    from seasonscapes.relighting.lit_texture import lit_texture
+    from seasonscapes.rendering.gather import occluder
+    from seasonscapes.rendering.scene import mi_mesh
+    from seasonscapes.rendering.transport import Effort
+    from seasonscapes.terrain.surface import Texture
+    from seasonscapes.terrain.texels import texel_positions
+
+    ground_m = float(np.median(land.elevation.values))
+    moment = moment_at(utc, land.frame.latitude_deg, land.frame.longitude_deg, ground_m)
+    light = light_at(model, moment, ground_m, workspace=land.workspace, with_air=False)
+    positions, _ = texel_positions(land.terrain, land.atlas.width_px, land.atlas.height_px)
+    with progress_bar("relighting the albedo") as progress:
+        lit = lit_texture(occluder(mi_mesh(land.terrain, texture.values)), positions, texture.values, light,
+                          effort=Effort(subpixels=1, rays=_RAYS), progress=progress)  # fmt: skip
+    return Texture(lit.radiance.astype(np.float32), texture.weight)
