@@ -39,6 +39,8 @@ SATELLITE_DATE, SATELLITE_DAY = "2024-07-23", 205
 # GPS, compass and spirit level of an uncalibrated webcam; 12 points clicked to half a pixel, of which two are wrong.
 GPS = PoseSigmas(5.0, 5.0, 4.0, 1.0, 1.0, 0.02)
 CLICKS, WRONG, CLICK_PX = 12, 2, 0.5
+# The middle of the real raster's scenes (EPSG:32632): meadows, walls of 3 km and firn within sight of each other.
+_WENGERNALP_UTM_M = (418000.0, 5158000.0)
 # Painting and judged webcams stand at least this far apart.
 _APART_M = 500.0
 
@@ -111,7 +113,7 @@ def massif_ground(seed: int, size: Size) -> Ground:
 
 
 def jungfrau_ground(seed: int, size: Size, data: Path) -> Ground:
-    """The real raster of the Bernese Oberland about its middle, in the snow that a seed lays."""
+    """The real raster of the Bernese Oberland about Wengernalp (as far as it reaches), in the snow that a seed lays."""
     from affine import Affine
     from texturing_places import jungfrau_land
 
@@ -121,7 +123,9 @@ def jungfrau_ground(seed: int, size: Size, data: Path) -> Ground:
     cell_m = abs(whole.transform.a)
     columns, rows = (min(round(extent / cell_m), n) for extent, n in
                      zip(size.extent_m, whole.values.shape[1::-1], strict=True))  # fmt: skip
-    top, left = (whole.values.shape[0] - rows) // 2, (whole.values.shape[1] - columns) // 2
+    column, row = ~whole.transform * _WENGERNALP_UTM_M
+    left = int(np.clip(round(column - columns / 2), 0, whole.values.shape[1] - columns))
+    top = int(np.clip(round(row - rows / 2), 0, whole.values.shape[0] - rows))
     transform = whole.transform * Affine.translation(left, top)
 
     def cropped(values: np.ndarray) -> Raster:
