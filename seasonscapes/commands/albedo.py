@@ -185,6 +185,28 @@ def _lights(land: Place, observations: Sequence[Observation], model: SkyModel) -
     return [held[one.time, one.camera.position_m.tobytes()] for one in observations]
 
 
+def _with_terrain(traced: Land, observations: list[Observation]) -> list[Observation]:
+    """Those that show any terrain: parts of a panorama may be all sky."""
+    from seasonscapes.rendering.sightlines import faces_met
+
+    held: dict[bytes, np.ndarray] = {}
+    kept, empty = [], set()
+    for one in observations:
+        key = repr((one.webcam, one.camera.width_px, one.camera.height_px, one.camera.fx)).encode()
+        key += one.camera.world_from_camera.tobytes()
+        if key not in held:
+            held[key] = faces_met(traced.occluder, one.camera) >= 0
+        if (held[key] & one.mask).any():
+            kept.append(one)
+        else:
+            empty.add(one.webcam)
+    for name in sorted(empty):
+        say(f"left out: {name}: it sees none of the terrain")
+    if not kept:
+        raise InputError("albedo", "no photograph shows any of the terrain")
+    return kept
+
+
 def _prepared(land: Place, observations: list[Observation], model: SkyModel, *, fit_haze: bool,
               fit_curve: bool) -> tuple[Land, list[Shot], dict[str, Any]]:  # fmt: skip
     from seasonscapes.albedo.forward import trace_land
@@ -196,6 +218,7 @@ def _prepared(land: Place, observations: list[Observation], model: SkyModel, *, 
     facts: dict[str, Any] = {}
     with progress_bar("daylight of the atlas") as progress:
         traced = trace_land(land.terrain, (land.atlas.height_px, land.atlas.width_px), progress=progress)
+    observations = _with_terrain(traced, observations)
     with progress_bar("footprints of the photographs") as progress:
         try:
             shots = make_shots(traced, observations, _lights(land, observations, model), progress=progress)

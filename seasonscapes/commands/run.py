@@ -38,6 +38,8 @@ class RunEffort:
     """Of training through pictures."""
     suns: int = 24
     """Instants that the Gaussians learn from."""
+    views: int = 3
+    """Cameras around the terrain that pictures to learn from are made for; 0 learns on the surface alone."""
 
 
 @dataclass(frozen=True)
@@ -264,7 +266,7 @@ def _distil(job: Job, land: Place, folder: Path) -> list[Path]:
     own, effort = folder / "gaussians", job.effort
     with _logged(own, "distil"):
         distill(job.scene, output=own / "model.safetensors", albedo=_dated(job, folder), discs=effort.discs, suns=effort.suns,
-                steps=effort.steps, picture_steps=effort.picture_steps, seed=job.seed, sky=job.sky, place=job.place)  # fmt: skip
+                views=effort.views, steps=effort.steps, picture_steps=effort.picture_steps, seed=job.seed, sky=job.sky, place=job.place)  # fmt: skip
     return [own / "model.safetensors"]
 
 

@@ -122,16 +122,19 @@ def _masks(pictures: RunPictures, webcams: Sequence[str]) -> list[Path]:
 
 def bring_pictures(pictures: RunPictures, land: Place, times: Sequence[datetime], sky: tuple[SkyModel, int],
                    own: Path) -> list[Path]:  # fmt: skip
-    """The stage that photographs a synthetic scene, or lists the pictures of a real one with their checksums.
+    """The stage that photographs a synthetic scene, or copies the pictures of a real one, so that they stay what they are.
 
-    ``sky`` is its model and the seed. Masks are copied, so that later stages see what they are.
+    ``sky`` is its model and the seed.
     """
     from seasonscapes.cameras.observation import read_manifest, write_manifest
+    from seasonscapes.relighting.frame_file import time_stamp
 
     if pictures.manifest is not None:
         rows = _chosen_rows(pictures, times)
-        write_manifest(own / "manifest.csv", rows)
-        return [own / "manifest.csv", *_copied(_masks(pictures, [row.webcam for row in rows]), own / "masks")]
+        names = [f"{row.webcam}_{time_stamp(row.time)}{Path(row.path).suffix}" for row in rows]
+        copies = [_copied(Path(row.path), own / name) for row, name in zip(rows, names, strict=True)]
+        write_manifest(own / "manifest.csv", [replace(row, path=name) for row, name in zip(rows, names, strict=True)])
+        return [own / "manifest.csv", *copies, *_copied_masks(pictures, [row.webcam for row in rows], own)]
     from seasonscapes.commands.paint import chosen_cameras
     from seasonscapes.commands.webcam_shots import make_webcam_series
 
@@ -145,7 +148,7 @@ def bring_pictures(pictures: RunPictures, land: Place, times: Sequence[datetime]
         make_webcam_series(land, times, sky[0], own, cameras=webcams, seed=sky[1], progress=progress)
     taken = [own / row.path for row in read_manifest(own / "manifest.csv")]
     records = [own / f"{name}_calibration.json" for name in webcams]
-    return [own / "manifest.csv", *taken, *records, *_copied(_masks(pictures, list(webcams)), own / "masks")]
+    return [own / "manifest.csv", *taken, *records, *_copied_masks(pictures, list(webcams), own)]
 
 
 def bring_poses(pictures: RunPictures, land: Place, times: Sequence[datetime], seed: int,
@@ -156,7 +159,7 @@ def bring_poses(pictures: RunPictures, land: Place, times: Sequence[datetime], s
     """
     taken, own = folders
     if pictures.manifest is not None:
-        return _copied(_chosen_records(pictures, _chosen_rows(pictures, times)), own)
+        return [_copied(path, own / path.name) for path in _chosen_records(pictures, _chosen_rows(pictures, times))]
     files, doubts = _found_by_skyline(land, times[len(times) // 2], seed, taken, own)
     for name, doubt in doubts.items():
         say(f"run: calibrate: {name} is left out: {doubt}")
@@ -167,15 +170,16 @@ def bring_poses(pictures: RunPictures, land: Place, times: Sequence[datetime], s
     return files
 
 
-def _copied(files: Sequence[Path], folder: Path) -> list[Path]:
+def _copied(file: Path, copy: Path) -> Path:
     from seasonscapes.images import atomic_path
 
-    copies = []
-    for file in files:
-        with atomic_path(folder / file.name) as temporary:
-            shutil.copyfile(file, temporary)
-        copies.append(folder / file.name)
-    return copies
+    with atomic_path(copy) as temporary:
+        shutil.copyfile(file, temporary)
+    return copy
+
+
+def _copied_masks(pictures: RunPictures, webcams: Sequence[str], own: Path) -> list[Path]:
+    return [_copied(path, own / "masks" / path.name) for path in _masks(pictures, webcams)]
 
 
 def _found_by_skyline(land: Place, time: datetime, seed: int, taken: Path,
