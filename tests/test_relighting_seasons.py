@@ -74,6 +74,51 @@ def test_what_no_snow_explains_follows_time():
     np.testing.assert_allclose(albedo_between((summer, autumn), turning, 0.3, 0.9), summer + 0.03, atol=1e-6)
 
 
+def test_snow_that_ages_stays_snow():
+    """Firn is darker than fresh snow, and no sign of a line above the summits."""
+    ground = slopes(4000)
+    high = ground.height_m[:, None] > 2200.0
+    pair = (snow_above(ground, 1000.0), np.where(high, np.float32(0.62), snow_above(ground, 1900.0)))
+    turning = snow_turning(ground, *pair)
+    assert not turning[high[:, 0], 0].any()
+    half = albedo_between(pair, turning, 0.5, 0.5)
+    np.testing.assert_allclose(half[high[:, 0]], 0.5 * (pair[0] + pair[1])[high[:, 0]], atol=1e-6)
+    truth = snow_above(ground, 1450.0)
+    assert np.mean((half - truth)[~high[:, 0]] ** 2) < 0.2 * np.mean(
+        (0.5 * (pair[0] + pair[1]) - truth)[~high[:, 0]] ** 2
+    )
+
+
+def test_days_between_are_nearer_the_truth_than_a_cross_fade():
+    """On the massif, whose snow knows aspect, hollows, walls, forests, patches and its own table of line heights."""
+    from seasonscapes.frames import LocalFrame
+    from seasonscapes.terrain.imagery import bake_imagery
+    from seasonscapes.terrain.mesh import build_mesh
+    from seasonscapes.terrain.surface import Raster
+    from seasonscapes.terrain.synthetic import alpine_albedo, alpine_massif
+    from seasonscapes.terrain.unwrap import unwrap
+
+    place = alpine_massif(seed=23, size_m=6000.0, spacing_m=60.0)
+    terrain, atlas = unwrap(build_mesh(place.elevation, LocalFrame(46.55, 7.98), mesher="grid"), texel_m=60.0)
+    ground, texel = texel_ground(terrain, (atlas.height_px, atlas.width_px))
+
+    def worn(day: float) -> np.ndarray:
+        image = Raster(alpine_albedo(place, day), place.elevation.transform, place.elevation.crs)
+        return bake_imagery(terrain, atlas, image).values.reshape(-1, 3)[texel]
+
+    def psnr(values: np.ndarray, truth: np.ndarray) -> float:
+        return float(-10.0 * np.log10(np.mean((values - truth) ** 2)))
+
+    gains = []
+    for first, second, day in ((90.0, 197.0, 152.0), (213.0, 15.0, 288.0), (115.0, 145.0, 130.0)):
+        dated, truth = np.stack([worn(first), worn(second)]), worn(day)
+        _, _, way = neighbours([first, second], day)
+        faded = (1.0 - way) * dated[0] + way * dated[1]
+        gains.append(psnr(albedo_at(dated, (first, second), day, ground), truth) - psnr(faded, truth))
+    assert min(gains) > 2.0, gains
+    assert np.mean(gains) > 4.0, gains
+
+
 def test_where_dates_say_nothing_heights_decide():
     """All white on one date and all bare on the other: valleys and south faces are free first."""
     ground = slopes(3000)

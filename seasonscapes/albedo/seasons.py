@@ -26,8 +26,8 @@ YEAR_DAYS = 365.2422
 _LOWEST_LINE_DAY = 39.0
 # Snow is bright in blue as in red; rock, soil and leaves are not. Shares between these values of the test are mixtures.
 _SNOW_DARKEST, _SNOW_BRIGHTEST = 0.32, 0.60
-# A change of albedo that only snow makes.
-_SNOW_CHANGE = 0.12
+# A change of albedo that only snow makes, and from what share of snow on both dates on it is snow that merely aged.
+_SNOW_CHANGE, _STILL_WHITE = 0.12, 0.75
 # Below this upward component of the normal snow slides off, whatever the date: such places tell nothing of the line.
 _STEEP_UP = 0.72
 # What is thought of height [km], normal (east, north, up) and hollowness [hm] before the dates are asked: one logit is
@@ -144,15 +144,14 @@ def snow_turning(ground: Ground, first: np.ndarray, second: np.ndarray) -> np.nd
         ``(N, 3)`` float32: whether the place turns with the snow (1 or 0), and that times the shares of the time at which
         its turn begins and that it takes. Sums of places may be averaged, over a pixel or a footprint.
     """
-    change = second.mean(axis=1) - first.mean(axis=1)
-    turning = np.zeros((len(change), 3), np.float32)
-    moving = np.abs(change) > _SNOW_CHANGE
-    if not moving.any():
+    gains = _gains(first, second)
+    turning = np.zeros((len(gains), 3), np.float32)
+    if not gains.any():
         return turning
-    holds = _features(ground) @ _holding(ground, (first, second), change)
+    holds = _features(ground) @ _holding(ground, (first, second), gains)
     # Melting begins where snow holds least, snowfall where it holds best.
-    for sign in (-1.0, 1.0):
-        these = np.flatnonzero(sign * change > _SNOW_CHANGE)
+    for sign in (-1, 1):
+        these = np.flatnonzero(gains == sign)
         if len(these) == 0:
             continue
         low, high = np.percentile(holds[these], [3.0, 97.0])
@@ -160,29 +159,35 @@ def snow_turning(ground: Ground, first: np.ndarray, second: np.ndarray) -> np.nd
         order = np.clip((holds[these] - low) / span, 0.0, 1.0)
         edge = float(np.clip(_EDGE_LOGITS / span, _EDGE_LEAST, _EDGE_MOST))
         turning[these, 0] = 1.0
-        turning[these, 1] = (order if sign < 0.0 else 1.0 - order) / (1.0 + edge)
+        turning[these, 1] = (order if sign < 0 else 1.0 - order) / (1.0 + edge)
         turning[these, 2] = edge / (1.0 + edge)
     return turning
+
+
+def _gains(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Whether places ``(N,)`` gain snow (1) or lose it (−1) between two dates, or neither (0)."""
+    change = second.mean(axis=1) - first.mean(axis=1)
+    white = np.minimum(snow_share(first), snow_share(second)) > _STILL_WHITE
+    return np.where((np.abs(change) > _SNOW_CHANGE) & ~white, np.sign(change), 0.0).astype(np.int8)
 
 
 def _features(ground: Ground) -> np.ndarray:
     return np.concatenate([ground.height_m[:, None] / 1000.0, ground.normal, ground.hollow_m[:, None] / 100.0], axis=1)
 
 
-def _holding(ground: Ground, dated: tuple[np.ndarray, np.ndarray], change: np.ndarray) -> np.ndarray:
+def _holding(ground: Ground, dated: tuple[np.ndarray, np.ndarray], gains: np.ndarray) -> np.ndarray:
     """How well snow holds, as a weight ``(5,)`` of each of a place's features, in logits.
 
     Logistic regression of white or bare on both dates at once, which share all weights but have a line each
     (proportional odds, McCullagh 1980), by iteratively re-weighted least squares with a weak pull to what is thought.
     """
-    turns = np.abs(change) > _SNOW_CHANGE
-    told = np.flatnonzero((ground.normal[:, 2] > _STEEP_UP) | turns)
+    told = np.flatnonzero((ground.normal[:, 2] > _STEEP_UP) | (gains != 0))
     told = told[:: max(1, len(told) // _MOST_PLACES)]
     part = Ground(ground.height_m[told], ground.normal[told], ground.hollow_m[told])
     x = _features(part).astype(np.float64)
     x -= x.mean(axis=0)
-    white = [np.where(turns[told], sign * change[told] > 0.0, snow_share(values[told]) > 0.5)
-             for sign, values in zip((-1.0, 1.0), dated, strict=True)]  # fmt: skip
+    white = [np.where(gains[told] != 0, gains[told] == sign, snow_share(values[told]) > 0.5)
+             for sign, values in zip((-1, 1), dated, strict=True)]  # fmt: skip
     y = np.concatenate(white).astype(np.float64)
     ones, none = np.ones((len(x), 1)), np.zeros((len(x), 1))
     rows = np.concatenate([np.concatenate([x, ones, none], axis=1), np.concatenate([x, none, ones], axis=1)])
