@@ -37,7 +37,7 @@ _TRUST = 1e-4
 # A place turns while the line crosses so many logits about it.
 _EDGE_LOGITS, _EDGE_LEAST, _EDGE_MOST = 6.0, 0.05, 1.0
 # Places that the line is fitted on: thousands tell seven numbers as well as millions.
-_MOST_PLACES = 40_000
+_MOST_PLACES = 10_000
 
 
 @dataclass(frozen=True)
@@ -204,7 +204,8 @@ def _holding(ground: Ground, dated: tuple[np.ndarray, np.ndarray], gains: np.nda
         slope = rows.T @ (y - p) - pull @ (weight - thought)
         step = np.linalg.solve(rows.T @ ((p * (1.0 - p))[:, None] * rows) + pull, slope)
         # Newton's step may overshoot where most places are sure; the sum to be least is convex.
-        while misfit(weight + step) > misfit(weight) and np.abs(step).max() > 1e-4:
+        now = misfit(weight)
+        while misfit(weight + step) > now and np.abs(step).max() > 1e-4:
             step = 0.5 * step
         weight = weight + step
         if np.abs(step).max() < 1e-4:
