@@ -16,11 +16,12 @@ import numpy as np
 
 from seasonscapes.albedo.seasons import DatedAlbedo, albedo_between, day_number, line_share, season_weights
 from seasonscapes.cameras.pinhole import Camera
-from seasonscapes.daylight import light_for
+from seasonscapes.daylight import light_for, tabulate_light
 from seasonscapes.exposure import exposure_ev100
 from seasonscapes.pipeline import MeshOptions, Place, camera_for, dated_albedos, load_place, turning_between
 from seasonscapes.relighting.frame_file import frame_ev100, frame_name, save_frame
 from seasonscapes.scene import NamedCamera
+from seasonscapes.sky.elevation_table import TABLE_REVISION
 from seasonscapes.sky.models import SkyModel
 from seasonscapes.workspace import Workspace, build_once, content_key
 
@@ -102,11 +103,10 @@ class Studio:
     dressed: tuple[list, Any] | None = None
 
 
-def assignment_key(assignment: Assignment, place: Place) -> str:
-    """Name of all that decides a frame but its time. Reads the albedo's files to name their content: ask once."""
-    dated = dated_albedos(place, assignment.albedo)
-    inputs = {"revision": REVISION, "place": place.key, "view": assignment.view, "size": assignment.size_px,
-              "model": assignment.model, "albedo": [_named(each) for each in dated],
+def assignment_key(assignment: Assignment, place: Place, dated: list[DatedAlbedo]) -> str:
+    """Name of all that decides a frame but its time; ``dated`` are the assignment's albedos."""
+    inputs = {"revision": [REVISION, TABLE_REVISION], "place": place.key, "view": assignment.view,
+              "size": assignment.size_px, "model": assignment.model, "albedo": [_named(each) for each in dated],
               "base": _named(_base(assignment, dated)), "season": assignment.season, "seed": assignment.seed}  # fmt: skip
     return content_key(inputs)
 
@@ -143,13 +143,15 @@ def open_studio(assignment: Assignment, *, progress: Progress | None = None) -> 
     dated = dated_albedos(place, assignment.albedo)
     base = _base(assignment, dated)
     terrain = occluder(mi_mesh(place.terrain, base.load().values))
-    coefficients = _coefficients(assignment, place, camera, (terrain, base), progress)
+    tell = progress or (lambda _: None)
+    tabulate_light(place, camera, assignment.model, progress=lambda share: tell(0.1 * share))
+    coefficients = _coefficients(assignment, place, camera, (terrain, base), lambda share: tell(0.1 + 0.9 * share))
     return Studio(assignment, place, camera, coefficients, terrain, ready_view(terrain, coefficients), dated, base,
-                  frames_folder(assignment, place))  # fmt: skip
+                  frames_folder(assignment, place, dated))  # fmt: skip
 
 
 def _coefficients(assignment: Assignment, place: Place, camera: Camera, clothed: tuple[Any, DatedAlbedo],
-                  progress: Progress | None) -> Any:  # fmt: skip
+                  progress: Progress) -> Any:  # fmt: skip
     from seasonscapes.rendering.coefficients_file import load_coefficients, save_coefficients
     from seasonscapes.rendering.transport import Effort, trace_view
 
@@ -239,9 +241,12 @@ def _load_colours(path: Path) -> tuple[np.ndarray, np.ndarray]:
         return file["pixels"], file["senders"]
 
 
-def frames_folder(assignment: Assignment, place: Place) -> Path:
-    """Where the frames of an assignment lie; another assignment has another folder, so frames never mix."""
-    return place.workspace.folder / f"{place.scene.name}/frames-{assignment_key(assignment, place)}"
+def frames_folder(assignment: Assignment, place: Place, dated: list[DatedAlbedo]) -> Path:
+    """Where the frames of an assignment lie; another assignment has another folder, so frames never mix.
+
+    ``dated`` are its albedos, of `pipeline.dated_albedos`, which reads their files to name their content: ask once.
+    """
+    return place.workspace.folder / f"{place.scene.name}/frames-{assignment_key(assignment, place, dated)}"
 
 
 def view_at(studio: Studio, time: datetime) -> tuple[Any, Any, Any]:
@@ -250,7 +255,7 @@ def view_at(studio: Studio, time: datetime) -> tuple[Any, Any, Any]:
 
     model = studio.assignment.model
     rows = _CLOUDY_ROWS if model.cloudiness > 0.0 else _CLEAR_ROWS
-    light, moment = light_for(studio.place, studio.camera, model, time, map_height=rows)
+    light, moment = light_for(studio.place, studio.camera, model, time, map_height=rows, tabulated=True)
     return relight_view(dressed_view(studio, time.date()), light), light, moment
 
 

@@ -16,7 +16,7 @@ import pytest
 from seasonscapes.albedo.seasons import season_weights
 from seasonscapes.cli import main
 from seasonscapes.errors import InputError
-from seasonscapes.pipeline import MeshOptions, load_place
+from seasonscapes.pipeline import MeshOptions, dated_albedos, load_place
 from seasonscapes.relighting.adaptation import adapted_ev100
 from seasonscapes.relighting.efficacy import efficacies_lm_w
 from seasonscapes.relighting.film import write_film
@@ -267,7 +267,8 @@ def test_a_killed_worker_loses_nothing(hill):
     times = hours(60, 7.0)
     # A seed of its own: no other test's frames lie in this folder.
     assignment = replace(hill, seed=5)
-    folder = frames_folder(assignment, place_of(assignment))
+    place = place_of(assignment)
+    folder = frames_folder(assignment, place, dated_albedos(place, assignment.albedo))
     for each in times:
         render_frame(assignment, each)
     expected = {path.name: load_frame(path)[0] for path in folder.iterdir()}

@@ -217,14 +217,12 @@ def _check_rays(rays: int) -> None:
 
 def _light(land: Place, model: SkyModel, time: str) -> tuple[datetime, Any, Illumination]:
     """An instant, where sun and moon stand then, and their light on the land."""
-    import numpy as np
-
     from seasonscapes.civil_time import resolve_time
-    from seasonscapes.daylight import light_at, moment_at
+    from seasonscapes.daylight import light_at, median_height_m, moment_at
 
     resolved = resolve_time(time, land.frame.latitude_deg, land.frame.longitude_deg)
     say(resolved.reading)
-    ground_m = float(np.median(land.elevation.values))
+    ground_m = median_height_m(land)
     moment = moment_at(resolved.utc, land.frame.latitude_deg, land.frame.longitude_deg, ground_m)
     return resolved.utc, moment, light_at(model, moment, ground_m, workspace=land.workspace, with_air=False)
 
@@ -239,7 +237,7 @@ def _lights(land: Place, model: SkyModel, times: list[datetime]) -> tuple[list, 
     """Lights of a period where there is any worth a watt, and the hours that each stands for (trapezoid rule)."""
     import numpy as np
 
-    from seasonscapes.daylight import light_at, moment_at
+    from seasonscapes.daylight import light_at, median_height_m, moment_at
 
     if len(times) < 2:
         raise InputError("--every", "leaves one instant", cure="give --time for an instant, or a shorter --every")
@@ -248,7 +246,7 @@ def _lights(land: Place, model: SkyModel, times: list[datetime]) -> tuple[list, 
     hours = np.zeros(len(times))
     hours[:-1] += 0.5 * gaps / 3600.0
     hours[1:] += 0.5 * gaps / 3600.0
-    ground_m = float(np.median(land.elevation.values))
+    ground_m = median_height_m(land)
     lights, kept = [], []
     with progress_bar("skies") as progress:
         for index, each in enumerate(times):

@@ -67,10 +67,10 @@ def sky(
 def _standpoint(scene: str | None, at: str | None, place: PlaceOptions) -> tuple[float, float, float]:
     """Latitude, longitude [deg] and the height [m] at which one stands."""
     if at is None:
-        import numpy as np
+        from seasonscapes.daylight import median_height_m
 
         land = place.load(str(scene))
-        return land.frame.latitude_deg, land.frame.longitude_deg, float(np.median(land.elevation.values))
+        return land.frame.latitude_deg, land.frame.longitude_deg, median_height_m(land)
     latitude, longitude, height, _ = parse_at(at)
     if height is None and "+" in at:
         raise InputError("--at", "without a scene there is no ground to stand above", got=at, expected="LAT,LON,HEIGHT")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from seasonscapes.frames import angles_from_direction
+from seasonscapes.sky.along_rays import parts_along
 from seasonscapes.sky.scattering import AtmosphereTables
 from seasonscapes.sky.seen import (
     DISTANCE_EDGES_M,
@@ -14,9 +15,9 @@ from seasonscapes.sky.seen import (
     View,
     azimuths_filled,
     column_of,
+    diffuse_seen,
     interpolated,
     row_of,
-    scattered_parts,
     sky_radiance,
     with_phases,
 )
@@ -101,15 +102,6 @@ def air_between(view: View, lights: tuple[tuple[SeenLight, np.ndarray], ...], il
 
 def airlight(tables: AtmosphereTables, view: View, true_elevation_rad: float, irradiance: np.ndarray) -> np.ndarray:
     """Parts of a luminary's light up to each of the fixed distances ``(K, A, M, 10)``; arguments of `seen_sky`."""
-    return near_light(near_parts(tables, view, true_elevation_rad, rgb_from_transfer() * irradiance))
-
-
-def near_light(parts: np.ndarray) -> np.ndarray:
-    """`airlight` of what `near_parts` gives for a luminary's spectrum."""
-    filled = azimuths_filled(parts)
+    colours, diffuse = rgb_from_transfer() * irradiance, diffuse_seen(tables, view, true_elevation_rad, near=True)
+    filled = azimuths_filled(parts_along(tables, view.near, true_elevation_rad, colours, diffuse, cumulative=True))
     return np.concatenate([np.zeros_like(filled[:, :, :1]), filled], axis=2)
-
-
-def near_parts(tables: AtmosphereTables, view: View, true_elevation_rad: float, colours: np.ndarray) -> np.ndarray:
-    """Parts ``(K, A, M - 1, 3 C + 1)`` up to each of the fixed distances but the first, 0; see `scattered_parts`."""
-    return scattered_parts(tables, view.near, view.elevation_rad, true_elevation_rad, colours, cumulative=True)

@@ -16,6 +16,7 @@ All radiances are transfers: over the sun's spectral irradiance above the air [1
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -63,11 +64,15 @@ class AtmosphereTables:
         See `SunColumns`.
     moments
         Light scattered at least once, summed over all orders.
+    diffuse_of
+        Gives, for an observer's height and whether near distances are meant, `seen.diffuse_by_elevation`: quick for
+        many suns. Without, diffuse light is worked out for each sun.
     """
 
     atmosphere: Atmosphere
     sun_columns: SunColumns
     moments: Moments
+    diffuse_of: Callable[[float, bool], np.ndarray] | None = None
 
 
 def _directions(horizon_rad: float) -> tuple[np.ndarray, np.ndarray]:

@@ -7,22 +7,24 @@ is as sharp as its phase function wherever it is looked up.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
 from seasonscapes.frames import angles_from_direction, direction_from_angles
-from seasonscapes.images import REC709_LUMINANCE
 from seasonscapes.sky.air import TOP_HEIGHT_M, Atmosphere, delta_scaled, gas_phase, optics
+from seasonscapes.sky.along_rays import AZIMUTHS, AZIMUTHS_RAD, diffuse_along, ground_along, parts_along
 from seasonscapes.sky.aureole import spread_aerosol_phase
-from seasonscapes.sky.cells import Samples, cell_columns, local_sun, sample_cells, scattering_per_m
-from seasonscapes.sky.moments import HARMONIC_ORDER, diffuse_source, sun_geometry, sun_index
-from seasonscapes.sky.paths import equal_cells, horizon_elevation_rad, resampled, sun_transfer, towards_sun, trace_rays
+from seasonscapes.sky.cells import Samples, cell_columns, sample_cells
+from seasonscapes.sky.elevation_table import at_elevation, by_elevation
+from seasonscapes.sky.moments import HARMONIC_ORDER
+from seasonscapes.sky.paths import equal_cells, horizon_elevation_rad, resampled, trace_rays
 from seasonscapes.sky.scattering import AtmosphereTables
 from seasonscapes.sky.spectrum import WAVELENGTHS_NM, rgb_from_transfer
 
-_ABOVE, _BELOW, _AZIMUTHS, _AZIMUTHS_OUT, _CELLS = 44, 20, 12, 49, 36
+_ABOVE, _BELOW, _AZIMUTHS_OUT, _CELLS = 44, 20, 49, 36
 _SPACING_ABOVE, _SPACING_BELOW = 2.5, 3.0
 # Aerial perspective is tabulated up to these distances, and down to this far below the model's ground.
 DISTANCE_EDGES_M = np.concatenate([400e3 * np.linspace(0.0, 1.0, 41) ** 3, [520e3, 700e3, 950e3, 1300e3]])
@@ -131,24 +133,34 @@ def seen_sky(tables: AtmosphereTables, view: View, luminary_direction: np.ndarra
     irradiance
         Spectral irradiance above the air over that of the sun at 1 au ``(B,)``.
     """
-    return seen_light(tables, view, luminary_direction,
-                      sky_parts(tables, view, true_elevation_rad, rgb_from_transfer() * irradiance))  # fmt: skip
-
-
-def seen_light(tables: AtmosphereTables, view: View, luminary_direction: np.ndarray, parts: np.ndarray) -> SeenLight:
-    """`SeenLight` of what `sky_parts` gives for a luminary's spectrum."""
+    colours = rgb_from_transfer() * irradiance
+    parts = parts_along(tables, view.sky, true_elevation_rad, colours, diffuse_seen(tables, view, true_elevation_rad))
+    parts = parts[:, :, 0]
+    parts[:, :, 6:9] += (ground_along(tables, view.sky, true_elevation_rad) @ colours.T).astype(np.float32)
     return SeenLight(
         np.asarray(luminary_direction, float), _rgb_aerosol_depth(tables.atmosphere), tables.atmosphere.asymmetry,
         view.horizon_rad, azimuths_filled(parts),
     )  # fmt: skip
 
 
-def sky_parts(tables: AtmosphereTables, view: View, true_elevation_rad: float, colours: np.ndarray) -> np.ndarray:
-    """Parts ``(K, A, 3 C + 1)`` of the light along whole rays, the ground's included; see `scattered_parts`."""
-    parts = scattered_parts(tables, view.sky, view.elevation_rad, true_elevation_rad, colours)[:, :, -1]
-    count = len(colours)
-    parts[:, :, 2 * count : 3 * count] += (_ground(tables, view.sky, true_elevation_rad) @ colours.T).astype(np.float32)
-    return parts
+def diffuse_seen(tables: AtmosphereTables, view: View, true_elevation_rad: float, *, near: bool = False) -> np.ndarray:
+    """Transfers of diffuse light along whole rays ``(K, A, 1, B)``, or up to each of the fixed distances but the first.
+
+    They are worked out for this sun, or looked up where the tables came with diffuse light by the sun's elevation.
+    """
+    if tables.diffuse_of is not None:
+        return at_elevation(tables.diffuse_of(view.height_m, near), true_elevation_rad)
+    samples = view.near if near else view.sky
+    return diffuse_along(tables, samples, view.elevation_rad, np.array([true_elevation_rad]), cumulative=near)[0]
+
+
+def diffuse_by_elevation(tables: AtmosphereTables, height_m: float, near: bool, *,
+                         progress: Callable[[float], None] | None = None) -> np.ndarray:  # fmt: skip
+    """`diffuse_seen` of every sun, as a table of `elevation_table`; some seconds."""
+    view = observer_view(tables, height_m)
+    samples = view.near if near else view.sky
+    return by_elevation(lambda suns: diffuse_along(tables, samples, view.elevation_rad, suns, cumulative=near),
+                        progress=progress)  # fmt: skip
 
 
 def sky_radiance(light: SeenLight, direction: np.ndarray) -> np.ndarray:
@@ -198,63 +210,14 @@ def _rgb_aerosol_depth(atmosphere: Atmosphere) -> np.ndarray:
     return np.interp([610.0, 550.0, 465.0], WAVELENGTHS_NM, optics(atmosphere).scattering[1])
 
 
-def scattered_parts(tables: AtmosphereTables, samples: Samples, elevation_rad: np.ndarray, sun_rad: float,
-                    colours: np.ndarray, *, cumulative: bool = False) -> np.ndarray:  # fmt: skip
-    """Light ``(K, A, M or 1, 3 C + 1)`` that gas and aerosol scatter once, over their phase functions, and diffuse light.
-
-    Of each in turn the C channels of ``colours`` ``(C, B)``, weights of the bands' transfers. The last part is the mean
-    column of aerosol along sun, scattering point and eye.
-    """
-    atmosphere = tables.atmosphere
-    plain = optics(atmosphere)
-    scaled = delta_scaled(plain, HARMONIC_ORDER)
-    azimuth = (np.arange(_AZIMUTHS) + 0.5) * np.pi / _AZIMUTHS
-    sine, geometry = sun_geometry(samples, elevation_rad, np.full(_AZIMUTHS, sun_rad), azimuth)
-    column, share = towards_sun(atmosphere, tables.sun_columns, samples.height_m[..., None], np.arcsin(sine))
-    arriving = (np.exp(-(column @ scaled.extinction)) * share[..., None]).astype(np.float32)
-    # Scattering with the full coefficient, attenuation with the scaled one: TMS.
-    sigma = (scattering_per_m(atmosphere, plain, samples.height_m) * samples.weight).astype(np.float32)
-    aerosol = arriving * sigma[1][:, :, None]
-    diffuse = diffuse_source(atmosphere, scaled, tables.moments, samples, geometry)
-    diffuse *= samples.weight[:, :, None].astype(np.float32)
-    # Weighed by the luminance that each cell scatters.
-    weights, luminance = colours.T.astype(np.float32), (REC709_LUMINANCE @ rgb_from_transfer()).astype(np.float32)
-    bright = aerosol @ luminance + np.float32(1e-30)
-    passed = bright * (column[..., 1] + samples.aerosol_column[..., None]).astype(np.float32)
-    once = arriving * sigma[0][:, :, None]
-    terms = [once @ weights, aerosol @ weights, diffuse @ weights, passed[..., None], bright[..., None]]
-    parts = np.concatenate(terms, axis=-1).swapaxes(1, 2)
-    parts = np.cumsum(parts, axis=2) if cumulative else parts.sum(axis=2, keepdims=True)
-    parts[..., -2] /= parts[..., -1]
-    return parts[..., :-1]
-
-
-def _ground(tables: AtmosphereTables, samples: Samples, sun_rad: float) -> np.ndarray:
-    """What the ground sends along rays that end on it ``(K, A, B)``."""
-    atmosphere = tables.atmosphere
-    scaled = delta_scaled(optics(atmosphere), HARMONIC_ORDER)
-    azimuth = (np.arange(_AZIMUTHS) + 0.5) * np.pi / _AZIMUTHS
-    sine = local_sun(samples.paths.turn_rad[:, -1, None], sun_rad, np.cos(azimuth))
-    index, share = sun_index(sine)
-    share = share[..., None]
-    table = tables.moments.ground_irradiance
-    direct = sun_transfer(atmosphere, tables.sun_columns, scaled, np.full(sine.shape, atmosphere.ground_height_m),
-                          np.arcsin(sine)) * np.maximum(sine, 0.0)[..., None]  # fmt: skip
-    irradiance = direct + table[index] * (1.0 - share) + table[index + 1] * share
-    albedo = np.broadcast_to(np.asarray(atmosphere.ground_albedo, float), WAVELENGTHS_NM.shape)
-    ends = np.where(samples.paths.ends_on_ground[:, None], samples.end_transmittance, 0.0)
-    return irradiance * ends[:, None, :] * albedo / np.pi
-
-
 def azimuths_filled(parts: np.ndarray) -> np.ndarray:
     """Cosine series through the computed azimuths, at an even grid from 0 to π: ``(K, A, ...)`` → ``(K, A', ...)``."""
-    inner = (np.arange(_AZIMUTHS) + 0.5) * np.pi / _AZIMUTHS
     outer = np.linspace(0.0, np.pi, _AZIMUTHS_OUT)
-    order = np.arange(_AZIMUTHS)
-    forward = np.cos(np.outer(order, inner)) * (2.0 / _AZIMUTHS)
+    order = np.arange(AZIMUTHS)
+    forward = np.cos(np.outer(order, AZIMUTHS_RAD)) * (2.0 / AZIMUTHS)
     forward[0] *= 0.5
     series = (np.cos(np.outer(outer, order)) @ forward).astype(np.float32)
-    filled = series @ parts.reshape(len(parts), _AZIMUTHS, -1)
+    filled = series @ parts.reshape(len(parts), AZIMUTHS, -1)
     return filled.reshape(len(parts), _AZIMUTHS_OUT, *parts.shape[2:])
 
 

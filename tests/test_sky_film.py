@@ -1,0 +1,211 @@
+"""The sky of thousands of instants: what is looked up agrees with what is worked out, and quick sums with slow twins."""
+
+from dataclasses import asdict, replace
+from datetime import UTC, datetime
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from atmosphere_cases import tables_of
+
+from seasonscapes import daylight
+from seasonscapes.frames import direction_from_angles
+from seasonscapes.sky.air import delta_scaled, gas_moments, optics
+from seasonscapes.sky.atmosphere import illumination_from_atmosphere
+from seasonscapes.sky.cells import scattering_per_m
+from seasonscapes.sky.elevation_table import KNOTS_DEG, at_elevation, by_elevation, load_table, save_table
+from seasonscapes.sky.illumination import luminance
+from seasonscapes.sky.moments import HARMONIC_ORDER, diffuse_source, height_index, sun_geometry, zonal
+from seasonscapes.sky.seen import (
+    diffuse_by_elevation,
+    observer_view,
+    seen_sky,
+    sky_radiance,
+    sky_radiance_grid,
+)
+
+HEIGHT_M = 2800.0
+
+
+@pytest.fixture(scope="module")
+def looked_up():
+    """Tables that come with diffuse light for an observer at `HEIGHT_M`."""
+    tables = tables_of()
+    diffuse = {near: diffuse_by_elevation(tables, HEIGHT_M, near) for near in (False, True)}
+
+    def diffuse_of(height_m: float, near: bool) -> np.ndarray:
+        assert height_m == HEIGHT_M
+        return diffuse[near]
+
+    assert sum(table.nbytes for table in diffuse.values()) < 110e6
+    return replace(tables, diffuse_of=diffuse_of)
+
+
+def worst(table_light: np.ndarray, exact_light: np.ndarray) -> float:
+    """Largest relative deviation in luminance."""
+    exact = luminance(exact_light)
+    return float((np.abs(luminance(table_light) - exact) / exact).max())
+
+
+@pytest.mark.parametrize(("low_deg", "high_deg", "bound"), [
+    (-18.0, -12.0, 5e-3), (-12.0, -6.0, 3e-3), (-6.0, -2.0, 3e-3), (-2.0, 3.0, 3e-3), (3.0, 65.0, 3e-3),
+])  # fmt: skip
+def test_a_film_s_sky_is_the_picture_s(looked_up, low_deg, high_deg, bound):
+    """Random suns between the knots, random lines of sight: sky and airlight within 0.3 % through civil twilight."""
+    rng = np.random.default_rng(int(100 + low_deg))
+    direction = rng.normal(size=(4000, 3)) * [1.0, 1.0, 0.4]
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    depth_m = 10.0 ** rng.uniform(1.0, 5.3, 4000)
+    for _ in range(4):
+        sun = direction_from_angles(rng.uniform(0.0, 360.0), rng.uniform(low_deg, high_deg))
+        exact, quick = (illumination_from_atmosphere(tables, sun, HEIGHT_M, shape=(32, 64))
+                        for tables in (tables_of(), looked_up))  # fmt: skip
+        assert worst(quick.sky_radiance, exact.sky_radiance) < bound
+        for depth in (depth_m, np.full(4000, np.inf)):
+            (through, air), (exact_through, exact_air) = (
+                light.aerial_perspective(depth, direction) for light in (quick, exact)
+            )
+            assert worst(air, exact_air) < bound
+            np.testing.assert_array_equal(through, exact_through)
+        if exact.sun is not None:
+            np.testing.assert_array_equal(quick.sun.normal_illuminance_lx, exact.sun.normal_illuminance_lx)
+
+
+def test_the_moon_s_colour_is_kept(looked_up):
+    """Moonlight has another spectrum than sunlight: each channel within 0.3 % of the brightest, not luminance alone."""
+    sun, spectrum = direction_from_angles(300.0, -25.0), 2e-6 * np.linspace(0.7, 1.3, 9)
+    moon = (direction_from_angles(120.0, 17.3), spectrum, 0.26)
+    exact, quick = (illumination_from_atmosphere(tables, sun, HEIGHT_M, moon=moon, shape=(32, 64))
+                    for tables in (tables_of(), looked_up))  # fmt: skip
+    unlike = illumination_from_atmosphere(
+        looked_up, sun, HEIGHT_M, moon=(moon[0], spectrum[::-1], 0.26), shape=(32, 64)
+    )
+    scale = exact.sky_radiance.max(axis=-1, keepdims=True)
+    assert (np.abs(quick.sky_radiance - exact.sky_radiance) / scale).max() < 3e-3
+    assert (np.abs(unlike.sky_radiance - exact.sky_radiance) / scale).max() > 0.05
+    direction = direction_from_angles(np.arange(0.0, 360.0, 10.0), 1.0)
+    air, exact_air = (light.aerial_perspective(np.full(36, 3e4), direction)[1] for light in (quick, exact))
+    assert (np.abs(air - exact_air) / exact_air.max(axis=-1, keepdims=True)).max() < 3e-3
+
+
+def test_a_table_by_elevation_is_cubic_and_fine_enough(tmp_path):
+    def values_of(suns_rad: np.ndarray) -> np.ndarray:
+        # Three per degree, as twilight; and a line.
+        return np.stack([np.exp(1.1 * np.degrees(suns_rad)), 100.0 + np.degrees(suns_rad)], axis=1)[:, None] + 1e-20
+
+    told: list[float] = []
+    table = by_elevation(values_of, progress=told.append)
+    assert told[-1] == 1.0 and sorted(told) == told  # noqa: PT018 (one statement of what progress is)
+    assert len(table) == len(KNOTS_DEG)
+    save_table(table, tmp_path / "t.npy")
+    kept = load_table(tmp_path / "t.npy")
+    for elevation_deg in (*np.random.default_rng(4).uniform(-12.0, 3.0, 40), -12.0, 0.0, -29.99, 90.0):
+        rad = np.radians(elevation_deg)
+        expected = values_of(np.array([rad]))[0]
+        found = at_elevation(kept, rad)
+        assert found.shape == (1, 2)
+        rows = slice(None) if elevation_deg >= -12.0 else slice(1, 2)
+        np.testing.assert_allclose(found[0, rows], expected[0, rows], rtol=1e-3)
+        np.testing.assert_array_equal(found, at_elevation(table, rad))
+    np.testing.assert_array_equal(at_elevation(kept, np.radians(-80.0)), at_elevation(kept, np.radians(KNOTS_DEG[0])))
+
+
+def test_diffuse_source_is_the_plain_sum_over_harmonics():
+    """``J = Σ_a β_a Σ_lm χ_al Φ_lm Y_lm`` of one cell after the other, with Φ interpolated linearly."""
+    tables = tables_of()
+    view = observer_view(tables, HEIGHT_M)
+    scaled = delta_scaled(optics(tables.atmosphere), HARMONIC_ORDER)
+    suns, azimuths = np.radians([-7.3, 1.2, 33.0]), np.radians([10.0, 80.0, 170.0])
+    _, geometry = sun_geometry(view.sky, view.elevation_rad, suns, azimuths)
+    found = diffuse_source(tables.atmosphere, scaled, tables.moments, view.sky, geometry)
+    index, share, cosines = geometry
+    row, share_of_row = height_index(tables.atmosphere, view.sky.height_m)
+    sigma = scattering_per_m(tables.atmosphere, scaled, view.sky.height_m)
+    chi = np.stack([gas_moments(HARMONIC_ORDER), scaled.aerosol_moments[: HARMONIC_ORDER + 1]])
+    rng = np.random.default_rng(8)
+    for k, s, q in zip(rng.integers(0, len(found), 60), rng.integers(0, found.shape[1], 60), rng.integers(0, 3, 60),
+                       strict=True):  # fmt: skip
+
+        def at(table, k=k, s=s, q=q):
+            low, high = (
+                table[row[k, s] + up, index[k, s, q]] * (1.0 - share[k, s, q])
+                + table[row[k, s] + up, index[k, s, q] + 1] * share[k, s, q]
+                for up in (0, 1)
+            )
+            return low * (1.0 - share_of_row[k, s]) + high * share_of_row[k, s]
+
+        harmonics = zonal(np.sin(view.sky.elevation_rad[k, s]), HARMONIC_ORDER) * cosines[k, s, q]
+        phase = np.einsum("ab,al->lb", sigma[:, k, s], chi)
+        total = np.einsum("lb,lmb,lm->b", phase, at(tables.moments.ratio.astype(float)), harmonics)
+        expected = np.maximum(total, 0.0) * np.exp(at(tables.moments.log_mean.astype(float)))
+        np.testing.assert_allclose(found[k, s, q], expected, rtol=2e-5)
+
+
+def test_a_grid_of_directions_is_the_same_sky():
+    tables, sun = tables_of(), direction_from_angles(200.0, 4.0)
+    light = seen_sky(tables, observer_view(tables, HEIGHT_M), sun, np.radians(4.0), np.ones(9))
+    elevation_deg, azimuth_deg = np.linspace(-89.0, 89.0, 41), np.linspace(0.0, 359.0, 30)
+    directions = direction_from_angles(azimuth_deg[None, :], elevation_deg[:, None])
+    np.testing.assert_allclose(
+        sky_radiance_grid(light, elevation_deg, azimuth_deg), sky_radiance(light, directions), rtol=1e-4
+    )
+
+
+def test_film_tables_are_built_once_and_whole(tmp_path, monkeypatch):
+    """A table that has no manifest, as an interrupted run leaves it, is built anew; a finished one is read."""
+    workspace, built = daylight.Workspace(tmp_path), []
+
+    def build(tables, height_m, near):
+        built.append((height_m, near))
+        return by_elevation(lambda suns: np.full((len(suns), 2), 1.0 + near))
+
+    monkeypatch.setattr(daylight, "diffuse_by_elevation", build)
+    tables = tables_of()
+    for _ in range(2):
+        diffuse_of = daylight._diffuse_in(workspace, tables)
+        for _ in range(2):
+            assert at_elevation(diffuse_of(900.0, True), 0.3) == pytest.approx(2.0, rel=1e-3)
+    assert built == [(900.0, True)]
+    (manifest,) = tmp_path.rglob("*.npy.json")
+    manifest.unlink()
+    assert at_elevation(daylight._diffuse_in(workspace, tables)(900.0, True), 0.3) == pytest.approx(2.0, rel=1e-3)
+    daylight._diffuse_in(workspace, tables)(901.0, True)
+    assert built == [(900.0, True), (900.0, True), (901.0, True)]
+
+
+def test_light_for_a_film_differs_by_less_than_its_bound(tmp_path, monkeypatch):
+    """The whole way through `daylight`, in two processes' worth of studios: equal to the digit once the tables lie there."""
+    import places
+
+    from seasonscapes.pipeline import camera_for, load_place
+    from seasonscapes.sky.models import read_sky_model
+    from seasonscapes.workspace import Workspace
+
+    place = load_place(places.write_place(tmp_path), Workspace(tmp_path / "work"))
+    camera, model = camera_for(place, place.scene.camera(None), size_px=(32, 24)), read_sky_model("clear")
+    when = datetime(2024, 9, 1, 17, 50, tzinfo=UTC)
+    monkeypatch.setattr(daylight, "atmosphere_tables", lambda atmosphere: tables_of(**asdict(atmosphere)))
+    told: list[float] = []
+    daylight.tabulate_light(place, camera, model, progress=told.append)
+    assert told[-1] == 1.0
+    exact, moment = daylight.light_for(place, camera, model, when, map_height=16)
+    assert -3.0 < moment.sun.elevation_deg < 3.0
+    quick, _ = daylight.light_for(place, camera, model, when, map_height=16, tabulated=True)
+    daylight.tables_in.cache_clear()
+    again, _ = daylight.light_for(place, camera, model, when, map_height=16, tabulated=True)
+    for name in ("sky_radiance", "visible_sky"):
+        assert 0.0 < worst(getattr(quick, name), getattr(exact, name)) < 3e-3
+        np.testing.assert_array_equal(getattr(again, name), getattr(quick, name))
+
+
+def test_median_height_is_worked_out_once(monkeypatch):
+    calls = []
+    median = np.median
+    monkeypatch.setattr(daylight.np, "median", lambda values: calls.append(1) or median(values))
+    first, second = (
+        SimpleNamespace(elevation=SimpleNamespace(values=np.full((3, 3, 1), level))) for level in (5.0, 7.0)
+    )
+    assert [daylight.median_height_m(place) for place in (first, second, first)] == [5.0, 7.0, 5.0]
+    assert len(calls) == 2
+    first.elevation.values = np.full((3, 3, 1), 9.0)
+    assert daylight.median_height_m(first) == 9.0
