@@ -120,8 +120,7 @@ def timelapse(
     scene
         A scene file, or the name of a bundled scene (alpine).
     season
-        How colours change with the date where there are several dated albedos: blended (from one into the next), nearest,
-        or snow-line (snow climbs and comes down: each place turns at its own day; the rest is blended).
+        Between dated albedos: blended (one into the next), nearest, or snow-line (snow goes place by place, by height).
     albedo
         DATE=FILE.npz, may be repeated: recovered albedos of a date instead of the scene's own colours.
     exposure
