@@ -1,6 +1,6 @@
-"""Values that change with the sun's elevation alone, tabulated: a film asks for thousands of suns, a table for 161.
+"""Values that change with the sun's elevation alone, tabulated: a film asks for thousands of suns, a table for 177.
 
-Knots divide the intervals of `moments.SUN_ELEVATION_KNOTS_DEG` by four, so that they are close through twilight and lie
+Knots divide the intervals of `moments.SUN_ELEVATION_KNOTS_DEG`, so that they are close through twilight and lie
 on the kinks of what is tabulated. In between the cubic through the four nearest knots holds. Values are kept in half
 precision (3e-4 of each value) over a scale for each knot, since they fall by nine orders of magnitude into the night.
 """
@@ -16,10 +16,19 @@ from seasonscapes.images import atomic_path
 from seasonscapes.sky.moments import SUN_ELEVATION_KNOTS_DEG
 
 # Raised whenever an equal atmosphere and observer give other tables.
-TABLE_REVISION = 1
-_PARTS, _AT_ONCE = 4, 4
-KNOTS_DEG = np.interp(np.arange(_PARTS * (len(SUN_ELEVATION_KNOTS_DEG) - 1) + 1) / _PARTS,
-                      np.arange(len(SUN_ELEVATION_KNOTS_DEG)), SUN_ELEVATION_KNOTS_DEG)  # fmt: skip
+TABLE_REVISION = 2
+_AT_ONCE = 4
+
+
+def _knots_deg() -> np.ndarray:
+    """Four parts to an interval, and eight where dusk ends in the night: there light falls most steeply."""
+    low, high = SUN_ELEVATION_KNOTS_DEG[:-1], SUN_ELEVATION_KNOTS_DEG[1:]
+    parts = np.where((low >= -18.0) & (low < -12.0), 8, 4)
+    each = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(low, high, parts, strict=True)]
+    return np.concatenate([*each, high[-1:]])
+
+
+KNOTS_DEG = _knots_deg()
 # Half precision is exact to 11 bits from 2^-14 to 65504.
 _LARGEST = 32768.0
 
