@@ -1,12 +1,18 @@
-"""The whole way on a small synthetic massif: photographs, poses, texture, albedo, other hours, Gaussians."""
+"""The whole way on a small synthetic massif: panoramas, poses, texture, albedo, other hours, Gaussians; killed anywhere."""
 
 import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from seasonscapes.cli import main
+from seasonscapes.workspace import file_hash
 
 SCENE = """name = "little"
 attribution = "made by a test"
@@ -39,31 +45,142 @@ pitch_deg = 7.0
 fov_deg = 60.0
 """
 
+STAGES = ("pictures", "calibrate", "paint", "inpaint", "albedo", "relight", "distil", "splat")
+
+# The program with less light transport: the same code, a fifth of the time.
+LAUNCHER = """import sys
+from seasonscapes.evaluation import synthetic_webcams
+from seasonscapes.rendering import transport
+transport.Effort.__init__.__defaults__ = (4, 16, 64, 4, 512, 32, 16, "reinhart")
+transport._PILOTS = 1 << 14
+synthetic_webcams.webcam_series.__kwdefaults__["effort"] = transport.Effort()
+from seasonscapes.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+class Runs:
+    """Runs of one and the same job as processes of their own, each in its own folder and workspace."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        (folder / "little.toml").write_text(SCENE)
+        (folder / "launch.py").write_text(LAUNCHER)
+
+    def arguments(self, name: str) -> list[str]:
+        return ["run", str(self.folder / "little.toml"), "--workspace", str(self.folder / f"{name}-work"),
+                "--times", "2024-07-20T10:00,2024-07-20T15:00", "--at-hours", "2024-07-20T18:00", "--photo-size", "720x120",
+                "--size", "96x64", "--texel-m", "120", "--refine", "1", "--max-error-m", "6", "--discs", "24", "--suns", "2",
+                "--steps", "40", "--picture-steps", "2", "--views", "1", "--sky", "hosek", "-o", str(self.folder / name)]  # fmt: skip
+
+    def start(self, name: str) -> subprocess.Popen:
+        command = [sys.executable, str(self.folder / "launch.py"), *self.arguments(name)]
+        return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory) -> Runs:
+    """With one run that nothing disturbed, ``whole``."""
+    runs = Runs(tmp_path_factory.mktemp("runs"))
+    process = runs.start("whole")
+    told = process.stderr.read()
+    assert process.wait() == 0, told
+    (runs.folder / "whole.log").write_text(told)
+    return runs
+
+
+def ledger_of(folder: Path) -> dict:
+    path = folder / "run.json"
+    return json.loads(path.read_text()) if path.is_file() else {}
+
 
 @pytest.mark.slow
-def test_photographs_to_gaussians(tmp_path, capsys):
-    scene = tmp_path / "little.toml"
-    scene.write_text(SCENE)
-    common = ["run", str(scene), "--workspace", str(tmp_path / "work"), "--times", "2024-07-20T10:00,2024-07-20T15:00",
-              "--at-hours", "2024-07-20T18:00", "--photo-size", "192x128", "--size", "96x64", "--texel-m", "60", "--discs", "24",
-              "--suns", "3", "--steps", "40", "--picture-steps", "2", "--sky", "hosek", "-o", str(tmp_path / "run"), "--json"]  # fmt: skip
-    assert main([*common, "--until", "calibrate"]) == 0
-    assert list(json.loads(capsys.readouterr().out)["stages"]) == ["pictures", "calibrate"]
-    assert main(common) == 0
-    said = capsys.readouterr()
-    assert "run: calibrate: fresh" in said.err
-    stages = json.loads(said.out)["stages"]
-    assert list(stages) == ["pictures", "calibrate", "paint", "inpaint", "albedo", "relight", "distil", "splat"]
-    relit, splat = (
-        np.asarray(Image.open(next((tmp_path / "run" / name).glob("*.png"))), float) for name in ("relight", "splat")
+def test_panoramas_to_gaussians(runs, capsys):
+    whole = runs.folder / "whole"
+    assert list(ledger_of(whole)) == list(STAGES)
+    photographs = sorted((whole / "pictures").glob("aerial_*.png"))
+    assert [Image.open(path).size for path in photographs] == [(720, 120)] * 2
+    true, found = (
+        json.loads((whole / name / "aerial_calibration.json").read_text()) for name in ("pictures", "calibration")
     )
+    assert true["projection"] == found["projection"] == "cylindrical"
+    off = [abs(true["angles_deg"][name] - found["angles_deg"][name]) for name in ("heading", "roll")]
+    assert 0.0 < off[0] < 0.4
+    assert off[1] < 0.4
+    # Mountains that stand too near for so coarse a picture: their webcam is left out, and the rest goes on.
+    told = (runs.folder / "whole.log").read_text()
+    assert "meadow is left out: the horizon is too even" in told
+    assert "1 of 2 webcams found by their skylines" in told
+    assert not (whole / "calibration" / "meadow_calibration.json").exists()
+    albedo = np.load(whole / "albedo" / "albedo.npz")
+    assert (albedo["source"] == 1).mean() > 0.1
+    relit, splat = (np.asarray(Image.open(next((whole / name).glob("*.png"))), float) for name in ("relight", "splat"))
     assert relit.shape == splat.shape == (64, 96, 3)
     assert relit.std() > 5.0
     # Two ways to the same hour from the same albedo: not the same picture, but one of the same thing.
     assert np.corrcoef(relit.mean(axis=2).ravel(), splat.mean(axis=2).ravel())[0, 1] > 0.6
-    assert main(["info", str(tmp_path / "run")]) == 0
+    assert main(["info", str(whole)]) == 0
     capsys.readouterr()
-    assert main([*common, "--from", "splat", "--until", "paint"]) == 2
+    assert main([*runs.arguments("whole"), "--from", "splat", "--until", "paint"]) == 2
     assert "--until" in capsys.readouterr().err
-    assert main([*common, "--until", "everything"]) == 2
+    assert main([*runs.arguments("whole"), "--until", "everything"]) == 2
     assert "no such stage" in capsys.readouterr().err
+    assert main([*runs.arguments("whole"), "--photo-kind", "fisheye"]) == 2
+    assert "panorama or perspective" in capsys.readouterr().err
+
+
+def killed_in(runs: Runs, name: str, stage: str, delay_s: float) -> list[str]:
+    """Start a run, kill it so long after it says that it begins a stage; all that it said."""
+    process, told = runs.start(name), []
+    for line in process.stderr:
+        told.append(line.strip())
+        if line.startswith(f"run: {stage}: …"):
+            time.sleep(delay_s)
+            process.kill()
+            break
+    process.stderr.close()
+    code = process.wait()
+    assert code == -signal.SIGKILL or stage == "splat", (stage, code, told)
+    return told
+
+
+def contents(path: Path) -> dict:
+    """What a file holds, to the bit. Pictures tell how long they took beside their pixels; of safetensors' header the
+    order is by chance."""
+    if path.suffix == ".safetensors":
+        from safetensors import safe_open
+
+        with safe_open(path, "np") as file:
+            return {"": file.metadata()} | {name: file.get_tensor(name).tobytes() for name in file.keys()}  # noqa: SIM118
+    if path.suffix == ".npz":
+        with np.load(path) as file:
+            return {name: file[name].tobytes() for name in file.files}
+    if path.suffix == ".png":
+        return {"pixels": np.asarray(Image.open(path)).tobytes()}
+    return {"bytes": path.read_bytes()}
+
+
+@pytest.mark.slow
+def test_a_run_killed_in_every_stage_ends_as_one_that_nothing_disturbed(runs):
+    whole, killed = runs.folder / "whole", runs.folder / "killed"
+    seconds = {name: entry["seconds"] for name, entry in ledger_of(whole).items()}
+    rng = np.random.default_rng()
+    for number, stage in enumerate(STAGES):
+        delay_s = rng.uniform(0.0, 0.6) * min(seconds[stage], 4.0)
+        told = killed_in(runs, "killed", stage, delay_s)
+        assert [f"run: {name}: fresh" for name in STAGES[: max(number - 1, 0)]] == [
+            x for x in told if x.endswith(": fresh")
+        ]
+        ledger = ledger_of(killed)
+        assert list(ledger)[:number] == list(STAGES[:number]), (stage, delay_s)
+        for entry in ledger.values():
+            for name, digest in entry["files"].items():
+                assert file_hash(killed / name) == digest, (stage, delay_s, name)
+    process = runs.start("killed")
+    told = process.stderr.read()
+    assert process.wait() == 0, told
+    files = {name for entry in ledger_of(whole).values() for name in entry["files"]}
+    assert {name for entry in ledger_of(killed).values() for name in entry["files"]} == files
+    for name in sorted(files):
+        assert contents(killed / name) == contents(whole / name), name
+    assert not list(killed.rglob(".*.part*")), "nothing half-written is left"
