@@ -62,8 +62,10 @@ def parts_along(tables: AtmosphereTables, samples: Samples, sun_rad: float, colo
 
 def diffuse_along(tables: AtmosphereTables, samples: Samples, elevation_rad: np.ndarray, suns_rad: np.ndarray, *,
                   cumulative: bool = False) -> np.ndarray:  # fmt: skip
-    """Transfers ``(N, K, A, M or 1, B)`` of light that is scattered more than once or comes from the ground and is
-    scattered then, along rays of K elevations under N suns [rad]."""
+    """Transfers ``(N, K, A, M or 1, B)`` of diffuse light along rays of K elevations under N suns [rad].
+
+    Diffuse is what was scattered, or sent back by the ground, before it was scattered towards the observer.
+    """
     scaled = delta_scaled(optics(tables.atmosphere), HARMONIC_ORDER)
     suns, azimuths = (part.ravel() for part in np.meshgrid(suns_rad, AZIMUTHS_RAD, indexing="ij"))
     _, geometry = sun_geometry(samples, elevation_rad, suns, azimuths)
