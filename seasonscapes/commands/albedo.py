@@ -128,49 +128,30 @@ def _moments(times: str, land: Place) -> list[datetime]:
 def _photographed(land: Place, moments: list[datetime], model: SkyModel, size_px: tuple[int, int]) -> list[Observation]:
     """Pictures of the synthetic webcams, as they deliver them: 8 bits, JPEG, unknown exposure and white balance."""
     from seasonscapes.commands.paint import chosen_cameras
-    from seasonscapes.daylight import light_for
-    from seasonscapes.evaluation.synthetic_webcams import Hour, webcam_series
-    from seasonscapes.pipeline import albedo_for
+    from seasonscapes.commands.webcam_shots import photographs
 
     if land.synthetic is None:
         raise InputError("--synthetic-webcams", f"the scene '{land.scene.name}' is a real place",
                          cure="give its pictures with --manifest")  # fmt: skip
     cameras = chosen_cameras(land, None, size_px)
-    # One albedo for all: the photographs are of one season.
-    truth = albedo_for(land, moments[0]).values
-    found = []
     with progress_bar(f"photographing from {len(cameras)} webcams") as progress:
-        for number, (name, camera) in enumerate(cameras.items()):
-            hours = [Hour(moment, light_for(land, camera, model, moment)[0], truth) for moment in moments]
-            made = webcam_series(land.terrain, name, camera, hours,
-                                 progress=lambda share, n=number: progress((n + share) / len(cameras)))  # fmt: skip
-            found += [picture.observation for picture in made]
-    return found
+        made = photographs(land, moments, model, cameras, progress=progress)
+        return [picture.observation for _, pictures in made for picture in pictures]
 
 
 def _opened(land: Place, moments: list[datetime], folders: tuple, within_min: float) -> list[Observation]:
-    from seasonscapes.calibration.record import read_calibration
-    from seasonscapes.commands.webcam_shots import Sources, observations_of, rows_at
+    from seasonscapes.commands.webcam_shots import Sources, calibrated_views, rows_at
 
-    manifest, calibrations, masks = folders
-    if manifest is None:
+    if folders[0] is None:
         raise InputError("--manifest", "missing", expected="the .csv of seasonscapes webcams --manifest",
                          cure="for a synthetic scene: --synthetic-webcams")  # fmt: skip
-    sources = Sources(manifest, calibrations, masks)
-    rows = {row.path: row for moment in moments for row in rows_at(sources, moment, within_min=within_min)}
-    found, without = [], set()
-    for row in rows.values():
-        record = calibrations / f"{row.webcam}_calibration.json"
-        if record.is_file():
-            found += observations_of(row, sources, read_calibration(record), land.frame)
-        else:
-            without.add(row.webcam)
+    sources = Sources(*folders)
+    near = [rows_at(sources, moment, within_min=within_min, flag="--times") for moment in moments]
+    rows = {row.path: row for each in near for row in each}
+    opened, without = calibrated_views(list(rows.values()), sources, land.frame)
     for name in sorted(without):
         say(f"left out: {name}: no calibration")
-    if not found:
-        raise InputError(calibrations, "holds no calibration of a webcam with a picture at these times",
-                         cure="seasonscapes calibrate SCENE --webcam ... -o FOLDER")  # fmt: skip
-    return found
+    return [view for _, views in opened for view in views]
 
 
 def _lights(land: Place, observations: Sequence[Observation], model: SkyModel) -> list:

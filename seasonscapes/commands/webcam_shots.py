@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from seasonscapes.cameras.observation import ManifestRow, Observation
     from seasonscapes.cameras.panorama import Panorama
     from seasonscapes.cameras.pinhole import Camera
+    from seasonscapes.evaluation.synthetic_webcams import SyntheticPicture
+    from seasonscapes.evaluation.webcam_faults import PoseSigmas
     from seasonscapes.frames import LocalFrame
     from seasonscapes.pipeline import Place
     from seasonscapes.sky.models import SkyModel
@@ -65,29 +67,42 @@ def rows_at(sources: Sources, time: datetime, *, within_min: float, flag: str = 
     return [nearest[name] for name in sorted(nearest)]
 
 
+def calibrated_views(rows: Sequence[ManifestRow], sources: Sources, frame: LocalFrame, *, progress: Progress | None = None
+                     ) -> tuple[list[tuple[CalibratedWebcam, list[Observation]]], list[str]]:  # fmt: skip
+    """The views of each picture, with its webcam's calibration; and the webcams that have none yet.
+
+    `InputError` where no webcam has one.
+    """
+    from seasonscapes.calibration.record import read_calibration
+
+    opened, without = [], []
+    for number, row in enumerate(rows):
+        record = sources.calibrations / f"{row.webcam}_calibration.json"
+        if record.is_file():
+            pose = read_calibration(record)
+            opened.append((pose, observations_of(row, sources, pose, frame)))
+        elif row.webcam not in without:
+            without.append(row.webcam)
+        if progress is not None:
+            progress((number + 1) / len(rows))
+    if not opened:
+        raise InputError(sources.calibrations, "holds no calibration of a webcam with a picture at that time",
+                         got=", ".join(without), cure="seasonscapes calibrate SCENE --webcam ... -o FOLDER")  # fmt: skip
+    return opened, without
+
+
 def shots_of(place: Place, rows: Sequence[ManifestRow], sources: Sources, model: SkyModel, *,
              progress: Progress | None = None) -> tuple[list[Shot], list[str]]:  # fmt: skip
     """A shot for each perspective picture, several for each panorama; and the webcams that have no calibration yet."""
-    from seasonscapes.calibration.record import read_calibration
     from seasonscapes.daylight import light_for
     from seasonscapes.texturing.shots import Shot
 
-    shots, without = [], []
-    for number, row in enumerate(rows):
-        record = sources.calibrations / f"{row.webcam}_calibration.json"
-        if not record.is_file():
-            without.append(row.webcam)
-            continue
-        pose = read_calibration(record)
-        views = observations_of(row, sources, pose, place.frame)
+    opened, without = calibrated_views(rows, sources, place.frame, progress=progress)
+    shots = []
+    for pose, views in opened:
         # The views of a panorama share a place, and so the air.
-        air = light_for(place, views[0].camera, model, row.time)[0].aerial_perspective
+        air = light_for(place, views[0].camera, model, views[0].time)[0].aerial_perspective
         shots += [Shot(view, air, pose.sigma) for view in views]
-        if progress is not None:
-            progress((number + 1) / len(rows))
-    if not shots:
-        raise InputError(sources.calibrations, "holds no calibration of a webcam with a picture at that time",
-                         got=", ".join(without), cure="seasonscapes calibrate SCENE --webcam ... -o FOLDER")  # fmt: skip
     return shots, without
 
 
@@ -161,36 +176,49 @@ def make_webcam_series(place: Place, times: Sequence[datetime], model: SkyModel,
     Pictures of a single time bear the webcam's name alone, those of several its name and time.
     """
     from seasonscapes.cameras.observation import ManifestRow, write_manifest
-    from seasonscapes.daylight import light_for
-    from seasonscapes.evaluation.synthetic_webcams import Hour, webcam_series
     from seasonscapes.evaluation.webcam_faults import PoseSigmas
     from seasonscapes.images import write_png8
-    from seasonscapes.pipeline import albedo_for
     from seasonscapes.relighting.frame_file import time_stamp
 
-    tell = progress or (lambda share: None)
+    def names(webcam: str) -> list[str]:
+        return [f"{webcam}.png" if len(times) == 1 else f"{webcam}_{time_stamp(time)}.png" for time in times]
+
+    def record(webcam: str) -> Path:
+        return folder / f"{webcam}_calibration.json"
+
+    left = {webcam: camera for webcam, camera in cameras.items()
+            if not all(path.is_file() for path in (record(webcam), *(folder / name for name in names(webcam))))}  # fmt: skip
     sigmas = PoseSigmas(0.5, 0.5, 0.01, 0.01, 0.01)
-    albedos: dict[int, np.ndarray] = {}
-    rows = []
-    for number, (name, camera) in enumerate(cameras.items()):
-        names = [f"{name}.png" if len(times) == 1 else f"{name}_{time_stamp(time)}.png" for time in times]
-        record = folder / f"{name}_calibration.json"
-        if not (record.is_file() and all((folder / each).is_file() for each in names)):
-            hours = []
-            for time in times:
-                day = time.timetuple().tm_yday
-                if day not in albedos:
-                    albedos[day] = albedo_for(place, time).values
-                hours.append(Hour(time, light_for(place, camera, model, time)[0], albedos[day]))
-            made = webcam_series(place.terrain, name, camera, hours, poses=sigmas, seed=seed,
-                                 progress=lambda share, n=number: tell((n + share) / len(cameras)))  # fmt: skip
-            for each, picture in zip(names, made, strict=True):
-                write_png8(folder / each, picture.encoded)
-            _write_pose(record, name, made[0].observation.camera, sigmas, place.frame)
-        rows += [ManifestRow(name, time, each) for time, each in zip(times, names, strict=True)]
-        tell((number + 1) / len(cameras))
+    for webcam, made in photographs(place, times, model, left, poses=sigmas, seed=seed, progress=progress):
+        for name, picture in zip(names(webcam), made, strict=True):
+            write_png8(folder / name, picture.encoded)
+        _write_pose(record(webcam), webcam, made[0].observation.camera, sigmas, place.frame)
+    rows = [
+        ManifestRow(webcam, time, name) for webcam in cameras for time, name in zip(times, names(webcam), strict=True)
+    ]
     write_manifest(folder / "manifest.csv", rows)
     return Sources(folder / "manifest.csv", folder)
+
+
+def photographs(place: Place, times: Sequence[datetime], model: SkyModel, cameras: Mapping[str, Camera | Panorama], *,
+                poses: PoseSigmas | None = None, seed: int = 0,
+                progress: Progress | None = None) -> Iterator[tuple[str, list[SyntheticPicture]]]:  # fmt: skip
+    """Each webcam of a synthetic place and its pictures, in the land's colours of each day; see `webcam_series`."""
+    from seasonscapes.daylight import light_for
+    from seasonscapes.evaluation.synthetic_webcams import Hour, webcam_series
+    from seasonscapes.pipeline import albedo_for
+
+    tell = progress or (lambda share: None)
+    albedos: dict[int, np.ndarray] = {}
+    for number, (name, camera) in enumerate(cameras.items()):
+        hours = []
+        for time in times:
+            day = time.timetuple().tm_yday
+            if day not in albedos:
+                albedos[day] = albedo_for(place, time).values
+            hours.append(Hour(time, light_for(place, camera, model, time)[0], albedos[day]))
+        yield name, webcam_series(place.terrain, name, camera, hours, poses=poses, seed=seed,
+                                  progress=lambda share, n=number: tell((n + share) / len(cameras)))  # fmt: skip
 
 
 def _write_pose(path: Path, name: str, camera: Camera | Panorama, sigmas, frame: LocalFrame) -> None:

@@ -1,0 +1,114 @@
+"""Synthetic webcams' files: one function photographs for `run`, `paint` and `albedo`; finished ones are kept."""
+
+from dataclasses import replace
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+from test_run import SCENE
+
+from seasonscapes.calibration.record import read_calibration
+from seasonscapes.calibration.skyline import encoded_from_file
+from seasonscapes.cameras.observation import read_manifest
+from seasonscapes.cameras.panorama import Panorama, level_panorama
+from seasonscapes.commands.albedo import _opened, _with_terrain
+from seasonscapes.commands.options import PlaceOptions, SkyOptions
+from seasonscapes.commands.paint import chosen_cameras
+from seasonscapes.commands.webcam_shots import calibrated_views, make_webcam_series, photographs, rows_at, shots_of
+from seasonscapes.errors import InputError
+from seasonscapes.evaluation import synthetic_webcams
+from seasonscapes.rendering.gather import occluder
+from seasonscapes.rendering.scene import mi_mesh
+from seasonscapes.rendering.transport import Effort
+
+TIMES = [datetime(2024, 7, 20, hour, tzinfo=UTC) for hour in (8, 13)]
+
+
+@pytest.fixture(scope="module")
+def taken(tmp_path_factory):
+    """A place, its two webcams as panoramas, and where their pictures lie."""
+    folder = tmp_path_factory.mktemp("webcams")
+    (folder / "little.toml").write_text(SCENE)
+    place = PlaceOptions(workspace=folder / "work", texel_m=240.0, refine=1, max_error_m=20.0).load(
+        str(folder / "little.toml")
+    )
+    size = (240, 48)
+    cameras = {
+        name: level_panorama(camera, place.frame, size) for name, camera in chosen_cameras(place, None, size).items()
+    }
+    before = synthetic_webcams.webcam_series.__kwdefaults__["effort"]
+    synthetic_webcams.webcam_series.__kwdefaults__["effort"] = Effort(4, 4, 16, 1, 64, 16, 8)
+    model = SkyOptions(sky="hosek").model()
+    yield place, cameras, model, make_webcam_series(place, TIMES, model, folder / "shots", cameras=cameras)
+    synthetic_webcams.webcam_series.__kwdefaults__["effort"] = before
+
+
+def test_a_level_panorama_turns_about_the_cameras_own_vertical(taken):
+    place, cameras, _, _ = taken
+    views = chosen_cameras(place, None, (240, 48))
+    from seasonscapes.calibration.pose_model import angles_from_rotation
+    from seasonscapes.frames import geodetic_from_enu, local_axes
+
+    for name, heading in (("aerial", 141.3), ("meadow", 164.3)):
+        panorama = cameras[name]
+        assert panorama.full_circle
+        assert panorama.fx == panorama.fy
+        np.testing.assert_array_equal(panorama.position_m, views[name].position_m)
+        latitude, longitude, _ = geodetic_from_enu(place.frame, panorama.position_m)
+        own = local_axes(place.frame, float(latitude), float(longitude)) @ panorama.world_from_camera[:3, :3]
+        assert angles_from_rotation(own) == pytest.approx((heading, 0.0, 0.0), abs=1e-9)
+
+
+def test_the_files_are_what_was_photographed(taken):
+    place, cameras, model, sources = taken
+    rows = read_manifest(sources.manifest)
+    assert [(row.webcam, row.time) for row in rows] == [(name, time) for name in cameras for time in TIMES]
+    made = dict(photographs(place, TIMES, model, {"meadow": cameras["meadow"]}))["meadow"]
+    assert made[0].observation.camera.fx == cameras["meadow"].fx
+    exact = encoded_from_file(sources.manifest.parent / rows[2].path)
+    # Poses apart, the pictures of `albedo --synthetic-webcams` are those that `run` writes.
+    np.testing.assert_array_equal(made[0].encoded, exact)
+    assert isinstance(read_calibration(sources.calibrations / "meadow_calibration.json").view, Panorama)
+
+
+def test_finished_webcams_are_kept_and_others_made(taken):
+    place, cameras, model, sources = taken
+    folder = sources.manifest.parent
+    files = {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
+    lost = next(folder.glob("meadow_*.png"))
+    content = lost.read_bytes()
+    lost.unlink()
+    make_webcam_series(place, TIMES, model, folder, cameras=cameras)
+    assert lost.read_bytes() == content
+    again = {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
+    assert again.keys() == files.keys()
+    assert all(again[name] == files[name] for name in files if name.startswith("aerial"))
+
+
+def test_views_of_panoramas_serve_paint_and_albedo_alike(taken, tmp_path, capsys):
+    place, _, model, sources = taken
+    rows = rows_at(sources, TIMES[0], within_min=1.0)
+    views, without = calibrated_views(rows, sources, place.frame)
+    assert without == []
+    assert [pose.webcam for pose, _ in views] == ["aerial", "meadow"]
+    shots, _ = shots_of(place, rows, sources, model)
+    opened = _opened(place, TIMES[:1], (sources.manifest, sources.calibrations, None), 1.0)
+    for shot, one in zip(shots, opened, strict=True):
+        assert shot.observation.webcam == one.webcam
+        np.testing.assert_array_equal(shot.observation.image, one.image)
+
+    # Parts of a panorama that show sky alone are left out, and so is what a mask leaves nothing of.
+    class Traced:
+        occluder = occluder(mi_mesh(place.terrain, np.full(3, 0.2)))
+
+    kept = _with_terrain(Traced, opened)
+    said = capsys.readouterr().err
+    assert 0 < len(kept) < len(opened)
+    assert "left out: aerial/0: it sees none of the terrain" in said
+    nothing = [replace(one, mask=np.zeros_like(one.mask)) for one in opened]
+    with pytest.raises(InputError, match="no photograph shows any of the terrain"):
+        _with_terrain(Traced, nothing)
+    with pytest.raises(InputError, match="holds no calibration"):
+        calibrated_views(rows, replace(sources, calibrations=tmp_path), place.frame)
+    with pytest.raises(InputError, match="--times: no picture within"):
+        _opened(place, [TIMES[0].replace(month=3)], (sources.manifest, sources.calibrations, None), 1.0)
