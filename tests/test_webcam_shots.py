@@ -112,3 +112,11 @@ def test_views_of_panoramas_serve_paint_and_albedo_alike(taken, tmp_path, capsys
         calibrated_views(rows, replace(sources, calibrations=tmp_path), place.frame)
     with pytest.raises(InputError, match="--times: no picture within"):
         _opened(place, [TIMES[0].replace(month=3)], (sources.manifest, sources.calibrations, None), 1.0)
+
+
+def test_a_webcam_that_sees_no_land_is_named(taken):
+    place, cameras, model, _ = taken
+    pose = cameras["aerial"].world_from_camera.copy()
+    pose[2, 3] += 1e5
+    with pytest.raises(InputError, match="camera 'high': sees no terrain"):
+        list(photographs(place, TIMES[:1], model, {"high": replace(cameras["aerial"], world_from_camera=pose)}))

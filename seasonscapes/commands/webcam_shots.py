@@ -217,8 +217,14 @@ def photographs(place: Place, times: Sequence[datetime], model: SkyModel, camera
             if day not in albedos:
                 albedos[day] = albedo_for(place, time).values
             hours.append(Hour(time, light_for(place, camera, model, time)[0], albedos[day]))
-        yield name, webcam_series(place.terrain, name, camera, hours, poses=poses, seed=seed,
-                                  progress=lambda share, n=number: tell((n + share) / len(cameras)))  # fmt: skip
+        try:
+            made = webcam_series(place.terrain, name, camera, hours, poses=poses, seed=seed,
+                                 progress=lambda share, n=number: tell((n + share) / len(cameras)))  # fmt: skip
+        except ValueError as error:
+            if "sees no terrain" not in str(error):
+                raise
+            raise InputError(f"camera '{name}'", "sees no terrain", cure=f"--leave-out {name}") from None
+        yield name, made
 
 
 def _write_pose(path: Path, name: str, camera: Camera | Panorama, sigmas, frame: LocalFrame) -> None:
