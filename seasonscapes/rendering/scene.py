@@ -14,6 +14,7 @@ import numpy as np
 from seasonscapes.frames import equirectangular_directions, sample_equirectangular
 from seasonscapes.rendering.backend import use_backend
 from seasonscapes.sky.illumination import Illumination, Luminary
+from seasonscapes.terrain.ground import vertex_normals
 from seasonscapes.terrain.surface import Terrain
 
 # Discs of sun and moon are polygons at this distance: 60 km of terrain then sees them within 0.0004° of parallel.
@@ -71,7 +72,9 @@ def mi_mesh(terrain: Terrain, albedo: np.ndarray, *, smooth: bool = True) -> Any
     parameters["vertex_texcoords"] = uv.ravel()
     parameters.update()
     if smooth:
-        mesh.recompute_vertex_normals()
+        # Mitsuba's own sums are made by all threads at once: their last bits, and pictures with them, would be by chance.
+        parameters["vertex_normals"] = vertex_normals(terrain).ravel()
+        parameters.update()
     return mesh
 
 
