@@ -16,8 +16,9 @@ each colour first, as one must for a real webcam.
 * Held-out hours: the albedo recovered from the painted hours' pictures, relit.
 * Distilled: Gaussians that learned from that albedo under suns of other days, seen at the held-out hours.
 * Each stage alone is given the truth of the stages before it. Ablations change one thing of the whole.
-* The satellite's image shows reflectance on a July forenoon with that hour's shades in it, as such images do, on the same
-  texels. Satellite only is that image on the terrain without air, at the best exposure there is for each picture.
+* The satellite's image shows reflectance on a July forenoon with that hour's shades in it, as such images do, misplaced
+  and noisy, on the same texels. Its hour is known: the light is taken out before it guides. Satellite only is the image
+  as it is on the terrain without air, at the best exposure there is for each picture.
 
 ``--figures`` writes truth, ours, satellite only and the difference, and a day as MP4 and GIF.
 """
@@ -102,7 +103,7 @@ def stages(bench: Bench) -> tuple[dict[str, dict], dict]:
     rows["all, relit painted hours"] = judge.scores(relit, painted)
     bench.clock.tell("albedo, relit")
     told = {at: bench.true_texture(world.lights[at][0], albedo) for at in painted}
-    guides = {at: bench.guides_at(at, relit=told[at]) for at in painted}
+    guides = {at: bench.guides_at(at, bench.satellite, relit=told[at]) for at in painted}
     paintings = {at: bench.painted(at, relit=told[at]) for at in painted}
     textures = {at: bench.completed(paintings[at].texture, at, guides=guides[at]) for at in painted}
     rows["all, painted hours"] = judge.scores(lambda c, at: judge.of_texture(textures[at], c, at), painted)
@@ -126,7 +127,7 @@ def stages(bench: Bench) -> tuple[dict[str, dict], dict]:
 def satellite_view(bench: Bench) -> Callable:
     """The image from above as it is, without air; its exposure is the best there is, and it borrows the truth's sky."""
     judge = bench.judge
-    return lambda camera, at: judge.in_sight(bench.satellite.values, judge.truth(camera, at).radiance, camera)
+    return lambda camera, at: judge.in_sight(bench.from_above.values, judge.truth(camera, at).radiance, camera)
 
 
 def ablations(bench: Bench, whole: dict) -> tuple[dict[str, dict], dict[str, dict]]:
@@ -150,7 +151,9 @@ def ablations(bench: Bench, whole: dict) -> tuple[dict[str, dict], dict[str, dic
     rows = Rows()
     rows["full"] = texture_scores(whole["textures"])
     summer = judge.of_albedo(bench.satellite.values)
-    rows["no painting (summer's image, relit)"] = judge.scores(summer, painted, most=most)
+    rows["no painting (July's image, delit, relit)"] = judge.scores(summer, painted, most=most)
+    bare_image = judge.of_albedo(bench.from_above.values)
+    rows["no painting (July's image as it is, relit)"] = judge.scores(bare_image, painted, most=most)
     with mock.patch(
         "seasonscapes.texturing.paint.by_ray", lambda terrain, camera, surface, sight: np.ones(len(surface.texel), bool)
     ):
@@ -165,7 +168,7 @@ def ablations(bench: Bench, whole: dict) -> tuple[dict[str, dict], dict[str, dic
     rows["no guidance (membrane)"] = texture_scores(refilled("membrane"))
     rows["no guidance (Telea, as the paper)"] = texture_scores(refilled("telea"))
     rows["no satellite among the guides"] = texture_scores({
-        at: bench.completed(whole["paintings"][at].texture, at, guides=bench.guides_at(at, satellite=False, relit=told[at]))
+        at: bench.completed(whole["paintings"][at].texture, at, guides=bench.guides_at(at, relit=told[at]))
         for at in painted})  # fmt: skip
     rows["no inpainting (one mean colour)"] = texture_scores(
         {at: one_colour(whole["paintings"][at].texture) for at in painted}
@@ -187,7 +190,10 @@ def ablations(bench: Bench, whole: dict) -> tuple[dict[str, dict], dict[str, dic
     late["no albedo (nearest painted hour)"] = judge.scores(nearest, held, most=most)
     untold = bench.completed_albedo(bench.solved(response=False))
     late["no tone curve searched"] = judge.scores(judge.of_albedo(untold), held, most=most)
-    late["no painting (summer's image, relit)"] = judge.scores(summer, held, most=most)
+    shaded = bench.completed_albedo(whole["fit"], bench.from_above)
+    late["the satellite's light left in"] = judge.scores(judge.of_albedo(shaded), held, most=most)
+    late["no painting (July's image, delit, relit)"] = judge.scores(summer, held, most=most)
+    late["no painting (July's image as it is, relit)"] = judge.scores(bare_image, held, most=most)
     late["no aerial perspective"] = judge.scores(judge.of_albedo(whole["albedo"], air=False), held, most=most)
     late["satellite only, best exposure"] = judge.scores(satellite_view(bench), held, most=most)
     bench.clock.tell("the other ablations")
@@ -280,7 +286,7 @@ def save_day(bench: Bench, whole: dict, folder: Path) -> None:
     sheets = []
     for light in lights:
         shown = {name: np.maximum(relight_view(view, light).radiance, 0.0) for name, view in views.items()}
-        shown["satellite only"] = judge.in_sight(bench.satellite.values, shown["truth"])
+        shown["satellite only"] = judge.in_sight(bench.from_above.values, shown["truth"])
         ev100 = exposure_ev100(shown["truth"])
         sheets.append(side_by_side({name: srgb_from_linear(develop(value, ev100)) for name, value in shown.items()}))
     write_film(folder / "alpinebench_day.mp4", (linear_from_srgb(sheet) for sheet in sheets), fps=8.0)

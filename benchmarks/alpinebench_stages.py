@@ -9,6 +9,7 @@ from dataclasses import replace
 from datetime import datetime, timedelta
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -28,6 +29,7 @@ from alpinebench_scene import (
 
 from seasonscapes.albedo.closed_form import AlbedoFit, solve_albedo
 from seasonscapes.albedo.forward import Land, ambient_on_texels, sun_on_texels, trace_land
+from seasonscapes.albedo.orthophoto import texture_albedo
 from seasonscapes.albedo.response import fit_response, with_response
 from seasonscapes.albedo.shots import EIGHT_BIT, LINEAR, make_shots
 from seasonscapes.evaluation.masks import land_mask
@@ -158,28 +160,44 @@ class Bench:
         self.clock.tell("judged views")
         self.land: Land = trace_land(self.world.terrain, self.world.albedo.shape[:2], effort=_TEXEL, seed=seed)
         self.clock.tell("daylight coefficients of texels")
-        self.satellite = Texture(self._from_above(), np.ones(self.world.albedo.shape[:2], np.float32))
-        self.guides = {at: self.guides_at(at) for at in self.world.painted_hours}
+        self.from_above, self.satellite = self._from_above()
+        self.guides = {at: self.guides_at(at, self.satellite) for at in self.world.painted_hours}
         self.clock.tell("satellite and guides")
 
-    def _from_above(self) -> np.ndarray:
-        """Reflectance ``(R, S, 3)`` as a satellite's image holds it: the land's radiance over that of even white ground."""
+    def _from_above(self) -> tuple[Texture, Texture]:
+        """A satellite's image ``(R, S, 3)``, and the same with the light of its hour taken out.
+
+        It holds the land's radiance over that of even white ground: shaded, misplaced by three quarters of a texel, noisy.
+        """
+        shape, seed = self.world.albedo.shape[:2], self.world.seed
         (light,) = lights_for(
             hours(SATELLITE_DATE, 10.5), self.world.painting[:1], self.world.sky, default_workspace()
         )[0]
-        radiance = self.true_texture(light, self.world.summer)
-        return (np.pi * radiance / np.asarray(global_horizontal_illuminance(light), np.float32)).astype(np.float32)
+        # Other rays than those that take the light out again.
+        land = trace_land(self.world.terrain, shape, effort=_TEXEL, seed=seed + 500)
+        even = np.asarray(global_horizontal_illuminance(light), np.float32)
+        image = np.pi * self.true_texture(light, self.world.summer, land) / even
+        noise = np.exp(0.03 * np.random.default_rng([seed, 500]).standard_normal(image.shape))
+        image = cv2.warpAffine(
+            image, np.float32([[1, 0, 0.6], [0, 1, -0.4]]), shape[::-1], borderMode=cv2.BORDER_REPLICATE
+        )
+        image = (image * noise).astype(np.float32)
+        albedo, _ = texture_albedo(self.land, [image * even / np.float32(np.pi)], [light])
+        whole = np.ones(shape, np.float32)
+        return Texture(image, whole), Texture(np.where(np.isfinite(albedo), albedo, image), whole)
 
-    def guides_at(self, at: datetime, *, satellite: bool = True, relit: np.ndarray | None = None) -> Guides:
+    def guides_at(self, at: datetime, satellite: Texture | None = None, *, relit: np.ndarray | None = None) -> Guides:
+        """Relief, sun, the satellite's image and a relit albedo."""
         day = [at.replace(hour=0, minute=0) + timedelta(hours=h) for h in range(24)]
         suns = np.asarray(sun_position(day, LATITUDE_DEG, LONGITUDE_DEG).direction, float)
         extra = {} if relit is None else {f"relit_{n}": relit[..., n] for n in range(3)}
-        return guides_for(self.world.terrain, self.world.atlas, satellite=self.satellite if satellite else None, extra=extra,
+        return guides_for(self.world.terrain, self.world.atlas, satellite=satellite, extra=extra,
                           sun_direction=sun_position(at, LATITUDE_DEG, LONGITUDE_DEG).direction, day_suns=suns)  # fmt: skip
 
-    def true_texture(self, light: Illumination, albedo: np.ndarray) -> np.ndarray:
+    def true_texture(self, light: Illumination, albedo: np.ndarray, land: Land | None = None) -> np.ndarray:
         """Radiance ``(R, S, 3)`` [cd/m²] that an albedo sends under a light."""
-        received = sun_on_texels(self.land, light) + ambient_on_texels(self.land, light, albedo)
+        land = land or self.land
+        received = sun_on_texels(land, light) + ambient_on_texels(land, light, albedo)
         return (albedo * received.reshape(albedo.shape) / np.pi).astype(np.float32)
 
     def painted(self, at: datetime, options: PaintOptions | None = None, *, relit: np.ndarray | None = None, clean: bool = False,
@@ -214,11 +232,12 @@ class Bench:
             shots = with_response(shots, fit_response(self.land, shots, seed=self.world.seed).strength)
         return solve_albedo(self.land, shots, trust=LINEAR if clean else EIGHT_BIT)
 
-    def completed_albedo(self, fit: AlbedoFit) -> np.ndarray:
-        """Seen texels' albedo, and what the land tells about the others."""
+    def completed_albedo(self, fit: AlbedoFit, satellite: Texture | None = None) -> np.ndarray:
+        """Seen texels' albedo, and what the land (and another image of it) tells about the others."""
         at = self.world.painted_hours[0]
         texture = Texture(fit.albedo, (fit.seen >= 0.5).astype(np.float32))
-        return np.clip(self.completed(texture, at), 0.004, 0.98)
+        guides = None if satellite is None else self.guides_at(at, satellite)
+        return np.clip(self.completed(texture, at, guides=guides), 0.004, 0.98)
 
     def seen_texels(self) -> np.ndarray:
         """Texels ``(R, S)`` that painting at true poses reaches, at the first painted hour."""
