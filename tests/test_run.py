@@ -45,7 +45,7 @@ pitch_deg = 7.0
 fov_deg = 60.0
 """
 
-STAGES = ("pictures", "calibrate", "paint", "inpaint", "albedo", "relight", "distil", "splat")
+STAGES = ("pictures", "calibrate", "albedo", "paint", "inpaint", "relight", "distil", "splat")
 
 # The program with less light transport: the same code, a fifth of the time.
 LAUNCHER = """import sys

@@ -21,7 +21,7 @@ from seasonscapes.images import write_png8
 from seasonscapes.ledger import run_stages
 
 NOON = datetime(2024, 9, 1, 10, tzinfo=UTC)
-AFTER = ["paint", "inpaint", "albedo", "relight", "distil", "splat"]
+AFTER = ["albedo", "paint", "inpaint", "relight", "distil", "splat"]
 ALL = ["pictures", "calibrate", *AFTER]
 
 

@@ -42,7 +42,7 @@ def albedo(
     size: str = "384x256",
     fit_haze: bool = False,
     fit_curve: bool = False,
-    refine: int = 0,
+    iterations: int = 0,
     output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("out/albedo.npz"),
     sky: SkyOptions | None = None,
     place: PlaceOptions | None = None,
@@ -72,7 +72,7 @@ def albedo(
         Find the visibility that explains the pictures best (takes minutes the first time).
     fit_curve
         Find the webcams' tone curve.
-    refine
+    iterations
         Iterations of differentiable rendering after the closed form.
     output
         A .npz with albedo, standard deviation, times sunlit and source of each texel; pictures go beside it.
@@ -83,13 +83,13 @@ def albedo(
     start = clock.perf_counter()
     check_suffix(output, (".npz",))
     check_range("--within-min", within_min, 0.0, 1e6)
-    check_range("--refine", refine, 0, 100_000)
+    check_range("--iterations", iterations, 0, 100_000)
     if place.texel_m is None:
         place = replace(place, texel_m=_TEXEL_M)
     from seasonscapes.rendering.backend import use_backend
 
     model, size_px = sky.model(), parse_size(size)
-    use_backend(gradients=refine > 0)
+    use_backend(gradients=iterations > 0)
     land = place.load(scene)
     moments = _moments(times, land)
     if synthetic_webcams:
@@ -97,7 +97,7 @@ def albedo(
     else:
         observations = _opened(land, moments, (manifest, calibrations, masks), within_min)
     traced, shots, facts = _prepared(land, observations, model, fit_haze=fit_haze, fit_curve=fit_curve)
-    fit, known = _solved(land, traced, shots, refine)
+    fit, known = _solved(land, traced, shots, iterations)
     _save(output, land, known, fit)
     figures = _figures(output, known)
     record: dict[str, Any] = {
@@ -224,7 +224,7 @@ def _prepared(land: Place, observations: list[Observation], model: SkyModel, *, 
     return traced, shots, facts
 
 
-def _solved(land: Place, traced: Land, shots: list[Shot], refine: int) -> tuple[AlbedoFit, KnownAlbedo]:
+def _solved(land: Place, traced: Land, shots: list[Shot], iterations: int) -> tuple[AlbedoFit, KnownAlbedo]:
     from seasonscapes.albedo.closed_form import solve_albedo
     from seasonscapes.albedo.inverse import InverseOptions, refine_albedo
     from seasonscapes.albedo.shots import EIGHT_BIT
@@ -233,11 +233,11 @@ def _solved(land: Place, traced: Land, shots: list[Shot], refine: int) -> tuple[
     try:
         with progress_bar("albedo") as progress:
             fit = solve_albedo(traced, shots, trust=EIGHT_BIT, progress=progress)
-        if refine:
-            options = InverseOptions(iterations=refine, levels=(1,))
+        if iterations:
+            options = InverseOptions(iterations=iterations, levels=(1,))
             with progress_bar("differentiable rendering") as progress:
                 fit = refine_albedo(land.terrain, traced, shots, fit, trust=EIGHT_BIT, options=options,
-                                    callbacks=[lambda state: progress(state.iteration / refine)]).fit  # fmt: skip
+                                    callbacks=[lambda state: progress(state.iteration / iterations)]).fit  # fmt: skip
         return fit, known_albedo(traced, shots, fit)
     except ValueError as error:
         raise InputError("albedo", str(error).split(": ", 1)[-1]) from None

@@ -75,7 +75,7 @@ def run(
 ) -> None:
     """Take a scene from photographs to pictures of other hours and to Gaussians; goes on where it was.
 
-    Stages: pictures, calibrate, paint, inpaint, albedo, relight, distil, splat. Each is made again only where its
+    Stages: pictures, calibrate, albedo, paint, inpaint, relight, distil, splat. Each is made again only where its
     arguments, the content of what it reads or this program have changed; run.json in the folder keeps the account.
 
     Parameters
@@ -87,7 +87,7 @@ def run(
     at_hours
         When to picture the place: ISO 8601, commas between.
     start
-        Make this stage and all after it again.
+        Make this stage (pictures, calibrate, albedo, paint, inpaint, relight, distil or splat) and all after it again.
     until
         Stop after this stage.
     seed
@@ -146,9 +146,9 @@ def stages_of(job: Job, land: Place) -> list[Stage]:
     return [
         stage("pictures", {**common, "pictures": picture_facts(job.pictures, land, moments)}, (), _pictures),
         stage("calibrate", {**common, "records": record_facts(job.pictures, moments)}, ("pictures",), _calibrate, "calibration"),
-        stage("paint", common, ("pictures", "calibrate"), _paint),
-        stage("inpaint", common, ("paint",), _inpaint),
         stage("albedo", common, ("pictures", "calibrate"), _albedo),
+        stage("paint", common, ("pictures", "calibrate", "albedo"), _paint),
+        stage("inpaint", common, ("paint", "albedo"), _inpaint),
         stage("relight", looks, ("albedo",), _relight),
         stage("distil", {**common, "effort": asdict(job.effort)}, ("albedo",), _distil, "gaussians"),
         stage("splat", looks, ("distil",), _splat),
@@ -204,6 +204,19 @@ def _sources(job: Job, folder: Path) -> dict:
     }
 
 
+def _albedo_file(folder: Path) -> Path:
+    return folder / "albedo" / "albedo.npz"
+
+
+def _albedo(job: Job, land: Place, folder: Path) -> list[Path]:
+    from seasonscapes.commands.albedo import albedo
+
+    with _logged(folder / "albedo", "albedo"):
+        albedo(job.scene, times=",".join(job.times), **_sources(job, folder), fit_curve=True, output=_albedo_file(folder),
+               sky=job.sky, place=job.place)  # fmt: skip
+    return [_albedo_file(folder)]
+
+
 def _paint(job: Job, land: Place, folder: Path) -> list[Path]:
     from seasonscapes.commands.paint import PictureOptions, paint
 
@@ -211,14 +224,8 @@ def _paint(job: Job, land: Place, folder: Path) -> list[Path]:
     for time in job.times:
         own = folder / "paint" / _stamp(time)
         with _logged(own, "paint"):
-            paint(
-                job.scene,
-                time=time,
-                pictures=PictureOptions(**_sources(job, folder)),
-                output=own,
-                sky=job.sky,
-                place=job.place,
-            )
+            paint(job.scene, time=time, pictures=PictureOptions(**_sources(job, folder)), albedo=_albedo_file(folder), output=own,
+                  sky=job.sky, place=job.place)  # fmt: skip
         files.append(own / "painted.npz")
     return files
 
@@ -231,23 +238,13 @@ def _inpaint(job: Job, land: Place, folder: Path) -> list[Path]:
         own = folder / "inpaint" / _stamp(time)
         with _logged(own, "inpaint"):
             inpaint(job.scene, time=time, texture=folder / "paint" / _stamp(time) / "painted.npz", output=own / "completed.npz",
-                    figures=own, fast=True, seed=job.seed, sky=job.sky, place=job.place)  # fmt: skip
+                    figures=own, albedo=_albedo_file(folder), fast=True, seed=job.seed, sky=job.sky, place=job.place)  # fmt: skip
         files.append(own / "completed.npz")
     return files
 
 
-def _albedo(job: Job, land: Place, folder: Path) -> list[Path]:
-    from seasonscapes.commands.albedo import albedo
-
-    own = folder / "albedo"
-    with _logged(own, "albedo"):
-        albedo(job.scene, times=",".join(job.times), **_sources(job, folder), output=own / "albedo.npz", sky=job.sky,
-               place=job.place)  # fmt: skip
-    return [own / "albedo.npz"]
-
-
 def _dated(job: Job, folder: Path) -> list[str]:
-    return [f"{_moment(job.times[0]).date().isoformat()}={folder / 'albedo' / 'albedo.npz'}"]
+    return [f"{_moment(job.times[0]).date().isoformat()}={_albedo_file(folder)}"]
 
 
 def _relight(job: Job, land: Place, folder: Path) -> list[Path]:
