@@ -20,7 +20,7 @@ each colour first, as one must for a real webcam.
   and noisy, on the same texels. Its hour is known: the light is taken out before it guides. Satellite only is the image
   as it is on the terrain without air, at the best exposure there is for each picture.
 
-``--figures`` writes truth, ours, satellite only and the difference, and a day as MP4 and GIF.
+``--figures`` writes truth, ours, satellite only and the difference, and a day as MP4 and as an animated WebP.
 """
 
 from __future__ import annotations
@@ -276,7 +276,7 @@ def save_figures(bench: Bench, whole: dict, folder: Path) -> None:
 
 
 def save_day(bench: Bench, whole: dict, folder: Path) -> None:
-    """The judged day every 20 minutes: truth, ours and satellite only, as MP4 and GIF."""
+    """The judged day every 20 minutes: truth, ours and satellite only, as MP4 and animated WebP."""
     from PIL import Image
 
     judge, camera = bench.judge, bench.world.judged[0]
@@ -291,8 +291,8 @@ def save_day(bench: Bench, whole: dict, folder: Path) -> None:
         sheets.append(side_by_side({name: srgb_from_linear(develop(value, ev100)) for name, value in shown.items()}))
     write_film(folder / "alpinebench_day.mp4", (linear_from_srgb(sheet) for sheet in sheets), fps=8.0)
     frames = [Image.fromarray(np.round(255.0 * sheet).astype(np.uint8)) for sheet in sheets]
-    with atomic_path(folder / "alpinebench_day.gif") as temporary:
-        frames[0].save(temporary, "GIF", save_all=True, append_images=frames[1:], duration=125, loop=0)
+    with atomic_path(folder / "alpinebench_day.webp") as temporary:
+        frames[0].save(temporary, "WEBP", save_all=True, append_images=frames[1:], duration=125, loop=0, quality=70)
 
 
 def main() -> None:

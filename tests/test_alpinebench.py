@@ -59,5 +59,5 @@ def test_what_is_left_out_is_missed(measured):
 @pytest.mark.timeout(1200)
 def test_figures(measured):
     _, folder = measured
-    for name in ("alpinebench_painted.png", "alpinebench_held_out.png", "alpinebench_day.gif", "alpinebench_day.mp4"):
+    for name in ("alpinebench_painted.png", "alpinebench_held_out.png", "alpinebench_day.webp", "alpinebench_day.mp4"):
         assert (folder / name).stat().st_size > 10_000
