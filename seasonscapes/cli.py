@@ -6,7 +6,7 @@ import json
 import os
 import sys
 
-from cyclopts import App
+from cyclopts import App, Parameter
 
 from seasonscapes import __version__
 from seasonscapes.errors import InputError
@@ -17,6 +17,8 @@ app = App(
     version=__version__,
     help_flags=["--help", "-h"],
     help_format="plaintext",
+    # Nobody asks for an empty list of albedos.
+    default_parameter=Parameter(negative_iterable=()),
 )
 app.command("seasonscapes.commands.render:render", help="Render a view of a place at a date and hour.")
 app.command("seasonscapes.commands.paint:paint", help="Paint calibrated pictures of one time into the place's texture.")

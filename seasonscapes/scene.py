@@ -51,9 +51,15 @@ class SyntheticElevation(Declaration):
 
     kind: Literal["alpine"] = "alpine"
     seed: int = Field(default=1912, ge=0)
-    size_m: float = Field(default=12000.0, ge=1000.0, le=40000.0)
+    size_m: float = Field(default=12000.0, ge=2000.0, le=12000.0)
     spacing_m: Literal[15.0, 30.0, 60.0] = 15.0
     detail_m: float = Field(default=3.75, ge=0.5, le=500.0)
+
+    @model_validator(mode="after")
+    def _whole_cells(self):
+        if self.size_m % (2.0 * self.spacing_m):
+            raise ValueError(f"size_m: got {self.size_m:g}, expected an even number of cells of {self.spacing_m:g} m")
+        return self
 
 
 class Elevation(Declaration):

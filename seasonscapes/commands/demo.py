@@ -68,10 +68,16 @@ def demo(
         Folder for the pictures.
     camera
         A camera of the scene alpine; the first one when left out.
-    size, spp
+    size
         Of the large panels; the hourly ones are half as wide.
-    device, workspace, json
-        As in `seasonscapes render`.
+    spp
+        Samples per pixel of the large panels.
+    device
+        auto, cuda or llvm.
+    workspace
+        Folder for built artefacts.
+    json
+        Print one machine-readable record.
     """
     from seasonscapes.commands.talk import parse_size
     from seasonscapes.pipeline import find_scene, load_place

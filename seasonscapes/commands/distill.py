@@ -57,8 +57,10 @@ def distill(
         Cameras around the terrain that pictures to learn from are made for; 0 learns on the surface alone.
     view_px
         Their size.
-    steps, picture_steps
-        Steps on the surface, and through pictures.
+    steps
+        Of training on the surface.
+    picture_steps
+        Of training through pictures.
     kind
         full (physics and a network), physical (no network), or sun (a network alone, for comparison).
     export_views
