@@ -89,7 +89,9 @@ def test_hidden_texels_follow_the_albedo(place, capsys):
     texture = str(folder / "albedo" / "painted.npz")
     error = {}
     for name, extra in (("relief", []), ("relit", ["--albedo", str(folder / "albedo.npz")])):
-        record = _run(folder, capsys, "inpaint", "--texture", texture, "--fast", *extra, "-o", str(folder / f"{name}.npz"))
+        record = _run(
+            folder, capsys, "inpaint", "--texture", texture, "--fast", *extra, "-o", str(folder / f"{name}.npz")
+        )
         assert ("relit_1" in record["guides"]) == (name == "relit")
         completed, painted = load_texture(folder / f"{name}.npz"), load_texture(texture)
         hole = (painted.weight == 0.0) & (true > 0.0).all(axis=2)

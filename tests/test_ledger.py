@@ -142,7 +142,10 @@ def test_a_kill_between_any_two_steps_leaves_nothing_old(tmp_path, monkeypatch):
                 assert killed < 6
         half_made(folder, "a", fail=False)
         assert (folder / "own" / "second.txt").read_text() == "a!"
-        assert json.loads((folder / "run.json").read_text())["only"]["files"].keys() == {"own/first.txt", "own/second.txt"}
+        assert json.loads((folder / "run.json").read_text())["only"]["files"].keys() == {
+            "own/first.txt",
+            "own/second.txt",
+        }
 
 
 def test_a_folder_that_no_run_has_made_is_left_alone(tmp_path):

@@ -105,7 +105,9 @@ def test_a_changed_picture_record_or_mask_is_noticed(real):
     assert not (real.folder / "run" / "pictures" / "masks" / "b.png").exists(), "none is left of what is no more"
     (real.folder / "records" / "b_calibration.json").unlink()
     assert real.made() == ["calibrate", *AFTER]
-    assert [path.name for path in (real.folder / "run" / "calibration").glob("*_calibration.json")] == ["a_calibration.json"]
+    assert [path.name for path in (real.folder / "run" / "calibration").glob("*_calibration.json")] == [
+        "a_calibration.json"
+    ]
     assert real.made() == []
 
 

@@ -30,7 +30,7 @@ def changed(old: str, new: str) -> str:
     (places.SCENE + places.SCENE[places.SCENE.index("[[camera]]"):], "two cameras are named 'south'"),
     (changed('file = "dem.tif"', ""), "either 'file' or a table 'synthetic'"),
     (changed('file = "dem.tif"', 'synthetic = {seed = 1}'), "drop the table 'imagery'"),
-    (changed('file = "dem.tif"', "synthetic = {size_m = 5010.0}"), "size_m: got 5010, expected an even number of cells of 15"),
+    (changed('file = "dem.tif"', "synthetic = {size_m = 5015.0}"), "size_m: got 5015, expected an even number of cells of 15"),
     (changed('file = "dem.tif"', 'file = "none.tif"'), r"elevation\.file: no such file"),
     (changed('file = "dem.tif"', 'file = "../dem.tif"'), r"elevation\.file: leads outside.*--allow-outside"),
     (changed('file = "dem.tif"', 'file = "/vsicurl/http://x/dem.tif"'), "leads outside"),
