@@ -234,10 +234,10 @@ class Bench:
 
     def completed_albedo(self, fit: AlbedoFit, satellite: Texture | None = None) -> np.ndarray:
         """Seen texels' albedo, and what the land (and another image of it) tells about the others."""
-        at = self.world.painted_hours[0]
         texture = Texture(fit.albedo, (fit.seen >= 0.5).astype(np.float32))
-        guides = None if satellite is None else self.guides_at(at, satellite)
-        return np.clip(self.completed(texture, at, guides=guides), 0.004, 0.98)
+        # No hour's sun among the guides: albedo knows none.
+        guides = guides_for(self.world.terrain, self.world.atlas, satellite=satellite or self.satellite)
+        return np.clip(self.completed(texture, self.world.painted_hours[0], guides=guides), 0.004, 0.98)
 
     def seen_texels(self) -> np.ndarray:
         """Texels ``(R, S)`` that painting at true poses reaches, at the first painted hour."""
