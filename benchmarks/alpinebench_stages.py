@@ -32,6 +32,7 @@ from seasonscapes.albedo.forward import Land, ambient_on_texels, sun_on_texels, 
 from seasonscapes.albedo.orthophoto import texture_albedo
 from seasonscapes.albedo.response import fit_response, with_response
 from seasonscapes.albedo.shots import EIGHT_BIT, LINEAR, make_shots
+from seasonscapes.commands.expected import RELIT_SIGMA
 from seasonscapes.evaluation.masks import land_mask
 from seasonscapes.evaluation.metrics import score
 from seasonscapes.evaluation.synthetic_webcams import SyntheticPicture
@@ -57,8 +58,6 @@ _SUBPIXELS = 3
 LESSONS = (("2024-01-15", 11.0), ("2024-03-10", 8.5), ("2024-04-20", 15.0), ("2024-05-12", 6.5), ("2024-06-18", 12.0),
            ("2024-07-05", 17.0), ("2024-08-14", 9.5), ("2024-10-08", 13.5))  # fmt: skip
 NEAR_M = 60.0
-# How far off a relit albedo may be [log]; chosen on seeds 5 and 6.
-RELIT_SIGMA = 0.2
 
 
 class Judge:
@@ -161,6 +160,8 @@ class Bench:
         self.land: Land = trace_land(self.world.terrain, self.world.albedo.shape[:2], effort=_TEXEL, seed=seed)
         self.clock.tell("daylight coefficients of texels")
         self.from_above, self.satellite = self._from_above()
+        # No hour's sun among the guides of an albedo: it knows none.
+        self.albedo_guides = guides_for(self.world.terrain, self.world.atlas, satellite=self.satellite)
         self.guides = {at: self.guides_at(at, self.satellite) for at in self.world.painted_hours}
         self.clock.tell("satellite and guides")
 
@@ -190,8 +191,7 @@ class Bench:
         """Relief, sun, the satellite's image and a relit albedo."""
         day = [at.replace(hour=0, minute=0) + timedelta(hours=h) for h in range(24)]
         suns = np.asarray(sun_position(day, LATITUDE_DEG, LONGITUDE_DEG).direction, float)
-        extra = {} if relit is None else {f"relit_{n}": relit[..., n] for n in range(3)}
-        return guides_for(self.world.terrain, self.world.atlas, satellite=satellite, extra=extra,
+        return guides_for(self.world.terrain, self.world.atlas, satellite=satellite, relit=relit,
                           sun_direction=sun_position(at, LATITUDE_DEG, LONGITUDE_DEG).direction, day_suns=suns)  # fmt: skip
 
     def true_texture(self, light: Illumination, albedo: np.ndarray, land: Land | None = None) -> np.ndarray:
@@ -235,8 +235,9 @@ class Bench:
     def completed_albedo(self, fit: AlbedoFit, satellite: Texture | None = None) -> np.ndarray:
         """Seen texels' albedo, and what the land (and another image of it) tells about the others."""
         texture = Texture(fit.albedo, (fit.seen >= 0.5).astype(np.float32))
-        # No hour's sun among the guides: albedo knows none.
-        guides = guides_for(self.world.terrain, self.world.atlas, satellite=satellite or self.satellite)
+        guides = self.albedo_guides
+        if satellite is not None:
+            guides = guides_for(self.world.terrain, self.world.atlas, satellite=satellite)
         return np.clip(self.completed(texture, self.world.painted_hours[0], guides=guides), 0.004, 0.98)
 
     def seen_texels(self) -> np.ndarray:

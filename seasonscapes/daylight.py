@@ -138,6 +138,13 @@ def tabulate_light(place: Place, camera: Camera, model: SkyModel, *,
             progress((index + 1) / len(wanted))
 
 
+def land_light(place: Place, model: SkyModel, time: datetime) -> tuple[Illumination, Moment]:
+    """The light that a place's land receives at an instant, for receivers that no air lies before."""
+    ground_m = median_height_m(place)
+    moment = moment_at(time, place.frame.latitude_deg, place.frame.longitude_deg, ground_m)
+    return light_at(model, moment, ground_m, workspace=place.workspace, with_air=False), moment
+
+
 _medians_m: dict[int, tuple[weakref.ref, float]] = {}
 
 

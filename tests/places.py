@@ -33,6 +33,38 @@ heading_deg = 0.0
 pitch_deg = -8.0
 """
 
+# A synthetic one with two cameras.
+MASSIF = """name = "little"
+attribution = "made by a test"
+vertical_datum = "local"
+
+[origin]
+latitude_deg = 46.55
+longitude_deg = 7.98
+
+[elevation.synthetic]
+spacing_m = 60.0
+detail_m = 60.0
+
+[[camera]]
+name = "aerial"
+latitude_deg = 46.597988
+longitude_deg = 7.91382
+above_ground_m = 2000.0
+heading_deg = 141.3
+pitch_deg = -11.0
+fov_deg = 52.0
+
+[[camera]]
+name = "meadow"
+latitude_deg = 46.591238
+longitude_deg = 7.962256
+above_ground_m = 60.0
+heading_deg = 164.3
+pitch_deg = 7.0
+fov_deg = 60.0
+"""
+
 
 def write_raster(path: Path, values: np.ndarray, *, spacing_m: float, crs: str | None = "EPSG:32632",
                  nodata: float | None = None, origin: tuple[float, float] | None = None) -> Path:  # fmt: skip

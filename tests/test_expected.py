@@ -4,41 +4,11 @@ import json
 
 import numpy as np
 import pytest
+from places import MASSIF
 
 from seasonscapes.cli import main
 from seasonscapes.images import atomic_path
 from seasonscapes.terrain.surface import Texture, load_texture, save_texture
-
-SCENE = """name = "little"
-attribution = "made by a test"
-vertical_datum = "local"
-
-[origin]
-latitude_deg = 46.55
-longitude_deg = 7.98
-
-[elevation.synthetic]
-spacing_m = 60.0
-detail_m = 60.0
-
-[[camera]]
-name = "aerial"
-latitude_deg = 46.597988
-longitude_deg = 7.91382
-above_ground_m = 2000.0
-heading_deg = 141.3
-pitch_deg = -11.0
-fov_deg = 52.0
-
-[[camera]]
-name = "meadow"
-latitude_deg = 46.591238
-longitude_deg = 7.962256
-above_ground_m = 60.0
-heading_deg = 164.3
-pitch_deg = 7.0
-fov_deg = 60.0
-"""
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +23,7 @@ def place(tmp_path_factory):
 
     folder = tmp_path_factory.mktemp("expected")
     scene = folder / "little.toml"
-    scene.write_text(SCENE)
+    scene.write_text(MASSIF)
     land = load_place(scene, Workspace(folder / "work"), options=MeshOptions(texel_m=60.0))
     utc = datetime(2024, 7, 20, 8, 0, tzinfo=UTC)
     true = albedo_for(land, utc)

@@ -10,40 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from places import MASSIF
 
 from seasonscapes.cli import main
 from seasonscapes.workspace import file_hash
-
-SCENE = """name = "little"
-attribution = "made by a test"
-vertical_datum = "local"
-
-[origin]
-latitude_deg = 46.55
-longitude_deg = 7.98
-
-[elevation.synthetic]
-spacing_m = 60.0
-detail_m = 60.0
-
-[[camera]]
-name = "aerial"
-latitude_deg = 46.597988
-longitude_deg = 7.91382
-above_ground_m = 2000.0
-heading_deg = 141.3
-pitch_deg = -11.0
-fov_deg = 52.0
-
-[[camera]]
-name = "meadow"
-latitude_deg = 46.591238
-longitude_deg = 7.962256
-above_ground_m = 60.0
-heading_deg = 164.3
-pitch_deg = 7.0
-fov_deg = 60.0
-"""
 
 STAGES = ("pictures", "calibrate", "albedo", "paint", "inpaint", "relight", "distil", "splat")
 
@@ -64,7 +34,7 @@ class Runs:
 
     def __init__(self, folder: Path):
         self.folder = folder
-        (folder / "little.toml").write_text(SCENE)
+        (folder / "little.toml").write_text(MASSIF)
         (folder / "launch.py").write_text(LAUNCHER)
 
     def arguments(self, name: str) -> list[str]:

@@ -5,7 +5,7 @@ from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
-from places import SCENE, hill_heights, write_place, write_raster
+from places import MASSIF, SCENE, hill_heights, write_place, write_raster
 
 from seasonscapes.calibration.pose_model import values_of
 from seasonscapes.calibration.record import write_calibration
@@ -168,11 +168,9 @@ def test_arguments_of_later_stages_leave_the_earlier_ones_fresh(real):
 
 
 def test_photographs_of_a_synthetic_scene_are_keyed_by_how_they_are_taken(tmp_path):
-    from test_run import SCENE as LITTLE
+    (tmp_path / "little.toml").write_text(MASSIF)
 
-    (tmp_path / "little.toml").write_text(LITTLE)
-
-    def key(text=LITTLE, **pictures) -> dict:
+    def key(text=MASSIF, **pictures) -> dict:
         (tmp_path / "little.toml").write_text(text)
         place = PlaceOptions(workspace=tmp_path / "work", texel_m=240.0, refine=1)
         job = Job(str(tmp_path / "little.toml"), (NOON.isoformat(),), (NOON.isoformat(),), RunPictures(**pictures), RunEffort(),
@@ -182,6 +180,6 @@ def test_photographs_of_a_synthetic_scene_are_keyed_by_how_they_are_taken(tmp_pa
     plain = key()
     assert plain == key()
     others = [key(photo_size="720x120"), key(photo_kind="perspective"), key(leave_out="meadow"),
-              key(LITTLE.replace("60.0\nheading_deg = 164.3", "70.0\nheading_deg = 164.3"))]  # fmt: skip
+              key(MASSIF.replace("60.0\nheading_deg = 164.3", "70.0\nheading_deg = 164.3"))]  # fmt: skip
     assert all(other != plain for other in others)
     assert others[1]["pictures"]["size"] == (720, 480)

@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 import pytest
-from test_run import SCENE
+from places import MASSIF
 
 from seasonscapes.calibration.record import read_calibration
 from seasonscapes.calibration.skyline import encoded_from_file
@@ -28,7 +28,7 @@ TIMES = [datetime(2024, 7, 20, hour, tzinfo=UTC) for hour in (8, 13)]
 def taken(tmp_path_factory):
     """A place, its two webcams as panoramas, and where their pictures lie."""
     folder = tmp_path_factory.mktemp("webcams")
-    (folder / "little.toml").write_text(SCENE)
+    (folder / "little.toml").write_text(MASSIF)
     place = PlaceOptions(workspace=folder / "work", texel_m=240.0, refine=1, max_error_m=20.0).load(
         str(folder / "little.toml")
     )

@@ -208,9 +208,9 @@ def prepare_school(
 
 def draw_lights(land, model, days: list[float], seed: int, progress) -> tuple[list, list[datetime]]:
     """One light for each day, at a random hour with the sun above 2°, or the best of many where there is none."""
-    from seasonscapes.daylight import light_at, moment_at
+    from seasonscapes.daylight import light_at, median_height_m, moment_at
 
-    rng, height_m = np.random.default_rng(seed), float(np.median(land.elevation.values))
+    rng, height_m = np.random.default_rng(seed), median_height_m(land)
     lights, times = [], []
     for number, day in enumerate(days):
         tried = []

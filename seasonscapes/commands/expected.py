@@ -39,7 +39,7 @@ def expected_radiance(land: Place, albedo: Path, utc: datetime, model: SkyModel)
 def _relit(land: Place, texture: Texture, utc: datetime, model: SkyModel) -> Texture:
     import numpy as np
 
-    from seasonscapes.daylight import light_at, median_height_m, moment_at
+    from seasonscapes.daylight import land_light
     from seasonscapes.relighting.lit_texture import lit_texture
     from seasonscapes.rendering.gather import occluder
     from seasonscapes.rendering.scene import mi_mesh
@@ -47,9 +47,7 @@ def _relit(land: Place, texture: Texture, utc: datetime, model: SkyModel) -> Tex
     from seasonscapes.terrain.surface import Texture
     from seasonscapes.terrain.texels import texel_positions
 
-    ground_m = median_height_m(land)
-    moment = moment_at(utc, land.frame.latitude_deg, land.frame.longitude_deg, ground_m)
-    light = light_at(model, moment, ground_m, workspace=land.workspace, with_air=False)
+    light, _ = land_light(land, model, utc)
     positions, _ = texel_positions(land.terrain, land.atlas.width_px, land.atlas.height_px)
     with progress_bar("relighting the albedo") as progress:
         lit = lit_texture(occluder(mi_mesh(land.terrain, texture.values)), positions, texture.values, light,

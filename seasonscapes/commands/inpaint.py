@@ -173,9 +173,8 @@ def guides_of(land: Place, moment: datetime, relit: Texture | None = None) -> Gu
     at = (land.frame.latitude_deg, land.frame.longitude_deg)
     hours = [moment + timedelta(hours=h) for h in range(-12, 12)]
     day = np.asarray(sun_position(hours, *at).direction, float)
-    extra = {} if relit is None else {f"relit_{n + 1}": relit.values[..., n] for n in range(3)}
-    return guides_for(land.terrain, land.atlas, satellite=satellite, sun_direction=sun_position(moment, *at).direction,
-                      day_suns=day, extra=extra)  # fmt: skip
+    return guides_for(land.terrain, land.atlas, satellite=satellite, relit=None if relit is None else relit.values,
+                      sun_direction=sun_position(moment, *at).direction, day_suns=day)  # fmt: skip
 
 
 def save_completed(completed: Completed, painted: Texture, path: Path) -> None:

@@ -218,13 +218,12 @@ def _check_rays(rays: int) -> None:
 def _light(land: Place, model: SkyModel, time: str) -> tuple[datetime, Any, Illumination]:
     """An instant, where sun and moon stand then, and their light on the land."""
     from seasonscapes.civil_time import resolve_time
-    from seasonscapes.daylight import light_at, median_height_m, moment_at
+    from seasonscapes.daylight import land_light
 
     resolved = resolve_time(time, land.frame.latitude_deg, land.frame.longitude_deg)
     say(resolved.reading)
-    ground_m = median_height_m(land)
-    moment = moment_at(resolved.utc, land.frame.latitude_deg, land.frame.longitude_deg, ground_m)
-    return resolved.utc, moment, light_at(model, moment, ground_m, workspace=land.workspace, with_air=False)
+    light, moment = land_light(land, model, resolved.utc)
+    return resolved.utc, moment, light
 
 
 def _record(scene: str, land: Place, when: datetime, moment: Any, light: Illumination) -> dict[str, Any]:

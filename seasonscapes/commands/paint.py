@@ -15,6 +15,8 @@ from seasonscapes.commands.talk import check_range, finish, parse_size, progress
 from seasonscapes.errors import InputError
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from seasonscapes.commands.webcam_shots import Sources
     from seasonscapes.pipeline import Place
     from seasonscapes.sky.models import SkyModel
@@ -81,7 +83,7 @@ def paint(
     json
         Print one machine-readable record.
     """
-    from seasonscapes.commands.expected import RELIT_SIGMA, expected_radiance
+    from seasonscapes.commands.expected import RELIT_SIGMA
     from seasonscapes.texturing.paint import MODES, PaintOptions
     from seasonscapes.texturing.painting_file import save_painting, write_figures
 
@@ -98,14 +100,13 @@ def paint(
     land = place.load(scene)
     moment = resolve_time(time, land.frame.latitude_deg, land.frame.longitude_deg)
     say(moment.reading)
-    if albedo is not None:
-        # A wrong file is refused before any picture is taken.
-        expected_radiance(land, albedo, moment.utc, model)
+    # First of all: a wrong file is refused before any picture is taken.
+    predicted = None if albedo is None else _predicted(land, albedo, moment.utc, model)
     sources = _sources(land, pictures, moment.utc, model, size_px)
     options = PaintOptions(mode=mode, fit_gains=harmonise, fit_haze=harmonise, near_m=near_m,
                            predicted_sigma=1.0 if albedo is None else RELIT_SIGMA)  # fmt: skip
     painting, without = painting_for(
-        land, sources, moment.utc, model, options, within_min=pictures.within_min, albedo=albedo
+        land, sources, moment.utc, model, options, within_min=pictures.within_min, predicted=predicted
     )
     for line in (*painting.skipped, *(f"{name}: no calibration" for name in without)):
         say(f"left out: {line}")
@@ -178,18 +179,18 @@ def chosen_cameras(land: Place, leave_out: str | None, size_px: tuple[int, int])
 
 
 def painting_for(land: Place, sources: Sources, utc: datetime, model: SkyModel, options: PaintOptions, *,
-                 within_min: float = 30.0, albedo: Path | None = None) -> tuple[Painting, list[str]]:  # fmt: skip
+                 within_min: float = 30.0, predicted: np.ndarray | None = None) -> tuple[Painting, list[str]]:  # fmt: skip
     """The painting of a time, from the workspace where equal files were painted before; and webcams without calibration.
 
     An interrupted painting goes on from its finished tiles.
     """
+    import hashlib
     import shutil
 
     from seasonscapes.commands.webcam_shots import rows_at
     from seasonscapes.texturing.painting_file import load_painting, save_painting
-    from seasonscapes.workspace import build_once, content_key, file_hash
+    from seasonscapes.workspace import build_once, content_key
 
-    predicted = None if albedo is None else _predicted(land, albedo, utc, model)
     rows = rows_at(sources, utc, within_min=within_min)
     inputs = {
         "revision": _REVISION,
@@ -198,8 +199,8 @@ def painting_for(land: Place, sources: Sources, utc: datetime, model: SkyModel, 
         "options": options,
         "files": _hashes(sources, rows),
     }
-    if albedo is not None:
-        inputs["albedo"] = [file_hash(albedo), utc.isoformat()]
+    if predicted is not None:
+        inputs["predicted"] = hashlib.sha256(predicted.tobytes()).hexdigest()
     tiles = land.workspace.folder / land.scene.name / f"tiles-{content_key(inputs)}"
     painting = build_once(land.workspace, f"{land.scene.name}/painting", inputs, suffix=".npz", save=save_painting,
                           load=load_painting,
@@ -223,7 +224,7 @@ def _hashes(sources: Sources, rows) -> list:
     return found
 
 
-def _predicted(land: Place, albedo: Path, utc: datetime, model: SkyModel):
+def _predicted(land: Place, albedo: Path, utc: datetime, model: SkyModel) -> np.ndarray:
     """Radiance of the texels whose albedo was measured, NaN elsewhere."""
     import numpy as np
 
@@ -234,7 +235,7 @@ def _predicted(land: Place, albedo: Path, utc: datetime, model: SkyModel):
 
 
 def _painted(land: Place, sources: Sources, rows, model: SkyModel, options: PaintOptions, tiles: Path,
-             predicted) -> Painting:  # fmt: skip
+             predicted: np.ndarray | None) -> Painting:  # fmt: skip
     import numpy as np
 
     from seasonscapes.commands.webcam_shots import shots_of

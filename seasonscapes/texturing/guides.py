@@ -69,14 +69,16 @@ def stack_guides(layers: Mapping[str, np.ndarray], satellite: Texture | None = N
     return Guides(np.stack(columns, -1), tuple(names), surface, plan)
 
 
-def guides_for(terrain: Terrain, atlas: Atlas, *, satellite: Texture | None = None, sun_direction=None, day_suns=None,
-               extra: Mapping[str, np.ndarray] | None = None) -> Guides:  # fmt: skip
+def guides_for(terrain: Terrain, atlas: Atlas, *, satellite: Texture | None = None, relit: np.ndarray | None = None,
+               sun_direction=None, day_suns=None, extra: Mapping[str, np.ndarray] | None = None) -> Guides:  # fmt: skip
     """Guides for every texel of a terrain's atlas.
 
     Parameters
     ----------
     satellite
         An image baked into the atlas (`terrain.imagery.bake_imagery`), ``weight`` 0 where it does not reach.
+    relit
+        ``(R, S, 3)`` radiance of an albedo in the light of the hour.
     sun_direction, day_suns
         See `land_layers`.
     extra
@@ -88,8 +90,11 @@ def guides_for(terrain: Terrain, atlas: Atlas, *, satellite: Texture | None = No
         A satellite image or an extra layer of another size than the atlas.
     """
     shape = (atlas.height_px, atlas.width_px)
+    extra = dict(extra or {})
+    if relit is not None:
+        extra |= {f"relit_{n + 1}": relit[..., n] for n in range(3)}
     for name, size in [("satellite", satellite.values.shape[:2] if satellite is not None else shape),
-                       *((name, layer.shape) for name, layer in (extra or {}).items())]:  # fmt: skip
+                       *((name, layer.shape) for name, layer in extra.items())]:  # fmt: skip
         if size != shape:
             raise ValueError(f"guides_for: {name} is {size}, the atlas {shape}")
     positions, face_id = texel_positions(terrain, atlas.width_px, atlas.height_px)
@@ -104,5 +109,5 @@ def guides_for(terrain: Terrain, atlas: Atlas, *, satellite: Texture | None = No
         # At the rim of the land only cells with a height have a say.
         sums = from_plan(plan, np.nan_to_num(layer)[..., None])[..., 0]
         layers[name] = np.where(share > 0.0, sums / np.maximum(share, 1e-6), np.nan).astype(np.float32)
-    layers |= extra or {}
+    layers |= extra
     return stack_guides(layers, satellite, plan=plan if atlas.charts > 1 else None, surface=face_id >= 0)

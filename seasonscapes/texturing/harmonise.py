@@ -122,7 +122,8 @@ def equal_gains(shots: Sequence[ReadyShot], *, radiance: float | None = None) ->
 
 
 def harmonise(shots: Sequence[ReadyShot], terrain: Occluder, *, predicted: np.ndarray | None = None,
-              predicted_sigma: float = 1.0, fit_haze: bool = True, fit_contrast: bool = True, radiance: float | None = None) -> Harmony:  # fmt: skip
+              predicted_sigma: float = 1.0, fit_haze: bool = True, fit_contrast: bool = True,
+              radiance: float | None = None) -> Harmony:  # fmt: skip
     """Fit gains, contrasts and haze over all places that two cameras see.
 
     Parameters
