@@ -10,8 +10,8 @@ with its real colours under a made-up snow cover. Views that no webcam saw, and 
 judged: pictures developed with the truth's exposure, land beyond 60 m, mode ``valid``. ``matched`` fits one factor for
 each colour first, as one must for a real webcam.
 
-* Panoramas are calibrated, cut into views, and give the albedo; that albedo, relit, ties the pictures of each hour
-  together and guides the completion of what they paint.
+* Panoramas are calibrated, cut into views, and give the albedo, which corrects the satellite's image where no webcam
+  looked; relit, it ties the pictures of each hour together, and what they paint corrects it.
 * Painted hours: the painted and completed texture, seen from the judged webcams through the air.
 * Held-out hours: the albedo recovered from the painted hours' pictures, relit.
 * Distilled: Gaussians that learned from that albedo under suns of other days, seen at the held-out hours.
@@ -94,18 +94,17 @@ def stages(bench: Bench) -> tuple[dict[str, dict], dict]:
     bench.clock.tell("paint, harmonise")
     rows["relight (true albedo)"] = judge.scores(judge.of_albedo(world.albedo), held)
     fit = bench.solved(clean=True, true_pose=True)
-    rows["albedo alone, clean + relight"] = judge.scores(judge.of_albedo(bench.completed_albedo(fit)), held)
+    rows["albedo alone, clean + relight"] = judge.scores(judge.of_albedo(bench.completed_albedo(fit)[0]), held)
     bench.clock.tell("albedo alone")
     albedo_fit = bench.solved()
-    albedo = bench.completed_albedo(albedo_fit)
+    albedo, sigma = bench.completed_albedo(albedo_fit)
     relit = judge.of_albedo(albedo)
     rows["all, held-out hours"] = judge.scores(relit, held)
     rows["all, relit painted hours"] = judge.scores(relit, painted)
     bench.clock.tell("albedo, relit")
     told = {at: bench.true_texture(world.lights[at][0], albedo) for at in painted}
-    guides = {at: bench.guides_at(at, bench.satellite, relit=told[at]) for at in painted}
     paintings = {at: bench.painted(at, relit=told[at]) for at in painted}
-    textures = {at: bench.completed(paintings[at].texture, at, guides=guides[at]) for at in painted}
+    textures = {at: bench.fused(paintings[at].texture, at, told[at], sigma / albedo[..., 1]) for at in painted}
     rows["all, painted hours"] = judge.scores(lambda c, at: judge.of_texture(textures[at], c, at), painted)
     bench.clock.tell("calibrated, painted, completed")
     splats = Splats(bench)
@@ -115,7 +114,6 @@ def stages(bench: Bench) -> tuple[dict[str, dict], dict]:
     return rows, {
         "paintings": paintings,
         "told": told,
-        "guides": guides,
         "textures": textures,
         "albedo": albedo,
         "fit": albedo_fit,
@@ -130,51 +128,69 @@ def satellite_view(bench: Bench) -> Callable:
     return lambda camera, at: judge.in_sight(bench.from_above.values, judge.truth(camera, at).radiance, camera)
 
 
-def ablations(bench: Bench, whole: dict) -> tuple[dict[str, dict], dict[str, dict]]:
-    """One factor at a time: at painted hours, and at held-out hours."""
-    judge, held = bench.judge, bench.world.held_hours
+def painting_ablations(bench: Bench, whole: dict) -> dict[str, dict]:
+    """The painting and its completion from what the land tells, as the paper's is, one factor at a time."""
+    judge, told, most = bench.judge, whole["told"], bench.world.size.ablated
     # Two hours tell: a shaded one and a sunny one.
     painted = ablated_hours(bench)
-
-    told, guides, most = whole["told"], whole["guides"], bench.world.size.ablated
 
     def texture_scores(textures: dict, *, air: bool = True) -> dict:
         return judge.scores(lambda c, at: judge.of_texture(textures[at], c, at, air=air), painted, most=most)
 
     def repainted(options: PaintOptions | None = None, **how) -> dict:
-        return {at: bench.completed(bench.painted(at, options, relit=told[at], **how).texture, at, guides=guides[at])
-                for at in painted}  # fmt: skip
+        return {at: bench.completed(bench.painted(at, options, relit=told[at], **how).texture, at) for at in painted}
 
     def refilled(method: str) -> dict:
         return {at: bench.completed(whole["paintings"][at].texture, at, method=method) for at in painted}
 
     rows = Rows()
-    rows["full"] = texture_scores(whole["textures"])
-    summer = judge.of_albedo(bench.satellite.values)
-    rows["no painting (July's image, delit, relit)"] = judge.scores(summer, painted, most=most)
-    bare_image = judge.of_albedo(bench.from_above.values)
-    rows["no painting (July's image as it is, relit)"] = judge.scores(bare_image, painted, most=most)
-    with mock.patch(
-        "seasonscapes.texturing.paint.by_ray", lambda terrain, camera, surface, sight: np.ones(len(surface.texel), bool)
-    ):
+    rows["full"] = texture_scores(refilled("guided"))
+    everywhere = mock.patch("seasonscapes.texturing.paint.by_ray",
+                            lambda terrain, camera, surface, sight: np.ones(len(surface.texel), bool))  # fmt: skip
+    with everywhere:
         rows["no occlusion test"] = texture_scores(repainted())
     bench.clock.tell("no occlusion test")
     rows["no gain compensation"] = texture_scores(repainted(PaintOptions(fit_gains=False)))
     rows["first camera wins (as the paper)"] = texture_scores(repainted(PaintOptions(mode="first")))
     rows["no silhouette guard"] = texture_scores(repainted(PaintOptions(guard=False)))
     alone = {at: bench.completed(bench.painted(at).texture, at) for at in painted}
-    rows["no albedo to tie pictures and to guide"] = texture_scores(alone)
+    rows["no albedo to tie pictures"] = texture_scores(alone)
     bench.clock.tell("painting's ablations")
     rows["no guidance (membrane)"] = texture_scores(refilled("membrane"))
     rows["no guidance (Telea, as the paper)"] = texture_scores(refilled("telea"))
-    rows["no satellite among the guides"] = texture_scores({
-        at: bench.completed(whole["paintings"][at].texture, at, guides=bench.guides_at(at, relit=told[at]))
-        for at in painted})  # fmt: skip
     rows["no inpainting (one mean colour)"] = texture_scores(
         {at: one_colour(whole["paintings"][at].texture) for at in painted}
     )
     bench.clock.tell("completion's ablations")
     rows["no aerial perspective"] = texture_scores(repainted(air=False), air=False)
+    rows["satellite only, best exposure"] = judge.scores(satellite_view(bench), painted, most=most)
+    return rows
+
+
+def ablations(bench: Bench, whole: dict) -> tuple[dict[str, dict], dict[str, dict]]:
+    """The whole, one factor at a time: at painted hours, and at held-out hours."""
+    judge, held, told, most = bench.judge, bench.world.held_hours, whole["told"], bench.world.size.ablated
+    painted = ablated_hours(bench)
+    paintings = {at: whole["paintings"][at].texture for at in painted}
+
+    def texture_scores(textures: dict) -> dict:
+        return judge.scores(lambda c, at: judge.of_texture(textures[at], c, at), painted, most=most)
+
+    rows = Rows()
+    rows["full"] = texture_scores(whole["textures"])
+    rows["no painting (the relit albedo alone)"] = texture_scores(told)
+    rows["painted texels as they are, the relit albedo beyond"] = texture_scores(
+        {
+            at: np.where(painting.weight[..., None] > 0.0, painting.values, told[at])
+            for at, painting in paintings.items()
+        }
+    )
+    rows["no albedo (painting, guided completion)"] = texture_scores(
+        {at: bench.completed(bench.painted(at).texture, at) for at in painted}
+    )
+    summer, bare_image = judge.of_albedo(bench.satellite.values), judge.of_albedo(bench.from_above.values)
+    rows["no webcams (July's image, delit, relit)"] = judge.scores(summer, painted, most=most)
+    rows["no webcams (July's image as it is, relit)"] = judge.scores(bare_image, painted, most=most)
     rows["satellite only, best exposure"] = judge.scores(satellite_view(bench), painted, most=most)
     late = Rows()
     late["full"] = judge.scores(whole["relit"], held, most=most)
@@ -187,16 +203,18 @@ def ablations(bench: Bench, whole: dict) -> tuple[dict[str, dict], dict[str, dic
         )
         return judge.of_texture(whole["textures"][source] * np.float32(level), camera, at)
 
-    late["no albedo (nearest painted hour)"] = judge.scores(nearest, held, most=most)
-    untold = bench.completed_albedo(bench.solved(response=False))
+    late["no relighting (nearest painted hour)"] = judge.scores(nearest, held, most=most)
+    untold = bench.completed_albedo(bench.solved(response=False))[0]
     late["no tone curve searched"] = judge.scores(judge.of_albedo(untold), held, most=most)
-    shaded = bench.completed_albedo(whole["fit"], bench.from_above)
+    guided = bench.guided_albedo(whole["fit"])
+    late["satellite a guide, no base to correct"] = judge.scores(judge.of_albedo(guided), held, most=most)
+    shaded = bench.completed_albedo(whole["fit"], bench.from_above)[0]
     late["the satellite's light left in"] = judge.scores(judge.of_albedo(shaded), held, most=most)
-    late["no painting (July's image, delit, relit)"] = judge.scores(summer, held, most=most)
-    late["no painting (July's image as it is, relit)"] = judge.scores(bare_image, held, most=most)
+    late["no webcams (July's image, delit, relit)"] = judge.scores(summer, held, most=most)
+    late["no webcams (July's image as it is, relit)"] = judge.scores(bare_image, held, most=most)
     late["no aerial perspective"] = judge.scores(judge.of_albedo(whole["albedo"], air=False), held, most=most)
     late["satellite only, best exposure"] = judge.scores(satellite_view(bench), held, most=most)
-    bench.clock.tell("the other ablations")
+    bench.clock.tell("the whole's ablations")
     return rows, late
 
 
@@ -234,10 +252,10 @@ def key_of(name: str) -> str:
     return "_".join("".join(c if c.isalnum() else " " for c in name.lower()).split())
 
 
-def numbers_of(bench: Bench, rows: dict, painted_rows: dict, held_rows: dict, whole: dict) -> dict[str, float]:
-    """All of it, flat."""
+def numbers_of(bench: Bench, rows: dict, ablated: dict[str, dict], whole: dict) -> dict[str, float]:
+    """All of it, flat; ``ablated`` has a table for each of its names."""
     numbers: dict[str, float] = {"seed": bench.world.seed}
-    for prefix, table in (("stage", rows), ("ablation_painted", painted_rows), ("ablation_held_out", held_rows)):
+    for prefix, table in {"stage": rows, **ablated}.items():
         for name, row in table.items():
             numbers |= {f"{prefix}_{key_of(name)}_{key}": value for key, value in row.items()}
     full, held = rows["all, painted hours"], rows["all, held-out hours"]
@@ -316,11 +334,14 @@ def main() -> None:
     rows, whole = stages(bench)
     print_stages(rows)
     painted_rows, held_rows = ablations(bench, whole)
+    painting_rows = painting_ablations(bench, whole)
     most = min(bench.world.size.ablated, len(bench.world.judged))
-    print(f"\ntwo painted hours, {most} views that no webcam saw")
+    print(f"\nthe whole, two painted hours, {most} views that no webcam saw")
     print_ablations(painted_rows)
-    print("\nheld-out hours, the same views")
+    print("\nthe whole, held-out hours, the same views")
     print_ablations(held_rows)
+    print("\npainting and its completion alone, as the paper's, two painted hours, the same views")
+    print_ablations(painting_rows)
     at = bench.world.painted_hours[0]
     true, ours = (bench.judge.developed(value, 0, at) for value in
                   (bench.judge.truth(0, at).radiance, bench.judge.of_texture(whole["textures"][at], 0, at)))  # fmt: skip
@@ -329,9 +350,8 @@ def main() -> None:
     if arguments.figures is not None:
         save_figures(bench, whole, arguments.figures)
         save_day(bench, whole, arguments.figures)
-    numbers = numbers_of(bench, rows, painted_rows, held_rows, whole) | {
-        "seconds": time.perf_counter() - bench.clock.start
-    }
+    ablated = {"ablation_painted": painted_rows, "ablation_held_out": held_rows, "ablation_painting": painting_rows}
+    numbers = numbers_of(bench, rows, ablated, whole) | {"seconds": time.perf_counter() - bench.clock.start}
     if arguments.json is not None:
         arguments.json.write_text(json.dumps({key: float(value) for key, value in numbers.items()}, indent=1) + "\n")
 

@@ -32,6 +32,8 @@ from seasonscapes.albedo.forward import Land, ambient_on_texels, sun_on_texels, 
 from seasonscapes.albedo.orthophoto import texture_albedo
 from seasonscapes.albedo.response import fit_response, with_response
 from seasonscapes.albedo.shots import EIGHT_BIT, LINEAR, make_shots
+from seasonscapes.albedo.uncertainty import texel_sigma
+from seasonscapes.commands.corrected_albedo import corrected_albedo
 from seasonscapes.commands.expected import RELIT_SIGMA
 from seasonscapes.evaluation.masks import land_mask
 from seasonscapes.evaluation.metrics import score
@@ -47,6 +49,7 @@ from seasonscapes.sky.ephemeris import sun_position
 from seasonscapes.sky.illumination import Illumination, global_horizontal_illuminance
 from seasonscapes.terrain.surface import Texture, sample_texture
 from seasonscapes.texturing.complete import complete
+from seasonscapes.texturing.fused import fuse
 from seasonscapes.texturing.guides import Guides, guides_for
 from seasonscapes.texturing.paint import Painting, PaintOptions, paint
 from seasonscapes.texturing.shots import Shot
@@ -161,7 +164,7 @@ class Bench:
         self.clock.tell("daylight coefficients of texels")
         self.from_above, self.satellite = self._from_above()
         # No hour's sun among the guides of an albedo: it knows none.
-        self.albedo_guides = guides_for(self.world.terrain, self.world.atlas, satellite=self.satellite)
+        self.albedo_guides = guides_for(self.world.terrain, self.world.atlas)
         self.guides = {at: self.guides_at(at, self.satellite) for at in self.world.painted_hours}
         self.clock.tell("satellite and guides")
 
@@ -187,11 +190,11 @@ class Bench:
         whole = np.ones(shape, np.float32)
         return Texture(image, whole), Texture(np.where(np.isfinite(albedo), albedo, image), whole)
 
-    def guides_at(self, at: datetime, satellite: Texture | None = None, *, relit: np.ndarray | None = None) -> Guides:
-        """Relief, sun, the satellite's image and a relit albedo."""
+    def guides_at(self, at: datetime, satellite: Texture | None = None) -> Guides:
+        """Relief, sun and the satellite's image."""
         day = [at.replace(hour=0, minute=0) + timedelta(hours=h) for h in range(24)]
         suns = np.asarray(sun_position(day, LATITUDE_DEG, LONGITUDE_DEG).direction, float)
-        return guides_for(self.world.terrain, self.world.atlas, satellite=satellite, relit=relit,
+        return guides_for(self.world.terrain, self.world.atlas, satellite=satellite,
                           sun_direction=sun_position(at, LATITUDE_DEG, LONGITUDE_DEG).direction, day_suns=suns)  # fmt: skip
 
     def true_texture(self, light: Illumination, albedo: np.ndarray, land: Land | None = None) -> np.ndarray:
@@ -213,10 +216,12 @@ class Bench:
             options = replace(options or PaintOptions(), predicted_sigma=RELIT_SIGMA)
         return paint(shots, self.world.terrain, self.world.atlas, self.world.bare, options=options, predicted=relit)
 
-    def completed(
-        self, texture: Texture, at: datetime, *, method: str = "guided", guides: Guides | None = None
-    ) -> np.ndarray:
-        return complete(texture, guides or self.guides[at], method=method, fast=True, seed=self.world.seed).values
+    def completed(self, texture: Texture, at: datetime, *, method: str = "guided") -> np.ndarray:
+        return complete(texture, self.guides[at], method=method, fast=True, seed=self.world.seed).values
+
+    def fused(self, texture: Texture, at: datetime, told: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+        """A painting and what an albedo of relative error ``sigma``, relit, says of the hour."""
+        return fuse(texture, told, sigma, self.guides[at]).values
 
     def solved(self, *, clean: bool = False, true_pose: bool = False, response: bool = True) -> AlbedoFit:
         """Albedo from all painted hours' pictures; unless these are clean, their tone curve is searched for."""
@@ -232,13 +237,17 @@ class Bench:
             shots = with_response(shots, fit_response(self.land, shots, seed=self.world.seed).strength)
         return solve_albedo(self.land, shots, trust=LINEAR if clean else EIGHT_BIT)
 
-    def completed_albedo(self, fit: AlbedoFit, satellite: Texture | None = None) -> np.ndarray:
-        """Seen texels' albedo, and what the land (and another image of it) tells about the others."""
+    def completed_albedo(self, fit: AlbedoFit, base: Texture | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Another picture of the land (left out, the satellite's, its light taken out) corrected by the seen texels; and σ."""
+        sigma = np.where(fit.seen >= 0.5, texel_sigma(fit), np.inf)
+        base = base or self.satellite
+        return corrected_albedo(fit.albedo, sigma, base.values, self.albedo_guides, fast=True, seed=self.world.seed)
+
+    def guided_albedo(self, fit: AlbedoFit) -> np.ndarray:
+        """Seen texels' albedo as it is; the others' learned, the satellite's image one guide among others."""
+        guides = guides_for(self.world.terrain, self.world.atlas, satellite=self.satellite)
         texture = Texture(fit.albedo, (fit.seen >= 0.5).astype(np.float32))
-        guides = self.albedo_guides
-        if satellite is not None:
-            guides = guides_for(self.world.terrain, self.world.atlas, satellite=satellite)
-        return np.clip(self.completed(texture, self.world.painted_hours[0], guides=guides), 0.004, 0.98)
+        return np.clip(complete(texture, guides, fast=True, seed=self.world.seed).values, 0.004, 0.98)
 
     def seen_texels(self) -> np.ndarray:
         """Texels ``(R, S)`` that painting at true poses reaches, at the first painted hour."""

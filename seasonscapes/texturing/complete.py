@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 
 from seasonscapes.terrain.surface import Texture
+from seasonscapes.texturing.corrected import corrected_fill
 from seasonscapes.texturing.detail import add_detail
 from seasonscapes.texturing.guided import guided_fill
 from seasonscapes.texturing.guides import Guides
@@ -28,10 +29,10 @@ class Completed:
     Parameters
     ----------
     values
-        ``(R, S, 3)`` float32, finite everywhere; painted texels are the given ones to the bit.
+        ``(R, S, 3)`` float32, finite everywhere; painted texels are the given ones to the bit, unless there was a base.
     sigma
         Standard error ``(R, S)`` of the filled texels in the unit of ``values``, RMS over the channels; 0 where
-        painted (what painting itself gets wrong is not known here).
+        painted (what painting itself gets wrong is not known here), and with a base that of the prediction everywhere.
     painted
         ``(R, S)`` bool: seen by a camera.
     """
@@ -67,8 +68,8 @@ def _unguided(fill: Callable, values: np.ndarray, painted: np.ndarray, guides: G
 INPAINTERS: dict[str, Callable] = {"guided": guided_fill, "membrane": membrane, "telea": telea}
 
 
-def complete(texture: Texture, guides: Guides, *, method: str = "guided", detail: float = 0.0, fast: bool = False,
-             seed: int = 0, progress: Progress | None = None) -> Completed:  # fmt: skip
+def complete(texture: Texture, guides: Guides, *, base: np.ndarray | None = None, method: str = "guided",
+             detail: float = 0.0, fast: bool = False, seed: int = 0, progress: Progress | None = None) -> Completed:  # fmt: skip
     """Fill every texel that no camera saw.
 
     Parameters
@@ -77,8 +78,12 @@ def complete(texture: Texture, guides: Guides, *, method: str = "guided", detail
         Radiance or albedo; painted where ``weight`` is positive and the values are finite.
     guides
         From `guides.guides_for`, of the same size. Methods that do not look at the land use only its charts.
+    base
+        ``(R, S, 3)`` what another source says that every texel is, in the texture's unit (for an albedo: an image from
+        above with its light taken out); NaN where it says nothing. It is corrected by what was painted, and painted
+        texels give way to it as far as their ``weight`` tells that they scatter: see `corrected`.
     method
-        A name of `INPAINTERS`.
+        A name of `INPAINTERS`; with a base ``guided`` alone.
     detail
         Strength of synthesised grain in [0, 1]: 0 for albedo recovery, about 0.6 for pictures.
     fast
@@ -91,13 +96,17 @@ def complete(texture: Texture, guides: Guides, *, method: str = "guided", detail
     Raises
     ------
     ValueError
-        An unknown method, guides of another size, a negative value among the painted ones, or no painted texel on
+        An unknown method, guides or a base of another size, a base with another method than ``guided``, a negative value among the painted ones, or no painted texel on
         the surface.
     """
     if method not in INPAINTERS:
         raise ValueError(f"method: got {method!r}, expected one of {', '.join(INPAINTERS)}")
     if guides.surface.shape != texture.weight.shape:
         raise ValueError(f"guides are {guides.surface.shape}, the texture {texture.weight.shape}")
+    if base is not None and (base.shape != texture.values.shape or method != "guided"):
+        raise ValueError(
+            f"base: {base.shape} for a texture {texture.values.shape} and method {method!r}, expected guided"
+        )
     if not 0.0 <= detail <= 1.0:
         raise ValueError(f"detail: got {detail}, expected 0 to 1")
     tell = progress or (lambda share: None)
@@ -107,20 +116,26 @@ def complete(texture: Texture, guides: Guides, *, method: str = "guided", detail
         raise ValueError("complete: no painted texel on the surface: there is nothing to learn from")
     if texture.values[painted].min() < 0.0:
         raise ValueError("complete: negative values among the painted texels")
-    hole = guides.surface & ~painted
+    # Painted texels, too, give way to a base.
+    changed = guides.surface & ~painted if base is None else guides.surface
     values = np.where(painted[..., None], texture.values, 0.0).astype(np.float32)
     sigma = np.zeros(painted.shape, np.float32)
-    if hole.any():
+    if changed.any():
         scale = max(float(np.median(values[seen])), 1e-6 * float(values[seen].max()), 1e-12)
         encoded = np.cbrt(values / np.float32(scale))
-        filled, spread = INPAINTERS[method](
-            encoded, seen, guides, fast=fast, seed=seed, progress=lambda s: tell(0.9 * s)
-        )
+        how: dict = {"fast": fast, "seed": seed, "progress": lambda s: tell(0.9 * s)}
+        if base is None:
+            made, spread = INPAINTERS[method](encoded, seen, guides, **how)
+            brightest = float(encoded[seen].max())
+        else:
+            like = np.cbrt(np.maximum(base, 0.0) / scale).astype(np.float32)
+            made, spread = corrected_fill(encoded, np.where(seen, texture.weight, 0.0), like, guides, **how)
+            brightest = max(float(encoded[seen].max()), float(np.nanmax(like[guides.surface])))
         if detail > 0.0:
-            filled = add_detail(filled, seen, guides, strength=detail, seed=seed)
-        # No hidden texel is brighter than anything seen: cubes must not make suns of small errors.
-        lightness = np.clip(filled[hole], 0.0, float(encoded[seen].max()))
-        values[hole], sigma[hole] = scale * lightness**3, scale * spread[hole]
+            made = add_detail(made, seen, guides, strength=detail, seed=seed)
+        # Nothing is brighter than all that is known: cubes must not make suns of small errors.
+        values[changed] = scale * np.clip(made[changed], 0.0, brightest) ** 3
+        sigma[changed] = scale * spread[changed]
     beside = ~guides.surface & ~painted
     if beside.any():
         # Between charts nothing lies; a look-up at a chart's rim must still find its colour.

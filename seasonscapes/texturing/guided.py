@@ -129,16 +129,17 @@ def _forest(guide: np.ndarray, encoded: np.ndarray, seed: int, *, trees: int):
     from sklearn.ensemble import ExtraTreesRegressor
 
     forest = ExtraTreesRegressor(trees, min_samples_leaf=5, max_features=0.5, n_jobs=1, random_state=seed)
-    return forest.fit(_said(guide), encoded)
+    return forest.fit(for_trees(guide), encoded)
 
 
-def _said(guide: np.ndarray) -> np.ndarray:
+def for_trees(guide: np.ndarray) -> np.ndarray:
+    """Guides ``(n, G)`` as trees take them."""
     return np.ascontiguousarray(np.where(np.isfinite(guide), guide, _MISSING), np.float32)
 
 
 def forest_mean_spread(forest, guide: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean ``(n, 3)`` over the trees and the standard deviation between them ``(n,)``, RMS over the channels."""
-    said = _said(guide)
+    said = for_trees(guide)
     total, square = np.zeros((len(said), 3)), np.zeros((len(said), 3))
     for tree in forest.estimators_:
         value = tree.tree_.predict(said).reshape(len(said), 3)
@@ -185,7 +186,7 @@ def guided_fill(values: np.ndarray, painted: np.ndarray, guides: Guides, *, fast
         sigma.ravel()[part[inside]] = spread.sigma(table[part[inside]], colour[inside], between[inside])
         tell(0.35 + 0.6 * min(1.0, (start + _BLOCK) / len(wanted)))
     residual = np.where(rim[..., None], values - predicted, 0.0)
-    filled = np.where(hole[..., None], predicted + _carried(residual, rim, guides), values)
+    filled = np.where(hole[..., None], predicted + carried(residual, rim, guides), values)
     return filled.astype(np.float32), sigma
 
 
@@ -232,7 +233,7 @@ def _near(hole: np.ndarray, known: np.ndarray, reach_px: int, guides: Guides) ->
     return known & (cv2.dilate(hole.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
 
 
-def _carried(residual: np.ndarray, known: np.ndarray, guides: Guides) -> np.ndarray:
+def carried(residual: np.ndarray, known: np.ndarray, guides: Guides) -> np.ndarray:
     """The residual in the holes; by way of the plan where the atlas has several charts."""
     if guides.plan is None:
         # Painted texels far from any hole have no residual, but they are nobody's neighbours either.

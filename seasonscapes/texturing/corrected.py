@@ -1,0 +1,110 @@
+"""Completion with a base: a picture of the same land from elsewhere, corrected by what cameras saw.
+
+An image from above with its light taken out is nearly the albedo of another day. What is learned is how the painted texels
+differ from such a base, by relief: a small and smooth thing, so that land unlike any that was seen keeps the base's look
+instead of that of the nearest thing in sight. Trees of large leaves do not learn the noise of single texels.
+
+Painted texels are not taken as they are. Those that were seen badly (at grazing angles, from far off, in the shade) scatter
+more about the corrected base than those that were seen well; each gives way to it as far as texels of its weight do. What
+is left of the difference is carried a few texels into the holes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from seasonscapes.texturing.guided import (
+    FAST_SAMPLES,
+    SAMPLES,
+    carried,
+    for_trees,
+    forest_mean_spread,
+    guided_fill,
+)
+from seasonscapes.texturing.guides import Guides
+from seasonscapes.texturing.scatter import fit_scatter
+from seasonscapes.texturing.uncertainty import Spread, fit_spread, spatial_folds
+
+Progress = Callable[[float], None]
+_LEAF, _BLOCK = 20, 200_000
+
+
+def corrected_fill(values: np.ndarray, weight: np.ndarray, base: np.ndarray, guides: Guides, *, fast: bool = False,
+                   seed: int = 0, progress: Progress | None = None) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """All texels of the surface by correcting a base; see `complete.complete` for arguments and result.
+
+    Parameters
+    ----------
+    values, base
+        Encoded colours ``(R, S, 3)``; a base that is not finite somewhere is first completed by what was painted.
+    weight
+        ``(R, S)``, 0 where not painted. Only its order counts.
+    """
+    tell = progress or (lambda share: None)
+    painted = (weight > 0.0) & guides.surface
+    base = _whole(base, values, painted, guides, fast=fast, seed=seed)
+    rng = np.random.default_rng(seed)
+    known = np.flatnonzero(painted)
+    sample = np.sort(rng.choice(known, min(FAST_SAMPLES if fast else SAMPLES, len(known)), replace=False))
+    guide, encoded = _rows(guides, base, sample), values.reshape(-1, 3)[sample].astype(np.float64)
+    weights, trees = weight.ravel()[sample], 20 if fast else 40
+    first = _fit(guide, encoded, None, seed, trees=trees)
+    share = fit_scatter(encoded - first(guide)[0], weights).share(weights)
+    forest = _fit(guide, encoded, share, seed, trees=trees)
+    scatter = fit_scatter(encoded - forest(guide)[0], weights)
+    tell(0.3)
+    spread = _spread_of(guides, painted, sample, (guide, encoded, share), seed)
+    tell(0.4)
+    corrected, sigma = base.copy(), np.zeros(painted.shape, np.float32)
+    wanted = np.flatnonzero(guides.surface)
+    for start in range(0, len(wanted), _BLOCK):
+        part = wanted[start : start + _BLOCK]
+        rows = _rows(guides, base, part)
+        colour, between = forest(rows)
+        corrected.reshape(-1, 3)[part] = colour
+        sigma.ravel()[part] = spread.sigma(rows, colour, between)
+        tell(0.4 + 0.55 * min(1.0, (start + _BLOCK) / len(wanted)))
+    believed = np.where(painted, scatter.share(np.where(painted, weight, 1.0)), 0.0)[..., None]
+    residual = (believed * (values - corrected)).astype(np.float32)
+    return corrected + np.where(painted[..., None], residual, carried(residual, painted, guides)), sigma
+
+
+def _whole(base: np.ndarray, values: np.ndarray, painted: np.ndarray, guides: Guides, *, fast: bool, seed: int):
+    """A base without gaps on the surface."""
+    gap = guides.surface & ~np.isfinite(base).all(axis=2)
+    whole = np.where(np.isfinite(base), base, 0.0).astype(np.float32)
+    if gap.any():
+        learned, _ = guided_fill(values, painted, guides, fast=fast, seed=seed)
+        whole[gap] = learned[gap]
+    return whole
+
+
+def _rows(guides: Guides, base: np.ndarray, texel: np.ndarray) -> np.ndarray:
+    """Guides and, last, the base ``(n, G + 3)`` of flat texels."""
+    table = guides.values.reshape(-1, guides.values.shape[2])[texel]
+    return np.concatenate([table, base.reshape(-1, 3)[texel]], axis=1)
+
+
+def _fit(guide: np.ndarray, encoded: np.ndarray, weight: np.ndarray | None, seed: int, *, trees: int) -> Callable:
+    """A function from rows to encoded colours ``(n, 3)`` and the trees' spread ``(n,)``."""
+    from sklearn.ensemble import ExtraTreesRegressor
+
+    forest = ExtraTreesRegressor(trees, min_samples_leaf=_LEAF, max_features=0.5, n_jobs=1, random_state=seed)
+    forest.fit(for_trees(guide), encoded - guide[:, -3:], sample_weight=weight)
+
+    def predict(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        mean, between = forest_mean_spread(forest, rows)
+        return rows[:, -3:] + mean, between
+
+    return predict
+
+
+def _spread_of(guides: Guides, painted: np.ndarray, sample: np.ndarray, known: tuple, seed: int) -> Spread:
+    guide, encoded, share = known
+    row, column = np.unravel_index(sample, painted.shape)
+    place = np.stack([column, row], -1) if guides.plan is None else guides.plan.pixel.reshape(-1, 2)[sample]
+    fold = spatial_folds(place, painted, guides.surface & ~painted, seed)
+    return fit_spread(guide, encoded, fold, lambda rows: _fit(guide[rows], encoded[rows], share[rows], seed, trees=10),
+                      seed=seed)  # fmt: skip
