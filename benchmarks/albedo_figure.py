@@ -20,10 +20,13 @@ from seasonscapes.albedo.closed_form import solve_albedo
 from seasonscapes.albedo.forward import trace_land
 from seasonscapes.albedo.shots import EIGHT_BIT, make_shots
 from seasonscapes.albedo.uncertainty import known_albedo
+from seasonscapes.commands.corrected_albedo import complete_known
 from seasonscapes.evaluation.webcam_faults import WebcamFaults
 from seasonscapes.exposure import develop, exposure_ev100
 from seasonscapes.images import atomic_path, srgb_from_linear
 from seasonscapes.sky.models import read_sky_model
+from seasonscapes.terrain.atlas import measure_atlas
+from seasonscapes.texturing.guides import guides_for
 from seasonscapes.workspace import default_workspace
 
 
@@ -44,7 +47,8 @@ def main() -> None:
     land = trace_land(truth.terrain, truth.shape)
     shots = make_shots(land, seen, flat(lights))
     fit = solve_albedo(land, shots, trust=EIGHT_BIT)
-    found = known_albedo(land, shots, fit)
+    atlas = measure_atlas(truth.terrain, "planar", truth.albedo.shape[1], truth.albedo.shape[0])
+    found = complete_known(known_albedo(land, shots, fit), fit, None, guides_for(truth.terrain, atlas))
     view = [args.camera]
     evening = [
         [light] for light in [lights_for(hours(FIT_DATE, 16.3), truth.cameras, model, workspace)[0][args.camera]]

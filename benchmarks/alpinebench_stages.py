@@ -32,7 +32,6 @@ from seasonscapes.albedo.forward import Land, ambient_on_texels, sun_on_texels, 
 from seasonscapes.albedo.orthophoto import texture_albedo
 from seasonscapes.albedo.response import fit_response, with_response
 from seasonscapes.albedo.shots import EIGHT_BIT, LINEAR, make_shots
-from seasonscapes.albedo.uncertainty import texel_sigma
 from seasonscapes.commands.corrected_albedo import corrected_albedo
 from seasonscapes.commands.expected import RELIT_SIGMA
 from seasonscapes.evaluation.masks import land_mask
@@ -239,9 +238,8 @@ class Bench:
 
     def completed_albedo(self, fit: AlbedoFit, base: Texture | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Another picture of the land (left out, the satellite's, its light taken out) corrected by the seen texels; and σ."""
-        sigma = np.where(fit.seen >= 0.5, texel_sigma(fit), np.inf)
         base = base or self.satellite
-        return corrected_albedo(fit.albedo, sigma, base.values, self.albedo_guides, fast=True, seed=self.world.seed)
+        return corrected_albedo(fit, base.values, self.albedo_guides, fast=True, seed=self.world.seed)
 
     def guided_albedo(self, fit: AlbedoFit) -> np.ndarray:
         """Seen texels' albedo as it is; the others' learned, the satellite's image one guide among others."""

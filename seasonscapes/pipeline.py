@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from datetime import date, datetime
+from datetime import date, datetime, timedelta
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -246,6 +246,20 @@ def albedo_for(place: Place, date: datetime) -> Texture:
     inputs.update(imagery=imagery.model_copy(update={"file": Path(imagery.file).name}), hash=file_hash(imagery.file))
     return build_once(place.workspace, f"{place.scene.name}/albedo", inputs, suffix=".npz", save=save_texture,
                       load=load_texture, build=lambda: _baked_image(place))  # fmt: skip
+
+
+# The synthetic place has no satellite; its colours of this day stand for a summer's image.
+_IMAGE_DAY = 205
+
+
+def image_from_above(place: Place, date: datetime) -> Texture | None:
+    """The scene's image, ``weight`` 0 where it does not reach; of a synthetic place its colours of a summer's day.
+
+    ``None`` where the scene names none. Of ``date`` the year counts alone.
+    """
+    if place.synthetic is not None:
+        return albedo_for(place, date.replace(month=1, day=1) + timedelta(days=_IMAGE_DAY - 1))
+    return None if place.scene.imagery is None else albedo_for(place, date)
 
 
 # A synthetic place's albedo is known for every day; films pass through those of these days of each month.

@@ -14,12 +14,15 @@ from seasonscapes.albedo.inverse import Extra, InverseOptions, refine_albedo
 from seasonscapes.albedo.mitsuba_pictures import SKY, differentiable_views, mi_picture
 from seasonscapes.albedo.painted import painted_radiance
 from seasonscapes.albedo.shots import EIGHT_BIT, Shot, make_shots
-from seasonscapes.albedo.uncertainty import KnownAlbedo, known_albedo
+from seasonscapes.albedo.uncertainty import KnownAlbedo, known_albedo, usable_sigma
+from seasonscapes.commands.corrected_albedo import complete_known
 from seasonscapes.evaluation.webcam_faults import WebcamFaults, degrade
 from seasonscapes.frames import direction_from_angles
 from seasonscapes.images import linear_from_srgb
 from seasonscapes.rendering.hosek import hosek_illumination
 from seasonscapes.rendering.reception import luminaries
+from seasonscapes.terrain.atlas import measure_atlas
+from seasonscapes.texturing.guides import guides_for
 
 QUICK = Effort(rounds=4, iterations=10)
 
@@ -298,15 +301,36 @@ def test_uncertainty_ranks_errors_and_gaps_are_marked(place, shots, clean):
     low, high = np.quantile(known.sigma[measured], [0.33, 0.67])
     sure, unsure = measured & (known.sigma <= low), measured & (known.sigma >= high)
     assert error[unsure].mean() > 2.0 * error[sure].mean()
-    gap = known.source == 2
-    assert gap.any()
-    assert np.isfinite(known.sigma[gap]).all()
-    median = np.abs(np.median(place.albedo[measured], axis=0) - place.albedo)[..., 1]
-    assert error[gap].mean() < median[gap].mean(), "completion beats one colour for all"
     assert known.sunlit.max() >= 2
-    bare = known_albedo(place.land, shots, clean, complete=False)
-    assert (bare.source != 2).all()
-    assert np.isinf(bare.sigma[bare.source == 0]).all()
+    assert (known.source[~measured] == 0).all()
+    assert np.isinf(known.sigma[~measured]).all()
+
+
+def test_gaps_are_completed_and_marked(place, shots, clean):
+    """From relief alone they beat one colour for all; from an image that is too dark and noisy, by far."""
+    known, guides = known_albedo(place.land, shots, clean), guides_for(place.terrain, measure_atlas(place.terrain, "planar", place.albedo.shape[1], place.albedo.shape[0]))
+    measured = known.source == 1
+    gap = guides.surface & ~measured
+
+    def error(albedo: np.ndarray) -> float:
+        return float(np.abs(albedo - place.albedo)[gap].mean())
+
+    flat = error(np.broadcast_to(np.median(place.albedo[measured], axis=0), place.albedo.shape))
+    bare = complete_known(known, clean, None, guides)
+    assert (bare.source[gap] == 2).all()
+    assert (bare.source[measured] == 1).all()
+    assert np.isfinite(bare.sigma[guides.surface]).all()
+    assert error(bare.albedo) < flat
+    image = 0.6 * place.albedo * np.random.default_rng(1).normal(1.0, 0.1, place.albedo.shape)
+    image = np.maximum(image, 0.01).astype(np.float32)
+    corrected = complete_known(known, clean, image, guides)
+    assert error(corrected.albedo) < 0.6 * min(error(bare.albedo), error(image))
+    seen = clean.seen >= 0.5
+    poor = seen & (usable_sigma(clean) > np.quantile(usable_sigma(clean)[seen], 0.9))
+    well = seen & (usable_sigma(clean) < np.median(usable_sigma(clean)[seen]))
+    before, after = (np.abs(values - place.albedo).mean(axis=2) for values in (clean.albedo, corrected.albedo))
+    assert after[poor].mean() < 0.8 * before[poor].mean(), "what was seen badly gives way"
+    assert after[well].mean() < 1.1 * before[well].mean(), "what was seen well stays"
 
 
 def _snow_above(line_m: float) -> KnownAlbedo:

@@ -50,6 +50,9 @@ def albedo(
 ) -> None:
     """Find the albedo of a place from photographs of several hours, whose light is known.
 
+    Where no photograph shows the land, and as far as one shows it badly, it is the scene's image corrected by what the
+    photographs show elsewhere; without an image it is learned from relief.
+
     Parameters
     ----------
     scene
@@ -225,10 +228,15 @@ def _prepared(land: Place, observations: list[Observation], model: SkyModel, *, 
 
 
 def _solved(land: Place, traced: Land, shots: list[Shot], iterations: int) -> tuple[AlbedoFit, KnownAlbedo]:
+    import numpy as np
+
     from seasonscapes.albedo.closed_form import solve_albedo
     from seasonscapes.albedo.inverse import InverseOptions, refine_albedo
     from seasonscapes.albedo.shots import EIGHT_BIT
     from seasonscapes.albedo.uncertainty import known_albedo
+    from seasonscapes.commands.corrected_albedo import complete_known
+    from seasonscapes.pipeline import image_from_above
+    from seasonscapes.texturing.guides import guides_for
 
     try:
         with progress_bar("albedo") as progress:
@@ -238,7 +246,11 @@ def _solved(land: Place, traced: Land, shots: list[Shot], iterations: int) -> tu
             with progress_bar("differentiable rendering") as progress:
                 fit = refine_albedo(land.terrain, traced, shots, fit, trust=EIGHT_BIT, options=options,
                                     callbacks=[lambda state: progress(state.iteration / iterations)]).fit  # fmt: skip
-        return fit, known_albedo(traced, shots, fit)
+        known = known_albedo(traced, shots, fit)
+        image = image_from_above(land, shots[0].observation.time)
+        base = None if image is None else np.where(image.weight[..., None] > 0.0, image.values, np.float32(np.nan))
+        with progress_bar("completing") as progress:
+            return fit, complete_known(known, fit, base, guides_for(land.terrain, land.atlas), progress=progress)
     except ValueError as error:
         raise InputError("albedo", str(error).split(": ", 1)[-1]) from None
 

@@ -3,40 +3,53 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import numpy as np
 
+    from seasonscapes.albedo.closed_form import AlbedoFit
+    from seasonscapes.albedo.uncertainty import KnownAlbedo
     from seasonscapes.texturing.guides import Guides
 
 
-def corrected_albedo(albedo: np.ndarray, sigma: np.ndarray, base: np.ndarray | None, guides: Guides, *, fast: bool = False,
-                     seed: int = 0, progress: Callable[[float], None] | None = None) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+def corrected_albedo(fit: AlbedoFit, base: np.ndarray | None, guides: Guides, *, fast: bool = False, seed: int = 0,
+                     progress: Callable[[float], None] | None = None) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Albedo ``(R, S, 3)`` of every texel of the surface, and its standard deviation ``(R, S)``.
 
     Parameters
     ----------
-    albedo, sigma
-        What photographs say, ``(R, S, 3)`` and ``(R, S)``; σ is infinite where they say nothing.
     base
-        ``(R, S, 3)`` albedo from elsewhere, of any scale; ``None`` where there is no image: gaps are then learned from
-        relief alone and measured texels stay as they are.
+        ``(R, S, 3)`` albedo from elsewhere, of any scale, NaN where unknown; ``None`` where there is none: gaps are then
+        learned from relief alone and seen texels stay as they are.
     guides
         Relief; no hour's sun, for an albedo knows none, and not the base itself.
     """
     import numpy as np
 
     from seasonscapes.albedo.closed_form import HIGHEST, LOWEST
+    from seasonscapes.albedo.uncertainty import usable_sigma
     from seasonscapes.terrain.surface import Texture
     from seasonscapes.texturing.complete import complete
 
-    # Relative precision: what is compared are albedos' cube roots, in which equal relative errors are equal enough.
-    weight = np.square(albedo[..., 1] / np.maximum(sigma, 1e-4)).astype(np.float32)
-    made = complete(Texture(albedo, weight), guides, base=base, fast=fast, seed=seed, progress=progress)
+    sigma = usable_sigma(fit)
+    # Relative precision: what is compared are cube roots, in which equal relative errors are equal enough.
+    weight = np.square(fit.albedo[..., 1] / np.maximum(sigma, 1e-4)).astype(np.float32)
+    made = complete(Texture(fit.albedo, weight), guides, base=base, fast=fast, seed=seed, progress=progress)
     values = np.clip(made.values, LOWEST, HIGHEST)
     if base is None:
         return values, np.where(weight > 0.0, sigma, made.sigma).astype(np.float32)
     with np.errstate(divide="ignore"):
         both = 1.0 / np.sqrt(1.0 / np.square(np.maximum(made.sigma, 1e-6)) + 1.0 / np.square(sigma))
     return values, both.astype(np.float32)
+
+
+def complete_known(known: KnownAlbedo, fit: AlbedoFit, base: np.ndarray | None, guides: Guides, *, seed: int = 0,
+                   progress: Callable[[float], None] | None = None) -> KnownAlbedo:  # fmt: skip
+    """The same with every texel of the surface known; what is not measured is marked as completed."""
+    import numpy as np
+
+    albedo, sigma = corrected_albedo(fit, base, guides, fast=True, seed=seed, progress=progress)
+    source = np.where(guides.surface & (known.source != 1), np.uint8(2), known.source)
+    return replace(known, albedo=albedo, sigma=np.where(guides.surface, sigma, np.float32(np.inf)), source=source)

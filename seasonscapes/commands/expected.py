@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 from seasonscapes.commands.talk import progress_bar
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from seasonscapes.pipeline import Place
     from seasonscapes.sky.models import SkyModel
     from seasonscapes.terrain.surface import Texture
@@ -34,6 +36,17 @@ def expected_radiance(land: Place, albedo: Path, utc: datetime, model: SkyModel)
     inputs = {"revision": _REVISION, "place": land.key, "albedo": dated.content, "time": utc.isoformat(), "sky": model}
     return build_once(land.workspace, f"{land.scene.name}/expected", inputs, suffix=".npz", save=save_texture,
                       load=load_texture, build=lambda: _relit(land, dated.load(), utc, model))  # fmt: skip
+
+
+def albedo_error(albedo: Path) -> np.ndarray:
+    """Relative standard error ``(R, S)`` of an albedo file; where it tells none, what albedos from photographs have."""
+    import numpy as np
+
+    with np.load(albedo, allow_pickle=False) as stored:
+        values = stored["values"]
+        sigma = stored["sigma"] if "sigma" in stored else np.full(values.shape[:2], np.inf, np.float32)
+    relative = sigma / np.maximum(values[..., 1], 1e-3)
+    return np.where(np.isfinite(relative), relative, RELIT_SIGMA).astype(np.float32)
 
 
 def _relit(land: Place, texture: Texture, utc: datetime, model: SkyModel) -> Texture:

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from seasonscapes.texturing.complete import Completed
     from seasonscapes.texturing.guides import Guides
 
-# The synthetic place has no satellite; its colours of this day stand for a summer image.
-_SATELLITE_DAY = 205
 _FIGURE_PX = 1024
 
 
@@ -59,7 +57,8 @@ def inpaint(
         guided (learns from satellite colour, relief and sun), membrane (smooth), telea (from the rims inwards) or
         diffusion (an image model along --path, then guided; needs weights and, in earnest, a GPU).
     albedo
-        What ``seasonscapes albedo`` wrote for this scene: relit at this hour it is a further guide.
+        What ``seasonscapes albedo`` wrote for this scene. Relit at this hour it takes the place of guided: painted
+        texels are weighed against it, each by its error, and it is what no camera saw. With diffusion it is a guide.
     detail
         Strength of synthesised grain: 0 for albedo recovery, about 0.6 for pictures.
     fast
@@ -84,6 +83,8 @@ def inpaint(
 
     if method not in (*INPAINTERS, "diffusion"):
         raise InputError("--method", "unknown method", got=method, expected=", ".join([*INPAINTERS, "diffusion"]))
+    if albedo is not None and method not in ("guided", "diffusion"):
+        raise InputError("--albedo", f"of no use with --method {method}", expected="guided or diffusion")
     diffusion, told = diffusion or DiffusionOptions(), {}
     if method == "diffusion":
         diffusion.check()
@@ -96,12 +97,18 @@ def inpaint(
         from seasonscapes.commands.expected import expected_radiance
 
         relit = expected_radiance(land, albedo, moment.utc, sky.model())
-    guides = guides_of(land, moment.utc, relit)
+    guides = guides_of(land, moment.utc, None if method == "guided" else relit)
     if method == "diffusion":
         from seasonscapes.commands.inpaint_path import complete_along_path
 
         effort = Effort(detail, fast, seed, sky.cloudiness or float(sky.sky == "overcast"))
         completed, told = complete_along_path(land, painted, guides, moment.utc, diffusion, effort)
+    elif relit is not None:
+        from seasonscapes.commands.expected import albedo_error
+        from seasonscapes.texturing.fused import fuse
+
+        completed = fuse(painted, relit.values, albedo_error(albedo), guides)
+        told = {"guides": ["albedo, relit"]}
     else:
         with progress_bar(f"completing ({method})") as progress:
             completed = complete(painted, guides, method=method, detail=detail, fast=fast, seed=seed, progress=progress)
@@ -161,15 +168,11 @@ def guides_of(land: Place, moment: datetime, relit: Texture | None = None) -> Gu
     """Relief, the sun of the hour and of the day, the place's image, and a relit albedo, for every texel."""
     import numpy as np
 
-    from seasonscapes.pipeline import albedo_for
+    from seasonscapes.pipeline import image_from_above
     from seasonscapes.sky.ephemeris import sun_position
     from seasonscapes.texturing.guides import guides_for
 
-    satellite = None
-    if land.synthetic is not None:
-        satellite = albedo_for(land, moment.replace(month=1, day=1) + timedelta(days=_SATELLITE_DAY - 1))
-    elif land.scene.imagery is not None:
-        satellite = albedo_for(land, moment)
+    satellite = image_from_above(land, moment)
     at = (land.frame.latitude_deg, land.frame.longitude_deg)
     hours = [moment + timedelta(hours=h) for h in range(-12, 12)]
     day = np.asarray(sun_position(hours, *at).direction, float)
