@@ -17,7 +17,7 @@ each colour first, as one must for a real webcam.
 * Distilled: Gaussians that learned from that albedo under suns of other days, seen at the held-out hours.
 * Each stage alone is given the truth of the stages before it. Ablations change one thing of the whole.
 * The satellite's image shows reflectance on a July forenoon with that hour's shades in it, as such images do, misplaced
-  and noisy, on the same texels. Its hour is known: the light is taken out before it guides. Satellite only is the image
+  and noisy, on the same texels. Its hour is known: the light is taken out before it is corrected. Satellite only is the image
   as it is on the terrain without air, at the best exposure there is for each picture.
 
 ``--figures`` writes truth, ours, satellite only and the difference, and a day as MP4 and as an animated WebP.
@@ -128,14 +128,19 @@ def satellite_view(bench: Bench) -> Callable:
     return lambda camera, at: judge.in_sight(bench.from_above.values, judge.truth(camera, at).radiance, camera)
 
 
-def painting_ablations(bench: Bench, whole: dict) -> dict[str, dict]:
-    """The painting and its completion from what the land tells, as the paper's is, one factor at a time."""
-    judge, told, most = bench.judge, whole["told"], bench.world.size.ablated
-    # Two hours tell: a shaded one and a sunny one.
-    painted = ablated_hours(bench)
+def texture_scores(bench: Bench, textures: dict, *, air: bool = True) -> dict[str, float]:
+    """Of textures of the ablated hours, in the ablated views."""
+    judge = bench.judge
+    return judge.scores(lambda c, at: judge.of_texture(textures[at], c, at, air=air), ablated_hours(bench),
+                        most=bench.world.size.ablated)  # fmt: skip
 
-    def texture_scores(textures: dict, *, air: bool = True) -> dict:
-        return judge.scores(lambda c, at: judge.of_texture(textures[at], c, at, air=air), painted, most=most)
+
+def painting_ablations(bench: Bench, whole: dict, without: dict[str, dict]) -> dict[str, dict]:
+    """The painting and its completion from what the land tells, as the paper's is, one factor at a time.
+
+    ``without`` are the rows of the whole's ablations at the same hours.
+    """
+    told, painted = whole["told"], ablated_hours(bench)
 
     def repainted(options: PaintOptions | None = None, **how) -> dict:
         return {at: bench.completed(bench.painted(at, options, relit=told[at], **how).texture, at) for at in painted}
@@ -144,26 +149,24 @@ def painting_ablations(bench: Bench, whole: dict) -> dict[str, dict]:
         return {at: bench.completed(whole["paintings"][at].texture, at, method=method) for at in painted}
 
     rows = Rows()
-    rows["full"] = texture_scores(refilled("guided"))
+    rows["full"] = texture_scores(bench, refilled("guided"))
     everywhere = mock.patch("seasonscapes.texturing.paint.by_ray",
                             lambda terrain, camera, surface, sight: np.ones(len(surface.texel), bool))  # fmt: skip
     with everywhere:
-        rows["no occlusion test"] = texture_scores(repainted())
+        rows["no occlusion test"] = texture_scores(bench, repainted())
     bench.clock.tell("no occlusion test")
-    rows["no gain compensation"] = texture_scores(repainted(PaintOptions(fit_gains=False)))
-    rows["first camera wins (as the paper)"] = texture_scores(repainted(PaintOptions(mode="first")))
-    rows["no silhouette guard"] = texture_scores(repainted(PaintOptions(guard=False)))
-    alone = {at: bench.completed(bench.painted(at).texture, at) for at in painted}
-    rows["no albedo to tie pictures"] = texture_scores(alone)
+    rows["no gain compensation"] = texture_scores(bench, repainted(PaintOptions(fit_gains=False)))
+    rows["first camera wins (as the paper)"] = texture_scores(bench, repainted(PaintOptions(mode="first")))
+    rows["no silhouette guard"] = texture_scores(bench, repainted(PaintOptions(guard=False)))
+    rows["no albedo to tie pictures"] = without["no albedo (painting, guided completion)"]
     bench.clock.tell("painting's ablations")
-    rows["no guidance (membrane)"] = texture_scores(refilled("membrane"))
-    rows["no guidance (Telea, as the paper)"] = texture_scores(refilled("telea"))
-    rows["no inpainting (one mean colour)"] = texture_scores(
-        {at: one_colour(whole["paintings"][at].texture) for at in painted}
-    )
+    rows["no guidance (membrane)"] = texture_scores(bench, refilled("membrane"))
+    rows["no guidance (Telea, as the paper)"] = texture_scores(bench, refilled("telea"))
+    plain = {at: one_colour(whole["paintings"][at].texture) for at in painted}
+    rows["no inpainting (one mean colour)"] = texture_scores(bench, plain)
     bench.clock.tell("completion's ablations")
-    rows["no aerial perspective"] = texture_scores(repainted(air=False), air=False)
-    rows["satellite only, best exposure"] = judge.scores(satellite_view(bench), painted, most=most)
+    rows["no aerial perspective"] = texture_scores(bench, repainted(air=False), air=False)
+    rows["satellite only, best exposure"] = without["satellite only, best exposure"]
     return rows
 
 
@@ -172,22 +175,13 @@ def ablations(bench: Bench, whole: dict) -> tuple[dict[str, dict], dict[str, dic
     judge, held, told, most = bench.judge, bench.world.held_hours, whole["told"], bench.world.size.ablated
     painted = ablated_hours(bench)
     paintings = {at: whole["paintings"][at].texture for at in painted}
-
-    def texture_scores(textures: dict) -> dict:
-        return judge.scores(lambda c, at: judge.of_texture(textures[at], c, at), painted, most=most)
-
     rows = Rows()
-    rows["full"] = texture_scores(whole["textures"])
-    rows["no painting (the relit albedo alone)"] = texture_scores(told)
-    rows["painted texels as they are, the relit albedo beyond"] = texture_scores(
-        {
-            at: np.where(painting.weight[..., None] > 0.0, painting.values, told[at])
-            for at, painting in paintings.items()
-        }
-    )
-    rows["no albedo (painting, guided completion)"] = texture_scores(
-        {at: bench.completed(bench.painted(at).texture, at) for at in painted}
-    )
+    rows["full"] = texture_scores(bench, whole["textures"])
+    rows["no painting (the relit albedo alone)"] = texture_scores(bench, told)
+    kept = {at: np.where(one.weight[..., None] > 0.0, one.values, told[at]) for at, one in paintings.items()}
+    rows["painted texels as they are, the relit albedo beyond"] = texture_scores(bench, kept)
+    alone = {at: bench.completed(bench.painted(at).texture, at) for at in painted}
+    rows["no albedo (painting, guided completion)"] = texture_scores(bench, alone)
     summer, bare_image = judge.of_albedo(bench.satellite.values), judge.of_albedo(bench.from_above.values)
     rows["no webcams (July's image, delit, relit)"] = judge.scores(summer, painted, most=most)
     rows["no webcams (July's image as it is, relit)"] = judge.scores(bare_image, painted, most=most)
@@ -219,7 +213,7 @@ def ablations(bench: Bench, whole: dict) -> tuple[dict[str, dict], dict[str, dic
 
 
 def ablated_hours(bench: Bench) -> tuple[datetime, ...]:
-    """The first painted hour and the middle one."""
+    """The first painted hour and the middle one: a shaded one and a sunny one tell."""
     painted = bench.world.painted_hours
     return (painted[0], painted[len(painted) // 2])
 
@@ -334,7 +328,7 @@ def main() -> None:
     rows, whole = stages(bench)
     print_stages(rows)
     painted_rows, held_rows = ablations(bench, whole)
-    painting_rows = painting_ablations(bench, whole)
+    painting_rows = painting_ablations(bench, whole, painted_rows)
     most = min(bench.world.size.ablated, len(bench.world.judged))
     print(f"\nthe whole, two painted hours, {most} views that no webcam saw")
     print_ablations(painted_rows)

@@ -239,7 +239,7 @@ class Bench:
     def completed_albedo(self, fit: AlbedoFit, base: Texture | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Another picture of the land (left out, the satellite's, its light taken out) corrected by the seen texels; and σ."""
         base = base or self.satellite
-        return corrected_albedo(fit, base.values, self.albedo_guides, fast=True, seed=self.world.seed)
+        return corrected_albedo(fit, base.values, self.albedo_guides, seed=self.world.seed)
 
     def guided_albedo(self, fit: AlbedoFit) -> np.ndarray:
         """Seen texels' albedo as it is; the others' learned, the satellite's image one guide among others."""

@@ -308,7 +308,9 @@ def test_uncertainty_ranks_errors_and_gaps_are_marked(place, shots, clean):
 
 def test_gaps_are_completed_and_marked(place, shots, clean):
     """From relief alone they beat one colour for all; from an image that is too dark and noisy, by far."""
-    known, guides = known_albedo(place.land, shots, clean), guides_for(place.terrain, measure_atlas(place.terrain, "planar", place.albedo.shape[1], place.albedo.shape[0]))
+    height, width = place.albedo.shape[:2]
+    guides = guides_for(place.terrain, measure_atlas(place.terrain, "planar", width, height))
+    known = known_albedo(place.land, shots, clean)
     measured = known.source == 1
     gap = guides.surface & ~measured
 

@@ -32,7 +32,8 @@ class KnownAlbedo:
     albedo
         ``(R, S, 3)`` float32.
     sigma
-        ``(R, S)`` float32 standard deviation (green); of completed texels that of the completion, infinite where nothing is known.
+        ``(R, S)`` float32 standard deviation (green); of completed texels that of the completion, infinite where nothing is
+        known.
     sunlit
         ``(R, S)`` uint8 in how many photographs the texel was seen in direct sunlight.
     source
@@ -59,6 +60,11 @@ def texel_sigma(fit: AlbedoFit) -> np.ndarray:
     return np.where((fit.seen > 0.0) & (fit.information > 0.0), sigma, np.inf).astype(np.float32)
 
 
+def usable_sigma(fit: AlbedoFit) -> np.ndarray:
+    """σ ``(R, S)`` of all that was seen, poorly known texels included, for those who weigh by it; infinite elsewhere."""
+    return np.where(fit.seen >= _FEWEST_PIXELS, texel_sigma(fit), np.inf).astype(np.float32)
+
+
 def times_sunlit(shots: Sequence[Shot]) -> np.ndarray:
     """In how many photographs each texel was seen in direct sunlight ``(R, S)`` uint8."""
     shape = shots[0].footprints.shape
@@ -81,19 +87,12 @@ def known_albedo(land: Land, shots: Sequence[Shot], fit: AlbedoFit) -> KnownAlbe
     ValueError
         Where no texel at all is measured.
     """
-    sigma = texel_sigma(fit)
-    on_surface = np.zeros(land.shape[0] * land.shape[1], bool)
-    on_surface[land.texel] = True
-    measured = (
-        (sigma < _POOR * fit.albedo[..., 1] + 0.02) & (fit.seen >= _FEWEST_PIXELS) & on_surface.reshape(land.shape)
-    )
+    sigma = usable_sigma(fit)
+    measured = np.zeros(land.shape[0] * land.shape[1], bool)
+    measured[land.texel] = True
+    measured = measured.reshape(land.shape) & (sigma < _POOR * fit.albedo[..., 1] + 0.02)
     if not measured.any():
         raise ValueError("known_albedo: no texel is measured")
     albedo = np.where(measured[..., None], fit.albedo, np.median(fit.albedo[measured], axis=0)).astype(np.float32)
     sigma = np.where(measured, sigma, np.inf).astype(np.float32)
     return KnownAlbedo(albedo, sigma, times_sunlit(shots), measured.astype(np.uint8))
-
-
-def usable_sigma(fit: AlbedoFit) -> np.ndarray:
-    """σ ``(R, S)`` of all that was seen, poorly known texels included, for those who weigh by it; infinite elsewhere."""
-    return np.where(fit.seen >= _FEWEST_PIXELS, texel_sigma(fit), np.inf).astype(np.float32)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from seasonscapes.texturing.guides import Guides
 
 
-def corrected_albedo(fit: AlbedoFit, base: np.ndarray | None, guides: Guides, *, fast: bool = False, seed: int = 0,
+def corrected_albedo(fit: AlbedoFit, base: np.ndarray | None, guides: Guides, *, seed: int = 0,
                      progress: Callable[[float], None] | None = None) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Albedo ``(R, S, 3)`` of every texel of the surface, and its standard deviation ``(R, S)``.
 
@@ -36,20 +36,19 @@ def corrected_albedo(fit: AlbedoFit, base: np.ndarray | None, guides: Guides, *,
     sigma = usable_sigma(fit)
     # Relative precision: what is compared are cube roots, in which equal relative errors are equal enough.
     weight = np.square(fit.albedo[..., 1] / np.maximum(sigma, 1e-4)).astype(np.float32)
-    made = complete(Texture(fit.albedo, weight), guides, base=base, fast=fast, seed=seed, progress=progress)
+    made = complete(Texture(fit.albedo, weight), guides, base=base, fast=True, seed=seed, progress=progress)
     values = np.clip(made.values, LOWEST, HIGHEST)
     if base is None:
         return values, np.where(weight > 0.0, sigma, made.sigma).astype(np.float32)
-    with np.errstate(divide="ignore"):
-        both = 1.0 / np.sqrt(1.0 / np.square(np.maximum(made.sigma, 1e-6)) + 1.0 / np.square(sigma))
+    both = 1.0 / np.sqrt(1.0 / np.square(np.maximum(made.sigma, 1e-6)) + 1.0 / np.square(sigma))
     return values, both.astype(np.float32)
 
 
-def complete_known(known: KnownAlbedo, fit: AlbedoFit, base: np.ndarray | None, guides: Guides, *, seed: int = 0,
+def complete_known(known: KnownAlbedo, fit: AlbedoFit, base: np.ndarray | None, guides: Guides, *,
                    progress: Callable[[float], None] | None = None) -> KnownAlbedo:  # fmt: skip
     """The same with every texel of the surface known; what is not measured is marked as completed."""
     import numpy as np
 
-    albedo, sigma = corrected_albedo(fit, base, guides, fast=True, seed=seed, progress=progress)
+    albedo, sigma = corrected_albedo(fit, base, guides, progress=progress)
     source = np.where(guides.surface & (known.source != 1), np.uint8(2), known.source)
     return replace(known, albedo=albedo, sigma=np.where(guides.surface, sigma, np.float32(np.inf)), source=source)

@@ -80,6 +80,7 @@ def inpaint(
     from seasonscapes.civil_time import resolve_time
     from seasonscapes.images import atomic_path
     from seasonscapes.texturing.complete import INPAINTERS, complete
+    from seasonscapes.texturing.guides import guides_for
 
     if method not in (*INPAINTERS, "diffusion"):
         raise InputError("--method", "unknown method", got=method, expected=", ".join([*INPAINTERS, "diffusion"]))
@@ -97,13 +98,15 @@ def inpaint(
         from seasonscapes.commands.expected import expected_radiance
 
         relit = expected_radiance(land, albedo, moment.utc, sky.model())
-    guides = guides_of(land, moment.utc, None if method == "guided" else relit)
+    fused = relit is not None and method == "guided"
+    # Of a fused texture's guides only the surface and the charts matter: neither sun nor image is looked at.
+    guides = guides_for(land.terrain, land.atlas) if fused else guides_of(land, moment.utc, relit)
     if method == "diffusion":
         from seasonscapes.commands.inpaint_path import complete_along_path
 
         effort = Effort(detail, fast, seed, sky.cloudiness or float(sky.sky == "overcast"))
         completed, told = complete_along_path(land, painted, guides, moment.utc, diffusion, effort)
-    elif relit is not None:
+    elif fused:
         from seasonscapes.commands.expected import albedo_error
         from seasonscapes.texturing.fused import fuse
 

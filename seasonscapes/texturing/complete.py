@@ -96,8 +96,8 @@ def complete(texture: Texture, guides: Guides, *, base: np.ndarray | None = None
     Raises
     ------
     ValueError
-        An unknown method, guides or a base of another size, a base with another method than ``guided``, a negative value among the painted ones, or no painted texel on
-        the surface.
+        An unknown method, guides or a base of another size, a base with another method than ``guided``, a negative value
+        among the painted ones, or no painted texel on the surface.
     """
     if method not in INPAINTERS:
         raise ValueError(f"method: got {method!r}, expected one of {', '.join(INPAINTERS)}")

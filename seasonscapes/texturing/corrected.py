@@ -16,19 +16,21 @@ from collections.abc import Callable
 import numpy as np
 
 from seasonscapes.texturing.guided import (
+    BLOCK,
     FAST_SAMPLES,
     SAMPLES,
     carried,
-    for_trees,
+    fit_forest,
+    folds_of,
     forest_mean_spread,
     guided_fill,
 )
 from seasonscapes.texturing.guides import Guides
 from seasonscapes.texturing.scatter import fit_scatter
-from seasonscapes.texturing.uncertainty import Spread, fit_spread, spatial_folds
+from seasonscapes.texturing.uncertainty import Spread, fit_spread
 
 Progress = Callable[[float], None]
-_LEAF, _BLOCK = 20, 200_000
+_LEAF = 20
 
 
 def corrected_fill(values: np.ndarray, weight: np.ndarray, base: np.ndarray, guides: Guides, *, fast: bool = False,
@@ -59,13 +61,13 @@ def corrected_fill(values: np.ndarray, weight: np.ndarray, base: np.ndarray, gui
     tell(0.4)
     corrected, sigma = base.copy(), np.zeros(painted.shape, np.float32)
     wanted = np.flatnonzero(guides.surface)
-    for start in range(0, len(wanted), _BLOCK):
-        part = wanted[start : start + _BLOCK]
+    for start in range(0, len(wanted), BLOCK):
+        part = wanted[start : start + BLOCK]
         rows = _rows(guides, base, part)
         colour, between = forest(rows)
         corrected.reshape(-1, 3)[part] = colour
         sigma.ravel()[part] = spread.sigma(rows, colour, between)
-        tell(0.4 + 0.55 * min(1.0, (start + _BLOCK) / len(wanted)))
+        tell(0.4 + 0.55 * min(1.0, (start + BLOCK) / len(wanted)))
     believed = np.where(painted, scatter.share(np.where(painted, weight, 1.0)), 0.0)[..., None]
     residual = (believed * (values - corrected)).astype(np.float32)
     return corrected + np.where(painted[..., None], residual, carried(residual, painted, guides)), sigma
@@ -89,10 +91,7 @@ def _rows(guides: Guides, base: np.ndarray, texel: np.ndarray) -> np.ndarray:
 
 def _fit(guide: np.ndarray, encoded: np.ndarray, weight: np.ndarray | None, seed: int, *, trees: int) -> Callable:
     """A function from rows to encoded colours ``(n, 3)`` and the trees' spread ``(n,)``."""
-    from sklearn.ensemble import ExtraTreesRegressor
-
-    forest = ExtraTreesRegressor(trees, min_samples_leaf=_LEAF, max_features=0.5, n_jobs=1, random_state=seed)
-    forest.fit(for_trees(guide), encoded - guide[:, -3:], sample_weight=weight)
+    forest = fit_forest(guide, encoded - guide[:, -3:], seed, trees=trees, leaf=_LEAF, weight=weight)
 
     def predict(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         mean, between = forest_mean_spread(forest, rows)
@@ -103,8 +102,5 @@ def _fit(guide: np.ndarray, encoded: np.ndarray, weight: np.ndarray | None, seed
 
 def _spread_of(guides: Guides, painted: np.ndarray, sample: np.ndarray, known: tuple, seed: int) -> Spread:
     guide, encoded, share = known
-    row, column = np.unravel_index(sample, painted.shape)
-    place = np.stack([column, row], -1) if guides.plan is None else guides.plan.pixel.reshape(-1, 2)[sample]
-    fold = spatial_folds(place, painted, guides.surface & ~painted, seed)
-    return fit_spread(guide, encoded, fold, lambda rows: _fit(guide[rows], encoded[rows], share[rows], seed, trees=10),
-                      seed=seed)  # fmt: skip
+    return fit_spread(guide, encoded, folds_of(sample, painted, guides, seed),
+                      lambda rows: _fit(guide[rows], encoded[rows], share[rows], seed, trees=10), seed=seed)  # fmt: skip

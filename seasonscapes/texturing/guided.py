@@ -24,7 +24,7 @@ SAMPLES, FAST_SAMPLES = 40_000, 20_000
 REACH_PX = 12.0
 # Boosting is sharper, the forest steadier; their mean beats both where the guides tell little.
 MIX = 0.65
-_BLOCK = 200_000
+BLOCK = 200_000
 # Guides whose names begin so are pictures of the land: its colour is likely to follow theirs.
 IMAGES = ("satellite", "relit")
 # Trees cannot ask "is it missing?" in every library version; a value that no guide takes says so.
@@ -113,7 +113,7 @@ def fit_regression(guide: np.ndarray, encoded: np.ndarray, images: np.ndarray | 
 
     beyond = fit_beyond(guide, encoded, np.zeros(guide.shape[1], bool) if images is None else images)
     left = encoded - beyond(guide)
-    forest = _forest(guide, left, seed, trees=20 if fast else 12)
+    forest = fit_forest(guide, left, seed, trees=20 if fast else 12)
     if fast:
         return Regression(beyond, None, forest)
     boosted = []
@@ -125,21 +125,22 @@ def fit_regression(guide: np.ndarray, encoded: np.ndarray, images: np.ndarray | 
     return Regression(beyond, tuple(boosted), forest)
 
 
-def _forest(guide: np.ndarray, encoded: np.ndarray, seed: int, *, trees: int):
+def fit_forest(guide: np.ndarray, encoded: np.ndarray, seed: int, *, trees: int, leaf: int = 5,
+               weight: np.ndarray | None = None):  # fmt: skip
+    """Extremely randomised trees from guides ``(n, G)`` to colours ``(n, 3)``, of at least ``leaf`` samples each leaf."""
     from sklearn.ensemble import ExtraTreesRegressor
 
-    forest = ExtraTreesRegressor(trees, min_samples_leaf=5, max_features=0.5, n_jobs=1, random_state=seed)
-    return forest.fit(for_trees(guide), encoded)
+    forest = ExtraTreesRegressor(trees, min_samples_leaf=leaf, max_features=0.5, n_jobs=1, random_state=seed)
+    return forest.fit(_said(guide), encoded, sample_weight=weight)
 
 
-def for_trees(guide: np.ndarray) -> np.ndarray:
-    """Guides ``(n, G)`` as trees take them."""
+def _said(guide: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(np.where(np.isfinite(guide), guide, _MISSING), np.float32)
 
 
 def forest_mean_spread(forest, guide: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean ``(n, 3)`` over the trees and the standard deviation between them ``(n,)``, RMS over the channels."""
-    said = for_trees(guide)
+    said = _said(guide)
     total, square = np.zeros((len(said), 3)), np.zeros((len(said), 3))
     for tree in forest.estimators_:
         value = tree.tree_.predict(said).reshape(len(said), 3)
@@ -178,13 +179,13 @@ def guided_fill(values: np.ndarray, painted: np.ndarray, guides: Guides, *, fast
     predicted = np.zeros_like(values, dtype=np.float32)
     sigma = np.zeros(painted.shape, np.float32)
     wanted = np.flatnonzero(hole | rim)
-    for start in range(0, len(wanted), _BLOCK):
-        part = wanted[start : start + _BLOCK]
+    for start in range(0, len(wanted), BLOCK):
+        part = wanted[start : start + BLOCK]
         colour, between = predict(regression, table[part])
         predicted.reshape(-1, 3)[part] = colour
         inside = hole.ravel()[part]
         sigma.ravel()[part[inside]] = spread.sigma(table[part[inside]], colour[inside], between[inside])
-        tell(0.35 + 0.6 * min(1.0, (start + _BLOCK) / len(wanted)))
+        tell(0.35 + 0.6 * min(1.0, (start + BLOCK) / len(wanted)))
     residual = np.where(rim[..., None], values - predicted, 0.0)
     filled = np.where(hole[..., None], predicted + carried(residual, rim, guides), values)
     return filled.astype(np.float32), sigma
@@ -211,16 +212,22 @@ def blinded(guide: np.ndarray, guides: Guides, painted: np.ndarray, rng: np.rand
 
 def _spread_of(guides: Guides, painted: np.ndarray, sampled: tuple, seed: int) -> Spread:
     sample, guide, encoded, images = sampled
-    row, column = np.unravel_index(sample, painted.shape)
-    place = np.stack([column, row], -1) if guides.plan is None else guides.plan.pixel.reshape(-1, 2)[sample]
-    fold = spatial_folds(place, painted, guides.surface & ~painted, seed)
 
     def fit(rows):
         beyond = fit_beyond(guide[rows], encoded[rows], images)
-        held_out = Regression(beyond, None, _forest(guide[rows], encoded[rows] - beyond(guide[rows]), seed, trees=10))
+        held_out = Regression(
+            beyond, None, fit_forest(guide[rows], encoded[rows] - beyond(guide[rows]), seed, trees=10)
+        )
         return lambda other: predict(held_out, other)
 
-    return fit_spread(guide, encoded, fold, fit, seed=seed)
+    return fit_spread(guide, encoded, folds_of(sample, painted, guides, seed), fit, seed=seed)
+
+
+def folds_of(sample: np.ndarray, painted: np.ndarray, guides: Guides, seed: int) -> np.ndarray:
+    """Fold number ``(n,)`` of flat texels, by where they lie on the land: see `spatial_folds`."""
+    row, column = np.unravel_index(sample, painted.shape)
+    place = np.stack([column, row], -1) if guides.plan is None else guides.plan.pixel.reshape(-1, 2)[sample]
+    return spatial_folds(place, painted, guides.surface & ~painted, seed)
 
 
 def _near(hole: np.ndarray, known: np.ndarray, reach_px: int, guides: Guides) -> np.ndarray:
