@@ -120,8 +120,11 @@ class Judge:
         pictures = path_traced(self.truth, albedo, self.lights, spp=self.spp, seed=seed)
         if self.ev is None:
             self.ev = [[exposure_ev100(image) for image in row] for row in pictures]
-        return [srgb_from_linear(develop(image, ev)) for row, evs in zip(pictures, self.ev, strict=True)
-                for image, ev in zip(row, evs, strict=True)]  # fmt: skip
+        return [
+            srgb_from_linear(develop(image, ev))
+            for row, evs in zip(pictures, self.ev, strict=True)
+            for image, ev in zip(row, evs, strict=True)
+        ]
 
     def relit_db(self, albedo: np.ndarray) -> float:
         """PSNR of relit pictures over all their terrain."""
@@ -137,9 +140,13 @@ class Judge:
         def relative(mask):
             return float(np.abs(error[mask]).sum() / true[mask].sum()) if mask.any() else float("nan")
 
-        result = {"psnr_db": psnr(error[self.mask]), "rel_error": relative(self.mask), "rel_error_shaded": relative(self.never),
-                  "median_rel_error": float(np.median(np.abs(error[self.mask]) / true[self.mask])),
-                  "ghost": ghost(guess, true, self.edges)}  # fmt: skip
+        result = {
+            "psnr_db": psnr(error[self.mask]),
+            "rel_error": relative(self.mask),
+            "rel_error_shaded": relative(self.never),
+            "median_rel_error": float(np.median(np.abs(error[self.mask]) / true[self.mask])),
+            "ghost": ghost(guess, true, self.edges),
+        }
         if relit:
             result["relit_psnr_db"] = self.relit_db(guess.reshape(albedo.shape).astype(np.float32))
         return result
@@ -159,8 +166,9 @@ def terrain_pixels(truth: Truth) -> list[np.ndarray]:
 def shadow_edges(sunlit: np.ndarray, shape, mask: np.ndarray) -> np.ndarray:
     """Pairs ``(E, 2)`` of neighbouring observed texels, the first in sunlight and the second in shade at some time."""
     grid = np.arange(shape[0] * shape[1]).reshape(shape)
-    pairs = np.concatenate([np.stack([grid[:, :-1].ravel(), grid[:, 1:].ravel()], 1),
-                            np.stack([grid[:-1].ravel(), grid[1:].ravel()], 1)])  # fmt: skip
+    pairs = np.concatenate(
+        [np.stack([grid[:, :-1].ravel(), grid[:, 1:].ravel()], 1), np.stack([grid[:-1].ravel(), grid[1:].ravel()], 1)]
+    )
     pairs = pairs[mask[pairs].all(axis=1)]
     found = []
     for lit in sunlit:
@@ -224,8 +232,14 @@ def run(args) -> dict[str, float]:
     workspace = default_workspace() if args.workspace is None else Workspace(args.workspace)
     numbers: dict[str, float] = {"seed": float(args.seed)}
     clock = Clock()
-    truth = make_truth(args.seed, size_m=size.size_m, spacing_m=size.spacing_m, texel_m=size.texel_m, cameras=size.cameras,
-                       size_px=size.size_px)  # fmt: skip
+    truth = make_truth(
+        args.seed,
+        size_m=size.size_m,
+        spacing_m=size.spacing_m,
+        texel_m=size.texel_m,
+        cameras=size.cameras,
+        size_px=size.size_px,
+    )
     model = read_sky_model("clear")
     times = hours(FIT_DATE, *size.clock)
     lights = lights_for(times, truth.cameras, model, workspace)
@@ -240,11 +254,13 @@ def run(args) -> dict[str, float]:
     numbers["seconds_footprints"] = clock.tell("footprints")
     clean = solve_albedo(land, shots, trust=LINEAR)
     numbers["seconds_closed_form"] = clock.tell("closed form")
-    sunlit = np.stack([sun_on_texels(land, row[0]).sum(axis=1) > 0.02 * row[0].sun.normal_illuminance_lx.sum()
-                       for row in lights])  # fmt: skip
+    sunlit = np.stack(
+        [sun_on_texels(land, row[0]).sum(axis=1) > 0.02 * row[0].sun.normal_illuminance_lx.sum() for row in lights]
+    )
     judge = Judge(truth, clean.seen, sunlit, held, winter, size)
-    numbers.update(texels=float(judge.mask.sum()), texels_never_sunlit=float(judge.never.sum()),
-                   relit_ceiling_db=judge.ceiling_db)  # fmt: skip
+    numbers.update(
+        texels=float(judge.mask.sum()), texels_never_sunlit=float(judge.never.sum()), relit_ceiling_db=judge.ceiling_db
+    )
     table: list[tuple[str, dict[str, float]]] = []
     score(table, numbers, "clean", judge.scores(clean.albedo), judge)
     clock.tell("judged")
@@ -354,13 +370,17 @@ class Clock:
 
 def print_table(table, judge: Judge) -> None:
     """Rows of scores."""
-    print(f"{judge.mask.sum()} texels observed, {judge.never.sum()} of them never sunlit; "
-          f"relit ceiling (true albedo): {judge.ceiling_db:.2f} dB")  # fmt: skip
+    print(
+        f"{judge.mask.sum()} texels observed, {judge.never.sum()} of them never sunlit; "
+        f"relit ceiling (true albedo): {judge.ceiling_db:.2f} dB"
+    )
     print(f"{'':28s}{'PSNR':>8s}{'rel.':>8s}{'shaded':>8s}{'median':>8s}{'ghost':>8s}{'relit':>8s}")
     for name, v in table:
         relit = f"{v['relit_psnr_db']:8.2f}" if "relit_psnr_db" in v else f"{'':8s}"
-        print(f"{name:28s}{v['psnr_db']:8.2f}{v['rel_error']:8.3f}{v['rel_error_shaded']:8.3f}{v['median_rel_error']:8.3f}"
-              f"{v['ghost']:8.3f}{relit}")  # fmt: skip
+        print(
+            f"{name:28s}{v['psnr_db']:8.2f}{v['rel_error']:8.3f}{v['rel_error_shaded']:8.3f}{v['median_rel_error']:8.3f}"
+            f"{v['ghost']:8.3f}{relit}"
+        )
 
 
 def show_pictures(folder: Path | None, truth: Truth, fit: AlbedoFit, judge: Judge) -> None:

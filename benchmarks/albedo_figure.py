@@ -54,15 +54,21 @@ def main() -> None:
         [light] for light in [lights_for(hours(FIT_DATE, 16.3), truth.cameras, model, workspace)[0][args.camera]]
     ]
     evening = [[None] * args.camera + evening[0]]
-    relit, true = (path_traced(truth, albedo, evening, spp=256, seed=5, cameras=view)[0][0]
-                   for albedo in (found.albedo, truth.albedo))  # fmt: skip
+    relit, true = (
+        path_traced(truth, albedo, evening, spp=256, seed=5, cameras=view)[0][0]
+        for albedo in (found.albedo, truth.albedo)
+    )
     ev = exposure_ev100(true)
     footprints = shots[args.camera].footprints
     bare = np.zeros((footprints.camera.height_px * footprints.camera.width_px, 3), np.float32) + 0.75
     bare[footprints.pixel] = footprints.matrix(footprints.share) @ found.albedo.reshape(-1, 3)
     photograph = srgb_from_linear(seen[args.camera].image)
-    panels = [photograph, srgb_from_linear(bare.reshape(photograph.shape)), srgb_from_linear(develop(relit, ev)),
-              srgb_from_linear(develop(true, ev))]  # fmt: skip
+    panels = [
+        photograph,
+        srgb_from_linear(bare.reshape(photograph.shape)),
+        srgb_from_linear(develop(relit, ev)),
+        srgb_from_linear(develop(true, ev)),
+    ]
     titles = ("photograph, 09:00", "albedo found", "relit, 18:18", "truth, 18:18")
     levels = [np.ascontiguousarray((255.0 * np.clip(panel, 0.0, 1.0)).astype(np.uint8)[..., ::-1]) for panel in panels]
     for image, title in zip(levels, titles, strict=True):

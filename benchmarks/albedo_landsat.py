@@ -110,8 +110,10 @@ def scene(folder: Path):
     elevation, _ = fill_nodata(read_elevation(folder / "dem_30m.tif"))
     # The model has noise on flats and seams between quads.
     smooth = cv2.GaussianBlur(elevation.values[..., 0], (0, 0), 1.0)[..., None]
-    terrain, atlas = unwrap(build_mesh(Raster(smooth, elevation.transform, elevation.crs), centre_frame(elevation), mesher="grid"),
-                            texel_m=30.0)  # fmt: skip
+    terrain, atlas = unwrap(
+        build_mesh(Raster(smooth, elevation.transform, elevation.crs), centre_frame(elevation), mesher="grid"),
+        texel_m=30.0,
+    )
     bands = {}
     for date in DATES:
         raster = read_raster(folder / f"landsat7_{date}.tif")
@@ -156,8 +158,9 @@ def light_of(sun: np.ndarray, centre_um: np.ndarray):
 
     grey = light.sky_radiance.mean(axis=2, keepdims=True)
     shape = grey / diffuse_horizontal_illuminance(np.repeat(grey, 3, axis=2))[0]
-    return replace(light, sky_radiance=(shape * diffuse).astype(np.float32),
-                   sun=replace(light.sun, normal_illuminance_lx=direct))  # fmt: skip
+    return replace(
+        light, sky_radiance=(shape * diffuse).astype(np.float32), sun=replace(light.sun, normal_illuminance_lx=direct)
+    )
 
 
 if __name__ == "__main__":

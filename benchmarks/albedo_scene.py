@@ -37,8 +37,16 @@ class Truth:
         return self.albedo.shape[:2]
 
 
-def make_truth(seed: int, *, size_m: float, spacing_m: float, texel_m: float, cameras: int, size_px: tuple[int, int],
-               day_of_year: int = 254) -> Truth:  # fmt: skip
+def make_truth(
+    seed: int,
+    *,
+    size_m: float,
+    spacing_m: float,
+    texel_m: float,
+    cameras: int,
+    size_px: tuple[int, int],
+    day_of_year: int = 254,
+) -> Truth:
     """The massif of a seed with its albedo of a day, and cameras that together see much of it."""
     from seasonscapes.terrain.synthetic import alpine_massif
 
@@ -58,8 +66,11 @@ def terrain_and_albedo(place, spacing_m: float, texel_m: float, day_of_year: int
 
     frame = LocalFrame(LATITUDE_DEG, LONGITUDE_DEG)
     terrain, atlas = unwrap(build_mesh(place.elevation, frame, mesher="grid"), texel_m=texel_m)
-    image = Raster(alpine_albedo(place, day_of_year, upsample=2), place.elevation.transform * Affine.scale(0.5),
-                   place.elevation.crs)  # fmt: skip
+    image = Raster(
+        alpine_albedo(place, day_of_year, upsample=2),
+        place.elevation.transform * Affine.scale(0.5),
+        place.elevation.crs,
+    )
     return terrain, bake_imagery(terrain, atlas, image).values
 
 
@@ -110,8 +121,9 @@ def _resized(camera: Camera, size: tuple[int, int]) -> Camera:
     return Camera(*size, camera.fx * scale, camera.fy * scale, size[0] / 2.0, size[1] / 2.0, camera.world_from_camera)
 
 
-def lights_for(times: Sequence[datetime], cameras: Sequence[Camera], model: SkyModel,
-               workspace: Workspace) -> list[list[Illumination]]:  # fmt: skip
+def lights_for(
+    times: Sequence[datetime], cameras: Sequence[Camera], model: SkyModel, workspace: Workspace
+) -> list[list[Illumination]]:
     """Light of each time as each camera sees it ``[time][camera]``: on the land that of its median height."""
     result = []
     for time in times:
@@ -131,8 +143,15 @@ def hours(date: str, *clock: float) -> list[datetime]:
     return [day.replace(hour=int(h), minute=round(60 * (h % 1.0))) for h in clock]
 
 
-def path_traced(truth: Truth, albedo: np.ndarray, lights: list[list[Illumination]], *, spp: int, seed: int,
-                cameras: Sequence[int] | None = None) -> list[list[np.ndarray]]:  # fmt: skip
+def path_traced(
+    truth: Truth,
+    albedo: np.ndarray,
+    lights: list[list[Illumination]],
+    *,
+    spp: int,
+    seed: int,
+    cameras: Sequence[int] | None = None,
+) -> list[list[np.ndarray]]:
     """Radiance ``(H, W, 3)`` at each camera of each time, ``[time][camera]``."""
     from seasonscapes.rendering.radiance import render_view
     from seasonscapes.rendering.scene import mi_mesh, relight
@@ -141,7 +160,11 @@ def path_traced(truth: Truth, albedo: np.ndarray, lights: list[list[Illumination
     top = float(truth.terrain.vertices[:, 2].max())
     chosen = range(len(truth.cameras)) if cameras is None else cameras
     return [
-        [render_view(relight(mesh, row[c], max_height_m=top), truth.cameras[c], spp=spp, seed=seed + 97 * t + c).radiance
-         for c in chosen]
+        [
+            render_view(
+                relight(mesh, row[c], max_height_m=top), truth.cameras[c], spp=spp, seed=seed + 97 * t + c
+            ).radiance
+            for c in chosen
+        ]
         for t, row in enumerate(lights)
-    ]  # fmt: skip
+    ]

@@ -66,8 +66,11 @@ class Rows(dict):
     """Scores by name; each is told as it is measured, so that a run that is interrupted has said what it knew."""
 
     def __setitem__(self, name: str, row: dict[str, float]) -> None:
-        print(f"    {name}: {row['psnr_db']:.2f} dB, matched {row['matched_psnr_db']:.2f} dB, SSIM {row['ssim']:.3f}",
-              file=sys.stderr, flush=True)  # fmt: skip
+        print(
+            f"    {name}: {row['psnr_db']:.2f} dB, matched {row['matched_psnr_db']:.2f} dB, SSIM {row['ssim']:.3f}",
+            file=sys.stderr,
+            flush=True,
+        )
         super().__setitem__(name, row)
 
 
@@ -87,10 +90,12 @@ def stages(bench: Bench) -> tuple[dict[str, dict], dict]:
     holes = {at: bench.completed(Texture(true[at], seen.astype(np.float32)), at) for at in painted}
     rows["inpaint alone"] = judge.scores(lambda c, at: judge.of_texture(holes[at], c, at), painted)
     bench.clock.tell("inpaint alone")
-    rows["paint alone, clean + inpaint"] = judge.scores(filled({at: bench.painted(at, clean=True, true_pose=True)
-                                                                 for at in painted}), painted)  # fmt: skip
-    rows["harmonise + paint + inpaint"] = judge.scores(filled({at: bench.painted(at, true_pose=True) for at in painted}),
-                                                       painted)  # fmt: skip
+    rows["paint alone, clean + inpaint"] = judge.scores(
+        filled({at: bench.painted(at, clean=True, true_pose=True) for at in painted}), painted
+    )
+    rows["harmonise + paint + inpaint"] = judge.scores(
+        filled({at: bench.painted(at, true_pose=True) for at in painted}), painted
+    )
     bench.clock.tell("paint, harmonise")
     rows["relight (true albedo)"] = judge.scores(judge.of_albedo(world.albedo), held)
     fit = bench.solved(clean=True, true_pose=True)
@@ -131,8 +136,11 @@ def satellite_view(bench: Bench) -> Callable:
 def texture_scores(bench: Bench, textures: dict, *, air: bool = True) -> dict[str, float]:
     """Of textures of the ablated hours, in the ablated views."""
     judge = bench.judge
-    return judge.scores(lambda c, at: judge.of_texture(textures[at], c, at, air=air), ablated_hours(bench),
-                        most=bench.world.size.ablated)  # fmt: skip
+    return judge.scores(
+        lambda c, at: judge.of_texture(textures[at], c, at, air=air),
+        ablated_hours(bench),
+        most=bench.world.size.ablated,
+    )
 
 
 def painting_ablations(bench: Bench, whole: dict, without: dict[str, dict]) -> dict[str, dict]:
@@ -150,8 +158,9 @@ def painting_ablations(bench: Bench, whole: dict, without: dict[str, dict]) -> d
 
     rows = Rows()
     rows["full"] = texture_scores(bench, refilled("guided"))
-    everywhere = mock.patch("seasonscapes.texturing.paint.by_ray",
-                            lambda terrain, camera, surface, sight: np.ones(len(surface.texel), bool))  # fmt: skip
+    everywhere = mock.patch(
+        "seasonscapes.texturing.paint.by_ray", lambda terrain, camera, surface, sight: np.ones(len(surface.texel), bool)
+    )
     with everywhere:
         rows["no occlusion test"] = texture_scores(bench, repainted())
     bench.clock.tell("no occlusion test")
@@ -228,16 +237,25 @@ _SHOWN = ("psnr_db", "matched_psnr_db", "ssim", "flip", "lpips", "colour_angle_d
 
 
 def print_stages(rows: dict[str, dict]) -> None:
-    print("\n".join(table_lines([{"stage": name} | {key: row[key] for key in _SHOWN if key in row}
-                                 for name, row in rows.items()])))  # fmt: skip
+    print(
+        "\n".join(
+            table_lines(
+                [{"stage": name} | {key: row[key] for key in _SHOWN if key in row} for name, row in rows.items()]
+            )
+        )
+    )
 
 
 def print_ablations(rows: dict[str, dict]) -> None:
     """With the paper's Drop: of LPIPS where its weights are at hand, else of FLIP."""
     full = rows["full"]
     error = "lpips" if "lpips" in full else "flip"
-    table = [{"ablation": name} | {key: row[key] for key in _SHOWN if key in row}
-             | {f"drop_{error}_percent": 100.0 * drop(full[error], row[error])} for name, row in rows.items()]  # fmt: skip
+    table = [
+        {"ablation": name}
+        | {key: row[key] for key in _SHOWN if key in row}
+        | {f"drop_{error}_percent": 100.0 * drop(full[error], row[error])}
+        for name, row in rows.items()
+    ]
     print("\n".join(table_lines(table)))
 
 
@@ -254,18 +272,29 @@ def numbers_of(bench: Bench, rows: dict, ablated: dict[str, dict], whole: dict) 
             numbers |= {f"{prefix}_{key_of(name)}_{key}": value for key, value in row.items()}
     full, held = rows["all, painted hours"], rows["all, held-out hours"]
     numbers["distilled_psnr_db"] = rows["all, distilled, held-out hours"]["psnr_db"]
-    numbers |= {"painted_view_psnr_db": full["psnr_db"], "painted_view_ssim": full["ssim"],
-                "painted_view_matched_psnr_db": full["matched_psnr_db"], "held_out_hour_psnr_db": held["psnr_db"],
-                "held_out_hour_ssim": held["ssim"], "held_out_hour_matched_psnr_db": held["matched_psnr_db"],
-                "mask_share": full["mask_share"], "painted_texel_share": float(whole["seen"].mean())}  # fmt: skip
+    numbers |= {
+        "painted_view_psnr_db": full["psnr_db"],
+        "painted_view_ssim": full["ssim"],
+        "painted_view_matched_psnr_db": full["matched_psnr_db"],
+        "held_out_hour_psnr_db": held["psnr_db"],
+        "held_out_hour_ssim": held["ssim"],
+        "held_out_hour_matched_psnr_db": held["matched_psnr_db"],
+        "mask_share": full["mask_share"],
+        "painted_texel_share": float(whole["seen"].mean()),
+    }
     # As the paper scores: multiplied by the mask, over the whole frame.
-    flattered = bench.judge.scores(lambda c, at: bench.judge.of_texture(whole["textures"][at], c, at),
-                                   bench.world.painted_hours, mode="paper")  # fmt: skip
+    flattered = bench.judge.scores(
+        lambda c, at: bench.judge.of_texture(whole["textures"][at], c, at), bench.world.painted_hours, mode="paper"
+    )
     numbers |= {f"painted_view_paper_mode_{key}": flattered[key] for key in ("psnr_db", "ssim")}
     error = albedo_error(bench.world.albedo, whole["albedo"], whole["fit"].seen >= 0.5)
     numbers |= {"albedo_psnr_db": error.psnr_db, "albedo_scale_invariant_mae": error.scale_invariant_mae}
-    errors = np.array([pose_errors(solved, camera) for solved, camera in
-                       zip(bench.pictures.calibrated, bench.world.painting, strict=True)])  # fmt: skip
+    errors = np.array(
+        [
+            pose_errors(solved, camera)
+            for solved, camera in zip(bench.pictures.calibrated, bench.world.painting, strict=True)
+        ]
+    )
     return numbers | {
         "heading_error_deg_max": float(errors[:, 0].max()),
         "position_error_m_max": float(errors[:, 1].max()),
@@ -282,8 +311,11 @@ def save_figures(bench: Bench, whole: dict, folder: Path) -> None:
         ours = judge.of_texture(whole["textures"][at], 0, at) if name == "painted" else whole["relit"](0, at)
         true = judge.truth(0, at)
         shown = {"truth": true.radiance, "ours": ours, "satellite only": satellite(0, at)}
-        sheet = comparison({key: judge.developed(value, 0, at) for key, value in shown.items()}, mask=judge.mask(0),
-                           window=steepest_window(true.gbuffer.normal, true.gbuffer.depth))  # fmt: skip
+        sheet = comparison(
+            {key: judge.developed(value, 0, at) for key, value in shown.items()},
+            mask=judge.mask(0),
+            window=steepest_window(true.gbuffer.normal, true.gbuffer.depth),
+        )
         write_png8(folder / f"alpinebench_{name}.png", np.round(255.0 * sheet).astype(np.uint8))
 
 
@@ -337,8 +369,10 @@ def main() -> None:
     print("\npainting and its completion alone, as the paper's, two painted hours, the same views")
     print_ablations(painting_rows)
     at = bench.world.painted_hours[0]
-    true, ours = (bench.judge.developed(value, 0, at) for value in
-                  (bench.judge.truth(0, at).radiance, bench.judge.of_texture(whole["textures"][at], 0, at)))  # fmt: skip
+    true, ours = (
+        bench.judge.developed(value, 0, at)
+        for value in (bench.judge.truth(0, at).radiance, bench.judge.of_texture(whole["textures"][at], 0, at))
+    )
     print("\nby distance, first painted hour, first view")
     print("\n".join(table_lines(by_distance(true, ours, bench.judge.truth(0, at).gbuffer.depth, bench.judge.mask(0)))))
     if arguments.figures is not None:

@@ -83,12 +83,35 @@ _QUICK_HOURS = (7.0, 8.5, 10.0, 12.0, 14.0, 15.5)
 SIZES = {
     "tiny": Size((3000.0, 3000.0), 60.0, 30.0, 2, 75.0, 96, 1, (144, 96), (8.5, 10.0, 14.0), _WEB, 60.0),
     "quick": Size((5400.0, 5400.0), 30.0, 18.0, 2, 75.0, 200, 1, (300, 200), _QUICK_HOURS, _WEB, 36.0),
-    "small": Size((8040.0, 8040.0), 30.0, 10.0, 2, 75.0, 512, 1, (768, 512), tuple(np.linspace(6.5, 16.0, 18).tolist()),
-                  _FINE, 40.0),
-    "medium": Size((12000.0, 12000.0), 30.0, 16.0, 7, 150.0, 384, 41, (288, 192), tuple(np.linspace(6.5, 16.0, 14).tolist()),
-                   _WEB, 60.0, 4),
+    "small": Size(
+        (8040.0, 8040.0),
+        30.0,
+        10.0,
+        2,
+        75.0,
+        512,
+        1,
+        (768, 512),
+        tuple(np.linspace(6.5, 16.0, 18).tolist()),
+        _FINE,
+        40.0,
+    ),
+    "medium": Size(
+        (12000.0, 12000.0),
+        30.0,
+        16.0,
+        7,
+        150.0,
+        384,
+        41,
+        (288, 192),
+        tuple(np.linspace(6.5, 16.0, 14).tolist()),
+        _WEB,
+        60.0,
+        4,
+    ),
     "large": Size((36500.0, 21000.0), 100.0, 30.0, 16, 150.0, 384, 16, (384, 256), (7.5, 9.5, 12.0, 15.0), _WEB, 120.0),
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True)
@@ -108,8 +131,11 @@ def massif_ground(seed: int, size: Size) -> Ground:
 
     place = alpine_massif(seed=seed, size_m=size.extent_m[0], spacing_m=size.spacing_m)
     finer = place.elevation.transform * Affine.scale(0.5)
-    return Ground(place.elevation, lambda day: Raster(alpine_albedo(place, day, upsample=2), finer, place.elevation.crs),
-                  LocalFrame(LATITUDE_DEG, LONGITUDE_DEG))  # fmt: skip
+    return Ground(
+        place.elevation,
+        lambda day: Raster(alpine_albedo(place, day, upsample=2), finer, place.elevation.crs),
+        LocalFrame(LATITUDE_DEG, LONGITUDE_DEG),
+    )
 
 
 def jungfrau_ground(seed: int, size: Size, data: Path) -> Ground:
@@ -121,8 +147,9 @@ def jungfrau_ground(seed: int, size: Size, data: Path) -> Ground:
 
     whole, _, albedo_of = jungfrau_land(data, np.random.default_rng(seed))
     cell_m = abs(whole.transform.a)
-    columns, rows = (min(round(extent / cell_m), n) for extent, n in
-                     zip(size.extent_m, whole.values.shape[1::-1], strict=True))  # fmt: skip
+    columns, rows = (
+        min(round(extent / cell_m), n) for extent, n in zip(size.extent_m, whole.values.shape[1::-1], strict=True)
+    )
     column, row = ~whole.transform * _WENGERNALP_UTM_M
     left = int(np.clip(round(column - columns / 2), 0, whole.values.shape[1] - columns))
     top = int(np.clip(round(row - rows / 2), 0, whole.values.shape[0] - rows))
@@ -192,8 +219,22 @@ def make_world(seed: int, size: Size, data: Path | None = None) -> World:
     painted_hours, held_hours = held_out_hours(times, 3)
     sky = with_overrides(read_sky_model("clear"), visibility_km=60.0)
     lights = lights_for(times, [*painting, *judged], sky, default_workspace())
-    return World(seed, size, terrain, atlas, bare, albedo, summer, painting, judged, painted_hours, held_hours,
-                 dict(zip(times, lights, strict=True)), sky, ground.frame)  # fmt: skip
+    return World(
+        seed,
+        size,
+        terrain,
+        atlas,
+        bare,
+        albedo,
+        summer,
+        painting,
+        judged,
+        painted_hours,
+        held_hours,
+        dict(zip(times, lights, strict=True)),
+        sky,
+        ground.frame,
+    )
 
 
 def choose_cameras(terrain: Terrain, bare: Occluder, size: Size, seed: int) -> tuple[list[Panorama], list[Camera]]:
@@ -208,15 +249,22 @@ def choose_cameras(terrain: Terrain, bare: Occluder, size: Size, seed: int) -> t
         azimuth, radius = rng.uniform(0.0, 360.0), rng.uniform(0.35, 0.9) * reach
         spot = radius * np.array([np.sin(np.radians(azimuth)), np.cos(np.radians(azimuth))])
         ground = terrain.vertices[np.argmin(((terrain.vertices[:, :2] - spot) ** 2).sum(axis=1)), 2]
-        camera = camera_of(np.append(spot, ground + rng.uniform(40.0, 250.0)), azimuth + 180.0 + rng.uniform(-35.0, 35.0),
-                           rng.uniform(-10.0, 2.0), (96, 64))  # fmt: skip
+        camera = camera_of(
+            np.append(spot, ground + rng.uniform(40.0, 250.0)),
+            azimuth + 180.0 + rng.uniform(-35.0, 35.0),
+            rng.uniform(-10.0, 2.0),
+            (96, 64),
+        )
         seen = trace_gbuffer(scene, camera)
         land = np.isfinite(seen.depth)
         if 0.5 < land.mean() < 0.93 and np.percentile(seen.depth[land], 5) > 120.0:
             found.append((camera, np.unique((seen.uv[land] * 96).astype(int) @ np.array([1, 96]))))
     judged, covered = _greedy(found, size.judged, np.zeros(0, int), None)
-    apart = [entry for entry in found
-             if all(np.linalg.norm(entry[0].position_m - other.position_m) > _APART_M for other in judged)]  # fmt: skip
+    apart = [
+        entry
+        for entry in found
+        if all(np.linalg.norm(entry[0].position_m - other.position_m) > _APART_M for other in judged)
+    ]
     painting, _ = _greedy(apart, size.webcams, np.zeros(0, int), covered)
     return [panorama_of(camera, size) for camera in painting], [resized(camera, size.judged_px) for camera in judged]
 
@@ -280,8 +328,12 @@ def take_pictures(world: World) -> Pictures:
     judged = [series(world, len(world.painting) + c, f"judge-{c}") for c in range(len(world.judged))]
     calibrated = [calibrated_by_clicks(world, c, pictures[0]) for c, pictures in enumerate(painting)]
     made = Pictures(painting, judged, calibrated)
-    used = [use_of(picture.observation, "painting") for row in painting for picture in row
-            if picture.observation.time in world.painted_hours]  # fmt: skip
+    used = [
+        use_of(picture.observation, "painting")
+        for row in painting
+        for picture in row
+        if picture.observation.time in world.painted_hours
+    ]
     seen = [use_of(picture.observation, "evaluation") for row in judged for picture in row]
     refuse_leaks(seen, used, kind="view")
     refuse_leaks([use for use in seen if use.time in world.held_hours], used, kind="hour")
@@ -313,8 +365,9 @@ def pose_errors(calibrated: Calibration, truth: Panorama) -> tuple[float, float]
     return abs((off[0] + 180.0) % 360.0 - 180.0), float(np.linalg.norm(off[3:6]))
 
 
-def observed(pictures: Pictures, world: World, time: datetime, *, gain: float | None = None,
-             true_pose: bool = False) -> list[tuple[Observation, dict, int]]:  # fmt: skip
+def observed(
+    pictures: Pictures, world: World, time: datetime, *, gain: float | None = None, true_pose: bool = False
+) -> list[tuple[Observation, dict, int]]:
     """Views cut out of the panoramas of a time, their poses' deviations, and the numbers of their webcams.
 
     Parameters

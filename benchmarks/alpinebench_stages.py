@@ -57,8 +57,16 @@ from seasonscapes.workspace import default_workspace
 _TEXEL = Effort(subpixels=1, rays=64, listed=32, senders=1024, rank=24)
 _SUBPIXELS = 3
 # Days and hours that Gaussians learn from; the judged day is not among them.
-LESSONS = (("2024-01-15", 11.0), ("2024-03-10", 8.5), ("2024-04-20", 15.0), ("2024-05-12", 6.5), ("2024-06-18", 12.0),
-           ("2024-07-05", 17.0), ("2024-08-14", 9.5), ("2024-10-08", 13.5))  # fmt: skip
+LESSONS = (
+    ("2024-01-15", 11.0),
+    ("2024-03-10", 8.5),
+    ("2024-04-20", 15.0),
+    ("2024-05-12", 6.5),
+    ("2024-06-18", 12.0),
+    ("2024-07-05", 17.0),
+    ("2024-08-14", 9.5),
+    ("2024-10-08", 13.5),
+)
 NEAR_M = 60.0
 
 
@@ -102,8 +110,14 @@ class Judge:
         """The views' light transport over a texture of albedo, by camera."""
         set_albedo(self.scene, albedo)
         chosen = range(len(self.ready)) if cameras is None else cameras
-        return {n: with_albedo(self.ready[n], view_albedo(self.world.bare, self.ready[n].coefficients),
-                               senders_albedo(self.ready[n].coefficients, albedo)) for n in chosen}  # fmt: skip
+        return {
+            n: with_albedo(
+                self.ready[n],
+                view_albedo(self.world.bare, self.ready[n].coefficients),
+                senders_albedo(self.ready[n].coefficients, albedo),
+            )
+            for n in chosen
+        }
 
     def of_albedo(self, albedo: np.ndarray, *, air: bool = True) -> Callable[[int, datetime], np.ndarray]:
         """Views of a texture of albedo under any light."""
@@ -133,8 +147,9 @@ class Judge:
         land = np.nan_to_num(sample_texture(texture, self.uv[camera])).mean(axis=2)
         return np.where(self.coverage[camera][..., None] > 0.5, self.matched(land, true, camera), true)
 
-    def scores(self, view: Callable[[int, datetime], np.ndarray], times, *, most: int | None = None,
-               mode: str = "valid") -> dict[str, float]:  # fmt: skip
+    def scores(
+        self, view: Callable[[int, datetime], np.ndarray], times, *, most: int | None = None, mode: str = "valid"
+    ) -> dict[str, float]:
         """Means over the (first) judged webcams and times, of the picture as it is and with its colours matched."""
         found = []
         for camera in range(len(self.rows))[:most]:
@@ -193,8 +208,13 @@ class Bench:
         """Relief, sun and the satellite's image."""
         day = [at.replace(hour=0, minute=0) + timedelta(hours=h) for h in range(24)]
         suns = np.asarray(sun_position(day, LATITUDE_DEG, LONGITUDE_DEG).direction, float)
-        return guides_for(self.world.terrain, self.world.atlas, satellite=satellite,
-                          sun_direction=sun_position(at, LATITUDE_DEG, LONGITUDE_DEG).direction, day_suns=suns)  # fmt: skip
+        return guides_for(
+            self.world.terrain,
+            self.world.atlas,
+            satellite=satellite,
+            sun_direction=sun_position(at, LATITUDE_DEG, LONGITUDE_DEG).direction,
+            day_suns=suns,
+        )
 
     def true_texture(self, light: Illumination, albedo: np.ndarray, land: Land | None = None) -> np.ndarray:
         """Radiance ``(R, S, 3)`` [cd/m²] that an albedo sends under a light."""
@@ -202,8 +222,16 @@ class Bench:
         received = sun_on_texels(land, light) + ambient_on_texels(land, light, albedo)
         return (albedo * received.reshape(albedo.shape) / np.pi).astype(np.float32)
 
-    def painted(self, at: datetime, options: PaintOptions | None = None, *, relit: np.ndarray | None = None, clean: bool = False,
-                true_pose: bool = False, air: bool = True) -> Painting:  # fmt: skip
+    def painted(
+        self,
+        at: datetime,
+        options: PaintOptions | None = None,
+        *,
+        relit: np.ndarray | None = None,
+        clean: bool = False,
+        true_pose: bool = False,
+        air: bool = True,
+    ) -> Painting:
         """The webcams' pictures of an hour, in the texture; ``relit`` is what an albedo says that they show."""
         lights = self.world.lights[at]
         gain = clean_gain(self.pictures, self.world, at) if clean else None
@@ -264,8 +292,9 @@ class Splats:
         self.bench, world = bench, bench.world
         self.surfels = terrain_surfels(world.terrain, world.size.disc_m)
         set_albedo(bench.judge.scene, world.albedo)
-        self.transport = trace_transport(world.bare, self.surfels, surfel_albedo(self.surfels, world.albedo), rays=64,
-                                         seed=world.seed)  # fmt: skip
+        self.transport = trace_transport(
+            world.bare, self.surfels, surfel_albedo(self.surfels, world.albedo), rays=64, seed=world.seed
+        )
         times = [hours(day, hour)[0] for day, hour in LESSONS]
         self.lights = [row[0] for row in lights_for(times, world.painting[:1], world.sky, default_workspace())]
         self.states = [light_state(self.transport, light, DAY_OF_YEAR) for light in self.lights]
@@ -285,11 +314,25 @@ class Splats:
         around = neighbourhood_mean(self.surfels.means, own, self.surfels.plan.spacing_m)
         received = surfel_irradiance(world.bare, self.surfels, self.lights, rays=64, seed=seed)
         lessons = lessons_from(self.states, [0] * len(self.states), own[None], received)
-        appearance = Appearance("full", own[None], around[None], self.transport, fourier_embedding(self.surfels.means, seed=seed),
-                                times=len(self.states), seed=seed)  # fmt: skip
+        appearance = Appearance(
+            "full",
+            own[None],
+            around[None],
+            self.transport,
+            fourier_embedding(self.surfels.means, seed=seed),
+            times=len(self.states),
+            seed=seed,
+        )
         distil(appearance, lessons, schedule=Schedule(surface_steps=600), seed=seed)
-        model = model_from(self.surfels, own[None], [DAY_OF_YEAR], self.transport, kind="full",
-                           frame=world.frame, appearance=learned_numbers(appearance))  # fmt: skip
+        model = model_from(
+            self.surfels,
+            own[None],
+            [DAY_OF_YEAR],
+            self.transport,
+            kind="full",
+            frame=world.frame,
+            appearance=learned_numbers(appearance),
+        )
         weights = [model_weights(model, camera) for camera in world.judged]
 
         def view(camera: int, at: datetime) -> np.ndarray:

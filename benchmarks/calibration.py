@@ -46,12 +46,14 @@ def by_points(trials: int, seed: int) -> dict:
         rng = np.random.default_rng(seed)
         scores = [score_points(point_trial(rng, panoramic=panoramic), noise_px=1.0) for _ in range(trials)]
         heading = np.array([s.heading_error_deg for s in scores])
-        numbers |= {f"points_{name}_heading_median_deg": np.median(heading),
-                    f"points_{name}_heading_p95_deg": np.quantile(heading, 0.95),
-                    f"points_{name}_heading_under_0.02_share": np.mean(heading < 0.02),
-                    f"points_{name}_focal_under_0.2pc_share": np.mean([s.focal_error < 0.002 for s in scores]),
-                    f"points_{name}_two_sigma_coverage": np.mean([s.within_two_sigma for s in scores]),
-                    f"points_{name}_wrong_all_found_share": np.mean([s.wrong_found for s in scores])}  # fmt: skip
+        numbers |= {
+            f"points_{name}_heading_median_deg": np.median(heading),
+            f"points_{name}_heading_p95_deg": np.quantile(heading, 0.95),
+            f"points_{name}_heading_under_0.02_share": np.mean(heading < 0.02),
+            f"points_{name}_focal_under_0.2pc_share": np.mean([s.focal_error < 0.002 for s in scores]),
+            f"points_{name}_two_sigma_coverage": np.mean([s.within_two_sigma for s in scores]),
+            f"points_{name}_wrong_all_found_share": np.mean([s.wrong_found for s in scores]),
+        }
     numbers["heading_error_deg"] = numbers["points_panorama_heading_median_deg"]
     return numbers
 
@@ -76,10 +78,15 @@ def by_skyline(trials: int, seed: int) -> dict:
         trial = picture_trial(rng, visibility_m=float(np.exp(rng.uniform(np.log(200.0), np.log(5000.0)))))
         fit = align_to_skyline(trial.image, trial.start, trial.rasters, trial.frame, mask=trial.mask, search=REHEARSAL)
         fooled += bool(fit.reliable and _error(fit, trial) >= 0.1)
-    return {"skyline_success_rate": np.mean(errors < 0.1), "skyline_heading_median_deg": np.median(errors),
-            "skyline_failures_not_flagged": int(np.sum((errors >= 0.1) & trusted)),
-            "skyline_trusted_share": np.mean(trusted), "skyline_seconds_median": np.median(seconds),
-            "fog_trials": fogs, "fog_failures_not_flagged": fooled}  # fmt: skip
+    return {
+        "skyline_success_rate": np.mean(errors < 0.1),
+        "skyline_heading_median_deg": np.median(errors),
+        "skyline_failures_not_flagged": int(np.sum((errors >= 0.1) & trusted)),
+        "skyline_trusted_share": np.mean(trusted),
+        "skyline_seconds_median": np.median(seconds),
+        "fog_trials": fogs,
+        "fog_failures_not_flagged": fooled,
+    }
 
 
 def _error(fit, trial) -> float:
@@ -94,17 +101,22 @@ def finse(folder: Path, figures: Path | None) -> dict:
     at = geodetic_from_map("EPSG:25832", _column(rows, "x_world"), _column(rows, "y_world"))
     latitude, longitude = (float(v) for v in geodetic_from_map("EPSG:25832", 419169.2, 6718421.3))
     frame = LocalFrame(latitude, longitude, 0.0, 0.13)
-    points = Correspondences(np.stack([_column(rows, "x_img"), _column(rows, "y_img")], -1),
-                             enu_from_geodetic(frame, *at, _column(rows, "z_world")),
-                             tuple(r["name"] for r in rows))  # fmt: skip
+    points = Correspondences(
+        np.stack([_column(rows, "x_img"), _column(rows, "y_img")], -1),
+        enu_from_geodetic(frame, *at, _column(rows, "z_world")),
+        tuple(r["name"] for r in rows),
+    )
     start = camera_at(frame, latitude, longitude, 1212.0, heading_deg=66.0, fov_deg=65.8, size_px=(1920, 1080))
     priors = Priors(k1=np.inf)
     everyone = calibrate(start, points, priors=priors, loss="squares")
     robust = calibrate(start, points, priors=priors)
     left_out = leave_one_out(start, points, priors=priors, loss="squares")
     rasters = [read_elevation(folder / "dsm_4m.tif"), read_elevation(folder / "dem_context_aster_100m.tif")]
-    search = Search(tilt_deg=10.0, focal=0.06, priors=Priors(tilt_deg=10.0, roll_deg=3.0, horizontal_m=3.0,
-                                                             vertical_m=3.0, focal=0.05, k1=0.1))  # fmt: skip
+    search = Search(
+        tilt_deg=10.0,
+        focal=0.06,
+        priors=Priors(tilt_deg=10.0, roll_deg=3.0, horizontal_m=3.0, vertical_m=3.0, focal=0.05, k1=0.1),
+    )
     image = encoded_from_file(folder / "2019-05-24_12-00-01.jpg")
     mask = np.ones(image.shape[:2], bool)
     mask[:60] = False
@@ -113,29 +125,42 @@ def finse(folder: Path, figures: Path | None) -> dict:
         save_overlay(
             figures / "finse_points.png", image, robust, points=points, horizon=fit.horizon, title="Finse, points"
         )
-        save_overlay(figures / "finse_skyline.png", image, fit.calibration, horizon=fit.horizon,
-                     title="Finse, skyline alone")  # fmt: skip
-    return {"finse_rms_px": everyone.rms_px, "finse_inlier_rms_px": robust.inlier_rms_px,
-            "finse_leave_one_out_px": float(np.sqrt(np.mean(np.sum(left_out**2, axis=1)))),
-            "finse_skyline_minus_points_deg": apart(fit.calibration.values[0], robust.values[0]),
-            "finse_skyline_sigma_deg": fit.heading_sigma_deg, "finse_skyline_trusted": int(fit.reliable)}  # fmt: skip
+        save_overlay(
+            figures / "finse_skyline.png", image, fit.calibration, horizon=fit.horizon, title="Finse, skyline alone"
+        )
+    return {
+        "finse_rms_px": everyone.rms_px,
+        "finse_inlier_rms_px": robust.inlier_rms_px,
+        "finse_leave_one_out_px": float(np.sqrt(np.mean(np.sum(left_out**2, axis=1)))),
+        "finse_skyline_minus_points_deg": apart(fit.calibration.values[0], robust.values[0]),
+        "finse_skyline_sigma_deg": fit.heading_sigma_deg,
+        "finse_skyline_trusted": int(fit.reliable),
+    }
 
 
 def aletsch(folder: Path, figures: Path | None) -> dict:
     """The 1890s photograph of the Aletsch glacier from its KML start, both ways with the same trust in its position."""
     rows = list(csv.DictReader((folder / "gcps.csv").read_text().splitlines()))
     frame = LocalFrame(46.4314217, 8.0932999, 0.0, 0.13)
-    points = Correspondences(np.stack([_column(rows, "col_px"), _column(rows, "row_px")], -1),
-                             enu_from_geodetic(frame, *(_column(rows, n) for n in ("lat_deg", "lon_deg", "z_m"))))  # fmt: skip
-    start = camera_at(frame, 46.4314217, 8.0932999, 2929.0, heading_deg=-63.37, pitch_deg=-11.28, fov_deg=63.08,
-                      size_px=(1024, 763))  # fmt: skip
+    points = Correspondences(
+        np.stack([_column(rows, "col_px"), _column(rows, "row_px")], -1),
+        enu_from_geodetic(frame, *(_column(rows, n) for n in ("lat_deg", "lon_deg", "z_m"))),
+    )
+    start = camera_at(
+        frame, 46.4314217, 8.0932999, 2929.0, heading_deg=-63.37, pitch_deg=-11.28, fov_deg=63.08, size_px=(1024, 763)
+    )
     rasters, numbers = [read_elevation(folder / "dem_aster_25m.tif")], {}
     image = encoded_from_file(folder / "photo_07861v.jpg")
     for sigma_m in (5.0, 10.0):
         priors = Priors(horizontal_m=sigma_m, vertical_m=sigma_m)
         solved = calibrate(start, points, priors=priors, loss="squares")
-        search = Search(heading_deg=10.0, tilt_deg=5.0, focal=0.18, terrain_sigma_m=15.0,
-                        priors=Priors(tilt_deg=5.0, roll_deg=2.0, horizontal_m=sigma_m, vertical_m=sigma_m, focal=0.1))  # fmt: skip
+        search = Search(
+            heading_deg=10.0,
+            tilt_deg=5.0,
+            focal=0.18,
+            terrain_sigma_m=15.0,
+            priors=Priors(tilt_deg=5.0, roll_deg=2.0, horizontal_m=sigma_m, vertical_m=sigma_m, focal=0.1),
+        )
         fit = align_to_skyline(image, start, rasters, frame, search=search)
         numbers[f"aletsch_skyline_minus_points_deg_gps{sigma_m:.0f}m"] = apart(
             fit.calibration.values[0], solved.values[0]
@@ -145,8 +170,9 @@ def aletsch(folder: Path, figures: Path | None) -> dict:
     numbers["aletsch_rms_px"] = free.rms_px
     if figures:
         save_overlay(figures / "aletsch_points.png", image, free, points=points, title="Aletsch, points")
-        save_overlay(figures / "aletsch_skyline.png", image, fit.calibration, horizon=fit.horizon,
-                     title="Aletsch, skyline alone")  # fmt: skip
+        save_overlay(
+            figures / "aletsch_skyline.png", image, fit.calibration, horizon=fit.horizon, title="Aletsch, skyline alone"
+        )
     return numbers
 
 

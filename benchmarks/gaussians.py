@@ -121,8 +121,12 @@ class Scene:
         model, found, days = read_sky_model("clear"), [], []
         while len(found) < count:
             at = float(self.rng.integers(1, 366)) if day is None else day
-            moment = moment_at(datetime(2024, 1, 1, tzinfo=UTC) + timedelta(days=at - 1, hours=float(self.rng.uniform(4, 20))),
-                               self.frame.latitude_deg, self.frame.longitude_deg, 2000.0)  # fmt: skip
+            moment = moment_at(
+                datetime(2024, 1, 1, tzinfo=UTC) + timedelta(days=at - 1, hours=float(self.rng.uniform(4, 20))),
+                self.frame.latitude_deg,
+                self.frame.longitude_deg,
+                2000.0,
+            )
             if moment.sun.elevation_deg > 4.0:
                 found.append(light_at(model, moment, 2000.0, workspace=default_workspace()))
                 days.append(at)
@@ -147,8 +151,10 @@ def truth_of(scene: Scene, terrain, camera, lights, states, *, seed: int = 3) ->
 
     below = cv2.dilate(scene.underside(camera).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     solid = (ready.coverage > 0.999) & ~below
-    pictures = [relight_view(ready, light).surface * np.float32(np.pi / state.global_lx)
-                for light, state in zip(lights, states, strict=True)]  # fmt: skip
+    pictures = [
+        relight_view(ready, light).surface * np.float32(np.pi / state.global_lx)
+        for light, state in zip(lights, states, strict=True)
+    ]
     return Truth(np.stack(pictures), solid)
 
 
@@ -204,15 +210,25 @@ class Contest:
         start = time.perf_counter()
         self.truth = [truth_of(scene, scene.occluder, camera, self.lights, self.states) for camera in scene.cameras]
         self.seconds["views"] = time.perf_counter() - start
-        self.frames = [Frame(self.weights[v], t, self.truth[v].pictures[t], self.truth[v].solid)
-                       for v in range(3) for t in range(self.suns)]  # fmt: skip
+        self.frames = [
+            Frame(self.weights[v], t, self.truth[v].pictures[t], self.truth[v].solid)
+            for v in range(3)
+            for t in range(self.suns)
+        ]
 
     def appearance(self, kind: str):
         from seasonscapes.gaussians.appearance import EMBEDDING, Appearance, fourier_embedding
 
         size = 24 if kind in ("code", "sun") else EMBEDDING
-        return Appearance(kind, self.albedo[None], self.around[None], self.transport,
-                          fourier_embedding(self.surfels.means, size, seed=self.seed), times=self.suns, seed=self.seed)  # fmt: skip
+        return Appearance(
+            kind,
+            self.albedo[None],
+            self.around[None],
+            self.transport,
+            fourier_embedding(self.surfels.means, size, seed=self.seed),
+            times=self.suns,
+            seed=self.seed,
+        )
 
     def trained(self, kind: str):
         from seasonscapes.gaussians.distil import Schedule, distil
@@ -266,8 +282,11 @@ class Contest:
 
     def score_pictures(self, share) -> float:
         """Mean PSNR on the training cameras of pictures mixed from training ones by weights ``share(t) (suns,)``."""
-        values = [psnr(np.einsum("t,thwc->hwc", share(t), truth.pictures[: self.suns]), truth.pictures[t], truth.solid)
-                  for truth in self.truth[:3] for t in self.held_out]  # fmt: skip
+        values = [
+            psnr(np.einsum("t,thwc->hwc", share(t), truth.pictures[: self.suns]), truth.pictures[t], truth.solid)
+            for truth in self.truth[:3]
+            for t in self.held_out
+        ]
         return float(np.mean(values))
 
     def sun_weights(self, power: float):
@@ -334,8 +353,10 @@ def seasons(contest: Contest, appearance) -> dict[str, float]:
         for name, albedo in guesses.items():
             around = neighbourhood_mean(surfels.means, albedo, surfels.plan.spacing_m)
             appearance.albedo, appearance.around = torch.as_tensor(albedo)[None], torch.as_tensor(around)[None]
-            values = [psnr(contest.picture(0, colours_at(appearance, state)), picture, truth.solid)
-                      for state, picture in zip(states, truth.pictures, strict=True)]  # fmt: skip
+            values = [
+                psnr(contest.picture(0, colours_at(appearance, state)), picture, truth.solid)
+                for state, picture in zip(states, truth.pictures, strict=True)
+            ]
             result[f"season_{('seen', 'unseen', 'seen2')[number]}{name}_psnr_db"] = float(np.mean(values))
     appearance.albedo, appearance.around = held
     return result
@@ -387,11 +408,20 @@ def speed(contest: Contest, appearance) -> dict[str, float]:
     noisy_db = psnr(noisy[part, part] * scale, truth.pictures[0], truth.solid)
     equal = spp * 10.0 ** ((splats_db - noisy_db) / 10.0)
     check, _ = path_trace(lit, middle, spp=256, seed=6)
-    return {"frame_ms": 1e3 * moving, "frames_per_second": 1.0 / moving, "torch_frame_ms": 1e3 * in_torch,
-            "still_camera_ms": 1e3 * still, "colours_ms": 1e3 * relit, "frame_psnr_db": splats_db,
-            "path_8spp_psnr_db": noisy_db, "path_spp_of_equal_error": equal, "path_seconds_of_equal_error": equal * seconds,
-            "speedup_vs_path": equal * seconds / moving, "speedup_vs_path_still_camera": equal * seconds / still,
-            "truth_vs_path_psnr_db": psnr(check * scale, truth.pictures[0], truth.solid)}  # fmt: skip
+    return {
+        "frame_ms": 1e3 * moving,
+        "frames_per_second": 1.0 / moving,
+        "torch_frame_ms": 1e3 * in_torch,
+        "still_camera_ms": 1e3 * still,
+        "colours_ms": 1e3 * relit,
+        "frame_psnr_db": splats_db,
+        "path_8spp_psnr_db": noisy_db,
+        "path_spp_of_equal_error": equal,
+        "path_seconds_of_equal_error": equal * seconds,
+        "speedup_vs_path": equal * seconds / moving,
+        "speedup_vs_path_still_camera": equal * seconds / still,
+        "truth_vs_path_psnr_db": psnr(check * scale, truth.pictures[0], truth.solid),
+    }
 
 
 def best(call, rounds: int = 5) -> float:
@@ -433,8 +463,15 @@ def packed_scores(contest: Contest, appearance) -> dict[str, float]:
     from seasonscapes.gaussians.model import bytes_each, model_from, packed, unpacked
     from seasonscapes.gaussians.render import appearance_of, learned_numbers
 
-    model = model_from(contest.surfels, contest.albedo[None], [SUMMER_DAY], contest.transport, kind="full",
-                       frame=contest.scene.frame, appearance=learned_numbers(appearance))  # fmt: skip
+    model = model_from(
+        contest.surfels,
+        contest.albedo[None],
+        [SUMMER_DAY],
+        contest.transport,
+        kind="full",
+        frame=contest.scene.frame,
+        appearance=learned_numbers(appearance),
+    )
     again = contest.score(appearance_of(unpacked(*packed(model))))
     return {"bytes_per_gaussian": bytes_each(model), "packed_held_out_hour_psnr_db": again[0]}
 

@@ -69,8 +69,9 @@ def reference_of(scene, camera, corners: list, spp: int, seed: int) -> tuple[np.
     cover = []
     for corner in corners:
         for half in range(2):
-            image, coverage = path_trace(scene, block_camera(camera, corner), spp=spp // 2, seed=seed + half,
-                                         max_depth=arena.MAX_DEPTH)[:2]  # fmt: skip
+            image, coverage = path_trace(
+                scene, block_camera(camera, corner), spp=spp // 2, seed=seed + half, max_depth=arena.MAX_DEPTH
+            )[:2]
             halves[half].append(image.reshape(-1, 3))
         cover.append(coverage.reshape(-1))
     return np.concatenate(halves[0]), np.concatenate(halves[1]), np.concatenate(cover)
@@ -103,8 +104,11 @@ def equal_error(folder: Path, arguments: argparse.Namespace, seed: int) -> dict[
     terrain, ready, cost = coefficients_of(scene, camera, seed % 2**30)
     print(f"coefficients: {cost['seconds']:.1f} s, {cost['cpu_seconds']:.1f} s of CPU", flush=True)
     light = scene.illumination
-    renders = {"coefficients": lambda spp, seed: arena.timed(lambda: relight_view(ready, light).radiance),
-               "path (ours)": arena.ours(scene, camera), "mitsuba": arena.bare(folder, "directional")}  # fmt: skip
+    renders = {
+        "coefficients": lambda spp, seed: arena.timed(lambda: relight_view(ready, light).radiance),
+        "path (ours)": arena.ours(scene, camera),
+        "mitsuba": arena.bare(folder, "directional"),
+    }
     cycles = arena.Cycles(arguments.bpy_python, folder) if arguments.bpy_python else None
     if cycles is not None:
         renders["cycles"] = cycles
@@ -124,20 +128,33 @@ def equal_error(folder: Path, arguments: argparse.Namespace, seed: int) -> dict[
     lit, shadow = land & (seen > 0.9), land & (seen < 0.02)
     mine = cut(results["coefficients"]["images"][0], corners)
     record = {
-        "triangles": facts["triangles"], "width_px": width_px, "reference_spp": reference_spp,
-        "reference_noise": float(noise), "reference_median_error": float(median), "pixels_lit": int(lit.sum()), "pixels_shadow": int(shadow.sum()),
-        "rel_rmse": rel_rmse(mine, truth, land), "rel_rmse_lit": rel_rmse(mine, truth, lit),
-        "rel_rmse_shadow": rel_rmse(mine, truth, shadow), "mean_difference": float(mine[land].mean() / truth[land].mean() - 1.0),
-        "precompute_s": cost["seconds"], "precompute_cpu_s": cost["cpu_seconds"],
+        "triangles": facts["triangles"],
+        "width_px": width_px,
+        "reference_spp": reference_spp,
+        "reference_noise": float(noise),
+        "reference_median_error": float(median),
+        "pixels_lit": int(lit.sum()),
+        "pixels_shadow": int(shadow.sum()),
+        "rel_rmse": rel_rmse(mine, truth, land),
+        "rel_rmse_lit": rel_rmse(mine, truth, lit),
+        "rel_rmse_shadow": rel_rmse(mine, truth, shadow),
+        "mean_difference": float(mine[land].mean() / truth[land].mean() - 1.0),
+        "precompute_s": cost["seconds"],
+        "precompute_cpu_s": cost["cpu_seconds"],
         "frame_s": float(np.median(results["coefficients"]["seconds"])),
         "frame_cpu_s": float(np.median(results["coefficients"]["cpu_seconds"])),
-    }  # fmt: skip
+    }
     # Only what the coefficients add counts: the reference's noise is in the difference too.
     goal = np.sqrt(max(record["rel_rmse"] ** 2 - noise**2, 1e-12))
     for name, key in (("path (ours)", "own_path"), ("mitsuba", "path"), ("cycles", "cycles")):
         if name in results:
-            record |= _rival(results[name], [cut(image, corners) for image in results[name]["images"]], land, spp,
-                             {"goal": goal, "key": key, **record})  # fmt: skip
+            record |= _rival(
+                results[name],
+                [cut(image, corners) for image in results[name]["images"]],
+                land,
+                spp,
+                {"goal": goal, "key": key, **record},
+            )
     record |= sun_ray_throughput(terrain, ready, light)
     if arguments.pictures:
         save_pictures(arguments.pictures, results)
@@ -257,8 +274,12 @@ def visibility_agreement(seed: int, count: int) -> dict[str, float]:
         direction = direction_from_angles(rng.uniform(0, 360), rng.uniform(2.0, 60.0))
         sun = Luminary(direction, np.full(3, 1e5), 0.001)
         each = points.reshape(-1, 1)
-        rays = sun_rays(terrain, (each.origin, each.normal, each.outward), np.ones((len(found), 1), np.float32),
-                        numbered_turn(found))  # fmt: skip
+        rays = sun_rays(
+            terrain,
+            (each.origin, each.normal, each.outward),
+            np.ones((len(found), 1), np.float32),
+            numbered_turn(found),
+        )
         seen = cosine_seen(rays, sun)[:, 0] > 0.0
         # Only places that face the sun: on the others there is nothing to ask.
         facing = np.minimum(points.outward @ direction, points.normal @ direction) > 0.1
@@ -306,8 +327,15 @@ def a_year(frames: int, width_px: int) -> dict[str, float]:
         for day in (datetime(2024, 1, 16, tzinfo=UTC), datetime(2024, 7, 16, tzinfo=UTC)):
             save_texture(albedo_for(place, day), Path(name) / f"{day:%m%d}.npz")
             dated.append((day.date().isoformat(), str(Path(name) / f"{day:%m%d}.npz")))
-        assignment = Assignment(str(path), name, MeshOptions(), read_scene(path).camera(None), (width_px, width_px * 2 // 3),
-                                read_sky_model("clear"), albedo=tuple(dated))  # fmt: skip
+        assignment = Assignment(
+            str(path),
+            name,
+            MeshOptions(),
+            read_scene(path).camera(None),
+            (width_px, width_px * 2 // 3),
+            read_sky_model("clear"),
+            albedo=tuple(dated),
+        )
         clock = {"coefficients": time.perf_counter()}
         held_studio(assignment)
         clock["frames"] = time.perf_counter()
@@ -325,12 +353,14 @@ def a_year(frames: int, width_px: int) -> dict[str, float]:
         clock["end"] = time.perf_counter()
     share = len(bright) / frames
     return {
-        "year_frames": len(bright), "year_measured_frames": frames,
+        "year_frames": len(bright),
+        "year_measured_frames": frames,
         "year_coefficients_s": clock["frames"] - clock["coefficients"],
-        "year_frame_s": (clock["film"] - clock["frames"]) / frames, "year_frame_cpu_s": cpu / frames,
+        "year_frame_s": (clock["film"] - clock["frames"]) / frames,
+        "year_frame_cpu_s": cpu / frames,
         "year_film_s_per_frame": (clock["end"] - clock["film"]) / frames,
         "year_minutes": (clock["frames"] - clock["coefficients"] + share * (clock["end"] - clock["frames"])) / 60.0,
-    }  # fmt: skip
+    }
 
 
 _MEMORY = """

@@ -64,8 +64,16 @@ def make_scene(seed: int, folder: Path, *, width_px: int, threads: int):
     light = hosek_illumination(direction_from_angles(135.0, 38.0))
     start = time.perf_counter()
     scene = build_scene(terrain, albedo, light)
-    camera = camera_at(terrain.frame, 46.60, 7.95, 4200.0, heading_deg=160.0, pitch_deg=-14.0, fov_deg=60.0,
-                       size_px=(width_px, width_px * 2 // 3))  # fmt: skip
+    camera = camera_at(
+        terrain.frame,
+        46.60,
+        7.95,
+        4200.0,
+        heading_deg=160.0,
+        pitch_deg=-14.0,
+        fov_deg=60.0,
+        size_px=(width_px, width_px * 2 // 3),
+    )
     facts = {
         "triangles": len(terrain.faces),
         "build_seconds": time.perf_counter() - start,
@@ -98,8 +106,14 @@ def write_files(folder: Path, facts: dict, scene, terrain, albedo: np.ndarray) -
     sky = np.array(mi.traverse(scene.mi_scene.environment())["data"])[:, :-1]
     write_exr(folder / "sky.exr", {"": sky})
     write_exr(folder / "albedo.exr", {"": albedo})
-    np.savez(folder / "scene.npz", vertices=terrain.vertices, faces=terrain.faces, uv=terrain.uv, albedo=albedo,
-             sky=scene.illumination.sky_radiance)  # fmt: skip
+    np.savez(
+        folder / "scene.npz",
+        vertices=terrain.vertices,
+        faces=terrain.faces,
+        uv=terrain.uv,
+        albedo=albedo,
+        sky=scene.illumination.sky_radiance,
+    )
     (folder / "facts.json").write_text(json.dumps(facts))
 
 
@@ -138,8 +152,12 @@ class Cycles:
 
     def __init__(self, python: str, folder: Path):
         self.folder = folder
-        self.process = subprocess.Popen([python, str(HERE / "cycles_render.py"), str(folder)], text=True,
-                                        stdin=subprocess.PIPE, stdout=subprocess.PIPE)  # fmt: skip
+        self.process = subprocess.Popen(
+            [python, str(HERE / "cycles_render.py"), str(folder)],
+            text=True,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+        )
         self.about = self.answer("ready")
 
     def answer(self, word: str) -> dict:
@@ -253,12 +271,16 @@ def record_of(table: dict[str, dict], results: dict[str, dict]) -> dict[str, flo
 
 def show(table: dict[str, dict], record: dict[str, float]) -> None:
     """The table as text."""
-    print(f"\n{'':18s}{'Msamples/s':>11s}{'per CPU s':>11s}{'net':>8s}{'noise':>9s}{'1/(var·s)':>11s}{'first call':>12s}"
-          f"{'1 spp':>9s}{'mean diff':>11s}{'block diff':>12s}")  # fmt: skip
+    print(
+        f"\n{'':18s}{'Msamples/s':>11s}{'per CPU s':>11s}{'net':>8s}{'noise':>9s}{'1/(var·s)':>11s}{'first call':>12s}"
+        f"{'1 spp':>9s}{'mean diff':>11s}{'block diff':>12s}"
+    )
     for name, row in table.items():
-        print(f"{name:18s}{row['msamples_per_s']:11.3f}{row['msamples_per_cpu_s']:11.3f}{row['msamples_per_cpu_s_net']:8.3f}"
-              f"{row['noise']:9.4f}{row['efficiency']:11.2f}{row['first_s']:10.2f} s{row['seconds_1spp']:7.2f} s"
-              f"{row['mean_difference']:+11.4f}{row['block_difference']:12.4f}")  # fmt: skip
+        print(
+            f"{name:18s}{row['msamples_per_s']:11.3f}{row['msamples_per_cpu_s']:11.3f}{row['msamples_per_cpu_s_net']:8.3f}"
+            f"{row['noise']:9.4f}{row['efficiency']:11.2f}{row['first_s']:10.2f} s{row['seconds_1spp']:7.2f} s"
+            f"{row['mean_difference']:+11.4f}{row['block_difference']:12.4f}"
+        )
     print()
     for key, value in record.items():
         if "_vs_" in key:
@@ -306,8 +328,11 @@ def main() -> None:
     with cache, tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         scene, camera, facts = make_scene(seed, folder, width_px=width_px, threads=arguments.threads)
-        renders: dict[str, Render] = {"ours": ours(scene, camera), "bare_polygon": bare(folder, "polygon"),
-                                      "bare_directional": bare(folder, "directional")}  # fmt: skip
+        renders: dict[str, Render] = {
+            "ours": ours(scene, camera),
+            "bare_polygon": bare(folder, "polygon"),
+            "bare_directional": bare(folder, "directional"),
+        }
         cycles = Cycles(arguments.bpy_python, folder) if arguments.bpy_python else None
         if cycles is None:
             print("no Cycles column: neither --bpy-python nor SEASONSCAPES_BPY_PYTHON names a Python that has bpy")
@@ -329,8 +354,15 @@ def main() -> None:
     if arguments.pictures:
         save_pictures(arguments.pictures, results)
     if arguments.json:
-        record |= {"seed": seed, "threads": arguments.threads, "triangles": facts["triangles"], "spp": spp, "width_px": width_px,
-                   "rounds": rounds, "load_1min": os.getloadavg()[0]}  # fmt: skip
+        record |= {
+            "seed": seed,
+            "threads": arguments.threads,
+            "triangles": facts["triangles"],
+            "spp": spp,
+            "width_px": width_px,
+            "rounds": rounds,
+            "load_1min": os.getloadavg()[0],
+        }
         arguments.json.write_text(json.dumps(record, indent=1))
 
 

@@ -73,9 +73,10 @@ def day_numbers(quick: bool, seed: int) -> dict[str, float]:
             for name, column in (("direct ", deviation[:, 0]), ("diffuse", deviation[:, 1])):
                 print(f"{height:6.0f}  {depth:.2f}  {name} " + " ".join(f"{100 * d:6.1f}" for d in column), flush=True)
     return {
-        "direct_error_max": float(np.abs(direct).max()), "diffuse_error_max": float(np.abs(diffuse).max()),
+        "direct_error_max": float(np.abs(direct).max()),
+        "diffuse_error_max": float(np.abs(diffuse).max()),
         "diffuse_error_mean": float(np.abs(diffuse).mean()),
-    }  # fmt: skip
+    }
 
 
 def altitude_numbers(quick: bool, seed: int) -> dict[str, float]:
@@ -85,17 +86,22 @@ def altitude_numbers(quick: bool, seed: int) -> dict[str, float]:
     for elevation in (15.0, 30.0, 60.0, 75.0):
         found = np.array([our_illuminance_lx(tables, elevation, height) for height in heights])
         above = [air.aerosol_optical_depth_500nm * np.exp(-h / air.aerosol_scale_height_m) for h in heights]
-        expected = np.array([
-            spectrl2_illuminance_lx(elevation, depth, height, angstrom_exponent=air.angstrom_exponent)
-            for depth, height in zip(above, heights, strict=True)
-        ])  # fmt: skip
+        expected = np.array(
+            [
+                spectrl2_illuminance_lx(elevation, depth, height, angstrom_exponent=air.angstrom_exponent)
+                for depth, height in zip(above, heights, strict=True)
+            ]
+        )
         ratio, theirs = found[1] / found[0], expected[1] / expected[0]
         sun = direction_from_angles(0.0, elevation)
         top = [luminance(sky_radiance_map(tables, sun, h, shape=(64, 8))[0].mean(0)) for h in heights]
         zenith[elevation] = float(top[1] / top[0])
         worst.append(np.abs(ratio / theirs - 1.0))
-        print(f"3500 m over 500 m, sun {elevation:.0f}°: direct {ratio[0]:.3f} (SPECTRL2 {theirs[0]:.3f}), diffuse "
-              f"{ratio[1]:.3f} ({theirs[1]:.3f}), zenith {zenith[elevation]:.3f}", flush=True)  # fmt: skip
+        print(
+            f"3500 m over 500 m, sun {elevation:.0f}°: direct {ratio[0]:.3f} (SPECTRL2 {theirs[0]:.3f}), diffuse "
+            f"{ratio[1]:.3f} ({theirs[1]:.3f}), zenith {zenith[elevation]:.3f}",
+            flush=True,
+        )
     return {
         "altitude_direct_error_max": float(np.max(worst, axis=0)[0]),
         "altitude_diffuse_error_max": float(np.max(worst, axis=0)[1]),
@@ -148,11 +154,12 @@ def air_numbers(quick: bool, seed: int) -> dict[str, float]:
     transmittance = air(distance, np.broadcast_to(direction_from_angles(20.0, 2.0), (30, 3)))[0][:, 1]
     white = tables_of(refraction=False, ozone_du=0.0, single_scattering_albedo=1.0, ground_albedo=1.0)
     numbers = {
-        "aerial_error_max": float(np.abs(errors).max()), "aerial_error_mean": float(np.abs(errors).mean()),
+        "aerial_error_max": float(np.abs(errors).max()),
+        "aerial_error_mean": float(np.abs(errors).mean()),
         "aerial_horizon_gap_max": float(np.abs(gaps).max()),
         "koschmieder_error_max": float(np.abs(transmittance / np.exp(-3.912 * distance / 50e3) - 1.0).max()),
         "energy_error_max": float(np.abs(energy_imbalance(white)).max()),
-    }  # fmt: skip
+    }
     print("\n".join(f"{name:28s} {value:.5f}" for name, value in numbers.items()), flush=True)
     return numbers
 
@@ -174,19 +181,23 @@ def oracle_numbers(quick: bool, seed: int) -> dict[str, float]:
                     deviation, noise = against_oracle(tables, sun, direction, paths=paths, seed=seed + 2 * len(rows))
                 rows.append((deviation, noise))
         rows = np.array(rows)
-        print(f"sun {sun:5.1f}°: deviation max {100 * np.abs(rows[:, 0]).max():.1f} %, mean "
-              f"{100 * np.abs(rows[:, 0]).mean():.1f} %, signed mean {100 * rows[:, 0].mean():+.1f} %; the oracle's own "
-              f"standard error up to {100 * rows[:, 1].max():.1f} %", flush=True)  # fmt: skip
+        print(
+            f"sun {sun:5.1f}°: deviation max {100 * np.abs(rows[:, 0]).max():.1f} %, mean "
+            f"{100 * np.abs(rows[:, 0]).mean():.1f} %, signed mean {100 * rows[:, 0].mean():+.1f} %; the oracle's own "
+            f"standard error up to {100 * rows[:, 1].max():.1f} %",
+            flush=True,
+        )
         name = f"oracle_error_max_sun{sun:+.0f}"
         numbers[name] = float(np.abs(rows[:, 0]).max())
         if sun in ORACLE_SUNS_DEG:
             everything.append(rows)
     rows = np.concatenate(everything)
     return numbers | {
-        "oracle_error_max": float(np.abs(rows[:, 0]).max()), "oracle_error_mean": float(np.abs(rows[:, 0]).mean()),
+        "oracle_error_max": float(np.abs(rows[:, 0]).max()),
+        "oracle_error_mean": float(np.abs(rows[:, 0]).mean()),
         "oracle_noise_max": float(rows[:, 1].max()),
         "oracle_within_5_percent": float((np.abs(rows[:, 0]) < 0.05).mean()),
-    }  # fmt: skip
+    }
 
 
 def step_numbers(quick: bool, seed: int) -> dict[str, float]:
@@ -199,10 +210,12 @@ def step_numbers(quick: bool, seed: int) -> dict[str, float]:
     near = (np.abs(elevations[1:]) < 1.05) & (np.abs(elevations[:-1]) < 1.05)
     usno = np.array([oracles_usno.supplement_sun_lx(e) for e in np.arange(1.0, -0.85, -0.1)])
     numbers = {
-        "step_max": float(beyond.max()), "step_max_near_zero": float(beyond[np.abs(elevations[1:-2]) < 1.05].max()),
-        "step_raw_zero": float(raw[near].max()), "step_raw_max": float(raw.max()),
+        "step_max": float(beyond.max()),
+        "step_max_near_zero": float(beyond[np.abs(elevations[1:-2]) < 1.05].max()),
+        "step_raw_zero": float(raw[near].max()),
+        "step_raw_max": float(raw.max()),
         "step_raw_zero_usno": float(np.abs(np.diff(np.log(usno))).max()),
-    }  # fmt: skip
+    }
     print("\n".join(f"{name:28s} {value:.4f}" for name, value in numbers.items()), flush=True)
     return numbers
 
@@ -224,11 +237,12 @@ def speed_numbers(quick: bool, seed: int) -> dict[str, float]:
     depth, started = random.uniform(10.0, 6e4, 1_000_000), time.perf_counter()
     light.aerial_perspective(depth, direction)
     numbers = {
-        "seconds_tables": seconds_tables, "seconds_first_illumination": first,
+        "seconds_tables": seconds_tables,
+        "seconds_first_illumination": first,
         "seconds_per_illumination": float(np.median(taken, axis=0)[0]),
         "processor_seconds_per_illumination": float(np.median(taken, axis=0)[1]),
         "seconds_per_megapixel_of_aerial_perspective": time.perf_counter() - started,
-    }  # fmt: skip
+    }
     print("\n".join(f"{name:44s} {value:.3f}" for name, value in numbers.items()), flush=True)
     return numbers
 
@@ -243,9 +257,15 @@ def night_part(quick: bool, seed: int) -> dict[str, float]:
 
 
 PARTS: dict[str, Callable[[bool, int], dict[str, float]]] = {
-    "speed": speed_numbers, "day": day_numbers, "altitude": altitude_numbers, "colour": colour_numbers,
-    "air": air_numbers, "steps": step_numbers, "oracle": oracle_numbers, "night": night_part,
-}  # fmt: skip
+    "speed": speed_numbers,
+    "day": day_numbers,
+    "altitude": altitude_numbers,
+    "colour": colour_numbers,
+    "air": air_numbers,
+    "steps": step_numbers,
+    "oracle": oracle_numbers,
+    "night": night_part,
+}
 
 
 def plot_domes(folder: Path) -> None:

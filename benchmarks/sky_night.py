@@ -117,8 +117,10 @@ def print_rows(rows: list[NightRow]) -> None:
     """The comparison as a table."""
     print(f"{'source':10s} {'altitude':>8s} {'ours lx':>10s} {'Supplement':>11s} {'Circular':>10s}   factors")
     for row in rows:
-        print(f"{row.source:10s} {row.altitude_deg:7.0f}° {row.ours_lx:10.4g} {row.supplement_lx:11.4g} "
-              f"{row.circular_lx:10.4g}   {row.factors[0]:.2f} {row.factors[1]:.2f}")  # fmt: skip
+        print(
+            f"{row.source:10s} {row.altitude_deg:7.0f}° {row.ours_lx:10.4g} {row.supplement_lx:11.4g} "
+            f"{row.circular_lx:10.4g}   {row.factors[0]:.2f} {row.factors[1]:.2f}"
+        )
 
 
 def main() -> None:

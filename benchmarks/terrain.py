@@ -46,8 +46,18 @@ def write_massif(path: Path, rows: int, columns: int, spacing_m: float, seed: in
     from affine import Affine
 
     transform = Affine(spacing_m, 0, LV95_ORIGIN_M[0], 0, -spacing_m, LV95_ORIGIN_M[1])
-    with rasterio.open(path, "w", driver="GTiff", count=1, height=rows, width=columns, dtype="float32",
-                       crs="EPSG:2056", transform=transform, tiled=True) as file:  # fmt: skip
+    with rasterio.open(
+        path,
+        "w",
+        driver="GTiff",
+        count=1,
+        height=rows,
+        width=columns,
+        dtype="float32",
+        crs="EPSG:2056",
+        transform=transform,
+        tiled=True,
+    ) as file:
         file.write(fractal_heights(rows, columns, spacing_m, seed), 1)
 
 
@@ -74,10 +84,16 @@ def adaptive_3000km2(seed: int, folder: str) -> dict:
     terrain = build_mesh(raster, centre_frame(raster), max_error_m=5.0)
     seconds, peak_gb = time.perf_counter() - start, peak_memory_gb()
     report = mesh_report(terrain, raster)
-    return {"seconds_3000km2": seconds, "peak_gb": peak_gb, "samples_3000km2": report.samples,
-            "triangles_3000km2": report.triangles, "triangles_saved_ratio": report.saved_ratio,
-            "vertical_rmse_m": report.vertical_rmse_m, "vertical_max_m": report.vertical_max_m,
-            "uncovered_samples": report.uncovered_samples}  # fmt: skip
+    return {
+        "seconds_3000km2": seconds,
+        "peak_gb": peak_gb,
+        "samples_3000km2": report.samples,
+        "triangles_3000km2": report.triangles,
+        "triangles_saved_ratio": report.saved_ratio,
+        "vertical_rmse_m": report.vertical_rmse_m,
+        "vertical_max_m": report.vertical_max_m,
+        "uncovered_samples": report.uncovered_samples,
+    }
 
 
 def grid_3000km2(seed: int, folder: str) -> dict:
@@ -88,8 +104,11 @@ def grid_3000km2(seed: int, folder: str) -> dict:
     start = time.perf_counter()
     raster = read_elevation(Path(folder) / "massif.tif")
     terrain = build_mesh(raster, centre_frame(raster), mesher="grid")
-    return {"grid_seconds_3000km2": time.perf_counter() - start, "grid_peak_gb": peak_memory_gb(),
-            "grid_triangles_3000km2": len(terrain.faces)}  # fmt: skip
+    return {
+        "grid_seconds_3000km2": time.perf_counter() - start,
+        "grid_peak_gb": peak_memory_gb(),
+        "grid_triangles_3000km2": len(terrain.faces),
+    }
 
 
 def atlases_3000km2(seed: int, folder: str) -> dict:
@@ -121,8 +140,12 @@ def jungfrau(seed: int, folder: str) -> dict:
         terrain = build_mesh(raster, frame, mesher=mesher, max_error_m=bound_m)
         seconds, report = time.perf_counter() - start, mesh_report(terrain, raster)
         name = f"jungfrau_{mesher}" + (f"_{bound_m:g}m" if mesher == "adaptive" else "")
-        record |= {f"{name}_seconds": seconds, f"{name}_triangles": report.triangles,
-                   f"{name}_rmse_m": report.vertical_rmse_m, f"{name}_max_m": report.vertical_max_m}  # fmt: skip
+        record |= {
+            f"{name}_seconds": seconds,
+            f"{name}_triangles": report.triangles,
+            f"{name}_rmse_m": report.vertical_rmse_m,
+            f"{name}_max_m": report.vertical_max_m,
+        }
     return record | _atlas_record(build_mesh(raster, frame, max_error_m=20.0), "jungfrau", 2048)
 
 
@@ -134,9 +157,13 @@ def _atlas_record(terrain, name: str, side_px: int) -> dict:
         start = time.perf_counter()
         _, atlas = unwrap(terrain, kind=kind, max_side_px=side_px)
         key = f"{name}_{kind}"
-        record |= {f"{key}_seconds": time.perf_counter() - start, f"{key}_texel_p50_m": atlas.texel_p50_m,
-                   f"{key}_texel_p99_m": atlas.texel_p99_m, f"{key}_stretch_p99_m": atlas.stretch_p99_m,
-                   f"{key}_utilization": atlas.utilization}  # fmt: skip
+        record |= {
+            f"{key}_seconds": time.perf_counter() - start,
+            f"{key}_texel_p50_m": atlas.texel_p50_m,
+            f"{key}_texel_p99_m": atlas.texel_p99_m,
+            f"{key}_stretch_p99_m": atlas.stretch_p99_m,
+            f"{key}_utilization": atlas.utilization,
+        }
     return record
 
 
@@ -150,8 +177,11 @@ def full_grid_20m(seed: int, folder: str) -> dict:
     frame = centre_frame(raster)
     start = time.perf_counter()
     terrain = build_mesh(raster, frame, mesher="grid")
-    record = {"full_grid_triangles": len(terrain.faces), "full_grid_build_seconds": time.perf_counter() - start,
-              "full_grid_build_peak_gb": peak_memory_gb()}  # fmt: skip
+    record = {
+        "full_grid_triangles": len(terrain.faces),
+        "full_grid_build_seconds": time.perf_counter() - start,
+        "full_grid_build_peak_gb": peak_memory_gb(),
+    }
     del raster
     return record | _render_record(terrain, frame)
 
@@ -173,14 +203,24 @@ def _render_record(terrain, frame) -> dict:
     start = time.perf_counter()
     scene = build_scene(terrain, np.full(3, 0.3), light)
     built = time.perf_counter()
-    camera = camera_at(frame, frame.latitude_deg - 0.25, frame.longitude_deg, 6_000.0, heading_deg=0.0,
-                       pitch_deg=-12.0, size_px=(1536, 1024))  # fmt: skip
+    camera = camera_at(
+        frame,
+        frame.latitude_deg - 0.25,
+        frame.longitude_deg,
+        6_000.0,
+        heading_deg=0.0,
+        pitch_deg=-12.0,
+        size_px=(1536, 1024),
+    )
     image, coverage = path_trace(scene, camera, spp=16)
     if not (np.isfinite(image).all() and coverage.mean() > 0.3):
         raise SystemExit("full_grid_20m: the render is empty or not finite")
     print(f"full_grid_20m: rendered on {device}, {100 * coverage.mean():.0f} % of the picture is land", file=sys.stderr)
-    return {"full_grid_scene_seconds": built - start, "full_grid_render_seconds": time.perf_counter() - built,
-            "full_grid_peak_gb": peak_memory_gb()}  # fmt: skip
+    return {
+        "full_grid_scene_seconds": built - start,
+        "full_grid_render_seconds": time.perf_counter() - built,
+        "full_grid_peak_gb": peak_memory_gb(),
+    }
 
 
 def massif_20m(seed: int, folder: str) -> dict:
@@ -189,8 +229,10 @@ def massif_20m(seed: int, folder: str) -> dict:
     return {}
 
 
-PARTS = {part.__name__: part for part in (massif_30m, adaptive_3000km2, grid_3000km2, jungfrau, atlases_3000km2,
-                                          massif_20m, full_grid_20m)}  # fmt: skip
+PARTS = {
+    part.__name__: part
+    for part in (massif_30m, adaptive_3000km2, grid_3000km2, jungfrau, atlases_3000km2, massif_20m, full_grid_20m)
+}
 NOT_QUICK = ("atlases_3000km2", "massif_20m", "full_grid_20m")
 
 

@@ -60,21 +60,26 @@ def judge(bed: places.Testbed, figures: Path | None) -> dict[str, float]:
     score = {name: rivals.psnr(p, truth, hole) for name, p in pictures.items()}
     likeness = {name: rivals.ssim(p, truth, hole) for name, p in pictures.items()}
     quartiles = rivals.sigma_quartiles(result.values, result.sigma, bed.truth, hole)
-    print(f"\n{bed.name}: {100 * bed.seen.mean():.0f} % painted; σ over error by quartile "
-          + " ".join(f"{q:.2f}" for q in quartiles))  # fmt: skip
+    print(
+        f"\n{bed.name}: {100 * bed.seen.mean():.0f} % painted; σ over error by quartile "
+        + " ".join(f"{q:.2f}" for q in quartiles)
+    )
     for name, value in sorted(score.items(), key=lambda item: item[1]):
         seam = rivals.seam_excess(pictures[name], truth, bed.seen, bed.guides.surface)
         print(f"  {name:14s} {value:6.2f} dB   SSIM {likeness[name]:.3f}   seam {seam:+6.2f}")
     numbers = {
-        "psnr_db": score["guided"], "telea_psnr_db": score["telea"], "gain_over_telea_db": score["guided"] - score["telea"],
+        "psnr_db": score["guided"],
+        "telea_psnr_db": score["telea"],
+        "gain_over_telea_db": score["guided"] - score["telea"],
         "fast_gain_over_telea_db": score["guided_fast"] - score["telea"],
         "gain_over_best_membrane_db": score["guided"] - max(score[n] for n in rivals.MEMBRANES),
         "gain_over_best_transfer_db": score["guided"] - max(score[n] for n in rivals.TRANSFERS),
         "ssim_over_telea": likeness["guided"] / likeness["telea"],
         "seam_excess_levels": rivals.seam_excess(pictures["guided"], truth, bed.seen, bed.guides.surface),
-        "sigma_quartile_low": min(quartiles), "sigma_quartile_high": max(quartiles),
+        "sigma_quartile_low": min(quartiles),
+        "sigma_quartile_high": max(quartiles),
         "sigma_quartiles_within_30pc": float(np.mean([1 / 1.3 <= q <= 1.3 for q in quartiles])),
-    }  # fmt: skip
+    }
     if figures is not None:
         save_figure(figures / f"completion_{bed.name}.png", truth, bed.seen, pictures, result)
     return numbers
@@ -112,9 +117,11 @@ def controls(bed: places.Testbed) -> dict[str, float]:
     values |= {name: layers[name] for name in layers if name in values and ("sun" in name or name == "insolation")}
     values = {name: layer for name, layer in values.items() if not name.startswith("facing")}
     right = {name: bed.guides.values[..., i] for i, name in enumerate(bed.guides.names) if name in values}
-    return {"control_permuted_drop_db": honest - score(permuted),
-            "control_wrong_sun_drop_db": score(stack_guides(right, surface=bed.guides.surface))
-            - score(stack_guides(values, surface=bed.guides.surface))}  # fmt: skip
+    return {
+        "control_permuted_drop_db": honest - score(permuted),
+        "control_wrong_sun_drop_db": score(stack_guides(right, surface=bed.guides.surface))
+        - score(stack_guides(values, surface=bed.guides.surface)),
+    }
 
 
 def held_out_view(bed: places.Testbed, figures: Path | None) -> dict[str, float]:
@@ -148,8 +155,11 @@ def held_out_view(bed: places.Testbed, figures: Path | None) -> dict[str, float]
         before = np.where(unseen[..., None], 0.1, views["truth"])
         row_of = np.concatenate([before, views["telea"], views["guided"], views["truth"]], axis=1)
         write_png8(figures / f"view_{bed.name}.png", (np.clip(row_of, 0.0, 1.0) * 255.0).astype(np.uint8))
-    return {"held_out_view_psnr_db": score["guided"], "held_out_view_gain_over_telea_db": score["guided"] - score["telea"],
-            "held_out_view_unseen_share": float(unseen.mean())}  # fmt: skip
+    return {
+        "held_out_view_psnr_db": score["guided"],
+        "held_out_view_gain_over_telea_db": score["guided"] - score["telea"],
+        "held_out_view_unseen_share": float(unseen.mean()),
+    }
 
 
 def cost(bed: places.Testbed, side: int = 1440) -> dict[str, float]:
@@ -161,8 +171,12 @@ def cost(bed: places.Testbed, side: int = 1440) -> dict[str, float]:
 
     table = np.stack([larger(layer) for layer in np.moveaxis(bed.guides.values, -1, 0)], -1)
     seen = cv2.resize(bed.seen.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-    big = replace(bed, truth=np.maximum(larger(bed.truth), 0.0), seen=seen,
-                  guides=Guides(table, bed.guides.names, np.ones(seen.shape, bool)))  # fmt: skip
+    big = replace(
+        bed,
+        truth=np.maximum(larger(bed.truth), 0.0),
+        seen=seen,
+        guides=Guides(table, bed.guides.names, np.ones(seen.shape, bool)),
+    )
     hidden = float((~seen).sum()) / 1e6
     return {
         "cost_cpu_s_per_mtexel": completed(big)[1] / hidden,
@@ -180,8 +194,10 @@ def finse(data: Path, seed: int, figures: Path | None, quick: bool) -> dict[str,
             bed.shown(completed(alone)[0].values), bed.shown(bed.truth), bed.guides.surface & ~bed.seen
         )
         print(f"  {'relief alone':14s} {relief:6.2f} dB")
-        numbers |= {f"{bed.name}_{key}": found[key] for key in ("psnr_db", "gain_over_telea_db", "sigma_quartile_low",
-                                                                "sigma_quartile_high")}  # fmt: skip
+        numbers |= {
+            f"{bed.name}_{key}": found[key]
+            for key in ("psnr_db", "gain_over_telea_db", "sigma_quartile_low", "sigma_quartile_high")
+        }
         numbers[f"{bed.name}_relief_alone_gain_over_telea_db"] = relief - found["telea_psnr_db"]
     return numbers
 

@@ -63,18 +63,31 @@ class Stage:
 def make_stage(seed: int, *, quick: bool) -> Stage:
     """The pictures of a seed's massif, hour and faults."""
     texel_m = 6.0 if quick else 5.0
-    truth = make_truth(seed, size_m=6000.0 if quick else 9000.0, spacing_m=30.0, texel_m=texel_m, cameras=6 if quick else 8,
-                       size_px=(480, 320) if quick else (720, 480))  # fmt: skip
+    truth = make_truth(
+        seed,
+        size_m=6000.0 if quick else 9000.0,
+        spacing_m=30.0,
+        texel_m=texel_m,
+        cameras=6 if quick else 8,
+        size_px=(480, 320) if quick else (720, 480),
+    )
     rng = np.random.default_rng(seed)
     clock = float(rng.choice([8.5, 10.0, 13.5, 15.0]))
     sky = with_overrides(read_sky_model("clear"), visibility_km=SKY_KM)
     when = hours("2024-09-11", clock)
     lights = lights_for(when, truth.cameras, sky, default_workspace())[0]
     pictures = [
-        webcam_series(truth.terrain, f"webcam-{n}", camera, [Hour(when[0], light, truth.albedo)], faults=TYPICAL,
-                      effort=EFFORT, seed=seed)[0]
+        webcam_series(
+            truth.terrain,
+            f"webcam-{n}",
+            camera,
+            [Hour(when[0], light, truth.albedo)],
+            faults=TYPICAL,
+            effort=EFFORT,
+            seed=seed,
+        )[0]
         for n, (camera, light) in enumerate(zip(truth.cameras, lights, strict=True))
-    ]  # fmt: skip
+    ]
     height, width = truth.shape
     atlas = measure_atlas(truth.terrain, "planar", width, height)
     return Stage(truth, atlas, occluder(mi_mesh(truth.terrain, truth.albedo)), lights, texel_m, pictures)
@@ -87,17 +100,23 @@ def with_foreground(stage: Stage, seed: int) -> Stage:
     for picture in stage.pictures:
         radiance, front = add_foreground(picture.radiance, rng)
         encoded, done = degrade(radiance, TYPICAL, rng)
-        seen = replace(picture.observation, image=linear_from_srgb(encoded / np.float32(255.0)),
-                       camera=perturb_pose(picture.camera, sigmas, rng)[0])  # fmt: skip
-        pictures.append(replace(picture, observation=seen, encoded=encoded, radiance=radiance, foreground=front,
-                                development=done))  # fmt: skip
+        seen = replace(
+            picture.observation,
+            image=linear_from_srgb(encoded / np.float32(255.0)),
+            camera=perturb_pose(picture.camera, sigmas, rng)[0],
+        )
+        pictures.append(
+            replace(picture, observation=seen, encoded=encoded, radiance=radiance, foreground=front, development=done)
+        )
     return replace(stage, pictures=pictures)
 
 
 def shots_of(stage: Stage, **changes) -> list[Shot]:
     """The stage's pictures as painting takes them."""
-    return [Shot(replace(picture.observation, **changes), light.aerial_perspective)
-            for picture, light in zip(stage.pictures, stage.lights, strict=True)]  # fmt: skip
+    return [
+        Shot(replace(picture.observation, **changes), light.aerial_perspective)
+        for picture, light in zip(stage.pictures, stage.lights, strict=True)
+    ]
 
 
 def land_truth(stage: Stage, texel: np.ndarray, *, seed: int) -> np.ndarray:
@@ -107,8 +126,9 @@ def land_truth(stage: Stage, texel: np.ndarray, *, seed: int) -> np.ndarray:
     place[surface.texel] = surface.position_m
     albedo = stage.truth.albedo.reshape(-1, 3)[texel]
     radiance = np.full((len(texel), 3), np.nan)
-    for index, _, (light,) in irradiance_blocks(stage.terrain, place[texel], [stage.lights[0]], replace(EFFORT, rays=256),
-                                                seed=seed):  # fmt: skip
+    for index, _, (light,) in irradiance_blocks(
+        stage.terrain, place[texel], [stage.lights[0]], replace(EFFORT, rays=256), seed=seed
+    ):
         radiance[index] = albedo[index] / np.pi * light.total
     return radiance
 
@@ -143,10 +163,13 @@ def visibility(stage: Stage, *, seed: int, rays: int) -> dict:
         truth.append(oracle.sees(places.position_m, places.face, camera.position_m))
         grazing.append(seen.cosine < 0.2)
         depth = trace_gbuffer(scene, camera).depth
-        modes = {"ray": by_ray(stage.terrain, camera, places, seen),
-                 "ray_lifted_2m": by_ray(stage.terrain, camera, places, seen, lift_m=2.0),
-                 "depth": by_depth(depth, seen), "depth_2pc": by_depth(depth, seen, tolerance=0.02),
-                 "faces": by_faces(stage.terrain, camera, places, seen)}  # fmt: skip
+        modes = {
+            "ray": by_ray(stage.terrain, camera, places, seen),
+            "ray_lifted_2m": by_ray(stage.terrain, camera, places, seen, lift_m=2.0),
+            "depth": by_depth(depth, seen),
+            "depth_2pc": by_depth(depth, seen, tolerance=0.02),
+            "faces": by_faces(stage.terrain, camera, places, seen),
+        }
         for name, value in modes.items():
             found.setdefault(name, []).append(value)
         start = time.process_time()
@@ -169,8 +192,12 @@ def harmony(stage: Stage, *, seed: int, texels: int = 20_000) -> dict:
     shots, terrain, rng = shots_of(stage), stage.truth.terrain, np.random.default_rng(seed)
     numbers, sample, truth = {}, None, None
     raw = [replace(shot, air=None) for shot in shots]
-    kinds = {"plain": PaintOptions(fit_gains=False), "harmonised": PaintOptions(), "no_haze_fit": PaintOptions(fit_haze=False),
-             "first": PaintOptions(mode="first")}  # fmt: skip
+    kinds = {
+        "plain": PaintOptions(fit_gains=False),
+        "harmonised": PaintOptions(),
+        "no_haze_fit": PaintOptions(fit_haze=False),
+        "first": PaintOptions(mode="first"),
+    }
     for name, options in kinds.items():
         start = time.process_time()
         painting = paint(raw if name == "plain" else shots, terrain, stage.atlas, stage.terrain, options=options)
@@ -189,10 +216,14 @@ def harmony(stage: Stage, *, seed: int, texels: int = 20_000) -> dict:
             said = painting.harmony
             gains = np.array([p.development.gains for p in stage.pictures])
             error = said.log_gain - np.log(gains)
-            numbers |= {"painted_share": len(painted) / painting.best.size, "haze": said.haze,
-                        "gain_error": float(np.std(error - error.mean(axis=0))), "gain_bias": float(error.mean()),
-                        "scatter_after": said.scatter_after,
-                        "painting_mtexel_camera_per_cpu_s": painting.best.size * len(shots) / 1e6 / seconds}  # fmt: skip
+            numbers |= {
+                "painted_share": len(painted) / painting.best.size,
+                "haze": said.haze,
+                "gain_error": float(np.std(error - error.mean(axis=0))),
+                "gain_bias": float(error.mean()),
+                "scatter_after": said.scatter_after,
+                "painting_mtexel_camera_per_cpu_s": painting.best.size * len(shots) / 1e6 / seconds,
+            }
     numbers["harmonising_gain_db"] = numbers["painted_harmonised_db"] - numbers["painted_plain_db"]
     return numbers
 
@@ -244,9 +275,14 @@ def guard(stage: Stage, *, seed: int, texels: int = 12_000) -> dict:
     """Poses that are 0.2° off: painted texels with and without keeping away from silhouettes."""
     rng = np.random.default_rng(seed)
     sigmas = PoseSigmas(heading_deg=0.2, pitch_deg=0.1)
-    shots = [replace(shot, pose_sigma={"heading_deg": 0.2, "tilt_deg": 0.1},
-                     observation=replace(shot.observation, camera=perturb_pose(shot.observation.camera, sigmas, rng)[0]))
-             for shot in shots_of(stage)]  # fmt: skip
+    shots = [
+        replace(
+            shot,
+            pose_sigma={"heading_deg": 0.2, "tilt_deg": 0.1},
+            observation=replace(shot.observation, camera=perturb_pose(shot.observation.camera, sigmas, rng)[0]),
+        )
+        for shot in shots_of(stage)
+    ]
     numbers, sample = {}, None
     for name, kept in (("unguarded", False), ("guarded", True)):
         painting = paint(shots, stage.truth.terrain, stage.atlas, stage.terrain, options=PaintOptions(guard=kept))
@@ -286,8 +322,10 @@ def rejection(stage: Stage, *, seed: int, texels: int = 12_000) -> dict:
     for _ in range(2):
         expected = predict_in_folds(painting.texture, guides.values, fit, seed=seed)
         number = {name: k for k, name in enumerate(first.webcams)}
-        rejects = [foreground_mask(r, number[r.shot.observation.webcam], painting.harmony, expected, uv)
-                   for r, uv in zip(ready, uvs, strict=True)]  # fmt: skip
+        rejects = [
+            foreground_mask(r, number[r.shot.observation.webcam], painting.harmony, expected, uv)
+            for r, uv in zip(ready, uvs, strict=True)
+        ]
         painting = paint(shots, terrain, stage.atlas, stage.terrain, rejects=rejects)
     found, false = [], []
     for shot, mask, uv in zip(shots, rejects, uvs, strict=True):

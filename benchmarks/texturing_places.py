@@ -50,8 +50,9 @@ class Testbed:
 # ---------------------------------------------------------------------------------------------- who sees what
 
 
-def viewshed(z: np.ndarray, spacing_m: float, stand: tuple[float, float, float], heading_deg: float,
-             fov_deg: float) -> np.ndarray:  # fmt: skip
+def viewshed(
+    z: np.ndarray, spacing_m: float, stand: tuple[float, float, float], heading_deg: float, fov_deg: float
+) -> np.ndarray:
     """Cells ``(H, W)`` that a camera at (column, row, height [m]) sees, by walking along every line of sight."""
     column, row = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in z.shape[::-1]))
     dx, dy, rise = column - stand[0], row - stand[1], z - np.float32(stand[2])
@@ -86,8 +87,16 @@ def seen_from(z: np.ndarray, spacing_m: float, rng: np.random.Generator, count: 
 # ---------------------------------------------------------------------------------------------- lit places
 
 
-def lit_testbeds(place: str, albedo_of: Callable, elevation: Raster, seasons: dict, rng: np.random.Generator, *,
-                 cameras: int, satellite: np.ndarray | None = None) -> Iterator[Testbed]:  # fmt: skip
+def lit_testbeds(
+    place: str,
+    albedo_of: Callable,
+    elevation: Raster,
+    seasons: dict,
+    rng: np.random.Generator,
+    *,
+    cameras: int,
+    satellite: np.ndarray | None = None,
+) -> Iterator[Testbed]:
     """The same terrain under the true light of several dates, painted by the same cameras.
 
     Parameters
@@ -131,9 +140,19 @@ def lit_testbeds(place: str, albedo_of: Callable, elevation: Raster, seasons: di
         day_suns = np.asarray(sun_position(hours, frame.latitude_deg, frame.longitude_deg).direction)
         layers = land_layers(z, spacing_m, sun_direction=sun, day_suns=day_suns)
         guides = stack_guides(layers, Texture(image.astype(np.float32)), surface=surface)
-        yield Testbed(f"{place}_{season}", truth.astype(np.float32), seen, guides, image.astype(np.float32),
-                      lambda v, white=white: srgb_from_linear(v / white).astype(np.float32), z, spacing_m, sun, terrain,
-                      views[-1])  # fmt: skip
+        yield Testbed(
+            f"{place}_{season}",
+            truth.astype(np.float32),
+            seen,
+            guides,
+            image.astype(np.float32),
+            lambda v, white=white: srgb_from_linear(v / white).astype(np.float32),
+            z,
+            spacing_m,
+            sun,
+            terrain,
+            views[-1],
+        )
 
 
 def irradiance_of(terrain: Terrain, albedo: np.ndarray, positions: np.ndarray, when: datetime, frame) -> np.ndarray:
@@ -155,8 +174,14 @@ def irradiance_of(terrain: Terrain, albedo: np.ndarray, positions: np.ndarray, w
 def massif(seed: int, seasons: dict, *, spacing_m: float = 30.0, cameras: int = 10) -> Iterator[Testbed]:
     """The embedded massif of a seed."""
     place = alpine_massif(seed=seed, spacing_m=spacing_m)
-    return lit_testbeds("massif", lambda day: alpine_albedo(place, day), place.elevation, seasons,
-                        np.random.default_rng(seed), cameras=cameras)  # fmt: skip
+    return lit_testbeds(
+        "massif",
+        lambda day: alpine_albedo(place, day),
+        place.elevation,
+        seasons,
+        np.random.default_rng(seed),
+        cameras=cameras,
+    )
 
 
 def jungfrau_land(data: Path, rng: np.random.Generator) -> tuple[Raster, np.ndarray, Callable[[int], np.ndarray]]:
@@ -209,8 +234,17 @@ def landsat(data: Path, seed: int) -> Iterator[Testbed]:
     guides = stack_guides(land_layers(z, 30.0, sun_direction=sun), Texture(image))
     rng = np.random.default_rng(seed)
     for name, seen in (("blocks", hidden_blocks(z.shape, rng)), ("views", seen_from(z, 30.0, rng, 8))):
-        yield Testbed(f"landsat_{name}", truth, seen, guides, image,
-                      lambda v: np.clip((v - low) / (high - low), 0.0, 1.0).astype(np.float32), z, 30.0, sun)  # fmt: skip
+        yield Testbed(
+            f"landsat_{name}",
+            truth,
+            seen,
+            guides,
+            image,
+            lambda v: np.clip((v - low) / (high - low), 0.0, 1.0).astype(np.float32),
+            z,
+            30.0,
+            sun,
+        )
 
 
 def hidden_blocks(shape: tuple[int, int], rng: np.random.Generator, share: float = 0.55, sizes=(12, 64)) -> np.ndarray:
@@ -238,8 +272,10 @@ def finse(data: Path, seed: int, blocks_m=(64.0, 160.0, 360.0)) -> Iterator[Test
     sun = np.asarray(sun_position(datetime(2019, 5, 24, 10, 0, tzinfo=UTC), 60.6, 7.53).direction)
     layers = land_layers(filled, spacing, sun_direction=sun)
     weight = np.isfinite(summer).all(axis=2).astype(np.float32)
-    blurred = cv2.GaussianBlur(np.nan_to_num(summer), (0, 0), 4.0) / np.maximum(
-        cv2.GaussianBlur(weight, (0, 0), 4.0), 1e-3)[..., None]  # fmt: skip
+    blurred = (
+        cv2.GaussianBlur(np.nan_to_num(summer), (0, 0), 4.0)
+        / np.maximum(cv2.GaussianBlur(weight, (0, 0), 4.0), 1e-3)[..., None]
+    )
     surface = np.isfinite(spring).all(axis=2)
     satellite = Texture(np.where(weight[..., None] > 0.0, blurred, np.nan).astype(np.float32), weight)
     guides = stack_guides(layers, satellite, surface=surface)
@@ -251,8 +287,18 @@ def finse(data: Path, seed: int, blocks_m=(64.0, 160.0, 360.0)) -> Iterator[Test
         shift = rng.integers(0, cells, 2)
         grid = np.kron(hidden, np.ones((cells, cells), bool))[shift[0] :, shift[1] :][: z.shape[0], : z.shape[1]]
         image = np.nan_to_num(np.where(weight[..., None] > 0.0, blurred, np.nanmedian(summer)))
-        yield Testbed(f"finse_{block_m:.0f}m", truth, surface & ~grid, guides, image.astype(np.float32),
-                      lambda v: srgb_from_linear(v).astype(np.float32), filled, spacing, sun, held_out=(camera_cell,))  # fmt: skip
+        yield Testbed(
+            f"finse_{block_m:.0f}m",
+            truth,
+            surface & ~grid,
+            guides,
+            image.astype(np.float32),
+            lambda v: srgb_from_linear(v).astype(np.float32),
+            filled,
+            spacing,
+            sun,
+            held_out=(camera_cell,),
+        )
 
 
 def without_image(bed: Testbed) -> Testbed:

@@ -49,8 +49,10 @@ def nearest(known: np.ndarray, seen: np.ndarray) -> np.ndarray:
 def histogram_transfer(image: np.ndarray, known: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """Each channel of the image through the monotone curve that gives it the painted texels' histogram."""
     rank = np.linspace(0.0, 1.0, 256)
-    curves = [np.interp(image[..., c], np.quantile(image[..., c][seen], rank), np.quantile(known[..., c][seen], rank))
-              for c in range(3)]  # fmt: skip
+    curves = [
+        np.interp(image[..., c], np.quantile(image[..., c][seen], rank), np.quantile(known[..., c][seen], rank))
+        for c in range(3)
+    ]
     return np.stack(curves, -1)
 
 

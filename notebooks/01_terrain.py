@@ -51,8 +51,10 @@ _ = plt.axis("off")
 
 # %%
 bounds_m = [20.0, 10.0, 5.0, 2.0]
-counts = [len(load_place(Path("small.toml"), default_workspace(), options=MeshOptions(max_error_m=bound)).terrain.faces)
-          for bound in bounds_m]  # fmt: skip
+counts = [
+    len(load_place(Path("small.toml"), default_workspace(), options=MeshOptions(max_error_m=bound)).terrain.faces)
+    for bound in bounds_m
+]
 plt.loglog(bounds_m, counts, "o-")
 plt.xlabel("error bound [m]")
 plt.ylabel("triangles")

@@ -88,8 +88,9 @@ _ = plt.axis("off")
 # A panorama is cut into perspective views that share one pose.
 
 # %%
-panorama = panorama_from_angles("cylindrical", (3600, 500), horizontal_fov_deg=360.0, vertical_fov_deg=45.0,
-                                pose=camera.world_from_camera)  # fmt: skip
+panorama = panorama_from_angles(
+    "cylindrical", (3600, 500), horizontal_fov_deg=360.0, vertical_fov_deg=45.0, pose=camera.world_from_camera
+)
 print([f"{view.width_px} x {view.height_px}" for view in split_panorama(panorama)])
 
 # %% [markdown]

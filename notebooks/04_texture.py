@@ -85,9 +85,13 @@ for axis in axes:
 # %%
 at = (place.frame.latitude_deg, place.frame.longitude_deg)
 day = [time + timedelta(hours=hour) for hour in range(-12, 12)]
-guides = guides_for(place.terrain, place.atlas, satellite=albedo_for(place, datetime(2024, 7, 23, tzinfo=UTC)),
-                    sun_direction=sun_position(time, *at).direction,
-                    day_suns=np.asarray(sun_position(day, *at).direction))  # fmt: skip
+guides = guides_for(
+    place.terrain,
+    place.atlas,
+    satellite=albedo_for(place, datetime(2024, 7, 23, tzinfo=UTC)),
+    sun_direction=sun_position(time, *at).direction,
+    day_suns=np.asarray(sun_position(day, *at).direction),
+)
 completed = {
     method: complete(painting.texture, guides, method=method, fast=True).values for method in ("guided", "telea")
 }

@@ -73,8 +73,9 @@ print(albedo_error(truth, fit.albedo, seen))
 
 # %%
 figure, axes = plt.subplots(1, 3, figsize=(15, 5))
-for axis, (name, values) in zip(axes, {"truth": truth, "recovered": fit.albedo, "error × 4": 4 * np.abs(fit.albedo - truth)}.items(),
-                                strict=True):  # fmt: skip
+for axis, (name, values) in zip(
+    axes, {"truth": truth, "recovered": fit.albedo, "error × 4": 4 * np.abs(fit.albedo - truth)}.items(), strict=True
+):
     axis.imshow(srgb_from_linear(values * seen[..., None]))
     axis.set_title(name)
     axis.axis("off")

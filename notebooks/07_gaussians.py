@@ -70,8 +70,10 @@ def lit(time: datetime):
     return light, light_state(transport, light, float(time.timetuple().tm_yday))
 
 
-lessons_at = [datetime(2024, month, 11, hour, tzinfo=UTC)
-              for month, hour in ((1, 11), (3, 8), (4, 15), (5, 6), (6, 12), (7, 17), (9, 9), (10, 14))]  # fmt: skip
+lessons_at = [
+    datetime(2024, month, 11, hour, tzinfo=UTC)
+    for month, hour in ((1, 11), (3, 8), (4, 15), (5, 6), (6, 12), (7, 17), (9, 9), (10, 14))
+]
 lights, states = zip(*(lit(time) for time in lessons_at), strict=True)
 lessons = lessons_from(states, [0] * len(states), albedo[None], surfel_irradiance(land, surfels, lights, rays=64))
 appearance = Appearance(
@@ -99,9 +101,15 @@ pair = [srgb_from_linear(picture) for picture in (truth, splats)]
 solid = (ready.coverage > 0.999) & (weights.coverage > 0.5)
 print(f"{-10 * np.log10(np.mean((pair[0] - pair[1])[solid] ** 2)):.1f} dB")
 figure, axes = plt.subplots(1, 3, figsize=(14, 5))
-for axis, (name, picture) in zip(axes, {"relit": pair[0], "splats": pair[1] * solid[..., None],
-                                        "difference × 4": 4 * np.abs(pair[0] - pair[1]) * solid[..., None]}.items(),
-                                 strict=True):  # fmt: skip
+for axis, (name, picture) in zip(
+    axes,
+    {
+        "relit": pair[0],
+        "splats": pair[1] * solid[..., None],
+        "difference × 4": 4 * np.abs(pair[0] - pair[1]) * solid[..., None],
+    }.items(),
+    strict=True,
+):
     axis.imshow(np.clip(picture, 0, 1))
     axis.set_title(name)
     axis.axis("off")

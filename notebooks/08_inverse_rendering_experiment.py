@@ -76,8 +76,15 @@ def watch(state) -> None:
     errors.append(albedo_error(truth, state.values["albedo"], seen).mae)
 
 
-options = InverseOptions(unknowns=("albedo", "log_gain"), levels=(4, 1), iterations=16, pictures=2, spp=4, check_every=8,
-                         steps={"albedo": 0.03, "log_gain": 0.02})  # fmt: skip
+options = InverseOptions(
+    unknowns=("albedo", "log_gain"),
+    levels=(4, 1),
+    iterations=16,
+    pictures=2,
+    spp=4,
+    check_every=8,
+    steps={"albedo": 0.03, "log_gain": 0.02},
+)
 found = refine_albedo(place.terrain, land, shots, grey, options=options, callbacks=[watch])
 print(f"gains from {grey.gains.mean():.2f} to {found.fit.gains.mean():.2f} of the true ones")
 
@@ -93,8 +100,9 @@ _ = axes[1].legend()
 
 # %%
 figure, axes = plt.subplots(1, 3, figsize=(15, 5))
-for axis, (name, values) in zip(axes, {"truth": truth, "closed form": closed.albedo, "by gradients": found.fit.albedo}.items(),
-                                strict=True):  # fmt: skip
+for axis, (name, values) in zip(
+    axes, {"truth": truth, "closed form": closed.albedo, "by gradients": found.fit.albedo}.items(), strict=True
+):
     axis.imshow(srgb_from_linear(values * seen[..., None]))
     axis.set_title(name)
     axis.axis("off")

@@ -44,6 +44,10 @@ def bundled_path(kind: Kind, name: str) -> Path:
     if name not in names:
         what = {"scenes": "scene", "sun_models": "sky model"}[kind]
         close = difflib.get_close_matches(name, names, n=1)
-        raise InputError(name, f"neither a file nor a bundled {what}", expected="one of " + ", ".join(names),
-                         cure=f"did you mean '{close[0]}'?" if close else None)  # fmt: skip
+        raise InputError(
+            name,
+            f"neither a file nor a bundled {what}",
+            expected="one of " + ", ".join(names),
+            cure=f"did you mean '{close[0]}'?" if close else None,
+        )
     return bundled_folder(kind) / f"{name}.toml"

@@ -42,8 +42,11 @@ def zone_at(latitude_deg: float, longitude_deg: float) -> str:
     try:
         ZoneInfo(name)
     except (ZoneInfoNotFoundError, ValueError):
-        raise InputError("time", f"no civil time zone is known at latitude {latitude_deg}, longitude {longitude_deg}",
-                         cure="give the time with an offset, e.g. 2024-09-01T12:00Z") from None  # fmt: skip
+        raise InputError(
+            "time",
+            f"no civil time zone is known at latitude {latitude_deg}, longitude {longitude_deg}",
+            cure="give the time with an offset, e.g. 2024-09-01T12:00Z",
+        ) from None
     return name
 
 
@@ -61,8 +64,9 @@ def resolve_time(text: str, latitude_deg: float, longitude_deg: float) -> Resolv
         parsed = datetime.fromisoformat(text)
         dated_only = not any(separator in text[1:] for separator in ("T", "t", " "))
         if dated_only:
-            raise InputError("time", "the hour is missing", got=text, expected="a date and time",
-                             cure=f"write {text}T12:00")  # fmt: skip
+            raise InputError(
+                "time", "the hour is missing", got=text, expected="a date and time", cure=f"write {text}T12:00"
+            )
         if parsed.utcoffset() is not None:
             utc = parsed.astimezone(UTC)
             return ResolvedTime(utc, None, f"{text} = {_utc_text(utc)}")
@@ -74,9 +78,12 @@ def resolve_time(text: str, latitude_deg: float, longitude_deg: float) -> Resolv
     except OverflowError:
         raise InputError("time", "out of range", got=text) from None
     except ValueError:
-        raise InputError("time", "not an ISO 8601 date and time", got=text,
-                         expected="e.g. 2024-09-01T12:00, 2024-09-01T12:00+02:00 or 2024-09-01T10:00Z",
-                         ) from None  # fmt: skip
+        raise InputError(
+            "time",
+            "not an ISO 8601 date and time",
+            got=text,
+            expected="e.g. 2024-09-01T12:00, 2024-09-01T12:00+02:00 or 2024-09-01T10:00Z",
+        ) from None
     reading = f"{parsed.isoformat(timespec='minutes')} civil time in {name} ({early:%Z}) = {_utc_text(utc)}"
     return ResolvedTime(utc, name, reading)
 

@@ -23,8 +23,9 @@ _DEATHS = 10
 _AHEAD = 4
 
 
-def frames_on_cluster(cluster: str, assignment: Assignment, times: list[datetime], *,
-                      exr_folder: str | None = None) -> Iterator[dict]:  # fmt: skip
+def frames_on_cluster(
+    cluster: str, assignment: Assignment, times: list[datetime], *, exr_folder: str | None = None
+) -> Iterator[dict]:
     """The records of frames as they are done, in any order; see `studio.render_frame`.
 
     Parameters
@@ -88,12 +89,19 @@ def _started(cluster: str) -> Any:
     if kind == "local" and rest.isdigit() and 1 <= int(rest) <= 1024:
         from distributed import LocalCluster
 
-        return LocalCluster(n_workers=int(rest), threads_per_worker=1, processes=True, host="127.0.0.1",
-                            dashboard_address=None, memory_limit=0)  # fmt: skip
+        return LocalCluster(
+            n_workers=int(rest),
+            threads_per_worker=1,
+            processes=True,
+            host="127.0.0.1",
+            dashboard_address=None,
+            memory_limit=0,
+        )
     if kind == "slurm" and rest:
         return _slurm(Path(rest))
-    raise InputError("--cluster", "unknown kind of cluster", got=cluster,
-                     expected="local:N, tcp://HOST:PORT or slurm:FILE")  # fmt: skip
+    raise InputError(
+        "--cluster", "unknown kind of cluster", got=cluster, expected="local:N, tcp://HOST:PORT or slurm:FILE"
+    )
 
 
 def _slurm(path: Path) -> Any:
@@ -106,8 +114,11 @@ def _slurm(path: Path) -> Any:
         raise InputError(path, f"not TOML: {error}") from None
     jobs, wishes = table.get("jobs"), table.get("slurm")
     if not isinstance(jobs, int) or jobs < 1 or not isinstance(wishes, dict) or set(table) - {"jobs", "slurm"}:
-        raise InputError(path, "does not describe a cluster",
-                         expected='jobs = 8 and a table [slurm] with cores, memory, walltime, queue, account')  # fmt: skip
+        raise InputError(
+            path,
+            "does not describe a cluster",
+            expected="jobs = 8 and a table [slurm] with cores, memory, walltime, queue, account",
+        )
     from dask_jobqueue import SLURMCluster
 
     try:

@@ -18,13 +18,7 @@ import numpy as np
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.pipeline import Place, camera_geodetic
 from seasonscapes.sky.air import Atmosphere
-from seasonscapes.sky.atmosphere import (
-    TABLES_REVISION,
-    AtmosphereTables,
-    atmosphere_tables,
-    load_tables,
-    save_tables,
-)
+from seasonscapes.sky.atmosphere import TABLES_REVISION, AtmosphereTables, atmosphere_tables, load_tables, save_tables
 from seasonscapes.sky.elevation_table import TABLE_REVISION, load_table, save_table
 from seasonscapes.sky.ephemeris import LunarPosition, SolarPosition, moon_position, sun_position
 from seasonscapes.sky.illuminate import illuminate
@@ -45,8 +39,11 @@ class Moment:
 
 def moment_at(time: datetime, latitude_deg: float, longitude_deg: float, height_m: float = 0.0) -> Moment:
     """Sun and moon of an aware datetime at a place."""
-    return Moment(time, sun_position(time, latitude_deg, longitude_deg, height_m),
-                  moon_position(time, latitude_deg, longitude_deg, height_m))  # fmt: skip
+    return Moment(
+        time,
+        sun_position(time, latitude_deg, longitude_deg, height_m),
+        moon_position(time, latitude_deg, longitude_deg, height_m),
+    )
 
 
 @lru_cache(maxsize=8)
@@ -61,10 +58,14 @@ def tables_in(workspace: Workspace, *, tabulated: bool = False):
     def tables_of(atmosphere: Atmosphere) -> AtmosphereTables:
         if atmosphere not in held:
             tables = build_once(
-                workspace, "sky/tables", {"revision": TABLES_REVISION, "atmosphere": atmosphere}, suffix=".npz",
-                build=lambda: atmosphere_tables(atmosphere), save=lambda tables, path: save_tables(path, tables),
+                workspace,
+                "sky/tables",
+                {"revision": TABLES_REVISION, "atmosphere": atmosphere},
+                suffix=".npz",
+                build=lambda: atmosphere_tables(atmosphere),
+                save=lambda tables, path: save_tables(path, tables),
                 load=load_tables,
-            )  # fmt: skip
+            )
             held[atmosphere] = replace(tables, diffuse_of=_diffuse_in(workspace, tables)) if tabulated else tables
         return held[atmosphere]
 
@@ -79,10 +80,21 @@ def _diffuse_in(workspace: Workspace, tables: AtmosphereTables) -> Callable[[flo
         key = (height_m, near)
         with lock:
             if key not in held:
-                inputs = {"revision": [TABLES_REVISION, TABLE_REVISION], "atmosphere": tables.atmosphere,
-                          "height_m": height_m, "near": near}  # fmt: skip
-                held[key] = build_once(workspace, "sky/diffuse", inputs, suffix=".npy", save=save_table, load=load_table,
-                                       build=lambda: diffuse_by_elevation(tables, height_m, near))  # fmt: skip
+                inputs = {
+                    "revision": [TABLES_REVISION, TABLE_REVISION],
+                    "atmosphere": tables.atmosphere,
+                    "height_m": height_m,
+                    "near": near,
+                }
+                held[key] = build_once(
+                    workspace,
+                    "sky/diffuse",
+                    inputs,
+                    suffix=".npy",
+                    save=save_table,
+                    load=load_table,
+                    build=lambda: diffuse_by_elevation(tables, height_m, near),
+                )
             return held[key]
 
     return diffuse_of
@@ -101,12 +113,21 @@ def light_at(
     """The light of an instant for an observer at a height [m]; see `sky.illuminate` and `tables_in`."""
     from seasonscapes.rendering.hosek import hosek_illumination
 
-    return illuminate(model, moment.sun, moment.moon, height_m=height_m, map_height=map_height, with_air=with_air,
-                      tables_of=tables_in(workspace, tabulated=tabulated), hosek=hosek_illumination)  # fmt: skip
+    return illuminate(
+        model,
+        moment.sun,
+        moment.moon,
+        height_m=height_m,
+        map_height=map_height,
+        with_air=with_air,
+        tables_of=tables_in(workspace, tabulated=tabulated),
+        hosek=hosek_illumination,
+    )
 
 
-def light_for(place: Place, camera: Camera, model: SkyModel, time: datetime, *,
-              map_height: int = 128, tabulated: bool = False) -> tuple[Illumination, Moment]:  # fmt: skip
+def light_for(
+    place: Place, camera: Camera, model: SkyModel, time: datetime, *, map_height: int = 128, tabulated: bool = False
+) -> tuple[Illumination, Moment]:
     """The light that falls on a place, seen by a camera.
 
     Sun, moon and sky are those at the terrain's median height, since they light the land; the sky behind it and the
@@ -115,17 +136,25 @@ def light_for(place: Place, camera: Camera, model: SkyModel, time: datetime, *,
     """
     ground_m = median_height_m(place)
     moment = moment_at(time, place.frame.latitude_deg, place.frame.longitude_deg, ground_m)
-    on_land = light_at(model, moment, ground_m, workspace=place.workspace, map_height=map_height, with_air=False,
-                       tabulated=tabulated)  # fmt: skip
-    from_camera = light_at(model, moment, camera_geodetic(place, camera)[2], workspace=place.workspace,
-                           map_height=map_height, tabulated=tabulated)  # fmt: skip
+    on_land = light_at(
+        model, moment, ground_m, workspace=place.workspace, map_height=map_height, with_air=False, tabulated=tabulated
+    )
+    from_camera = light_at(
+        model,
+        moment,
+        camera_geodetic(place, camera)[2],
+        workspace=place.workspace,
+        map_height=map_height,
+        tabulated=tabulated,
+    )
     return replace(
         on_land, aerial_perspective=from_camera.aerial_perspective, visible_sky=from_camera.sky_radiance
     ), moment
 
 
-def tabulate_light(place: Place, camera: Camera, model: SkyModel, *,
-                   progress: Callable[[float], None] | None = None) -> None:  # fmt: skip
+def tabulate_light(
+    place: Place, camera: Camera, model: SkyModel, *, progress: Callable[[float], None] | None = None
+) -> None:
     """Build what `light_for` looks up when ``tabulated``, where the workspace has none, before others ask for it."""
     if not isinstance(model, AtmosphereModel):
         return

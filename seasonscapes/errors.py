@@ -19,8 +19,9 @@ class InputError(Exception):
         What stood there, what should have stood there, and what to do about it.
     """
 
-    def __init__(self, where: str | Path, problem: str, *, got: Any = None, expected: str | None = None,
-                 cure: str | None = None):  # fmt: skip
+    def __init__(
+        self, where: str | Path, problem: str, *, got: Any = None, expected: str | None = None, cure: str | None = None
+    ):
         parts = [f"{where}: {problem}"]
         if got is not None:
             parts.append(f"got {got!r}" if isinstance(got, str) else f"got {got}")

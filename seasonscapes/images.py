@@ -138,8 +138,9 @@ def read_image_linear(path: str | os.PathLike) -> np.ndarray:
     return linear_from_srgb(encoded[..., ::-1].astype(np.float32) / top)
 
 
-def write_exr(path: str | os.PathLike, layers: Mapping[str, np.ndarray], *, header: Mapping | None = None,
-              half: bool = False) -> None:  # fmt: skip
+def write_exr(
+    path: str | os.PathLike, layers: Mapping[str, np.ndarray], *, header: Mapping | None = None, half: bool = False
+) -> None:
     """Write float32 layers to one OpenEXR file, atomically.
 
     Parameters

@@ -63,8 +63,14 @@ def stage_range(stages: Sequence[Stage], first: str | None, last: str | None) ->
     return start, end
 
 
-def run_stages(folder: Path, stages: Sequence[Stage], *, first: str | None = None, last: str | None = None,
-               tell: Callable[[str], None] = lambda line: None) -> dict:  # fmt: skip
+def run_stages(
+    folder: Path,
+    stages: Sequence[Stage],
+    *,
+    first: str | None = None,
+    last: str | None = None,
+    tell: Callable[[str], None] = lambda line: None,
+) -> dict:
     """Make what is not fresh; the ledger as it stands then.
 
     Parameters
@@ -87,8 +93,12 @@ def run_stages(folder: Path, stages: Sequence[Stage], *, first: str | None = Non
             tell(f"{stage.name}: fresh")
             continue
         if first is not None and index < start:
-            raise InputError("--from", f"stage '{stage.name}' before it is not fresh", got=first,
-                             cure=f"start with --from {stage.name}, or without --from")  # fmt: skip
+            raise InputError(
+                "--from",
+                f"stage '{stage.name}' before it is not fresh",
+                got=first,
+                cure=f"start with --from {stage.name}, or without --from",
+            )
         clock = time.perf_counter()
         _begin(folder, stage, key, ledger)
         tell(f"{stage.name}: …")
@@ -125,8 +135,12 @@ def _begin(folder: Path, stage: Stage, key: str, ledger: dict) -> None:
             part.unlink()
         left = json.loads(mark.read_text()) if mark.is_file() else None
         if left is None and not finished and own.is_dir() and any(own.iterdir()):
-            raise InputError("--output", f"holds a folder '{stage.own}' that no run has made", got=str(folder),
-                             cure="choose another folder")  # fmt: skip
+            raise InputError(
+                "--output",
+                f"holds a folder '{stage.own}' that no run has made",
+                got=str(folder),
+                cure="choose another folder",
+            )
         if finished or left != {"stage": stage.name, "key": key}:
             if own.is_dir():
                 own.replace(aside)

@@ -102,8 +102,9 @@ def find_scene(name: str) -> Path:
     return bundled.bundled_path("scenes", name)
 
 
-def load_place(path: Path, workspace: Workspace, *, options: MeshOptions | None = None,
-               allow_outside: bool = False) -> Place:  # fmt: skip
+def load_place(
+    path: Path, workspace: Workspace, *, options: MeshOptions | None = None, allow_outside: bool = False
+) -> Place:
     """Read a scene file and its elevation, and build its terrain (or load it, where it was built before)."""
     options = options or MeshOptions()
     scene = read_scene(path, allow_outside=allow_outside)
@@ -120,8 +121,15 @@ def load_place(path: Path, workspace: Workspace, *, options: MeshOptions | None 
         "frame": frame,
         "options": options,
     }
-    terrain, atlas = build_once(workspace, f"{scene.name}/terrain", key, suffix=".npz", save=_save_terrain, load=_load_terrain,
-                                build=lambda: _terrain(elevation, frame, scene, options))  # fmt: skip
+    terrain, atlas = build_once(
+        workspace,
+        f"{scene.name}/terrain",
+        key,
+        suffix=".npz",
+        save=_save_terrain,
+        load=_load_terrain,
+        build=lambda: _terrain(elevation, frame, scene, options),
+    )
     return Place(Path(path), scene, frame, elevation, fill, terrain, atlas, synthetic, key, workspace)
 
 
@@ -133,8 +141,15 @@ def _elevation(path: Path, scene: SceneFile, workspace: Workspace):
 
         made = scene.elevation.synthetic
         inputs = {"revision": REVISIONS["place"], "synthetic": made}
-        synthetic = build_once(workspace, f"{scene.name}/massif", inputs, suffix=".npz", save=save_place, load=load_place,
-                               build=lambda: alpine_massif(seed=made.seed, size_m=made.size_m, spacing_m=made.spacing_m))  # fmt: skip
+        synthetic = build_once(
+            workspace,
+            f"{scene.name}/massif",
+            inputs,
+            suffix=".npz",
+            save=save_place,
+            load=load_place,
+            build=lambda: alpine_massif(seed=made.seed, size_m=made.size_m, spacing_m=made.spacing_m),
+        )
         raster = synthetic.elevation
     else:
         synthetic = None
@@ -152,9 +167,12 @@ def _frame(scene: SceneFile, elevation: Raster) -> LocalFrame:
     origin = scene.origin
     west, south, east, north = bounds_geographic(elevation)
     if not (west - 1.0 <= origin.longitude_deg <= east + 1.0 and south - 1.0 <= origin.latitude_deg <= north + 1.0):
-        raise InputError("origin", "lies more than 1° outside the elevation raster",
-                         got=f"{origin.latitude_deg}, {origin.longitude_deg}",
-                         expected=f"latitude {south:.3f} … {north:.3f}, longitude {west:.3f} … {east:.3f}")  # fmt: skip
+        raise InputError(
+            "origin",
+            "lies more than 1° outside the elevation raster",
+            got=f"{origin.latitude_deg}, {origin.longitude_deg}",
+            expected=f"latitude {south:.3f} … {north:.3f}, longitude {west:.3f} … {east:.3f}",
+        )
     return LocalFrame(origin.latitude_deg, origin.longitude_deg, origin.height_m, scene.refraction_k)
 
 
@@ -235,17 +253,30 @@ def albedo_for(place: Place, date: datetime) -> Texture:
     if place.synthetic is not None:
         day = date.timetuple().tm_yday
         inputs["day_of_year"] = day
-        return build_once(place.workspace, f"{place.scene.name}/albedo-day{day:03d}", inputs, suffix=".npz",
-                          save=save_texture, load=load_texture,
-                          build=lambda: bake_imagery(place.terrain, place.atlas, _synthetic_image(place, day)))  # fmt: skip
+        return build_once(
+            place.workspace,
+            f"{place.scene.name}/albedo-day{day:03d}",
+            inputs,
+            suffix=".npz",
+            save=save_texture,
+            load=load_texture,
+            build=lambda: bake_imagery(place.terrain, place.atlas, _synthetic_image(place, day)),
+        )
     imagery = place.scene.imagery
     if imagery is None:
         inputs["uniform"] = GREY_ALBEDO
         shape = (place.atlas.height_px, place.atlas.width_px)
         return Texture(np.full((*shape, 3), GREY_ALBEDO, np.float32), np.zeros(shape, np.float32))
     inputs.update(imagery=imagery.model_copy(update={"file": Path(imagery.file).name}), hash=file_hash(imagery.file))
-    return build_once(place.workspace, f"{place.scene.name}/albedo", inputs, suffix=".npz", save=save_texture,
-                      load=load_texture, build=lambda: _baked_image(place))  # fmt: skip
+    return build_once(
+        place.workspace,
+        f"{place.scene.name}/albedo",
+        inputs,
+        suffix=".npz",
+        save=save_texture,
+        load=load_texture,
+        build=lambda: _baked_image(place),
+    )
 
 
 # The synthetic place has no satellite; its colours of this day stand for a summer's image.
@@ -287,8 +318,12 @@ def dated_albedos(place: Place, given: Sequence[tuple[str, str]] = ()) -> list[D
         content = "grey" if imagery is None else f"{imagery.model_dump_json()}:{file_hash(imagery.file)}"
         return [DatedAlbedo(moment.date(), content, lambda: albedo_for(place, moment))]
     moments = [datetime(2024, month, day) for month in range(1, 13) for day in _FILM_DAYS]
-    return [DatedAlbedo(each.date(), f"synthetic:{REVISIONS['albedo']}:{each.timetuple().tm_yday}",
-                        partial(albedo_for, place, each)) for each in moments]  # fmt: skip
+    return [
+        DatedAlbedo(
+            each.date(), f"synthetic:{REVISIONS['albedo']}:{each.timetuple().tm_yday}", partial(albedo_for, place, each)
+        )
+        for each in moments
+    ]
 
 
 def turning_between(place: Place, first: DatedAlbedo, second: DatedAlbedo) -> Texture:
@@ -307,8 +342,15 @@ def turning_between(place: Place, first: DatedAlbedo, second: DatedAlbedo) -> Te
         # Bilinear look-ups at the rim reach texels beyond the surface.
         return Texture(fill_nearest(values.reshape(*shape, 3), weight), weight)
 
-    return build_once(place.workspace, f"{place.scene.name}/snow-turning", inputs, suffix=".npz", save=save_texture,
-                      load=load_texture, build=build)  # fmt: skip
+    return build_once(
+        place.workspace,
+        f"{place.scene.name}/snow-turning",
+        inputs,
+        suffix=".npz",
+        save=save_texture,
+        load=load_texture,
+        build=build,
+    )
 
 
 def albedo_of_day(place: Place, dated: Sequence[DatedAlbedo], day: date, *, season: str = "blended") -> Texture:
@@ -334,8 +376,9 @@ def _given_albedo(place: Place, day: str, path: Path) -> DatedAlbedo:
     try:
         when = date.fromisoformat(day)
     except ValueError:
-        raise InputError("--albedo", "not a date", got=day,
-                         expected="DATE=FILE.npz, such as 2024-07-20=summer.npz") from None  # fmt: skip
+        raise InputError(
+            "--albedo", "not a date", got=day, expected="DATE=FILE.npz, such as 2024-07-20=summer.npz"
+        ) from None
     if not path.is_file():
         raise InputError("--albedo", "no such file", got=str(path))
 
@@ -343,8 +386,13 @@ def _given_albedo(place: Place, day: str, path: Path) -> DatedAlbedo:
         texture = load_texture(path)
         shape = (place.atlas.height_px, place.atlas.width_px)
         if texture.values.shape[:2] != shape:
-            raise InputError(path, "this texture is of another atlas", got="{} × {} texels".format(*texture.values.shape[:2]),
-                             expected="{} × {}".format(*shape), cure="give the --atlas and --texel-m that it was made with")  # fmt: skip
+            raise InputError(
+                path,
+                "this texture is of another atlas",
+                got="{} × {} texels".format(*texture.values.shape[:2]),
+                expected="{} × {}".format(*shape),
+                cure="give the --atlas and --texel-m that it was made with",
+            )
         return texture
 
     return DatedAlbedo(when, file_hash(path), load)
@@ -377,9 +425,14 @@ def _baked_image(place: Place) -> Texture:
     imagery = place.scene.imagery
     bands = tuple(imagery.bands) if imagery.bands else None
     # Imagery far finer than the texels is averaged while it is read.
-    image = read_imagery(imagery.file, bounds_deg=bounds_geographic(place.elevation), bands=bands,
-                         finest_m=0.5 * place.atlas.texel_p50_m, encoding=imagery.encoding,
-                         full_scale=imagery.full_scale)  # fmt: skip
+    image = read_imagery(
+        imagery.file,
+        bounds_deg=bounds_geographic(place.elevation),
+        bands=bands,
+        finest_m=0.5 * place.atlas.texel_p50_m,
+        encoding=imagery.encoding,
+        full_scale=imagery.full_scale,
+    )
     texture = bake_imagery(place.terrain, place.atlas, image)
     values = np.clip(texture.values * imagery.reflectance_scale, 0.0, 0.95)
     seen = texture.weight > 0.0
@@ -395,8 +448,12 @@ def ground_height_m(place: Place, latitude_deg: float, longitude_deg: float, *, 
     height = float(sample_raster(place.elevation, x, y)[..., 0])
     if not np.isfinite(height):
         west, south, east, north = bounds_geographic(place.elevation)
-        raise InputError(where, "the place lies outside the elevation raster", got=f"{latitude_deg}, {longitude_deg}",
-                         expected=f"latitude {south:.4f} … {north:.4f}, longitude {west:.4f} … {east:.4f}")  # fmt: skip
+        raise InputError(
+            where,
+            "the place lies outside the elevation raster",
+            got=f"{latitude_deg}, {longitude_deg}",
+            expected=f"latitude {south:.4f} … {north:.4f}, longitude {west:.4f} … {east:.4f}",
+        )
     return height
 
 
@@ -410,8 +467,13 @@ def camera_for(place: Place, view: NamedCamera, *, size_px: tuple[int, int], whe
         x, y = map_from_geodetic(place.elevation.crs, view.latitude_deg, view.longitude_deg)
         ground = float(sample_raster(place.elevation, x, y)[..., 0])  # NaN off the raster: nothing to be below of
         if view.height_m < ground:
-            raise InputError(where, f"'{view.name}' stands below the ground", got=f"{view.height_m:g} m",
-                             expected=f"above {ground:.1f} m", cure="give above_ground_m instead")  # fmt: skip
+            raise InputError(
+                where,
+                f"'{view.name}' stands below the ground",
+                got=f"{view.height_m:g} m",
+                expected=f"above {ground:.1f} m",
+                cure="give above_ground_m instead",
+            )
     return camera_from_place(place.frame, view, ground, size_px=size_px)
 
 

@@ -179,8 +179,12 @@ def read_scene(path: str | Path, *, allow_outside: bool = False) -> SceneFile:
         virtual = name.startswith("/vsi")
         target = Path(name) if virtual else (folder / name).resolve()
         if not allow_outside and (virtual or not target.is_relative_to(folder)):
-            raise InputError(f"{path}: {key}", "leads outside the scene file's folder", got=name,
-                             cure="move the data beside the file, or pass --allow-outside")  # fmt: skip
+            raise InputError(
+                f"{path}: {key}",
+                "leads outside the scene file's folder",
+                got=name,
+                cure="move the data beside the file, or pass --allow-outside",
+            )
         if not virtual and not target.is_file():
             raise InputError(f"{path}: {key}", "no such file", got=str(target))
         return name if virtual else str(target)
@@ -195,9 +199,19 @@ def read_scene(path: str | Path, *, allow_outside: bool = False) -> SceneFile:
     return scene.model_copy(update=updates)
 
 
-def camera_from_place(frame: LocalFrame, view: NamedCamera, ground_height_m: float, *,
-                      size_px: tuple[int, int]) -> Camera:  # fmt: skip
+def camera_from_place(
+    frame: LocalFrame, view: NamedCamera, ground_height_m: float, *, size_px: tuple[int, int]
+) -> Camera:
     """The pinhole camera of a named view, whose ground lies at ``ground_height_m`` in the scene's datum."""
     height_m = view.height_m if view.height_m is not None else ground_height_m + float(view.above_ground_m)
-    return camera_at(frame, view.latitude_deg, view.longitude_deg, height_m, heading_deg=view.heading_deg,
-                     pitch_deg=view.pitch_deg, roll_deg=view.roll_deg, fov_deg=view.fov_deg, size_px=size_px)  # fmt: skip
+    return camera_at(
+        frame,
+        view.latitude_deg,
+        view.longitude_deg,
+        height_m,
+        heading_deg=view.heading_deg,
+        pitch_deg=view.pitch_deg,
+        roll_deg=view.roll_deg,
+        fov_deg=view.fov_deg,
+        size_px=size_px,
+    )

@@ -105,9 +105,17 @@ class Studio:
 
 def assignment_key(assignment: Assignment, place: Place, dated: list[DatedAlbedo]) -> str:
     """Name of all that decides a frame but its time; ``dated`` are the assignment's albedos."""
-    inputs = {"revision": [REVISION, TABLE_REVISION], "place": place.key, "view": assignment.view,
-              "size": assignment.size_px, "model": assignment.model, "albedo": [_named(each) for each in dated],
-              "base": _named(_base(assignment, dated)), "season": assignment.season, "seed": assignment.seed}  # fmt: skip
+    inputs = {
+        "revision": [REVISION, TABLE_REVISION],
+        "place": place.key,
+        "view": assignment.view,
+        "size": assignment.size_px,
+        "model": assignment.model,
+        "albedo": [_named(each) for each in dated],
+        "base": _named(_base(assignment, dated)),
+        "season": assignment.season,
+        "seed": assignment.seed,
+    }
     return content_key(inputs)
 
 
@@ -137,8 +145,12 @@ def open_studio(assignment: Assignment, *, progress: Progress | None = None) -> 
     from seasonscapes.rendering.scene import mi_mesh
 
     use_backend(assignment.device)
-    place = load_place(Path(assignment.scene), Workspace(Path(assignment.workspace)), options=assignment.options,
-                       allow_outside=assignment.allow_outside)  # fmt: skip
+    place = load_place(
+        Path(assignment.scene),
+        Workspace(Path(assignment.workspace)),
+        options=assignment.options,
+        allow_outside=assignment.allow_outside,
+    )
     camera = camera_for(place, assignment.view, size_px=assignment.size_px)
     dated = dated_albedos(place, assignment.albedo)
     base = _base(assignment, dated)
@@ -146,18 +158,35 @@ def open_studio(assignment: Assignment, *, progress: Progress | None = None) -> 
     tell = progress or (lambda _: None)
     tabulate_light(place, camera, assignment.model, progress=lambda share: tell(0.1 * share))
     coefficients = _coefficients(assignment, place, camera, (terrain, base), lambda share: tell(0.1 + 0.9 * share))
-    return Studio(assignment, place, camera, coefficients, terrain, ready_view(terrain, coefficients), dated, base,
-                  frames_folder(assignment, place, dated))  # fmt: skip
+    return Studio(
+        assignment,
+        place,
+        camera,
+        coefficients,
+        terrain,
+        ready_view(terrain, coefficients),
+        dated,
+        base,
+        frames_folder(assignment, place, dated),
+    )
 
 
-def _coefficients(assignment: Assignment, place: Place, camera: Camera, clothed: tuple[Any, DatedAlbedo],
-                  progress: Progress) -> Any:  # fmt: skip
+def _coefficients(
+    assignment: Assignment, place: Place, camera: Camera, clothed: tuple[Any, DatedAlbedo], progress: Progress
+) -> Any:
     from seasonscapes.rendering.coefficients_file import load_coefficients, save_coefficients
     from seasonscapes.rendering.transport import Effort, trace_view
 
     terrain, base = clothed
-    inputs = {"revision": REVISION, "place": place.key, "view": assignment.view, "size": assignment.size_px,
-              "albedo": _named(base), "effort": asdict(Effort()), "seed": assignment.seed}  # fmt: skip
+    inputs = {
+        "revision": REVISION,
+        "place": place.key,
+        "view": assignment.view,
+        "size": assignment.size_px,
+        "albedo": _named(base),
+        "effort": asdict(Effort()),
+        "seed": assignment.seed,
+    }
     key = content_key(inputs)
     folder = place.workspace.folder / f"{place.scene.name}/coefficients-{key}"
     if (folder / "coefficients.json").is_file():
@@ -206,8 +235,10 @@ def _worn(studio: Studio, weights: list[tuple[int, float]], day: date) -> list[n
         cover = np.maximum(studio.coefficients.coverage[:, None], 1e-3)
         studio.turnings = {name: (pixels / cover, senders)}
     line = line_share(*(day_number(each) for each in (pair[0].day, pair[1].day, day)))
-    return [albedo_between((parts[0][k], parts[1][k]), turning, weights[1][1], line)
-            for k, turning in enumerate(studio.turnings[name])]  # fmt: skip
+    return [
+        albedo_between((parts[0][k], parts[1][k]), turning, weights[1][1], line)
+        for k, turning in enumerate(studio.turnings[name])
+    ]
 
 
 def _colours(studio: Studio, dated: DatedAlbedo) -> tuple[np.ndarray, np.ndarray]:
@@ -217,9 +248,15 @@ def _colours(studio: Studio, dated: DatedAlbedo) -> tuple[np.ndarray, np.ndarray
     from seasonscapes.rendering.transport import view_albedo
 
     assignment, place = studio.assignment, studio.place
-    inputs = {"revision": REVISION, "place": place.key, "view": assignment.view, "size": assignment.size_px,
-              "albedo": _named(dated), "base": _named(studio.base),
-              "seed": assignment.seed}  # fmt: skip
+    inputs = {
+        "revision": REVISION,
+        "place": place.key,
+        "view": assignment.view,
+        "size": assignment.size_px,
+        "albedo": _named(dated),
+        "base": _named(studio.base),
+        "seed": assignment.seed,
+    }
 
     def build() -> tuple[np.ndarray, np.ndarray]:
         texture = dated.load().values
@@ -227,8 +264,15 @@ def _colours(studio: Studio, dated: DatedAlbedo) -> tuple[np.ndarray, np.ndarray
         pixels = view_albedo(studio.terrain, studio.coefficients).astype(np.float16)
         return pixels, senders_albedo(studio.coefficients, texture).astype(np.float16)
 
-    pixels, senders = build_once(place.workspace, f"{place.scene.name}/view-albedo", inputs, suffix=".npz", build=build,
-                                 save=_save_colours, load=_load_colours)  # fmt: skip
+    pixels, senders = build_once(
+        place.workspace,
+        f"{place.scene.name}/view-albedo",
+        inputs,
+        suffix=".npz",
+        build=build,
+        save=_save_colours,
+        load=_load_colours,
+    )
     return pixels.astype(np.float32), senders.astype(np.float32)
 
 
@@ -287,8 +331,11 @@ def render_frame(assignment: Assignment, time: datetime, *, exr_folder: str | No
     if copy is not None:
         from seasonscapes.images import write_exr
 
-        write_exr(copy, {"": view.radiance, "alpha": view.coverage, "depth": view.gbuffer.depth},
-                  header={"seasonscapes:provenance": record, "seasonscapes:units": "cd/m2"})  # fmt: skip
+        write_exr(
+            copy,
+            {"": view.radiance, "alpha": view.coverage, "depth": view.gbuffer.depth},
+            header={"seasonscapes:provenance": record, "seasonscapes:units": "cd/m2"},
+        )
     save_frame(path, view.radiance, metered_ev100=metered, record=record)
     return {"time_utc": time.isoformat(), "metered_ev100": metered, "rendered": True}
 

@@ -62,8 +62,16 @@ def _plain(value: Any) -> Any:
     raise TypeError(f"content_key: cannot name a {type(value).__name__}")
 
 
-def build_once(workspace: Workspace, name: str, inputs: dict, *, suffix: str, build: Callable[[], Value],
-               save: Callable[[Value, Path], None], load: Callable[[Path], Value]) -> Value:  # fmt: skip
+def build_once(
+    workspace: Workspace,
+    name: str,
+    inputs: dict,
+    *,
+    suffix: str,
+    build: Callable[[], Value],
+    save: Callable[[Value, Path], None],
+    load: Callable[[Path], Value],
+) -> Value:
     """Load the artefact of these inputs, or build it, save it atomically and write its manifest.
 
     Parameters

@@ -67,10 +67,12 @@ def case() -> Case:
     lights = [hosek_illumination(direction_from_angles(*sun), shape=(64, 128)) for sun in SUNS_DEG]
     mesh, top = mi_mesh(terrain, albedo), float(terrain.vertices[:, 2].max())
     pictures = [
-        [render_view(relight(mesh, light, max_height_m=top), camera, spp=64, seed=10 * t + c).radiance
-         for c, camera in enumerate(cameras)]
+        [
+            render_view(relight(mesh, light, max_height_m=top), camera, spp=64, seed=10 * t + c).radiance
+            for c, camera in enumerate(cameras)
+        ]
         for t, light in enumerate(lights)
-    ]  # fmt: skip
+    ]
     land = trace_land(terrain, albedo.shape[:2], effort=Effort(subpixels=1, rays=128, listed=64, senders=1024, rank=24))
     return Case(place, terrain, albedo, cameras, lights, pictures, land)
 

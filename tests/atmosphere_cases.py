@@ -18,11 +18,7 @@ from seasonscapes.sky.atmosphere import (
 )
 from seasonscapes.sky.aureole import spread_aerosol_phase
 from seasonscapes.sky.cells import sample_cells, scattering_per_m
-from seasonscapes.sky.illumination import (
-    diffuse_horizontal_illuminance,
-    direct_horizontal_illuminance,
-    luminance,
-)
+from seasonscapes.sky.illumination import diffuse_horizontal_illuminance, direct_horizontal_illuminance, luminance
 from seasonscapes.sky.moments import HARMONIC_ORDER, SUN_ELEVATION_KNOTS_DEG, diffuse_source, sun_geometry
 from seasonscapes.sky.paths import sun_transfer, towards_sun, trace_rays
 from seasonscapes.sky.scattering import AtmosphereTables
@@ -45,28 +41,40 @@ def chromaticity(rgb) -> np.ndarray:
     return xyz[:2] / xyz.sum()
 
 
-def spectrl2_illuminance_lx(elevation_deg: float, optical_depth_500nm: float, height_m: float, *,
-                            angstrom_exponent: float = 1.14) -> tuple[float, float]:  # fmt: skip
+def spectrl2_illuminance_lx(
+    elevation_deg: float, optical_depth_500nm: float, height_m: float, *, angstrom_exponent: float = 1.14
+) -> tuple[float, float]:
     """Direct normal and diffuse horizontal illuminance [lx] by pvlib's SPECTRL2 weighted by V(λ), at 1 au."""
     import colour
     import pvlib
 
     day = 94  # the only thing it does to the result is the distance, which is divided out again
     spectra = pvlib.spectrum.spectrl2(
-        apparent_zenith=90.0 - elevation_deg, aoi=90.0 - elevation_deg, surface_tilt=0.0, ground_albedo=0.2,
+        apparent_zenith=90.0 - elevation_deg,
+        aoi=90.0 - elevation_deg,
+        surface_tilt=0.0,
+        ground_albedo=0.2,
         surface_pressure=pvlib.atmosphere.alt2pres(height_m),
         relative_airmass=pvlib.atmosphere.get_relative_airmass(90.0 - elevation_deg, "kastenyoung1989"),
-        precipitable_water=0.5, ozone=0.32, aerosol_turbidity_500nm=optical_depth_500nm, dayofyear=day,
+        precipitable_water=0.5,
+        ozone=0.32,
+        aerosol_turbidity_500nm=optical_depth_500nm,
+        dayofyear=day,
         alpha=angstrom_exponent,
-    )  # fmt: skip
+    )
     sensitivity = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
     distance = pvlib.irradiance.get_extra_radiation(day, solar_constant=1.0, method="spencer")
     return tuple(
-        float(683.0 / distance * np.sum(
-            np.interp(sensitivity.wavelengths, spectra["wavelength"], np.ravel(spectra[key])) * sensitivity.values[:, 1]
-        ))
+        float(
+            683.0
+            / distance
+            * np.sum(
+                np.interp(sensitivity.wavelengths, spectra["wavelength"], np.ravel(spectra[key]))
+                * sensitivity.values[:, 1]
+            )
+        )
         for key in ("dni", "dhi")
-    )  # fmt: skip
+    )
 
 
 def our_illuminance_lx(tables: AtmosphereTables, elevation_deg: float, height_m: float) -> tuple[float, float]:
@@ -90,8 +98,16 @@ def steps_beyond_trend(illuminance_lx: np.ndarray) -> np.ndarray:
     return np.abs(step[1:-1] - 0.5 * (step[:-2] + step[2:]))
 
 
-def against_oracle(tables: AtmosphereTables, sun_elevation_deg: float, direction: np.ndarray, *, paths: int, seed: int,
-                   height_m: float = 500.0, distance_m: float = np.inf) -> tuple[float, float]:  # fmt: skip
+def against_oracle(
+    tables: AtmosphereTables,
+    sun_elevation_deg: float,
+    direction: np.ndarray,
+    *,
+    paths: int,
+    seed: int,
+    height_m: float = 500.0,
+    distance_m: float = np.inf,
+) -> tuple[float, float]:
     """Relative deviation in luminance from the brute-force oracle, and the oracle's own relative standard error.
 
     The tables' atmosphere must not refract. The sun stands in the north.
@@ -112,8 +128,15 @@ def against_oracle(tables: AtmosphereTables, sun_elevation_deg: float, direction
     return float(ours / truth - 1.0), float(np.abs(weights) @ error / truth)
 
 
-def dense_airlight(tables: AtmosphereTables, sun_direction: np.ndarray, height_m: float, direction: np.ndarray,
-                   distance_m: float, *, cells: int = 400) -> np.ndarray:  # fmt: skip
+def dense_airlight(
+    tables: AtmosphereTables,
+    sun_direction: np.ndarray,
+    height_m: float,
+    direction: np.ndarray,
+    distance_m: float,
+    *,
+    cells: int = 400,
+) -> np.ndarray:
     """Airlight ``(3,)`` [cd/m²] up to a distance, integrated along this one ray alone with many cells."""
     atmosphere, (azimuth_deg, elevation_deg) = tables.atmosphere, angles_from_direction(direction)
     sun_azimuth_deg, apparent_deg = angles_from_direction(sun_direction)
@@ -163,6 +186,11 @@ def energy_imbalance(tables: AtmosphereTables) -> np.ndarray:
 def homogeneous(visibility_m: float) -> Atmosphere:
     """A grey atmosphere of the same aerosol at every height, with a meteorological range."""
     return Atmosphere(
-        3.912 / visibility_m * TOP_HEIGHT_M, 0.0, np.inf, ozone_du=0.0, pressure_hpa=0.0, refraction=False,
+        3.912 / visibility_m * TOP_HEIGHT_M,
+        0.0,
+        np.inf,
+        ozone_du=0.0,
+        pressure_hpa=0.0,
+        refraction=False,
         single_scattering_albedo=0.9,
-    )  # fmt: skip
+    )

@@ -36,8 +36,9 @@ def observer(atmosphere: Atmosphere, height_m: float) -> np.ndarray:
     return np.array([0.0, 0.0, atmosphere.ground_radius_m - atmosphere.ground_height_m + height_m])
 
 
-def once_scattered(walk: Walk, position: np.ndarray, direction: np.ndarray, *, nodes: int = 600,
-                   distance_m: float = np.inf) -> np.ndarray:  # fmt: skip
+def once_scattered(
+    walk: Walk, position: np.ndarray, direction: np.ndarray, *, nodes: int = 600, distance_m: float = np.inf
+) -> np.ndarray:
     """Sunlight scattered once, and sunlit ground, along one ray ``(3,)`` up to a distance: quadrature, ``(B,)``."""
     edges, on_ground = _edges(walk, position[None], direction[None], cells=nodes, distance_m=distance_m)
     middle, length = 0.5 * (edges[0, 1:] + edges[0, :-1]), np.diff(edges[0])
@@ -55,8 +56,16 @@ def once_scattered(walk: Walk, position: np.ndarray, direction: np.ndarray, *, n
     return light
 
 
-def many_times_scattered(walk: Walk, position: np.ndarray, direction: np.ndarray, *, paths: int, seed: int,
-                         bounces: int = 14, distance_m: float = np.inf) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+def many_times_scattered(
+    walk: Walk,
+    position: np.ndarray,
+    direction: np.ndarray,
+    *,
+    paths: int,
+    seed: int,
+    bounces: int = 14,
+    distance_m: float = np.inf,
+) -> tuple[np.ndarray, np.ndarray]:
     """Mean and standard error ``(B,)`` of light scattered twice or more along one ray ``(3,)``, by random walks.
 
     Its last scattering is nearer than ``distance_m``.
@@ -91,8 +100,11 @@ def _walks(walk: Walk, position, direction, count: int, random, bounces: int, di
         factor = through * np.where(ground["taken"][:, None], lambert, air)
         throughput, heading = throughput * factor / pdf[:, None], new
         # Russian roulette on the brightest band once paths grow faint.
-        chance = np.minimum(1.0, throughput.max(axis=1) / 0.05) if bounce > 1 else np.minimum(
-            1.0, 1e6 * throughput.max(axis=1))  # fmt: skip
+        chance = (
+            np.minimum(1.0, throughput.max(axis=1) / 0.05)
+            if bounce > 1
+            else np.minimum(1.0, 1e6 * throughput.max(axis=1))
+        )
         keep = random.random(len(chance)) < chance
         throughput = throughput[keep] / chance[keep, None]
         where, heading, alive = where[keep], heading[keep], alive[keep]
@@ -154,8 +166,9 @@ def _next_vertex(walk: Walk, where, heading, random, *, distance_m: float):
     transmittance = np.exp(-(total[rows, cell] + fraction[:, None] * depth[rows, cell]))
     at_end = np.exp(-total[:, -1])
     density_of_choice = share[rows, cell] / np.maximum(length[rows, cell], 1e-9) * (1.0 - to_ground)
-    through = np.where(taken[:, None], at_end / np.maximum(to_ground, 1e-9)[:, None],
-                       transmittance / density_of_choice[:, None])  # fmt: skip
+    through = np.where(
+        taken[:, None], at_end / np.maximum(to_ground, 1e-9)[:, None], transmittance / density_of_choice[:, None]
+    )
     new = where + distance[:, None] * heading
     local = constituent_densities(walk.atmosphere, np.linalg.norm(new, axis=1) - walk.centre)
     sigma = local[:2, :, None] * air.scattering[:2, None, :]

@@ -66,15 +66,30 @@ fov_deg = 60.0
 """
 
 
-def write_raster(path: Path, values: np.ndarray, *, spacing_m: float, crs: str | None = "EPSG:32632",
-                 nodata: float | None = None, origin: tuple[float, float] | None = None) -> Path:  # fmt: skip
+def write_raster(
+    path: Path,
+    values: np.ndarray,
+    *,
+    spacing_m: float,
+    crs: str | None = "EPSG:32632",
+    nodata: float | None = None,
+    origin: tuple[float, float] | None = None,
+) -> Path:
     """A north-up float GeoTIFF ``(H, W)`` or ``(H, W, C)`` centred on the test place."""
     values = np.asarray(values, np.float32)
     values = values[..., None] if values.ndim == 2 else values
     height, width, count = values.shape
     west, north = origin or (EAST_M - width * spacing_m / 2, NORTH_M + height * spacing_m / 2)
-    profile = {"driver": "GTiff", "height": height, "width": width, "count": count, "dtype": "float32", "crs": crs,
-               "transform": Affine(spacing_m, 0, west, 0, -spacing_m, north), "nodata": nodata}  # fmt: skip
+    profile = {
+        "driver": "GTiff",
+        "height": height,
+        "width": width,
+        "count": count,
+        "dtype": "float32",
+        "crs": crs,
+        "transform": Affine(spacing_m, 0, west, 0, -spacing_m, north),
+        "nodata": nodata,
+    }
     with rasterio.open(path, "w", **profile) as file:
         file.write(values.transpose(2, 0, 1))
     return path

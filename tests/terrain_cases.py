@@ -38,8 +38,14 @@ def write_tiff(path, values, transform=None, crs=None, **profile):
     """Write ``(H, W)`` or ``(C, H, W)`` as GeoTIFF."""
     values = np.asarray(values)
     values = values[None] if values.ndim == 2 else values
-    profile = {"driver": "GTiff", "count": len(values), "height": values.shape[1], "width": values.shape[2],
-               "dtype": values.dtype, **profile}  # fmt: skip
+    profile = {
+        "driver": "GTiff",
+        "count": len(values),
+        "height": values.shape[1],
+        "width": values.shape[2],
+        "dtype": values.dtype,
+        **profile,
+    }
     if crs is not None:
         profile["crs"] = crs
     if transform is not None:
@@ -64,8 +70,11 @@ def triangles_overlap(a, b, tolerance):
 def overlapping_pairs(uv, faces, tolerance=1e-6):
     """All pairs of faces that share an area in UV, by brute force."""
     corners = np.asarray(uv, np.float64)[faces]
-    return [(i, j) for i, j in itertools.combinations(range(len(faces)), 2)
-            if triangles_overlap(corners[i], corners[j], tolerance)]  # fmt: skip
+    return [
+        (i, j)
+        for i, j in itertools.combinations(range(len(faces)), 2)
+        if triangles_overlap(corners[i], corners[j], tolerance)
+    ]
 
 
 def _cross(a, b):

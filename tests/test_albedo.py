@@ -211,8 +211,14 @@ def test_all_clipped_is_an_error(place, shots):
 
 
 def test_night_is_an_error(place, shots):
-    dark = [replace(s, light=replace(s.light, sun=None, sky_radiance=0.0 * s.light.sky_radiance),
-                    footprints=replace(s.footprints, sunlit=[[] for _ in s.footprints.sunlit])) for s in shots]  # fmt: skip
+    dark = [
+        replace(
+            s,
+            light=replace(s.light, sun=None, sky_radiance=0.0 * s.light.sky_radiance),
+            footprints=replace(s.footprints, sunlit=[[] for _ in s.footprints.sunlit]),
+        )
+        for s in shots
+    ]
     with pytest.raises(ValueError, match="no photograph has any light"):
         solve_albedo(place.land, dark)
 

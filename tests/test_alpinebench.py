@@ -16,7 +16,17 @@ def measured(tmp_path_factory):
     """The quick bench's numbers and its figures' folder."""
     folder = tmp_path_factory.mktemp("alpinebench")
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    command = [sys.executable, str(BENCH), "--quick", "--seed", "21", "--json", str(folder / "numbers.json"), "--figures", str(folder)]  # fmt: skip
+    command = [
+        sys.executable,
+        str(BENCH),
+        "--quick",
+        "--seed",
+        "21",
+        "--json",
+        str(folder / "numbers.json"),
+        "--figures",
+        str(folder),
+    ]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
     return json.loads((folder / "numbers.json").read_text()), folder
@@ -27,9 +37,16 @@ def measured(tmp_path_factory):
 def test_the_whole_way(measured):
     numbers, _ = measured
     # Measured: 34.3 dB, 0.950; 37.7 dB, 0.970; 29.2, 34.1, 39.2 and 45.7 dB.
-    least = {"painted_view_psnr_db": 33.3, "painted_view_ssim": 0.94, "held_out_hour_psnr_db": 36.7,
-             "held_out_hour_ssim": 0.96, "distilled_psnr_db": 28.2, "stage_inpaint_alone_psnr_db": 33.1,
-             "stage_albedo_alone_clean_relight_psnr_db": 38.2, "stage_relight_true_albedo_psnr_db": 44.0}  # fmt: skip
+    least = {
+        "painted_view_psnr_db": 33.3,
+        "painted_view_ssim": 0.94,
+        "held_out_hour_psnr_db": 36.7,
+        "held_out_hour_ssim": 0.96,
+        "distilled_psnr_db": 28.2,
+        "stage_inpaint_alone_psnr_db": 33.1,
+        "stage_albedo_alone_clean_relight_psnr_db": 38.2,
+        "stage_relight_true_albedo_psnr_db": 44.0,
+    }
     short = {name: numbers[name] for name, bound in least.items() if not numbers[name] >= bound}
     assert not short
     # Hours that nobody photographed are no worse than those that were, by the same webcams' pictures.
@@ -46,17 +63,29 @@ def test_what_is_left_out_is_missed(measured):
 
     # As in the paper: without painting most is lost, without its parts less.
     assert lost("painting", "satellite_only_best_exposure") > 10.0
-    for name, least in (("no_gain_compensation", 4.0), ("no_aerial_perspective", 5.0), ("no_inpainting_one_mean_colour", 4.0),
-                        ("no_occlusion_test", 2.0), ("no_albedo_to_tie_pictures", 1.5),
-                        ("no_guidance_telea_as_the_paper", 1.0)):  # fmt: skip
+    for name, least in (
+        ("no_gain_compensation", 4.0),
+        ("no_aerial_perspective", 5.0),
+        ("no_inpainting_one_mean_colour", 4.0),
+        ("no_occlusion_test", 2.0),
+        ("no_albedo_to_tie_pictures", 1.5),
+        ("no_guidance_telea_as_the_paper", 1.0),
+    ):
         assert lost("painting", name) > least, name
-    for name, least in (("satellite_only_best_exposure", 18.0), ("no_albedo_painting_guided_completion", 8.0),
-                        ("painted_texels_as_they_are_the_relit_albedo_beyond", 4.0),
-                        ("no_webcams_july_s_image_as_it_is_relit", 10.0)):  # fmt: skip
+    for name, least in (
+        ("satellite_only_best_exposure", 18.0),
+        ("no_albedo_painting_guided_completion", 8.0),
+        ("painted_texels_as_they_are_the_relit_albedo_beyond", 4.0),
+        ("no_webcams_july_s_image_as_it_is_relit", 10.0),
+    ):
         assert lost("painted", name) > least, name
-    for name, least in (("no_relighting_nearest_painted_hour", 12.0), ("no_aerial_perspective", 10.0),
-                        ("no_webcams_july_s_image_delit_relit", 4.0), ("no_tone_curve_searched", 4.0),
-                        ("satellite_a_guide_no_base_to_correct", 2.0)):  # fmt: skip
+    for name, least in (
+        ("no_relighting_nearest_painted_hour", 12.0),
+        ("no_aerial_perspective", 10.0),
+        ("no_webcams_july_s_image_delit_relit", 4.0),
+        ("no_tone_curve_searched", 4.0),
+        ("satellite_a_guide_no_base_to_correct", 2.0),
+    ):
         assert lost("held_out", name) > least, name
 
 

@@ -28,8 +28,15 @@ def trial():
 @pytest.fixture
 def session(trial, tmp_path):
     look = partial(look_at_rasters, rasters=trial.rasters, frame=trial.frame, nearest_m=120.0)
-    return PickSession("HUT", trial.image, trial.start, trial.frame, look, tmp_path,
-                       priors=Priors(horizontal_m=10.0, vertical_m=10.0, focal=0.02))  # fmt: skip
+    return PickSession(
+        "HUT",
+        trial.image,
+        trial.start,
+        trial.frame,
+        look,
+        tmp_path,
+        priors=Priors(horizontal_m=10.0, vertical_m=10.0, focal=0.02),
+    )
 
 
 def true_pixel(trial, position):
@@ -114,14 +121,21 @@ def test_the_server_answers_only_here_and_only_with_its_token(session):
         assert server.server_address[0] == "127.0.0.1"
         root = address.split("?")[0]
         assert b"<canvas" in urllib.request.urlopen(address).read()
-        for request in (root, root + "?token=wrong", urllib.request.Request(root + "state", b"{}"),
-                        urllib.request.Request(address, headers={"Host": "evil.example"})):  # fmt: skip
+        for request in (
+            root,
+            root + "?token=wrong",
+            urllib.request.Request(root + "state", b"{}"),
+            urllib.request.Request(address, headers={"Host": "evil.example"}),
+        ):
             with pytest.raises(urllib.error.HTTPError) as error:
                 urllib.request.urlopen(request)
             assert error.value.code == 403
         token = {"X-Token": address.split("=")[1]}
-        for path, body, message in (("solve", b"{}", "at least 3 are needed"), ("pick", b"{}", "not a request"),
-                                    ("pick", b"[", "Expecting value")):  # fmt: skip
+        for path, body, message in (
+            ("solve", b"{}", "at least 3 are needed"),
+            ("pick", b"{}", "not a request"),
+            ("pick", b"[", "Expecting value"),
+        ):
             with pytest.raises(urllib.error.HTTPError) as error:
                 urllib.request.urlopen(urllib.request.Request(root + path, body, headers=token))
             assert message in json.loads(error.value.read())["error"]
@@ -206,8 +220,10 @@ def test_the_page_from_click_to_file_in_chromium(session, trial, browser):
         until(lambda: browser.execute_script("return panes.terrain.image.complete"))
         ActionChains(browser).move_to_element_with_offset(browser.find_element(By.ID, "terrain"), 0, 40).perform()
         until(lambda: browser.execute_script("return cursor !== null"))
-        stretched = "return Object.values(panes).some(p => p.canvas.width !== p.canvas.clientWidth || " \
-                    "p.canvas.height !== p.canvas.clientHeight)"  # fmt: skip
+        stretched = (
+            "return Object.values(panes).some(p => p.canvas.width !== p.canvas.clientWidth || "
+            "p.canvas.height !== p.canvas.clientHeight)"
+        )
         until(lambda: not browser.execute_script(stretched))
         press("save")
         until(lambda: data("saved") == "yes")

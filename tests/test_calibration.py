@@ -19,8 +19,9 @@ FREE = Priors(horizontal_m=np.inf, vertical_m=np.inf)
 
 def test_angles_are_the_inverse_of_the_rotation():
     rng = np.random.default_rng(0)
-    for heading, pitch, roll in zip(rng.uniform(0, 360, 50), rng.uniform(-80, 80, 50), rng.uniform(-170, 170, 50),
-                                    strict=True):  # fmt: skip
+    for heading, pitch, roll in zip(
+        rng.uniform(0, 360, 50), rng.uniform(-80, 80, 50), rng.uniform(-170, 170, 50), strict=True
+    ):
         assert angles_from_rotation(rotation_from_angles(heading, pitch, roll)) == pytest.approx((heading, pitch, roll))
 
 
@@ -44,10 +45,12 @@ def test_clean_matches_give_the_truth_to_the_last_digit(panoramic, loss):
 def coverage(trials: int, seed: int) -> dict:
     rng = np.random.default_rng(seed)
     scores = [score_points(point_trial(rng, panoramic=i % 2 == 0), noise_px=1.0) for i in range(trials)]
-    return {"heading": np.array([s.heading_error_deg for s in scores]),
-            "focal": np.array([s.focal_error for s in scores]),
-            "inside": np.array([s.within_two_sigma for s in scores]),
-            "found": np.array([s.wrong_found for s in scores])}  # fmt: skip
+    return {
+        "heading": np.array([s.heading_error_deg for s in scores]),
+        "focal": np.array([s.focal_error for s in scores]),
+        "inside": np.array([s.within_two_sigma for s in scores]),
+        "found": np.array([s.wrong_found for s in scores]),
+    }
 
 
 @pytest.mark.slow
@@ -72,8 +75,11 @@ def test_a_radial_term_is_recovered_and_its_points_named():
 
     trial = point_trial(np.random.default_rng(8), panoramic=False, count=40, noise_px=0.5, outlier_share=0.1)
     pixel = distort(trial.points.pixel, trial.truth, -0.12)
-    solved = calibrate(trial.start, Correspondences(pixel, trial.points.position_m),
-                       priors=Priors(horizontal_m=20, vertical_m=20, k1=np.inf))  # fmt: skip
+    solved = calibrate(
+        trial.start,
+        Correspondences(pixel, trial.points.position_m),
+        priors=Priors(horizontal_m=20, vertical_m=20, k1=np.inf),
+    )
     assert solved.k1 == pytest.approx(-0.12, abs=3.0 * solved.sigma["k1"])
     assert solved.sigma["k1"] < 0.01
     assert set(solved.outlier_names) == {str(i + 1) for i in np.flatnonzero(trial.wrong)}
@@ -103,14 +109,17 @@ def broken(points, how):
     return Correspondences(points.pixel, points.position_m[rng.permutation(len(points))])
 
 
-@pytest.mark.parametrize(("how", "message"), [
-    ("few", r"2 points for 4 unknowns without a prior: at least 3 are needed"),
-    ("mirror x", "mirrored"),
-    ("mirror y", "mirrored"),
-    ("turned", "on its head"),
-    ("reversed", "in reverse order"),
-    ("shuffled", "no pose in common|on its head|behind the camera"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ("few", r"2 points for 4 unknowns without a prior: at least 3 are needed"),
+        ("mirror x", "mirrored"),
+        ("mirror y", "mirrored"),
+        ("turned", "on its head"),
+        ("reversed", "in reverse order"),
+        ("shuffled", "no pose in common|on its head|behind the camera"),
+    ],
+)
 def test_matches_that_cannot_be_are_refused_with_a_reason(how, message):
     for seed in (1, 2, 3):
         trial = point_trial(np.random.default_rng(seed), panoramic=False, outlier_share=0.0)
@@ -156,9 +165,11 @@ def test_points_survive_their_file(tmp_path):
     assert again.names == trial.points.names
     assert np.abs(again.position_m - trial.points.position_m).max() < 1e-3
     text = (tmp_path / "p.csv").read_text()
-    for wrong, message in ((text.replace("height_m", "alt"), "'height_m' is missing"),
-                           (text + "x,1,2,nan,8,9\n", "line 14: not a point"),
-                           (text + "x,1\n", "line 14")):  # fmt: skip
+    for wrong, message in (
+        (text.replace("height_m", "alt"), "'height_m' is missing"),
+        (text + "x,1,2,nan,8,9\n", "line 14: not a point"),
+        (text + "x,1\n", "line 14"),
+    ):
         (tmp_path / "p.csv").write_text(wrong)
         with pytest.raises(InputError, match=message):
             read_points(tmp_path / "p.csv", frame)
@@ -175,9 +186,11 @@ def finse(folder):
     longitude, latitude = to_wgs84.transform(column["x_world"], column["y_world"])
     at = to_wgs84.transform(419169.2, 6718421.3)
     frame = LocalFrame(at[1], at[0], 0.0, 0.13)
-    points = Correspondences(np.stack([column["x_img"], column["y_img"]], -1),
-                             enu_from_geodetic(frame, latitude, longitude, column["z_world"]),
-                             tuple(r["name"] for r in rows))  # fmt: skip
+    points = Correspondences(
+        np.stack([column["x_img"], column["y_img"]], -1),
+        enu_from_geodetic(frame, latitude, longitude, column["z_world"]),
+        tuple(r["name"] for r in rows),
+    )
     start = camera_at(frame, at[1], at[0], 1212.0, heading_deg=70.0, fov_deg=65.8, size_px=(1920, 1080))
     return start, points
 
@@ -202,10 +215,13 @@ def test_aletsch_resection(data_dir):
     column = {
         name: np.array([float(r[name]) for r in rows]) for name in ("col_px", "row_px", "lat_deg", "lon_deg", "z_m")
     }
-    points = Correspondences(np.stack([column["col_px"], column["row_px"]], -1),
-                             enu_from_geodetic(frame, column["lat_deg"], column["lon_deg"], column["z_m"]))  # fmt: skip
-    start: Camera = camera_at(frame, 46.4314217, 8.0932999, 2929.0, heading_deg=-63.37, pitch_deg=-11.3, fov_deg=63.08,
-                              size_px=(1024, 763))  # fmt: skip
+    points = Correspondences(
+        np.stack([column["col_px"], column["row_px"]], -1),
+        enu_from_geodetic(frame, column["lat_deg"], column["lon_deg"], column["z_m"]),
+    )
+    start: Camera = camera_at(
+        frame, 46.4314217, 8.0932999, 2929.0, heading_deg=-63.37, pitch_deg=-11.3, fov_deg=63.08, size_px=(1024, 763)
+    )
     solved = calibrate(start, points, priors=Priors(horizontal_m=100.0, vertical_m=100.0), loss="squares")
     assert solved.rms_px < 8.0
     assert solved.values[0] == pytest.approx(296.9, abs=0.3)

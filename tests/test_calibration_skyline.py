@@ -31,8 +31,11 @@ def raster_of(height_of, cells=400, cell=100.0) -> Raster:
     """Heights as a function of metres east and north of (EAST, NORTH), the grid's middle."""
     offset = (np.arange(cells) + 0.5 - cells / 2) * cell
     values = height_of(offset[None, :], -offset[:, None]).astype(np.float32)
-    return Raster(np.broadcast_to(values, (cells, cells))[..., None].copy(),
-                  Affine(cell, 0, EAST - cells / 2 * cell, 0, -cell, NORTH + cells / 2 * cell), CRS)  # fmt: skip
+    return Raster(
+        np.broadcast_to(values, (cells, cells))[..., None].copy(),
+        Affine(cell, 0, EAST - cells / 2 * cell, 0, -cell, NORTH + cells / 2 * cell),
+        CRS,
+    )
 
 
 def frame_at_middle(refraction=0.0) -> LocalFrame:
@@ -84,14 +87,21 @@ def test_profiles_agree_with_exact_transforms_point_by_point():
 
 
 def test_a_near_ridge_before_a_far_one_is_an_edge_and_flat_ground_is_not():
-    raster = raster_of(lambda e, n: 300.0 * np.exp(-(((n - 4000.0) / 400.0) ** 2))
-                       + 1500.0 * np.exp(-(((n - 12_000.0) / 600.0) ** 2)) + 0.0 * e)  # fmt: skip
+    raster = raster_of(
+        lambda e, n: (
+            300.0 * np.exp(-(((n - 4000.0) / 400.0) ** 2)) + 1500.0 * np.exp(-(((n - 12_000.0) / 600.0) ** 2)) + 0.0 * e
+        )
+    )
     horizon = horizon_from([raster], frame_at_middle(), [0.0, 0.0, 50.0], azimuth_deg=np.arange(-5.0, 5.0, 0.5))
     assert len(horizon.edges_m) == 20
     assert np.abs(horizon.edges_m[:, 1] - 4000.0).max() < 150.0
     assert (horizon.edge_gap > 1.0).all()
-    flat = horizon_from([raster_of(lambda e, n: 0.0 * e + 0.0 * n)], frame_at_middle(), [0.0, 0.0, 10.0],
-                        azimuth_deg=np.arange(0.0, 360.0, 30.0))  # fmt: skip
+    flat = horizon_from(
+        [raster_of(lambda e, n: 0.0 * e + 0.0 * n)],
+        frame_at_middle(),
+        [0.0, 0.0, 10.0],
+        azimuth_deg=np.arange(0.0, 360.0, 30.0),
+    )
     assert len(flat.edges_m) == 0
 
 
@@ -126,8 +136,14 @@ def test_the_drawn_skyline_is_where_the_horizon_says(trial):
     """Two independent roads: the picture was ray-cast pixel by pixel, the horizon projected point by point."""
     position = trial.truth.position_m
     heading = values_of(trial.truth, np.eye(3))[0]
-    horizon = horizon_from(trial.rasters, trial.frame, position, azimuth_deg=heading + np.arange(-30, 30, 0.05),
-                           nearest_m=120.0, below_ground_m=40.0)  # fmt: skip
+    horizon = horizon_from(
+        trial.rasters,
+        trial.frame,
+        position,
+        azimuth_deg=heading + np.arange(-30, 30, 0.05),
+        nearest_m=120.0,
+        below_ground_m=40.0,
+    )
     pixel, front = project_values(trial.truth, np.eye(3), values_of(trial.truth, np.eye(3)), horizon.skyline_m)
     pixel = pixel[front & np.isfinite(pixel).all(1)]
     columns = np.arange(SIZE[0])
@@ -193,8 +209,9 @@ def test_points_and_skyline_together(trial, fit):
     inside = front & (pixel[:, 0] > 0) & (pixel[:, 0] < SIZE[0]) & (pixel[:, 1] > 0) & (pixel[:, 1] < SIZE[1])
     points = Correspondences(pixel[inside], position[inside])
     assert len(points) >= 3
-    both = align_to_skyline(trial.image, trial.start, trial.rasters, trial.frame, mask=trial.mask, points=points,
-                            search=REHEARSAL)  # fmt: skip
+    both = align_to_skyline(
+        trial.image, trial.start, trial.rasters, trial.frame, mask=trial.mask, points=points, search=REHEARSAL
+    )
     assert heading_error(both, trial) < 0.1
     assert len(both.calibration.names) == len(points)
 
@@ -222,8 +239,9 @@ def test_the_overlay_shows_ridges_points_and_arrows(tmp_path, trial, fit):
     red = (picture == [230, 40, 40]).all(axis=-1)
     assert red.any(axis=0).mean() > 0.5
     save_overlay(tmp_path / "o.png", trial.image, fit.calibration, horizon=fit.horizon)
-    assert np.array_equal(encoded_from_file(tmp_path / "o.png"), draw_overlay(trial.image, fit.calibration,
-                                                                              horizon=fit.horizon))  # fmt: skip
+    assert np.array_equal(
+        encoded_from_file(tmp_path / "o.png"), draw_overlay(trial.image, fit.calibration, horizon=fit.horizon)
+    )
 
 
 def column(rows, name):
@@ -239,12 +257,17 @@ def test_finse_by_its_skyline_alone(data_dir):
     rasters = [read_elevation(folder / "dsm_4m.tif"), read_elevation(folder / "dem_context_aster_100m.tif")]
     rows = list(csv.DictReader((folder / "gcps.csv").read_text().splitlines()))
     at = geodetic_from_map("EPSG:25832", column(rows, "x_world"), column(rows, "y_world"))
-    points = Correspondences(np.stack([column(rows, "x_img"), column(rows, "y_img")], -1),
-                             enu_from_geodetic(frame, *at, column(rows, "z_world")))  # fmt: skip
+    points = Correspondences(
+        np.stack([column(rows, "x_img"), column(rows, "y_img")], -1),
+        enu_from_geodetic(frame, *at, column(rows, "z_world")),
+    )
     start = camera_at(frame, latitude, longitude, 1212.0, heading_deg=66.0, fov_deg=65.8, size_px=(1920, 1080))
     by_points = calibrate(start, points, priors=Priors(k1=np.inf))
-    search = Search(tilt_deg=10.0, focal=0.06, priors=Priors(tilt_deg=10.0, roll_deg=3.0, horizontal_m=3.0,
-                                                             vertical_m=3.0, focal=0.05, k1=0.1))  # fmt: skip
+    search = Search(
+        tilt_deg=10.0,
+        focal=0.06,
+        priors=Priors(tilt_deg=10.0, roll_deg=3.0, horizontal_m=3.0, vertical_m=3.0, focal=0.05, k1=0.1),
+    )
     image = encoded_from_file(folder / "2019-05-24_12-00-01.jpg")
     mask = np.ones(image.shape[:2], bool)
     mask[:60] = False  # the camera's lettering

@@ -75,29 +75,52 @@ def test_equal_calls_equal_files(hill, tmp_path):
 
 
 def test_a_place_of_ones_own(hill, tmp_path, capsys):
-    assert run("render", hill, "--at", "46.5405,7.98,+30", "--heading", "10", "--time", "2024-09-01T08:00", "-o",
-               tmp_path / "a.png", *SMALL) == 0  # fmt: skip
+    assert (
+        run(
+            "render",
+            hill,
+            "--at",
+            "46.5405,7.98,+30",
+            "--heading",
+            "10",
+            "--time",
+            "2024-09-01T08:00",
+            "-o",
+            tmp_path / "a.png",
+            *SMALL,
+        )
+        == 0
+    )
 
 
-@pytest.mark.parametrize(("arguments", "message"), [
-    (["--time", "2024-09-01T02:00"], r"the sun stands at -\d+.*choose an atmosphere model"),
-    (["--time", "2024-03-31T02:30"], "offset"),
-    (["--time", "noon"], "--time|time"),
-    (["--time", "2024-09-01T12:00", "--camera", "north"], "no such camera"),
-    (["--time", "2024-09-01T12:00", "--at", "46.53;7.98", "--heading", "0"], "--at: not a place"),
-    (["--time", "2024-09-01T12:00", "--at", "7.98,146.53", "--heading", "0"], "outside the elevation raster|no civil"),
-    (["--time", "2024-09-01T12:00", "--at", "97.98,46.53", "--heading", "0"], "--at: latitude or longitude out of range"),
-    (["--time", "2024-09-01T12:00", "--at", "46.5405,7.98,500", "--heading", "0"], "below the ground"),
-    (["--time", "2024-09-01T12:00", "--at", "46.5405,7.98"], "--heading: missing"),
-    (["--time", "2024-09-01T12:00", "--heading", "5"], "--heading: goes with --at"),
-    (["--time", "2024-09-01T12:00", "--size", "huge"], "--size: not a picture size"),
-    (["--time", "2024-09-01T12:00", "--spp", "0"], "--spp: out of range"),
-    (["--time", "2024-09-01T12:00", "--exposure", "bright"], "--exposure: not an exposure"),
-    (["--time", "2024-09-01T12:00", "--turbidity", "40"], "turbidity"),
-    (["--time", "2024-09-01T12:00", "--device", "tpu"], "--device: unknown device"),
-    (["--time", "2024-09-01T12:00", "-o", "a.jpg"], "--output: unknown kind"),
-    (["--time", "2024-09-01T12:00", "--sky", "purple"], "purple"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--time", "2024-09-01T02:00"], r"the sun stands at -\d+.*choose an atmosphere model"),
+        (["--time", "2024-03-31T02:30"], "offset"),
+        (["--time", "noon"], "--time|time"),
+        (["--time", "2024-09-01T12:00", "--camera", "north"], "no such camera"),
+        (["--time", "2024-09-01T12:00", "--at", "46.53;7.98", "--heading", "0"], "--at: not a place"),
+        (
+            ["--time", "2024-09-01T12:00", "--at", "7.98,146.53", "--heading", "0"],
+            "outside the elevation raster|no civil",
+        ),
+        (
+            ["--time", "2024-09-01T12:00", "--at", "97.98,46.53", "--heading", "0"],
+            "--at: latitude or longitude out of range",
+        ),
+        (["--time", "2024-09-01T12:00", "--at", "46.5405,7.98,500", "--heading", "0"], "below the ground"),
+        (["--time", "2024-09-01T12:00", "--at", "46.5405,7.98"], "--heading: missing"),
+        (["--time", "2024-09-01T12:00", "--heading", "5"], "--heading: goes with --at"),
+        (["--time", "2024-09-01T12:00", "--size", "huge"], "--size: not a picture size"),
+        (["--time", "2024-09-01T12:00", "--spp", "0"], "--spp: out of range"),
+        (["--time", "2024-09-01T12:00", "--exposure", "bright"], "--exposure: not an exposure"),
+        (["--time", "2024-09-01T12:00", "--turbidity", "40"], "turbidity"),
+        (["--time", "2024-09-01T12:00", "--device", "tpu"], "--device: unknown device"),
+        (["--time", "2024-09-01T12:00", "-o", "a.jpg"], "--output: unknown kind"),
+        (["--time", "2024-09-01T12:00", "--sky", "purple"], "purple"),
+    ],
+)
 def test_each_mistake_is_one_line_and_leaves_no_file(hill, tmp_path, capsys, monkeypatch, arguments, message):
     import re
 
@@ -157,8 +180,19 @@ def test_doctor_names_an_unusable_libllvm(tmp_path, bad):
 def test_a_killed_render_leaves_no_half_file(hill, tmp_path, how):
     """Killed in the middle of path tracing: no picture, no temporary file; the same call then succeeds."""
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "seasonscapes", "render", str(hill), "--time", "2024-09-01T12:00", "-o",
-               str(out / "a.png"), "--sky", "hosek"]  # fmt: skip
+    command = [
+        sys.executable,
+        "-m",
+        "seasonscapes",
+        "render",
+        str(hill),
+        "--time",
+        "2024-09-01T12:00",
+        "-o",
+        str(out / "a.png"),
+        "--sky",
+        "hosek",
+    ]
     process = subprocess.Popen([*command, "--size", "1024x1024", "--spp", "512"], stderr=subprocess.PIPE, text=True)
     for line in process.stderr:
         if "sun at azimuth" in line:

@@ -41,8 +41,23 @@ def town(tmp_path_factory):
 
 def arguments(town, *more, time="2024-09-01T10:00Z"):
     folder, scene, _ = town
-    return ["paint", str(scene), "--time", time, "--manifest", str(folder / "pictures" / "manifest.csv"), "--calibrations",
-            str(folder / "poses"), "--workspace", str(folder / "work"), "-o", str(folder / "out"), "--sky", "hosek", *more]  # fmt: skip
+    return [
+        "paint",
+        str(scene),
+        "--time",
+        time,
+        "--manifest",
+        str(folder / "pictures" / "manifest.csv"),
+        "--calibrations",
+        str(folder / "poses"),
+        "--workspace",
+        str(folder / "work"),
+        "-o",
+        str(folder / "out"),
+        "--sky",
+        "hosek",
+        *more,
+    ]
 
 
 def test_paint_writes_what_it_says(town, capsys):
@@ -75,8 +90,20 @@ def test_errors_say_what_to_do(town, capsys, more, time, line):
 
 def test_a_webcam_without_calibration_is_named(town, capsys, tmp_path):
     folder, scene, _ = town
-    line = ["paint", str(scene), "--time", "2024-09-01T10:00Z", "--manifest", str(folder / "pictures" / "manifest.csv"),
-            "--calibrations", str(tmp_path), "--workspace", str(folder / "work"), "-o", str(tmp_path / "out")]  # fmt: skip
+    line = [
+        "paint",
+        str(scene),
+        "--time",
+        "2024-09-01T10:00Z",
+        "--manifest",
+        str(folder / "pictures" / "manifest.csv"),
+        "--calibrations",
+        str(tmp_path),
+        "--workspace",
+        str(folder / "work"),
+        "-o",
+        str(tmp_path / "out"),
+    ]
     assert main(line) == 2
     said = capsys.readouterr().err
     assert "south" in said
@@ -88,8 +115,10 @@ def test_a_pose_means_the_same_in_another_frame(town):
     folder, _, camera = town
     own = read_calibration(folder / "poses" / "south_calibration.json")
     other = LocalFrame(own.frame.latitude_deg + 0.02, own.frame.longitude_deg - 0.03, 500.0, own.frame.refraction_k)
-    moved = type(camera)(*(getattr(camera, n) for n in ("width_px", "height_px", "fx", "fy", "cx", "cy")),
-                         pose_in_frame(own.view.world_from_camera, own.frame, other))  # fmt: skip
+    moved = type(camera)(
+        *(getattr(camera, n) for n in ("width_px", "height_px", "fx", "fy", "cx", "cy")),
+        pose_in_frame(own.view.world_from_camera, own.frame, other),
+    )
     assert np.linalg.norm(moved.position_m - camera.position_m) > 1000.0
     places = [(46.551, 7.981, 1400.0), (46.556, 7.977, 1200.0)]
     for place in places:

@@ -41,8 +41,20 @@ def test_webcams_lists_checks_and_maps(tmp_path, capsys):
     cut = tmp_path / "pictures" / "2024-09-01" / "13-00-00" / "360" / "south.jpg"
     cut.parent.mkdir(parents=True)
     cut.write_bytes(good.read_bytes()[:2000])
-    assert run("webcams", scene, "--pictures", tmp_path / "pictures", "--manifest", tmp_path / "good.csv", "-o",
-               tmp_path / "map.png", "--json") == 0  # fmt: skip
+    assert (
+        run(
+            "webcams",
+            scene,
+            "--pictures",
+            tmp_path / "pictures",
+            "--manifest",
+            tmp_path / "good.csv",
+            "-o",
+            tmp_path / "map.png",
+            "--json",
+        )
+        == 0
+    )
     record = json.loads(capsys.readouterr().out)
     assert record["heights"][0]["plausible"]
     assert record["pictures"] == 2
@@ -58,16 +70,19 @@ def test_the_bernese_cameras_travel_with_the_package(capsys):
     assert len(json.loads(capsys.readouterr().out)["webcams"]) == 32
 
 
-@pytest.mark.parametrize(("arguments", "message"), [
-    (["--picture", "none.jpg", "--skyline"], "--picture: no such file"),
-    (["--picture", "bad.jpg", "--skyline"], "--picture: not a readable picture"),
-    (["--picture", "small.png", "--skyline"], "10 x 10 px, the view 320 x 200"),
-    (["--picture", "small.png"], "no evidence"),
-    (["--picture", "good.png", "--points", "none.csv"], "none.csv: no such file"),
-    (["--picture", "good.png", "--points", "few.csv"], "points"),
-    (["--picture", "good.png", "--skyline", "--webcam", "north"], "north"),
-    (["--picture", "good.png", "--skyline", "--mask", "bad.jpg"], "--mask: not a readable picture"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--picture", "none.jpg", "--skyline"], "--picture: no such file"),
+        (["--picture", "bad.jpg", "--skyline"], "--picture: not a readable picture"),
+        (["--picture", "small.png", "--skyline"], "10 x 10 px, the view 320 x 200"),
+        (["--picture", "small.png"], "no evidence"),
+        (["--picture", "good.png", "--points", "none.csv"], "none.csv: no such file"),
+        (["--picture", "good.png", "--points", "few.csv"], "points"),
+        (["--picture", "good.png", "--skyline", "--webcam", "north"], "north"),
+        (["--picture", "good.png", "--skyline", "--mask", "bad.jpg"], "--mask: not a readable picture"),
+    ],
+)
 def test_calibrate_says_what_is_wrong(tmp_path, capsys, monkeypatch, arguments, message):
     scene = scene_with_webcam(tmp_path)
     monkeypatch.chdir(tmp_path)
@@ -100,8 +115,20 @@ def test_calibrate_from_points(tmp_path, capsys):
         writer.writerow(["name", "x_px", "y_px", "latitude_deg", "longitude_deg", "height_m"])
         writer.writerows([str(i), *pixel[i], latitude[i], longitude[i], height[i]] for i in range(12))
     cv2.imwrite(str(tmp_path / "photo.png"), np.full((200, 320, 3), 90, np.uint8))
-    assert run("calibrate", scene, "--picture", tmp_path / "photo.png", "--points", tmp_path / "points.csv", "-o",
-               tmp_path / "out", "--json") == 0  # fmt: skip
+    assert (
+        run(
+            "calibrate",
+            scene,
+            "--picture",
+            tmp_path / "photo.png",
+            "--points",
+            tmp_path / "points.csv",
+            "-o",
+            tmp_path / "out",
+            "--json",
+        )
+        == 0
+    )
     record = json.loads(capsys.readouterr().out)
     assert record["values"][0] == pytest.approx(5.0, abs=0.05)
     assert record["values"][1] == pytest.approx(3.0, abs=0.05)

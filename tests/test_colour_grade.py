@@ -23,8 +23,11 @@ def test_the_default_grade_changes_nothing():
     assert np.array_equal(undo_grade(image, named_grade("identity")), image)
 
 
-@pytest.mark.parametrize("grade", [*GRADES.values(), Grade(1.5, 0.4, -0.8, 0.7, -0.5, 0.4), Grade(-3.0, -0.3)],
-                         ids=lambda g: f"{g.exposure_ev}/{g.contrast}/{g.highlights_ev}")  # fmt: skip
+@pytest.mark.parametrize(
+    "grade",
+    [*GRADES.values(), Grade(1.5, 0.4, -0.8, 0.7, -0.5, 0.4), Grade(-3.0, -0.3)],
+    ids=lambda g: f"{g.exposure_ev}/{g.contrast}/{g.highlights_ev}",
+)
 def test_a_grade_is_undone_over_sixteen_stops_and_is_monotone(grade):
     rng = np.random.default_rng(1)
     image = 0.18 * 2.0 ** rng.uniform(-9, 7, (4000, 1)) * rng.uniform(0.2, 1.0, (4000, 3))
@@ -49,11 +52,15 @@ def test_each_number_does_what_it_says():
     assert np.log(steeper[1] / steeper[0]) > 1.15 * np.log(0.19 / 0.17)
 
 
-@pytest.mark.parametrize(("numbers", "message"), [
-    ({"contrast": 1.5}, "contrast = 1.5"), ({"exposure_ev": float("nan")}, "exposure_ev = nan"),
-    ({"contrast": -0.5, "highlights_ev": -2.0, "shadows_ev": 2.0}, "fold the tone curve"),
-    ({"middle_grey": 0.0}, "middle_grey"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("numbers", "message"),
+    [
+        ({"contrast": 1.5}, "contrast = 1.5"),
+        ({"exposure_ev": float("nan")}, "exposure_ev = nan"),
+        ({"contrast": -0.5, "highlights_ev": -2.0, "shadows_ev": 2.0}, "fold the tone curve"),
+        ({"middle_grey": 0.0}, "middle_grey"),
+    ],
+)
 def test_grades_that_cannot_be_undone_are_refused(numbers, message):
     with pytest.raises(ValueError, match=message):
         Grade(**numbers)

@@ -306,8 +306,17 @@ def hill(tmp_path, monkeypatch):
 def test_inpaint_writes_a_texture_and_figures(hill, tmp_path, capsys):
     path, texture = hill
     output = tmp_path / "done.npz"
-    inpaint(str(path), time="2024-09-01T10:00", texture=tmp_path / "painted.npz", fast=True, output=output, json=True,
-            figures=tmp_path / "fig", view=ViewOptions(camera="south", size="96x64"), sky=SkyOptions(sky="hosek"))  # fmt: skip
+    inpaint(
+        str(path),
+        time="2024-09-01T10:00",
+        texture=tmp_path / "painted.npz",
+        fast=True,
+        output=output,
+        json=True,
+        figures=tmp_path / "fig",
+        view=ViewOptions(camera="south", size="96x64"),
+        sky=SkyOptions(sky="hosek"),
+    )
     record = json.loads(capsys.readouterr().out)
     seen = texture.weight > 0.0
     done = load_texture(output)
@@ -316,8 +325,12 @@ def test_inpaint_writes_a_texture_and_figures(hill, tmp_path, capsys):
     assert record["filled_share"] == pytest.approx(np.mean(~seen), abs=0.02)
     assert {"satellite_1", "sun", "insolation"} <= set(record["guides"])
     assert sorted(p.name for p in (tmp_path / "fig").iterdir()) == [
-        "hill_south_after.png", "hill_south_before.png", "hill_texture_after.png", "hill_texture_before.png",
-        "hill_texture_sigma.png"]  # fmt: skip
+        "hill_south_after.png",
+        "hill_south_before.png",
+        "hill_texture_after.png",
+        "hill_texture_before.png",
+        "hill_texture_sigma.png",
+    ]
     # West is reddish on the map, and stays so in the hole.
     assert done.values[40, 15, 0] > 1.5 * done.values[40, 15, 1]
     assert done.values[40, 65, 0] == pytest.approx(done.values[40, 65, 1], rel=0.1)
@@ -328,12 +341,14 @@ def test_inpaint_says_what_is_wrong(hill, tmp_path):
     empty, small = tmp_path / "empty.npz", tmp_path / "small.npz"
     save_texture(Texture(texture.values, np.zeros_like(texture.weight)), empty)
     save_texture(Texture(texture.values[:9, :9], texture.weight[:9, :9]), small)
-    for options, text in (({"texture": tmp_path / "none.npz"}, "no such file"),
-                          ({"texture": path}, "not a painted texture"),
-                          ({"texture": empty}, "no painted texel"),
-                          ({"texture": small}, "made for another atlas"),
-                          ({"texture": empty, "method": "magic"}, "unknown method"),
-                          ({"texture": empty, "detail": 2.0}, "out of range")):  # fmt: skip
+    for options, text in (
+        ({"texture": tmp_path / "none.npz"}, "no such file"),
+        ({"texture": path}, "not a painted texture"),
+        ({"texture": empty}, "no painted texel"),
+        ({"texture": small}, "made for another atlas"),
+        ({"texture": empty, "method": "magic"}, "unknown method"),
+        ({"texture": empty, "detail": 2.0}, "out of range"),
+    ):
         with pytest.raises(InputError, match=text):
             inpaint(str(path), time="2024-09-01T10:00", output=tmp_path / "done.npz", **options)
     assert not (tmp_path / "done.npz").exists()

@@ -30,10 +30,13 @@ def test_hosek_and_atmosphere_agree_by_day(workspace, time):
     moment = moment_at(datetime.fromisoformat(time).replace(tzinfo=UTC), *PLACE)
     assert moment.sun.elevation_deg > 29.0
     lux = [
-        luminance(global_horizontal_illuminance(light_at(with_overrides(read_sky_model(name), turbidity=3.0), moment, 0.0,
-                                                         workspace=workspace)))
+        luminance(
+            global_horizontal_illuminance(
+                light_at(with_overrides(read_sky_model(name), turbidity=3.0), moment, 0.0, workspace=workspace)
+            )
+        )
         for name in ("hosek", "clear")
-    ]  # fmt: skip
+    ]
     assert lux[0] / lux[1] == pytest.approx(1.0, abs=0.10)
 
 

@@ -181,13 +181,20 @@ def test_every_condition_changes_the_output(weights, painter):
     changed = {
         name: moved(load_painter(weights, replace(SETTINGS, **change), image=GUIDE)(view))
         for name, change in {
-            "other prompt": {"prompt": "A lake in winter"}, "no prompt": {"prompt": ""}, "negative": {"negative": "snow"},
-            "no depth": {"depth_scale": 0.0}, "weak depth": {"depth_scale": 0.7}, "no mask": {"inpaint_scale": 0.0},
-            "neither": {"depth_scale": 0.0, "inpaint_scale": 0.0}, "no image": {"image_scale": 0.0},
-            "weak image": {"image_scale": 0.4}, "guidance": {"guidance": 6.0}, "steps": {"steps": 4},
+            "other prompt": {"prompt": "A lake in winter"},
+            "no prompt": {"prompt": ""},
+            "negative": {"negative": "snow"},
+            "no depth": {"depth_scale": 0.0},
+            "weak depth": {"depth_scale": 0.7},
+            "no mask": {"inpaint_scale": 0.0},
+            "neither": {"depth_scale": 0.0, "inpaint_scale": 0.0},
+            "no image": {"image_scale": 0.0},
+            "weak image": {"image_scale": 0.4},
+            "guidance": {"guidance": 6.0},
+            "steps": {"steps": 4},
             "strength": {"strength": 0.7},
         }.items()
-    }  # fmt: skip
+    }
     changed["other image"] = moved(load_painter(weights, SETTINGS, image=1.0 - GUIDE)(view))
     changed["depth inverted"] = moved(painter(replace(view, depth=1.0 - view.depth)))
     changed["other picture"] = moved(painter(replace(view, picture=1.0 - view.picture)))
@@ -243,8 +250,12 @@ def test_missing_weights_say_which_where_how_and_what_else(tmp_path, part, name)
         find_weights(tmp_path, part, name)
     text = str(caught.value)
     assert "\n" not in text
-    for words in (f"the {part} weights '{name}' are missing", str(tmp_path / name), f"hf download {name} --local-dir",
-                  "--method guided, which needs no weights"):  # fmt: skip
+    for words in (
+        f"the {part} weights '{name}' are missing",
+        str(tmp_path / name),
+        f"hf download {name} --local-dir",
+        "--method guided, which needs no weights",
+    ):
         assert words in text
 
 
@@ -373,8 +384,9 @@ def hill(tmp_path_factory):
     seen[: shape[0] // 4] = False
     texture = Texture(np.where(seen[..., None], values, np.nan), seen.astype(np.float32))
     at = [(46.5405, 7.98, 1250.0, 0.0), (46.545, 7.99, 1300.0, 330.0), (46.5510, 7.992, 1350.0, 280.0)]
-    known = [camera_at(land.frame, *place, heading_deg=heading, pitch_deg=-12.0, size_px=(50, 34))
-             for *place, heading in at]  # fmt: skip
+    known = [
+        camera_at(land.frame, *place, heading_deg=heading, pitch_deg=-12.0, size_px=(50, 34)) for *place, heading in at
+    ]
     return land, texture, fly(known, 4)
 
 
@@ -540,8 +552,11 @@ def test_the_sky_may_be_painted_but_never_reaches_the_texture(hill):
     holes = {}
     for paint_sky in (False, True):
         shown = []
-        canvas, steps = walked(hill, lambda view, tell, shown=shown: shown.append(view) or np.ones_like(view.picture),
-                               replace(OPTIONS, paint_sky=paint_sky))  # fmt: skip
+        canvas, steps = walked(
+            hill,
+            lambda view, tell, shown=shown: shown.append(view) or np.ones_like(view.picture),
+            replace(OPTIONS, paint_sky=paint_sky),
+        )
         holes[paint_sky] = (shown[0], canvas, steps)
     sky = holes[False][0].depth == 0.0
     if not sky.any():
@@ -584,9 +599,17 @@ def run(hill, weights, tmp_path_factory):
 
     def call(output, **flags):
         options = {"path": folder / "path.json", "weights": weights, "steps": 2, "dilate_px": 2, "least_hole": 0.0}
-        inpaint(str(land.path), time="2024-09-01T10:00", texture=folder / "painted.npz", method="diffusion", fast=True,
-                output=output, json=True, place=PlaceOptions(texel_m=TEXEL_M, workspace=folder / "work"),
-                diffusion=DiffusionOptions(**(options | flags)))  # fmt: skip
+        inpaint(
+            str(land.path),
+            time="2024-09-01T10:00",
+            texture=folder / "painted.npz",
+            method="diffusion",
+            fast=True,
+            output=output,
+            json=True,
+            place=PlaceOptions(texel_m=TEXEL_M, workspace=folder / "work"),
+            diffusion=DiffusionOptions(**(options | flags)),
+        )
 
     return call
 
@@ -654,12 +677,18 @@ def test_hybrid_and_ablations_end_to_end(run, hill, tmp_path, capsys):
 
 
 def test_the_verb_says_what_is_wrong(run, tmp_path):
-    for flags, words in (({"path": None}, "--path: missing"), ({"path": tmp_path / "none.json"}, "no such file"),
-                         ({"weights": tmp_path / "none"}, "no such folder"),
-                         ({"weights": tmp_path}, "the base weights .* are missing"),
-                         ({"guide_image": tmp_path / "none.jpg"}, "--guide-image"), ({"mask": "xor"}, "coverage or hsv"),
-                         ({"without": "prompt,sky"}, "of prompt, depth, mask, image"), ({"steps": 0}, "--steps"),
-                         ({"strength": 0.1}, "--strength"), ({"film": tmp_path / "a.gif"}, "mp4")):  # fmt: skip
+    for flags, words in (
+        ({"path": None}, "--path: missing"),
+        ({"path": tmp_path / "none.json"}, "no such file"),
+        ({"weights": tmp_path / "none"}, "no such folder"),
+        ({"weights": tmp_path}, "the base weights .* are missing"),
+        ({"guide_image": tmp_path / "none.jpg"}, "--guide-image"),
+        ({"mask": "xor"}, "coverage or hsv"),
+        ({"without": "prompt,sky"}, "of prompt, depth, mask, image"),
+        ({"steps": 0}, "--steps"),
+        ({"strength": 0.1}, "--strength"),
+        ({"film": tmp_path / "a.gif"}, "mp4"),
+    ):
         with pytest.raises(InputError, match=words):
             run(tmp_path / "done.npz", **flags)
     assert not (tmp_path / "done.npz").exists()

@@ -149,8 +149,17 @@ def test_sun_events_of_zurich_and_of_the_poles():
     # USNO (aa.usno.navy.mil) rounds to the minute: sunrise 05:29, sunset 21:26 CEST.
     assert abs(zurich.sunrise - datetime(2024, 6, 20, 3, 29, tzinfo=UTC)) < timedelta(minutes=1)
     assert abs(zurich.sunset - datetime(2024, 6, 20, 19, 26, tzinfo=UTC)) < timedelta(minutes=1)
-    order = [zurich.astronomical_dawn, zurich.nautical_dawn, zurich.civil_dawn, zurich.sunrise, zurich.solar_noon,
-             zurich.sunset, zurich.civil_dusk, zurich.nautical_dusk, zurich.astronomical_dusk]  # fmt: skip
+    order = [
+        zurich.astronomical_dawn,
+        zurich.nautical_dawn,
+        zurich.civil_dawn,
+        zurich.sunrise,
+        zurich.solar_noon,
+        zurich.sunset,
+        zurich.civil_dusk,
+        zurich.nautical_dusk,
+        zurich.astronomical_dusk,
+    ]
     assert order == sorted(order)
     # The dusk that ends this day comes after civil midnight.
     assert zurich.astronomical_dusk.astimezone(ZoneInfo("Europe/Zurich")).date() == date(2024, 6, 21)

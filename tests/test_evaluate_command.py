@@ -57,8 +57,13 @@ def test_masks_and_modes(folders, capsys):
     write_png8(folders / "mask.png", half)
     scores = {}
     for mode in ("valid", "paper"):
-        evaluate(truth=folders / "truth" / "a.png", pictures=folders / "made" / "a.png", mask=folders / "mask.png", mode=mode,
-                 json=True)  # fmt: skip
+        evaluate(
+            truth=folders / "truth" / "a.png",
+            pictures=folders / "made" / "a.png",
+            mask=folders / "mask.png",
+            mode=mode,
+            json=True,
+        )
         scores[mode] = record_of(capsys)["pictures"][0]
     assert scores["valid"]["mask_share"] == 0.5
     assert scores["paper"]["psnr_db"] - scores["valid"]["psnr_db"] == pytest.approx(-10 * np.log10(0.5), abs=0.01)

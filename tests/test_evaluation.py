@@ -67,8 +67,9 @@ def test_psnr_and_ssim_as_scikit_image(pair):
     from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
     assert psnr_db(*pair) == pytest.approx(peak_signal_noise_ratio(*pair, data_range=1.0), abs=1e-9)
-    theirs = structural_similarity(*pair, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1.0,
-                                   channel_axis=2)  # fmt: skip
+    theirs = structural_similarity(
+        *pair, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1.0, channel_axis=2
+    )
     # scikit-image too leaves out the frame's rim of five pixels: windows wholly within the frame.
     assert ssim(*pair) == pytest.approx(theirs, abs=1e-9)
 
@@ -153,8 +154,13 @@ def test_colour_angle_closed_form_and_exposure():
 
 def test_score_refuses_what_is_no_picture(pair, mask):
     truth, picture = pair
-    for arguments in [(truth, picture[:-1]), (truth, picture, mask[:-1]), (truth, picture, np.zeros_like(mask)),
-                      (truth, 255.0 * picture), (truth * np.nan, picture)]:  # fmt: skip
+    for arguments in [
+        (truth, picture[:-1]),
+        (truth, picture, mask[:-1]),
+        (truth, picture, np.zeros_like(mask)),
+        (truth, 255.0 * picture),
+        (truth * np.nan, picture),
+    ]:
         with pytest.raises(ValueError, match="score"):
             score(*arguments)
     with pytest.raises(ValueError, match="mode"):
@@ -173,8 +179,10 @@ def random_weights():
     for n, shape in shapes.items():
         network[f"features.{n}.weight"] = torch.randn(shape, generator=generator) * (2.0 / np.prod(shape[1:])) ** 0.5
         network[f"features.{n}.bias"] = 0.1 * torch.randn(shape[0], generator=generator)
-    linear = {f"lin{i}.model.1.weight": torch.rand((1, shape[0], 1, 1), generator=generator)
-              for i, shape in enumerate(shapes.values())}  # fmt: skip
+    linear = {
+        f"lin{i}.model.1.weight": torch.rand((1, shape[0], 1, 1), generator=generator)
+        for i, shape in enumerate(shapes.values())
+    }
     return network, linear
 
 
@@ -292,8 +300,9 @@ def test_tables_by_class_and_distance():
     assert [row["psnr_db"] for row in rows[:2]] == pytest.approx([20.0, 40.0])
     assert [row["share"] for row in rows] == [0.5, 0.5, 0.0]
     assert np.isnan(rows[2]["psnr_db"])
-    far = by_distance(truth, picture, np.tile([500.0, 500.0, 3000.0, np.inf], (2, 1)),
-                      np.tile([True, True, True, False], (2, 1)))  # fmt: skip
+    far = by_distance(
+        truth, picture, np.tile([500.0, 500.0, 3000.0, np.inf], (2, 1)), np.tile([True, True, True, False], (2, 1))
+    )
     shares = {row["name"]: row["share"] for row in far}
     assert shares["0–1 km"] == pytest.approx(2 / 3)
     assert shares["2–4 km"] == pytest.approx(1 / 3)

@@ -76,9 +76,13 @@ def test_colmap_text_means_what_its_manual_says(tmp_path):
     view = some_views(1)[0]
     write_colmap(tmp_path, [view])
     w, x, y, z, *t = (float(v) for v in (tmp_path / "images.txt").read_text().splitlines()[1].split()[1:8])
-    rotation = np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-                         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-                         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]])  # fmt: skip
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
     fx, fy, cx, cy = (float(v) for v in (tmp_path / "cameras.txt").read_text().splitlines()[1].split()[4:])
     point = view.camera.position_m + 500.0 * ray_directions(view.camera, [[300.0, 200.0]])[0]
     local = rotation @ point + t
@@ -108,13 +112,21 @@ def test_opencv_projects_the_same_points_with_distortion(tmp_path):
         camera_from_opencv((8, 8), matrix, [0.1, 0.2, 0, 0, 0], rvec, tvec)
 
 
-@pytest.mark.parametrize(("name", "text", "message"), [
-    ("transforms.json", '{"frames": [{"file_path": "a"}]}', r"frames\[0\]: key 'fl_x' is missing"),
-    ("transforms.json", '{"fl_x": 1, "cx": 1, "cy": 1, "w": 2, "h": 2, "k1": 0.1, "frames": [{"file_path": "a", '
-     '"transform_matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]}', "distortion k1 is not zero"),
-    ("transforms.json", "[]", "not a JSON object"), ("transforms.json", "{", "not valid JSON"),
-    ("cameras.txt", "1 OPENCV 10 10 5 5 5 5 0 0 0 0\n", "camera model OPENCV has distortion"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("transforms.json", '{"frames": [{"file_path": "a"}]}', r"frames\[0\]: key 'fl_x' is missing"),
+        (
+            "transforms.json",
+            '{"fl_x": 1, "cx": 1, "cy": 1, "w": 2, "h": 2, "k1": 0.1, "frames": [{"file_path": "a", '
+            '"transform_matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]}',
+            "distortion k1 is not zero",
+        ),
+        ("transforms.json", "[]", "not a JSON object"),
+        ("transforms.json", "{", "not valid JSON"),
+        ("cameras.txt", "1 OPENCV 10 10 5 5 5 5 0 0 0 0\n", "camera model OPENCV has distortion"),
+    ],
+)
 def test_foreign_files_that_do_not_fit_say_so(tmp_path, name, text, message):
     (tmp_path / name).write_text(text)
     with pytest.raises(InputError, match=message):
@@ -127,8 +139,13 @@ def test_stretching_and_back_is_the_identity_and_the_steps_are_those_measured():
     assert steps == pytest.approx([59.84, 41.25, 60.0], abs=0.02)
     rng = np.random.default_rng(1)
     for _ in range(50):
-        k = np.array([[rng.uniform(800, 2500), rng.uniform(-9, 9), rng.uniform(1000, 2000)],
-                      [0.0, rng.uniform(800, 2500), rng.uniform(800, 1200)], [0.0, 0.0, 1.0]])  # fmt: skip
+        k = np.array(
+            [
+                [rng.uniform(800, 2500), rng.uniform(-9, 9), rng.uniform(1000, 2000)],
+                [0.0, rng.uniform(800, 2500), rng.uniform(800, 1200)],
+                [0.0, 0.0, 1.0],
+            ]
+        )
         rotation = rotation_from_angles(rng.uniform(0, 360), rng.uniform(-30, 30), rng.uniform(-9, 9))
         k2, rotation2 = unstretch(*stretch(k, rotation, 46.6), 46.6)
         assert np.abs(k2 - k).max() < 1e-8
@@ -153,13 +170,16 @@ def poses(data_dir, name):
 
 
 @pytest.mark.data
-@pytest.mark.parametrize(("name", "count", "kind"), [
-    ("Rshot/transformation_Roundshot_flat.json", 138, "unrefined"),
-    ("Rshot/transformation_final_v4_flat.json", 138, "refined"),
-    ("Rshot/transformation_manCorr_flat.json", 112, "refined"),
-    ("GRIND/transforms_novelLaubH_wayp_3_all.json", 40, "refined"),
-    ("REGION_J/transforms_novelLaubH_wayp_video_pix.json", 6, "refined"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "count", "kind"),
+    [
+        ("Rshot/transformation_Roundshot_flat.json", 138, "unrefined"),
+        ("Rshot/transformation_final_v4_flat.json", 138, "refined"),
+        ("Rshot/transformation_manCorr_flat.json", 112, "refined"),
+        ("GRIND/transforms_novelLaubH_wayp_3_all.json", 40, "refined"),
+        ("REGION_J/transforms_novelLaubH_wayp_video_pix.json", 6, "refined"),
+    ],
+)
 def test_the_reference_files_come_in_and_go_back(data_dir, name, count, kind):
     views = read_reference_poses(poses(data_dir, name), FRAME, kind=kind)
     assert len(views) == count
@@ -193,13 +213,26 @@ def test_the_138_views_spread_as_measured_and_share_a_pose_when_solved_together(
     assert birg.solution is not None
 
 
-@pytest.mark.parametrize(("change", "message"), [
-    ({"transform_matrix": [[1, 0], [0, 1]]}, "not a finite 4 x 4"), ({"fx": None}, "not a camera record"),
-    ({"transform_matrix": np.diag([2.0, 1.0, 1.0, 1.0]).tolist()}, "no rotation"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"transform_matrix": [[1, 0], [0, 1]]}, "not a finite 4 x 4"),
+        ({"fx": None}, "not a camera record"),
+        ({"transform_matrix": np.diag([2.0, 1.0, 1.0, 1.0]).tolist()}, "no rotation"),
+    ],
+)
 def test_broken_reference_records_are_named(tmp_path, change, message):
-    record = {"fx": 1000, "fy": 1000, "cx": 10, "cy": 10, "wid": 20, "hei": 20, "k3 ": 0, "surprise": 1,
-              "transform_matrix": np.eye(4).tolist()}  # fmt: skip
+    record = {
+        "fx": 1000,
+        "fy": 1000,
+        "cx": 10,
+        "cy": 10,
+        "wid": 20,
+        "hei": 20,
+        "k3 ": 0,
+        "surprise": 1,
+        "transform_matrix": np.eye(4).tolist(),
+    }
     (tmp_path / "p.json").write_text(json.dumps({"meta": {}, "0_1-CAM_0": record}))
     view = read_reference_poses(tmp_path / "p.json", FRAME, kind="unrefined")[0]
     assert (view.webcam, view.index) == ("1-CAM", 0)

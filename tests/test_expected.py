@@ -34,8 +34,18 @@ def place(tmp_path_factory):
 
 
 def _run(folder, capsys, verb: str, *extra: str) -> dict:
-    common = [str(folder / "little.toml"), "--workspace", str(folder / "work"), "--texel-m", "60", "--sky", "hosek", "--time",
-              "2024-07-20T10:00+02:00", "--json"]  # fmt: skip
+    common = [
+        str(folder / "little.toml"),
+        "--workspace",
+        str(folder / "work"),
+        "--texel-m",
+        "60",
+        "--sky",
+        "hosek",
+        "--time",
+        "2024-07-20T10:00+02:00",
+        "--json",
+    ]
     assert main([verb, *common, *extra]) == 0
     return json.loads(capsys.readouterr().out)
 
@@ -73,8 +83,27 @@ def test_another_atlas_is_refused(place, capsys):
     folder, _ = place
     with atomic_path(folder / "wrong.npz") as temporary:
         save_texture(Texture(np.ones((8, 8, 3), np.float32), np.ones((8, 8), np.float32)), temporary)
-    assert main(["paint", str(folder / "little.toml"), "--workspace", str(folder / "work"), "--texel-m", "60", "--sky", "hosek",
-                 "--time", "2024-07-20T11:00+02:00", "--synthetic-webcams", "--albedo", str(folder / "wrong.npz"), "-o",
-                 str(folder / "other")]) == 2  # fmt: skip
+    assert (
+        main(
+            [
+                "paint",
+                str(folder / "little.toml"),
+                "--workspace",
+                str(folder / "work"),
+                "--texel-m",
+                "60",
+                "--sky",
+                "hosek",
+                "--time",
+                "2024-07-20T11:00+02:00",
+                "--synthetic-webcams",
+                "--albedo",
+                str(folder / "wrong.npz"),
+                "-o",
+                str(folder / "other"),
+            ]
+        )
+        == 2
+    )
     assert "of another atlas" in capsys.readouterr().err
     assert not (folder / "other").exists()

@@ -23,8 +23,10 @@ FRAME = LocalFrame(46.55, 7.98, 1200.0)
 
 
 def test_enu_agrees_with_proj():
-    pipeline = ("+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "
-                "+step +proj=topocentric +ellps=WGS84 +lon_0=7.98 +lat_0=46.55 +h_0=1200")  # fmt: skip
+    pipeline = (
+        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "
+        "+step +proj=topocentric +ellps=WGS84 +lon_0=7.98 +lat_0=46.55 +h_0=1200"
+    )
     rng = np.random.default_rng(0)
     latitude, longitude = 46.55 + rng.uniform(-0.9, 0.9, 500), 7.98 + rng.uniform(-1.2, 1.2, 500)
     height = rng.uniform(-100, 8000, 500)
@@ -95,8 +97,17 @@ def test_equirectangular_map_round_trip():
     ("angles", "pixel_of_forward"), [((30.0, -10.0, 0.0), (300, 200)), ((200.0, 45.0, 20.0), (300, 200))]
 )
 def test_camera_looks_where_it_is_told(angles, pixel_of_forward):
-    camera = camera_at(LocalFrame(46.55, 7.98), 46.55, 7.98, 100.0, heading_deg=angles[0], pitch_deg=angles[1],
-                       roll_deg=angles[2], fov_deg=60.0, size_px=(600, 400))  # fmt: skip
+    camera = camera_at(
+        LocalFrame(46.55, 7.98),
+        46.55,
+        7.98,
+        100.0,
+        heading_deg=angles[0],
+        pitch_deg=angles[1],
+        roll_deg=angles[2],
+        fov_deg=60.0,
+        size_px=(600, 400),
+    )
     point = camera.position_m + 500.0 * direction_from_angles(angles[0], angles[1])
     pixel, depth = project(camera, point)
     np.testing.assert_allclose(pixel, pixel_of_forward, atol=1e-6)
@@ -125,12 +136,25 @@ def test_positive_roll_lowers_the_right_side_of_the_camera():
     assert rotation_from_angles(0.0, 0.0, 10.0)[2, 0] < 0.0
 
 
-@pytest.mark.parametrize(("change", "message"), [
-    ({"world_from_camera": np.diag([1.0, 1.0, -1.0, 1.0])}, "mirrored"),
-    ({"world_from_camera": np.full((4, 4), np.nan)}, "finite"),
-    ({"fx": 0.0}, "positive"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"world_from_camera": np.diag([1.0, 1.0, -1.0, 1.0])}, "mirrored"),
+        ({"world_from_camera": np.full((4, 4), np.nan)}, "finite"),
+        ({"fx": 0.0}, "positive"),
+    ],
+)
 def test_impossible_cameras_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
-        Camera(**{"width_px": 4, "height_px": 3, "fx": 5.0, "fy": 5.0, "cx": 2.0, "cy": 1.5,
-                  "world_from_camera": np.eye(4), **change})  # fmt: skip
+        Camera(
+            **{
+                "width_px": 4,
+                "height_px": 3,
+                "fx": 5.0,
+                "fy": 5.0,
+                "cx": 2.0,
+                "cy": 1.5,
+                "world_from_camera": np.eye(4),
+                **change,
+            }
+        )

@@ -18,7 +18,11 @@ def land():
     truth, seen, guides = made_up_land()
     relief = {name: guides.values[..., n] for n, name in enumerate(guides.names) if not name.startswith("satellite")}
     rng = np.random.default_rng(0)
-    base = truth * np.exp(0.1 * rng.standard_normal(truth.shape)) * np.where(relief["elevation"] > 1500.0, 0.5, 1.0)[..., None]
+    base = (
+        truth
+        * np.exp(0.1 * rng.standard_normal(truth.shape))
+        * np.where(relief["elevation"] > 1500.0, 0.5, 1.0)[..., None]
+    )
     return truth, seen, stack_guides(relief), base.astype(np.float32)
 
 
@@ -88,7 +92,9 @@ def test_fusing_follows_the_error_that_is_told(land, told, nearer):
     np.testing.assert_array_equal(made.painted, seen)
     depth = cv2.distanceTransform((~seen).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
     moved = np.abs(np.log(made.values / base)).mean(axis=2)
-    assert moved[depth > 8.0].mean() < 0.7 * moved[(depth > 0.0) & (depth < 2.0)].mean(), "deep in a hole the base stands"
+    assert moved[depth > 8.0].mean() < 0.7 * moved[(depth > 0.0) & (depth < 2.0)].mean(), (
+        "deep in a hole the base stands"
+    )
     assert (made.sigma[seen].mean()) < made.sigma[~seen].mean()
 
 

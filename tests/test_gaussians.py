@@ -40,22 +40,10 @@ from seasonscapes.gaussians.rasterise import (  # noqa: E402
 )
 from seasonscapes.gaussians.rasterise_cuda import rasterise_cuda  # noqa: E402
 from seasonscapes.gaussians.rasterise_twin import rasterise_twin  # noqa: E402
-from seasonscapes.gaussians.render import (  # noqa: E402
-    CUTS,
-    draw_layers,
-    learned_numbers,
-    model_colours,
-    model_weights,
-    render_model,
-)
+from seasonscapes.gaussians.render import CUTS, draw_layers, learned_numbers, model_colours, model_weights, render_model  # noqa: E402
 from seasonscapes.gaussians.surfels import axes_from_quaternions, surfel_albedo, terrain_surfels  # noqa: E402
 from seasonscapes.gaussians.tiles import joined_shapes, select_tiles, tile_bounds, tile_discs, tile_tree  # noqa: E402
-from seasonscapes.gaussians.transport import (  # noqa: E402
-    light_state,
-    neighbourhood_mean,
-    surfel_irradiance,
-    trace_transport,
-)
+from seasonscapes.gaussians.transport import light_state, neighbourhood_mean, surfel_irradiance, trace_transport  # noqa: E402
 from seasonscapes.rendering.gather import occluder  # noqa: E402
 from seasonscapes.rendering.horizon import horizon_angles  # noqa: E402
 from seasonscapes.rendering.irradiance import surface_at  # noqa: E402
@@ -76,7 +64,9 @@ def some_splats(count: int, *, seed: int = 0, dtype=torch.float32) -> tuple[Spla
     rng = np.random.default_rng(seed)
     means = np.stack([rng.uniform(-6, 6, count), rng.uniform(-6, 6, count), rng.uniform(4, 20, count)], axis=1)
     columns = (means, rng.normal(size=(count, 4)), rng.uniform(-2.5, 0.3, (count, 3)), rng.uniform(-2, 4, count))
-    return Splats(*(torch.as_tensor(c, dtype=dtype) for c in columns)), torch.as_tensor(rng.uniform(0, 1, (count, 3)), dtype=dtype)  # fmt: skip
+    return Splats(*(torch.as_tensor(c, dtype=dtype) for c in columns)), torch.as_tensor(
+        rng.uniform(0, 1, (count, 3)), dtype=dtype
+    )
 
 
 def test_rasteriser_equals_its_twin():
@@ -116,8 +106,10 @@ def test_gradients_equal_finite_differences():
     value(leaves).backward()
     for number, leaf in enumerate(leaves):
         step = torch.as_tensor(rng.normal(size=tuple(leaf.shape)))
-        sides = [value([p.detach() + (1e-6 * sign * step if k == number else 0.0) for k, p in enumerate(leaves)])
-                 for sign in (1, -1)]  # fmt: skip
+        sides = [
+            value([p.detach() + (1e-6 * sign * step if k == number else 0.0) for k, p in enumerate(leaves)])
+            for sign in (1, -1)
+        ]
         difference = float(sides[0] - sides[1]) / 2e-6
         assert float((leaf.grad * step).sum()) == pytest.approx(difference, rel=1e-3)
 
@@ -315,8 +307,16 @@ def model(hill, told) -> GaussianModel:
     _, surfels, _, albedo, transport = hill
     trained = appearance(hill)
     distil(trained, told, (), Schedule(30, 0, batch=256))
-    return model_from(surfels, np.stack([albedo, 0.5 * albedo]), [100.0, 200.0], transport, kind="full", frame=FRAME,
-                      appearance=learned_numbers(trained), note={"seed": 0})  # fmt: skip
+    return model_from(
+        surfels,
+        np.stack([albedo, 0.5 * albedo]),
+        [100.0, 200.0],
+        transport,
+        kind="full",
+        frame=FRAME,
+        appearance=learned_numbers(trained),
+        note={"seed": 0},
+    )
 
 
 def test_model_survives_its_file(model, tmp_path):
@@ -494,13 +494,16 @@ def test_splat_writes_what_is_asked_for(distilled, suffix, capsys):
         assert pixels[-8:].mean(axis=(0, 1))[0] > pixels[-8:].mean(axis=(0, 1))[2], "the ground is not"
 
 
-@pytest.mark.parametrize(("arguments", "said"), [
-    (["--model", "none.safetensors"], "no such file"),
-    (["--device", "tpu"], "unknown device"),
-    (["-o", "a.jpg"], "unknown kind of file"),
-    (["--at", "46.551,7.98,800", "--heading", "0"], "stands below the ground"),
-    (["--at", "46.551,7.98,+3000", "--heading", "0", "--pitch", "80"], "sees no Gaussian"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--model", "none.safetensors"], "no such file"),
+        (["--device", "tpu"], "unknown device"),
+        (["-o", "a.jpg"], "unknown kind of file"),
+        (["--at", "46.551,7.98,800", "--heading", "0"], "stands below the ground"),
+        (["--at", "46.551,7.98,+3000", "--heading", "0", "--pitch", "80"], "sees no Gaussian"),
+    ],
+)
 def test_splat_says_what_is_wrong(distilled, arguments, said, capsys):
     scene, model, common = distilled
     given = {"--model": str(model), "-o": str(model.parent / "a.png")}
@@ -513,8 +516,11 @@ def test_splat_says_what_is_wrong(distilled, arguments, said, capsys):
 
 def test_distill_says_what_is_wrong(tmp_path, capsys):
     scene = places.write_place(tmp_path)
-    for arguments, said in ((["--kind", "magic"], "unknown kind"), (["--suns", "0"], "out of range"),
-                            (["--views", "0", "--export-views", "x"], "no views to export")):  # fmt: skip
+    for arguments, said in (
+        (["--kind", "magic"], "unknown kind"),
+        (["--suns", "0"], "out of range"),
+        (["--views", "0", "--export-views", "x"], "no views to export"),
+    ):
         assert main(["distill", str(scene), *arguments]) == 2
         assert said in capsys.readouterr().err
 
@@ -581,8 +587,14 @@ def test_a_free_code_is_found_for_a_new_picture(hill, told):
     lights = light_tensors(told.states)
     code = fit_code(trained, lights, Frame(weights, 0, image, weights.coverage > 0.9), steps=30)
     with torch.no_grad():
-        errors = [float((trained(torch.arange(576), torch.tensor(0), lights, one) - torch.as_tensor(told.colours[0])).abs().mean())
-                  for one in (code, trained.codes[2])]  # fmt: skip
+        errors = [
+            float(
+                (trained(torch.arange(576), torch.tensor(0), lights, one) - torch.as_tensor(told.colours[0]))
+                .abs()
+                .mean()
+            )
+            for one in (code, trained.codes[2])
+        ]
     assert errors[0] < 0.8 * errors[1]
 
 

@@ -97,8 +97,10 @@ def test_stages_do_not_call_later_stages():
 
 
 def test_no_circles():
-    graph = {module: {o for o in map(own, names) if o is not None and o in MODULES and o != module}
-             for module, names in MODULES.items()}  # fmt: skip
+    graph = {
+        module: {o for o in map(own, names) if o is not None and o in MODULES and o != module}
+        for module, names in MODULES.items()
+    }
     graphlib.TopologicalSorter(graph).prepare()
 
 

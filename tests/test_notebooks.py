@@ -14,8 +14,17 @@ NAMES = sorted(path.stem for path in FOLDER.glob("*.py"))
 
 
 def test_all_are_there():
-    assert NAMES == ["00_tour", "01_terrain", "02_sky", "03_webcams", "04_texture", "05_albedo", "06_relight", "07_gaussians",
-                     "08_inverse_rendering_experiment"]  # fmt: skip
+    assert NAMES == [
+        "00_tour",
+        "01_terrain",
+        "02_sky",
+        "03_webcams",
+        "04_texture",
+        "05_albedo",
+        "06_relight",
+        "07_gaussians",
+        "08_inverse_rendering_experiment",
+    ]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -47,8 +56,9 @@ def executed():
 
     def execute(name: str) -> tuple[int, str]:
         environment = os.environ | {"MPLBACKEND": "Agg", "OMP_NUM_THREADS": "1"}
-        done = subprocess.run([sys.executable, f"{name}.py"], cwd=FOLDER, env=environment, capture_output=True, text=True,
-                              check=False)  # fmt: skip
+        done = subprocess.run(
+            [sys.executable, f"{name}.py"], cwd=FOLDER, env=environment, capture_output=True, text=True, check=False
+        )
         return done.returncode, done.stderr
 
     with ThreadPoolExecutor(2) as pool:

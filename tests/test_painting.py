@@ -169,8 +169,9 @@ def test_two_ridges_leak_nothing():
 
     ridges = Land(height)
     eye = np.array([0.0, -550.0, 120.0])
-    painting = ridges.paint([ridges.shot(camera_towards(eye, (0.0, 400.0, 80.0), fov_deg=80.0), "south")], guard=False,
-                            fit_gains=False)  # fmt: skip
+    painting = ridges.paint(
+        [ridges.shot(camera_towards(eye, (0.0, 400.0, 80.0), fov_deg=80.0), "south")], guard=False, fit_gains=False
+    )
     place, _ = texel_positions(ridges.terrain, ridges.atlas.width_px, ridges.atlas.height_px)
     n, z = place[..., 1].astype(float), place[..., 2].astype(float)
     # The line of sight in the profile at the height of the first crest, n = -100, and of the second, n = 400.
@@ -307,8 +308,12 @@ def test_harmonising_helps_under_webcam_faults(land, overlapping):
 
 
 def same(a, b):
-    return (np.array_equal(a.texture.values, b.texture.values) and np.array_equal(a.texture.weight, b.texture.weight)
-            and np.array_equal(a.best, b.best) and np.array_equal(a.coverage, b.coverage))  # fmt: skip
+    return (
+        np.array_equal(a.texture.values, b.texture.values)
+        and np.array_equal(a.texture.weight, b.texture.weight)
+        and np.array_equal(a.best, b.best)
+        and np.array_equal(a.coverage, b.coverage)
+    )
 
 
 def test_order_does_not_matter_when_weighted_and_does_when_first(land, cameras):
@@ -350,12 +355,16 @@ def test_views_without_anything_to_say_are_left_out_and_told(land, cameras):
     good = land.shot(cameras[0], "good")
     away = land.shot(camera_towards((0.0, 0.0, 300.0), (0.0, 10.0, 900.0)), "away")
     dark = replace(good, observation=replace(good.observation, mask=np.zeros((120, 160), bool), webcam="masked"))
-    broken = replace(good, observation=replace(good.observation, image=np.full((120, 160, 3), np.nan, np.float32),
-                                               webcam="broken"))  # fmt: skip
+    broken = replace(
+        good, observation=replace(good.observation, image=np.full((120, 160, 3), np.nan, np.float32), webcam="broken")
+    )
     painting = land.paint([good, away, dark, broken])
     assert painting.webcams == ("good",)
-    assert sorted(painting.skipped) == ["away: it sees none of the terrain", "broken: its picture holds no finite value",
-                                        "masked: its mask leaves no pixel"]  # fmt: skip
+    assert sorted(painting.skipped) == [
+        "away: it sees none of the terrain",
+        "broken: its picture holds no finite value",
+        "masked: its mask leaves no pixel",
+    ]
     assert same(painting, land.paint([good]))
     with pytest.raises(ValueError, match="no picture has anything to paint: away: it sees none"):
         land.paint([away])
@@ -468,8 +477,13 @@ def test_atlas_of_charts_is_painted_too():
     cliffs = Land(hills, count=41, texel_m=10.0)
     terrain, atlas = unwrap(cliffs.terrain, kind="xatlas", texel_m=10.0)
     shot = cliffs.shot(camera_towards((-500.0, -450.0, 170.0), (0.0, 0.0, 0.0)), "one")
-    painting = paint([shot], terrain, atlas, occluder(mi_mesh(terrain, np.full(3, 0.3))),
-                     options=PaintOptions(near_m=1.0, fit_gains=False))  # fmt: skip
+    painting = paint(
+        [shot],
+        terrain,
+        atlas,
+        occluder(mi_mesh(terrain, np.full(3, 0.3))),
+        options=PaintOptions(near_m=1.0, fit_gains=False),
+    )
     place, _ = texel_positions(terrain, atlas.width_px, atlas.height_px)
     painted = painting.texture.weight > 0.0
     e, n = place[painted][:, 0], place[painted][:, 1]

@@ -27,8 +27,9 @@ def make(projection, size, fov_h, fov_v, heading, tilt, roll, row) -> Panorama:
     pose = np.eye(4)
     pose[:3, :3] = rotation_from_angles(heading, tilt, roll)
     pose[:3, 3] = [120.0, -40.0, 2000.0]
-    return panorama_from_angles(projection, size, horizontal_fov_deg=fov_h, vertical_fov_deg=fov_v, pose=pose,
-                                horizon_row_px=row)  # fmt: skip
+    return panorama_from_angles(
+        projection, size, horizontal_fov_deg=fov_h, vertical_fov_deg=fov_v, pose=pose, horizon_row_px=row
+    )
 
 
 def ray_by_hand(case, column, row):
@@ -91,8 +92,10 @@ def test_tilt_is_a_rotation_of_rays_and_not_a_shift_of_rows():
     assert np.degrees(np.arcsin(up)) == pytest.approx([12.0, 0.0, -12.0], abs=1e-9)
 
 
-@pytest.mark.parametrize(("span", "fov", "count"), [(360.0, 100.0, 4), (360.0, 85.0, 5), (360.0, 70.0, 6),
-                                                    (150.0, 85.0, 2), (260.0, 90.0, 4)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("span", "fov", "count"),
+    [(360.0, 100.0, 4), (360.0, 85.0, 5), (360.0, 70.0, 6), (150.0, 85.0, 2), (260.0, 90.0, 4)],
+)
 def test_views_cover_the_panorama_with_the_overlap_asked_for(span, fov, count):
     panorama = make("cylindrical", (round(span * 30), 2048), span, 45.0, 33.0, 0.0, 0.0, None)
     views = split_panorama(panorama, fov_deg=fov, overlap_deg=8.0)
@@ -110,8 +113,14 @@ def test_views_cover_the_panorama_with_the_overlap_asked_for(span, fov, count):
 def scene_colour(direction):
     """A smooth landscape of waves over all directions; band-limited well below the pixel pitch."""
     x, y, z = np.moveaxis(direction, -1, 0)
-    return np.stack([0.5 + 0.4 * np.sin(30 * x + 3) * np.cos(20 * y), 0.4 + 0.3 * np.cos(25 * z + 10 * x),
-                     0.3 + 0.2 * np.sin(35 * y - 15 * z)], -1).astype(np.float32)  # fmt: skip
+    return np.stack(
+        [
+            0.5 + 0.4 * np.sin(30 * x + 3) * np.cos(20 * y),
+            0.4 + 0.3 * np.cos(25 * z + 10 * x),
+            0.3 + 0.2 * np.sin(35 * y - 15 * z),
+        ],
+        -1,
+    ).astype(np.float32)
 
 
 @pytest.mark.parametrize("projection", ["cylindrical", "equirectangular"])
@@ -124,8 +133,10 @@ def test_a_cut_view_equals_a_view_rendered_directly(projection):
         # The truth is the mean over the pixel's area too.
         offsets = (np.arange(4) + 0.5) / 4 - 0.5
         x, y = np.meshgrid(np.arange(240) + 0.5, np.arange(180) + 0.5)
-        truth = np.mean([scene_colour(ray_directions(camera, np.stack([x + dx, y + dy], -1)))
-                         for dx in offsets for dy in offsets], axis=0)  # fmt: skip
+        truth = np.mean(
+            [scene_colour(ray_directions(camera, np.stack([x + dx, y + dy], -1))) for dx in offsets for dy in offsets],
+            axis=0,
+        )
         error = (view - truth)[inside]
         assert 10 * np.log10(1.0 / np.mean(error**2)) > 50.0
 

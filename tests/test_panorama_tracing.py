@@ -128,8 +128,16 @@ def test_a_webcam_series_of_panoramas(tmp_path):
     time = datetime(2024, 7, 20, 10, tzinfo=UTC)
     effort = Effort(subpixels=4, shades=16, rays=64, senders=256)
     poses = PoseSigmas(1.0, 1.0, 0.5, 0.2, 0.2, 0.05)
-    made = webcam_series(TERRAIN, "round", panorama, [Hour(time, LIGHT, colours())], faults=CLEAN, poses=poses,
-                         foreground=True, effort=effort)[0]  # fmt: skip
+    made = webcam_series(
+        TERRAIN,
+        "round",
+        panorama,
+        [Hour(time, LIGHT, colours())],
+        faults=CLEAN,
+        poses=poses,
+        foreground=True,
+        effort=effort,
+    )[0]
     assert made.encoded.shape == made.radiance.shape == (66, 300, 3)
     assert made.camera is panorama
     believed = made.observation.camera

@@ -65,10 +65,23 @@ def mitsuba_picture(scene: RenderScene, spp: int, max_depth: int, seed: int) -> 
 
     pose = CAMERA.world_from_camera @ np.diag([-1.0, -1.0, 1.0, 1.0])
     fov_deg = 2.0 * np.degrees(np.arctan(0.5 * CAMERA.width_px / CAMERA.fx))
-    film = {"type": "hdrfilm", "width": CAMERA.width_px, "height": CAMERA.height_px, "component_format": "float32",
-            "rfilter": {"type": "box"}}  # fmt: skip
-    sensor = mi.load_dict({"type": "perspective", "fov": fov_deg, "near_clip": 0.5, "far_clip": 1e7, "film": film,
-                           "to_world": mi.ScalarTransform4f(pose)})  # fmt: skip
+    film = {
+        "type": "hdrfilm",
+        "width": CAMERA.width_px,
+        "height": CAMERA.height_px,
+        "component_format": "float32",
+        "rfilter": {"type": "box"},
+    }
+    sensor = mi.load_dict(
+        {
+            "type": "perspective",
+            "fov": fov_deg,
+            "near_clip": 0.5,
+            "far_clip": 1e7,
+            "film": film,
+            "to_world": mi.ScalarTransform4f(pose),
+        }
+    )
     picture = mi.render(scene.mi_scene, sensor=sensor, integrator=mi_path_integrator(max_depth), spp=spp, seed=seed)
     return np.array(picture)[..., :3]
 

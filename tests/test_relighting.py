@@ -35,8 +35,15 @@ def hill(tmp_path_factory) -> Assignment:
     """A hill of 3 km under the Hosek sky, whose light costs little."""
     folder = tmp_path_factory.mktemp("hill")
     path = places.write_place(folder)
-    return Assignment(str(path), str(folder / "workspace"), MeshOptions(), read_scene(path).camera(None), SIZE,
-                      read_sky_model("hosek"), base_day="2024-06-21")  # fmt: skip
+    return Assignment(
+        str(path),
+        str(folder / "workspace"),
+        MeshOptions(),
+        read_scene(path).camera(None),
+        SIZE,
+        read_sky_model("hosek"),
+        base_day="2024-06-21",
+    )
 
 
 def place_of(assignment: Assignment):
@@ -47,13 +54,16 @@ def hours(count: int, minutes: float = 10.0) -> list[datetime]:
     return [NOON + timedelta(minutes=minutes * index) for index in range(count)]
 
 
-@pytest.mark.parametrize(("day", "season", "expected"), [
-    (date(2023, 7, 20), "nearest", [(1, 1.0)]),
-    (date(2023, 12, 31), "nearest", [(0, 1.0)]),
-    (date(2025, 1, 15), "blended", [(0, 1.0)]),
-    (date(2025, 4, 15), "blended", [(0, 0.5), (1, 0.5)]),
-    (date(2025, 10, 14), "blended", [(1, 0.505), (0, 0.495)]),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("day", "season", "expected"),
+    [
+        (date(2023, 7, 20), "nearest", [(1, 1.0)]),
+        (date(2023, 12, 31), "nearest", [(0, 1.0)]),
+        (date(2025, 1, 15), "blended", [(0, 1.0)]),
+        (date(2025, 4, 15), "blended", [(0, 0.5), (1, 0.5)]),
+        (date(2025, 10, 14), "blended", [(1, 0.505), (0, 0.495)]),
+    ],
+)
 def test_colours_go_round_the_year(day, season, expected):
     weights = season_weights([date(2019, 1, 15), date(2022, 7, 14)], day, season=season)
     assert [index for index, _ in weights] == [index for index, _ in expected]
@@ -168,8 +178,20 @@ def test_shards_are_a_partition():
 
 
 def arguments(hill: Assignment, output: Path, *more: str) -> list[str]:
-    return ["timelapse", hill.scene, "--workspace", hill.workspace, "--sky", "hosek", "--size", "48x32", "-o", str(output),
-            "--json", *more]  # fmt: skip
+    return [
+        "timelapse",
+        hill.scene,
+        "--workspace",
+        hill.workspace,
+        "--sky",
+        "hosek",
+        "--size",
+        "48x32",
+        "-o",
+        str(output),
+        "--json",
+        *more,
+    ]
 
 
 def test_timelapse_resumes_and_grows(hill, tmp_path, capsys):
@@ -210,18 +232,24 @@ def test_shards_then_the_film(hill, tmp_path, capsys):
     assert len(list((tmp_path / "x").glob("*.exr"))) == 3
 
 
-@pytest.mark.parametrize(("more", "message"), [
-    (["--from", "2024-06-21T12:00"], "--to are needed|and --to"),
-    (["--from", "2024-06-21T12:00", "--to", "2024-06-21T11:00"], "before --from"),
-    (["--from", "2024-06-21T12:00", "--to", "2024-06-21T13:00", "--every", "soon"], "length of time"),
-    (["--times", ","], "no time in it"),
-    (["--times", "2024-06-21T12:00", "--season", "dry"], "--season"),
-    (["--times", "2024-06-21T12:00", "--albedo", "summer.npz"], "--albedo"),
-    (["--times", "2024-06-21T12:00", "--cluster", "cloud:9"], "--cluster"),
-    (["--times", "2024-06-21T12:00", "--cluster", "slurm:none.toml"], "no such file"),
-    (["--times", "2024-06-21T12:00", "--exr"], "wants a folder"),
-    (["--times", "2024-06-21T12:00", "--at", "46.551,7.98,+300", "--heading", "0", "--pitch", "80"], "sees no terrain"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--from", "2024-06-21T12:00"], "--to are needed|and --to"),
+        (["--from", "2024-06-21T12:00", "--to", "2024-06-21T11:00"], "before --from"),
+        (["--from", "2024-06-21T12:00", "--to", "2024-06-21T13:00", "--every", "soon"], "length of time"),
+        (["--times", ","], "no time in it"),
+        (["--times", "2024-06-21T12:00", "--season", "dry"], "--season"),
+        (["--times", "2024-06-21T12:00", "--albedo", "summer.npz"], "--albedo"),
+        (["--times", "2024-06-21T12:00", "--cluster", "cloud:9"], "--cluster"),
+        (["--times", "2024-06-21T12:00", "--cluster", "slurm:none.toml"], "no such file"),
+        (["--times", "2024-06-21T12:00", "--exr"], "wants a folder"),
+        (
+            ["--times", "2024-06-21T12:00", "--at", "46.551,7.98,+300", "--heading", "0", "--pitch", "80"],
+            "sees no terrain",
+        ),
+    ],
+)
 def test_timelapse_says_what_is_wrong(hill, tmp_path, capsys, more, message):
     import re
 
@@ -345,8 +373,13 @@ def test_watts_agree_with_pvlib():
     when = datetime(2024, 6, 21, 11, 20, tzinfo=UTC)
     place = pvlib.location.Location(46.55, 7.98, altitude=2000.0)
     expected = place.get_clearsky(pd.DatetimeIndex([when]), linke_turbidity=2.6).iloc[0]
-    light = light_at(read_sky_model("clear"), moment_at(when, 46.55, 7.98, 2000.0), 2000.0, workspace=default_workspace(),
-                     with_air=False)  # fmt: skip
+    light = light_at(
+        read_sky_model("clear"),
+        moment_at(when, 46.55, 7.98, 2000.0),
+        2000.0,
+        workspace=default_workspace(),
+        with_air=False,
+    )
     direct, diffuse = _efficacies(light)
     beam = luminance(direct_horizontal_illuminance(light.sun)) / direct
     sky = luminance(diffuse_horizontal_illuminance(light.sky_radiance)) / diffuse
@@ -405,8 +438,18 @@ def test_lit_texture(hill, tmp_path, capsys):
 
     from seasonscapes.images import read_exr
 
-    common = ["lit-texture", hill.scene, "--workspace", hill.workspace, "--sky", "hosek", "--time",
-              "2024-06-21T11:00Z", "--texel-m", "50"]  # fmt: skip
+    common = [
+        "lit-texture",
+        hill.scene,
+        "--workspace",
+        hill.workspace,
+        "--sky",
+        "hosek",
+        "--time",
+        "2024-06-21T11:00Z",
+        "--texel-m",
+        "50",
+    ]
     for suffix in ("exr", "png", "glb"):
         assert main([*common, "--rays", "16", "-o", str(tmp_path / f"lit.{suffix}")]) == 0
     layers, header = read_exr(tmp_path / "lit.exr")

@@ -188,9 +188,17 @@ def mountain(tmp_path_factory) -> Assignment:
         values[texel] = snow_above(ground, line_m, by_north_m=150.0)
         save_texture(Texture(values.reshape(*shape, 3)), folder / f"{day}.npz")
         pairs.append((day.isoformat(), str(folder / f"{day}.npz")))
-    return Assignment(str(path), str(folder / "workspace"), MeshOptions(), read_scene(path).camera(None), (48, 32),
-                      read_sky_model("hosek"), albedo=tuple(pairs), season="snow-line",
-                      base_day=SNOWY.isoformat())  # fmt: skip
+    return Assignment(
+        str(path),
+        str(folder / "workspace"),
+        MeshOptions(),
+        read_scene(path).camera(None),
+        (48, 32),
+        read_sky_model("hosek"),
+        albedo=tuple(pairs),
+        season="snow-line",
+        base_day=SNOWY.isoformat(),
+    )
 
 
 def by_height(height_m: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -241,7 +249,17 @@ def test_a_film_of_a_spring(mountain):
 
 
 def test_timelapse_moves_the_snow_line(mountain, tmp_path, capsys):
-    common = ["timelapse", mountain.scene, "--workspace", mountain.workspace, "--sky", "hosek", "--size", "48x32", "--json"]  # fmt: skip
+    common = [
+        "timelapse",
+        mountain.scene,
+        "--workspace",
+        mountain.workspace,
+        "--sky",
+        "hosek",
+        "--size",
+        "48x32",
+        "--json",
+    ]
     given = [part for day, name in mountain.albedo for part in ("--albedo", f"{day}={name}")]
     when = ["--times", f"{SNOWY}T11:00Z,2023-05-20T11:00Z,{GREEN}T11:00Z"]
     pictures = {}
@@ -272,8 +290,19 @@ def test_frames_of_a_day_have_its_line(mountain):
 def test_render_wears_dated_albedos(mountain, tmp_path, capsys):
     from seasonscapes.images import read_exr
 
-    common = ["render", mountain.scene, "--workspace", mountain.workspace, "--sky", "hosek", "--size", "48x32", "--spp", "1",
-              *[part for day, name in mountain.albedo for part in ("--albedo", f"{day}={name}")]]  # fmt: skip
+    common = [
+        "render",
+        mountain.scene,
+        "--workspace",
+        mountain.workspace,
+        "--sky",
+        "hosek",
+        "--size",
+        "48x32",
+        "--spp",
+        "1",
+        *[part for day, name in mountain.albedo for part in ("--albedo", f"{day}={name}")],
+    ]
     worn = {}
     for season in ("snow-line", "blended", "nearest"):
         assert main([*common, "--time", "2023-05-25T12:00Z", "--season", season, "-o", str(tmp_path / "a.exr")]) == 0

@@ -120,8 +120,12 @@ SUNS = [(90.0, 20.0), (270.0, 30.0), (180.0, 25.0), (0.0, 20.0), (135.0, 30.0), 
 def test_shadow_of_a_pyramid(azimuth_deg, elevation_deg):
     """The shadow on the plane is the closed form's, pixel by pixel, and points away from the sun."""
     size, pixel_m = 250, 4.0
-    scene = build_scene(heightfield(pyramid, count=201), np.full(3, 0.5),
-                        sun_at(azimuth_deg, elevation_deg, radius_deg=0.001), smooth=False)  # fmt: skip
+    scene = build_scene(
+        heightfield(pyramid, count=201),
+        np.full(3, 0.5),
+        sun_at(azimuth_deg, elevation_deg, radius_deg=0.001),
+        smooth=False,
+    )
     image, _ = path_trace(scene, looking_down(5000.0, size=size), spp=16, max_depth=2)
     shade = 1.0 - image[..., 1] / np.median(image[..., 1])
     # Closed form on 2 × 2 points of each pixel: shaded iff the ray to the sun passes below the pyramid.
@@ -284,11 +288,14 @@ def test_hosek_is_photometric_and_turned_the_right_way():
     assert red > 2.0 * blue, "a low sun is red"
 
 
-@pytest.mark.parametrize(("arguments", "message"), [
-    ({"sun_direction": direction_from_angles(90.0, -3.0)}, "below the horizon"),
-    ({"sun_direction": direction_from_angles(90.0, 30.0), "turbidity": 12.0}, "expected 1 to 10"),
-    ({"sun_direction": direction_from_angles(90.0, 30.0), "ground_albedo": 1.2}, "expected 0 to 1"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"sun_direction": direction_from_angles(90.0, -3.0)}, "below the horizon"),
+        ({"sun_direction": direction_from_angles(90.0, 30.0), "turbidity": 12.0}, "expected 1 to 10"),
+        ({"sun_direction": direction_from_angles(90.0, 30.0), "ground_albedo": 1.2}, "expected 0 to 1"),
+    ],
+)
 def test_hosek_refuses_what_it_cannot_do(arguments, message):
     with pytest.raises(InputError, match=message):
         hosek_illumination(**arguments)

@@ -38,10 +38,40 @@ class Runs:
         (folder / "launch.py").write_text(LAUNCHER)
 
     def arguments(self, name: str) -> list[str]:
-        return ["run", str(self.folder / "little.toml"), "--workspace", str(self.folder / f"{name}-work"),
-                "--times", "2024-07-20T10:00,2024-07-20T15:00", "--at-hours", "2024-07-20T18:00", "--photo-size", "720x120",
-                "--size", "96x64", "--texel-m", "120", "--refine", "1", "--max-error-m", "6", "--discs", "24", "--suns", "2",
-                "--steps", "40", "--picture-steps", "2", "--views", "1", "--sky", "hosek", "-o", str(self.folder / name)]  # fmt: skip
+        return [
+            "run",
+            str(self.folder / "little.toml"),
+            "--workspace",
+            str(self.folder / f"{name}-work"),
+            "--times",
+            "2024-07-20T10:00,2024-07-20T15:00",
+            "--at-hours",
+            "2024-07-20T18:00",
+            "--photo-size",
+            "720x120",
+            "--size",
+            "96x64",
+            "--texel-m",
+            "120",
+            "--refine",
+            "1",
+            "--max-error-m",
+            "6",
+            "--discs",
+            "24",
+            "--suns",
+            "2",
+            "--steps",
+            "40",
+            "--picture-steps",
+            "2",
+            "--views",
+            "1",
+            "--sky",
+            "hosek",
+            "-o",
+            str(self.folder / name),
+        ]
 
     def start(self, name: str) -> subprocess.Popen:
         command = [sys.executable, str(self.folder / "launch.py"), *self.arguments(name)]

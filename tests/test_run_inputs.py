@@ -57,11 +57,21 @@ class Real:
         )
 
     def job(self, **changed) -> Job:
-        pictures = RunPictures(manifest=self.shots / "manifest.csv", calibrations=self.folder / "records",
-                               masks=self.folder / "masks")  # fmt: skip
+        pictures = RunPictures(
+            manifest=self.shots / "manifest.csv", calibrations=self.folder / "records", masks=self.folder / "masks"
+        )
         times = tuple((NOON + timedelta(hours=hour)).isoformat() for hour in range(2))
-        job = Job(str(self.scene), times, (NOON.isoformat(),), pictures, RunEffort(), ViewOptions(size="12x8"),
-                  SkyOptions(sky="hosek"), PlaceOptions(workspace=self.folder / "work", texel_m=50.0), 0)  # fmt: skip
+        job = Job(
+            str(self.scene),
+            times,
+            (NOON.isoformat(),),
+            pictures,
+            RunEffort(),
+            ViewOptions(size="12x8"),
+            SkyOptions(sky="hosek"),
+            PlaceOptions(workspace=self.folder / "work", texel_m=50.0),
+            0,
+        )
         return replace(job, **changed)
 
     def made(self, **changed) -> list[str]:
@@ -173,13 +183,26 @@ def test_photographs_of_a_synthetic_scene_are_keyed_by_how_they_are_taken(tmp_pa
     def key(text=MASSIF, **pictures) -> dict:
         (tmp_path / "little.toml").write_text(text)
         place = PlaceOptions(workspace=tmp_path / "work", texel_m=240.0, refine=1)
-        job = Job(str(tmp_path / "little.toml"), (NOON.isoformat(),), (NOON.isoformat(),), RunPictures(**pictures), RunEffort(),
-                  ViewOptions(), SkyOptions(sky="hosek"), place, 0)  # fmt: skip
+        job = Job(
+            str(tmp_path / "little.toml"),
+            (NOON.isoformat(),),
+            (NOON.isoformat(),),
+            RunPictures(**pictures),
+            RunEffort(),
+            ViewOptions(),
+            SkyOptions(sky="hosek"),
+            place,
+            0,
+        )
         return stages_of(job, place.load(job.scene))[0].inputs
 
     plain = key()
     assert plain == key()
-    others = [key(photo_size="720x120"), key(photo_kind="perspective"), key(leave_out="meadow"),
-              key(MASSIF.replace("60.0\nheading_deg = 164.3", "70.0\nheading_deg = 164.3"))]  # fmt: skip
+    others = [
+        key(photo_size="720x120"),
+        key(photo_kind="perspective"),
+        key(leave_out="meadow"),
+        key(MASSIF.replace("60.0\nheading_deg = 164.3", "70.0\nheading_deg = 164.3")),
+    ]
     assert all(other != plain for other in others)
     assert others[1]["pictures"]["size"] == (720, 480)

@@ -16,30 +16,44 @@ def changed(old: str, new: str) -> str:
     return places.SCENE.replace(old, new)
 
 
-@pytest.mark.parametrize(("text", "message"), [
-    (changed('name = "hill"\n', ""), r"hill\.toml: name: missing key"),
-    (changed("vertical_datum", "vertical_datumm"), r"unknown key.*did you mean 'vertical_datum'"),
-    (changed("heading_deg = 0.0", "headin_deg = 0.0"), r"camera\[0\]\.headin_deg.*did you mean 'heading_deg'"),
-    (changed("heading_deg = 0.0", 'heading_deg = "north"'), r"camera\[0\]\.heading_deg: .*valid number.*'north'"),
-    (changed("heading_deg = 0.0", "heading_deg = nan"), r"camera\[0\]\.heading_deg: .*finite"),
-    (changed("above_ground_m = 120.0", ""), r"camera\[0\]: .*either 'height_m'.*or 'above_ground_m'"),
-    (changed("above_ground_m = 120.0", "above_ground_m = 120.0\nheight_m = 900.0"), "give either"),
-    (changed("latitude_deg = 46.5405", "latitude_deg = 5155750.0"), r"latitude_deg: .*less than or equal to 90"),
-    (changed('vertical_datum = "local"', 'vertical_datum = "sea"'), r"vertical_datum: .*'ellipsoidal'.*'sea'"),
-    (changed('name = "south"', 'name = ""'), r"camera\[0\]\.name"),
-    (places.SCENE + places.SCENE[places.SCENE.index("[[camera]]"):], "two cameras are named 'south'"),
-    (changed('file = "dem.tif"', ""), "either 'file' or a table 'synthetic'"),
-    (changed('file = "dem.tif"', 'synthetic = {seed = 1}'), "drop the table 'imagery'"),
-    (changed('file = "dem.tif"', "synthetic = {size_m = 5015.0}"), "size_m: got 5015, expected an even number of cells of 15"),
-    (changed('file = "dem.tif"', 'file = "none.tif"'), r"elevation\.file: no such file"),
-    (changed('file = "dem.tif"', 'file = "../dem.tif"'), r"elevation\.file: leads outside.*--allow-outside"),
-    (changed('file = "dem.tif"', 'file = "/vsicurl/http://x/dem.tif"'), "leads outside"),
-    (changed("[elevation]", "[area]\nwest_deg = 8.0\neast_deg = 7.9\nsouth_deg = 46.5\nnorth_deg = 46.6\n[elevation]"),
-     r"area: expected west_deg < east_deg"),
-    (changed("[elevation]", "[area]\nwest_deg = 1.0\neast_deg = 7.9\nsouth_deg = 46.5\nnorth_deg = 46.6\n[elevation]"),
-     r"area: spans more than 3°"),
-    ("name = [", "not valid TOML"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (changed('name = "hill"\n', ""), r"hill\.toml: name: missing key"),
+        (changed("vertical_datum", "vertical_datumm"), r"unknown key.*did you mean 'vertical_datum'"),
+        (changed("heading_deg = 0.0", "headin_deg = 0.0"), r"camera\[0\]\.headin_deg.*did you mean 'heading_deg'"),
+        (changed("heading_deg = 0.0", 'heading_deg = "north"'), r"camera\[0\]\.heading_deg: .*valid number.*'north'"),
+        (changed("heading_deg = 0.0", "heading_deg = nan"), r"camera\[0\]\.heading_deg: .*finite"),
+        (changed("above_ground_m = 120.0", ""), r"camera\[0\]: .*either 'height_m'.*or 'above_ground_m'"),
+        (changed("above_ground_m = 120.0", "above_ground_m = 120.0\nheight_m = 900.0"), "give either"),
+        (changed("latitude_deg = 46.5405", "latitude_deg = 5155750.0"), r"latitude_deg: .*less than or equal to 90"),
+        (changed('vertical_datum = "local"', 'vertical_datum = "sea"'), r"vertical_datum: .*'ellipsoidal'.*'sea'"),
+        (changed('name = "south"', 'name = ""'), r"camera\[0\]\.name"),
+        (places.SCENE + places.SCENE[places.SCENE.index("[[camera]]") :], "two cameras are named 'south'"),
+        (changed('file = "dem.tif"', ""), "either 'file' or a table 'synthetic'"),
+        (changed('file = "dem.tif"', "synthetic = {seed = 1}"), "drop the table 'imagery'"),
+        (
+            changed('file = "dem.tif"', "synthetic = {size_m = 5015.0}"),
+            "size_m: got 5015, expected an even number of cells of 15",
+        ),
+        (changed('file = "dem.tif"', 'file = "none.tif"'), r"elevation\.file: no such file"),
+        (changed('file = "dem.tif"', 'file = "../dem.tif"'), r"elevation\.file: leads outside.*--allow-outside"),
+        (changed('file = "dem.tif"', 'file = "/vsicurl/http://x/dem.tif"'), "leads outside"),
+        (
+            changed(
+                "[elevation]", "[area]\nwest_deg = 8.0\neast_deg = 7.9\nsouth_deg = 46.5\nnorth_deg = 46.6\n[elevation]"
+            ),
+            r"area: expected west_deg < east_deg",
+        ),
+        (
+            changed(
+                "[elevation]", "[area]\nwest_deg = 1.0\neast_deg = 7.9\nsouth_deg = 46.5\nnorth_deg = 46.6\n[elevation]"
+            ),
+            r"area: spans more than 3°",
+        ),
+        ("name = [", "not valid TOML"),
+    ],
+)
 def test_each_mistake_has_its_line(tmp_path, text, message):
     path = places.write_place(tmp_path, text)
     with pytest.raises(InputError, match=message) as error:
@@ -102,13 +116,16 @@ def in_feet_and_a_half(values, profile):
     return values * 10.0, profile
 
 
-@pytest.mark.parametrize(("name", "change", "message"), [
-    ("dem.tif", without_crs, "no CRS"),
-    ("dem.tif", in_degrees, "degrees where metres"),
-    ("image.tif", elsewhere, r"image\.tif: the raster does not reach the area"),
-    ("dem.tif", mostly_holes, "too much of the area has no data"),
-    ("dem.tif", in_feet_and_a_half, "heights that no place on land has"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("dem.tif", without_crs, "no CRS"),
+        ("dem.tif", in_degrees, "degrees where metres"),
+        ("image.tif", elsewhere, r"image\.tif: the raster does not reach the area"),
+        ("dem.tif", mostly_holes, "too much of the area has no data"),
+        ("dem.tif", in_feet_and_a_half, "heights that no place on land has"),
+    ],
+)
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 def test_each_bad_raster_has_its_line(tmp_path, name, change, message):
     from datetime import UTC, datetime
@@ -168,10 +185,13 @@ def test_the_second_load_reads_what_the_first_built(tmp_path):
     assert len(list(workspace.folder.rglob("terrain-*.npz"))) == 3
 
 
-@pytest.mark.parametrize(("options", "message"), [
-    (MeshOptions(mesher="delaunay"), "--mesher: unknown mesher"),
-    (MeshOptions(atlas="globe"), "--atlas: unknown atlas"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (MeshOptions(mesher="delaunay"), "--mesher: unknown mesher"),
+        (MeshOptions(atlas="globe"), "--atlas: unknown atlas"),
+    ],
+)
 def test_unknown_options_are_named(tmp_path, options, message):
     with pytest.raises(InputError, match=message):
         load_place(places.write_place(tmp_path), Workspace(tmp_path / "work"), options=options)

@@ -17,13 +17,7 @@ from seasonscapes.sky.elevation_table import KNOTS_DEG, at_elevation, by_elevati
 from seasonscapes.sky.illumination import luminance
 from seasonscapes.sky.models import atmosphere_of, read_sky_model
 from seasonscapes.sky.moments import HARMONIC_ORDER, diffuse_source, height_index, sun_geometry, zonal
-from seasonscapes.sky.seen import (
-    diffuse_by_elevation,
-    observer_view,
-    seen_sky,
-    sky_radiance,
-    sky_radiance_grid,
-)
+from seasonscapes.sky.seen import diffuse_by_elevation, observer_view, seen_sky, sky_radiance, sky_radiance_grid
 
 HEIGHT_M = 2800.0
 
@@ -48,9 +42,10 @@ def worst(table_light: np.ndarray, exact_light: np.ndarray) -> float:
     return float((np.abs(luminance(table_light) - exact) / exact).max())
 
 
-@pytest.mark.parametrize(("low_deg", "high_deg", "bound"), [
-    (-18.0, -12.0, 1e-2), (-12.0, -6.0, 3e-3), (-6.0, -2.0, 3e-3), (-2.0, 3.0, 3e-3), (3.0, 65.0, 3e-3),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("low_deg", "high_deg", "bound"),
+    [(-18.0, -12.0, 1e-2), (-12.0, -6.0, 3e-3), (-6.0, -2.0, 3e-3), (-2.0, 3.0, 3e-3), (3.0, 65.0, 3e-3)],
+)
 def test_a_film_s_sky_is_the_picture_s(looked_up, low_deg, high_deg, bound):
     """Random suns between the knots, random lines of sight: sky and airlight within 0.3 % through civil twilight."""
     rng = np.random.default_rng(int(100 + low_deg))
@@ -59,8 +54,9 @@ def test_a_film_s_sky_is_the_picture_s(looked_up, low_deg, high_deg, bound):
     depth_m = 10.0 ** rng.uniform(1.0, 5.3, 4000)
     for _ in range(4):
         sun = direction_from_angles(rng.uniform(0.0, 360.0), rng.uniform(low_deg, high_deg))
-        exact, quick = (illumination_from_atmosphere(tables, sun, HEIGHT_M, shape=(32, 64))
-                        for tables in (tables_of(), looked_up))  # fmt: skip
+        exact, quick = (
+            illumination_from_atmosphere(tables, sun, HEIGHT_M, shape=(32, 64)) for tables in (tables_of(), looked_up)
+        )
         assert worst(quick.sky_radiance, exact.sky_radiance) < bound
         for depth in (depth_m, np.full(4000, np.inf)):
             (through, air), (exact_through, exact_air) = (
@@ -76,8 +72,10 @@ def test_the_moon_s_colour_is_kept(looked_up):
     """Moonlight has another spectrum than sunlight: each channel within 0.3 % of the brightest, not luminance alone."""
     sun, spectrum = direction_from_angles(300.0, -25.0), 2e-6 * np.linspace(0.7, 1.3, 9)
     moon = (direction_from_angles(120.0, 17.3), spectrum, 0.26)
-    exact, quick = (illumination_from_atmosphere(tables, sun, HEIGHT_M, moon=moon, shape=(32, 64))
-                    for tables in (tables_of(), looked_up))  # fmt: skip
+    exact, quick = (
+        illumination_from_atmosphere(tables, sun, HEIGHT_M, moon=moon, shape=(32, 64))
+        for tables in (tables_of(), looked_up)
+    )
     unlike = illumination_from_atmosphere(
         looked_up, sun, HEIGHT_M, moon=(moon[0], spectrum[::-1], 0.26), shape=(32, 64)
     )
@@ -129,8 +127,9 @@ def test_diffuse_source_is_the_plain_sum_over_harmonics():
     sigma = scattering_per_m(tables.atmosphere, scaled, view.sky.height_m)
     chi = np.stack([gas_moments(HARMONIC_ORDER), scaled.aerosol_moments[: HARMONIC_ORDER + 1]])
     rng = np.random.default_rng(8)
-    for k, s, q in zip(rng.integers(0, len(found), 60), rng.integers(0, found.shape[1], 60), rng.integers(0, 3, 60),
-                       strict=True):  # fmt: skip
+    for k, s, q in zip(
+        rng.integers(0, len(found), 60), rng.integers(0, found.shape[1], 60), rng.integers(0, 3, 60), strict=True
+    ):
 
         def at(table, k=k, s=s, q=q):
             low, high = (

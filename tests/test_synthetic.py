@@ -319,8 +319,10 @@ def test_slumping_moves_but_neither_makes_nor_loses_rock():
     links = flow.links_of(lattice)
     settled = flow.slump(z, links, limit, 400)
     assert settled.sum() == pytest.approx(z.sum(), rel=1e-9)
-    steepest = max(np.abs((settled[a] - settled[b]) / d).max() for a, b, d in
-                   zip(links.first, links.second, links.length_m, strict=True))  # fmt: skip
+    steepest = max(
+        np.abs((settled[a] - settled[b]) / d).max()
+        for a, b, d in zip(links.first, links.second, links.length_m, strict=True)
+    )
     assert steepest < 0.85
 
 

@@ -106,8 +106,9 @@ def test_fine_stripes_become_their_mean_and_not_a_moire(terrain):
 
 def test_anisotropic_footprints_keep_what_the_short_side_can_see():
     """Texels of 10 × 80 m: stripes of 80 m across the short side survive, those along the long side are averaged."""
-    terrain = build_mesh(Raster(np.full((40, 40, 1), 800.0, np.float32),
-                                Affine(100, 0, 2640000, 0, -100, 1158000), "EPSG:2056"), FRAME)  # fmt: skip
+    terrain = build_mesh(
+        Raster(np.full((40, 40, 1), 800.0, np.float32), Affine(100, 0, 2640000, 0, -100, 1158000), "EPSG:2056"), FRAME
+    )
     terrain, atlas = unwrap(terrain, texel_m=10.0)
     tall = type(atlas)(**{**vars(atlas), "height_px": atlas.height_px // 8})
     image = Affine(10, 0, 2639900, 0, -10, 1158100)
@@ -229,8 +230,10 @@ def test_real_image_lies_on_the_real_mountains(data_dir):
     bounds = (7.95, 46.52, 8.05, 46.60)
     terrain = build_mesh(read_elevation(data_dir / "jungfrau" / "dem_surface_100m.tif", bounds_deg=bounds), FRAME)
     terrain, atlas = unwrap(terrain, texel_m=50.0)
-    a, b = (bake_imagery(terrain, atlas, read_imagery(data_dir / "jungfrau" / name, bounds_deg=bounds))
-            for name in ("swissimage_136m.tif", "swissimage_on_dem_100m.tif"))  # fmt: skip
+    a, b = (
+        bake_imagery(terrain, atlas, read_imagery(data_dir / "jungfrau" / name, bounds_deg=bounds))
+        for name in ("swissimage_136m.tif", "swissimage_on_dem_100m.tif")
+    )
     both = (a.weight > 0.9) & (b.weight > 0.9)
     assert both.mean() > 0.9
     assert np.corrcoef(a.values[both].ravel(), b.values[both].ravel())[0, 1] > 0.98

@@ -98,8 +98,16 @@ def test_vrt_mosaic_joins_its_tiles_without_a_seam(tmp_path):
 def test_window_covers_what_was_asked_and_touches_nothing_else(tmp_path):
     """Tiles outside the window are destroyed on disk: only a read that never touches them can succeed."""
     full = hill_lv95(256, 256, 30.0)
-    path = write_tiff(tmp_path / "tiled.tif", full.values[..., 0], full.transform, full.crs, tiled=True,
-                      blockxsize=64, blockysize=64, compress="deflate")  # fmt: skip
+    path = write_tiff(
+        tmp_path / "tiled.tif",
+        full.values[..., 0],
+        full.transform,
+        full.crs,
+        tiled=True,
+        blockxsize=64,
+        blockysize=64,
+        compress="deflate",
+    )
     whole = read_elevation(path)
     # A box well within tile column 1, row 2.
     latitude, longitude = geodetic_from_map(full.crs, *_centre(full, np.array([72, 120]), np.array([184, 136])))
@@ -152,15 +160,22 @@ def test_shrinking_while_reading_is_the_mean_of_blocks(tmp_path):
     assert raster.transform == Affine(300, 0, 2640000, 0, -300, 1160000)
 
 
-@pytest.mark.parametrize(("crs", "transform", "values", "message"), [
-    (None, LV95, 500.0, "the raster has no CRS; say which with: gdal_edit.py -a_srs EPSG:… FILE"),
-    ("EPSG:2056", None, 500.0, "the raster has a CRS but no placement on the map (geotransform)"),
-    ("EPSG:2056", Affine(0.001, 0, 7.9, 0, -0.001, 46.6), 500.0,
-     "degrees where metres are meant, in the projected CRS EPSG:2056; got 'x 7.9 … 7.904, y 46.597 … 46.6'"),
-    ("EPSG:4326", LV95, 500.0, "coordinates beyond ±180°/±90° in the geographic CRS EPSG:4326"),
-    ("EPSG:2056", LV95, 90000.0, "heights that no place on land has; got '90000 … 90000'; expected -500 … 9000 m"),
-    ("EPSG:2056", LV95, -32768.0, "cure"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("crs", "transform", "values", "message"),
+    [
+        (None, LV95, 500.0, "the raster has no CRS; say which with: gdal_edit.py -a_srs EPSG:… FILE"),
+        ("EPSG:2056", None, 500.0, "the raster has a CRS but no placement on the map (geotransform)"),
+        (
+            "EPSG:2056",
+            Affine(0.001, 0, 7.9, 0, -0.001, 46.6),
+            500.0,
+            "degrees where metres are meant, in the projected CRS EPSG:2056; got 'x 7.9 … 7.904, y 46.597 … 46.6'",
+        ),
+        ("EPSG:4326", LV95, 500.0, "coordinates beyond ±180°/±90° in the geographic CRS EPSG:4326"),
+        ("EPSG:2056", LV95, 90000.0, "heights that no place on land has; got '90000 … 90000'; expected -500 … 9000 m"),
+        ("EPSG:2056", LV95, -32768.0, "cure"),
+    ],
+)
 @pytest.mark.filterwarnings("ignore:Dataset has no geotransform")
 def test_bad_elevation_rasters_are_named(tmp_path, crs, transform, values, message):
     path = write_tiff(tmp_path / "a.tif", np.full((3, 4), values, np.float32), transform, crs)

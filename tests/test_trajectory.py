@@ -11,15 +11,7 @@ from scipy.spatial import cKDTree
 
 from seasonscapes.cameras.path_file import load_path, read_reference_path, resized, save_path, view_record
 from seasonscapes.cameras.pinhole import Camera, camera_at, project, rotation_from_angles
-from seasonscapes.cameras.trajectory import (
-    CURVES,
-    clearance,
-    cleared,
-    curve_through,
-    fly,
-    roll_of,
-    views_along,
-)
+from seasonscapes.cameras.trajectory import CURVES, clearance, cleared, curve_through, fly, roll_of, views_along
 from seasonscapes.commands.options import PlaceOptions
 from seasonscapes.commands.path import ground_of, path, waypoints_of
 from seasonscapes.errors import InputError
@@ -38,8 +30,12 @@ def camera(place, heading_deg=0.0, pitch_deg=0.0, roll_deg=0.0, focal=80.0):
 
 def waypoints():
     # Chords of very different lengths, and a sharp turn.
-    return [camera([0, 0, 1000], 10, -5), camera([1500, 300, 1200], 80, -10), camera([1700, 700, 1250], 150, -15),
-            camera([-500, 3000, 1500], 300, -20)]  # fmt: skip
+    return [
+        camera([0, 0, 1000], 10, -5),
+        camera([1500, 300, 1200], 80, -10),
+        camera([1700, 700, 1250], 150, -15),
+        camera([-500, 3000, 1500], 300, -20),
+    ]
 
 
 def places_of(views):
@@ -248,7 +244,8 @@ def test_a_path_comes_back_from_its_file(tmp_path):
     made = camera_at(FRAME, 46.6, 8.02, 2100.0, heading_deg=140.0, pitch_deg=-12.0, roll_deg=3.0)
     told = view_record(made, FRAME)
     assert [told[k] for k in ("latitude_deg", "longitude_deg", "height_m", "heading_deg", "pitch_deg", "roll_deg")] == (
-        pytest.approx([46.6, 8.02, 2100.0, 140.0, -12.0, 3.0], abs=1e-6))  # fmt: skip
+        pytest.approx([46.6, 8.02, 2100.0, 140.0, -12.0, 3.0], abs=1e-6)
+    )
     # The file knows no frame: another one puts the same views at the same places on Earth.
     other = load_path(tmp_path / "p.json", LocalFrame(46.5, 8.1, 500.0, 0.13))
     assert view_record(other[3], LocalFrame(46.5, 8.1, 500.0, 0.13)) == pytest.approx(
@@ -261,9 +258,13 @@ def test_a_path_comes_back_from_its_file(tmp_path):
 
 def test_files_that_are_no_path(tmp_path):
     file = tmp_path / "p.json"
-    for text, words in (("{}", "is no path"), ('{"kind": "seasonscapes path"}', "not a path"), ("{", "p.json"),
-                        ('{"kind": "seasonscapes path", "size_px": [9, 9], "views": []}', "no view"),
-                        ('{"kind": "seasonscapes path", "size_px": [9, 9], "views": [{"fx": 1}]}', "latitude_deg")):  # fmt: skip
+    for text, words in (
+        ("{}", "is no path"),
+        ('{"kind": "seasonscapes path"}', "not a path"),
+        ("{", "p.json"),
+        ('{"kind": "seasonscapes path", "size_px": [9, 9], "views": []}', "no view"),
+        ('{"kind": "seasonscapes path", "size_px": [9, 9], "views": [{"fx": 1}]}', "latitude_deg"),
+    ):
         file.write_text(text)
         with pytest.raises(InputError, match=words):
             load_path(file, FRAME)
@@ -279,8 +280,17 @@ def reference_file(folder, interpolation="linear", numbers=(4, 6)):
         matrix = np.eye(4)
         matrix[:3, :3] = np.stack([right, [0.0, 0.0, 1.0], back], axis=1)
         matrix[:3, 3] = longitude, latitude, height
-        return {"wid": 3072.0, "hei": 2048.0, "cx": 1536.0, "cy": 1024.0, "fx": 1000.0, "fy": 1400.0, "k3 ": 0.0,
-                "file_path": "", "transform_matrix": matrix.tolist()}  # fmt: skip
+        return {
+            "wid": 3072.0,
+            "hei": 2048.0,
+            "cx": 1536.0,
+            "cy": 1024.0,
+            "fx": 1000.0,
+            "fy": 1400.0,
+            "k3 ": 0.0,
+            "file_path": "",
+            "transform_matrix": matrix.tolist(),
+        }
 
     meta = {
         "mode": "waypoints",
@@ -288,8 +298,12 @@ def reference_file(folder, interpolation="linear", numbers=(4, 6)):
         "nbr_points": list(numbers),
         "interpolation": interpolation,
     }
-    table = {"meta": meta, "a": record(8.00, 46.60, 1500.0, 0.0), "b": record(7.98, 46.58, 1300.0, 90.0),
-             "c": record(8.03, 46.62, 2000.0, 0.0)}  # fmt: skip
+    table = {
+        "meta": meta,
+        "a": record(8.00, 46.60, 1500.0, 0.0),
+        "b": record(7.98, 46.58, 1300.0, 90.0),
+        "c": record(8.03, 46.62, 2000.0, 0.0),
+    }
     file = folder / "wayp.json"
     file.write_text(json.dumps(table))
     return file
@@ -341,8 +355,16 @@ def scene(tmp_path, monkeypatch):
 
 
 def test_the_verb_writes_a_path_and_a_map(scene, tmp_path, capsys):
-    path(str(scene), via=["south", "46.5505,7.9805,+60", "46.56,7.97,1500"], views=12, clearance_m=40.0, size="96x64",
-         output=tmp_path / "p.json", map=tmp_path / "map.png", json=True)  # fmt: skip
+    path(
+        str(scene),
+        via=["south", "46.5505,7.9805,+60", "46.56,7.97,1500"],
+        views=12,
+        clearance_m=40.0,
+        size="96x64",
+        output=tmp_path / "p.json",
+        map=tmp_path / "map.png",
+        json=True,
+    )
     record = json.loads(capsys.readouterr().out)
     assert record["views"] == 12
     assert record["lowest_above_ground_m"] >= 40.0
@@ -373,15 +395,18 @@ def test_the_verb_reads_reference_files(scene, tmp_path, capsys):
 
 
 def test_the_verb_says_what_is_wrong(scene, tmp_path):
-    for flags, words in (({}, "give one of them"), ({"via": ["south"]}, "at least two waypoints"),
-                         ({"via": ["south", "nowhere"]}, "not a waypoint"),
-                         ({"via": ["south", "46.55,7.98,+50,north"]}, "not a heading"),
-                         ({"via": ["south", "99,7.98,+50"]}, "out of range"),
-                         ({"via": ["south", "47.9,7.98,+50"]}, "outside the elevation raster"),
-                         ({"via": ["south", "south"]}, "same place"),
-                         ({"via": ["south", "46.55,7.98,+50"], "curve": "bezier"}, "expected spline or linear"),
-                         ({"via": ["south", "46.55,7.98,+50"], "views": 1}, "--views"),
-                         ({"reference": tmp_path / "none.json"}, "none.json")):  # fmt: skip
+    for flags, words in (
+        ({}, "give one of them"),
+        ({"via": ["south"]}, "at least two waypoints"),
+        ({"via": ["south", "nowhere"]}, "not a waypoint"),
+        ({"via": ["south", "46.55,7.98,+50,north"]}, "not a heading"),
+        ({"via": ["south", "99,7.98,+50"]}, "out of range"),
+        ({"via": ["south", "47.9,7.98,+50"]}, "outside the elevation raster"),
+        ({"via": ["south", "south"]}, "same place"),
+        ({"via": ["south", "46.55,7.98,+50"], "curve": "bezier"}, "expected spline or linear"),
+        ({"via": ["south", "46.55,7.98,+50"], "views": 1}, "--views"),
+        ({"reference": tmp_path / "none.json"}, "none.json"),
+    ):
         with pytest.raises(InputError, match=words):
             path(str(scene), output=tmp_path / "p.json", **flags)
     assert not (tmp_path / "p.json").exists()

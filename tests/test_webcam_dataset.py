@@ -38,9 +38,19 @@ FRAME = LocalFrame(46.6, 8.0, 1500.0)
 
 
 def webcam(**changes) -> Webcam:
-    facts = {"id": "HUT", "latitude_deg": 46.6, "longitude_deg": 8.0, "height_m": 2000.0, "projection": "cylindrical",
-             "width_px": 80, "height_px": 20, "horizontal_fov_deg": 360.0, "vertical_fov_deg": 62.8,
-             "north_column_px": 0.0, "time_zone": "Europe/Zurich"}  # fmt: skip
+    facts = {
+        "id": "HUT",
+        "latitude_deg": 46.6,
+        "longitude_deg": 8.0,
+        "height_m": 2000.0,
+        "projection": "cylindrical",
+        "width_px": 80,
+        "height_px": 20,
+        "horizontal_fov_deg": 360.0,
+        "vertical_fov_deg": 62.8,
+        "north_column_px": 0.0,
+        "time_zone": "Europe/Zurich",
+    }
     return Webcam(**{**facts, **changes})
 
 
@@ -51,8 +61,13 @@ def test_the_bernese_cameras_are_all_there_and_their_north_column_faces_north():
         panorama = webcam_model(facts, FRAME)
         middle = np.array([[facts.north_column_px, facts.height_px / 2]])
         point = panorama.position_m + 1000.0 * panorama_directions(panorama, middle)
-        assert np.abs(np.array(enu_from_geodetic(FRAME, facts.latitude_deg, facts.longitude_deg, facts.height_m))
-                      - panorama.position_m).max() < 1e-6  # fmt: skip
+        assert (
+            np.abs(
+                np.array(enu_from_geodetic(FRAME, facts.latitude_deg, facts.longitude_deg, facts.height_m))
+                - panorama.position_m
+            ).max()
+            < 1e-6
+        )
         # Seen from its own horizon the middle row of the north column lies north, at the lens's tilt.
         direction = local_axes(FRAME, facts.latitude_deg, facts.longitude_deg) @ (point[0] - panorama.position_m)
         azimuth, elevation = angles_from_direction(direction)
@@ -67,14 +82,17 @@ def test_heading_from_the_north_column_by_hand(north, heading):
     assert webcam_heading_deg(webcam(north_column_px=north)) == pytest.approx(heading)
 
 
-@pytest.mark.parametrize(("changes", "message"), [
-    ({"above_ground_m": 3.0}, "exactly one of height_m and above_ground_m"),
-    ({"north_column_px": None}, "exactly one of north_column_px and heading_deg"),
-    ({"projection": "perspective"}, "needs heading_deg"),
-    ({"vertical_fov_deg": None}, "needs vertical_fov_deg"),
-    ({"time_zone": "Europe/Bern"}, "unknown time zone 'Europe/Bern'"),
-    ({"latitude_deg": 460.0}, "less than or equal to 90"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"above_ground_m": 3.0}, "exactly one of height_m and above_ground_m"),
+        ({"north_column_px": None}, "exactly one of north_column_px and heading_deg"),
+        ({"projection": "perspective"}, "needs heading_deg"),
+        ({"vertical_fov_deg": None}, "needs vertical_fov_deg"),
+        ({"time_zone": "Europe/Bern"}, "unknown time zone 'Europe/Bern'"),
+        ({"latitude_deg": 460.0}, "less than or equal to 90"),
+    ],
+)
 def test_facts_that_cannot_be_are_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         webcam(**changes)
@@ -82,9 +100,11 @@ def test_facts_that_cannot_be_are_refused(changes, message):
 
 def test_errors_in_a_webcam_file_are_one_line(tmp_path):
     text = BERNESE.read_text()
-    cases = {"two webcams are called 1-HEISCH": text.replace('"2-BSPIEZ"', '"1-HEISCH"'),
-             "did you mean 'height_m'": text.replace("height_m = 1134.0", "heigth_m = 1134.0"),
-             "not valid TOML": text + "[["}  # fmt: skip
+    cases = {
+        "two webcams are called 1-HEISCH": text.replace('"2-BSPIEZ"', '"1-HEISCH"'),
+        "did you mean 'height_m'": text.replace("height_m = 1134.0", "heigth_m = 1134.0"),
+        "not valid TOML": text + "[[",
+    }
     for message, broken in cases.items():
         (tmp_path / "w.toml").write_text(broken)
         with pytest.raises(InputError, match=message) as error:
@@ -96,12 +116,17 @@ def test_errors_in_a_webcam_file_are_one_line(tmp_path):
 
 def test_heights_are_checked_against_the_terrain():
     cams = [webcam(id=name) for name in ("fine", "sunk", "flying", "away")] + [
-        webcam(id="mast", height_m=None, above_ground_m=12.0)]  # fmt: skip
+        webcam(id="mast", height_m=None, above_ground_m=12.0)
+    ]
     checks = check_heights(cams, [1990.0, 2100.0, 1500.0, np.nan, 900.0])
     assert [c.plausible for c in checks] == [True, False, False, False, True]
-    assert [c.verdict for c in checks] == ["10 m above ground", "100 m below ground",
-                                           "500 m above ground, more than a mast", "outside the terrain",
-                                           "12 m above ground"]  # fmt: skip
+    assert [c.verdict for c in checks] == [
+        "10 m above ground",
+        "100 m below ground",
+        "500 m above ground, more than a mast",
+        "outside the terrain",
+        "12 m above ground",
+    ]
 
 
 def test_the_map_shows_each_webcam_in_its_place():
@@ -111,11 +136,17 @@ def test_the_map_shows_each_webcam_in_its_place():
     assert len(red) > 32 * 20
 
 
-@pytest.mark.parametrize(("local", "utc"), [
-    ("2024-03-31T01:59:59", "2024-03-31T00:59:59"), ("2024-03-31T03:00:00", "2024-03-31T01:00:00"),
-    ("2024-10-27T01:59:59", "2024-10-26T23:59:59"), ("2024-10-27T03:00:00", "2024-10-27T02:00:00"),
-    ("2024-12-21T12:00:00", "2024-12-21T11:00:00"), ("2024-06-21T12:00:00", "2024-06-21T10:00:00"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("local", "utc"),
+    [
+        ("2024-03-31T01:59:59", "2024-03-31T00:59:59"),
+        ("2024-03-31T03:00:00", "2024-03-31T01:00:00"),
+        ("2024-10-27T01:59:59", "2024-10-26T23:59:59"),
+        ("2024-10-27T03:00:00", "2024-10-27T02:00:00"),
+        ("2024-12-21T12:00:00", "2024-12-21T11:00:00"),
+        ("2024-06-21T12:00:00", "2024-06-21T10:00:00"),
+    ],
+)
 def test_camera_clocks_keep_daylight_saving(local, utc):
     got = utc_from_camera_clock(datetime.fromisoformat(local), "Europe/Zurich")
     assert got == datetime.fromisoformat(utc).replace(tzinfo=UTC)
@@ -136,10 +167,18 @@ def picture(path: Path, size=(80, 20), seed=0) -> None:
 
 def test_a_folder_with_every_fault_is_reported_and_not_fatal(tmp_path):
     cams = [webcam(), webcam(id="TOP")]
-    for seed, name in enumerate(["2024-09-01/12-00-00/360/HUT.jpg", "2024-09-01/12-10-00/360/HUT.jpg",
-                                 "2024-09-01/12-20-00/360/HUT.jpg", "2024-09-01/12-30-00/360/HUT.jpg",
-                                 "2024-09-01/12-00-00/360/GONE.jpg", "2024-10-27/02-30-00/360/TOP.jpg",
-                                 "2024-03-31/02-30-00/360/TOP.jpg", "notes/old.jpg"]):  # fmt: skip
+    for seed, name in enumerate(
+        [
+            "2024-09-01/12-00-00/360/HUT.jpg",
+            "2024-09-01/12-10-00/360/HUT.jpg",
+            "2024-09-01/12-20-00/360/HUT.jpg",
+            "2024-09-01/12-30-00/360/HUT.jpg",
+            "2024-09-01/12-00-00/360/GONE.jpg",
+            "2024-10-27/02-30-00/360/TOP.jpg",
+            "2024-03-31/02-30-00/360/TOP.jpg",
+            "notes/old.jpg",
+        ]
+    ):
         picture(tmp_path / name, seed=seed)
     day = tmp_path / "2024-09-01"
     picture(day / "12-40-00/360/HUT.jpg", size=(64, 20))
@@ -158,9 +197,15 @@ def test_a_folder_with_every_fault_is_reported_and_not_fatal(tmp_path):
     again = read_manifest(tmp_path / "manifest.csv")
     assert again[:-1] == rows
     found = {(p.kind, Path(p.path).parts[1]) for p in check_pictures(again, tmp_path, cams)}
-    assert found == {("truncated", "12-20-00"), ("unreadable", "12-30-00"), ("wrong size", "12-40-00"),
-                     ("duplicate picture", "12-50-00"), ("empty", "13-00-00"), ("missing", "lost.jpg"),
-                     ("duplicate time", "lost.jpg")}  # fmt: skip
+    assert found == {
+        ("truncated", "12-20-00"),
+        ("unreadable", "12-30-00"),
+        ("wrong size", "12-40-00"),
+        ("duplicate picture", "12-50-00"),
+        ("empty", "13-00-00"),
+        ("missing", "lost.jpg"),
+        ("duplicate time", "lost.jpg"),
+    }
 
 
 def test_a_checksum_that_changed_and_damage_in_the_middle_are_found(tmp_path):
@@ -184,12 +229,15 @@ def test_85000_rows_are_read_and_checked_for_repeats_in_seconds(tmp_path):
     assert seconds < 10.0  # 0.5 s when measured; a shared machine may be slow, opening pictures would take hours
 
 
-@pytest.mark.parametrize(("text", "message"), [
-    ("webcam,path\nHUT,a.jpg\n", "column 'time_utc' is missing"),
-    ("webcam,time_utc,path\nHUT,2024-09-01T12:00,a.jpg\n", "line 2: time_utc '2024-09-01T12:00' has no offset"),
-    ("webcam,time_utc,path\nHUT,noon,a.jpg\n", "line 2"),
-    ("webcam,time_utc,path\nHUT\n", "line 2"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("webcam,path\nHUT,a.jpg\n", "column 'time_utc' is missing"),
+        ("webcam,time_utc,path\nHUT,2024-09-01T12:00,a.jpg\n", "line 2: time_utc '2024-09-01T12:00' has no offset"),
+        ("webcam,time_utc,path\nHUT,noon,a.jpg\n", "line 2"),
+        ("webcam,time_utc,path\nHUT\n", "line 2"),
+    ],
+)
 def test_a_broken_manifest_names_its_line(tmp_path, text, message):
     (tmp_path / "m.csv").write_text(text)
     with pytest.raises(InputError, match=message):

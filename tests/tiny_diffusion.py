@@ -24,8 +24,14 @@ def write_tokenizer(folder: Path) -> None:
     folder.mkdir(parents=True)
     (folder / "vocab.json").write_text(json.dumps({symbol: n for n, symbol in enumerate(symbols)}))
     (folder / "merges.txt").write_text("#version: 0.2\n")
-    config = {"tokenizer_class": "CLIPTokenizer", "model_max_length": 77, "bos_token": "<|startoftext|>",
-              "eos_token": "<|endoftext|>", "unk_token": "<|endoftext|>", "pad_token": "<|endoftext|>"}  # fmt: skip
+    config = {
+        "tokenizer_class": "CLIPTokenizer",
+        "model_max_length": 77,
+        "bos_token": "<|startoftext|>",
+        "eos_token": "<|endoftext|>",
+        "unk_token": "<|endoftext|>",
+        "pad_token": "<|endoftext|>",
+    }
     (folder / "tokenizer_config.json").write_text(json.dumps(config))
 
 
@@ -52,8 +58,12 @@ def adapter_state(unet, seed: int) -> dict:
     def random(*shape: int):
         return torch.randn(shape, generator=generator) / shape[-1] ** 0.5
 
-    state = {"image_proj.proj.weight": random(4 * _TEXT, _IMAGE), "image_proj.proj.bias": random(4 * _TEXT),
-             "image_proj.norm.weight": torch.ones(_TEXT), "image_proj.norm.bias": torch.zeros(_TEXT)}  # fmt: skip
+    state = {
+        "image_proj.proj.weight": random(4 * _TEXT, _IMAGE),
+        "image_proj.proj.bias": random(4 * _TEXT),
+        "image_proj.norm.weight": torch.ones(_TEXT),
+        "image_proj.norm.bias": torch.zeros(_TEXT),
+    }
     for number, name in enumerate(unet.attn_processors):
         if name.endswith("attn2.processor"):
             layer = unet.get_submodule(name.removesuffix(".processor"))
@@ -89,34 +99,78 @@ def write_tiny_weights(folder: Path) -> Path:
 
     torch.manual_seed(0)
     unet = UNet2DConditionModel(
-        sample_size=8, in_channels=4, out_channels=4, block_out_channels=_BLOCKS, layers_per_block=1, norm_num_groups=4,
-        down_block_types=_DOWN, up_block_types=("UpBlock2D", "CrossAttnUpBlock2D"), cross_attention_dim=_TEXT,
+        sample_size=8,
+        in_channels=4,
+        out_channels=4,
+        block_out_channels=_BLOCKS,
+        layers_per_block=1,
+        norm_num_groups=4,
+        down_block_types=_DOWN,
+        up_block_types=("UpBlock2D", "CrossAttnUpBlock2D"),
+        cross_attention_dim=_TEXT,
         attention_head_dim=4,
-    )  # fmt: skip
-    vae = AutoencoderKL(block_out_channels=(4, 4, 8, 8), norm_num_groups=2, latent_channels=4, sample_size=64,
-                        down_block_types=("DownEncoderBlock2D",) * 4, up_block_types=("UpDecoderBlock2D",) * 4)  # fmt: skip
-    text = CLIPTextModel(CLIPTextConfig(vocab_size=514, hidden_size=_TEXT, intermediate_size=32, num_hidden_layers=2,
-                                        num_attention_heads=2, projection_dim=_TEXT, bos_token_id=512, eos_token_id=513,
-                                        pad_token_id=513))  # fmt: skip
-    vision = CLIPVisionModelWithProjection(CLIPVisionConfig(
-        hidden_size=16, intermediate_size=32, num_hidden_layers=2, num_attention_heads=2, image_size=32, patch_size=8,
-        projection_dim=_IMAGE))  # fmt: skip
+    )
+    vae = AutoencoderKL(
+        block_out_channels=(4, 4, 8, 8),
+        norm_num_groups=2,
+        latent_channels=4,
+        sample_size=64,
+        down_block_types=("DownEncoderBlock2D",) * 4,
+        up_block_types=("UpDecoderBlock2D",) * 4,
+    )
+    text = CLIPTextModel(
+        CLIPTextConfig(
+            vocab_size=514,
+            hidden_size=_TEXT,
+            intermediate_size=32,
+            num_hidden_layers=2,
+            num_attention_heads=2,
+            projection_dim=_TEXT,
+            bos_token_id=512,
+            eos_token_id=513,
+            pad_token_id=513,
+        )
+    )
+    vision = CLIPVisionModelWithProjection(
+        CLIPVisionConfig(
+            hidden_size=16,
+            intermediate_size=32,
+            num_hidden_layers=2,
+            num_attention_heads=2,
+            image_size=32,
+            patch_size=8,
+            projection_dim=_IMAGE,
+        )
+    )
     scheduler = EulerAncestralDiscreteScheduler(beta_start=0.00085, beta_end=0.012, beta_schedule="scaled_linear")
     base = folder / BASE
     for name, part in (("unet", unet), ("vae", vae), ("text_encoder", text), ("scheduler", scheduler)):
         part.save_pretrained(base / name)
     as_published(base)
     write_tokenizer(base / "tokenizer")
-    index = {"_class_name": "StableDiffusionPipeline", "_diffusers_version": "0.42.0", "safety_checker": [None, None],
-             "feature_extractor": [None, None], "unet": ["diffusers", "UNet2DConditionModel"],
-             "vae": ["diffusers", "AutoencoderKL"], "scheduler": ["diffusers", "EulerAncestralDiscreteScheduler"],
-             "text_encoder": ["transformers", "CLIPTextModel"], "tokenizer": ["transformers", "CLIPTokenizer"]}  # fmt: skip
+    index = {
+        "_class_name": "StableDiffusionPipeline",
+        "_diffusers_version": "0.42.0",
+        "safety_checker": [None, None],
+        "feature_extractor": [None, None],
+        "unet": ["diffusers", "UNet2DConditionModel"],
+        "vae": ["diffusers", "AutoencoderKL"],
+        "scheduler": ["diffusers", "EulerAncestralDiscreteScheduler"],
+        "text_encoder": ["transformers", "CLIPTextModel"],
+        "tokenizer": ["transformers", "CLIPTokenizer"],
+    }
     (base / "model_index.json").write_text(json.dumps(index))
     for seed, name in ((1, DEPTH), (2, INPAINT)):
         torch.manual_seed(seed)
-        net = ControlNetModel(block_out_channels=_BLOCKS, layers_per_block=1, norm_num_groups=4, down_block_types=_DOWN,
-                              cross_attention_dim=_TEXT, attention_head_dim=4,
-                              conditioning_embedding_out_channels=(4, 8, 8, 16))  # fmt: skip
+        net = ControlNetModel(
+            block_out_channels=_BLOCKS,
+            layers_per_block=1,
+            norm_num_groups=4,
+            down_block_types=_DOWN,
+            cross_attention_dim=_TEXT,
+            attention_head_dim=4,
+            conditioning_embedding_out_channels=(4, 8, 8, 16),
+        )
         awaken(net, seed).save_pretrained(folder / name)
     models = folder / ADAPTER / "models"
     vision.save_pretrained(models / "image_encoder")

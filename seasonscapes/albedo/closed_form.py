@@ -65,9 +65,16 @@ class AlbedoFit:
     history: list[dict] = field(default_factory=list)
 
 
-def solve_albedo(land: Land, shots: Sequence[Shot], *, trust: Trust = LINEAR, effort: Effort = Effort(),
-                 start: np.ndarray | None = None, prior: tuple[np.ndarray, float] | None = None,
-                 progress: Progress | None = None) -> AlbedoFit:  # fmt: skip
+def solve_albedo(
+    land: Land,
+    shots: Sequence[Shot],
+    *,
+    trust: Trust = LINEAR,
+    effort: Effort = Effort(),
+    start: np.ndarray | None = None,
+    prior: tuple[np.ndarray, float] | None = None,
+    progress: Progress | None = None,
+) -> AlbedoFit:
     """Albedo, exposures and white balances from photographs under known light.
 
     Parameters
@@ -127,8 +134,9 @@ def _require_usable(rows: list[Rows]) -> None:
 # ---------------------------------------------------------------------------------------------- conjugate gradients
 
 
-def _solve(rows: list[Rows], start: np.ndarray, effort: Effort, shape: tuple[int, int],
-           prior: tuple[np.ndarray, float] | None) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+def _solve(
+    rows: list[Rows], start: np.ndarray, effort: Effort, shape: tuple[int, int], prior: tuple[np.ndarray, float] | None
+) -> tuple[np.ndarray, np.ndarray]:
     """Minimise the weighted squares over albedo, gains projected out. Returns albedo and the normal diagonal."""
     diagonal = np.zeros_like(start)
     target = np.zeros_like(start)
@@ -164,8 +172,9 @@ def _solve(rows: list[Rows], start: np.ndarray, effort: Effort, shape: tuple[int
     return _conjugate_gradients(normal, target, start, preconditioner, effort.iterations), diagonal
 
 
-def _conjugate_gradients(normal: Callable, target: np.ndarray, x: np.ndarray, preconditioner: np.ndarray,
-                         iterations: int) -> np.ndarray:  # fmt: skip
+def _conjugate_gradients(
+    normal: Callable, target: np.ndarray, x: np.ndarray, preconditioner: np.ndarray, iterations: int
+) -> np.ndarray:
     """Preconditioned conjugate gradients for three independent systems side by side."""
     x = x.copy()
     residual = target - normal(x)

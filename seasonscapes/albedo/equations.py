@@ -56,9 +56,19 @@ def rows_of(shot: Shot, trust: Trust, size: int) -> Rows:
     radiance = sky_seen(shot.seen, shot.light)[chosen] if len(shot.seen.sky.pixel) else np.zeros((0, 3), np.float32)
     suns = [np.asarray(body.normal_illuminance_lx, np.float32) for body in luminaries(shot.light)]
     values = np.nan_to_num(picture[terrain].astype(np.float32))
-    rows = Rows(shot, values, np.repeat(whole[:, None], 3, axis=1), picture_noise(values, trust), transmittance, airlight,
-                 picture[sky].astype(np.float32), radiance.astype(np.float32), np.zeros((size, 3), np.float32),
-                 np.ones(3), suns)  # fmt: skip
+    rows = Rows(
+        shot,
+        values,
+        np.repeat(whole[:, None], 3, axis=1),
+        picture_noise(values, trust),
+        transmittance,
+        airlight,
+        picture[sky].astype(np.float32),
+        radiance.astype(np.float32),
+        np.zeros((size, 3), np.float32),
+        np.ones(3),
+        suns,
+    )
     if shot.gain is not None:
         rows.inverse_gain = 1.0 / shot.gain
     elif not rows.projected:

@@ -76,8 +76,16 @@ class Footprints:
         return csr_array((values, self.texel, self.start), shape=size, copy=False)
 
 
-def trace_footprints(terrain: Occluder, camera: Camera, shape: tuple[int, int], suns: Sequence[Sequence[Luminary]], *,
-                     rays: int = 16, seed: int = 0, progress: Progress | None = None) -> Footprints:  # fmt: skip
+def trace_footprints(
+    terrain: Occluder,
+    camera: Camera,
+    shape: tuple[int, int],
+    suns: Sequence[Sequence[Luminary]],
+    *,
+    rays: int = 16,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Footprints:
     """Footprints of a camera's pixels, sun by sun. Memory beyond the result does not grow with the picture.
 
     Parameters
@@ -115,23 +123,30 @@ def trace_footprints(terrain: Occluder, camera: Camera, shape: tuple[int, int], 
     sunlit = [
         [np.concatenate([p[7][t][b] for p in parts]) for b in range(len(bodies))] for t, bodies in enumerate(suns)
     ]
-    return Footprints(camera, shape, pixel, coverage, start, texel, share, sunlit, np.concatenate(lit, axis=1), distance,
-                      spread)  # fmt: skip
+    return Footprints(
+        camera, shape, pixel, coverage, start, texel, share, sunlit, np.concatenate(lit, axis=1), distance, spread
+    )
 
 
-def _block_entries(terrain: Occluder, camera: Camera, shape: tuple[int, int], samples: tuple,
-                   suns: Sequence[Sequence[Luminary]]) -> tuple[tuple, np.ndarray]:  # fmt: skip
+def _block_entries(
+    terrain: Occluder, camera: Camera, shape: tuple[int, int], samples: tuple, suns: Sequence[Sequence[Luminary]]
+) -> tuple[tuple, np.ndarray]:
     """Columns of `Footprints` for a block of pixels, and its ``lit`` ``(T, n)``."""
     points, hit, pixel = samples
     count, rays = hit.shape
     texel, weight = bilinear_texels(points.uv.reshape(-1, 2), shape)
     weight *= np.where(hit.ravel(), np.float32(1.0 / rays), np.float32(0.0))[:, None]
-    entry, start, columns = _merged(np.repeat(np.arange(count, dtype=np.int64), rays * 4), texel.ravel(), count,
-                                    shape[0] * shape[1])  # fmt: skip
+    entry, start, columns = _merged(
+        np.repeat(np.arange(count, dtype=np.int64), rays * 4), texel.ravel(), count, shape[0] * shape[1]
+    )
     weight = weight.ravel()
     share = np.bincount(entry, weight, len(columns)).astype(np.float32)
-    shadow_rays = sun_rays(terrain, (points.origin, points.normal, points.outward), hit.astype(np.float32),
-                           pixel_turn(pixel, camera.width_px, rays))  # fmt: skip
+    shadow_rays = sun_rays(
+        terrain,
+        (points.origin, points.normal, points.outward),
+        hit.astype(np.float32),
+        pixel_turn(pixel, camera.width_px, rays),
+    )
     lit = np.full((len(suns), count), np.nan, np.float32)
     sunlit = []
     for t, bodies in enumerate(suns):
@@ -149,8 +164,16 @@ def _block_entries(terrain: Occluder, camera: Camera, shape: tuple[int, int], sa
     nearest = np.where(hit, distance, np.inf).min(axis=1)
     farthest = np.where(hit, distance, 0.0).max(axis=1)
     mean = (distance * hit).sum(axis=1) / hit.sum(axis=1)
-    columns = (pixel, hit.mean(axis=1, dtype=np.float32), np.diff(start), columns.astype(np.int32), share,
-               mean.astype(np.float32), (farthest / np.maximum(nearest, 1e-3)).astype(np.float32), sunlit)  # fmt: skip
+    columns = (
+        pixel,
+        hit.mean(axis=1, dtype=np.float32),
+        np.diff(start),
+        columns.astype(np.int32),
+        share,
+        mean.astype(np.float32),
+        (farthest / np.maximum(nearest, 1e-3)).astype(np.float32),
+        sunlit,
+    )
     return columns, lit
 
 
@@ -197,8 +220,14 @@ def thinned_footprints(footprints: Footprints, keep: np.ndarray) -> Footprints:
     start = np.zeros(int(keep.sum()) + 1, np.int32)
     np.cumsum(count[keep], out=start[1:])
     return replace(
-        footprints, pixel=footprints.pixel[keep], coverage=footprints.coverage[keep], start=start,
-        texel=footprints.texel[entries], share=footprints.share[entries],
-        sunlit=[[values[entries] for values in bodies] for bodies in footprints.sunlit], lit=footprints.lit[:, keep],
-        distance_m=footprints.distance_m[keep], spread=footprints.spread[keep],
-    )  # fmt: skip
+        footprints,
+        pixel=footprints.pixel[keep],
+        coverage=footprints.coverage[keep],
+        start=start,
+        texel=footprints.texel[entries],
+        share=footprints.share[entries],
+        sunlit=[[values[entries] for values in bodies] for bodies in footprints.sunlit],
+        lit=footprints.lit[:, keep],
+        distance_m=footprints.distance_m[keep],
+        spread=footprints.spread[keep],
+    )

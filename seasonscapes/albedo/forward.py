@@ -58,8 +58,15 @@ class Land:
     ready: ReadyPoints
 
 
-def trace_land(terrain: Terrain, shape: tuple[int, int], *, effort: Effort = TEXEL_EFFORT, seed: int = 0,
-               smooth: bool = True, progress: Progress | None = None) -> Land:  # fmt: skip
+def trace_land(
+    terrain: Terrain,
+    shape: tuple[int, int],
+    *,
+    effort: Effort = TEXEL_EFFORT,
+    seed: int = 0,
+    smooth: bool = True,
+    progress: Progress | None = None,
+) -> Land:
     """Trace the daylight coefficients of every texel of a texture of this shape. Knows nothing of any albedo.
 
     Parameters
@@ -135,8 +142,11 @@ def seen_by(footprints: Footprints, *, sky_pixels: int = 4000, seed: int = 0) ->
     if len(open_pixels) > sky_pixels:
         open_pixels = np.sort(np.random.default_rng(seed).choice(open_pixels, sky_pixels, replace=False))
     nothing = (np.empty(0, np.int64), np.empty((0, 1), np.float32))
-    return Seen(air_places(camera, footprints.pixel, footprints.distance_m, nothing), sky_grid(camera, open_pixels),
-                float(np.degrees(1.0 / camera.fx)))  # fmt: skip
+    return Seen(
+        air_places(camera, footprints.pixel, footprints.distance_m, nothing),
+        sky_grid(camera, open_pixels),
+        float(np.degrees(1.0 / camera.fx)),
+    )
 
 
 def air_between(seen: Seen, light: Illumination, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -152,8 +162,9 @@ def sky_seen(seen: Seen, light: Illumination) -> np.ndarray:
     return open_sky(seen.sky, replace(light, sun=None, moon=None), seen.pixel_angle_deg)
 
 
-def surface_radiance(footprints: Footprints, number: int, light: tuple[Illumination, np.ndarray],
-                     albedo: np.ndarray) -> np.ndarray:  # fmt: skip
+def surface_radiance(
+    footprints: Footprints, number: int, light: tuple[Illumination, np.ndarray], albedo: np.ndarray
+) -> np.ndarray:
     """Radiance ``(n, 3)`` that leaves the terrain of each pixel, before the air [cd/m²].
 
     Parameters

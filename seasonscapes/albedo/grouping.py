@@ -67,7 +67,12 @@ def share_static(dated: Sequence[KnownAlbedo]) -> list[KnownAlbedo]:
     for one, was in zip(dated, measured, strict=True):
         same_snow = np.abs(snow_share(one.albedo) - snow_share(mean)) < 0.5
         use = static & (was | same_snow)
-        result.append(replace(one, albedo=np.where(use[..., None], mean, one.albedo).astype(np.float32),
-                              sigma=np.where(use, joined_sigma, one.sigma).astype(np.float32),
-                              source=np.where(use, 1, one.source).astype(np.uint8)))  # fmt: skip
+        result.append(
+            replace(
+                one,
+                albedo=np.where(use[..., None], mean, one.albedo).astype(np.float32),
+                sigma=np.where(use, joined_sigma, one.sigma).astype(np.float32),
+                source=np.where(use, 1, one.source).astype(np.uint8),
+            )
+        )
     return result

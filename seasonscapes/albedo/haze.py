@@ -68,13 +68,28 @@ def mixed_light(first: Illumination, second: Illumination, share: float) -> Illu
     visible = None
     if first.visible_sky is not None and second.visible_sky is not None:
         visible = _mixed(first.visible_sky, second.visible_sky, share).astype(np.float32)
-    return replace(first, sky_radiance=sky, sun=body(first.sun, second.sun), moon=body(first.moon, second.moon),
-                   aerial_perspective=air, visible_sky=visible)  # fmt: skip
+    return replace(
+        first,
+        sky_radiance=sky,
+        sun=body(first.sun, second.sun),
+        moon=body(first.moon, second.moon),
+        aerial_perspective=air,
+        visible_sky=visible,
+    )
 
 
-def fit_visibility(land: Land, shots: Sequence[Shot], lights_of: LightsOf, *, visibilities_km: Sequence[float] = VISIBILITIES_KM,
-                   trust: Trust = LINEAR, share: float = 0.2, seed: int = 0, start: AlbedoFit | None = None,
-                   progress: Callable[[float], None] | None = None) -> HazeFit:  # fmt: skip
+def fit_visibility(
+    land: Land,
+    shots: Sequence[Shot],
+    lights_of: LightsOf,
+    *,
+    visibilities_km: Sequence[float] = VISIBILITIES_KM,
+    trust: Trust = LINEAR,
+    share: float = 0.2,
+    seed: int = 0,
+    start: AlbedoFit | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> HazeFit:
     """The meteorological range [km] that explains the photographs best.
 
     Parameters

@@ -66,7 +66,9 @@ class InverseOptions:
     max_depth: int = 6
     held_out: float = 0.12
     check_every: int = 15
-    steps: Mapping[str, float] = field(default_factory=lambda: {"albedo": 0.006, "log_gain": 0.004, "sun": 0.01, "sky": 0.01, "haze": 0.02})  # fmt: skip
+    steps: Mapping[str, float] = field(
+        default_factory=lambda: {"albedo": 0.006, "log_gain": 0.004, "sun": 0.01, "sky": 0.01, "haze": 0.02}
+    )
     seed: int = 0
 
 
@@ -103,9 +105,18 @@ class InverseFit:
     history: list[dict[str, float]]
 
 
-def refine_albedo(terrain: Terrain, land: Land, shots: Sequence[Shot], start: AlbedoFit, *, trust: Trust = LINEAR,
-                  options: InverseOptions | None = None, extra: Mapping[str, Extra] | None = None,
-                  callbacks: Sequence[Callback] = (), resume: Path | None = None) -> InverseFit:  # fmt: skip
+def refine_albedo(
+    terrain: Terrain,
+    land: Land,
+    shots: Sequence[Shot],
+    start: AlbedoFit,
+    *,
+    trust: Trust = LINEAR,
+    options: InverseOptions | None = None,
+    extra: Mapping[str, Extra] | None = None,
+    callbacks: Sequence[Callback] = (),
+    resume: Path | None = None,
+) -> InverseFit:
     """Refine a closed-form albedo by differentiable rendering.
 
     Parameters
@@ -175,7 +186,9 @@ def _targets(land: Land, shots: Sequence[Shot], start: AlbedoFit, trust: Trust) 
         image[shot.footprints.pixel] = np.sqrt(weight) / np.asarray(gain, np.float32)
         image *= 1.0 / np.sqrt(max(float((weight > 0.0).mean(axis=1).sum()), 1.0))
         shape = (camera.height_px, camera.width_px, 3)
-        found.append((mi.TensorXf(np.nan_to_num(shot.observation.image.astype(np.float32))), mi.TensorXf(image.reshape(shape))))  # fmt: skip
+        found.append(
+            (mi.TensorXf(np.nan_to_num(shot.observation.image.astype(np.float32))), mi.TensorXf(image.reshape(shape)))
+        )
     return found
 
 
@@ -292,8 +305,14 @@ def _judge(task: _Task, values: dict[str, np.ndarray]) -> float:
     with dr.suspend_grad():
         for index in map(int, task.judges):
             target, root = task.targets[index]
-            first, second = ((mi_picture(task.views, index, unknowns, spp=2 * task.options.spp, seed=7_000_000 + 2 * index + k)
-                              - target) * root for k in (0, 1))  # fmt: skip
+            first, second = (
+                (
+                    mi_picture(task.views, index, unknowns, spp=2 * task.options.spp, seed=7_000_000 + 2 * index + k)
+                    - target
+                )
+                * root
+                for k in (0, 1)
+            )
             losses.append(float(dr.sum(first * second, axis=None).array[0]))
     return float(np.mean(losses))
 
@@ -302,15 +321,21 @@ def _bound(task: _Task, optimizer: Any) -> None:
     """Keep every unknown within what it can be."""
     import drjit as dr
 
-    limits = {"albedo": (LOWEST, HIGHEST), "correction": (0.2, 5.0), "sun": (0.05, 20.0), "sky": (0.05, 20.0),
-              "haze": (0.0, 20.0)} | {name: (one.low, one.high) for name, one in task.extra.items()}  # fmt: skip
+    limits = {
+        "albedo": (LOWEST, HIGHEST),
+        "correction": (0.2, 5.0),
+        "sun": (0.05, 20.0),
+        "sky": (0.05, 20.0),
+        "haze": (0.0, 20.0),
+    } | {name: (one.low, one.high) for name, one in task.extra.items()}
     for name in optimizer.keys():  # noqa: SIM118 (not a dict)
         if name in limits:
             optimizer[name] = dr.clip(dr.detach(optimizer[name]), *limits[name])
 
 
-def _values(task: _Task, optimizer: Any, base: np.ndarray, level: int,
-            values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:  # fmt: skip
+def _values(
+    task: _Task, optimizer: Any, base: np.ndarray, level: int, values: dict[str, np.ndarray]
+) -> dict[str, np.ndarray]:
     import drjit as dr
 
     with dr.suspend_grad():

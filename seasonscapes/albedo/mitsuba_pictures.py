@@ -47,8 +47,9 @@ class DifferentiableViews:
     mi_integrator: Any
 
 
-def differentiable_views(terrain: Terrain, albedo: np.ndarray, shots: Sequence[Shot], *, max_depth: int = 6,
-                         smooth: bool = True) -> DifferentiableViews:  # fmt: skip
+def differentiable_views(
+    terrain: Terrain, albedo: np.ndarray, shots: Sequence[Shot], *, max_depth: int = 6, smooth: bool = True
+) -> DifferentiableViews:
     """Scenes, sensors and air of photographs.
 
     Raises
@@ -96,16 +97,28 @@ def mi_sensor(camera: Camera) -> Any:
 
     if abs(camera.fx / camera.fy - 1.0) > 1e-6:
         raise ValueError("differentiable pictures need square pixels")
-    film = {"type": "hdrfilm", "width": camera.width_px, "height": camera.height_px, "pixel_format": "rgb",
-            "component_format": "float32", "rfilter": {"type": "box"}}  # fmt: skip
-    return mi.load_dict({
-        "type": "perspective", "fov_axis": "x", "near_clip": 0.5, "far_clip": 1.0e7, "film": film,
-        "fov": float(np.degrees(2.0 * np.arctan(0.5 * camera.width_px / camera.fx))),
-        "principal_point_offset_x": 0.5 - camera.cx / camera.width_px,
-        "principal_point_offset_y": 0.5 - camera.cy / camera.height_px,
-        # Mitsuba looks along +z with x to the left.
-        "to_world": mi.ScalarTransform4f(camera.world_from_camera @ np.diag([-1.0, -1.0, 1.0, 1.0])),
-    })  # fmt: skip
+    film = {
+        "type": "hdrfilm",
+        "width": camera.width_px,
+        "height": camera.height_px,
+        "pixel_format": "rgb",
+        "component_format": "float32",
+        "rfilter": {"type": "box"},
+    }
+    return mi.load_dict(
+        {
+            "type": "perspective",
+            "fov_axis": "x",
+            "near_clip": 0.5,
+            "far_clip": 1.0e7,
+            "film": film,
+            "fov": float(np.degrees(2.0 * np.arctan(0.5 * camera.width_px / camera.fx))),
+            "principal_point_offset_x": 0.5 - camera.cx / camera.width_px,
+            "principal_point_offset_y": 0.5 - camera.cy / camera.height_px,
+            # Mitsuba looks along +z with x to the left.
+            "to_world": mi.ScalarTransform4f(camera.world_from_camera @ np.diag([-1.0, -1.0, 1.0, 1.0])),
+        }
+    )
 
 
 def mi_picture(views: DifferentiableViews, index: int, unknowns: dict[str, Any], *, spp: int, seed: int) -> Any:
@@ -134,8 +147,15 @@ def mi_picture(views: DifferentiableViews, index: int, unknowns: dict[str, Any],
         elif name in params:
             params[name] = value
     params.update()
-    image = mi.render(views.mi_scenes[index], params, sensor=views.mi_sensors[index], integrator=views.mi_integrator,
-                      spp=spp, seed=2 * seed, seed_grad=2 * seed + 1)  # fmt: skip
+    image = mi.render(
+        views.mi_scenes[index],
+        params,
+        sensor=views.mi_sensors[index],
+        integrator=views.mi_integrator,
+        spp=spp,
+        seed=2 * seed,
+        seed_grad=2 * seed + 1,
+    )
     haze = unknowns.get("haze")
     depth, airlight = views.mi_depth[index], views.mi_airlight[index]
     if haze is None:

@@ -15,8 +15,9 @@ from seasonscapes.albedo.forward import Land, ambient_on_texels, sun_on_texels
 from seasonscapes.sky.illumination import Illumination
 
 
-def texture_albedo(land: Land, radiance: Sequence[np.ndarray], lights: Sequence[Illumination], *, rounds: int = 4,
-                   model: float = 0.05) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+def texture_albedo(
+    land: Land, radiance: Sequence[np.ndarray], lights: Sequence[Illumination], *, rounds: int = 4, model: float = 0.05
+) -> tuple[np.ndarray, np.ndarray]:
     """Albedo ``(R, S, 3)`` of lit textures, and the mean illuminance it rests on ``(R, S, 3)`` [lx]; NaN where unknown.
 
     Parameters

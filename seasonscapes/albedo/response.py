@@ -47,9 +47,17 @@ def with_response(shots: Sequence[Shot], strength: float) -> list[Shot]:
     ]
 
 
-def fit_response(land: Land, shots: Sequence[Shot], *, strengths: Sequence[float] = STRENGTHS, trust: Trust = EIGHT_BIT,
-                 share: float = 0.2, start: AlbedoFit | None = None, seed: int = 0,
-                 progress: Callable[[float], None] | None = None) -> ResponseFit:  # fmt: skip
+def fit_response(
+    land: Land,
+    shots: Sequence[Shot],
+    *,
+    strengths: Sequence[float] = STRENGTHS,
+    trust: Trust = EIGHT_BIT,
+    share: float = 0.2,
+    start: AlbedoFit | None = None,
+    seed: int = 0,
+    progress: Callable[[float], None] | None = None,
+) -> ResponseFit:
     """The S-curve that all photographs share (one kind of webcam), by search over its strength.
 
     Raises
@@ -64,8 +72,13 @@ def fit_response(land: Land, shots: Sequence[Shot], *, strengths: Sequence[float
     costs: dict[float, float] = {}
 
     def cost_at(strength: float) -> float:
-        fit = solve_albedo(land, with_response(thin, strength), trust=trust, effort=_QUICK,
-                           start=None if start is None else start.albedo)  # fmt: skip
+        fit = solve_albedo(
+            land,
+            with_response(thin, strength),
+            trust=trust,
+            effort=_QUICK,
+            start=None if start is None else start.albedo,
+        )
         costs[strength] = fit.cost
         tell(len(costs) / (len(strengths) + 1))
         return fit.cost

@@ -186,8 +186,10 @@ def _holding(ground: Ground, dated: tuple[np.ndarray, np.ndarray], gains: np.nda
     part = Ground(ground.height_m[told], ground.normal[told], ground.hollow_m[told])
     x = _features(part).astype(np.float64)
     x -= x.mean(axis=0)
-    white = [np.where(gains[told] != 0, gains[told] == sign, snow_share(values[told]) > 0.5)
-             for sign, values in zip((-1, 1), dated, strict=True)]  # fmt: skip
+    white = [
+        np.where(gains[told] != 0, gains[told] == sign, snow_share(values[told]) > 0.5)
+        for sign, values in zip((-1, 1), dated, strict=True)
+    ]
     y = np.concatenate(white).astype(np.float64)
     ones, none = np.ones((len(x), 1)), np.zeros((len(x), 1))
     rows = np.concatenate([np.concatenate([x, ones, none], axis=1), np.concatenate([x, none, ones], axis=1)])

@@ -75,9 +75,16 @@ class Shot:
     gain: np.ndarray | None = None
 
 
-def make_shots(land: Land, observations: Sequence[Observation], lights: Sequence[Illumination], *, rays: int = 16,
-               gains: Sequence[np.ndarray | None] | None = None, seed: int = 0,
-               progress: Progress | None = None) -> list[Shot]:  # fmt: skip
+def make_shots(
+    land: Land,
+    observations: Sequence[Observation],
+    lights: Sequence[Illumination],
+    *,
+    rays: int = 16,
+    gains: Sequence[np.ndarray | None] | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> list[Shot]:
     """Trace the footprints of all cameras, each camera once for all its photographs.
 
     Parameters
@@ -98,8 +105,15 @@ def make_shots(land: Land, observations: Sequence[Observation], lights: Sequence
     shots: dict[int, Shot] = {}
     for done, members in enumerate(groups.values()):
         suns = [luminaries(lights[i]) for i in members]
-        footprints = trace_footprints(land.occluder, observations[members[0]].camera, land.shape, suns, rays=rays, seed=seed,
-                                      progress=lambda share, done=done: tell((done + share) / len(groups)))  # fmt: skip
+        footprints = trace_footprints(
+            land.occluder,
+            observations[members[0]].camera,
+            land.shape,
+            suns,
+            rays=rays,
+            seed=seed,
+            progress=lambda share, done=done: tell((done + share) / len(groups)),
+        )
         seen = seen_by(footprints, seed=seed)
         for number, i in enumerate(members):
             gain = None if gains is None or gains[i] is None else np.broadcast_to(np.asarray(gains[i], float), (3,))

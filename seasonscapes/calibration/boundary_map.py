@@ -115,8 +115,15 @@ def _tolerant(thin: np.ndarray, sigma: float = 2.5) -> np.ndarray:
     return np.minimum(cv2.GaussianBlur(thin, (0, 0), sigma) * (sigma * np.sqrt(2.0 * np.pi)), 1.0)
 
 
-def edge_near(boundary: BoundaryMap, pixel: np.ndarray, front: np.ndarray, reach_px: np.ndarray, skyline: bool,
-              *, least: float = 0.25):  # fmt: skip
+def edge_near(
+    boundary: BoundaryMap,
+    pixel: np.ndarray,
+    front: np.ndarray,
+    reach_px: np.ndarray,
+    skyline: bool,
+    *,
+    least: float = 0.25,
+):
     """Edges beside the points of a projected line, across its course, up to ``reach_px`` ``(N,)`` away.
 
     Returns index ``(K,)`` of the points that met one, where it is ``(K, 2)``, the direction across ``(K, 2)`` and its
@@ -135,8 +142,14 @@ def edge_near(boundary: BoundaryMap, pixel: np.ndarray, front: np.ndarray, reach
     unit = np.linspace(-1.0, 1.0, 2 * int(np.ceil(2.0 * reach.max())) + 1)
     offsets = reach * unit
     samples = (place[:, None] + offsets[..., None] * normal[:, None] - 0.5).astype(np.float32)
-    found = cv2.remap(values.astype(np.float32), samples[..., 0], samples[..., 1], cv2.INTER_LINEAR,
-                      borderMode=cv2.BORDER_CONSTANT, borderValue=0)  # fmt: skip
+    found = cv2.remap(
+        values.astype(np.float32),
+        samples[..., 0],
+        samples[..., 1],
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=0,
+    )
     ranked = found * np.exp(-0.5 * (unit / 0.7) ** 2)
     best = np.clip(np.argmax(ranked, axis=1), 1, len(unit) - 2)
     rows = np.arange(len(best))

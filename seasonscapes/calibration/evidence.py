@@ -93,8 +93,20 @@ class Priors:
     @property
     def sigmas(self) -> np.ndarray:
         """In the order of `PARAMETERS`, ``(9,)``."""
-        return np.array([self.heading_deg, self.tilt_deg, self.roll_deg, self.horizontal_m, self.horizontal_m,
-                         self.vertical_m, self.focal, self.k1, self.horizon_px], float)  # fmt: skip
+        return np.array(
+            [
+                self.heading_deg,
+                self.tilt_deg,
+                self.roll_deg,
+                self.horizontal_m,
+                self.horizontal_m,
+                self.vertical_m,
+                self.focal,
+                self.k1,
+                self.horizon_px,
+            ],
+            float,
+        )
 
 
 # The unknowns of a calibration, in order. `focal` is the logarithm of the field-of-view scale, `horizon_px` an offset.

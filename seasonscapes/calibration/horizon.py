@@ -61,8 +61,13 @@ def terrain_height(rasters: Sequence[Raster], latitude_deg, longitude_deg) -> np
     return height
 
 
-def terrain_profile(rasters: Sequence[Raster], frame: LocalFrame, position_m: np.ndarray, azimuth_deg: np.ndarray,
-                    distance_m: np.ndarray) -> np.ndarray:  # fmt: skip
+def terrain_profile(
+    rasters: Sequence[Raster],
+    frame: LocalFrame,
+    position_m: np.ndarray,
+    azimuth_deg: np.ndarray,
+    distance_m: np.ndarray,
+) -> np.ndarray:
     """Terrain points ``(A, R, 3)`` in the local frame along azimuths at distances from a place; NaN off the terrain.
 
     The map grid is met through a quartic of the plan position, fitted to the exact transforms (off by centimetres over
@@ -93,8 +98,9 @@ def terrain_profile(rasters: Sequence[Raster], frame: LocalFrame, position_m: np
     return np.stack([*plan, base[0] + (height - level_m)], axis=-1)
 
 
-def _on_plan(frame: LocalFrame, position_m: np.ndarray, reach_m: float, function, unit: list[np.ndarray],
-             level_m: float) -> list:  # fmt: skip
+def _on_plan(
+    frame: LocalFrame, position_m: np.ndarray, reach_m: float, function, unit: list[np.ndarray], level_m: float
+) -> list:
     """Values of a smooth function of latitude and longitude at plan positions, by a quartic in units of the reach.
 
     A plan position means a place only with a height: that of the camera. (Where the ground is 1 km lower, 15 km away,
@@ -129,9 +135,17 @@ def _horner(coefficients: np.ndarray, x: np.ndarray):
     return total
 
 
-def horizon_from(rasters: Sequence[Raster], frame: LocalFrame, position_m, *, azimuth_deg: np.ndarray | None = None,
-                 nearest_m: float = 30.0, reach_m: float = 60e3, least_gap: float = 0.15,
-                 below_ground_m: float = 5.0) -> Horizon:  # fmt: skip
+def horizon_from(
+    rasters: Sequence[Raster],
+    frame: LocalFrame,
+    position_m,
+    *,
+    azimuth_deg: np.ndarray | None = None,
+    nearest_m: float = 30.0,
+    reach_m: float = 60e3,
+    least_gap: float = 0.15,
+    below_ground_m: float = 5.0,
+) -> Horizon:
     """Compute the horizon of a place.
 
     Parameters

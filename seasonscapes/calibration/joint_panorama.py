@@ -45,8 +45,9 @@ class JointPanorama:
     solution: Calibration | None
 
 
-def joint_panoramas(webcams: Sequence[Webcam], refined: Sequence[ReferenceView], table: Sequence[ReferenceView],
-                    frame: LocalFrame) -> list[JointPanorama]:  # fmt: skip
+def joint_panoramas(
+    webcams: Sequence[Webcam], refined: Sequence[ReferenceView], table: Sequence[ReferenceView], frame: LocalFrame
+) -> list[JointPanorama]:
     """Solve one pose per panorama from its refined views.
 
     A view is a statement about where pixels of the panorama look: a grid of its pixels goes back through the cut that
@@ -82,11 +83,19 @@ def _joint(webcam: Webcam, views: list[ReferenceView], first: dict[str, Referenc
     try:
         solution = calibrate(panorama, points, priors=priors, axes=axes)
     except ValueError:
-        return JointPanorama(webcam.id, tuple(v.name for v in views), np.array(offset), np.full(len(views), np.nan),
-                             np.full(len(views), np.nan), np.array(ratio), None)  # fmt: skip
+        return JointPanorama(
+            webcam.id,
+            tuple(v.name for v in views),
+            np.array(offset),
+            np.full(len(views), np.nan),
+            np.full(len(views), np.nan),
+            np.array(ratio),
+            None,
+        )
     errors = np.array([_axis_error(webcam, view, first[view.name].camera, solution, axes) for view in views])
-    return JointPanorama(webcam.id, tuple(v.name for v in views), np.array(offset), errors[:, 0], errors[:, 1],
-                         np.array(ratio), solution)  # fmt: skip
+    return JointPanorama(
+        webcam.id, tuple(v.name for v in views), np.array(offset), errors[:, 0], errors[:, 1], np.array(ratio), solution
+    )
 
 
 def _panorama_pixels(webcam: Webcam, cut: Camera, axes: np.ndarray, grid: np.ndarray) -> np.ndarray:

@@ -16,12 +16,23 @@ from seasonscapes.images import write_png8
 
 # sRGB.
 _SKYLINE, _RIDGE, _SEEN, _PROJECTED, _ARROW, _OUT = (
-    (230, 40, 40), (255, 200, 0), (255, 140, 0), (40, 200, 70), (255, 255, 255), (200, 60, 220),
-)  # fmt: skip
+    (230, 40, 40),
+    (255, 200, 0),
+    (255, 140, 0),
+    (40, 200, 70),
+    (255, 255, 255),
+    (200, 60, 220),
+)
 
 
-def draw_overlay(image: np.ndarray, calibration: Calibration, *, points: Correspondences | None = None,
-                 horizon: Horizon | None = None, title: str = "") -> np.ndarray:  # fmt: skip
+def draw_overlay(
+    image: np.ndarray,
+    calibration: Calibration,
+    *,
+    points: Correspondences | None = None,
+    horizon: Horizon | None = None,
+    title: str = "",
+) -> np.ndarray:
     """Draw a calibration over its photograph.
 
     Parameters
@@ -43,8 +54,10 @@ def draw_overlay(image: np.ndarray, calibration: Calibration, *, points: Corresp
     """
     view = calibration.view
     if image.shape[:2] != (view.height_px, view.width_px):
-        raise ValueError(f"draw_overlay: the picture is {image.shape[1]} x {image.shape[0]} px, the view "
-                         f"{view.width_px} x {view.height_px}")  # fmt: skip
+        raise ValueError(
+            f"draw_overlay: the picture is {image.shape[1]} x {image.shape[0]} px, the view "
+            f"{view.width_px} x {view.height_px}"
+        )
     canvas = np.ascontiguousarray(image[..., :3]).copy()
     thick = max(1, round(view.height_px / 700))
     axes = np.eye(3) if horizon is None else horizon.axes
@@ -98,5 +111,13 @@ def _caption(canvas: np.ndarray, text: str) -> None:
     (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, max(1, round(scale * 1.5)))
     bottom = canvas.shape[0]
     canvas[bottom - 2 * height :, : width + 2 * height] //= 3
-    cv2.putText(canvas, text, (height, bottom - height // 2), cv2.FONT_HERSHEY_SIMPLEX, scale, (255, 255, 255),
-                max(1, round(scale * 1.5)), cv2.LINE_AA)  # fmt: skip
+    cv2.putText(
+        canvas,
+        text,
+        (height, bottom - height // 2),
+        cv2.FONT_HERSHEY_SIMPLEX,
+        scale,
+        (255, 255, 255),
+        max(1, round(scale * 1.5)),
+        cv2.LINE_AA,
+    )

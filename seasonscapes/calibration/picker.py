@@ -68,8 +68,10 @@ class PickSession:
 
     def __post_init__(self):
         if self.image.shape[:2] != (self.start.height_px, self.start.width_px):
-            raise ValueError(f"PickSession: the picture is {self.image.shape[1]} x {self.image.shape[0]} px, the view "
-                             f"{self.start.width_px} x {self.start.height_px}")  # fmt: skip
+            raise ValueError(
+                f"PickSession: the picture is {self.image.shape[1]} x {self.image.shape[0]} px, the view "
+                f"{self.start.width_px} x {self.start.height_px}"
+            )
         render(self)
 
     @property
@@ -169,13 +171,28 @@ def describe(session: PickSession) -> dict:
     projected = _projected(session, np.array(session.position_m)) if session.position_m else []
     solution = session.solution
     aside = [] if solution is None else solution.outlier.tolist()
-    pairs = [{"name": str(i + 1), "photo": session.pixel[i], "terrain": session.terrain_pixel[i],
-              "projected": projected[i], "set_aside": bool(i < len(aside) and aside[i])}
-             for i in range(len(session.pixel))]  # fmt: skip
-    summary = "" if solution is None else (
-        f"heading {solution.values[0]:.2f} ± {solution.sigma['heading_deg']:.2f}°, RMS {solution.rms_px:.1f} px")  # fmt: skip
-    return {"pairs": pairs, "solved": solution is not None, "version": session.version, "summary": summary,
-            "report": [] if solution is None else list(report_lines(solution))}  # fmt: skip
+    pairs = [
+        {
+            "name": str(i + 1),
+            "photo": session.pixel[i],
+            "terrain": session.terrain_pixel[i],
+            "projected": projected[i],
+            "set_aside": bool(i < len(aside) and aside[i]),
+        }
+        for i in range(len(session.pixel))
+    ]
+    summary = (
+        ""
+        if solution is None
+        else (f"heading {solution.values[0]:.2f} ± {solution.sigma['heading_deg']:.2f}°, RMS {solution.rms_px:.1f} px")
+    )
+    return {
+        "pairs": pairs,
+        "solved": solution is not None,
+        "version": session.version,
+        "summary": summary,
+        "report": [] if solution is None else list(report_lines(solution)),
+    }
 
 
 def serve(session: PickSession, *, port: int = 0) -> tuple[ThreadingHTTPServer, str]:
@@ -237,8 +254,11 @@ def _handler(session: PickSession, token: str, lock: threading.Lock) -> type[Bas
                 with lock:
                     picture = session.image if address.path == "/photo.jpg" else session.relief
                 suffix = address.path[-4:]
-                self._send(200, f"image/{'jpeg' if suffix == '.jpg' else 'png'}",
-                           cv2.imencode(suffix, picture[..., ::-1])[1].tobytes())  # fmt: skip
+                self._send(
+                    200,
+                    f"image/{'jpeg' if suffix == '.jpg' else 'png'}",
+                    cv2.imencode(suffix, picture[..., ::-1])[1].tobytes(),
+                )
             else:
                 self._send(404, "application/json", b'{"error": "no such page"}')
 

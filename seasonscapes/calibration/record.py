@@ -37,16 +37,29 @@ def write_calibration(path: Path, webcam: str, calibration: Calibration, frame: 
     record = {
         "webcam": webcam,
         "projection": view.projection if isinstance(view, Panorama) else "perspective",
-        "size_px": [view.width_px, view.height_px], "fx": view.fx, "fy": view.fy, "cx": view.cx, "cy": view.cy,
-        "k1": calibration.k1, "world_from_camera": view.world_from_camera.tolist(),
-        "latitude_deg": latitude, "longitude_deg": longitude, "height_m": height,
+        "size_px": [view.width_px, view.height_px],
+        "fx": view.fx,
+        "fy": view.fy,
+        "cx": view.cx,
+        "cy": view.cy,
+        "k1": calibration.k1,
+        "world_from_camera": view.world_from_camera.tolist(),
+        "latitude_deg": latitude,
+        "longitude_deg": longitude,
+        "height_m": height,
         "angles_deg": dict(zip(("heading", "tilt", "roll"), calibration.values[:3].tolist(), strict=True)),
         "sigma": calibration.sigma,
-        "frame": {"latitude_deg": frame.latitude_deg, "longitude_deg": frame.longitude_deg, "height_m": frame.height_m,
-                  "refraction_k": frame.refraction_k},
-        "points": [{"name": name, "residual_px": error.tolist(), "set_aside": bool(out)} for name, error, out in
-                   zip(calibration.names, calibration.residual_px, calibration.outlier, strict=True)],
-    }  # fmt: skip
+        "frame": {
+            "latitude_deg": frame.latitude_deg,
+            "longitude_deg": frame.longitude_deg,
+            "height_m": frame.height_m,
+            "refraction_k": frame.refraction_k,
+        },
+        "points": [
+            {"name": name, "residual_px": error.tolist(), "set_aside": bool(out)}
+            for name, error, out in zip(calibration.names, calibration.residual_px, calibration.outlier, strict=True)
+        ],
+    }
     with atomic_path(path) as temporary:
         temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
 

@@ -27,8 +27,15 @@ class PointTrial:
     wrong: np.ndarray
 
 
-def point_trial(rng: np.random.Generator, *, panoramic: bool = True, count: int = 12, noise_px: float = 1.0,
-                outlier_share: float = 0.2, heading_off_deg: float = 5.0) -> PointTrial:  # fmt: skip
+def point_trial(
+    rng: np.random.Generator,
+    *,
+    panoramic: bool = True,
+    count: int = 12,
+    noise_px: float = 1.0,
+    outlier_share: float = 0.2,
+    heading_off_deg: float = 5.0,
+) -> PointTrial:
     """Points of 200 m to 15 km distance all over the picture; wrong ones lie 20 to 400 px away from their place.
 
     The panorama is that of a 35 mm rotating camera (0.023° a pixel), the photograph a frame of 65°.
@@ -38,8 +45,9 @@ def point_trial(rng: np.random.Generator, *, panoramic: bool = True, count: int 
     pose[:3, :3] = rotation_from_angles(heading, tilt, roll)
     pose[:3, 3] = rng.uniform(-1, 1, 3) * [5e3, 5e3, 300.0] + [0.0, 0.0, 2000.0]
     if panoramic:
-        truth = panorama_from_angles("cylindrical", (15680, 2048), horizontal_fov_deg=360.0, vertical_fov_deg=45.4,
-                                     pose=pose)  # fmt: skip
+        truth = panorama_from_angles(
+            "cylindrical", (15680, 2048), horizontal_fov_deg=360.0, vertical_fov_deg=45.4, pose=pose
+        )
     else:
         truth = Camera(3072, 2048, 2400.0, 2400.0, 1536.0, 1024.0, pose)
     size = np.array([truth.width_px, truth.height_px])
@@ -78,8 +86,13 @@ def score_points(trial: PointTrial, *, noise_px: float | None = None, loss: str 
     truth = values_of(trial.truth, np.eye(3))
     error = solved.values - truth
     sigma = np.array([solved.sigma[name] for name in ("east_m", "north_m", "up_m")])
-    return PointScore(abs((error[0] + 180.0) % 360.0 - 180.0), abs(solved.view.fy / trial.truth.fy - 1.0), error[3:6],
-                      np.abs(error[3:6]) <= 2.0 * sigma, bool(solved.outlier[trial.wrong].all()))  # fmt: skip
+    return PointScore(
+        abs((error[0] + 180.0) % 360.0 - 180.0),
+        abs(solved.view.fy / trial.truth.fy - 1.0),
+        error[3:6],
+        np.abs(error[3:6]) <= 2.0 * sigma,
+        bool(solved.outlier[trial.wrong].all()),
+    )
 
 
 def reproject(trial: PointTrial) -> np.ndarray:

@@ -55,8 +55,14 @@ def made_up_massif(rng: np.random.Generator) -> Raster:
     return Raster(np.maximum(height, 600.0)[..., None], transform, _CRS)
 
 
-def picture_trial(rng: np.random.Generator, *, visibility_m: float | None = None, covered: float | None = None,
-                  heading_off_deg: float | None = None, size_px: tuple[int, int] = (1280, 854)) -> PictureTrial:  # fmt: skip
+def picture_trial(
+    rng: np.random.Generator,
+    *,
+    visibility_m: float | None = None,
+    covered: float | None = None,
+    heading_off_deg: float | None = None,
+    size_px: tuple[int, int] = (1280, 854),
+) -> PictureTrial:
     """One trial.
 
     Parameters
@@ -74,8 +80,9 @@ def picture_trial(rng: np.random.Generator, *, visibility_m: float | None = None
     fov = rng.uniform(50, 75)
     heading, elevation = _outlook(raster, frame, place, fov, rng)
     pitch = elevation - rng.uniform(0.0, 0.25) * fov * size_px[1] / size_px[0]
-    truth = camera_at(frame, *place, heading_deg=heading, pitch_deg=pitch, roll_deg=rng.normal(0, 0.7), fov_deg=fov,
-                      size_px=size_px)  # fmt: skip
+    truth = camera_at(
+        frame, *place, heading_deg=heading, pitch_deg=pitch, roll_deg=rng.normal(0, 0.7), fov_deg=fov, size_px=size_px
+    )
     view = look_at_rasters(truth, [raster], frame, nearest_m=120.0, reach_m=40e3)
     distance, normal, seen = view.distance_m, view.normal, view.position_m - truth.position_m
     covered = rng.uniform(0.0, 0.35) if covered is None else covered
@@ -101,16 +108,23 @@ def panorama_trial(rng: np.random.Generator, *, size_px: tuple[int, int] = (3600
     pose = np.eye(4)
     pose[:3, :3] = rotation_from_angles(rng.uniform(0, 360), *rng.normal(0, 0.4, 2))
     pose[:3, 3] = [0.0, 0.0, place[2]]
-    truth = panorama_from_angles("cylindrical", size_px, horizontal_fov_deg=360.0, vertical_fov_deg=41.0, pose=pose,
-                                 horizon_row_px=size_px[1] * rng.uniform(0.45, 0.55))  # fmt: skip
+    truth = panorama_from_angles(
+        "cylindrical",
+        size_px,
+        horizontal_fov_deg=360.0,
+        vertical_fov_deg=41.0,
+        pose=pose,
+        horizon_row_px=size_px[1] * rng.uniform(0.45, 0.55),
+    )
     view = look_at_rasters(truth, [raster], frame, nearest_m=120.0, reach_m=40e3)
     image = _paint(view.distance_m, view.normal, view.position_m - truth.position_m, rng, 60e3)
     values = values_of(truth, np.eye(3))
     values[:3] = values[0] + rng.uniform(-10, 10), 0.0, 0.0
     values[8] = rng.uniform(-1.5, 1.5) * truth.fy * np.pi / 180.0
     mask = np.ones(image.shape[:2], bool)
-    return PictureTrial(image, mask, np.isinf(view.distance_m), truth, view_from_values(truth, np.eye(3), values),
-                        (raster,), frame)  # fmt: skip
+    return PictureTrial(
+        image, mask, np.isinf(view.distance_m), truth, view_from_values(truth, np.eye(3), values), (raster,), frame
+    )
 
 
 def _viewpoint(raster: Raster, rng: np.random.Generator):
@@ -151,8 +165,13 @@ def _paint(distance, normal, spot, rng, visibility_m: float) -> np.ndarray:
     grain = 1.0 + 0.25 * np.sin(spot[..., 0] / 31.0 + np.sin(spot[..., 1] / 23.0))[..., None]
     ground = np.where(snowy, [0.85, 0.88, 0.92], np.array([0.16, 0.17, 0.10]) * grain) * lit[..., None]
     base = np.array([0.55, 0.68, 0.88]) * rng.uniform(0.7, 1.1) + rng.uniform(0, 0.25)
-    clouds = sum(cv2.resize(rng.normal(size=(n, 2 * n)), (width, height), interpolation=cv2.INTER_CUBIC) / n
-                 for n in (3, 6, 12)) * 0.5  # fmt: skip
+    clouds = (
+        sum(
+            cv2.resize(rng.normal(size=(n, 2 * n)), (width, height), interpolation=cv2.INTER_CUBIC) / n
+            for n in (3, 6, 12)
+        )
+        * 0.5
+    )
     up = np.linspace(0.85, 1.1, height)[::-1, None, None]
     sky = base * up + (rng.uniform(0.0, 0.5) * np.clip(clouds, 0, 1))[..., None]
     seen = np.where(np.isfinite(distance), distance, 1e9)

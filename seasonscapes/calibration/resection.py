@@ -93,10 +93,19 @@ class Problem:
         return self.sigmas > 0
 
 
-def calibrate(start: View, points: Correspondences | None = None, *, priors: Priors | None = None,
-              skyline: SkylineEvidence | None = None, loss: Loss = "cauchy", noise_px: float | None = None,
-              k1: float = 0.0, axes: np.ndarray | None = None, guess: np.ndarray | None = None,
-              ground_m: Callable[[float, float], float] | None = None) -> Calibration:  # fmt: skip
+def calibrate(
+    start: View,
+    points: Correspondences | None = None,
+    *,
+    priors: Priors | None = None,
+    skyline: SkylineEvidence | None = None,
+    loss: Loss = "cauchy",
+    noise_px: float | None = None,
+    k1: float = 0.0,
+    axes: np.ndarray | None = None,
+    guess: np.ndarray | None = None,
+    ground_m: Callable[[float, float], float] | None = None,
+) -> Calibration:
     """Solve for one view.
 
     Parameters
@@ -151,8 +160,15 @@ def calibrate(start: View, points: Correspondences | None = None, *, priors: Pri
             if sigmas[angle] == 0.0:
                 values[angle] = origin[angle]
     empty = Correspondences(np.empty((0, 2)), np.empty((0, 3)))
-    problem = Problem(start, axes, origin, sigmas, empty if points is None else points,
-                      skyline.residuals if skyline else None, skyline.sigma_px if skyline else 1.0)  # fmt: skip
+    problem = Problem(
+        start,
+        axes,
+        origin,
+        sigmas,
+        empty if points is None else points,
+        skyline.residuals if skyline else None,
+        skyline.sigma_px if skyline else 1.0,
+    )
     values, outlier, noise = _solve(problem, values, loss, noise_px)
     result = _finish(problem, values, outlier, noise, widen=noise_px is None)
     if ground_m is not None:
@@ -190,8 +206,9 @@ def _refuse_below_ground(values: np.ndarray, ground_m: Callable, what: str, *, t
         raise ValueError(f"{what} puts the camera {below:.0f} m below ground; check its height and vertical datum")
 
 
-def _residual_rows(problem: Problem, values: np.ndarray, noise: float, shape: Callable | None,
-                   keep: np.ndarray) -> np.ndarray:  # fmt: skip
+def _residual_rows(
+    problem: Problem, values: np.ndarray, noise: float, shape: Callable | None, keep: np.ndarray
+) -> np.ndarray:
     """Whitened residuals: points, further evidence and priors. ``shape`` bends point residuals to a robust loss."""
     rows = []
     if len(problem.points):
@@ -221,8 +238,15 @@ def _soft_l1(error: np.ndarray, scale: float) -> np.ndarray:
     return error * np.sqrt(np.divide(bent, squared, out=np.ones_like(squared), where=squared > 1e-20))
 
 
-def _minimise(problem: Problem, values: np.ndarray, noise: float, shape: Callable | None, keep: np.ndarray, *,
-              tolerance: float = 1e-10):  # fmt: skip
+def _minimise(
+    problem: Problem,
+    values: np.ndarray,
+    noise: float,
+    shape: Callable | None,
+    keep: np.ndarray,
+    *,
+    tolerance: float = 1e-10,
+):
     from scipy.optimize import least_squares
 
     free = problem.free
@@ -363,8 +387,10 @@ def _refuse_no_agreement(problem: Problem, chosen: np.ndarray, error: np.ndarray
     limit = 0.04 * problem.start.width_px
     if problem.extra is None and (chosen.sum() < needed or np.median(error) > limit):
         agree = f"{int(chosen.sum())} of {len(chosen)} agree"
-        raise ValueError(f"the matches have no pose in common: {agree}, median error "
-                         f"{np.median(error):.0f} px; check their pairing and the camera's position")  # fmt: skip
+        raise ValueError(
+            f"the matches have no pose in common: {agree}, median error "
+            f"{np.median(error):.0f} px; check their pairing and the camera's position"
+        )
 
 
 def _finish(problem: Problem, values: np.ndarray, outlier: np.ndarray, noise: float, *, widen: bool) -> Calibration:

@@ -90,9 +90,17 @@ class SkylineFit:
     horizon: Horizon
 
 
-def align_to_skyline(image: np.ndarray, start: View, rasters: Sequence[Raster], frame: LocalFrame, *,
-                     mask: np.ndarray | None = None, search: Search | None = None,
-                     points: Correspondences | None = None, k1: float = 0.0) -> SkylineFit:  # fmt: skip
+def align_to_skyline(
+    image: np.ndarray,
+    start: View,
+    rasters: Sequence[Raster],
+    frame: LocalFrame,
+    *,
+    mask: np.ndarray | None = None,
+    search: Search | None = None,
+    points: Correspondences | None = None,
+    k1: float = 0.0,
+) -> SkylineFit:
     """Find a view's pose by its skyline, or by skyline and points together.
 
     Parameters
@@ -124,19 +132,29 @@ def align_to_skyline(image: np.ndarray, start: View, rasters: Sequence[Raster], 
     """
     search = search or Search()
     if image.shape[:2] != (start.height_px, start.width_px):
-        raise ValueError(f"align_to_skyline: the picture is {image.shape[1]} x {image.shape[0]} px, the view "
-                         f"{start.width_px} x {start.height_px}")  # fmt: skip
+        raise ValueError(
+            f"align_to_skyline: the picture is {image.shape[1]} x {image.shape[0]} px, the view "
+            f"{start.width_px} x {start.height_px}"
+        )
     latitude, longitude, _ = geodetic_from_enu(frame, start.position_m)
     axes = local_axes(frame, float(latitude), float(longitude))
     origin = values_of(start, axes, k1)
     azimuth = _azimuths(start, origin, search)
-    horizon = horizon_from(rasters, frame, start.position_m, azimuth_deg=azimuth, nearest_m=max(60.0, 3.0 * _cell(rasters[0])),
-                           below_ground_m=40.0)  # fmt: skip
+    horizon = horizon_from(
+        rasters,
+        frame,
+        start.position_m,
+        azimuth_deg=azimuth,
+        nearest_m=max(60.0, 3.0 * _cell(rasters[0])),
+        below_ground_m=40.0,
+    )
     boundary = boundary_map(image, mask, start.fy * np.pi / 180.0)
     candidates, scores = _coarse(start, axes, origin, horizon, boundary, search)
     error_m = search.terrain_sigma_m or _cell(rasters[0]) / 3.0
-    fits = [_refine(start, axes, candidates[index], (horizon, error_m), boundary, search, points)
-            for index in _peaks(candidates, scores, 6)]  # fmt: skip
+    fits = [
+        _refine(start, axes, candidates[index], (horizon, error_m), boundary, search, points)
+        for index in _peaks(candidates, scores, 6)
+    ]
     fits = [fit for fit in fits if fit is not None]
     if not fits:
         return SkylineFit(None, False, 0.0, 0.0, float("inf"), 0.0, ("no pose of the search meets any edges",), horizon)
@@ -200,8 +218,15 @@ def _steps(half: float, step: float) -> np.ndarray:
     return np.linspace(-half, half, 2 * count + 1) if count else np.zeros(1)
 
 
-def _scores(start: View, axes: np.ndarray, values: np.ndarray, position: np.ndarray, evidence: np.ndarray, scale: float,
-            shift: np.ndarray) -> np.ndarray:  # fmt: skip
+def _scores(
+    start: View,
+    axes: np.ndarray,
+    values: np.ndarray,
+    position: np.ndarray,
+    evidence: np.ndarray,
+    scale: float,
+    shift: np.ndarray,
+) -> np.ndarray:
     """Mean evidence ``(S,)`` along a projected line for each downward shift in working pixels.
 
     Out of the picture above or below counts as not met: columns are what there is to explain. Masked pixels are no
@@ -260,8 +285,16 @@ def _refine(start, axes, values, terrain, boundary, search, points):
         priors = replace(search.priors, heading_deg=np.inf)
         if isinstance(start, Panorama) and not priors.horizon_px:
             priors = replace(priors, horizon_px=search.tilt_deg * start.fy * np.pi / 180.0)
-        calibration = calibrate(start, points, priors=priors, axes=axes, k1=float(values[7]), guess=values,
-                                skyline=evidence, noise_px=None if points else 1.0)  # fmt: skip
+        calibration = calibrate(
+            start,
+            points,
+            priors=priors,
+            axes=axes,
+            k1=float(values[7]),
+            guess=values,
+            skyline=evidence,
+            noise_px=None if points else 1.0,
+        )
         values = calibration.values
     return calibration, _sits(start, axes, values, terrain[0], boundary)
 
@@ -292,8 +325,12 @@ def _climb(start, axes, values, horizon, boundary, search) -> np.ndarray:
         return -score
 
     simplex = np.vstack([np.zeros(len(free)), np.eye(len(free))]) - 1.0 / (len(free) + 1)
-    found = minimize(loss, np.zeros(len(free)), method="Nelder-Mead",
-                     options={"initial_simplex": simplex, "maxfev": 250, "xatol": 0.02, "fatol": 1e-4})  # fmt: skip
+    found = minimize(
+        loss,
+        np.zeros(len(free)),
+        method="Nelder-Mead",
+        options={"initial_simplex": simplex, "maxfev": 250, "xatol": 0.02, "fatol": 1e-4},
+    )
     best = values.copy()
     if found.fun < loss(np.zeros(len(free))):
         best[free] += found.x * size

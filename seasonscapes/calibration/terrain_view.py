@@ -38,8 +38,15 @@ class TerrainView:
 def scaled_view(view: View, width_px: int) -> View:
     """The same view in fewer (or more) pixels."""
     scale = width_px / view.width_px
-    return replace(view, width_px=width_px, height_px=max(1, round(view.height_px * scale)), fx=view.fx * scale,
-                   fy=view.fy * scale, cx=view.cx * scale, cy=view.cy * scale)  # fmt: skip
+    return replace(
+        view,
+        width_px=width_px,
+        height_px=max(1, round(view.height_px * scale)),
+        fx=view.fx * scale,
+        fy=view.fy * scale,
+        cx=view.cx * scale,
+        cy=view.cy * scale,
+    )
 
 
 def look_with(view: View, trace: Callable) -> TerrainView:
@@ -50,8 +57,9 @@ def look_with(view: View, trace: Callable) -> TerrainView:
     return TerrainView(np.asarray(hit.depth, float), normal, np.asarray(hit.position, float))
 
 
-def look_at_rasters(view: View, rasters: Sequence[Raster], frame: LocalFrame, *, nearest_m: float = 60.0,
-                    reach_m: float = 60e3) -> TerrainView:  # fmt: skip
+def look_at_rasters(
+    view: View, rasters: Sequence[Raster], frame: LocalFrame, *, nearest_m: float = 60.0, reach_m: float = 60e3
+) -> TerrainView:
     """A view by marching over elevation rasters, every azimuth once; no renderer is needed.
 
     Each azimuth's running horizon is a sorted list: the first step that rises to a pixel's elevation is what it sees.

@@ -75,8 +75,9 @@ def undo_grade(image: np.ndarray, grade: Grade) -> np.ndarray:
 
 
 def _gains(grade: Grade) -> np.ndarray:
-    gains = 2.0 ** np.array([grade.warmth / 2.0 - grade.tint / 2.0, grade.tint / 2.0,
-                             -grade.warmth / 2.0 - grade.tint / 2.0])  # fmt: skip
+    gains = 2.0 ** np.array(
+        [grade.warmth / 2.0 - grade.tint / 2.0, grade.tint / 2.0, -grade.warmth / 2.0 - grade.tint / 2.0]
+    )
     return 2.0**grade.exposure_ev * gains / (gains @ REC709_LUMINANCE)
 
 
@@ -213,8 +214,12 @@ def fit_response(encoded: np.ndarray, light: np.ndarray, *, knots: int = 12, smo
         weight = np.clip(x[use], at[0], at[-1]) / 2.2
         basis, target = basis * weight[:, None], target * weight
         bend = np.diff(np.eye(knots), 2, axis=0) * np.sqrt(use.sum()) * smoothness
-        solved = least_squares(lambda c, b=basis, t=target, d=bend: np.concatenate([b @ c - t, d @ c]),
-                               np.full(knots, np.median(target / weight)), loss="soft_l1", f_scale=0.02)  # fmt: skip
+        solved = least_squares(
+            lambda c, b=basis, t=target, d=bend: np.concatenate([b @ c - t, d @ c]),
+            np.full(knots, np.median(target / weight)),
+            loss="soft_l1",
+            f_scale=0.02,
+        )
         correction = np.exp(CubicSpline(at, solved.x, bc_type="natural")(np.clip(grid, at[0], at[-1])))
         curve = linear_from_srgb(grid).astype(float) * correction
         out.append(np.maximum.accumulate(curve) + np.arange(1024) * 1e-9 * curve[-1])

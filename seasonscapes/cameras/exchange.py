@@ -49,8 +49,10 @@ def write_colmap(folder: Path, views: Sequence[NamedView]) -> None:
             raise ValueError(f"COLMAP's text format has no way to write the blank in {name!r}")
         rotation = camera.world_from_camera[:3, :3].T
         x, y, z, w = Rotation.from_matrix(rotation).as_quat(canonical=True)
-        cameras.append(f"{number} PINHOLE {camera.width_px} {camera.height_px} "
-                       + " ".join(repr(float(v)) for v in (camera.fx, camera.fy, camera.cx, camera.cy)))  # fmt: skip
+        cameras.append(
+            f"{number} PINHOLE {camera.width_px} {camera.height_px} "
+            + " ".join(repr(float(v)) for v in (camera.fx, camera.fy, camera.cx, camera.cy))
+        )
         pose = (w, x, y, z, *(-rotation @ camera.position_m))
         images += [f"{number} {' '.join(repr(float(v)) for v in pose)} {number} {name}", ""]
     for name, lines in (("cameras.txt", cameras), ("images.txt", images), ("points3D.txt", ["# empty"])):
@@ -68,8 +70,12 @@ def read_colmap(folder: Path) -> list[NamedView]:
         if model == "SIMPLE_PINHOLE":
             numbers = [numbers[0], *numbers]
         elif model != "PINHOLE":
-            raise InputError(folder / "cameras.txt", f"camera model {model} has distortion", expected="PINHOLE",
-                             cure="undistort the pictures first (colmap image_undistorter)")  # fmt: skip
+            raise InputError(
+                folder / "cameras.txt",
+                f"camera model {model} has distortion",
+                expected="PINHOLE",
+                cure="undistort the pictures first (colmap image_undistorter)",
+            )
         intrinsics[number] = (int(width), int(height), *numbers)
     views = []
     # Every second line lists 2-D points; blank ones count, so they cannot be dropped before pairing.
@@ -90,15 +96,30 @@ def write_transforms(path: Path, views: Sequence[NamedView], frame: LocalFrame) 
     frames = []
     for view in views:
         camera = view.camera
-        record = {"file_path": view.file or view.name, "name": view.name, "w": camera.width_px, "h": camera.height_px,
-                  "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy,
-                  "transform_matrix": (camera.world_from_camera @ _FLIP).tolist()}  # fmt: skip
+        record = {
+            "file_path": view.file or view.name,
+            "name": view.name,
+            "w": camera.width_px,
+            "h": camera.height_px,
+            "fl_x": camera.fx,
+            "fl_y": camera.fy,
+            "cx": camera.cx,
+            "cy": camera.cy,
+            "transform_matrix": (camera.world_from_camera @ _FLIP).tolist(),
+        }
         if view.time is not None:
             record["time_utc"] = view.time.astimezone(UTC).isoformat().replace("+00:00", "Z")
         frames.append(record)
-    place = {"crs": "local east-north-up [m] about the origin, through ECEF (EPSG:4978)", "geographic_crs": "EPSG:4979",
-             "origin": {"latitude_deg": frame.latitude_deg, "longitude_deg": frame.longitude_deg,
-                        "height_m": frame.height_m, "refraction_k": frame.refraction_k}}  # fmt: skip
+    place = {
+        "crs": "local east-north-up [m] about the origin, through ECEF (EPSG:4978)",
+        "geographic_crs": "EPSG:4979",
+        "origin": {
+            "latitude_deg": frame.latitude_deg,
+            "longitude_deg": frame.longitude_deg,
+            "height_m": frame.height_m,
+            "refraction_k": frame.refraction_k,
+        },
+    }
     _write_text(path, json.dumps({"camera_model": "PINHOLE", "world": place, "frames": frames}, indent=1) + "\n")
 
 
@@ -118,8 +139,14 @@ def read_transforms(path: Path) -> tuple[list[NamedView], LocalFrame | None]:
         if bent:
             raise InputError(f"{path}: frames[{index}]", f"distortion {bent[0]} is not zero", cure="undistort first")
         stamp = record.get("time_utc")
-        views.append(NamedView(record.get("name", record["file_path"]), Camera(*size, *intrinsics, pose),
-                               record["file_path"], datetime.fromisoformat(stamp) if stamp else None))  # fmt: skip
+        views.append(
+            NamedView(
+                record.get("name", record["file_path"]),
+                Camera(*size, *intrinsics, pose),
+                record["file_path"],
+                datetime.fromisoformat(stamp) if stamp else None,
+            )
+        )
     origin = table.get("world", {}).get("origin")
     return views, LocalFrame(**origin) if origin else None
 
@@ -149,8 +176,14 @@ def camera_from_opencv(size_px: tuple[int, int], matrix, distortion, rvec, tvec)
 def write_opencv(path: Path, camera: Camera, k1: float = 0.0) -> None:
     """Write one camera as the JSON that ``cv2.FileStorage`` would hold: matrix, distortion, rvec, tvec."""
     matrix, distortion, rvec, tvec = opencv_from_camera(camera, k1)
-    record = {"image_width": camera.width_px, "image_height": camera.height_px, "camera_matrix": matrix.tolist(),
-              "distortion_coefficients": distortion.tolist(), "rvec": rvec.tolist(), "tvec": tvec.tolist()}  # fmt: skip
+    record = {
+        "image_width": camera.width_px,
+        "image_height": camera.height_px,
+        "camera_matrix": matrix.tolist(),
+        "distortion_coefficients": distortion.tolist(),
+        "rvec": rvec.tolist(),
+        "tvec": tvec.tolist(),
+    }
     _write_text(path, json.dumps(record, indent=1) + "\n")
 
 
@@ -158,8 +191,13 @@ def read_opencv(path: Path) -> tuple[Camera, float]:
     """Read what `write_opencv` writes."""
     record = read_json(path)
     try:
-        return camera_from_opencv((record["image_width"], record["image_height"]), record["camera_matrix"],
-                                  record["distortion_coefficients"], record["rvec"], record["tvec"])  # fmt: skip
+        return camera_from_opencv(
+            (record["image_width"], record["image_height"]),
+            record["camera_matrix"],
+            record["distortion_coefficients"],
+            record["rvec"],
+            record["tvec"],
+        )
     except KeyError as error:
         raise InputError(path, f"key {error} is missing") from None
 

@@ -135,8 +135,13 @@ def steps_per_metre(latitude_deg: float) -> np.ndarray:
     meridian = SEMI_MAJOR_AXIS_M * (1.0 - ECCENTRICITY_SQUARED) / squeeze**1.5
     parallel = SEMI_MAJOR_AXIS_M / np.sqrt(squeeze) * np.cos(np.radians(latitude_deg))
     degree = np.pi / 180.0
-    return np.array([_GRID[0] / (_EXTENT_DEG[0] * degree * meridian), _GRID[1] / (_EXTENT_DEG[1] * degree * parallel),
-                     1.0 / _STEP_UP_M])  # fmt: skip
+    return np.array(
+        [
+            _GRID[0] / (_EXTENT_DEG[0] * degree * meridian),
+            _GRID[1] / (_EXTENT_DEG[1] * degree * parallel),
+            1.0 / _STEP_UP_M,
+        ]
+    )
 
 
 def unstretch(k: np.ndarray, grid_from_camera: np.ndarray, latitude_deg: float) -> tuple[np.ndarray, np.ndarray]:
@@ -174,9 +179,17 @@ def reference_records(views: Sequence[ReferenceView], frame: LocalFrame, *, kind
         matrix = np.eye(4)
         matrix[:3, :3] = rotation @ np.diag([1.0, -1.0, -1.0])
         matrix[:3, 3] = longitude, latitude, height
-        table[view.name] = {"file_path": view.file, "wid": camera.width_px, "hei": camera.height_px, "fx": k[0, 0],
-                            "fy": k[1, 1], "cx": k[0, 2], "cy": k[1, 2], "transform_matrix": matrix.tolist(),
-                            **dict.fromkeys(("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"), 0.0)}  # fmt: skip
+        table[view.name] = {
+            "file_path": view.file,
+            "wid": camera.width_px,
+            "hei": camera.height_px,
+            "fx": k[0, 0],
+            "fy": k[1, 1],
+            "cx": k[0, 2],
+            "cy": k[1, 2],
+            "transform_matrix": matrix.tolist(),
+            **dict.fromkeys(("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"), 0.0),
+        }
     return table
 
 

@@ -106,8 +106,9 @@ def utc_from_camera_clock(naive: datetime, time_zone: str) -> datetime:
     return early.astimezone(UTC)
 
 
-def scan_folder(folder: Path, webcams: Sequence[Webcam], *, layout: str = REFERENCE_LAYOUT
-                ) -> tuple[list[ManifestRow], list[Problem]]:  # fmt: skip
+def scan_folder(
+    folder: Path, webcams: Sequence[Webcam], *, layout: str = REFERENCE_LAYOUT
+) -> tuple[list[ManifestRow], list[Problem]]:
     """List the pictures below a folder by their names alone; no picture is opened.
 
     Parameters
@@ -146,8 +147,9 @@ def scan_folder(folder: Path, webcams: Sequence[Webcam], *, layout: str = REFERE
             resolved[key] = _resolve(*key)
         if isinstance(resolved[key], str):
             kind = resolved[key].split(":")[0]
-            problems.append(Problem({"ambiguous": "ambiguous time", "skipped": "skipped time"}.get(kind, kind), name,
-                                    resolved[key]))  # fmt: skip
+            problems.append(
+                Problem({"ambiguous": "ambiguous time", "skipped": "skipped time"}.get(kind, kind), name, resolved[key])
+            )
             continue
         rows.append(ManifestRow(match["webcam"], resolved[key], name, file.stat().st_size))
     rows.sort(key=lambda row: (row.webcam, row.time, row.path))
@@ -213,8 +215,9 @@ def _row(path: Path, number: int, cells: list[str], place: list[int | None]) -> 
         raise InputError(f"{path}: line {number}", str(error), cure="write e.g. 2024-09-01T10:00:00Z") from None
 
 
-def check_pictures(rows: Sequence[ManifestRow], folder: Path, webcams: Sequence[Webcam], *,
-                   decode: bool = False) -> list[Problem]:  # fmt: skip
+def check_pictures(
+    rows: Sequence[ManifestRow], folder: Path, webcams: Sequence[Webcam], *, decode: bool = False
+) -> list[Problem]:
     """Look at the pictures' files: there, whole, of the webcam's size, and each a different one.
 
     Only headers and last bytes are read; equal contents are looked for among files of equal length. ``decode`` opens
@@ -297,7 +300,10 @@ def open_observation(row: ManifestRow, folder: Path, camera: Camera | Panorama) 
             path, "not a readable picture", cure="fetch it again, or take it out of the manifest"
         ) from None
     if image.shape[:2] != (camera.height_px, camera.width_px):
-        raise InputError(path, "the picture has another size than its camera",
-                         got=f"{image.shape[1]} x {image.shape[0]}",
-                         expected=f"{camera.width_px} x {camera.height_px}")  # fmt: skip
+        raise InputError(
+            path,
+            "the picture has another size than its camera",
+            got=f"{image.shape[1]} x {image.shape[0]}",
+            expected=f"{camera.width_px} x {camera.height_px}",
+        )
     return Observation(image, np.ones(image.shape[:2], bool), camera, row.time, row.webcam)

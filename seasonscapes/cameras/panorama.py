@@ -84,9 +84,14 @@ class Panorama:
 
 
 def panorama_from_angles(
-    projection: Projection, size_px: tuple[int, int], *, horizontal_fov_deg: float, vertical_fov_deg: float,
-    pose: np.ndarray, horizon_row_px: float | None = None,
-) -> Panorama:  # fmt: skip
+    projection: Projection,
+    size_px: tuple[int, int],
+    *,
+    horizontal_fov_deg: float,
+    vertical_fov_deg: float,
+    pose: np.ndarray,
+    horizon_row_px: float | None = None,
+) -> Panorama:
     """A panorama from its fields of view, its heading at the middle column.
 
     ``vertical_fov_deg`` is that of a lens centred on the horizon, as makers state it. `ValueError` outside (0, 360] and
@@ -156,8 +161,14 @@ def view_directions(view: Camera | Panorama, pixel=None) -> np.ndarray:
     return panorama_directions(view, pixel) if isinstance(view, Panorama) else ray_directions(view, pixel)
 
 
-def split_panorama(panorama: Panorama, *, fov_deg: float = 85.0, overlap_deg: float = 10.0,
-                   size_px: tuple[int, int] | None = None, count: int | None = None) -> list[Camera]:  # fmt: skip
+def split_panorama(
+    panorama: Panorama,
+    *,
+    fov_deg: float = 85.0,
+    overlap_deg: float = 10.0,
+    size_px: tuple[int, int] | None = None,
+    count: int | None = None,
+) -> list[Camera]:
     """Perspective views that cover a panorama, evenly spread, sharing its position and axis.
 
     The views look along the panorama's own horizon with square pixels. Their principal point is moved up or down, as
@@ -186,8 +197,11 @@ def split_panorama(panorama: Panorama, *, fov_deg: float = 85.0, overlap_deg: fl
         raise ValueError(f"overlap_deg: got {overlap_deg}, expected 0 <= overlap < fov_deg = {fov_deg}")
     fov = min(fov_deg, span)
     step = fov - overlap_deg
-    least = int(np.ceil(span / step - 1e-9)) if panorama.full_circle else 1 + int(
-        np.ceil(max(span - fov, 0.0) / step - 1e-9))  # fmt: skip
+    least = (
+        int(np.ceil(span / step - 1e-9))
+        if panorama.full_circle
+        else 1 + int(np.ceil(max(span - fov, 0.0) / step - 1e-9))
+    )
     views = least if count is None else count
     if views < least:
         raise ValueError(f"count: {views} views of {fov:.1f}° leave gaps in {span:.1f}°; expected at least {least}")
@@ -205,15 +219,17 @@ def split_panorama(panorama: Panorama, *, fov_deg: float = 85.0, overlap_deg: fl
     cameras = []
     for azimuth in np.radians(azimuth_deg):
         pose = panorama.world_from_camera.copy()
-        turn = np.array([[np.cos(azimuth), 0.0, np.sin(azimuth)], [0.0, 1.0, 0.0],
-                         [-np.sin(azimuth), 0.0, np.cos(azimuth)]])  # fmt: skip
+        turn = np.array(
+            [[np.cos(azimuth), 0.0, np.sin(azimuth)], [0.0, 1.0, 0.0], [-np.sin(azimuth), 0.0, np.cos(azimuth)]]
+        )
         pose[:3, :3] = pose[:3, :3] @ turn
         cameras.append(Camera(width, height, focal, focal, width / 2.0, height / 2.0 + focal * tangent.mean(), pose))
     return cameras
 
 
-def cut_view(image: np.ndarray, panorama: Panorama, camera: Camera, *,
-             supersample: int | None = None) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+def cut_view(
+    image: np.ndarray, panorama: Panorama, camera: Camera, *, supersample: int | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Resample one perspective view out of a panorama, anti-aliased and in linear light.
 
     Every output pixel is the mean of ``supersample²`` bicubic samples; left out, enough to meet every source pixel
@@ -232,8 +248,10 @@ def cut_view(image: np.ndarray, panorama: Panorama, camera: Camera, *,
         Linear view ``(h, w, 3)`` float32 and ``(h, w)`` bool, False where the panorama does not reach.
     """
     if image.shape[:2] != (panorama.height_px, panorama.width_px):
-        raise ValueError(f"cut_view: the picture is {image.shape[1]} x {image.shape[0]} px, the panorama model "
-                         f"{panorama.width_px} x {panorama.height_px}")  # fmt: skip
+        raise ValueError(
+            f"cut_view: the picture is {image.shape[1]} x {image.shape[0]} px, the panorama model "
+            f"{panorama.width_px} x {panorama.height_px}"
+        )
     if supersample is None:
         supersample = max(1, int(np.ceil(max(panorama.fx / camera.fx, panorama.fy / camera.fy) - 0.05)))
     height, width = camera.height_px, camera.width_px

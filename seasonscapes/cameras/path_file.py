@@ -62,8 +62,12 @@ def load_path(path: Path, frame: LocalFrame) -> list[Camera]:
     """The cameras of a path file; `InputError` where it is none."""
     table = read_json(path)
     if table.get("kind") != KIND:
-        raise InputError(path, "is no path", expected=f'"kind": "{KIND}"',
-                         cure="make one with `seasonscapes path`, which reads the reference's files too")  # fmt: skip
+        raise InputError(
+            path,
+            "is no path",
+            expected=f'"kind": "{KIND}"',
+            cure="make one with `seasonscapes path`, which reads the reference's files too",
+        )
     try:
         size = int(table["size_px"][0]), int(table["size_px"][1])
         cameras = [camera_of(record, frame, size) for record in table["views"]]
@@ -77,8 +81,15 @@ def load_path(path: Path, frame: LocalFrame) -> list[Camera]:
 def resized(camera: Camera, size_px: tuple[int, int]) -> Camera:
     """The same view in a picture of another size; its field of view stays, pixels may change shape."""
     x, y = size_px[0] / camera.width_px, size_px[1] / camera.height_px
-    return replace(camera, width_px=size_px[0], height_px=size_px[1], fx=camera.fx * x, cx=camera.cx * x,
-                   fy=camera.fy * y, cy=camera.cy * y)  # fmt: skip
+    return replace(
+        camera,
+        width_px=size_px[0],
+        height_px=size_px[1],
+        fx=camera.fx * x,
+        cx=camera.cx * x,
+        fy=camera.fy * y,
+        cy=camera.cy * y,
+    )
 
 
 @dataclass(frozen=True)

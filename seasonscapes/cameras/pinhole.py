@@ -68,9 +68,18 @@ def rotation_from_angles(heading_deg: float, pitch_deg: float, roll_deg: float =
     return np.stack([right, down, forward], axis=1)
 
 
-def camera_at(frame: LocalFrame, latitude_deg: float, longitude_deg: float, height_m: float, *,
-              heading_deg: float, pitch_deg: float = 0.0, roll_deg: float = 0.0, fov_deg: float = 60.0,
-              size_px: tuple[int, int] = (1536, 1024)) -> Camera:  # fmt: skip
+def camera_at(
+    frame: LocalFrame,
+    latitude_deg: float,
+    longitude_deg: float,
+    height_m: float,
+    *,
+    heading_deg: float,
+    pitch_deg: float = 0.0,
+    roll_deg: float = 0.0,
+    fov_deg: float = 60.0,
+    size_px: tuple[int, int] = (1536, 1024),
+) -> Camera:
     """A camera with square pixels and a centred principal point at a WGS 84 place.
 
     Parameters

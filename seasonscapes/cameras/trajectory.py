@@ -192,9 +192,16 @@ def clearance(positions_m: np.ndarray, ground: Ground, around_m: float) -> np.nd
     return np.where(known.any(axis=1), positions_m[:, 2] - highest, np.nan)
 
 
-def fly(waypoints: Sequence[Camera], count: int, *, curve: str = "spline", turn: str = "smooth",
-        look_at_m: np.ndarray | None = None, closed: bool = False,
-        clear_of: tuple[Ground, float] | None = None) -> list[Camera]:  # fmt: skip
+def fly(
+    waypoints: Sequence[Camera],
+    count: int,
+    *,
+    curve: str = "spline",
+    turn: str = "smooth",
+    look_at_m: np.ndarray | None = None,
+    closed: bool = False,
+    clear_of: tuple[Ground, float] | None = None,
+) -> list[Camera]:
     """Cameras along a path through waypoints, evenly spaced: exactly so many, none of them twice.
 
     Parameters
@@ -229,8 +236,15 @@ def fly(waypoints: Sequence[Camera], count: int, *, curve: str = "spline", turn:
     return views_along(line, waypoints, count, turn=turn, look_at_m=look_at_m, closed=closed)
 
 
-def views_along(line: Curve, waypoints: Sequence[Camera], count: int, *, turn: str = "smooth",
-                look_at_m: np.ndarray | None = None, closed: bool = False) -> list[Camera]:  # fmt: skip
+def views_along(
+    line: Curve,
+    waypoints: Sequence[Camera],
+    count: int,
+    *,
+    turn: str = "smooth",
+    look_at_m: np.ndarray | None = None,
+    closed: bool = False,
+) -> list[Camera]:
     """The views of `fly`, on a curve that was made before (its knots are the waypoints)."""
     s_m = np.linspace(0.0, line.length_m, count, endpoint=not closed)
     places = line.position(s_m)

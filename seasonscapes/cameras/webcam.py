@@ -102,8 +102,12 @@ def find_webcam(webcams: Sequence[Webcam], webcam_id: str) -> Webcam:
     if webcam_id in known:
         return known[webcam_id]
     close = difflib.get_close_matches(webcam_id, known, n=1, cutoff=0.4)
-    raise InputError("--webcam", "no such webcam", got=webcam_id,
-                     cure=f"did you mean '{close[0]}'?" if close else f"known: {', '.join(sorted(known))}")  # fmt: skip
+    raise InputError(
+        "--webcam",
+        "no such webcam",
+        got=webcam_id,
+        cure=f"did you mean '{close[0]}'?" if close else f"known: {', '.join(sorted(known))}",
+    )
 
 
 def webcam_heading_deg(webcam: Webcam) -> float:
@@ -137,8 +141,13 @@ def webcam_model(webcam: Webcam, frame: LocalFrame, *, ground_m: float | None = 
         fov = webcam.vertical_fov_deg
         fy = fx if fov is None else 0.5 * rows / np.tan(np.radians(fov) / 2.0)
         return Camera(width, rows, fx, fy, 0.5 * width, 0.5 * rows, pose)
-    level = panorama_from_angles(webcam.projection, (width, rows), horizontal_fov_deg=webcam.horizontal_fov_deg,
-                                 vertical_fov_deg=webcam.vertical_fov_deg, pose=pose)  # fmt: skip
+    level = panorama_from_angles(
+        webcam.projection,
+        (width, rows),
+        horizontal_fov_deg=webcam.horizontal_fov_deg,
+        vertical_fov_deg=webcam.vertical_fov_deg,
+        pose=pose,
+    )
     tilt = np.radians(webcam.lens_tilt_deg)
     rise = np.tan(tilt) if level.projection == "cylindrical" else tilt
     return Panorama(level.projection, width, rows, level.fx, level.fy, level.cx, 0.5 * rows + level.fy * rise, pose)
@@ -154,8 +163,9 @@ class HeightCheck:
     verdict: str
 
 
-def check_heights(webcams: Sequence[Webcam], ground_m: Sequence[float], *, mast_m: float = 60.0,
-                  terrain_error_m: float = 10.0) -> list[HeightCheck]:  # fmt: skip
+def check_heights(
+    webcams: Sequence[Webcam], ground_m: Sequence[float], *, mast_m: float = 60.0, terrain_error_m: float = 10.0
+) -> list[HeightCheck]:
     """Compare stated heights with the terrain under each camera, ``ground_m`` ``(N,)`` [m] in the same datum.
 
     A camera is plausible from ``terrain_error_m`` below the (smoothed) terrain up to ``mast_m`` above it.
@@ -183,8 +193,9 @@ def draw_webcam_map(webcams: Sequence[Webcam], *, width_px: int = 1200, reach_m:
     """
     import cv2
 
-    middle = LocalFrame(float(np.mean([w.latitude_deg for w in webcams])),
-                        float(np.mean([w.longitude_deg for w in webcams])))  # fmt: skip
+    middle = LocalFrame(
+        float(np.mean([w.latitude_deg for w in webcams])), float(np.mean([w.longitude_deg for w in webcams]))
+    )
     plan = np.array([enu_from_geodetic(middle, w.latitude_deg, w.longitude_deg, 0.0)[:2] for w in webcams])
     low, high = plan.min(0) - 2.0 * reach_m, plan.max(0) + 2.0 * reach_m
     scale = width_px / (high[0] - low[0])
@@ -204,8 +215,14 @@ def draw_webcam_map(webcams: Sequence[Webcam], *, width_px: int = 1200, reach_m:
     written: list[tuple[int, int]] = []
     for webcam, place in zip(webcams, plan, strict=True):
         heading = np.radians(webcam_heading_deg(webcam))
-        cv2.line(picture, at(place), at(place + reach_m * np.array([np.sin(heading), np.cos(heading)])), (30, 80, 170),
-                 2, cv2.LINE_AA)  # fmt: skip
+        cv2.line(
+            picture,
+            at(place),
+            at(place + reach_m * np.array([np.sin(heading), np.cos(heading)])),
+            (30, 80, 170),
+            2,
+            cv2.LINE_AA,
+        )
         cv2.circle(picture, at(place), 4, (190, 40, 30), -1, cv2.LINE_AA)
         x, y = at(place)
         while any(abs(x - other[0]) < 110 and abs(y - other[1]) < 13 for other in written):

@@ -104,12 +104,19 @@ def albedo(
     _save(output, land, known, fit)
     figures = _figures(output, known)
     record: dict[str, Any] = {
-        "output": str(output), "scene": land.scene.name, "photographs": len(shots),
+        "output": str(output),
+        "scene": land.scene.name,
+        "photographs": len(shots),
         "times_utc": [moment.astimezone(UTC).isoformat() for moment in moments],
-        "measured_share": float((known.source == 1).mean()), "completed_share": float((known.source == 2).mean()),
-        "residual": [round(float(value), 4) for value in fit.residual], "gains": fit.gains.tolist(), **facts,
-        "figures": figures, "attribution": land.scene.attribution, "seconds": round(clock.perf_counter() - start, 1),
-    }  # fmt: skip
+        "measured_share": float((known.source == 1).mean()),
+        "completed_share": float((known.source == 2).mean()),
+        "residual": [round(float(value), 4) for value in fit.residual],
+        "gains": fit.gains.tolist(),
+        **facts,
+        "figures": figures,
+        "attribution": land.scene.attribution,
+        "seconds": round(clock.perf_counter() - start, 1),
+    }
     if land.synthetic is not None:
         record |= _truth(land, known, moments[0])
     finish(record, _lines(record, shots), as_json=json)
@@ -134,8 +141,11 @@ def _photographed(land: Place, moments: list[datetime], model: SkyModel, size_px
     from seasonscapes.commands.webcam_shots import photographs
 
     if land.synthetic is None:
-        raise InputError("--synthetic-webcams", f"the scene '{land.scene.name}' is a real place",
-                         cure="give its pictures with --manifest")  # fmt: skip
+        raise InputError(
+            "--synthetic-webcams",
+            f"the scene '{land.scene.name}' is a real place",
+            cure="give its pictures with --manifest",
+        )
     cameras = chosen_cameras(land, None, size_px)
     with progress_bar(f"photographing from {len(cameras)} webcams") as progress:
         made = photographs(land, moments, model, cameras, progress=progress)
@@ -146,8 +156,12 @@ def _opened(land: Place, moments: list[datetime], folders: tuple, within_min: fl
     from seasonscapes.commands.webcam_shots import Sources, calibrated_views, rows_at
 
     if folders[0] is None:
-        raise InputError("--manifest", "missing", expected="the .csv of seasonscapes webcams --manifest",
-                         cure="for a synthetic scene: --synthetic-webcams")  # fmt: skip
+        raise InputError(
+            "--manifest",
+            "missing",
+            expected="the .csv of seasonscapes webcams --manifest",
+            cure="for a synthetic scene: --synthetic-webcams",
+        )
     sources = Sources(*folders)
     near = [rows_at(sources, moment, within_min=within_min, flag="--times") for moment in moments]
     rows = {row.path: row for each in near for row in each}
@@ -191,8 +205,9 @@ def _with_terrain(traced: Land, observations: list[Observation]) -> list[Observa
     return kept
 
 
-def _prepared(land: Place, observations: list[Observation], model: SkyModel, *, fit_haze: bool,
-              fit_curve: bool) -> tuple[Land, list[Shot], dict[str, Any]]:  # fmt: skip
+def _prepared(
+    land: Place, observations: list[Observation], model: SkyModel, *, fit_haze: bool, fit_curve: bool
+) -> tuple[Land, list[Shot], dict[str, Any]]:
     from seasonscapes.albedo.forward import trace_land
     from seasonscapes.albedo.haze import fit_visibility
     from seasonscapes.albedo.response import fit_response, with_response
@@ -244,8 +259,15 @@ def _solved(land: Place, traced: Land, shots: list[Shot], iterations: int) -> tu
         if iterations:
             options = InverseOptions(iterations=iterations, levels=(1,))
             with progress_bar("differentiable rendering") as progress:
-                fit = refine_albedo(land.terrain, traced, shots, fit, trust=EIGHT_BIT, options=options,
-                                    callbacks=[lambda state: progress(state.iteration / iterations)]).fit  # fmt: skip
+                fit = refine_albedo(
+                    land.terrain,
+                    traced,
+                    shots,
+                    fit,
+                    trust=EIGHT_BIT,
+                    options=options,
+                    callbacks=[lambda state: progress(state.iteration / iterations)],
+                ).fit
         known = known_albedo(traced, shots, fit)
         image = image_from_above(land, shots[0].observation.time)
         base = None if image is None else np.where(image.weight[..., None] > 0.0, image.values, np.float32(np.nan))
@@ -263,8 +285,16 @@ def _save(output: Path, land: Place, known: KnownAlbedo, fit: AlbedoFit) -> None
 
     weight = np.where(known.source == 1, 1.0 / np.maximum(known.sigma, 1e-4) ** 2, 0.0).astype(np.float32)
     with atomic_path(output) as temporary, open(temporary, "wb") as file:
-        np.savez_compressed(file, values=known.albedo, weight=weight, sigma=known.sigma, sunlit=known.sunlit,
-                            source=known.source, gains=fit.gains, residual=fit.residual)  # fmt: skip
+        np.savez_compressed(
+            file,
+            values=known.albedo,
+            weight=weight,
+            sigma=known.sigma,
+            sunlit=known.sunlit,
+            source=known.source,
+            gains=fit.gains,
+            residual=fit.residual,
+        )
 
 
 def _figures(output: Path, known: KnownAlbedo) -> dict[str, str]:
@@ -296,15 +326,21 @@ def _truth(land: Place, known: KnownAlbedo, moment: datetime) -> dict[str, float
 
     truth, measured = albedo_for(land, moment).values, known.source == 1
     error = known.albedo[measured] - truth[measured]
-    return {"true_psnr_db": round(float(-10.0 * np.log10(np.mean(error**2))), 2),
-            "true_relative_error": round(float(np.abs(error).sum() / truth[measured].sum()), 4)}  # fmt: skip
+    return {
+        "true_psnr_db": round(float(-10.0 * np.log10(np.mean(error**2))), 2),
+        "true_relative_error": round(float(np.abs(error).sum() / truth[measured].sum()), 4),
+    }
 
 
 def _lines(record: dict[str, Any], shots: list[Shot]) -> list[str]:
-    lines = [f"{shot.observation.webcam:<16} {shot.observation.time:%Y-%m-%d %H:%M} UTC  residual {residual:.1%}"
-             for shot, residual in zip(shots, record["residual"], strict=True)]  # fmt: skip
+    lines = [
+        f"{shot.observation.webcam:<16} {shot.observation.time:%Y-%m-%d %H:%M} UTC  residual {residual:.1%}"
+        for shot, residual in zip(shots, record["residual"], strict=True)
+    ]
     lines.append(f"{record['measured_share']:.1%} of the texture measured, {record['completed_share']:.1%} completed")
     if "true_psnr_db" in record:
-        lines.append(f"against the truth, where measured: {record['true_psnr_db']} dB, relative error "
-                     f"{record['true_relative_error']:.1%}")  # fmt: skip
+        lines.append(
+            f"against the truth, where measured: {record['true_psnr_db']} dB, relative error "
+            f"{record['true_relative_error']:.1%}"
+        )
     return [*lines, record["output"], *record["figures"].values()]

@@ -85,12 +85,16 @@ def calibrate(
     try:
         if skyline:
             open_area = None if mask is None else _picture(mask, "--mask").max(axis=2) > 127
-            fit = align_to_skyline(image, stand.view, stand.rasters, stand.frame, mask=open_area, points=matched,
-                                   k1=stand.webcam.radial_k1)  # fmt: skip
+            fit = align_to_skyline(
+                image, stand.view, stand.rasters, stand.frame, mask=open_area, points=matched, k1=stand.webcam.radial_k1
+            )
             solution, horizon, doubts = fit.calibration, fit.horizon, fit.doubts
         else:
-            priors = Priors(horizontal_m=stand.webcam.position_sigma_m, vertical_m=stand.webcam.position_sigma_m,
-                            k1=np.inf if radial else 0.0)  # fmt: skip
+            priors = Priors(
+                horizontal_m=stand.webcam.position_sigma_m,
+                vertical_m=stand.webcam.position_sigma_m,
+                k1=np.inf if radial else 0.0,
+            )
             solution = solve(stand.view, matched, priors=priors, k1=stand.webcam.radial_k1, axes=stand.axes)
             horizon = horizon_from(stand.rasters, stand.frame, solution.view.position_m, below_ground_m=40.0)
     except ValueError as error:
@@ -103,9 +107,17 @@ def calibrate(
     save_overlay(figure, image, solution, points=matched, horizon=horizon, title=stand.webcam.id)
     for doubt in doubts:
         say(f"not reliable: {doubt}")
-    record = {"webcam": stand.webcam.id, "reliable": not doubts, "doubts": list(doubts), "sigma": solution.sigma,
-              "values": solution.values.tolist(), "rms_px": solution.rms_px, "outliers": list(solution.outlier_names),
-              "calibration": str(record_file), "overlay": str(figure)}  # fmt: skip
+    record = {
+        "webcam": stand.webcam.id,
+        "reliable": not doubts,
+        "doubts": list(doubts),
+        "sigma": solution.sigma,
+        "values": solution.values.tolist(),
+        "rms_px": solution.rms_px,
+        "outliers": list(solution.outlier_names),
+        "calibration": str(record_file),
+        "overlay": str(figure),
+    }
     finish(record, [*report_lines(solution), f"{record_file}", f"{figure}"], as_json=json)
 
 
@@ -141,9 +153,12 @@ def annotate(
     stand = _stand(scene, webcam, terrain or TerrainSource())
     image = _picture(picture, "--picture")
     if image.shape[:2] != (stand.view.height_px, stand.view.width_px):
-        raise InputError(picture, "the picture has another size than its webcam",
-                         got=f"{image.shape[1]} x {image.shape[0]}",
-                         expected=f"{stand.view.width_px} x {stand.view.height_px}")  # fmt: skip
+        raise InputError(
+            picture,
+            "the picture has another size than its webcam",
+            got=f"{image.shape[1]} x {image.shape[0]}",
+            expected=f"{stand.view.width_px} x {stand.view.height_px}",
+        )
     look = partial(look_at_rasters, rasters=stand.rasters, frame=stand.frame)
     session = PickSession(stand.webcam.id, image, stand.view, stand.frame, look, output, k1=stand.webcam.radial_k1)
     server, address = serve(session, port=port)

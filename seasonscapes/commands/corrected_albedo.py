@@ -14,8 +14,14 @@ if TYPE_CHECKING:
     from seasonscapes.texturing.guides import Guides
 
 
-def corrected_albedo(fit: AlbedoFit, base: np.ndarray | None, guides: Guides, *, seed: int = 0,
-                     progress: Callable[[float], None] | None = None) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+def corrected_albedo(
+    fit: AlbedoFit,
+    base: np.ndarray | None,
+    guides: Guides,
+    *,
+    seed: int = 0,
+    progress: Callable[[float], None] | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
     """Albedo ``(R, S, 3)`` of every texel of the surface, and its standard deviation ``(R, S)``.
 
     Parameters
@@ -44,8 +50,14 @@ def corrected_albedo(fit: AlbedoFit, base: np.ndarray | None, guides: Guides, *,
     return values, both.astype(np.float32)
 
 
-def complete_known(known: KnownAlbedo, fit: AlbedoFit, base: np.ndarray | None, guides: Guides, *,
-                   progress: Callable[[float], None] | None = None) -> KnownAlbedo:  # fmt: skip
+def complete_known(
+    known: KnownAlbedo,
+    fit: AlbedoFit,
+    base: np.ndarray | None,
+    guides: Guides,
+    *,
+    progress: Callable[[float], None] | None = None,
+) -> KnownAlbedo:
     """The same with every texel of the surface known; what is not measured is marked as completed."""
     import numpy as np
 

@@ -120,8 +120,17 @@ def _film(place, view, path: Path, size_px: tuple[int, int], device: str) -> Pat
     from seasonscapes.sky.models import read_sky_model
     from seasonscapes.studio import Assignment
 
-    assignment = Assignment(str(place.path.resolve()), str(place.workspace.folder.resolve()), MeshOptions(), view, size_px,
-                            read_sky_model("clear"), season="nearest", base_day=FILM_START[:10], device=device)  # fmt: skip
+    assignment = Assignment(
+        str(place.path.resolve()),
+        str(place.workspace.folder.resolve()),
+        MeshOptions(),
+        view,
+        size_px,
+        read_sky_model("clear"),
+        season="nearest",
+        base_day=FILM_START[:10],
+        device=device,
+    )
     start = resolve_time(FILM_START, view.latitude_deg, view.longitude_deg).utc
     times = [start + index * timedelta(minutes=10) for index in range(145)]
     render_frames(assignment, times, WorkOptions(), None)
@@ -144,8 +153,17 @@ class _Studio:
         from seasonscapes import __version__
 
         path = self.folder / f"{name}.png"
-        record = json_module.dumps({"panel": panel.__dict__, "size": size_px, "spp": spp, "version": __version__,
-                                    "view": self.view.model_dump(), "terrain": str(self.place.key)}, sort_keys=True)  # fmt: skip
+        record = json_module.dumps(
+            {
+                "panel": panel.__dict__,
+                "size": size_px,
+                "spp": spp,
+                "version": __version__,
+                "view": self.view.model_dump(),
+                "terrain": str(self.place.key),
+            },
+            sort_keys=True,
+        )
         if path.is_file() and Image.open(path).text.get("seasonscapes:panel") == record:
             return path
         self._render(path, panel, size_px, spp, record)

@@ -75,9 +75,16 @@ def distill(
     sky, place = sky or SkyOptions(), place or PlaceOptions()
     start = clock.perf_counter()
     check_suffix(output, (".safetensors",))
-    for flag, value, low, high in (("--discs", discs, 8, 4096), ("--suns", suns, 1, 512), ("--dates", dates, 1, 24),
-                                   ("--views", views, 0, 64), ("--view-px", view_px, 16, 4096), ("--steps", steps, 1, 1e6),
-                                   ("--picture-steps", picture_steps, 0, 1e6), ("--seed", seed, 0, 2**32)):  # fmt: skip
+    for flag, value, low, high in (
+        ("--discs", discs, 8, 4096),
+        ("--suns", suns, 1, 512),
+        ("--dates", dates, 1, 24),
+        ("--views", views, 0, 64),
+        ("--view-px", view_px, 16, 4096),
+        ("--steps", steps, 1, 1e6),
+        ("--picture-steps", picture_steps, 0, 1e6),
+        ("--seed", seed, 0, 2**32),
+    ):
         check_range(flag, value, low, high)
     if kind not in ("full", "physical", "sun"):
         raise InputError("--kind", "unknown kind", got=kind, expected="full, physical or sun")
@@ -96,26 +103,61 @@ def distill(
     dated = dated_textures(land, [parse_dated(text) for text in albedo or ()], dates)
     school = prepare_school(land, model, (discs, suns, views, view_px), dated, seed)
     surfels = school.surfels
-    appearance = Appearance(kind, school.albedo, school.around, school.transport, fourier_embedding(surfels.means, seed=seed),
-                            times=suns, seed=seed)  # fmt: skip
+    appearance = Appearance(
+        kind,
+        school.albedo,
+        school.around,
+        school.transport,
+        fourier_embedding(surfels.means, seed=seed),
+        times=suns,
+        seed=seed,
+    )
     checkpoint = output.with_suffix(".checkpoint.safetensors")
     with progress_bar("distilling") as progress:
-        losses = distil(appearance, school.lessons, school.frames, Schedule(steps, picture_steps), seed=seed,
-                        checkpoint=checkpoint, progress=progress)  # fmt: skip
+        losses = distil(
+            appearance,
+            school.lessons,
+            school.frames,
+            Schedule(steps, picture_steps),
+            seed=seed,
+            checkpoint=checkpoint,
+            progress=progress,
+        )
     note = {"scene": land.scene.name, "seed": seed, "suns": suns, "attribution": land.scene.attribution}
-    made = model_from(surfels, school.albedo, school.days, school.transport, kind=kind, frame=land.frame,
-                      appearance=learned_numbers(appearance), note=note)  # fmt: skip
+    made = model_from(
+        surfels,
+        school.albedo,
+        school.days,
+        school.transport,
+        kind=kind,
+        frame=land.frame,
+        appearance=learned_numbers(appearance),
+        note=note,
+    )
     save_model(made, output)
     checkpoint.unlink(missing_ok=True)
-    record: dict[str, Any] = {"output": str(output), "scene": land.scene.name, "gaussians": len(surfels.means),
-                              "spacing_m": round(surfels.plan.spacing_m, 2), "bytes_per_gaussian": round(bytes_each(made), 1),
-                              "suns": suns, "dates": school.days, "loss": losses[-1] if losses else None}  # fmt: skip
+    record: dict[str, Any] = {
+        "output": str(output),
+        "scene": land.scene.name,
+        "gaussians": len(surfels.means),
+        "spacing_m": round(surfels.plan.spacing_m, 2),
+        "bytes_per_gaussian": round(bytes_each(made), 1),
+        "suns": suns,
+        "dates": school.days,
+        "loss": losses[-1] if losses else None,
+    }
     if export_views is not None:
         export(export_views, land, school)
         record["views"] = str(export_views)
     record["seconds"] = round(clock.perf_counter() - start, 1)
-    finish(record, [f"{output}  ({record['gaussians']:,} Gaussians {record['spacing_m']} m apart, "
-                    f"{record['bytes_per_gaussian']} bytes each, {record['seconds']} s)"], as_json=json)  # fmt: skip
+    finish(
+        record,
+        [
+            f"{output}  ({record['gaussians']:,} Gaussians {record['spacing_m']} m apart, "
+            f"{record['bytes_per_gaussian']} bytes each, {record['seconds']} s)"
+        ],
+        as_json=json,
+    )
 
 
 def require_torch() -> None:
@@ -195,13 +237,15 @@ def prepare_school(
             ]
         if mine:
             with progress_bar(f"surface, date {season + 1} of {len(days)}") as progress:
-                received[mine] = surfel_irradiance(bare, surfels, [lights[n] for n in mine], rays=128, seed=seed,
-                                                   progress=progress)  # fmt: skip
+                received[mine] = surfel_irradiance(
+                    bare, surfels, [lights[n] for n in mine], rays=128, seed=seed, progress=progress
+                )
         # Pictures of one date are enough: they teach the splats' width, not the season.
         if season == len(days) // 2 and views and mine:
             with progress_bar("pictures") as progress:
-                frames = relit_frames(bare, surfels, cameras, [(n, lights[n], states[n]) for n in mine], seed=seed,
-                                      progress=progress)  # fmt: skip
+                frames = relit_frames(
+                    bare, surfels, cameras, [(n, lights[n], states[n]) for n in mine], seed=seed, progress=progress
+                )
     lessons = lessons_from(states, seasons, albedo, received)
     return School(surfels, albedo, around, days, transport, lessons, times, frames, cameras)
 

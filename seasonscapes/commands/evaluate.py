@@ -117,8 +117,12 @@ def paired(truth: Path, pictures: Path) -> dict[str, tuple[Path, Path]]:
     true, made = (_by_stem(flag, path) for flag, path in (("--truth", truth), ("--pictures", pictures)))
     missing = sorted(set(true) - set(made))
     if missing:
-        raise InputError("--pictures", f"no picture for {len(missing)} of {len(true)} truths, the first", got=missing[0],
-                         cure="every truth is scored, so that none can be left out silently")  # fmt: skip
+        raise InputError(
+            "--pictures",
+            f"no picture for {len(missing)} of {len(true)} truths, the first",
+            got=missing[0],
+            cure="every truth is scored, so that none can be left out silently",
+        )
     return {name: (true[name], made[name]) for name in sorted(true)}
 
 
@@ -155,12 +159,20 @@ def read_pair(true_path: Path, path: Path, *, match: str = "none") -> Pair:
 
     linear = [each.suffix.lower() in _LINEAR for each in (true_path, path)]
     if linear[0] != linear[1]:
-        raise InputError(path, "radiance and a developed picture cannot be compared", got=f"{true_path.name}, {path.name}",
-                         expected="two .exr, or two of .png and .jpg")  # fmt: skip
+        raise InputError(
+            path,
+            "radiance and a developed picture cannot be compared",
+            got=f"{true_path.name}, {path.name}",
+            expected="two .exr, or two of .png and .jpg",
+        )
     (true, depth), (made, _) = _read(true_path), _read(path)
     if true.shape != made.shape:
-        raise InputError(path, "another size than the truth", got=f"{made.shape[1]}x{made.shape[0]}",
-                         expected=f"{true.shape[1]}x{true.shape[0]}")  # fmt: skip
+        raise InputError(
+            path,
+            "another size than the truth",
+            got=f"{made.shape[1]}x{made.shape[0]}",
+            expected=f"{true.shape[1]}x{true.shape[0]}",
+        )
     if match == "gain":
         made = made * matching_gain(true, made)
     if linear[0]:
@@ -220,8 +232,12 @@ def mask_of(name: str, mask: Path | None, pair: Pair, *, near_m: float, far_m: f
         raise InputError("--mask", "no such mask", got=str(path))
     white = _read(path)[0].max(axis=2) > 0.5
     if white.shape != pair.truth.shape[:2]:
-        raise InputError(path, "another size than the truth", got=f"{white.shape[1]}x{white.shape[0]}",
-                         expected=f"{pair.truth.shape[1]}x{pair.truth.shape[0]}")  # fmt: skip
+        raise InputError(
+            path,
+            "another size than the truth",
+            got=f"{white.shape[1]}x{white.shape[0]}",
+            expected=f"{pair.truth.shape[1]}x{pair.truth.shape[0]}",
+        )
     return white if chosen is None else white & chosen
 
 
@@ -238,8 +254,9 @@ def refuse_used(truths: Sequence[Path], used: Sequence[Path]) -> None:
         known = {file_content_hash(path): path for path in files if path.suffix.lower() in _ENCODED}
         for path in truths:
             if path.suffix.lower() in _ENCODED and (held := known.get(file_content_hash(path))) is not None:
-                raise InputError(path, "this truth is not held out: it has the pixels of a picture that was used",
-                                 got=str(held))  # fmt: skip
+                raise InputError(
+                    path, "this truth is not held out: it has the pixels of a picture that was used", got=str(held)
+                )
     except ValueError as error:
         raise InputError("--used", str(error)) from None
 

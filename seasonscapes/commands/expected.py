@@ -34,8 +34,15 @@ def expected_radiance(land: Place, albedo: Path, utc: datetime, model: SkyModel)
 
     (dated,) = dated_albedos(land, [(utc.date().isoformat(), str(albedo))])
     inputs = {"revision": _REVISION, "place": land.key, "albedo": dated.content, "time": utc.isoformat(), "sky": model}
-    return build_once(land.workspace, f"{land.scene.name}/expected", inputs, suffix=".npz", save=save_texture,
-                      load=load_texture, build=lambda: _relit(land, dated.load(), utc, model))  # fmt: skip
+    return build_once(
+        land.workspace,
+        f"{land.scene.name}/expected",
+        inputs,
+        suffix=".npz",
+        save=save_texture,
+        load=load_texture,
+        build=lambda: _relit(land, dated.load(), utc, model),
+    )
 
 
 def albedo_error(albedo: Path) -> np.ndarray:
@@ -63,6 +70,12 @@ def _relit(land: Place, texture: Texture, utc: datetime, model: SkyModel) -> Tex
     light, _ = land_light(land, model, utc)
     positions, _ = texel_positions(land.terrain, land.atlas.width_px, land.atlas.height_px)
     with progress_bar("relighting the albedo") as progress:
-        lit = lit_texture(occluder(mi_mesh(land.terrain, texture.values)), positions, texture.values, light,
-                          effort=Effort(subpixels=1, rays=_RAYS), progress=progress)  # fmt: skip
+        lit = lit_texture(
+            occluder(mi_mesh(land.terrain, texture.values)),
+            positions,
+            texture.values,
+            light,
+            effort=Effort(subpixels=1, rays=_RAYS),
+            progress=progress,
+        )
     return Texture(lit.radiance.astype(np.float32), texture.weight)

@@ -25,8 +25,9 @@ def info(artefact: Path, *, json: bool = False) -> None:
         raise InputError("info", "no such file", got=str(artefact))
     kind = "folder" if artefact.is_dir() else artefact.suffix.lower()
     if kind not in READERS:
-        raise InputError("info", "this kind of file carries no provenance", got=artefact.name,
-                         expected=", ".join(sorted(READERS)))  # fmt: skip
+        raise InputError(
+            "info", "this kind of file carries no provenance", got=artefact.name, expected=", ".join(sorted(READERS))
+        )
     try:
         record = {"file": str(artefact), **READERS[kind](artefact)}
     except (OSError, ValueError, KeyError, RuntimeError) as error:
@@ -77,8 +78,12 @@ def _tif(path: Path) -> dict:
     import rasterio
 
     with rasterio.open(path) as file:
-        return {"size_px": [file.width, file.height], "crs": str(file.crs), "bands": ", ".join(d or "?" for d in file.descriptions),
-                "seasonscapes": _loaded(file.tags().get("seasonscapes", "none"))}  # fmt: skip
+        return {
+            "size_px": [file.width, file.height],
+            "crs": str(file.crs),
+            "bands": ", ".join(d or "?" for d in file.descriptions),
+            "seasonscapes": _loaded(file.tags().get("seasonscapes", "none")),
+        }
 
 
 def _npz(path: Path) -> dict:
@@ -148,5 +153,15 @@ def _folder(path: Path) -> dict:
     raise ValueError("neither daylight coefficients nor a run")
 
 
-READERS = {".exr": _exr, ".png": _png, ".tif": _tif, ".tiff": _tif, ".npz": _npz, ".glb": _glb, ".mp4": _mp4,
-           ".safetensors": _safetensors, ".json": _json, "folder": _folder}  # fmt: skip
+READERS = {
+    ".exr": _exr,
+    ".png": _png,
+    ".tif": _tif,
+    ".tiff": _tif,
+    ".npz": _npz,
+    ".glb": _glb,
+    ".mp4": _mp4,
+    ".safetensors": _safetensors,
+    ".json": _json,
+    "folder": _folder,
+}

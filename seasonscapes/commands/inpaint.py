@@ -125,14 +125,27 @@ def inpaint(
     hole = guides.surface & ~completed.painted
     share = float(hole.sum() / max(guides.surface.sum(), 1))
     record: dict[str, Any] = {
-        "output": str(output), "scene": land.scene.name, "method": method, "time_utc": moment.utc.isoformat(),
-        "texels": int(guides.surface.sum()), "filled_share": share, "guides": list(guides.names),
-        "sigma_median": float(_median(completed.sigma[hole])), "value_median": float(_median(completed.values[hole])),
-        "figures": [str(path) for path in pictures], "seconds": round(clock.perf_counter() - start, 2),
-    } | told  # fmt: skip
-    finish(record, [f"{output}  ({100 * share:.1f} % of {record['texels']:,} texels filled by {method}, median σ "
-                    f"{record['sigma_median']:.3g} on {record['value_median']:.3g}, {record['seconds']} s)",
-                    *record["figures"]], as_json=json)  # fmt: skip
+        "output": str(output),
+        "scene": land.scene.name,
+        "method": method,
+        "time_utc": moment.utc.isoformat(),
+        "texels": int(guides.surface.sum()),
+        "filled_share": share,
+        "guides": list(guides.names),
+        "sigma_median": float(_median(completed.sigma[hole])),
+        "value_median": float(_median(completed.values[hole])),
+        "figures": [str(path) for path in pictures],
+        "seconds": round(clock.perf_counter() - start, 2),
+    } | told
+    finish(
+        record,
+        [
+            f"{output}  ({100 * share:.1f} % of {record['texels']:,} texels filled by {method}, median σ "
+            f"{record['sigma_median']:.3g} on {record['value_median']:.3g}, {record['seconds']} s)",
+            *record["figures"],
+        ],
+        as_json=json,
+    )
 
 
 def _median(values) -> float:
@@ -156,12 +169,21 @@ def read_painted(path: Path, land: Place) -> Texture:
         raise InputError("--texture", f"not a painted texture: {error}", got=str(path)) from None
     size = (land.atlas.height_px, land.atlas.width_px)
     if texture.weight.shape != size:
-        raise InputError("--texture", "made for another atlas", got=f"{texture.weight.shape[1]} × {texture.weight.shape[0]}",
-                         expected=f"{size[1]} × {size[0]}", cure="give the same --atlas and --texel-m as for painting")  # fmt: skip
+        raise InputError(
+            "--texture",
+            "made for another atlas",
+            got=f"{texture.weight.shape[1]} × {texture.weight.shape[0]}",
+            expected=f"{size[1]} × {size[0]}",
+            cure="give the same --atlas and --texel-m as for painting",
+        )
     painted = painted_texels(texture)
     if not painted.any():
-        raise InputError("--texture", "no painted texel: there is nothing to learn from", got=str(path),
-                         cure="did the cameras see the land? look at the figures of `seasonscapes paint`")  # fmt: skip
+        raise InputError(
+            "--texture",
+            "no painted texel: there is nothing to learn from",
+            got=str(path),
+            cure="did the cameras see the land? look at the figures of `seasonscapes paint`",
+        )
     if texture.values[painted].min() < 0.0:
         raise InputError("--texture", "negative radiance", got=str(path), expected="values of at least 0")
     return texture
@@ -179,8 +201,14 @@ def guides_of(land: Place, moment: datetime, relit: Texture | None = None) -> Gu
     at = (land.frame.latitude_deg, land.frame.longitude_deg)
     hours = [moment + timedelta(hours=h) for h in range(-12, 12)]
     day = np.asarray(sun_position(hours, *at).direction, float)
-    return guides_for(land.terrain, land.atlas, satellite=satellite, relit=None if relit is None else relit.values,
-                      sun_direction=sun_position(moment, *at).direction, day_suns=day)  # fmt: skip
+    return guides_for(
+        land.terrain,
+        land.atlas,
+        satellite=satellite,
+        relit=None if relit is None else relit.values,
+        sun_direction=sun_position(moment, *at).direction,
+        day_suns=day,
+    )
 
 
 def save_completed(completed: Completed, painted: Texture, path: Path) -> None:
@@ -205,8 +233,11 @@ def save_figures(folder: Path, land: Place, completed: Completed) -> list[Path]:
     after = develop(values, ev100)
     sigma = _shrunk(completed.sigma[..., None], shrink)
     scale = np.percentile(sigma, 99.0) or 1.0
-    pictures = {"before": after * seen + 0.05 * (1.0 - seen), "after": after,
-                "sigma": np.repeat(np.clip(sigma / scale, 0.0, 1.0) ** 2.2, 3, axis=2)}  # fmt: skip
+    pictures = {
+        "before": after * seen + 0.05 * (1.0 - seen),
+        "after": after,
+        "sigma": np.repeat(np.clip(sigma / scale, 0.0, 1.0) ** 2.2, 3, axis=2),
+    }
     paths = []
     for name, picture in pictures.items():
         paths.append(folder / f"{land.scene.name}_texture_{name}.png")
@@ -221,8 +252,9 @@ def _shrunk(values, factor: int):
     return cv2.resize(values, size, interpolation=cv2.INTER_AREA).reshape(size[1], size[0], -1)
 
 
-def save_views(folder: Path, land: Place, completed: Completed, view: ViewOptions, sky: SkyOptions,
-               moment: datetime) -> list[Path]:  # fmt: skip
+def save_views(
+    folder: Path, land: Place, completed: Completed, view: ViewOptions, sky: SkyOptions, moment: datetime
+) -> list[Path]:
     """The land as a camera sees it, through the air of that hour, before and after completion."""
     import numpy as np
 

@@ -119,10 +119,14 @@ class DiffusionOptions:
 
         known, out = DiffusionSettings(), self.left_out()
         return DiffusionSettings(
-            prompt="" if "prompt" in out else prompt, depth_scale=0.0 if "depth" in out else known.depth_scale,
-            inpaint_scale=0.0 if "mask" in out else known.inpaint_scale, steps=self.steps, guidance=self.guidance,
-            image_scale=0.0 if "image" in out else known.image_scale, strength=self.chosen_strength(),
-        )  # fmt: skip
+            prompt="" if "prompt" in out else prompt,
+            depth_scale=0.0 if "depth" in out else known.depth_scale,
+            inpaint_scale=0.0 if "mask" in out else known.inpaint_scale,
+            steps=self.steps,
+            guidance=self.guidance,
+            image_scale=0.0 if "image" in out else known.image_scale,
+            strength=self.chosen_strength(),
+        )
 
 
 @dataclass(frozen=True)
@@ -135,8 +139,9 @@ class Effort:
     cloudiness: float = 0.0
 
 
-def complete_along_path(land: Place, painted: Texture, guides: Guides, time: datetime, flags: DiffusionOptions,
-                        effort: Effort) -> tuple[Completed, dict[str, Any]]:  # fmt: skip
+def complete_along_path(
+    land: Place, painted: Texture, guides: Guides, time: datetime, flags: DiffusionOptions, effort: Effort
+) -> tuple[Completed, dict[str, Any]]:
     """Paint along the path, complete what is left by guided, and film it; what was completed, and plain facts about it."""
     import numpy as np
 
@@ -160,8 +165,13 @@ def complete_along_path(land: Place, painted: Texture, guides: Guides, time: dat
             return complete(texture, guides, detail=detail, fast=effort.fast, seed=effort.seed, progress=progress)
 
     alone = guided(painted, 0.0, "completing (guided)") if flags.hybrid else None
-    walk = Walk(painted, cameras, tiling(land.terrain, land.atlas), occluder(mi_mesh(land.terrain, np.full(3, 0.2))),
-                None if alone is None else alone.values)  # fmt: skip
+    walk = Walk(
+        painted,
+        cameras,
+        tiling(land.terrain, land.atlas),
+        occluder(mi_mesh(land.terrain, np.full(3, 0.2))),
+        None if alone is None else alone.values,
+    )
     canvas = Canvas(painted)
     folder = _folder(land, painted, flags, effort, identity)
     told = _walked(walk, canvas, painter, flags, effort, folder, guides.surface)
@@ -208,8 +218,10 @@ def _painter(flags: DiffusionOptions, prompt: str) -> tuple[Painter, dict[str, A
     image = None if flags.guide_image is None else _guide_picture(flags.guide_image)
     settings, machine = flags.settings(prompt), Machine(flags.device, flags.dtype, flags.offload)
     painter = load_painter(flags.weights, settings, names=names, machine=machine, image=image)
-    prints = {part: fingerprint(find_weights(flags.weights, part, getattr(names, part)), part, getattr(names, part))
-              for part in needed_parts(settings, image is not None)}  # fmt: skip
+    prints = {
+        part: fingerprint(find_weights(flags.weights, part, getattr(names, part)), part, getattr(names, part))
+        for part in needed_parts(settings, image is not None)
+    }
     guide = None if flags.guide_image is None else file_hash(flags.guide_image)
     return painter, {
         "weights": prints,
@@ -236,17 +248,36 @@ def _folder(land: Place, painted: Texture, flags: DiffusionOptions, effort: Effo
     from seasonscapes.workspace import content_key, file_hash
 
     texture = hashlib.sha256(painted.values.tobytes() + painted.weight.tobytes()).hexdigest()
-    key = content_key({
-        "revision": _REVISION, "place": land.key, "texture": texture, "path": file_hash(flags.path), "hybrid": flags.hybrid,
-        "fast": effort.fast and flags.hybrid, "seed": effort.seed, "cloudiness": effort.cloudiness, "mask": flags.mask,
-        "dilate": flags.dilate_px, "least": flags.least_hole, "sky": flags.paint_sky, **identity,
-    })  # fmt: skip
+    key = content_key(
+        {
+            "revision": _REVISION,
+            "place": land.key,
+            "texture": texture,
+            "path": file_hash(flags.path),
+            "hybrid": flags.hybrid,
+            "fast": effort.fast and flags.hybrid,
+            "seed": effort.seed,
+            "cloudiness": effort.cloudiness,
+            "mask": flags.mask,
+            "dilate": flags.dilate_px,
+            "least": flags.least_hole,
+            "sky": flags.paint_sky,
+            **identity,
+        }
+    )
     above = flags.frames if flags.frames is not None else land.workspace.folder / land.scene.name
     return above / f"diffusion-{key}"
 
 
-def _walked(walk: Walk, canvas: Canvas, painter: Painter, flags: DiffusionOptions, effort: Effort, folder: Path,
-            surface: np.ndarray) -> dict[str, Any]:  # fmt: skip
+def _walked(
+    walk: Walk,
+    canvas: Canvas,
+    painter: Painter,
+    flags: DiffusionOptions,
+    effort: Effort,
+    folder: Path,
+    surface: np.ndarray,
+) -> dict[str, Any]:
     """Go along the path; coverage of the surface before and after each view, and how long views took."""
     import numpy as np
 
@@ -263,8 +294,12 @@ def _walked(walk: Walk, canvas: Canvas, painter: Painter, flags: DiffusionOption
             seconds, before = seconds + ([] if step.skipped else [now - before]), now
             skipped += step.skipped
             coverage.append(float((canvas.covered & surface).sum() / size))
-    return {"coverage": coverage, "views": len(walk.cameras), "views_skipped": skipped,
-            "seconds_per_view": float(np.median(seconds)) if seconds else None}  # fmt: skip
+    return {
+        "coverage": coverage,
+        "views": len(walk.cameras),
+        "views_skipped": skipped,
+        "seconds_per_view": float(np.median(seconds)) if seconds else None,
+    }
 
 
 def _filmed(walk: Walk, canvas: Canvas, values: np.ndarray, flags: DiffusionOptions, effort: Effort) -> str:

@@ -87,13 +87,25 @@ def lit_texture(
         texture = dated_albedos(land, [(when.date().isoformat(), str(albedo))])[0].load()
     positions, _ = texel_positions(land.terrain, land.atlas.width_px, land.atlas.height_px)
     with progress_bar("baking") as progress:
-        lit = bake(occluder(mi_mesh(land.terrain, texture.values)), positions, texture.values, light,
-                   effort=Effort(subpixels=1, rays=rays), seed=seed, progress=progress)  # fmt: skip
+        lit = bake(
+            occluder(mi_mesh(land.terrain, texture.values)),
+            positions,
+            texture.values,
+            light,
+            effort=Effort(subpixels=1, rays=rays),
+            seed=seed,
+            progress=progress,
+        )
     record = _record(scene, land, when, moment, light) | {"output": str(output), "rays": rays, "seed": seed}
     if output.suffix.lower() == ".exr":
-        write_exr(output, {"": lit.radiance, "sun": lit.sun, "sky": lit.sky, "bounce": lit.bounce, "albedo": lit.albedo},
-                  header={"seasonscapes:provenance": record,
-                          "seasonscapes:units": "radiance in cd/m2; sun, sky and bounce in lux"})  # fmt: skip
+        write_exr(
+            output,
+            {"": lit.radiance, "sun": lit.sun, "sky": lit.sky, "bounce": lit.bounce, "albedo": lit.albedo},
+            header={
+                "seasonscapes:provenance": record,
+                "seasonscapes:units": "radiance in cd/m2; sun, sky and bounce in lux",
+            },
+        )
     else:
         record["exposure_ev100"] = exposure_ev100(lit.radiance, metering)
         picture = develop(lit.radiance, record["exposure_ev100"], eye=metering == "eye")
@@ -163,8 +175,12 @@ def irradiance(
     check_suffix(output, (".tif", ".tiff"))
     _check_rays(rays)
     if (time is None) == (when is None):
-        raise InputError("--time", "give either an instant or a period", got="both" if when else "neither",
-                         cure="--time T, or --from T0 --to T1 --every 1h")  # fmt: skip
+        raise InputError(
+            "--time",
+            "give either an instant or a period",
+            got="both" if when else "neither",
+            cure="--time T, or --from T0 --to T1 --every 1h",
+        )
     import numpy as np
 
     from seasonscapes.pipeline import albedo_for
@@ -193,16 +209,27 @@ def irradiance(
     grid, positions = _grid(land, spacing_m)
     middle = times[len(times) // 2]
     with progress_bar("irradiance") as progress:
-        received = dose(occluder(mi_mesh(land.terrain, albedo_for(land, middle).values)), positions, lights, hours,
-                        effort=Effort(subpixels=1, rays=rays), search_m=_SEARCH_M, seed=seed, progress=progress)  # fmt: skip
+        received = dose(
+            occluder(mi_mesh(land.terrain, albedo_for(land, middle).values)),
+            positions,
+            lights,
+            hours,
+            effort=Effort(subpixels=1, rays=rays),
+            search_m=_SEARCH_M,
+            seed=seed,
+            progress=progress,
+        )
     bands = _bands(received, period=time is None)
     _write_map(output, grid, bands, record)
     record["output"] = str(output)
     record["mean"] = {name: round(float(np.nanmean(values)), 4) for name, values in bands.items()}
     record["seconds"] = round(clock.perf_counter() - start, 2)
     lines = [f"{name:<18} mean {record['mean'][name]:.4g}" for name in bands]
-    finish(record, [*lines, f"{output}  ({grid.values.shape[1]} × {grid.values.shape[0]} cells, {record['seconds']} s)"],
-           as_json=json)  # fmt: skip
+    finish(
+        record,
+        [*lines, f"{output}  ({grid.values.shape[1]} × {grid.values.shape[0]} cells, {record['seconds']} s)"],
+        as_json=json,
+    )
 
 
 # The mesh keeps within some metres of the raster; on a cliff a cell's height may be far off it.
@@ -228,8 +255,13 @@ def _light(land: Place, model: SkyModel, time: str) -> tuple[datetime, Any, Illu
 
 def _record(scene: str, land: Place, when: datetime, moment: Any, light: Illumination) -> dict[str, Any]:
     sun = {"azimuth_deg": float(moment.sun.azimuth_deg), "elevation_deg": float(moment.sun.elevation_deg)}
-    return {"scene": scene, "time_utc": when.astimezone(UTC).isoformat(), "sun": sun, "sky": light.model,
-            "attribution": land.scene.attribution}  # fmt: skip
+    return {
+        "scene": scene,
+        "time_utc": when.astimezone(UTC).isoformat(),
+        "sun": sun,
+        "sky": light.model,
+        "attribution": land.scene.attribution,
+    }
 
 
 def _lights(land: Place, model: SkyModel, times: list[datetime]) -> tuple[list, list[datetime], np.ndarray]:
@@ -306,9 +338,21 @@ def _write_map(path: Path, grid: Any, bands: dict[str, np.ndarray], record: dict
     from seasonscapes.images import atomic_path
 
     rows, columns = grid.values.shape[:2]
-    profile = {"driver": "GTiff", "height": rows, "width": columns, "count": len(bands), "dtype": "float32",
-               "crs": grid.crs, "transform": grid.transform, "nodata": float("nan"), "compress": "deflate", "predictor": 3,
-               "tiled": True, "blockxsize": 256, "blockysize": 256}  # fmt: skip
+    profile = {
+        "driver": "GTiff",
+        "height": rows,
+        "width": columns,
+        "count": len(bands),
+        "dtype": "float32",
+        "crs": grid.crs,
+        "transform": grid.transform,
+        "nodata": float("nan"),
+        "compress": "deflate",
+        "predictor": 3,
+        "tiled": True,
+        "blockxsize": 256,
+        "blockysize": 256,
+    }
     with atomic_path(path) as temporary, rasterio.open(temporary, "w", **profile) as file:
         for index, (name, values) in enumerate(bands.items(), start=1):
             file.write(values.reshape(rows, columns), index)

@@ -78,8 +78,13 @@ class SkyOptions:
         """The declared model with these flags applied."""
         from seasonscapes.sky.models import read_sky_model, with_overrides
 
-        return with_overrides(read_sky_model(self.sky), turbidity=self.turbidity, visibility_km=self.visibility_km,
-                              ozone_du=self.ozone_du, cloudiness=self.cloudiness)  # fmt: skip
+        return with_overrides(
+            read_sky_model(self.sky),
+            turbidity=self.turbidity,
+            visibility_km=self.visibility_km,
+            ozone_du=self.ozone_du,
+            cloudiness=self.cloudiness,
+        )
 
 
 @Parameter(name="*")
@@ -122,8 +127,16 @@ class ViewOptions:
         check_range("--pitch", self.pitch, -90.0, 90.0)
         check_range("--fov", self.fov, 1.0, 169.0)
         latitude, longitude, height, above = parse_at(self.at)
-        return NamedCamera(name="at", latitude_deg=latitude, longitude_deg=longitude, height_m=height,
-                           above_ground_m=above, heading_deg=self.heading, pitch_deg=self.pitch, fov_deg=self.fov)  # fmt: skip
+        return NamedCamera(
+            name="at",
+            latitude_deg=latitude,
+            longitude_deg=longitude,
+            height_m=height,
+            above_ground_m=above,
+            heading_deg=self.heading,
+            pitch_deg=self.pitch,
+            fov_deg=self.fov,
+        )
 
     def pinhole(self, place: Place) -> Camera:
         """The camera of the chosen view."""

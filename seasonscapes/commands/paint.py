@@ -103,8 +103,13 @@ def paint(
     # First of all: a wrong file is refused before any picture is taken.
     predicted = None if albedo is None else _predicted(land, albedo, moment.utc, model)
     sources = _sources(land, pictures, moment.utc, model, size_px)
-    options = PaintOptions(mode=mode, fit_gains=harmonise, fit_haze=harmonise, near_m=near_m,
-                           predicted_sigma=1.0 if albedo is None else RELIT_SIGMA)  # fmt: skip
+    options = PaintOptions(
+        mode=mode,
+        fit_gains=harmonise,
+        fit_haze=harmonise,
+        near_m=near_m,
+        predicted_sigma=1.0 if albedo is None else RELIT_SIGMA,
+    )
     painting, without = painting_for(
         land, sources, moment.utc, model, options, within_min=pictures.within_min, predicted=predicted
     )
@@ -114,14 +119,24 @@ def paint(
         save_painting(painting, temporary)
     figures = write_figures(painting, output)
     record = painting_record(painting) | {
-        "time_utc": moment.utc.astimezone(UTC).isoformat(), "time_reading": moment.reading, "scene": land.scene.name,
-        "mode": mode, "uncalibrated": without, "painted": str(output / "painted.npz"), "figures": figures,
-        "attribution": land.scene.attribution, "seconds": round(clock.perf_counter() - start, 1),
-    }  # fmt: skip
-    lines = [f"{name:<16} gain {g[0]:.3g} {g[1]:.3g} {g[2]:.3g}  contrast {c:.2f}  paints {s:.1%}" for name, g, c, s in
-             zip(record["webcams"], record["gains"], record["contrasts"], record["shares"], strict=True)]  # fmt: skip
-    lines.append(f"{record['painted_share']:.1%} of the texture painted; haze {record['haze']:.2f} of the sky model's; "
-                 f"cameras agree within {record['scatter_after']:.2f} (log) at {record['overlaps']} places")  # fmt: skip
+        "time_utc": moment.utc.astimezone(UTC).isoformat(),
+        "time_reading": moment.reading,
+        "scene": land.scene.name,
+        "mode": mode,
+        "uncalibrated": without,
+        "painted": str(output / "painted.npz"),
+        "figures": figures,
+        "attribution": land.scene.attribution,
+        "seconds": round(clock.perf_counter() - start, 1),
+    }
+    lines = [
+        f"{name:<16} gain {g[0]:.3g} {g[1]:.3g} {g[2]:.3g}  contrast {c:.2f}  paints {s:.1%}"
+        for name, g, c, s in zip(record["webcams"], record["gains"], record["contrasts"], record["shares"], strict=True)
+    ]
+    lines.append(
+        f"{record['painted_share']:.1%} of the texture painted; haze {record['haze']:.2f} of the sky model's; "
+        f"cameras agree within {record['scatter_after']:.2f} (log) at {record['overlaps']} places"
+    )
     finish(record, [*lines, str(output / "painted.npz"), *figures.values()], as_json=json)
 
 
@@ -132,11 +147,17 @@ def painting_record(painting: Painting) -> dict:
     harmony, size = painting.harmony, painting.best.size
     shares = np.bincount(painting.best[painting.best >= 0].ravel(), minlength=len(painting.webcams)) / size
     return {
-        "webcams": list(painting.webcams), "skipped": list(painting.skipped), "gains": np.exp(harmony.log_gain).tolist(),
-        "contrasts": harmony.contrast.tolist(), "haze": harmony.haze, "overlaps": harmony.overlaps,
-        "scatter_before": harmony.scatter_before, "scatter_after": harmony.scatter_after, "shares": shares.tolist(),
+        "webcams": list(painting.webcams),
+        "skipped": list(painting.skipped),
+        "gains": np.exp(harmony.log_gain).tolist(),
+        "contrasts": harmony.contrast.tolist(),
+        "haze": harmony.haze,
+        "overlaps": harmony.overlaps,
+        "scatter_before": harmony.scatter_before,
+        "scatter_after": harmony.scatter_after,
+        "shares": shares.tolist(),
         "painted_share": float(np.mean(painting.texture.weight > 0.0)),
-    }  # fmt: skip
+    }
 
 
 def _sources(
@@ -147,12 +168,19 @@ def _sources(
 
     if not pictures.synthetic_webcams:
         if pictures.manifest is None:
-            raise InputError("--manifest", "missing", expected="the .csv of seasonscapes webcams --manifest",
-                             cure="for a synthetic scene: --synthetic-webcams")  # fmt: skip
+            raise InputError(
+                "--manifest",
+                "missing",
+                expected="the .csv of seasonscapes webcams --manifest",
+                cure="for a synthetic scene: --synthetic-webcams",
+            )
         return Sources(pictures.manifest, pictures.calibrations, pictures.masks)
     if land.synthetic is None:
-        raise InputError("--synthetic-webcams", f"the scene '{land.scene.name}' is a real place",
-                         cure="give its pictures with --manifest")  # fmt: skip
+        raise InputError(
+            "--synthetic-webcams",
+            f"the scene '{land.scene.name}' is a real place",
+            cure="give its pictures with --manifest",
+        )
     cameras = chosen_cameras(land, pictures.leave_out, size_px)
     key = content_key(
         {"place": land.key, "time": utc.isoformat(), "sky": model, "size": size_px, "revision": _WEBCAMS_REVISION}
@@ -178,8 +206,16 @@ def chosen_cameras(land: Place, leave_out: str | None, size_px: tuple[int, int])
     return chosen
 
 
-def painting_for(land: Place, sources: Sources, utc: datetime, model: SkyModel, options: PaintOptions, *,
-                 within_min: float = 30.0, predicted: np.ndarray | None = None) -> tuple[Painting, list[str]]:  # fmt: skip
+def painting_for(
+    land: Place,
+    sources: Sources,
+    utc: datetime,
+    model: SkyModel,
+    options: PaintOptions,
+    *,
+    within_min: float = 30.0,
+    predicted: np.ndarray | None = None,
+) -> tuple[Painting, list[str]]:
     """The painting of a time, from the workspace where equal files were painted before; and webcams without calibration.
 
     An interrupted painting goes on from its finished tiles.
@@ -202,9 +238,15 @@ def painting_for(land: Place, sources: Sources, utc: datetime, model: SkyModel, 
     if predicted is not None:
         inputs["predicted"] = hashlib.sha256(predicted.tobytes()).hexdigest()
     tiles = land.workspace.folder / land.scene.name / f"tiles-{content_key(inputs)}"
-    painting = build_once(land.workspace, f"{land.scene.name}/painting", inputs, suffix=".npz", save=save_painting,
-                          load=load_painting,
-                          build=lambda: _painted(land, sources, rows, model, options, tiles, predicted))  # fmt: skip
+    painting = build_once(
+        land.workspace,
+        f"{land.scene.name}/painting",
+        inputs,
+        suffix=".npz",
+        save=save_painting,
+        load=load_painting,
+        build=lambda: _painted(land, sources, rows, model, options, tiles, predicted),
+    )
     shutil.rmtree(tiles, ignore_errors=True)
     without = [row.webcam for row in rows if not (sources.calibrations / f"{row.webcam}_calibration.json").is_file()]
     return painting, without
@@ -234,8 +276,15 @@ def _predicted(land: Place, albedo: Path, utc: datetime, model: SkyModel) -> np.
     return np.where((expected.weight > 0.0)[..., None], expected.values, np.float32(np.nan))
 
 
-def _painted(land: Place, sources: Sources, rows, model: SkyModel, options: PaintOptions, tiles: Path,
-             predicted: np.ndarray | None) -> Painting:  # fmt: skip
+def _painted(
+    land: Place,
+    sources: Sources,
+    rows,
+    model: SkyModel,
+    options: PaintOptions,
+    tiles: Path,
+    predicted: np.ndarray | None,
+) -> Painting:
     import numpy as np
 
     from seasonscapes.commands.webcam_shots import shots_of
@@ -248,7 +297,15 @@ def _painted(land: Place, sources: Sources, rows, model: SkyModel, options: Pain
     terrain = occluder(mi_mesh(land.terrain, np.full(3, 0.2)))
     try:
         with progress_bar("painting") as progress:
-            return paint_shots(shots, land.terrain, land.atlas, terrain, options=options, predicted=predicted, resume=tiles,
-                               progress=progress)  # fmt: skip
+            return paint_shots(
+                shots,
+                land.terrain,
+                land.atlas,
+                terrain,
+                options=options,
+                predicted=predicted,
+                resume=tiles,
+                progress=progress,
+            )
     except ValueError as error:
         raise InputError(sources.manifest, str(error).removeprefix("paint: ")) from None

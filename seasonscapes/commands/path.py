@@ -95,8 +95,11 @@ def path(
     from seasonscapes.commands.path_map import draw_path_map
     from seasonscapes.images import write_png8
 
-    for flag, value, known in (("--curve", curve or "spline", CURVES), ("--turn", turn, TURNS),
-                               ("--kind", kind, ("refined", "unrefined"))):  # fmt: skip
+    for flag, value, known in (
+        ("--curve", curve or "spline", CURVES),
+        ("--turn", turn, TURNS),
+        ("--kind", kind, ("refined", "unrefined")),
+    ):
         if value not in known:
             raise InputError(flag, "unknown", got=value, expected=" or ".join(known))
     land = place.load(scene)
@@ -113,26 +116,51 @@ def path(
         cameras = waypoints
     else:
         count = views or (60 if given is None else given.count) or 60
-        line, lift_m, cameras = _flown(waypoints, count, curve or ("spline" if given is None else given.curve), turn,
-                                       target, closed, (ground, clearance_m))  # fmt: skip
+        line, lift_m, cameras = _flown(
+            waypoints,
+            count,
+            curve or ("spline" if given is None else given.curve),
+            turn,
+            target,
+            closed,
+            (ground, clearance_m),
+        )
     positions = np.array([camera.position_m for camera in cameras])
     above = clearance(positions, ground, 0.0)
-    note = {"scene": land.scene.name, "views": len(cameras), "length_m": line.length_m if line else None,
-            "curve": curve or (given.curve if given else "spline"), "turn": turn, "clearance_m": clearance_m,
-            "lifted_m": lift_m, "lowest_above_ground_m": float(np.nanmin(above)) if np.isfinite(above).any() else None}  # fmt: skip
+    note = {
+        "scene": land.scene.name,
+        "views": len(cameras),
+        "length_m": line.length_m if line else None,
+        "curve": curve or (given.curve if given else "spline"),
+        "turn": turn,
+        "clearance_m": clearance_m,
+        "lifted_m": lift_m,
+        "lowest_above_ground_m": float(np.nanmin(above)) if np.isfinite(above).any() else None,
+    }
     save_path(output, cameras, land.frame, note=note)
     record = {"output": str(output), **note, "map": None if map is None else str(map)}
     if map is not None:
         write_png8(map, draw_path_map(land, cameras, waypoints if line is not None else [], ground))
     lowest = note["lowest_above_ground_m"]
-    lines = [f"{output}  ({len(cameras)} views" + (f", {line.length_m / 1000:.2f} km" if line else "")
-             + (f", at least {lowest:.0f} m above the ground" if lowest is not None else "")
-             + (f", lifted by up to {lift_m:.0f} m" if lift_m > 0.0 else "") + ")"]  # fmt: skip
+    lines = [
+        f"{output}  ({len(cameras)} views"
+        + (f", {line.length_m / 1000:.2f} km" if line else "")
+        + (f", at least {lowest:.0f} m above the ground" if lowest is not None else "")
+        + (f", lifted by up to {lift_m:.0f} m" if lift_m > 0.0 else "")
+        + ")"
+    ]
     finish(record, [*lines, *([str(map)] if map else [])], as_json=json)
 
 
-def _flown(waypoints: list[Camera], count: int, curve: str, turn: str, target: np.ndarray | None, closed: bool,
-           clear_of: tuple[Ground, float]) -> tuple[Curve, float, list[Camera]]:  # fmt: skip
+def _flown(
+    waypoints: list[Camera],
+    count: int,
+    curve: str,
+    turn: str,
+    target: np.ndarray | None,
+    closed: bool,
+    clear_of: tuple[Ground, float],
+) -> tuple[Curve, float, list[Camera]]:
     import numpy as np
 
     from seasonscapes.cameras.trajectory import cleared, curve_through, views_along
@@ -169,8 +197,18 @@ def waypoints_of(land: Place, specs: list[str], fov_deg: float, size_px: tuple[i
         angles = _angles(spec, parts[3:])
         free.append(len(cameras) if angles is None else -1)
         heading, pitch = angles or (0.0, 0.0)
-        cameras.append(camera_at(land.frame, latitude, longitude, height, heading_deg=heading, pitch_deg=pitch,
-                                 fov_deg=fov_deg, size_px=size_px))  # fmt: skip
+        cameras.append(
+            camera_at(
+                land.frame,
+                latitude,
+                longitude,
+                height,
+                heading_deg=heading,
+                pitch_deg=pitch,
+                fov_deg=fov_deg,
+                size_px=size_px,
+            )
+        )
     for number in (index for index in free if index >= 0):
         # Towards the next one; the last looks on as it came.
         start = min(number, len(cameras) - 2)
@@ -179,8 +217,16 @@ def waypoints_of(land: Place, specs: list[str], fov_deg: float, size_px: tuple[i
             cameras[start + 1].position_m - cameras[start].position_m
         )
         heading, pitch = (float(value) for value in angles_from_direction(towards))
-        cameras[number] = camera_at(land.frame, latitude, longitude, height, heading_deg=heading,
-                                    pitch_deg=float(np.clip(pitch, -30.0, 30.0)), fov_deg=fov_deg, size_px=size_px)  # fmt: skip
+        cameras[number] = camera_at(
+            land.frame,
+            latitude,
+            longitude,
+            height,
+            heading_deg=heading,
+            pitch_deg=float(np.clip(pitch, -30.0, 30.0)),
+            fov_deg=fov_deg,
+            size_px=size_px,
+        )
     return cameras
 
 

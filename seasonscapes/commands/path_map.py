@@ -77,8 +77,16 @@ def _drawn(relief: np.ndarray, pixel: Callable, cameras: Sequence[Camera], waypo
     for number, camera in enumerate(waypoints):
         place = pixel(camera.position_m[None])[0]
         cv2.circle(picture, _point(place), 6 * 8, (40, 90, 220), -1, cv2.LINE_AA, 3)
-        cv2.putText(picture, str(number + 1), (int(place[0]) + 8, int(place[1]) - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.6,
-                    (20, 40, 120), 2, cv2.LINE_AA)  # fmt: skip
+        cv2.putText(
+            picture,
+            str(number + 1),
+            (int(place[0]) + 8, int(place[1]) - 8),
+            cv2.FONT_HERSHEY_SIMPLEX,
+            0.6,
+            (20, 40, 120),
+            2,
+            cv2.LINE_AA,
+        )
     return picture
 
 
@@ -100,8 +108,15 @@ def _profile(positions: np.ndarray, ground_m: np.ndarray, width_px: int) -> np.n
     solid = np.nan_to_num(ground_m, nan=low)
     area = np.concatenate([np.stack([x, y(solid)], 1), [[x[-1], _PROFILE_PX], [x[0], _PROFILE_PX]]])
     cv2.fillPoly(picture, [np.round(area * 8).astype(np.int32)], (170, 165, 155), cv2.LINE_AA, 3)
-    cv2.polylines(picture, [np.round(np.stack([x, y(positions[:, 2])], 1) * 8).astype(np.int32)], False, (230, 60, 40), 2,
-                  cv2.LINE_AA, 3)  # fmt: skip
+    cv2.polylines(
+        picture,
+        [np.round(np.stack([x, y(positions[:, 2])], 1) * 8).astype(np.int32)],
+        False,
+        (230, 60, 40),
+        2,
+        cv2.LINE_AA,
+        3,
+    )
     text = f"{way[-1] / 1000:.1f} km, {positions[:, 2].min():.0f} to {positions[:, 2].max():.0f} m"
     cv2.putText(picture, text, (14, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (60, 60, 60), 1, cv2.LINE_AA)
     return picture

@@ -92,8 +92,14 @@ def render(
     dated = dated_albedos(land, given) if given else []
     colours = albedo_of_day(land, dated, moment.utc.date(), season=season) if dated else albedo_for(land, moment.utc)
     with progress_bar("path tracing") as progress:
-        picture = render_view(build_scene(land.terrain, colours.values, light), camera, spp=spp, seed=seed,
-                              max_depth=max_depth, progress=progress)  # fmt: skip
+        picture = render_view(
+            build_scene(land.terrain, colours.values, light),
+            camera,
+            spp=spp,
+            seed=seed,
+            max_depth=max_depth,
+            progress=progress,
+        )
     ev100 = exposure_ev100(picture.radiance, metering)
     record: dict[str, Any] = {
         "output": str(output),
@@ -121,8 +127,14 @@ def render(
     else:
         save_layers(output, land, camera, chosen, picture, colours, record)
     record["seconds"] = round(clock.perf_counter() - start, 2)
-    finish(record, [f"{output}  ({size_px[0]} × {size_px[1]}, {spp} samples per pixel, EV {ev100:.1f}, "
-                    f"{record['seconds']} s, {backend.variant})"], as_json=json)  # fmt: skip
+    finish(
+        record,
+        [
+            f"{output}  ({size_px[0]} × {size_px[1]}, {spp} samples per pixel, EV {ev100:.1f}, "
+            f"{record['seconds']} s, {backend.variant})"
+        ],
+        as_json=json,
+    )
 
 
 def save_layers(path: Path, place, pinhole, view: NamedCamera, picture, albedo, record: dict) -> None:

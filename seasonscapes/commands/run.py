@@ -122,8 +122,11 @@ def run(
     stages = stages_of(job, land)
     stage_range(stages, start, until)
     ledger = run_stages(output, stages, first=start, last=until, tell=lambda line: say(f"run: {line}"))
-    record = {"output": str(output), "scene": land.scene.name, "stages": {
-        name: {"seconds": entry["seconds"], "files": len(entry["files"])} for name, entry in ledger.items()}}  # fmt: skip
+    record = {
+        "output": str(output),
+        "scene": land.scene.name,
+        "stages": {name: {"seconds": entry["seconds"], "files": len(entry["files"])} for name, entry in ledger.items()},
+    }
     lines = [f"{name:<10} {entry['seconds']:8.1f} s  {len(entry['files'])} files" for name, entry in ledger.items()]
     finish(record, [*lines, str(output)], as_json=json)
 
@@ -133,8 +136,13 @@ def stages_of(job: Job, land: Place) -> list[Stage]:
     from seasonscapes.ledger import Stage
 
     moments = [_moment(time) for time in job.times]
-    common = {"place": land.key, "imagery": _imagery(land), "sky": job.sky.model().model_dump(mode="json"),
-              "seed": job.seed, "times": job.times}  # fmt: skip
+    common = {
+        "place": land.key,
+        "imagery": _imagery(land),
+        "sky": job.sky.model().model_dump(mode="json"),
+        "seed": job.seed,
+        "times": job.times,
+    }
     view = job.view.chosen(land.scene).model_dump(mode="json")
     looks = {**common, "hours": job.hours, "view": view, "size": job.view.size_px()}
 
@@ -145,14 +153,20 @@ def stages_of(job: Job, land: Place) -> list[Stage]:
 
     return [
         stage("pictures", {**common, "pictures": picture_facts(job.pictures, land, moments)}, (), _pictures),
-        stage("calibrate", {**common, "records": record_facts(job.pictures, moments)}, ("pictures",), _calibrate, "calibration"),
+        stage(
+            "calibrate",
+            {**common, "records": record_facts(job.pictures, moments)},
+            ("pictures",),
+            _calibrate,
+            "calibration",
+        ),
         stage("albedo", common, ("pictures", "calibrate"), _albedo),
         stage("paint", common, ("pictures", "calibrate", "albedo"), _paint),
         stage("inpaint", common, ("paint", "albedo"), _inpaint),
         stage("relight", looks, ("albedo",), _relight),
         stage("distil", {**common, "effort": asdict(job.effort)}, ("albedo",), _distil, "gaussians"),
         stage("splat", looks, ("distil",), _splat),
-    ]  # fmt: skip
+    ]
 
 
 def _imagery(land: Place) -> dict | None:
@@ -212,8 +226,15 @@ def _albedo(job: Job, land: Place, folder: Path) -> list[Path]:
     from seasonscapes.commands.albedo import albedo
 
     with _logged(folder / "albedo", "albedo"):
-        albedo(job.scene, times=",".join(job.times), **_sources(job, folder), fit_curve=True, output=_albedo_file(folder),
-               sky=job.sky, place=job.place)  # fmt: skip
+        albedo(
+            job.scene,
+            times=",".join(job.times),
+            **_sources(job, folder),
+            fit_curve=True,
+            output=_albedo_file(folder),
+            sky=job.sky,
+            place=job.place,
+        )
     return [_albedo_file(folder)]
 
 
@@ -224,8 +245,15 @@ def _paint(job: Job, land: Place, folder: Path) -> list[Path]:
     for time in job.times:
         own = folder / "paint" / _stamp(time)
         with _logged(own, "paint"):
-            paint(job.scene, time=time, pictures=PictureOptions(**_sources(job, folder)), albedo=_albedo_file(folder), output=own,
-                  sky=job.sky, place=job.place)  # fmt: skip
+            paint(
+                job.scene,
+                time=time,
+                pictures=PictureOptions(**_sources(job, folder)),
+                albedo=_albedo_file(folder),
+                output=own,
+                sky=job.sky,
+                place=job.place,
+            )
         files.append(own / "painted.npz")
     return files
 
@@ -237,8 +265,18 @@ def _inpaint(job: Job, land: Place, folder: Path) -> list[Path]:
     for time in job.times:
         own = folder / "inpaint" / _stamp(time)
         with _logged(own, "inpaint"):
-            inpaint(job.scene, time=time, texture=folder / "paint" / _stamp(time) / "painted.npz", output=own / "completed.npz",
-                    figures=own, albedo=_albedo_file(folder), fast=True, seed=job.seed, sky=job.sky, place=job.place)  # fmt: skip
+            inpaint(
+                job.scene,
+                time=time,
+                texture=folder / "paint" / _stamp(time) / "painted.npz",
+                output=own / "completed.npz",
+                figures=own,
+                albedo=_albedo_file(folder),
+                fast=True,
+                seed=job.seed,
+                sky=job.sky,
+                place=job.place,
+            )
         files.append(own / "completed.npz")
     return files
 
@@ -252,8 +290,17 @@ def _relight(job: Job, land: Place, folder: Path) -> list[Path]:
 
     own = folder / "relight"
     with _logged(own, "relight"):
-        timelapse(job.scene, when=WhenOptions(times=",".join(job.hours)), view=job.view, sky=job.sky, smooth="0s",
-                  albedo=_dated(job, folder), seed=job.seed, output=own, place=job.place)  # fmt: skip
+        timelapse(
+            job.scene,
+            when=WhenOptions(times=",".join(job.hours)),
+            view=job.view,
+            sky=job.sky,
+            smooth="0s",
+            albedo=_dated(job, folder),
+            seed=job.seed,
+            output=own,
+            place=job.place,
+        )
     return [own / f"{_stamp(hour)}.png" for hour in job.hours]
 
 
@@ -262,8 +309,19 @@ def _distil(job: Job, land: Place, folder: Path) -> list[Path]:
 
     own, effort = folder / "gaussians", job.effort
     with _logged(own, "distil"):
-        distill(job.scene, output=own / "model.safetensors", albedo=_dated(job, folder), discs=effort.discs, suns=effort.suns,
-                views=effort.views, steps=effort.steps, picture_steps=effort.picture_steps, seed=job.seed, sky=job.sky, place=job.place)  # fmt: skip
+        distill(
+            job.scene,
+            output=own / "model.safetensors",
+            albedo=_dated(job, folder),
+            discs=effort.discs,
+            suns=effort.suns,
+            views=effort.views,
+            steps=effort.steps,
+            picture_steps=effort.picture_steps,
+            seed=job.seed,
+            sky=job.sky,
+            place=job.place,
+        )
     return [own / "model.safetensors"]
 
 
@@ -274,6 +332,13 @@ def _splat(job: Job, land: Place, folder: Path) -> list[Path]:
     for hour in job.hours:
         files.append(own / f"{_stamp(hour)}.png")
         with _logged(own, _stamp(hour)):
-            splat(job.scene, time=hour, model=folder / "gaussians" / "model.safetensors", view=job.view, sky=job.sky,
-                  output=files[-1], place=job.place)  # fmt: skip
+            splat(
+                job.scene,
+                time=hour,
+                model=folder / "gaussians" / "model.safetensors",
+                view=job.view,
+                sky=job.sky,
+                output=files[-1],
+                place=job.place,
+            )
     return files

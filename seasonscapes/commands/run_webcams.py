@@ -60,11 +60,18 @@ def picture_facts(pictures: RunPictures, land: Place, times: Sequence[datetime])
         if land.synthetic is None:
             raise InputError("--manifest", "missing", expected="the .csv of seasonscapes webcams --manifest")
         cameras = [camera.model_dump(mode="json") for camera in land.scene.cameras]
-        return {"cameras": cameras, "leave_out": pictures.leave_out, "kind": pictures.photo_kind,
-                "size": pictures.size_px(), "masks": _mask_hashes(pictures, [each["name"] for each in cameras])}  # fmt: skip
+        return {
+            "cameras": cameras,
+            "leave_out": pictures.leave_out,
+            "kind": pictures.photo_kind,
+            "size": pictures.size_px(),
+            "masks": _mask_hashes(pictures, [each["name"] for each in cameras]),
+        }
     rows = _chosen_rows(pictures, times)
-    return {"pictures": [[row.webcam, row.time.isoformat(), row.sha256] for row in rows],
-            "masks": _mask_hashes(pictures, [row.webcam for row in rows])}  # fmt: skip
+    return {
+        "pictures": [[row.webcam, row.time.isoformat(), row.sha256] for row in rows],
+        "masks": _mask_hashes(pictures, [row.webcam for row in rows]),
+    }
 
 
 def record_facts(pictures: RunPictures, times: Sequence[datetime]) -> dict:
@@ -100,9 +107,12 @@ def _chosen_records(pictures: RunPictures, rows: Sequence[ManifestRow]) -> list[
     paths = [pictures.calibrations / f"{webcam}_calibration.json" for webcam in sorted({row.webcam for row in rows})]
     found = [path for path in paths if path.is_file()]
     if not found:
-        raise InputError("--calibrations", "holds no record of a webcam with a picture at these times",
-                         got=str(pictures.calibrations),
-                         cure="seasonscapes calibrate SCENE --webcam ... -o FOLDER")  # fmt: skip
+        raise InputError(
+            "--calibrations",
+            "holds no record of a webcam with a picture at these times",
+            got=str(pictures.calibrations),
+            cure="seasonscapes calibrate SCENE --webcam ... -o FOLDER",
+        )
     return found
 
 
@@ -120,8 +130,9 @@ def _masks(pictures: RunPictures, webcams: Sequence[str]) -> list[Path]:
     return [path for path in (pictures.masks / f"{name}.png" for name in sorted(set(webcams))) if path.is_file()]
 
 
-def bring_pictures(pictures: RunPictures, land: Place, times: Sequence[datetime], sky: tuple[SkyModel, int],
-                   own: Path) -> list[Path]:  # fmt: skip
+def bring_pictures(
+    pictures: RunPictures, land: Place, times: Sequence[datetime], sky: tuple[SkyModel, int], own: Path
+) -> list[Path]:
     """The stage that photographs a synthetic scene, or copies the pictures of a real one, so that they stay what they are.
 
     ``sky`` is its model and the seed.
@@ -151,8 +162,9 @@ def bring_pictures(pictures: RunPictures, land: Place, times: Sequence[datetime]
     return [own / "manifest.csv", *taken, *records, *_copied_masks(pictures, list(webcams), own)]
 
 
-def bring_poses(pictures: RunPictures, land: Place, times: Sequence[datetime], seed: int,
-                folders: tuple[Path, Path]) -> list[Path]:  # fmt: skip
+def bring_poses(
+    pictures: RunPictures, land: Place, times: Sequence[datetime], seed: int, folders: tuple[Path, Path]
+) -> list[Path]:
     """The stage that copies the records of real webcams, or finds synthetic ones by their skylines.
 
     ``folders`` are that of the photographs and this stage's own.
@@ -164,8 +176,11 @@ def bring_poses(pictures: RunPictures, land: Place, times: Sequence[datetime], s
     for name, doubt in doubts.items():
         say(f"run: calibrate: {name} is left out: {doubt}")
     if not files:
-        raise InputError("run", "no webcam could be calibrated: " + "; ".join(sorted(set(doubts.values()))),
-                         cure="choose --times with a clear skyline")  # fmt: skip
+        raise InputError(
+            "run",
+            "no webcam could be calibrated: " + "; ".join(sorted(set(doubts.values()))),
+            cure="choose --times with a clear skyline",
+        )
     say(f"run: calibrate: {len(files)} of {len(files) + len(doubts)} webcams found by their skylines")
     return files
 
@@ -182,8 +197,9 @@ def _copied_masks(pictures: RunPictures, webcams: Sequence[str], own: Path) -> l
     return [_copied(path, own / "masks" / path.name) for path in _masks(pictures, webcams)]
 
 
-def _found_by_skyline(land: Place, time: datetime, seed: int, taken: Path,
-                      own: Path) -> tuple[list[Path], dict[str, str]]:  # fmt: skip
+def _found_by_skyline(
+    land: Place, time: datetime, seed: int, taken: Path, own: Path
+) -> tuple[list[Path], dict[str, str]]:
     """Records of the webcams whose skyline at a time can be trusted, and why others are not; from a compass's guess."""
     import numpy as np
 

@@ -71,8 +71,9 @@ def splat(
     splats = load_model(model)
     land = place.load(scene)
     if splats.note.get("scene") != land.scene.name:
-        raise InputError("--model", "was distilled from another scene", got=str(splats.note.get("scene")),
-                         expected=land.scene.name)  # fmt: skip
+        raise InputError(
+            "--model", "was distilled from another scene", got=str(splats.note.get("scene")), expected=land.scene.name
+        )
     chosen, camera = view.chosen(land.scene), view.pinhole(land)
     moment = resolve_time(time, chosen.latitude_deg, chosen.longitude_deg)
     say(moment.reading)
@@ -94,8 +95,14 @@ def splat(
             output, (splats, camera, light, day), (metering, subpixels, device), land.scene.attribution, record
         )
     record["seconds"] = round(clock.perf_counter() - start, 2)
-    finish(record, [f"{output}  ({record['gaussians']:,} Gaussians, sun at {record['sun']['elevation_deg']:.1f}°, "
-                    f"{record['seconds']} s)"], as_json=json)  # fmt: skip
+    finish(
+        record,
+        [
+            f"{output}  ({record['gaussians']:,} Gaussians, sun at {record['sun']['elevation_deg']:.1f}°, "
+            f"{record['seconds']} s)"
+        ],
+        as_json=json,
+    )
 
 
 def write_picture(output: Path, scene: tuple, how: tuple, attribution: str, record: dict[str, Any]) -> None:

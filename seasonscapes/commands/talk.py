@@ -38,8 +38,14 @@ def progress_bar(title: str) -> Iterator[Callable[[float], None]]:
         TimeRemainingColumn,
     )
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TextColumn("left"),
-               TimeRemainingColumn())  # fmt: skip
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
     console = Console(stderr=True)
     with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
         task = bar.add_task(title, total=1.0)
@@ -84,8 +90,9 @@ def check_range(flag: str, value: float, low: float, high: float) -> None:
 def check_suffix(output: Path, suffixes: tuple[str, ...]) -> None:
     """`InputError` about ``--output`` where its name does not end in one of the suffixes."""
     if output.suffix.lower() not in suffixes:
-        raise InputError("--output", "unknown kind of file", got=str(output),
-                         expected="a name that ends in " + " or ".join(suffixes))  # fmt: skip
+        raise InputError(
+            "--output", "unknown kind of file", got=str(output), expected="a name that ends in " + " or ".join(suffixes)
+        )
 
 
 def parse_size(text: str) -> tuple[int, int]:
@@ -110,8 +117,13 @@ def parse_at(text: str) -> tuple[float, float, float | None, float | None]:
     if len(numbers) not in (2, 3):
         raise InputError("--at", "not a place", got=text, expected=expected)
     if not (-90.0 <= numbers[0] <= 90.0 and -180.0 <= numbers[1] <= 180.0):
-        raise InputError("--at", "latitude or longitude out of range", got=text, expected=expected,
-                         cure="is the order latitude, longitude, in degrees?")  # fmt: skip
+        raise InputError(
+            "--at",
+            "latitude or longitude out of range",
+            got=text,
+            expected=expected,
+            cure="is the order latitude, longitude, in degrees?",
+        )
     if len(numbers) == 2:
         return numbers[0], numbers[1], None, 2.0
     if parts[2].startswith("+"):

@@ -28,13 +28,22 @@ def terrain(scene: str, *, options: PlaceOptions | None = None, json: bool = Fal
     seconds = clock.perf_counter() - start
     if place.fill.filled_cells:
         fill = place.fill
-        say(f"filled {fill.filled_cells} cells without data ({100 * fill.share:.2f} %) in {fill.holes} holes, "
-            f"the largest of {fill.largest_hole_cells} cells")  # fmt: skip
+        say(
+            f"filled {fill.filled_cells} cells without data ({100 * fill.share:.2f} %) in {fill.holes} holes, "
+            f"the largest of {fill.largest_hole_cells} cells"
+        )
     report = mesh_report(place.terrain, place.elevation)
     # Linux counts in KiB, macOS in bytes.
     peak_gb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1.0 if sys.platform == "darwin" else 1024.0) / 1e9
-    record = {"scene": place.scene.name, "mesh": asdict(report), "atlas": asdict(place.atlas), "fill": asdict(place.fill),
-              "frame": asdict(place.frame), "seconds": round(seconds, 2), "peak_gb": round(peak_gb, 3)}  # fmt: skip
+    record = {
+        "scene": place.scene.name,
+        "mesh": asdict(report),
+        "atlas": asdict(place.atlas),
+        "fill": asdict(place.fill),
+        "frame": asdict(place.frame),
+        "seconds": round(seconds, 2),
+        "peak_gb": round(peak_gb, 3),
+    }
     height, width = place.elevation.values.shape[:2]
     texels = place.atlas
     lines = [

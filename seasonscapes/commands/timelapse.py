@@ -76,7 +76,12 @@ def parse_duration(flag: str, text: str) -> timedelta:
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(s|min|m|h|d)", text.strip())
     unit = {"s": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
     if not match or float(match[1]) * unit[match[2]] < 1.0:
-        raise InputError(flag, "not a length of time of at least a second", got=text, expected="a number and s, min, h or d, such as 10min")  # fmt: skip
+        raise InputError(
+            flag,
+            "not a length of time of at least a second",
+            got=text,
+            expected="a number and s, min, h or d, such as 10min",
+        )
     return timedelta(seconds=float(match[1]) * unit[match[2]])
 
 
@@ -168,10 +173,19 @@ def timelapse(
     chosen = view.chosen(read_scene(path, allow_outside=place.allow_outside))
     times = when.instants(chosen.latitude_deg, chosen.longitude_deg)
     assignment = Assignment(
-        str(path.resolve()), str(place.folder().folder.resolve()), place.mesh(), chosen, view.size_px(), sky.model(),
-        albedo=tuple(parse_dated(text) for text in albedo or ()), season=season,
-        base_day=_base_day(times), seed=seed, device=device, allow_outside=place.allow_outside,
-    )  # fmt: skip
+        str(path.resolve()),
+        str(place.folder().folder.resolve()),
+        place.mesh(),
+        chosen,
+        view.size_px(),
+        sky.model(),
+        albedo=tuple(parse_dated(text) for text in albedo or ()),
+        season=season,
+        base_day=_base_day(times),
+        seed=seed,
+        device=device,
+        allow_outside=place.allow_outside,
+    )
     mine = times if work.shard is None else shard(times, work.shard)
     done = render_frames(assignment, mine, work, str(output.resolve()) if exr else None)
     record = {"scene": scene, "camera": chosen.name, "frames": len(mine), "rendered": done["rendered"]}
@@ -181,8 +195,14 @@ def timelapse(
         if not keep_frames:
             _sweep(assignment, times)
     record["seconds"] = round(clock.perf_counter() - start, 2)
-    finish(record, [f"{record.get('output', 'shard ' + str(work.shard))}  ({len(mine)} frames, {done['rendered']} rendered now, "
-                    f"{record['seconds']} s)"], as_json=json)  # fmt: skip
+    finish(
+        record,
+        [
+            f"{record.get('output', 'shard ' + str(work.shard))}  ({len(mine)} frames, {done['rendered']} rendered now, "
+            f"{record['seconds']} s)"
+        ],
+        as_json=json,
+    )
 
 
 def check_season(season: str) -> None:
@@ -255,8 +275,7 @@ def develop_film(assignment: Assignment, times: list[datetime], output: Path, lo
             return
         for time, picture in zip(times, told(), strict=True):
             about = film_record(assignment) | {"time_utc": time.isoformat()}
-            write_png(output / f"{time_stamp(time)}.png", picture,
-                      metadata={"seasonscapes": json_module.dumps(about)})  # fmt: skip
+            write_png(output / f"{time_stamp(time)}.png", picture, metadata={"seasonscapes": json_module.dumps(about)})
 
 
 def film_record(assignment: Assignment) -> dict:
@@ -265,8 +284,15 @@ def film_record(assignment: Assignment) -> dict:
     from seasonscapes.studio import held_studio
 
     scene = held_studio(assignment).place.scene
-    return {"scene": scene.name, "camera": assignment.view.name, "sky": assignment.model.name, "season": assignment.season,
-            "seed": assignment.seed, "attribution": scene.attribution, "seasonscapes": __version__}  # fmt: skip
+    return {
+        "scene": scene.name,
+        "camera": assignment.view.name,
+        "sky": assignment.model.name,
+        "season": assignment.season,
+        "seed": assignment.seed,
+        "attribution": scene.attribution,
+        "seasonscapes": __version__,
+    }
 
 
 def developed(

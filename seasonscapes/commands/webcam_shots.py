@@ -67,8 +67,9 @@ def rows_at(sources: Sources, time: datetime, *, within_min: float, flag: str = 
     return [nearest[name] for name in sorted(nearest)]
 
 
-def calibrated_views(rows: Sequence[ManifestRow], sources: Sources, frame: LocalFrame, *, progress: Progress | None = None
-                     ) -> tuple[list[tuple[CalibratedWebcam, list[Observation]]], list[str]]:  # fmt: skip
+def calibrated_views(
+    rows: Sequence[ManifestRow], sources: Sources, frame: LocalFrame, *, progress: Progress | None = None
+) -> tuple[list[tuple[CalibratedWebcam, list[Observation]]], list[str]]:
     """The views of each picture, with its webcam's calibration; and the webcams that have none yet.
 
     `InputError` where no webcam has one.
@@ -86,13 +87,18 @@ def calibrated_views(rows: Sequence[ManifestRow], sources: Sources, frame: Local
         if progress is not None:
             progress((number + 1) / len(rows))
     if not opened:
-        raise InputError(sources.calibrations, "holds no calibration of a webcam with a picture at that time",
-                         got=", ".join(without), cure="seasonscapes calibrate SCENE --webcam ... -o FOLDER")  # fmt: skip
+        raise InputError(
+            sources.calibrations,
+            "holds no calibration of a webcam with a picture at that time",
+            got=", ".join(without),
+            cure="seasonscapes calibrate SCENE --webcam ... -o FOLDER",
+        )
     return opened, without
 
 
-def shots_of(place: Place, rows: Sequence[ManifestRow], sources: Sources, model: SkyModel, *,
-             progress: Progress | None = None) -> tuple[list[Shot], list[str]]:  # fmt: skip
+def shots_of(
+    place: Place, rows: Sequence[ManifestRow], sources: Sources, model: SkyModel, *, progress: Progress | None = None
+) -> tuple[list[Shot], list[str]]:
     """A shot for each perspective picture, several for each panorama; and the webcams that have no calibration yet."""
     from seasonscapes.daylight import light_for
     from seasonscapes.texturing.shots import Shot
@@ -141,8 +147,12 @@ def _mask(sources: Sources, webcam: str, shape: tuple[int, int]) -> np.ndarray:
     except ValueError:
         raise InputError(path, "not a readable picture") from None
     if mask.shape != shape:
-        raise InputError(path, "the mask has another size than its webcam's pictures",
-                         got=f"{mask.shape[1]} x {mask.shape[0]}", expected=f"{shape[1]} x {shape[0]}")  # fmt: skip
+        raise InputError(
+            path,
+            "the mask has another size than its webcam's pictures",
+            got=f"{mask.shape[1]} x {mask.shape[0]}",
+            expected=f"{shape[1]} x {shape[0]}",
+        )
     return mask
 
 
@@ -158,9 +168,16 @@ def pose_in_frame(world_from_camera: np.ndarray, own: LocalFrame, other: LocalFr
     return pose
 
 
-def make_webcams(place: Place, time: datetime, model: SkyModel, folder: Path, *,
-                 cameras: Mapping[str, Camera | Panorama], seed: int = 0,
-                 progress: Progress | None = None) -> Sources:  # fmt: skip
+def make_webcams(
+    place: Place,
+    time: datetime,
+    model: SkyModel,
+    folder: Path,
+    *,
+    cameras: Mapping[str, Camera | Panorama],
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Sources:
     """Photograph a synthetic place as webcams would, into files as real ones leave them. Finished pictures are kept.
 
     Poses are off by what a good calibration leaves (0.01° and 0.5 m), and the records say so.
@@ -168,9 +185,16 @@ def make_webcams(place: Place, time: datetime, model: SkyModel, folder: Path, *,
     return make_webcam_series(place, [time], model, folder, cameras=cameras, seed=seed, progress=progress)
 
 
-def make_webcam_series(place: Place, times: Sequence[datetime], model: SkyModel, folder: Path, *,
-                       cameras: Mapping[str, Camera | Panorama], seed: int = 0,
-                       progress: Progress | None = None) -> Sources:  # fmt: skip
+def make_webcam_series(
+    place: Place,
+    times: Sequence[datetime],
+    model: SkyModel,
+    folder: Path,
+    *,
+    cameras: Mapping[str, Camera | Panorama],
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Sources:
     """`make_webcams` at several times; each webcam's light transport is traced once for all of them.
 
     Pictures of a single time bear the webcam's name alone, those of several its name and time.
@@ -186,8 +210,11 @@ def make_webcam_series(place: Place, times: Sequence[datetime], model: SkyModel,
     def record(webcam: str) -> Path:
         return folder / f"{webcam}_calibration.json"
 
-    left = {webcam: camera for webcam, camera in cameras.items()
-            if not all(path.is_file() for path in (record(webcam), *(folder / name for name in names(webcam))))}  # fmt: skip
+    left = {
+        webcam: camera
+        for webcam, camera in cameras.items()
+        if not all(path.is_file() for path in (record(webcam), *(folder / name for name in names(webcam))))
+    }
     sigmas = PoseSigmas(0.5, 0.5, 0.01, 0.01, 0.01)
     for webcam, made in photographs(place, times, model, left, poses=sigmas, seed=seed, progress=progress):
         for name, picture in zip(names(webcam), made, strict=True):
@@ -200,9 +227,16 @@ def make_webcam_series(place: Place, times: Sequence[datetime], model: SkyModel,
     return Sources(folder / "manifest.csv", folder)
 
 
-def photographs(place: Place, times: Sequence[datetime], model: SkyModel, cameras: Mapping[str, Camera | Panorama], *,
-                poses: PoseSigmas | None = None, seed: int = 0,
-                progress: Progress | None = None) -> Iterator[tuple[str, list[SyntheticPicture]]]:  # fmt: skip
+def photographs(
+    place: Place,
+    times: Sequence[datetime],
+    model: SkyModel,
+    cameras: Mapping[str, Camera | Panorama],
+    *,
+    poses: PoseSigmas | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Iterator[tuple[str, list[SyntheticPicture]]]:
     """Each webcam of a synthetic place and its pictures, in the land's colours of each day; see `webcam_series`."""
     from seasonscapes.daylight import light_for
     from seasonscapes.evaluation.synthetic_webcams import Hour, webcam_series
@@ -218,8 +252,15 @@ def photographs(place: Place, times: Sequence[datetime], model: SkyModel, camera
                 albedos[day] = albedo_for(place, time).values
             hours.append(Hour(time, light_for(place, camera, model, time)[0], albedos[day]))
         try:
-            made = webcam_series(place.terrain, name, camera, hours, poses=poses, seed=seed,
-                                 progress=lambda share, n=number: tell((n + share) / len(cameras)))  # fmt: skip
+            made = webcam_series(
+                place.terrain,
+                name,
+                camera,
+                hours,
+                poses=poses,
+                seed=seed,
+                progress=lambda share, n=number: tell((n + share) / len(cameras)),
+            )
         except ValueError as error:
             if "sees no terrain" not in str(error):
                 raise
@@ -232,8 +273,25 @@ def _write_pose(path: Path, name: str, camera: Camera | Panorama, sigmas, frame:
     from seasonscapes.calibration.record import write_calibration
     from seasonscapes.calibration.resection import Calibration
 
-    deviations = [sigmas.heading_deg, sigmas.pitch_deg, sigmas.roll_deg, sigmas.horizontal_m, sigmas.horizontal_m,
-                  sigmas.vertical_m, sigmas.log_focal, 0.0, 0.0]  # fmt: skip
-    solved = Calibration(camera, 0.0, values_of(camera, np.eye(3)), np.diag(np.square(deviations)), (), np.zeros((0, 2)),
-                         np.zeros(0, bool), 0.0)  # fmt: skip
+    deviations = [
+        sigmas.heading_deg,
+        sigmas.pitch_deg,
+        sigmas.roll_deg,
+        sigmas.horizontal_m,
+        sigmas.horizontal_m,
+        sigmas.vertical_m,
+        sigmas.log_focal,
+        0.0,
+        0.0,
+    ]
+    solved = Calibration(
+        camera,
+        0.0,
+        values_of(camera, np.eye(3)),
+        np.diag(np.square(deviations)),
+        (),
+        np.zeros((0, 2)),
+        np.zeros(0, bool),
+        0.0,
+    )
     write_calibration(path, name, solved, frame)

@@ -15,8 +15,13 @@ _PAPER = 0.97
 _HEAT = np.array([[0.0, 0.0, 0.02], [0.32, 0.07, 0.48], [0.71, 0.21, 0.47], [0.98, 0.53, 0.38], [0.99, 0.99, 0.75]])
 
 
-def comparison(pictures: Mapping[str, np.ndarray], *, mask: np.ndarray | None = None,
-               window: tuple[int, int, int, int] | None = None, magnify: int = 3) -> np.ndarray:  # fmt: skip
+def comparison(
+    pictures: Mapping[str, np.ndarray],
+    *,
+    mask: np.ndarray | None = None,
+    window: tuple[int, int, int, int] | None = None,
+    magnify: int = 3,
+) -> np.ndarray:
     """One row of pictures with their names, then the FLIP error of the second against the first.
 
     Parameters
@@ -46,8 +51,13 @@ def comparison(pictures: Mapping[str, np.ndarray], *, mask: np.ndarray | None = 
     if window is not None:
         left, top, width, height = window
         size = min(magnify * width, shown[0].shape[1])
-        rows.append(_row([_grown(picture[top : top + height, left : left + width], size) for picture in [*shown, error]],
-                         [""] * (len(shown) + 1), shown[0].shape[1]))  # fmt: skip
+        rows.append(
+            _row(
+                [_grown(picture[top : top + height, left : left + width], size) for picture in [*shown, error]],
+                [""] * (len(shown) + 1),
+                shown[0].shape[1],
+            )
+        )
     return np.concatenate(rows)
 
 
@@ -65,8 +75,9 @@ def heat(values: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(values, place, channel) for channel in _HEAT.T], axis=-1)
 
 
-def steepest_window(normal: np.ndarray, depth_m: np.ndarray, *, share: float = 1.0 / 3.0,
-                    nearest_m: float = 60.0) -> tuple[int, int, int, int]:  # fmt: skip
+def steepest_window(
+    normal: np.ndarray, depth_m: np.ndarray, *, share: float = 1.0 / 3.0, nearest_m: float = 60.0
+) -> tuple[int, int, int, int]:
     """The part of a view that shows most steep land: left, top, width, height [px].
 
     Parameters

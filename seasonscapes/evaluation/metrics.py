@@ -54,8 +54,9 @@ class Score:
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 
-def score(truth: np.ndarray, picture: np.ndarray, mask: np.ndarray | None = None, *, mode: str = "valid",
-          lpips=None) -> Score:  # fmt: skip
+def score(
+    truth: np.ndarray, picture: np.ndarray, mask: np.ndarray | None = None, *, mode: str = "valid", lpips=None
+) -> Score:
     """All metrics of a picture against the truth.
 
     Parameters
@@ -104,8 +105,15 @@ def ssim_map(truth: np.ndarray, picture: np.ndarray) -> np.ndarray:
 
     rim = _SSIM_WINDOW // 2
     padded = [np.pad(image, ((rim, rim), (rim, rim), (0, 0))) for image in (truth, picture)]
-    _, full = structural_similarity(*padded, gaussian_weights=True, sigma=_SSIM_SIGMA, use_sample_covariance=False,
-                                    data_range=1.0, channel_axis=2, full=True)  # fmt: skip
+    _, full = structural_similarity(
+        *padded,
+        gaussian_weights=True,
+        sigma=_SSIM_SIGMA,
+        use_sample_covariance=False,
+        data_range=1.0,
+        channel_axis=2,
+        full=True,
+    )
     return full[rim:-rim, rim:-rim].mean(axis=2)
 
 
@@ -166,8 +174,9 @@ def _framed(truth: np.ndarray, picture: np.ndarray, mask: np.ndarray, mode: str)
     return truth, np.where(inside, picture, truth)
 
 
-def _checked(truth: np.ndarray, picture: np.ndarray, mask: np.ndarray | None,
-             mode: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+def _checked(
+    truth: np.ndarray, picture: np.ndarray, mask: np.ndarray | None, mode: str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     if mode not in MODES:
         raise ValueError(f"score: mode {mode!r}, expected one of {', '.join(MODES)}")
     truth, picture = np.asarray(truth, np.float64), np.asarray(picture, np.float64)

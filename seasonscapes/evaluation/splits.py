@@ -91,12 +91,15 @@ def held_out_views(webcams: Sequence[str], count: int, *, seed: int = 0) -> tupl
     if not 1 <= count < len(names):
         raise ValueError(f"held_out_views: {count} of {len(names)} webcams, expected 1 to {len(names) - 1}")
     chosen = set(np.random.default_rng(seed).choice(names, count, replace=False).tolist())
-    return (tuple(name for name in webcams if webcam_of(name) not in chosen),
-            tuple(name for name in webcams if webcam_of(name) in chosen))  # fmt: skip
+    return (
+        tuple(name for name in webcams if webcam_of(name) not in chosen),
+        tuple(name for name in webcams if webcam_of(name) in chosen),
+    )
 
 
-def held_out_hours(times: Sequence[datetime], every: int, *,
-                   first: int = 1) -> tuple[tuple[datetime, ...], tuple[datetime, ...]]:  # fmt: skip
+def held_out_hours(
+    times: Sequence[datetime], every: int, *, first: int = 1
+) -> tuple[tuple[datetime, ...], tuple[datetime, ...]]:
     """Times to use, and times to score at: of all in order every ``every``-th, beginning with number ``first``.
 
     With ``first`` ≥ 1 the day's first hour is used, so that what is scored lies between hours that were seen.
@@ -131,8 +134,12 @@ def refuse_leaks(evaluated: Sequence[Use], used: Sequence[Use], *, kind: str = "
     """
     if kind not in KINDS:
         raise ValueError(f"refuse_leaks: kind {kind!r}, expected one of {', '.join(KINDS)}")
-    found = [f"{one.webcam} at {one.instant.isoformat()} was used for {other.purpose} ({why})"
-             for one in evaluated for other in used if (why := _leak(one, other, kind))]  # fmt: skip
+    found = [
+        f"{one.webcam} at {one.instant.isoformat()} was used for {other.purpose} ({why})"
+        for one in evaluated
+        for other in used
+        if (why := _leak(one, other, kind))
+    ]
     if found:
         raise Leak("evaluation pictures that are not held out: " + "; ".join(dict.fromkeys(found)))
 

@@ -62,8 +62,15 @@ def albedo_error(truth: np.ndarray, estimate: np.ndarray, weight: np.ndarray | N
     scale = np.where(power > 0.0, (weight @ (truth * estimate)) / np.where(power > 0.0, power, 1.0), 1.0)
     off, scaled = np.abs(estimate - truth), np.abs(estimate * scale - truth)
     rmse = float(np.sqrt(mean(off**2)))
-    return AlbedoError(mean(off), rmse, float("inf") if rmse == 0.0 else float(-20.0 * np.log10(rmse)), scale, mean(scaled),
-                       float(np.sqrt(mean(scaled**2))), angle_deg(truth, estimate))  # fmt: skip
+    return AlbedoError(
+        mean(off),
+        rmse,
+        float("inf") if rmse == 0.0 else float(-20.0 * np.log10(rmse)),
+        scale,
+        mean(scaled),
+        float(np.sqrt(mean(scaled**2))),
+        angle_deg(truth, estimate),
+    )
 
 
 def shadow_iou(truth_lit: np.ndarray, estimate_lit: np.ndarray, mask: np.ndarray | None = None) -> float:

@@ -78,9 +78,19 @@ class SyntheticPicture:
     gbuffer: GBuffer
 
 
-def webcam_series(terrain: Terrain, webcam: str, camera: Camera | Panorama, hours: Sequence[Hour], *, faults: WebcamFaults = TYPICAL,
-                  poses: PoseSigmas | None = None, foreground: bool = False, effort: Effort = QUICK, seed: int = 0,
-                  progress: Progress | None = None) -> list[SyntheticPicture]:  # fmt: skip
+def webcam_series(
+    terrain: Terrain,
+    webcam: str,
+    camera: Camera | Panorama,
+    hours: Sequence[Hour],
+    *,
+    faults: WebcamFaults = TYPICAL,
+    poses: PoseSigmas | None = None,
+    foreground: bool = False,
+    effort: Effort = QUICK,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> list[SyntheticPicture]:
     """Pictures of one webcam at several hours. Its pose error and its foreground are the same in all of them.
 
     Parameters
@@ -117,8 +127,9 @@ def webcam_series(terrain: Terrain, webcam: str, camera: Camera | Panorama, hour
         if foreground:
             radiance, front = add_foreground(radiance, np.random.default_rng(stand))
         encoded, done = degrade(radiance, faults, rng)
-        observation = Observation(linear_from_srgb(encoded / np.float32(255.0)), np.ones(front.shape, bool), believed,
-                                  hour.time, webcam)  # fmt: skip
+        observation = Observation(
+            linear_from_srgb(encoded / np.float32(255.0)), np.ones(front.shape, bool), believed, hour.time, webcam
+        )
         pictures.append(
             SyntheticPicture(observation, encoded, camera, radiance, view.surface, front, done, view.gbuffer)
         )

@@ -10,8 +10,9 @@ import numpy as np
 DISTANCE_EDGES_M = (0.0, 1000.0, 2000.0, 4000.0, 8000.0, np.inf)
 
 
-def by_class(truth: np.ndarray, picture: np.ndarray, labels: np.ndarray, names: Mapping[int, str],
-             mask: np.ndarray | None = None) -> list[dict]:  # fmt: skip
+def by_class(
+    truth: np.ndarray, picture: np.ndarray, labels: np.ndarray, names: Mapping[int, str], mask: np.ndarray | None = None
+) -> list[dict]:
     """PSNR of each class of pixels.
 
     Parameters
@@ -33,8 +34,14 @@ def by_class(truth: np.ndarray, picture: np.ndarray, labels: np.ndarray, names: 
     return [_row(name, squared, mask & (labels == label), mask) for label, name in names.items()]
 
 
-def by_distance(truth: np.ndarray, picture: np.ndarray, depth_m: np.ndarray, mask: np.ndarray | None = None, *,
-                edges_m: Sequence[float] = DISTANCE_EDGES_M) -> list[dict]:  # fmt: skip
+def by_distance(
+    truth: np.ndarray,
+    picture: np.ndarray,
+    depth_m: np.ndarray,
+    mask: np.ndarray | None = None,
+    *,
+    edges_m: Sequence[float] = DISTANCE_EDGES_M,
+) -> list[dict]:
     """PSNR of the pixels between each two distances; rows as in `by_class`."""
     names = {i + 1: _between(edges_m[i], edges_m[i + 1]) for i in range(len(edges_m) - 1)}
     return by_class(truth, picture, np.digitize(depth_m, edges_m), names, mask)
@@ -62,8 +69,13 @@ def summary(records: Sequence[Mapping[str, float]]) -> dict[str, dict[str, float
         finite = values[np.isfinite(values)]
         told = (np.mean, np.std, np.median) if finite.size else (lambda _: float("nan"),) * 3
         mean, deviation, median = (float(each(finite)) for each in told)
-        result[name] = {"n": len(values), "mean": mean, "std": deviation, "median": median,
-                        "not_finite": int(len(values) - finite.size)}  # fmt: skip
+        result[name] = {
+            "n": len(values),
+            "mean": mean,
+            "std": deviation,
+            "median": median,
+            "not_finite": int(len(values) - finite.size),
+        }
     return result
 
 
@@ -81,8 +93,13 @@ def table_lines(rows: Sequence[Mapping[str, object]], *, digits: int = 3, markdo
     heads = list(dict.fromkeys(key for row in rows for key in row))
     cells = [heads, *([_cell(row.get(head), digits) for head in heads] for row in rows)]
     widths = [max(len(line[i]) for line in cells) for i in range(len(heads))]
-    lines = [[text.ljust(width) if i == 0 else text.rjust(width)
-              for i, (text, width) in enumerate(zip(line, widths, strict=True))] for line in cells]  # fmt: skip
+    lines = [
+        [
+            text.ljust(width) if i == 0 else text.rjust(width)
+            for i, (text, width) in enumerate(zip(line, widths, strict=True))
+        ]
+        for line in cells
+    ]
     if not markdown:
         return ["  ".join(line).rstrip() for line in lines]
     rule = ["-" * width if i == 0 else "-" * (width - 1) + ":" for i, width in enumerate(widths)]

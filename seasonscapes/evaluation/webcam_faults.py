@@ -155,10 +155,15 @@ def perturb_pose(camera: View, sigmas: PoseSigmas, rng: np.random.Generator) -> 
     focal length of such a panorama changes in its rows alone.
     """
     draw = rng.normal(0.0, 1.0, 7)
-    error = {"east_m": draw[0] * sigmas.horizontal_m, "north_m": draw[1] * sigmas.horizontal_m,
-             "up_m": draw[2] * sigmas.vertical_m, "heading_deg": draw[3] * sigmas.heading_deg,
-             "pitch_deg": draw[4] * sigmas.pitch_deg, "roll_deg": draw[5] * sigmas.roll_deg,
-             "log_focal": draw[6] * sigmas.log_focal}  # fmt: skip
+    error = {
+        "east_m": draw[0] * sigmas.horizontal_m,
+        "north_m": draw[1] * sigmas.horizontal_m,
+        "up_m": draw[2] * sigmas.vertical_m,
+        "heading_deg": draw[3] * sigmas.heading_deg,
+        "pitch_deg": draw[4] * sigmas.pitch_deg,
+        "roll_deg": draw[5] * sigmas.roll_deg,
+        "log_focal": draw[6] * sigmas.log_focal,
+    }
     error = {name: float(value) for name, value in error.items()}
     level = rotation_from_angles(0.0, 0.0)
     turn = rotation_from_angles(error["heading_deg"], 0.0) @ level.T
@@ -178,8 +183,9 @@ _WALLS = np.array([[0.62, 0.58, 0.50], [0.20, 0.13, 0.08], [0.45, 0.42, 0.36]])
 _STEEL, _PANE = np.array([0.30, 0.31, 0.32]), np.array([0.05, 0.06, 0.07])
 
 
-def add_foreground(radiance: np.ndarray, rng: np.random.Generator, *, houses: int = 3,
-                   mast: bool = True) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+def add_foreground(
+    radiance: np.ndarray, rng: np.random.Generator, *, houses: int = 3, mast: bool = True
+) -> tuple[np.ndarray, np.ndarray]:
     """Stand houses and a mast, which no elevation model knows, before a picture.
 
     Parameters
@@ -208,8 +214,12 @@ def add_foreground(radiance: np.ndarray, rng: np.random.Generator, *, houses: in
         _fill(image, mask, [(x, height), (x, top), (x + thick, top), (x + thick, height)], light * _STEEL)
         for rung in np.linspace(top, 0.5 * height, 3):
             y, half = int(rung), int(0.02 * size)
-            _fill(image, mask, [(x - half, y), (x + half, y), (x + half, y + thick), (x - half, y + thick)],
-                  light * _STEEL)  # fmt: skip
+            _fill(
+                image,
+                mask,
+                [(x - half, y), (x + half, y), (x + half, y + thick), (x - half, y + thick)],
+                light * _STEEL,
+            )
     return image, mask.astype(bool)
 
 
@@ -222,18 +232,34 @@ def _house(image: np.ndarray, mask: np.ndarray, middle: float, light: float, rng
     shade = rng.uniform(0.25, 1.1, 2)  # sides turned to and from the light
     wall, roof = _WALLS[rng.integers(len(_WALLS))], _ROOFS[rng.integers(len(_ROOFS))]
     corner = middle + rng.uniform(-0.3, 0.3) * half
-    _fill(image, mask, [(middle - half, height), (middle - half, eaves), (corner, eaves), (corner, height)],
-          light * shade[0] * wall)  # fmt: skip
-    _fill(image, mask, [(corner, height), (corner, eaves), (middle + half, eaves), (middle + half, height)],
-          light * shade[1] * wall)  # fmt: skip
+    _fill(
+        image,
+        mask,
+        [(middle - half, height), (middle - half, eaves), (corner, eaves), (corner, height)],
+        light * shade[0] * wall,
+    )
+    _fill(
+        image,
+        mask,
+        [(corner, height), (corner, eaves), (middle + half, eaves), (middle + half, height)],
+        light * shade[1] * wall,
+    )
     out = 1.12 * half
-    _fill(image, mask, [(middle - out, eaves), (middle - 0.7 * half, ridge), (middle + 0.7 * half, ridge),
-                        (middle + out, eaves)], light * rng.uniform(0.5, 1.1) * roof)  # fmt: skip
+    _fill(
+        image,
+        mask,
+        [(middle - out, eaves), (middle - 0.7 * half, ridge), (middle + 0.7 * half, ridge), (middle + out, eaves)],
+        light * rng.uniform(0.5, 1.1) * roof,
+    )
     pane = 0.1 * half
     for x in np.linspace(middle - 0.75 * half, middle + 0.75 * half, 5):
         for y in np.arange(eaves + 2.0 * pane, height, 5.0 * pane):
-            _fill(image, mask, [(x - pane, y), (x + pane, y), (x + pane, y + 2.5 * pane), (x - pane, y + 2.5 * pane)],
-                  light * _PANE)  # fmt: skip
+            _fill(
+                image,
+                mask,
+                [(x - pane, y), (x + pane, y), (x + pane, y + 2.5 * pane), (x - pane, y + 2.5 * pane)],
+                light * _PANE,
+            )
 
 
 def _fill(image: np.ndarray, mask: np.ndarray, corners: list[tuple[float, float]], colour: np.ndarray) -> None:

@@ -79,9 +79,22 @@ def time_features(state: LightState) -> np.ndarray:
     body = state.bodies[0][0] if len(state.bodies[0]) else np.zeros(3)
     strength = state.bodies[1][0] / state.global_lx if len(state.bodies[0]) else np.zeros(3)
     sky = state.sky_lx / state.global_lx
-    return np.array([*body, float(body @ body > 0.0), np.log1p(strength @ LUMINANCE_WEIGHTS), strength[0] - strength[2],
-                     sky @ LUMINANCE_WEIGHTS, sky[2] - sky[0], (np.log10(state.global_lx) - 4.5) / 2.0,
-                     np.sin(season), np.cos(season), np.sin(2.0 * season), np.cos(2.0 * season), 1.0])  # fmt: skip
+    return np.array(
+        [
+            *body,
+            float(body @ body > 0.0),
+            np.log1p(strength @ LUMINANCE_WEIGHTS),
+            strength[0] - strength[2],
+            sky @ LUMINANCE_WEIGHTS,
+            sky[2] - sky[0],
+            (np.log10(state.global_lx) - 4.5) / 2.0,
+            np.sin(season),
+            np.cos(season),
+            np.sin(2.0 * season),
+            np.cos(2.0 * season),
+            1.0,
+        ]
+    )
 
 
 def fourier_embedding(means: np.ndarray, size: int = EMBEDDING, *, seed: int = 0) -> np.ndarray:
@@ -110,8 +123,17 @@ class Appearance(nn.Module):
         T, how many free codes ``code`` has.
     """
 
-    def __init__(self, kind: str, albedo: np.ndarray, around: np.ndarray, transport: Transport, embedding: np.ndarray, *,
-                 times: int = 1, seed: int = 0):  # fmt: skip
+    def __init__(
+        self,
+        kind: str,
+        albedo: np.ndarray,
+        around: np.ndarray,
+        transport: Transport,
+        embedding: np.ndarray,
+        *,
+        times: int = 1,
+        seed: int = 0,
+    ):
         super().__init__()
         if kind not in KINDS:
             raise ValueError(f"kind: got {kind!r}, expected one of {', '.join(KINDS)}")
@@ -143,8 +165,9 @@ class Appearance(nn.Module):
             embedding + 3 + {"code": CODE, "sun": TIME_FEATURES, "full": TIME_FEATURES + PHYSICAL_FEATURES}[self.kind]
         )
 
-    def forward(self, index: torch.Tensor, time: torch.Tensor, lights: LightTensors,
-                code: torch.Tensor | None = None) -> torch.Tensor:  # fmt: skip
+    def forward(
+        self, index: torch.Tensor, time: torch.Tensor, lights: LightTensors, code: torch.Tensor | None = None
+    ) -> torch.Tensor:
         """Colours ``(n, 3)`` of Gaussians ``index (n,)`` at ``time (n,)``, or all at one time ``()``.
 
         ``code (32,)`` takes the place of the codes of ``kind="code"``.
@@ -212,8 +235,9 @@ def _network(inputs: int, width: int, generator: torch.Generator) -> nn.Sequenti
 
 
 @torch.no_grad()
-def colours_at(appearance: Appearance, state: LightState, season: int = 0, *,
-               code: torch.Tensor | None = None) -> np.ndarray:  # fmt: skip
+def colours_at(
+    appearance: Appearance, state: LightState, season: int = 0, *, code: torch.Tensor | None = None
+) -> np.ndarray:
     """Colours ``(N, 3)`` float32 of all Gaussians under a light; radiance is colour × ``state.global_lx`` / π."""
     lights, time = light_tensors([state], [season]), torch.zeros((), dtype=torch.long)
     count = appearance.albedo.shape[1]

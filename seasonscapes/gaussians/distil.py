@@ -27,8 +27,15 @@ from seasonscapes.images import atomic_path
 
 Progress = Callable[[float], None]
 # Learning rates of the parameters; all fall to a tenth over each stage, and begin the second at `_SECOND` of these.
-RATES = {"log_colour": 2e-3, "log_gain": 5e-3, "shift": 1e-3, "log_softness": 1e-2, "embedding": 5e-3, "codes": 5e-3,
-         "mlp": 2e-3}  # fmt: skip
+RATES = {
+    "log_colour": 2e-3,
+    "log_gain": 5e-3,
+    "shift": 1e-3,
+    "log_softness": 1e-2,
+    "embedding": 5e-3,
+    "codes": 5e-3,
+    "mlp": 2e-3,
+}
 _SECOND, _FALL = 0.5, 0.1
 _SURFACE_SHARE = 0.5
 
@@ -80,24 +87,37 @@ class Lessons:
 
     def __post_init__(self):
         if not len(self.states) == len(self.seasons) == len(self.colours) > 0:
-            raise ValueError(f"Lessons: got {len(self.states)} lights, {len(self.seasons)} seasons and "
-                             f"{len(self.colours)} sets of colours, expected one of each for every time")  # fmt: skip
+            raise ValueError(
+                f"Lessons: got {len(self.states)} lights, {len(self.seasons)} seasons and "
+                f"{len(self.colours)} sets of colours, expected one of each for every time"
+            )
         if not np.isfinite(self.colours).all():
             raise ValueError(f"Lessons: {int(np.sum(~np.isfinite(self.colours)))} colours are not finite")
 
 
-def lessons_from(states: Sequence[LightState], seasons: Sequence[int], albedo: np.ndarray,
-                 irradiance: np.ndarray) -> Lessons:  # fmt: skip
+def lessons_from(
+    states: Sequence[LightState], seasons: Sequence[int], albedo: np.ndarray, irradiance: np.ndarray
+) -> Lessons:
     """Lessons from irradiance ``(T, N, 3)`` [lx] of discs with dated albedos ``(M, N, 3)``."""
-    colours = np.stack([
-        albedo[season] * received / np.float32(state.global_lx)
-        for state, season, received in zip(states, seasons, irradiance, strict=True)
-    ])  # fmt: skip
+    colours = np.stack(
+        [
+            albedo[season] * received / np.float32(state.global_lx)
+            for state, season, received in zip(states, seasons, irradiance, strict=True)
+        ]
+    )
     return Lessons(list(states), list(seasons), colours.astype(np.float32))
 
 
-def distil(appearance: Appearance, lessons: Lessons, frames: Sequence[Frame] = (), schedule: Schedule | None = None, *,
-           seed: int = 0, checkpoint: Path | None = None, progress: Progress | None = None) -> list[float]:  # fmt: skip
+def distil(
+    appearance: Appearance,
+    lessons: Lessons,
+    frames: Sequence[Frame] = (),
+    schedule: Schedule | None = None,
+    *,
+    seed: int = 0,
+    checkpoint: Path | None = None,
+    progress: Progress | None = None,
+) -> list[float]:
     """Train an appearance in place; the loss of every step that was taken by this call.
 
     Parameters
@@ -159,8 +179,9 @@ def _optimiser(appearance: Appearance) -> torch.optim.Adam:
     groups: dict[str, list] = {}
     for name, parameter in appearance.named_parameters():
         groups.setdefault(name.split(".")[0], []).append(parameter)
-    return torch.optim.Adam([{"params": group, "lr": RATES[name], "name": name} for name, group in groups.items()],
-                            eps=1e-15, fused=True)  # fmt: skip
+    return torch.optim.Adam(
+        [{"params": group, "lr": RATES[name], "name": name} for name, group in groups.items()], eps=1e-15, fused=True
+    )
 
 
 def _set_rates(optimiser: torch.optim.Adam, step: int, schedule: Schedule) -> None:
@@ -170,8 +191,9 @@ def _set_rates(optimiser: torch.optim.Adam, step: int, schedule: Schedule) -> No
         group["lr"] = RATES[group["name"]] * (_SECOND if second else 1.0) * _FALL**share
 
 
-def fit_code(appearance: Appearance, lights: LightTensors, frame: Frame, *, steps: int = 128, rate: float = 0.1,
-             seed: int = 0) -> torch.Tensor:  # fmt: skip
+def fit_code(
+    appearance: Appearance, lights: LightTensors, frame: Frame, *, steps: int = 128, rate: float = 0.1, seed: int = 0
+) -> torch.Tensor:
     """The free code ``(32,)`` of a picture that was not trained on, from its usable pixels (WildGaussians' protocol)."""
     picture = picture_of(frame)
     # From the middle of the codes that were learned, where the network is at home.
@@ -200,8 +222,10 @@ def save_checkpoint(path: Path, appearance: Appearance, optimiser: torch.optim.A
     tensors = {f"value.{name}": parameter.detach() for name, parameter in appearance.named_parameters()}
     names = {id(parameter): name for name, parameter in appearance.named_parameters()}
     for parameter, memory in optimiser.state.items():
-        tensors |= {f"{key}.{names[id(parameter)]}": value.reshape(-1) if key == "step" else value
-                    for key, value in memory.items()}  # fmt: skip
+        tensors |= {
+            f"{key}.{names[id(parameter)]}": value.reshape(-1) if key == "step" else value
+            for key, value in memory.items()
+        }
     with atomic_path(path) as temporary:
         save_file(tensors, temporary, metadata={"run": json.dumps(run, sort_keys=True), "step": str(step)})
 
@@ -219,7 +243,9 @@ def load_checkpoint(path: Path, appearance: Appearance, optimiser: torch.optim.A
             if value.shape != parameter.shape:
                 raise ValueError(f"{path}: {name} has shape {tuple(value.shape)}, expected {tuple(parameter.shape)}")
             parameter.data.copy_(value)
-            optimiser.state[parameter] = {"step": file.get_tensor(f"step.{name}").reshape(()),
-                                          "exp_avg": file.get_tensor(f"exp_avg.{name}"),
-                                          "exp_avg_sq": file.get_tensor(f"exp_avg_sq.{name}")}  # fmt: skip
+            optimiser.state[parameter] = {
+                "step": file.get_tensor(f"step.{name}").reshape(()),
+                "exp_avg": file.get_tensor(f"exp_avg.{name}"),
+                "exp_avg_sq": file.get_tensor(f"exp_avg_sq.{name}"),
+            }
         return int(stored["step"])

@@ -52,8 +52,14 @@ def write_ply(path: Path, splats: BakedSplats) -> None:
     table = np.zeros((len(splats.means), len(_COLUMNS)), "<f4")
     table[:, 0:3], table[:, 6:9] = splats.means, (splats.rgb - 0.5) / SH0
     table[:, 9], table[:, 10:13], table[:, 13:17] = splats.opacity_logits, splats.log_scales, splats.quaternions
-    header = ["ply", "format binary_little_endian 1.0", "comment east-north-up metres, sRGB", f"element vertex {len(table)}",
-              *(f"property float {name}" for name in _COLUMNS), "end_header"]  # fmt: skip
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment east-north-up metres, sRGB",
+        f"element vertex {len(table)}",
+        *(f"property float {name}" for name in _COLUMNS),
+        "end_header",
+    ]
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write(("\n".join(header) + "\n").encode("ascii"))
         file.write(table.tobytes())
@@ -80,9 +86,13 @@ def read_ply(path: Path) -> BakedSplats:
     def columns(*wanted: str) -> np.ndarray:
         return table[:, [names.index(name) for name in wanted]].copy()
 
-    return BakedSplats(columns("x", "y", "z"), columns("rot_0", "rot_1", "rot_2", "rot_3"),
-                       columns("scale_0", "scale_1", "scale_2"), columns("opacity")[:, 0],
-                       columns("f_dc_0", "f_dc_1", "f_dc_2") * np.float32(SH0) + np.float32(0.5))  # fmt: skip
+    return BakedSplats(
+        columns("x", "y", "z"),
+        columns("rot_0", "rot_1", "rot_2", "rot_3"),
+        columns("scale_0", "scale_1", "scale_2"),
+        columns("opacity")[:, 0],
+        columns("f_dc_0", "f_dc_1", "f_dc_2") * np.float32(SH0) + np.float32(0.5),
+    )
 
 
 def write_gltf(path: Path, splats: BakedSplats, *, note: dict | None = None) -> None:
@@ -102,21 +112,34 @@ def write_gltf(path: Path, splats: BakedSplats, *, note: dict | None = None) -> 
     body, views, accessors = b"", [], []
     for name, values in arrays.items():
         values = np.ascontiguousarray(values, "<f4")
-        accessor = {"bufferView": len(views), "componentType": 5126, "count": len(values),
-                    "type": kinds[values.shape[1] if values.ndim == 2 else 1]}  # fmt: skip
+        accessor = {
+            "bufferView": len(views),
+            "componentType": 5126,
+            "count": len(values),
+            "type": kinds[values.shape[1] if values.ndim == 2 else 1],
+        }
         if name == "POSITION":
             accessor |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
         accessors.append(accessor)
         views.append({"buffer": 0, "byteOffset": len(body), "byteLength": values.nbytes, "target": 34962})
         body += values.tobytes()
-    primitive = {"mode": 0, "attributes": {name: index for index, name in enumerate(arrays)},
-                 "extensions": {"KHR_gaussian_splatting": {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}}}  # fmt: skip
+    primitive = {
+        "mode": 0,
+        "attributes": {name: index for index, name in enumerate(arrays)},
+        "extensions": {"KHR_gaussian_splatting": {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}},
+    }
     root2 = float(np.sqrt(0.5))
-    document = {"asset": {"version": "2.0", "generator": "seasonscapes", "extras": note or {}},
-                "extensionsUsed": ["KHR_gaussian_splatting"], "scene": 0, "scenes": [{"nodes": [0]}],
-                "nodes": [{"name": "east-north-up", "mesh": 0, "rotation": [-root2, 0.0, 0.0, root2]}],
-                "meshes": [{"primitives": [primitive]}], "accessors": accessors, "bufferViews": views,
-                "buffers": [{"byteLength": len(body)}]}  # fmt: skip
+    document = {
+        "asset": {"version": "2.0", "generator": "seasonscapes", "extras": note or {}},
+        "extensionsUsed": ["KHR_gaussian_splatting"],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"name": "east-north-up", "mesh": 0, "rotation": [-root2, 0.0, 0.0, root2]}],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": len(body)}],
+    }
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
@@ -173,8 +196,10 @@ def write_training_views(folder: Path, views: Sequence[TrainingView], splats: Ba
     write_colmap(folder / "sparse" / "0", named)
     levels = np.rint(255.0 * np.clip(splats.rgb, 0.0, 1.0)).astype(int)
     lines = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]"]
-    lines += [f"{number} {x:.3f} {y:.3f} {z:.3f} {r} {g} {b} 0"
-              for number, ((x, y, z), (r, g, b)) in enumerate(zip(splats.means, levels, strict=True), 1)]  # fmt: skip
+    lines += [
+        f"{number} {x:.3f} {y:.3f} {z:.3f} {r} {g} {b} 0"
+        for number, ((x, y, z), (r, g, b)) in enumerate(zip(splats.means, levels, strict=True), 1)
+    ]
     with atomic_path(folder / "sparse" / "0" / "points3D.txt") as temporary:
         temporary.write_text("\n".join(lines) + "\n")
     write_ply(folder / "points.ply", splats)

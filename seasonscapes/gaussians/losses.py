@@ -47,8 +47,9 @@ class Frame:
             raise ValueError("Frame: no splat and no usable pixel in view; does the camera stand inside the mountain?")
 
 
-def surface_loss(appearance: Appearance, lights: LightTensors, targets: torch.Tensor, batch: int,
-                 rng: np.random.Generator) -> torch.Tensor:  # fmt: skip
+def surface_loss(
+    appearance: Appearance, lights: LightTensors, targets: torch.Tensor, batch: int, rng: np.random.Generator
+) -> torch.Tensor:
     """Relative squared error of random (disc, time) pairs: unbiased even where targets are noisy."""
     times, count, _ = targets.shape
     index = torch.as_tensor(rng.integers(0, count, batch))
@@ -78,8 +79,9 @@ def picture_of(frame: Frame) -> Picture:
     number[discs] = np.arange(len(discs), dtype=np.int32)
     scale = 1.0 / np.maximum(frame.weights.coverage.ravel(), 1e-3)
     data = matrix.data * np.repeat(scale, np.diff(matrix.indptr))
-    forward = sparse.csr_array((data.astype(np.float32), number[matrix.indices], matrix.indptr),
-                               shape=(matrix.shape[0], len(discs)))  # fmt: skip
+    forward = sparse.csr_array(
+        (data.astype(np.float32), number[matrix.indices], matrix.indptr), shape=(matrix.shape[0], len(discs))
+    )
     mask = torch.as_tensor(frame.mask & (frame.weights.coverage > 0.5))
     target = torch.where(mask[..., None], encoded(torch.as_tensor(np.nan_to_num(frame.image).astype(np.float32))), 0.0)
     return Picture(

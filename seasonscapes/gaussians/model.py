@@ -77,8 +77,14 @@ class GaussianModel:
 
     def __post_init__(self):
         count = len(self.means)
-        wanted = {"means": (count, 3), "quaternions": (count, 4), "log_scales": (count, 3), "opacity_logits": (count,),
-                  "albedo": (len(self.days), count, 3), "cell": (count,)}  # fmt: skip
+        wanted = {
+            "means": (count, 3),
+            "quaternions": (count, 4),
+            "log_scales": (count, 3),
+            "opacity_logits": (count,),
+            "albedo": (len(self.days), count, 3),
+            "cell": (count,),
+        }
         for name, shape in wanted.items():
             values = getattr(self, name)
             if values.shape != shape:
@@ -96,14 +102,36 @@ class GaussianModel:
         return albedo_at(self.albedo, self.days, day, ground)
 
 
-def model_from(surfels: Surfels, albedo: np.ndarray, days, transport: Transport, *, kind: str, frame: LocalFrame,
-               appearance: dict[str, np.ndarray], note: dict | None = None) -> GaussianModel:  # fmt: skip
+def model_from(
+    surfels: Surfels,
+    albedo: np.ndarray,
+    days,
+    transport: Transport,
+    *,
+    kind: str,
+    frame: LocalFrame,
+    appearance: dict[str, np.ndarray],
+    note: dict | None = None,
+) -> GaussianModel:
     """A model of discs, dated albedos ``(M, N, 3)`` and learned numbers, as `render.learned_numbers` gives them."""
     learned = dict(appearance)
     features = learned.pop("embedding", np.zeros((len(surfels.means), 0), np.float32))
-    return GaussianModel(surfels.means, surfels.quaternions, surfels.log_scales, surfels.opacity_logits, features,
-                         np.asarray(albedo, np.float32), np.asarray(days, np.float64), transport, learned, kind,
-                         surfels.plan, surfels.cell, frame, note or {})  # fmt: skip
+    return GaussianModel(
+        surfels.means,
+        surfels.quaternions,
+        surfels.log_scales,
+        surfels.opacity_logits,
+        features,
+        np.asarray(albedo, np.float32),
+        np.asarray(days, np.float64),
+        transport,
+        learned,
+        kind,
+        surfels.plan,
+        surfels.cell,
+        frame,
+        note or {},
+    )
 
 
 def save_model(model: GaussianModel, path: str | os.PathLike) -> None:
@@ -112,8 +140,11 @@ def save_model(model: GaussianModel, path: str | os.PathLike) -> None:
 
     tensors, facts = packed(model)
     with atomic_path(path) as temporary:
-        save_file({name: np.ascontiguousarray(values) for name, values in tensors.items()}, temporary,
-                  metadata={"format": FORMAT, "facts": json.dumps(facts)})  # fmt: skip
+        save_file(
+            {name: np.ascontiguousarray(values) for name, values in tensors.items()},
+            temporary,
+            metadata={"format": FORMAT, "facts": json.dumps(facts)},
+        )
 
 
 def load_model(path: str | os.PathLike) -> GaussianModel:
@@ -156,16 +187,25 @@ def packed(model: GaussianModel) -> tuple[dict[str, np.ndarray], dict]:
         "normal": octahedral(transport.normals),
         "roughness": np.rint(255.0 * np.clip(np.linalg.norm(transport.normals, axis=1), 0.0, 1.0)).astype(np.uint8),
         "albedo": np.rint(255.0 * np.sqrt(np.clip(model.albedo, 0.0, 1.0))).astype(np.uint8),
-        **{f"transport.{name}": getattr(transport, name)
-           for name in ("horizon", "sky", "sky_scale", "from_sky", "bounce", "bounce_scale")},
-    }  # fmt: skip
+        **{
+            f"transport.{name}": getattr(transport, name)
+            for name in ("horizon", "sky", "sky_scale", "from_sky", "bounce", "bounce_scale")
+        },
+    }
     feature_scale = np.maximum(np.abs(model.features).max(axis=0, initial=0.0), 1e-9) / 127.0
     tensors["features"] = np.rint(model.features / feature_scale).astype(np.int8)
     for name, values in model.appearance.items():
         tensors[f"appearance.{name}"] = _bytes(values, *_RANGES[name]) if name in _RANGES else values
-    facts = {"kind": model.kind, "days": model.days.tolist(), "height": [low, step], "plan": asdict(model.plan),
-             "frame": asdict(model.frame), "note": model.note, "patches": transport.patches,
-             "feature_scale": feature_scale.tolist()}  # fmt: skip
+    facts = {
+        "kind": model.kind,
+        "days": model.days.tolist(),
+        "height": [low, step],
+        "plan": asdict(model.plan),
+        "frame": asdict(model.frame),
+        "note": model.note,
+        "patches": transport.patches,
+        "feature_scale": feature_scale.tolist(),
+    }
     return tensors, facts
 
 
@@ -174,11 +214,20 @@ def unpacked(tensors: dict[str, np.ndarray], facts: dict) -> GaussianModel:
     plan, (low, step) = Plan(**facts["plan"]), facts["height"]
     cell = np.flatnonzero(np.unpackbits(tensors["taken"])[: plan.columns * plan.rows]).astype(np.int32)
     row, column = np.divmod(cell, plan.columns)
-    means = np.stack([plan.west_m + (column + 0.5) * plan.east_step_m, plan.north_m - (row + 0.5) * plan.north_step_m,
-                      low + tensors["height"] * step], axis=1).astype(np.float32)  # fmt: skip
+    means = np.stack(
+        [
+            plan.west_m + (column + 0.5) * plan.east_step_m,
+            plan.north_m - (row + 0.5) * plan.north_step_m,
+            low + tensors["height"] * step,
+        ],
+        axis=1,
+    ).astype(np.float32)
     normals = from_octahedral(tensors["normal"]) * (tensors["roughness"][:, None] / np.float32(255.0))
-    held = {item.name: tensors[f"transport.{item.name}"] for item in fields(Transport)
-            if f"transport.{item.name}" in tensors}  # fmt: skip
+    held = {
+        item.name: tensors[f"transport.{item.name}"]
+        for item in fields(Transport)
+        if f"transport.{item.name}" in tensors
+    }
     transport = Transport(normals=normals, patches=facts["patches"], **held)
     appearance = {}
     for name, values in tensors.items():
@@ -187,17 +236,31 @@ def unpacked(tensors: dict[str, np.ndarray], facts: dict) -> GaussianModel:
             appearance[short] = _values(values, *_RANGES[short]) if short in _RANGES else values
     features = tensors["features"] * np.array(facts["feature_scale"], np.float32)
     albedo = ((tensors["albedo"] / np.float32(255.0)) ** 2).astype(np.float32)
-    return GaussianModel(means, *disc_shapes(normals, plan.spacing_m), features, albedo, np.array(facts["days"]),
-                         transport, appearance, facts["kind"], plan, cell, LocalFrame(**facts["frame"]),
-                         facts["note"])  # fmt: skip
+    return GaussianModel(
+        means,
+        *disc_shapes(normals, plan.spacing_m),
+        features,
+        albedo,
+        np.array(facts["days"]),
+        transport,
+        appearance,
+        facts["kind"],
+        plan,
+        cell,
+        LocalFrame(**facts["frame"]),
+        facts["note"],
+    )
 
 
 def bytes_each(model: GaussianModel) -> float:
     """Bytes of the file for each Gaussian, one date of albedo counted, what all share left out."""
     tensors, _ = packed(model)
     count = len(model.means)
-    own = {name: values.nbytes for name, values in tensors.items()
-           if values.shape[:1] == (count,) or name in ("taken", "albedo")}  # fmt: skip
+    own = {
+        name: values.nbytes
+        for name, values in tensors.items()
+        if values.shape[:1] == (count,) or name in ("taken", "albedo")
+    }
     own["albedo"] //= len(model.days)
     return sum(own.values()) / count
 

@@ -101,9 +101,17 @@ def splats_from(
 def rotations(quaternions: torch.Tensor) -> torch.Tensor:
     """Rotations ``(N, 3, 3)`` of quaternions ``(N, 4)`` wxyz of any length."""
     w, x, y, z = (quaternions / quaternions.norm(dim=1, keepdim=True)).unbind(1)
-    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]  # fmt: skip
+    rows = [
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    ]
     return torch.stack(rows, dim=1).reshape(-1, 3, 3)
 
 
@@ -113,8 +121,9 @@ def camera_tensors(camera: Camera, like: torch.Tensor) -> tuple[torch.Tensor, to
     return pose[:3, :3].T.to(like), pose[:3, 3].to(like)
 
 
-def project_splats(splats: Splats, camera: Camera, *, alpha_cut: float = ALPHA_CUT,
-                   pixel_variance: float = PIXEL_VARIANCE) -> Projected:  # fmt: skip
+def project_splats(
+    splats: Splats, camera: Camera, *, alpha_cut: float = ALPHA_CUT, pixel_variance: float = PIXEL_VARIANCE
+) -> Projected:
     """The splats that may be seen, nearest first (ties by number), with their ellipses in the picture."""
     turn, position = camera_tensors(camera, splats.means)
     with torch.no_grad():
@@ -136,8 +145,9 @@ def project_splats(splats: Splats, camera: Camera, *, alpha_cut: float = ALPHA_C
     return Projected(index, centre, conic, opacity, yy, z)
 
 
-def _candidates(splats: Splats, camera: Camera, turn: torch.Tensor, position: torch.Tensor,
-                alpha_cut: float) -> torch.Tensor:  # fmt: skip
+def _candidates(
+    splats: Splats, camera: Camera, turn: torch.Tensor, position: torch.Tensor, alpha_cut: float
+) -> torch.Tensor:
     """Numbers of the splats in front of the camera and near the picture, nearest first; ties keep their order."""
     local = (splats.means - position) @ turn.T
     x, y, z = local.unbind(1)
@@ -145,8 +155,10 @@ def _candidates(splats: Splats, camera: Camera, turn: torch.Tensor, position: to
     if alpha_cut > 0.0:
         # A sphere of four standard deviations around the centre, against the four sides of the view.
         reach = 4.0 * splats.log_scales.amax(dim=1).exp()
-        for along, focal, low, high in ((x, camera.fx, -camera.cx, camera.width_px - camera.cx),
-                                        (y, camera.fy, -camera.cy, camera.height_px - camera.cy)):  # fmt: skip
+        for along, focal, low, high in (
+            (x, camera.fx, -camera.cx, camera.width_px - camera.cx),
+            (y, camera.fy, -camera.cy, camera.height_px - camera.cy),
+        ):
             for bound, side in ((low - 2.0, 1.0), (high + 2.0, -1.0)):
                 slope = bound / focal
                 keep &= side * (along - slope * z) > -reach * (1.0 + slope * slope) ** 0.5
@@ -185,8 +197,9 @@ def blend_pairs(seen: Projected, width_px: int, height_px: int, *, alpha_cut: fl
     return Pairs(splat, weight, start)
 
 
-def _pairs_in_depth_order(seen: Projected, width_px: int, height_px: int,
-                          alpha_cut: float) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
+def _pairs_in_depth_order(
+    seen: Projected, width_px: int, height_px: int, alpha_cut: float
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Splat and pixel of every pair with α above the cut: the exact run of pixels of each ellipse in each row."""
     count = len(seen.index)
     if alpha_cut <= 0.0:
@@ -230,8 +243,14 @@ def _to_pixel_order(pixel: torch.Tensor, pixels: int) -> tuple[torch.Tensor, tor
     return torch.from_numpy(table.data) - 1, torch.from_numpy(table.indptr.astype(np.int64))
 
 
-def rasterise(splats: Splats, colours: torch.Tensor, camera: Camera, *, alpha_cut: float = ALPHA_CUT,
-              pixel_variance: float = PIXEL_VARIANCE) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
+def rasterise(
+    splats: Splats,
+    colours: torch.Tensor,
+    camera: Camera,
+    *,
+    alpha_cut: float = ALPHA_CUT,
+    pixel_variance: float = PIXEL_VARIANCE,
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Blend colours ``(N, C)`` front to back over black: picture ``(H, W, C)`` and coverage ``(H, W)``.
 
     Differentiable in geometry, opacity and colour; the order of the splats, and which pixels the cut leaves out, are
@@ -257,8 +276,9 @@ def rasterise(splats: Splats, colours: torch.Tensor, camera: Camera, *, alpha_cu
 
 
 @torch.no_grad()
-def view_weights(splats: Splats, camera: Camera, *, subpixels: int = 1,
-                 pixel_variance: float = PIXEL_VARIANCE) -> ViewWeights:  # fmt: skip
+def view_weights(
+    splats: Splats, camera: Camera, *, subpixels: int = 1, pixel_variance: float = PIXEL_VARIANCE
+) -> ViewWeights:
     """The sparse matrix of a view whose geometry is frozen; weights behind a closed front are left out.
 
     Parameters

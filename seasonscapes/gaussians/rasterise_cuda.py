@@ -9,8 +9,9 @@ from seasonscapes.errors import InputError
 from seasonscapes.gaussians.rasterise import NEAR_M, PIXEL_VARIANCE, Splats
 
 
-def rasterise_cuda(splats: Splats, colours: torch.Tensor, camera: Camera, *,
-                   pixel_variance: float = PIXEL_VARIANCE) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
+def rasterise_cuda(
+    splats: Splats, colours: torch.Tensor, camera: Camera, *, pixel_variance: float = PIXEL_VARIANCE
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Picture ``(H, W, C)`` and coverage ``(H, W)`` on the GPU, as `rasterise.rasterise`; differentiable.
 
     Raises
@@ -23,8 +24,9 @@ def rasterise_cuda(splats: Splats, colours: torch.Tensor, camera: Camera, *,
     try:
         from gsplat import rasterization
     except ImportError:
-        raise InputError("--device", "the CUDA rasteriser needs gsplat", got="cuda",
-                         cure="pip install gsplat, or use --device cpu") from None  # fmt: skip
+        raise InputError(
+            "--device", "the CUDA rasteriser needs gsplat", got="cuda", cure="pip install gsplat, or use --device cpu"
+        ) from None
     device = torch.device("cuda")
     pose = torch.as_tensor(camera.world_from_camera, dtype=torch.float64)
     # Positions relative to the camera keep their centimetres in float32, kilometres from the origin.
@@ -35,8 +37,18 @@ def rasterise_cuda(splats: Splats, colours: torch.Tensor, camera: Camera, *,
         [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]], device=device
     )
     image, coverage, _ = rasterization(
-        means, splats.quaternions.to(device), splats.log_scales.exp().to(device),
-        torch.sigmoid(splats.opacity_logits).to(device), colours.to(device), view[None], intrinsics[None],
-        camera.width_px, camera.height_px, near_plane=NEAR_M, far_plane=1e7, eps2d=pixel_variance, packed=False,
-    )  # fmt: skip
+        means,
+        splats.quaternions.to(device),
+        splats.log_scales.exp().to(device),
+        torch.sigmoid(splats.opacity_logits).to(device),
+        colours.to(device),
+        view[None],
+        intrinsics[None],
+        camera.width_px,
+        camera.height_px,
+        near_plane=NEAR_M,
+        far_plane=1e7,
+        eps2d=pixel_variance,
+        packed=False,
+    )
     return image[0], coverage[0, ..., 0]

@@ -8,8 +8,14 @@ from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.gaussians.rasterise import ALPHA_CUT, ALPHA_MOST, NEAR_M, PIXEL_VARIANCE, Splats
 
 
-def rasterise_twin(splats: Splats, colours: torch.Tensor, camera: Camera, *, alpha_cut: float = ALPHA_CUT,
-                   pixel_variance: float = PIXEL_VARIANCE) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
+def rasterise_twin(
+    splats: Splats,
+    colours: torch.Tensor,
+    camera: Camera,
+    *,
+    alpha_cut: float = ALPHA_CUT,
+    pixel_variance: float = PIXEL_VARIANCE,
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Picture ``(H, W, C)`` and coverage ``(H, W)``, as `rasterise.rasterise`; works in the splats' own precision."""
     dtype = splats.means.dtype
     pose = torch.as_tensor(camera.world_from_camera, dtype=dtype)
@@ -32,22 +38,29 @@ def rasterise_twin(splats: Splats, colours: torch.Tensor, camera: Camera, *, alp
     return image, 1.0 - through
 
 
-def _ellipse(splats: Splats, i: int, local: torch.Tensor, pose: torch.Tensor,
-             camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
+def _ellipse(
+    splats: Splats, i: int, local: torch.Tensor, pose: torch.Tensor, camera: Camera
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Centre ``(2,)`` and covariance ``(2, 2)`` in the picture of one splat, through the projection's Jacobian."""
     w, x, y, z = splats.quaternions[i] / splats.quaternions[i].norm()
-    turn = torch.stack([
-        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]),
-        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]),
-        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]),
-    ])  # fmt: skip
+    turn = torch.stack(
+        [
+            torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]),
+            torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]),
+            torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]),
+        ]
+    )
     covariance = turn @ torch.diag(splats.log_scales[i].exp() ** 2) @ turn.T
     a, b, depth = local
     u = (a / depth).clamp(-0.65 * camera.width_px / camera.fx, 0.65 * camera.width_px / camera.fx)
     v = (b / depth).clamp(-0.65 * camera.height_px / camera.fy, 0.65 * camera.height_px / camera.fy)
     zero = torch.zeros_like(depth)
-    jacobian = torch.stack([torch.stack([camera.fx / depth, zero, -camera.fx * u / depth]),
-                            torch.stack([zero, camera.fy / depth, -camera.fy * v / depth])])  # fmt: skip
+    jacobian = torch.stack(
+        [
+            torch.stack([camera.fx / depth, zero, -camera.fx * u / depth]),
+            torch.stack([zero, camera.fy / depth, -camera.fy * v / depth]),
+        ]
+    )
     project = jacobian @ pose[:3, :3].T
     centre = torch.stack([camera.fx * a / depth + camera.cx, camera.fy * b / depth + camera.cy])
     return centre, project @ covariance @ project.T

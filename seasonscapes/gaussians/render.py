@@ -67,8 +67,9 @@ def appearance_of(model: GaussianModel, *, albedo: np.ndarray | None = None, see
     around = np.stack([neighbourhood_mean(model.means, one, model.plan.spacing_m) for one in own])
     embedding = model.features if model.features.shape[1] else fourier_embedding(model.means)
     codes = model.appearance.get("codes")
-    appearance = Appearance(model.kind, own, around, model.transport, embedding, seed=seed,
-                            times=1 if codes is None else len(codes))  # fmt: skip
+    appearance = Appearance(
+        model.kind, own, around, model.transport, embedding, seed=seed, times=1 if codes is None else len(codes)
+    )
     for name, parameter in appearance.named_parameters():
         if name != "embedding" and name in model.appearance:
             parameter.data.copy_(torch.as_tensor(model.appearance[name]))
@@ -114,9 +115,17 @@ def model_weights(model: GaussianModel, camera: Camera, *, subpixels: int = 2) -
     return weights
 
 
-def render_model(model: GaussianModel, camera: Camera, illumination: Illumination, day: float, *,
-                 weights: ViewWeights | None = None, colours: tuple[np.ndarray, LightState] | None = None,
-                 subpixels: int = 2, device: str = "cpu") -> SplatView:  # fmt: skip
+def render_model(
+    model: GaussianModel,
+    camera: Camera,
+    illumination: Illumination,
+    day: float,
+    *,
+    weights: ViewWeights | None = None,
+    colours: tuple[np.ndarray, LightState] | None = None,
+    subpixels: int = 2,
+    device: str = "cpu",
+) -> SplatView:
     """The model seen by a camera under a light.
 
     Parameters
@@ -146,8 +155,9 @@ def render_model(model: GaussianModel, camera: Camera, illumination: Illuminatio
     return SplatView(radiance, surface.astype(np.float32), solid.astype(np.float32), depth.astype(np.float32))
 
 
-def draw_layers(model: GaussianModel, camera: Camera, layers: np.ndarray, *, subpixels: int = 1,
-                device: str = "cpu") -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+def draw_layers(
+    model: GaussianModel, camera: Camera, layers: np.ndarray, *, subpixels: int = 1, device: str = "cpu"
+) -> tuple[np.ndarray, np.ndarray]:
     """Blend layers ``(N, C)`` of the Gaussians: picture ``(H, W, C)`` and coverage ``(H, W)``, the quickest way there is.
 
     ``cpu`` goes through the renderer's vector units (`rendering.splatting`), or through torch where it has none.
@@ -182,8 +192,9 @@ def ready_model(model: GaussianModel) -> ReadySplats:
     return ready_splats(model.means, axes.numpy(), torch.sigmoid(splats.opacity_logits).numpy())
 
 
-def through_air(camera: Camera, illumination: Illumination, surface: np.ndarray, coverage: np.ndarray,
-                depth: np.ndarray) -> np.ndarray:  # fmt: skip
+def through_air(
+    camera: Camera, illumination: Illumination, surface: np.ndarray, coverage: np.ndarray, depth: np.ndarray
+) -> np.ndarray:
     """Radiance ``(H, W, 3)`` at the camera: the surface through the air of its distance, and the open sky behind."""
     from seasonscapes.rendering.air_grid import open_sky, sky_grid
 

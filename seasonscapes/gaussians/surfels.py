@@ -77,9 +77,13 @@ class Surfels:
     uv: np.ndarray
 
 
-def terrain_surfels(terrain: Terrain, spacing_m: float, *,
-                    bounds_m: tuple[float, float, float, float] | None = None,
-                    normals: np.ndarray | None = None) -> Surfels:  # fmt: skip
+def terrain_surfels(
+    terrain: Terrain,
+    spacing_m: float,
+    *,
+    bounds_m: tuple[float, float, float, float] | None = None,
+    normals: np.ndarray | None = None,
+) -> Surfels:
     """One disc for each cell of a square plan that the terrain covers entirely.
 
     Parameters
@@ -131,8 +135,11 @@ def disc_shapes(normals: np.ndarray, spacing_m: float) -> tuple[np.ndarray, np.n
     axes, stretch = _disc_axes(normals)
     scales = np.stack([SIGMA * stretch, np.full(len(stretch), SIGMA), np.full(len(stretch), THICKNESS)], axis=1)
     logit = np.log(OPACITY / (1.0 - OPACITY))
-    return (quaternions_from_axes(axes).astype(np.float32), np.log(scales * spacing_m).astype(np.float32),
-            np.full(len(stretch), logit, np.float32))  # fmt: skip
+    return (
+        quaternions_from_axes(axes).astype(np.float32),
+        np.log(scales * spacing_m).astype(np.float32),
+        np.full(len(stretch), logit, np.float32),
+    )
 
 
 def _cells(terrain: Terrain, plan: Plan, at_vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -180,10 +187,19 @@ def axes_from_quaternions(quaternions: np.ndarray) -> np.ndarray:
     """Rotations ``(N, 3, 3)`` of quaternions ``(N, 4)`` wxyz of any length."""
     w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
     return np.stack(
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1,
-    ).reshape(-1, 3, 3)  # fmt: skip
+        [
+            1 - 2 * (y * y + z * z),
+            2 * (x * y - w * z),
+            2 * (x * z + w * y),
+            2 * (x * y + w * z),
+            1 - 2 * (x * x + z * z),
+            2 * (y * z - w * x),
+            2 * (x * z - w * y),
+            2 * (y * z + w * x),
+            1 - 2 * (x * x + y * y),
+        ],
+        axis=1,
+    ).reshape(-1, 3, 3)
 
 
 def surfel_albedo(surfels: Surfels, albedo: np.ndarray) -> np.ndarray:

@@ -92,8 +92,9 @@ def bounce_terms(direction: np.ndarray) -> np.ndarray:
     return np.concatenate([np.ones((*direction.shape[:-1], 1)), direction], axis=-1)
 
 
-def trace_transport(occluder, surfels: Surfels, albedo: np.ndarray, *, rays: int = 128, seed: int = 0,
-                    progress: Progress | None = None) -> Transport:  # fmt: skip
+def trace_transport(
+    occluder, surfels: Surfels, albedo: np.ndarray, *, rays: int = 128, seed: int = 0, progress: Progress | None = None
+) -> Transport:
     """Trace what `Transport` holds.
 
     Parameters
@@ -112,15 +113,26 @@ def trace_transport(occluder, surfels: Surfels, albedo: np.ndarray, *, rays: int
     traced = centre_coefficients(occluder, surfels, rays=rays, rank=SKY_RANK, seed=seed)
     tell(0.4)
     low, high = HORIZON_RANGE_RAD
-    angle = horizon_angles(occluder, traced.points, azimuths=AZIMUTHS, low_rad=low, high_rad=high,
-                           progress=lambda share: tell(0.4 + 0.4 * share))  # fmt: skip
+    angle = horizon_angles(
+        occluder,
+        traced.points,
+        azimuths=AZIMUTHS,
+        low_rad=low,
+        high_rad=high,
+        progress=lambda share: tell(0.4 + 0.4 * share),
+    )
     ready = ready_points(occluder, traced)
     around = neighbourhood_mean(surfels.means, albedo, surfels.plan.spacing_m).mean(axis=1)
     bounce = _bounce_coefficients(lambda light: irradiance(ready, light, sun_rays_each=1).bounce.mean(axis=1)) / around
     tell(1.0)
-    return Transport(surfels.normals, quantised_horizon(angle), *signed_bytes(traced.reception.direct.astype(np.float32)),
-                     np.asarray(traced.senders.from_sky, np.float32), traced.senders.patches,
-                     *signed_bytes(bounce.T))  # fmt: skip
+    return Transport(
+        surfels.normals,
+        quantised_horizon(angle),
+        *signed_bytes(traced.reception.direct.astype(np.float32)),
+        np.asarray(traced.senders.from_sky, np.float32),
+        traced.senders.patches,
+        *signed_bytes(bounce.T),
+    )
 
 
 def centre_coefficients(occluder, surfels: Surfels, *, rays: int, rank: int, seed: int = 0):
@@ -185,19 +197,33 @@ def light_state(transport: Transport, illumination: Illumination, day: float) ->
     everything = float(luminance(global_horizontal_illuminance(illumination)))
     if not (np.isfinite(everything) and everything > 0.0):
         raise ValueError(f"illumination: horizontal illuminance is {everything} lx, expected light")
-    bodies = [b for b in (illumination.sun, illumination.moon)
-              if b is not None and luminance(b.normal_illuminance_lx) > 1e-4 * everything]  # fmt: skip
+    bodies = [
+        b
+        for b in (illumination.sun, illumination.moon)
+        if b is not None and luminance(b.normal_illuminance_lx) > 1e-4 * everything
+    ]
     bodies.sort(key=lambda body: -luminance(body.normal_illuminance_lx))
     sky = transport.from_sky.T @ patch_radiance(sky_patches(transport.patches), illumination.sky_radiance)
     directions = np.array([body.direction for body in bodies], np.float32).reshape(-1, 3)
     illuminances = np.array([body.normal_illuminance_lx for body in bodies], np.float32).reshape(-1, 3)
-    return LightState((directions, illuminances), sky.astype(np.float32),
-                      diffuse_horizontal_illuminance(illumination.sky_radiance).astype(np.float32), everything,
-                      float(day))  # fmt: skip
+    return LightState(
+        (directions, illuminances),
+        sky.astype(np.float32),
+        diffuse_horizontal_illuminance(illumination.sky_radiance).astype(np.float32),
+        everything,
+        float(day),
+    )
 
 
-def surfel_irradiance(occluder, surfels: Surfels, lights: Sequence[Illumination], *, rays: int = 256, seed: int = 0,
-                      progress: Progress | None = None) -> np.ndarray:  # fmt: skip
+def surfel_irradiance(
+    occluder,
+    surfels: Surfels,
+    lights: Sequence[Illumination],
+    *,
+    rays: int = 256,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> np.ndarray:
     """Irradiance of every disc under every light, the truth that discs learn from: ``(T, N, 3)`` float32 [lx].
 
     Sun and moon are averaged over the places of each disc's cell by shadow rays; sky and other slopes are taken at
@@ -215,8 +241,12 @@ def surfel_irradiance(occluder, surfels: Surfels, lights: Sequence[Illumination]
     if len(found) != count * each:
         raise ValueError("places of discs have no surface under them; is it the same terrain?")
     points = points.reshape(count, each)
-    sun = sun_rays(occluder, (points.origin, points.normal, points.outward),
-                   np.full((count, each), 1.0 / each, np.float32), numbered_turn(np.arange(count)))  # fmt: skip
+    sun = sun_rays(
+        occluder,
+        (points.origin, points.normal, points.outward),
+        np.full((count, each), 1.0 / each, np.float32),
+        numbered_turn(np.arange(count)),
+    )
     result = np.empty((len(lights), count, 3), np.float32)
     for number, light in enumerate(lights):
         received = irradiance(ready, light, sun_rays_each=1)

@@ -34,8 +34,15 @@ def overview_cameras(terrain: Terrain, count: int, *, size_px: int = 256, first_
     return cameras
 
 
-def relit_frames(occluder, surfels: Surfels, cameras: Sequence[Camera], lights: Sequence[tuple[int, Illumination, LightState]], *,
-                 seed: int = 0, progress: Callable[[float], None] | None = None) -> list[Frame]:  # fmt: skip
+def relit_frames(
+    occluder,
+    surfels: Surfels,
+    cameras: Sequence[Camera],
+    lights: Sequence[tuple[int, Illumination, LightState]],
+    *,
+    seed: int = 0,
+    progress: Callable[[float], None] | None = None,
+) -> list[Frame]:
     """Frames of every camera at every time, camera by camera, relit from daylight coefficients.
 
     Parameters

@@ -39,9 +39,15 @@ def write_film(
                 if writer is None:
                     size = (width, height)
                     writer = imageio_ffmpeg.write_frames(
-                        str(temporary), size, fps=fps, quality=quality, macro_block_size=2, codec="libx264",
-                        pix_fmt_out="yuv420p", output_params=["-movflags", "+faststart", "-metadata", f"comment={note}"],
-                    )  # fmt: skip
+                        str(temporary),
+                        size,
+                        fps=fps,
+                        quality=quality,
+                        macro_block_size=2,
+                        codec="libx264",
+                        pix_fmt_out="yuv420p",
+                        output_params=["-movflags", "+faststart", "-metadata", f"comment={note}"],
+                    )
                     writer.send(None)
                 if (width, height) != size:
                     raise ValueError(f"film: a picture of {width} × {height}, expected {size[0]} × {size[1]}")

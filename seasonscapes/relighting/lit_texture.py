@@ -40,8 +40,16 @@ class LitTexture:
         return np.nan_to_num((self.sun + self.sky + self.bounce) * self.albedo / np.float32(np.pi))
 
 
-def lit_texture(terrain: Any, positions: np.ndarray, albedo: np.ndarray, light: Illumination, *, effort: Effort | None = None,
-                seed: int = 0, progress: Progress | None = None) -> LitTexture:  # fmt: skip
+def lit_texture(
+    terrain: Any,
+    positions: np.ndarray,
+    albedo: np.ndarray,
+    light: Illumination,
+    *,
+    effort: Effort | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> LitTexture:
     """Bake the light of an instant into a texture.
 
     Parameters
@@ -84,8 +92,17 @@ class Dose:
     sunlit: np.ndarray
 
 
-def dose(terrain: Any, positions: np.ndarray, lights: Sequence[Illumination], weights: np.ndarray, *,
-         effort: Effort | None = None, search_m: float = 2.0, seed: int = 0, progress: Progress | None = None) -> Dose:  # fmt: skip
+def dose(
+    terrain: Any,
+    positions: np.ndarray,
+    lights: Sequence[Illumination],
+    weights: np.ndarray,
+    *,
+    effort: Effort | None = None,
+    search_m: float = 2.0,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Dose:
     """Sum what places receive under many lights.
 
     Parameters

@@ -59,8 +59,9 @@ def _nodes(camera: Camera | Panorama, step: int) -> np.ndarray:
     return view_directions(camera, np.stack(np.meshgrid(x, y), axis=-1))
 
 
-def air_places(camera: Camera | Panorama, pixel: np.ndarray, depth_m: np.ndarray,
-               several: tuple[np.ndarray, np.ndarray]) -> AirPlaces:  # fmt: skip
+def air_places(
+    camera: Camera | Panorama, pixel: np.ndarray, depth_m: np.ndarray, several: tuple[np.ndarray, np.ndarray]
+) -> AirPlaces:
     """For flat indices ``(n,)`` of pixels and their distances ``(n,)`` [m].
 
     ``several`` are the numbers ``(k,)`` among the n of pixels whose air is averaged over samples, and those samples'
@@ -77,14 +78,22 @@ def air_places(camera: Camera | Panorama, pixel: np.ndarray, depth_m: np.ndarray
 
         row, column = np.divmod(flat, camera.width_px)
         share = np.log(np.maximum(distance, low) / low) / np.log(depths[-1] / low)
-        columns = ((column / step + 0.5) / nodes.shape[1],
-                   (row / step + 0.5) / nodes.shape[0], (share * (_SLICES - 1) + 0.5) / _SLICES)  # fmt: skip
+        columns = (
+            (column / step + 0.5) / nodes.shape[1],
+            (row / step + 0.5) / nodes.shape[0],
+            (share * (_SLICES - 1) + 0.5) / _SLICES,
+        )
         return mi.Point3f(*(mi.Float(np.ascontiguousarray(values, np.float32)) for values in columns))
 
     samples = np.repeat(pixel[index], distance_m.shape[1])
-    return AirPlaces(nodes, depths, place(pixel, depth_m), index,
-                     place(samples, np.where(shown, distance_m, low).ravel()),
-                     shown / np.maximum(shown.sum(axis=1, keepdims=True), 1))  # fmt: skip
+    return AirPlaces(
+        nodes,
+        depths,
+        place(pixel, depth_m),
+        index,
+        place(samples, np.where(shown, distance_m, low).ravel()),
+        shown / np.maximum(shown.sum(axis=1, keepdims=True), 1),
+    )
 
 
 def air_at(places: AirPlaces, air: AerialPerspective) -> tuple[np.ndarray, np.ndarray]:

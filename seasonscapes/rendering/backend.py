@@ -61,11 +61,17 @@ def library_version(path: str) -> tuple[int, int, int]:
 def _candidate_paths() -> list[str]:
     """Paths of libLLVM on this machine, the likeliest to work first (newest by file name)."""
     patterns = [
-        "/usr/lib/*-linux-gnu/libLLVM*.so*", "/lib/*-linux-gnu/libLLVM*.so*", "/usr/lib/llvm-*/lib/libLLVM*.so*",
-        "/usr/lib64/libLLVM*.so*", "/usr/lib64/llvm*/lib/libLLVM*.so*", "/usr/lib/libLLVM*.so*",
-        "/usr/local/lib/libLLVM*.so*", "/opt/homebrew/opt/llvm*/lib/libLLVM*.dylib",
-        "/usr/local/opt/llvm*/lib/libLLVM*.dylib", os.path.join(sys.prefix, "lib", "libLLVM*.so*"),
-    ]  # fmt: skip
+        "/usr/lib/*-linux-gnu/libLLVM*.so*",
+        "/lib/*-linux-gnu/libLLVM*.so*",
+        "/usr/lib/llvm-*/lib/libLLVM*.so*",
+        "/usr/lib64/libLLVM*.so*",
+        "/usr/lib64/llvm*/lib/libLLVM*.so*",
+        "/usr/lib/libLLVM*.so*",
+        "/usr/local/lib/libLLVM*.so*",
+        "/opt/homebrew/opt/llvm*/lib/libLLVM*.dylib",
+        "/usr/local/opt/llvm*/lib/libLLVM*.dylib",
+        os.path.join(sys.prefix, "lib", "libLLVM*.so*"),
+    ]
     found = {os.path.realpath(path) for pattern in patterns for path in glob.glob(pattern)}
 
     def by_version(path: str) -> int:

@@ -133,8 +133,16 @@ def dr_clamp() -> Any:
     return dr.WrapMode.Clamp
 
 
-def gather(terrain: Occluder, patches: SkyPatches, points: Points, *, rays: int, first: np.ndarray,
-           scramble: np.ndarray, mi_label: Any) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+def gather(
+    terrain: Occluder,
+    patches: SkyPatches,
+    points: Points,
+    *,
+    rays: int,
+    first: np.ndarray,
+    scramble: np.ndarray,
+    mi_label: Any,
+) -> tuple[np.ndarray, np.ndarray]:
     """Where cosine-distributed rays of N points go.
 
     Parameters
@@ -168,8 +176,9 @@ def gather(terrain: Occluder, patches: SkyPatches, points: Points, *, rays: int,
     return patch, met
 
 
-def _gather_block(terrain: Occluder, patches: SkyPatches, points: Points, rays: int,
-                  keys: tuple) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+def _gather_block(
+    terrain: Occluder, patches: SkyPatches, points: Points, rays: int, keys: tuple
+) -> tuple[np.ndarray, np.ndarray]:
     import drjit as dr
     import mitsuba as mi
 

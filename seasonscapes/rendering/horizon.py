@@ -13,8 +13,15 @@ from seasonscapes.rendering.gather import Occluder, Points
 LANES, HALVINGS = 1 << 22, 11
 
 
-def horizon_angles(terrain: Occluder, points: Points, *, azimuths: int = 64, low_rad: float = -0.02,
-                   high_rad: float = 1.29, progress: Callable[[float], None] | None = None) -> np.ndarray:  # fmt: skip
+def horizon_angles(
+    terrain: Occluder,
+    points: Points,
+    *,
+    azimuths: int = 64,
+    low_rad: float = -0.02,
+    high_rad: float = 1.29,
+    progress: Callable[[float], None] | None = None,
+) -> np.ndarray:
     """Elevation ``(N, azimuths)`` float32 [rad] above which places see the sky; column 0 looks north, clockwise.
 
     On a height field what is above a free direction is free, so that halving finds the edge (Max 1988, "Horizon

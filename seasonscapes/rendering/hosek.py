@@ -18,8 +18,13 @@ CD_M2_PER_UNIT = 683.0 * 106.857
 SUN_ANGULAR_RADIUS_DEG = 0.2666
 
 
-def hosek_illumination(sun_direction: np.ndarray, *, turbidity: float = 3.0, ground_albedo: float = 0.2,
-                       shape: tuple[int, int] = (128, 256)) -> Illumination:  # fmt: skip
+def hosek_illumination(
+    sun_direction: np.ndarray,
+    *,
+    turbidity: float = 3.0,
+    ground_albedo: float = 0.2,
+    shape: tuple[int, int] = (128, 256),
+) -> Illumination:
     """Clear daylight at sea level.
 
     Parameters
@@ -39,8 +44,11 @@ def hosek_illumination(sun_direction: np.ndarray, *, turbidity: float = 3.0, gro
     """
     _, elevation_deg = angles_from_direction(sun_direction)
     if elevation_deg <= 0.0:
-        raise InputError("--sky hosek", f"the sun stands at {float(elevation_deg):.2f}°, below the horizon; this model is black there",
-                         cure="choose a time between sunrise and sunset, or the atmosphere model")  # fmt: skip
+        raise InputError(
+            "--sky hosek",
+            f"the sun stands at {float(elevation_deg):.2f}°, below the horizon; this model is black there",
+            cure="choose a time between sunrise and sunset, or the atmosphere model",
+        )
     if not 1.0 <= turbidity <= 10.0:
         raise InputError("--turbidity", "outside the Hosek model", got=turbidity, expected="1 to 10")
     if not 0.0 <= ground_albedo <= 1.0:

@@ -116,8 +116,9 @@ def _rays(terrain: Occluder, points: Points, number: np.ndarray) -> SunRays:
     return sun_rays(terrain, (each.origin, each.normal, each.outward), weight, numbered_turn(number))
 
 
-def irradiance(ready: ReadyPoints, illumination: Illumination, light: SenderLight | None = None, *,
-               sun_rays_each: int = 4) -> Irradiance:  # fmt: skip
+def irradiance(
+    ready: ReadyPoints, illumination: Illumination, light: SenderLight | None = None, *, sun_rays_each: int = 4
+) -> Irradiance:
     """Illuminance on the places under a light.
 
     Parameters
@@ -134,9 +135,16 @@ def irradiance(ready: ReadyPoints, illumination: Illumination, light: SenderLigh
     return Irradiance(sun, np.float32(np.pi) * sky, np.float32(np.pi) * bounce)
 
 
-def irradiance_blocks(terrain: Occluder, position_m: np.ndarray, lights: Sequence[Illumination], effort: Effort | None = None, *,
-                      seed: int = 0, search_m: float = 2.0, progress: Progress | None = None,
-                      ) -> Iterator[tuple[np.ndarray, Points, Iterator[Irradiance]]]:  # fmt: skip
+def irradiance_blocks(
+    terrain: Occluder,
+    position_m: np.ndarray,
+    lights: Sequence[Illumination],
+    effort: Effort | None = None,
+    *,
+    seed: int = 0,
+    search_m: float = 2.0,
+    progress: Progress | None = None,
+) -> Iterator[tuple[np.ndarray, Points, Iterator[Irradiance]]]:
     """Irradiance of many places under many lights, block by block: nothing is kept, so memory stays bounded.
 
     Parameters

@@ -29,8 +29,14 @@ SURVIVAL = 2.0
 _PIXEL, _BOUNCE, _LOBE, _SURVIVAL, _LUMINARY = range(5)
 
 
-def trace_block(scene: RenderScene, camera: Camera | Panorama, block: tuple[int, int, int, int], *, max_depth: int,
-                seed: tuple[int, int]) -> np.ndarray:  # fmt: skip
+def trace_block(
+    scene: RenderScene,
+    camera: Camera | Panorama,
+    block: tuple[int, int, int, int],
+    *,
+    max_depth: int,
+    seed: tuple[int, int],
+) -> np.ndarray:
     """Sums over the samples of a block of rows, ``(height, W, 4)``: radiance [cd/m²] and samples that met terrain.
 
     Parameters

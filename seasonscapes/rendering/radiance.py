@@ -48,8 +48,15 @@ def mi_path_integrator(max_depth: int) -> Any:
     return mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": 64, "hide_emitters": True})
 
 
-def path_trace(scene: RenderScene, camera: Camera | Panorama, *, spp: int = 64, seed: int = 0, max_depth: int = 6,
-               progress: Progress | None = None) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+def path_trace(
+    scene: RenderScene,
+    camera: Camera | Panorama,
+    *,
+    spp: int = 64,
+    seed: int = 0,
+    max_depth: int = 6,
+    progress: Progress | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
     """Radiance that leaves the terrain towards the camera ``(H, W, 3)`` [cd/m²] and coverage ``(H, W)``.
 
     Box-filtered over the pixel and, on the LLVM backend, bit-identical for equal arguments whatever the number of
@@ -87,8 +94,9 @@ def path_trace(scene: RenderScene, camera: Camera | Panorama, *, spp: int = 64, 
     return image[..., :3], np.clip(image[..., 3], 0.0, 1.0)
 
 
-def _trace_block(scene: RenderScene, camera: Camera | Panorama, block: tuple[int, int, int, int], *, max_depth: int,
-                 seed: int) -> np.ndarray:  # fmt: skip
+def _trace_block(
+    scene: RenderScene, camera: Camera | Panorama, block: tuple[int, int, int, int], *, max_depth: int, seed: int
+) -> np.ndarray:
     """Sums over the samples of one block of rows as ``(height, W, 4)``: radiance and coverage."""
     from seasonscapes.rendering.paths import trace_block  # imports Dr.Jit, whose library `use_backend` chooses first
 
@@ -96,8 +104,9 @@ def _trace_block(scene: RenderScene, camera: Camera | Panorama, block: tuple[int
     return trace_block(scene, camera, block, max_depth=max_depth, seed=(first, second))
 
 
-def _trace_block_scalar(scene: RenderScene, camera: Camera | Panorama, block: tuple[int, int, int, int], *, max_depth: int,
-                        seed: int) -> np.ndarray:  # fmt: skip
+def _trace_block_scalar(
+    scene: RenderScene, camera: Camera | Panorama, block: tuple[int, int, int, int], *, max_depth: int, seed: int
+) -> np.ndarray:
     """The same through Mitsuba's own sensor and film, as the scalar variant knows no lanes."""
     import mitsuba as mi
 
@@ -138,16 +147,24 @@ def _trace_block_scalar(scene: RenderScene, camera: Camera | Panorama, block: tu
     return np.array(mean, np.float32) * count
 
 
-def render_view(scene: RenderScene, camera: Camera | Panorama, *, spp: int = 64, seed: int = 0, max_depth: int = 6,
-                progress: Progress | None = None) -> View:  # fmt: skip
+def render_view(
+    scene: RenderScene,
+    camera: Camera | Panorama,
+    *,
+    spp: int = 64,
+    seed: int = 0,
+    max_depth: int = 6,
+    progress: Progress | None = None,
+) -> View:
     """Path trace the terrain, look at it through the air, and put the sky behind it; see `path_trace`."""
     surface, coverage = path_trace(scene, camera, spp=spp, seed=seed, max_depth=max_depth, progress=progress)
     gbuffer = trace_gbuffer(scene, camera)
     return View(through_air(scene, camera, surface, coverage, gbuffer), surface, coverage, gbuffer)
 
 
-def through_air(scene: RenderScene, camera: Camera | Panorama, surface: np.ndarray, coverage: np.ndarray,
-                gbuffer: GBuffer) -> np.ndarray:  # fmt: skip
+def through_air(
+    scene: RenderScene, camera: Camera | Panorama, surface: np.ndarray, coverage: np.ndarray, gbuffer: GBuffer
+) -> np.ndarray:
     """Radiance ``(H, W, 3)`` at the camera of a terrain picture seen through the air, with the sky behind it.
 
     Each pixel's air is that of its centre's distance, except along silhouettes, where 4 × 4 distances are averaged:

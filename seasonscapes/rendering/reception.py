@@ -68,8 +68,9 @@ def ready_senders(terrain: Occluder, senders: Senders) -> ReadySenders:
     """Senders ready for any light."""
     points = senders.points
     shape = points.origin.shape[:2]
-    rays = sun_rays(terrain, (points.origin, points.normal, points.outward), np.ones(shape),
-                    numbered_turn(np.arange(shape[0])))  # fmt: skip
+    rays = sun_rays(
+        terrain, (points.origin, points.normal, points.outward), np.ones(shape), numbered_turn(np.arange(shape[0]))
+    )
     return ReadySenders(senders, ready_reception(senders.reception), rays)
 
 

@@ -90,9 +90,17 @@ def ready_view(terrain: Occluder, coefficients: ViewCoefficients) -> ReadyView:
     rays = sun_rays(
         terrain, places, coefficients.sample_weight, pixel_turn(pixel, camera.width_px, coefficients.effort.subpixels)
     )
-    return ReadyView(coefficients, rays, ready_reception(coefficients.reception, passes),
-                     ready_senders(terrain, coefficients.senders), rough, gbuffer, coverage, air,
-                     sky_grid(camera, np.flatnonzero(coverage.reshape(-1) < 1.0)))  # fmt: skip
+    return ReadyView(
+        coefficients,
+        rays,
+        ready_reception(coefficients.reception, passes),
+        ready_senders(terrain, coefficients.senders),
+        rough,
+        gbuffer,
+        coverage,
+        air,
+        sky_grid(camera, np.flatnonzero(coverage.reshape(-1) < 1.0)),
+    )
 
 
 def _distances(coefficients: ViewCoefficients) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -61,8 +61,14 @@ def mi_mesh(terrain: Terrain, albedo: np.ndarray, *, smooth: bool = True) -> Any
         }
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict({"type": "diffuse", "reflectance": reflectance})
-    mesh = mi.Mesh("terrain", len(terrain.vertices), len(terrain.faces), has_vertex_normals=smooth,
-                   has_vertex_texcoords=True, props=properties)  # fmt: skip
+    mesh = mi.Mesh(
+        "terrain",
+        len(terrain.vertices),
+        len(terrain.faces),
+        has_vertex_normals=smooth,
+        has_vertex_texcoords=True,
+        props=properties,
+    )
     uv = np.array(terrain.uv, np.float32)
     # Mitsuba's bitmaps put row 0 at v = 0; ours is at v = 1 (v runs upwards).
     uv[:, 1] = 1.0 - uv[:, 1]
@@ -128,8 +134,13 @@ def mi_sky(sky_radiance: np.ndarray) -> Any:
     )
     values = sample_equirectangular(np.asarray(sky_radiance, np.float64), direction).astype(np.float32)
     enu_from_local = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], float)
-    return mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(values)),
-                         "to_world": mi.ScalarTransform4f(enu_from_local)})  # fmt: skip
+    return mi.load_dict(
+        {
+            "type": "envmap",
+            "bitmap": mi.Bitmap(np.ascontiguousarray(values)),
+            "to_world": mi.ScalarTransform4f(enu_from_local),
+        }
+    )
 
 
 def relight(mi_terrain: Any, illumination: Illumination, *, max_height_m: float) -> RenderScene:
@@ -152,8 +163,9 @@ def build_scene(
     terrain: Terrain, albedo: np.ndarray, illumination: Illumination, *, smooth: bool = True
 ) -> RenderScene:
     """Terrain with albedo ``(R, S, 3)`` or ``(3,)`` under a light; see `mi_mesh` and `relight`."""
-    return relight(mi_mesh(terrain, albedo, smooth=smooth), illumination,
-                   max_height_m=float(terrain.vertices[:, 2].max()))  # fmt: skip
+    return relight(
+        mi_mesh(terrain, albedo, smooth=smooth), illumination, max_height_m=float(terrain.vertices[:, 2].max())
+    )
 
 
 def set_albedo(scene: RenderScene, albedo: np.ndarray) -> None:

@@ -82,8 +82,9 @@ def pilot_hits(terrain: Occluder, points: Points, depth: int, seed: int) -> tupl
     return joined(found), np.concatenate(faces), np.concatenate(weights)
 
 
-def cluster_faces(hits: tuple[Points, np.ndarray, np.ndarray], faces: tuple[np.ndarray, np.ndarray], count: int, *,
-                  seed: int) -> tuple[Points, np.ndarray]:  # fmt: skip
+def cluster_faces(
+    hits: tuple[Points, np.ndarray, np.ndarray], faces: tuple[np.ndarray, np.ndarray], count: int, *, seed: int
+) -> tuple[Points, np.ndarray]:
     """Divide faces by position and normal, by medians of hits, into ``count`` groups, a power of two.
 
     Parameters
@@ -159,8 +160,9 @@ def _systematic(weight: np.ndarray, count: int, start: float) -> np.ndarray:
     )
 
 
-def sender_lists(met: np.ndarray, weight: np.ndarray, count: int, *,
-                 start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+def sender_lists(
+    met: np.ndarray, weight: np.ndarray, count: int, *, start: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """``count`` senders for each receiver out of those that its rays met ``(N, K)``, and the share of rays that met any.
 
     Systematic resampling along the rays' own (stratified) order: the expected number of times that a sender is listed

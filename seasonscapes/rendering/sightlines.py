@@ -16,8 +16,9 @@ LANES = 1 << 22
 _LIFT_ULP = 8.0
 
 
-def clear_sight(terrain: Occluder, position_m: np.ndarray, normal: np.ndarray, eye_m: np.ndarray, *,
-                lift_m: float | None = None) -> np.ndarray:  # fmt: skip
+def clear_sight(
+    terrain: Occluder, position_m: np.ndarray, normal: np.ndarray, eye_m: np.ndarray, *, lift_m: float | None = None
+) -> np.ndarray:
     """Whether nothing stands between places on the terrain and an eye, ``(N,)`` bool.
 
     Parameters
@@ -39,8 +40,9 @@ def clear_sight(terrain: Occluder, position_m: np.ndarray, normal: np.ndarray, e
     return clear
 
 
-def _clear_block(terrain: Occluder, position_m: np.ndarray, normal: np.ndarray, eye_m: np.ndarray,
-                 lift_m: float | None) -> np.ndarray:  # fmt: skip
+def _clear_block(
+    terrain: Occluder, position_m: np.ndarray, normal: np.ndarray, eye_m: np.ndarray, lift_m: float | None
+) -> np.ndarray:
     import drjit as dr
     import mitsuba as mi
 

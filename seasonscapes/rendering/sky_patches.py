@@ -173,9 +173,15 @@ def sky_covariance(patches: SkyPatches, *, unrest: float = 0.15) -> np.ndarray:
     angle = np.arccos(np.clip(direction @ suns.T, -1.0, 1.0))
     skies = []
     # (a, b) gradation, (c, d, e) indicatrix of CIE types 1, 5, 12, 13 and 14, then a narrow aureole, then dusk.
-    for a, b, c, d, e in ((4.0, -0.7, 0.0, -1.0, 0.0), (0.0, -1.0, 0.0, -1.0, 0.0), (-1.0, -0.32, 10.0, -3.0, 0.45),
-                          (-1.0, -0.32, 16.0, -3.0, 0.30), (-1.0, -0.15, 16.0, -3.0, 0.30),
-                          (-1.0, -0.32, 60.0, -12.0, 0.3), (-1.0, -1.2, 4.0, -2.0, 0.2)):  # fmt: skip
+    for a, b, c, d, e in (
+        (4.0, -0.7, 0.0, -1.0, 0.0),
+        (0.0, -1.0, 0.0, -1.0, 0.0),
+        (-1.0, -0.32, 10.0, -3.0, 0.45),
+        (-1.0, -0.32, 16.0, -3.0, 0.30),
+        (-1.0, -0.15, 16.0, -3.0, 0.30),
+        (-1.0, -0.32, 60.0, -12.0, 0.3),
+        (-1.0, -1.2, 4.0, -2.0, 0.2),
+    ):
         gradation = 1.0 + a * np.exp(b / zenith_cosine)
         indicatrix = 1.0 + c * (np.exp(d * angle) - np.exp(d * np.pi / 2.0)) + e * np.cos(angle) ** 2
         skies.append(np.where(above[:, None], gradation[:, None] * indicatrix, 0.0))

@@ -33,8 +33,14 @@ class Neighbours:
     weight: np.ndarray
 
 
-def neighbours(grid: tuple[int, int], pixel: np.ndarray, surface: tuple[np.ndarray, np.ndarray, np.ndarray], *,
-               stride: int, sharpness: float) -> Neighbours:  # fmt: skip
+def neighbours(
+    grid: tuple[int, int],
+    pixel: np.ndarray,
+    surface: tuple[np.ndarray, np.ndarray, np.ndarray],
+    *,
+    stride: int,
+    sharpness: float,
+) -> Neighbours:
     """Which receivers to share with, and how much.
 
     Parameters

@@ -43,8 +43,12 @@ class ReadySplats:
 def finer_camera(camera: Camera, times: int) -> Camera:
     """The same view with ``times`` as many pixels along each side."""
     numbers = (camera.fx, camera.fy, camera.cx, camera.cy)
-    return Camera(camera.width_px * times, camera.height_px * times, *(times * number for number in numbers),
-                  camera.world_from_camera)  # fmt: skip
+    return Camera(
+        camera.width_px * times,
+        camera.height_px * times,
+        *(times * number for number in numbers),
+        camera.world_from_camera,
+    )
 
 
 def ready_splats(means: np.ndarray, axes: np.ndarray, opacity: np.ndarray) -> ReadySplats:
@@ -99,8 +103,10 @@ def splat_layers(ready: ReadySplats, layers: np.ndarray, camera: Camera, cuts: C
         alpha = dr.minimum(opacity * dr.exp(-0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy), most)
         alpha = dr.select(alpha >= least, alpha, 0.0)
         weight = through * alpha
-        added = (dr.fma(weight, dr.gather(mi.Float, channel, splat), held)
-                 for channel, held in zip(channels, sums, strict=True))  # fmt: skip
+        added = (
+            dr.fma(weight, dr.gather(mi.Float, channel, splat), held)
+            for channel, held in zip(channels, sums, strict=True)
+        )
         return (number + 1, through * (1.0 - alpha), *added)
 
     begin, end = dr.gather(mi.UInt32, mi_start, tile), dr.gather(mi.UInt32, mi_start, tile + 1)
@@ -141,9 +147,17 @@ def _project(ready: ReadySplats, camera: Camera, cuts: Cuts) -> tuple:
     if cuts.one_sided:
         seen &= dr.dot(local, ready.mi_axes[2]) < 0.0
     reach = dr.sqrt(dr.maximum(2.0 * dr.log(ready.mi_opacity / number(max(cuts.alpha_cut, 1e-30))), 0.0))
-    facts = (fx * x / z + number(camera.cx), fy * y / z + number(camera.cy), yy / determinant, -xy / determinant,
-             xx / determinant, ready.mi_opacity, z, dr.select(seen, reach * dr.sqrt(xx), -1.0),
-             dr.select(seen, reach * dr.sqrt(yy), -1.0))  # fmt: skip
+    facts = (
+        fx * x / z + number(camera.cx),
+        fy * y / z + number(camera.cy),
+        yy / determinant,
+        -xy / determinant,
+        xx / determinant,
+        ready.mi_opacity,
+        z,
+        dr.select(seen, reach * dr.sqrt(xx), -1.0),
+        dr.select(seen, reach * dr.sqrt(yy), -1.0),
+    )
     dr.eval(facts)
     return facts
 
@@ -154,8 +168,13 @@ def _bins(facts: tuple, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
     cx, cy, depth, reach_x, reach_y = (np.array(facts[k]) for k in (0, 1, 6, 7, 8))
     across, down = -(-camera.width_px // TILE), -(-camera.height_px // TILE)
-    inside = np.flatnonzero((reach_x >= 0.0) & (cx + reach_x > 0.0) & (cx - reach_x < camera.width_px)
-                            & (cy + reach_y > 0.0) & (cy - reach_y < camera.height_px))  # fmt: skip
+    inside = np.flatnonzero(
+        (reach_x >= 0.0)
+        & (cx + reach_x > 0.0)
+        & (cx - reach_x < camera.width_px)
+        & (cy + reach_y > 0.0)
+        & (cy - reach_y < camera.height_px)
+    )
     inside = inside[np.argsort(depth[inside], kind="stable")]
 
     def tiles(centre: np.ndarray, reach: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -172,8 +191,9 @@ def _bins(facts: tuple, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     number = np.arange(len(splat), dtype=np.int32) - np.repeat((np.cumsum(each) - each).astype(np.int32), each)
     row = number // wide[splat]
     tile = (top[splat] + row) * np.int32(across) + left[splat] + number - row * wide[splat]
-    table = sparse.coo_array((inside[splat].astype(np.int64) + 1, (tile, np.zeros(len(tile), np.int32))),
-                             shape=(across * down, 1))  # fmt: skip
+    table = sparse.coo_array(
+        (inside[splat].astype(np.int64) + 1, (tile, np.zeros(len(tile), np.int32))), shape=(across * down, 1)
+    )
     table.has_canonical_format = True  # else splats of one tile would be added up
     table = table.tocsr()
     return (table.data - 1).astype(np.uint32), table.indptr.astype(np.uint32)

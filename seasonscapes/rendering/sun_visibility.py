@@ -52,8 +52,9 @@ class SunRays:
         return dr.width(self.mi_weight) // self.places
 
 
-def sun_rays(terrain: Occluder, places: tuple[np.ndarray, np.ndarray, np.ndarray], weight: np.ndarray,
-             turn: np.ndarray) -> SunRays:  # fmt: skip
+def sun_rays(
+    terrain: Occluder, places: tuple[np.ndarray, np.ndarray, np.ndarray], weight: np.ndarray, turn: np.ndarray
+) -> SunRays:
     """Shadow rays from places.
 
     Parameters

@@ -155,8 +155,14 @@ class Preparation:
     senders: Senders
 
 
-def trace_view(terrain: Occluder, camera: Camera | Panorama, effort: Effort | None = None, *, seed: int = 0,
-               progress: Progress | None = None) -> ViewCoefficients:  # fmt: skip
+def trace_view(
+    terrain: Occluder,
+    camera: Camera | Panorama,
+    effort: Effort | None = None,
+    *,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> ViewCoefficients:
     """Daylight coefficients of a view. Memory beyond the result does not grow with the view.
 
     Parameters
@@ -195,12 +201,21 @@ def view_neighbours(view: ViewCoefficients, *, stride: int, sharpness: float) ->
     position = view.sample_origin.mean(axis=1)
     normal = view.normal / np.maximum(np.linalg.norm(view.normal, axis=1, keepdims=True), 1e-6)
     size = np.linalg.norm(position - camera.position_m.astype(np.float32), axis=1) / np.float32(camera.fx)
-    return neighbours((camera.height_px, camera.width_px), view.pixel, (position, normal, size), stride=stride,
-                      sharpness=sharpness)  # fmt: skip
+    return neighbours(
+        (camera.height_px, camera.width_px), view.pixel, (position, normal, size), stride=stride, sharpness=sharpness
+    )
 
 
-def trace_points(terrain: Occluder, points: Points, effort: Effort | None = None, *, prepared: Preparation | None = None,
-                 seed: int = 0, number: np.ndarray | None = None, progress: Progress | None = None) -> PointCoefficients:  # fmt: skip
+def trace_points(
+    terrain: Occluder,
+    points: Points,
+    effort: Effort | None = None,
+    *,
+    prepared: Preparation | None = None,
+    seed: int = 0,
+    number: np.ndarray | None = None,
+    progress: Progress | None = None,
+) -> PointCoefficients:
     """Daylight coefficients of places on the terrain, such as texels.
 
     Parameters
@@ -243,8 +258,15 @@ def prepare(terrain: Occluder, pilot: Points, effort: Effort, *, seed: int = 0) 
     some = joined(
         [pilot[:half], hits[0][np.resize(np.arange(len(hits[1])), half)] if len(hits[1]) else pilot[half:_EXAMPLES]]
     )
-    patch, met = gather(terrain, patches, some, rays=_EXAMPLE_RAYS, first=np.zeros(_EXAMPLES, np.uint32),
-                        scramble=np.arange(_EXAMPLES, dtype=np.uint32), mi_label=none)  # fmt: skip
+    patch, met = gather(
+        terrain,
+        patches,
+        some,
+        rays=_EXAMPLE_RAYS,
+        first=np.zeros(_EXAMPLES, np.uint32),
+        scramble=np.arange(_EXAMPLES, dtype=np.uint32),
+        mi_label=none,
+    )
     rows = patch_sums(patch, np.where(met == OPEN, np.float32(1.0 / _EXAMPLE_RAYS), 0.0), np.eye(patches.size))
     basis = direction_basis(rows, patches, effort.rank)
     if effort.bounces == 0 or len(hits[1]) == 0:
@@ -257,21 +279,34 @@ def prepare(terrain: Occluder, pilot: Points, effort: Effort, *, seed: int = 0) 
     step = max(1, BLOCK_RAYS // effort.rays)
     even = np.full((size, PLACES), 1.0 / PLACES, np.float32)
     parts = [
-        _receive(terrain, prepared, points[i : i + step],
-                 (even[i : i + step], np.arange(i, min(i + step, size), dtype=np.uint32)), effort, seed)
+        _receive(
+            terrain,
+            prepared,
+            points[i : i + step],
+            (even[i : i + step], np.arange(i, min(i + step, size), dtype=np.uint32)),
+            effort,
+            seed,
+        )
         for i in range(0, size, step)
-    ]  # fmt: skip
+    ]
     reception = Reception(*(np.concatenate(column) for column in zip(*parts, strict=True)))
     return replace(prepared, senders=replace(senders, reception=reception))
 
 
 def _nothing(basis: DirectionBasis, effort: Effort) -> Reception:
-    return Reception(np.zeros((1, basis.into.shape[1]), np.float16), np.zeros((1, effort.listed), np.uint16),
-                     np.zeros(1, np.float16))  # fmt: skip
+    return Reception(
+        np.zeros((1, basis.into.shape[1]), np.float16), np.zeros((1, effort.listed), np.uint16), np.zeros(1, np.float16)
+    )
 
 
-def _view_rows(terrain: Occluder, prepared: Preparation, camera: Camera | Panorama, rows: tuple[int, int], effort: Effort,
-               seed: int) -> list[tuple]:  # fmt: skip
+def _view_rows(
+    terrain: Occluder,
+    prepared: Preparation,
+    camera: Camera | Panorama,
+    rows: tuple[int, int],
+    effort: Effort,
+    seed: int,
+) -> list[tuple]:
     """The columns of `ViewCoefficients` and of its `Reception` for a block of rows; empty where they show no terrain."""
     points, hit, pixel = view_samples(terrain, camera, rows, effort.subpixels, seed)
     if len(pixel) == 0:
@@ -280,8 +315,19 @@ def _view_rows(terrain: Occluder, prepared: Preparation, camera: Camera | Panora
     shown = pixel - rows[0] * camera.width_px
     albedo, normal, coverage = pixel_moments(terrain, camera, rows, effort.shades, seed)
     received = _receive(terrain, prepared, points, (weight, pixel.astype(np.uint32)), effort, seed)
-    return [(pixel, coverage[shown], albedo[shown], normal[shown], points.origin, points.normal.astype(np.float16),
-             points.outward.astype(np.float16), weight.astype(np.float16), *received)]  # fmt: skip
+    return [
+        (
+            pixel,
+            coverage[shown],
+            albedo[shown],
+            normal[shown],
+            points.origin,
+            points.normal.astype(np.float16),
+            points.outward.astype(np.float16),
+            weight.astype(np.float16),
+            *received,
+        )
+    ]
 
 
 def view_albedo(terrain: Occluder, coefficients: ViewCoefficients) -> np.ndarray:
@@ -292,8 +338,14 @@ def view_albedo(terrain: Occluder, coefficients: ViewCoefficients) -> np.ndarray
     ]
 
 
-def _receive(terrain: Occluder, prepared: Preparation, points: Points, shares: tuple[np.ndarray, np.ndarray],
-             effort: Effort, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+def _receive(
+    terrain: Occluder,
+    prepared: Preparation,
+    points: Points,
+    shares: tuple[np.ndarray, np.ndarray],
+    effort: Effort,
+    seed: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Columns of `Reception` for N receivers with S places each.
 
     ``shares`` are the weights of places ``(N, S)`` and a number ``(N,)`` that makes each receiver's rays its own.
@@ -304,8 +356,15 @@ def _receive(terrain: Occluder, prepared: Preparation, points: Points, shares: t
     # Ray i of a receiver starts at place i · S / rays, so that each place has an aligned run of the sequence.
     first = np.tile(np.arange(places, dtype=np.uint32) * np.uint32(each), count)
     scramble = np.repeat(identity + np.uint32((seed * 747796405 + 1) % 2**32), places)
-    patch, met = gather(terrain, sky_patches(effort.patches), points.reshape(-1), rays=each, first=first,
-                        scramble=scramble, mi_label=prepared.mi_label)  # fmt: skip
+    patch, met = gather(
+        terrain,
+        sky_patches(effort.patches),
+        points.reshape(-1),
+        rays=each,
+        first=first,
+        scramble=scramble,
+        mi_label=prepared.mi_label,
+    )
     patch, met = patch.reshape(count, -1), met.reshape(count, -1)
     ray_weight = np.repeat(weight / np.float32(each), each, axis=1)
     direct = patch_sums(patch, np.where(met == OPEN, ray_weight, 0.0), prepared.basis.into)

@@ -17,8 +17,9 @@ from seasonscapes.sky.illumination import LUMINANCE_WEIGHTS
 _PIXEL = 103
 
 
-def view_samples(terrain: Occluder, camera: Camera | Panorama, rows: tuple[int, int], count: int,
-                 seed: int) -> tuple[Points, np.ndarray, np.ndarray]:  # fmt: skip
+def view_samples(
+    terrain: Occluder, camera: Camera | Panorama, rows: tuple[int, int], count: int, seed: int
+) -> tuple[Points, np.ndarray, np.ndarray]:
     """Surfaces ``(n, S)`` under the samples of a block of rows, which are terrain ``(n, S)``, and the pixels ``(n,)``.
 
     Only pixels that show terrain. Terrain comes first among the samples of a pixel; sky is black and repeats the place
@@ -48,8 +49,9 @@ def sample_weights(albedo: np.ndarray, hit: np.ndarray) -> np.ndarray:
     return (shade / shade.sum(axis=1, keepdims=True)).astype(np.float32)
 
 
-def camera_points(terrain: Occluder, camera: Camera | Panorama, rows: tuple[int, int], count: int,
-                   seed: int) -> tuple[Points, np.ndarray]:  # fmt: skip
+def camera_points(
+    terrain: Occluder, camera: Camera | Panorama, rows: tuple[int, int], count: int, seed: int
+) -> tuple[Points, np.ndarray]:
     """Surfaces under stratified samples of rows of pixels, samples of a pixel side by side, and which met terrain."""
     interaction = _mi_camera_rays(terrain, camera, rows, count, seed)
     valid = interaction.is_valid()
@@ -74,8 +76,9 @@ def _mi_camera_rays(terrain: Occluder, camera: Camera | Panorama, rows: tuple[in
     return terrain.mi_scene.ray_intersect(mi_rays(camera, x, y))
 
 
-def pixel_moments(terrain: Occluder, camera: Camera | Panorama, rows: tuple[int, int], count: int,
-             seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+def pixel_moments(
+    terrain: Occluder, camera: Camera | Panorama, rows: tuple[int, int], count: int, seed: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean albedo ``(N, 3)``, mean normal weighted by luminous albedo ``(N, 3)`` and coverage ``(N,)`` of all pixels.
 
     Nothing but these sums leaves the device, so that many samples may be taken.

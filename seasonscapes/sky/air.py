@@ -64,10 +64,15 @@ class Atmosphere:
 
     def __post_init__(self):
         bounds = {
-            "aerosol_optical_depth_500nm": (0.0, 50.0), "angstrom_exponent": (-1.0, 4.0),
-            "aerosol_scale_height_m": (50.0, np.inf), "single_scattering_albedo": (0.0, 1.0), "asymmetry": (0.0, 0.85),
-            "ozone_du": (0.0, 1000.0), "ground_height_m": (-500.0, 6000.0), "pressure_hpa": (0.0, 1100.0),
-        }  # fmt: skip
+            "aerosol_optical_depth_500nm": (0.0, 50.0),
+            "angstrom_exponent": (-1.0, 4.0),
+            "aerosol_scale_height_m": (50.0, np.inf),
+            "single_scattering_albedo": (0.0, 1.0),
+            "asymmetry": (0.0, 0.85),
+            "ozone_du": (0.0, 1000.0),
+            "ground_height_m": (-500.0, 6000.0),
+            "pressure_hpa": (0.0, 1100.0),
+        }
         for name, (low, high) in bounds.items():
             if not low <= getattr(self, name) <= high:
                 raise ValueError(f"{name}: got {getattr(self, name)}, expected {low:g} to {high:g}")
@@ -105,9 +110,14 @@ def visibility_extinction_per_m(visibility_m: float) -> float:
     return KOSCHMIEDER / visibility_m
 
 
-def aerosol_optical_depth_from_visibility(visibility_m: float, *, height_m: float = 0.0, angstrom_exponent: float = 1.3,
-                                          aerosol_scale_height_m: float = 2000.0, ground_height_m: float = 0.0,
-                                          ) -> float:  # fmt: skip
+def aerosol_optical_depth_from_visibility(
+    visibility_m: float,
+    *,
+    height_m: float = 0.0,
+    angstrom_exponent: float = 1.3,
+    aerosol_scale_height_m: float = 2000.0,
+    ground_height_m: float = 0.0,
+) -> float:
     """Aerosol optical depth at 500 nm that gives a meteorological range at a height.
 
     The aerosol makes up what gas leaves of ``3.912 / V`` at 550 nm.

@@ -21,8 +21,15 @@ AZIMUTHS = 12
 AZIMUTHS_RAD = (np.arange(AZIMUTHS) + 0.5) * np.pi / AZIMUTHS
 
 
-def parts_along(tables: AtmosphereTables, samples: Samples, sun_rad: float, colours: np.ndarray, diffuse: np.ndarray, *,
-                cumulative: bool = False) -> np.ndarray:  # fmt: skip
+def parts_along(
+    tables: AtmosphereTables,
+    samples: Samples,
+    sun_rad: float,
+    colours: np.ndarray,
+    diffuse: np.ndarray,
+    *,
+    cumulative: bool = False,
+) -> np.ndarray:
     """Light ``(K, A, M or 1, 10)`` of one luminary: once by gas, once by aerosol, all else, and the aerosol's column.
 
     Light scattered once is over its phase function. The last part is the mean column of aerosol along sun, scattering
@@ -60,8 +67,14 @@ def parts_along(tables: AtmosphereTables, samples: Samples, sun_rad: float, colo
     )
 
 
-def diffuse_along(tables: AtmosphereTables, samples: Samples, elevation_rad: np.ndarray, suns_rad: np.ndarray, *,
-                  cumulative: bool = False) -> np.ndarray:  # fmt: skip
+def diffuse_along(
+    tables: AtmosphereTables,
+    samples: Samples,
+    elevation_rad: np.ndarray,
+    suns_rad: np.ndarray,
+    *,
+    cumulative: bool = False,
+) -> np.ndarray:
     """Transfers ``(N, K, A, M or 1, B)`` of diffuse light along rays of K elevations under N suns [rad].
 
     Diffuse is what was scattered, or sent back by the ground, before it was scattered towards the observer.
@@ -84,8 +97,12 @@ def ground_along(tables: AtmosphereTables, samples: Samples, sun_rad: float) -> 
     index, share = sun_index(sine)
     share = share[..., None]
     table = tables.moments.ground_irradiance
-    direct = sun_transfer(atmosphere, tables.sun_columns, scaled, np.full(sine.shape, atmosphere.ground_height_m),
-                          np.arcsin(sine)) * np.maximum(sine, 0.0)[..., None]  # fmt: skip
+    direct = (
+        sun_transfer(
+            atmosphere, tables.sun_columns, scaled, np.full(sine.shape, atmosphere.ground_height_m), np.arcsin(sine)
+        )
+        * np.maximum(sine, 0.0)[..., None]
+    )
     irradiance = direct + table[index] * (1.0 - share) + table[index + 1] * share
     albedo = np.broadcast_to(np.asarray(atmosphere.ground_albedo, float), WAVELENGTHS_NM.shape)
     ends = np.where(samples.paths.ends_on_ground[:, None], samples.end_transmittance, 0.0)

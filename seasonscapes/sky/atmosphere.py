@@ -59,8 +59,14 @@ def true_elevation_deg(atmosphere: Atmosphere, apparent_elevation_deg, height_m:
     return np.interp(apparent, lifted, true)
 
 
-def sky_radiance_map(tables: AtmosphereTables, sun_direction, observer_height_m: float, *,
-                     shape: tuple[int, int] = (128, 256), irradiance=1.0) -> np.ndarray:  # fmt: skip
+def sky_radiance_map(
+    tables: AtmosphereTables,
+    sun_direction,
+    observer_height_m: float,
+    *,
+    shape: tuple[int, int] = (128, 256),
+    irradiance=1.0,
+) -> np.ndarray:
     """Radiance of the whole sphere around an observer, without the sun's disc.
 
     Parameters
@@ -86,8 +92,15 @@ def sky_radiance_map(tables: AtmosphereTables, sun_direction, observer_height_m:
     return _map_of((light,), shape)
 
 
-def sun_luminary(tables: AtmosphereTables, sun_direction, observer_height_m: float, distance_au: float = 1.0, *,
-                 irradiance=1.0, angular_radius_deg: float | None = None) -> Luminary | None:  # fmt: skip
+def sun_luminary(
+    tables: AtmosphereTables,
+    sun_direction,
+    observer_height_m: float,
+    distance_au: float = 1.0,
+    *,
+    irradiance=1.0,
+    angular_radius_deg: float | None = None,
+) -> Luminary | None:
     """The sun (or another luminary) as it shines through the air on a plane facing it.
 
     The share of its disc below the horizon of the model's ground is taken away, so that it sets gradually; limb
@@ -116,9 +129,16 @@ def sun_luminary(tables: AtmosphereTables, sun_direction, observer_height_m: flo
     return Luminary(direction, illuminance, radius)
 
 
-def illumination_from_atmosphere(tables: AtmosphereTables, sun_direction, observer_height_m: float, *,
-                                 distance_au: float = 1.0, moon: tuple | None = None, shape: tuple[int, int] = (128, 256),
-                                 with_air: bool = True) -> Illumination:  # fmt: skip
+def illumination_from_atmosphere(
+    tables: AtmosphereTables,
+    sun_direction,
+    observer_height_m: float,
+    *,
+    distance_au: float = 1.0,
+    moon: tuple | None = None,
+    shape: tuple[int, int] = (128, 256),
+    with_air: bool = True,
+) -> Illumination:
     """All the light of one instant for an observer: sun, sky, moon and aerial perspective.
 
     Parameters
@@ -179,11 +199,15 @@ def save_tables(path: str | PathLike, tables: AtmosphereTables) -> None:
     """Write tables to one ``.npz`` file, atomically."""
     with atomic_path(path) as temporary:
         np.savez_compressed(
-            temporary, revision=TABLES_REVISION, atmosphere=json.dumps(asdict(tables.atmosphere)),
-            lowest_rad=tables.sun_columns.lowest_rad, log_columns=tables.sun_columns.log_columns,
-            log_mean=tables.moments.log_mean, ratio=tables.moments.ratio,
+            temporary,
+            revision=TABLES_REVISION,
+            atmosphere=json.dumps(asdict(tables.atmosphere)),
+            lowest_rad=tables.sun_columns.lowest_rad,
+            log_columns=tables.sun_columns.log_columns,
+            log_mean=tables.moments.log_mean,
+            ratio=tables.moments.ratio,
             ground_irradiance=tables.moments.ground_irradiance,
-        )  # fmt: skip
+        )
 
 
 def load_tables(path: str | PathLike) -> AtmosphereTables:
@@ -237,9 +261,13 @@ def _direct_transfer(tables: AtmosphereTables, direction: np.ndarray, height_m: 
     true_rad = _true_rad(tables.atmosphere, direction, height_m)
     height = max(float(height_m), tables.atmosphere.ground_height_m)
     return sun_transfer(
-        tables.atmosphere, tables.sun_columns, optics(tables.atmosphere), np.asarray(height), true_rad,
+        tables.atmosphere,
+        tables.sun_columns,
+        optics(tables.atmosphere),
+        np.asarray(height),
+        true_rad,
         radius_deg=radius_deg,
-    )  # fmt: skip
+    )
 
 
 def _surface_transfer(tables: AtmosphereTables, direction: np.ndarray, height_m: float, true_rad: float) -> np.ndarray:

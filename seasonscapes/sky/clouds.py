@@ -38,8 +38,14 @@ class _CloudedAir:
         return transmittance, self.share * airlight + (1.0 - transmittance) * self.airlight
 
 
-def with_clouds(clear: Illumination, cloudiness: float, source_direction: np.ndarray, *,
-                transmission: float | None = None, colour: np.ndarray | None = None) -> Illumination:  # fmt: skip
+def with_clouds(
+    clear: Illumination,
+    cloudiness: float,
+    source_direction: np.ndarray,
+    *,
+    transmission: float | None = None,
+    colour: np.ndarray | None = None,
+) -> Illumination:
     """The light under a sky whose share ``cloudiness`` is covered; 0 returns ``clear`` unchanged.
 
     Global light falls as ``1 - (1 - t) c^3.4`` and its direct share as ``1 - c²``, the forms that Kasten & Czeplak

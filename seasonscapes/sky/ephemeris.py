@@ -150,9 +150,16 @@ def refraction_deg(true_elevation_deg, *, pressure_hpa: float = 1013.25, tempera
     return (lift * share**2 * (3.0 - 2.0 * share))[()]
 
 
-def sun_position(time: datetime | Sequence[datetime], latitude_deg: float, longitude_deg: float, height_m: float = 0.0,
-                 *, pressure_hpa: float | None = None, temperature_c: float = 10.0,
-                 delta_t_s: float | None = None) -> SolarPosition:  # fmt: skip
+def sun_position(
+    time: datetime | Sequence[datetime],
+    latitude_deg: float,
+    longitude_deg: float,
+    height_m: float = 0.0,
+    *,
+    pressure_hpa: float | None = None,
+    temperature_c: float = 10.0,
+    delta_t_s: float | None = None,
+) -> SolarPosition:
     """Apparent topocentric place of the sun.
 
     Parameters
@@ -187,8 +194,15 @@ def sun_position(time: datetime | Sequence[datetime], latitude_deg: float, longi
     )
 
 
-def moon_position(time: datetime | Sequence[datetime], latitude_deg: float, longitude_deg: float, height_m: float = 0.0,
-                  *, pressure_hpa: float | None = None, temperature_c: float = 10.0) -> LunarPosition:  # fmt: skip
+def moon_position(
+    time: datetime | Sequence[datetime],
+    latitude_deg: float,
+    longitude_deg: float,
+    height_m: float = 0.0,
+    *,
+    pressure_hpa: float | None = None,
+    temperature_c: float = 10.0,
+) -> LunarPosition:
     """Apparent topocentric place, distance and phase of the moon; parameters and errors as in `sun_position`."""
     when = _skyfield_time(time, None)
     kernel, place = _kernel(), _observer(latitude_deg, longitude_deg, height_m).at(when)
@@ -336,8 +350,9 @@ def _skyfield_time(time: datetime | Sequence[datetime], delta_t_s: float | None)
     whole, fraction = whole + 2451545.0, fraction / 86400.0
     if np.any((whole + fraction < _FIRST_JD) | (whole + fraction > _LAST_JD)):
         wrong = times[int(np.argmax((whole + fraction < _FIRST_JD) | (whole + fraction > _LAST_JD)))]
-        raise InputError("time", "outside the ephemeris of sun and moon", got=wrong.isoformat(),
-                         expected="1899-07-29 to 2053-10-07")  # fmt: skip
+        raise InputError(
+            "time", "outside the ephemeris of sun and moon", got=wrong.isoformat(), expected="1899-07-29 to 2053-10-07"
+        )
     scale = _timescale(delta_t_s)
     # ΔT varies by seconds a year, so that one look-up at UT1 instead of TT is exact enough (< 1 µs).
     terrestrial = fraction + scale.delta_t_function(whole + fraction) / 86400.0

@@ -38,9 +38,17 @@ def tables_in_memory(atmosphere: Atmosphere) -> AtmosphereTables:
     return atmosphere_tables(atmosphere)
 
 
-def illuminate(model: SkyModel, sun: SolarPosition, moon: LunarPosition | None = None, *, height_m: float = 0.0,
-               map_height: int = 128, with_air: bool = True, tables_of: TablesOf = tables_in_memory,
-               hosek: HosekOf | None = None) -> Illumination:  # fmt: skip
+def illuminate(
+    model: SkyModel,
+    sun: SolarPosition,
+    moon: LunarPosition | None = None,
+    *,
+    height_m: float = 0.0,
+    map_height: int = 128,
+    with_air: bool = True,
+    tables_of: TablesOf = tables_in_memory,
+    hosek: HosekOf | None = None,
+) -> Illumination:
     """All the light of one instant at one place under a sky model.
 
     Parameters
@@ -74,8 +82,12 @@ def illuminate(model: SkyModel, sun: SolarPosition, moon: LunarPosition | None =
     if isinstance(model, HosekModel):
         if hosek is None:
             raise ValueError("kind 'hosek' is evaluated by the renderer: pass hosek=rendering.hosek.hosek_illumination")
-        clear = hosek(sun.direction, turbidity=model.turbidity, ground_albedo=model.ground.albedo,
-                      shape=(map_height, 2 * map_height))  # fmt: skip
+        clear = hosek(
+            sun.direction,
+            turbidity=model.turbidity,
+            ground_albedo=model.ground.albedo,
+            shape=(map_height, 2 * map_height),
+        )
         return _named(model, _clouded(model, clear, sun, None))
     if isinstance(model, AtmosphereModel):
         moon = _worth_having(sun, moon)
@@ -95,27 +107,50 @@ def _worth_having(sun: SolarPosition, moon: LunarPosition | None) -> LunarPositi
     return moon
 
 
-def _atmosphere(model: AtmosphereModel, sun: SolarPosition, moon: LunarPosition | None, height_m: float,
-                extent: tuple[int, bool], tables_of: TablesOf) -> Illumination:  # fmt: skip
+def _atmosphere(
+    model: AtmosphereModel,
+    sun: SolarPosition,
+    moon: LunarPosition | None,
+    height_m: float,
+    extent: tuple[int, bool],
+    tables_of: TablesOf,
+) -> Illumination:
     map_height, with_air = extent
     source = None
     if moon is not None:
         source = (moon.direction, moon_to_sun_ratio(moon, WAVELENGTHS_NM), float(moon.angular_radius_deg))
     clear = illumination_from_atmosphere(
-        tables_of(atmosphere_of(model)), sun.direction, height_m, distance_au=float(sun.distance_au), moon=source,
-        shape=(map_height, 2 * map_height), with_air=with_air,
-    )  # fmt: skip
+        tables_of(atmosphere_of(model)),
+        sun.direction,
+        height_m,
+        distance_au=float(sun.distance_au),
+        moon=source,
+        shape=(map_height, 2 * map_height),
+        with_air=with_air,
+    )
     haze = model.aerosol.optical_depth_500nm * float(angstrom_ratio(model.aerosol.angstrom_exponent, 500.0, 550.0))
-    night = night_sky_radiance(map_height, 2 * map_height, height_m=height_m, ground_albedo=model.ground.albedo,
-                               optical_depth=haze + float(rayleigh_optical_depth(550.0)))  # fmt: skip
+    night = night_sky_radiance(
+        map_height,
+        2 * map_height,
+        height_m=height_m,
+        ground_albedo=model.ground.albedo,
+        optical_depth=haze + float(rayleigh_optical_depth(550.0)),
+    )
     return replace(clear, sky_radiance=(clear.sky_radiance + night).astype(np.float32))
 
 
-def _overcast(model: OvercastModel, sun: SolarPosition, moon: LunarPosition | None, height_m: float,
-              map_height: int) -> Illumination:  # fmt: skip
-    return overcast(sun, _worth_having(sun, moon), height_m=height_m, map_height=map_height,
-                    visibility_km=model.visibility_km, ground_albedo=model.ground.albedo,
-                    intermediate=model.distribution == "intermediate")  # fmt: skip
+def _overcast(
+    model: OvercastModel, sun: SolarPosition, moon: LunarPosition | None, height_m: float, map_height: int
+) -> Illumination:
+    return overcast(
+        sun,
+        _worth_having(sun, moon),
+        height_m=height_m,
+        map_height=map_height,
+        visibility_km=model.visibility_km,
+        ground_albedo=model.ground.albedo,
+        intermediate=model.distribution == "intermediate",
+    )
 
 
 def _clouded(model: SkyModel, clear: Illumination, sun: SolarPosition, moon: LunarPosition | None) -> Illumination:

@@ -110,5 +110,6 @@ def global_horizontal_illuminance(illumination: Illumination) -> np.ndarray:
 def uniform_sky(radiance_rgb, *, height: int = 32) -> Illumination:
     """The same radiance from every direction (the white furnace), ``radiance_rgb`` ``(3,)`` or scalar [cd/m²]."""
     shape = equirectangular_directions(height, 2 * height).shape
-    return Illumination(sky_radiance=np.broadcast_to(np.asarray(radiance_rgb, np.float32), shape).copy(),
-                        model={"kind": "uniform"})  # fmt: skip
+    return Illumination(
+        sky_radiance=np.broadcast_to(np.asarray(radiance_rgb, np.float32), shape).copy(), model={"kind": "uniform"}
+    )

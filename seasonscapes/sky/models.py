@@ -133,14 +133,24 @@ def read_sky_model(name_or_path: str | Path) -> SkyModel:
     table = read_toml(path)
     kind = table.get("kind")
     if kind not in KINDS:
-        raise InputError(f"{path}: kind", "no such kind of sky model" if "kind" in table else "missing key", got=kind,
-                         expected="one of " + ", ".join(KINDS))  # fmt: skip
+        raise InputError(
+            f"{path}: kind",
+            "no such kind of sky model" if "kind" in table else "missing key",
+            got=kind,
+            expected="one of " + ", ".join(KINDS),
+        )
     model = validate(table, KINDS[kind], where=path)
     return model if model.name else model.model_copy(update={"name": path.stem})
 
 
-def with_overrides(model: SkyModel, *, turbidity: float | None = None, visibility_km: float | None = None,
-                   ozone_du: float | None = None, cloudiness: float | None = None) -> SkyModel:  # fmt: skip
+def with_overrides(
+    model: SkyModel,
+    *,
+    turbidity: float | None = None,
+    visibility_km: float | None = None,
+    ozone_du: float | None = None,
+    cloudiness: float | None = None,
+) -> SkyModel:
     """The model with the flags of the command line applied.
 
     Parameters
@@ -169,8 +179,11 @@ def with_overrides(model: SkyModel, *, turbidity: float | None = None, visibilit
         if not 0.0 <= cloudiness <= 1.0:
             raise InputError("--cloudiness", "out of range", got=cloudiness, expected="0 to 1")
         if isinstance(model, OvercastModel):
-            raise InputError("--cloudiness", f"sky model '{model.name}' is a closed layer already",
-                             cure="choose a clear model, such as --sky clear")  # fmt: skip
+            raise InputError(
+                "--cloudiness",
+                f"sky model '{model.name}' is a closed layer already",
+                cure="choose a clear model, such as --sky clear",
+            )
         model = model.model_copy(update={"cloudiness": float(cloudiness)})
     if isinstance(model, AtmosphereModel):
         return _hazed(model, turbidity, visibility_km, ozone_du)
@@ -186,12 +199,17 @@ def check_valid(model: SkyModel, sun_elevation_deg: float, height_m: float) -> N
     low, high = model.valid.sun_elevation_deg
     if not low <= sun_elevation_deg <= high:
         cure = "choose an atmosphere model, such as --sky clear" if isinstance(model, HosekModel) else None
-        raise InputError(f"sky model '{model.name}'", f"the sun stands at {sun_elevation_deg:.2f}°",
-                         expected=f"{low:g}° to {high:g}°", cure=cure)  # fmt: skip
+        raise InputError(
+            f"sky model '{model.name}'",
+            f"the sun stands at {sun_elevation_deg:.2f}°",
+            expected=f"{low:g}° to {high:g}°",
+            cure=cure,
+        )
     low, high = model.valid.height_m
     if not low <= height_m <= high:
-        raise InputError(f"sky model '{model.name}'", f"the observer is at {height_m:.0f} m",
-                         expected=f"{low:g} to {high:g} m")  # fmt: skip
+        raise InputError(
+            f"sky model '{model.name}'", f"the observer is at {height_m:.0f} m", expected=f"{low:g} to {high:g} m"
+        )
 
 
 def atmosphere_of(model: AtmosphereModel) -> Atmosphere:
@@ -221,12 +239,14 @@ def _check_override(model: SkyModel, parameter: str, value: float) -> None:
         raise InputError(flag, f"sky model '{model.name}' does not know it")
     low, high = interval
     if not low <= value <= high:
-        raise InputError(flag, f"outside the range of sky model '{model.name}'", got=value,
-                         expected=f"{low:g} to {high:g}")  # fmt: skip
+        raise InputError(
+            flag, f"outside the range of sky model '{model.name}'", got=value, expected=f"{low:g} to {high:g}"
+        )
 
 
-def _hazed(model: AtmosphereModel, turbidity: float | None, visibility: float | None,
-           ozone_du: float | None) -> AtmosphereModel:  # fmt: skip
+def _hazed(
+    model: AtmosphereModel, turbidity: float | None, visibility: float | None, ozone_du: float | None
+) -> AtmosphereModel:
     aerosol, ozone = model.aerosol, model.ozone
     if turbidity is not None:
         depth = aerosol_optical_depth_from_turbidity(turbidity, angstrom_exponent=aerosol.angstrom_exponent)

@@ -16,10 +16,14 @@ from seasonscapes.sky.cells import Samples, local_sun, scattering_per_m
 HARMONIC_ORDER, LATER_ORDER = 10, 4
 _HEIGHTS = 14
 # Close through twilight, where light falls by a factor of three a degree.
-SUN_ELEVATION_KNOTS_DEG = np.concatenate([
-    np.arange(-30.0, -18.0, 3.0), np.arange(-18.0, -12.0, 1.5), np.arange(-12.0, 3.0, 0.75),
-    [3.0, 4.5, 6.0, 8.0, 11.0, 15.0, 20.0, 27.0, 36.0, 47.0, 60.0, 74.0, 90.0],
-])  # fmt: skip
+SUN_ELEVATION_KNOTS_DEG = np.concatenate(
+    [
+        np.arange(-30.0, -18.0, 3.0),
+        np.arange(-18.0, -12.0, 1.5),
+        np.arange(-12.0, 3.0, 0.75),
+        [3.0, 4.5, 6.0, 8.0, 11.0, 15.0, 20.0, 27.0, 36.0, 47.0, 60.0, 74.0, 90.0],
+    ]
+)
 DARK = 1e-30
 
 
@@ -70,8 +74,9 @@ def zonal(z: np.ndarray, order: int = HARMONIC_ORDER) -> np.ndarray:
     return values
 
 
-def diffuse_source(atmosphere: Atmosphere, scaled: Optics, moments: Moments, samples: Samples,
-                   geometry: tuple) -> np.ndarray:  # fmt: skip
+def diffuse_source(
+    atmosphere: Atmosphere, scaled: Optics, moments: Moments, samples: Samples, geometry: tuple
+) -> np.ndarray:
     """Source of scattered diffuse light ``J`` at samples under many suns and azimuths ``(K, S, Q, B)`` [1/(m sr)].
 
     ``geometry`` is what `sun_geometry` gives for the samples.
@@ -91,8 +96,9 @@ def diffuse_source(atmosphere: Atmosphere, scaled: Optics, moments: Moments, sam
     return source.reshape(*index.shape, bands)
 
 
-def _by_cell(atmosphere: Atmosphere, scaled: Optics, moments: Moments, samples: Samples,
-             knots: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+def _by_cell(
+    atmosphere: Atmosphere, scaled: Optics, moments: Moments, samples: Samples, knots: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
     """For cells in order of height, numbers ``(X,)`` and what they scatter under a range of the sun's knots.
 
     The second array ``(X, (1 + L) B, J)`` holds the logarithm of Φ_00 and then, for each m, the sum over l of all that
@@ -120,8 +126,11 @@ def _by_cell(atmosphere: Atmosphere, scaled: Optics, moments: Moments, samples: 
         for m in range(orders):
             factor = weight[:, part, None, m:] * legendre[part, None, m:, m] * hats[part, :, None]
             table = moments.ratio[p : p + 2, first:last, m:, m].transpose(3, 0, 2, 1)
-            np.matmul(factor.reshape(bands, stop - start, -1), table.reshape(bands, -1, last - first),
-                      out=block[:, 1 + m].swapaxes(0, 1))  # fmt: skip
+            np.matmul(
+                factor.reshape(bands, stop - start, -1),
+                table.reshape(bands, -1, last - first),
+                out=block[:, 1 + m].swapaxes(0, 1),
+            )
     return order, columns
 
 
@@ -133,8 +142,9 @@ def _hats(index: np.ndarray, share: np.ndarray, count: int) -> np.ndarray:
     return matrix
 
 
-def sun_geometry(samples: Samples, start_elevation_rad: np.ndarray, sun_elevation_rad: np.ndarray,
-                 azimuth_rad: np.ndarray) -> tuple[np.ndarray, tuple]:  # fmt: skip
+def sun_geometry(
+    samples: Samples, start_elevation_rad: np.ndarray, sun_elevation_rad: np.ndarray, azimuth_rad: np.ndarray
+) -> tuple[np.ndarray, tuple]:
     """Where the sun stands at each sample ``(K, S, Q)`` for Q pairs of sun elevation and azimuth from the sun.
 
     Returns

@@ -93,8 +93,9 @@ def air_mass(elevation_deg) -> np.ndarray:
     return 1.0 / (np.sin(np.radians(elevation)) + 0.50572 * (elevation + 6.07995) ** -1.6364)
 
 
-def night_sky_radiance(height: int, width: int, *, height_m: float = 0.0, optical_depth: float = 0.19,
-                       ground_albedo: float = 0.2) -> np.ndarray:  # fmt: skip
+def night_sky_radiance(
+    height: int, width: int, *, height_m: float = 0.0, optical_depth: float = 0.19, ground_albedo: float = 0.2
+) -> np.ndarray:
     """Radiance of the moonless night sky far from any lamp, ``(height, width, 3)`` [cd/m²], as in `Illumination`.
 
     About 21.6 mag/arcsec² at the zenith and 0.95 mlx on the ground. It varies by a factor of two in nature, with

@@ -14,33 +14,9 @@ from seasonscapes.sky.night import moon_to_sun_ratio, night_sky_radiance
 # Clear horizontal illuminance [lx] by sun elevation [deg]: the fits of Seidelmann (ed.), Explanatory Supplement to the
 # Astronomical Almanac (1992), § 9.3, less the night sky of 6.2e-4 lx that measurements below -12° contain.
 _ELEVATION_DEG = (
-    -20,
-    -18,
-    -16,
-    -14,
-    -12,
-    -10,
-    -8,
-    -6,
-    -5,
-    -4,
-    -3,
-    -2,
-    -1,
-    0,
-    1,
-    2,
-    3,
-    5,
-    7,
-    10,
-    15,
-    20,
-    30,
-    45,
-    60,
-    90,
-)
+    -20, -18, -16, -14, -12, -10, -8, -6, -5, -4, -3, -2, -1,
+    0, 1, 2, 3, 5, 7, 10, 15, 20, 30, 45, 60, 90,
+)  # fmt: skip
 _CLEAR_LX = (
     1e-7, 2.5e-5, 8.2e-4, 2.30e-3, 7.44e-3, 4.15e-2, 0.3474, 3.411, 10.44, 29.93, 79.07, 189.4, 404.6, 758.6, 1268.0,
     1920.8, 2689.0, 4538.3, 6839.2, 11121.0, 19228.0, 27376.0, 46297.0, 77848.0, 103118.0, 128825.0,
@@ -166,8 +142,9 @@ def grey_air(visibility_km: float, airlight: np.ndarray, *, height_m: float = 0.
     return GreyAir(np.stack([haze, rayleigh]), np.array([1500.0, 8000.0]), np.asarray(airlight, float))
 
 
-def overcast_sky_radiance(illuminance: np.ndarray, height: int, *, ground_albedo: float = 0.2,
-                          source_direction: np.ndarray | None = None) -> np.ndarray:  # fmt: skip
+def overcast_sky_radiance(
+    illuminance: np.ndarray, height: int, *, ground_albedo: float = 0.2, source_direction: np.ndarray | None = None
+) -> np.ndarray:
     """Map ``(height, 2 height, 3)`` [cd/m²] of a closed sky that puts ``illuminance`` ``(3,)`` [lx] on the ground.
 
     The CIE standard overcast sky; where ``source_direction`` is given, the CIE intermediate one about it.
@@ -184,9 +161,16 @@ def overcast_sky_radiance(illuminance: np.ndarray, height: int, *, ground_albedo
     return shape[..., None] * np.asarray(illuminance, float)
 
 
-def overcast(sun: SolarPosition, moon: LunarPosition | None = None, *, height_m: float = 0.0, map_height: int = 128,
-             visibility_km: float = 20.0, ground_albedo: float = 0.2,
-             intermediate: bool = False) -> Illumination:  # fmt: skip
+def overcast(
+    sun: SolarPosition,
+    moon: LunarPosition | None = None,
+    *,
+    height_m: float = 0.0,
+    map_height: int = 128,
+    visibility_km: float = 20.0,
+    ground_albedo: float = 0.2,
+    intermediate: bool = False,
+) -> Illumination:
     """Illumination under a closed layer of cloud at any hour: no discs, no shadows, an absolute grey dome.
 
     Parameters
@@ -216,6 +200,10 @@ def overcast(sun: SolarPosition, moon: LunarPosition | None = None, *, height_m:
     return Illumination(
         sky_radiance=sky.astype(np.float32),
         aerial_perspective=grey_air(visibility_km, horizon, height_m=height_m),
-        model={"kind": "overcast", "distribution": "intermediate" if intermediate else "standard",
-               "visibility_km": visibility_km, "ground_albedo": ground_albedo},
-    )  # fmt: skip
+        model={
+            "kind": "overcast",
+            "distribution": "intermediate" if intermediate else "standard",
+            "visibility_km": visibility_km,
+            "ground_albedo": ground_albedo,
+        },
+    )

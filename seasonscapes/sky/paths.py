@@ -156,8 +156,9 @@ def sun_columns(atmosphere: Atmosphere) -> SunColumns:
     return SunColumns(true[:, 0], table)
 
 
-def towards_sun(atmosphere: Atmosphere, columns: SunColumns, height_m, elevation_rad, *,
-                radius_deg: float = SUN_RADIUS_DEG) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+def towards_sun(
+    atmosphere: Atmosphere, columns: SunColumns, height_m, elevation_rad, *, radius_deg: float = SUN_RADIUS_DEG
+) -> tuple[np.ndarray, np.ndarray]:
     """Columns of air between points and the sun, and how much of the sun's disc is there to be seen.
 
     Parameters
@@ -190,8 +191,15 @@ def towards_sun(atmosphere: Atmosphere, columns: SunColumns, height_m, elevation
     return mixed[..., :3], mixed[..., 3] * visible
 
 
-def sun_transfer(atmosphere: Atmosphere, columns: SunColumns, optics: Optics, height_m, elevation_rad, *,
-                 radius_deg: float = SUN_RADIUS_DEG) -> np.ndarray:  # fmt: skip
+def sun_transfer(
+    atmosphere: Atmosphere,
+    columns: SunColumns,
+    optics: Optics,
+    height_m,
+    elevation_rad,
+    *,
+    radius_deg: float = SUN_RADIUS_DEG,
+) -> np.ndarray:
     """Share of the sun's normal irradiance that arrives at points, per band ``(..., B)``: Beer's law.
 
     Parameters as in `towards_sun`.

@@ -38,8 +38,16 @@ def correlated_colour_temperature_k(rgb: np.ndarray) -> float | None:
     return float(kelvin)
 
 
-def sky_record(illumination: Illumination, time: datetime, sun: SolarPosition, moon: LunarPosition,
-               latitude_deg: float, longitude_deg: float, *, zone: str | None = None) -> dict[str, Any]:  # fmt: skip
+def sky_record(
+    illumination: Illumination,
+    time: datetime,
+    sun: SolarPosition,
+    moon: LunarPosition,
+    latitude_deg: float,
+    longitude_deg: float,
+    *,
+    zone: str | None = None,
+) -> dict[str, Any]:
     """Everything about the light of an instant as plain numbers, ready for JSON.
 
     Parameters
@@ -64,8 +72,11 @@ def sky_record(illumination: Illumination, time: datetime, sun: SolarPosition, m
     tz = ZoneInfo(zone) if zone else timezone(timedelta(minutes=round(4.0 * longitude_deg)))
     events = sun_events(time.astimezone(tz).date(), latitude_deg, longitude_deg, tz)
     bodies = {"sun": illumination.sun, "moon": illumination.moon}
-    source = max((name for name, body in bodies.items() if body is not None), key=lambda name: _normal_lx(bodies[name]),
-                 default=None)  # fmt: skip
+    source = max(
+        (name for name, body in bodies.items() if body is not None),
+        key=lambda name: _normal_lx(bodies[name]),
+        default=None,
+    )
     light = {
         "direct_normal": np.zeros(3) if source is None else np.asarray(bodies[source].normal_illuminance_lx, float),
         "diffuse_horizontal": diffuse_horizontal_illuminance(illumination.sky_radiance),
@@ -187,8 +198,17 @@ def _normal_lx(body: Luminary) -> float:
 
 
 def _event_times(events: SunEvents) -> dict[str, str | None]:
-    names = ("sunrise", "sunset", "solar_noon", "civil_dawn", "civil_dusk", "nautical_dawn", "nautical_dusk",
-             "astronomical_dawn", "astronomical_dusk")  # fmt: skip
+    names = (
+        "sunrise",
+        "sunset",
+        "solar_noon",
+        "civil_dawn",
+        "civil_dusk",
+        "nautical_dawn",
+        "nautical_dusk",
+        "astronomical_dawn",
+        "astronomical_dusk",
+    )
     times = {name: getattr(events, name) for name in names}
     return {f"{name}_utc": None if time is None else _iso(time) for name, time in times.items()}
 

@@ -39,14 +39,7 @@ from seasonscapes.sky.moments import (
     table_heights_m,
     zonal,
 )
-from seasonscapes.sky.paths import (
-    SunColumns,
-    equal_cells,
-    horizon_elevation_rad,
-    sun_columns,
-    sun_transfer,
-    trace_rays,
-)
+from seasonscapes.sky.paths import SunColumns, equal_cells, horizon_elevation_rad, sun_columns, sun_transfer, trace_rays
 from seasonscapes.sky.spectrum import WAVELENGTHS_NM
 
 _AZIMUTHS, _CELLS, _THREADS = 11, 24, 4

@@ -120,8 +120,13 @@ def observer_view(tables: AtmosphereTables, height_m: float) -> View:
     return _view(tables.atmosphere, float(max(height_m, tables.atmosphere.ground_height_m + 1.0)))
 
 
-def seen_sky(tables: AtmosphereTables, view: View, luminary_direction: np.ndarray, true_elevation_rad: float,
-             irradiance: np.ndarray) -> SeenLight:  # fmt: skip
+def seen_sky(
+    tables: AtmosphereTables,
+    view: View,
+    luminary_direction: np.ndarray,
+    true_elevation_rad: float,
+    irradiance: np.ndarray,
+) -> SeenLight:
     """Sky of a luminary for an observer.
 
     Parameters
@@ -138,9 +143,12 @@ def seen_sky(tables: AtmosphereTables, view: View, luminary_direction: np.ndarra
     parts = parts[:, :, 0]
     parts[:, :, 6:9] += (ground_along(tables, view.sky, true_elevation_rad) @ colours.T).astype(np.float32)
     return SeenLight(
-        np.asarray(luminary_direction, float), _rgb_aerosol_depth(tables.atmosphere), tables.atmosphere.asymmetry,
-        view.horizon_rad, azimuths_filled(parts),
-    )  # fmt: skip
+        np.asarray(luminary_direction, float),
+        _rgb_aerosol_depth(tables.atmosphere),
+        tables.atmosphere.asymmetry,
+        view.horizon_rad,
+        azimuths_filled(parts),
+    )
 
 
 def diffuse_seen(tables: AtmosphereTables, view: View, true_elevation_rad: float, *, near: bool = False) -> np.ndarray:
@@ -154,13 +162,15 @@ def diffuse_seen(tables: AtmosphereTables, view: View, true_elevation_rad: float
     return diffuse_along(tables, samples, view.elevation_rad, np.array([true_elevation_rad]), cumulative=near)[0]
 
 
-def diffuse_by_elevation(tables: AtmosphereTables, height_m: float, near: bool, *,
-                         progress: Callable[[float], None] | None = None) -> np.ndarray:  # fmt: skip
+def diffuse_by_elevation(
+    tables: AtmosphereTables, height_m: float, near: bool, *, progress: Callable[[float], None] | None = None
+) -> np.ndarray:
     """`diffuse_seen` of every sun, as a table of `elevation_table`; some seconds."""
     view = observer_view(tables, height_m)
     samples = view.near if near else view.sky
-    return by_elevation(lambda suns: diffuse_along(tables, samples, view.elevation_rad, suns, cumulative=near),
-                        progress=progress)  # fmt: skip
+    return by_elevation(
+        lambda suns: diffuse_along(tables, samples, view.elevation_rad, suns, cumulative=near), progress=progress
+    )
 
 
 def sky_radiance(light: SeenLight, direction: np.ndarray) -> np.ndarray:

@@ -79,9 +79,12 @@ def require_side(width: int, height: int, texel_m: float, max_side_px: int) -> N
     """`InputError` where an atlas would be larger than allowed."""
     if max(width, height) > max_side_px:
         coarser = texel_m * max(width, height) / max_side_px
-        raise InputError("atlas", f"texels of {texel_m:g} m need {width} × {height} of them",
-                         expected=f"at most {max_side_px} along a side",
-                         cure=f"take texels of {coarser:.3g} m or a larger limit")  # fmt: skip
+        raise InputError(
+            "atlas",
+            f"texels of {texel_m:g} m need {width} × {height} of them",
+            expected=f"at most {max_side_px} along a side",
+            cure=f"take texels of {coarser:.3g} m or a larger limit",
+        )
 
 
 def measure_atlas(terrain: Terrain, kind: str, width_px: int, height_px: int, *, charts: int = 1) -> Atlas:

@@ -29,9 +29,12 @@ def chart_atlas(terrain: Terrain, texel_m: float | None, max_side_px: int) -> tu
     import xatlas
 
     if len(terrain.faces) > MAX_FACES:
-        raise InputError("atlas xatlas", f"too many faces to cut into charts: {len(terrain.faces)}",
-                         expected=f"at most {MAX_FACES}",
-                         cure="take the adaptive mesher with a larger error bound, or the planar atlas")  # fmt: skip
+        raise InputError(
+            "atlas xatlas",
+            f"too many faces to cut into charts: {len(terrain.faces)}",
+            expected=f"at most {MAX_FACES}",
+            cure="take the adaptive mesher with a larger error bound, or the planar atlas",
+        )
     builder, blocks = xatlas.Atlas(), list(_blocks(terrain))
     for faces in blocks:
         used, local = np.unique(faces, return_inverse=True)

@@ -33,8 +33,12 @@ def write_glb(
         baseColorTexture=Image.fromarray(np.ascontiguousarray(picture)), metallicFactor=0.0, roughnessFactor=1.0
     )
     # `process=False`: merging vertices would tear the texture at chart borders.
-    mesh = trimesh.Trimesh(np.stack([east, up, -north], axis=-1), terrain.faces, process=False,
-                           visual=trimesh.visual.TextureVisuals(uv=terrain.uv, material=material))  # fmt: skip
+    mesh = trimesh.Trimesh(
+        np.stack([east, up, -north], axis=-1),
+        terrain.faces,
+        process=False,
+        visual=trimesh.visual.TextureVisuals(uv=terrain.uv, material=material),
+    )
     document = pygltflib.GLTF2.load_from_bytes(mesh.export(file_type="glb", include_normals=not unlit))
     document.asset.extras = extras or {}
     if unlit:

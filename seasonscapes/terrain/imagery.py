@@ -29,9 +29,15 @@ _EXPONENTS = [(i, j, k) for k, top in ((0, _DEGREE), (1, 3)) for i in range(top 
 _MAX_FIT_ERROR_PX = 0.01
 
 
-def read_imagery(path: str | os.PathLike, *, bounds_deg: tuple[float, float, float, float] | None = None,
-                 bands: tuple[int, ...] | None = None, finest_m: float | None = None, encoding: str = "srgb",
-                 full_scale: float = 255.0) -> Raster:  # fmt: skip
+def read_imagery(
+    path: str | os.PathLike,
+    *,
+    bounds_deg: tuple[float, float, float, float] | None = None,
+    bands: tuple[int, ...] | None = None,
+    finest_m: float | None = None,
+    encoding: str = "srgb",
+    full_scale: float = 255.0,
+) -> Raster:
     """Read a colour image on a map as scene-linear Rec.709.
 
     Parameters
@@ -63,16 +69,26 @@ def read_imagery(path: str | os.PathLike, *, bounds_deg: tuple[float, float, flo
             return values / full_scale
         brightest = np.max(values, initial=-np.inf, where=np.isfinite(values))
         if brightest > full_scale:
-            raise InputError(path, "brighter than full scale", got=f"{brightest:g}", expected=f"at most {full_scale:g}",
-                             cure="state the image's full scale")  # fmt: skip
+            raise InputError(
+                path,
+                "brighter than full scale",
+                got=f"{brightest:g}",
+                expected=f"at most {full_scale:g}",
+                cure="state the image's full scale",
+            )
         with np.errstate(invalid="ignore"):
             return linear_from_srgb(values / full_scale)
 
     raster = read_raster(path, bounds_deg=bounds_deg, bands=bands, finest_m=finest_m, decode=decode)
     count = raster.values.shape[2]
     if count not in (1, 3):
-        raise InputError(path, "not a colour image", got=count, expected="one (grey) or three bands, and alpha",
-                         cure="name its red, green and blue bands")  # fmt: skip
+        raise InputError(
+            path,
+            "not a colour image",
+            got=count,
+            expected="one (grey) or three bands, and alpha",
+            cure="name its red, green and blue bands",
+        )
     # A pixel that lacks one colour lacks them all.
     values = np.where(np.isfinite(raster.values).all(axis=2, keepdims=True), raster.values, np.float32(np.nan))
     return replace(raster, values=np.repeat(values, 3 // count, axis=2))

@@ -53,8 +53,9 @@ class MeshReport:
     uncovered_samples: int
 
 
-def build_mesh(raster: Raster, frame: LocalFrame, *, mesher: str = "adaptive",
-               max_error_m: float = DEFAULT_MAX_ERROR_M) -> Terrain:  # fmt: skip
+def build_mesh(
+    raster: Raster, frame: LocalFrame, *, mesher: str = "adaptive", max_error_m: float = DEFAULT_MAX_ERROR_M
+) -> Terrain:
     """Triangulate the heights of a raster.
 
     Parameters

@@ -28,14 +28,18 @@ def warped_noise(seed: int, wavelength_m: float, east_m: np.ndarray, north_m: np
     step = 0.5 * wavelength_m
     row, column = north_m / step, east_m / step
     first_row, first_column = int(np.floor(row.min())) - _LATTICE_MARGIN, int(np.floor(column.min())) - _LATTICE_MARGIN
-    lattice = _lattice(seed, range(first_row, int(row.max()) + _LATTICE_MARGIN),
-                       range(first_column, int(column.max()) + _LATTICE_MARGIN))  # fmt: skip
+    lattice = _lattice(
+        seed,
+        range(first_row, int(row.max()) + _LATTICE_MARGIN),
+        range(first_column, int(column.max()) + _LATTICE_MARGIN),
+    )
     coordinates = np.stack([row - first_row, column - first_column])
     return ndimage.map_coordinates(lattice, coordinates, order=3, prefilter=False, mode="nearest") / _SPLINE_DEVIATION
 
 
-def fractal_noise(seed: int, wavelength_m: float, east_m: np.ndarray, north_m: np.ndarray, *,
-                  octaves: int, gain: float = 0.5) -> np.ndarray:  # fmt: skip
+def fractal_noise(
+    seed: int, wavelength_m: float, east_m: np.ndarray, north_m: np.ndarray, *, octaves: int, gain: float = 0.5
+) -> np.ndarray:
     """Sum of octaves of `spline_noise`, ``(H, W)`` float32; unit variance when the grid holds them all.
 
     Octaves finer than the grid are left out: within a cell they average to nothing, sampled they would alias.

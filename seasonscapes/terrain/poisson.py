@@ -25,8 +25,11 @@ def poisson_surface(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     try:
         import open3d
     except ImportError as error:
-        raise InputError("mesher poisson", f"Open3D cannot be loaded ({error})",
-                         cure="pip install 'seasonscapes[poisson]', or take the adaptive mesher") from None  # fmt: skip
+        raise InputError(
+            "mesher poisson",
+            f"Open3D cannot be loaded ({error})",
+            cure="pip install 'seasonscapes[poisson]', or take the adaptive mesher",
+        ) from None
     along_rows, along_columns = np.gradient(points, axis=(0, 1))
     normals = np.cross(along_columns, along_rows).reshape(-1, 3)
     normals *= np.sign(np.median(normals[:, 2])) / np.linalg.norm(normals, axis=1, keepdims=True)

@@ -51,8 +51,9 @@ class FillReport:
 # ---------------------------------------------------------------------------------------------- reading
 
 
-def read_elevation(path: str | os.PathLike, *, bounds_deg: tuple[float, float, float, float] | None = None,
-                   band: int | None = None) -> Raster:  # fmt: skip
+def read_elevation(
+    path: str | os.PathLike, *, bounds_deg: tuple[float, float, float, float] | None = None, band: int | None = None
+) -> Raster:
     """Read a raster of heights, one band, and check that they can be heights in metres.
 
     Parameters
@@ -75,20 +76,34 @@ def read_elevation(path: str | os.PathLike, *, bounds_deg: tuple[float, float, f
     raster = read_raster(path, bounds_deg=bounds_deg, bands=None if band is None else (band,))
     count = raster.values.shape[2]
     if count != 1:
-        raise InputError(path, "more than one band", got=count, expected="one band of heights",
-                         cure="name the band that holds the heights")  # fmt: skip
+        raise InputError(
+            path,
+            "more than one band",
+            got=count,
+            expected="one band of heights",
+            cure="name the band that holds the heights",
+        )
     if np.isfinite(raster.values).any():
         low, high = float(np.nanmin(raster.values)), float(np.nanmax(raster.values))
         if low < PLAUSIBLE_ELEVATION_M[0] or high > PLAUSIBLE_ELEVATION_M[1]:
-            raise InputError(path, "heights that no place on land has", got=f"{low:g} … {high:g}",
-                             expected=f"{PLAUSIBLE_ELEVATION_M[0]:g} … {PLAUSIBLE_ELEVATION_M[1]:g} m",
-                             cure="check unit (metres), band, and that the file declares its nodata")  # fmt: skip
+            raise InputError(
+                path,
+                "heights that no place on land has",
+                got=f"{low:g} … {high:g}",
+                expected=f"{PLAUSIBLE_ELEVATION_M[0]:g} … {PLAUSIBLE_ELEVATION_M[1]:g} m",
+                cure="check unit (metres), band, and that the file declares its nodata",
+            )
     return raster
 
 
-def read_raster(path: str | os.PathLike, *, bounds_deg: tuple[float, float, float, float] | None = None,
-                bands: tuple[int, ...] | None = None, finest_m: float | None = None,
-                decode: Callable[[np.ndarray], np.ndarray] | None = None) -> Raster:  # fmt: skip
+def read_raster(
+    path: str | os.PathLike,
+    *,
+    bounds_deg: tuple[float, float, float, float] | None = None,
+    bands: tuple[int, ...] | None = None,
+    finest_m: float | None = None,
+    decode: Callable[[np.ndarray], np.ndarray] | None = None,
+) -> Raster:
     """Read a raster that GDAL knows (GeoTIFF, SRTM ``.hgt``, VRT mosaic …), or a window of it.
 
     Parameters
@@ -142,8 +157,11 @@ def _checked_crs(source, path) -> str:
     if source.crs is None:
         raise InputError(path, "the raster has no CRS", cure="say which with: gdal_edit.py -a_srs EPSG:… FILE")
     if source.transform == Affine.identity():
-        raise InputError(path, "the raster has a CRS but no placement on the map (geotransform)",
-                         cure="write one with: gdal_edit.py -a_ullr … FILE")  # fmt: skip
+        raise InputError(
+            path,
+            "the raster has a CRS but no placement on the map (geotransform)",
+            cure="write one with: gdal_edit.py -a_ullr … FILE",
+        )
     text = source.crs.to_string()
     width, height = source.width, source.height
     corners = np.stack(apply_affine(source.transform, [0, width, 0, width], [0, 0, height, height]), axis=-1)
@@ -154,11 +172,20 @@ def _checked_crs(source, path) -> str:
         # 0…360° longitudes are in use; half a pixel past the pole is how .hgt grids lie.
         low, high = corners.min(0), corners.max(0)
         if low[1] < -90.0 - pixel or high[1] > 90.0 + pixel or low[0] < -180.0 - pixel or high[0] > 360.0 + pixel:
-            raise InputError(path, f"coordinates beyond ±180°/±90° in the geographic CRS {text}", got=extent,
-                             expected="degrees", cure="the file's CRS is probably a projected one")  # fmt: skip
+            raise InputError(
+                path,
+                f"coordinates beyond ±180°/±90° in the geographic CRS {text}",
+                got=extent,
+                expected="degrees",
+                cure="the file's CRS is probably a projected one",
+            )
     elif np.abs(corners).max() <= 360.0 and pixel < 1.0:
-        raise InputError(path, f"degrees where metres are meant, in the projected CRS {text}", got=extent,
-                         cure="the file's CRS is probably EPSG:4326")  # fmt: skip
+        raise InputError(
+            path,
+            f"degrees where metres are meant, in the projected CRS {text}",
+            got=extent,
+            cure="the file's CRS is probably EPSG:4326",
+        )
     return text
 
 
@@ -196,8 +223,12 @@ def _window(source, crs: str, bounds_deg, path):
     right, bottom = min(right, source.width), min(bottom, source.height)
     if right - left < 2 or bottom - top < 2:
         extent = _bounds_deg(crs, source.transform, source.width, source.height)
-        raise InputError(path, "the raster does not reach the area asked for", got=_bounds_text(extent),
-                         expected=_bounds_text(bounds_deg))  # fmt: skip
+        raise InputError(
+            path,
+            "the raster does not reach the area asked for",
+            got=_bounds_text(extent),
+            expected=_bounds_text(bounds_deg),
+        )
     return Window(left, top, right - left, bottom - top)
 
 
@@ -258,8 +289,10 @@ def _boundary(west, south, east, north, steps: int = 33) -> tuple[np.ndarray, np
     """Points along the sides of a box: the edges of a map rarely stay straight in another."""
     t = np.linspace(0.0, 1.0, steps)
     x, y = west + (east - west) * t, south + (north - south) * t
-    return (np.concatenate([x, x, np.full(steps, west), np.full(steps, east)]),
-            np.concatenate([np.full(steps, south), np.full(steps, north), y, y]))  # fmt: skip
+    return (
+        np.concatenate([x, x, np.full(steps, west), np.full(steps, east)]),
+        np.concatenate([np.full(steps, south), np.full(steps, north), y, y]),
+    )
 
 
 def _bounds_deg(crs, transform, width, height) -> tuple[float, float, float, float]:
@@ -290,8 +323,13 @@ def require_overlap(raster: Raster, other: Raster, *, where: str | os.PathLike, 
     """Raise `InputError` about ``where`` (the file of ``raster``) unless the two rasters share ground."""
     a, b = bounds_geographic(raster), bounds_geographic(other)
     if max(a[0], b[0]) >= min(a[2], b[2]) or max(a[1], b[1]) >= min(a[3], b[3]):
-        raise InputError(where, f"does not overlap the {other_name} raster", got=_bounds_text(a),
-                         expected=_bounds_text(b), cure="check the CRS of both files")  # fmt: skip
+        raise InputError(
+            where,
+            f"does not overlap the {other_name} raster",
+            got=_bounds_text(a),
+            expected=_bounds_text(b),
+            cure="check the CRS of both files",
+        )
 
 
 # ---------------------------------------------------------------------------------------------- values
@@ -321,8 +359,9 @@ def sample_raster(raster: Raster, x, y) -> np.ndarray:
     return np.where(inside[..., None], total, np.nan)
 
 
-def fill_nodata(raster: Raster, *, max_share: float = DEFAULT_MAX_HOLE_SHARE,
-                where: str | os.PathLike = "raster") -> tuple[Raster, FillReport]:  # fmt: skip
+def fill_nodata(
+    raster: Raster, *, max_share: float = DEFAULT_MAX_HOLE_SHARE, where: str | os.PathLike = "raster"
+) -> tuple[Raster, FillReport]:
     """Fill cells without data by the smoothest surface through their rims (discrete harmonic, ∇²z = 0).
 
     A membrane neither overshoots nor invents peaks. Where a hole reaches the raster's edge the slope across that edge
@@ -350,8 +389,13 @@ def fill_nodata(raster: Raster, *, max_share: float = DEFAULT_MAX_HOLE_SHARE,
         raise InputError(where, "no data at all in the area asked for", cure="check area and nodata value")
     share = cells / hole.size
     if share > max_share:
-        raise InputError(where, "too much of the area has no data", got=f"{100 * share:.1f} %",
-                         expected=f"at most {100 * max_share:g} %", cure="choose another area or raster")  # fmt: skip
+        raise InputError(
+            where,
+            "too much of the area has no data",
+            got=f"{100 * share:.1f} %",
+            expected=f"at most {100 * max_share:g} %",
+            cure="choose another area or raster",
+        )
     labels, holes = ndimage.label(hole, structure=np.ones((3, 3), int))
     largest = int(np.bincount(labels.ravel())[1:].max())
     values = np.stack([harmonic_fill(raster.values[..., c], hole) for c in range(raster.values.shape[2])], axis=2)

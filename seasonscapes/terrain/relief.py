@@ -29,9 +29,12 @@ def relief_atlas(terrain: Terrain, texel_m: float | None, max_side_px: int) -> t
         More faces than `MAX_FACES`, a surface with holes or in pieces, or one so rugged that rounding folds a face.
     """
     if len(terrain.faces) > MAX_FACES:
-        raise InputError("atlas relief", f"too many faces to solve for: {len(terrain.faces)}",
-                         expected=f"at most {MAX_FACES}",
-                         cure="take the adaptive mesher with a larger error bound, or the planar atlas")  # fmt: skip
+        raise InputError(
+            "atlas relief",
+            f"too many faces to solve for: {len(terrain.faces)}",
+            expected=f"at most {MAX_FACES}",
+            cure="take the adaptive mesher with a larger error bound, or the planar atlas",
+        )
     _, _, width, height = plan_size(terrain, texel_m, max_side_px)
     rim = boundary_loop(terrain.faces, len(terrain.vertices))
     uv = _rim_on_rectangle(terrain, rim)

@@ -106,8 +106,15 @@ def save_place(place: SyntheticPlace, path: str | os.PathLike) -> None:
     """Write the place as one ``.npz``, atomically."""
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         maps = {name: getattr(place, name) for name in _MAPS}
-        np.savez_compressed(file, elevation=place.elevation.values, transform=np.array(place.elevation.transform)[:6],
-                            crs=place.elevation.crs, seed=place.seed, spacing_m=place.spacing_m, **maps)  # fmt: skip
+        np.savez_compressed(
+            file,
+            elevation=place.elevation.values,
+            transform=np.array(place.elevation.transform)[:6],
+            crs=place.elevation.crs,
+            seed=place.seed,
+            spacing_m=place.spacing_m,
+            **maps,
+        )
 
 
 def load_place(path: str | os.PathLike) -> SyntheticPlace:
@@ -120,5 +127,17 @@ def load_place(path: str | os.PathLike) -> SyntheticPlace:
         return SyntheticPlace(raster, **maps, seed=int(held["seed"]), spacing_m=float(held["spacing_m"]))
 
 
-__all__ = ["CENTRE_LATITUDE_DEG", "CENTRE_LONGITUDE_DEG", "CRS", "SEASONS", "Cover", "SyntheticPlace", "alpine_albedo",
-           "alpine_massif", "load_place", "save_place", "snow_fraction", "snow_line_m"]  # fmt: skip
+__all__ = [
+    "CENTRE_LATITUDE_DEG",
+    "CENTRE_LONGITUDE_DEG",
+    "CRS",
+    "SEASONS",
+    "Cover",
+    "SyntheticPlace",
+    "alpine_albedo",
+    "alpine_massif",
+    "load_place",
+    "save_place",
+    "snow_fraction",
+    "snow_line_m",
+]

@@ -192,8 +192,10 @@ def valley_floor(plan: Plan, lattice: Lattice) -> ValleyFloor:
     weight = 1.0 / (distance + 60.0) ** 3
     height = (weight * points[index, 2]).sum(-1) / weight.sum(-1)
     half_width = np.interp(height, [560.0, 585.0, 700.0, 1010.0], [450.0, 420.0, 230.0, 40.0])
-    bays = sum(a * warped_noise(plan.seed + 71 + k, w, lattice.east_m, lattice.north_m)
-               for k, (w, a) in enumerate(((900.0, 60.0), (350.0, 30.0), (140.0, 12.0))))  # fmt: skip
+    bays = sum(
+        a * warped_noise(plan.seed + 71 + k, w, lattice.east_m, lattice.north_m)
+        for k, (w, a) in enumerate(((900.0, 60.0), (350.0, 30.0), (140.0, 12.0)))
+    )
     beyond = distance[..., 0] - half_width
     # The lake fills the main valley's floor between two deltas; its ends are round.
     position = np.stack([bent.east_m, bent.north_m], -1)

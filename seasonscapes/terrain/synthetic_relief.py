@@ -252,8 +252,9 @@ def _moraines(ice: tuple[np.ndarray, np.ndarray], surface: np.ndarray) -> np.nda
     return debris
 
 
-def _stage_surface(z: np.ndarray, lattice: Lattice, plan: Plan, floor: ValleyFloor, stage: _Stage,
-                   bare: np.ndarray) -> np.ndarray:  # fmt: skip
+def _stage_surface(
+    z: np.ndarray, lattice: Lattice, plan: Plan, floor: ValleyFloor, stage: _Stage, bare: np.ndarray
+) -> np.ndarray:
     """One stage of carving from heights on the jittered lattice to heights on the regular grid."""
     spacing = stage.spacing_m
     rng = np.random.default_rng(plan.seed + int(spacing) + 1)

@@ -15,8 +15,9 @@ from seasonscapes.terrain.surface import Terrain
 DEFAULT_MAX_SIDE_PX = 4096
 
 
-def unwrap(terrain: Terrain, *, kind: str = "planar", texel_m: float | None = None,
-           max_side_px: int = DEFAULT_MAX_SIDE_PX) -> tuple[Terrain, Atlas]:  # fmt: skip
+def unwrap(
+    terrain: Terrain, *, kind: str = "planar", texel_m: float | None = None, max_side_px: int = DEFAULT_MAX_SIDE_PX
+) -> tuple[Terrain, Atlas]:
     """Lay a surface out flat, so that no two of its places share a texel.
 
     Parameters

@@ -68,8 +68,17 @@ def _unguided(fill: Callable, values: np.ndarray, painted: np.ndarray, guides: G
 INPAINTERS: dict[str, Callable] = {"guided": guided_fill, "membrane": membrane, "telea": telea}
 
 
-def complete(texture: Texture, guides: Guides, *, base: np.ndarray | None = None, method: str = "guided",
-             detail: float = 0.0, fast: bool = False, seed: int = 0, progress: Progress | None = None) -> Completed:  # fmt: skip
+def complete(
+    texture: Texture,
+    guides: Guides,
+    *,
+    base: np.ndarray | None = None,
+    method: str = "guided",
+    detail: float = 0.0,
+    fast: bool = False,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Completed:
     """Fill every texel that no camera saw.
 
     Parameters

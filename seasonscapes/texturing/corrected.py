@@ -33,8 +33,16 @@ Progress = Callable[[float], None]
 _LEAF = 20
 
 
-def corrected_fill(values: np.ndarray, weight: np.ndarray, base: np.ndarray, guides: Guides, *, fast: bool = False,
-                   seed: int = 0, progress: Progress | None = None) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+def corrected_fill(
+    values: np.ndarray,
+    weight: np.ndarray,
+    base: np.ndarray,
+    guides: Guides,
+    *,
+    fast: bool = False,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
     """All texels of the surface by correcting a base; see `complete.complete` for arguments and result.
 
     Parameters
@@ -102,5 +110,10 @@ def _fit(guide: np.ndarray, encoded: np.ndarray, weight: np.ndarray | None, seed
 
 def _spread_of(guides: Guides, painted: np.ndarray, sample: np.ndarray, known: tuple, seed: int) -> Spread:
     guide, encoded, share = known
-    return fit_spread(guide, encoded, folds_of(sample, painted, guides, seed),
-                      lambda rows: _fit(guide[rows], encoded[rows], share[rows], seed, trees=10), seed=seed)  # fmt: skip
+    return fit_spread(
+        guide,
+        encoded,
+        folds_of(sample, painted, guides, seed),
+        lambda rows: _fit(guide[rows], encoded[rows], share[rows], seed, trees=10),
+        seed=seed,
+    )

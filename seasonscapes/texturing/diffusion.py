@@ -98,17 +98,27 @@ class Painter:
             if torch.cuda.is_available():
                 torch.cuda.empty_cache()
             height, width = view.hole.shape
-            raise InputError("--device", f"the GPU's memory ran out at {width} × {height}", got=_first_line(error),
-                             cure="finished views are kept: run the same command again with --offload, or make a path of "
-                                  "smaller --size") from None  # fmt: skip
+            raise InputError(
+                "--device",
+                f"the GPU's memory ran out at {width} × {height}",
+                got=_first_line(error),
+                cure="finished views are kept: run the same command again with --offload, or make a path of "
+                "smaller --size",
+            ) from None
 
 
 def _first_line(error: Exception) -> str:
     return (str(error).strip().splitlines() or [""])[0][:160]
 
 
-def load_painter(folder: Path | None, settings: DiffusionSettings, *, names: WeightNames | None = None,
-                 machine: Machine | None = None, image: np.ndarray | None = None) -> Painter:  # fmt: skip
+def load_painter(
+    folder: Path | None,
+    settings: DiffusionSettings,
+    *,
+    names: WeightNames | None = None,
+    machine: Machine | None = None,
+    image: np.ndarray | None = None,
+) -> Painter:
     """Read the weights that the settings ask for.
 
     Parameters
@@ -146,8 +156,11 @@ def load_painter(folder: Path | None, settings: DiffusionSettings, *, names: Wei
 
 def needed_parts(settings: DiffusionSettings, with_image: bool) -> list[str]:
     """Which parts of the weights these settings need: names of fields of `WeightNames`."""
-    scales = {"depth": settings.depth_scale, "inpaint": settings.inpaint_scale,
-              "adapter": settings.image_scale if with_image else 0.0}  # fmt: skip
+    scales = {
+        "depth": settings.depth_scale,
+        "inpaint": settings.inpaint_scale,
+        "adapter": settings.image_scale if with_image else 0.0,
+    }
     parts = ["base", *(part for part, scale in scales.items() if scale > 0.0)]
     # The pipeline wants a ControlNet; with weight 0 it has no say.
     return parts if {"depth", "inpaint"} & set(parts) else [*parts, "inpaint"]
@@ -159,8 +172,11 @@ def _require_extra() -> None:
         import torch  # noqa: F401
         import transformers
     except ImportError as error:
-        raise InputError("--method diffusion", f"{error.name} is not installed", cure="pip install 'seasonscapes[diffusion]', "
-                         "or take --method guided, which needs none of it") from None  # fmt: skip
+        raise InputError(
+            "--method diffusion",
+            f"{error.name} is not installed",
+            cure="pip install 'seasonscapes[diffusion]', or take --method guided, which needs none of it",
+        ) from None
     diffusers.utils.logging.set_verbosity_error()
     diffusers.utils.logging.disable_progress_bar()
     transformers.utils.logging.set_verbosity_error()
@@ -203,10 +219,16 @@ def _assembled(places: dict[str, Path], settings: DiffusionSettings, dtype: Any)
     text = _read(CLIPTextModel, base / "text_encoder", dtype)
     _check_fit(unet, text, nets, places)
     pipe = StableDiffusionControlNetInpaintPipeline(
-        vae=_read(AutoencoderKL, base / "vae", dtype), text_encoder=text, tokenizer=CLIPTokenizer.from_pretrained(base / "tokenizer"),
-        unet=unet, controlnet=list(nets.values()), safety_checker=None, feature_extractor=None,
-        scheduler=EulerAncestralDiscreteScheduler.from_pretrained(base / "scheduler"), requires_safety_checker=False,
-    )  # fmt: skip
+        vae=_read(AutoencoderKL, base / "vae", dtype),
+        text_encoder=text,
+        tokenizer=CLIPTokenizer.from_pretrained(base / "tokenizer"),
+        unet=unet,
+        controlnet=list(nets.values()),
+        safety_checker=None,
+        feature_extractor=None,
+        scheduler=EulerAncestralDiscreteScheduler.from_pretrained(base / "scheduler"),
+        requires_safety_checker=False,
+    )
     return pipe
 
 
@@ -216,30 +238,46 @@ def _read(kind: Any, place: Path, dtype: Any) -> Any:
     diffusers_made = kind.__module__.startswith("diffusers")
     stem, key = ("diffusion_pytorch_model", "torch_dtype") if diffusers_made else ("model", "dtype")
     try:
-        model, report = kind.from_pretrained(place, variant=variant_of(place, stem), use_safetensors=True,
-                                             local_files_only=True, output_loading_info=True, **{key: dtype})  # fmt: skip
+        model, report = kind.from_pretrained(
+            place,
+            variant=variant_of(place, stem),
+            use_safetensors=True,
+            local_files_only=True,
+            output_loading_info=True,
+            **{key: dtype},
+        )
     except (SafetensorError, OSError, RuntimeError, ValueError) as error:
         raise InputError("--weights", f"{place} cannot be read: {_first_line(error)}") from None
     # Tensors that a file lacks are left as they were made, at random: no picture would tell why.
     lacking = [name for name in report["missing_keys"] if not name.endswith("position_ids")]
     if lacking:
-        raise InputError("--weights", f"{place} lacks {len(lacking)} tensors of its model, such as {lacking[0]}",
-                         cure="these are the weights of something else")  # fmt: skip
+        raise InputError(
+            "--weights",
+            f"{place} lacks {len(lacking)} tensors of its model, such as {lacking[0]}",
+            cure="these are the weights of something else",
+        )
     return model.eval()
 
 
 def _check_fit(unet: Any, text: Any, nets: dict[str, Any], places: dict[str, Path]) -> None:
     width = unet.config.cross_attention_dim
     if text.config.hidden_size != width or unet.config.in_channels not in (4, 9):
-        raise InputError("--weights", f"{places['base']} is no Stable Diffusion 1.5", expected="a text encoder as wide as "
-                         f"the UNet's attention ({width}) and 4 or 9 channels")  # fmt: skip
+        raise InputError(
+            "--weights",
+            f"{places['base']} is no Stable Diffusion 1.5",
+            expected=f"a text encoder as wide as the UNet's attention ({width}) and 4 or 9 channels",
+        )
     for part, net in nets.items():
         if (net.config.cross_attention_dim, tuple(net.config.block_out_channels)) != (
             width,
             tuple(unet.config.block_out_channels),
         ):
-            raise InputError("--weights", f"{places[part]} is a ControlNet for another base model",
-                             got=f"attention {net.config.cross_attention_dim}", expected=f"attention {width}")  # fmt: skip
+            raise InputError(
+                "--weights",
+                f"{places[part]} is a ControlNet for another base model",
+                got=f"attention {net.config.cross_attention_dim}",
+                expected=f"attention {width}",
+            )
 
 
 def _adapted(pipe: Any, place: Path, image: np.ndarray, settings: DiffusionSettings, device: str) -> list:
@@ -283,14 +321,23 @@ def _painted(painter: Painter, view: Conditions, tell: Callable[[float], None]) 
 
     with torch.no_grad():
         found = pipe(
-            prompt=settings.prompt, negative_prompt=settings.negative if settings.prompt else "", image=_tensor(picture),
-            mask_image=_tensor(whole_cells(hole)[..., None]), control_image=controls, height=hole.shape[0],
-            width=hole.shape[1], num_inference_steps=settings.steps, guidance_scale=settings.guidance,
-            strength=settings.strength, controlnet_conditioning_scale=scales, output_type="np",
+            prompt=settings.prompt,
+            negative_prompt=settings.negative if settings.prompt else "",
+            image=_tensor(picture),
+            mask_image=_tensor(whole_cells(hole)[..., None]),
+            control_image=controls,
+            height=hole.shape[0],
+            width=hole.shape[1],
+            num_inference_steps=settings.steps,
+            guidance_scale=settings.guidance,
+            strength=settings.strength,
+            controlnet_conditioning_scale=scales,
+            output_type="np",
             # Drawn on the CPU: a seed then means the same noise on every device.
-            generator=torch.Generator("cpu").manual_seed(view.seed), ip_adapter_image_embeds=painter.image_embeds,
+            generator=torch.Generator("cpu").manual_seed(view.seed),
+            ip_adapter_image_embeds=painter.image_embeds,
             callback_on_step_end=after_step,
-        ).images[0]  # fmt: skip
+        ).images[0]
     if not np.isfinite(found).all():
         raise InputError("--dtype", "the model overflowed", cure="run again with --dtype bfloat16 or float32")
     return found[:height, :width].astype(np.float32)

@@ -24,8 +24,9 @@ _CLOSED, _LEAST_AREA = 0.03, 5e-4
 _DEPTH_BINS = 8
 
 
-def foreground_mask(ready: ReadyShot, number: int, harmony: Harmony, predicted: np.ndarray, uv: np.ndarray, *,
-                    outlier: float = _OUTLIER) -> np.ndarray:  # fmt: skip
+def foreground_mask(
+    ready: ReadyShot, number: int, harmony: Harmony, predicted: np.ndarray, uv: np.ndarray, *, outlier: float = _OUTLIER
+) -> np.ndarray:
     """Pixels ``(H, W)`` bool that show something else than the land.
 
     Parameters
@@ -61,8 +62,9 @@ def _solid(found: np.ndarray) -> np.ndarray:
     return cv2.dilate(large[label].astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
 
 
-def _disagreement(ready: ReadyShot, number: int, harmony: Harmony, predicted: np.ndarray,
-                  uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+def _disagreement(
+    ready: ReadyShot, number: int, harmony: Harmony, predicted: np.ndarray, uv: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Logarithm of seen over predicted ``(H, W, 3)``, and where both are known."""
     camera = ready.shot.observation.camera
     # Beside silhouettes a pixel shows two surfaces; the guard looks after those.
@@ -93,8 +95,9 @@ def _standardised(apart: np.ndarray, log_depth: np.ndarray) -> np.ndarray:
     return result
 
 
-def predict_in_folds(texture: Texture, guides: np.ndarray, fit: Callable, *, folds: int = 4, samples: int = 20_000,
-                     seed: int = 0) -> np.ndarray:  # fmt: skip
+def predict_in_folds(
+    texture: Texture, guides: np.ndarray, fit: Callable, *, folds: int = 4, samples: int = 20_000, seed: int = 0
+) -> np.ndarray:
     """Radiance ``(R, S, 3)`` that a regression expects, each texel's from land elsewhere.
 
     Parameters

@@ -106,8 +106,9 @@ def unmixed(parts: np.ndarray) -> np.ndarray:
     return np.stack([rg + g, g, bg + g], -1)
 
 
-def fit_regression(guide: np.ndarray, encoded: np.ndarray, images: np.ndarray | None = None, *, fast: bool = False,
-                   seed: int = 0) -> Regression:  # fmt: skip
+def fit_regression(
+    guide: np.ndarray, encoded: np.ndarray, images: np.ndarray | None = None, *, fast: bool = False, seed: int = 0
+) -> Regression:
     """Fit guides ``(n, G)``, of which ``images`` ``(G,)`` bool are such, to encoded colours ``(n, 3)``."""
     from sklearn.ensemble import HistGradientBoostingRegressor
 
@@ -118,15 +119,23 @@ def fit_regression(guide: np.ndarray, encoded: np.ndarray, images: np.ndarray | 
         return Regression(beyond, None, forest)
     boosted = []
     for channel, (target, rounds) in enumerate(zip(mixed(left).T, (100, 40, 40), strict=True)):
-        model = HistGradientBoostingRegressor(max_iter=rounds, learning_rate=0.1, max_leaf_nodes=31, max_features=0.5,
-                                              min_samples_leaf=20, l2_regularization=1.0, early_stopping=False,
-                                              random_state=seed + channel)  # fmt: skip
+        model = HistGradientBoostingRegressor(
+            max_iter=rounds,
+            learning_rate=0.1,
+            max_leaf_nodes=31,
+            max_features=0.5,
+            min_samples_leaf=20,
+            l2_regularization=1.0,
+            early_stopping=False,
+            random_state=seed + channel,
+        )
         boosted.append(model.fit(guide, target))
     return Regression(beyond, tuple(boosted), forest)
 
 
-def fit_forest(guide: np.ndarray, encoded: np.ndarray, seed: int, *, trees: int, leaf: int = 5,
-               weight: np.ndarray | None = None):  # fmt: skip
+def fit_forest(
+    guide: np.ndarray, encoded: np.ndarray, seed: int, *, trees: int, leaf: int = 5, weight: np.ndarray | None = None
+):
     """Extremely randomised trees from guides ``(n, G)`` to colours ``(n, 3)``, of at least ``leaf`` samples each leaf."""
     from sklearn.ensemble import ExtraTreesRegressor
 
@@ -160,8 +169,15 @@ def predict(regression: Regression, guide: np.ndarray) -> tuple[np.ndarray, np.n
     return regression.beyond(guide) + mean, spread
 
 
-def guided_fill(values: np.ndarray, painted: np.ndarray, guides: Guides, *, fast: bool = False, seed: int = 0,
-                progress: Progress | None = None) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+def guided_fill(
+    values: np.ndarray,
+    painted: np.ndarray,
+    guides: Guides,
+    *,
+    fast: bool = False,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
     """Fill by regression and propagated residual; see `complete.complete` for arguments and result."""
     tell = progress or (lambda share: None)
     rng = np.random.default_rng(seed)

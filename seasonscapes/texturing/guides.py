@@ -43,8 +43,13 @@ class Guides:
             raise ValueError(f"Guides: values {self.values.shape} and surface {self.surface.shape} differ in size")
 
 
-def stack_guides(layers: Mapping[str, np.ndarray], satellite: Texture | None = None, *,
-                 plan: Plan | None = None, surface: np.ndarray | None = None) -> Guides:  # fmt: skip
+def stack_guides(
+    layers: Mapping[str, np.ndarray],
+    satellite: Texture | None = None,
+    *,
+    plan: Plan | None = None,
+    surface: np.ndarray | None = None,
+) -> Guides:
     """Guides from layers ``(R, S)`` and a satellite image in the same atlas.
 
     Parameters
@@ -69,8 +74,16 @@ def stack_guides(layers: Mapping[str, np.ndarray], satellite: Texture | None = N
     return Guides(np.stack(columns, -1), tuple(names), surface, plan)
 
 
-def guides_for(terrain: Terrain, atlas: Atlas, *, satellite: Texture | None = None, relit: np.ndarray | None = None,
-               sun_direction=None, day_suns=None, extra: Mapping[str, np.ndarray] | None = None) -> Guides:  # fmt: skip
+def guides_for(
+    terrain: Terrain,
+    atlas: Atlas,
+    *,
+    satellite: Texture | None = None,
+    relit: np.ndarray | None = None,
+    sun_direction=None,
+    day_suns=None,
+    extra: Mapping[str, np.ndarray] | None = None,
+) -> Guides:
     """Guides for every texel of a terrain's atlas.
 
     Parameters
@@ -93,8 +106,10 @@ def guides_for(terrain: Terrain, atlas: Atlas, *, satellite: Texture | None = No
     extra = dict(extra or {})
     if relit is not None:
         extra |= {f"relit_{n + 1}": relit[..., n] for n in range(3)}
-    for name, size in [("satellite", satellite.values.shape[:2] if satellite is not None else shape),
-                       *((name, layer.shape) for name, layer in extra.items())]:  # fmt: skip
+    for name, size in [
+        ("satellite", satellite.values.shape[:2] if satellite is not None else shape),
+        *((name, layer.shape) for name, layer in extra.items()),
+    ]:
         if size != shape:
             raise ValueError(f"guides_for: {name} is {size}, the atlas {shape}")
     positions, face_id = texel_positions(terrain, atlas.width_px, atlas.height_px)

@@ -84,8 +84,9 @@ def through_haze(transmittance: np.ndarray, airlight: np.ndarray, haze: float) -
     return thicker, airlight * ratio
 
 
-def land_radiance(value: np.ndarray, camera: int, air: tuple[np.ndarray, np.ndarray],
-                  harmony: Harmony) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+def land_radiance(
+    value: np.ndarray, camera: int, air: tuple[np.ndarray, np.ndarray], harmony: Harmony
+) -> tuple[np.ndarray, np.ndarray]:
     """Radiance ``(N, 3)`` [cd/m²] of the land from picture values ``(N, 3)``, and its share of the picture ``(N,)``.
 
     Parameters
@@ -121,9 +122,16 @@ def equal_gains(shots: Sequence[ReadyShot], *, radiance: float | None = None) ->
     return replace(start, log_gain=same, log_sky_gain=same)
 
 
-def harmonise(shots: Sequence[ReadyShot], terrain: Occluder, *, predicted: np.ndarray | None = None,
-              predicted_sigma: float = 1.0, fit_haze: bool = True, fit_contrast: bool = True,
-              radiance: float | None = None) -> Harmony:  # fmt: skip
+def harmonise(
+    shots: Sequence[ReadyShot],
+    terrain: Occluder,
+    *,
+    predicted: np.ndarray | None = None,
+    predicted_sigma: float = 1.0,
+    fit_haze: bool = True,
+    fit_contrast: bool = True,
+    radiance: float | None = None,
+) -> Harmony:
     """Fit gains, contrasts and haze over all places that two cameras see.
 
     Parameters
@@ -170,9 +178,12 @@ def harmonise(shots: Sequence[ReadyShot], terrain: Occluder, *, predicted: np.nd
 
 def _moved(harmony: Harmony, step: np.ndarray) -> Harmony:
     count = len(harmony.contrast)
-    return replace(harmony, log_gain=harmony.log_gain + step[: 3 * count].reshape(3, count).T,
-                   contrast=np.clip(harmony.contrast * np.exp(step[3 * count : 4 * count]), 0.7, 2.0),
-                   haze=float(np.clip(harmony.haze * np.exp(step[-1]), 0.1, 10.0)))  # fmt: skip
+    return replace(
+        harmony,
+        log_gain=harmony.log_gain + step[: 3 * count].reshape(3, count).T,
+        contrast=np.clip(harmony.contrast * np.exp(step[3 * count : 4 * count]), 0.7, 2.0),
+        haze=float(np.clip(harmony.haze * np.exp(step[-1]), 0.1, 10.0)),
+    )
 
 
 def _with_sky(shots: Sequence[ReadyShot], harmony: Harmony, radiance: float | None) -> Harmony:
@@ -249,8 +260,13 @@ def _steepness(samples: Samples, harmony: Harmony) -> np.ndarray:
     return np.log(np.clip((high - low) / tiny, 1e-2, 1.0 / _LEAST_LAND))
 
 
-def _gauss_newton(overlaps: Overlaps, told: tuple[np.ndarray | None, float], harmony: Harmony,
-                  prior: tuple[np.ndarray, np.ndarray], free: np.ndarray) -> np.ndarray:  # fmt: skip
+def _gauss_newton(
+    overlaps: Overlaps,
+    told: tuple[np.ndarray | None, float],
+    harmony: Harmony,
+    prior: tuple[np.ndarray, np.ndarray],
+    free: np.ndarray,
+) -> np.ndarray:
     """One step of iteratively reweighted least squares (Huber): of gains (colour by colour), log contrasts, log haze.
 
     Differences are divided by how much the tone curves spread them: else curves that flatten everything would agree best.
@@ -263,20 +279,31 @@ def _gauss_newton(overlaps: Overlaps, told: tuple[np.ndarray | None, float], har
     noise = left.noise**2 * np.exp(2.0 * left.steepness) + right.noise**2 * np.exp(2.0 * right.steepness)
     half = 0.5 * error
     blocks = [
-        (error / spread, noise / spread**2 + _LAND_SIGMA**2,
-         ((own.camera, -1.0 / spread, (left.by_contrast - half * left.steeper_by_contrast) / spread),
-          (other.camera, 1.0 / spread, (-right.by_contrast - half * right.steeper_by_contrast) / spread)),
-         (left.by_haze - right.by_haze - half * (left.steeper_by_haze + right.steeper_by_haze)) / spread,
-         _counts(own.camera * count + other.camera))
-    ]  # fmt: skip
+        (
+            error / spread,
+            noise / spread**2 + _LAND_SIGMA**2,
+            (
+                (own.camera, -1.0 / spread, (left.by_contrast - half * left.steeper_by_contrast) / spread),
+                (other.camera, 1.0 / spread, (-right.by_contrast - half * right.steeper_by_contrast) / spread),
+            ),
+            (left.by_haze - right.by_haze - half * (left.steeper_by_haze + right.steeper_by_haze)) / spread,
+            _counts(own.camera * count + other.camera),
+        )
+    ]
     if expected is not None:
         known = np.isfinite(expected).all(axis=1)
         side = _side(overlaps.alone[known], harmony)
         camera, spread = overlaps.alone.camera[known], np.exp(side.steepness)
         apart = side.log_land - expected[known] - harmony.log_gain[camera]
-        blocks.append((apart / spread, side.noise**2 + predicted_sigma**2,
-                       ((camera, -1.0 / spread, (side.by_contrast - apart * side.steeper_by_contrast) / spread),),
-                       (side.by_haze - apart * side.steeper_by_haze) / spread, _counts(camera)))  # fmt: skip
+        blocks.append(
+            (
+                apart / spread,
+                side.noise**2 + predicted_sigma**2,
+                ((camera, -1.0 / spread, (side.by_contrast - apart * side.steeper_by_contrast) / spread),),
+                (side.by_haze - apart * side.steeper_by_haze) / spread,
+                _counts(camera),
+            )
+        )
     matrix, gradient = _priors(harmony, prior, count)
     for block in blocks:
         for colour in range(3):
@@ -321,6 +348,7 @@ def _priors(harmony: Harmony, prior: tuple[np.ndarray, np.ndarray], count: int) 
     weight = np.concatenate(
         [np.tile(1.0 / sigma[:, 0] ** 2, 3), np.full(count, _CONTRAST_SIGMA**-2), [_HAZE_SIGMA**-2]]
     )
-    apart = np.concatenate([(harmony.log_gain - middle).T.ravel(), np.log(harmony.contrast) - _CONTRAST,
-                            [np.log(harmony.haze)]])  # fmt: skip
+    apart = np.concatenate(
+        [(harmony.log_gain - middle).T.ravel(), np.log(harmony.contrast) - _CONTRAST, [np.log(harmony.haze)]]
+    )
     return np.diag(weight), weight * apart

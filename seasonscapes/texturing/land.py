@@ -49,9 +49,14 @@ def land_layers(heights_m: np.ndarray, spacing_m: float, *, sun_direction=None, 
     # Texels finer than the mesh see facets, and grids that nearly match it see beats of the two.
     fine = cv2.GaussianBlur(z, (0, 0), 1.0, borderType=cv2.BORDER_REPLICATE)
     normal = _normals(fine, spacing_m)
-    layers = {"elevation": z, "slope": np.degrees(np.arccos(np.clip(normal[2], -1.0, 1.0))),
-              "facing_east": normal[0], "facing_north": normal[1],
-              "curvature": _depth(fine, 3.0), "hollow": _depth(z, max(8.0, 250.0 / spacing_m))}  # fmt: skip
+    layers = {
+        "elevation": z,
+        "slope": np.degrees(np.arccos(np.clip(normal[2], -1.0, 1.0))),
+        "facing_east": normal[0],
+        "facing_north": normal[1],
+        "curvature": _depth(fine, 3.0),
+        "hollow": _depth(z, max(8.0, 250.0 / spacing_m)),
+    }
     layers |= _open_to(z, spacing_m, day_suns)
     if sun_direction is not None:
         sun = np.asarray(sun_direction, float)
@@ -59,8 +64,12 @@ def land_layers(heights_m: np.ndarray, spacing_m: float, *, sun_direction=None, 
         margin = sun_margin_deg(z, spacing_m, sun)
         seen = np.clip(margin / (2.0 * _PENUMBRA_DEG) + 0.5, 0.0, 1.0) * np.maximum(cosine, 0.0)
         around = cv2.GaussianBlur(seen.astype(np.float32), (0, 0), 2.0, borderType=cv2.BORDER_REPLICATE)
-        layers |= {"sun_cosine": cosine, "sun_margin": np.clip(margin, -_MARGIN_DEG, _MARGIN_DEG), "sun": seen,
-                   "sun_around": around}  # fmt: skip
+        layers |= {
+            "sun_cosine": cosine,
+            "sun_margin": np.clip(margin, -_MARGIN_DEG, _MARGIN_DEG),
+            "sun": seen,
+            "sun_around": around,
+        }
     return {name: np.where(known, layer, np.nan).astype(np.float32) for name, layer in layers.items()}
 
 
@@ -94,12 +103,19 @@ def _depth(z: np.ndarray, sigma_px: float) -> np.ndarray:
 def _shifted(z: np.ndarray, east_px: float, north_px: float) -> np.ndarray:
     """``z`` at the places that lie so far to the east and north; beyond the edge the land ends in the depth."""
     move = np.float32([[1.0, 0.0, east_px], [0.0, 1.0, -north_px]])
-    return cv2.warpAffine(z, move, z.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-                          borderMode=cv2.BORDER_CONSTANT, borderValue=-1e6)  # fmt: skip
+    return cv2.warpAffine(
+        z,
+        move,
+        z.shape[::-1],
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=-1e6,
+    )
 
 
-def horizon_tangent(z: np.ndarray, spacing_m: float, azimuth_rad: float, *, stride: float = _STRIDE,
-                    reach_m: float | None = None) -> np.ndarray:  # fmt: skip
+def horizon_tangent(
+    z: np.ndarray, spacing_m: float, azimuth_rad: float, *, stride: float = _STRIDE, reach_m: float | None = None
+) -> np.ndarray:
     """Tangent of the horizon's elevation towards an azimuth ``(H, W)``, at least 0; steps grow by ``stride``."""
     if reach_m is None:
         reach_m = 0.5 * max(z.shape) * spacing_m
@@ -140,8 +156,10 @@ def _open_to(z: np.ndarray, spacing_m: float, day_suns) -> dict[str, np.ndarray]
     layers = {"sky_view": _sky_view(normal, azimuths, horizons)}
     if day_suns is not None:
         layers["insolation"] = _insolation(normal, horizons, np.atleast_2d(np.asarray(day_suns, float)))
-    return {name: cv2.resize(layer.astype(np.float32), z.shape[::-1], interpolation=cv2.INTER_LINEAR)
-            for name, layer in layers.items()}  # fmt: skip
+    return {
+        name: cv2.resize(layer.astype(np.float32), z.shape[::-1], interpolation=cv2.INTER_LINEAR)
+        for name, layer in layers.items()
+    }
 
 
 def _sky_view(normal, azimuths, horizons) -> np.ndarray:

@@ -57,8 +57,10 @@ def _relaxed(values: np.ndarray, hole: np.ndarray, sweeps: int) -> np.ndarray:
     for parity in (0, 1):
         r, c = row[(row + column) % 2 == parity], column[(row + column) % 2 == parity]
         # Beyond the outer edge a texel sees itself: the edge is free.
-        neighbours = [np.clip(r + dr, 0, height - 1) * width + np.clip(c + dc, 0, width - 1)
-                      for dr, dc in ((0, 1), (0, -1), (1, 0), (-1, 0))]  # fmt: skip
+        neighbours = [
+            np.clip(r + dr, 0, height - 1) * width + np.clip(c + dc, 0, width - 1)
+            for dr, dc in ((0, 1), (0, -1), (1, 0), (-1, 0))
+        ]
         colours.append((r * width + c, np.stack(neighbours)))
     for _ in range(sweeps):
         for texel, neighbours in colours:

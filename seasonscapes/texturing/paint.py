@@ -88,9 +88,19 @@ class PaintOptions:
             raise ValueError(f"PaintOptions: mode {self.mode!r}, expected one of {', '.join(MODES)}")
 
 
-def paint(shots: Sequence[Shot], terrain: Terrain, atlas: Atlas, occluder: Occluder, *, options: PaintOptions | None = None,
-          predicted: np.ndarray | None = None, rejects: Sequence[np.ndarray | None] | None = None,
-          radiance: float | None = None, resume: Path | None = None, progress: Progress | None = None) -> Painting:  # fmt: skip
+def paint(
+    shots: Sequence[Shot],
+    terrain: Terrain,
+    atlas: Atlas,
+    occluder: Occluder,
+    *,
+    options: PaintOptions | None = None,
+    predicted: np.ndarray | None = None,
+    rejects: Sequence[np.ndarray | None] | None = None,
+    radiance: float | None = None,
+    resume: Path | None = None,
+    progress: Progress | None = None,
+) -> Painting:
     """Paint observations of one time into an atlas.
 
     Parameters
@@ -122,23 +132,38 @@ def paint(shots: Sequence[Shot], terrain: Terrain, atlas: Atlas, occluder: Occlu
     if not ready:
         raise ValueError("paint: no picture has anything to paint: " + "; ".join(skipped or ["no pictures"]))
     if options.fit_gains:
-        harmony = harmonise(ready, occluder, predicted=predicted, predicted_sigma=options.predicted_sigma,
-                            fit_haze=options.fit_haze, radiance=radiance)  # fmt: skip
+        harmony = harmonise(
+            ready,
+            occluder,
+            predicted=predicted,
+            predicted_sigma=options.predicted_sigma,
+            fit_haze=options.fit_haze,
+            radiance=radiance,
+        )
     else:
         harmony = equal_gains(ready, radiance=radiance)
     tell(0.3)
     painting = _blank(atlas, ready, harmony, skipped)
     tiles = list(tiles_of(cut))
     for number, tile in enumerate(tiles):
-        _place(painting, tile, _kept_tile(resume, tile, lambda tile=tile: paint_tile(ready, occluder, cut, tile, harmony,
-                                                                                  options.mode)))  # fmt: skip
+        _place(
+            painting,
+            tile,
+            _kept_tile(resume, tile, lambda tile=tile: paint_tile(ready, occluder, cut, tile, harmony, options.mode)),
+        )
         tell(0.3 + 0.7 * (number + 1) / len(tiles))
     return painting
 
 
-def prepare_shots(shots: Sequence[Shot], occluder: Occluder, cut: Tiling, options: PaintOptions, *,
-                  rejects: Sequence[np.ndarray | None] | None = None,
-                  progress: Progress | None = None) -> tuple[list[ReadyShot], list[str]]:  # fmt: skip
+def prepare_shots(
+    shots: Sequence[Shot],
+    occluder: Occluder,
+    cut: Tiling,
+    options: PaintOptions,
+    *,
+    rejects: Sequence[np.ndarray | None] | None = None,
+    progress: Progress | None = None,
+) -> tuple[list[ReadyShot], list[str]]:
     """The shots that have something to paint, ready, and a line for each other one that says why it has not."""
     tell = progress or (lambda share: None)
     if rejects is not None and len(rejects) != len(shots):
@@ -183,8 +208,9 @@ class _Painted:
     coverage: np.ndarray
 
 
-def paint_tile(ready: Sequence[ReadyShot], occluder: Occluder, cut: Tiling, tile: Tile, harmony: Harmony,
-               mode: str = "weighted") -> _Painted:  # fmt: skip
+def paint_tile(
+    ready: Sequence[ReadyShot], occluder: Occluder, cut: Tiling, tile: Tile, harmony: Harmony, mode: str = "weighted"
+) -> _Painted:
     """One tile of a painting, from all shots that see any of it."""
     size = tile.height * tile.width
     total, most = np.zeros((size, 3)), np.zeros(size, np.float32)
@@ -210,8 +236,9 @@ def paint_tile(ready: Sequence[ReadyShot], occluder: Occluder, cut: Tiling, tile
     return _Painted(values.reshape(*shape, 3), most.reshape(shape), best.reshape(shape), coverage.reshape(shape))
 
 
-def shot_texels(ready: ReadyShot, number: int, occluder: Occluder, surface, tile: Tile,
-                harmony: Harmony) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+def shot_texels(
+    ready: ReadyShot, number: int, occluder: Occluder, surface, tile: Tile, harmony: Harmony
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What one shot has to say about a tile: flat texels ``(N,)``, radiance ``(N, 3)`` [cd/m²] and weight ``(N,)``."""
     camera = ready.shot.observation.camera
     surface = surface[tile_blocks(ready.blocks, tile, surface.texel)]

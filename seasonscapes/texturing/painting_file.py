@@ -24,8 +24,14 @@ def save_painting(painting: Painting, path: str | os.PathLike) -> None:
     """Write a painting to one ``.npz`` file."""
     harmony = {name: np.asarray(value).tolist() for name, value in asdict(painting.harmony).items()}
     note = {"webcams": painting.webcams, "skipped": painting.skipped, "harmony": harmony}
-    np.savez(path, values=painting.texture.values, weight=painting.texture.weight, best=painting.best,
-             coverage=painting.coverage, note=json.dumps(note))  # fmt: skip
+    np.savez(
+        path,
+        values=painting.texture.values,
+        weight=painting.texture.weight,
+        best=painting.best,
+        coverage=painting.coverage,
+        note=json.dumps(note),
+    )
 
 
 def load_painting(path: str | os.PathLike) -> Painting:
@@ -33,8 +39,14 @@ def load_painting(path: str | os.PathLike) -> Painting:
     with np.load(path, allow_pickle=False) as stored:
         note = json.loads(str(stored["note"]))
         lists = {name: np.array(value) if isinstance(value, list) else value for name, value in note["harmony"].items()}
-        return Painting(Texture(stored["values"], stored["weight"]), stored["best"], stored["coverage"],
-                        tuple(note["webcams"]), Harmony(**lists), tuple(note["skipped"]))  # fmt: skip
+        return Painting(
+            Texture(stored["values"], stored["weight"]),
+            stored["best"],
+            stored["coverage"],
+            tuple(note["webcams"]),
+            Harmony(**lists),
+            tuple(note["skipped"]),
+        )
 
 
 def write_figures(painting: Painting, folder: Path) -> dict[str, str]:
@@ -48,9 +60,16 @@ def write_figures(painting: Painting, folder: Path) -> dict[str, str]:
     texture, names = painting.texture, ("exr", "texture", "coverage", "cameras")
     files = {name: folder / ("painted.exr" if name == "exr" else f"{name}.png") for name in names}
     painted = texture.weight > 0.0
-    write_exr(files["exr"], {"": texture.values, "weight": texture.weight, "camera": painting.best.astype(np.float32),
-                             "coverage": painting.coverage.astype(np.float32)},
-              header={"seasonscapes:webcams": list(painting.webcams)})  # fmt: skip
+    write_exr(
+        files["exr"],
+        {
+            "": texture.values,
+            "weight": texture.weight,
+            "camera": painting.best.astype(np.float32),
+            "coverage": painting.coverage.astype(np.float32),
+        },
+        header={"seasonscapes:webcams": list(painting.webcams)},
+    )
     step = max(1, -(-max(painted.shape) // _MOST_FIGURE_PX))
     thin = (slice(None, None, step), slice(None, None, step))
     values, painted = texture.values[thin], painted[thin]
@@ -68,8 +87,10 @@ def _coverage_figure(coverage: np.ndarray) -> np.ndarray:
     scaled = np.where(coverage > 0, 40 + 215 * (coverage.astype(float) / most), 0).astype(np.uint8)
     picture = cv2.applyColorMap(scaled, cv2.COLORMAP_VIRIDIS)[..., ::-1].copy()
     picture[coverage == 0] = _UNPAINTED
-    lines = [(str(n), cv2.applyColorMap(np.array([[int(40 + 215 * n / most)]], np.uint8), cv2.COLORMAP_VIRIDIS)[0, 0, ::-1])
-             for n in range(1, most + 1)]  # fmt: skip
+    lines = [
+        (str(n), cv2.applyColorMap(np.array([[int(40 + 215 * n / most)]], np.uint8), cv2.COLORMAP_VIRIDIS)[0, 0, ::-1])
+        for n in range(1, most + 1)
+    ]
     return _with_legend(picture, lines[:24])
 
 
@@ -94,8 +115,16 @@ def _with_legend(picture: np.ndarray, lines: list[tuple[str, np.ndarray]]) -> np
     for row, (name, colour) in enumerate(lines):
         top = size // 2 + row * size
         cv2.rectangle(strip, (size // 2, top), (size // 2 + size, top + size * 3 // 4), colour.tolist(), -1)
-        cv2.putText(strip, name, (2 * size, top + size * 3 // 4), cv2.FONT_HERSHEY_SIMPLEX, size / 32.0, (235, 235, 235), 1,
-                    cv2.LINE_AA)  # fmt: skip
+        cv2.putText(
+            strip,
+            name,
+            (2 * size, top + size * 3 // 4),
+            cv2.FONT_HERSHEY_SIMPLEX,
+            size / 32.0,
+            (235, 235, 235),
+            1,
+            cv2.LINE_AA,
+        )
     padded = np.full((strip.shape[0], *picture.shape[1:]), 24, np.uint8)
     padded[: picture.shape[0]] = picture
     return np.concatenate([padded, strip], axis=1)

@@ -133,8 +133,15 @@ class Canvas:
         flat[step.texels] = True
 
 
-def walk_path(walk: Walk, canvas: Canvas, inpaint: Inpaint, options: WalkOptions, *, folder: Path | None = None,
-              progress: Callable[[float], None] | None = None) -> Iterator[Step]:  # fmt: skip
+def walk_path(
+    walk: Walk,
+    canvas: Canvas,
+    inpaint: Inpaint,
+    options: WalkOptions,
+    *,
+    folder: Path | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Iterator[Step]:
     """Go along the path and paint; yields each view when the canvas has it.
 
     Parameters
@@ -162,8 +169,9 @@ def walk_path(walk: Walk, canvas: Canvas, inpaint: Inpaint, options: WalkOptions
     for index in range(count):
         step = kept_step(folder, index)
         if step is None:
-            step, pictures = _paint_view(walk, canvas, inpaint, options, index, white,
-                                         lambda share, index=index: tell((index + share) / count))  # fmt: skip
+            step, pictures = _paint_view(
+                walk, canvas, inpaint, options, index, white, lambda share, index=index: tell((index + share) / count)
+            )
             if folder is not None:
                 keep_step(folder, step, pictures)
         canvas.superpose(step)
@@ -171,8 +179,15 @@ def walk_path(walk: Walk, canvas: Canvas, inpaint: Inpaint, options: WalkOptions
         yield step
 
 
-def _paint_view(walk: Walk, canvas: Canvas, inpaint: Inpaint, options: WalkOptions, index: int, white: float,
-                tell: Callable[[float], None]) -> tuple[Step, dict[str, np.ndarray]]:  # fmt: skip
+def _paint_view(
+    walk: Walk,
+    canvas: Canvas,
+    inpaint: Inpaint,
+    options: WalkOptions,
+    index: int,
+    white: float,
+    tell: Callable[[float], None],
+) -> tuple[Step, dict[str, np.ndarray]]:
     """One round of the loop; and the pictures that show it."""
     camera = walk.cameras[index]
     gbuffer = trace_gbuffer(RenderScene(walk.terrain.mi_scene, walk.terrain.mi_terrain, None, 0.0), camera)  # type: ignore[arg-type]
@@ -204,8 +219,9 @@ def _in_vain(walk: Walk, canvas: Canvas, camera: Camera, shown: np.ndarray, shar
     return share < _FEW_HOLES and len(back_project(walk, canvas, camera, shown, white)[0]) == 0
 
 
-def partial_view(walk: Walk, canvas: Canvas, gbuffer: GBuffer, options: WalkOptions,
-                 white: float) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+def partial_view(
+    walk: Walk, canvas: Canvas, gbuffer: GBuffer, options: WalkOptions, white: float
+) -> tuple[np.ndarray, np.ndarray]:
     """The land as far as it has values, sRGB-encoded ``(H, W, 3)``, and its holes ``(H, W)`` bool."""
     land = np.isfinite(gbuffer.depth)
     radiance, known = look_up(canvas.values, canvas.covered, gbuffer.uv)
@@ -216,8 +232,9 @@ def partial_view(walk: Walk, canvas: Canvas, gbuffer: GBuffer, options: WalkOpti
     return picture, hole
 
 
-def _guessed(walk: Walk, gbuffer: GBuffer, shown: np.ndarray, wanted: np.ndarray, hole: np.ndarray,
-             white: float) -> np.ndarray:  # fmt: skip
+def _guessed(
+    walk: Walk, gbuffer: GBuffer, shown: np.ndarray, wanted: np.ndarray, hole: np.ndarray, white: float
+) -> np.ndarray:
     """The picture with something in its holes: a completion's colours, or those of the rims."""
     known = ~wanted
     picture = shown
@@ -230,8 +247,9 @@ def _guessed(walk: Walk, gbuffer: GBuffer, shown: np.ndarray, wanted: np.ndarray
     return np.where(known[..., None], picture, push_pull(picture, known.astype(np.float32))).astype(np.float32)
 
 
-def back_project(walk: Walk, canvas: Canvas, camera: Camera, picture: np.ndarray,
-                 white: float) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+def back_project(
+    walk: Walk, canvas: Canvas, camera: Camera, picture: np.ndarray, white: float
+) -> tuple[np.ndarray, np.ndarray]:
     """What a picture tells of the holes that its camera truly sees: flat texels ``(N,)`` and radiance ``(N, 3)``.
 
     By one ray a texel, sampled without aliasing and away from silhouettes, as painting does.
@@ -258,8 +276,9 @@ def back_project(walk: Walk, canvas: Canvas, camera: Camera, picture: np.ndarray
     return np.concatenate(texels), np.concatenate(values).astype(np.float32)
 
 
-def frames_of(values: np.ndarray, cameras: Sequence[Camera], terrain: Occluder, white: float, *,
-              cloudiness: float = 0.0) -> Iterator[np.ndarray]:  # fmt: skip
+def frames_of(
+    values: np.ndarray, cameras: Sequence[Camera], terrain: Occluder, white: float, *, cloudiness: float = 0.0
+) -> Iterator[np.ndarray]:
     """Display-linear frames ``(H, W, 3)`` of a finished texture ``(R, S, 3)`` along a path, one at a time."""
     scene = RenderScene(terrain.mi_scene, terrain.mi_terrain, None, 0.0)  # type: ignore[arg-type]
     everywhere = np.ones(values.shape[:2], bool)

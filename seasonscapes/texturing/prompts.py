@@ -8,14 +8,29 @@ NEGATIVE = (
     "lowres, worst quality, low quality, blurry, cropped, frame, text, watermark, people, oversaturated, painting"
 )
 # Months of the northern Alps, and what they look like.
-_SEASONS = ("deep winter, snow down to the valleys", "late winter, snow down to the valleys", "early spring, snow on the slopes, brown meadows in the valley", "spring, green valleys, snow on high slopes",
-            "late spring, fresh green meadows, snow on the summits", "early summer, green meadows, snow fields on the summits",
-            "high summer, green alpine meadows, grey rock, glaciers", "late summer, green alpine meadows, grey rock, glaciers",
-            "early autumn, yellowing meadows, grey rock", "autumn, golden larches, brown meadows, fresh snow on the summits",
-            "late autumn, brown meadows, snow on the slopes", "early winter, snow on the slopes")  # fmt: skip
+_SEASONS = (
+    "deep winter, snow down to the valleys",
+    "late winter, snow down to the valleys",
+    "early spring, snow on the slopes, brown meadows in the valley",
+    "spring, green valleys, snow on high slopes",
+    "late spring, fresh green meadows, snow on the summits",
+    "early summer, green meadows, snow fields on the summits",
+    "high summer, green alpine meadows, grey rock, glaciers",
+    "late summer, green alpine meadows, grey rock, glaciers",
+    "early autumn, yellowing meadows, grey rock",
+    "autumn, golden larches, brown meadows, fresh snow on the summits",
+    "late autumn, brown meadows, snow on the slopes",
+    "early winter, snow on the slopes",
+)
 # From an elevation of the sun upwards [deg].
-_HOURS = ((-90.0, "at night under the stars"), (-12.0, "in deep twilight"), (-6.0, "at dusk"), (-0.8, "at sunrise, long shadows"),
-          (6.0, "in low warm sunlight, long shadows"), (20.0, "in bright daylight"))  # fmt: skip
+_HOURS = (
+    (-90.0, "at night under the stars"),
+    (-12.0, "in deep twilight"),
+    (-6.0, "at dusk"),
+    (-0.8, "at sunrise, long shadows"),
+    (6.0, "in low warm sunlight, long shadows"),
+    (20.0, "in bright daylight"),
+)
 
 
 def prompt_for(time: datetime, latitude_deg: float, sun_elevation_deg: float, *, cloudiness: float = 0.0) -> str:

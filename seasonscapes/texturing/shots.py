@@ -95,8 +95,15 @@ class ReadyShot:
     probe_uv: np.ndarray
 
 
-def ready_shot(shot: Shot, terrain: Occluder, cut: Tiling, *, near_m: float = NEAR_M, reject: np.ndarray | None = None,
-               guard: bool = True) -> ReadyShot:  # fmt: skip
+def ready_shot(
+    shot: Shot,
+    terrain: Occluder,
+    cut: Tiling,
+    *,
+    near_m: float = NEAR_M,
+    reject: np.ndarray | None = None,
+    guard: bool = True,
+) -> ReadyShot:
     """Look at the land from a shot's camera and mark what of the picture can be trusted.
 
     Parameters
@@ -122,12 +129,25 @@ def ready_shot(shot: Shot, terrain: Occluder, cut: Tiling, *, near_m: float = NE
     pixel = np.flatnonzero(trust > 0.5)
     pixel = np.random.default_rng(_PROBE_SEED).permutation(pixel)[:PROBES]
     side_m = _texel_side_m(cut)
-    probes = TexelSurface(pixel, np.full(len(pixel), -1, np.int32), gbuffer.position.reshape(-1, 3)[pixel].astype(float),
-                          gbuffer.normal.reshape(-1, 3)[pixel].astype(np.float32),
-                          np.full(len(pixel), side_m, np.float32))  # fmt: skip
+    probes = TexelSurface(
+        pixel,
+        np.full(len(pixel), -1, np.int32),
+        gbuffer.position.reshape(-1, 3)[pixel].astype(float),
+        gbuffer.normal.reshape(-1, 3)[pixel].astype(np.float32),
+        np.full(len(pixel), side_m, np.float32),
+    )
     median = np.median(image.reshape(-1, 3)[pixel], axis=0) if len(pixel) else np.full(3, np.nan)
-    return ReadyShot(shot, depth, trust.astype(np.float32), _levels(image, usable, trust), seen_blocks(gbuffer.uv, cut),
-                     *_horizon_sky(shot, depth), median, probes, gbuffer.uv.reshape(-1, 2)[pixel].astype(np.float32))  # fmt: skip
+    return ReadyShot(
+        shot,
+        depth,
+        trust.astype(np.float32),
+        _levels(image, usable, trust),
+        seen_blocks(gbuffer.uv, cut),
+        *_horizon_sky(shot, depth),
+        median,
+        probes,
+        gbuffer.uv.reshape(-1, 2)[pixel].astype(np.float32),
+    )
 
 
 def _texel_side_m(cut: Tiling) -> float:
@@ -232,6 +252,8 @@ def _look_up(level: np.ndarray, pixel: np.ndarray, number: int) -> np.ndarray:
     place[:count] = pixel / 2.0**number - 0.5
     place = place.reshape(rows, _ROW, 2)
     # A picture of five channels is one of four and one of one.
-    parts = [cv2.remap(level[..., part], place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-             for part in (slice(0, 4), slice(4, 5))]  # fmt: skip
+    parts = [
+        cv2.remap(level[..., part], place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        for part in (slice(0, 4), slice(4, 5))
+    ]
     return np.concatenate([part.reshape(rows * _ROW, -1)[:count] for part in parts], axis=1)

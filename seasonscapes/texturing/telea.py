@@ -6,8 +6,9 @@ import cv2
 import numpy as np
 
 
-def telea_fill(values: np.ndarray, known: np.ndarray, *, radius_px: float = 3.0,
-               flag: int = cv2.INPAINT_TELEA) -> np.ndarray:  # fmt: skip
+def telea_fill(
+    values: np.ndarray, known: np.ndarray, *, radius_px: float = 3.0, flag: int = cv2.INPAINT_TELEA
+) -> np.ndarray:
     """Holes filled from their rims inwards (Telea 2004, doi:10.1080/10867651.2004.10487596).
 
     Parameters
@@ -31,7 +32,8 @@ def telea_fill(values: np.ndarray, known: np.ndarray, *, radius_px: float = 3.0,
     scale = 65_535.0 / max(high - low, 1e-12)
     # OpenCV 5.0 fills float pictures with nonsense; 16 bits of the known range lose nothing that one could see.
     levels = np.where(known[..., None], np.round((values - low) * scale), 0.0).astype(np.uint16)
-    channels = [cv2.inpaint(np.ascontiguousarray(channel), hole, radius_px, flag)
-                for channel in np.moveaxis(levels, -1, 0)]  # fmt: skip
+    channels = [
+        cv2.inpaint(np.ascontiguousarray(channel), hole, radius_px, flag) for channel in np.moveaxis(levels, -1, 0)
+    ]
     filled = np.stack(channels, -1).astype(np.float32) / scale + low
     return np.where(known[..., None], values, filled).astype(np.float32)

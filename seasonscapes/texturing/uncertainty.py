@@ -79,9 +79,17 @@ def fit_spread(guide: np.ndarray, encoded: np.ndarray, fold: np.ndarray, fit: Ca
     square = np.mean((np.maximum(colour, 0.0) ** 3 - encoded**3) ** 2, axis=1) + _TINY
     # Of the losses with a logarithmic link this one is steady where a few squares outweigh all others.
     size = float(square.mean())
-    model = HistGradientBoostingRegressor(loss="poisson", max_iter=40, learning_rate=0.12, max_leaf_nodes=6,
-                                          min_samples_leaf=200, l2_regularization=1.0, max_features=0.5,
-                                          early_stopping=False, random_state=seed)  # fmt: skip
+    model = HistGradientBoostingRegressor(
+        loss="poisson",
+        max_iter=40,
+        learning_rate=0.12,
+        max_leaf_nodes=6,
+        min_samples_leaf=200,
+        l2_regularization=1.0,
+        max_features=0.5,
+        early_stopping=False,
+        random_state=seed,
+    )
     return Spread(model.fit(_features(guide, colour, between), square / size), size)
 
 

@@ -58,8 +58,9 @@ def sight_of(camera: Camera, surface: TexelSurface) -> Sight:
     return Sight(np.stack([x, y], axis=-1), distance, cosine, inside)
 
 
-def by_ray(terrain: Occluder, camera: Camera, surface: TexelSurface, sight: Sight, *,
-           lift_m: float | None = None) -> np.ndarray:  # fmt: skip
+def by_ray(
+    terrain: Occluder, camera: Camera, surface: TexelSurface, sight: Sight, *, lift_m: float | None = None
+) -> np.ndarray:
     """Whether a camera sees places, ``(N,)`` bool, by one shadow ray each; see `sightlines.clear_sight`."""
     seen = sight.inside.copy()
     index = np.flatnonzero(seen)

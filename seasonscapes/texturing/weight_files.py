@@ -33,17 +33,21 @@ class WeightNames:
 
 # Folder in the part, class that its config.json must name, stem of its weights file.
 _LAYOUT = {
-    "base": (("unet", "UNet2DConditionModel", _MODEL), ("vae", "AutoencoderKL", _MODEL),
-             ("text_encoder", "CLIPTextModel", _TEXT)),
+    "base": (
+        ("unet", "UNet2DConditionModel", _MODEL),
+        ("vae", "AutoencoderKL", _MODEL),
+        ("text_encoder", "CLIPTextModel", _TEXT),
+    ),
     "depth": ((".", "ControlNetModel", _MODEL),),
     "inpaint": ((".", "ControlNetModel", _MODEL),),
     "adapter": (("models/image_encoder", "CLIPVisionModelWithProjection", _TEXT),),
-}  # fmt: skip
+}
 _PLAIN = {
     "base": ("model_index.json", "scheduler/scheduler_config.json", "tokenizer/vocab.json", "tokenizer/merges.txt"),
-    "depth": (), "inpaint": (),
+    "depth": (),
+    "inpaint": (),
     "adapter": ("models/ip-adapter_sd15.safetensors",),
-}  # fmt: skip
+}
 
 
 def find_weights(folder: Path | None, part: str, name: str) -> Path:
@@ -100,8 +104,9 @@ def _how(folder: Path | None, name: str) -> str:
 def _check_plain(place: Path, part: str, name: str, file: str) -> None:
     path = place / file
     if not path.is_file():
-        raise InputError("--weights", f"{path} is missing, so this is no folder of '{name}' or not all of it",
-                         cure=_how(None, name))  # fmt: skip
+        raise InputError(
+            "--weights", f"{path} is missing, so this is no folder of '{name}' or not all of it", cure=_how(None, name)
+        )
     if path.suffix == ".safetensors":
         _check_whole(path, name)
     elif path.suffix == ".json":
@@ -111,8 +116,11 @@ def _check_plain(place: Path, part: str, name: str, file: str) -> None:
 def _check_model(place: Path, part: str, name: str, kind: str, stem: str) -> None:
     config = place / "config.json"
     if not config.is_file():
-        raise InputError("--weights", f"{config} is missing, so this is no folder of '{name}' or not all of it",
-                         cure=_how(None, name))  # fmt: skip
+        raise InputError(
+            "--weights",
+            f"{config} is missing, so this is no folder of '{name}' or not all of it",
+            cure=_how(None, name),
+        )
     found = _read_json(config, name)
     named = found.get("_class_name") or next(iter(found.get("architectures") or ["nothing"]))
     if named != kind:
@@ -155,8 +163,9 @@ def weight_shards(place: Path, stem: str, name: str) -> list[Path]:
         if file.is_file():
             return [file]
     left = sorted(path.name for path in place.glob("*.bin"))
-    raise InputError("--weights", f"{place / stem}.safetensors is missing", got=", ".join(left) or None,
-                     cure=_how(None, name))  # fmt: skip
+    raise InputError(
+        "--weights", f"{place / stem}.safetensors is missing", got=", ".join(left) or None, cure=_how(None, name)
+    )
 
 
 def _read_json(path: Path, name: str) -> dict:
@@ -188,5 +197,10 @@ def _check_whole(path: Path, name: str) -> None:
             "--weights", f"{path} is no weights file", got=f"{size:,} bytes", cure=_how(None, name)
         ) from None
     if size != wanted:
-        raise InputError("--weights", f"{path} is half-downloaded", got=f"{size:,} bytes", expected=f"{wanted:,}",
-                         cure=_how(None, name))  # fmt: skip
+        raise InputError(
+            "--weights",
+            f"{path} is half-downloaded",
+            got=f"{size:,} bytes",
+            expected=f"{wanted:,}",
+            cure=_how(None, name),
+        )
