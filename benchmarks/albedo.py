@@ -36,11 +36,11 @@ from albedo_scene import Truth, hours, lights_for, make_truth, path_traced  # no
 
 from seasonscapes.albedo.closed_form import AlbedoFit, solve_albedo  # noqa: E402
 from seasonscapes.albedo.corrections import CORRECTIONS, slopes_under  # noqa: E402
-from seasonscapes.albedo.forward import sun_on_texels, trace_land  # noqa: E402
+from seasonscapes.albedo.forward_model import sun_on_texels, trace_texel_transport  # noqa: E402
 from seasonscapes.albedo.haze import fit_visibility  # noqa: E402
 from seasonscapes.albedo.painted import painted_radiance  # noqa: E402
-from seasonscapes.albedo.response import fit_response, with_response  # noqa: E402
-from seasonscapes.albedo.shots import EIGHT_BIT, LINEAR, make_shots  # noqa: E402
+from seasonscapes.albedo.photographs import EIGHT_BIT, LINEAR, prepare_photographs  # noqa: E402
+from seasonscapes.albedo.tone_curve import fit_tone_curve, with_tone_curve  # noqa: E402
 from seasonscapes.cameras.observation import Observation  # noqa: E402
 from seasonscapes.evaluation.webcam_faults import WebcamFaults, degrade  # noqa: E402
 from seasonscapes.exposure import develop, exposure_ev100  # noqa: E402
@@ -154,11 +154,11 @@ class Judge:
 
 def terrain_pixels(truth: Truth) -> list[np.ndarray]:
     """Which pixels ``(H, W)`` of each camera show terrain."""
-    from seasonscapes.rendering.gather import occluder
     from seasonscapes.rendering.gbuffer import trace_gbuffer
-    from seasonscapes.rendering.scene import RenderScene, mi_mesh
+    from seasonscapes.rendering.hemisphere_rays import ray_scene
+    from seasonscapes.rendering.mitsuba_scene import RenderScene, mi_mesh
 
-    bare = occluder(mi_mesh(truth.terrain, np.full(3, 0.3)))
+    bare = ray_scene(mi_mesh(truth.terrain, np.full(3, 0.3)))
     scene = RenderScene(bare.mi_scene, bare.mi_terrain, None, 0.0)
     return [np.isfinite(trace_gbuffer(scene, camera).depth) for camera in truth.cameras]
 
@@ -187,9 +187,9 @@ def ghost(guess: np.ndarray, true: np.ndarray, edges: np.ndarray) -> float:
 # ---------------------------------------------------------------------------------------------- rivals
 
 
-def rivals(truth: Truth, land, shots, gains: np.ndarray, times, lights) -> dict[str, np.ndarray]:
+def rivals(truth: Truth, land, photographs, gains: np.ndarray, times, lights) -> dict[str, np.ndarray]:
     """Albedo ``(R, S, 3)`` by each correction: best single time and median of all times, by name."""
-    painted = painted_radiance(shots, gains)
+    painted = painted_radiance(photographs, gains)
     normal = np.tile([0.0, 0.0, 1.0], (truth.shape[0] * truth.shape[1], 1))
     normal[land.texel] = land.normal
     methods = {"as_it_is": lambda radiance, slopes: radiance, **CORRECTIONS}
@@ -247,12 +247,12 @@ def run(args) -> dict[str, float]:
     winter = lights_for(hours(WINTER_DATE, 10.0, 13.0), truth.cameras, model, workspace)
     pictures = path_traced(truth, truth.albedo, lights, spp=size.spp, seed=args.seed)
     clock.tell("truth rendered")
-    land = trace_land(truth.terrain, truth.shape)
+    land = trace_texel_transport(truth.terrain, truth.shape)
     numbers["seconds_land"] = clock.tell("daylight coefficients of texels")
     seen, gains = observations(truth, times, pictures, None, args.seed)
-    shots = make_shots(land, seen, flat(lights), gains=gains)
+    photographs = prepare_photographs(land, seen, flat(lights), gains=gains)
     numbers["seconds_footprints"] = clock.tell("footprints")
-    clean = solve_albedo(land, shots, trust=LINEAR)
+    clean = solve_albedo(land, photographs, noise_model=LINEAR)
     numbers["seconds_closed_form"] = clock.tell("closed form")
     sunlit = np.stack(
         [sun_on_texels(land, row[0]).sum(axis=1) > 0.02 * row[0].sun.normal_illuminance_lx.sum() for row in lights]
@@ -264,33 +264,36 @@ def run(args) -> dict[str, float]:
     table: list[tuple[str, dict[str, float]]] = []
     score(table, numbers, "clean", judge.scores(clean.albedo), judge)
     clock.tell("judged")
-    best = best_rival(table, judge, rivals(truth, land, shots, np.stack(gains), times, lights))
+    best = best_rival(table, judge, rivals(truth, land, photographs, np.stack(gains), times, lights))
     margins = [numbers["clean_psnr_db"] - best]
     show_pictures(args.pictures, truth, clean, judge)
     webcam_seen, true_gains = observations(truth, times, pictures, WebcamFaults(tone_strength=0.0), args.seed + 1)
-    webcam_shots = [replace(shot, observation=one, gain=None) for shot, one in zip(shots, webcam_seen, strict=True)]
-    webcam = solve_albedo(land, webcam_shots, trust=EIGHT_BIT)
+    webcam_shots = [
+        replace(photograph, observation=one, gain=None)
+        for photograph, one in zip(photographs, webcam_seen, strict=True)
+    ]
+    webcam = solve_albedo(land, webcam_shots, noise_model=EIGHT_BIT)
     score(table, numbers, "webcam", judge.scores(webcam.albedo), judge)
     numbers["webcam_gain_error"] = float(np.median(np.abs(webcam.gains / np.array(true_gains) - 1.0)))
     best = best_rival(table, judge, rivals(truth, land, webcam_shots, webcam.gains, times, lights), prefix="webcam ")
     margins.append(numbers["webcam_psnr_db"] - best)
     numbers["margin_over_best_correction_db"] = min(margins)
     clock.tell("webcam")
-    curve(args, truth, land, times, pictures, shots, judge, table, numbers, clock)
+    curve(args, truth, land, times, pictures, photographs, judge, table, numbers, clock)
     haze(args, truth, land, times, model, workspace, judge, table, numbers, clock)
-    controls(truth, land, shots, times, model, workspace, judge, table, numbers, clock)
+    controls(truth, land, photographs, times, model, workspace, judge, table, numbers, clock)
     print_table(table, judge)
     return numbers
 
 
-def curve(args, truth, land, times, pictures, shots, judge, table, numbers, clock) -> None:
+def curve(args, truth, land, times, pictures, photographs, judge, table, numbers, clock) -> None:
     """An unknown S-curve on top of all that webcams do."""
     faults = WebcamFaults(tone_strength=0.4)
     seen, _ = observations(truth, times, pictures, faults, args.seed + 3)
-    bent = [replace(shot, observation=one, gain=None) for shot, one in zip(shots, seen, strict=True)]
-    found = fit_response(land, bent, share=0.2 if args.quick else 0.1)
+    bent = [replace(photograph, observation=one, gain=None) for photograph, one in zip(photographs, seen, strict=True)]
+    found = fit_tone_curve(land, bent, share=0.2 if args.quick else 0.1)
     numbers["curve_strength_error"] = abs(found.strength - faults.tone_strength)
-    fit = solve_albedo(land, with_response(bent, found.strength), trust=EIGHT_BIT)
+    fit = solve_albedo(land, with_tone_curve(bent, found.strength), noise_model=EIGHT_BIT)
     score(table, numbers, "curve", judge.scores(fit.albedo), judge)
     clock.tell("tone curve")
 
@@ -305,26 +308,29 @@ def haze(args, truth, land, times, model, workspace, judge, table, numbers, cloc
     rows = [true[i : i + len(truth.cameras)] for i in range(0, len(true), len(truth.cameras))]
     pictures = path_traced(truth, truth.albedo, rows, spp=size_of(args).spp, seed=args.seed + 5)
     seen, _ = observations(truth, times, pictures, WebcamFaults(tone_strength=0.0), args.seed + 2)
-    shots = make_shots(land, seen, true)
-    found = fit_visibility(land, shots, lights_of, trust=EIGHT_BIT)
+    photographs = prepare_photographs(land, seen, true)
+    found = fit_visibility(land, photographs, lights_of, noise_model=EIGHT_BIT)
     numbers["haze_visibility_km"] = found.visibility_km
     numbers["haze_visibility_error"] = abs(found.visibility_km / TRUE_HAZE_KM - 1.0)
-    shots = [replace(shot, light=light) for shot, light in zip(shots, lights_of(found.visibility_km), strict=True)]
-    score(table, numbers, "haze", judge.scores(solve_albedo(land, shots, trust=EIGHT_BIT).albedo), judge)
+    photographs = [
+        replace(photograph, light=light)
+        for photograph, light in zip(photographs, lights_of(found.visibility_km), strict=True)
+    ]
+    score(table, numbers, "haze", judge.scores(solve_albedo(land, photographs, noise_model=EIGHT_BIT).albedo), judge)
     clock.tell("haze")
 
 
-def controls(truth, land, shots, times, model, workspace, judge, table, numbers, clock) -> None:
+def controls(truth, land, photographs, times, model, workspace, judge, table, numbers, clock) -> None:
     """What must fail: clocks an hour wrong, a world mirrored east–west, half the terrain's resolution."""
     from datetime import timedelta
 
     wrong = lights_for([t + timedelta(hours=1) for t in times], truth.cameras, model, workspace)
-    observed = [shot.observation for shot in shots]
-    gains = [shot.gain for shot in shots]
-    late = solve_albedo(land, make_shots(land, observed, flat(wrong), gains=gains))
+    observed = [photograph.observation for photograph in photographs]
+    gains = [photograph.gain for photograph in photographs]
+    late = solve_albedo(land, prepare_photographs(land, observed, flat(wrong), gains=gains))
     score(table, numbers, "control_hour_wrong", judge.scores(late.albedo), judge)
-    mirrored = [mirror(shot.light) for shot in shots]
-    east_west = solve_albedo(land, make_shots(land, observed, mirrored, gains=gains))
+    mirrored = [mirror(photograph.light) for photograph in photographs]
+    east_west = solve_albedo(land, prepare_photographs(land, observed, mirrored, gains=gains))
     score(table, numbers, "control_mirrored", judge.scores(east_west.albedo), judge)
     clock.tell("controls")
 

@@ -17,16 +17,16 @@ from albedo import FIT_DATE, flat, observations
 from albedo_scene import hours, lights_for, make_truth, path_traced
 
 from seasonscapes.albedo.closed_form import solve_albedo
-from seasonscapes.albedo.forward import trace_land
-from seasonscapes.albedo.shots import EIGHT_BIT, make_shots
-from seasonscapes.albedo.uncertainty import known_albedo
+from seasonscapes.albedo.forward_model import trace_texel_transport
+from seasonscapes.albedo.photographs import EIGHT_BIT, prepare_photographs
+from seasonscapes.albedo.standard_error import known_albedo
 from seasonscapes.commands.corrected_albedo import complete_known
 from seasonscapes.evaluation.webcam_faults import WebcamFaults
 from seasonscapes.exposure import develop, exposure_ev100
 from seasonscapes.images import atomic_path, srgb_from_linear
 from seasonscapes.sky.models import read_sky_model
 from seasonscapes.terrain.atlas import measure_atlas
-from seasonscapes.texturing.guides import guides_for
+from seasonscapes.texturing.predictors import predictors_for
 from seasonscapes.workspace import default_workspace
 
 
@@ -44,11 +44,11 @@ def main() -> None:
     lights = lights_for(times, truth.cameras, model, workspace)
     pictures = path_traced(truth, truth.albedo, lights, spp=48, seed=1)
     seen, _ = observations(truth, times, pictures, WebcamFaults(tone_strength=0.0), 2)
-    land = trace_land(truth.terrain, truth.shape)
-    shots = make_shots(land, seen, flat(lights))
-    fit = solve_albedo(land, shots, trust=EIGHT_BIT)
+    land = trace_texel_transport(truth.terrain, truth.shape)
+    photographs = prepare_photographs(land, seen, flat(lights))
+    fit = solve_albedo(land, photographs, noise_model=EIGHT_BIT)
     atlas = measure_atlas(truth.terrain, "planar", truth.albedo.shape[1], truth.albedo.shape[0])
-    found = complete_known(known_albedo(land, shots, fit), fit, None, guides_for(truth.terrain, atlas))
+    found = complete_known(known_albedo(land, photographs, fit), fit, None, predictors_for(truth.terrain, atlas))
     view = [args.camera]
     evening = [
         [light] for light in [lights_for(hours(FIT_DATE, 16.3), truth.cameras, model, workspace)[0][args.camera]]
@@ -59,7 +59,7 @@ def main() -> None:
         for albedo in (found.albedo, truth.albedo)
     )
     ev = exposure_ev100(true)
-    footprints = shots[args.camera].footprints
+    footprints = photographs[args.camera].footprints
     bare = np.zeros((footprints.camera.height_px * footprints.camera.width_px, 3), np.float32) + 0.75
     bare[footprints.pixel] = footprints.matrix(footprints.share) @ found.albedo.reshape(-1, 3)
     photograph = srgb_from_linear(seen[args.camera].image)

@@ -47,14 +47,14 @@ def main() -> None:
 def measure(folder: Path, seed: int) -> dict[str, float]:
     """Correlations by date, band and method; printed as a table."""
     from seasonscapes.albedo.corrections import CORRECTIONS, slopes_under
-    from seasonscapes.albedo.forward import trace_land
-    from seasonscapes.albedo.orthophoto import texture_albedo
+    from seasonscapes.albedo.delighting import delight_textures
+    from seasonscapes.albedo.forward_model import trace_texel_transport
     from seasonscapes.frames import direction_from_angles
     from seasonscapes.rendering.backend import use_backend
 
     use_backend()
     terrain, shape, bands = scene(folder)
-    land = trace_land(terrain, shape, seed=seed)
+    land = trace_texel_transport(terrain, shape, seed=seed)
     normal = land.normal
     steep = np.degrees(np.arccos(normal[:, 2])) > 8.0
     numbers: dict[str, float] = {}
@@ -70,7 +70,9 @@ def measure(folder: Path, seed: int) -> dict[str, float]:
             texture = np.full((shape[0] * shape[1], 3), np.nan, np.float32)
             # Radiance in units where the sun's normal irradiance is that of `light`.
             texture[land.texel] = radiance[:, triple] / SOLAR[triple] * 1.0e5
-            ours[:, triple] = texture_albedo(land, [texture.reshape(*shape, 3)], [light])[0].reshape(-1, 3)[land.texel]
+            ours[:, triple] = delight_textures(land, [texture.reshape(*shape, 3)], [light])[0].reshape(-1, 3)[
+                land.texel
+            ]
         methods = {"as it is": radiance, "ours": ours}
         methods |= {name: correct(radiance, slopes) for name, correct in CORRECTIONS.items()}
         kept[date] = methods

@@ -76,11 +76,11 @@ def terrain_and_albedo(place, spacing_m: float, texel_m: float, day_of_year: int
 
 def low_cameras(terrain: Terrain, count: int, size_px: tuple[int, int], seed: int) -> list[Camera]:
     """Webcams on masts around the massif: of a few dozen places those that together see the most, each with some sky."""
-    from seasonscapes.rendering.gather import occluder
     from seasonscapes.rendering.gbuffer import trace_gbuffer
-    from seasonscapes.rendering.scene import RenderScene, mi_mesh
+    from seasonscapes.rendering.hemisphere_rays import ray_scene
+    from seasonscapes.rendering.mitsuba_scene import RenderScene, mi_mesh
 
-    bare = occluder(mi_mesh(terrain, np.full(3, 0.3)))
+    bare = ray_scene(mi_mesh(terrain, np.full(3, 0.3)))
     scene = RenderScene(bare.mi_scene, bare.mi_terrain, None, 0.0)
     rng = np.random.default_rng(seed)
     reach = float(np.abs(terrain.vertices[:, :2]).max())
@@ -153,8 +153,8 @@ def path_traced(
     cameras: Sequence[int] | None = None,
 ) -> list[list[np.ndarray]]:
     """Radiance ``(H, W, 3)`` at each camera of each time, ``[time][camera]``."""
+    from seasonscapes.rendering.mitsuba_scene import mi_mesh, relight
     from seasonscapes.rendering.radiance import render_view
-    from seasonscapes.rendering.scene import mi_mesh, relight
 
     mesh = mi_mesh(truth.terrain, albedo)
     top = float(truth.terrain.vertices[:, 2].max())

@@ -56,7 +56,7 @@ from seasonscapes.relighting.film import write_film  # noqa: E402
 from seasonscapes.rendering.relit_view import relight_view  # noqa: E402
 from seasonscapes.sky.illumination import global_horizontal_illuminance  # noqa: E402
 from seasonscapes.terrain.surface import Texture  # noqa: E402
-from seasonscapes.texturing.paint import PaintOptions  # noqa: E402
+from seasonscapes.texturing.painting import PaintOptions  # noqa: E402
 from seasonscapes.workspace import default_workspace  # noqa: E402
 
 # ---------------------------------------------------------------------------------------------- the tables
@@ -159,7 +159,8 @@ def painting_ablations(bench: Bench, whole: dict, without: dict[str, dict]) -> d
     rows = Rows()
     rows["full"] = texture_scores(bench, refilled("guided"))
     everywhere = mock.patch(
-        "seasonscapes.texturing.paint.by_ray", lambda terrain, camera, surface, sight: np.ones(len(surface.texel), bool)
+        "seasonscapes.texturing.painting.by_ray",
+        lambda terrain, camera, surface, sight: np.ones(len(surface.texel), bool),
     )
     with everywhere:
         rows["no occlusion test"] = texture_scores(bench, repainted())

@@ -16,18 +16,18 @@ from albedo_scene import LATITUDE_DEG, LONGITUDE_DEG, hours, lights_for
 
 from seasonscapes.calibration.evidence import Correspondences, Priors
 from seasonscapes.calibration.pose_model import values_of
-from seasonscapes.calibration.resection import Calibration, calibrate
+from seasonscapes.calibration.resection import Calibration, resect
 from seasonscapes.cameras.observation import Observation
 from seasonscapes.cameras.panorama import Panorama, cut_view, split_panorama
 from seasonscapes.cameras.pinhole import Camera, rotation_from_angles
 from seasonscapes.evaluation.splits import held_out_hours, refuse_leaks, use_of
-from seasonscapes.evaluation.synthetic_webcams import Hour, SyntheticPicture, webcam_series
+from seasonscapes.evaluation.synthetic_webcams import SyntheticPicture, WebcamInstant, webcam_series
 from seasonscapes.evaluation.webcam_faults import TYPICAL, PoseSigmas, perturb_pose
 from seasonscapes.frames import LocalFrame
-from seasonscapes.rendering.gather import Occluder, occluder
 from seasonscapes.rendering.gbuffer import trace_gbuffer
-from seasonscapes.rendering.scene import RenderScene, mi_mesh
-from seasonscapes.rendering.transport import Effort
+from seasonscapes.rendering.hemisphere_rays import RayScene, ray_scene
+from seasonscapes.rendering.mitsuba_scene import RenderScene, mi_mesh
+from seasonscapes.rendering.transport import SamplingOptions
 from seasonscapes.sky.illumination import Illumination
 from seasonscapes.sky.models import SkyModel, read_sky_model, with_overrides
 from seasonscapes.terrain.atlas import Atlas, measure_atlas
@@ -72,13 +72,13 @@ class Size:
     judged: int
     judged_px: tuple[int, int]
     clock: tuple[float, ...]
-    effort: Effort
+    sampling: SamplingOptions
     disc_m: float
     ablated: int = 8
 
 
-_WEB = Effort(subpixels=4, shades=16, rays=64, senders=1024, listed=32, rank=24)
-_FINE = Effort(subpixels=4, shades=16, rays=128, senders=4096, listed=32, rank=24)
+_WEB = SamplingOptions(subpixels=4, shades=16, rays=64, clusters=1024, listed=32, rank=24)
+_FINE = SamplingOptions(subpixels=4, shades=16, rays=128, clusters=4096, listed=32, rank=24)
 _QUICK_HOURS = (7.0, 8.5, 10.0, 12.0, 14.0, 15.5)
 SIZES = {
     "tiny": Size((3000.0, 3000.0), 60.0, 30.0, 2, 75.0, 96, 1, (144, 96), (8.5, 10.0, 14.0), _WEB, 60.0),
@@ -184,7 +184,7 @@ class World:
     size: Size
     terrain: Terrain
     atlas: Atlas
-    bare: Occluder
+    bare: RayScene
     albedo: np.ndarray
     summer: np.ndarray
     painting: list[Panorama]
@@ -213,7 +213,7 @@ def make_world(seed: int, size: Size, data: Path | None = None) -> World:
     )
     shape = albedo.shape[:2]
     atlas = measure_atlas(terrain, "planar", shape[1], shape[0])
-    bare = occluder(mi_mesh(terrain, albedo))
+    bare = ray_scene(mi_mesh(terrain, albedo))
     painting, judged = choose_cameras(terrain, bare, size, seed)
     times = hours(DATE, *size.clock)
     painted_hours, held_hours = held_out_hours(times, 3)
@@ -237,7 +237,7 @@ def make_world(seed: int, size: Size, data: Path | None = None) -> World:
     )
 
 
-def choose_cameras(terrain: Terrain, bare: Occluder, size: Size, seed: int) -> tuple[list[Panorama], list[Camera]]:
+def choose_cameras(terrain: Terrain, bare: RayScene, size: Size, seed: int) -> tuple[list[Panorama], list[Camera]]:
     """Webcams to be judged that see much, and painting ones elsewhere that together see most of what these see.
 
     Chosen by geometry alone, as webcams of one valley do look at the same mountains.
@@ -343,8 +343,10 @@ def take_pictures(world: World) -> Pictures:
 def series(world: World, number: int, name: str) -> list[SyntheticPicture]:
     """Pictures of one webcam at all hours, at full physics and with a webcam's faults."""
     camera = [*world.painting, *world.judged][number]
-    made = [Hour(time, world.lights[time][number], world.albedo) for time in world.hours]
-    return webcam_series(world.terrain, name, camera, made, faults=TYPICAL, effort=world.size.effort, seed=world.seed)
+    made = [WebcamInstant(time, world.lights[time][number], world.albedo) for time in world.hours]
+    return webcam_series(
+        world.terrain, name, camera, made, faults=TYPICAL, sampling=world.size.sampling, seed=world.seed
+    )
 
 
 def calibrated_by_clicks(world: World, number: int, picture: SyntheticPicture) -> Calibration:
@@ -356,7 +358,7 @@ def calibrated_by_clicks(world: World, number: int, picture: SyntheticPicture) -
     pixel = chosen[:, ::-1] + 0.5 + rng.normal(0.0, CLICK_PX, (CLICKS, 2))
     pixel[:WRONG] += rng.choice([-1.0, 1.0], (WRONG, 2)) * rng.uniform(8.0, 40.0, (WRONG, 2))
     points = Correspondences(pixel, picture.gbuffer.position[chosen[:, 0], chosen[:, 1]])
-    return calibrate(start, points, priors=Priors(horizontal_m=GPS.horizontal_m, vertical_m=GPS.vertical_m, focal=0.02))
+    return resect(start, points, priors=Priors(horizontal_m=GPS.horizontal_m, vertical_m=GPS.vertical_m, focal=0.02))
 
 
 def pose_errors(calibrated: Calibration, truth: Panorama) -> tuple[float, float]:

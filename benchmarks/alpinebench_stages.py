@@ -28,10 +28,10 @@ from alpinebench_scene import (
 )
 
 from seasonscapes.albedo.closed_form import AlbedoFit, solve_albedo
-from seasonscapes.albedo.forward import Land, ambient_on_texels, sun_on_texels, trace_land
-from seasonscapes.albedo.orthophoto import texture_albedo
-from seasonscapes.albedo.response import fit_response, with_response
-from seasonscapes.albedo.shots import EIGHT_BIT, LINEAR, make_shots
+from seasonscapes.albedo.delighting import delight_textures
+from seasonscapes.albedo.forward_model import TexelTransport, ambient_on_texels, sun_on_texels, trace_texel_transport
+from seasonscapes.albedo.photographs import EIGHT_BIT, LINEAR, prepare_photographs
+from seasonscapes.albedo.tone_curve import fit_tone_curve, with_tone_curve
 from seasonscapes.commands.corrected_albedo import corrected_albedo
 from seasonscapes.commands.expected import RELIT_SIGMA
 from seasonscapes.evaluation.masks import land_mask
@@ -40,21 +40,27 @@ from seasonscapes.evaluation.synthetic_webcams import SyntheticPicture
 from seasonscapes.exposure import develop, exposure_ev100
 from seasonscapes.images import srgb_from_linear
 from seasonscapes.rendering.gbuffer import trace_gbuffer
-from seasonscapes.rendering.radiance import through_air
-from seasonscapes.rendering.relit_view import ReadyView, ready_view, relight_view, senders_albedo, with_albedo
-from seasonscapes.rendering.scene import RenderScene, set_albedo
-from seasonscapes.rendering.transport import Effort, trace_view, view_albedo
+from seasonscapes.rendering.mitsuba_scene import RenderScene, set_albedo
+from seasonscapes.rendering.radiance import apply_aerial_perspective
+from seasonscapes.rendering.relit_view import (
+    RelightableView,
+    cluster_albedo,
+    relight_view,
+    relightable_view,
+    with_albedo,
+)
+from seasonscapes.rendering.transport import SamplingOptions, trace_view, view_albedo
 from seasonscapes.sky.ephemeris import sun_position
 from seasonscapes.sky.illumination import Illumination, global_horizontal_illuminance
 from seasonscapes.terrain.surface import Texture, sample_texture
-from seasonscapes.texturing.complete import complete
-from seasonscapes.texturing.fused import fuse
-from seasonscapes.texturing.guides import Guides, guides_for
-from seasonscapes.texturing.paint import Painting, PaintOptions, paint
-from seasonscapes.texturing.shots import Shot
+from seasonscapes.texturing.bayesian_fusion import fuse_with_albedo
+from seasonscapes.texturing.completion import complete
+from seasonscapes.texturing.inputs import PaintingInput
+from seasonscapes.texturing.painting import Painting, PaintOptions, paint_atlas
+from seasonscapes.texturing.predictors import Predictors, predictors_for
 from seasonscapes.workspace import default_workspace
 
-_TEXEL = Effort(subpixels=1, rays=64, listed=32, senders=1024, rank=24)
+_TEXEL = SamplingOptions(subpixels=1, rays=64, listed=32, clusters=1024, rank=24)
 _SUBPIXELS = 3
 # Days and hours that Gaussians learn from; the judged day is not among them.
 LESSONS = (
@@ -87,8 +93,8 @@ class Judge:
             self.coverage.append(np.isfinite(seen.depth).mean(axis=-1).astype(np.float32))
             # Other random numbers than the truth's.
             set_albedo(self.scene, world.albedo)
-            made = trace_view(world.bare, camera, world.size.effort, seed=world.seed + 1000 + number)
-            self.ready.append(ready_view(world.bare, made))
+            made = trace_view(world.bare, camera, world.size.sampling, seed=world.seed + 1000 + number)
+            self.ready.append(relightable_view(world.bare, made))
 
     def light(self, camera: int, at: datetime) -> Illumination:
         return self.world.lights[at][len(self.world.painting) + camera]
@@ -102,11 +108,11 @@ class Judge:
         light = self.light(camera, at)
         light = light if air else replace(light, aerial_perspective=None)
         stage = RenderScene(self.world.bare.mi_scene, self.world.bare.mi_terrain, light, 0.0)
-        return through_air(
+        return apply_aerial_perspective(
             stage, self.world.judged[camera], surface, self.coverage[camera], self.truth(camera, at).gbuffer
         )
 
-    def clothed(self, albedo: np.ndarray, cameras: Sequence[int] | None = None) -> dict[int, ReadyView]:
+    def clothed(self, albedo: np.ndarray, cameras: Sequence[int] | None = None) -> dict[int, RelightableView]:
         """The views' light transport over a texture of albedo, by camera."""
         set_albedo(self.scene, albedo)
         chosen = range(len(self.ready)) if cameras is None else cameras
@@ -114,7 +120,7 @@ class Judge:
             n: with_albedo(
                 self.ready[n],
                 view_albedo(self.world.bare, self.ready[n].coefficients),
-                senders_albedo(self.ready[n].coefficients, albedo),
+                cluster_albedo(self.ready[n].coefficients, albedo),
             )
             for n in chosen
         }
@@ -174,12 +180,14 @@ class Bench:
         self.clock.tell("webcams' pictures, calibrated")
         self.judge = Judge(self.world, self.pictures, lpips)
         self.clock.tell("judged views")
-        self.land: Land = trace_land(self.world.terrain, self.world.albedo.shape[:2], effort=_TEXEL, seed=seed)
+        self.land: TexelTransport = trace_texel_transport(
+            self.world.terrain, self.world.albedo.shape[:2], sampling=_TEXEL, seed=seed
+        )
         self.clock.tell("daylight coefficients of texels")
         self.from_above, self.satellite = self._from_above()
         # No hour's sun among the guides of an albedo: it knows none.
-        self.albedo_guides = guides_for(self.world.terrain, self.world.atlas)
-        self.guides = {at: self.guides_at(at, self.satellite) for at in self.world.painted_hours}
+        self.albedo_guides = predictors_for(self.world.terrain, self.world.atlas)
+        self.predictors = {at: self.guides_at(at, self.satellite) for at in self.world.painted_hours}
         self.clock.tell("satellite and guides")
 
     def _from_above(self) -> tuple[Texture, Texture]:
@@ -192,7 +200,7 @@ class Bench:
             hours(SATELLITE_DATE, 10.5), self.world.painting[:1], self.world.sky, default_workspace()
         )[0]
         # Other rays than those that take the light out again.
-        land = trace_land(self.world.terrain, shape, effort=_TEXEL, seed=seed + 500)
+        land = trace_texel_transport(self.world.terrain, shape, sampling=_TEXEL, seed=seed + 500)
         even = np.asarray(global_horizontal_illuminance(light), np.float32)
         image = np.pi * self.true_texture(light, self.world.summer, land) / even
         noise = np.exp(0.03 * np.random.default_rng([seed, 500]).standard_normal(image.shape))
@@ -200,15 +208,15 @@ class Bench:
             image, np.float32([[1, 0, 0.6], [0, 1, -0.4]]), shape[::-1], borderMode=cv2.BORDER_REPLICATE
         )
         image = (image * noise).astype(np.float32)
-        albedo, _ = texture_albedo(self.land, [image * even / np.float32(np.pi)], [light])
+        albedo, _ = delight_textures(self.land, [image * even / np.float32(np.pi)], [light])
         whole = np.ones(shape, np.float32)
         return Texture(image, whole), Texture(np.where(np.isfinite(albedo), albedo, image), whole)
 
-    def guides_at(self, at: datetime, satellite: Texture | None = None) -> Guides:
+    def guides_at(self, at: datetime, satellite: Texture | None = None) -> Predictors:
         """Relief, sun and the satellite's image."""
         day = [at.replace(hour=0, minute=0) + timedelta(hours=h) for h in range(24)]
         suns = np.asarray(sun_position(day, LATITUDE_DEG, LONGITUDE_DEG).direction, float)
-        return guides_for(
+        return predictors_for(
             self.world.terrain,
             self.world.atlas,
             satellite=satellite,
@@ -216,7 +224,7 @@ class Bench:
             day_suns=suns,
         )
 
-    def true_texture(self, light: Illumination, albedo: np.ndarray, land: Land | None = None) -> np.ndarray:
+    def true_texture(self, light: Illumination, albedo: np.ndarray, land: TexelTransport | None = None) -> np.ndarray:
         """Radiance ``(R, S, 3)`` [cd/m²] that an albedo sends under a light."""
         land = land or self.land
         received = sun_on_texels(land, light) + ambient_on_texels(land, light, albedo)
@@ -235,20 +243,22 @@ class Bench:
         """The webcams' pictures of an hour, in the texture; ``relit`` is what an albedo says that they show."""
         lights = self.world.lights[at]
         gain = clean_gain(self.pictures, self.world, at) if clean else None
-        shots = []
+        inputs = []
         for seen, sigma, number in observed(self.pictures, self.world, at, gain=gain, true_pose=true_pose):
             seen = replace(seen, image=np.clip(seen.image, 0.0, 1.0))
-            shots.append(Shot(seen, lights[number].aerial_perspective if air else None, sigma))
+            inputs.append(PaintingInput(seen, lights[number].aerial_perspective if air else None, sigma))
         if relit is not None:
             options = replace(options or PaintOptions(), predicted_sigma=RELIT_SIGMA)
-        return paint(shots, self.world.terrain, self.world.atlas, self.world.bare, options=options, predicted=relit)
+        return paint_atlas(
+            inputs, self.world.terrain, self.world.atlas, self.world.bare, options=options, predicted=relit
+        )
 
     def completed(self, texture: Texture, at: datetime, *, method: str = "guided") -> np.ndarray:
-        return complete(texture, self.guides[at], method=method, fast=True, seed=self.world.seed).values
+        return complete(texture, self.predictors[at], method=method, fast=True, seed=self.world.seed).values
 
     def fused(self, texture: Texture, at: datetime, told: np.ndarray, sigma: np.ndarray) -> np.ndarray:
         """A painting and what an albedo of relative error ``sigma``, relit, says of the hour."""
-        return fuse(texture, told, sigma, self.guides[at]).values
+        return fuse_with_albedo(texture, told, sigma, self.predictors[at]).values
 
     def solved(self, *, clean: bool = False, true_pose: bool = False, response: bool = True) -> AlbedoFit:
         """Albedo from all painted hours' pictures; unless these are clean, their tone curve is searched for."""
@@ -259,10 +269,10 @@ class Bench:
                 seen.append(one)
                 lights.append(self.world.lights[at][number])
                 gains.append(np.ones(3) if clean else None)
-        shots = make_shots(self.land, seen, lights, gains=gains, seed=self.world.seed)
+        inputs = prepare_photographs(self.land, seen, lights, gains=gains, seed=self.world.seed)
         if response and not clean:
-            shots = with_response(shots, fit_response(self.land, shots, seed=self.world.seed).strength)
-        return solve_albedo(self.land, shots, trust=LINEAR if clean else EIGHT_BIT)
+            inputs = with_tone_curve(inputs, fit_tone_curve(self.land, inputs, seed=self.world.seed).strength)
+        return solve_albedo(self.land, inputs, noise_model=LINEAR if clean else EIGHT_BIT)
 
     def completed_albedo(self, fit: AlbedoFit, base: Texture | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Another picture of the land (left out, the satellite's, its light taken out) corrected by the seen texels; and σ."""
@@ -271,9 +281,9 @@ class Bench:
 
     def guided_albedo(self, fit: AlbedoFit) -> np.ndarray:
         """Seen texels' albedo as it is; the others' learned, the satellite's image one guide among others."""
-        guides = guides_for(self.world.terrain, self.world.atlas, satellite=self.satellite)
+        predictors = predictors_for(self.world.terrain, self.world.atlas, satellite=self.satellite)
         texture = Texture(fit.albedo, (fit.seen >= 0.5).astype(np.float32))
-        return np.clip(complete(texture, guides, fast=True, seed=self.world.seed).values, 0.004, 0.98)
+        return np.clip(complete(texture, predictors, fast=True, seed=self.world.seed).values, 0.004, 0.98)
 
     def seen_texels(self) -> np.ndarray:
         """Texels ``(R, S)`` that painting at true poses reaches, at the first painted hour."""
@@ -284,15 +294,15 @@ class Splats:
     """Gaussians distilled from an albedo under suns of other days; discs and their light transport are made once."""
 
     def __init__(self, bench: Bench):
+        from seasonscapes.gaussians.disc_transport import light_state, trace_disc_transport
         from seasonscapes.gaussians.rasterise import choose_threads
         from seasonscapes.gaussians.surfels import surfel_albedo, terrain_surfels
-        from seasonscapes.gaussians.transport import light_state, trace_transport
 
         choose_threads(1)
         self.bench, world = bench, bench.world
         self.surfels = terrain_surfels(world.terrain, world.size.disc_m)
         set_albedo(bench.judge.scene, world.albedo)
-        self.transport = trace_transport(
+        self.transport = trace_disc_transport(
             world.bare, self.surfels, surfel_albedo(self.surfels, world.albedo), rays=64, seed=world.seed
         )
         times = [hours(day, hour)[0] for day, hour in LESSONS]
@@ -302,18 +312,18 @@ class Splats:
     def views(self, albedo: np.ndarray) -> Callable[[int, datetime], np.ndarray]:
         """Views of the Gaussians that an albedo was distilled into."""
         from seasonscapes.gaussians.appearance import Appearance, fourier_embedding
-        from seasonscapes.gaussians.distil import Schedule, distil, lessons_from
+        from seasonscapes.gaussians.disc_transport import neighbourhood_mean, surfel_irradiance
         from seasonscapes.gaussians.model import model_from
-        from seasonscapes.gaussians.render import learned_numbers, model_weights, render_model
+        from seasonscapes.gaussians.splat_view import learned_numbers, model_weights, render_model
         from seasonscapes.gaussians.surfels import surfel_albedo
-        from seasonscapes.gaussians.transport import neighbourhood_mean, surfel_irradiance
+        from seasonscapes.gaussians.training import Schedule, surface_targets, train
 
         world, seed = self.bench.world, self.bench.world.seed
         set_albedo(self.bench.judge.scene, albedo)
         own = surfel_albedo(self.surfels, albedo)
         around = neighbourhood_mean(self.surfels.means, own, self.surfels.plan.spacing_m)
         received = surfel_irradiance(world.bare, self.surfels, self.lights, rays=64, seed=seed)
-        lessons = lessons_from(self.states, [0] * len(self.states), own[None], received)
+        targets = surface_targets(self.states, [0] * len(self.states), own[None], received)
         appearance = Appearance(
             "full",
             own[None],
@@ -323,7 +333,7 @@ class Splats:
             times=len(self.states),
             seed=seed,
         )
-        distil(appearance, lessons, schedule=Schedule(surface_steps=600), seed=seed)
+        train(appearance, targets, schedule=Schedule(surface_steps=600), seed=seed)
         model = model_from(
             self.surfels,
             own[None],

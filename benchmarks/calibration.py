@@ -22,16 +22,16 @@ import numpy as np
 from seasonscapes.calibration.evidence import Correspondences, Priors
 from seasonscapes.calibration.overlay import save_overlay
 from seasonscapes.calibration.pose_model import values_of
-from seasonscapes.calibration.rehearsal import point_trial, score_points
-from seasonscapes.calibration.rehearsal_pictures import picture_trial
-from seasonscapes.calibration.resection import calibrate, leave_one_out
-from seasonscapes.calibration.skyline import Search, align_to_skyline, encoded_from_file
+from seasonscapes.calibration.resection import leave_one_out, resect
+from seasonscapes.calibration.skyline import SearchRange, align_to_skyline, encoded_from_file
 from seasonscapes.cameras.pinhole import camera_at
+from seasonscapes.evaluation.calibration_pictures import picture_trial
+from seasonscapes.evaluation.calibration_trials import point_trial, score_points
 from seasonscapes.frames import LocalFrame, enu_from_geodetic
 from seasonscapes.terrain.crs import geodetic_from_map
 from seasonscapes.terrain.raster import read_elevation
 
-REHEARSAL = Search(priors=Priors(tilt_deg=2.0, roll_deg=1.0, horizontal_m=3.0, vertical_m=2.0, focal=0.0))
+REHEARSAL = SearchRange(priors=Priors(tilt_deg=2.0, roll_deg=1.0, horizontal_m=3.0, vertical_m=2.0, focal=0.0))
 
 
 def apart(a: float, b: float) -> float:
@@ -108,11 +108,11 @@ def finse(folder: Path, figures: Path | None) -> dict:
     )
     start = camera_at(frame, latitude, longitude, 1212.0, heading_deg=66.0, fov_deg=65.8, size_px=(1920, 1080))
     priors = Priors(k1=np.inf)
-    everyone = calibrate(start, points, priors=priors, loss="squares")
-    robust = calibrate(start, points, priors=priors)
+    everyone = resect(start, points, priors=priors, loss="squares")
+    robust = resect(start, points, priors=priors)
     left_out = leave_one_out(start, points, priors=priors, loss="squares")
     rasters = [read_elevation(folder / "dsm_4m.tif"), read_elevation(folder / "dem_context_aster_100m.tif")]
-    search = Search(
+    search = SearchRange(
         tilt_deg=10.0,
         focal=0.06,
         priors=Priors(tilt_deg=10.0, roll_deg=3.0, horizontal_m=3.0, vertical_m=3.0, focal=0.05, k1=0.1),
@@ -153,8 +153,8 @@ def aletsch(folder: Path, figures: Path | None) -> dict:
     image = encoded_from_file(folder / "photo_07861v.jpg")
     for sigma_m in (5.0, 10.0):
         priors = Priors(horizontal_m=sigma_m, vertical_m=sigma_m)
-        solved = calibrate(start, points, priors=priors, loss="squares")
-        search = Search(
+        solved = resect(start, points, priors=priors, loss="squares")
+        search = SearchRange(
             heading_deg=10.0,
             tilt_deg=5.0,
             focal=0.18,
@@ -166,7 +166,7 @@ def aletsch(folder: Path, figures: Path | None) -> dict:
             fit.calibration.values[0], solved.values[0]
         )
         numbers[f"aletsch_points_sigma_deg_gps{sigma_m:.0f}m"] = solved.sigma["heading_deg"]
-    free = calibrate(start, points, priors=Priors(horizontal_m=np.inf, vertical_m=np.inf), loss="squares")
+    free = resect(start, points, priors=Priors(horizontal_m=np.inf, vertical_m=np.inf), loss="squares")
     numbers["aletsch_rms_px"] = free.rms_px
     if figures:
         save_overlay(figures / "aletsch_points.png", image, free, points=points, title="Aletsch, points")

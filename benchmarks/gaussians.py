@@ -54,8 +54,8 @@ class Scene:
 
     def __init__(self, seed: int, sizes: Sizes):
         from seasonscapes.frames import LocalFrame
-        from seasonscapes.rendering.gather import occluder
-        from seasonscapes.rendering.scene import mi_mesh
+        from seasonscapes.rendering.hemisphere_rays import ray_scene
+        from seasonscapes.rendering.mitsuba_scene import mi_mesh
         from seasonscapes.terrain.mesh import build_mesh
         from seasonscapes.terrain.synthetic import alpine_massif
         from seasonscapes.terrain.unwrap import unwrap
@@ -66,7 +66,7 @@ class Scene:
         self.terrain, self.atlas = unwrap(build_mesh(self.place.elevation, self.frame, mesher="grid"), texel_m=7.5)
         self.spacing_m = float(np.ptp(self.terrain.vertices[:, 0])) / sizes.side
         self.mesh = mi_mesh(self.terrain, self.albedo(SUMMER_DAY))
-        self.occluder = occluder(self.mesh)
+        self.ray_scene = ray_scene(self.mesh)
         first = float(self.rng.uniform(0.0, 360.0))
         self.cameras = [self.camera(first + turn) for turn in (0.0, 120.0, 240.0, 55.0)]
 
@@ -107,9 +107,9 @@ class Scene:
         """Pixels ``(H, W)`` that see a face from below, past the rim of the massif: there is no such place on Earth."""
         from seasonscapes.cameras.pinhole import ray_directions
         from seasonscapes.rendering.gbuffer import trace_gbuffer
-        from seasonscapes.rendering.scene import RenderScene
+        from seasonscapes.rendering.mitsuba_scene import RenderScene
 
-        seen = trace_gbuffer(RenderScene(self.occluder.mi_scene, self.mesh, None, 0.0), camera)
+        seen = trace_gbuffer(RenderScene(self.ray_scene.mi_scene, self.mesh, None, 0.0), camera)
         return np.nansum(seen.normal * ray_directions(camera), axis=-1) > 0.0
 
     def lights(self, count: int, *, day: float | None = None):
@@ -135,18 +135,18 @@ class Scene:
 
 @dataclass(frozen=True)
 class Truth:
-    """What a camera sees at T times: ``pictures (T, H, W, 3)`` in `Lessons`' unit, ``solid (H, W)`` all-terrain pixels."""
+    """What a camera sees at T times: ``pictures (T, H, W, 3)`` in `SurfaceTargets`' unit, ``solid (H, W)`` all-terrain pixels."""
 
     pictures: np.ndarray
     solid: np.ndarray
 
 
 def truth_of(scene: Scene, terrain, camera, lights, states, *, seed: int = 3) -> Truth:
-    from seasonscapes.rendering.relit_view import ready_view, relight_view
-    from seasonscapes.rendering.transport import Effort, trace_view
+    from seasonscapes.rendering.relit_view import relight_view, relightable_view
+    from seasonscapes.rendering.transport import SamplingOptions, trace_view
 
-    view = trace_view(terrain, camera, Effort(rays=256), seed=seed)
-    ready = ready_view(terrain, view)
+    view = trace_view(terrain, camera, SamplingOptions(rays=256), seed=seed)
+    ready = relightable_view(terrain, view)
     import cv2
 
     below = cv2.dilate(scene.underside(camera).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
@@ -161,7 +161,7 @@ def truth_of(scene: Scene, terrain, camera, lights, states, *, seed: int = 3) ->
 def shadow_truth(scene: Scene, terrain, gbuffer, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Which pixel centres see the sun, and which face it ``(H, W)``."""
     from seasonscapes.rendering.gbuffer import occluded
-    from seasonscapes.rendering.scene import RenderScene
+    from seasonscapes.rendering.mitsuba_scene import RenderScene
 
     facing = np.nan_to_num(gbuffer.normal @ direction, nan=-1.0) > 0.0
     bare = RenderScene(terrain.mi_scene, scene.mesh, None, 0.0)
@@ -181,11 +181,16 @@ class Contest:
     """Discs, lessons, frames and truth, and what each contestant makes of them."""
 
     def __init__(self, scene: Scene, seed: int, *, learn: bool = True):
-        from seasonscapes.gaussians.distil import Frame, lessons_from
+        from seasonscapes.gaussians.disc_transport import (
+            light_state,
+            neighbourhood_mean,
+            surfel_irradiance,
+            trace_disc_transport,
+        )
         from seasonscapes.gaussians.rasterise import view_weights
         from seasonscapes.gaussians.surfels import surfel_albedo, terrain_surfels
-        from seasonscapes.gaussians.transport import light_state, neighbourhood_mean, surfel_irradiance, trace_transport
-        from seasonscapes.gaussians.views import facing
+        from seasonscapes.gaussians.training import TrainingFrame, surface_targets
+        from seasonscapes.gaussians.training_views import facing
 
         sizes, self.scene, self.seed = scene.sizes, scene, seed
         self.seconds: dict[str, float] = {}
@@ -193,7 +198,7 @@ class Contest:
         self.surfels = terrain_surfels(scene.terrain, scene.spacing_m)
         self.albedo = surfel_albedo(self.surfels, scene.albedo(SUMMER_DAY))
         self.around = neighbourhood_mean(self.surfels.means, self.albedo, self.surfels.plan.spacing_m)
-        self.transport = trace_transport(scene.occluder, self.surfels, self.albedo, rays=64, seed=seed)
+        self.transport = trace_disc_transport(scene.ray_scene, self.surfels, self.albedo, rays=64, seed=seed)
         self.seconds["transport"] = time.perf_counter() - start
         self.lights, days = scene.lights(sizes.suns + sizes.held_out)
         self.states = [light_state(self.transport, light, day) for light, day in zip(self.lights, days, strict=True)]
@@ -204,14 +209,14 @@ class Contest:
         if not learn:
             return
         start = time.perf_counter()
-        received = surfel_irradiance(scene.occluder, self.surfels, self.lights[: self.suns], rays=128, seed=seed)
-        self.lessons = lessons_from(self.states[: self.suns], [0] * self.suns, self.albedo[None], received)
+        received = surfel_irradiance(scene.ray_scene, self.surfels, self.lights[: self.suns], rays=128, seed=seed)
+        self.targets = surface_targets(self.states[: self.suns], [0] * self.suns, self.albedo[None], received)
         self.seconds["lessons"] = time.perf_counter() - start
         start = time.perf_counter()
-        self.truth = [truth_of(scene, scene.occluder, camera, self.lights, self.states) for camera in scene.cameras]
+        self.truth = [truth_of(scene, scene.ray_scene, camera, self.lights, self.states) for camera in scene.cameras]
         self.seconds["views"] = time.perf_counter() - start
         self.frames = [
-            Frame(self.weights[v], t, self.truth[v].pictures[t], self.truth[v].solid)
+            TrainingFrame(self.weights[v], t, self.truth[v].pictures[t], self.truth[v].solid)
             for v in range(3)
             for t in range(self.suns)
         ]
@@ -231,13 +236,11 @@ class Contest:
         )
 
     def trained(self, kind: str):
-        from seasonscapes.gaussians.distil import Schedule, distil
+        from seasonscapes.gaussians.training import Schedule, train
 
         sizes, appearance = self.scene.sizes, self.appearance(kind)
         start = time.perf_counter()
-        distil(
-            appearance, self.lessons, self.frames, Schedule(sizes.surface_steps, sizes.picture_steps), seed=self.seed
-        )
+        train(appearance, self.targets, self.frames, Schedule(sizes.surface_steps, sizes.picture_steps), seed=self.seed)
         self.seconds[kind] = time.perf_counter() - start
         return appearance
 
@@ -262,7 +265,7 @@ class Contest:
     def score_code(self, appearance) -> tuple[float, float]:
         """Free codes fitted to the left half, judged on the right; as many pictures as `Sizes.code_fits` says."""
         from seasonscapes.gaussians.appearance import light_tensors
-        from seasonscapes.gaussians.distil import Frame, fit_code
+        from seasonscapes.gaussians.training import TrainingFrame, fit_code
 
         lights, table = light_tensors(self.states), []
         import torch
@@ -272,7 +275,7 @@ class Contest:
             for v in (0, 3):
                 truth = self.truth[v]
                 left = np.arange(truth.solid.shape[1])[None, :] < truth.solid.shape[1] // 2
-                frame = Frame(self.weights[v], t, truth.pictures[t], truth.solid & left)
+                frame = TrainingFrame(self.weights[v], t, truth.pictures[t], truth.solid & left)
                 code = fit_code(appearance, lights, frame, seed=self.seed)
                 with torch.no_grad():
                     colours = appearance(torch.arange(len(self.albedo)), torch.tensor(t), lights, code).numpy()
@@ -309,17 +312,17 @@ class Contest:
         import torch
 
         from seasonscapes.rendering.gbuffer import trace_gbuffer
-        from seasonscapes.rendering.scene import RenderScene
+        from seasonscapes.rendering.mitsuba_scene import RenderScene
 
         scene, both, either = self.scene, 0, 0
-        bare = RenderScene(scene.occluder.mi_scene, scene.mesh, None, 0.0)
+        bare = RenderScene(scene.ray_scene.mi_scene, scene.mesh, None, 0.0)
         seen_by = [(trace_gbuffer(bare, camera), ~scene.underside(camera)) for camera in scene.cameras]
         for t in self.held_out:
             direction = torch.as_tensor(self.states[t].bodies[0][0])
             with torch.no_grad():
                 seen = appearance.visibility(torch.arange(len(self.albedo)), direction).numpy()
             for v, (gbuffer, above) in enumerate(seen_by):
-                sunny, facing = shadow_truth(scene, scene.occluder, gbuffer, self.states[t].bodies[0][0])
+                sunny, facing = shadow_truth(scene, scene.ray_scene, gbuffer, self.states[t].bodies[0][0])
                 asked = facing & above & (self.weights[v].coverage > 0.5)
                 dark, true = (self.picture(v, seen[:, None])[..., 0] < 0.5)[asked], ~sunny[asked]
                 both, either = both + int(np.sum(dark & true)), either + int(np.sum(dark | true))
@@ -332,21 +335,21 @@ def seasons(contest: Contest, appearance) -> dict[str, float]:
 
     from seasonscapes.albedo.seasons import albedo_at
     from seasonscapes.gaussians.appearance import colours_at
+    from seasonscapes.gaussians.disc_transport import light_state, neighbourhood_mean
     from seasonscapes.gaussians.surfels import surfel_albedo
-    from seasonscapes.gaussians.transport import light_state, neighbourhood_mean
-    from seasonscapes.rendering.gather import occluder
-    from seasonscapes.rendering.scene import mi_mesh
-    from seasonscapes.terrain.ground import ground_at
+    from seasonscapes.rendering.hemisphere_rays import ray_scene
+    from seasonscapes.rendering.mitsuba_scene import mi_mesh
+    from seasonscapes.terrain.attributes import attributes_at
 
     scene, surfels = contest.scene, contest.surfels
     true = {day: scene.albedo(day) for day in SPRING_DAYS}
     dated = np.stack([surfel_albedo(surfels, true[day]) for day in (SPRING_DAYS[0], SPRING_DAYS[2])])
-    ground = ground_at(surfels.means, surfels.normals, surfels.plan.spacing_m)
+    ground = attributes_at(surfels.means, surfels.normals, surfels.plan.spacing_m)
     result, held = {}, (appearance.albedo, appearance.around)
     for number, day in enumerate(SPRING_DAYS):
         lights, _ = scene.lights(3, day=day)
         states = [light_state(contest.transport, light, day) for light in lights]
-        truth = truth_of(scene, occluder(mi_mesh(scene.terrain, true[day])), scene.cameras[0], lights, states)
+        truth = truth_of(scene, ray_scene(mi_mesh(scene.terrain, true[day])), scene.cameras[0], lights, states)
         guesses = {"": albedo_at(dated, (SPRING_DAYS[0], SPRING_DAYS[2]), day, ground)}
         if number == 1:
             guesses["_mean"] = dated.mean(axis=0)
@@ -372,18 +375,18 @@ def speed(contest: Contest, appearance) -> dict[str, float]:
 
     from seasonscapes.gaussians.appearance import colours_at
     from seasonscapes.gaussians.rasterise import rotations, splat_colours, view_weights
-    from seasonscapes.gaussians.render import CUTS
-    from seasonscapes.gaussians.views import facing
+    from seasonscapes.gaussians.splat_view import CUTS
+    from seasonscapes.gaussians.training_views import facing
+    from seasonscapes.rendering.mitsuba_scene import relight
     from seasonscapes.rendering.radiance import path_trace
-    from seasonscapes.rendering.scene import relight
-    from seasonscapes.rendering.splatting import finer_camera, ready_splats, splat_layers
+    from seasonscapes.rendering.splatting import finer_camera, splat_layers, upload_splats
 
     scene, surfels, t = contest.scene, contest.surfels, contest.held_out[0]
     camera = finer_camera(scene.cameras[0], scene.sizes.speed_px // scene.cameras[0].width_px)
     splats = facing(surfels, camera)
     axes = rotations(splats.quaternions) * splats.log_scales.exp()[:, None, :]
     opacity = 1.0 / (1.0 + np.exp(-surfels.opacity_logits))
-    ready = ready_splats(surfels.means, axes.numpy(), opacity)
+    ready = upload_splats(surfels.means, axes.numpy(), opacity)
     colours = colours_at(appearance, contest.states[t])
     moving = best(lambda: splat_layers(ready, colours, camera, CUTS))
     in_torch = best(lambda: splat_colours(view_weights(splats, camera), colours))
@@ -396,7 +399,7 @@ def speed(contest: Contest, appearance) -> dict[str, float]:
     side = camera.width_px * 3 // 8
     edge = (camera.width_px - side) // 2
     middle = replace(camera, width_px=side, height_px=side, cx=camera.cx - edge, cy=camera.cy - edge)
-    truth = truth_of(scene, scene.occluder, middle, [contest.lights[t]], [contest.states[t]])
+    truth = truth_of(scene, scene.ray_scene, middle, [contest.lights[t]], [contest.states[t]])
     part = slice(edge, edge + side)
     scale, spp = np.pi / contest.states[t].global_lx, 8
     path_trace(lit, camera, spp=spp)
@@ -461,7 +464,7 @@ def contact_sheet(contest: Contest, appearance, path: str) -> None:
 def packed_scores(contest: Contest, appearance) -> dict[str, float]:
     """Bytes for each Gaussian on disk, and what packing costs in PSNR."""
     from seasonscapes.gaussians.model import bytes_each, model_from, packed, unpacked
-    from seasonscapes.gaussians.render import appearance_of, learned_numbers
+    from seasonscapes.gaussians.splat_view import appearance_of, learned_numbers
 
     model = model_from(
         contest.surfels,

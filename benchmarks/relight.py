@@ -85,13 +85,13 @@ def rel_rmse(image: np.ndarray, reference: np.ndarray, mask: np.ndarray) -> floa
 
 def coefficients_of(scene, camera, seed: int):
     """Our view, ready, and what making it took."""
-    from seasonscapes.rendering.gather import occluder
-    from seasonscapes.rendering.relit_view import ready_view
-    from seasonscapes.rendering.transport import Effort, trace_view
+    from seasonscapes.rendering.hemisphere_rays import ray_scene
+    from seasonscapes.rendering.relit_view import relightable_view
+    from seasonscapes.rendering.transport import SamplingOptions, trace_view
 
     start, start_cpu = time.perf_counter(), time.process_time()
-    terrain = occluder(scene.mi_terrain)
-    ready = ready_view(terrain, trace_view(terrain, camera, Effort(), seed=seed))
+    terrain = ray_scene(scene.mi_terrain)
+    ready = relightable_view(terrain, trace_view(terrain, camera, SamplingOptions(), seed=seed))
     return terrain, ready, {"seconds": time.perf_counter() - start, "cpu_seconds": time.process_time() - start_cpu}
 
 
@@ -251,9 +251,9 @@ def visibility_agreement(seed: int, count: int) -> dict[str, float]:
     """Share of places and suns on which our shadow rays and the march agree, away from shadow edges."""
     from seasonscapes.frames import direction_from_angles, enu_from_geodetic
     from seasonscapes.pipeline import MeshOptions, find_scene, load_place
-    from seasonscapes.rendering.gather import occluder
+    from seasonscapes.rendering.hemisphere_rays import ray_scene
     from seasonscapes.rendering.irradiance import surface_at
-    from seasonscapes.rendering.scene import mi_mesh
+    from seasonscapes.rendering.mitsuba_scene import mi_mesh
     from seasonscapes.rendering.sun_visibility import cosine_seen, numbered_turn, sun_rays
     from seasonscapes.sky.illumination import Luminary
     from seasonscapes.terrain.raster import geodetic_from_map
@@ -267,7 +267,7 @@ def visibility_agreement(seed: int, count: int) -> dict[str, float]:
     x, y = place.elevation.transform * (column + 0.5, row + 0.5)
     latitude, longitude = geodetic_from_map(place.elevation.crs, x, y)
     ground = enu_from_geodetic(place.frame, latitude, longitude, place.elevation.values[row, column, 0])
-    terrain = occluder(mi_mesh(place.terrain, np.full(3, 0.3)))
+    terrain = ray_scene(mi_mesh(place.terrain, np.full(3, 0.3)))
     points, found = surface_at(terrain, ground, search_m=5.0)
     march, agree, clear = SunMarch(place), 0, 0
     for _ in range(8):
@@ -369,7 +369,7 @@ sys.path.insert(0, {here!r})
 import numpy as np, tempfile
 from pathlib import Path
 import render as arena
-from seasonscapes.rendering.gather import occluder
+from seasonscapes.rendering.hemisphere_rays import occluder
 from seasonscapes.rendering.relit_view import ready_view, relight_view
 from seasonscapes.rendering.transport import Effort, trace_view
 scene, camera, facts = arena.make_scene({seed}, Path(tempfile.mkdtemp()), width_px=1536, threads=2)

@@ -48,7 +48,7 @@ def make_scene(seed: int, folder: Path, *, width_px: int, threads: int):
     from seasonscapes.cameras.pinhole import camera_at
     from seasonscapes.frames import LocalFrame, direction_from_angles
     from seasonscapes.rendering.hosek import hosek_illumination
-    from seasonscapes.rendering.scene import build_scene
+    from seasonscapes.rendering.mitsuba_scene import build_scene
     from seasonscapes.terrain.imagery import bake_imagery
     from seasonscapes.terrain.mesh import build_mesh
     from seasonscapes.terrain.surface import Raster
@@ -96,7 +96,7 @@ def write_files(folder: Path, facts: dict, scene, terrain, albedo: np.ndarray) -
     import mitsuba as mi
 
     from seasonscapes.images import write_exr
-    from seasonscapes.rendering.scene import mi_luminary
+    from seasonscapes.rendering.mitsuba_scene import mi_luminary
 
     scene.mi_terrain.write_ply(str(folder / "terrain.ply"))
     sun = mi_luminary(scene.illumination.sun)

@@ -42,8 +42,8 @@ from atmosphere_cases import (
 )
 
 from seasonscapes.frames import direction_from_angles
-from seasonscapes.sky.air import Atmosphere
-from seasonscapes.sky.atmosphere import atmosphere_tables, illumination_from_atmosphere, sky_radiance_map
+from seasonscapes.sky.atmosphere import Atmosphere
+from seasonscapes.sky.clear_sky import atmosphere_tables, illumination_from_atmosphere, sky_radiance_map
 from seasonscapes.sky.illumination import luminance
 
 try:
@@ -271,7 +271,7 @@ PARTS: dict[str, Callable[[bool, int], dict[str, float]]] = {
 def plot_domes(folder: Path) -> None:
     """Fish-eye pictures of the sky from noon to deep twilight, north on top and the sun in the south."""
     from seasonscapes.images import auto_exposure_ev100, expose, tone_curve, write_png
-    from seasonscapes.sky.seen import observer_view, seen_sky, sky_radiance
+    from seasonscapes.sky.observer_radiance import observed_sky, observer_view, sky_radiance
 
     across = (np.arange(480) + 0.5) / 240.0 - 1.0
     east, north = np.meshgrid(across, -across)
@@ -281,7 +281,7 @@ def plot_domes(folder: Path) -> None:
     for elevation in (60.0, 10.0, 0.0, -4.0, -8.0):
         sun = direction_from_angles(180.0, elevation)
         view = observer_view(tables_of(), 500.0)
-        sky = sky_radiance(seen_sky(tables_of(), view, sun, np.radians(elevation), np.ones(9)), direction)
+        sky = sky_radiance(observed_sky(tables_of(), view, sun, np.radians(elevation), np.ones(9)), direction)
         inside = radius < 1.0
         picture = tone_curve(expose(sky.astype(np.float32), auto_exposure_ev100(sky, inside)))
         pictures.append(np.where(inside[..., None], picture, 0.0))

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from seasonscapes.sky.atmosphere import AtmosphereTables
+from seasonscapes.sky.clear_sky import AtmosphereTables
 from seasonscapes.sky.ephemeris import LunarPosition, SolarPosition, refraction_deg
 from seasonscapes.sky.illuminate import illuminate, tables_in_memory
 from seasonscapes.sky.illumination import global_horizontal_illuminance, luminance

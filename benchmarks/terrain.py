@@ -193,8 +193,8 @@ def _render_record(terrain, frame) -> dict:
     from seasonscapes.cameras.pinhole import camera_at
     from seasonscapes.frames import direction_from_angles
     from seasonscapes.rendering.backend import use_backend
+    from seasonscapes.rendering.mitsuba_scene import build_scene
     from seasonscapes.rendering.radiance import path_trace
-    from seasonscapes.rendering.scene import build_scene
     from seasonscapes.sky.illumination import Illumination, Luminary
 
     device = use_backend().device

@@ -24,18 +24,18 @@ import texturing_places as places
 import texturing_rivals as rivals
 
 from seasonscapes.terrain.surface import Texture, sample_texture
-from seasonscapes.texturing.complete import Completed, complete
-from seasonscapes.texturing.guides import Guides, stack_guides
-from seasonscapes.texturing.land import land_layers
+from seasonscapes.texturing.completion import Completed, complete
+from seasonscapes.texturing.predictors import Predictors, stack_predictors
+from seasonscapes.texturing.terrain_features import terrain_features
 
 SEASONS = {"winter": (32, 11.0), "autumn": (288, 14.0), "spring": (135, 8.0)}
 
 
-def completed(bed: places.Testbed, guides: Guides | None = None, **options) -> tuple[Completed, float]:
+def completed(bed: places.Testbed, predictors: Predictors | None = None, **options) -> tuple[Completed, float]:
     """The product's own completion and its processor time [s]."""
     texture = Texture(np.where(bed.seen[..., None], bed.truth, np.nan).astype(np.float32), bed.seen.astype(np.float32))
     start = time.process_time()
-    result = complete(texture, guides or bed.guides, **options)
+    result = complete(texture, predictors or bed.predictors, **options)
     seconds = time.process_time() - start
     if not np.array_equal(result.values[bed.seen], bed.truth[bed.seen]):
         raise AssertionError("painted texels have changed")
@@ -45,7 +45,7 @@ def completed(bed: places.Testbed, guides: Guides | None = None, **options) -> t
 def judge(bed: places.Testbed, figures: Path | None) -> dict[str, float]:
     """Guided completion and every rival on one testbed."""
     truth = bed.shown(bed.truth)
-    hole = bed.guides.surface & ~bed.seen
+    hole = bed.predictors.surface & ~bed.seen
     result, _ = completed(bed)
     fast, _ = completed(bed, fast=True)
     grainy, _ = completed(bed, detail=0.6)
@@ -56,7 +56,7 @@ def judge(bed: places.Testbed, figures: Path | None) -> dict[str, float]:
     pictures |= {"guided_fast": bed.shown(fast.values), "guided_grain": bed.shown(grainy.values)}
     pictures["guided"] = bed.shown(result.values)
     # Where no land lies nobody is judged, and nothing bleeds in from there.
-    pictures = {name: np.where(bed.guides.surface[..., None], p, truth) for name, p in pictures.items()}
+    pictures = {name: np.where(bed.predictors.surface[..., None], p, truth) for name, p in pictures.items()}
     score = {name: rivals.psnr(p, truth, hole) for name, p in pictures.items()}
     likeness = {name: rivals.ssim(p, truth, hole) for name, p in pictures.items()}
     quartiles = rivals.sigma_quartiles(result.values, result.sigma, bed.truth, hole)
@@ -65,7 +65,7 @@ def judge(bed: places.Testbed, figures: Path | None) -> dict[str, float]:
         + " ".join(f"{q:.2f}" for q in quartiles)
     )
     for name, value in sorted(score.items(), key=lambda item: item[1]):
-        seam = rivals.seam_excess(pictures[name], truth, bed.seen, bed.guides.surface)
+        seam = rivals.seam_excess(pictures[name], truth, bed.seen, bed.predictors.surface)
         print(f"  {name:14s} {value:6.2f} dB   SSIM {likeness[name]:.3f}   seam {seam:+6.2f}")
     numbers = {
         "psnr_db": score["guided"],
@@ -75,7 +75,7 @@ def judge(bed: places.Testbed, figures: Path | None) -> dict[str, float]:
         "gain_over_best_membrane_db": score["guided"] - max(score[n] for n in rivals.MEMBRANES),
         "gain_over_best_transfer_db": score["guided"] - max(score[n] for n in rivals.TRANSFERS),
         "ssim_over_telea": likeness["guided"] / likeness["telea"],
-        "seam_excess_levels": rivals.seam_excess(pictures["guided"], truth, bed.seen, bed.guides.surface),
+        "seam_excess_levels": rivals.seam_excess(pictures["guided"], truth, bed.seen, bed.predictors.surface),
         "sigma_quartile_low": min(quartiles),
         "sigma_quartile_high": max(quartiles),
         "sigma_quartiles_within_30pc": float(np.mean([1 / 1.3 <= q <= 1.3 for q in quartiles])),
@@ -98,38 +98,38 @@ def save_figure(path: Path, truth, seen, pictures, result) -> None:
 
 def controls(bed: places.Testbed) -> dict[str, float]:
     """By how much the score falls when a guide lies [dB]: permuted texels, and the sun of another season's hour."""
-    truth, hole = bed.shown(bed.truth), bed.guides.surface & ~bed.seen
+    truth, hole = bed.shown(bed.truth), bed.predictors.surface & ~bed.seen
 
-    def score(guides):
-        return rivals.psnr(bed.shown(completed(bed, guides)[0].values), truth, hole)
+    def score(predictors):
+        return rivals.psnr(bed.shown(completed(bed, predictors)[0].values), truth, hole)
 
-    honest = score(bed.guides)
+    honest = score(bed.predictors)
     order = np.random.default_rng(0).permutation(bed.seen.size)
-    flat = bed.guides.values.reshape(-1, len(bed.guides.names))
-    permuted = replace(bed.guides, values=flat[order].reshape(bed.guides.values.shape))
+    flat = bed.predictors.values.reshape(-1, len(bed.predictors.names))
+    permuted = replace(bed.predictors, values=flat[order].reshape(bed.predictors.values.shape))
     # A summer morning's sun: high, and on the other side.
     wrong = np.array([-bed.sun[0], bed.sun[1], 0.0])
     wrong = np.append(wrong[:2] / np.linalg.norm(wrong[:2]) * np.cos(np.radians(60.0)), np.sin(np.radians(60.0)))
     day = [wrong]
-    layers = land_layers(bed.heights, bed.spacing_m, sun_direction=wrong, day_suns=day)
-    values = {name: bed.guides.values[..., i] for i, name in enumerate(bed.guides.names)}
+    layers = terrain_features(bed.heights, bed.spacing_m, sun_direction=wrong, day_suns=day)
+    values = {name: bed.predictors.values[..., i] for i, name in enumerate(bed.predictors.names)}
     # What is left may not tell the aspect, or trees find the true sun for themselves.
     values |= {name: layers[name] for name in layers if name in values and ("sun" in name or name == "insolation")}
     values = {name: layer for name, layer in values.items() if not name.startswith("facing")}
-    right = {name: bed.guides.values[..., i] for i, name in enumerate(bed.guides.names) if name in values}
+    right = {name: bed.predictors.values[..., i] for i, name in enumerate(bed.predictors.names) if name in values}
     return {
         "control_permuted_drop_db": honest - score(permuted),
-        "control_wrong_sun_drop_db": score(stack_guides(right, surface=bed.guides.surface))
-        - score(stack_guides(values, surface=bed.guides.surface)),
+        "control_wrong_sun_drop_db": score(stack_predictors(right, surface=bed.predictors.surface))
+        - score(stack_predictors(values, surface=bed.predictors.surface)),
     }
 
 
 def held_out_view(bed: places.Testbed, figures: Path | None) -> dict[str, float]:
     """Pixels of a camera that painted nothing, where no other camera saw the land either."""
     from seasonscapes.cameras.pinhole import Camera, rotation_from_angles
-    from seasonscapes.rendering.gather import occluder
     from seasonscapes.rendering.gbuffer import trace_gbuffer
-    from seasonscapes.rendering.scene import mi_mesh
+    from seasonscapes.rendering.hemisphere_rays import ray_scene
+    from seasonscapes.rendering.mitsuba_scene import mi_mesh
 
     (column, row, height), heading = bed.held_out
     low = bed.terrain.vertices[:, :2].min(axis=0)
@@ -141,7 +141,7 @@ def held_out_view(bed: places.Testbed, figures: Path | None) -> dict[str, float]
         height,
     ]
     camera = Camera(768, 512, 500.0, 500.0, 384.0, 256.0, pose)
-    gbuffer = trace_gbuffer(occluder(mi_mesh(bed.terrain, np.full(3, 0.2))), camera)
+    gbuffer = trace_gbuffer(ray_scene(mi_mesh(bed.terrain, np.full(3, 0.2))), camera)
     seen = np.nan_to_num(sample_texture(bed.seen[..., None].astype(np.float32), gbuffer.uv)[..., 0], nan=1.0)
     unseen = seen < 0.5
     shown = bed.shown(bed.truth)
@@ -169,13 +169,13 @@ def cost(bed: places.Testbed, side: int = 1440) -> dict[str, float]:
     def larger(values):
         return cv2.resize(np.nan_to_num(values).astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
 
-    table = np.stack([larger(layer) for layer in np.moveaxis(bed.guides.values, -1, 0)], -1)
+    table = np.stack([larger(layer) for layer in np.moveaxis(bed.predictors.values, -1, 0)], -1)
     seen = cv2.resize(bed.seen.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
     big = replace(
         bed,
         truth=np.maximum(larger(bed.truth), 0.0),
         seen=seen,
-        guides=Guides(table, bed.guides.names, np.ones(seen.shape, bool)),
+        predictors=Predictors(table, bed.predictors.names, np.ones(seen.shape, bool)),
     )
     hidden = float((~seen).sum()) / 1e6
     return {
@@ -191,7 +191,7 @@ def finse(data: Path, seed: int, figures: Path | None, quick: bool) -> dict[str,
         found = judge(bed, figures)
         alone = places.without_image(bed)
         relief = rivals.psnr(
-            bed.shown(completed(alone)[0].values), bed.shown(bed.truth), bed.guides.surface & ~bed.seen
+            bed.shown(completed(alone)[0].values), bed.shown(bed.truth), bed.predictors.surface & ~bed.seen
         )
         print(f"  {'relief alone':14s} {relief:6.2f} dB")
         numbers |= {

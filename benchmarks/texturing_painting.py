@@ -25,26 +25,26 @@ sys.path.append(str(HERE.parent / "tests"))
 from albedo_scene import Truth, hours, lights_for, make_truth, terrain_and_albedo  # noqa: E402
 from oracles_visibility import BinnedTriangles  # noqa: E402
 
-from seasonscapes.evaluation.synthetic_webcams import Hour, SyntheticPicture, webcam_series  # noqa: E402
+from seasonscapes.evaluation.synthetic_webcams import SyntheticPicture, WebcamInstant, webcam_series  # noqa: E402
 from seasonscapes.evaluation.webcam_faults import TYPICAL, PoseSigmas, add_foreground, degrade, perturb_pose  # noqa: E402
 from seasonscapes.images import expose, linear_from_srgb, srgb_from_linear  # noqa: E402
-from seasonscapes.rendering.gather import Occluder, occluder  # noqa: E402
 from seasonscapes.rendering.gbuffer import trace_gbuffer  # noqa: E402
+from seasonscapes.rendering.hemisphere_rays import RayScene, ray_scene  # noqa: E402
 from seasonscapes.rendering.irradiance import irradiance_blocks  # noqa: E402
-from seasonscapes.rendering.scene import RenderScene, mi_mesh  # noqa: E402
-from seasonscapes.rendering.transport import Effort  # noqa: E402
+from seasonscapes.rendering.mitsuba_scene import RenderScene, mi_mesh  # noqa: E402
+from seasonscapes.rendering.transport import SamplingOptions  # noqa: E402
 from seasonscapes.sky.models import read_sky_model, with_overrides  # noqa: E402
 from seasonscapes.terrain.atlas import measure_atlas  # noqa: E402
 from seasonscapes.terrain.surface import Texture, sample_texture  # noqa: E402
+from seasonscapes.texturing.atlas_tiles import AtlasTile, tile_surface, tiling  # noqa: E402
 from seasonscapes.texturing.foreground import foreground_mask, predict_in_folds  # noqa: E402
-from seasonscapes.texturing.guides import guides_for  # noqa: E402
-from seasonscapes.texturing.paint import PaintOptions, paint  # noqa: E402
-from seasonscapes.texturing.shots import Shot, ready_shot  # noqa: E402
-from seasonscapes.texturing.tiles import Tile, tile_surface, tiling  # noqa: E402
-from seasonscapes.texturing.visibility import by_depth, by_faces, by_ray, sight_of  # noqa: E402
+from seasonscapes.texturing.inputs import PaintingInput, prepare_input  # noqa: E402
+from seasonscapes.texturing.painting import PaintOptions, paint_atlas  # noqa: E402
+from seasonscapes.texturing.predictors import predictors_for  # noqa: E402
+from seasonscapes.texturing.visibility import by_depth, by_faces, by_ray, project_texels  # noqa: E402
 from seasonscapes.workspace import default_workspace  # noqa: E402
 
-EFFORT = Effort(subpixels=4, shades=16, rays=64, senders=1024, listed=32, rank=24)
+EFFORT = SamplingOptions(subpixels=4, shades=16, rays=64, clusters=1024, listed=32, rank=24)
 SKY_KM = 60.0
 
 
@@ -54,7 +54,7 @@ class Stage:
 
     truth: Truth
     atlas: object
-    terrain: Occluder
+    terrain: RayScene
     lights: list
     texel_m: float
     pictures: list[SyntheticPicture]
@@ -81,16 +81,16 @@ def make_stage(seed: int, *, quick: bool) -> Stage:
             truth.terrain,
             f"webcam-{n}",
             camera,
-            [Hour(when[0], light, truth.albedo)],
+            [WebcamInstant(when[0], light, truth.albedo)],
             faults=TYPICAL,
-            effort=EFFORT,
+            sampling=EFFORT,
             seed=seed,
         )[0]
         for n, (camera, light) in enumerate(zip(truth.cameras, lights, strict=True))
     ]
     height, width = truth.shape
     atlas = measure_atlas(truth.terrain, "planar", width, height)
-    return Stage(truth, atlas, occluder(mi_mesh(truth.terrain, truth.albedo)), lights, texel_m, pictures)
+    return Stage(truth, atlas, ray_scene(mi_mesh(truth.terrain, truth.albedo)), lights, texel_m, pictures)
 
 
 def with_foreground(stage: Stage, seed: int) -> Stage:
@@ -111,10 +111,10 @@ def with_foreground(stage: Stage, seed: int) -> Stage:
     return replace(stage, pictures=pictures)
 
 
-def shots_of(stage: Stage, **changes) -> list[Shot]:
+def shots_of(stage: Stage, **changes) -> list[PaintingInput]:
     """The stage's pictures as painting takes them."""
     return [
-        Shot(replace(picture.observation, **changes), light.aerial_perspective)
+        PaintingInput(replace(picture.observation, **changes), light.aerial_perspective)
         for picture, light in zip(stage.pictures, stage.lights, strict=True)
     ]
 
@@ -133,9 +133,9 @@ def land_truth(stage: Stage, texel: np.ndarray, *, seed: int) -> np.ndarray:
     return radiance
 
 
-def whole(stage: Stage) -> Tile:
+def whole(stage: Stage) -> AtlasTile:
     """The atlas as one tile."""
-    return Tile(0, 0, stage.atlas.height_px, stage.atlas.width_px)
+    return AtlasTile(0, 0, stage.atlas.height_px, stage.atlas.width_px)
 
 
 def decibels(got: np.ndarray, truth: np.ndarray) -> float:
@@ -154,7 +154,7 @@ def visibility(stage: Stage, *, seed: int, rays: int) -> dict:
     scene = RenderScene(stage.terrain.mi_scene, stage.terrain.mi_terrain, None, 0.0)
     truth, grazing, found, seconds, count = [], [], {}, 0.0, 0
     for camera in stage.truth.cameras:
-        sight = sight_of(camera, surface)
+        sight = project_texels(camera, surface)
         inside = np.flatnonzero(sight.inside)
         # Half of the sample are grazing texels, which are the hard ones.
         flat = inside[sight.cosine[inside] < 0.2]
@@ -173,7 +173,7 @@ def visibility(stage: Stage, *, seed: int, rays: int) -> dict:
         for name, value in modes.items():
             found.setdefault(name, []).append(value)
         start = time.process_time()
-        by_ray(stage.terrain, camera, surface, sight_of(camera, surface))
+        by_ray(stage.terrain, camera, surface, project_texels(camera, surface))
         seconds, count = seconds + time.process_time() - start, count + len(surface.texel)
     truth, grazing = np.concatenate(truth), np.concatenate(grazing)
     numbers = {"visibility_mtexel_per_cpu_s": count / 1e6 / seconds, "visibility_samples": len(truth)}
@@ -187,11 +187,11 @@ def visibility(stage: Stage, *, seed: int, rays: int) -> dict:
     return numbers
 
 
-def harmony(stage: Stage, *, seed: int, texels: int = 20_000) -> dict:
+def radiometry(stage: Stage, *, seed: int, texels: int = 20_000) -> dict:
     """Painted texels against the truth: one gain for all, gains, gains and haze; and the paper's first-come order."""
-    shots, terrain, rng = shots_of(stage), stage.truth.terrain, np.random.default_rng(seed)
+    inputs, terrain, rng = shots_of(stage), stage.truth.terrain, np.random.default_rng(seed)
     numbers, sample, truth = {}, None, None
-    raw = [replace(shot, air=None) for shot in shots]
+    raw = [replace(item, air=None) for item in inputs]
     kinds = {
         "plain": PaintOptions(fit_gains=False),
         "harmonised": PaintOptions(),
@@ -200,7 +200,7 @@ def harmony(stage: Stage, *, seed: int, texels: int = 20_000) -> dict:
     }
     for name, options in kinds.items():
         start = time.process_time()
-        painting = paint(raw if name == "plain" else shots, terrain, stage.atlas, stage.terrain, options=options)
+        painting = paint_atlas(raw if name == "plain" else inputs, terrain, stage.atlas, stage.terrain, options=options)
         seconds = time.process_time() - start
         if sample is None:
             painted = np.flatnonzero(painting.texture.weight.ravel() > 0.0)
@@ -213,7 +213,7 @@ def harmony(stage: Stage, *, seed: int, texels: int = 20_000) -> dict:
         level = np.exp(np.median(np.log(got[there] / truth[there]), axis=0))
         numbers[f"painted_{name}_db"] = decibels(got[there] / level, truth[there])
         if name == "harmonised":
-            said = painting.harmony
+            said = painting.radiometry
             gains = np.array([p.development.gains for p in stage.pictures])
             error = said.log_gain - np.log(gains)
             numbers |= {
@@ -222,7 +222,7 @@ def harmony(stage: Stage, *, seed: int, texels: int = 20_000) -> dict:
                 "gain_error": float(np.std(error - error.mean(axis=0))),
                 "gain_bias": float(error.mean()),
                 "scatter_after": said.scatter_after,
-                "painting_mtexel_camera_per_cpu_s": painting.best.size * len(shots) / 1e6 / seconds,
+                "painting_mtexel_camera_per_cpu_s": painting.best.size * len(inputs) / 1e6 / seconds,
             }
     numbers["harmonising_gain_db"] = numbers["painted_harmonised_db"] - numbers["painted_plain_db"]
     return numbers
@@ -234,14 +234,17 @@ def reprojection(stage: Stage) -> dict:
     for picture in stage.pictures[:3]:
         gain = 0.25 / float(np.percentile(picture.surface, 99.0))
         image = np.clip(picture.surface * gain, 0.0, 1.0).astype(np.float32)
-        shot = Shot(replace(picture.observation, image=image, camera=picture.camera))
-        painting = paint([shot], stage.truth.terrain, stage.atlas, stage.terrain, options=PaintOptions(fit_gains=False))
+        item = PaintingInput(replace(picture.observation, image=image, camera=picture.camera))
+        painting = paint_atlas(
+            [item], stage.truth.terrain, stage.atlas, stage.terrain, options=PaintOptions(fit_gains=False)
+        )
         covered = (
             sample_texture((painting.texture.weight > 0)[..., None].astype(np.float32), picture.gbuffer.uv)[..., 0]
             > 0.999
         )
         back = (
-            np.exp(painting.harmony.log_gain[0]) * sample_texture(painting.texture.values, picture.gbuffer.uv)[covered]
+            np.exp(painting.radiometry.log_gain[0])
+            * sample_texture(painting.texture.values, picture.gbuffer.uv)[covered]
         )
         decibel.append(-10.0 * np.log10(np.mean((srgb_from_linear(back) - srgb_from_linear(image[covered])) ** 2)))
     return {"reprojection_db": float(np.mean(decibel)), "reprojection_worst_db": float(np.min(decibel))}
@@ -255,8 +258,8 @@ def two_ridges() -> dict:
         lambda e, n: np.maximum(0.0, 100.0 - 0.5 * np.abs(n + 100.0)) + np.maximum(0.0, 160.0 - 0.5 * np.abs(n - 400.0))
     )
     eye = np.array([0.0, -550.0, 120.0])
-    shot = ridges.shot(camera_towards(eye, (0.0, 400.0, 80.0), fov_deg=80.0), "south")
-    painted = ridges.paint([shot], guard=False, fit_gains=False).texture.weight > 0.0
+    item = ridges.item(camera_towards(eye, (0.0, 400.0, 80.0), fov_deg=80.0), "south")
+    painted = ridges.paint([item], guard=False, fit_gains=False).texture.weight > 0.0
     place, _ = texel_positions(ridges.terrain, ridges.atlas.width_px, ridges.atlas.height_px)
     n, z = place[..., 1].astype(float), place[..., 2].astype(float)
     hidden = np.zeros(n.shape, bool)
@@ -275,17 +278,19 @@ def guard(stage: Stage, *, seed: int, texels: int = 12_000) -> dict:
     """Poses that are 0.2° off: painted texels with and without keeping away from silhouettes."""
     rng = np.random.default_rng(seed)
     sigmas = PoseSigmas(heading_deg=0.2, pitch_deg=0.1)
-    shots = [
+    inputs = [
         replace(
-            shot,
+            item,
             pose_sigma={"heading_deg": 0.2, "tilt_deg": 0.1},
-            observation=replace(shot.observation, camera=perturb_pose(shot.observation.camera, sigmas, rng)[0]),
+            observation=replace(item.observation, camera=perturb_pose(item.observation.camera, sigmas, rng)[0]),
         )
-        for shot in shots_of(stage)
+        for item in shots_of(stage)
     ]
     numbers, sample = {}, None
     for name, kept in (("unguarded", False), ("guarded", True)):
-        painting = paint(shots, stage.truth.terrain, stage.atlas, stage.terrain, options=PaintOptions(guard=kept))
+        painting = paint_atlas(
+            inputs, stage.truth.terrain, stage.atlas, stage.terrain, options=PaintOptions(guard=kept)
+        )
         painted = painting.texture.weight.ravel() > 0.0
         if sample is None:
             sample = np.sort(rng.permutation(np.flatnonzero(painted))[:texels])
@@ -298,42 +303,42 @@ def guard(stage: Stage, *, seed: int, texels: int = 12_000) -> dict:
 
 def rejection(stage: Stage, *, seed: int, texels: int = 12_000) -> dict:
     """Houses and a mast before every webcam: how much of them is found, and what painting gains by it."""
-    from seasonscapes.texturing.guided import fit_regression, predict
+    from seasonscapes.texturing.regression_fill import fit_regression, predict
 
-    terrain, shots = stage.truth.terrain, shots_of(stage)
-    first = paint(shots, terrain, stage.atlas, stage.terrain)
+    terrain, inputs = stage.truth.terrain, shots_of(stage)
+    first = paint_atlas(inputs, terrain, stage.atlas, stage.terrain)
     sun = stage.lights[0].sun
     # The land in another season serves as the satellite's image.
     summer = terrain_and_albedo(stage.truth.place, stage.truth.spacing_m, stage.texel_m, 190)[1]
-    guides = guides_for(
+    predictors = predictors_for(
         terrain, stage.atlas, satellite=Texture(summer), sun_direction=None if sun is None else sun.direction
     )
 
-    def fit(guide, target):
-        regression = fit_regression(guide, target, fast=True, seed=seed)
+    def fit(predictor, target):
+        regression = fit_regression(predictor, target, fast=True, seed=seed)
         return lambda other: predict(regression, other)[0]
 
     pictures = {picture.observation.webcam: picture for picture in stage.pictures}
     cut, scene = tiling(terrain, stage.atlas), RenderScene(stage.terrain.mi_scene, stage.terrain.mi_terrain, None, 0.0)
-    ready = [ready_shot(shot, stage.terrain, cut) for shot in shots]
-    uvs = [trace_gbuffer(scene, shot.observation.camera).uv for shot in shots]
-    rejects, painting = [None] * len(shots), first
+    ready = [prepare_input(item, stage.terrain, cut) for item in inputs]
+    uvs = [trace_gbuffer(scene, item.observation.camera).uv for item in inputs]
+    rejects, painting = [None] * len(inputs), first
     # What was found at first no longer teaches the regression.
     for _ in range(2):
-        expected = predict_in_folds(painting.texture, guides.values, fit, seed=seed)
+        expected = predict_in_folds(painting.texture, predictors.values, fit, seed=seed)
         number = {name: k for k, name in enumerate(first.webcams)}
         rejects = [
-            foreground_mask(r, number[r.shot.observation.webcam], painting.harmony, expected, uv)
+            foreground_mask(r, number[r.item.observation.webcam], painting.radiometry, expected, uv)
             for r, uv in zip(ready, uvs, strict=True)
         ]
-        painting = paint(shots, terrain, stage.atlas, stage.terrain, rejects=rejects)
+        painting = paint_atlas(inputs, terrain, stage.atlas, stage.terrain, rejects=rejects)
     found, false = [], []
-    for shot, mask, uv in zip(shots, rejects, uvs, strict=True):
-        land, front = np.isfinite(uv).all(axis=2), pictures[shot.observation.webcam].foreground
+    for item, mask, uv in zip(inputs, rejects, uvs, strict=True):
+        land, front = np.isfinite(uv).all(axis=2), pictures[item.observation.webcam].foreground
         found.append((np.count_nonzero(mask & front & land), np.count_nonzero(front & land)))
         false.append((np.count_nonzero(mask & ~front & land), np.count_nonzero(~front & land)))
-    oracle = paint(
-        shots, terrain, stage.atlas, stage.terrain, rejects=[pictures[s.observation.webcam].foreground for s in shots]
+    oracle = paint_atlas(
+        inputs, terrain, stage.atlas, stage.terrain, rejects=[pictures[s.observation.webcam].foreground for s in inputs]
     )
     painted = np.flatnonzero(first.texture.weight.ravel() > 0.0)
     sample = np.sort(np.random.default_rng(seed).permutation(painted)[:texels])
@@ -350,7 +355,7 @@ def measure(quick: bool, seed: int) -> dict:
     """All numbers of painting, flat."""
     stage = make_stage(seed, quick=quick)
     numbers = visibility(stage, seed=seed, rays=400 if quick else 2000)
-    numbers |= two_ridges() | reprojection(stage) | harmony(stage, seed=seed) | guard(stage, seed=seed)
+    numbers |= two_ridges() | reprojection(stage) | radiometry(stage, seed=seed) | guard(stage, seed=seed)
     numbers |= rejection(with_foreground(stage, seed), seed=seed)
     return {name: float(value) for name, value in numbers.items()}
 

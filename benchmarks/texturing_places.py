@@ -22,8 +22,8 @@ from seasonscapes.terrain.surface import Raster, Terrain, Texture
 from seasonscapes.terrain.synthetic import alpine_albedo, alpine_massif, snow_line_m
 from seasonscapes.terrain.texels import texel_positions
 from seasonscapes.terrain.unwrap import unwrap
-from seasonscapes.texturing.guides import Guides, stack_guides
-from seasonscapes.texturing.land import land_layers
+from seasonscapes.texturing.predictors import Predictors, stack_predictors
+from seasonscapes.texturing.terrain_features import terrain_features
 from seasonscapes.workspace import default_workspace
 
 # ETM+ gain and bias of bands 3, 2, 1 [W m⁻² sr⁻¹ µm⁻¹], as its README gives them.
@@ -37,7 +37,7 @@ class Testbed:
     name: str
     truth: np.ndarray
     seen: np.ndarray
-    guides: Guides
+    predictors: Predictors
     satellite: np.ndarray
     shown: Callable[[np.ndarray], np.ndarray]
     heights: np.ndarray
@@ -138,13 +138,13 @@ def lit_testbeds(
         sun = np.asarray(sun_position(when, frame.latitude_deg, frame.longitude_deg).direction)
         hours = [when.replace(hour=0, minute=0) + timedelta(hours=h) for h in range(24)]
         day_suns = np.asarray(sun_position(hours, frame.latitude_deg, frame.longitude_deg).direction)
-        layers = land_layers(z, spacing_m, sun_direction=sun, day_suns=day_suns)
-        guides = stack_guides(layers, Texture(image.astype(np.float32)), surface=surface)
+        layers = terrain_features(z, spacing_m, sun_direction=sun, day_suns=day_suns)
+        predictors = stack_predictors(layers, Texture(image.astype(np.float32)), surface=surface)
         yield Testbed(
             f"{place}_{season}",
             truth.astype(np.float32),
             seen,
-            guides,
+            predictors,
             image.astype(np.float32),
             lambda v, white=white: srgb_from_linear(v / white).astype(np.float32),
             z,
@@ -157,16 +157,16 @@ def lit_testbeds(
 
 def irradiance_of(terrain: Terrain, albedo: np.ndarray, positions: np.ndarray, when: datetime, frame) -> np.ndarray:
     """Traced illuminance ``(H, W, 3)`` [lx]: sun, sky and what the land sends; not the guides' own heightfield sun."""
-    from seasonscapes.rendering.gather import occluder
+    from seasonscapes.rendering.hemisphere_rays import ray_scene
     from seasonscapes.rendering.irradiance import irradiance_blocks
-    from seasonscapes.rendering.scene import build_scene
+    from seasonscapes.rendering.mitsuba_scene import build_scene
 
     height_m = float(np.nanmedian(positions[..., 2]))
     moment = moment_at(when, frame.latitude_deg, frame.longitude_deg, height_m)
     light = light_at(read_sky_model("clear"), moment, height_m, workspace=default_workspace())
     stage = build_scene(terrain, albedo, light)
     result = np.zeros((positions.shape[0] * positions.shape[1], 3), np.float32)
-    for index, _, (found,) in irradiance_blocks(occluder(stage.mi_terrain), positions.reshape(-1, 3), [light]):
+    for index, _, (found,) in irradiance_blocks(ray_scene(stage.mi_terrain), positions.reshape(-1, 3), [light]):
         result[index] = found.total
     return result.reshape(positions.shape)
 
@@ -231,14 +231,14 @@ def landsat(data: Path, seed: int) -> Iterator[Testbed]:
     sun = np.array([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)])
     # All six bands of July are the guide; red, green and blue come first.
     image = july[..., [2, 1, 0, 3, 4, 5]] / 255.0
-    guides = stack_guides(land_layers(z, 30.0, sun_direction=sun), Texture(image))
+    predictors = stack_predictors(terrain_features(z, 30.0, sun_direction=sun), Texture(image))
     rng = np.random.default_rng(seed)
     for name, seen in (("blocks", hidden_blocks(z.shape, rng)), ("views", seen_from(z, 30.0, rng, 8))):
         yield Testbed(
             f"landsat_{name}",
             truth,
             seen,
-            guides,
+            predictors,
             image,
             lambda v: np.clip((v - low) / (high - low), 0.0, 1.0).astype(np.float32),
             z,
@@ -270,7 +270,7 @@ def finse(data: Path, seed: int, blocks_m=(64.0, 160.0, 360.0)) -> Iterator[Test
     known = np.isfinite(z)
     filled = np.where(known, z, np.nanmedian(z)).astype(np.float32)
     sun = np.asarray(sun_position(datetime(2019, 5, 24, 10, 0, tzinfo=UTC), 60.6, 7.53).direction)
-    layers = land_layers(filled, spacing, sun_direction=sun)
+    layers = terrain_features(filled, spacing, sun_direction=sun)
     weight = np.isfinite(summer).all(axis=2).astype(np.float32)
     blurred = (
         cv2.GaussianBlur(np.nan_to_num(summer), (0, 0), 4.0)
@@ -278,7 +278,7 @@ def finse(data: Path, seed: int, blocks_m=(64.0, 160.0, 360.0)) -> Iterator[Test
     )
     surface = np.isfinite(spring).all(axis=2)
     satellite = Texture(np.where(weight[..., None] > 0.0, blurred, np.nan).astype(np.float32), weight)
-    guides = stack_guides(layers, satellite, surface=surface)
+    predictors = stack_predictors(layers, satellite, surface=surface)
     truth = np.nan_to_num(spring).astype(np.float32)
     rng = np.random.default_rng(seed)
     for block_m in blocks_m:
@@ -291,7 +291,7 @@ def finse(data: Path, seed: int, blocks_m=(64.0, 160.0, 360.0)) -> Iterator[Test
             f"finse_{block_m:.0f}m",
             truth,
             surface & ~grid,
-            guides,
+            predictors,
             image.astype(np.float32),
             lambda v: srgb_from_linear(v).astype(np.float32),
             filled,
@@ -303,16 +303,16 @@ def finse(data: Path, seed: int, blocks_m=(64.0, 160.0, 360.0)) -> Iterator[Test
 
 def without_image(bed: Testbed) -> Testbed:
     """The same with the relief alone."""
-    keep = [i for i, name in enumerate(bed.guides.names) if not name.startswith("satellite")]
-    names = tuple(bed.guides.names[i] for i in keep)
-    return replace(bed, guides=replace(bed.guides, values=bed.guides.values[..., keep], names=names))
+    keep = [i for i, name in enumerate(bed.predictors.names) if not name.startswith("satellite")]
+    names = tuple(bed.predictors.names[i] for i in keep)
+    return replace(bed, predictors=replace(bed.predictors, values=bed.predictors.values[..., keep], names=names))
 
 
 def _finse_painted(folder: Path):
     """Heights, spacing, camera cell, and both photographs ``(H, W, 3)`` on the ground (linear, NaN where not seen)."""
     from seasonscapes.calibration.evidence import Correspondences, Priors
     from seasonscapes.calibration.pose_model import project_values
-    from seasonscapes.calibration.resection import calibrate
+    from seasonscapes.calibration.resection import resect
     from seasonscapes.cameras.pinhole import camera_at
     from seasonscapes.frames import LocalFrame, enu_from_geodetic
     from seasonscapes.terrain.crs import geodetic_from_map
@@ -326,7 +326,7 @@ def _finse_painted(folder: Path):
         np.stack([column["x_img"], column["y_img"]], -1), enu_from_geodetic(frame, *at, column["z_world"])
     )
     start = camera_at(frame, latitude, longitude, 1212.0, heading_deg=66.0, fov_deg=65.8, size_px=(1920, 1080))
-    pose = calibrate(start, points, priors=Priors(k1=np.inf))
+    pose = resect(start, points, priors=Priors(k1=np.inf))
     raster = read_elevation(folder / "dsm_4m.tif")
     z = raster.values[..., 0]
     c, r = np.meshgrid(np.arange(z.shape[1]) + 0.5, np.arange(z.shape[0]) + 0.5)

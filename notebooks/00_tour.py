@@ -25,8 +25,8 @@ from seasonscapes.daylight import light_at, light_for, moment_at
 from seasonscapes.exposure import develop, exposure_ev100
 from seasonscapes.images import srgb_from_linear
 from seasonscapes.pipeline import albedo_for, camera_for, load_place
+from seasonscapes.rendering.mitsuba_scene import build_scene
 from seasonscapes.rendering.radiance import render_view
-from seasonscapes.rendering.scene import build_scene
 from seasonscapes.sky.models import read_sky_model
 from seasonscapes.sky.report import dome_picture
 from seasonscapes.workspace import default_workspace

@@ -27,9 +27,9 @@ import numpy as np
 
 from seasonscapes.cameras.pinhole import camera_at
 from seasonscapes.pipeline import MeshOptions, albedo_for, load_place
-from seasonscapes.rendering.gather import occluder
 from seasonscapes.rendering.gbuffer import trace_gbuffer
-from seasonscapes.rendering.scene import RenderScene, mi_mesh
+from seasonscapes.rendering.hemisphere_rays import ray_scene
+from seasonscapes.rendering.mitsuba_scene import RenderScene, mi_mesh
 from seasonscapes.workspace import default_workspace
 
 # %% [markdown]
@@ -86,7 +86,7 @@ for axis, month in zip(axes, (1, 4, 7, 10), strict=True):
 camera = camera_at(
     place.frame, 46.5712, 7.98, 3200.0, heading_deg=180.0, pitch_deg=-18.0, fov_deg=60.0, size_px=(420, 280)
 )
-land = occluder(mi_mesh(place.terrain, np.full(3, 0.3)))
+land = ray_scene(mi_mesh(place.terrain, np.full(3, 0.3)))
 seen = trace_gbuffer(RenderScene(land.mi_scene, land.mi_terrain, None, 0.0), camera)
 figure, axes = plt.subplots(1, 2, figsize=(12, 4))
 shown = axes[0].imshow(seen.depth / 1000.0)

@@ -28,11 +28,11 @@ import numpy as np
 
 from seasonscapes.calibration.evidence import Correspondences, Priors
 from seasonscapes.calibration.overlay import draw_overlay
-from seasonscapes.calibration.resection import calibrate
+from seasonscapes.calibration.resection import resect
 from seasonscapes.cameras.panorama import panorama_from_angles, split_panorama
 from seasonscapes.daylight import light_for
 from seasonscapes.evaluation.splits import held_out_hours, refuse_leaks, use_of
-from seasonscapes.evaluation.synthetic_webcams import Hour, webcam_series
+from seasonscapes.evaluation.synthetic_webcams import WebcamInstant, webcam_series
 from seasonscapes.evaluation.webcam_faults import CLEAN, SEVERE, TYPICAL, PoseSigmas, degrade, perturb_pose
 from seasonscapes.pipeline import albedo_for, camera_for, load_place
 from seasonscapes.sky.models import read_sky_model
@@ -47,7 +47,9 @@ camera = camera_for(place, place.scene.camera("west"), size_px=(300, 200))
 hours = []
 for hour in (7, 9, 12, 15):
     time = datetime(2024, 9, 11, hour, tzinfo=UTC)
-    hours.append(Hour(time, light_for(place, camera, read_sky_model("clear"), time)[0], albedo_for(place, time).values))
+    hours.append(
+        WebcamInstant(time, light_for(place, camera, read_sky_model("clear"), time)[0], albedo_for(place, time).values)
+    )
 pictures = webcam_series(place.terrain, "west", camera, hours)
 figure, axes = plt.subplots(1, 4, figsize=(15, 3))
 for axis, picture in zip(axes, pictures, strict=True):
@@ -77,7 +79,7 @@ chosen = rng.permutation(np.argwhere(np.isfinite(truth.depth) & (truth.depth > 2
 pixel = chosen[:, ::-1] + 0.5 + rng.normal(0.0, 0.5, (12, 2))
 pixel[:2] += 30.0
 points = Correspondences(pixel, truth.position[chosen[:, 0], chosen[:, 1]])
-solved = calibrate(start, points, priors=Priors(horizontal_m=5.0, vertical_m=5.0, focal=0.02))
+solved = resect(start, points, priors=Priors(horizontal_m=5.0, vertical_m=5.0, focal=0.02))
 print(f"heading was off by {off['heading_deg']:+.2f}°; set aside: {np.flatnonzero(solved.outlier).tolist()}")
 print(f"{solved.inlier_rms_px:.2f} px; heading ± {solved.sigma['heading_deg']:.3f}°")
 plt.figure(figsize=(9, 6))

@@ -29,21 +29,21 @@ from seasonscapes.daylight import light_for
 from seasonscapes.evaluation.figures import comparison
 from seasonscapes.evaluation.masks import land_mask
 from seasonscapes.evaluation.metrics import score
-from seasonscapes.evaluation.synthetic_webcams import Hour, webcam_series
+from seasonscapes.evaluation.synthetic_webcams import WebcamInstant, webcam_series
 from seasonscapes.exposure import develop, exposure_ev100
 from seasonscapes.images import srgb_from_linear
 from seasonscapes.pipeline import MeshOptions, albedo_for, camera_for, load_place
-from seasonscapes.rendering.gather import occluder
-from seasonscapes.rendering.radiance import render_view, through_air
-from seasonscapes.rendering.scene import build_scene, mi_mesh
-from seasonscapes.rendering.transport import Effort
+from seasonscapes.rendering.hemisphere_rays import ray_scene
+from seasonscapes.rendering.mitsuba_scene import build_scene, mi_mesh
+from seasonscapes.rendering.radiance import apply_aerial_perspective, render_view
+from seasonscapes.rendering.transport import SamplingOptions
 from seasonscapes.sky.ephemeris import sun_position
 from seasonscapes.sky.models import read_sky_model
 from seasonscapes.terrain.surface import sample_texture
-from seasonscapes.texturing.complete import complete
-from seasonscapes.texturing.guides import guides_for
-from seasonscapes.texturing.paint import paint
-from seasonscapes.texturing.shots import Shot
+from seasonscapes.texturing.completion import complete
+from seasonscapes.texturing.inputs import PaintingInput
+from seasonscapes.texturing.painting import paint_atlas
+from seasonscapes.texturing.predictors import predictors_for
 from seasonscapes.workspace import default_workspace
 
 # %% [markdown]
@@ -53,13 +53,15 @@ from seasonscapes.workspace import default_workspace
 place = load_place(Path("small.toml"), default_workspace(), options=MeshOptions(texel_m=25.0))
 time, model = datetime(2024, 9, 11, 9, tzinfo=UTC), read_sky_model("clear")
 albedo = albedo_for(place, time)
-effort = Effort(subpixels=4, shades=16, rays=64, senders=1024, listed=32, rank=24)
+sampling = SamplingOptions(subpixels=4, shades=16, rays=64, clusters=1024, listed=32, rank=24)
 shots, shown = [], []
 for name in ("west", "middle", "south"):
     camera = camera_for(place, place.scene.camera(name), size_px=(210, 140))
     light, _ = light_for(place, camera, model, time)
-    picture = webcam_series(place.terrain, name, camera, [Hour(time, light, albedo.values)], effort=effort)[0]
-    shots.append(Shot(picture.observation, light.aerial_perspective))
+    picture = webcam_series(
+        place.terrain, name, camera, [WebcamInstant(time, light, albedo.values)], sampling=sampling
+    )[0]
+    shots.append(PaintingInput(picture.observation, light.aerial_perspective))
     shown.append(picture.encoded)
 plt.figure(figsize=(14, 4))
 plt.imshow(np.concatenate(shown, axis=1))
@@ -69,8 +71,8 @@ _ = plt.axis("off")
 # Each texel asks by ray which webcams see it. Their exposure, white balance, contrast and haze are made to agree.
 
 # %%
-land = occluder(mi_mesh(place.terrain, albedo.values))
-painting = paint(shots, place.terrain, place.atlas, land)
+land = ray_scene(mi_mesh(place.terrain, albedo.values))
+painting = paint_atlas(shots, place.terrain, place.atlas, land)
 figure, axes = plt.subplots(1, 2, figsize=(12, 5))
 axes[0].imshow(srgb_from_linear(develop(painting.texture.values, exposure_ev100(painting.texture.values))))
 axes[1].imshow(painting.coverage, cmap="viridis")
@@ -85,7 +87,7 @@ for axis in axes:
 # %%
 at = (place.frame.latitude_deg, place.frame.longitude_deg)
 day = [time + timedelta(hours=hour) for hour in range(-12, 12)]
-guides = guides_for(
+guides = predictors_for(
     place.terrain,
     place.atlas,
     satellite=albedo_for(place, datetime(2024, 7, 23, tzinfo=UTC)),
@@ -112,7 +114,9 @@ truth = render_view(stage, camera, spp=32)
 
 def view(texture: np.ndarray) -> np.ndarray:
     surface = np.nan_to_num(sample_texture(texture, truth.gbuffer.uv))
-    return through_air(stage, camera, surface, np.isfinite(truth.gbuffer.depth).astype(np.float32), truth.gbuffer)
+    return apply_aerial_perspective(
+        stage, camera, surface, np.isfinite(truth.gbuffer.depth).astype(np.float32), truth.gbuffer
+    )
 
 
 ev100, mask = exposure_ev100(truth.radiance), land_mask(truth.gbuffer.depth)

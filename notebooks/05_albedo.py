@@ -26,16 +26,16 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from seasonscapes.albedo.closed_form import solve_albedo
-from seasonscapes.albedo.forward import trace_land
-from seasonscapes.albedo.shots import EIGHT_BIT, make_shots
-from seasonscapes.albedo.uncertainty import texel_sigma, times_sunlit
+from seasonscapes.albedo.forward_model import trace_texel_transport
+from seasonscapes.albedo.photographs import EIGHT_BIT, prepare_photographs
+from seasonscapes.albedo.standard_error import texel_sigma, times_sunlit
 from seasonscapes.daylight import light_for
 from seasonscapes.evaluation.surfaces import albedo_error
-from seasonscapes.evaluation.synthetic_webcams import Hour, webcam_series
+from seasonscapes.evaluation.synthetic_webcams import WebcamInstant, webcam_series
 from seasonscapes.evaluation.webcam_faults import WebcamFaults
 from seasonscapes.images import srgb_from_linear
 from seasonscapes.pipeline import MeshOptions, albedo_for, camera_for, load_place
-from seasonscapes.rendering.transport import Effort
+from seasonscapes.rendering.transport import SamplingOptions
 from seasonscapes.sky.models import read_sky_model
 from seasonscapes.workspace import default_workspace
 
@@ -46,13 +46,15 @@ from seasonscapes.workspace import default_workspace
 place = load_place(Path("small.toml"), default_workspace(), options=MeshOptions(texel_m=40.0))
 day, model = datetime(2024, 9, 11, tzinfo=UTC), read_sky_model("clear")
 truth = albedo_for(place, day).values
-effort = Effort(subpixels=4, shades=16, rays=64, senders=1024, listed=32, rank=24)
+sampling = SamplingOptions(subpixels=4, shades=16, rays=64, clusters=1024, listed=32, rank=24)
 observations, lights, shown = [], [], []
 for name in ("west", "south"):
     camera = camera_for(place, place.scene.camera(name), size_px=(180, 120))
     times = [day.replace(hour=hour) for hour in (7, 10, 13, 15)]
-    hours = [Hour(time, light_for(place, camera, model, time)[0], truth) for time in times]
-    pictures = webcam_series(place.terrain, name, camera, hours, faults=WebcamFaults(tone_strength=0.0), effort=effort)
+    hours = [WebcamInstant(time, light_for(place, camera, model, time)[0], truth) for time in times]
+    pictures = webcam_series(
+        place.terrain, name, camera, hours, faults=WebcamFaults(tone_strength=0.0), sampling=sampling
+    )
     observations += [picture.observation for picture in pictures]
     lights += [hour.illumination for hour in hours]
     shown.append(np.concatenate([picture.encoded for picture in pictures], axis=1))
@@ -65,9 +67,11 @@ _ = plt.axis("off")
 # least-squares problem.
 
 # %%
-land = trace_land(place.terrain, truth.shape[:2], effort=Effort(subpixels=1, rays=64, listed=32, senders=1024, rank=24))
-shots = make_shots(land, observations, lights)
-fit = solve_albedo(land, shots, trust=EIGHT_BIT)
+land = trace_texel_transport(
+    place.terrain, truth.shape[:2], sampling=SamplingOptions(subpixels=1, rays=64, listed=32, clusters=1024, rank=24)
+)
+photographs = prepare_photographs(land, observations, lights)
+fit = solve_albedo(land, photographs, noise_model=EIGHT_BIT)
 seen = fit.seen >= 1.0
 print(albedo_error(truth, fit.albedo, seen))
 
@@ -88,7 +92,7 @@ figure, axes = plt.subplots(1, 2, figsize=(12, 5))
 sigma = texel_sigma(fit)
 shown = axes[0].imshow(np.where(np.isfinite(sigma), sigma, np.nan), vmax=0.1)
 figure.colorbar(shown, ax=axes[0], label="standard deviation")
-shown = axes[1].imshow(times_sunlit(shots))
+shown = axes[1].imshow(times_sunlit(photographs))
 figure.colorbar(shown, ax=axes[1], label="pictures in sunlight")
 for axis in axes:
     axis.axis("off")

@@ -33,11 +33,11 @@ from seasonscapes.evaluation.metrics import score
 from seasonscapes.exposure import develop, exposure_ev100
 from seasonscapes.images import srgb_from_linear
 from seasonscapes.pipeline import albedo_for, camera_for, load_place
-from seasonscapes.rendering.gather import occluder
+from seasonscapes.rendering.hemisphere_rays import ray_scene
+from seasonscapes.rendering.mitsuba_scene import RenderScene, build_scene, mi_mesh, set_albedo
 from seasonscapes.rendering.radiance import render_view
-from seasonscapes.rendering.relit_view import ready_view, relight_view, senders_albedo, with_albedo
-from seasonscapes.rendering.scene import RenderScene, build_scene, mi_mesh, set_albedo
-from seasonscapes.rendering.transport import Effort, trace_view, view_albedo
+from seasonscapes.rendering.relit_view import cluster_albedo, relight_view, relightable_view, with_albedo
+from seasonscapes.rendering.transport import SamplingOptions, trace_view, view_albedo
 from seasonscapes.sky.models import read_sky_model
 from seasonscapes.workspace import default_workspace
 
@@ -53,10 +53,12 @@ def shown(radiance: np.ndarray) -> np.ndarray:
 place = load_place(Path("small.toml"), default_workspace())
 camera = camera_for(place, place.scene.camera("unseen"), size_px=(270, 180))
 autumn = datetime(2024, 9, 18, tzinfo=UTC)
-land = occluder(mi_mesh(place.terrain, albedo_for(place, autumn).values))
+land = ray_scene(mi_mesh(place.terrain, albedo_for(place, autumn).values))
 start = clock.perf_counter()
-coefficients = trace_view(land, camera, Effort(subpixels=4, shades=16, rays=128, senders=2048, listed=32, rank=24))
-ready = ready_view(land, coefficients)
+coefficients = trace_view(
+    land, camera, SamplingOptions(subpixels=4, shades=16, rays=128, clusters=2048, listed=32, rank=24)
+)
+ready = relightable_view(land, coefficients)
 print(f"traced in {clock.perf_counter() - start:.1f} s")
 
 # %% [markdown]
@@ -93,7 +95,7 @@ for axis, (month, day) in zip(axes, ((2, 10), (5, 20), (7, 20)), strict=True):
     noon = datetime(2024, month, day, 11, tzinfo=UTC)
     colours = albedo_for(place, noon).values
     set_albedo(RenderScene(land.mi_scene, land.mi_terrain, lights[0], 0.0), colours)
-    clothed = with_albedo(ready, view_albedo(land, coefficients), senders_albedo(coefficients, colours))
+    clothed = with_albedo(ready, view_albedo(land, coefficients), cluster_albedo(coefficients, colours))
     axis.imshow(shown(relight_view(clothed, light_for(place, camera, model, noon)[0]).radiance))
     axis.set_title(f"{noon:%d %B}")
     axis.axis("off")

@@ -28,17 +28,22 @@ import numpy as np
 
 from seasonscapes.daylight import light_at, moment_at
 from seasonscapes.gaussians.appearance import Appearance, colours_at, fourier_embedding
-from seasonscapes.gaussians.distil import Schedule, distil, lessons_from
+from seasonscapes.gaussians.disc_transport import (
+    light_state,
+    neighbourhood_mean,
+    surfel_irradiance,
+    trace_disc_transport,
+)
 from seasonscapes.gaussians.rasterise import choose_threads, splat_colours, view_weights
 from seasonscapes.gaussians.surfels import surfel_albedo, terrain_surfels
-from seasonscapes.gaussians.transport import light_state, neighbourhood_mean, surfel_irradiance, trace_transport
-from seasonscapes.gaussians.views import facing, overview_cameras
+from seasonscapes.gaussians.training import Schedule, surface_targets, train
+from seasonscapes.gaussians.training_views import facing, overview_cameras
 from seasonscapes.images import srgb_from_linear
 from seasonscapes.pipeline import MeshOptions, albedo_for, load_place
-from seasonscapes.rendering.gather import occluder
-from seasonscapes.rendering.relit_view import ready_view, relight_view
-from seasonscapes.rendering.scene import mi_mesh
-from seasonscapes.rendering.transport import Effort, trace_view
+from seasonscapes.rendering.hemisphere_rays import ray_scene
+from seasonscapes.rendering.mitsuba_scene import mi_mesh
+from seasonscapes.rendering.relit_view import relight_view, relightable_view
+from seasonscapes.rendering.transport import SamplingOptions, trace_view
 from seasonscapes.sky.models import read_sky_model
 from seasonscapes.workspace import default_workspace
 
@@ -51,11 +56,11 @@ choose_threads(1)
 place = load_place(Path("small.toml"), default_workspace(), options=MeshOptions(texel_m=25.0))
 day = datetime(2024, 9, 11, tzinfo=UTC)
 texture = albedo_for(place, day).values
-land = occluder(mi_mesh(place.terrain, texture))
+land = ray_scene(mi_mesh(place.terrain, texture))
 surfels = terrain_surfels(place.terrain, 75.0)
 albedo = surfel_albedo(surfels, texture)
 around = neighbourhood_mean(surfels.means, albedo, surfels.plan.spacing_m)
-transport = trace_transport(land, surfels, albedo, rays=64)
+transport = trace_disc_transport(land, surfels, albedo, rays=64)
 print(f"{len(albedo):,} discs, mean sky-view factor {transport.open_sky.mean():.2f}")
 
 # %% [markdown]
@@ -75,11 +80,11 @@ lessons_at = [
     for month, hour in ((1, 11), (3, 8), (4, 15), (5, 6), (6, 12), (7, 17), (9, 9), (10, 14))
 ]
 lights, states = zip(*(lit(time) for time in lessons_at), strict=True)
-lessons = lessons_from(states, [0] * len(states), albedo[None], surfel_irradiance(land, surfels, lights, rays=64))
+targets = surface_targets(states, [0] * len(states), albedo[None], surfel_irradiance(land, surfels, lights, rays=64))
 appearance = Appearance(
     "full", albedo[None], around[None], transport, fourier_embedding(surfels.means), times=len(states)
 )
-losses = distil(appearance, lessons, schedule=Schedule(surface_steps=250))
+losses = train(appearance, targets, schedule=Schedule(surface_steps=250))
 plt.semilogy(np.convolve(losses, np.ones(20) / 20, "valid"))
 plt.xlabel("step")
 _ = plt.ylabel("loss")
@@ -91,8 +96,8 @@ _ = plt.ylabel("loss")
 # %%
 camera = overview_cameras(place.terrain, 1, size_px=160, first_deg=200.0)[0]
 light, state = lit(day + timedelta(hours=7.5))
-ready = ready_view(
-    land, trace_view(land, camera, Effort(subpixels=4, shades=16, rays=128, senders=2048, listed=32, rank=24))
+ready = relightable_view(
+    land, trace_view(land, camera, SamplingOptions(subpixels=4, shades=16, rays=128, clusters=2048, listed=32, rank=24))
 )
 truth = relight_view(ready, light).surface * np.float32(np.pi / state.global_lx)
 weights = view_weights(facing(surfels, camera), camera, subpixels=2)

@@ -29,17 +29,17 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from seasonscapes.albedo.closed_form import solve_albedo
-from seasonscapes.albedo.forward import trace_land
+from seasonscapes.albedo.forward_model import trace_texel_transport
 from seasonscapes.albedo.inverse import InverseOptions, refine_albedo
-from seasonscapes.albedo.shots import make_shots
+from seasonscapes.albedo.photographs import prepare_photographs
 from seasonscapes.cameras.observation import Observation
 from seasonscapes.daylight import light_for
 from seasonscapes.evaluation.surfaces import albedo_error
 from seasonscapes.images import srgb_from_linear
 from seasonscapes.pipeline import MeshOptions, albedo_for, camera_for, load_place
+from seasonscapes.rendering.mitsuba_scene import build_scene
 from seasonscapes.rendering.radiance import render_view
-from seasonscapes.rendering.scene import build_scene
-from seasonscapes.rendering.transport import Effort
+from seasonscapes.rendering.transport import SamplingOptions
 from seasonscapes.sky.models import read_sky_model
 from seasonscapes.workspace import default_workspace
 
@@ -64,9 +64,11 @@ for name in ("west", "south"):
 # The closed form is the reference; the experiment begins from grey, with gains 20 % off.
 
 # %%
-land = trace_land(place.terrain, truth.shape[:2], effort=Effort(subpixels=1, rays=64, listed=32, senders=1024, rank=24))
-shots = make_shots(land, observations, lights, gains=[np.ones(3)] * len(lights))
-closed = solve_albedo(land, shots)
+land = trace_texel_transport(
+    place.terrain, truth.shape[:2], sampling=SamplingOptions(subpixels=1, rays=64, listed=32, clusters=1024, rank=24)
+)
+photographs = prepare_photographs(land, observations, lights, gains=[np.ones(3)] * len(lights))
+closed = solve_albedo(land, photographs)
 seen = closed.seen >= 1.0
 grey = replace(closed, albedo=np.full_like(truth, 0.2), gains=1.2 * closed.gains)
 errors = []
@@ -85,7 +87,7 @@ options = InverseOptions(
     check_every=8,
     steps={"albedo": 0.03, "log_gain": 0.02},
 )
-found = refine_albedo(place.terrain, land, shots, grey, options=options, callbacks=[watch])
+found = refine_albedo(place.terrain, land, photographs, grey, options=options, callbacks=[watch])
 print(f"gains from {grey.gains.mean():.2f} to {found.fit.gains.mean():.2f} of the true ones")
 
 # %%

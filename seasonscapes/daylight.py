@@ -17,14 +17,14 @@ import numpy as np
 
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.pipeline import Place, camera_geodetic
-from seasonscapes.sky.air import Atmosphere
-from seasonscapes.sky.atmosphere import TABLES_REVISION, AtmosphereTables, atmosphere_tables, load_tables, save_tables
+from seasonscapes.sky.atmosphere import Atmosphere
+from seasonscapes.sky.clear_sky import TABLES_REVISION, AtmosphereTables, atmosphere_tables, load_tables, save_tables
 from seasonscapes.sky.elevation_table import TABLE_REVISION, load_table, save_table
 from seasonscapes.sky.ephemeris import LunarPosition, SolarPosition, moon_position, sun_position
 from seasonscapes.sky.illuminate import illuminate
 from seasonscapes.sky.illumination import Illumination
 from seasonscapes.sky.models import AtmosphereModel, SkyModel, atmosphere_of
-from seasonscapes.sky.seen import diffuse_by_elevation, observer_view
+from seasonscapes.sky.observer_radiance import diffuse_by_elevation, observer_view
 from seasonscapes.workspace import Workspace, build_once
 
 

@@ -48,7 +48,7 @@ def read_declaration(path: Path, model: type[Model]) -> Model:
 
 
 def validate(table: dict, model: type[Model], *, where: str | Path) -> Model:
-    """Validate tables that came from ``where``; see `read_declaration`."""
+    """Validate tables that came from ``describe_position``; see `read_declaration`."""
     try:
         return model.model_validate(table)
     except ValidationError as error:

@@ -14,11 +14,11 @@ import numpy as np
 from seasonscapes import bundled
 from seasonscapes.albedo.seasons import (
     DatedAlbedo,
-    albedo_between,
     day_number,
-    line_share,
+    interpolate_albedo,
     season_weights,
-    snow_turning,
+    snow_transition,
+    snowline_fraction,
 )
 from seasonscapes.declaration import InputError
 from seasonscapes.frames import LocalFrame, geodetic_from_enu
@@ -37,7 +37,7 @@ from seasonscapes.workspace import Workspace, build_once, file_hash
 if TYPE_CHECKING:
     from seasonscapes.cameras.pinhole import Camera
     from seasonscapes.terrain.raster import FillReport
-    from seasonscapes.terrain.synthetic import SyntheticPlace
+    from seasonscapes.terrain.synthetic import SyntheticMassif
     from seasonscapes.terrain.unwrap import Atlas
 
 # Raised when a stage's result changes for equal inputs, so that old artefacts are not taken for new ones.
@@ -89,7 +89,7 @@ class Place:
     fill: FillReport
     terrain: Terrain
     atlas: Atlas
-    synthetic: SyntheticPlace | None
+    synthetic: SyntheticMassif | None
     key: dict
     workspace: Workspace
 
@@ -137,7 +137,7 @@ def _elevation(path: Path, scene: SceneFile, workspace: Workspace):
     from seasonscapes.terrain.raster import fill_nodata, read_elevation
 
     if scene.elevation.synthetic is not None:
-        from seasonscapes.terrain.synthetic import alpine_massif, load_place, save_place
+        from seasonscapes.terrain.synthetic import alpine_massif, load_massif, save_massif
 
         made = scene.elevation.synthetic
         inputs = {"revision": REVISIONS["place"], "synthetic": made}
@@ -146,8 +146,8 @@ def _elevation(path: Path, scene: SceneFile, workspace: Workspace):
             f"{scene.name}/massif",
             inputs,
             suffix=".npz",
-            save=save_place,
-            load=load_place,
+            save=save_massif,
+            load=load_massif,
             build=lambda: alpine_massif(seed=made.seed, size_m=made.size_m, spacing_m=made.spacing_m),
         )
         raster = synthetic.elevation
@@ -327,18 +327,18 @@ def dated_albedos(place: Place, given: Sequence[tuple[str, str]] = ()) -> list[D
 
 
 def turning_between(place: Place, first: DatedAlbedo, second: DatedAlbedo) -> Texture:
-    """When each texel changes between two dated albedos, see `albedo.seasons.snow_turning`; kept in the workspace."""
+    """When each texel changes between two dated albedos, see `albedo.seasons.snow_transition`; kept in the workspace."""
     inputs = {"revision": REVISIONS["turning"], "terrain": place.key, "dated": [first.content, second.content]}
 
     def build() -> Texture:
         from seasonscapes.albedo.closed_form import fill_nearest
-        from seasonscapes.terrain.ground import texel_ground
+        from seasonscapes.terrain.attributes import texel_attributes
 
         shape = (place.atlas.height_px, place.atlas.width_px)
-        ground, texel = texel_ground(place.terrain, shape)
+        ground, texel = texel_attributes(place.terrain, shape)
         values, weight = np.zeros((shape[0] * shape[1], 3), np.float32), np.zeros(shape, np.float32)
         weight.reshape(-1)[texel] = 1.0
-        values[texel] = snow_turning(ground, *(each.load().values.reshape(-1, 3)[texel] for each in (first, second)))
+        values[texel] = snow_transition(ground, *(each.load().values.reshape(-1, 3)[texel] for each in (first, second)))
         # Bilinear look-ups at the rim reach texels beyond the surface.
         return Texture(fill_nearest(values.reshape(*shape, 3), weight), weight)
 
@@ -366,10 +366,10 @@ def albedo_of_day(place: Place, dated: Sequence[DatedAlbedo], day: date, *, seas
     way, seen = weights[1][1], np.minimum(textures[0].weight, textures[1].weight)
     if season == "snow-line":
         turning = turning_between(place, first, second).values
-        line = line_share(*(day_number(each) for each in (first.day, second.day, day)))
+        line = snowline_fraction(*(day_number(each) for each in (first.day, second.day, day)))
     else:
         turning, line = np.zeros_like(textures[0].values), way
-    return Texture(albedo_between((textures[0].values, textures[1].values), turning, way, line), seen)
+    return Texture(interpolate_albedo((textures[0].values, textures[1].values), turning, way, line), seen)
 
 
 def _given_albedo(place: Place, day: str, path: Path) -> DatedAlbedo:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from seasonscapes.albedo.seasons import DatedAlbedo, albedo_between, day_number, line_share, season_weights
+from seasonscapes.albedo.seasons import DatedAlbedo, day_number, interpolate_albedo, season_weights, snowline_fraction
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.daylight import light_for, tabulate_light
 from seasonscapes.exposure import exposure_ev100
@@ -140,9 +140,9 @@ def open_studio(assignment: Assignment, *, progress: Progress | None = None) -> 
         Where the camera sees no terrain.
     """
     from seasonscapes.rendering.backend import use_backend
-    from seasonscapes.rendering.gather import occluder
-    from seasonscapes.rendering.relit_view import ready_view
-    from seasonscapes.rendering.scene import mi_mesh
+    from seasonscapes.rendering.hemisphere_rays import ray_scene
+    from seasonscapes.rendering.mitsuba_scene import mi_mesh
+    from seasonscapes.rendering.relit_view import relightable_view
 
     use_backend(assignment.device)
     place = load_place(
@@ -154,7 +154,7 @@ def open_studio(assignment: Assignment, *, progress: Progress | None = None) -> 
     camera = camera_for(place, assignment.view, size_px=assignment.size_px)
     dated = dated_albedos(place, assignment.albedo)
     base = _base(assignment, dated)
-    terrain = occluder(mi_mesh(place.terrain, base.load().values))
+    terrain = ray_scene(mi_mesh(place.terrain, base.load().values))
     tell = progress or (lambda _: None)
     tabulate_light(place, camera, assignment.model, progress=lambda share: tell(0.1 * share))
     coefficients = _coefficients(assignment, place, camera, (terrain, base), lambda share: tell(0.1 + 0.9 * share))
@@ -164,7 +164,7 @@ def open_studio(assignment: Assignment, *, progress: Progress | None = None) -> 
         camera,
         coefficients,
         terrain,
-        ready_view(terrain, coefficients),
+        relightable_view(terrain, coefficients),
         dated,
         base,
         frames_folder(assignment, place, dated),
@@ -175,7 +175,7 @@ def _coefficients(
     assignment: Assignment, place: Place, camera: Camera, clothed: tuple[Any, DatedAlbedo], progress: Progress
 ) -> Any:
     from seasonscapes.rendering.coefficients_file import load_coefficients, save_coefficients
-    from seasonscapes.rendering.transport import Effort, trace_view
+    from seasonscapes.rendering.transport import SamplingOptions, trace_view
 
     terrain, base = clothed
     inputs = {
@@ -184,14 +184,16 @@ def _coefficients(
         "view": assignment.view,
         "size": assignment.size_px,
         "albedo": _named(base),
-        "effort": asdict(Effort()),
+        "effort": asdict(SamplingOptions()),
         "seed": assignment.seed,
     }
     key = content_key(inputs)
     folder = place.workspace.folder / f"{place.scene.name}/coefficients-{key}"
     if (folder / "coefficients.json").is_file():
         return load_coefficients(folder, key=key)
-    save_coefficients(folder, trace_view(terrain, camera, Effort(), seed=assignment.seed, progress=progress), key=key)
+    save_coefficients(
+        folder, trace_view(terrain, camera, SamplingOptions(), seed=assignment.seed, progress=progress), key=key
+    )
     return load_coefficients(folder, key=key)
 
 
@@ -231,20 +233,22 @@ def _worn(studio: Studio, weights: list[tuple[int, float]], day: date) -> list[n
     name = f"turning:{pair[0].content}:{pair[1].content}"
     if name not in studio.turnings:
         # When a place turns is a texture like any other, and averaged over pixels as colours are.
-        pixels, senders = _colours(studio, DatedAlbedo(pair[0].day, name, lambda: turning_between(studio.place, *pair)))
+        pixels, clusters = _colours(
+            studio, DatedAlbedo(pair[0].day, name, lambda: turning_between(studio.place, *pair))
+        )
         cover = np.maximum(studio.coefficients.coverage[:, None], 1e-3)
-        studio.turnings = {name: (pixels / cover, senders)}
-    line = line_share(*(day_number(each) for each in (pair[0].day, pair[1].day, day)))
+        studio.turnings = {name: (pixels / cover, clusters)}
+    line = snowline_fraction(*(day_number(each) for each in (pair[0].day, pair[1].day, day)))
     return [
-        albedo_between((parts[0][k], parts[1][k]), turning, weights[1][1], line)
+        interpolate_albedo((parts[0][k], parts[1][k]), turning, weights[1][1], line)
         for k, turning in enumerate(studio.turnings[name])
     ]
 
 
 def _colours(studio: Studio, dated: DatedAlbedo) -> tuple[np.ndarray, np.ndarray]:
     """Mean albedo of the view's pixels and of what lights them, for a dated texture; kept in the workspace."""
-    from seasonscapes.rendering.relit_view import senders_albedo
-    from seasonscapes.rendering.scene import set_albedo
+    from seasonscapes.rendering.mitsuba_scene import set_albedo
+    from seasonscapes.rendering.relit_view import cluster_albedo
     from seasonscapes.rendering.transport import view_albedo
 
     assignment, place = studio.assignment, studio.place
@@ -262,9 +266,9 @@ def _colours(studio: Studio, dated: DatedAlbedo) -> tuple[np.ndarray, np.ndarray
         texture = dated.load().values
         set_albedo(studio.terrain, texture)
         pixels = view_albedo(studio.terrain, studio.coefficients).astype(np.float16)
-        return pixels, senders_albedo(studio.coefficients, texture).astype(np.float16)
+        return pixels, cluster_albedo(studio.coefficients, texture).astype(np.float16)
 
-    pixels, senders = build_once(
+    pixels, clusters = build_once(
         place.workspace,
         f"{place.scene.name}/view-albedo",
         inputs,
@@ -273,16 +277,16 @@ def _colours(studio: Studio, dated: DatedAlbedo) -> tuple[np.ndarray, np.ndarray
         save=_save_colours,
         load=_load_colours,
     )
-    return pixels.astype(np.float32), senders.astype(np.float32)
+    return pixels.astype(np.float32), clusters.astype(np.float32)
 
 
 def _save_colours(colours: tuple[np.ndarray, np.ndarray], path: Path) -> None:
-    np.savez(path, pixels=colours[0], senders=colours[1])
+    np.savez(path, pixels=colours[0], clusters=colours[1])
 
 
 def _load_colours(path: Path) -> tuple[np.ndarray, np.ndarray]:
     with np.load(path) as file:
-        return file["pixels"], file["senders"]
+        return file["pixels"], file["clusters"]
 
 
 def frames_folder(assignment: Assignment, place: Place, dated: list[DatedAlbedo]) -> Path:

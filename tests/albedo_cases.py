@@ -9,20 +9,20 @@ from functools import cache
 import numpy as np
 from affine import Affine
 
-from seasonscapes.albedo.forward import Land, trace_land
+from seasonscapes.albedo.forward_model import TexelTransport, trace_texel_transport
 from seasonscapes.cameras.observation import Observation
 from seasonscapes.cameras.pinhole import Camera, rotation_from_angles
 from seasonscapes.frames import LocalFrame, direction_from_angles
 from seasonscapes.rendering.backend import use_backend
 from seasonscapes.rendering.hosek import hosek_illumination
+from seasonscapes.rendering.mitsuba_scene import mi_mesh, relight
 from seasonscapes.rendering.radiance import render_view
-from seasonscapes.rendering.scene import mi_mesh, relight
-from seasonscapes.rendering.transport import Effort
+from seasonscapes.rendering.transport import SamplingOptions
 from seasonscapes.sky.illumination import Illumination
 from seasonscapes.terrain.imagery import bake_imagery
 from seasonscapes.terrain.mesh import build_mesh
 from seasonscapes.terrain.surface import Raster, Terrain
-from seasonscapes.terrain.synthetic import SyntheticPlace, alpine_albedo, alpine_massif
+from seasonscapes.terrain.synthetic import SyntheticMassif, alpine_albedo, alpine_massif
 from seasonscapes.terrain.unwrap import unwrap
 
 SUNS_DEG = ((110.0, 22.0), (150.0, 40.0), (200.0, 42.0), (250.0, 20.0))
@@ -35,13 +35,13 @@ SIZE_PX = (108, 72)
 class Case:
     """The place, its truth, and pictures ``[time][camera]`` ``(H, W, 3)`` [cd/m²]."""
 
-    place: SyntheticPlace
+    place: SyntheticMassif
     terrain: Terrain
     albedo: np.ndarray
     cameras: list[Camera]
     lights: list[Illumination]
     pictures: list[list[np.ndarray]]
-    land: Land
+    land: TexelTransport
 
     def observations(self, times=None, *, image_of=lambda image: image) -> tuple[list[Observation], list[Illumination]]:
         """Observations of some of the hours, and the light of each."""
@@ -73,7 +73,9 @@ def case() -> Case:
         ]
         for t, light in enumerate(lights)
     ]
-    land = trace_land(terrain, albedo.shape[:2], effort=Effort(subpixels=1, rays=128, listed=64, senders=1024, rank=24))
+    land = trace_texel_transport(
+        terrain, albedo.shape[:2], sampling=SamplingOptions(subpixels=1, rays=128, listed=64, clusters=1024, rank=24)
+    )
     return Case(place, terrain, albedo, cameras, lights, pictures, land)
 
 

@@ -8,21 +8,21 @@ import numpy as np
 from oracles_atmosphere import Walk, many_times_scattered, observer, once_scattered
 
 from seasonscapes.frames import angles_from_direction, direction_from_angles
-from seasonscapes.sky.air import TOP_HEIGHT_M, Atmosphere, delta_scaled, gas_phase, optics
-from seasonscapes.sky.atmosphere import (
+from seasonscapes.sky.atmosphere import TOP_HEIGHT_M, Atmosphere, delta_scaled, gas_phase, optics
+from seasonscapes.sky.aureole import spread_aerosol_phase
+from seasonscapes.sky.clear_sky import (
     atmosphere_tables,
     illumination_from_atmosphere,
     sky_radiance_map,
     sun_luminary,
     true_elevation_deg,
 )
-from seasonscapes.sky.aureole import spread_aerosol_phase
-from seasonscapes.sky.cells import sample_cells, scattering_per_m
+from seasonscapes.sky.curved_rays import sun_transfer, towards_sun, trace_curved_rays
 from seasonscapes.sky.illumination import diffuse_horizontal_illuminance, direct_horizontal_illuminance, luminance
-from seasonscapes.sky.moments import HARMONIC_ORDER, SUN_ELEVATION_KNOTS_DEG, diffuse_source, sun_geometry
-from seasonscapes.sky.paths import sun_transfer, towards_sun, trace_rays
+from seasonscapes.sky.observer_radiance import observed_sky, observer_view, sky_radiance
+from seasonscapes.sky.ray_cells import sample_cells, scattering_per_m
 from seasonscapes.sky.scattering import AtmosphereTables
-from seasonscapes.sky.seen import observer_view, seen_sky, sky_radiance
+from seasonscapes.sky.sh_moments import HARMONIC_ORDER, SUN_ELEVATION_KNOTS_DEG, diffuse_source, sun_geometry
 from seasonscapes.sky.spectrum import RGB_FROM_XYZ, WAVELENGTHS_NM, rgb_from_transfer
 
 # What SPECTRL2 takes its aerosol to be, at the eye's wavelengths (Bird & Riordan 1986, table 3: rural).
@@ -119,7 +119,7 @@ def against_oracle(
     weights = np.array([0.2126390, 0.7151687, 0.0721923]) @ rgb_from_transfer()
     truth = weights @ (once + many)
     if np.isinf(distance_m):
-        light = seen_sky(tables, observer_view(tables, height_m), sun, np.radians(sun_elevation_deg), np.ones(9))
+        light = observed_sky(tables, observer_view(tables, height_m), sun, np.radians(sun_elevation_deg), np.ones(9))
         ours = luminance(sky_radiance(light, direction))
     else:
         air = illumination_from_atmosphere(tables, sun, height_m, shape=(2, 4)).aerial_perspective
@@ -144,7 +144,7 @@ def dense_airlight(
     plain = optics(atmosphere)
     scaled = delta_scaled(plain, HARMONIC_ORDER)
     floor_m = atmosphere.ground_height_m - 2000.0
-    paths = trace_rays(atmosphere, height_m, np.radians([elevation_deg]), floor_m=floor_m)
+    paths = trace_curved_rays(atmosphere, height_m, np.radians([elevation_deg]), floor_m=floor_m)
     edges = np.linspace(0.0, 1.0, cells + 1)[None] ** 1.5 * min(distance_m, paths.distance_m[0, -1])
     samples = sample_cells(atmosphere, scaled, paths, edges)
     turn = np.radians([azimuth_deg - sun_azimuth_deg])

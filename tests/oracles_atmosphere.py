@@ -1,6 +1,6 @@
 """The atmosphere once more, slow and plain: straight rays, quadrature for one scattering, random walks for the rest.
 
-Shares with the package what the air is made of (`seasonscapes.sky.air`), and nothing of how light goes through it: no
+Shares with the package what the air is made of (`seasonscapes.sky.atmosphere`), and nothing of how light goes through it: no
 tables, no moments, no interpolation. Spectral, nine bands along each path. The sun is a point; there is no refraction.
 All radiances are transfers [1/sr]: over the sun's spectral irradiance above the air.
 """
@@ -11,7 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from seasonscapes.sky.air import TOP_HEIGHT_M, Atmosphere, aerosol_phase, constituent_densities, gas_phase, optics
+from seasonscapes.sky.atmosphere import (
+    TOP_HEIGHT_M,
+    Atmosphere,
+    aerosol_phase,
+    constituent_densities,
+    gas_phase,
+    optics,
+)
 from seasonscapes.sky.spectrum import WAVELENGTHS_NM
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(40)

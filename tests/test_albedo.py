@@ -7,24 +7,24 @@ import numpy as np
 import pytest
 from albedo_cases import Case, case, psnr
 
-from seasonscapes.albedo import corrections, equations, grouping, haze, response
-from seasonscapes.albedo.closed_form import Effort, solve_albedo
-from seasonscapes.albedo.forward import ambient_on_texels, surface_radiance
-from seasonscapes.albedo.inverse import Extra, InverseOptions, refine_albedo
-from seasonscapes.albedo.mitsuba_pictures import SKY, differentiable_views, mi_picture
+from seasonscapes.albedo import corrections, equations, haze, season_grouping, tone_curve
+from seasonscapes.albedo.closed_form import SolverOptions, solve_albedo
+from seasonscapes.albedo.differentiable_views import SKY, differentiable_views, mi_picture
+from seasonscapes.albedo.forward_model import ambient_on_texels, predicted_surface_radiance
+from seasonscapes.albedo.inverse import ExtraUnknown, InverseOptions, refine_albedo
 from seasonscapes.albedo.painted import painted_radiance
-from seasonscapes.albedo.shots import EIGHT_BIT, Shot, make_shots
-from seasonscapes.albedo.uncertainty import KnownAlbedo, known_albedo, usable_sigma
+from seasonscapes.albedo.photographs import EIGHT_BIT, AlbedoPhotograph, prepare_photographs
+from seasonscapes.albedo.standard_error import KnownAlbedo, finite_sigma, known_albedo
 from seasonscapes.commands.corrected_albedo import complete_known
 from seasonscapes.evaluation.webcam_faults import WebcamFaults, degrade
 from seasonscapes.frames import direction_from_angles
 from seasonscapes.images import linear_from_srgb
 from seasonscapes.rendering.hosek import hosek_illumination
-from seasonscapes.rendering.reception import luminaries
+from seasonscapes.rendering.receivers import luminaries
 from seasonscapes.terrain.atlas import measure_atlas
-from seasonscapes.texturing.guides import guides_for
+from seasonscapes.texturing.predictors import predictors_for
 
-QUICK = Effort(rounds=4, iterations=10)
+QUICK = SolverOptions(rounds=4, iterations=10)
 
 
 @pytest.fixture(scope="module")
@@ -33,23 +33,27 @@ def place() -> Case:
 
 
 @pytest.fixture(scope="module")
-def shots(place) -> list[Shot]:
+def photographs(place) -> list[AlbedoPhotograph]:
     observations, lights = place.observations()
-    return make_shots(place.land, observations, lights, gains=[np.ones(3)] * len(observations))
+    return prepare_photographs(place.land, observations, lights, gains=[np.ones(3)] * len(observations))
 
 
 @pytest.fixture(scope="module")
-def clean(place, shots):
-    return solve_albedo(place.land, shots)
+def clean(place, photographs):
+    return solve_albedo(place.land, photographs)
 
 
-def webcam_shots(place, shots, faults, seed=3) -> list[Shot]:
+def webcam_shots(place, photographs, faults, seed=3) -> list[AlbedoPhotograph]:
     rng = np.random.default_rng(seed)
     found = []
-    for shot in shots:
-        levels, _ = degrade(shot.observation.image, faults, rng)
+    for photograph in photographs:
+        levels, _ = degrade(photograph.observation.image, faults, rng)
         found.append(
-            replace(shot, observation=replace(shot.observation, image=linear_from_srgb(levels / 255.0)), gain=None)
+            replace(
+                photograph,
+                observation=replace(photograph.observation, image=linear_from_srgb(levels / 255.0)),
+                gain=None,
+            )
         )
     return found
 
@@ -57,33 +61,37 @@ def webcam_shots(place, shots, faults, seed=3) -> list[Shot]:
 # ---------------------------------------------------------------------------------------------- linear parts
 
 
-def test_footprints_equal_path_tracing(place, shots):
+def test_footprints_equal_path_tracing(place, photographs):
     """The true albedo through footprints and daylight of texels is what a path tracer sees."""
     ratios = []
-    for shot in shots:
-        ambient = ambient_on_texels(place.land, shot.light, place.albedo)
-        seen = surface_radiance(shot.footprints, shot.number, (shot.light, ambient), place.albedo.reshape(-1, 3))
-        whole = shot.footprints.coverage > 0.999
-        ratios.append((seen / np.maximum(shot.observation.image.reshape(-1, 3)[shot.footprints.pixel], 1e-6))[whole])
+    for photograph in photographs:
+        ambient = ambient_on_texels(place.land, photograph.light, place.albedo)
+        seen = predicted_surface_radiance(
+            photograph.footprints, photograph.number, (photograph.light, ambient), place.albedo.reshape(-1, 3)
+        )
+        whole = photograph.footprints.coverage > 0.999
+        ratios.append(
+            (seen / np.maximum(photograph.observation.image.reshape(-1, 3)[photograph.footprints.pixel], 1e-6))[whole]
+        )
     ratios = np.concatenate(ratios)
     assert np.median(ratios) == pytest.approx(1.0, abs=0.01)
     assert np.median(np.abs(ratios - 1.0)) < 0.04, "the rest is the noise of 64 samples"
 
 
-def test_rows_are_means_of_the_texture(shots):
-    footprints = shots[0].footprints
+def test_rows_are_means_of_the_texture(photographs):
+    footprints = photographs[0].footprints
     ones = footprints.matrix(footprints.share) @ np.ones(footprints.shape[0] * footprints.shape[1], np.float32)
     np.testing.assert_allclose(ones, footprints.coverage, rtol=1e-4)
     for values in footprints.sunlit[0]:
         assert (values <= footprints.share * 1.0001 + 1e-7).all(), "no cosine exceeds one"
 
 
-def test_adjoint_is_the_transpose(place, shots):
+def test_adjoint_is_the_transpose(place, photographs):
     rng = np.random.default_rng(0)
-    row = equations.rows_of(shots[4], EIGHT_BIT, place.albedo.size // 3)
-    row.ambient = ambient_on_texels(place.land, shots[4].light, place.albedo)
+    row = equations.equations_of(photographs[4], EIGHT_BIT, place.albedo.size // 3)
+    row.ambient = ambient_on_texels(place.land, photographs[4].light, place.albedo)
     a = rng.random((place.albedo.size // 3, 3), np.float32)
-    model, _ = equations.model_of(row, a)
+    model, _ = equations.forward_product(row, a)
     r = rng.random(model.shape, np.float32)
     left, right = (model.astype(float) * r).sum(), (a.astype(float) * equations.adjoint(row, r)).sum()
     assert left == pytest.approx(right, rel=1e-5)
@@ -99,25 +107,28 @@ def test_clean_pictures_give_the_albedo(place, clean):
     assert np.median(clean.albedo[seen] / place.albedo[seen]) == pytest.approx(1.0, abs=0.01)
 
 
-def test_never_sunlit_texels_are_as_good(place, shots, clean):
+def test_never_sunlit_texels_are_as_good(place, photographs, clean):
     lit = np.zeros(place.albedo.shape[:2], bool).ravel()
-    for shot in shots:
-        for values in shot.footprints.sunlit[shot.number]:
-            lit |= np.bincount(shot.footprints.texel, values, len(lit)) > 0.0
+    for photograph in photographs:
+        for values in photograph.footprints.sunlit[photograph.number]:
+            lit |= np.bincount(photograph.footprints.texel, values, len(lit)) > 0.0
     shaded = (clean.seen >= 2.0) & ~lit.reshape(clean.seen.shape)
     assert shaded.sum() > 20
     assert np.abs(clean.albedo - place.albedo)[shaded].sum() / place.albedo[shaded].sum() < 0.08
 
 
-def test_webcam_pictures(place, shots):
+def test_webcam_pictures(place, photographs):
     fit = solve_albedo(
-        place.land, webcam_shots(place, shots, WebcamFaults(tone_strength=0.0)), trust=EIGHT_BIT, effort=QUICK
+        place.land,
+        webcam_shots(place, photographs, WebcamFaults(tone_strength=0.0)),
+        noise_model=EIGHT_BIT,
+        solver=QUICK,
     )
     assert psnr(fit.albedo, place.albedo, fit.seen >= 1.0) > 24.0
 
 
-def test_corrections_are_far_behind(place, shots, clean):
-    painted = painted_radiance(shots, clean.gains)
+def test_corrections_are_far_behind(place, photographs, clean):
+    painted = painted_radiance(photographs, clean.gains)
     normal = np.tile([0.0, 0.0, 1.0], (place.albedo.size // 3, 1))
     normal[place.land.texel] = place.land.normal
     seen, best = clean.seen >= 1.0, 0.0
@@ -140,8 +151,8 @@ def test_wrong_light_is_clearly_worse(place, clean, wrong):
         azimuth = azimuth + 16.0 if wrong == "hour" else -azimuth
         turned[id(light)] = hosek_illumination(direction_from_angles(azimuth, elevation), shape=(64, 128))
     lights = [turned[id(light)] for light in lights]
-    shots = make_shots(place.land, observations, lights, gains=[np.ones(3)] * len(lights))
-    fit = solve_albedo(place.land, shots, effort=QUICK)
+    photographs = prepare_photographs(place.land, observations, lights, gains=[np.ones(3)] * len(lights))
+    fit = solve_albedo(place.land, photographs, solver=QUICK)
     seen = clean.seen >= 1.0
     assert psnr(fit.albedo, place.albedo, seen) < psnr(clean.albedo, place.albedo, seen) - (
         4.0 if wrong == "hour" else 8.0
@@ -149,13 +160,13 @@ def test_wrong_light_is_clearly_worse(place, clean, wrong):
     assert np.median(fit.residual) > 2.0 * np.median(clean.residual), "and the residual tells"
 
 
-def test_response_curve_is_found(place, shots):
-    bent = webcam_shots(place, shots, WebcamFaults(tone_strength=0.4, exposure_sigma_ev=0.2))
-    found = response.fit_response(place.land, bent, share=0.5)
+def test_response_curve_is_found(place, photographs):
+    bent = webcam_shots(place, photographs, WebcamFaults(tone_strength=0.4, exposure_sigma_ev=0.2))
+    found = tone_curve.fit_tone_curve(place.land, bent, share=0.5)
     assert found.strength == pytest.approx(0.4, abs=0.15)
     levels = np.linspace(0.0, 1.0, 50)
     curve = 0.6 * levels + 0.4 * levels**2 * (3.0 - 2.0 * levels)
-    undone = response.without_curve(linear_from_srgb(curve), 0.4)
+    undone = tone_curve.invert_tone_curve(linear_from_srgb(curve), 0.4)
     np.testing.assert_allclose(undone, linear_from_srgb(levels), atol=2e-4)
 
 
@@ -173,18 +184,18 @@ class Fog:
         return transmittance, (1.0 - transmittance) * np.array([5000.0, 6500.0, 8000.0])
 
 
-def test_visibility_is_found(place, shots):
+def test_visibility_is_found(place, photographs):
     true_km = 6.0
     hazy = []
-    for shot in shots:
-        pixel = shot.footprints.pixel
-        image = shot.observation.image.copy()
-        transmittance, airlight = Fog(true_km)(shot.footprints.distance_m, None)
+    for photograph in photographs:
+        pixel = photograph.footprints.pixel
+        image = photograph.observation.image.copy()
+        transmittance, airlight = Fog(true_km)(photograph.footprints.distance_m, None)
         image.reshape(-1, 3)[pixel] = image.reshape(-1, 3)[pixel] * transmittance + airlight
-        hazy.append(replace(shot, observation=replace(shot.observation, image=image.astype(np.float32))))
+        hazy.append(replace(photograph, observation=replace(photograph.observation, image=image.astype(np.float32))))
 
     def lights_of(visibility_km):
-        return [replace(shot.light, aerial_perspective=Fog(visibility_km)) for shot in shots]
+        return [replace(photograph.light, aerial_perspective=Fog(visibility_km)) for photograph in photographs]
 
     found = haze.fit_visibility(place.land, hazy, lights_of, visibilities_km=(2.5, 4.0, 8.0, 16.0), share=0.5)
     assert found.visibility_km == pytest.approx(true_km, rel=0.15)
@@ -197,48 +208,52 @@ def test_visibility_is_found(place, shots):
 # ---------------------------------------------------------------------------------------------- odd sets of pictures
 
 
-def test_a_single_picture_still_answers(place, shots):
-    fit = solve_albedo(place.land, shots[6:7], effort=QUICK)
+def test_a_single_picture_still_answers(place, photographs):
+    fit = solve_albedo(place.land, photographs[6:7], solver=QUICK)
     seen = fit.seen >= 1.0
     assert seen.sum() > 100
     assert psnr(fit.albedo, place.albedo, seen) > 22.0
 
 
-def test_all_clipped_is_an_error(place, shots):
-    white = [replace(s, observation=replace(s.observation, image=np.ones_like(s.observation.image))) for s in shots]
+def test_all_clipped_is_an_error(place, photographs):
+    white = [
+        replace(s, observation=replace(s.observation, image=np.ones_like(s.observation.image))) for s in photographs
+    ]
     with pytest.raises(ValueError, match="all clipped"):
-        solve_albedo(place.land, white, trust=EIGHT_BIT)
+        solve_albedo(place.land, white, noise_model=EIGHT_BIT)
 
 
-def test_night_is_an_error(place, shots):
+def test_night_is_an_error(place, photographs):
     dark = [
         replace(
             s,
             light=replace(s.light, sun=None, sky_radiance=0.0 * s.light.sky_radiance),
             footprints=replace(s.footprints, sunlit=[[] for _ in s.footprints.sunlit]),
         )
-        for s in shots
+        for s in photographs
     ]
     with pytest.raises(ValueError, match="no photograph has any light"):
         solve_albedo(place.land, dark)
 
 
-def test_nothing_fixes_the_exposure(place, shots):
-    blind = [replace(s, gain=None, observation=replace(s.observation, mask=mask_of_terrain(s))) for s in shots]
+def test_nothing_fixes_the_exposure(place, photographs):
+    blind = [replace(s, gain=None, observation=replace(s.observation, mask=mask_of_terrain(s))) for s in photographs]
     with pytest.raises(ValueError, match="nothing fixes the exposure"):
         solve_albedo(place.land, blind)
 
 
-def mask_of_terrain(shot) -> np.ndarray:
-    mask = np.zeros(shot.observation.mask.size, bool)
-    mask[shot.footprints.pixel] = True
-    return mask.reshape(shot.observation.mask.shape)
+def mask_of_terrain(photograph) -> np.ndarray:
+    mask = np.zeros(photograph.observation.mask.size, bool)
+    mask[photograph.footprints.pixel] = True
+    return mask.reshape(photograph.observation.mask.shape)
 
 
-def test_contradicting_times_are_outvoted(place, shots, clean):
+def test_contradicting_times_are_outvoted(place, photographs, clean):
     """A picture with another hour's name: the others outvote it, and its residual gives it away."""
-    swapped = list(shots)
-    swapped[0] = replace(shots[0], observation=replace(shots[0].observation, image=shots[9].observation.image))
+    swapped = list(photographs)
+    swapped[0] = replace(
+        photographs[0], observation=replace(photographs[0].observation, image=photographs[9].observation.image)
+    )
     fit = solve_albedo(place.land, swapped)
     seen = clean.seen >= 1.0
     assert psnr(fit.albedo, place.albedo, seen) > psnr(clean.albedo, place.albedo, seen) - 6.0
@@ -249,12 +264,12 @@ def test_contradicting_times_are_outvoted(place, shots, clean):
 
 
 @pytest.mark.parametrize("name", ["albedo", "sun", "sky", "haze", "log_gain"])
-def test_gradients_equal_finite_differences(place, shots, name):
+def test_gradients_equal_finite_differences(place, photographs, name):
     """Within 2 %, from independent random numbers."""
     import drjit as dr
     import mitsuba as mi
 
-    foggy = [replace(s, light=replace(s.light, aerial_perspective=Fog(8.0))) for s in shots[3:5]]
+    foggy = [replace(s, light=replace(s.light, aerial_perspective=Fog(8.0))) for s in photographs[3:5]]
     views = differentiable_views(place.terrain, place.albedo, foggy)
 
     def value(x, seed):
@@ -273,35 +288,37 @@ def test_gradients_equal_finite_differences(place, shots, name):
     assert float(dr.grad(x)[0]) == pytest.approx((slope[0] - slope[1]) / (2.0 * step), rel=0.02)
 
 
-def test_refinement_saves_resumes_and_takes_extras(place, shots, clean, tmp_path):
-    poor = solve_albedo(place.land, shots, effort=Effort(rounds=1))
+def test_refinement_saves_resumes_and_takes_extras(place, photographs, clean, tmp_path):
+    poor = solve_albedo(place.land, photographs, solver=SolverOptions(rounds=1))
     seen = clean.seen >= 1.0
     told, file = [], tmp_path / "state.npz"
     options = InverseOptions(unknowns=("albedo",), levels=(1,), iterations=24, check_every=8, spp=8)
-    done = refine_albedo(place.terrain, place.land, shots, poor, options=options, callbacks=[told.append], resume=file)
+    done = refine_albedo(
+        place.terrain, place.land, photographs, poor, options=options, callbacks=[told.append], resume=file
+    )
     assert psnr(done.fit.albedo, place.albedo, seen) > psnr(poor.albedo, place.albedo, seen)
     assert len(told) == len(done.history)
     assert any("held_out" in record for record in done.history)
-    again = refine_albedo(place.terrain, place.land, shots, poor, options=options, resume=file)
+    again = refine_albedo(place.terrain, place.land, photographs, poor, options=options, resume=file)
     assert len(again.history) == len(done.history), "a finished state has nothing left to do"
-    brighter = {SKY: Extra(np.array([1.3]), low=0.1, high=3.0, step=0.02)}
+    brighter = {SKY: ExtraUnknown(np.array([1.3]), low=0.1, high=3.0, step=0.02)}
     options = InverseOptions(unknowns=(), levels=(1,), iterations=20, check_every=5, spp=4)
-    found = refine_albedo(place.terrain, place.land, shots, clean, options=options, extra=brighter)
+    found = refine_albedo(place.terrain, place.land, photographs, clean, options=options, extra=brighter)
     assert abs(found.values[SKY][0] - 1.0) < 0.2, "the sky's own scale is found again"
 
 
-def test_refinement_refuses(place, shots, clean):
+def test_refinement_refuses(place, photographs, clean):
     with pytest.raises(ValueError, match="two photographs"):
-        refine_albedo(place.terrain, place.land, shots[:1], clean)
+        refine_albedo(place.terrain, place.land, photographs[:1], clean)
     with pytest.raises(ValueError, match="colour"):
-        refine_albedo(place.terrain, place.land, shots, clean, options=InverseOptions(unknowns=("colour",)))
+        refine_albedo(place.terrain, place.land, photographs, clean, options=InverseOptions(unknowns=("colour",)))
 
 
 # ---------------------------------------------------------------------------------------------- uncertainty, seasons
 
 
-def test_uncertainty_ranks_errors_and_gaps_are_marked(place, shots, clean):
-    known = known_albedo(place.land, shots, clean)
+def test_uncertainty_ranks_errors_and_gaps_are_marked(place, photographs, clean):
+    known = known_albedo(place.land, photographs, clean)
     measured = known.source == 1
     error = np.abs(known.albedo - place.albedo)[..., 1]
     low, high = np.quantile(known.sigma[measured], [0.33, 0.67])
@@ -312,30 +329,30 @@ def test_uncertainty_ranks_errors_and_gaps_are_marked(place, shots, clean):
     assert np.isinf(known.sigma[~measured]).all()
 
 
-def test_gaps_are_completed_and_marked(place, shots, clean):
+def test_gaps_are_completed_and_marked(place, photographs, clean):
     """From relief alone they beat one colour for all; from an image that is too dark and noisy, by far."""
     height, width = place.albedo.shape[:2]
-    guides = guides_for(place.terrain, measure_atlas(place.terrain, "planar", width, height))
-    known = known_albedo(place.land, shots, clean)
+    predictors = predictors_for(place.terrain, measure_atlas(place.terrain, "planar", width, height))
+    known = known_albedo(place.land, photographs, clean)
     measured = known.source == 1
-    gap = guides.surface & ~measured
+    gap = predictors.surface & ~measured
 
     def error(albedo: np.ndarray) -> float:
         return float(np.abs(albedo - place.albedo)[gap].mean())
 
     flat = error(np.broadcast_to(np.median(place.albedo[measured], axis=0), place.albedo.shape))
-    bare = complete_known(known, clean, None, guides)
+    bare = complete_known(known, clean, None, predictors)
     assert (bare.source[gap] == 2).all()
     assert (bare.source[measured] == 1).all()
-    assert np.isfinite(bare.sigma[guides.surface]).all()
+    assert np.isfinite(bare.sigma[predictors.surface]).all()
     assert error(bare.albedo) < flat
     image = 0.6 * place.albedo * np.random.default_rng(1).normal(1.0, 0.1, place.albedo.shape)
     image = np.maximum(image, 0.01).astype(np.float32)
-    corrected = complete_known(known, clean, image, guides)
+    corrected = complete_known(known, clean, image, predictors)
     assert error(corrected.albedo) < 0.6 * min(error(bare.albedo), error(image))
     seen = clean.seen >= 0.5
-    poor = seen & (usable_sigma(clean) > np.quantile(usable_sigma(clean)[seen], 0.9))
-    well = seen & (usable_sigma(clean) < np.median(usable_sigma(clean)[seen]))
+    poor = seen & (finite_sigma(clean) > np.quantile(finite_sigma(clean)[seen], 0.9))
+    well = seen & (finite_sigma(clean) < np.median(finite_sigma(clean)[seen]))
     before, after = (np.abs(values - place.albedo).mean(axis=2) for values in (clean.albedo, corrected.albedo))
     assert after[poor].mean() < 0.8 * before[poor].mean(), "what was seen badly gives way"
     assert after[well].mean() < 1.1 * before[well].mean(), "what was seen well stays"
@@ -357,8 +374,8 @@ def _snow_above(line_m: float) -> KnownAlbedo:
 def test_dates_are_grouped_by_their_snow():
     first, second, same = _snow_above(2900.0), _snow_above(2300.0), _snow_above(2890.0)
     days = [date(2024, 9, 10), date(2024, 11, 9), date(2024, 9, 20)]
-    assert grouping.group_dates(days, [first, second, same]) == [[0, 2], [1]]
-    shared = grouping.share_static([first, second])
+    assert season_grouping.group_dates(days, [first, second, same]) == [[0, 2], [1]]
+    shared = season_grouping.share_unchanged([first, second])
     static = np.abs(first.albedo - second.albedo).max(axis=2) < 0.01
     assert (shared[0].sigma[static] < first.sigma[static]).mean() > 0.95, "evidence is joined"
     changed = np.abs(first.albedo - second.albedo)[..., 1] > 0.2

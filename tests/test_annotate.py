@@ -9,13 +9,23 @@ from functools import partial
 import numpy as np
 import pytest
 
+from seasonscapes.calibration.annotation import (
+    AnnotationSession,
+    add_match,
+    describe_position,
+    position_at,
+    remove_last_match,
+    save_session,
+    serve_session,
+    session_state,
+    solve_session,
+)
+from seasonscapes.calibration.calibration_file import read_calibration
 from seasonscapes.calibration.evidence import Priors, read_points
-from seasonscapes.calibration.picker import PickSession, describe, pick, place_at, save, serve, solve, undo, where
 from seasonscapes.calibration.pose_model import project_values, values_of
-from seasonscapes.calibration.record import read_calibration
-from seasonscapes.calibration.rehearsal_pictures import picture_trial
 from seasonscapes.calibration.terrain_view import look_at_rasters, look_with, scaled_view
 from seasonscapes.declaration import InputError
+from seasonscapes.evaluation.calibration_pictures import picture_trial
 
 SIZE = (640, 427)
 
@@ -28,7 +38,7 @@ def trial():
 @pytest.fixture
 def session(trial, tmp_path):
     look = partial(look_at_rasters, rasters=trial.rasters, frame=trial.frame, nearest_m=120.0)
-    return PickSession(
+    return AnnotationSession(
         "HUT",
         trial.image,
         trial.start,
@@ -51,7 +61,7 @@ def good_places(session, trial, count):
         at = rng.uniform([5, 5], [width - 5, height - 5])
         if not np.isfinite(session.seen.position_m[int(at[1]), int(at[0])]).all():
             continue
-        pixel = true_pixel(trial, place_at(session, at))
+        pixel = true_pixel(trial, position_at(session, at))
         if (
             5 < pixel[0] < SIZE[0] - 5
             and 5 < pixel[1] < SIZE[1] - 5
@@ -63,30 +73,30 @@ def good_places(session, trial, count):
 
 def test_what_is_picked_is_the_first_surface_and_the_sky_is_refused(session, trial):
     y, x = np.argwhere(np.isfinite(session.seen.distance_m))[5000]
-    place = place_at(session, (x + 0.5, y + 0.5))
+    place = position_at(session, (x + 0.5, y + 0.5))
     pixel, _ = project_values(session.shown, np.eye(3), values_of(session.shown, np.eye(3)), place[None])
     assert np.abs(pixel[0] - [x + 0.5, y + 0.5]).max() < 1.0
     sky = np.argwhere(~np.isfinite(session.seen.distance_m))[0]
     with pytest.raises(ValueError, match="that is sky"):
-        pick(session, (5, 5), (sky[1], sky[0]))
-    assert where(session, (sky[1], sky[0])) is None
+        add_match(session, (5, 5), (sky[1], sky[0]))
+    assert describe_position(session, (sky[1], sky[0])) is None
     with pytest.raises(ValueError, match="outside the photograph"):
-        pick(session, (SIZE[0] + 9, 5), (x, y))
+        add_match(session, (SIZE[0] + 9, 5), (x, y))
     with pytest.raises(ValueError, match="no pair to take back"):
-        undo(session)
+        remove_last_match(session)
 
 
 def test_pairs_solve_to_the_truth_and_are_saved(session, trial):
     for at in good_places(session, trial, 8):
-        pick(session, true_pixel(trial, place_at(session, at)), at)
-    before = [np.subtract(p["projected"], p["photo"]) for p in describe(session)["pairs"]]
-    solve(session)
-    after = [np.subtract(p["projected"], p["photo"]) for p in describe(session)["pairs"]]
+        add_match(session, true_pixel(trial, position_at(session, at)), at)
+    before = [np.subtract(p["projected"], p["photo"]) for p in session_state(session)["pairs"]]
+    solve_session(session)
+    after = [np.subtract(p["projected"], p["photo"]) for p in session_state(session)["pairs"]]
     assert np.abs(before).max() > 20.0
     assert np.abs(after).max() < 0.05
     heading = values_of(trial.truth, np.eye(3))[0]
     assert session.solution.values[0] == pytest.approx(heading, abs=0.02)
-    points, record = save(session)
+    points, record = save_session(session)
     assert len(read_points(points, trial.frame)) == 8
     again = read_calibration(record)
     assert np.allclose(again.view.world_from_camera, session.solution.view.world_from_camera, atol=1e-12)
@@ -116,7 +126,7 @@ def test_a_renderer_can_take_the_marchers_place(session, trial):
 
 
 def test_the_server_answers_only_here_and_only_with_its_token(session):
-    server, address = serve(session)
+    server, address = serve_session(session)
     try:
         assert server.server_address[0] == "127.0.0.1"
         root = address.split("?")[0]
@@ -190,13 +200,13 @@ def test_the_page_from_click_to_file_in_chromium(session, trial, browser):
     def message():
         return browser.find_element(By.ID, "message").text
 
-    server, address = serve(session)
+    server, address = serve_session(session)
     try:
         browser.get(address)
         until(lambda: data("photo") == "ready" and data("terrain") == "ready")
         places = good_places(session, trial, 7)
         for number, at in enumerate(places, 1):
-            click("photo", true_pixel(trial, place_at(session, at)))
+            click("photo", true_pixel(trial, position_at(session, at)))
             until(lambda: "same feature in the terrain" in message())
             click("terrain", at)
             until(lambda n=number: data("pairs") == str(n))

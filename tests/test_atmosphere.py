@@ -16,8 +16,8 @@ from atmosphere_cases import (
 )
 
 from seasonscapes.frames import direction_from_angles, equirectangular_directions
-from seasonscapes.sky.air import Atmosphere, optics
-from seasonscapes.sky.atmosphere import (
+from seasonscapes.sky.atmosphere import Atmosphere, optics
+from seasonscapes.sky.clear_sky import (
     illumination_from_atmosphere,
     load_tables,
     save_tables,
@@ -25,9 +25,9 @@ from seasonscapes.sky.atmosphere import (
     sun_luminary,
     true_elevation_deg,
 )
+from seasonscapes.sky.curved_rays import SUN_RADIUS_DEG, sun_columns, sun_transfer
 from seasonscapes.sky.illumination import diffuse_horizontal_illuminance, luminance
-from seasonscapes.sky.paths import SUN_RADIUS_DEG, sun_columns, sun_transfer
-from seasonscapes.sky.seen import DISTANCE_EDGES_M
+from seasonscapes.sky.observer_radiance import DISTANCE_EDGES_M
 from seasonscapes.sky.spectrum import rgb_from_transfer
 
 D65 = np.array([0.3127, 0.3290])

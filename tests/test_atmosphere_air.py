@@ -6,7 +6,7 @@ import pvlib
 import pytest
 
 from seasonscapes.sky import spectrum
-from seasonscapes.sky.air import (
+from seasonscapes.sky.atmosphere import (
     TOP_HEIGHT_M,
     Atmosphere,
     aerosol_optical_depth_from_turbidity,

@@ -5,12 +5,12 @@ import pytest
 from atmosphere_cases import against_oracle, chromaticity, dense_airlight, homogeneous, tables_of
 
 from seasonscapes.frames import direction_from_angles
-from seasonscapes.sky.aerial import airlight
-from seasonscapes.sky.air import Atmosphere
-from seasonscapes.sky.atmosphere import illumination_from_atmosphere, sky_radiance_map
+from seasonscapes.sky.aerial_perspective import airlight
+from seasonscapes.sky.atmosphere import Atmosphere
+from seasonscapes.sky.clear_sky import illumination_from_atmosphere, sky_radiance_map
+from seasonscapes.sky.curved_rays import horizon_elevation_rad, trace_curved_rays
 from seasonscapes.sky.illumination import luminance
-from seasonscapes.sky.paths import horizon_elevation_rad, trace_rays
-from seasonscapes.sky.seen import observer_view, seen_sky, sky_radiance
+from seasonscapes.sky.observer_radiance import observed_sky, observer_view, sky_radiance
 
 
 @pytest.mark.parametrize("sun_elevation_deg", [60.0, 10.0, 3.0, 0.0, -4.0])
@@ -108,12 +108,12 @@ def test_pieces_of_a_picture_do_not_matter():
 
 def test_rays_without_refraction_are_straight_and_with_it_bend_as_surveyors_know():
     straight = Atmosphere(refraction=False)
-    paths = trace_rays(straight, 1000.0, np.radians([0.0, 3.0, 40.0]))
+    paths = trace_curved_rays(straight, 1000.0, np.radians([0.0, 3.0, 40.0]))
     radius = straight.ground_radius_m + 1000.0
     slope = np.sin(np.radians([0.0, 3.0, 40.0]))[:, None]
     exact = np.sqrt(radius**2 + paths.distance_m**2 + 2 * radius * paths.distance_m * slope) - straight.ground_radius_m
     np.testing.assert_allclose(paths.height_m, exact, atol=5.0)
-    bent = trace_rays(Atmosphere(), 500.0, np.array([0.0]))
+    bent = trace_curved_rays(Atmosphere(), 500.0, np.array([0.0]))
     drop = np.interp(3e4, bent.distance_m[0], bent.height_m[0]) - 500.0
     # A level line of sight: (1 - k) d² / 2R. Standard air has k = 0.16 at sea level; surveyors take 0.13 for warm days.
     assert 1.0 - drop / (3e4**2 / (2 * 6371e3)) == pytest.approx(0.15, abs=0.03)
@@ -124,7 +124,7 @@ def test_sky_and_airlight_share_one_view():
     tables, sun = tables_of(), direction_from_angles(0.0, 15.0)
     view = observer_view(tables, 700.0)
     assert observer_view(tables, 700.0) is view
-    light = seen_sky(tables, view, sun, np.radians(15.0), np.ones(9))
+    light = observed_sky(tables, view, sun, np.radians(15.0), np.ones(9))
     parts = airlight(tables, view, np.radians(15.0), np.ones(9))
     assert parts.shape == (*light.parts.shape[:2], view.near_depth.shape[1], 10)
     above = view.elevation_rad > view.horizon_rad

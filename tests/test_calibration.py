@@ -7,11 +7,11 @@ import pytest
 
 from seasonscapes.calibration.evidence import Correspondences, Priors, read_points, take, write_points
 from seasonscapes.calibration.pose_model import angles_from_rotation
-from seasonscapes.calibration.rehearsal import point_trial, reproject, score_points
-from seasonscapes.calibration.resection import calibrate, leave_one_out, report_lines
+from seasonscapes.calibration.resection import leave_one_out, report_lines, resect
 from seasonscapes.cameras.panorama import project_panorama
 from seasonscapes.cameras.pinhole import Camera, camera_at, project, rotation_from_angles
 from seasonscapes.declaration import InputError
+from seasonscapes.evaluation.calibration_trials import point_trial, reproject, score_points
 from seasonscapes.frames import LocalFrame, enu_from_geodetic
 
 FREE = Priors(horizontal_m=np.inf, vertical_m=np.inf)
@@ -36,7 +36,7 @@ def test_the_solver_projects_as_the_cameras_do(panoramic):
 @pytest.mark.parametrize("loss", ["cauchy", "l1", "squares"])
 def test_clean_matches_give_the_truth_to_the_last_digit(panoramic, loss):
     trial = point_trial(np.random.default_rng(5), panoramic=panoramic, noise_px=0.0, outlier_share=0.0)
-    solved = calibrate(trial.start, trial.points, priors=FREE, loss=loss)
+    solved = resect(trial.start, trial.points, priors=FREE, loss=loss)
     assert np.abs(solved.view.position_m - trial.truth.position_m).max() < 1e-3
     assert np.abs(solved.view.world_from_camera - trial.truth.world_from_camera)[:3, :3].max() < 1e-6
     assert solved.view.fy == pytest.approx(trial.truth.fy, rel=1e-6)
@@ -75,7 +75,7 @@ def test_a_radial_term_is_recovered_and_its_points_named():
 
     trial = point_trial(np.random.default_rng(8), panoramic=False, count=40, noise_px=0.5, outlier_share=0.1)
     pixel = distort(trial.points.pixel, trial.truth, -0.12)
-    solved = calibrate(
+    solved = resect(
         trial.start,
         Correspondences(pixel, trial.points.position_m),
         priors=Priors(horizontal_m=20, vertical_m=20, k1=np.inf),
@@ -88,7 +88,7 @@ def test_a_radial_term_is_recovered_and_its_points_named():
 
 def test_an_unknown_held_fixed_stays_and_has_no_error():
     trial = point_trial(np.random.default_rng(9), panoramic=False, outlier_share=0.0)
-    solved = calibrate(trial.start, trial.points, priors=Priors(horizontal_m=0.0, vertical_m=0.0, focal=0.0))
+    solved = resect(trial.start, trial.points, priors=Priors(horizontal_m=0.0, vertical_m=0.0, focal=0.0))
     assert np.array_equal(solved.view.position_m, trial.start.position_m)
     assert solved.view.fx == trial.start.fx
     assert solved.sigma["east_m"] == solved.sigma["focal"] == 0.0
@@ -124,7 +124,7 @@ def test_matches_that_cannot_be_are_refused_with_a_reason(how, message):
     for seed in (1, 2, 3):
         trial = point_trial(np.random.default_rng(seed), panoramic=False, outlier_share=0.0)
         with pytest.raises(ValueError, match=message):
-            calibrate(trial.start, broken(trial.points, how))
+            resect(trial.start, broken(trial.points, how))
 
 
 def test_a_point_behind_the_camera_is_named():
@@ -132,7 +132,7 @@ def test_a_point_behind_the_camera_is_named():
     position = trial.points.position_m.copy()
     position[4] = 2.0 * trial.truth.position_m - position[4]
     with pytest.raises(ValueError, match="behind the camera: P5"):
-        calibrate(trial.start, Correspondences(trial.points.pixel, position, tuple(f"P{i + 1}" for i in range(12))))
+        resect(trial.start, Correspondences(trial.points.pixel, position, tuple(f"P{i + 1}" for i in range(12))))
 
 
 def test_nan_and_a_camera_below_ground_and_no_evidence_are_refused():
@@ -143,9 +143,9 @@ def test_nan_and_a_camera_below_ground_and_no_evidence_are_refused():
         Correspondences(pixel, trial.points.position_m)
     height = trial.truth.position_m[2]
     with pytest.raises(ValueError, match=r"the start puts the camera \d+ m below ground"):
-        calibrate(trial.start, trial.points, ground_m=lambda e, n: height + 100.0)
+        resect(trial.start, trial.points, ground_m=lambda e, n: height + 100.0)
     with pytest.raises(ValueError, match="neither points nor a skyline"):
-        calibrate(trial.start)
+        resect(trial.start)
     with pytest.raises(ValueError, match="must not be negative or NaN"):
         Priors(focal=-1.0)
 
@@ -154,7 +154,7 @@ def test_what_the_points_leave_open_is_said():
     trial = point_trial(np.random.default_rng(3), panoramic=False, count=12, outlier_share=0.0, noise_px=0.0)
     one = take(trial.points, np.zeros(8, int))
     with pytest.raises(ValueError, match=r"leaves (focal|roll_deg|tilt_deg|heading_deg) open"):
-        calibrate(trial.start, one, noise_px=1.0)
+        resect(trial.start, one, noise_px=1.0)
 
 
 def test_points_survive_their_file(tmp_path):
@@ -199,13 +199,13 @@ def finse(folder):
 def test_finse_resection_with_one_radial_term(data_dir):
     start, points = finse(data_dir)
     priors = Priors(k1=np.inf)
-    solved = calibrate(start, points, priors=priors, loss="squares")
+    solved = resect(start, points, priors=priors, loss="squares")
     assert solved.rms_px < 5.55  # 5.51, the least-squares optimum of this model over all 45 points
     assert solved.k1 == pytest.approx(-0.266, abs=0.01)
     assert solved.values[0] == pytest.approx(61.0, abs=0.1)
     without = leave_one_out(start, points, priors=priors, loss="squares")
     assert np.sqrt(np.mean(np.sum(without**2, axis=1))) < 6.5  # 5.96
-    assert calibrate(start, points, priors=priors).inlier_rms_px < 4.6
+    assert resect(start, points, priors=priors).inlier_rms_px < 4.6
 
 
 @pytest.mark.data
@@ -222,6 +222,6 @@ def test_aletsch_resection(data_dir):
     start: Camera = camera_at(
         frame, 46.4314217, 8.0932999, 2929.0, heading_deg=-63.37, pitch_deg=-11.3, fov_deg=63.08, size_px=(1024, 763)
     )
-    solved = calibrate(start, points, priors=Priors(horizontal_m=100.0, vertical_m=100.0), loss="squares")
+    solved = resect(start, points, priors=Priors(horizontal_m=100.0, vertical_m=100.0), loss="squares")
     assert solved.rms_px < 8.0
     assert solved.values[0] == pytest.approx(296.9, abs=0.3)

@@ -8,20 +8,20 @@ from affine import Affine
 
 from seasonscapes.calibration.boundary_map import boundary_map, picture_area
 from seasonscapes.calibration.evidence import Correspondences, Priors
-from seasonscapes.calibration.horizon import horizon_from, terrain_height, terrain_profile
 from seasonscapes.calibration.overlay import draw_overlay, save_overlay
 from seasonscapes.calibration.pose_model import project_values, values_of, view_from_values
-from seasonscapes.calibration.rehearsal_pictures import panorama_trial, picture_trial
-from seasonscapes.calibration.resection import calibrate
-from seasonscapes.calibration.skyline import Search, align_to_skyline, encoded_from_file
+from seasonscapes.calibration.resection import resect
+from seasonscapes.calibration.skyline import SearchRange, align_to_skyline, encoded_from_file
+from seasonscapes.calibration.terrain_horizon import horizon_from, terrain_height, terrain_profile
 from seasonscapes.cameras.pinhole import camera_at
+from seasonscapes.evaluation.calibration_pictures import panorama_trial, picture_trial
 from seasonscapes.frames import MEAN_RADIUS_M, LocalFrame, enu_from_geodetic, geodetic_from_enu
 from seasonscapes.terrain.crs import geodetic_from_map, map_from_geodetic
 from seasonscapes.terrain.raster import read_elevation
 from seasonscapes.terrain.surface import Raster
 
 CRS, EAST, NORTH = "EPSG:25832", 500_000.0, 5_160_000.0
-REHEARSAL = Search(priors=Priors(tilt_deg=2.0, roll_deg=1.0, horizontal_m=3.0, vertical_m=2.0, focal=0.0))
+REHEARSAL = SearchRange(priors=Priors(tilt_deg=2.0, roll_deg=1.0, horizontal_m=3.0, vertical_m=2.0, focal=0.0))
 
 
 SIZE = (800, 534)
@@ -160,7 +160,7 @@ def test_a_hazy_picture_with_a_roof_in_it_is_aligned_and_trusted(fit, trial):
 
 def test_a_full_panorama_finds_its_heading_its_horizon_row_and_its_lean():
     trial = panorama_trial(np.random.default_rng(3), size_px=(2400, 280))
-    search = Search(
+    search = SearchRange(
         tilt_deg=3.0, priors=Priors(tilt_deg=1.0, roll_deg=1.0, horizontal_m=3.0, vertical_m=3.0, focal=0.02)
     )
     fit = align_to_skyline(trial.image, trial.start, trial.rasters, trial.frame, search=search)
@@ -262,8 +262,8 @@ def test_finse_by_its_skyline_alone(data_dir):
         enu_from_geodetic(frame, *at, column(rows, "z_world")),
     )
     start = camera_at(frame, latitude, longitude, 1212.0, heading_deg=66.0, fov_deg=65.8, size_px=(1920, 1080))
-    by_points = calibrate(start, points, priors=Priors(k1=np.inf))
-    search = Search(
+    by_points = resect(start, points, priors=Priors(k1=np.inf))
+    search = SearchRange(
         tilt_deg=10.0,
         focal=0.06,
         priors=Priors(tilt_deg=10.0, roll_deg=3.0, horizontal_m=3.0, vertical_m=3.0, focal=0.05, k1=0.1),

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from places import write_place
 
-from seasonscapes.calibration.record import read_calibration
+from seasonscapes.calibration.calibration_file import read_calibration
 from seasonscapes.cameras.observation import ManifestRow, write_manifest
 from seasonscapes.cameras.pinhole import project
 from seasonscapes.cli import main

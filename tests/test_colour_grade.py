@@ -9,7 +9,7 @@ from seasonscapes.cameras.colour_grade import (
     Response,
     apply_grade,
     encoded_from_linear,
-    fit_response,
+    fit_response_curve,
     linear_from_encoded,
     named_grade,
     undo_grade,
@@ -81,7 +81,7 @@ def test_a_response_is_found_from_pairs_some_of_which_are_wrong():
     light = rng.uniform(0.001, 1.0, (3000, 3)) ** 2
     encoded = camera_curve(light) + rng.normal(0, 0.01, light.shape)
     encoded[:150] = rng.uniform(0, 1, (150, 3))
-    found = fit_response(encoded, 700.0 * light)
+    found = fit_response_curve(encoded, 700.0 * light)
     test_light = np.linspace(0.03, 0.9, 200)[:, None] * np.ones(3)
     recovered = linear_from_encoded(camera_curve(test_light), found)
     ratio = recovered / test_light
@@ -96,8 +96,10 @@ def test_srgb_is_the_default_and_useless_pairs_are_refused():
     assert np.allclose(linear_from_encoded(codes), linear_from_srgb(codes / 255.0))
     assert np.allclose(encoded_from_linear(linear_from_encoded(codes)) * 255, codes, atol=1e-3)
     with pytest.raises(ValueError, match="at least 20 are needed"):
-        fit_response(np.full((5, 3), 0.5), np.ones((5, 3)))
+        fit_response_curve(np.full((5, 3), 0.5), np.ones((5, 3)))
     with pytest.raises(ValueError, match="do not rise together"):
-        fit_response(np.linspace(0.1, 0.9, 99)[:, None] * np.ones(3), np.linspace(1, 0.1, 99)[:, None] * np.ones(3))
+        fit_response_curve(
+            np.linspace(0.1, 0.9, 99)[:, None] * np.ones(3), np.linspace(1, 0.1, 99)[:, None] * np.ones(3)
+        )
     with pytest.raises(ValueError, match="strictly increasing"):
         Response(np.zeros((3, 5)))

@@ -12,17 +12,17 @@ from seasonscapes.commands.options import SkyOptions, ViewOptions
 from seasonscapes.errors import InputError
 from seasonscapes.frames import LocalFrame
 from seasonscapes.pipeline import MeshOptions, albedo_for, load_place
-from seasonscapes.terrain.holes import harmonic_fill
+from seasonscapes.terrain.hole_filling import harmonic_fill
 from seasonscapes.terrain.mesh import build_mesh
 from seasonscapes.terrain.surface import Raster, Texture, load_texture, save_texture
 from seasonscapes.terrain.unwrap import unwrap
-from seasonscapes.texturing.complete import INPAINTERS, complete
-from seasonscapes.texturing.guides import guides_for, stack_guides
-from seasonscapes.texturing.land import horizon_tangent, land_layers, sun_margin_deg
+from seasonscapes.texturing.completion import INPAINTERS, complete
 from seasonscapes.texturing.membrane import membrane_fill
-from seasonscapes.texturing.plan import from_plan, onto_plan
+from seasonscapes.texturing.predictors import predictors_for, stack_predictors
 from seasonscapes.texturing.push_pull import propagate, push_pull
 from seasonscapes.texturing.telea import telea_fill
+from seasonscapes.texturing.terrain_features import horizon_tangent, sun_margin_deg, terrain_features
+from seasonscapes.texturing.top_down_grid import from_grid, to_grid
 from seasonscapes.workspace import Workspace
 
 SIDE, SPACING_M = 128, 50.0
@@ -37,7 +37,7 @@ def made_up_land(seed: int = 3):
     """A truth that follows from height, sun and a satellite image, a mask with holes of all sizes, and its guides."""
     z = 1500.0 + 400.0 * smooth_noise(seed, 9.0) + 60.0 * smooth_noise(seed + 1, 2.5)
     sun = np.array([0.5, -0.6, 0.624])
-    layers = land_layers(z, SPACING_M, sun_direction=sun)
+    layers = terrain_features(z, SPACING_M, sun_direction=sun)
     forest = smooth_noise(seed + 2, 5.0) > 0.2
     ground = np.where(forest[..., None], [0.03, 0.05, 0.02], [0.12, 0.14, 0.06])
     snow = 1.0 / (1.0 + np.exp(-(z - 1600.0) / 25.0))[..., None]
@@ -47,7 +47,7 @@ def made_up_land(seed: int = 3):
     satellite = Texture((ground * (0.4 + layers["sky_view"][..., None])).astype(np.float32))
     seen = smooth_noise(seed + 3, 6.0) > 0.1
     seen[::9, ::7] = False  # holes of one texel
-    return truth.astype(np.float32), seen, stack_guides(layers, satellite)
+    return truth.astype(np.float32), seen, stack_predictors(layers, satellite)
 
 
 def painted(truth: np.ndarray, seen: np.ndarray) -> Texture:
@@ -67,7 +67,7 @@ def test_layers_of_a_tilted_plane_are_those_of_geometry():
     slope = np.radians(30.0)
     z = (-np.tan(slope) * north).astype(np.float32) + 0.0 * east.astype(np.float32)  # it faces north
     sun = np.array([0.0, np.sin(np.radians(40.0)), np.cos(np.radians(40.0))])
-    layers = {name: layer[12:28, 12:28] for name, layer in land_layers(z, 10.0, sun_direction=sun).items()}
+    layers = {name: layer[12:28, 12:28] for name, layer in terrain_features(z, 10.0, sun_direction=sun).items()}
     np.testing.assert_allclose(layers["slope"], 30.0, atol=1e-2)
     np.testing.assert_allclose(layers["facing_north"], np.sin(slope), atol=1e-4)
     np.testing.assert_allclose(layers["facing_east"], 0.0, atol=1e-4)
@@ -86,7 +86,7 @@ def test_a_wall_throws_a_shadow_of_height_over_tangent():
     length_m = (150 - dark.min()) * 10.0
     assert length_m == pytest.approx(100.0 / np.tan(elevation), abs=25.0)
     assert dark.max() == 149
-    assert (land_layers(z, 10.0, sun_direction=[0.0, 0.6, -0.8])["sun"] == 0.0).all()
+    assert (terrain_features(z, 10.0, sun_direction=[0.0, 0.6, -0.8])["sun"] == 0.0).all()
     tangent = horizon_tangent(z, 10.0, np.pi / 2.0, stride=1.03)[30, 100]
     assert tangent == pytest.approx(100.0 / 500.0, rel=0.05)
 
@@ -94,14 +94,16 @@ def test_a_wall_throws_a_shadow_of_height_over_tangent():
 def test_holes_of_the_heights_stay_holes_and_throw_no_shadow():
     z = np.full((50, 50), 800.0, np.float32)
     z[20:25, 20:25] = np.nan
-    layers = land_layers(z, 30.0, sun_direction=[0.7, 0.0, 0.714], day_suns=[[0.7, 0.0, 0.714], [0.0, 0.7, -0.714]])
+    layers = terrain_features(
+        z, 30.0, sun_direction=[0.7, 0.0, 0.714], day_suns=[[0.7, 0.0, 0.714], [0.0, 0.7, -0.714]]
+    )
     for layer in layers.values():
         assert np.isnan(layer[20:25, 20:25]).all()
         assert np.isfinite(layer[:20]).all()
     np.testing.assert_allclose(layers["sun"][:20], 0.714, atol=1e-4)
     np.testing.assert_allclose(layers["insolation"][:20], 0.357, atol=1e-3)
     with pytest.raises(ValueError, match="no finite height"):
-        land_layers(np.full((5, 5), np.nan), 10.0)
+        terrain_features(np.full((5, 5), np.nan), 10.0)
 
 
 # ---------------------------------------------------------------------------------------------- fills of pictures
@@ -149,8 +151,13 @@ def test_telea_and_membrane_fill_a_ramp_between_its_ends():
 
 @pytest.fixture(scope="module")
 def filled():
-    truth, seen, guides = made_up_land()
-    return truth, seen, guides, {name: complete(painted(truth, seen), guides, method=name) for name in INPAINTERS}
+    truth, seen, predictors = made_up_land()
+    return (
+        truth,
+        seen,
+        predictors,
+        {name: complete(painted(truth, seen), predictors, method=name) for name in INPAINTERS},
+    )
 
 
 def test_painted_texels_stay_bit_identical_and_nothing_is_left_open(filled):
@@ -184,33 +191,33 @@ def test_sigma_is_as_large_as_the_error(filled):
 
 
 def test_controls_lower_the_score(filled):
-    truth, seen, guides, done = filled
+    truth, seen, predictors, done = filled
     score = hidden_psnr(done["guided"].values, truth, seen)
-    shuffled = guides.values.reshape(-1, len(guides.names))[np.random.default_rng(0).permutation(seen.size)]
-    permuted = stack_guides(dict(zip(guides.names, shuffled.T.reshape(-1, *seen.shape), strict=True)))
+    shuffled = predictors.values.reshape(-1, len(predictors.names))[np.random.default_rng(0).permutation(seen.size)]
+    permuted = stack_predictors(dict(zip(predictors.names, shuffled.T.reshape(-1, *seen.shape), strict=True)))
     assert hidden_psnr(complete(painted(truth, seen), permuted, fast=True).values, truth, seen) < score - 5.0
-    names = guides.names
-    moved = {name: guides.values[..., i] for i, name in enumerate(names)}
+    names = predictors.names
+    moved = {name: predictors.values[..., i] for i, name in enumerate(names)}
     moved |= {name: np.roll(moved[name], 23, axis=1) for name in names if name.startswith("sun")}
     moved |= {name: np.zeros_like(moved[name]) for name in ("facing_east", "facing_north")}
-    assert hidden_psnr(complete(painted(truth, seen), stack_guides(moved)).values, truth, seen) < score - 0.5
+    assert hidden_psnr(complete(painted(truth, seen), stack_predictors(moved)).values, truth, seen) < score - 0.5
 
 
 def test_fast_and_seeds(filled):
-    truth, seen, guides, done = filled
+    truth, seen, predictors, done = filled
     texture = painted(truth, seen)
-    fast = complete(texture, guides, fast=True)
+    fast = complete(texture, predictors, fast=True)
     assert hidden_psnr(fast.values, truth, seen) > hidden_psnr(done["membrane"].values, truth, seen) + 4.0
-    np.testing.assert_array_equal(fast.values, complete(texture, guides, fast=True).values)
+    np.testing.assert_array_equal(fast.values, complete(texture, predictors, fast=True).values)
 
 
 def test_grain_is_the_seen_land_s_and_touches_no_painted_texel(filled):
-    truth, seen, guides, _ = filled
+    truth, seen, predictors, _ = filled
     rough = truth * np.exp(0.25 * np.random.default_rng(1).standard_normal(truth.shape[:2]))[..., None].astype(
         np.float32
     )
     texture = painted(rough, seen)
-    plain, grained = (complete(texture, guides, fast=True, detail=d) for d in (0.0, 1.0))
+    plain, grained = (complete(texture, predictors, fast=True, detail=d) for d in (0.0, 1.0))
     np.testing.assert_array_equal(grained.values[seen], rough[seen])
 
     def grain(values):
@@ -222,17 +229,19 @@ def test_grain_is_the_seen_land_s_and_touches_no_painted_texel(filled):
 
 
 def test_a_satellite_image_that_covers_half_the_place():
-    truth, seen, guides = made_up_land()
-    half = guides.values.copy()
-    image = [i for i, name in enumerate(guides.names) if name.startswith("satellite")]
+    truth, seen, predictors = made_up_land()
+    half = predictors.values.copy()
+    image = [i for i, name in enumerate(predictors.names) if name.startswith("satellite")]
     half[:, SIDE // 2 :, image] = np.nan
     # And the cameras saw only where there is an image: what to do without one must be learned all the same.
     seen = seen & (np.arange(SIDE) < SIDE // 2)[None, :]
     beyond = ~seen & (np.arange(SIDE) >= SIDE // 2)[None, :]
-    layers = dict(zip(guides.names, np.moveaxis(half, -1, 0), strict=True))
+    layers = dict(zip(predictors.names, np.moveaxis(half, -1, 0), strict=True))
     surface = np.ones(seen.shape, bool)
-    with_half = complete(painted(truth, seen), stack_guides(layers, surface=surface))
-    without = complete(painted(truth, seen), stack_guides({n: v for n, v in layers.items() if not n.startswith("sat")}))
+    with_half = complete(painted(truth, seen), stack_predictors(layers, surface=surface))
+    without = complete(
+        painted(truth, seen), stack_predictors({n: v for n, v in layers.items() if not n.startswith("sat")})
+    )
     assert np.isfinite(with_half.values).all()
     inside = ~seen & ~beyond
     assert hidden_psnr(with_half.values, truth, ~inside) > hidden_psnr(without.values, truth, ~inside) + 1.0
@@ -240,24 +249,24 @@ def test_a_satellite_image_that_covers_half_the_place():
 
 
 def test_all_painted_none_painted_and_nonsense():
-    truth, seen, guides = made_up_land()
-    whole = complete(Texture(truth), guides)
+    truth, seen, predictors = made_up_land()
+    whole = complete(Texture(truth), predictors)
     np.testing.assert_array_equal(whole.values, truth)
     assert not whole.sigma.any()
     with pytest.raises(ValueError, match="no painted texel"):
-        complete(Texture(truth, np.zeros(seen.shape, np.float32)), guides)
+        complete(Texture(truth, np.zeros(seen.shape, np.float32)), predictors)
     with pytest.raises(ValueError, match="no painted texel"):
-        complete(Texture(np.full_like(truth, np.nan)), guides)
+        complete(Texture(np.full_like(truth, np.nan)), predictors)
     with pytest.raises(ValueError, match="expected one of guided, membrane, telea"):
-        complete(Texture(truth), guides, method="magic")
+        complete(Texture(truth), predictors, method="magic")
     with pytest.raises(ValueError, match="negative"):
-        complete(Texture(-truth), guides)
+        complete(Texture(-truth), predictors)
     with pytest.raises(ValueError, match="the texture"):
-        complete(Texture(truth[:50]), guides)
+        complete(Texture(truth[:50]), predictors)
     one = np.zeros(seen.shape, bool)
     one[40, 40] = True
     for name in INPAINTERS:
-        lonely = complete(painted(truth, one), guides, method=name)
+        lonely = complete(painted(truth, one), predictors, method=name)
         np.testing.assert_allclose(lonely.values, np.broadcast_to(truth[40, 40], truth.shape), rtol=1e-3)
         assert (lonely.sigma[~one] > 0.3 * truth[40, 40].mean()).all()
 
@@ -270,17 +279,17 @@ def test_charts_that_lie_apart_are_neighbours_on_the_land():
     terrain = build_mesh(raster, LocalFrame(46.55, 7.98, 0.0, 0.13), mesher="grid")
     terrain, atlas = unwrap(terrain, kind="xatlas", texel_m=40.0, max_side_px=1024)
     assert atlas.charts > 1
-    guides = guides_for(terrain, atlas, sun_direction=[0.0, -0.7, 0.714])
-    assert guides.plan is not None
-    east = guides.plan.pixel[..., 0] / guides.plan.width_px
+    predictors = predictors_for(terrain, atlas, sun_direction=[0.0, -0.7, 0.714])
+    assert predictors.plan is not None
+    east = predictors.plan.pixel[..., 0] / predictors.plan.width_px
     truth = np.stack([1.0 + east, 2.0 - east, 1.0 + 0.0 * east], -1).astype(np.float32)
-    mean, count = onto_plan(guides.plan, truth, guides.surface)
-    back = from_plan(guides.plan, push_pull(mean, count > 0))
-    assert np.nanmax(np.abs(back - truth)[guides.surface]) < 0.1
-    seen = guides.surface & (np.abs(east - 0.5) > 0.12)
+    mean, count = to_grid(predictors.plan, truth, predictors.surface)
+    back = from_grid(predictors.plan, push_pull(mean, count > 0))
+    assert np.nanmax(np.abs(back - truth)[predictors.surface]) < 0.1
+    seen = predictors.surface & (np.abs(east - 0.5) > 0.12)
     for method in ("membrane", "telea", "guided"):
-        done = complete(painted(truth, seen), guides, method=method)
-        hole = guides.surface & ~seen
+        done = complete(painted(truth, seen), predictors, method=method)
+        hole = predictors.surface & ~seen
         assert np.isfinite(done.values).all()
         assert np.sqrt(np.mean((done.values - truth)[hole] ** 2)) < 0.15, method  # a constant: 0.25 or more
 

@@ -14,18 +14,27 @@ from PIL import Image
 
 from seasonscapes.cameras.path_file import save_path
 from seasonscapes.cameras.pinhole import camera_at
-from seasonscapes.cameras.trajectory import fly
+from seasonscapes.cameras.trajectory import cameras_along_path
 from seasonscapes.commands import inpaint_path
 from seasonscapes.commands.inpaint import inpaint
 from seasonscapes.commands.inpaint_path import DiffusionOptions
 from seasonscapes.commands.options import PlaceOptions
 from seasonscapes.errors import InputError
 from seasonscapes.pipeline import MeshOptions, load_place
-from seasonscapes.rendering.gather import occluder
 from seasonscapes.rendering.gbuffer import trace_gbuffer
-from seasonscapes.rendering.scene import RenderScene, mi_mesh
+from seasonscapes.rendering.hemisphere_rays import ray_scene
+from seasonscapes.rendering.mitsuba_scene import RenderScene, mi_mesh
 from seasonscapes.terrain.surface import Texture, load_texture, save_texture
-from seasonscapes.texturing.conditions import (
+from seasonscapes.texturing.atlas_tiles import tiling
+from seasonscapes.texturing.path_inpainting import (
+    InpaintingState,
+    PathInpaintingInputs,
+    PathInpaintingOptions,
+    frames_of,
+    inpaint_along_path,
+)
+from seasonscapes.texturing.prompts import prompt_for
+from seasonscapes.texturing.view_conditions import (
     Conditions,
     decode,
     depth_picture,
@@ -35,9 +44,6 @@ from seasonscapes.texturing.conditions import (
     red_pixels,
     white_radiance,
 )
-from seasonscapes.texturing.path_inpainting import Canvas, Walk, WalkOptions, frames_of, walk_path
-from seasonscapes.texturing.prompts import prompt_for
-from seasonscapes.texturing.tiles import tiling
 from seasonscapes.workspace import Workspace
 
 pytest.importorskip("diffusers", reason="the extra 'diffusion' is not installed")
@@ -46,7 +52,7 @@ import torch
 from tiny_diffusion import ADAPTER, BASE, DEPTH, INPAINT, write_tiny_weights
 
 from seasonscapes.texturing.diffusion import DiffusionSettings, Machine, load_painter, needed_parts, whole_cells
-from seasonscapes.texturing.weight_files import WeightNames, find_weights, fingerprint
+from seasonscapes.texturing.model_weights import WeightNames, find_weights, weights_fingerprint
 
 HEIGHT, WIDTH = 50, 70  # not divisible by 8
 
@@ -82,7 +88,7 @@ def test_near_is_white_in_the_depth_picture():
 def test_a_view_from_a_mast_has_its_foot_in_white(hill):
     land, _, _ = hill
     view = camera_at(land.frame, 46.5405, 7.98, 1120.0, heading_deg=0.0, pitch_deg=-8.0, size_px=(48, 32))
-    terrain = occluder(mi_mesh(land.terrain, np.full(3, 0.2)))
+    terrain = ray_scene(mi_mesh(land.terrain, np.full(3, 0.2)))
     picture = depth_picture(trace_gbuffer(RenderScene(terrain.mi_scene, terrain.mi_terrain, None, 0.0), view).depth)
     assert picture[-1].min() > 0.8
     assert picture[-1].mean() > picture[16].mean() + 0.2
@@ -238,7 +244,9 @@ def test_hub_names_stand_for_folders(weights):
     assert find_weights(weights, "depth", DEPTH) == weights / DEPTH
     assert find_weights(None, "depth", str(weights / DEPTH)) == weights / DEPTH
     assert find_weights(weights / "lllyasviel", "depth", DEPTH) == weights / DEPTH
-    prints = {fingerprint(weights / name, part, name) for part, name in (("depth", DEPTH), ("inpaint", INPAINT))}
+    prints = {
+        weights_fingerprint(weights / name, part, name) for part, name in (("depth", DEPTH), ("inpaint", INPAINT))
+    }
     assert len(prints) == 2
 
 
@@ -387,13 +395,13 @@ def hill(tmp_path_factory):
     known = [
         camera_at(land.frame, *place, heading_deg=heading, pitch_deg=-12.0, size_px=(50, 34)) for *place, heading in at
     ]
-    return land, texture, fly(known, 4)
+    return land, texture, cameras_along_path(known, 4)
 
 
 def walk_on(hill, base=None):
     land, texture, cameras = hill
-    return Walk(
-        texture, cameras, tiling(land.terrain, land.atlas), occluder(mi_mesh(land.terrain, np.full(3, 0.2))), base
+    return PathInpaintingInputs(
+        texture, cameras, tiling(land.terrain, land.atlas), ray_scene(mi_mesh(land.terrain, np.full(3, 0.2))), base
     )
 
 
@@ -404,34 +412,34 @@ def noise(view, tell):
     return (0.5 * rng.random(view.picture.shape) + 0.5 * view.picture).astype(np.float32)
 
 
-OPTIONS = WalkOptions(dilate_px=2, least_share=0.0, seed=7)
+OPTIONS = PathInpaintingOptions(dilate_px=2, least_share=0.0, seed=7)
 
 
 def walked(hill, inpaint_with=noise, options=OPTIONS, base=None, folder=None):
-    canvas = Canvas(hill[1])
-    return canvas, list(walk_path(walk_on(hill, base), canvas, inpaint_with, options, folder=folder))
+    state = InpaintingState(hill[1])
+    return state, list(inpaint_along_path(walk_on(hill, base), state, inpaint_with, options, folder=folder))
 
 
 def test_coverage_grows_and_painted_texels_stay_to_the_bit(hill):
-    canvas, covered = Canvas(hill[1]), []
-    for step in walk_path(walk_on(hill), canvas, noise, OPTIONS):
-        covered.append(canvas.covered.copy())
+    state, covered = InpaintingState(hill[1]), []
+    for step in inpaint_along_path(walk_on(hill), state, noise, OPTIONS):
+        covered.append(state.covered.copy())
         assert not step.skipped
         assert np.isfinite(step.values).all()
     assert all((later | ~earlier).all() for earlier, later in pairwise(covered))
-    assert canvas.covered.sum() > canvas.painted.sum() + 50
+    assert state.covered.sum() > state.painted.sum() + 50
     seen = hill[1].weight > 0.0
-    np.testing.assert_array_equal(canvas.values[seen], hill[1].values[seen])
-    np.testing.assert_array_equal(canvas.painted, seen)
+    np.testing.assert_array_equal(state.values[seen], hill[1].values[seen])
+    np.testing.assert_array_equal(state.painted, seen)
     with pytest.raises(ValueError, match="would overwrite"):
-        canvas.superpose(replace(step, texels=np.flatnonzero(seen)[:1], values=np.ones((1, 3), np.float32)))
+        state.superpose(replace(step, texels=np.flatnonzero(seen)[:1], values=np.ones((1, 3), np.float32)))
 
 
 def test_only_what_a_view_truly_sees_is_painted(hill):
     """From the south alone nothing behind the top gets a colour, though all of it is open."""
     land, texture, cameras = hill
-    canvas = Canvas(texture)
-    step = next(walk_path(walk_on((land, texture, cameras[:1])), canvas, noise, OPTIONS))
+    state = InpaintingState(texture)
+    step = next(inpaint_along_path(walk_on((land, texture, cameras[:1])), state, noise, OPTIONS))
     rows = step.texels // land.atlas.width_px
     # The top lies a little north of the middle; rows run southwards.
     assert len(rows) > 20
@@ -442,8 +450,8 @@ def test_only_what_a_view_truly_sees_is_painted(hill):
 def test_what_is_painted_is_what_the_model_gave(hill):
     """A model that paints holes green: green texels in the holes, and frames that show everything else untouched."""
     green = np.array([0.1, 0.8, 0.2], np.float32)
-    canvas, steps = walked(hill, lambda view, tell: np.broadcast_to(green, view.picture.shape))
-    white = white_radiance(canvas.values, canvas.painted)
+    state, steps = walked(hill, lambda view, tell: np.broadcast_to(green, view.picture.shape))
+    white = white_radiance(state.values, state.painted)
     # But for rims, where a texel's pixels are painted ones too.
     assert np.median(np.abs(encode(steps[0].values, white) - green).max(axis=1)) < 0.02
     # Composed: outside the hole (dilated for the model) the frame is the partial picture.
@@ -510,9 +518,9 @@ def test_killed_in_the_middle_it_goes_on_with_the_same_result(hill, tmp_path):
 def test_a_view_without_a_hole_is_skipped(hill):
     land, texture, cameras = hill
     full = (land, Texture(np.nan_to_num(texture.values, nan=500.0)), cameras)
-    canvas, steps = walked(full, lambda view, tell: pytest.fail("nothing to paint"))
+    state, steps = walked(full, lambda view, tell: pytest.fail("nothing to paint"))
     assert all(step.skipped and step.hole_share == 0.0 and len(step.texels) == 0 for step in steps)
-    np.testing.assert_array_equal(canvas.values, full[1].values)
+    np.testing.assert_array_equal(state.values, full[1].values)
     # And so are views with hardly any.
     _, few = walked(hill, lambda view, tell: pytest.fail("too little"), replace(OPTIONS, least_share=1.0))
     assert all(step.skipped and 0.0 < step.hole_share < 1.0 for step in few)
@@ -523,24 +531,24 @@ def test_the_reference_s_mask_takes_red_land_for_holes(hill):
     red = Texture(np.where(texture.weight[..., None] > 0, np.float32([900.0, 150.0, 100.0]), np.nan), texture.weight)
     shares = {}
     for mask in ("coverage", "hsv"):
-        canvas, steps = walked((land, red, cameras), options=replace(OPTIONS, mask=mask))
+        state, steps = walked((land, red, cameras), options=replace(OPTIONS, mask=mask))
         shares[mask] = steps[0].hole_share
         # Even so, painted texels are left alone.
-        np.testing.assert_array_equal(canvas.values[canvas.painted], red.values[canvas.painted])
+        np.testing.assert_array_equal(state.values[state.painted], red.values[state.painted])
     assert shares["coverage"] < 0.6
     assert shares["hsv"] == 1.0
     with pytest.raises(ValueError, match="expected one of coverage, hsv"):
-        WalkOptions(mask="xor")
+        PathInpaintingOptions(mask="xor")
 
 
 def test_hybrid_shows_the_model_a_completion(hill):
     base = np.zeros((*hill[1].weight.shape, 3), np.float32) + np.float32([100.0, 200.0, 1200.0])
     views = []
-    canvas, _ = walked(hill, lambda view, tell: views.append(view) or view.picture, base=base)
-    white = white_radiance(canvas.values, canvas.painted)
+    state, _ = walked(hill, lambda view, tell: views.append(view) or view.picture, base=base)
+    white = white_radiance(state.values, state.painted)
     expected = encode(np.float32([100.0, 200.0, 1200.0]), white)
-    inside = canvas.imagined.copy()
-    assert np.median(np.abs(encode(canvas.values[inside], white) - expected)) < 0.01
+    inside = state.imagined.copy()
+    assert np.median(np.abs(encode(state.values[inside], white) - expected)) < 0.01
     # Without it, holes show their rims' colours.
     plain = []
     walked(hill, lambda view, tell: plain.append(view) or view.picture)
@@ -552,12 +560,12 @@ def test_the_sky_may_be_painted_but_never_reaches_the_texture(hill):
     holes = {}
     for paint_sky in (False, True):
         shown = []
-        canvas, steps = walked(
+        state, steps = walked(
             hill,
             lambda view, tell, shown=shown: shown.append(view) or np.ones_like(view.picture),
             replace(OPTIONS, paint_sky=paint_sky),
         )
-        holes[paint_sky] = (shown[0], canvas, steps)
+        holes[paint_sky] = (shown[0], state, steps)
     sky = holes[False][0].depth == 0.0
     if not sky.any():
         pytest.fail("the test's first view shows no sky")

@@ -8,7 +8,7 @@ import pytest
 
 from seasonscapes.commands.evaluate import evaluate, matching_gain
 from seasonscapes.errors import InputError
-from seasonscapes.evaluation.figures import comparison, heat, steepest_window
+from seasonscapes.evaluation.figures import comparison, error_colours, steepest_window
 from seasonscapes.evaluation.metrics import psnr_db
 from seasonscapes.images import read_image_linear, write_exr, write_png8
 
@@ -135,7 +135,7 @@ def test_comparison_sheet():
     assert np.array_equal(plain[head + 24 : head + HEIGHT, :WIDTH], a[24:])
     difference = plain[head : head + HEIGHT, -WIDTH - 4 : -4]
     assert difference[:24] == pytest.approx(np.broadcast_to([0.0, 0.0, 0.02], (24, WIDTH, 3)))
-    assert heat(np.array([[1.0]]))[0, 0] == pytest.approx([0.99, 0.99, 0.75])
+    assert error_colours(np.array([[1.0]]))[0, 0] == pytest.approx([0.99, 0.99, 0.75])
     with pytest.raises(ValueError, match="at least one more"):
         comparison({"truth": a})
 

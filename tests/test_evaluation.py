@@ -21,8 +21,8 @@ from seasonscapes.evaluation.metrics import (
     whole_windows,
 )
 from seasonscapes.evaluation.splits import (
-    Leak,
-    Use,
+    LeakageError,
+    PictureUse,
     content_hash,
     file_content_hash,
     held_out_hours,
@@ -353,18 +353,18 @@ def test_held_out_hours_lie_between_used_ones():
 
 
 def test_leaks_are_refused_by_webcam_and_time():
-    paint = [Use("a", NOON, "painting"), Use("b/1", NOON, "guidance")]
+    paint = [PictureUse("a", NOON, "painting"), PictureUse("b/1", NOON, "guidance")]
     later = NOON + timedelta(hours=1)
-    refuse_leaks([Use("c", NOON, "evaluation"), Use("a", later, "evaluation")], paint)
+    refuse_leaks([PictureUse("c", NOON, "evaluation"), PictureUse("a", later, "evaluation")], paint)
     zurich = NOON.astimezone(timezone(timedelta(hours=2)))
-    with pytest.raises(Leak, match=r"a at 2024-09-18T11:00:00\+00:00 was used for painting"):
-        refuse_leaks([Use("a", zurich, "evaluation")], paint)
-    with pytest.raises(Leak, match="guidance"):  # another view of the same panorama at the same instant
-        refuse_leaks([Use("b/2", NOON, "evaluation")], paint)
-    with pytest.raises(Leak, match="same webcam, at"):
-        refuse_leaks([Use("a", later, "evaluation")], paint, kind="view")
-    with pytest.raises(Leak, match="same instant, at a"):
-        refuse_leaks([Use("c", NOON, "evaluation")], paint, kind="hour")
+    with pytest.raises(LeakageError, match=r"a at 2024-09-18T11:00:00\+00:00 was used for painting"):
+        refuse_leaks([PictureUse("a", zurich, "evaluation")], paint)
+    with pytest.raises(LeakageError, match="guidance"):  # another view of the same panorama at the same instant
+        refuse_leaks([PictureUse("b/2", NOON, "evaluation")], paint)
+    with pytest.raises(LeakageError, match="same webcam, at"):
+        refuse_leaks([PictureUse("a", later, "evaluation")], paint, kind="view")
+    with pytest.raises(LeakageError, match="same instant, at a"):
+        refuse_leaks([PictureUse("c", NOON, "evaluation")], paint, kind="hour")
 
 
 def test_leaks_are_refused_by_content(tmp_path):
@@ -373,8 +373,8 @@ def test_leaks_are_refused_by_content(tmp_path):
     seen = Observation(linear_from_srgb(levels / np.float32(255.0)), np.ones((12, 16), bool), camera, NOON, "a")
     write_png8(tmp_path / "copy.png", levels)
     assert content_hash(levels) == observation_hash(seen) == file_content_hash(tmp_path / "copy.png")
-    renamed = Use("elsewhere", NOON + timedelta(days=1), "evaluation", file_content_hash(tmp_path / "copy.png"))
-    with pytest.raises(Leak, match="same pixels"):
+    renamed = PictureUse("elsewhere", NOON + timedelta(days=1), "evaluation", file_content_hash(tmp_path / "copy.png"))
+    with pytest.raises(LeakageError, match="same pixels"):
         refuse_leaks([renamed], [use_of(seen, "training")])
     levels[0, 0, 0] ^= 1
     assert content_hash(levels) != observation_hash(seen)
@@ -382,9 +382,9 @@ def test_leaks_are_refused_by_content(tmp_path):
 
 def test_uses_must_be_plain():
     with pytest.raises(ValueError, match="purpose"):
-        Use("a", NOON, "decoration")
+        PictureUse("a", NOON, "decoration")
     with pytest.raises(ValueError, match="offset"):
-        Use("a", NOON.replace(tzinfo=None), "painting")
+        PictureUse("a", NOON.replace(tzinfo=None), "painting")
     with pytest.raises(ValueError, match="kind"):
         refuse_leaks([], [], kind="year")
     with pytest.raises(ValueError, match="uint8"):

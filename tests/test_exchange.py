@@ -20,7 +20,9 @@ from seasonscapes.cameras.exchange import (
     write_opencv,
     write_transforms,
 )
-from seasonscapes.cameras.exchange_reference import (
+from seasonscapes.cameras.lens import distort
+from seasonscapes.cameras.pinhole import Camera, project, ray_directions, rotation_from_angles
+from seasonscapes.cameras.reference_poses import (
     geodetic_of_translation,
     read_reference_matches,
     read_reference_poses,
@@ -29,8 +31,6 @@ from seasonscapes.cameras.exchange_reference import (
     stretch,
     unstretch,
 )
-from seasonscapes.cameras.lens import distort
-from seasonscapes.cameras.pinhole import Camera, project, ray_directions, rotation_from_angles
 from seasonscapes.cameras.webcam import read_webcams
 from seasonscapes.declaration import InputError
 from seasonscapes.frames import LocalFrame, geodetic_from_enu

@@ -19,7 +19,12 @@ from seasonscapes.cli import app, main  # noqa: E402
 from seasonscapes.errors import InputError  # noqa: E402
 from seasonscapes.frames import equirectangular_directions  # noqa: E402
 from seasonscapes.gaussians.appearance import Appearance, colours_at, fourier_embedding, light_tensors  # noqa: E402
-from seasonscapes.gaussians.distil import Frame, Lessons, Schedule, distil, fit_code, lessons_from  # noqa: E402
+from seasonscapes.gaussians.disc_transport import (  # noqa: E402
+    light_state,
+    neighbourhood_mean,
+    surfel_irradiance,
+    trace_disc_transport,
+)
 from seasonscapes.gaussians.interchange import (  # noqa: E402
     BakedSplats,
     TrainingView,
@@ -39,19 +44,26 @@ from seasonscapes.gaussians.rasterise import (  # noqa: E402
     view_weights,
 )
 from seasonscapes.gaussians.rasterise_cuda import rasterise_cuda  # noqa: E402
-from seasonscapes.gaussians.rasterise_twin import rasterise_twin  # noqa: E402
-from seasonscapes.gaussians.render import CUTS, draw_layers, learned_numbers, model_colours, model_weights, render_model  # noqa: E402
+from seasonscapes.gaussians.rasterise_reference import rasterise_reference  # noqa: E402
+from seasonscapes.gaussians.splat_view import (  # noqa: E402
+    CUTS,
+    draw_layers,
+    learned_numbers,
+    model_colours,
+    model_weights,
+    render_model,
+)
 from seasonscapes.gaussians.surfels import axes_from_quaternions, surfel_albedo, terrain_surfels  # noqa: E402
-from seasonscapes.gaussians.tiles import joined_shapes, select_tiles, tile_bounds, tile_discs, tile_tree  # noqa: E402
-from seasonscapes.gaussians.transport import light_state, neighbourhood_mean, surfel_irradiance, trace_transport  # noqa: E402
-from seasonscapes.rendering.gather import occluder  # noqa: E402
-from seasonscapes.rendering.horizon import horizon_angles  # noqa: E402
+from seasonscapes.gaussians.tile_tree import joined_shapes, select_tiles, tile_bounds, tile_discs, tile_tree  # noqa: E402
+from seasonscapes.gaussians.training import Schedule, SurfaceTargets, TrainingFrame, fit_code, surface_targets, train  # noqa: E402
+from seasonscapes.rendering.hemisphere_rays import ray_scene  # noqa: E402
+from seasonscapes.rendering.horizon_angles import horizon_angles  # noqa: E402
 from seasonscapes.rendering.irradiance import surface_at  # noqa: E402
+from seasonscapes.rendering.mitsuba_scene import mi_mesh, relight  # noqa: E402
 from seasonscapes.rendering.radiance import path_trace  # noqa: E402
-from seasonscapes.rendering.scene import mi_mesh, relight  # noqa: E402
-from seasonscapes.rendering.splatting import ready_splats, splat_layers  # noqa: E402
+from seasonscapes.rendering.splatting import splat_layers, upload_splats  # noqa: E402
 from seasonscapes.sky.illumination import Illumination, global_horizontal_illuminance  # noqa: E402
-from seasonscapes.terrain.ground import vertex_normals  # noqa: E402
+from seasonscapes.terrain.attributes import vertex_normals  # noqa: E402
 
 choose_threads(1)
 for _verb in ("distill", "splat"):
@@ -72,7 +84,7 @@ def some_splats(count: int, *, seed: int = 0, dtype=torch.float32) -> tuple[Spla
 def test_rasteriser_equals_its_twin():
     splats, colours = some_splats(150)
     image, coverage = rasterise(splats, colours, CAMERA)
-    expected, expected_coverage = rasterise_twin(splats, colours, CAMERA)
+    expected, expected_coverage = rasterise_reference(splats, colours, CAMERA)
     assert expected_coverage.max() > 0.9
     assert expected_coverage.min() < 0.5, "the scene must have both"
     assert float((image - expected).abs().max()) < 1e-4
@@ -82,7 +94,7 @@ def test_rasteriser_equals_its_twin():
 @pytest.mark.parametrize("cut", [1.0 / 255.0, 0.0])
 def test_gradients_equal_the_twin_s(cut):
     grads = []
-    for draw in (rasterise, rasterise_twin):
+    for draw in (rasterise, rasterise_reference):
         splats, colours = some_splats(60, seed=1, dtype=torch.float64)
         leaves = [tensor.clone().requires_grad_() for tensor in (*splats, colours)]
         image, _ = draw(Splats(*leaves[:4]), leaves[4], CAMERA, alpha_cut=cut)
@@ -128,7 +140,7 @@ def test_ties_in_depth_keep_their_order():
         np.array([[0.0, 0.0, 5.0]] * 2), np.array([[1.0, 0, 0, 0]] * 2), np.zeros((2, 3)), np.full(2, 6.0)
     )
     colours = torch.tensor([[1.0, 0, 0], [0, 1.0, 0]])
-    for draw in (rasterise, rasterise_twin):
+    for draw in (rasterise, rasterise_reference):
         red, green, _ = draw(both, colours, CAMERA)[0][9, 12]
         assert red > 0.9 > 0.1 > green
 
@@ -159,7 +171,7 @@ def hill():
     )
     mesh = mi_mesh(terrain, texture)
     albedo = surfel_albedo(surfels, texture)
-    transport = trace_transport(occluder(mesh), surfels, albedo, rays=64)
+    transport = trace_disc_transport(ray_scene(mesh), surfels, albedo, rays=64)
     return terrain, surfels, mesh, albedo, transport
 
 
@@ -179,16 +191,16 @@ def appearance(hill, kind: str = "full", *, seed: int = 0, times: int = 3) -> Ap
     )
 
 
-def lessons(hill) -> Lessons:
+def targets(hill) -> SurfaceTargets:
     _, surfels, mesh, albedo, transport = hill
     states = [light_state(transport, each, 180.0) for each in LIGHTS]
-    received = surfel_irradiance(occluder(mesh), surfels, LIGHTS, rays=64)
-    return lessons_from(states, [0] * len(LIGHTS), albedo[None], received)
+    received = surfel_irradiance(ray_scene(mesh), surfels, LIGHTS, rays=64)
+    return surface_targets(states, [0] * len(LIGHTS), albedo[None], received)
 
 
 @pytest.fixture(scope="module")
-def told(hill) -> Lessons:
-    return lessons(hill)
+def told(hill) -> SurfaceTargets:
+    return targets(hill)
 
 
 def test_discs_lie_on_the_terrain_and_close_it(hill):
@@ -209,7 +221,7 @@ def test_a_plane_in_the_sun_is_lambert_s():
     terrain = heightfield(lambda e, n: 0.0 * e, count=3)
     surfels = terrain_surfels(terrain, 200.0)
     albedo = np.full((len(surfels.means), 3), 0.3, np.float32)
-    transport = trace_transport(occluder(mi_mesh(terrain, np.full(3, 0.3))), surfels, albedo, rays=256)
+    transport = trace_disc_transport(ray_scene(mi_mesh(terrain, np.full(3, 0.3))), surfels, albedo, rays=256)
     model = Appearance("physical", albedo[None], albedo[None], transport, fourier_embedding(surfels.means))
     state = light_state(transport, LIGHTS[1], 180.0)
     expected = 0.3 * global_horizontal_illuminance(LIGHTS[1]) / state.global_lx
@@ -234,7 +246,7 @@ def test_horizon_of_a_cliff_is_its_angle():
     """200 m of cliff, 100 m to the west of the places: atan 2 towards it, nothing towards the plain."""
     terrain = heightfield(lambda e, n: np.where(e < -100.0, 200.0, 0.0), side_m=800.0, count=401)
     places = np.array([[0.0, 0.0, 0.0], [0.0, 50.0, 0.0]], np.float32)
-    bare = occluder(mi_mesh(terrain, np.full(3, 0.3)))
+    bare = ray_scene(mi_mesh(terrain, np.full(3, 0.3)))
     angle = horizon_angles(bare, surface_at(bare, places)[0])
     assert angle[:, 48] == pytest.approx(np.arctan2(200.0, 102.0), abs=0.01)
     assert angle[:, 16].max() < 0.001
@@ -242,7 +254,7 @@ def test_horizon_of_a_cliff_is_its_angle():
 
 @pytest.mark.parametrize("kind", ["code", "sun", "physical", "full"])
 def test_training_lowers_the_loss(hill, told, kind):
-    losses = distil(appearance(hill, kind), told, (), Schedule(120, 0, batch=512), seed=3)
+    losses = train(appearance(hill, kind), told, (), Schedule(120, 0, batch=512), seed=3)
     assert np.mean(losses[-10:]) < 0.8 * np.mean(losses[:10])
 
 
@@ -252,10 +264,10 @@ def test_pictures_teach_and_an_interrupted_run_goes_on(hill, told, tmp_path):
     camera = looking_down(size=48, view_m=900.0)
     weights = view_weights(splats_of_surfels(surfels), camera)
     image = splat_colours(weights, told.colours[0]) / np.maximum(weights.coverage, 1e-3)[..., None]
-    frames = [Frame(weights, 0, image, weights.coverage > 0.9)]
+    frames = [TrainingFrame(weights, 0, image, weights.coverage > 0.9)]
     schedule = Schedule(20, 10, batch=256, checkpoint_every=8)
     whole = appearance(hill)
-    losses = distil(whole, told, frames, schedule, seed=5)
+    losses = train(whole, told, frames, schedule, seed=5)
     assert losses[-1] < losses[20]
 
     class Stop(Exception):
@@ -267,14 +279,14 @@ def test_pictures_teach_and_an_interrupted_run_goes_on(hill, told, tmp_path):
 
     path = tmp_path / "run.safetensors"
     with pytest.raises(Stop):
-        distil(appearance(hill), told, frames, schedule, seed=5, checkpoint=path, progress=stop_after)
+        train(appearance(hill), told, frames, schedule, seed=5, checkpoint=path, progress=stop_after)
     again = appearance(hill, seed=9)
-    rest = distil(again, told, frames, schedule, seed=5, checkpoint=path)
+    rest = train(again, told, frames, schedule, seed=5, checkpoint=path)
     assert len(rest) == 30 - 16
     for one, other in zip(whole.parameters(), again.parameters(), strict=True):
         assert torch.equal(one, other)
     with pytest.raises(ValueError, match="another run"):
-        distil(appearance(hill), told, frames, schedule, seed=6, checkpoint=path)
+        train(appearance(hill), told, frames, schedule, seed=6, checkpoint=path)
     assert not [p for p in tmp_path.iterdir() if p != path]
 
 
@@ -284,20 +296,20 @@ def splats_of_surfels(surfels) -> Splats:
 
 def test_one_time_and_no_view_are_enough(hill, told):
     model = appearance(hill, times=1)
-    once = Lessons(told.states[:1], [0], told.colours[:1])
-    assert len(distil(model, once, (), Schedule(5, 50, batch=64))) == 5
+    once = SurfaceTargets(told.states[:1], [0], told.colours[:1])
+    assert len(train(model, once, (), Schedule(5, 50, batch=64))) == 5
 
 
 def test_bad_lessons_and_frames_are_refused(hill, told):
     broken = told.colours.copy()
     broken[1, 7] = np.nan
     with pytest.raises(ValueError, match="3 colours are not finite"):
-        Lessons(told.states, told.seasons, broken)
+        SurfaceTargets(told.states, told.seasons, broken)
     with pytest.raises(ValueError, match="0 lights"):
-        Lessons([], [], np.zeros((0, 5, 3)))
+        SurfaceTargets([], [], np.zeros((0, 5, 3)))
     empty = view_weights(splats_of_surfels(hill[1]), under_the_hill())
     with pytest.raises(ValueError, match="inside the mountain"):
-        Frame(empty, 0, np.zeros((8, 8, 3)), np.ones((8, 8), bool))
+        TrainingFrame(empty, 0, np.zeros((8, 8, 3)), np.ones((8, 8), bool))
     with pytest.raises(ValueError, match="expected light"):
         light_state(hill[4], Illumination(np.zeros((16, 32, 3), np.float32)), 1.0)
 
@@ -306,7 +318,7 @@ def test_bad_lessons_and_frames_are_refused(hill, told):
 def model(hill, told) -> GaussianModel:
     _, surfels, _, albedo, transport = hill
     trained = appearance(hill)
-    distil(trained, told, (), Schedule(30, 0, batch=256))
+    train(trained, told, (), Schedule(30, 0, batch=256))
     return model_from(
         surfels,
         np.stack([albedo, 0.5 * albedo]),
@@ -581,11 +593,11 @@ def above(east_m: float) -> np.ndarray:
 def test_a_free_code_is_found_for_a_new_picture(hill, told):
     """WildGaussians' protocol: after fitting, the picture is nearer than with the code of another time."""
     trained = appearance(hill, "code")
-    distil(trained, told, (), Schedule(80, 0, batch=512), seed=1)
+    train(trained, told, (), Schedule(80, 0, batch=512), seed=1)
     weights = view_weights(splats_of_surfels(hill[1]), looking_down(size=32, view_m=900.0))
     image = splat_colours(weights, told.colours[0]) / np.maximum(weights.coverage, 1e-3)[..., None]
     lights = light_tensors(told.states)
-    code = fit_code(trained, lights, Frame(weights, 0, image, weights.coverage > 0.9), steps=30)
+    code = fit_code(trained, lights, TrainingFrame(weights, 0, image, weights.coverage > 0.9), steps=30)
     with torch.no_grad():
         errors = [
             float(
@@ -602,8 +614,8 @@ def test_fast_splatting_draws_the_same_picture():
     """On the renderer's device; what the opacity cut leaves out may differ by rounding, four thousandths at most."""
     splats, colours = some_splats(150, seed=6)
     axes = rotations(splats.quaternions) * splats.log_scales.exp()[:, None, :]
-    ready = ready_splats(splats.means.numpy(), axes.numpy(), torch.sigmoid(splats.opacity_logits).numpy())
-    expected, covered = rasterise_twin(splats, colours, CAMERA)
+    ready = upload_splats(splats.means.numpy(), axes.numpy(), torch.sigmoid(splats.opacity_logits).numpy())
+    expected, covered = rasterise_reference(splats, colours, CAMERA)
     image, coverage = splat_layers(ready, colours.numpy(), CAMERA, CUTS._replace(one_sided=False))
     assert image.shape == (20, 24, 3)
     assert np.abs(image - expected.numpy()).max() < 4.5e-3

@@ -25,21 +25,21 @@ from seasonscapes.evaluation.webcam_faults import (
     undo_development,
 )
 from seasonscapes.images import linear_from_srgb, srgb_from_linear
-from seasonscapes.rendering.gather import occluder
 from seasonscapes.rendering.gbuffer import trace_gbuffer
-from seasonscapes.rendering.scene import RenderScene, mi_mesh
+from seasonscapes.rendering.hemisphere_rays import ray_scene
+from seasonscapes.rendering.mitsuba_scene import RenderScene, mi_mesh
 from seasonscapes.terrain.atlas import measure_atlas
 from seasonscapes.terrain.surface import load_texture, sample_texture
 from seasonscapes.terrain.texels import texel_positions
 from seasonscapes.terrain.unwrap import unwrap
+from seasonscapes.texturing.atlas_tiles import tile_surface, tiles_of, tiling
 from seasonscapes.texturing.foreground import foreground_mask, predict_in_folds
-from seasonscapes.texturing.harmonise import Harmony, harmonise, land_radiance, straighten
-from seasonscapes.texturing.paint import PaintOptions, paint, prepare_shots
+from seasonscapes.texturing.inputs import PaintingInput, prepare_input, sample_input
+from seasonscapes.texturing.painting import PaintOptions, paint_atlas, prepare_inputs
 from seasonscapes.texturing.painting_file import load_painting, save_painting, write_figures
-from seasonscapes.texturing.shots import Shot, ready_shot, sample_shot
+from seasonscapes.texturing.radiometric_fit import RadiometricFit, fit_radiometry, invert_contrast, radiance_at_surface
 from seasonscapes.texturing.silhouette import depth_jumps, pose_sigma_px, silhouette_guard
-from seasonscapes.texturing.tiles import tile_surface, tiles_of, tiling
-from seasonscapes.texturing.visibility import by_depth, by_faces, by_ray, sight_of
+from seasonscapes.texturing.visibility import by_depth, by_faces, by_ray, project_texels
 from seasonscapes.texturing.weights import sharpened, texel_weight
 
 NOON = datetime(2024, 9, 1, 12, tzinfo=UTC)
@@ -62,7 +62,7 @@ class Land:
 
     def __init__(self, height, *, count=121, side_m=1200.0, texel_m=5.0):
         self.terrain, self.atlas = unwrap(heightfield(height, count=count, side_m=side_m), texel_m=texel_m)
-        self.occluder = occluder(mi_mesh(self.terrain, np.full(3, 0.3)))
+        self.ray_scene = ray_scene(mi_mesh(self.terrain, np.full(3, 0.3)))
         self.cut = tiling(self.terrain, self.atlas)
         place, _ = texel_positions(self.terrain, self.atlas.width_px, self.atlas.height_px)
         e, n = place[..., 0], place[..., 1]
@@ -71,7 +71,7 @@ class Land:
 
     def look(self, camera):
         """The G-buffer of a camera."""
-        return trace_gbuffer(RenderScene(self.occluder.mi_scene, self.occluder.mi_terrain, None, 0.0), camera)
+        return trace_gbuffer(RenderScene(self.ray_scene.mi_scene, self.ray_scene.mi_terrain, None, 0.0), camera)
 
     def picture(self, camera, air=None) -> np.ndarray:
         """Radiance at a camera, through the air, against a sky of one colour."""
@@ -84,7 +84,7 @@ class Land:
             land = land * transmittance + airlight
         return np.where(np.isfinite(buffer.depth)[..., None], land, SKY).astype(np.float32)
 
-    def shot(self, camera, name, *, gains=1e-4, faults=None, seed=0, air=None, foreground=False) -> Shot:
+    def item(self, camera, name, *, gains=1e-4, faults=None, seed=0, air=None, foreground=False) -> PaintingInput:
         """What a webcam would deliver: with fixed gains, or with faults."""
         radiance = self.picture(camera, air)
         if foreground:
@@ -93,11 +93,13 @@ class Land:
             image = np.clip(radiance * gains, 0.0, 1.0).astype(np.float32)
         else:
             image = linear_from_srgb(degrade(radiance, faults, np.random.default_rng(seed))[0] / np.float32(255.0))
-        return Shot(Observation(image, np.ones(image.shape[:2], bool), camera, NOON, name), air)
+        return PaintingInput(Observation(image, np.ones(image.shape[:2], bool), camera, NOON, name), air)
 
-    def paint(self, shots, **options):
+    def paint(self, inputs, **options):
         """Painted with no near limit."""
-        return paint(shots, self.terrain, self.atlas, self.occluder, options=PaintOptions(near_m=1.0, **options))
+        return paint_atlas(
+            inputs, self.terrain, self.atlas, self.ray_scene, options=PaintOptions(near_m=1.0, **options)
+        )
 
 
 def hills(e, n):
@@ -138,11 +140,11 @@ def test_rays_agree_with_a_scalar_oracle(land, cameras):
     surface = tile_surface(land.cut, next(tiles_of(land.cut)))
     oracle, rng = BinnedTriangles(land.terrain.vertices, land.terrain.faces, bins=40), np.random.default_rng(5)
     for camera in cameras:
-        sight = sight_of(camera, surface)
+        sight = project_texels(camera, surface)
         inside, grazing = np.flatnonzero(sight.inside), np.flatnonzero(sight.inside & (sight.cosine < 0.2))
         some = np.concatenate([rng.permutation(inside)[:200], rng.permutation(grazing)[:100]])
         truth = oracle.sees(surface.position_m[some], surface.face[some], camera.position_m)
-        seen = by_ray(land.occluder, camera, surface[some], sight[some])
+        seen = by_ray(land.ray_scene, camera, surface[some], sight[some])
         assert 0.2 < truth.mean() < 0.98, "the sample must hold seen and hidden texels"
         assert np.count_nonzero(seen & ~truth) <= 0.001 * seen.sum()
         assert np.count_nonzero(seen & truth) >= 0.995 * truth.sum()
@@ -153,10 +155,10 @@ def test_other_visibility_tests_are_worse(land, cameras):
     surface = tile_surface(land.cut, next(tiles_of(land.cut)))
     wrong = {"depth": 0, "faces": 0}
     for camera in cameras:
-        sight = sight_of(camera, surface)
-        truth = by_ray(land.occluder, camera, surface, sight)
+        sight = project_texels(camera, surface)
+        truth = by_ray(land.ray_scene, camera, surface, sight)
         wrong["depth"] += np.count_nonzero(by_depth(land.look(camera).depth, sight) != truth)
-        wrong["faces"] += np.count_nonzero(by_faces(land.occluder, camera, surface, sight) != truth)
+        wrong["faces"] += np.count_nonzero(by_faces(land.ray_scene, camera, surface, sight) != truth)
     assert min(wrong.values()) > 500
 
 
@@ -170,7 +172,7 @@ def test_two_ridges_leak_nothing():
     ridges = Land(height)
     eye = np.array([0.0, -550.0, 120.0])
     painting = ridges.paint(
-        [ridges.shot(camera_towards(eye, (0.0, 400.0, 80.0), fov_deg=80.0), "south")], guard=False, fit_gains=False
+        [ridges.item(camera_towards(eye, (0.0, 400.0, 80.0), fov_deg=80.0), "south")], guard=False, fit_gains=False
     )
     place, _ = texel_positions(ridges.terrain, ridges.atlas.width_px, ridges.atlas.height_px)
     n, z = place[..., 1].astype(float), place[..., 2].astype(float)
@@ -190,10 +192,10 @@ def test_two_ridges_leak_nothing():
 def test_painted_view_projects_back_into_its_own_camera():
     fine = Land(hills, texel_m=1.25)
     camera = camera_towards((-250.0, -650.0, 260.0), (0.0, 0.0, 0.0), size=(320, 240))
-    painting = fine.paint([fine.shot(camera, "south")], fit_gains=False)
+    painting = fine.paint([fine.item(camera, "south")], fit_gains=False)
     buffer = fine.look(camera)
     sound = sample_texture((painting.texture.weight > 0)[..., None].astype(np.float32), buffer.uv)[..., 0] > 0.999
-    gain_of = np.exp(painting.harmony.log_gain[0])
+    gain_of = np.exp(painting.radiometry.log_gain[0])
     back = srgb_from_linear(np.clip(gain_of * sample_texture(painting.texture.values, buffer.uv)[sound], 0, 1))
     seen = srgb_from_linear(1e-4 * fine.picture(camera)[sound])
     assert sound.mean() > 0.4
@@ -234,14 +236,14 @@ def test_weights_are_what_the_formula_says():
 
 def test_a_texel_larger_than_pixels_gets_their_mean(land, cameras):
     noise = np.random.default_rng(0).uniform(0.1, 0.9, (120, 160, 3)).astype(np.float32)
-    shot = Shot(Observation(noise, np.ones((120, 160), bool), cameras[0], NOON, "noisy"))
-    ready = ready_shot(shot, land.occluder, land.cut, near_m=0.0)
+    item = PaintingInput(Observation(noise, np.ones((120, 160), bool), cameras[0], NOON, "noisy"))
+    ready = prepare_input(item, land.ray_scene, land.cut, near_m=0.0)
     usable = ready.levels[0][..., 3]
     row, column = np.argwhere(np.lib.stride_tricks.sliding_window_view(usable, (8, 8)).all(axis=(2, 3)))[0] // 8 * 8 + 8
-    value, trust = sample_shot(ready, np.array([[column + 4.0, row + 4.0]]), np.array([8.0]))
+    value, confidence = sample_input(ready, np.array([[column + 4.0, row + 4.0]]), np.array([8.0]))
     around = noise[row : row + 8, column : column + 8].mean(axis=(0, 1))
     np.testing.assert_allclose(value[0], around, atol=0.06)
-    assert trust[0] >= 0.0
+    assert confidence[0] >= 0.0
 
 
 # --- agreement --------------------------------------------------------------------------------------------------------
@@ -249,12 +251,12 @@ def test_a_texel_larger_than_pixels_gets_their_mean(land, cameras):
 
 def test_gains_and_haze_are_recovered(land, overlapping):
     gains = np.array([[1.0, 1.0, 1.0], [1.9, 1.6, 1.2], [0.6, 0.7, 0.8]]) * 5e-5
-    shots = [
-        land.shot(c, f"cam-{k}", gains=g, air=thick_air)
+    inputs = [
+        land.item(c, f"cam-{k}", gains=g, air=thick_air)
         for k, (c, g) in enumerate(zip(overlapping, gains, strict=True))
     ]
-    ready, _ = prepare_shots(shots, land.occluder, land.cut, PaintOptions(near_m=1.0))
-    found = harmonise(ready, land.occluder, fit_contrast=False)
+    ready, _ = prepare_inputs(inputs, land.ray_scene, land.cut, PaintOptions(near_m=1.0))
+    found = fit_radiometry(ready, land.ray_scene, fit_contrast=False)
     np.testing.assert_allclose(found.log_gain, np.log(gains), atol=0.06)
     assert found.haze == pytest.approx(1.0, abs=0.1)
     assert found.scatter_after < 0.04 < found.scatter_before
@@ -262,10 +264,10 @@ def test_gains_and_haze_are_recovered(land, overlapping):
     def more(depth_m, direction):
         return thick_air(1.4 * np.asarray(depth_m), direction)
 
-    ready, _ = prepare_shots(
-        [replace(shot, air=more) for shot in shots], land.occluder, land.cut, PaintOptions(near_m=1.0)
+    ready, _ = prepare_inputs(
+        [replace(item, air=more) for item in inputs], land.ray_scene, land.cut, PaintOptions(near_m=1.0)
     )
-    assert harmonise(ready, land.occluder, fit_contrast=False).haze == pytest.approx(1.0 / 1.4, abs=0.1)
+    assert fit_radiometry(ready, land.ray_scene, fit_contrast=False).haze == pytest.approx(1.0 / 1.4, abs=0.1)
 
 
 def test_air_is_subtracted_exactly_when_all_is_known():
@@ -273,7 +275,9 @@ def test_air_is_subtracted_exactly_when_all_is_known():
     transmittance, airlight = clear_air(np.array([500.0]), None)
     picture = np.array([2e-4, 1.5e-4, 1e-4]) * (land_value * transmittance + airlight)
     gains = np.log(np.array([[2e-4, 1.5e-4, 1e-4]]))
-    radiance, share = land_radiance(picture, 0, (transmittance, airlight), Harmony(gains, gains, np.ones(1)))
+    radiance, share = radiance_at_surface(
+        picture, 0, (transmittance, airlight), RadiometricFit(gains, gains, np.ones(1))
+    )
     np.testing.assert_allclose(radiance, land_value, rtol=1e-4)
     np.testing.assert_allclose(
         share, (land_value * transmittance / (land_value * transmittance + airlight)).min(), rtol=1e-4
@@ -283,21 +287,21 @@ def test_air_is_subtracted_exactly_when_all_is_known():
 def test_straightening_is_monotone_and_keeps_the_middle():
     value = np.linspace(0.0, 1.0, 201)
     for contrast in (0.8, 1.0, 1.4):
-        straight = straighten(value, contrast)
+        straight = invert_contrast(value, contrast)
         assert (np.diff(straight) >= 0.0).all()
         assert straight[0] == 0.0
         assert straight[-1] == pytest.approx(1.0)
-    np.testing.assert_allclose(straighten(value, 1.0), value, atol=1e-5)
+    np.testing.assert_allclose(invert_contrast(value, 1.0), value, atol=1e-5)
     middle = linear_from_srgb(np.array([0.5]))
-    np.testing.assert_allclose(straighten(middle, 1.5), middle, rtol=1e-4)
+    np.testing.assert_allclose(invert_contrast(middle, 1.5), middle, rtol=1e-4)
 
 
 def test_harmonising_helps_under_webcam_faults(land, overlapping):
     faults = replace(TYPICAL, tone_strength=0.2)
-    shots = [land.shot(c, f"cam-{k}", faults=faults, seed=k, air=clear_air) for k, c in enumerate(overlapping)]
+    inputs = [land.item(c, f"cam-{k}", faults=faults, seed=k, air=clear_air) for k, c in enumerate(overlapping)]
     error = {}
     for fit in (False, True):
-        painting = land.paint(shots, fit_gains=fit)
+        painting = land.paint(inputs, fit_gains=fit)
         painted = painting.texture.weight > 0.0
         ratio = np.log(painting.texture.values[painted] / land.radiance[painted])
         error[fit] = np.std(ratio - np.median(ratio, axis=0))
@@ -318,9 +322,9 @@ def same(a, b):
 
 def test_order_does_not_matter_when_weighted_and_does_when_first(land, cameras):
     gains = (1e-4, 1.4e-4, 0.8e-4)
-    shots = [land.shot(c, f"cam-{k}", gains=g) for k, (c, g) in enumerate(zip(cameras, gains, strict=True))]
-    assert same(land.paint(shots), land.paint(shots[::-1]))
-    first, last = (land.paint(order, mode="first", fit_gains=False) for order in (shots, shots[::-1]))
+    inputs = [land.item(c, f"cam-{k}", gains=g) for k, (c, g) in enumerate(zip(cameras, gains, strict=True))]
+    assert same(land.paint(inputs), land.paint(inputs[::-1]))
+    first, last = (land.paint(order, mode="first", fit_gains=False) for order in (inputs, inputs[::-1]))
     assert first.webcams == ("cam-0", "cam-1", "cam-2")
     assert last.webcams == ("cam-2", "cam-1", "cam-0")
     assert not np.array_equal(first.texture.values, last.texture.values)
@@ -329,9 +333,9 @@ def test_order_does_not_matter_when_weighted_and_does_when_first(land, cameras):
 
 
 def test_tiles_change_nothing_and_resume(land, cameras, tmp_path, monkeypatch):
-    shots = [land.shot(c, f"cam-{k}") for k, c in enumerate(cameras)]
-    whole = land.paint(shots)
-    assert same(whole, land.paint(shots, tile_px=64))
+    inputs = [land.item(c, f"cam-{k}") for k, c in enumerate(cameras)]
+    whole = land.paint(inputs)
+    assert same(whole, land.paint(inputs, tile_px=64))
     cut = PaintOptions(near_m=1.0, tile_px=100)
     killed = []
 
@@ -341,19 +345,19 @@ def test_tiles_change_nothing_and_resume(land, cameras, tmp_path, monkeypatch):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        paint(shots, land.terrain, land.atlas, land.occluder, options=cut, resume=tmp_path, progress=stop)
+        paint_atlas(inputs, land.terrain, land.atlas, land.ray_scene, options=cut, resume=tmp_path, progress=stop)
     done = sorted(tmp_path.glob("tile-*.npz"))
     assert 0 < len(done) < 9
     assert not list(tmp_path.glob(".*"))
     stamps = [path.stat().st_mtime_ns for path in done]
-    again = paint(shots, land.terrain, land.atlas, land.occluder, options=cut, resume=tmp_path)
+    again = paint_atlas(inputs, land.terrain, land.atlas, land.ray_scene, options=cut, resume=tmp_path)
     assert [path.stat().st_mtime_ns for path in done] == stamps, "finished tiles are not painted again"
     assert same(whole, again)
 
 
 def test_views_without_anything_to_say_are_left_out_and_told(land, cameras):
-    good = land.shot(cameras[0], "good")
-    away = land.shot(camera_towards((0.0, 0.0, 300.0), (0.0, 10.0, 900.0)), "away")
+    good = land.item(cameras[0], "good")
+    away = land.item(camera_towards((0.0, 0.0, 300.0), (0.0, 10.0, 900.0)), "away")
     dark = replace(good, observation=replace(good.observation, mask=np.zeros((120, 160), bool), webcam="masked"))
     broken = replace(
         good, observation=replace(good.observation, image=np.full((120, 160, 3), np.nan, np.float32), webcam="broken")
@@ -371,7 +375,7 @@ def test_views_without_anything_to_say_are_left_out_and_told(land, cameras):
 
 
 def test_single_nan_pixels_spoil_only_themselves(land, cameras):
-    good = land.shot(cameras[0], "good")
+    good = land.item(cameras[0], "good")
     image = good.observation.image.copy()
     image[60:63, 80:83] = np.nan
     spoilt = land.paint([replace(good, observation=replace(good.observation, image=image))], fit_gains=False)
@@ -383,9 +387,9 @@ def test_single_nan_pixels_spoil_only_themselves(land, cameras):
 
 def test_unpainted_is_told_by_weight_not_by_colour(land, cameras):
     """A picture as red as an alpenglow is painted like any other."""
-    shot = land.shot(cameras[0], "glow")
-    red = np.broadcast_to(np.array([0.8, 0.05, 0.02], np.float32), shot.observation.image.shape).copy()
-    painting = land.paint([replace(shot, observation=replace(shot.observation, image=red))], fit_gains=False)
+    item = land.item(cameras[0], "glow")
+    red = np.broadcast_to(np.array([0.8, 0.05, 0.02], np.float32), item.observation.image.shape).copy()
+    painting = land.paint([replace(item, observation=replace(item.observation, image=red))], fit_gains=False)
     painted = painting.texture.weight > 0.0
     assert painted.mean() > 0.1
     assert (painting.best[painted] == 0).all()
@@ -395,12 +399,12 @@ def test_unpainted_is_told_by_weight_not_by_colour(land, cameras):
 
 
 def test_painting_on_disk(land, cameras, tmp_path):
-    painting = land.paint([land.shot(c, f"cam-{k}") for k, c in enumerate(cameras)])
+    painting = land.paint([land.item(c, f"cam-{k}") for k, c in enumerate(cameras)])
     save_painting(painting, tmp_path / "p.npz")
     back = load_painting(tmp_path / "p.npz")
     assert same(painting, back)
     assert back.webcams == painting.webcams
-    np.testing.assert_allclose(back.harmony.log_gain, painting.harmony.log_gain)
+    np.testing.assert_allclose(back.radiometry.log_gain, painting.radiometry.log_gain)
     np.testing.assert_array_equal(load_texture(tmp_path / "p.npz").values, painting.texture.values)
     files = write_figures(painting, tmp_path / "figures")
     assert all(
@@ -414,14 +418,14 @@ def test_painting_on_disk(land, cameras, tmp_path):
 
 def test_houses_and_masts_are_found(land, cameras):
     camera = camera_towards((-500.0, -450.0, 170.0), (0.0, 0.0, 0.0), size=(320, 240))
-    shot = land.shot(camera, "village", foreground=True)
+    item = land.item(camera, "village", foreground=True)
     _, truth = add_foreground(land.picture(camera), np.random.default_rng(0))
-    ready = ready_shot(shot, land.occluder, land.cut, near_m=1.0)
+    ready = prepare_input(item, land.ray_scene, land.cut, near_m=1.0)
     log_gain = np.full((1, 3), np.log(1e-4))
     rng = np.random.default_rng(2)
     guess = land.radiance * np.exp(rng.normal(0.0, 0.05, land.radiance.shape)).astype(np.float32)
     uv = land.look(camera).uv
-    found = foreground_mask(ready, 0, Harmony(log_gain, log_gain, np.ones(1)), guess, uv)
+    found = foreground_mask(ready, 0, RadiometricFit(log_gain, log_gain, np.ones(1)), guess, uv)
     on_land = np.isfinite(uv).all(axis=2)
     assert found[truth & on_land].mean() > 0.85
     assert found[~truth & on_land].mean() < 0.05
@@ -430,7 +434,7 @@ def test_houses_and_masts_are_found(land, cameras):
 def test_predictions_owe_nothing_to_their_own_fold(land):
     from seasonscapes.terrain.surface import Texture
 
-    guides = np.log(land.radiance) @ np.array([[1.0, 0.2], [0.1, 1.0], [0.3, 0.4]], np.float32)
+    predictors = np.log(land.radiance) @ np.array([[1.0, 0.2], [0.1, 1.0], [0.3, 0.4]], np.float32)
     seen = []
 
     def fit(x, y):
@@ -439,11 +443,11 @@ def test_predictions_owe_nothing_to_their_own_fold(land):
         return lambda z: np.column_stack([z, np.ones(len(z))]) @ solution
 
     spoilt = Texture(land.radiance.copy())
-    clean = predict_in_folds(spoilt, guides, fit)
+    clean = predict_in_folds(spoilt, predictors, fit)
     assert len(seen) == 4
     assert np.isfinite(clean).all()
     spoilt.values[:20, :20] *= 50.0
-    again = predict_in_folds(Texture(spoilt.values), guides, fit)
+    again = predict_in_folds(Texture(spoilt.values), predictors, fit)
     inner = np.log(again[:16, :16] / clean[:16, :16])
     assert np.abs(inner).max() < 1.5, "a block that is fifty times too bright does not predict itself"
 
@@ -476,19 +480,19 @@ def test_atlas_of_charts_is_painted_too():
     """Nothing in painting takes the atlas for a plan."""
     cliffs = Land(hills, count=41, texel_m=10.0)
     terrain, atlas = unwrap(cliffs.terrain, kind="xatlas", texel_m=10.0)
-    shot = cliffs.shot(camera_towards((-500.0, -450.0, 170.0), (0.0, 0.0, 0.0)), "one")
-    painting = paint(
-        [shot],
+    item = cliffs.item(camera_towards((-500.0, -450.0, 170.0), (0.0, 0.0, 0.0)), "one")
+    painting = paint_atlas(
+        [item],
         terrain,
         atlas,
-        occluder(mi_mesh(terrain, np.full(3, 0.3))),
+        ray_scene(mi_mesh(terrain, np.full(3, 0.3))),
         options=PaintOptions(near_m=1.0, fit_gains=False),
     )
     place, _ = texel_positions(terrain, atlas.width_px, atlas.height_px)
     painted = painting.texture.weight > 0.0
     e, n = place[painted][:, 0], place[painted][:, 1]
     truth = 1500.0 * np.stack([1.5 + np.sin(e / 60.0), 1.5 + np.cos(n / 45.0), 1.5 + np.sin((e + n) / 80.0)], axis=-1)
-    ratio = painting.texture.values[painted] * np.exp(painting.harmony.log_gain[0]) / (1e-4 * truth)
+    ratio = painting.texture.values[painted] * np.exp(painting.radiometry.log_gain[0]) / (1e-4 * truth)
     assert painted.mean() > 0.1
     assert np.median(np.abs(np.log(ratio))) < 0.05
     assert measure_atlas(terrain, "xatlas", atlas.width_px, atlas.height_px).width_px == atlas.width_px

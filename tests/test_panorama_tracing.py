@@ -9,18 +9,18 @@ from test_transport import gradient_sky
 
 from seasonscapes.cameras.panorama import cut_view, panorama_from_angles, project_panorama, split_panorama
 from seasonscapes.cameras.pinhole import rotation_from_angles
-from seasonscapes.evaluation.synthetic_webcams import Hour, webcam_series
+from seasonscapes.evaluation.synthetic_webcams import WebcamInstant, webcam_series
 from seasonscapes.evaluation.webcam_faults import CLEAN, PoseSigmas, perturb_pose
 from seasonscapes.rendering.coefficients_file import load_coefficients, save_coefficients
-from seasonscapes.rendering.gather import occluder
+from seasonscapes.rendering.hemisphere_rays import ray_scene
+from seasonscapes.rendering.mitsuba_scene import mi_mesh, relight
 from seasonscapes.rendering.radiance import render_view
-from seasonscapes.rendering.relit_view import ready_view, relight_view
-from seasonscapes.rendering.scene import mi_mesh, relight
+from seasonscapes.rendering.relit_view import relight_view, relightable_view
 from seasonscapes.rendering.sightlines import faces_met
-from seasonscapes.rendering.transport import Effort, trace_view
+from seasonscapes.rendering.transport import SamplingOptions, trace_view
 from seasonscapes.sky.illumination import Illumination
 
-EFFORT = Effort(subpixels=16, shades=64, rays=128, senders=1024)
+EFFORT = SamplingOptions(subpixels=16, shades=64, rays=128, clusters=1024)
 TERRAIN = heightfield(lambda e, n: 0.0006 * (e**2 + n**2) + 25.0 * np.sin(e / 55.0) * np.cos(n / 40.0 + e / 90.0))
 
 
@@ -57,14 +57,14 @@ def land():
 @pytest.mark.parametrize(("projection", "tilt_deg"), [("cylindrical", 0.0), ("equirectangular", 5.0)])
 def test_a_view_cut_out_of_a_relit_panorama_equals_one_traced_directly(land, projection, tilt_deg):
     panorama = panorama_at(25.0, projection, size_px=(450, 100), tilt_deg=tilt_deg)
-    bare = occluder(land)
-    whole = relight_view(ready_view(bare, trace_view(bare, panorama, EFFORT)), LIGHT)
+    bare = ray_scene(land)
+    whole = relight_view(relightable_view(bare, trace_view(bare, panorama, EFFORT)), LIGHT)
     assert 0.2 < whole.coverage.mean() < 0.95
     cameras = split_panorama(panorama, fov_deg=80.0)
     # The first one looks across the seam, which is at the back of the heading.
     for camera in cameras[0:3:2] if tilt_deg == 0.0 else cameras[:1]:
         cut, inside = cut_view(whole.radiance, panorama, camera)
-        direct = relight_view(ready_view(bare, trace_view(bare, camera, EFFORT)), LIGHT)
+        direct = relight_view(relightable_view(bare, trace_view(bare, camera, EFFORT)), LIGHT)
         error = np.abs(cut - direct.radiance) / direct.radiance.mean(axis=2, keepdims=True)
         ground = inside & (direct.coverage > 0.0)
         assert ground.mean() > 0.2
@@ -76,8 +76,8 @@ def test_a_view_cut_out_of_a_relit_panorama_equals_one_traced_directly(land, pro
 
 def test_a_panorama_is_path_traced_to_the_same_picture(land):
     panorama = panorama_at(300.0, size_px=(360, 80))
-    bare = occluder(land)
-    relit = relight_view(ready_view(bare, trace_view(bare, panorama, EFFORT)), LIGHT).radiance
+    bare = ray_scene(land)
+    relit = relight_view(relightable_view(bare, trace_view(bare, panorama, EFFORT)), LIGHT).radiance
     traced = render_view(relight(land, LIGHT, max_height_m=300.0), panorama, spp=128).radiance
     assert relit.mean() / traced.mean() == pytest.approx(1.0, abs=0.01)
     assert np.median(np.abs(relit - traced) / traced.mean(axis=2, keepdims=True)) < 0.02
@@ -87,9 +87,9 @@ def test_a_panorama_is_path_traced_to_the_same_picture(land):
 def test_each_pixel_shows_the_place_that_projects_to_it(land, projection):
     """Neither mirrored nor turned; and the sampled rays of the renderer are those of the camera model."""
     panorama = panorama_at(100.0, projection, tilt_deg=3.0)
-    bare = occluder(land)
-    coefficients = trace_view(bare, panorama, Effort(subpixels=4, shades=4, rays=16, senders=64, bounces=0))
-    ready = ready_view(bare, coefficients)
+    bare = ray_scene(land)
+    coefficients = trace_view(bare, panorama, SamplingOptions(subpixels=4, shades=4, rays=16, clusters=64, bounces=0))
+    ready = relightable_view(bare, coefficients)
     seen = np.isfinite(ready.gbuffer.depth)
     row, column = np.nonzero(seen)
     pixel, _ = project_panorama(panorama, ready.gbuffer.position[seen])
@@ -109,10 +109,10 @@ def test_each_pixel_shows_the_place_that_projects_to_it(land, projection):
 
 def test_the_last_column_meets_the_first(land):
     """Turned by half a circle, the seam is in the middle and nothing is seen of it."""
-    bare = occluder(land)
+    bare = ray_scene(land)
     pictures = [
         relight_view(
-            ready_view(bare, trace_view(bare, panorama_at(heading, size_px=(360, 80)), EFFORT)), LIGHT
+            relightable_view(bare, trace_view(bare, panorama_at(heading, size_px=(360, 80)), EFFORT)), LIGHT
         ).radiance
         for heading in (10.0, 190.0)
     ]
@@ -126,17 +126,17 @@ def test_the_last_column_meets_the_first(land):
 def test_a_webcam_series_of_panoramas(tmp_path):
     panorama = panorama_at(80.0, size_px=(300, 66))
     time = datetime(2024, 7, 20, 10, tzinfo=UTC)
-    effort = Effort(subpixels=4, shades=16, rays=64, senders=256)
+    sampling = SamplingOptions(subpixels=4, shades=16, rays=64, clusters=256)
     poses = PoseSigmas(1.0, 1.0, 0.5, 0.2, 0.2, 0.05)
     made = webcam_series(
         TERRAIN,
         "round",
         panorama,
-        [Hour(time, LIGHT, colours())],
+        [WebcamInstant(time, LIGHT, colours())],
         faults=CLEAN,
         poses=poses,
         foreground=True,
-        effort=effort,
+        sampling=sampling,
     )[0]
     assert made.encoded.shape == made.radiance.shape == (66, 300, 3)
     assert made.camera is panorama
@@ -152,8 +152,10 @@ def test_a_webcam_series_of_panoramas(tmp_path):
 
 
 def test_coefficients_of_a_panorama_are_kept_in_files(land, tmp_path):
-    bare = occluder(land)
-    made = trace_view(bare, panorama_at(0.0, size_px=(90, 20)), Effort(subpixels=4, shades=4, rays=16, senders=64))
+    bare = ray_scene(land)
+    made = trace_view(
+        bare, panorama_at(0.0, size_px=(90, 20)), SamplingOptions(subpixels=4, shades=4, rays=16, clusters=64)
+    )
     save_coefficients(tmp_path / "view", made)
     again = load_coefficients(tmp_path / "view")
     assert again.camera.projection == "cylindrical"

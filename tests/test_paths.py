@@ -6,8 +6,8 @@ from test_rendering import PLANE, heightfield, looking_down, pyramid, sun_at
 
 from seasonscapes.frames import equirectangular_directions
 from seasonscapes.rendering import backend, radiance
+from seasonscapes.rendering.mitsuba_scene import RenderScene, build_scene
 from seasonscapes.rendering.radiance import mi_path_integrator, path_trace
-from seasonscapes.rendering.scene import RenderScene, build_scene
 from seasonscapes.sky.illumination import Illumination
 
 CAMERA = looking_down(600.0, size=48)

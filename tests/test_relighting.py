@@ -17,10 +17,10 @@ from seasonscapes.albedo.seasons import season_weights
 from seasonscapes.cli import main
 from seasonscapes.errors import InputError
 from seasonscapes.pipeline import MeshOptions, dated_albedos, load_place
-from seasonscapes.relighting.adaptation import adapted_ev100
-from seasonscapes.relighting.efficacy import efficacies_lm_w
+from seasonscapes.relighting.exposure_smoothing import smoothed_ev100
 from seasonscapes.relighting.film import write_film
 from seasonscapes.relighting.frame_file import frame_ev100, load_frame, save_frame
+from seasonscapes.relighting.luminous_efficacy import efficacies_lm_w
 from seasonscapes.scene import read_scene
 from seasonscapes.sky.models import read_sky_model
 from seasonscapes.studio import Assignment, frames_folder, open_studio, render_frame, shard, view_at
@@ -74,16 +74,16 @@ def test_colours_go_round_the_year(day, season, expected):
 def test_exposure_follows_a_dusk_and_loses_its_flicker():
     seconds = np.arange(60) * 600.0
     ramp = 14.0 - seconds / 3600.0
-    np.testing.assert_allclose(adapted_ev100(seconds, ramp, window_s=1800.0), ramp, atol=1e-9)
+    np.testing.assert_allclose(smoothed_ev100(seconds, ramp, window_s=1800.0), ramp, atol=1e-9)
     flicker = ramp + 0.2 * np.random.default_rng(3).choice([-1.0, 1.0], 60)
-    smooth = adapted_ev100(seconds, flicker, window_s=1800.0)
+    smooth = smoothed_ev100(seconds, flicker, window_s=1800.0)
     assert np.diff(smooth - ramp).std() < 0.2 * np.diff(flicker - ramp).std()
-    np.testing.assert_array_equal(adapted_ev100(seconds, flicker, window_s=0.0), flicker)
+    np.testing.assert_array_equal(smoothed_ev100(seconds, flicker, window_s=0.0), flicker)
     # A fall far quicker than the window is followed to within half a stop.
     cliff = np.where(seconds < 18000.0, 14.0, -3.0)
-    assert np.abs(adapted_ev100(seconds, cliff, window_s=7200.0) - cliff).max() <= 0.5
+    assert np.abs(smoothed_ev100(seconds, cliff, window_s=7200.0) - cliff).max() <= 0.5
     # Hours apart from each other, frames keep their own.
-    np.testing.assert_allclose(adapted_ev100(seconds * 60.0, flicker, window_s=900.0), flicker, atol=1e-6)
+    np.testing.assert_allclose(smoothed_ev100(seconds * 60.0, flicker, window_s=900.0), flicker, atol=1e-6)
 
 
 @pytest.mark.parametrize("level", [1e-4, 1.0, 3e4])
@@ -116,8 +116,8 @@ def test_a_film_plays(tmp_path):
 
 def test_a_frame_equals_path_tracing(hill):
     """The whole way from a file and a time, against Monte Carlo."""
+    from seasonscapes.rendering.mitsuba_scene import build_scene
     from seasonscapes.rendering.radiance import render_view
-    from seasonscapes.rendering.scene import build_scene
 
     studio = open_studio(hill)
     view, light, _ = view_at(studio, NOON)

@@ -8,13 +8,20 @@ import numpy as np
 import places
 import pytest
 
-from seasonscapes.albedo.seasons import albedo_at, albedo_between, line_share, neighbours, snow_share, snow_turning
+from seasonscapes.albedo.seasons import (
+    albedo_at,
+    interpolate_albedo,
+    neighbouring_dates,
+    snow_share,
+    snow_transition,
+    snowline_fraction,
+)
 from seasonscapes.cli import main
 from seasonscapes.pipeline import MeshOptions, albedo_of_day, dated_albedos, load_place
 from seasonscapes.scene import read_scene
 from seasonscapes.sky.models import read_sky_model
 from seasonscapes.studio import Assignment, dressed_view, open_studio
-from seasonscapes.terrain.ground import Ground, texel_ground
+from seasonscapes.terrain.attributes import TerrainAttributes, texel_attributes
 from seasonscapes.terrain.surface import Texture, load_texture, save_texture
 from seasonscapes.workspace import Workspace
 
@@ -24,15 +31,15 @@ DAYS = [SNOWY + timedelta(days=10 * k) for k in range(11)]
 BANDS_M = np.linspace(900.0, 2100.0, 7)
 
 
-def slopes(count: int, *, seed: int = 0) -> Ground:
+def slopes(count: int, *, seed: int = 0) -> TerrainAttributes:
     """Places of a mountain that face all ways, up to 2,000 m."""
     rng = np.random.default_rng(seed)
     turn, tilt = rng.uniform(0.0, 2.0 * np.pi, count), np.radians(rng.uniform(5.0, 35.0, count))
     normal = np.stack([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)], axis=1)
-    return Ground(rng.uniform(0.0, 3000.0, count), normal, np.zeros(count))
+    return TerrainAttributes(rng.uniform(0.0, 3000.0, count), normal, np.zeros(count))
 
 
-def snow_above(ground: Ground, line_m: float, *, by_north_m: float = 500.0) -> np.ndarray:
+def snow_above(ground: TerrainAttributes, line_m: float, *, by_north_m: float = 500.0) -> np.ndarray:
     white = ground.height_m > line_m - by_north_m * ground.normal[:, 1]
     return np.where(white[:, None], WHITE, BARE).astype(np.float32)
 
@@ -47,31 +54,31 @@ def half_done(values: np.ndarray) -> float:
 def test_the_line_moves_up_and_down(first_m, second_m):
     ground = slopes(6000)
     pair = (snow_above(ground, first_m), snow_above(ground, second_m))
-    turning = snow_turning(ground, *pair)
+    turning = snow_transition(ground, *pair)
     changed = np.any(pair[0] != pair[1], axis=1)
     np.testing.assert_array_equal(turning[:, 0], changed)
     for way in (0.25, 0.5, 0.75):
         truth = snow_above(ground, first_m + way * (second_m - first_m))
-        moved = albedo_between(pair, turning, way, way)
+        moved = interpolate_albedo(pair, turning, way, way)
         faded = (1.0 - way) * pair[0] + way * pair[1]
         assert np.mean((moved - truth) ** 2) < 0.12 * np.mean((faded - truth) ** 2)
         assert half_done(moved) < 0.15 * changed.mean()
     for way, end in enumerate(pair):
-        np.testing.assert_array_equal(albedo_between(pair, turning, float(way), float(way)), end)
+        np.testing.assert_array_equal(interpolate_albedo(pair, turning, float(way), float(way)), end)
     # A line that was seen elsewhere than time says is believed.
-    late = albedo_between(pair, turning, 0.5, 0.9)
+    late = interpolate_albedo(pair, turning, 0.5, 0.9)
     truth = snow_above(ground, first_m + 0.9 * (second_m - first_m))
-    assert np.mean((late - truth) ** 2) < 0.2 * np.mean((albedo_between(pair, turning, 0.5, 0.5) - truth) ** 2)
+    assert np.mean((late - truth) ** 2) < 0.2 * np.mean((interpolate_albedo(pair, turning, 0.5, 0.5) - truth) ** 2)
     with pytest.raises(ValueError, match="expected 0 to 1"):
-        albedo_between(pair, turning, 1.2, 1.0)
+        interpolate_albedo(pair, turning, 1.2, 1.0)
 
 
 def test_what_no_snow_explains_follows_time():
     ground = slopes(50)
     summer, autumn = np.tile(BARE, (50, 1)), np.tile(BARE + np.float32(0.1), (50, 1))
-    turning = snow_turning(ground, summer, autumn)
+    turning = snow_transition(ground, summer, autumn)
     assert not turning.any()
-    np.testing.assert_allclose(albedo_between((summer, autumn), turning, 0.3, 0.9), summer + 0.03, atol=1e-6)
+    np.testing.assert_allclose(interpolate_albedo((summer, autumn), turning, 0.3, 0.9), summer + 0.03, atol=1e-6)
 
 
 def test_snow_that_ages_stays_snow():
@@ -79,9 +86,9 @@ def test_snow_that_ages_stays_snow():
     ground = slopes(4000)
     high = ground.height_m[:, None] > 2200.0
     pair = (snow_above(ground, 1000.0), np.where(high, np.float32(0.62), snow_above(ground, 1900.0)))
-    turning = snow_turning(ground, *pair)
+    turning = snow_transition(ground, *pair)
     assert not turning[high[:, 0], 0].any()
-    half = albedo_between(pair, turning, 0.5, 0.5)
+    half = interpolate_albedo(pair, turning, 0.5, 0.5)
     np.testing.assert_allclose(half[high[:, 0]], 0.5 * (pair[0] + pair[1])[high[:, 0]], atol=1e-6)
     truth = snow_above(ground, 1450.0)
     assert np.mean((half - truth)[~high[:, 0]] ** 2) < 0.2 * np.mean(
@@ -100,7 +107,7 @@ def test_days_between_are_nearer_the_truth_than_a_cross_fade():
 
     place = alpine_massif(seed=23, size_m=6000.0, spacing_m=60.0)
     terrain, atlas = unwrap(build_mesh(place.elevation, LocalFrame(46.55, 7.98), mesher="grid"), texel_m=60.0)
-    ground, texel = texel_ground(terrain, (atlas.height_px, atlas.width_px))
+    ground, texel = texel_attributes(terrain, (atlas.height_px, atlas.width_px))
 
     def worn(day: float) -> np.ndarray:
         image = Raster(alpine_albedo(place, day), place.elevation.transform, place.elevation.crs)
@@ -112,7 +119,7 @@ def test_days_between_are_nearer_the_truth_than_a_cross_fade():
     gains = []
     for first, second, day in ((90.0, 197.0, 152.0), (213.0, 15.0, 288.0), (115.0, 145.0, 130.0)):
         dated, truth = np.stack([worn(first), worn(second)]), worn(day)
-        _, _, way = neighbours([first, second], day)
+        _, _, way = neighbouring_dates([first, second], day)
         faded = (1.0 - way) * dated[0] + way * dated[1]
         gains.append(psnr(albedo_at(dated, (first, second), day, ground), truth) - psnr(faded, truth))
     assert min(gains) > 2.0, gains
@@ -123,7 +130,7 @@ def test_where_dates_say_nothing_heights_decide():
     """All white on one date and all bare on the other: valleys and south faces are free first."""
     ground = slopes(3000)
     pair = (np.tile(WHITE, (3000, 1)), np.tile(BARE, (3000, 1)))
-    half = snow_share(albedo_between(pair, snow_turning(ground, *pair), 0.5, 0.5))
+    half = snow_share(interpolate_albedo(pair, snow_transition(ground, *pair), 0.5, 0.5))
     assert np.corrcoef(half, ground.height_m)[0, 1] > 0.8
     middle = np.abs(ground.height_m - 1500.0) < 200.0
     north, south = (middle & (sign * ground.normal[:, 1] > 0.2) for sign in (1.0, -1.0))
@@ -131,25 +138,25 @@ def test_where_dates_say_nothing_heights_decide():
 
 
 def test_the_year_is_a_circle():
-    assert neighbours([100.0, 200.0], 150.0) == (0, 1, 0.5)
-    first, second, way = neighbours([100.0, 200.0], 20.0)
+    assert neighbouring_dates([100.0, 200.0], 150.0) == (0, 1, 0.5)
+    first, second, way = neighbouring_dates([100.0, 200.0], 20.0)
     assert (first, second) == (1, 0)
     assert way == pytest.approx(185.2422 / 265.2422)
-    assert neighbours([100.0, 200.0], 200.0) == (1, 1, 0.0)
-    assert neighbours([100.0], 10.0) == (0, 0, 0.0)
+    assert neighbouring_dates([100.0, 200.0], 200.0) == (1, 1, 0.0)
+    assert neighbouring_dates([100.0], 10.0) == (0, 0, 0.0)
 
 
 def test_the_line_keeps_the_climate():
     """From January to July snow stays low till April; the other way it waits for autumn; at the ends nothing jumps."""
-    assert line_share(15.0, 197.0, 60.0) < 0.05
-    assert 0.15 < line_share(15.0, 197.0, 106.0) < 0.4
-    assert line_share(197.0, 15.0, 240.0) < 0.05
+    assert snowline_fraction(15.0, 197.0, 60.0) < 0.05
+    assert 0.15 < snowline_fraction(15.0, 197.0, 106.0) < 0.4
+    assert snowline_fraction(197.0, 15.0, 240.0) < 0.05
     # Dates of like climate tell no direction, and a month has no time for more than a straight line.
-    assert line_share(130.0, 310.0, 220.0) == pytest.approx(0.5, abs=0.02)
-    assert line_share(115.0, 145.0, 130.0) == pytest.approx(0.5, abs=0.02)
+    assert snowline_fraction(130.0, 310.0, 220.0) == pytest.approx(0.5, abs=0.02)
+    assert snowline_fraction(115.0, 145.0, 130.0) == pytest.approx(0.5, abs=0.02)
     for first, second in ((15.0, 197.0), (197.0, 15.0), (60.0, 213.0), (335.0, 74.0), (258.0, 345.0)):
         days = first + np.linspace(0.0, (second - first) % 365.2422, 40)
-        shares = np.array([line_share(first, second, day) for day in days])
+        shares = np.array([snowline_fraction(first, second, day) for day in days])
         assert shares[0] == 0.0
         assert shares[-1] == pytest.approx(1.0, abs=1e-6)
         assert np.diff(shares).min() > -0.03
@@ -181,7 +188,7 @@ def mountain(tmp_path_factory) -> Assignment:
     places.write_raster(folder / "dem.tif", 1900.0 - 0.6 * np.hypot(east, north), spacing_m=50.0)
     place = load_place(path, Workspace(folder / "workspace"))
     shape = (place.atlas.height_px, place.atlas.width_px)
-    ground, texel = texel_ground(place.terrain, shape)
+    ground, texel = texel_attributes(place.terrain, shape)
     pairs = []
     for day, line_m in ((SNOWY, 1150.0), (GREEN, 1800.0)):
         values = np.tile(BARE, (shape[0] * shape[1], 1))
@@ -210,7 +217,7 @@ def by_height(height_m: np.ndarray, values: np.ndarray) -> np.ndarray:
 def test_textures_of_a_spring(mountain):
     place = load_place(Path(mountain.scene), Workspace(Path(mountain.workspace)))
     dated = dated_albedos(place, mountain.albedo)
-    ground, texel = texel_ground(place.terrain, (place.atlas.height_px, place.atlas.width_px))
+    ground, texel = texel_attributes(place.terrain, (place.atlas.height_px, place.atlas.width_px))
     film = [albedo_of_day(place, dated, day, season="snow-line").values.reshape(-1, 3)[texel] for day in DAYS]
     faded = [albedo_of_day(place, dated, day, season="blended").values.reshape(-1, 3)[texel] for day in DAYS]
     rows = np.array([by_height(ground.height_m, values) for values in film])

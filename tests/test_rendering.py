@@ -9,8 +9,8 @@ from seasonscapes.frames import LocalFrame, direction_from_angles, equirectangul
 from seasonscapes.rendering import backend
 from seasonscapes.rendering.gbuffer import occluded, trace_gbuffer
 from seasonscapes.rendering.hosek import hosek_illumination
+from seasonscapes.rendering.mitsuba_scene import build_scene, relight, set_albedo
 from seasonscapes.rendering.radiance import path_trace, render_view
-from seasonscapes.rendering.scene import build_scene, relight, set_albedo
 from seasonscapes.sky.illumination import (
     Illumination,
     Luminary,

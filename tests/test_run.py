@@ -21,9 +21,9 @@ STAGES = ("pictures", "calibrate", "albedo", "paint", "inpaint", "relight", "dis
 LAUNCHER = """import sys
 from seasonscapes.evaluation import synthetic_webcams
 from seasonscapes.rendering import transport
-transport.Effort.__init__.__defaults__ = (4, 16, 64, 4, 512, 32, 16, "reinhart")
+transport.SamplingOptions.__init__.__defaults__ = (4, 16, 64, 4, 512, 32, 16, "reinhart")
 transport._PILOTS = 1 << 14
-synthetic_webcams.webcam_series.__kwdefaults__["effort"] = transport.Effort()
+synthetic_webcams.webcam_series.__kwdefaults__["sampling"] = transport.SamplingOptions()
 from seasonscapes.cli import main
 sys.exit(main(sys.argv[1:]))
 """

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from places import MASSIF, SCENE, hill_heights, write_place, write_raster
 
+from seasonscapes.calibration.calibration_file import write_calibration
 from seasonscapes.calibration.pose_model import values_of
-from seasonscapes.calibration.record import write_calibration
 from seasonscapes.calibration.resection import Calibration
 from seasonscapes.cameras.observation import ManifestRow, read_manifest, write_manifest
 from seasonscapes.cameras.pinhole import Camera
@@ -31,7 +31,7 @@ class Real:
     def __init__(self, folder):
         self.folder, self.count = folder, 0
         self.scene = write_place(folder / "place")
-        self.shots = folder / "shots"
+        self.inputs = folder / "shots"
         rows = []
         for webcam in ("a", "b"):
             for hour in range(3):
@@ -39,10 +39,10 @@ class Real:
                 rows.append(ManifestRow(webcam, NOON + timedelta(hours=hour), f"{webcam}{hour}.png"))
             self.record(webcam)
             self.mask(webcam, 255)
-        write_manifest(self.shots / "manifest.csv", rows)
+        write_manifest(self.inputs / "manifest.csv", rows)
 
     def picture(self, name, value):
-        write_png8(self.shots / name, np.full((8, 12, 3), value, np.uint8))
+        write_png8(self.inputs / name, np.full((8, 12, 3), value, np.uint8))
 
     def mask(self, webcam, value):
         write_png8(self.folder / "masks" / f"{webcam}.png", np.full((8, 12, 3), value, np.uint8))
@@ -58,7 +58,7 @@ class Real:
 
     def job(self, **changed) -> Job:
         pictures = RunPictures(
-            manifest=self.shots / "manifest.csv", calibrations=self.folder / "records", masks=self.folder / "masks"
+            manifest=self.inputs / "manifest.csv", calibrations=self.folder / "records", masks=self.folder / "masks"
         )
         times = tuple((NOON + timedelta(hours=hour)).isoformat() for hour in range(2))
         job = Job(
@@ -122,16 +122,16 @@ def test_a_changed_picture_record_or_mask_is_noticed(real):
 
 
 def test_a_changed_manifest_is_noticed_where_it_concerns_the_times(real):
-    rows = read_manifest(real.shots / "manifest.csv")
-    write_manifest(real.shots / "manifest.csv", [replace(rows[0], time=NOON + timedelta(minutes=5)), *rows[1:]])
+    rows = read_manifest(real.inputs / "manifest.csv")
+    write_manifest(real.inputs / "manifest.csv", [replace(rows[0], time=NOON + timedelta(minutes=5)), *rows[1:]])
     assert real.made() == ALL
     # A picture of another hour is none of these times' business, and neither is its name.
     real.picture("a2.png", 77)
     assert real.made() == []
-    real.shots.rename(real.folder / "elsewhere")
-    real.shots = real.folder / "elsewhere"
+    real.inputs.rename(real.folder / "elsewhere")
+    real.inputs = real.folder / "elsewhere"
     assert real.made() == []
-    (real.shots / "b0.png").unlink()
+    (real.inputs / "b0.png").unlink()
     with pytest.raises(InputError, match="no such picture"):
         real.made()
 
@@ -145,7 +145,7 @@ def test_the_pictures_of_a_run_are_its_own(real):
     # Somebody writes into the run's folder: made again, and not from what stands there.
     write_png8(taken / rows[0].path, np.zeros((8, 12, 3), np.uint8))
     assert real.made() == ["pictures"], "the same pictures again leave the rest fresh"
-    assert (taken / rows[0].path).read_bytes() == (real.shots / "a0.png").read_bytes()
+    assert (taken / rows[0].path).read_bytes() == (real.inputs / "a0.png").read_bytes()
 
 
 def test_a_changed_scene_is_noticed(real):

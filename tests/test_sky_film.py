@@ -10,14 +10,20 @@ from atmosphere_cases import tables_of
 
 from seasonscapes import daylight
 from seasonscapes.frames import direction_from_angles
-from seasonscapes.sky.air import delta_scaled, gas_moments, optics
-from seasonscapes.sky.atmosphere import illumination_from_atmosphere
-from seasonscapes.sky.cells import scattering_per_m
+from seasonscapes.sky.atmosphere import delta_scaled, gas_moments, optics
+from seasonscapes.sky.clear_sky import illumination_from_atmosphere
 from seasonscapes.sky.elevation_table import KNOTS_DEG, at_elevation, by_elevation, load_table, save_table
 from seasonscapes.sky.illumination import luminance
 from seasonscapes.sky.models import atmosphere_of, read_sky_model
-from seasonscapes.sky.moments import HARMONIC_ORDER, diffuse_source, height_index, sun_geometry, zonal
-from seasonscapes.sky.seen import diffuse_by_elevation, observer_view, seen_sky, sky_radiance, sky_radiance_grid
+from seasonscapes.sky.observer_radiance import (
+    diffuse_by_elevation,
+    observed_sky,
+    observer_view,
+    sky_radiance,
+    sky_radiance_grid,
+)
+from seasonscapes.sky.ray_cells import scattering_per_m
+from seasonscapes.sky.sh_moments import HARMONIC_ORDER, diffuse_source, height_index, sun_geometry, zonal
 
 HEIGHT_M = 2800.0
 
@@ -148,7 +154,7 @@ def test_diffuse_source_is_the_plain_sum_over_harmonics():
 
 def test_a_grid_of_directions_is_the_same_sky():
     tables, sun = tables_of(), direction_from_angles(200.0, 4.0)
-    light = seen_sky(tables, observer_view(tables, HEIGHT_M), sun, np.radians(4.0), np.ones(9))
+    light = observed_sky(tables, observer_view(tables, HEIGHT_M), sun, np.radians(4.0), np.ones(9))
     elevation_deg, azimuth_deg = np.linspace(-89.0, 89.0, 41), np.linspace(0.0, 359.0, 30)
     directions = direction_from_angles(azimuth_deg[None, :], elevation_deg[:, None])
     np.testing.assert_allclose(

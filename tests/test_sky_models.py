@@ -44,7 +44,7 @@ def full_moon_at(elevation_deg) -> LunarPosition:
 @pytest.fixture(scope="module")
 def quick_tables():
     """Tables of two orders of scattering, which is enough to see that the parts are joined."""
-    from seasonscapes.sky.atmosphere import atmosphere_tables
+    from seasonscapes.sky.clear_sky import atmosphere_tables
 
     kept = {}
 

@@ -12,14 +12,14 @@ from seasonscapes.terrain.synthetic import (
     Cover,
     alpine_albedo,
     alpine_massif,
-    load_place,
-    save_place,
+    load_massif,
+    save_massif,
     snow_fraction,
     snow_line_m,
 )
 from seasonscapes.terrain.synthetic_cover import FOREST
 from seasonscapes.terrain.synthetic_ice import grow_ice, mass_balance_m
-from seasonscapes.terrain.synthetic_plan import LAKE_LEVEL_M
+from seasonscapes.terrain.synthetic_layout import LAKE_LEVEL_M
 
 
 @pytest.fixture(scope="module")
@@ -222,8 +222,8 @@ def test_strips_leave_no_seam(small, monkeypatch):
 
 
 def test_save_and_load(place, tmp_path):
-    save_place(place, tmp_path / "alpine.npz")
-    back = load_place(tmp_path / "alpine.npz")
+    save_massif(place, tmp_path / "alpine.npz")
+    back = load_massif(tmp_path / "alpine.npz")
     assert back.elevation.transform == place.elevation.transform
     assert (back.elevation.crs, back.seed, back.spacing_m) == ("EPSG:32632", 1912, 60.0)
     assert alpine_albedo(back, 77.0).tobytes() == alpine_albedo(place, 77.0).tobytes()

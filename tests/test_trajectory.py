@@ -9,9 +9,17 @@ import pytest
 from PIL import Image
 from scipy.spatial import cKDTree
 
-from seasonscapes.cameras.path_file import load_path, read_reference_path, resized, save_path, view_record
+from seasonscapes.cameras.path_file import load_path, read_reference_path, resize_camera, save_path, view_record
 from seasonscapes.cameras.pinhole import Camera, camera_at, project, rotation_from_angles
-from seasonscapes.cameras.trajectory import CURVES, clearance, cleared, curve_through, fly, roll_of, views_along
+from seasonscapes.cameras.trajectory import (
+    CURVES,
+    cameras_along_path,
+    curve_through,
+    height_above_ground,
+    lift_above_ground,
+    roll_of,
+    views_along,
+)
 from seasonscapes.commands.options import PlaceOptions
 from seasonscapes.commands.path import ground_of, path, waypoints_of
 from seasonscapes.errors import InputError
@@ -49,7 +57,7 @@ def places_of(views):
 @pytest.mark.parametrize("curve", CURVES)
 @pytest.mark.parametrize("count", [2, 3, 41])
 def test_exactly_so_many_views_and_none_twice(curve, closed, count):
-    views = fly(waypoints(), count, curve=curve, closed=closed)
+    views = cameras_along_path(waypoints(), count, curve=curve, closed=closed)
     assert len(views) == count
     apart = cKDTree(places_of(views)).query(places_of(views), k=2)[0][:, 1]
     assert apart.min() > 20.0
@@ -127,9 +135,9 @@ def test_smooth_turns_have_no_jerk_where_slerp_has():
 
 def test_a_level_horizon_stays_level_and_roll_is_blended():
     for turn in ("smooth", "slerp"):
-        views = fly(waypoints(), 50, turn=turn)
+        views = cameras_along_path(waypoints(), 50, turn=turn)
         assert max(abs(roll_of(each.world_from_camera[:3, :3])) for each in views) < 1e-9
-    rolled = fly([camera([0, 0, 0], 0, 0, 10.0), camera([1000, 0, 0], 90, 0, 20.0)], 11)
+    rolled = cameras_along_path([camera([0, 0, 0], 0, 0, 10.0), camera([1000, 0, 0], 90, 0, 20.0)], 11)
     rolls = np.degrees([roll_of(each.world_from_camera[:3, :3]) for each in rolled])
     np.testing.assert_allclose(rolls, np.linspace(10.0, 20.0, 11), atol=1e-6)
 
@@ -138,26 +146,26 @@ def test_look_at_keeps_the_place_in_the_middle_and_lenses_blend():
     target = np.array([800.0, 900.0, 400.0])
     known = waypoints()
     known[-1] = camera([-500, 3000, 1500], focal=160.0)
-    views = fly(known, 25, look_at_m=target)
+    views = cameras_along_path(known, 25, look_at_m=target)
     for each in views:
         np.testing.assert_allclose(project(each, target)[0], [48.0, 32.0], atol=1e-6)
     assert views[-1].fx == pytest.approx(160.0)
     assert all(a.fx <= b.fx + 1e-9 for a, b in pairwise(views))
     with pytest.raises(ValueError, match="straight above"):
-        fly([camera([0, 0, 100]), camera([100, 0, 100])], 3, look_at_m=np.array([50.0, 0.0, 0.0]))
+        cameras_along_path([camera([0, 0, 100]), camera([100, 0, 100])], 3, look_at_m=np.array([50.0, 0.0, 0.0]))
 
 
 def test_what_is_no_path_is_refused():
     with pytest.raises(ValueError, match="two waypoints"):
-        fly(waypoints()[:1], 5)
+        cameras_along_path(waypoints()[:1], 5)
     with pytest.raises(ValueError, match="same place"):
-        fly([waypoints()[0], waypoints()[0], waypoints()[1]], 5)
+        cameras_along_path([waypoints()[0], waypoints()[0], waypoints()[1]], 5)
     with pytest.raises(ValueError, match="at least 2 views"):
-        fly(waypoints(), 1)
+        cameras_along_path(waypoints(), 1)
     with pytest.raises(ValueError, match="expected one of spline, linear"):
-        fly(waypoints(), 5, curve="bezier")
+        cameras_along_path(waypoints(), 5, curve="bezier")
     with pytest.raises(ValueError, match="expected one of smooth, slerp"):
-        fly(waypoints(), 5, turn="squash")
+        cameras_along_path(waypoints(), 5, turn="squash")
 
 
 # ---------------------------------------------------------------------------------------------- clearance
@@ -169,10 +177,10 @@ def hill(places_en):
 
 def test_a_path_is_lifted_over_a_hill_and_stays_smooth():
     line = curve_through(places_of(waypoints()))
-    lifted, most = cleared(line, hill, 60.0)
+    lifted, most = lift_above_ground(line, hill, 60.0)
     s = np.linspace(0.0, lifted.length_m, 20001)
-    assert clearance(line.position(s), hill, 60.0).min() < 0.0
-    assert clearance(lifted.position(s), hill, 60.0).min() >= 60.0
+    assert height_above_ground(line.position(s), hill, 60.0).min() < 0.0
+    assert height_above_ground(lifted.position(s), hill, 60.0).min() >= 60.0
     assert most > 60.0
     # Far from the hill nothing has moved, and the lift is vertical.
     np.testing.assert_allclose(lifted.at_parameter(line.knots[-1]), line.at_parameter(line.knots[-1]), atol=1e-6)
@@ -187,10 +195,10 @@ def test_a_path_is_lifted_over_a_hill_and_stays_smooth():
 
 def test_high_above_the_ground_nothing_is_lifted_and_off_the_land_there_is_none():
     line = curve_through(places_of(waypoints()) + np.array([0.0, 0.0, 2000.0]))
-    same, most = cleared(line, hill, 60.0)
+    same, most = lift_above_ground(line, hill, 60.0)
     assert same is line
     assert most == 0.0
-    nowhere, most = cleared(line, lambda places_en: np.full(len(places_en), np.nan), 60.0)
+    nowhere, most = lift_above_ground(line, lambda places_en: np.full(len(places_en), np.nan), 60.0)
     assert nowhere is line
     assert most == 0.0
 
@@ -203,12 +211,12 @@ def alpine(tmp_path_factory):
 @pytest.mark.parametrize("curve", CURVES)
 def test_clearance_on_the_embedded_scene_by_rays(alpine, curve):
     """Rays straight down onto the mesh itself: nowhere lower than stated, where the bare path runs into the ground."""
-    from seasonscapes.rendering.gather import occluder
     from seasonscapes.rendering.gbuffer import trace_rays
-    from seasonscapes.rendering.scene import RenderScene, mi_mesh
+    from seasonscapes.rendering.hemisphere_rays import ray_scene
+    from seasonscapes.rendering.mitsuba_scene import RenderScene, mi_mesh
 
     known = waypoints_of(alpine, ["aerial", "meadow", "lake", "46.55,7.95,+80", "ridge"], 60.0, (96, 64))
-    terrain = occluder(mi_mesh(alpine.terrain, np.full(3, 0.2)))
+    terrain = ray_scene(mi_mesh(alpine.terrain, np.full(3, 0.2)))
 
     def above(line):
         places_m = line.position(np.linspace(0.0, line.length_m, 4000))
@@ -217,7 +225,7 @@ def test_clearance_on_the_embedded_scene_by_rays(alpine, curve):
         return trace_rays(RenderScene(terrain.mi_scene, terrain.mi_terrain, None, 0.0), high, down).depth - 5000.0
 
     bare = curve_through(places_of(known), curve=curve)
-    line, most = cleared(bare, ground_of(alpine), 50.0)
+    line, most = lift_above_ground(bare, ground_of(alpine), 50.0)
     assert above(bare).min() < 0.0 < most
     assert above(line).min() >= 50.0
     views = views_along(line, known, 120)
@@ -231,7 +239,7 @@ def test_clearance_on_the_embedded_scene_by_rays(alpine, curve):
 
 
 def test_a_path_comes_back_from_its_file(tmp_path):
-    views = fly(waypoints(), 7)
+    views = cameras_along_path(waypoints(), 7)
     straight_down = camera([10.0, 20.0, 3000.0], 37.0, -90.0)
     rolled = camera([10.0, 20.0, 3000.0], 123.0, 15.0, -8.0)
     save_path(tmp_path / "p.json", [*views, straight_down, rolled], FRAME, note={"scene": "x"})
@@ -251,7 +259,7 @@ def test_a_path_comes_back_from_its_file(tmp_path):
     assert view_record(other[3], LocalFrame(46.5, 8.1, 500.0, 0.13)) == pytest.approx(
         view_record(views[3], FRAME), abs=1e-6
     )
-    small = resized(views[0], (48, 16))
+    small = resize_camera(views[0], (48, 16))
     far = views[0].position_m + views[0].world_from_camera[:3, :3] @ [3.0, 1.0, 10.0]
     np.testing.assert_allclose(project(small, far)[0], project(views[0], far)[0] * [0.5, 0.25])
 
@@ -329,7 +337,7 @@ def test_the_published_trajectories(data_dir):
     given = read_reference_path(waypoints_file, FRAME)
     theirs = read_reference_path(waypoints_file.with_name("transforms_novelLaubH_wayp_linear_all.json"), FRAME)
     assert (given.count, len(given.cameras), theirs.count, len(theirs.cameras)) == (355, 21, None, 355)
-    ours = fly(given.cameras, given.count, curve=given.curve)
+    ours = cameras_along_path(given.cameras, given.count, curve=given.curve)
     # Theirs stands still at each joint and changes its pace there; ours does neither, along the same lines.
     pace = np.linalg.norm(np.diff(places_of(theirs.cameras), axis=0), axis=1)
     assert np.count_nonzero(pace < 1e-3) == 19
@@ -342,7 +350,7 @@ def test_the_published_trajectories(data_dir):
     for name, count in (("GRIND/transforms_novelLaubH_wayp_3", 40), ("REGION_J/transforms_novelLaubH_wayp_video", 400)):
         smooth = read_reference_path(folder / f"{name}.json", FRAME)
         assert (smooth.count, smooth.curve) == (count, "spline")
-        assert len(fly(smooth.cameras, smooth.count)) == count
+        assert len(cameras_along_path(smooth.cameras, smooth.count)) == count
 
 
 # ---------------------------------------------------------------------------------------------- the verb

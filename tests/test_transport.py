@@ -9,12 +9,12 @@ from test_rendering import PLANE, heightfield, looking_down, sun_at
 from seasonscapes.cameras.pinhole import Camera, rotation_from_angles
 from seasonscapes.frames import direction_from_angles, equirectangular_directions
 from seasonscapes.rendering.coefficients_file import load_coefficients, save_coefficients
-from seasonscapes.rendering.gather import occluder
-from seasonscapes.rendering.irradiance import irradiance, irradiance_blocks, ready_points, surface_at
+from seasonscapes.rendering.hemisphere_rays import ray_scene
+from seasonscapes.rendering.irradiance import irradiance, irradiance_blocks, surface_at, upload_points
+from seasonscapes.rendering.light_clusters import cluster_lists
+from seasonscapes.rendering.mitsuba_scene import mi_mesh, relight, set_albedo
 from seasonscapes.rendering.radiance import path_trace, render_view
-from seasonscapes.rendering.relit_view import ready_view, relight_view
-from seasonscapes.rendering.scene import mi_mesh, relight, set_albedo
-from seasonscapes.rendering.senders import sender_lists
+from seasonscapes.rendering.relit_view import relight_view, relightable_view
 from seasonscapes.rendering.sky_patches import (
     SUBDIVISIONS,
     direction_weights,
@@ -23,10 +23,10 @@ from seasonscapes.rendering.sky_patches import (
     patch_radiance,
     sky_patches,
 )
-from seasonscapes.rendering.transport import Effort, trace_points, trace_view, view_albedo
+from seasonscapes.rendering.transport import SamplingOptions, trace_points, trace_view, view_albedo
 from seasonscapes.sky.illumination import Illumination, uniform_sky
 
-QUICK = Effort(rays=128, senders=1024, listed=32)
+QUICK = SamplingOptions(rays=128, clusters=1024, listed=32)
 ALBEDO = np.array([0.55, 0.45, 0.35])
 
 
@@ -42,8 +42,8 @@ def valley():
     terrain = heightfield(lambda e, n: 120.0 * np.cos(e / 90.0) + 60.0 * np.sin(n / 70.0), count=101)
     mesh = mi_mesh(terrain, ALBEDO)
     camera = looking_down(900.0, size=64, view_m=700.0)
-    view = trace_view(occluder(mesh), camera, Effort(senders=4096), seed=3)
-    return mesh, camera, ready_view(occluder(mesh), view)
+    view = trace_view(ray_scene(mesh), camera, SamplingOptions(clusters=4096), seed=3)
+    return mesh, camera, relightable_view(ray_scene(mesh), view)
 
 
 LIGHTS = {
@@ -71,8 +71,8 @@ def test_bounces_are_as_many_as_asked_for(bounces, max_depth):
     """Measured in a bowl of bright walls, where each bounce adds a tenth and more."""
     bowl = heightfield(lambda e, n: 0.002 * (e**2 + n**2), count=61)
     mesh, camera, light = mi_mesh(bowl, np.full(3, 0.9)), looking_down(300.0, size=16, view_m=300.0), LIGHTS["sun"]
-    view = trace_view(occluder(mesh), camera, Effort(rays=256, senders=1024, bounces=bounces))
-    relit = relight_view(ready_view(occluder(mesh), view), light).surface.mean()
+    view = trace_view(ray_scene(mesh), camera, SamplingOptions(rays=256, clusters=1024, bounces=bounces))
+    relit = relight_view(relightable_view(ray_scene(mesh), view), light).surface.mean()
     reference = path_trace(relight(mesh, light, max_height_m=1000.0), camera, spp=1024, max_depth=max_depth)[0].mean()
     deeper = path_trace(relight(mesh, light, max_height_m=1000.0), camera, spp=1024, max_depth=max_depth + 1)[0].mean()
     assert relit == pytest.approx(reference, rel=0.01)
@@ -81,8 +81,8 @@ def test_bounces_are_as_many_as_asked_for(bounces, max_depth):
 
 def test_lambert_and_an_open_sky_are_closed_forms():
     """A plane sees the whole upper sky and no terrain."""
-    view = trace_view(occluder(mi_mesh(PLANE, ALBEDO)), looking_down(size=12), QUICK)
-    ready = ready_view(occluder(mi_mesh(PLANE, ALBEDO)), view)
+    view = trace_view(ray_scene(mi_mesh(PLANE, ALBEDO)), looking_down(size=12), QUICK)
+    ready = relightable_view(ray_scene(mi_mesh(PLANE, ALBEDO)), view)
     sky = uniform_sky(1000.0)
     light = Illumination(sky.sky_radiance, sun_at(140.0, 35.0).sun)
     expected = ALBEDO / np.pi * 1.0e5 * np.sin(np.radians(35.0)) + ALBEDO * 1000.0
@@ -96,9 +96,9 @@ def test_white_furnace_in_a_bowl():
     bowl = heightfield(lambda e, n: 0.0005 * (e**2 + n**2), count=61)
     mesh = mi_mesh(bowl, np.ones(3), smooth=False)
     view = trace_view(
-        occluder(mesh), looking_down(300.0, size=24, view_m=300.0), Effort(rays=256, bounces=12, senders=512)
+        ray_scene(mesh), looking_down(300.0, size=24, view_m=300.0), SamplingOptions(rays=256, bounces=12, clusters=512)
     )
-    image = relight_view(ready_view(occluder(mesh), view), uniform_sky(1.0)).surface
+    image = relight_view(relightable_view(ray_scene(mesh), view), uniform_sky(1.0)).surface
     assert np.abs(image - 1.0).max() < 0.02
     assert image.mean() == pytest.approx(1.0, abs=0.003)
 
@@ -112,8 +112,8 @@ def test_penumbra_is_as_wide_as_the_disc():
     pose[:3, 3] = [-200.0, 0.0, 1500.0]
     camera = Camera(256, 8, 256 * 15.0, 256 * 15.0, 128.0, 4.0, pose)  # 100 m wide
     light = sun_at(90.0, 45.0, radius_deg=2.0)
-    view = trace_view(occluder(mesh), camera, Effort(rays=64, subpixels=64, bounces=0, senders=1))
-    profile = relight_view(ready_view(occluder(mesh), view), light).surface[..., 1].mean(axis=0)
+    view = trace_view(ray_scene(mesh), camera, SamplingOptions(rays=64, subpixels=64, bounces=0, clusters=1))
+    profile = relight_view(relightable_view(ray_scene(mesh), view), light).surface[..., 1].mean(axis=0)
     profile /= 1.0e5 / np.pi * np.sin(np.radians(45.0))
     edge_m = terrain.vertices[terrain.vertices[:, 2] > 100.0][:, 0].min()
     east_m = -200.0 + (np.arange(256) + 0.5 - 128.0) * 100.0 / 256
@@ -140,7 +140,9 @@ def test_air_and_background_are_those_of_render_view():
     pose[:3, 3] = [-100.0, -450.0, 120.0]
     camera = Camera(96, 64, 90.0, 90.0, 48.0, 32.0, pose)
     reference = render_view(relight(mesh, light, max_height_m=80.0), camera, spp=256)
-    view = relight_view(ready_view(occluder(mesh), trace_view(occluder(mesh), camera, Effort(senders=2048))), light)
+    view = relight_view(
+        relightable_view(ray_scene(mesh), trace_view(ray_scene(mesh), camera, SamplingOptions(clusters=2048))), light
+    )
     assert np.abs(view.coverage - reference.coverage).max() < 0.2
     open_sky = (view.coverage == 0.0) & (reference.coverage == 0.0)
     assert 0.2 < open_sky.mean() < 0.8
@@ -156,7 +158,7 @@ def test_another_albedo_in_place_of_the_first():
     """A season's change of colour is a product, and exact where albedo does not vary within the pixel."""
     texture = np.full((8, 8, 3), 0.2, np.float32)
     mesh = mi_mesh(PLANE, texture)
-    terrain, camera = occluder(mesh), looking_down(size=8)
+    terrain, camera = ray_scene(mesh), looking_down(size=8)
     view = trace_view(terrain, camera, QUICK)
     scene = relight(mesh, uniform_sky(1.0), max_height_m=0.0)
     set_albedo(scene, 3.0 * texture)
@@ -166,14 +168,14 @@ def test_another_albedo_in_place_of_the_first():
 def test_irradiance_of_places():
     """Sun, sky and bounce of texels on a ridge against path tracing of a white surface there."""
     mesh = mi_mesh(heightfield(lambda e, n: 100.0 * np.cos(e / 90.0), count=201), ALBEDO, smooth=False)
-    terrain, light = occluder(mesh), LIGHTS["sun"]
+    terrain, light = ray_scene(mesh), LIGHTS["sun"]
     east = np.linspace(-251.3, 248.9, 41)
     place = np.stack([east, np.full(41, 7.0), 100.0 * np.cos(east / 90.0)], axis=-1)
     place[3] = np.nan
     points, index = surface_at(terrain, place)
     assert sorted(set(range(41)) - set(index)) == [3]
-    coefficients = trace_points(terrain, points, Effort(rays=1024, senders=2048, listed=128))
-    received = irradiance(ready_points(terrain, coefficients), light, sun_rays_each=64)
+    coefficients = trace_points(terrain, points, SamplingOptions(rays=1024, clusters=2048, listed=128))
+    received = irradiance(upload_points(terrain, coefficients), light, sun_rays_each=64)
     # Looking straight down with pixels of a millimetre: radiance = albedo / π · E.
     scene = relight(mesh, light, max_height_m=100.0)
     total, direct = np.empty((40, 3)), np.empty((40, 3))
@@ -201,7 +203,7 @@ def test_blocks_of_places_equal_all_at_once(monkeypatch):
 
     def run() -> np.ndarray:
         total = np.full((2, len(place), 3), np.nan, np.float32)
-        for index, _, results in irradiance_blocks(occluder(mesh), place, lights, QUICK):
+        for index, _, results in irradiance_blocks(ray_scene(mesh), place, lights, QUICK):
             for k, result in enumerate(results):
                 total[k, index] = result.total
         return total
@@ -222,7 +224,7 @@ def test_saved_coefficients_light_the_same_picture(valley, tmp_path):
     assert isinstance(again.sample_origin, np.memmap), "mapped, not read"
     light = LIGHTS["low sun"]
     np.testing.assert_array_equal(
-        relight_view(ready_view(occluder(mesh), again), light).radiance, relight_view(ready, light).radiance
+        relight_view(relightable_view(ray_scene(mesh), again), light).radiance, relight_view(ready, light).radiance
     )
     with pytest.raises(ValueError, match="expected other"):
         load_coefficients(tmp_path / "view", key="other")
@@ -289,22 +291,22 @@ def test_sender_lists_are_in_proportion():
     met = rng.integers(-2, 6, (400, 64)).astype(np.int32)
     weight = rng.random((400, 64)).astype(np.float32)
     weight /= weight.sum(axis=1, keepdims=True)
-    listed, share = sender_lists(met, weight, 32, start=rng.random(400, np.float32))
+    listed, share = cluster_lists(met, weight, 32, start=rng.random(400, np.float32))
     np.testing.assert_allclose(share, np.where(met >= 0, weight, 0.0).sum(axis=1), rtol=1e-5)
-    for sender in range(6):
-        exact = np.where(met == sender, weight, 0.0).sum(axis=1)
-        estimate = (listed == sender).mean(axis=1) * share
+    for cluster in range(6):
+        exact = np.where(met == cluster, weight, 0.0).sum(axis=1)
+        estimate = (listed == cluster).mean(axis=1) * share
         assert estimate.mean() == pytest.approx(exact.mean(), rel=0.02)
     met[0] = -1
-    listed, share = sender_lists(met, weight, 32, start=rng.random(400, np.float32))
+    listed, share = cluster_lists(met, weight, 32, start=rng.random(400, np.float32))
     assert share[0] == 0.0
     assert listed[0].max() == 0
 
 
-@pytest.mark.parametrize("wrong", [{"subpixels": 15}, {"rays": 100}, {"rays": 8}, {"listed": 3}, {"senders": 1 << 17}])
-def test_effort_refuses(wrong):
-    with pytest.raises(ValueError, match="Effort"):
-        Effort(**wrong)
+@pytest.mark.parametrize("wrong", [{"subpixels": 15}, {"rays": 100}, {"rays": 8}, {"listed": 3}, {"clusters": 1 << 17}])
+def test_sampling_options_refuse(wrong):
+    with pytest.raises(ValueError, match="SamplingOptions"):
+        SamplingOptions(**wrong)
 
 
 def test_a_camera_that_sees_no_terrain_is_told():
@@ -312,4 +314,4 @@ def test_a_camera_that_sees_no_terrain_is_told():
     pose[:3, :3] = rotation_from_angles(0.0, 60.0)
     pose[:3, 3] = [0.0, 0.0, 100.0]
     with pytest.raises(ValueError, match="sees no terrain"):
-        trace_view(occluder(mi_mesh(PLANE, ALBEDO)), Camera(8, 8, 8.0, 8.0, 4.0, 4.0, pose), QUICK)
+        trace_view(ray_scene(mi_mesh(PLANE, ALBEDO)), Camera(8, 8, 8.0, 8.0, 4.0, 4.0, pose), QUICK)

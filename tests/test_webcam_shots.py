@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from places import MASSIF
 
-from seasonscapes.calibration.record import read_calibration
+from seasonscapes.calibration.calibration_file import read_calibration
 from seasonscapes.calibration.skyline import encoded_from_file
 from seasonscapes.cameras.observation import read_manifest
 from seasonscapes.cameras.panorama import Panorama, level_panorama
@@ -17,9 +17,9 @@ from seasonscapes.commands.paint import chosen_cameras
 from seasonscapes.commands.webcam_shots import calibrated_views, make_webcam_series, photographs, rows_at, shots_of
 from seasonscapes.errors import InputError
 from seasonscapes.evaluation import synthetic_webcams
-from seasonscapes.rendering.gather import occluder
-from seasonscapes.rendering.scene import mi_mesh
-from seasonscapes.rendering.transport import Effort
+from seasonscapes.rendering.hemisphere_rays import ray_scene
+from seasonscapes.rendering.mitsuba_scene import mi_mesh
+from seasonscapes.rendering.transport import SamplingOptions
 
 TIMES = [datetime(2024, 7, 20, hour, tzinfo=UTC) for hour in (8, 13)]
 
@@ -36,11 +36,11 @@ def taken(tmp_path_factory):
     cameras = {
         name: level_panorama(camera, place.frame, size) for name, camera in chosen_cameras(place, None, size).items()
     }
-    before = synthetic_webcams.webcam_series.__kwdefaults__["effort"]
-    synthetic_webcams.webcam_series.__kwdefaults__["effort"] = Effort(4, 4, 16, 1, 64, 16, 8)
+    before = synthetic_webcams.webcam_series.__kwdefaults__["sampling"]
+    synthetic_webcams.webcam_series.__kwdefaults__["sampling"] = SamplingOptions(4, 4, 16, 1, 64, 16, 8)
     model = SkyOptions(sky="hosek").model()
     yield place, cameras, model, make_webcam_series(place, TIMES, model, folder / "shots", cameras=cameras)
-    synthetic_webcams.webcam_series.__kwdefaults__["effort"] = before
+    synthetic_webcams.webcam_series.__kwdefaults__["sampling"] = before
 
 
 def test_a_level_panorama_turns_about_the_cameras_own_vertical(taken):
@@ -91,15 +91,15 @@ def test_views_of_panoramas_serve_paint_and_albedo_alike(taken, tmp_path, capsys
     views, without = calibrated_views(rows, sources, place.frame)
     assert without == []
     assert [pose.webcam for pose, _ in views] == ["aerial", "meadow"]
-    shots, _ = shots_of(place, rows, sources, model)
+    inputs, _ = shots_of(place, rows, sources, model)
     opened = _opened(place, TIMES[:1], (sources.manifest, sources.calibrations, None), 1.0)
-    for shot, one in zip(shots, opened, strict=True):
-        assert shot.observation.webcam == one.webcam
-        np.testing.assert_array_equal(shot.observation.image, one.image)
+    for item, one in zip(inputs, opened, strict=True):
+        assert item.observation.webcam == one.webcam
+        np.testing.assert_array_equal(item.observation.image, one.image)
 
     # Parts of a panorama that show sky alone are left out, and so is what a mask leaves nothing of.
     class Traced:
-        occluder = occluder(mi_mesh(place.terrain, np.full(3, 0.2)))
+        ray_scene = ray_scene(mi_mesh(place.terrain, np.full(3, 0.2)))
 
     kept = _with_terrain(Traced, opened)
     said = capsys.readouterr().err

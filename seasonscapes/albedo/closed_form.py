@@ -17,10 +17,18 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from seasonscapes.albedo.equations import Rows, adjoint, model_of, projected_gain, rows_of, squared_adjoint, weigh
+from seasonscapes.albedo.equations import (
+    PhotographEquations,
+    adjoint,
+    equations_of,
+    forward_product,
+    projected_gain,
+    reweight,
+    squared_adjoint,
+)
 from seasonscapes.albedo.footprints import seen_weight
-from seasonscapes.albedo.forward import Land, ambient_on_texels
-from seasonscapes.albedo.shots import LINEAR, Shot, Trust
+from seasonscapes.albedo.forward_model import TexelTransport, ambient_on_texels
+from seasonscapes.albedo.photographs import LINEAR, AlbedoPhotograph, NoiseModel
 
 Progress = Callable[[float], None]
 # Albedos of nature lie within these; fresh snow is 0.95 at most, lakes and conifers reflect 2 %.
@@ -28,7 +36,7 @@ LOWEST, HIGHEST = 0.004, 0.98
 
 
 @dataclass(frozen=True)
-class Effort:
+class SolverOptions:
     """How hard to try: rounds of interreflection and re-weighting, iterations of conjugate gradients in each."""
 
     rounds: int = 5
@@ -66,11 +74,11 @@ class AlbedoFit:
 
 
 def solve_albedo(
-    land: Land,
-    shots: Sequence[Shot],
+    land: TexelTransport,
+    photographs: Sequence[AlbedoPhotograph],
     *,
-    trust: Trust = LINEAR,
-    effort: Effort = Effort(),
+    noise_model: NoiseModel = LINEAR,
+    solver: SolverOptions = SolverOptions(),
     start: np.ndarray | None = None,
     prior: tuple[np.ndarray, float] | None = None,
     progress: Progress | None = None,
@@ -91,22 +99,22 @@ def solve_albedo(
     """
     tell = progress or (lambda share: None)
     size = land.shape[0] * land.shape[1]
-    rows = [rows_of(shot, trust, size) for shot in shots]
+    rows = [equations_of(photograph, noise_model, size) for photograph in photographs]
     _require_usable(rows)
-    seen = seen_weight(_unique([shot.footprints for shot in shots]))
+    seen = seen_weight(_unique([photograph.footprints for photograph in photographs]))
     albedo = np.full((size, 3), 0.25, np.float32) if start is None else start.reshape(size, 3).astype(np.float32)
     observed = seen.ravel() > 0.0
     history = []
-    for number in range(effort.rounds):
+    for number in range(solver.rounds):
         filled = fill_nearest(albedo.reshape(*land.shape, 3), seen)
         for row in rows:
-            row.ambient = ambient_on_texels(land, row.shot.light, filled)
-        weigh(rows, albedo, trust, robust=number > 0)
-        albedo, diagonal = _solve(rows, albedo, effort, land.shape, prior)
+            row.ambient = ambient_on_texels(land, row.photograph.light, filled)
+        reweight(rows, albedo, noise_model, robust=number > 0)
+        albedo, diagonal = _solve(rows, albedo, solver, land.shape, prior)
         albedo = np.clip(albedo, LOWEST, HIGHEST)
-        cost, residual = _assess(rows, albedo, trust)
+        cost, residual = _assess(rows, albedo, noise_model)
         history.append({"round": number, "cost": cost, "residual": float(np.median(residual))})
-        tell((number + 1) / effort.rounds)
+        tell((number + 1) / solver.rounds)
     albedo = fill_nearest(albedo.reshape(*land.shape, 3), seen)
     gains = np.stack([1.0 / row.inverse_gain for row in rows])
     information = np.where(observed, diagonal[:, 1], 0.0).reshape(land.shape).astype(np.float32)
@@ -117,12 +125,14 @@ def _unique(items: Sequence) -> list:
     return list({id(item): item for item in items}.values())
 
 
-def _require_usable(rows: list[Rows]) -> None:
+def _require_usable(rows: list[PhotographEquations]) -> None:
     counts = [int(row.usable[:, 0].sum()) for row in rows]
     if sum(counts) == 0:
         raise ValueError("solve_albedo: no usable pixel in any photograph: all clipped, black or masked")
     dark = [
-        row for row in rows if not row.suns and row.ambient.max() <= 0.0 and row.shot.light.sky_radiance.max() <= 0.0
+        row
+        for row in rows
+        if not row.suns and row.ambient.max() <= 0.0 and row.photograph.light.sky_radiance.max() <= 0.0
     ]
     if len(dark) == len(rows):
         raise ValueError("solve_albedo: no photograph has any light")
@@ -135,7 +145,11 @@ def _require_usable(rows: list[Rows]) -> None:
 
 
 def _solve(
-    rows: list[Rows], start: np.ndarray, effort: Effort, shape: tuple[int, int], prior: tuple[np.ndarray, float] | None
+    rows: list[PhotographEquations],
+    start: np.ndarray,
+    solver: SolverOptions,
+    shape: tuple[int, int],
+    prior: tuple[np.ndarray, float] | None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Minimise the weighted squares over albedo, gains projected out. Returns albedo and the normal diagonal."""
     diagonal = np.zeros_like(start)
@@ -152,7 +166,7 @@ def _solve(
             right = row.picture * row.inverse_gain.astype(np.float32) - row.airlight
         target += adjoint(row, row.weight * right)
     typical = np.array([np.median(d[d > 0.0]) if (d > 0.0).any() else 1.0 for d in diagonal.T], np.float32)
-    smooth = effort.smoothness * typical
+    smooth = solver.smoothness * typical
     pull = np.zeros(3, np.float32)
     if prior is not None:
         pull = prior[1] * typical
@@ -161,7 +175,7 @@ def _solve(
     def normal(a: np.ndarray) -> np.ndarray:
         total = smooth * _laplacian(a, shape) + (pull + 1e-6 * typical) * a
         for row, bottom in zip(rows, bottoms, strict=True):
-            model = model_of(row, a)[0]
+            model = forward_product(row, a)[0]
             if bottom is not None:
                 model -= row.picture * ((row.weight * row.picture * model).sum(axis=0) / bottom)
             total += adjoint(row, row.weight * model)
@@ -169,7 +183,7 @@ def _solve(
 
     preconditioner = 1.0 / (diagonal + 4.0 * smooth + pull + 1e-6 * typical)
     target = target + 1e-6 * typical * start
-    return _conjugate_gradients(normal, target, start, preconditioner, effort.iterations), diagonal
+    return _conjugate_gradients(normal, target, start, preconditioner, solver.iterations), diagonal
 
 
 def _conjugate_gradients(
@@ -212,23 +226,23 @@ def _laplacian(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     return result.reshape(values.shape)
 
 
-def _assess(rows: list[Rows], albedo: np.ndarray, trust: Trust) -> tuple[float, np.ndarray]:
+def _assess(rows: list[PhotographEquations], albedo: np.ndarray, noise_model: NoiseModel) -> tuple[float, np.ndarray]:
     """Robust cost a pixel in the pictures' own relative scale, and median relative residual of each photograph."""
     total, count, residuals = 0.0, 0, []
     for row in rows:
-        radiance = model_of(row, albedo)[0] + row.airlight
+        radiance = forward_product(row, albedo)[0] + row.airlight
         if row.projected:
             row.inverse_gain = projected_gain(row, radiance)
         h = row.inverse_gain.astype(np.float32)
         floor = 1e-3 * float(np.median(radiance)) + 1e-9
         relative = (h * row.picture - radiance) / (radiance + floor)
-        promised = np.sqrt(trust.model**2 + (row.noise * h / (radiance + floor)) ** 2)
+        promised = np.sqrt(noise_model.model**2 + (row.noise * h / (radiance + floor)) ** 2)
         keep = row.usable[:, 0]
         total += float(np.log1p((relative[keep] / (2.385 * promised[keep])) ** 2).sum())
         count += int(keep.sum()) * 3
         if len(row.sky_picture):
             apart = (h * row.sky_picture - row.sky_radiance) / (row.sky_radiance + floor)
-            total += float(np.log1p((apart / (2.385 * trust.sky)) ** 2).sum())
+            total += float(np.log1p((apart / (2.385 * noise_model.sky)) ** 2).sum())
             count += apart.size
         residuals.append(float(np.median(np.abs(relative[keep]))) if keep.any() else np.nan)
     return total / max(count, 1), np.array(residuals)
@@ -244,14 +258,16 @@ def fill_nearest(values: np.ndarray, seen: np.ndarray) -> np.ndarray:
     return values[row, column]
 
 
-def pixel_weights(land: Land, shots: Sequence[Shot], fit: AlbedoFit, trust: Trust = LINEAR) -> list[np.ndarray]:
+def pixel_weights(
+    land: TexelTransport, photographs: Sequence[AlbedoPhotograph], fit: AlbedoFit, noise_model: NoiseModel = LINEAR
+) -> list[np.ndarray]:
     """Weights ``(n, 3)`` [1 / (cd/m²)²] that a fit's last round gives the terrain pixels of each photograph."""
     size = land.shape[0] * land.shape[1]
     albedo = fit.albedo.reshape(size, 3)
     weights = []
-    for shot, gain in zip(shots, fit.gains, strict=True):
-        row = rows_of(replace(shot, gain=np.asarray(gain, float)), trust, size)
-        row.ambient = ambient_on_texels(land, shot.light, fit.albedo)
-        weigh([row], albedo, trust, robust=True)
+    for photograph, gain in zip(photographs, fit.gains, strict=True):
+        row = equations_of(replace(photograph, gain=np.asarray(gain, float)), noise_model, size)
+        row.ambient = ambient_on_texels(land, photograph.light, fit.albedo)
+        reweight([row], albedo, noise_model, robust=True)
         weights.append(row.weight)
     return weights

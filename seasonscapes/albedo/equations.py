@@ -7,19 +7,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from seasonscapes.albedo.footprints import whole_pixels
-from seasonscapes.albedo.forward import air_between, sky_seen
-from seasonscapes.albedo.shots import Shot, Trust
-from seasonscapes.rendering.reception import luminaries
+from seasonscapes.albedo.forward_model import aerial_perspective_of, sky_radiance_of
+from seasonscapes.albedo.photographs import AlbedoPhotograph, NoiseModel
+from seasonscapes.rendering.receivers import luminaries
 
 # Sky pixels that fix a gain, and how far they keep from sun and moon, whose glare and disc say nothing.
 _FEWEST_SKY, _GLARE_DEG = 100, 8.0
 
 
 @dataclass
-class Rows:
+class PhotographEquations:
     """The equations of one photograph; weights change from round to round."""
 
-    shot: Shot
+    photograph: AlbedoPhotograph
     picture: np.ndarray  # (n, 3)
     usable: np.ndarray  # (n, 3) bool
     noise: np.ndarray  # (n, 3) standard deviation of the picture
@@ -35,32 +35,36 @@ class Rows:
     @property
     def projected(self) -> bool:
         """Whether the gain is eliminated: neither given nor fixed by the sky."""
-        return self.shot.gain is None and len(self.sky_picture) < _FEWEST_SKY
+        return self.photograph.gain is None and len(self.sky_picture) < _FEWEST_SKY
 
 
-def rows_of(shot: Shot, trust: Trust, size: int) -> Rows:
+def equations_of(photograph: AlbedoPhotograph, noise_model: NoiseModel, size: int) -> PhotographEquations:
     """Pick the photograph's terrain and sky pixels and say how far each is to be trusted."""
-    footprints, observation = shot.footprints, shot.observation
+    footprints, observation = photograph.footprints, photograph.observation
     picture = observation.image.reshape(-1, 3)
     usable = observation.mask.ravel() & np.isfinite(picture).all(axis=1)
-    if trust.levels is not None:
+    if noise_model.levels is not None:
         # One clipped channel clips the pixel: demosaicing and JPEG mix the channels.
-        usable = usable & (picture.max(axis=1) < trust.white) & (picture.max(axis=1) > trust.black)
-    terrain, sky = footprints.pixel, shot.seen.sky.pixel
+        usable = usable & (picture.max(axis=1) < noise_model.white) & (picture.max(axis=1) > noise_model.black)
+    terrain, sky = footprints.pixel, photograph.seen.sky.pixel
     whole = whole_pixels(footprints) & usable[terrain]
-    transmittance, airlight = air_between(shot.seen, shot.light, len(terrain))
+    transmittance, airlight = aerial_perspective_of(photograph.seen, photograph.light, len(terrain))
     chosen = usable[sky]
-    for body in luminaries(shot.light):
-        chosen &= shot.seen.sky.direction @ np.asarray(body.direction) < np.cos(np.radians(_GLARE_DEG))
+    for body in luminaries(photograph.light):
+        chosen &= photograph.seen.sky.direction @ np.asarray(body.direction) < np.cos(np.radians(_GLARE_DEG))
     sky = sky[chosen]
-    radiance = sky_seen(shot.seen, shot.light)[chosen] if len(shot.seen.sky.pixel) else np.zeros((0, 3), np.float32)
-    suns = [np.asarray(body.normal_illuminance_lx, np.float32) for body in luminaries(shot.light)]
+    radiance = (
+        sky_radiance_of(photograph.seen, photograph.light)[chosen]
+        if len(photograph.seen.sky.pixel)
+        else np.zeros((0, 3), np.float32)
+    )
+    suns = [np.asarray(body.normal_illuminance_lx, np.float32) for body in luminaries(photograph.light)]
     values = np.nan_to_num(picture[terrain].astype(np.float32))
-    rows = Rows(
-        shot,
+    rows = PhotographEquations(
+        photograph,
         values,
         np.repeat(whole[:, None], 3, axis=1),
-        picture_noise(values, trust),
+        picture_noise(values, noise_model),
         transmittance,
         airlight,
         picture[sky].astype(np.float32),
@@ -69,55 +73,55 @@ def rows_of(shot: Shot, trust: Trust, size: int) -> Rows:
         np.ones(3),
         suns,
     )
-    if shot.gain is not None:
-        rows.inverse_gain = 1.0 / shot.gain
+    if photograph.gain is not None:
+        rows.inverse_gain = 1.0 / photograph.gain
     elif not rows.projected:
         rows.inverse_gain = _median_ratio(rows.sky_radiance, rows.sky_picture)
     return rows
 
 
-def picture_noise(linear: np.ndarray, trust: Trust) -> np.ndarray:
+def picture_noise(linear: np.ndarray, noise_model: NoiseModel) -> np.ndarray:
     """Standard deviation of linear values from rounding and compression of their sRGB encoding."""
-    if trust.levels is None:
+    if noise_model.levels is None:
         return np.zeros_like(linear)
     bright = np.maximum(linear, 1e-6)
     slope = np.where(linear <= 0.0031308, 1.0 / 12.92, 2.4 / 1.055 * bright ** (1.0 - 1.0 / 2.4))
-    return (trust.level_noise / trust.levels * slope).astype(np.float32)
+    return (noise_model.level_noise / noise_model.levels * slope).astype(np.float32)
 
 
 # ---------------------------------------------------------------------------------------------- linear parts
 
 
-def model_of(row: Rows, albedo: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def forward_product(row: PhotographEquations, albedo: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Radiance ``(n, 3)`` at the camera without airlight, and its directly sunlit part."""
-    footprints = row.shot.footprints
+    footprints = row.photograph.footprints
     sun = np.zeros((len(footprints.pixel), 3), np.float32)
-    for illuminance, values in zip(row.suns, footprints.sunlit[row.shot.number], strict=True):
+    for illuminance, values in zip(row.suns, footprints.sunlit[row.photograph.number], strict=True):
         sun += (footprints.matrix(values) @ albedo) * illuminance
     total = sun + footprints.matrix(footprints.share) @ (row.ambient * albedo)
     scale = row.transmittance / np.float32(np.pi)
     return total * scale, sun * scale
 
 
-def adjoint(row: Rows, residual: np.ndarray) -> np.ndarray:
-    """Transpose of `model_of`: ``(n, 3)`` → ``(R·S, 3)``."""
-    footprints = row.shot.footprints
+def adjoint(row: PhotographEquations, residual: np.ndarray) -> np.ndarray:
+    """Transpose of `forward_product`: ``(n, 3)`` → ``(R·S, 3)``."""
+    footprints = row.photograph.footprints
     scaled = residual * row.transmittance / np.float32(np.pi)
     total = (footprints.matrix(footprints.share).T @ scaled) * row.ambient
-    for illuminance, values in zip(row.suns, footprints.sunlit[row.shot.number], strict=True):
+    for illuminance, values in zip(row.suns, footprints.sunlit[row.photograph.number], strict=True):
         total += footprints.matrix(values).T @ (scaled * illuminance)
     return total
 
 
-def squared_adjoint(row: Rows) -> np.ndarray:
+def squared_adjoint(row: PhotographEquations) -> np.ndarray:
     """Diagonal of the normal matrix, ``(R·S, 3)``: the preconditioner and the information of each texel."""
-    footprints = row.shot.footprints
+    footprints = row.photograph.footprints
     scaled = row.weight * (row.transmittance / np.float32(np.pi)) ** 2
     share, texel = footprints.share, footprints.texel
     total = np.empty_like(row.ambient)
     for channel in range(3):
         values = share * row.ambient[texel, channel]
-        for illuminance, sunlit in zip(row.suns, footprints.sunlit[row.shot.number], strict=True):
+        for illuminance, sunlit in zip(row.suns, footprints.sunlit[row.photograph.number], strict=True):
             values = values + sunlit * illuminance[channel]
         total[:, channel] = footprints.matrix(values * values).T @ scaled[:, channel]
     return total
@@ -126,18 +130,18 @@ def squared_adjoint(row: Rows) -> np.ndarray:
 # ---------------------------------------------------------------------------------------------- weights
 
 
-def weigh(rows: list[Rows], albedo: np.ndarray, trust: Trust, *, robust: bool) -> None:
+def reweight(rows: list[PhotographEquations], albedo: np.ndarray, noise_model: NoiseModel, *, robust: bool) -> None:
     """Weights of all equations from the present albedo: variances, times Cauchy's where ``robust``."""
     for row in rows:
-        model, sun = model_of(row, albedo)
+        model, sun = forward_product(row, albedo)
         radiance = model + row.airlight
         if row.projected:
             row.inverse_gain = projected_gain(row, radiance)
-        lit = row.shot.footprints.lit[row.shot.number] if row.suns else np.zeros(len(model))
+        lit = row.photograph.footprints.lit[row.photograph.number] if row.suns else np.zeros(len(model))
         mixed = np.nan_to_num(4.0 * lit * (1.0 - lit)).astype(np.float32)[:, None]
         noise = row.noise * row.inverse_gain.astype(np.float32)
         floor = 1e-3 * float(np.median(radiance)) + 1e-9
-        variance = (trust.model * radiance) ** 2 + (trust.edge * sun * mixed) ** 2 + noise**2 + floor**2
+        variance = (noise_model.model * radiance) ** 2 + (noise_model.edge * sun * mixed) ** 2 + noise**2 + floor**2
         row.weight = np.where(row.usable, 1.0 / variance, 0.0).astype(np.float32)
         if robust:
             h = row.inverse_gain.astype(np.float32)
@@ -159,7 +163,7 @@ def _median_ratio(top: np.ndarray, bottom: np.ndarray) -> np.ndarray:
     return np.array([np.median(top[k, c] / bottom[k, c]) if k.any() else 1.0 for c, k in enumerate(sound)], float)
 
 
-def projected_gain(row: Rows, radiance: np.ndarray) -> np.ndarray:
+def projected_gain(row: PhotographEquations, radiance: np.ndarray) -> np.ndarray:
     """Inverse gain ``(3,)`` that fits terrain pixels best to a radiance."""
     keep = row.usable[:, 0]
     if row.weight is None:

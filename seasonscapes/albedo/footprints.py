@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from seasonscapes.cameras.pinhole import Camera
-from seasonscapes.rendering.gather import Occluder
+from seasonscapes.rendering.hemisphere_rays import RayScene
 from seasonscapes.rendering.sun_visibility import cosine_seen, pixel_turn, sun_rays
 from seasonscapes.rendering.view_samples import view_samples
 from seasonscapes.sky.illumination import Luminary
@@ -77,7 +77,7 @@ class Footprints:
 
 
 def trace_footprints(
-    terrain: Occluder,
+    terrain: RayScene,
     camera: Camera,
     shape: tuple[int, int],
     suns: Sequence[Sequence[Luminary]],
@@ -91,7 +91,7 @@ def trace_footprints(
     Parameters
     ----------
     terrain
-        From `gather.occluder`. Its albedo plays no part.
+        From `gather_hemisphere.occluder`. Its albedo plays no part.
     shape
         Rows and columns of the texture to be found.
     suns
@@ -129,7 +129,7 @@ def trace_footprints(
 
 
 def _block_entries(
-    terrain: Occluder, camera: Camera, shape: tuple[int, int], samples: tuple, suns: Sequence[Sequence[Luminary]]
+    terrain: RayScene, camera: Camera, shape: tuple[int, int], samples: tuple, suns: Sequence[Sequence[Luminary]]
 ) -> tuple[tuple, np.ndarray]:
     """Columns of `Footprints` for a block of pixels, and its ``lit`` ``(T, n)``."""
     points, hit, pixel = samples

@@ -13,15 +13,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from seasonscapes.albedo.closed_form import AlbedoFit, Effort, solve_albedo
-from seasonscapes.albedo.forward import Land
-from seasonscapes.albedo.shots import LINEAR, Shot, Trust, thinned_shots
+from seasonscapes.albedo.closed_form import AlbedoFit, SolverOptions, solve_albedo
+from seasonscapes.albedo.forward_model import TexelTransport
+from seasonscapes.albedo.photographs import LINEAR, AlbedoPhotograph, NoiseModel, thinned_photographs
 from seasonscapes.sky.illumination import AerialPerspective, Illumination, Luminary
 
 LightsOf = Callable[[float], Sequence[Illumination]]
 # Half again as far from one to the next; from thick haze to polar air.
 VISIBILITIES_KM = (12.0, 20.0, 33.0, 55.0, 90.0, 150.0)
-_QUICK = Effort(rounds=3, iterations=8)
+_QUICK = SolverOptions(rounds=3, iterations=8)
 
 
 @dataclass(frozen=True)
@@ -79,12 +79,12 @@ def mixed_light(first: Illumination, second: Illumination, share: float) -> Illu
 
 
 def fit_visibility(
-    land: Land,
-    shots: Sequence[Shot],
+    land: TexelTransport,
+    photographs: Sequence[AlbedoPhotograph],
     lights_of: LightsOf,
     *,
     visibilities_km: Sequence[float] = VISIBILITIES_KM,
-    trust: Trust = LINEAR,
+    noise_model: NoiseModel = LINEAR,
     share: float = 0.2,
     seed: int = 0,
     start: AlbedoFit | None = None,
@@ -111,7 +111,7 @@ def fit_visibility(
     nodes = sorted(map(float, visibilities_km))
     if len(nodes) < 3:
         raise ValueError("fit_visibility: three visibilities at least")
-    thin = thinned_shots(shots, share, seed)
+    thin = thinned_photographs(photographs, share, seed)
     lights: dict[float, Sequence[Illumination]] = {}
     costs: dict[float, float] = {}
     albedo = None if start is None else start.albedo
@@ -120,8 +120,8 @@ def fit_visibility(
         nonlocal albedo
         if visibility_km not in costs:
             chosen = _lights_at(visibility_km, nodes, lights, lights_of)
-            tried = [replace(shot, light=light) for shot, light in zip(thin, chosen, strict=True)]
-            fit = solve_albedo(land, tried, trust=trust, effort=_QUICK, start=albedo)
+            tried = [replace(photograph, light=light) for photograph, light in zip(thin, chosen, strict=True)]
+            fit = solve_albedo(land, tried, noise_model=noise_model, solver=_QUICK, start=albedo)
             albedo, costs[visibility_km] = fit.albedo, fit.cost
             tell(min(1.0, len(costs) / 8.0))
         return costs[visibility_km]

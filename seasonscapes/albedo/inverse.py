@@ -17,15 +17,15 @@ from typing import Any
 import numpy as np
 
 from seasonscapes.albedo.closed_form import HIGHEST, LOWEST, AlbedoFit, pixel_weights
-from seasonscapes.albedo.forward import Land
-from seasonscapes.albedo.mitsuba_pictures import DifferentiableViews, differentiable_views, mi_picture
-from seasonscapes.albedo.shots import LINEAR, Shot, Trust
+from seasonscapes.albedo.differentiable_views import DifferentiableViews, differentiable_views, mi_picture
+from seasonscapes.albedo.forward_model import TexelTransport
+from seasonscapes.albedo.photographs import LINEAR, AlbedoPhotograph, NoiseModel
 from seasonscapes.images import atomic_path
 from seasonscapes.terrain.surface import Terrain
 
 
 @dataclass(frozen=True)
-class Extra:
+class ExtraUnknown:
     """An experiment's own unknown: a parameter of Mitsuba's by its key, its start, bounds and step."""
 
     start: np.ndarray
@@ -73,7 +73,7 @@ class InverseOptions:
 
 
 @dataclass
-class State:
+class IterationState:
     """Where an optimisation stands; callbacks get it after every iteration and may set ``stop``.
 
     Parameters
@@ -93,7 +93,7 @@ class State:
     stop: bool = False
 
 
-Callback = Callable[[State], None]
+Callback = Callable[[IterationState], None]
 
 
 @dataclass(frozen=True)
@@ -107,13 +107,13 @@ class InverseFit:
 
 def refine_albedo(
     terrain: Terrain,
-    land: Land,
-    shots: Sequence[Shot],
+    land: TexelTransport,
+    photographs: Sequence[AlbedoPhotograph],
     start: AlbedoFit,
     *,
-    trust: Trust = LINEAR,
+    noise_model: NoiseModel = LINEAR,
     options: InverseOptions | None = None,
-    extra: Mapping[str, Extra] | None = None,
+    extra: Mapping[str, ExtraUnknown] | None = None,
     callbacks: Sequence[Callback] = (),
     resume: Path | None = None,
 ) -> InverseFit:
@@ -126,7 +126,7 @@ def refine_albedo(
     extra
         More unknowns, by Mitsuba's key (``sky.data``, ``terrain.vertex_positions``, …).
     callbacks
-        Called with the `State` after each iteration.
+        Called with the `IterationState` after each iteration.
     resume
         A file to save the state in at every judgement, and to go on from where it exists.
 
@@ -138,14 +138,20 @@ def refine_albedo(
         Fewer than two photographs, or an unknown without meaning.
     """
     options, extra = options or InverseOptions(), dict(extra or {})
-    if len(shots) < 2:
+    if len(photographs) < 2:
         raise ValueError("refine_albedo: two photographs at least, one of them to judge by")
     strange = set(options.unknowns) - {"albedo", "log_gain", "sun", "sky", "haze"}
     if strange:
         raise ValueError(f"refine_albedo: unknown {', '.join(sorted(strange))}; Mitsuba's own go into extra")
-    views = differentiable_views(terrain, start.albedo, shots, max_depth=options.max_depth)
-    task = _Task(views, _targets(land, shots, start, trust), options, extra, *_split(len(shots), options))
-    state = _loaded(resume) if resume is not None and resume.is_file() else State(_start_values(start, options, extra))
+    views = differentiable_views(terrain, start.albedo, photographs, max_depth=options.max_depth)
+    task = _Task(
+        views, _targets(land, photographs, start, noise_model), options, extra, *_split(len(photographs), options)
+    )
+    state = (
+        _loaded(resume)
+        if resume is not None and resume.is_file()
+        else IterationState(_start_values(start, options, extra))
+    )
     for stage in range(state.stage, len(options.levels)):
         first = state.iteration if stage == state.stage else 0
         state.stage = stage
@@ -163,7 +169,7 @@ class _Task:
     views: DifferentiableViews
     targets: list[tuple[Any, Any]]
     options: InverseOptions
-    extra: dict[str, Extra]
+    extra: dict[str, ExtraUnknown]
     fitted: np.ndarray
     judges: np.ndarray
 
@@ -175,31 +181,40 @@ def _split(count: int, options: InverseOptions) -> tuple[np.ndarray, np.ndarray]
     return np.sort(order[held:]), np.sort(order[:held])
 
 
-def _targets(land: Land, shots: Sequence[Shot], start: AlbedoFit, trust: Trust) -> list[tuple[Any, Any]]:
+def _targets(
+    land: TexelTransport, photographs: Sequence[AlbedoPhotograph], start: AlbedoFit, noise_model: NoiseModel
+) -> list[tuple[Any, Any]]:
     """Each photograph ``(H, W, 3)`` and the root of its pixels' weights [1 / picture value], as tensors."""
     import mitsuba as mi
 
     found = []
-    for shot, weight, gain in zip(shots, pixel_weights(land, shots, start, trust), start.gains, strict=True):
-        camera = shot.footprints.camera
+    for photograph, weight, gain in zip(
+        photographs, pixel_weights(land, photographs, start, noise_model), start.gains, strict=True
+    ):
+        camera = photograph.footprints.camera
         image = np.zeros((camera.height_px * camera.width_px, 3), np.float32)
-        image[shot.footprints.pixel] = np.sqrt(weight) / np.asarray(gain, np.float32)
+        image[photograph.footprints.pixel] = np.sqrt(weight) / np.asarray(gain, np.float32)
         image *= 1.0 / np.sqrt(max(float((weight > 0.0).mean(axis=1).sum()), 1.0))
         shape = (camera.height_px, camera.width_px, 3)
         found.append(
-            (mi.TensorXf(np.nan_to_num(shot.observation.image.astype(np.float32))), mi.TensorXf(image.reshape(shape)))
+            (
+                mi.TensorXf(np.nan_to_num(photograph.observation.image.astype(np.float32))),
+                mi.TensorXf(image.reshape(shape)),
+            )
         )
     return found
 
 
-def _start_values(start: AlbedoFit, options: InverseOptions, extra: dict[str, Extra]) -> dict[str, np.ndarray]:
+def _start_values(start: AlbedoFit, options: InverseOptions, extra: dict[str, ExtraUnknown]) -> dict[str, np.ndarray]:
     # Gains always take part, as pictures have their own unit; they move only where they are unknowns.
     values = {"albedo": start.albedo.astype(np.float32), "log_gain": np.log(start.gains).astype(np.float32)}
     values |= {name: np.ones(1, np.float32) for name in ("sun", "sky", "haze") if name in options.unknowns}
     return values | {name: np.asarray(one.start, np.float32) for name, one in extra.items()}
 
 
-def _run_stage(task: _Task, state: State, first: int, callbacks: Sequence[Callback], resume: Path | None) -> None:
+def _run_stage(
+    task: _Task, state: IterationState, first: int, callbacks: Sequence[Callback], resume: Path | None
+) -> None:
     import drjit as dr
 
     options = task.options
@@ -346,14 +361,14 @@ def _values(
     return values | found
 
 
-def _save(state: State, path: Path) -> None:
+def _save(state: IterationState, path: Path) -> None:
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         note = json.dumps({"stage": state.stage, "iteration": state.iteration, "history": state.history})
         np.savez(file, note=note, **{f"value:{name}": value for name, value in state.values.items()})
 
 
-def _loaded(path: Path) -> State:
+def _loaded(path: Path) -> IterationState:
     with np.load(path, allow_pickle=False) as held:
         note = json.loads(str(held["note"]))
         values = {name.removeprefix("value:"): held[name] for name in held.files if name.startswith("value:")}
-    return State(values, note["stage"], note["iteration"], note["history"])
+    return IterationState(values, note["stage"], note["iteration"], note["history"])

@@ -16,7 +16,7 @@ from datetime import date
 
 import numpy as np
 
-from seasonscapes.terrain.ground import Ground
+from seasonscapes.terrain.attributes import TerrainAttributes
 from seasonscapes.terrain.surface import Texture
 
 SEASONS = ("blended", "nearest", "snow-line")
@@ -91,13 +91,13 @@ def season_weights(dates: Sequence[date], day: date, *, season: str = "blended")
         raise ValueError("season_weights: no dated albedo")
     if season not in SEASONS:
         raise ValueError(f"season: got {season!r}, expected one of {', '.join(SEASONS)}")
-    preceding, following, way = neighbours([day_number(each) for each in dates], day_number(day))
+    preceding, following, way = neighbouring_dates([day_number(each) for each in dates], day_number(day))
     if season == "nearest":
         return [(following if way >= 0.5 else preceding, 1.0)]
     return [(index, weight) for index, weight in ((preceding, 1.0 - way), (following, way)) if weight > 0.0]
 
 
-def neighbours(days: Sequence[float], day: float) -> tuple[int, int, float]:
+def neighbouring_dates(days: Sequence[float], day: float) -> tuple[int, int, float]:
     """The last of some days of the year before a day, the first after it, and the share of the time between them.
 
     Both are the same, and the share 0, where the day is one of them or there is only one.
@@ -113,7 +113,7 @@ def neighbours(days: Sequence[float], day: float) -> tuple[int, int, float]:
     return preceding, following, before[preceding] / (after[following] + before[preceding])
 
 
-def line_share(first: float, second: float, day: float) -> float:
+def snowline_fraction(first: float, second: float, day: float) -> float:
     """How much of its way between two days of the year the snow line has gone on a day between them, by the climate.
 
     Its height follows the year as a cosine whose least and greatest lie in the middle of February and of August (in the
@@ -128,8 +128,8 @@ def line_share(first: float, second: float, day: float) -> float:
     return float((1.0 - known) * way + known * np.clip((now - start) / (end - start), 0.0, 1.0))
 
 
-def snow_turning(ground: Ground, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """When each place changes between two dates, for `albedo_between`.
+def snow_transition(ground: TerrainAttributes, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """When each place changes between two dates, for `interpolate_albedo`.
 
     Parameters
     ----------
@@ -171,11 +171,13 @@ def _gains(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.where((np.abs(change) > _SNOW_CHANGE) & ~white, np.sign(change), 0.0).astype(np.int8)
 
 
-def _features(ground: Ground) -> np.ndarray:
-    return np.concatenate([ground.height_m[:, None] / 1000.0, ground.normal, ground.hollow_m[:, None] / 100.0], axis=1)
+def _features(ground: TerrainAttributes) -> np.ndarray:
+    return np.concatenate(
+        [ground.height_m[:, None] / 1000.0, ground.normal, ground.concavity_m[:, None] / 100.0], axis=1
+    )
 
 
-def _holding(ground: Ground, dated: tuple[np.ndarray, np.ndarray], gains: np.ndarray) -> np.ndarray:
+def _holding(ground: TerrainAttributes, dated: tuple[np.ndarray, np.ndarray], gains: np.ndarray) -> np.ndarray:
     """How well snow holds, as a weight ``(5,)`` of each of a place's features, in logits.
 
     Logistic regression of white or bare on both dates at once, which share all weights but have a line each
@@ -183,7 +185,7 @@ def _holding(ground: Ground, dated: tuple[np.ndarray, np.ndarray], gains: np.nda
     """
     told = np.flatnonzero((ground.normal[:, 2] > _STEEP_UP) | (gains != 0))
     told = told[:: max(1, len(told) // _MOST_PLACES)]
-    part = Ground(ground.height_m[told], ground.normal[told], ground.hollow_m[told])
+    part = TerrainAttributes(ground.height_m[told], ground.normal[told], ground.concavity_m[told])
     x = _features(part).astype(np.float64)
     x -= x.mean(axis=0)
     white = [
@@ -215,7 +217,9 @@ def _holding(ground: Ground, dated: tuple[np.ndarray, np.ndarray], gains: np.nda
     return weight[:5].astype(np.float32)
 
 
-def albedo_between(dated: tuple[np.ndarray, np.ndarray], turning: np.ndarray, way: float, line: float) -> np.ndarray:
+def interpolate_albedo(
+    dated: tuple[np.ndarray, np.ndarray], turning: np.ndarray, way: float, line: float
+) -> np.ndarray:
     """Albedo ``(..., 3)`` of a day between two dates.
 
     Parameters
@@ -223,11 +227,11 @@ def albedo_between(dated: tuple[np.ndarray, np.ndarray], turning: np.ndarray, wa
     dated
         ``(..., 3)`` each, on the two dates.
     turning
-        ``(..., 3)`` from `snow_turning`.
+        ``(..., 3)`` from `snow_transition`.
     way
         Share of the time that has passed: small changes follow it.
     line
-        How much of its way from the first date's height to the second's the snow line has gone: `line_share`, or what a
+        How much of its way from the first date's height to the second's the snow line has gone: `snowline_fraction`, or what a
         snow station or a picture of the day says.
 
     Raises
@@ -247,7 +251,7 @@ def albedo_between(dated: tuple[np.ndarray, np.ndarray], turning: np.ndarray, wa
     return ((1.0 - done) * first + done * second).astype(np.float32)
 
 
-def albedo_at(values: np.ndarray, days: Sequence[float], day: float, ground: Ground) -> np.ndarray:
+def albedo_at(values: np.ndarray, days: Sequence[float], day: float, ground: TerrainAttributes) -> np.ndarray:
     """Albedo ``(N, 3)`` of places on a day of the year from dated ones, the snow line moving.
 
     Parameters
@@ -264,8 +268,10 @@ def albedo_at(values: np.ndarray, days: Sequence[float], day: float, ground: Gro
     """
     if len(days) == 0 or not np.isfinite(day):
         raise ValueError(f"albedo_at: got {len(days)} dates and day {day}")
-    first, second, way = neighbours(days, day)
+    first, second, way = neighbouring_dates(days, day)
     if first == second:
         return values[first]
     pair = (values[first], values[second])
-    return albedo_between(pair, snow_turning(ground, *pair), way, line_share(days[first], days[second], day))
+    return interpolate_albedo(
+        pair, snow_transition(ground, *pair), way, snowline_fraction(days[first], days[second], day)
+    )

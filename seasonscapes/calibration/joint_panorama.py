@@ -10,10 +10,10 @@ import numpy as np
 
 from seasonscapes.calibration.evidence import Correspondences, Priors
 from seasonscapes.calibration.pose_model import angles_from_rotation
-from seasonscapes.calibration.resection import Calibration, calibrate
-from seasonscapes.cameras.exchange_reference import ReferenceView
+from seasonscapes.calibration.resection import Calibration, resect
 from seasonscapes.cameras.panorama import project_panorama
 from seasonscapes.cameras.pinhole import Camera, ray_directions
+from seasonscapes.cameras.reference_poses import ReferenceView
 from seasonscapes.cameras.webcam import Webcam, webcam_heading_deg, webcam_model
 from seasonscapes.frames import LocalFrame, local_axes
 
@@ -81,7 +81,7 @@ def _joint(webcam: Webcam, views: list[ReferenceView], first: dict[str, Referenc
     priors = Priors(tilt_deg=5.0, roll_deg=5.0, horizontal_m=0.0, vertical_m=0.0, focal=0.05, horizon_px=400.0)
     points = Correspondences(np.concatenate(pixel), np.concatenate(position))
     try:
-        solution = calibrate(panorama, points, priors=priors, axes=axes)
+        solution = resect(panorama, points, priors=priors, axes=axes)
     except ValueError:
         return JointPanorama(
             webcam.id,

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 
 from seasonscapes.calibration.evidence import Correspondences
-from seasonscapes.calibration.horizon import Horizon
 from seasonscapes.calibration.pose_model import project_values, values_of
 from seasonscapes.calibration.resection import Calibration
+from seasonscapes.calibration.terrain_horizon import Horizon
 from seasonscapes.cameras.panorama import Panorama
 from seasonscapes.images import write_png8
 

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from seasonscapes.calibration.evidence import PARAMETERS, Correspondences, Priors, take
-from seasonscapes.calibration.first_rotation import check_orientation, rotation_among_pairs
+from seasonscapes.calibration.initial_rotation import check_orientation, rotation_among_pairs
 from seasonscapes.calibration.pose_model import View, pixel_error, values_of, view_from_values
 from seasonscapes.cameras.pinhole import Camera
 
@@ -77,7 +77,7 @@ class Calibration:
 
 
 @dataclass(frozen=True)
-class Problem:
+class ResectionProblem:
     """Everything a solver step needs, gathered once."""
 
     start: View
@@ -93,7 +93,7 @@ class Problem:
         return self.sigmas > 0
 
 
-def calibrate(
+def resect(
     start: View,
     points: Correspondences | None = None,
     *,
@@ -160,7 +160,7 @@ def calibrate(
             if sigmas[angle] == 0.0:
                 values[angle] = origin[angle]
     empty = Correspondences(np.empty((0, 2)), np.empty((0, 3)))
-    problem = Problem(
+    problem = ResectionProblem(
         start,
         axes,
         origin,
@@ -177,10 +177,10 @@ def calibrate(
 
 
 def leave_one_out(start: View, points: Correspondences, **options) -> np.ndarray:
-    """Error of each point ``(N, 2)`` [px] as predicted by a calibration that never saw it; options as `calibrate`."""
+    """Error of each point ``(N, 2)`` [px] as predicted by a calibration that never saw it; options as `resect`."""
     errors, axes = np.empty((len(points), 2)), np.eye(3)
     for i in range(len(points)):
-        rest = calibrate(start, take(points, np.arange(len(points)) != i), **options)
+        rest = resect(start, take(points, np.arange(len(points)) != i), **options)
         errors[i] = pixel_error(rest.view, axes, values_of(rest.view, axes, rest.k1), take(points, [i]))[0][0]
     return errors
 
@@ -207,7 +207,7 @@ def _refuse_below_ground(values: np.ndarray, ground_m: Callable, what: str, *, t
 
 
 def _residual_rows(
-    problem: Problem, values: np.ndarray, noise: float, shape: Callable | None, keep: np.ndarray
+    problem: ResectionProblem, values: np.ndarray, noise: float, shape: Callable | None, keep: np.ndarray
 ) -> np.ndarray:
     """Whitened residuals: points, further evidence and priors. ``shape`` bends point residuals to a robust loss."""
     rows = []
@@ -239,7 +239,7 @@ def _soft_l1(error: np.ndarray, scale: float) -> np.ndarray:
 
 
 def _minimise(
-    problem: Problem,
+    problem: ResectionProblem,
     values: np.ndarray,
     noise: float,
     shape: Callable | None,
@@ -266,7 +266,7 @@ def _minimise(
     return result, solved.jac
 
 
-def _solve(problem: Problem, values: np.ndarray, loss: Loss, noise_px: float | None):
+def _solve(problem: ResectionProblem, values: np.ndarray, loss: Loss, noise_px: float | None):
     """Unknowns, outliers ``(N,)`` and noise [px]: from a wide robust loss to least squares over those that agree."""
     count = len(problem.points)
     everyone = np.ones(count, bool)
@@ -292,7 +292,7 @@ def _solve(problem: Problem, values: np.ndarray, loss: Loss, noise_px: float | N
     return _second_opinions(problem, values, keep, noise, noise_px)
 
 
-def _settle(problem: Problem, values: np.ndarray, keep: np.ndarray, noise: float, noise_px: float | None):
+def _settle(problem: ResectionProblem, values: np.ndarray, keep: np.ndarray, noise: float, noise_px: float | None):
     """Least squares over those that agree and who agrees with it, in turn, until neither changes."""
     carried = float(problem.free.sum())
     for _ in range(8):
@@ -319,7 +319,7 @@ def _cut(freedom: float, estimated: bool) -> float:
     return float(np.sqrt(2.0 * f.ppf(0.999, 2, max(freedom, 2.0))))
 
 
-def _carried(problem: Problem, jacobian: np.ndarray) -> float:
+def _carried(problem: ResectionProblem, jacobian: np.ndarray) -> float:
     """How many unknowns the evidence determines; one that its prior holds counts little (trace of the resolution)."""
     sigmas = problem.sigmas[problem.free]
     try:
@@ -329,7 +329,9 @@ def _carried(problem: Problem, jacobian: np.ndarray) -> float:
     return float(len(sigmas) - np.sum(np.where(np.isfinite(sigmas), np.minimum(variance / sigmas**2, 1.0), 0.0)))
 
 
-def _second_opinions(problem: Problem, values: np.ndarray, keep: np.ndarray, noise: float, noise_px: float | None):
+def _second_opinions(
+    problem: ResectionProblem, values: np.ndarray, keep: np.ndarray, noise: float, noise_px: float | None
+):
     """A wrong match that stands alone in its region bends the solution to itself; leave out each, see who agrees.
 
     The solution of the least truncated sum of squares is kept. Large sets do not need it.
@@ -361,28 +363,28 @@ def _second_opinions(problem: Problem, values: np.ndarray, keep: np.ndarray, noi
     return values, ~keep, noise
 
 
-def _errors(problem: Problem, values: np.ndarray) -> np.ndarray:
+def _errors(problem: ResectionProblem, values: np.ndarray) -> np.ndarray:
     return pixel_error(problem.start, problem.axes, values, problem.points)[0]
 
 
-def _unknowns_from_data(problem: Problem) -> int:
+def _unknowns_from_data(problem: ResectionProblem) -> int:
     """Unknowns that the points must carry; a prior carries its own."""
     return int(np.isinf(problem.sigmas).sum())
 
 
-def _median_noise(problem: Problem, values: np.ndarray) -> float:
+def _median_noise(problem: ResectionProblem, values: np.ndarray) -> float:
     # The median of a Rayleigh distribution is 1.1774 sigma; the fit has taken up some of the residuals.
     count = len(problem.points)
     share = max(1.0 - float(problem.free.sum()) / (2.0 * count), 0.2)
     return max(float(np.median(np.linalg.norm(_errors(problem, values), axis=1))) / 1.1774 / np.sqrt(share), 1e-3)
 
 
-def _noise(problem: Problem, values: np.ndarray, keep: np.ndarray, carried: float) -> float:
+def _noise(problem: ResectionProblem, values: np.ndarray, keep: np.ndarray, carried: float) -> float:
     freedom = max(2.0 * keep.sum() - carried, 1.0)
     return max(float(np.sqrt(np.sum(_errors(problem, values)[keep] ** 2) / freedom)), 1e-6)
 
 
-def _refuse_no_agreement(problem: Problem, chosen: np.ndarray, error: np.ndarray) -> None:
+def _refuse_no_agreement(problem: ResectionProblem, chosen: np.ndarray, error: np.ndarray) -> None:
     needed = max(3, int(np.ceil(_unknowns_from_data(problem) / 2)))
     limit = 0.04 * problem.start.width_px
     if problem.extra is None and (chosen.sum() < needed or np.median(error) > limit):
@@ -393,7 +395,9 @@ def _refuse_no_agreement(problem: Problem, chosen: np.ndarray, error: np.ndarray
         )
 
 
-def _finish(problem: Problem, values: np.ndarray, outlier: np.ndarray, noise: float, *, widen: bool) -> Calibration:
+def _finish(
+    problem: ResectionProblem, values: np.ndarray, outlier: np.ndarray, noise: float, *, widen: bool
+) -> Calibration:
     view, k1 = view_from_values(problem.start, problem.axes, values), float(values[7])
     residual, front = pixel_error(problem.start, problem.axes, values, problem.points)
     if not front.all():
@@ -417,7 +421,7 @@ def _finish(problem: Problem, values: np.ndarray, outlier: np.ndarray, noise: fl
     return Calibration(view, k1, values, covariance, problem.points.names, residual, outlier, noise, skyline_rms)
 
 
-def _covariance(problem: Problem, jacobian: np.ndarray) -> np.ndarray:
+def _covariance(problem: ResectionProblem, jacobian: np.ndarray) -> np.ndarray:
     free = np.flatnonzero(problem.free)
     information = jacobian.T @ jacobian
     scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))

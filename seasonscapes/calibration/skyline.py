@@ -2,7 +2,7 @@
 
 No sky is cut out first. The picture becomes a map of how well each pixel would serve as a boundary with calm sky right
 above it; the terrain's horizon, shaped by a trial pose, collects what lies under it. All poses within the search are
-tried coarsely, the best few are refined to sub-pixel edges by `calibrate`, and what remains of the doubt (a rival pose
+tried coarsely, the best few are refined to sub-pixel edges by `resect`, and what remains of the doubt (a rival pose
 elsewhere, few edges met, wide error bars, a rim of the search) decides whether the result is to be trusted.
 """
 
@@ -16,9 +16,9 @@ import numpy as np
 
 from seasonscapes.calibration.boundary_map import BoundaryMap, boundary_map, edge_near
 from seasonscapes.calibration.evidence import Correspondences, Priors
-from seasonscapes.calibration.horizon import Horizon, horizon_from
 from seasonscapes.calibration.pose_model import View, project_values, values_of, view_from_values
-from seasonscapes.calibration.resection import Calibration, SkylineEvidence, calibrate
+from seasonscapes.calibration.resection import Calibration, SkylineEvidence, resect
+from seasonscapes.calibration.terrain_horizon import Horizon, horizon_from
 from seasonscapes.cameras.panorama import Panorama
 from seasonscapes.frames import LocalFrame, geodetic_from_enu, local_axes
 from seasonscapes.terrain.surface import Raster
@@ -30,7 +30,7 @@ LEAST_MET, LEAST_LEAD, MOST_SIGMA_DEG, LEAST_COLUMNS = 0.6, 1.06, 0.12, 0.15
 
 
 @dataclass(frozen=True)
-class Search:
+class SearchRange:
     """How far from the start to look, each way, and how far the start is trusted otherwise.
 
     Parameters
@@ -97,7 +97,7 @@ def align_to_skyline(
     frame: LocalFrame,
     *,
     mask: np.ndarray | None = None,
-    search: Search | None = None,
+    search: SearchRange | None = None,
     points: Correspondences | None = None,
     k1: float = 0.0,
 ) -> SkylineFit:
@@ -130,7 +130,7 @@ def align_to_skyline(
     ValueError
         A picture of another size than the view; no terrain in sight; a camera below ground.
     """
-    search = search or Search()
+    search = search or SearchRange()
     if image.shape[:2] != (start.height_px, start.width_px):
         raise ValueError(
             f"align_to_skyline: the picture is {image.shape[1]} x {image.shape[0]} px, the view "
@@ -166,7 +166,7 @@ def _cell(raster: Raster) -> float:
     return size * 111_195.0 if size < 0.1 else size
 
 
-def _azimuths(start: View, origin: np.ndarray, search: Search) -> np.ndarray:
+def _azimuths(start: View, origin: np.ndarray, search: SearchRange) -> np.ndarray:
     """Directions that any pose of the search may see, at about two thirds of a pixel."""
     if isinstance(start, Panorama):
         half, pitch = start.span_deg / 2.0, 1.0 / start.fx
@@ -180,7 +180,9 @@ def _azimuths(start: View, origin: np.ndarray, search: Search) -> np.ndarray:
     return origin[0] + offset - half + (np.arange(count) + 0.5) * (2.0 * half / count)
 
 
-def _coarse(start: View, axes: np.ndarray, origin: np.ndarray, horizon: Horizon, boundary: BoundaryMap, search: Search):
+def _coarse(
+    start: View, axes: np.ndarray, origin: np.ndarray, horizon: Horizon, boundary: BoundaryMap, search: SearchRange
+):
     """Poses ``(P, 9)`` and their scores over the whole search at 0.4° or a coarser pixel.
 
     A small tilt moves the whole line up or down (in a panorama it is the horizon's row that moves): all tilts of a
@@ -285,7 +287,7 @@ def _refine(start, axes, values, terrain, boundary, search, points):
         priors = replace(search.priors, heading_deg=np.inf)
         if isinstance(start, Panorama) and not priors.horizon_px:
             priors = replace(priors, horizon_px=search.tilt_deg * start.fy * np.pi / 180.0)
-        calibration = calibrate(
+        calibration = resect(
             start,
             points,
             priors=priors,

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from seasonscapes.calibration.horizon import terrain_profile
 from seasonscapes.calibration.pose_model import View
+from seasonscapes.calibration.terrain_horizon import terrain_profile
 from seasonscapes.cameras.panorama import view_directions
 from seasonscapes.frames import LocalFrame, geodetic_from_enu, local_axes
 from seasonscapes.terrain.surface import Raster

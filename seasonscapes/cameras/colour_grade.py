@@ -178,7 +178,9 @@ def encoded_from_linear(linear: np.ndarray, response: Response = SRGB) -> np.nda
     return np.stack([np.interp(linear[..., c], response.linear[c], at) for c in range(3)], -1)
 
 
-def fit_response(encoded: np.ndarray, light: np.ndarray, *, knots: int = 12, smoothness: float = 0.003) -> Response:
+def fit_response_curve(
+    encoded: np.ndarray, light: np.ndarray, *, knots: int = 12, smoothness: float = 0.003
+) -> Response:
     """Fit a response from pairs of encoded values and known relative light (renders, exposures, a grey card).
 
     The curve is a monotone correction of sRGB in the logarithm of light: knots evenly spaced in the encoded value,

@@ -74,7 +74,7 @@ class ManifestRow:
 
 
 @dataclass(frozen=True, slots=True)
-class Problem:
+class PictureProblem:
     """What is wrong with one picture.
 
     ``kind`` is one of: unreadable name, unknown webcam, ambiguous time, skipped time, missing, empty, truncated,
@@ -108,7 +108,7 @@ def utc_from_camera_clock(naive: datetime, time_zone: str) -> datetime:
 
 def scan_folder(
     folder: Path, webcams: Sequence[Webcam], *, layout: str = REFERENCE_LAYOUT
-) -> tuple[list[ManifestRow], list[Problem]]:
+) -> tuple[list[ManifestRow], list[PictureProblem]]:
     """List the pictures below a folder by their names alone; no picture is opened.
 
     Parameters
@@ -137,10 +137,10 @@ def scan_folder(
         name = file.relative_to(folder).as_posix()
         match = pattern.fullmatch(name)
         if not match:
-            problems.append(Problem("unreadable name", name, f"expected {layout}"))
+            problems.append(PictureProblem("unreadable name", name, f"expected {layout}"))
             continue
         if match["webcam"] not in zone_of:
-            problems.append(Problem("unknown webcam", name, f"{match['webcam']} is not in the scene"))
+            problems.append(PictureProblem("unknown webcam", name, f"{match['webcam']} is not in the scene"))
             continue
         key = (match["day"], match["time"], zone_of[match["webcam"]])
         if key not in resolved:
@@ -148,7 +148,9 @@ def scan_folder(
         if isinstance(resolved[key], str):
             kind = resolved[key].split(":")[0]
             problems.append(
-                Problem({"ambiguous": "ambiguous time", "skipped": "skipped time"}.get(kind, kind), name, resolved[key])
+                PictureProblem(
+                    {"ambiguous": "ambiguous time", "skipped": "skipped time"}.get(kind, kind), name, resolved[key]
+                )
             )
             continue
         rows.append(ManifestRow(match["webcam"], resolved[key], name, file.stat().st_size))
@@ -164,14 +166,14 @@ def _resolve(day: str, time: str, zone: str) -> datetime | str:
         return text if text.startswith(("ambiguous", "skipped")) else f"unreadable name: {text}"
 
 
-def duplicate_times(rows: Iterable[ManifestRow]) -> list[Problem]:
+def duplicate_times(rows: Iterable[ManifestRow]) -> list[PictureProblem]:
     """Rows that repeat an earlier row's webcam and instant."""
     first: dict = {}
     problems = []
     for row in rows:
         other = first.setdefault((row.webcam, row.time), row)
         if other is not row:
-            problems.append(Problem("duplicate time", row.path, f"same webcam and time as {other.path}"))
+            problems.append(PictureProblem("duplicate time", row.path, f"same webcam and time as {other.path}"))
     return problems
 
 
@@ -217,7 +219,7 @@ def _row(path: Path, number: int, cells: list[str], place: list[int | None]) -> 
 
 def check_pictures(
     rows: Sequence[ManifestRow], folder: Path, webcams: Sequence[Webcam], *, decode: bool = False
-) -> list[Problem]:
+) -> list[PictureProblem]:
     """Look at the pictures' files: there, whole, of the webcam's size, and each a different one.
 
     Only headers and last bytes are read; equal contents are looked for among files of equal length. ``decode`` opens
@@ -228,16 +230,16 @@ def check_pictures(
     by_length = defaultdict(list)
     for row in rows:
         if row.webcam not in size_of:
-            problems.append(Problem("unknown webcam", row.path, f"{row.webcam} is not in the scene"))
+            problems.append(PictureProblem("unknown webcam", row.path, f"{row.webcam} is not in the scene"))
             continue
         try:
             length = (folder / row.path).stat().st_size
         except FileNotFoundError:
-            problems.append(Problem("missing", row.path, "no such file"))
+            problems.append(PictureProblem("missing", row.path, "no such file"))
             continue
         fault = _fault(folder / row.path, row, length, size_of[row.webcam], decode)
         if fault:
-            problems.append(Problem(fault[0], row.path, fault[1]))
+            problems.append(PictureProblem(fault[0], row.path, fault[1]))
         if length:
             by_length[length].append(row)
     for same in by_length.values():
@@ -272,13 +274,15 @@ def _fault(file: Path, row: ManifestRow, length: int, size: tuple[int, int], dec
     return None
 
 
-def _equal_contents(rows: Sequence[ManifestRow], folder: Path) -> list[Problem]:
+def _equal_contents(rows: Sequence[ManifestRow], folder: Path) -> list[PictureProblem]:
     first: dict[str, str] = {}
     problems = []
     for row in rows:
         other = first.setdefault(file_sha256(folder / row.path), row.path)
         if other != row.path:
-            problems.append(Problem("duplicate picture", row.path, f"same content as {other}: the camera stood still?"))
+            problems.append(
+                PictureProblem("duplicate picture", row.path, f"same content as {other}: the camera stood still?")
+            )
     return problems
 
 

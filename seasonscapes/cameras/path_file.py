@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from seasonscapes.cameras.exchange import read_json
-from seasonscapes.cameras.exchange_reference import Kind, read_reference_poses
 from seasonscapes.cameras.pinhole import Camera, rotation_from_angles
+from seasonscapes.cameras.reference_poses import Kind, read_reference_poses
 from seasonscapes.cameras.trajectory import roll_of
 from seasonscapes.errors import InputError
 from seasonscapes.frames import LocalFrame, angles_from_direction, enu_from_geodetic, geodetic_from_enu, local_axes
@@ -78,7 +78,7 @@ def load_path(path: Path, frame: LocalFrame) -> list[Camera]:
     return cameras
 
 
-def resized(camera: Camera, size_px: tuple[int, int]) -> Camera:
+def resize_camera(camera: Camera, size_px: tuple[int, int]) -> Camera:
     """The same view in a picture of another size; its field of view stays, pixels may change shape."""
     x, y = size_px[0] / camera.width_px, size_px[1] / camera.height_px
     return replace(

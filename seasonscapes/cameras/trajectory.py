@@ -141,7 +141,7 @@ def _measured(base: Any, lift: Any, knots: np.ndarray) -> Curve:
     return Curve(base, lift, knots, np.stack([ends, np.concatenate([[0.0], np.cumsum(lengths)])]))
 
 
-def cleared(curve: Curve, ground: Ground, clearance_m: float) -> tuple[Curve, float]:
+def lift_above_ground(curve: Curve, ground: Ground, clearance_m: float) -> tuple[Curve, float]:
     """The same curve lifted, smoothly, where it comes nearer to the ground than a clearance.
 
     Parameters
@@ -165,7 +165,7 @@ def cleared(curve: Curve, ground: Ground, clearance_m: float) -> tuple[Curve, fl
     reach = max(4, int(np.ceil(max(8.0 * clearance_m, 100.0) / curve.length_m * count)))
     for _ in range(_CLEAR_ROUNDS):
         u = curve.parameter(np.linspace(0.0, curve.length_m, count))
-        missing = clearance_m - clearance(curve.at_parameter(u), ground, clearance_m)
+        missing = clearance_m - height_above_ground(curve.at_parameter(u), ground, clearance_m)
         missing = np.where(np.isfinite(missing), missing, -np.inf)
         if missing.max() <= 0.0:
             break
@@ -181,7 +181,7 @@ def cleared(curve: Curve, ground: Ground, clearance_m: float) -> tuple[Curve, fl
     return curve, most
 
 
-def clearance(positions_m: np.ndarray, ground: Ground, around_m: float) -> np.ndarray:
+def height_above_ground(positions_m: np.ndarray, ground: Ground, around_m: float) -> np.ndarray:
     """Height ``(N,)`` [m] of places ``(N, 3)`` above the highest ground within ``around_m`` of them; NaN off the land."""
     angle = np.arange(8) * (np.pi / 4.0)
     ring = around_m * np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -192,7 +192,7 @@ def clearance(positions_m: np.ndarray, ground: Ground, around_m: float) -> np.nd
     return np.where(known.any(axis=1), positions_m[:, 2] - highest, np.nan)
 
 
-def fly(
+def cameras_along_path(
     waypoints: Sequence[Camera],
     count: int,
     *,
@@ -218,7 +218,7 @@ def fly(
     look_at_m
         ``(3,)`` ENU: look at this place all the way instead.
     clear_of
-        The ground and a least clearance [m]; see `cleared`.
+        The ground and a least clearance [m]; see `lift_above_ground`.
 
     Raises
     ------
@@ -232,7 +232,7 @@ def fly(
     waypoints = [*waypoints, waypoints[0]] if closed else list(waypoints)
     line = curve_through(np.array([each.position_m for each in waypoints]), curve=curve, closed=closed)
     if clear_of is not None:
-        line, _ = cleared(line, *clear_of)
+        line, _ = lift_above_ground(line, *clear_of)
     return views_along(line, waypoints, count, turn=turn, look_at_m=look_at_m, closed=closed)
 
 
@@ -245,7 +245,7 @@ def views_along(
     look_at_m: np.ndarray | None = None,
     closed: bool = False,
 ) -> list[Camera]:
-    """The views of `fly`, on a curve that was made before (its knots are the waypoints)."""
+    """The views of `cameras_along_path`, on a curve that was made before (its knots are the waypoints)."""
     s_m = np.linspace(0.0, line.length_m, count, endpoint=not closed)
     places = line.position(s_m)
     if look_at_m is not None:

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     import numpy as np
 
     from seasonscapes.albedo.closed_form import AlbedoFit
-    from seasonscapes.albedo.forward import Land
-    from seasonscapes.albedo.shots import Shot
-    from seasonscapes.albedo.uncertainty import KnownAlbedo
+    from seasonscapes.albedo.forward_model import TexelTransport
+    from seasonscapes.albedo.photographs import AlbedoPhotograph
+    from seasonscapes.albedo.standard_error import KnownAlbedo
     from seasonscapes.cameras.observation import Observation
     from seasonscapes.pipeline import Place
     from seasonscapes.sky.models import SkyModel
@@ -99,14 +99,14 @@ def albedo(
         observations = _photographed(land, moments, model, size_px)
     else:
         observations = _opened(land, moments, (manifest, calibrations, masks), within_min)
-    traced, shots, facts = _prepared(land, observations, model, fit_haze=fit_haze, fit_curve=fit_curve)
-    fit, known = _solved(land, traced, shots, iterations)
+    traced, photographs, facts = _prepared(land, observations, model, fit_haze=fit_haze, fit_curve=fit_curve)
+    fit, known = _solved(land, traced, photographs, iterations)
     _save(output, land, known, fit)
     figures = _figures(output, known)
     record: dict[str, Any] = {
         "output": str(output),
         "scene": land.scene.name,
-        "photographs": len(shots),
+        "photographs": len(photographs),
         "times_utc": [moment.astimezone(UTC).isoformat() for moment in moments],
         "measured_share": float((known.source == 1).mean()),
         "completed_share": float((known.source == 2).mean()),
@@ -119,7 +119,7 @@ def albedo(
     }
     if land.synthetic is not None:
         record |= _truth(land, known, moments[0])
-    finish(record, _lines(record, shots), as_json=json)
+    finish(record, _lines(record, photographs), as_json=json)
 
 
 def _moments(times: str, land: Place) -> list[datetime]:
@@ -183,7 +183,7 @@ def _lights(land: Place, observations: Sequence[Observation], model: SkyModel) -
     return [held[one.time, one.camera.position_m.tobytes()] for one in observations]
 
 
-def _with_terrain(traced: Land, observations: list[Observation]) -> list[Observation]:
+def _with_terrain(traced: TexelTransport, observations: list[Observation]) -> list[Observation]:
     """Those that show any terrain: parts of a panorama may be all sky."""
     from seasonscapes.rendering.sightlines import faces_met
 
@@ -193,7 +193,7 @@ def _with_terrain(traced: Land, observations: list[Observation]) -> list[Observa
         key = repr((one.webcam, one.camera.width_px, one.camera.height_px, one.camera.fx)).encode()
         key += one.camera.world_from_camera.tobytes()
         if key not in held:
-            held[key] = faces_met(traced.occluder, one.camera) >= 0
+            held[key] = faces_met(traced.ray_scene, one.camera) >= 0
         if (held[key] & one.mask).any():
             kept.append(one)
         else:
@@ -207,26 +207,28 @@ def _with_terrain(traced: Land, observations: list[Observation]) -> list[Observa
 
 def _prepared(
     land: Place, observations: list[Observation], model: SkyModel, *, fit_haze: bool, fit_curve: bool
-) -> tuple[Land, list[Shot], dict[str, Any]]:
-    from seasonscapes.albedo.forward import trace_land
+) -> tuple[TexelTransport, list[AlbedoPhotograph], dict[str, Any]]:
+    from seasonscapes.albedo.forward_model import trace_texel_transport
     from seasonscapes.albedo.haze import fit_visibility
-    from seasonscapes.albedo.response import fit_response, with_response
-    from seasonscapes.albedo.shots import EIGHT_BIT, make_shots
+    from seasonscapes.albedo.photographs import EIGHT_BIT, prepare_photographs
+    from seasonscapes.albedo.tone_curve import fit_tone_curve, with_tone_curve
     from seasonscapes.sky.models import with_overrides
 
     facts: dict[str, Any] = {}
     with progress_bar("daylight of the atlas") as progress:
-        traced = trace_land(land.terrain, (land.atlas.height_px, land.atlas.width_px), progress=progress)
+        traced = trace_texel_transport(land.terrain, (land.atlas.height_px, land.atlas.width_px), progress=progress)
     observations = _with_terrain(traced, observations)
     with progress_bar("footprints of the photographs") as progress:
         try:
-            shots = make_shots(traced, observations, _lights(land, observations, model), progress=progress)
+            photographs = prepare_photographs(
+                traced, observations, _lights(land, observations, model), progress=progress
+            )
         except ValueError as error:
             raise InputError("albedo", str(error)) from None
     if fit_curve:
         with progress_bar("tone curve") as progress:
-            curve = fit_response(traced, shots, progress=progress)
-        shots = with_response(shots, curve.strength)
+            curve = fit_tone_curve(traced, photographs, progress=progress)
+        photographs = with_tone_curve(photographs, curve.strength)
         facts["curve_strength"] = round(curve.strength, 3)
         say(f"tone curve: strength {curve.strength:.2f}")
     if fit_haze:
@@ -235,44 +237,49 @@ def _prepared(
             return _lights(land, observations, with_overrides(model, visibility_km=visibility_km))
 
         with progress_bar("visibility") as progress:
-            found = fit_visibility(traced, shots, lights_of, trust=EIGHT_BIT, progress=progress)
+            found = fit_visibility(traced, photographs, lights_of, noise_model=EIGHT_BIT, progress=progress)
         facts["visibility_km"] = round(found.visibility_km, 1)
         say(f"visibility {found.visibility_km:.0f} km")
-        shots = [replace(shot, light=light) for shot, light in zip(shots, lights_of(found.visibility_km), strict=True)]
-    return traced, shots, facts
+        photographs = [
+            replace(photograph, light=light)
+            for photograph, light in zip(photographs, lights_of(found.visibility_km), strict=True)
+        ]
+    return traced, photographs, facts
 
 
-def _solved(land: Place, traced: Land, shots: list[Shot], iterations: int) -> tuple[AlbedoFit, KnownAlbedo]:
+def _solved(
+    land: Place, traced: TexelTransport, photographs: list[AlbedoPhotograph], iterations: int
+) -> tuple[AlbedoFit, KnownAlbedo]:
     import numpy as np
 
     from seasonscapes.albedo.closed_form import solve_albedo
     from seasonscapes.albedo.inverse import InverseOptions, refine_albedo
-    from seasonscapes.albedo.shots import EIGHT_BIT
-    from seasonscapes.albedo.uncertainty import known_albedo
+    from seasonscapes.albedo.photographs import EIGHT_BIT
+    from seasonscapes.albedo.standard_error import known_albedo
     from seasonscapes.commands.corrected_albedo import complete_known
     from seasonscapes.pipeline import image_from_above
-    from seasonscapes.texturing.guides import guides_for
+    from seasonscapes.texturing.predictors import predictors_for
 
     try:
         with progress_bar("albedo") as progress:
-            fit = solve_albedo(traced, shots, trust=EIGHT_BIT, progress=progress)
+            fit = solve_albedo(traced, photographs, noise_model=EIGHT_BIT, progress=progress)
         if iterations:
             options = InverseOptions(iterations=iterations, levels=(1,))
             with progress_bar("differentiable rendering") as progress:
                 fit = refine_albedo(
                     land.terrain,
                     traced,
-                    shots,
+                    photographs,
                     fit,
-                    trust=EIGHT_BIT,
+                    noise_model=EIGHT_BIT,
                     options=options,
                     callbacks=[lambda state: progress(state.iteration / iterations)],
                 ).fit
-        known = known_albedo(traced, shots, fit)
-        image = image_from_above(land, shots[0].observation.time)
+        known = known_albedo(traced, photographs, fit)
+        image = image_from_above(land, photographs[0].observation.time)
         base = None if image is None else np.where(image.weight[..., None] > 0.0, image.values, np.float32(np.nan))
         with progress_bar("completing") as progress:
-            return fit, complete_known(known, fit, base, guides_for(land.terrain, land.atlas), progress=progress)
+            return fit, complete_known(known, fit, base, predictors_for(land.terrain, land.atlas), progress=progress)
     except ValueError as error:
         raise InputError("albedo", str(error).split(": ", 1)[-1]) from None
 
@@ -332,10 +339,10 @@ def _truth(land: Place, known: KnownAlbedo, moment: datetime) -> dict[str, float
     }
 
 
-def _lines(record: dict[str, Any], shots: list[Shot]) -> list[str]:
+def _lines(record: dict[str, Any], photographs: list[AlbedoPhotograph]) -> list[str]:
     lines = [
-        f"{shot.observation.webcam:<16} {shot.observation.time:%Y-%m-%d %H:%M} UTC  residual {residual:.1%}"
-        for shot, residual in zip(shots, record["residual"], strict=True)
+        f"{photograph.observation.webcam:<16} {photograph.observation.time:%Y-%m-%d %H:%M} UTC  residual {residual:.1%}"
+        for photograph, residual in zip(photographs, record["residual"], strict=True)
     ]
     lines.append(f"{record['measured_share']:.1%} of the texture measured, {record['completed_share']:.1%} completed")
     if "true_psnr_db" in record:

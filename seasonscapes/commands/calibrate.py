@@ -68,13 +68,13 @@ def calibrate(
     json
         Print one machine-readable record.
     """
+    from seasonscapes.calibration.calibration_file import write_calibration
     from seasonscapes.calibration.evidence import Priors, read_points
-    from seasonscapes.calibration.horizon import horizon_from
     from seasonscapes.calibration.overlay import save_overlay
-    from seasonscapes.calibration.record import write_calibration
-    from seasonscapes.calibration.resection import calibrate as solve
     from seasonscapes.calibration.resection import report_lines
+    from seasonscapes.calibration.resection import resect as solve
     from seasonscapes.calibration.skyline import align_to_skyline
+    from seasonscapes.calibration.terrain_horizon import horizon_from
 
     if points is None and not skyline:
         raise InputError("calibrate", "no evidence", cure="give --points FILE, --skyline, or both")
@@ -147,7 +147,7 @@ def annotate(
     """
     from functools import partial
 
-    from seasonscapes.calibration.picker import PickSession, serve
+    from seasonscapes.calibration.annotation import AnnotationSession, serve_session
     from seasonscapes.calibration.terrain_view import look_at_rasters
 
     stand = _stand(scene, webcam, terrain or TerrainSource())
@@ -160,8 +160,10 @@ def annotate(
             expected=f"{stand.view.width_px} x {stand.view.height_px}",
         )
     look = partial(look_at_rasters, rasters=stand.rasters, frame=stand.frame)
-    session = PickSession(stand.webcam.id, image, stand.view, stand.frame, look, output, k1=stand.webcam.radial_k1)
-    server, address = serve(session, port=port)
+    session = AnnotationSession(
+        stand.webcam.id, image, stand.view, stand.frame, look, output, k1=stand.webcam.radial_k1
+    )
+    server, address = serve_session(session, port=port)
     say(f"annotate: open {address} in a browser; Ctrl-C ends")
     try:
         while True:

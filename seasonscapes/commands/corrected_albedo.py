@@ -10,14 +10,14 @@ if TYPE_CHECKING:
     import numpy as np
 
     from seasonscapes.albedo.closed_form import AlbedoFit
-    from seasonscapes.albedo.uncertainty import KnownAlbedo
-    from seasonscapes.texturing.guides import Guides
+    from seasonscapes.albedo.standard_error import KnownAlbedo
+    from seasonscapes.texturing.predictors import Predictors
 
 
 def corrected_albedo(
     fit: AlbedoFit,
     base: np.ndarray | None,
-    guides: Guides,
+    predictors: Predictors,
     *,
     seed: int = 0,
     progress: Callable[[float], None] | None = None,
@@ -29,20 +29,20 @@ def corrected_albedo(
     base
         ``(R, S, 3)`` albedo from elsewhere, of any scale, NaN where unknown; ``None`` where there is none: gaps are then
         learned from relief alone and seen texels stay as they are.
-    guides
+    predictors
         Relief; no hour's sun, for an albedo knows none, and not the base itself.
     """
     import numpy as np
 
     from seasonscapes.albedo.closed_form import HIGHEST, LOWEST
-    from seasonscapes.albedo.uncertainty import usable_sigma
+    from seasonscapes.albedo.standard_error import finite_sigma
     from seasonscapes.terrain.surface import Texture
-    from seasonscapes.texturing.complete import complete
+    from seasonscapes.texturing.completion import complete
 
-    sigma = usable_sigma(fit)
+    sigma = finite_sigma(fit)
     # Relative precision: what is compared are cube roots, in which equal relative errors are equal enough.
     weight = np.square(fit.albedo[..., 1] / np.maximum(sigma, 1e-4)).astype(np.float32)
-    made = complete(Texture(fit.albedo, weight), guides, base=base, fast=True, seed=seed, progress=progress)
+    made = complete(Texture(fit.albedo, weight), predictors, base=base, fast=True, seed=seed, progress=progress)
     values = np.clip(made.values, LOWEST, HIGHEST)
     if base is None:
         return values, np.where(weight > 0.0, sigma, made.sigma).astype(np.float32)
@@ -54,13 +54,13 @@ def complete_known(
     known: KnownAlbedo,
     fit: AlbedoFit,
     base: np.ndarray | None,
-    guides: Guides,
+    predictors: Predictors,
     *,
     progress: Callable[[float], None] | None = None,
 ) -> KnownAlbedo:
     """The same with every texel of the surface known; what is not measured is marked as completed."""
     import numpy as np
 
-    albedo, sigma = corrected_albedo(fit, base, guides, progress=progress)
-    source = np.where(guides.surface & (known.source != 1), np.uint8(2), known.source)
-    return replace(known, albedo=albedo, sigma=np.where(guides.surface, sigma, np.float32(np.inf)), source=source)
+    albedo, sigma = corrected_albedo(fit, base, predictors, progress=progress)
+    source = np.where(predictors.surface & (known.source != 1), np.uint8(2), known.source)
+    return replace(known, albedo=albedo, sigma=np.where(predictors.surface, sigma, np.float32(np.inf)), source=source)

@@ -175,8 +175,8 @@ class _Studio:
         from seasonscapes.exposure import develop, exposure_ev100
         from seasonscapes.images import write_png
         from seasonscapes.pipeline import albedo_for, camera_for
+        from seasonscapes.rendering.mitsuba_scene import mi_mesh, relight
         from seasonscapes.rendering.radiance import render_view
-        from seasonscapes.rendering.scene import mi_mesh, relight
         from seasonscapes.sky.models import read_sky_model
 
         place, view = self.place, self.view

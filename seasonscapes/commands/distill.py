@@ -92,10 +92,10 @@ def distill(
         raise InputError("--export-views", "there are no views to export", cure="ask for some with --views")
     require_torch()
     from seasonscapes.gaussians.appearance import Appearance, fourier_embedding
-    from seasonscapes.gaussians.distil import Schedule, distil
     from seasonscapes.gaussians.model import bytes_each, model_from, save_model
     from seasonscapes.gaussians.rasterise import choose_threads
-    from seasonscapes.gaussians.render import learned_numbers
+    from seasonscapes.gaussians.splat_view import learned_numbers
+    from seasonscapes.gaussians.training import Schedule, train
 
     choose_threads(1)
     model = sky.model()
@@ -114,9 +114,9 @@ def distill(
     )
     checkpoint = output.with_suffix(".checkpoint.safetensors")
     with progress_bar("distilling") as progress:
-        losses = distil(
+        losses = train(
             appearance,
-            school.lessons,
+            school.targets,
             school.frames,
             Schedule(steps, picture_steps),
             seed=seed,
@@ -177,7 +177,7 @@ class School:
     around: np.ndarray
     days: list[float]
     transport: Any
-    lessons: Any
+    targets: Any
     times: list[datetime]
     frames: list
     cameras: list
@@ -207,12 +207,17 @@ def prepare_school(
     land, model, counts: tuple[int, int, int, int], dated: list[tuple[float, np.ndarray]], seed: int
 ) -> School:
     """Trace what is to be learned. Each date has its own albedo, and with it its own light from other slopes."""
-    from seasonscapes.gaussians.distil import lessons_from
+    from seasonscapes.gaussians.disc_transport import (
+        light_state,
+        neighbourhood_mean,
+        surfel_irradiance,
+        trace_disc_transport,
+    )
     from seasonscapes.gaussians.surfels import surfel_albedo, terrain_surfels
-    from seasonscapes.gaussians.transport import light_state, neighbourhood_mean, surfel_irradiance, trace_transport
-    from seasonscapes.gaussians.views import overview_cameras, relit_frames
-    from seasonscapes.rendering.gather import occluder
-    from seasonscapes.rendering.scene import mi_mesh
+    from seasonscapes.gaussians.training import surface_targets
+    from seasonscapes.gaussians.training_views import overview_cameras, relit_frames
+    from seasonscapes.rendering.hemisphere_rays import ray_scene
+    from seasonscapes.rendering.mitsuba_scene import mi_mesh
 
     discs, suns, views, view_px = counts
     days, textures = [day for day, _ in dated], [texture for _, texture in dated]
@@ -227,10 +232,10 @@ def prepare_school(
     cameras = overview_cameras(land.terrain, views, size_px=view_px, first_deg=30.0)
     for season, texture in enumerate(textures):
         mine = [number for number in range(suns) if seasons[number] == season]
-        bare = occluder(mi_mesh(land.terrain, texture))
+        bare = ray_scene(mi_mesh(land.terrain, texture))
         if transport is None:
             with progress_bar("transport") as progress:
-                transport = trace_transport(bare, surfels, albedo[season], rays=64, seed=seed, progress=progress)
+                transport = trace_disc_transport(bare, surfels, albedo[season], rays=64, seed=seed, progress=progress)
             states = [
                 light_state(transport, light, float(at.timetuple().tm_yday))
                 for light, at in zip(lights, times, strict=True)
@@ -246,8 +251,8 @@ def prepare_school(
                 frames = relit_frames(
                     bare, surfels, cameras, [(n, lights[n], states[n]) for n in mine], seed=seed, progress=progress
                 )
-    lessons = lessons_from(states, seasons, albedo, received)
-    return School(surfels, albedo, around, days, transport, lessons, times, frames, cameras)
+    targets = surface_targets(states, seasons, albedo, received)
+    return School(surfels, albedo, around, days, transport, targets, times, frames, cameras)
 
 
 def draw_lights(land, model, days: list[float], seed: int, progress) -> tuple[list, list[datetime]]:
@@ -282,7 +287,7 @@ def export(folder: Path, land, school: School) -> None:
         name = f"images/{number:04d}.png"
         write_png(folder / name, np.clip(frame.image, 0.0, 1.0))
         view = NamedView(f"{number:04d}", school.cameras[number // each], name, school.times[frame.time])
-        views.append(TrainingView(view, school.lessons.states[frame.time]))
+        views.append(TrainingView(view, school.targets.states[frame.time]))
     surfels = school.surfels
     rgb = srgb_from_linear(school.albedo[len(school.days) // 2]).astype(np.float32)
     splats = BakedSplats(surfels.means, surfels.quaternions, surfels.log_scales, surfels.opacity_logits, rgb)

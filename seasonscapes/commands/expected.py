@@ -61,9 +61,9 @@ def _relit(land: Place, texture: Texture, utc: datetime, model: SkyModel) -> Tex
 
     from seasonscapes.daylight import land_light
     from seasonscapes.relighting.lit_texture import lit_texture
-    from seasonscapes.rendering.gather import occluder
-    from seasonscapes.rendering.scene import mi_mesh
-    from seasonscapes.rendering.transport import Effort
+    from seasonscapes.rendering.hemisphere_rays import ray_scene
+    from seasonscapes.rendering.mitsuba_scene import mi_mesh
+    from seasonscapes.rendering.transport import SamplingOptions
     from seasonscapes.terrain.surface import Texture
     from seasonscapes.terrain.texels import texel_positions
 
@@ -71,11 +71,11 @@ def _relit(land: Place, texture: Texture, utc: datetime, model: SkyModel) -> Tex
     positions, _ = texel_positions(land.terrain, land.atlas.width_px, land.atlas.height_px)
     with progress_bar("relighting the albedo") as progress:
         lit = lit_texture(
-            occluder(mi_mesh(land.terrain, texture.values)),
+            ray_scene(mi_mesh(land.terrain, texture.values)),
             positions,
             texture.values,
             light,
-            effort=Effort(subpixels=1, rays=_RAYS),
+            sampling=SamplingOptions(subpixels=1, rays=_RAYS),
             progress=progress,
         )
     return Texture(lit.radiance.astype(np.float32), texture.weight)

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
     from seasonscapes.pipeline import Place
     from seasonscapes.terrain.surface import Texture
-    from seasonscapes.texturing.complete import Completed
-    from seasonscapes.texturing.guides import Guides
+    from seasonscapes.texturing.completion import Completed
+    from seasonscapes.texturing.predictors import Predictors
 
 _FIGURE_PX = 1024
 
@@ -79,8 +79,8 @@ def inpaint(
     check_range("--seed", seed, 0, 2**32 - 1)
     from seasonscapes.civil_time import resolve_time
     from seasonscapes.images import atomic_path
-    from seasonscapes.texturing.complete import INPAINTERS, complete
-    from seasonscapes.texturing.guides import guides_for
+    from seasonscapes.texturing.completion import INPAINTERS, complete
+    from seasonscapes.texturing.predictors import predictors_for
 
     if method not in (*INPAINTERS, "diffusion"):
         raise InputError("--method", "unknown method", got=method, expected=", ".join([*INPAINTERS, "diffusion"]))
@@ -100,21 +100,23 @@ def inpaint(
         relit = expected_radiance(land, albedo, moment.utc, sky.model())
     fused = relit is not None and method == "guided"
     # Of a fused texture's guides only the surface and the charts matter: neither sun nor image is looked at.
-    guides = guides_for(land.terrain, land.atlas) if fused else guides_of(land, moment.utc, relit)
+    predictors = predictors_for(land.terrain, land.atlas) if fused else guides_of(land, moment.utc, relit)
     if method == "diffusion":
         from seasonscapes.commands.inpaint_path import complete_along_path
 
         effort = Effort(detail, fast, seed, sky.cloudiness or float(sky.sky == "overcast"))
-        completed, told = complete_along_path(land, painted, guides, moment.utc, diffusion, effort)
+        completed, told = complete_along_path(land, painted, predictors, moment.utc, diffusion, effort)
     elif fused:
         from seasonscapes.commands.expected import albedo_error
-        from seasonscapes.texturing.fused import fuse
+        from seasonscapes.texturing.bayesian_fusion import fuse_with_albedo
 
-        completed = fuse(painted, relit.values, albedo_error(albedo), guides)
+        completed = fuse_with_albedo(painted, relit.values, albedo_error(albedo), predictors)
         told = {"guides": ["albedo, relit"]}
     else:
         with progress_bar(f"completing ({method})") as progress:
-            completed = complete(painted, guides, method=method, detail=detail, fast=fast, seed=seed, progress=progress)
+            completed = complete(
+                painted, predictors, method=method, detail=detail, fast=fast, seed=seed, progress=progress
+            )
     with atomic_path(output) as temporary:
         save_completed(completed, painted, temporary)
     pictures = []
@@ -122,16 +124,16 @@ def inpaint(
         pictures = save_figures(figures, land, completed)
         if view.camera is not None or view.at is not None:
             pictures += save_views(figures, land, completed, view, sky, moment.utc)
-    hole = guides.surface & ~completed.painted
-    share = float(hole.sum() / max(guides.surface.sum(), 1))
+    hole = predictors.surface & ~completed.painted
+    share = float(hole.sum() / max(predictors.surface.sum(), 1))
     record: dict[str, Any] = {
         "output": str(output),
         "scene": land.scene.name,
         "method": method,
         "time_utc": moment.utc.isoformat(),
-        "texels": int(guides.surface.sum()),
+        "texels": int(predictors.surface.sum()),
         "filled_share": share,
-        "guides": list(guides.names),
+        "guides": list(predictors.names),
         "sigma_median": float(_median(completed.sigma[hole])),
         "value_median": float(_median(completed.values[hole])),
         "figures": [str(path) for path in pictures],
@@ -159,7 +161,7 @@ def read_painted(path: Path, land: Place) -> Texture:
     from zipfile import BadZipFile
 
     from seasonscapes.terrain.surface import load_texture
-    from seasonscapes.texturing.complete import painted_texels
+    from seasonscapes.texturing.completion import painted_texels
 
     if not path.is_file():
         raise InputError("--texture", "no such file", got=str(path), cure="run `seasonscapes paint` first")
@@ -189,19 +191,19 @@ def read_painted(path: Path, land: Place) -> Texture:
     return texture
 
 
-def guides_of(land: Place, moment: datetime, relit: Texture | None = None) -> Guides:
+def guides_of(land: Place, moment: datetime, relit: Texture | None = None) -> Predictors:
     """Relief, the sun of the hour and of the day, the place's image, and a relit albedo, for every texel."""
     import numpy as np
 
     from seasonscapes.pipeline import image_from_above
     from seasonscapes.sky.ephemeris import sun_position
-    from seasonscapes.texturing.guides import guides_for
+    from seasonscapes.texturing.predictors import predictors_for
 
     satellite = image_from_above(land, moment)
     at = (land.frame.latitude_deg, land.frame.longitude_deg)
     hours = [moment + timedelta(hours=h) for h in range(-12, 12)]
     day = np.asarray(sun_position(hours, *at).direction, float)
-    return guides_for(
+    return predictors_for(
         land.terrain,
         land.atlas,
         satellite=satellite,
@@ -262,8 +264,8 @@ def save_views(
     from seasonscapes.exposure import develop, exposure_ev100
     from seasonscapes.images import write_png
     from seasonscapes.rendering.gbuffer import trace_gbuffer
-    from seasonscapes.rendering.radiance import through_air
-    from seasonscapes.rendering.scene import build_scene
+    from seasonscapes.rendering.mitsuba_scene import build_scene
+    from seasonscapes.rendering.radiance import apply_aerial_perspective
     from seasonscapes.terrain.surface import sample_texture
 
     camera, chosen = view.pinhole(land), view.chosen(land.scene)
@@ -273,7 +275,7 @@ def save_views(
     coverage = np.isfinite(gbuffer.depth).astype(np.float32)
     surface = np.nan_to_num(sample_texture(completed.values, gbuffer.uv))
     seen = np.nan_to_num(sample_texture(completed.painted[..., None].astype(np.float32), gbuffer.uv), nan=1.0)
-    picture = through_air(stage, camera, surface, coverage, gbuffer)
+    picture = apply_aerial_perspective(stage, camera, surface, coverage, gbuffer)
     after = develop(picture, exposure_ev100(picture))
     paths = []
     for name, shown in (("before", after * seen + 0.05 * (1.0 - seen)), ("after", after)):

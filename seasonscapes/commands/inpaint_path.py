@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
     from seasonscapes.pipeline import Place
     from seasonscapes.terrain.surface import Texture
-    from seasonscapes.texturing.complete import Completed
+    from seasonscapes.texturing.completion import Completed
     from seasonscapes.texturing.diffusion import DiffusionSettings, Painter
-    from seasonscapes.texturing.guides import Guides
-    from seasonscapes.texturing.path_inpainting import Canvas, Walk
+    from seasonscapes.texturing.path_inpainting import InpaintingState, PathInpaintingInputs
+    from seasonscapes.texturing.predictors import Predictors
 
 # Raised when equal inputs give other views.
 _REVISION = 1
@@ -83,7 +83,7 @@ class DiffusionOptions:
 
     def check(self) -> None:
         """`InputError` about flags that cannot work, before anything is built."""
-        from seasonscapes.texturing.conditions import MASKS
+        from seasonscapes.texturing.view_conditions import MASKS
 
         if self.path is None:
             raise InputError("--path", "missing", expected="a .json of `seasonscapes path`")
@@ -140,17 +140,17 @@ class Effort:
 
 
 def complete_along_path(
-    land: Place, painted: Texture, guides: Guides, time: datetime, flags: DiffusionOptions, effort: Effort
+    land: Place, painted: Texture, predictors: Predictors, time: datetime, flags: DiffusionOptions, effort: Effort
 ) -> tuple[Completed, dict[str, Any]]:
     """Paint along the path, complete what is left by guided, and film it; what was completed, and plain facts about it."""
     import numpy as np
 
     from seasonscapes.cameras.path_file import load_path
-    from seasonscapes.rendering.gather import occluder
-    from seasonscapes.rendering.scene import mi_mesh
-    from seasonscapes.texturing.complete import complete
-    from seasonscapes.texturing.path_inpainting import Canvas, Walk
-    from seasonscapes.texturing.tiles import tiling
+    from seasonscapes.rendering.hemisphere_rays import ray_scene
+    from seasonscapes.rendering.mitsuba_scene import mi_mesh
+    from seasonscapes.texturing.atlas_tiles import tiling
+    from seasonscapes.texturing.completion import complete
+    from seasonscapes.texturing.path_inpainting import InpaintingState, PathInpaintingInputs
 
     cameras = load_path(flags.path, land.frame)  # type: ignore[arg-type]
     prompt = flags.prompt if flags.prompt is not None else prompt_of(land, time, effort.cloudiness)
@@ -162,28 +162,28 @@ def complete_along_path(
 
     def guided(texture: Texture, detail: float, title: str) -> Completed:
         with progress_bar(title) as progress:
-            return complete(texture, guides, detail=detail, fast=effort.fast, seed=effort.seed, progress=progress)
+            return complete(texture, predictors, detail=detail, fast=effort.fast, seed=effort.seed, progress=progress)
 
     alone = guided(painted, 0.0, "completing (guided)") if flags.hybrid else None
-    walk = Walk(
+    inputs = PathInpaintingInputs(
         painted,
         cameras,
         tiling(land.terrain, land.atlas),
-        occluder(mi_mesh(land.terrain, np.full(3, 0.2))),
+        ray_scene(mi_mesh(land.terrain, np.full(3, 0.2))),
         None if alone is None else alone.values,
     )
-    canvas = Canvas(painted)
+    state = InpaintingState(painted)
     folder = _folder(land, painted, flags, effort, identity)
-    told = _walked(walk, canvas, painter, flags, effort, folder, guides.surface)
-    rest = guided(canvas.texture(), effort.detail, "completing the rest (guided)")
-    completed = joined(rest, alone or guided(painted, 0.0, "judging what was painted (guided)"), canvas)
+    told = _walked(inputs, state, painter, flags, effort, folder, predictors.surface)
+    rest = guided(state.texture(), effort.detail, "completing the rest (guided)")
+    completed = joined(rest, alone or guided(painted, 0.0, "judging what was painted (guided)"), state)
     told |= {"prompt": prompt, "views_folder": str(folder), "weights": identity["weights"], "film": None}
     if flags.film is not None:
-        told["film"] = _filmed(walk, canvas, completed.values, flags, effort)
+        told["film"] = _filmed(inputs, state, completed.values, flags, effort)
     return completed, told
 
 
-def joined(rest: Completed, alone: Completed, canvas: Canvas) -> Completed:
+def joined(rest: Completed, alone: Completed, state: InpaintingState) -> Completed:
     """The completion of what the model left open, with what it gave; nothing that was painted has moved.
 
     What an image model made up has no standard error of its own: it is said to be off by as much as a completion from the
@@ -191,11 +191,11 @@ def joined(rest: Completed, alone: Completed, canvas: Canvas) -> Completed:
     """
     import numpy as np
 
-    from seasonscapes.texturing.complete import Completed
+    from seasonscapes.texturing.completion import Completed
 
     apart = np.mean((rest.values - alone.values) ** 2, axis=2)
-    sigma = np.where(canvas.imagined, np.sqrt(alone.sigma**2 + apart), rest.sigma).astype(np.float32)
-    return Completed(rest.values, sigma, canvas.painted)
+    sigma = np.where(state.imagined, np.sqrt(alone.sigma**2 + apart), rest.sigma).astype(np.float32)
+    return Completed(rest.values, sigma, state.painted)
 
 
 def prompt_of(land: Place, time: datetime, cloudiness: float) -> str:
@@ -211,7 +211,7 @@ def prompt_of(land: Place, time: datetime, cloudiness: float) -> str:
 def _painter(flags: DiffusionOptions, prompt: str) -> tuple[Painter, dict[str, Any]]:
     """The model, and plain values that tell it from any other."""
     from seasonscapes.texturing.diffusion import Machine, load_painter, needed_parts
-    from seasonscapes.texturing.weight_files import WeightNames, find_weights, fingerprint
+    from seasonscapes.texturing.model_weights import WeightNames, find_weights, weights_fingerprint
     from seasonscapes.workspace import file_hash
 
     names = WeightNames(flags.base, flags.depth_net, flags.inpaint_net, flags.adapter)
@@ -219,7 +219,7 @@ def _painter(flags: DiffusionOptions, prompt: str) -> tuple[Painter, dict[str, A
     settings, machine = flags.settings(prompt), Machine(flags.device, flags.dtype, flags.offload)
     painter = load_painter(flags.weights, settings, names=names, machine=machine, image=image)
     prints = {
-        part: fingerprint(find_weights(flags.weights, part, getattr(names, part)), part, getattr(names, part))
+        part: weights_fingerprint(find_weights(flags.weights, part, getattr(names, part)), part, getattr(names, part))
         for part in needed_parts(settings, image is not None)
     }
     guide = None if flags.guide_image is None else file_hash(flags.guide_image)
@@ -270,8 +270,8 @@ def _folder(land: Place, painted: Texture, flags: DiffusionOptions, effort: Effo
 
 
 def _walked(
-    walk: Walk,
-    canvas: Canvas,
+    inputs: PathInpaintingInputs,
+    state: InpaintingState,
     painter: Painter,
     flags: DiffusionOptions,
     effort: Effort,
@@ -281,36 +281,38 @@ def _walked(
     """Go along the path; coverage of the surface before and after each view, and how long views took."""
     import numpy as np
 
-    from seasonscapes.texturing.path_inpainting import WalkOptions, walk_path
+    from seasonscapes.texturing.path_inpainting import PathInpaintingOptions, inpaint_along_path
 
-    options = WalkOptions(
+    options = PathInpaintingOptions(
         flags.mask, flags.dilate_px, flags.least_hole, flags.paint_sky, effort.cloudiness, effort.seed
     )
     size = max(int(surface.sum()), 1)
-    coverage, seconds, skipped, before = [float((canvas.covered & surface).sum() / size)], [], 0, clock.perf_counter()
-    with progress_bar(f"painting {len(walk.cameras)} views") as progress:
-        for step in walk_path(walk, canvas, painter, options, folder=folder, progress=progress):
+    coverage, seconds, skipped, before = [float((state.covered & surface).sum() / size)], [], 0, clock.perf_counter()
+    with progress_bar(f"painting {len(inputs.cameras)} views") as progress:
+        for step in inpaint_along_path(inputs, state, painter, options, folder=folder, progress=progress):
             now = clock.perf_counter()
             seconds, before = seconds + ([] if step.skipped else [now - before]), now
             skipped += step.skipped
-            coverage.append(float((canvas.covered & surface).sum() / size))
+            coverage.append(float((state.covered & surface).sum() / size))
     return {
         "coverage": coverage,
-        "views": len(walk.cameras),
+        "views": len(inputs.cameras),
         "views_skipped": skipped,
         "seconds_per_view": float(np.median(seconds)) if seconds else None,
     }
 
 
-def _filmed(walk: Walk, canvas: Canvas, values: np.ndarray, flags: DiffusionOptions, effort: Effort) -> str:
+def _filmed(
+    inputs: PathInpaintingInputs, state: InpaintingState, values: np.ndarray, flags: DiffusionOptions, effort: Effort
+) -> str:
     from seasonscapes.relighting.film import write_film
-    from seasonscapes.texturing.conditions import white_radiance
     from seasonscapes.texturing.path_inpainting import frames_of
+    from seasonscapes.texturing.view_conditions import white_radiance
 
-    white = white_radiance(canvas.values, canvas.painted)
-    frames = frames_of(values, walk.cameras, walk.terrain, white, cloudiness=effort.cloudiness)
+    white = white_radiance(state.values, state.painted)
+    frames = frames_of(values, inputs.cameras, inputs.terrain, white, cloudiness=effort.cloudiness)
     with progress_bar("filming") as progress:
-        write_film(flags.film, _counted(frames, len(walk.cameras), progress), fps=flags.fps)  # type: ignore[arg-type]
+        write_film(flags.film, _counted(frames, len(inputs.cameras), progress), fps=flags.fps)  # type: ignore[arg-type]
     return str(flags.film)
 
 

@@ -72,9 +72,9 @@ def lit_texture(
     from seasonscapes.pipeline import albedo_for, dated_albedos
     from seasonscapes.relighting.lit_texture import lit_texture as bake
     from seasonscapes.rendering.backend import use_backend
-    from seasonscapes.rendering.gather import occluder
-    from seasonscapes.rendering.scene import mi_mesh
-    from seasonscapes.rendering.transport import Effort
+    from seasonscapes.rendering.hemisphere_rays import ray_scene
+    from seasonscapes.rendering.mitsuba_scene import mi_mesh
+    from seasonscapes.rendering.transport import SamplingOptions
     from seasonscapes.terrain.texels import texel_positions
 
     metering, model = parse_exposure(exposure), sky.model()
@@ -88,11 +88,11 @@ def lit_texture(
     positions, _ = texel_positions(land.terrain, land.atlas.width_px, land.atlas.height_px)
     with progress_bar("baking") as progress:
         lit = bake(
-            occluder(mi_mesh(land.terrain, texture.values)),
+            ray_scene(mi_mesh(land.terrain, texture.values)),
             positions,
             texture.values,
             light,
-            effort=Effort(subpixels=1, rays=rays),
+            sampling=SamplingOptions(subpixels=1, rays=rays),
             seed=seed,
             progress=progress,
         )
@@ -184,11 +184,11 @@ def irradiance(
     import numpy as np
 
     from seasonscapes.pipeline import albedo_for
-    from seasonscapes.relighting.lit_texture import dose
+    from seasonscapes.relighting.lit_texture import integrate_irradiance
     from seasonscapes.rendering.backend import use_backend
-    from seasonscapes.rendering.gather import occluder
-    from seasonscapes.rendering.scene import mi_mesh
-    from seasonscapes.rendering.transport import Effort
+    from seasonscapes.rendering.hemisphere_rays import ray_scene
+    from seasonscapes.rendering.mitsuba_scene import mi_mesh
+    from seasonscapes.rendering.transport import SamplingOptions
 
     model = sky.model()
     use_backend(device)
@@ -209,12 +209,12 @@ def irradiance(
     grid, positions = _grid(land, spacing_m)
     middle = times[len(times) // 2]
     with progress_bar("irradiance") as progress:
-        received = dose(
-            occluder(mi_mesh(land.terrain, albedo_for(land, middle).values)),
+        received = integrate_irradiance(
+            ray_scene(mi_mesh(land.terrain, albedo_for(land, middle).values)),
             positions,
             lights,
             hours,
-            effort=Effort(subpixels=1, rays=rays),
+            sampling=SamplingOptions(subpixels=1, rays=rays),
             search_m=_SEARCH_M,
             seed=seed,
             progress=progress,

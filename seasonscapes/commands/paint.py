@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from seasonscapes.commands.webcam_shots import Sources
     from seasonscapes.pipeline import Place
     from seasonscapes.sky.models import SkyModel
-    from seasonscapes.texturing.paint import Painting, PaintOptions
+    from seasonscapes.texturing.painting import Painting, PaintOptions
 
 # Raised when equal inputs give another painting, or other synthetic pictures.
 _REVISION, _WEBCAMS_REVISION = 3, 1
@@ -84,7 +84,7 @@ def paint(
         Print one machine-readable record.
     """
     from seasonscapes.commands.expected import RELIT_SIGMA
-    from seasonscapes.texturing.paint import MODES, PaintOptions
+    from seasonscapes.texturing.painting import MODES, PaintOptions
     from seasonscapes.texturing.painting_file import save_painting, write_figures
 
     pictures, sky, place = pictures or PictureOptions(), sky or SkyOptions(), place or PlaceOptions()
@@ -144,17 +144,17 @@ def painting_record(painting: Painting) -> dict:
     """Plain numbers about a painting: gains [1 / (cd/m²)], haze, and the share of the texture that each webcam paints best."""
     import numpy as np
 
-    harmony, size = painting.harmony, painting.best.size
+    radiometry, size = painting.radiometry, painting.best.size
     shares = np.bincount(painting.best[painting.best >= 0].ravel(), minlength=len(painting.webcams)) / size
     return {
         "webcams": list(painting.webcams),
         "skipped": list(painting.skipped),
-        "gains": np.exp(harmony.log_gain).tolist(),
-        "contrasts": harmony.contrast.tolist(),
-        "haze": harmony.haze,
-        "overlaps": harmony.overlaps,
-        "scatter_before": harmony.scatter_before,
-        "scatter_after": harmony.scatter_after,
+        "gains": np.exp(radiometry.log_gain).tolist(),
+        "contrasts": radiometry.contrast.tolist(),
+        "haze": radiometry.haze,
+        "overlaps": radiometry.overlaps,
+        "scatter_before": radiometry.scatter_before,
+        "scatter_after": radiometry.scatter_after,
         "shares": shares.tolist(),
         "painted_share": float(np.mean(painting.texture.weight > 0.0)),
     }
@@ -288,13 +288,13 @@ def _painted(
     import numpy as np
 
     from seasonscapes.commands.webcam_shots import shots_of
-    from seasonscapes.rendering.gather import occluder
-    from seasonscapes.rendering.scene import mi_mesh
-    from seasonscapes.texturing.paint import paint as paint_shots
+    from seasonscapes.rendering.hemisphere_rays import ray_scene
+    from seasonscapes.rendering.mitsuba_scene import mi_mesh
+    from seasonscapes.texturing.painting import paint_atlas as paint_shots
 
     with progress_bar("opening pictures") as progress:
         shots, _ = shots_of(land, rows, sources, model, progress=progress)
-    terrain = occluder(mi_mesh(land.terrain, np.full(3, 0.2)))
+    terrain = ray_scene(mi_mesh(land.terrain, np.full(3, 0.2)))
     try:
         with progress_bar("painting") as progress:
             return paint_shots(

@@ -90,8 +90,8 @@ def path(
         raise InputError("--via", "a path needs at least two waypoints", got=via[0] if via else None, expected=_VIA)
     import numpy as np
 
-    from seasonscapes.cameras.path_file import read_reference_path, resized, save_path
-    from seasonscapes.cameras.trajectory import CURVES, TURNS, clearance
+    from seasonscapes.cameras.path_file import read_reference_path, resize_camera, save_path
+    from seasonscapes.cameras.trajectory import CURVES, TURNS, height_above_ground
     from seasonscapes.commands.path_map import draw_path_map
     from seasonscapes.images import write_png8
 
@@ -107,7 +107,7 @@ def path(
     if reference is not None:
         given = read_reference_path(reference, land.frame, kind=kind)
         size_px = parse_size(size) if size else (given.cameras[0].width_px // 2, given.cameras[0].height_px // 2)
-        waypoints = [resized(camera, size_px) for camera in given.cameras]
+        waypoints = [resize_camera(camera, size_px) for camera in given.cameras]
     else:
         waypoints = waypoints_of(land, via or [], fov, parse_size(size or "1536x1024"))
     target = None if look_at is None else _place_of(land, look_at)
@@ -126,7 +126,7 @@ def path(
             (ground, clearance_m),
         )
     positions = np.array([camera.position_m for camera in cameras])
-    above = clearance(positions, ground, 0.0)
+    above = height_above_ground(positions, ground, 0.0)
     note = {
         "scene": land.scene.name,
         "views": len(cameras),
@@ -163,14 +163,14 @@ def _flown(
 ) -> tuple[Curve, float, list[Camera]]:
     import numpy as np
 
-    from seasonscapes.cameras.trajectory import cleared, curve_through, views_along
+    from seasonscapes.cameras.trajectory import curve_through, lift_above_ground, views_along
 
     waypoints = [*waypoints, waypoints[0]] if closed else waypoints
     lift_m = 0.0
     try:
         line = curve_through(np.array([each.position_m for each in waypoints]), curve=curve, closed=closed)
         if clear_of[1] > 0.0:
-            line, lift_m = cleared(line, *clear_of)
+            line, lift_m = lift_above_ground(line, *clear_of)
         return line, lift_m, views_along(line, waypoints, count, turn=turn, look_at_m=target, closed=closed)
     except ValueError as error:
         raise InputError("--via", str(error)) from None

@@ -73,8 +73,8 @@ def render(
     from seasonscapes.images import write_png
     from seasonscapes.pipeline import albedo_for, albedo_of_day, dated_albedos
     from seasonscapes.rendering.backend import use_backend
+    from seasonscapes.rendering.mitsuba_scene import build_scene
     from seasonscapes.rendering.radiance import render_view
-    from seasonscapes.rendering.scene import build_scene
     from seasonscapes.workspace import content_key
 
     metering, size_px, model = parse_exposure(exposure), view.size_px(), sky.model()

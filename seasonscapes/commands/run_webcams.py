@@ -203,8 +203,8 @@ def _found_by_skyline(
     """Records of the webcams whose skyline at a time can be trusted, and why others are not; from a compass's guess."""
     import numpy as np
 
+    from seasonscapes.calibration.calibration_file import read_calibration, write_calibration
     from seasonscapes.calibration.pose_model import values_of, view_from_values
-    from seasonscapes.calibration.record import read_calibration, write_calibration
     from seasonscapes.calibration.skyline import align_to_skyline, encoded_from_file
     from seasonscapes.cameras.observation import read_manifest
 

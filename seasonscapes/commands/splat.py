@@ -108,7 +108,7 @@ def splat(
 def write_picture(output: Path, scene: tuple, how: tuple, attribution: str, record: dict[str, Any]) -> None:
     """Render and write a picture; the record tells the exposure and the milliseconds of both halves."""
     from seasonscapes.exposure import develop, exposure_ev100
-    from seasonscapes.gaussians.render import model_colours, render_model
+    from seasonscapes.gaussians.splat_view import model_colours, render_model
     from seasonscapes.images import write_exr, write_png
 
     (splats, camera, light, day), (metering, subpixels, device) = scene, how
@@ -135,7 +135,7 @@ def write_baked(output: Path, splats, light, day: float, metering: str | float, 
     """All Gaussians of one instant in display colours, exposed for a grey card in the open unless told otherwise."""
     from seasonscapes.exposure import develop, exposure_ev100
     from seasonscapes.gaussians.interchange import BakedSplats, write_gltf, write_ply
-    from seasonscapes.gaussians.render import model_colours
+    from seasonscapes.gaussians.splat_view import model_colours
     from seasonscapes.images import srgb_from_linear
 
     colours, state = model_colours(splats, light, day)

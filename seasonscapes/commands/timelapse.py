@@ -302,7 +302,7 @@ def developed(
     import numpy as np
 
     from seasonscapes.exposure import develop, exposure_ev100
-    from seasonscapes.relighting.adaptation import adapted_ev100
+    from seasonscapes.relighting.exposure_smoothing import smoothed_ev100
     from seasonscapes.relighting.frame_file import frame_ev100, frame_name, load_frame
     from seasonscapes.studio import held_studio
 
@@ -315,7 +315,7 @@ def developed(
         wanted = np.array([exposure_ev100(load_frame(path)[0], "eye") for path in paths])
     else:
         wanted, window_s = np.full(len(paths), float(metering)), 0.0
-    for path, ev100 in zip(paths, adapted_ev100(seconds, wanted, window_s=window_s), strict=True):
+    for path, ev100 in zip(paths, smoothed_ev100(seconds, wanted, window_s=window_s), strict=True):
         yield develop(load_frame(path)[0], float(ev100), eye=metering == "eye")
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from seasonscapes.errors import InputError
 
 if TYPE_CHECKING:
-    from seasonscapes.calibration.record import CalibratedWebcam
+    from seasonscapes.calibration.calibration_file import CalibratedWebcam
     from seasonscapes.cameras.observation import ManifestRow, Observation
     from seasonscapes.cameras.panorama import Panorama
     from seasonscapes.cameras.pinhole import Camera
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from seasonscapes.frames import LocalFrame
     from seasonscapes.pipeline import Place
     from seasonscapes.sky.models import SkyModel
-    from seasonscapes.texturing.shots import Shot
+    from seasonscapes.texturing.inputs import PaintingInput
 
 Progress = Callable[[float], None]
 
@@ -74,7 +74,7 @@ def calibrated_views(
 
     `InputError` where no webcam has one.
     """
-    from seasonscapes.calibration.record import read_calibration
+    from seasonscapes.calibration.calibration_file import read_calibration
 
     opened, without = [], []
     for number, row in enumerate(rows):
@@ -98,17 +98,17 @@ def calibrated_views(
 
 def shots_of(
     place: Place, rows: Sequence[ManifestRow], sources: Sources, model: SkyModel, *, progress: Progress | None = None
-) -> tuple[list[Shot], list[str]]:
+) -> tuple[list[PaintingInput], list[str]]:
     """A shot for each perspective picture, several for each panorama; and the webcams that have no calibration yet."""
     from seasonscapes.daylight import light_for
-    from seasonscapes.texturing.shots import Shot
+    from seasonscapes.texturing.inputs import PaintingInput
 
     opened, without = calibrated_views(rows, sources, place.frame, progress=progress)
     shots = []
     for pose, views in opened:
         # The views of a panorama share a place, and so the air.
         air = light_for(place, views[0].camera, model, views[0].time)[0].aerial_perspective
-        shots += [Shot(view, air, pose.sigma) for view in views]
+        shots += [PaintingInput(view, air, pose.sigma) for view in views]
     return shots, without
 
 
@@ -239,7 +239,7 @@ def photographs(
 ) -> Iterator[tuple[str, list[SyntheticPicture]]]:
     """Each webcam of a synthetic place and its pictures, in the land's colours of each day; see `webcam_series`."""
     from seasonscapes.daylight import light_for
-    from seasonscapes.evaluation.synthetic_webcams import Hour, webcam_series
+    from seasonscapes.evaluation.synthetic_webcams import WebcamInstant, webcam_series
     from seasonscapes.pipeline import albedo_for
 
     tell = progress or (lambda share: None)
@@ -250,7 +250,7 @@ def photographs(
             day = time.timetuple().tm_yday
             if day not in albedos:
                 albedos[day] = albedo_for(place, time).values
-            hours.append(Hour(time, light_for(place, camera, model, time)[0], albedos[day]))
+            hours.append(WebcamInstant(time, light_for(place, camera, model, time)[0], albedos[day]))
         try:
             made = webcam_series(
                 place.terrain,
@@ -269,8 +269,8 @@ def photographs(
 
 
 def _write_pose(path: Path, name: str, camera: Camera | Panorama, sigmas, frame: LocalFrame) -> None:
+    from seasonscapes.calibration.calibration_file import write_calibration
     from seasonscapes.calibration.pose_model import values_of
-    from seasonscapes.calibration.record import write_calibration
     from seasonscapes.calibration.resection import Calibration
 
     deviations = [

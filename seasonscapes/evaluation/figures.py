@@ -46,7 +46,7 @@ def comparison(
     if len({picture.shape for picture in shown}) != 1:
         raise ValueError(f"comparison: pictures of shapes {[picture.shape for picture in shown]}")
     mask = np.ones(shown[0].shape[:2], bool) if mask is None else mask
-    error = heat(np.where(mask, flip_map(shown[0], np.where(mask[..., None], shown[1], shown[0])), 0.0))
+    error = error_colours(np.where(mask, flip_map(shown[0], np.where(mask[..., None], shown[1], shown[0])), 0.0))
     rows = [_row([_paled(picture, mask) for picture in shown] + [error], [*names, f"difference of {names[1]}"])]
     if window is not None:
         left, top, width, height = window
@@ -69,7 +69,7 @@ def side_by_side(pictures: Mapping[str, np.ndarray]) -> np.ndarray:
     return _row(shown, list(pictures))
 
 
-def heat(values: np.ndarray) -> np.ndarray:
+def error_colours(values: np.ndarray) -> np.ndarray:
     """Colours ``(H, W, 3)`` of errors ``(H, W)`` in [0, 1]."""
     place = np.linspace(0.0, 1.0, len(_HEAT))
     return np.stack([np.interp(values, place, channel) for channel in _HEAT.T], axis=-1)

@@ -17,12 +17,12 @@ PURPOSES = ("painting", "guidance", "training", "evaluation")
 KINDS = ("picture", "view", "hour")
 
 
-class Leak(ValueError):
+class LeakageError(ValueError):
     """A picture that is to be scored was used to make what is scored."""
 
 
 @dataclass(frozen=True)
-class Use:
+class PictureUse:
     """A picture and what it is used for.
 
     Parameters
@@ -53,9 +53,9 @@ class Use:
         return self.time.astimezone(UTC)
 
 
-def use_of(observation: Observation, purpose: str) -> Use:
+def use_of(observation: Observation, purpose: str) -> PictureUse:
     """How an observation is used, with its content."""
-    return Use(observation.webcam, observation.time, purpose, observation_hash(observation))
+    return PictureUse(observation.webcam, observation.time, purpose, observation_hash(observation))
 
 
 def content_hash(levels: np.ndarray) -> str:
@@ -118,8 +118,8 @@ def webcam_of(name: str) -> str:
     return name.split("/", 1)[0]
 
 
-def refuse_leaks(evaluated: Sequence[Use], used: Sequence[Use], *, kind: str = "picture") -> None:
-    """Raise `Leak` where a picture that is to be scored was used for painting, guidance or training.
+def refuse_leaks(evaluated: Sequence[PictureUse], used: Sequence[PictureUse], *, kind: str = "picture") -> None:
+    """Raise `LeakageError` where a picture that is to be scored was used for painting, guidance or training.
 
     Parameters
     ----------
@@ -141,10 +141,10 @@ def refuse_leaks(evaluated: Sequence[Use], used: Sequence[Use], *, kind: str = "
         if (why := _leak(one, other, kind))
     ]
     if found:
-        raise Leak("evaluation pictures that are not held out: " + "; ".join(dict.fromkeys(found)))
+        raise LeakageError("evaluation pictures that are not held out: " + "; ".join(dict.fromkeys(found)))
 
 
-def _leak(one: Use, other: Use, kind: str) -> str | None:
+def _leak(one: PictureUse, other: PictureUse, kind: str) -> str | None:
     if one.content is not None and one.content == other.content:
         return "the same pixels"
     same_webcam, same_time = webcam_of(one.webcam) == webcam_of(other.webcam), one.instant == other.instant

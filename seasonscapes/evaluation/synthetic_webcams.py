@@ -22,21 +22,21 @@ from seasonscapes.evaluation.webcam_faults import (
     perturb_pose,
 )
 from seasonscapes.images import linear_from_srgb
-from seasonscapes.rendering.gather import occluder
 from seasonscapes.rendering.gbuffer import GBuffer
-from seasonscapes.rendering.relit_view import ready_view, relight_view
-from seasonscapes.rendering.scene import RenderScene, mi_mesh, set_albedo
-from seasonscapes.rendering.transport import Effort, trace_view, view_albedo
+from seasonscapes.rendering.hemisphere_rays import ray_scene
+from seasonscapes.rendering.mitsuba_scene import RenderScene, mi_mesh, set_albedo
+from seasonscapes.rendering.relit_view import relight_view, relightable_view
+from seasonscapes.rendering.transport import SamplingOptions, trace_view, view_albedo
 from seasonscapes.sky.illumination import Illumination
 from seasonscapes.terrain.surface import Terrain
 
 Progress = Callable[[float], None]
 # Pictures of 720 x 480 in a few seconds each, with noise well below that of 8 bits.
-QUICK = Effort(subpixels=4, shades=16, rays=128, senders=2048, listed=32, rank=24)
+QUICK = SamplingOptions(subpixels=4, shades=16, rays=128, clusters=2048, listed=32, rank=24)
 
 
 @dataclass(frozen=True)
-class Hour:
+class WebcamInstant:
     """An instant as a webcam sees it: its light (of the webcam's own place) and the land's albedo ``(R, S, 3)``."""
 
     time: datetime
@@ -82,12 +82,12 @@ def webcam_series(
     terrain: Terrain,
     webcam: str,
     camera: Camera | Panorama,
-    hours: Sequence[Hour],
+    hours: Sequence[WebcamInstant],
     *,
     faults: WebcamFaults = TYPICAL,
     poses: PoseSigmas | None = None,
     foreground: bool = False,
-    effort: Effort = QUICK,
+    sampling: SamplingOptions = QUICK,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> list[SyntheticPicture]:
@@ -101,7 +101,7 @@ def webcam_series(
         Where it truly is; a panorama is traced as one picture.
     poses
         How far off the pose is that the observations carry; left out, it is exact.
-    effort
+    sampling
         Of the light transport.
 
     Raises
@@ -114,15 +114,15 @@ def webcam_series(
     believed, _ = perturb_pose(camera, poses or PoseSigmas(), rng)
     stand = int(rng.integers(2**32))
     mesh = mi_mesh(terrain, hours[0].albedo)
-    bare = occluder(mesh)
-    coefficients = trace_view(bare, camera, effort, seed=seed, progress=lambda share: tell(0.7 * share))
+    bare = ray_scene(mesh)
+    coefficients = trace_view(bare, camera, sampling, seed=seed, progress=lambda share: tell(0.7 * share))
     pictures, shown = [], hours[0].albedo
     for index, hour in enumerate(hours):
         if hour.albedo is not shown:
             set_albedo(RenderScene(bare.mi_scene, bare.mi_terrain, hour.illumination, 0.0), hour.albedo)
             coefficients = replace(coefficients, albedo=view_albedo(bare, coefficients))
             shown = hour.albedo
-        view = relight_view(ready_view(bare, coefficients), hour.illumination)
+        view = relight_view(relightable_view(bare, coefficients), hour.illumination)
         radiance, front = np.maximum(view.radiance, 0.0), np.zeros(view.coverage.shape, bool)
         if foreground:
             radiance, front = add_foreground(radiance, np.random.default_rng(stand))

@@ -21,12 +21,12 @@ import numpy as np
 import torch
 from torch import nn
 
-from seasonscapes.gaussians.transport import (
+from seasonscapes.gaussians.disc_transport import (
     AZIMUTHS,
     HORIZON_RANGE_RAD,
     SOFTNESS_RAD,
+    DiscTransport,
     LightState,
-    Transport,
     bounce_terms,
 )
 from seasonscapes.sky.illumination import LUMINANCE_WEIGHTS
@@ -128,7 +128,7 @@ class Appearance(nn.Module):
         kind: str,
         albedo: np.ndarray,
         around: np.ndarray,
-        transport: Transport,
+        transport: DiscTransport,
         embedding: np.ndarray,
         *,
         times: int = 1,

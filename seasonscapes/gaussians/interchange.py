@@ -18,7 +18,7 @@ import numpy as np
 from seasonscapes.cameras.exchange import NamedView, write_colmap, write_transforms
 from seasonscapes.errors import InputError
 from seasonscapes.frames import LocalFrame
-from seasonscapes.gaussians.transport import LightState
+from seasonscapes.gaussians.disc_transport import LightState
 from seasonscapes.images import atomic_path
 
 # Y₀₀, the constant spherical harmonic.

@@ -15,7 +15,7 @@ _DARK = 0.02
 
 
 @dataclass(frozen=True)
-class Frame:
+class TrainingFrame:
     """A picture to learn from: a path-traced view, or a painted one.
 
     Parameters
@@ -25,7 +25,7 @@ class Frame:
     time
         Its number among the lessons' times.
     image
-        ``(H, W, 3)`` colours as in `Lessons`, of the surface, before the air.
+        ``(H, W, 3)`` colours as in `SurfaceTargets`, of the surface, before the air.
     mask
         ``(H, W)`` bool, True = usable.
     """
@@ -59,7 +59,7 @@ def surface_loss(
 
 
 @dataclass(frozen=True)
-class Picture:
+class TrainingPicture:
     """A frame laid out for training: seen discs ``(n,)``, weights over them (rows sum to 1), and pixels in sRGB."""
 
     discs: torch.Tensor
@@ -70,7 +70,7 @@ class Picture:
     mask: torch.Tensor
 
 
-def picture_of(frame: Frame) -> Picture:
+def training_picture(frame: TrainingFrame) -> TrainingPicture:
     from scipy import sparse
 
     matrix = frame.weights.matrix
@@ -84,7 +84,7 @@ def picture_of(frame: Frame) -> Picture:
     )
     mask = torch.as_tensor(frame.mask & (frame.weights.coverage > 0.5))
     target = torch.where(mask[..., None], encoded(torch.as_tensor(np.nan_to_num(frame.image).astype(np.float32))), 0.0)
-    return Picture(
+    return TrainingPicture(
         torch.as_tensor(discs.astype(np.int64)), forward, forward.T.tocsr(), torch.tensor(frame.time), target, mask
     )
 
@@ -108,17 +108,17 @@ def encoded(linear: torch.Tensor) -> torch.Tensor:
     return torch.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clamp(min=1e-4) ** (1.0 / 2.4) - 0.055)
 
 
-def picture_loss(appearance: Appearance, lights: LightTensors, picture: Picture) -> torch.Tensor:
+def picture_loss(appearance: Appearance, lights: LightTensors, picture: TrainingPicture) -> torch.Tensor:
     """0.8 L1 + 0.2 D-SSIM of a frame in sRGB over its usable pixels."""
     values = appearance(picture.discs, picture.time, lights)
     image = encoded(SparseProduct.apply(values, picture.forward, picture.backward)).reshape(picture.target.shape)
     image = torch.where(picture.mask[..., None], image, 0.0)
     share = picture.mask.float().mean()
     difference = (image - picture.target).abs().mean() / share
-    return 0.8 * difference + 0.2 * (1.0 - ssim_map(image, picture.target)).mean() / share
+    return 0.8 * difference + 0.2 * (1.0 - torch_ssim_map(image, picture.target)).mean() / share
 
 
-def ssim_map(image: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
+def torch_ssim_map(image: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
     """Structural similarity ``(C, H, W)`` of pictures ``(H, W, C)`` (Wang et al. 2004, doi:10.1109/TIP.2003.819861)."""
     offset = torch.arange(11.0) - 5.0
     window = torch.exp(-(offset**2) / 4.5)

@@ -15,10 +15,10 @@ import numpy as np
 from seasonscapes.albedo.seasons import albedo_at
 from seasonscapes.errors import InputError
 from seasonscapes.frames import LocalFrame
-from seasonscapes.gaussians.surfels import Plan, Surfels, disc_shapes
-from seasonscapes.gaussians.transport import Transport
+from seasonscapes.gaussians.disc_transport import DiscTransport
+from seasonscapes.gaussians.surfels import SurfelGrid, Surfels, disc_shapes
 from seasonscapes.images import atomic_path
-from seasonscapes.terrain.ground import ground_at
+from seasonscapes.terrain.attributes import attributes_at
 
 FORMAT = "seasonscapes gaussians 1"
 # Learned numbers of each disc and the range that their bytes span; beyond it they are clipped.
@@ -67,10 +67,10 @@ class GaussianModel:
     features: np.ndarray
     albedo: np.ndarray
     days: np.ndarray
-    transport: Transport
+    transport: DiscTransport
     appearance: dict[str, np.ndarray]
     kind: str
-    plan: Plan
+    plan: SurfelGrid
     cell: np.ndarray
     frame: LocalFrame
     note: dict = field(default_factory=dict)
@@ -98,7 +98,7 @@ class GaussianModel:
         """Albedo ``(N, 3)`` of a day of the year; see `albedo.seasons.albedo_at`."""
         if len(self.days) == 1:
             return self.albedo[0]
-        ground = ground_at(self.means, self.transport.normals, self.plan.spacing_m)
+        ground = attributes_at(self.means, self.transport.normals, self.plan.spacing_m)
         return albedo_at(self.albedo, self.days, day, ground)
 
 
@@ -106,14 +106,14 @@ def model_from(
     surfels: Surfels,
     albedo: np.ndarray,
     days,
-    transport: Transport,
+    transport: DiscTransport,
     *,
     kind: str,
     frame: LocalFrame,
     appearance: dict[str, np.ndarray],
     note: dict | None = None,
 ) -> GaussianModel:
-    """A model of discs, dated albedos ``(M, N, 3)`` and learned numbers, as `render.learned_numbers` gives them."""
+    """A model of discs, dated albedos ``(M, N, 3)`` and learned numbers, as `splat_view.learned_numbers` gives them."""
     learned = dict(appearance)
     features = learned.pop("embedding", np.zeros((len(surfels.means), 0), np.float32))
     return GaussianModel(
@@ -211,7 +211,7 @@ def packed(model: GaussianModel) -> tuple[dict[str, np.ndarray], dict]:
 
 def unpacked(tensors: dict[str, np.ndarray], facts: dict) -> GaussianModel:
     """The model of `packed` arrays."""
-    plan, (low, step) = Plan(**facts["plan"]), facts["height"]
+    plan, (low, step) = SurfelGrid(**facts["plan"]), facts["height"]
     cell = np.flatnonzero(np.unpackbits(tensors["taken"])[: plan.columns * plan.rows]).astype(np.int32)
     row, column = np.divmod(cell, plan.columns)
     means = np.stack(
@@ -225,10 +225,10 @@ def unpacked(tensors: dict[str, np.ndarray], facts: dict) -> GaussianModel:
     normals = from_octahedral(tensors["normal"]) * (tensors["roughness"][:, None] / np.float32(255.0))
     held = {
         item.name: tensors[f"transport.{item.name}"]
-        for item in fields(Transport)
+        for item in fields(DiscTransport)
         if f"transport.{item.name}" in tensors
     }
-    transport = Transport(normals=normals, patches=facts["patches"], **held)
+    transport = DiscTransport(normals=normals, patches=facts["patches"], **held)
     appearance = {}
     for name, values in tensors.items():
         if name.startswith("appearance."):

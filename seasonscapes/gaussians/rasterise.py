@@ -3,7 +3,7 @@
 * training: here, in plain torch. Pairs of (pixel, splat) are listed exactly, row by row of each ellipse, then brought
   from depth order into pixel order by one counting sort. Gradients by autograd.
 * pictures alone: `rendering.splatting`, several times faster; on CUDA gsplat, in `rasterise_cuda`.
-* the oracle: `rasterise_twin`, slow and obvious.
+* the oracle: `rasterise_reference`, slow and obvious.
 
 Where the geometry is frozen a view is a sparse matrix, pixels × splats: `view_weights` makes it once, and every colour
 after that costs one product.

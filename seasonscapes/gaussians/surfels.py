@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from seasonscapes.terrain.ground import vertex_normals
+from seasonscapes.terrain.attributes import vertex_normals
 from seasonscapes.terrain.surface import Terrain, sample_texture
 from seasonscapes.terrain.texels import barycentric, texel_coordinates, texel_positions
 
@@ -26,7 +26,7 @@ SUBCELLS = 4
 
 
 @dataclass(frozen=True)
-class Plan:
+class SurfelGrid:
     """The grid of cells that discs stand for: north-west corner and size of a cell [m], columns and rows."""
 
     west_m: float
@@ -66,7 +66,7 @@ class Surfels:
         ``(N, S, 2)`` float32 atlas coordinates of the places.
     """
 
-    plan: Plan
+    plan: SurfelGrid
     cell: np.ndarray
     means: np.ndarray
     quaternions: np.ndarray
@@ -107,7 +107,9 @@ def terrain_surfels(
     columns, rows = round(float(east - west) / spacing_m), round(float(north - south) / spacing_m)
     if min(columns, rows) < 1:
         raise ValueError(f"spacing_m: got {spacing_m}, but the plan is {min(east - west, north - south):.0f} m wide")
-    plan = Plan(float(west), float(north), float(east - west) / columns, float(north - south) / rows, columns, rows)
+    plan = SurfelGrid(
+        float(west), float(north), float(east - west) / columns, float(north - south) / rows, columns, rows
+    )
     normals = vertex_normals(terrain) if normals is None else normals
     positions, normals, uv = _cells(_within(terrain, (west, south, east, north)), plan, normals)
     whole = np.isfinite(positions).all(axis=(1, 2))
@@ -142,7 +144,7 @@ def disc_shapes(normals: np.ndarray, spacing_m: float) -> tuple[np.ndarray, np.n
     )
 
 
-def _cells(terrain: Terrain, plan: Plan, at_vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _cells(terrain: Terrain, plan: SurfelGrid, at_vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Positions, normals and atlas coordinates ``(cells, S, ...)`` of places in a plan's cells; NaN off the terrain."""
     width, height = plan.columns, plan.rows
     low = np.array([plan.west_m, plan.north_m - height * plan.north_step_m])

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from seasonscapes.relighting.efficacy import efficacies_lm_w
+from seasonscapes.relighting.luminous_efficacy import efficacies_lm_w
 from seasonscapes.rendering.irradiance import irradiance_blocks
-from seasonscapes.rendering.transport import Effort
+from seasonscapes.rendering.transport import SamplingOptions
 from seasonscapes.sky.illumination import Illumination, diffuse_horizontal_illuminance, luminance
 
 Progress = Callable[[float], None]
@@ -46,7 +46,7 @@ def lit_texture(
     albedo: np.ndarray,
     light: Illumination,
     *,
-    effort: Effort | None = None,
+    sampling: SamplingOptions | None = None,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> LitTexture:
@@ -55,7 +55,7 @@ def lit_texture(
     Parameters
     ----------
     terrain
-        From `rendering.gather.occluder`.
+        From `rendering.hemisphere_rays.ray_scene`.
     positions
         ``(R, S, 3)`` of the texels' centres, ENU [m], NaN where there is no surface; see `terrain.texels`.
     albedo
@@ -63,7 +63,7 @@ def lit_texture(
     """
     parts = [np.full((*positions.shape[:2], 3), np.nan, np.float32) for _ in range(3)]
     flat = [part.reshape(-1, 3) for part in parts]
-    blocks = irradiance_blocks(terrain, positions.reshape(-1, 3), [light], effort, seed=seed, progress=progress)
+    blocks = irradiance_blocks(terrain, positions.reshape(-1, 3), [light], sampling, seed=seed, progress=progress)
     for index, _, results in blocks:
         for received in results:
             for part, values in zip(flat, (received.sun, received.sky, received.bounce), strict=True):
@@ -72,7 +72,7 @@ def lit_texture(
 
 
 @dataclass(frozen=True)
-class Dose:
+class IntegratedIrradiance:
     """What a surface receives over a time, or at an instant where the weights say so.
 
     Parameters
@@ -92,17 +92,17 @@ class Dose:
     sunlit: np.ndarray
 
 
-def dose(
+def integrate_irradiance(
     terrain: Any,
     positions: np.ndarray,
     lights: Sequence[Illumination],
     weights: np.ndarray,
     *,
-    effort: Effort | None = None,
+    sampling: SamplingOptions | None = None,
     search_m: float = 2.0,
     seed: int = 0,
     progress: Progress | None = None,
-) -> Dose:
+) -> IntegratedIrradiance:
     """Sum what places receive under many lights.
 
     Parameters
@@ -118,7 +118,7 @@ def dose(
     """
     efficacy = [_efficacies(light) for light in lights]
     sums = np.full((len(positions), 5), np.nan, np.float32)
-    blocks = irradiance_blocks(terrain, positions, lights, effort, seed=seed, search_m=search_m, progress=progress)
+    blocks = irradiance_blocks(terrain, positions, lights, sampling, seed=seed, search_m=search_m, progress=progress)
     for index, points, results in blocks:
         total = np.zeros((len(index), 5), np.float64)
         for light, weight, (direct, diffuse), received in zip(lights, weights, efficacy, results, strict=True):
@@ -130,7 +130,7 @@ def dose(
             total[:, 3] += weight * (sun + sky + bounce)
             total[:, 4] += weight * _in_sun(light, points.normal, sun)
         sums[index] = total
-    return Dose(*sums.T)
+    return IntegratedIrradiance(*sums.T)
 
 
 def _efficacies(light: Illumination) -> tuple[float, float]:

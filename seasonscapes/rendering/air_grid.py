@@ -14,7 +14,7 @@ import numpy as np
 
 from seasonscapes.cameras.panorama import Panorama, view_directions
 from seasonscapes.cameras.pinhole import Camera
-from seasonscapes.rendering.scene import background
+from seasonscapes.rendering.mitsuba_scene import background
 from seasonscapes.sky.illumination import AerialPerspective, Illumination
 
 # Nodes are this far apart in angle and in pixels at most.
@@ -158,7 +158,7 @@ def sky_grid(camera: Camera | Panorama, pixel: np.ndarray) -> SkyGrid:
 
 
 def open_sky(grid: SkyGrid, illumination: Illumination, pixel_angle_deg: float) -> np.ndarray:
-    """Radiance ``(K, 3)`` [cd/m²] of the open pixels, with the discs of sun and moon; see `scene.background`."""
+    """Radiance ``(K, 3)`` [cd/m²] of the open pixels, with the discs of sun and moon; see `mitsuba_scene.background`."""
     bare = replace(illumination, sun=None, moon=None)
     at_nodes = np.zeros((len(grid.used), 3), np.float32)
     at_nodes[grid.used] = background(bare, grid.node.reshape(-1, 3)[grid.used], pixel_angle_deg)

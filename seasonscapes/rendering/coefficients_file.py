@@ -16,15 +16,24 @@ import numpy as np
 
 from seasonscapes.cameras.panorama import Panorama
 from seasonscapes.cameras.pinhole import Camera
-from seasonscapes.rendering.gather import Points
-from seasonscapes.rendering.senders import Reception, Senders
-from seasonscapes.rendering.transport import Effort, PointCoefficients, ViewCoefficients
+from seasonscapes.rendering.hemisphere_rays import SurfacePoints
+from seasonscapes.rendering.light_clusters import LightClusters, ReceiverCoefficients
+from seasonscapes.rendering.transport import PointCoefficients, SamplingOptions, ViewCoefficients
 
 # A new number wherever the same inputs give other coefficients, or the files other names.
 REVISION = 1
 _KINDS = {
     kind.__name__: kind
-    for kind in (Camera, Panorama, Points, Reception, Senders, Effort, PointCoefficients, ViewCoefficients)
+    for kind in (
+        Camera,
+        Panorama,
+        SurfacePoints,
+        ReceiverCoefficients,
+        LightClusters,
+        SamplingOptions,
+        PointCoefficients,
+        ViewCoefficients,
+    )
 }
 Coefficients = ViewCoefficients | PointCoefficients
 

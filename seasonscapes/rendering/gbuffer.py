@@ -10,7 +10,7 @@ import numpy as np
 from seasonscapes.cameras.panorama import Panorama, view_directions
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.rendering.backend import point3, to_numpy, use_backend
-from seasonscapes.rendering.scene import RenderScene
+from seasonscapes.rendering.mitsuba_scene import RenderScene
 
 # Rays begin this far in front of the camera, so that a mast's own ground does not hide the view.
 NEAR_M = 0.5

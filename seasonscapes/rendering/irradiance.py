@@ -9,19 +9,19 @@ from functools import partial
 import numpy as np
 
 from seasonscapes.rendering.backend import point3
-from seasonscapes.rendering.gather import Occluder, Points, surface_points
-from seasonscapes.rendering.reception import (
-    ReadyReception,
-    ReadySenders,
-    SenderLight,
+from seasonscapes.rendering.hemisphere_rays import RayScene, SurfacePoints, surface_points
+from seasonscapes.rendering.receivers import (
+    ClusterLight,
+    DeviceClusters,
+    DeviceReceivers,
     arriving,
-    light_senders,
+    light_clusters,
     luminaries,
-    ready_reception,
-    ready_senders,
+    upload_clusters,
+    upload_receivers,
 )
 from seasonscapes.rendering.sun_visibility import SunRays, cosine_seen, numbered_turn, sun_rays
-from seasonscapes.rendering.transport import Effort, PointCoefficients, prepare, trace_points
+from seasonscapes.rendering.transport import PointCoefficients, SamplingOptions, prepare_transport, trace_points
 from seasonscapes.sky.illumination import Illumination
 
 # Texels in work at a time: their coefficients take about 300 bytes each.
@@ -55,15 +55,15 @@ class Irradiance:
 
 
 @dataclass(frozen=True)
-class ReadyPoints:
+class DevicePoints:
     """Coefficients of places laid out for speed, for any number of lights."""
 
     rays: SunRays
-    reception: ReadyReception
-    senders: ReadySenders
+    receivers: DeviceReceivers
+    clusters: DeviceClusters
 
 
-def surface_at(terrain: Occluder, position_m: np.ndarray, *, search_m: float = 2.0) -> tuple[Points, np.ndarray]:
+def surface_at(terrain: RayScene, position_m: np.ndarray, *, search_m: float = 2.0) -> tuple[SurfacePoints, np.ndarray]:
     """The surface at places ``(N, 3)`` ENU on it [m], such as `terrain.texels.texel_positions` gives.
 
     A vertical ray from ``search_m`` above finds the face within as much below, so that normals and albedo are the
@@ -84,14 +84,14 @@ def surface_at(terrain: Occluder, position_m: np.ndarray, *, search_m: float = 2
     missed = np.flatnonzero(sound & ~found)
     if len(missed):
         again, hit = _below(terrain, start[missed] + _ASIDE_M, search_m)
-        for name in Points.__dataclass_fields__:
+        for name in SurfacePoints.__dataclass_fields__:
             getattr(points, name)[missed[hit]] = getattr(again, name)[hit]
         found[missed[hit]] = True
     index = np.flatnonzero(found)
     return points[index], index
 
 
-def _below(terrain: Occluder, start_m: np.ndarray, search_m: float) -> tuple[Points, np.ndarray]:
+def _below(terrain: RayScene, start_m: np.ndarray, search_m: float) -> tuple[SurfacePoints, np.ndarray]:
     import mitsuba as mi
 
     ray = mi.Ray3f(point3(start_m.astype(np.float32)), mi.Vector3f(0.0, 0.0, -1.0))
@@ -100,35 +100,35 @@ def _below(terrain: Occluder, start_m: np.ndarray, search_m: float) -> tuple[Poi
     return surface_points(interaction, found), np.array(found)
 
 
-def ready_points(terrain: Occluder, coefficients: PointCoefficients) -> ReadyPoints:
+def upload_points(terrain: RayScene, coefficients: PointCoefficients) -> DevicePoints:
     """Load coefficients (perhaps memory-mapped) into the form that `irradiance` uses."""
-    senders = ready_senders(terrain, coefficients.senders)
-    return ReadyPoints(
+    clusters = upload_clusters(terrain, coefficients.clusters)
+    return DevicePoints(
         _rays(terrain, coefficients.points, np.arange(len(coefficients.points.origin))),
-        ready_reception(coefficients.reception),
-        senders,
+        upload_receivers(coefficients.receivers),
+        clusters,
     )
 
 
-def _rays(terrain: Occluder, points: Points, number: np.ndarray) -> SunRays:
+def _rays(terrain: RayScene, points: SurfacePoints, number: np.ndarray) -> SunRays:
     each = points.reshape(-1, 1)
     weight = np.ones(each.origin.shape[:2], np.float32)
     return sun_rays(terrain, (each.origin, each.normal, each.outward), weight, numbered_turn(number))
 
 
 def irradiance(
-    ready: ReadyPoints, illumination: Illumination, light: SenderLight | None = None, *, sun_rays_each: int = 4
+    ready: DevicePoints, illumination: Illumination, light: ClusterLight | None = None, *, sun_rays_each: int = 4
 ) -> Irradiance:
     """Illuminance on the places under a light.
 
     Parameters
     ----------
     light
-        From `reception.light_senders`, where one light serves many blocks of places of one terrain.
+        From `receivers.light_clusters`, where one light serves many blocks of places of one terrain.
     sun_rays_each
         Shadow rays from each place to different points of the disc.
     """
-    sky, bounce = arriving(ready.reception, light or light_senders(ready.senders, illumination))
+    sky, bounce = arriving(ready.receivers, light or light_clusters(ready.clusters, illumination))
     sun = np.zeros_like(sky)
     for body in luminaries(illumination):
         sun += cosine_seen(ready.rays, body, each=sun_rays_each) * np.asarray(body.normal_illuminance_lx, np.float32)
@@ -136,15 +136,15 @@ def irradiance(
 
 
 def irradiance_blocks(
-    terrain: Occluder,
+    terrain: RayScene,
     position_m: np.ndarray,
     lights: Sequence[Illumination],
-    effort: Effort | None = None,
+    sampling: SamplingOptions | None = None,
     *,
     seed: int = 0,
     search_m: float = 2.0,
     progress: Progress | None = None,
-) -> Iterator[tuple[np.ndarray, Points, Iterator[Irradiance]]]:
+) -> Iterator[tuple[np.ndarray, SurfacePoints, Iterator[Irradiance]]]:
     """Irradiance of many places under many lights, block by block: nothing is kept, so memory stays bounded.
 
     Parameters
@@ -167,21 +167,21 @@ def irradiance_blocks(
     ValueError
         Where no place at all lies on the terrain.
     """
-    effort = effort or Effort()
+    sampling = sampling or SamplingOptions()
     tell = progress or (lambda share: None)
     sound = np.flatnonzero(np.isfinite(position_m).all(axis=1))
     some = np.random.default_rng(seed).permutation(sound)[: 1 << 18]
     pilot, found = surface_at(terrain, position_m[some], search_m=search_m)
     if len(found) == 0:
         raise ValueError("irradiance: no place lies on the terrain")
-    prepared = prepare(terrain, pilot, effort, seed=seed)
-    senders = ready_senders(terrain, prepared.senders)
-    sent = [light_senders(senders, light) for light in lights]
+    prepared = prepare_transport(terrain, pilot, sampling, seed=seed)
+    clusters = upload_clusters(terrain, prepared.clusters)
+    sent = [light_clusters(clusters, light) for light in lights]
     for start in range(0, len(sound), BLOCK):
         part = sound[start : start + BLOCK]
         points, found = surface_at(terrain, position_m[part], search_m=search_m)
         if len(found):
-            traced = trace_points(terrain, points, effort, prepared=prepared, seed=seed, number=part[found])
-            ready = ReadyPoints(_rays(terrain, points, part[found]), ready_reception(traced.reception), senders)
+            traced = trace_points(terrain, points, sampling, prepared=prepared, seed=seed, number=part[found])
+            ready = DevicePoints(_rays(terrain, points, part[found]), upload_receivers(traced.receivers), clusters)
             yield part[found], points, map(partial(irradiance, ready), lights, sent)
         tell(min(1.0, (start + BLOCK) / len(sound)))

@@ -12,7 +12,7 @@ from seasonscapes.cameras.panorama import Panorama, view_directions
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.rendering.backend import use_backend
 from seasonscapes.rendering.gbuffer import GBuffer, trace_gbuffer
-from seasonscapes.rendering.scene import RenderScene, background
+from seasonscapes.rendering.mitsuba_scene import RenderScene, background
 
 # Samples in flight: about 50 MB on the LLVM backend; more are no faster.
 LANES = 1 << 22
@@ -20,7 +20,7 @@ Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)
-class View:
+class RenderedView:
     """A rendered view.
 
     Parameters
@@ -98,7 +98,9 @@ def _trace_block(
     scene: RenderScene, camera: Camera | Panorama, block: tuple[int, int, int, int], *, max_depth: int, seed: int
 ) -> np.ndarray:
     """Sums over the samples of one block of rows as ``(height, W, 4)``: radiance and coverage."""
-    from seasonscapes.rendering.paths import trace_block  # imports Dr.Jit, whose library `use_backend` chooses first
+    from seasonscapes.rendering.path_tracer import (
+        trace_block,  # imports Dr.Jit, whose library `use_backend` chooses first
+    )
 
     first, second = np.random.SeedSequence(seed).generate_state(2)
     return trace_block(scene, camera, block, max_depth=max_depth, seed=(first, second))
@@ -155,14 +157,14 @@ def render_view(
     seed: int = 0,
     max_depth: int = 6,
     progress: Progress | None = None,
-) -> View:
+) -> RenderedView:
     """Path trace the terrain, look at it through the air, and put the sky behind it; see `path_trace`."""
     surface, coverage = path_trace(scene, camera, spp=spp, seed=seed, max_depth=max_depth, progress=progress)
     gbuffer = trace_gbuffer(scene, camera)
-    return View(through_air(scene, camera, surface, coverage, gbuffer), surface, coverage, gbuffer)
+    return RenderedView(apply_aerial_perspective(scene, camera, surface, coverage, gbuffer), surface, coverage, gbuffer)
 
 
-def through_air(
+def apply_aerial_perspective(
     scene: RenderScene, camera: Camera | Panorama, surface: np.ndarray, coverage: np.ndarray, gbuffer: GBuffer
 ) -> np.ndarray:
     """Radiance ``(H, W, 3)`` at the camera of a terrain picture seen through the air, with the sky behind it.

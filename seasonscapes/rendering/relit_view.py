@@ -8,19 +8,19 @@ import cv2
 import numpy as np
 
 from seasonscapes.rendering.air_grid import AirPlaces, SkyGrid, air_at, air_places, open_sky, sky_grid
-from seasonscapes.rendering.gather import Occluder, texture_at
 from seasonscapes.rendering.gbuffer import GBuffer, trace_gbuffer
-from seasonscapes.rendering.radiance import View
-from seasonscapes.rendering.reception import (
-    ReadyReception,
-    ReadySenders,
+from seasonscapes.rendering.hemisphere_rays import RayScene, texture_at
+from seasonscapes.rendering.mitsuba_scene import RenderScene
+from seasonscapes.rendering.radiance import RenderedView
+from seasonscapes.rendering.receivers import (
+    DeviceClusters,
+    DeviceReceivers,
     arriving,
-    light_senders,
+    light_clusters,
     luminaries,
-    ready_reception,
-    ready_senders,
+    upload_clusters,
+    upload_receivers,
 )
-from seasonscapes.rendering.scene import RenderScene
 from seasonscapes.rendering.sun_visibility import SunRays, first_place_sees, incidence, pixel_turn, sun_rays
 from seasonscapes.rendering.transport import ViewCoefficients, view_neighbours
 from seasonscapes.sky.illumination import Illumination, Luminary
@@ -38,7 +38,7 @@ _BLOCK = 1 << 17
 
 
 @dataclass(frozen=True)
-class ReadyView:
+class RelightableView:
     """A view's coefficients laid out for speed, with what no light changes. n pixels show terrain, S samples in each.
 
     Parameters
@@ -47,7 +47,7 @@ class ReadyView:
         As they were made or read.
     rays
         Shadow rays of all samples, pixel by pixel.
-    reception, senders
+    receivers, senders
         On the device.
     rough
         ``(n,)`` bool: pixels with silhouettes inside.
@@ -63,8 +63,8 @@ class ReadyView:
 
     coefficients: ViewCoefficients
     rays: SunRays
-    reception: ReadyReception
-    senders: ReadySenders
+    receivers: DeviceReceivers
+    clusters: DeviceClusters
     rough: np.ndarray
     gbuffer: GBuffer
     coverage: np.ndarray
@@ -72,7 +72,7 @@ class ReadyView:
     sky: SkyGrid
 
 
-def ready_view(terrain: Occluder, coefficients: ViewCoefficients) -> ReadyView:
+def relightable_view(terrain: RayScene, coefficients: ViewCoefficients) -> RelightableView:
     """Load coefficients (perhaps memory-mapped) into the form that `relight_view` uses. Done once for many lights."""
     camera, pixel = coefficients.camera, coefficients.pixel
     nearest, farthest, distance = _distances(coefficients)
@@ -88,13 +88,13 @@ def ready_view(terrain: Occluder, coefficients: ViewCoefficients) -> ReadyView:
     passes = [view_neighbours(coefficients, stride=stride, sharpness=_BOUNCE_SHARPNESS) for stride in _BOUNCE_STRIDES]
     places = (coefficients.sample_origin, coefficients.sample_normal, coefficients.sample_outward)
     rays = sun_rays(
-        terrain, places, coefficients.sample_weight, pixel_turn(pixel, camera.width_px, coefficients.effort.subpixels)
+        terrain, places, coefficients.sample_weight, pixel_turn(pixel, camera.width_px, coefficients.sampling.subpixels)
     )
-    return ReadyView(
+    return RelightableView(
         coefficients,
         rays,
-        ready_reception(coefficients.reception, passes),
-        ready_senders(terrain, coefficients.senders),
+        upload_receivers(coefficients.receivers, passes),
+        upload_clusters(terrain, coefficients.clusters),
         rough,
         gbuffer,
         coverage,
@@ -116,7 +116,7 @@ def _distances(coefficients: ViewCoefficients) -> tuple[np.ndarray, np.ndarray, 
     return distance.min(axis=1), farthest, distance
 
 
-def with_albedo(ready: ReadyView, albedo: np.ndarray, senders_albedo: np.ndarray) -> ReadyView:
+def with_albedo(ready: RelightableView, albedo: np.ndarray, cluster_albedo: np.ndarray) -> RelightableView:
     """The view with other colours on the same land (another season's).
 
     Parameters
@@ -124,35 +124,35 @@ def with_albedo(ready: ReadyView, albedo: np.ndarray, senders_albedo: np.ndarray
     albedo
         ``(n, 3)`` mean albedo of the pixels, as from `transport.view_albedo`.
     senders_albedo
-        ``(M, PLACES, 3)`` of the places that pass light on, as from `senders_albedo`.
+        ``(M, PLACES, 3)`` of the places that pass light on, as from `cluster_albedo`.
     """
-    points = replace(ready.senders.senders.points, albedo=np.asarray(senders_albedo, np.float32))
-    senders = replace(ready.senders.senders, points=points)
-    coefficients = replace(ready.coefficients, albedo=np.asarray(albedo, np.float32), senders=senders)
-    return replace(ready, coefficients=coefficients, senders=replace(ready.senders, senders=senders))
+    points = replace(ready.clusters.clusters.points, albedo=np.asarray(cluster_albedo, np.float32))
+    clusters = replace(ready.clusters.clusters, points=points)
+    coefficients = replace(ready.coefficients, albedo=np.asarray(albedo, np.float32), clusters=clusters)
+    return replace(ready, coefficients=coefficients, clusters=replace(ready.clusters, clusters=clusters))
 
 
-def senders_albedo(coefficients: ViewCoefficients, texture: np.ndarray) -> np.ndarray:
+def cluster_albedo(coefficients: ViewCoefficients, texture: np.ndarray) -> np.ndarray:
     """Albedo ``(M, PLACES, 3)`` of the places that pass light on, for a texture ``(R, S, 3)``."""
-    points = coefficients.senders.points
+    points = coefficients.clusters.points
     # Zero marks a surface that was met from its back: that stays black in every season.
     front = np.asarray(points.albedo).max(axis=-1, keepdims=True) > 0.0
     values = texture_at(texture, np.asarray(points.uv).reshape(-1, 2)).reshape(points.albedo.shape)
     return np.where(front, values, 0.0).astype(np.float32)
 
 
-def relight_view(ready: ReadyView, illumination: Illumination) -> View:
+def relight_view(ready: RelightableView, illumination: Illumination) -> RenderedView:
     """The view under a light; equals `radiance.render_view` in expectation, with the same number of bounces."""
     coefficients = ready.coefficients
-    shown = surface_radiance(ready, illumination)
+    shown = relit_surface_radiance(ready, illumination)
     surface = np.zeros((*ready.coverage.shape, 3), np.float32)
     surface.reshape(-1, 3)[coefficients.pixel] = shown
-    return View(_through_air(ready, illumination, shown), surface, ready.coverage, ready.gbuffer)
+    return RenderedView(_through_air(ready, illumination, shown), surface, ready.coverage, ready.gbuffer)
 
 
-def surface_radiance(ready: ReadyView, illumination: Illumination) -> np.ndarray:
+def relit_surface_radiance(ready: RelightableView, illumination: Illumination) -> np.ndarray:
     """Radiance ``(n, 3)`` [cd/m²] that leaves the terrain of each pixel that shows any, sky counting as black."""
-    direct, bounced = arriving(ready.reception, light_senders(ready.senders, illumination))
+    direct, bounced = arriving(ready.receivers, light_clusters(ready.clusters, illumination))
     total = direct + bounced
     for body in luminaries(illumination):
         light = np.asarray(body.normal_illuminance_lx, np.float32) / np.float32(np.pi)
@@ -160,7 +160,7 @@ def surface_radiance(ready: ReadyView, illumination: Illumination) -> np.ndarray
     return total * ready.coefficients.albedo
 
 
-def sun_cosine(ready: ReadyView, luminary: Luminary) -> np.ndarray:
+def sun_cosine(ready: RelightableView, luminary: Luminary) -> np.ndarray:
     """Mean over each pixel ``(n,)`` of cos(angle of incidence) × share of the disc that is seen.
 
     One ray decides for a pixel whose neighbours agree with it; along shadow edges and silhouettes all samples do.
@@ -177,7 +177,7 @@ def sun_cosine(ready: ReadyView, luminary: Luminary) -> np.ndarray:
     return result
 
 
-def _disagree(ready: ReadyView, seen: np.ndarray) -> np.ndarray:
+def _disagree(ready: RelightableView, seen: np.ndarray) -> np.ndarray:
     """Pixels among the n of whose eight neighbours on terrain some see the luminary and some do not."""
     camera, pixel = ready.coefficients.camera, ready.coefficients.pixel
     image = np.full((camera.height_px, camera.width_px), 127, np.uint8)
@@ -188,8 +188,8 @@ def _disagree(ready: ReadyView, seen: np.ndarray) -> np.ndarray:
     return (brightest != darkest).reshape(-1)[pixel]
 
 
-def _through_air(ready: ReadyView, illumination: Illumination, surface: np.ndarray) -> np.ndarray:
-    """Radiance ``(H, W, 3)`` at the camera; see `radiance.through_air`, whose distances are at hand here."""
+def _through_air(ready: RelightableView, illumination: Illumination, surface: np.ndarray) -> np.ndarray:
+    """Radiance ``(H, W, 3)`` at the camera; see `radiance.apply_aerial_perspective`, whose distances are at hand here."""
     camera, pixel = ready.coefficients.camera, ready.coefficients.pixel
     if illumination.aerial_perspective is not None:
         transmittance, airlight = air_at(ready.air, illumination.aerial_perspective)

@@ -7,8 +7,8 @@ import numpy as np
 from seasonscapes.cameras.panorama import Panorama, view_directions
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.rendering.backend import point3
-from seasonscapes.rendering.gather import Occluder
 from seasonscapes.rendering.gbuffer import NEAR_M
+from seasonscapes.rendering.hemisphere_rays import RayScene
 
 LANES = 1 << 22
 # Origins are lifted by this many units in the last place of their largest coordinate: 8 mm at 16 km. Less would meet the
@@ -17,7 +17,7 @@ _LIFT_ULP = 8.0
 
 
 def clear_sight(
-    terrain: Occluder, position_m: np.ndarray, normal: np.ndarray, eye_m: np.ndarray, *, lift_m: float | None = None
+    terrain: RayScene, position_m: np.ndarray, normal: np.ndarray, eye_m: np.ndarray, *, lift_m: float | None = None
 ) -> np.ndarray:
     """Whether nothing stands between places on the terrain and an eye, ``(N,)`` bool.
 
@@ -41,7 +41,7 @@ def clear_sight(
 
 
 def _clear_block(
-    terrain: Occluder, position_m: np.ndarray, normal: np.ndarray, eye_m: np.ndarray, lift_m: float | None
+    terrain: RayScene, position_m: np.ndarray, normal: np.ndarray, eye_m: np.ndarray, lift_m: float | None
 ) -> np.ndarray:
     import drjit as dr
     import mitsuba as mi
@@ -59,7 +59,7 @@ def _clear_block(
     return ~np.array(terrain.mi_scene.ray_test(ray))
 
 
-def faces_met(terrain: Occluder, camera: Camera | Panorama) -> np.ndarray:
+def faces_met(terrain: RayScene, camera: Camera | Panorama) -> np.ndarray:
     """Index ``(H, W)`` int64 of the face that each pixel centre's ray meets, −1 in the sky."""
     import mitsuba as mi
 

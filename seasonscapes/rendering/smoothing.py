@@ -33,7 +33,7 @@ class Neighbours:
     weight: np.ndarray
 
 
-def neighbours(
+def edge_aware_neighbours(
     grid: tuple[int, int],
     pixel: np.ndarray,
     surface: tuple[np.ndarray, np.ndarray, np.ndarray],

@@ -19,7 +19,7 @@ TILE = 4
 _CLOSED = 1e-4
 
 
-class Cuts(NamedTuple):
+class SplatLimits(NamedTuple):
     """Least opacity that is drawn, most that a splat may have, the pixel's own variance [px²] and the near limit [m];
     with ``one_sided``, splats whose third axis points away from the camera are left out."""
 
@@ -31,7 +31,7 @@ class Cuts(NamedTuple):
 
 
 @dataclass(frozen=True)
-class ReadySplats:
+class DeviceSplats:
     """N splats on the device: centres, the three axes of each ellipsoid (rotation × scale), and opacity."""
 
     mi_centre: Any
@@ -51,7 +51,7 @@ def finer_camera(camera: Camera, times: int) -> Camera:
     )
 
 
-def ready_splats(means: np.ndarray, axes: np.ndarray, opacity: np.ndarray) -> ReadySplats:
+def upload_splats(means: np.ndarray, axes: np.ndarray, opacity: np.ndarray) -> DeviceSplats:
     """Copy to the device: ``means (N, 3)``, ``axes (N, 3, 3)`` with one axis of the ellipsoid a column, ``opacity (N,)``.
 
     Raises
@@ -65,14 +65,16 @@ def ready_splats(means: np.ndarray, axes: np.ndarray, opacity: np.ndarray) -> Re
     import mitsuba as mi
 
     columns = [mi.Vector3f(point3(axes[:, :, k])) for k in range(3)]
-    ready = ReadySplats(
+    ready = DeviceSplats(
         mi.Point3f(point3(means)), columns, mi.Float(np.ascontiguousarray(opacity, np.float32)), len(means)
     )
     dr.eval(ready.mi_centre, ready.mi_axes, ready.mi_opacity)
     return ready
 
 
-def splat_layers(ready: ReadySplats, layers: np.ndarray, camera: Camera, cuts: Cuts) -> tuple[np.ndarray, np.ndarray]:
+def splat_layers(
+    ready: DeviceSplats, layers: np.ndarray, camera: Camera, cuts: SplatLimits
+) -> tuple[np.ndarray, np.ndarray]:
     """Blend layers ``(N, C)`` front to back over black: picture ``(H, W, C)`` and coverage ``(H, W)``."""
     import drjit as dr
     import mitsuba as mi
@@ -122,7 +124,7 @@ def splat_layers(ready: ReadySplats, layers: np.ndarray, camera: Camera, cuts: C
     return np.stack([picture(values) for values in sums], axis=-1), 1.0 - picture(through)
 
 
-def _project(ready: ReadySplats, camera: Camera, cuts: Cuts) -> tuple:
+def _project(ready: DeviceSplats, camera: Camera, cuts: SplatLimits) -> tuple:
     """Centre (x, y), conic (xx, xy, yy), opacity, depth and reaches (x, y) in the picture of all splats, as lanes."""
     import drjit as dr
     import mitsuba as mi

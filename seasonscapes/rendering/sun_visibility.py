@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from seasonscapes.rendering.backend import point3
-from seasonscapes.rendering.gather import Occluder
+from seasonscapes.rendering.hemisphere_rays import RayScene
 from seasonscapes.sky.illumination import Luminary
 
 # Lanes in one launch: more do not run faster, and memory stays bounded.
@@ -36,7 +36,7 @@ class SunRays:
         S.
     """
 
-    terrain: Occluder
+    terrain: RayScene
     mi_origin: Any
     mi_normal: list[Any]
     mi_outward: list[Any]
@@ -53,7 +53,7 @@ class SunRays:
 
 
 def sun_rays(
-    terrain: Occluder, places: tuple[np.ndarray, np.ndarray, np.ndarray], weight: np.ndarray, turn: np.ndarray
+    terrain: RayScene, places: tuple[np.ndarray, np.ndarray, np.ndarray], weight: np.ndarray, turn: np.ndarray
 ) -> SunRays:
     """Shadow rays from places.
 

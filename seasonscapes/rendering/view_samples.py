@@ -8,8 +8,8 @@ import numpy as np
 
 from seasonscapes.cameras.panorama import Panorama
 from seasonscapes.cameras.pinhole import Camera
-from seasonscapes.rendering.gather import LANES, Occluder, Points, front_side, surface_points
 from seasonscapes.rendering.gbuffer import mi_rays
+from seasonscapes.rendering.hemisphere_rays import LANES, RayScene, SurfacePoints, front_side, surface_points
 from seasonscapes.rendering.sobol import hashed, sobol_pair
 from seasonscapes.sky.illumination import LUMINANCE_WEIGHTS
 
@@ -18,8 +18,8 @@ _PIXEL = 103
 
 
 def view_samples(
-    terrain: Occluder, camera: Camera | Panorama, rows: tuple[int, int], count: int, seed: int
-) -> tuple[Points, np.ndarray, np.ndarray]:
+    terrain: RayScene, camera: Camera | Panorama, rows: tuple[int, int], count: int, seed: int
+) -> tuple[SurfacePoints, np.ndarray, np.ndarray]:
     """Surfaces ``(n, S)`` under the samples of a block of rows, which are terrain ``(n, S)``, and the pixels ``(n,)``.
 
     Only pixels that show terrain. Terrain comes first among the samples of a pixel; sky is black and repeats the place
@@ -35,11 +35,11 @@ def view_samples(
     order = np.argsort(np.where(hit, lot, 2.0), axis=1)
     hit = np.take_along_axis(hit, order, axis=1)
     columns = {}
-    for name in Points.__dataclass_fields__:
+    for name in SurfacePoints.__dataclass_fields__:
         values = getattr(flat, name).reshape(*shown.shape, count, -1)[shown]
         values = np.take_along_axis(values, order[..., None], axis=1)
         columns[name] = np.where(hit[..., None], values, 0.0 if name == "albedo" else values[:, :1])
-    return Points(**columns), hit, pixel
+    return SurfacePoints(**columns), hit, pixel
 
 
 def sample_weights(albedo: np.ndarray, hit: np.ndarray) -> np.ndarray:
@@ -50,15 +50,15 @@ def sample_weights(albedo: np.ndarray, hit: np.ndarray) -> np.ndarray:
 
 
 def camera_points(
-    terrain: Occluder, camera: Camera | Panorama, rows: tuple[int, int], count: int, seed: int
-) -> tuple[Points, np.ndarray]:
+    terrain: RayScene, camera: Camera | Panorama, rows: tuple[int, int], count: int, seed: int
+) -> tuple[SurfacePoints, np.ndarray]:
     """Surfaces under stratified samples of rows of pixels, samples of a pixel side by side, and which met terrain."""
     interaction = _mi_camera_rays(terrain, camera, rows, count, seed)
     valid = interaction.is_valid()
     return surface_points(interaction, valid), np.array(valid)
 
 
-def _mi_camera_rays(terrain: Occluder, camera: Camera | Panorama, rows: tuple[int, int], count: int, seed: int) -> Any:
+def _mi_camera_rays(terrain: RayScene, camera: Camera | Panorama, rows: tuple[int, int], count: int, seed: int) -> Any:
     """What stratified rays through a block of rows meet, ``count`` to a pixel side by side, and the number of pixels."""
     import drjit as dr
     import mitsuba as mi
@@ -77,7 +77,7 @@ def _mi_camera_rays(terrain: Occluder, camera: Camera | Panorama, rows: tuple[in
 
 
 def pixel_moments(
-    terrain: Occluder, camera: Camera | Panorama, rows: tuple[int, int], count: int, seed: int
+    terrain: RayScene, camera: Camera | Panorama, rows: tuple[int, int], count: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean albedo ``(N, 3)``, mean normal weighted by luminous albedo ``(N, 3)`` and coverage ``(N,)`` of all pixels.
 

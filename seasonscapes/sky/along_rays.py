@@ -9,11 +9,11 @@ from __future__ import annotations
 import numpy as np
 
 from seasonscapes.images import REC709_LUMINANCE
-from seasonscapes.sky.air import delta_scaled, optics
-from seasonscapes.sky.cells import Samples, local_sun, scattering_per_m
-from seasonscapes.sky.moments import HARMONIC_ORDER, diffuse_source, sun_geometry, sun_index
-from seasonscapes.sky.paths import sun_transfer, towards_sun
+from seasonscapes.sky.atmosphere import delta_scaled, optics
+from seasonscapes.sky.curved_rays import sun_transfer, towards_sun
+from seasonscapes.sky.ray_cells import CellSamples, local_sun, scattering_per_m
 from seasonscapes.sky.scattering import AtmosphereTables
+from seasonscapes.sky.sh_moments import HARMONIC_ORDER, diffuse_source, sun_geometry, sun_index
 from seasonscapes.sky.spectrum import WAVELENGTHS_NM, rgb_from_transfer
 
 # From the luminary's azimuth to the opposite one.
@@ -23,7 +23,7 @@ AZIMUTHS_RAD = (np.arange(AZIMUTHS) + 0.5) * np.pi / AZIMUTHS
 
 def parts_along(
     tables: AtmosphereTables,
-    samples: Samples,
+    samples: CellSamples,
     sun_rad: float,
     colours: np.ndarray,
     diffuse: np.ndarray,
@@ -69,7 +69,7 @@ def parts_along(
 
 def diffuse_along(
     tables: AtmosphereTables,
-    samples: Samples,
+    samples: CellSamples,
     elevation_rad: np.ndarray,
     suns_rad: np.ndarray,
     *,
@@ -89,7 +89,7 @@ def diffuse_along(
     return by_sun.transpose(2, 0, 3, 1, 4)
 
 
-def ground_along(tables: AtmosphereTables, samples: Samples, sun_rad: float) -> np.ndarray:
+def ground_along(tables: AtmosphereTables, samples: CellSamples, sun_rad: float) -> np.ndarray:
     """Transfers ``(K, A, B)`` of what the ground sends along rays that end on it."""
     atmosphere = tables.atmosphere
     scaled = delta_scaled(optics(atmosphere), HARMONIC_ORDER)

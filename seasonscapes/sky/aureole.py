@@ -19,7 +19,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from seasonscapes.sky.air import Atmosphere, aerosol_phase, optics
+from seasonscapes.sky.atmosphere import Atmosphere, aerosol_phase, optics
 
 _ORDERS, _ANGLES, _DEPTHS, _DEEPEST = 400, 96, 32, 30.0
 

@@ -1,6 +1,6 @@
 """Values that change with the sun's elevation alone, tabulated: a film asks for thousands of suns, a table for 177.
 
-Knots divide the intervals of `moments.SUN_ELEVATION_KNOTS_DEG`, so that they are close through twilight and lie
+Knots divide the intervals of `sh_moments.SUN_ELEVATION_KNOTS_DEG`, so that they are close through twilight and lie
 on the kinks of what is tabulated. In between the cubic through the four nearest knots holds. Values are kept in half
 precision (3e-4 of each value) over a scale for each knot, since they fall by nine orders of magnitude into the night.
 """
@@ -13,7 +13,7 @@ from os import PathLike
 import numpy as np
 
 from seasonscapes.images import atomic_path
-from seasonscapes.sky.moments import SUN_ELEVATION_KNOTS_DEG
+from seasonscapes.sky.sh_moments import SUN_ELEVATION_KNOTS_DEG
 
 # Raised whenever an equal atmosphere and observer give other tables.
 TABLE_REVISION = 2

@@ -8,8 +8,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from seasonscapes.sky.air import Atmosphere
-from seasonscapes.sky.atmosphere import AtmosphereTables, atmosphere_tables, illumination_from_atmosphere
+from seasonscapes.sky.atmosphere import Atmosphere
+from seasonscapes.sky.clear_sky import AtmosphereTables, atmosphere_tables, illumination_from_atmosphere
 from seasonscapes.sky.clouds import with_clouds
 from seasonscapes.sky.ephemeris import LunarPosition, SolarPosition
 from seasonscapes.sky.illumination import Illumination, diffuse_horizontal_illuminance, luminance

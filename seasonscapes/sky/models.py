@@ -9,7 +9,7 @@ from pydantic import Field, field_validator
 
 from seasonscapes.bundled import bundled_path
 from seasonscapes.declaration import Declaration, InputError, read_toml, validate
-from seasonscapes.sky.air import (
+from seasonscapes.sky.atmosphere import (
     Atmosphere,
     aerosol_optical_depth_from_turbidity,
     aerosol_optical_depth_from_visibility,
@@ -63,7 +63,7 @@ class Ozone(Declaration):
     column_du: float = Field(ge=0.0, le=1000.0)
 
 
-class Ground(Declaration):
+class GroundModel(Declaration):
     """What lies below the sky: its mean albedo, and the height of the lowland from which haze counts [m]."""
 
     albedo: Share
@@ -80,7 +80,7 @@ class SkyModel(Declaration):
     description, sources
         For people; where the numbers come from.
     ground, valid
-        See `Ground`, `Valid`.
+        See `GroundModel`, `Valid`.
     cloudiness
         Share of the sky that clouds cover, in [0, 1]; see `sky.clouds`.
     """
@@ -88,13 +88,13 @@ class SkyModel(Declaration):
     name: str = ""
     description: str
     sources: list[str] = Field(min_length=1)
-    ground: Ground
+    ground: GroundModel
     valid: Valid
     cloudiness: Share = 0.0
 
 
 class AtmosphereModel(SkyModel):
-    """Clear or hazy air at any hour, spectral and with multiple scattering (`sky.atmosphere`)."""
+    """Clear or hazy air at any hour, spectral and with multiple scattering (`sky.clear_sky`)."""
 
     kind: Literal["atmosphere"] = "atmosphere"
     aerosol: Aerosol

@@ -23,15 +23,23 @@ from functools import partial
 
 import numpy as np
 
-from seasonscapes.sky.air import Atmosphere, Optics, delta_scaled, gas_moments, optics
-from seasonscapes.sky.cells import Samples, local_sun, sample_cells, scattering_per_m
-from seasonscapes.sky.moments import (
+from seasonscapes.sky.atmosphere import Atmosphere, Optics, delta_scaled, gas_moments, optics
+from seasonscapes.sky.curved_rays import (
+    SunColumns,
+    equal_cells,
+    horizon_elevation_rad,
+    sun_columns,
+    sun_transfer,
+    trace_curved_rays,
+)
+from seasonscapes.sky.ray_cells import CellSamples, local_sun, sample_cells, scattering_per_m
+from seasonscapes.sky.sh_moments import (
     DARK,
     HARMONIC_ORDER,
     LATER_ORDER,
     SUN_ELEVATION_KNOTS_DEG,
-    Moments,
-    as_moments,
+    ShMoments,
+    as_sh_moments,
     azimuthal,
     diffuse_source,
     sun_geometry,
@@ -39,7 +47,6 @@ from seasonscapes.sky.moments import (
     table_heights_m,
     zonal,
 )
-from seasonscapes.sky.paths import SunColumns, equal_cells, horizon_elevation_rad, sun_columns, sun_transfer, trace_rays
 from seasonscapes.sky.spectrum import WAVELENGTHS_NM
 
 _AZIMUTHS, _CELLS, _THREADS = 11, 24, 4
@@ -58,13 +65,13 @@ class AtmosphereTables:
     moments
         Light scattered at least once, summed over all orders.
     diffuse_of
-        Gives, for an observer's height and whether near distances are meant, `seen.diffuse_by_elevation`: quick for
+        Gives, for an observer's height and whether near distances are meant, `observer_radiance.diffuse_by_elevation`: quick for
         many suns. Without, diffuse light is worked out for each sun.
     """
 
     atmosphere: Atmosphere
     sun_columns: SunColumns
-    moments: Moments
+    moments: ShMoments
     diffuse_of: Callable[[float, bool], np.ndarray] | None = None
 
 
@@ -84,7 +91,7 @@ def _directions(horizon_rad: float) -> tuple[np.ndarray, np.ndarray]:
 class _Level:
     """Rays from one table height under every sun: what every order reuses."""
 
-    samples: Samples
+    samples: CellSamples
     sines: np.ndarray  # of the rays' elevations (K,)
     weights: np.ndarray  # solid angle (K, A)
     basis: np.ndarray  # harmonics of the rays' directions (K, A, L, L)
@@ -95,7 +102,7 @@ class _Level:
 
 def _level(atmosphere: Atmosphere, scaled: Optics, height_m: float) -> _Level:
     elevation, weight = _directions(float(horizon_elevation_rad(atmosphere, height_m)))
-    paths = trace_rays(atmosphere, height_m, elevation)
+    paths = trace_curved_rays(atmosphere, height_m, elevation)
     samples = sample_cells(atmosphere, scaled, paths, equal_cells(atmosphere, paths, _CELLS))
     azimuth = (np.arange(_AZIMUTHS) + 0.5) * np.pi / _AZIMUTHS
     sun = np.radians(SUN_ELEVATION_KNOTS_DEG)
@@ -174,7 +181,7 @@ def atmosphere_tables(atmosphere: Atmosphere, *, tolerance: float = 0.1, max_ord
         for order in range(2, max_orders + 1):
             # Light that was scattered twice is smooth enough for a lower order.
             source = values if order == 2 else values[:, :, : LATER_ORDER + 1, : LATER_ORDER + 1]
-            before, moments, leaving = values[:, :, 0, 0], as_moments(source, ground), ground * albedo
+            before, moments, leaving = values[:, :, 0, 0], as_sh_moments(source, ground), ground * albedo
             next_order = partial(_received_next, atmosphere, scaled, moments, leaving)
             values, ground = _gathered(pool.map(next_order, levels))
             total, total_ground = total + values, total_ground + ground
@@ -184,7 +191,7 @@ def atmosphere_tables(atmosphere: Atmosphere, *, tolerance: float = 0.1, max_ord
             if (rest * values[:, :, 0, 0] < tolerance * total[:, :, 0, 0] + DARK).all():
                 break
     total = total + rest[:, :, None, None] * values
-    return AtmosphereTables(atmosphere, columns, as_moments(total, total_ground + rest[0] * ground))
+    return AtmosphereTables(atmosphere, columns, as_sh_moments(total, total_ground + rest[0] * ground))
 
 
 def _gathered(received) -> tuple[np.ndarray, np.ndarray]:
@@ -199,12 +206,12 @@ def _received(level: _Level, radiance: np.ndarray, leaving: np.ndarray) -> tuple
     return _project(level, radiance), _irradiance(level, radiance)
 
 
-def _received_next(atmosphere: Atmosphere, scaled: Optics, moments: Moments, leaving: np.ndarray, level: _Level):
+def _received_next(atmosphere: Atmosphere, scaled: Optics, moments: ShMoments, leaving: np.ndarray, level: _Level):
     """The same for light of one more order."""
     return _received(level, _next_radiance(atmosphere, scaled, moments, level), leaving)
 
 
-def _next_radiance(atmosphere: Atmosphere, scaled: Optics, moments: Moments, level: _Level) -> np.ndarray:
+def _next_radiance(atmosphere: Atmosphere, scaled: Optics, moments: ShMoments, level: _Level) -> np.ndarray:
     """Light of one more order ``(K, Q, B)`` [1/sr] along a level's rays."""
     source = diffuse_source(atmosphere, scaled, moments, level.samples, level.geometry)
     return np.einsum("ksb,ksqb->kqb", level.samples.weight, source)

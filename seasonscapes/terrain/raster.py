@@ -17,7 +17,7 @@ from affine import Affine
 from seasonscapes.declaration import InputError
 from seasonscapes.frames import LocalFrame, enu_from_geodetic
 from seasonscapes.terrain.crs import apply_affine, geodetic_from_map, horizontal_crs, map_from_geodetic
-from seasonscapes.terrain.holes import harmonic_fill, nan_mean
+from seasonscapes.terrain.hole_filling import harmonic_fill, nan_mean
 from seasonscapes.terrain.surface import Raster
 
 # From the shore of the Dead Sea (-430 m) to above Mount Everest (8,849 m). Feet, centimetres, unmarked nodata and
@@ -320,7 +320,7 @@ def _bounds_text(bounds_deg) -> str:
 
 
 def require_overlap(raster: Raster, other: Raster, *, where: str | os.PathLike, other_name: str = "elevation") -> None:
-    """Raise `InputError` about ``where`` (the file of ``raster``) unless the two rasters share ground."""
+    """Raise `InputError` about ``describe_position`` (the file of ``raster``) unless the two rasters share ground."""
     a, b = bounds_geographic(raster), bounds_geographic(other)
     if max(a[0], b[0]) >= min(a[2], b[2]) or max(a[1], b[1]) >= min(a[3], b[3]):
         raise InputError(

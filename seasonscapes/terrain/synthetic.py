@@ -19,11 +19,11 @@ from seasonscapes.terrain.synthetic_relief import relief
 
 CENTRE_LATITUDE_DEG, CENTRE_LONGITUDE_DEG = 46.55, 7.98
 CRS = "EPSG:32632"
-_MAPS = ("cover", "slope_deg", "northness", "hollow_m", "debris", "shore_m")
+_MAPS = ("cover", "slope_deg", "northness", "concavity_m", "debris", "shore_m")
 
 
 @dataclass(frozen=True)
-class SyntheticPlace:
+class SyntheticMassif:
     """The massif and the maps that its colours follow from; arrays ``(H, W)``, row 0 in the north.
 
     Parameters
@@ -34,7 +34,7 @@ class SyntheticPlace:
         `Cover` classes, uint8.
     slope_deg, northness
         Steepness [deg] and northward component of the unit normal, float32.
-    hollow_m
+    concavity_m
         Depth below the surroundings [m], float32: snow gathers there.
     debris
         Share of the glaciers under moraine, float32 in [0, 1].
@@ -48,14 +48,14 @@ class SyntheticPlace:
     cover: np.ndarray
     slope_deg: np.ndarray
     northness: np.ndarray
-    hollow_m: np.ndarray
+    concavity_m: np.ndarray
     debris: np.ndarray
     shore_m: np.ndarray
     seed: int
     spacing_m: float
 
 
-def alpine_massif(*, seed: int = 1912, size_m: float = 12000.0, spacing_m: float = 15.0) -> SyntheticPlace:
+def alpine_massif(*, seed: int = 1912, size_m: float = 12000.0, spacing_m: float = 15.0) -> SyntheticMassif:
     """Make the massif at 46.55° N, 7.98° E; the same seed gives the same bytes.
 
     Parameters
@@ -89,7 +89,7 @@ def alpine_massif(*, seed: int = 1912, size_m: float = 12000.0, spacing_m: float
     z = shape.elevation.astype(np.float32)
     smooth = cv2.GaussianBlur(z, (0, 0), 90.0 / spacing_m)
     slope, northness = slope_and_northness(z, spacing_m)
-    return SyntheticPlace(
+    return SyntheticMassif(
         Raster(z[..., None], transform, CRS),
         cover,
         slope,
@@ -102,7 +102,7 @@ def alpine_massif(*, seed: int = 1912, size_m: float = 12000.0, spacing_m: float
     )
 
 
-def save_place(place: SyntheticPlace, path: str | os.PathLike) -> None:
+def save_massif(place: SyntheticMassif, path: str | os.PathLike) -> None:
     """Write the place as one ``.npz``, atomically."""
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         maps = {name: getattr(place, name) for name in _MAPS}
@@ -117,14 +117,14 @@ def save_place(place: SyntheticPlace, path: str | os.PathLike) -> None:
         )
 
 
-def load_place(path: str | os.PathLike) -> SyntheticPlace:
-    """Read what `save_place` wrote."""
+def load_massif(path: str | os.PathLike) -> SyntheticMassif:
+    """Read what `save_massif` wrote."""
     from affine import Affine
 
     with np.load(path) as held:
         raster = Raster(held["elevation"], Affine(*held["transform"]), str(held["crs"]))
         maps = {name: held[name] for name in _MAPS}
-        return SyntheticPlace(raster, **maps, seed=int(held["seed"]), spacing_m=float(held["spacing_m"]))
+        return SyntheticMassif(raster, **maps, seed=int(held["seed"]), spacing_m=float(held["spacing_m"]))
 
 
 __all__ = [
@@ -133,11 +133,11 @@ __all__ = [
     "CRS",
     "SEASONS",
     "Cover",
-    "SyntheticPlace",
+    "SyntheticMassif",
     "alpine_albedo",
     "alpine_massif",
-    "load_place",
-    "save_place",
+    "load_massif",
+    "save_massif",
     "snow_fraction",
     "snow_line_m",
 ]

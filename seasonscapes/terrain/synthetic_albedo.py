@@ -12,7 +12,7 @@ import numpy as np
 
 from seasonscapes.terrain.noise import fractal_noise, spline_noise
 from seasonscapes.terrain.synthetic_cover import FOREST, Cover
-from seasonscapes.terrain.synthetic_plan import LEDGES_M, strata_level_m
+from seasonscapes.terrain.synthetic_layout import LEDGES_M, strata_level_m
 
 SEASONS = {"winter": 32, "spring": 135, "summer": 205, "autumn": 288}
 _YEAR = 365.25
@@ -130,7 +130,7 @@ def _snow(place, day: float, rows: slice, upsample: int) -> np.ndarray:
     z = _block(place.elevation.values[..., 0], rows, upsample)
     slope, shade = (_block(f, rows, upsample, cv2.INTER_LINEAR) for f in (place.slope_deg, place.northness))
     patches = fractal_noise(place.seed + 301, 420.0, east, north, octaves=7, gain=0.7)
-    hollow = _block(place.hollow_m, rows, upsample, cv2.INTER_LINEAR)
+    hollow = _block(place.concavity_m, rows, upsample, cv2.INTER_LINEAR)
     # Sun decides between slopes most when it is strong and low: least in midwinter, when all that falls stays.
     contrast = 330.0 + 130.0 * np.sin(2.0 * np.pi * (day - 60.0) / _YEAR)
     line = snow_line_m(day) - contrast * shade - 10.0 * np.clip(hollow, -12.0, 12.0) + 95.0 * patches
@@ -247,7 +247,7 @@ def alpine_albedo(place, day_of_year: float, *, upsample: int = 1) -> np.ndarray
     Parameters
     ----------
     place
-        The massif (`SyntheticPlace`).
+        The massif (`SyntheticMassif`).
     day_of_year
         1 = 1 January; fractions and any number of years are allowed, the result is periodic in 365.25 days.
     upsample

@@ -20,13 +20,13 @@ from seasonscapes.terrain.flow import (
 )
 from seasonscapes.terrain.noise import fractal_noise, spline_noise, warped_noise
 from seasonscapes.terrain.synthetic_ice import grow_ice
-from seasonscapes.terrain.synthetic_plan import (
+from seasonscapes.terrain.synthetic_layout import (
     LAKE_LEVEL_M,
     LEDGES_M,
-    Plan,
+    MassifLayout,
     ValleyFloor,
     anchoring,
-    plan_of,
+    massif_layout,
     sketched_heights,
     strata_level_m,
     valley_floor,
@@ -253,7 +253,7 @@ def _moraines(ice: tuple[np.ndarray, np.ndarray], surface: np.ndarray) -> np.nda
 
 
 def _stage_surface(
-    z: np.ndarray, lattice: Lattice, plan: Plan, floor: ValleyFloor, stage: _Stage, bare: np.ndarray
+    z: np.ndarray, lattice: Lattice, plan: MassifLayout, floor: ValleyFloor, stage: _Stage, bare: np.ndarray
 ) -> np.ndarray:
     """One stage of carving from heights on the jittered lattice to heights on the regular grid."""
     spacing = stage.spacing_m
@@ -286,7 +286,7 @@ def _bare(z: np.ndarray, spacing_m: float, ice: tuple[np.ndarray, np.ndarray] | 
 
 def relief(half_m: float, spacing_m: float, seed: int) -> Relief:
     """The massif on the regular grid of ``spacing_m`` (one of the stages') reaching ``half_m`` from its centre."""
-    plan = plan_of(seed)
+    plan = massif_layout(seed)
     floor = valley_floor(plan, _regular(half_m + 1020.0, 60.0))
     z = ice = debris = None
     for stage in (stage for stage in _STAGES if stage.spacing_m >= spacing_m):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from seasonscapes.texturing.guides import Guides
+from seasonscapes.texturing.predictors import Predictors
 
 PATCH_PX = 16
 # A patch whose grain is taken may have a few holes itself.
@@ -12,7 +12,7 @@ _SEEN_SHARE = 0.95
 
 
 def add_detail(
-    filled: np.ndarray, painted: np.ndarray, guides: Guides, *, strength: float, seed: int = 0
+    filled: np.ndarray, painted: np.ndarray, predictors: Predictors, *, strength: float, seed: int = 0
 ) -> np.ndarray:
     """Fine structure of painted patches added to the filled texels, after Efros & Freeman 2001
     (doi:10.1145/383259.383296) with blended instead of cut borders.
@@ -36,11 +36,11 @@ def add_detail(
         return filled
     starts = [(r, c) for r in range(0, height - PATCH_PX + 1, half) for c in range(0, width - PATCH_PX + 1, half)]
     starts = np.array(starts)
-    whole = _patch_sums((painted & guides.surface).astype(np.float32), starts) > _SEEN_SHARE * PATCH_PX**2
-    touched = _patch_sums((guides.surface & ~painted).astype(np.float32), starts) > 0.5
+    whole = _patch_sums((painted & predictors.surface).astype(np.float32), starts) > _SEEN_SHARE * PATCH_PX**2
+    touched = _patch_sums((predictors.surface & ~painted).astype(np.float32), starts) > 0.5
     if whole.sum() < 8 or not touched.any():
         return filled
-    features = _patch_features(filled, guides, starts)
+    features = _patch_features(filled, predictors, starts)
     grain = filled - _local_mean(filled)
     tree = cKDTree(features[whole])
     _, near = tree.query(features[touched], k=min(5, int(whole.sum())))
@@ -58,7 +58,7 @@ def add_detail(
         total[here] += np.float32(share) * window * grain[there]
         square[here] += window**2
     added = total / np.sqrt(np.maximum(square, 0.25))
-    return np.where((guides.surface & ~painted)[..., None], filled + np.float32(strength) * added, filled)
+    return np.where((predictors.surface & ~painted)[..., None], filled + np.float32(strength) * added, filled)
 
 
 def _local_mean(values: np.ndarray) -> np.ndarray:
@@ -75,9 +75,11 @@ def _patch_sums(values: np.ndarray, starts: np.ndarray) -> np.ndarray:
     return total[end_row, end_column] - total[row, end_column] - total[end_row, column] + total[row, column]
 
 
-def _patch_features(filled: np.ndarray, guides: Guides, starts: np.ndarray) -> np.ndarray:
+def _patch_features(filled: np.ndarray, predictors: Predictors, starts: np.ndarray) -> np.ndarray:
     """Mean guides and mean colour of each patch, scaled to unit deviation; the colour counts as much as all guides."""
-    known = np.nan_to_num(guides.values[..., [k for k, n in enumerate(guides.names) if not n.startswith("satellite")]])
+    known = np.nan_to_num(
+        predictors.values[..., [k for k, n in enumerate(predictors.names) if not n.startswith("satellite")]]
+    )
     means = _patch_sums(np.concatenate([filled, known], -1), starts) / PATCH_PX**2
     means = (means - means.mean(0)) / np.maximum(means.std(0), 1e-6)
     means[:, :3] *= np.sqrt(known.shape[2] / 3.0)

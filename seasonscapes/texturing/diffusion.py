@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from seasonscapes.errors import InputError
-from seasonscapes.texturing.conditions import Conditions
+from seasonscapes.texturing.model_weights import WeightNames, find_weights, variant_of
 from seasonscapes.texturing.prompts import NEGATIVE
-from seasonscapes.texturing.weight_files import WeightNames, find_weights, variant_of
+from seasonscapes.texturing.view_conditions import Conditions
 
 # Latents are this many times smaller than pictures.
 _CELL_PX = 8
@@ -124,7 +124,7 @@ def load_painter(
     Parameters
     ----------
     folder
-        Weights folder; left out, the hub's cache. See `weight_files.find_weights`.
+        Weights folder; left out, the hub's cache. See `model_weights.find_weights`.
     image
         Guide picture ``(h, w, 3)`` sRGB-encoded in [0, 1], such as a webcam's of that hour; without one the IP-Adapter
         is not used.
@@ -292,10 +292,10 @@ def _adapted(pipe: Any, place: Path, image: np.ndarray, settings: DiffusionSetti
     except (RuntimeError, ValueError, KeyError, OSError) as error:
         raise InputError("--weights", f"{place} does not fit the base model: {_first_line(error)}") from None
     pipe.set_ip_adapter_scale(settings.image_scale)
-    guide = Image.fromarray(np.round(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8))
+    predictor = Image.fromarray(np.round(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8))
     pipe.image_encoder.to(device)
     with torch.no_grad():
-        return pipe.prepare_ip_adapter_image_embeds(guide, None, device, 1, settings.guidance > 1.0)
+        return pipe.prepare_ip_adapter_image_embeds(predictor, None, device, 1, settings.guidance > 1.0)
 
 
 def _painted(painter: Painter, view: Conditions, tell: Callable[[float], None]) -> np.ndarray:

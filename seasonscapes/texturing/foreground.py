@@ -13,8 +13,8 @@ import numpy as np
 
 from seasonscapes.cameras.pinhole import ray_directions
 from seasonscapes.terrain.surface import Texture, sample_texture
-from seasonscapes.texturing.harmonise import Harmony, land_radiance
-from seasonscapes.texturing.shots import ReadyShot, air_to
+from seasonscapes.texturing.inputs import PreparedInput, air_to
+from seasonscapes.texturing.radiometric_fit import RadiometricFit, radiance_at_surface
 
 # Deviations that count, and the share of the 5 x 5 pixels around that must have them too.
 _OUTLIER, _COHERENT = 3.2, 0.5
@@ -25,14 +25,20 @@ _DEPTH_BINS = 8
 
 
 def foreground_mask(
-    ready: ReadyShot, number: int, harmony: Harmony, predicted: np.ndarray, uv: np.ndarray, *, outlier: float = _OUTLIER
+    ready: PreparedInput,
+    number: int,
+    radiometry: RadiometricFit,
+    predicted: np.ndarray,
+    uv: np.ndarray,
+    *,
+    outlier: float = _OUTLIER,
 ) -> np.ndarray:
     """Pixels ``(H, W)`` bool that show something else than the land.
 
     Parameters
     ----------
     ready, number
-        A shot and its index in ``harmony``.
+        A shot and its index in ``radiometry``.
     predicted
         ``(R, S, 3)`` radiance [cd/m²] of the land that owes nothing to this picture's own pixels there (`predict_in_folds`);
         NaN where unknown.
@@ -41,7 +47,7 @@ def foreground_mask(
     outlier
         Robust standard deviations.
     """
-    apart, known = _disagreement(ready, number, harmony, predicted, uv)
+    apart, known = _disagreement(ready, number, radiometry, predicted, uv)
     if np.count_nonzero(known) < 100:
         return np.zeros(known.shape, bool)
     score = np.zeros(known.shape, np.float32)
@@ -63,12 +69,12 @@ def _solid(found: np.ndarray) -> np.ndarray:
 
 
 def _disagreement(
-    ready: ReadyShot, number: int, harmony: Harmony, predicted: np.ndarray, uv: np.ndarray
+    ready: PreparedInput, number: int, radiometry: RadiometricFit, predicted: np.ndarray, uv: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Logarithm of seen over predicted ``(H, W, 3)``, and where both are known."""
-    camera = ready.shot.observation.camera
+    camera = ready.item.observation.camera
     # Beside silhouettes a pixel shows two surfaces; the guard looks after those.
-    usable = (ready.levels[0][..., 3] > 0.0) & (ready.trust > 0.0)
+    usable = (ready.levels[0][..., 3] > 0.0) & (ready.confidence > 0.0)
     expected = sample_texture(predicted, uv)
     with np.errstate(invalid="ignore"):
         known = usable & (expected > 0.0).all(axis=2)
@@ -76,7 +82,7 @@ def _disagreement(
     place = camera.position_m + ray_directions(camera)[known] * ready.depth_m[known][:, None]
     share = cv2.blur(usable.astype(np.float32), (3, 3))
     value = cv2.blur(ready.levels[0][..., :3] * usable[..., None], (3, 3))[known] / share[known][:, None]
-    seen, _ = land_radiance(value, number, air_to(ready, place), harmony)
+    seen, _ = radiance_at_surface(value, number, air_to(ready, place), radiometry)
     apart[known] = np.log(np.maximum(seen, 1e-6)) - np.log(expected[known])
     return apart, known
 
@@ -96,7 +102,7 @@ def _standardised(apart: np.ndarray, log_depth: np.ndarray) -> np.ndarray:
 
 
 def predict_in_folds(
-    texture: Texture, guides: np.ndarray, fit: Callable, *, folds: int = 4, samples: int = 20_000, seed: int = 0
+    texture: Texture, predictors: np.ndarray, fit: Callable, *, folds: int = 4, samples: int = 20_000, seed: int = 0
 ) -> np.ndarray:
     """Radiance ``(R, S, 3)`` that a regression expects, each texel's from land elsewhere.
 
@@ -104,7 +110,7 @@ def predict_in_folds(
     ----------
     texture
         Painted radiance; ``weight`` 0 where nothing was.
-    guides
+    predictors
         ``(R, S, G)``, NaN where unknown.
     fit
         ``fit(guides (n, G), log radiance (n, 3))`` gives a function from guides to log radiance.
@@ -121,7 +127,7 @@ def predict_in_folds(
     side = max(8, max(height, width) // 12)
     block = (row // side) * 1009 + column // side
     fold = np.random.default_rng(seed).permutation(int(block.max()) + 1)[block] % folds
-    table = guides.reshape(-1, guides.shape[2])
+    table = predictors.reshape(-1, predictors.shape[2])
     values = texture.values.reshape(-1, 3)
     sound = np.isfinite(table).any(axis=1)
     painted = (texture.weight.ravel() > 0.0) & sound & (values > 0.0).all(axis=1)

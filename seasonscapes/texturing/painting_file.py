@@ -13,8 +13,8 @@ import numpy as np
 from seasonscapes.exposure import develop, exposure_ev100
 from seasonscapes.images import srgb_from_linear, write_exr, write_png, write_png8
 from seasonscapes.terrain.surface import Texture
-from seasonscapes.texturing.harmonise import Harmony
-from seasonscapes.texturing.paint import Painting
+from seasonscapes.texturing.painting import Painting
+from seasonscapes.texturing.radiometric_fit import RadiometricFit
 
 _UNPAINTED = np.array([38, 40, 46], np.uint8)
 _MOST_FIGURE_PX = 2048
@@ -22,8 +22,8 @@ _MOST_FIGURE_PX = 2048
 
 def save_painting(painting: Painting, path: str | os.PathLike) -> None:
     """Write a painting to one ``.npz`` file."""
-    harmony = {name: np.asarray(value).tolist() for name, value in asdict(painting.harmony).items()}
-    note = {"webcams": painting.webcams, "skipped": painting.skipped, "harmony": harmony}
+    radiometry = {name: np.asarray(value).tolist() for name, value in asdict(painting.radiometry).items()}
+    note = {"webcams": painting.webcams, "skipped": painting.skipped, "harmony": radiometry}
     np.savez(
         path,
         values=painting.texture.values,
@@ -44,7 +44,7 @@ def load_painting(path: str | os.PathLike) -> Painting:
             stored["best"],
             stored["coverage"],
             tuple(note["webcams"]),
-            Harmony(**lists),
+            RadiometricFit(**lists),
             tuple(note["skipped"]),
         )
 

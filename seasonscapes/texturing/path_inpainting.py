@@ -16,11 +16,17 @@ import numpy as np
 from seasonscapes.cameras.observation import Observation
 from seasonscapes.cameras.pinhole import Camera, ray_directions
 from seasonscapes.images import linear_from_srgb
-from seasonscapes.rendering.gather import Occluder
 from seasonscapes.rendering.gbuffer import GBuffer, trace_gbuffer
-from seasonscapes.rendering.scene import RenderScene
+from seasonscapes.rendering.hemisphere_rays import RayScene
+from seasonscapes.rendering.mitsuba_scene import RenderScene
 from seasonscapes.terrain.surface import Texture
-from seasonscapes.texturing.conditions import (
+from seasonscapes.texturing.atlas_tiles import AtlasTiling, sees_tile, tile_surface, tiles_of
+from seasonscapes.texturing.inputs import PaintingInput, prepare_input
+from seasonscapes.texturing.painting import input_texels
+from seasonscapes.texturing.path_steps import PathStep, levels_of, load_step, save_step
+from seasonscapes.texturing.push_pull import push_pull
+from seasonscapes.texturing.radiometric_fit import RadiometricFit
+from seasonscapes.texturing.view_conditions import (
     MASKS,
     Conditions,
     decode,
@@ -32,12 +38,6 @@ from seasonscapes.texturing.conditions import (
     red_pixels,
     white_radiance,
 )
-from seasonscapes.texturing.harmonise import Harmony
-from seasonscapes.texturing.paint import shot_texels
-from seasonscapes.texturing.path_steps import Step, keep_step, kept_step, levels_of
-from seasonscapes.texturing.push_pull import push_pull
-from seasonscapes.texturing.shots import Shot, ready_shot
-from seasonscapes.texturing.tiles import Tiling, sees_tile, tile_surface, tiles_of
 
 # An image model: paints the hole of a view, sRGB-encoded ``(H, W, 3)``. The second argument is told the share done.
 Inpaint = Callable[[Conditions, Callable[[float], None]], np.ndarray]
@@ -49,7 +49,7 @@ _RED = np.array([1.0, 0.0, 0.0], np.float32)
 
 
 @dataclass(frozen=True)
-class Walk:
+class PathInpaintingInputs:
     """What to go over.
 
     Parameters
@@ -68,13 +68,13 @@ class Walk:
 
     texture: Texture
     cameras: Sequence[Camera]
-    cut: Tiling
-    terrain: Occluder
+    cut: AtlasTiling
+    terrain: RayScene
     base: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
-class WalkOptions:
+class PathInpaintingOptions:
     """How to go.
 
     Parameters
@@ -107,7 +107,7 @@ class WalkOptions:
             raise ValueError("WalkOptions: dilate_px must not be negative, and least_share between 0 and 1")
 
 
-class Canvas:
+class InpaintingState:
     """The texture while it is being walked over: values, what is covered, and what the model gave."""
 
     def __init__(self, texture: Texture):
@@ -124,7 +124,7 @@ class Canvas:
         """All that has a value by now; weight 1 there."""
         return Texture(self.values.copy(), self.covered.astype(np.float32))
 
-    def superpose(self, step: Step) -> None:
+    def superpose(self, step: PathStep) -> None:
         """Add a view's texels; one that is covered already is a mistake, not a choice."""
         flat = self.covered.reshape(-1)
         if flat[step.texels].any():
@@ -133,20 +133,20 @@ class Canvas:
         flat[step.texels] = True
 
 
-def walk_path(
-    walk: Walk,
-    canvas: Canvas,
+def inpaint_along_path(
+    inputs: PathInpaintingInputs,
+    state: InpaintingState,
     inpaint: Inpaint,
-    options: WalkOptions,
+    options: PathInpaintingOptions,
     *,
     folder: Path | None = None,
     progress: Callable[[float], None] | None = None,
-) -> Iterator[Step]:
+) -> Iterator[PathStep]:
     """Go along the path and paint; yields each view when the canvas has it.
 
     Parameters
     ----------
-    canvas
+    state
         Of ``walk.texture``; it is filled.
     inpaint
         The image model.
@@ -161,46 +161,46 @@ def walk_path(
     ValueError
         No painted texel, or a model that returns a picture of another size or values that are not finite.
     """
-    if not canvas.painted.any():
+    if not state.painted.any():
         raise ValueError("walk_path: no painted texel: there is nothing to go on")
     tell = progress or (lambda share: None)
-    white = white_radiance(canvas.values, canvas.painted)
-    count = len(walk.cameras)
+    white = white_radiance(state.values, state.painted)
+    count = len(inputs.cameras)
     for index in range(count):
-        step = kept_step(folder, index)
+        step = load_step(folder, index)
         if step is None:
             step, pictures = _paint_view(
-                walk, canvas, inpaint, options, index, white, lambda share, index=index: tell((index + share) / count)
+                inputs, state, inpaint, options, index, white, lambda share, index=index: tell((index + share) / count)
             )
             if folder is not None:
-                keep_step(folder, step, pictures)
-        canvas.superpose(step)
+                save_step(folder, step, pictures)
+        state.superpose(step)
         tell((index + 1) / count)
         yield step
 
 
 def _paint_view(
-    walk: Walk,
-    canvas: Canvas,
+    inputs: PathInpaintingInputs,
+    state: InpaintingState,
     inpaint: Inpaint,
-    options: WalkOptions,
+    options: PathInpaintingOptions,
     index: int,
     white: float,
     tell: Callable[[float], None],
-) -> tuple[Step, dict[str, np.ndarray]]:
+) -> tuple[PathStep, dict[str, np.ndarray]]:
     """One round of the loop; and the pictures that show it."""
-    camera = walk.cameras[index]
-    gbuffer = trace_gbuffer(RenderScene(walk.terrain.mi_scene, walk.terrain.mi_terrain, None, 0.0), camera)  # type: ignore[arg-type]
+    camera = inputs.cameras[index]
+    gbuffer = trace_gbuffer(RenderScene(inputs.terrain.mi_scene, inputs.terrain.mi_terrain, None, 0.0), camera)  # type: ignore[arg-type]
     land = np.isfinite(gbuffer.depth)
-    partial, hole = partial_view(walk, canvas, gbuffer, options, white)
+    partial, hole = partial_view(inputs, state, gbuffer, options, white)
     share = float(hole.sum() / max(land.sum(), 1))
     sky = plain_sky(ray_directions(camera), cloudiness=options.cloudiness)
     shown = np.where(land[..., None], partial, sky)
     nothing = np.empty(0, np.int64), np.empty((0, 3), np.float32)
-    if not hole.any() or share < options.least_share or _in_vain(walk, canvas, camera, shown, share, white):
-        return Step(index, share, *nothing, levels_of(shown), True), {}
+    if not hole.any() or share < options.least_share or _in_vain(inputs, state, camera, shown, share, white):
+        return PathStep(index, share, *nothing, levels_of(shown), True), {}
     wanted = hole | ~land if options.paint_sky else hole
-    guess = _guessed(walk, gbuffer, shown, wanted, hole, white)
+    guess = _guessed(inputs, gbuffer, shown, wanted, hole, white)
     mask = dilated(wanted, options.dilate_px)
     depth = depth_picture(gbuffer.depth)
     seed = int(np.random.SeedSequence((options.seed, index)).generate_state(1, np.uint64)[0] >> 1)
@@ -208,23 +208,25 @@ def _paint_view(
     if result.shape != shown.shape or not np.isfinite(result).all():
         raise ValueError(f"view {index}: the image model returned {result.shape}, or values that are not finite")
     composed = np.where(wanted[..., None], np.clip(result, 0.0, 1.0), shown)
-    texels, values = back_project(walk, canvas, camera, composed, white)
+    texels, values = back_project(inputs, state, camera, composed, white)
     hidden = np.where(hole[..., None], np.float32(0.0), shown)
     pictures = {"partial": hidden, "mask": mask.astype(np.float32), "depth": depth}
-    return Step(index, share, texels, values, levels_of(composed), False), pictures
+    return PathStep(index, share, texels, values, levels_of(composed), False), pictures
 
 
-def _in_vain(walk: Walk, canvas: Canvas, camera: Camera, shown: np.ndarray, share: float, white: float) -> bool:
+def _in_vain(
+    inputs: PathInpaintingInputs, state: InpaintingState, camera: Camera, shown: np.ndarray, share: float, white: float
+) -> bool:
     """Whether all that a view could paint lies beside silhouettes, where nothing is taken from it: hours for nothing."""
-    return share < _FEW_HOLES and len(back_project(walk, canvas, camera, shown, white)[0]) == 0
+    return share < _FEW_HOLES and len(back_project(inputs, state, camera, shown, white)[0]) == 0
 
 
 def partial_view(
-    walk: Walk, canvas: Canvas, gbuffer: GBuffer, options: WalkOptions, white: float
+    inputs: PathInpaintingInputs, state: InpaintingState, gbuffer: GBuffer, options: PathInpaintingOptions, white: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """The land as far as it has values, sRGB-encoded ``(H, W, 3)``, and its holes ``(H, W)`` bool."""
     land = np.isfinite(gbuffer.depth)
-    radiance, known = look_up(canvas.values, canvas.covered, gbuffer.uv)
+    radiance, known = look_up(state.values, state.covered, gbuffer.uv)
     picture = encode(radiance, white)
     hole = land & ~known
     if options.mask == "hsv":
@@ -233,13 +235,18 @@ def partial_view(
 
 
 def _guessed(
-    walk: Walk, gbuffer: GBuffer, shown: np.ndarray, wanted: np.ndarray, hole: np.ndarray, white: float
+    inputs: PathInpaintingInputs,
+    gbuffer: GBuffer,
+    shown: np.ndarray,
+    wanted: np.ndarray,
+    hole: np.ndarray,
+    white: float,
 ) -> np.ndarray:
     """The picture with something in its holes: a completion's colours, or those of the rims."""
     known = ~wanted
     picture = shown
-    if walk.base is not None:
-        fill, _ = look_up(walk.base, np.ones(walk.base.shape[:2], bool), gbuffer.uv)
+    if inputs.base is not None:
+        fill, _ = look_up(inputs.base, np.ones(inputs.base.shape[:2], bool), gbuffer.uv)
         picture = np.where(hole[..., None], encode(fill, white), picture)
         known = known | hole
     if not known.any():
@@ -248,7 +255,7 @@ def _guessed(
 
 
 def back_project(
-    walk: Walk, canvas: Canvas, camera: Camera, picture: np.ndarray, white: float
+    inputs: PathInpaintingInputs, state: InpaintingState, camera: Camera, picture: np.ndarray, white: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """What a picture tells of the holes that its camera truly sees: flat texels ``(N,)`` and radiance ``(N, 3)``.
 
@@ -256,20 +263,20 @@ def back_project(
     """
     linear = decode(picture, 1.0) * _HEADROOM
     everywhere = np.ones(picture.shape[:2], bool)
-    shot = Shot(Observation(linear, everywhere, camera, datetime(2000, 1, 1, tzinfo=UTC), "path"))
-    ready = ready_shot(shot, walk.terrain, walk.cut, near_m=0.0)
+    item = PaintingInput(Observation(linear, everywhere, camera, datetime(2000, 1, 1, tzinfo=UTC), "path"))
+    ready = prepare_input(item, inputs.terrain, inputs.cut, near_m=0.0)
     same = np.full((1, 3), np.log(_HEADROOM / white))
-    harmony = Harmony(same, same, np.ones(1))
+    radiometry = RadiometricFit(same, same, np.ones(1))
     texels, values = [], []
-    for tile in tiles_of(walk.cut):
+    for tile in tiles_of(inputs.cut):
         rows, columns = tile.window
-        open_ = ~canvas.covered[rows, columns].ravel()
+        open_ = ~state.covered[rows, columns].ravel()
         if not sees_tile(ready.blocks, tile) or not open_.any():
             continue
-        surface = tile_surface(walk.cut, tile)
-        local, radiance, _ = shot_texels(ready, 0, walk.terrain, surface[open_[surface.texel]], tile, harmony)
+        surface = tile_surface(inputs.cut, tile)
+        local, radiance, _ = input_texels(ready, 0, inputs.terrain, surface[open_[surface.texel]], tile, radiometry)
         row, column = tile.row + local // tile.width, tile.column + local % tile.width
-        texels.append(row * walk.cut.width_px + column)
+        texels.append(row * inputs.cut.width_px + column)
         values.append(radiance)
     if not texels:
         return np.empty(0, np.int64), np.empty((0, 3), np.float32)
@@ -277,7 +284,7 @@ def back_project(
 
 
 def frames_of(
-    values: np.ndarray, cameras: Sequence[Camera], terrain: Occluder, white: float, *, cloudiness: float = 0.0
+    values: np.ndarray, cameras: Sequence[Camera], terrain: RayScene, white: float, *, cloudiness: float = 0.0
 ) -> Iterator[np.ndarray]:
     """Display-linear frames ``(H, W, 3)`` of a finished texture ``(R, S, 3)`` along a path, one at a time."""
     scene = RenderScene(terrain.mi_scene, terrain.mi_terrain, None, 0.0)  # type: ignore[arg-type]

@@ -11,7 +11,7 @@ from seasonscapes.images import atomic_path, write_png8
 
 
 @dataclass(frozen=True)
-class Step:
+class PathStep:
     """One view, done.
 
     Parameters
@@ -49,7 +49,7 @@ def _picture(folder: Path, index: int, name: str) -> Path:
     return folder / f"view_{index:04d}_{name}.png"
 
 
-def keep_step(folder: Path, step: Step, pictures: dict[str, np.ndarray]) -> None:
+def save_step(folder: Path, step: PathStep, pictures: dict[str, np.ndarray]) -> None:
     """Write a view, pictures first and the record last: what has a record is whole."""
     for name, picture in {**pictures, "result": step.frame}.items():
         levels = picture if picture.dtype == np.uint8 else levels_of(picture)
@@ -58,7 +58,7 @@ def keep_step(folder: Path, step: Step, pictures: dict[str, np.ndarray]) -> None
         np.savez(temporary, texels=step.texels, values=step.values, hole_share=step.hole_share, skipped=step.skipped)
 
 
-def kept_step(folder: Path | None, index: int) -> Step | None:
+def load_step(folder: Path | None, index: int) -> PathStep | None:
     """A view that was written before, or ``None``."""
     if folder is None or not _record(folder, index).is_file():
         return None
@@ -67,6 +67,6 @@ def kept_step(folder: Path | None, index: int) -> Step | None:
     with Image.open(_picture(folder, index, "result")) as file:
         frame = np.array(file)
     with np.load(_record(folder, index), allow_pickle=False) as stored:
-        return Step(
+        return PathStep(
             index, float(stored["hole_share"]), stored["texels"], stored["values"], frame, bool(stored["skipped"])
         )

@@ -59,9 +59,9 @@ def silhouette_guard(
         Scalar or ``(H, W)`` from `pose_sigma_px`: at a silhouette that of its nearer side decides.
     """
     jump = depth_jumps(depth_m, ratio=ratio)
-    trust = np.isfinite(depth_m).astype(np.float32)
+    confidence = np.isfinite(depth_m).astype(np.float32)
     if not jump.any():
-        return trust
+        return confidence
     sigma = np.broadcast_to(np.asarray(sigma_px, np.float32), depth_m.shape)
     # A silhouette moves as its nearer side does.
     worst = cv2.dilate(np.where(jump, np.minimum(sigma, _WIDEST_PX), 0.0).astype(np.float32), np.ones((3, 3), np.uint8))
@@ -71,7 +71,7 @@ def silhouette_guard(
     at_jump = np.zeros(int(label.max()) + 1, np.float32)
     at_jump[label[jump]] = worst[jump]
     share = np.clip(away / (1.0 + 1.5 * at_jump[label]), 0.0, 1.0)
-    return trust * (share * share * (3.0 - 2.0 * share)).astype(np.float32)
+    return confidence * (share * share * (3.0 - 2.0 * share)).astype(np.float32)
 
 
 def picture_mask(image: np.ndarray, mask: np.ndarray, depth_m: np.ndarray, *, near_m: float) -> np.ndarray:

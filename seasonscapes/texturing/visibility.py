@@ -11,16 +11,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from seasonscapes.cameras.pinhole import Camera
-from seasonscapes.rendering.gather import Occluder
+from seasonscapes.rendering.hemisphere_rays import RayScene
 from seasonscapes.rendering.sightlines import clear_sight, faces_met
-from seasonscapes.texturing.tiles import TexelSurface
+from seasonscapes.texturing.atlas_tiles import TexelSurface
 
 # Half the side of the pixels around a texel's own that `by_depth` may agree with, and its tolerance.
 _DEPTH_TOLERANCE = 0.005
 
 
 @dataclass(frozen=True)
-class Sight:
+class ProjectedTexels:
     """A camera's picture of N places: where they fall in it, and how.
 
     Parameters
@@ -40,11 +40,11 @@ class Sight:
     cosine: np.ndarray
     inside: np.ndarray
 
-    def __getitem__(self, key) -> Sight:
-        return Sight(*(getattr(self, name)[key] for name in self.__dataclass_fields__))
+    def __getitem__(self, key) -> ProjectedTexels:
+        return ProjectedTexels(*(getattr(self, name)[key] for name in self.__dataclass_fields__))
 
 
-def sight_of(camera: Camera, surface: TexelSurface) -> Sight:
+def project_texels(camera: Camera, surface: TexelSurface) -> ProjectedTexels:
     """Project places into a camera's frame; nothing of what stands between is known yet."""
     pose = camera.world_from_camera
     offset = surface.position_m - pose[:3, 3]
@@ -55,11 +55,11 @@ def sight_of(camera: Camera, surface: TexelSurface) -> Sight:
         scale = np.where(local[:, 2] > 0.0, 1.0 / local[:, 2], np.nan)
         x, y = camera.fx * local[:, 0] * scale + camera.cx, camera.fy * local[:, 1] * scale + camera.cy
         inside = (x >= 0.0) & (x < camera.width_px) & (y >= 0.0) & (y < camera.height_px) & (cosine > 0.0)
-    return Sight(np.stack([x, y], axis=-1), distance, cosine, inside)
+    return ProjectedTexels(np.stack([x, y], axis=-1), distance, cosine, inside)
 
 
 def by_ray(
-    terrain: Occluder, camera: Camera, surface: TexelSurface, sight: Sight, *, lift_m: float | None = None
+    terrain: RayScene, camera: Camera, surface: TexelSurface, sight: ProjectedTexels, *, lift_m: float | None = None
 ) -> np.ndarray:
     """Whether a camera sees places, ``(N,)`` bool, by one shadow ray each; see `sightlines.clear_sight`."""
     seen = sight.inside.copy()
@@ -71,7 +71,7 @@ def by_ray(
     return seen
 
 
-def by_depth(depth_m: np.ndarray, sight: Sight, *, tolerance: float = _DEPTH_TOLERANCE) -> np.ndarray:
+def by_depth(depth_m: np.ndarray, sight: ProjectedTexels, *, tolerance: float = _DEPTH_TOLERANCE) -> np.ndarray:
     """The same by a depth map ``(H, W)`` [m]: within a share ``tolerance`` of what the place's pixel shows."""
     seen = sight.inside.copy()
     index = np.flatnonzero(seen)
@@ -80,7 +80,7 @@ def by_depth(depth_m: np.ndarray, sight: Sight, *, tolerance: float = _DEPTH_TOL
     return seen
 
 
-def by_faces(terrain: Occluder, camera: Camera, surface: TexelSurface, sight: Sight) -> np.ndarray:
+def by_faces(terrain: RayScene, camera: Camera, surface: TexelSurface, sight: ProjectedTexels) -> np.ndarray:
     """The same by faces: all of a face of which any pixel was met."""
     met = np.unique(faces_met(terrain, camera))
     return sight.inside & np.isin(surface.face, met[met >= 0])

@@ -27,11 +27,11 @@ def texel_weight(cosine: np.ndarray, px_per_texel: np.ndarray) -> np.ndarray:
     return (np.maximum(cosine, 0.0) * (np.minimum(px_per_texel, _ENOUGH_PX) / _ENOUGH_PX) ** 2).astype(np.float32)
 
 
-def exposure_trust(image: np.ndarray) -> np.ndarray:
+def exposure_confidence(image: np.ndarray) -> np.ndarray:
     """Trust ``(H, W)`` float32 in the tones of a picture ``(H, W, 3)`` in [0, 1]: low near either end, 0 where clipped."""
     brightest = image.max(axis=2)
-    trust = np.where((brightest < BRIGHTEST) & (brightest > DARKEST), 1.0, _EXTREME_TRUST)
-    return np.where(brightest < _CLIPPED, trust, 0.0).astype(np.float32)
+    confidence = np.where((brightest < BRIGHTEST) & (brightest > DARKEST), 1.0, _EXTREME_TRUST)
+    return np.where(brightest < _CLIPPED, confidence, 0.0).astype(np.float32)
 
 
 def sharpened(weight: np.ndarray) -> np.ndarray:
