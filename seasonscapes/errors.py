@@ -1,4 +1,8 @@
-"""The one error that is the user's: a wrong file or flag. It imports nothing, so that the front door opens quickly."""
+"""Exceptions of the package. This module imports nothing heavy, so that the command line starts quickly.
+
+Every exception here describes a mistake in the user's input that the program recognises. The command line prints its
+message as one line and exits with code 2. Any other exception is a bug and keeps its traceback.
+"""
 
 from __future__ import annotations
 
@@ -6,17 +10,21 @@ from pathlib import Path
 from typing import Any
 
 
-class InputError(Exception):
-    """The user's file or flag is wrong. One line: where, what was got, what was expected, and the likely cure.
+class SeasonscapesError(Exception):
+    """Base class of all exceptions that report a problem with the user's input."""
+
+
+class InputError(SeasonscapesError):
+    """A file, key or argument is wrong. The message is one line: where, what was got, what was expected, the cure.
 
     Parameters
     ----------
     where
-        File, file and key, or flag.
+        File, file and key, or argument.
     problem
         What is wrong.
     got, expected, cure
-        What stood there, what should have stood there, and what to do about it.
+        The value found, the value expected, and how to correct it.
     """
 
     def __init__(
@@ -31,3 +39,31 @@ class InputError(Exception):
             parts.append(cure)
         super().__init__("; ".join(" ".join(part.split()) for part in parts))
         self.where, self.problem, self.got, self.expected, self.cure = str(where), problem, got, expected, cure
+
+
+class NoTerrainInView(SeasonscapesError, ValueError):
+    """A camera's image shows no part of the terrain."""
+
+
+class NoUsablePixels(SeasonscapesError, ValueError):
+    """No pixel of the given photographs can be used: all are masked, clipped, too near or show no terrain."""
+
+
+class NotEnoughEvidence(SeasonscapesError, ValueError):
+    """The given points, skyline or overlaps do not determine the unknowns."""
+
+
+class UnreadableImage(SeasonscapesError, ValueError):
+    """A file is not an image that can be decoded."""
+
+
+class InvalidPath(SeasonscapesError, ValueError):
+    """Waypoints do not define a camera path."""
+
+
+class FrameMismatch(SeasonscapesError, ValueError):
+    """A camera, light or terrain belongs to another local frame than the one it is used with, or states none."""
+
+
+class AtlasMismatch(SeasonscapesError, ValueError):
+    """A texture belongs to another UV atlas than the terrain it is used with."""

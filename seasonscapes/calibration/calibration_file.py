@@ -72,13 +72,13 @@ def read_calibration(path: Path) -> CalibratedWebcam:
         pose, size = np.array(record["world_from_camera"], float), [int(v) for v in record["size_px"]]
         projection = record["projection"]
         sigma = {name: float(record["sigma"][name]) for name in PARAMETERS}
+        frame = LocalFrame(**record["frame"])
         if projection == "perspective":
-            view: View = Camera(*size, *numbers, pose)
+            view: View = Camera(*size, *numbers, pose, frame)
         elif projection in PROJECTIONS:
-            view = Panorama(projection, *size, *numbers, pose)
+            view = Panorama(projection, *size, *numbers, pose, frame)
         else:
             raise ValueError(f"projection {projection!r}")
-        frame = LocalFrame(**record["frame"])
         return CalibratedWebcam(str(record["webcam"]), view, float(record["k1"]), sigma, frame)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(path, f"not a calibration record: {error!r}") from None

@@ -126,6 +126,8 @@ def write_transforms(path: Path, views: Sequence[NamedView], frame: LocalFrame) 
 def read_transforms(path: Path) -> tuple[list[NamedView], LocalFrame | None]:
     """Views of a ``transforms.json``, intrinsics per frame or for all, and the frame where it states one."""
     table = read_json(path)
+    origin = table.get("world", {}).get("origin")
+    frame = LocalFrame(**origin) if origin else None
     views = []
     for index, record in enumerate(table.get("frames", [])):
         values = {**{k: v for k, v in table.items() if k != "frames"}, **record}
@@ -142,13 +144,12 @@ def read_transforms(path: Path) -> tuple[list[NamedView], LocalFrame | None]:
         views.append(
             NamedView(
                 record.get("name", record["file_path"]),
-                Camera(*size, *intrinsics, pose),
+                Camera(*size, *intrinsics, pose, frame),
                 record["file_path"],
                 datetime.fromisoformat(stamp) if stamp else None,
             )
         )
-    origin = table.get("world", {}).get("origin")
-    return views, LocalFrame(**origin) if origin else None
+    return views, frame
 
 
 def opencv_from_camera(camera: Camera, k1: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

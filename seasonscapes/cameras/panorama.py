@@ -42,6 +42,8 @@ class Panorama:
     world_from_camera
         Rigid transform ``(4, 4)``, OpenCV axes at the column ``cx``: x right, y down along the axis of rotation, z
         forward. A level camera has y straight down.
+    frame
+        The local frame that ``world_from_camera`` refers to; ``None`` where it is not known. See `pinhole.view_in_frame`.
     """
 
     projection: Projection
@@ -52,6 +54,7 @@ class Panorama:
     cx: float
     cy: float
     world_from_camera: np.ndarray
+    frame: LocalFrame | None = None
 
     def __post_init__(self):
         if self.projection not in PROJECTIONS:
@@ -91,6 +94,7 @@ def panorama_from_angles(
     vertical_fov_deg: float,
     pose: np.ndarray,
     horizon_row_px: float | None = None,
+    frame: LocalFrame | None = None,
 ) -> Panorama:
     """A panorama from its fields of view, its heading at the middle column.
 
@@ -105,7 +109,8 @@ def panorama_from_angles(
     half = np.radians(vertical_fov_deg) / 2.0
     fy = 0.5 * height / (np.tan(half) if projection == "cylindrical" else half)
     row = 0.5 * height if horizon_row_px is None else horizon_row_px
-    return Panorama(projection, width, height, width / np.radians(horizontal_fov_deg), fy, 0.5 * width, row, pose)
+    fx = width / np.radians(horizontal_fov_deg)
+    return Panorama(projection, width, height, fx, fy, 0.5 * width, row, pose, frame)
 
 
 def level_panorama(camera: Camera, frame: LocalFrame, size_px: tuple[int, int]) -> Panorama:
@@ -117,7 +122,7 @@ def level_panorama(camera: Camera, frame: LocalFrame, size_px: tuple[int, int]) 
     pose[:3, :3] = axes.T @ rotation_from_angles(float(np.degrees(np.arctan2(east, north))), 0.0)
     width, height = size_px
     focal = width / (2.0 * np.pi)
-    return Panorama("cylindrical", width, height, focal, focal, 0.5 * width, 0.5 * height, pose)
+    return Panorama("cylindrical", width, height, focal, focal, 0.5 * width, 0.5 * height, pose, frame)
 
 
 def project_panorama(panorama: Panorama, position_m) -> tuple[np.ndarray, np.ndarray]:
@@ -223,7 +228,8 @@ def split_panorama(
             [[np.cos(azimuth), 0.0, np.sin(azimuth)], [0.0, 1.0, 0.0], [-np.sin(azimuth), 0.0, np.cos(azimuth)]]
         )
         pose[:3, :3] = pose[:3, :3] @ turn
-        cameras.append(Camera(width, height, focal, focal, width / 2.0, height / 2.0 + focal * tangent.mean(), pose))
+        centre_row = height / 2.0 + focal * tangent.mean()
+        cameras.append(Camera(width, height, focal, focal, width / 2.0, centre_row, pose, panorama.frame))
     return cameras
 
 

@@ -44,7 +44,7 @@ def camera_of(record: dict, frame: LocalFrame, size_px: tuple[int, int]) -> Came
     pose = np.eye(4)
     pose[:3, :3] = local_axes(frame, latitude, longitude).T @ rotation_from_angles(heading, pitch, roll)
     pose[:3, 3] = enu_from_geodetic(frame, latitude, longitude, height)
-    return Camera(*size_px, *(float(record[name]) for name in _LENS), pose)
+    return Camera(*size_px, *(float(record[name]) for name in _LENS), pose, frame)
 
 
 def save_path(path: Path, cameras: Sequence[Camera], frame: LocalFrame, *, note: dict | None = None) -> None:

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from seasonscapes.frames import LocalFrame, enu_from_geodetic, local_axes
+from seasonscapes.errors import FrameMismatch
+from seasonscapes.frames import LocalFrame, enu_from_geodetic, geodetic_from_enu, local_axes
+
+if TYPE_CHECKING:
+    from seasonscapes.cameras.panorama import Panorama
+
+View = TypeVar("View", "Camera", "Panorama")
 
 
 @dataclass(frozen=True)
@@ -21,6 +28,8 @@ class Camera:
         Focal lengths and principal point [px].
     world_from_camera
         Rigid transform ``(4, 4)`` float64 with OpenCV axes: x right, y down, z forward. World is east-north-up [m].
+    frame
+        The local frame that ``world_from_camera`` refers to; ``None`` where it is not known. See `view_in_frame`.
     """
 
     width_px: int
@@ -30,6 +39,7 @@ class Camera:
     cx: float
     cy: float
     world_from_camera: np.ndarray
+    frame: LocalFrame | None = None
 
     def __post_init__(self):
         pose = np.asarray(self.world_from_camera, float)
@@ -46,6 +56,58 @@ class Camera:
     def position_m(self) -> np.ndarray:
         """Projection centre ``(3,)`` east-north-up [m]."""
         return self.world_from_camera[:3, 3]
+
+
+def pose_in_frame(world_from_camera: np.ndarray, own: LocalFrame, other: LocalFrame) -> np.ndarray:
+    """Express a pose in another local frame: same geodetic position, same angles to its own horizon.
+
+    Parameters
+    ----------
+    world_from_camera
+        Rigid transform ``(4, 4)`` in the frame ``own``.
+    own, other
+        The frame it is in, and the frame it is wanted in.
+
+    Returns
+    -------
+    numpy.ndarray
+        Rigid transform ``(4, 4)`` float64 in the frame ``other``.
+    """
+    latitude, longitude, height = (float(v) for v in geodetic_from_enu(own, world_from_camera[:3, 3]))
+    pose = np.eye(4)
+    turn = local_axes(other, latitude, longitude).T @ local_axes(own, latitude, longitude)
+    pose[:3, :3] = turn @ world_from_camera[:3, :3]
+    pose[:3, 3] = enu_from_geodetic(other, latitude, longitude, height)
+    return pose
+
+
+def view_in_frame(view: View, frame: LocalFrame) -> View:
+    """The same camera or panorama with its pose expressed in ``frame``.
+
+    Raises
+    ------
+    FrameMismatch
+        Where the view does not state the frame of its pose.
+
+    Examples
+    --------
+    >>> from seasonscapes.cameras.pinhole import camera_at, view_in_frame
+    >>> from seasonscapes.frames import LocalFrame
+    >>> here, there = LocalFrame(46.55, 7.98), LocalFrame(46.60, 7.90)
+    >>> camera = camera_at(here, 46.56, 7.99, 1500.0, heading_deg=90.0, pitch_deg=0.0, size_px=(90, 60))
+    >>> moved = view_in_frame(camera, there)
+    >>> moved.frame == there, bool(abs(moved.position_m - camera.position_m).max() > 1000.0)
+    (True, True)
+    """
+    if view.frame is None:
+        raise FrameMismatch(
+            "the camera does not state the local frame of its pose; build it with frame=..., "
+            "for example dataclasses.replace(camera, frame=place.frame)"
+        )
+    if view.frame == frame:
+        return view
+    pose = pose_in_frame(view.world_from_camera, view.frame, frame)
+    return replace(view, world_from_camera=pose, frame=frame)
 
 
 def rotation_from_angles(heading_deg: float, pitch_deg: float, roll_deg: float = 0.0) -> np.ndarray:
@@ -102,7 +164,7 @@ def camera_at(
     pose[:3, 3] = enu_from_geodetic(frame, latitude_deg, longitude_deg, height_m)
     width, height = size_px
     focal = 0.5 * width / np.tan(np.radians(fov_deg) / 2.0)
-    return Camera(width, height, focal, focal, width / 2.0, height / 2.0, pose)
+    return Camera(width, height, focal, focal, width / 2.0, height / 2.0, pose, frame)
 
 
 def project(camera: Camera, position_m) -> tuple[np.ndarray, np.ndarray]:

@@ -108,7 +108,7 @@ def _view(name, matrix, intrinsics, size, file, frame, kind, where) -> Reference
     pose[:3, :3] = local_axes(frame, latitude, longitude).T @ _SEU_FROM_ENU.T @ rotation
     pose[:3, 3] = enu_from_geodetic(frame, latitude, longitude, height)
     webcam, index = _identity(name)
-    camera = Camera(*size, k[0, 0], k[1, 1], k[0, 2], k[1, 2], pose)
+    camera = Camera(*size, k[0, 0], k[1, 1], k[0, 2], k[1, 2], pose, frame)
     return ReferenceView(name, webcam, index, camera, float(k[0, 1]), file)
 
 

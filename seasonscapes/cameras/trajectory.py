@@ -7,7 +7,7 @@ parameter (chord lengths, de Boor 1978) and so is their arc-length form, as long
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -268,7 +268,7 @@ def views_along(
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = rotation, place
         views.append(
-            Camera(waypoints[0].width_px, waypoints[0].height_px, float(fx), float(fy), float(cx), float(cy), pose)
+            replace(waypoints[0], fx=float(fx), fy=float(fy), cx=float(cx), cy=float(cy), world_from_camera=pose)
         )
     return views
 

@@ -140,7 +140,7 @@ def webcam_model(webcam: Webcam, frame: LocalFrame, *, ground_m: float | None = 
         fx = 0.5 * width / np.tan(np.radians(webcam.horizontal_fov_deg) / 2.0)
         fov = webcam.vertical_fov_deg
         fy = fx if fov is None else 0.5 * rows / np.tan(np.radians(fov) / 2.0)
-        return Camera(width, rows, fx, fy, 0.5 * width, 0.5 * rows, pose)
+        return Camera(width, rows, fx, fy, 0.5 * width, 0.5 * rows, pose, frame)
     level = panorama_from_angles(
         webcam.projection,
         (width, rows),
@@ -150,7 +150,8 @@ def webcam_model(webcam: Webcam, frame: LocalFrame, *, ground_m: float | None = 
     )
     tilt = np.radians(webcam.lens_tilt_deg)
     rise = np.tan(tilt) if level.projection == "cylindrical" else tilt
-    return Panorama(level.projection, width, rows, level.fx, level.fy, level.cx, 0.5 * rows + level.fy * rise, pose)
+    horizon_row = 0.5 * rows + level.fy * rise
+    return Panorama(level.projection, width, rows, level.fx, level.fy, level.cx, horizon_row, pose, frame)
 
 
 @dataclass(frozen=True)

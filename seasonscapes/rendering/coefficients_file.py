@@ -16,16 +16,18 @@ import numpy as np
 
 from seasonscapes.cameras.panorama import Panorama
 from seasonscapes.cameras.pinhole import Camera
+from seasonscapes.frames import LocalFrame
 from seasonscapes.rendering.hemisphere_rays import SurfacePoints
 from seasonscapes.rendering.light_clusters import LightClusters, ReceiverCoefficients
 from seasonscapes.rendering.transport import PointCoefficients, SamplingOptions, ViewCoefficients
 
 # A new number wherever the same inputs give other coefficients, or the files other names.
-REVISION = 1
+REVISION = 2
 _KINDS = {
     kind.__name__: kind
     for kind in (
         Camera,
+        LocalFrame,
         Panorama,
         SurfacePoints,
         ReceiverCoefficients,

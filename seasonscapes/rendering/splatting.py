@@ -6,7 +6,7 @@ doi:10.1145/3592433; a pixel's loop ends as soon as nothing more would shine thr
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -42,13 +42,8 @@ class DeviceSplats:
 
 def finer_camera(camera: Camera, times: int) -> Camera:
     """The same view with ``times`` as many pixels along each side."""
-    numbers = (camera.fx, camera.fy, camera.cx, camera.cy)
-    return Camera(
-        camera.width_px * times,
-        camera.height_px * times,
-        *(times * number for number in numbers),
-        camera.world_from_camera,
-    )
+    scaled = {name: times * getattr(camera, name) for name in ("width_px", "height_px", "fx", "fy", "cx", "cy")}
+    return replace(camera, **scaled)
 
 
 def upload_splats(means: np.ndarray, axes: np.ndarray, opacity: np.ndarray) -> DeviceSplats:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from datetime import datetime
 from typing import Protocol
 
 import numpy as np
 
-from seasonscapes.frames import equirectangular_directions
+from seasonscapes.frames import LocalFrame, equirectangular_directions
 
 # Linear Rec.709 weights of luminance (ITU-R BT.709): Y = w · rgb. Photometric RGB means that this Y is in lux or cd/m².
 LUMINANCE_WEIGHTS = np.array([0.2126390, 0.7151687, 0.0721923])
@@ -66,6 +67,10 @@ class Illumination:
         at another sky than the one that lights the valley.
     model
         Name of the sky model and its parameters, for the record.
+    frame
+        The local frame in whose east-north-up axes all directions are given; ``None`` where it is not known.
+    time
+        The instant, aware; ``None`` where the light belongs to no instant.
     """
 
     sky_radiance: np.ndarray
@@ -74,6 +79,8 @@ class Illumination:
     aerial_perspective: AerialPerspective | None = None
     visible_sky: np.ndarray | None = None
     model: dict = field(default_factory=dict)
+    frame: LocalFrame | None = None
+    time: datetime | None = None
 
 
 def luminance(rgb: np.ndarray) -> np.ndarray:

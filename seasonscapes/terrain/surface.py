@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from dataclasses import dataclass, field
@@ -9,6 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from affine import Affine
 
+from seasonscapes.errors import AtlasMismatch
 from seasonscapes.frames import LocalFrame
 
 
@@ -63,16 +65,65 @@ class Texture:
         ``(R, S, 3)`` float32 with row 0 at v = 1: albedo in [0, 1], or radiance [cd/m²], by the name of the variable.
     weight
         ``(R, S)`` float32, 0 where never seen.
+    atlas_id
+        Identity of the UV atlas that the texture belongs to, see `atlas_identity`; ``None`` where it is not known.
     """
 
     values: np.ndarray
     weight: np.ndarray = field(default=None)  # type: ignore[assignment]
+    atlas_id: str | None = None
 
     def __post_init__(self):
         if self.weight is None:
             object.__setattr__(self, "weight", np.ones(self.values.shape[:2], np.float32))
         if self.values.shape[:2] != self.weight.shape:
             raise ValueError(f"Texture: values {self.values.shape} and weight {self.weight.shape} differ in size")
+
+
+def atlas_identity(terrain: Terrain, width_px: int, height_px: int) -> str:
+    """A short name of a UV atlas: equal for equal texture coordinates, faces and texture size.
+
+    Parameters
+    ----------
+    terrain
+        The surface that the atlas belongs to.
+    width_px, height_px
+        Size of its textures [texels].
+
+    Returns
+    -------
+    str
+        16 hexadecimal digits.
+    """
+    digest = hashlib.sha256(f"{width_px}x{height_px}".encode())
+    digest.update(np.ascontiguousarray(terrain.uv, np.float32))
+    digest.update(np.ascontiguousarray(terrain.faces, np.uint32))
+    return digest.hexdigest()[:16]
+
+
+def require_atlas(texture: Texture, atlas_id: str, shape: tuple[int, int], *, what: str = "texture") -> None:
+    """Raise `AtlasMismatch` where a texture belongs to another atlas.
+
+    Parameters
+    ----------
+    texture
+        A texture that states no atlas is judged by its size alone.
+    atlas_id, shape
+        Identity and size (rows, columns) of the atlas that is expected.
+    what
+        What the message calls the texture, such as its file.
+    """
+    size = texture.values.shape[:2]
+    if size != shape:
+        raise AtlasMismatch(
+            f"{what}: belongs to another atlas; got {size[1]} × {size[0]} texels; expected {shape[1]} × {shape[0]}; "
+            "use the --atlas, --texel-m and mesh options that it was made with"
+        )
+    if texture.atlas_id is not None and texture.atlas_id != atlas_id:
+        raise AtlasMismatch(
+            f"{what}: belongs to another atlas of the same size; got {texture.atlas_id}; expected {atlas_id}; "
+            "use the --atlas, --texel-m and mesh options that it was made with"
+        )
 
 
 def save_terrain(terrain: Terrain, path: str | os.PathLike, *, note: dict | None = None) -> None:
@@ -92,13 +143,15 @@ def load_terrain(path: str | os.PathLike) -> tuple[Terrain, dict]:
 
 def save_texture(texture: Texture, path: str | os.PathLike) -> None:
     """Write a texture to one ``.npz`` file; values keep float32, so a texture read back is the same to the bit."""
-    np.savez(path, values=texture.values, weight=texture.weight)
+    known = {} if texture.atlas_id is None else {"atlas_id": texture.atlas_id}
+    np.savez(path, values=texture.values, weight=texture.weight, **known)
 
 
 def load_texture(path: str | os.PathLike) -> Texture:
     """Read what `save_texture` wrote."""
     with np.load(path, allow_pickle=False) as stored:
-        return Texture(stored["values"], stored["weight"])
+        atlas_id = str(stored["atlas_id"]) if "atlas_id" in stored else None
+        return Texture(stored["values"], stored["weight"], atlas_id)
 
 
 def sample_texture(values: np.ndarray, uv: np.ndarray) -> np.ndarray:
