@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -33,12 +33,15 @@ class RenderedView:
         ``(H, W)`` share of each pixel that terrain covers.
     gbuffer
         First surfaces at pixel centres.
+    provenance
+        Plain values for the record: scene, camera, time, sun, sky, samples and the like; written to files.
     """
 
     radiance: np.ndarray
     surface: np.ndarray
     coverage: np.ndarray
     gbuffer: GBuffer
+    provenance: dict = field(default_factory=dict)
 
 
 def mi_path_integrator(max_depth: int) -> Any:
