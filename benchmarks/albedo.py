@@ -257,7 +257,7 @@ def run(args) -> dict[str, float]:
     sunlit = np.stack(
         [sun_on_texels(land, row[0]).sum(axis=1) > 0.02 * row[0].sun.normal_illuminance_lx.sum() for row in lights]
     )
-    judge = Judge(truth, clean.seen, sunlit, held, winter, size)
+    judge = Judge(truth, clean.pixel_count, sunlit, held, winter, size)
     numbers.update(
         texels=float(judge.mask.sum()), texels_never_sunlit=float(judge.never.sum()), relit_ceiling_db=judge.ceiling_db
     )

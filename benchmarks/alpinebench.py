@@ -288,7 +288,7 @@ def numbers_of(bench: Bench, rows: dict, ablated: dict[str, dict], whole: dict) 
         lambda c, at: bench.judge.of_texture(whole["textures"][at], c, at), bench.world.painted_hours, mode="paper"
     )
     numbers |= {f"painted_view_paper_mode_{key}": flattered[key] for key in ("psnr_db", "ssim")}
-    error = albedo_error(bench.world.albedo, whole["albedo"], whole["fit"].seen >= 0.5)
+    error = albedo_error(bench.world.albedo, whole["albedo"], whole["fit"].pixel_count >= 0.5)
     numbers |= {"albedo_psnr_db": error.psnr_db, "albedo_scale_invariant_mae": error.scale_invariant_mae}
     errors = np.array(
         [

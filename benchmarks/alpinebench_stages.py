@@ -282,7 +282,7 @@ class Bench:
     def guided_albedo(self, fit: AlbedoFit) -> np.ndarray:
         """Seen texels' albedo as it is; the others' learned, the satellite's image one guide among others."""
         predictors = predictors_for(self.world.terrain, self.world.atlas, satellite=self.satellite)
-        texture = Texture(fit.albedo, (fit.seen >= 0.5).astype(np.float32))
+        texture = Texture(fit.albedo, (fit.pixel_count >= 0.5).astype(np.float32))
         return np.clip(complete(texture, predictors, fast=True, seed=self.world.seed).values, 0.004, 0.98)
 
     def seen_texels(self) -> np.ndarray:

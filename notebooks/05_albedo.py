@@ -72,7 +72,7 @@ land = trace_texel_transport(
 )
 photographs = prepare_photographs(land, observations, lights)
 fit = solve_albedo(land, photographs, noise_model=EIGHT_BIT)
-seen = fit.seen >= 1.0
+seen = fit.pixel_count >= 1.0
 print(albedo_error(truth, fit.albedo, seen))
 
 # %%

@@ -69,7 +69,7 @@ land = trace_texel_transport(
 )
 photographs = prepare_photographs(land, observations, lights, gains=[np.ones(3)] * len(lights))
 closed = solve_albedo(land, photographs)
-seen = closed.seen >= 1.0
+seen = closed.pixel_count >= 1.0
 grey = replace(closed, albedo=np.full_like(truth, 0.2), gains=1.2 * closed.gains)
 errors = []
 

@@ -41,7 +41,7 @@ class Case:
     cameras: list[Camera]
     lights: list[Illumination]
     pictures: list[list[np.ndarray]]
-    land: TexelTransport
+    transport: TexelTransport
 
     def observations(self, times=None, *, image_of=lambda image: image) -> tuple[list[Observation], list[Illumination]]:
         """Observations of some of the hours, and the light of each."""
@@ -73,10 +73,10 @@ def case() -> Case:
         ]
         for t, light in enumerate(lights)
     ]
-    land = trace_texel_transport(
+    transport = trace_texel_transport(
         terrain, albedo.shape[:2], sampling=SamplingOptions(subpixels=1, rays=128, listed=64, clusters=1024, rank=24)
     )
-    return Case(place, terrain, albedo, cameras, lights, pictures, land)
+    return Case(place, terrain, albedo, cameras, lights, pictures, transport)
 
 
 def _camera(terrain: Terrain, azimuth_deg: float, distance_m: float, above_m: float, pitch_deg: float) -> Camera:

@@ -35,12 +35,12 @@ def place() -> Case:
 @pytest.fixture(scope="module")
 def photographs(place) -> list[AlbedoPhotograph]:
     observations, lights = place.observations()
-    return prepare_photographs(place.land, observations, lights, gains=[np.ones(3)] * len(observations))
+    return prepare_photographs(place.transport, observations, lights, gains=[np.ones(3)] * len(observations))
 
 
 @pytest.fixture(scope="module")
 def clean(place, photographs):
-    return solve_albedo(place.land, photographs)
+    return solve_albedo(place.transport, photographs)
 
 
 def webcam_shots(place, photographs, faults, seed=3) -> list[AlbedoPhotograph]:
@@ -65,9 +65,9 @@ def test_footprints_equal_path_tracing(place, photographs):
     """The true albedo through footprints and daylight of texels is what a path tracer sees."""
     ratios = []
     for photograph in photographs:
-        ambient = ambient_on_texels(place.land, photograph.light, place.albedo)
+        ambient = ambient_on_texels(place.transport, photograph.light, place.albedo)
         seen = predicted_surface_radiance(
-            photograph.footprints, photograph.number, (photograph.light, ambient), place.albedo.reshape(-1, 3)
+            photograph.footprints, photograph.number, photograph.light, ambient, place.albedo.reshape(-1, 3)
         )
         whole = photograph.footprints.coverage > 0.999
         ratios.append(
@@ -89,7 +89,7 @@ def test_rows_are_means_of_the_texture(photographs):
 def test_adjoint_is_the_transpose(place, photographs):
     rng = np.random.default_rng(0)
     row = equations.equations_of(photographs[4], EIGHT_BIT, place.albedo.size // 3)
-    row.ambient = ambient_on_texels(place.land, photographs[4].light, place.albedo)
+    row.ambient = ambient_on_texels(place.transport, photographs[4].light, place.albedo)
     a = rng.random((place.albedo.size // 3, 3), np.float32)
     model, _ = equations.forward_product(row, a)
     r = rng.random(model.shape, np.float32)
@@ -101,7 +101,7 @@ def test_adjoint_is_the_transpose(place, photographs):
 
 
 def test_clean_pictures_give_the_albedo(place, clean):
-    seen = clean.seen >= 1.0
+    seen = clean.pixel_count >= 1.0
     assert psnr(clean.albedo, place.albedo, seen) > 30.0
     assert np.abs(clean.albedo - place.albedo)[seen].sum() / place.albedo[seen].sum() < 0.04
     assert np.median(clean.albedo[seen] / place.albedo[seen]) == pytest.approx(1.0, abs=0.01)
@@ -112,26 +112,26 @@ def test_never_sunlit_texels_are_as_good(place, photographs, clean):
     for photograph in photographs:
         for values in photograph.footprints.sunlit[photograph.number]:
             lit |= np.bincount(photograph.footprints.texel, values, len(lit)) > 0.0
-    shaded = (clean.seen >= 2.0) & ~lit.reshape(clean.seen.shape)
+    shaded = (clean.pixel_count >= 2.0) & ~lit.reshape(clean.pixel_count.shape)
     assert shaded.sum() > 20
     assert np.abs(clean.albedo - place.albedo)[shaded].sum() / place.albedo[shaded].sum() < 0.08
 
 
 def test_webcam_pictures(place, photographs):
     fit = solve_albedo(
-        place.land,
+        place.transport,
         webcam_shots(place, photographs, WebcamFaults(tone_strength=0.0)),
         noise_model=EIGHT_BIT,
         solver=QUICK,
     )
-    assert psnr(fit.albedo, place.albedo, fit.seen >= 1.0) > 24.0
+    assert psnr(fit.albedo, place.albedo, fit.pixel_count >= 1.0) > 24.0
 
 
 def test_corrections_are_far_behind(place, photographs, clean):
     painted = painted_radiance(photographs, clean.gains)
     normal = np.tile([0.0, 0.0, 1.0], (place.albedo.size // 3, 1))
-    normal[place.land.texel] = place.land.normal
-    seen, best = clean.seen >= 1.0, 0.0
+    normal[place.transport.texel] = place.transport.normal
+    seen, best = clean.pixel_count >= 1.0, 0.0
     for light, radiance in zip(place.lights, painted.values(), strict=True):
         slopes = corrections.slopes_under(normal, light.sun.direction)
         ground = luminaries(light)[0].normal_illuminance_lx * light.sun.direction[2]
@@ -151,9 +151,9 @@ def test_wrong_light_is_clearly_worse(place, clean, wrong):
         azimuth = azimuth + 16.0 if wrong == "hour" else -azimuth
         turned[id(light)] = hosek_illumination(direction_from_angles(azimuth, elevation), shape=(64, 128))
     lights = [turned[id(light)] for light in lights]
-    photographs = prepare_photographs(place.land, observations, lights, gains=[np.ones(3)] * len(lights))
-    fit = solve_albedo(place.land, photographs, solver=QUICK)
-    seen = clean.seen >= 1.0
+    photographs = prepare_photographs(place.transport, observations, lights, gains=[np.ones(3)] * len(lights))
+    fit = solve_albedo(place.transport, photographs, solver=QUICK)
+    seen = clean.pixel_count >= 1.0
     assert psnr(fit.albedo, place.albedo, seen) < psnr(clean.albedo, place.albedo, seen) - (
         4.0 if wrong == "hour" else 8.0
     )
@@ -162,7 +162,7 @@ def test_wrong_light_is_clearly_worse(place, clean, wrong):
 
 def test_response_curve_is_found(place, photographs):
     bent = webcam_shots(place, photographs, WebcamFaults(tone_strength=0.4, exposure_sigma_ev=0.2))
-    found = tone_curve.fit_tone_curve(place.land, bent, share=0.5)
+    found = tone_curve.fit_tone_curve(place.transport, bent, share=0.5)
     assert found.strength == pytest.approx(0.4, abs=0.15)
     levels = np.linspace(0.0, 1.0, 50)
     curve = 0.6 * levels + 0.4 * levels**2 * (3.0 - 2.0 * levels)
@@ -197,7 +197,7 @@ def test_visibility_is_found(place, photographs):
     def lights_of(visibility_km):
         return [replace(photograph.light, aerial_perspective=Fog(visibility_km)) for photograph in photographs]
 
-    found = haze.fit_visibility(place.land, hazy, lights_of, visibilities_km=(2.5, 4.0, 8.0, 16.0), share=0.5)
+    found = haze.fit_visibility(place.transport, hazy, lights_of, visibilities_km=(2.5, 4.0, 8.0, 16.0), share=0.5)
     assert found.visibility_km == pytest.approx(true_km, rel=0.15)
     mixed = haze.mixed_light(lights_of(4.0)[0], lights_of(8.0)[0], 0.5).aerial_perspective
     between = 1.0 / (0.5 / 4.0 + 0.5 / 8.0)
@@ -209,8 +209,8 @@ def test_visibility_is_found(place, photographs):
 
 
 def test_a_single_picture_still_answers(place, photographs):
-    fit = solve_albedo(place.land, photographs[6:7], solver=QUICK)
-    seen = fit.seen >= 1.0
+    fit = solve_albedo(place.transport, photographs[6:7], solver=QUICK)
+    seen = fit.pixel_count >= 1.0
     assert seen.sum() > 100
     assert psnr(fit.albedo, place.albedo, seen) > 22.0
 
@@ -220,7 +220,7 @@ def test_all_clipped_is_an_error(place, photographs):
         replace(s, observation=replace(s.observation, image=np.ones_like(s.observation.image))) for s in photographs
     ]
     with pytest.raises(ValueError, match="all clipped"):
-        solve_albedo(place.land, white, noise_model=EIGHT_BIT)
+        solve_albedo(place.transport, white, noise_model=EIGHT_BIT)
 
 
 def test_night_is_an_error(place, photographs):
@@ -233,13 +233,13 @@ def test_night_is_an_error(place, photographs):
         for s in photographs
     ]
     with pytest.raises(ValueError, match="no photograph has any light"):
-        solve_albedo(place.land, dark)
+        solve_albedo(place.transport, dark)
 
 
 def test_nothing_fixes_the_exposure(place, photographs):
     blind = [replace(s, gain=None, observation=replace(s.observation, mask=mask_of_terrain(s))) for s in photographs]
     with pytest.raises(ValueError, match="nothing fixes the exposure"):
-        solve_albedo(place.land, blind)
+        solve_albedo(place.transport, blind)
 
 
 def mask_of_terrain(photograph) -> np.ndarray:
@@ -254,8 +254,8 @@ def test_contradicting_times_are_outvoted(place, photographs, clean):
     swapped[0] = replace(
         photographs[0], observation=replace(photographs[0].observation, image=photographs[9].observation.image)
     )
-    fit = solve_albedo(place.land, swapped)
-    seen = clean.seen >= 1.0
+    fit = solve_albedo(place.transport, swapped)
+    seen = clean.pixel_count >= 1.0
     assert psnr(fit.albedo, place.albedo, seen) > psnr(clean.albedo, place.albedo, seen) - 6.0
     assert np.argmax(fit.residual) == 0
 
@@ -289,36 +289,36 @@ def test_gradients_equal_finite_differences(place, photographs, name):
 
 
 def test_refinement_saves_resumes_and_takes_extras(place, photographs, clean, tmp_path):
-    poor = solve_albedo(place.land, photographs, solver=SolverOptions(rounds=1))
-    seen = clean.seen >= 1.0
+    poor = solve_albedo(place.transport, photographs, solver=SolverOptions(rounds=1))
+    seen = clean.pixel_count >= 1.0
     told, file = [], tmp_path / "state.npz"
     options = InverseOptions(unknowns=("albedo",), levels=(1,), iterations=24, check_every=8, spp=8)
     done = refine_albedo(
-        place.terrain, place.land, photographs, poor, options=options, callbacks=[told.append], resume=file
+        place.terrain, place.transport, photographs, poor, options=options, callbacks=[told.append], resume=file
     )
     assert psnr(done.fit.albedo, place.albedo, seen) > psnr(poor.albedo, place.albedo, seen)
     assert len(told) == len(done.history)
     assert any("held_out" in record for record in done.history)
-    again = refine_albedo(place.terrain, place.land, photographs, poor, options=options, resume=file)
+    again = refine_albedo(place.terrain, place.transport, photographs, poor, options=options, resume=file)
     assert len(again.history) == len(done.history), "a finished state has nothing left to do"
     brighter = {SKY: ExtraUnknown(np.array([1.3]), low=0.1, high=3.0, step=0.02)}
     options = InverseOptions(unknowns=(), levels=(1,), iterations=20, check_every=5, spp=4)
-    found = refine_albedo(place.terrain, place.land, photographs, clean, options=options, extra=brighter)
+    found = refine_albedo(place.terrain, place.transport, photographs, clean, options=options, extra=brighter)
     assert abs(found.values[SKY][0] - 1.0) < 0.2, "the sky's own scale is found again"
 
 
 def test_refinement_refuses(place, photographs, clean):
     with pytest.raises(ValueError, match="two photographs"):
-        refine_albedo(place.terrain, place.land, photographs[:1], clean)
+        refine_albedo(place.terrain, place.transport, photographs[:1], clean)
     with pytest.raises(ValueError, match="colour"):
-        refine_albedo(place.terrain, place.land, photographs, clean, options=InverseOptions(unknowns=("colour",)))
+        refine_albedo(place.terrain, place.transport, photographs, clean, options=InverseOptions(unknowns=("colour",)))
 
 
 # ---------------------------------------------------------------------------------------------- uncertainty, seasons
 
 
 def test_uncertainty_ranks_errors_and_gaps_are_marked(place, photographs, clean):
-    known = known_albedo(place.land, photographs, clean)
+    known = known_albedo(place.transport, photographs, clean)
     measured = known.source == 1
     error = np.abs(known.albedo - place.albedo)[..., 1]
     low, high = np.quantile(known.sigma[measured], [0.33, 0.67])
@@ -333,7 +333,7 @@ def test_gaps_are_completed_and_marked(place, photographs, clean):
     """From relief alone they beat one colour for all; from an image that is too dark and noisy, by far."""
     height, width = place.albedo.shape[:2]
     predictors = predictors_for(place.terrain, measure_atlas(place.terrain, "planar", width, height))
-    known = known_albedo(place.land, photographs, clean)
+    known = known_albedo(place.transport, photographs, clean)
     measured = known.source == 1
     gap = predictors.surface & ~measured
 
@@ -350,7 +350,7 @@ def test_gaps_are_completed_and_marked(place, photographs, clean):
     image = np.maximum(image, 0.01).astype(np.float32)
     corrected = complete_known(known, clean, image, predictors)
     assert error(corrected.albedo) < 0.6 * min(error(bare.albedo), error(image))
-    seen = clean.seen >= 0.5
+    seen = clean.pixel_count >= 0.5
     poor = seen & (finite_sigma(clean) > np.quantile(finite_sigma(clean)[seen], 0.9))
     well = seen & (finite_sigma(clean) < np.median(finite_sigma(clean)[seen]))
     before, after = (np.abs(values - place.albedo).mean(axis=2) for values in (clean.albedo, corrected.albedo))

@@ -1,6 +1,6 @@
-"""What remote sensing does against relief: cosine, Minnaert, C and SCS+C corrections. Here as rivals to be measured.
+"""Topographic correction of remote sensing images: cosine, Minnaert, C and SCS+C corrections, as baselines.
 
-All work on a radiance texture and the cosine of incidence alone: no cast shadows, no sky, no interreflection. With
+All operate on a radiance texture and the cosine of incidence alone: no cast shadows, no sky, no interreflection. With
 θ the sun's zenith angle, i the angle of incidence, α the slope:
 
 * cosine: L cos θ / cos i (Teillet, Guindon & Goodenough 1982, doi:10.1080/07038992.1982.10855028)
@@ -16,13 +16,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# Faces that the sun grazes: every correction blows up there, and all of them are used with a limit.
+# Lower limit of the cosine of incidence: every correction diverges at grazing incidence and is applied with a limit.
 _LEAST_COSINE = 0.1
 
 
 @dataclass(frozen=True)
 class Slopes:
-    """How a surface stands to the sun, ``(N,)`` each: cosine of incidence, cosine of its slope; and cos θ of the sun."""
+    """Orientation of N surface points relative to the sun.
+
+    Parameters
+    ----------
+    incidence
+        ``(N,)`` cosine of the angle of incidence.
+    slope
+        ``(N,)`` cosine of the slope.
+    zenith
+        Cosine of the sun's zenith angle.
+    """
 
     incidence: np.ndarray
     slope: np.ndarray
@@ -30,18 +40,57 @@ class Slopes:
 
 
 def slopes_under(normal: np.ndarray, sun_direction: np.ndarray) -> Slopes:
-    """Slopes of unit normals ``(N, 3)`` ENU under a sun."""
+    """Compute incidence and slope cosines of surface normals under a sun.
+
+    Parameters
+    ----------
+    normal
+        ``(N, 3)`` unit normals, ENU.
+    sun_direction
+        ``(3,)`` unit vector towards the sun, ENU.
+
+    Returns
+    -------
+    Slopes
+        Cosines of incidence, slope and zenith angle.
+    """
     sun = np.asarray(sun_direction, float)
     return Slopes(normal @ sun, normal[:, 2].astype(float), float(sun[2]))
 
 
 def cosine(radiance: np.ndarray, slopes: Slopes) -> np.ndarray:
-    """Cosine correction of ``(N, 3)``; NaN where the surface turns away from the sun, as in all of these."""
+    """Apply the cosine correction.
+
+    Parameters
+    ----------
+    radiance
+        ``(N, 3)``, any unit.
+    slopes
+        Orientation of the N points.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(N, 3)`` radiance as on flat ground; NaN where the surface faces away from the sun.
+    """
     return radiance * (slopes.zenith / _lit(slopes))[:, None]
 
 
 def minnaert(radiance: np.ndarray, slopes: Slopes) -> np.ndarray:
-    """Minnaert correction of ``(N, 3)``, one k for each channel."""
+    """Apply the Minnaert correction, with one exponent k per channel.
+
+    Parameters
+    ----------
+    radiance
+        ``(N, 3)``, any unit.
+    slopes
+        Orientation of the N points.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(N, 3)`` radiance as on flat ground; NaN where the surface faces away from the sun.
+    """
     ratio = slopes.zenith / _lit(slopes)
     corrected = np.full(radiance.shape, np.nan)
     for channel in range(radiance.shape[1]):
@@ -53,12 +102,38 @@ def minnaert(radiance: np.ndarray, slopes: Slopes) -> np.ndarray:
 
 
 def c_correction(radiance: np.ndarray, slopes: Slopes) -> np.ndarray:
-    """C correction of ``(N, 3)``."""
+    """Apply the C correction.
+
+    Parameters
+    ----------
+    radiance
+        ``(N, 3)``, any unit.
+    slopes
+        Orientation of the N points.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(N, 3)`` radiance as on flat ground; NaN where the surface faces away from the sun.
+    """
     return _with_c(radiance, slopes, np.full(len(radiance), slopes.zenith))
 
 
 def scs_c(radiance: np.ndarray, slopes: Slopes) -> np.ndarray:
-    """SCS+C correction of ``(N, 3)``."""
+    """Apply the SCS+C (sun-canopy-sensor) correction.
+
+    Parameters
+    ----------
+    radiance
+        ``(N, 3)``, any unit.
+    slopes
+        Orientation of the N points.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(N, 3)`` radiance as on flat ground; NaN where the surface faces away from the sun.
+    """
     return _with_c(radiance, slopes, slopes.slope * slopes.zenith)
 
 
@@ -71,10 +146,12 @@ CORRECTIONS: dict[str, Callable[[np.ndarray, Slopes], np.ndarray]] = {
 
 
 def _lit(slopes: Slopes) -> np.ndarray:
+    """Limited cosine of incidence ``(N,)``; NaN where the surface faces away from the sun."""
     return np.where(slopes.incidence > 0.0, np.maximum(slopes.incidence, _LEAST_COSINE), np.nan)
 
 
-def _with_c(radiance: np.ndarray, slopes: Slopes, level: np.ndarray) -> np.ndarray:
+def _with_c(radiance: np.ndarray, slopes: Slopes, reference: np.ndarray) -> np.ndarray:
+    """L (reference + c) / (cos i + c), with c by regression for each channel."""
     corrected = np.full(radiance.shape, np.nan)
     lit = _lit(slopes)
     for channel in range(radiance.shape[1]):
@@ -83,7 +160,7 @@ def _with_c(radiance: np.ndarray, slopes: Slopes, level: np.ndarray) -> np.ndarr
         if keep.sum() <= 10:
             continue
         gradient, intercept = np.polyfit(slopes.incidence[keep], values[keep], 1)
-        # A falling regression has no meaning; a large c then leaves the picture as it is.
+        # A negative gradient has no physical meaning; a large c leaves the radiance unchanged.
         c = intercept / gradient if gradient > 1e-12 else 1e6
-        corrected[:, channel] = values * (level + c) / np.maximum(lit + c, 0.05)
+        corrected[:, channel] = values * (reference + c) / np.maximum(lit + c, 0.05)
     return corrected

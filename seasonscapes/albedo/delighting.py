@@ -1,7 +1,7 @@
-"""Light out of pictures that lie on the texture already: orthophotos, satellite scenes, a user's lit texture.
+"""Albedo from lit textures: orthophotos, satellite scenes and other images that are already in texture space.
 
-Here the footprint of a texel is itself, so the closed form is a robust mean: albedo = π Σ w E L / Σ w E². Interreflection
-is iterated as it is for photographs.
+Each texel is its own footprint, so the closed form reduces to a robust mean: albedo = π Σ w E L / Σ w E².
+Interreflection is iterated as for photographs.
 """
 
 from __future__ import annotations
@@ -16,48 +16,60 @@ from seasonscapes.sky.illumination import Illumination
 
 
 def delight_textures(
-    land: TexelTransport,
+    transport: TexelTransport,
     radiance: Sequence[np.ndarray],
     lights: Sequence[Illumination],
     *,
     rounds: int = 4,
     model: float = 0.05,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Albedo ``(R, S, 3)`` of lit textures, and the mean illuminance it rests on ``(R, S, 3)`` [lx]; NaN where unknown.
+    """Estimate the albedo of lit textures by dividing out their illuminance.
 
     Parameters
     ----------
+    transport
+        Daylight coefficients of the texels.
     radiance
-        ``(R, S, 3)`` [cd/m²] each, NaN where a texture knows nothing.
+        ``(R, S, 3)`` [cd/m²] each, NaN where a texture has no value.
     lights
-        Of each texture.
+        Illumination of each texture.
+    rounds
+        Iterations of interreflection and robust weights.
     model
-        Relative error of modelled light; residuals beyond a few of these count little.
+        Relative error of the modelled light; residuals beyond a few multiples of it are down-weighted.
+
+    Returns
+    -------
+    tuple of numpy.ndarray
+        Albedo ``(R, S, 3)`` and the mean illuminance behind it ``(R, S, 3)`` [lx]; NaN where unknown.
 
     Raises
     ------
     ValueError
-        No texture, not one light for each, or textures of another size than the land's.
+        If there is no texture, not one light for each, or a texture whose size differs from the transport's.
     """
     if not radiance or len(radiance) != len(lights):
-        raise ValueError(f"texture_albedo: got {len(radiance)} textures and {len(lights)} lights, one of each expected")
-    if any(one.shape[:2] != land.shape for one in radiance):
-        raise ValueError(f"texture_albedo: textures must be {land.shape} like the land's")
-    values = np.stack([one.reshape(-1, 3) for one in radiance]).astype(np.float32)
+        raise ValueError(
+            f"delight_textures: got {len(radiance)} textures and {len(lights)} lights, expected one light per texture"
+        )
+    if any(texture.shape[:2] != transport.shape for texture in radiance):
+        raise ValueError(f"delight_textures: textures must have the transport's shape {transport.shape}")
+    values = np.stack([texture.reshape(-1, 3) for texture in radiance]).astype(np.float32)
     known = np.isfinite(values)
     values = np.where(known, values, 0.0)
-    suns = np.stack([sun_on_texels(land, light) for light in lights])
-    albedo = np.full((land.shape[0] * land.shape[1], 3), 0.25, np.float32)
+    direct = np.stack([sun_on_texels(transport, light) for light in lights])
+    albedo = np.full((transport.shape[0] * transport.shape[1], 3), 0.25, np.float32)
     for number in range(rounds):
-        reflecting = np.nan_to_num(albedo, nan=0.25).reshape(*land.shape, 3)
-        light = suns + np.stack([ambient_on_texels(land, one, reflecting) for one in lights])
-        weight = known / np.maximum((model * light) ** 2, 1e-12)
+        reflecting = np.nan_to_num(albedo, nan=0.25).reshape(*transport.shape, 3)
+        illuminance = direct + np.stack([ambient_on_texels(transport, light, reflecting) for light in lights])
+        weight = known / np.maximum((model * illuminance) ** 2, 1e-12)
         if number and len(values) > 2:
-            apart = np.pi * values / np.maximum(light, 1e-6) / np.maximum(albedo, LOWEST) - 1.0
-            weight = weight / (1.0 + (apart / (2.385 * model)) ** 2)
-        bottom = (weight * light * light).sum(axis=0)
+            residual = np.pi * values / np.maximum(illuminance, 1e-6) / np.maximum(albedo, LOWEST) - 1.0
+            weight = weight / (1.0 + (residual / (2.385 * model)) ** 2)
+        denominator = (weight * illuminance * illuminance).sum(axis=0)
         with np.errstate(invalid="ignore", divide="ignore"):
-            albedo = np.where(bottom > 0.0, np.pi * (weight * light * values).sum(axis=0) / bottom, np.nan)
+            numerator = (weight * illuminance * values).sum(axis=0)
+            albedo = np.where(denominator > 0.0, np.pi * numerator / denominator, np.nan)
         albedo = np.clip(albedo, LOWEST, HIGHEST)
-    mean = np.where(known, light, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
-    return albedo.reshape(*land.shape, 3).astype(np.float32), mean.reshape(*land.shape, 3)
+    mean = np.where(known, illuminance, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    return albedo.reshape(*transport.shape, 3).astype(np.float32), mean.reshape(*transport.shape, 3)

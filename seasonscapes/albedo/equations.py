@@ -1,4 +1,4 @@
-"""The equations of photographs: their radiance is linear in the texture; its transpose, and the weights of residuals."""
+"""Linear equations of photographs: radiance as a linear function of the texels, its adjoint, and residual weights."""
 
 from __future__ import annotations
 
@@ -11,26 +11,50 @@ from seasonscapes.albedo.forward_model import aerial_perspective_of, sky_radianc
 from seasonscapes.albedo.photographs import AlbedoPhotograph, NoiseModel
 from seasonscapes.rendering.receivers import luminaries
 
-# Sky pixels that fix a gain, and how far they keep from sun and moon, whose glare and disc say nothing.
+# Sky pixels needed to fix a gain, and their least distance from sun and moon, whose disc and glare are not modelled.
 _FEWEST_SKY, _GLARE_DEG = 100, 8.0
 
 
 @dataclass
 class PhotographEquations:
-    """The equations of one photograph; weights change from round to round."""
+    """Equations of one photograph with n terrain pixels and K sky pixels; the weights change in each round.
+
+    Parameters
+    ----------
+    photograph
+        Its source.
+    picture
+        ``(n, 3)`` linear values of the terrain pixels.
+    usable
+        ``(n, 3)`` bool.
+    noise
+        ``(n, 3)`` standard deviation of ``picture``.
+    transmittance, airlight
+        ``(n, 3)`` of the air in front of the terrain; airlight in [cd/m²].
+    sky_picture, sky_radiance
+        ``(K, 3)`` linear values of sky pixels, and their modelled radiance [cd/m²].
+    ambient
+        ``(R·S, 3)`` illuminance of the texels from sky and interreflection [lx].
+    inverse_gain
+        ``(3,)`` radiance over pixel value.
+    luminary_lx
+        Normal illuminance ``(3,)`` [lx] of each luminary.
+    weight
+        ``(n, 3)`` inverse variances [1 / (cd/m²)²]; ``None`` before the first `reweight`.
+    """
 
     photograph: AlbedoPhotograph
-    picture: np.ndarray  # (n, 3)
-    usable: np.ndarray  # (n, 3) bool
-    noise: np.ndarray  # (n, 3) standard deviation of the picture
+    picture: np.ndarray
+    usable: np.ndarray
+    noise: np.ndarray
     transmittance: np.ndarray
     airlight: np.ndarray
-    sky_picture: np.ndarray  # (K, 3)
+    sky_picture: np.ndarray
     sky_radiance: np.ndarray
-    ambient: np.ndarray  # (R·S, 3)
-    inverse_gain: np.ndarray  # (3,)
-    suns: list[np.ndarray]
-    weight: np.ndarray | None = None  # (n, 3)
+    ambient: np.ndarray
+    inverse_gain: np.ndarray
+    luminary_lx: list[np.ndarray]
+    weight: np.ndarray | None = None
 
     @property
     def projected(self) -> bool:
@@ -39,28 +63,43 @@ class PhotographEquations:
 
 
 def equations_of(photograph: AlbedoPhotograph, noise_model: NoiseModel, size: int) -> PhotographEquations:
-    """Pick the photograph's terrain and sky pixels and say how far each is to be trusted."""
+    """Select the terrain and sky pixels of a photograph and estimate their noise.
+
+    Parameters
+    ----------
+    photograph
+        With light and footprints.
+    noise_model
+        Standard deviations and clipping limits.
+    size
+        Number of texels, R·S.
+
+    Returns
+    -------
+    PhotographEquations
+        With zero ambient illuminance and no weights yet.
+    """
     footprints, observation = photograph.footprints, photograph.observation
     picture = observation.image.reshape(-1, 3)
     usable = observation.mask.ravel() & np.isfinite(picture).all(axis=1)
     if noise_model.levels is not None:
         # One clipped channel clips the pixel: demosaicing and JPEG mix the channels.
         usable = usable & (picture.max(axis=1) < noise_model.white) & (picture.max(axis=1) > noise_model.black)
-    terrain, sky = footprints.pixel, photograph.seen.sky.pixel
+    terrain, sky = footprints.pixel, photograph.atmosphere.sky.pixel
     whole = whole_pixels(footprints) & usable[terrain]
-    transmittance, airlight = aerial_perspective_of(photograph.seen, photograph.light, len(terrain))
+    transmittance, airlight = aerial_perspective_of(photograph.atmosphere, photograph.light, len(terrain))
     chosen = usable[sky]
     for body in luminaries(photograph.light):
-        chosen &= photograph.seen.sky.direction @ np.asarray(body.direction) < np.cos(np.radians(_GLARE_DEG))
+        chosen &= photograph.atmosphere.sky.direction @ np.asarray(body.direction) < np.cos(np.radians(_GLARE_DEG))
     sky = sky[chosen]
     radiance = (
-        sky_radiance_of(photograph.seen, photograph.light)[chosen]
-        if len(photograph.seen.sky.pixel)
+        sky_radiance_of(photograph.atmosphere, photograph.light)[chosen]
+        if len(photograph.atmosphere.sky.pixel)
         else np.zeros((0, 3), np.float32)
     )
-    suns = [np.asarray(body.normal_illuminance_lx, np.float32) for body in luminaries(photograph.light)]
+    luminary_lx = [np.asarray(body.normal_illuminance_lx, np.float32) for body in luminaries(photograph.light)]
     values = np.nan_to_num(picture[terrain].astype(np.float32))
-    rows = PhotographEquations(
+    equations = PhotographEquations(
         photograph,
         values,
         np.repeat(whole[:, None], 3, axis=1),
@@ -71,17 +110,30 @@ def equations_of(photograph: AlbedoPhotograph, noise_model: NoiseModel, size: in
         radiance.astype(np.float32),
         np.zeros((size, 3), np.float32),
         np.ones(3),
-        suns,
+        luminary_lx,
     )
     if photograph.gain is not None:
-        rows.inverse_gain = 1.0 / photograph.gain
-    elif not rows.projected:
-        rows.inverse_gain = _median_ratio(rows.sky_radiance, rows.sky_picture)
-    return rows
+        equations.inverse_gain = 1.0 / photograph.gain
+    elif not equations.projected:
+        equations.inverse_gain = _median_ratio(equations.sky_radiance, equations.sky_picture)
+    return equations
 
 
 def picture_noise(linear: np.ndarray, noise_model: NoiseModel) -> np.ndarray:
-    """Standard deviation of linear values from rounding and compression of their sRGB encoding."""
+    """Standard deviation of linear values caused by rounding and compression of their sRGB encoding.
+
+    Parameters
+    ----------
+    linear
+        ``(...)`` linear values, 1 clips.
+    noise_model
+        Number of levels and their noise.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(...)`` float32, in linear units; zero for pictures that were not encoded.
+    """
     if noise_model.levels is None:
         return np.zeros_like(linear)
     bright = np.maximum(linear, 1e-6)
@@ -92,36 +144,76 @@ def picture_noise(linear: np.ndarray, noise_model: NoiseModel) -> np.ndarray:
 # ---------------------------------------------------------------------------------------------- linear parts
 
 
-def forward_product(row: PhotographEquations, albedo: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Radiance ``(n, 3)`` at the camera without airlight, and its directly sunlit part."""
-    footprints = row.photograph.footprints
+def forward_product(equations: PhotographEquations, albedo: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Apply the linear forward model to an albedo.
+
+    Parameters
+    ----------
+    equations
+        Of one photograph.
+    albedo
+        ``(R·S, 3)``.
+
+    Returns
+    -------
+    tuple of numpy.ndarray
+        Radiance ``(n, 3)`` at the camera without airlight, and its directly sunlit part [cd/m²].
+    """
+    footprints = equations.photograph.footprints
     sun = np.zeros((len(footprints.pixel), 3), np.float32)
-    for illuminance, values in zip(row.suns, footprints.sunlit[row.photograph.number], strict=True):
+    for illuminance, values in zip(equations.luminary_lx, footprints.sunlit[equations.photograph.number], strict=True):
         sun += (footprints.matrix(values) @ albedo) * illuminance
-    total = sun + footprints.matrix(footprints.share) @ (row.ambient * albedo)
-    scale = row.transmittance / np.float32(np.pi)
+    total = sun + footprints.matrix(footprints.share) @ (equations.ambient * albedo)
+    scale = equations.transmittance / np.float32(np.pi)
     return total * scale, sun * scale
 
 
-def adjoint(row: PhotographEquations, residual: np.ndarray) -> np.ndarray:
-    """Transpose of `forward_product`: ``(n, 3)`` → ``(R·S, 3)``."""
-    footprints = row.photograph.footprints
-    scaled = residual * row.transmittance / np.float32(np.pi)
-    total = (footprints.matrix(footprints.share).T @ scaled) * row.ambient
-    for illuminance, values in zip(row.suns, footprints.sunlit[row.photograph.number], strict=True):
+def adjoint(equations: PhotographEquations, residual: np.ndarray) -> np.ndarray:
+    """Apply the transpose of `forward_product`.
+
+    Parameters
+    ----------
+    equations
+        Of one photograph.
+    residual
+        ``(n, 3)``.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(R·S, 3)``.
+    """
+    footprints = equations.photograph.footprints
+    scaled = residual * equations.transmittance / np.float32(np.pi)
+    total = (footprints.matrix(footprints.share).T @ scaled) * equations.ambient
+    for illuminance, values in zip(equations.luminary_lx, footprints.sunlit[equations.photograph.number], strict=True):
         total += footprints.matrix(values).T @ (scaled * illuminance)
     return total
 
 
-def squared_adjoint(row: PhotographEquations) -> np.ndarray:
-    """Diagonal of the normal matrix, ``(R·S, 3)``: the preconditioner and the information of each texel."""
-    footprints = row.photograph.footprints
-    scaled = row.weight * (row.transmittance / np.float32(np.pi)) ** 2
+def squared_adjoint(equations: PhotographEquations) -> np.ndarray:
+    """Diagonal of the normal matrix: preconditioner, and information of each texel.
+
+    Parameters
+    ----------
+    equations
+        Of one photograph, with weights.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(R·S, 3)`` [1 / albedo²].
+    """
+    assert equations.weight is not None, "call reweight first"
+    footprints = equations.photograph.footprints
+    scaled = equations.weight * (equations.transmittance / np.float32(np.pi)) ** 2
     share, texel = footprints.share, footprints.texel
-    total = np.empty_like(row.ambient)
+    total = np.empty_like(equations.ambient)
     for channel in range(3):
-        values = share * row.ambient[texel, channel]
-        for illuminance, sunlit in zip(row.suns, footprints.sunlit[row.photograph.number], strict=True):
+        values = share * equations.ambient[texel, channel]
+        for illuminance, sunlit in zip(
+            equations.luminary_lx, footprints.sunlit[equations.photograph.number], strict=True
+        ):
             values = values + sunlit * illuminance[channel]
         total[:, channel] = footprints.matrix(values * values).T @ scaled[:, channel]
     return total
@@ -130,44 +222,75 @@ def squared_adjoint(row: PhotographEquations) -> np.ndarray:
 # ---------------------------------------------------------------------------------------------- weights
 
 
-def reweight(rows: list[PhotographEquations], albedo: np.ndarray, noise_model: NoiseModel, *, robust: bool) -> None:
-    """Weights of all equations from the present albedo: variances, times Cauchy's where ``robust``."""
-    for row in rows:
-        model, sun = forward_product(row, albedo)
-        radiance = model + row.airlight
-        if row.projected:
-            row.inverse_gain = projected_gain(row, radiance)
-        lit = row.photograph.footprints.lit[row.photograph.number] if row.suns else np.zeros(len(model))
-        mixed = np.nan_to_num(4.0 * lit * (1.0 - lit)).astype(np.float32)[:, None]
-        noise = row.noise * row.inverse_gain.astype(np.float32)
+def reweight(systems: list[PhotographEquations], albedo: np.ndarray, noise_model: NoiseModel, *, robust: bool) -> None:
+    """Update the weights and projected gains of all photographs in place.
+
+    Parameters
+    ----------
+    systems
+        Equations of each photograph.
+    albedo
+        ``(R·S, 3)`` current estimate.
+    noise_model
+        Standard deviations of model and picture.
+    robust
+        Multiply the inverse variances by Cauchy weights of the current residuals.
+    """
+    for equations in systems:
+        model, sun = forward_product(equations, albedo)
+        radiance = model + equations.airlight
+        if equations.projected:
+            equations.inverse_gain = projected_gain(equations, radiance)
+        photograph = equations.photograph
+        lit = photograph.footprints.lit[photograph.number] if equations.luminary_lx else np.zeros(len(model))
+        # Highest where a shadow's edge divides the pixel.
+        penumbra = np.nan_to_num(4.0 * lit * (1.0 - lit)).astype(np.float32)[:, None]
+        noise = equations.noise * equations.inverse_gain.astype(np.float32)
         floor = 1e-3 * float(np.median(radiance)) + 1e-9
-        variance = (noise_model.model * radiance) ** 2 + (noise_model.edge * sun * mixed) ** 2 + noise**2 + floor**2
-        row.weight = np.where(row.usable, 1.0 / variance, 0.0).astype(np.float32)
+        variance = (noise_model.model * radiance) ** 2 + (noise_model.edge * sun * penumbra) ** 2 + noise**2 + floor**2
+        equations.weight = np.where(equations.usable, 1.0 / variance, 0.0).astype(np.float32)
         if robust:
-            h = row.inverse_gain.astype(np.float32)
-            row.weight *= _cauchy((h * row.picture - radiance) * np.sqrt(row.weight), row.usable)
+            h = equations.inverse_gain.astype(np.float32)
+            residual = (h * equations.picture - radiance) * np.sqrt(equations.weight)
+            equations.weight *= _cauchy(residual, equations.usable)
 
 
-def _cauchy(normal: np.ndarray, usable: np.ndarray) -> np.ndarray:
-    """Cauchy's weights of residuals that should have unit variance; one doubtful channel makes the pixel doubtful."""
-    worst = np.abs(normal).max(axis=1, keepdims=True)
+def _cauchy(residual: np.ndarray, usable: np.ndarray) -> np.ndarray:
+    """Cauchy weights ``(n, 1)`` of normalised residuals ``(n, 3)``; the channel of largest residual sets the pixel's."""
+    worst = np.abs(residual).max(axis=1, keepdims=True)
     counted = worst[usable[:, 0]]
-    # Where the promise was too bold, the spread found counts instead: 2.385 gives 95 % efficiency for normal errors.
+    # If the variances were underestimated, the empirical spread replaces them. 2.385 gives 95 % efficiency for normal
+    # errors.
     scale = max(1.0, float(np.median(counted)) / 1.4 if len(counted) else 1.0)
     return 1.0 / (1.0 + (worst / (2.385 * scale)) ** 2)
 
 
-def _median_ratio(top: np.ndarray, bottom: np.ndarray) -> np.ndarray:
-    """Median of top over positive bottom, channel by channel ``(3,)``."""
-    sound = [bottom[:, c] > 0.0 for c in range(3)]
-    return np.array([np.median(top[k, c] / bottom[k, c]) if k.any() else 1.0 for c, k in enumerate(sound)], float)
+def _median_ratio(numerator: np.ndarray, denominator: np.ndarray) -> np.ndarray:
+    """Median ratio over positive denominators, channel by channel ``(3,)``."""
+    positive = [denominator[:, c] > 0.0 for c in range(3)]
+    return np.array(
+        [np.median(numerator[k, c] / denominator[k, c]) if k.any() else 1.0 for c, k in enumerate(positive)], float
+    )
 
 
-def projected_gain(row: PhotographEquations, radiance: np.ndarray) -> np.ndarray:
-    """Inverse gain ``(3,)`` that fits terrain pixels best to a radiance."""
-    keep = row.usable[:, 0]
-    if row.weight is None:
-        return _median_ratio(radiance[keep], row.picture[keep])
-    bottom = (row.weight * row.picture**2).sum(axis=0)
-    top = (row.weight * row.picture * radiance).sum(axis=0)
-    return np.where(bottom > 0.0, top / np.maximum(bottom, 1e-30), row.inverse_gain).astype(float)
+def projected_gain(equations: PhotographEquations, radiance: np.ndarray) -> np.ndarray:
+    """Inverse gain that fits the terrain pixels to a radiance in the least-squares sense.
+
+    Parameters
+    ----------
+    equations
+        Of one photograph; without weights, the median ratio is returned.
+    radiance
+        ``(n, 3)`` modelled radiance of the terrain pixels at the camera [cd/m²].
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(3,)`` radiance over pixel value.
+    """
+    keep = equations.usable[:, 0]
+    if equations.weight is None:
+        return _median_ratio(radiance[keep], equations.picture[keep])
+    denominator = (equations.weight * equations.picture**2).sum(axis=0)
+    numerator = (equations.weight * equations.picture * radiance).sum(axis=0)
+    return np.where(denominator > 0.0, numerator / np.maximum(denominator, 1e-30), equations.inverse_gain).astype(float)

@@ -1,9 +1,9 @@
-"""What a photograph's pixels are made of: each pixel as a weighted sum of texels, sunlit or not, through sub-pixel rays.
+"""Pixel footprints: each terrain pixel of a photograph as a weighted sum of texels, sunlit or not, by sub-pixel rays.
 
-A pixel's radiance is linear in the texture: S rays fall within it, each meets the surface at a texture coordinate, and
-the texture is bilinear there. Solving for texels against these sums (rather than against a photograph resampled onto the
-texture) is worth 6 to 8 dB of albedo, because neither a pixel that covers many texels nor a texel that covers many
-pixels is ever blurred.
+The radiance of a pixel is linear in the texture: S rays are cast within the pixel, each hits the surface at a texture
+coordinate, and the texture is interpolated bilinearly there. Solving for texels against these sums, instead of
+resampling the photograph onto the texture first, gains 6 to 8 dB of albedo, because neither a pixel that covers many
+texels nor a texel that covers many pixels is blurred.
 """
 
 from __future__ import annotations
@@ -14,20 +14,22 @@ from typing import Any
 
 import numpy as np
 
+from seasonscapes.cameras.panorama import Panorama
 from seasonscapes.cameras.pinhole import Camera
-from seasonscapes.rendering.hemisphere_rays import RayScene
+from seasonscapes.errors import NoTerrainInView
+from seasonscapes.rendering.hemisphere_rays import RayScene, SurfacePoints
 from seasonscapes.rendering.sun_visibility import cosine_seen, pixel_turn, sun_rays
 from seasonscapes.rendering.view_samples import view_samples
 from seasonscapes.sky.illumination import Luminary
 
-# Sub-pixel rays in work at a time: their texels and weights take about 100 bytes each.
+# Sub-pixel rays processed at a time: their texels and weights take about 100 bytes each.
 _BLOCK_RAYS = 1 << 20
 Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)
 class Footprints:
-    """The terrain pixels of one camera as sums over texels, under T positions of sun and moon. n pixels, Z entries.
+    """The n terrain pixels of one camera as sums over texels with Z entries, under T positions of sun and moon.
 
     Parameters
     ----------
@@ -36,27 +38,28 @@ class Footprints:
     shape
         Rows and columns of the texture.
     pixel
-        ``(n,)`` int32 flat index of pixels that show any terrain.
+        ``(n,)`` int32 flat index of pixels that contain terrain.
     coverage
-        ``(n,)`` float32 share of the pixel's rays that met terrain.
+        ``(n,)`` float32 fraction of the pixel's rays that hit terrain.
     start
-        ``(n + 1,)`` int32, where each pixel's entries begin (compressed rows).
+        ``(n + 1,)`` int32 first entry of each pixel (compressed rows).
     texel
         ``(Z,)`` int32 flat index of texels.
     share
-        ``(Z,)`` float32: the pixel's mean texture value is Σ share · texel; rows sum to the coverage.
+        ``(Z,)`` float32: the mean texture value of a pixel is Σ share · texel; rows sum to the coverage.
     sunlit
-        Per light a list with one ``(Z,)`` float32 for each luminary: the same shares times cosine of incidence times
-        visible part of its disc.
+        For each light a list with one ``(Z,)`` float32 per luminary: the same weights times cosine of incidence times
+        visible fraction of the luminary's disc.
     lit
-        ``(T, n)`` float32 share of each pixel's facing surface that sees the (first) luminary; NaN where none faces it.
+        ``(T, n)`` float32 fraction of each pixel's surface facing the (first) luminary from which the luminary is
+        visible; NaN where no surface faces it.
     distance_m
-        ``(n,)`` float32 mean distance of what the pixel shows [m].
+        ``(n,)`` float32 mean distance of the terrain in the pixel [m].
     spread
         ``(n,)`` float32 farthest over nearest distance within the pixel.
     """
 
-    camera: Camera
+    camera: Camera | Panorama
     shape: tuple[int, int]
     pixel: np.ndarray
     coverage: np.ndarray
@@ -69,70 +72,113 @@ class Footprints:
     spread: np.ndarray
 
     def matrix(self, values: np.ndarray) -> Any:
-        """``(n, texels)`` sparse matrix with these entries ``(Z,)``; the pattern is shared, nothing is copied."""
+        """Return the ``(n, R·S)`` sparse matrix with entries ``values (Z,)``; the pattern is shared, not copied."""
         from scipy.sparse import csr_array
 
         size = (len(self.pixel), self.shape[0] * self.shape[1])
         return csr_array((values, self.texel, self.start), shape=size, copy=False)
 
 
+@dataclass(frozen=True)
+class _Block:
+    """Columns of `Footprints` for a block of pixels, with the number of entries in place of their start."""
+
+    pixel: np.ndarray
+    coverage: np.ndarray
+    entries: np.ndarray
+    texel: np.ndarray
+    share: np.ndarray
+    sunlit: list[list[np.ndarray]]
+    lit: np.ndarray
+    distance_m: np.ndarray
+    spread: np.ndarray
+
+
 def trace_footprints(
     terrain: RayScene,
-    camera: Camera,
+    camera: Camera | Panorama,
     shape: tuple[int, int],
-    suns: Sequence[Sequence[Luminary]],
+    luminaries: Sequence[Sequence[Luminary]],
     *,
     rays: int = 16,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Footprints:
-    """Footprints of a camera's pixels, sun by sun. Memory beyond the result does not grow with the picture.
+    """Trace the footprints of a camera's pixels in blocks of bounded memory.
 
     Parameters
     ----------
     terrain
-        From `gather_hemisphere.occluder`. Its albedo plays no part.
+        From `hemisphere_rays.ray_scene`. Its albedo has no influence.
+    camera
+        The view.
     shape
-        Rows and columns of the texture to be found.
-    suns
-        For each of T lights its luminaries (`reception.luminaries`): none, the sun, the moon or both.
+        Rows and columns of the unknown texture.
+    luminaries
+        For each of T lights its luminaries (`receivers.luminaries`): none, the sun, the moon or both.
     rays
         S rays in each pixel; powers of two are best.
+    seed
+        Of the positions of rays within their pixels.
+    progress
+        Called with the finished fraction.
+
+    Returns
+    -------
+    Footprints
+        Weights of all texels in all terrain pixels.
 
     Raises
     ------
-    ValueError
-        Where the camera sees no terrain.
+    NoTerrainInView
+        If no ray of the camera hits the terrain.
     """
-    tell = progress or (lambda share: None)
+    report = progress or (lambda fraction: None)
     rows = max(1, _BLOCK_RAYS // (camera.width_px * rays))
-    parts, lit = [], []
+    blocks = []
     for top in range(0, camera.height_px, rows):
-        block = (top, min(rows, camera.height_px - top))
-        points, hit, pixel = view_samples(terrain, camera, block, rays, seed)
+        points, hit, pixel = view_samples(terrain, camera, (top, min(rows, camera.height_px - top)), rays, seed)
         if len(pixel):
-            columns, seen = _block_entries(terrain, camera, shape, (points, hit, pixel), suns)
-            parts.append(columns)
-            lit.append(seen)
-        tell(min(1.0, (top + rows) / camera.height_px))
-    if not parts:
-        raise ValueError("the camera sees no terrain")
-    pixel, coverage, count, texel, share, distance, spread = (np.concatenate([p[k] for p in parts]) for k in range(7))
+            blocks.append(_block_entries(terrain, camera, shape, points, hit, pixel, luminaries))
+        report(min(1.0, (top + rows) / camera.height_px))
+    if not blocks:
+        raise NoTerrainInView("trace_footprints: no terrain in the camera's view; check the pose of the camera")
+
+    def joined(name: str) -> np.ndarray:
+        return np.concatenate([getattr(block, name) for block in blocks])
+
+    pixel = joined("pixel")
     start = np.zeros(len(pixel) + 1, np.int32)
-    np.cumsum(count, out=start[1:])
+    np.cumsum(joined("entries"), out=start[1:])
     sunlit = [
-        [np.concatenate([p[7][t][b] for p in parts]) for b in range(len(bodies))] for t, bodies in enumerate(suns)
+        [np.concatenate([block.sunlit[t][b] for block in blocks]) for b in range(len(bodies))]
+        for t, bodies in enumerate(luminaries)
     ]
     return Footprints(
-        camera, shape, pixel, coverage, start, texel, share, sunlit, np.concatenate(lit, axis=1), distance, spread
+        camera,
+        shape,
+        pixel,
+        joined("coverage"),
+        start,
+        joined("texel"),
+        joined("share"),
+        sunlit,
+        np.concatenate([block.lit for block in blocks], axis=1),
+        joined("distance_m"),
+        joined("spread"),
     )
 
 
 def _block_entries(
-    terrain: RayScene, camera: Camera, shape: tuple[int, int], samples: tuple, suns: Sequence[Sequence[Luminary]]
-) -> tuple[tuple, np.ndarray]:
-    """Columns of `Footprints` for a block of pixels, and its ``lit`` ``(T, n)``."""
-    points, hit, pixel = samples
+    terrain: RayScene,
+    camera: Camera | Panorama,
+    shape: tuple[int, int],
+    points: SurfacePoints,
+    hit: np.ndarray,
+    pixel: np.ndarray,
+    luminaries: Sequence[Sequence[Luminary]],
+) -> _Block:
+    """Footprints of pixels ``(n,)`` from their surface samples and hits ``(n, S)``."""
     count, rays = hit.shape
     texel, weight = bilinear_texels(points.uv.reshape(-1, 2), shape)
     weight *= np.where(hit.ravel(), np.float32(1.0 / rays), np.float32(0.0))[:, None]
@@ -147,40 +193,52 @@ def _block_entries(
         hit.astype(np.float32),
         pixel_turn(pixel, camera.width_px, rays),
     )
-    lit = np.full((len(suns), count), np.nan, np.float32)
+    lit = np.full((len(luminaries), count), np.nan, np.float32)
     sunlit = []
-    for t, bodies in enumerate(suns):
+    for t, bodies in enumerate(luminaries):
         sunlit.append([])
         for number, body in enumerate(bodies):
-            seen = cosine_seen(shadow_rays, body)
-            # Each sample's four corners share its cosine.
-            values = np.bincount(entry, weight * np.repeat(seen.ravel(), 4), len(columns))
+            cosine = cosine_seen(shadow_rays, body)
+            # The four texels of a sample share its cosine.
+            values = np.bincount(entry, weight * np.repeat(cosine.ravel(), 4), len(columns))
             sunlit[t].append(values.astype(np.float32))
             if number == 0:
                 facing = np.maximum(points.normal @ np.asarray(body.direction, np.float32), 0.0) * hit
                 with np.errstate(invalid="ignore", divide="ignore"):
-                    lit[t] = np.clip((seen * hit).sum(axis=1) / facing.sum(axis=1), 0.0, 1.0)
+                    lit[t] = np.clip((cosine * hit).sum(axis=1) / facing.sum(axis=1), 0.0, 1.0)
     distance = np.linalg.norm(points.origin - camera.position_m.astype(np.float32), axis=2)
     nearest = np.where(hit, distance, np.inf).min(axis=1)
     farthest = np.where(hit, distance, 0.0).max(axis=1)
     mean = (distance * hit).sum(axis=1) / hit.sum(axis=1)
-    columns = (
+    return _Block(
         pixel,
         hit.mean(axis=1, dtype=np.float32),
         np.diff(start),
         columns.astype(np.int32),
         share,
+        sunlit,
+        lit,
         mean.astype(np.float32),
         (farthest / np.maximum(nearest, 1e-3)).astype(np.float32),
-        sunlit,
     )
-    return columns, lit
 
 
 def bilinear_texels(uv: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """The four texels ``(N, 4)`` int64 (flat) around texture coordinates ``(N, 2)`` and their weights ``(N, 4)``.
+    """Compute the texels and weights of bilinear interpolation.
 
-    As `terrain.surface.sample_texture` and the renderer's own texture: centres at half texels, clamped at the rim.
+    As `terrain.surface.sample_texture` and the renderer's texture: texel centres at +0.5, clamped at the border.
+
+    Parameters
+    ----------
+    uv
+        ``(N, 2)`` texture coordinates, v upwards.
+    shape
+        Rows and columns of the texture.
+
+    Returns
+    -------
+    tuple of numpy.ndarray
+        Flat texel indices ``(N, 4)`` int64 and weights ``(N, 4)`` float32.
     """
     height, width = shape
     x, y = uv[:, 0] * width - 0.5, (1.0 - uv[:, 1]) * height - 0.5
@@ -194,27 +252,66 @@ def bilinear_texels(uv: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray,
 
 
 def _merged(row: np.ndarray, texel: np.ndarray, rows: int, texels: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Entries of equal row and texel become one: the new entry of each old one, starts of rows, texels of entries."""
+    """Merge entries of equal row and texel: the new entry of each old one, starts of rows, texels of new entries."""
     unique, entry = np.unique(row * texels + texel, return_inverse=True)
     start = np.searchsorted(unique, np.arange(rows + 1, dtype=np.int64) * texels).astype(np.int32)
     return entry, start, unique % texels
 
 
-def seen_weight(footprints: Sequence[Footprints]) -> np.ndarray:
-    """How many pixels each texel fills, summed over cameras, ``(R, S)`` float32; 0 where it is never seen."""
+def texel_pixel_count(footprints: Sequence[Footprints]) -> np.ndarray:
+    """Count the pixels that each texel covers, summed over cameras.
+
+    Parameters
+    ----------
+    footprints
+        Of each camera, all of one texture shape.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(R, S)`` float32 fractional pixel counts; 0 where no pixel contains the texel.
+    """
     total = np.zeros(footprints[0].shape[0] * footprints[0].shape[1])
-    for one in footprints:
-        total += np.bincount(one.texel, one.share, len(total))
+    for camera_footprints in footprints:
+        total += np.bincount(camera_footprints.texel, camera_footprints.share, len(total))
     return total.reshape(footprints[0].shape).astype(np.float32)
 
 
 def whole_pixels(footprints: Footprints, *, full: float = 0.999) -> np.ndarray:
-    """Pixels ``(n,)`` bool that show terrain alone: sky in a pixel is brighter than any slope, and not sharp in a photograph."""
+    """Select the pixels that contain terrain only.
+
+    Sky within a pixel is brighter than any slope, and photographs are not sharp, so mixed pixels are unusable.
+
+    Parameters
+    ----------
+    footprints
+        Of one camera.
+    full
+        Least coverage of a selected pixel.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(n,)`` bool.
+    """
     return footprints.coverage >= full
 
 
 def thinned_footprints(footprints: Footprints, keep: np.ndarray) -> Footprints:
-    """The footprints of some of the pixels ``(n,)`` bool."""
+    """Restrict footprints to a subset of their pixels.
+
+    Parameters
+    ----------
+    footprints
+        Of one camera, n pixels.
+    keep
+        ``(n,)`` bool.
+
+    Returns
+    -------
+    Footprints
+        With the kept pixels only.
+    """
     count = np.diff(footprints.start)
     entries = np.repeat(keep, count)
     start = np.zeros(int(keep.sum()) + 1, np.int32)

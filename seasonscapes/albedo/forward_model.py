@@ -1,10 +1,10 @@
-"""The forward model: what a photograph of a texture would be, given the light. And its parts, which are linear.
+"""Forward model of a photograph of a textured terrain under a given light, and its linear parts.
 
 radiance at the camera = T · Σ texels share · albedo/π · (E_sun · cos · visibility + E_sky + E_bounce) + airlight
 picture                = response(gain · radiance), clipped
 
 with exact shadow rays in the photograph's pixels (`footprints`), skylight and interreflection per texel (daylight
-coefficients of the atlas), transmittance T and airlight from the light's own aerial perspective, one gain for each
+coefficients of the atlas), transmittance T and airlight from the light's own aerial perspective, and one gain per
 photograph and channel (exposure and white balance together).
 """
 
@@ -28,13 +28,13 @@ from seasonscapes.terrain.surface import Terrain
 from seasonscapes.terrain.texels import texel_positions
 
 Progress = Callable[[float], None]
-# Texels need fewer rays than pixels do: their neighbours are averaged by every footprint.
+# Texels need fewer rays than pixels: every footprint averages over neighbouring texels.
 TEXEL_EFFORT = SamplingOptions(subpixels=1, rays=512, listed=64, clusters=8192, rank=32)
 
 
 @dataclass(frozen=True)
 class TexelTransport:
-    """A terrain whose albedo is to be found: its daylight coefficients, texel by texel.
+    """Daylight coefficients of each texel of a terrain texture.
 
     Parameters
     ----------
@@ -45,9 +45,9 @@ class TexelTransport:
     texel
         ``(N,)`` flat index of texels that lie on the surface.
     position_m, normal
-        ``(N, 3)`` of these.
-    ready
-        Their coefficients, for any number of lights.
+        ``(N, 3)`` of these texels.
+    device_points
+        Their coefficients on the rendering device, valid for any light.
     """
 
     ray_scene: RayScene
@@ -55,7 +55,7 @@ class TexelTransport:
     texel: np.ndarray
     position_m: np.ndarray
     normal: np.ndarray
-    ready: DevicePoints
+    device_points: DevicePoints
 
 
 def trace_texel_transport(
@@ -67,65 +67,130 @@ def trace_texel_transport(
     smooth: bool = True,
     progress: Progress | None = None,
 ) -> TexelTransport:
-    """Trace the daylight coefficients of every texel of a texture of this shape. Knows nothing of any albedo.
+    """Trace the daylight coefficients of every texel of a texture. They do not depend on the texture's albedo.
 
     Parameters
     ----------
+    terrain
+        Mesh with texture coordinates.
+    shape
+        Rows and columns R, S of the texture.
+    sampling
+        Numbers of rays, light clusters and basis directions.
+    seed
+        Of the random numbers.
     smooth
-        Interpolated vertex normals, as `rendering.mitsuba_scene.mi_mesh`; photographs' own terrain is best lit smoothly.
+        Interpolate vertex normals, as `rendering.mitsuba_scene.mi_mesh`; recommended for photographs.
+    progress
+        Called with the finished fraction.
+
+    Returns
+    -------
+    TexelTransport
+        Coefficients of all texels that lie on the terrain.
+
+    Raises
+    ------
+    ValueError
+        If no texel lies on the terrain.
     """
     from seasonscapes.rendering.mitsuba_scene import mi_mesh
 
-    # A middling grey decides which parts of the terrain are worth listing as senders; their true shade comes later.
-    bare = ray_scene(mi_mesh(terrain, np.full(3, 0.3, np.float32), smooth=smooth))
+    # A medium grey decides which parts of the terrain are listed as light clusters; their albedo is set later.
+    grey = ray_scene(mi_mesh(terrain, np.full(3, 0.3, np.float32), smooth=smooth))
     position, _ = texel_positions(terrain, shape[1], shape[0])
-    points, texel = surface_at(bare, position.reshape(-1, 3))
+    points, texel = surface_at(grey, position.reshape(-1, 3))
     if len(texel) == 0:
-        raise ValueError("trace_land: no texel lies on the terrain")
-    coefficients = trace_points(bare, points, sampling, seed=seed, number=texel, progress=progress)
-    return TexelTransport(bare, shape, texel, points.origin, points.normal, upload_points(bare, coefficients))
+        raise ValueError("trace_texel_transport: no texel lies on the terrain")
+    coefficients = trace_points(grey, points, sampling, seed=seed, number=texel, progress=progress)
+    return TexelTransport(grey, shape, texel, points.origin, points.normal, upload_points(grey, coefficients))
 
 
 def clusters_with_albedo(clusters: DeviceClusters, albedo: np.ndarray) -> DeviceClusters:
-    """Senders that reflect by a texture ``(R, S, 3)``: interreflection then is that of this albedo."""
+    """Replace the albedo of light clusters, so that interreflection follows a given texture.
+
+    Parameters
+    ----------
+    clusters
+        Light clusters on the device.
+    albedo
+        ``(R, S, 3)`` texture.
+
+    Returns
+    -------
+    DeviceClusters
+        The same clusters with the texture's albedo at their points.
+    """
     points = clusters.clusters.points
     uv = points.uv.reshape(-1, 2)
     values = texture_at(albedo, uv).astype(np.float32).reshape(points.albedo.shape)
     return replace(clusters, clusters=replace(clusters.clusters, points=replace(points, albedo=values)))
 
 
-def ambient_on_texels(land: TexelTransport, light: Illumination, albedo: np.ndarray | None) -> np.ndarray:
-    """Illuminance ``(R·S, 3)`` float32 [lx] on texels from sky and interreflection; zero where there is no surface.
+def ambient_on_texels(transport: TexelTransport, light: Illumination, albedo: np.ndarray | None) -> np.ndarray:
+    """Illuminance of the texels from sky and interreflection.
 
     Parameters
     ----------
+    transport
+        Daylight coefficients of the texels.
+    light
+        Sun, moon and sky.
     albedo
-        ``(R, S, 3)`` of the terrain that reflects; ``None`` leaves interreflection out.
+        ``(R, S, 3)`` of the reflecting terrain; ``None`` leaves interreflection out.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(R·S, 3)`` float32 [lx]; zero for texels off the surface.
     """
-    clusters = land.ready.clusters
+    clusters = transport.device_points.clusters
     clusters = (
         clusters_with_albedo(clusters, np.zeros((2, 2, 3), np.float32))
         if albedo is None
         else clusters_with_albedo(clusters, albedo)
     )
-    sky, bounce = arriving(land.ready.receivers, light_clusters(clusters, light))
-    ambient = np.zeros((land.shape[0] * land.shape[1], 3), np.float32)
-    ambient[land.texel] = np.float32(np.pi) * (sky + bounce)
+    sky, bounce = arriving(transport.device_points.receivers, light_clusters(clusters, light))
+    ambient = np.zeros((transport.shape[0] * transport.shape[1], 3), np.float32)
+    ambient[transport.texel] = np.float32(np.pi) * (sky + bounce)
     return ambient
 
 
-def sun_on_texels(land: TexelTransport, light: Illumination) -> np.ndarray:
-    """Illuminance ``(R·S, 3)`` float32 [lx] on texels directly from sun and moon."""
-    sun = np.zeros((land.shape[0] * land.shape[1], 3), np.float32)
+def sun_on_texels(transport: TexelTransport, light: Illumination) -> np.ndarray:
+    """Direct illuminance of the texels from sun and moon.
+
+    Parameters
+    ----------
+    transport
+        Daylight coefficients of the texels.
+    light
+        Sun, moon and sky.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(R·S, 3)`` float32 [lx]; zero for texels off the surface.
+    """
+    sun = np.zeros((transport.shape[0] * transport.shape[1], 3), np.float32)
     for body in luminaries(light):
-        cosine = cosine_seen(land.ready.rays, body, each=4)
-        sun[land.texel] += cosine * np.asarray(body.normal_illuminance_lx, np.float32)
+        cosine = cosine_seen(transport.device_points.rays, body, each=4)
+        sun[transport.texel] += cosine * np.asarray(body.normal_illuminance_lx, np.float32)
     return sun
 
 
 @dataclass(frozen=True)
 class CameraAtmosphere:
-    """A camera's directions at which air and open sky are asked, for any number of lights."""
+    """Pixels of a camera at which aerial perspective and sky radiance are evaluated, for any light.
+
+    Parameters
+    ----------
+    air
+        Terrain pixels and their distances.
+    sky
+        A sample of the open pixels.
+    pixel_angle_deg
+        Angle of a pixel at the image centre [°].
+    """
 
     air: AirPlaces
     sky: SkyGrid
@@ -133,55 +198,105 @@ class CameraAtmosphere:
 
 
 def camera_atmosphere(footprints: Footprints, *, sky_pixels: int = 4000, seed: int = 0) -> CameraAtmosphere:
-    """Where to ask the air before the terrain, and the sky at some of the open pixels.
+    """Select the pixels at which aerial perspective and sky radiance are evaluated.
 
-    ``sky_pixels`` of the open ones are drawn: their mean fixes three gains, which thousands do as well as all.
+    Parameters
+    ----------
+    footprints
+        Of the camera.
+    sky_pixels
+        Number of open pixels drawn; their mean fixes three gains, for which thousands of pixels suffice.
+    seed
+        Of the draw.
+
+    Returns
+    -------
+    CameraAtmosphere
+        All terrain pixels, and the drawn open pixels.
     """
     camera = footprints.camera
     covered = np.zeros(camera.width_px * camera.height_px, bool)
     covered[footprints.pixel] = True
-    # A pixel beside the skyline is blurred with it by lens and JPEG.
-    picture = covered.reshape(camera.height_px, camera.width_px)
-    open_pixels = np.flatnonzero(~cv2.dilate(picture.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool).ravel())
+    # Lens and JPEG blur terrain into the open pixels next to the skyline.
+    terrain = covered.reshape(camera.height_px, camera.width_px).astype(np.uint8)
+    open_pixels = np.flatnonzero(~cv2.dilate(terrain, np.ones((5, 5), np.uint8)).astype(bool).ravel())
     if len(open_pixels) > sky_pixels:
         open_pixels = np.sort(np.random.default_rng(seed).choice(open_pixels, sky_pixels, replace=False))
-    nothing = (np.empty(0, np.int64), np.empty((0, 1), np.float32))
+    no_mixed_pixels = (np.empty(0, np.int64), np.empty((0, 1), np.float32))
     return CameraAtmosphere(
-        air_places(camera, footprints.pixel, footprints.distance_m, nothing),
+        air_places(camera, footprints.pixel, footprints.distance_m, no_mixed_pixels),
         sky_grid(camera, open_pixels),
         float(np.degrees(1.0 / camera.fx)),
     )
 
 
-def aerial_perspective_of(seen: CameraAtmosphere, light: Illumination, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Transmittance and airlight ``(n, 3)`` float32 between a camera and its n terrain pixels; 1 and 0 without air."""
-    if light.aerial_perspective is None:
-        return np.ones((count, 3), np.float32), np.zeros((count, 3), np.float32)
-    transmittance, airlight = air_at(seen.air, light.aerial_perspective)
-    return np.ascontiguousarray(transmittance, np.float32), np.ascontiguousarray(airlight, np.float32)
-
-
-def sky_radiance_of(seen: CameraAtmosphere, light: Illumination) -> np.ndarray:
-    """Radiance ``(K, 3)`` [cd/m²] of the chosen open pixels ``seen.sky.pixel``, without the discs of sun and moon."""
-    return open_sky(seen.sky, replace(light, sun=None, moon=None), seen.pixel_angle_deg)
-
-
-def predicted_surface_radiance(
-    footprints: Footprints, number: int, light: tuple[Illumination, np.ndarray], albedo: np.ndarray
-) -> np.ndarray:
-    """Radiance ``(n, 3)`` that leaves the terrain of each pixel, before the air [cd/m²].
+def aerial_perspective_of(
+    atmosphere: CameraAtmosphere, light: Illumination, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Transmittance and airlight between a camera and its terrain pixels.
 
     Parameters
     ----------
-    number
-        Which of the footprints' T lights.
+    atmosphere
+        Pixels of the camera.
     light
-        That light, and the ambient illuminance ``(R·S, 3)`` on texels [lx] that goes with it.
+        Illumination with or without aerial perspective.
+    count
+        Number n of terrain pixels.
+
+    Returns
+    -------
+    tuple of numpy.ndarray
+        Transmittance ``(n, 3)`` and airlight ``(n, 3)`` [cd/m²], float32; 1 and 0 without aerial perspective.
+    """
+    if light.aerial_perspective is None:
+        return np.ones((count, 3), np.float32), np.zeros((count, 3), np.float32)
+    transmittance, airlight = air_at(atmosphere.air, light.aerial_perspective)
+    return np.ascontiguousarray(transmittance, np.float32), np.ascontiguousarray(airlight, np.float32)
+
+
+def sky_radiance_of(atmosphere: CameraAtmosphere, light: Illumination) -> np.ndarray:
+    """Sky radiance of a camera's sampled open pixels, without the discs of sun and moon.
+
+    Parameters
+    ----------
+    atmosphere
+        Pixels of the camera.
+    light
+        Illumination of the photograph.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(K, 3)`` [cd/m²] at the pixels ``atmosphere.sky.pixel``.
+    """
+    return open_sky(atmosphere.sky, replace(light, sun=None, moon=None), atmosphere.pixel_angle_deg)
+
+
+def predicted_surface_radiance(
+    footprints: Footprints, number: int, light: Illumination, ambient: np.ndarray, albedo: np.ndarray
+) -> np.ndarray:
+    """Radiance that leaves the terrain in each pixel, before aerial perspective.
+
+    Parameters
+    ----------
+    footprints
+        Of the camera, under T lights.
+    number
+        Index of the light among these T.
+    light
+        The light itself.
+    ambient
+        ``(R·S, 3)`` illuminance of the texels from sky and interreflection [lx], from `ambient_on_texels`.
     albedo
         ``(R·S, 3)``.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(n, 3)`` [cd/m²].
     """
-    illumination, ambient = light
     total = footprints.matrix(footprints.share) @ (ambient * albedo)
-    for body, values in zip(luminaries(illumination), footprints.sunlit[number], strict=True):
+    for body, values in zip(luminaries(light), footprints.sunlit[number], strict=True):
         total += (footprints.matrix(values) @ albedo) * np.asarray(body.normal_illuminance_lx, np.float32)
     return total / np.float32(np.pi)

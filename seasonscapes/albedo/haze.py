@@ -1,9 +1,9 @@
-"""How hazy the air was: the visibility under which the photographs agree with each other and with their sky, by search.
+"""Visibility (meteorological range) from photographs: one-dimensional search for the least robust cost of the albedo fit.
 
-Haze enters everything (sun, sky, airlight, transmittance), never linearly, but it is one number a day: so the closed form
-is solved for a few visibilities, on a share of the pixels, and the robust cost is followed to its least. Airlight is not
-free: it comes with the same sky model as the light, and the sky's own pixels fix the gain for every visibility that is
-tried. (A free airlight runs away with the albedo: dark and hazy looks like bright and shaded.)
+Haze acts on sun, sky, airlight and transmittance, never linearly, but it is one number per day. The closed form is
+therefore solved for a few visibilities on a fraction of the pixels, and the robust cost is minimised. Airlight is not a
+free parameter: it comes from the same sky model as the light, and the sky pixels fix the gain at every visibility that
+is tried. (With free airlight, haze and albedo are confounded: dark and hazy resembles bright and shaded.)
 """
 
 from __future__ import annotations
@@ -19,14 +19,22 @@ from seasonscapes.albedo.photographs import LINEAR, AlbedoPhotograph, NoiseModel
 from seasonscapes.sky.illumination import AerialPerspective, Illumination, Luminary
 
 LightsOf = Callable[[float], Sequence[Illumination]]
-# Half again as far from one to the next; from thick haze to polar air.
+# Geometric steps of about 1.65, from thick haze to polar air [km].
 VISIBILITIES_KM = (12.0, 20.0, 33.0, 55.0, 90.0, 150.0)
 _QUICK = SolverOptions(rounds=3, iterations=8)
 
 
 @dataclass(frozen=True)
 class HazeFit:
-    """The visibility found [km], and the robust cost of every one that was tried."""
+    """Result of the visibility search.
+
+    Parameters
+    ----------
+    visibility_km
+        Visibility of least cost [km].
+    costs
+        Robust cost of every visibility [km] that was tried.
+    """
 
     visibility_km: float
     costs: dict[float, float]
@@ -34,27 +42,48 @@ class HazeFit:
 
 @dataclass(frozen=True)
 class MixedAir:
-    """Aerial perspective between those of two visibilities: optical depths and the logarithms of airlight are mixed."""
+    """Aerial perspective interpolated between two visibilities, linear in optical depth and in the log of airlight.
+
+    Parameters
+    ----------
+    first, second
+        Aerial perspectives of the two visibilities.
+    share
+        Weight of the second, in [0, 1].
+    """
 
     first: AerialPerspective
     second: AerialPerspective
     share: float
 
     def __call__(self, depth_m: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """See `AerialPerspective`."""
-        near, far = self.first(depth_m, direction), self.second(depth_m, direction)
-        return _mixed(near[0], far[0], self.share), _mixed(near[1], far[1], self.share)
+        """Return transmittance and airlight; see `AerialPerspective`."""
+        first, second = self.first(depth_m, direction), self.second(depth_m, direction)
+        return _mixed(first[0], second[0], self.share), _mixed(first[1], second[1], self.share)
 
 
 def _mixed(a: np.ndarray, b: np.ndarray, share: float) -> np.ndarray:
+    """Geometric interpolation; zero where both values are zero."""
     tiny = 1e-12
     mixed = np.exp((1.0 - share) * np.log(np.maximum(a, tiny)) + share * np.log(np.maximum(b, tiny)))
-    # What is black in both stays so.
     return np.where((np.asarray(a) <= 0.0) & (np.asarray(b) <= 0.0), 0.0, mixed)
 
 
 def mixed_light(first: Illumination, second: Illumination, share: float) -> Illumination:
-    """A light between two of the same instant and another haze, ``share`` of the way from the first to the second."""
+    """Interpolate geometrically between two lights of one instant under different visibility.
+
+    Parameters
+    ----------
+    first, second
+        The two lights.
+    share
+        Weight of the second, in [0, 1].
+
+    Returns
+    -------
+    Illumination
+        Sun, moon, sky and aerial perspective in between.
+    """
 
     def body(a: Luminary | None, b: Luminary | None) -> Luminary | None:
         if a is None or b is None:
@@ -79,7 +108,7 @@ def mixed_light(first: Illumination, second: Illumination, share: float) -> Illu
 
 
 def fit_visibility(
-    land: TexelTransport,
+    transport: TexelTransport,
     photographs: Sequence[AlbedoPhotograph],
     lights_of: LightsOf,
     *,
@@ -90,28 +119,47 @@ def fit_visibility(
     start: AlbedoFit | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> HazeFit:
-    """The meteorological range [km] that explains the photographs best.
+    """Estimate the meteorological range at which the albedo fit has the least robust cost.
 
     Parameters
     ----------
+    transport
+        Daylight coefficients of the texels.
+    photographs
+        Photographs of one day.
     lights_of
-        The lights of all photographs for a visibility [km]. Asked at ``visibilities_km`` alone; between these, lights
-        are mixed along the extinction.
+        Lights of all photographs as a function of visibility [km]. Evaluated at ``visibilities_km`` only; lights in
+        between are interpolated, linearly in extinction.
+    visibilities_km
+        Nodes of the search [km], at least three.
+    noise_model
+        Standard deviations that weight the residuals.
     share
-        Of the pixels that are used.
+        Fraction of the pixels used.
+    seed
+        Of the drawn pixels.
     start
-        A fit to begin from.
+        Initial albedo fit.
+    progress
+        Called with the estimated finished fraction.
+
+    Returns
+    -------
+    HazeFit
+        Best visibility, and the cost of all that were tried.
 
     Raises
     ------
     ValueError
-        Fewer than three visibilities.
+        If there are fewer than three visibilities.
+    NoUsablePixels, NotEnoughEvidence
+        From `solve_albedo`.
     """
-    tell = progress or (lambda done: None)
+    report = progress or (lambda fraction: None)
     nodes = sorted(map(float, visibilities_km))
     if len(nodes) < 3:
-        raise ValueError("fit_visibility: three visibilities at least")
-    thin = thinned_photographs(photographs, share, seed)
+        raise ValueError(f"fit_visibility: got {len(nodes)} visibilities, expected at least three")
+    thinned = thinned_photographs(photographs, share, seed)
     lights: dict[float, Sequence[Illumination]] = {}
     costs: dict[float, float] = {}
     albedo = None if start is None else start.albedo
@@ -119,11 +167,11 @@ def fit_visibility(
     def cost_at(visibility_km: float) -> float:
         nonlocal albedo
         if visibility_km not in costs:
-            chosen = _lights_at(visibility_km, nodes, lights, lights_of)
-            tried = [replace(photograph, light=light) for photograph, light in zip(thin, chosen, strict=True)]
-            fit = solve_albedo(land, tried, noise_model=noise_model, solver=_QUICK, start=albedo)
+            tried_lights = _lights_at(visibility_km, nodes, lights, lights_of)
+            relit = [replace(photograph, light=light) for photograph, light in zip(thinned, tried_lights, strict=True)]
+            fit = solve_albedo(transport, relit, noise_model=noise_model, solver=_QUICK, start=albedo)
             albedo, costs[visibility_km] = fit.albedo, fit.cost
-            tell(min(1.0, len(costs) / 8.0))
+            report(min(1.0, len(costs) / 8.0))
         return costs[visibility_km]
 
     at = len(nodes) // 2
@@ -133,37 +181,40 @@ def fit_visibility(
         if best == at:
             break
         at = best
-    triple = nodes[max(0, min(at - 1, len(nodes) - 3)) :][:3]
+    bracket = nodes[max(0, min(at - 1, len(nodes) - 3)) :][:3]
     for _ in range(3):
-        guess = _parabola_least([1.0 / v for v in triple], [cost_at(v) for v in triple])
-        guess_km = float(np.clip(1.0 / guess, nodes[0], nodes[-1])) if guess > 0.0 else nodes[-1]
-        if min(abs(guess_km / v - 1.0) for v in triple) < 0.02:
+        extinction = _parabola_minimum([1.0 / v for v in bracket], [cost_at(v) for v in bracket])
+        guess_km = float(np.clip(1.0 / extinction, nodes[0], nodes[-1])) if extinction > 0.0 else nodes[-1]
+        if min(abs(guess_km / v - 1.0) for v in bracket) < 0.02:
             break
         cost_at(guess_km)
-        # The best three that bracket the least, if they do.
-        order = sorted([*triple, guess_km], key=cost_at)
-        triple = sorted(order[:3])
-    tell(1.0)
-    return HazeFit(min(costs, key=costs.get), dict(sorted(costs.items())))
+        order = sorted([*bracket, guess_km], key=cost_at)
+        bracket = sorted(order[:3])
+    report(1.0)
+    return HazeFit(min(costs, key=costs.__getitem__), dict(sorted(costs.items())))
 
 
-def _lights_at(visibility_km: float, nodes: list[float], held: dict, lights_of: LightsOf) -> Sequence[Illumination]:
+def _lights_at(
+    visibility_km: float, nodes: list[float], cache: dict[float, Sequence[Illumination]], lights_of: LightsOf
+) -> Sequence[Illumination]:
+    """Lights of all photographs at a visibility, interpolated between the nodes; ``cache`` stores those of the nodes."""
+
     def node(value: float) -> Sequence[Illumination]:
-        if value not in held:
-            held[value] = list(lights_of(value))
-        return held[value]
+        if value not in cache:
+            cache[value] = list(lights_of(value))
+        return cache[value]
 
     if visibility_km in nodes:
         return node(visibility_km)
     upper = next(i for i, value in enumerate(nodes) if value > visibility_km)
     low, high = nodes[upper - 1], nodes[upper]
-    # Extinction is what light depends on almost linearly, in the exponent.
+    # The logarithm of light is almost linear in extinction, which is proportional to 1 / visibility.
     share = (1.0 / visibility_km - 1.0 / low) / (1.0 / high - 1.0 / low)
     return [mixed_light(a, b, share) for a, b in zip(node(low), node(high), strict=True)]
 
 
-def _parabola_least(x: Sequence[float], y: Sequence[float]) -> float:
-    """Abscissa of the least of the parabola through three points; the lowest point's where it opens downwards."""
+def _parabola_minimum(x: Sequence[float], y: Sequence[float]) -> float:
+    """Abscissa of the minimum of the parabola through three points; that of the lowest point if it opens downwards."""
     curve = np.polyfit(np.asarray(x) / x[0], y, 2)
     if curve[0] <= 0.0:
         return x[int(np.argmin(y))]

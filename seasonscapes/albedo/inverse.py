@@ -1,9 +1,9 @@
-"""Albedo by differentiable rendering, from the closed form on: every bounce, and any unknown that Mitsuba can differentiate.
+"""Albedo by differentiable rendering, started from the closed form, with any further parameter Mitsuba differentiates.
 
-What the closed form linearises (interreflection by rounds, haze by search, sun and sky as given) is here one loss over one
-set of unknowns: albedo texture, gains, scale of sun and of sky, haze, and whatever of Mitsuba's own parameters is named in
-``extra``. Adam with bounds; pixels are weighed as the closed form weighs them; texture corrections start coarse and end
-fine; photographs held out decide the step and when to stop.
+The closed form's approximations (interreflection by outer iterations, haze by search, given sun and sky) are replaced by
+one loss over one set of unknowns: albedo texture, gains, scales of sun and sky, haze, and any Mitsuba parameters named in
+``extra``. The optimiser is Adam with bounds; pixels have the weights of the closed form; texture corrections proceed from
+coarse to fine; held-out photographs control the step size and early stopping.
 """
 
 from __future__ import annotations
@@ -20,13 +20,24 @@ from seasonscapes.albedo.closed_form import HIGHEST, LOWEST, AlbedoFit, pixel_we
 from seasonscapes.albedo.differentiable_views import DifferentiableViews, differentiable_views, mi_picture
 from seasonscapes.albedo.forward_model import TexelTransport
 from seasonscapes.albedo.photographs import LINEAR, AlbedoPhotograph, NoiseModel
+from seasonscapes.errors import NotEnoughEvidence
 from seasonscapes.images import atomic_path
 from seasonscapes.terrain.surface import Terrain
 
 
 @dataclass(frozen=True)
 class ExtraUnknown:
-    """An experiment's own unknown: a parameter of Mitsuba's by its key, its start, bounds and step."""
+    """An additional unknown: a Mitsuba parameter.
+
+    Parameters
+    ----------
+    start
+        Initial value.
+    low, high
+        Bounds.
+    step
+        Learning rate of Adam.
+    """
 
     start: np.ndarray
     low: float = -np.inf
@@ -36,26 +47,31 @@ class ExtraUnknown:
 
 @dataclass(frozen=True)
 class InverseOptions:
-    """How to optimise.
+    """Options of the optimisation.
 
     Parameters
     ----------
     unknowns
         Of ``albedo``, ``log_gain``, ``sun``, ``sky``, ``haze``.
     levels
-        Coarseness of the albedo's correction, stage by stage: 4 means one value for 4 × 4 texels, 1 the texels themselves.
+        Resolution of the albedo correction in each stage: 4 means one value per 4 × 4 texels, 1 the texels themselves.
     iterations
         In each stage.
     pictures
-        Photographs in an iteration.
+        Photographs per iteration.
     spp
-        Samples a pixel.
+        Samples per pixel.
+    max_depth
+        Longest path, in segments.
     held_out
-        Share of the photographs that only judge.
+        Fraction of the photographs used for validation only.
     check_every
-        Iterations between judgements; the step is halved when they get worse, and the stage ends at the third time.
+        Iterations between validations; the step is halved when the validation loss rises, and the stage ends the third
+        time.
     steps
-        Adam's step of each unknown: of albedo in units of albedo, of all others relative.
+        Learning rate of each unknown: of albedo in units of albedo, of all others relative.
+    seed
+        Of the split, the mini-batches and the rendering.
     """
 
     unknowns: tuple[str, ...] = ("albedo", "log_gain")
@@ -74,16 +90,18 @@ class InverseOptions:
 
 @dataclass
 class IterationState:
-    """Where an optimisation stands; callbacks get it after every iteration and may set ``stop``.
+    """State of an optimisation, passed to callbacks after every iteration; they may set ``stop``.
 
     Parameters
     ----------
     values
         Best values by name.
     stage, iteration
-        Of `InverseOptions.levels`, and within it.
+        Index into `InverseOptions.levels`, and finished iterations of that stage.
     history
-        A record for each iteration: loss, and held-out loss where it was judged.
+        A record for each iteration: ``stage``, ``iteration``, ``loss``, and ``held_out`` loss where it was evaluated.
+    stop
+        End the optimisation after this iteration.
     """
 
     values: dict[str, np.ndarray]
@@ -98,7 +116,17 @@ Callback = Callable[[IterationState], None]
 
 @dataclass(frozen=True)
 class InverseFit:
-    """What was found: the closed form's record with new albedo and gains, all values by name, and the loss history."""
+    """Result of the optimisation.
+
+    Parameters
+    ----------
+    fit
+        The closed-form fit with new albedo and gains.
+    values
+        All unknowns by name.
+    history
+        See `IterationState.history`.
+    """
 
     fit: AlbedoFit
     values: dict[str, np.ndarray]
@@ -107,7 +135,7 @@ class InverseFit:
 
 def refine_albedo(
     terrain: Terrain,
-    land: TexelTransport,
+    transport: TexelTransport,
     photographs: Sequence[AlbedoPhotograph],
     start: AlbedoFit,
     *,
@@ -122,40 +150,59 @@ def refine_albedo(
     Parameters
     ----------
     terrain
-        The surface of ``land``.
+        The terrain of ``transport``.
+    transport
+        Daylight coefficients of the texels.
+    photographs
+        K photographs, at least two.
+    start
+        Closed-form fit of these photographs.
+    noise_model
+        Standard deviations that weight the residuals.
+    options
+        Unknowns, iterations and steps; defaults if omitted.
     extra
-        More unknowns, by Mitsuba's key (``sky.data``, ``terrain.vertex_positions``, …).
+        Further unknowns, by Mitsuba's key (``sky.data``, ``terrain.vertex_positions``, …).
     callbacks
         Called with the `IterationState` after each iteration.
     resume
-        A file to save the state in at every judgement, and to go on from where it exists.
+        Checkpoint file (``.npz``), written at every validation and read if it exists.
+
+    Returns
+    -------
+    InverseFit
+        Refined albedo and gains, all unknowns, and the loss history.
 
     Raises
     ------
     InputError
-        Where the device has no gradients.
+        If the device has no gradients.
+    NotEnoughEvidence
+        If there are fewer than two photographs.
     ValueError
-        Fewer than two photographs, or an unknown without meaning.
+        If an unknown is not supported, or a camera is a panorama or has pixels that are not square.
     """
     options, extra = options or InverseOptions(), dict(extra or {})
     if len(photographs) < 2:
-        raise ValueError("refine_albedo: two photographs at least, one of them to judge by")
-    strange = set(options.unknowns) - {"albedo", "log_gain", "sun", "sky", "haze"}
-    if strange:
-        raise ValueError(f"refine_albedo: unknown {', '.join(sorted(strange))}; Mitsuba's own go into extra")
+        raise NotEnoughEvidence("refine_albedo: at least two photographs are needed, one of them for validation")
+    unsupported = set(options.unknowns) - {"albedo", "log_gain", "sun", "sky", "haze"}
+    if unsupported:
+        raise ValueError(
+            f"refine_albedo: unsupported unknowns {', '.join(sorted(unsupported))}; pass Mitsuba parameters in extra"
+        )
     views = differentiable_views(terrain, start.albedo, photographs, max_depth=options.max_depth)
-    task = _Task(
-        views, _targets(land, photographs, start, noise_model), options, extra, *_split(len(photographs), options)
+    problem = _Problem(
+        views, _targets(transport, photographs, start, noise_model), options, extra, *_split(len(photographs), options)
     )
     state = (
-        _loaded(resume)
+        _load(resume)
         if resume is not None and resume.is_file()
         else IterationState(_start_values(start, options, extra))
     )
     for stage in range(state.stage, len(options.levels)):
         first = state.iteration if stage == state.stage else 0
         state.stage = stage
-        _run_stage(task, state, first, callbacks, resume)
+        _run_stage(problem, state, first, callbacks, resume)
         if state.stop:
             break
     values = state.values
@@ -165,112 +212,117 @@ def refine_albedo(
 
 
 @dataclass(frozen=True)
-class _Task:
+class _Problem:
+    """Scenes, targets ``(picture, weight root)``, unknowns, and indices of training and validation photographs."""
+
     views: DifferentiableViews
     targets: list[tuple[Any, Any]]
     options: InverseOptions
     extra: dict[str, ExtraUnknown]
-    fitted: np.ndarray
-    judges: np.ndarray
+    training: np.ndarray
+    validation: np.ndarray
 
 
 def _split(count: int, options: InverseOptions) -> tuple[np.ndarray, np.ndarray]:
-    """Photographs to fit and to judge by, at least one of each."""
+    """Indices of training and validation photographs, at least one of each."""
     order = np.random.default_rng(options.seed).permutation(count)
-    held = int(np.clip(round(options.held_out * count), 1, count - 1))
-    return np.sort(order[held:]), np.sort(order[:held])
+    held_out = int(np.clip(round(options.held_out * count), 1, count - 1))
+    return np.sort(order[held_out:]), np.sort(order[:held_out])
 
 
 def _targets(
-    land: TexelTransport, photographs: Sequence[AlbedoPhotograph], start: AlbedoFit, noise_model: NoiseModel
+    transport: TexelTransport, photographs: Sequence[AlbedoPhotograph], start: AlbedoFit, noise_model: NoiseModel
 ) -> list[tuple[Any, Any]]:
-    """Each photograph ``(H, W, 3)`` and the root of its pixels' weights [1 / picture value], as tensors."""
+    """Each photograph ``(H, W, 3)`` and the root of its pixels' weights [1 / pixel value], as tensors."""
     import mitsuba as mi
 
-    found = []
+    targets = []
     for photograph, weight, gain in zip(
-        photographs, pixel_weights(land, photographs, start, noise_model), start.gains, strict=True
+        photographs, pixel_weights(transport, photographs, start, noise_model), start.gains, strict=True
     ):
         camera = photograph.footprints.camera
         image = np.zeros((camera.height_px * camera.width_px, 3), np.float32)
         image[photograph.footprints.pixel] = np.sqrt(weight) / np.asarray(gain, np.float32)
         image *= 1.0 / np.sqrt(max(float((weight > 0.0).mean(axis=1).sum()), 1.0))
         shape = (camera.height_px, camera.width_px, 3)
-        found.append(
+        targets.append(
             (
                 mi.TensorXf(np.nan_to_num(photograph.observation.image.astype(np.float32))),
                 mi.TensorXf(image.reshape(shape)),
             )
         )
-    return found
+    return targets
 
 
 def _start_values(start: AlbedoFit, options: InverseOptions, extra: dict[str, ExtraUnknown]) -> dict[str, np.ndarray]:
-    # Gains always take part, as pictures have their own unit; they move only where they are unknowns.
+    # Gains are always present, because pictures have their own unit; they change only if they are unknowns.
     values = {"albedo": start.albedo.astype(np.float32), "log_gain": np.log(start.gains).astype(np.float32)}
     values |= {name: np.ones(1, np.float32) for name in ("sun", "sky", "haze") if name in options.unknowns}
-    return values | {name: np.asarray(one.start, np.float32) for name, one in extra.items()}
+    return values | {name: np.asarray(unknown.start, np.float32) for name, unknown in extra.items()}
 
 
 def _run_stage(
-    task: _Task, state: IterationState, first: int, callbacks: Sequence[Callback], resume: Path | None
+    problem: _Problem, state: IterationState, first: int, callbacks: Sequence[Callback], resume: Path | None
 ) -> None:
+    """Optimise at one resolution, from iteration ``first`` on, and update ``state``."""
     import drjit as dr
 
-    options = task.options
+    options = problem.options
     level = options.levels[state.stage]
     base = state.values["albedo"]
-    optimizer = _optimizer(task, state.values, level)
-    scale, worse = 1.0, 0
-    best = _judge(task, state.values)
+    optimizer = _optimizer(problem, state.values, level)
+    step_scale, failures = 1.0, 0
+    best = _validation_loss(problem, state.values)
     rng = np.random.default_rng((options.seed, state.stage, first))
     mean: dict[str, np.ndarray] | None = None
     for iteration in range(first, options.iterations):
-        chosen = rng.choice(task.fitted, min(options.pictures, len(task.fitted)), replace=False)
+        chosen = rng.choice(problem.training, min(options.pictures, len(problem.training)), replace=False)
         loss = 0.0
         for index in chosen:
-            unknowns = _lanes(task, optimizer, base, level, state.values)
-            part = _loss(task, int(index), unknowns, seed=int(rng.integers(2**30)))
+            unknowns = _unknowns(problem, optimizer, base, level, state.values)
+            part = _loss(problem, int(index), unknowns, seed=int(rng.integers(2**30)))
             dr.backward(part / float(len(chosen)))
             loss += float(part.array[0]) / len(chosen)
         optimizer.step()
-        _bound(task, optimizer)
-        now = _values(task, optimizer, base, level, state.values)
-        # The path of a stochastic optimiser jitters about the answer: its running mean is nearer to it.
-        mean = now if mean is None else {name: 0.9 * mean[name] + 0.1 * now[name] for name in now}
+        _clip_to_bounds(problem, optimizer)
+        current = _current_values(problem, optimizer, base, level, state.values)
+        # Iterates of a stochastic optimiser scatter about the minimum; their running mean is closer to it.
+        mean = current if mean is None else {name: 0.9 * mean[name] + 0.1 * current[name] for name in current}
         state.iteration = iteration + 1
         record = {"stage": float(state.stage), "iteration": float(iteration), "loss": loss}
         if (iteration + 1) % options.check_every == 0 or iteration + 1 == options.iterations:
-            judged = _judge(task, mean)
-            record["held_out"] = judged
-            if judged < best:
-                best, state.values = judged, mean
+            validation = _validation_loss(problem, mean)
+            record["held_out"] = validation
+            if validation < best:
+                best, state.values = validation, mean
             else:
-                worse, scale = worse + 1, 0.5 * scale
-                optimizer.set_learning_rate({name: scale * step for name, step in _steps(task, level).items()})
+                failures, step_scale = failures + 1, 0.5 * step_scale
+                optimizer.set_learning_rate(
+                    {name: step_scale * step for name, step in _learning_rates(problem, level).items()}
+                )
         state.history.append(record)
         if "held_out" in record and resume is not None:
             _save(state, resume)
         for callback in callbacks:
             callback(state)
-        if state.stop or worse >= 3:
+        if state.stop or failures >= 3:
             break
-    state.iteration = options.iterations if worse >= 3 else state.iteration
+    state.iteration = options.iterations if failures >= 3 else state.iteration
 
 
-def _steps(task: _Task, level: int) -> dict[str, float]:
-    """Adam's step of each unknown that moves, by its name in the optimiser."""
+def _learning_rates(problem: _Problem, level: int) -> dict[str, float]:
+    """Learning rate of each unknown, by its name in the optimiser."""
     names = {"albedo": "albedo" if level == 1 else "correction"}
-    steps = {names.get(name, name): task.options.steps[name] for name in task.options.unknowns}
-    return steps | {name: one.step for name, one in task.extra.items()}
+    rates = {names.get(name, name): problem.options.steps[name] for name in problem.options.unknowns}
+    return rates | {name: unknown.step for name, unknown in problem.extra.items()}
 
 
-def _optimizer(task: _Task, values: dict[str, np.ndarray], level: int) -> Any:
+def _optimizer(problem: _Problem, values: dict[str, np.ndarray], level: int) -> Any:
     import mitsuba as mi
 
-    steps = _steps(task, level)
+    rates = _learning_rates(problem, level)
     optimizer = mi.ad.Adam(lr=0.01, beta_2=0.99, mask_updates=True)
-    for name in steps:
+    for name in rates:
         if name == "correction":
             height, width = (max(2, -(-side // level)) for side in values["albedo"].shape[:2])
             optimizer[name] = mi.TensorXf(np.ones((height, width, 3), np.float32))
@@ -278,39 +330,42 @@ def _optimizer(task: _Task, values: dict[str, np.ndarray], level: int) -> Any:
             optimizer[name] = mi.TensorXf(values[name])
         else:
             optimizer[name] = mi.Float(values[name].ravel())
-    optimizer.set_learning_rate(steps)
+    optimizer.set_learning_rate(rates)
     return optimizer
 
 
-def _lanes(task: _Task, optimizer: Any, base: np.ndarray, level: int, values: dict[str, np.ndarray]) -> dict[str, Any]:
-    """All unknowns as `mi_picture` wants them; those of the optimiser carry gradients."""
+def _unknowns(
+    problem: _Problem, optimizer: Any, base: np.ndarray, level: int, values: dict[str, np.ndarray]
+) -> dict[str, Any]:
+    """All unknowns as input of `mi_picture`; those of the optimiser carry gradients."""
     import drjit as dr
     import mitsuba as mi
 
     unknowns = {"log_gain": mi.TensorXf(values["log_gain"])} | {name: optimizer[name] for name in optimizer.keys()}  # noqa: SIM118
     if "correction" in unknowns:
-        texture = mi.Texture2f(unknowns.pop("correction"), wrap_mode=dr.WrapMode.Clamp)
+        texture = mi.Texture2f(unknowns.pop("correction"), wrap_mode=dr.WrapMode.Clamp)  # pyright: ignore[reportCallIssue]
         height, width = base.shape[:2]
         column, row = dr.meshgrid(dr.arange(mi.Float, width), dr.arange(mi.Float, height))
         factor = mi.Color3f(texture.eval(mi.Point2f((column + 0.5) / width, (row + 0.5) / height)))
-        unknowns["albedo"] = mi.TensorXf(base) * mi.TensorXf(dr.ravel(factor), shape=base.shape)
+        mi_factor: Any = dr.ravel(factor)
+        unknowns["albedo"] = mi.TensorXf(base) * mi.TensorXf(mi_factor, shape=base.shape)
     return unknowns
 
 
-def _loss(task: _Task, index: int, unknowns: dict[str, Any], *, seed: int) -> Any:
-    """Weighted mean square of what a photograph and its picture differ by."""
+def _loss(problem: _Problem, index: int, unknowns: dict[str, Any], *, seed: int) -> Any:
+    """Weighted mean squared difference between a photograph and its rendering."""
     import drjit as dr
 
-    target, root = task.targets[index]
-    image = mi_picture(task.views, index, unknowns, spp=task.options.spp, seed=seed)
+    target, root = problem.targets[index]
+    image = mi_picture(problem.views, index, unknowns, spp=problem.options.spp, seed=seed)
     return dr.sum(dr.square((image - target) * root), axis=None)
 
 
-def _judge(task: _Task, values: dict[str, np.ndarray]) -> float:
-    """Loss of the photographs held out, with equal random numbers each time.
+def _validation_loss(problem: _Problem, values: dict[str, np.ndarray]) -> float:
+    """Loss of the validation photographs, with the same random numbers each time.
 
-    The product of two independent pictures' errors: the square of one would count its noise, which grows with albedo,
-    and a darker answer would always seem the better one.
+    The product of the errors of two independent renderings: the squared error of one rendering would include its noise,
+    which grows with albedo, and would bias the choice towards dark albedos.
     """
     import drjit as dr
     import mitsuba as mi
@@ -318,11 +373,13 @@ def _judge(task: _Task, values: dict[str, np.ndarray]) -> float:
     unknowns = {name: mi.TensorXf(v) if v.ndim > 1 else mi.Float(v.ravel()) for name, v in values.items()}
     losses = []
     with dr.suspend_grad():
-        for index in map(int, task.judges):
-            target, root = task.targets[index]
+        for index in map(int, problem.validation):
+            target, root = problem.targets[index]
             first, second = (
                 (
-                    mi_picture(task.views, index, unknowns, spp=2 * task.options.spp, seed=7_000_000 + 2 * index + k)
+                    mi_picture(
+                        problem.views, index, unknowns, spp=2 * problem.options.spp, seed=7_000_000 + 2 * index + k
+                    )
                     - target
                 )
                 * root
@@ -332,8 +389,7 @@ def _judge(task: _Task, values: dict[str, np.ndarray]) -> float:
     return float(np.mean(losses))
 
 
-def _bound(task: _Task, optimizer: Any) -> None:
-    """Keep every unknown within what it can be."""
+def _clip_to_bounds(problem: _Problem, optimizer: Any) -> None:
     import drjit as dr
 
     limits = {
@@ -342,33 +398,35 @@ def _bound(task: _Task, optimizer: Any) -> None:
         "sun": (0.05, 20.0),
         "sky": (0.05, 20.0),
         "haze": (0.0, 20.0),
-    } | {name: (one.low, one.high) for name, one in task.extra.items()}
+    } | {name: (unknown.low, unknown.high) for name, unknown in problem.extra.items()}
     for name in optimizer.keys():  # noqa: SIM118 (not a dict)
         if name in limits:
             optimizer[name] = dr.clip(dr.detach(optimizer[name]), *limits[name])
 
 
-def _values(
-    task: _Task, optimizer: Any, base: np.ndarray, level: int, values: dict[str, np.ndarray]
+def _current_values(
+    problem: _Problem, optimizer: Any, base: np.ndarray, level: int, values: dict[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
+    """The optimiser's values as numpy arrays, and all others unchanged."""
     import drjit as dr
 
     with dr.suspend_grad():
-        lanes = _lanes(task, optimizer, base, level, values)
-        found = {name: np.array(value, np.float32).reshape(values[name].shape) for name, value in lanes.items()}
-    if "albedo" in found:
-        found["albedo"] = np.clip(found["albedo"], LOWEST, HIGHEST)
-    return values | found
+        unknowns = _unknowns(problem, optimizer, base, level, values)
+        current = {name: np.array(value, np.float32).reshape(values[name].shape) for name, value in unknowns.items()}
+    if "albedo" in current:
+        current["albedo"] = np.clip(current["albedo"], LOWEST, HIGHEST)
+    return values | current
 
 
 def _save(state: IterationState, path: Path) -> None:
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         note = json.dumps({"stage": state.stage, "iteration": state.iteration, "history": state.history})
-        np.savez(file, note=note, **{f"value:{name}": value for name, value in state.values.items()})
+        arrays: dict[str, Any] = {f"value:{name}": value for name, value in state.values.items()}
+        np.savez(file, note=note, **arrays)
 
 
-def _loaded(path: Path) -> IterationState:
-    with np.load(path, allow_pickle=False) as held:
-        note = json.loads(str(held["note"]))
-        values = {name.removeprefix("value:"): held[name] for name in held.files if name.startswith("value:")}
+def _load(path: Path) -> IterationState:
+    with np.load(path, allow_pickle=False) as file:
+        note = json.loads(str(file["note"]))
+        values = {name.removeprefix("value:"): file[name] for name in file.files if name.startswith("value:")}
     return IterationState(values, note["stage"], note["iteration"], note["history"])

@@ -1,4 +1,4 @@
-"""Photographs made ready for solving: each with its light, its footprints, and how far it is to be trusted."""
+"""Photographs prepared for albedo estimation: each with its light, pixel footprints and noise model."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """What pictures and model promise: standard deviations that weigh the residuals.
+    """Standard deviations of pictures and forward model, which weight the residuals.
 
     Parameters
     ----------
     model
-        Of the modelled radiance, relative: sampling of light, sub-texel relief.
+        Of the modelled radiance, relative: Monte Carlo noise, relief below texel size.
     edge
-        Of sunlight where a shadow's edge runs through the pixel, relative: penumbra and terrain are never exact.
+        Of sunlight where a shadow's edge crosses the pixel, relative: penumbra and terrain are never exact.
     sky
         Of the sky's radiance, relative.
     levels
-        Bits of the picture's encoding; ``None`` for linear floats. Rounding and JPEG blur about one level.
+        Highest level of the picture's encoding (255 for 8 bits); ``None`` for linear floats.
     level_noise
-        Standard deviation in levels of the encoded picture.
+        Standard deviation of rounding and JPEG compression, in levels of the encoded picture.
     black, white
-        Linear values at and beyond which a pixel says nothing, of 1 that clips; for encoded pictures only.
+        Linear values at and beyond which a pixel is unusable (1 clips); for encoded pictures only.
     """
 
     model: float = 0.02
@@ -51,32 +51,32 @@ EIGHT_BIT = NoiseModel(levels=255)
 
 @dataclass(frozen=True)
 class AlbedoPhotograph:
-    """One photograph, its light, and where its pixels lie in the footprints of its camera.
+    """One photograph, its light, and the footprints of its pixels.
 
     Parameters
     ----------
     observation
         Picture and mask; values are linear in any unit, 1 clips for encoded pictures.
     light
-        As seen from its camera.
+        Illumination at its camera.
     footprints, number
-        Of its camera, and which of their lights this is.
-    seen
-        Of its camera.
+        Of its camera, and the index of its light among the footprints' T lights.
+    atmosphere
+        Pixels of its camera at which aerial perspective and sky radiance are evaluated.
     gain
-        ``(3,)`` known picture value over radiance; ``None`` where exposure and white balance are to be found.
+        ``(3,)`` known pixel value over radiance; ``None`` if exposure and white balance are unknown.
     """
 
     observation: Observation
     light: Illumination
     footprints: Footprints
     number: int
-    seen: CameraAtmosphere
+    atmosphere: CameraAtmosphere
     gain: np.ndarray | None = None
 
 
 def prepare_photographs(
-    land: TexelTransport,
+    transport: TexelTransport,
     observations: Sequence[Observation],
     lights: Sequence[Illumination],
     *,
@@ -89,49 +89,89 @@ def prepare_photographs(
 
     Parameters
     ----------
+    transport
+        Daylight coefficients of the texels.
+    observations
+        K pictures.
+    lights
+        Illumination of each picture.
+    rays
+        Rays in each pixel.
     gains
-        Known picture value over radiance, ``(3,)`` each; left out, unknown.
+        Known pixel value over radiance, ``(3,)`` each, or ``None``; all are unknown if omitted.
+    seed
+        Of ray positions and sampled sky pixels.
+    progress
+        Called with the finished fraction.
+
+    Returns
+    -------
+    list of AlbedoPhotograph
+        In the order of the observations.
+
+    Raises
+    ------
+    ValueError
+        If there is no observation, or not one light for each.
+    NoTerrainInView
+        If a camera's view contains no terrain.
     """
-    tell = progress or (lambda share: None)
+    report = progress or (lambda fraction: None)
     if len(observations) != len(lights) or not observations:
         raise ValueError(
-            f"make_shots: got {len(observations)} photographs and {len(lights)} lights, one of each expected"
+            f"prepare_photographs: got {len(observations)} photographs and {len(lights)} lights, "
+            "expected one light per photograph"
         )
     groups: dict[bytes, list[int]] = {}
-    for index, one in enumerate(observations):
-        camera = one.camera
+    for index, observation in enumerate(observations):
+        camera = observation.camera
         size = np.array([camera.width_px, camera.height_px, camera.fx, camera.fy, camera.cx, camera.cy])
         groups.setdefault(size.tobytes() + camera.world_from_camera.tobytes(), []).append(index)
     photographs: dict[int, AlbedoPhotograph] = {}
     for done, members in enumerate(groups.values()):
-        suns = [luminaries(lights[i]) for i in members]
+        bodies = [luminaries(lights[i]) for i in members]
         footprints = trace_footprints(
-            land.ray_scene,
+            transport.ray_scene,
             observations[members[0]].camera,
-            land.shape,
-            suns,
+            transport.shape,
+            bodies,
             rays=rays,
             seed=seed,
-            progress=lambda share, done=done: tell((done + share) / len(groups)),
+            progress=lambda fraction, done=done: report((done + fraction) / len(groups)),
         )
-        seen = camera_atmosphere(footprints, seed=seed)
+        atmosphere = camera_atmosphere(footprints, seed=seed)
         for number, i in enumerate(members):
             gain = None if gains is None or gains[i] is None else np.broadcast_to(np.asarray(gains[i], float), (3,))
-            photographs[i] = AlbedoPhotograph(observations[i], lights[i], footprints, number, seen, gain)
+            photographs[i] = AlbedoPhotograph(observations[i], lights[i], footprints, number, atmosphere, gain)
     return [photographs[i] for i in range(len(observations))]
 
 
 def thinned_photographs(photographs: Sequence[AlbedoPhotograph], share: float, seed: int) -> list[AlbedoPhotograph]:
-    """The same photographs with a share of their terrain pixels."""
+    """Draw a random subset of the terrain pixels of photographs.
+
+    Parameters
+    ----------
+    photographs
+        Photographs of one camera share their footprints, and receive the same subset.
+    share
+        Fraction of the pixels to keep.
+    seed
+        Of the draw.
+
+    Returns
+    -------
+    list of AlbedoPhotograph
+        In the same order.
+    """
     if share >= 1.0:
         return list(photographs)
     rng = np.random.default_rng(seed)
-    made: dict[int, tuple[Footprints, object]] = {}
+    thinned: dict[int, tuple[Footprints, CameraAtmosphere]] = {}
     result = []
     for photograph in photographs:
-        if id(photograph.footprints) not in made:
+        if id(photograph.footprints) not in thinned:
             part = thinned_footprints(photograph.footprints, rng.random(len(photograph.footprints.pixel)) < share)
-            made[id(photograph.footprints)] = part, replace(camera_atmosphere(part), sky=photograph.seen.sky)
-        footprints, seen = made[id(photograph.footprints)]
-        result.append(replace(photograph, footprints=footprints, seen=seen))
+            thinned[id(photograph.footprints)] = (part, replace(camera_atmosphere(part), sky=photograph.atmosphere.sky))
+        footprints, atmosphere = thinned[id(photograph.footprints)]
+        result.append(replace(photograph, footprints=footprints, atmosphere=atmosphere))
     return result

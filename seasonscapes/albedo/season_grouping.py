@@ -1,4 +1,4 @@
-"""Albedos recovered from photographs of several dates: which of them share a season, and what does not change between them."""
+"""Grouping of dated albedos by season, and averaging of texels that do not change between the dates."""
 
 from __future__ import annotations
 
@@ -11,14 +11,27 @@ import numpy as np
 from seasonscapes.albedo.seasons import day_number, snow_share
 from seasonscapes.albedo.standard_error import KnownAlbedo
 
-# Two dates belong to one season where fewer texels than this changed their snow, and fewer than that their colour.
+# Two dates belong to one season if the fraction of texels whose snow changed is below the first limit, and the fraction
+# whose colour changed is below the second.
 _SNOW_CHANGED, _COLOUR_CHANGED = 0.04, 0.12
 
 
 def group_dates(days: Sequence[date], known: Sequence[KnownAlbedo]) -> list[list[int]]:
-    """Dates that share a season, as lists of indices: consecutive in the year, with the same snow and the same colours.
+    """Group dates that are consecutive in the year and have the same snow cover and colours.
 
-    Only texels measured on both dates are compared.
+    Only texels measured on both of two dates are compared.
+
+    Parameters
+    ----------
+    days
+        Dates, in any order and of any years.
+    known
+        Albedo of each date.
+
+    Returns
+    -------
+    list of list of int
+        Indices of the dates of each season.
     """
     if not days:
         return []
@@ -29,7 +42,7 @@ def group_dates(days: Sequence[date], known: Sequence[KnownAlbedo]) -> list[list
             groups[-1].append(index)
         else:
             groups.append([index])
-    # The year is a circle: December may go on in January.
+    # The year is cyclic: a season may contain December and January.
     if len(groups) > 1 and _same_season(known[groups[-1][-1]], known[groups[0][0]]):
         groups[0] = groups.pop() + groups[0]
     return groups
@@ -46,33 +59,43 @@ def _same_season(a: KnownAlbedo, b: KnownAlbedo) -> bool:
 
 
 def share_unchanged(dated: Sequence[KnownAlbedo]) -> list[KnownAlbedo]:
-    """Albedos of several dates with what did not change between them shared: its evidence is joined.
+    """Replace texels that did not change between dates by their inverse-variance weighted mean.
 
-    A texel measured on several dates, on all of which it agrees within twice its standard deviation, gets one mean
-    everywhere, weighted by information; and dates on which it was not measured get it where all others agree and the snow
-    that the completion expects is the same.
+    A texel is unchanged if it is measured on at least two dates and agrees with the mean within two standard deviations
+    on all of them. Dates on which it was not measured receive the mean too, if the snow cover of their completed value
+    equals that of the mean.
+
+    Parameters
+    ----------
+    dated
+        Albedos of several dates.
+
+    Returns
+    -------
+    list of KnownAlbedo
+        In the same order, with joint means and standard deviations.
     """
     if len(dated) < 2:
         return list(dated)
-    values = np.stack([one.albedo for one in dated])
-    sigma = np.stack([one.sigma for one in dated])
-    measured = np.stack([one.source == 1 for one in dated])
+    values = np.stack([known.albedo for known in dated])
+    sigma = np.stack([known.sigma for known in dated])
+    measured = np.stack([known.source == 1 for known in dated])
     weight = np.where(measured, 1.0 / np.maximum(sigma, 1e-4) ** 2, 0.0)
     total = weight.sum(axis=0)
     mean = (weight[..., None] * values).sum(axis=0) / np.maximum(total, 1e-12)[..., None]
-    apart = np.where(measured, np.abs(values[..., 1] - mean[..., 1]) / np.maximum(sigma, 1e-4), 0.0).max(axis=0)
-    static = (measured.sum(axis=0) >= 2) & (apart < 2.0)
-    joined_sigma = 1.0 / np.sqrt(np.maximum(total, 1e-12))
+    deviation = np.where(measured, np.abs(values[..., 1] - mean[..., 1]) / np.maximum(sigma, 1e-4), 0.0).max(axis=0)
+    unchanged = (measured.sum(axis=0) >= 2) & (deviation < 2.0)
+    joint_sigma = 1.0 / np.sqrt(np.maximum(total, 1e-12))
     result = []
-    for one, was in zip(dated, measured, strict=True):
-        same_snow = np.abs(snow_share(one.albedo) - snow_share(mean)) < 0.5
-        use = static & (was | same_snow)
+    for known, was_measured in zip(dated, measured, strict=True):
+        same_snow = np.abs(snow_share(known.albedo) - snow_share(mean)) < 0.5
+        use = unchanged & (was_measured | same_snow)
         result.append(
             replace(
-                one,
-                albedo=np.where(use[..., None], mean, one.albedo).astype(np.float32),
-                sigma=np.where(use, joined_sigma, one.sigma).astype(np.float32),
-                source=np.where(use, 1, one.source).astype(np.uint8),
+                known,
+                albedo=np.where(use[..., None], mean, known.albedo).astype(np.float32),
+                sigma=np.where(use, joint_sigma, known.sigma).astype(np.float32),
+                source=np.where(use, 1, known.source).astype(np.uint8),
             )
         )
     return result

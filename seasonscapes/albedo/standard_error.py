@@ -1,8 +1,8 @@
-"""How well each texel's albedo is known.
+"""Standard error of each texel's albedo.
 
-A texel's variance comes from the information matrix of the closed form (its diagonal: what the pixels that show it, and the
-light upon it, tell), scaled by how well the photographs were explained, plus a share of the albedo for what light cannot
-tell. Texels that are completed later (`commands.corrected_albedo`) are marked so, never passed off as measured.
+The variance of a texel comes from the diagonal of the closed form's information matrix (the pixels that contain the texel
+and the light upon it), scaled by the residuals of the photographs, plus a common relative term for gains, haze and sky.
+Texels that are completed later (`commands.corrected_albedo`) are marked as such, never as measured.
 """
 
 from __future__ import annotations
@@ -15,27 +15,28 @@ import numpy as np
 from seasonscapes.albedo.closed_form import AlbedoFit
 from seasonscapes.albedo.forward_model import TexelTransport
 from seasonscapes.albedo.photographs import AlbedoPhotograph
+from seasonscapes.errors import NotEnoughEvidence
 
-# What the gains, the haze and the sky leave unknown of every texel, relative.
+# Relative uncertainty of every texel caused by gains, haze and sky.
 _COMMON = 0.01
-# A texel is measured where its standard deviation stays below this share of its albedo (plus 0.02), and it was seen by
-# so many pixels.
+# A texel counts as measured if its standard deviation is below this fraction of its albedo (plus 0.02) and it covers at
+# least this many pixels.
 _POOR, _FEWEST_PIXELS = 0.35, 0.5
 
 
 @dataclass(frozen=True)
 class KnownAlbedo:
-    """An albedo with how well it is known.
+    """An albedo texture with its uncertainty.
 
     Parameters
     ----------
     albedo
         ``(R, S, 3)`` float32.
     sigma
-        ``(R, S)`` float32 standard deviation (green); of completed texels that of the completion, infinite where nothing is
-        known.
+        ``(R, S)`` float32 standard deviation (green); that of the completion for completed texels, infinite where nothing
+        is known.
     sunlit
-        ``(R, S)`` uint8 in how many photographs the texel was seen in direct sunlight.
+        ``(R, S)`` uint8 number of photographs in which the texel is visible in direct sunlight.
     source
         ``(R, S)`` uint8, a key of `SOURCES`.
     """
@@ -50,49 +51,96 @@ SOURCES = {0: "nothing known", 1: "measured", 2: "completed"}
 
 
 def texel_sigma(fit: AlbedoFit) -> np.ndarray:
-    """Standard deviation ``(R, S)`` float32 of the albedo (green); infinite where nothing was seen."""
+    """Standard deviation of each texel's albedo.
+
+    Parameters
+    ----------
+    fit
+        Result of `closed_form.solve_albedo`.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(R, S)`` float32 (green); infinite where nothing was observed.
+    """
     with np.errstate(divide="ignore"):
         random = 1.0 / np.sqrt(fit.information.astype(float))
-    # Neighbours share pixels, so a texel that no pixel has to itself is known worse than the diagonal says.
-    shared = 1.0 + 1.0 / np.maximum(fit.seen, 1e-3)
+    # Neighbouring texels share pixels, so the diagonal underestimates the variance of texels smaller than a pixel.
+    shared = 1.0 + 1.0 / np.maximum(fit.pixel_count, 1e-3)
     scale = max(1.0, float(np.nanmedian(fit.residual)) / 0.0135)
     sigma = np.hypot(scale * random * shared, _COMMON * fit.albedo[..., 1])
-    return np.where((fit.seen > 0.0) & (fit.information > 0.0), sigma, np.inf).astype(np.float32)
+    return np.where((fit.pixel_count > 0.0) & (fit.information > 0.0), sigma, np.inf).astype(np.float32)
 
 
 def finite_sigma(fit: AlbedoFit) -> np.ndarray:
-    """σ ``(R, S)`` of all that was seen, poorly known texels included, for those who weigh by it; infinite elsewhere."""
-    return np.where(fit.seen >= _FEWEST_PIXELS, texel_sigma(fit), np.inf).astype(np.float32)
+    """Standard deviation of all observed texels, poorly determined ones included, for use in weights.
+
+    Parameters
+    ----------
+    fit
+        Result of `closed_form.solve_albedo`.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(R, S)`` float32 (green); infinite for texels that cover less than half a pixel.
+    """
+    return np.where(fit.pixel_count >= _FEWEST_PIXELS, texel_sigma(fit), np.inf).astype(np.float32)
 
 
 def times_sunlit(photographs: Sequence[AlbedoPhotograph]) -> np.ndarray:
-    """In how many photographs each texel was seen in direct sunlight ``(R, S)`` uint8."""
+    """Count the photographs in which each texel is visible in direct sunlight.
+
+    Parameters
+    ----------
+    photographs
+        At least one, all of one texture shape.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(R, S)`` uint8, at most 255.
+    """
     shape = photographs[0].footprints.shape
     count = np.zeros(shape[0] * shape[1], np.int32)
     for photograph in photographs:
         footprints = photograph.footprints
         if not footprints.sunlit[photograph.number]:
             continue
-        seen = np.bincount(footprints.texel, footprints.share, len(count))
-        lit = np.bincount(footprints.texel, footprints.sunlit[photograph.number][0], len(count))
-        count += (lit > 0.05 * seen) & (seen > 0.0)
+        pixels = np.bincount(footprints.texel, footprints.share, len(count))
+        sunlit = np.bincount(footprints.texel, footprints.sunlit[photograph.number][0], len(count))
+        count += (sunlit > 0.05 * pixels) & (pixels > 0.0)
     return np.minimum(count, 255).astype(np.uint8).reshape(shape)
 
 
-def known_albedo(land: TexelTransport, photographs: Sequence[AlbedoPhotograph], fit: AlbedoFit) -> KnownAlbedo:
-    """The albedo of a fit and its uncertainty; where nothing is measured, the median, of infinite σ.
+def known_albedo(transport: TexelTransport, photographs: Sequence[AlbedoPhotograph], fit: AlbedoFit) -> KnownAlbedo:
+    """Combine the albedo of a fit with its uncertainty.
+
+    Parameters
+    ----------
+    transport
+        Daylight coefficients of the texels.
+    photographs
+        The photographs of the fit.
+    fit
+        Result of `closed_form.solve_albedo`.
+
+    Returns
+    -------
+    KnownAlbedo
+        Texels that are not measured hold the median albedo with infinite standard deviation.
 
     Raises
     ------
-    ValueError
-        Where no texel at all is measured.
+    NotEnoughEvidence
+        If no texel is measured.
     """
     sigma = finite_sigma(fit)
-    measured = np.zeros(land.shape[0] * land.shape[1], bool)
-    measured[land.texel] = True
-    measured = measured.reshape(land.shape) & (sigma < _POOR * fit.albedo[..., 1] + 0.02)
+    measured = np.zeros(transport.shape[0] * transport.shape[1], bool)
+    measured[transport.texel] = True
+    measured = measured.reshape(transport.shape) & (sigma < _POOR * fit.albedo[..., 1] + 0.02)
     if not measured.any():
-        raise ValueError("known_albedo: no texel is measured")
+        raise NotEnoughEvidence("known_albedo: no texel is measured: too few pixels or too large a standard error")
     albedo = np.where(measured[..., None], fit.albedo, np.median(fit.albedo[measured], axis=0)).astype(np.float32)
     sigma = np.where(measured, sigma, np.inf).astype(np.float32)
     return KnownAlbedo(albedo, sigma, times_sunlit(photographs), measured.astype(np.uint8))

@@ -1,8 +1,8 @@
-"""The camera's response curve: one strength of an S-curve, found where the photographs agree best under their light.
+"""Tone curve of a camera: strength of an S-curve at which the photographs are most consistent under their lights.
 
-Webcams lift bright and darken dark values on top of sRGB. The family here is the cubic that keeps both ends of the encoded
-range, ``(1 - s) e + s (3 e² - 2 e³)``; s = 0 is sRGB itself. What tells s apart from albedo is that one place is seen bright
-and dark, at many hours, and that the sky is known.
+Webcams brighten bright values and darken dark values on top of sRGB. The family here is the cubic that keeps both ends
+of the encoded range, ``(1 - s) e + s (3 e² - 2 e³)``; s = 0 is sRGB itself. The strength s is separable from albedo
+because each place is observed both bright and dark, at many hours, and because the sky radiance is known.
 """
 
 from __future__ import annotations
@@ -23,14 +23,35 @@ STRENGTHS = (0.0, 0.2, 0.4, 0.6)
 
 @dataclass(frozen=True)
 class ToneCurveFit:
-    """The strength found, and the robust cost of every one that was tried."""
+    """Result of the tone-curve search.
+
+    Parameters
+    ----------
+    strength
+        Strength of least cost.
+    costs
+        Robust cost of every strength that was tried.
+    """
 
     strength: float
     costs: dict[float, float]
 
 
 def invert_tone_curve(linear: np.ndarray, strength: float) -> np.ndarray:
-    """Linear values ``(...)`` in [0, 1] of a picture that was decoded as plain sRGB but went through an S-curve."""
+    """Remove an S-curve from a picture that was decoded as plain sRGB.
+
+    Parameters
+    ----------
+    linear
+        ``(...)`` values in [0, 1].
+    strength
+        Of the S-curve, in [0, 1].
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(...)`` scene-linear values in [0, 1].
+    """
     if strength == 0.0:
         return linear
     knots = np.linspace(0.0, 1.0, 4097)
@@ -40,7 +61,20 @@ def invert_tone_curve(linear: np.ndarray, strength: float) -> np.ndarray:
 
 
 def with_tone_curve(photographs: Sequence[AlbedoPhotograph], strength: float) -> list[AlbedoPhotograph]:
-    """The same photographs with the S-curve taken out."""
+    """Remove an S-curve from photographs.
+
+    Parameters
+    ----------
+    photographs
+        Photographs decoded as plain sRGB.
+    strength
+        Of the S-curve, in [0, 1].
+
+    Returns
+    -------
+    list of AlbedoPhotograph
+        The same photographs with scene-linear values.
+    """
     return [
         replace(
             photograph,
@@ -53,7 +87,7 @@ def with_tone_curve(photographs: Sequence[AlbedoPhotograph], strength: float) ->
 
 
 def fit_tone_curve(
-    land: TexelTransport,
+    transport: TexelTransport,
     photographs: Sequence[AlbedoPhotograph],
     *,
     strengths: Sequence[float] = STRENGTHS,
@@ -63,29 +97,55 @@ def fit_tone_curve(
     seed: int = 0,
     progress: Callable[[float], None] | None = None,
 ) -> ToneCurveFit:
-    """The S-curve that all photographs share (one kind of webcam), by search over its strength.
+    """Estimate the strength of the S-curve that all photographs share (one type of webcam).
+
+    Parameters
+    ----------
+    transport
+        Daylight coefficients of the texels.
+    photographs
+        Photographs decoded as plain sRGB.
+    strengths
+        Strengths to try, rising, at least three; the minimum is refined by a parabola.
+    noise_model
+        Standard deviations that weight the residuals.
+    share
+        Fraction of the pixels used.
+    start
+        Initial albedo fit.
+    seed
+        Of the drawn pixels.
+    progress
+        Called with the finished fraction.
+
+    Returns
+    -------
+    ToneCurveFit
+        Best strength, and the cost of all that were tried.
 
     Raises
     ------
     ValueError
-        Fewer than three strengths to try.
+        If there are fewer than three strengths.
+    NoUsablePixels, NotEnoughEvidence
+        From `solve_albedo`.
     """
-    tell = progress or (lambda done: None)
+    report = progress or (lambda fraction: None)
     if len(strengths) < 3:
-        raise ValueError("fit_response: three strengths at least")
-    thin = thinned_photographs(photographs, share, seed)
+        raise ValueError(f"fit_tone_curve: got {len(strengths)} strengths, expected at least three")
+    thinned = thinned_photographs(photographs, share, seed)
     costs: dict[float, float] = {}
 
     def cost_at(strength: float) -> float:
         fit = solve_albedo(
-            land,
-            with_tone_curve(thin, strength),
+            transport,
+            with_tone_curve(thinned, strength),
             noise_model=noise_model,
             solver=_QUICK,
             start=None if start is None else start.albedo,
         )
         costs[strength] = fit.cost
-        tell(len(costs) / (len(strengths) + 1))
+        report(len(costs) / (len(strengths) + 1))
         return fit.cost
 
     values = [cost_at(float(s)) for s in strengths]
@@ -96,5 +156,5 @@ def fit_tone_curve(
         guess = float(np.clip(-0.5 * curve[1] / curve[0], strengths[0], strengths[-1]))
         if min(abs(guess - s) for s in costs) > 0.01:
             cost_at(guess)
-    tell(1.0)
-    return ToneCurveFit(min(costs, key=costs.get), dict(sorted(costs.items())))
+    report(1.0)
+    return ToneCurveFit(min(costs, key=costs.__getitem__), dict(sorted(costs.items())))
