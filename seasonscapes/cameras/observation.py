@@ -10,8 +10,8 @@ import csv
 import hashlib
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from zoneinfo import ZoneInfo
@@ -46,6 +46,8 @@ class Observation:
         Aware, UTC.
     webcam
         Id of the webcam it came from.
+    pose_sigma
+        Standard deviations of the pose by the names of a calibration record; missing ones count as exact.
     """
 
     image: np.ndarray
@@ -53,6 +55,7 @@ class Observation:
     camera: Camera | Panorama
     time: datetime
     webcam: str
+    pose_sigma: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self):
         size = (self.camera.height_px, self.camera.width_px)
