@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 from skimage.metrics import structural_similarity
 
-from seasonscapes.texturing.membrane import membrane_fill
-from seasonscapes.texturing.push_pull import push_pull
+from seasonscapes.texturing.smooth_fill import membrane_fill, push_pull
 
 MEMBRANES = ("push_pull", "laplace")
 TRANSFERS = ("histogram", "affine", "class_affine")

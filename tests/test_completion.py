@@ -17,10 +17,8 @@ from seasonscapes.terrain.mesh import build_mesh
 from seasonscapes.terrain.surface import Raster, Texture, load_texture, save_texture
 from seasonscapes.terrain.unwrap import unwrap
 from seasonscapes.texturing.completion import INPAINTERS, complete
-from seasonscapes.texturing.membrane import membrane_fill
 from seasonscapes.texturing.predictors import predictors_for, stack_predictors
-from seasonscapes.texturing.push_pull import propagate, push_pull
-from seasonscapes.texturing.telea import telea_fill
+from seasonscapes.texturing.smooth_fill import membrane_fill, propagate, push_pull, telea_fill
 from seasonscapes.texturing.terrain_features import horizon_tangent, sun_margin_deg, terrain_features
 from seasonscapes.texturing.top_down_grid import from_grid, to_grid
 from seasonscapes.workspace import Workspace

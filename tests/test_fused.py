@@ -9,7 +9,7 @@ from seasonscapes.terrain.surface import Texture
 from seasonscapes.texturing.bayesian_fusion import fuse_with_albedo
 from seasonscapes.texturing.completion import complete
 from seasonscapes.texturing.predictors import stack_predictors
-from seasonscapes.texturing.shrinkage import fit_variance_by_weight
+from seasonscapes.texturing.texel_weights import fit_variance_by_weight
 
 
 @pytest.fixture(scope="module")

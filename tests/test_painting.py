@@ -39,8 +39,8 @@ from seasonscapes.texturing.painting import PaintOptions, paint_atlas, prepare_i
 from seasonscapes.texturing.painting_file import load_painting, save_painting, write_figures
 from seasonscapes.texturing.radiometric_fit import RadiometricFit, fit_radiometry, invert_contrast, radiance_at_surface
 from seasonscapes.texturing.silhouette import depth_jumps, pose_sigma_px, silhouette_guard
+from seasonscapes.texturing.texel_weights import sharpened, texel_weight
 from seasonscapes.texturing.visibility import by_depth, by_faces, by_ray, project_texels
-from seasonscapes.texturing.weights import sharpened, texel_weight
 
 NOON = datetime(2024, 9, 1, 12, tzinfo=UTC)
 SKY = np.array([3000.0, 4000.0, 6000.0])

@@ -14,7 +14,7 @@ from seasonscapes.terrain.surface import Texture
 from seasonscapes.texturing.completion import Completed, painted_texels
 from seasonscapes.texturing.predictors import Predictors
 from seasonscapes.texturing.regression_fill import propagate_residual
-from seasonscapes.texturing.shrinkage import fit_variance_by_weight
+from seasonscapes.texturing.texel_weights import fit_variance_by_weight
 
 # Of the modelled light, and of the best pictures (noise, JPEG, tone curve) [log].
 _LIGHT_SIGMA, _PICTURE_SIGMA = 0.05, 0.05

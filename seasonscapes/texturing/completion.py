@@ -11,12 +11,10 @@ import numpy as np
 from seasonscapes.terrain.surface import Texture
 from seasonscapes.texturing.completion_error import sigma_by_distance
 from seasonscapes.texturing.detail import add_detail
-from seasonscapes.texturing.membrane import membrane_fill
 from seasonscapes.texturing.predictors import Predictors
-from seasonscapes.texturing.push_pull import push_pull
 from seasonscapes.texturing.regression_fill import regression_fill
 from seasonscapes.texturing.residual_correction import corrected_fill
-from seasonscapes.texturing.telea import telea_fill
+from seasonscapes.texturing.smooth_fill import membrane_fill, push_pull, telea_fill
 from seasonscapes.texturing.top_down_grid import from_grid, to_grid
 
 Progress = Callable[[float], None]

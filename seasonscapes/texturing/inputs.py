@@ -16,8 +16,8 @@ from seasonscapes.rendering.mitsuba_scene import RenderScene
 from seasonscapes.sky.illumination import AerialPerspective
 from seasonscapes.texturing.atlas_tiles import AtlasTiling, TexelSurface, seen_blocks
 from seasonscapes.texturing.silhouette import picture_mask, pose_sigma_px, silhouette_guard
+from seasonscapes.texturing.texel_weights import BRIGHTEST, exposure_confidence
 from seasonscapes.texturing.visibility import ProjectedTexels
-from seasonscapes.texturing.weights import BRIGHTEST, exposure_confidence
 
 # What is nearer than this is rather a roof or a tree than the terrain model's ground.
 NEAR_M = 60.0

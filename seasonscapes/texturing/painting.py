@@ -32,8 +32,8 @@ from seasonscapes.texturing.inputs import (
     texel_extent_px,
 )
 from seasonscapes.texturing.radiometric_fit import RadiometricFit, common_gain, fit_radiometry, radiance_at_surface
+from seasonscapes.texturing.texel_weights import sharpened, texel_weight
 from seasonscapes.texturing.visibility import by_ray, project_texels
-from seasonscapes.texturing.weights import sharpened, texel_weight
 
 MODES = ("weighted", "first")
 Progress = Callable[[float], None]

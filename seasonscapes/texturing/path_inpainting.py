@@ -24,8 +24,8 @@ from seasonscapes.texturing.atlas_tiles import AtlasTiling, sees_tile, tile_surf
 from seasonscapes.texturing.inputs import PaintingInput, prepare_input
 from seasonscapes.texturing.painting import input_texels
 from seasonscapes.texturing.path_steps import PathStep, levels_of, load_step, save_step
-from seasonscapes.texturing.push_pull import push_pull
 from seasonscapes.texturing.radiometric_fit import RadiometricFit
+from seasonscapes.texturing.smooth_fill import push_pull
 from seasonscapes.texturing.view_conditions import (
     MASKS,
     Conditions,

@@ -15,7 +15,7 @@ import numpy as np
 
 from seasonscapes.texturing.completion_error import ErrorModel, fit_error_model, spatial_folds
 from seasonscapes.texturing.predictors import Predictors
-from seasonscapes.texturing.push_pull import propagate
+from seasonscapes.texturing.smooth_fill import propagate
 from seasonscapes.texturing.top_down_grid import from_grid, to_grid
 
 Progress = Callable[[float], None]

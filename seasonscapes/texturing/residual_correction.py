@@ -27,7 +27,7 @@ from seasonscapes.texturing.regression_fill import (
     propagate_residual,
     regression_fill,
 )
-from seasonscapes.texturing.shrinkage import fit_variance_by_weight
+from seasonscapes.texturing.texel_weights import fit_variance_by_weight
 
 Progress = Callable[[float], None]
 _LEAF = 20
