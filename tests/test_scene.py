@@ -120,10 +120,10 @@ def in_feet_and_a_half(values, profile):
     ("name", "change", "message"),
     [
         ("dem.tif", without_crs, "no CRS"),
-        ("dem.tif", in_degrees, "degrees where metres"),
-        ("image.tif", elsewhere, r"image\.tif: the raster does not reach the area"),
+        ("dem.tif", in_degrees, "coordinates in degrees in the projected CRS"),
+        ("image.tif", elsewhere, r"image\.tif: the raster does not overlap the requested area"),
         ("dem.tif", mostly_holes, "too much of the area has no data"),
-        ("dem.tif", in_feet_and_a_half, "heights that no place on land has"),
+        ("dem.tif", in_feet_and_a_half, "heights outside the range of land elevations"),
     ],
 )
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")

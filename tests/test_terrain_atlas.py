@@ -166,7 +166,7 @@ def test_an_overhang_is_refused_by_planar_with_the_way_out():
     faces[4] = (4, 3, 5)
     terrain = Terrain(vertices, faces, np.zeros((6, 2), np.float32), FRAME)
     folded = Terrain(vertices, np.array([(0, 1, 4), (0, 4, 1)], np.uint32), terrain.uv, FRAME)
-    with pytest.raises(InputError, match=r"atlas planar: 1 of 2 faces fold over in the plan; take the xatlas atlas"):
+    with pytest.raises(InputError, match=r"atlas planar: 1 of 2 faces fold over in UV space; use the xatlas atlas"):
         unwrap(folded)
 
 
@@ -195,7 +195,7 @@ def test_relief_of_level_ground_is_planar():
 def test_relief_refuses_what_has_holes_or_too_many_faces(monkeypatch):
     terrain = build_mesh(hill_lv95(6, 6), FRAME, mesher="grid")
     torn = Terrain(terrain.vertices, np.delete(terrain.faces, 24, axis=0), terrain.uv, FRAME)
-    with pytest.raises(InputError, match=r"atlas relief: the surface is not one piece without holes; take the xatlas"):
+    with pytest.raises(InputError, match=r"atlas relief: the surface is not one piece without holes; use the xatlas"):
         unwrap(torn, kind="relief")
     monkeypatch.setattr(relief, "MAX_FACES", 49)
     with pytest.raises(

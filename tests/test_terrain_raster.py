@@ -163,16 +163,21 @@ def test_shrinking_while_reading_is_the_mean_of_blocks(tmp_path):
 @pytest.mark.parametrize(
     ("crs", "transform", "values", "message"),
     [
-        (None, LV95, 500.0, "the raster has no CRS; say which with: gdal_edit.py -a_srs EPSG:… FILE"),
-        ("EPSG:2056", None, 500.0, "the raster has a CRS but no placement on the map (geotransform)"),
+        (None, LV95, 500.0, "the raster has no CRS; assign one with: gdal_edit.py -a_srs EPSG:… FILE"),
+        ("EPSG:2056", None, 500.0, "the raster has a CRS but no geotransform"),
         (
             "EPSG:2056",
             Affine(0.001, 0, 7.9, 0, -0.001, 46.6),
             500.0,
-            "degrees where metres are meant, in the projected CRS EPSG:2056; got 'x 7.9 … 7.904, y 46.597 … 46.6'",
+            "coordinates in degrees in the projected CRS EPSG:2056; got 'x 7.9 … 7.904, y 46.597 … 46.6'",
         ),
         ("EPSG:4326", LV95, 500.0, "coordinates beyond ±180°/±90° in the geographic CRS EPSG:4326"),
-        ("EPSG:2056", LV95, 90000.0, "heights that no place on land has; got '90000 … 90000'; expected -500 … 9000 m"),
+        (
+            "EPSG:2056",
+            LV95,
+            90000.0,
+            "heights outside the range of land elevations; got '90000 … 90000'; expected -500 … 9000 m",
+        ),
         ("EPSG:2056", LV95, -32768.0, "cure"),
     ],
 )
@@ -200,7 +205,7 @@ def test_missing_and_unreadable_files_and_bands_are_named(tmp_path):
     assert read_elevation(path, band=2).values.shape == (2, 2, 1)
     with pytest.raises(InputError, match=r"no such band; got 4; expected 1 … 3"):
         read_elevation(path, band=4)
-    with pytest.raises(InputError, match=r"does not reach the area asked for; got 'W 7\.9"):
+    with pytest.raises(InputError, match=r"does not overlap the requested area; got 'W 7\.9"):
         read_elevation(path, band=1, bounds_deg=(9.0, 46.0, 9.1, 46.1))
     with pytest.raises(ValueError, match="west < east"):
         read_elevation(path, band=1, bounds_deg=(9.1, 46.0, 9.0, 46.1))
@@ -243,7 +248,7 @@ def test_unusable_coordinate_systems_are_named():
     with pytest.raises(InputError, match="EPSG:999999: not a coordinate reference system"):
         geodetic_from_map("EPSG:999999", 0.0, 0.0)
     local = 'LOCAL_CS["site grid",UNIT["metre",1],AXIS["x",EAST],AXIS["y",NORTH]]'
-    with pytest.raises(InputError, match="not tied to the Earth"):
+    with pytest.raises(InputError, match="neither geographic nor projected"):
         geodetic_from_map(local, 0.0, 0.0)
 
 
@@ -317,7 +322,7 @@ def test_filling_refuses_emptiness():
     whole, report = fill_nodata(hill_lv95(5, 5))
     assert report.filled_cells == 0
     assert np.isfinite(whole.values).all()
-    with pytest.raises(InputError, match=r"dem.tif: no data at all in the area asked for"):
+    with pytest.raises(InputError, match=r"dem.tif: no data at all in the requested area"):
         fill_nodata(_with_hole(np.ones((4, 4)), np.ones((4, 4), bool)), where="dem.tif")
     half = np.zeros((4, 4), bool)
     half[:2] = True

@@ -1,4 +1,4 @@
-"""What every UV atlas is measured by: texel sizes on the surface, and that no two places share a texel."""
+"""Quality measures of a UV atlas: texel size and stretch on the surface, signed areas in UV, fold-over test."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _CHUNK_FACES = 500_000
 
 @dataclass(frozen=True)
 class Atlas:
-    """The size of a texture for a terrain and how finely it resolves the surface.
+    """Size and surface resolution of a UV atlas.
 
     Parameters
     ----------
@@ -23,14 +23,14 @@ class Atlas:
     width_px, height_px
         Size in texels.
     texel_p1_m, texel_p50_m, texel_p99_m
-        Side of a square with the area that one texel covers **on the surface** (not in plan), percentiles over the
-        surface's area [m].
+        Square root of the area that one texel covers **on the surface** (not in horizontal projection), area-weighted
+        percentiles [m].
     stretch_p99_m
-        The longer extent of a texel on the surface, 99th percentile [m].
+        Larger singular value of the map from texels to metres, area-weighted 99th percentile [m].
     utilization
-        Share of the texels that the surface uses.
+        Fraction of the texture that the charts cover, in [0, 1].
     charts
-        Number of connected pieces.
+        Number of charts.
     """
 
     kind: str
@@ -45,7 +45,20 @@ class Atlas:
 
 
 def planar_uv(vertices: np.ndarray) -> np.ndarray:
-    """Top-down UV ``(V, 2)`` float32 that fills [0, 1] with the bounding box of the plan (not square texels)."""
+    """Compute top-down UV coordinates that map the horizontal bounding box onto the unit square.
+
+    Texels are not square unless the box is.
+
+    Parameters
+    ----------
+    vertices
+        ``(V, 3)`` east-north-up [m].
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(V, 2)`` float32 in [0, 1].
+    """
     low, high = vertices[:, :2].min(0).astype(np.float64), vertices[:, :2].max(0).astype(np.float64)
     uv = np.empty((len(vertices), 2), np.float32)
     for axis in (0, 1):
@@ -56,12 +69,32 @@ def planar_uv(vertices: np.ndarray) -> np.ndarray:
 
 
 def plan_size(terrain: Terrain, texel_m: float | None, max_side_px: int) -> tuple[np.ndarray, float, int, int]:
-    """South-west corner ``(2,)`` [m], texel side [m], width and height [texels] of a plan with square texels.
+    """Compute origin, texel size and dimensions of a top-down texture grid with square texels.
+
+    Parameters
+    ----------
+    terrain
+        The surface whose horizontal bounding box the grid covers.
+    texel_m
+        Texel side [m]; ``None`` for the smallest side that ``max_side_px`` allows.
+    max_side_px
+        Largest width or height [texels].
+
+    Returns
+    -------
+    low
+        South-west corner ``(2,)`` east, north [m].
+    texel_m
+        Texel side [m].
+    width, height
+        Size of the grid [texels].
 
     Raises
     ------
     InputError
-        ``texel_m`` asks for more than ``max_side_px``.
+        The grid needs more than ``max_side_px`` texels along a side.
+    ValueError
+        ``texel_m`` is not positive.
     """
     low = terrain.vertices[:, :2].min(0).astype(np.float64)
     extent = terrain.vertices[:, :2].max(0).astype(np.float64) - low
@@ -69,28 +102,59 @@ def plan_size(terrain: Terrain, texel_m: float | None, max_side_px: int) -> tupl
         texel_m = float(extent.max()) / max_side_px
     if not texel_m > 0.0:
         raise ValueError(f"texel_m: got {texel_m}, expected a positive size")
-    # A hair less than a whole texel past the edge is a rounding error, not a reason for one more row.
+    # The tolerance keeps rounding errors from adding a row or column.
     width, height = (max(1, int(np.ceil(side / texel_m - 1e-6))) for side in extent)
     require_side(width, height, texel_m, max_side_px)
     return low, texel_m, width, height
 
 
 def require_side(width: int, height: int, texel_m: float, max_side_px: int) -> None:
-    """`InputError` where an atlas would be larger than allowed."""
+    """Raise `InputError` where an atlas is larger than allowed.
+
+    Parameters
+    ----------
+    width, height
+        Size of the atlas [texels].
+    texel_m
+        Texel side [m], for the message.
+    max_side_px
+        Largest width or height [texels].
+
+    Raises
+    ------
+    InputError
+        The larger side exceeds ``max_side_px``.
+    """
     if max(width, height) > max_side_px:
         coarser = texel_m * max(width, height) / max_side_px
         raise InputError(
             "atlas",
             f"texels of {texel_m:g} m need {width} × {height} of them",
             expected=f"at most {max_side_px} along a side",
-            cure=f"take texels of {coarser:.3g} m or a larger limit",
+            cure=f"use texels of {coarser:.3g} m or a larger limit",
         )
 
 
 def measure_atlas(terrain: Terrain, kind: str, width_px: int, height_px: int, *, charts: int = 1) -> Atlas:
-    """Texel sizes on the surface from the singular values of each face's map from texels to metres.
+    """Measure an atlas by the singular values of each face's affine map from texels to metres.
 
     After Sander et al. 2001, "Texture mapping progressive meshes", doi:10.1145/383259.383307.
+
+    Parameters
+    ----------
+    terrain
+        Surface with the UV coordinates to measure.
+    kind
+        Name of the parametrisation, copied into the result.
+    width_px, height_px
+        Size of the texture [texels].
+    charts
+        Number of charts, copied into the result.
+
+    Returns
+    -------
+    Atlas
+        Size, texel sizes [m] and utilisation.
     """
     longer, shorter, area = singular_values(terrain, width_px, height_px)
     texel = np.sqrt(longer * shorter)
@@ -101,7 +165,22 @@ def measure_atlas(terrain: Terrain, kind: str, width_px: int, height_px: int, *,
 
 
 def singular_values(terrain: Terrain, width_px: int, height_px: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Longer and shorter extent of a texel on each face [m] and the face's area [m²], each ``(F,)``."""
+    """Compute the singular values of each face's affine map from texels to metres.
+
+    Parameters
+    ----------
+    terrain
+        Surface with UV coordinates.
+    width_px, height_px
+        Size of the texture [texels].
+
+    Returns
+    -------
+    longer, shorter
+        Singular values ``(F,)``: major and minor extent of one texel on the surface [m].
+    area
+        Surface area ``(F,)`` of each face [m²].
+    """
     longer, shorter, area = (np.empty(len(terrain.faces)) for _ in range(3))
     scale = np.array([width_px, height_px], np.float64)
     for start in range(0, len(terrain.faces), _CHUNK_FACES):
@@ -122,7 +201,7 @@ def singular_values(terrain: Terrain, width_px: int, height_px: int) -> tuple[np
     return longer, shorter, area
 
 
-def _weighted_percentiles(values: np.ndarray, weights: np.ndarray, percents) -> tuple[float, ...]:
+def _weighted_percentiles(values: np.ndarray, weights: np.ndarray, percents: tuple[float, ...]) -> tuple[float, ...]:
     order = np.argsort(values)
     rank = np.cumsum(weights[order])
     index = np.searchsorted(rank, np.asarray(percents) / 100.0 * rank[-1])
@@ -130,7 +209,20 @@ def _weighted_percentiles(values: np.ndarray, weights: np.ndarray, percents) -> 
 
 
 def signed_uv_areas(uv: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Areas ``(F,)`` of the faces in UV, negative where a face is turned over."""
+    """Compute the signed area of each face in UV space.
+
+    Parameters
+    ----------
+    uv
+        ``(V, 2)`` texture coordinates.
+    faces
+        ``(F, 3)`` vertex indices.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(F,)`` float64, negative for faces of reversed orientation.
+    """
     areas = np.empty(len(faces))
     for start in range(0, len(faces), _CHUNK_FACES):
         corners = uv[faces[start : start + _CHUNK_FACES]].astype(np.float64)
@@ -140,7 +232,22 @@ def signed_uv_areas(uv: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def require_unfolded(terrain: Terrain, kind: str, *, cure: str) -> None:
-    """`InputError` where a face is turned over or has no area in UV: two places would then share texels."""
+    """Raise `InputError` where the parametrisation folds over, so that two surface points would share a texel.
+
+    Parameters
+    ----------
+    terrain
+        Surface with the UV coordinates to test.
+    kind
+        Name of the atlas, for the message.
+    cure
+        Advice for the message.
+
+    Raises
+    ------
+    InputError
+        A face has zero or negative area in UV.
+    """
     folded = int(np.count_nonzero(~(signed_uv_areas(terrain.uv, terrain.faces) > 0.0)))
     if folded:
-        raise InputError(f"atlas {kind}", f"{folded} of {len(terrain.faces)} faces fold over in the plan", cure=cure)
+        raise InputError(f"atlas {kind}", f"{folded} of {len(terrain.faces)} faces fold over in UV space", cure=cure)

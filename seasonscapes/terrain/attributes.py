@@ -1,4 +1,4 @@
-"""What the weather meets on the ground: how high places lie, how they face, and whether they are hollow."""
+"""Terrain attributes at surface points: height, unit normal and concavity."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ import numpy as np
 from seasonscapes.terrain.surface import Terrain
 from seasonscapes.terrain.texels import barycentric, texel_coordinates, texel_positions
 
-# Hollows are seen against land this far around; a plan finer than this shows them no better [m].
-_HOLLOW_M, _FINEST_M = 90.0, 15.0
+# Standard deviation of the Gaussian mean height that concavity refers to, and smallest cell of its grid [m].
+_CONCAVITY_SIGMA_M, _MIN_SPACING_M = 90.0, 15.0
 
 
 @dataclass(frozen=True)
 class TerrainAttributes:
-    """N places on the land.
+    """Terrain attributes at N surface points.
 
     Parameters
     ----------
     height_m
-        ``(N,)`` [m].
+        ``(N,)`` up coordinate [m].
     normal
-        ``(N, 3)`` unit normals, ENU.
+        ``(N, 3)`` unit normals, east-north-up.
     concavity_m
-        ``(N,)`` depth below the land around [m].
+        ``(N,)`` Gaussian-weighted mean height of the surroundings minus the point's own height [m]; positive in hollows.
     """
 
     height_m: np.ndarray
@@ -33,28 +33,69 @@ class TerrainAttributes:
 
 
 def attributes_at(position_m: np.ndarray, normal: np.ndarray, spacing_m: float) -> TerrainAttributes:
-    """The ground at places ``(N, 3)`` ENU [m] about ``spacing_m`` apart, with normals ``(N, 3)`` of any length."""
+    """Compute terrain attributes at given surface points.
+
+    Parameters
+    ----------
+    position_m
+        ``(N, 3)`` points on the surface, east-north-up [m].
+    normal
+        ``(N, 3)`` surface normals of any length.
+    spacing_m
+        Typical distance between neighbouring points [m].
+
+    Returns
+    -------
+    TerrainAttributes
+        Attributes of the N points, float32.
+    """
     unit = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
     height = position_m[:, 2:].astype(np.float32)
-    around = plan_blur(position_m, height, max(spacing_m, _FINEST_M), _HOLLOW_M)
-    return TerrainAttributes(height[:, 0], unit.astype(np.float32), (around - height)[:, 0])
+    mean_height = plan_blur(position_m, height, max(spacing_m, _MIN_SPACING_M), _CONCAVITY_SIGMA_M)
+    return TerrainAttributes(height[:, 0], unit.astype(np.float32), (mean_height - height)[:, 0])
 
 
 def texel_attributes(terrain: Terrain, shape: tuple[int, int]) -> tuple[TerrainAttributes, np.ndarray]:
-    """The ground under the texels of a texture of ``shape``, and the flat index ``(N,)`` of those that lie on it."""
+    """Compute terrain attributes at the texel centres of a texture.
+
+    Parameters
+    ----------
+    terrain
+        Surface with UV coordinates.
+    shape
+        Rows and columns of the texture.
+
+    Returns
+    -------
+    attributes
+        Attributes of the N texels that a face covers.
+    texel
+        Flat index ``(N,)`` of these texels in a texture of ``shape``.
+    """
     height, width = shape
     position, face_id = texel_positions(terrain, width, height)
     texel = np.flatnonzero(face_id >= 0)
     corners = terrain.faces[face_id.ravel()[texel]]
     centre = np.stack([texel % width, texel // width], axis=-1) + 0.5
-    share = barycentric(texel_coordinates(terrain.uv, width, height)[corners], centre)
-    normal = np.einsum("nk,nkc->nc", share, vertex_normals(terrain)[corners])
+    weights = barycentric(texel_coordinates(terrain.uv, width, height)[corners], centre)
+    normal = np.einsum("nk,nkc->nc", weights, vertex_normals(terrain)[corners])
     area_m2 = float(np.prod(np.ptp(terrain.vertices[:, :2].astype(np.float64), axis=0)))
     return attributes_at(position.reshape(-1, 3)[texel], normal, np.sqrt(area_m2 / max(len(texel), 1))), texel
 
 
 def vertex_normals(terrain: Terrain) -> np.ndarray:
-    """Unit normals ``(V, 3)``: means of the faces around, weighted by their angles (Thürmer & Wüthrich 1998)."""
+    """Compute vertex normals as angle-weighted means of the adjacent face normals (Thürmer & Wüthrich 1998).
+
+    Parameters
+    ----------
+    terrain
+        The surface.
+
+    Returns
+    -------
+    numpy.ndarray
+        Unit normals ``(V, 3)`` float32, east-north-up.
+    """
     corner = terrain.vertices[terrain.faces].astype(np.float64)
     face = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     face /= np.maximum(np.linalg.norm(face, axis=1, keepdims=True), 1e-30)
@@ -69,7 +110,26 @@ def vertex_normals(terrain: Terrain) -> np.ndarray:
 
 
 def plan_blur(position_m: np.ndarray, values: np.ndarray, spacing_m: float, sigma_m: float) -> np.ndarray:
-    """Values ``(N, C)`` at places ``(N, 3)`` averaged in plan, weighted by a Gaussian of ``sigma_m``."""
+    """Smooth scattered values with a horizontal Gaussian kernel (normalised convolution on a grid).
+
+    Values are binned into square cells; the Gaussian of the sums is divided by the Gaussian of the counts.
+
+    Parameters
+    ----------
+    position_m
+        ``(N, 3)`` points, east-north-up [m]; heights are not used.
+    values
+        ``(N, C)`` values at the points.
+    spacing_m
+        Cell size of the grid [m].
+    sigma_m
+        Standard deviation of the Gaussian [m].
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(N, C)`` float32 smoothed values at the same points.
+    """
     import cv2
 
     cell = np.floor((position_m[:, :2] - position_m[:, :2].min(axis=0)) / spacing_m + 0.5).astype(int)
@@ -78,6 +138,6 @@ def plan_blur(position_m: np.ndarray, values: np.ndarray, spacing_m: float, sigm
     np.add.at(grid, (cell[:, 1], cell[:, 0]), values)
     np.add.at(count, (cell[:, 1], cell[:, 0]), 1.0)
     sigma = sigma_m / spacing_m
-    wide = cv2.GaussianBlur(grid, (0, 0), sigma).reshape(grid.shape)
-    mean = wide / np.maximum(cv2.GaussianBlur(count, (0, 0), sigma), 1e-6)[..., None]
+    blurred = cv2.GaussianBlur(grid, (0, 0), sigma).reshape(grid.shape)
+    mean = blurred / np.maximum(cv2.GaussianBlur(count, (0, 0), sigma), 1e-6)[..., None]
     return mean[cell[:, 1], cell[:, 0]]

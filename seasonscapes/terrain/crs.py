@@ -1,19 +1,40 @@
-"""From a raster's map coordinates to WGS 84 and back, horizontally and without silent shortcuts."""
+"""Horizontal transformations between map coordinates and WGS 84 (PROJ, without ballpark operations)."""
 
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from affine import Affine
+from numpy.typing import ArrayLike
 
 from seasonscapes.declaration import InputError
 from seasonscapes.terrain.surface import Raster
 
+if TYPE_CHECKING:
+    from pyproj import CRS, Transformer
+
 
 @lru_cache(maxsize=64)
-def horizontal_crs(crs: str):
-    """The horizontal part of a CRS: vertical parts must never move a height."""
+def horizontal_crs(crs: str) -> CRS:
+    """Return the horizontal part of a CRS; the vertical part is dropped so that heights are never transformed.
+
+    Parameters
+    ----------
+    crs
+        Coordinate reference system as WKT or ``EPSG:n``.
+
+    Returns
+    -------
+    pyproj.CRS
+        A two-dimensional geographic or projected CRS.
+
+    Raises
+    ------
+    InputError
+        ``crs`` cannot be parsed, or is neither geographic nor projected.
+    """
     from pyproj import CRS
     from pyproj.exceptions import CRSError
 
@@ -25,44 +46,108 @@ def horizontal_crs(crs: str):
         parsed = parsed.sub_crs_list[0]
     parsed = parsed.to_2d()
     if not (parsed.is_geographic or parsed.is_projected):
-        raise InputError(crs, "a CRS that is not tied to the Earth", expected="a geographic or projected CRS")
+        raise InputError(
+            crs, "a CRS that is neither geographic nor projected", expected="a geographic or projected CRS"
+        )
     return parsed
 
 
 @lru_cache(maxsize=64)
-def _transformer(crs: str):
+def _transformer(crs: str) -> Transformer:
     from pyproj import Transformer
     from pyproj.exceptions import ProjError
 
     try:
-        # A ballpark transformation ignores the datum shift (about 100 m in Switzerland), silently.
+        # A ballpark transformation silently omits the datum shift (about 100 m in Switzerland).
         return Transformer.from_crs(horizontal_crs(crs), "EPSG:4326", always_xy=True, allow_ballpark=False)
     except ProjError as error:
         raise InputError(crs, f"no accurate transformation to WGS 84: {error}") from None
 
 
-def geodetic_from_map(crs: str, x, y) -> tuple[np.ndarray, np.ndarray]:
-    """WGS 84 latitude and longitude [deg] of map coordinates ``(...)``; infinite where the projection has no answer."""
+def geodetic_from_map(crs: str, x: ArrayLike, y: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Transform map coordinates to WGS 84.
+
+    Parameters
+    ----------
+    crs
+        CRS of the map as WKT or ``EPSG:n``.
+    x, y
+        Map coordinates ``(...)`` in the CRS's units.
+
+    Returns
+    -------
+    latitude_deg, longitude_deg
+        ``(...)`` float64 [deg]; infinite outside the domain of the projection.
+
+    Raises
+    ------
+    InputError
+        The CRS is invalid, or PROJ has no accurate transformation to WGS 84.
+    """
     longitude, latitude = _transformer(crs).transform(np.asarray(x, float), np.asarray(y, float))
     return np.asarray(latitude), np.asarray(longitude)
 
 
-def map_from_geodetic(crs: str, latitude_deg, longitude_deg) -> tuple[np.ndarray, np.ndarray]:
-    """Map coordinates x and y ``(...)`` of WGS 84 positions; infinite where the projection has no answer."""
+def map_from_geodetic(crs: str, latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Transform WGS 84 positions to map coordinates.
+
+    Parameters
+    ----------
+    crs
+        CRS of the map as WKT or ``EPSG:n``.
+    latitude_deg, longitude_deg
+        Positions ``(...)`` [deg].
+
+    Returns
+    -------
+    x, y
+        ``(...)`` float64 in the CRS's units; infinite outside the domain of the projection.
+
+    Raises
+    ------
+    InputError
+        The CRS is invalid, or PROJ has no accurate transformation from WGS 84.
+    """
     x, y = _transformer(crs).transform(
         np.asarray(longitude_deg, float), np.asarray(latitude_deg, float), direction="INVERSE"
     )
     return np.asarray(x), np.asarray(y)
 
 
-def apply_affine(transform: Affine, x, y) -> tuple[np.ndarray, np.ndarray]:
-    """Both coordinates ``(...)`` after an affine map: pixel to map with a raster's transform, back with its inverse."""
+def apply_affine(transform: Affine, x: ArrayLike, y: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Apply an affine map to coordinates.
+
+    Parameters
+    ----------
+    transform
+        A raster's transform for (column, row) → map coordinates, its inverse for the other direction.
+    x, y
+        Coordinates ``(...)``.
+
+    Returns
+    -------
+    x, y
+        Mapped coordinates ``(...)`` float64.
+    """
     x, y = np.asarray(x, float), np.asarray(y, float)
     return transform.a * x + transform.b * y + transform.c, transform.d * x + transform.e * y + transform.f
 
 
-def raster_pixels(raster: Raster, latitude_deg, longitude_deg) -> np.ndarray:
-    """Column and row ``(..., 2)`` in a raster, 0.5 at the first pixel's centre, of WGS 84 positions ``(...)``."""
+def raster_pixels(raster: Raster, latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> np.ndarray:
+    """Compute the pixel coordinates of WGS 84 positions in a raster.
+
+    Parameters
+    ----------
+    raster
+        Supplies transform and CRS.
+    latitude_deg, longitude_deg
+        Positions ``(...)`` [deg].
+
+    Returns
+    -------
+    numpy.ndarray
+        Column and row ``(..., 2)``; the first pixel's centre is (0.5, 0.5).
+    """
     return np.stack(
         apply_affine(~raster.transform, *map_from_geodetic(raster.crs, latitude_deg, longitude_deg)), axis=-1
     )

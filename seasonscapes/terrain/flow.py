@@ -1,12 +1,11 @@
-"""Water on a lattice: steepest descent, catchments and erosion, without a loop over cells.
+"""Vectorised drainage routing and erosion on a lattice: D8 steepest descent, catchment area, stream-power incision.
 
-The lattice has the neighbours of a grid, but its points may be moved off their places: on an exact grid rivers and
-crests settle into eight directions, and the eye sees it at once. Half a cell of jitter takes that away.
+The lattice has the topology of a grid with jittered points: on a regular grid, D8 routing aligns rivers and crests with
+eight directions, which a jitter of half a cell removes.
 
-Everything along a flow path (sums, recurrences) is found by path doubling: after step ``k`` each cell knows the
-result over its next ``2**k`` cells, and joins it with what the cell at the end of that stretch knows. A path of
-2,000 cells takes 11 gathers. One implicit step of the stream-power law (Braun & Willett 2013,
-doi:10.1016/j.geomorph.2012.10.008) then costs as much as a few filters.
+Sums and linear recurrences along flow paths are computed by path doubling (pointer jumping): after iteration ``k`` each
+cell holds the result over its next ``2**k`` cells, so a path of 2,000 cells takes 11 gathers. One implicit step of the
+stream-power law (Braun & Willett 2013, doi:10.1016/j.geomorph.2012.10.008) then costs as much as a few filters.
 """
 
 from __future__ import annotations
@@ -22,7 +21,15 @@ _HALF_NEIGHBOURS = ((0, 1), (1, -1), (1, 0), (1, 1))
 
 @dataclass(frozen=True)
 class Lattice:
-    """Points ``(H, W)`` [m] about a centre; ``east_m`` rises with the column, ``north_m`` falls with the row."""
+    """A grid of points that may be displaced from their regular positions.
+
+    Parameters
+    ----------
+    east_m, north_m
+        Coordinates ``(H, W)`` about the centre [m]; east increases with the column, north decreases with the row.
+    spacing_m
+        Distance of neighbouring regular positions [m].
+    """
 
     east_m: np.ndarray
     north_m: np.ndarray
@@ -30,14 +37,31 @@ class Lattice:
 
     @property
     def border(self) -> np.ndarray:
-        """True on the outermost cells, ``(H, W)``."""
+        """Mask ``(H, W)`` bool of the outermost cells."""
         border = np.zeros(self.east_m.shape, bool)
         border[[0, -1], :] = border[:, [0, -1]] = True
         return border
 
 
 def jittered_lattice(half_m: float, spacing_m: float, jitter: float, rng: np.random.Generator) -> Lattice:
-    """Square lattice about (0, 0) reaching at least ``half_m``; points move up to ``jitter`` cells along each axis."""
+    """Generate a square lattice about (0, 0) with uniformly jittered points.
+
+    Parameters
+    ----------
+    half_m
+        Least distance from the centre to each side [m].
+    spacing_m
+        Cell size [m].
+    jitter
+        Largest displacement along each axis [cells].
+    rng
+        Source of the displacements.
+
+    Returns
+    -------
+    Lattice
+        ``2 ceil(half_m / spacing_m) + 1`` points along each axis.
+    """
     half = int(np.ceil(half_m / spacing_m))
     axis = np.arange(-half, half + 1) * spacing_m
     shift = rng.uniform(-jitter * spacing_m, jitter * spacing_m, (2, len(axis), len(axis)))
@@ -46,15 +70,34 @@ def jittered_lattice(half_m: float, spacing_m: float, jitter: float, rng: np.ran
 
 @dataclass(frozen=True)
 class Links:
-    """Lengths [m] of the steps between neighbours: an ``(h, w)`` array for each of four directions, with its slices."""
+    """Links between neighbouring cells in four directions (the other four are their reverses).
 
-    first: tuple
-    second: tuple
-    length_m: tuple
+    Parameters
+    ----------
+    first, second
+        For each direction, the index expressions of the two ends of its links.
+    length_m
+        For each direction, the lengths ``(h, w)`` of its links [m].
+    """
+
+    first: tuple[tuple[slice, slice], ...]
+    second: tuple[tuple[slice, slice], ...]
+    length_m: tuple[np.ndarray, ...]
 
 
 def links_of(lattice: Lattice) -> Links:
-    """The steps east, south-west, south and south-east of every cell."""
+    """Build the links of a lattice to the east, south-west, south and south-east.
+
+    Parameters
+    ----------
+    lattice
+        The points to link.
+
+    Returns
+    -------
+    Links
+        Index expressions and lengths for each direction.
+    """
     height, width = lattice.east_m.shape
     first, second, length = [], [], []
     for dy, dx in _HALF_NEIGHBOURS:
@@ -68,14 +111,14 @@ def links_of(lattice: Lattice) -> Links:
 
 @dataclass(frozen=True)
 class FlowRoutes:
-    """Where each cell drains to.
+    """Drainage network: the receiver of every cell.
 
     Parameters
     ----------
     receiver
-        ``(N + 1,)`` flat index of the next cell; ``N`` (drained away) for outlets and for the sentinel ``N`` itself.
+        ``(N + 1,)`` flat index of the downstream cell; ``N`` for outlets and for the sentinel ``N`` itself.
     distance_m
-        ``(H, W)`` length of that step [m], 0 for outlets. The step out of a pit leads across its lowest pass.
+        ``(H, W)`` distance to the receiver [m], 0 for outlets. A pit's receiver lies beyond its lowest pass.
     pits
         Number of interior cells without a lower neighbour.
     """
@@ -86,32 +129,48 @@ class FlowRoutes:
 
 
 def route_flow(elevation: np.ndarray, links: Links, outlets: np.ndarray) -> FlowRoutes:
-    """Steepest-descent routes of a surface ``(H, W)`` [m] to ``outlets`` ``(H, W)`` bool; pits spill at their pass.
+    """Route flow by steepest descent among eight neighbours; depressions overflow at their lowest pass.
 
-    Depressions are joined by the minimum spanning tree of their passes (Cordonnier et al. 2019,
+    Depressions are connected by the minimum spanning tree of their passes (Cordonnier et al. 2019,
     doi:10.5194/esurf-7-549-2019).
+
+    Parameters
+    ----------
+    elevation
+        Surface heights ``(H, W)`` [m].
+    links
+        Links of the lattice that carries the surface.
+    outlets
+        ``(H, W)`` bool, True where water leaves the domain.
+
+    Returns
+    -------
+    FlowRoutes
+        Receiver of every cell.
     """
     count, width = elevation.size, elevation.shape[1]
     steepest, offset = np.zeros_like(elevation), np.zeros(elevation.shape, np.int64)
     step = np.zeros_like(elevation)
     for (dy, dx), a, b, length in zip(_HALF_NEIGHBOURS, links.first, links.second, links.length_m, strict=True):
         slope = (elevation[a] - elevation[b]) / length
-        for part, fall, way in ((a, slope, 1), (b, -slope, -1)):
-            steeper = fall > steepest[part]
-            steepest[part] = np.where(steeper, fall, steepest[part])
-            offset[part] = np.where(steeper, way * (dy * width + dx), offset[part])
+        for part, descent, sign in ((a, slope, 1), (b, -slope, -1)):
+            steeper = descent > steepest[part]
+            steepest[part] = np.where(steeper, descent, steepest[part])
+            offset[part] = np.where(steeper, sign * (dy * width + dx), offset[part])
             step[part] = np.where(steeper, length, step[part])
     receiver = np.append(np.arange(count) + offset.ravel(), count)
     pit = np.flatnonzero((offset == 0) & ~outlets)
     receiver[pit] = receiver[np.flatnonzero(outlets)] = count
     step[outlets] = 0.0
     if len(pit):
-        _spill(receiver, step, elevation, pit, float(np.median(links.length_m[0])))
+        _route_pits(receiver, step, elevation, pit, float(np.median(links.length_m[0])))
     return FlowRoutes(receiver, step, len(pit))
 
 
-def _spill(receiver, distance, elevation, pits, spacing_m) -> None:
-    """Give each pit the cell beyond its lowest pass as receiver, in place."""
+def _route_pits(
+    receiver: np.ndarray, distance: np.ndarray, elevation: np.ndarray, pits: np.ndarray, spacing_m: float
+) -> None:
+    """Set the receiver of each pit to the cell beyond its lowest pass, in place."""
     count, width = elevation.size, elevation.shape[1]
     basin = _basins(receiver, pits).reshape(elevation.shape)
     index = np.arange(count).reshape(elevation.shape)
@@ -131,16 +190,16 @@ def _spill(receiver, distance, elevation, pits, spacing_m) -> None:
     chosen = order[first]
     weight = passes[chosen] - passes.min() + 1.0
     graph = sparse.csr_array((weight, (labels[chosen].min(axis=1), labels[chosen].max(axis=1))), shape=(size, size))
-    _, before = csgraph.breadth_first_order(csgraph.minimum_spanning_tree(graph), 0, directed=False)
-    here, there = np.arange(1, size), before[1:]
-    edge = chosen[np.searchsorted(key, np.minimum(here, there) * size + np.maximum(here, there))]
-    beyond = np.where(labels[edge, 0] == there, cells[edge, 0], cells[edge, 1])
+    _, predecessor = csgraph.breadth_first_order(csgraph.minimum_spanning_tree(graph), 0, directed=False)
+    own, downstream = np.arange(1, size), predecessor[1:]
+    edge = chosen[np.searchsorted(key, np.minimum(own, downstream) * size + np.maximum(own, downstream))]
+    beyond = np.where(labels[edge, 0] == downstream, cells[edge, 0], cells[edge, 1])
     receiver[pits] = beyond
     distance.ravel()[pits] = spacing_m * np.hypot(pits // width - beyond // width, pits % width - beyond % width)
 
 
 def _basins(receiver: np.ndarray, pits: np.ndarray) -> np.ndarray:
-    """Number of the pit ``(N,)`` that each cell drains to, counted from 1; 0 where it reaches an outlet."""
+    """Label each cell ``(N,)`` with the pit it drains to, counted from 1; 0 for cells that reach an outlet."""
     ends = np.where(receiver == len(receiver) - 1, np.arange(len(receiver)), receiver)
     while not np.array_equal(further := ends[ends], ends):
         ends = further
@@ -150,7 +209,20 @@ def _basins(receiver: np.ndarray, pits: np.ndarray) -> np.ndarray:
 
 
 def accumulate(routes: FlowRoutes, amount: np.ndarray) -> np.ndarray:
-    """What passes through each cell when every cell adds ``amount`` ``(H, W)``: catchment areas from cell areas."""
+    """Accumulate a quantity downstream, such as cell areas into catchment areas.
+
+    Parameters
+    ----------
+    routes
+        Drainage network.
+    amount
+        Contribution ``(H, W)`` of each cell.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(H, W)`` sum over each cell and all cells upstream of it.
+    """
     total, ahead = np.append(amount.ravel().astype(float), 0.0), routes.receiver
     while (ahead[:-1] != len(ahead) - 1).any():
         total += np.bincount(ahead, weights=total, minlength=len(ahead))
@@ -160,7 +232,20 @@ def accumulate(routes: FlowRoutes, amount: np.ndarray) -> np.ndarray:
 
 
 def recur(routes: FlowRoutes, constant: np.ndarray, factor: np.ndarray) -> np.ndarray:
-    """Solve ``z = constant + factor * z[receiver]`` for all cells ``(H, W)``; beyond an outlet ``z`` is 0."""
+    """Solve the linear recurrence ``z = constant + factor * z[receiver]`` along the drainage network.
+
+    Parameters
+    ----------
+    routes
+        Drainage network.
+    constant, factor
+        Coefficients ``(H, W)``.
+
+    Returns
+    -------
+    numpy.ndarray
+        Solution ``(H, W)``, with ``z = 0`` downstream of outlets.
+    """
     c, d = np.append(constant.ravel().astype(float), 0.0), np.append(factor.ravel().astype(float), 0.0)
     ahead = routes.receiver
     while (ahead[:-1] != len(ahead) - 1).any():
@@ -171,21 +256,53 @@ def recur(routes: FlowRoutes, constant: np.ndarray, factor: np.ndarray) -> np.nd
 
 
 def incise(elevation: np.ndarray, routes: FlowRoutes, rate_m: np.ndarray) -> np.ndarray:
-    """One implicit step of linear stream-power incision, ``rate_m = K A^m Δt`` ``(H, W)`` [m]; stable for any rate."""
+    """Take one implicit time step of linear stream-power incision, ∂z/∂t = −K Aᵐ ∂z/∂s; unconditionally stable.
+
+    Parameters
+    ----------
+    elevation
+        Surface heights ``(H, W)`` [m].
+    routes
+        Drainage network of the surface.
+    rate_m
+        ``K A^m Δt`` ``(H, W)`` [m].
+
+    Returns
+    -------
+    numpy.ndarray
+        Heights ``(H, W)`` after the step [m].
+    """
     inside = routes.distance_m > 0.0
     courant = np.where(inside, rate_m / np.where(inside, routes.distance_m, 1.0), 0.0)
     return recur(routes, elevation / (1.0 + courant), courant / (1.0 + courant))
 
 
 def slump(elevation: np.ndarray, links: Links, limit: np.ndarray, rounds: int) -> np.ndarray:
-    """Let material slide where the step to a neighbour exceeds ``limit`` ``(H, W)``, the tangent it can stand."""
+    """Relax slopes above a critical gradient by moving material downhill (thermal erosion).
+
+    Parameters
+    ----------
+    elevation
+        Surface heights ``(H, W)`` [m].
+    links
+        Links of the lattice.
+    limit
+        Critical gradient ``(H, W)``: tangent of the steepest stable slope.
+    rounds
+        Number of explicit iterations.
+
+    Returns
+    -------
+    numpy.ndarray
+        Heights ``(H, W)`` [m]; the sum is conserved.
+    """
     z = elevation.copy()
     for _ in range(rounds):
         change = np.zeros_like(z)
         for a, b, length in zip(links.first, links.second, links.length_m, strict=True):
-            fall = z[a] - z[b]
-            stands = 0.5 * (limit[a] + limit[b]) * length
-            moved = 0.12 * (fall - np.clip(fall, -stands, stands))
+            drop = z[a] - z[b]
+            stable = 0.5 * (limit[a] + limit[b]) * length
+            moved = 0.12 * (drop - np.clip(drop, -stable, stable))
             change[a] -= moved
             change[b] += moved
         z += change
@@ -193,9 +310,22 @@ def slump(elevation: np.ndarray, links: Links, limit: np.ndarray, rounds: int) -
 
 
 def on_grid(values: np.ndarray, lattice: Lattice) -> np.ndarray:
-    """Values of a jittered lattice at its unmoved places, ``(H, W)``: a plane fitted to the neighbours of each.
+    """Resample values from a jittered lattice to the regular grid by moving least squares.
 
-    Moving least squares with a Gaussian weight of half a cell: planes come out exact, noise of one cell is softened.
+    At each grid point a plane is fitted to the 3 × 3 neighbourhood with Gaussian weights; linear functions are
+    reproduced exactly, noise at the scale of one cell is attenuated.
+
+    Parameters
+    ----------
+    values
+        ``(H, W)`` at the lattice's points.
+    lattice
+        The jittered points.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(H, W)`` at the regular positions.
     """
     height, width = values.shape
     half_row, half_column = (height - 1) // 2, (width - 1) // 2
@@ -214,5 +344,5 @@ def on_grid(values: np.ndarray, lattice: Lattice) -> np.ndarray:
     s, sx, sy, sxx, sxy, syy, sv, sxv, syv = sums
     minor = sxx * syy - sxy * sxy
     determinant = s * minor - sx * (sx * syy - sxy * sy) + sy * (sx * sxy - sxx * sy)
-    top = sv * minor - sx * (sxv * syy - sxy * syv) + sy * (sxv * sxy - sxx * syv)
-    return values + top / determinant
+    numerator = sv * minor - sx * (sxv * syy - sxy * syv) + sy * (sxv * sxy - sxx * syv)
+    return values + numerator / determinant

@@ -1,4 +1,4 @@
-"""Satellite and aerial images laid into a terrain's atlas."""
+"""Satellite and aerial imagery: reading as linear colour, anisotropically filtered resampling into a UV atlas."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from seasonscapes.terrain.surface import Raster, Terrain, Texture
 from seasonscapes.terrain.texels import texel_coordinates, texel_positions
 
 ENCODINGS = ("srgb", "linear")
-# Longest footprint in pixels of the chosen mip level that is still resolved; longer ones are blurred.
+# Largest number of samples along a footprint; more elongated footprints use a coarser mip level.
 _MAX_ANISOTROPY = 8
 _CHUNK = 250_000
-# Powers of east, north and up in the fitted map from the local frame to image pixels.
+# Exponents of east, north and up in the polynomial from the local frame to image pixels.
 _DEGREE = 6
 _EXPONENTS = [(i, j, k) for k, top in ((0, _DEGREE), (1, 3)) for i in range(top + 1) for j in range(top + 1 - i)]
-# Largest error of a fitted map [image pixels]; a tenth of what one could see.
+# Largest accepted error of the polynomial [image pixels], about a tenth of a visible shift.
 _MAX_FIT_ERROR_PX = 0.01
 
 
 def read_imagery(
-    path: str | os.PathLike,
+    path: str | os.PathLike[str],
     *,
     bounds_deg: tuple[float, float, float, float] | None = None,
     bands: tuple[int, ...] | None = None,
@@ -38,18 +38,18 @@ def read_imagery(
     encoding: str = "srgb",
     full_scale: float = 255.0,
 ) -> Raster:
-    """Read a colour image on a map as scene-linear Rec.709.
+    """Read a georeferenced colour image as scene-linear Rec.709.
 
     Parameters
     ----------
     path, bounds_deg, finest_m
-        As in `read_raster`; half the size of a texel is fine enough for any use.
+        As in `read_raster`; for baking, half the texel size is sufficient for ``finest_m``.
     bands
-        Red, green and blue band numbers from 1; left out: the file's three colour bands, or its only one as grey.
+        Red, green and blue band numbers from 1; ``None`` for the file's three colour bands, or its only band as grey.
     encoding
-        ``srgb`` for pictures made for the eye, ``linear`` for reflectance.
+        ``srgb`` for display-referred images, ``linear`` for reflectance.
     full_scale
-        The number in the file that stands for 1.
+        The file's value that corresponds to 1.
 
     Returns
     -------
@@ -59,18 +59,20 @@ def read_imagery(
     Raises
     ------
     InputError
-        As `read_raster`; neither one nor three colour bands; values that exceed ``full_scale``.
+        As `read_raster`; neither one nor three colour bands; sRGB values that exceed ``full_scale``.
+    ValueError
+        Unknown ``encoding``.
     """
     if encoding not in ENCODINGS:
         raise ValueError(f"encoding: got {encoding!r}, expected one of {', '.join(ENCODINGS)}")
 
-    def decode(values):
+    def decode(values: np.ndarray) -> np.ndarray:
         if encoding == "linear":
             return values / full_scale
         brightest = np.max(values, initial=-np.inf, where=np.isfinite(values))
         if brightest > full_scale:
             raise InputError(
-                path,
+                os.fspath(path),
                 "brighter than full scale",
                 got=f"{brightest:g}",
                 expected=f"at most {full_scale:g}",
@@ -83,34 +85,39 @@ def read_imagery(
     count = raster.values.shape[2]
     if count not in (1, 3):
         raise InputError(
-            path,
+            os.fspath(path),
             "not a colour image",
             got=count,
             expected="one (grey) or three bands, and alpha",
             cure="name its red, green and blue bands",
         )
-    # A pixel that lacks one colour lacks them all.
+    # A pixel with one missing channel counts as missing.
     values = np.where(np.isfinite(raster.values).all(axis=2, keepdims=True), raster.values, np.float32(np.nan))
     return replace(raster, values=np.repeat(values, 3 // count, axis=2))
 
 
 def bake_imagery(terrain: Terrain, atlas: Atlas, image: Raster, *, gutter_px: int = 4) -> Texture:
-    """Resample an image in any CRS into the terrain's atlas.
+    """Resample an image in any CRS into the terrain's atlas with anisotropic filtering.
 
-    Each texel is the mean of the image over the texel's footprint: a mip level chosen by its shorter side, sampled
-    along its longer side (McCormack et al. 1999, "Feline"), so that neither minification nor a steep face aliases.
+    Each texel is the mean of the image over the texel's footprint: the mip level follows from the footprint's minor
+    axis, and samples are averaged along its major axis (McCormack et al. 1999, "Feline"), which avoids aliasing under
+    minification and on steep faces.
 
     Parameters
     ----------
+    terrain
+        Surface with the atlas's UV coordinates.
+    atlas
+        Size of the texture.
     image
-        ``values`` ``(H, W, 3)``, scene-linear; NaN has no weight.
+        ``values`` ``(H, W, 3)``, scene-linear; NaN has zero weight.
     gutter_px
-        Texels around each chart that repeat its rim, so that bilinear look-ups never meet an empty texel.
+        Width of the dilated border around each chart, for bilinear look-ups at chart borders [texels].
 
     Returns
     -------
     Texture
-        ``weight`` is the share of the footprint that the image covers, 0 outside it and outside the charts.
+        ``weight`` is the fraction of the footprint that the image covers; 0 outside the image and outside the charts.
 
     Raises
     ------
@@ -126,25 +133,51 @@ def bake_imagery(terrain: Terrain, atlas: Atlas, image: Raster, *, gutter_px: in
     for start in range(0, len(texel), _CHUNK):
         part = texel[start : start + _CHUNK]
         pixel = pixels_of(positions.reshape(-1, 3)[part])
-        rgb, share = _filtered(pyramid, pixel, footprint[face_id.ravel()[part]])
-        values.reshape(-1, 3)[part], weight.ravel()[part] = rgb, share
+        rgb, coverage = _filtered(pyramid, pixel, footprint[face_id.ravel()[part]])
+        values.reshape(-1, 3)[part], weight.ravel()[part] = rgb, coverage
     if not weight.any():
         raise InputError("imagery", "the image covers none of the terrain", cure="check the CRS of both files")
     return dilate(Texture(values, weight), face_id >= 0, gutter_px)
 
 
 def image_pixels(frame: LocalFrame, image: Raster, positions: np.ndarray) -> np.ndarray:
-    """Column and row ``(N, 2)`` in a raster (0.5 at the first pixel's centre) of positions ``(N, 3)`` [m], exactly."""
+    """Project points of the local frame to pixel coordinates of a raster, through the exact CRS transformation.
+
+    Parameters
+    ----------
+    frame
+        Local frame of the positions.
+    image
+        Raster that supplies transform and CRS.
+    positions
+        ``(N, 3)`` east-north-up [m].
+
+    Returns
+    -------
+    numpy.ndarray
+        Column and row ``(N, 2)``; the first pixel's centre is (0.5, 0.5).
+    """
     latitude, longitude, _ = geodetic_from_enu(frame, positions)
     return raster_pixels(image, latitude, longitude)
 
 
 def pixel_map(terrain: Terrain, image: Raster) -> Callable[[np.ndarray], np.ndarray]:
-    """`image_pixels` for many points: a polynomial in east and north, linear in up, or itself where that is not exact.
+    """Build a fast version of `image_pixels`: a polynomial in east and north that is linear in up.
 
-    From one map to another over tens of kilometres everything is smooth; ten million calls of a projection library are
-    not needed to know it. The fit is accepted only if no point of a check within the terrain's box is off by more
-    than `_MAX_FIT_ERROR_PX`.
+    The polynomial is fitted at Chebyshev nodes of the terrain's bounding box and accepted if its error at a sample of
+    the vertices is at most `_MAX_FIT_ERROR_PX`; otherwise the exact transformation is returned.
+
+    Parameters
+    ----------
+    terrain
+        Supplies local frame and bounding box.
+    image
+        Raster that supplies transform and CRS.
+
+    Returns
+    -------
+    Callable
+        Function from positions ``(N, 3)`` [m] to column and row ``(N, 2)``.
     """
     low, high = terrain.vertices.min(0).astype(np.float64), terrain.vertices.max(0).astype(np.float64)
     middle, half = (low + high) / 2.0, np.maximum((high - low) / 2.0, 1.0)
@@ -156,7 +189,7 @@ def pixel_map(terrain: Terrain, image: Raster) -> Callable[[np.ndarray], np.ndar
     basis = np.stack([e**i * n**j * u**k for i, j, k in _EXPONENTS], axis=-1)
     coefficients = np.linalg.lstsq(basis, target, rcond=None)[0]
 
-    def fitted(positions):
+    def fitted(positions: np.ndarray) -> np.ndarray:
         e, n, u = ((positions - middle) / half).T
         return np.stack([_polynomial(coefficients[:, axis], e, n, u) for axis in (0, 1)], axis=-1)
 
@@ -180,8 +213,8 @@ def _polynomial(coefficients: np.ndarray, e: np.ndarray, n: np.ndarray, u: np.nd
     return total
 
 
-def _face_footprints(terrain: Terrain, atlas: Atlas, pixels_of) -> np.ndarray:
-    """Ellipse of image pixels under a texel of each face, ``(F, 4)`` float32: longer side (x, y), longer, shorter.
+def _face_footprints(terrain: Terrain, atlas: Atlas, pixels_of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Footprint ellipse of a texel of each face in the image, ``(F, 4)`` float32: major axis (x, y), its length, minor.
 
     The lengths are the singular values of the map from texels to pixels.
     """
@@ -193,12 +226,12 @@ def _face_footprints(terrain: Terrain, atlas: Atlas, pixels_of) -> np.ndarray:
         t = np.moveaxis(texel_of[faces], 1, 0)
         p1, p2, t1, t2 = p[1] - p[0], p[2] - p[0], t[1] - t[0], t[2] - t[0]
         determinant = (t1[:, 0] * t2[:, 1] - t1[:, 1] * t2[:, 0])[:, None]
-        # A face without area in the atlas covers no texel; any finite number will do.
+        # Faces of zero UV area cover no texel; their footprint only has to be finite.
         determinant = np.where(determinant == 0.0, np.inf, determinant)
         x, y = (p1 * t2[:, 1:] - p2 * t1[:, 1:]) / determinant, (p2 * t1[:, :1] - p1 * t2[:, :1]) / determinant
         a, b, c = (np.sum(x * x, 1), np.sum(x * y, 1), np.sum(y * y, 1))
         largest = (a + c + np.sqrt((a - c) ** 2 + 4.0 * b * b)) / 2.0
-        # Eigenvector of the 2 × 2 Gram matrix, from whichever row does not vanish, carried to the image.
+        # Eigenvector of the 2 × 2 Gram matrix, from a row that does not vanish, mapped to the image.
         vector = np.where((a >= c)[:, None], np.stack([largest - c, b], 1), np.stack([b, largest - a], 1))
         vector = vector / np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-300)
         footprint[start : start + len(faces), :2] = x * vector[:, :1] + y * vector[:, 1:]
@@ -208,7 +241,7 @@ def _face_footprints(terrain: Terrain, atlas: Atlas, pixels_of) -> np.ndarray:
 
 
 def _pyramid(values: np.ndarray) -> list[np.ndarray]:
-    """Levels ``(H, W, C + 1)`` of premultiplied colour and coverage, each half the one before, by exact box means."""
+    """Mip levels ``(H, W, C + 1)`` of premultiplied colour and coverage, each the 2 × 2 box mean of the previous one."""
     known = np.isfinite(values).all(axis=2, keepdims=True)
     levels = [np.concatenate([np.where(known, values, 0.0), known], axis=2).astype(np.float32)]
     while max(levels[-1].shape[:2]) > 1:
@@ -219,7 +252,7 @@ def _pyramid(values: np.ndarray) -> list[np.ndarray]:
 
 
 def _filtered(pyramid: list[np.ndarray], pixel: np.ndarray, footprint: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Colour ``(N, 3)`` and coverage ``(N,)`` over the footprints ``(N, 4)`` at pixels ``(N, 2)``."""
+    """Mean colour ``(N, 3)`` and coverage ``(N,)`` over the footprints ``(N, 4)`` at pixels ``(N, 2)``."""
     major, longer, shorter = footprint[:, :2], footprint[:, 2], footprint[:, 3]
     side = np.maximum(np.maximum(shorter, longer / _MAX_ANISOTROPY), 1.0)
     taps = np.ceil(np.maximum(longer, 1.0) / side - 1e-3).astype(int)
@@ -237,13 +270,13 @@ def _filtered(pyramid: list[np.ndarray], pixel: np.ndarray, footprint: np.ndarra
             if blend.any():
                 sample += _bilinear(pyramid[lower + 1], at / 2.0 ** (lower + 1)) * blend
             result[chosen] += sample / count
-    share = result[:, -1]
-    rgb = np.where(share[:, None] > 1e-6, result[:, :-1] / np.maximum(share, 1e-6)[:, None], 0.0)
-    return rgb.astype(np.float32), np.where(share > 1e-6, np.minimum(share, 1.0), 0.0)
+    coverage = result[:, -1]
+    rgb = np.where(coverage[:, None] > 1e-6, result[:, :-1] / np.maximum(coverage, 1e-6)[:, None], 0.0)
+    return rgb.astype(np.float32), np.where(coverage > 1e-6, np.minimum(coverage, 1.0), 0.0)
 
 
 def _bilinear(level: np.ndarray, pixel: np.ndarray) -> np.ndarray:
-    """Values ``(N, C)`` at pixels ``(N, 2)``; zero beyond the edge."""
+    """Bilinear interpolation ``(N, C)`` at pixels ``(N, 2)``, with zeros outside the image."""
     height, width = level.shape[:2]
     column, row = np.clip(np.nan_to_num(pixel, posinf=-9.0, neginf=-9.0) - 0.5, -2.0, [width + 1.0, height + 1.0]).T
     column0, row0 = np.floor(column).astype(int), np.floor(row).astype(int)
@@ -258,7 +291,22 @@ def _bilinear(level: np.ndarray, pixel: np.ndarray) -> np.ndarray:
 
 
 def dilate(texture: Texture, covered: np.ndarray, gutter_px: int) -> Texture:
-    """Grow what is ``covered`` ``(H, W)`` by rings of texels that take the mean of their known neighbours."""
+    """Extend a texture beyond its covered texels by rings of weighted neighbour means.
+
+    Parameters
+    ----------
+    texture
+        The texture to extend.
+    covered
+        ``(H, W)`` bool, True where the texture is defined.
+    gutter_px
+        Number of rings [texels].
+
+    Returns
+    -------
+    Texture
+        The extended texture, without ``atlas_id``.
+    """
     values, weight, known = texture.values.copy(), texture.weight.copy(), covered.copy()
     for _ in range(gutter_px):
         rim_row, rim_column = np.nonzero(_grown(known) & ~known)
@@ -280,7 +328,7 @@ def dilate(texture: Texture, covered: np.ndarray, gutter_px: int) -> Texture:
 
 
 def _grown(mask: np.ndarray) -> np.ndarray:
-    """A mask and its 8 neighbours."""
+    """Binary dilation of a mask by its 8-neighbourhood."""
     grown = np.pad(mask, 1)
     grown = grown[:-2] | grown[1:-1] | grown[2:]
     return grown[:, :-2] | grown[:, 1:-1] | grown[:, 2:]

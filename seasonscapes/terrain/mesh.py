@@ -1,15 +1,16 @@
-"""From heights on a map to triangles in the local frame, and how far those triangles are from the heights.
+"""Triangulation of elevation rasters in the local frame, and the vertical error of the resulting mesh.
 
-Every vertex goes map → WGS 84 → ECEF → east-north-up, so that convergence of the meridians, Earth curvature and (where
-the frame asks for it) refraction come by themselves.
+Every vertex is transformed map → WGS 84 → ECEF → east-north-up, which includes meridian convergence, Earth curvature
+and, if the frame has a refraction coefficient, terrestrial refraction.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from seasonscapes.frames import MEAN_RADIUS_M, LocalFrame, enu_from_geodetic, geodetic_from_enu
 from seasonscapes.terrain.atlas import planar_uv
@@ -19,28 +20,28 @@ from seasonscapes.terrain.surface import Raster, Terrain
 from seasonscapes.terrain.texels import covering_faces
 
 DEFAULT_MAX_ERROR_M = 5.0
-# Work in pieces of this many samples: the float64 temporaries of geodesy then stay below 200 MB.
+# Samples per block: bounds the float64 temporaries of the geodetic transformation to 200 MB.
 _CHUNK = 500_000
-# Samples that the Poisson surface is given past the rim.
+# Extrapolated samples around the raster for the Poisson reconstruction.
 _MARGIN = 4
 
 
 @dataclass(frozen=True)
 class MeshReport:
-    """How a mesh compares with the raster it was made from.
+    """Size of a mesh and its vertical error against the raster it approximates.
 
     Parameters
     ----------
     triangles, vertices
-        Counts.
+        Number of triangles and vertices.
     grid_triangles
-        Triangles of the full grid.
+        Number of triangles of the full grid.
     saved_ratio
-        Share of the full grid's triangles that were not needed, in [0, 1].
+        ``1 - triangles / grid_triangles``.
     vertical_rmse_m, vertical_max_m
-        Distance of the mesh from the raster's samples along the local vertical [m].
+        Root mean square and largest distance between mesh and raster samples along the local vertical [m].
     samples, uncovered_samples
-        Samples compared, and those that no triangle covers.
+        Number of samples, and of samples that no triangle covers.
     """
 
     triangles: int
@@ -56,22 +57,24 @@ class MeshReport:
 def build_mesh(
     raster: Raster, frame: LocalFrame, *, mesher: str = "adaptive", max_error_m: float = DEFAULT_MAX_ERROR_M
 ) -> Terrain:
-    """Triangulate the heights of a raster.
+    """Triangulate an elevation raster.
 
     Parameters
     ----------
     raster
         ``values`` ``(H, W, 1)`` heights [m] without holes (see `fill_nodata`). Samples are pixel centres.
+    frame
+        Local frame of the mesh.
     mesher
-        A name in `MESHERS`: ``adaptive`` (as few triangles as the error bound needs), ``grid`` (every sample a
-        vertex), ``poisson`` (the surface of the SeasonScapes paper; needs the extra ``poisson``).
+        A name in `MESHERS`: ``adaptive`` (greedy refinement to the error bound), ``grid`` (every sample a vertex),
+        ``poisson`` (screened Poisson surface, as in the SeasonScapes paper; needs the extra ``poisson``).
     max_error_m
-        Bound of ``adaptive`` on the vertical distance between mesh and every sample [m]; others ignore it.
+        Bound of ``adaptive`` on the vertical distance between the mesh and every sample [m]; other meshers ignore it.
 
     Returns
     -------
     Terrain
-        With the planar UV of its plan; see `unwrap` for the others.
+        The mesh with top-down UV coordinates; see `unwrap` for other parametrisations.
 
     Raises
     ------
@@ -90,15 +93,34 @@ def build_mesh(
     return Terrain(vertices, faces, planar_uv(vertices), frame)
 
 
-def sample_positions(raster: Raster, frame: LocalFrame, row, column, height_m) -> np.ndarray:
-    """East, north, up ``(N, 3)`` float64 [m] of points at pixel-centre indices ``(N,)`` with given heights ``(N,)``."""
+def sample_positions(
+    raster: Raster, frame: LocalFrame, row: ArrayLike, column: ArrayLike, height_m: ArrayLike
+) -> np.ndarray:
+    """Compute positions in the local frame of raster samples.
+
+    Parameters
+    ----------
+    raster
+        Supplies transform and CRS.
+    frame
+        Local frame of the result.
+    row, column
+        Indices ``(...)``; integers are pixel centres.
+    height_m
+        Heights ``(...)`` in the raster's vertical datum [m].
+
+    Returns
+    -------
+    numpy.ndarray
+        East, north, up ``(..., 3)`` float64 [m].
+    """
     x, y = apply_affine(raster.transform, np.asarray(column) + 0.5, np.asarray(row) + 0.5)
     latitude, longitude = geodetic_from_map(raster.crs, x, y)
     return enu_from_geodetic(frame, latitude, longitude, height_m)
 
 
-def _row_strips(raster: Raster, frame: LocalFrame):
-    """Positions of all samples strip by strip: first row, and ``(rows, W, 3)`` float64."""
+def _row_strips(raster: Raster, frame: LocalFrame) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield the positions of all samples in strips of rows: first row, and ``(rows, W, 3)`` float64."""
     height, width = raster.values.shape[:2]
     strip = max(1, _CHUNK // width)
     for first in range(0, height, strip):
@@ -108,15 +130,15 @@ def _row_strips(raster: Raster, frame: LocalFrame):
 
 
 def _is_mirrored(raster: Raster) -> bool:
-    """Whether rows run to the left of columns on the ground, as in south-up rasters (north-up ones are not)."""
+    """Whether the transform has a positive determinant (south-up raster), which reverses the orientation of faces."""
     return raster.transform.determinant > 0.0
 
 
 def _adaptive(raster: Raster, frame: LocalFrame, max_error_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Greedy insertion of the worst sample until none is further off than the bound (Garland & Heckbert 1995).
+    """Greedy insertion of the sample of largest error until all are within the bound (Garland & Heckbert 1995).
 
-    What is triangulated is the *up* coordinate of each sample, not its height: a triangle is flat in the frame, and
-    over a 20 km lake the Earth bulges 8 m out of it.
+    The error refers to the *up* coordinate of each sample, not to its height: triangles are flat in the local frame,
+    and Earth curvature makes an 8 m bulge over a 20 km lake.
     """
     from pydelatin import Delatin
 
@@ -124,7 +146,7 @@ def _adaptive(raster: Raster, frame: LocalFrame, max_error_m: float) -> tuple[np
     up = np.empty((height, width), np.float32)
     for first, position in _row_strips(raster, frame):
         up[first : first + len(position)] = position[..., 2]
-    # The mesher's planes are linear in pixels and float32, ours in metres and through the Earth: keep a little in hand.
+    # Delatin interpolates in pixel coordinates and float32, the mesh in metres: the margin keeps the bound valid.
     mesh = Delatin(up, max_error=0.995 * max_error_m)
     column, row = mesh.vertices[:, 0].astype(np.intp), height - 1 - mesh.vertices[:, 1].astype(np.intp)
     vertices = sample_positions(raster, frame, row, column, raster.values[row, column, 0]).astype(np.float32)
@@ -133,7 +155,7 @@ def _adaptive(raster: Raster, frame: LocalFrame, max_error_m: float) -> tuple[np
 
 
 def _grid(raster: Raster, frame: LocalFrame, max_error_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Two triangles for each cell of four samples."""
+    """Two triangles per grid cell."""
     height, width = raster.values.shape[:2]
     vertices = np.empty((height, width, 3), np.float32)
     for first, position in _row_strips(raster, frame):
@@ -142,7 +164,20 @@ def _grid(raster: Raster, frame: LocalFrame, max_error_m: float) -> tuple[np.nda
 
 
 def grid_faces(height: int, width: int, *, mirrored: bool = False) -> np.ndarray:
-    """Faces ``(2 (H-1) (W-1), 3)`` uint32 of a grid of samples whose row 0 is north; reversed when ``mirrored``."""
+    """Generate the faces of a regular grid of vertices.
+
+    Parameters
+    ----------
+    height, width
+        Number of rows and columns of vertices; row 0 is in the north.
+    mirrored
+        Whether to reverse the orientation, for rasters with a south-up transform.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(2 (H-1) (W-1), 3)`` uint32.
+    """
     faces = np.empty((height - 1, width - 1, 2, 3), np.uint32)
     corner = np.arange(height - 1, dtype=np.uint32)[:, None] * np.uint32(width) + np.arange(width - 1, dtype=np.uint32)
     south = np.uint32(width)
@@ -154,22 +189,23 @@ def grid_faces(height: int, width: int, *, mirrored: bool = False) -> np.ndarray
 
 
 def _poisson(raster: Raster, frame: LocalFrame, max_error_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Screened Poisson surface of all samples, cut at the raster's rim."""
+    """Screened Poisson surface of all samples, clipped to the raster's extent."""
     height, width = raster.values.shape[:2]
-    # Reconstruction bends at the rim of its points: give it a margin that continues the slope, then cut it off.
+    # The reconstruction is inaccurate at its boundary: extrapolate the slope over a margin and clip it afterwards.
     row, column = np.mgrid[-_MARGIN : height + _MARGIN, -_MARGIN : width + _MARGIN]
     heights = np.pad(raster.values[..., 0].astype(np.float64), _MARGIN, mode="reflect", reflect_type="odd")
     vertices, faces = poisson_surface(sample_positions(raster, frame, row, column, heights))
     pixel = _pixel_coordinates(vertices, frame, raster) - 0.5
-    inside = ((pixel >= 0.0) & (pixel <= [width - 1, height - 1])).all(axis=1)
+    inside = np.all((pixel >= 0.0) & (pixel <= [width - 1, height - 1]), axis=1)
     faces = largest_piece(faces[inside[faces].any(axis=1)], len(vertices))
-    if _plan_area(vertices, faces) < 0.0:
+    if _projected_area(vertices, faces) < 0.0:
         faces = faces[:, ::-1]
     used, faces = np.unique(faces, return_inverse=True)
     return vertices[used], faces.reshape(-1, 3).astype(np.uint32)
 
 
-def _plan_area(vertices: np.ndarray, faces: np.ndarray) -> float:
+def _projected_area(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Signed horizontal area [m²]; positive for faces that are counter-clockwise from above."""
     a, b, c = (vertices[faces[:, k], :2].astype(np.float64) for k in range(3))
     return float(np.sum((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])) / 2.0
 
@@ -182,24 +218,37 @@ MESHERS: dict[str, Callable[[Raster, LocalFrame, float], tuple[np.ndarray, np.nd
 
 
 def mesh_report(terrain: Terrain, raster: Raster) -> MeshReport:
-    """Measure a mesh against the raster's samples, knowing nothing of how it was made.
+    """Measure the vertical error of a mesh against the raster's samples, independently of the mesher.
 
-    The vertices are carried back to the map to find the triangle under each sample; the distance is then taken in the
-    frame, from the sample along its own vertical (not the origin's, 0.27° off at 30 km) to the plane of that triangle.
+    The vertices are projected to the raster to find the triangle that covers each sample. The error is the distance
+    from the sample to the plane of that triangle along the sample's own vertical, which deviates from the origin's by
+    0.27° at 30 km.
+
+    Parameters
+    ----------
+    terrain
+        The mesh.
+    raster
+        The elevation raster, without holes.
+
+    Returns
+    -------
+    MeshReport
+        Size and errors.
     """
     height, width = raster.values.shape[:2]
     pixel = _pixel_coordinates(terrain.vertices, terrain.frame, raster)
-    # Samples on the rim lie exactly on the mesh's edge: widen by a thousandth of a pixel, more than float32 loses.
+    # Outermost samples lie exactly on the mesh's edge: scale by a thousandth of a pixel, more than the float32 error.
     middle = np.array([width, height]) / 2.0
     pixel = middle + (pixel - middle) * (1.0 + 2e-3 / max(height, width))
     face_id = covering_faces(pixel, terrain.faces, width, height)
-    square, worst, covered = 0.0, 0.0, 0
+    squared_sum, largest, covered = 0.0, 0.0, 0
     for first, position in _row_strips(raster, terrain.frame):
         ids = face_id[first : first + len(position)]
         hit = ids >= 0
         distance = _height_above_plane(terrain, ids[hit], position[hit])
-        square += float(np.sum(distance**2))
-        worst = max(worst, float(np.abs(distance).max(initial=0.0)))
+        squared_sum += float(np.sum(distance**2))
+        largest = max(largest, float(np.abs(distance).max(initial=0.0)))
         covered += distance.size
     grid_triangles = 2 * (height - 1) * (width - 1)
     return MeshReport(
@@ -207,15 +256,15 @@ def mesh_report(terrain: Terrain, raster: Raster) -> MeshReport:
         vertices=len(terrain.vertices),
         grid_triangles=grid_triangles,
         saved_ratio=1.0 - len(terrain.faces) / grid_triangles,
-        vertical_rmse_m=float(np.sqrt(square / max(covered, 1))),
-        vertical_max_m=worst,
+        vertical_rmse_m=float(np.sqrt(squared_sum / max(covered, 1))),
+        vertical_max_m=largest,
         samples=height * width,
         uncovered_samples=height * width - covered,
     )
 
 
 def _pixel_coordinates(vertices: np.ndarray, frame: LocalFrame, raster: Raster) -> np.ndarray:
-    """Column and row ``(V, 2)`` of vertices, 0.5 at the first pixel's centre."""
+    """Column and row ``(V, 2)`` of vertices; the first pixel's centre is (0.5, 0.5)."""
     pixel = np.empty((len(vertices), 2))
     for first in range(0, len(pixel), _CHUNK):
         part = slice(first, first + _CHUNK)
@@ -225,9 +274,9 @@ def _pixel_coordinates(vertices: np.ndarray, frame: LocalFrame, raster: Raster) 
 
 
 def _height_above_plane(terrain: Terrain, faces: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Signed distance ``(N,)`` [m] of points ``(N, 3)`` above the planes of faces ``(N,)``, along their verticals."""
+    """Signed distance ``(N,)`` [m] of points ``(N, 3)`` above the planes of faces ``(N,)`` along the local vertical."""
     a, b, c = (terrain.vertices[terrain.faces[faces, k]].astype(np.float64) for k in range(3))
     normal = np.cross(b - a, c - a)
-    # The vertical of a place leans outwards by its distance over the Earth's radius.
+    # The local vertical deviates from the origin's by the distance divided by the Earth's radius.
     vertical = normal[:, 2] + np.einsum("ij,ij->i", position[:, :2], normal[:, :2]) / MEAN_RADIUS_M
     return np.einsum("ij,ij->i", position - a, normal) / vertical

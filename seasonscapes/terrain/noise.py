@@ -1,20 +1,34 @@
-"""Seeded noise in metres: the same field whatever grid looks at it."""
+"""Seeded, band-limited noise defined in world coordinates, independent of the sampling grid."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy import ndimage, sparse
 
-# Variance of a cubic B-spline sum of unit white noise, averaged over position: (∫ B3²)² in two dimensions.
+# Standard deviation of a cubic B-spline sum of unit white noise in two dimensions, averaged over position: ∫ B3².
 _SPLINE_DEVIATION = 151.0 / 315.0
 _LATTICE_MARGIN = 4
 
 
 def spline_noise(seed: int, wavelength_m: float, east_m: np.ndarray, north_m: np.ndarray) -> np.ndarray:
-    """Smooth noise of unit variance over the grid ``north_m (H,) × east_m (W,)``, ``(H, W)`` float32.
+    """Evaluate smooth noise of unit variance on a grid.
 
-    White noise on a lattice of half the wavelength, interpolated with cubic B-splines. The lattice hangs on the world,
-    not on the grid: grids of other spacing sample the same field.
+    White noise on a lattice of half the wavelength, interpolated with cubic B-splines. The lattice is fixed in world
+    coordinates, so that grids of different spacing sample the same field.
+
+    Parameters
+    ----------
+    seed
+        Selects the field.
+    wavelength_m
+        Twice the lattice spacing [m].
+    east_m, north_m
+        Axes ``(W,)`` and ``(H,)`` of the grid [m].
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(H, W)`` float32.
     """
     step = 0.5 * wavelength_m
     rows, columns = _spline_basis(north_m / step), _spline_basis(east_m / step)
@@ -24,7 +38,22 @@ def spline_noise(seed: int, wavelength_m: float, east_m: np.ndarray, north_m: np
 
 
 def warped_noise(seed: int, wavelength_m: float, east_m: np.ndarray, north_m: np.ndarray) -> np.ndarray:
-    """`spline_noise` at arbitrary positions (arrays of one shape)."""
+    """Evaluate the field of `spline_noise` at arbitrary positions.
+
+    Parameters
+    ----------
+    seed
+        Selects the field.
+    wavelength_m
+        Twice the lattice spacing [m].
+    east_m, north_m
+        Positions, arrays of one shape [m].
+
+    Returns
+    -------
+    numpy.ndarray
+        Noise of that shape, float64.
+    """
     step = 0.5 * wavelength_m
     row, column = north_m / step, east_m / step
     first_row, first_column = int(np.floor(row.min())) - _LATTICE_MARGIN, int(np.floor(column.min())) - _LATTICE_MARGIN
@@ -40,9 +69,27 @@ def warped_noise(seed: int, wavelength_m: float, east_m: np.ndarray, north_m: np
 def fractal_noise(
     seed: int, wavelength_m: float, east_m: np.ndarray, north_m: np.ndarray, *, octaves: int, gain: float = 0.5
 ) -> np.ndarray:
-    """Sum of octaves of `spline_noise`, ``(H, W)`` float32; unit variance when the grid holds them all.
+    """Evaluate fractal noise, a weighted sum of octaves of `spline_noise`, on a grid.
 
-    Octaves finer than the grid are left out: within a cell they average to nothing, sampled they would alias.
+    Octaves with wavelengths below 1.4 grid spacings are omitted, because they would alias.
+
+    Parameters
+    ----------
+    seed
+        Selects the field.
+    wavelength_m
+        Wavelength of the first octave [m]; each further octave halves it.
+    east_m, north_m
+        Axes ``(W,)`` and ``(H,)`` of the grid [m].
+    octaves
+        Number of octaves.
+    gain
+        Amplitude ratio of successive octaves.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(H, W)`` float32, of unit variance if the grid resolves all octaves.
     """
     weights = (gain ** np.arange(octaves)).astype(np.float32)
     finest = 1.4 * abs(float(east_m[1] - east_m[0]))
@@ -54,7 +101,7 @@ def fractal_noise(
 
 
 def _spline_basis(position: np.ndarray) -> tuple[sparse.csr_array, range]:
-    """Cubic B-spline weights ``(len(position), lattice)`` and the lattice indices they refer to."""
+    """Cubic B-spline weights ``(len(position), lattice)`` and the range of lattice indices of their columns."""
     position = np.asarray(position, float)
     cell = np.floor(position).astype(int)
     first = int(cell.min()) - 1
@@ -70,9 +117,9 @@ def _spline_basis(position: np.ndarray) -> tuple[sparse.csr_array, range]:
 
 
 def _lattice(seed: int, rows: range, columns: range) -> np.ndarray:
-    """White noise at integer lattice points, uniform with unit variance: a hash, so any window of it can be had.
+    """Uniform white noise of unit variance at integer lattice points, as a hash of seed, row and column.
 
-    The finaliser of MurmurHash3 (Appleby, public domain) over seed, row and column.
+    Uses the finaliser of MurmurHash3 (Appleby, public domain), so that any window can be evaluated independently.
     """
     row = np.asarray(rows, np.int64).astype(np.uint32)[:, None]
     column = np.asarray(columns, np.int64).astype(np.uint32)[None, :]
@@ -81,6 +128,7 @@ def _lattice(seed: int, rows: range, columns: range) -> np.ndarray:
 
 
 def _murmur(h: np.ndarray) -> np.ndarray:
+    """32-bit finaliser of MurmurHash3."""
     h = h ^ (h >> np.uint32(16))
     h = h * np.uint32(0x85EBCA6B)
     h = h ^ (h >> np.uint32(13))

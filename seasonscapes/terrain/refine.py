@@ -1,4 +1,4 @@
-"""A finer raster through the same heights: coarse samples become a smooth surface instead of large facets."""
+"""Upsampling of rasters by monotone cubic interpolation, to avoid visible facets in meshes of coarse rasters."""
 
 from __future__ import annotations
 
@@ -11,23 +11,28 @@ from seasonscapes.terrain.surface import Raster
 
 
 def refine_raster(raster: Raster, factor: int) -> Raster:
-    """Interpolate ``factor`` - 1 samples between each two, monotone cubic along rows and columns (PCHIP).
+    """Upsample a raster by monotone piecewise cubic interpolation along rows and columns (PCHIP).
 
-    Every given sample is kept, and no interval overshoots its ends: a lake stays flat beneath its cliffs, where a
-    spline would ring. Fritsch & Butland 1984, doi:10.1137/0905021.
+    Samples are interpolated exactly and without overshoot, so that, unlike with a spline, a lake next to a cliff stays
+    flat. Fritsch & Butland 1984, doi:10.1137/0905021.
 
     Parameters
     ----------
     raster
-        ``(H, W, C)`` without NaN.
+        ``values`` ``(H, W, C)`` without NaN.
     factor
-        1 leaves the raster as it is.
+        Number of intervals per original interval; 1 returns the raster unchanged.
 
     Returns
     -------
     Raster
         ``((H - 1) factor + 1, (W - 1) factor + 1, C)`` float32. Its pixels are ``factor`` times smaller and centred on
-        the samples, so its outer edge lies within the old one.
+        the samples, so its outer edge lies within the original one.
+
+    Raises
+    ------
+    ValueError
+        ``factor`` is less than 1.
     """
     from scipy.interpolate import PchipInterpolator
 
@@ -40,7 +45,7 @@ def refine_raster(raster: Raster, factor: int) -> Raster:
         count = values.shape[axis]
         fine = np.arange((count - 1) * factor + 1) / factor
         values = PchipInterpolator(np.arange(count), values, axis=axis)(fine).astype(np.float32)
-    # The first sample's centre stays at (0.5, 0.5) of the old grid.
+    # The first sample's centre stays at (0.5, 0.5) of the original grid.
     transform = (
         raster.transform * Affine.translation(0.5, 0.5) * Affine.scale(1.0 / factor) * Affine.translation(-0.5, -0.5)
     )
@@ -50,5 +55,22 @@ def refine_raster(raster: Raster, factor: int) -> Raster:
 def refinement_factor(
     samples: int, spacing_m: float, *, most_samples: int = 4_000_000, least_spacing_m: float = 10.0
 ) -> int:
-    """1, 2 or 4: the largest that keeps the raster within a number of samples and above a spacing worth having [m]."""
+    """Choose the largest upsampling factor of 1, 2 or 4 within limits on sample count and spacing.
+
+    Parameters
+    ----------
+    samples
+        Number of samples of the original raster.
+    spacing_m
+        Spacing of the original raster [m].
+    most_samples
+        Largest number of samples of the upsampled raster.
+    least_spacing_m
+        Smallest useful spacing [m].
+
+    Returns
+    -------
+    int
+        Factor for `refine_raster`; 1 if no larger one satisfies the limits.
+    """
     return max(k for k in (1, 2, 4) if k == 1 or (samples * k * k <= most_samples and spacing_m / k >= least_spacing_m))

@@ -1,4 +1,4 @@
-"""The nouns of terrain: rasters on a map, a triangulated surface in the local frame, textures on it."""
+"""Data types of terrain and their storage: georeferenced raster, triangulated surface, texture over a UV atlas."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from affine import Affine
@@ -16,12 +17,13 @@ from seasonscapes.frames import LocalFrame
 
 @dataclass(frozen=True)
 class Raster:
-    """Values on a map grid.
+    """Gridded values with a georeference.
 
     Parameters
     ----------
     values
-        ``(H, W, C)`` float32; row 0 is the first row of the file (north, for north-up rasters). NaN marks no data.
+        ``(H, W, C)`` float32; row 0 is the first row of the file (north, for north-up rasters). NaN for cells without
+        data.
     transform
         Affine map from (column, row) to map coordinates; (0, 0) is the **corner** of the first pixel.
     crs
@@ -35,18 +37,18 @@ class Raster:
 
 @dataclass(frozen=True)
 class Terrain:
-    """A triangulated surface.
+    """A triangulated terrain surface with texture coordinates.
 
     Parameters
     ----------
     vertices
         ``(V, 3)`` float32 east-north-up [m].
     faces
-        ``(F, 3)`` uint32, counter-clockwise seen from above (from outside).
+        ``(F, 3)`` uint32, counter-clockwise when viewed from above (from outside).
     uv
-        ``(V, 2)`` float32 in [0, 1]; v runs upwards: v = 1 is row 0 of a texture.
+        ``(V, 2)`` float32 in [0, 1]; v points upwards: v = 1 is the upper edge of row 0 of a texture.
     frame
-        The local frame that the vertices are in.
+        Local frame of the vertices.
     """
 
     vertices: np.ndarray
@@ -57,20 +59,20 @@ class Terrain:
 
 @dataclass(frozen=True)
 class Texture:
-    """Values over the atlas of a terrain.
+    """An image over the UV atlas of a terrain.
 
     Parameters
     ----------
     values
-        ``(R, S, 3)`` float32 with row 0 at v = 1: albedo in [0, 1], or radiance [cd/m²], by the name of the variable.
+        ``(R, S, 3)`` float32 with row 0 at v = 1: albedo in [0, 1] or radiance [cd/m²], depending on the use.
     weight
-        ``(R, S)`` float32, 0 where never seen.
+        ``(R, S)`` float32 weight of the observations, 0 for unobserved texels; ones if left out.
     atlas_id
-        Identity of the UV atlas that the texture belongs to, see `atlas_identity`; ``None`` where it is not known.
+        Identifier of the UV atlas that the texture belongs to, see `atlas_identity`; ``None`` if unknown.
     """
 
     values: np.ndarray
-    weight: np.ndarray = field(default=None)  # type: ignore[assignment]
+    weight: np.ndarray = field(default=None)  # type: ignore[assignment]  # set in __post_init__
     atlas_id: str | None = None
 
     def __post_init__(self):
@@ -81,7 +83,7 @@ class Texture:
 
 
 def atlas_identity(terrain: Terrain, width_px: int, height_px: int) -> str:
-    """A short name of a UV atlas: equal for equal texture coordinates, faces and texture size.
+    """Compute an identifier of a UV atlas as a hash of texture coordinates, faces and texture size.
 
     Parameters
     ----------
@@ -96,8 +98,8 @@ def atlas_identity(terrain: Terrain, width_px: int, height_px: int) -> str:
         16 hexadecimal digits.
     """
     digest = hashlib.sha256(f"{width_px}x{height_px}".encode())
-    digest.update(np.ascontiguousarray(terrain.uv, np.float32))
-    digest.update(np.ascontiguousarray(terrain.faces, np.uint32))
+    digest.update(np.ascontiguousarray(terrain.uv, np.float32).data)
+    digest.update(np.ascontiguousarray(terrain.faces, np.uint32).data)
     return digest.hexdigest()[:16]
 
 
@@ -107,11 +109,16 @@ def require_atlas(texture: Texture, atlas_id: str, shape: tuple[int, int], *, wh
     Parameters
     ----------
     texture
-        A texture that states no atlas is judged by its size alone.
+        The texture to check; without ``atlas_id``, only its size is compared.
     atlas_id, shape
-        Identity and size (rows, columns) of the atlas that is expected.
+        Identifier and size (rows, columns) of the expected atlas.
     what
-        What the message calls the texture, such as its file.
+        Name of the texture in the message, such as its file.
+
+    Raises
+    ------
+    AtlasMismatch
+        Size or identifier differ.
     """
     size = texture.values.shape[:2]
     if size != shape:
@@ -126,38 +133,93 @@ def require_atlas(texture: Texture, atlas_id: str, shape: tuple[int, int], *, wh
         )
 
 
-def save_terrain(terrain: Terrain, path: str | os.PathLike, *, note: dict | None = None) -> None:
-    """Write a terrain, and plain values that belong to it, to one ``.npz`` file."""
+def save_terrain(terrain: Terrain, path: str | os.PathLike[str], *, note: dict[str, Any] | None = None) -> None:
+    """Write a terrain and its metadata to one ``.npz`` file.
+
+    Parameters
+    ----------
+    terrain
+        The surface.
+    path
+        File to write.
+    note
+        JSON-serialisable metadata.
+    """
     frame = np.array([getattr(terrain.frame, name) for name in LocalFrame.__dataclass_fields__], np.float64)
     np.savez(
         path, vertices=terrain.vertices, faces=terrain.faces, uv=terrain.uv, frame=frame, note=json.dumps(note or {})
     )
 
 
-def load_terrain(path: str | os.PathLike) -> tuple[Terrain, dict]:
-    """The terrain and the note that `save_terrain` wrote."""
+def load_terrain(path: str | os.PathLike[str]) -> tuple[Terrain, dict[str, Any]]:
+    """Read a terrain and its metadata from a file of `save_terrain`.
+
+    Parameters
+    ----------
+    path
+        File to read.
+
+    Returns
+    -------
+    terrain
+        The surface.
+    note
+        Its metadata.
+    """
     with np.load(path, allow_pickle=False) as stored:
         frame = LocalFrame(*map(float, stored["frame"]))
         return Terrain(stored["vertices"], stored["faces"], stored["uv"], frame), json.loads(str(stored["note"]))
 
 
-def save_texture(texture: Texture, path: str | os.PathLike) -> None:
-    """Write a texture to one ``.npz`` file; values keep float32, so a texture read back is the same to the bit."""
-    known = {} if texture.atlas_id is None else {"atlas_id": texture.atlas_id}
-    np.savez(path, values=texture.values, weight=texture.weight, **known)
+def save_texture(texture: Texture, path: str | os.PathLike[str]) -> None:
+    """Write a texture to one ``.npz`` file, without loss of precision.
+
+    Parameters
+    ----------
+    texture
+        The texture.
+    path
+        File to write.
+    """
+    identity: dict[str, Any] = {} if texture.atlas_id is None else {"atlas_id": texture.atlas_id}
+    np.savez(path, values=texture.values, weight=texture.weight, **identity)
 
 
-def load_texture(path: str | os.PathLike) -> Texture:
-    """Read what `save_texture` wrote."""
+def load_texture(path: str | os.PathLike[str]) -> Texture:
+    """Read a texture from a file of `save_texture`.
+
+    Parameters
+    ----------
+    path
+        File to read.
+
+    Returns
+    -------
+    Texture
+        The texture; ``atlas_id`` is ``None`` if the file has none.
+    """
     with np.load(path, allow_pickle=False) as stored:
         atlas_id = str(stored["atlas_id"]) if "atlas_id" in stored else None
         return Texture(stored["values"], stored["weight"], atlas_id)
 
 
 def sample_texture(values: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Bilinear look-up of a texture ``(R, S, C)`` at ``uv`` ``(..., 2)``, clamped at its edge; NaN where uv is NaN."""
+    """Interpolate a texture bilinearly at UV coordinates, clamped at its edges.
+
+    Parameters
+    ----------
+    values
+        Texture ``(R, S, C)`` with row 0 at v = 1.
+    uv
+        Texture coordinates ``(..., 2)``.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(..., C)`` float32; NaN where ``uv`` is NaN.
+    """
     height, width = values.shape[:2]
-    known = np.isfinite(uv).all(axis=-1)
+    known = np.all(np.isfinite(uv), axis=-1)
     u, v = np.moveaxis(np.where(known[..., None], uv, 0.0), -1, 0)
     column, row = np.clip(u * width - 0.5, 0.0, width - 1.0), np.clip((1.0 - v) * height - 0.5, 0.0, height - 1.0)
     column0, row0 = np.minimum(column.astype(int), max(width - 2, 0)), np.minimum(row.astype(int), max(height - 2, 0))

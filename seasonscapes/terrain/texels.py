@@ -1,6 +1,8 @@
-"""Which triangle covers which texel, and where on the ground a texel lies."""
+"""Rasterisation of a mesh in UV space: covering face, surface position and barycentric coordinates of texels."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -11,11 +13,11 @@ _CHUNK_TEXELS = 1_000_000
 
 
 def _spans(x: np.ndarray, y: np.ndarray, width: int, height: int) -> tuple[np.ndarray, ...]:
-    """Horizontal runs of texel centres inside triangles ``(N, 3)``: triangle, row, first column, end column.
+    """Scanline spans of texel centres inside triangles ``(N, 3)``: triangle, row, first column, end column.
 
-    Coordinates are shifted so that centres are whole numbers. Both triangles at an edge compute its crossing with a
-    row from the same two end points in the same order, and runs are half open: every centre inside a mesh belongs to
-    exactly one of its triangles.
+    Coordinates are shifted so that texel centres are integers. Both triangles of an edge compute its intersection with
+    a row from the same end points in the same order, and spans are half open: every texel centre inside a mesh belongs
+    to exactly one of its triangles.
     """
     order = np.lexsort((x, y), axis=1)
     x, y = np.take_along_axis(x, order, 1), np.take_along_axis(y, order, 1)
@@ -25,8 +27,8 @@ def _spans(x: np.ndarray, y: np.ndarray, width: int, height: int) -> tuple[np.nd
     triangle = np.repeat(np.arange(len(x)), count)
     row = np.arange(len(triangle)) - np.repeat(np.cumsum(count) - count, count) + first[triangle]
 
-    def crossing(i, j):
-        # Rows only meet edges with y_i <= row < y_j, so the division is sound wherever the result is used.
+    def crossing(i: int, j: int) -> np.ndarray:
+        # Rows intersect only edges with y_i <= row < y_j: results of a division by zero are never used.
         xi, yi, xj, yj = x[triangle, i], y[triangle, i], x[triangle, j], y[triangle, j]
         with np.errstate(divide="ignore", invalid="ignore"):
             return xi + (row - yi) / (yj - yi) * (xj - xi)
@@ -39,14 +41,14 @@ def _spans(x: np.ndarray, y: np.ndarray, width: int, height: int) -> tuple[np.nd
     return triangle[keep], row[keep], left[keep], right[keep]
 
 
-def _covered(xy: np.ndarray, faces: np.ndarray, width: int, height: int):
-    """Pairs of flat texel index and face index, chunk by chunk."""
+def _covered(xy: np.ndarray, faces: np.ndarray, width: int, height: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield pairs of flat texel index and covering face index, in chunks."""
     for start in range(0, len(faces), _CHUNK_FACES):
         corners = np.asarray(xy[faces[start : start + _CHUNK_FACES]], np.float64) - 0.5
         triangle, row, left, right = _spans(corners[..., 0], corners[..., 1], width, height)
         length = right - left
         ends = np.cumsum(length)
-        # A handful of huge triangles can cover all texels: cut the list of runs so that memory stays bounded.
+        # A few large triangles can cover all texels: split the list of spans to bound the memory.
         cuts = np.searchsorted(ends, np.arange(0, ends[-1] if len(ends) else 0, 4 * _CHUNK_TEXELS)[1:])
         for part in np.split(np.arange(len(length)), np.unique(cuts)):
             n = length[part]
@@ -55,14 +57,21 @@ def _covered(xy: np.ndarray, faces: np.ndarray, width: int, height: int):
 
 
 def covering_faces(xy: np.ndarray, faces: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Index ``(height, width)`` int32 of the face that covers each texel centre, −1 where none does.
+    """Find the face that covers each texel centre.
 
     Parameters
     ----------
     xy
-        ``(V, 2)`` column and row in texels; the first texel's centre is (0.5, 0.5).
+        ``(V, 2)`` column and row of the vertices [texels]; the first texel's centre is (0.5, 0.5).
     faces
-        ``(F, 3)`` vertex indices. Where faces overlap, the last one counts.
+        ``(F, 3)`` vertex indices. Where faces overlap, the one with the largest index is returned.
+    width, height
+        Size of the texture [texels].
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(height, width)`` int32 face index, −1 for uncovered texels.
     """
     face_id = np.full(width * height, -1, np.int32)
     for texel, face in _covered(xy, faces, width, height):
@@ -71,7 +80,18 @@ def covering_faces(xy: np.ndarray, faces: np.ndarray, width: int, height: int) -
 
 
 def coverage_count(xy: np.ndarray, faces: np.ndarray, width: int, height: int) -> np.ndarray:
-    """How many faces cover each texel centre, ``(height, width)`` int32: 0 or 1 all over for an injective atlas."""
+    """Count the faces that cover each texel centre; 0 or 1 everywhere for an injective atlas.
+
+    Parameters
+    ----------
+    xy, faces, width, height
+        As in `covering_faces`.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(height, width)`` int32 number of faces.
+    """
     count = np.zeros(width * height, np.int32)
     for texel, _ in _covered(xy, faces, width, height):
         np.add.at(count, texel, 1)
@@ -79,20 +99,40 @@ def coverage_count(xy: np.ndarray, faces: np.ndarray, width: int, height: int) -
 
 
 def texel_coordinates(uv: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Column and row ``(..., 2)`` float64 of UV coordinates; v = 1 is the upper edge of row 0."""
+    """Convert UV coordinates to texel coordinates.
+
+    Parameters
+    ----------
+    uv
+        ``(..., 2)`` in [0, 1]; v = 1 is the upper edge of row 0.
+    width, height
+        Size of the texture [texels].
+
+    Returns
+    -------
+    numpy.ndarray
+        Column and row ``(..., 2)`` float64; the first texel's centre is (0.5, 0.5).
+    """
     uv = np.asarray(uv, np.float64)
     return np.stack([uv[..., 0] * width, (1.0 - uv[..., 1]) * height], axis=-1)
 
 
 def texel_positions(terrain: Terrain, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Where on the surface each texel's centre lies.
+    """Compute the surface position of each texel centre.
+
+    Parameters
+    ----------
+    terrain
+        Surface with UV coordinates.
+    width, height
+        Size of the texture [texels].
 
     Returns
     -------
     positions
-        ``(height, width, 3)`` float32 east-north-up [m]; NaN where no face covers the texel.
+        ``(height, width, 3)`` float32 east-north-up [m]; NaN for uncovered texels.
     face_id
-        ``(height, width)`` int32, −1 where no face covers it.
+        ``(height, width)`` int32 index of the covering face, −1 for uncovered texels.
     """
     xy = texel_coordinates(terrain.uv, width, height)
     face_id = covering_faces(xy, terrain.faces, width, height)
@@ -108,7 +148,20 @@ def texel_positions(terrain: Terrain, width: int, height: int) -> tuple[np.ndarr
 
 
 def barycentric(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """Barycentric weights ``(N, 3)``, clipped to the triangle, of points ``(N, 2)`` in triangles ``(N, 3, 2)``."""
+    """Compute barycentric coordinates, clipped to the triangle.
+
+    Parameters
+    ----------
+    corners
+        Triangles ``(N, 3, 2)``.
+    point
+        Points ``(N, 2)``.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(N, 3)`` weights that sum to 1; equal weights for degenerate triangles.
+    """
     a, b, c = (corners[:, k] - point for k in range(3))
     weights = np.stack([_cross(b, c), _cross(c, a), _cross(a, b)], axis=-1)
     total = weights.sum(axis=1, keepdims=True)
