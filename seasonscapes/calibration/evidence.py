@@ -1,14 +1,15 @@
-"""What a calibration rests on: points matched by hand, and how far each unknown is trusted beforehand."""
+"""Evidence of a camera resection: point correspondences and prior standard deviations of the unknowns."""
 
 from __future__ import annotations
 
 import csv
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from seasonscapes.declaration import InputError
+from seasonscapes.errors import InputError
 from seasonscapes.frames import LocalFrame, enu_from_geodetic, geodetic_from_enu
 from seasonscapes.images import atomic_path
 
@@ -17,16 +18,21 @@ POINT_COLUMNS = ("name", "x_px", "y_px", "latitude_deg", "longitude_deg", "heigh
 
 @dataclass(frozen=True)
 class Correspondences:
-    """Matched points: where each is in the picture and in the world.
+    """Image points and the world points that they correspond to.
 
     Parameters
     ----------
     pixel
-        ``(N, 2)`` x right, y down, origin at the picture's top left corner [px].
+        Image coordinates ``(N, 2)`` [px]: x right, y down, origin at the top left corner of the image.
     position_m
-        ``(N, 3)`` east-north-up [m].
+        World coordinates ``(N, 3)``, east-north-up [m].
     names
-        One for each, for reports; numbered when left out.
+        One name per point, for reports; ``"1"``, ``"2"``, … if omitted.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not match, or a coordinate is NaN or infinite.
     """
 
     pixel: np.ndarray
@@ -42,9 +48,9 @@ class Correspondences:
         names = tuple(self.names) or tuple(str(i + 1) for i in range(len(pixel)))
         if len(names) != len(pixel):
             raise ValueError(f"Correspondences: {len(names)} names for {len(pixel)} points")
-        bad = ~(np.isfinite(pixel).all(1) & np.isfinite(position).all(1))
-        if bad.any():
-            raise ValueError(f"Correspondences: point {names[int(np.argmax(bad))]} holds NaN or infinity")
+        invalid = ~(np.isfinite(pixel).all(1) & np.isfinite(position).all(1))
+        if invalid.any():
+            raise ValueError(f"Correspondences: point {names[int(np.argmax(invalid))]} holds NaN or infinity")
         object.__setattr__(self, "pixel", pixel)
         object.__setattr__(self, "position_m", position)
         object.__setattr__(self, "names", names)
@@ -53,28 +59,49 @@ class Correspondences:
         return len(self.pixel)
 
 
-def take(points: Correspondences, index) -> Correspondences:
-    """Some of the points, by index or mask."""
-    keep = np.arange(len(points))[index]
-    return Correspondences(points.pixel[keep], points.position_m[keep], tuple(points.names[i] for i in keep))
+def take(points: Correspondences, index: np.ndarray | Sequence[int] | slice) -> Correspondences:
+    """Return a subset of the correspondences.
+
+    Parameters
+    ----------
+    points
+        Correspondences of N points.
+    index
+        Indices ``(K,)``, boolean mask ``(N,)`` or slice.
+
+    Returns
+    -------
+    Correspondences
+        The K selected points with their names.
+    """
+    selected = np.arange(len(points))[index]
+    return Correspondences(
+        points.pixel[selected], points.position_m[selected], tuple(points.names[i] for i in selected)
+    )
 
 
 @dataclass(frozen=True)
 class Priors:
-    """One standard deviation of each unknown about its start: 0 holds it fixed, infinity leaves it to the evidence.
+    """Standard deviations of the Gaussian priors about the start values: 0 fixes an unknown, infinity omits its prior.
 
     Parameters
     ----------
     heading_deg, tilt_deg, roll_deg
         Angles [deg].
     horizontal_m, vertical_m
-        Position, each of east and north, and up [m].
+        Position: east and north each, and up [m].
     focal
-        Field-of-view scale, relative. The width of a full circle is known; there it scales the rows alone.
+        Scale of the field of view, relative. The width of a full-circle panorama is fixed; there the scale applies to
+        the rows only.
     k1
-        Radial term (perspective cameras only).
+        Radial distortion coefficient (perspective cameras only).
     horizon_px
-        Row of a panorama's own horizon: a lens pitched on a level axis moves it (panoramas only).
+        Row of a panorama's horizon [px]: a lens pitched on a level rotation axis shifts it (panoramas only).
+
+    Raises
+    ------
+    ValueError
+        If a standard deviation is negative or NaN.
     """
 
     heading_deg: float = np.inf
@@ -92,7 +119,7 @@ class Priors:
 
     @property
     def sigmas(self) -> np.ndarray:
-        """In the order of `PARAMETERS`, ``(9,)``."""
+        """Standard deviations ``(9,)`` in the order of `PARAMETERS`."""
         return np.array(
             [
                 self.heading_deg,
@@ -114,13 +141,31 @@ PARAMETERS = ("heading_deg", "tilt_deg", "roll_deg", "east_m", "north_m", "up_m"
 
 
 def read_points(path: Path, frame: LocalFrame) -> Correspondences:
-    """Read ``name,x_px,y_px,latitude_deg,longitude_deg,height_m``; `InputError` names the line that is wrong."""
+    """Read correspondences from a CSV file with the columns `POINT_COLUMNS`.
+
+    Parameters
+    ----------
+    path
+        CSV file with a header line; positions are geodetic WGS 84 coordinates.
+    frame
+        Local frame of the returned positions.
+
+    Returns
+    -------
+    Correspondences
+        The points in file order; a point without a name is numbered.
+
+    Raises
+    ------
+    InputError
+        If the file or a column is missing, or a line (which the message names) holds no valid point.
+    """
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
             rows = list(csv.DictReader(file))
     except FileNotFoundError:
         raise InputError(path, "no such file") from None
-    pixel, place, names = [], [], []
+    pixel, geodetic, names = [], [], []
     for number, row in enumerate(rows, 2):
         try:
             values = [float(row[column]) for column in POINT_COLUMNS[1:]]
@@ -131,15 +176,25 @@ def read_points(path: Path, frame: LocalFrame) -> Correspondences:
         except (TypeError, ValueError) as error:
             raise InputError(f"{path}: line {number}", f"not a point: {error}") from None
         pixel.append(values[:2])
-        place.append(values[2:])
+        geodetic.append(values[2:])
         names.append(row.get("name") or str(number - 1))
-    place = np.array(place).reshape(-1, 3)
-    position = enu_from_geodetic(frame, place[:, 0], place[:, 1], place[:, 2])
+    geodetic = np.array(geodetic).reshape(-1, 3)
+    position = enu_from_geodetic(frame, geodetic[:, 0], geodetic[:, 1], geodetic[:, 2])
     return Correspondences(np.array(pixel).reshape(-1, 2), position.reshape(-1, 3), tuple(names))
 
 
 def write_points(path: Path, points: Correspondences, frame: LocalFrame) -> None:
-    """Write what `read_points` reads, atomically."""
+    """Write correspondences to a CSV file that `read_points` reads; the file appears atomically.
+
+    Parameters
+    ----------
+    path
+        File to write.
+    points
+        Correspondences, positions in ``frame``.
+    frame
+        Local frame; the file holds geodetic WGS 84 coordinates.
+    """
     latitude, longitude, height = geodetic_from_enu(frame, points.position_m)
     with atomic_path(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")

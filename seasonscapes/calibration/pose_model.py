@@ -1,4 +1,8 @@
-"""A camera as nine numbers and back: the unknowns that every kind of evidence speaks about."""
+"""Pack and unpack the nine calibration parameters shared by all residuals, and project points with them.
+
+The parameters (`evidence.PARAMETERS`) are heading, tilt and roll [deg], position [m], logarithm of the field-of-view
+scale, radial distortion coefficient ``k1`` and offset of the horizon row [px].
+"""
 
 from __future__ import annotations
 
@@ -16,7 +20,23 @@ View = Camera | Panorama
 
 
 def angles_from_rotation(rotation: np.ndarray) -> tuple[float, float, float]:
-    """Heading in [0, 360), pitch and roll [deg] of a ``world_from_camera`` rotation: undoes `rotation_from_angles`."""
+    """Compute heading, pitch and roll of a rotation; the inverse of `rotation_from_angles`.
+
+    Parameters
+    ----------
+    rotation
+        ``world_from_camera`` rotation ``(3, 3)``.
+
+    Returns
+    -------
+    heading, pitch, roll : float
+        Angles [deg]; the heading lies in [0, 360).
+
+    Examples
+    --------
+    >>> [round(angle, 6) for angle in angles_from_rotation(rotation_from_angles(30.0, -5.0, 2.0))]
+    [30.0, -5.0, 2.0]
+    """
     forward = rotation[:, 2]
     heading, pitch = np.degrees(np.arctan2(forward[0], forward[1])), np.degrees(np.arcsin(np.clip(forward[2], -1, 1)))
     level = rotation_from_angles(heading, pitch)
@@ -25,27 +45,42 @@ def angles_from_rotation(rotation: np.ndarray) -> tuple[float, float, float]:
 
 
 def values_of(view: View, axes: np.ndarray, k1: float = 0.0) -> np.ndarray:
-    """The unknowns ``(9,)`` of a view, in the order of `PARAMETERS`, with a field-of-view scale of one.
+    """Return the calibration parameters of a view.
 
-    ``axes`` ``(3, 3)`` are the rows east, north, up of the camera's own horizon (`frames.local_axes`).
+    Parameters
+    ----------
+    view
+        Camera or panorama.
+    axes
+        East, north and up at the camera, rows ``(3, 3)`` (`frames.local_axes`).
+    k1
+        Radial distortion coefficient.
+
+    Returns
+    -------
+    ndarray
+        Parameters ``(9,)`` in the order of `PARAMETERS`; field-of-view scale 1 (logarithm 0), horizon offset 0.
     """
     angles = angles_from_rotation(axes @ view.world_from_camera[:3, :3])
     return np.array([*angles, *view.position_m, 0.0, k1, 0.0])
 
 
 def _rotation(axes: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """``world_from_camera``: as `rotation_from_angles` about ``axes``, without array ceremony (solvers live here)."""
+    """``world_from_camera`` rotation ``(3, 3)``: as `rotation_from_angles` about ``axes``.
+
+    Scalar arithmetic, because solvers call this function for every residual evaluation.
+    """
     sin_h, cos_h = math.sin(math.radians(values[0])), math.cos(math.radians(values[0]))
     sin_p, cos_p = math.sin(math.radians(values[1])), math.cos(math.radians(values[1]))
     sin_r, cos_r = math.sin(math.radians(values[2])), math.cos(math.radians(values[2]))
     right, down = (cos_h, -sin_h, 0.0), (sin_p * sin_h, sin_p * cos_h, -cos_p)
-    turned = [(cos_r * r + sin_r * d, cos_r * d - sin_r * r) for r, d in zip(right, down, strict=True)]
+    rolled = [(cos_r * r + sin_r * d, cos_r * d - sin_r * r) for r, d in zip(right, down, strict=True)]
     forward = (sin_h * cos_p, cos_h * cos_p, sin_p)
-    return axes.T @ np.array([[*pair, ahead] for pair, ahead in zip(turned, forward, strict=True)])
+    return axes.T @ np.array([[*pair, ahead] for pair, ahead in zip(rolled, forward, strict=True)])
 
 
-def _scales(start: View, log_scale: float) -> tuple[float, float]:
-    """Factors of ``fx`` and ``fy``. A full circle keeps its width, and no panorama grows beyond one."""
+def _focal_scales(start: View, log_scale: float) -> tuple[float, float]:
+    """Factors of ``fx`` and ``fy``. A full circle keeps its width, and no panorama exceeds a full circle."""
     scale = math.exp(log_scale)
     if not isinstance(start, Panorama):
         return scale, scale
@@ -53,51 +88,123 @@ def _scales(start: View, log_scale: float) -> tuple[float, float]:
 
 
 def view_from_values(start: View, axes: np.ndarray, values: np.ndarray) -> View:
-    """The view at given unknowns, as an ideal pinhole or a panorama; ``values[7]`` (k1) is kept by the caller."""
+    """Return the ideal pinhole camera or panorama with given calibration parameters.
+
+    Parameters
+    ----------
+    start
+        View that the field-of-view scale and the horizon offset refer to.
+    axes
+        East, north and up at the camera, rows ``(3, 3)``.
+    values
+        Parameters ``(9,)``; ``values[7]`` (``k1``) is not part of a view and is left to the caller.
+
+    Returns
+    -------
+    Camera or Panorama
+        As ``start``, with the pose, focal lengths and horizon row of ``values``.
+    """
     pose = np.eye(4)
     pose[:3, :3] = _rotation(axes, values)
     pose[:3, 3] = values[3:6]
-    wide, high = _scales(start, values[6])
-    return replace(start, fx=start.fx * wide, fy=start.fy * high, cy=start.cy + values[8], world_from_camera=pose)
+    scale_x, scale_y = _focal_scales(start, values[6])
+    return replace(start, fx=start.fx * scale_x, fy=start.fy * scale_y, cy=start.cy + values[8], world_from_camera=pose)
 
 
-def project_values(start: View, axes: np.ndarray, values: np.ndarray, position_m: np.ndarray):
-    """Lens pixels ``(N, 2)`` at given unknowns and whether each point ``(N, 3)`` lies in front.
+def project_values(
+    start: View, axes: np.ndarray, values: np.ndarray, position_m: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Project world points to lens pixels with given calibration parameters.
 
-    Finite everywhere and smooth across the camera plane, as a solver needs: points behind get far-away pixels.
+    The projection is finite everywhere and smooth across the camera plane, as a solver requires: points behind the
+    camera are mapped to distant pixels.
+
+    Parameters
+    ----------
+    start
+        View that the field-of-view scale and the horizon offset refer to.
+    axes
+        East, north and up at the camera, rows ``(3, 3)``.
+    values
+        Parameters ``(9,)``.
+    position_m
+        World points ``(N, 3)`` [m].
+
+    Returns
+    -------
+    pixel : ndarray
+        Lens pixels ``(N, 2)`` (with radial distortion).
+    in_front : ndarray
+        ``(N,)`` bool, True where the point lies in front of the camera.
     """
     local = (position_m - values[3:6]) @ _rotation(axes, values)
-    wide, high = _scales(start, values[6])
+    scale_x, scale_y = _focal_scales(start, values[6])
     centre = np.array([start.cx, start.cy])
     if isinstance(start, Panorama):
         pixel, distance = project_local(start, local)
-        return (pixel - centre) * [wide, high] + centre + [0.0, values[8]], distance > 0
+        return (pixel - centre) * [scale_x, scale_y] + centre + [0.0, values[8]], distance > 0
     depth = local[:, 2]
-    normal = local[:, :2] / np.maximum(depth, 0.02 * np.sqrt(np.sum(local**2, axis=1)))[:, None]
+    normalised = local[:, :2] / np.maximum(depth, 0.02 * np.sqrt(np.sum(local**2, axis=1)))[:, None]
     if values[7]:
-        normal = normal * _bend(np.sqrt(np.sum(normal**2, axis=1, keepdims=True)), values[7])
-    return normal * [start.fx * wide, start.fy * high] + centre + [0.0, values[8]], depth > 0
+        radius = np.sqrt(np.sum(normalised**2, axis=1, keepdims=True))
+        normalised = normalised * _distortion_factor(radius, values[7])
+    return normalised * [start.fx * scale_x, start.fy * scale_y] + centre + [0.0, values[8]], depth > 0
 
 
-def _bend(radius: np.ndarray, k1: float) -> np.ndarray:
-    """Distorted over ideal radius. Beyond the fold of a barrel the polynomial comes back; it is continued straight."""
-    edge = np.minimum(radius, math.sqrt(0.98 / (-3.0 * k1)) if k1 < 0 else np.inf)
-    bent = edge * (1.0 + k1 * edge**2) + (1.0 + 3.0 * k1 * edge**2) * (radius - edge)
-    return np.divide(bent, radius, out=np.ones_like(radius), where=radius > 1e-12)
+def _distortion_factor(radius: np.ndarray, k1: float) -> np.ndarray:
+    """Distorted over ideal radius.
+
+    The polynomial of a barrel distortion decreases beyond its maximum; it is extrapolated linearly from just before it.
+    """
+    limit = np.minimum(radius, math.sqrt(0.98 / (-3.0 * k1)) if k1 < 0 else np.inf)
+    distorted = limit * (1.0 + k1 * limit**2) + (1.0 + 3.0 * k1 * limit**2) * (radius - limit)
+    return np.divide(distorted, radius, out=np.ones_like(radius), where=radius > 1e-12)
 
 
-def pixel_error(start: View, axes: np.ndarray, values: np.ndarray, points: Correspondences):
-    """Projected minus observed ``(N, 2)`` [px], columns the short way round; and whether each lies in front."""
-    pixel, front = project_values(start, axes, values, points.position_m)
+def pixel_error(
+    start: View, axes: np.ndarray, values: np.ndarray, points: Correspondences
+) -> tuple[np.ndarray, np.ndarray]:
+    """Compute reprojection errors of correspondences.
+
+    Parameters
+    ----------
+    start, axes, values
+        View, axes and parameters as in `project_values`.
+    points
+        Correspondences of N points.
+
+    Returns
+    -------
+    error : ndarray
+        Projected minus observed pixel ``(N, 2)`` [px]; column differences of a panorama are wrapped to half a circle.
+    in_front : ndarray
+        ``(N,)`` bool, True where the point lies in front of the camera.
+    """
+    pixel, in_front = project_values(start, axes, values, points.position_m)
     error = pixel - points.pixel
     if isinstance(start, Panorama):
         circle = 2.0 * np.pi * start.fx
         error[:, 0] -= circle * np.round(error[:, 0] / circle)
-    return error, front
+    return error, in_front
 
 
 def bearings(view: View, k1: float, pixel: np.ndarray) -> np.ndarray:
-    """Unit world directions ``(N, 3)`` of lens pixels ``(N, 2)``; NaN where the lens has no ray."""
+    """Compute the viewing directions of lens pixels.
+
+    Parameters
+    ----------
+    view
+        Camera or panorama.
+    k1
+        Radial distortion coefficient (perspective cameras only).
+    pixel
+        Lens pixels ``(N, 2)``.
+
+    Returns
+    -------
+    ndarray
+        Unit world directions ``(N, 3)``; NaN where the lens model has no ray.
+    """
     if isinstance(view, Panorama):
         return panorama_directions(view, pixel)
     return ray_directions(view, undistort(pixel, view, k1) if k1 else pixel)

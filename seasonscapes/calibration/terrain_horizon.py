@@ -1,16 +1,18 @@
-"""What the terrain draws against the sky from one place: its horizon, and the edges of nearer ridges before farther ones.
+"""Terrain horizon of a viewpoint: the skyline, and the edges of ridges in front of more distant terrain.
 
-Rays march outwards over the elevation grid, all azimuths at once. Positions go through `frames` (ECEF, with the frame's
-refraction), so that curvature and refraction need no formula here.
+Rays march outwards over the elevation raster, all azimuths at once. Positions are transformed by `frames` (ECEF, with
+the frame's refraction), which accounts for Earth curvature and refraction.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from seasonscapes.errors import NoTerrainInView
 from seasonscapes.frames import LocalFrame, enu_from_geodetic, geodetic_from_enu, local_axes
 from seasonscapes.terrain.crs import map_from_geodetic, raster_pixels
 from seasonscapes.terrain.raster import sample_raster
@@ -19,24 +21,25 @@ from seasonscapes.terrain.surface import Raster
 
 @dataclass(frozen=True)
 class Horizon:
-    """The terrain as seen from ``position_m``.
+    """Skyline and ridge edges of the terrain as observed from one position.
 
     Parameters
     ----------
     position_m
-        Place it was computed for, ``(3,)`` in the local frame [m].
+        Viewpoint ``(3,)`` in the local frame [m].
     axes
-        East, north and up there, rows ``(3, 3)``.
+        East, north and up at the viewpoint, rows ``(3, 3)``.
     azimuth_deg
-        ``(A,)`` directions that were looked into, clockwise from north [deg].
+        Azimuths ``(A,)``, clockwise from north [deg].
     skyline_m
-        ``(A, 3)`` the point of the horizon in each [m].
+        Skyline point ``(A, 3)`` at each azimuth [m].
     skyline_elevation_deg
-        ``(A,)`` its elevation [deg]; NaN where there is no terrain in that azimuth, or it ends still rising.
+        Elevation angle ``(A,)`` of the skyline [deg]; NaN where there is no terrain at that azimuth, or where the
+        elevation angle still increases at the edge of the terrain.
     edges_m
-        ``(E, 3)`` points where a nearer ridge hides what lies behind it, the skyline excluded [m].
+        Points ``(E, 3)`` where a nearer ridge occludes the terrain behind it, without the skyline [m].
     edge_gap
-        ``(E,)`` how much farther what is seen behind lies, as a share of the ridge's distance.
+        ``(E,)`` distance from the ridge to the next visible terrain behind it, relative to the distance of the ridge.
     """
 
     position_m: np.ndarray
@@ -48,16 +51,29 @@ class Horizon:
     edge_gap: np.ndarray
 
 
-def terrain_height(rasters: Sequence[Raster], latitude_deg, longitude_deg) -> np.ndarray:
-    """Heights [m] at places, from the first raster that knows them; NaN where none does."""
+def terrain_height(rasters: Sequence[Raster], latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> np.ndarray:
+    """Sample terrain heights at geodetic positions, from the first raster that covers each position.
+
+    Parameters
+    ----------
+    rasters
+        Elevation rasters in order of precedence.
+    latitude_deg, longitude_deg
+        WGS 84 coordinates of equal shape ``(...)`` [deg].
+
+    Returns
+    -------
+    ndarray
+        Heights ``(...)`` [m]; NaN where no raster has a value.
+    """
     latitude, longitude = np.asarray(latitude_deg, float), np.asarray(longitude_deg, float)
     height = np.full(latitude.shape, np.nan)
     for raster in rasters:
-        open_ = np.isnan(height)
-        if not open_.any():
+        missing = np.isnan(height)
+        if not missing.any():
             break
-        x, y = map_from_geodetic(raster.crs, latitude[open_], longitude[open_])
-        height[open_] = sample_raster(raster, x, y)[..., 0]
+        x, y = map_from_geodetic(raster.crs, latitude[missing], longitude[missing])
+        height[missing] = sample_raster(raster, x, y)[..., 0]
     return height
 
 
@@ -68,10 +84,28 @@ def terrain_profile(
     azimuth_deg: np.ndarray,
     distance_m: np.ndarray,
 ) -> np.ndarray:
-    """Terrain points ``(A, R, 3)`` in the local frame along azimuths at distances from a place; NaN off the terrain.
+    """Sample terrain points along azimuths at given distances from a position.
 
-    The map grid is met through a quartic of the plan position, fitted to the exact transforms (off by centimetres over
-    tens of kilometres), since millions of exact ones would take minutes.
+    Raster coordinates are approximated by a quartic polynomial of the plan position, fitted to the exact transforms
+    (errors of centimetres over tens of kilometres), because millions of exact transforms would take minutes.
+
+    Parameters
+    ----------
+    rasters
+        Elevation rasters in order of precedence.
+    frame
+        Local frame.
+    position_m
+        Origin ``(3,)`` of the profiles in the frame [m].
+    azimuth_deg
+        Azimuths ``(A,)``, clockwise from north [deg].
+    distance_m
+        Increasing distances ``(R,)`` [m].
+
+    Returns
+    -------
+    ndarray
+        Terrain points ``(A, R, 3)`` in the frame [m]; up is NaN outside the rasters.
     """
     from scipy.ndimage import map_coordinates
 
@@ -79,44 +113,49 @@ def terrain_profile(
     axes = local_axes(frame, latitude, longitude)
     azimuth = np.radians(np.asarray(azimuth_deg, float))[:, None]
     sine, cosine = np.sin(azimuth), np.cos(azimuth)
-    # Plan position in the frame; the small fall of the plane below the horizon matters to height alone.
+    # Plan position in the frame. The tilt of the camera's horizontal plane against the frame's affects only heights.
     plan = [distance_m * (sine * axes[0, i] + cosine * axes[1, i]) + position_m[i] for i in (0, 1)]
     unit = [(plan[i] - position_m[i]) / distance_m[-1] for i in (0, 1)]
     reach = float(distance_m[-1])
     height = np.full(unit[0].shape, np.nan, np.float32)
     for raster in rasters:
-        column, row = _on_plan(
+        column, row = _polynomial_on_plan(
             frame, position_m, reach, lambda la, lo, r=raster: raster_pixels(r, la, lo), unit, level_m
         )
         values = np.ascontiguousarray(raster.values[..., 0], np.float32)
-        found = map_coordinates(values, [row - 0.5, column - 0.5], order=1, cval=np.nan, output=np.float32)
-        height = np.where(np.isnan(height), found, height)
-    # How the level of the camera rises over the frame's plane (it falls: curvature), refraction included.
-    base = _on_plan(
+        sampled = map_coordinates(values, [row - 0.5, column - 0.5], order=1, cval=np.nan, output=np.float32)
+        height = np.where(np.isnan(height), sampled, height)
+    # Up coordinate of the surface at the camera's ellipsoidal height: curvature, with refraction included.
+    base = _polynomial_on_plan(
         frame, position_m, reach, lambda la, lo: enu_from_geodetic(frame, la, lo, level_m)[..., 2:], unit, level_m
     )
     return np.stack([*plan, base[0] + (height - level_m)], axis=-1)
 
 
-def _on_plan(
-    frame: LocalFrame, position_m: np.ndarray, reach_m: float, function, unit: list[np.ndarray], level_m: float
-) -> list:
-    """Values of a smooth function of latitude and longitude at plan positions, by a quartic in units of the reach.
+def _polynomial_on_plan(
+    frame: LocalFrame,
+    position_m: np.ndarray,
+    reach_m: float,
+    function: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    unit: list[np.ndarray],
+    level_m: float,
+) -> list[np.ndarray]:
+    """Channels of a smooth function of latitude and longitude at plan positions, as quartics in units of the reach.
 
-    A plan position means a place only with a height: that of the camera. (Where the ground is 1 km lower, 15 km away,
-    verticals lean apart by 2.4 m.)
+    A plan position defines a geodetic position only together with a height; the camera's height is used. (Where the
+    ground is 1 km lower, at 15 km, the verticals differ by 2.4 m.)
     """
     side = np.linspace(-1.0, 1.0, 9)
     grid = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
     ground = np.column_stack([position_m[:2] + reach_m * grid, np.zeros(len(grid))])
-    # Points of the plane itself are off the ellipsoid by the curvature; bring them to the level first.
+    # Points of the horizontal plane lie above the ellipsoid because of curvature; move them to the camera's height.
     for _ in range(3):
         _, _, height = geodetic_from_enu(frame, ground)
         ground[:, 2] -= height - level_m
     latitude, longitude, _ = geodetic_from_enu(frame, ground)
     values = function(latitude, longitude)
     terms = np.polynomial.polynomial.polyvander2d(grid[:, 0], grid[:, 1], [4, 4])
-    # Total degree four at most.
+    # Terms of total degree four at most.
     low = (np.arange(5)[:, None] + np.arange(5) <= 4).ravel()
     results = []
     for channel in range(values.shape[-1]):
@@ -128,7 +167,7 @@ def _on_plan(
     return results
 
 
-def _horner(coefficients: np.ndarray, x: np.ndarray):
+def _horner(coefficients: np.ndarray, x: np.ndarray) -> np.ndarray:
     total = coefficients[-1]
     for value in coefficients[-2::-1]:
         total = total * x + value
@@ -138,7 +177,7 @@ def _horner(coefficients: np.ndarray, x: np.ndarray):
 def horizon_from(
     rasters: Sequence[Raster],
     frame: LocalFrame,
-    position_m,
+    position_m: ArrayLike,
     *,
     azimuth_deg: np.ndarray | None = None,
     nearest_m: float = 30.0,
@@ -146,87 +185,97 @@ def horizon_from(
     least_gap: float = 0.15,
     below_ground_m: float = 5.0,
 ) -> Horizon:
-    """Compute the horizon of a place.
+    """Compute the terrain horizon of a viewpoint.
 
     Parameters
     ----------
     rasters
-        Elevations, the most detailed first; where one ends the next goes on.
+        Elevation rasters in order of precedence, the most detailed first.
+    frame
+        Local frame.
     position_m
-        Where the camera is, in the local frame [m].
+        Viewpoint ``(3,)`` in the frame [m].
     azimuth_deg
-        ``(A,)`` increasing [deg]; all round every 0.1° when left out.
+        Increasing azimuths ``(A,)`` [deg]; the full circle in steps of 0.1° if omitted.
     nearest_m
-        Terrain nearer than this is left out: a mast's own hill would hide everything.
+        Terrain nearer than this distance is ignored, because the ground next to a mast would occlude everything [m].
     reach_m
-        How far to look.
+        Maximum distance [m].
     least_gap
-        Ridges with less distance behind them, as a share of their own, are no edges.
+        Minimum `Horizon.edge_gap` of a ridge edge.
     below_ground_m
-        How far under the terrain the camera may be: what the heights are uncertain by.
+        Tolerated depth of the viewpoint below the terrain, for the uncertainty of the heights [m].
+
+    Returns
+    -------
+    Horizon
+        Skyline and ridge edges.
 
     Raises
     ------
-    ValueError
-        Where no ray meets terrain, or the camera is too far under it.
+    NoTerrainInView
+        If no ray meets terrain, or the viewpoint lies too far below the ground.
     """
     position = np.asarray(position_m, float)
     latitude, longitude, height = (float(v) for v in geodetic_from_enu(frame, position))
     axes = local_axes(frame, latitude, longitude)
-    under = float(terrain_height(rasters, [latitude], [longitude])[0]) - height
-    if under > below_ground_m:
-        raise ValueError(f"the camera is {under:.0f} m below ground; check its height and vertical datum")
+    depth = float(terrain_height(rasters, [latitude], [longitude])[0]) - height
+    if depth > below_ground_m:
+        raise NoTerrainInView(f"the camera is {depth:.0f} m below ground; check its height and vertical datum")
     cell = _cell_m(rasters[0])
     distance = _distances(nearest_m, reach_m, 0.7 * cell)
     azimuth_deg = np.arange(3600) * 0.1 if azimuth_deg is None else np.asarray(azimuth_deg, float)
     skyline, elevation, edges, gaps = [], [], [], []
-    # In slices, so that memory stays below some hundred megabytes.
+    # Blocks of azimuths bound the memory to some hundred megabytes.
     for part in np.array_split(azimuth_deg, max(1, len(azimuth_deg) * len(distance) // 1_000_000)):
         points = terrain_profile(rasters, frame, position, part, distance)
         local = (points - position) @ axes.T
         slope = local[..., 2] / np.hypot(local[..., 0], local[..., 1])
-        top, found, ridge, gap = _visible_ridges(slope, distance, least_gap)
+        top, has_skyline, ridge, gap = _visible_ridges(slope, distance, least_gap)
         rows = np.arange(len(part))
-        skyline.append(np.where(found[:, None], points[rows, top], np.nan))
-        elevation.append(np.where(found, np.degrees(np.arctan(slope[rows, top])), np.nan))
+        skyline.append(np.where(has_skyline[:, None], points[rows, top], np.nan))
+        elevation.append(np.where(has_skyline, np.degrees(np.arctan(slope[rows, top])), np.nan))
         edges.append(points[ridge])
         gaps.append(gap)
     elevation = np.concatenate(elevation)
     if not np.isfinite(elevation).any():
-        raise ValueError("no terrain within reach of the camera")
+        raise NoTerrainInView("no terrain within reach of the camera")
     return Horizon(
         position, axes, azimuth_deg, np.concatenate(skyline), elevation, np.concatenate(edges), np.concatenate(gaps)
     )
 
 
 def _cell_m(raster: Raster) -> float:
+    """Cell size [m]; rasters in degrees are recognised by their small cells."""
     size = float(np.sqrt(abs(raster.transform.determinant)))
     return size * 111_195.0 if abs(raster.transform.a) < 0.1 else size
 
 
 def _distances(nearest_m: float, reach_m: float, step_m: float) -> np.ndarray:
-    """Even steps first, then growing by 0.3 % of the distance: half a pixel of most cameras."""
+    """Distances [m] with a constant step at first, then a step of 0.3 % of the distance (half a pixel, typically)."""
     distance = [nearest_m]
     while distance[-1] < reach_m:
         distance.append(distance[-1] + max(step_m, 0.003 * distance[-1]))
     return np.array(distance)
 
 
-def _visible_ridges(slope: np.ndarray, distance: np.ndarray, least_gap: float):
-    """Index of the horizon, whether there is one, mask of ridge points and the gap behind each of those."""
+def _visible_ridges(
+    slope: np.ndarray, distance: np.ndarray, least_gap: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Skyline index ``(A,)``, whether there is a skyline ``(A,)``, mask of ridge edges ``(A, R)``, their gaps ``(E,)``."""
     filled = np.where(np.isfinite(slope), slope, -np.inf)
     highest = np.maximum.accumulate(filled, axis=1)
     visible = (filled >= highest) & np.isfinite(slope)
     top = np.argmax(filled, axis=1)
-    # Where the terrain ends still rising, the true horizon lies beyond it.
+    # If the slope still increases at the edge of the terrain, the true skyline lies beyond it.
     last = slope.shape[1] - 1 - np.argmax(np.isfinite(slope)[:, ::-1], axis=1)
-    found = np.isfinite(filled[np.arange(len(top)), top]) & (top < last)
-    # Next visible sample after each: scan backwards.
+    has_skyline = np.isfinite(filled[np.arange(len(top)), top]) & (top < last)
+    # Next visible sample after each sample, by a backward scan.
     index = np.where(visible, np.arange(slope.shape[1]), slope.shape[1])
     following = np.minimum.accumulate(index[:, ::-1], axis=1)[:, ::-1]
     after = np.concatenate([following[:, 1:], np.full((len(slope), 1), slope.shape[1])], axis=1)
     behind = distance[np.minimum(after, slope.shape[1] - 1)]
     gap = np.where(after < slope.shape[1], behind / distance - 1.0, 0.0)
-    # Something must be hidden in between; steps alone are no gap.
+    # At least one occluded sample must lie in between; a large sampling step alone is no gap.
     ridge = visible & (gap > least_gap) & (after > np.arange(slope.shape[1]) + 1)
-    return top, found, ridge, gap[ridge]
+    return top, has_skyline, ridge, gap[ridge]
