@@ -199,7 +199,7 @@ def test_relief_refuses_what_has_holes_or_too_many_faces(monkeypatch):
         unwrap(torn, kind="relief")
     monkeypatch.setattr(relief, "MAX_FACES", 49)
     with pytest.raises(
-        InputError, match=r"too many faces to solve for: 50; expected at most 49; take the adaptive mesher"
+        InputError, match=r"too many faces to solve for: 50; expected at most 49; use the adaptive mesher"
     ):
         unwrap(terrain, kind="relief")
 

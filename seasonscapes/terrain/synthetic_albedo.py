@@ -1,4 +1,4 @@
-"""The colour of the synthetic massif on any day of the year: reflectances known to the last digit.
+"""Diffuse albedo and snow cover of the synthetic massif as functions of the day of the year.
 
 Reflectances are linear Rec.709, rounded from published spectra: rock, soil and vegetation from the ECOSTRESS library
 (Meerdink et al. 2019, doi:10.1016/j.rse.2019.05.015), snow and ice from Warren 2019 (doi:10.1098/rsta.2018.0161)
@@ -7,21 +7,26 @@ and Cuffey & Paterson 2010 (table 5.2), larch and pasture in autumn from the sam
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 
 from seasonscapes.terrain.noise import fractal_noise, spline_noise
 from seasonscapes.terrain.synthetic_cover import FOREST, Cover
 from seasonscapes.terrain.synthetic_layout import LEDGES_M, strata_level_m
+from seasonscapes.terrain.synthetic_massif import SyntheticMassif
 
 SEASONS = {"winter": 32, "spring": 135, "summer": 205, "autumn": 288}
 _YEAR = 365.25
 
-# Mean height [m] above which level ground is white, by day of year.
+# Mean height [m] of the snow line on level ground, by day of year.
 _SNOW_LINE = ((1, 780), (32, 640), (60, 760), (91, 1250), (121, 1750), (152, 2250), (182, 2750), (213, 3050),
               (236, 3100), (258, 2950), (288, 2550), (319, 1650), (345, 1000))  # fmt: skip
-# Reflectance of what changes colour, by day of year at 1,500 m.
-_TURNING = {
+# Reflectance of classes with an annual cycle, by day of year at 1,500 m.
+_SEASONAL_ALBEDO = {
     Cover.MEADOW: (
         (60, (0.150, 0.120, 0.060)),
         (110, (0.120, 0.115, 0.045)),
@@ -67,7 +72,7 @@ _TURNING = {
         (325, (0.090, 0.070, 0.045)),
     ),
 }
-_STEADY = {
+_CONSTANT_ALBEDO = {
     Cover.WATER: (0.014, 0.034, 0.038),
     Cover.CONIFER: (0.022, 0.036, 0.017),
     Cover.SCREE: (0.240, 0.231, 0.214),
@@ -75,142 +80,180 @@ _STEADY = {
     Cover.ICE: (0.400, 0.470, 0.520),
     Cover.FIRN: (0.660, 0.690, 0.720),
 }
-# Share of full snow cover that stays in view from above: crowns shed and hide it.
-_SNOW_IN_VIEW = {Cover.CONIFER: 0.24, Cover.LARCH: 0.45, Cover.BROADLEAF: 0.55, Cover.SHRUB: 0.85, Cover.WATER: 0.0}
+# Fraction of the snow cover that is visible from above; tree crowns shed and cover snow.
+_VISIBLE_SNOW = {Cover.CONIFER: 0.24, Cover.LARCH: 0.45, Cover.BROADLEAF: 0.55, Cover.SHRUB: 0.85, Cover.WATER: 0.0}
 _STRIP_ROWS = 160
 
 
 def snow_line_m(day_of_year: float) -> float:
-    """Mean height [m] of the snow line on level ground, continuous and periodic over the year."""
+    """Compute the mean height of the snow line on level ground, continuous and periodic in the year.
+
+    Parameters
+    ----------
+    day_of_year
+        1 = 1 January; fractions and values outside the year are allowed.
+
+    Returns
+    -------
+    float
+        Height [m].
+    """
     return float(_periodic(day_of_year, [(d, (h,)) for d, h in _SNOW_LINE])[..., 0])
 
 
-def _periodic(day, knots) -> np.ndarray:
-    """Monotone cubic interpolation (PCHIP) over the year: ``day (...)`` → ``(..., C)`` float32."""
+def _periodic(day: ArrayLike, knots: Sequence[tuple[int, tuple[float, ...]]]) -> np.ndarray:
+    """Periodic monotone cubic interpolation (PCHIP) over the year: ``day`` ``(...)`` → ``(..., C)`` float32."""
     from scipy.interpolate import PchipInterpolator
 
     days = np.array([d for d, _ in knots], float)
     values = np.array([v for _, v in knots], float)
     days = np.concatenate([days[-3:] - _YEAR, days, days[:3] + _YEAR])
     values = np.concatenate([values[-3:], values, values[:3]])
-    # A table of quarter days is exact enough for a colour and many times faster than splines per pixel.
+    # Linear interpolation in a table of quarter days is accurate enough and much faster than splines per pixel.
     table_days = np.arange(-0.25, _YEAR + 0.5, 0.25)
     table = PchipInterpolator(days, values)(table_days)
     day = np.mod(np.asarray(day, float), _YEAR)
     return np.stack([np.interp(day, table_days, column) for column in table.T], -1).astype(np.float32)
 
 
-def _smoothstep(low, high, x):
+def _smoothstep(low: float, high: float, x: np.ndarray) -> np.ndarray:
     t = np.clip((x - low) / (high - low), 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 
 
-def _block(field: np.ndarray, rows: slice, upsample: int, interpolation=cv2.INTER_CUBIC) -> np.ndarray:
-    """Rows of the upsampled field; pixel corners stay where they are."""
+def _upsampled(field: np.ndarray, rows: slice, upsample: int, interpolation: int = cv2.INTER_CUBIC) -> np.ndarray:
+    """Rows of a map upsampled by an integer factor, with unchanged outer edges."""
     if upsample == 1:
         return field[rows].astype(np.float32)
     low, high = max(rows.start - 4, 0), min(rows.stop + 4, field.shape[0])
     size = (field.shape[1] * upsample, (high - low) * upsample)
-    big = cv2.resize(field[low:high].astype(np.float32), size, interpolation=interpolation)
-    return big[(rows.start - low) * upsample : (rows.stop - low) * upsample]
+    resized = cv2.resize(field[low:high].astype(np.float32), size, interpolation=interpolation)
+    return resized[(rows.start - low) * upsample : (rows.stop - low) * upsample]
 
 
-def _positions(place, rows: slice, upsample: int) -> tuple[np.ndarray, np.ndarray]:
-    """East of the columns and north of the rows [m] about the place's centre."""
-    height, width = place.cover.shape
-    step = place.spacing_m / upsample
+def _axes(massif: SyntheticMassif, rows: slice, upsample: int) -> tuple[np.ndarray, np.ndarray]:
+    """East of the columns ``(w,)`` and north of the rows ``(h,)`` [m] about the massif's centre."""
+    height, width = massif.cover.shape
+    step = massif.spacing_m / upsample
     column = np.arange(width * upsample) + 0.5
     row = np.arange(rows.start * upsample, rows.stop * upsample) + 0.5
-    return column * step - 0.5 * width * place.spacing_m, 0.5 * height * place.spacing_m - row * step
+    return column * step - 0.5 * width * massif.spacing_m, 0.5 * height * massif.spacing_m - row * step
 
 
-def _snow(place, day: float, rows: slice, upsample: int) -> np.ndarray:
-    """Share of the ground under seasonal snow, ``(h, w)`` float32 in [0, 1]."""
-    east, north = _positions(place, rows, upsample)
-    z = _block(place.elevation.values[..., 0], rows, upsample)
-    slope, shade = (_block(f, rows, upsample, cv2.INTER_LINEAR) for f in (place.slope_deg, place.northness))
-    patches = fractal_noise(place.seed + 301, 420.0, east, north, octaves=7, gain=0.7)
-    hollow = _block(place.concavity_m, rows, upsample, cv2.INTER_LINEAR)
-    # Sun decides between slopes most when it is strong and low: least in midwinter, when all that falls stays.
+def _snow(massif: SyntheticMassif, day: float, rows: slice, upsample: int) -> np.ndarray:
+    """Fraction of the ground under seasonal snow, ``(h, w)`` float32 in [0, 1]."""
+    east, north = _axes(massif, rows, upsample)
+    z = _upsampled(massif.elevation.values[..., 0], rows, upsample)
+    slope, northness = (_upsampled(f, rows, upsample, cv2.INTER_LINEAR) for f in (massif.slope_deg, massif.northness))
+    patches = fractal_noise(massif.seed + 301, 420.0, east, north, octaves=7, gain=0.7)
+    concavity = _upsampled(massif.concavity_m, rows, upsample, cv2.INTER_LINEAR)
+    # The dependence of the snow line on aspect is largest in early summer and smallest in early winter.
     contrast = 330.0 + 130.0 * np.sin(2.0 * np.pi * (day - 60.0) / _YEAR)
-    line = snow_line_m(day) - contrast * shade - 10.0 * np.clip(hollow, -12.0, 12.0) + 95.0 * patches
-    lies = _smoothstep(-90.0, 130.0, z - line)
-    # Walls steeper than about 55° shed it; ledges below the pixel keep some.
-    level = strata_level_m(z, east, north, place.seed)
+    line = snow_line_m(day) - contrast * northness - 10.0 * np.clip(concavity, -12.0, 12.0) + 95.0 * patches
+    accumulated = _smoothstep(-90.0, 130.0, z - line)
+    # Slopes above about 55° shed snow, except on ledges; unresolved ledges retain 6 %.
+    level = strata_level_m(z, east, north, massif.seed)
     ledge = np.cos(level * (2.0 * np.pi / LEDGES_M[1]))
-    holds = 1.0 - _smoothstep(
+    retained = 1.0 - _smoothstep(
         44.0,
         60.0,
-        slope - 5.0 * patches - (1.2 + 2.2 * fractal_noise(place.seed + 311, 700.0, east, north, octaves=3)) * ledge,
+        slope - 5.0 * patches - (1.2 + 2.2 * fractal_noise(massif.seed + 311, 700.0, east, north, octaves=3)) * ledge,
     )
-    return lies * (0.06 + 0.94 * holds)
+    return accumulated * (0.06 + 0.94 * retained)
 
 
-def snow_fraction(place, day_of_year: float) -> np.ndarray:
-    """Share of each cell under seasonal snow, ``(H, W)`` float32 in [0, 1]; permanent firn and ice not counted."""
-    height = place.cover.shape[0]
-    return np.concatenate([_snow(place, day_of_year, rows, 1) for rows in _strips(height)])
+def snow_fraction(massif: SyntheticMassif, day_of_year: float) -> np.ndarray:
+    """Compute the seasonal snow cover on a day; permanent firn and ice are not included.
+
+    Parameters
+    ----------
+    massif
+        The massif.
+    day_of_year
+        1 = 1 January; fractions and values outside the year are allowed.
+
+    Returns
+    -------
+    numpy.ndarray
+        Fraction of each cell under snow, ``(H, W)`` float32 in [0, 1].
+    """
+    height = massif.cover.shape[0]
+    return np.concatenate([_snow(massif, day_of_year, rows, 1) for rows in _strips(height)])
 
 
 def _strips(height: int) -> list[slice]:
     return [slice(start, min(start + _STRIP_ROWS, height)) for start in range(0, height, _STRIP_ROWS)]
 
 
-def _classes(place, rows: slice, upsample: int, grain: np.ndarray) -> np.ndarray:
-    """Cover at the finer scale: borders between classes are roughened by noise instead of being stairs."""
+def _upsampled_cover(massif: SyntheticMassif, rows: slice, upsample: int, grain: np.ndarray) -> np.ndarray:
+    """Cover classes at the finer resolution, with class borders perturbed by noise."""
     if upsample == 1:
-        return place.cover[rows]
-    # On the lake's cells the land reaches on beneath, so that the shore alone decides.
-    cover = np.where(place.shore_m < 0.0, np.uint8(Cover.MEADOW), place.cover)
-    shore = _block(place.shore_m, rows, upsample, cv2.INTER_LINEAR)
+        return massif.cover[rows]
+    # Lake cells are replaced by meadow here: the lake's outline follows from the shore distance below.
+    cover = np.where(massif.shore_m < 0.0, np.uint8(Cover.MEADOW), massif.cover)
+    shore = _upsampled(massif.shore_m, rows, upsample, cv2.INTER_LINEAR)
     best, chosen = np.full(grain.shape, -np.inf, np.float32), np.zeros(grain.shape, np.uint8)
     for k, kind in enumerate(Cover):
         if not (cover[rows] == kind).any():
             continue
-        share = _block((cover == kind).astype(np.float32), rows, upsample, cv2.INTER_LINEAR)
-        jog = np.roll(grain, 37 * k, axis=1) if kind != Cover.WATER else 0.0
-        score = np.where(share > 0.02, share + 0.16 * jog, -1.0).astype(np.float32)
+        fraction = _upsampled((cover == kind).astype(np.float32), rows, upsample, cv2.INTER_LINEAR)
+        perturbation = np.roll(grain, 37 * k, axis=1) if kind != Cover.WATER else 0.0
+        score = np.where(fraction > 0.02, fraction + 0.16 * perturbation, -1.0).astype(np.float32)
         better = score > best
         best, chosen = np.where(better, score, best), np.where(better, np.uint8(kind), chosen)
-    # The lake's shore is known better than the cells.
+    # The shore distance resolves the lake's outline below the cell size.
     return np.where(shore < 0.0, np.uint8(Cover.WATER), chosen)
 
 
-def _ground(place, day: float, rows: slice, upsample: int) -> tuple[np.ndarray, np.ndarray]:
-    """Reflectance ``(h, w, 3)`` without seasonal snow, and the classes ``(h, w)``."""
-    east, north = _positions(place, rows, upsample)
-    seed = place.seed
+@dataclass(frozen=True)
+class _Strip:
+    """Fields on a strip of rows: cover class, height [m], short- and long-wave noise, each ``(h, w)``; its axes [m]."""
+
+    cover: np.ndarray
+    height_m: np.ndarray
+    grain: np.ndarray
+    broad: np.ndarray
+    east_m: np.ndarray
+    north_m: np.ndarray
+
+
+def _ground(massif: SyntheticMassif, day: float, rows: slice, upsample: int) -> tuple[np.ndarray, np.ndarray]:
+    """Albedo ``(h, w, 3)`` without seasonal snow, and cover classes ``(h, w)``."""
+    east, north = _axes(massif, rows, upsample)
+    seed = massif.seed
     grain = fractal_noise(seed + 401, 60.0, east, north, octaves=3 + upsample.bit_length(), gain=0.8)
     broad = fractal_noise(seed + 411, 900.0, east, north, octaves=5, gain=0.6)
-    z = _block(place.elevation.values[..., 0], rows, upsample)
-    cover = _classes(place, rows, upsample, grain)
+    z = _upsampled(massif.elevation.values[..., 0], rows, upsample)
+    cover = _upsampled_cover(massif, rows, upsample, grain)
     albedo = np.empty((*cover.shape, 3), np.float32)
-    # Spring climbs and autumn descends by about 3 days in 100 m (Hopkins 1918).
-    late = np.clip((z - 1500.0) * 0.030, -25.0, 30.0) + 4.0 * broad
-    spring = 0.5 + 0.5 * np.cos(2.0 * np.pi * (day - 120.0) / _YEAR)
-    local_day = day + late * (1.0 - 2.0 * spring)
+    # Spring is later and autumn earlier by about 3 days per 100 m of height (Hopkins 1918).
+    delay_days = np.clip((z - 1500.0) * 0.030, -25.0, 30.0) + 4.0 * broad
+    spring_weight = 0.5 + 0.5 * np.cos(2.0 * np.pi * (day - 120.0) / _YEAR)
+    local_day = day + delay_days * (1.0 - 2.0 * spring_weight)
     for kind in Cover:
-        here = cover == kind
-        if not here.any():
+        cells = cover == kind
+        if not cells.any():
             continue
-        albedo[here] = _periodic(local_day[here], _TURNING[kind]) if kind in _TURNING else np.float32(_STEADY[kind])
+        if kind in _SEASONAL_ALBEDO:
+            albedo[cells] = _periodic(local_day[cells], _SEASONAL_ALBEDO[kind])
+        else:
+            albedo[cells] = np.array(_CONSTANT_ALBEDO[kind], np.float32)
     ice = cover == Cover.ICE
     if ice.any():
-        debris = _block(place.debris, rows, upsample, cv2.INTER_LINEAR)
+        debris = _upsampled(massif.debris, rows, upsample, cv2.INTER_LINEAR)
         dirt = np.clip(debris + 0.30 * grain + 0.45 * broad - 0.65, 0.0, 0.75) + 0.30 * _smoothstep(2700.0, 1500.0, z)
         dirt = np.clip(dirt, 0.0, 0.92)[ice, None]
-        # Crevasses and ogives lie across the flow, along the contours.
+        # Crevasses and ogives are transverse to the flow, along contour lines.
         crevasse = np.sin(z * (2.0 * np.pi / 11.0) + 2.5 * grain + 3.0 * broad)[ice, None]
-        albedo[ice] = (albedo[ice] + dirt * (0.8 * np.float32(_STEADY[Cover.SCREE]) - albedo[ice])) * (
-            1.0 + 0.07 * crevasse
-        )
-    _texture(albedo, cover, z, grain, broad, (east, north), seed)
+        scree = np.array(_CONSTANT_ALBEDO[Cover.SCREE], np.float32)
+        albedo[ice] = (albedo[ice] + dirt * (0.8 * scree - albedo[ice])) * (1.0 + 0.07 * crevasse)
+    _add_texture(albedo, _Strip(cover, z, grain, broad, east, north), seed)
     return albedo, cover
 
 
-def _texture(albedo, cover, z, grain, broad, position, seed) -> None:
-    """Variation within a class, in place: crowns, tufts, strata, crevasses."""
-    east, north = position
+def _add_texture(albedo: np.ndarray, strip: _Strip, seed: int) -> None:
+    """Multiply an albedo ``(h, w, 3)`` by within-class variation (crowns, tufts, strata, field plots), in massif."""
+    cover, grain, broad = strip.cover, strip.grain, strip.broad
     contrast = {
         Cover.MEADOW: 0.16,
         Cover.CONIFER: 0.42,
@@ -227,7 +270,7 @@ def _texture(albedo, cover, z, grain, broad, position, seed) -> None:
     for kind, amount in contrast.items():
         gain[cover == kind] = amount
     factor = np.exp(gain * grain + np.where(np.isin(cover, (Cover.FIRN, Cover.ICE)), 0.02, 0.10) * broad)
-    level = strata_level_m(z, east, north, seed) + 8.0 * grain
+    level = strata_level_m(strip.height_m, strip.east_m, strip.north_m, seed) + 8.0 * grain
     bands = sum(np.sin(level * (2.0 * np.pi / period) + 0.8) for period in LEDGES_M)
     factor *= np.where(cover == Cover.ROCK, np.exp(0.13 * bands), 1.0)
     albedo *= factor[..., None]
@@ -235,23 +278,29 @@ def _texture(albedo, cover, z, grain, broad, position, seed) -> None:
     albedo *= np.exp(rusty * np.array([1.0, 0.0, -1.0], np.float32))
     field = cover == Cover.FIELD
     if field.any():
-        plots = np.sign(spline_noise(seed + 421, 260.0, east, north)) + np.sign(
-            spline_noise(seed + 422, 190.0, east, north)
+        plots = np.sign(spline_noise(seed + 421, 260.0, strip.east_m, strip.north_m)) + np.sign(
+            spline_noise(seed + 422, 190.0, strip.east_m, strip.north_m)
         )
         albedo[field] *= np.exp(0.16 * plots[field])[:, None]
 
 
-def alpine_albedo(place, day_of_year: float, *, upsample: int = 1) -> np.ndarray:
-    """Diffuse reflectance of the massif on a day, ``(H·upsample, W·upsample, 3)`` float32 linear Rec.709.
+def alpine_albedo(massif: SyntheticMassif, day_of_year: float, *, upsample: int = 1) -> np.ndarray:
+    """Compute the diffuse albedo of the massif on a day, including seasonal snow.
 
     Parameters
     ----------
-    place
-        The massif (`SyntheticMassif`).
+    massif
+        The massif.
     day_of_year
-        1 = 1 January; fractions and any number of years are allowed, the result is periodic in 365.25 days.
+        1 = 1 January; fractions and values outside the year are allowed. The result is periodic in 365.25 days.
     upsample
-        Texels per cell along each axis: finer detail of crowns, tufts and blocks. The corners of the map stay.
+        Texels per cell along each axis (1, 2, 4 or 8), which adds detail below the cell size. The map's outer edges are
+        unchanged.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(H·upsample, W·upsample, 3)`` float32 linear Rec.709 in [0.01, 0.93].
 
     Raises
     ------
@@ -260,24 +309,24 @@ def alpine_albedo(place, day_of_year: float, *, upsample: int = 1) -> np.ndarray
     """
     if upsample not in (1, 2, 4, 8):
         raise ValueError(f"upsample: got {upsample}, expected 1, 2, 4 or 8")
-    height, width = place.cover.shape
+    height, width = massif.cover.shape
     result = np.empty((height * upsample, width * upsample, 3), np.float32)
     for rows in _strips(height):
-        albedo, cover = _ground(place, day_of_year, rows, upsample)
-        snow = _snow(place, day_of_year, rows, upsample)
-        in_view = np.ones(cover.shape, np.float32)
-        for kind, share in _SNOW_IN_VIEW.items():
-            in_view[cover == kind] = share
-        east, north = _positions(place, rows, upsample)
-        age = 0.04 * fractal_noise(place.seed + 501, 200.0, east, north, octaves=3)
-        white = _snow_colour(day_of_year) + age[..., None] * 0.35
-        weight = (snow * in_view)[..., None]
-        result[rows.start * upsample : rows.stop * upsample] = albedo + weight * (white - albedo)
+        albedo, cover = _ground(massif, day_of_year, rows, upsample)
+        snow = _snow(massif, day_of_year, rows, upsample)
+        visible = np.ones(cover.shape, np.float32)
+        for kind, fraction in _VISIBLE_SNOW.items():
+            visible[cover == kind] = fraction
+        east, north = _axes(massif, rows, upsample)
+        ageing = 0.04 * fractal_noise(massif.seed + 501, 200.0, east, north, octaves=3)
+        snow_albedo = _snow_albedo(day_of_year) + ageing[..., None] * 0.35
+        weight = (snow * visible)[..., None]
+        result[rows.start * upsample : rows.stop * upsample] = albedo + weight * (snow_albedo - albedo)
     return np.clip(result, 0.01, 0.93, out=result)
 
 
-def _snow_colour(day: float) -> np.ndarray:
-    """Fresh in midwinter, coarse and dusty by July."""
+def _snow_albedo(day: float) -> np.ndarray:
+    """Albedo ``(3,)`` of seasonal snow: fresh snow in midwinter, coarse-grained snow with dust in July."""
     return _periodic(
         day,
         [

@@ -1,43 +1,72 @@
-"""Glaciers of the synthetic massif: a thin sheet of ice that snow feeds and warmth consumes."""
+"""Glaciers of the synthetic massif: shallow-ice approximation with an elevation-dependent mass balance."""
 
 from __future__ import annotations
 
 import numpy as np
 
-# Glen's law for temperate ice in the shallow-ice form, 2 A (ρ g)³ / 5 with A = 2.4e-24 Pa⁻³ s⁻¹, ρ = 910 kg m⁻³,
+# Glen's flow law for temperate ice in the shallow-ice approximation, 2 A (ρ g)³ / 5 with A = 2.4e-24 Pa⁻³ s⁻¹, ρ = 910 kg m⁻³,
 # per year (Cuffey & Paterson, The Physics of Glaciers, 4th ed., 2010, tables 3.4 and 8.1); doubled for sliding.
 _FLUIDITY = 2.0 * 2.15e-5
 
 
 def mass_balance_m(surface: np.ndarray, equilibrium_m: np.ndarray | float) -> np.ndarray:
-    """Ice won or lost in a year [m]: 0.85 m per 100 m of height, less than 1.6 m of gain, and no ice far down.
+    """Compute the annual surface mass balance as a function of height above the equilibrium line.
 
-    The gradient is that of Alpine glaciers (Huss & Bauder 2009, doi:10.3189/172756409787769645).
+    The gradient of 0.85 m per 100 m is that of Alpine glaciers (Huss & Bauder 2009, doi:10.3189/172756409787769645).
+    Accumulation is limited to 1.6 m; ablation increases more steeply 1000 m below the equilibrium line.
+
+    Parameters
+    ----------
+    surface
+        Surface heights ``(H, W)`` [m].
+    equilibrium_m
+        Height of the equilibrium line, ``(H, W)`` or a scalar [m].
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(H, W)`` ice gained (positive) or lost per year [m].
     """
     above = surface - equilibrium_m
     return np.minimum(0.0085 * above * (1.0 + np.maximum(-above - 1000.0, 0.0) / 500.0), 1.6)
 
 
 def grow_ice(bed: np.ndarray, spacing_m: float, equilibrium_m: np.ndarray, *, rounds: int) -> np.ndarray:
-    """Ice thickness ``(H, W)`` [m] near its steady state on a bed ``(H, W)`` [m].
+    """Compute the near-steady-state ice thickness on a bed in the shallow-ice approximation.
 
-    Shallow-ice diffusion with a step of its own for every cell: the way there is no history, the end state is the
-    balance of flow and mass balance (Huybrechts et al. 1996, EISMINT, doi:10.3189/S0260305500013197). Faces steeper
-    than about 45° shed their snow.
+    Explicit diffusion with local time steps: intermediate states are not physical, the steady state balances ice flux
+    and mass balance (Huybrechts et al. 1996, EISMINT, doi:10.3189/S0260305500013197). Accumulation vanishes on slopes
+    above about 45°.
+
+    Parameters
+    ----------
+    bed
+        Bed heights ``(H, W)`` [m].
+    spacing_m
+        Cell size [m].
+    equilibrium_m
+        Height of the equilibrium line ``(H, W)`` [m].
+    rounds
+        Number of iterations.
+
+    Returns
+    -------
+    numpy.ndarray
+        Ice thickness ``(H, W)`` float32 [m]; zero at the border.
     """
     bed = np.asarray(bed, np.float32)
     thickness = np.zeros_like(bed)
-    holds = np.clip((1.1 - np.hypot(*np.gradient(bed, spacing_m))) / 0.45, 0.0, 1.0)
+    accumulation_factor = np.clip((1.1 - np.hypot(*np.gradient(bed, spacing_m))) / 0.45, 0.0, 1.0)
     for _ in range(rounds):
         surface = bed + thickness
         balance = mass_balance_m(surface, equilibrium_m)
-        balance = np.where(balance > 0.0, balance * holds, balance)
+        balance = np.where(balance > 0.0, balance * accumulation_factor, balance)
         down = (surface[1:] - surface[:-1]) / spacing_m
         right = (surface[:, 1:] - surface[:, :-1]) / spacing_m
-        # Mahaffy's scheme (1976, doi:10.1029/JC081i006p01059): diffusivity on the corners, flux on the faces.
+        # Mahaffy's scheme (1976, doi:10.1029/JC081i006p01059): diffusivity at cell corners, flux at cell faces.
         ice = 0.25 * (thickness[1:, 1:] + thickness[1:, :-1] + thickness[:-1, 1:] + thickness[:-1, :-1])
-        steep = (0.5 * (down[:, 1:] + down[:, :-1])) ** 2 + (0.5 * (right[1:] + right[:-1])) ** 2
-        diffusivity = np.pad(np.float32(_FLUIDITY) * ice**5 * np.minimum(steep, 0.3), 1)
+        squared_slope = (0.5 * (down[:, 1:] + down[:, :-1])) ** 2 + (0.5 * (right[1:] + right[:-1])) ** 2
+        diffusivity = np.pad(np.float32(_FLUIDITY) * ice**5 * np.minimum(squared_slope, 0.3), 1)
         across_rows = 0.5 * (diffusivity[1:-1, 1:] + diffusivity[1:-1, :-1])
         across_columns = 0.5 * (diffusivity[1:, 1:-1] + diffusivity[:-1, 1:-1])
         flux_down, flux_right = (

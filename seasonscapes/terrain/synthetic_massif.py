@@ -1,0 +1,90 @@
+"""Data type of the synthetic massif: elevation, ground cover and the terrain attributes that its albedo depends on."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+
+import numpy as np
+
+from seasonscapes.images import atomic_path
+from seasonscapes.terrain.surface import Raster
+
+_MAPS = ("cover", "slope_deg", "northness", "concavity_m", "debris", "shore_m")
+
+
+@dataclass(frozen=True)
+class SyntheticMassif:
+    """A procedurally generated massif; maps are ``(H, W)`` with row 0 in the north.
+
+    Parameters
+    ----------
+    elevation
+        Surface heights ``(H, W, 1)`` float32 [m] on the UTM grid; lake and ice surfaces included.
+    cover
+        `Cover` classes, uint8.
+    slope_deg, northness
+        Slope [deg] and northward component of the unit normal, float32.
+    concavity_m
+        Gaussian-weighted mean height of the surroundings minus the cell's height [m], float32; positive in hollows.
+    debris
+        Fraction of glacier surface covered by debris, float32 in [0, 1].
+    shore_m
+        Signed distance to the lake's shore, negative on the lake [m], float32; resolves the shore below the cell size.
+    seed, spacing_m
+        Seed and cell size [m] of the generator.
+    """
+
+    elevation: Raster
+    cover: np.ndarray
+    slope_deg: np.ndarray
+    northness: np.ndarray
+    concavity_m: np.ndarray
+    debris: np.ndarray
+    shore_m: np.ndarray
+    seed: int
+    spacing_m: float
+
+
+def save_massif(massif: SyntheticMassif, path: str | os.PathLike[str]) -> None:
+    """Write a massif to one ``.npz`` file, atomically.
+
+    Parameters
+    ----------
+    massif
+        The massif.
+    path
+        File to write.
+    """
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        maps = {name: getattr(massif, name) for name in _MAPS}
+        np.savez_compressed(
+            file,
+            elevation=massif.elevation.values,
+            transform=np.array(massif.elevation.transform)[:6],
+            crs=massif.elevation.crs,
+            seed=massif.seed,
+            spacing_m=massif.spacing_m,
+            **maps,
+        )
+
+
+def load_massif(path: str | os.PathLike[str]) -> SyntheticMassif:
+    """Read a massif from a file of `save_massif`.
+
+    Parameters
+    ----------
+    path
+        File to read.
+
+    Returns
+    -------
+    SyntheticMassif
+        The massif, equal to the one that was saved.
+    """
+    from affine import Affine
+
+    with np.load(path) as stored:
+        raster = Raster(stored["elevation"], Affine(*stored["transform"]), str(stored["crs"]))
+        maps = {name: stored[name] for name in _MAPS}
+        return SyntheticMassif(raster, **maps, seed=int(stored["seed"]), spacing_m=float(stored["spacing_m"]))
