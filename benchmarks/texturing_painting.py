@@ -328,7 +328,7 @@ def rejection(stage: Stage, *, seed: int, texels: int = 12_000) -> dict:
         expected = predict_in_folds(painting.texture, predictors.values, fit, seed=seed)
         number = {name: k for k, name in enumerate(first.webcams)}
         rejects = [
-            foreground_mask(r, number[r.item.observation.webcam], painting.radiometry, expected, uv)
+            foreground_mask(r, number[r.painting_input.observation.webcam], painting.radiometry, expected, uv)
             for r, uv in zip(ready, uvs, strict=True)
         ]
         painting = paint_atlas(inputs, terrain, stage.atlas, stage.terrain, rejects=rejects)

@@ -13,6 +13,7 @@ from test_rendering import heightfield
 
 from seasonscapes.cameras.observation import Observation
 from seasonscapes.cameras.pinhole import Camera, project, rotation_from_angles
+from seasonscapes.errors import NoUsablePixels
 from seasonscapes.evaluation.webcam_faults import (
     CLEAN,
     SEVERE,
@@ -365,12 +366,12 @@ def test_views_without_anything_to_say_are_left_out_and_told(land, cameras):
     painting = land.paint([good, away, dark, broken])
     assert painting.webcams == ("good",)
     assert sorted(painting.skipped) == [
-        "away: it sees none of the terrain",
-        "broken: its picture holds no finite value",
-        "masked: its mask leaves no pixel",
+        "away: no terrain in view",
+        "broken: its image has no finite pixel",
+        "masked: its mask excludes every pixel",
     ]
     assert same(painting, land.paint([good]))
-    with pytest.raises(ValueError, match="no picture has anything to paint: away: it sees none"):
+    with pytest.raises(NoUsablePixels, match="no photograph has usable pixels: away: no terrain in view"):
         land.paint([away])
 
 

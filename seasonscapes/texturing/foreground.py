@@ -1,7 +1,8 @@
-"""What stands before the land and no elevation model knows: houses and masts, found because the picture disagrees.
+"""Foreground masks: objects that the terrain model lacks (houses, masts), detected as coherent outliers of a prediction.
 
-A regression, told where each texel lies and how it is lit but not what was painted near it, says what the land should look
-like. Where a picture differs from that by more than the picture as a whole does, in a patch, something else is seen.
+A regression on terrain attributes and light, fitted to texels of other blocks, predicts the radiance of each texel.
+Pixels whose deviation from the prediction exceeds the robust scatter of the whole image, in coherent patches, show
+something other than terrain.
 """
 
 from __future__ import annotations
@@ -16,16 +17,24 @@ from seasonscapes.terrain.surface import Texture, sample_texture
 from seasonscapes.texturing.inputs import PreparedInput, air_to
 from seasonscapes.texturing.radiometric_fit import RadiometricFit, radiance_at_surface
 
-# Deviations that count, and the share of the 5 x 5 pixels around that must have them too.
+# A regression: called with predictors (n, G) and log radiance (n, 3), it returns a function from predictors to log
+# radiance.
+Fit = Callable[[np.ndarray, np.ndarray], Callable[[np.ndarray], np.ndarray]]
+# Threshold of the deviation [robust standard deviations], and the least fraction of outliers in the window around.
 _OUTLIER, _COHERENT = 3.2, 0.5
+# Side of that window [px].
 _PATCH = 5
-# Gaps of this share of the picture's width are closed; patches below this share of its area are chance.
-_CLOSED, _LEAST_AREA = 0.03, 5e-4
+# Width of the gaps that are closed as a fraction of the image width; least area of a patch as a fraction of the image.
+_CLOSED, _MIN_AREA = 0.03, 5e-4
+# Fewer comparable pixels give no mask.
+_MIN_PIXELS = 100
 _DEPTH_BINS = 8
+# Least number of training texels per fold, and texels that are predicted at once.
+_MIN_TRAINING, _CHUNK = 50, 1 << 18
 
 
 def foreground_mask(
-    ready: PreparedInput,
+    prepared: PreparedInput,
     number: int,
     radiometry: RadiometricFit,
     predicted: np.ndarray,
@@ -33,94 +42,107 @@ def foreground_mask(
     *,
     outlier: float = _OUTLIER,
 ) -> np.ndarray:
-    """Pixels ``(H, W)`` bool that show something else than the land.
+    """Return the pixels that show something other than terrain.
 
     Parameters
     ----------
-    ready, number
-        A shot and its index in ``radiometry``.
+    prepared
+        A painting input.
+    number
+        Its index in ``radiometry``.
+    radiometry
+        Gains, contrasts and haze.
     predicted
-        ``(R, S, 3)`` radiance [cd/m²] of the land that owes nothing to this picture's own pixels there (`predict_in_folds`);
-        NaN where unknown.
+        ``(R, S, 3)`` radiance [cd/m²] of the terrain, predicted without the texels of the same block
+        (`predict_in_folds`); NaN where unknown.
     uv
-        ``(H, W, 2)`` of the shot's G-buffer.
+        ``(H, W, 2)`` texture coordinates of the input's G-buffer.
     outlier
-        Robust standard deviations.
+        Threshold of the deviation [robust standard deviations].
+
+    Returns
+    -------
+    ndarray
+        ``(H, W)`` bool.
     """
-    apart, known = _disagreement(ready, number, radiometry, predicted, uv)
-    if np.count_nonzero(known) < 100:
+    log_ratio, known = _log_ratio(prepared, number, radiometry, predicted, uv)
+    if np.count_nonzero(known) < _MIN_PIXELS:
         return np.zeros(known.shape, bool)
     score = np.zeros(known.shape, np.float32)
-    score[known] = np.sqrt(np.mean(_standardised(apart[known], np.log(ready.depth_m[known])) ** 2, axis=1))
-    far_off = (score > outlier).astype(np.float32)
+    score[known] = np.sqrt(np.mean(_standardised(log_ratio[known], np.log(prepared.depth_m[known])) ** 2, axis=1))
+    outliers = (score > outlier).astype(np.float32)
     patch = (_PATCH, _PATCH)
-    share = cv2.blur(far_off, patch) / np.maximum(cv2.blur(known.astype(np.float32), patch), 1e-3)
-    return _solid((share > _COHERENT) & known)
+    fraction = cv2.blur(outliers, patch) / np.maximum(cv2.blur(known.astype(np.float32), patch), 1e-3)
+    return _clean_mask((fraction > _COHERENT) & known)
 
 
-def _solid(found: np.ndarray) -> np.ndarray:
-    """What was found, its windows closed and its specks dropped, and a pixel wider."""
-    side = 2 * round(0.5 * _CLOSED * found.shape[1]) + 1
-    closed = cv2.morphologyEx(found.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((side, side), np.uint8))
+def _clean_mask(mask: np.ndarray) -> np.ndarray:
+    """Close gaps, drop small patches and dilate by one pixel."""
+    side = 2 * round(0.5 * _CLOSED * mask.shape[1]) + 1
+    closed = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((side, side), np.uint8))
     _, label, statistics, _ = cv2.connectedComponentsWithStats(closed)
-    large = statistics[:, cv2.CC_STAT_AREA] >= _LEAST_AREA * found.size
+    large = statistics[:, cv2.CC_STAT_AREA] >= _MIN_AREA * mask.size
     large[0] = False
-    return cv2.dilate(large[label].astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+    return cv2.dilate(large[label.astype(np.intp)].astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
 
 
-def _disagreement(
-    ready: PreparedInput, number: int, radiometry: RadiometricFit, predicted: np.ndarray, uv: np.ndarray
+def _log_ratio(
+    prepared: PreparedInput, number: int, radiometry: RadiometricFit, predicted: np.ndarray, uv: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Logarithm of seen over predicted ``(H, W, 3)``, and where both are known."""
-    camera = ready.item.observation.camera
-    # Beside silhouettes a pixel shows two surfaces; the guard looks after those.
-    usable = (ready.levels[0][..., 3] > 0.0) & (ready.confidence > 0.0)
+    """Logarithm of observed over predicted radiance ``(H, W, 3)``, and where both are known ``(H, W)`` bool."""
+    camera = prepared.painting_input.camera
+    # Pixels at silhouettes mix two surfaces; their confidence is 0.
+    usable = (prepared.levels[0][..., 3] > 0.0) & (prepared.confidence > 0.0)
     expected = sample_texture(predicted, uv)
     with np.errstate(invalid="ignore"):
         known = usable & (expected > 0.0).all(axis=2)
-    apart = np.zeros((*usable.shape, 3), np.float32)
-    place = camera.position_m + ray_directions(camera)[known] * ready.depth_m[known][:, None]
-    share = cv2.blur(usable.astype(np.float32), (3, 3))
-    value = cv2.blur(ready.levels[0][..., :3] * usable[..., None], (3, 3))[known] / share[known][:, None]
-    seen, _ = radiance_at_surface(value, number, air_to(ready, place), radiometry)
-    apart[known] = np.log(np.maximum(seen, 1e-6)) - np.log(expected[known])
-    return apart, known
+    log_ratio = np.zeros((*usable.shape, 3), np.float32)
+    position = camera.position_m + ray_directions(camera)[known] * prepared.depth_m[known][:, None]
+    coverage = cv2.blur(usable.astype(np.float32), (3, 3))
+    value = cv2.blur(prepared.levels[0][..., :3] * usable[..., None], (3, 3))[known] / coverage[known][:, None]
+    observed, _ = radiance_at_surface(value, number, air_to(prepared, position), radiometry)
+    log_ratio[known] = np.log(np.maximum(observed, 1e-6)) - np.log(expected[known])
+    return log_ratio, known
 
 
-def _standardised(apart: np.ndarray, log_depth: np.ndarray) -> np.ndarray:
-    """Errors ``(N, 3)`` over their robust scatter, about their median, at like distances."""
+def _standardised(log_ratio: np.ndarray, log_depth: np.ndarray) -> np.ndarray:
+    """Deviations ``(N, 3)`` from the median in units of the robust scatter, per bin of distance."""
     edges = np.quantile(log_depth, np.linspace(0.0, 1.0, _DEPTH_BINS + 1)[1:-1])
-    group = np.searchsorted(edges, log_depth)
-    result = np.empty_like(apart)
-    overall = np.median(np.abs(apart - np.median(apart, axis=0)), axis=0)
-    for number in np.unique(group):
-        part = group == number
-        centred = apart[part] - np.median(apart[part], axis=0)
+    bin_index = np.searchsorted(edges, log_depth)
+    result = np.empty_like(log_ratio)
+    overall = np.median(np.abs(log_ratio - np.median(log_ratio, axis=0)), axis=0)
+    for number in np.unique(bin_index):
+        selected = bin_index == number
+        centred = log_ratio[selected] - np.median(log_ratio[selected], axis=0)
         scatter = np.maximum(np.median(np.abs(centred), axis=0), 0.5 * overall)
-        result[part] = centred / np.maximum(1.4826 * scatter, 1e-3)
+        result[selected] = centred / np.maximum(1.4826 * scatter, 1e-3)
     return result
 
 
 def predict_in_folds(
-    texture: Texture, predictors: np.ndarray, fit: Callable, *, folds: int = 4, samples: int = 20_000, seed: int = 0
+    texture: Texture, predictors: np.ndarray, fit: Fit, *, folds: int = 4, samples: int = 20_000, seed: int = 0
 ) -> np.ndarray:
-    """Radiance ``(R, S, 3)`` that a regression expects, each texel's from land elsewhere.
+    """Predict the radiance of every texel by regression, each fold from the texels of the other folds.
 
     Parameters
     ----------
     texture
-        Painted radiance; ``weight`` 0 where nothing was.
+        Painted radiance; ``weight`` is 0 where unpainted.
     predictors
         ``(R, S, G)``, NaN where unknown.
     fit
-        ``fit(guides (n, G), log radiance (n, 3))`` gives a function from guides to log radiance.
+        ``fit(predictors (n, G), log radiance (n, 3))`` returns a function from predictors to log radiance.
     folds
-        The land is cut into blocks, whose colours are predicted from those of other folds.
+        Number of spatial cross-validation folds; square blocks of texels are assigned to them at random.
+    samples
+        Training texels per fold.
+    seed
+        Of the assignment to folds and of the training texels.
 
     Returns
     -------
-    numpy.ndarray
-        NaN where no guide is known.
+    ndarray
+        ``(R, S, 3)`` float32; NaN where no predictor is known, or where fewer than 50 texels are left to train on.
     """
     height, width = texture.weight.shape
     row, column = np.divmod(np.arange(height * width), width)
@@ -129,17 +151,17 @@ def predict_in_folds(
     fold = np.random.default_rng(seed).permutation(int(block.max()) + 1)[block] % folds
     table = predictors.reshape(-1, predictors.shape[2])
     values = texture.values.reshape(-1, 3)
-    sound = np.isfinite(table).any(axis=1)
-    painted = (texture.weight.ravel() > 0.0) & sound & (values > 0.0).all(axis=1)
+    finite = np.isfinite(table).any(axis=1)
+    painted = (texture.weight.ravel() > 0.0) & finite & (values > 0.0).all(axis=1)
     expected = np.full((height * width, 3), np.nan, np.float32)
     for number in range(folds):
-        train = np.flatnonzero(painted & (fold != number))
-        if len(train) < 50:
+        training = np.flatnonzero(painted & (fold != number))
+        if len(training) < _MIN_TRAINING:
             continue
-        train = np.random.default_rng([seed, number]).permutation(train)[:samples]
-        model = fit(table[train], np.log(values[train]))
-        apply = np.flatnonzero(sound & (fold == number))
-        for start in range(0, len(apply), 1 << 18):
-            part = apply[start : start + (1 << 18)]
+        training = np.random.default_rng([seed, number]).permutation(training)[:samples]
+        model = fit(table[training], np.log(values[training]))
+        target = np.flatnonzero(finite & (fold == number))
+        for start in range(0, len(target), _CHUNK):
+            part = target[start : start + _CHUNK]
             expected[part] = np.exp(model(table[part]))
     return expected.reshape(height, width, 3)

@@ -1,4 +1,4 @@
-"""Photographs painted into the atlas: each texel from the cameras that see it, as radiance of the land [cd/m²]."""
+"""Projection of photographs into a texture atlas: per-texel radiance of the terrain [cd/m²], blended over cameras."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from seasonscapes.errors import NoUsablePixels
 from seasonscapes.images import atomic_path
 from seasonscapes.rendering.hemisphere_rays import RayScene
 from seasonscapes.terrain.atlas import Atlas
@@ -16,7 +17,8 @@ from seasonscapes.texturing.atlas_tiles import (
     TILE_PX,
     AtlasTile,
     AtlasTiling,
-    sees_tile,
+    TexelSurface,
+    is_tile_visible,
     tile_blocks,
     tile_surface,
     tiles_of,
@@ -37,30 +39,30 @@ from seasonscapes.texturing.visibility import by_ray, project_texels
 
 MODES = ("weighted", "first")
 Progress = Callable[[float], None]
-# A texel that all cameras trust less than this is left to completion.
-_LEAST_WEIGHT = 1e-4
+# A camera with a smaller weight does not paint a texel.
+_MIN_WEIGHT = 1e-4
 
 
 @dataclass(frozen=True)
 class Painting:
-    """What cameras paint into an atlas.
+    """A texture painted from photographs.
 
     Parameters
     ----------
     texture
-        Radiance ``(R, S, 3)`` [cd/m²] leaving the land, the air removed; relative where no sky gave a scale. ``weight``
-        is the greatest of the cameras' weights, 0 where none painted.
+        Radiance ``(R, S, 3)`` [cd/m²] at the surface, without the air; relative where no sky fixes the scale.
+        ``weight`` is the greatest of the cameras' weights, 0 where none painted.
     best
-        ``(R, S)`` int16 index of the camera with the greatest weight (of the one that painted, in mode ``first``), −1
-        where none did; it counts in the order of ``webcams``.
+        ``(R, S)`` int16 index into ``webcams`` of the camera with the greatest weight (in mode ``first``, of the camera
+        that painted the texel); −1 where none did.
     coverage
-        ``(R, S)`` uint8: how many cameras have a say.
+        ``(R, S)`` uint8 number of contributing cameras.
     webcams
-        Names of the shots that were used.
+        Names of the cameras used.
     radiometry
-        Their gains and haze, in that order.
+        Their gains, contrasts and common haze, in the same order.
     skipped
-        A line for each shot that has nothing to say, and why.
+        One line for each input that was not used: name and reason.
     """
 
     texture: Texture
@@ -73,23 +75,28 @@ class Painting:
 
 @dataclass(frozen=True)
 class PaintOptions:
-    """How to paint.
+    """Options of `paint_atlas`.
 
     Parameters
     ----------
     mode
-        ``weighted`` blends by sharpened weights; ``first`` lets the first camera in order that sees a texel have it, as
-        the paper does.
+        ``weighted`` blends cameras by sharpened weights; ``first`` takes the first camera in order that the texel is
+        visible from, as the paper does.
     fit_gains, fit_haze
-        Make cameras agree in exposure and white balance, and fit the haze before them.
+        Fit each camera's exposure and white balance, and the common haze.
     predicted_sigma
         As in `fit_radiometry`.
     guard
-        Keep away from silhouettes.
+        Reduce the confidence of pixels near silhouettes.
     near_m
-        Leave out pixels that show terrain nearer than this [m].
+        Exclude pixels that show terrain nearer than this [m].
     tile_px
-        Side of the tiles that are worked on one after the other.
+        Side of the tiles that are processed one after the other [texels].
+
+    Raises
+    ------
+    ValueError
+        Unknown mode.
     """
 
     mode: str = "weighted"
@@ -118,39 +125,56 @@ def paint_atlas(
     resume: Path | None = None,
     progress: Progress | None = None,
 ) -> Painting:
-    """Paint observations of one time into an atlas.
+    """Paint photographs of one time into an atlas.
 
     Parameters
     ----------
     inputs
-        In any order: in mode ``weighted`` it does not matter, in ``first`` it is the order of precedence.
+        Photographs. Their order is irrelevant in mode ``weighted`` and the order of precedence in mode ``first``.
+    terrain
+        The surface with its texture coordinates.
+    atlas
+        Size of the atlas.
     ray_scene
-        The same terrain for rays (`gather_hemisphere.occluder`).
+        Ray-tracing scene of the same terrain (`hemisphere_rays.ray_scene`).
+    options
+        Defaults to `PaintOptions()`.
     predicted
         As in `fit_radiometry`.
     rejects
-        For each shot a mask ``(H, W)`` bool of pixels to leave out, or ``None``; see `foreground.foreground_mask`.
+        For each input a mask ``(H, W)`` bool of pixels to exclude, or ``None``; see `foreground.foreground_mask`.
     radiance
         As in `fit_radiometry`.
     resume
-        A folder for finished tiles: a painting that was interrupted goes on from there. It belongs to these arguments
-        alone; the caller names it by them.
+        Folder for finished tiles, from which an interrupted call continues. It must be specific to these arguments;
+        the caller chooses its name.
     progress
-        Called with the share that is done.
+        Called with the finished fraction.
+
+    Returns
+    -------
+    Painting
+        Radiance, weights and the fitted radiometry.
 
     Raises
     ------
+    NoUsablePixels
+        No input, or none with a usable pixel of terrain; the message gives the reason for each.
     ValueError
-        No shot at all, or none that sees any of the terrain; the message says why for each.
+        ``rejects`` and ``inputs`` differ in number.
     """
-    options, tell = options or PaintOptions(), progress or (lambda share: None)
-    cut = tiling(terrain, atlas, tile_px=options.tile_px)
-    ready, skipped = prepare_inputs(inputs, ray_scene, cut, options, rejects=rejects, progress=lambda s: tell(0.2 * s))
-    if not ready:
-        raise ValueError("paint: no picture has anything to paint: " + "; ".join(skipped or ["no pictures"]))
+    options, report = options or PaintOptions(), progress or (lambda fraction: None)
+    atlas_tiling = tiling(terrain, atlas, tile_px=options.tile_px)
+    prepared, skipped = prepare_inputs(
+        inputs, ray_scene, atlas_tiling, options, rejects=rejects, progress=lambda fraction: report(0.2 * fraction)
+    )
+    if not prepared:
+        raise NoUsablePixels(
+            "paint: no photograph has usable pixels: " + "; ".join(skipped or ["no photographs given"])
+        )
     if options.fit_gains:
         radiometry = fit_radiometry(
-            ready,
+            prepared,
             ray_scene,
             predicted=predicted,
             predicted_sigma=options.predicted_sigma,
@@ -158,68 +182,98 @@ def paint_atlas(
             radiance=radiance,
         )
     else:
-        radiometry = common_gain(ready, radiance=radiance)
-    tell(0.3)
-    painting = _blank(atlas, ready, radiometry, skipped)
-    tiles = list(tiles_of(cut))
+        radiometry = common_gain(prepared, radiance=radiance)
+    report(0.3)
+    painting = _empty_painting(atlas, prepared, radiometry, skipped)
+    tiles = list(tiles_of(atlas_tiling))
     for number, tile in enumerate(tiles):
-        _place(
-            painting,
+        painted_tile = _load_or_paint(
+            resume,
             tile,
-            _kept_tile(
-                resume, tile, lambda tile=tile: paint_tile(ready, ray_scene, cut, tile, radiometry, options.mode)
-            ),
+            lambda tile=tile: paint_tile(prepared, ray_scene, atlas_tiling, tile, radiometry, options.mode),
         )
-        tell(0.3 + 0.7 * (number + 1) / len(tiles))
+        _write_tile(painting, tile, painted_tile)
+        report(0.3 + 0.7 * (number + 1) / len(tiles))
     return painting
 
 
 def prepare_inputs(
     inputs: Sequence[PaintingInput],
     ray_scene: RayScene,
-    cut: AtlasTiling,
+    atlas_tiling: AtlasTiling,
     options: PaintOptions,
     *,
     rejects: Sequence[np.ndarray | None] | None = None,
     progress: Progress | None = None,
 ) -> tuple[list[PreparedInput], list[str]]:
-    """The shots that have something to paint, ready, and a line for each other one that says why it has not."""
-    tell = progress or (lambda share: None)
+    """Prepare the inputs that show usable terrain, and give the reason for each other one.
+
+    Parameters
+    ----------
+    inputs
+        Photographs.
+    ray_scene
+        Ray-tracing scene of the terrain.
+    atlas_tiling
+        The atlas in tiles, with the same terrain.
+    options
+        Options of `paint_atlas`.
+    rejects
+        As in `paint_atlas`.
+    progress
+        Called with the finished fraction.
+
+    Returns
+    -------
+    prepared
+        The usable inputs; sorted in mode ``weighted``, else in the given order.
+    skipped
+        One line for each other input: name and reason.
+
+    Raises
+    ------
+    ValueError
+        ``rejects`` and ``inputs`` differ in number.
+    """
+    report = progress or (lambda fraction: None)
     if rejects is not None and len(rejects) != len(inputs):
-        raise ValueError(f"paint: {len(rejects)} masks for {len(inputs)} pictures")
+        raise ValueError(f"paint: got {len(rejects)} reject masks for {len(inputs)} photographs")
     pairs = list(zip(inputs, rejects or [None] * len(inputs), strict=True))
     if options.mode == "weighted":
-        # A sum in another order would differ in its last bits.
+        # Floating-point sums depend on the order of their terms.
         pairs.sort(key=lambda pair: pair[0].key)
-    ready, skipped = [], []
-    for number, (item, reject) in enumerate(pairs):
-        why = _unusable(item)
-        if why is None:
-            prepared = prepare_input(item, ray_scene, cut, near_m=options.near_m, reject=reject, guard=options.guard)
+    prepared_inputs, skipped = [], []
+    for number, (painting_input, reject) in enumerate(pairs):
+        reason = _unusable(painting_input)
+        if reason is None:
+            prepared = prepare_input(
+                painting_input, ray_scene, atlas_tiling, near_m=options.near_m, reject=reject, guard=options.guard
+            )
             if not np.isfinite(prepared.depth_m).any():
-                why = "it sees none of the terrain"
+                reason = "no terrain in view"
             elif not prepared.confidence.any():
-                why = "no usable pixel shows terrain"
+                reason = "no usable pixel shows terrain"
             else:
-                ready.append(prepared)
-        if why is not None:
-            skipped.append(f"{item.observation.webcam}: {why}")
-        tell((number + 1) / len(pairs))
-    return ready, skipped
+                prepared_inputs.append(prepared)
+        if reason is not None:
+            skipped.append(f"{painting_input.observation.webcam}: {reason}")
+        report((number + 1) / len(pairs))
+    return prepared_inputs, skipped
 
 
-def _unusable(item: PaintingInput) -> str | None:
-    seen = item.observation
-    if not seen.mask.any():
-        return "its mask leaves no pixel"
-    if not np.isfinite(seen.image[seen.mask]).all(axis=1).any():
-        return "its picture holds no finite value"
+def _unusable(painting_input: PaintingInput) -> str | None:
+    """Reason why an input has no usable pixel, whatever it shows, or ``None``."""
+    observation = painting_input.observation
+    if not observation.mask.any():
+        return "its mask excludes every pixel"
+    if not np.isfinite(observation.image[observation.mask]).all(axis=1).any():
+        return "its image has no finite pixel"
     return None
 
 
 @dataclass(frozen=True)
-class _Painted:
-    """What of a tile is painted; arrays as in `Painting`."""
+class _PaintedTile:
+    """Painted texels of one tile; arrays as in `Painting`."""
 
     values: np.ndarray
     weight: np.ndarray
@@ -228,83 +282,138 @@ class _Painted:
 
 
 def paint_tile(
-    ready: Sequence[PreparedInput],
+    prepared: Sequence[PreparedInput],
     ray_scene: RayScene,
-    cut: AtlasTiling,
+    atlas_tiling: AtlasTiling,
     tile: AtlasTile,
     radiometry: RadiometricFit,
     mode: str = "weighted",
-) -> _Painted:
-    """One tile of a painting, from all shots that see any of it."""
+) -> _PaintedTile:
+    """Paint one tile from all inputs that any of it is visible in.
+
+    Parameters
+    ----------
+    prepared
+        All inputs.
+    ray_scene
+        Ray-tracing scene of the terrain.
+    atlas_tiling
+        The atlas in tiles.
+    tile
+        The tile to paint.
+    radiometry
+        Gains, contrasts and haze of the inputs.
+    mode
+        As in `PaintOptions`.
+
+    Returns
+    -------
+    _PaintedTile
+        Arrays ``(height, width)`` as in `Painting`.
+    """
     size = tile.height * tile.width
-    total, most = np.zeros((size, 3)), np.zeros(size, np.float32)
+    weighted_sum, greatest = np.zeros((size, 3)), np.zeros(size, np.float32)
     weights, best, coverage = np.zeros(size), np.full(size, -1, np.int16), np.zeros(size, np.uint8)
-    those = [number for number, item in enumerate(ready) if sees_tile(item.blocks, tile)]
-    surface = tile_surface(cut, tile) if those else None
-    for number in those:
-        texel, value, weight = input_texels(ready[number], number, ray_scene, surface, tile, radiometry)
+    visible = [number for number, candidate in enumerate(prepared) if is_tile_visible(candidate.blocks, tile)]
+    surface = tile_surface(atlas_tiling, tile) if visible else None
+    for number in visible:
+        assert surface is not None
+        texel, value, weight = input_texels(prepared[number], number, ray_scene, surface, tile, radiometry)
         if mode == "first":
             free = best[texel] < 0
             texel, value, weight = texel[free], value[free], weight[free]
-        share = sharpened(weight)
-        total[texel] += share[:, None] * value
-        weights[texel] += share
-        better = weight > most[texel]
+        blending = sharpened(weight)
+        weighted_sum[texel] += blending[:, None] * value
+        weights[texel] += blending
+        better = weight > greatest[texel]
         best[texel[better]] = number
-        most[texel[better]] = weight[better]
+        greatest[texel[better]] = weight[better]
         coverage[texel] += 1
     painted = weights > 0.0
     values = np.zeros((size, 3), np.float32)
-    values[painted] = total[painted] / weights[painted, None]
+    values[painted] = weighted_sum[painted] / weights[painted, None]
     shape = (tile.height, tile.width)
-    return _Painted(values.reshape(*shape, 3), most.reshape(shape), best.reshape(shape), coverage.reshape(shape))
+    return _PaintedTile(
+        values.reshape(*shape, 3), greatest.reshape(shape), best.reshape(shape), coverage.reshape(shape)
+    )
 
 
 def input_texels(
-    ready: PreparedInput, number: int, ray_scene: RayScene, surface, tile: AtlasTile, radiometry: RadiometricFit
+    prepared: PreparedInput,
+    number: int,
+    ray_scene: RayScene,
+    surface: TexelSurface,
+    tile: AtlasTile,
+    radiometry: RadiometricFit,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What one shot has to say about a tile: flat texels ``(N,)``, radiance ``(N, 3)`` [cd/m²] and weight ``(N,)``."""
-    camera = ready.item.observation.camera
-    surface = surface[tile_blocks(ready.blocks, tile, surface.texel)]
-    sight = project_texels(camera, surface)
-    index = np.flatnonzero(sight.inside)
-    surface, sight = surface[index], sight[index]
-    px_per_texel = camera.fx * surface.texel_m / np.maximum(sight.distance_m, 1e-3)
-    value, confidence = sample_input(ready, sight.pixel, texel_extent_px(camera, surface, sight))
-    weight = texel_weight(sight.cosine, px_per_texel) * confidence
-    keep = np.flatnonzero(weight > _LEAST_WEIGHT)
-    # Rays last: only for texels that something could be painted into.
-    keep = keep[by_ray(ray_scene, camera, surface[keep], sight[keep])]
-    radiance, share = radiance_at_surface(value[keep], number, air_to(ready, surface.position_m[keep]), radiometry)
-    return surface.texel[keep], radiance, weight[keep] * share**2
+    """Compute radiance and weight of a tile's texels from one input.
+
+    Parameters
+    ----------
+    prepared
+        The input.
+    number
+        Its index in ``radiometry``.
+    ray_scene
+        Ray-tracing scene of the terrain.
+    surface
+        Surface points of the tile's texels, or of some of them.
+    tile
+        The tile.
+    radiometry
+        Gains, contrasts and haze.
+
+    Returns
+    -------
+    texel
+        ``(N,)`` flat indices in the tile of the texels that the input paints.
+    radiance
+        ``(N, 3)`` [cd/m²].
+    weight
+        ``(N,)`` in (0, 1].
+    """
+    camera = prepared.painting_input.camera
+    surface = surface[tile_blocks(prepared.blocks, tile, surface.texel)]
+    projected = project_texels(camera, surface)
+    index = np.flatnonzero(projected.inside)
+    surface, projected = surface[index], projected[index]
+    px_per_texel = camera.fx * surface.texel_m / np.maximum(projected.distance_m, 1e-3)
+    value, confidence = sample_input(prepared, projected.pixel, texel_extent_px(camera, surface, projected))
+    weight = texel_weight(projected.cosine, px_per_texel) * confidence
+    keep = np.flatnonzero(weight > _MIN_WEIGHT)
+    # Shadow rays are the costliest test and come last.
+    keep = keep[by_ray(ray_scene, camera, surface[keep], projected[keep])]
+    air = air_to(prepared, surface.position_m[keep])
+    radiance, surface_share = radiance_at_surface(value[keep], number, air, radiometry)
+    return surface.texel[keep], radiance, weight[keep] * surface_share**2
 
 
-def _blank(
-    atlas: Atlas, ready: Sequence[PreparedInput], radiometry: RadiometricFit, skipped: Sequence[str]
+def _empty_painting(
+    atlas: Atlas, prepared: Sequence[PreparedInput], radiometry: RadiometricFit, skipped: Sequence[str]
 ) -> Painting:
     shape = (atlas.height_px, atlas.width_px)
     texture = Texture(np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32))
-    names = tuple(item.item.observation.webcam for item in ready)
+    names = tuple(used.painting_input.observation.webcam for used in prepared)
     return Painting(texture, np.full(shape, -1, np.int16), np.zeros(shape, np.uint8), names, radiometry, tuple(skipped))
 
 
-def _place(painting: Painting, tile: AtlasTile, part: _Painted) -> None:
+def _write_tile(painting: Painting, tile: AtlasTile, painted_tile: _PaintedTile) -> None:
     rows, columns = tile.window
-    painting.texture.values[rows, columns] = part.values
-    painting.texture.weight[rows, columns] = part.weight
-    painting.best[rows, columns] = part.best
-    painting.coverage[rows, columns] = part.coverage
+    painting.texture.values[rows, columns] = painted_tile.values
+    painting.texture.weight[rows, columns] = painted_tile.weight
+    painting.best[rows, columns] = painted_tile.best
+    painting.coverage[rows, columns] = painted_tile.coverage
 
 
-def _kept_tile(folder: Path | None, tile: AtlasTile, build: Callable[[], _Painted]) -> _Painted:
-    """A tile from the folder of finished ones, or painted and put there."""
+def _load_or_paint(folder: Path | None, tile: AtlasTile, paint: Callable[[], _PaintedTile]) -> _PaintedTile:
+    """Load a finished tile from the folder, or paint and store it."""
     if folder is None:
-        return build()
+        return paint()
     path = folder / f"{tile.name}.npz"
     if path.is_file():
         with np.load(path, allow_pickle=False) as stored:
-            return _Painted(*(stored[name] for name in _Painted.__dataclass_fields__))
-    part = build()
+            return _PaintedTile(*(stored[name] for name in _PaintedTile.__dataclass_fields__))
+    painted_tile = paint()
     with atomic_path(path) as temporary:
-        np.savez(temporary, **{name: getattr(part, name) for name in _Painted.__dataclass_fields__})
-    return part
+        np.savez(temporary, **{name: getattr(painted_tile, name) for name in _PaintedTile.__dataclass_fields__})
+    return painted_tile

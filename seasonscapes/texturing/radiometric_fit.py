@@ -1,16 +1,17 @@
-"""Cameras made to agree: exposure, white balance and contrast of each, and the haze before all of them.
+"""Radiometric calibration of overlapping photographs: gain, white balance and contrast per camera, one common haze.
 
-A picture's value is ``v = R_a(g (T^h L + s A_h))``: radiance L of the land through the sky model's transmittance T, with
-its airlight A as much stronger or weaker as ``1 - T^h`` is than ``1 - T``, times the camera's gain g for each colour, on a
-tone curve R of contrast a. The airlight's own scale s g is read off the sky above the horizon of the same picture, which
-needs no gain. Gains, contrasts and one haze exponent h (1 is the sky model's own haze) are fitted together, by robust
-least squares over all places that two cameras see, and against a prediction where one is given.
+The image value is ``v = R_a(g (T^h L + s A_h))``: radiance L of the surface through the transmittance T of the sky model,
+plus its airlight A, scaled by ``(1 - T^h) / (1 - T)`` to A_h, times the camera's gain g per channel, on a tone curve R of
+contrast a. The scale of the airlight, s g, is measured on the sky above the horizon in the same image, which needs no
+gain. Gains, contrasts and one haze exponent h (1 is the sky model's own haze) are fitted jointly by robust least squares
+over all surface points visible from two cameras, and against predicted radiance where it is given.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -20,40 +21,42 @@ from seasonscapes.terrain.surface import sample_texture
 from seasonscapes.texturing.camera_overlaps import CameraSamples, OverlapPairs, find_overlaps
 from seasonscapes.texturing.inputs import PreparedInput, horizon_radiance
 
-# Scatter of the logarithms of two cameras' views of one place, and of a picture's encoded values (noise, JPEG).
-_LAND_SIGMA, _PICTURE_SIGMA = 0.1, 0.012
+# Standard deviation of the log radiance of one point between two cameras, and of encoded image values (noise, JPEG).
+_SURFACE_SIGMA, _IMAGE_SIGMA = 0.1, 0.012
 _HUBER = 1.5
-# How far a gain may lie from what the sky tells, and from what the picture's mean tells [log].
-_SKY_SIGMA, _MEAN_SIGMA = 0.4, 1.0
-# Webcams steepen contrast: logarithm of the exponent, and of the haze's.
+# Prior standard deviation of a log gain that the sky determines, and of one that the image's median determines.
+_SKY_SIGMA, _MEDIAN_SIGMA = 0.4, 1.0
+# Prior mean and standard deviation of log contrast (webcams steepen contrast), and standard deviation of log haze.
 _CONTRAST, _CONTRAST_SIGMA, _HAZE_SIGMA = 0.1, 0.05, 0.5
-# Neighbouring places are not independent: so many count as one, and those of one pair of cameras as no more than so many.
-_PLACES_AS_ONE, _PLACES_A_PAIR = 20.0, 10.0
-# Radiance of the land over that of the horizon's sky, where no picture shows any sky.
-_LAND_OF_SKY = 0.25
-# The least share of a picture's value that the land itself must have.
-_LEAST_LAND = 0.08
-_STEPS, _FARTHEST_STEP, _FIRST_HAZE = 15, 0.3, 0.6
+# Neighbouring points are correlated: this many count as one, and those of a pair of cameras as at most so many.
+_CORRELATED_POINTS, _MAX_POINTS_PER_PAIR = 20.0, 10.0
+# Median radiance of the surface over that of the sky at the horizon, where no image shows any sky.
+_SURFACE_TO_SKY = 0.25
+# Least share of the surface in an image value; the rest is airlight.
+_MIN_SURFACE_SHARE = 0.08
+_ITERATIONS, _MAX_STEP, _INITIAL_HAZE = 15, 0.3, 0.6
+# Step of finite differences in logarithms.
+_DIFFERENCE = 1e-3
 
 
 @dataclass(frozen=True)
 class RadiometricFit:
-    """What turns picture values into radiances of the land.
+    """Parameters that convert the image values of K cameras into radiance of the surface.
 
     Parameters
     ----------
     log_gain
-        ``(K, 3)`` logarithm of picture value over radiance.
+        ``(K, 3)`` logarithm of image value over radiance.
     log_sky_gain
-        ``(K, 3)`` the same, for the airlight.
+        ``(K, 3)`` the same for airlight.
     contrast
-        ``(K,)`` exponent of each camera's tone curve, 1 for sRGB alone; see `invert_contrast`.
+        ``(K,)`` exponent of each camera's tone curve, 1 for plain sRGB; see `invert_contrast`.
     haze
         Exponent of the sky model's transmittance.
     overlaps
-        Pairs that were compared.
+        Number of compared pairs.
     scatter_before, scatter_after
-        Median absolute difference of two cameras' logarithms of radiance there, before anything was fitted and now.
+        Median absolute difference of log radiance over these pairs, before and after the fit.
     """
 
     log_gain: np.ndarray
@@ -66,9 +69,27 @@ class RadiometricFit:
 
 
 def invert_contrast(value: np.ndarray, contrast: np.ndarray | float) -> np.ndarray:
-    """Decoded picture values in [0, 1] without the camera's tone curve.
+    """Invert a camera's contrast curve.
 
-    The curve bends encoded values e about their middle: ``eᵃ / (eᵃ + (1 - e)ᵃ)``; this is its inverse.
+    The curve acts on sRGB-encoded values e, about their middle: ``eᵃ / (eᵃ + (1 - e)ᵃ)``.
+
+    Parameters
+    ----------
+    value
+        ``(...)`` decoded image values in [0, 1].
+    contrast
+        Exponent a, broadcast against ``value``.
+
+    Returns
+    -------
+    ndarray
+        ``(...)`` decoded values in [0, 1] without the curve.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> invert_contrast(np.array([0.0, 1.0]), 1.4).tolist()
+    [0.0, 1.0]
     """
     encoded = srgb_from_linear(value)
     power = 1.0 / np.asarray(contrast)
@@ -77,48 +98,87 @@ def invert_contrast(value: np.ndarray, contrast: np.ndarray | float) -> np.ndarr
 
 
 def scale_haze(transmittance: np.ndarray, airlight: np.ndarray, haze: float) -> tuple[np.ndarray, np.ndarray]:
-    """Transmittance and airlight with ``haze`` times the optical depth."""
-    thicker = transmittance**haze
+    """Scale the optical depth of the air.
+
+    Parameters
+    ----------
+    transmittance, airlight
+        ``(..., 3)`` of the sky model; airlight in [cd/m²].
+    haze
+        Factor of the optical depth.
+
+    Returns
+    -------
+    transmittance, airlight
+        ``(..., 3)`` each: ``T^h`` and ``A (1 - T^h) / (1 - T)``.
+    """
+    scaled = transmittance**haze
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.where(transmittance < 1.0 - 1e-6, (1.0 - thicker) / (1.0 - transmittance), haze)
-    return thicker, airlight * ratio
+        ratio = np.where(transmittance < 1.0 - 1e-6, (1.0 - scaled) / (1.0 - transmittance), haze)
+    return scaled, airlight * ratio
 
 
 def radiance_at_surface(
     value: np.ndarray, camera: int, air: tuple[np.ndarray, np.ndarray], radiometry: RadiometricFit
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Radiance ``(N, 3)`` [cd/m²] of the land from picture values ``(N, 3)``, and its share of the picture ``(N,)``.
+    """Convert image values to radiance at the surface.
 
     Parameters
     ----------
+    value
+        ``(N, 3)`` decoded image values.
+    camera
+        Index of the camera in ``radiometry``.
     air
-        Transmittance and airlight ``(N, 3)`` of the sky model up to each place.
+        Transmittance and airlight ``(N, 3)`` of the sky model between camera and each point.
+    radiometry
+        Gains, contrasts and haze.
+
+    Returns
+    -------
+    radiance
+        ``(N, 3)`` float32 [cd/m²].
+    surface_share
+        ``(N,)`` float32 in (0, 1]: share of the surface in the image value, the least over the channels.
 
     Notes
     -----
-    Where the airlight alone would be brighter than the picture, a small share is kept: the second value tells, and
-    painting weighs by its square.
+    The share has a lower limit of 0.08, which also applies where the airlight alone would exceed the image value.
+    Painting multiplies weights by the square of the share.
     """
     samples = CameraSamples(np.full(len(value), camera), value, *air)
-    log_land, share = _land(samples, radiometry)
-    return np.exp(log_land - radiometry.log_gain[camera]).astype(np.float32), share.min(axis=1).astype(np.float32)
+    log_surface, share = _log_surface(samples, radiometry)
+    return (np.exp(log_surface - radiometry.log_gain[camera]).astype(np.float32), share.min(axis=1).astype(np.float32))
 
 
-def _land(samples: CameraSamples, radiometry: RadiometricFit) -> tuple[np.ndarray, np.ndarray]:
-    """Logarithm of gain × radiance ``(N, 3)`` of the land, and its share of the picture's value ``(N, 3)``."""
+def _log_surface(samples: CameraSamples, radiometry: RadiometricFit) -> tuple[np.ndarray, np.ndarray]:
+    """Logarithm of gain × radiance of the surface ``(N, 3)``, and its share of the image value ``(N, 3)``."""
     value = invert_contrast(samples.value, radiometry.contrast[samples.camera][:, None])
     transmittance, airlight = scale_haze(samples.transmittance, samples.airlight, radiometry.haze)
     share = 1.0 - airlight * np.exp(radiometry.log_sky_gain[samples.camera]) / np.maximum(value, 1e-6)
-    share = np.clip(share, _LEAST_LAND, 1.0)
+    share = np.clip(share, _MIN_SURFACE_SHARE, 1.0)
     return np.log(np.maximum(value, 1e-6) * share) - np.log(np.maximum(transmittance, 1e-3)), share
 
 
 def common_gain(inputs: Sequence[PreparedInput], *, radiance: float | None = None) -> RadiometricFit:
-    """No harmony: one gain for all cameras, by which their mean stands for ``radiance`` [cd/m²] (or as the skies tell)."""
+    """Return one gain for all cameras and channels, without a fit: the mean of the gains of the single images.
+
+    Parameters
+    ----------
+    inputs
+        Prepared photographs.
+    radiance
+        As in `fit_radiometry`.
+
+    Returns
+    -------
+    RadiometricFit
+        Contrast and haze are 1.
+    """
     count = len(inputs)
     start = RadiometricFit(np.zeros((count, 3)), np.zeros((count, 3)), np.ones(count))
-    prior, _ = _prior_gains(inputs, start, radiance)
-    same = np.broadcast_to(prior.mean(), (count, 3)).copy()
+    prior = _gain_prior(inputs, start, radiance)
+    same = np.broadcast_to(prior.mean.mean(), (count, 3)).copy()
     return replace(start, log_gain=same, log_sky_gain=same)
 
 
@@ -132,51 +192,58 @@ def fit_radiometry(
     fit_contrast: bool = True,
     radiance: float | None = None,
 ) -> RadiometricFit:
-    """Fit gains, contrasts and haze over all places that two cameras see.
+    """Fit gains, contrasts and haze to all surface points visible from two cameras.
 
     Parameters
     ----------
+    inputs
+        Prepared photographs.
+    terrain
+        Ray-tracing scene of the terrain.
     predicted
-        ``(R, S, 3)`` radiance [cd/m²] that is expected of the land (NaN where it is not known): ties cameras together
-        that share no place, and all of them to the absolute scale.
+        ``(R, S, 3)`` predicted radiance [cd/m²] of the surface, NaN where unknown. It links cameras without common
+        points, and all of them to the absolute scale.
     predicted_sigma
-        Standard error of its logarithm: about 1 for a regression from a satellite's image, 0.2 for a relit albedo.
-    fit_haze, fit_contrast
-        Let them differ from the sky model's haze and from plain sRGB.
+        Standard error of its logarithm: about 1 for a regression on a satellite image, 0.2 for a relit albedo.
+    fit_haze
+        Fit the haze exponent; otherwise it is 1.
+    fit_contrast
+        Fit the contrasts; otherwise they are 1.
     radiance
-        Median radiance of the land [cd/m²], where no picture shows any sky; left out, a quarter of the horizon's by the
-        sky model, and 1 (relative values) without any.
+        Median radiance of the surface [cd/m²], used where no image shows any sky. ``None``: a quarter of the sky model's
+        radiance at the horizon, or 1 (relative values) without a sky model.
 
     Returns
     -------
-    Harmony
-        Absolute where skies are seen: their radiance is the sky model's.
+    RadiometricFit
+        Absolute where sky is in view: its radiance is the sky model's.
     """
     count = len(inputs)
     overlaps = find_overlaps(inputs, terrain)
-    expected = None if predicted is None else _expected(predicted, overlaps.alone_uv)
+    expected = None if predicted is None else _log_predicted(predicted, overlaps.single_uv)
     radiometry = RadiometricFit(np.zeros((count, 3)), np.zeros((count, 3)), np.ones(count), overlaps=len(overlaps.uv))
-    radiometry = replace(radiometry, log_gain=_prior_gains(inputs, radiometry, radiance)[0])
-    radiometry = _with_sky(inputs, radiometry, radiance)
+    radiometry = replace(radiometry, log_gain=_gain_prior(inputs, radiometry, radiance).mean)
+    radiometry = _with_sky_gain(inputs, radiometry, radiance)
     before = _scatter(overlaps, common_gain(inputs))
     free = np.concatenate([np.ones(3 * count, bool), np.full(count, fit_contrast), [fit_haze]])
     if fit_contrast:
         radiometry = replace(radiometry, contrast=np.full(count, np.exp(_CONTRAST)))
     if fit_haze:
-        # Begin in clear air: where too much is taken away nothing is left that could tell so.
-        radiometry = replace(radiometry, haze=_FIRST_HAZE)
-    for _ in range(_STEPS):
-        prior = _prior_gains(inputs, radiometry, radiance)
-        step = _gauss_newton(overlaps, (expected, predicted_sigma), radiometry, prior, free)
-        # Gains are nearly linear; what bends the curve moves by little at a time.
-        step[3 * count :] = np.clip(step[3 * count :], -_FARTHEST_STEP, _FARTHEST_STEP)
-        radiometry = _with_sky(inputs, _moved(radiometry, step), radiance)
+        # Start in clear air: where too much airlight is subtracted, the clipped share has no gradient.
+        radiometry = replace(radiometry, haze=_INITIAL_HAZE)
+    for _ in range(_ITERATIONS):
+        prior = _gain_prior(inputs, radiometry, radiance)
+        step = _gauss_newton_step(overlaps, expected, predicted_sigma, radiometry, prior, free)
+        # Contrast and haze are strongly nonlinear, gains nearly linear.
+        step[3 * count :] = np.clip(step[3 * count :], -_MAX_STEP, _MAX_STEP)
+        radiometry = _with_sky_gain(inputs, _apply_step(radiometry, step), radiance)
         if np.abs(step).max() < 1e-4:
             break
     return replace(radiometry, scatter_before=before, scatter_after=_scatter(overlaps, radiometry))
 
 
-def _moved(radiometry: RadiometricFit, step: np.ndarray) -> RadiometricFit:
+def _apply_step(radiometry: RadiometricFit, step: np.ndarray) -> RadiometricFit:
+    """Radiometry after a step of log gains ``3 K`` (channel by channel), log contrasts ``K`` and log haze."""
     count = len(radiometry.contrast)
     return replace(
         radiometry,
@@ -186,137 +253,183 @@ def _moved(radiometry: RadiometricFit, step: np.ndarray) -> RadiometricFit:
     )
 
 
-def _with_sky(inputs: Sequence[PreparedInput], radiometry: RadiometricFit, radiance: float | None) -> RadiometricFit:
-    """The same with the airlight's gains read off the straightened skies."""
-    return replace(radiometry, log_sky_gain=_prior_gains(inputs, radiometry, radiance)[0])
-
-
-def _prior_gains(
+def _with_sky_gain(
     inputs: Sequence[PreparedInput], radiometry: RadiometricFit, radiance: float | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """What each gain is by its own picture alone ``(K, 3)``, and how surely ``(K, 1)``."""
+) -> RadiometricFit:
+    """The same with gains of the airlight measured on the sky under the present contrasts."""
+    return replace(radiometry, log_sky_gain=_gain_prior(inputs, radiometry, radiance).mean)
+
+
+@dataclass(frozen=True)
+class _GainPrior:
+    """Log gain by each camera's own image.
+
+    Parameters
+    ----------
+    mean
+        ``(K, 3)``.
+    sigma
+        ``(K, 1)`` its standard deviation.
+    """
+
+    mean: np.ndarray
+    sigma: np.ndarray
+
+
+def _gain_prior(inputs: Sequence[PreparedInput], radiometry: RadiometricFit, radiance: float | None) -> _GainPrior:
+    """Log gains from the sky in each image or, without any, from the image's median value."""
     contrast = radiometry.contrast[:, None]
-    mean = np.log(invert_contrast(np.array([ready.median_value for ready in inputs]), contrast))
-    value, expected = (np.array([getattr(ready, name) for ready in inputs]) for name in ("sky_value", "sky_radiance"))
-    seen = np.isfinite(value)
+    median = np.log(invert_contrast(np.array([prepared.median_value for prepared in inputs]), contrast))
+    value = np.array([prepared.sky_value for prepared in inputs])
+    expected = np.array([prepared.sky_radiance for prepared in inputs])
+    finite = np.isfinite(value)
     sky = np.where(
-        seen, np.log(invert_contrast(np.where(seen, value, 0.5), contrast) / np.where(seen, expected, 1.0)), 0.0
+        finite, np.log(invert_contrast(np.where(finite, value, 0.5), contrast) / np.where(finite, expected, 1.0)), 0.0
     )
-    known = seen.any(axis=1)
-    # A colour that is clipped has the gain of the others: white balance differs by little.
-    grey = sky.sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
-    sky = np.where(seen, sky, grey[:, None])
-    # A picture without sky is taken for as bright a land as those with sky show.
+    known = np.asarray(finite.any(axis=1))
+    # A clipped channel takes the mean gain of the others: white balance varies little.
+    grey = sky.sum(axis=1) / np.maximum(finite.sum(axis=1), 1)
+    sky = np.where(finite, sky, grey[:, None])
+    # The surface in an image without sky is assumed to be as bright as in the images with sky.
     if known.any():
-        offset = np.median((sky - mean)[known], axis=0)
+        offset = np.median((sky - median)[known], axis=0)
     else:
-        horizon = float(np.mean([horizon_radiance(ready.item) for ready in inputs]))
-        offset = -np.log(radiance or _LAND_OF_SKY * horizon or 1.0)
-    return np.where(known[:, None], sky, mean + offset), np.where(known, _SKY_SIGMA, _MEAN_SIGMA)[:, None]
+        horizon = float(np.mean([horizon_radiance(prepared.painting_input) for prepared in inputs]))
+        offset = -np.log(radiance or _SURFACE_TO_SKY * horizon or 1.0)
+    return _GainPrior(
+        np.where(known[:, None], sky, median + offset), np.where(known, _SKY_SIGMA, _MEDIAN_SIGMA)[:, None]
+    )
 
 
-def _expected(predicted: np.ndarray, uv: np.ndarray) -> np.ndarray:
+def _log_predicted(predicted: np.ndarray, uv: np.ndarray) -> np.ndarray:
     value = sample_texture(predicted, uv)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(value > 0.0, np.log(value), np.nan)
 
 
 def _scatter(overlaps: OverlapPairs, radiometry: RadiometricFit) -> float:
+    """Median absolute difference of log radiance over all pairs."""
     if len(overlaps.uv) == 0:
         return float("nan")
-    left, right = (_land(s, radiometry)[0] - radiometry.log_gain[s.camera] for s in (overlaps.own, overlaps.other))
+    left, right = (
+        _log_surface(samples, radiometry)[0] - radiometry.log_gain[samples.camera]
+        for samples in (overlaps.own, overlaps.other)
+    )
     return float(np.median(np.abs(left - right)))
 
 
 @dataclass(frozen=True)
-class _Side:
-    """One camera's part in a comparison, ``(N, 3)`` each.
+class _Linearisation:
+    """Log radiance of samples and its derivatives, ``(N, 3)`` each.
 
-    ``steepness`` is the logarithm of how much straightening and clearing spread tones at this value; ``by_...`` are slopes
-    in the logarithms of contrast and haze, of ``log_land`` and of ``steepness``.
+    Parameters
+    ----------
+    log_surface
+        Logarithm of gain × radiance.
+    noise
+        Standard deviation of the logarithm of the image value.
+    log_slope
+        Logarithm of the derivative of ``log_surface`` with respect to the logarithm of the image value.
+    by_contrast, by_haze
+        Derivatives of ``log_surface`` with respect to log contrast and log haze.
+    slope_by_contrast, slope_by_haze
+        Derivatives of ``log_slope`` with respect to the same.
     """
 
-    log_land: np.ndarray
+    log_surface: np.ndarray
     noise: np.ndarray
-    steepness: np.ndarray
+    log_slope: np.ndarray
     by_contrast: np.ndarray
     by_haze: np.ndarray
-    steeper_by_contrast: np.ndarray
-    steeper_by_haze: np.ndarray
+    slope_by_contrast: np.ndarray
+    slope_by_haze: np.ndarray
 
 
-def _side(samples: CameraSamples, radiometry: RadiometricFit) -> _Side:
-    tiny = 1e-3
-    log_land, _ = _land(samples, radiometry)
-    steepness = _steepness(samples, radiometry)
-    bent = replace(radiometry, contrast=radiometry.contrast * np.exp(tiny))
-    hazier = replace(radiometry, haze=radiometry.haze * np.exp(tiny))
-    # Noise and rounding are even in encoded values.
-    noise = _PICTURE_SIGMA * 2.4 / np.maximum(srgb_from_linear(samples.value) + 0.055, 0.02)
-    slopes = ((_land(samples, other)[0] - log_land) / tiny for other in (bent, hazier))
-    steeper = ((_steepness(samples, other) - steepness) / tiny for other in (bent, hazier))
-    return _Side(log_land, noise, steepness, *slopes, *steeper)
-
-
-def _steepness(samples: CameraSamples, radiometry: RadiometricFit) -> np.ndarray:
-    tiny = 1e-3
-    low, high = (
-        _land(replace(samples, value=samples.value * np.exp(sign * tiny)), radiometry)[0] for sign in (-0.5, 0.5)
+def _linearise(samples: CameraSamples, radiometry: RadiometricFit) -> _Linearisation:
+    log_surface, _ = _log_surface(samples, radiometry)
+    log_slope = _log_slope(samples, radiometry)
+    more_contrast = replace(radiometry, contrast=radiometry.contrast * np.exp(_DIFFERENCE))
+    more_haze = replace(radiometry, haze=radiometry.haze * np.exp(_DIFFERENCE))
+    # Noise and rounding have a constant standard deviation in encoded values.
+    noise = _IMAGE_SIGMA * 2.4 / np.maximum(srgb_from_linear(samples.value) + 0.055, 0.02)
+    value_derivatives = (
+        (_log_surface(samples, other)[0] - log_surface) / _DIFFERENCE for other in (more_contrast, more_haze)
     )
-    return np.log(np.clip((high - low) / tiny, 1e-2, 1.0 / _LEAST_LAND))
+    slope_derivatives = ((_log_slope(samples, other) - log_slope) / _DIFFERENCE for other in (more_contrast, more_haze))
+    return _Linearisation(log_surface, noise, log_slope, *value_derivatives, *slope_derivatives)
 
 
-def _gauss_newton(
+def _log_slope(samples: CameraSamples, radiometry: RadiometricFit) -> np.ndarray:
+    low, high = (
+        _log_surface(replace(samples, value=samples.value * np.exp(sign * _DIFFERENCE)), radiometry)[0]
+        for sign in (-0.5, 0.5)
+    )
+    return np.log(np.clip((high - low) / _DIFFERENCE, 1e-2, 1.0 / _MIN_SURFACE_SHARE))
+
+
+@dataclass(frozen=True)
+class _CameraDerivatives:
+    """Derivatives of N residuals with respect to the parameters of one camera each.
+
+    Parameters
+    ----------
+    camera
+        ``(N,)`` index of the camera.
+    by_gain, by_contrast
+        ``(N, 3)`` with respect to log gain and log contrast.
+    """
+
+    camera: np.ndarray
+    by_gain: np.ndarray
+    by_contrast: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Residuals:
+    """N residuals per channel with their derivatives.
+
+    Parameters
+    ----------
+    residual, variance
+        ``(N, 3)``.
+    cameras
+        Derivatives with respect to the parameters of every camera involved.
+    by_haze
+        ``(N, 3)`` derivatives with respect to log haze.
+    count
+        ``(N,)`` number of independent observations that each row counts as.
+    """
+
+    residual: np.ndarray
+    variance: np.ndarray
+    cameras: tuple[_CameraDerivatives, ...]
+    by_haze: np.ndarray
+    count: np.ndarray
+
+
+def _gauss_newton_step(
     overlaps: OverlapPairs,
-    told: tuple[np.ndarray | None, float],
+    expected: np.ndarray | None,
+    predicted_sigma: float,
     radiometry: RadiometricFit,
-    prior: tuple[np.ndarray, np.ndarray],
+    prior: _GainPrior,
     free: np.ndarray,
 ) -> np.ndarray:
-    """One step of iteratively reweighted least squares (Huber): of gains (colour by colour), log contrasts, log haze.
+    """One step of iteratively reweighted least squares (Huber): of log gains (channel by channel), log contrasts, log haze.
 
-    Differences are divided by how much the tone curves spread them: else curves that flatten everything would agree best.
+    Residuals are divided by the local slope of the tone curves; otherwise curves that flatten everything would fit best.
     """
-    count, (expected, predicted_sigma) = len(radiometry.contrast), told
-    own, other = overlaps.own, overlaps.other
-    left, right = _side(own, radiometry), _side(other, radiometry)
-    error = left.log_land - right.log_land - radiometry.log_gain[own.camera] + radiometry.log_gain[other.camera]
-    spread = np.exp(0.5 * (left.steepness + right.steepness))
-    noise = left.noise**2 * np.exp(2.0 * left.steepness) + right.noise**2 * np.exp(2.0 * right.steepness)
-    half = 0.5 * error
-    blocks = [
-        (
-            error / spread,
-            noise / spread**2 + _LAND_SIGMA**2,
-            (
-                (own.camera, -1.0 / spread, (left.by_contrast - half * left.steeper_by_contrast) / spread),
-                (other.camera, 1.0 / spread, (-right.by_contrast - half * right.steeper_by_contrast) / spread),
-            ),
-            (left.by_haze - right.by_haze - half * (left.steeper_by_haze + right.steeper_by_haze)) / spread,
-            _counts(own.camera * count + other.camera),
-        )
-    ]
+    count = len(radiometry.contrast)
+    residuals = [_overlap_residuals(overlaps, radiometry)]
     if expected is not None:
-        known = np.isfinite(expected).all(axis=1)
-        side = _side(overlaps.alone[known], radiometry)
-        camera, spread = overlaps.alone.camera[known], np.exp(side.steepness)
-        apart = side.log_land - expected[known] - radiometry.log_gain[camera]
-        blocks.append(
-            (
-                apart / spread,
-                side.noise**2 + predicted_sigma**2,
-                ((camera, -1.0 / spread, (side.by_contrast - apart * side.steeper_by_contrast) / spread),),
-                (side.by_haze - apart * side.steeper_by_haze) / spread,
-                _counts(camera),
-            )
-        )
-    matrix, gradient = _priors(radiometry, prior, count)
-    for block in blocks:
-        for colour in range(3):
-            jacobian, weight, apart = _rows(block, colour, count)
+        residuals.append(_predicted_residuals(overlaps.single, expected, predicted_sigma, radiometry))
+    matrix, gradient = _prior_equations(radiometry, prior, count)
+    for block in residuals:
+        for channel in range(3):
+            jacobian, weight, residual = _channel_equations(block, channel, count)
             matrix += (jacobian.T @ jacobian.multiply(weight[:, None])).toarray()
-            gradient += jacobian.T @ (weight * apart)
-    # A curve that all cameras share cannot be told from the land's own contrast: only their differences are fitted.
+            gradient += jacobian.T @ (weight * residual)
+    # A contrast common to all cameras cannot be separated from the contrast of the surface: only differences are fitted.
     shared = np.zeros(len(gradient))
     shared[3 * count : 4 * count] = 1e3
     matrix += np.outer(shared, shared)
@@ -325,38 +438,77 @@ def _gauss_newton(
     return step
 
 
-def _counts(kind: np.ndarray) -> np.ndarray:
-    """As how many independent places each row ``(N,)`` counts: all of one kind together as no more than a few."""
-    _, number, members = np.unique(kind, return_inverse=True, return_counts=True)
-    return np.minimum(1.0 / _PLACES_AS_ONE, _PLACES_A_PAIR / members)[number]
+def _overlap_residuals(overlaps: OverlapPairs, radiometry: RadiometricFit) -> _Residuals:
+    """Differences of log radiance between the two cameras of each pair."""
+    own, other = overlaps.own, overlaps.other
+    left, right = _linearise(own, radiometry), _linearise(other, radiometry)
+    error = left.log_surface - right.log_surface - radiometry.log_gain[own.camera] + radiometry.log_gain[other.camera]
+    slope = np.exp(0.5 * (left.log_slope + right.log_slope))
+    noise = left.noise**2 * np.exp(2.0 * left.log_slope) + right.noise**2 * np.exp(2.0 * right.log_slope)
+    half = 0.5 * error
+    return _Residuals(
+        error / slope,
+        noise / slope**2 + _SURFACE_SIGMA**2,
+        (
+            _CameraDerivatives(own.camera, -1.0 / slope, (left.by_contrast - half * left.slope_by_contrast) / slope),
+            _CameraDerivatives(
+                other.camera, 1.0 / slope, (-right.by_contrast - half * right.slope_by_contrast) / slope
+            ),
+        ),
+        (left.by_haze - right.by_haze - half * (left.slope_by_haze + right.slope_by_haze)) / slope,
+        _independent_count(own.camera * len(radiometry.contrast) + other.camera),
+    )
 
 
-def _rows(block: tuple, colour: int, count: int) -> tuple:
-    """Sparse Jacobian ``(N, 4 K + 1)``, weights and errors of one colour."""
+def _predicted_residuals(
+    single: CameraSamples, expected: np.ndarray, predicted_sigma: float, radiometry: RadiometricFit
+) -> _Residuals:
+    """Differences of log radiance between each camera and the prediction."""
+    known = np.asarray(np.isfinite(expected).all(axis=1))
+    samples = _linearise(single[known], radiometry)
+    camera, slope = single.camera[known], np.exp(samples.log_slope)
+    error = samples.log_surface - expected[known] - radiometry.log_gain[camera]
+    return _Residuals(
+        error / slope,
+        samples.noise**2 + predicted_sigma**2,
+        (_CameraDerivatives(camera, -1.0 / slope, (samples.by_contrast - error * samples.slope_by_contrast) / slope),),
+        (samples.by_haze - error * samples.slope_by_haze) / slope,
+        _independent_count(camera),
+    )
+
+
+def _independent_count(group: np.ndarray) -> np.ndarray:
+    """Number of independent observations ``(N,)`` that each row counts as, limited per group of rows."""
+    _, number, members = np.unique(group, return_inverse=True, return_counts=True)
+    return np.minimum(1.0 / _CORRELATED_POINTS, _MAX_POINTS_PER_PAIR / members)[number]
+
+
+def _channel_equations(block: _Residuals, channel: int, count: int) -> tuple[Any, np.ndarray, np.ndarray]:
+    """Sparse Jacobian ``(N, 4 K + 1)``, Huber weights ``(N,)`` and residuals ``(N,)`` of one channel."""
     from scipy import sparse
 
-    error, variance, sides, haze, counts = block
-    rows = np.arange(len(error))
-    entries = [(rows, np.full(len(rows), 4 * count), haze[:, colour])]
-    for camera, gain, contrast in sides:
-        entries.append((rows, colour * count + camera, gain[:, colour]))
-        entries.append((rows, 3 * count + camera, contrast[:, colour]))
+    rows = np.arange(len(block.residual))
+    entries = [(rows, np.full(len(rows), 4 * count), block.by_haze[:, channel])]
+    for derivatives in block.cameras:
+        entries.append((rows, channel * count + derivatives.camera, derivatives.by_gain[:, channel]))
+        entries.append((rows, 3 * count + derivatives.camera, derivatives.by_contrast[:, channel]))
     row, column, value = (np.concatenate(part) for part in zip(*entries, strict=True))
     jacobian = sparse.csr_array((value, (row, column)), shape=(len(rows), 4 * count + 1))
-    apart, sigma = error[:, colour], np.sqrt(variance[:, colour])
-    weight = np.minimum(1.0, _HUBER / np.maximum(np.abs(apart / sigma), 1e-9)) / sigma**2 * counts
-    return jacobian, weight, apart
+    residual, sigma = block.residual[:, channel], np.sqrt(block.variance[:, channel])
+    weight = np.minimum(1.0, _HUBER / np.maximum(np.abs(residual / sigma), 1e-9)) / sigma**2 * block.count
+    return jacobian, weight, residual
 
 
-def _priors(
-    radiometry: RadiometricFit, prior: tuple[np.ndarray, np.ndarray], count: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Normal matrix and gradient of what is known before any overlap is looked at."""
-    middle, sigma = prior
+def _prior_equations(radiometry: RadiometricFit, prior: _GainPrior, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Normal matrix and gradient of the priors of gains, contrasts and haze."""
     weight = np.concatenate(
-        [np.tile(1.0 / sigma[:, 0] ** 2, 3), np.full(count, _CONTRAST_SIGMA**-2), [_HAZE_SIGMA**-2]]
+        [np.tile(1.0 / prior.sigma[:, 0] ** 2, 3), np.full(count, _CONTRAST_SIGMA**-2), [_HAZE_SIGMA**-2]]
     )
-    apart = np.concatenate(
-        [(radiometry.log_gain - middle).T.ravel(), np.log(radiometry.contrast) - _CONTRAST, [np.log(radiometry.haze)]]
+    deviation = np.concatenate(
+        [
+            (radiometry.log_gain - prior.mean).T.ravel(),
+            np.log(radiometry.contrast) - _CONTRAST,
+            [np.log(radiometry.haze)],
+        ]
     )
-    return np.diag(weight), weight * apart
+    return np.diag(weight), weight * deviation

@@ -1,7 +1,7 @@
-"""Which texels a camera sees: a ray from each, off its face along the normal, to the camera.
+"""Visibility of texels from a camera, by one shadow ray per texel from the surface to the camera.
 
-`by_depth` and `by_faces` are what others do, kept to compare with: a depth map leaks at ridges and loses grazing slopes,
-and painting whole faces of which one pixel was seen leaks past every one of them.
+`by_depth` and `by_faces` implement the usual alternatives for comparison: a depth map leaks at ridges and loses slopes at
+grazing incidence, and marking every face that any pixel hits as visible leaks behind every ridge.
 """
 
 from __future__ import annotations
@@ -15,24 +15,24 @@ from seasonscapes.rendering.hemisphere_rays import RayScene
 from seasonscapes.rendering.sightlines import clear_sight, faces_met
 from seasonscapes.texturing.atlas_tiles import TexelSurface
 
-# Half the side of the pixels around a texel's own that `by_depth` may agree with, and its tolerance.
+# Relative tolerance of `by_depth`.
 _DEPTH_TOLERANCE = 0.005
 
 
 @dataclass(frozen=True)
 class ProjectedTexels:
-    """A camera's picture of N places: where they fall in it, and how.
+    """Projection of N surface points into a camera's image.
 
     Parameters
     ----------
     pixel
-        ``(N, 2)`` (x, y); NaN behind the camera.
+        ``(N, 2)`` image coordinates (x, y); NaN behind the camera.
     distance_m
-        ``(N,)`` from the camera [m].
+        ``(N,)`` distance from the camera [m].
     cosine
-        ``(N,)`` between the face's normal and the direction to the camera.
+        ``(N,)`` cosine of the angle between the face's normal and the direction to the camera.
     inside
-        ``(N,)`` bool: within the frame, and the face turned towards the camera.
+        ``(N,)`` bool: within the image, and the face turned towards the camera.
     """
 
     pixel: np.ndarray
@@ -40,12 +40,26 @@ class ProjectedTexels:
     cosine: np.ndarray
     inside: np.ndarray
 
-    def __getitem__(self, key) -> ProjectedTexels:
+    def __getitem__(self, key: np.ndarray | slice) -> ProjectedTexels:
+        """Return the points selected by an index array, mask or slice."""
         return ProjectedTexels(*(getattr(self, name)[key] for name in self.__dataclass_fields__))
 
 
 def project_texels(camera: Camera, surface: TexelSurface) -> ProjectedTexels:
-    """Project places into a camera's frame; nothing of what stands between is known yet."""
+    """Project surface points into a camera's image, without a test for occlusion.
+
+    Parameters
+    ----------
+    camera
+        The view.
+    surface
+        N surface points.
+
+    Returns
+    -------
+    ProjectedTexels
+        Of the N points.
+    """
     pose = camera.world_from_camera
     offset = surface.position_m - pose[:3, 3]
     local = offset @ pose[:3, :3]
@@ -59,28 +73,80 @@ def project_texels(camera: Camera, surface: TexelSurface) -> ProjectedTexels:
 
 
 def by_ray(
-    terrain: RayScene, camera: Camera, surface: TexelSurface, sight: ProjectedTexels, *, lift_m: float | None = None
+    terrain: RayScene, camera: Camera, surface: TexelSurface, projected: ProjectedTexels, *, lift_m: float | None = None
 ) -> np.ndarray:
-    """Whether a camera sees places, ``(N,)`` bool, by one shadow ray each; see `sightlines.clear_sight`."""
-    seen = sight.inside.copy()
-    index = np.flatnonzero(seen)
+    """Return which surface points are visible from a camera, by one shadow ray each.
+
+    Parameters
+    ----------
+    terrain
+        Ray-tracing scene of the terrain.
+    camera
+        The view.
+    surface
+        N surface points.
+    projected
+        Their projection, from `project_texels`.
+    lift_m
+        Offset of the ray origins along the normals [m]; ``None`` for just beyond the rounding of float32. See
+        `sightlines.clear_sight`.
+
+    Returns
+    -------
+    ndarray
+        ``(N,)`` bool.
+    """
+    visible = projected.inside.copy()
+    index = np.flatnonzero(visible)
     if len(index):
-        seen[index] = clear_sight(
+        visible[index] = clear_sight(
             terrain, surface.position_m[index], surface.normal[index], camera.position_m, lift_m=lift_m
         )
-    return seen
+    return visible
 
 
-def by_depth(depth_m: np.ndarray, sight: ProjectedTexels, *, tolerance: float = _DEPTH_TOLERANCE) -> np.ndarray:
-    """The same by a depth map ``(H, W)`` [m]: within a share ``tolerance`` of what the place's pixel shows."""
-    seen = sight.inside.copy()
-    index = np.flatnonzero(seen)
-    column, row = sight.pixel[index].astype(int).T
-    seen[index] = sight.distance_m[index] <= depth_m[row, column] * (1.0 + tolerance)
-    return seen
+def by_depth(depth_m: np.ndarray, projected: ProjectedTexels, *, tolerance: float = _DEPTH_TOLERANCE) -> np.ndarray:
+    """Return which surface points are visible, by comparison with a depth map.
+
+    Parameters
+    ----------
+    depth_m
+        ``(H, W)`` distance along the rays [m].
+    projected
+        N projected points.
+    tolerance
+        Relative excess of a point's distance over the depth map that still counts as visible.
+
+    Returns
+    -------
+    ndarray
+        ``(N,)`` bool.
+    """
+    visible = projected.inside.copy()
+    index = np.flatnonzero(visible)
+    column, row = projected.pixel[index].astype(int).T
+    visible[index] = projected.distance_m[index] <= depth_m[row, column] * (1.0 + tolerance)
+    return visible
 
 
-def by_faces(terrain: RayScene, camera: Camera, surface: TexelSurface, sight: ProjectedTexels) -> np.ndarray:
-    """The same by faces: all of a face of which any pixel was met."""
-    met = np.unique(faces_met(terrain, camera))
-    return sight.inside & np.isin(surface.face, met[met >= 0])
+def by_faces(terrain: RayScene, camera: Camera, surface: TexelSurface, projected: ProjectedTexels) -> np.ndarray:
+    """Return which surface points are visible, taking each face that any pixel's ray hits as visible as a whole.
+
+    Parameters
+    ----------
+    terrain
+        Ray-tracing scene of the terrain.
+    camera
+        The view.
+    surface
+        N surface points.
+    projected
+        Their projection, from `project_texels`.
+
+    Returns
+    -------
+    ndarray
+        ``(N,)`` bool.
+    """
+    hit = np.unique(faces_met(terrain, camera))
+    return projected.inside & np.isin(surface.face, hit[hit >= 0])
