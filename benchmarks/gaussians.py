@@ -345,7 +345,7 @@ def seasons(contest: Contest, appearance) -> dict[str, float]:
     true = {day: scene.albedo(day) for day in SPRING_DAYS}
     dated = np.stack([surfel_albedo(surfels, true[day]) for day in (SPRING_DAYS[0], SPRING_DAYS[2])])
     ground = attributes_at(surfels.means, surfels.normals, surfels.plan.spacing_m)
-    result, held = {}, (appearance.albedo, appearance.around)
+    result, held = {}, (appearance.albedo, appearance.neighbourhood_albedo)
     for number, day in enumerate(SPRING_DAYS):
         lights, _ = scene.lights(3, day=day)
         states = [light_state(contest.transport, light, day) for light in lights]
@@ -355,13 +355,16 @@ def seasons(contest: Contest, appearance) -> dict[str, float]:
             guesses["_mean"] = dated.mean(axis=0)
         for name, albedo in guesses.items():
             around = neighbourhood_mean(surfels.means, albedo, surfels.plan.spacing_m)
-            appearance.albedo, appearance.around = torch.as_tensor(albedo)[None], torch.as_tensor(around)[None]
+            appearance.albedo, appearance.neighbourhood_albedo = (
+                torch.as_tensor(albedo)[None],
+                torch.as_tensor(around)[None],
+            )
             values = [
                 psnr(contest.picture(0, colours_at(appearance, state)), picture, truth.solid)
                 for state, picture in zip(states, truth.pictures, strict=True)
             ]
             result[f"season_{('seen', 'unseen', 'seen2')[number]}{name}_psnr_db"] = float(np.mean(values))
-    appearance.albedo, appearance.around = held
+    appearance.albedo, appearance.neighbourhood_albedo = held
     return result
 
 

@@ -381,7 +381,7 @@ def under_the_hill() -> Camera:
 
 
 def test_a_camera_that_sees_nothing_says_so(model):
-    with pytest.raises(ValueError, match="sees no Gaussian"):
+    with pytest.raises(ValueError, match="no Gaussian in the camera's view"):
         model_weights(model, under_the_hill())
 
 
@@ -513,7 +513,7 @@ def test_splat_writes_what_is_asked_for(distilled, suffix, capsys):
         (["--device", "tpu"], "unknown device"),
         (["-o", "a.jpg"], "unknown kind of file"),
         (["--at", "46.551,7.98,800", "--heading", "0"], "stands below the ground"),
-        (["--at", "46.551,7.98,+3000", "--heading", "0", "--pitch", "80"], "sees no Gaussian"),
+        (["--at", "46.551,7.98,+3000", "--heading", "0", "--pitch", "80"], "no Gaussian in the camera's view"),
     ],
 )
 def test_splat_says_what_is_wrong(distilled, arguments, said, capsys):
@@ -632,5 +632,5 @@ def test_backs_of_discs_are_not_drawn(hill, model):
     np.testing.assert_allclose(image, splat_colours(weights, layers), atol=0.01)
     pose = np.eye(4)
     pose[:3, 3] = [0.0, 0.0, -800.0]
-    with pytest.raises(ValueError, match="sees no Gaussian"):
+    with pytest.raises(ValueError, match="no Gaussian in the camera's view"):
         draw_layers(model, replace(camera, world_from_camera=pose), layers)

@@ -1,15 +1,16 @@
-"""From a light to the colour of every Gaussian: physical shading, then an affine correction that a small network gives.
+"""Appearance model: colour of each Gaussian under a light, by physical shading and a learned affine correction.
 
     c = γ ĉ + β,   (γ − 1, β) = MLP([Gaussian embedding, time embedding, physical features, ĉ])
 
 The affine form is that of WildGaussians (Kulhanek et al. 2024, arXiv:2407.08447), whose ĉ is a free colour and whose
-time embedding a free vector for each photograph. Here ĉ is what physics says under this very sun and sky, the time
-embedding is a continuous function of the instant, and the last layer starts at zero: untrained, the model is physics.
+time embedding is a free vector per photograph. Here ĉ is the physically shaded colour under the given sun and sky, the
+time embedding is a continuous function of the instant, and the last layer is initialised to zero, so that the untrained
+model equals physical shading.
 
     ĉ = a · (Σ V(ω) (n·ω)⁺ E_ω + s E_sky + b E_bounce)
 
-with V the horizon's soft visibility. Colours are radiance × π over the luminance of the horizontal illuminance, so that
-noon and dusk are of one size. `KINDS` switches parts off for comparison.
+with V the soft visibility above the horizon. Colours are radiance × π over the luminance of the horizontal illuminance,
+so that noon and dusk have the same magnitude. `KINDS` lists ablations.
 """
 
 from __future__ import annotations
@@ -31,11 +32,11 @@ from seasonscapes.gaussians.disc_transport import (
 )
 from seasonscapes.sky.illumination import LUMINANCE_WEIGHTS
 
-# What the network is told. `code` is a free vector for each training time, as WildGaussians has; `sun` the time
-# embedding alone; `physical` no network at all; `full` everything.
+# Ablations by network input: `code` a free vector per training time, as in WildGaussians; `sun` the time embedding alone;
+# `physical` no network at all; `full` physical shading, its features and the time embedding.
 KINDS = ("code", "sun", "physical", "full")
 EMBEDDING, CODE = 6, 32
-# Width of the network. Without physics it has everything to learn: WildGaussians' own sizes then, 24 for the embedding.
+# Width of the hidden layers; without physical shading those of WildGaussians.
 HIDDEN = {"code": 128, "sun": 128, "full": 64}
 TIME_FEATURES, PHYSICAL_FEATURES = 14, 8
 BODIES = 2
@@ -43,9 +44,23 @@ BODIES = 2
 
 @dataclass(frozen=True)
 class LightTensors:
-    """T light states as tensors: ``direction (T, 2, 3)``, ``illuminance (T, 2, 3)``, ``sky (T, r, 3)``,
-    ``bounce (T, 5, 3)``, ``features (T, 14)``; all but the first divided by the luminance of the horizontal illuminance.
-    ``season (T,)`` says which of the dated albedos each time has."""
+    """T light states as tensors; radiometric values are relative to the luminance of the horizontal illuminance.
+
+    Parameters
+    ----------
+    direction
+        ``(T, 2, 3)`` unit vectors towards sun and moon.
+    illuminance
+        ``(T, 2, 3)`` relative normal illuminance; zero for a missing body.
+    sky
+        ``(T, r, 3)`` relative light per sky coefficient.
+    bounce
+        ``(T, 5, 3)`` relative light per bounce coefficient.
+    features
+        ``(T, 14)`` time embedding from `time_features`.
+    season
+        ``(T,)`` index of the dated albedo of each time.
+    """
 
     direction: torch.Tensor
     illuminance: torch.Tensor
@@ -56,13 +71,30 @@ class LightTensors:
 
 
 def light_tensors(states: Sequence[LightState], seasons: Sequence[int] | None = None) -> LightTensors:
-    """Stack light states; bodies beyond two are left out, missing ones send nothing. Seasons left out are all 0."""
+    """Stack light states into tensors.
+
+    Parameters
+    ----------
+    states
+        T light states; bodies beyond two are dropped.
+    seasons
+        Index of the dated albedo of each time; 0 if omitted.
+
+    Returns
+    -------
+    LightTensors
+        Of T times.
+    """
     rows = [_light_rows(state) for state in states]
-    columns = (torch.as_tensor(np.stack(column), dtype=torch.float32) for column in zip(*rows, strict=True))
-    return LightTensors(*columns, torch.as_tensor([0] * len(states) if seasons is None else list(seasons)))
+    direction, illuminance, sky, bounce, features = (
+        torch.as_tensor(np.stack(column), dtype=torch.float32) for column in zip(*rows, strict=True)
+    )
+    season = torch.as_tensor([0] * len(states) if seasons is None else list(seasons))
+    return LightTensors(direction, illuminance, sky, bounce, features, season)
 
 
 def _light_rows(state: LightState) -> tuple[np.ndarray, ...]:
+    """Columns of `LightTensors` except ``season`` for one state."""
     direction, illuminance = np.zeros((BODIES, 3)), np.zeros((BODIES, 3))
     direction[:, 2] = 1.0
     count = min(len(state.bodies[0]), BODIES)
@@ -74,7 +106,19 @@ def _light_rows(state: LightState) -> tuple[np.ndarray, ...]:
 
 
 def time_features(state: LightState) -> np.ndarray:
-    """What an instant is, ``(14,)``: sun's direction, strength and colour, the sky's share and colour, the season."""
+    """Time embedding of a light state.
+
+    Parameters
+    ----------
+    state
+        Light of one instant.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(14,)``: direction, strength and colour of the sun, relative strength and colour of the sky, logarithm of the
+        horizontal illuminance, two harmonics of the season, and a constant.
+    """
     season = 2.0 * np.pi * state.day / 365.2425
     body = state.bodies[0][0] if len(state.bodies[0]) else np.zeros(3)
     strength = state.bodies[1][0] / state.global_lx if len(state.bodies[0]) else np.zeros(3)
@@ -98,7 +142,22 @@ def time_features(state: LightState) -> np.ndarray:
 
 
 def fourier_embedding(means: np.ndarray, size: int = EMBEDDING, *, seed: int = 0) -> np.ndarray:
-    """Sines and cosines of centres ``(N, size)``, as WildGaussians begins with: coarse places first, a little noise."""
+    """Initial embedding of Gaussians as in WildGaussians: sines and cosines of their centres, with a little noise.
+
+    Parameters
+    ----------
+    means
+        ``(N, 3)`` centres [m].
+    size
+        Dimension of the embedding; low frequencies come first.
+    seed
+        Of the noise.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(N, size)`` float32.
+    """
     centred = means - np.median(means, axis=0)
     unit = 0.5 * centred / np.quantile(np.abs(centred), 0.97) + 0.5
     waves = [wave(2.0 * np.pi * 2.0**octave * unit) for octave in range(-(-size // 6)) for wave in (np.sin, np.cos)]
@@ -113,33 +172,48 @@ class Appearance(nn.Module):
     ----------
     kind
         One of `KINDS`.
-    albedo, around
-        ``(M, N, 3)`` of the discs at M dates, and of the land around them.
+    albedo, neighbourhood_albedo
+        ``(M, N, 3)`` albedo of the discs on M dates, and its mean over their surroundings.
     transport
-        Needed by ``physical`` and ``full``; for the others it only says how many there are.
+        Light transport of the discs; its values are used by ``physical`` and ``full`` only.
     embedding
         ``(N, D)`` from `fourier_embedding`.
     times
-        T, how many free codes ``code`` has.
+        Number T of free codes of ``code``.
+    seed
+        Of the network's initial weights.
+
+    Raises
+    ------
+    ValueError
+        If the kind is unknown.
     """
+
+    albedo: torch.Tensor
+    neighbourhood_albedo: torch.Tensor
+    normals: torch.Tensor
+    horizon: torch.Tensor
+    sky: torch.Tensor
+    bounce: torch.Tensor
+    open_sky: torch.Tensor
 
     def __init__(
         self,
         kind: str,
         albedo: np.ndarray,
-        around: np.ndarray,
+        neighbourhood_albedo: np.ndarray,
         transport: DiscTransport,
         embedding: np.ndarray,
         *,
         times: int = 1,
         seed: int = 0,
-    ):
+    ) -> None:
         super().__init__()
         if kind not in KINDS:
             raise ValueError(f"kind: got {kind!r}, expected one of {', '.join(KINDS)}")
         count = albedo.shape[1]
         self.kind = kind
-        for name, values in (("albedo", albedo), ("around", around)):
+        for name, values in (("albedo", albedo), ("neighbourhood_albedo", neighbourhood_albedo)):
             self.register_buffer(name, torch.as_tensor(np.asarray(values, np.float32)))
         low, high = HORIZON_RANGE_RAD
         self.register_buffer("normals", torch.as_tensor(transport.normals))
@@ -148,19 +222,20 @@ class Appearance(nn.Module):
         self.register_buffer("sky", torch.as_tensor(transport.sky * transport.sky_scale))
         self.register_buffer("bounce", torch.as_tensor(transport.bounce * transport.bounce_scale))
         self.register_buffer("open_sky", torch.as_tensor(transport.open_sky))
-        # Logarithms of gains on colour, on sky and bounce; the horizon's shift [rad] and the logarithm of its softness.
+        # Log gains of colour, and of sky and bounce; shift of the horizon [rad] and logarithm of its softness [rad].
         self.log_colour = nn.Parameter(torch.zeros(count, 3))
         self.log_gain = nn.Parameter(torch.zeros(count, 2))
         self.shift = nn.Parameter(torch.zeros(count))
         self.log_softness = nn.Parameter(torch.full((count,), float(np.log(SOFTNESS_RAD))))
         if kind != "physical":
             generator = torch.Generator().manual_seed(seed)
-            self.embedding = nn.Parameter(torch.tensor(embedding, dtype=torch.float32))  # a copy: training changes it
+            self.embedding = nn.Parameter(torch.tensor(embedding, dtype=torch.float32))  # copied: modified by training
             if kind == "code":
                 self.codes = nn.Parameter(0.01 * torch.randn(times, CODE, generator=generator))
             self.mlp = _network(self._inputs(embedding.shape[1]), HIDDEN[kind], generator)
 
     def _inputs(self, embedding: int) -> int:
+        """Number of network inputs."""
         return (
             embedding + 3 + {"code": CODE, "sun": TIME_FEATURES, "full": TIME_FEATURES + PHYSICAL_FEATURES}[self.kind]
         )
@@ -168,9 +243,23 @@ class Appearance(nn.Module):
     def forward(
         self, index: torch.Tensor, time: torch.Tensor, lights: LightTensors, code: torch.Tensor | None = None
     ) -> torch.Tensor:
-        """Colours ``(n, 3)`` of Gaussians ``index (n,)`` at ``time (n,)``, or all at one time ``()``.
+        """Compute the colours of Gaussians.
 
-        ``code (32,)`` takes the place of the codes of ``kind="code"``.
+        Parameters
+        ----------
+        index
+            ``(n,)`` Gaussians.
+        time
+            ``(n,)`` index of the light of each, or one for all ``()``.
+        lights
+            T light states.
+        code
+            ``(32,)``, replaces the codes of ``kind="code"``.
+
+        Returns
+        -------
+        torch.Tensor
+            ``(n, 3)`` colours, not negative.
         """
         season = lights.season[time]
         base = self.albedo[season, index] * self.log_colour[index].exp()
@@ -180,45 +269,60 @@ class Appearance(nn.Module):
             base = base * irradiance
         if self.kind == "physical":
             return base
-        known = lights.features[time] if self.kind != "code" else self.codes[time] if code is None else code
-        parts = [self.embedding[index], base, known.expand(len(index), -1), *features]
+        embedded_time = lights.features[time] if self.kind != "code" else self.codes[time] if code is None else code
+        parts = [self.embedding[index], base, embedded_time.expand(len(index), -1), *features]
         gamma, beta = self.mlp(torch.cat(parts, dim=1)).split(3, dim=1)
-        # Physics leaves little to add; without it β carries half of the picture.
+        # With physical shading β is a small correction; without it β is as large as the shaded colour.
         return ((1.0 + gamma) * base + (0.1 if self.kind == "full" else 1.0) * beta).clamp(min=0.0)
 
-    def _physical(self, index: torch.Tensor, time: torch.Tensor, lights: LightTensors):
-        """Irradiance ``(n, 3)`` and features for the network, each ``(n, k)``."""
+    def _physical(
+        self, index: torch.Tensor, time: torch.Tensor, lights: LightTensors
+    ) -> tuple[torch.Tensor, list[torch.Tensor]]:
+        """Relative irradiance ``(n, 3)`` and features for the network, each ``(n, k)``."""
         normals, gain = self.normals[index], self.log_gain[index].exp()
-        total, told = torch.zeros(len(index), 3), []
+        total, features = torch.zeros(len(index), 3), []
         for body in range(BODIES):
             direction, illuminance = lights.direction[time, body], lights.illuminance[time, body]
             if body and not bool(illuminance.any()):
                 continue
             cosine = (normals * direction).sum(1)
-            seen = self.visibility(index, direction) * cosine.clamp(min=0.0)
-            total = total + seen[:, None] * illuminance
+            visible_cosine = self.visibility(index, direction) * cosine.clamp(min=0.0)
+            total = total + visible_cosine[:, None] * illuminance
             if body == 0:
-                told = [seen[:, None], cosine[:, None]]
+                features = [visible_cosine[:, None], cosine[:, None]]
         if time.ndim:
             sky = torch.einsum("nr,nrc->nc", self.sky[index], lights.sky[time])
             bounce = torch.einsum("nk,nkc->nc", self.bounce[index], lights.bounce[time])
         else:
             sky, bounce = self.sky[index] @ lights.sky[time], self.bounce[index] @ lights.bounce[time]
         sky = sky.clamp(min=0.0) * gain[:, :1]
-        bounce = bounce.clamp(min=0.0) * self.around[lights.season[time], index] * gain[:, 1:]
-        told += [self.open_sky[index, None], sky[:, 1:2], bounce[:, 1:2], normals]
-        return total + sky + bounce, told
+        bounce = bounce.clamp(min=0.0) * self.neighbourhood_albedo[lights.season[time], index] * gain[:, 1:]
+        features += [self.open_sky[index, None], sky[:, 1:2], bounce[:, 1:2], normals]
+        return total + sky + bounce, features
 
     def visibility(self, index: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
-        """Share ``(n,)`` of each disc that a direction ``(3,)`` or directions ``(n, 3)`` reach."""
+        """Soft visibility of directions above the horizon of discs.
+
+        Parameters
+        ----------
+        index
+            ``(n,)`` Gaussians.
+        direction
+            ``(n, 3)`` unit vectors, ENU, or one for all ``(3,)``.
+
+        Returns
+        -------
+        torch.Tensor
+            ``(n,)`` in [0, 1].
+        """
         elevation = torch.asin(direction[..., 2].clamp(-1.0, 1.0))
-        turn = torch.atan2(direction[..., 0], direction[..., 1]) * (AZIMUTHS / (2.0 * np.pi))
-        column = torch.floor(turn)
-        share, first = turn - column, index * AZIMUTHS
+        position = torch.atan2(direction[..., 0], direction[..., 1]) * (AZIMUTHS / (2.0 * np.pi))
+        column = torch.floor(position)
+        fraction, first = position - column, index * AZIMUTHS
         column = column.long()
         left = self.horizon[first + column % AZIMUTHS].float()
         right = self.horizon[first + (column + 1) % AZIMUTHS].float()
-        angle = (left + (right - left) * share) * self.horizon_step + self.horizon_low
+        angle = (left + (right - left) * fraction) * self.horizon_step + self.horizon_low
         return torch.sigmoid((elevation - angle - self.shift[index]) / self.log_softness[index].exp())
 
 
@@ -238,7 +342,24 @@ def _network(inputs: int, width: int, generator: torch.Generator) -> nn.Sequenti
 def colours_at(
     appearance: Appearance, state: LightState, season: int = 0, *, code: torch.Tensor | None = None
 ) -> np.ndarray:
-    """Colours ``(N, 3)`` float32 of all Gaussians under a light; radiance is colour × ``state.global_lx`` / π."""
+    """Compute the colours of all Gaussians under a light.
+
+    Parameters
+    ----------
+    appearance
+        Of N Gaussians.
+    state
+        The light.
+    season
+        Index of the dated albedo.
+    code
+        ``(32,)``, replaces the codes of ``kind="code"``.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(N, 3)`` float32; radiance is colour × ``state.global_lx`` / π.
+    """
     lights, time = light_tensors([state], [season]), torch.zeros((), dtype=torch.long)
     count = appearance.albedo.shape[1]
     parts = [

@@ -1,7 +1,7 @@
-"""Gaussians for other programs: a baked 3DGS ``.ply``, a glTF, and the training views for other trainers.
+"""Export of Gaussians: baked 3DGS ``.ply``, glTF, and training views for other trainers.
 
-Other programs know no sun, so what goes out is one instant: display-referred sRGB colours as spherical harmonics of
-degree 0. Positions stay east-north-up metres.
+These formats have no light, so one instant is exported: display-referred sRGB colours as spherical harmonics of degree
+0. Positions are east-north-up [m].
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -29,8 +30,26 @@ _COLUMNS = ("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opac
 
 @dataclass(frozen=True)
 class BakedSplats:
-    """N Gaussians of one instant: ``means (N, 3)`` [m], ``quaternions (N, 4)`` wxyz, ``log_scales (N, 3)``,
-    ``opacity_logits (N,)`` and display-referred sRGB ``rgb (N, 3)`` in [0, 1], float32 each."""
+    """N Gaussians with the colours of one instant, float32.
+
+    Parameters
+    ----------
+    means
+        ``(N, 3)`` ENU [m].
+    quaternions
+        ``(N, 4)`` wxyz.
+    log_scales
+        ``(N, 3)`` natural logarithms of standard deviations [m].
+    opacity_logits
+        ``(N,)``.
+    rgb
+        ``(N, 3)`` display-referred sRGB in [0, 1].
+
+    Raises
+    ------
+    ValueError
+        If there is no Gaussian, or arrays differ in length or are not finite.
+    """
 
     means: np.ndarray
     quaternions: np.ndarray
@@ -38,17 +57,25 @@ class BakedSplats:
     opacity_logits: np.ndarray
     rgb: np.ndarray
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if len(self.means) == 0:
-            raise ValueError("BakedSplats: there is no Gaussian to write")
+            raise ValueError("BakedSplats: got no Gaussian, expected at least one")
         for name in self.__dataclass_fields__:
             values = getattr(self, name)
             if len(values) != len(self.means) or not np.isfinite(values).all():
-                raise ValueError(f"BakedSplats: {name} has another length than means, or values that are not finite")
+                raise ValueError(f"BakedSplats: {name} differs in length from means, or has values that are not finite")
 
 
 def write_ply(path: Path, splats: BakedSplats) -> None:
-    """The ``.ply`` of 3D Gaussian splatting, 68 bytes a splat: log scales, logit opacity, wxyz, f_dc = (rgb − ½) / Y₀₀."""
+    """Write a 3DGS ``.ply``, 68 bytes per splat: log scales, logit opacity, wxyz, f_dc = (rgb − ½) / Y₀₀.
+
+    Parameters
+    ----------
+    path
+        Output file, written atomically.
+    splats
+        Gaussians of one instant.
+    """
     table = np.zeros((len(splats.means), len(_COLUMNS)), "<f4")
     table[:, 0:3], table[:, 6:9] = splats.means, (splats.rgb - 0.5) / SH0
     table[:, 9], table[:, 10:13], table[:, 13:17] = splats.opacity_logits, splats.log_scales, splats.quaternions
@@ -66,7 +93,23 @@ def write_ply(path: Path, splats: BakedSplats) -> None:
 
 
 def read_ply(path: Path) -> BakedSplats:
-    """Read a 3DGS ``.ply`` of binary little-endian floats; harmonics above degree 0 are left out."""
+    """Read a 3DGS ``.ply`` of binary little-endian floats; harmonics above degree 0 are dropped.
+
+    Parameters
+    ----------
+    path
+        Input file.
+
+    Returns
+    -------
+    BakedSplats
+        Its Gaussians.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, truncated or of another format.
+    """
     try:
         data = Path(path).read_bytes()
     except FileNotFoundError:
@@ -95,10 +138,20 @@ def read_ply(path: Path) -> BakedSplats:
     )
 
 
-def write_gltf(path: Path, splats: BakedSplats, *, note: dict | None = None) -> None:
-    """A ``.glb`` with ``KHR_gaussian_splatting`` (Khronos release candidate of 2026): points for readers without it.
+def write_gltf(path: Path, splats: BakedSplats, *, note: dict[str, Any] | None = None) -> None:
+    """Write a ``.glb`` with ``KHR_gaussian_splatting`` (Khronos release candidate of 2026).
 
-    Scales are linear, opacity in [0, 1], quaternions xyzw; glTF has y up, to which a node turns the scene.
+    Readers without the extension display points. Scales are linear, opacity is in [0, 1], quaternions are xyzw; a node
+    rotates the scene to glTF's y-up axes.
+
+    Parameters
+    ----------
+    path
+        Output file, written atomically.
+    splats
+        Gaussians of one instant.
+    note
+        Plain values for the ``extras`` of the asset.
     """
     arrays = {
         "POSITION": splats.means,
@@ -159,35 +212,55 @@ def _linear(encoded: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class TrainingView:
-    """A picture that others may train on: its camera, file and time in ``view``, and the light it was taken in."""
+    """A training picture for other trainers.
+
+    Parameters
+    ----------
+    view
+        Camera, file and time.
+    light
+        Light of the picture.
+    """
 
     view: NamedView
     light: LightState
 
 
 def write_training_views(folder: Path, views: Sequence[TrainingView], splats: BakedSplats, frame: LocalFrame) -> None:
-    """``transforms.json`` (nerfstudio), ``sparse/0/*.txt`` (COLMAP) and ``points.ply`` for other trainers.
+    """Write ``transforms.json`` (nerfstudio), ``sparse/0/*.txt`` (COLMAP) and ``points.ply`` for other trainers.
 
-    Every frame of ``transforms.json`` tells ``timestamp_utc``, ``sun_enu`` (unit, towards the sun; absent by night),
-    ``sun_lx``, ``sky_lx`` and ``exposure`` (1 over the luminance of the horizontal illuminance [lx]); readers pass over
-    keys that they do not know. COLMAP's ``points3D.txt`` holds the discs' centres with their colours.
+    Every frame of ``transforms.json`` has ``timestamp_utc``, ``sun_enu`` (unit, towards the sun; absent by night),
+    ``sun_lx``, ``sky_lx`` and ``exposure`` (1 over the luminance of the horizontal illuminance [lx]); readers ignore
+    unknown keys. COLMAP's ``points3D.txt`` contains the centres of the discs with their colours.
+
+    Parameters
+    ----------
+    folder
+        Output folder.
+    views
+        Training pictures, each with a time.
+    splats
+        Initial Gaussians.
+    frame
+        Local frame of cameras and Gaussians.
 
     Raises
     ------
     ValueError
-        No view, or one without a time.
+        If there is no view, or a view has no time.
     """
     if not views:
-        raise ValueError("write_training_views: there is no view to write")
-    named = [each.view for each in views]
-    if any(view.time is None for view in named):
+        raise ValueError("write_training_views: no view to write")
+    named = [training_view.view for training_view in views]
+    times = [view.time for view in named if view.time is not None]
+    if len(times) != len(named):
         raise ValueError("write_training_views: a view has no time")
     write_transforms(folder / "transforms.json", named, frame)
     table = json.loads((folder / "transforms.json").read_text())
     table["ply_file_path"] = "points.ply"
-    for record, each in zip(table["frames"], views, strict=True):
-        light = each.light
-        record["timestamp_utc"] = each.view.time.astimezone(UTC).isoformat().replace("+00:00", "Z")
+    for record, time, training_view in zip(table["frames"], times, views, strict=True):
+        light = training_view.light
+        record["timestamp_utc"] = time.astimezone(UTC).isoformat().replace("+00:00", "Z")
         record |= {"sky_lx": light.sky_lx.tolist(), "exposure": 1.0 / light.global_lx, "day_of_year": light.day}
         if len(light.bodies[0]):
             record |= {"sun_enu": light.bodies[0][0].tolist(), "sun_lx": light.bodies[1][0].tolist()}

@@ -1,33 +1,45 @@
-"""What training is judged by: colours of (disc, time) pairs, and pictures through frozen weights."""
+"""Loss functions of training: colours of (disc, time) pairs, and pictures rendered with frozen splat weights."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
+from seasonscapes.errors import NoTerrainInView
 from seasonscapes.gaussians.appearance import Appearance, LightTensors
 from seasonscapes.gaussians.rasterise import ViewWeights
 
-# Relative squared error, but not of what is nearly black (Lehtinen et al. 2018, arXiv:1803.04189, § 3.2).
-_DARK = 0.02
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
+# Floor of the denominator of the relative squared error (Lehtinen et al. 2018, arXiv:1803.04189, § 3.2).
+_RELATIVE_FLOOR = 0.02
 
 
 @dataclass(frozen=True)
 class TrainingFrame:
-    """A picture to learn from: a path-traced view, or a painted one.
+    """A training picture: a path-traced view, or a painted one.
 
     Parameters
     ----------
     weights
         Of its camera, from `rasterise.view_weights`; frames of one camera share them.
     time
-        Its number among the lessons' times.
+        Index among the times of the training targets.
     image
-        ``(H, W, 3)`` colours as in `SurfaceTargets`, of the surface, before the air.
+        ``(H, W, 3)`` colours of the surface as in `SurfaceTargets`, before aerial perspective.
     mask
         ``(H, W)`` bool, True = usable.
+
+    Raises
+    ------
+    ValueError
+        If the sizes differ, or a usable pixel is not finite.
+    NoTerrainInView
+        If no splat or no usable pixel is in view.
     """
 
     weights: ViewWeights
@@ -35,52 +47,103 @@ class TrainingFrame:
     image: np.ndarray
     mask: np.ndarray
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.image.shape != (*self.mask.shape, 3) or self.mask.shape != (
             self.weights.height_px,
             self.weights.width_px,
         ):
-            raise ValueError(f"Frame: image {self.image.shape} and mask {self.mask.shape} do not fit the camera")
+            raise ValueError(
+                f"TrainingFrame: got image {self.image.shape} and mask {self.mask.shape}, "
+                f"expected the camera's {self.weights.height_px} × {self.weights.width_px} pixels"
+            )
         if not np.isfinite(self.image[self.mask]).all():
-            raise ValueError("Frame: the picture has usable pixels that are not finite")
+            raise ValueError("TrainingFrame: the picture has usable pixels that are not finite")
         if not self.mask.any() or self.weights.matrix.nnz == 0:
-            raise ValueError("Frame: no splat and no usable pixel in view; does the camera stand inside the mountain?")
+            raise NoTerrainInView(
+                "TrainingFrame: no splat or no usable pixel in view; the camera may be inside the mountain"
+            )
 
 
 def surface_loss(
     appearance: Appearance, lights: LightTensors, targets: torch.Tensor, batch: int, rng: np.random.Generator
 ) -> torch.Tensor:
-    """Relative squared error of random (disc, time) pairs: unbiased even where targets are noisy."""
+    """Relative squared error of random (disc, time) pairs; unbiased under noisy targets.
+
+    Parameters
+    ----------
+    appearance
+        Of N discs.
+    lights
+        T light states.
+    targets
+        ``(T, N, 3)`` colours.
+    batch
+        Number of pairs.
+    rng
+        Draws the pairs.
+
+    Returns
+    -------
+    torch.Tensor
+        Scalar loss.
+    """
     times, count, _ = targets.shape
     index = torch.as_tensor(rng.integers(0, count, batch))
     time = torch.as_tensor(rng.integers(0, times, batch))
     value = appearance(index, time, lights)
-    return ((value - targets[time, index]) ** 2 / (value.detach() ** 2 + _DARK)).mean()
+    return ((value - targets[time, index]) ** 2 / (value.detach() ** 2 + _RELATIVE_FLOOR)).mean()
 
 
 @dataclass(frozen=True)
 class TrainingPicture:
-    """A frame laid out for training: seen discs ``(n,)``, weights over them (rows sum to 1), and pixels in sRGB."""
+    """A frame prepared for training.
+
+    Parameters
+    ----------
+    discs
+        ``(n,)`` indices of the visible discs.
+    forward, backward
+        Weights ``(H W, n)`` of these discs in the pixels, rows sum to 1; and their transpose.
+    time
+        Index of the light, ``()``.
+    target
+        ``(H, W, 3)`` sRGB.
+    mask
+        ``(H, W)`` bool, True = usable and covered by splats.
+    """
 
     discs: torch.Tensor
-    forward: object
-    backward: object
+    forward: csr_array
+    backward: csr_array
     time: torch.Tensor
     target: torch.Tensor
     mask: torch.Tensor
 
 
 def training_picture(frame: TrainingFrame) -> TrainingPicture:
+    """Restrict a frame to its visible discs, normalise its weights and encode its pixels.
+
+    Parameters
+    ----------
+    frame
+        With frozen weights.
+
+    Returns
+    -------
+    TrainingPicture
+        Input of `picture_loss`.
+    """
     from scipy import sparse
 
     matrix = frame.weights.matrix
     discs = np.unique(matrix.indices)
-    number = np.zeros(matrix.shape[1], np.int32)
+    pixels, splats = matrix.shape  # pyright: ignore[reportGeneralTypeIssues]
+    number = np.zeros(splats, np.int32)
     number[discs] = np.arange(len(discs), dtype=np.int32)
     scale = 1.0 / np.maximum(frame.weights.coverage.ravel(), 1e-3)
     data = matrix.data * np.repeat(scale, np.diff(matrix.indptr))
     forward = sparse.csr_array(
-        (data.astype(np.float32), number[matrix.indices], matrix.indptr), shape=(matrix.shape[0], len(discs))
+        (data.astype(np.float32), number[matrix.indices], matrix.indptr), shape=(pixels, len(discs))
     )
     mask = torch.as_tensor(frame.mask & (frame.weights.coverage > 0.5))
     target = torch.where(mask[..., None], encoded(torch.as_tensor(np.nan_to_num(frame.image).astype(np.float32))), 0.0)
@@ -90,36 +153,75 @@ def training_picture(frame: TrainingFrame) -> TrainingPicture:
 
 
 class SparseProduct(torch.autograd.Function):
-    """A constant sparse matrix times a dense one; the transpose is given too, as it serves many steps."""
+    """Product of a constant sparse matrix and a dense one; the transpose is an argument because many steps reuse it."""
 
     @staticmethod
-    def forward(context, values: torch.Tensor, matrix, transpose) -> torch.Tensor:
+    def forward(context: Any, values: torch.Tensor, matrix: csr_array, transpose: csr_array) -> torch.Tensor:
+        """Return ``matrix @ values``, ``(m, C)``."""
         context.transpose = transpose
         return torch.from_numpy(matrix @ values.detach().numpy())
 
     @staticmethod
-    def backward(context, gradient: torch.Tensor):
+    def backward(context: Any, gradient: torch.Tensor) -> tuple[torch.Tensor, None, None]:
+        """Return the gradient with respect to ``values``, ``(n, C)``."""
         return torch.from_numpy(context.transpose @ gradient.contiguous().numpy()), None, None
 
 
 def encoded(linear: torch.Tensor) -> torch.Tensor:
-    """sRGB of linear values; brighter than 1 goes on along the same curve, so that it still has a slope."""
+    """Encode linear values as sRGB, extended along the same curve above 1 so that gradients do not vanish there.
+
+    Parameters
+    ----------
+    linear
+        ``(...)``; negative values are clipped.
+
+    Returns
+    -------
+    torch.Tensor
+        ``(...)``.
+    """
     linear = linear.clamp(min=0.0)
     return torch.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clamp(min=1e-4) ** (1.0 / 2.4) - 0.055)
 
 
 def picture_loss(appearance: Appearance, lights: LightTensors, picture: TrainingPicture) -> torch.Tensor:
-    """0.8 L1 + 0.2 D-SSIM of a frame in sRGB over its usable pixels."""
+    """0.8 L1 + 0.2 D-SSIM of a frame in sRGB over its usable pixels.
+
+    Parameters
+    ----------
+    appearance
+        Of N discs.
+    lights
+        T light states.
+    picture
+        From `training_picture`.
+
+    Returns
+    -------
+    torch.Tensor
+        Scalar loss.
+    """
     values = appearance(picture.discs, picture.time, lights)
     image = encoded(SparseProduct.apply(values, picture.forward, picture.backward)).reshape(picture.target.shape)
     image = torch.where(picture.mask[..., None], image, 0.0)
-    share = picture.mask.float().mean()
-    difference = (image - picture.target).abs().mean() / share
-    return 0.8 * difference + 0.2 * (1.0 - torch_ssim_map(image, picture.target)).mean() / share
+    usable_fraction = picture.mask.float().mean()
+    difference = (image - picture.target).abs().mean() / usable_fraction
+    return 0.8 * difference + 0.2 * (1.0 - torch_ssim_map(image, picture.target)).mean() / usable_fraction
 
 
 def torch_ssim_map(image: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
-    """Structural similarity ``(C, H, W)`` of pictures ``(H, W, C)`` (Wang et al. 2004, doi:10.1109/TIP.2003.819861)."""
+    """Structural similarity of two pictures (Wang et al. 2004, doi:10.1109/TIP.2003.819861).
+
+    Parameters
+    ----------
+    image, other
+        ``(H, W, C)`` in [0, 1].
+
+    Returns
+    -------
+    torch.Tensor
+        ``(C, H, W)``, 1 where equal.
+    """
     offset = torch.arange(11.0) - 5.0
     window = torch.exp(-(offset**2) / 4.5)
     window = window / window.sum()

@@ -1,14 +1,17 @@
-"""The Gaussian model: known geometry, traced transport, learned corrections. One record, one file.
+"""Relightable Gaussian model: known geometry, traced light transport, learned corrections; and its file format.
 
-A file holds about 100 bytes for each Gaussian. What follows from the grid is not stored: a disc's place in plan is its
-cell, its turn and size follow from its normal. Everything else is a byte where a byte is enough.
+A file takes about 100 bytes per Gaussian. Values that follow from the grid are not stored: the horizontal position of a
+disc is its cell, and its rotation and size follow from its normal. All other values are quantised, to one byte where
+possible.
 """
 
 from __future__ import annotations
 
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
+from typing import Any
 
 import numpy as np
 
@@ -21,13 +24,13 @@ from seasonscapes.images import atomic_path
 from seasonscapes.terrain.attributes import attributes_at
 
 FORMAT = "seasonscapes gaussians 1"
-# Learned numbers of each disc and the range that their bytes span; beyond it they are clipped.
+# Learned parameters of each disc and the range of their quantisation; values beyond it are clipped.
 _RANGES = {"log_colour": (-1.0, 1.0), "log_gain": (-2.0, 2.0), "shift": (-0.1, 0.1), "log_softness": (-6.2, -1.0)}
 
 
 @dataclass(frozen=True)
 class GaussianModel:
-    """N Gaussians on a terrain that can be lit for any instant.
+    """N Gaussians on a terrain that can be relit for any instant.
 
     Parameters
     ----------
@@ -40,24 +43,29 @@ class GaussianModel:
     opacity_logits
         ``(N,)`` float32.
     features
-        ``(N, D)`` float32 embedding; no column for a physical model.
+        ``(N, D)`` float32 embedding; D = 0 for a physical model.
     albedo
-        ``(M, N, 3)`` float32 at M dates.
+        ``(M, N, 3)`` float32 on M dates.
     days
-        ``(M,)`` days of the year of these, rising.
+        ``(M,)`` days of the year of these dates, rising.
     transport
-        What each disc knows of the land around it.
+        Light transport of the discs.
     appearance
-        Learned numbers: ``log_colour (N, 3)``, ``log_gain (N, 2)``, ``shift (N,)``, ``log_softness (N,)``, and the
+        Learned parameters: ``log_colour (N, 3)``, ``log_gain (N, 2)``, ``shift (N,)``, ``log_softness (N,)``, and the
         network's ``mlp.*``.
     kind
-        Which appearance, a name in `appearance.KINDS`.
+        Kind of appearance, a name in `appearance.KINDS`.
     plan, cell
-        The grid that the discs stand on, see `surfels.Surfels`.
+        Grid of the discs, see `surfels.Surfels`.
     frame
-        The local frame that positions are in.
+        Local frame of the positions.
     note
-        Plain values about how it was made.
+        Plain values that record how the model was made.
+
+    Raises
+    ------
+    ValueError
+        If array shapes do not agree, values are not finite, or the days do not rise.
     """
 
     means: np.ndarray
@@ -73,11 +81,11 @@ class GaussianModel:
     plan: SurfelGrid
     cell: np.ndarray
     frame: LocalFrame
-    note: dict = field(default_factory=dict)
+    note: dict[str, Any] = field(default_factory=dict)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         count = len(self.means)
-        wanted = {
+        expected = {
             "means": (count, 3),
             "quaternions": (count, 4),
             "log_scales": (count, 3),
@@ -85,7 +93,7 @@ class GaussianModel:
             "albedo": (len(self.days), count, 3),
             "cell": (count,),
         }
-        for name, shape in wanted.items():
+        for name, shape in expected.items():
             values = getattr(self, name)
             if values.shape != shape:
                 raise ValueError(f"GaussianModel: {name} has shape {values.shape}, expected {shape}")
@@ -95,25 +103,61 @@ class GaussianModel:
             raise ValueError(f"GaussianModel: days {self.days.tolist()} do not rise")
 
     def albedo_on(self, day: float) -> np.ndarray:
-        """Albedo ``(N, 3)`` of a day of the year; see `albedo.seasons.albedo_at`."""
+        """Interpolate the dated albedos to a day of the year; see `albedo.seasons.albedo_at`.
+
+        Parameters
+        ----------
+        day
+            Day of the year.
+
+        Returns
+        -------
+        numpy.ndarray
+            ``(N, 3)``.
+        """
         if len(self.days) == 1:
             return self.albedo[0]
-        ground = attributes_at(self.means, self.transport.normals, self.plan.spacing_m)
-        return albedo_at(self.albedo, self.days, day, ground)
+        attributes = attributes_at(self.means, self.transport.normals, self.plan.spacing_m)
+        return albedo_at(self.albedo, self.days, day, attributes)
 
 
 def model_from(
     surfels: Surfels,
     albedo: np.ndarray,
-    days,
+    days: Sequence[float] | np.ndarray,
     transport: DiscTransport,
     *,
     kind: str,
     frame: LocalFrame,
     appearance: dict[str, np.ndarray],
-    note: dict | None = None,
+    note: dict[str, Any] | None = None,
 ) -> GaussianModel:
-    """A model of discs, dated albedos ``(M, N, 3)`` and learned numbers, as `splat_view.learned_numbers` gives them."""
+    """Assemble a model from discs, dated albedos, transport and learned parameters.
+
+    Parameters
+    ----------
+    surfels
+        N discs.
+    albedo
+        ``(M, N, 3)`` on M dates.
+    days
+        ``(M,)`` days of the year of these dates, rising.
+    transport
+        Light transport of the discs.
+    kind
+        Kind of appearance, a name in `appearance.KINDS`.
+    frame
+        Local frame of the positions.
+    appearance
+        Learned parameters by name, from `splat_view.learned_numbers`.
+    note
+        Plain values that record how the model was made.
+
+    Returns
+    -------
+    GaussianModel
+        Relightable model.
+    """
     learned = dict(appearance)
     features = learned.pop("embedding", np.zeros((len(surfels.means), 0), np.float32))
     return GaussianModel(
@@ -134,55 +178,99 @@ def model_from(
     )
 
 
-def save_model(model: GaussianModel, path: str | os.PathLike) -> None:
-    """Write a model to one ``.safetensors`` file, packed, atomically."""
-    from safetensors.numpy import save_file
+def save_model(model: GaussianModel, path: str | os.PathLike[str]) -> None:
+    """Write a model to one packed ``.safetensors`` file, atomically.
 
-    tensors, facts = packed(model)
-    with atomic_path(path) as temporary:
-        save_file(
-            {name: np.ascontiguousarray(values) for name, values in tensors.items()},
-            temporary,
-            metadata={"format": FORMAT, "facts": json.dumps(facts)},
-        )
-
-
-def load_model(path: str | os.PathLike) -> GaussianModel:
-    """Read what `save_model` wrote; `InputError` where the file is missing or something else."""
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(os.fspath(path), "np") as file:
-            facts = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
-    except FileNotFoundError:
-        raise InputError(path, "no such file", cure="make one with `seasonscapes distill`") from None
-    except SafetensorError as error:
-        raise InputError(path, f"not a safetensors file: {error}") from None
-    if facts.get("format") != FORMAT:
-        raise InputError(path, "not a Gaussian model", got=str(facts.get("format")), expected=FORMAT)
-    return unpacked(tensors, json.loads(facts["facts"]))
-
-
-def packed(model: GaussianModel) -> tuple[dict[str, np.ndarray], dict]:
-    """A model's arrays in few bytes, and the plain values that bring them back.
+    Parameters
+    ----------
+    model
+        Model whose geometry follows from grid and normals.
+    path
+        Output file.
 
     Raises
     ------
     ValueError
-        Where the geometry is not what follows from grid and normals, and would be lost.
+        If the geometry does not follow from grid and normals, so that it would be lost.
+    """
+    from safetensors.numpy import save_file
+
+    tensors, header = packed(model)
+    with atomic_path(path) as temporary:
+        save_file(
+            {name: np.ascontiguousarray(values) for name, values in tensors.items()},
+            temporary,
+            metadata={"format": FORMAT, "facts": json.dumps(header)},
+        )
+
+
+def load_model(path: str | os.PathLike[str]) -> GaussianModel:
+    """Read a model written by `save_model`.
+
+    Parameters
+    ----------
+    path
+        ``.safetensors`` file.
+
+    Returns
+    -------
+    GaussianModel
+        Relightable model.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, or is no Gaussian model.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    where = os.fspath(path)
+    try:
+        with safe_open(where, "np") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+    except FileNotFoundError:
+        raise InputError(where, "no such file", cure="make one with `seasonscapes distill`") from None
+    except SafetensorError as error:
+        raise InputError(where, f"not a safetensors file: {error}") from None
+    if metadata.get("format") != FORMAT:
+        raise InputError(where, "not a Gaussian model", got=str(metadata.get("format")), expected=FORMAT)
+    return unpacked(tensors, json.loads(metadata["facts"]))
+
+
+def packed(model: GaussianModel) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Quantise the arrays of a model for storage.
+
+    Parameters
+    ----------
+    model
+        Model whose geometry follows from grid and normals.
+
+    Returns
+    -------
+    tensors
+        Arrays by name.
+    header
+        Plain values needed to restore them.
+
+    Raises
+    ------
+    ValueError
+        If the geometry does not follow from grid and normals, so that it would be lost.
     """
     shape = disc_shapes(model.transport.normals, model.plan.spacing_m)
     for name, expected in zip(("quaternions", "log_scales", "opacity_logits"), shape, strict=True):
         if not np.allclose(getattr(model, name), expected, atol=1e-3):
-            raise ValueError(f"save_model: {name} are not those of discs on the terrain; export a .ply instead")
-    taken = np.zeros(model.plan.columns * model.plan.rows, bool)
-    taken[model.cell] = True
+            raise ValueError(
+                f"save_model: {name} do not follow from the discs' grid and normals; export a .ply instead"
+            )
+    occupied = np.zeros(model.plan.columns * model.plan.rows, bool)
+    occupied[model.cell] = True
     low, high = float(model.means[:, 2].min()), float(model.means[:, 2].max())
     step = max(high - low, 1e-3) / 65535.0
     transport = model.transport
     tensors = {
-        "taken": np.packbits(taken),
+        "taken": np.packbits(occupied),
         "height": np.rint((model.means[:, 2] - low) / step).astype(np.uint16),
         "normal": octahedral(transport.normals),
         "roughness": np.rint(255.0 * np.clip(np.linalg.norm(transport.normals, axis=1), 0.0, 1.0)).astype(np.uint8),
@@ -195,8 +283,8 @@ def packed(model: GaussianModel) -> tuple[dict[str, np.ndarray], dict]:
     feature_scale = np.maximum(np.abs(model.features).max(axis=0, initial=0.0), 1e-9) / 127.0
     tensors["features"] = np.rint(model.features / feature_scale).astype(np.int8)
     for name, values in model.appearance.items():
-        tensors[f"appearance.{name}"] = _bytes(values, *_RANGES[name]) if name in _RANGES else values
-    facts = {
+        tensors[f"appearance.{name}"] = _quantised(values, *_RANGES[name]) if name in _RANGES else values
+    header = {
         "kind": model.kind,
         "days": model.days.tolist(),
         "height": [low, step],
@@ -206,12 +294,25 @@ def packed(model: GaussianModel) -> tuple[dict[str, np.ndarray], dict]:
         "patches": transport.patches,
         "feature_scale": feature_scale.tolist(),
     }
-    return tensors, facts
+    return tensors, header
 
 
-def unpacked(tensors: dict[str, np.ndarray], facts: dict) -> GaussianModel:
-    """The model of `packed` arrays."""
-    plan, (low, step) = SurfelGrid(**facts["plan"]), facts["height"]
+def unpacked(tensors: dict[str, np.ndarray], header: dict[str, Any]) -> GaussianModel:
+    """Restore a model from `packed` arrays.
+
+    Parameters
+    ----------
+    tensors
+        Arrays by name.
+    header
+        Plain values, both from `packed`.
+
+    Returns
+    -------
+    GaussianModel
+        The model, up to quantisation.
+    """
+    plan, (low, step) = SurfelGrid(**header["plan"]), header["height"]
     cell = np.flatnonzero(np.unpackbits(tensors["taken"])[: plan.columns * plan.rows]).astype(np.int32)
     row, column = np.divmod(cell, plan.columns)
     means = np.stack(
@@ -223,37 +324,48 @@ def unpacked(tensors: dict[str, np.ndarray], facts: dict) -> GaussianModel:
         axis=1,
     ).astype(np.float32)
     normals = from_octahedral(tensors["normal"]) * (tensors["roughness"][:, None] / np.float32(255.0))
-    held = {
+    stored = {
         item.name: tensors[f"transport.{item.name}"]
         for item in fields(DiscTransport)
         if f"transport.{item.name}" in tensors
     }
-    transport = DiscTransport(normals=normals, patches=facts["patches"], **held)
+    transport = DiscTransport(normals=normals, patches=header["patches"], **stored)
     appearance = {}
     for name, values in tensors.items():
         if name.startswith("appearance."):
             short = name.removeprefix("appearance.")
-            appearance[short] = _values(values, *_RANGES[short]) if short in _RANGES else values
-    features = tensors["features"] * np.array(facts["feature_scale"], np.float32)
+            appearance[short] = _dequantised(values, *_RANGES[short]) if short in _RANGES else values
+    features = tensors["features"] * np.array(header["feature_scale"], np.float32)
     albedo = ((tensors["albedo"] / np.float32(255.0)) ** 2).astype(np.float32)
     return GaussianModel(
         means,
         *disc_shapes(normals, plan.spacing_m),
         features,
         albedo,
-        np.array(facts["days"]),
+        np.array(header["days"]),
         transport,
         appearance,
-        facts["kind"],
+        header["kind"],
         plan,
         cell,
-        LocalFrame(**facts["frame"]),
-        facts["note"],
+        LocalFrame(**header["frame"]),
+        header["note"],
     )
 
 
 def bytes_each(model: GaussianModel) -> float:
-    """Bytes of the file for each Gaussian, one date of albedo counted, what all share left out."""
+    """Compute the storage per Gaussian, with one date of albedo and without shared arrays.
+
+    Parameters
+    ----------
+    model
+        Model whose geometry follows from grid and normals.
+
+    Returns
+    -------
+    float
+        Bytes per Gaussian.
+    """
     tensors, _ = packed(model)
     count = len(model.means)
     own = {
@@ -265,16 +377,27 @@ def bytes_each(model: GaussianModel) -> float:
     return sum(own.values()) / count
 
 
-def _bytes(values: np.ndarray, low: float, high: float) -> np.ndarray:
+def _quantised(values: np.ndarray, low: float, high: float) -> np.ndarray:
     return np.rint((np.clip(values, low, high) - low) * (255.0 / (high - low))).astype(np.uint8)
 
 
-def _values(levels: np.ndarray, low: float, high: float) -> np.ndarray:
+def _dequantised(levels: np.ndarray, low: float, high: float) -> np.ndarray:
     return (low + levels * np.float32((high - low) / 255.0)).astype(np.float32)
 
 
 def octahedral(direction: np.ndarray) -> np.ndarray:
-    """Directions ``(N, 3)`` of any length as ``(N, 2)`` int16 on an unfolded octahedron (Cigolle et al. 2014)."""
+    """Encode directions on an unfolded octahedron (Cigolle et al. 2014).
+
+    Parameters
+    ----------
+    direction
+        ``(N, 3)`` of any length.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(N, 2)`` int16.
+    """
     unit = direction / np.maximum(np.abs(direction).sum(axis=1, keepdims=True), 1e-30)
     flat = unit[:, :2]
     folded = (1.0 - np.abs(flat[:, ::-1])) * np.where(flat >= 0.0, 1.0, -1.0)
@@ -282,7 +405,18 @@ def octahedral(direction: np.ndarray) -> np.ndarray:
 
 
 def from_octahedral(code: np.ndarray) -> np.ndarray:
-    """Unit directions ``(N, 3)`` float32, the inverse of `octahedral`."""
+    """Decode directions encoded by `octahedral`.
+
+    Parameters
+    ----------
+    code
+        ``(N, 2)`` int16.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(N, 3)`` float32 unit vectors.
+    """
     flat = code.astype(np.float64) / 32767.0
     height = 1.0 - np.abs(flat).sum(axis=1)
     folded = (1.0 - np.abs(flat[:, ::-1])) * np.where(flat >= 0.0, 1.0, -1.0)

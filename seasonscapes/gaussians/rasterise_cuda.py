@@ -1,4 +1,4 @@
-"""The rasteriser on CUDA through gsplat (Apache-2.0), imported only when called."""
+"""Rasterisation on CUDA with gsplat (Apache-2.0), which is imported only when used."""
 
 from __future__ import annotations
 
@@ -12,24 +12,40 @@ from seasonscapes.gaussians.rasterise import NEAR_M, PIXEL_VARIANCE, Splats
 def rasterise_cuda(
     splats: Splats, colours: torch.Tensor, camera: Camera, *, pixel_variance: float = PIXEL_VARIANCE
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Picture ``(H, W, C)`` and coverage ``(H, W)`` on the GPU, as `rasterise.rasterise`; differentiable.
+    """Blend colours front to back over black on the GPU, as `rasterise.rasterise`; differentiable.
+
+    Parameters
+    ----------
+    splats
+        N Gaussians.
+    colours
+        ``(N, C)``.
+    camera
+        The view.
+    pixel_variance
+        Variance added to each splat [px²].
+
+    Returns
+    -------
+    tuple of torch.Tensor
+        Picture ``(H, W, C)`` and coverage ``(H, W)``, on the GPU.
 
     Raises
     ------
     InputError
-        Without a CUDA device, or without gsplat.
+        If there is no CUDA device, or gsplat is not installed.
     """
     if not torch.cuda.is_available():
         raise InputError("--device", "no CUDA device found", got="cuda", cure="use --device cpu")
     try:
-        from gsplat import rasterization
+        from gsplat import rasterization  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise InputError(
             "--device", "the CUDA rasteriser needs gsplat", got="cuda", cure="pip install gsplat, or use --device cpu"
         ) from None
     device = torch.device("cuda")
     pose = torch.as_tensor(camera.world_from_camera, dtype=torch.float64)
-    # Positions relative to the camera keep their centimetres in float32, kilometres from the origin.
+    # Relative to the camera, because float32 loses centimetres some kilometres from the origin.
     means = (splats.means.double() - pose[:3, 3].to(splats.means.device)).float().to(device)
     view = torch.eye(4, device=device)
     view[:3, :3] = pose[:3, :3].T.float()

@@ -1,4 +1,4 @@
-"""A picture of a Gaussian model at an instant: colours for its light, splats, the air in between, the sky behind."""
+"""Rendering of a Gaussian model at an instant: colours under its light, splatting, aerial perspective, and sky."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from seasonscapes.cameras.pinhole import Camera, ray_directions
+from seasonscapes.errors import NoTerrainInView
 from seasonscapes.gaussians.appearance import Appearance, colours_at, fourier_embedding
 from seasonscapes.gaussians.disc_transport import LightState, light_state, neighbourhood_mean
 from seasonscapes.gaussians.model import GaussianModel
@@ -27,9 +28,9 @@ from seasonscapes.rendering.backend import use_backend
 from seasonscapes.rendering.splatting import DeviceSplats, SplatLimits, finer_camera, splat_layers, upload_splats
 from seasonscapes.sky.illumination import AerialPerspective, Illumination
 
-# Coverage from which a pixel counts as all terrain.
+# Coverage from which on a pixel is treated as entirely terrain.
 SOLID = 0.85
-NOTHING_IN_VIEW = "the camera sees no Gaussian; does it look away, or stand inside the mountain?"
+NOTHING_IN_VIEW = "no Gaussian in the camera's view; it may face away from the terrain or be inside the mountain"
 CUTS = SplatLimits(ALPHA_CUT, ALPHA_MOST, PIXEL_VARIANCE, NEAR_M, one_sided=True)
 
 
@@ -40,13 +41,13 @@ class SplatView:
     Parameters
     ----------
     radiance
-        ``(H, W, 3)`` [cd/m²]: splats through the air over the sky.
+        ``(H, W, 3)`` [cd/m²] at the camera: terrain with aerial perspective, over the sky.
     surface
-        ``(H, W, 3)`` radiance of the terrain before the air, weighted by ``coverage``.
+        ``(H, W, 3)`` [cd/m²] radiance of the terrain before aerial perspective, weighted by ``coverage``.
     coverage
-        ``(H, W)``.
+        ``(H, W)`` fraction of each pixel that is terrain.
     depth
-        ``(H, W)`` mean distance of what is seen along the ray [m]; infinite where nothing is.
+        ``(H, W)`` mean distance of the splats along the ray [m]; infinite where there are none.
     """
 
     radiance: np.ndarray
@@ -56,20 +57,28 @@ class SplatView:
 
 
 def appearance_of(model: GaussianModel, *, albedo: np.ndarray | None = None, seed: int = 0) -> Appearance:
-    """The model's appearance as a torch module, ready to colour or to train on.
+    """Restore the appearance of a model as a torch module.
 
     Parameters
     ----------
+    model
+        Relightable model.
     albedo
-        ``(N, 3)`` to use in place of the model's own dates, such as `GaussianModel.albedo_on` gives.
+        ``(N, 3)`` in place of the model's dated albedos, for example from `GaussianModel.albedo_on`.
+    seed
+        Of network weights that the model does not contain.
+
+    Returns
+    -------
+    Appearance
+        With the model's learned parameters.
     """
-    own = model.albedo if albedo is None else albedo[None]
-    around = np.stack([neighbourhood_mean(model.means, one, model.plan.spacing_m) for one in own])
+    dated = model.albedo if albedo is None else albedo[None]
+    surroundings = np.stack([neighbourhood_mean(model.means, values, model.plan.spacing_m) for values in dated])
     embedding = model.features if model.features.shape[1] else fourier_embedding(model.means)
     codes = model.appearance.get("codes")
-    appearance = Appearance(
-        model.kind, own, around, model.transport, embedding, seed=seed, times=1 if codes is None else len(codes)
-    )
+    times = 1 if codes is None else len(codes)
+    appearance = Appearance(model.kind, dated, surroundings, model.transport, embedding, seed=seed, times=times)
     for name, parameter in appearance.named_parameters():
         if name != "embedding" and name in model.appearance:
             parameter.data.copy_(torch.as_tensor(model.appearance[name]))
@@ -77,41 +86,97 @@ def appearance_of(model: GaussianModel, *, albedo: np.ndarray | None = None, see
 
 
 def learned_numbers(appearance: Appearance) -> dict[str, np.ndarray]:
-    """Everything that training may have changed, by name, as numpy; see `model.model_from`."""
+    """Copy the trainable parameters of an appearance to numpy, for `model.model_from`.
+
+    Parameters
+    ----------
+    appearance
+        Trained module.
+
+    Returns
+    -------
+    dict
+        Arrays by parameter name.
+    """
     return {name: parameter.detach().numpy().copy() for name, parameter in appearance.named_parameters()}
 
 
 def model_colours(model: GaussianModel, illumination: Illumination, day: float) -> tuple[np.ndarray, LightState]:
-    """Colours ``(N, 3)`` of a light on a day of the year, and its state: radiance is colour × ``global_lx`` / π.
+    """Compute the colours of all Gaussians under a light.
+
+    Parameters
+    ----------
+    model
+        Relightable model of N Gaussians.
+    illumination
+        Sun, moon and sky.
+    day
+        Day of the year, for the albedo.
+
+    Returns
+    -------
+    tuple of (numpy.ndarray, LightState)
+        Colours ``(N, 3)`` and the light's state; radiance is colour × ``global_lx`` / π [cd/m²].
 
     Raises
     ------
     ValueError
-        A dark light; a model of free codes, which knows no other instants than its own.
+        If the light is dark, or the model has free codes, which are defined at its training times only.
     """
     if model.kind == "code":
-        raise ValueError("a model of free codes cannot be lit for another instant")
+        raise ValueError("model_colours: a model with free codes cannot be relit for another instant")
     state = light_state(model.transport, illumination, day)
     return colours_at(appearance_of(model, albedo=model.albedo_on(day)), state), state
 
 
-def splats_of(model: GaussianModel, *, seen_from: np.ndarray | None = None) -> Splats:
-    """The model's geometry as tensors; from a place ``(3,)``, discs that show it their backs are made transparent.
+def splats_of(model: GaussianModel, *, viewpoint_m: np.ndarray | None = None) -> Splats:
+    """Return the geometry of a model as tensors, with back-face culling.
 
-    A terrain's back is inside the mountain: what faces away is hidden by what does not, and need not be drawn.
+    Parameters
+    ----------
+    model
+        N Gaussians.
+    viewpoint_m
+        ``(3,)`` position of a camera, ENU [m]: discs that face away from it become transparent, as they are hidden
+        inside the mountain. If omitted, all discs are kept.
+
+    Returns
+    -------
+    Splats
+        float32 tensors.
     """
     logits = model.opacity_logits
-    if seen_from is not None:
-        away = np.einsum("nc,nc->n", model.means - seen_from.astype(np.float32), model.transport.normals) > 0.0
-        logits = np.where(away, np.float32(-20.0), logits)
+    if viewpoint_m is not None:
+        facing_away = np.einsum("nc,nc->n", model.means - viewpoint_m.astype(np.float32), model.transport.normals) > 0.0
+        logits = np.where(facing_away, np.float32(-20.0), logits)
     return splats_from(model.means, model.quaternions, model.log_scales, logits)
 
 
 def model_weights(model: GaussianModel, camera: Camera, *, subpixels: int = 2) -> ViewWeights:
-    """Weights of a camera, for any light; `ValueError` where no Gaussian is in view."""
-    weights = view_weights(splats_of(model, seen_from=camera.position_m), camera, subpixels=subpixels)
+    """Compute the blending weights of a camera, valid for any light.
+
+    Parameters
+    ----------
+    model
+        N Gaussians.
+    camera
+        The view.
+    subpixels
+        Samples along a pixel's side.
+
+    Returns
+    -------
+    ViewWeights
+        ``(H W, N)``.
+
+    Raises
+    ------
+    NoTerrainInView
+        If no Gaussian is in view.
+    """
+    weights = view_weights(splats_of(model, viewpoint_m=camera.position_m), camera, subpixels=subpixels)
     if weights.matrix.nnz == 0:
-        raise ValueError(NOTHING_IN_VIEW)
+        raise NoTerrainInView(NOTHING_IN_VIEW)
     return weights
 
 
@@ -126,30 +191,50 @@ def render_model(
     subpixels: int = 2,
     device: str = "cpu",
 ) -> SplatView:
-    """The model seen by a camera under a light.
+    """Render a Gaussian model for a camera under a light.
 
     Parameters
     ----------
+    model
+        Relightable model.
+    camera
+        The view.
+    illumination
+        Sun, moon, sky and aerial perspective.
     day
-        Of the year, for the season.
+        Day of the year, for the albedo.
     weights, colours
-        From `model_weights` and `model_colours`, where one of them serves many pictures.
+        From `model_weights` and `model_colours`, if one of them is reused for many pictures.
     subpixels
-        Samples along a pixel's side, where ``weights`` are not given.
+        Samples along a pixel's side, if ``weights`` are not given.
     device
-        ``cpu``, or ``cuda`` through gsplat.
+        ``cpu``, or ``cuda`` with gsplat.
+
+    Returns
+    -------
+    SplatView
+        Radiance, surface radiance, coverage and depth.
+
+    Raises
+    ------
+    NoTerrainInView
+        If no Gaussian is in view.
+    ValueError
+        If the light is dark, or the model has free codes.
+    InputError
+        If CUDA is requested but not available.
     """
     values, state = colours or model_colours(model, illumination, day)
     distance = np.linalg.norm(model.means - camera.position_m.astype(np.float32), axis=1)
     layers = np.concatenate([values * np.float32(state.global_lx / np.pi), distance[:, None]], axis=1)
     if weights is not None:
-        drawn, covered = splat_colours(weights, layers), weights.coverage
+        blended, coverage = splat_colours(weights, layers), weights.coverage
     else:
-        drawn, covered = draw_layers(model, camera, layers, subpixels=subpixels, device=device)
-    # Discs meet with gaps of a few hundredths between them; the sky must not shine through a mountain.
-    solid = np.clip(covered / SOLID, 0.0, 1.0)
-    mean = drawn / np.maximum(covered, 1e-6)[..., None]
-    depth = np.where(covered > 1e-3, mean[..., 3], np.inf)
+        blended, coverage = draw_layers(model, camera, layers, subpixels=subpixels, device=device)
+    # Neighbouring discs leave gaps of a few per cent, through which the sky must not shine.
+    solid = np.clip(coverage / SOLID, 0.0, 1.0)
+    mean = blended / np.maximum(coverage, 1e-6)[..., None]
+    depth = np.where(coverage > 1e-3, mean[..., 3], np.inf)
     surface = mean[..., :3] * solid[..., None]
     radiance = composite_with_air(camera, illumination, surface, solid, depth)
     return SplatView(radiance, surface.astype(np.float32), solid.astype(np.float32), depth.astype(np.float32))
@@ -158,35 +243,67 @@ def render_model(
 def draw_layers(
     model: GaussianModel, camera: Camera, layers: np.ndarray, *, subpixels: int = 1, device: str = "cpu"
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Blend layers ``(N, C)`` of the Gaussians: picture ``(H, W, C)`` and coverage ``(H, W)``, the quickest way there is.
+    """Blend layers of the Gaussians with the fastest rasteriser of a device.
 
-    ``cpu`` goes through the renderer's vector units (`rendering.splatting`), or through torch where it has none.
+    ``cpu`` uses the renderer's vectorised backend (`rendering.splatting`), or torch on the scalar variant.
+
+    Parameters
+    ----------
+    model
+        N Gaussians.
+    camera
+        The view.
+    layers
+        ``(N, C)`` values to blend.
+    subpixels
+        Samples along a pixel's side; not used on CUDA.
+    device
+        ``cpu``, or ``cuda`` with gsplat.
+
+    Returns
+    -------
+    tuple of numpy.ndarray
+        Picture ``(H, W, C)``, blended over zero, and coverage ``(H, W)``.
 
     Raises
     ------
-    ValueError
-        Where no Gaussian is in view.
+    NoTerrainInView
+        If no Gaussian is in view.
+    InputError
+        If CUDA is requested but not available.
     """
     if device == "cuda":
         from seasonscapes.gaussians.rasterise_cuda import rasterise_cuda
 
-        drawn, covered = rasterise_cuda(splats_of(model, seen_from=camera.position_m), torch.from_numpy(layers), camera)
-        drawn, covered = drawn.detach().cpu().numpy(), covered.detach().cpu().numpy()
+        splats = splats_of(model, viewpoint_m=camera.position_m)
+        cuda_picture, cuda_coverage = rasterise_cuda(splats, torch.from_numpy(layers), camera)
+        blended, coverage = cuda_picture.detach().cpu().numpy(), cuda_coverage.detach().cpu().numpy()
     elif use_backend().device == "scalar":
         weights = model_weights(model, camera, subpixels=subpixels)
-        drawn, covered = splat_colours(weights, layers), weights.coverage
+        blended, coverage = splat_colours(weights, layers), weights.coverage
     else:
         fine = finer_camera(camera, subpixels)
-        drawn, covered = splat_layers(upload_model(model), layers, fine, CUTS)
+        blended, coverage = splat_layers(upload_model(model), layers, fine, CUTS)
         shape = (camera.height_px, subpixels, camera.width_px, subpixels)
-        drawn, covered = drawn.reshape(*shape, -1).mean((1, 3)), covered.reshape(shape).mean((1, 3))
-    if not covered.any():
-        raise ValueError(NOTHING_IN_VIEW)
-    return drawn, covered
+        blended, coverage = blended.reshape(*shape, -1).mean((1, 3)), coverage.reshape(shape).mean((1, 3))
+    if not coverage.any():
+        raise NoTerrainInView(NOTHING_IN_VIEW)
+    return blended, coverage
 
 
 def upload_model(model: GaussianModel) -> DeviceSplats:
-    """The model's geometry on the renderer's device, for `rendering.splatting.splat_layers`."""
+    """Copy the geometry of a model to the rendering device.
+
+    Parameters
+    ----------
+    model
+        N Gaussians.
+
+    Returns
+    -------
+    rendering.splatting.DeviceSplats
+        Input of `rendering.splatting.splat_layers`.
+    """
     splats = splats_of(model)
     axes = rotations(splats.quaternions) * splats.log_scales.exp()[:, None, :]
     return upload_splats(model.means, axes.numpy(), torch.sigmoid(splats.opacity_logits).numpy())
@@ -195,31 +312,50 @@ def upload_model(model: GaussianModel) -> DeviceSplats:
 def composite_with_air(
     camera: Camera, illumination: Illumination, surface: np.ndarray, coverage: np.ndarray, depth: np.ndarray
 ) -> np.ndarray:
-    """Radiance ``(H, W, 3)`` at the camera: the surface through the air of its distance, and the open sky behind."""
+    """Apply aerial perspective to a surface and composite it over the open sky.
+
+    Parameters
+    ----------
+    camera
+        The view.
+    illumination
+        Sky, sun, moon, and optionally aerial perspective.
+    surface
+        ``(H, W, 3)`` radiance before aerial perspective, weighted by coverage [cd/m²].
+    coverage
+        ``(H, W)``.
+    depth
+        ``(H, W)`` distance along the ray [m]; infinite where there is no terrain.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(H, W, 3)`` float32 radiance at the camera [cd/m²].
+    """
     from seasonscapes.rendering.air_grid import open_sky, sky_grid
 
     image = surface.reshape(-1, 3).astype(np.float32)
-    cover = coverage.ravel()
-    shown = np.flatnonzero((cover > 0.0) & np.isfinite(depth.ravel()))
-    if illumination.aerial_perspective is not None and len(shown):
-        transmittance, airlight = _air(camera, illumination.aerial_perspective, shown, depth.ravel()[shown])
-        image[shown] = image[shown] * transmittance + airlight * cover[shown, None]
-    hole = np.flatnonzero(cover < 1.0)
-    if len(hole):
-        sky = open_sky(sky_grid(camera, hole), illumination, float(np.degrees(1.0 / camera.fx)))
-        image[hole] += (1.0 - cover[hole, None]) * sky
+    flat_coverage = coverage.ravel()
+    terrain = np.flatnonzero((flat_coverage > 0.0) & np.isfinite(depth.ravel()))
+    if illumination.aerial_perspective is not None and len(terrain):
+        transmittance, airlight = _air(camera, illumination.aerial_perspective, terrain, depth.ravel()[terrain])
+        image[terrain] = image[terrain] * transmittance + airlight * flat_coverage[terrain, None]
+    open_pixels = np.flatnonzero(flat_coverage < 1.0)
+    if len(open_pixels):
+        sky = open_sky(sky_grid(camera, open_pixels), illumination, float(np.degrees(1.0 / camera.fx)))
+        image[open_pixels] += (1.0 - flat_coverage[open_pixels, None]) * sky
     return image.reshape(surface.shape)
 
 
 def _air(
     camera: Camera, air: AerialPerspective, pixel: np.ndarray, depth_m: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Transmittance and airlight ``(n, 3)`` of pixels: from a coarse grid, or one by one where there are no lanes."""
+    """Transmittance and airlight ``(n, 3)`` of pixels: from a coarse grid, or pixel by pixel on the scalar variant."""
     from seasonscapes.rendering.air_grid import air_at, air_places
 
     if use_backend().device == "scalar":
         row, column = np.divmod(pixel, camera.width_px)
         transmittance, airlight = air(depth_m, ray_directions(camera, np.stack([column, row], axis=-1) + 0.5))
         return np.asarray(transmittance, np.float32), np.asarray(airlight, np.float32)
-    none = (np.zeros(0, np.int64), np.zeros((0, 1), np.float32))
-    return air_at(air_places(camera, pixel, depth_m, none), air)
+    no_mixed_pixels = (np.zeros(0, np.int64), np.zeros((0, 1), np.float32))
+    return air_at(air_places(camera, pixel, depth_m, no_mixed_pixels), air)

@@ -1,7 +1,7 @@
-"""Discs on the terrain: where the Gaussians lie, how they are turned, how large they are, and what colour is under them.
+"""Surfels (discs) on the terrain: positions, rotations and sizes of the Gaussians, and the albedo of their cells.
 
-The geometry is known, so it is not learned: one disc for each cell of a square plan, lying on the surface, stretched
-along the slope so that steep faces have no holes.
+The geometry is known and therefore not learned: one disc per cell of a horizontal grid, tangent to the surface and
+elongated along the slope so that steep faces have no holes.
 """
 
 from __future__ import annotations
@@ -14,20 +14,31 @@ from seasonscapes.terrain.attributes import vertex_normals
 from seasonscapes.terrain.surface import Terrain, sample_texture
 from seasonscapes.terrain.texels import barycentric, texel_coordinates, texel_positions
 
-# Standard deviations along the surface over the discs' distance. Below 0.5 holes open; above 0.55 the picture blurs.
+# Standard deviation along the surface, relative to the grid spacing. Below 0.5 holes open; above 0.55 the picture blurs.
 SIGMA = 0.52
-# Thickness over the distance: 3DGS readers refuse a zero, and a thick disc smears along grazing views.
+# Standard deviation along the normal, relative to the spacing: 3DGS readers reject zero, and thick discs smear at grazing
+# angles.
 THICKNESS = 0.03
 OPACITY = 0.995
-# Cliffs steeper than about 80° would need discs longer than the plan can tell.
+# Limit of the elongation, reached on cliffs steeper than about 80°.
 _MAX_STRETCH = 5.0
-# Places in each cell, a square, that albedo, normal and light are averaged over.
+# Sample points along a cell's side, over which albedo, normal and light are averaged.
 SUBCELLS = 4
 
 
 @dataclass(frozen=True)
 class SurfelGrid:
-    """The grid of cells that discs stand for: north-west corner and size of a cell [m], columns and rows."""
+    """Horizontal grid of the cells of discs.
+
+    Parameters
+    ----------
+    west_m, north_m
+        North-west corner, ENU [m].
+    east_step_m, north_step_m
+        Size of a cell [m].
+    columns, rows
+        Number of cells.
+    """
 
     west_m: float
     north_m: float
@@ -38,7 +49,7 @@ class SurfelGrid:
 
     @property
     def spacing_m(self) -> float:
-        """Mean distance of neighbours."""
+        """Mean distance of neighbouring discs [m]."""
         return 0.5 * (self.east_step_m + self.north_step_m)
 
 
@@ -53,17 +64,17 @@ class Surfels:
     means
         ``(N, 3)`` float32 ENU [m].
     quaternions
-        ``(N, 4)`` float32 wxyz; turn the disc's own axes (down the slope, across it, normal) into ENU.
+        ``(N, 4)`` float32 wxyz; rotate the axes of the disc (down the slope, across it, normal) to ENU.
     log_scales
         ``(N, 3)`` float32, natural logarithms of standard deviations [m] along these axes.
     opacity_logits
         ``(N,)`` float32.
     normals
-        ``(N, 3)`` float32 mean of the surface's shading normals over the cell; its length is below 1 where it is rough.
+        ``(N, 3)`` float32 mean shading normal over the cell; its length is below 1 where the surface is rough.
     places
-        ``(N, S, 3)`` float32 points of each cell on the surface [m].
+        ``(N, S, 3)`` float32 sample points of each cell on the surface, ENU [m].
     uv
-        ``(N, S, 2)`` float32 atlas coordinates of the places.
+        ``(N, S, 2)`` float32 atlas coordinates of the sample points.
     """
 
     plan: SurfelGrid
@@ -84,21 +95,28 @@ def terrain_surfels(
     bounds_m: tuple[float, float, float, float] | None = None,
     normals: np.ndarray | None = None,
 ) -> Surfels:
-    """One disc for each cell of a square plan that the terrain covers entirely.
+    """Make one disc for each cell of a horizontal grid that is completely covered by terrain.
 
     Parameters
     ----------
+    terrain
+        Mesh with texture coordinates.
     spacing_m
-        Side of a cell [m]; about one pixel on the ground is where the picture stops gaining.
+        Side of a cell [m]; below about the size of one pixel on the ground the picture does not improve.
     bounds_m
-        West, south, east and north end of the plan; the terrain's own when left out.
+        West, south, east and north end of the grid [m]; the extent of the terrain if omitted.
     normals
-        ``(V, 3)`` from `vertex_normals`, where many plans of one terrain are made.
+        ``(V, 3)`` from `vertex_normals`, if several grids are made on one terrain.
+
+    Returns
+    -------
+    Surfels
+        N discs.
 
     Raises
     ------
     ValueError
-        A spacing that is not positive, or a plan that holds no cell on the terrain.
+        If the spacing is not positive or exceeds the grid, or the terrain covers no cell.
     """
     if not spacing_m > 0.0:
         raise ValueError(f"spacing_m: got {spacing_m}, expected a positive distance")
@@ -106,7 +124,9 @@ def terrain_surfels(
     west, south, east, north = bounds_m or (*corners.min(axis=0), *corners.max(axis=0))
     columns, rows = round(float(east - west) / spacing_m), round(float(north - south) / spacing_m)
     if min(columns, rows) < 1:
-        raise ValueError(f"spacing_m: got {spacing_m}, but the plan is {min(east - west, north - south):.0f} m wide")
+        raise ValueError(
+            f"spacing_m: got {spacing_m}, expected at most the grid's width of {min(east - west, north - south):.0f} m"
+        )
     plan = SurfelGrid(
         float(west), float(north), float(east - west) / columns, float(north - south) / rows, columns, rows
     )
@@ -114,7 +134,9 @@ def terrain_surfels(
     positions, normals, uv = _cells(_within(terrain, (west, south, east, north)), plan, normals)
     whole = np.isfinite(positions).all(axis=(1, 2))
     if not whole.any():
-        raise ValueError("terrain_surfels: the terrain covers no cell")
+        raise ValueError(
+            "terrain_surfels: the terrain covers no cell completely; use a smaller spacing or other bounds"
+        )
     positions, normals, uv = positions[whole], normals[whole], uv[whole]
     means = positions.mean(axis=1, dtype=np.float64).astype(np.float32)
     mean_normal = normals.mean(axis=1)
@@ -125,15 +147,28 @@ def terrain_surfels(
 
 
 def _within(terrain: Terrain, bounds_m: tuple[float, float, float, float]) -> Terrain:
-    """The faces of a terrain whose boxes meet a rectangle, with all vertices (so that their normals stay)."""
+    """Restrict a terrain to faces whose bounding boxes intersect a rectangle; vertices and their order are kept."""
     west, south, east, north = bounds_m
     x, y = terrain.vertices[:, 0][terrain.faces], terrain.vertices[:, 1][terrain.faces]
-    meet = (x.max(1) >= west) & (x.min(1) <= east) & (y.max(1) >= south) & (y.min(1) <= north)
-    return terrain if meet.all() else replace(terrain, faces=terrain.faces[meet])
+    inside = (x.max(1) >= west) & (x.min(1) <= east) & (y.max(1) >= south) & (y.min(1) <= north)
+    return terrain if inside.all() else replace(terrain, faces=terrain.faces[inside])
 
 
 def disc_shapes(normals: np.ndarray, spacing_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Quaternions, logarithms of scales and opacity logits of discs that lie on a surface with normals ``(N, 3)``."""
+    """Compute the shapes of discs tangent to a surface.
+
+    Parameters
+    ----------
+    normals
+        ``(N, 3)`` of any length, ENU.
+    spacing_m
+        Mean distance of neighbouring discs [m].
+
+    Returns
+    -------
+    tuple of numpy.ndarray
+        Quaternions ``(N, 4)`` wxyz, log scales ``(N, 3)`` and opacity logits ``(N,)``, float32.
+    """
     axes, stretch = _disc_axes(normals)
     scales = np.stack([SIGMA * stretch, np.full(len(stretch), SIGMA), np.full(len(stretch), THICKNESS)], axis=1)
     logit = np.log(OPACITY / (1.0 - OPACITY))
@@ -145,21 +180,21 @@ def disc_shapes(normals: np.ndarray, spacing_m: float) -> tuple[np.ndarray, np.n
 
 
 def _cells(terrain: Terrain, plan: SurfelGrid, at_vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Positions, normals and atlas coordinates ``(cells, S, ...)`` of places in a plan's cells; NaN off the terrain."""
+    """Positions, normals and atlas coordinates ``(cells, S, ...)`` of the cells' sample points; NaN off the terrain."""
     width, height = plan.columns, plan.rows
     low = np.array([plan.west_m, plan.north_m - height * plan.north_step_m])
     flat = (terrain.vertices[:, :2] - low) / [width * plan.east_step_m, height * plan.north_step_m]
-    above = replace(terrain, uv=flat)
+    top_down = replace(terrain, uv=flat)
     columns, rows = width * SUBCELLS, height * SUBCELLS
-    positions, face_id = texel_positions(above, columns, rows)
+    positions, face_id = texel_positions(top_down, columns, rows)
     normals, uv = np.zeros((rows * columns, 3), np.float32), np.zeros((rows * columns, 2), np.float32)
     covered = np.flatnonzero(face_id >= 0)
     corners = terrain.faces[face_id.ravel()[covered]]
     centre = np.stack([covered % columns, covered // columns], axis=-1) + 0.5
-    share = barycentric(texel_coordinates(flat, columns, rows)[corners], centre)
-    normal = np.einsum("nk,nkc->nc", share, at_vertices[corners])
+    weights = barycentric(texel_coordinates(flat, columns, rows)[corners], centre)
+    normal = np.einsum("nk,nkc->nc", weights, at_vertices[corners])
     normals[covered] = normal / np.linalg.norm(normal, axis=1, keepdims=True)
-    uv[covered] = np.einsum("nk,nkc->nc", share, terrain.uv[corners])
+    uv[covered] = np.einsum("nk,nkc->nc", weights, terrain.uv[corners])
 
     def by_cell(values: np.ndarray) -> np.ndarray:
         split = values.reshape(height, SUBCELLS, width, SUBCELLS, -1).swapaxes(1, 2)
@@ -169,7 +204,7 @@ def _cells(terrain: Terrain, plan: SurfelGrid, at_vertices: np.ndarray) -> tuple
 
 
 def _disc_axes(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Axes of discs as columns ``(N, 3, 3)`` (down the slope, across it, normal) and stretch along the slope ``(N,)``."""
+    """Axes of discs as columns ``(N, 3, 3)`` (down the slope, across it, normal) and elongation down the slope ``(N,)``."""
     up = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
     across = np.stack([-up[:, 1], up[:, 0], np.zeros(len(up))], axis=1)
     length = np.linalg.norm(across, axis=1, keepdims=True)
@@ -179,14 +214,36 @@ def _disc_axes(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def quaternions_from_axes(axes: np.ndarray) -> np.ndarray:
-    """Unit quaternions ``(N, 4)`` wxyz, w not negative, of rotations ``(N, 3, 3)``."""
+    """Convert rotation matrices to unit quaternions.
+
+    Parameters
+    ----------
+    axes
+        ``(N, 3, 3)``.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(N, 4)`` wxyz, w not negative.
+    """
     from scipy.spatial.transform import Rotation
 
     return np.roll(Rotation.from_matrix(axes).as_quat(canonical=True), 1, axis=1)
 
 
 def axes_from_quaternions(quaternions: np.ndarray) -> np.ndarray:
-    """Rotations ``(N, 3, 3)`` of quaternions ``(N, 4)`` wxyz of any length."""
+    """Convert quaternions to rotation matrices.
+
+    Parameters
+    ----------
+    quaternions
+        ``(N, 4)`` wxyz, of any length.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(N, 3, 3)``.
+    """
     w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
     return np.stack(
         [
@@ -205,17 +262,29 @@ def axes_from_quaternions(quaternions: np.ndarray) -> np.ndarray:
 
 
 def surfel_albedo(surfels: Surfels, albedo: np.ndarray) -> np.ndarray:
-    """Mean of an albedo texture ``(R, S, 3)`` over each disc's cell, ``(N, 3)`` float32 in [0, 1].
+    """Average an albedo texture over the cell of each disc.
+
+    Parameters
+    ----------
+    surfels
+        N discs.
+    albedo
+        ``(R, S, 3)`` texture.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(N, 3)`` float32 in [0, 1].
 
     Raises
     ------
     ValueError
-        Where the texture is not finite under the discs.
+        If the texture is not finite at a disc.
     """
     total = np.zeros((len(surfels.means), 3))
-    for place in range(surfels.uv.shape[1]):
-        total += sample_texture(albedo, surfels.uv[:, place])
+    for sample in range(surfels.uv.shape[1]):
+        total += sample_texture(albedo, surfels.uv[:, sample])
     mean = total / surfels.uv.shape[1]
     if not np.isfinite(mean).all():
-        raise ValueError("surfel_albedo: the albedo has values that are not finite; fill its gaps first")
+        raise ValueError("surfel_albedo: the albedo has values that are not finite; complete the texture first")
     return np.clip(mean, 0.0, 1.0).astype(np.float32)

@@ -1,8 +1,8 @@
-"""Land too large for one set of discs: a quadtree of tiles, as fine as the picture needs.
+"""Level of detail for large terrains: a quadtree of tiles of discs, refined to the resolution of the picture.
 
-Every tile has the same number of discs; a tile's four children halve their distance. Discs of a level are made from the
-terrain when they are asked for, and nothing is stored twice. Each tile has its own origin, so that float32 keeps its
-millimetres however large the land is.
+Every tile has the same number of discs; the four children of a tile halve the distance of its discs. The discs of a tile
+are generated from the terrain on demand. Each tile has its own origin, so that float32 positions are accurate to a
+millimetre whatever the extent of the terrain.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from seasonscapes.terrain.surface import Terrain
 
 @dataclass(frozen=True)
 class TileTree:
-    """A square of land in tiles.
+    """Quadtree over a square that contains the terrain.
 
     Parameters
     ----------
     west_m, north_m, side_m
-        The square.
+        North-west corner and side of the square, ENU [m].
     discs
-        Along a tile's side.
+        Discs along a tile's side.
     levels
-        Level 0 is one tile; level l has 4ˡ, with discs ``side_m / discs / 2**l`` apart.
+        Number of levels: level 0 is one tile; level l has 4ˡ, with discs ``side_m / discs / 2**l`` apart.
     low_m, high_m
-        Heights that the land lies between.
+        Lowest and highest point of the terrain [m].
     """
 
     west_m: float
@@ -41,13 +41,13 @@ class TileTree:
     high_m: float
 
     def spacing_m(self, level: int) -> float:
-        """Distance of the discs of a level."""
+        """Return the distance of the discs of a level [m]."""
         return self.side_m / self.discs / 2.0**level
 
 
 @dataclass(frozen=True, order=True)
 class TreeTile:
-    """A tile by its level and its place in it, rows from the north."""
+    """Index of a tile: its level, and row (from the north) and column within the level."""
 
     level: int
     row: int
@@ -56,7 +56,17 @@ class TreeTile:
 
 @dataclass(frozen=True)
 class TileDiscs:
-    """Discs of a tile: ``surfels.means`` are relative to ``origin_m (3,)`` float64."""
+    """Discs of a tile.
+
+    Parameters
+    ----------
+    tile
+        Index of the tile.
+    origin_m
+        ``(3,)`` float64 origin of the tile, ENU [m].
+    surfels
+        Discs; ``surfels.means`` are relative to ``origin_m``.
+    """
 
     tile: TreeTile
     origin_m: np.ndarray
@@ -64,7 +74,27 @@ class TileDiscs:
 
 
 def tile_tree(terrain: Terrain, *, finest_m: float, discs: int = 256) -> TileTree:
-    """The quadtree over a terrain whose last level has discs at most ``finest_m`` apart."""
+    """Build the quadtree over a terrain.
+
+    Parameters
+    ----------
+    terrain
+        Mesh, ENU [m].
+    finest_m
+        Largest distance of discs on the last level [m].
+    discs
+        Discs along a tile's side.
+
+    Returns
+    -------
+    TileTree
+        Extent and number of levels.
+
+    Raises
+    ------
+    ValueError
+        If ``finest_m`` or ``discs`` is not positive.
+    """
     if not finest_m > 0.0 or discs < 1:
         raise ValueError(f"tile_tree: got {finest_m} m and {discs} discs, expected positive numbers")
     low, high = terrain.vertices.min(axis=0).astype(float), terrain.vertices.max(axis=0).astype(float)
@@ -74,16 +104,46 @@ def tile_tree(terrain: Terrain, *, finest_m: float, discs: int = 256) -> TileTre
 
 
 def tile_bounds(tree: TileTree, tile: TreeTile) -> tuple[float, float, float, float]:
-    """West, south, east and north end of a tile [m]."""
+    """Return the horizontal bounds of a tile.
+
+    Parameters
+    ----------
+    tree
+        Quadtree of the tile.
+    tile
+        Index of the tile.
+
+    Returns
+    -------
+    tuple of float
+        West, south, east and north end, ENU [m].
+    """
     side = tree.side_m / 2.0**tile.level
     west, north = tree.west_m + tile.column * side, tree.north_m - tile.row * side
     return west, north - side, west + side, north
 
 
 def select_tiles(tree: TileTree, camera: Camera, *, disc_px: float = 1.0) -> list[TreeTile]:
-    """The coarsest tiles whose nearest discs are at most ``disc_px`` apart in the picture, those out of view left out.
+    """Select the coarsest visible tiles that are fine enough for a picture.
 
-    A tile at the last level is taken as it is.
+    Parameters
+    ----------
+    tree
+        Quadtree over the terrain.
+    camera
+        The view.
+    disc_px
+        Largest distance of a tile's nearest discs in the picture [px]; tiles of the last level may exceed it.
+
+    Returns
+    -------
+    list of TreeTile
+        Disjoint tiles in the view frustum, sorted.
+
+    Raises
+    ------
+    ValueError
+        If ``disc_px`` is not positive.
     """
     if not disc_px > 0.0:
         raise ValueError(f"disc_px: got {disc_px}, expected a positive number of pixels")
@@ -106,7 +166,7 @@ def select_tiles(tree: TileTree, camera: Camera, *, disc_px: float = 1.0) -> lis
 
 
 def _out_of_view(camera: Camera, low: np.ndarray, high: np.ndarray) -> bool:
-    """Whether a box lies wholly outside one of the five planes of a view."""
+    """Whether a box lies completely outside one of the five planes of the view frustum."""
     corner = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
     x, y, z = ((corner - camera.position_m) @ camera.world_from_camera[:3, :3]).T
     left, right = -camera.cx / camera.fx, (camera.width_px - camera.cx) / camera.fx
@@ -116,7 +176,29 @@ def _out_of_view(camera: Camera, low: np.ndarray, high: np.ndarray) -> bool:
 
 
 def tile_discs(terrain: Terrain, tree: TileTree, tile: TreeTile, *, normals: np.ndarray | None = None) -> TileDiscs:
-    """Make the discs of a tile; `ValueError` where the terrain covers none of its cells. See `terrain_surfels`."""
+    """Make the discs of a tile.
+
+    Parameters
+    ----------
+    terrain
+        Mesh with texture coordinates.
+    tree
+        Quadtree over the terrain.
+    tile
+        Index of the tile.
+    normals
+        ``(V, 3)`` from `terrain.attributes.vertex_normals`, if several tiles are made.
+
+    Returns
+    -------
+    TileDiscs
+        Discs relative to the tile's origin.
+
+    Raises
+    ------
+    ValueError
+        If the terrain covers no cell of the tile; see `surfels.terrain_surfels`.
+    """
     bounds = tile_bounds(tree, tile)
     surfels = terrain_surfels(terrain, tree.spacing_m(tile.level), bounds_m=bounds, normals=normals)
     origin = np.array([0.5 * (bounds[0] + bounds[2]), 0.5 * (bounds[1] + bounds[3]), tree.low_m])
@@ -125,10 +207,24 @@ def tile_discs(terrain: Terrain, tree: TileTree, tile: TreeTile, *, normals: np.
 
 
 def joined_shapes(tiles: list[TileDiscs], camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Means **relative to the camera** ``(N, 3)``, quaternions, log scales and opacity logits of all tiles' discs.
+    """Concatenate the discs of tiles, relative to a camera.
 
-    To be drawn by the same camera moved to the origin: what is near then has small numbers.
+    They are to be rendered by the same camera moved to the origin, so that near discs have small coordinates.
+
+    Parameters
+    ----------
+    tiles
+        At least one.
+    camera
+        The view.
+
+    Returns
+    -------
+    tuple of numpy.ndarray
+        Means **relative to the camera** ``(N, 3)`` [m], quaternions ``(N, 4)``, log scales ``(N, 3)`` and opacity logits
+        ``(N,)``.
     """
-    means = [each.surfels.means + (each.origin_m - camera.position_m).astype(np.float32) for each in tiles]
-    rest = [(each.surfels.quaternions, each.surfels.log_scales, each.surfels.opacity_logits) for each in tiles]
-    return np.concatenate(means), *(np.concatenate(column) for column in zip(*rest, strict=True))
+    means = [part.surfels.means + (part.origin_m - camera.position_m).astype(np.float32) for part in tiles]
+    shapes = [(part.surfels.quaternions, part.surfels.log_scales, part.surfels.opacity_logits) for part in tiles]
+    quaternions, log_scales, opacity_logits = (np.concatenate(column) for column in zip(*shapes, strict=True))
+    return np.concatenate(means), quaternions, log_scales, opacity_logits

@@ -1,12 +1,13 @@
-"""Teach Gaussians what a path tracer knows, in two stages.
+"""Distillation of a Gaussian model from path-traced targets in two stages.
 
-1. On the surface: the radiance of (disc, time) pairs, from irradiance traced at the discs. No rasteriser, no hidden
-   discs, no blur; most of the learning happens here.
-2. In pictures: a short stage over cameras and times, 0.8 L1 + 0.2 D-SSIM in sRGB, through frozen sparse weights, so
-   that colours make up for the width of the splats. The first loss stays beside it, or what no camera sees would drift.
+1. Surface stage: radiance of (disc, time) pairs, from irradiance traced at the discs. No rasterisation, occlusion or
+   blur is involved; most of the training happens here.
+2. Picture stage: a few steps over cameras and times, 0.8 L1 + 0.2 D-SSIM in sRGB, through frozen sparse weights, so that
+   the colours compensate for the extent of the splats. The surface loss is kept, because discs outside all pictures
+   would drift otherwise.
 
-Geometry is known and stays as it is. Every step draws from a generator seeded by (seed, stage, step): a run that was
-interrupted goes on from its checkpoint as if nothing had happened.
+The geometry is known and not trained. Every step has its own random generator, seeded by (seed, step), so that an
+interrupted run continues from its checkpoint with identical results.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -33,7 +35,8 @@ from seasonscapes.gaussians.rasterise import choose_threads
 from seasonscapes.images import atomic_path
 
 Progress = Callable[[float], None]
-# Learning rates of the parameters; all fall to a tenth over each stage, and begin the second at `_SECOND` of these.
+# Initial learning rates. They decay exponentially by `_DECAY` over each stage; the second stage starts at
+# `_SECOND_STAGE` times these.
 RATES = {
     "log_colour": 2e-3,
     "log_gain": 5e-3,
@@ -43,24 +46,30 @@ RATES = {
     "codes": 5e-3,
     "mlp": 2e-3,
 }
-_SECOND, _FALL = 0.5, 0.1
-_SURFACE_SHARE = 0.5
+_SECOND_STAGE, _DECAY = 0.5, 0.1
+# Weight of the surface loss in the second stage.
+_SURFACE_WEIGHT = 0.5
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """How long to learn.
+    """Numbers of training steps.
 
     Parameters
     ----------
     surface_steps, picture_steps
         Steps of the two stages.
     batch
-        (Disc, time) pairs in a step of the first.
+        (Disc, time) pairs per step.
     checkpoint_every
         Steps between checkpoints.
     threads
-        Of torch, chosen and not inherited; see `rasterise.choose_threads`.
+        Number of torch threads; see `rasterise.choose_threads`.
+
+    Raises
+    ------
+    ValueError
+        If a number is out of range.
     """
 
     surface_steps: int = 2500
@@ -69,43 +78,65 @@ class Schedule:
     checkpoint_every: int = 250
     threads: int = 1
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if min(self.surface_steps, self.picture_steps) < 0 or min(self.batch, self.checkpoint_every, self.threads) < 1:
             raise ValueError("Schedule: steps must not be negative, batch, checkpoint_every and threads at least 1")
 
 
 @dataclass(frozen=True)
 class SurfaceTargets:
-    """What is learned on the surface: T times of N discs.
+    """Training targets of the surface stage: colours of N discs at T times.
 
     Parameters
     ----------
     states
         T light states.
     seasons
-        T numbers of dated albedos.
+        T indices of dated albedos.
     colours
         ``(T, N, 3)`` float32: radiance × π over the luminance of the horizontal illuminance.
+
+    Raises
+    ------
+    ValueError
+        If the lengths differ or are zero, or a colour is not finite.
     """
 
     states: Sequence[LightState]
     seasons: Sequence[int]
     colours: np.ndarray
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not len(self.states) == len(self.seasons) == len(self.colours) > 0:
             raise ValueError(
-                f"Lessons: got {len(self.states)} lights, {len(self.seasons)} seasons and "
+                f"SurfaceTargets: got {len(self.states)} lights, {len(self.seasons)} seasons and "
                 f"{len(self.colours)} sets of colours, expected one of each for every time"
             )
         if not np.isfinite(self.colours).all():
-            raise ValueError(f"Lessons: {int(np.sum(~np.isfinite(self.colours)))} colours are not finite")
+            raise ValueError(f"SurfaceTargets: {int(np.sum(~np.isfinite(self.colours)))} colours are not finite")
 
 
 def surface_targets(
     states: Sequence[LightState], seasons: Sequence[int], albedo: np.ndarray, irradiance: np.ndarray
 ) -> SurfaceTargets:
-    """Lessons from irradiance ``(T, N, 3)`` [lx] of discs with dated albedos ``(M, N, 3)``."""
+    """Compute training targets from traced irradiance and dated albedos.
+
+    Parameters
+    ----------
+    states
+        T light states.
+    seasons
+        T indices of dated albedos.
+    albedo
+        ``(M, N, 3)`` of N discs on M dates.
+    irradiance
+        ``(T, N, 3)`` of the discs [lx], from `disc_transport.surfel_irradiance`.
+
+    Returns
+    -------
+    SurfaceTargets
+        Colours of N discs at T times.
+    """
     colours = np.stack(
         [
             albedo[season] * received / np.float32(state.global_lx)
@@ -125,21 +156,36 @@ def train(
     checkpoint: Path | None = None,
     progress: Progress | None = None,
 ) -> list[float]:
-    """Train an appearance in place; the loss of every step that was taken by this call.
+    """Train an appearance in place.
 
     Parameters
     ----------
+    appearance
+        Module to train.
+    targets
+        Colours of the discs for the surface stage.
     frames
-        Pictures for the second stage; without any it is left out.
+        Pictures for the picture stage, which is skipped if there are none.
+    schedule
+        Numbers of steps; defaults if omitted.
+    seed
+        Of the random draws.
     checkpoint
-        A ``.safetensors`` file to save to, and to go on from where it exists.
+        ``.safetensors`` file to save to; training continues from it if it exists.
+    progress
+        Called with the finished fraction after each step.
+
+    Returns
+    -------
+    list of float
+        Loss of each step taken by this call.
 
     Raises
     ------
     ValueError
-        A checkpoint of another run: kind, seed, sizes or schedule differ.
+        If the checkpoint belongs to another run: kind, seed, sizes or schedule differ.
     FloatingPointError
-        The loss is no longer finite.
+        If the loss is not finite.
     """
     schedule = schedule or Schedule()
     choose_threads(schedule.threads)
@@ -154,18 +200,18 @@ def train(
     }
     start = load_checkpoint(checkpoint, appearance, optimiser, run) if checkpoint and Path(checkpoint).is_file() else 0
     lights = light_tensors(targets.states, targets.seasons)
-    targets = torch.as_tensor(targets.colours)
+    colours = torch.as_tensor(targets.colours)
     pictures = [training_picture(frame) for frame in frames]
     total, losses = schedule.surface_steps + schedule.picture_steps, []
     for step in range(start, total):
         _set_rates(optimiser, step, schedule)
         rng = np.random.default_rng([seed, step])
-        loss = surface_loss(appearance, lights, targets, schedule.batch, rng)
+        loss = surface_loss(appearance, lights, colours, schedule.batch, rng)
         if step >= schedule.surface_steps:
-            picture = pictures[_turn(step - schedule.surface_steps, len(pictures), seed)]
-            loss = _SURFACE_SHARE * loss + picture_loss(appearance, lights, picture)
+            picture = pictures[_picture_index(step - schedule.surface_steps, len(pictures), seed)]
+            loss = _SURFACE_WEIGHT * loss + picture_loss(appearance, lights, picture)
         if not bool(torch.isfinite(loss)):
-            raise FloatingPointError(f"distilling: the loss of step {step} is {float(loss)}")
+            raise FloatingPointError(f"train: the loss of step {step} is {float(loss)}, expected a finite number")
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         optimiser.step()
@@ -177,13 +223,14 @@ def train(
     return losses
 
 
-def _turn(step: int, count: int, seed: int) -> int:
-    """Which picture a step of the second stage takes: all of them, shuffled anew each round."""
+def _picture_index(step: int, count: int, seed: int) -> int:
+    """Picture of a step of the second stage: all pictures in random order, reshuffled every epoch."""
     return int(np.random.default_rng([seed, 7, step // count]).permutation(count)[step % count])
 
 
 def _optimiser(appearance: Appearance) -> torch.optim.Adam:
-    groups: dict[str, list] = {}
+    """Adam with one parameter group per entry of `RATES`."""
+    groups: dict[str, list[torch.nn.Parameter]] = {}
     for name, parameter in appearance.named_parameters():
         groups.setdefault(name.split(".")[0], []).append(parameter)
     return torch.optim.Adam(
@@ -193,9 +240,9 @@ def _optimiser(appearance: Appearance) -> torch.optim.Adam:
 
 def _set_rates(optimiser: torch.optim.Adam, step: int, schedule: Schedule) -> None:
     second = step >= schedule.surface_steps
-    share = (step - schedule.surface_steps) / schedule.picture_steps if second else step / schedule.surface_steps
+    fraction = (step - schedule.surface_steps) / schedule.picture_steps if second else step / schedule.surface_steps
     for group in optimiser.param_groups:
-        group["lr"] = RATES[group["name"]] * (_SECOND if second else 1.0) * _FALL**share
+        group["lr"] = RATES[group["name"]] * (_SECOND_STAGE if second else 1.0) * _DECAY**fraction
 
 
 def fit_code(
@@ -207,44 +254,103 @@ def fit_code(
     rate: float = 0.1,
     seed: int = 0,
 ) -> torch.Tensor:
-    """The free code ``(32,)`` of a picture that was not trained on, from its usable pixels (WildGaussians' protocol)."""
+    """Fit the free code of a picture outside the training set to its usable pixels (WildGaussians' protocol).
+
+    Parameters
+    ----------
+    appearance
+        Trained module of ``kind="code"``, which is not changed.
+    lights
+        Light states of the training times.
+    frame
+        The picture.
+    steps
+        Number of Adam steps.
+    rate
+        Learning rate.
+    seed
+        Of the drawn pixels.
+
+    Returns
+    -------
+    torch.Tensor
+        ``(32,)``.
+    """
     picture = training_picture(frame)
-    # From the middle of the codes that were learned, where the network is at home.
+    # Start from the mean of the learned codes, within the network's training range.
     code = appearance.codes.detach().mean(dim=0).requires_grad_()
     optimiser = torch.optim.Adam([code], lr=rate)
     rows = np.flatnonzero(picture.mask.numpy().ravel())
     for step in range(steps):
-        # A few thousand pixels tell as much of 32 numbers as all do.
+        # A random batch of pixels suffices for 32 unknowns.
         chosen = np.random.default_rng([seed, step]).choice(rows, min(1024, len(rows)), replace=False)
-        some = picture.forward[chosen]
-        seen = np.unique(some.indices)
-        some = some[:, seen]
-        values = appearance(picture.discs[torch.from_numpy(seen).long()], picture.time, lights, code)
-        drawn = SparseProduct.apply(values, some, some.T.tocsr())
-        loss = (encoded(drawn) - picture.target.reshape(-1, 3)[chosen]).abs().mean()
+        weights = picture.forward[chosen]
+        visible = np.unique(weights.indices)
+        weights = weights[:, visible]
+        values = appearance(picture.discs[torch.from_numpy(visible).long()], picture.time, lights, code)
+        pixels = SparseProduct.apply(values, weights, weights.T.tocsr())
+        loss = (encoded(pixels) - picture.target.reshape(-1, 3)[chosen]).abs().mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
     return code.detach()
 
 
-def save_checkpoint(path: Path, appearance: Appearance, optimiser: torch.optim.Adam, run: dict, step: int) -> None:
-    """Parameters, the optimiser's memory and what run this is, in one file, atomically."""
+def save_checkpoint(
+    path: Path, appearance: Appearance, optimiser: torch.optim.Adam, run: dict[str, Any], step: int
+) -> None:
+    """Write parameters and optimiser state to one ``.safetensors`` file, atomically.
+
+    Parameters
+    ----------
+    path
+        Output file.
+    appearance
+        Module in training.
+    optimiser
+        Its optimiser.
+    run
+        Plain values that identify the run.
+    step
+        Number of finished steps.
+    """
     from safetensors.torch import save_file
 
     tensors = {f"value.{name}": parameter.detach() for name, parameter in appearance.named_parameters()}
     names = {id(parameter): name for name, parameter in appearance.named_parameters()}
-    for parameter, memory in optimiser.state.items():
+    for parameter, moments in optimiser.state.items():
         tensors |= {
             f"{key}.{names[id(parameter)]}": value.reshape(-1) if key == "step" else value
-            for key, value in memory.items()
+            for key, value in moments.items()
         }
     with atomic_path(path) as temporary:
         save_file(tensors, temporary, metadata={"run": json.dumps(run, sort_keys=True), "step": str(step)})
 
 
-def load_checkpoint(path: Path, appearance: Appearance, optimiser: torch.optim.Adam, run: dict) -> int:
-    """Put a checkpoint back and return how many steps it has behind it."""
+def load_checkpoint(path: Path, appearance: Appearance, optimiser: torch.optim.Adam, run: dict[str, Any]) -> int:
+    """Restore parameters and optimiser state from a checkpoint, in place.
+
+    Parameters
+    ----------
+    path
+        File written by `save_checkpoint`.
+    appearance
+        Module to restore.
+    optimiser
+        Its optimiser.
+    run
+        Plain values that identify the run.
+
+    Returns
+    -------
+    int
+        Number of finished steps.
+
+    Raises
+    ------
+    ValueError
+        If the checkpoint belongs to another run, or a parameter has another shape.
+    """
     from safetensors import safe_open
 
     with safe_open(path, "pt") as file:
