@@ -31,7 +31,7 @@ from seasonscapes.frames import LocalFrame, enu_from_geodetic
 from seasonscapes.terrain.crs import geodetic_from_map
 from seasonscapes.terrain.raster import read_elevation
 
-REHEARSAL = SearchRange(priors=Priors(tilt_deg=2.0, roll_deg=1.0, horizontal_m=3.0, vertical_m=2.0, focal=0.0))
+TRIAL_SEARCH = SearchRange(priors=Priors(tilt_deg=2.0, roll_deg=1.0, horizontal_m=3.0, vertical_m=2.0, focal=0.0))
 
 
 def apart(a: float, b: float) -> float:
@@ -64,7 +64,9 @@ def by_skyline(trials: int, seed: int) -> dict:
     for index in range(trials):
         trial = picture_trial(np.random.default_rng([seed, index]))
         began = time.perf_counter()
-        fit = align_to_skyline(trial.image, trial.start, trial.rasters, trial.frame, mask=trial.mask, search=REHEARSAL)
+        fit = align_to_skyline(
+            trial.image, trial.start, trial.rasters, trial.frame, mask=trial.mask, search=TRIAL_SEARCH
+        )
         seconds.append(time.perf_counter() - began)
         errors.append(_error(fit, trial))
         trusted.append(fit.reliable)
@@ -76,7 +78,9 @@ def by_skyline(trials: int, seed: int) -> dict:
     for index in range(fogs):
         rng = np.random.default_rng([seed, 1_000_000 + index])
         trial = picture_trial(rng, visibility_m=float(np.exp(rng.uniform(np.log(200.0), np.log(5000.0)))))
-        fit = align_to_skyline(trial.image, trial.start, trial.rasters, trial.frame, mask=trial.mask, search=REHEARSAL)
+        fit = align_to_skyline(
+            trial.image, trial.start, trial.rasters, trial.frame, mask=trial.mask, search=TRIAL_SEARCH
+        )
         fooled += bool(fit.reliable and _error(fit, trial) >= 0.1)
     return {
         "skyline_success_rate": np.mean(errors < 0.1),

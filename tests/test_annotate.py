@@ -56,10 +56,10 @@ def true_pixel(trial, position):
 def good_places(session, trial, count):
     """Terrain pixels whose point also lies in the photograph, spread over the picture."""
     rng, found = np.random.default_rng(1), []
-    height, width = session.seen.distance_m.shape
+    height, width = session.terrain_view.distance_m.shape
     while len(found) < count:
         at = rng.uniform([5, 5], [width - 5, height - 5])
-        if not np.isfinite(session.seen.position_m[int(at[1]), int(at[0])]).all():
+        if not np.isfinite(session.terrain_view.position_m[int(at[1]), int(at[0])]).all():
             continue
         pixel = true_pixel(trial, position_at(session, at))
         if (
@@ -72,17 +72,19 @@ def good_places(session, trial, count):
 
 
 def test_what_is_picked_is_the_first_surface_and_the_sky_is_refused(session, trial):
-    y, x = np.argwhere(np.isfinite(session.seen.distance_m))[5000]
+    y, x = np.argwhere(np.isfinite(session.terrain_view.distance_m))[5000]
     place = position_at(session, (x + 0.5, y + 0.5))
-    pixel, _ = project_values(session.shown, np.eye(3), values_of(session.shown, np.eye(3)), place[None])
+    pixel, _ = project_values(
+        session.rendered_view, np.eye(3), values_of(session.rendered_view, np.eye(3)), place[None]
+    )
     assert np.abs(pixel[0] - [x + 0.5, y + 0.5]).max() < 1.0
-    sky = np.argwhere(~np.isfinite(session.seen.distance_m))[0]
-    with pytest.raises(ValueError, match="that is sky"):
+    sky = np.argwhere(~np.isfinite(session.terrain_view.distance_m))[0]
+    with pytest.raises(ValueError, match="is sky"):
         add_match(session, (5, 5), (sky[1], sky[0]))
     assert describe_position(session, (sky[1], sky[0])) is None
     with pytest.raises(ValueError, match="outside the photograph"):
         add_match(session, (SIZE[0] + 9, 5), (x, y))
-    with pytest.raises(ValueError, match="no pair to take back"):
+    with pytest.raises(ValueError, match="no match to remove"):
         remove_last_match(session)
 
 
@@ -211,11 +213,11 @@ def test_the_page_from_click_to_file_in_chromium(session, trial, browser):
             click("terrain", at)
             until(lambda n=number: data("pairs") == str(n))
         # A click into the sky of the terrain is answered, not taken.
-        sky = np.argwhere(~np.isfinite(session.seen.distance_m))
+        sky = np.argwhere(~np.isfinite(session.terrain_view.distance_m))
         y, x = sky[len(sky) // 3]
         click("photo", (100, 100))
         click("terrain", (x, y))
-        until(lambda: "that is sky" in message())
+        until(lambda: "is sky" in message())
         assert data("pairs") == "7"
         press("undo")  # the half pair
         press("undo")

@@ -21,7 +21,7 @@ from seasonscapes.terrain.raster import read_elevation
 from seasonscapes.terrain.surface import Raster
 
 CRS, EAST, NORTH = "EPSG:25832", 500_000.0, 5_160_000.0
-REHEARSAL = SearchRange(priors=Priors(tilt_deg=2.0, roll_deg=1.0, horizontal_m=3.0, vertical_m=2.0, focal=0.0))
+TRIAL_SEARCH = SearchRange(priors=Priors(tilt_deg=2.0, roll_deg=1.0, horizontal_m=3.0, vertical_m=2.0, focal=0.0))
 
 
 SIZE = (800, 534)
@@ -124,7 +124,7 @@ def trial():
 
 @pytest.fixture(scope="module")
 def fit(trial):
-    return align_to_skyline(trial.image, trial.start, trial.rasters, trial.frame, mask=trial.mask, search=REHEARSAL)
+    return align_to_skyline(trial.image, trial.start, trial.rasters, trial.frame, mask=trial.mask, search=TRIAL_SEARCH)
 
 
 def heading_error(fit, trial):
@@ -155,7 +155,7 @@ def test_the_drawn_skyline_is_where_the_horizon_says(trial):
 def test_a_hazy_picture_with_a_roof_in_it_is_aligned_and_trusted(fit, trial):
     assert fit.reliable, fit.doubts
     assert heading_error(fit, trial) < 0.1
-    assert fit.met > 0.8
+    assert fit.edge_fraction > 0.8
 
 
 def test_a_full_panorama_finds_its_heading_its_horizon_row_and_its_lean():
@@ -176,7 +176,7 @@ def test_several_trials_from_within_ten_degrees():
     errors, trusted = [], []
     for seed in (0, 3, 8):
         each = picture_trial(np.random.default_rng(seed), size_px=SIZE)
-        got = align_to_skyline(each.image, each.start, each.rasters, each.frame, mask=each.mask, search=REHEARSAL)
+        got = align_to_skyline(each.image, each.start, each.rasters, each.frame, mask=each.mask, search=TRIAL_SEARCH)
         errors.append(heading_error(got, each))
         trusted.append(got.reliable)
     assert max(errors) < 0.1
@@ -186,7 +186,7 @@ def test_several_trials_from_within_ten_degrees():
 @pytest.mark.parametrize(("seed", "visibility_m"), [(1003, 380.0), (1000, 1200.0)])
 def test_fog_is_not_trusted(seed, visibility_m):
     trial = picture_trial(np.random.default_rng(seed), visibility_m=visibility_m, size_px=SIZE)
-    fit = align_to_skyline(trial.image, trial.start, trial.rasters, trial.frame, mask=trial.mask, search=REHEARSAL)
+    fit = align_to_skyline(trial.image, trial.start, trial.rasters, trial.frame, mask=trial.mask, search=TRIAL_SEARCH)
     assert not fit.reliable
     assert fit.doubts
 
@@ -196,7 +196,7 @@ def test_the_wrong_mountains_are_not_trusted(trial):
     values = values_of(trial.start, np.eye(3))
     values[0] += 130.0
     elsewhere = view_from_values(trial.start, np.eye(3), values)
-    fit = align_to_skyline(trial.image, elsewhere, trial.rasters, trial.frame, mask=trial.mask, search=REHEARSAL)
+    fit = align_to_skyline(trial.image, elsewhere, trial.rasters, trial.frame, mask=trial.mask, search=TRIAL_SEARCH)
     assert not fit.reliable
 
 
@@ -210,14 +210,14 @@ def test_points_and_skyline_together(trial, fit):
     points = Correspondences(pixel[inside], position[inside])
     assert len(points) >= 3
     both = align_to_skyline(
-        trial.image, trial.start, trial.rasters, trial.frame, mask=trial.mask, points=points, search=REHEARSAL
+        trial.image, trial.start, trial.rasters, trial.frame, mask=trial.mask, points=points, search=TRIAL_SEARCH
     )
     assert heading_error(both, trial) < 0.1
     assert len(both.calibration.names) == len(points)
 
 
 def test_a_picture_of_another_size_is_refused(trial):
-    with pytest.raises(ValueError, match="the picture is 799 x 534 px"):
+    with pytest.raises(ValueError, match="the image is 799 x 534 px"):
         align_to_skyline(trial.image[:, 1:], trial.start, trial.rasters, trial.frame)
     with pytest.raises(ValueError, match="expected \\(H, W, 3\\) uint8"):
         boundary_map(trial.image.astype(float), None, 10.0)

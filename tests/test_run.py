@@ -109,7 +109,7 @@ def test_panoramas_to_gaussians(runs, capsys):
     assert off[1] < 0.4
     # Mountains that stand too near for so coarse a picture: their webcam is left out, and the rest goes on.
     told = (runs.folder / "whole.log").read_text()
-    assert "meadow is left out: the horizon is too even" in told
+    assert "meadow is left out: the horizon is too smooth" in told
     assert "1 of 2 webcams found by their skylines" in told
     assert not (whole / "calibration" / "meadow_calibration.json").exists()
     albedo = np.load(whole / "albedo" / "albedo.npz")

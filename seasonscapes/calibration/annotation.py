@@ -1,7 +1,7 @@
-"""Picking matches by hand: photograph left, rendered terrain right, on a local web page.
+"""Manual annotation of correspondences on a local web page: photograph on the left, rendered terrain on the right.
 
-The work is done here, in plain functions on a session; the page only shows it. The server answers on 127.0.0.1 alone,
-and only to those who know the token of the address it prints: other pages in the same browser do not.
+All computation is done by functions on an `AnnotationSession`; the page only displays its state. The server listens on
+127.0.0.1 and requires the token in the address that it returns, so that other pages in the same browser have no access.
 """
 
 from __future__ import annotations
@@ -9,10 +9,11 @@ from __future__ import annotations
 import json
 import secrets
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 from urllib.parse import parse_qs, urlparse
 
 import cv2
@@ -25,99 +26,169 @@ from seasonscapes.calibration.resection import Calibration, report_lines, resect
 from seasonscapes.calibration.terrain_view import TerrainView, scaled_view, shaded_relief
 from seasonscapes.frames import LocalFrame, geodetic_from_enu, local_axes
 
-_LARGEST_REQUEST = 10_000
+_MAX_REQUEST_BYTES = 10_000
+
+_Json = dict[str, Any]
 
 
 @dataclass
 class AnnotationSession:
-    """One webcam being matched; the only mutable thing here.
+    """State of the annotation of one webcam; a mutable object, changed by the functions of this module.
 
     Parameters
     ----------
     webcam
-        Its id, for the saved files.
+        Id of the webcam, used in file names.
     image
         Photograph ``(H, W, 3)`` uint8 sRGB.
     start
-        Where it is thought to be.
+        Approximate view; its size is that of the photograph.
     frame
-        The scene's frame.
-    look
-        What a view sees of the terrain: `terrain_view.look_at_rasters`, or `look_with` a renderer, made ready.
+        Local frame of the scene.
+    render
+        Function that computes the terrain view of a camera or panorama: `terrain_view.look_at_rasters` with its rasters
+        and frame bound, or `terrain_view.look_with` with a ray caster bound.
     folder
-        Where ``<webcam>_points.csv`` and ``<webcam>_calibration.json`` are saved.
+        Folder of ``<webcam>_points.csv`` and ``<webcam>_calibration.json``.
+    priors
+        Standard deviations about the start.
+    k1
+        Initial radial distortion coefficient.
+    width_px
+        Maximum width of the rendered terrain [px].
+    pixel, position_m, terrain_pixel
+        Of each match: pixel in the photograph, world position [m], pixel in the rendered terrain.
+    solution
+        Latest calibration, or ``None``.
+    version
+        Number of times that the terrain has been rendered.
+    rendered_view, terrain_view, relief
+        View of the rendered terrain, its surfaces, and its shaded relief ``(h, w, 3)`` uint8.
+
+    Raises
+    ------
+    ValueError
+        If the photograph and the view differ in size.
     """
 
     webcam: str
     image: np.ndarray
     start: View
     frame: LocalFrame
-    look: Callable[[View], TerrainView]
+    render: Callable[[View], TerrainView]
     folder: Path
     priors: Priors = field(default_factory=Priors)
     k1: float = 0.0
     width_px: int = 1400
-    pixel: list = field(default_factory=list)
-    position_m: list = field(default_factory=list)
-    terrain_pixel: list = field(default_factory=list)
+    pixel: list[list[float]] = field(default_factory=list)
+    position_m: list[list[float]] = field(default_factory=list)
+    terrain_pixel: list[list[float]] = field(default_factory=list)
     solution: Calibration | None = None
     version: int = 0
-    shown: View = field(init=False)
-    seen: TerrainView = field(init=False)
+    rendered_view: View = field(init=False)
+    terrain_view: TerrainView = field(init=False)
     relief: np.ndarray = field(init=False)
 
     def __post_init__(self):
         if self.image.shape[:2] != (self.start.height_px, self.start.width_px):
             raise ValueError(
-                f"PickSession: the picture is {self.image.shape[1]} x {self.image.shape[0]} px, the view "
-                f"{self.start.width_px} x {self.start.height_px}"
+                f"AnnotationSession: the image is {self.image.shape[1]} x {self.image.shape[0]} px, expected "
+                f"{self.start.width_px} x {self.start.height_px} as the view"
             )
         render_terrain(self)
 
     @property
     def view(self) -> View:
-        """The best view so far."""
+        """The calibrated view, or the start before the first calibration."""
         return self.start if self.solution is None else self.solution.view
 
 
 def render_terrain(session: AnnotationSession) -> None:
-    """Look at the terrain from the best view so far; marks in it move along."""
-    session.shown = scaled_view(session.view, min(session.width_px, session.view.width_px))
-    session.seen = session.look(session.shown)
-    session.relief = shaded_relief(session.seen)
+    """Render the terrain from the current view and reproject the matches into it.
+
+    Parameters
+    ----------
+    session
+        Session; its rendered terrain and ``terrain_pixel`` are updated.
+    """
+    session.rendered_view = scaled_view(session.view, min(session.width_px, session.view.width_px))
+    session.terrain_view = session.render(session.rendered_view)
+    session.relief = shaded_relief(session.terrain_view)
     session.version += 1
     if session.position_m:
         axes = np.eye(3)
-        pixel, _ = project_values(session.shown, axes, values_of(session.shown, axes), np.array(session.position_m))
+        values = values_of(session.rendered_view, axes)
+        pixel, _ = project_values(session.rendered_view, axes, values, np.array(session.position_m))
         session.terrain_pixel = pixel.tolist()
 
 
-def position_at(session: AnnotationSession, terrain_pixel) -> np.ndarray:
-    """The point of the terrain ``(3,)`` behind a pixel of its picture; `ValueError` in the sky or outside.
+def position_at(session: AnnotationSession, terrain_pixel: Sequence[float]) -> np.ndarray:
+    """Return the terrain point at a pixel of the rendered terrain: the first surface along the ray of the pixel.
 
-    It is the first surface along the ray, so what a ridge hides cannot be picked.
+    Parameters
+    ----------
+    session
+        Session.
+    terrain_pixel
+        Pixel ``(x, y)`` of the rendered terrain.
+
+    Returns
+    -------
+    ndarray
+        Position ``(3,)``, east-north-up [m].
+
+    Raises
+    ------
+    ValueError
+        If the pixel lies in the sky or outside the image.
     """
     x, y = (int(np.floor(v)) for v in terrain_pixel)
-    height, width = session.seen.distance_m.shape
+    height, width = session.terrain_view.distance_m.shape
     if not (0 <= x < width and 0 <= y < height):
-        raise ValueError("outside the terrain picture")
-    position = session.seen.position_m[y, x]
+        raise ValueError("outside the terrain image")
+    position = session.terrain_view.position_m[y, x]
     if not np.isfinite(position).all():
-        raise ValueError("that is sky; pick a point on the terrain")
+        raise ValueError("this pixel is sky; pick a point on the terrain")
     return position
 
 
-def describe_position(session: AnnotationSession, terrain_pixel) -> list[float] | None:
-    """Where a point of the terrain picture falls in the photograph by the best view so far; ``None`` in the sky."""
+def describe_position(session: AnnotationSession, terrain_pixel: Sequence[float]) -> list[float] | None:
+    """Project a pixel of the rendered terrain into the photograph, with the current view.
+
+    Parameters
+    ----------
+    session
+        Session.
+    terrain_pixel
+        Pixel ``(x, y)`` of the rendered terrain.
+
+    Returns
+    -------
+    list of float or None
+        Pixel ``[x, y]`` of the photograph; ``None`` in the sky, outside the image or behind the camera.
+    """
     try:
         position = position_at(session, terrain_pixel)
     except ValueError:
         return None
-    return _projected(session, position[None])[0]
+    return _project(session, position[None])[0]
 
 
-def add_match(session: AnnotationSession, photo_pixel, terrain_pixel) -> None:
-    """Add a pair."""
+def add_match(session: AnnotationSession, photo_pixel: Sequence[float], terrain_pixel: Sequence[float]) -> None:
+    """Add a match between the photograph and the rendered terrain.
+
+    Parameters
+    ----------
+    session
+        Session.
+    photo_pixel, terrain_pixel
+        Pixel ``(x, y)`` of the same feature in the photograph and in the rendered terrain.
+
+    Raises
+    ------
+    ValueError
+        If a pixel lies outside its image, or the terrain pixel in the sky.
+    """
     x, y = (float(v) for v in photo_pixel)
     height, width = session.image.shape[:2]
     if not (0 <= x <= width and 0 <= y <= height):
@@ -129,20 +200,53 @@ def add_match(session: AnnotationSession, photo_pixel, terrain_pixel) -> None:
 
 
 def remove_last_match(session: AnnotationSession) -> None:
-    """Take the last pair back."""
+    """Remove the last match.
+
+    Parameters
+    ----------
+    session
+        Session.
+
+    Raises
+    ------
+    ValueError
+        If there is no match.
+    """
     if not session.pixel:
-        raise ValueError("there is no pair to take back")
-    for pairs in (session.pixel, session.position_m, session.terrain_pixel):
-        pairs.pop()
+        raise ValueError("there is no match to remove")
+    for values in (session.pixel, session.position_m, session.terrain_pixel):
+        values.pop()
 
 
 def matched_points(session: AnnotationSession) -> Correspondences:
-    """The pairs so far."""
+    """Return the matches of a session as correspondences, pixels in the photograph.
+
+    Parameters
+    ----------
+    session
+        Session of N matches.
+
+    Returns
+    -------
+    Correspondences
+        N correspondences, numbered from 1.
+    """
     return Correspondences(np.array(session.pixel).reshape(-1, 2), np.array(session.position_m).reshape(-1, 3))
 
 
 def solve_session(session: AnnotationSession) -> None:
-    """Calibrate from the pairs, always about the original start, and look again."""
+    """Calibrate from the matches, with priors about the original start, and render the terrain again.
+
+    Parameters
+    ----------
+    session
+        Session; its ``solution`` and rendered terrain are updated.
+
+    Raises
+    ------
+    NotEnoughEvidence
+        As `resect`.
+    """
     latitude, longitude, _ = geodetic_from_enu(session.frame, session.start.position_m)
     axes = local_axes(session.frame, float(latitude), float(longitude))
     session.solution = resect(session.start, matched_points(session), priors=session.priors, k1=session.k1, axes=axes)
@@ -150,7 +254,18 @@ def solve_session(session: AnnotationSession) -> None:
 
 
 def save_session(session: AnnotationSession) -> list[Path]:
-    """Write the points, and the calibration where there is one; the files written."""
+    """Write the matches, and the calibration if there is one.
+
+    Parameters
+    ----------
+    session
+        Session.
+
+    Returns
+    -------
+    list of Path
+        The files written.
+    """
     files = [session.folder / f"{session.webcam}_points.csv"]
     write_points(files[0], matched_points(session), session.frame)
     if session.solution is not None:
@@ -159,25 +274,38 @@ def save_session(session: AnnotationSession) -> list[Path]:
     return files
 
 
-def _projected(session: AnnotationSession, position: np.ndarray) -> list:
+def _project(session: AnnotationSession, position: np.ndarray) -> list[list[float] | None]:
+    """Pixels of world points ``(N, 3)`` in the photograph; ``None`` behind the camera."""
     axes = np.eye(3)
     k1 = session.k1 if session.solution is None else session.solution.k1
-    pixel, front = project_values(session.view, axes, values_of(session.view, axes, k1), position)
-    return [p.tolist() if ok else None for p, ok in zip(pixel, front, strict=True)]
+    pixel, in_front = project_values(session.view, axes, values_of(session.view, axes, k1), position)
+    return [xy.tolist() if visible else None for xy, visible in zip(pixel, in_front, strict=True)]
 
 
-def session_state(session: AnnotationSession) -> dict:
-    """The session as the page shows it."""
-    projected = _projected(session, np.array(session.position_m)) if session.position_m else []
+def session_state(session: AnnotationSession) -> dict[str, Any]:
+    """Return the state that the page displays, as JSON values.
+
+    Parameters
+    ----------
+    session
+        Session.
+
+    Returns
+    -------
+    dict
+        ``pairs`` (matches with their reprojections and outlier flags), ``solved``, ``version``, ``summary`` and
+        ``report`` (lines of text).
+    """
+    projected = _project(session, np.array(session.position_m)) if session.position_m else []
     solution = session.solution
-    aside = [] if solution is None else solution.outlier.tolist()
+    outlier = [] if solution is None else solution.outlier.tolist()
     pairs = [
         {
             "name": str(i + 1),
             "photo": session.pixel[i],
             "terrain": session.terrain_pixel[i],
             "projected": projected[i],
-            "set_aside": bool(i < len(aside) and aside[i]),
+            "set_aside": bool(i < len(outlier) and outlier[i]),
         }
         for i in range(len(session.pixel))
     ]
@@ -196,16 +324,31 @@ def session_state(session: AnnotationSession) -> dict:
 
 
 def serve_session(session: AnnotationSession, *, port: int = 0) -> tuple[ThreadingHTTPServer, str]:
-    """Start the page in a thread of its own; the server (call ``shutdown``) and its address with the token."""
+    """Serve the page of a session on 127.0.0.1 in a background thread.
+
+    Parameters
+    ----------
+    session
+        Session.
+    port
+        TCP port; 0 selects a free one.
+
+    Returns
+    -------
+    server : ThreadingHTTPServer
+        The running server; call ``shutdown`` to stop it.
+    address : str
+        URL of the page with its access token.
+    """
     token, lock = secrets.token_urlsafe(16), threading.Lock()
     server = ThreadingHTTPServer(("127.0.0.1", port), _handler(session, token, lock))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     return server, f"http://127.0.0.1:{server.server_address[1]}/?token={token}"
 
 
-def _actions(session: AnnotationSession) -> dict[str, Callable[[dict], dict]]:
-    def then_describe(action):
-        def run(body):
+def _actions(session: AnnotationSession) -> dict[str, Callable[[_Json], _Json]]:
+    def returning_state(action: Callable[[_Json], None]) -> Callable[[_Json], _Json]:
+        def run(body: _Json) -> _Json:
             action(body)
             return session_state(session)
 
@@ -214,9 +357,9 @@ def _actions(session: AnnotationSession) -> dict[str, Callable[[dict], dict]]:
     return {
         "/state": lambda body: session_state(session),
         "/where": lambda body: {"photo": describe_position(session, body["terrain"])},
-        "/pick": then_describe(lambda body: add_match(session, body["photo"], body["terrain"])),
-        "/undo": then_describe(lambda body: remove_last_match(session)),
-        "/solve": then_describe(lambda body: solve_session(session)),
+        "/pick": returning_state(lambda body: add_match(session, body["photo"], body["terrain"])),
+        "/undo": returning_state(lambda body: remove_last_match(session)),
+        "/solve": returning_state(lambda body: solve_session(session)),
         "/save": lambda body: {"files": [str(path) for path in save_session(session)]},
     }
 
@@ -225,7 +368,7 @@ def _handler(session: AnnotationSession, token: str, lock: threading.Lock) -> ty
     actions = _actions(session)
 
     class Handler(BaseHTTPRequestHandler):
-        def log_message(self, *args):
+        def log_message(self, format: str, *args: object) -> None:
             pass
 
         def _allowed(self, given: str | None) -> bool:
@@ -243,7 +386,7 @@ def _handler(session: AnnotationSession, token: str, lock: threading.Lock) -> ty
             self.end_headers()
             self.wfile.write(body)
 
-        def do_GET(self):
+        def do_GET(self) -> None:
             address = urlparse(self.path)
             if not self._allowed(parse_qs(address.query).get("token", [""])[0]):
                 return
@@ -252,22 +395,22 @@ def _handler(session: AnnotationSession, token: str, lock: threading.Lock) -> ty
                 self._send(200, "text/html; charset=utf-8", page.replace("@TOKEN@", token).encode())
             elif address.path in ("/photo.jpg", "/terrain.png"):
                 with lock:
-                    picture = session.image if address.path == "/photo.jpg" else session.relief
+                    image = session.image if address.path == "/photo.jpg" else session.relief
                 suffix = address.path[-4:]
                 self._send(
                     200,
                     f"image/{'jpeg' if suffix == '.jpg' else 'png'}",
-                    cv2.imencode(suffix, picture[..., ::-1])[1].tobytes(),
+                    cv2.imencode(suffix, image[..., ::-1])[1].tobytes(),
                 )
             else:
                 self._send(404, "application/json", b'{"error": "no such page"}')
 
-        def do_POST(self):
+        def do_POST(self) -> None:
             if not self._allowed(self.headers.get("X-Token")):
                 return
             action = actions.get(urlparse(self.path).path)
             length = int(self.headers.get("Content-Length") or 0)
-            if action is None or length > _LARGEST_REQUEST:
+            if action is None or length > _MAX_REQUEST_BYTES:
                 self._send(404, "application/json", b'{"error": "no such action"}')
                 return
             try:
@@ -275,7 +418,7 @@ def _handler(session: AnnotationSession, token: str, lock: threading.Lock) -> ty
                 with lock:
                     answer = action(body)
             except (ValueError, KeyError, TypeError) as error:
-                # What the person did wrong, as a sentence on the page.
+                # The page displays the message; a KeyError or TypeError has none that is readable.
                 text = str(error) if isinstance(error, ValueError) else f"not a request of this page: {error!r}"
                 self._send(400, "application/json", json.dumps({"error": text}).encode())
                 return

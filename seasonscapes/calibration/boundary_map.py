@@ -1,8 +1,8 @@
-"""How well each pixel of a photograph would serve as the border of a landscape: an edge with calm air right above it.
+"""Likelihood of a skyline at each pixel of a photograph: an edge with a smooth region directly above it.
 
-A contrast of logarithms: the gradient at a pixel against the usual gradient in a window just above. It makes the pale
-snow ridge under a bright cloud count as much as a dark one, and pattern inside the ground count little, since there the
-window above is patterned too. Nothing is learned and nothing is cut out.
+The measure is a difference of logarithms: the gradient magnitude at a pixel against the typical gradient magnitude in a
+window just above it. A pale snow ridge under a bright cloud therefore scores as high as a dark one, and texture on the
+ground scores low, because the window above it is textured too. No training and no sky segmentation are involved.
 """
 
 from __future__ import annotations
@@ -12,26 +12,28 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-# Gradients below this [Lab units a pixel] are sensor and compression noise.
+from seasonscapes.errors import NoUsablePixels
+
+# Gradients below this value [Lab units per pixel] are sensor and compression noise.
 _NOISE = 0.35
-# Pixels of the working picture in a degree of view: fine enough for a start, coarse enough to be quick.
+# Resolution of the coarse maps [px per degree]: fine enough for an initial pose, coarse enough for a fast search.
 _PER_DEGREE = 10.0
 
 
 @dataclass(frozen=True)
 class BoundaryMap:
-    """Evidence for boundaries, at a working scale for the search and in full for the refinement.
+    """Edge likelihood at a coarse scale for the search and at full resolution for the refinement.
 
     Parameters
     ----------
     scale
-        Working pixels per picture pixel.
+        Coarse pixels per image pixel.
     coarse, coarse_edges
-        ``(h, w)`` tolerant evidence in [0, 1] for a skyline and for any edge; NaN where masked.
+        ``(h, w)`` blurred likelihood in [0, 1] of a skyline and of any edge; NaN where masked.
     near
-        ``(h, w)`` 1 where a distinct boundary lies within three working pixels, 0 elsewhere; NaN where masked.
+        ``(h, w)`` 1 where a distinct boundary lies within three coarse pixels, else 0; NaN where masked.
     fine, fine_edges
-        ``(H, W)`` evidence in [0, 1] of full resolution; 0 where masked.
+        ``(H, W)`` likelihood in [0, 1] of a skyline and of any edge at full resolution; 0 where masked.
     """
 
     scale: float
@@ -42,76 +44,133 @@ class BoundaryMap:
     fine_edges: np.ndarray
 
 
+@dataclass(frozen=True)
+class EdgeMatches:
+    """Image edges found near K points of a projected line.
+
+    Parameters
+    ----------
+    index
+        Index ``(K,)`` of the matched points of the line.
+    pixel
+        Sub-pixel position ``(K, 2)`` of the edge.
+    normal
+        Unit vector ``(K, 2)`` across the line, along which the edge was searched.
+    strength
+        Edge likelihood ``(K,)`` in [0, 1].
+    """
+
+    index: np.ndarray
+    pixel: np.ndarray
+    normal: np.ndarray
+    strength: np.ndarray
+
+
 def picture_area(encoded: np.ndarray) -> np.ndarray:
-    """Mask ``(H, W)`` without a uniform frame around a picture ``(H, W, 3)`` uint8 (card, letterbox)."""
+    """Detect a uniform border around an image (mount of a print, letterbox).
+
+    Parameters
+    ----------
+    encoded
+        Image ``(H, W, 3)`` uint8.
+
+    Returns
+    -------
+    ndarray
+        Mask ``(H, W)`` bool, False on the border and up to four pixels inside its edge.
+    """
     corner = np.median(np.concatenate([encoded[:3, :3], encoded[-3:, -3:]]).reshape(-1, 3), axis=0)
-    same = np.abs(encoded.astype(np.int16) - corner).max(axis=-1) <= 12
-    mask = np.ones(same.shape, bool)
+    is_border_colour = np.abs(encoded.astype(np.int16) - corner).max(axis=-1) <= 12
+    mask = np.ones(is_border_colour.shape, bool)
     for axis in (0, 1):
-        share = same.mean(axis=1 - axis)
+        fraction = is_border_colour.mean(axis=1 - axis)
         for order in (slice(None), slice(None, None, -1)):
-            run = int(np.argmax(share[order] < 0.97)) if (share < 0.97).any() else 0
-            if 2 <= run < 0.25 * len(share):
-                # A few pixels of the frame's own edge go too.
-                cut = np.arange(len(share))[order][: run + 4]
-                mask[(cut, slice(None)) if axis == 0 else (slice(None), cut)] = False
+            width = int(np.argmax(fraction[order] < 0.97)) if (fraction < 0.97).any() else 0
+            if 2 <= width < 0.25 * len(fraction):
+                border = np.arange(len(fraction))[order][: width + 4]
+                mask[(border, slice(None)) if axis == 0 else (slice(None), border)] = False
     return mask
 
 
 def boundary_map(encoded: np.ndarray, mask: np.ndarray | None, pixels_per_degree: float) -> BoundaryMap:
-    """Evidence of a picture ``(H, W, 3)`` uint8 sRGB; ``mask`` ``(H, W)`` False before the landscape, or ``None``."""
+    """Compute the edge likelihood of an image.
+
+    Parameters
+    ----------
+    encoded
+        Image ``(H, W, 3)`` uint8 sRGB.
+    mask
+        ``(H, W)`` bool, False where foreground occludes the landscape; `picture_area` if ``None``.
+    pixels_per_degree
+        Angular resolution of the image [px/°].
+
+    Returns
+    -------
+    BoundaryMap
+        Coarse and full-resolution maps.
+
+    Raises
+    ------
+    NoUsablePixels
+        If the mask leaves less than 5 % of the image.
+    ValueError
+        If the image or the mask has the wrong shape or type.
+    """
     mask = picture_area(encoded) if mask is None else np.asarray(mask, bool)
     if encoded.ndim != 3 or encoded.dtype != np.uint8:
         raise ValueError(f"boundary_map: got {encoded.dtype} {encoded.shape}, expected (H, W, 3) uint8")
-    if mask.shape != encoded.shape[:2] or mask.mean() < 0.05:
-        raise ValueError(f"boundary_map: the mask {mask.shape} leaves {100 * mask.mean():.0f} % of {encoded.shape[:2]}")
+    if mask.shape != encoded.shape[:2]:
+        raise ValueError(f"boundary_map: got a mask {mask.shape}, expected {encoded.shape[:2]} as the image")
+    if mask.mean() < 0.05:
+        raise NoUsablePixels(
+            f"boundary_map: the mask leaves {100 * mask.mean():.0f} % of the image, expected at least 5 %"
+        )
     scale = min(1.0, _PER_DEGREE / pixels_per_degree)
     small = cv2.resize(encoded, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    open_small = cv2.resize(mask.astype(np.uint8), small.shape[1::-1], interpolation=cv2.INTER_AREA) > 0
-    # The frame of a mask is itself an edge: what is close to it says nothing.
-    open_small = cv2.erode(open_small.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=1) > 0
-    open_full = cv2.erode(mask.astype(np.uint8), np.ones((9, 9), np.uint8), borderValue=1) > 0
-    border, edge = _evidence(small, 1.0)
+    usable_small = cv2.resize(mask.astype(np.uint8), small.shape[1::-1], interpolation=cv2.INTER_AREA) > 0
+    # The outline of a mask is itself an edge in the image; pixels close to it are not used.
+    usable_small = cv2.erode(usable_small.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=1) > 0
+    usable = cv2.erode(mask.astype(np.uint8), np.ones((9, 9), np.uint8), borderValue=1) > 0
+    border, edge = _edge_likelihood(small, 1.0)
     thin, thin_edge = _thin(border), _thin(edge)
     near = cv2.dilate((thin > 0.4).astype(np.float32), np.ones((7, 3), np.uint8))
-    fine, fine_edge = _evidence(encoded, 1.0 / scale)
-    hidden = ~open_small
-    maps = [_tolerant(thin), _tolerant(thin_edge), near]
-    for values in maps:
-        values[hidden] = np.nan
-    return BoundaryMap(scale, *maps, np.where(open_full, fine, 0.0), np.where(open_full, fine_edge, 0.0))
+    fine, fine_edge = _edge_likelihood(encoded, 1.0 / scale)
+    coarse, coarse_edge = _blurred(thin), _blurred(thin_edge)
+    for values in (coarse, coarse_edge, near):
+        values[~usable_small] = np.nan
+    return BoundaryMap(scale, coarse, coarse_edge, near, np.where(usable, fine, 0.0), np.where(usable, fine_edge, 0.0))
 
 
-def _evidence(encoded: np.ndarray, zoom: float) -> tuple[np.ndarray, np.ndarray]:
-    """Skyline and edge evidence ``(H, W)`` in [0, 1]; ``zoom`` says how much larger than working size the picture is."""
+def _edge_likelihood(encoded: np.ndarray, zoom: float) -> tuple[np.ndarray, np.ndarray]:
+    """Skyline and edge likelihood ``(H, W)`` in [0, 1]; ``zoom`` is the size of the image over the coarse size."""
     lab = cv2.cvtColor(encoded.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)
-    lab = cv2.GaussianBlur(lab, (0, 0), 1.2) * np.float32([1.0, 1.5, 1.5])
-    across = cv2.Sobel(lab, cv2.CV_32F, 1, 0, scale=0.125 * zoom)
-    down = cv2.Sobel(lab, cv2.CV_32F, 0, 1, scale=0.125 * zoom)
-    strength = np.sqrt(np.sum(across**2 + down**2, axis=2))
-    upright = np.clip(1.5 * np.sqrt(np.sum(down**2, axis=2)) / np.maximum(strength, 1e-6), 0.0, 1.0)
+    lab = cv2.GaussianBlur(lab, (0, 0), 1.2) * np.array([1.0, 1.5, 1.5], np.float32)
+    gradient_x = cv2.Sobel(lab, cv2.CV_32F, 1, 0, scale=0.125 * zoom)
+    gradient_y = cv2.Sobel(lab, cv2.CV_32F, 0, 1, scale=0.125 * zoom)
+    strength = np.sqrt(np.sum(gradient_x**2 + gradient_y**2, axis=2))
+    vertical = np.clip(1.5 * np.sqrt(np.sum(gradient_y**2, axis=2)) / np.maximum(strength, 1e-6), 0.0, 1.0)
     window, gap, side = max(3, int(0.05 * encoded.shape[0])), round(3 * zoom), 2 * round(2 * zoom) + 1
-    # A fourth-power mean: one distinct edge within the window is enough to make it unquiet.
-    unquiet = cv2.blur((strength + _NOISE) ** 4, (side, window), borderType=cv2.BORDER_REPLICATE) ** 0.25
-    # The blur is centred; the window has to end `gap` rows above the pixel.
+    # With a fourth-power mean, one distinct edge in the window suffices for a high texture value.
+    texture = cv2.blur((strength + _NOISE) ** 4, (side, window), borderType=cv2.BORDER_REPLICATE) ** 0.25
+    # The blur is centred, but the window must end `gap` rows above the pixel.
     shift = gap + window // 2
-    above = np.log(np.vstack([np.repeat(unquiet[:1], shift, axis=0), unquiet[:-shift]]))
+    above = np.log(np.vstack([np.repeat(texture[:1], shift, axis=0), texture[:-shift]]))
     level = np.log(strength + _NOISE)
     contrast = np.clip((level - above) / 2.2, 0.0, 1.0)
-    border = contrast * upright
+    border = contrast * vertical
     top = round(4 * zoom)
     border[:top] = 0.0
     typical = max(float(np.percentile(strength, 92)), 1.0)
-    return border, np.clip(strength / typical, 0.0, 1.0) * upright
+    return border, np.clip(strength / typical, 0.0, 1.0) * vertical
 
 
 def _thin(values: np.ndarray) -> np.ndarray:
-    """Only the strongest of five rows stays."""
+    """Non-maximum suppression over five rows."""
     return np.where(values >= cv2.dilate(values, np.ones((5, 1), np.uint8)), values, 0.0).astype(np.float32)
 
 
-def _tolerant(thin: np.ndarray, sigma: float = 2.5) -> np.ndarray:
-    """A line of full strength spreads into a ridge of height one."""
+def _blurred(thin: np.ndarray, sigma: float = 2.5) -> np.ndarray:
+    """Gaussian blur, normalised so that a horizontal line of likelihood 1 keeps its maximum."""
     return np.minimum(cv2.GaussianBlur(thin, (0, 0), sigma) * (sigma * np.sqrt(2.0 * np.pi)), 1.0)
 
 
@@ -123,11 +182,28 @@ def edge_near(
     skyline: bool,
     *,
     least: float = 0.25,
-):
-    """Edges beside the points of a projected line, across its course, up to ``reach_px`` ``(N,)`` away.
+) -> EdgeMatches | None:
+    """Search the strongest edge across a projected line at each of its points.
 
-    Returns index ``(K,)`` of the points that met one, where it is ``(K, 2)``, the direction across ``(K, 2)`` and its
-    strength ``(K,)``; ``None`` where none did.
+    Parameters
+    ----------
+    boundary
+        Edge likelihood of the image.
+    pixel
+        Points of the line ``(N, 2)`` in order [px].
+    front
+        ``(N,)`` bool, True where the point lies in front of the camera.
+    reach_px
+        Search distance ``(N,)`` to each side [px].
+    skyline
+        Whether the line is a skyline, searched across its own direction; other edges are searched vertically.
+    least
+        Minimum likelihood of an edge.
+
+    Returns
+    -------
+    EdgeMatches or None
+        Edges with sub-pixel positions (parabola through three samples); ``None`` if fewer than five are found.
     """
     values = boundary.fine if skyline else boundary.fine_edges
     height, width = values.shape
@@ -136,13 +212,13 @@ def edge_near(
     index = np.flatnonzero(inside)
     if len(index) < 5:
         return None
-    place = pixel[index]
-    normal = _across(place) if skyline else np.tile([0.0, 1.0], (len(place), 1))
+    origin = pixel[index]
+    normal = _line_normals(origin) if skyline else np.tile([0.0, 1.0], (len(origin), 1))
     reach = reach_px[index, None]
     unit = np.linspace(-1.0, 1.0, 2 * int(np.ceil(2.0 * reach.max())) + 1)
     offsets = reach * unit
-    samples = (place[:, None] + offsets[..., None] * normal[:, None] - 0.5).astype(np.float32)
-    found = cv2.remap(
+    samples = (origin[:, None] + offsets[..., None] * normal[:, None] - 0.5).astype(np.float32)
+    likelihood = cv2.remap(
         values.astype(np.float32),
         samples[..., 0],
         samples[..., 1],
@@ -150,28 +226,28 @@ def edge_near(
         borderMode=cv2.BORDER_CONSTANT,
         borderValue=0,
     )
-    ranked = found * np.exp(-0.5 * (unit / 0.7) ** 2)
-    best = np.clip(np.argmax(ranked, axis=1), 1, len(unit) - 2)
+    weighted = likelihood * np.exp(-0.5 * (unit / 0.7) ** 2)
+    best = np.clip(np.argmax(weighted, axis=1), 1, len(unit) - 2)
     rows = np.arange(len(best))
-    left, middle, right = found[rows, best - 1], found[rows, best], found[rows, best + 1]
-    bend = 2.0 * middle - left - right
-    shift = np.where(bend > 1e-4, 0.5 * (right - left) / np.maximum(bend, 1e-4), 0.0)
-    met = middle > least
-    if met.sum() < 5:
+    left, middle, right = likelihood[rows, best - 1], likelihood[rows, best], likelihood[rows, best + 1]
+    curvature = 2.0 * middle - left - right
+    shift = np.where(curvature > 1e-4, 0.5 * (right - left) / np.maximum(curvature, 1e-4), 0.0)
+    matched = middle > least
+    if matched.sum() < 5:
         return None
     distance = offsets[rows, best] + reach[:, 0] * (unit[1] - unit[0]) * np.clip(shift, -1.0, 1.0)
-    target = place + distance[:, None] * normal
-    return index[met], target[met], normal[met], np.clip(middle[met], 0.0, 1.0)
+    edge = origin + distance[:, None] * normal
+    return EdgeMatches(index[matched], edge[matched], normal[matched], np.clip(middle[matched], 0.0, 1.0))
 
 
-def _across(place: np.ndarray) -> np.ndarray:
-    """Unit vectors across a line of points in order, from its course over a few pixels; pointing down."""
-    along = np.empty_like(place)
+def _line_normals(pixel: np.ndarray) -> np.ndarray:
+    """Unit normals ``(N, 2)`` of a polyline, from its direction over a few points; pointing down."""
+    along = np.empty_like(pixel)
     span = 4
-    along[span:-span] = place[2 * span :] - place[: -2 * span]
+    along[span:-span] = pixel[2 * span :] - pixel[: -2 * span]
     along[:span], along[-span:] = along[span], along[-span - 1]
     length = np.linalg.norm(along, axis=1, keepdims=True)
-    # A jump from one ridge to another is no course.
+    # A jump from one ridge to another does not define a direction; a horizontal line is assumed.
     along = np.where((length > 0) & (length < 60.0), along / np.maximum(length, 1e-9), [1.0, 0.0])
     normal = np.stack([-along[:, 1], along[:, 0]], -1)
     return normal * np.where(normal[:, 1:] < 0, -1.0, 1.0)

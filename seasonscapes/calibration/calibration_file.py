@@ -1,4 +1,4 @@
-"""A calibration on disk: one JSON record that a person can read and a later stage can use."""
+"""Calibration records: read and write the pose, field of view and uncertainty of a webcam as JSON."""
 
 from __future__ import annotations
 
@@ -14,14 +14,28 @@ from seasonscapes.calibration.resection import Calibration
 from seasonscapes.cameras.exchange import read_json
 from seasonscapes.cameras.panorama import PROJECTIONS, Panorama
 from seasonscapes.cameras.pinhole import Camera
-from seasonscapes.declaration import InputError
+from seasonscapes.errors import InputError
 from seasonscapes.frames import LocalFrame, geodetic_from_enu
 from seasonscapes.images import atomic_path
 
 
 @dataclass(frozen=True)
 class CalibratedWebcam:
-    """What `read_calibration` gives: the webcam's id, its view, lens term, standard deviations and frame."""
+    """Contents of a calibration record.
+
+    Parameters
+    ----------
+    webcam
+        Id of the webcam.
+    view
+        Camera or panorama with its pose in ``frame``.
+    k1
+        Radial distortion coefficient.
+    sigma
+        Standard deviation of each parameter, by the names `PARAMETERS`; 0 where it was fixed.
+    frame
+        Local frame of the pose.
+    """
 
     webcam: str
     view: View
@@ -31,7 +45,19 @@ class CalibratedWebcam:
 
 
 def write_calibration(path: Path, webcam: str, calibration: Calibration, frame: LocalFrame) -> None:
-    """Write a calibration, atomically. Positions are also given in WGS 84, residuals with their names."""
+    """Write a calibration record; the file appears atomically.
+
+    Parameters
+    ----------
+    path
+        JSON file to write.
+    webcam
+        Id of the webcam.
+    calibration
+        Result of a resection.
+    frame
+        Local frame of the pose. The record holds the position in WGS 84 as well.
+    """
     view = calibration.view
     latitude, longitude, height = (float(v) for v in geodetic_from_enu(frame, view.position_m))
     record = {
@@ -56,8 +82,10 @@ def write_calibration(path: Path, webcam: str, calibration: Calibration, frame: 
             "refraction_k": frame.refraction_k,
         },
         "points": [
-            {"name": name, "residual_px": error.tolist(), "set_aside": bool(out)}
-            for name, error, out in zip(calibration.names, calibration.residual_px, calibration.outlier, strict=True)
+            {"name": name, "residual_px": error.tolist(), "set_aside": bool(is_outlier)}
+            for name, error, is_outlier in zip(
+                calibration.names, calibration.residual_px, calibration.outlier, strict=True
+            )
         ],
     }
     with atomic_path(path) as temporary:
@@ -65,18 +93,35 @@ def write_calibration(path: Path, webcam: str, calibration: Calibration, frame: 
 
 
 def read_calibration(path: Path) -> CalibratedWebcam:
-    """Read what `write_calibration` wrote; `InputError` for anything else."""
+    """Read a calibration record.
+
+    Parameters
+    ----------
+    path
+        JSON file written by `write_calibration`.
+
+    Returns
+    -------
+    CalibratedWebcam
+        View, distortion, standard deviations and frame.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or is no calibration record.
+    """
     record = read_json(path)
     try:
-        numbers = [float(record[key]) for key in ("fx", "fy", "cx", "cy")]
-        pose, size = np.array(record["world_from_camera"], float), [int(v) for v in record["size_px"]]
+        fx, fy, cx, cy = (float(record[key]) for key in ("fx", "fy", "cx", "cy"))
+        pose = np.array(record["world_from_camera"], float)
+        width, height = (int(v) for v in record["size_px"])
         projection = record["projection"]
         sigma = {name: float(record["sigma"][name]) for name in PARAMETERS}
         frame = LocalFrame(**record["frame"])
         if projection == "perspective":
-            view: View = Camera(*size, *numbers, pose, frame)
+            view: View = Camera(width, height, fx, fy, cx, cy, pose, frame)
         elif projection in PROJECTIONS:
-            view = Panorama(projection, *size, *numbers, pose, frame)
+            view = Panorama(projection, width, height, fx, fy, cx, cy, pose, frame)
         else:
             raise ValueError(f"projection {projection!r}")
         return CalibratedWebcam(str(record["webcam"]), view, float(record["k1"]), sigma, frame)

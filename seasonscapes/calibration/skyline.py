@@ -1,13 +1,14 @@
-"""Alignment to the terrain without any hand: the horizon and the ridges before it, looked for in the photograph.
+"""Automatic camera resection from the skyline: align the terrain horizon to edges in the photograph.
 
-No sky is cut out first. The picture becomes a map of how well each pixel would serve as a boundary with calm sky right
-above it; the terrain's horizon, shaped by a trial pose, collects what lies under it. All poses within the search are
-tried coarsely, the best few are refined to sub-pixel edges by `resect`, and what remains of the doubt (a rival pose
-elsewhere, few edges met, wide error bars, a rim of the search) decides whether the result is to be trusted.
+The sky is not segmented. `boundary_map` measures at each pixel the likelihood of a skyline; a trial pose is scored by the
+mean likelihood along its projected horizon and ridges. All poses in the search range are scored coarsely, and the best
+few are refined to sub-pixel edges by `resect`. The result counts as reliable if no other heading scores similarly, enough
+of the horizon coincides with edges, the heading is well determined, and it does not lie at the limit of the range.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -20,29 +21,30 @@ from seasonscapes.calibration.pose_model import View, project_values, values_of,
 from seasonscapes.calibration.resection import Calibration, SkylineEvidence, resect
 from seasonscapes.calibration.terrain_horizon import Horizon, horizon_from
 from seasonscapes.cameras.panorama import Panorama
+from seasonscapes.errors import UnreadableImage
 from seasonscapes.frames import LocalFrame, geodetic_from_enu, local_axes
 from seasonscapes.terrain.surface import Raster
 
-# Points of a line that are worth their time.
-_MOST_POINTS = 700
-# What a result must reach to be trusted; found on rehearsals with fog, masks and wrong places (benchmarks/calibration.py).
-LEAST_MET, LEAST_LEAD, MOST_SIGMA_DEG, LEAST_COLUMNS = 0.6, 1.06, 0.12, 0.15
+# Maximum number of points of a line in the refinement.
+_MAX_POINTS = 700
+# Thresholds of a reliable fit, found in synthetic trials with fog, masks and wrong places (benchmarks/calibration.py).
+MIN_EDGE_FRACTION, MIN_SCORE_RATIO, MAX_HEADING_SIGMA_DEG, MIN_COLUMN_FRACTION = 0.6, 1.06, 0.12, 0.15
 
 
 @dataclass(frozen=True)
 class SearchRange:
-    """How far from the start to look, each way, and how far the start is trusted otherwise.
+    """Range of poses about the start that are searched, and the priors of the refinement.
 
     Parameters
     ----------
     heading_deg, tilt_deg, roll_deg
-        Half ranges [deg]. For a panorama ``tilt_deg`` is also how far its horizon may be off its row.
+        Half ranges [deg]. For a panorama ``tilt_deg`` is also the half range of its horizon row, as an angle.
     focal
         Half range of the field-of-view scale, relative.
     terrain_sigma_m
-        Height error of the terrain [m]; a third of a cell when left out.
+        Standard deviation of the terrain height [m]; a third of a raster cell if ``None``.
     priors
-        Standard deviations for the refinement; position most of all, since a skyline says little about it.
+        Standard deviations in the refinement. Those of the position matter most, because a skyline hardly constrains it.
     """
 
     heading_deg: float = 12.0
@@ -57,37 +59,81 @@ class SearchRange:
 
 @dataclass(frozen=True)
 class SkylineFit:
-    """An alignment and how far it can be believed.
+    """Result of a skyline alignment and its reliability.
 
     Parameters
     ----------
     calibration
-        The solved view; ``None`` where no pose of the search met any edges at all.
+        Calibrated view; ``None`` if no pose in the search range coincides with image edges.
     reliable
-        Whether every test below is passed.
-    met
-        Share of the horizon inside the picture (and the mask) that has an edge where it is expected, less what chance
-        alone would give.
-    lead
-        Score of the pose over that of the best rival more than 1.5° away in heading.
+        Whether all criteria below are met.
+    edge_fraction
+        Fraction of the horizon within the image and the mask that coincides with an image edge, corrected for chance
+        coincidences.
+    score_ratio
+        Score of the pose relative to the best pose more than 1° away in heading; infinite if there is none.
     heading_sigma_deg
         Standard deviation of the heading [deg].
-    columns
-        Share of the picture's columns that the used horizon crosses.
+    column_fraction
+        Fraction of the image columns that the visible horizon crosses.
     doubts
-        The tests that failed, in words; empty when reliable.
+        Description of each criterion that is not met; empty if reliable.
     horizon
-        The terrain's horizon at the solved place.
+        Terrain horizon at the start position.
     """
 
     calibration: Calibration | None
     reliable: bool
-    met: float
-    lead: float
+    edge_fraction: float
+    score_ratio: float
     heading_sigma_deg: float
-    columns: float
+    column_fraction: float
     doubts: tuple[str, ...]
     horizon: Horizon
+
+
+@dataclass(frozen=True)
+class _SkylineProblem:
+    """Inputs shared by the search, the refinement and the assessment.
+
+    Parameters
+    ----------
+    start
+        View that the parameters refer to.
+    axes
+        East, north and up at the camera, rows ``(3, 3)``.
+    origin
+        Parameters ``(9,)`` of the start.
+    horizon
+        Terrain horizon at the start position.
+    terrain_sigma_m
+        Standard deviation of the terrain height [m].
+    boundary
+        Edge likelihood of the photograph.
+    search
+        Search range.
+    points
+        Correspondences used in addition, or ``None``.
+    """
+
+    start: View
+    axes: np.ndarray
+    origin: np.ndarray
+    horizon: Horizon
+    terrain_sigma_m: float
+    boundary: BoundaryMap
+    search: SearchRange
+    points: Correspondences | None
+
+    @property
+    def skyline_m(self) -> np.ndarray:
+        """Skyline points ``(S, 3)`` [m] of the azimuths that have a skyline."""
+        return self.horizon.skyline_m[np.isfinite(self.horizon.skyline_elevation_deg)]
+
+    @property
+    def pixels_per_degree(self) -> float:
+        """Vertical resolution of the photograph [px/°]."""
+        return self.start.fy * np.pi / 180.0
 
 
 def align_to_skyline(
@@ -101,40 +147,48 @@ def align_to_skyline(
     points: Correspondences | None = None,
     k1: float = 0.0,
 ) -> SkylineFit:
-    """Find a view's pose by its skyline, or by skyline and points together.
+    """Estimate the pose of a view from its skyline, or from skyline and correspondences together.
 
     Parameters
     ----------
     image
-        ``(H, W, 3)`` uint8 sRGB.
+        Photograph ``(H, W, 3)`` uint8 sRGB.
     start
-        Where the camera is thought to be and to look.
+        Approximate view.
     rasters
-        Elevations, the most detailed first.
+        Elevation rasters, the most detailed first.
+    frame
+        Local frame of the view.
     mask
-        ``(H, W)`` bool, False where something stands before the landscape.
+        ``(H, W)`` bool, False where foreground occludes the landscape.
     search
-        How far to look; `Search()` when left out.
+        Search range; `SearchRange()` if omitted.
     points
-        Matched points that count as well.
+        Correspondences used in addition.
     k1
-        Radial term of the lens.
+        Radial distortion coefficient.
 
     Returns
     -------
     SkylineFit
-        ``reliable`` is False and ``doubts`` says why where the pose should not be used.
+        Calibration with its reliability. If ``reliable`` is False, ``doubts`` states why the pose should not be used.
 
     Raises
     ------
+    NoTerrainInView
+        If no terrain is visible from the start position, or the position lies below the ground.
+    NoUsablePixels
+        If the mask leaves less than 5 % of the image.
+    NotEnoughEvidence
+        If the correspondences contradict each other, or a parameter remains undetermined.
     ValueError
-        A picture of another size than the view; no terrain in sight; a camera below ground.
+        If the image and the view differ in size.
     """
     search = search or SearchRange()
     if image.shape[:2] != (start.height_px, start.width_px):
         raise ValueError(
-            f"align_to_skyline: the picture is {image.shape[1]} x {image.shape[0]} px, the view "
-            f"{start.width_px} x {start.height_px}"
+            f"align_to_skyline: the image is {image.shape[1]} x {image.shape[0]} px, expected "
+            f"{start.width_px} x {start.height_px} as the view"
         )
     latitude, longitude, _ = geodetic_from_enu(frame, start.position_m)
     axes = local_axes(frame, float(latitude), float(longitude))
@@ -145,29 +199,29 @@ def align_to_skyline(
         frame,
         start.position_m,
         azimuth_deg=azimuth,
-        nearest_m=max(60.0, 3.0 * _cell(rasters[0])),
+        nearest_m=max(60.0, 3.0 * _cell_m(rasters[0])),
         below_ground_m=40.0,
     )
     boundary = boundary_map(image, mask, start.fy * np.pi / 180.0)
-    candidates, scores = _coarse(start, axes, origin, horizon, boundary, search)
-    error_m = search.terrain_sigma_m or _cell(rasters[0]) / 3.0
-    fits = [
-        _refine(start, axes, candidates[index], (horizon, error_m), boundary, search, points)
-        for index in _peaks(candidates, scores, 6)
-    ]
-    fits = [fit for fit in fits if fit is not None]
+    terrain_sigma_m = search.terrain_sigma_m or _cell_m(rasters[0]) / 3.0
+    problem = _SkylineProblem(start, axes, origin, horizon, terrain_sigma_m, boundary, search, points)
+    poses, scores = _search_poses(problem)
+    refined = [_refine(problem, poses[index]) for index in _best_distinct(poses, scores, 6)]
+    fits = [fit for fit in refined if fit is not None]
     if not fits:
-        return SkylineFit(None, False, 0.0, 0.0, float("inf"), 0.0, ("no pose of the search meets any edges",), horizon)
-    return _judge(axes, origin, fits, horizon, boundary, search)
+        reason = "no pose in the search range coincides with image edges"
+        return SkylineFit(None, False, 0.0, 0.0, float("inf"), 0.0, (reason,), horizon)
+    return _assess(problem, fits)
 
 
-def _cell(raster: Raster) -> float:
+def _cell_m(raster: Raster) -> float:
+    """Cell size [m]; rasters in degrees are recognised by their small cells."""
     size = float(np.sqrt(abs(raster.transform.determinant)))
     return size * 111_195.0 if size < 0.1 else size
 
 
 def _azimuths(start: View, origin: np.ndarray, search: SearchRange) -> np.ndarray:
-    """Directions that any pose of the search may see, at about two thirds of a pixel."""
+    """Azimuths ``(A,)`` [deg] visible from any pose in the search range, in steps of about two thirds of a pixel."""
     if isinstance(start, Panorama):
         half, pitch = start.span_deg / 2.0, 1.0 / start.fx
         offset = np.degrees((0.5 * start.width_px - start.cx) / start.fx)
@@ -180,38 +234,31 @@ def _azimuths(start: View, origin: np.ndarray, search: SearchRange) -> np.ndarra
     return origin[0] + offset - half + (np.arange(count) + 0.5) * (2.0 * half / count)
 
 
-def _coarse(
-    start: View, axes: np.ndarray, origin: np.ndarray, horizon: Horizon, boundary: BoundaryMap, search: SearchRange
-):
-    """Poses ``(P, 9)`` and their scores over the whole search at 0.4° or a coarser pixel.
+def _search_poses(problem: _SkylineProblem) -> tuple[np.ndarray, np.ndarray]:
+    """Parameters ``(P, 9)`` and scores ``(P,)`` of all poses in the range, in steps of 0.4° or of a coarse pixel.
 
-    A small tilt moves the whole line up or down (in a panorama it is the horizon's row that moves): all tilts of a
-    heading share one projection.
+    A small tilt shifts the projected horizon vertically (in a panorama the horizon row itself is shifted), so all tilts
+    of a heading share one projection.
     """
-    per_degree = start.fy * np.pi / 180.0
+    start, search, boundary, horizon = problem.start, problem.search, problem.boundary, problem.horizon
+    per_degree = problem.pixels_per_degree
     step = float(np.clip(3.0 / per_degree / boundary.scale, 0.12, 0.4))
     headings = _steps(search.heading_deg, step)
     tilts = _steps(search.tilt_deg, step)
-    keep = np.isfinite(horizon.skyline_elevation_deg)
-    sky = horizon.skyline_m[keep][:: max(1, int(keep.sum() / 500))]
+    skyline = problem.skyline_m
+    skyline = skyline[:: max(1, int(len(skyline) / 500))]
     edges = horizon.edges_m[:: max(1, len(horizon.edges_m) // 300)]
-    # Up in the picture by a degree of tilt.
-    shift = np.round(tilts * per_degree * boundary.scale).astype(int)
+    row_shift = np.round(tilts * per_degree * boundary.scale).astype(int)
     poses, scores = [], []
-    panoramic = isinstance(start, Panorama)
-    lifts = tilts[:, None] * (per_degree * np.eye(9)[8] if panoramic else np.eye(9)[1])
-    # Leaning the axis of a panorama bends its horizon into a wave; that is left to the climb.
-    for roll in np.zeros(1) if panoramic else _steps(search.roll_deg, 1.0):
-        for scale in _steps(np.log1p(search.focal), 0.03):
+    is_panorama = isinstance(start, Panorama)
+    tilt_offsets = tilts[:, None] * (per_degree * np.eye(9)[8] if is_panorama else np.eye(9)[1])
+    # A tilted axis of a panorama turns its horizon into a sine curve; that is left to the local maximisation.
+    for roll in np.zeros(1) if is_panorama else _steps(search.roll_deg, 1.0):
+        for log_scale in _steps(np.log1p(search.focal), 0.03):
             for heading in headings:
-                values = origin + np.array([heading, 0.0, roll, 0, 0, 0, scale, 0, 0])
-                score = _scores(start, axes, values, sky, boundary.coarse, boundary.scale, shift)
-                if len(edges) > 20:
-                    score = score + 0.25 * _scores(
-                        start, axes, values, edges, boundary.coarse_edges, boundary.scale, shift
-                    )
-                scores.append(score)
-                poses.append(values + lifts)
+                values = problem.origin + np.array([heading, 0.0, roll, 0, 0, 0, log_scale, 0, 0])
+                scores.append(_pose_scores(problem, values, skyline, edges, row_shift))
+                poses.append(values + tilt_offsets)
     return np.concatenate(poses), np.concatenate(scores)
 
 
@@ -220,246 +267,278 @@ def _steps(half: float, step: float) -> np.ndarray:
     return np.linspace(-half, half, 2 * count + 1) if count else np.zeros(1)
 
 
-def _scores(
-    start: View,
-    axes: np.ndarray,
-    values: np.ndarray,
-    position: np.ndarray,
-    evidence: np.ndarray,
-    scale: float,
-    shift: np.ndarray,
+def _pose_scores(
+    problem: _SkylineProblem, values: np.ndarray, skyline: np.ndarray, edges: np.ndarray, row_shift: np.ndarray
 ) -> np.ndarray:
-    """Mean evidence ``(S,)`` along a projected line for each downward shift in working pixels.
+    """Score ``(S,)`` of parameters ``(9,)`` at each downward shift in coarse pixels: skyline and a quarter of ridges."""
+    boundary = problem.boundary
+    score = _mean_likelihood(problem, values, skyline, boundary.coarse, row_shift)
+    if len(edges) > 20:
+        score = score + 0.25 * _mean_likelihood(problem, values, edges, boundary.coarse_edges, row_shift)
+    return score
 
-    Out of the picture above or below counts as not met: columns are what there is to explain. Masked pixels are no
-    evidence either way.
+
+def _mean_likelihood(
+    problem: _SkylineProblem, values: np.ndarray, position: np.ndarray, likelihood: np.ndarray, row_shift: np.ndarray
+) -> np.ndarray:
+    """Mean likelihood ``(S,)`` along a projected line for each downward shift in coarse pixels.
+
+    Points above or below the image count as zero, so that a pose is scored over all columns. Masked pixels are omitted.
     """
-    pixel, front = project_values(start, axes, values, position)
-    column = np.floor(pixel[:, 0] * scale).astype(int)
+    start = problem.start
+    pixel, in_front = project_values(start, problem.axes, values, position)
+    column = np.floor(pixel[:, 0] * problem.boundary.scale).astype(int)
     if isinstance(start, Panorama) and start.full_circle:
-        column %= evidence.shape[1]
-    use = front & (column >= 0) & (column < evidence.shape[1])
+        column %= likelihood.shape[1]
+    use = in_front & (column >= 0) & (column < likelihood.shape[1])
     if use.sum() < 20:
-        return np.zeros(len(shift))
-    row = np.floor(pixel[use, 1] * scale).astype(int) + shift[:, None]
-    seen = (row >= 0) & (row < evidence.shape[0])
-    found = np.where(seen, evidence[np.clip(row, 0, evidence.shape[0] - 1), column[use]], 0.0)
-    hidden = np.isnan(found)
-    return np.where(hidden, 0.0, found).sum(axis=1) / np.maximum((~hidden).sum(axis=1), 20)
+        return np.zeros(len(row_shift))
+    row = np.floor(pixel[use, 1] * problem.boundary.scale).astype(int) + row_shift[:, None]
+    inside = (row >= 0) & (row < likelihood.shape[0])
+    sampled = np.where(inside, likelihood[np.clip(row, 0, likelihood.shape[0] - 1), column[use]], 0.0)
+    masked = np.isnan(sampled)
+    return np.where(masked, 0.0, sampled).sum(axis=1) / np.maximum((~masked).sum(axis=1), 20)
 
 
-def _collect(start: View, values: np.ndarray, scale: float, pixel: np.ndarray, front: np.ndarray):
-    """Evidence ``(N,)`` under pixels, 0 outside, and which of them lie in the picture's columns and are not masked."""
-    column, row = np.floor(pixel[:, 0] * scale).astype(int), np.floor(pixel[:, 1] * scale).astype(int)
-    if isinstance(start, Panorama) and start.full_circle:
-        column %= values.shape[1]
-    inside = front & (column >= 0) & (column < values.shape[1])
-    seen = inside & (row >= 0) & (row < values.shape[0])
-    found = np.zeros(len(pixel))
-    found[seen] = values[row[seen], column[seen]]
-    return found, inside & ~np.isnan(found)
-
-
-def _peaks(poses: np.ndarray, scores: np.ndarray, count: int) -> list[int]:
-    """Indices of the best poses that differ by more than a degree of heading, or by 8 % of scale."""
+def _best_distinct(poses: np.ndarray, scores: np.ndarray, count: int) -> list[int]:
+    """Indices of the best poses that differ by more than 1° in heading or 8 % in scale."""
     chosen: list[int] = []
     for index in np.argsort(scores)[::-1]:
-        apart = np.abs(poses[index] - poses[chosen])
-        if np.all((apart[:, 0] > 1.0) | (apart[:, 6] > 0.08)):
+        difference = np.abs(poses[index] - poses[chosen])
+        if np.all((difference[:, 0] > 1.0) | (difference[:, 6] > 0.08)):
             chosen.append(int(index))
             if len(chosen) == count:
                 break
     return chosen
 
 
-def _refine(start, axes, values, terrain, boundary, search, points):
-    """The calibration at the edges nearest to its own horizon, in rounds of shrinking reach; and how well it sits there.
+def _refine(problem: _SkylineProblem, values: np.ndarray) -> tuple[Calibration, float] | None:
+    """Calibrate to the edges nearest to the projected horizon, with decreasing search distance; and the final score.
 
-    ``None`` where the horizon leaves the picture.
+    ``None`` if too little of the horizon lies near edges.
     """
+    start, search = problem.start, problem.search
+    values = _maximise_score(problem, values)
+    priors = replace(search.priors, heading_deg=np.inf)
+    if isinstance(start, Panorama) and not priors.horizon_px:
+        priors = replace(priors, horizon_px=search.tilt_deg * start.fy * np.pi / 180.0)
     calibration = None
-    values = _climb(start, axes, values, terrain[0], boundary, search)
-    pixels = 1.0 / boundary.scale
-    for reach in (8.0 * pixels, 4.0 * pixels, 2.5 * pixels, 2.0 * pixels):
-        evidence = _edges_at(start, axes, values, terrain, boundary, reach)
+    coarse_px = 1.0 / problem.boundary.scale
+    for reach in (8.0 * coarse_px, 4.0 * coarse_px, 2.5 * coarse_px, 2.0 * coarse_px):
+        evidence = _skyline_evidence(problem, values, reach)
         if evidence is None:
             return None
-        priors = replace(search.priors, heading_deg=np.inf)
-        if isinstance(start, Panorama) and not priors.horizon_px:
-            priors = replace(priors, horizon_px=search.tilt_deg * start.fy * np.pi / 180.0)
         calibration = resect(
             start,
-            points,
+            problem.points,
             priors=priors,
-            axes=axes,
+            axes=problem.axes,
             k1=float(values[7]),
             guess=values,
             skyline=evidence,
-            noise_px=None if points else 1.0,
+            noise_px=None if problem.points else 1.0,
         )
         values = calibration.values
-    return calibration, _sits(start, axes, values, terrain[0], boundary)
+    assert calibration is not None
+    return calibration, _score(problem, values)
 
 
-def _climb(start, axes, values, horizon, boundary, search) -> np.ndarray:
-    """The summit of the score near a pose, in heading, tilt, roll and scale (Nelder & Mead 1965).
+def _maximise_score(problem: _SkylineProblem, values: np.ndarray) -> np.ndarray:
+    """Parameters of the local maximum of the score in heading, tilt, roll and scale (Nelder & Mead 1965).
 
-    Edges are then met on both sides of a peak at once, which a search across nearly level lines cannot do.
+    Starting the edge search there, edges on both sides of a summit are found; a search across nearly horizontal lines
+    could not correct the heading.
     """
     from scipy.optimize import minimize
 
-    panoramic = isinstance(start, Panorama)
-    lift = search.tilt_deg if panoramic else 0.0
-    spans = np.array([search.heading_deg, search.tilt_deg, search.roll_deg, 0, 0, 0, search.focal, 0, lift])
-    free = np.flatnonzero(spans > 0)
+    start, search, horizon = problem.start, problem.search, problem.horizon
+    horizon_range = search.tilt_deg if isinstance(start, Panorama) else 0.0
+    ranges = np.array([search.heading_deg, search.tilt_deg, search.roll_deg, 0, 0, 0, search.focal, 0, horizon_range])
+    free = np.flatnonzero(ranges > 0)
     size = np.array([0.5, 0.4, 0.6, 0, 0, 0, 0.03, 0, 0.4 * start.fy * np.pi / 180.0])[free]
-    keep = np.isfinite(horizon.skyline_elevation_deg)
-    sky = _thinned(start, axes, values, horizon.skyline_m[keep], 600)
-    edges = _thinned(start, axes, values, horizon.edges_m, 300) if len(horizon.edges_m) else horizon.edges_m
-    none = np.zeros(1, int)
+    skyline = _visible_subset(problem, values, problem.skyline_m, 600)
+    edges = _visible_subset(problem, values, horizon.edges_m, 300) if len(horizon.edges_m) else horizon.edges_m
+    no_shift = np.zeros(1, int)
 
-    def loss(unit):
+    def loss(unit: np.ndarray) -> float:
         trial = values.copy()
         trial[free] += unit * size
-        score = _scores(start, axes, trial, sky, boundary.coarse, boundary.scale, none)[0]
-        if len(edges) > 20:
-            score += 0.25 * _scores(start, axes, trial, edges, boundary.coarse_edges, boundary.scale, none)[0]
-        return -score
+        return -_pose_scores(problem, trial, skyline, edges, no_shift)[0]
 
     simplex = np.vstack([np.zeros(len(free)), np.eye(len(free))]) - 1.0 / (len(free) + 1)
-    found = minimize(
+    minimum = minimize(
         loss,
         np.zeros(len(free)),
         method="Nelder-Mead",
         options={"initial_simplex": simplex, "maxfev": 250, "xatol": 0.02, "fatol": 1e-4},
     )
     best = values.copy()
-    if found.fun < loss(np.zeros(len(free))):
-        best[free] += found.x * size
+    if minimum.fun < loss(np.zeros(len(free))):
+        best[free] += minimum.x * size
     return best
 
 
-def _edges_at(start, axes, values, terrain, boundary, reach):
-    """Evidence: horizon (and ridge) points against the edges found within ``reach`` pixels across their course.
+def _skyline_evidence(problem: _SkylineProblem, values: np.ndarray, reach: float) -> SkylineEvidence | None:
+    """Residuals of horizon and ridge points against the edges within ``reach`` pixels across their lines.
 
-    A point counts by the sharpness of its edge and by what the terrain's height error makes of it at its distance.
+    A point is weighted by the likelihood of its edge and by the angle of the terrain's height error at its distance.
+    ``None`` if fewer than 30 points of the first line match an edge.
     """
-    horizon, error_m = terrain
-    groups = [(horizon.skyline_m[np.isfinite(horizon.skyline_elevation_deg)], 1.0, True), (horizon.edges_m, 2.0, False)]
+    start, axes, horizon = problem.start, problem.axes, problem.horizon
+    # Points of a line, factor of their standard deviation, whether the line is a skyline.
+    lines = [(problem.skyline_m, 1.0, True), (horizon.edges_m, 2.0, False)]
     points, target, normal, weight = [], [], [], []
-    for position, slack, is_sky in groups:
+    for position, sigma_factor, is_skyline in lines:
         if len(position) < 5:
             continue
-        position = _thinned(start, axes, values, position, _MOST_POINTS)
-        pixel, front = project_values(start, axes, values, position)
-        blur = start.fy * error_m / np.linalg.norm(position - values[3:6], axis=1)
-        found = edge_near(boundary, pixel, front, reach + 2.0 * np.minimum(blur, 2.0 * reach), is_sky)
-        if found is None:
+        position = _visible_subset(problem, values, position, _MAX_POINTS)
+        pixel, in_front = project_values(start, axes, values, position)
+        blur = start.fy * problem.terrain_sigma_m / np.linalg.norm(position - values[3:6], axis=1)
+        reach_px = reach + 2.0 * np.minimum(blur, 2.0 * reach)
+        edge = edge_near(problem.boundary, pixel, in_front, reach_px, is_skyline)
+        if edge is None:
             continue
-        index, place, across, strength = found
-        points.append(position[index])
-        target.append(place)
-        normal.append(across)
-        weight.append(strength / slack / np.hypot(1.0, blur[index]))
+        points.append(position[edge.index])
+        target.append(edge.pixel)
+        normal.append(edge.normal)
+        weight.append(edge.strength / sigma_factor / np.hypot(1.0, blur[edge.index]))
     if not points or len(points[0]) < 30:
         return None
     points, target, normal, weight = (np.concatenate(part) for part in (points, target, normal, weight))
 
-    def residuals(view, k1):
+    def residuals(view: View, k1: float) -> np.ndarray:
         pixel, _ = project_values(view, axes, values_of(view, axes, k1), points)
-        miss = pixel - target
+        error = pixel - target
         if isinstance(view, Panorama):
-            turn = 2.0 * np.pi * view.fx
-            miss[:, 0] -= turn * np.round(miss[:, 0] / turn)
-        return np.sum(miss * normal, axis=1) * weight
+            circle = 2.0 * np.pi * view.fx
+            error[:, 0] -= circle * np.round(error[:, 0] / circle)
+        return np.sum(error * normal, axis=1) * weight
 
-    now = residuals(view_from_values(start, axes, values), values[7])
-    spread = max(1.4826 * float(np.median(np.abs(now - np.median(now)))), 0.5)
-    # Neighbouring columns err together: one independent miss in as many as their correlation spans.
-    return SkylineEvidence(residuals, spread * np.sqrt(_correlation_length(now)))
+    initial = residuals(view_from_values(start, axes, values), values[7])
+    spread = max(1.4826 * float(np.median(np.abs(initial - np.median(initial)))), 0.5)
+    # Errors of neighbouring columns are correlated: one independent residual per correlation length.
+    return SkylineEvidence(residuals, spread * np.sqrt(_correlation_length(initial)))
 
 
-def _thinned(start, axes, values, position, count):
-    """Evenly chosen points of those that fall into the picture."""
-    pixel, front = project_values(start, axes, values, position)
-    inside = np.flatnonzero(front & (pixel[:, 0] > 0) & (pixel[:, 0] < start.width_px))
+def _visible_subset(problem: _SkylineProblem, values: np.ndarray, position: np.ndarray, count: int) -> np.ndarray:
+    """About ``count`` points, evenly selected from those that project into the image columns."""
+    pixel, in_front = project_values(problem.start, problem.axes, values, position)
+    inside = np.flatnonzero(in_front & (pixel[:, 0] > 0) & (pixel[:, 0] < problem.start.width_px))
     return position[inside[:: max(1, len(inside) // count)]]
 
 
-def _sits(start, axes, values, horizon, boundary) -> float:
-    """Mean evidence right under the projected skyline and ridges: the score that rivals are compared by."""
-    none = np.zeros(1, int)
-    keep = np.isfinite(horizon.skyline_elevation_deg)
-    score = _scores(start, axes, values, horizon.skyline_m[keep], boundary.coarse, boundary.scale, none)[0]
-    if len(horizon.edges_m) > 20:
-        score += 0.25 * _scores(start, axes, values, horizon.edges_m, boundary.coarse_edges, boundary.scale, none)[0]
-    return float(score)
+def _score(problem: _SkylineProblem, values: np.ndarray) -> float:
+    """Score of a refined pose over all points of the horizon and ridges."""
+    return float(_pose_scores(problem, values, problem.skyline_m, problem.horizon.edges_m, np.zeros(1, int))[0])
 
 
-def _correlation_length(misses: np.ndarray) -> float:
-    centred = np.clip(misses - np.median(misses), -8, 8)
+def _correlation_length(residual: np.ndarray) -> float:
+    """Correlation length of consecutive residuals [samples]: sum of the autocorrelation over both signs of the lag."""
+    centred = np.clip(residual - np.median(residual), -8, 8)
     power = np.mean(centred**2)
     if power <= 0:
         return 1.0
     total = 1.0
     for lag in range(1, min(200, len(centred) // 3)):
-        value = float(np.mean(centred[:-lag] * centred[lag:]) / power)
-        if value < 0.1:
+        correlation = float(np.mean(centred[:-lag] * centred[lag:]) / power)
+        if correlation < 0.1:
             break
-        total += 2.0 * value
+        total += 2.0 * correlation
     return total
 
 
-def _met(start, axes, values, horizon, boundary):
-    """Share of visible horizon with a strong boundary within 3 px of a coarse pixel, less chance; and column share."""
-    keep = np.isfinite(horizon.skyline_elevation_deg)
-    pixel, front = project_values(start, axes, values, horizon.skyline_m[keep])
-    # A horizon above or below the frame of a flat panorama is neither met nor missed.
-    front = front & (pixel[:, 1] > 0) & (pixel[:, 1] < start.height_px)
-    near, inside = _collect(start, boundary.near, boundary.scale, pixel, front)
+def _edge_coverage(problem: _SkylineProblem, view: View, values: np.ndarray) -> tuple[float, float]:
+    """Fraction of the visible horizon within three coarse pixels of a boundary, less chance; fraction of columns."""
+    pixel, in_front = project_values(view, problem.axes, values, problem.skyline_m)
+    # Parts of the horizon above or below the image are not counted.
+    in_front = in_front & (pixel[:, 1] > 0) & (pixel[:, 1] < view.height_px)
+    near, inside = _sample_near(problem.boundary, view, pixel, in_front)
     if inside.sum() < 20:
         return 0.0, 0.0
-    # What other rows of the same columns, not far away, would meet.
+    # Chance level: the same columns at other rows nearby.
     chance = []
     for shift in (-0.10, -0.07, 0.07, 0.10, 0.14):
-        moved = pixel + np.array([0.0, shift * boundary.coarse.shape[0] / boundary.scale])
-        value, usable = _collect(start, boundary.near, boundary.scale, moved, front)
+        shifted = pixel + np.array([0.0, shift * problem.boundary.coarse.shape[0] / problem.boundary.scale])
+        value, usable = _sample_near(problem.boundary, view, shifted, in_front)
         if usable.sum() >= 20:
             chance.append(value[usable].mean())
     expected = float(np.mean(chance)) if chance else 0.0
-    columns = np.unique(np.floor(pixel[inside, 0] / start.width_px * 200)).size / 200.0
-    return float((near[inside].mean() - expected) / max(1.0 - expected, 0.1)), columns
+    column_fraction = np.unique(np.floor(pixel[inside, 0] / view.width_px * 200)).size / 200.0
+    return float((near[inside].mean() - expected) / max(1.0 - expected, 0.1)), column_fraction
 
 
-def _judge(axes, origin, fits, horizon, boundary, search) -> SkylineFit:
+def _sample_near(
+    boundary: BoundaryMap, view: View, pixel: np.ndarray, in_front: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """`BoundaryMap.near` at pixels, 0 outside ``(N,)``; whether a pixel is in an image column and not masked ``(N,)``."""
+    near, scale = boundary.near, boundary.scale
+    column, row = np.floor(pixel[:, 0] * scale).astype(int), np.floor(pixel[:, 1] * scale).astype(int)
+    if isinstance(view, Panorama) and view.full_circle:
+        column %= near.shape[1]
+    in_column = in_front & (column >= 0) & (column < near.shape[1])
+    inside = in_column & (row >= 0) & (row < near.shape[0])
+    sampled = np.zeros(len(pixel))
+    sampled[inside] = near[row[inside], column[inside]]
+    return sampled, in_column & ~np.isnan(sampled)
+
+
+def _assess(problem: _SkylineProblem, fits: list[tuple[Calibration, float]]) -> SkylineFit:
+    """Select the fit of the highest score and test its reliability."""
     calibration, score = max(fits, key=lambda fit: fit[1])
-    start, values = replace(calibration.view), values_of(calibration.view, axes, calibration.k1)
+    view, search = calibration.view, problem.search
+    values = values_of(view, problem.axes, calibration.k1)
 
-    def apart(a, b):
+    def heading_difference(a: float, b: float) -> float:
         return abs((a - b + 180.0) % 360.0 - 180.0)
 
-    rivals = [other for fit, other in fits if apart(fit.values[0], values[0]) > 1.0]
-    lead = score / max(max(rivals), 1e-6) if rivals else float("inf")
-    offset = (values[0] - origin[0] + 180.0) % 360.0 - 180.0
-    met, columns = _met(start, axes, values, horizon, boundary)
+    other_scores = [other for fit, other in fits if heading_difference(fit.values[0], values[0]) > 1.0]
+    score_ratio = score / max(max(other_scores), 1e-6) if other_scores else float("inf")
+    offset = (values[0] - problem.origin[0] + 180.0) % 360.0 - 180.0
+    edge_fraction, column_fraction = _edge_coverage(problem, view, values)
     sigma = calibration.sigma["heading_deg"]
     doubts = []
-    if met < LEAST_MET:
-        doubts.append(f"only {100 * max(met, 0.0):.0f} % of the horizon meets an edge (fog, or something before it)")
-    if lead < LEAST_LEAD:
-        doubts.append(f"another heading fits {100 / max(lead, 1e-6):.0f} % as well")
-    if sigma > MOST_SIGMA_DEG:
-        doubts.append(f"the horizon is too even to fix the heading (± {sigma:.2f}°)")
-    if columns < LEAST_COLUMNS:
-        doubts.append(f"the horizon shows in {100 * columns:.0f} % of the columns alone")
+    if edge_fraction < MIN_EDGE_FRACTION:
+        percent = 100 * max(edge_fraction, 0.0)
+        doubts.append(f"only {percent:.0f} % of the horizon coincides with an image edge (fog or foreground)")
+    if score_ratio < MIN_SCORE_RATIO:
+        doubts.append(f"another heading reaches {100 / max(score_ratio, 1e-6):.0f} % of the score")
+    if sigma > MAX_HEADING_SIGMA_DEG:
+        doubts.append(f"the horizon is too smooth to determine the heading (± {sigma:.2f}°)")
+    if column_fraction < MIN_COLUMN_FRACTION:
+        doubts.append(f"the horizon is visible in only {100 * column_fraction:.0f} % of the columns")
     if search.heading_deg < 180.0 and abs(offset) > search.heading_deg - 0.3:
-        doubts.append("the heading lies at the rim of the search")
-    return SkylineFit(calibration, not doubts, met, lead, float(sigma), columns, tuple(doubts), horizon)
+        doubts.append("the heading lies at the limit of the search range")
+    return SkylineFit(
+        calibration,
+        not doubts,
+        edge_fraction,
+        score_ratio,
+        float(sigma),
+        column_fraction,
+        tuple(doubts),
+        problem.horizon,
+    )
 
 
-def encoded_from_file(path) -> np.ndarray:
-    """``(H, W, 3)`` uint8 sRGB of a picture file; `ValueError` where it is none."""
-    picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if picture is None:
-        raise ValueError(f"{path}: not a readable picture")
-    return np.ascontiguousarray(picture[..., ::-1])
+def encoded_from_file(path: str | os.PathLike[str]) -> np.ndarray:
+    """Read an image file as 8-bit sRGB.
+
+    Parameters
+    ----------
+    path
+        Image file of any format that OpenCV decodes.
+
+    Returns
+    -------
+    ndarray
+        Image ``(H, W, 3)`` uint8 sRGB.
+
+    Raises
+    ------
+    UnreadableImage
+        If the file cannot be decoded.
+    """
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image is None:
+        raise UnreadableImage(f"{path}: not a readable image")
+    return np.ascontiguousarray(image[..., ::-1])
