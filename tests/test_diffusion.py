@@ -299,10 +299,10 @@ def test_wrong_and_half_downloaded_weights(weights, tmp_path):
 
     unet = f"{BASE}/unet/{name}"
     assert "is half-downloaded" in spoil(unet, lambda at: cut(at / unet, 0.6))
-    assert "is no weights file" in spoil(
+    assert "is not a weights file" in spoil(
         unet, lambda at: (at / unet).write_text("version https://git-lfs.example/spec/v1\n")
     )
-    assert "is no weights file" in spoil(unet, lambda at: (at / unet).write_bytes(b""))
+    assert "is not a weights file" in spoil(unet, lambda at: (at / unet).write_bytes(b""))
     assert "is missing" in spoil(unet, lambda at: (at / unet).unlink())
     assert "half-downloaded" in spoil(f"{DEPTH}/{name}", lambda at: cut(at / DEPTH / name, 0.99))
     adapter = f"{ADAPTER}/models/ip-adapter_sd15.safetensors"

@@ -1,7 +1,7 @@
-"""Stable Diffusion 1.5 with two ControlNets and an image prompt, as the SeasonScapes paper uses it to fill holes.
+"""Image inpainting with Stable Diffusion 1.5, two ControlNets and an image prompt, as in the SeasonScapes paper.
 
-Depth and inpaint ControlNets (Zhang, Rao & Agrawala 2023), IP-Adapter (Ye et al. 2023), Euler's ancestral sampler: all by
-`diffusers`. Needs the extra ``diffusion``.
+Depth and inpaint ControlNets (Zhang, Rao & Agrawala 2023), IP-Adapter (Ye et al. 2023) and Euler's ancestral sampler, as
+implemented in `diffusers`. Needs the extra ``diffusion``.
 """
 
 from __future__ import annotations
@@ -18,29 +18,38 @@ from seasonscapes.texturing.model_weights import WeightNames, find_weights, vari
 from seasonscapes.texturing.prompts import NEGATIVE
 from seasonscapes.texturing.view_conditions import Conditions
 
-# Latents are this many times smaller than pictures.
+# Pixels per side of a latent cell.
 _CELL_PX = 8
-# What hides a pixel from the inpaint ControlNet, as it was trained.
-_HIDDEN = -1.0
-# More parameters than this are real weights: on a CPU a large view then takes over an hour.
+# Value of masked pixels in the training data of the inpaint ControlNet.
+_MASKED = -1.0
+# Number of parameters above which a large view takes over an hour on a CPU.
 _LARGE = 100_000_000
+
+Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)
 class DiffusionSettings:
-    """How to paint; the defaults are the paper's.
+    """Settings of the sampler and its conditions; the defaults are the paper's.
 
     Parameters
     ----------
     prompt, negative
-        Empty switches the text off.
+        Prompt and negative prompt; an empty prompt disables text conditioning.
     depth_scale, inpaint_scale, image_scale
-        Weights of the depth ControlNet, of the inpaint ControlNet and of the guide image; 0 leaves that part out, and its
-        weights are not looked for.
-    steps, guidance
-        Of the sampler, and of classifier-free guidance (1 is none).
+        Weights of the depth ControlNet, the inpaint ControlNet and the image prompt; 0 disables that part, whose weight
+        files are then not needed.
+    steps
+        Steps of the sampler.
+    guidance
+        Scale of classifier-free guidance; 1 is none.
     strength
-        1 paints from noise; 0.3 to 0.5 adds detail to what is there (*hybrid*).
+        1 starts from pure noise; 0.3 to 0.5 adds detail to the given picture (*hybrid*).
+
+    Raises
+    ------
+    ValueError
+        No step would be run, or ``strength`` or ``guidance`` is out of range.
     """
 
     prompt: str = ""
@@ -61,7 +70,17 @@ class DiffusionSettings:
 
 @dataclass(frozen=True)
 class Machine:
-    """Where to run: ``device`` and ``dtype`` by name, and whether parts wait in main memory for their turn."""
+    """Device and number format of the model.
+
+    Parameters
+    ----------
+    device
+        ``auto``, ``cuda`` or ``cpu``.
+    dtype
+        ``auto``, ``float16``, ``bfloat16`` or ``float32``.
+    offload
+        Keep the parts of the model in main memory and move each to the GPU only while it runs.
+    """
 
     device: str = "auto"
     dtype: str = "auto"
@@ -70,7 +89,19 @@ class Machine:
 
 @dataclass(frozen=True)
 class Painter:
-    """A loaded model; call it with `Conditions`."""
+    """A loaded image model, called with `Conditions`.
+
+    Parameters
+    ----------
+    pipe
+        Pipeline of `diffusers`.
+    settings
+        Settings of the sampler.
+    image_embeds
+        Embeddings of the image prompt, or ``None``.
+    device
+        Name of the device.
+    """
 
     pipe: Any
     settings: DiffusionSettings
@@ -79,21 +110,33 @@ class Painter:
 
     @property
     def slow(self) -> bool:
-        """Real weights without a GPU."""
+        """Whether a large model runs on a CPU."""
         return self.device == "cpu" and sum(p.numel() for p in self.pipe.unet.parameters()) > _LARGE
 
-    def __call__(self, view: Conditions, tell: Callable[[float], None] | None = None) -> np.ndarray:
-        """Paint the hole of a view: an sRGB-encoded picture ``(H, W, 3)`` float32. All of it is the model's.
+    def __call__(self, view: Conditions, progress: Progress | None = None) -> np.ndarray:
+        """Inpaint the hole of a view.
+
+        Parameters
+        ----------
+        view
+            Picture, hole, depth and seed.
+        progress
+            Called with the finished fraction.
+
+        Returns
+        -------
+        ndarray
+            ``(H, W, 3)`` float32, sRGB-encoded. Pixels outside the hole are generated too and differ from the given ones.
 
         Raises
         ------
         InputError
-            The GPU's memory ran out.
+            The GPU's memory ran out, or the model overflowed.
         """
         import torch
 
         try:
-            return _painted(self, view, tell or (lambda share: None))
+            return _inpaint(self, view, progress or (lambda fraction: None))
         except torch.OutOfMemoryError as error:
             if torch.cuda.is_available():
                 torch.cuda.empty_cache()
@@ -119,34 +162,46 @@ def load_painter(
     machine: Machine | None = None,
     image: np.ndarray | None = None,
 ) -> Painter:
-    """Read the weights that the settings ask for.
+    """Load the parts of the image model that the settings need.
 
     Parameters
     ----------
     folder
-        Weights folder; left out, the hub's cache. See `model_weights.find_weights`.
+        Weights folder, or ``None`` for the hub's cache. See `model_weights.find_weights`.
+    settings
+        Settings of the sampler.
+    names
+        Hub names or folders of the parts; defaults to `WeightNames()`.
+    machine
+        Device and number format; defaults to `Machine()`.
     image
-        Guide picture ``(h, w, 3)`` sRGB-encoded in [0, 1], such as a webcam's of that hour; without one the IP-Adapter
-        is not used.
+        Image prompt ``(h, w, 3)``, sRGB-encoded in [0, 1], such as a webcam photograph of the same hour; without one the
+        IP-Adapter is not used.
+
+    Returns
+    -------
+    Painter
+        The loaded model.
 
     Raises
     ------
     InputError
-        Missing, wrong or half-downloaded weights, weights that do not fit each other, a missing extra, no such device.
+        Weights that are missing, wrong, incomplete or incompatible with each other; a missing package; an unknown or
+        unavailable device.
     """
     names, machine = names or WeightNames(), machine or Machine()
-    places = {
+    folders = {
         part: find_weights(folder, part, getattr(names, part)) for part in needed_parts(settings, image is not None)
     }
     _require_extra()
     device, dtype = _device_of(machine)
-    pipe = _assembled(places, settings, dtype)
+    pipe = _assemble(folders, dtype)
     embeds = None
     if image is not None and settings.image_scale > 0.0:
-        embeds = _adapted(pipe, places["adapter"], image, settings, device)
+        embeds = _encode_image_prompt(pipe, folders["adapter"], image, settings, device)
     if machine.offload and device != "cpu":
         pipe.enable_model_cpu_offload(device=device)
-        # Decoding a large picture at once needs more memory than all else; in tiles its colours are a little uneven.
+        # Decoding a large picture at once needs more memory than any other step; tiles cause slight colour differences.
         pipe.vae.enable_tiling()
     else:
         pipe.to(device)
@@ -155,14 +210,27 @@ def load_painter(
 
 
 def needed_parts(settings: DiffusionSettings, with_image: bool) -> list[str]:
-    """Which parts of the weights these settings need: names of fields of `WeightNames`."""
+    """Return the parts of the model that the settings need.
+
+    Parameters
+    ----------
+    settings
+        Settings of the sampler.
+    with_image
+        Whether there is an image prompt.
+
+    Returns
+    -------
+    list of str
+        Field names of `WeightNames`.
+    """
     scales = {
         "depth": settings.depth_scale,
         "inpaint": settings.inpaint_scale,
         "adapter": settings.image_scale if with_image else 0.0,
     }
     parts = ["base", *(part for part, scale in scales.items() if scale > 0.0)]
-    # The pipeline wants a ControlNet; with weight 0 it has no say.
+    # The pipeline needs at least one ControlNet; its weight may be 0.
     return parts if {"depth", "inpaint"} & set(parts) else [*parts, "inpaint"]
 
 
@@ -175,7 +243,7 @@ def _require_extra() -> None:
         raise InputError(
             "--method diffusion",
             f"{error.name} is not installed",
-            cure="pip install 'seasonscapes[diffusion]', or take --method guided, which needs none of it",
+            cure="pip install 'seasonscapes[diffusion]', or use --method guided, which does not need it",
         ) from None
     diffusers.utils.logging.set_verbosity_error()
     diffusers.utils.logging.disable_progress_bar()
@@ -202,69 +270,68 @@ def _device_of(machine: Machine) -> tuple[str, Any]:
     return device, dtypes[name]
 
 
-def _assembled(places: dict[str, Path], settings: DiffusionSettings, dtype: Any) -> Any:
-    """The pipeline of the base's parts and the ControlNets, all of one number format."""
-    from diffusers import (
-        AutoencoderKL,
-        ControlNetModel,
-        EulerAncestralDiscreteScheduler,
-        StableDiffusionControlNetInpaintPipeline,
-        UNet2DConditionModel,
-    )
+def _assemble(folders: dict[str, Path], dtype: Any) -> Any:
+    """Pipeline of the base model and the ControlNets, all in one number format."""
+    import diffusers
     from transformers import CLIPTextModel, CLIPTokenizer
 
-    base = places["base"]
-    unet = _read(UNet2DConditionModel, base / "unet", dtype)
-    nets = {part: _read(ControlNetModel, places[part], dtype) for part in ("depth", "inpaint") if part in places}
-    text = _read(CLIPTextModel, base / "text_encoder", dtype)
-    _check_fit(unet, text, nets, places)
-    pipe = StableDiffusionControlNetInpaintPipeline(
-        vae=_read(AutoencoderKL, base / "vae", dtype),
+    # The lazily loaded names of diffusers are not visible to type checkers.
+    classes: Any = diffusers
+    base = folders["base"]
+    unet = _load_model(classes.UNet2DConditionModel, base / "unet", dtype)
+    nets = {
+        part: _load_model(classes.ControlNetModel, folders[part], dtype)
+        for part in ("depth", "inpaint")
+        if part in folders
+    }
+    text = _load_model(CLIPTextModel, base / "text_encoder", dtype)
+    _check_compatible(unet, text, nets, folders)
+    return classes.StableDiffusionControlNetInpaintPipeline(
+        vae=_load_model(classes.AutoencoderKL, base / "vae", dtype),
         text_encoder=text,
         tokenizer=CLIPTokenizer.from_pretrained(base / "tokenizer"),
         unet=unet,
         controlnet=list(nets.values()),
         safety_checker=None,
         feature_extractor=None,
-        scheduler=EulerAncestralDiscreteScheduler.from_pretrained(base / "scheduler"),
+        scheduler=classes.EulerAncestralDiscreteScheduler.from_pretrained(base / "scheduler"),
         requires_safety_checker=False,
     )
-    return pipe
 
 
-def _read(kind: Any, place: Path, dtype: Any) -> Any:
+def _load_model(model_class: Any, folder: Path, dtype: Any) -> Any:
     from safetensors import SafetensorError
 
-    diffusers_made = kind.__module__.startswith("diffusers")
-    stem, key = ("diffusion_pytorch_model", "torch_dtype") if diffusers_made else ("model", "dtype")
+    from_diffusers = model_class.__module__.startswith("diffusers")
+    stem, key = ("diffusion_pytorch_model", "torch_dtype") if from_diffusers else ("model", "dtype")
     try:
-        model, report = kind.from_pretrained(
-            place,
-            variant=variant_of(place, stem),
+        model, loading_info = model_class.from_pretrained(
+            folder,
+            variant=variant_of(folder, stem),
             use_safetensors=True,
             local_files_only=True,
             output_loading_info=True,
             **{key: dtype},
         )
     except (SafetensorError, OSError, RuntimeError, ValueError) as error:
-        raise InputError("--weights", f"{place} cannot be read: {_first_line(error)}") from None
-    # Tensors that a file lacks are left as they were made, at random: no picture would tell why.
-    lacking = [name for name in report["missing_keys"] if not name.endswith("position_ids")]
-    if lacking:
+        raise InputError("--weights", f"{folder} cannot be read: {_first_line(error)}") from None
+    # Tensors missing in the file keep their random initial values, which no later check would notice.
+    missing = [name for name in loading_info["missing_keys"] if not name.endswith("position_ids")]
+    if missing:
         raise InputError(
             "--weights",
-            f"{place} lacks {len(lacking)} tensors of its model, such as {lacking[0]}",
-            cure="these are the weights of something else",
+            f"{folder} lacks {len(missing)} tensors of its model, such as {missing[0]}",
+            cure="use the weights of this model; these belong to another one",
         )
     return model.eval()
 
 
-def _check_fit(unet: Any, text: Any, nets: dict[str, Any], places: dict[str, Path]) -> None:
+def _check_compatible(unet: Any, text: Any, nets: dict[str, Any], folders: dict[str, Path]) -> None:
     width = unet.config.cross_attention_dim
     if text.config.hidden_size != width or unet.config.in_channels not in (4, 9):
         raise InputError(
             "--weights",
-            f"{places['base']} is no Stable Diffusion 1.5",
+            f"{folders['base']} is not Stable Diffusion 1.5",
             expected=f"a text encoder as wide as the UNet's attention ({width}) and 4 or 9 channels",
         )
     for part, net in nets.items():
@@ -274,53 +341,53 @@ def _check_fit(unet: Any, text: Any, nets: dict[str, Any], places: dict[str, Pat
         ):
             raise InputError(
                 "--weights",
-                f"{places[part]} is a ControlNet for another base model",
+                f"{folders[part]} is a ControlNet for another base model",
                 got=f"attention {net.config.cross_attention_dim}",
                 expected=f"attention {width}",
             )
 
 
-def _adapted(pipe: Any, place: Path, image: np.ndarray, settings: DiffusionSettings, device: str) -> list:
-    """Load the IP-Adapter; the guide picture as the image encoder sees it."""
+def _encode_image_prompt(pipe: Any, folder: Path, image: np.ndarray, settings: DiffusionSettings, device: str) -> Any:
+    """Load the IP-Adapter and compute the embeddings of the image prompt."""
     import torch
     from PIL import Image
 
     try:
         pipe.load_ip_adapter(
-            str(place), subfolder="models", weight_name="ip-adapter_sd15.safetensors", local_files_only=True
+            str(folder), subfolder="models", weight_name="ip-adapter_sd15.safetensors", local_files_only=True
         )
     except (RuntimeError, ValueError, KeyError, OSError) as error:
-        raise InputError("--weights", f"{place} does not fit the base model: {_first_line(error)}") from None
+        raise InputError("--weights", f"{folder} does not fit the base model: {_first_line(error)}") from None
     pipe.set_ip_adapter_scale(settings.image_scale)
-    predictor = Image.fromarray(np.round(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8))
+    prompt_image = Image.fromarray(np.round(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8))
     pipe.image_encoder.to(device)
     with torch.no_grad():
-        return pipe.prepare_ip_adapter_image_embeds(predictor, None, device, 1, settings.guidance > 1.0)
+        return pipe.prepare_ip_adapter_image_embeds(prompt_image, None, device, 1, settings.guidance > 1.0)
 
 
-def _painted(painter: Painter, view: Conditions, tell: Callable[[float], None]) -> np.ndarray:
+def _inpaint(painter: Painter, view: Conditions, report: Progress) -> np.ndarray:
     import torch
 
     settings, pipe = painter.settings, painter.pipe
     height, width = view.hole.shape
-    rim = ((0, -height % _CELL_PX), (0, -width % _CELL_PX))
-    picture = np.pad(view.picture, (*rim, (0, 0)), mode="edge")
-    hole, depth = np.pad(view.hole, rim, mode="edge"), np.pad(view.depth, rim, mode="edge")
+    padding = ((0, -height % _CELL_PX), (0, -width % _CELL_PX))
+    picture = np.pad(view.picture, (*padding, (0, 0)), mode="edge")
+    hole, depth = np.pad(view.hole, padding, mode="edge"), np.pad(view.depth, padding, mode="edge")
     controls, scales = [], []
     if settings.depth_scale > 0.0:
         controls.append(_tensor(np.repeat(depth[..., None], 3, axis=2)))
         scales.append(settings.depth_scale)
     if settings.inpaint_scale > 0.0 or not controls:
-        controls.append(_tensor(np.where(hole[..., None], _HIDDEN, picture)))
+        controls.append(_tensor(np.where(hole[..., None], _MASKED, picture)))
         scales.append(settings.inpaint_scale)
-    todo = max(1, int(settings.steps * settings.strength))
+    step_count = max(1, int(settings.steps * settings.strength))
 
-    def after_step(_pipe: Any, number: int, _time: Any, held: dict) -> dict:
-        tell((number + 1) / todo)
-        return held
+    def after_step(_pipe: Any, number: int, _time: Any, tensors: dict[str, Any]) -> dict[str, Any]:
+        report((number + 1) / step_count)
+        return tensors
 
     with torch.no_grad():
-        found = pipe(
+        result = pipe(
             prompt=settings.prompt,
             negative_prompt=settings.negative if settings.prompt else "",
             image=_tensor(picture),
@@ -333,14 +400,14 @@ def _painted(painter: Painter, view: Conditions, tell: Callable[[float], None]) 
             strength=settings.strength,
             controlnet_conditioning_scale=scales,
             output_type="np",
-            # Drawn on the CPU: a seed then means the same noise on every device.
+            # Noise from the CPU generator is the same on every device.
             generator=torch.Generator("cpu").manual_seed(view.seed),
             ip_adapter_image_embeds=painter.image_embeds,
             callback_on_step_end=after_step,
         ).images[0]
-    if not np.isfinite(found).all():
+    if not np.isfinite(result).all():
         raise InputError("--dtype", "the model overflowed", cure="run again with --dtype bfloat16 or float32")
-    return found[:height, :width].astype(np.float32)
+    return result[:height, :width].astype(np.float32)
 
 
 def _tensor(picture: np.ndarray) -> Any:
@@ -350,9 +417,19 @@ def _tensor(picture: np.ndarray) -> Any:
 
 
 def whole_cells(hole: np.ndarray) -> np.ndarray:
-    """A mask ``(H, W)`` grown to whole latent cells of 8 × 8 pixels.
+    """Dilate a mask to whole latent cells of 8 × 8 pixels.
 
-    The pipeline takes one pixel of each cell for all of them, and would not see a hole of a few pixels.
+    The pipeline samples its mask at one pixel per cell and would otherwise miss holes of a few pixels.
+
+    Parameters
+    ----------
+    hole
+        ``(H, W)`` bool, with sides divisible by 8.
+
+    Returns
+    -------
+    ndarray
+        ``(H, W)`` bool.
     """
     rows, columns = hole.shape[0] // _CELL_PX, hole.shape[1] // _CELL_PX
     cells = hole.reshape(rows, _CELL_PX, columns, _CELL_PX).any(axis=(1, 3))

@@ -139,9 +139,7 @@ def prepare_input(
         Ready for `sample_input`.
     """
     observation, camera = painting_input.observation, painting_input.camera
-    # A G-buffer needs geometry alone, so a scene without light suffices.
-    scene = RenderScene(terrain.mi_scene, terrain.mi_terrain, None, 0.0)  # pyright: ignore[reportArgumentType]
-    gbuffer = trace_gbuffer(scene, camera)
+    gbuffer = trace_gbuffer(unlit_scene(terrain), camera)
     depth = gbuffer.depth.astype(np.float32)
     usable = picture_mask(observation.image, observation.mask, depth, near_m=near_m)
     if reject is not None:
@@ -172,6 +170,22 @@ def prepare_input(
         probes,
         gbuffer.uv.reshape(-1, 2)[pixel].astype(np.float32),
     )
+
+
+def unlit_scene(terrain: RayScene) -> RenderScene:
+    """Return a scene without light, which suffices for a G-buffer.
+
+    Parameters
+    ----------
+    terrain
+        Ray-tracing scene of the terrain.
+
+    Returns
+    -------
+    RenderScene
+        For `trace_gbuffer` alone.
+    """
+    return RenderScene(terrain.mi_scene, terrain.mi_terrain, None, 0.0)  # pyright: ignore[reportArgumentType]
 
 
 def _texel_side_m(atlas_tiling: AtlasTiling) -> float:

@@ -1,4 +1,4 @@
-"""A finished view of a walk along a path, and the files that keep it: pictures for people, a record to go on from."""
+"""Result of inpainting one view of a path, and its storage: images for inspection and a record to resume from."""
 
 from __future__ import annotations
 
@@ -12,20 +12,22 @@ from seasonscapes.images import atomic_path, write_png8
 
 @dataclass(frozen=True)
 class PathStep:
-    """One view, done.
+    """Result of inpainting one view.
 
     Parameters
     ----------
     index
-        In the path.
+        Number of the view in the path.
     hole_share
-        Share of the view's land that was a hole.
-    texels, values
-        Flat indices ``(N,)`` and radiance ``(N, 3)`` float32 [cd/m²] of the texels that it gave a value.
+        Fraction of the view's terrain pixels that were a hole.
+    texels
+        ``(N,)`` flat indices of the texels that received a value.
+    values
+        ``(N, 3)`` float32 their radiance [cd/m²].
     frame
-        ``(H, W, 3)`` uint8, the composed picture.
+        ``(H, W, 3)`` uint8 sRGB, the composed image.
     skipped
-        There was nothing to paint.
+        Whether the image model was not run.
     """
 
     index: int
@@ -36,37 +38,71 @@ class PathStep:
     skipped: bool
 
 
-def levels_of(picture: np.ndarray) -> np.ndarray:
-    """Bytes of a picture in [0, 1]."""
+def to_uint8(picture: np.ndarray) -> np.ndarray:
+    """Quantise an image to 8 bits.
+
+    Parameters
+    ----------
+    picture
+        ``(...)``, clipped to [0, 1].
+
+    Returns
+    -------
+    ndarray
+        ``(...)`` uint8.
+    """
     return np.round(np.clip(picture, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
-def _record(folder: Path, index: int) -> Path:
+def _record_path(folder: Path, index: int) -> Path:
     return folder / f"view_{index:04d}.npz"
 
 
-def _picture(folder: Path, index: int, name: str) -> Path:
+def _picture_path(folder: Path, index: int, name: str) -> Path:
     return folder / f"view_{index:04d}_{name}.png"
 
 
 def save_step(folder: Path, step: PathStep, pictures: dict[str, np.ndarray]) -> None:
-    """Write a view, pictures first and the record last: what has a record is whole."""
+    """Write a step: first its images, then its record, so that a record implies complete images.
+
+    Parameters
+    ----------
+    folder
+        Folder to write to.
+    step
+        The result.
+    pictures
+        Further images by name, ``(H, W)`` or ``(H, W, 3)``, in [0, 1] or uint8.
+    """
     for name, picture in {**pictures, "result": step.frame}.items():
-        levels = picture if picture.dtype == np.uint8 else levels_of(picture)
-        write_png8(_picture(folder, step.index, name), levels)
-    with atomic_path(_record(folder, step.index)) as temporary:
+        levels = picture if picture.dtype == np.uint8 else to_uint8(picture)
+        write_png8(_picture_path(folder, step.index, name), levels)
+    with atomic_path(_record_path(folder, step.index)) as temporary:
         np.savez(temporary, texels=step.texels, values=step.values, hole_share=step.hole_share, skipped=step.skipped)
 
 
 def load_step(folder: Path | None, index: int) -> PathStep | None:
-    """A view that was written before, or ``None``."""
-    if folder is None or not _record(folder, index).is_file():
+    """Read a step that `save_step` wrote.
+
+    Parameters
+    ----------
+    folder
+        Folder of the steps, or ``None`` for none.
+    index
+        Number of the view in the path.
+
+    Returns
+    -------
+    PathStep or None
+        ``None`` where no complete step is stored.
+    """
+    if folder is None or not _record_path(folder, index).is_file():
         return None
     from PIL import Image
 
-    with Image.open(_picture(folder, index, "result")) as file:
+    with Image.open(_picture_path(folder, index, "result")) as file:
         frame = np.array(file)
-    with np.load(_record(folder, index), allow_pickle=False) as stored:
+    with np.load(_record_path(folder, index), allow_pickle=False) as stored:
         return PathStep(
             index, float(stored["hole_share"]), stored["texels"], stored["values"], frame, bool(stored["skipped"])
         )

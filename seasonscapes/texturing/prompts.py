@@ -1,4 +1,4 @@
-"""What to ask an image model for: the landscape of a date, an hour and a sky, in words."""
+"""Text prompts for an image model: season, light and cloudiness of a mountain landscape in words."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from datetime import datetime
 NEGATIVE = (
     "lowres, worst quality, low quality, blurry, cropped, frame, text, watermark, people, oversaturated, painting"
 )
-# Months of the northern Alps, and what they look like.
+# Appearance of the northern Alps by month, from January.
 _SEASONS = (
     "deep winter, snow down to the valleys",
     "late winter, snow down to the valleys",
@@ -22,7 +22,7 @@ _SEASONS = (
     "late autumn, brown meadows, snow on the slopes",
     "early winter, snow on the slopes",
 )
-# From an elevation of the sun upwards [deg].
+# Light by the least solar elevation [deg], increasing.
 _HOURS = (
     (-90.0, "at night under the stars"),
     (-12.0, "in deep twilight"),
@@ -34,16 +34,23 @@ _HOURS = (
 
 
 def prompt_for(time: datetime, latitude_deg: float, sun_elevation_deg: float, *, cloudiness: float = 0.0) -> str:
-    """A prompt for the landscape of an hour.
+    """Return a prompt for a landscape at one instant.
 
     Parameters
     ----------
     time
-        Its month decides the season; south of the equator half a year later.
+        Its month selects the season.
+    latitude_deg
+        Latitude [deg]; south of the equator the seasons are shifted by half a year.
     sun_elevation_deg
-        Decides the light.
+        Solar elevation [deg]; selects the light.
     cloudiness
-        0 to 1.
+        In [0, 1].
+
+    Returns
+    -------
+    str
+        One English sentence.
     """
     month = time.month if latitude_deg >= 0.0 else (time.month + 5) % 12 + 1
     hour = next(words for low, words in reversed(_HOURS) if sun_elevation_deg >= low)

@@ -1,7 +1,8 @@
-"""What an image model is told about a view with holes: the partial picture, where its holes are, how far things are.
+"""Conditions of an image model for a view with holes: the partial picture, the mask of its holes and a depth picture.
 
-The reference implementation finds holes by colour (red texels, so autumn and alpenglow are holes too) and hands over its
-depth inverted. Here coverage decides, and near is white, as `control_v11f1p_sd15_depth` was trained.
+The reference implementation finds holes by colour (red texels, so that autumn foliage and alpenglow count as holes) and
+passes its depth inverted. Here holes follow from coverage, and near is white, as in the training data of
+`control_v11f1p_sd15_depth`.
 """
 
 from __future__ import annotations
@@ -15,30 +16,30 @@ from seasonscapes.images import linear_from_srgb, srgb_from_linear
 from seasonscapes.terrain.surface import sample_texture
 
 MASKS = ("coverage", "hsv")
-# Distances beyond these percentiles of the land are taken for the nearest and the farthest.
-_NEAREST, _FARTHEST = 0.5, 99.5
-# The farthest land stays this much lighter than the sky, so that the skyline is seen.
+# Percentiles of the terrain's distances that become white and the darkest grey.
+_NEAR_PERCENTILE, _FAR_PERCENTILE = 0.5, 99.5
+# Grey of the farthest terrain; brighter than the sky, to keep the skyline visible.
 _FARTHEST_GREY = 0.08
-# A pixel is a hole where less than half of the texels under it have a value.
-_LEAST_COVER = 0.5
-# The whitest painted land is this bright in a picture; what a model paints may be brighter.
-_WHITEST = 0.85
+# A pixel is a hole where a smaller fraction of the texels under it has a value.
+_MIN_COVERAGE = 0.5
+# Linear picture value of the 99th percentile of the painted radiance; the headroom is for the image model.
+_BRIGHTEST_PAINTED = 0.85
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """One view for an image model.
+    """Inputs of an image model for one view.
 
     Parameters
     ----------
     picture
-        ``(H, W, 3)`` float32 sRGB-encoded in [0, 1]; holes hold a guess (their rims' colours, or a completion's).
+        ``(H, W, 3)`` float32 sRGB-encoded in [0, 1]; holes contain an initial estimate.
     hole
-        ``(H, W)`` bool: to be painted.
+        ``(H, W)`` bool: pixels to inpaint.
     depth
-        ``(H, W)`` float32 in [0, 1], near is white, the sky black.
+        ``(H, W)`` float32 in [0, 1]; near is white, the sky black.
     seed
-        Of this view.
+        Seed of this view.
     """
 
     picture: np.ndarray
@@ -48,71 +49,128 @@ class Conditions:
 
 
 def white_radiance(values: np.ndarray, painted: np.ndarray) -> float:
-    """The radiance [cd/m²] that is white in pictures of a painted texture ``(R, S, 3)``, the same for all views."""
+    """Return the radiance that pictures of a texture show as white, common to all views.
+
+    Parameters
+    ----------
+    values
+        ``(R, S, 3)`` radiance [cd/m²].
+    painted
+        ``(R, S)`` bool: texels that count.
+
+    Returns
+    -------
+    float
+        [cd/m²], somewhat above the 99th percentile of the painted texels' brightest channel.
+    """
     brightest = values[painted].max(axis=1)
-    return max(float(np.percentile(brightest, 99.0)), 1e-9) / _WHITEST
+    return max(float(np.percentile(brightest, 99.0)), 1e-9) / _BRIGHTEST_PAINTED
 
 
 def encode(radiance: np.ndarray, white: float) -> np.ndarray:
-    """Radiance as an sRGB picture in [0, 1]; brighter than ``white`` is clipped."""
+    """Encode radiance as an sRGB picture; values above white are clipped.
+
+    Parameters
+    ----------
+    radiance
+        ``(..., 3)`` [cd/m²].
+    white
+        Radiance of white [cd/m²].
+
+    Returns
+    -------
+    ndarray
+        ``(..., 3)`` float32 in [0, 1].
+    """
     return srgb_from_linear(radiance / white).astype(np.float32)
 
 
 def decode(picture: np.ndarray, white: float) -> np.ndarray:
-    """The way back."""
+    """Decode an sRGB picture to radiance; the inverse of `encode`.
+
+    Parameters
+    ----------
+    picture
+        ``(..., 3)``, clipped to [0, 1].
+    white
+        Radiance of white [cd/m²].
+
+    Returns
+    -------
+    ndarray
+        ``(..., 3)`` float32 [cd/m²].
+    """
     return (linear_from_srgb(np.clip(picture, 0.0, 1.0)) * white).astype(np.float32)
 
 
 def depth_picture(depth_m: np.ndarray) -> np.ndarray:
-    """Depth as ControlNet takes it ``(H, W)`` float32: near is 1, the farthest land dark grey, the sky 0.
+    """Return a depth map as the depth ControlNet expects it, linear in the logarithm of distance.
 
     Parameters
     ----------
     depth_m
         ``(H, W)`` distance along the rays [m]; infinite is sky.
 
+    Returns
+    -------
+    ndarray
+        ``(H, W)`` float32 in [0, 1]: 1 near, dark grey for the farthest terrain, 0 for the sky.
+
     Notes
     -----
-    In the logarithm of distance: a landscape spans three decades, and in disparity all of it beyond the first slope
-    would be black.
+    A landscape spans three decades of distance; in disparity, everything beyond the nearest slope would be black.
     """
-    land = np.isfinite(depth_m)
+    terrain = np.isfinite(depth_m)
     picture = np.zeros(depth_m.shape, np.float32)
-    if land.any():
-        distance = np.log(np.maximum(depth_m[land], 1e-3))
-        near, far = np.percentile(distance, [_NEAREST, _FARTHEST])
+    if terrain.any():
+        distance = np.log(np.maximum(depth_m[terrain], 1e-3))
+        near, far = np.percentile(distance, [_NEAR_PERCENTILE, _FAR_PERCENTILE])
         nearness = np.clip((far - distance) / max(far - near, 1e-6), 0.0, 1.0)
-        picture[land] = _FARTHEST_GREY + (1.0 - _FARTHEST_GREY) * nearness
+        picture[terrain] = _FARTHEST_GREY + (1.0 - _FARTHEST_GREY) * nearness
     return picture
 
 
 def look_up(values: np.ndarray, covered: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What pixels see of a texture with holes: radiance ``(H, W, 3)`` and whether there is enough of it ``(H, W)`` bool.
+    """Sample a texture with holes bilinearly, ignoring texels without a value.
 
     Parameters
     ----------
-    values, covered
-        ``(R, S, 3)`` and ``(R, S)`` bool. Texels that are not covered have no say.
+    values
+        ``(R, S, 3)`` radiance [cd/m²].
+    covered
+        ``(R, S)`` bool: texels with a value.
     uv
-        ``(H, W, 2)`` of a G-buffer, NaN in the sky.
+        ``(H, W, 2)`` texture coordinates of a G-buffer, NaN in the sky.
+
+    Returns
+    -------
+    radiance
+        ``(H, W, 3)`` [cd/m²].
+    known
+        ``(H, W)`` bool: at least half of the bilinear weight lies on texels with a value.
     """
-    known = np.where(covered[..., None], values, 0.0)
-    layers = np.concatenate([known, covered[..., None]], axis=2).astype(np.float32)
-    found = np.nan_to_num(sample_texture(layers, uv))
-    share = found[..., 3:]
-    return found[..., :3] / np.maximum(share, 1e-6), share[..., 0] >= _LEAST_COVER
+    masked = np.where(covered[..., None], values, 0.0)
+    layers = np.concatenate([masked, covered[..., None]], axis=2).astype(np.float32)
+    sampled = np.nan_to_num(sample_texture(layers, uv))
+    coverage = sampled[..., 3:]
+    return sampled[..., :3] / np.maximum(coverage, 1e-6), coverage[..., 0] >= _MIN_COVERAGE
 
 
 def red_pixels(picture: np.ndarray) -> np.ndarray:
-    """The reference implementation's hole mask ``(H, W)`` bool: red by hue, wherever it comes from.
+    """Return the reference implementation's hole mask: all red pixels, whatever their origin.
 
-    OpenCV's hue (0 to 179) 0 to 15 or 165 to 180 with saturation and value of at least 50 of 255; autumn, alpenglow and
-    red rock are holes to it.
+    OpenCV's hue (0 to 179) 0 to 15 or 165 to 180 with saturation and value of at least 50 of 255. Autumn foliage,
+    alpenglow and red rock therefore count as holes.
 
     Parameters
     ----------
     picture
         ``(H, W, 3)`` sRGB-encoded in [0, 1] with unpainted texels in pure red.
+
+    Returns
+    -------
+    ndarray
+        ``(H, W)`` bool.
     """
     hsv = cv2.cvtColor(np.round(np.clip(picture, 0.0, 1.0) * 255.0).astype(np.uint8), cv2.COLOR_RGB2HSV)
     hue, saturation, value = (hsv[..., k].astype(int) for k in range(3))
@@ -120,7 +178,20 @@ def red_pixels(picture: np.ndarray) -> np.ndarray:
 
 
 def dilated(hole: np.ndarray, reach_px: int) -> np.ndarray:
-    """A mask ``(H, W)`` bool grown by a disc."""
+    """Dilate a mask by a disc.
+
+    Parameters
+    ----------
+    hole
+        ``(H, W)`` bool.
+    reach_px
+        Radius of the disc [px]; 0 returns the mask itself.
+
+    Returns
+    -------
+    ndarray
+        ``(H, W)`` bool.
+    """
     if reach_px <= 0:
         return hole
     side = 2 * reach_px + 1
@@ -129,12 +200,19 @@ def dilated(hole: np.ndarray, reach_px: int) -> np.ndarray:
 
 
 def plain_sky(direction: np.ndarray, *, cloudiness: float = 0.0) -> np.ndarray:
-    """An sRGB-encoded sky ``(..., 3)`` float32 without clouds' shapes, for frames: pale at the horizon, blue above.
+    """Return a featureless sky for frames: pale at the horizon, blue above, grey where overcast.
 
     Parameters
     ----------
     direction
         Unit vectors ``(..., 3)`` ENU.
+    cloudiness
+        Fraction of grey in [0, 1].
+
+    Returns
+    -------
+    ndarray
+        ``(..., 3)`` float32, sRGB-encoded.
     """
     height = np.sqrt(np.clip(direction[..., 2:], 0.0, 1.0))
     blue = (1.0 - height) * np.array([0.80, 0.87, 0.93]) + height * np.array([0.30, 0.50, 0.80])
