@@ -1,8 +1,8 @@
 """Differentiable rendering of photographs: path replay backpropagation with the package's light, air and cameras.
 
 Vicini, Speierer & Jakob 2021, "Path replay backpropagation", doi:10.1145/3450626.3459804: memory does not grow with the
-length of paths. A rendered photograph equals the forward model (`forward_model`), but with every bounce traced and every
-parameter differentiable.
+length of paths. A rendered photograph equals the forward model (`forward_model`), but with every bounce traced and
+every parameter differentiable.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ def mi_sensor(camera: Camera | Panorama) -> Any:
     Returns
     -------
     mitsuba.Sensor
-        With a box filter and linear float32 pixels.
+        Sensor with a box filter and linear float32 pixels.
 
     Raises
     ------
@@ -173,12 +173,12 @@ def mi_picture(views: DifferentiableViews, index: int, unknowns: dict[str, Any],
     Parameters
     ----------
     views
-        From `differentiable_views`.
+        Scenes from `differentiable_views`.
     index
-        Of the photograph.
+        Index of the photograph.
     unknowns
-        Dr.Jit arrays and tensors by name: ``albedo`` ``(R, S, 3)``, ``sun`` and ``sky`` (scales), ``haze`` (scale of the
-        air's optical depth), ``log_gain`` ``(K, 3)``; and any of Mitsuba's parameters by its key. Missing ones keep
+        Dr.Jit arrays and tensors by name: ``albedo`` ``(R, S, 3)``, ``sun`` and ``sky`` (scales), ``haze`` (scale of
+        the air's optical depth), ``log_gain`` ``(K, 3)``; and any of Mitsuba's parameters by its key. Missing ones keep
         their value (gains: 1).
     spp
         Samples per pixel.

@@ -22,7 +22,7 @@ class PhotographEquations:
     Parameters
     ----------
     photograph
-        Its source.
+        The photograph itself.
     picture
         ``(n, 3)`` linear values of the terrain pixels.
     usable
@@ -68,7 +68,7 @@ def equations_of(photograph: AlbedoPhotograph, noise_model: NoiseModel, size: in
     Parameters
     ----------
     photograph
-        With light and footprints.
+        Photograph with its light and footprints.
     noise_model
         Standard deviations and clipping limits.
     size
@@ -77,7 +77,7 @@ def equations_of(photograph: AlbedoPhotograph, noise_model: NoiseModel, size: in
     Returns
     -------
     PhotographEquations
-        With zero ambient illuminance and no weights yet.
+        Equations with zero ambient illuminance and without weights.
     """
     footprints, observation = photograph.footprints, photograph.observation
     picture = observation.image.reshape(-1, 3)
@@ -150,7 +150,7 @@ def forward_product(equations: PhotographEquations, albedo: np.ndarray) -> tuple
     Parameters
     ----------
     equations
-        Of one photograph.
+        Equations of one photograph.
     albedo
         ``(R·S, 3)``.
 
@@ -174,7 +174,7 @@ def adjoint(equations: PhotographEquations, residual: np.ndarray) -> np.ndarray:
     Parameters
     ----------
     equations
-        Of one photograph.
+        Equations of one photograph.
     residual
         ``(n, 3)``.
 
@@ -197,7 +197,7 @@ def squared_adjoint(equations: PhotographEquations) -> np.ndarray:
     Parameters
     ----------
     equations
-        Of one photograph, with weights.
+        Equations of one photograph, with weights.
 
     Returns
     -------
@@ -256,11 +256,10 @@ def reweight(systems: list[PhotographEquations], albedo: np.ndarray, noise_model
 
 
 def _cauchy(residual: np.ndarray, usable: np.ndarray) -> np.ndarray:
-    """Cauchy weights ``(n, 1)`` of normalised residuals ``(n, 3)``; the channel of largest residual sets the pixel's."""
+    """Cauchy weights ``(n, 1)`` of normalised residuals ``(n, 3)``, by the largest residual of each pixel."""
     worst = np.abs(residual).max(axis=1, keepdims=True)
     counted = worst[usable[:, 0]]
-    # If the variances were underestimated, the empirical spread replaces them. 2.385 gives 95 % efficiency for normal
-    # errors.
+    # The empirical spread replaces variances that were underestimated. 2.385 gives 95 % efficiency for normal errors.
     scale = max(1.0, float(np.median(counted)) / 1.4 if len(counted) else 1.0)
     return 1.0 / (1.0 + (worst / (2.385 * scale)) ** 2)
 
@@ -279,7 +278,7 @@ def projected_gain(equations: PhotographEquations, radiance: np.ndarray) -> np.n
     Parameters
     ----------
     equations
-        Of one photograph; without weights, the median ratio is returned.
+        Equations of one photograph; without weights, the median ratio is returned.
     radiance
         ``(n, 3)`` modelled radiance of the terrain pixels at the camera [cd/m²].
 

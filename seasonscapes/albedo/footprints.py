@@ -109,7 +109,7 @@ def trace_footprints(
     Parameters
     ----------
     terrain
-        From `hemisphere_rays.ray_scene`. Its albedo has no influence.
+        Terrain from `hemisphere_rays.ray_scene`. Its albedo has no influence.
     camera
         The view.
     shape
@@ -119,7 +119,7 @@ def trace_footprints(
     rays
         S rays in each pixel; powers of two are best.
     seed
-        Of the positions of rays within their pixels.
+        Seed of the positions of rays within their pixels.
     progress
         Called with the finished fraction.
 
@@ -264,7 +264,7 @@ def texel_pixel_count(footprints: Sequence[Footprints]) -> np.ndarray:
     Parameters
     ----------
     footprints
-        Of each camera, all of one texture shape.
+        Footprints of each camera, all of one texture shape.
 
     Returns
     -------
@@ -285,7 +285,7 @@ def whole_pixels(footprints: Footprints, *, full: float = 0.999) -> np.ndarray:
     Parameters
     ----------
     footprints
-        Of one camera.
+        Footprints of one camera.
     full
         Least coverage of a selected pixel.
 
@@ -303,14 +303,14 @@ def thinned_footprints(footprints: Footprints, keep: np.ndarray) -> Footprints:
     Parameters
     ----------
     footprints
-        Of one camera, n pixels.
+        Footprints of one camera, n pixels.
     keep
         ``(n,)`` bool.
 
     Returns
     -------
     Footprints
-        With the kept pixels only.
+        Footprints of the kept pixels only.
     """
     count = np.diff(footprints.start)
     entries = np.repeat(keep, count)

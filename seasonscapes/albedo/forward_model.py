@@ -78,7 +78,7 @@ def trace_texel_transport(
     sampling
         Numbers of rays, light clusters and basis directions.
     seed
-        Of the random numbers.
+        Seed of the random numbers.
     smooth
         Interpolate vertex normals, as `rendering.mitsuba_scene.mi_mesh`; recommended for photographs.
     progress
@@ -203,11 +203,11 @@ def camera_atmosphere(footprints: Footprints, *, sky_pixels: int = 4000, seed: i
     Parameters
     ----------
     footprints
-        Of the camera.
+        Footprints of the camera.
     sky_pixels
         Number of open pixels drawn; their mean fixes three gains, for which thousands of pixels suffice.
     seed
-        Of the draw.
+        Seed of the draw.
 
     Returns
     -------
@@ -281,7 +281,7 @@ def predicted_surface_radiance(
     Parameters
     ----------
     footprints
-        Of the camera, under T lights.
+        Footprints of the camera, under T lights.
     number
         Index of the light among these T.
     light

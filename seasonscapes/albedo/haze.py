@@ -1,4 +1,4 @@
-"""Visibility (meteorological range) from photographs: one-dimensional search for the least robust cost of the albedo fit.
+"""Visibility (meteorological range) from photographs, by one-dimensional minimisation of the albedo fit's robust cost.
 
 Haze acts on sun, sky, airlight and transmittance, never linearly, but it is one number per day. The closed form is
 therefore solved for a few visibilities on a fraction of the pixels, and the robust cost is minimised. Airlight is not a
@@ -137,7 +137,7 @@ def fit_visibility(
     share
         Fraction of the pixels used.
     seed
-        Of the drawn pixels.
+        Seed of the drawn pixels.
     start
         Initial albedo fit.
     progress
@@ -153,7 +153,7 @@ def fit_visibility(
     ValueError
         If there are fewer than three visibilities.
     NoUsablePixels, NotEnoughEvidence
-        From `solve_albedo`.
+        See `closed_form.solve_albedo`.
     """
     report = progress or (lambda fraction: None)
     nodes = sorted(map(float, visibilities_km))
@@ -197,7 +197,7 @@ def fit_visibility(
 def _lights_at(
     visibility_km: float, nodes: list[float], cache: dict[float, Sequence[Illumination]], lights_of: LightsOf
 ) -> Sequence[Illumination]:
-    """Lights of all photographs at a visibility, interpolated between the nodes; ``cache`` stores those of the nodes."""
+    """Lights of all photographs at a visibility, interpolated between the nodes, whose lights are cached."""
 
     def node(value: float) -> Sequence[Illumination]:
         if value not in cache:

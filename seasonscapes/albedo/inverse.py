@@ -1,9 +1,9 @@
 """Albedo by differentiable rendering, started from the closed form, with any further parameter Mitsuba differentiates.
 
-The closed form's approximations (interreflection by outer iterations, haze by search, given sun and sky) are replaced by
-one loss over one set of unknowns: albedo texture, gains, scales of sun and sky, haze, and any Mitsuba parameters named in
-``extra``. The optimiser is Adam with bounds; pixels have the weights of the closed form; texture corrections proceed from
-coarse to fine; held-out photographs control the step size and early stopping.
+The closed form's approximations (interreflection by outer iterations, haze by search, given sun and sky) are replaced
+by one loss over one set of unknowns: albedo texture, gains, scales of sun and sky, haze, and any Mitsuba parameters
+named in ``extra``. The optimiser is Adam with bounds; pixels have the weights of the closed form; texture corrections
+proceed from coarse to fine; held-out photographs control the step size and early stopping.
 """
 
 from __future__ import annotations
@@ -52,11 +52,11 @@ class InverseOptions:
     Parameters
     ----------
     unknowns
-        Of ``albedo``, ``log_gain``, ``sun``, ``sky``, ``haze``.
+        Names out of ``albedo``, ``log_gain``, ``sun``, ``sky`` and ``haze``.
     levels
         Resolution of the albedo correction in each stage: 4 means one value per 4 × 4 texels, 1 the texels themselves.
     iterations
-        In each stage.
+        Iterations in each stage.
     pictures
         Photographs per iteration.
     spp
@@ -71,7 +71,7 @@ class InverseOptions:
     steps
         Learning rate of each unknown: of albedo in units of albedo, of all others relative.
     seed
-        Of the split, the mini-batches and the rendering.
+        Seed of the split, the mini-batches and the rendering.
     """
 
     unknowns: tuple[str, ...] = ("albedo", "log_gain")
@@ -341,9 +341,11 @@ def _unknowns(
     import drjit as dr
     import mitsuba as mi
 
-    unknowns = {"log_gain": mi.TensorXf(values["log_gain"])} | {name: optimizer[name] for name in optimizer.keys()}  # noqa: SIM118
+    unknowns: dict[str, Any] = {"log_gain": mi.TensorXf(values["log_gain"])}
+    unknowns |= {name: optimizer[name] for name in optimizer.keys()}  # noqa: SIM118 (not a dict)
     if "correction" in unknowns:
-        texture = mi.Texture2f(unknowns.pop("correction"), wrap_mode=dr.WrapMode.Clamp)  # pyright: ignore[reportCallIssue]
+        correction = unknowns.pop("correction")
+        texture = mi.Texture2f(correction, wrap_mode=dr.WrapMode.Clamp)  # pyright: ignore[reportCallIssue]
         height, width = base.shape[:2]
         column, row = dr.meshgrid(dr.arange(mi.Float, width), dr.arange(mi.Float, height))
         factor = mi.Color3f(texture.eval(mi.Point2f((column + 0.5) / width, (row + 0.5) / height)))

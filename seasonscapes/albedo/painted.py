@@ -15,8 +15,8 @@ from seasonscapes.albedo.photographs import AlbedoPhotograph
 def painted_radiance(photographs: Sequence[AlbedoPhotograph], gains: np.ndarray) -> dict[datetime, np.ndarray]:
     """Resample photographs onto the texture, one radiance texture per time.
 
-    Gains and aerial perspective are removed, so that the texture is the product of illuminance and albedo. Each texel is
-    the mean of the pixels that contain it, weighted by its share in them.
+    Gains and aerial perspective are removed, so that the texture is the product of illuminance and albedo. Each texel
+    is the mean of the pixels that contain it, weighted by its share in them.
 
     Parameters
     ----------

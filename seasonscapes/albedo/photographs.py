@@ -23,11 +23,12 @@ class NoiseModel:
     Parameters
     ----------
     model
-        Of the modelled radiance, relative: Monte Carlo noise, relief below texel size.
+        Relative standard deviation of the modelled radiance: Monte Carlo noise, relief below texel size.
     edge
-        Of sunlight where a shadow's edge crosses the pixel, relative: penumbra and terrain are never exact.
+        Relative standard deviation of sunlight where a shadow's edge crosses the pixel: penumbra and terrain are not
+        exact.
     sky
-        Of the sky's radiance, relative.
+        Relative standard deviation of the sky's radiance.
     levels
         Highest level of the picture's encoding (255 for 8 bits); ``None`` for linear floats.
     level_noise
@@ -60,7 +61,7 @@ class AlbedoPhotograph:
     light
         Illumination at its camera.
     footprints, number
-        Of its camera, and the index of its light among the footprints' T lights.
+        Footprints of its camera, and the index of its light among their T lights.
     atmosphere
         Pixels of its camera at which aerial perspective and sky radiance are evaluated.
     gain
@@ -100,14 +101,14 @@ def prepare_photographs(
     gains
         Known pixel value over radiance, ``(3,)`` each, or ``None``; all are unknown if omitted.
     seed
-        Of ray positions and sampled sky pixels.
+        Seed of ray positions and sampled sky pixels.
     progress
         Called with the finished fraction.
 
     Returns
     -------
     list of AlbedoPhotograph
-        In the order of the observations.
+        Photographs in the order of the observations.
 
     Raises
     ------
@@ -156,12 +157,12 @@ def thinned_photographs(photographs: Sequence[AlbedoPhotograph], share: float, s
     share
         Fraction of the pixels to keep.
     seed
-        Of the draw.
+        Seed of the draw.
 
     Returns
     -------
     list of AlbedoPhotograph
-        In the same order.
+        Photographs in the same order.
     """
     if share >= 1.0:
         return list(photographs)

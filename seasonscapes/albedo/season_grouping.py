@@ -73,7 +73,7 @@ def share_unchanged(dated: Sequence[KnownAlbedo]) -> list[KnownAlbedo]:
     Returns
     -------
     list of KnownAlbedo
-        In the same order, with joint means and standard deviations.
+        Albedos in the same order, with joint means and standard deviations.
     """
     if len(dated) < 2:
         return list(dated)

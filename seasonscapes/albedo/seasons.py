@@ -24,8 +24,8 @@ SEASONS = ("blended", "nearest", "snow-line")
 YEAR_DAYS = 365.2422
 # Day of the year with the lowest snow line, about seven weeks after the winter solstice.
 _LOWEST_SNOWLINE_DAY = 39.0
-# Snow has equal albedo in blue and red; rock, soil and leaves are darker in one of them. The lesser of the two below the
-# first value means no snow, above the second full snow cover.
+# Snow has equal albedo in blue and red; rock, soil and leaves are darker in one of them. The lesser of the two below
+# the first value means no snow, above the second full snow cover.
 _SNOW_DARKEST, _SNOW_BRIGHTEST = 0.32, 0.60
 # Least albedo change attributed to snow, and snow share on both dates from which on a change is attributed to ageing.
 _SNOW_CHANGE, _SNOW_COVERED = 0.12, 0.75
@@ -98,7 +98,7 @@ def day_number(day: date) -> float:
     Returns
     -------
     float
-        From 1 to 366.
+        Day number, from 1 to 366.
     """
     return float(day.timetuple().tm_yday)
 
@@ -109,7 +109,7 @@ def season_weights(dates: Sequence[date], day: date, *, season: str = "blended")
     Parameters
     ----------
     dates
-        Of the albedos, in any order and of any years: the year is cyclic.
+        Dates of the albedos, in any order and of any years: the year is cyclic.
     day
         The date to interpolate at.
     season

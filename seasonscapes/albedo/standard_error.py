@@ -1,8 +1,8 @@
 """Standard error of each texel's albedo.
 
-The variance of a texel comes from the diagonal of the closed form's information matrix (the pixels that contain the texel
-and the light upon it), scaled by the residuals of the photographs, plus a common relative term for gains, haze and sky.
-Texels that are completed later (`commands.corrected_albedo`) are marked as such, never as measured.
+The variance of a texel comes from the diagonal of the closed form's information matrix (the pixels that contain the
+texel and the light upon it), scaled by the residuals of the photographs, plus a common relative term for gains, haze
+and sky. Texels that are completed later (`albedo_completion`) are marked as such, never as measured.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ class KnownAlbedo:
     albedo
         ``(R, S, 3)`` float32.
     sigma
-        ``(R, S)`` float32 standard deviation (green); that of the completion for completed texels, infinite where nothing
-        is known.
+        ``(R, S)`` float32 standard deviation (green); that of the completion for completed texels, infinite where
+        nothing is known.
     sunlit
         ``(R, S)`` uint8 number of photographs in which the texel is visible in direct sunlight.
     source
@@ -94,7 +94,7 @@ def times_sunlit(photographs: Sequence[AlbedoPhotograph]) -> np.ndarray:
     Parameters
     ----------
     photographs
-        At least one, all of one texture shape.
+        At least one photograph, all of one texture shape.
 
     Returns
     -------

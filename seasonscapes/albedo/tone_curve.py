@@ -45,7 +45,7 @@ def invert_tone_curve(linear: np.ndarray, strength: float) -> np.ndarray:
     linear
         ``(...)`` values in [0, 1].
     strength
-        Of the S-curve, in [0, 1].
+        Strength of the S-curve, in [0, 1].
 
     Returns
     -------
@@ -68,7 +68,7 @@ def with_tone_curve(photographs: Sequence[AlbedoPhotograph], strength: float) ->
     photographs
         Photographs decoded as plain sRGB.
     strength
-        Of the S-curve, in [0, 1].
+        Strength of the S-curve, in [0, 1].
 
     Returns
     -------
@@ -114,7 +114,7 @@ def fit_tone_curve(
     start
         Initial albedo fit.
     seed
-        Of the drawn pixels.
+        Seed of the drawn pixels.
     progress
         Called with the finished fraction.
 
@@ -128,7 +128,7 @@ def fit_tone_curve(
     ValueError
         If there are fewer than three strengths.
     NoUsablePixels, NotEnoughEvidence
-        From `solve_albedo`.
+        See `closed_form.solve_albedo`.
     """
     report = progress or (lambda fraction: None)
     if len(strengths) < 3:

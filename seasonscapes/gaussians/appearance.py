@@ -32,8 +32,8 @@ from seasonscapes.gaussians.disc_transport import (
 )
 from seasonscapes.sky.illumination import LUMINANCE_WEIGHTS
 
-# Ablations by network input: `code` a free vector per training time, as in WildGaussians; `sun` the time embedding alone;
-# `physical` no network at all; `full` physical shading, its features and the time embedding.
+# Ablations by network input: `code` a free vector per training time, as in WildGaussians; `sun` the time embedding
+# alone; `physical` no network at all; `full` physical shading, its features and the time embedding.
 KINDS = ("code", "sun", "physical", "full")
 EMBEDDING, CODE = 6, 32
 # Width of the hidden layers; without physical shading those of WildGaussians.
@@ -83,7 +83,7 @@ def light_tensors(states: Sequence[LightState], seasons: Sequence[int] | None = 
     Returns
     -------
     LightTensors
-        Of T times.
+        Lights of T times.
     """
     rows = [_light_rows(state) for state in states]
     direction, illuminance, sky, bounce, features = (
@@ -151,7 +151,7 @@ def fourier_embedding(means: np.ndarray, size: int = EMBEDDING, *, seed: int = 0
     size
         Dimension of the embedding; low frequencies come first.
     seed
-        Of the noise.
+        Seed of the noise.
 
     Returns
     -------
@@ -181,7 +181,7 @@ class Appearance(nn.Module):
     times
         Number T of free codes of ``code``.
     seed
-        Of the network's initial weights.
+        Seed of the network's initial weights.
 
     Raises
     ------
@@ -347,7 +347,7 @@ def colours_at(
     Parameters
     ----------
     appearance
-        Of N Gaussians.
+        Appearance of N Gaussians.
     state
         The light.
     season

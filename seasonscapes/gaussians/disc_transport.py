@@ -148,7 +148,7 @@ def trace_disc_transport(
     rays
         Over each disc's hemisphere, a power of two.
     seed
-        Of the random numbers.
+        Seed of the random numbers.
     progress
         Called with the finished fraction.
 
@@ -211,12 +211,12 @@ def centre_coefficients(
     rank
         Number of sky coefficients.
     seed
-        Of the random numbers.
+        Seed of the random numbers.
 
     Returns
     -------
     rendering.transport.PointCoefficients
-        Of N points.
+        Coefficients of N points.
 
     Raises
     ------
@@ -229,13 +229,14 @@ def centre_coefficients(
     points, found = surface_at(ray_scene, surfels.places[:, surfels.places.shape[1] // 2 - 3])
     if len(found) != len(surfels.means):
         raise ValueError(
-            f"{len(surfels.means) - len(found)} discs have no terrain below them; use the terrain the discs were made from"
+            f"{len(surfels.means) - len(found)} discs have no terrain below them; "
+            "use the terrain that the discs were made from"
         )
     return trace_points(ray_scene, points, SamplingOptions(rays=rays, rank=rank, clusters=SENDERS), seed=seed)
 
 
 def _bounce_coefficients(reflected: Callable[[Illumination], np.ndarray]) -> np.ndarray:
-    """Coefficients ``(5, N)`` of interreflection: least squares over unit suns in 40 directions, and a grey unit sky."""
+    """Coefficients ``(5, N)`` of interreflection, by least squares over 40 sun directions, and for a grey unit sky."""
     directions = [
         direction_from_angles(360.0 * k / count + 7.0 * elevation, elevation)
         for elevation, count in ((4.0, 8), (14.0, 10), (28.0, 10), (45.0, 8), (68.0, 4))
@@ -363,7 +364,7 @@ def surfel_irradiance(
     rays
         Over each disc's hemisphere, a power of two.
     seed
-        Of the random numbers.
+        Seed of the random numbers.
     progress
         Called with the finished fraction.
 

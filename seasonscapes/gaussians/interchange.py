@@ -103,7 +103,7 @@ def read_ply(path: Path) -> BakedSplats:
     Returns
     -------
     BakedSplats
-        Its Gaussians.
+        Gaussians of the file.
 
     Raises
     ------

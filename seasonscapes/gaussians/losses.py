@@ -26,7 +26,7 @@ class TrainingFrame:
     Parameters
     ----------
     weights
-        Of its camera, from `rasterise.view_weights`; frames of one camera share them.
+        Blending weights of its camera, from `rasterise.view_weights`; frames of one camera share them.
     time
         Index among the times of the training targets.
     image
@@ -72,7 +72,7 @@ def surface_loss(
     Parameters
     ----------
     appearance
-        Of N discs.
+        Appearance of N discs.
     lights
         T light states.
     targets
@@ -126,7 +126,7 @@ def training_picture(frame: TrainingFrame) -> TrainingPicture:
     Parameters
     ----------
     frame
-        With frozen weights.
+        Frame with frozen weights.
 
     Returns
     -------
@@ -190,11 +190,11 @@ def picture_loss(appearance: Appearance, lights: LightTensors, picture: Training
     Parameters
     ----------
     appearance
-        Of N discs.
+        Appearance of N discs.
     lights
         T light states.
     picture
-        From `training_picture`.
+        Picture from `training_picture`.
 
     Returns
     -------

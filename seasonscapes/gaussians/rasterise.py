@@ -2,8 +2,8 @@
 
 Implementations of the same interface:
 
-* this module, for training: pairs of (pixel, splat) are enumerated exactly, row by row of each ellipse, and brought from
-  depth order into pixel order by one counting sort. Gradients by autograd.
+* this module, for training: pairs of (pixel, splat) are enumerated exactly, row by row of each ellipse, and brought
+  from depth order into pixel order by one counting sort. Gradients by autograd.
 * `rendering.splatting`, several times faster and without gradients; on CUDA gsplat, in `rasterise_cuda`.
 * `rasterise_reference`, a direct implementation for tests.
 
@@ -40,8 +40,19 @@ TRANSMITTANCE_CUT = 1e-4
 
 
 class Splats(NamedTuple):
-    """N Gaussians as tensors: ``means (N, 3)`` in the camera's world [m], ``quaternions (N, 4)`` wxyz,
-    ``log_scales (N, 3)``, ``opacity_logits (N,)``."""
+    """N Gaussians as tensors.
+
+    Parameters
+    ----------
+    means
+        ``(N, 3)`` centres in the camera's world frame [m].
+    quaternions
+        ``(N, 4)`` wxyz, of any length.
+    log_scales
+        ``(N, 3)`` natural logarithms of standard deviations [m].
+    opacity_logits
+        ``(N,)``.
+    """
 
     means: torch.Tensor
     quaternions: torch.Tensor
@@ -50,8 +61,23 @@ class Splats(NamedTuple):
 
 
 class Projected(NamedTuple):
-    """n splats in the picture, nearest first: ``index (n,)`` among the N, ``centre (n, 2)`` [px], ``conic (n, 3)`` (xx, xy
-    and yy of the inverse covariance), ``opacity (n,)``, ``variance_y (n,)`` [px²], ``depth (n,)`` along the axis [m]."""
+    """n projected splats, nearest first.
+
+    Parameters
+    ----------
+    index
+        ``(n,)`` index among all N splats.
+    centre
+        ``(n, 2)`` [px].
+    conic
+        ``(n, 3)`` elements xx, xy and yy of the inverse covariance [1/px²].
+    opacity
+        ``(n,)``.
+    variance_y
+        ``(n,)`` vertical variance [px²].
+    depth
+        ``(n,)`` along the optical axis [m].
+    """
 
     index: torch.Tensor
     centre: torch.Tensor
@@ -91,7 +117,7 @@ def choose_threads(threads: int = 1) -> None:
     Parameters
     ----------
     threads
-        At least 1.
+        Number of threads, at least 1.
     """
     torch.set_num_threads(threads)
 
@@ -243,8 +269,17 @@ def _candidates(
 
 
 class Pairs(NamedTuple):
-    """K pairs in pixel order, nearest first within a pixel: ``splat (K,)`` index among the projected, ``weight (K,)``, and
-    ``start (H W + 1,)`` of each pixel's pairs."""
+    """K pairs of pixel and splat in pixel order, nearest first within a pixel.
+
+    Parameters
+    ----------
+    splat
+        ``(K,)`` index among the projected splats.
+    weight
+        ``(K,)`` blending weight.
+    start
+        ``(H W + 1,)`` first pair of each pixel.
+    """
 
     splat: torch.Tensor
     weight: torch.Tensor
@@ -266,7 +301,7 @@ def blend_pairs(projected: Projected, width_px: int, height_px: int, *, alpha_cu
     Returns
     -------
     Pairs
-        In pixel order.
+        Pairs in pixel order.
     """
     with torch.no_grad():
         splat, pixel = _pairs_in_depth_order(projected, width_px, height_px, alpha_cut)
@@ -280,7 +315,8 @@ def blend_pairs(projected: Projected, width_px: int, height_px: int, *, alpha_cu
     power = -0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy
     alpha = (opacity * power.exp()).clamp(max=ALPHA_MOST).index_select(0, order)
     splat = splat.index_select(0, order)
-    # Transmittance as a cumulative sum of logarithms over all pairs; double precision, because it has millions of terms.
+    # Transmittance by a cumulative sum of logarithms over all pairs; double precision, because it has millions of
+    # terms.
     log_transmittance = torch.cumsum(torch.log1p(-alpha), 0, dtype=torch.float64)
     before = torch.cat([log_transmittance.new_zeros(1), log_transmittance])
     first = before.index_select(0, start[:-1]).repeat_interleave(start.diff())
@@ -443,7 +479,7 @@ def splat_colours(weights: ViewWeights, colours: np.ndarray) -> np.ndarray:
     Parameters
     ----------
     weights
-        Of N splats.
+        Blending weights of N splats.
     colours
         ``(N, C)``.
 

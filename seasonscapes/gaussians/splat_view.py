@@ -66,12 +66,12 @@ def appearance_of(model: GaussianModel, *, albedo: np.ndarray | None = None, see
     albedo
         ``(N, 3)`` in place of the model's dated albedos, for example from `GaussianModel.albedo_on`.
     seed
-        Of network weights that the model does not contain.
+        Seed of network weights that the model does not contain.
 
     Returns
     -------
     Appearance
-        With the model's learned parameters.
+        Module with the model's learned parameters.
     """
     dated = model.albedo if albedo is None else albedo[None]
     surroundings = np.stack([neighbourhood_mean(model.means, values, model.plan.spacing_m) for values in dated])
@@ -204,7 +204,7 @@ def render_model(
     day
         Day of the year, for the albedo.
     weights, colours
-        From `model_weights` and `model_colours`, if one of them is reused for many pictures.
+        Results of `model_weights` and `model_colours`, if one of them is reused for many pictures.
     subpixels
         Samples along a pixel's side, if ``weights`` are not given.
     device

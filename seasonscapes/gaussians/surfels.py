@@ -14,10 +14,11 @@ from seasonscapes.terrain.attributes import vertex_normals
 from seasonscapes.terrain.surface import Terrain, sample_texture
 from seasonscapes.terrain.texels import barycentric, texel_coordinates, texel_positions
 
-# Standard deviation along the surface, relative to the grid spacing. Below 0.5 holes open; above 0.55 the picture blurs.
+# Standard deviation along the surface, relative to the grid spacing. Below 0.5 holes open; above 0.55 the picture
+# blurs.
 SIGMA = 0.52
-# Standard deviation along the normal, relative to the spacing: 3DGS readers reject zero, and thick discs smear at grazing
-# angles.
+# Standard deviation along the normal, relative to the spacing: 3DGS readers reject zero, and thick discs smear at
+# grazing angles.
 THICKNESS = 0.03
 OPACITY = 0.995
 # Limit of the elongation, reached on cliffs steeper than about 80°.
@@ -204,7 +205,7 @@ def _cells(terrain: Terrain, plan: SurfelGrid, at_vertices: np.ndarray) -> tuple
 
 
 def _disc_axes(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Axes of discs as columns ``(N, 3, 3)`` (down the slope, across it, normal) and elongation down the slope ``(N,)``."""
+    """Axes of discs as columns ``(N, 3, 3)`` (down the slope, across it, normal) and elongation ``(N,)``."""
     up = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
     across = np.stack([-up[:, 1], up[:, 0], np.zeros(len(up))], axis=1)
     length = np.linalg.norm(across, axis=1, keepdims=True)

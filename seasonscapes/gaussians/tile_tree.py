@@ -1,7 +1,7 @@
 """Level of detail for large terrains: a quadtree of tiles of discs, refined to the resolution of the picture.
 
-Every tile has the same number of discs; the four children of a tile halve the distance of its discs. The discs of a tile
-are generated from the terrain on demand. Each tile has its own origin, so that float32 positions are accurate to a
+Every tile has the same number of discs; the four children of a tile halve the distance of its discs. The discs of a
+tile are generated from the terrain on demand. Each tile has its own origin, so that float32 positions are accurate to a
 millimetre whatever the extent of the terrain.
 """
 
@@ -214,15 +214,15 @@ def joined_shapes(tiles: list[TileDiscs], camera: Camera) -> tuple[np.ndarray, n
     Parameters
     ----------
     tiles
-        At least one.
+        At least one tile with its discs.
     camera
         The view.
 
     Returns
     -------
     tuple of numpy.ndarray
-        Means **relative to the camera** ``(N, 3)`` [m], quaternions ``(N, 4)``, log scales ``(N, 3)`` and opacity logits
-        ``(N,)``.
+        Means **relative to the camera** ``(N, 3)`` [m], quaternions ``(N, 4)``, log scales ``(N, 3)`` and opacity
+        logits ``(N,)``.
     """
     means = [part.surfels.means + (part.origin_m - camera.position_m).astype(np.float32) for part in tiles]
     shapes = [(part.surfels.quaternions, part.surfels.log_scales, part.surfels.opacity_logits) for part in tiles]

@@ -2,9 +2,9 @@
 
 1. Surface stage: radiance of (disc, time) pairs, from irradiance traced at the discs. No rasterisation, occlusion or
    blur is involved; most of the training happens here.
-2. Picture stage: a few steps over cameras and times, 0.8 L1 + 0.2 D-SSIM in sRGB, through frozen sparse weights, so that
-   the colours compensate for the extent of the splats. The surface loss is kept, because discs outside all pictures
-   would drift otherwise.
+2. Picture stage: a few steps over cameras and times, 0.8 L1 + 0.2 D-SSIM in sRGB, through frozen sparse weights, so
+   that the colours compensate for the extent of the splats. The surface loss is kept, because discs outside all
+   pictures would drift otherwise.
 
 The geometry is known and not trained. Every step has its own random generator, seeded by (seed, step), so that an
 interrupted run continues from its checkpoint with identical results.
@@ -169,7 +169,7 @@ def train(
     schedule
         Numbers of steps; defaults if omitted.
     seed
-        Of the random draws.
+        Seed of the random draws.
     checkpoint
         ``.safetensors`` file to save to; training continues from it if it exists.
     progress
@@ -269,7 +269,7 @@ def fit_code(
     rate
         Learning rate.
     seed
-        Of the drawn pixels.
+        Seed of the drawn pixels.
 
     Returns
     -------
@@ -308,7 +308,7 @@ def save_checkpoint(
     appearance
         Module in training.
     optimiser
-        Its optimiser.
+        Optimiser of the module.
     run
         Plain values that identify the run.
     step
@@ -337,7 +337,7 @@ def load_checkpoint(path: Path, appearance: Appearance, optimiser: torch.optim.A
     appearance
         Module to restore.
     optimiser
-        Its optimiser.
+        Optimiser of the module.
     run
         Plain values that identify the run.
 

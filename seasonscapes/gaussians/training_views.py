@@ -38,7 +38,7 @@ def overview_cameras(terrain: Terrain, count: int, *, size_px: int = 256, first_
     Returns
     -------
     list of Camera
-        At equal angles.
+        Cameras at equal angles.
     """
     low, high = terrain.vertices.min(axis=0).astype(float), terrain.vertices.max(axis=0).astype(float)
     centre, radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm((high - low)[:2]))
@@ -75,9 +75,9 @@ def relit_frames(
     cameras
         The views.
     lights
-        For each time its index among the training targets' times, its light and its light state.
+        Index among the training targets' times, light and light state of each time.
     seed
-        Of the random numbers.
+        Seed of the random numbers.
     progress
         Called with the finished fraction after each camera.
 
