@@ -114,21 +114,21 @@ class Scene:
 
     def lights(self, count: int, *, day: float | None = None):
         """Random instants with the sun above 4°: lights, days of the year."""
-        from seasonscapes.daylight import light_at, moment_at
         from seasonscapes.sky.models import read_sky_model
+        from seasonscapes.workflows.illumination import illumination_at, sun_moon_position
         from seasonscapes.workspace import default_workspace
 
         model, found, days = read_sky_model("clear"), [], []
         while len(found) < count:
             at = float(self.rng.integers(1, 366)) if day is None else day
-            moment = moment_at(
+            moment = sun_moon_position(
                 datetime(2024, 1, 1, tzinfo=UTC) + timedelta(days=at - 1, hours=float(self.rng.uniform(4, 20))),
                 self.frame.latitude_deg,
                 self.frame.longitude_deg,
                 2000.0,
             )
             if moment.sun.elevation_deg > 4.0:
-                found.append(light_at(model, moment, 2000.0, workspace=default_workspace()))
+                found.append(illumination_at(model, moment, 2000.0, workspace=default_workspace()))
                 days.append(at)
         return found, days
 
@@ -378,7 +378,7 @@ def speed(contest: Contest, appearance) -> dict[str, float]:
 
     from seasonscapes.gaussians.appearance import colours_at
     from seasonscapes.gaussians.rasterise import rotations, splat_colours, view_weights
-    from seasonscapes.gaussians.splat_view import CUTS
+    from seasonscapes.gaussians.splat_view import SPLAT_LIMITS
     from seasonscapes.gaussians.training_views import facing
     from seasonscapes.rendering.mitsuba_scene import relight
     from seasonscapes.rendering.radiance import path_trace
@@ -391,12 +391,12 @@ def speed(contest: Contest, appearance) -> dict[str, float]:
     opacity = 1.0 / (1.0 + np.exp(-surfels.opacity_logits))
     ready = upload_splats(surfels.means, axes.numpy(), opacity)
     colours = colours_at(appearance, contest.states[t])
-    moving = best(lambda: splat_layers(ready, colours, camera, CUTS))
+    moving = best(lambda: splat_layers(ready, colours, camera, SPLAT_LIMITS))
     in_torch = best(lambda: splat_colours(view_weights(splats, camera), colours))
     relit = best(lambda: colours_at(appearance, contest.states[t]))
     weights = view_weights(splats, camera)
     still = best(lambda: splat_colours(weights, colours))
-    drawn, covered = splat_layers(ready, colours, camera, CUTS)
+    drawn, covered = splat_layers(ready, colours, camera, SPLAT_LIMITS)
     lit = relight(scene.mesh, contest.lights[t], max_height_m=float(scene.terrain.vertices[:, 2].max()))
     # Errors are compared in the middle of the picture, 3/8 of its side; times are those of all of it.
     side = camera.width_px * 3 // 8

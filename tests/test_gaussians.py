@@ -16,7 +16,7 @@ from test_rendering import FRAME, heightfield, looking_down, sun_at  # noqa: E40
 from seasonscapes.cameras.exchange import NamedView, read_colmap, read_transforms  # noqa: E402
 from seasonscapes.cameras.pinhole import Camera, rotation_from_angles  # noqa: E402
 from seasonscapes.cli import app, main  # noqa: E402
-from seasonscapes.errors import InputError  # noqa: E402
+from seasonscapes.errors import InputError, NoTerrainInView  # noqa: E402
 from seasonscapes.frames import equirectangular_directions  # noqa: E402
 from seasonscapes.gaussians.appearance import Appearance, colours_at, fourier_embedding, light_tensors  # noqa: E402
 from seasonscapes.gaussians.disc_transport import (  # noqa: E402
@@ -46,7 +46,7 @@ from seasonscapes.gaussians.rasterise import (  # noqa: E402
 from seasonscapes.gaussians.rasterise_cuda import rasterise_cuda  # noqa: E402
 from seasonscapes.gaussians.rasterise_reference import rasterise_reference  # noqa: E402
 from seasonscapes.gaussians.splat_view import (  # noqa: E402
-    CUTS,
+    SPLAT_LIMITS,
     draw_layers,
     learned_numbers,
     model_colours,
@@ -308,7 +308,7 @@ def test_bad_lessons_and_frames_are_refused(hill, told):
     with pytest.raises(ValueError, match="0 lights"):
         SurfaceTargets([], [], np.zeros((0, 5, 3)))
     empty = view_weights(splats_of_surfels(hill[1]), under_the_hill())
-    with pytest.raises(ValueError, match="inside the mountain"):
+    with pytest.raises(NoTerrainInView, match="inside the mountain"):
         TrainingFrame(empty, 0, np.zeros((8, 8, 3)), np.ones((8, 8), bool))
     with pytest.raises(ValueError, match="expected light"):
         light_state(hill[4], Illumination(np.zeros((16, 32, 3), np.float32)), 1.0)
@@ -381,7 +381,7 @@ def under_the_hill() -> Camera:
 
 
 def test_a_camera_that_sees_nothing_says_so(model):
-    with pytest.raises(ValueError, match="no Gaussian in the camera's view"):
+    with pytest.raises(NoTerrainInView, match="no Gaussian in the camera's view"):
         model_weights(model, under_the_hill())
 
 
@@ -616,7 +616,7 @@ def test_fast_splatting_draws_the_same_picture():
     axes = rotations(splats.quaternions) * splats.log_scales.exp()[:, None, :]
     ready = upload_splats(splats.means.numpy(), axes.numpy(), torch.sigmoid(splats.opacity_logits).numpy())
     expected, covered = rasterise_reference(splats, colours, CAMERA)
-    image, coverage = splat_layers(ready, colours.numpy(), CAMERA, CUTS._replace(one_sided=False))
+    image, coverage = splat_layers(ready, colours.numpy(), CAMERA, SPLAT_LIMITS._replace(one_sided=False))
     assert image.shape == (20, 24, 3)
     assert np.abs(image - expected.numpy()).max() < 4.5e-3
     assert np.abs(image - expected.numpy()).mean() < 1e-4
@@ -632,5 +632,5 @@ def test_backs_of_discs_are_not_drawn(hill, model):
     np.testing.assert_allclose(image, splat_colours(weights, layers), atol=0.01)
     pose = np.eye(4)
     pose[:3, 3] = [0.0, 0.0, -800.0]
-    with pytest.raises(ValueError, match="no Gaussian in the camera's view"):
+    with pytest.raises(NoTerrainInView, match="no Gaussian in the camera's view"):
         draw_layers(model, replace(camera, world_from_camera=pose), layers)

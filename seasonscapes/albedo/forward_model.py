@@ -29,7 +29,7 @@ from seasonscapes.terrain.texels import texel_positions
 
 Progress = Callable[[float], None]
 # Texels need fewer rays than pixels: every footprint averages over neighbouring texels.
-TEXEL_EFFORT = SamplingOptions(subpixels=1, rays=512, listed=64, clusters=8192, rank=32)
+TEXEL_SAMPLING = SamplingOptions(subpixels=1, rays=512, listed=64, clusters=8192, rank=32)
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def trace_texel_transport(
     terrain: Terrain,
     shape: tuple[int, int],
     *,
-    sampling: SamplingOptions = TEXEL_EFFORT,
+    sampling: SamplingOptions = TEXEL_SAMPLING,
     seed: int = 0,
     smooth: bool = True,
     progress: Progress | None = None,

@@ -28,11 +28,11 @@ HORIZON_RANGE_RAD = (-0.02, 1.29)
 # Number of sky coefficients per disc.
 SKY_RANK = 8
 # Standard deviation of the Gaussian that averages albedo around a disc, for the colour of interreflection [m].
-AROUND_M = 300.0
+NEIGHBOURHOOD_SIGMA_M = 300.0
 # Initial softness of the horizon [rad]: the sun's radius and half a step of the table.
 SOFTNESS_RAD = 0.012
 # Light clusters of the terrain; few suffice, because interreflection is smooth.
-SENDERS = 4096
+LIGHT_CLUSTERS = 4096
 Progress = Callable[[float], None]
 
 
@@ -232,7 +232,7 @@ def centre_coefficients(
             f"{len(surfels.means) - len(found)} discs have no terrain below them; "
             "use the terrain that the discs were made from"
         )
-    return trace_points(ray_scene, points, SamplingOptions(rays=rays, rank=rank, clusters=SENDERS), seed=seed)
+    return trace_points(ray_scene, points, SamplingOptions(rays=rays, rank=rank, clusters=LIGHT_CLUSTERS), seed=seed)
 
 
 def _bounce_coefficients(reflected: Callable[[Illumination], np.ndarray]) -> np.ndarray:
@@ -249,7 +249,7 @@ def _bounce_coefficients(reflected: Callable[[Illumination], np.ndarray]) -> np.
 
 
 def neighbourhood_mean(means: np.ndarray, albedo: np.ndarray, spacing_m: float) -> np.ndarray:
-    """Average the albedo of discs over their surroundings, with a Gaussian of `AROUND_M`.
+    """Average the albedo of discs over their surroundings, with a Gaussian of `NEIGHBOURHOOD_SIGMA_M`.
 
     Parameters
     ----------
@@ -265,7 +265,7 @@ def neighbourhood_mean(means: np.ndarray, albedo: np.ndarray, spacing_m: float) 
     numpy.ndarray
         ``(N, 3)``, at least 0.001.
     """
-    return np.maximum(plan_blur(means, albedo, spacing_m, AROUND_M), 1e-3)
+    return np.maximum(plan_blur(means, albedo, spacing_m, NEIGHBOURHOOD_SIGMA_M), 1e-3)
 
 
 @dataclass(frozen=True)

@@ -29,9 +29,9 @@ from seasonscapes.rendering.splatting import DeviceSplats, SplatLimits, finer_ca
 from seasonscapes.sky.illumination import AerialPerspective, Illumination
 
 # Coverage from which on a pixel is treated as entirely terrain.
-SOLID = 0.85
+FULL_COVERAGE = 0.85
 NOTHING_IN_VIEW = "no Gaussian in the camera's view; it may face away from the terrain or be inside the mountain"
-CUTS = SplatLimits(ALPHA_CUT, ALPHA_MOST, PIXEL_VARIANCE, NEAR_M, one_sided=True)
+SPLAT_LIMITS = SplatLimits(ALPHA_CUT, ALPHA_MOST, PIXEL_VARIANCE, NEAR_M, one_sided=True)
 
 
 @dataclass(frozen=True)
@@ -232,7 +232,7 @@ def render_model(
     else:
         blended, coverage = draw_layers(model, camera, layers, subpixels=subpixels, device=device)
     # Neighbouring discs leave gaps of a few per cent, through which the sky must not shine.
-    solid = np.clip(coverage / SOLID, 0.0, 1.0)
+    solid = np.clip(coverage / FULL_COVERAGE, 0.0, 1.0)
     mean = blended / np.maximum(coverage, 1e-6)[..., None]
     depth = np.where(coverage > 1e-3, mean[..., 3], np.inf)
     surface = mean[..., :3] * solid[..., None]
@@ -283,7 +283,7 @@ def draw_layers(
         blended, coverage = splat_colours(weights, layers), weights.coverage
     else:
         fine = finer_camera(camera, subpixels)
-        blended, coverage = splat_layers(upload_model(model), layers, fine, CUTS)
+        blended, coverage = splat_layers(upload_model(model), layers, fine, SPLAT_LIMITS)
         shape = (camera.height_px, subpixels, camera.width_px, subpixels)
         blended, coverage = blended.reshape(*shape, -1).mean((1, 3)), coverage.reshape(shape).mean((1, 3))
     if not coverage.any():

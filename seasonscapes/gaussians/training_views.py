@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from seasonscapes.cameras.pinhole import Camera, rotation_from_angles
-from seasonscapes.gaussians.disc_transport import SENDERS, LightState
+from seasonscapes.gaussians.disc_transport import LIGHT_CLUSTERS, LightState
 from seasonscapes.gaussians.losses import TrainingFrame
 from seasonscapes.gaussians.rasterise import Splats, splats_from, view_weights
 from seasonscapes.gaussians.surfels import Surfels
@@ -97,7 +97,7 @@ def relit_frames(
     frames = []
     for number, camera in enumerate(cameras):
         view = relightable_view(
-            ray_scene, trace_view(ray_scene, camera, SamplingOptions(rays=256, clusters=SENDERS), seed=seed)
+            ray_scene, trace_view(ray_scene, camera, SamplingOptions(rays=256, clusters=LIGHT_CLUSTERS), seed=seed)
         )
         weights = view_weights(facing(surfels, camera), camera, subpixels=2)
         for time, light, state in lights:
