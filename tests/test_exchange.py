@@ -218,7 +218,7 @@ def test_the_138_views_spread_as_measured_and_share_a_pose_when_solved_together(
     [
         ({"transform_matrix": [[1, 0], [0, 1]]}, "not a finite 4 x 4"),
         ({"fx": None}, "not a camera record"),
-        ({"transform_matrix": np.diag([2.0, 1.0, 1.0, 1.0]).tolist()}, "no rotation"),
+        ({"transform_matrix": np.diag([2.0, 1.0, 1.0, 1.0]).tolist()}, "not a rotation"),
     ],
 )
 def test_broken_reference_records_are_named(tmp_path, change, message):

@@ -152,7 +152,7 @@ def test_averaging_happens_in_linear_light():
 
 def test_a_picture_of_another_size_is_refused():
     panorama = make("cylindrical", (3600, 700), 360.0, 62.8, 0.0, 0.0, 0.0, None)
-    with pytest.raises(ValueError, match="the picture is 3599 x 700 px, the panorama model 3600 x 700"):
+    with pytest.raises(ValueError, match="the image is 3599 x 700 px, the panorama model 3600 x 700"):
         cut_view(np.zeros((700, 3599, 3), np.uint8), panorama, split_panorama(panorama)[0])
     with pytest.raises(ValueError, match="leave gaps"):
         split_panorama(panorama, fov_deg=80.0, count=4)

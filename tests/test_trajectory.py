@@ -21,10 +21,12 @@ from seasonscapes.cameras.trajectory import (
     views_along,
 )
 from seasonscapes.commands.options import PlaceOptions
-from seasonscapes.commands.path import ground_of, path, waypoints_of
-from seasonscapes.errors import InputError
+from seasonscapes.commands.path import path
+from seasonscapes.errors import InputError, InvalidPath
 from seasonscapes.frames import LocalFrame, enu_from_geodetic
-from seasonscapes.pipeline import MeshOptions, find_scene, load_place
+from seasonscapes.workflows.camera_paths import waypoint_cameras
+from seasonscapes.workflows.place import MeshOptions, find_scene, load_place
+from seasonscapes.workflows.views import local_ground
 from seasonscapes.workspace import Workspace
 
 FRAME = LocalFrame(46.55, 7.98, 1000.0, 0.13)
@@ -151,14 +153,14 @@ def test_look_at_keeps_the_place_in_the_middle_and_lenses_blend():
         np.testing.assert_allclose(project(each, target)[0], [48.0, 32.0], atol=1e-6)
     assert views[-1].fx == pytest.approx(160.0)
     assert all(a.fx <= b.fx + 1e-9 for a, b in pairwise(views))
-    with pytest.raises(ValueError, match="straight above"):
+    with pytest.raises(InvalidPath, match="vertically above"):
         cameras_along_path([camera([0, 0, 100]), camera([100, 0, 100])], 3, look_at_m=np.array([50.0, 0.0, 0.0]))
 
 
 def test_what_is_no_path_is_refused():
-    with pytest.raises(ValueError, match="two waypoints"):
+    with pytest.raises(InvalidPath, match="two waypoints"):
         cameras_along_path(waypoints()[:1], 5)
-    with pytest.raises(ValueError, match="same place"):
+    with pytest.raises(InvalidPath, match="same place"):
         cameras_along_path([waypoints()[0], waypoints()[0], waypoints()[1]], 5)
     with pytest.raises(ValueError, match="at least 2 views"):
         cameras_along_path(waypoints(), 1)
@@ -215,7 +217,7 @@ def test_clearance_on_the_embedded_scene_by_rays(alpine, curve):
     from seasonscapes.rendering.hemisphere_rays import ray_scene
     from seasonscapes.rendering.mitsuba_scene import RenderScene, mi_mesh
 
-    known = waypoints_of(alpine, ["aerial", "meadow", "lake", "46.55,7.95,+80", "ridge"], 60.0, (96, 64))
+    known = waypoint_cameras(alpine, ["aerial", "meadow", "lake", "46.55,7.95,+80", "ridge"], 60.0, (96, 64))
     terrain = ray_scene(mi_mesh(alpine.terrain, np.full(3, 0.2)))
 
     def above(line):
@@ -225,7 +227,7 @@ def test_clearance_on_the_embedded_scene_by_rays(alpine, curve):
         return trace_rays(RenderScene(terrain.mi_scene, terrain.mi_terrain, None, 0.0), high, down).depth - 5000.0
 
     bare = curve_through(places_of(known), curve=curve)
-    line, most = lift_above_ground(bare, ground_of(alpine), 50.0)
+    line, most = lift_above_ground(bare, local_ground(alpine), 50.0)
     assert above(bare).min() < 0.0 < most
     assert above(line).min() >= 50.0
     views = views_along(line, known, 120)
@@ -267,10 +269,10 @@ def test_a_path_comes_back_from_its_file(tmp_path):
 def test_files_that_are_no_path(tmp_path):
     file = tmp_path / "p.json"
     for text, words in (
-        ("{}", "is no path"),
-        ('{"kind": "seasonscapes path"}', "not a path"),
+        ("{}", "is not a camera path file"),
+        ('{"kind": "seasonscapes path"}', "not a valid camera path"),
         ("{", "p.json"),
-        ('{"kind": "seasonscapes path", "size_px": [9, 9], "views": []}', "no view"),
+        ('{"kind": "seasonscapes path", "size_px": [9, 9], "views": []}', "no views"),
         ('{"kind": "seasonscapes path", "size_px": [9, 9], "views": [{"fx": 1}]}', "latitude_deg"),
     ):
         file.write_text(text)

@@ -30,7 +30,7 @@ from seasonscapes.cameras.webcam import (
     webcam_heading_deg,
     webcam_model,
 )
-from seasonscapes.declaration import InputError
+from seasonscapes.errors import InputError, UnreadableImage
 from seasonscapes.frames import LocalFrame, angles_from_direction, enu_from_geodetic, local_axes
 
 BERNESE = Path(__file__).parents[1] / "scenes" / "bernese_highlands.toml"
@@ -101,7 +101,7 @@ def test_facts_that_cannot_be_are_refused(changes, message):
 def test_errors_in_a_webcam_file_are_one_line(tmp_path):
     text = BERNESE.read_text()
     cases = {
-        "two webcams are called 1-HEISCH": text.replace('"2-BSPIEZ"', '"1-HEISCH"'),
+        "two webcams have the id 1-HEISCH": text.replace('"2-BSPIEZ"', '"1-HEISCH"'),
         "did you mean 'height_m'": text.replace("height_m = 1134.0", "heigth_m = 1134.0"),
         "not valid TOML": text + "[[",
     }
@@ -252,10 +252,10 @@ def test_opening_a_picture_checks_it(tmp_path):
     assert seen.image.shape == (20, 80, 3)
     assert seen.mask.all()
     picture(tmp_path / "a.jpg", size=(40, 20))
-    with pytest.raises(InputError, match="another size"):
+    with pytest.raises(InputError, match="size differs"):
         open_observation(row, tmp_path, camera)
     (tmp_path / "a.jpg").write_bytes(b"nothing")
-    with pytest.raises(InputError, match="not a readable picture"):
+    with pytest.raises(UnreadableImage, match="not a readable picture"):
         open_observation(row, tmp_path, camera)
     with pytest.raises(ValueError, match="not UTC"):
         Observation(seen.image, seen.mask, camera, datetime(2024, 9, 1), "HUT")

@@ -1,7 +1,7 @@
-"""Cameras to and from other programs: COLMAP text, nerfstudio's ``transforms.json``, OpenCV.
+"""Import and export of cameras: COLMAP text models, nerfstudio's ``transforms.json``, OpenCV.
 
-All of them get the scene's own east-north-up metres; `transforms.json` also carries what those metres are about
-(origin, refraction, WGS 84) and each picture's time, so that a view can come back to its place on Earth.
+Poses are written in the scene's local east-north-up frame [m]; ``transforms.json`` also stores the frame's origin and
+refraction coefficient and the time of each image, so that views remain georeferenced.
 """
 
 from __future__ import annotations
@@ -11,9 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.declaration import InputError
@@ -26,7 +28,19 @@ _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 @dataclass(frozen=True)
 class NamedView:
-    """A camera with the picture it belongs to; ``time`` aware UTC or ``None``."""
+    """A camera with the image it belongs to.
+
+    Parameters
+    ----------
+    name
+        Name of the view.
+    camera
+        The camera.
+    file
+        Image file; empty if there is none.
+    time
+        Time of exposure, aware UTC; ``None`` if unknown.
+    """
 
     name: str
     camera: Camera
@@ -35,9 +49,22 @@ class NamedView:
 
 
 def write_colmap(folder: Path, views: Sequence[NamedView]) -> None:
-    """Write ``cameras.txt``, ``images.txt`` and an empty ``points3D.txt``; one PINHOLE camera for each view.
+    """Write a COLMAP text model: ``cameras.txt``, ``images.txt`` and an empty ``points3D.txt``.
 
-    COLMAP stores ``camera_from_world`` as a quaternion (w first) and a translation; pixel centres lie at +0.5.
+    Each view gets its own PINHOLE camera. COLMAP stores ``camera_from_world`` as a quaternion (w first) and a
+    translation; pixel centres lie at +0.5.
+
+    Parameters
+    ----------
+    folder
+        Folder of the model.
+    views
+        Views to write.
+
+    Raises
+    ------
+    ValueError
+        A file name contains white space, which the format does not support.
     """
     from scipy.spatial.transform import Rotation
 
@@ -45,8 +72,8 @@ def write_colmap(folder: Path, views: Sequence[NamedView]) -> None:
     images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"]
     for number, view in enumerate(views, 1):
         camera, name = view.camera, view.file or view.name
-        if any(letter.isspace() for letter in name):
-            raise ValueError(f"COLMAP's text format has no way to write the blank in {name!r}")
+        if any(character.isspace() for character in name):
+            raise ValueError(f"write_colmap: got file name {name!r}, expected one without white space")
         rotation = camera.world_from_camera[:3, :3].T
         x, y, z, w = Rotation.from_matrix(rotation).as_quat(canonical=True)
         cameras.append(
@@ -60,7 +87,23 @@ def write_colmap(folder: Path, views: Sequence[NamedView]) -> None:
 
 
 def read_colmap(folder: Path) -> list[NamedView]:
-    """Views of a COLMAP text model with PINHOLE or SIMPLE_PINHOLE cameras; `InputError` for others."""
+    """Read the views of a COLMAP text model.
+
+    Parameters
+    ----------
+    folder
+        Folder of ``cameras.txt`` and ``images.txt``.
+
+    Returns
+    -------
+    list of NamedView
+        Views in the order of ``images.txt``, without local frame.
+
+    Raises
+    ------
+    InputError
+        A file is missing, or a camera model is neither PINHOLE nor SIMPLE_PINHOLE.
+    """
     from scipy.spatial.transform import Rotation
 
     intrinsics = {}
@@ -74,25 +117,36 @@ def read_colmap(folder: Path) -> list[NamedView]:
                 folder / "cameras.txt",
                 f"camera model {model} has distortion",
                 expected="PINHOLE",
-                cure="undistort the pictures first (colmap image_undistorter)",
+                cure="undistort the images first (colmap image_undistorter)",
             )
         intrinsics[number] = (int(width), int(height), *numbers)
     views = []
-    # Every second line lists 2-D points; blank ones count, so they cannot be dropped before pairing.
+    # Every second line lists 2-D points and may be blank: blank lines must be kept until lines are paired.
     for line in _lines(folder / "images.txt", keep_blank=True)[::2]:
         if not line.strip():
             continue
         _, *values, number, name = line.split(maxsplit=9)
-        w, x, y, z, *shift = (float(v) for v in values)
+        w, x, y, z, *translation = (float(v) for v in values)
         pose = np.eye(4)
         pose[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix().T
-        pose[:3, 3] = -pose[:3, :3] @ shift
-        views.append(NamedView(name, Camera(*intrinsics[number], pose), name))
+        pose[:3, 3] = -pose[:3, :3] @ translation
+        width, height, fx, fy, cx, cy = intrinsics[number]
+        views.append(NamedView(name, Camera(width, height, fx, fy, cx, cy, pose), name))
     return views
 
 
 def write_transforms(path: Path, views: Sequence[NamedView], frame: LocalFrame) -> None:
-    """Write nerfstudio's ``transforms.json`` with every view's own intrinsics, the place and the times."""
+    """Write nerfstudio's ``transforms.json`` with intrinsics per view, the local frame and the times.
+
+    Parameters
+    ----------
+    path
+        File to write.
+    views
+        Views to write.
+    frame
+        Local frame of their poses.
+    """
     frames = []
     for view in views:
         camera = view.camera
@@ -110,7 +164,7 @@ def write_transforms(path: Path, views: Sequence[NamedView], frame: LocalFrame) 
         if view.time is not None:
             record["time_utc"] = view.time.astimezone(UTC).isoformat().replace("+00:00", "Z")
         frames.append(record)
-    place = {
+    world = {
         "crs": "local east-north-up [m] about the origin, through ECEF (EPSG:4978)",
         "geographic_crs": "EPSG:4979",
         "origin": {
@@ -120,11 +174,29 @@ def write_transforms(path: Path, views: Sequence[NamedView], frame: LocalFrame) 
             "refraction_k": frame.refraction_k,
         },
     }
-    _write_text(path, json.dumps({"camera_model": "PINHOLE", "world": place, "frames": frames}, indent=1) + "\n")
+    _write_text(path, json.dumps({"camera_model": "PINHOLE", "world": world, "frames": frames}, indent=1) + "\n")
 
 
 def read_transforms(path: Path) -> tuple[list[NamedView], LocalFrame | None]:
-    """Views of a ``transforms.json``, intrinsics per frame or for all, and the frame where it states one."""
+    """Read the views of a ``transforms.json``, with intrinsics per view or shared by all.
+
+    Parameters
+    ----------
+    path
+        File to read.
+
+    Returns
+    -------
+    views
+        The views.
+    frame
+        Local frame of the poses; ``None`` if the file does not state one.
+
+    Raises
+    ------
+    InputError
+        Invalid JSON, a missing key, or non-zero distortion.
+    """
     table = read_json(path)
     origin = table.get("world", {}).get("origin")
     frame = LocalFrame(**origin) if origin else None
@@ -132,19 +204,20 @@ def read_transforms(path: Path) -> tuple[list[NamedView], LocalFrame | None]:
     for index, record in enumerate(table.get("frames", [])):
         values = {**{k: v for k, v in table.items() if k != "frames"}, **record}
         try:
-            intrinsics = [values["fl_x"], values.get("fl_y", values["fl_x"]), values["cx"], values["cy"]]
+            fx, fy, cx, cy = values["fl_x"], values.get("fl_y", values["fl_x"]), values["cx"], values["cy"]
             pose = np.array(record["transform_matrix"], float) @ _FLIP
-            size = int(values["w"]), int(values["h"])
+            width, height = int(values["w"]), int(values["h"])
         except KeyError as error:
             raise InputError(f"{path}: frames[{index}]", f"key {error} is missing") from None
-        bent = [key for key in ("k1", "k2", "k3", "k4", "p1", "p2") if values.get(key)]
-        if bent:
-            raise InputError(f"{path}: frames[{index}]", f"distortion {bent[0]} is not zero", cure="undistort first")
+        distortion = [key for key in ("k1", "k2", "k3", "k4", "p1", "p2") if values.get(key)]
+        if distortion:
+            problem = f"distortion {distortion[0]} is not zero"
+            raise InputError(f"{path}: frames[{index}]", problem, cure="undistort the images first")
         stamp = record.get("time_utc")
         views.append(
             NamedView(
                 record.get("name", record["file_path"]),
-                Camera(*size, *intrinsics, pose, frame),
+                Camera(width, height, fx, fy, cx, cy, pose, frame),
                 record["file_path"],
                 datetime.fromisoformat(stamp) if stamp else None,
             )
@@ -153,29 +226,82 @@ def read_transforms(path: Path) -> tuple[list[NamedView], LocalFrame | None]:
 
 
 def opencv_from_camera(camera: Camera, k1: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Camera matrix ``(3, 3)``, distortion ``(5,)``, ``rvec`` ``(3,)`` and ``tvec`` ``(3,)`` for ``cv2.projectPoints``.
+    """Convert a camera to the arguments of ``cv2.projectPoints``.
 
-    OpenCV counts from the centre of the first pixel: its principal point is half a pixel less.
+    OpenCV's pixel coordinates have their origin at the centre of the first pixel: its principal point is smaller by
+    half a pixel.
+
+    Parameters
+    ----------
+    camera
+        The camera.
+    k1
+        Radial distortion coefficient; see `seasonscapes.cameras.lens`.
+
+    Returns
+    -------
+    matrix
+        Camera matrix ``(3, 3)``.
+    distortion
+        Distortion coefficients ``(5,)``.
+    rvec, tvec
+        Rotation vector and translation ``(3,)`` of ``camera_from_world``.
     """
     matrix = np.array([[camera.fx, 0.0, camera.cx - 0.5], [0.0, camera.fy, camera.cy - 0.5], [0.0, 0.0, 1.0]])
     rotation = camera.world_from_camera[:3, :3].T
     return matrix, np.array([k1, 0.0, 0.0, 0.0, 0.0]), cv2.Rodrigues(rotation)[0].ravel(), -rotation @ camera.position_m
 
 
-def camera_from_opencv(size_px: tuple[int, int], matrix, distortion, rvec, tvec) -> tuple[Camera, float]:
-    """The camera and its ``k1``; `ValueError` where there is skew or any other distortion than ``k1``."""
-    matrix, distortion = np.asarray(matrix, float), np.atleast_1d(np.asarray(distortion, float).ravel())
-    if abs(matrix[0, 1]) > 1e-9 or np.any(distortion[1:]):
-        raise ValueError("camera_from_opencv: only k1 is supported; undistort the picture first")
+def camera_from_opencv(
+    size_px: tuple[int, int], matrix: ArrayLike, distortion: ArrayLike, rvec: ArrayLike, tvec: ArrayLike
+) -> tuple[Camera, float]:
+    """Convert OpenCV's camera parameters to a camera; the inverse of `opencv_from_camera`.
+
+    Parameters
+    ----------
+    size_px
+        Width and height of the image [px].
+    matrix
+        Camera matrix ``(3, 3)`` without skew.
+    distortion
+        Distortion coefficients, of which only ``k1`` may differ from 0.
+    rvec, tvec
+        Rotation vector and translation ``(3,)`` of ``camera_from_world``.
+
+    Returns
+    -------
+    camera
+        The camera, without local frame.
+    k1
+        Radial distortion coefficient.
+
+    Raises
+    ------
+    ValueError
+        Skew, or a distortion coefficient other than ``k1`` is not 0.
+    """
+    k, coefficients = np.asarray(matrix, float), np.atleast_1d(np.asarray(distortion, float).ravel())
+    if abs(k[0, 1]) > 1e-9 or np.any(coefficients[1:]):
+        raise ValueError("camera_from_opencv: only k1 is supported; undistort the image first")
     pose = np.eye(4)
     pose[:3, :3] = cv2.Rodrigues(np.asarray(rvec, float).reshape(3, 1))[0].T
     pose[:3, 3] = -pose[:3, :3] @ np.asarray(tvec, float).ravel()
-    camera = Camera(*size_px, matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5, pose)
-    return camera, float(distortion[0]) if len(distortion) else 0.0
+    camera = Camera(*size_px, k[0, 0], k[1, 1], k[0, 2] + 0.5, k[1, 2] + 0.5, pose)
+    return camera, float(coefficients[0]) if len(coefficients) else 0.0
 
 
 def write_opencv(path: Path, camera: Camera, k1: float = 0.0) -> None:
-    """Write one camera as the JSON that ``cv2.FileStorage`` would hold: matrix, distortion, rvec, tvec."""
+    """Write one camera as JSON with OpenCV's parameters: matrix, distortion, rvec, tvec.
+
+    Parameters
+    ----------
+    path
+        File to write.
+    camera
+        The camera.
+    k1
+        Radial distortion coefficient.
+    """
     matrix, distortion, rvec, tvec = opencv_from_camera(camera, k1)
     record = {
         "image_width": camera.width_px,
@@ -189,7 +315,25 @@ def write_opencv(path: Path, camera: Camera, k1: float = 0.0) -> None:
 
 
 def read_opencv(path: Path) -> tuple[Camera, float]:
-    """Read what `write_opencv` writes."""
+    """Read a camera from a file of `write_opencv`.
+
+    Parameters
+    ----------
+    path
+        File to read.
+
+    Returns
+    -------
+    camera
+        The camera, without local frame.
+    k1
+        Radial distortion coefficient.
+
+    Raises
+    ------
+    InputError
+        Invalid JSON or a missing key.
+    """
     record = read_json(path)
     try:
         return camera_from_opencv(
@@ -203,8 +347,24 @@ def read_opencv(path: Path) -> tuple[Camera, float]:
         raise InputError(path, f"key {error} is missing") from None
 
 
-def read_json(path: Path) -> dict:
-    """A JSON object; `InputError` where the file is missing or holds something else."""
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object.
+
+    Parameters
+    ----------
+    path
+        File to read, UTF-8 with or without byte order mark.
+
+    Returns
+    -------
+    dict
+        The object.
+
+    Raises
+    ------
+    InputError
+        The file is missing, is not valid JSON, or does not contain an object.
+    """
     try:
         table = json.loads(Path(path).read_text(encoding="utf-8-sig"))
     except FileNotFoundError:

@@ -1,7 +1,7 @@
-"""Timestamped pictures: the manifest that lists them, its checks, and one of them opened.
+"""Timestamped webcam images: manifest, consistency checks, and loading of single observations.
 
-The manifest is a CSV a person can read, one line a picture: ``webcam,time_utc,path,bytes,sha256``. It is read without
-opening a single picture, so that 85,000 of them take a second; what is wrong with some is reported, never fatal.
+The manifest is a CSV file with one line per image: ``webcam,time_utc,path,bytes,sha256``. It is read without opening
+image files (85,000 entries take a second); problems with single images are reported and not fatal.
 """
 
 from __future__ import annotations
@@ -21,33 +21,33 @@ import numpy as np
 from seasonscapes.cameras.panorama import Panorama
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.cameras.webcam import Webcam
-from seasonscapes.declaration import InputError
+from seasonscapes.errors import InputError, UnreadableImage
 from seasonscapes.images import atomic_path, read_image_linear
 
 COLUMNS = ("webcam", "time_utc", "path", "bytes", "sha256")
-# The folder layout of the reference repository; each name stands for one part of a path.
+# Folder layout of the reference repository, with placeholders for parts of the path.
 REFERENCE_LAYOUT = "{day}/{time}/360/{webcam}.jpg"
 _PARTS = {"day": r"\d{4}-\d{2}-\d{2}", "time": r"\d{2}[-:]\d{2}(?:[-:]\d{2})?", "webcam": r"[^/]+"}
 
 
 @dataclass(frozen=True)
 class Observation:
-    """A picture of the scene, ready for use.
+    """A scene-linear image of the scene with its camera and time.
 
     Parameters
     ----------
     image
         ``(H, W, 3)`` float32 scene-linear Rec.709.
     mask
-        ``(H, W)`` bool, True = usable.
+        ``(H, W)`` bool, True for usable pixels.
     camera
-        The calibrated view.
+        Calibrated camera or panorama.
     time
-        Aware, UTC.
+        Time of exposure, aware UTC.
     webcam
-        Id of the webcam it came from.
+        Id of the webcam.
     pose_sigma
-        Standard deviations of the pose by the names of a calibration record; missing ones count as exact.
+        Standard deviations of pose parameters, by the names of a calibration record; missing parameters are exact.
     """
 
     image: np.ndarray
@@ -61,13 +61,28 @@ class Observation:
         size = (self.camera.height_px, self.camera.width_px)
         if self.image.shape != (*size, 3) or self.mask.shape != size:
             raise ValueError(f"Observation: image {self.image.shape} and mask {self.mask.shape}, camera {size}")
-        if self.time.utcoffset() is None or self.time.utcoffset().total_seconds() != 0:
+        offset = self.time.utcoffset()
+        if offset is None or offset.total_seconds() != 0:
             raise ValueError(f"Observation: time {self.time} is not UTC")
 
 
 @dataclass(frozen=True, slots=True)
 class ManifestRow:
-    """One picture that exists somewhere: ``path`` relative to the manifest's folder; size and checksum when known."""
+    """One image of a manifest.
+
+    Parameters
+    ----------
+    webcam
+        Id of the webcam.
+    time
+        Time of exposure, aware UTC.
+    path
+        Image file, relative to the manifest's folder.
+    bytes
+        File size; ``None`` if unknown.
+    sha256
+        Hexadecimal SHA-256 checksum; empty if unknown.
+    """
 
     webcam: str
     time: datetime
@@ -78,10 +93,17 @@ class ManifestRow:
 
 @dataclass(frozen=True, slots=True)
 class PictureProblem:
-    """What is wrong with one picture.
+    """A problem with one image.
 
-    ``kind`` is one of: unreadable name, unknown webcam, ambiguous time, skipped time, missing, empty, truncated,
-    unreadable, wrong size, changed, duplicate time, duplicate picture.
+    Parameters
+    ----------
+    kind
+        One of: unreadable name, unknown webcam, ambiguous time, skipped time, missing, empty, truncated, unreadable,
+        wrong size, changed, duplicate time, duplicate picture.
+    path
+        Image file, relative to its folder.
+    detail
+        Description for the report.
     """
 
     kind: str
@@ -90,13 +112,25 @@ class PictureProblem:
 
 
 def utc_from_camera_clock(naive: datetime, time_zone: str) -> datetime:
-    """UTC of a camera's wall time.
+    """Convert the local time of a camera's clock to UTC.
+
+    Parameters
+    ----------
+    naive
+        Local time without offset.
+    time_zone
+        IANA name of the time zone.
+
+    Returns
+    -------
+    datetime.datetime
+        Aware UTC.
 
     Raises
     ------
     ValueError
-        ``"ambiguous …"`` in the hour that daylight saving repeats, ``"skipped …"`` in the one it leaves out: a guess
-        would put the sun 15° off.
+        ``"ambiguous …"`` in the hour that is repeated at the end of daylight saving time, ``"skipped …"`` in the hour
+        that is skipped at its start. An error of one hour would displace the sun by 15°.
     """
     zone = ZoneInfo(time_zone)
     early, late = (naive.replace(tzinfo=zone, fold=fold) for fold in (0, 1))
@@ -112,18 +146,31 @@ def utc_from_camera_clock(naive: datetime, time_zone: str) -> datetime:
 def scan_folder(
     folder: Path, webcams: Sequence[Webcam], *, layout: str = REFERENCE_LAYOUT
 ) -> tuple[list[ManifestRow], list[PictureProblem]]:
-    """List the pictures below a folder by their names alone; no picture is opened.
+    """List the images below a folder by their file names, without opening them.
 
     Parameters
     ----------
+    folder
+        Folder to scan recursively.
+    webcams
+        Known webcams, with their time zones.
     layout
-        Path pattern of ``{day}`` (2024-09-01), ``{time}`` (12-00-00, camera clock) and ``{webcam}``.
+        Path pattern with ``{day}`` (2024-09-01), ``{time}`` (12-00-00, camera clock) and ``{webcam}``.
 
     Returns
     -------
-    tuple
-        Rows in order of webcam and time, and problems: names that do not fit, unknown webcams, times that daylight
-        saving skips or repeats, two pictures of one webcam and instant.
+    rows
+        Images in order of webcam and time.
+    problems
+        File names that do not match the layout, unknown webcams, ambiguous or skipped local times, several images of
+        one webcam and instant.
+
+    Raises
+    ------
+    InputError
+        The folder does not exist.
+    ValueError
+        ``layout`` does not contain each placeholder once.
     """
     if not folder.is_dir():
         raise InputError(folder, "no such folder")
@@ -133,7 +180,8 @@ def scan_folder(
     if set(parts[1::2]) != set(_PARTS):
         raise ValueError(f"layout {layout!r} needs each of {{day}}, {{time}} and {{webcam}} once")
     suffix = Path(layout).suffix.lower()
-    rows, problems, resolved = [], [], {}
+    rows, problems = [], []
+    utc_of: dict[tuple[str, str, str], datetime | str] = {}
     for file in sorted(folder.rglob("*")):
         if file.suffix.lower() != suffix:
             continue
@@ -146,22 +194,21 @@ def scan_folder(
             problems.append(PictureProblem("unknown webcam", name, f"{match['webcam']} is not in the scene"))
             continue
         key = (match["day"], match["time"], zone_of[match["webcam"]])
-        if key not in resolved:
-            resolved[key] = _resolve(*key)
-        if isinstance(resolved[key], str):
-            kind = resolved[key].split(":")[0]
-            problems.append(
-                PictureProblem(
-                    {"ambiguous": "ambiguous time", "skipped": "skipped time"}.get(kind, kind), name, resolved[key]
-                )
-            )
+        if key not in utc_of:
+            utc_of[key] = _utc_or_problem(*key)
+        time = utc_of[key]
+        if isinstance(time, str):
+            kind = time.split(":")[0]
+            kind = {"ambiguous": "ambiguous time", "skipped": "skipped time"}.get(kind, kind)
+            problems.append(PictureProblem(kind, name, time))
             continue
-        rows.append(ManifestRow(match["webcam"], resolved[key], name, file.stat().st_size))
+        rows.append(ManifestRow(match["webcam"], time, name, file.stat().st_size))
     rows.sort(key=lambda row: (row.webcam, row.time, row.path))
     return rows, problems + duplicate_times(rows)
 
 
-def _resolve(day: str, time: str, zone: str) -> datetime | str:
+def _utc_or_problem(day: str, time: str, zone: str) -> datetime | str:
+    """UTC of a local time in a file name, or a description of the problem."""
     try:
         return utc_from_camera_clock(datetime.fromisoformat(f"{day}T{time.replace('-', ':')}"), zone)
     except ValueError as error:
@@ -170,8 +217,19 @@ def _resolve(day: str, time: str, zone: str) -> datetime | str:
 
 
 def duplicate_times(rows: Iterable[ManifestRow]) -> list[PictureProblem]:
-    """Rows that repeat an earlier row's webcam and instant."""
-    first: dict = {}
+    """Find rows that repeat the webcam and instant of an earlier row.
+
+    Parameters
+    ----------
+    rows
+        Rows of a manifest.
+
+    Returns
+    -------
+    list of PictureProblem
+        One problem of kind ``duplicate time`` per repeated row.
+    """
+    first: dict[tuple[str, datetime], ManifestRow] = {}
     problems = []
     for row in rows:
         other = first.setdefault((row.webcam, row.time), row)
@@ -181,7 +239,15 @@ def duplicate_times(rows: Iterable[ManifestRow]) -> list[PictureProblem]:
 
 
 def write_manifest(path: Path, rows: Iterable[ManifestRow]) -> None:
-    """Write the CSV, atomically; the inverse of `read_manifest`."""
+    """Write a manifest as CSV, atomically; the inverse of `read_manifest`.
+
+    Parameters
+    ----------
+    path
+        File to write.
+    rows
+        Rows in order.
+    """
     with atomic_path(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(COLUMNS)
@@ -191,25 +257,41 @@ def write_manifest(path: Path, rows: Iterable[ManifestRow]) -> None:
 
 
 def read_manifest(path: Path) -> list[ManifestRow]:
-    """Rows of a manifest; no picture is opened. `InputError` names the line that does not parse."""
+    """Read a manifest, without opening images.
+
+    Parameters
+    ----------
+    path
+        CSV file with the columns ``webcam``, ``time_utc``, ``path`` and optionally ``bytes``, ``sha256``.
+
+    Returns
+    -------
+    list of ManifestRow
+        Rows in the order of the file.
+
+    Raises
+    ------
+    InputError
+        The file is missing or not UTF-8, a column is missing, or a line is invalid.
+    """
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
             reader = csv.reader(file)
-            header = next(reader, None)
-            missing = [name for name in COLUMNS[:3] if name not in (header or [])]
+            header = next(reader, None) or []
+            missing = [name for name in COLUMNS[:3] if name not in header]
             if missing:
                 raise InputError(path, f"column {missing[0]!r} is missing", expected=",".join(COLUMNS))
-            place = [header.index(name) if name in header else None for name in COLUMNS]
-            return [_row(path, number, cells, place) for number, cells in enumerate(reader, 2) if cells]
+            columns = [header.index(name) if name in header else None for name in COLUMNS]
+            return [_row(path, number, cells, columns) for number, cells in enumerate(reader, 2) if cells]
     except FileNotFoundError:
         raise InputError(path, "no such file") from None
     except UnicodeDecodeError as error:
         raise InputError(path, f"not UTF-8 text: {error}") from None
 
 
-def _row(path: Path, number: int, cells: list[str], place: list[int | None]) -> ManifestRow:
+def _row(path: Path, number: int, cells: list[str], columns: list[int | None]) -> ManifestRow:
     try:
-        webcam, stamp, name, size, digest = ("" if index is None else cells[index].strip() for index in place)
+        webcam, stamp, name, size, digest = ("" if index is None else cells[index].strip() for index in columns)
         time = datetime.fromisoformat(stamp)
         if time.utcoffset() is None:
             raise ValueError(f"time_utc {stamp!r} has no offset")
@@ -223,10 +305,25 @@ def _row(path: Path, number: int, cells: list[str], place: list[int | None]) -> 
 def check_pictures(
     rows: Sequence[ManifestRow], folder: Path, webcams: Sequence[Webcam], *, decode: bool = False
 ) -> list[PictureProblem]:
-    """Look at the pictures' files: there, whole, of the webcam's size, and each a different one.
+    """Check image files for existence, completeness, size, checksum and duplicates.
 
-    Only headers and last bytes are read; equal contents are looked for among files of equal length. ``decode`` opens
-    every picture in full, which also finds damage in the middle.
+    Only headers and the last bytes are read, and checksums where the manifest has them or file sizes coincide.
+
+    Parameters
+    ----------
+    rows
+        Rows of a manifest.
+    folder
+        Folder that the paths are relative to.
+    webcams
+        Known webcams, with their image sizes.
+    decode
+        Whether to decode every image completely, which also detects damage in the middle of a file.
+
+    Returns
+    -------
+    list of PictureProblem
+        All problems found; at most one per file apart from duplicates.
     """
     size_of = {webcam.id: (webcam.width_px, webcam.height_px) for webcam in webcams}
     problems = duplicate_times(rows)
@@ -240,18 +337,21 @@ def check_pictures(
         except FileNotFoundError:
             problems.append(PictureProblem("missing", row.path, "no such file"))
             continue
-        fault = _fault(folder / row.path, row, length, size_of[row.webcam], decode)
-        if fault:
-            problems.append(PictureProblem(fault[0], row.path, fault[1]))
+        problem = _file_problem(folder / row.path, row, length, size_of[row.webcam], decode)
+        if problem:
+            problems.append(PictureProblem(problem[0], row.path, problem[1]))
         if length:
             by_length[length].append(row)
-    for same in by_length.values():
-        if len(same) > 1:
-            problems += _equal_contents(same, folder)
+    for candidates in by_length.values():
+        if len(candidates) > 1:
+            problems += _duplicate_contents(candidates, folder)
     return problems
 
 
-def _fault(file: Path, row: ManifestRow, length: int, size: tuple[int, int], decode: bool) -> tuple[str, str] | None:
+def _file_problem(
+    file: Path, row: ManifestRow, length: int, size: tuple[int, int], decode: bool
+) -> tuple[str, str] | None:
+    """Kind and description of the first problem of a file."""
     from PIL import Image
 
     if length == 0:
@@ -267,49 +367,84 @@ def _fault(file: Path, row: ManifestRow, length: int, size: tuple[int, int], dec
         stream.seek(max(0, length - 64))
         tail = stream.read()
     if (kind == "JPEG" and b"\xff\xd9" not in tail) or (kind == "PNG" and b"IEND" not in tail):
-        return "truncated", f"{length} bytes end without the {kind} end marker"
+        return "truncated", f"{length} bytes without the {kind} end marker"
     if found != size:
-        return "wrong size", f"{found[0]} x {found[1]} px, the webcam has {size[0]} x {size[1]}"
+        return "wrong size", f"{found[0]} x {found[1]} px; expected {size[0]} x {size[1]}"
     if row.bytes is not None and row.bytes != length:
-        return "changed", f"{length} bytes, the manifest says {row.bytes}"
+        return "changed", f"{length} bytes; expected {row.bytes} from the manifest"
     if row.sha256 and file_sha256(file) != row.sha256:
         return "changed", "the checksum differs from the manifest's"
     return None
 
 
-def _equal_contents(rows: Sequence[ManifestRow], folder: Path) -> list[PictureProblem]:
+def _duplicate_contents(rows: Sequence[ManifestRow], folder: Path) -> list[PictureProblem]:
     first: dict[str, str] = {}
     problems = []
     for row in rows:
         other = first.setdefault(file_sha256(folder / row.path), row.path)
         if other != row.path:
             problems.append(
-                PictureProblem("duplicate picture", row.path, f"same content as {other}: the camera stood still?")
+                PictureProblem(
+                    "duplicate picture", row.path, f"same content as {other}; the webcam may have been frozen"
+                )
             )
     return problems
 
 
 def file_sha256(path: Path) -> str:
-    """Hexadecimal SHA-256 of a file."""
+    """Compute the SHA-256 checksum of a file.
+
+    Parameters
+    ----------
+    path
+        File to read.
+
+    Returns
+    -------
+    str
+        Hexadecimal checksum.
+    """
     with open(path, "rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def open_observation(row: ManifestRow, folder: Path, camera: Camera | Panorama) -> Observation:
-    """Open one picture of a perspective view; `InputError` where it is missing, damaged or of another size."""
+    """Load the image of a manifest row as an observation with an all-true mask.
+
+    Parameters
+    ----------
+    row
+        Row of a manifest.
+    folder
+        Folder that the path is relative to.
+    camera
+        Calibrated camera or panorama of the webcam.
+
+    Returns
+    -------
+    Observation
+        The scene-linear image with camera and time.
+
+    Raises
+    ------
+    InputError
+        The file is missing, or its size differs from the camera's.
+    UnreadableImage
+        The file cannot be decoded.
+    """
     path = folder / row.path
     try:
         image = read_image_linear(path)
     except FileNotFoundError:
         raise InputError(path, "no such picture") from None
     except ValueError:
-        raise InputError(
-            path, "not a readable picture", cure="fetch it again, or take it out of the manifest"
+        raise UnreadableImage(
+            f"{path}: not a readable picture; download it again or remove it from the manifest"
         ) from None
     if image.shape[:2] != (camera.height_px, camera.width_px):
         raise InputError(
             path,
-            "the picture has another size than its camera",
+            "the image size differs from the camera's",
             got=f"{image.shape[1]} x {image.shape[0]}",
             expected=f"{camera.width_px} x {camera.height_px}",
         )

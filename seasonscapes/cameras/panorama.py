@@ -1,9 +1,9 @@
-"""Cylindrical and equirectangular panoramas as exact ray models, and the perspective views cut out of them.
+"""Cylindrical and equirectangular panorama models, and resampling of perspective views from panoramas.
 
-A rotating camera sweeps its columns evenly in azimuth. Its rows are linear in the *tangent* of elevation where a line
-sensor or stitched strips were used (cylindrical), and in elevation itself where the stitcher mapped to the sphere
-(equirectangular). Taking one for the other misses by up to 42 px of 2048 at 63° of vertical field. A tilted mount turns
-the rays, it does not shift rows; a horizon that is off the middle row of a level camera is `Panorama.cy`.
+The columns of a panorama are linear in azimuth. Its rows are linear in the *tangent* of elevation for line sensors and
+stitched strips (cylindrical), or in elevation for images stitched on a sphere (equirectangular). The two models differ
+by up to 42 px of 2048 at 63° of vertical field. A tilted mount rotates the rays and does not shift rows; the horizon
+row of a level camera is `Panorama.cy`.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 
 from seasonscapes.cameras.pinhole import Camera, ray_directions, rotation_from_angles
 from seasonscapes.frames import LocalFrame, geodetic_from_enu, local_axes
@@ -20,30 +21,30 @@ from seasonscapes.images import linear_from_srgb
 
 Projection = Literal["cylindrical", "equirectangular"]
 PROJECTIONS: tuple[Projection, ...] = ("cylindrical", "equirectangular")
-# Largest side that cv2.remap addresses (signed 16-bit).
+# Largest image side of cv2.remap (signed 16-bit coordinates).
 _REMAP_LIMIT = 32766
 
 
 @dataclass(frozen=True)
 class Panorama:
-    """A calibrated panorama: one pose and one projection for all the views that are cut out of it.
+    """A calibrated panorama with a single projection centre.
 
     Parameters
     ----------
     projection
         ``"cylindrical"``: ``row = cy - fy tan(elevation)``; ``"equirectangular"``: ``row = cy - fy elevation``.
-        Both: ``column = cx + fx azimuth``, angles [rad] about the panorama's own axis, azimuth from its heading.
+        Both: ``column = cx + fx azimuth``. Angles [rad] refer to the panorama's own axis and heading.
     width_px, height_px
         Image size; pixel centres lie at +0.5.
     fx, fy
         Pixels per radian of azimuth, and per unit of tangent (cylindrical) or radian (equirectangular) of elevation.
     cx, cy
-        Column that faces the heading and row of the panorama's own horizon [px].
+        Column of the heading and row of the panorama's own horizon [px].
     world_from_camera
-        Rigid transform ``(4, 4)``, OpenCV axes at the column ``cx``: x right, y down along the axis of rotation, z
-        forward. A level camera has y straight down.
+        Rigid transform ``(4, 4)`` with OpenCV axes at the column ``cx``: x right, y down along the axis of rotation, z
+        forward. The y axis of a level camera is vertical.
     frame
-        The local frame that ``world_from_camera`` refers to; ``None`` where it is not known. See `pinhole.view_in_frame`.
+        Local frame of ``world_from_camera``; ``None`` if unknown. See `pinhole.view_in_frame`.
     """
 
     projection: Projection
@@ -82,7 +83,7 @@ class Panorama:
 
     @property
     def full_circle(self) -> bool:
-        """Whether the last column meets the first (within two pixels)."""
+        """Whether the field of view is 360° within two pixels."""
         return abs(self.span_deg - 360.0) * self.width_px <= 2.0 * 360.0
 
 
@@ -96,10 +97,34 @@ def panorama_from_angles(
     horizon_row_px: float | None = None,
     frame: LocalFrame | None = None,
 ) -> Panorama:
-    """A panorama from its fields of view, its heading at the middle column.
+    """Create a panorama from its fields of view, with the heading at the middle column.
 
-    ``vertical_fov_deg`` is that of a lens centred on the horizon, as makers state it. `ValueError` outside (0, 360] and
-    (0, 180) degrees.
+    Parameters
+    ----------
+    projection
+        ``"cylindrical"`` or ``"equirectangular"``.
+    size_px
+        Width and height [px].
+    horizontal_fov_deg
+        Horizontal field of view [deg].
+    vertical_fov_deg
+        Vertical field of view of a lens centred on the horizon, as stated by manufacturers [deg].
+    pose
+        ``world_from_camera`` ``(4, 4)``.
+    horizon_row_px
+        Row of the horizon [px]; ``None`` for the middle row.
+    frame
+        Local frame of the pose.
+
+    Returns
+    -------
+    Panorama
+        The panorama.
+
+    Raises
+    ------
+    ValueError
+        Horizontal field of view outside (0°, 360°], or vertical outside (0°, 180°).
     """
     width, height = size_px
     if not 0.0 < horizontal_fov_deg <= 360.0:
@@ -114,7 +139,22 @@ def panorama_from_angles(
 
 
 def level_panorama(camera: Camera, frame: LocalFrame, size_px: tuple[int, int]) -> Panorama:
-    """A full circle about a camera's place: a cylinder with square pixels, level there, its middle column at the heading."""
+    """Create a full-circle cylindrical panorama at a camera's position, level and with the camera's heading.
+
+    Parameters
+    ----------
+    camera
+        Supplies position and heading (middle column).
+    frame
+        Local frame of the camera.
+    size_px
+        Width and height [px]; pixels are square.
+
+    Returns
+    -------
+    Panorama
+        The panorama.
+    """
     latitude, longitude, _ = geodetic_from_enu(frame, camera.position_m)
     axes = local_axes(frame, float(latitude), float(longitude))
     east, north, _ = axes @ camera.world_from_camera[:3, 2]
@@ -125,18 +165,43 @@ def level_panorama(camera: Camera, frame: LocalFrame, size_px: tuple[int, int]) 
     return Panorama("cylindrical", width, height, focal, focal, 0.5 * width, 0.5 * height, pose, frame)
 
 
-def project_panorama(panorama: Panorama, position_m) -> tuple[np.ndarray, np.ndarray]:
-    """Pixel coordinates ``(..., 2)`` and distance ``(...)`` [m] of world points ``(..., 3)``.
+def project_panorama(panorama: Panorama, position_m: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Project world points to the panorama.
 
-    Columns of a full circle lie in [0, width). Otherwise they continue beyond the edges on both sides, up to the
-    direction opposite to the middle column. A point at the camera itself gets NaN.
+    Parameters
+    ----------
+    panorama
+        The panorama.
+    position_m
+        World points ``(..., 3)`` [m].
+
+    Returns
+    -------
+    pixel
+        Pixel coordinates ``(..., 2)`` (x, y). Columns of a full circle lie in [0, width); otherwise they extend beyond
+        both edges up to the direction opposite to the middle column. NaN for the projection centre.
+    distance
+        Distance from the projection centre ``(...)`` [m].
     """
     pose = panorama.world_from_camera
     return project_local(panorama, (np.asarray(position_m, float) - pose[:3, 3]) @ pose[:3, :3])
 
 
 def project_local(panorama: Panorama, local_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """As `project_panorama`, for points ``(..., 3)`` in camera axes."""
+    """Project points given in camera axes; see `project_panorama`.
+
+    Parameters
+    ----------
+    panorama
+        The panorama.
+    local_m
+        Points ``(..., 3)`` in camera axes [m].
+
+    Returns
+    -------
+    pixel, distance
+        As in `project_panorama`.
+    """
     x, y, z = np.moveaxis(np.asarray(local_m, float), -1, 0)
     horizontal, distance = np.hypot(x, z), np.sqrt(x * x + y * y + z * z)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -148,8 +213,21 @@ def project_local(panorama: Panorama, local_m: np.ndarray) -> tuple[np.ndarray, 
     return np.where((distance > 0)[..., None], pixel, np.nan), distance
 
 
-def panorama_directions(panorama: Panorama, pixel=None) -> np.ndarray:
-    """Unit world directions ``(..., 3)`` of pixels ``(..., 2)`` (x, y); of all pixel centres when left out."""
+def panorama_directions(panorama: Panorama, pixel: ArrayLike | None = None) -> np.ndarray:
+    """Compute the world directions of pixels of a panorama.
+
+    Parameters
+    ----------
+    panorama
+        The panorama.
+    pixel
+        Pixel coordinates ``(..., 2)`` (x, y); ``None`` for all pixel centres ``(H, W, 2)``.
+
+    Returns
+    -------
+    numpy.ndarray
+        Unit vectors ``(..., 3)``.
+    """
     if pixel is None:
         x, y = np.meshgrid(np.arange(panorama.width_px) + 0.5, np.arange(panorama.height_px) + 0.5)
     else:
@@ -161,8 +239,21 @@ def panorama_directions(panorama: Panorama, pixel=None) -> np.ndarray:
     return local @ panorama.world_from_camera[:3, :3].T
 
 
-def view_directions(view: Camera | Panorama, pixel=None) -> np.ndarray:
-    """Unit world directions ``(..., 3)`` of pixels ``(..., 2)`` (x, y) of either kind of view; see `panorama_directions`."""
+def view_directions(view: Camera | Panorama, pixel: ArrayLike | None = None) -> np.ndarray:
+    """Compute the world directions of pixels of a camera or panorama.
+
+    Parameters
+    ----------
+    view
+        Camera or panorama.
+    pixel
+        Pixel coordinates ``(..., 2)`` (x, y); ``None`` for all pixel centres ``(H, W, 2)``.
+
+    Returns
+    -------
+    numpy.ndarray
+        Unit vectors ``(..., 3)``.
+    """
     return panorama_directions(view, pixel) if isinstance(view, Panorama) else ray_directions(view, pixel)
 
 
@@ -174,21 +265,28 @@ def split_panorama(
     size_px: tuple[int, int] | None = None,
     count: int | None = None,
 ) -> list[Camera]:
-    """Perspective views that cover a panorama, evenly spread, sharing its position and axis.
+    """Create evenly spaced perspective cameras that cover a panorama, with its position and vertical axis.
 
-    The views look along the panorama's own horizon with square pixels. Their principal point is moved up or down, as
-    with a shift lens, so that the panorama's rows fill the frame and what is vertical stays so.
+    The optical axes lie on the panorama's horizon; pixels are square. The principal point is shifted vertically, as
+    with a shift lens, so that the panorama's rows fill the image and vertical lines remain vertical.
 
     Parameters
     ----------
+    panorama
+        The panorama to cover.
     fov_deg
-        Horizontal field of view of each [deg]; a partial panorama that is narrower gets a single view of its own span.
+        Horizontal field of view of each camera [deg]; a narrower partial panorama gets one camera of its own span.
     overlap_deg
-        Least overlap of neighbours [deg].
+        Least overlap of neighbouring cameras [deg].
     size_px
-        Width and height; left out, the panorama's height and the width that keeps its resolution on the axis.
+        Width and height [px]; ``None`` for the panorama's height and the width of equal resolution on the optical axis.
     count
-        Number of views; left out, as few as the overlap allows.
+        Number of cameras; ``None`` for the smallest number with the given overlap.
+
+    Returns
+    -------
+    list of Camera
+        Cameras in order of increasing azimuth, in the panorama's local frame.
 
     Raises
     ------
@@ -224,10 +322,10 @@ def split_panorama(
     cameras = []
     for azimuth in np.radians(azimuth_deg):
         pose = panorama.world_from_camera.copy()
-        turn = np.array(
+        rotation = np.array(
             [[np.cos(azimuth), 0.0, np.sin(azimuth)], [0.0, 1.0, 0.0], [-np.sin(azimuth), 0.0, np.cos(azimuth)]]
         )
-        pose[:3, :3] = pose[:3, :3] @ turn
+        pose[:3, :3] = pose[:3, :3] @ rotation
         centre_row = height / 2.0 + focal * tangent.mean()
         cameras.append(Camera(width, height, focal, focal, width / 2.0, centre_row, pose, panorama.frame))
     return cameras
@@ -236,26 +334,36 @@ def split_panorama(
 def cut_view(
     image: np.ndarray, panorama: Panorama, camera: Camera, *, supersample: int | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Resample one perspective view out of a panorama, anti-aliased and in linear light.
+    """Resample a perspective view from a panorama, with anti-aliasing in linear light.
 
-    Every output pixel is the mean of ``supersample²`` bicubic samples; left out, enough to meet every source pixel
-    under it. Light adds up, encoded sRGB does not: bytes are linearised first.
+    Every output pixel is the mean of ``supersample²`` bicubic samples.
 
     Parameters
     ----------
     image
-        ``(H, W, 3)`` scene-linear float, or uint8 sRGB.
+        ``(H, W, 3)`` scene-linear float, or uint8 sRGB, which is linearised first.
+    panorama
+        Model of the image.
     camera
-        Any view from the panorama's position (parallax is not modelled).
+        Any camera at the panorama's position (parallax is not modelled).
+    supersample
+        Samples per pixel along each axis; ``None`` for at least the panorama's resolution on the optical axis.
 
     Returns
     -------
-    tuple
-        Linear view ``(h, w, 3)`` float32 and ``(h, w)`` bool, False where the panorama does not reach.
+    view
+        Scene-linear image ``(h, w, 3)`` float32.
+    inside
+        ``(h, w)`` bool, False outside the panorama.
+
+    Raises
+    ------
+    ValueError
+        The image size differs from the model's, or the source region exceeds the size limit of ``cv2.remap``.
     """
     if image.shape[:2] != (panorama.height_px, panorama.width_px):
         raise ValueError(
-            f"cut_view: the picture is {image.shape[1]} x {image.shape[0]} px, the panorama model "
+            f"cut_view: the image is {image.shape[1]} x {image.shape[0]} px, the panorama model "
             f"{panorama.width_px} x {panorama.height_px}"
         )
     if supersample is None:
@@ -264,7 +372,7 @@ def cut_view(
     x = (np.arange(width * supersample) + 0.5) / supersample
     column_row = _source_coordinates(panorama, camera, x, (np.arange(height * supersample) + 0.5) / supersample)
     source, offset = _crop_linear(image, panorama, column_row[..., 0])
-    # cv2 counts from pixel centres.
+    # cv2's pixel coordinates have their origin at the centre of the first pixel.
     map_x = (column_row[..., 0] - offset - 0.5).astype(np.float32)
     map_y = (column_row[..., 1] - 0.5).astype(np.float32)
     sampled = cv2.remap(source, map_x, map_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
@@ -273,11 +381,11 @@ def cut_view(
         inside &= (column_row[..., 0] >= 0.0) & (column_row[..., 0] <= panorama.width_px)
     shape = (height, supersample, width, supersample)
     view = np.maximum(sampled, 0.0).reshape(*shape, 3).mean(axis=(1, 3), dtype=np.float32)
-    return view, inside.reshape(shape).all(axis=(1, 3))
+    return view, np.all(inside.reshape(shape), axis=(1, 3))
 
 
 def _source_coordinates(panorama: Panorama, camera: Camera, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Panorama pixels ``(len(y), len(x), 2)`` behind a grid of view pixels; columns unwrapped, so they never jump."""
+    """Panorama pixels ``(len(y), len(x), 2)`` of a grid of view pixels, with unwrapped (continuous) columns."""
     direction = ray_directions(camera, np.stack(np.meshgrid(x, y), axis=-1))
     pixel, _ = project_local(panorama, direction @ panorama.world_from_camera[:3, :3])
     circle = 2.0 * np.pi * panorama.fx
@@ -286,14 +394,16 @@ def _source_coordinates(panorama: Panorama, camera: Camera, x: np.ndarray, y: np
 
 
 def _crop_linear(image: np.ndarray, panorama: Panorama, column: np.ndarray) -> tuple[np.ndarray, int]:
-    """The columns of the panorama that are needed, wrapped where it closes, linear float32; the first one's index."""
+    """Range of required columns, wrapped around for full circles, as linear float32; and index of the first column."""
     first, last = int(np.floor(column.min())) - 4, int(np.ceil(column.max())) + 4
     if panorama.full_circle:
         columns = np.mod(np.arange(first, last), panorama.width_px)
     else:
         columns = np.clip(np.arange(first, last), 0, panorama.width_px - 1)
     if max(len(columns), image.shape[0]) > _REMAP_LIMIT:
-        raise ValueError(f"cut_view: {len(columns)} x {image.shape[0]} px at once is over the limit of {_REMAP_LIMIT}")
+        raise ValueError(
+            f"cut_view: {len(columns)} x {image.shape[0]} px exceed the limit of {_REMAP_LIMIT} px of cv2.remap"
+        )
     crop = image[:, columns]
     if crop.dtype == np.uint8:
         crop = linear_from_srgb(np.arange(256, dtype=np.float32) / 255.0)[crop]

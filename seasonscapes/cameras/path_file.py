@@ -1,14 +1,15 @@
-"""Paths on disk: views by GPS, height and angles in one JSON file, and the reference repository's own files.
+"""Camera path files: views by WGS 84 position, height and angles in JSON, and the reference repository's files.
 
-A path says nothing of a frame: the same file serves every scene file of its place.
+Paths are independent of a local frame, so that one file can be used with every scene file of the same region.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,34 +22,86 @@ from seasonscapes.frames import LocalFrame, angles_from_direction, enu_from_geod
 from seasonscapes.images import atomic_path
 
 KIND = "seasonscapes path"
-_LENS = ("fx", "fy", "cx", "cy")
-_PLACE = ("latitude_deg", "longitude_deg", "height_m", "heading_deg", "pitch_deg", "roll_deg")
+_INTRINSICS = ("fx", "fy", "cx", "cy")
+_POSE = ("latitude_deg", "longitude_deg", "height_m", "heading_deg", "pitch_deg", "roll_deg")
 
 
 def view_record(camera: Camera, frame: LocalFrame) -> dict[str, float]:
-    """A camera as plain numbers: WGS 84 place, angles against true north and the horizon there, lens in pixels."""
+    """Convert a camera to a frame-independent record.
+
+    Parameters
+    ----------
+    camera
+        The camera.
+    frame
+        Local frame of its pose.
+
+    Returns
+    -------
+    dict
+        WGS 84 latitude and longitude [deg], height [m], heading, pitch and roll against true north and the horizon at
+        the camera [deg], and intrinsics [px].
+    """
     latitude, longitude, height = (float(value) for value in geodetic_from_enu(frame, camera.position_m))
     rotation = local_axes(frame, latitude, longitude) @ camera.world_from_camera[:3, :3]
     heading, pitch = (float(value) for value in angles_from_direction(rotation[:, 2]))
     roll = float(np.degrees(roll_of(rotation)))
     if np.hypot(*rotation[:2, 2]) < 1e-6:
-        # Straight up or down only the side still tells where the camera is turned.
+        # For vertical optical axes, heading and roll are degenerate: the heading follows from the image's x axis.
         heading, roll = float(np.degrees(np.arctan2(-rotation[1, 0], rotation[0, 0]))) % 360.0, 0.0
     numbers = (latitude, longitude, height, heading, pitch, roll)
-    return dict(zip(_PLACE, numbers, strict=True)) | {name: float(getattr(camera, name)) for name in _LENS}
+    return dict(zip(_POSE, numbers, strict=True)) | {name: float(getattr(camera, name)) for name in _INTRINSICS}
 
 
-def camera_of(record: dict, frame: LocalFrame, size_px: tuple[int, int]) -> Camera:
-    """The camera of a `view_record`; `KeyError`, `TypeError` or `ValueError` where it is none."""
-    latitude, longitude, height, heading, pitch, roll = (float(record[name]) for name in _PLACE)
+def camera_of(record: Mapping[str, float], frame: LocalFrame, size_px: tuple[int, int]) -> Camera:
+    """Create a camera from a record; the inverse of `view_record`.
+
+    Parameters
+    ----------
+    record
+        A record of `view_record`.
+    frame
+        Local frame of the camera.
+    size_px
+        Width and height [px].
+
+    Returns
+    -------
+    Camera
+        The camera.
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError
+        A missing, non-numeric or invalid entry.
+    """
+    latitude, longitude, height, heading, pitch, roll = (float(record[name]) for name in _POSE)
     pose = np.eye(4)
     pose[:3, :3] = local_axes(frame, latitude, longitude).T @ rotation_from_angles(heading, pitch, roll)
     pose[:3, 3] = enu_from_geodetic(frame, latitude, longitude, height)
-    return Camera(*size_px, *(float(record[name]) for name in _LENS), pose, frame)
+    fx, fy, cx, cy = (float(record[name]) for name in _INTRINSICS)
+    return Camera(*size_px, fx, fy, cx, cy, pose, frame)
 
 
-def save_path(path: Path, cameras: Sequence[Camera], frame: LocalFrame, *, note: dict | None = None) -> None:
-    """Write cameras of one size, in order, atomically; ``note`` holds plain values for people."""
+def save_path(path: Path, cameras: Sequence[Camera], frame: LocalFrame, *, note: dict[str, Any] | None = None) -> None:
+    """Write a camera path to a JSON file, atomically.
+
+    Parameters
+    ----------
+    path
+        File to write.
+    cameras
+        Views in order, all of the same image size.
+    frame
+        Local frame of the views.
+    note
+        JSON-serialisable metadata for human readers.
+
+    Raises
+    ------
+    ValueError
+        The views differ in size.
+    """
     sizes = {(camera.width_px, camera.height_px) for camera in cameras}
     if len(sizes) != 1:
         raise ValueError(f"save_path: views of {len(sizes)} sizes, expected one")
@@ -59,27 +112,58 @@ def save_path(path: Path, cameras: Sequence[Camera], frame: LocalFrame, *, note:
 
 
 def load_path(path: Path, frame: LocalFrame) -> list[Camera]:
-    """The cameras of a path file; `InputError` where it is none."""
+    """Read a camera path from a file of `save_path`.
+
+    Parameters
+    ----------
+    path
+        File to read.
+    frame
+        Local frame of the cameras.
+
+    Returns
+    -------
+    list of Camera
+        Views in order.
+
+    Raises
+    ------
+    InputError
+        The file is missing, is not a camera path, or has no views.
+    """
     table = read_json(path)
     if table.get("kind") != KIND:
         raise InputError(
             path,
-            "is no path",
+            "is not a camera path file",
             expected=f'"kind": "{KIND}"',
-            cure="make one with `seasonscapes path`, which reads the reference's files too",
+            cure="create one with `seasonscapes path`, which also reads the reference's files",
         )
     try:
         size = int(table["size_px"][0]), int(table["size_px"][1])
         cameras = [camera_of(record, frame, size) for record in table["views"]]
     except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise InputError(path, f"not a path: {error!r}") from None
+        raise InputError(path, f"not a valid camera path: {error!r}") from None
     if not cameras:
-        raise InputError(path, "holds no view")
+        raise InputError(path, "the camera path has no views")
     return cameras
 
 
 def resize_camera(camera: Camera, size_px: tuple[int, int]) -> Camera:
-    """The same view in a picture of another size; its field of view stays, pixels may change shape."""
+    """Change the image size of a camera at constant field of view; the pixel aspect ratio may change.
+
+    Parameters
+    ----------
+    camera
+        The camera.
+    size_px
+        New width and height [px].
+
+    Returns
+    -------
+    Camera
+        The camera with scaled intrinsics.
+    """
     x, y = size_px[0] / camera.width_px, size_px[1] / camera.height_px
     return replace(
         camera,
@@ -99,9 +183,9 @@ class ReferencePath:
     Parameters
     ----------
     cameras
-        Its waypoints in their order, or all views of a file that holds them all.
+        Waypoints in order, or all views if the file is already interpolated.
     count
-        Views that it asks for; ``None`` where ``cameras`` are the views.
+        Number of views to interpolate; ``None`` if ``cameras`` are the views.
     curve
         ``spline`` or ``linear``.
     """
@@ -112,18 +196,37 @@ class ReferencePath:
 
 
 def read_reference_path(path: Path, frame: LocalFrame, *, kind: Kind = "refined") -> ReferencePath:
-    """Waypoints (with their ``meta``) or views of the reference's trajectory files; see `read_reference_poses`.
+    """Read a trajectory file of the reference repository: waypoints with ``meta``, or interpolated views.
 
-    Its own interpolation repeats the view at every joint of linear paths and takes each pair of waypoints for equally
-    far apart; ours keeps its number of views and evens out the speed.
+    The reference's interpolation repeats the view at each waypoint of linear paths and uses the same number of views
+    between all waypoints; `cameras_along_path` keeps the total number of views at constant speed.
+
+    Parameters
+    ----------
+    path
+        File to read.
+    frame
+        Local frame of the cameras.
+    kind
+        As in `read_reference_poses`.
+
+    Returns
+    -------
+    ReferencePath
+        Waypoints or views, number of views and type of curve.
+
+    Raises
+    ------
+    InputError
+        As `read_reference_poses`; invalid ``meta``.
     """
     views = {view.name: view.camera for view in read_reference_poses(path, frame, kind=kind)}
     meta = read_json(path).get("meta")
     if meta is None:
         return ReferencePath(list(views.values()), None, "linear")
     try:
-        names, wanted = list(meta["waypoints"]), meta["nbr_points"]
-        count = int(wanted) if isinstance(wanted, int) else sum(int(number) for number in wanted)
+        names, number = list(meta["waypoints"]), meta["nbr_points"]
+        count = int(number) if isinstance(number, int) else sum(int(part) for part in number)
         curve = {"smooth": "spline", "linear": "linear"}[meta["interpolation"]]
         cameras = [views[name] for name in names]
     except (KeyError, TypeError, ValueError) as error:

@@ -1,35 +1,46 @@
-"""The pinhole camera: intrinsics in pixels, a metric pose, projection and rays."""
+"""Pinhole camera model: intrinsics in pixels, metric pose, projection and ray directions."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, TypeVar
+from dataclasses import Field, dataclass, replace
+from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from seasonscapes.errors import FrameMismatch
 from seasonscapes.frames import LocalFrame, enu_from_geodetic, geodetic_from_enu, local_axes
 
-if TYPE_CHECKING:
-    from seasonscapes.cameras.panorama import Panorama
 
-View = TypeVar("View", "Camera", "Panorama")
+class _Posed(Protocol):
+    """A dataclass with a pose in a local frame: `Camera` or `Panorama`."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+    @property
+    def world_from_camera(self) -> np.ndarray: ...
+
+    @property
+    def frame(self) -> LocalFrame | None: ...
+
+
+View = TypeVar("View", bound=_Posed)
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A calibrated pinhole view.
+    """A calibrated pinhole camera.
 
     Parameters
     ----------
     width_px, height_px
-        Image size. Pixel centres lie at +0.5; row 0 is on top.
+        Image size [px]. Pixel centres lie at +0.5; row 0 is on top.
     fx, fy, cx, cy
         Focal lengths and principal point [px].
     world_from_camera
         Rigid transform ``(4, 4)`` float64 with OpenCV axes: x right, y down, z forward. World is east-north-up [m].
     frame
-        The local frame that ``world_from_camera`` refers to; ``None`` where it is not known. See `view_in_frame`.
+        Local frame of ``world_from_camera``; ``None`` if unknown. See `view_in_frame`.
     """
 
     width_px: int
@@ -59,14 +70,14 @@ class Camera:
 
 
 def pose_in_frame(world_from_camera: np.ndarray, own: LocalFrame, other: LocalFrame) -> np.ndarray:
-    """Express a pose in another local frame: same geodetic position, same angles to its own horizon.
+    """Transform a pose to another local frame: same geodetic position, same angles to the horizon at the camera.
 
     Parameters
     ----------
     world_from_camera
         Rigid transform ``(4, 4)`` in the frame ``own``.
     own, other
-        The frame it is in, and the frame it is wanted in.
+        Source and target frame.
 
     Returns
     -------
@@ -75,19 +86,31 @@ def pose_in_frame(world_from_camera: np.ndarray, own: LocalFrame, other: LocalFr
     """
     latitude, longitude, height = (float(v) for v in geodetic_from_enu(own, world_from_camera[:3, 3]))
     pose = np.eye(4)
-    turn = local_axes(other, latitude, longitude).T @ local_axes(own, latitude, longitude)
-    pose[:3, :3] = turn @ world_from_camera[:3, :3]
+    rotation = local_axes(other, latitude, longitude).T @ local_axes(own, latitude, longitude)
+    pose[:3, :3] = rotation @ world_from_camera[:3, :3]
     pose[:3, 3] = enu_from_geodetic(other, latitude, longitude, height)
     return pose
 
 
 def view_in_frame(view: View, frame: LocalFrame) -> View:
-    """The same camera or panorama with its pose expressed in ``frame``.
+    """Return a camera or panorama with its pose transformed to another local frame.
+
+    Parameters
+    ----------
+    view
+        `Camera` or `Panorama` with ``frame``.
+    frame
+        Target frame.
+
+    Returns
+    -------
+    Camera or Panorama
+        The view in ``frame``; the same object if it is already in ``frame``.
 
     Raises
     ------
     FrameMismatch
-        Where the view does not state the frame of its pose.
+        The view does not state the frame of its pose.
 
     Examples
     --------
@@ -111,7 +134,7 @@ def view_in_frame(view: View, frame: LocalFrame) -> View:
 
 
 def rotation_from_angles(heading_deg: float, pitch_deg: float, roll_deg: float = 0.0) -> np.ndarray:
-    """``world_from_camera`` rotation ``(3, 3)`` with OpenCV axes.
+    """Compute the ``world_from_camera`` rotation of a camera with OpenCV axes.
 
     Parameters
     ----------
@@ -120,7 +143,12 @@ def rotation_from_angles(heading_deg: float, pitch_deg: float, roll_deg: float =
     pitch_deg
         Elevation of the optical axis, up positive [deg].
     roll_deg
-        Turn about the optical axis; positive lowers the right-hand side of the camera [deg].
+        Rotation about the optical axis; positive lowers the right-hand side of the camera [deg].
+
+    Returns
+    -------
+    numpy.ndarray
+        Rotation ``(3, 3)``.
     """
     heading, pitch, roll = np.radians([heading_deg, pitch_deg, roll_deg])
     forward = np.array([np.sin(heading) * np.cos(pitch), np.cos(heading) * np.cos(pitch), np.sin(pitch)])
@@ -142,10 +170,14 @@ def camera_at(
     fov_deg: float = 60.0,
     size_px: tuple[int, int] = (1536, 1024),
 ) -> Camera:
-    """A camera with square pixels and a centred principal point at a WGS 84 place.
+    """Create a camera with square pixels and a centred principal point at a WGS 84 position.
 
     Parameters
     ----------
+    frame
+        Local frame of the pose.
+    latitude_deg, longitude_deg
+        Position of the projection centre [deg].
     height_m
         Height of the projection centre in the scene's vertical datum [m].
     heading_deg, pitch_deg, roll_deg
@@ -154,6 +186,16 @@ def camera_at(
         Horizontal field of view [deg].
     size_px
         Width and height [px].
+
+    Returns
+    -------
+    Camera
+        The camera, with ``frame``.
+
+    Raises
+    ------
+    ValueError
+        Field of view outside (0°, 180°).
     """
     if not 0.0 < fov_deg < 180.0:
         raise ValueError(f"fov_deg: got {fov_deg}, expected 0 < fov < 180")
@@ -167,10 +209,22 @@ def camera_at(
     return Camera(width, height, focal, focal, width / 2.0, height / 2.0, pose, frame)
 
 
-def project(camera: Camera, position_m) -> tuple[np.ndarray, np.ndarray]:
-    """Pixel coordinates ``(..., 2)`` and depth along the optical axis ``(...)`` [m] of world points ``(..., 3)``.
+def project(camera: Camera, position_m: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Project world points to the image.
 
-    Points at or behind the camera plane get NaN pixels.
+    Parameters
+    ----------
+    camera
+        The camera.
+    position_m
+        World points ``(..., 3)`` [m].
+
+    Returns
+    -------
+    pixel
+        Pixel coordinates ``(..., 2)`` (x, y); NaN for points at or behind the camera plane.
+    depth
+        Depth along the optical axis ``(...)`` [m].
     """
     pose = camera.world_from_camera
     local = (np.asarray(position_m, float) - pose[:3, 3]) @ pose[:3, :3]
@@ -181,8 +235,21 @@ def project(camera: Camera, position_m) -> tuple[np.ndarray, np.ndarray]:
     return pixel, depth
 
 
-def ray_directions(camera: Camera, pixel=None) -> np.ndarray:
-    """Unit world directions of pixels ``(..., 2)`` (x, y) as ``(..., 3)``; of all pixel centres when left out."""
+def ray_directions(camera: Camera, pixel: ArrayLike | None = None) -> np.ndarray:
+    """Compute the world directions of pixels.
+
+    Parameters
+    ----------
+    camera
+        The camera.
+    pixel
+        Pixel coordinates ``(..., 2)`` (x, y); ``None`` for all pixel centres ``(H, W, 2)``.
+
+    Returns
+    -------
+    numpy.ndarray
+        Unit vectors ``(..., 3)``.
+    """
     if pixel is None:
         x, y = np.meshgrid(np.arange(camera.width_px) + 0.5, np.arange(camera.height_px) + 0.5)
     else:

@@ -1,7 +1,7 @@
-"""Paths of cameras through waypoints: at constant speed, smooth, clear of the ground.
+"""Camera paths through waypoints: arc-length parametrised curves, ground clearance, interpolation of rotations.
 
-A `Curve` is a position as a function of arc length. Cubic splines are twice continuously differentiable in their own
-parameter (chord lengths, de Boor 1978) and so is their arc-length form, as long as the curve never stops.
+A `Curve` gives the position as a function of arc length. Cubic splines with chord-length knots (de Boor 1978) are twice
+continuously differentiable, and so is their arc-length parametrisation wherever the derivative does not vanish.
 """
 
 from __future__ import annotations
@@ -9,64 +9,92 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from seasonscapes.cameras.pinhole import Camera
+from seasonscapes.errors import InvalidPath
+
+if TYPE_CHECKING:
+    from scipy.interpolate import PPoly
 
 CURVES = ("spline", "linear")
 TURNS = ("smooth", "slerp")
-# Height of the ground ``(N,)`` in local up [m] at places ``(N, 2)`` east, north [m]; NaN where it is not known.
+# Terrain height ``(N,)`` (local up) [m] at positions ``(N, 2)`` east, north [m]; NaN outside the terrain.
 Ground = Callable[[np.ndarray], np.ndarray]
 
-_PIECES = 64  # of each segment, for arc length
+_PIECES = 64  # quadrature intervals per segment for arc length
 _GAUSS_X, _GAUSS_W = np.polynomial.legendre.leggauss(5)
-# The ground is looked at this often along the curve, and this far to either side of it.
-_PROBE_M, _MOST_PROBES = 5.0, 40_000
-_CLEAR_ROUNDS = 6
+# Spacing of the clearance samples along the curve [m], their largest number, and the largest number of lifts.
+_SAMPLE_M, _MAX_SAMPLES = 5.0, 40_000
+_MAX_LIFTS = 6
 
 
 @dataclass(frozen=True)
 class Curve:
-    """A path in space by arc length.
+    """A space curve with arc-length parametrisation.
 
     Parameters
     ----------
     base
-        Piecewise polynomial of the parameter, ``(..., 3)`` ENU [m].
+        Piecewise polynomial of the curve parameter, ``(..., 3)`` east-north-up [m].
     lift
         Piecewise polynomial that is added to the heights [m], or ``None``.
     knots
-        Parameters ``(K,)`` of the waypoints.
+        Parameter values ``(K,)`` of the waypoints.
     table
-        Parameter and arc length ``(2, M)`` at the ends of small pieces.
+        Parameter values and arc lengths ``(2, M)`` at the ends of the quadrature intervals.
     """
 
-    base: Any
-    lift: Any
+    base: PPoly
+    lift: PPoly | None
     knots: np.ndarray
     table: np.ndarray
 
     @property
     def length_m(self) -> float:
-        """From end to end [m]."""
+        """Total arc length [m]."""
         return float(self.table[1, -1])
 
     @property
     def waypoints_at_m(self) -> np.ndarray:
-        """Arc length ``(K,)`` of the waypoints [m]."""
+        """Arc lengths ``(K,)`` of the waypoints [m]."""
         return np.interp(self.knots, *self.table)
 
     def at_parameter(self, u: np.ndarray, order: int = 0) -> np.ndarray:
-        """Position, or its derivative of an order, ``(N, 3)`` by the parameter."""
-        place = np.array(self.base(u, order), float)
+        """Evaluate the position or a derivative with respect to the curve parameter.
+
+        Parameters
+        ----------
+        u
+            Parameter values ``(N,)``.
+        order
+            Order of the derivative; 0 for the position.
+
+        Returns
+        -------
+        numpy.ndarray
+            ``(N, 3)`` east-north-up.
+        """
+        value = np.array(self.base(u, order), float)
         if self.lift is not None:
-            place[..., 2] += self.lift(u, order)
-        return place
+            value[..., 2] += self.lift(u, order)
+        return value
 
     def parameter(self, s_m: np.ndarray) -> np.ndarray:
-        """The parameter ``(N,)`` at arc lengths [m], by bisection's start and Newton's steps."""
+        """Compute the curve parameter at given arc lengths by Newton's method.
+
+        Parameters
+        ----------
+        s_m
+            Arc lengths ``(N,)`` [m]; clipped to the curve.
+
+        Returns
+        -------
+        numpy.ndarray
+            Parameter values ``(N,)``.
+        """
         u_table, s_table = self.table
         s_m = np.clip(np.asarray(s_m, float), 0.0, s_table[-1])
         piece = np.clip(np.searchsorted(s_table, s_m, side="right") - 1, 0, len(s_table) - 2)
@@ -74,16 +102,40 @@ class Curve:
         u = low + (s_m - s_table[piece]) / (s_table[piece + 1] - s_table[piece]) * (high - low)
         for _ in range(4):
             speed = np.linalg.norm(self.at_parameter(u, 1), axis=-1)
-            apart = s_table[piece] + _lengths(self.at_parameter, low, u) - s_m
-            u = np.clip(u - apart / np.maximum(speed, 1e-12), low, high)
+            residual = s_table[piece] + _arc_lengths(self.at_parameter, low, u) - s_m
+            u = np.clip(u - residual / np.maximum(speed, 1e-12), low, high)
         return u
 
     def position(self, s_m: np.ndarray) -> np.ndarray:
-        """Position ``(N, 3)`` ENU [m] at arc lengths ``(N,)`` [m]."""
+        """Evaluate the position at given arc lengths.
+
+        Parameters
+        ----------
+        s_m
+            Arc lengths ``(N,)`` [m]; clipped to the curve.
+
+        Returns
+        -------
+        numpy.ndarray
+            Positions ``(N, 3)`` east-north-up [m].
+        """
         return self.at_parameter(self.parameter(s_m))
 
     def derivatives(self, s_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Unit tangent and curvature vector [1/m], ``(N, 3)`` each: first and second derivatives by arc length."""
+        """Evaluate the first and second derivatives with respect to arc length.
+
+        Parameters
+        ----------
+        s_m
+            Arc lengths ``(N,)`` [m]; clipped to the curve.
+
+        Returns
+        -------
+        tangent
+            Unit tangents ``(N, 3)``.
+        curvature
+            Curvature vectors ``(N, 3)`` [1/m].
+        """
         u = self.parameter(s_m)
         first, second = self.at_parameter(u, 1), self.at_parameter(u, 2)
         square = np.sum(first**2, axis=-1, keepdims=True)
@@ -91,98 +143,138 @@ class Curve:
         return first / np.sqrt(square), (second - first * along / square) / square
 
 
-def _lengths(at: Callable, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Arc lengths ``(N,)`` between parameters that lie in one piece."""
+def _arc_lengths(evaluate: Callable[[np.ndarray, int], np.ndarray], low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Arc lengths ``(N,)`` between parameters of one quadrature interval (Gauss–Legendre, 5 points)."""
     half, middle = 0.5 * (high - low), 0.5 * (high + low)
-    speed = np.linalg.norm(at((middle[:, None] + half[:, None] * _GAUSS_X).ravel(), 1), axis=-1)
+    speed = np.linalg.norm(evaluate((middle[:, None] + half[:, None] * _GAUSS_X).ravel(), 1), axis=-1)
     return half * (speed.reshape(-1, len(_GAUSS_X)) @ _GAUSS_W)
 
 
 def curve_through(positions_m: np.ndarray, *, curve: str = "spline", closed: bool = False) -> Curve:
-    """A curve through waypoints ``(K, 3)`` ENU [m].
+    """Interpolate waypoints by a curve.
 
     Parameters
     ----------
+    positions_m
+        Waypoints ``(K, 3)`` east-north-up [m].
     curve
-        ``spline`` (cubic, natural ends) or ``linear``.
+        ``spline`` (cubic with natural end conditions) or ``linear``.
     closed
-        Return to the first waypoint; without a corner there, for a spline.
+        Whether the curve returns to the first waypoint; splines are then periodic.
+
+    Returns
+    -------
+    Curve
+        The curve with its table of arc lengths.
 
     Raises
     ------
+    InvalidPath
+        Fewer than two waypoints, or two consecutive waypoints at the same position.
     ValueError
-        Fewer than two waypoints, or two in a row at one place: a path must move on.
+        Unknown ``curve``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from seasonscapes.cameras.trajectory import curve_through
+    >>> round(curve_through(np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0]]), curve="linear").length_m, 6)
+    5.0
     """
     from scipy.interpolate import CubicSpline, PPoly
 
     if curve not in CURVES:
         raise ValueError(f"curve: got {curve!r}, expected one of {', '.join(CURVES)}")
-    places = np.asarray(positions_m, float)
-    if closed and not np.allclose(places[0], places[-1]):
-        places = np.vstack([places, places[:1]])
-    chords = np.linalg.norm(np.diff(places, axis=0), axis=1)
-    if len(places) < 2 or chords.min() < 1e-3:
-        raise ValueError("a path needs at least two waypoints, and no two in a row at the same place")
+    positions = np.asarray(positions_m, float)
+    if closed and not np.allclose(positions[0], positions[-1]):
+        positions = np.vstack([positions, positions[:1]])
+    chords = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    if len(positions) < 2 or chords.min() < 1e-3:
+        raise InvalidPath("a path needs at least two waypoints, and no two in a row at the same place")
     knots = np.concatenate([[0.0], np.cumsum(chords)])
     if curve == "linear":
-        base = PPoly(np.stack([np.diff(places, axis=0) / chords[:, None], places[:-1]]), knots)
+        base = PPoly(np.stack([np.diff(positions, axis=0) / chords[:, None], positions[:-1]]), knots)
     else:
-        places = np.vstack([places[:-1], places[:1]]) if closed else places
-        base = CubicSpline(knots, places, bc_type="periodic" if closed else "natural")
-    return _measured(base, None, knots)
+        positions = np.vstack([positions[:-1], positions[:1]]) if closed else positions
+        base = CubicSpline(knots, positions, bc_type="periodic" if closed else "natural")
+    return _with_arc_lengths(base, None, knots)
 
 
-def _measured(base: Any, lift: Any, knots: np.ndarray) -> Curve:
-    """A curve with its table of arc lengths."""
+def _with_arc_lengths(base: PPoly, lift: PPoly | None, knots: np.ndarray) -> Curve:
+    """Curve with its table of arc lengths."""
     cuts = [knots] if lift is None else [knots, lift.x]
     ends = np.unique(np.concatenate([*cuts, *(np.linspace(a, b, _PIECES + 1) for a, b in pairwise(knots))]))
-    bare = Curve(base, lift, knots, np.zeros((2, 2)))
-    lengths = _lengths(bare.at_parameter, ends[:-1], ends[1:])
+    curve = Curve(base, lift, knots, np.zeros((2, 2)))
+    lengths = _arc_lengths(curve.at_parameter, ends[:-1], ends[1:])
     return Curve(base, lift, knots, np.stack([ends, np.concatenate([[0.0], np.cumsum(lengths)])]))
 
 
 def lift_above_ground(curve: Curve, ground: Ground, clearance_m: float) -> tuple[Curve, float]:
-    """The same curve lifted, smoothly, where it comes nearer to the ground than a clearance.
+    """Raise a curve smoothly where its clearance above the terrain is too small.
 
     Parameters
     ----------
+    curve
+        The curve.
+    ground
+        Terrain height as a function of position.
     clearance_m
-        Least height above the highest ground within so many metres to any side.
+        Least height above the highest terrain within a horizontal distance of ``clearance_m`` [m].
 
     Returns
     -------
     curve
-        As smooth as it was: what is added to the heights is a cubic spline.
+        The curve with a cubic spline added to its heights; waypoints may be raised, too.
     lift_m
-        The most that was added; 0 leaves the curve as it was. Waypoints near such a place are lifted with it.
+        Upper bound of the added height [m]; 0 if the curve is unchanged.
+
+    Raises
+    ------
+    InvalidPath
+        The clearance was not reached within the largest number of iterations.
     """
     from scipy.interpolate import CubicSpline
     from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
-    most = 0.0
-    count = int(np.clip(curve.length_m / _PROBE_M, 200, _MOST_PROBES))
-    # Wide enough that the lift is a gentle climb rather than a jump.
+    total_lift_m = 0.0
+    count = int(np.clip(curve.length_m / _SAMPLE_M, 200, _MAX_SAMPLES))
+    # The width of the filters limits the slope of the added height.
     reach = max(4, int(np.ceil(max(8.0 * clearance_m, 100.0) / curve.length_m * count)))
-    for _ in range(_CLEAR_ROUNDS):
+    for _ in range(_MAX_LIFTS):
         u = curve.parameter(np.linspace(0.0, curve.length_m, count))
         missing = clearance_m - height_above_ground(curve.at_parameter(u), ground, clearance_m)
         missing = np.where(np.isfinite(missing), missing, -np.inf)
         if missing.max() <= 0.0:
             break
-        # Half a metre more, for what lies between two probes.
-        wanted = np.where(missing > -0.5, missing + 0.5, 0.0)
-        wide = maximum_filter1d(np.maximum(wanted, 0.0), 2 * reach + 1, mode="nearest")
-        more = gaussian_filter1d(wide, reach / 3.0, mode="nearest", truncate=3.0)
-        most += float(more.max())
-        total = more if curve.lift is None else more + curve.lift(u)
-        curve = _measured(curve.base, CubicSpline(u, total, bc_type="natural"), curve.knots)
+        # A margin of half a metre covers the terrain between samples.
+        required = np.where(missing > -0.5, missing + 0.5, 0.0)
+        widened = maximum_filter1d(np.maximum(required, 0.0), 2 * reach + 1, mode="nearest")
+        added = gaussian_filter1d(widened, reach / 3.0, mode="nearest", truncate=3.0)
+        total_lift_m += float(added.max())
+        total = added if curve.lift is None else added + curve.lift(u)
+        curve = _with_arc_lengths(curve.base, CubicSpline(u, total, bc_type="natural"), curve.knots)
     else:
-        raise ValueError(f"the path could not be kept {clearance_m:g} m above the ground")
-    return curve, most
+        raise InvalidPath(f"the path could not be kept {clearance_m:g} m above the ground; move its waypoints upwards")
+    return curve, total_lift_m
 
 
 def height_above_ground(positions_m: np.ndarray, ground: Ground, around_m: float) -> np.ndarray:
-    """Height ``(N,)`` [m] of places ``(N, 3)`` above the highest ground within ``around_m`` of them; NaN off the land."""
+    """Compute the height above the highest terrain within a horizontal radius, sampled at 17 points.
+
+    Parameters
+    ----------
+    positions_m
+        Positions ``(N, 3)`` east-north-up [m].
+    ground
+        Terrain height as a function of position.
+    around_m
+        Radius [m].
+
+    Returns
+    -------
+    numpy.ndarray
+        Heights ``(N,)`` [m]; NaN outside the terrain.
+    """
     angle = np.arange(8) * (np.pi / 4.0)
     ring = around_m * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     offsets = np.vstack([np.zeros((1, 2)), 0.5 * ring, ring])
@@ -202,42 +294,52 @@ def cameras_along_path(
     closed: bool = False,
     clear_of: tuple[Ground, float] | None = None,
 ) -> list[Camera]:
-    """Cameras along a path through waypoints, evenly spaced: exactly so many, none of them twice.
+    """Interpolate cameras between waypoints, equally spaced in arc length.
 
     Parameters
     ----------
     waypoints
-        Their poses are passed through, their lenses blended; pictures have the size of the first one's.
+        Cameras whose poses are interpolated exactly. Intrinsics are interpolated linearly; images have the size of the
+        first waypoint's.
     count
-        Number of views, at least 2; a closed path does not come back to its first view.
+        Number of cameras, at least 2; a closed path does not repeat its first camera.
     curve
-        See `curve_through`.
+        Type of curve; see `curve_through`.
     turn
-        ``smooth`` (rotation spline, angular velocity and acceleration are continuous) or ``slerp`` (constant turns from
-        waypoint to waypoint). Roll is blended by itself, so that a level horizon stays level.
+        ``smooth`` (rotation spline with continuous angular velocity and acceleration) or ``slerp`` (constant angular
+        velocity between waypoints). Roll is interpolated separately, so that a level horizon remains level.
     look_at_m
-        ``(3,)`` ENU: look at this place all the way instead.
+        Position ``(3,)`` east-north-up [m] that all cameras are directed to, instead of interpolated rotations.
+    closed
+        Whether the path returns to the first waypoint.
     clear_of
-        The ground and a least clearance [m]; see `lift_above_ground`.
+        Terrain height as a function of position, and least clearance [m]; see `lift_above_ground`.
+
+    Returns
+    -------
+    list of Camera
+        ``count`` cameras.
 
     Raises
     ------
+    InvalidPath
+        As `curve_through` and `lift_above_ground`; ``look_at_m`` lies on the path or vertically above or below it.
     ValueError
-        As `curve_through`; a look-at place straight above, below or on the path.
+        ``count`` below 2, or unknown ``curve`` or ``turn``.
     """
     if count < 2:
         raise ValueError(f"count: got {count}, a path has at least 2 views")
     if turn not in TURNS:
         raise ValueError(f"turn: got {turn!r}, expected one of {', '.join(TURNS)}")
     waypoints = [*waypoints, waypoints[0]] if closed else list(waypoints)
-    line = curve_through(np.array([each.position_m for each in waypoints]), curve=curve, closed=closed)
+    path = curve_through(np.array([camera.position_m for camera in waypoints]), curve=curve, closed=closed)
     if clear_of is not None:
-        line, _ = lift_above_ground(line, *clear_of)
-    return views_along(line, waypoints, count, turn=turn, look_at_m=look_at_m, closed=closed)
+        path, _ = lift_above_ground(path, *clear_of)
+    return views_along(path, waypoints, count, turn=turn, look_at_m=look_at_m, closed=closed)
 
 
 def views_along(
-    line: Curve,
+    path: Curve,
     waypoints: Sequence[Camera],
     count: int,
     *,
@@ -245,57 +347,93 @@ def views_along(
     look_at_m: np.ndarray | None = None,
     closed: bool = False,
 ) -> list[Camera]:
-    """The views of `cameras_along_path`, on a curve that was made before (its knots are the waypoints)."""
-    s_m = np.linspace(0.0, line.length_m, count, endpoint=not closed)
-    places = line.position(s_m)
+    """Interpolate cameras along a given curve; see `cameras_along_path`.
+
+    Parameters
+    ----------
+    path
+        Curve whose knots are the waypoints.
+    waypoints, count, turn, look_at_m, closed
+        As in `cameras_along_path`; for closed paths the first waypoint is repeated at the end of ``waypoints``.
+
+    Returns
+    -------
+    list of Camera
+        ``count`` cameras.
+
+    Raises
+    ------
+    InvalidPath
+        ``look_at_m`` lies on the path or vertically above or below it.
+    """
+    s_m = np.linspace(0.0, path.length_m, count, endpoint=not closed)
+    positions = path.position(s_m)
     if look_at_m is not None:
-        rotations = _looking_at(places, np.asarray(look_at_m, float))
+        rotations = _look_at_rotations(positions, np.asarray(look_at_m, float))
     else:
-        known, at_m = [each.world_from_camera[:3, :3] for each in waypoints], line.waypoints_at_m
+        known, at_m = [camera.world_from_camera[:3, :3] for camera in waypoints], path.waypoints_at_m
         if closed:
-            # Once more before and after, so that the turning is as smooth where the ends meet.
-            at_m = np.concatenate([at_m[:-1] - line.length_m, at_m, at_m[1:] + line.length_m])
+            # Periodic continuation by one period on both sides keeps the rotation smooth at the joint.
+            at_m = np.concatenate([at_m[:-1] - path.length_m, at_m, at_m[1:] + path.length_m])
             known = [*known[:-1], *known, *known[1:]]
-        rotations = _turned(at_m, known, s_m, turn)
-    lenses = np.array([(each.fx, each.fy, each.cx, each.cy) for each in waypoints], float)
-    size = np.array([(each.width_px, each.height_px) for each in waypoints], float)
-    # Lenses in pictures of the first one's size.
+        rotations = _interpolated_rotations(at_m, known, s_m, turn)
+    known_intrinsics = np.array([(camera.fx, camera.fy, camera.cx, camera.cy) for camera in waypoints], float)
+    size = np.array([(camera.width_px, camera.height_px) for camera in waypoints], float)
+    # Scale the intrinsics to the image size of the first waypoint.
     scale = size[0] / size
-    lenses *= scale[:, [0, 1, 0, 1]]
-    lens = np.stack([np.interp(s_m, line.waypoints_at_m, column) for column in lenses.T], axis=1)
+    known_intrinsics *= scale[:, [0, 1, 0, 1]]
+    intrinsics = np.stack([np.interp(s_m, path.waypoints_at_m, column) for column in known_intrinsics.T], axis=1)
     views = []
-    for place, rotation, (fx, fy, cx, cy) in zip(places, rotations, lens, strict=True):
+    for position, rotation, (fx, fy, cx, cy) in zip(positions, rotations, intrinsics, strict=True):
         pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotation, place
+        pose[:3, :3], pose[:3, 3] = rotation, position
         views.append(
             replace(waypoints[0], fx=float(fx), fy=float(fy), cx=float(cx), cy=float(cy), world_from_camera=pose)
         )
     return views
 
 
-def _turned(at_m: np.ndarray, rotations: Sequence[np.ndarray], s_m: np.ndarray, turn: str) -> np.ndarray:
-    """World-from-camera rotations ``(N, 3, 3)`` blended between those of the waypoints."""
+def _interpolated_rotations(
+    at_m: np.ndarray, rotations: Sequence[np.ndarray], s_m: np.ndarray, turn: str
+) -> np.ndarray:
+    """``world_from_camera`` rotations ``(N, 3, 3)`` interpolated between those of the waypoints."""
     from scipy.spatial.transform import Rotation, RotationSpline, Slerp
 
     known = Rotation.from_matrix(np.array(rotations))
     if turn == "smooth" and len(rotations) > 2:
-        blended = RotationSpline(at_m, known)(s_m).as_matrix()
+        interpolated = RotationSpline(at_m, known)(s_m).as_matrix()
     else:
-        blended = Slerp(at_m, known)(np.clip(s_m, at_m[0], at_m[-1])).as_matrix()
-    roll = np.interp(s_m, at_m, np.unwrap([roll_of(each) for each in rotations]))
-    return np.array([_levelled(each[:, 2], angle, each) for each, angle in zip(blended, roll, strict=True)])
+        interpolated = Slerp(at_m, known)(np.clip(s_m, at_m[0], at_m[-1])).as_matrix()
+    roll = np.interp(s_m, at_m, np.unwrap([roll_of(rotation) for rotation in rotations]))
+    return np.array(
+        [
+            _rotation_from_roll(rotation[:, 2], angle, rotation)
+            for rotation, angle in zip(interpolated, roll, strict=True)
+        ]
+    )
 
 
 def roll_of(rotation: np.ndarray) -> float:
-    """Turn of a camera about its axis against the horizon [rad], positive lowers the right-hand side; 0 straight down."""
+    """Compute the roll of a camera against the horizon.
+
+    Parameters
+    ----------
+    rotation
+        ``world_from_camera`` rotation ``(3, 3)``.
+
+    Returns
+    -------
+    float
+        Roll [rad], positive if the right-hand side is lower; 0 for vertical optical axes.
+    """
     across = np.cross(rotation[:, 2], [0.0, 0.0, 1.0])
     if np.linalg.norm(across) < 1e-6:
         return 0.0
     return float(np.arctan2(-rotation[2, 0], -rotation[2, 1]))
 
 
-def _levelled(forward: np.ndarray, roll: float, fallback: np.ndarray) -> np.ndarray:
-    """Rotation that looks along a direction with a roll [rad]."""
+def _rotation_from_roll(forward: np.ndarray, roll: float, fallback: np.ndarray) -> np.ndarray:
+    """Rotation with a given optical axis and roll [rad]; ``fallback`` for vertical axes."""
     right = np.cross(forward, [0.0, 0.0, 1.0])
     norm = np.linalg.norm(right)
     if norm < 1e-6:
@@ -307,10 +445,10 @@ def _levelled(forward: np.ndarray, roll: float, fallback: np.ndarray) -> np.ndar
     )
 
 
-def _looking_at(places: np.ndarray, target: np.ndarray) -> np.ndarray:
-    offset = target - places
+def _look_at_rotations(positions: np.ndarray, target: np.ndarray) -> np.ndarray:
+    offset = target - positions
     distance = np.linalg.norm(offset, axis=1)
     flat = np.hypot(offset[:, 0], offset[:, 1])
     if (distance < 1e-3).any() or (flat < 1e-6 * distance).any():
-        raise ValueError("look_at: the path passes through the place, or straight above or below it")
-    return np.array([_levelled(each, 0.0, np.eye(3)) for each in offset / distance[:, None]])
+        raise InvalidPath("look_at: the path passes through the target, or vertically above or below it")
+    return np.array([_rotation_from_roll(forward, 0.0, np.eye(3)) for forward in offset / distance[:, None]])

@@ -1,8 +1,8 @@
-"""A webcam's facts: where it stands, how its picture maps to directions, and which clock it keeps.
+"""Declarations of webcams in scene files (position, projection, orientation, clock), checks and an overview map.
 
-Two tilts are kept apart because they do different things. ``lens_tilt_deg`` is what makers state: a lens pitched on a
-level axis of rotation, which lifts the middle row by the same angle all round and so moves the horizon off it.
-``tilt_deg`` and ``roll_deg`` lean the axis itself and turn the rays.
+Two kinds of tilt are distinguished. ``lens_tilt_deg``, as stated by manufacturers, is the pitch of the lens on a level
+axis of rotation: it shifts the horizon from the middle row by the same angle in all directions. ``tilt_deg`` and
+``roll_deg`` tilt the axis of rotation itself and rotate the rays.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import numpy as np
@@ -23,8 +23,39 @@ from seasonscapes.frames import LocalFrame, enu_from_geodetic, local_axes
 
 
 class Webcam(Declaration):
-    """One camera of a scene file. Exactly one of each pair is given: ``height_m`` or ``above_ground_m``,
-    ``north_column_px`` or ``heading_deg``."""
+    """Declaration of one webcam in a scene file.
+
+    Exactly one of each pair is given: ``height_m`` or ``above_ground_m``, ``north_column_px`` or ``heading_deg``.
+
+    Parameters
+    ----------
+    id, name
+        Identifier, and name for human readers.
+    latitude_deg, longitude_deg
+        WGS 84 position [deg].
+    height_m, above_ground_m
+        Height in ``vertical_datum`` or above the terrain [m].
+    vertical_datum
+        Vertical datum of ``height_m``.
+    position_sigma_m
+        Standard deviation of the position [m].
+    projection
+        ``cylindrical``, ``equirectangular`` or ``perspective``.
+    width_px, height_px
+        Image size [px].
+    horizontal_fov_deg, vertical_fov_deg
+        Fields of view [deg]; ``vertical_fov_deg`` is required for panoramas.
+    north_column_px, heading_deg
+        Column that is directed to true north [px], or azimuth of the middle column [deg].
+    lens_tilt_deg
+        Pitch of the lens on a level axis of rotation [deg].
+    tilt_deg, roll_deg
+        Pitch and roll of the axis of rotation, or of a perspective camera [deg].
+    radial_k1
+        Radial distortion coefficient of a perspective camera; see `seasonscapes.cameras.lens`.
+    time_zone
+        IANA name of the time zone of the camera's clock.
+    """
 
     id: str = Field(min_length=1, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
     name: str = ""
@@ -57,7 +88,7 @@ class Webcam(Declaration):
         return value
 
     @model_validator(mode="after")
-    def _one_of_each(self):
+    def _one_of_each(self) -> Self:
         if (self.height_m is None) == (self.above_ground_m is None):
             raise ValueError(f"webcam {self.id}: give exactly one of height_m and above_ground_m")
         if (self.north_column_px is None) == (self.heading_deg is None):
@@ -71,76 +102,139 @@ class Webcam(Declaration):
 
 
 class WebcamFile(Declaration):
-    """A file of nothing but ``[[webcam]]`` tables."""
+    """A TOML file of ``[[webcam]]`` tables."""
 
     webcam: list[Webcam] = Field(min_length=1)
 
     @model_validator(mode="after")
-    def _unique(self):
-        seen: set[str] = set()
+    def _unique(self) -> Self:
+        ids: set[str] = set()
         for webcam in self.webcam:
-            if webcam.id in seen:
-                raise ValueError(f"two webcams are called {webcam.id}")
-            seen.add(webcam.id)
+            if webcam.id in ids:
+                raise ValueError(f"two webcams have the id {webcam.id}")
+            ids.add(webcam.id)
         return self
 
 
 def read_webcams(path: Path) -> tuple[Webcam, ...]:
-    """The ``[[webcam]]`` tables of a TOML file; `InputError` in one line for the first thing that is wrong.
+    """Read and validate the ``[[webcam]]`` tables of a TOML file.
 
-    The file may be a scene file: its other tables are `seasonscapes.scene`'s to judge.
+    Parameters
+    ----------
+    path
+        A file of webcams, or a scene file, whose other tables are ignored here.
+
+    Returns
+    -------
+    tuple of Webcam
+        Webcams in the order of the file.
+
+    Raises
+    ------
+    InputError
+        The file is missing, or an entry is invalid; the message describes the first problem.
     """
     tables = {key: value for key, value in read_toml(path).items() if key == "webcam"}
     return tuple(validate(tables, WebcamFile, where=path).webcam)
 
 
 def find_webcam(webcams: Sequence[Webcam], webcam_id: str) -> Webcam:
-    """The webcam of that id; `InputError` that suggests the nearest known one."""
+    """Find a webcam by its id.
+
+    Parameters
+    ----------
+    webcams
+        Known webcams.
+    webcam_id
+        Id to find.
+
+    Returns
+    -------
+    Webcam
+        The webcam.
+
+    Raises
+    ------
+    InputError
+        Unknown id; the message suggests the most similar one.
+    """
     import difflib
 
     known = {webcam.id: webcam for webcam in webcams}
     if webcam_id in known:
         return known[webcam_id]
-    close = difflib.get_close_matches(webcam_id, known, n=1, cutoff=0.4)
+    similar = difflib.get_close_matches(webcam_id, known, n=1, cutoff=0.4)
     raise InputError(
         "--webcam",
         "no such webcam",
         got=webcam_id,
-        cure=f"did you mean '{close[0]}'?" if close else f"known: {', '.join(sorted(known))}",
+        cure=f"did you mean '{similar[0]}'?" if similar else f"known: {', '.join(sorted(known))}",
     )
 
 
 def webcam_heading_deg(webcam: Webcam) -> float:
-    """Azimuth of the middle column [deg], from the heading or from the column that faces north."""
+    """Compute the azimuth of the middle column from ``heading_deg`` or ``north_column_px``.
+
+    Parameters
+    ----------
+    webcam
+        The webcam.
+
+    Returns
+    -------
+    float
+        Azimuth in [0, 360) [deg].
+    """
     if webcam.heading_deg is not None:
         return webcam.heading_deg % 360.0
+    assert webcam.north_column_px is not None  # checked by the validator
     return (0.5 * webcam.width_px - webcam.north_column_px) * webcam.horizontal_fov_deg / webcam.width_px % 360.0
 
 
 def webcam_model(webcam: Webcam, frame: LocalFrame, *, ground_m: float | None = None) -> Panorama | Camera:
-    """The uncalibrated camera that a webcam's facts describe.
+    """Create the uncalibrated camera model of a webcam.
 
-    ``ground_m`` is the height of the terrain under it, needed where its height is stated above ground (`ValueError`).
-    A perspective camera comes as its ideal pinhole; ``radial_k1`` goes to `seasonscapes.cameras.lens`.
+    Parameters
+    ----------
+    webcam
+        The webcam.
+    frame
+        Local frame of the model.
+    ground_m
+        Height of the terrain at the webcam [m]; required if the webcam's height is given above ground.
+
+    Returns
+    -------
+    Panorama or Camera
+        The model; a perspective camera without its radial distortion (see `seasonscapes.cameras.lens`).
+
+    Raises
+    ------
+    ValueError
+        ``ground_m`` is required and missing.
     """
     height = webcam.height_m
     if height is None:
         if ground_m is None:
-            raise ValueError(f"webcam {webcam.id} stands above_ground_m = {webcam.above_ground_m}: ground_m is needed")
+            raise ValueError(
+                f"webcam {webcam.id}: height given as above_ground_m = {webcam.above_ground_m}; ground_m is needed"
+            )
+        assert webcam.above_ground_m is not None  # checked by the validator
         height = ground_m + webcam.above_ground_m
-    panoramic = webcam.projection != "perspective"
-    pitch = webcam.tilt_deg if panoramic else webcam.tilt_deg + webcam.lens_tilt_deg
+    perspective = webcam.projection == "perspective"
+    pitch = webcam.tilt_deg + webcam.lens_tilt_deg if perspective else webcam.tilt_deg
     pose = np.eye(4)
     pose[:3, :3] = local_axes(frame, webcam.latitude_deg, webcam.longitude_deg).T @ rotation_from_angles(
         webcam_heading_deg(webcam), pitch, webcam.roll_deg
     )
     pose[:3, 3] = enu_from_geodetic(frame, webcam.latitude_deg, webcam.longitude_deg, height)
     width, rows = webcam.width_px, webcam.height_px
-    if not panoramic:
+    if webcam.projection == "perspective":
         fx = 0.5 * width / np.tan(np.radians(webcam.horizontal_fov_deg) / 2.0)
         fov = webcam.vertical_fov_deg
         fy = fx if fov is None else 0.5 * rows / np.tan(np.radians(fov) / 2.0)
         return Camera(width, rows, fx, fy, 0.5 * width, 0.5 * rows, pose, frame)
+    assert webcam.vertical_fov_deg is not None  # checked by the validator
     level = panorama_from_angles(
         webcam.projection,
         (width, rows),
@@ -156,7 +250,19 @@ def webcam_model(webcam: Webcam, frame: LocalFrame, *, ground_m: float | None = 
 
 @dataclass(frozen=True)
 class HeightCheck:
-    """A webcam's height against the terrain: ``above_ground_m`` is NaN outside it; ``verdict`` is for people."""
+    """Result of the height check of one webcam.
+
+    Parameters
+    ----------
+    webcam_id
+        Id of the webcam.
+    above_ground_m
+        Height above the terrain [m]; NaN outside the terrain.
+    plausible
+        Whether the height is within the tolerances.
+    verdict
+        Description for human readers.
+    """
 
     webcam_id: str
     above_ground_m: float
@@ -167,13 +273,28 @@ class HeightCheck:
 def check_heights(
     webcams: Sequence[Webcam], ground_m: Sequence[float], *, mast_m: float = 60.0, terrain_error_m: float = 10.0
 ) -> list[HeightCheck]:
-    """Compare stated heights with the terrain under each camera, ``ground_m`` ``(N,)`` [m] in the same datum.
+    """Compare the stated heights of webcams with the terrain.
 
-    A camera is plausible from ``terrain_error_m`` below the (smoothed) terrain up to ``mast_m`` above it.
+    Parameters
+    ----------
+    webcams
+        N webcams.
+    ground_m
+        Height of the terrain at each webcam, ``(N,)`` in the same vertical datum [m]; NaN outside the terrain.
+    mast_m
+        Largest plausible height above the terrain [m].
+    terrain_error_m
+        Largest plausible depth below the (smoothed) terrain [m].
+
+    Returns
+    -------
+    list of HeightCheck
+        One result per webcam.
     """
     checks = []
     for webcam, ground in zip(webcams, ground_m, strict=True):
         above = webcam.above_ground_m if webcam.height_m is None else webcam.height_m - float(ground)
+        assert above is not None  # checked by the validator
         if not np.isfinite(ground):
             verdict, plausible = "outside the terrain", False
         elif above < -terrain_error_m:
@@ -187,53 +308,67 @@ def check_heights(
 
 
 def draw_webcam_map(webcams: Sequence[Webcam], *, width_px: int = 1200, reach_m: float = 3000.0) -> np.ndarray:
-    """A plan ``(H, W, 3)`` uint8 sRGB of where the webcams stand and what they cover, north up.
+    """Draw a north-up map of webcam positions and horizontal fields of view, with scale bar and ids.
 
-    A wedge of ``reach_m`` shows each field of view; its bold line is the heading of the middle column. Circles all
-    round are full panoramas. A scale bar and the ids are drawn in.
+    A sector shows each field of view (a full circle for 360° panoramas); a bold line shows the heading of the middle
+    column.
+
+    Parameters
+    ----------
+    webcams
+        Webcams to draw.
+    width_px
+        Width of the map [px].
+    reach_m
+        Radius of the sectors [m].
+
+    Returns
+    -------
+    numpy.ndarray
+        Map ``(H, W, 3)`` uint8 sRGB.
     """
     import cv2
 
     middle = LocalFrame(
         float(np.mean([w.latitude_deg for w in webcams])), float(np.mean([w.longitude_deg for w in webcams]))
     )
-    plan = np.array([enu_from_geodetic(middle, w.latitude_deg, w.longitude_deg, 0.0)[:2] for w in webcams])
-    low, high = plan.min(0) - 2.0 * reach_m, plan.max(0) + 2.0 * reach_m
+    positions = np.array([enu_from_geodetic(middle, w.latitude_deg, w.longitude_deg, 0.0)[:2] for w in webcams])
+    low, high = positions.min(0) - 2.0 * reach_m, positions.max(0) + 2.0 * reach_m
     scale = width_px / (high[0] - low[0])
     picture = np.full((int(np.ceil((high[1] - low[1]) * scale)), width_px, 3), 250, np.uint8)
 
-    def at(point_m):
-        return tuple(round(v) for v in ((point_m[0] - low[0]) * scale, (high[1] - point_m[1]) * scale))
+    def pixel(point_m: Sequence[float] | np.ndarray) -> tuple[int, int]:
+        return round((point_m[0] - low[0]) * scale), round((high[1] - point_m[1]) * scale)
 
     shade = picture.copy()
-    for webcam, place in zip(webcams, plan, strict=True):
+    for webcam, position in zip(webcams, positions, strict=True):
         heading, half = webcam_heading_deg(webcam), webcam.horizontal_fov_deg / 2.0
         angles = np.radians(np.linspace(heading - half, heading + half, 64))
-        rim = place + reach_m * np.stack([np.sin(angles), np.cos(angles)], -1)
-        outline = rim if half >= 180.0 else np.vstack([place, rim])
-        cv2.fillPoly(shade, [np.array([at(p) for p in outline])], (150, 190, 235), cv2.LINE_AA)
+        rim = position + reach_m * np.stack([np.sin(angles), np.cos(angles)], -1)
+        outline = rim if half >= 180.0 else np.vstack([position, rim])
+        cv2.fillPoly(shade, [np.array([pixel(p) for p in outline])], (150, 190, 235), cv2.LINE_AA)
     picture = cv2.addWeighted(shade, 0.5, picture, 0.5, 0.0)
-    written: list[tuple[int, int]] = []
-    for webcam, place in zip(webcams, plan, strict=True):
+    label_positions: list[tuple[int, int]] = []
+    for webcam, position in zip(webcams, positions, strict=True):
         heading = np.radians(webcam_heading_deg(webcam))
         cv2.line(
             picture,
-            at(place),
-            at(place + reach_m * np.array([np.sin(heading), np.cos(heading)])),
+            pixel(position),
+            pixel(position + reach_m * np.array([np.sin(heading), np.cos(heading)])),
             (30, 80, 170),
             2,
             cv2.LINE_AA,
         )
-        cv2.circle(picture, at(place), 4, (190, 40, 30), -1, cv2.LINE_AA)
-        x, y = at(place)
-        while any(abs(x - other[0]) < 110 and abs(y - other[1]) < 13 for other in written):
+        cv2.circle(picture, pixel(position), 4, (190, 40, 30), -1, cv2.LINE_AA)
+        x, y = pixel(position)
+        while any(abs(x - other[0]) < 110 and abs(y - other[1]) < 13 for other in label_positions):
             y += 6
-        written.append((x, y))
+        label_positions.append((x, y))
         cv2.putText(picture, webcam.id, (x + 6, y - 6), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (20, 20, 20), 1, cv2.LINE_AA)
     bar = 5000.0 if high[0] - low[0] > 20000.0 else 1000.0
     left = (low[0] + 0.03 * (high[0] - low[0]), low[1] + 0.03 * (high[1] - low[1]))
-    cv2.line(picture, at(left), at((left[0] + bar, left[1])), (20, 20, 20), 3)
-    x, y = at(left)
+    cv2.line(picture, pixel(left), pixel((left[0] + bar, left[1])), (20, 20, 20), 3)
+    x, y = pixel(left)
     cv2.putText(
         picture, f"{bar / 1000:.0f} km", (x, y - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (20, 20, 20), 1, cv2.LINE_AA
     )
