@@ -127,7 +127,7 @@ def _mean_value_weights(terrain: Terrain) -> tuple[np.ndarray, np.ndarray, np.nd
     """Directed edges i → j and their mean value weights (tan α/2 + tan β/2) / |ij|, one entry per adjacent face."""
     i, j, weight = [], [], []
     for k in range(3):
-        apex, left, right = (terrain.faces[:, (k + turn) % 3].astype(np.int64) for turn in range(3))
+        apex, left, right = (terrain.faces[:, (k + offset) % 3].astype(np.int64) for offset in range(3))
         a = terrain.vertices[left].astype(np.float64) - terrain.vertices[apex]
         b = terrain.vertices[right].astype(np.float64) - terrain.vertices[apex]
         length_a, length_b = np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1)
