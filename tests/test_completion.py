@@ -11,7 +11,6 @@ from seasonscapes.commands.inpaint import inpaint
 from seasonscapes.commands.options import SkyOptions, ViewOptions
 from seasonscapes.errors import InputError
 from seasonscapes.frames import LocalFrame
-from seasonscapes.pipeline import MeshOptions, albedo_for, load_place
 from seasonscapes.terrain.hole_filling import harmonic_fill
 from seasonscapes.terrain.mesh import build_mesh
 from seasonscapes.terrain.surface import Raster, Texture, load_texture, save_texture
@@ -21,6 +20,8 @@ from seasonscapes.texturing.predictors import predictors_for, stack_predictors
 from seasonscapes.texturing.smooth_fill import membrane_fill, propagate, push_pull, telea_fill
 from seasonscapes.texturing.terrain_features import horizon_tangent, sun_margin_deg, terrain_features
 from seasonscapes.texturing.top_down_grid import from_grid, to_grid
+from seasonscapes.workflows.albedo_sources import albedo_for
+from seasonscapes.workflows.place import MeshOptions, load_place
 from seasonscapes.workspace import Workspace
 
 SIDE, SPACING_M = 128, 50.0
@@ -278,11 +279,11 @@ def test_charts_that_lie_apart_are_neighbours_on_the_land():
     terrain, atlas = unwrap(terrain, kind="xatlas", texel_m=40.0, max_side_px=1024)
     assert atlas.charts > 1
     predictors = predictors_for(terrain, atlas, sun_direction=[0.0, -0.7, 0.714])
-    assert predictors.plan is not None
-    east = predictors.plan.pixel[..., 0] / predictors.plan.width_px
+    assert predictors.grid is not None
+    east = predictors.grid.pixel[..., 0] / predictors.grid.width_px
     truth = np.stack([1.0 + east, 2.0 - east, 1.0 + 0.0 * east], -1).astype(np.float32)
-    mean, count = to_grid(predictors.plan, truth, predictors.surface)
-    back = from_grid(predictors.plan, push_pull(mean, count > 0))
+    mean, count = to_grid(predictors.grid, truth, predictors.surface)
+    back = from_grid(predictors.grid, push_pull(mean, count > 0))
     assert np.nanmax(np.abs(back - truth)[predictors.surface]) < 0.1
     seen = predictors.surface & (np.abs(east - 0.5) > 0.12)
     for method in ("membrane", "telea", "guided"):

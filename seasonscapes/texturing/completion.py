@@ -1,15 +1,17 @@
-"""Complete a painted texture: every texel that no camera saw gets a value and an honest σ."""
+"""Completion of a painted texture: a value and a standard error for every unpainted texel, by a choice of methods."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Protocol
 
 import numpy as np
 
+from seasonscapes.errors import AtlasMismatch, NotEnoughEvidence
 from seasonscapes.terrain.surface import Texture
-from seasonscapes.texturing.completion_error import sigma_by_distance
+from seasonscapes.texturing.completion_error import Fill, sigma_by_distance
 from seasonscapes.texturing.detail import add_detail
 from seasonscapes.texturing.predictors import Predictors
 from seasonscapes.texturing.regression_fill import regression_fill
@@ -27,12 +29,12 @@ class Completed:
     Parameters
     ----------
     values
-        ``(R, S, 3)`` float32, finite everywhere; painted texels are the given ones to the bit, unless there was a base.
+        ``(R, S, 3)`` float32, finite everywhere; painted texels equal the given ones bit for bit, unless there was a base.
     sigma
-        Standard error ``(R, S)`` of the filled texels in the unit of ``values``, RMS over the channels; 0 where
-        painted (what painting itself gets wrong is not known here), and with a base that of the prediction everywhere.
+        Standard error ``(R, S)`` of the filled texels in the unit of ``values``, RMS over the channels. 0 where painted
+        (errors of the painting are not known here); with a base, that of the prediction everywhere.
     painted
-        ``(R, S)`` bool: seen by a camera.
+        ``(R, S)`` bool: painted from a photograph.
     """
 
     values: np.ndarray
@@ -40,34 +42,86 @@ class Completed:
     painted: np.ndarray
 
 
+class Inpainter(Protocol):
+    """A completion method."""
+
+    def __call__(
+        self,
+        values: np.ndarray,
+        painted: np.ndarray,
+        predictors: Predictors,
+        *,
+        fast: bool = False,
+        seed: int = 0,
+        progress: Progress | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return filled colours and their standard error; only unpainted texels on the surface are used.
+
+        Parameters
+        ----------
+        values
+            ``(R, S, 3)`` encoded colours (cube roots); ignored where not painted.
+        painted
+            ``(R, S)`` bool.
+        predictors
+            Of the same size.
+        fast
+            Trade some accuracy for time.
+        seed
+            Equal seeds give equal results.
+        progress
+            Called with the finished fraction.
+
+        Returns
+        -------
+        filled
+            ``(R, S, 3)`` encoded colours.
+        sigma
+            ``(R, S)`` standard error of the decoded colours.
+        """
+        ...
+
+
 def membrane(
-    values, painted, predictors: Predictors, *, fast: bool = False, seed: int = 0, progress: Progress | None = None
-):
-    """Laplace's equation between the painted texels; knows nothing of the land."""
-    return _unguided(membrane_fill, values, painted, predictors, seed)
+    values: np.ndarray,
+    painted: np.ndarray,
+    predictors: Predictors,
+    *,
+    fast: bool = False,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Fill by the Laplace equation, without predictors; an `Inpainter`."""
+    return _smooth_fill(membrane_fill, values, painted, predictors, seed)
 
 
 def telea(
-    values, painted, predictors: Predictors, *, fast: bool = False, seed: int = 0, progress: Progress | None = None
-):
-    """`cv2.inpaint` after Telea, the reference implementation's completion."""
-    return _unguided(partial(telea_fill, radius_px=1.0 if fast else 3.0), values, painted, predictors, seed)
+    values: np.ndarray,
+    painted: np.ndarray,
+    predictors: Predictors,
+    *,
+    fast: bool = False,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Fill by Telea inpainting as the reference implementation does, without predictors; an `Inpainter`."""
+    return _smooth_fill(partial(telea_fill, radius_px=1.0 if fast else 3.0), values, painted, predictors, seed)
 
 
-def _unguided(fill: Callable, values: np.ndarray, painted: np.ndarray, predictors: Predictors, seed: int):
-    """A method that knows pictures only, on the plan where the atlas has several charts."""
-    if predictors.plan is None:
+def _smooth_fill(
+    fill: Fill, values: np.ndarray, painted: np.ndarray, predictors: Predictors, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Apply an image filling method in the atlas or, with several charts, on the top-down grid."""
+    if predictors.grid is None:
         return fill(values, painted), sigma_by_distance(fill, values, painted, seed=seed)
-    mean, count = to_grid(predictors.plan, values, painted)
+    mean, count = to_grid(predictors.grid, values, painted)
     picture = fill(mean, count > 0)
     sigma = sigma_by_distance(fill, mean, count > 0, seed=seed)
-    taken = np.nan_to_num(from_grid(predictors.plan, np.concatenate([picture, sigma[..., None]], -1)))
-    return taken[..., :-1], taken[..., -1]
+    sampled = np.nan_to_num(from_grid(predictors.grid, np.concatenate([picture, sigma[..., None]], -1)))
+    return sampled[..., :-1], sampled[..., -1]
 
 
-# A new method is one line: a function (values, painted, guides, *, fast, seed, progress) → (values, sigma) in
-# encoded colours (cube roots); only what it says of surface texels that are not painted is used.
-INPAINTERS: dict[str, Callable] = {"guided": regression_fill, "membrane": membrane, "telea": telea}
+INPAINTERS: dict[str, Inpainter] = {"guided": regression_fill, "membrane": membrane, "telea": telea}
 
 
 def complete(
@@ -81,81 +135,110 @@ def complete(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Completed:
-    """Fill every texel that no camera saw.
+    """Fill every unpainted texel of a texture.
 
     Parameters
     ----------
     texture
         Radiance or albedo; painted where ``weight`` is positive and the values are finite.
     predictors
-        From `predictors.predictors_for`, of the same size. Methods that do not look at the land use only its charts.
+        From `predictors.predictors_for`, of the same size. The methods ``membrane`` and ``telea`` use only its surface and
+        top-down grid.
     base
-        ``(R, S, 3)`` what another source says that every texel is, in the texture's unit (for an albedo: an image from
-        above with its light taken out); NaN where it says nothing. It is corrected by what was painted, and painted
-        texels give way to it as far as their ``weight`` tells that they scatter: see `corrected`.
+        ``(R, S, 3)`` estimate of every texel from another source, in the texture's unit (for an albedo: an orthophoto
+        without its illumination), NaN where unknown. It is corrected by the painted texels, which in turn are shrunk
+        towards it according to their ``weight``; see `residual_correction`.
     method
-        A name of `INPAINTERS`; with a base ``guided`` alone.
+        A name of `INPAINTERS`; ``guided`` if there is a base.
     detail
-        Strength of synthesised grain in [0, 1]: 0 for albedo recovery, about 0.6 for pictures.
+        Strength of synthesised grain in [0, 1]: 0 for albedo recovery, about 0.6 for visualisation.
     fast
-        Trade a little accuracy for time.
+        Trade some accuracy for time.
     seed
         Equal seeds give equal textures.
     progress
-        Called with the share that is done.
+        Called with the finished fraction.
+
+    Returns
+    -------
+    Completed
+        The complete texture with its standard error.
 
     Raises
     ------
+    NotEnoughEvidence
+        No texel on the surface is painted.
+    AtlasMismatch
+        ``predictors`` belong to a texture of another size.
     ValueError
-        An unknown method, guides or a base of another size, a base with another method than ``guided``, a negative value
-        among the painted ones, or no painted texel on the surface.
+        Unknown method, ``detail`` out of range, a base of another size or with another method than ``guided``, or a
+        negative painted value.
     """
     if method not in INPAINTERS:
         raise ValueError(f"method: got {method!r}, expected one of {', '.join(INPAINTERS)}")
     if predictors.surface.shape != texture.weight.shape:
-        raise ValueError(f"predictors are {predictors.surface.shape}, the texture {texture.weight.shape}")
+        raise AtlasMismatch(f"complete: predictors are {predictors.surface.shape}, the texture {texture.weight.shape}")
     if base is not None and (base.shape != texture.values.shape or method != "guided"):
         raise ValueError(
             f"base: {base.shape} for a texture {texture.values.shape} and method {method!r}, expected guided"
         )
     if not 0.0 <= detail <= 1.0:
         raise ValueError(f"detail: got {detail}, expected 0 to 1")
-    tell = progress or (lambda share: None)
+    report = progress or (lambda fraction: None)
     painted = painted_texels(texture)
-    seen = painted & predictors.surface
-    if not seen.any():
-        raise ValueError("complete: no painted texel on the surface: there is nothing to learn from")
+    known = painted & predictors.surface
+    if not known.any():
+        raise NotEnoughEvidence("complete: no painted texel on the surface: there is nothing to learn from")
     if texture.values[painted].min() < 0.0:
         raise ValueError("complete: negative values among the painted texels")
-    # Painted texels, too, give way to a base.
+    # With a base, painted texels change too.
     changed = predictors.surface & ~painted if base is None else predictors.surface
     values = np.where(painted[..., None], texture.values, 0.0).astype(np.float32)
     sigma = np.zeros(painted.shape, np.float32)
     if changed.any():
-        scale = max(float(np.median(values[seen])), 1e-6 * float(values[seen].max()), 1e-12)
+        scale = max(float(np.median(values[known])), 1e-6 * float(values[known].max()), 1e-12)
         encoded = np.cbrt(values / np.float32(scale))
-        how: dict = {"fast": fast, "seed": seed, "progress": lambda s: tell(0.9 * s)}
+
+        def report_filling(fraction: float) -> None:
+            report(0.9 * fraction)
+
         if base is None:
-            made, spread = INPAINTERS[method](encoded, seen, predictors, **how)
-            brightest = float(encoded[seen].max())
+            filled, error = INPAINTERS[method](
+                encoded, known, predictors, fast=fast, seed=seed, progress=report_filling
+            )
+            brightest = float(encoded[known].max())
         else:
-            like = np.cbrt(np.maximum(base, 0.0) / scale).astype(np.float32)
-            made, spread = corrected_fill(encoded, np.where(seen, texture.weight, 0.0), like, predictors, **how)
-            brightest = max(float(encoded[seen].max()), float(np.nanmax(like[predictors.surface])))
+            encoded_base = np.cbrt(np.maximum(base, 0.0) / scale).astype(np.float32)
+            known_weight = np.where(known, texture.weight, 0.0)
+            filled, error = corrected_fill(
+                encoded, known_weight, encoded_base, predictors, fast=fast, seed=seed, progress=report_filling
+            )
+            brightest = max(float(encoded[known].max()), float(np.nanmax(encoded_base[predictors.surface])))
         if detail > 0.0:
-            made = add_detail(made, seen, predictors, strength=detail, seed=seed)
-        # Nothing is brighter than all that is known: cubes must not make suns of small errors.
-        values[changed] = scale * np.clip(made[changed], 0.0, brightest) ** 3
-        sigma[changed] = scale * spread[changed]
-    beside = ~predictors.surface & ~painted
-    if beside.any():
-        # Between charts nothing lies; a look-up at a chart's rim must still find its colour.
-        grown = push_pull(np.concatenate([values, sigma[..., None]], -1), (~beside).astype(np.float32))
-        values[beside], sigma[beside] = grown[beside][:, :3], grown[beside][:, 3]
-    tell(1.0)
+            filled = add_detail(filled, known, predictors, strength=detail, seed=seed)
+        # Cubing amplifies small errors of bright texels; no filled texel may be brighter than all known ones.
+        values[changed] = scale * np.clip(filled[changed], 0.0, brightest) ** 3
+        sigma[changed] = scale * error[changed]
+    off_surface = ~predictors.surface & ~painted
+    if off_surface.any():
+        # Texels between charts are filled for bilinear look-ups at chart borders.
+        extended = push_pull(np.concatenate([values, sigma[..., None]], -1), (~off_surface).astype(np.float32))
+        values[off_surface], sigma[off_surface] = extended[off_surface][:, :3], extended[off_surface][:, 3]
+    report(1.0)
     return Completed(values, sigma, painted)
 
 
 def painted_texels(texture: Texture) -> np.ndarray:
-    """Where a camera's finite colour lies, ``(R, S)`` bool."""
+    """Return the texels with a positive weight and finite values.
+
+    Parameters
+    ----------
+    texture
+        Any texture.
+
+    Returns
+    -------
+    ndarray
+        ``(R, S)`` bool.
+    """
     return (texture.weight > 0.0) & np.isfinite(texture.values).all(axis=2)

@@ -1,85 +1,139 @@
-"""How far off a completion is likely to be: learned from its own errors on blocks of land that were held out."""
+"""Standard error of completed texels, estimated from cross-validation errors on spatial folds of painted texels."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
+if TYPE_CHECKING:
+    from sklearn.ensemble import HistGradientBoostingRegressor
+
 FOLDS = 4
+# Side of the blocks that share a fold, in multiples of the depth of the holes, and its lower limit [px].
+_BLOCK_DEPTHS, _MIN_BLOCK_PX = 4.0, 16.0
 _TINY = 1e-8
+
+# Returns predicted colours (k, 3) and their spread (k,) for predictors (k, G).
+Predict = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+# Fits a model to the selected rows (n,) bool of the training data.
+Fit = Callable[[np.ndarray], Predict]
+# Fills values (H, W, C) where known (H, W) is False.
+Fill = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
 class ErrorModel:
-    """A fitted model of the error's size.
+    """Regression model of the squared error of a completion.
 
     Parameters
     ----------
     model
-        From guides, predicted colour and the trees' spread to the squared error, as a share of ``size``.
+        Predicts the squared error, in units of ``size``, from predictors, predicted colour and spread.
     size
         Mean squared error.
     """
 
-    model: object
+    model: HistGradientBoostingRegressor
     size: float
 
-    def sigma(self, predictor: np.ndarray, colour: np.ndarray, between: np.ndarray) -> np.ndarray:
-        """Standard error ``(n,)`` of the cubes of colours ``(n, 3)``, RMS over the channels."""
-        return np.sqrt(self.size * self.model.predict(_features(predictor, colour, between))).astype(np.float32)
+    def sigma(self, predictor: np.ndarray, colour: np.ndarray, spread: np.ndarray) -> np.ndarray:
+        """Return the standard error of the cubes of predicted colours, RMS over the channels.
+
+        Parameters
+        ----------
+        predictor
+            ``(n, G)``.
+        colour
+            ``(n, 3)`` predicted colours, cube roots.
+        spread
+            ``(n,)`` standard deviation between the trees.
+
+        Returns
+        -------
+        ndarray
+            ``(n,)`` float32.
+        """
+        return np.sqrt(self.size * self.model.predict(_features(predictor, colour, spread))).astype(np.float32)
 
 
-def _features(predictor: np.ndarray, colour: np.ndarray, between: np.ndarray) -> np.ndarray:
-    return np.column_stack([predictor, colour, between]).astype(np.float32)
+def _features(predictor: np.ndarray, colour: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    return np.column_stack([predictor, colour, spread]).astype(np.float32)
 
 
-def spatial_folds(place: np.ndarray, painted: np.ndarray, hole: np.ndarray, seed: int) -> np.ndarray:
-    """Fold number ``(n,)`` of texels at ``place`` ``(n, 2)`` (column, row): whole square blocks share one.
-
-    Blocks are as wide as holes are: neighbours of a hidden texel are hidden too, and so those of a held-out texel
-    must be. Random folds would flatter.
-    """
-    distance = cv2.distanceTransform((~painted).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
-    depth = float(np.percentile(distance[hole], 75.0)) if hole.any() else 8.0
-    extent = float(np.ptp(place, axis=0).max()) + 1.0
-    side = float(np.clip(4.0 * depth, min(16.0, extent / 4.0), max(extent / 8.0, 16.0)))
-    cell = np.floor((place - place.min(axis=0)) / side).astype(np.int64)
-    number = cell[:, 1] * (cell[:, 0].max() + 1) + cell[:, 0]
-    _, block = np.unique(number, return_inverse=True)
-    turn = np.random.default_rng(seed).permutation(block.max() + 1)
-    return turn[block] % FOLDS
-
-
-def fit_error_model(
-    predictor: np.ndarray, encoded: np.ndarray, fold: np.ndarray, fit: Callable, *, seed: int = 0
-) -> ErrorModel:
-    """Errors of models fitted without each fold, as a function of everything known beforehand.
+def spatial_folds(position: np.ndarray, painted: np.ndarray, hole: np.ndarray, seed: int) -> np.ndarray:
+    """Assign texels to spatial cross-validation folds by square blocks.
 
     Parameters
     ----------
-    predictor, encoded
-        ``(n, G)`` and ``(n, 3)``, cube roots. Errors are those of the cubes: what is predicted dark and lies in the
-        sun after all is rare, and no error of cube roots would tell how far off it is.
+    position
+        ``(n, 2)`` column and row of the texels.
+    painted, hole
+        ``(R, S)`` bool; the depth of the holes determines the size of the blocks.
+    seed
+        Of the assignment of blocks to folds.
+
+    Returns
+    -------
+    ndarray
+        ``(n,)`` fold number.
+
+    Notes
+    -----
+    Blocks are as wide as the holes: the neighbours of a hidden texel are hidden too, so those of a held-out texel must
+    be held out. Random folds would underestimate the error.
+    """
+    distance = cv2.distanceTransform((~painted).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+    depth = float(np.percentile(distance[hole], 75.0)) if hole.any() else 8.0
+    extent = float(np.ptp(position, axis=0).max()) + 1.0
+    side = float(np.clip(_BLOCK_DEPTHS * depth, min(_MIN_BLOCK_PX, extent / 4.0), max(extent / 8.0, _MIN_BLOCK_PX)))
+    cell = np.floor((position - position.min(axis=0)) / side).astype(np.int64)
+    number = cell[:, 1] * (cell[:, 0].max() + 1) + cell[:, 0]
+    _, block = np.unique(number, return_inverse=True)
+    shuffled = np.random.default_rng(seed).permutation(block.max() + 1)
+    return shuffled[block] % FOLDS
+
+
+def fit_error_model(
+    predictor: np.ndarray, encoded: np.ndarray, fold: np.ndarray, fit: Fit, *, seed: int = 0
+) -> ErrorModel:
+    """Fit the squared cross-validation error as a function of predictors, predicted colour and spread.
+
+    Parameters
+    ----------
+    predictor
+        ``(n, G)``.
+    encoded
+        ``(n, 3)`` colours, cube roots. Errors are those of the cubes: dark predictions of sunlit texels are rare, and
+        errors of cube roots would not represent their size.
     fold
         ``(n,)`` from `spatial_folds`.
     fit
-        Takes rows ``(n,)`` bool; gives a function from guides to predicted colours ``(k, 3)`` and spread ``(k,)``.
+        Called with rows ``(n,)`` bool; returns a function from predictors to predicted colours ``(k, 3)`` and spread
+        ``(k,)``.
+    seed
+        Of the regression.
+
+    Returns
+    -------
+    ErrorModel
+        The fitted model.
     """
     from sklearn.ensemble import HistGradientBoostingRegressor
 
-    colour, between = np.empty_like(encoded), np.empty(len(encoded))
+    colour, spread = np.empty_like(encoded), np.empty(len(encoded))
     for number in np.unique(fold):
-        out = fold == number
-        if out.all():
-            # One block alone cannot be held out of itself: the error may be as large as the value.
-            colour[out], between[out] = 0.0, 0.0
+        held_out = fold == number
+        if held_out.all():
+            # A single block leaves nothing to train on: take the error to be as large as the value.
+            colour[held_out], spread[held_out] = 0.0, 0.0
             continue
-        colour[out], between[out] = fit(~out)(predictor[out])
+        colour[held_out], spread[held_out] = fit(~held_out)(predictor[held_out])
     square = np.mean((np.maximum(colour, 0.0) ** 3 - encoded**3) ** 2, axis=1) + _TINY
-    # Of the losses with a logarithmic link this one is steady where a few squares outweigh all others.
+    # The Poisson loss is the most robust of the losses with a logarithmic link where a few squares dominate.
     size = float(square.mean())
     model = HistGradientBoostingRegressor(
         loss="poisson",
@@ -89,47 +143,60 @@ def fit_error_model(
         min_samples_leaf=200,
         l2_regularization=1.0,
         max_features=0.5,
-        early_stopping=False,
+        early_stopping=False,  # pyright: ignore[reportArgumentType]
         random_state=seed,
     )
-    return ErrorModel(model.fit(_features(predictor, colour, between), square / size), size)
+    return ErrorModel(model.fit(_features(predictor, colour, spread), square / size), size)
 
 
-def sigma_by_distance(fill: Callable, values: np.ndarray, known: np.ndarray, *, seed: int = 0) -> np.ndarray:
-    """σ ``(H, W)`` of a method that knows pictures only, from its own errors as they grow with the distance inwards.
+def sigma_by_distance(fill: Fill, values: np.ndarray, known: np.ndarray, *, seed: int = 0) -> np.ndarray:
+    """Estimate the standard error of an image filling method as a non-decreasing function of distance to known pixels.
 
-    Discs of known texels are hidden, as deep as the holes are, filled by ``fill(values, known)``, and the squared
-    error is averaged by distance to the nearest texel left; it may only grow.
+    Known pixels in discs as deep as the holes are hidden and filled, and their squared error is averaged in bins of
+    distance to the nearest remaining pixel.
 
     Parameters
     ----------
-    values, known
-        Cube roots ``(H, W, C)``, and ``(H, W)``. σ is that of the cubes.
+    fill
+        The method, called with values and known pixels.
+    values
+        ``(H, W, C)`` colours, cube roots.
+    known
+        ``(H, W)`` bool.
+    seed
+        Of the discs.
+
+    Returns
+    -------
+    ndarray
+        ``(H, W)`` float32 standard error of the cubes, RMS over the channels; 0 where known.
     """
     if known.all():
         return np.zeros(known.shape, np.float32)
     depth = cv2.distanceTransform((~known).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
     row, column = np.nonzero(known)
-    rng, left = np.random.default_rng(seed), known.astype(np.uint8)
-    # A third of the known texels at most: the rest must still fill.
-    most = max(2.0, min(float(depth.max()), 0.25 * min(known.shape)))
-    while left.sum() > 0.67 * known.sum():
+    rng, kept = np.random.default_rng(seed), known.astype(np.uint8)
+    # At most a third of the known pixels is hidden, so that enough is left to fill from.
+    max_radius = max(2.0, min(float(depth.max()), 0.25 * min(known.shape)))
+    while kept.sum() > 0.67 * known.sum():
         centre = rng.integers(len(row))
-        radius = int(np.ceil(rng.uniform(1.0, most)))
-        cv2.circle(left, (int(column[centre]), int(row[centre])), radius, 0, -1)
-    if not left.any():
-        left[row[0], column[0]] = 1
-    left = (left > 0) & known
-    hidden = known & ~left
+        radius = int(np.ceil(rng.uniform(1.0, max_radius)))
+        cv2.circle(kept, (int(column[centre]), int(row[centre])), radius, 0, -1)
+    if not kept.any():
+        kept[row[0], column[0]] = 1
+    kept = (kept > 0) & known
+    hidden = known & ~kept
     if not hidden.any():
-        # Too little is known to hide any of it: the error may be as large as the values.
+        # Too few pixels are known to hide any: take the error to be as large as the values.
         return np.where(known, 0.0, np.sqrt(np.mean(values[known] ** 6))).astype(np.float32)
-    inner = cv2.distanceTransform((~left).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
-    error = np.mean((np.maximum(fill(values, left)[hidden], 0.0) ** 3 - values[hidden] ** 3) ** 2, axis=1)
-    edges = np.unique(np.geomspace(1.0, most + 1.0, 12).round(1))
-    bins = np.clip(np.searchsorted(edges, inner[hidden], side="right"), 0, len(edges) - 1)
-    count = np.bincount(bins, minlength=len(edges))
-    met = count > 0
-    mean = np.maximum.accumulate(np.bincount(bins, weights=error, minlength=len(edges))[met] / count[met])
-    sigma = np.sqrt(np.maximum(np.interp(depth, edges[met], mean), _TINY))
+    distance = cv2.distanceTransform((~kept).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+    error = np.mean((np.maximum(fill(values, kept)[hidden], 0.0) ** 3 - values[hidden] ** 3) ** 2, axis=1)
+    edges = np.unique(np.geomspace(1.0, max_radius + 1.0, 12).round(1))
+    bin_index = np.clip(np.searchsorted(edges, distance[hidden], side="right"), 0, len(edges) - 1)
+    count = np.bincount(bin_index, minlength=len(edges))
+    occupied = count > 0
+    mean = np.maximum.accumulate(
+        np.bincount(bin_index, weights=error, minlength=len(edges))[occupied] / count[occupied]
+    )
+    sigma = np.sqrt(np.maximum(np.interp(depth, edges[occupied], mean), _TINY))
     return np.where(known, 0.0, sigma).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Detail for the eye: grain of the seen land quilted onto the smooth prediction of the unseen."""
+"""Synthesis of fine detail: texture quilting of the grain of painted patches onto smoothly completed texels."""
 
 from __future__ import annotations
 
@@ -7,28 +7,40 @@ import numpy as np
 from seasonscapes.texturing.predictors import Predictors
 
 PATCH_PX = 16
-# A patch whose grain is taken may have a few holes itself.
-_SEEN_SHARE = 0.95
+# Least fraction of painted texels in a source patch.
+_MIN_PAINTED = 0.95
+# Least number of source patches, and number of similar patches from which one is drawn.
+_MIN_SOURCES, _CANDIDATES = 8, 5
 
 
 def add_detail(
     filled: np.ndarray, painted: np.ndarray, predictors: Predictors, *, strength: float, seed: int = 0
 ) -> np.ndarray:
-    """Fine structure of painted patches added to the filled texels, after Efros & Freeman 2001
-    (doi:10.1145/383259.383296) with blended instead of cut borders.
+    """Add the grain of painted patches to the filled texels by texture quilting.
 
-    A patch's grain is its painted colour less that colour's local mean. Each patch of the hole takes the grain of a
-    painted patch that the guides call alike. Two overlapping grids of patches are joined with weights whose squares
-    sum to 1, which keeps the variance.
+    After Efros & Freeman 2001 (doi:10.1145/383259.383296), with blended instead of cut borders. The grain of a patch is
+    its painted colour minus the local mean. Each patch of a hole receives the grain of a painted patch with similar
+    predictors. Overlapping patches are blended with weights whose squares sum to 1, which preserves the variance.
 
     Parameters
     ----------
-    filled, painted
-        Encoded colours ``(R, S, 3)``, complete, and which of them were seen.
+    filled
+        ``(R, S, 3)`` encoded colours, complete.
+    painted
+        ``(R, S)`` bool.
+    predictors
+        Of the same size.
     strength
-        1 gives the hole the grain of the seen land; 0 none.
+        1 adds grain of the same variance as that of painted texels; 0 none.
+    seed
+        Of the choice among similar patches.
+
+    Returns
+    -------
+    ndarray
+        ``(R, S, 3)`` encoded colours; painted texels are unchanged.
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
     half = PATCH_PX // 2
     height, width = painted.shape
@@ -36,27 +48,29 @@ def add_detail(
         return filled
     starts = [(r, c) for r in range(0, height - PATCH_PX + 1, half) for c in range(0, width - PATCH_PX + 1, half)]
     starts = np.array(starts)
-    whole = _patch_sums((painted & predictors.surface).astype(np.float32), starts) > _SEEN_SHARE * PATCH_PX**2
-    touched = _patch_sums((predictors.surface & ~painted).astype(np.float32), starts) > 0.5
-    if whole.sum() < 8 or not touched.any():
+    source = _patch_sums((painted & predictors.surface).astype(np.float32), starts) > _MIN_PAINTED * PATCH_PX**2
+    target = _patch_sums((predictors.surface & ~painted).astype(np.float32), starts) > 0.5
+    if source.sum() < _MIN_SOURCES or not target.any():
         return filled
     features = _patch_features(filled, predictors, starts)
     grain = filled - _local_mean(filled)
-    tree = cKDTree(features[whole])
-    _, near = tree.query(features[touched], k=min(5, int(whole.sum())))
+    tree = cKDTree(features[source])
+    _, near = tree.query(features[target], k=min(_CANDIDATES, int(source.sum())))
     rng = np.random.default_rng(seed)
     chosen = np.take_along_axis(near, rng.integers(0, near.shape[1], (len(near), 1)), 1)[:, 0]
     window = np.sin((np.arange(PATCH_PX) + 0.5) * np.pi / PATCH_PX)
     window = (window[:, None] * window[None, :])[..., None].astype(np.float32)
     total, square = np.zeros_like(filled), np.zeros((height, width, 1), np.float32)
-    # The prediction has some grain of its own: only what it lacks is added.
+    # The prediction has some grain already; only the missing part of its variance is added.
     power = _patch_sums((grain**2).mean(axis=2), starts)
-    lack = np.sqrt(np.clip(1.0 - power[touched] / np.maximum(power[whole][chosen], 1e-12), 0.0, 1.0))
-    for (row, column), source, share in zip(starts[touched], starts[whole][chosen], lack, strict=True):
-        here = np.s_[row : row + PATCH_PX, column : column + PATCH_PX]
-        there = np.s_[source[0] : source[0] + PATCH_PX, source[1] : source[1] + PATCH_PX]
-        total[here] += np.float32(share) * window * grain[there]
-        square[here] += window**2
+    missing = np.sqrt(np.clip(1.0 - power[target] / np.maximum(power[source][chosen], 1e-12), 0.0, 1.0))
+    for (row, column), (source_row, source_column), amplitude in zip(
+        starts[target], starts[source][chosen], missing, strict=True
+    ):
+        at_target = np.s_[row : row + PATCH_PX, column : column + PATCH_PX]
+        at_source = np.s_[source_row : source_row + PATCH_PX, source_column : source_column + PATCH_PX]
+        total[at_target] += np.float32(amplitude) * window * grain[at_source]
+        square[at_target] += window**2
     added = total / np.sqrt(np.maximum(square, 0.25))
     return np.where((predictors.surface & ~painted)[..., None], filled + np.float32(strength) * added, filled)
 
@@ -68,7 +82,7 @@ def _local_mean(values: np.ndarray) -> np.ndarray:
 
 
 def _patch_sums(values: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    """Sum over each patch ``(n, ...)`` by an integral image."""
+    """Sums over patches ``(n, ...)`` by an integral image."""
     total = np.pad(values.astype(np.float64), ((1, 0), (1, 0), *((0, 0),) * (values.ndim - 2))).cumsum(0).cumsum(1)
     row, column = starts.T
     end_row, end_column = row + PATCH_PX, column + PATCH_PX
@@ -76,7 +90,7 @@ def _patch_sums(values: np.ndarray, starts: np.ndarray) -> np.ndarray:
 
 
 def _patch_features(filled: np.ndarray, predictors: Predictors, starts: np.ndarray) -> np.ndarray:
-    """Mean guides and mean colour of each patch, scaled to unit deviation; the colour counts as much as all guides."""
+    """Mean colour and predictors of each patch, standardised; the colour has the same total weight as the predictors."""
     known = np.nan_to_num(
         predictors.values[..., [k for k, n in enumerate(predictors.names) if not n.startswith("satellite")]]
     )

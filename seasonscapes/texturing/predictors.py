@@ -1,4 +1,4 @@
-"""Guides of a completion: for each texel what is known of it without any camera having seen it."""
+"""Predictors for the completion of a texture: terrain attributes, insolation and imagery at every texel."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from seasonscapes.errors import AtlasMismatch
 from seasonscapes.terrain.atlas import Atlas
 from seasonscapes.terrain.surface import Terrain, Texture
 from seasonscapes.terrain.texels import texel_positions
@@ -16,62 +18,82 @@ from seasonscapes.texturing.top_down_grid import TopDownGrid, from_grid, grid_he
 
 @dataclass(frozen=True)
 class Predictors:
-    """What the land itself tells about each texel.
+    """Predictor variables of every texel.
 
     Parameters
     ----------
     values
-        ``(R, S, G)`` float32; NaN where unknown (beyond a satellite image, off the surface).
+        ``(R, S, G)`` float32; NaN where unknown (outside a satellite image, off the surface).
     names
-        Of the G layers. Those that begin with ``satellite`` come from an image and may be missing in places.
+        Names of the G layers. Those that begin with ``satellite`` or ``relit`` are images of the terrain; satellite
+        layers may be missing in places.
     surface
-        ``(R, S)`` bool: the texel lies on the land, not in the space between charts.
-    plan
-        Where the atlas has several charts: the texels' places on a top-down grid, so that what is propagated crosses
-        from chart to chart as the land does. ``None`` where the texture itself is one connected picture of the land.
+        ``(R, S)`` bool: texels on the terrain; the others lie between charts.
+    grid
+        Positions of the texels on a top-down grid, for spatial operations across chart borders; ``None`` where the
+        texture is a single chart.
+
+    Raises
+    ------
+    ValueError
+        Shapes and names do not agree.
     """
 
     values: np.ndarray
     names: tuple[str, ...]
     surface: np.ndarray
-    plan: TopDownGrid | None = None
+    grid: TopDownGrid | None = None
 
     def __post_init__(self):
         if self.values.ndim != 3 or self.values.shape[2] != len(self.names):
-            raise ValueError(f"Guides: values {self.values.shape} and {len(self.names)} names")
+            raise ValueError(f"Predictors: values {self.values.shape} and {len(self.names)} names")
         if self.values.shape[:2] != self.surface.shape:
-            raise ValueError(f"Guides: values {self.values.shape} and surface {self.surface.shape} differ in size")
+            raise ValueError(f"Predictors: values {self.values.shape} and surface {self.surface.shape} differ in size")
 
 
 def stack_predictors(
     layers: Mapping[str, np.ndarray],
     satellite: Texture | None = None,
     *,
-    plan: TopDownGrid | None = None,
+    grid: TopDownGrid | None = None,
     surface: np.ndarray | None = None,
 ) -> Predictors:
-    """Guides from layers ``(R, S)`` and a satellite image in the same atlas.
+    """Stack layers and a satellite image in the same atlas.
 
     Parameters
     ----------
+    layers
+        ``(R, S)`` each, by name.
     satellite
         ``values`` ``(R, S, C)`` linear, of any scale; missing where ``weight`` is 0 or a value is not finite.
+    grid
+        As in `Predictors`.
     surface
-        Left out: where every layer is finite.
+        As in `Predictors`; ``None`` for the texels where every layer is finite.
+
+    Returns
+    -------
+    Predictors
+        Layers in the given order, then ``satellite_1`` and so on unless no texel has an image.
+
+    Raises
+    ------
+    ValueError
+        ``layers`` is empty, or shapes do not agree.
     """
     if not layers:
-        raise ValueError("stack_guides: no layers")
+        raise ValueError("stack_predictors: no layers")
     columns = [np.asarray(layer, np.float32) for layer in layers.values()]
     names = list(layers)
     if surface is None:
-        surface = np.isfinite(columns).all(axis=0)
+        surface = np.asarray(np.isfinite(columns).all(axis=0))
     if satellite is not None:
-        seen = (satellite.weight > 0.0) & np.isfinite(satellite.values).all(axis=2)
-        if seen.any():
+        imaged = (satellite.weight > 0.0) & np.isfinite(satellite.values).all(axis=2)
+        if imaged.any():
             for channel in range(satellite.values.shape[2]):
-                columns.append(np.where(seen, satellite.values[..., channel], np.nan).astype(np.float32))
+                columns.append(np.where(imaged, satellite.values[..., channel], np.nan).astype(np.float32))
                 names.append(f"satellite_{channel + 1}")
-    return Predictors(np.stack(columns, -1), tuple(names), surface, plan)
+    return Predictors(np.stack(columns, -1), tuple(names), surface, grid)
 
 
 def predictors_for(
@@ -80,27 +102,36 @@ def predictors_for(
     *,
     satellite: Texture | None = None,
     relit: np.ndarray | None = None,
-    sun_direction=None,
-    day_suns=None,
+    sun_direction: ArrayLike | None = None,
+    day_suns: ArrayLike | None = None,
     extra: Mapping[str, np.ndarray] | None = None,
 ) -> Predictors:
-    """Guides for every texel of a terrain's atlas.
+    """Compute the predictors of every texel of a terrain's atlas.
 
     Parameters
     ----------
+    terrain
+        The surface with its texture coordinates.
+    atlas
+        Size and kind of the atlas.
     satellite
-        An image baked into the atlas (`terrain.imagery.bake_imagery`), ``weight`` 0 where it does not reach.
+        An image baked into the atlas (`terrain.imagery.bake_imagery`), ``weight`` 0 outside its extent.
     relit
-        ``(R, S, 3)`` radiance of an albedo in the light of the hour.
+        ``(R, S, 3)`` radiance of an albedo in the light of the photographs.
     sun_direction, day_suns
-        See `terrain_features`.
+        As in `terrain_features`.
     extra
-        More layers ``(R, S)``, such as irradiance that a renderer has found.
+        Further layers ``(R, S)`` by name, such as irradiance from a renderer.
+
+    Returns
+    -------
+    Predictors
+        Terrain attributes, then the extra and relit layers, then the satellite image.
 
     Raises
     ------
-    ValueError
-        A satellite image or an extra layer of another size than the atlas.
+    AtlasMismatch
+        A satellite image or a layer of another size than the atlas.
     """
     shape = (atlas.height_px, atlas.width_px)
     extra = dict(extra or {})
@@ -111,18 +142,18 @@ def predictors_for(
         *((name, layer.shape) for name, layer in extra.items()),
     ]:
         if size != shape:
-            raise ValueError(f"guides_for: {name} is {size}, the atlas {shape}")
+            raise AtlasMismatch(f"predictors_for: {name} is {size}, the atlas {shape}")
     positions, face_id = texel_positions(terrain, atlas.width_px, atlas.height_px)
-    # A planar atlas is itself the plan: with its own cell size the two coincide.
+    # A planar atlas is a top-down grid itself: with its own cell size the two coincide.
     planar_m = float((np.ptp(terrain.vertices[:, :2], axis=0) / [atlas.width_px, atlas.height_px]).max())
     cell_m = planar_m if atlas.kind == "planar" else atlas.texel_p50_m
     heights, spacing_m = grid_heights(terrain, cell_m)
-    plan = top_down_grid(terrain, positions, heights.shape[1], heights.shape[0])
-    share = from_grid(plan, np.isfinite(heights).astype(np.float32)[..., None])[..., 0]
+    grid = top_down_grid(terrain, positions, heights.shape[1], heights.shape[0])
+    coverage = from_grid(grid, np.isfinite(heights).astype(np.float32)[..., None])[..., 0]
     layers = {}
     for name, layer in terrain_features(heights, spacing_m, sun_direction=sun_direction, day_suns=day_suns).items():
-        # At the rim of the land only cells with a height have a say.
-        sums = from_grid(plan, np.nan_to_num(layer)[..., None])[..., 0]
-        layers[name] = np.where(share > 0.0, sums / np.maximum(share, 1e-6), np.nan).astype(np.float32)
+        # At the border of the terrain, the mean is over cells with a height alone.
+        sums = from_grid(grid, np.nan_to_num(layer)[..., None])[..., 0]
+        layers[name] = np.where(coverage > 0.0, sums / np.maximum(coverage, 1e-6), np.nan).astype(np.float32)
     layers |= extra
-    return stack_predictors(layers, satellite, plan=plan if atlas.charts > 1 else None, surface=face_id >= 0)
+    return stack_predictors(layers, satellite, grid=grid if atlas.charts > 1 else None, surface=face_id >= 0)
