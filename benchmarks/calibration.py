@@ -52,7 +52,7 @@ def by_points(trials: int, seed: int) -> dict:
             f"points_{name}_heading_under_0.02_share": np.mean(heading < 0.02),
             f"points_{name}_focal_under_0.2pc_share": np.mean([s.focal_error < 0.002 for s in scores]),
             f"points_{name}_two_sigma_coverage": np.mean([s.within_two_sigma for s in scores]),
-            f"points_{name}_wrong_all_found_share": np.mean([s.wrong_found for s in scores]),
+            f"points_{name}_wrong_all_found_share": np.mean([s.outliers_found for s in scores]),
         }
     numbers["heading_error_deg"] = numbers["points_panorama_heading_median_deg"]
     return numbers

@@ -49,7 +49,7 @@ def coverage(trials: int, seed: int) -> dict:
         "heading": np.array([s.heading_error_deg for s in scores]),
         "focal": np.array([s.focal_error for s in scores]),
         "inside": np.array([s.within_two_sigma for s in scores]),
-        "found": np.array([s.wrong_found for s in scores]),
+        "found": np.array([s.outliers_found for s in scores]),
     }
 
 
@@ -82,7 +82,7 @@ def test_a_radial_term_is_recovered_and_its_points_named():
     )
     assert solved.k1 == pytest.approx(-0.12, abs=3.0 * solved.sigma["k1"])
     assert solved.sigma["k1"] < 0.01
-    assert set(solved.outlier_names) == {str(i + 1) for i in np.flatnonzero(trial.wrong)}
+    assert set(solved.outlier_names) == {str(i + 1) for i in np.flatnonzero(trial.outlier)}
     assert any(line.endswith("outlier") for line in report_lines(solved))
 
 

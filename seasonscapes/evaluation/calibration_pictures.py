@@ -1,7 +1,6 @@
-"""Pictures of a made-up massif from a known pose: haze, clouds, snow, something standing before it, fog at will.
+"""Synthetic trials of skyline alignment: images of a fractal massif from a known pose, with haze, clouds and foreground.
 
-The terrain that a trial hands to the alignment is not the one it was drawn from: it has height errors of its own, as
-every elevation model has.
+The elevation raster of a trial differs from the rendered terrain by random height errors, as elevation models do.
 """
 
 from __future__ import annotations
@@ -27,7 +26,25 @@ _CELL_M, _CELLS = 40.0, 640
 
 @dataclass(frozen=True)
 class PictureTrial:
-    """A picture ``(H, W, 3)`` uint8 with its true sky and camera, and what is known of it."""
+    """Synthetic photograph with its ground truth, and the inputs of an alignment.
+
+    Parameters
+    ----------
+    image
+        Photograph ``(H, W, 3)`` uint8 sRGB.
+    mask
+        ``(H, W)`` bool, False on the foreground.
+    sky
+        ``(H, W)`` bool, True where the rendered terrain shows sky (foreground ignored).
+    truth
+        True view.
+    start
+        Approximate view, the start of an alignment.
+    rasters
+        Elevation rasters for the alignment.
+    frame
+        Local frame of the views.
+    """
 
     image: np.ndarray
     mask: np.ndarray
@@ -38,8 +55,19 @@ class PictureTrial:
     frame: LocalFrame
 
 
-def made_up_massif(rng: np.random.Generator) -> Raster:
-    """A fractal mountain range of 26 km by 26 km: ridged noise in octaves over a broad valley."""
+def fractal_massif(rng: np.random.Generator) -> Raster:
+    """Generate a fractal mountain range of 26 km by 26 km from octaves of ridged noise.
+
+    Parameters
+    ----------
+    rng
+        Random generator.
+
+    Returns
+    -------
+    Raster
+        Heights ``(640, 640, 1)`` [m] with cells of 40 m.
+    """
     height = np.zeros((_CELLS, _CELLS), np.float32)
     amplitude, cells = 900.0, 5
     weight = np.ones_like(height)
@@ -63,51 +91,79 @@ def picture_trial(
     heading_off_deg: float | None = None,
     size_px: tuple[int, int] = (1280, 854),
 ) -> PictureTrial:
-    """One trial.
+    """Generate one trial with a perspective camera.
 
     Parameters
     ----------
+    rng
+        Random generator.
     visibility_m
-        Meteorological visibility [m]: 20 to 150 km at random when left out. In fog of some hundred metres there is no
-        skyline, whatever an algorithm may believe.
+        Meteorological visibility [m]; log-uniform between 20 and 150 km if omitted. Fog with a visibility of some
+        hundred metres hides the skyline.
     covered
-        Share of the columns in which something masked reaches above the skyline; 0 to 0.35 at random when left out.
+        Fraction of the columns in which masked foreground rises above the skyline; uniform in [0, 0.35] if omitted.
     heading_off_deg
-        Error of the start's heading; uniform within ±10 when left out.
+        Heading error of the start [deg]; uniform within ±10 if omitted.
+    size_px
+        Width and height of the image [px].
+
+    Returns
+    -------
+    PictureTrial
+        Image, ground truth and start.
     """
-    raster = made_up_massif(rng)
-    frame, place = _viewpoint(raster, rng)
+    raster = fractal_massif(rng)
+    frame, viewpoint = _viewpoint(raster, rng)
     fov = rng.uniform(50, 75)
-    heading, elevation = _outlook(raster, frame, place, fov, rng)
+    heading, elevation = _open_heading(raster, frame, viewpoint[2], fov, rng)
     pitch = elevation - rng.uniform(0.0, 0.25) * fov * size_px[1] / size_px[0]
     truth = camera_at(
-        frame, *place, heading_deg=heading, pitch_deg=pitch, roll_deg=rng.normal(0, 0.7), fov_deg=fov, size_px=size_px
+        frame,
+        *viewpoint,
+        heading_deg=heading,
+        pitch_deg=pitch,
+        roll_deg=rng.normal(0, 0.7),
+        fov_deg=fov,
+        size_px=size_px,
     )
     view = look_at_rasters(truth, [raster], frame, nearest_m=120.0, reach_m=40e3)
-    distance, normal, seen = view.distance_m, view.normal, view.position_m - truth.position_m
+    distance, normal, offset = view.distance_m, view.normal, view.position_m - truth.position_m
     covered = rng.uniform(0.0, 0.35) if covered is None else covered
     if visibility_m is None:
         visibility_m = float(np.exp(rng.uniform(np.log(20e3), np.log(150e3))))
-    image = _paint(distance, normal, seen, rng, visibility_m)
-    image, mask = _stand_before(image, covered, rng)
+    image = _shade(distance, normal, offset, rng, visibility_m)
+    image, mask = _add_roof(image, covered, rng)
     values = values_of(truth, np.eye(3))
     values[0] += rng.uniform(-10, 10) if heading_off_deg is None else heading_off_deg
     values[1:3] += [rng.normal(0, 1.0), -values[2]]
     values[3:6] += rng.normal(0, 1.0, 3) * [3.0, 3.0, 2.0]
     error = cv2.GaussianBlur(rng.normal(size=(_CELLS, _CELLS)).astype(np.float32), (0, 0), 1.5)
-    known = replace(raster, values=raster.values + (5.0 * error / error.std())[..., None])
+    measured = replace(raster, values=raster.values + (5.0 * error / error.std())[..., None])
     return PictureTrial(
-        image, mask, np.isinf(distance), truth, view_from_values(truth, np.eye(3), values), (known,), frame
+        image, mask, np.isinf(distance), truth, view_from_values(truth, np.eye(3), values), (measured,), frame
     )
 
 
 def panorama_trial(rng: np.random.Generator, *, size_px: tuple[int, int] = (3600, 420)) -> PictureTrial:
-    """A full turn from one place; the start is off in heading, by some rows of the horizon and by a lean of its axis."""
-    raster = made_up_massif(rng)
-    frame, place = _viewpoint(raster, rng)
+    """Generate one trial with a full-circle panorama; the start has errors in heading, axis tilt and horizon row.
+
+    Parameters
+    ----------
+    rng
+        Random generator.
+    size_px
+        Width and height of the image [px].
+
+    Returns
+    -------
+    PictureTrial
+        Image, ground truth and start; no foreground, and the raster is the rendered terrain.
+    """
+    raster = fractal_massif(rng)
+    frame, viewpoint = _viewpoint(raster, rng)
     pose = np.eye(4)
     pose[:3, :3] = rotation_from_angles(rng.uniform(0, 360), *rng.normal(0, 0.4, 2))
-    pose[:3, 3] = [0.0, 0.0, place[2]]
+    pose[:3, 3] = [0.0, 0.0, viewpoint[2]]
     truth = panorama_from_angles(
         "cylindrical",
         size_px,
@@ -117,7 +173,7 @@ def panorama_trial(rng: np.random.Generator, *, size_px: tuple[int, int] = (3600
         horizon_row_px=size_px[1] * rng.uniform(0.45, 0.55),
     )
     view = look_at_rasters(truth, [raster], frame, nearest_m=120.0, reach_m=40e3)
-    image = _paint(view.distance_m, view.normal, view.position_m - truth.position_m, rng, 60e3)
+    image = _shade(view.distance_m, view.normal, view.position_m - truth.position_m, rng, 60e3)
     values = values_of(truth, np.eye(3))
     values[:3] = values[0] + rng.uniform(-10, 10), 0.0, 0.0
     values[8] = rng.uniform(-1.5, 1.5) * truth.fy * np.pi / 180.0
@@ -127,43 +183,53 @@ def panorama_trial(rng: np.random.Generator, *, size_px: tuple[int, int] = (3600
     )
 
 
-def _viewpoint(raster: Raster, rng: np.random.Generator):
-    """A place on a shoulder near the middle, 10 m above ground: high enough to see, not a summit."""
+def _viewpoint(raster: Raster, rng: np.random.Generator) -> tuple[LocalFrame, tuple[float, float, float]]:
+    """Frame of a viewpoint near the centre and its latitude, longitude [deg] and height [m], 10 m above the ground.
+
+    The ground height is the 85th percentile of random positions: high enough for a wide view, but not a summit.
+    """
     middle = np.array([_EAST_M, _NORTH_M]) + 0.5 * _CELLS * _CELL_M
-    spots = middle + rng.uniform(-4000, 4000, (60, 2))
-    latitude, longitude = geodetic_from_map(_CRS, spots[:, 0], spots[:, 1])
+    candidates = middle + rng.uniform(-4000, 4000, (60, 2))
+    latitude, longitude = geodetic_from_map(_CRS, candidates[:, 0], candidates[:, 1])
     height = terrain_height([raster], latitude, longitude)
     chosen = int(np.argsort(height)[int(0.85 * len(height))])
     frame = LocalFrame(float(latitude[chosen]), float(longitude[chosen]), 0.0, 0.13)
     return frame, (float(latitude[chosen]), float(longitude[chosen]), float(height[chosen]) + 10.0)
 
 
-def _outlook(raster: Raster, frame: LocalFrame, place, fov_deg: float, rng: np.random.Generator) -> tuple[float, float]:
-    """A heading with a wide view, as people choose for webcams, and the mean elevation of its skyline [deg]."""
-    position = np.array([0.0, 0.0, place[2]])
+def _open_heading(
+    raster: Raster, frame: LocalFrame, height_m: float, fov_deg: float, rng: np.random.Generator
+) -> tuple[float, float]:
+    """A heading with a wide view, as is typical of webcams, and the median elevation of its skyline [deg]."""
+    position = np.array([0.0, 0.0, height_m])
     horizon = horizon_from([raster], frame, position, azimuth_deg=np.arange(0.0, 360.0, 1.0), nearest_m=120.0)
     elevation = np.nan_to_num(horizon.skyline_elevation_deg, nan=30.0)
     distance = np.linalg.norm(np.nan_to_num(horizon.skyline_m) - position, axis=1)
     half = int(fov_deg / 2)
     window = np.arange(-half, half + 1)
-    # Share of the view that ends within 2 km or towers over the camera.
-    poor = (distance < 2000.0) | (elevation > 12.0)
-    share = np.array([poor[(a + window) % 360].mean() for a in range(360)])
-    chosen = int(rng.choice(np.argsort(share)[:60]))
+    # Azimuths whose skyline is nearer than 2 km or higher than 12°.
+    obstructed = (distance < 2000.0) | (elevation > 12.0)
+    fraction = np.array([obstructed[(a + window) % 360].mean() for a in range(360)])
+    chosen = int(rng.choice(np.argsort(fraction)[:60]))
     return float(chosen), float(np.median(elevation[(chosen + window) % 360]))
 
 
-def _paint(distance, normal, spot, rng, visibility_m: float) -> np.ndarray:
-    """Sunlit rock, meadow and snow patches behind air; clouds in the sky; blur, noise, eight bits."""
+def _shade(
+    distance: np.ndarray, normal: np.ndarray, offset_m: np.ndarray, rng: np.random.Generator, visibility_m: float
+) -> np.ndarray:
+    """Image ``(H, W, 3)`` uint8 of sunlit rock, meadow and snow behind haze, with clouds, blur and noise.
+
+    ``offset_m`` ``(H, W, 3)`` is the position of the surface relative to the camera.
+    """
     height, width = distance.shape
     sun = np.array([np.sin(t := rng.uniform(0, 2 * np.pi)), np.cos(t), rng.uniform(0.3, 1.2)])
-    lit = 0.25 + 0.75 * np.clip(normal @ (sun / np.linalg.norm(sun)), 0.0, 1.0)
+    shade = 0.25 + 0.75 * np.clip(normal @ (sun / np.linalg.norm(sun)), 0.0, 1.0)
     snow_line = rng.uniform(-900, 900)
-    spot = np.nan_to_num(spot)
-    patch = 250.0 * np.sin(spot[..., 0] / 170.0) * np.sin(spot[..., 1] / 210.0)
-    snowy = (spot[..., 2] + patch > snow_line)[..., None] & (normal[..., 2:] > 0.6)
-    grain = 1.0 + 0.25 * np.sin(spot[..., 0] / 31.0 + np.sin(spot[..., 1] / 23.0))[..., None]
-    ground = np.where(snowy, [0.85, 0.88, 0.92], np.array([0.16, 0.17, 0.10]) * grain) * lit[..., None]
+    offset_m = np.nan_to_num(offset_m)
+    patch = 250.0 * np.sin(offset_m[..., 0] / 170.0) * np.sin(offset_m[..., 1] / 210.0)
+    snowy = (offset_m[..., 2] + patch > snow_line)[..., None] & (normal[..., 2:] > 0.6)
+    grain = 1.0 + 0.25 * np.sin(offset_m[..., 0] / 31.0 + np.sin(offset_m[..., 1] / 23.0))[..., None]
+    ground = np.where(snowy, [0.85, 0.88, 0.92], np.array([0.16, 0.17, 0.10]) * grain) * shade[..., None]
     base = np.array([0.55, 0.68, 0.88]) * rng.uniform(0.7, 1.1) + rng.uniform(0, 0.25)
     clouds = (
         sum(
@@ -172,21 +238,21 @@ def _paint(distance, normal, spot, rng, visibility_m: float) -> np.ndarray:
         )
         * 0.5
     )
-    up = np.linspace(0.85, 1.1, height)[::-1, None, None]
-    sky = base * up + (rng.uniform(0.0, 0.5) * np.clip(clouds, 0, 1))[..., None]
-    seen = np.where(np.isfinite(distance), distance, 1e9)
-    # Koschmieder: 2 % of contrast is left at the visibility. In fog the sky itself is grey.
-    through = np.exp(-3.912 * seen / visibility_m)[..., None]
+    gradient = np.linspace(0.85, 1.1, height)[::-1, None, None]
+    sky = base * gradient + (rng.uniform(0.0, 0.5) * np.clip(clouds, 0, 1))[..., None]
+    path_m = np.where(np.isfinite(distance), distance, 1e9)
+    # Koschmieder: the contrast decreases to 2 % at the visibility. In fog the sky itself is uniform.
+    transmittance = np.exp(-3.912 * path_m / visibility_m)[..., None]
     sky = sky.mean(axis=(0, 1)) + (sky - sky.mean(axis=(0, 1))) * min(1.0, visibility_m / 10e3)
-    image = ground * through + sky.mean(axis=(0, 1)) * 0.97 * (1.0 - through)
+    image = ground * transmittance + sky.mean(axis=(0, 1)) * 0.97 * (1.0 - transmittance)
     image = np.where(np.isfinite(distance)[..., None], image, sky)
     image = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 0.7)
     encoded = np.clip(image, 0, 1) ** (1 / 2.2) * 255.0 + rng.normal(0, 1.5, image.shape)
     return np.clip(encoded, 0, 255).astype(np.uint8)
 
 
-def _stand_before(image: np.ndarray, covered: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """A dark roof that covers some columns up to the sky and the lowest rows; masked as its owner would."""
+def _add_roof(image: np.ndarray, covered: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Image with a dark roof that reaches above the skyline in a fraction of the columns, and the mask without it."""
     height, width = image.shape[:2]
     mask = np.ones((height, width), bool)
     if covered <= 0.0:

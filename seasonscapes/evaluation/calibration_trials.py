@@ -1,4 +1,4 @@
-"""Calibrations whose truth is known: synthetic matches and pictures with the faults that real ones have."""
+"""Synthetic trials of camera resection: correspondences with noise and outliers from a known camera, and their scores."""
 
 from __future__ import annotations
 
@@ -8,23 +8,35 @@ import numpy as np
 
 from seasonscapes.calibration.evidence import Correspondences, Priors
 from seasonscapes.calibration.pose_model import View, bearings, project_values, values_of, view_from_values
-from seasonscapes.calibration.resection import Calibration, resect
+from seasonscapes.calibration.resection import Calibration, Loss, resect
 from seasonscapes.cameras.panorama import panorama_from_angles
 from seasonscapes.cameras.pinhole import Camera, rotation_from_angles
 
-# A start 30 m off in a random direction is what this standard deviation of each axis describes.
+# Position error of the start, and the standard deviation per axis of an error of that length in a random direction [m].
 START_OFFSET_M = 30.0
 START_SIGMA_M = START_OFFSET_M / np.sqrt(3.0)
 
 
 @dataclass(frozen=True)
 class PointTrial:
-    """A camera, matches of it with noise and outliers, and a start that is off."""
+    """Correspondences of a known camera and an inaccurate start.
+
+    Parameters
+    ----------
+    truth
+        True view.
+    start
+        Approximate view, the start of a resection.
+    points
+        N correspondences with noise and outliers.
+    outlier
+        ``(N,)`` bool, True for outliers.
+    """
 
     truth: View
     start: View
     points: Correspondences
-    wrong: np.ndarray
+    outlier: np.ndarray
 
 
 def point_trial(
@@ -36,9 +48,28 @@ def point_trial(
     outlier_share: float = 0.2,
     heading_off_deg: float = 5.0,
 ) -> PointTrial:
-    """Points of 200 m to 15 km distance all over the picture; wrong ones lie 20 to 400 px away from their place.
+    """Generate correspondences at distances of 200 m to 15 km, spread over the image.
 
-    The panorama is that of a 35 mm rotating camera (0.023° a pixel), the photograph a frame of 65°.
+    Parameters
+    ----------
+    rng
+        Random generator.
+    panoramic
+        Whether the view is a full-circle panorama (of a 35 mm rotating camera, 0.023° per pixel) or a photograph with a
+        field of view of 65°.
+    count
+        Number of correspondences.
+    noise_px
+        Standard deviation of a pixel coordinate [px].
+    outlier_share
+        Fraction of outliers, which are displaced by 20 to 400 px.
+    heading_off_deg
+        Absolute heading error of the start [deg].
+
+    Returns
+    -------
+    PointTrial
+        True view, start, correspondences and outliers.
     """
     heading, tilt, roll = rng.uniform(0, 360), rng.normal(0, 3.0), rng.normal(0, 1.5)
     pose = np.eye(4)
@@ -54,33 +85,67 @@ def point_trial(
     pixel = rng.uniform(0.04 * size, [0.96, 0.8] * size, (count, 2))
     distance = np.exp(rng.uniform(np.log(200.0), np.log(15e3), count))
     position = truth.position_m + distance[:, None] * bearings(truth, 0.0, pixel)
-    seen = pixel + rng.normal(0, noise_px, (count, 2))
-    wrong = np.zeros(count, bool)
-    wrong[rng.permutation(count)[: round(outlier_share * count)]] = True
-    angle = rng.uniform(0, 2 * np.pi, wrong.sum())
-    seen[wrong] += rng.uniform(20, 400, (wrong.sum(), 1)) * np.stack([np.cos(angle), np.sin(angle)], -1)
+    observed = pixel + rng.normal(0, noise_px, (count, 2))
+    outlier = np.zeros(count, bool)
+    outlier[rng.permutation(count)[: round(outlier_share * count)]] = True
+    angle = rng.uniform(0, 2 * np.pi, outlier.sum())
+    observed[outlier] += rng.uniform(20, 400, (outlier.sum(), 1)) * np.stack([np.cos(angle), np.sin(angle)], -1)
     values = values_of(truth, np.eye(3))
     values[0] += rng.choice([-1.0, 1.0]) * heading_off_deg
     values[1:3] += rng.normal(0, 1.0, 2)
     offset = rng.normal(size=3)
     values[3:6] += START_OFFSET_M * offset / np.linalg.norm(offset)
     values[6] += rng.normal(0, 0.02)
-    return PointTrial(truth, view_from_values(truth, np.eye(3), values), Correspondences(seen, position), wrong)
+    return PointTrial(truth, view_from_values(truth, np.eye(3), values), Correspondences(observed, position), outlier)
 
 
 @dataclass(frozen=True)
 class PointScore:
-    """How one trial ended; ``within_two_sigma`` ``(3,)`` of east, north and up."""
+    """Errors of a resection against the ground truth.
+
+    Parameters
+    ----------
+    heading_error_deg
+        Absolute heading error [deg].
+    focal_error
+        Absolute relative error of the focal length.
+    position_error_m
+        Error ``(3,)`` of east, north and up [m].
+    within_two_sigma
+        ``(3,)`` bool, whether the error of each coordinate is within two standard deviations.
+    outliers_found
+        Whether all outliers were rejected.
+    """
 
     heading_error_deg: float
     focal_error: float
     position_error_m: np.ndarray
     within_two_sigma: np.ndarray
-    wrong_found: bool
+    outliers_found: bool
 
 
-def score_points(trial: PointTrial, *, noise_px: float | None = None, loss: str = "cauchy") -> PointScore:
-    """Calibrate a trial and compare with its truth."""
+def score_points(trial: PointTrial, *, noise_px: float | None = None, loss: Loss = "cauchy") -> PointScore:
+    """Calibrate a trial and compare the result with the ground truth.
+
+    Parameters
+    ----------
+    trial
+        Synthetic trial.
+    noise_px
+        Standard deviation of a pixel coordinate [px]; estimated if ``None``.
+    loss
+        Robust loss, as in `resect`.
+
+    Returns
+    -------
+    PointScore
+        Errors of the result.
+
+    Raises
+    ------
+    NotEnoughEvidence
+        As `resect`.
+    """
     priors = Priors(horizontal_m=START_SIGMA_M, vertical_m=START_SIGMA_M)
     solved: Calibration = resect(trial.start, trial.points, priors=priors, noise_px=noise_px, loss=loss)
     truth = values_of(trial.truth, np.eye(3))
@@ -91,11 +156,22 @@ def score_points(trial: PointTrial, *, noise_px: float | None = None, loss: str 
         abs(solved.view.fy / trial.truth.fy - 1.0),
         error[3:6],
         np.abs(error[3:6]) <= 2.0 * sigma,
-        bool(solved.outlier[trial.wrong].all()),
+        bool(solved.outlier[trial.outlier].all()),
     )
 
 
 def reproject(trial: PointTrial) -> np.ndarray:
-    """True pixels ``(N, 2)`` of a trial's points, for tests of the trial itself."""
+    """Project the points of a trial with its true view, for tests of the trial itself.
+
+    Parameters
+    ----------
+    trial
+        Synthetic trial of N points.
+
+    Returns
+    -------
+    ndarray
+        True pixels ``(N, 2)``.
+    """
     axes = np.eye(3)
     return project_values(trial.truth, axes, values_of(trial.truth, axes), trial.points.position_m)[0]

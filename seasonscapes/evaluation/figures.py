@@ -1,4 +1,4 @@
-"""Pictures beside the truth: truth | ours | another | difference, with the steepest part magnified below."""
+"""Comparison figures: images side by side with the ground truth, the FLIP error map and a magnified detail."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ import numpy as np
 
 from seasonscapes.evaluation.metrics import flip_map
 
-_GAP_PX, _HEAD_PX = 4, 18
-_PAPER = 0.97
-# Anchors of the difference's colours: black, violet, orange, pale yellow; even steps of error look even.
-_HEAT = np.array([[0.0, 0.0, 0.02], [0.32, 0.07, 0.48], [0.71, 0.21, 0.47], [0.98, 0.53, 0.38], [0.99, 0.99, 0.75]])
+_GAP_PX, _LABEL_PX = 4, 18
+_BACKGROUND = 0.97
+# Colour map of the error from 0 to 1: black, violet, orange, pale yellow (perceptually uniform).
+_ERROR_COLOURS = np.array(
+    [[0.0, 0.0, 0.02], [0.32, 0.07, 0.48], [0.71, 0.21, 0.47], [0.98, 0.53, 0.38], [0.99, 0.99, 0.75]]
+)
 
 
 def comparison(
@@ -22,70 +24,109 @@ def comparison(
     window: tuple[int, int, int, int] | None = None,
     magnify: int = 3,
 ) -> np.ndarray:
-    """One row of pictures with their names, then the FLIP error of the second against the first.
+    """Compose a row of labelled images followed by the FLIP error map of the second image against the first.
 
     Parameters
     ----------
     pictures
-        Name to ``(H, W, 3)`` sRGB-encoded in [0, 1]; the first is the truth, the second is what is judged.
+        Images ``(H, W, 3)``, sRGB-encoded in [0, 1], by label; the first is the ground truth, the second is evaluated.
     mask
-        ``(H, W)`` bool; beyond it pictures are paled and no difference is shown.
+        ``(H, W)`` bool; outside the mask images are brightened and the error is zero. All pixels if omitted.
     window
-        Left, top, width and height [px] of a part to magnify below (`steepest_window`).
+        Left, top, width and height [px] of a detail that is magnified in a second row (`steepest_window`).
     magnify
-        How many times at most; a magnified part is as wide as its picture.
+        Maximum magnification; a magnified detail is at most as wide as its image.
 
     Returns
     -------
     ndarray
-        ``(h, w, 3)`` in [0, 1], sRGB-encoded.
+        Figure ``(h, w, 3)``, sRGB-encoded in [0, 1].
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than two images, or their shapes differ.
     """
     if len(pictures) < 2:
-        raise ValueError(f"comparison: {len(pictures)} pictures, expected the truth and at least one more")
-    names, shown = list(pictures), [np.asarray(picture, np.float64) for picture in pictures.values()]
-    if len({picture.shape for picture in shown}) != 1:
-        raise ValueError(f"comparison: pictures of shapes {[picture.shape for picture in shown]}")
-    mask = np.ones(shown[0].shape[:2], bool) if mask is None else mask
-    error = error_colours(np.where(mask, flip_map(shown[0], np.where(mask[..., None], shown[1], shown[0])), 0.0))
-    rows = [_row([_paled(picture, mask) for picture in shown] + [error], [*names, f"difference of {names[1]}"])]
+        raise ValueError(f"comparison: got {len(pictures)} images, expected the ground truth and at least one more")
+    names, images = list(pictures), [np.asarray(picture, np.float64) for picture in pictures.values()]
+    if len({image.shape for image in images}) != 1:
+        raise ValueError(f"comparison: got shapes {[image.shape for image in images]}, expected equal shapes")
+    mask = np.ones(images[0].shape[:2], bool) if mask is None else mask
+    error = error_colours(np.where(mask, flip_map(images[0], np.where(mask[..., None], images[1], images[0])), 0.0))
+    rows = [_row([_brighten_masked(image, mask) for image in images] + [error], [*names, f"difference of {names[1]}"])]
     if window is not None:
         left, top, width, height = window
-        size = min(magnify * width, shown[0].shape[1])
+        magnified_px = min(magnify * width, images[0].shape[1])
         rows.append(
             _row(
-                [_grown(picture[top : top + height, left : left + width], size) for picture in [*shown, error]],
-                [""] * (len(shown) + 1),
-                shown[0].shape[1],
+                [_magnify(image[top : top + height, left : left + width], magnified_px) for image in [*images, error]],
+                [""] * (len(images) + 1),
+                images[0].shape[1],
             )
         )
     return np.concatenate(rows)
 
 
 def side_by_side(pictures: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Pictures ``(H, W, 3)`` in [0, 1] in one row, with their names above; `ValueError` where sizes differ."""
-    shown = [np.asarray(picture, np.float64) for picture in pictures.values()]
-    if len({picture.shape for picture in shown}) != 1:
-        raise ValueError(f"side_by_side: pictures of shapes {[picture.shape for picture in shown]}")
-    return _row(shown, list(pictures))
+    """Compose a row of labelled images.
+
+    Parameters
+    ----------
+    pictures
+        Images ``(H, W, 3)``, sRGB-encoded in [0, 1], by label.
+
+    Returns
+    -------
+    ndarray
+        Figure ``(h, w, 3)``, sRGB-encoded in [0, 1].
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ.
+    """
+    images = [np.asarray(picture, np.float64) for picture in pictures.values()]
+    if len({image.shape for image in images}) != 1:
+        raise ValueError(f"side_by_side: got shapes {[image.shape for image in images]}, expected equal shapes")
+    return _row(images, list(pictures))
 
 
 def error_colours(values: np.ndarray) -> np.ndarray:
-    """Colours ``(H, W, 3)`` of errors ``(H, W)`` in [0, 1]."""
-    place = np.linspace(0.0, 1.0, len(_HEAT))
-    return np.stack([np.interp(values, place, channel) for channel in _HEAT.T], axis=-1)
+    """Map errors to colours.
+
+    Parameters
+    ----------
+    values
+        Errors ``(H, W)`` in [0, 1].
+
+    Returns
+    -------
+    ndarray
+        Colours ``(H, W, 3)``, sRGB-encoded in [0, 1].
+    """
+    knots = np.linspace(0.0, 1.0, len(_ERROR_COLOURS))
+    return np.stack([np.interp(values, knots, channel) for channel in _ERROR_COLOURS.T], axis=-1)
 
 
 def steepest_window(
     normal: np.ndarray, depth_m: np.ndarray, *, share: float = 1.0 / 3.0, nearest_m: float = 60.0
 ) -> tuple[int, int, int, int]:
-    """The part of a view that shows most steep land: left, top, width, height [px].
+    """Find the window of a view with the most steep terrain.
 
     Parameters
     ----------
     normal, depth_m
-        ``(H, W, 3)`` and ``(H, W)`` of the view's G-buffer.
+        Normals ``(H, W, 3)`` and distances ``(H, W)`` [m] of the view's G-buffer.
     share
-        Of the picture's width and height.
+        Size of the window as a fraction of the image size.
+    nearest_m
+        Terrain nearer than this distance is ignored [m].
+
+    Returns
+    -------
+    left, top, width, height : int
+        Window [px].
     """
     height, width = depth_m.shape
     steep = np.where(np.isfinite(depth_m) & (depth_m > nearest_m), 1.0 - np.nan_to_num(normal[..., 2], nan=1.0), 0.0)
@@ -101,28 +142,29 @@ def steepest_window(
     return int(left), int(top), size[1], size[0]
 
 
-def _paled(picture: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    return np.where(mask[..., None], picture, 0.5 * picture + 0.5 * _PAPER)
+def _brighten_masked(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    return np.where(mask[..., None], image, 0.5 * image + 0.5 * _BACKGROUND)
 
 
-def _grown(picture: np.ndarray, width_px: int) -> np.ndarray:
-    height_px = round(picture.shape[0] * width_px / picture.shape[1])
-    return cv2.resize(picture, (width_px, height_px), interpolation=cv2.INTER_NEAREST)
+def _magnify(image: np.ndarray, width_px: int) -> np.ndarray:
+    height_px = round(image.shape[0] * width_px / image.shape[1])
+    return cv2.resize(image, (width_px, height_px), interpolation=cv2.INTER_NEAREST)
 
 
-def _row(pictures: list[np.ndarray], names: list[str], column_px: int | None = None) -> np.ndarray:
-    column_px = column_px or pictures[0].shape[1]
-    head = _HEAD_PX if any(names) else 0
-    sheet = np.full((head + pictures[0].shape[0] + _GAP_PX, len(pictures) * (column_px + _GAP_PX), 3), _PAPER)
-    for number, (picture, name) in enumerate(zip(pictures, names, strict=True)):
-        left = number * (column_px + _GAP_PX)
-        sheet[head : head + picture.shape[0], left : left + picture.shape[1]] = picture
-        if name:
-            sheet[:head, left : left + column_px] = _written(name, (head, column_px))
+def _row(images: list[np.ndarray], labels: list[str], column_px: int | None = None) -> np.ndarray:
+    """Images of equal size in columns, with labels above unless all are empty."""
+    width = images[0].shape[1] if column_px is None else column_px
+    head = _LABEL_PX if any(labels) else 0
+    sheet = np.full((head + images[0].shape[0] + _GAP_PX, len(images) * (width + _GAP_PX), 3), _BACKGROUND)
+    for number, (image, label) in enumerate(zip(images, labels, strict=True)):
+        left = number * (width + _GAP_PX)
+        sheet[head : head + image.shape[0], left : left + image.shape[1]] = image
+        if label:
+            sheet[:head, left : left + width] = _label_image(label, (head, width))
     return sheet
 
 
-def _written(text: str, size: tuple[int, int]) -> np.ndarray:
-    strip = np.full((*size, 3), round(255 * _PAPER), np.uint8)
+def _label_image(text: str, size: tuple[int, int]) -> np.ndarray:
+    strip = np.full((*size, 3), round(255 * _BACKGROUND), np.uint8)
     cv2.putText(strip, text, (2, size[0] - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (25, 25, 25), 1, cv2.LINE_AA)
     return strip / 255.0

@@ -1,55 +1,76 @@
-"""LPIPS with AlexNet: distance of pictures in the features of a network that was trained to know things.
+"""LPIPS with AlexNet: perceptual distance of two images in the feature space of a classification network.
 
-Zhang, Isola, Efros, Shechtman & Wang 2018 (doi:10.1109/CVPR.2018.00068), version 0.1. Two weight files are needed, by
-local path; they are the user's to get: ``alexnet.pth`` (state dict of torchvision's AlexNet, keys ``features.0.weight`` …)
-and ``lpips_alex.pth`` (its linear layers, keys ``lin0.model.1.weight`` …).
+Zhang, Isola, Efros, Shechtman & Wang 2018 (doi:10.1109/CVPR.2018.00068), version 0.1. Two local weight files,
+not distributed with this package, are required: ``alexnet.pth`` (state dict of torchvision's AlexNet, keys
+``features.0.weight`` …) and ``lpips_alex.pth`` (its linear layers, keys ``lin0.model.1.weight`` …).
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+if TYPE_CHECKING:
+    import torch
+
 WEIGHTS = ("alexnet.pth", "lpips_alex.pth")
 ENVIRONMENT = "SEASONSCAPES_LPIPS"
-# ImageNet's mean and standard deviation, for values in [-1, 1].
+# Mean and standard deviation of ImageNet colours, for values in [-1, 1].
 _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-# Layer of torchvision's `features`, stride, padding, and whether pooling comes before it.
+# Convolutional layers: index in torchvision's `features`, stride, padding, and whether max pooling precedes it.
 _LAYERS = ((0, 4, 2, False), (3, 1, 2, True), (6, 1, 1, True), (8, 1, 1, False), (10, 1, 1, False))
 _SMALLEST_PX = 31
 Lpips = Callable[[np.ndarray, np.ndarray, np.ndarray | None], float]
 
 
 def missing_lpips(folder: Path | None = None) -> str | None:
-    """Why LPIPS cannot be measured, or ``None`` where it can."""
-    folder = folder or (Path(os.environ[ENVIRONMENT]) if ENVIRONMENT in os.environ else None)
-    if folder is None:
-        return f"no folder of weights is named (set {ENVIRONMENT})"
-    absent = [name for name in WEIGHTS if not (folder / name).is_file()]
-    return f"{folder} holds no {' and no '.join(absent)}" if absent else None
-
-
-def load_lpips(folder: Path | None = None) -> Lpips:
-    """A function that measures LPIPS of two pictures ``(H, W, 3)`` sRGB in [0, 1], within a mask or over the frame.
+    """Describe why LPIPS is not available.
 
     Parameters
     ----------
     folder
-        Of the two weight files; left out, what the environment names.
+        Folder of the weight files; the value of the environment variable ``SEASONSCAPES_LPIPS`` if omitted.
+
+    Returns
+    -------
+    str or None
+        Reason, or ``None`` if all weight files exist.
+    """
+    folder = folder or (Path(os.environ[ENVIRONMENT]) if ENVIRONMENT in os.environ else None)
+    if folder is None:
+        return f"no folder of weights is given (set {ENVIRONMENT})"
+    absent = [name for name in WEIGHTS if not (folder / name).is_file()]
+    return f"{folder} does not contain {' and '.join(absent)}" if absent else None
+
+
+def load_lpips(folder: Path | None = None) -> Lpips:
+    """Load LPIPS from its weight files.
+
+    Parameters
+    ----------
+    folder
+        Folder of the weight files; the value of the environment variable ``SEASONSCAPES_LPIPS`` if omitted.
+
+    Returns
+    -------
+    callable
+        Function of two images ``(H, W, 3)``, sRGB-encoded in [0, 1], and a mask ``(H, W)`` bool or ``None``, that
+        returns their LPIPS within the mask, or over the whole image.
 
     Raises
     ------
     FileNotFoundError
-        Weights are missing; `missing_lpips` says which.
+        If a weight file is missing (`missing_lpips`).
     ValueError
-        The files hold other weights.
+        If the files contain other weights.
     """
-    why = missing_lpips(folder)
-    if why is not None:
-        raise FileNotFoundError(f"LPIPS: {why}")
+    reason = missing_lpips(folder)
+    if reason is not None:
+        raise FileNotFoundError(f"LPIPS: {reason}")
     import torch
 
     folder = folder or Path(os.environ[ENVIRONMENT])
@@ -57,8 +78,26 @@ def load_lpips(folder: Path | None = None) -> Lpips:
     return lpips_of(network, linear)
 
 
-def lpips_of(network: dict, linear: dict) -> Lpips:
-    """LPIPS from state dicts of the network and of the linear layers; see `load_lpips`."""
+def lpips_of(network: Mapping[str, torch.Tensor], linear: Mapping[str, torch.Tensor]) -> Lpips:
+    """Create LPIPS from the state dicts of its network and linear layers.
+
+    Parameters
+    ----------
+    network
+        State dict of torchvision's AlexNet.
+    linear
+        State dict of the linear layers.
+
+    Returns
+    -------
+    callable
+        As `load_lpips`.
+
+    Raises
+    ------
+    ValueError
+        If a key is missing.
+    """
     import torch
 
     try:
@@ -67,35 +106,35 @@ def lpips_of(network: dict, linear: dict) -> Lpips:
         ]
         weights = [linear[f"lin{i}.model.1.weight"].float() for i in range(len(_LAYERS))]
     except KeyError as error:
-        raise ValueError(f"LPIPS: the weights have no {error}") from None
+        raise ValueError(f"LPIPS: the weights lack the key {error}") from None
     shift, scale = (torch.tensor(values).view(1, 3, 1, 1) for values in (_SHIFT, _SCALE))
 
     def features(image: np.ndarray) -> list[torch.Tensor]:
         x = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)[None], np.float32)) * 2.0 - 1.0
-        x, found = (x - shift) / scale, []
+        x, outputs = (x - shift) / scale, []
         for (_, stride, padding, pool), (weight, bias) in zip(_LAYERS, convolutions, strict=True):
             x = torch.nn.functional.max_pool2d(x, 3, 2) if pool else x
             x = torch.relu(torch.nn.functional.conv2d(x, weight, bias, stride, padding))
-            found.append(x / (x.norm(dim=1, keepdim=True) + 1e-10))
-        return found
+            outputs.append(x / (x.norm(dim=1, keepdim=True) + 1e-10))
+        return outputs
 
-    def measure(truth: np.ndarray, picture: np.ndarray, mask: np.ndarray | None = None) -> float:
+    def measure(truth: np.ndarray, image: np.ndarray, mask: np.ndarray | None = None) -> float:
         if min(truth.shape[:2]) < _SMALLEST_PX:
             raise ValueError(
-                f"LPIPS: a picture of {truth.shape[:2]} pixels, expected at least {_SMALLEST_PX} on a side"
+                f"LPIPS: got an image of {truth.shape[:2]} pixels, expected at least {_SMALLEST_PX} on each side"
             )
         total = 0.0
         with torch.no_grad():
-            for a, b, weight in zip(features(truth), features(picture), weights, strict=True):
+            for a, b, weight in zip(features(truth), features(image), weights, strict=True):
                 layer = torch.nn.functional.conv2d((a - b) ** 2, weight)
-                total += float(_mean(layer, mask))
+                total += float(_masked_mean(layer, mask))
         return total
 
-    def _mean(layer: torch.Tensor, mask: np.ndarray | None) -> torch.Tensor:
+    def _masked_mean(layer: torch.Tensor, mask: np.ndarray | None) -> torch.Tensor:
         if mask is None:
             return layer.mean()
-        share = torch.from_numpy(mask.astype(np.float32))[None, None]
-        share = torch.nn.functional.interpolate(share, layer.shape[2:], mode="area")
-        return (layer * share).sum() / share.sum()
+        weight = torch.from_numpy(mask.astype(np.float32))[None, None]
+        weight = torch.nn.functional.interpolate(weight, layer.shape[2:], mode="area")
+        return (layer * weight).sum() / weight.sum()
 
     return measure

@@ -1,42 +1,72 @@
-"""Which pixels count: land at a distance that can be judged, by metric depth; and the reference evaluation's own rule."""
+"""Evaluation masks: terrain within a range of distances, and the mask of the reference evaluation."""
 
 from __future__ import annotations
 
 import numpy as np
 
-# What is nearer than this is rather a roof or a tree than the terrain model's ground; painting leaves it out, too.
+# Nearer pixels often show roofs or trees that the terrain model lacks; painting excludes them as well.
 NEAR_M = 60.0
 
 
 def land_mask(depth_m: np.ndarray, *, near_m: float = NEAR_M, far_m: float = np.inf) -> np.ndarray:
-    """Pixels ``(H, W)`` bool that show land between two distances; infinite depth is sky.
+    """Return the mask of pixels that show terrain between two distances.
+
+    Parameters
+    ----------
+    depth_m
+        Distance ``(H, W)`` along the ray [m]; infinite in the sky.
+    near_m, far_m
+        Minimum and maximum distance [m].
+
+    Returns
+    -------
+    ndarray
+        ``(H, W)`` bool.
 
     Raises
     ------
     ValueError
-        Depth is NaN or negative somewhere, or the distances are not in order.
+        If a depth is NaN or negative, or the distances are not in order.
+
+    Examples
+    --------
+    >>> land_mask(np.array([[10.0, 500.0, np.inf]]))
+    array([[False,  True, False]])
     """
     depth_m = np.asarray(depth_m)
     if not (depth_m >= 0.0).all():
         raise ValueError("land_mask: depth is negative or NaN")
     if not 0.0 <= near_m < far_m:
-        raise ValueError(f"land_mask: near_m = {near_m}, far_m = {far_m}, expected 0 ≤ near_m < far_m")
+        raise ValueError(f"land_mask: got near_m = {near_m}, far_m = {far_m}, expected 0 ≤ near_m < far_m")
     return np.isfinite(depth_m) & (depth_m >= near_m) & (depth_m <= far_m)
 
 
 def reference_mask(depth_m: np.ndarray, *, share: float = 0.45) -> np.ndarray:
-    """The mask of the reference evaluation: without the sky, and without about the nearest share of the land.
+    """Return the mask of the reference evaluation: no sky, and not the nearest fraction of the terrain.
 
-    Depth along the view is normalised to 0.5 (near) … 1 (far), sky 0; a histogram of 256 bins over [0, 1] loses its
-    first bin; the mask is what lies beyond the bin where the cumulated histogram reaches the share. The bin's index is
-    used as a level without the bin that was dropped, so that the cut lies one bin too near. All of that is kept.
+    The depth is normalised to 0.5 (nearest) … 1 (farthest), sky 0. A histogram of 256 bins over [0, 1], without its
+    first bin, is cumulated; the mask contains the pixels beyond the bin at which it reaches ``share``. As in the
+    reference code, the index of that bin is not corrected for the removed first bin, so the threshold is one bin too
+    near.
+
+    Parameters
+    ----------
+    depth_m
+        Distance ``(H, W)`` along the ray [m]; infinite in the sky.
+    share
+        Fraction of the terrain pixels to exclude.
+
+    Returns
+    -------
+    ndarray
+        ``(H, W)`` bool.
     """
     depth_m = np.asarray(depth_m, np.float64)
-    land = np.isfinite(depth_m)
-    if not land.any():
-        return land
-    near, far = depth_m[land].min(), depth_m[land].max()
-    level = np.where(land, 0.5 + 0.5 * (np.where(land, depth_m, near) - near) / max(far - near, 1e-9), 0.0)
+    terrain = np.isfinite(depth_m)
+    if not terrain.any():
+        return terrain
+    near, far = depth_m[terrain].min(), depth_m[terrain].max()
+    level = np.where(terrain, 0.5 + 0.5 * (np.where(terrain, depth_m, near) - near) / max(far - near, 1e-9), 0.0)
     counts = np.histogram(level, bins=256, range=(0.0, 1.0))[0][1:]
     cumulated = np.cumsum(counts) / counts.sum()
     return level > np.searchsorted(cumulated, share) / 255.0

@@ -1,9 +1,9 @@
-"""How far a picture is from the truth: PSNR, SSIM, FLIP, colour angle. Masked honestly, or as the paper does.
+"""Image quality metrics against a ground truth: PSNR, SSIM, FLIP, LPIPS and colour angle, with two ways of masking.
 
-Mode ``valid`` looks at pixels within the mask alone. Mode ``paper`` multiplies both pictures by the mask and scores the
-whole frame, as the reference evaluation does: masked pixels then count as perfect, which adds ``-10 log10(share)`` dB to
-PSNR. It is there to compare with published numbers, and the share that the mask leaves always goes with a score.
-Pictures are display values (sRGB-encoded) in [0, 1].
+Mode ``valid`` evaluates only pixels within the mask. Mode ``paper`` multiplies both images by the mask and evaluates the
+whole image, as the reference evaluation does: masked pixels then count as perfect, which adds ``-10 log10(share)`` dB to
+PSNR, with ``share`` the fraction of pixels within the mask. That mode serves to compare with published values; every
+score reports the fraction. Images are display values (sRGB-encoded) in [0, 1].
 """
 
 from __future__ import annotations
@@ -13,33 +13,35 @@ from dataclasses import asdict, dataclass
 import cv2
 import numpy as np
 
+from seasonscapes.errors import NoUsablePixels
+from seasonscapes.evaluation.lpips import Lpips
 from seasonscapes.images import linear_from_srgb
 
 MODES = ("valid", "paper")
 # Wang, Bovik, Sheikh & Simoncelli 2004 (doi:10.1109/TIP.2003.819861): Gaussian window of 11 pixels, sigma 1.5.
 _SSIM_WINDOW, _SSIM_SIGMA = 11, 1.5
-# Darker than this (linear, of 1) a pixel's colour is noise.
-_DARKEST = 1e-3
+# Linear colours with a smaller norm are excluded from the colour angle, because noise dominates them.
+_MIN_NORM = 1e-3
 
 
 @dataclass(frozen=True)
 class Score:
-    """A picture against the truth.
+    """Metrics of an image against the ground truth.
 
     Parameters
     ----------
     psnr_db
-        Peak signal to noise, 1 being the peak; infinite for equal pictures.
+        Peak signal-to-noise ratio for a peak of 1 [dB]; infinite for equal images.
     ssim
-        Mean structural similarity; in mode ``valid`` of windows wholly within the mask, NaN where there is none.
+        Mean structural similarity; in mode ``valid`` over windows that lie entirely within the mask, NaN without any.
     flip
         Mean FLIP error (Andersson et al. 2020, doi:10.1145/3406183) at 67 pixels per degree, 0 to 1.
     colour_angle_deg
-        Mean angle between linear colours, which no exposure changes; NaN where all is black.
+        Mean angle between linear colours [deg], independent of exposure; NaN if all pixels are black.
     mask_share
-        Of the frame that the mask leaves, 0 to 1.
+        Fraction of the image within the mask, 0 to 1.
     lpips
-        LPIPS, where its weights are at hand.
+        LPIPS, or ``None`` if it was not computed.
     """
 
     psnr_db: float
@@ -50,32 +52,44 @@ class Score:
     lpips: float | None = None
 
     def record(self) -> dict[str, float]:
-        """Plain numbers by name; without LPIPS where it was not measured."""
+        """Return the metrics by name, without LPIPS if it was not computed."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 
 def score(
-    truth: np.ndarray, picture: np.ndarray, mask: np.ndarray | None = None, *, mode: str = "valid", lpips=None
+    truth: np.ndarray,
+    picture: np.ndarray,
+    mask: np.ndarray | None = None,
+    *,
+    mode: str = "valid",
+    lpips: Lpips | None = None,
 ) -> Score:
-    """All metrics of a picture against the truth.
+    """Compute all metrics of an image against the ground truth.
 
     Parameters
     ----------
     truth, picture
-        ``(H, W, 3)`` sRGB-encoded, in [0, 1].
+        Ground truth and image ``(H, W, 3)``, sRGB-encoded in [0, 1].
     mask
-        ``(H, W)`` bool, True where it counts; left out, everywhere.
+        ``(H, W)`` bool, True where pixels are evaluated; all pixels if omitted.
     mode
-        ``valid`` or ``paper``.
+        Masking, ``valid`` or ``paper`` (see the module).
     lpips
-        A function of two pictures ``(H, W, 3)`` and of a mask, or ``None`` (`lpips.load_lpips`).
+        LPIPS function (`lpips.load_lpips`), or ``None`` to omit that metric.
+
+    Returns
+    -------
+    Score
+        The metrics.
 
     Raises
     ------
+    NoUsablePixels
+        If the mask contains no pixel.
     ValueError
-        Shapes differ, values are outside [0, 1] or not finite, the mask leaves nothing, or the mode is unknown.
+        If the shapes differ, values within the mask are not finite or outside [0, 1], or the mode is unknown.
     """
-    truth, picture, mask = _checked(truth, picture, mask, mode)
+    truth, picture, mask = _validated(truth, picture, mask, mode)
     return Score(
         psnr_db(truth, picture, mask, mode=mode),
         ssim(truth, picture, mask, mode=mode),
@@ -84,28 +98,49 @@ def score(
         float(mask.mean()),
         None
         if lpips is None
-        else float(lpips(*_framed(truth, picture, mask, mode), mask if mode == "valid" else None)),
+        else float(lpips(*_fill_masked(truth, picture, mask, mode), mask if mode == "valid" else None)),
     )
 
 
 def psnr_db(truth: np.ndarray, picture: np.ndarray, mask: np.ndarray | None = None, *, mode: str = "valid") -> float:
-    """Peak signal-to-noise ratio [dB] of values whose peak is 1, ``-10 log10(mean squared error)``; see `score`.
+    """Compute the peak signal-to-noise ratio ``-10 log10(mean squared error)`` for a peak of 1.
 
-    In mode ``paper`` it is the mean of the three channels' decibels, as the reference code has it.
+    In mode ``paper`` the values of the three channels [dB] are averaged, as in the reference code.
+
+    Parameters
+    ----------
+    truth, picture, mask, mode
+        As in `score`.
+
+    Returns
+    -------
+    float
+        PSNR [dB]; infinite for equal images.
     """
-    truth, picture, mask = _checked(truth, picture, mask, mode)
+    truth, picture, mask = _validated(truth, picture, mask, mode)
     squared = (truth - picture) ** 2
     errors = np.array([squared[mask].mean()]) if mode == "valid" else (squared * mask[..., None]).mean(axis=(0, 1))
     return float("inf") if errors.min() == 0.0 else float(np.mean(-10.0 * np.log10(errors)))
 
 
 def ssim_map(truth: np.ndarray, picture: np.ndarray) -> np.ndarray:
-    """Structural similarity ``(H, W)`` of each pixel's window, mean over channels; zeros beyond the frame."""
+    """Compute the structural similarity of the window around each pixel, with zero padding.
+
+    Parameters
+    ----------
+    truth, picture
+        Images ``(H, W, 3)``, sRGB-encoded in [0, 1].
+
+    Returns
+    -------
+    ndarray
+        SSIM ``(H, W)``, mean over the channels.
+    """
     from skimage.metrics import structural_similarity
 
     rim = _SSIM_WINDOW // 2
     padded = [np.pad(image, ((rim, rim), (rim, rim), (0, 0))) for image in (truth, picture)]
-    _, full = structural_similarity(
+    full = structural_similarity(
         *padded,
         gaussian_weights=True,
         sigma=_SSIM_SIGMA,
@@ -113,13 +148,24 @@ def ssim_map(truth: np.ndarray, picture: np.ndarray) -> np.ndarray:
         data_range=1.0,
         channel_axis=2,
         full=True,
-    )
+    )[1]
     return full[rim:-rim, rim:-rim].mean(axis=2)
 
 
 def ssim(truth: np.ndarray, picture: np.ndarray, mask: np.ndarray | None = None, *, mode: str = "valid") -> float:
-    """Mean structural similarity; see `score`. In mode ``valid``, of windows wholly within frame and mask; NaN if none."""
-    truth, picture, mask = _checked(truth, picture, mask, mode)
+    """Compute the mean structural similarity.
+
+    Parameters
+    ----------
+    truth, picture, mask, mode
+        As in `score`.
+
+    Returns
+    -------
+    float
+        SSIM; in mode ``valid`` over windows that lie entirely within image and mask, NaN without any.
+    """
+    truth, picture, mask = _validated(truth, picture, mask, mode)
     if mode == "paper":
         return float(ssim_map(truth * mask[..., None], picture * mask[..., None]).mean())
     whole = whole_windows(mask)
@@ -127,69 +173,130 @@ def ssim(truth: np.ndarray, picture: np.ndarray, mask: np.ndarray | None = None,
 
 
 def whole_windows(mask: np.ndarray, window_px: int = _SSIM_WINDOW) -> np.ndarray:
-    """Pixels ``(H, W)`` bool whose square window lies wholly within the mask and the frame."""
+    """Return the pixels whose square window lies entirely within the mask and the image.
+
+    Parameters
+    ----------
+    mask
+        ``(H, W)`` bool.
+    window_px
+        Side of the window [px].
+
+    Returns
+    -------
+    ndarray
+        ``(H, W)`` bool.
+    """
     square = np.ones((window_px, window_px), np.uint8)
     return cv2.erode(mask.astype(np.uint8), square, borderType=cv2.BORDER_CONSTANT, borderValue=0).astype(bool)
 
 
 def flip_map(truth: np.ndarray, picture: np.ndarray) -> np.ndarray:
-    """FLIP error ``(H, W)``, 0 to 1, of two sRGB-encoded pictures seen at 67 pixels per degree."""
+    """Compute the FLIP error of each pixel at a viewing resolution of 67 pixels per degree.
+
+    Parameters
+    ----------
+    truth, picture
+        Images ``(H, W, 3)``, sRGB-encoded in [0, 1].
+
+    Returns
+    -------
+    ndarray
+        FLIP error ``(H, W)``, 0 to 1.
+    """
     import flip_evaluator
 
-    pair = [np.ascontiguousarray(image, np.float32) for image in (truth, picture)]
-    error, _, _ = flip_evaluator.evaluate(*pair, "LDR", applyMagma=False, computeMeanError=False)
+    reference, test = (np.ascontiguousarray(image, np.float32) for image in (truth, picture))
+    error, _, _ = flip_evaluator.evaluate(reference, test, "LDR", applyMagma=False, computeMeanError=False)
     return np.asarray(error, np.float64).reshape(truth.shape[:2])
 
 
 def flip(truth: np.ndarray, picture: np.ndarray, mask: np.ndarray | None = None, *, mode: str = "valid") -> float:
-    """Mean FLIP error; see `score`. What lies beyond the mask cannot bleed in: there both pictures are made equal."""
-    truth, picture, mask = _checked(truth, picture, mask, mode)
-    error = flip_map(*_framed(truth, picture, mask, mode))
+    """Compute the mean FLIP error.
+
+    In mode ``valid`` both images are made equal outside the mask, so that the filters of FLIP propagate no error from
+    there.
+
+    Parameters
+    ----------
+    truth, picture, mask, mode
+        As in `score`.
+
+    Returns
+    -------
+    float
+        FLIP error, 0 to 1.
+    """
+    truth, picture, mask = _validated(truth, picture, mask, mode)
+    error = flip_map(*_fill_masked(truth, picture, mask, mode))
     return float(error[mask].mean() if mode == "valid" else error.mean())
 
 
 def colour_angle_deg(truth: np.ndarray, picture: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Mean angle [deg] between the linear colours of pixels within the mask; NaN where all are black."""
-    truth, picture, mask = _checked(truth, picture, mask, "valid")
+    """Compute the mean angle between the linear colours of two images.
+
+    Parameters
+    ----------
+    truth, picture, mask
+        As in `score`.
+
+    Returns
+    -------
+    float
+        Angle [deg]; NaN if all pixels are black.
+    """
+    truth, picture, mask = _validated(truth, picture, mask, "valid")
     return angle_deg(linear_from_srgb(truth[mask]), linear_from_srgb(picture[mask]))
 
 
 def angle_deg(truth: np.ndarray, other: np.ndarray) -> float:
-    """Mean angle [deg] between linear colours ``(N, 3)`` of which neither is black; NaN where none is left."""
+    """Compute the mean angle between linear colours, without pairs in which one colour is black.
+
+    Parameters
+    ----------
+    truth, other
+        Linear colours ``(N, 3)``.
+
+    Returns
+    -------
+    float
+        Angle [deg]; NaN if no pair remains.
+    """
     truth, other = np.asarray(truth, np.float64), np.asarray(other, np.float64)
-    norms = [np.linalg.norm(each, axis=1) for each in (truth, other)]
-    kept = (norms[0] > _DARKEST) & (norms[1] > _DARKEST)
+    norms = [np.linalg.norm(colours, axis=1) for colours in (truth, other)]
+    kept = (norms[0] > _MIN_NORM) & (norms[1] > _MIN_NORM)
     if not kept.any():
         return float("nan")
-    # By the tangent: the cosine of a small angle has no digits left.
+    # Arctangent, because the arccosine of a small angle loses all significant digits.
     cross = np.linalg.norm(np.cross(truth[kept], other[kept]), axis=1)
     return float(np.degrees(np.arctan2(cross, (truth[kept] * other[kept]).sum(axis=1))).mean())
 
 
-def _framed(truth: np.ndarray, picture: np.ndarray, mask: np.ndarray, mode: str) -> tuple[np.ndarray, np.ndarray]:
-    """Pictures for metrics with wide windows: black beyond the mask (``paper``), or the truth there (``valid``)."""
+def _fill_masked(truth: np.ndarray, picture: np.ndarray, mask: np.ndarray, mode: str) -> tuple[np.ndarray, np.ndarray]:
+    """Images for metrics with wide windows: outside the mask black (``paper``), or equal to the truth (``valid``)."""
     inside = mask[..., None]
     if mode == "paper":
         return truth * inside, picture * inside
     return truth, np.where(inside, picture, truth)
 
 
-def _checked(
+def _validated(
     truth: np.ndarray, picture: np.ndarray, mask: np.ndarray | None, mode: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     if mode not in MODES:
-        raise ValueError(f"score: mode {mode!r}, expected one of {', '.join(MODES)}")
+        raise ValueError(f"score: got mode {mode!r}, expected one of {', '.join(MODES)}")
     truth, picture = np.asarray(truth, np.float64), np.asarray(picture, np.float64)
     if truth.shape != picture.shape or truth.ndim != 3 or truth.shape[2] != 3:
-        raise ValueError(f"score: pictures of shapes {truth.shape} and {picture.shape}, expected (H, W, 3) twice")
+        raise ValueError(f"score: got images of shapes {truth.shape} and {picture.shape}, expected equal (H, W, 3)")
     mask = np.ones(truth.shape[:2], bool) if mask is None else np.asarray(mask, bool)
     if mask.shape != truth.shape[:2]:
-        raise ValueError(f"score: a mask of shape {mask.shape} for pictures of {truth.shape[:2]}")
+        raise ValueError(f"score: got a mask of shape {mask.shape}, expected {truth.shape[:2]} as the images")
     if not mask.any():
-        raise ValueError("score: the mask leaves no pixel")
+        raise NoUsablePixels("score: the mask contains no pixel")
     for name, values in (("truth", truth), ("picture", picture)):
-        # Written so that NaN fails too.
+        # NaN fails this comparison too.
         if not (values[mask].min() >= 0.0 and values[mask].max() <= 1.0):
-            raise ValueError(f"score: values of the {name} are outside [0, 1]")
-    # What lies beyond the mask may be anything, even NaN, and says nothing.
-    return (*(np.clip(np.nan_to_num(values), 0.0, 1.0) for values in (truth, picture)), mask)
+            raise ValueError(f"score: values of the {name} are not finite or outside [0, 1]")
+    # Values outside the mask are arbitrary and may be NaN.
+    truth, picture = (np.clip(np.nan_to_num(values), 0.0, 1.0) for values in (truth, picture))
+    return truth, picture, mask

@@ -1,4 +1,4 @@
-"""What is held out, and the proof that it was: no picture that is scored may have been used to make what is scored."""
+"""Held-out splits for evaluation, and the check that no evaluated image was used as an input (data leakage)."""
 
 from __future__ import annotations
 
@@ -11,30 +11,36 @@ from pathlib import Path
 import numpy as np
 
 from seasonscapes.cameras.observation import Observation
+from seasonscapes.errors import SeasonscapesError
 from seasonscapes.images import srgb_from_linear
 
 PURPOSES = ("painting", "guidance", "training", "evaluation")
 KINDS = ("picture", "view", "hour")
 
 
-class LeakageError(ValueError):
-    """A picture that is to be scored was used to make what is scored."""
+class LeakageError(SeasonscapesError, ValueError):
+    """An image to be evaluated was used as an input of the evaluated result."""
 
 
 @dataclass(frozen=True)
 class PictureUse:
-    """A picture and what it is used for.
+    """Use of an image.
 
     Parameters
     ----------
     webcam
-        Its id; what follows a slash is a part of the same panorama.
+        Id of the webcam; a suffix after a slash denotes a view of the same panorama.
     time
-        Aware; compared as an instant.
+        Time with a UTC offset; compared as an instant.
     purpose
-        painting, guidance, training or evaluation.
+        One of `PURPOSES`: painting, guidance, training or evaluation.
     content
-        SHA-256 of its pixels (`content_hash`), where they are at hand.
+        SHA-256 of the pixels (`content_hash`), or ``None``.
+
+    Raises
+    ------
+    ValueError
+        If the purpose is unknown or the time has no offset.
     """
 
     webcam: str
@@ -44,114 +50,223 @@ class PictureUse:
 
     def __post_init__(self):
         if self.purpose not in PURPOSES:
-            raise ValueError(f"Use: purpose {self.purpose!r}, expected one of {', '.join(PURPOSES)}")
+            raise ValueError(f"PictureUse: got purpose {self.purpose!r}, expected one of {', '.join(PURPOSES)}")
         if self.time.tzinfo is None:
-            raise ValueError(f"Use: {self.webcam} at {self.time}: the time has no offset")
+            raise ValueError(f"PictureUse: {self.webcam} at {self.time}: the time has no UTC offset")
 
     @property
     def instant(self) -> datetime:
+        """Time in UTC."""
         return self.time.astimezone(UTC)
 
 
 def use_of(observation: Observation, purpose: str) -> PictureUse:
-    """How an observation is used, with its content."""
+    """Describe the use of an observation, with the hash of its content.
+
+    Parameters
+    ----------
+    observation
+        Image with webcam and time.
+    purpose
+        One of `PURPOSES`.
+
+    Returns
+    -------
+    PictureUse
+        Use of the observation.
+    """
     return PictureUse(observation.webcam, observation.time, purpose, observation_hash(observation))
 
 
 def content_hash(levels: np.ndarray) -> str:
-    """SHA-256 of a picture's decoded bytes ``(H, W, 3)`` uint8, so that a copy under another name or as PNG is the same."""
+    """Compute the SHA-256 of decoded pixels, which is independent of file name and lossless format.
+
+    Parameters
+    ----------
+    levels
+        Image ``(H, W, 3)`` uint8.
+
+    Returns
+    -------
+    str
+        Hexadecimal digest of shape and pixels.
+
+    Raises
+    ------
+    ValueError
+        If the array has another type or number of dimensions.
+    """
     levels = np.ascontiguousarray(levels)
     if levels.dtype != np.uint8 or levels.ndim != 3:
-        raise ValueError(f"content_hash: {levels.dtype} of shape {levels.shape}, expected uint8 (H, W, 3)")
+        raise ValueError(f"content_hash: got {levels.dtype} of shape {levels.shape}, expected uint8 (H, W, 3)")
     return hashlib.sha256(repr(levels.shape).encode() + levels.tobytes()).hexdigest()
 
 
 def observation_hash(observation: Observation) -> str:
-    """`content_hash` of the 8-bit picture that an observation was decoded from."""
+    """Compute the `content_hash` of the 8-bit image that an observation was decoded from.
+
+    Parameters
+    ----------
+    observation
+        Image, scene-linear.
+
+    Returns
+    -------
+    str
+        Hexadecimal digest.
+    """
     levels = np.round(255.0 * srgb_from_linear(np.nan_to_num(observation.image)))
     return content_hash(levels.astype(np.uint8))
 
 
 def file_content_hash(path: Path) -> str:
-    """`content_hash` of a picture file, of 8 bits or reduced to them."""
+    """Compute the `content_hash` of an image file, reduced to 8 bits.
+
+    Parameters
+    ----------
+    path
+        Image file.
+
+    Returns
+    -------
+    str
+        Hexadecimal digest.
+    """
     from seasonscapes.images import read_image_linear
 
     return content_hash(np.round(255.0 * srgb_from_linear(read_image_linear(path))).astype(np.uint8))
 
 
 def held_out_views(webcams: Sequence[str], count: int, *, seed: int = 0) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Webcams to paint with, and ``count`` webcams to score at, drawn at random; views of a panorama stay together.
+    """Split webcams at random into those to use and those to evaluate; views of one panorama stay together.
+
+    Parameters
+    ----------
+    webcams
+        Names of webcams or of views (``webcam/view``).
+    count
+        Number of webcams to hold out.
+    seed
+        Seed of the random selection.
+
+    Returns
+    -------
+    used, held_out : tuple of str
+        Names in the order of ``webcams``.
 
     Raises
     ------
     ValueError
-        Nothing would be left on one of the sides.
+        If one of the two parts would be empty.
     """
     names = sorted({webcam_of(name) for name in webcams})
     if not 1 <= count < len(names):
-        raise ValueError(f"held_out_views: {count} of {len(names)} webcams, expected 1 to {len(names) - 1}")
-    chosen = set(np.random.default_rng(seed).choice(names, count, replace=False).tolist())
+        raise ValueError(f"held_out_views: got {count} of {len(names)} webcams, expected 1 to {len(names) - 1}")
+    held_out = set(np.random.default_rng(seed).choice(names, count, replace=False).tolist())
     return (
-        tuple(name for name in webcams if webcam_of(name) not in chosen),
-        tuple(name for name in webcams if webcam_of(name) in chosen),
+        tuple(name for name in webcams if webcam_of(name) not in held_out),
+        tuple(name for name in webcams if webcam_of(name) in held_out),
     )
 
 
 def held_out_hours(
     times: Sequence[datetime], every: int, *, first: int = 1
 ) -> tuple[tuple[datetime, ...], tuple[datetime, ...]]:
-    """Times to use, and times to score at: of all in order every ``every``-th, beginning with number ``first``.
+    """Split times into those to use and those to evaluate: every ``every``-th time in order is held out.
 
-    With ``first`` ≥ 1 the day's first hour is used, so that what is scored lies between hours that were seen.
+    With ``first`` ≥ 1 the earliest time is used, so that no evaluated time precedes all used ones.
+
+    Parameters
+    ----------
+    times
+        Distinct times.
+    every
+        Period of the held-out times, at least 2.
+    first
+        Index of the first held-out time.
+
+    Returns
+    -------
+    used, held_out : tuple of datetime
+        Times in order.
+
+    Raises
+    ------
+    ValueError
+        If no time would be held out, ``every`` is less than 2, or times coincide.
     """
     ordered = sorted(times)
-    out = ordered[first::every] if every >= 2 else []
-    if not out or len(set(ordered)) != len(ordered):
+    held_out = ordered[first::every] if every >= 2 else []
+    if not held_out or len(set(ordered)) != len(ordered):
         raise ValueError(
-            f"held_out_hours: every {every} of {len(ordered)} times, expected different times and every ≥ 2"
+            f"held_out_hours: got every = {every} and {len(ordered)} times, expected distinct times and every ≥ 2"
         )
-    return tuple(time for time in ordered if time not in out), tuple(out)
+    return tuple(time for time in ordered if time not in held_out), tuple(held_out)
 
 
 def webcam_of(name: str) -> str:
-    """The webcam that a view's name belongs to: ``mountain/3`` is view 3 of the panorama ``mountain``."""
+    """Return the webcam of a view.
+
+    Parameters
+    ----------
+    name
+        Name of a webcam, or of a view of its panorama (``webcam/view``).
+
+    Returns
+    -------
+    str
+        Id of the webcam.
+
+    Examples
+    --------
+    >>> webcam_of("mountain/3")
+    'mountain'
+    """
     return name.split("/", 1)[0]
 
 
 def refuse_leaks(evaluated: Sequence[PictureUse], used: Sequence[PictureUse], *, kind: str = "picture") -> None:
-    """Raise `LeakageError` where a picture that is to be scored was used for painting, guidance or training.
+    """Check that no image to be evaluated was used for painting, guidance or training.
 
     Parameters
     ----------
+    evaluated
+        Images to be evaluated.
+    used
+        Images that were used.
     kind
-        ``picture``: neither the same pixels nor the same webcam at the same instant. ``view``: nor that webcam at any
-        time. ``hour``: nor any webcam at that instant.
+        Criterion. ``picture``: neither the same pixels nor the same webcam at the same instant; ``view``: in addition
+        not the same webcam at any time; ``hour``: in addition not any webcam at the same instant.
 
     Raises
     ------
-    Leak
-        Names each offending pair.
+    LeakageError
+        If a pair of images violates the criterion; the message lists all pairs.
+    ValueError
+        If the criterion is unknown.
     """
     if kind not in KINDS:
-        raise ValueError(f"refuse_leaks: kind {kind!r}, expected one of {', '.join(KINDS)}")
-    found = [
-        f"{one.webcam} at {one.instant.isoformat()} was used for {other.purpose} ({why})"
-        for one in evaluated
+        raise ValueError(f"refuse_leaks: got kind {kind!r}, expected one of {', '.join(KINDS)}")
+    leaks = [
+        f"{image.webcam} at {image.instant.isoformat()} was used for {other.purpose} ({reason})"
+        for image in evaluated
         for other in used
-        if (why := _leak(one, other, kind))
+        if (reason := _leak(image, other, kind))
     ]
-    if found:
-        raise LeakageError("evaluation pictures that are not held out: " + "; ".join(dict.fromkeys(found)))
+    if leaks:
+        raise LeakageError("evaluation images that are not held out: " + "; ".join(dict.fromkeys(leaks)))
 
 
-def _leak(one: PictureUse, other: PictureUse, kind: str) -> str | None:
-    if one.content is not None and one.content == other.content:
+def _leak(evaluated: PictureUse, used: PictureUse, kind: str) -> str | None:
+    """Reason why a pair of images violates the criterion, or ``None``."""
+    if evaluated.content is not None and evaluated.content == used.content:
         return "the same pixels"
-    same_webcam, same_time = webcam_of(one.webcam) == webcam_of(other.webcam), one.instant == other.instant
+    same_webcam = webcam_of(evaluated.webcam) == webcam_of(used.webcam)
+    same_time = evaluated.instant == used.instant
     if same_webcam and same_time:
         return "the same webcam and instant"
     if kind == "view" and same_webcam:
-        return f"the same webcam, at {other.instant.isoformat()}"
+        return f"the same webcam, at {used.instant.isoformat()}"
     if kind == "hour" and same_time:
-        return f"the same instant, at {other.webcam}"
+        return f"the same instant, at {used.webcam}"
     return None

@@ -1,4 +1,4 @@
-"""Webcams of a place whose truth is known: pictures at full physics, then treated as webcams treat theirs."""
+"""Synthetic webcam images with ground truth: rendered radiance, degraded by pose errors, foreground, exposure and noise."""
 
 from __future__ import annotations
 
@@ -31,13 +31,23 @@ from seasonscapes.sky.illumination import Illumination
 from seasonscapes.terrain.surface import Terrain
 
 Progress = Callable[[float], None]
-# Pictures of 720 x 480 in a few seconds each, with noise well below that of 8 bits.
+# Sampling for images of 720 x 480 px in a few seconds each, with noise well below the quantisation of 8 bits.
 QUICK = SamplingOptions(subpixels=4, shades=16, rays=128, clusters=2048, listed=32, rank=24)
 
 
 @dataclass(frozen=True)
 class WebcamInstant:
-    """An instant as a webcam sees it: its light (of the webcam's own place) and the land's albedo ``(R, S, 3)``."""
+    """Light and surface of one image.
+
+    Parameters
+    ----------
+    time
+        Time with a UTC offset.
+    illumination
+        Sun, sky and atmosphere at the position of the webcam.
+    albedo
+        Albedo texture ``(R, S, 3)`` of the terrain.
+    """
 
     time: datetime
     illumination: Illumination
@@ -46,24 +56,24 @@ class WebcamInstant:
 
 @dataclass(frozen=True)
 class SyntheticPicture:
-    """A webcam's picture and its truth.
+    """Synthetic webcam image with its ground truth.
 
     Parameters
     ----------
     observation
-        What a stage gets: decoded sRGB in [0, 1], and the pose that it believes.
+        Input of a stage: decoded sRGB in [0, 1] with the erroneous pose.
     encoded
-        ``(H, W, 3)`` uint8, the file's bytes.
+        Image ``(H, W, 3)`` uint8 sRGB.
     camera
-        The true pose.
+        Camera or panorama at the true pose.
     radiance
-        ``(H, W, 3)`` [cd/m²] at the camera, with what stands before the land.
+        Radiance at the camera ``(H, W, 3)`` [cd/m²], foreground included.
     surface
-        ``(H, W, 3)`` [cd/m²] leaving the land, before the air.
+        Radiance leaving the terrain ``(H, W, 3)`` [cd/m²], before aerial perspective.
     foreground
-        ``(H, W)`` bool: houses and masts.
+        ``(H, W)`` bool, True on houses and masts.
     development
-        What the webcam did.
+        Exposure, white balance and tone curve of the image.
     gbuffer
         First surfaces at the true pose.
     """
@@ -82,7 +92,7 @@ def webcam_series(
     terrain: Terrain,
     webcam: str,
     camera: Camera | Panorama,
-    hours: Sequence[WebcamInstant],
+    instants: Sequence[WebcamInstant],
     *,
     faults: WebcamFaults = TYPICAL,
     poses: PoseSigmas | None = None,
@@ -91,47 +101,71 @@ def webcam_series(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> list[SyntheticPicture]:
-    """Pictures of one webcam at several hours. Its pose error and its foreground are the same in all of them.
+    """Simulate the images of one webcam at several instants, with the same pose error and foreground in all images.
 
     Parameters
     ----------
+    terrain
+        Terrain mesh with its UV atlas.
     webcam
-        Its id; with ``seed`` it decides what is random, so that a webcam keeps its faults whichever others there are.
+        Id of the webcam. Together with ``seed`` it determines all random numbers, so that the images of a webcam do not
+        depend on other webcams.
     camera
-        Where it truly is; a panorama is traced as one picture.
+        Camera or panorama at the true pose.
+    instants
+        Light and albedo of each image.
+    faults
+        Exposure, white balance, tone curve, noise and compression of the webcam.
     poses
-        How far off the pose is that the observations carry; left out, it is exact.
+        Standard deviations of the pose error of the observations; exact poses if omitted.
+    foreground
+        Whether to add houses and a mast.
     sampling
-        Of the light transport.
+        Sampling of the light transport.
+    seed
+        Seed of the random numbers.
+    progress
+        Callback with the completed fraction, 0 to 1.
+
+    Returns
+    -------
+    list of SyntheticPicture
+        One image per instant.
 
     Raises
     ------
     ValueError
-        The webcam sees no terrain.
+        If no terrain is visible from the camera (raised by `trace_view`).
     """
-    tell = progress or (lambda share: None)
+    report = progress or (lambda fraction: None)
     rng = np.random.default_rng([seed, zlib.crc32(webcam.encode())])
-    believed, _ = perturb_pose(camera, poses or PoseSigmas(), rng)
-    stand = int(rng.integers(2**32))
-    mesh = mi_mesh(terrain, hours[0].albedo)
-    bare = ray_scene(mesh)
-    coefficients = trace_view(bare, camera, sampling, seed=seed, progress=lambda share: tell(0.7 * share))
-    pictures, shown = [], hours[0].albedo
-    for index, hour in enumerate(hours):
-        if hour.albedo is not shown:
-            set_albedo(RenderScene(bare.mi_scene, bare.mi_terrain, hour.illumination, 0.0), hour.albedo)
-            coefficients = replace(coefficients, albedo=view_albedo(bare, coefficients))
-            shown = hour.albedo
-        view = relight_view(relightable_view(bare, coefficients), hour.illumination)
-        radiance, front = np.maximum(view.radiance, 0.0), np.zeros(view.coverage.shape, bool)
+    perturbed, _ = perturb_pose(camera, poses or PoseSigmas(), rng)
+    foreground_seed = int(rng.integers(2**32))
+    mesh = mi_mesh(terrain, instants[0].albedo)
+    unlit = ray_scene(mesh)
+    coefficients = trace_view(unlit, camera, sampling, seed=seed, progress=lambda f: report(0.7 * f))
+    pictures, current_albedo = [], instants[0].albedo
+    for index, instant in enumerate(instants):
+        if instant.albedo is not current_albedo:
+            set_albedo(RenderScene(unlit.mi_scene, unlit.mi_terrain, instant.illumination, 0.0), instant.albedo)
+            coefficients = replace(coefficients, albedo=view_albedo(unlit, coefficients))
+            current_albedo = instant.albedo
+        view = relight_view(relightable_view(unlit, coefficients), instant.illumination)
+        radiance, in_foreground = np.maximum(view.radiance, 0.0), np.zeros(view.coverage.shape, bool)
         if foreground:
-            radiance, front = add_foreground(radiance, np.random.default_rng(stand))
-        encoded, done = degrade(radiance, faults, rng)
+            radiance, in_foreground = add_foreground(radiance, np.random.default_rng(foreground_seed))
+        encoded, development = degrade(radiance, faults, rng)
         observation = Observation(
-            linear_from_srgb(encoded / np.float32(255.0)), np.ones(front.shape, bool), believed, hour.time, webcam
+            linear_from_srgb(encoded / np.float32(255.0)),
+            np.ones(in_foreground.shape, bool),
+            perturbed,
+            instant.time,
+            webcam,
         )
         pictures.append(
-            SyntheticPicture(observation, encoded, camera, radiance, view.surface, front, done, view.gbuffer)
+            SyntheticPicture(
+                observation, encoded, camera, radiance, view.surface, in_foreground, development, view.gbuffer
+            )
         )
-        tell(0.7 + 0.3 * (index + 1) / len(hours))
+        report(0.7 + 0.3 * (index + 1) / len(instants))
     return pictures

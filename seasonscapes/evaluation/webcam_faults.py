@@ -1,7 +1,7 @@
-"""What a webcam makes of a landscape: exposure, white balance, tone curve, noise, JPEG; poses that are slightly off; houses.
+"""Simulated webcam degradations: exposure, white balance, tone curve, noise, JPEG, pose errors and foreground objects.
 
-Everything that is done is told, so that each estimator that undoes some of it can be measured. Haze is none of these:
-it comes with the light (`sky.models`, visibility).
+All applied degradations are returned, so that estimators of them can be evaluated. Haze is not included, because it is
+part of the illumination (`sky.models`, visibility).
 """
 
 from __future__ import annotations
@@ -21,29 +21,34 @@ from seasonscapes.images import (
     srgb_from_linear,
 )
 
-# The luminance that the meter finds is put here, where 1 is the least that clips: an 18 % grey card.
+# Exposed value of the metered luminance, relative to the clipping level: an 18 % grey card.
 _METERED_GREY = 0.18
 
 
 @dataclass(frozen=True)
 class WebcamFaults:
-    """How a webcam treats its picture; `CLEAN` treats it as well as 8 bits can.
+    """Degradation of an image by a webcam; `CLEAN` only quantises to 8 bits.
 
     Parameters
     ----------
     exposure_sigma_ev
-        Standard deviation of the automatic exposure about what average metering asks for [stops].
+        Standard deviation of the exposure about that of average metering [stops].
     white_balance_sigma
         Standard deviation of the logarithms of the red and blue gains.
     tone_strength
-        S-curve in the encoded values, 0 (sRGB alone) to 0.9.
+        Strength of an S-curve applied to the encoded values, 0 (sRGB only) to 0.9.
     full_well
-        Electrons of a sensor cell that clips: photon noise is ``sqrt(x / full_well)`` of values x in [0, 1]; infinite
-        for none.
+        Full-well capacity of a pixel [electrons]: shot noise has the standard deviation ``sqrt(x / full_well)`` at
+        values x in [0, 1]; infinite for no shot noise.
     read_noise
-        Standard deviation of the noise in the dark, where 1 clips.
+        Standard deviation of the read noise, relative to the clipping level.
     jpeg_quality
-        1 to 100 (4:2:0 chroma); ``None`` leaves JPEG out.
+        JPEG quality, 1 to 100 (4:2:0 chroma); ``None`` for no compression.
+
+    Raises
+    ------
+    ValueError
+        If a value is out of range.
     """
 
     exposure_sigma_ev: float = 0.35
@@ -55,11 +60,11 @@ class WebcamFaults:
 
     def __post_init__(self):
         if not 0.0 <= self.tone_strength <= 0.9:
-            raise ValueError(f"WebcamFaults: tone_strength = {self.tone_strength}, expected 0 to 0.9")
+            raise ValueError(f"WebcamFaults: got tone_strength = {self.tone_strength}, expected 0 to 0.9")
         if min(self.exposure_sigma_ev, self.white_balance_sigma, self.read_noise) < 0.0 or not self.full_well > 0.0:
-            raise ValueError("WebcamFaults: sigmas must not be negative, and full_well must be positive")
+            raise ValueError("WebcamFaults: standard deviations must not be negative, and full_well must be positive")
         if self.jpeg_quality is not None and not 1 <= self.jpeg_quality <= 100:
-            raise ValueError(f"WebcamFaults: jpeg_quality = {self.jpeg_quality}, expected 1 to 100")
+            raise ValueError(f"WebcamFaults: got jpeg_quality = {self.jpeg_quality}, expected 1 to 100")
 
 
 CLEAN = WebcamFaults(0.0, 0.0, 0.0, np.inf, 0.0, None)
@@ -69,20 +74,20 @@ SEVERE = WebcamFaults(0.7, 0.12, 0.7, 3000.0, 0.006, 65)
 
 @dataclass(frozen=True)
 class Development:
-    """What was done to a picture.
+    """Development of an image from radiance to encoded values, as it was applied.
 
     Parameters
     ----------
     gains
-        ``(3,)`` exposed value over radiance [1 / (cd/m²)], exposure and white balance together; 1 clips.
+        Exposed value over radiance ``(3,)`` [1 / (cd/m²)], exposure and white balance together; values clip at 1.
     exposure_error_ev
-        Stops brighter than metered.
+        Exposure relative to the metered exposure [stops]; positive is brighter.
     white_balance
-        ``(3,)`` share of it in ``gains``; green is 1.
+        White-balance factor ``(3,)`` contained in ``gains``; green is 1.
     tone_strength
-        Of the S-curve.
+        Strength of the S-curve.
     clipped
-        ``(H, W)`` bool: pixels with a channel beyond the sensor's range.
+        ``(H, W)`` bool, True where a channel is clipped.
     """
 
     gains: np.ndarray
@@ -94,7 +99,17 @@ class Development:
 
 @dataclass(frozen=True)
 class PoseSigmas:
-    """Standard deviations of a pose: position [m], angles [deg], logarithm of the focal length."""
+    """Standard deviations of pose errors.
+
+    Parameters
+    ----------
+    horizontal_m, vertical_m
+        Position: east and north each, and up [m].
+    heading_deg, pitch_deg, roll_deg
+        Angles [deg].
+    log_focal
+        Natural logarithm of the focal length.
+    """
 
     horizontal_m: float = 0.0
     vertical_m: float = 0.0
@@ -105,12 +120,28 @@ class PoseSigmas:
 
 
 def degrade(radiance: np.ndarray, faults: WebcamFaults, rng: np.random.Generator) -> tuple[np.ndarray, Development]:
-    """The picture ``(H, W, 3)`` uint8 sRGB that a webcam delivers of radiance ``(H, W, 3)`` [cd/m²], and what was done.
+    """Simulate the image that a webcam delivers of given radiance.
+
+    Parameters
+    ----------
+    radiance
+        Radiance ``(H, W, 3)`` [cd/m²].
+    faults
+        Degradation.
+    rng
+        Random generator.
+
+    Returns
+    -------
+    levels : ndarray
+        Image ``(H, W, 3)`` uint8 sRGB.
+    development : Development
+        The applied development.
 
     Raises
     ------
     ValueError
-        The radiance is not finite, or black all over.
+        If the radiance is not finite, or nowhere positive.
     """
     radiance = np.asarray(radiance, np.float32)
     if not np.isfinite(radiance).all():
@@ -126,33 +157,90 @@ def degrade(radiance: np.ndarray, faults: WebcamFaults, rng: np.random.Generator
     exposed = exposed + rng.standard_normal(exposed.shape, np.float32) * noise
     levels = np.round(255.0 * tone(srgb_from_linear(exposed), faults.tone_strength)).astype(np.uint8)
     if faults.jpeg_quality is not None:
-        written = cv2.imencode(".jpg", levels[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, faults.jpeg_quality])[1]
-        levels = np.ascontiguousarray(cv2.imdecode(written, cv2.IMREAD_COLOR)[..., ::-1])
+        jpeg = cv2.imencode(".jpg", levels[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, faults.jpeg_quality])[1]
+        decoded = cv2.imdecode(jpeg, cv2.IMREAD_COLOR)
+        assert decoded is not None
+        levels = np.ascontiguousarray(decoded[..., ::-1])
     return levels, Development(gains, error_ev, white_balance, faults.tone_strength, clipped)
 
 
-def undo_development(levels: np.ndarray, done: Development) -> np.ndarray:
-    """Radiance ``(H, W, 3)`` [cd/m²] from bytes when all that was done is known; clipped pixels stay too dark."""
-    encoded = untone(np.asarray(levels, np.float32) / 255.0, done.tone_strength)
-    return (linear_from_srgb(encoded) / done.gains).astype(np.float32)
+def undo_development(levels: np.ndarray, development: Development) -> np.ndarray:
+    """Recover radiance from an image whose development is known.
+
+    Parameters
+    ----------
+    levels
+        Image ``(H, W, 3)`` uint8.
+    development
+        Its development.
+
+    Returns
+    -------
+    ndarray
+        Radiance ``(H, W, 3)`` float32 [cd/m²]; too low where clipped.
+    """
+    encoded = untone(np.asarray(levels, np.float32) / 255.0, development.tone_strength)
+    return (linear_from_srgb(encoded) / development.gains).astype(np.float32)
 
 
 def tone(encoded: np.ndarray, strength: float) -> np.ndarray:
-    """An S-curve of values in [0, 1]: a share ``strength`` of ``3e² - 2e³`` and the rest of ``e``."""
+    """Apply an S-curve: ``strength`` times ``3e² - 2e³`` plus ``1 - strength`` times ``e``.
+
+    Parameters
+    ----------
+    encoded
+        Values ``(...)`` in [0, 1].
+    strength
+        Strength of the curve, 0 to 0.9.
+
+    Returns
+    -------
+    ndarray
+        Values ``(...)`` in [0, 1].
+    """
     return (1.0 - strength) * encoded + strength * encoded * encoded * (3.0 - 2.0 * encoded)
 
 
 def untone(toned: np.ndarray, strength: float) -> np.ndarray:
-    """Inverse of `tone`, by a table that is finer than 8 bits."""
+    """Invert `tone` by interpolation in a table of 4097 knots.
+
+    Parameters
+    ----------
+    toned
+        Values ``(...)`` in [0, 1].
+    strength
+        Strength of the curve, 0 to 0.9.
+
+    Returns
+    -------
+    ndarray
+        Values ``(...)`` in [0, 1], float32.
+    """
     knots = np.linspace(0.0, 1.0, 4097)
     return np.interp(toned, tone(knots, strength), knots).astype(np.float32)
 
 
 def perturb_pose(camera: View, sigmas: PoseSigmas, rng: np.random.Generator) -> tuple[View, dict[str, float]]:
-    """A view that is off by a random amount, and by how much: keys as the fields of `PoseSigmas`, and east, north, up.
+    """Add random errors to the pose and focal length of a view.
 
-    Heading turns about the frame's up axis, pitch and roll about the camera's own axes. A full circle stays one: the
-    focal length of such a panorama changes in its rows alone.
+    The heading error rotates about the up axis of the frame, pitch and roll errors about the axes of the camera. A
+    full-circle panorama keeps its horizontal focal length.
+
+    Parameters
+    ----------
+    camera
+        Camera or panorama.
+    sigmas
+        Standard deviations of the errors.
+    rng
+        Random generator.
+
+    Returns
+    -------
+    view : Camera or Panorama
+        View with errors.
+    error : dict
+        The errors: ``east_m``, ``north_m``, ``up_m``, ``heading_deg``, ``pitch_deg``, ``roll_deg`` and ``log_focal``.
     """
     draw = rng.normal(0.0, 1.0, 7)
     error = {
@@ -166,10 +254,10 @@ def perturb_pose(camera: View, sigmas: PoseSigmas, rng: np.random.Generator) -> 
     }
     error = {name: float(value) for name, value in error.items()}
     level = rotation_from_angles(0.0, 0.0)
-    turn = rotation_from_angles(error["heading_deg"], 0.0) @ level.T
-    nod = level.T @ rotation_from_angles(0.0, error["pitch_deg"], error["roll_deg"])
+    heading_rotation = rotation_from_angles(error["heading_deg"], 0.0) @ level.T
+    camera_rotation = level.T @ rotation_from_angles(0.0, error["pitch_deg"], error["roll_deg"])
     pose = camera.world_from_camera.copy()
-    pose[:3, :3] = turn @ pose[:3, :3] @ nod
+    pose[:3, :3] = heading_rotation @ pose[:3, :3] @ camera_rotation
     pose[:3, 3] += [error["east_m"], error["north_m"], error["up_m"]]
     values = values_of(camera, np.eye(3))
     values[6] = error["log_focal"]
@@ -177,7 +265,7 @@ def perturb_pose(camera: View, sigmas: PoseSigmas, rng: np.random.Generator) -> 
     return replace(camera, fx=scaled.fx, fy=scaled.fy, world_from_camera=pose), error
 
 
-# Reflectances of what stands before webcams: roof tiles, slate, plaster, weathered wood, steel.
+# Reflectances of foreground objects: roof tiles and slate, plaster and weathered wood, steel, window panes.
 _ROOFS = np.array([[0.24, 0.10, 0.06], [0.10, 0.10, 0.11], [0.16, 0.09, 0.06]])
 _WALLS = np.array([[0.62, 0.58, 0.50], [0.20, 0.13, 0.08], [0.45, 0.42, 0.36]])
 _STEEL, _PANE = np.array([0.30, 0.31, 0.32]), np.array([0.05, 0.06, 0.07])
@@ -186,73 +274,87 @@ _STEEL, _PANE = np.array([0.30, 0.31, 0.32]), np.array([0.05, 0.06, 0.07])
 def add_foreground(
     radiance: np.ndarray, rng: np.random.Generator, *, houses: int = 3, mast: bool = True
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Stand houses and a mast, which no elevation model knows, before a picture.
+    """Add houses and a mast, which elevation models do not contain, to the foreground of an image.
+
+    Their irradiance is derived from the lower half of the image, whose median luminance is taken to be that of a
+    surface of reflectance 0.2.
 
     Parameters
     ----------
     radiance
-        ``(H, W, 3)`` [cd/m²].
+        Radiance ``(H, W, 3)`` [cd/m²].
+    rng
+        Random generator.
+    houses
+        Number of houses.
+    mast
+        Whether to add a mast.
 
     Returns
     -------
-    radiance
-        With them. They are lit like the picture's lower half: its median luminance is taken for a fifth reflected.
-    mask
-        ``(H, W)`` bool, True where they stand.
+    radiance : ndarray
+        Radiance ``(H, W, 3)`` float32 [cd/m²] with the foreground.
+    mask : ndarray
+        ``(H, W)`` bool, True on the foreground.
     """
     image = np.array(radiance, np.float32)
     height, width = image.shape[:2]
     light = 5.0 * float(np.median(image[height // 2 :] @ REC709_LUMINANCE))
     mask = np.zeros((height, width), np.uint8)
-    middles = (np.arange(houses) + rng.uniform(0.25, 0.75, houses)) * width / max(houses, 1)
-    for middle in middles:
-        _house(image, mask, float(middle), light, rng)
+    centres = (np.arange(houses) + rng.uniform(0.25, 0.75, houses)) * width / max(houses, 1)
+    for centre in centres:
+        _house(image, mask, float(centre), light, rng)
     if mast:
         x, top = int(rng.uniform(0.1, 0.9) * width), int(rng.uniform(0.15, 0.35) * height)
         size = min(width, 1.5 * height)  # see `_house`
-        thick = max(2, round(0.004 * size))
-        _fill(image, mask, [(x, height), (x, top), (x + thick, top), (x + thick, height)], light * _STEEL)
+        thickness = max(2, round(0.004 * size))
+        _fill(image, mask, [(x, height), (x, top), (x + thickness, top), (x + thickness, height)], light * _STEEL)
         for rung in np.linspace(top, 0.5 * height, 3):
             y, half = int(rung), int(0.02 * size)
             _fill(
                 image,
                 mask,
-                [(x - half, y), (x + half, y), (x + half, y + thick), (x - half, y + thick)],
+                [(x - half, y), (x + half, y), (x + half, y + thickness), (x - half, y + thickness)],
                 light * _STEEL,
             )
     return image, mask.astype(bool)
 
 
-def _house(image: np.ndarray, mask: np.ndarray, middle: float, light: float, rng: np.random.Generator) -> None:
+def _house(image: np.ndarray, mask: np.ndarray, centre: float, light: float, rng: np.random.Generator) -> None:
     height, width = mask.shape
-    # A panorama is wide because it shows more, not because it is nearer.
+    # A panorama is wider because of its larger field of view; the size of objects is limited by the height.
     half = 0.5 * rng.uniform(0.08, 0.16) * min(width, 1.5 * height)
     eaves = height - rng.uniform(0.10, 0.22) * height
     ridge = eaves - rng.uniform(0.35, 0.6) * half
-    shade = rng.uniform(0.25, 1.1, 2)  # sides turned to and from the light
+    shade = rng.uniform(0.25, 1.1, 2)  # relative irradiance of the two walls
     wall, roof = _WALLS[rng.integers(len(_WALLS))], _ROOFS[rng.integers(len(_ROOFS))]
-    corner = middle + rng.uniform(-0.3, 0.3) * half
+    corner = centre + rng.uniform(-0.3, 0.3) * half
     _fill(
         image,
         mask,
-        [(middle - half, height), (middle - half, eaves), (corner, eaves), (corner, height)],
+        [(centre - half, height), (centre - half, eaves), (corner, eaves), (corner, height)],
         light * shade[0] * wall,
     )
     _fill(
         image,
         mask,
-        [(corner, height), (corner, eaves), (middle + half, eaves), (middle + half, height)],
+        [(corner, height), (corner, eaves), (centre + half, eaves), (centre + half, height)],
         light * shade[1] * wall,
     )
-    out = 1.12 * half
+    overhang = 1.12 * half
     _fill(
         image,
         mask,
-        [(middle - out, eaves), (middle - 0.7 * half, ridge), (middle + 0.7 * half, ridge), (middle + out, eaves)],
+        [
+            (centre - overhang, eaves),
+            (centre - 0.7 * half, ridge),
+            (centre + 0.7 * half, ridge),
+            (centre + overhang, eaves),
+        ],
         light * rng.uniform(0.5, 1.1) * roof,
     )
     pane = 0.1 * half
-    for x in np.linspace(middle - 0.75 * half, middle + 0.75 * half, 5):
+    for x in np.linspace(centre - 0.75 * half, centre + 0.75 * half, 5):
         for y in np.arange(eaves + 2.0 * pane, height, 5.0 * pane):
             _fill(
                 image,
