@@ -1,4 +1,4 @@
-"""Files that travel with the package: scenes and sky models, in a wheel and in a checkout alike."""
+"""Lookup of the scene and sky-model files that are distributed with the package."""
 
 from __future__ import annotations
 
@@ -13,12 +13,22 @@ Kind = Literal["scenes", "sun_models"]
 
 
 def bundled_folder(kind: Kind) -> Path:
-    """The folder that holds them: ``seasonscapes/_data`` in a wheel, beside the package in a checkout.
+    """Locate the folder of bundled files: in ``seasonscapes/_data`` of a wheel, beside the package in a checkout.
+
+    Parameters
+    ----------
+    kind
+        ``scenes`` or ``sun_models``.
+
+    Returns
+    -------
+    Path
+        Existing folder.
 
     Raises
     ------
     FileNotFoundError
-        Where the installation lacks it.
+        If the installation has no such folder.
     """
     package = Path(str(files("seasonscapes")))
     for folder in (package / "_data" / kind, package.parent / kind):
@@ -28,25 +38,48 @@ def bundled_folder(kind: Kind) -> Path:
 
 
 def bundled_names(kind: Kind) -> list[str]:
-    """Names of the bundled declarations of a kind, sorted."""
+    """List the bundled files of a kind.
+
+    Parameters
+    ----------
+    kind
+        ``scenes`` or ``sun_models``.
+
+    Returns
+    -------
+    list of str
+        File names without suffix, sorted.
+    """
     return sorted(path.stem for path in bundled_folder(kind).glob("*.toml"))
 
 
 def bundled_path(kind: Kind, name: str) -> Path:
-    """The file of a bundled declaration by its bare name, such as ``alpine`` or ``clear``.
+    """Locate a bundled file by its name without suffix, such as ``alpine`` or ``clear``.
+
+    Parameters
+    ----------
+    kind
+        ``scenes`` or ``sun_models``.
+    name
+        File name without suffix.
+
+    Returns
+    -------
+    Path
+        TOML file.
 
     Raises
     ------
     InputError
-        Where there is none of that name; it says which there are.
+        If there is no bundled file of that name; the message lists the names.
     """
     names = bundled_names(kind)
     if name not in names:
-        what = {"scenes": "scene", "sun_models": "sky model"}[kind]
+        noun = {"scenes": "scene", "sun_models": "sky model"}[kind]
         close = difflib.get_close_matches(name, names, n=1)
         raise InputError(
             name,
-            f"neither a file nor a bundled {what}",
+            f"neither a file nor a bundled {noun}",
             expected="one of " + ", ".join(names),
             cure=f"did you mean '{close[0]}'?" if close else None,
         )

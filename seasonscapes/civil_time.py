@@ -1,9 +1,9 @@
-"""What a time on the command line means: ISO 8601, with civil time at the place where no offset is given."""
+"""Parsing of ISO 8601 times; a time without UTC offset is civil time at a given place."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import UTC, datetime, timezone
+from datetime import UTC, datetime
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from seasonscapes.declaration import InputError
@@ -11,16 +11,16 @@ from seasonscapes.declaration import InputError
 
 @dataclass(frozen=True)
 class ResolvedTime:
-    """A time as it was understood.
+    """A parsed time and its interpretation.
 
     Parameters
     ----------
     utc
         Aware UTC datetime.
     zone
-        IANA name of the zone the text was read in, or ``None`` where it gave its own offset.
+        IANA name of the civil time zone that was assumed, or ``None`` if the text gave its own offset.
     reading
-        One line for people: what the text was taken to mean.
+        One human-readable line with the text, the time zone and the UTC time.
     """
 
     utc: datetime
@@ -29,12 +29,22 @@ class ResolvedTime:
 
 
 def zone_at(latitude_deg: float, longitude_deg: float) -> str:
-    """IANA name of the civil time zone at a place; ``Etc/GMT±h`` at sea.
+    """Look up the civil time zone at a place.
+
+    Parameters
+    ----------
+    latitude_deg, longitude_deg
+        WGS 84 position [deg].
+
+    Returns
+    -------
+    str
+        IANA name of the zone; ``Etc/GMT±h`` at sea.
 
     Raises
     ------
     InputError
-        Where no zone is known.
+        If no zone is known there.
     """
     from tzfpy import get_tz
 
@@ -51,19 +61,36 @@ def zone_at(latitude_deg: float, longitude_deg: float) -> str:
 
 
 def resolve_time(text: str, latitude_deg: float, longitude_deg: float) -> ResolvedTime:
-    """Read an ISO 8601 date and time; one without offset is civil time at the place.
+    """Parse an ISO 8601 date and time; without UTC offset it is civil time at the place.
+
+    Parameters
+    ----------
+    text
+        Date and time, such as ``2024-09-01T12:00`` or ``2024-09-01T10:00Z``.
+    latitude_deg, longitude_deg
+        WGS 84 position [deg], used for a time without offset.
+
+    Returns
+    -------
+    ResolvedTime
+        The UTC time with its interpretation.
 
     Raises
     ------
     InputError
-        For text that is no date and time, and for a time that daylight saving skips or repeats: a guess would put the
-        sun 15° off.
+        If the text is not a date with a time, or if daylight saving skips or repeats the time there. A wrong guess of
+        the offset would displace the sun by 15°.
+
+    Examples
+    --------
+    >>> resolve_time("2024-09-01T12:00+02:00", 46.6, 8.0).reading
+    '2024-09-01T12:00+02:00 = 2024-09-01T10:00:00Z'
     """
     text = text.strip()
     try:
         parsed = datetime.fromisoformat(text)
-        dated_only = not any(separator in text[1:] for separator in ("T", "t", " "))
-        if dated_only:
+        has_time = any(separator in text[1:] for separator in ("T", "t", " "))
+        if not has_time:
             raise InputError(
                 "time", "the hour is missing", got=text, expected="a date and time", cure=f"write {text}T12:00"
             )
@@ -73,7 +100,7 @@ def resolve_time(text: str, latitude_deg: float, longitude_deg: float) -> Resolv
         name = zone_at(latitude_deg, longitude_deg)
         early, late = (parsed.replace(tzinfo=ZoneInfo(name), fold=fold) for fold in (0, 1))
         if early.utcoffset() != late.utcoffset():
-            _refuse_ambiguous(text, name, early, late)
+            raise _ambiguous_time_error(text, name, early, late)
         utc = early.astimezone(UTC)
     except OverflowError:
         raise InputError("time", "out of range", got=text) from None
@@ -88,12 +115,12 @@ def resolve_time(text: str, latitude_deg: float, longitude_deg: float) -> Resolv
     return ResolvedTime(utc, name, reading)
 
 
-def _refuse_ambiguous(text: str, name: str, early: datetime, late: datetime) -> None:
-    # A skipped wall time does not survive the way to UTC and back.
+def _ambiguous_time_error(text: str, name: str, early: datetime, late: datetime) -> InputError:
+    # A wall time that daylight saving skips changes when converted to UTC and back.
     back = early.astimezone(UTC).astimezone(early.tzinfo)
-    what = "happens twice" if back.replace(tzinfo=None) == early.replace(tzinfo=None) else "does not exist"
-    offers = " or ".join(time.replace(tzinfo=timezone(time.utcoffset())).isoformat() for time in (early, late))
-    raise InputError("time", f"{text} {what} in {name} (the clocks change)", cure=f"give the offset: {offers}")
+    problem = "happens twice" if back.replace(tzinfo=None) == early.replace(tzinfo=None) else "does not exist"
+    choices = " or ".join(time.isoformat() for time in (early, late))
+    return InputError("time", f"{text} {problem} in {name} (the clocks change)", cure=f"give the offset: {choices}")
 
 
 def _utc_text(utc: datetime) -> str:

@@ -1,4 +1,4 @@
-"""From a TOML file on disk to a validated model, with errors that a person can act on in one line."""
+"""Reading of TOML files into validated pydantic models, with one-line error messages."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic_core import ErrorDetails
 
 from seasonscapes.errors import InputError
 
@@ -15,7 +16,7 @@ __all__ = ["Declaration", "InputError", "read_declaration", "read_toml", "valida
 
 
 class Declaration(BaseModel):
-    """Base of everything read from TOML: immutable, strict, and no unknown keys."""
+    """Base class of models read from TOML: immutable, strictly typed, without unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
@@ -23,8 +24,24 @@ class Declaration(BaseModel):
 Model = TypeVar("Model", bound=Declaration)
 
 
-def read_toml(path: Path) -> dict:
-    """The tables of a TOML file; `InputError` where it is missing or does not parse."""
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read a TOML file.
+
+    Parameters
+    ----------
+    path
+        TOML file.
+
+    Returns
+    -------
+    dict
+        Top-level keys and tables.
+
+    Raises
+    ------
+    InputError
+        If the file does not exist, is a folder, or is not valid TOML.
+    """
     try:
         with open(path, "rb") as file:
             return tomllib.load(file)
@@ -39,43 +56,76 @@ def read_toml(path: Path) -> dict:
 def read_declaration(path: Path, model: type[Model]) -> Model:
     """Read and validate a TOML file.
 
+    Parameters
+    ----------
+    path
+        TOML file.
+    model
+        Model class to validate against.
+
+    Returns
+    -------
+    Model
+        Instance of ``model``.
+
     Raises
     ------
     InputError
-        One line about the first thing that is wrong: unknown key (with a suggestion), missing key, wrong type or value.
+        If the file cannot be read or does not fit the model. The message describes the first error in one line:
+        unknown key (with a suggestion), missing key, wrong type or wrong value.
     """
     return validate(read_toml(path), model, where=path)
 
 
-def validate(table: dict, model: type[Model], *, where: str | Path) -> Model:
-    """Validate tables that came from ``describe_position``; see `read_declaration`."""
+def validate(table: dict[str, Any], model: type[Model], *, where: str | Path) -> Model:
+    """Validate the tables of a TOML file.
+
+    Parameters
+    ----------
+    table
+        Keys and tables, from `read_toml`.
+    model
+        Model class to validate against.
+    where
+        File or argument named at the start of an error message.
+
+    Returns
+    -------
+    Model
+        Instance of ``model``.
+
+    Raises
+    ------
+    InputError
+        As in `read_declaration`, if the tables do not fit the model.
+    """
     try:
         return model.model_validate(table)
     except ValidationError as error:
-        # A misspelt key shows up twice, as unknown and as missing; the unknown one can name its cure.
-        errors = sorted(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
+        # A misspelt key is reported twice, as unknown and as missing; only the former leads to a suggestion.
+        errors = sorted(error.errors(), key=lambda details: details["type"] != "extra_forbidden")
         raise _input_error(errors[0], model, where) from None
 
 
-def _input_error(first: dict, model: type[BaseModel], where: str | Path) -> InputError:
-    location = [part for part in first["loc"] if not (isinstance(part, str) and part.startswith("function-"))]
+def _input_error(details: ErrorDetails, model: type[BaseModel], where: str | Path) -> InputError:
+    location = [part for part in details["loc"] if not (isinstance(part, str) and part.startswith("function-"))]
     key = ".".join(f"[{part}]" if isinstance(part, int) else str(part) for part in location).replace(".[", "[")
     at = f"{where}: {key}" if key else f"{where}"
-    if first["type"] == "extra_forbidden":
+    if details["type"] == "extra_forbidden":
         known = sorted(_fields_at(model, location[:-1]))
         close = difflib.get_close_matches(str(location[-1]), known, n=1)
         cure = f"did you mean '{close[0]}'?" if close else None
         return InputError(at, "unknown key", expected="one of " + ", ".join(known) if known else None, cure=cure)
-    if first["type"] == "missing":
+    if details["type"] == "missing":
         return InputError(at, "missing key", cure="add it to the file")
-    if first["type"] == "value_error":
-        return InputError(at, str(first["ctx"]["error"]))
-    got = first["input"]
-    return InputError(at, first["msg"], got=got if isinstance(got, (str, int, float, bool)) else type(got).__name__)
+    if details["type"] == "value_error":
+        return InputError(at, str(details.get("ctx", {})["error"]))
+    got = details["input"]
+    return InputError(at, details["msg"], got=got if isinstance(got, (str, int, float, bool)) else type(got).__name__)
 
 
-def _fields_at(model: type[BaseModel], location: list) -> list[str]:
-    """Field names of the nested model that a pydantic error location leads to."""
+def _fields_at(model: type[BaseModel], location: list[int | str]) -> list[str]:
+    """Field names of the nested model at a pydantic error location."""
     current: Any = model
     for part in location:
         if isinstance(part, int):
@@ -84,14 +134,14 @@ def _fields_at(model: type[BaseModel], location: list) -> list[str]:
         field = field or next((f for f in getattr(current, "model_fields", {}).values() if f.alias == part), None)
         if field is None:
             return []
-        current = _model_within(field.annotation) or current
+        current = _model_in(field.annotation) or current
     return [field.alias or name for name, field in getattr(current, "model_fields", {}).items()]
 
 
-def _model_within(annotation: Any) -> type[BaseModel] | None:
+def _model_in(annotation: Any) -> type[BaseModel] | None:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     for argument in getattr(annotation, "__args__", ()):
-        if (found := _model_within(argument)) is not None:
+        if (found := _model_in(argument)) is not None:
             return found
     return None

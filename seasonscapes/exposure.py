@@ -1,8 +1,9 @@
-"""From absolute radiance to a picture: what a camera's program, or an eye that has adapted, makes of a scene.
+"""Exposure and tone mapping from absolute radiance to a display-linear picture.
 
-* ``auto`` is a camera: average metering, with the under-exposure that keeps a night a night.
-* ``eye`` is a person who has adapted: dim scenes look dim, and colour drains towards rod vision below about 3 cd/m².
-* A number is EV100, for comparing pictures with each other.
+* ``auto``: average metering as in a camera, with reduced exposure of dim scenes so that nights stay dark.
+* ``eye``: a visual adaptation model; dim scenes stay dim, and colours desaturate towards rod vision below about
+  3 cd/m².
+* A number: a fixed EV100, for pictures that are compared with each other.
 """
 
 from __future__ import annotations
@@ -12,10 +13,9 @@ import numpy as np
 from seasonscapes.errors import InputError
 from seasonscapes.images import METER_CONSTANT, REC709_LUMINANCE, auto_exposure_ev100, expose, tone_curve
 
-# Below this metered EV a camera's program, like a photographer, stops lifting all the way: a quarter stop for each
-# stop that is missing, three at most.
-_DIM_EV, _DIM_SLOPE, _DIM_MOST = 4.0, 0.25, 3.0
-# Rods take over between these luminances [cd/m²] (mesopic range, CIE 191:2010).
+# Below this metered EV the scene is under-exposed by a quarter stop for each stop below it, by at most three stops.
+_DIM_EV, _DIM_SLOPE, _MAX_UNDEREXPOSURE = 4.0, 0.25, 3.0
+# Mesopic range [cd/m²], within which vision changes from rods to cones (CIE 191:2010).
 _MESOPIC = (0.005, 5.0)
 # Scotopic luminance from linear Rec.709, for the spectra of a typical display's primaries (Larson, Rushmeier & Piatko
 # 1997, doi:10.1109/2945.646233, eq. 9 through XYZ), and the bluish grey that rod vision is matched to in pictures.
@@ -26,7 +26,23 @@ MODES = ("auto", "eye")
 
 
 def parse_exposure(text: str) -> str | float:
-    """``auto``, ``eye`` or an EV100; `InputError` otherwise."""
+    """Parse the exposure given on the command line.
+
+    Parameters
+    ----------
+    text
+        ``auto``, ``eye`` or an EV100.
+
+    Returns
+    -------
+    str or float
+        The mode, or the EV100.
+
+    Raises
+    ------
+    InputError
+        If the text is neither a mode nor a number between -20 and 40.
+    """
     if text in MODES:
         return text
     try:
@@ -41,19 +57,39 @@ def parse_exposure(text: str) -> str | float:
 
 
 def exposure_ev100(image: np.ndarray, exposure: str | float = "auto") -> float:
-    """The EV100 to develop a scene-linear image ``(H, W, 3)`` [cd/m²] with."""
+    """Compute the EV100 of an image under an exposure mode.
+
+    Parameters
+    ----------
+    image
+        Scene-linear image ``(H, W, 3)`` [cd/m²].
+    exposure
+        One of `MODES`, or an EV100, which is returned unchanged.
+
+    Returns
+    -------
+    float
+        EV100.
+
+    Raises
+    ------
+    ValueError
+        If ``exposure`` is an unknown mode.
+    NoUsablePixels
+        If the exposure is metered and the image has no positive luminance.
+    """
     if not isinstance(exposure, str):
         return float(exposure)
     if exposure not in MODES:
         raise ValueError(f"exposure: got {exposure!r}, expected one of {', '.join(MODES)} or a number")
     metered = auto_exposure_ev100(image)
     if exposure == "auto":
-        return metered + float(np.clip(_DIM_SLOPE * (_DIM_EV - metered), 0.0, _DIM_MOST))
-    return metered + _dimness_stops(METER_CONSTANT * 2.0**metered)
+        return metered + float(np.clip(_DIM_SLOPE * (_DIM_EV - metered), 0.0, _MAX_UNDEREXPOSURE))
+    return metered + _adaptation_stops(METER_CONSTANT * 2.0**metered)
 
 
-def _dimness_stops(luminance: float) -> float:
-    """By how many stops darker than a sunlit scene an adapted eye sees a luminance [cd/m²].
+def _adaptation_stops(luminance: float) -> float:
+    """Perceived darkening [stops], relative to a sunlit scene, of a luminance [cd/m²] to which the eye has adapted.
 
     The key value of Krawczyk, Myszkowski & Seidel 2005 (doi:10.1145/1090122.1090154, eq. 11), relative to 1,000 cd/m².
     """
@@ -65,24 +101,32 @@ def _dimness_stops(luminance: float) -> float:
 
 
 def develop(image: np.ndarray, ev100: float, *, eye: bool = False) -> np.ndarray:
-    """Display-linear picture ``(H, W, 3)`` in [0, 1] of a scene-linear image [cd/m²].
+    """Convert a scene-linear image to a display-linear picture.
 
     Parameters
     ----------
+    image
+        Scene-linear image ``(H, W, 3)`` [cd/m²].
     ev100
-        From `exposure_ev100`.
+        Exposure, from `exposure_ev100`.
     eye
-        See dim pixels with the rods: colour drains and turns bluish (the Purkinje shift).
+        Model rod vision: dim pixels are desaturated and shifted towards blue (the Purkinje shift).
+
+    Returns
+    -------
+    ndarray
+        Display-linear picture ``(H, W, 3)`` in [0, 1].
     """
     if eye:
-        image = _through_rods(np.asarray(image, np.float64))
+        image = _blend_rod_vision(np.asarray(image, np.float64))
     return tone_curve(expose(image, ev100))
 
 
-def _through_rods(image: np.ndarray) -> np.ndarray:
+def _blend_rod_vision(image: np.ndarray) -> np.ndarray:
+    """Blend an image with its scotopic grey by the position of each pixel's luminance in the mesopic range."""
     luminance = np.maximum(image @ REC709_LUMINANCE, 1e-9)
     low, high = np.log10(_MESOPIC)
-    rods = np.clip((high - np.log10(luminance)) / (high - low), 0.0, 1.0)[..., None]
+    rod_weight = np.clip((high - np.log10(luminance)) / (high - low), 0.0, 1.0)[..., None]
     tint = _NIGHT_TINT / (_NIGHT_TINT @ REC709_LUMINANCE)
     grey = np.maximum(image @ _SCOTOPIC, 0.0)[..., None] * tint
-    return (1.0 - rods) * image + rods * grey
+    return (1.0 - rod_weight) * image + rod_weight * grey

@@ -1,8 +1,8 @@
-"""Where things are: WGS 84, the local east-north-up frame, angles and axes.
+"""Coordinate frames: WGS 84, the local east-north-up frame, direction angles and equirectangular maps.
 
-Conventions of the whole package are written here once:
+Conventions of the whole package:
 
-* World: east, north, up [m] about the scene's origin, reached **through ECEF**, so Earth curvature comes by itself.
+* World: east, north, up [m] about the scene's origin, computed **through ECEF**, so that Earth curvature is included.
 * Azimuth is clockwise from true north; elevation is above the local horizontal plane.
 * Directions point away from the surface: towards the sun, towards the viewer.
 * Transforms are named ``b_from_a``. Geodesy is float64 throughout.
@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 # WGS 84 defining constants (NGA.STND.0036).
 SEMI_MAJOR_AXIS_M = 6378137.0
@@ -20,24 +21,24 @@ FLATTENING = 1.0 / 298.257223563
 ECCENTRICITY_SQUARED = FLATTENING * (2.0 - FLATTENING)
 MEAN_RADIUS_M = 6371008.8
 
-# Mean terrestrial refraction of a line of sight as a share of Earth curvature (Gauss 1826; Bomford, Geodesy, 1980).
+# Mean terrestrial refraction of a line of sight as a fraction of Earth curvature (Gauss 1826; Bomford, Geodesy, 1980).
 STANDARD_REFRACTION_K = 0.13
 
 
 @dataclass(frozen=True)
 class LocalFrame:
-    """A local east-north-up frame touching the WGS 84 ellipsoid's normal at its origin.
+    """Local east-north-up frame whose up axis is the WGS 84 ellipsoid normal at its origin.
 
     Parameters
     ----------
     latitude_deg, longitude_deg
         Geodetic WGS 84 position of the origin [deg].
     height_m
-        Height of the origin above the surface that all heights of the scene refer to [m].
+        Height of the origin in the vertical datum of the scene [m].
     refraction_k
         Terrestrial refraction coefficient. Air bends a line of sight downwards with a curvature of ``k`` times the
-        Earth's. Lifting every point by ``k d² / 2R`` (``d`` its horizontal distance from the origin) straightens those
-        rays for every camera at once: it is the effective-Earth-radius construction ``R / (1 - k)``.
+        Earth's. Lifting every point by ``k d² / 2R`` (``d`` its horizontal distance from the origin) straightens these
+        rays for every camera at once: the effective-Earth-radius construction ``R / (1 - k)``.
         ``0`` is the exact geometric frame.
     """
 
@@ -47,8 +48,21 @@ class LocalFrame:
     refraction_k: float = 0.0
 
 
-def ecef_from_geodetic(latitude_deg, longitude_deg, height_m) -> np.ndarray:
-    """Geocentric Cartesian coordinates of WGS 84 positions, shape ``(..., 3)`` [m]."""
+def ecef_from_geodetic(latitude_deg: ArrayLike, longitude_deg: ArrayLike, height_m: ArrayLike) -> np.ndarray:
+    """Convert WGS 84 positions to geocentric Cartesian (ECEF) coordinates.
+
+    Parameters
+    ----------
+    latitude_deg, longitude_deg
+        Geodetic position ``(...)`` [deg].
+    height_m
+        Ellipsoidal height ``(...)`` [m].
+
+    Returns
+    -------
+    ndarray
+        ECEF coordinates ``(..., 3)`` [m], float64.
+    """
     latitude, longitude = np.radians(np.asarray(latitude_deg, float)), np.radians(np.asarray(longitude_deg, float))
     height = np.asarray(height_m, float)
     prime_vertical = SEMI_MAJOR_AXIS_M / np.sqrt(1.0 - ECCENTRICITY_SQUARED * np.sin(latitude) ** 2)
@@ -62,10 +76,21 @@ def ecef_from_geodetic(latitude_deg, longitude_deg, height_m) -> np.ndarray:
     )
 
 
-def geodetic_from_ecef(ecef_m) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """WGS 84 latitude [deg], longitude [deg] and height [m] of geocentric positions ``(..., 3)`` [m].
+def geodetic_from_ecef(ecef_m: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Convert geocentric Cartesian (ECEF) coordinates to WGS 84 positions.
 
-    Fixed-point iteration of Bowring's latitude; five rounds leave less than a nanometre below 100 km height.
+    Fixed-point iteration of Bowring's latitude; after five iterations the error is below one nanometre for heights up
+    to 100 km.
+
+    Parameters
+    ----------
+    ecef_m
+        ECEF coordinates ``(..., 3)`` [m].
+
+    Returns
+    -------
+    latitude_deg, longitude_deg, height_m
+        Geodetic latitude and longitude [deg] and ellipsoidal height [m], each ``(...)``.
     """
     x, y, z = np.moveaxis(np.asarray(ecef_m, float), -1, 0)
     distance = np.hypot(x, y)
@@ -75,13 +100,24 @@ def geodetic_from_ecef(ecef_m) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         prime_vertical = SEMI_MAJOR_AXIS_M / np.sqrt(1.0 - ECCENTRICITY_SQUARED * sine**2)
         latitude = np.arctan2(z + ECCENTRICITY_SQUARED * prime_vertical * sine, distance)
     sine, cosine = np.sin(latitude), np.cos(latitude)
-    # Well conditioned at the poles and at the equator alike.
+    # This form is well conditioned both at the poles and at the equator.
     height = distance * cosine + z * sine - SEMI_MAJOR_AXIS_M * np.sqrt(1.0 - ECCENTRICITY_SQUARED * sine**2)
     return np.degrees(latitude), np.degrees(np.arctan2(y, x)), height
 
 
 def axes_at(latitude_deg: float, longitude_deg: float) -> np.ndarray:
-    """Rows are the unit east, north and up vectors in ECEF at a place, shape ``(3, 3)`` (``enu_from_ecef``)."""
+    """Return the rotation ``enu_from_ecef`` at a geodetic position.
+
+    Parameters
+    ----------
+    latitude_deg, longitude_deg
+        Geodetic WGS 84 position [deg].
+
+    Returns
+    -------
+    ndarray
+        ``(3, 3)``; the rows are the unit east, north and up vectors in ECEF.
+    """
     latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
     sin_lat, cos_lat, sin_lon, cos_lon = np.sin(latitude), np.cos(latitude), np.sin(longitude), np.cos(longitude)
     return np.array(
@@ -97,8 +133,25 @@ def _refraction_lift(frame: LocalFrame, east_m: np.ndarray, north_m: np.ndarray)
     return frame.refraction_k * (east_m**2 + north_m**2) / (2.0 * MEAN_RADIUS_M)
 
 
-def enu_from_geodetic(frame: LocalFrame, latitude_deg, longitude_deg, height_m) -> np.ndarray:
-    """Local east, north, up [m] of WGS 84 positions, shape ``(..., 3)`` float64."""
+def enu_from_geodetic(
+    frame: LocalFrame, latitude_deg: ArrayLike, longitude_deg: ArrayLike, height_m: ArrayLike
+) -> np.ndarray:
+    """Convert WGS 84 positions to local east-north-up coordinates, including the frame's refraction lift.
+
+    Parameters
+    ----------
+    frame
+        Local frame.
+    latitude_deg, longitude_deg
+        Geodetic position ``(...)`` [deg].
+    height_m
+        Height in the vertical datum of the frame's origin ``(...)`` [m].
+
+    Returns
+    -------
+    ndarray
+        East, north, up ``(..., 3)`` [m], float64.
+    """
     origin = ecef_from_geodetic(frame.latitude_deg, frame.longitude_deg, frame.height_m)
     offset = ecef_from_geodetic(latitude_deg, longitude_deg, height_m) - origin
     enu = offset @ axes_at(frame.latitude_deg, frame.longitude_deg).T
@@ -106,8 +159,21 @@ def enu_from_geodetic(frame: LocalFrame, latitude_deg, longitude_deg, height_m) 
     return enu
 
 
-def geodetic_from_enu(frame: LocalFrame, position_m) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """WGS 84 latitude [deg], longitude [deg] and height [m] of local positions ``(..., 3)`` [m]."""
+def geodetic_from_enu(frame: LocalFrame, position_m: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Convert local east-north-up coordinates to WGS 84 positions; the inverse of `enu_from_geodetic`.
+
+    Parameters
+    ----------
+    frame
+        Local frame.
+    position_m
+        East, north, up ``(..., 3)`` [m].
+
+    Returns
+    -------
+    latitude_deg, longitude_deg, height_m
+        Geodetic latitude and longitude [deg] and height in the frame's vertical datum [m], each ``(...)``.
+    """
     position = np.array(position_m, float)
     position[..., 2] -= _refraction_lift(frame, position[..., 0], position[..., 1])
     origin = ecef_from_geodetic(frame.latitude_deg, frame.longitude_deg, frame.height_m)
@@ -115,23 +181,54 @@ def geodetic_from_enu(frame: LocalFrame, position_m) -> tuple[np.ndarray, np.nda
 
 
 def local_axes(frame: LocalFrame, latitude_deg: float, longitude_deg: float) -> np.ndarray:
-    """Rows are the unit east, north and up vectors **of another place**, in the frame's coordinates, ``(3, 3)``.
+    """Return the unit east, north and up vectors **of another place** in the frame's coordinates.
 
-    Up tilts away from the frame's up by the distance over the Earth's effective radius (0.27° at 30 km).
+    The up vector of a place tilts away from the frame's by the distance over the Earth's effective radius (0.27° at
+    30 km).
+
+    Parameters
+    ----------
+    frame
+        Local frame.
+    latitude_deg, longitude_deg
+        Geodetic WGS 84 position of the other place [deg].
+
+    Returns
+    -------
+    ndarray
+        ``(3, 3)``; the rows are orthonormal east, north and up vectors.
     """
     axes = axes_at(latitude_deg, longitude_deg) @ axes_at(frame.latitude_deg, frame.longitude_deg).T
     east, north, _ = enu_from_geodetic(
         LocalFrame(frame.latitude_deg, frame.longitude_deg), latitude_deg, longitude_deg, 0.0
     )
-    # The refraction lift shears the frame by its gradient; seen from the place that is a small turn of its horizon.
+    # The refraction lift shears the frame by its gradient; at the other place this is a small rotation of the horizon.
     gradient = frame.refraction_k / MEAN_RADIUS_M * np.array([east, north])
-    turn = np.array([[1.0, 0.0, gradient[0]], [0.0, 1.0, gradient[1]], [-gradient[0], -gradient[1], 1.0]])
-    q, r = np.linalg.qr((axes @ turn).T)
+    shear = np.array([[1.0, 0.0, gradient[0]], [0.0, 1.0, gradient[1]], [-gradient[0], -gradient[1], 1.0]])
+    q, r = np.linalg.qr((axes @ shear).T)
     return (q * np.sign(np.diag(r))).T
 
 
-def direction_from_angles(azimuth_deg, elevation_deg) -> np.ndarray:
-    """Unit east-north-up vectors ``(..., 3)`` from azimuth (clockwise from north) and elevation [deg]."""
+def direction_from_angles(azimuth_deg: ArrayLike, elevation_deg: ArrayLike) -> np.ndarray:
+    """Return unit vectors from azimuth and elevation.
+
+    Parameters
+    ----------
+    azimuth_deg
+        Azimuth clockwise from north ``(...)`` [deg].
+    elevation_deg
+        Elevation above the horizontal plane ``(...)`` [deg].
+
+    Returns
+    -------
+    ndarray
+        Unit east-north-up vectors ``(..., 3)``.
+
+    Examples
+    --------
+    >>> direction_from_angles(90.0, 0.0).round(6) + 0.0
+    array([1., 0., 0.])
+    """
     azimuth, elevation = np.radians(np.asarray(azimuth_deg, float)), np.radians(np.asarray(elevation_deg, float))
     return np.stack(
         np.broadcast_arrays(
@@ -141,24 +238,60 @@ def direction_from_angles(azimuth_deg, elevation_deg) -> np.ndarray:
     )
 
 
-def angles_from_direction(direction) -> tuple[np.ndarray, np.ndarray]:
-    """Azimuth in [0, 360) and elevation [deg] of east-north-up vectors ``(..., 3)`` of any length."""
+def angles_from_direction(direction: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Return azimuth and elevation of vectors.
+
+    Parameters
+    ----------
+    direction
+        East-north-up vectors of any length ``(..., 3)``.
+
+    Returns
+    -------
+    azimuth_deg, elevation_deg
+        Azimuth in [0, 360) clockwise from north and elevation [deg], each ``(...)``.
+    """
     east, north, up = np.moveaxis(np.asarray(direction, float), -1, 0)
     return np.degrees(np.arctan2(east, north)) % 360.0, np.degrees(np.arctan2(up, np.hypot(east, north)))
 
 
 def equirectangular_directions(height: int, width: int) -> np.ndarray:
-    """Unit directions of the pixel centres of a full-sphere map, ``(height, width, 3)``.
+    """Return the directions of the pixel centres of a full-sphere equirectangular map.
 
     Row 0 is the zenith, the last row the nadir. Column 0 begins at north and columns run clockwise through east.
+
+    Parameters
+    ----------
+    height, width
+        Size of the map [px].
+
+    Returns
+    -------
+    ndarray
+        Unit east-north-up vectors ``(height, width, 3)``.
     """
     elevation_deg = 90.0 - (np.arange(height) + 0.5) * (180.0 / height)
     azimuth_deg = (np.arange(width) + 0.5) * (360.0 / width)
     return direction_from_angles(azimuth_deg[None, :], elevation_deg[:, None])
 
 
-def sample_equirectangular(values: np.ndarray, direction) -> np.ndarray:
-    """Bilinear look-up of a full-sphere map ``(H, W, C)`` along directions ``(..., 3)``; wraps in azimuth."""
+def sample_equirectangular(values: np.ndarray, direction: ArrayLike) -> np.ndarray:
+    """Interpolate a full-sphere equirectangular map bilinearly along directions.
+
+    Columns wrap around in azimuth; rows are clamped at the poles.
+
+    Parameters
+    ----------
+    values
+        Map ``(H, W, C)`` with the layout of `equirectangular_directions`.
+    direction
+        East-north-up vectors ``(..., 3)``.
+
+    Returns
+    -------
+    ndarray
+        Interpolated values ``(..., C)``.
+    """
     height, width = values.shape[:2]
     azimuth_deg, elevation_deg = angles_from_direction(direction)
     column, row = azimuth_deg * (width / 360.0) - 0.5, (90.0 - elevation_deg) * (height / 180.0) - 0.5

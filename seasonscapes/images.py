@@ -1,7 +1,7 @@
-"""Pictures on disk and on screen: OpenEXR and PNG files, exposure and the tone curve.
+"""Image input and output (OpenEXR, PNG), exposure metering and the tone curve.
 
 In memory an image has row 0 on top and is float32, scene-linear Rec.709, photometric: its luminance Y is in cd/m².
-sRGB exists only in files. Exposure is EV100: ``luminance = 2**EV100 * 12.5 / 100`` is metered as middle grey.
+sRGB encoding is used in files only. Exposure is EV100: ``luminance = 2**EV100 * 12.5 / 100`` is metered as middle grey.
 """
 
 from __future__ import annotations
@@ -12,9 +12,13 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
+
+from seasonscapes.errors import NoUsablePixels, UnreadableImage
 
 # Reflected-light meter calibration constant (ISO 2720) at ISO 100.
 METER_CONSTANT = 12.5 / 100.0
@@ -25,10 +29,20 @@ REC709_LUMINANCE = np.array([0.2126390, 0.7151687, 0.0721923])
 
 @contextmanager
 def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
-    """A temporary path beside ``path`` that takes its name only when the block ends well.
+    """Context manager for atomic writing: a temporary path that replaces ``path`` when the block succeeds.
 
-    An interrupted or failed block leaves neither a half file nor the temporary one. The temporary name keeps the
-    suffix, since many writers choose the format by it.
+    After an exception in the block ``path`` is unchanged and the temporary file is removed. The temporary name keeps
+    the suffix, since many writers choose the format by it.
+
+    Parameters
+    ----------
+    path
+        Destination; missing parent folders are created.
+
+    Yields
+    ------
+    Path
+        Temporary path in the same folder to write to.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -37,7 +51,7 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     temporary = Path(name)
     try:
         yield temporary
-        # mkstemp makes private files; give the result the mode that open() would have given.
+        # mkstemp creates private files; set the mode that open() would have set.
         umask = os.umask(0)
         os.umask(umask)
         temporary.chmod(0o666 & ~umask)
@@ -47,55 +61,117 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
 
 
 def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
-    """IEC 61966-2-1 encoding of values in [0, 1]."""
+    """Encode linear values as sRGB (IEC 61966-2-1).
+
+    Parameters
+    ----------
+    linear
+        Linear values ``(...)``, clipped to [0, 1].
+
+    Returns
+    -------
+    ndarray
+        Encoded values in [0, 1] ``(...)``.
+    """
     linear = np.clip(linear, 0.0, 1.0)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.power(linear, 1.0 / 2.4) - 0.055)
 
 
-def linear_from_srgb(encoded: np.ndarray) -> np.ndarray:
-    """Inverse of `srgb_from_linear`."""
+def linear_from_srgb(encoded: ArrayLike) -> np.ndarray:
+    """Decode sRGB values (IEC 61966-2-1); the inverse of `srgb_from_linear`.
+
+    Parameters
+    ----------
+    encoded
+        Encoded values in [0, 1] ``(...)``.
+
+    Returns
+    -------
+    ndarray
+        Linear values in [0, 1] ``(...)``, float32.
+    """
     encoded = np.asarray(encoded, np.float32)
     return np.where(encoded <= 0.04045, encoded / 12.92, np.power((encoded + 0.055) / 1.055, 2.4)).astype(np.float32)
 
 
 def auto_exposure_ev100(image: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """EV100 that a camera's average metering would choose for a scene-linear image ``(H, W, 3)`` [cd/m²].
+    """Compute the EV100 that places the log-average luminance of an image at middle grey.
 
-    The log-average luminance, between its 2nd and 98th percentile so that neither a disc of sun nor a black corner
-    decides, is placed at the meter's middle grey.
+    Only luminances between the 2nd and the 98th percentile are averaged, so that the result depends neither on the
+    solar disc nor on black corners.
+
+    Parameters
+    ----------
+    image
+        Scene-linear image ``(H, W, 3)`` [cd/m²].
+    mask
+        Pixels to meter ``(H, W)``, boolean; all where left out.
+
+    Returns
+    -------
+    float
+        EV100.
+
+    Raises
+    ------
+    NoUsablePixels
+        If no metered pixel has a finite, positive luminance.
     """
     values = (np.asarray(image, np.float64) @ REC709_LUMINANCE)[... if mask is None else mask].ravel()
     values = values[np.isfinite(values) & (values > 0.0)]
     if values.size == 0:
-        raise ValueError("auto exposure: the image has no positive luminance")
+        raise NoUsablePixels("auto exposure: the image has no positive luminance; give an EV100")
     low, high = np.percentile(values, [2.0, 98.0])
     metered = np.exp(np.mean(np.log(values[(values >= low) & (values <= high)])))
     return float(np.log2(metered / METER_CONSTANT))
 
 
 def expose(image: np.ndarray, ev100: float) -> np.ndarray:
-    """Scene-linear [cd/m²] to display-linear before the tone curve; 1 is the luminance that saturates a sensor."""
+    """Scale a scene-linear image by an exposure, before the tone curve.
+
+    Parameters
+    ----------
+    image
+        Scene-linear image ``(..., 3)`` [cd/m²].
+    ev100
+        Exposure value at ISO 100.
+
+    Returns
+    -------
+    ndarray
+        Exposed linear values ``(..., 3)``; 1 is the luminance that saturates a sensor.
+    """
     return np.asarray(image) / (SATURATION_LUMINANCE * 2.0**ev100)
 
 
-# The curve's shape: middle grey stays in place up to a camera-like lift, a toe-less foot, a long soft shoulder.
+# Shape of the tone curve: a constant gain, linear (no toe) up to the start of the shoulder, then a long soft shoulder.
 _SHOULDER_START, _WHITE = 0.30, 8.0
 _EXPOSURE_GAIN = 1.6
 
 
 def tone_curve(exposed: np.ndarray) -> np.ndarray:
-    """Display-linear values in [0, 1] from exposed linear values ``(..., 3)``.
+    """Compress exposed linear values to the display range.
 
-    Filmic but neutral: linear up to a shoulder, then ``1 - (1 - s) exp``-like compression of the *largest* channel,
-    with the others following in proportion (so hues stay) and bleeding towards white as they near the top
-    (so that a sun's glow does not turn into a flat disc of colour). Same construction as Khronos PBR Neutral (2024)
-    with a wider shoulder, as landscapes hold more range than products.
+    Linear up to a shoulder; above it the *largest* channel is compressed smoothly towards 1. The other channels are
+    scaled in proportion, which preserves hue, and strongly compressed colours are desaturated towards white, which
+    avoids flat discs of saturated colour around the sun. Same construction as Khronos PBR Neutral (2024) with a wider
+    shoulder, because landscapes have a larger dynamic range than products.
+
+    Parameters
+    ----------
+    exposed
+        Exposed linear values ``(..., 3)`` from `expose`.
+
+    Returns
+    -------
+    ndarray
+        Display-linear values in [0, 1] ``(..., 3)``, float32.
     """
     colour = np.maximum(np.asarray(exposed, np.float32) * _EXPOSURE_GAIN, 0.0)
     peak = colour.max(axis=-1, keepdims=True)
     start, span = _SHOULDER_START, 1.0 - _SHOULDER_START
-    over = np.maximum(peak - start, 0.0)
-    compressed = start + span * over / (over + span) * (1.0 + over * span / _WHITE**2)
+    excess = np.maximum(peak - start, 0.0)
+    compressed = start + span * excess / (excess + span) * (1.0 + excess * span / _WHITE**2)
     compressed = np.where(peak > start, np.minimum(compressed, 1.0), peak)
     scaled = colour * (compressed / np.maximum(peak, 1e-12))
     whiten = 1.0 - 1.0 / (0.12 * np.maximum(peak - compressed, 0.0) + 1.0)
@@ -103,11 +179,18 @@ def tone_curve(exposed: np.ndarray) -> np.ndarray:
 
 
 def write_png(path: str | os.PathLike, image: np.ndarray, *, metadata: Mapping[str, str] | None = None) -> None:
-    """Write display-linear values ``(H, W, 3)`` in [0, 1] as an 8-bit sRGB PNG, atomically, dithered against banding.
+    """Write a display-linear image as a dithered 8-bit sRGB PNG, atomically.
 
-    ``metadata`` goes into text chunks.
+    Parameters
+    ----------
+    path
+        Destination.
+    image
+        Display-linear values ``(H, W, 3)`` in [0, 1].
+    metadata
+        Key-value pairs for the PNG's international text chunks.
     """
-    # Half a level of ordered noise hides the bands of a smooth sky; the pattern is fixed, so files are reproducible.
+    # Dithering by up to one level avoids banding in smooth skies; the pattern is fixed, so files are reproducible.
     height, width = image.shape[:2]
     noise = np.random.default_rng(0).random((64, 64), np.float32)
     tiled = np.tile(noise, (height // 64 + 1, width // 64 + 1))[:height, :width, None]
@@ -116,7 +199,17 @@ def write_png(path: str | os.PathLike, image: np.ndarray, *, metadata: Mapping[s
 
 
 def write_png8(path: str | os.PathLike, levels: np.ndarray, *, metadata: Mapping[str, str] | None = None) -> None:
-    """Write sRGB-encoded bytes ``(H, W, 3)`` or grey ``(H, W)`` as PNG, atomically."""
+    """Write 8-bit levels as a PNG, atomically.
+
+    Parameters
+    ----------
+    path
+        Destination.
+    levels
+        sRGB-encoded levels ``(H, W, 3)`` or grey levels ``(H, W)``, uint8.
+    metadata
+        Key-value pairs for the PNG's international text chunks.
+    """
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 
@@ -128,31 +221,58 @@ def write_png8(path: str | os.PathLike, levels: np.ndarray, *, metadata: Mapping
 
 
 def read_image_linear(path: str | os.PathLike) -> np.ndarray:
-    """Read an 8- or 16-bit picture as linear Rec.709 ``(H, W, 3)`` float32 in [0, 1]; `FileNotFoundError`/`ValueError`."""
+    """Read an 8- or 16-bit sRGB image file as linear Rec.709.
+
+    Parameters
+    ----------
+    path
+        Image file in a format that OpenCV decodes. EXIF orientation is ignored.
+
+    Returns
+    -------
+    ndarray
+        Linear Rec.709 ``(H, W, 3)`` in [0, 1], float32.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the file does not exist.
+    UnreadableImage
+        If the file cannot be decoded, or holds no integer pixels.
+    """
     if not Path(path).is_file():
         raise FileNotFoundError(path)
     encoded = cv2.imread(os.fspath(path), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
     if encoded is None:
-        raise ValueError(f"{path}: not a readable picture")
-    top = np.iinfo(encoded.dtype).max
-    return linear_from_srgb(encoded[..., ::-1].astype(np.float32) / top)
+        raise UnreadableImage(f"{path}: not a readable picture")
+    if not np.issubdtype(encoded.dtype, np.integer):
+        raise UnreadableImage(f"{path}: not a readable picture; got {encoded.dtype} pixels, expected 8 or 16 bits")
+    maximum = np.iinfo(encoded.dtype.name).max
+    return linear_from_srgb(encoded[..., ::-1].astype(np.float32) / maximum)
 
 
 def write_exr(
-    path: str | os.PathLike, layers: Mapping[str, np.ndarray], *, header: Mapping | None = None, half: bool = False
+    path: str | os.PathLike,
+    layers: Mapping[str, np.ndarray],
+    *,
+    header: Mapping[str, Any] | None = None,
+    half: bool = False,
 ) -> None:
-    """Write float32 layers to one OpenEXR file, atomically.
+    """Write named layers to one OpenEXR file, atomically.
 
     Parameters
     ----------
+    path
+        Destination.
     layers
-        Layer name to ``(H, W)``, ``(H, W, 2)`` or ``(H, W, 3)``. The name ``""`` is the beauty layer (R, G, B);
-        others become ``name.R`` …; ``depth`` of two axes becomes ``depth.Z``; vectors named ``normal`` and
-        ``position`` become ``.X .Y .Z`` and ``uv`` becomes ``.U .V``.
+        Mapping from layer name to values ``(H, W)``, ``(H, W, 2)`` or ``(H, W, 3)``. The layer ``""`` is written as
+        channels R, G, B, any other three-channel layer as ``name.R``, ``name.G``, ``name.B``. Layers ``normal`` and
+        ``position`` use ``.X .Y .Z`` and ``uv`` uses ``.U .V``. A single-channel layer uses ``.Z`` if it is named
+        ``depth``, ``.A`` if ``mask`` or ``alpha``, and ``.Y`` otherwise.
     header
         Attributes. Strings and floats are stored as such, everything else as JSON text.
     half
-        Store half precision: values up to 65504, three digits.
+        Store half precision (largest value 65504, three significant digits) in place of single precision.
     """
     import OpenEXR
 
@@ -166,22 +286,45 @@ def write_exr(
         axes = {"normal": "XYZ", "position": "XYZ", "uv": "UV"}.get(name, "RGB")
         for index, axis in enumerate(axes[: values.shape[2]]):
             channels[prefix + axis] = np.ascontiguousarray(values[..., index])
-    attributes: dict = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    attributes: dict[str, Any] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     for key, value in (header or {}).items():
         attributes[key] = value if isinstance(value, (str, float)) else json.dumps(value)
     with atomic_path(path) as temporary:
         OpenEXR.File(attributes, channels).write(os.fspath(temporary))
 
 
-def read_exr(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict]:
-    """Layers and header of an OpenEXR file, the inverse of `write_exr`."""
+def read_exr(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Read the layers and the header of an OpenEXR file; the inverse of `write_exr`.
+
+    Parameters
+    ----------
+    path
+        OpenEXR file.
+
+    Returns
+    -------
+    layers
+        Mapping from layer name to values ``(H, W)`` or ``(H, W, C)``.
+    header
+        Attributes of the file.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the file does not exist.
+    UnreadableImage
+        If the file is not an OpenEXR file that can be decoded.
+    """
     import OpenEXR
 
     if not Path(path).is_file():
         raise FileNotFoundError(path)
-    with OpenEXR.File(os.fspath(path), separate_channels=True) as file:
-        channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
-        header = dict(file.header())
+    try:
+        with OpenEXR.File(os.fspath(path), separate_channels=True) as file:
+            channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+            header = dict(file.header())
+    except (RuntimeError, ValueError) as error:
+        raise UnreadableImage(f"{path}: not a readable OpenEXR file ({error})") from None
     grouped: dict[str, dict[str, np.ndarray]] = {}
     for name, pixels in channels.items():
         layer, _, axis = name.rpartition(".")
