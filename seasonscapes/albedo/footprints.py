@@ -137,7 +137,7 @@ def trace_footprints(
     rows = max(1, _BLOCK_RAYS // (camera.width_px * rays))
     blocks = []
     for top in range(0, camera.height_px, rows):
-        points, hit, pixel = view_samples(terrain, camera, (top, min(rows, camera.height_px - top)), rays, seed)
+        points, hit, pixel = view_samples(terrain, camera, range(top, min(top + rows, camera.height_px)), rays, seed)
         if len(pixel):
             blocks.append(_block_entries(terrain, camera, shape, points, hit, pixel, luminaries))
         report(min(1.0, (top + rows) / camera.height_px))
@@ -189,7 +189,9 @@ def _block_entries(
     share = np.bincount(entry, weight, len(columns)).astype(np.float32)
     shadow_rays = sun_rays(
         terrain,
-        (points.origin, points.normal, points.outward),
+        points.origin,
+        points.normal,
+        points.outward,
         hit.astype(np.float32),
         pixel_turn(pixel, camera.width_px, rays),
     )

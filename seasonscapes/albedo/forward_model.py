@@ -224,7 +224,7 @@ def camera_atmosphere(footprints: Footprints, *, sky_pixels: int = 4000, seed: i
         open_pixels = np.sort(np.random.default_rng(seed).choice(open_pixels, sky_pixels, replace=False))
     no_mixed_pixels = (np.empty(0, np.int64), np.empty((0, 1), np.float32))
     return CameraAtmosphere(
-        air_places(camera, footprints.pixel, footprints.distance_m, no_mixed_pixels),
+        air_places(camera, footprints.pixel, footprints.distance_m, *no_mixed_pixels),
         sky_grid(camera, open_pixels),
         float(np.degrees(1.0 / camera.fx)),
     )

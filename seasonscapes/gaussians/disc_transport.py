@@ -392,7 +392,9 @@ def surfel_irradiance(
     points = points.reshape(count, samples)
     sun = sun_rays(
         ray_scene,
-        (points.origin, points.normal, points.outward),
+        points.origin,
+        points.normal,
+        points.outward,
         np.full((count, samples), 1.0 / samples, np.float32),
         numbered_turn(np.arange(count)),
     )

@@ -358,4 +358,4 @@ def _air(
         transmittance, airlight = air(depth_m, ray_directions(camera, np.stack([column, row], axis=-1) + 0.5))
         return np.asarray(transmittance, np.float32), np.asarray(airlight, np.float32)
     no_mixed_pixels = (np.zeros(0, np.int64), np.zeros((0, 1), np.float32))
-    return air_at(air_places(camera, pixel, depth_m, no_mixed_pixels), air)
+    return air_at(air_places(camera, pixel, depth_m, *no_mixed_pixels), air)

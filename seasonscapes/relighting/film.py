@@ -1,4 +1,4 @@
-"""Films: frames in, an H.264 file out, one frame in memory at a time."""
+"""H.264 encoding of image sequences, with one image in memory at a time."""
 
 from __future__ import annotations
 
@@ -13,25 +13,35 @@ from seasonscapes.images import atomic_path, srgb_from_linear
 def write_film(
     path: Path, pictures: Iterable[np.ndarray], *, fps: float = 24.0, quality: int = 8, note: str = ""
 ) -> int:
-    """Encode display-linear pictures ``(H, W, 3)`` in [0, 1] as an MP4 that browsers play; returns their number.
+    """Encode images as an MP4 file (H.264, 4:2:0) that browsers can play.
 
     Parameters
     ----------
+    path
+        Output file, written atomically.
     pictures
-        All of one size; odd rows and columns at the lower and right rim are dropped, as H.264 wants even sizes.
+        Display-linear images ``(H, W, 3)`` in [0, 1], all of the same size. H.264 requires even sizes: an odd last row
+        or column is dropped.
+    fps
+        Frames per second.
     quality
         0 to 10.
     note
-        Kept in the file as its comment.
+        Comment in the metadata of the file.
+
+    Returns
+    -------
+    int
+        Number of encoded images.
 
     Raises
     ------
     ValueError
-        Without any picture, or where sizes differ.
+        If there is no image, or the sizes differ.
     """
     import imageio_ffmpeg
 
-    count, writer, size = 0, None, None
+    count, writer, size = 0, None, (0, 0)
     with atomic_path(path) as temporary:
         try:
             for picture in pictures:
@@ -41,7 +51,7 @@ def write_film(
                     writer = imageio_ffmpeg.write_frames(
                         str(temporary),
                         size,
-                        fps=fps,
+                        fps=fps,  # pyright: ignore[reportArgumentType]  # FFmpeg accepts fractions
                         quality=quality,
                         macro_block_size=2,
                         codec="libx264",
@@ -50,8 +60,10 @@ def write_film(
                     )
                     writer.send(None)
                 if (width, height) != size:
-                    raise ValueError(f"film: a picture of {width} × {height}, expected {size[0]} × {size[1]}")
-                # Ordered noise of half a level hides the bands of a smooth sky; H.264 keeps enough of it.
+                    raise ValueError(
+                        f"write_film: got an image of {width} × {height} pixels, expected {size[0]} × {size[1]}"
+                    )
+                # Dithering against banding in smooth skies; enough of it remains after compression.
                 noise = np.random.default_rng(count).random((height, width, 1), np.float32)
                 encoded = srgb_from_linear(picture[:height, :width]) * 255.0 + noise
                 writer.send(np.ascontiguousarray(np.clip(encoded, 0.0, 255.0).astype(np.uint8)))
@@ -60,5 +72,5 @@ def write_film(
             if writer is not None:
                 writer.close()
         if count == 0:
-            raise ValueError("film: no picture to encode")
+            raise ValueError("write_film: got no images, expected at least one")
     return count

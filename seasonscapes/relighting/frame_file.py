@@ -1,7 +1,8 @@
-"""One frame on disk before it is developed: half-precision OpenEXR, scaled by its own metered exposure.
+"""Storage of undeveloped frames: half-precision OpenEXR, scaled by the metered exposure of the frame.
 
-Night is ten orders of magnitude darker than the sun's disc and half precision spans nine; scaled so that 1 is what
-saturates a sensor at the metered exposure, every frame uses its range where the picture is.
+A night scene is ten orders of magnitude darker than the disc of the sun, and half precision spans nine. Each frame is
+scaled so that 1 is the saturation luminance at its metered exposure, which places the image in the range of half
+precision.
 """
 
 from __future__ import annotations
@@ -9,30 +10,68 @@ from __future__ import annotations
 import os
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from seasonscapes.images import SATURATION_LUMINANCE, read_exr, write_exr
 
+# Just below the largest finite half-precision number, 65504.
 _LARGEST = 60000.0
 
 
-def save_frame(path: Path, radiance: np.ndarray, *, metered_ev100: float, record: dict) -> None:
-    """Write scene-linear radiance ``(H, W, 3)`` [cd/m²], atomically."""
+def save_frame(path: Path, radiance: np.ndarray, *, metered_ev100: float, record: dict[str, Any]) -> None:
+    """Write a frame, atomically.
+
+    Parameters
+    ----------
+    path
+        Output file.
+    radiance
+        ``(H, W, 3)`` scene-linear radiance [cd/m²].
+    metered_ev100
+        Metered exposure of the frame [EV100].
+    record
+        Provenance: plain values, stored in the header of the file.
+    """
     scale = SATURATION_LUMINANCE * 2.0**metered_ev100
     header = {"seasonscapes:metered_ev100": float(metered_ev100), "seasonscapes:provenance": record}
     write_exr(path, {"": np.minimum(radiance / scale, _LARGEST)}, header=header, half=True)
 
 
 def load_frame(path: Path) -> tuple[np.ndarray, float]:
-    """Radiance ``(H, W, 3)`` float32 [cd/m²] and metered EV100 of a frame."""
+    """Read a frame.
+
+    Parameters
+    ----------
+    path
+        File of `save_frame`.
+
+    Returns
+    -------
+    radiance
+        ``(H, W, 3)`` float32 scene-linear radiance [cd/m²].
+    metered_ev100
+        Metered exposure of the frame [EV100].
+    """
     layers, header = read_exr(path)
     metered = float(header["seasonscapes:metered_ev100"])
     return layers[""].astype(np.float32) * np.float32(SATURATION_LUMINANCE * 2.0**metered), metered
 
 
 def frame_ev100(path: Path) -> float:
-    """The metered EV100 of a frame, without reading its pixels."""
+    """Read the metered exposure of a frame [EV100], without its pixels.
+
+    Parameters
+    ----------
+    path
+        File of `save_frame`.
+
+    Returns
+    -------
+    float
+        Metered exposure [EV100].
+    """
     import OpenEXR
 
     with OpenEXR.File(os.fspath(path), header_only=True) as file:
@@ -40,10 +79,32 @@ def frame_ev100(path: Path) -> float:
 
 
 def time_stamp(time: datetime) -> str:
-    """An aware UTC time as a file's stem: sorts by time, and does not depend on which other frames a film has."""
+    """Format a time as the stem of a file name that sorts by time.
+
+    Parameters
+    ----------
+    time
+        Aware datetime in UTC.
+
+    Returns
+    -------
+    str
+        Such as ``20240901T080000Z``.
+    """
     return f"{time:%Y%m%dT%H%M%S}Z"
 
 
 def frame_name(time: datetime) -> str:
-    """The file of an aware UTC time's frame."""
+    """Return the file name of a frame.
+
+    Parameters
+    ----------
+    time
+        Aware datetime in UTC.
+
+    Returns
+    -------
+    str
+        Such as ``20240901T080000Z.exr``.
+    """
     return f"{time_stamp(time)}.exr"

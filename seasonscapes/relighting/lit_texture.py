@@ -1,14 +1,14 @@
-"""What the ground receives and sends back, texel by texel and cell by cell: lit textures, insolation maps."""
+"""Lit textures (illuminance and reflected radiance per texel) and irradiance integrated over time (insolation)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from seasonscapes.relighting.luminous_efficacy import efficacies_lm_w
+from seasonscapes.rendering.hemisphere_rays import RayScene
 from seasonscapes.rendering.irradiance import irradiance_blocks
 from seasonscapes.rendering.transport import SamplingOptions
 from seasonscapes.sky.illumination import Illumination, diffuse_horizontal_illuminance, luminance
@@ -18,15 +18,15 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True)
 class LitTexture:
-    """A texture under one light.
+    """Illuminance and albedo of the texels of a texture under one illumination.
 
     Parameters
     ----------
     sun, sky, bounce
-        ``(R, S, 3)`` float32 illuminance on the surface, from sun and moon, from the sky, by way of other terrain [lx];
-        NaN where no surface has the texel.
+        ``(R, S, 3)`` float32 illuminance of the surface by sun and moon, by the sky, and by light that other terrain
+        reflects [lx]; NaN for texels without a surface.
     albedo
-        ``(R, S, 3)`` what it was multiplied with.
+        ``(R, S, 3)`` albedo of the texels.
     """
 
     sun: np.ndarray
@@ -36,12 +36,12 @@ class LitTexture:
 
     @property
     def radiance(self) -> np.ndarray:
-        """Radiance ``(R, S, 3)`` that leaves the surface [cd/m²]; zero where there is none."""
+        """Radiance ``(R, S, 3)`` that leaves the surface [cd/m²]; zero for texels without a surface."""
         return np.nan_to_num((self.sun + self.sky + self.bounce) * self.albedo / np.float32(np.pi))
 
 
-def lit_texture(
-    terrain: Any,
+def bake_lit_texture(
+    terrain: RayScene,
     positions: np.ndarray,
     albedo: np.ndarray,
     light: Illumination,
@@ -50,39 +50,58 @@ def lit_texture(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> LitTexture:
-    """Bake the light of an instant into a texture.
+    """Compute the illuminance of all texels of a texture under an illumination.
 
     Parameters
     ----------
     terrain
         From `rendering.hemisphere_rays.ray_scene`.
     positions
-        ``(R, S, 3)`` of the texels' centres, ENU [m], NaN where there is no surface; see `terrain.texels`.
+        ``(R, S, 3)`` positions of the texel centres, ENU [m], from `terrain.texels`; NaN for texels without a surface.
     albedo
-        ``(R, S, 3)``.
+        ``(R, S, 3)`` albedo of the texels.
+    light
+        Sky, sun and moon.
+    sampling
+        Sampling options; defaults if ``None``.
+    seed
+        Of the sampling.
+    progress
+        Called with the completed fraction.
+
+    Returns
+    -------
+    LitTexture
+        Illuminance by component, and the albedo.
+
+    Raises
+    ------
+    ValueError
+        If no texel has a surface.
     """
-    parts = [np.full((*positions.shape[:2], 3), np.nan, np.float32) for _ in range(3)]
-    flat = [part.reshape(-1, 3) for part in parts]
+    sun, sky, bounce = (np.full((*positions.shape[:2], 3), np.nan, np.float32) for _ in range(3))
+    flat = [component.reshape(-1, 3) for component in (sun, sky, bounce)]
     blocks = irradiance_blocks(terrain, positions.reshape(-1, 3), [light], sampling, seed=seed, progress=progress)
     for index, _, results in blocks:
         for received in results:
-            for part, values in zip(flat, (received.sun, received.sky, received.bounce), strict=True):
-                part[index] = values
-    return LitTexture(*parts, albedo)
+            for component, values in zip(flat, (received.sun, received.sky, received.bounce), strict=True):
+                component[index] = values
+    return LitTexture(sun, sky, bounce, albedo)
 
 
 @dataclass(frozen=True)
 class IntegratedIrradiance:
-    """What a surface receives over a time, or at an instant where the weights say so.
+    """Weighted sums over time of the irradiance of N points; values of a single instant for one weight of 1.
 
     Parameters
     ----------
     direct_w, sky_w, reflected_w
-        ``(N,)`` float32 weighted sums of irradiance on the surface [W/m² × the weights' unit]; NaN without a surface.
+        ``(N,)`` float32 irradiance of the surface by sun and moon, by the sky, and by light that other terrain reflects
+        [W/m² × unit of the weights]; NaN for points without a surface.
     total_lx
-        ``(N,)`` of illuminance [lx × the weights' unit].
+        ``(N,)`` total illuminance [lx × unit of the weights].
     sunlit
-        ``(N,)`` sum of the weights while more than half of the sun's disc is in sight of the surface.
+        ``(N,)`` sum of the weights of the instants at which more than half of the sun's disc is visible.
     """
 
     direct_w: np.ndarray
@@ -93,7 +112,7 @@ class IntegratedIrradiance:
 
 
 def integrate_irradiance(
-    terrain: Any,
+    terrain: RayScene,
     positions: np.ndarray,
     lights: Sequence[Illumination],
     weights: np.ndarray,
@@ -103,37 +122,56 @@ def integrate_irradiance(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> IntegratedIrradiance:
-    """Sum what places receive under many lights.
+    """Sum the irradiance of surface points over several instants.
 
     Parameters
     ----------
+    terrain
+        From `rendering.hemisphere_rays.ray_scene`.
     positions
-        ``(N, 3)`` ENU [m]; NaN where there is none.
+        ``(N, 3)`` positions on the terrain, ENU [m]; NaN for none.
     lights
-        Of the instants.
+        Illuminations at the T instants.
     weights
-        ``(T,)`` of each: hours for an insolation in Wh/m², 1 for a single instant.
+        ``(T,)`` weight of each instant: hours for an insolation in Wh/m², 1 for a single instant.
+    sampling
+        Sampling options; defaults if ``None``.
     search_m
         See `rendering.irradiance.surface_at`.
+    seed
+        Of the sampling.
+    progress
+        Called with the completed fraction.
+
+    Returns
+    -------
+    IntegratedIrradiance
+        Weighted sums of irradiance, illuminance and sunshine.
+
+    Raises
+    ------
+    ValueError
+        If none of the positions lies on the terrain.
     """
-    efficacy = [_efficacies(light) for light in lights]
+    efficacies = [_efficacies(light) for light in lights]
     sums = np.full((len(positions), 5), np.nan, np.float32)
     blocks = irradiance_blocks(terrain, positions, lights, sampling, seed=seed, search_m=search_m, progress=progress)
     for index, points, results in blocks:
         total = np.zeros((len(index), 5), np.float64)
-        for light, weight, (direct, diffuse), received in zip(lights, weights, efficacy, results, strict=True):
-            sun, sky, bounce = (luminance(part) for part in (received.sun, received.sky, received.bounce))
+        for light, weight, (direct, diffuse), received in zip(lights, weights, efficacies, results, strict=True):
+            sun, sky, bounce = (luminance(values) for values in (received.sun, received.sky, received.bounce))
             total[:, 0] += weight * sun / direct
             total[:, 1] += weight * sky / diffuse
-            # What comes by way of the ground is sunlight for the most part while the sun is up.
+            # By day most reflected light is sunlight.
             total[:, 2] += weight * bounce / (direct if light.sun is not None else diffuse)
             total[:, 3] += weight * (sun + sky + bounce)
-            total[:, 4] += weight * _in_sun(light, points.normal, sun)
+            total[:, 4] += weight * _sunlit(light, points.normal, sun)
         sums[index] = total
     return IntegratedIrradiance(*sums.T)
 
 
 def _efficacies(light: Illumination) -> tuple[float, float]:
+    """Luminous efficacy of sunlight and of skylight [lm/W]."""
     sky = float(luminance(diffuse_horizontal_illuminance(light.sky_radiance)))
     if light.sun is None:
         return efficacies_lm_w(0.0, sky, 1.0)
@@ -141,7 +179,8 @@ def _efficacies(light: Illumination) -> tuple[float, float]:
     return efficacies_lm_w(float(luminance(light.sun.normal_illuminance_lx)), sky, elevation)
 
 
-def _in_sun(light: Illumination, normal: np.ndarray, sun_lx: np.ndarray) -> np.ndarray:
+def _sunlit(light: Illumination, normal: np.ndarray, sun_lx: np.ndarray) -> np.ndarray:
+    """Points ``(N,)`` from which more than half of the sun's disc is visible."""
     if light.sun is None:
         return np.zeros(len(sun_lx), bool)
     facing = np.maximum(normal @ np.asarray(light.sun.direction, np.float32), 1e-6)

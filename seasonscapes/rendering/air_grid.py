@@ -1,8 +1,9 @@
-"""Air and sky over a whole picture from a coarse grid: they are smooth, and a model of them is slow to ask.
+"""Aerial perspective and sky radiance of an image, interpolated from a coarse grid of pixels.
 
-Aerial perspective is asked at the nodes of a grid of pixels × distances and interpolated (Hillaire 2020, "A scalable and
-production ready sky and atmosphere rendering technique", doi:10.1111/cgf.14050, § 5.4); the open sky at every fourth
-pixel, and at every pixel around sun and moon.
+Both vary smoothly over an image, and the sky model is expensive to evaluate. Aerial perspective is evaluated at the nodes
+of a grid of pixels × distances and interpolated trilinearly (Hillaire 2020, "A scalable and production ready sky and
+atmosphere rendering technique", doi:10.1111/cgf.14050, § 5.4). Sky radiance is evaluated at every fourth pixel and
+interpolated bilinearly, but at every pixel around sun and moon.
 """
 
 from __future__ import annotations
@@ -17,87 +18,123 @@ from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.rendering.mitsuba_scene import background
 from seasonscapes.sky.illumination import AerialPerspective, Illumination
 
-# Nodes are this far apart in angle and in pixels at most.
+# Largest spacing of the nodes, in angle and in pixels.
 _AIR_STEP_DEG, _AIR_STEP_PX, _SLICES = 1.2, 16, 32
 _SKY_STEP_DEG, _SKY_STEP_PX = 0.3, 4
-# Around a luminary the sky is as sharp as the aerosol's forward peak.
+# Around sun and moon the sky varies as fast as the aerosol's forward-scattering peak.
 _AUREOLE_DEG = 4.0
 
 
 @dataclass(frozen=True)
 class AirPlaces:
-    """Where a view's n pixels of terrain lie in a grid at whose nodes the air is asked.
+    """Positions of a view's n terrain pixels in the grid at which aerial perspective is evaluated.
 
     Parameters
     ----------
     direction
-        ``(h, w, 3)`` of the nodes' pixels.
+        ``(h, w, 3)`` unit view directions of the nodes, ENU.
     depth_m
-        ``(_SLICES,)`` distances of the nodes, a geometric sequence.
-    mi_place
-        ``mi.Point3f`` of n lanes in the grid's texture.
-    several, mi_several, share
-        ``(k,)`` pixels that show several distances; ``k S`` lanes of their samples; ``(k, S)`` weights of these.
+        ``(_SLICES,)`` distances of the nodes, a geometric sequence [m].
+    mi_coordinate
+        ``mi.Point3f`` of n lanes: coordinates of the pixels in the grid's 3D texture.
+    mixed
+        ``(k,)`` numbers among the n of pixels whose samples lie at several distances.
+    mi_sample_coordinate
+        ``mi.Point3f`` of ``k S`` lanes: coordinates of the S samples of these pixels.
+    sample_weight
+        ``(k, S)`` weight of each of these samples, sum 1 over the terrain samples of a pixel.
     """
 
     direction: np.ndarray
     depth_m: np.ndarray
-    mi_place: Any
-    several: np.ndarray
-    mi_several: Any
-    share: np.ndarray
+    mi_coordinate: Any
+    mixed: np.ndarray
+    mi_sample_coordinate: Any
+    sample_weight: np.ndarray
 
 
 def _step_px(camera: Camera | Panorama, most_deg: float, most_px: int) -> int:
     return int(np.clip(np.radians(most_deg) * max(camera.fx, camera.fy), 1, most_px))
 
 
-def _nodes(camera: Camera | Panorama, step: int) -> np.ndarray:
-    """Directions at the centre of every ``step``-th pixel, the last ones past the rim."""
+def _node_directions(camera: Camera | Panorama, step: int) -> np.ndarray:
+    """View directions ``(h, w, 3)`` at the centre of every ``step``-th pixel; the last nodes lie beyond the image."""
     x = 0.5 + np.arange(0, camera.width_px + step, step)
     y = 0.5 + np.arange(0, camera.height_px + step, step)
     return view_directions(camera, np.stack(np.meshgrid(x, y), axis=-1))
 
 
 def air_places(
-    camera: Camera | Panorama, pixel: np.ndarray, depth_m: np.ndarray, several: tuple[np.ndarray, np.ndarray]
+    camera: Camera | Panorama, pixel: np.ndarray, depth_m: np.ndarray, mixed: np.ndarray, mixed_distance_m: np.ndarray
 ) -> AirPlaces:
-    """For flat indices ``(n,)`` of pixels and their distances ``(n,)`` [m].
+    """Build the grid of aerial perspective for the terrain pixels of a view.
 
-    ``several`` are the numbers ``(k,)`` among the n of pixels whose air is averaged over samples, and those samples'
-    distances ``(k, S)``, infinite where they show no terrain.
+    Parameters
+    ----------
+    camera
+        The view.
+    pixel
+        ``(n,)`` flat indices of the terrain pixels.
+    depth_m
+        ``(n,)`` distances of their terrain along the ray [m].
+    mixed
+        ``(k,)`` numbers among the n of pixels whose air is averaged over samples at several distances.
+    mixed_distance_m
+        ``(k, S)`` distances of the samples of these pixels [m], infinite for samples of the sky.
+
+    Returns
+    -------
+    AirPlaces
+        Grid nodes and the positions of the pixels between them, for `air_at`.
     """
-    index, distance_m = several
-    shown = np.isfinite(distance_m)
-    low, high = max(float(depth_m.min()), 1.0), float(max(depth_m.max(), distance_m[shown].max(initial=0.0)))
+    on_terrain = np.isfinite(mixed_distance_m)
+    low, high = (
+        max(float(depth_m.min()), 1.0),
+        float(max(depth_m.max(), mixed_distance_m[on_terrain].max(initial=0.0))),
+    )
     step = _step_px(camera, _AIR_STEP_DEG, _AIR_STEP_PX)
-    nodes, depths = _nodes(camera, step), np.geomspace(low, max(high, 1.01 * low), _SLICES)
+    nodes, depths = _node_directions(camera, step), np.geomspace(low, max(high, 1.01 * low), _SLICES)
 
-    def place(flat: np.ndarray, distance: np.ndarray) -> Any:
+    def coordinates(flat: np.ndarray, distance: np.ndarray) -> Any:
         import mitsuba as mi
 
         row, column = np.divmod(flat, camera.width_px)
-        share = np.log(np.maximum(distance, low) / low) / np.log(depths[-1] / low)
+        relative = np.log(np.maximum(distance, low) / low) / np.log(depths[-1] / low)
         columns = (
             (column / step + 0.5) / nodes.shape[1],
             (row / step + 0.5) / nodes.shape[0],
-            (share * (_SLICES - 1) + 0.5) / _SLICES,
+            (relative * (_SLICES - 1) + 0.5) / _SLICES,
         )
         return mi.Point3f(*(mi.Float(np.ascontiguousarray(values, np.float32)) for values in columns))
 
-    samples = np.repeat(pixel[index], distance_m.shape[1])
+    samples = np.repeat(pixel[mixed], mixed_distance_m.shape[1])
     return AirPlaces(
         nodes,
         depths,
-        place(pixel, depth_m),
-        index,
-        place(samples, np.where(shown, distance_m, low).ravel()),
-        shown / np.maximum(shown.sum(axis=1, keepdims=True), 1),
+        coordinates(pixel, depth_m),
+        mixed,
+        coordinates(samples, np.where(on_terrain, mixed_distance_m, low).ravel()),
+        on_terrain / np.maximum(on_terrain.sum(axis=1, keepdims=True), 1),
     )
 
 
 def air_at(places: AirPlaces, air: AerialPerspective) -> tuple[np.ndarray, np.ndarray]:
-    """Transmittance and airlight ``(n, 3)`` of the pixels."""
+    """Interpolate aerial perspective at the terrain pixels of a view.
+
+    Parameters
+    ----------
+    places
+        From `air_places`.
+    air
+        Aerial perspective of the illumination; evaluated at the grid nodes.
+
+    Returns
+    -------
+    transmittance
+        ``(n, 3)`` between terrain and camera.
+    airlight
+        ``(n, 3)`` radiance scattered into the view ray [cd/m²].
+    """
     import drjit as dr
     import mitsuba as mi
 
@@ -105,70 +142,101 @@ def air_at(places: AirPlaces, air: AerialPerspective) -> tuple[np.ndarray, np.nd
     depth = np.broadcast_to(places.depth_m[:, None, None], shape)
     parts = air(depth, np.broadcast_to(places.direction, (*shape, 3)))
     nodes = np.concatenate([np.broadcast_to(part, (*shape, 3)) for part in parts], axis=-1).astype(np.float32)
-    texture = mi.Texture3f(mi.TensorXf(np.ascontiguousarray(nodes)), wrap_mode=dr.WrapMode.Clamp)
-    values = np.array(texture.eval(places.mi_place)).T.copy()
-    if len(places.several):
-        samples = np.array(texture.eval(places.mi_several)).T.reshape(*places.share.shape, 6)
-        values[places.several] = np.einsum("ks,ksc->kc", places.share, samples)
+    # The stub of Dr.Jit gives the texture types as `object`.
+    texture: Any = mi.Texture3f(  # pyright: ignore[reportCallIssue]
+        mi.TensorXf(np.ascontiguousarray(nodes)), wrap_mode=dr.WrapMode.Clamp
+    )
+    values = np.array(texture.eval(places.mi_coordinate)).T.copy()
+    if len(places.mixed):
+        samples = np.array(texture.eval(places.mi_sample_coordinate)).T.reshape(*places.sample_weight.shape, 6)
+        values[places.mixed] = np.einsum("ks,ksc->kc", places.sample_weight, samples)
     return values[:, :3], values[:, 3:]
 
 
 @dataclass(frozen=True)
 class SkyGrid:
-    """Where a view's K open pixels lie among the nodes where the sky is asked.
+    """Positions of a view's K sky pixels among the nodes at which sky radiance is evaluated.
 
     Parameters
     ----------
     pixel
-        ``(K,)`` flat index of each.
-    node
-        ``(h, w, 3)`` directions of the nodes.
+        ``(K,)`` flat indices of the pixels.
+    node_direction
+        ``(h, w, 3)`` unit view directions of the nodes, ENU.
     used
-        ``(h w,)`` bool: nodes that open pixels need.
-    corner, share
-        ``(4, K)`` int32 nodes around each pixel and their weights.
+        ``(h w,)`` bool: nodes that the interpolation needs.
+    corner, weight
+        ``(4, K)`` int32 nodes around each pixel and their bilinear weights.
     direction
-        ``(K, 3)`` of the pixels themselves.
+        ``(K, 3)`` float32 unit view directions of the pixels, ENU.
     """
 
     pixel: np.ndarray
-    node: np.ndarray
+    node_direction: np.ndarray
     used: np.ndarray
     corner: np.ndarray
-    share: np.ndarray
+    weight: np.ndarray
     direction: np.ndarray
 
 
 def sky_grid(camera: Camera | Panorama, pixel: np.ndarray) -> SkyGrid:
-    """For the flat indices ``(K,)`` of pixels that show any open sky."""
+    """Build the grid of sky radiance for the sky pixels of a view.
+
+    Parameters
+    ----------
+    camera
+        The view.
+    pixel
+        ``(K,)`` flat indices of the pixels that are not fully covered by terrain.
+
+    Returns
+    -------
+    SkyGrid
+        Grid nodes and bilinear weights, for `open_sky`.
+    """
     step = _step_px(camera, _SKY_STEP_DEG, _SKY_STEP_PX)
-    node = _nodes(camera, step)
-    width = node.shape[1]
+    node_direction = _node_directions(camera, step)
+    width = node_direction.shape[1]
     row, column = np.divmod(pixel, camera.width_px)
     across, down = column / step, row / step
     left, top = across.astype(np.int32), down.astype(np.int32)
     fx, fy = (across - left).astype(np.float32), (down - top).astype(np.float32)
     first = top * width + left
     corner = np.stack([first, first + 1, first + width, first + width + 1])
-    share = np.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy])
-    used = np.zeros(node.shape[0] * width, bool)
+    weight = np.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy])
+    used = np.zeros(node_direction.shape[0] * width, bool)
     used[corner] = True
     direction = view_directions(camera, np.stack([column + 0.5, row + 0.5], axis=-1))
-    return SkyGrid(pixel, node, used, corner, share, direction.astype(np.float32))
+    return SkyGrid(pixel, node_direction, used, corner, weight, direction.astype(np.float32))
 
 
 def open_sky(grid: SkyGrid, illumination: Illumination, pixel_angle_deg: float) -> np.ndarray:
-    """Radiance ``(K, 3)`` [cd/m²] of the open pixels, with the discs of sun and moon; see `mitsuba_scene.background`."""
-    bare = replace(illumination, sun=None, moon=None)
+    """Radiance of the sky pixels of a view, with the discs of sun and moon.
+
+    Parameters
+    ----------
+    grid
+        From `sky_grid`.
+    illumination
+        Sky, sun, moon and aerial perspective.
+    pixel_angle_deg
+        Angular size of a pixel [deg], over which the edges of the discs are spread; see `mitsuba_scene.background`.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(K, 3)`` float32 [cd/m²].
+    """
+    without_discs = replace(illumination, sun=None, moon=None)
     at_nodes = np.zeros((len(grid.used), 3), np.float32)
-    at_nodes[grid.used] = background(bare, grid.node.reshape(-1, 3)[grid.used], pixel_angle_deg)
+    at_nodes[grid.used] = background(without_discs, grid.node_direction.reshape(-1, 3)[grid.used], pixel_angle_deg)
     sky = np.zeros((len(grid.direction), 3), np.float32)
-    for corner, share in zip(grid.corner, grid.share, strict=True):
-        sky += at_nodes[corner] * share[:, None]
-    near = np.zeros(len(sky), bool)
+    for corner, weight in zip(grid.corner, grid.weight, strict=True):
+        sky += at_nodes[corner] * weight[:, None]
+    in_aureole = np.zeros(len(sky), bool)
     for body in (illumination.sun, illumination.moon):
         if body is not None:
-            near |= grid.direction @ np.asarray(body.direction, np.float32) > np.cos(np.radians(_AUREOLE_DEG))
-    if near.any():
-        sky[near] = background(illumination, grid.direction[near].astype(np.float64), pixel_angle_deg)
+            in_aureole |= grid.direction @ np.asarray(body.direction, np.float32) > np.cos(np.radians(_AUREOLE_DEG))
+    if in_aureole.any():
+        sky[in_aureole] = background(illumination, grid.direction[in_aureole].astype(np.float64), pixel_angle_deg)
     return sky

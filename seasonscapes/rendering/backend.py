@@ -1,7 +1,7 @@
-"""Which Mitsuba variant runs here, and which libLLVM it stands on; numpy to Mitsuba and back.
+"""Selection of the Mitsuba variant and of its libLLVM, and conversions between numpy and Mitsuba arrays.
 
 Dr.Jit's LLVM backend *aborts the process* with an old libLLVM ("Cannot select … fminimum", LLVM 14 and 15 on AVX-512
-machines), so the library is chosen and its version read before a variant is set.
+machines). The library is therefore chosen, and its version read, before a variant is set.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 
 from seasonscapes.declaration import InputError
 
-# LLVM 14 and 15 were seen to abort; LLVMGetVersion itself exists from 16 on, so older ones cannot even be asked.
+# LLVM 14 and 15 abort; LLVMGetVersion exists from LLVM 16 on, so that older libraries do not report a version.
 OLDEST_LLVM = 16
 LLVM_CURE = "install one: 'apt-get install libllvm19' (Debian 12, Ubuntu 24.04), 'brew install llvm@19' (macOS)"
 VARIANTS = {"cuda": "cuda_ad_rgb", "llvm": "llvm_ad_rgb", "scalar": "scalar_rgb"}
@@ -28,19 +28,40 @@ VARIANTS = {"cuda": "cuda_ad_rgb", "llvm": "llvm_ad_rgb", "scalar": "scalar_rgb"
 
 @dataclass(frozen=True)
 class Library:
-    """A libLLVM on this machine; ``version`` is ``(0, 0, 0)`` where it is too old to tell."""
+    """A libLLVM on this machine.
+
+    Parameters
+    ----------
+    path
+        File of the shared library.
+    version
+        Major, minor and patch; ``(0, 0, 0)`` if the library is too old to report one or cannot be loaded.
+    """
 
     path: str
     version: tuple[int, int, int]
 
     @property
     def usable(self) -> bool:
+        """Whether the version is recent enough for Dr.Jit."""
         return self.version[0] >= OLDEST_LLVM
 
 
 @dataclass(frozen=True)
 class Backend:
-    """The variant that would be used, why, and the library beneath it."""
+    """A Mitsuba variant, the reason for choosing it, and its libLLVM.
+
+    Parameters
+    ----------
+    device
+        ``cuda``, ``llvm`` or ``scalar``.
+    variant
+        Name of the Mitsuba variant.
+    reason
+        Why this device was chosen, for display.
+    library
+        The libLLVM that was found; ``None`` for CUDA, on explicit request of ``scalar``, or if there is none.
+    """
 
     device: str
     variant: str
@@ -49,17 +70,33 @@ class Backend:
 
 
 def library_version(path: str) -> tuple[int, int, int]:
-    """Version that a libLLVM says of itself, ``(0, 0, 0)`` for those too old to say; `OSError` if it does not load."""
+    """Return the version that a libLLVM reports.
+
+    Parameters
+    ----------
+    path
+        File of the shared library.
+
+    Returns
+    -------
+    tuple of int
+        Major, minor and patch; ``(0, 0, 0)`` for libraries older than LLVM 16, which do not report a version.
+
+    Raises
+    ------
+    OSError
+        If the library cannot be loaded.
+    """
     library = ctypes.CDLL(path)
     if not hasattr(library, "LLVMGetVersion"):
         return (0, 0, 0)
-    parts = [ctypes.c_uint() for _ in range(3)]
-    library.LLVMGetVersion(*(ctypes.byref(part) for part in parts))
-    return tuple(part.value for part in parts)  # type: ignore[return-value]
+    major, minor, patch = (ctypes.c_uint() for _ in range(3))
+    library.LLVMGetVersion(*(ctypes.byref(part) for part in (major, minor, patch)))
+    return major.value, minor.value, patch.value
 
 
 def _candidate_paths() -> list[str]:
-    """Paths of libLLVM on this machine, the likeliest to work first (newest by file name)."""
+    """Paths of libLLVM on this machine, newest by file name first."""
     patterns = [
         "/usr/lib/*-linux-gnu/libLLVM*.so*",
         "/lib/*-linux-gnu/libLLVM*.so*",
@@ -83,9 +120,12 @@ def _candidate_paths() -> list[str]:
 
 @cache
 def find_llvm() -> Library | None:
-    """The libLLVM that Dr.Jit should load: ``DRJIT_LIBLLVM_PATH`` where set, else the newest usable one.
+    """Return the libLLVM that Dr.Jit should load: ``DRJIT_LIBLLVM_PATH`` if set, else the newest usable one.
 
-    Returns the best *unusable* one when there is nothing better, so that it can be named; ``None`` if there is none.
+    Returns
+    -------
+    Library or None
+        Without a usable library the newest unusable one, so that messages can name it; ``None`` if there is none.
     """
     given = os.environ.get("DRJIT_LIBLLVM_PATH")
     best: Library | None = None
@@ -102,7 +142,7 @@ def find_llvm() -> Library | None:
 
 @cache
 def cuda_devices() -> int:
-    """Number of CUDA devices that the driver reports; 0 without a driver."""
+    """Return the number of CUDA devices that the driver reports; 0 without a driver."""
     for name in ("libcuda.so.1", "nvcuda.dll"):
         try:
             driver = ctypes.CDLL(name)
@@ -115,12 +155,22 @@ def cuda_devices() -> int:
 
 
 def choose_backend(device: str = "auto") -> Backend:
-    """The backend for ``auto``, ``cuda``, ``llvm`` or ``scalar``, without loading Mitsuba.
+    """Choose a backend without loading Mitsuba.
+
+    Parameters
+    ----------
+    device
+        ``auto`` (first available of CUDA, LLVM and scalar), ``cuda``, ``llvm`` or ``scalar``.
+
+    Returns
+    -------
+    Backend
+        The chosen device, its Mitsuba variant and the reason.
 
     Raises
     ------
     InputError
-        When a device is asked for by name and cannot work here.
+        If the device is unknown, or is requested explicitly and not available on this machine.
     """
     _check_name(device)
     gpus = cuda_devices()
@@ -129,15 +179,15 @@ def choose_backend(device: str = "auto") -> Backend:
     if device == "cuda" or (device == "auto" and gpus > 0):
         return Backend("cuda", VARIANTS["cuda"], f"{gpus} CUDA device{'s' * (gpus > 1)} found")
     if device == "scalar":
-        return Backend("scalar", VARIANTS["scalar"], "asked for by name; forward rendering only")
+        return Backend("scalar", VARIANTS["scalar"], "requested explicitly; forward rendering only")
     library = find_llvm()
     if library is not None and library.usable:
-        why = "no CUDA device" if device == "auto" else "asked for by name"
-        return Backend("llvm", VARIANTS["llvm"], f"{why}; libLLVM {'.'.join(map(str, library.version))}", library)
+        reason = "no CUDA device" if device == "auto" else "requested explicitly"
+        return Backend("llvm", VARIANTS["llvm"], f"{reason}; libLLVM {'.'.join(map(str, library.version))}", library)
     problem = "no libLLVM found" if library is None else f"libLLVM at {library.path} is older than {OLDEST_LLVM}"
     if device == "llvm":
         raise InputError("--device", problem, got="llvm", cure=LLVM_CURE)
-    return Backend("scalar", VARIANTS["scalar"], f"{problem}; slower, and nothing that needs gradients works", library)
+    return Backend("scalar", VARIANTS["scalar"], f"{problem}; slower, and without gradients", library)
 
 
 def _check_name(device: str) -> None:
@@ -149,15 +199,26 @@ _active: Backend | None = None
 
 
 def use_backend(device: str | None = None, *, gradients: bool = False) -> Backend:
-    """Set Mitsuba's variant once per process and return what was set.
+    """Set Mitsuba's variant once per process and return the active backend.
 
-    ``device`` left out means ``SEASONSCAPES_DEVICE`` or ``auto``. A second call returns the active backend.
+    Parameters
+    ----------
+    device
+        ``auto``, ``cuda``, ``llvm`` or ``scalar``; by default the environment variable ``SEASONSCAPES_DEVICE``, else
+        ``auto``. Later calls return the backend that the first call has set.
+    gradients
+        Require a variant with automatic differentiation.
+
+    Returns
+    -------
+    Backend
+        The active backend.
 
     Raises
     ------
     InputError
-        When the device cannot work here, when gradients are needed and only ``scalar`` is there, or when another
-        device was already set in this process.
+        If the device is not available, if ``gradients`` are required and the variant is scalar, or if another device
+        is already active in this process.
     """
     global _active
     _check_name(device or "auto")
@@ -171,39 +232,70 @@ def use_backend(device: str | None = None, *, gradients: bool = False) -> Backen
         mi.set_log_level(mi.LogLevel.Error)
         _active = chosen
     elif device not in (None, "auto", _active.device):
-        raise InputError("--device", f"this process already renders on {_active.device}", got=device)
+        raise InputError("--device", f"the device of this process is already {_active.device}", got=device)
     if gradients and _active.device == "scalar":
-        raise InputError("--device", "this needs gradients, which the scalar variant does not have", cure=LLVM_CURE)
+        raise InputError("--device", "gradients are required, and the scalar variant has none", cure=LLVM_CURE)
     return _active
 
 
 def to_numpy(values: Any) -> np.ndarray:
-    """A numpy copy of a Mitsuba/Dr.Jit array with the axis of components last, ``(N,)`` or ``(N, C)`` float32.
+    """Copy a Mitsuba or Dr.Jit array to numpy, with the component axis last.
 
-    Dr.Jit numbers its axes (component, lane); numpy code of this package wants (lane, component).
+    Parameters
+    ----------
+    values
+        Dr.Jit array of N lanes, whose own axis order is (component, lane).
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(N,)`` or ``(N, C)``, float32 for Mitsuba's floats.
     """
     array = np.array(values)
     return array.T.copy() if array.ndim == 2 else array
 
 
 def point3(values: np.ndarray) -> Any:
-    """Positions or directions ``(N, 3)`` as ``mi.Point3f`` lanes (JIT variants)."""
+    """Convert positions or directions to Mitsuba lanes (vectorised variants only).
+
+    Parameters
+    ----------
+    values
+        ``(N, 3)``.
+
+    Returns
+    -------
+    mi.Point3f
+        N lanes of float32.
+    """
     import mitsuba as mi
 
     return mi.Point3f(*(mi.Float(np.ascontiguousarray(values[:, axis], np.float32)) for axis in range(3)))
 
 
 def probe_in_child(device: str = "auto", *, timeout_s: float = 120.0) -> tuple[bool, str]:
-    """Render a white furnace in a child process, so that even an aborting library cannot hurt this one.
+    """Run the test render of `probe` in a child process, so that an aborting library does not end this one.
 
-    Returns whether it worked and one line about it.
+    Parameters
+    ----------
+    device
+        See `choose_backend`.
+    timeout_s
+        The child process is ended after this time [s].
+
+    Returns
+    -------
+    success
+        Whether the test render succeeded.
+    message
+        One line about its result, or the error.
     """
     command = [sys.executable, "-m", "seasonscapes.rendering.probe", device]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
+        result = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
     except subprocess.TimeoutExpired:
-        return False, f"no answer within {timeout_s:.0f} s"
-    lines = (done.stdout if done.returncode == 0 else done.stderr).strip().splitlines() or ["no output"]
-    if done.returncode < 0:
-        return False, f"the process died of signal {-done.returncode}: {lines[-1]}"
-    return done.returncode == 0, lines[-1]
+        return False, f"the test render did not finish within {timeout_s:.0f} s"
+    lines = (result.stdout if result.returncode == 0 else result.stderr).strip().splitlines() or ["no output"]
+    if result.returncode < 0:
+        return False, f"the test render was ended by signal {-result.returncode}: {lines[-1]}"
+    return result.returncode == 0, lines[-1]

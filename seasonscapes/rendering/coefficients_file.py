@@ -1,4 +1,4 @@
-"""Daylight coefficients on disk: a folder of plain arrays that are mapped, not read, and one JSON file about them."""
+"""Storage of daylight coefficients: a folder of memory-mapped numpy arrays and one JSON file."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from seasonscapes.rendering.hemisphere_rays import SurfacePoints
 from seasonscapes.rendering.light_clusters import LightClusters, ReceiverCoefficients
 from seasonscapes.rendering.transport import PointCoefficients, SamplingOptions, ViewCoefficients
 
-# A new number wherever the same inputs give other coefficients, or the files other names.
+# Increment whenever the same inputs give other coefficients, or a stored field is renamed.
 REVISION = 2
-_KINDS = {
-    kind.__name__: kind
-    for kind in (
+_TYPES: dict[str, type] = {
+    stored.__name__: stored
+    for stored in (
         Camera,
         LocalFrame,
         Panorama,
@@ -41,8 +41,19 @@ Coefficients = ViewCoefficients | PointCoefficients
 
 
 @contextmanager
-def atomic_folder(path: str | os.PathLike) -> Iterator[Path]:
-    """A temporary folder beside ``path`` that takes its name only when the block ends well, replacing what was there."""
+def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Context manager: a temporary folder that replaces ``path`` when the block ends without an exception.
+
+    Parameters
+    ----------
+    path
+        The folder to create or replace; missing parents are created.
+
+    Yields
+    ------
+    pathlib.Path
+        The temporary folder, in the same parent.
+    """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}-", suffix=".part", dir=path.parent))
@@ -52,34 +63,56 @@ def atomic_folder(path: str | os.PathLike) -> Iterator[Path]:
         os.umask(umask)
         temporary.chmod(0o777 & ~umask)
         if path.exists():
-            # Folders cannot be exchanged in one step: the old one steps aside first, and is never half there.
-            aside = Path(tempfile.mkdtemp(prefix=f".{path.name}-", suffix=".old", dir=path.parent))
-            os.replace(path, aside)
+            # Two folders cannot be exchanged atomically: the old one is renamed first, so that it is never incomplete.
+            old = Path(tempfile.mkdtemp(prefix=f".{path.name}-", suffix=".old", dir=path.parent))
+            os.replace(path, old)
             os.replace(temporary, path)
-            shutil.rmtree(aside)
+            shutil.rmtree(old)
         else:
             os.replace(temporary, path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def save_coefficients(path: str | os.PathLike, coefficients: Coefficients, *, key: str = "") -> None:
-    """Write to a folder, atomically; ``key``, a name of all that they depend on, is kept for `load_coefficients` to check."""
+def save_coefficients(path: str | os.PathLike[str], coefficients: Coefficients, *, key: str = "") -> None:
+    """Write coefficients to a folder, atomically.
+
+    Parameters
+    ----------
+    path
+        The folder; replaced if it exists.
+    coefficients
+        Of a view or of points.
+    key
+        Identifier of all inputs that the coefficients depend on, stored for `load_coefficients` to compare.
+    """
     with atomic_folder(path) as folder:
         record = _write(folder, "", coefficients)
         text = json.dumps({"revision": REVISION, "key": key, "coefficients": record}, indent=1)
         (folder / "coefficients.json").write_text(text)
 
 
-def load_coefficients(path: str | os.PathLike, *, key: str | None = None) -> Coefficients:
-    """Read a folder of `save_coefficients`. Arrays stay on disk until they are used.
+def load_coefficients(path: str | os.PathLike[str], *, key: str | None = None) -> Coefficients:
+    """Read coefficients from a folder of `save_coefficients`.
+
+    Parameters
+    ----------
+    path
+        The folder.
+    key
+        Expected identifier of the inputs; ``None`` skips the comparison.
+
+    Returns
+    -------
+    ViewCoefficients or PointCoefficients
+        With memory-mapped arrays.
 
     Raises
     ------
     FileNotFoundError
-        Where there is none.
+        If the folder holds no coefficients.
     ValueError
-        Where it was written by another revision, or for other inputs than ``key`` says.
+        If the folder has another revision, or its key differs from ``key``.
     """
     folder = Path(path)
     record = json.loads((folder / "coefficients.json").read_text())
@@ -92,10 +125,10 @@ def load_coefficients(path: str | os.PathLike, *, key: str | None = None) -> Coe
 
 def _write(folder: Path, prefix: str, value: Any) -> Any:
     if is_dataclass(value):
-        parts = {
+        members = {
             field.name: _write(folder, f"{prefix}{field.name}.", getattr(value, field.name)) for field in fields(value)
         }
-        return {"type": type(value).__name__, **parts}
+        return {"type": type(value).__name__, **members}
     if isinstance(value, np.ndarray):
         np.save(folder / f"{prefix}npy", value)
         return "array"
@@ -106,6 +139,6 @@ def _read(folder: Path, prefix: str, record: Any) -> Any:
     if record == "array":
         return np.load(folder / f"{prefix}npy", mmap_mode="r")
     if isinstance(record, dict):
-        parts = {name: _read(folder, f"{prefix}{name}.", part) for name, part in record.items() if name != "type"}
-        return _KINDS[record["type"]](**parts)
+        members = {name: _read(folder, f"{prefix}{name}.", item) for name, item in record.items() if name != "type"}
+        return _TYPES[record["type"]](**members)
     return record

@@ -1,4 +1,4 @@
-"""A few numbers instead of hundreds of sky patches."""
+"""Low-rank basis for radiance from hundreds of sky patches: principal components weighted by the covariance of skies."""
 
 from __future__ import annotations
 
@@ -12,51 +12,62 @@ from seasonscapes.rendering.sky_patches import SkyPatches, sky_covariance, sky_p
 
 @dataclass(frozen=True)
 class DirectionBasis:
-    """Weighted sums over P patches that stand for all of them.
+    """Rank-r approximation of the sum over P patches of daylight coefficient × sky radiance.
 
-    Light arriving per patch ``(N, P)`` times ``into`` gives coefficients; their product with ``from_sky.T @ sky`` is,
-    nearly, the sum over patches of arriving light times sky radiance.
+    Daylight coefficients ``(N, P)`` times ``projection`` are N vectors of r coefficients. Their product with
+    ``from_sky.T @ sky`` approximates the daylight coefficients times the patch radiances ``sky``.
 
     Parameters
     ----------
-    into, from_sky
+    projection, from_sky
         ``(P, r)`` float32.
     error
-        Root mean square relative error of that sum over the skies it was made for, on the examples it was made from.
+        Root mean square relative error of the approximation over the modelled skies, on the examples of
+        `direction_basis`.
     """
 
-    into: np.ndarray
+    projection: np.ndarray
     from_sky: np.ndarray
     error: float
 
 
 @cache
 def _roots(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Square root of the skies' covariance and its inverse ``(P, P)``."""
+    """Symmetric square root of the covariance of skies, and the inverse of that root, ``(P, P)`` each."""
     values, vectors = np.linalg.eigh(sky_covariance(sky_patches(name)))
     root = np.sqrt(np.maximum(values, 1e-9))
     return (vectors * root) @ vectors.T, (vectors / root) @ vectors.T
 
 
 def direction_basis(rows: np.ndarray, patches: SkyPatches, rank: int) -> DirectionBasis:
-    """Principal components of light arriving per patch, weighted by how skies vary.
+    """Compute the principal components of daylight coefficients, weighted by the covariance of skies.
 
-    With C the skies' covariance, the first singular vectors of ``rows C^½`` leave the smallest mean square error of
-    ``rows · sky`` over those skies (Sloan, Hall, Hart & Snyder 2003, doi:10.1145/882262.882281, with one cluster).
+    With C the covariance of sky patch radiances, the first singular vectors of ``rows C^½`` minimise the mean square
+    error of ``rows · sky`` over these skies (Sloan, Hall, Hart & Snyder 2003, doi:10.1145/882262.882281, with one
+    cluster).
 
     Parameters
     ----------
     rows
-        Examples ``(N, P)``, N several times ``rank``.
+        ``(N, P)`` example daylight coefficients, N several times ``rank``.
+    patches
+        The P sky patches.
     rank
-        r; P or more keeps all.
+        Number r of components; P or more keeps all.
+
+    Returns
+    -------
+    DirectionBasis
+        Projection, reconstruction from the sky, and approximation error.
     """
     half, inverse = _roots(patches.name)
     weighted = np.asarray(rows, np.float64) @ half
     power, components = np.linalg.eigh(weighted.T @ weighted)
     power, components = np.maximum(power[::-1], 0.0), components[:, ::-1][:, :rank]
-    into = half @ components
-    # Coefficients of about 1 are where half precision is at its best.
-    scale = 1.0 / np.maximum(np.asarray(rows @ into).std(axis=0), 1e-12)
+    projection = half @ components
+    # Coefficients are scaled to a standard deviation of 1, where half precision is accurate.
+    scale = 1.0 / np.maximum(np.asarray(rows @ projection).std(axis=0), 1e-12)
     error = float(np.sqrt(power[rank:].sum() / max(power.sum(), 1e-300)))
-    return DirectionBasis((into * scale).astype(np.float32), (inverse @ components / scale).astype(np.float32), error)
+    return DirectionBasis(
+        (projection * scale).astype(np.float32), (inverse @ components / scale).astype(np.float32), error
+    )

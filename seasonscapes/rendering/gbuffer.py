@@ -1,4 +1,4 @@
-"""What each pixel sees: distance, place, normal, texture coordinate. And rays for any camera."""
+"""G-buffers: distance, position, normal and texture coordinate of the first surface along rays; rays of any camera."""
 
 from __future__ import annotations
 
@@ -12,25 +12,26 @@ from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.rendering.backend import point3, to_numpy, use_backend
 from seasonscapes.rendering.mitsuba_scene import RenderScene
 
-# Rays begin this far in front of the camera, so that a mast's own ground does not hide the view.
+# Rays start this far in front of the camera, so that terrain right at a mast does not block the view.
 NEAR_M = 0.5
+# Rays in one kernel launch; bounds the memory.
 LANES = 1 << 22
 
 
 @dataclass(frozen=True)
 class GBuffer:
-    """First surfaces along rays; arrays have the shape of the rays.
+    """First surfaces along rays; the arrays have the shape of the rays.
 
     Parameters
     ----------
     depth
-        Distance from the camera along the ray [m]; ``inf`` is sky. (Not the depth along the optical axis.)
+        Distance from the camera along the ray [m], not along the optical axis; ``inf`` in the sky.
     uv
-        Texture coordinates ``(..., 2)``, v upwards; NaN in the sky.
+        ``(..., 2)`` texture coordinates, v upwards; NaN in the sky.
     normal
-        Unit geometric normals ``(..., 3)`` ENU; NaN in the sky.
+        ``(..., 3)`` unit geometric normals, ENU; NaN in the sky.
     position
-        ``(..., 3)`` ENU [m]; NaN in the sky.
+        ``(..., 3)`` positions, ENU [m]; NaN in the sky.
     """
 
     depth: np.ndarray
@@ -40,11 +41,24 @@ class GBuffer:
 
 
 def mi_rays(camera: Camera | Panorama, x: Any, y: Any) -> Any:
-    """Mitsuba rays through pixel positions (lanes ``x``, ``y`` in pixels), normalised, with no far limit."""
+    """Create Mitsuba rays of a camera through pixel positions.
+
+    Parameters
+    ----------
+    camera
+        Any pinhole camera or panorama.
+    x, y
+        ``mi.Float`` lanes: pixel positions from the upper left corner of the image [px].
+
+    Returns
+    -------
+    mi.Ray3f
+        One ray per lane: unit direction, origin `NEAR_M` in front of the camera, no far limit.
+    """
     import drjit as dr
     import mitsuba as mi
 
-    # Opaque: a literal would be compiled into the kernel, and every camera would wait for LLVM again.
+    # Opaque: literals would be compiled into the kernel, and every camera would need a compilation of its own.
     def opaque(value: float) -> Any:
         return dr.opaque(mi.Float, float(value))
 
@@ -52,9 +66,9 @@ def mi_rays(camera: Camera | Panorama, x: Any, y: Any) -> Any:
     across, down = (x - opaque(camera.cx)) / opaque(camera.fx), (y - opaque(camera.cy)) / opaque(camera.fy)
     if isinstance(camera, Panorama):
         sine, cosine = dr.sincos(across)
-        # On a cylinder rows are linear in the tangent of elevation, on a sphere in elevation itself.
-        sink, level = (down, mi.Float(1.0)) if camera.projection == "cylindrical" else dr.sincos(down)
-        direction = dr.normalize((columns[0] * sine + columns[2] * cosine) * level + columns[1] * sink)
+        # Rows are linear in the tangent of elevation for a cylindrical projection, in elevation for a spherical one.
+        vertical, horizontal = (down, mi.Float(1.0)) if camera.projection == "cylindrical" else dr.sincos(down)
+        direction = dr.normalize((columns[0] * sine + columns[2] * cosine) * horizontal + columns[1] * vertical)
     else:
         direction = dr.normalize(columns[0] * across + columns[1] * down + columns[2])
     origin = mi.Point3f(*map(opaque, camera.position_m))
@@ -62,14 +76,44 @@ def mi_rays(camera: Camera | Panorama, x: Any, y: Any) -> Any:
 
 
 def trace_gbuffer(scene: RenderScene, camera: Camera | Panorama, pixel: np.ndarray | None = None) -> GBuffer:
-    """The G-buffer at pixel positions ``(..., 2)`` (x, y); at all pixel centres, ``(H, W)``, when left out."""
+    """Trace the G-buffer of a camera.
+
+    Parameters
+    ----------
+    scene
+        The scene.
+    camera
+        Any pinhole camera or panorama.
+    pixel
+        ``(..., 2)`` pixel positions (x, y) [px]; by default all pixel centres, ``(H, W)``.
+
+    Returns
+    -------
+    GBuffer
+        With arrays of the shape of ``pixel``.
+    """
     direction = view_directions(camera, pixel)
     origin = np.broadcast_to(camera.position_m, direction.shape)
     return trace_rays(scene, origin, direction)
 
 
 def trace_rays(scene: RenderScene, origin_m: np.ndarray, direction: np.ndarray) -> GBuffer:
-    """The G-buffer of any rays: origins and unit directions ``(..., 3)`` ENU. Works through blocks of bounded memory."""
+    """Trace the G-buffer of arbitrary rays, in blocks of bounded memory.
+
+    Parameters
+    ----------
+    scene
+        The scene.
+    origin_m
+        ``(..., 3)`` origins, ENU [m]; rays start `NEAR_M` in front of them.
+    direction
+        ``(..., 3)`` unit directions, ENU.
+
+    Returns
+    -------
+    GBuffer
+        With arrays of the shape of the rays.
+    """
     backend = use_backend()
     shape = direction.shape[:-1]
     origins, directions = np.reshape(origin_m, (-1, 3)), np.reshape(direction, (-1, 3))
@@ -91,7 +135,7 @@ def _trace_lanes(scene: RenderScene, origins: np.ndarray, directions: np.ndarray
 
     ray = mi.Ray3f(point3(origins + NEAR_M * directions), mi.Vector3f(point3(directions)))
     interaction = scene.mi_scene.ray_intersect(ray)
-    # The far polygons of sun and moon are no surface.
+    # Excludes the distant polygons that represent sun and moon.
     hit = interaction.is_valid() & (interaction.t < 1e9)
     distance = dr.select(hit, interaction.t + NEAR_M, dr.inf)
     dr.eval(distance, interaction.uv, interaction.n, interaction.p)
@@ -105,7 +149,11 @@ def _trace_scalar(scene: RenderScene, origins: np.ndarray, directions: np.ndarra
     distance, uv = np.full(count, np.inf, np.float32), np.zeros((count, 2), np.float32)
     normal, position = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
     for i in range(count):
-        ray = mi.Ray3f(list(map(float, origins[i] + NEAR_M * directions[i])), list(map(float, directions[i])))
+        # The stubs describe the vectorised variants only.
+        ray = mi.Ray3f(  # pyright: ignore[reportCallIssue]
+            list(map(float, origins[i] + NEAR_M * directions[i])),  # pyright: ignore[reportArgumentType]
+            list(map(float, directions[i])),  # pyright: ignore[reportArgumentType]
+        )
         interaction = scene.mi_scene.ray_intersect(ray)
         if interaction.is_valid() and interaction.t < 1e9:
             distance[i] = interaction.t + NEAR_M
@@ -114,6 +162,21 @@ def _trace_scalar(scene: RenderScene, origins: np.ndarray, directions: np.ndarra
 
 
 def occluded(scene: RenderScene, origin_m: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Whether rays from origins towards unit directions (both ``(N, 3)`` ENU) meet the terrain, ``(N,)`` bool."""
+    """Test whether rays hit the terrain.
+
+    Parameters
+    ----------
+    scene
+        The scene.
+    origin_m
+        ``(N, 3)`` origins, ENU [m].
+    direction
+        ``(N, 3)`` unit directions, ENU.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(N,)`` bool.
+    """
     use_backend(gradients=False)
     return np.isfinite(trace_rays(scene, origin_m, direction).depth)

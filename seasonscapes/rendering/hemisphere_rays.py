@@ -1,12 +1,12 @@
-"""Rays over the hemisphere of many points: which sky patch each one reaches, or which face it meets.
+"""Cosine-distributed hemisphere rays of many surface points: the sky patch or the cluster of faces that each ray hits.
 
-Points, normals and directions are lanes; one compiled kernel serves every block, view and seed.
+Points, normals and directions are lanes; one compiled kernel serves all blocks, views and seeds.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -14,21 +14,26 @@ from seasonscapes.rendering.backend import point3, use_backend
 from seasonscapes.rendering.sky_patches import SkyPatches, mi_patch_of
 from seasonscapes.rendering.sobol import hashed, sobol_pair, uniform
 
-# Rays in flight in one launch of the kernel.
+# Rays in one kernel launch; bounds the memory.
 LANES = 1 << 22
 # Mitsuba's math::RayEpsilon in single precision.
 RAY_EPSILON = float(np.finfo(np.float32).epsneg) * 1500.0
-# What a ray meets instead of a sender: nothing, or a surface that sends no light.
-OPEN, BLACK = -1, -2
-# Names of what random numbers are for, as words for their hashes.
-_HEMISPHERE, _WALK = 101, 102
+# Labels of rays that hit no cluster: the ray reaches the sky, or a surface that reflects no light.
+ESCAPED, ABSORBED = -1, -2
+# Keys of the random number streams, mixed into their hashes.
+_HEMISPHERE, _BOUNCE = 101, 102
 
 
 @dataclass(frozen=True)
 class RayScene:
-    """The terrain alone, without lights, for rays that ask what is in the way.
+    """The terrain without lights, for visibility rays.
 
-    ``mi_terrain`` carries the albedo, as in `RenderScene`.
+    Parameters
+    ----------
+    mi_scene
+        Mitsuba scene of the terrain alone.
+    mi_terrain
+        Mesh and material (albedo), as in `RenderScene`.
     """
 
     mi_scene: Any
@@ -37,18 +42,18 @@ class RayScene:
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """Places on a surface.
+    """Points on a surface.
 
     Parameters
     ----------
     origin
-        ``(..., 3)`` float32 ENU, lifted off the surface's outer side as Mitsuba lifts its rays [m].
+        ``(..., 3)`` float32 positions, ENU [m], offset along the geometric normal as Mitsuba offsets its rays.
     normal
         ``(..., 3)`` float32 unit shading normals.
     outward
         ``(..., 3)`` float32 unit geometric normals.
     albedo
-        ``(..., 3)`` float32; zero where the surface was met from its back.
+        ``(..., 3)`` float32; zero where the surface was hit from its back.
     uv
         ``(..., 2)`` float32 texture coordinates, v upwards.
     """
@@ -63,24 +68,34 @@ class SurfacePoints:
         return SurfacePoints(*(getattr(self, name)[key] for name in self.__dataclass_fields__))
 
     def reshape(self, *shape: int) -> SurfacePoints:
-        """The same points with leading axes ``shape``."""
+        """Return the points with leading axes ``shape``."""
         columns = (getattr(self, name) for name in self.__dataclass_fields__)
         return SurfacePoints(*(values.reshape(*shape, values.shape[-1]) for values in columns))
 
 
 def concatenate_points(parts: list[SurfacePoints]) -> SurfacePoints:
-    """All points of several sets, one after the other."""
+    """Concatenate sets of points along their first axis."""
     columns = ([getattr(part, name) for part in parts] for name in SurfacePoints.__dataclass_fields__)
     return SurfacePoints(*(np.concatenate(column) for column in columns))
 
 
 def ray_scene(mi_terrain: Any) -> RayScene:
-    """The terrain of a `RenderScene` without its lights (sun and moon are polygons there, and would block).
+    """Create a scene of the terrain without lights; the polygons of sun and moon in a `RenderScene` would occlude rays.
+
+    Parameters
+    ----------
+    mi_terrain
+        Mesh with material, from `mitsuba_scene.mi_mesh`.
+
+    Returns
+    -------
+    RayScene
+        The terrain for visibility rays.
 
     Raises
     ------
     ValueError
-        On the scalar variant, which has no lanes.
+        On the scalar variant.
     """
     if use_backend().device == "scalar":
         raise ValueError("daylight coefficients need a vectorised variant; install a libLLVM or use CUDA")
@@ -90,7 +105,20 @@ def ray_scene(mi_terrain: Any) -> RayScene:
 
 
 def front_side(interaction: Any, active: Any) -> Any:
-    """Lanes of an intersection that meet a surface from its front, by both its normals."""
+    """Return a mask of the lanes that hit the front of a surface, by its shading and its geometric normal.
+
+    Parameters
+    ----------
+    interaction
+        ``mi.SurfaceInteraction3f``.
+    active
+        ``mi.Bool``: lanes that hit a surface.
+
+    Returns
+    -------
+    mi.Bool
+        Subset of ``active``.
+    """
     import drjit as dr
 
     towards = interaction.to_world(interaction.wi)
@@ -98,19 +126,31 @@ def front_side(interaction: Any, active: Any) -> Any:
 
 
 def surface_points(interaction: Any, active: Any) -> SurfacePoints:
-    """The surfaces that lanes of an intersection met.
+    """Copy the surface points of an intersection from the device.
 
-    The outer side is that of the geometric normal (terrain faces run counter-clockwise seen from above); seen from its
-    back a surface is black, as Mitsuba's one-sided diffuse material is.
+    The front is the side of the geometric normal (terrain faces are counter-clockwise from above). The back of a surface
+    is black, as with Mitsuba's one-sided diffuse material.
+
+    Parameters
+    ----------
+    interaction
+        ``mi.SurfaceInteraction3f`` of N lanes.
+    active
+        ``mi.Bool``: lanes that hit a surface.
+
+    Returns
+    -------
+    SurfacePoints
+        N points; undefined where not ``active``.
     """
     import drjit as dr
     import mitsuba as mi
 
     front = front_side(interaction, active)
     albedo = dr.select(front, interaction.bsdf().eval_diffuse_reflectance(interaction, front), mi.Color3f(0.0))
-    # Mitsuba's own distance (Interaction::offset_p), so that contact shadows are the path tracer's.
-    lift = (1.0 + dr.max(dr.abs(interaction.p))) * RAY_EPSILON
-    lanes = (interaction.p + interaction.n * lift, interaction.sh_frame.n, interaction.n, albedo, interaction.uv)
+    # The offset of Mitsuba's Interaction::offset_p, so that contact shadows equal those of the path tracer.
+    offset = (1.0 + dr.max(dr.abs(interaction.p))) * RAY_EPSILON
+    lanes = (interaction.p + interaction.n * offset, interaction.sh_frame.n, interaction.n, albedo, interaction.uv)
     dr.eval(lanes)
     points = SurfacePoints(*(np.ascontiguousarray(np.array(values).T) for values in lanes))
     points.uv[:, 1] = 1.0 - points.uv[:, 1]
@@ -118,19 +158,30 @@ def surface_points(interaction: Any, active: Any) -> SurfacePoints:
 
 
 def texture_at(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Bilinear look-up ``(N, 3)`` of a texture ``(R, S, 3)`` at ``uv (N, 2)``, as the renderer's own texture does it."""
+    """Look up a texture bilinearly, with the filter of the renderer's own textures.
+
+    Parameters
+    ----------
+    texture
+        ``(R, S, 3)``, row 0 at v = 1.
+    uv
+        ``(N, 2)`` texture coordinates, v upwards.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(N, 3)`` float32.
+    """
     import mitsuba as mi
 
     use_backend()
-    bitmap = mi.Texture2f(mi.TensorXf(np.ascontiguousarray(texture, np.float32)), wrap_mode=dr_clamp())
-    return np.array(bitmap.eval(mi.Point2f(uv[:, 0], 1.0 - uv[:, 1]))).T
-
-
-def dr_clamp() -> Any:
-    """Dr.Jit's name for extending a texture by its rim."""
     import drjit as dr
 
-    return dr.WrapMode.Clamp
+    # The stub of Dr.Jit gives the texture types as `object`.
+    bitmap: Any = mi.Texture2f(  # pyright: ignore[reportCallIssue]
+        mi.TensorXf(np.ascontiguousarray(texture, np.float32)), wrap_mode=dr.WrapMode.Clamp
+    )
+    return np.array(bitmap.eval(mi.Point2f(uv[:, 0], 1.0 - uv[:, 1]))).T
 
 
 def gather_hemisphere(
@@ -141,88 +192,114 @@ def gather_hemisphere(
     rays: int,
     first: np.ndarray,
     scramble: np.ndarray,
-    mi_label: Any,
+    mi_face_cluster: Any,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where cosine-distributed rays of N points go.
+    """Trace cosine-distributed rays of surface points and return the direction and the hit of each ray.
 
     Parameters
     ----------
+    terrain
+        The terrain.
+    patches
+        Subdivision of the sphere of directions.
     points
-        N of them.
+        N surface points.
     rays
-        K, rays from each point. An aligned run of 2ᵏ points of a Sobol sequence is stratified in every way that k
-        binary digits can be.
+        Number K of rays per point, a power of two: aligned runs of 2ᵏ points of a Sobol sequence are stratified over
+        all elementary intervals of their size.
     first
-        ``(N,)`` uint32 number of each point's first ray in its sequence, a multiple of ``rays``.
+        ``(N,)`` uint32 index of each point's first ray in its Sobol sequence, a multiple of ``rays``.
     scramble
-        ``(N,)`` uint32; points with the same number share one sequence.
-    mi_label
-        ``mi.UInt32`` sender of every face.
+        ``(N,)`` uint32 key of each point's sequence; points with equal keys share one sequence.
+    mi_face_cluster
+        ``mi.UInt32`` cluster of each face.
 
     Returns
     -------
     patch
-        ``(N, K)`` int32 patch of sky in whose direction the ray goes, whether it gets there or not.
-    met
-        ``(N, K)`` int32 sender that it meets; `OPEN` where it gets to the sky; `BLACK` where it goes into
-        its own surface or meets a back side (from under the terrain's rim).
+        ``(N, K)`` int32 sky patch in the direction of each ray, whether the ray is occluded or not.
+    hit
+        ``(N, K)`` int32 cluster that each ray hits; `ESCAPED` if it reaches the sky; `ABSORBED` if it enters its own
+        surface or hits the back of a face (from below the terrain's border).
     """
-    patch, met = (np.empty((len(points.origin), rays), np.int32) for _ in range(2))
+    patch, hit = (np.empty((len(points.origin), rays), np.int32) for _ in range(2))
     step = max(1, LANES // rays)
     for start in range(0, len(patch), step):
         part = slice(start, start + step)
-        keys = (first[part], scramble[part], mi_label)
-        patch[part], met[part] = _gather_block(terrain, patches, points[part], rays, keys)
-    return patch, met
+        patch[part], hit[part] = _gather_block(
+            terrain, patches, points[part], rays, first[part], scramble[part], mi_face_cluster
+        )
+    return patch, hit
 
 
 def _gather_block(
-    terrain: RayScene, patches: SkyPatches, points: SurfacePoints, rays: int, keys: tuple
+    terrain: RayScene,
+    patches: SkyPatches,
+    points: SurfacePoints,
+    rays: int,
+    first: np.ndarray,
+    scramble: np.ndarray,
+    mi_face_cluster: Any,
 ) -> tuple[np.ndarray, np.ndarray]:
     import drjit as dr
     import mitsuba as mi
 
-    first, scramble, mi_label = keys
     count = len(points.origin)
     per_point = dr.opaque(mi.UInt32, rays)
     lane = dr.arange(mi.UInt32, count * rays)
     point = lane // per_point
-    number = lane - point * per_point + dr.gather(mi.UInt32, mi.UInt32(first), point)
+    index = lane - point * per_point + dr.gather(mi.UInt32, mi.UInt32(first), point)
     key = hashed(dr.gather(mi.UInt32, mi.UInt32(scramble), point), _HEMISPHERE)
-    frame = mi.Frame3f(dr.gather(mi.Normal3f, mi.Normal3f(point3(points.normal)), point))
-    direction = frame.to_world(mi.warp.square_to_cosine_hemisphere(sobol_pair(key, number)))
-    # Interpolated normals let some rays point into the facet; a path tracer finds those black.
-    outside = dr.dot(direction, dr.gather(mi.Normal3f, mi.Normal3f(point3(points.outward)), point)) > 0.0
+    mi_normal, mi_outward = (
+        cast(Any, dr.gather(mi.Normal3f, mi.Normal3f(point3(normals)), point))  # the stubs reject normals as vectors
+        for normals in (points.normal, points.outward)
+    )
+    direction = mi.Frame3f(mi_normal).to_world(mi.warp.square_to_cosine_hemisphere(sobol_pair(key, index)))
+    # With interpolated normals some rays enter the facet; they are black, as in a path tracer.
+    outside = dr.dot(direction, mi_outward) > 0.0
     ray = mi.Ray3f(dr.gather(mi.Point3f, point3(points.origin), point), direction)
-    hit = terrain.mi_scene.ray_intersect_preliminary(ray, active=outside)
-    interaction = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, outside)
+    preliminary = terrain.mi_scene.ray_intersect_preliminary(ray, active=outside)
+    interaction = preliminary.compute_surface_interaction(ray, mi.RayFlags.Minimal, outside)
     front = dr.dot(interaction.n, direction) < 0.0
-    label = mi.Int32(dr.gather(mi.UInt32, mi_label, hit.prim_index, hit.is_valid()))
-    met = dr.select(hit.is_valid(), dr.select(front, label, BLACK), OPEN)
-    met = dr.select(outside, met, BLACK)
+    cluster = mi.Int32(dr.gather(mi.UInt32, mi_face_cluster, preliminary.prim_index, preliminary.is_valid()))
+    hit = dr.select(preliminary.is_valid(), dr.select(front, cluster, ABSORBED), ESCAPED)
+    hit = dr.select(outside, hit, ABSORBED)
     patch = mi.Int32(mi_patch_of(patches, direction))
-    dr.eval(patch, met)
-    return np.array(patch).reshape(count, rays), np.array(met).reshape(count, rays)
+    dr.eval(patch, hit)
+    return np.array(patch).reshape(count, rays), np.array(hit).reshape(count, rays)
 
 
-def follow_one_ray(terrain: RayScene, points: SurfacePoints, seed: int) -> tuple[SurfacePoints, np.ndarray, np.ndarray]:
-    """One cosine-distributed ray from each of N points.
+def trace_bounce(terrain: RayScene, points: SurfacePoints, seed: int) -> tuple[SurfacePoints, np.ndarray, np.ndarray]:
+    """Trace one cosine-distributed ray from each surface point.
+
+    Parameters
+    ----------
+    terrain
+        The terrain.
+    points
+        N surface points.
+    seed
+        Of the random directions.
 
     Returns
     -------
-    points, face
-        The K surfaces met, and their faces ``(K,)`` uint32.
-    met
-        ``(N,)`` bool: which rays met one.
+    points
+        The K surface points that rays hit from the front.
+    face
+        ``(K,)`` uint32 faces of these points.
+    hit
+        ``(N,)`` bool: rays that hit a surface from the front.
     """
     import drjit as dr
     import mitsuba as mi
 
-    key = hashed(hashed(dr.arange(mi.UInt32, len(points.origin)), dr.opaque(mi.UInt32, seed)), _WALK)
+    key = hashed(hashed(dr.arange(mi.UInt32, len(points.origin)), dr.opaque(mi.UInt32, seed)), _BOUNCE)
     square = mi.Point2f(uniform(hashed(key, 0)), uniform(hashed(key, 1)))
-    direction = mi.Frame3f(mi.Normal3f(point3(points.normal))).to_world(mi.warp.square_to_cosine_hemisphere(square))
-    outside = dr.dot(direction, mi.Normal3f(point3(points.outward))) > 0.0
+    # The stubs reject normals as vectors.
+    mi_normal, mi_outward = (cast(Any, mi.Normal3f(point3(normals))) for normals in (points.normal, points.outward))
+    direction = mi.Frame3f(mi_normal).to_world(mi.warp.square_to_cosine_hemisphere(square))
+    outside = dr.dot(direction, mi_outward) > 0.0
     interaction = terrain.mi_scene.ray_intersect(mi.Ray3f(point3(points.origin), direction), active=outside)
     valid = interaction.is_valid() & (dr.dot(interaction.n, direction) < 0.0)
-    met = np.array(valid)
-    return surface_points(interaction, valid)[met], np.array(interaction.prim_index)[met], met
+    hit = np.array(valid)
+    return surface_points(interaction, valid)[hit], np.array(interaction.prim_index)[hit], hit

@@ -1,10 +1,11 @@
-"""Irradiance of places on the terrain under any light: what texels of an atlas receive, sun, sky and bounce apart."""
+"""Irradiance of surface points (such as texels) under any illumination, separated into sun, sky and interreflection."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -24,24 +25,25 @@ from seasonscapes.rendering.sun_visibility import SunRays, cosine_seen, numbered
 from seasonscapes.rendering.transport import PointCoefficients, SamplingOptions, prepare_transport, trace_points
 from seasonscapes.sky.illumination import Illumination
 
-# Texels in work at a time: their coefficients take about 300 bytes each.
+# Points per block: their coefficients take about 300 bytes each.
 BLOCK = 1 << 19
-_ASIDE_M = np.array([0.05, 0.03, 0.0])
+# Horizontal offset of the second attempt to find the surface below a point.
+_RETRY_OFFSET_M = np.array([0.05, 0.03, 0.0])
 Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)
 class Irradiance:
-    """Illuminance on N places [lx], photometric linear Rec.709, ``(N, 3)`` float32 each.
+    """Illuminance of N surface points [lx], photometric linear Rec.709, ``(N, 3)`` float32 each.
 
     Parameters
     ----------
     sun
-        Directly from sun and moon.
+        Direct light from sun and moon.
     sky
-        Directly from the sky.
+        Direct light from the sky.
     bounce
-        By way of other terrain.
+        Light reflected by other terrain.
     """
 
     sun: np.ndarray
@@ -50,13 +52,23 @@ class Irradiance:
 
     @property
     def total(self) -> np.ndarray:
-        """All of it ``(N, 3)``."""
+        """Sum of the three components ``(N, 3)`` [lx]."""
         return self.sun + self.sky + self.bounce
 
 
 @dataclass(frozen=True)
 class DevicePoints:
-    """Coefficients of places laid out for speed, for any number of lights."""
+    """`PointCoefficients` on the Dr.Jit device.
+
+    Parameters
+    ----------
+    rays
+        Shadow rays from the points.
+    receivers
+        Light transport coefficients of the points.
+    clusters
+        Clusters of faces that reflect light to the points.
+    """
 
     rays: SunRays
     receivers: DeviceReceivers
@@ -64,74 +76,105 @@ class DevicePoints:
 
 
 def surface_at(terrain: RayScene, position_m: np.ndarray, *, search_m: float = 2.0) -> tuple[SurfacePoints, np.ndarray]:
-    """The surface at places ``(N, 3)`` ENU on it [m], such as `terrain.texels.texel_positions` gives.
+    """Find the surface points of the terrain mesh at given positions, by vertical rays.
 
-    A vertical ray from ``search_m`` above finds the face within as much below, so that normals and albedo are the
-    renderer's own.
+    Normals and albedo are those of the mesh, as in rendering.
+
+    Parameters
+    ----------
+    terrain
+        The terrain.
+    position_m
+        ``(N, 3)`` positions on the terrain, ENU [m], for example from `terrain.texels.texel_positions`; NaN for none.
+    search_m
+        The ray starts this far above the position and ends as far below it [m].
 
     Returns
     -------
     points
-        K of them, where a surface was found.
+        K surface points.
     index
-        ``(K,)`` their numbers among the N. NaN places, and walls of overhangs, have none.
+        ``(K,)`` indices of these points among the N positions. Positions that are NaN, or not within ``search_m`` of
+        the surface as on vertical walls, are missing.
     """
-    sound = np.isfinite(position_m).all(axis=1)
-    start = np.where(sound[:, None], position_m, 0.0) + np.array([0.0, 0.0, search_m])
-    points, found = _below(terrain, start, search_m)
-    found &= sound
-    # A ray through a vertex of the mesh may slip between its faces: those look again a hand's breadth beside it.
-    missed = np.flatnonzero(sound & ~found)
+    valid = np.asarray(np.isfinite(position_m).all(axis=1))
+    start_m = np.where(valid[:, None], position_m, 0.0) + np.array([0.0, 0.0, search_m])
+    points, found = _surface_below(terrain, start_m, search_m)
+    found &= valid
+    # A ray exactly through a vertex or an edge of the mesh may miss both faces; it is repeated a few centimetres beside.
+    missed = np.flatnonzero(valid & ~found)
     if len(missed):
-        again, hit = _below(terrain, start[missed] + _ASIDE_M, search_m)
+        retried, hit = _surface_below(terrain, start_m[missed] + _RETRY_OFFSET_M, search_m)
         for name in SurfacePoints.__dataclass_fields__:
-            getattr(points, name)[missed[hit]] = getattr(again, name)[hit]
+            getattr(points, name)[missed[hit]] = getattr(retried, name)[hit]
         found[missed[hit]] = True
     index = np.flatnonzero(found)
     return points[index], index
 
 
-def _below(terrain: RayScene, start_m: np.ndarray, search_m: float) -> tuple[SurfacePoints, np.ndarray]:
+def _surface_below(terrain: RayScene, start_m: np.ndarray, search_m: float) -> tuple[SurfacePoints, np.ndarray]:
     import mitsuba as mi
 
     ray = mi.Ray3f(point3(start_m.astype(np.float32)), mi.Vector3f(0.0, 0.0, -1.0))
     interaction = terrain.mi_scene.ray_intersect(ray)
-    found = interaction.is_valid() & (interaction.t < 2.0 * search_m)
+    found: Any = interaction.is_valid() & (interaction.t < 2.0 * search_m)
     return surface_points(interaction, found), np.array(found)
 
 
 def upload_points(terrain: RayScene, coefficients: PointCoefficients) -> DevicePoints:
-    """Load coefficients (perhaps memory-mapped) into the form that `irradiance` uses."""
+    """Copy coefficients to the device.
+
+    Parameters
+    ----------
+    terrain
+        The terrain that occludes shadow rays.
+    coefficients
+        Coefficients of N points, possibly memory-mapped.
+
+    Returns
+    -------
+    DevicePoints
+        The device copy, for `irradiance`.
+    """
     clusters = upload_clusters(terrain, coefficients.clusters)
     return DevicePoints(
-        _rays(terrain, coefficients.points, np.arange(len(coefficients.points.origin))),
+        _shadow_rays(terrain, coefficients.points, np.arange(len(coefficients.points.origin))),
         upload_receivers(coefficients.receivers),
         clusters,
     )
 
 
-def _rays(terrain: RayScene, points: SurfacePoints, number: np.ndarray) -> SunRays:
-    each = points.reshape(-1, 1)
-    weight = np.ones(each.origin.shape[:2], np.float32)
-    return sun_rays(terrain, (each.origin, each.normal, each.outward), weight, numbered_turn(number))
+def _shadow_rays(terrain: RayScene, points: SurfacePoints, number: np.ndarray) -> SunRays:
+    samples = points.reshape(-1, 1)
+    weight = np.ones(samples.origin.shape[:2], np.float32)
+    return sun_rays(terrain, samples.origin, samples.normal, samples.outward, weight, numbered_turn(number))
 
 
 def irradiance(
-    ready: DevicePoints, illumination: Illumination, light: ClusterLight | None = None, *, sun_rays_each: int = 4
+    device: DevicePoints, illumination: Illumination, light: ClusterLight | None = None, *, sun_rays_each: int = 4
 ) -> Irradiance:
-    """Illuminance on the places under a light.
+    """Compute the illuminance of surface points under an illumination.
 
     Parameters
     ----------
+    device
+        N points, from `upload_points`.
+    illumination
+        Sky, sun and moon.
     light
-        From `receivers.light_clusters`, where one light serves many blocks of places of one terrain.
+        From `receivers.light_clusters` for the same illumination, if it is reused for several blocks of points.
     sun_rays_each
-        Shadow rays from each place to different points of the disc.
+        Shadow rays per point, to different points of the disc.
+
+    Returns
+    -------
+    Irradiance
+        ``(N, 3)`` illuminances [lx].
     """
-    sky, bounce = arriving(ready.receivers, light or light_clusters(ready.clusters, illumination))
+    sky, bounce = arriving(device.receivers, light or light_clusters(device.clusters, illumination))
     sun = np.zeros_like(sky)
     for body in luminaries(illumination):
-        sun += cosine_seen(ready.rays, body, each=sun_rays_each) * np.asarray(body.normal_illuminance_lx, np.float32)
+        sun += cosine_seen(device.rays, body, each=sun_rays_each) * np.asarray(body.normal_illuminance_lx, np.float32)
     return Irradiance(sun, np.float32(np.pi) * sky, np.float32(np.pi) * bounce)
 
 
@@ -145,43 +188,59 @@ def irradiance_blocks(
     search_m: float = 2.0,
     progress: Progress | None = None,
 ) -> Iterator[tuple[np.ndarray, SurfacePoints, Iterator[Irradiance]]]:
-    """Irradiance of many places under many lights, block by block: nothing is kept, so memory stays bounded.
+    """Compute the irradiance of many surface points under many illuminations, in blocks of bounded memory.
 
     Parameters
     ----------
+    terrain
+        The terrain.
     position_m
-        ``(N, 3)`` ENU; NaN where there is no surface.
+        ``(N, 3)`` positions on the terrain, ENU [m]; NaN for none.
     lights
-        Held at once, without their air if there are many.
+        The illuminations. All are kept in memory; omit their aerial perspective if there are many.
+    sampling
+        Sampling options; defaults if ``None``.
+    seed
+        Of the sampling.
     search_m
         See `surface_at`.
+    progress
+        Called with the completed fraction.
 
     Yields
     ------
-    index, points, irradiances
-        Which of the N ``(K,)``, their surfaces, and one `Irradiance` for each light, worked out as they are asked for.
-        Places without a surface never come.
+    index
+        ``(K,)`` indices of the block's points among the N positions; positions without a surface are missing.
+    points
+        The K surface points.
+    irradiances
+        Iterator of one `Irradiance` per light, computed when it is advanced.
 
     Raises
     ------
     ValueError
-        Where no place at all lies on the terrain.
+        If none of the positions lies on the terrain.
     """
     sampling = sampling or SamplingOptions()
-    tell = progress or (lambda share: None)
-    sound = np.flatnonzero(np.isfinite(position_m).all(axis=1))
-    some = np.random.default_rng(seed).permutation(sound)[: 1 << 18]
-    pilot, found = surface_at(terrain, position_m[some], search_m=search_m)
+    report = progress or (lambda fraction: None)
+    valid = np.flatnonzero(np.isfinite(position_m).all(axis=1))
+    chosen = np.random.default_rng(seed).permutation(valid)[: 1 << 18]
+    pilot, found = surface_at(terrain, position_m[chosen], search_m=search_m)
     if len(found) == 0:
-        raise ValueError("irradiance: no place lies on the terrain")
-    prepared = prepare_transport(terrain, pilot, sampling, seed=seed)
-    clusters = upload_clusters(terrain, prepared.clusters)
-    sent = [light_clusters(clusters, light) for light in lights]
-    for start in range(0, len(sound), BLOCK):
-        part = sound[start : start + BLOCK]
-        points, found = surface_at(terrain, position_m[part], search_m=search_m)
+        raise ValueError(
+            "irradiance_blocks: no position lies on the terrain; check that positions and terrain share a frame"
+        )
+    shared = prepare_transport(terrain, pilot, sampling, seed=seed)
+    clusters = upload_clusters(terrain, shared.clusters)
+    cluster_lights = [light_clusters(clusters, light) for light in lights]
+    for start in range(0, len(valid), BLOCK):
+        block = valid[start : start + BLOCK]
+        points, found = surface_at(terrain, position_m[block], search_m=search_m)
         if len(found):
-            traced = trace_points(terrain, points, sampling, prepared=prepared, seed=seed, number=part[found])
-            ready = DevicePoints(_rays(terrain, points, part[found]), upload_receivers(traced.receivers), clusters)
-            yield part[found], points, map(partial(irradiance, ready), lights, sent)
-        tell(min(1.0, (start + BLOCK) / len(sound)))
+            index = block[found]
+            coefficients = trace_points(terrain, points, sampling, shared=shared, seed=seed, number=index)
+            device = DevicePoints(
+                _shadow_rays(terrain, points, index), upload_receivers(coefficients.receivers), clusters
+            )
+            yield index, points, map(partial(irradiance, device), lights, cluster_lights)
+        report(min(1.0, (start + BLOCK) / len(valid)))

@@ -1,10 +1,11 @@
-"""Light between the mountains: a few thousand clusters of faces that pass on what sky and sun send them.
+"""Interreflected light through clusters of mesh faces (virtual point light clusters).
 
-The faces that bounced rays meet are gathered into M clusters of about equal importance, the *senders*. Under any light
-their radiance is found first (sky through their own daylight coefficients, sun by shadow rays from places inside them,
-further bounces by looking at each other); receivers then look up the senders that their own rays met. It is
-direct-to-indirect transfer (Hašan, Pellacini & Bala 2006, doi:10.1145/1141911.1141998), and being given the actual sun
-rather than a patch of sky around it, shadows at the receiver's side of a valley stay dark.
+The faces that bounced rays hit are grouped into M clusters of about equal importance. For a given illumination the
+reflected radiance of the clusters is computed first: from the sky through their own daylight coefficients, from the sun
+by shadow rays from points inside them, and from further bounces by exchange between clusters. Each receiver then sums
+the radiance of the clusters that its own hemisphere rays hit. This is direct-to-indirect transfer (Hašan, Pellacini &
+Bala 2006, doi:10.1145/1141911.1141998). The clusters are lit by the actual sun rather than by a sky patch around it, so
+that shadows on the opposite side of a valley contribute no light.
 """
 
 from __future__ import annotations
@@ -15,26 +16,27 @@ from typing import Any
 
 import numpy as np
 
-from seasonscapes.rendering.hemisphere_rays import RayScene, SurfacePoints, concatenate_points, follow_one_ray
+from seasonscapes.rendering.hemisphere_rays import RayScene, SurfacePoints, concatenate_points, trace_bounce
 
-# Unit normals that scatter more than this inside a cluster are parted before positions are.
+# Groups are split by normal while a component of their unit normals has a larger standard deviation, else by position.
 _NORMAL_SPREAD = 0.25
-# Places within each cluster where light is gathered.
-PLACES = 4
+# Surface points per cluster at which its irradiance is evaluated.
+POINTS_PER_CLUSTER = 4
 
 
 @dataclass(frozen=True)
 class ReceiverCoefficients:
-    """What N receivers receive: from the sky, in a basis of directions, and from senders.
+    """Light transport coefficients of N receivers (pixels, texels or clusters), from the sky and from clusters.
 
     Parameters
     ----------
     direct
-        ``(N, r)`` float16; irradiance / π from the sky = ``direct @ (from_sky.T @ patch radiances)``.
+        ``(N, r)`` float16 daylight coefficients in the directional basis; irradiance / π from the sky is
+        ``direct @ (from_sky.T @ patch radiances)``.
     cluster
-        ``(N, K)`` uint16 senders that the receiver's rays met, each with the same share of them.
+        ``(N, K)`` uint16 clusters that the receiver's rays hit, all of equal weight ``share / K``.
     share
-        ``(N,)`` float16 share of the receiver's cosine-weighted hemisphere that is terrain.
+        ``(N,)`` float16 fraction of the receiver's cosine-weighted hemisphere that terrain covers.
     """
 
     direct: np.ndarray
@@ -44,20 +46,20 @@ class ReceiverCoefficients:
 
 @dataclass(frozen=True)
 class LightClusters:
-    """M clusters of faces that light others.
+    """M clusters of faces that reflect light to receivers.
 
     Parameters
     ----------
     points
-        ``(M, PLACES, ...)`` places within them.
+        ``(M, POINTS_PER_CLUSTER, ...)`` surface points inside the clusters.
     receivers
-        What they receive.
+        Coefficients of the light that the clusters receive.
     from_sky
-        ``(P, r)`` float32, the basis of directions of all receptions that use these senders.
+        ``(P, r)`` float32 directional basis, shared by all receivers that use these clusters; see `DirectionBasis`.
     patches
         Name of the subdivision of the sky.
     bounces
-        Surfaces between receiver and light.
+        Number of surfaces on a path between light and receiver.
     """
 
     points: SurfacePoints
@@ -67,66 +69,114 @@ class LightClusters:
     bounces: int
 
 
-def pilot_hits(
-    terrain: RayScene, points: SurfacePoints, depth: int, seed: int
-) -> tuple[SurfacePoints, np.ndarray, np.ndarray]:
-    """Surfaces that random walks from points meet within ``depth`` bounces, their faces and throughputs ``(K,)``."""
+@dataclass(frozen=True)
+class PathHits:
+    """K points at which random paths hit the terrain, for placing the clusters.
+
+    Parameters
+    ----------
+    points
+        The K surface points.
+    face
+        ``(K,)`` uint32 faces of the points.
+    throughput
+        ``(K,)`` float32 path throughput before the reflection at the point.
+    """
+
+    points: SurfacePoints
+    face: np.ndarray
+    throughput: np.ndarray
+
+
+@dataclass(frozen=True)
+class FaceGeometry:
+    """Centroids [m] and unit normals ``(F, 3)`` float32 of the F faces of a mesh."""
+
+    centroid: np.ndarray
+    normal: np.ndarray
+
+
+def trace_path_hits(terrain: RayScene, points: SurfacePoints, depth: int, seed: int) -> PathHits:
+    """Trace one random path from each surface point and collect the points that the paths hit.
+
+    Parameters
+    ----------
+    terrain
+        The terrain.
+    points
+        Start of the paths.
+    depth
+        Largest number of bounces.
+    seed
+        Of the random directions.
+
+    Returns
+    -------
+    PathHits
+        All hits of all paths; the start points are not among them.
+    """
     found, faces, weights = [points[:0]], [np.empty(0, np.uint32)], [np.empty(0, np.float32)]
     weight = np.ones(len(points.origin), np.float32)
     for bounce in range(depth):
-        points, face, met = follow_one_ray(terrain, points, seed + bounce)
+        points, face, hit = trace_bounce(terrain, points, seed + bounce)
         if len(face) == 0:
             break
         found.append(points)
         faces.append(face)
-        weights.append(weight[met])
-        weight = weight[met] * points.albedo.mean(axis=1)
-    return concatenate_points(found), np.concatenate(faces), np.concatenate(weights)
+        weights.append(weight[hit])
+        weight = weight[hit] * points.albedo.mean(axis=1)
+    return PathHits(concatenate_points(found), np.concatenate(faces), np.concatenate(weights))
 
 
-def cluster_faces(
-    hits: tuple[SurfacePoints, np.ndarray, np.ndarray], faces: tuple[np.ndarray, np.ndarray], count: int, *, seed: int
-) -> tuple[SurfacePoints, np.ndarray]:
-    """Divide faces by position and normal, by medians of hits, into ``count`` groups, a power of two.
+def cluster_faces(hits: PathHits, faces: FaceGeometry, count: int, *, seed: int) -> tuple[SurfacePoints, np.ndarray]:
+    """Divide the faces of a mesh into clusters of about equal importance, by a binary tree over position and normal.
+
+    Each node of the tree is split at the weighted median of its hits.
 
     Parameters
     ----------
     hits
-        What `pilot_hits` found: surfaces, faces and throughputs.
+        Hits of random paths, weighted by their throughput.
     faces
-        Centroids and unit normals of all faces, ``(F, 3)`` each.
+        Geometry of all faces.
+    count
+        Number of clusters, a power of two; fewer are made of few hits.
+    seed
+        Of the choice of points.
 
     Returns
     -------
     points
-        ``(M, PLACES, ...)`` of the hits on each group, chosen in proportion to their throughput. Groups that no hit
-        fell on repeat a neighbour's.
-    label
-        ``(F,)`` uint32 group of every face.
+        ``(M, POINTS_PER_CLUSTER, ...)`` hits in each cluster, chosen with probability proportional to throughput.
+        Clusters without a hit repeat the points of a neighbouring one.
+    face_cluster
+        ``(F,)`` uint32 cluster of each face.
     """
-    points, face, weight = hits
-    face_key = np.concatenate(faces, axis=1)
-    # Whole faces are divided, not hits: a ray that meets a face must find its group without asking where it was met.
-    key = face_key[face]
-    levels = max(0, int(np.log2(max(min(count, len(face) / PLACES), 1))))
-    order, bounds = np.arange(len(face)), [0, len(face)]
-    label, every = np.zeros(len(face_key), np.uint32), np.arange(len(face_key))
+    face_key = np.concatenate((faces.centroid, faces.normal), axis=1)
+    # Faces are divided, not hits, so that the face alone determines the cluster that a ray hits.
+    key = face_key[hits.face]
+    hit_count = len(hits.face)
+    levels = max(0, int(np.log2(max(min(count, hit_count / POINTS_PER_CLUSTER), 1))))
+    order, bounds = np.arange(hit_count), [0, hit_count]
+    face_cluster, all_faces = np.zeros(len(face_key), np.uint32), np.arange(len(face_key))
     for _ in range(levels):
-        axes, values, cut = [], [], [0]
+        axes, values, split_bounds = [], [], [0]
         for start, end in itertools.pairwise(bounds):
-            axis, value, middle = _split(key, weight, order[start:end])
+            axis, value, middle = _split(key, hits.throughput, order[start:end])
             axes.append(axis)
             values.append(value)
-            cut += [start + middle, end]
-        side = face_key[every, np.array(axes)[label]] >= np.array(values, np.float32)[label]
-        label = label * np.uint32(2) + side.astype(np.uint32)
-        bounds = cut
-    return points[_places(order, np.array(bounds), weight, seed)], label
+            split_bounds += [start + middle, end]
+        side = face_key[all_faces, np.array(axes)[face_cluster]] >= np.array(values, np.float32)[face_cluster]
+        face_cluster = face_cluster * np.uint32(2) + side.astype(np.uint32)
+        bounds = split_bounds
+    return hits.points[_choose_points(order, np.array(bounds), hits.throughput, seed)], face_cluster
 
 
 def _split(key: np.ndarray, weight: np.ndarray, rows: np.ndarray) -> tuple[int, float, int]:
-    """Sort ``rows`` in place along the axis of widest scatter: that axis, a value near the weights' median, and where
-    in ``rows`` keys reach it."""
+    """Sort ``rows`` in place along the axis of largest spread and split them at the weighted median.
+
+    Returns the axis, the value of the split, and the number of rows below it.
+    """
     if len(rows) == 0:
         return 0, np.inf, 0
     values = key[rows]
@@ -137,25 +187,25 @@ def _split(key: np.ndarray, weight: np.ndarray, rows: np.ndarray) -> tuple[int, 
     values, total = key[rows, axis], np.cumsum(weight[rows])
     value = values[min(int(np.searchsorted(total, 0.5 * total[-1])), len(rows) - 1)]
     if value == values[0]:
-        # Many hits on the first face: cut after it, so that neither side is empty where that can be.
+        # With many hits on the first face the split is moved behind it, so that neither side is empty if possible.
         value = values[min(int(np.searchsorted(values, value, side="right")), len(rows) - 1)]
     return axis, float(value), int(np.searchsorted(values, value, side="left"))
 
 
-def _places(order: np.ndarray, bounds: np.ndarray, weight: np.ndarray, seed: int) -> np.ndarray:
-    """``(M, PLACES)`` of the hits in each group; ``bounds`` ``(M + 1,)`` in ``order``."""
+def _choose_points(order: np.ndarray, bounds: np.ndarray, weight: np.ndarray, seed: int) -> np.ndarray:
+    """Indices ``(M, POINTS_PER_CLUSTER)`` of hits in each cluster; ``bounds`` ``(M + 1,)`` delimit clusters in ``order``."""
     rng = np.random.default_rng(seed)
-    filled = np.flatnonzero(np.diff(bounds) > 0)
-    places = np.empty((len(bounds) - 1, PLACES), np.intp)
-    for group in filled:
-        rows = order[bounds[group] : bounds[group + 1]]
-        places[group] = rows[_systematic(weight[rows], PLACES, rng.random())]
-    nearest = filled[np.clip(np.searchsorted(filled, np.arange(len(places))), 0, len(filled) - 1)]
-    return places[nearest]
+    occupied = np.flatnonzero(np.diff(bounds) > 0)
+    chosen = np.empty((len(bounds) - 1, POINTS_PER_CLUSTER), np.intp)
+    for cluster in occupied:
+        rows = order[bounds[cluster] : bounds[cluster + 1]]
+        chosen[cluster] = rows[_systematic_sample(weight[rows], POINTS_PER_CLUSTER, rng.random())]
+    nearest = occupied[np.clip(np.searchsorted(occupied, np.arange(len(chosen))), 0, len(occupied) - 1)]
+    return chosen[nearest]
 
 
-def _systematic(weight: np.ndarray, count: int, start: float) -> np.ndarray:
-    """``count`` indices with expected number in proportion to weight, evenly spread along the order."""
+def _systematic_sample(weight: np.ndarray, count: int, start: float) -> np.ndarray:
+    """Systematic sample of ``count`` indices with expected frequency proportional to ``weight``."""
     total = np.cumsum(weight, dtype=np.float64)
     return np.minimum(
         np.searchsorted(total, (np.arange(count) + start) / count * total[-1], side="right"), len(weight) - 1
@@ -163,30 +213,47 @@ def _systematic(weight: np.ndarray, count: int, start: float) -> np.ndarray:
 
 
 def cluster_lists(
-    met: np.ndarray, weight: np.ndarray, count: int, *, start: np.ndarray
+    hit: np.ndarray, weight: np.ndarray, count: int, *, start: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """``count`` senders for each receiver out of those that its rays met ``(N, K)``, and the share of rays that met any.
+    """Reduce the clusters that a receiver's rays hit to a list of fixed length, by systematic resampling.
 
-    Systematic resampling along the rays' own (stratified) order: the expected number of times that a sender is listed
-    is in proportion to the weight of the rays that met it. ``weight`` ``(N, K)`` has sum 1 over each row; ``start``
-    ``(N,)`` is where in [0, 1) each receiver's picks begin.
+    Resampling follows the (stratified) order of the rays. The expected number of entries of a cluster is proportional to
+    the weight of the rays that hit it.
+
+    Parameters
+    ----------
+    hit
+        ``(N, K)`` cluster that each ray hits, negative for none.
+    weight
+        ``(N, K)`` weight of each ray, sum 1 over each row.
+    count
+        Length of the lists.
+    start
+        ``(N,)`` offset of each receiver's samples in [0, 1).
+
+    Returns
+    -------
+    cluster
+        ``(N, count)`` uint16 clusters.
+    share
+        ``(N,)`` total weight of the rays that hit a cluster.
     """
-    total = np.cumsum(np.where(met >= 0, weight, np.float32(0.0)), axis=1, dtype=np.float32)
+    total = np.cumsum(np.where(hit >= 0, weight, np.float32(0.0)), axis=1, dtype=np.float32)
     share = total[:, -1]
-    at = (np.arange(count, dtype=np.float32) + start[:, None]) / count * share[:, None]
-    # Rows side by side make one increasing sequence, which one search serves.
-    offset = np.arange(len(met), dtype=np.float64)[:, None] * 2.0
-    index = np.searchsorted((total + offset).ravel(), (at + offset).ravel(), side="right").reshape(at.shape)
-    index = np.clip(index - np.arange(len(met))[:, None] * met.shape[1], 0, met.shape[1] - 1)
-    chosen = np.take_along_axis(met, index, axis=1)
-    # Rounding may step past the last ray that met a sender; such a pick belongs to that ray.
-    last = met.shape[1] - 1 - np.argmax(met[:, ::-1] >= 0, axis=1)
-    chosen = np.where(chosen < 0, np.take_along_axis(met, last[:, None], axis=1), chosen)
+    sample = (np.arange(count, dtype=np.float32) + start[:, None]) / count * share[:, None]
+    # Offsets concatenate the rows to one increasing sequence, for a single search.
+    offset = np.arange(len(hit), dtype=np.float64)[:, None] * 2.0
+    index = np.searchsorted((total + offset).ravel(), (sample + offset).ravel(), side="right").reshape(sample.shape)
+    index = np.clip(index - np.arange(len(hit))[:, None] * hit.shape[1], 0, hit.shape[1] - 1)
+    chosen = np.take_along_axis(hit, index, axis=1)
+    # Rounding may select a ray behind the last one that hit a cluster; that last one is taken instead.
+    last = hit.shape[1] - 1 - np.argmax(hit[:, ::-1] >= 0, axis=1)
+    chosen = np.where(chosen < 0, np.take_along_axis(hit, last[:, None], axis=1), chosen)
     return np.maximum(chosen, 0).astype(np.uint16), share
 
 
-def face_geometry(mi_terrain: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Centroids and unit normals ``(F, 3)`` float32 of a mesh's faces."""
+def face_geometry(mi_terrain: Any) -> FaceGeometry:
+    """Compute the centroids and unit normals of the faces of a Mitsuba mesh."""
     import mitsuba as mi
 
     parameters = mi.traverse(mi_terrain)
@@ -194,4 +261,4 @@ def face_geometry(mi_terrain: Any) -> tuple[np.ndarray, np.ndarray]:
     corners = vertices[np.array(parameters["faces"]).reshape(-1, 3)]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
-    return corners.mean(axis=1).astype(np.float32), normal.astype(np.float32)
+    return FaceGeometry(corners.mean(axis=1).astype(np.float32), normal.astype(np.float32))

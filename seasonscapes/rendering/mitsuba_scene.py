@@ -1,13 +1,13 @@
-"""From terrain, albedo and illumination to a Mitsuba scene. Everything here speaks ENU; Mitsuba's own axes stay inside.
+"""Mitsuba scenes from terrain, albedo and illumination.
 
-Objects of Mitsuba are named ``mi_*``. Radiances go in as they are: the variants are RGB and unit-agnostic, so
-photometric linear Rec.709 in means cd/m² out.
+All arguments are in ENU; conversions to Mitsuba's own axes are internal. Mitsuba objects are named ``mi_*``. The RGB
+variants do not depend on units: photometric linear Rec.709 input gives radiance in cd/m².
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -17,16 +17,30 @@ from seasonscapes.sky.illumination import Illumination, Luminary
 from seasonscapes.terrain.attributes import vertex_normals
 from seasonscapes.terrain.surface import Terrain
 
-# Discs of sun and moon are polygons at this distance: 60 km of terrain then sees them within 0.0004° of parallel.
+# Distance of the polygons that represent sun and moon: across 60 km of terrain their direction varies by 0.0004°.
 LUMINARY_DISTANCE_M = 1.0e10
 LUMINARY_SIDES = 32
 
 
+class _HasTerrain(Protocol):
+    @property
+    def mi_terrain(self) -> Any: ...
+
+
 @dataclass(frozen=True)
 class RenderScene:
-    """A terrain with its material, under one light, ready for rays.
+    """A Mitsuba scene of a terrain under one illumination.
 
-    ``mi_terrain`` (mesh and material) may be handed to `relight` again and again: only the light is rebuilt.
+    Parameters
+    ----------
+    mi_scene
+        The complete scene, with sky, sun and moon as emitters.
+    mi_terrain
+        Mesh and material, which `relight` reuses for other illuminations.
+    illumination
+        Sky, sun, moon and aerial perspective.
+    max_height_m
+        Highest vertex of the terrain, up [m].
     """
 
     mi_scene: Any
@@ -36,21 +50,28 @@ class RenderScene:
 
 
 def mi_mesh(terrain: Terrain, albedo: np.ndarray, *, smooth: bool = True) -> Any:
-    """A Mitsuba mesh with a Lambertian texture.
+    """Create a Mitsuba mesh with a Lambertian material.
 
     Parameters
     ----------
+    terrain
+        Triangle mesh with texture coordinates.
     albedo
-        ``(R, S, 3)`` linear Rec.709 reflectance with row 0 at v = 1, or ``(3,)`` for one colour everywhere.
+        ``(R, S, 3)`` linear Rec.709 reflectance with row 0 at v = 1, or ``(3,)`` for a uniform colour.
     smooth
-        Interpolate vertex normals for shading. Off, the facets are flat: exact Lambert on every triangle.
+        Interpolate vertex normals for shading; otherwise each triangle is flat.
+
+    Returns
+    -------
+    mi.Mesh
+        The mesh.
     """
     use_backend()
     import mitsuba as mi
 
     albedo = np.asarray(albedo, np.float32)
     if albedo.ndim == 1:
-        reflectance: dict = {"type": "rgb", "value": albedo.tolist()}
+        reflectance: dict[str, Any] = {"type": "rgb", "value": albedo.tolist()}
     else:
         reflectance = {
             "type": "bitmap",
@@ -70,7 +91,7 @@ def mi_mesh(terrain: Terrain, albedo: np.ndarray, *, smooth: bool = True) -> Any
         props=properties,
     )
     uv = np.array(terrain.uv, np.float32)
-    # Mitsuba's bitmaps put row 0 at v = 0; ours is at v = 1 (v runs upwards).
+    # Mitsuba's bitmaps have row 0 at v = 0; here row 0 is at v = 1 (v runs upwards).
     uv[:, 1] = 1.0 - uv[:, 1]
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = np.ascontiguousarray(terrain.vertices, np.float32).ravel()
@@ -78,14 +99,14 @@ def mi_mesh(terrain: Terrain, albedo: np.ndarray, *, smooth: bool = True) -> Any
     parameters["vertex_texcoords"] = uv.ravel()
     parameters.update()
     if smooth:
-        # Mitsuba's own sums are made by all threads at once: their last bits, and pictures with them, would be by chance.
+        # Mitsuba sums vertex normals in parallel, with last bits that vary between runs and so would the images.
         parameters["vertex_normals"] = vertex_normals(terrain).ravel()
         parameters.update()
     return mesh
 
 
 def _polygon(direction: np.ndarray, angular_radius_deg: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Vertices, faces and solid angle [sr] of a regular polygon that faces the origin from ``direction``."""
+    """Vertices, faces and solid angle [sr] of a regular polygon in ``direction`` that faces the origin."""
     axis = np.array([0.0, 0.0, 1.0]) if abs(direction[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
     side = np.cross(direction, axis)
     side /= np.linalg.norm(side)
@@ -103,7 +124,18 @@ def _polygon(direction: np.ndarray, angular_radius_deg: float) -> tuple[np.ndarr
 
 
 def mi_luminary(luminary: Luminary) -> Any:
-    """Sun or moon as a far polygon of uniform radiance whose illuminance is exact (the solid angle is its own)."""
+    """Create the emitter of sun or moon: a distant polygon of uniform radiance, with the luminary's exact illuminance.
+
+    Parameters
+    ----------
+    luminary
+        Sun or moon.
+
+    Returns
+    -------
+    mi.Mesh
+        Polygon with an area emitter.
+    """
     import mitsuba as mi
 
     vertices, faces, solid_angle = _polygon(np.asarray(luminary.direction, float), luminary.angular_radius_deg)
@@ -118,10 +150,20 @@ def mi_luminary(luminary: Luminary) -> Any:
 
 
 def mi_sky(sky_radiance: np.ndarray) -> Any:
-    """An environment map in ENU.
+    """Create the environment emitter of a sky map.
 
-    Mitsuba's map has y up and its first column at -z, and its rows run from pole to pole *inclusive*: ours are pixel
-    centres, so the map is resampled to that grid.
+    Mitsuba's map has y up, its first column at -z, and rows from pole to pole *inclusive*. The map, whose values are at
+    pixel centres, is resampled to that grid.
+
+    Parameters
+    ----------
+    sky_radiance
+        ``(H, W, 3)`` equirectangular sky radiance, ENU [cd/m²].
+
+    Returns
+    -------
+    mi.Emitter
+        Environment map in ENU.
     """
     import mitsuba as mi
 
@@ -144,7 +186,29 @@ def mi_sky(sky_radiance: np.ndarray) -> Any:
 
 
 def relight(mi_terrain: Any, illumination: Illumination, *, max_height_m: float) -> RenderScene:
-    """The same terrain under another light. Black skies and luminaries without light are left out."""
+    """Create a scene of a terrain under an illumination.
+
+    A black sky, and luminaries without illuminance, are omitted.
+
+    Parameters
+    ----------
+    mi_terrain
+        Mesh from `mi_mesh`, or ``mi_terrain`` of another scene.
+    illumination
+        Sky, sun, moon and aerial perspective.
+    max_height_m
+        Highest vertex of the terrain, up [m].
+
+    Returns
+    -------
+    RenderScene
+        The scene.
+
+    Raises
+    ------
+    ValueError
+        If the illumination has no light.
+    """
     use_backend()
     import mitsuba as mi
 
@@ -155,23 +219,50 @@ def relight(mi_terrain: Any, illumination: Illumination, *, max_height_m: float)
         if luminary is not None and np.max(luminary.normal_illuminance_lx) > 0.0:
             members[name] = mi_luminary(luminary)
     if len(members) == 2:
-        raise ValueError("illumination: no light at all; neither sky, sun nor moon")
+        raise ValueError("relight: the illumination has no light at all; expected a sky, sun or moon that is not black")
     return RenderScene(mi.load_dict(members), mi_terrain, illumination, max_height_m)
 
 
 def build_scene(
     terrain: Terrain, albedo: np.ndarray, illumination: Illumination, *, smooth: bool = True
 ) -> RenderScene:
-    """Terrain with albedo ``(R, S, 3)`` or ``(3,)`` under a light; see `mi_mesh` and `relight`."""
+    """Create a scene of a terrain under an illumination; see `mi_mesh` and `relight`.
+
+    Parameters
+    ----------
+    terrain
+        Triangle mesh with texture coordinates.
+    albedo
+        ``(R, S, 3)`` linear Rec.709 reflectance, or ``(3,)`` for a uniform colour.
+    illumination
+        Sky, sun, moon and aerial perspective.
+    smooth
+        Interpolate vertex normals for shading.
+
+    Returns
+    -------
+    RenderScene
+        The scene.
+
+    Raises
+    ------
+    ValueError
+        If the illumination has no light.
+    """
     return relight(
         mi_mesh(terrain, albedo, smooth=smooth), illumination, max_height_m=float(terrain.vertices[:, 2].max())
     )
 
 
-def set_albedo(scene: RenderScene, albedo: np.ndarray) -> None:
-    """Replace the texture of a scene in place by one of the same size ``(R, S, 3)``; geometry and light stay.
+def set_albedo(scene: _HasTerrain, albedo: np.ndarray) -> None:
+    """Replace the albedo texture of a scene in place.
 
-    Anything with an ``mi_terrain`` will do, such as a `hemisphere_rays.RayScene`.
+    Parameters
+    ----------
+    scene
+        Any scene with an ``mi_terrain``: a `RenderScene` or a `hemisphere_rays.RayScene`.
+    albedo
+        ``(R, S, 3)`` linear Rec.709 reflectance, of the same size as the current texture.
     """
     import mitsuba as mi
 
@@ -182,10 +273,25 @@ def set_albedo(scene: RenderScene, albedo: np.ndarray) -> None:
 
 
 def background(illumination: Illumination, direction: np.ndarray, pixel_angle_deg: float) -> np.ndarray:
-    """Radiance ``(..., 3)`` [cd/m²] of the open sky along unit directions ``(..., 3)``, with the discs of sun and moon.
+    """Compute the radiance of the sky along view directions, with the discs of sun and moon.
 
-    The disc's edge is spread over one pixel, so that it does not alias. With aerial perspective the sky is what that
-    gives at infinite distance, which is finer than the map, plus what the map knows beyond it (stars, clouds).
+    The edges of the discs are blurred over one pixel against aliasing. With aerial perspective the sky is its airlight at
+    infinite distance, which has more detail than the map, plus the part of the map that this airlight lacks (stars,
+    clouds).
+
+    Parameters
+    ----------
+    illumination
+        Sky, sun, moon and aerial perspective.
+    direction
+        ``(..., 3)`` unit view directions, ENU.
+    pixel_angle_deg
+        Angular size of a pixel [deg].
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(..., 3)`` [cd/m²].
     """
     sky_map = illumination.sky_radiance if illumination.visible_sky is None else illumination.visible_sky
     air = illumination.aerial_perspective
@@ -194,21 +300,21 @@ def background(illumination: Illumination, direction: np.ndarray, pixel_angle_de
     else:
         height, width = sky_map.shape[:2]
         grid = equirectangular_directions(height, width)
-        beyond = sky_map - air(np.full((height, width), np.inf), grid)[1]
-        # Near the horizon the map is a coarse picture of a steep profile, so what it knows beyond the air is carried
-        # down from 4° above; below the horizon the air alone knows the ground.
+        residual = sky_map - air(np.full((height, width), np.inf), grid)[1]
+        # Near the horizon the map undersamples a steep profile: the residual of 4° elevation is used down to the horizon.
+        # Below the horizon the ground is part of the airlight, and the residual fades out.
         lowest = height // 2 - 1 - int(np.ceil(4.0 * height / 180.0))
-        beyond[lowest + 1 :] = beyond[lowest]
-        above = np.clip(1.0 + np.degrees(np.arcsin(np.clip(direction[..., 2:], -1.0, 1.0))) / 2.0, 0.0, 1.0)
+        residual[lowest + 1 :] = residual[lowest]
+        fade = np.clip(1.0 + np.degrees(np.arcsin(np.clip(direction[..., 2:], -1.0, 1.0))) / 2.0, 0.0, 1.0)
         sky = air(np.full(direction.shape[:-1], np.inf), direction)[1]
-        sky = sky + above * sample_equirectangular(beyond, direction)
+        sky = sky + fade * sample_equirectangular(residual, direction)
         sky = np.maximum(sky, 0.0)
     for luminary in (illumination.sun, illumination.moon):
         if luminary is None:
             continue
-        # Chord length, not arccos: the latter loses half its digits at such small angles.
+        # Chord length, because arccos loses half its digits at such small angles.
         angle_deg = np.degrees(np.linalg.norm(direction - np.asarray(luminary.direction), axis=-1))
-        cover = np.clip((luminary.angular_radius_deg - angle_deg) / pixel_angle_deg + 0.5, 0.0, 1.0)
+        coverage = np.clip((luminary.angular_radius_deg - angle_deg) / pixel_angle_deg + 0.5, 0.0, 1.0)
         solid_angle = 2.0 * np.pi * (1.0 - np.cos(np.radians(luminary.angular_radius_deg)))
-        sky = sky + cover[..., None] * (np.asarray(luminary.normal_illuminance_lx) / solid_angle)
+        sky = sky + coverage[..., None] * (np.asarray(luminary.normal_illuminance_lx) / solid_angle)
     return sky

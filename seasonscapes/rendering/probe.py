@@ -1,6 +1,6 @@
 """A one-second test render, run as a child process by `seasonscapes doctor`: ``python -m seasonscapes.rendering.probe``.
 
-It renders Lambert's plane under a uniform sky, whose radiance is known, and says what ran it and for how long.
+The scene is a Lambertian plane under a uniform sky, whose radiance is known; variant and duration are printed.
 """
 
 from __future__ import annotations
@@ -13,7 +13,25 @@ from seasonscapes.rendering.backend import use_backend
 
 
 def main(device: str) -> str:
-    """One line about the test render; `InputError` where the device cannot work, `RuntimeError` where it renders wrong."""
+    """Render the test scene.
+
+    Parameters
+    ----------
+    device
+        See `backend.choose_backend`.
+
+    Returns
+    -------
+    str
+        One line with the variant and the duration.
+
+    Raises
+    ------
+    InputError
+        If the device is not available.
+    RuntimeError
+        If the radiance is wrong.
+    """
     start = time.perf_counter()
     backend = use_backend(device)
     import mitsuba as mi
@@ -34,9 +52,9 @@ def main(device: str) -> str:
     )
     import numpy as np
 
-    mean = float(np.array(mi.render(scene, spp=64, seed=0)).mean())
+    mean = float(np.array(mi.render(scene, spp=64, seed=0)).mean())  # pyright: ignore[reportArgumentType]
     if abs(mean - 0.5) > 0.01:
-        raise RuntimeError(f"the test render is wrong: got mean radiance {mean:.4f}, expected 0.5")
+        raise RuntimeError(f"test render: got mean radiance {mean:.4f}, expected 0.5")
     return f"{backend.variant} rendered the test plane in {time.perf_counter() - start:.1f} s"
 
 

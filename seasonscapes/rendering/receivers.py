@@ -1,4 +1,8 @@
-"""What arrives at receivers under a given light: coefficients times sky, and the senders' radiance looked up."""
+"""Irradiance of receivers under a given illumination, from their daylight coefficients and the radiance of clusters.
+
+The sky contributes the product of daylight coefficients and sky radiance; interreflection is the mean radiance of the
+clusters that the receiver's rays hit. Computed on the Dr.Jit device.
+"""
 
 from __future__ import annotations
 
@@ -10,30 +14,49 @@ import numpy as np
 from seasonscapes.rendering.hemisphere_rays import RayScene
 from seasonscapes.rendering.light_clusters import LightClusters, ReceiverCoefficients
 from seasonscapes.rendering.sky_patches import patch_radiance, sky_patches
-from seasonscapes.rendering.smoothing import Neighbours, mi_neighbours, mi_smoothed
+from seasonscapes.rendering.smoothing import DeviceNeighbours, Neighbours, mi_smoothed, upload_neighbours
 from seasonscapes.rendering.sun_visibility import SunRays, cosine_seen, numbered_turn, sun_rays
 from seasonscapes.sky.illumination import Illumination, Luminary, luminance
 
-# A moon (or a setting sun) that is this much fainter than the rest of the light casts no shadow that could be seen.
-FAINT = 1e-4
+# A moon (or setting sun) whose illuminance is less than this fraction of the sky's casts no visible shadow.
+NEGLIGIBLE_FRACTION = 1e-4
 
 
 @dataclass(frozen=True)
 class DeviceReceivers:
-    """A `ReceiverCoefficients` on the device, column by column: every lane reads its own receiver in one sweep.
+    """`ReceiverCoefficients` of N receivers on the Dr.Jit device, one array per column for coalesced reads.
 
-    ``mi_smoothing`` are passes over neighbours for what senders send, see `smoothing`; none for loose points.
+    Parameters
+    ----------
+    mi_direct
+        r ``mi.Float16`` arrays of N daylight coefficients.
+    mi_cluster_pairs
+        K / 2 ``mi.UInt32`` arrays, each with two 16-bit cluster indices per receiver.
+    mi_share
+        ``mi.Float`` weight of each listed cluster.
+    smoothing
+        Passes of edge-aware smoothing for interreflected light; empty for points that are no pixels.
     """
 
     mi_direct: list[Any]
     mi_cluster_pairs: list[Any]
     mi_share: Any
-    mi_smoothing: list[tuple[list[Any], list[Any]]]
+    smoothing: list[DeviceNeighbours]
 
 
 @dataclass(frozen=True)
 class DeviceClusters:
-    """`LightClusters` on the device, and shadow rays from their places."""
+    """`LightClusters` on the Dr.Jit device.
+
+    Parameters
+    ----------
+    clusters
+        The clusters, in host memory.
+    receivers
+        Their coefficients on the device.
+    rays
+        Shadow rays from their surface points.
+    """
 
     clusters: LightClusters
     receivers: DeviceReceivers
@@ -42,90 +65,162 @@ class DeviceClusters:
 
 @dataclass(frozen=True)
 class ClusterLight:
-    """One light, as receivers meet it.
+    """One illumination in the form that receivers use.
 
-    ``mi_sky`` is ``from_sky.T @ patch radiances``, r rows of three; ``mi_sent`` the radiance of M senders, rows of four.
+    Parameters
+    ----------
+    mi_sky
+        ``mi.Float``: ``from_sky.T @ patch radiances``, r rows of three channels.
+    mi_cluster_radiance
+        ``mi.Float``: reflected radiance of the M clusters, rows of four channels of which the last is padding.
     """
 
     mi_sky: Any
-    mi_sent: Any
+    mi_cluster_radiance: Any
 
 
 def upload_receivers(receivers: ReceiverCoefficients, smoothing: list[Neighbours] | None = None) -> DeviceReceivers:
-    """Copy to the device; half precision stays half."""
+    """Copy receiver coefficients to the device, keeping half precision.
+
+    Parameters
+    ----------
+    receivers
+        Coefficients, possibly memory-mapped.
+    smoothing
+        Passes of edge-aware smoothing for interreflected light.
+
+    Returns
+    -------
+    DeviceReceivers
+        The device copy.
+    """
     import drjit as dr
     import mitsuba as mi
 
-    listed = np.asarray(receivers.cluster).astype(np.uint32)
+    cluster = np.asarray(receivers.cluster).astype(np.uint32)
     direct = [mi.Float16(np.ascontiguousarray(column)) for column in np.asarray(receivers.direct).T]
-    pairs = [mi.UInt32(listed[:, k] | (listed[:, k + 1] << np.uint32(16))) for k in range(0, listed.shape[1], 2)]
-    share = mi.Float(np.asarray(receivers.share, np.float32) / listed.shape[1])
+    pairs = [mi.UInt32(cluster[:, k] | (cluster[:, k + 1] << np.uint32(16))) for k in range(0, cluster.shape[1], 2)]
+    share = mi.Float(np.asarray(receivers.share, np.float32) / cluster.shape[1])
     dr.eval(direct, pairs, share)
-    return DeviceReceivers(direct, pairs, share, [mi_neighbours(around) for around in smoothing or []])
+    return DeviceReceivers(direct, pairs, share, [upload_neighbours(neighbours) for neighbours in smoothing or []])
 
 
 def upload_clusters(terrain: RayScene, clusters: LightClusters) -> DeviceClusters:
-    """Senders ready for any light."""
+    """Copy clusters to the device.
+
+    Parameters
+    ----------
+    terrain
+        The terrain that occludes their shadow rays.
+    clusters
+        The clusters, possibly memory-mapped.
+
+    Returns
+    -------
+    DeviceClusters
+        The device copy, with shadow rays from the points of the clusters.
+    """
     points = clusters.points
     shape = points.origin.shape[:2]
     rays = sun_rays(
-        terrain, (points.origin, points.normal, points.outward), np.ones(shape), numbered_turn(np.arange(shape[0]))
+        terrain, points.origin, points.normal, points.outward, np.ones(shape), numbered_turn(np.arange(shape[0]))
     )
     return DeviceClusters(clusters, upload_receivers(clusters.receivers), rays)
 
 
-def arriving(ready: DeviceReceivers, light: ClusterLight) -> tuple[np.ndarray, np.ndarray]:
-    """Irradiance / π from the sky and from senders, ``(N, 3)`` float32 each."""
+def arriving(device: DeviceReceivers, light: ClusterLight) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the irradiance of receivers from the sky and from clusters.
+
+    Parameters
+    ----------
+    device
+        N receivers.
+    light
+        From `light_clusters`.
+
+    Returns
+    -------
+    sky, reflected
+        ``(N, 3)`` float32 each, irradiance / π [cd/m²].
+    """
     import drjit as dr
 
-    direct, bounced = mi_direct(ready, light.mi_sky), mi_bounced(ready, light.mi_sent)
-    dr.eval(direct, bounced)
-    first, second = (np.stack([np.array(channel) for channel in part], axis=-1) for part in (direct, bounced))
+    direct, reflected = mi_direct(device, light.mi_sky), mi_reflected(device, light.mi_cluster_radiance)
+    dr.eval(direct, reflected)
+    first, second = (np.stack([np.array(channel) for channel in part], axis=-1) for part in (direct, reflected))
     return first, second
 
 
-def mi_direct(ready: DeviceReceivers, mi_sky: Any) -> list[Any]:
-    """Irradiance / π from the sky: three lanes of N."""
+def mi_direct(device: DeviceReceivers, mi_sky: Any) -> list[Any]:
+    """Irradiance / π from the sky: three ``mi.Float`` of N lanes; ``mi_sky`` as in `ClusterLight`."""
     import drjit as dr
     import mitsuba as mi
 
     total = [mi.Float(0.0)] * 3
-    for k, column in enumerate(ready.mi_direct):
-        wide = mi.Float(column)
-        total = [dr.fma(wide, dr.gather(mi.Float, mi_sky, 3 * k + c), total[c]) for c in range(3)]
-    # A basis of few directions may dip below zero where almost nothing arrives.
+    for k, column in enumerate(device.mi_direct):
+        coefficient = mi.Float(column)
+        total = [dr.fma(coefficient, dr.gather(mi.Float, mi_sky, 3 * k + c), total[c]) for c in range(3)]
+    # The truncated basis may give slightly negative values where the irradiance is close to zero.
     return [dr.fmax(channel, 0.0) for channel in total]
 
 
-def mi_bounced(ready: DeviceReceivers, mi_sent: Any) -> list[Any]:
-    """Irradiance / π from senders: three lanes of N."""
+def mi_reflected(device: DeviceReceivers, mi_cluster_radiance: Any) -> list[Any]:
+    """Irradiance / π from clusters: three ``mi.Float`` of N lanes; ``mi_cluster_radiance`` as in `ClusterLight`."""
     import drjit as dr
     import mitsuba as mi
 
     total = mi.Vector4f(0.0)
-    for pair in ready.mi_cluster_pairs:
-        total += dr.gather(mi.Vector4f, mi_sent, pair & 0xFFFF) + dr.gather(mi.Vector4f, mi_sent, pair >> 16)
-    bounced = [total[c] * ready.mi_share for c in range(3)]
-    for around in ready.mi_smoothing:
-        bounced = mi_smoothed(bounced, around)
-    return bounced
+    for pair in device.mi_cluster_pairs:
+        total += dr.gather(mi.Vector4f, mi_cluster_radiance, pair & 0xFFFF) + dr.gather(
+            mi.Vector4f, mi_cluster_radiance, pair >> 16
+        )
+    reflected = [total[c] * device.mi_share for c in range(3)]
+    for neighbours in device.smoothing:
+        reflected = mi_smoothed(reflected, neighbours)
+    return reflected
 
 
 def luminaries(illumination: Illumination) -> list[Luminary]:
-    """Sun and moon where they are bright enough to matter beside the sky."""
+    """Return sun and moon of an illumination, without those that are negligible compared to the sky.
+
+    Parameters
+    ----------
+    illumination
+        Sky, sun and moon.
+
+    Returns
+    -------
+    list of Luminary
+        The bodies brighter than `NEGLIGIBLE_FRACTION` of the sky.
+    """
     patches = sky_patches("tregenza")
     sky = patch_radiance(patches, illumination.sky_radiance)
-    faint = FAINT * float(luminance((sky * patches.solid_angle_sr[:, None]).sum(axis=0)))
-    both = (illumination.sun, illumination.moon)
-    return [body for body in both if body is not None and luminance(body.normal_illuminance_lx) > faint]
+    threshold_lx = NEGLIGIBLE_FRACTION * float(luminance((sky * patches.solid_angle_sr[:, None]).sum(axis=0)))
+    bodies = (illumination.sun, illumination.moon)
+    return [body for body in bodies if body is not None and luminance(body.normal_illuminance_lx) > threshold_lx]
 
 
-def light_clusters(ready: DeviceClusters, illumination: Illumination) -> ClusterLight:
-    """What sky and senders send under a light; further bounces by letting senders look at each other."""
+def light_clusters(device: DeviceClusters, illumination: Illumination) -> ClusterLight:
+    """Compute the reflected radiance of all clusters under an illumination.
+
+    Direct light from the sky, sun and moon is reflected first; further bounces are exchanged between the clusters.
+
+    Parameters
+    ----------
+    device
+        The clusters.
+    illumination
+        Sky, sun and moon.
+
+    Returns
+    -------
+    ClusterLight
+        Sky in the directional basis and radiance of the clusters, for `arriving`.
+    """
     import drjit as dr
     import mitsuba as mi
 
-    clusters = ready.clusters
+    clusters = device.clusters
     sky = patch_radiance(sky_patches(clusters.patches), illumination.sky_radiance)
     mi_sky = mi.Float((clusters.from_sky.T @ sky).astype(np.float32).ravel())
     if clusters.bounces == 0:
@@ -133,24 +228,29 @@ def light_clusters(ready: DeviceClusters, illumination: Illumination) -> Cluster
     albedo = clusters.points.albedo
     sunlit = np.zeros((len(albedo), 3), np.float32)
     for body in luminaries(illumination):
-        cosine = cosine_seen(ready.rays, body)[..., None]
+        cosine = cosine_seen(device.rays, body)[..., None]
         sunlit += (cosine * albedo).mean(axis=1) * (np.asarray(body.normal_illuminance_lx, np.float32) / np.pi)
     mean_albedo = [mi.Float(np.ascontiguousarray(column)) for column in albedo.mean(axis=1).T]
-    first = [mi.Float(np.ascontiguousarray(column)) for column in sunlit.T]
-    first = [
-        sun + shade * sky_
-        for sun, shade, sky_ in zip(first, mean_albedo, mi_direct(ready.receivers, mi_sky), strict=True)
+    from_sun = [mi.Float(np.ascontiguousarray(column)) for column in sunlit.T]
+    first_bounce = [
+        sun + reflectance * incident
+        for sun, reflectance, incident in zip(from_sun, mean_albedo, mi_direct(device.receivers, mi_sky), strict=True)
     ]
-    mi_sent = _mi_rows(first)
+    mi_radiance = _mi_rows(first_bounce)
     for _ in range(clusters.bounces - 1):
-        again = mi_bounced(ready.receivers, mi_sent)
-        mi_sent = _mi_rows([sent + a * b for sent, a, b in zip(first, mean_albedo, again, strict=True)])
-    dr.eval(mi_sent)
-    return ClusterLight(mi_sky, mi_sent)
+        reflected = mi_reflected(device.receivers, mi_radiance)
+        mi_radiance = _mi_rows(
+            [
+                first + reflectance * incident
+                for first, reflectance, incident in zip(first_bounce, mean_albedo, reflected, strict=True)
+            ]
+        )
+    dr.eval(mi_radiance)
+    return ClusterLight(mi_sky, mi_radiance)
 
 
 def _mi_rows(channels: list[Any]) -> Any:
-    """Four floats a row, which one aligned load fetches."""
+    """Interleave three channels to rows of four floats, which a single aligned load reads."""
     import drjit as dr
     import mitsuba as mi
 

@@ -1,4 +1,7 @@
-"""A view under any light from its daylight coefficients: the same picture as path tracing, without its noise and time."""
+"""Relighting of a view from its daylight coefficients.
+
+Equals path tracing in expectation; per illumination it costs some shadow rays and small matrix products.
+"""
 
 from __future__ import annotations
 
@@ -21,51 +24,53 @@ from seasonscapes.rendering.receivers import (
     upload_clusters,
     upload_receivers,
 )
-from seasonscapes.rendering.sun_visibility import SunRays, first_place_sees, incidence, pixel_turn, sun_rays
+from seasonscapes.rendering.sun_visibility import SunRays, first_sample_visible, incidence, pixel_turn, sun_rays
 from seasonscapes.rendering.transport import ViewCoefficients, view_neighbours
 from seasonscapes.sky.illumination import Illumination, Luminary
 
-# A pixel is rough where distances within it differ by more than this ratio: more than one surface shows in it.
+# Ratio of distances within a pixel above which it contains more than one surface,
 _DEPTH_RATIO = 1.05
-# ... and by more than this one its air is averaged over its samples.
+# and above which its aerial perspective is averaged over its samples.
 _AIR_RATIO = 1.1
-# Cosines of incidence below which samples of a pixel may face either way, or bumps between them cast shadows.
+# Below this cosine of incidence the samples of a pixel may face the sun or not, or shadow each other.
 _GRAZING = 0.25
-# Interreflected light is smooth: its noise is spread over neighbouring pixels of one surface.
+# Interreflected light varies slowly; its noise is averaged over neighbouring pixels of one surface.
 _BOUNCE_STRIDES, _BOUNCE_SHARPNESS = (1,), 64.0
-# Pixels in work at a time where temporaries are wide.
+# Pixels per block of the distance computation; bounds the memory.
 _BLOCK = 1 << 17
 
 
 @dataclass(frozen=True)
 class RelightableView:
-    """A view's coefficients laid out for speed, with what no light changes. n pixels show terrain, S samples in each.
+    """A view's coefficients on the Dr.Jit device, with all quantities that do not depend on the illumination.
+
+    n pixels show terrain, with S samples each.
 
     Parameters
     ----------
     coefficients
-        As they were made or read.
+        Coefficients of the view, in host memory.
     rays
-        Shadow rays of all samples, pixel by pixel.
-    receivers, senders
-        On the device.
-    rough
-        ``(n,)`` bool: pixels with silhouettes inside.
+        Shadow rays from all samples.
+    receivers, clusters
+        Light transport coefficients of the pixels, and the clusters of faces, on the device.
+    silhouette
+        ``(n,)`` bool: pixels that contain a depth discontinuity or the border of the terrain.
     gbuffer
         First surfaces at pixel centres.
     coverage
-        ``(H, W)`` share of each pixel that is terrain.
+        ``(H, W)`` float32 fraction of each pixel that terrain covers.
     air
-        Distances at which the air is asked.
+        Grid at which aerial perspective is evaluated.
     sky
-        Directions in which the open sky is asked.
+        Grid at which sky radiance is evaluated.
     """
 
     coefficients: ViewCoefficients
     rays: SunRays
     receivers: DeviceReceivers
     clusters: DeviceClusters
-    rough: np.ndarray
+    silhouette: np.ndarray
     gbuffer: GBuffer
     coverage: np.ndarray
     air: AirPlaces
@@ -73,29 +78,46 @@ class RelightableView:
 
 
 def relightable_view(terrain: RayScene, coefficients: ViewCoefficients) -> RelightableView:
-    """Load coefficients (perhaps memory-mapped) into the form that `relight_view` uses. Done once for many lights."""
+    """Copy the coefficients of a view to the device, once for many illuminations.
+
+    Parameters
+    ----------
+    terrain
+        The terrain that occludes shadow rays.
+    coefficients
+        Coefficients of the view, possibly memory-mapped.
+
+    Returns
+    -------
+    RelightableView
+        For `relight_view`.
+    """
     camera, pixel = coefficients.camera, coefficients.pixel
     nearest, farthest, distance = _distances(coefficients)
     coverage = np.zeros((camera.height_px, camera.width_px), np.float32)
     coverage.reshape(-1)[pixel] = coefficients.coverage
-    rough = (farthest > nearest * _DEPTH_RATIO) | (coefficients.coverage < 1.0)
-    # The bare terrain serves as the scene of a G-buffer: that looks at geometry alone.
-    scene = RenderScene(terrain.mi_scene, terrain.mi_terrain, None, 0.0)  # type: ignore[arg-type]
+    silhouette = (farthest > nearest * _DEPTH_RATIO) | (coefficients.coverage < 1.0)
+    # A G-buffer depends on geometry alone, so that the scene needs no illumination.
+    scene = RenderScene(terrain.mi_scene, terrain.mi_terrain, None, 0.0)  # pyright: ignore[reportArgumentType]
     gbuffer = trace_gbuffer(scene, camera)
     centre_m = gbuffer.depth.reshape(-1)[pixel]
-    several = np.flatnonzero((farthest > nearest * _AIR_RATIO) | ~np.isfinite(centre_m))
-    air = air_places(camera, pixel, np.where(np.isfinite(centre_m), centre_m, nearest), (several, distance[several]))
+    mixed = np.flatnonzero((farthest > nearest * _AIR_RATIO) | ~np.isfinite(centre_m))
+    air = air_places(camera, pixel, np.where(np.isfinite(centre_m), centre_m, nearest), mixed, distance[mixed])
     passes = [view_neighbours(coefficients, stride=stride, sharpness=_BOUNCE_SHARPNESS) for stride in _BOUNCE_STRIDES]
-    places = (coefficients.sample_origin, coefficients.sample_normal, coefficients.sample_outward)
     rays = sun_rays(
-        terrain, places, coefficients.sample_weight, pixel_turn(pixel, camera.width_px, coefficients.sampling.subpixels)
+        terrain,
+        coefficients.sample_origin,
+        coefficients.sample_normal,
+        coefficients.sample_outward,
+        coefficients.sample_weight,
+        pixel_turn(pixel, camera.width_px, coefficients.sampling.subpixels),
     )
     return RelightableView(
         coefficients,
         rays,
         upload_receivers(coefficients.receivers, passes),
         upload_clusters(terrain, coefficients.clusters),
-        rough,
+        silhouette,
         gbuffer,
         coverage,
         air,
@@ -104,99 +126,158 @@ def relightable_view(terrain: RayScene, coefficients: ViewCoefficients) -> Relig
 
 
 def _distances(coefficients: ViewCoefficients) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Nearest and farthest terrain in each pixel ``(n,)``, and of each sample ``(n, S)``, infinite in the sky [m]."""
+    """Nearest and farthest distance per pixel ``(n,)`` and distance per sample ``(n, S)`` [m], infinite in the sky."""
     position = coefficients.camera.position_m.astype(np.float32)
-    shown = np.asarray(coefficients.sample_weight) > 0.0
-    distance = np.empty(shown.shape, np.float32)
-    for start in range(0, len(shown), _BLOCK):
+    on_terrain = np.asarray(coefficients.sample_weight) > 0.0
+    distance = np.empty(on_terrain.shape, np.float32)
+    for start in range(0, len(on_terrain), _BLOCK):
         part = slice(start, start + _BLOCK)
         distance[part] = np.linalg.norm(coefficients.sample_origin[part] - position, axis=2)
-    farthest = np.where(shown, distance, 0.0).max(axis=1)
-    distance[~shown] = np.inf
+    farthest = np.where(on_terrain, distance, 0.0).max(axis=1)
+    distance[~on_terrain] = np.inf
     return distance.min(axis=1), farthest, distance
 
 
-def with_albedo(ready: RelightableView, albedo: np.ndarray, cluster_albedo: np.ndarray) -> RelightableView:
-    """The view with other colours on the same land (another season's).
+def with_albedo(view: RelightableView, albedo: np.ndarray, cluster_albedo: np.ndarray) -> RelightableView:
+    """Return the view with another albedo of the same terrain (such as another season's).
 
     Parameters
     ----------
+    view
+        The view.
     albedo
-        ``(n, 3)`` mean albedo of the pixels, as from `transport.view_albedo`.
-    senders_albedo
-        ``(M, PLACES, 3)`` of the places that pass light on, as from `cluster_albedo`.
+        ``(n, 3)`` mean albedo of the pixels, from `transport.view_albedo`.
+    cluster_albedo
+        ``(M, POINTS_PER_CLUSTER, 3)`` albedo of the points of the clusters, from the function `cluster_albedo`.
+
+    Returns
+    -------
+    RelightableView
+        The view with the albedo replaced.
     """
-    points = replace(ready.clusters.clusters.points, albedo=np.asarray(cluster_albedo, np.float32))
-    clusters = replace(ready.clusters.clusters, points=points)
-    coefficients = replace(ready.coefficients, albedo=np.asarray(albedo, np.float32), clusters=clusters)
-    return replace(ready, coefficients=coefficients, clusters=replace(ready.clusters, clusters=clusters))
+    points = replace(view.clusters.clusters.points, albedo=np.asarray(cluster_albedo, np.float32))
+    clusters = replace(view.clusters.clusters, points=points)
+    coefficients = replace(view.coefficients, albedo=np.asarray(albedo, np.float32), clusters=clusters)
+    return replace(view, coefficients=coefficients, clusters=replace(view.clusters, clusters=clusters))
 
 
 def cluster_albedo(coefficients: ViewCoefficients, texture: np.ndarray) -> np.ndarray:
-    """Albedo ``(M, PLACES, 3)`` of the places that pass light on, for a texture ``(R, S, 3)``."""
+    """Look up the albedo of the cluster points in a texture.
+
+    Parameters
+    ----------
+    coefficients
+        Coefficients of a view.
+    texture
+        ``(R, S, 3)`` albedo.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(M, POINTS_PER_CLUSTER, 3)`` float32.
+    """
     points = coefficients.clusters.points
-    # Zero marks a surface that was met from its back: that stays black in every season.
+    # An albedo of zero marks surfaces that were hit from their back, which stay black for every texture.
     front = np.asarray(points.albedo).max(axis=-1, keepdims=True) > 0.0
     values = texture_at(texture, np.asarray(points.uv).reshape(-1, 2)).reshape(points.albedo.shape)
     return np.where(front, values, 0.0).astype(np.float32)
 
 
-def relight_view(ready: RelightableView, illumination: Illumination) -> RenderedView:
-    """The view under a light; equals `radiance.render_view` in expectation, with the same number of bounces."""
-    coefficients = ready.coefficients
-    shown = relit_surface_radiance(ready, illumination)
-    surface = np.zeros((*ready.coverage.shape, 3), np.float32)
-    surface.reshape(-1, 3)[coefficients.pixel] = shown
-    return RenderedView(_through_air(ready, illumination, shown), surface, ready.coverage, ready.gbuffer)
+def relight_view(view: RelightableView, illumination: Illumination) -> RenderedView:
+    """Render the view under an illumination; equals `radiance.render_view` in expectation, for equally many bounces.
+
+    Parameters
+    ----------
+    view
+        From `relightable_view`.
+    illumination
+        Sky, sun, moon and aerial perspective.
+
+    Returns
+    -------
+    RenderedView
+        Radiance at the camera, radiance of the surface, coverage and G-buffer.
+    """
+    coefficients = view.coefficients
+    pixel_radiance = relit_surface_radiance(view, illumination)
+    surface = np.zeros((*view.coverage.shape, 3), np.float32)
+    surface.reshape(-1, 3)[coefficients.pixel] = pixel_radiance
+    return RenderedView(_at_camera(view, illumination, pixel_radiance), surface, view.coverage, view.gbuffer)
 
 
-def relit_surface_radiance(ready: RelightableView, illumination: Illumination) -> np.ndarray:
-    """Radiance ``(n, 3)`` [cd/m²] that leaves the terrain of each pixel that shows any, sky counting as black."""
-    direct, bounced = arriving(ready.receivers, light_clusters(ready.clusters, illumination))
-    total = direct + bounced
+def relit_surface_radiance(view: RelightableView, illumination: Illumination) -> np.ndarray:
+    """Compute the radiance that leaves the terrain in each of the n terrain pixels.
+
+    Parameters
+    ----------
+    view
+        From `relightable_view`.
+    illumination
+        Sky, sun and moon.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(n, 3)`` float32 [cd/m²], averaged over the pixel with the sky counted as black.
+    """
+    direct, reflected = arriving(view.receivers, light_clusters(view.clusters, illumination))
+    total = direct + reflected
     for body in luminaries(illumination):
         light = np.asarray(body.normal_illuminance_lx, np.float32) / np.float32(np.pi)
-        total += sun_cosine(ready, body)[:, None] * light
-    return total * ready.coefficients.albedo
+        total += sun_cosine(view, body)[:, None] * light
+    return total * view.coefficients.albedo
 
 
-def sun_cosine(ready: RelightableView, luminary: Luminary) -> np.ndarray:
-    """Mean over each pixel ``(n,)`` of cos(angle of incidence) × share of the disc that is seen.
+def sun_cosine(view: RelightableView, luminary: Luminary) -> np.ndarray:
+    """Average cos(angle of incidence) × visible fraction of the luminary's disc over each terrain pixel.
 
-    One ray decides for a pixel whose neighbours agree with it; along shadow edges and silhouettes all samples do.
+    One shadow ray per pixel is traced first. All samples of a pixel are traced where neighbouring pixels differ, on
+    silhouettes and at grazing incidence.
+
+    Parameters
+    ----------
+    view
+        From `relightable_view`.
+    luminary
+        Sun or moon.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(n,)``.
     """
-    cosine = np.maximum(ready.coefficients.normal @ np.asarray(luminary.direction, np.float32), 0.0)
-    seen = first_place_sees(ready.rays, luminary)
-    mixed = np.flatnonzero(_disagree(ready, seen) | ready.rough | (seen & (cosine < _GRAZING)))
-    result = np.where(seen, cosine, 0.0)
-    light, possible = incidence(ready.rays, luminary, mixed)
-    # The mean normal stems from many more samples than the rays do: only the share that is lit is taken from these.
-    sound = (cosine[mixed] > _GRAZING) & (possible > _GRAZING)
-    ratio = np.where(sound, cosine[mixed] / np.where(sound, possible, 1.0), 1.0)
-    result[mixed] = light * np.clip(ratio, 0.5, 2.0)
+    cosine = np.maximum(view.coefficients.normal @ np.asarray(luminary.direction, np.float32), 0.0)
+    visible = first_sample_visible(view.rays, luminary)
+    mixed = np.flatnonzero(_differs_nearby(view, visible) | view.silhouette | (visible & (cosine < _GRAZING)))
+    result = np.where(visible, cosine, 0.0)
+    sunlit, unoccluded = incidence(view.rays, luminary, mixed)
+    # The mean normal averages many more samples than the shadow rays: these only determine the sunlit fraction.
+    reliable = (cosine[mixed] > _GRAZING) & (unoccluded > _GRAZING)
+    ratio = np.where(reliable, cosine[mixed] / np.where(reliable, unoccluded, 1.0), 1.0)
+    result[mixed] = sunlit * np.clip(ratio, 0.5, 2.0)
     return result
 
 
-def _disagree(ready: RelightableView, seen: np.ndarray) -> np.ndarray:
-    """Pixels among the n of whose eight neighbours on terrain some see the luminary and some do not."""
-    camera, pixel = ready.coefficients.camera, ready.coefficients.pixel
+def _differs_nearby(view: RelightableView, visible: np.ndarray) -> np.ndarray:
+    """Pixels ``(n,)`` within whose 3 × 3 neighbourhood on terrain the luminary is visible from some pixels only."""
+    camera, pixel = view.coefficients.camera, view.coefficients.pixel
     image = np.full((camera.height_px, camera.width_px), 127, np.uint8)
-    image.reshape(-1)[pixel] = np.where(seen, 255, 0)
+    image.reshape(-1)[pixel] = np.where(visible, 255, 0)
     square = np.ones((3, 3), np.uint8)
     brightest = cv2.dilate(np.where(image == 127, 0, image).astype(np.uint8), square)
     darkest = cv2.erode(np.where(image == 127, 255, image).astype(np.uint8), square)
     return (brightest != darkest).reshape(-1)[pixel]
 
 
-def _through_air(ready: RelightableView, illumination: Illumination, surface: np.ndarray) -> np.ndarray:
-    """Radiance ``(H, W, 3)`` at the camera; see `radiance.apply_aerial_perspective`, whose distances are at hand here."""
-    camera, pixel = ready.coefficients.camera, ready.coefficients.pixel
+def _at_camera(view: RelightableView, illumination: Illumination, surface: np.ndarray) -> np.ndarray:
+    """Radiance ``(H, W, 3)`` at the camera, as `radiance.apply_aerial_perspective` with the distances of the samples."""
+    camera, pixel = view.coefficients.camera, view.coefficients.pixel
     if illumination.aerial_perspective is not None:
-        transmittance, airlight = air_at(ready.air, illumination.aerial_perspective)
-        surface = surface * transmittance + airlight * ready.coefficients.coverage[:, None]
+        transmittance, airlight = air_at(view.air, illumination.aerial_perspective)
+        surface = surface * transmittance + airlight * view.coefficients.coverage[:, None]
     image = np.zeros((camera.height_px * camera.width_px, 3), np.float32)
     image[pixel] = surface
-    if len(ready.sky.pixel):
-        sky = open_sky(ready.sky, illumination, float(np.degrees(1.0 / camera.fx)))
-        image[ready.sky.pixel] += (1.0 - ready.coverage.reshape(-1)[ready.sky.pixel])[:, None] * sky
-    return image.reshape(*ready.coverage.shape, 3)
+    if len(view.sky.pixel):
+        sky = open_sky(view.sky, illumination, float(np.degrees(1.0 / camera.fx)))
+        image[view.sky.pixel] += (1.0 - view.coverage.reshape(-1)[view.sky.pixel])[:, None] * sky
+    return image.reshape(*view.coverage.shape, 3)

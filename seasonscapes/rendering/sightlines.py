@@ -1,6 +1,8 @@
-"""Whether places on the terrain and an eye see each other, and which faces an eye meets."""
+"""Visibility between points on the terrain and a camera position, and the faces that are visible in a view."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 
@@ -10,27 +12,36 @@ from seasonscapes.rendering.backend import point3
 from seasonscapes.rendering.gbuffer import NEAR_M
 from seasonscapes.rendering.hemisphere_rays import RayScene
 
+# Rays in one kernel launch; bounds the memory.
 LANES = 1 << 22
-# Origins are lifted by this many units in the last place of their largest coordinate: 8 mm at 16 km. Less would meet the
-# place's own face, more would look over the rim of a ridge.
+# Offset of ray origins in units in the last place of their largest coordinate: 8 mm at 16 km. With less, rays would hit
+# the face they start from; with more, they would pass over the edge of a ridge.
 _LIFT_ULP = 8.0
 
 
 def clear_sight(
     terrain: RayScene, position_m: np.ndarray, normal: np.ndarray, eye_m: np.ndarray, *, lift_m: float | None = None
 ) -> np.ndarray:
-    """Whether nothing stands between places on the terrain and an eye, ``(N,)`` bool.
+    """Test whether the line of sight between points on the terrain and a camera position is unobstructed.
 
     Parameters
     ----------
+    terrain
+        The occluding terrain.
     position_m
-        ``(N, 3)`` ENU on the surface [m].
+        ``(N, 3)`` points on the surface, ENU [m].
     normal
-        ``(N, 3)`` unit normals of their faces. Rays begin off the surface along these.
+        ``(N, 3)`` unit normals of their faces, along which the ray origins are offset.
     eye_m
-        ``(3,)``; the last half metre before it is not looked at, so that a mast's own ground does not hide the view.
+        ``(3,)`` camera position, ENU [m]; the last half metre before it is ignored, so that terrain right at a mast does
+        not block the view.
     lift_m
-        How far off [m]; left out, just beyond the rounding of float32.
+        Offset of the ray origins [m]; by default just above the rounding error of float32.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(N,)`` bool.
     """
     position_m, normal = np.asarray(position_m, np.float32), np.asarray(normal, np.float32)
     clear = np.empty(len(position_m), bool)
@@ -46,12 +57,12 @@ def _clear_block(
     import drjit as dr
     import mitsuba as mi
 
-    # Opaque: a literal would be compiled into the kernel, and every camera would wait for LLVM again.
+    # Opaque: literals would be compiled into the kernel, and every camera would need a compilation of its own.
     eye = mi.Point3f(*(dr.opaque(mi.Float, float(value)) for value in eye_m))
-    place = mi.Point3f(point3(position_m))
-    rounding = dr.max(dr.abs(place)) * dr.opaque(mi.Float, _LIFT_ULP * float(np.finfo(np.float32).eps))
-    lift = dr.maximum(rounding, 1e-3) if lift_m is None else dr.opaque(mi.Float, float(lift_m))
-    origin = place + mi.Vector3f(point3(normal)) * lift
+    surface = mi.Point3f(point3(position_m))
+    rounding = dr.max(dr.abs(surface)) * dr.opaque(mi.Float, _LIFT_ULP * float(np.finfo(np.float32).eps))
+    offset: Any = dr.maximum(rounding, 1e-3) if lift_m is None else dr.opaque(mi.Float, float(lift_m))
+    origin = surface + mi.Vector3f(point3(normal)) * offset
     direction = eye - origin
     distance = dr.norm(direction)
     ray = mi.Ray3f(origin, direction / distance)
@@ -60,7 +71,20 @@ def _clear_block(
 
 
 def faces_met(terrain: RayScene, camera: Camera | Panorama) -> np.ndarray:
-    """Index ``(H, W)`` int64 of the face that each pixel centre's ray meets, −1 in the sky."""
+    """Find the face that is visible at each pixel centre.
+
+    Parameters
+    ----------
+    terrain
+        The terrain.
+    camera
+        The view.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(H, W)`` int64 face indices, −1 in the sky.
+    """
     import mitsuba as mi
 
     direction = view_directions(camera).reshape(-1, 3).astype(np.float32)

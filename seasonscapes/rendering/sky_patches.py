@@ -1,8 +1,9 @@
-"""The sphere of directions in patches: where a ray that leaves the terrain is counted.
+"""Subdivision of the sphere of directions into patches, for daylight coefficients.
 
-The upper half is the subdivision of daylight coefficients: 145 patches (Tregenza 1987, "Subdivision of the sky hemisphere
+The upper half has the usual subdivision of the sky: 145 patches (Tregenza 1987, "Subdivision of the sky hemisphere
 for luminance measurements", doi:10.1177/096032718701900103) or 577 (Reinhart & Walkenhorst 2001, each divided by two both
-ways, doi:10.1016/S0378-7788(00)00119-2). Mountains also see *below* the horizontal, so the lower half has patches too.
+ways, doi:10.1016/S0378-7788(00)00119-2). On mountains rays also escape *below* the horizontal, so that the lower half is
+subdivided too.
 """
 
 from __future__ import annotations
@@ -16,23 +17,24 @@ import numpy as np
 from seasonscapes.frames import angles_from_direction, direction_from_angles
 
 _TREGENZA_ROWS = (30, 30, 24, 24, 18, 12, 6)
-# Below the horizon light changes fast near the horizon and little further down: (lower edge [deg], patches).
+# Rows below the horizon, finer near it, where radiance varies most: (lower edge [deg], patches).
 _LOWER_ROWS = ((-2.0, 30), (-5.0, 30), (-10.0, 30), (-20.0, 24), (-40.0, 12), (-90.0, 6))
+# Divisions of Tregenza's patches per axis.
 SUBDIVISIONS = {"tregenza": 1, "reinhart": 2}
 
 
 @dataclass(frozen=True)
 class SkyPatches:
-    """Rows of equal elevation, each cut into equal azimuths, the first patch of a row beginning at north, clockwise.
+    """Rows of patches of equal elevation and equal width in azimuth, clockwise, the first patch starting at north.
 
     Parameters
     ----------
     name
         A key of `SUBDIVISIONS`.
     edges_deg
-        Elevations ``(rows + 1,)`` of the rows' edges, from 90 down to -90 [deg].
+        ``(rows + 1,)`` elevations of the edges of the rows, from 90 down to -90 [deg].
     counts
-        Patches in each row ``(rows,)``.
+        ``(rows,)`` number of patches in each row.
     """
 
     name: str
@@ -41,12 +43,12 @@ class SkyPatches:
 
     @property
     def size(self) -> int:
-        """P, the number of patches on the whole sphere."""
+        """Number P of patches on the whole sphere."""
         return int(self.counts.sum())
 
     @property
     def offsets(self) -> np.ndarray:
-        """Index of each row's first patch ``(rows,)``."""
+        """Index of the first patch of each row ``(rows,)``."""
         return np.cumsum(self.counts) - self.counts
 
     @property
@@ -57,7 +59,7 @@ class SkyPatches:
 
     @property
     def directions(self) -> np.ndarray:
-        """Unit vectors to the patches' centres ``(P, 3)``."""
+        """Unit vectors to the centres of the patches ``(P, 3)``."""
         row = np.repeat(np.arange(len(self.counts)), self.counts)
         middle = 0.5 * (self.edges_deg[:-1] + self.edges_deg[1:])
         middle[0] = 90.0 if self.counts[0] == 1 else middle[0]
@@ -67,17 +69,33 @@ class SkyPatches:
 
 @cache
 def sky_patches(name: str = "reinhart") -> SkyPatches:
-    """The whole sphere in patches; the upper half is Tregenza's 145 or Reinhart's 577.
+    """Return the subdivision of the whole sphere whose upper half has Tregenza's 145 or Reinhart's 577 patches.
+
+    Parameters
+    ----------
+    name
+        ``tregenza`` or ``reinhart``.
+
+    Returns
+    -------
+    SkyPatches
+        The subdivision.
 
     Raises
     ------
     ValueError
-        For an unknown name.
+        If the name is unknown.
+
+    Examples
+    --------
+    >>> patches = sky_patches("tregenza")
+    >>> int((patches.directions[:, 2] > 0.0).sum())
+    145
     """
     if name not in SUBDIVISIONS:
         raise ValueError(f"sky patches: got {name!r}, expected one of {', '.join(SUBDIVISIONS)}")
     m = SUBDIVISIONS[name]
-    # Rows of equal height up to a round cap of half that height (Bourgeois, Reinhart & Ward 2008).
+    # Rows of equal height and a circular cap of half that height (Bourgeois, Reinhart & Ward 2008).
     step = 90.0 / (len(_TREGENZA_ROWS) * m + 0.5)
     counts = np.repeat(np.array(_TREGENZA_ROWS) * m, m)
     upper = np.append(90.0, np.arange(len(counts), -1, -1) * step)
@@ -86,7 +104,20 @@ def sky_patches(name: str = "reinhart") -> SkyPatches:
 
 
 def patch_of(patches: SkyPatches, direction: np.ndarray) -> np.ndarray:
-    """Index of the patch of each direction ``(..., 3)``, ``(...)`` int."""
+    """Find the patch of each direction.
+
+    Parameters
+    ----------
+    patches
+        The subdivision.
+    direction
+        ``(..., 3)`` unit directions, ENU.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(...)`` int patch indices.
+    """
     azimuth_deg, elevation_deg = angles_from_direction(direction)
     row = np.searchsorted(-patches.edges_deg, -elevation_deg, side="right") - 1
     row = np.clip(row, 0, len(patches.counts) - 1)
@@ -95,7 +126,20 @@ def patch_of(patches: SkyPatches, direction: np.ndarray) -> np.ndarray:
 
 
 def mi_patch_of(patches: SkyPatches, direction: Any) -> Any:
-    """The same for lanes of Mitsuba vectors: ``mi.UInt32``."""
+    """Find the patch of each direction on the device.
+
+    Parameters
+    ----------
+    patches
+        The subdivision.
+    direction
+        ``mi.Vector3f`` unit directions, ENU.
+
+    Returns
+    -------
+    mi.UInt32
+        Patch indices.
+    """
     import drjit as dr
     import mitsuba as mi
 
@@ -104,14 +148,14 @@ def mi_patch_of(patches: SkyPatches, direction: Any) -> Any:
         row += dr.select(direction.z < float(sine), mi.UInt32(1), mi.UInt32(0))
     count = dr.gather(mi.UInt32, mi.UInt32(patches.counts.astype(np.uint32)), row)
     first = dr.gather(mi.UInt32, mi.UInt32(patches.offsets.astype(np.uint32)), row)
-    turn = dr.atan2(direction.x, direction.y) * (0.5 / np.pi)
-    turn = dr.select(turn < 0.0, turn + 1.0, turn)
-    return first + dr.minimum(mi.UInt32(turn * mi.Float(count)), count - 1)
+    revolution = dr.atan2(direction.x, direction.y) * (0.5 / np.pi)
+    revolution = dr.select(revolution < 0.0, revolution + 1.0, revolution)
+    return first + dr.minimum(mi.UInt32(revolution * mi.Float(count)), count - 1)
 
 
 @cache
 def _averaging(name: str, height: int, width: int) -> Any:
-    """Sparse ``(P, H W)``: mean over each patch of a map whose pixels are constant, by exact overlap."""
+    """Sparse matrix ``(P, H W)`` that averages a map of constant pixels over each patch, by exact overlap."""
     from scipy import sparse
 
     patches = sky_patches(name)
@@ -131,16 +175,41 @@ def _averaging(name: str, height: int, width: int) -> Any:
 
 
 def patch_radiance(patches: SkyPatches, sky_radiance: np.ndarray) -> np.ndarray:
-    """Mean radiance ``(P, 3)`` over each patch of an equirectangular map ``(H, W, 3)``."""
+    """Average an equirectangular radiance map over each patch.
+
+    Parameters
+    ----------
+    patches
+        The subdivision.
+    sky_radiance
+        ``(H, W, 3)`` equirectangular map.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(P, 3)`` float64, in the unit of the map.
+    """
     height, width = sky_radiance.shape[:2]
     return _averaging(patches.name, height, width) @ np.asarray(sky_radiance, np.float64).reshape(height * width, -1)
 
 
 def direction_weights(patches: SkyPatches, direction: np.ndarray) -> np.ndarray:
-    """Piecewise linear weights ``(P,)``, sum 1, of the patches around one direction ``(3,)``.
+    """Compute the weights for interpolating a quantity per patch at one direction.
 
-    Linear between the centres of rows, and between centres within each row: a quantity known per patch moves without
-    steps when a direction does.
+    Interpolation is linear between the centres of rows and between the centres of patches within a row, and therefore
+    continuous in the direction.
+
+    Parameters
+    ----------
+    patches
+        The subdivision.
+    direction
+        ``(3,)`` unit direction, ENU.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(P,)``, sum 1.
     """
     azimuth_deg, elevation_deg = (float(angle) for angle in angles_from_direction(direction))
     centre = 0.5 * (patches.edges_deg[:-1] + patches.edges_deg[1:])
@@ -158,11 +227,23 @@ def direction_weights(patches: SkyPatches, direction: np.ndarray) -> np.ndarray:
 
 
 def sky_covariance(patches: SkyPatches, *, unrest: float = 0.15) -> np.ndarray:
-    """How the radiances of patches vary together over likely skies ``(P, P)``, each sky of mean radiance 1.
+    """Compute the second moments of patch radiances over a family of likely skies, each of mean radiance 1.
 
-    Skies of the CIE general family (ISO 15469:2004; Kittler, Perez & Darula 1998) for suns all over the upper half,
-    with narrower aureoles added, twilight arches, and ground of any brightness; ``unrest`` is the relative deviation
-    of each single patch on its own (clouds), which keeps every sky representable.
+    The family are CIE general skies (ISO 15469:2004; Kittler, Perez & Darula 1998) for sun positions over the upper half,
+    skies with narrower aureoles and with twilight arches, and ground of varying brightness.
+
+    Parameters
+    ----------
+    patches
+        The subdivision.
+    unrest
+        Relative standard deviation of each patch independently of all others (clouds). A positive value gives the matrix
+        full rank, so that any sky can be represented.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(P, P)``.
     """
     direction = patches.directions
     elevation = np.arcsin(np.clip(direction[:, 2], -1.0, 1.0))
@@ -172,7 +253,7 @@ def sky_covariance(patches: SkyPatches, *, unrest: float = 0.15) -> np.ndarray:
     suns = direction[above & (elevation < np.radians(75.0))][::2]
     angle = np.arccos(np.clip(direction @ suns.T, -1.0, 1.0))
     skies = []
-    # (a, b) gradation, (c, d, e) indicatrix of CIE types 1, 5, 12, 13 and 14, then a narrow aureole, then dusk.
+    # (a, b) gradation, (c, d, e) indicatrix of CIE types 1, 5, 12, 13 and 14, of a narrow aureole, and of twilight.
     for a, b, c, d, e in (
         (4.0, -0.7, 0.0, -1.0, 0.0),
         (0.0, -1.0, 0.0, -1.0, 0.0),

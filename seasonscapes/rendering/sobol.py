@@ -1,8 +1,9 @@
-"""Random numbers of a pixel: Sobol points, shuffled and scrambled by hashes of where they are used.
+"""Sample points for path tracing: shuffled and Owen-scrambled Sobol points, keyed by hashes.
 
-The k-th sample of a pixel draws, for each decision along its path, the k-th point of a two-dimensional Sobol sequence
-of that decision's own: any 2ᵏ samples spread evenly over it, while decisions and pixels stay independent. There is no
-state: a number depends on its key and index alone, so neither blocks nor threads change a picture.
+For each random decision along a path, the k-th sample of a pixel uses the k-th point of a two-dimensional Sobol sequence
+that is scrambled independently per decision and pixel: aligned runs of 2ᵏ samples are stratified, decisions and pixels
+are independent. The generator has no state. A number depends on its key and index alone, so that images do not depend on
+the division into blocks or on threads.
 
 Burley 2020, "Practical hash-based Owen scrambling", JCGT 9(4); second dimension after Ahmed 2024, "An implementation
 algorithm of 2D Sobol sequence fast, elegant, and compact", doi:10.2312/sr.20241147.
@@ -14,7 +15,18 @@ from typing import Any
 
 
 def hashed(key: Any, word: Any) -> Any:
-    """A key ``mi.UInt32`` from a key and one more word (Wellons' *lowbias32* over both); one to one in ``key``."""
+    """Hash a key and a word to a new key (Wellons' *lowbias32*), bijective in ``key``.
+
+    Parameters
+    ----------
+    key, word
+        ``mi.UInt32``, or integers for ``word``.
+
+    Returns
+    -------
+    mi.UInt32
+        The new key.
+    """
     import mitsuba as mi
 
     bits = mi.UInt32(key) ^ (mi.UInt32(word) * mi.UInt32(0x9E3779B9))
@@ -26,16 +38,29 @@ def hashed(key: Any, word: Any) -> Any:
 
 
 def uniform(key: Any) -> Any:
-    """One number in [0, 1) from a key."""
+    """Return a uniform number in [0, 1), ``mi.Float``, from a key ``mi.UInt32``."""
     return _fraction(hashed(key, 0))
 
 
 def sobol_pair(key: Any, index: Any) -> Any:
-    """Point ``index`` of the Owen-scrambled, shuffled (0, 2)-sequence that belongs to ``key``, ``mi.Point2f``."""
+    """Return a point of the Owen-scrambled, shuffled (0, 2)-sequence of a key.
+
+    Parameters
+    ----------
+    key
+        ``mi.UInt32`` key of the sequence.
+    index
+        ``mi.UInt32`` index of the point.
+
+    Returns
+    -------
+    mi.Point2f
+        In [0, 1)².
+    """
     import drjit as dr
     import mitsuba as mi
 
-    # In digit-reversed numbers a nested scramble is a permutation in which bits reach only higher ones.
+    # In bit-reversed numbers a nested scramble is a permutation in which bits affect only higher bits.
     shuffled = dr.brev(_permuted(dr.brev(index), hashed(key, 1)))
     return mi.Point2f(
         _fraction(dr.brev(_permuted(shuffled, hashed(key, 2)))),
@@ -44,14 +69,14 @@ def sobol_pair(key: Any, index: Any) -> Any:
 
 
 def _fraction(bits: Any) -> Any:
-    """The 24 bits that float32 holds exactly, so that 1.0 is never reached."""
+    """Convert to [0, 1) with the 24 bits that float32 represents exactly, so that 1.0 does not occur."""
     import mitsuba as mi
 
     return mi.Float(bits >> 8) * (2.0**-24)
 
 
 def _permuted(bits: Any, key: Any) -> Any:
-    """Laine & Karras' hash with Vegdahl's constants (Burley 2020, section 2.2)."""
+    """Permute by Laine & Karras' hash with Vegdahl's constants (Burley 2020, section 2.2)."""
     import mitsuba as mi
 
     bits = bits ^ (bits * mi.UInt32(0x3D20ADEA))
@@ -62,7 +87,7 @@ def _permuted(bits: Any, key: Any) -> Any:
 
 
 def _pascal(index: Any) -> Any:
-    """The second Sobol dimension's digits, lowest bit first: Pascal's triangle modulo 2 times the index's bits."""
+    """Digits of the second Sobol dimension, lowest bit first: Pascal's triangle modulo 2 times the bits of the index."""
     import mitsuba as mi
 
     for shift, mask in ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF), (16, 0x0000FFFF)):

@@ -1,7 +1,7 @@
-"""Splats to pixels on the renderer's own device, as fast as it goes: tiles, one lane for each pixel, front to back.
+"""Rasterisation of Gaussian splats on the Dr.Jit device: tiles, one lane per pixel, blended front to back.
 
-The picture is that of `gaussians.rasterise`, whose gradients it does not have. Tiles after Kerbl et al. 2023,
-doi:10.1145/3592433; a pixel's loop ends as soon as nothing more would shine through.
+The image equals that of `gaussians.rasterise`, without gradients. Tiles after Kerbl et al. 2023, doi:10.1145/3592433. The
+loop of a pixel ends when its remaining transmittance is negligible.
 """
 
 from __future__ import annotations
@@ -14,14 +14,28 @@ import numpy as np
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.rendering.backend import point3, use_backend
 
-# Pixels along a tile's side; lanes of one tile run together.
+# Side of a tile [px]; the lanes of a tile run together.
 TILE = 4
-_CLOSED = 1e-4
+# Transmittance at which blending ends.
+_LEAST_TRANSMITTANCE = 1e-4
 
 
 class SplatLimits(NamedTuple):
-    """Least opacity that is drawn, most that a splat may have, the pixel's own variance [px²] and the near limit [m];
-    with ``one_sided``, splats whose third axis points away from the camera are left out."""
+    """Limits of rasterisation.
+
+    Parameters
+    ----------
+    alpha_cut
+        Least opacity that is drawn.
+    alpha_most
+        Largest opacity of a splat in a pixel.
+    pixel_variance
+        Variance of the pixel filter [px²].
+    near_m
+        Least distance along the optical axis [m].
+    one_sided
+        Omit splats whose third axis points away from the camera.
+    """
 
     alpha_cut: float
     alpha_most: float
@@ -32,7 +46,19 @@ class SplatLimits(NamedTuple):
 
 @dataclass(frozen=True)
 class DeviceSplats:
-    """N splats on the device: centres, the three axes of each ellipsoid (rotation × scale), and opacity."""
+    """N Gaussian splats on the Dr.Jit device.
+
+    Parameters
+    ----------
+    mi_centre
+        ``mi.Point3f`` centres, ENU [m].
+    mi_axes
+        Three ``mi.Vector3f``: axes of the ellipsoids (rotation × scale) [m].
+    mi_opacity
+        ``mi.Float`` opacities.
+    count
+        Number N of splats.
+    """
 
     mi_centre: Any
     mi_axes: list[Any]
@@ -41,18 +67,45 @@ class DeviceSplats:
 
 
 def finer_camera(camera: Camera, times: int) -> Camera:
-    """The same view with ``times`` as many pixels along each side."""
+    """Return the same view with a multiple of its pixels.
+
+    Parameters
+    ----------
+    camera
+        The view.
+    times
+        Factor of the number of pixels along each side.
+
+    Returns
+    -------
+    Camera
+        The view with scaled size, focal lengths and principal point.
+    """
     scaled = {name: times * getattr(camera, name) for name in ("width_px", "height_px", "fx", "fy", "cx", "cy")}
     return replace(camera, **scaled)
 
 
 def upload_splats(means: np.ndarray, axes: np.ndarray, opacity: np.ndarray) -> DeviceSplats:
-    """Copy to the device: ``means (N, 3)``, ``axes (N, 3, 3)`` with one axis of the ellipsoid a column, ``opacity (N,)``.
+    """Copy splats to the device.
+
+    Parameters
+    ----------
+    means
+        ``(N, 3)`` centres, ENU [m].
+    axes
+        ``(N, 3, 3)`` axes of the ellipsoids, one per column [m].
+    opacity
+        ``(N,)`` opacities.
+
+    Returns
+    -------
+    DeviceSplats
+        The device copy.
 
     Raises
     ------
     ValueError
-        On the scalar variant, which has no lanes.
+        On the scalar variant.
     """
     if use_backend().device == "scalar":
         raise ValueError("splatting needs a vectorised variant; install a libLLVM or use CUDA")
@@ -60,137 +113,186 @@ def upload_splats(means: np.ndarray, axes: np.ndarray, opacity: np.ndarray) -> D
     import mitsuba as mi
 
     columns = [mi.Vector3f(point3(axes[:, :, k])) for k in range(3)]
-    ready = DeviceSplats(
+    splats = DeviceSplats(
         mi.Point3f(point3(means)), columns, mi.Float(np.ascontiguousarray(opacity, np.float32)), len(means)
     )
-    dr.eval(ready.mi_centre, ready.mi_axes, ready.mi_opacity)
-    return ready
+    dr.eval(splats.mi_centre, splats.mi_axes, splats.mi_opacity)
+    return splats
 
 
 def splat_layers(
-    ready: DeviceSplats, layers: np.ndarray, camera: Camera, cuts: SplatLimits
+    splats: DeviceSplats, layers: np.ndarray, camera: Camera, cuts: SplatLimits
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Blend layers ``(N, C)`` front to back over black: picture ``(H, W, C)`` and coverage ``(H, W)``."""
+    """Rasterise splats: blend their values front to back over black.
+
+    Parameters
+    ----------
+    splats
+        N splats.
+    layers
+        ``(N, C)`` values of the splats, such as colours and distance.
+    camera
+        The view.
+    cuts
+        Limits of rasterisation.
+
+    Returns
+    -------
+    image
+        ``(H, W, C)`` float32 blended values.
+    coverage
+        ``(H, W)`` float32 opacity of each pixel.
+    """
     import drjit as dr
     import mitsuba as mi
 
-    facts = _project(ready, camera, cuts)
-    index, start = _bins(facts, camera)
+    projected = _project(splats, camera, cuts)
+    index, start = _tile_lists(projected, camera)
     if len(index) == 0:
-        size = (camera.height_px, camera.width_px)
-        return np.zeros((*size, layers.shape[1]), np.float32), np.zeros(size, np.float32)
+        shape = (camera.height_px, camera.width_px)
+        return np.zeros((*shape, layers.shape[1]), np.float32), np.zeros(shape, np.float32)
     across, down = -(-camera.width_px // TILE), -(-camera.height_px // TILE)
     lane = dr.arange(mi.UInt32, across * down * TILE * TILE)
     tile, inner = lane // (TILE * TILE), lane % (TILE * TILE)
-    wide = dr.opaque(mi.UInt32, across)
-    column, row = (tile % wide) * TILE + inner % TILE, (tile // wide) * TILE + inner // TILE
+    tile_columns = dr.opaque(mi.UInt32, across)
+    column, row = (tile % tile_columns) * TILE + inner % TILE, (tile // tile_columns) * TILE + inner // TILE
     x, y = mi.Float(column) + 0.5, mi.Float(row) + 0.5
     mi_start = mi.UInt32(start)
     channels = [mi.Float(np.ascontiguousarray(channel, np.float32)) for channel in layers.T]
     order = mi.UInt32(index)
     most, least = dr.opaque(mi.Float, cuts.alpha_most), dr.opaque(mi.Float, cuts.alpha_cut)
 
-    def unfinished(number: Any, through: Any, *sums: Any) -> Any:
-        return (number < end) & (through > _CLOSED)
+    parameters = (
+        projected.mi_x,
+        projected.mi_y,
+        projected.mi_conic_xx,
+        projected.mi_conic_xy,
+        projected.mi_conic_yy,
+        projected.mi_opacity,
+    )
 
-    def blend(number: Any, through: Any, *sums: Any) -> tuple:
+    def unfinished(number: Any, transmittance: Any, *sums: Any) -> Any:
+        return (number < end) & (transmittance > _LEAST_TRANSMITTANCE)
+
+    def blend(number: Any, transmittance: Any, *sums: Any) -> tuple[Any, ...]:
         splat = dr.gather(mi.UInt32, order, number)
-        cx, cy, xx, xy, yy, opacity = (dr.gather(mi.Float, values, splat) for values in facts[:6])
+        cx, cy, xx, xy, yy, opacity = (dr.gather(mi.Float, values, splat) for values in parameters)
         dx, dy = x - cx, y - cy
         alpha = dr.minimum(opacity * dr.exp(-0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy), most)
         alpha = dr.select(alpha >= least, alpha, 0.0)
-        weight = through * alpha
-        added = (
-            dr.fma(weight, dr.gather(mi.Float, channel, splat), held)
-            for channel, held in zip(channels, sums, strict=True)
+        weight = transmittance * alpha
+        blended = (
+            dr.fma(weight, dr.gather(mi.Float, channel, splat), partial_sum)
+            for channel, partial_sum in zip(channels, sums, strict=True)
         )
-        return (number + 1, through * (1.0 - alpha), *added)
+        return (number + 1, transmittance * (1.0 - alpha), *blended)
 
     begin, end = dr.gather(mi.UInt32, mi_start, tile), dr.gather(mi.UInt32, mi_start, tile + 1)
-    nothing = tuple(dr.zeros(mi.Float, len(start[:-1]) * TILE * TILE) for _ in channels)
-    state = (begin, dr.full(mi.Float, 1.0, dr.width(lane)), *nothing)
-    _, through, *sums = dr.while_loop(state, unfinished, blend, label="splats")
-    dr.eval(through, sums)
+    black = tuple(dr.zeros(mi.Float, len(start[:-1]) * TILE * TILE) for _ in channels)
+    state = (begin, dr.full(mi.Float, 1.0, dr.width(lane)), *black)
+    _, transmittance, *sums = dr.while_loop(state, unfinished, blend, label="splats")
+    dr.eval(transmittance, sums)
 
-    def picture(values: Any) -> np.ndarray:
+    def to_image(values: Any) -> np.ndarray:
         tiles = np.array(values).reshape(down, across, TILE, TILE).swapaxes(1, 2)
         return tiles.reshape(down * TILE, across * TILE)[: camera.height_px, : camera.width_px]
 
-    return np.stack([picture(values) for values in sums], axis=-1), 1.0 - picture(through)
+    return np.stack([to_image(values) for values in sums], axis=-1), 1.0 - to_image(transmittance)
 
 
-def _project(ready: DeviceSplats, camera: Camera, cuts: SplatLimits) -> tuple:
-    """Centre (x, y), conic (xx, xy, yy), opacity, depth and reaches (x, y) in the picture of all splats, as lanes."""
+@dataclass(frozen=True)
+class _ProjectedSplats:
+    """Splats in the image as ``mi.Float`` lanes: centre [px], conic [px⁻²], opacity, depth [m] and half extent [px].
+
+    The half extent is negative for splats that are not drawn.
+    """
+
+    mi_x: Any
+    mi_y: Any
+    mi_conic_xx: Any
+    mi_conic_xy: Any
+    mi_conic_yy: Any
+    mi_opacity: Any
+    mi_depth: Any
+    mi_extent_x: Any
+    mi_extent_y: Any
+
+
+def _project(splats: DeviceSplats, camera: Camera, cuts: SplatLimits) -> _ProjectedSplats:
     import drjit as dr
     import mitsuba as mi
 
     def number(value: float) -> Any:
         return dr.opaque(mi.Float, float(value))
 
-    turn = [mi.Vector3f(*map(number, camera.world_from_camera[:3, axis])) for axis in range(3)]
-    local = ready.mi_centre - mi.Point3f(*map(number, camera.position_m))
-    x, y, z = (dr.dot(local, axis) for axis in turn)
+    camera_axes = [mi.Vector3f(*map(number, camera.world_from_camera[:3, axis])) for axis in range(3)]
+    local = splats.mi_centre - mi.Point3f(*map(number, camera.position_m))
+    x, y, z = (dr.dot(local, axis) for axis in camera_axes)
     fx, fy = number(camera.fx), number(camera.fy)
-    # As 3DGS does, the slope of the projection is taken no further out than a third past the picture's rim.
+    # As in 3DGS, the derivative of the projection is evaluated at most 30 % outside of the image.
     limits = number(0.65 * camera.width_px / camera.fx), number(0.65 * camera.height_px / camera.fy)
     u, v = (dr.clip(side / z, -limit, limit) for side, limit in zip((x, y), limits, strict=True))
     xx, xy, yy = number(cuts.pixel_variance), mi.Float(0.0), number(cuts.pixel_variance)
-    for axis in ready.mi_axes:
-        a, b, c = (dr.dot(axis, side) for side in turn)
+    for axis in splats.mi_axes:
+        a, b, c = (dr.dot(axis, camera_axis) for camera_axis in camera_axes)
         across, down = fx / z * (a - u * c), fy / z * (b - v * c)
         xx, xy, yy = dr.fma(across, across, xx), dr.fma(across, down, xy), dr.fma(down, down, yy)
     determinant = xx * yy - xy * xy
-    seen = (z > number(cuts.near_m)) & (ready.mi_opacity >= number(cuts.alpha_cut))
+    visible = (z > number(cuts.near_m)) & (splats.mi_opacity >= number(cuts.alpha_cut))
     if cuts.one_sided:
-        seen &= dr.dot(local, ready.mi_axes[2]) < 0.0
-    reach = dr.sqrt(dr.maximum(2.0 * dr.log(ready.mi_opacity / number(max(cuts.alpha_cut, 1e-30))), 0.0))
-    facts = (
+        visible &= dr.dot(local, splats.mi_axes[2]) < 0.0
+    # Distance from the centre, in standard deviations, at which the opacity falls to the least one.
+    extent = dr.sqrt(dr.maximum(2.0 * dr.log(splats.mi_opacity / number(max(cuts.alpha_cut, 1e-30))), 0.0))
+    columns = (
         fx * x / z + number(camera.cx),
         fy * y / z + number(camera.cy),
         yy / determinant,
         -xy / determinant,
         xx / determinant,
-        ready.mi_opacity,
+        splats.mi_opacity,
         z,
-        dr.select(seen, reach * dr.sqrt(xx), -1.0),
-        dr.select(seen, reach * dr.sqrt(yy), -1.0),
+        dr.select(visible, extent * dr.sqrt(xx), -1.0),
+        dr.select(visible, extent * dr.sqrt(yy), -1.0),
     )
-    dr.eval(facts)
-    return facts
+    dr.eval(columns)
+    return _ProjectedSplats(*columns)
 
 
-def _bins(facts: tuple, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Splats of each tile, nearest first ``(K,)`` uint32, and where each tile's begin ``(tiles + 1,)`` uint32."""
+def _tile_lists(projected: _ProjectedSplats, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Splats of all tiles, nearest first ``(K,)``, and the start of each tile's list ``(tiles + 1,)``, both uint32."""
     from scipy import sparse
 
-    cx, cy, depth, reach_x, reach_y = (np.array(facts[k]) for k in (0, 1, 6, 7, 8))
+    cx, cy, depth, extent_x, extent_y = (
+        np.array(values)
+        for values in (projected.mi_x, projected.mi_y, projected.mi_depth, projected.mi_extent_x, projected.mi_extent_y)
+    )
     across, down = -(-camera.width_px // TILE), -(-camera.height_px // TILE)
     inside = np.flatnonzero(
-        (reach_x >= 0.0)
-        & (cx + reach_x > 0.0)
-        & (cx - reach_x < camera.width_px)
-        & (cy + reach_y > 0.0)
-        & (cy - reach_y < camera.height_px)
+        (extent_x >= 0.0)
+        & (cx + extent_x > 0.0)
+        & (cx - extent_x < camera.width_px)
+        & (cy + extent_y > 0.0)
+        & (cy - extent_y < camera.height_px)
     )
     inside = inside[np.argsort(depth[inside], kind="stable")]
 
-    def tiles(centre: np.ndarray, reach: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-        # Pixel centres lie half a pixel in: a box that only touches a tile's rim has none of them.
-        first = np.floor((centre[inside] - reach[inside] - 0.5) / TILE)
-        last = np.floor((centre[inside] + reach[inside] - 0.5) / TILE)
+    def tiles(centre: np.ndarray, extent: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+        # Pixel centres lie half a pixel inside: a box that only touches the edge of a tile contains none of them.
+        first = np.floor((centre[inside] - extent[inside] - 0.5) / TILE)
+        last = np.floor((centre[inside] + extent[inside] - 0.5) / TILE)
         first = np.clip(first, 0, count - 1).astype(np.int32)
         return first, np.clip(last, 0, count - 1).astype(np.int32) - first + 1
 
-    left, wide = tiles(cx, reach_x, across)
-    top, high = tiles(cy, reach_y, down)
-    each = wide * high
-    splat = np.repeat(np.arange(len(inside), dtype=np.int32), each)
-    number = np.arange(len(splat), dtype=np.int32) - np.repeat((np.cumsum(each) - each).astype(np.int32), each)
-    row = number // wide[splat]
-    tile = (top[splat] + row) * np.int32(across) + left[splat] + number - row * wide[splat]
+    left, width = tiles(cx, extent_x, across)
+    top, height = tiles(cy, extent_y, down)
+    count = width * height
+    splat = np.repeat(np.arange(len(inside), dtype=np.int32), count)
+    number = np.arange(len(splat), dtype=np.int32) - np.repeat((np.cumsum(count) - count).astype(np.int32), count)
+    row = number // width[splat]
+    tile = (top[splat] + row) * np.int32(across) + left[splat] + number - row * width[splat]
     table = sparse.coo_array(
         (inside[splat].astype(np.int64) + 1, (tile, np.zeros(len(tile), np.int32))), shape=(across * down, 1)
     )
-    table.has_canonical_format = True  # else splats of one tile would be added up
+    table.has_canonical_format = True  # otherwise the entries of a tile would be summed
     table = table.tocsr()
     return (table.data - 1).astype(np.uint32), table.indptr.astype(np.uint32)

@@ -1,4 +1,4 @@
-"""How much of the sun (or moon) places on the terrain see: exact shadow rays to points of its disc."""
+"""Visibility of the sun's (or moon's) disc from surface points, by shadow rays to points of the disc."""
 
 from __future__ import annotations
 
@@ -11,29 +11,38 @@ from seasonscapes.rendering.backend import point3
 from seasonscapes.rendering.hemisphere_rays import RayScene
 from seasonscapes.sky.illumination import Luminary
 
-# Lanes in one launch: more do not run faster, and memory stays bounded.
+# Rays in one kernel launch; bounds the memory, and more are not faster.
 LANES = 1 << 22
 _BAYER = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]])
 
 
 @dataclass(frozen=True)
+class _Disc:
+    """Points of a luminary's disc on the device: their directions and number, and the direction to the centre."""
+
+    mi_directions: Any
+    mi_count: Any
+    mi_centre: Any
+
+
+@dataclass(frozen=True)
 class SunRays:
-    """Places with normals on the device, S to a receiver, ready for a sun anywhere.
+    """Origins and normals of shadow rays on the Dr.Jit device: S sample points for each of N receivers.
 
     Parameters
     ----------
     terrain
-        What is in the way.
+        The occluding terrain.
     mi_origin
-        ``mi.Point3f`` of N · S lanes, receiver by receiver.
+        ``mi.Point3f`` of N · S lanes, the samples of a receiver side by side.
     mi_normal, mi_outward
-        Shading and geometric normals, three ``mi.Float16`` each.
+        Shading and geometric normals, three ``mi.Float16`` arrays each.
     mi_weight
-        Share of each place in its receiver, ``mi.Float16``.
-    mi_turn
-        ``mi.UInt32`` of N lanes: the disc's point that each receiver begins with.
-    places
-        S.
+        ``mi.Float16``: weight of each sample in its receiver.
+    mi_disc_offset
+        ``mi.UInt32`` of N lanes: index of the disc point that the first sample of each receiver uses.
+    samples
+        Number S of samples per receiver.
     """
 
     terrain: RayScene
@@ -41,163 +50,259 @@ class SunRays:
     mi_normal: list[Any]
     mi_outward: list[Any]
     mi_weight: Any
-    mi_turn: Any
-    places: int
+    mi_disc_offset: Any
+    samples: int
 
     @property
     def receivers(self) -> int:
-        """N."""
+        """Number N of receivers."""
         import drjit as dr
 
-        return dr.width(self.mi_weight) // self.places
+        return dr.width(self.mi_weight) // self.samples
 
 
 def sun_rays(
-    terrain: RayScene, places: tuple[np.ndarray, np.ndarray, np.ndarray], weight: np.ndarray, turn: np.ndarray
+    terrain: RayScene,
+    origin_m: np.ndarray,
+    normal: np.ndarray,
+    outward: np.ndarray,
+    weight: np.ndarray,
+    disc_offset: np.ndarray,
 ) -> SunRays:
-    """Shadow rays from places.
+    """Copy the origins and normals of shadow rays to the device.
 
     Parameters
     ----------
-    places
-        Origins, shading normals and geometric normals, ``(N, S, 3)`` each.
+    terrain
+        The occluding terrain.
+    origin_m
+        ``(N, S, 3)`` origins of the rays, off the surface, ENU [m].
+    normal, outward
+        ``(N, S, 3)`` unit shading normals and unit geometric normals.
     weight
-        ``(N, S)``, 0 where there is no place.
-    turn
-        ``(N,)`` any whole numbers. Places of a receiver take points of the disc in turn, beginning with this one:
-            neighbours that begin with different ones soon disagree in a penumbra, see `pixel_turn`.
+        ``(N, S)`` weight of each sample in its receiver, 0 for samples that are not on the terrain.
+    disc_offset
+        ``(N,)`` integers. The samples of a receiver use successive points of the disc, beginning with this one;
+        different offsets of neighbouring receivers dither penumbrae, see `pixel_turn`.
+
+    Returns
+    -------
+    SunRays
+        The device copy, for any position of the luminary.
     """
     import drjit as dr
     import mitsuba as mi
 
-    origin, *normals = places
-    mi_origin = point3(np.asarray(origin).reshape(-1, 3))
-    halves = [
+    mi_origin = point3(np.asarray(origin_m).reshape(-1, 3))
+    mi_normal, mi_outward = (
         [mi.Float16(np.ascontiguousarray(column, np.float16)) for column in np.asarray(values).reshape(-1, 3).T]
-        for values in normals
-    ]
+        for values in (normal, outward)
+    )
     mi_weight = mi.Float16(np.ascontiguousarray(weight, np.float16).ravel())
-    mi_turn = mi.UInt32((np.asarray(turn, np.int64) % 256).astype(np.uint32))
-    dr.eval(mi_origin, halves, mi_weight, mi_turn)
-    return SunRays(terrain, mi_origin, *halves, mi_weight, mi_turn, weight.shape[1])
+    mi_disc_offset = mi.UInt32((np.asarray(disc_offset, np.int64) % 256).astype(np.uint32))
+    dr.eval(mi_origin, mi_normal, mi_outward, mi_weight, mi_disc_offset)
+    return SunRays(terrain, mi_origin, mi_normal, mi_outward, mi_weight, mi_disc_offset, weight.shape[1])
 
 
-def pixel_turn(pixel: np.ndarray, width_px: int, places: int) -> np.ndarray:
-    """Point of the disc that each pixel begins with: every 4 × 4 pixels have sixteen different ones (Bayer's matrix)."""
+def pixel_turn(pixel: np.ndarray, width_px: int, samples: int) -> np.ndarray:
+    """Compute the disc offsets of pixels: the 16 pixels of each 4 × 4 block have different ones (Bayer's matrix).
+
+    Parameters
+    ----------
+    pixel
+        ``(N,)`` flat pixel indices.
+    width_px
+        Width of the image [px].
+    samples
+        Number S of samples per pixel.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(N,)`` integers, for `sun_rays`.
+    """
     row, column = np.divmod(pixel, width_px)
-    return _BAYER[row % 4, column % 4] * max(places // 16, 1)
+    return _BAYER[row % 4, column % 4] * max(samples // 16, 1)
 
 
 def numbered_turn(number: np.ndarray) -> np.ndarray:
-    """Points of the disc for receivers that have numbers instead of neighbours (Knuth's multiplicative hash)."""
+    """Compute the disc offsets of receivers that are no pixels, by Knuth's multiplicative hash.
+
+    Parameters
+    ----------
+    number
+        ``(N,)`` index of each receiver.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(N,)`` int64, for `sun_rays`.
+    """
     return (np.asarray(number, np.uint64) * np.uint64(2654435761) % np.uint64(1 << 32) >> np.uint64(16)).astype(
         np.int64
     )
 
 
 def disc_directions(luminary: Luminary, count: int) -> np.ndarray:
-    """Unit directions ``(count, 3)`` to points spread evenly over a luminary's disc (Vogel 1979's sunflower)."""
+    """Compute directions to points evenly distributed over the disc of a luminary (Vogel 1979's sunflower).
+
+    Parameters
+    ----------
+    luminary
+        Sun or moon.
+    count
+        Number of points.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(count, 3)`` unit directions, ENU.
+    """
     axis = np.asarray(luminary.direction, float)
     side = np.cross(axis, [0.0, 0.0, 1.0] if abs(axis[2]) < 0.9 else [1.0, 0.0, 0.0])
     side /= np.linalg.norm(side)
     other = np.cross(axis, side)
-    number = np.arange(count)
-    radius = np.tan(np.radians(luminary.angular_radius_deg)) * np.sqrt((number + 0.5) / count)
-    turn = number * np.pi * (3.0 - np.sqrt(5.0))
-    direction = axis + radius[:, None] * (np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * other)
+    index = np.arange(count)
+    radius = np.tan(np.radians(luminary.angular_radius_deg)) * np.sqrt((index + 0.5) / count)
+    angle = index * np.pi * (3.0 - np.sqrt(5.0))
+    direction = axis + radius[:, None] * (np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * other)
     return direction / np.linalg.norm(direction, axis=1, keepdims=True)
 
 
-def first_place_sees(rays: SunRays, luminary: Luminary) -> np.ndarray:
-    """Whether the first place of each receiver faces and sees its point of the disc, ``(N,)`` bool."""
+def first_sample_visible(rays: SunRays, luminary: Luminary) -> np.ndarray:
+    """Test whether the luminary is visible from the first sample of each receiver.
+
+    Parameters
+    ----------
+    rays
+        Shadow rays of N receivers.
+    luminary
+        Sun or moon.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(N,)`` bool: the sample faces the luminary, and its point of the disc is not occluded.
+    """
     import drjit as dr
     import mitsuba as mi
 
-    seen = np.empty(rays.receivers, bool)
-    disc = _mi_disc(luminary, rays.places)
-    for start in range(0, len(seen), LANES):
-        count = min(LANES, len(seen) - start)
+    result = np.empty(rays.receivers, bool)
+    disc = _mi_disc(luminary, rays.samples)
+    for start in range(0, len(result), LANES):
+        count = min(LANES, len(result) - start)
         lane = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, start)
-        visible, _, _ = _visible(rays, disc, lane * dr.opaque(mi.UInt32, rays.places))
+        visible, _, _ = _visible(rays, disc, lane * dr.opaque(mi.UInt32, rays.samples))
         dr.eval(visible)
-        seen[start : start + count] = np.array(visible)
-    return seen
+        result[start : start + count] = np.array(visible)
+    return result
 
 
 def incidence(rays: SunRays, luminary: Luminary, receiver: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted sums over the places of some receivers ``(K,)``: of cosine × visibility, and of the cosine alone."""
+    """Sum the cosine of incidence over the samples of receivers, with and without occlusion.
+
+    Parameters
+    ----------
+    rays
+        Shadow rays of N receivers.
+    luminary
+        Sun or moon.
+    receiver
+        ``(K,)`` indices of the receivers to evaluate.
+
+    Returns
+    -------
+    visible
+        ``(K,)`` float32 weighted sums of cosine × visibility.
+    unoccluded
+        ``(K,)`` float32 weighted sums of the cosine.
+    """
     import drjit as dr
     import mitsuba as mi
 
     sums = np.empty((2, len(receiver)), np.float32)
-    disc = _mi_disc(luminary, rays.places)
-    step = max(1, LANES // rays.places)
+    disc = _mi_disc(luminary, rays.samples)
+    step = max(1, LANES // rays.samples)
     for start in range(0, len(receiver), step):
         chosen = mi.UInt32(receiver[start : start + step].astype(np.uint32))
-        number = dr.arange(mi.UInt32, dr.width(chosen) * rays.places)
-        places = dr.opaque(mi.UInt32, rays.places)
-        lane = dr.gather(mi.UInt32, chosen, number // places) * places + number % places
+        index = dr.arange(mi.UInt32, dr.width(chosen) * rays.samples)
+        samples = dr.opaque(mi.UInt32, rays.samples)
+        lane = dr.gather(mi.UInt32, chosen, index // samples) * samples + index % samples
         visible, cosine, weight = _visible(rays, disc, lane)
-        share = dr.fmax(cosine, 0.0) * weight
-        lanes = [dr.select(visible, share, 0.0), share]
+        weighted = dr.fmax(cosine, 0.0) * weight
+        lanes = [dr.select(visible, weighted, 0.0), weighted]
         dr.eval(lanes)
-        blocks = [dr.block_sum(values, rays.places) for values in lanes]
+        blocks = [dr.block_sum(values, rays.samples) for values in lanes]
         dr.eval(blocks)
         sums[:, start : start + dr.width(chosen)] = [np.array(values) for values in blocks]
     return sums[0], sums[1]
 
 
 def cosine_seen(rays: SunRays, luminary: Luminary, *, each: int = 1) -> np.ndarray:
-    """Cosine of incidence × visibility of every place ``(N, S)``, from ``each`` points of the disc."""
-    import drjit as dr
-    import mitsuba as mi
+    """Compute cosine of incidence × visibility of the luminary for all samples.
 
-    disc = _mi_disc(luminary, rays.places * each)
-    result = np.empty(rays.receivers * rays.places, np.float32)
-    step = max(1, LANES // each)
-    for start in range(0, len(result), step):
-        count = min(step, len(result) - start)
-        number = dr.arange(mi.UInt32, count * each)
-        place = number // dr.opaque(mi.UInt32, each)
-        again = (number - place * dr.opaque(mi.UInt32, each)) * dr.opaque(mi.UInt32, rays.places)
-        visible, cosine, _ = _visible(rays, disc, place + dr.opaque(mi.UInt32, start), again)
-        seen = dr.select(visible, cosine, 0.0)
-        dr.eval(seen)
-        result[start : start + count] = np.array(dr.block_sum(seen, each)) / each
-    return result.reshape(-1, rays.places)
+    Parameters
+    ----------
+    rays
+        Shadow rays of N receivers with S samples each.
+    luminary
+        Sun or moon.
+    each
+        Shadow rays per sample, to different points of the disc.
 
-
-def _mi_disc(luminary: Luminary, places: int) -> tuple[Any, Any, Any]:
-    """Directions to points of the disc and their number, and the direction to its centre."""
-    import drjit as dr
-    import mitsuba as mi
-
-    count = max(places, 16)
-    centre = mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in luminary.direction))
-    return mi.Vector3f(point3(disc_directions(luminary, count))), dr.opaque(mi.UInt32, count), centre
-
-
-def _visible(rays: SunRays, disc: tuple[Any, Any, Any], lane: Any, again: Any = 0) -> tuple[Any, Any, Any]:
-    """Whether lanes of `SunRays` see the luminary, the cosine of incidence of its centre, and their weight.
-
-    ``again`` moves on to other points of the disc.
-
-    Where the facet turns its back a path tracer's shadow ray starts inside the mountain, so that is dark here too.
+    Returns
+    -------
+    numpy.ndarray
+        ``(N, S)`` float32, zero where the luminary is not visible.
     """
     import drjit as dr
     import mitsuba as mi
 
-    points, count, centre = disc
+    disc = _mi_disc(luminary, rays.samples * each)
+    result = np.empty(rays.receivers * rays.samples, np.float32)
+    step = max(1, LANES // each)
+    for start in range(0, len(result), step):
+        count = min(step, len(result) - start)
+        index = dr.arange(mi.UInt32, count * each)
+        sample = index // dr.opaque(mi.UInt32, each)
+        shift = (index - sample * dr.opaque(mi.UInt32, each)) * dr.opaque(mi.UInt32, rays.samples)
+        visible, cosine, _ = _visible(rays, disc, sample + dr.opaque(mi.UInt32, start), shift)
+        visible_cosine = dr.select(visible, cosine, 0.0)
+        dr.eval(visible_cosine)
+        result[start : start + count] = np.array(dr.block_sum(visible_cosine, each)) / each
+    return result.reshape(-1, rays.samples)
+
+
+def _mi_disc(luminary: Luminary, points: int) -> _Disc:
+    import drjit as dr
+    import mitsuba as mi
+
+    count = max(points, 16)
+    centre = mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in luminary.direction))
+    return _Disc(mi.Vector3f(point3(disc_directions(luminary, count))), dr.opaque(mi.UInt32, count), centre)
+
+
+def _visible(rays: SunRays, disc: _Disc, lane: Any, shift: Any = 0) -> tuple[Any, Any, Any]:
+    """Visibility of the luminary from samples (``lane`` of `SunRays`), cosine of incidence of its centre, and weight.
+
+    ``shift`` selects other points of the disc. Samples whose facet faces away from the luminary are dark, as in a path
+    tracer, whose shadow ray would start inside the terrain.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
     cosine, outward = (
-        sum(mi.Float(dr.gather(mi.Float16, column, lane)) * axis for column, axis in zip(columns, centre, strict=True))
+        sum(
+            mi.Float(dr.gather(mi.Float16, column, lane)) * axis
+            for column, axis in zip(columns, disc.mi_centre, strict=True)
+        )
         for columns in (rays.mi_normal, rays.mi_outward)
     )
     weight = mi.Float(dr.gather(mi.Float16, rays.mi_weight, lane))
     active = (cosine > 0.0) & (outward > 0.0) & (weight > 0.0)
-    # Places of a receiver take the disc's points in turn; each receiver begins with another one.
-    places = dr.opaque(mi.UInt32, rays.places)
-    receiver = lane // places
-    turn = lane - receiver * places + dr.gather(mi.UInt32, rays.mi_turn, receiver) + again
-    direction = dr.gather(mi.Vector3f, points, turn % count)
+    samples = dr.opaque(mi.UInt32, rays.samples)
+    receiver = lane // samples
+    disc_point = lane - receiver * samples + dr.gather(mi.UInt32, rays.mi_disc_offset, receiver) + shift
+    direction = dr.gather(mi.Vector3f, disc.mi_directions, disc_point % disc.mi_count)
     ray = mi.Ray3f(dr.gather(mi.Point3f, rays.mi_origin, lane, active), direction)
     return active & ~rays.terrain.mi_scene.ray_test(ray, active), cosine, weight

@@ -1,71 +1,84 @@
-"""Daylight coefficients: light transport traced once, so that each hour costs a few shadow rays and small products.
+"""Daylight coefficients: light transport traced once per view or set of points, for any illumination afterwards.
 
-Light is linear. For every receiver, a pixel or a texel, this keeps how much of each sky patch's radiance arrives
-(Tregenza & Waters 1983, "Daylight coefficients", doi:10.1177/096032718301500201) in a compact basis of directions, and
-which parts of the terrain it sees. Sun and moon are exact: shadow rays to points of their discs each time, from the
-receivers and from the terrain that sends light on to them (`clusters`).
+Light transport is linear. For each receiver (pixel or texel) the daylight coefficients of all sky patches (Tregenza &
+Waters 1983, "Daylight coefficients", doi:10.1177/096032718301500201) are stored in a low-rank directional basis,
+together with the clusters of terrain faces that its hemisphere rays hit. Sun and moon are exact: shadow rays to points of
+their discs are traced for each illumination, from the receivers and from the clusters (`light_clusters`).
 
-Radiance of a pixel = albedo / π · E, with the albedo of its visible surface kept apart: another season's may be put in
-its place, and in the senders'.
+The radiance of a pixel is albedo / π · E. The albedo of the pixels and of the clusters is stored separately, so that it
+can be replaced, for example by that of another season.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
 from seasonscapes.cameras.panorama import Panorama
 from seasonscapes.cameras.pinhole import Camera
+from seasonscapes.errors import NoTerrainInView
 from seasonscapes.rendering.direction_basis import DirectionBasis, direction_basis
-from seasonscapes.rendering.hemisphere_rays import OPEN, RayScene, SurfacePoints, concatenate_points, gather_hemisphere
+from seasonscapes.rendering.hemisphere_rays import (
+    ESCAPED,
+    RayScene,
+    SurfacePoints,
+    concatenate_points,
+    gather_hemisphere,
+)
 from seasonscapes.rendering.light_clusters import (
-    PLACES,
+    POINTS_PER_CLUSTER,
     LightClusters,
     ReceiverCoefficients,
     cluster_faces,
     cluster_lists,
     face_geometry,
-    pilot_hits,
+    trace_path_hits,
 )
 from seasonscapes.rendering.sky_patches import sky_patches
 from seasonscapes.rendering.smoothing import Neighbours, edge_aware_neighbours, smoothed
 from seasonscapes.rendering.view_samples import camera_points, pixel_moments, sample_weights, view_samples
 
-# Receivers' rays in work at a time: their labels and weights take about 20 bytes each.
+# Hemisphere rays per block of receivers: their hits and weights take about 20 bytes each.
 BLOCK_RAYS = 1 << 23
-# How much direct skylight depends on the normal when pixels share it: a sky's aureole is some 20° wide.
+# Exponent of the normals' cosine for smoothing direct skylight: the aureole is about 20° wide.
 _DIRECT_SHARPNESS = 64.0
+# Paths that are traced to place the clusters.
 _PILOTS = 1 << 18
-# Receivers, and rays from each, that the basis of directions is found from.
+# Number of receivers, and rays of each, from which the directional basis is computed.
 _EXAMPLES, _EXAMPLE_RAYS = 4096, 512
 Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)
 class SamplingOptions:
-    """How hard to try.
+    """Sampling options of daylight coefficients.
 
     Parameters
     ----------
     subpixels
-        S, samples in each pixel, a square; shadow rays start from them.
+        Number S of samples per pixel from which shadow rays start, a square.
     shades
-        Samples in each pixel for its mean albedo and normal, a square.
+        Samples per pixel for its mean albedo and normal, a square.
     rays
-        Rays over the hemisphere of each receiver, a power of two.
+        Hemisphere rays per receiver, a power of two.
     bounces
-        Surfaces between receiver and light: 4 equals ``max_depth=6`` of the path tracer.
+        Number of surfaces between light and receiver; 4 equals ``max_depth=6`` of the path tracer.
     clusters
-        M, parts of the terrain that pass light on, a power of two up to 65,536.
+        Number M of clusters of faces, a power of two up to 65,536.
     listed
-        K, senders kept for each receiver, even.
+        Number K of clusters stored per receiver, even.
     rank
-        r, coefficients kept per receiver for the sky.
+        Number r of daylight coefficients stored per receiver.
     patches
         Subdivision of the sky, a name in `sky_patches.SUBDIVISIONS`.
+
+    Raises
+    ------
+    ValueError
+        If a number violates these conditions.
     """
 
     subpixels: int = 16
@@ -82,7 +95,7 @@ class SamplingOptions:
             raise ValueError("SamplingOptions: subpixels must be a square, rays a power of two, bounces not negative")
         if self.rays % self.subpixels:
             raise ValueError(
-                f"SamplingOptions: {self.rays} rays cannot be shared evenly among {self.subpixels} subpixels"
+                f"SamplingOptions: got {self.rays} rays and {self.subpixels} subpixels, expected a multiple of subpixels"
             )
         if self.listed % 2 or not 0 < self.clusters <= 65536:
             raise ValueError("SamplingOptions: listed must be even and clusters at most 65536")
@@ -90,30 +103,32 @@ class SamplingOptions:
 
 @dataclass(frozen=True)
 class ViewCoefficients:
-    """All that a view needs to be lit anew. n of its pixels show terrain; S samples lie in each.
+    """Daylight coefficients of a view, for relighting it. n of its pixels show terrain, with S samples each.
 
     Parameters
     ----------
     camera
         The view.
     pixel
-        ``(n,)`` int32 flat index of pixels that show any terrain.
+        ``(n,)`` int32 flat indices of the pixels that show terrain.
     coverage
-        ``(n,)`` float32 share of the pixel that is terrain.
+        ``(n,)`` float32 fraction of the pixel that terrain covers.
     albedo
-        ``(n, 3)`` float32 mean albedo over the pixel; sky counts as black.
+        ``(n, 3)`` float32 mean albedo over the pixel; the sky counts as black.
     normal
-        ``(n, 3)`` float32 mean of the samples' normals, weighted by ``sample_weight``.
+        ``(n, 3)`` float32 mean shading normal, weighted by luminous albedo.
     sample_origin
-        ``(n, S, 3)`` float32, where shadow rays begin [m]; samples on terrain come first.
+        ``(n, S, 3)`` float32 origins of shadow rays, ENU [m]; samples on terrain come first.
     sample_normal, sample_outward
         ``(n, S, 3)`` float16 shading and geometric normals.
     sample_weight
-        ``(n, S)`` float16 share of each sample in the pixel's reflected light, sum 1; 0 in the sky.
-    receivers, senders
-        What arrives.
-    seed, effort
-        How they were made.
+        ``(n, S)`` float16 weight of each sample in the pixel's reflected light, sum 1; 0 in the sky.
+    receivers
+        Coefficients of the pixels.
+    clusters
+        Clusters of faces that reflect light to the pixels.
+    seed, sampling
+        Seed and options they were computed with.
     """
 
     camera: Camera | Panorama
@@ -133,14 +148,16 @@ class ViewCoefficients:
 
 @dataclass(frozen=True)
 class PointCoefficients:
-    """All that N places on the terrain (texels) need to be lit anew.
+    """Daylight coefficients of surface points (such as texels), for computing their irradiance.
 
     Parameters
     ----------
     points
-        The places, ``(N, ...)``.
-    receivers, senders
-        What arrives.
+        N surface points.
+    receivers
+        Coefficients of the points.
+    clusters
+        Clusters of faces that reflect light to the points.
     """
 
     points: SurfacePoints
@@ -150,11 +167,35 @@ class PointCoefficients:
 
 @dataclass(frozen=True)
 class SharedTransport:
-    """What all receivers of a terrain share while they are traced."""
+    """Basis and clusters that all receivers of a terrain share.
 
-    mi_label: Any
+    Parameters
+    ----------
+    mi_face_cluster
+        ``mi.UInt32`` cluster of each face.
+    basis
+        Directional basis of the sky.
+    clusters
+        The clusters and their own coefficients.
+    """
+
+    mi_face_cluster: Any
     basis: DirectionBasis
     clusters: LightClusters
+
+
+@dataclass(frozen=True)
+class _PixelArrays:
+    """The arrays of `ViewCoefficients` for a block of image rows."""
+
+    pixel: np.ndarray
+    coverage: np.ndarray
+    albedo: np.ndarray
+    normal: np.ndarray
+    sample_origin: np.ndarray
+    sample_normal: np.ndarray
+    sample_outward: np.ndarray
+    sample_weight: np.ndarray
 
 
 def trace_view(
@@ -165,46 +206,91 @@ def trace_view(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> ViewCoefficients:
-    """Daylight coefficients of a view. Memory beyond the result does not grow with the view.
+    """Trace the daylight coefficients of a view.
+
+    Memory beyond the result does not grow with the size of the view.
 
     Parameters
     ----------
     terrain
-        From `hemisphere_rays.ray_scene`; its albedo at this moment is used.
+        From `hemisphere_rays.ray_scene`, with its current albedo.
+    camera
+        The view.
+    sampling
+        Sampling options; defaults if ``None``.
+    seed
+        Of the sampling.
     progress
-        Called with the share that is done.
+        Called with the completed fraction.
+
+    Returns
+    -------
+    ViewCoefficients
+        For `relit_view.relightable_view`.
 
     Raises
     ------
-    ValueError
-        Where no pixel shows terrain.
+    NoTerrainInView
+        If no pixel shows terrain.
     """
     sampling = sampling or SamplingOptions()
-    tell = progress or (lambda share: None)
-    pilot, hit = camera_points(terrain, camera, (0, camera.height_px), 1, seed)
+    report = progress or (lambda fraction: None)
+    pilot, hit = camera_points(terrain, camera, range(camera.height_px), 1, seed)
     if not hit.any():
-        raise ValueError("the camera sees no terrain")
-    prepared = prepare_transport(terrain, pilot[hit], sampling, seed=seed)
-    tell(0.1)
+        raise NoTerrainInView("trace_view: the camera sees no terrain; check its position and orientation")
+    shared = prepare_transport(terrain, pilot[hit], sampling, seed=seed)
+    report(0.1)
     rows = max(1, BLOCK_RAYS // (camera.width_px * sampling.rays))
-    parts = []
+    blocks, receivers = [], []
     for top in range(0, camera.height_px, rows):
-        parts += _view_rows(terrain, prepared, camera, (top, min(rows, camera.height_px - top)), sampling, seed)
-        tell(0.1 + 0.9 * min(1.0, (top + rows) / camera.height_px))
-    columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
-    view = ViewCoefficients(camera, *columns[:8], ReceiverCoefficients(*columns[8:]), prepared.clusters, seed, sampling)
+        block_rows = range(top, min(top + rows, camera.height_px))
+        block = _view_rows(terrain, shared, camera, block_rows, sampling, seed)
+        if block is not None:
+            blocks.append(block[0])
+            receivers.append(block[1])
+        report(0.1 + 0.9 * min(1.0, (top + rows) / camera.height_px))
+    arrays = {
+        field.name: np.concatenate([getattr(block, field.name) for block in blocks]) for field in fields(_PixelArrays)
+    }
+    view = ViewCoefficients(
+        camera=camera,
+        receivers=_concatenate_receivers(receivers),
+        clusters=shared.clusters,
+        seed=seed,
+        sampling=sampling,
+        **arrays,
+    )
     direct = smoothed(view.receivers.direct, view_neighbours(view, stride=1, sharpness=_DIRECT_SHARPNESS))
     return replace(view, receivers=replace(view.receivers, direct=direct.astype(np.float16)))
 
 
 def view_neighbours(view: ViewCoefficients, *, stride: int, sharpness: float) -> Neighbours:
-    """Pixels of one surface around each of the n pixels; see `smoothing.edge_aware_neighbours`."""
+    """Find the neighbouring pixels that lie on the same surface, for the n terrain pixels of a view.
+
+    Parameters
+    ----------
+    view
+        The view.
+    stride, sharpness
+        See `smoothing.edge_aware_neighbours`.
+
+    Returns
+    -------
+    Neighbours
+        Indices among the n pixels, and weights.
+    """
     camera = view.camera
     position = view.sample_origin.mean(axis=1)
     normal = view.normal / np.maximum(np.linalg.norm(view.normal, axis=1, keepdims=True), 1e-6)
-    size = np.linalg.norm(position - camera.position_m.astype(np.float32), axis=1) / np.float32(camera.fx)
+    pixel_width_m = np.linalg.norm(position - camera.position_m.astype(np.float32), axis=1) / np.float32(camera.fx)
     return edge_aware_neighbours(
-        (camera.height_px, camera.width_px), view.pixel, (position, normal, size), stride=stride, sharpness=sharpness
+        (camera.height_px, camera.width_px),
+        view.pixel,
+        position,
+        normal,
+        pixel_width_m,
+        stride=stride,
+        sharpness=sharpness,
     )
 
 
@@ -213,173 +299,242 @@ def trace_points(
     points: SurfacePoints,
     sampling: SamplingOptions | None = None,
     *,
-    prepared: SharedTransport | None = None,
+    shared: SharedTransport | None = None,
     seed: int = 0,
     number: np.ndarray | None = None,
     progress: Progress | None = None,
 ) -> PointCoefficients:
-    """Daylight coefficients of places on the terrain, such as texels.
+    """Trace the daylight coefficients of surface points, such as texels.
 
     Parameters
     ----------
+    terrain
+        From `hemisphere_rays.ray_scene`, with its current albedo.
     points
-        N places, as from `surface_at`.
-    prepared
-        From `prepare_transport`, where many blocks of places of one terrain are traced one after the other.
+        N surface points, for example from `irradiance.surface_at`.
+    sampling
+        Sampling options; defaults if ``None``.
+    shared
+        From `prepare_transport`, if several blocks of points of one terrain are traced; computed from ``points`` if
+        ``None``.
+    seed
+        Of the sampling.
     number
-        ``(N,)`` each place's number among all of them: blocks then give what all at once would. Left out: 0, 1, ….
+        ``(N,)`` index of each point among the points of all blocks, which makes the result independent of the division
+        into blocks; 0, 1, … if ``None``.
+    progress
+        Called with the completed fraction.
+
+    Returns
+    -------
+    PointCoefficients
+        For `irradiance.upload_points`.
     """
     sampling = sampling or SamplingOptions()
-    tell = progress or (lambda share: None)
-    prepared = prepared or prepare_transport(terrain, points, sampling, seed=seed)
+    report = progress or (lambda fraction: None)
+    shared = shared or prepare_transport(terrain, points, sampling, seed=seed)
     number = np.arange(len(points.origin)) if number is None else number
     step = max(1, BLOCK_RAYS // sampling.rays)
-    parts = []
+    blocks = []
     for start in range(0, len(points.origin), step):
         block = points[start : start + step]
         identity = number[start : start + step].astype(np.uint32)
         weight = np.ones((len(block.origin), 1), np.float32)
-        parts.append(_receive(terrain, prepared, block.reshape(-1, 1), (weight, identity), sampling, seed))
-        tell(min(1.0, (start + step) / len(points.origin)))
-    columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
-    return PointCoefficients(points, ReceiverCoefficients(*columns), prepared.clusters)
+        blocks.append(_trace_receivers(terrain, shared, block.reshape(-1, 1), weight, identity, sampling, seed))
+        report(min(1.0, (start + step) / len(points.origin)))
+    return PointCoefficients(points, _concatenate_receivers(blocks), shared.clusters)
 
 
 def prepare_transport(
     terrain: RayScene, pilot: SurfacePoints, sampling: SamplingOptions, *, seed: int = 0
 ) -> SharedTransport:
-    """The basis of directions and the senders for receivers that are like ``pilot``, a sample of them."""
+    """Compute the directional basis and the clusters that all receivers share.
+
+    Parameters
+    ----------
+    terrain
+        The terrain.
+    pilot
+        A representative sample of the receivers' surface points.
+    sampling
+        Sampling options.
+    seed
+        Of the sampling.
+
+    Returns
+    -------
+    SharedTransport
+        For `trace_points`.
+    """
     import mitsuba as mi
 
     patches = sky_patches(sampling.patches)
     faces = face_geometry(terrain.mi_terrain)
-    choice = np.random.default_rng(seed).permutation(len(pilot.origin))
-    pilot = pilot[np.resize(choice, _PILOTS)]
-    none = mi.UInt32(np.zeros(len(faces[0]), np.uint32))
-    hits = pilot_hits(terrain, pilot, max(sampling.bounces, 1), seed)
-    # Receivers and senders share one basis, so both serve as its examples.
+    permutation = np.random.default_rng(seed).permutation(len(pilot.origin))
+    pilot = pilot[np.resize(permutation, _PILOTS)]
+    unclustered = mi.UInt32(np.zeros(len(faces.centroid), np.uint32))
+    hits = trace_path_hits(terrain, pilot, max(sampling.bounces, 1), seed)
+    hit_count = len(hits.face)
+    # Receivers and clusters share one basis, so that both serve as examples.
     half = _EXAMPLES // 2
-    some = concatenate_points(
-        [pilot[:half], hits[0][np.resize(np.arange(len(hits[1])), half)] if len(hits[1]) else pilot[half:_EXAMPLES]]
+    examples = concatenate_points(
+        [pilot[:half], hits.points[np.resize(np.arange(hit_count), half)] if hit_count else pilot[half:_EXAMPLES]]
     )
-    patch, met = gather_hemisphere(
+    patch, hit = gather_hemisphere(
         terrain,
         patches,
-        some,
+        examples,
         rays=_EXAMPLE_RAYS,
         first=np.zeros(_EXAMPLES, np.uint32),
         scramble=np.arange(_EXAMPLES, dtype=np.uint32),
-        mi_label=none,
+        mi_face_cluster=unclustered,
     )
-    rows = patch_sums(patch, np.where(met == OPEN, np.float32(1.0 / _EXAMPLE_RAYS), 0.0), np.eye(patches.size))
+    rows = patch_sums(patch, np.where(hit == ESCAPED, np.float32(1.0 / _EXAMPLE_RAYS), 0.0), np.eye(patches.size))
     basis = direction_basis(rows, patches, sampling.rank)
-    if sampling.bounces == 0 or len(hits[1]) == 0:
-        nothing = LightClusters(pilot[:1].reshape(1, 1), _nothing(basis, sampling), basis.from_sky, sampling.patches, 0)
-        return SharedTransport(none, basis, nothing)
-    points, label = cluster_faces(hits, faces, sampling.clusters, seed=seed)
+    if sampling.bounces == 0 or hit_count == 0:
+        unlit = LightClusters(
+            pilot[:1].reshape(1, 1), _zero_receivers(basis, sampling), basis.from_sky, sampling.patches, 0
+        )
+        return SharedTransport(unclustered, basis, unlit)
+    points, face_cluster = cluster_faces(hits, faces, sampling.clusters, seed=seed)
     size = len(points.origin)
-    clusters = LightClusters(points, _nothing(basis, sampling), basis.from_sky, sampling.patches, sampling.bounces)
-    prepared = SharedTransport(mi.UInt32(label), basis, clusters)
+    clusters = LightClusters(
+        points, _zero_receivers(basis, sampling), basis.from_sky, sampling.patches, sampling.bounces
+    )
+    shared = SharedTransport(mi.UInt32(face_cluster), basis, clusters)
     step = max(1, BLOCK_RAYS // sampling.rays)
-    even = np.full((size, PLACES), 1.0 / PLACES, np.float32)
-    parts = [
-        _receive(
+    uniform = np.full((size, POINTS_PER_CLUSTER), 1.0 / POINTS_PER_CLUSTER, np.float32)
+    blocks = [
+        _trace_receivers(
             terrain,
-            prepared,
+            shared,
             points[i : i + step],
-            (even[i : i + step], np.arange(i, min(i + step, size), dtype=np.uint32)),
+            uniform[i : i + step],
+            np.arange(i, min(i + step, size), dtype=np.uint32),
             sampling,
             seed,
         )
         for i in range(0, size, step)
     ]
-    receivers = ReceiverCoefficients(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-    return replace(prepared, clusters=replace(clusters, receivers=receivers))
+    return replace(shared, clusters=replace(clusters, receivers=_concatenate_receivers(blocks)))
 
 
-def _nothing(basis: DirectionBasis, sampling: SamplingOptions) -> ReceiverCoefficients:
+def _zero_receivers(basis: DirectionBasis, sampling: SamplingOptions) -> ReceiverCoefficients:
+    """A single receiver that receives no light."""
     return ReceiverCoefficients(
-        np.zeros((1, basis.into.shape[1]), np.float16),
+        np.zeros((1, basis.projection.shape[1]), np.float16),
         np.zeros((1, sampling.listed), np.uint16),
         np.zeros(1, np.float16),
     )
 
 
+def _concatenate_receivers(blocks: Sequence[ReceiverCoefficients]) -> ReceiverCoefficients:
+    return ReceiverCoefficients(
+        np.concatenate([block.direct for block in blocks]),
+        np.concatenate([block.cluster for block in blocks]),
+        np.concatenate([block.share for block in blocks]),
+    )
+
+
 def _view_rows(
     terrain: RayScene,
-    prepared: SharedTransport,
+    shared: SharedTransport,
     camera: Camera | Panorama,
-    rows: tuple[int, int],
+    rows: range,
     sampling: SamplingOptions,
     seed: int,
-) -> list[tuple]:
-    """The columns of `ViewCoefficients` and of its `ReceiverCoefficients` for a block of rows; empty where they show no terrain."""
+) -> tuple[_PixelArrays, ReceiverCoefficients] | None:
+    """Coefficients of the terrain pixels in some image rows; ``None`` if no pixel shows terrain."""
     points, hit, pixel = view_samples(terrain, camera, rows, sampling.subpixels, seed)
     if len(pixel) == 0:
-        return []
+        return None
     weight = sample_weights(points.albedo, hit)
-    shown = pixel - rows[0] * camera.width_px
+    row_pixel = pixel - rows.start * camera.width_px
     albedo, normal, coverage = pixel_moments(terrain, camera, rows, sampling.shades, seed)
-    received = _receive(terrain, prepared, points, (weight, pixel.astype(np.uint32)), sampling, seed)
-    return [
-        (
-            pixel,
-            coverage[shown],
-            albedo[shown],
-            normal[shown],
-            points.origin,
-            points.normal.astype(np.float16),
-            points.outward.astype(np.float16),
-            weight.astype(np.float16),
-            *received,
-        )
-    ]
+    receivers = _trace_receivers(terrain, shared, points, weight, pixel.astype(np.uint32), sampling, seed)
+    arrays = _PixelArrays(
+        pixel,
+        coverage[row_pixel],
+        albedo[row_pixel],
+        normal[row_pixel],
+        points.origin,
+        points.normal.astype(np.float16),
+        points.outward.astype(np.float16),
+        weight.astype(np.float16),
+    )
+    return arrays, receivers
 
 
 def view_albedo(terrain: RayScene, coefficients: ViewCoefficients) -> np.ndarray:
-    """Mean albedo ``(n, 3)`` of the pixels for the albedo that the terrain has now (another season's)."""
+    """Average the current albedo of the terrain (such as another season's) over the terrain pixels of a view.
+
+    Parameters
+    ----------
+    terrain
+        The terrain with the albedo, see `mitsuba_scene.set_albedo`.
+    coefficients
+        Coefficients of the view.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(n, 3)`` float32; the sky counts as black.
+    """
     camera, sampling = coefficients.camera, coefficients.sampling
-    return pixel_moments(terrain, camera, (0, camera.height_px), sampling.shades, coefficients.seed)[0][
+    return pixel_moments(terrain, camera, range(camera.height_px), sampling.shades, coefficients.seed)[0][
         coefficients.pixel
     ]
 
 
-def _receive(
+def _trace_receivers(
     terrain: RayScene,
-    prepared: SharedTransport,
+    shared: SharedTransport,
     points: SurfacePoints,
-    shares: tuple[np.ndarray, np.ndarray],
+    weight: np.ndarray,
+    identity: np.ndarray,
     sampling: SamplingOptions,
     seed: int,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Columns of `ReceiverCoefficients` for N receivers with S places each.
+) -> ReceiverCoefficients:
+    """Coefficients of N receivers with S surface points ``(N, S)`` each.
 
-    ``shares`` are the weights of places ``(N, S)`` and a number ``(N,)`` that makes each receiver's rays its own.
+    ``weight`` ``(N, S)`` are the weights of the points, ``identity`` ``(N,)`` the keys of the receivers' random numbers.
     """
-    weight, identity = shares
-    count, places = weight.shape
-    each = sampling.rays // places
-    # Ray i of a receiver starts at place i · S / rays, so that each place has an aligned run of the sequence.
-    first = np.tile(np.arange(places, dtype=np.uint32) * np.uint32(each), count)
-    scramble = np.repeat(identity + np.uint32((seed * 747796405 + 1) % 2**32), places)
-    patch, met = gather_hemisphere(
+    count, samples = weight.shape
+    sample_rays = sampling.rays // samples
+    # Sample i uses the Sobol points from i · rays / S on, so that each sample has an aligned run of the sequence.
+    first = np.tile(np.arange(samples, dtype=np.uint32) * np.uint32(sample_rays), count)
+    scramble = np.repeat(identity + np.uint32((seed * 747796405 + 1) % 2**32), samples)
+    patch, hit = gather_hemisphere(
         terrain,
         sky_patches(sampling.patches),
         points.reshape(-1),
-        rays=each,
+        rays=sample_rays,
         first=first,
         scramble=scramble,
-        mi_label=prepared.mi_label,
+        mi_face_cluster=shared.mi_face_cluster,
     )
-    patch, met = patch.reshape(count, -1), met.reshape(count, -1)
-    ray_weight = np.repeat(weight / np.float32(each), each, axis=1)
-    direct = patch_sums(patch, np.where(met == OPEN, ray_weight, 0.0), prepared.basis.into)
-    cluster, share = cluster_lists(met, ray_weight, sampling.listed, start=hash_to_unit(identity, seed))
-    return direct.astype(np.float16), cluster, share.astype(np.float16)
+    patch, hit = patch.reshape(count, -1), hit.reshape(count, -1)
+    ray_weight = np.repeat(weight / np.float32(sample_rays), sample_rays, axis=1)
+    direct = patch_sums(patch, np.where(hit == ESCAPED, ray_weight, 0.0), shared.basis.projection)
+    cluster, share = cluster_lists(hit, ray_weight, sampling.listed, start=hash_to_unit(identity, seed))
+    return ReceiverCoefficients(direct.astype(np.float16), cluster, share.astype(np.float16))
 
 
 def hash_to_unit(identity: np.ndarray, seed: int) -> np.ndarray:
-    """One number in [0, 1) for each receiver ``(N,)`` float32, whatever block it is in (Wellons' *lowbias32*)."""
+    """Hash receiver indices to numbers in [0, 1), independently of the division into blocks (Wellons' *lowbias32*).
+
+    Parameters
+    ----------
+    identity
+        ``(N,)`` unsigned integers.
+    seed
+        Any integer.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(N,)`` float32.
+    """
     bits = identity.astype(np.uint32) ^ np.uint32((seed * 2891336453 + 0x9E3779B9) % 2**32)
     for shift, factor in ((16, 0x7FEB352D), (15, 0x846CA68B)):
         bits = (bits ^ (bits >> np.uint32(shift))) * np.uint32(factor)
@@ -387,10 +542,23 @@ def hash_to_unit(identity: np.ndarray, seed: int) -> np.ndarray:
 
 
 def patch_sums(index: np.ndarray, weight: np.ndarray, table: np.ndarray) -> np.ndarray:
-    """Weighted sums ``(N, r)`` of rows of ``table (P, r)``, those that ``index (N, K)`` names with ``weight (N, K)``."""
+    """Compute weighted sums of selected rows of a table.
+
+    Parameters
+    ----------
+    index, weight
+        ``(N, K)`` row indices and their weights.
+    table
+        ``(P, r)``.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(N, r)`` sums over K of weight × row.
+    """
     from scipy import sparse
 
-    count, each = index.shape
-    start = np.arange(0, count * each + 1, each, dtype=np.int32)
+    count, terms = index.shape
+    start = np.arange(0, count * terms + 1, terms, dtype=np.int32)
     matrix = sparse.csr_array((weight.ravel(), index.ravel(), start), shape=(count, len(table)))
     return matrix @ table

@@ -1,4 +1,4 @@
-"""What lies under the pixels of a view: places for shadow rays, and mean albedo and normal of many more samples."""
+"""Stratified samples of the terrain in the pixels of a view: surface points, and mean albedo and normal per pixel."""
 
 from __future__ import annotations
 
@@ -13,91 +13,168 @@ from seasonscapes.rendering.hemisphere_rays import LANES, RayScene, SurfacePoint
 from seasonscapes.rendering.sobol import hashed, sobol_pair
 from seasonscapes.sky.illumination import LUMINANCE_WEIGHTS
 
-# Name of what random numbers are for, as a word for their hashes.
+# Key of the random number stream, mixed into its hashes.
 _PIXEL = 103
 
 
 def view_samples(
-    terrain: RayScene, camera: Camera | Panorama, rows: tuple[int, int], count: int, seed: int
+    terrain: RayScene, camera: Camera | Panorama, rows: range, count: int, seed: int
 ) -> tuple[SurfacePoints, np.ndarray, np.ndarray]:
-    """Surfaces ``(n, S)`` under the samples of a block of rows, which are terrain ``(n, S)``, and the pixels ``(n,)``.
+    """Sample the terrain in the pixels of some image rows.
 
-    Only pixels that show terrain. Terrain comes first among the samples of a pixel; sky is black and repeats the place
-    of the first.
+    The samples of a pixel are ordered at random, those on terrain first. Samples of the sky are black and repeat the
+    surface of the first sample.
+
+    Parameters
+    ----------
+    terrain
+        The terrain.
+    camera
+        The view.
+    rows
+        Consecutive image rows.
+    count
+        Number S of samples per pixel, a square.
+    seed
+        Of the sample positions.
+
+    Returns
+    -------
+    points
+        ``(n, S)`` surface points in the n pixels that show terrain.
+    hit
+        ``(n, S)`` bool: samples on terrain.
+    pixel
+        ``(n,)`` int32 flat indices of these pixels in the image.
     """
     flat, hit = camera_points(terrain, camera, rows, count, seed)
     hit = hit.reshape(-1, count)
-    shown = hit.any(axis=1)
-    pixel = (np.flatnonzero(shown) + rows[0] * camera.width_px).astype(np.int32)
-    hit = hit[shown]
-    # The first one stands for the pixel where a single ray must do: any of them, by lot.
-    lot = np.random.default_rng((seed, rows[0])).random(hit.shape, np.float32)
-    order = np.argsort(np.where(hit, lot, 2.0), axis=1)
+    on_terrain = hit.any(axis=1)
+    pixel = (np.flatnonzero(on_terrain) + rows.start * camera.width_px).astype(np.int32)
+    hit = hit[on_terrain]
+    # The first sample represents the pixel where a single ray is traced, so the order must not depend on position.
+    sort_key = np.random.default_rng((seed, rows.start)).random(hit.shape, np.float32)
+    order = np.argsort(np.where(hit, sort_key, 2.0), axis=1)
     hit = np.take_along_axis(hit, order, axis=1)
     columns = {}
     for name in SurfacePoints.__dataclass_fields__:
-        values = getattr(flat, name).reshape(*shown.shape, count, -1)[shown]
+        values = getattr(flat, name).reshape(*on_terrain.shape, count, -1)[on_terrain]
         values = np.take_along_axis(values, order[..., None], axis=1)
         columns[name] = np.where(hit[..., None], values, 0.0 if name == "albedo" else values[:, :1])
     return SurfacePoints(**columns), hit, pixel
 
 
 def sample_weights(albedo: np.ndarray, hit: np.ndarray) -> np.ndarray:
-    """Each sample's share of its pixel's albedo ``(n, S)``, by luminance; equal shares where all are black."""
-    shade = albedo @ LUMINANCE_WEIGHTS.astype(np.float32)
-    shade = np.where((shade.sum(axis=1) > 0.0)[:, None], shade, hit)
-    return (shade / shade.sum(axis=1, keepdims=True)).astype(np.float32)
+    """Compute the weight of each sample in its pixel's reflected light, proportional to luminous albedo.
+
+    Parameters
+    ----------
+    albedo
+        ``(n, S, 3)`` albedo of the samples.
+    hit
+        ``(n, S)`` bool: samples on terrain.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(n, S)`` float32, sum 1 per pixel; uniform over the terrain samples of pixels whose albedo is zero.
+    """
+    luminous = albedo @ LUMINANCE_WEIGHTS.astype(np.float32)
+    luminous = np.where((luminous.sum(axis=1) > 0.0)[:, None], luminous, hit)
+    return (luminous / luminous.sum(axis=1, keepdims=True)).astype(np.float32)
 
 
 def camera_points(
-    terrain: RayScene, camera: Camera | Panorama, rows: tuple[int, int], count: int, seed: int
+    terrain: RayScene, camera: Camera | Panorama, rows: range, count: int, seed: int
 ) -> tuple[SurfacePoints, np.ndarray]:
-    """Surfaces under stratified samples of rows of pixels, samples of a pixel side by side, and which met terrain."""
+    """Trace stratified camera rays through the pixels of some image rows.
+
+    Parameters
+    ----------
+    terrain
+        The terrain.
+    camera
+        The view.
+    rows
+        Consecutive image rows.
+    count
+        Rays per pixel.
+    seed
+        Of the sample positions.
+
+    Returns
+    -------
+    points
+        ``(len(rows) W count,)`` surface points, the samples of a pixel side by side; undefined where not ``hit``.
+    hit
+        ``(len(rows) W count,)`` bool: rays that hit terrain.
+    """
     interaction = _mi_camera_rays(terrain, camera, rows, count, seed)
     valid = interaction.is_valid()
     return surface_points(interaction, valid), np.array(valid)
 
 
-def _mi_camera_rays(terrain: RayScene, camera: Camera | Panorama, rows: tuple[int, int], count: int, seed: int) -> Any:
-    """What stratified rays through a block of rows meet, ``count`` to a pixel side by side, and the number of pixels."""
+def _mi_camera_rays(terrain: RayScene, camera: Camera | Panorama, rows: range, count: int, seed: int) -> Any:
+    """Surface interactions of ``count`` stratified rays per pixel, the rays of a pixel side by side."""
     import drjit as dr
     import mitsuba as mi
 
-    top, height = rows
-    pixels = camera.width_px * height
+    pixels = camera.width_px * len(rows)
     lane = dr.arange(mi.UInt32, pixels * count)
     width = dr.opaque(mi.UInt32, camera.width_px)
     index = lane // dr.opaque(mi.UInt32, count)
-    pixel = index + dr.opaque(mi.UInt32, top) * width
+    pixel = index + dr.opaque(mi.UInt32, rows.start) * width
     row = pixel // width
     key = hashed(hashed(pixel, dr.opaque(mi.UInt32, seed)), _PIXEL)
-    place = sobol_pair(key, lane - index * dr.opaque(mi.UInt32, count))
-    x, y = mi.Float(pixel - row * width) + place.x, mi.Float(row) + place.y
+    offset = sobol_pair(key, lane - index * dr.opaque(mi.UInt32, count))
+    x, y = mi.Float(pixel - row * width) + offset.x, mi.Float(row) + offset.y
     return terrain.mi_scene.ray_intersect(mi_rays(camera, x, y))
 
 
 def pixel_moments(
-    terrain: RayScene, camera: Camera | Panorama, rows: tuple[int, int], count: int, seed: int
+    terrain: RayScene, camera: Camera | Panorama, rows: range, count: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean albedo ``(N, 3)``, mean normal weighted by luminous albedo ``(N, 3)`` and coverage ``(N,)`` of all pixels.
+    """Average albedo, normal and terrain coverage over the pixels of some image rows.
 
-    Nothing but these sums leaves the device, so that many samples may be taken.
+    The averages are computed on the device, so that many samples per pixel are affordable.
+
+    Parameters
+    ----------
+    terrain
+        The terrain.
+    camera
+        The view.
+    rows
+        Consecutive image rows.
+    count
+        Samples per pixel.
+    seed
+        Of the sample positions.
+
+    Returns
+    -------
+    albedo
+        ``(N, 3)`` mean albedo of the N pixels of these rows, zero for the sky.
+    normal
+        ``(N, 3)`` mean shading normal, weighted by luminous albedo.
+    coverage
+        ``(N,)`` fraction of the pixel that terrain covers.
     """
     import drjit as dr
     import mitsuba as mi
 
     step = max(1, LANES // (camera.width_px * count))
     parts = []
-    for top in range(rows[0], rows[0] + rows[1], step):
-        block = (top, min(step, rows[0] + rows[1] - top))
+    for top in range(rows.start, rows.stop, step):
+        block = range(top, min(top + step, rows.stop))
         interaction = _mi_camera_rays(terrain, camera, block, count, seed)
         valid = interaction.is_valid()
         front = front_side(interaction, valid)
         albedo = interaction.bsdf().eval_diffuse_reflectance(interaction, front)
         albedo = dr.select(front, albedo, mi.Color3f(0.0))
-        # A little of every terrain sample's normal, so that black pixels have one too.
-        shade = dr.dot(albedo, mi.Color3f(*LUMINANCE_WEIGHTS.tolist())) + dr.select(valid, mi.Float(1e-6), 0.0)
-        lanes = [*albedo, *(shade * interaction.sh_frame.n), shade, dr.select(valid, mi.Float(1.0), 0.0)]
+        # A small constant weight defines the normal of black pixels too.
+        weight = dr.dot(albedo, mi.Color3f(*LUMINANCE_WEIGHTS.tolist())) + dr.select(valid, mi.Float(1e-6), 0.0)
+        lanes = [*albedo, *(weight * interaction.sh_frame.n), weight, dr.select(valid, mi.Float(1.0), 0.0)]
         sums = [dr.block_sum(values, count) for values in lanes]
         dr.eval(sums)
         parts.append(np.stack([np.array(values) for values in sums], axis=-1))
