@@ -475,7 +475,7 @@ def _calibration(
     if not in_front.all():
         names = ", ".join(np.array(problem.points.names)[~in_front])
         raise NotEnoughEvidence(
-            f"behind the camera: {names}; a correspondence is wrong, or the image looks in another direction"
+            f"behind the camera: {names}; a correspondence is wrong, or the camera faces another direction"
         )
     _, jacobian = _minimise(problem, values, noise, None, ~outlier)
     covariance = _covariance(problem, jacobian)

@@ -27,7 +27,7 @@ from seasonscapes.terrain.surface import Raster
 
 # Maximum number of points of a line in the refinement.
 _MAX_POINTS = 700
-# Thresholds of a reliable fit, found in synthetic trials with fog, masks and wrong places (benchmarks/calibration.py).
+# Thresholds of a reliable fit, found in synthetic trials with fog, masks and wrong locations (benchmarks/calibration.py).
 MIN_EDGE_FRACTION, MIN_SCORE_RATIO, MAX_HEADING_SIGMA_DEG, MIN_COLUMN_FRACTION = 0.6, 1.06, 0.12, 0.15
 
 

@@ -214,7 +214,7 @@ def horizon_from(
     Raises
     ------
     NoTerrainInView
-        If no ray meets terrain, or the viewpoint lies too far below the ground.
+        If no ray intersects terrain, or the viewpoint lies too far below the ground.
     """
     position = np.asarray(position_m, float)
     latitude, longitude, height = (float(v) for v in geodetic_from_enu(frame, position))

@@ -138,8 +138,8 @@ def ssim_map(truth: np.ndarray, picture: np.ndarray) -> np.ndarray:
     """
     from skimage.metrics import structural_similarity
 
-    rim = _SSIM_WINDOW // 2
-    padded = [np.pad(image, ((rim, rim), (rim, rim), (0, 0))) for image in (truth, picture)]
+    margin = _SSIM_WINDOW // 2
+    padded = [np.pad(image, ((margin, margin), (margin, margin), (0, 0))) for image in (truth, picture)]
     full = structural_similarity(
         *padded,
         gaussian_weights=True,
@@ -149,7 +149,7 @@ def ssim_map(truth: np.ndarray, picture: np.ndarray) -> np.ndarray:
         channel_axis=2,
         full=True,
     )[1]
-    return full[rim:-rim, rim:-rim].mean(axis=2)
+    return full[margin:-margin, margin:-margin].mean(axis=2)
 
 
 def ssim(truth: np.ndarray, picture: np.ndarray, mask: np.ndarray | None = None, *, mode: str = "valid") -> float:
