@@ -75,8 +75,8 @@ def test_scatter_falls_with_weight():
     scatter = fit_variance_by_weight(np.sqrt(0.01 + 0.02 / weight)[:, None] * rng.standard_normal((20_000, 3)), weight)
     for at in (0.1, 1.0, 10.0):
         assert scatter(np.array([at]))[0] == pytest.approx(0.01 + 0.02 / at, rel=0.25)
-        assert scatter.share(np.array([at]))[0] == pytest.approx(0.01 / (0.01 + 0.02 / at), rel=0.25)
-    assert (fit_variance_by_weight(rng.standard_normal((500, 3)), np.ones(500)).share(np.ones(3)) == 1.0).all()
+        assert scatter.shrinkage(np.array([at]))[0] == pytest.approx(0.01 / (0.01 + 0.02 / at), rel=0.25)
+    assert (fit_variance_by_weight(rng.standard_normal((500, 3)), np.ones(500)).shrinkage(np.ones(3)) == 1.0).all()
 
 
 @pytest.mark.parametrize(("told", "nearer"), [(0.02, "base"), (0.6, "painting")])

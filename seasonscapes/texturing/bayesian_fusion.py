@@ -1,8 +1,8 @@
 """Bayesian fusion of a painted texture with a relit albedo: per-texel posterior mean by the variances of both.
 
-A painting from the photographs of one instant observes most texels from one side, with errors of pose at shadow edges and
-an estimated exposure. An albedo recovered from many photographs is more accurate for most texels, but lacks what is
-specific to the instant (its snow, light that the model lacks). Texels without paint take the relit albedo: nothing is
+A painting from the photographs of one instant observes most texels from one side, with errors of pose at shadow edges
+and an estimated exposure. An albedo recovered from many photographs is more accurate for most texels, but lacks what is
+specific to the instant (its snow, light that the model lacks). Unpainted texels take the relit albedo: nothing is
 learned from the painting for other texels, since its blur would reduce their contrast.
 """
 
@@ -47,8 +47,8 @@ def fuse_with_albedo(texture: Texture, base: np.ndarray, base_sigma: np.ndarray,
 
     Notes
     -----
-    ln r = ln b + s (ln p − ln b) with s = σ_b² / (σ_b² + σ_p²). The painting's variance σ_p² by weight is the mean square
-    of ln p − ln b less the mean of σ_b². The remaining difference is propagated a few texels into the holes.
+    ln r = ln b + s (ln p − ln b) with s = σ_b² / (σ_b² + σ_p²). The painting's variance σ_p² by weight is the mean
+    square of ln p − ln b less the mean of σ_b². The remaining difference is propagated a few texels into the holes.
     """
     if base.shape != texture.values.shape or base_sigma.shape != texture.weight.shape:
         raise AtlasMismatch(

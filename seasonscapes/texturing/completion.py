@@ -29,7 +29,7 @@ class Completed:
     Parameters
     ----------
     values
-        ``(R, S, 3)`` float32, finite everywhere; painted texels equal the given ones bit for bit, unless there was a base.
+        ``(R, S, 3)`` float32, finite everywhere; without a base, painted texels equal the given ones bit for bit.
     sigma
         Standard error ``(R, S)`` of the filled texels in the unit of ``values``, RMS over the channels. 0 where painted
         (errors of the painting are not known here); with a base, that of the prediction everywhere.
@@ -91,7 +91,18 @@ def membrane(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fill by the Laplace equation, without predictors; an `Inpainter`."""
+    """Fill by the Laplace equation, without predictors; an `Inpainter`.
+
+    Parameters
+    ----------
+    values, painted, predictors, fast, seed, progress
+        As in `Inpainter`; of the predictors only the top-down grid is used.
+
+    Returns
+    -------
+    filled, sigma
+        As in `Inpainter`.
+    """
     return _smooth_fill(membrane_fill, values, painted, predictors, seed)
 
 
@@ -104,7 +115,18 @@ def telea(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fill by Telea inpainting as the reference implementation does, without predictors; an `Inpainter`."""
+    """Fill by Telea inpainting as the reference implementation does, without predictors; an `Inpainter`.
+
+    Parameters
+    ----------
+    values, painted, predictors, fast, seed, progress
+        As in `Inpainter`; of the predictors only the top-down grid is used.
+
+    Returns
+    -------
+    filled, sigma
+        As in `Inpainter`.
+    """
     return _smooth_fill(partial(telea_fill, radius_px=1.0 if fast else 3.0), values, painted, predictors, seed)
 
 
@@ -142,8 +164,8 @@ def complete(
     texture
         Radiance or albedo; painted where ``weight`` is positive and the values are finite.
     predictors
-        From `predictors.predictors_for`, of the same size. The methods ``membrane`` and ``telea`` use only its surface and
-        top-down grid.
+        From `predictors.predictors_for`, of the same size. The methods ``membrane`` and ``telea`` use only its surface
+        and top-down grid.
     base
         ``(R, S, 3)`` estimate of every texel from another source, in the texture's unit (for an albedo: an orthophoto
         without its illumination), NaN where unknown. It is corrected by the painted texels, which in turn are shrunk

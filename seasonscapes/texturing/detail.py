@@ -90,7 +90,7 @@ def _patch_sums(values: np.ndarray, starts: np.ndarray) -> np.ndarray:
 
 
 def _patch_features(filled: np.ndarray, predictors: Predictors, starts: np.ndarray) -> np.ndarray:
-    """Mean colour and predictors of each patch, standardised; the colour has the same total weight as the predictors."""
+    """Standardised mean colour and predictors of each patch; the colour has the total weight of the predictors."""
     known = np.nan_to_num(
         predictors.values[..., [k for k, n in enumerate(predictors.names) if not n.startswith("satellite")]]
     )

@@ -1,7 +1,7 @@
 """Image inpainting with Stable Diffusion 1.5, two ControlNets and an image prompt, as in the SeasonScapes paper.
 
-Depth and inpaint ControlNets (Zhang, Rao & Agrawala 2023), IP-Adapter (Ye et al. 2023) and Euler's ancestral sampler, as
-implemented in `diffusers`. Needs the extra ``diffusion``.
+Depth and inpaint ControlNets (Zhang, Rao & Agrawala 2023), IP-Adapter (Ye et al. 2023) and Euler's ancestral sampler,
+as implemented in `diffusers`. Needs the extra ``diffusion``.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ class Painter:
         Returns
         -------
         ndarray
-            ``(H, W, 3)`` float32, sRGB-encoded. Pixels outside the hole are generated too and differ from the given ones.
+            ``(H, W, 3)`` float32, sRGB-encoded. Pixels outside the hole differ from the given ones too.
 
         Raises
         ------
@@ -175,8 +175,8 @@ def load_painter(
     machine
         Device and number format; defaults to `Machine()`.
     image
-        Image prompt ``(h, w, 3)``, sRGB-encoded in [0, 1], such as a webcam photograph of the same hour; without one the
-        IP-Adapter is not used.
+        Image prompt ``(h, w, 3)``, sRGB-encoded in [0, 1], such as a webcam photograph of the same hour; without one
+        the IP-Adapter is not used.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Foreground masks: objects that the terrain model lacks (houses, masts), detected as coherent outliers of a prediction.
+"""Foreground masks: objects missing in the terrain model (houses, masts), detected as coherent outliers.
 
 A regression on terrain attributes and light, fitted to texels of other blocks, predicts the radiance of each texel.
 Pixels whose deviation from the prediction exceeds the robust scatter of the whole image, in coherent patches, show

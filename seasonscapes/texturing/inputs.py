@@ -339,7 +339,7 @@ def sample_input(prepared: PreparedInput, pixel: np.ndarray, px_per_texel: np.nd
 
 
 def _look_up(level: np.ndarray, pixel: np.ndarray, number: int) -> np.ndarray:
-    """Bilinear values ``(N, 5)``. OpenCV samples at a map with the shape of an image, so the list is folded into one."""
+    """Bilinear values ``(N, 5)``. OpenCV expects positions in the shape of an image, so the list is folded."""
     count = len(pixel)
     rows = -(-count // _ROW)
     position = np.zeros((rows * _ROW, 2), np.float32)
@@ -347,7 +347,13 @@ def _look_up(level: np.ndarray, pixel: np.ndarray, number: int) -> np.ndarray:
     position = position.reshape(rows, _ROW, 2)
     # OpenCV samples at most four channels at once.
     parts = [
-        cv2.remap(level[..., part], position, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # pyright: ignore[reportCallIssue, reportArgumentType]
+        cv2.remap(  # pyright: ignore[reportCallIssue]
+            level[..., part],
+            position,
+            None,  # pyright: ignore[reportArgumentType]
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
         for part in (slice(0, 4), slice(4, 5))
     ]
     return np.concatenate([part.reshape(rows * _ROW, -1)[:count] for part in parts], axis=1)

@@ -1,7 +1,7 @@
 """Location and integrity checks of the weight files of an image model, before gigabytes are read.
 
-A part of the model has a hub name, ``owner/name``. It is searched as a folder of that path, then in the weights folder as
-``owner/name`` or ``name``, and without a weights folder in the hub's cache on this machine. Nothing is downloaded.
+A part of the model has a hub name, ``owner/name``. It is searched as a folder of that path, then in the weights folder
+as ``owner/name`` or ``name``, and without a weights folder in the hub's cache on this machine. Nothing is downloaded.
 """
 
 from __future__ import annotations

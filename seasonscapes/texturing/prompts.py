@@ -23,7 +23,7 @@ _SEASONS = (
     "early winter, snow on the slopes",
 )
 # Light by the least solar elevation [deg], increasing.
-_HOURS = (
+_LIGHTS = (
     (-90.0, "at night under the stars"),
     (-12.0, "in deep twilight"),
     (-6.0, "at dusk"),
@@ -53,6 +53,9 @@ def prompt_for(time: datetime, latitude_deg: float, sun_elevation_deg: float, *,
         One English sentence.
     """
     month = time.month if latitude_deg >= 0.0 else (time.month + 5) % 12 + 1
-    hour = next(words for low, words in reversed(_HOURS) if sun_elevation_deg >= low)
+    light = next(words for low, words in reversed(_LIGHTS) if sun_elevation_deg >= low)
     sky = "on a clear day" if cloudiness < 0.2 else "with some clouds" if cloudiness < 0.7 else "under an overcast sky"
-    return f"photograph of a landscape of high mountains in {_SEASONS[month - 1]}, {hour}, {sky}, natural colours, fine detail"
+    return (
+        f"photograph of a landscape of high mountains in {_SEASONS[month - 1]}, {light}, {sky}, "
+        "natural colours, fine detail"
+    )

@@ -1,10 +1,10 @@
 """Radiometric calibration of overlapping photographs: gain, white balance and contrast per camera, one common haze.
 
-The image value is ``v = R_a(g (T^h L + s A_h))``: radiance L of the surface through the transmittance T of the sky model,
-plus its airlight A, scaled by ``(1 - T^h) / (1 - T)`` to A_h, times the camera's gain g per channel, on a tone curve R of
-contrast a. The scale of the airlight, s g, is measured on the sky above the horizon in the same image, which needs no
-gain. Gains, contrasts and one haze exponent h (1 is the sky model's own haze) are fitted jointly by robust least squares
-over all surface points visible from two cameras, and against predicted radiance where it is given.
+The image value is ``v = R_a(g (T^h L + s A_h))``: radiance L of the surface through the transmittance T of the sky
+model, plus its airlight A, scaled by ``(1 - T^h) / (1 - T)`` to A_h, times the camera's gain g per channel, on a tone
+curve R of contrast a. The scale of the airlight, s g, is measured on the sky above the horizon in the same image, which
+needs no gain. Gains, contrasts and one haze exponent h (1 is the sky model's own haze) are fitted jointly by robust
+least squares over all surface points visible from two cameras, and against predicted radiance where it is given.
 """
 
 from __future__ import annotations
@@ -210,8 +210,8 @@ def fit_radiometry(
     fit_contrast
         Fit the contrasts; otherwise they are 1.
     radiance
-        Median radiance of the surface [cd/m²], used where no image shows any sky. ``None``: a quarter of the sky model's
-        radiance at the horizon, or 1 (relative values) without a sky model.
+        Median radiance of the surface [cd/m²], used where no image shows any sky. ``None``: a quarter of the sky
+        model's radiance at the horizon, or 1 (relative values) without a sky model.
 
     Returns
     -------
@@ -415,9 +415,9 @@ def _gauss_newton_step(
     prior: _GainPrior,
     free: np.ndarray,
 ) -> np.ndarray:
-    """One step of iteratively reweighted least squares (Huber): of log gains (channel by channel), log contrasts, log haze.
+    """Step of log gains (channel by channel), log contrasts and log haze by reweighted least squares (Huber).
 
-    Residuals are divided by the local slope of the tone curves; otherwise curves that flatten everything would fit best.
+    Residuals are divided by the local slope of the tone curves; otherwise the flattest curves would fit best.
     """
     count = len(radiometry.contrast)
     residuals = [_overlap_residuals(overlaps, radiometry)]
@@ -429,7 +429,7 @@ def _gauss_newton_step(
             jacobian, weight, residual = _channel_equations(block, channel, count)
             matrix += (jacobian.T @ jacobian.multiply(weight[:, None])).toarray()
             gradient += jacobian.T @ (weight * residual)
-    # A contrast common to all cameras cannot be separated from the contrast of the surface: only differences are fitted.
+    # A contrast common to all cameras cannot be separated from that of the surface: only differences are fitted.
     shared = np.zeros(len(gradient))
     shared[3 * count : 4 * count] = 1e3
     matrix += np.outer(shared, shared)

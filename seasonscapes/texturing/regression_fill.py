@@ -1,8 +1,8 @@
 """Completion by regression: colour of unpainted texels from terrain attributes and imagery, trained on painted texels.
 
-Tree ensembles on satellite colour, height, slope, aspect, curvature, sky view factor and sun predict the unpainted texels.
-Where an image among the predictors (satellite, relit albedo) leaves the range of the training texels, a linear term
-extrapolates: trees alone are constant there, so that snow that no camera observed would take the colour of the brightest
+Tree ensembles on satellite colour, height, slope, aspect, curvature, sky view factor and sun predict the unpainted
+texels. Where an image among the predictors (satellite, relit albedo) leaves the range of the training texels, a linear
+term extrapolates: trees alone are constant there, so that unobserved snow would take the colour of the brightest
 observed ground. The residual of the prediction at painted texels is then propagated a few texels into the holes, which
 removes the seam.
 """
@@ -28,8 +28,8 @@ Progress = Callable[[float], None]
 SAMPLES, FAST_SAMPLES = 40_000, 20_000
 # Decay length of propagated residuals [texels].
 REACH_PX = 12.0
-# Weight of the boosted trees in their mean with the randomised trees. Boosting is more accurate, the randomised trees have
-# less variance; the mean is better than either where the predictors explain little.
+# Weight of the boosted trees in their mean with the randomised trees. Boosting is more accurate, the randomised trees
+# have less variance; the mean is better than either where the predictors explain little.
 MIX = 0.65
 # Texels predicted at once.
 BLOCK = 200_000
@@ -37,9 +37,9 @@ BLOCK = 200_000
 IMAGES = ("satellite", "relit")
 # Stands for NaN: not every version of the randomised trees accepts missing values. No predictor has this value.
 _MISSING = np.float32(-1.0e5)
-# Ridge penalty of the linear term in variances of its inputs, and the limit of the training range beyond which it applies
-# [standard deviations]. Chosen on synthetic massifs of seeds 5 to 7 with two cameras, and such that textures with large
-# painted areas do not become worse (seed 99, Landsat).
+# Ridge penalty of the linear term in variances of its inputs, and the limit of the training range beyond which it
+# applies [standard deviations]. Chosen on synthetic massifs of seeds 5 to 7 with two cameras, and such that textures
+# with large painted areas do not become worse (seed 99, Landsat).
 _RIDGE, _RANGE = 0.1, 1.0
 
 

@@ -1,13 +1,13 @@
 """Completion with a base texture, corrected by a regression of the residuals of painted texels.
 
-The base is an image of the same terrain from another source: an orthophoto without its illumination is close to the albedo
-of another day. The regression predicts the difference between painted texels and base from terrain attributes. This
-difference is small and smooth, so that terrain unlike any painted texel keeps the colour of the base. Large leaves keep
-the trees from fitting the noise of single texels.
+The base is an image of the same terrain from another source: an orthophoto without its illumination is close to the
+albedo of another day. The regression predicts the difference between painted texels and base from terrain attributes.
+This difference is small and smooth, so that terrain unlike any painted texel keeps the colour of the base. Large leaves
+keep the trees from fitting the noise of single texels.
 
-Painted texels observed at grazing incidence, from far away or in shade scatter more about the corrected base than others.
-Each painted texel is shrunk towards the corrected base by the empirical variance of texels of equal weight. The remaining
-residual is propagated a few texels into the holes.
+Painted texels observed at grazing incidence, from far away or in shade scatter more about the corrected base than
+others. Each painted texel is shrunk towards the corrected base by the empirical variance of texels of equal weight. The
+remaining residual is propagated a few texels into the holes.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def corrected_fill(
     predictor, encoded = _with_base(predictors, base, sample), values.reshape(-1, 3)[sample].astype(np.float64)
     weights, trees = weight.ravel()[sample], 20 if fast else 40
     unweighted = _fit_correction(predictor, encoded, None, seed, trees=trees)
-    shrinkage = fit_variance_by_weight(encoded - unweighted(predictor)[0], weights).share(weights)
+    shrinkage = fit_variance_by_weight(encoded - unweighted(predictor)[0], weights).shrinkage(weights)
     correction = _fit_correction(predictor, encoded, shrinkage, seed, trees=trees)
     variance = fit_variance_by_weight(encoded - correction(predictor)[0], weights)
     report(0.3)
@@ -101,7 +101,7 @@ def corrected_fill(
         corrected.reshape(-1, 3)[part] = colour
         sigma.ravel()[part] = error_model.sigma(rows, colour, spread)
         report(0.4 + 0.55 * min(1.0, (start + BLOCK) / len(surface)))
-    factor = np.where(painted, variance.share(np.where(painted, weight, 1.0)), 0.0)[..., None]
+    factor = np.where(painted, variance.shrinkage(np.where(painted, weight, 1.0)), 0.0)[..., None]
     residual = (factor * (values - corrected)).astype(np.float32)
     return corrected + np.where(painted[..., None], residual, propagate_residual(residual, painted, predictors)), sigma
 

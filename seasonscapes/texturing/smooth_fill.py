@@ -1,4 +1,4 @@
-"""Smooth hole filling of images without terrain data: Telea inpainting, the Laplace equation, and push–pull pyramids."""
+"""Hole filling of images without terrain data: Telea inpainting, the Laplace equation and push–pull pyramids."""
 
 from __future__ import annotations
 

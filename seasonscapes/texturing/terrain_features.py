@@ -1,8 +1,9 @@
-"""Terrain attributes of a height field: shape, sky view factor, direct sun at one instant and insolation over a period."""
+"""Terrain attributes of a height field: shape, sky view factor, direct sun at one instant, and insolation."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import numpy as np
@@ -55,8 +56,8 @@ def terrain_features(
         Layers ``(H, W)`` float32 by name, NaN where the heights are: ``elevation`` [m]; ``slope`` [deg];
         ``facing_east`` and ``facing_north``: sine and cosine of the aspect times the sine of the slope, 0 on level
         ground; ``curvature`` and ``hollow``: depth below the mean height of the neighbourhood and of the wider
-        surroundings [m]; ``sky_view``: sky view factor (Dozier & Frew 1990, doi:10.1109/36.58986); and the layers of the
-        sun directions.
+        surroundings [m]; ``sky_view``: sky view factor (Dozier & Frew 1990, doi:10.1109/36.58986); and the layers of
+        the sun directions.
 
     Raises
     ------
@@ -101,7 +102,8 @@ def _fill_nearest(heights: np.ndarray, known: np.ndarray) -> np.ndarray:
         return z
     from scipy.ndimage import distance_transform_edt
 
-    row, column = distance_transform_edt(~known, return_distances=False, return_indices=True)  # pyright: ignore[reportGeneralTypeIssues]
+    nearest: Any = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    row, column = nearest
     return z[row, column]
 
 

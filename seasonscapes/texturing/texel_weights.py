@@ -88,18 +88,18 @@ class VarianceByWeight:
     ----------
     log_weight
         ``(n,)`` nodes: mean logarithm of the weight in each bin, increasing.
-    square
+    variance
         ``(n,)`` mean square of the residuals at the nodes.
     """
 
     log_weight: np.ndarray
-    square: np.ndarray
+    variance: np.ndarray
 
     def __call__(self, weight: np.ndarray) -> np.ndarray:
         """Return the residual variance ``(...)`` float32 at weights ``(...)`` > 0."""
-        return np.interp(np.log(weight), self.log_weight, self.square).astype(np.float32)
+        return np.interp(np.log(weight), self.log_weight, self.variance).astype(np.float32)
 
-    def share(self, weight: np.ndarray) -> np.ndarray:
+    def shrinkage(self, weight: np.ndarray) -> np.ndarray:
         """Return the shrinkage factor of a residual ``(...)`` in (0, 1]: signal variance over total variance.
 
         Parameters
@@ -113,7 +113,7 @@ class VarianceByWeight:
         greatest weight is taken to be free of observation noise; the ratio of the two is the factor by which a
         posterior mean keeps the residual. It is 1 where all weights are equal.
         """
-        best = self.square[-max(1, len(self.square) // 4) :].mean()
+        best = self.variance[-max(1, len(self.variance) // 4) :].mean()
         return np.minimum(best / self(weight), 1.0)
 
 

@@ -1,4 +1,4 @@
-"""Resampling between a texture atlas and a top-down grid, on which texels of different charts are neighbours as on the map."""
+"""Resampling between a texture atlas and a top-down grid, for spatial operations across chart borders."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Visibility of texels from a camera, by one shadow ray per texel from the surface to the camera.
 
-`by_depth` and `by_faces` implement the usual alternatives for comparison: a depth map leaks at ridges and loses slopes at
-grazing incidence, and marking every face that any pixel hits as visible leaks behind every ridge.
+`by_depth` and `by_faces` implement the usual alternatives for comparison: a depth map leaks at ridges and loses slopes
+at grazing incidence, and marking every face that any pixel hits as visible leaks behind every ridge.
 """
 
 from __future__ import annotations
