@@ -1,8 +1,8 @@
 """Aerial perspective and sky radiance of an image, interpolated from a coarse grid of pixels.
 
-Both vary smoothly over an image, and the sky model is expensive to evaluate. Aerial perspective is evaluated at the nodes
-of a grid of pixels × distances and interpolated trilinearly (Hillaire 2020, "A scalable and production ready sky and
-atmosphere rendering technique", doi:10.1111/cgf.14050, § 5.4). Sky radiance is evaluated at every fourth pixel and
+Both vary smoothly over an image, and the sky model is expensive to evaluate. Aerial perspective is evaluated at the
+nodes of a grid of pixels × distances and interpolated trilinearly (Hillaire 2020, "A scalable and production ready sky
+and atmosphere rendering technique", doi:10.1111/cgf.14050, § 5.4). Sky radiance is evaluated at every fourth pixel and
 interpolated bilinearly, but at every pixel around sun and moon.
 """
 

@@ -142,7 +142,13 @@ def find_llvm() -> Library | None:
 
 @cache
 def cuda_devices() -> int:
-    """Return the number of CUDA devices that the driver reports; 0 without a driver."""
+    """Count the CUDA devices that the driver reports.
+
+    Returns
+    -------
+    int
+        Number of devices, 0 without a driver.
+    """
     for name in ("libcuda.so.1", "nvcuda.dll"):
         try:
             driver = ctypes.CDLL(name)

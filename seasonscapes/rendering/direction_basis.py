@@ -1,4 +1,4 @@
-"""Low-rank basis for radiance from hundreds of sky patches: principal components weighted by the covariance of skies."""
+"""Low-rank basis of sky patches: principal components of daylight coefficients, weighted by the covariance of skies."""
 
 from __future__ import annotations
 

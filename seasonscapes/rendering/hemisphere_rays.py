@@ -74,7 +74,18 @@ class SurfacePoints:
 
 
 def concatenate_points(parts: list[SurfacePoints]) -> SurfacePoints:
-    """Concatenate sets of points along their first axis."""
+    """Concatenate sets of points along their first axis.
+
+    Parameters
+    ----------
+    parts
+        Sets of points with equal trailing axes; at least one.
+
+    Returns
+    -------
+    SurfacePoints
+        All points.
+    """
     columns = ([getattr(part, name) for part in parts] for name in SurfacePoints.__dataclass_fields__)
     return SurfacePoints(*(np.concatenate(column) for column in columns))
 
@@ -128,8 +139,8 @@ def front_side(interaction: Any, active: Any) -> Any:
 def surface_points(interaction: Any, active: Any) -> SurfacePoints:
     """Copy the surface points of an intersection from the device.
 
-    The front is the side of the geometric normal (terrain faces are counter-clockwise from above). The back of a surface
-    is black, as with Mitsuba's one-sided diffuse material.
+    The front is the side of the geometric normal (terrain faces are counter-clockwise from above). The back of a
+    surface is black, as with Mitsuba's one-sided diffuse material.
 
     Parameters
     ----------

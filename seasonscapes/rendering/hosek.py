@@ -1,7 +1,7 @@
 """Hosek–Wilkie clear sky, evaluated by Mitsuba's ``sunsky`` emitter for a given sun direction, in photometric units.
 
-Hosek & Wilkie, "An analytic model for full spectral sky-dome radiance", 2012, doi:10.1145/2185520.2185591; sun disc after
-"Adding a solar-radiance function to the Hosek–Wilkie skylight model", 2013, doi:10.1109/MCG.2013.18.
+Hosek & Wilkie, "An analytic model for full spectral sky-dome radiance", 2012, doi:10.1145/2185520.2185591; sun disc
+after "Adding a solar-radiance function to the Hosek–Wilkie skylight model", 2013, doi:10.1109/MCG.2013.18.
 """
 
 from __future__ import annotations

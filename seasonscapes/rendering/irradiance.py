@@ -95,13 +95,13 @@ def surface_at(terrain: RayScene, position_m: np.ndarray, *, search_m: float = 2
         K surface points.
     index
         ``(K,)`` indices of these points among the N positions. Positions that are NaN, or not within ``search_m`` of
-        the surface as on vertical walls, are missing.
+        the surface as on vertical faces, are missing.
     """
     valid = np.asarray(np.isfinite(position_m).all(axis=1))
     start_m = np.where(valid[:, None], position_m, 0.0) + np.array([0.0, 0.0, search_m])
     points, found = _surface_below(terrain, start_m, search_m)
     found &= valid
-    # A ray exactly through a vertex or an edge of the mesh may miss both faces; it is repeated a few centimetres beside.
+    # A ray exactly through a vertex or an edge of the mesh may miss both faces; it is repeated a few centimetres away.
     missed = np.flatnonzero(valid & ~found)
     if len(missed):
         retried, hit = _surface_below(terrain, start_m[missed] + _RETRY_OFFSET_M, search_m)

@@ -193,7 +193,7 @@ def _split(key: np.ndarray, weight: np.ndarray, rows: np.ndarray) -> tuple[int, 
 
 
 def _choose_points(order: np.ndarray, bounds: np.ndarray, weight: np.ndarray, seed: int) -> np.ndarray:
-    """Indices ``(M, POINTS_PER_CLUSTER)`` of hits in each cluster; ``bounds`` ``(M + 1,)`` delimit clusters in ``order``."""
+    """Indices ``(M, POINTS_PER_CLUSTER)`` of hits; ``bounds`` ``(M + 1,)`` delimit the clusters in ``order``."""
     rng = np.random.default_rng(seed)
     occupied = np.flatnonzero(np.diff(bounds) > 0)
     chosen = np.empty((len(bounds) - 1, POINTS_PER_CLUSTER), np.intp)
@@ -217,8 +217,8 @@ def cluster_lists(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Reduce the clusters that a receiver's rays hit to a list of fixed length, by systematic resampling.
 
-    Resampling follows the (stratified) order of the rays. The expected number of entries of a cluster is proportional to
-    the weight of the rays that hit it.
+    Resampling follows the (stratified) order of the rays. The expected number of entries of a cluster is proportional
+    to the weight of the rays that hit it.
 
     Parameters
     ----------
@@ -253,7 +253,18 @@ def cluster_lists(
 
 
 def face_geometry(mi_terrain: Any) -> FaceGeometry:
-    """Compute the centroids and unit normals of the faces of a Mitsuba mesh."""
+    """Compute the centroids and unit normals of the faces of a mesh.
+
+    Parameters
+    ----------
+    mi_terrain
+        ``mi.Mesh`` of F triangles.
+
+    Returns
+    -------
+    FaceGeometry
+        ``(F, 3)`` float32 arrays.
+    """
     import mitsuba as mi
 
     parameters = mi.traverse(mi_terrain)

@@ -99,7 +99,7 @@ def mi_mesh(terrain: Terrain, albedo: np.ndarray, *, smooth: bool = True) -> Any
     parameters["vertex_texcoords"] = uv.ravel()
     parameters.update()
     if smooth:
-        # Mitsuba sums vertex normals in parallel, with last bits that vary between runs and so would the images.
+        # Mitsuba sums vertex normals in parallel; their last bits, and those of images, would vary between runs.
         parameters["vertex_normals"] = vertex_normals(terrain).ravel()
         parameters.update()
     return mesh
@@ -275,8 +275,8 @@ def set_albedo(scene: _HasTerrain, albedo: np.ndarray) -> None:
 def background(illumination: Illumination, direction: np.ndarray, pixel_angle_deg: float) -> np.ndarray:
     """Compute the radiance of the sky along view directions, with the discs of sun and moon.
 
-    The edges of the discs are blurred over one pixel against aliasing. With aerial perspective the sky is its airlight at
-    infinite distance, which has more detail than the map, plus the part of the map that this airlight lacks (stars,
+    The edges of the discs are blurred over one pixel against aliasing. With aerial perspective the sky is its airlight
+    at infinite distance, which has more detail than the map, plus the part of the map that this airlight lacks (stars,
     clouds).
 
     Parameters
@@ -301,7 +301,7 @@ def background(illumination: Illumination, direction: np.ndarray, pixel_angle_de
         height, width = sky_map.shape[:2]
         grid = equirectangular_directions(height, width)
         residual = sky_map - air(np.full((height, width), np.inf), grid)[1]
-        # Near the horizon the map undersamples a steep profile: the residual of 4° elevation is used down to the horizon.
+        # Near the horizon the map undersamples a steep profile: the residual at 4° elevation is used down to it.
         # Below the horizon the ground is part of the airlight, and the residual fades out.
         lowest = height // 2 - 1 - int(np.ceil(4.0 * height / 180.0))
         residual[lowest + 1 :] = residual[lowest]

@@ -1,8 +1,8 @@
 """Path tracing of terrain lit by a distant sun, moon and sky, on vectorised variants.
 
-Mitsuba's general ``path`` integrator spends half of its emitter samples on the sun and the other half on directions of the
-sky. Here each vertex casts one shadow ray to the sun and one to the moon, and the cosine-sampled continuation ray samples
-the sky. The expectation and the number of rays are the same, with much less noise.
+Mitsuba's general ``path`` integrator spends half of its emitter samples on the sun and the other half on directions of
+the sky. Here each vertex casts one shadow ray to the sun and one to the moon, and the cosine-sampled continuation ray
+samples the sky. The expectation and the number of rays are the same, with much less noise.
 """
 
 from __future__ import annotations

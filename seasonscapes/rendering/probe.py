@@ -1,4 +1,4 @@
-"""A one-second test render, run as a child process by `seasonscapes doctor`: ``python -m seasonscapes.rendering.probe``.
+"""One-second test render, run as a child process by `seasonscapes doctor`: ``python -m seasonscapes.rendering.probe``.
 
 The scene is a Lambertian plane under a uniform sky, whose radiance is known; variant and duration are printed.
 """

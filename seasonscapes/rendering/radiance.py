@@ -75,8 +75,8 @@ def path_trace(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Path trace the radiance that leaves the terrain towards the camera.
 
-    Box-filtered over the pixel. On the LLVM backend the result is bit-identical for equal arguments, independently of the
-    number of threads. Rendered in blocks of rows, so that memory does not grow with the image.
+    Box-filtered over the pixel. On the LLVM backend the result is bit-identical for equal arguments, independently of
+    the number of threads. Rendered in blocks of rows, so that memory does not grow with the image.
 
     Parameters
     ----------

@@ -145,13 +145,13 @@ def arriving(device: DeviceReceivers, light: ClusterLight) -> tuple[np.ndarray, 
     """
     import drjit as dr
 
-    direct, reflected = mi_direct(device, light.mi_sky), mi_reflected(device, light.mi_cluster_radiance)
+    direct, reflected = _sky_irradiance(device, light.mi_sky), _reflected_irradiance(device, light.mi_cluster_radiance)
     dr.eval(direct, reflected)
     first, second = (np.stack([np.array(channel) for channel in part], axis=-1) for part in (direct, reflected))
     return first, second
 
 
-def mi_direct(device: DeviceReceivers, mi_sky: Any) -> list[Any]:
+def _sky_irradiance(device: DeviceReceivers, mi_sky: Any) -> list[Any]:
     """Irradiance / π from the sky: three ``mi.Float`` of N lanes; ``mi_sky`` as in `ClusterLight`."""
     import drjit as dr
     import mitsuba as mi
@@ -164,7 +164,7 @@ def mi_direct(device: DeviceReceivers, mi_sky: Any) -> list[Any]:
     return [dr.fmax(channel, 0.0) for channel in total]
 
 
-def mi_reflected(device: DeviceReceivers, mi_cluster_radiance: Any) -> list[Any]:
+def _reflected_irradiance(device: DeviceReceivers, mi_cluster_radiance: Any) -> list[Any]:
     """Irradiance / π from clusters: three ``mi.Float`` of N lanes; ``mi_cluster_radiance`` as in `ClusterLight`."""
     import drjit as dr
     import mitsuba as mi
@@ -234,11 +234,13 @@ def light_clusters(device: DeviceClusters, illumination: Illumination) -> Cluste
     from_sun = [mi.Float(np.ascontiguousarray(column)) for column in sunlit.T]
     first_bounce = [
         sun + reflectance * incident
-        for sun, reflectance, incident in zip(from_sun, mean_albedo, mi_direct(device.receivers, mi_sky), strict=True)
+        for sun, reflectance, incident in zip(
+            from_sun, mean_albedo, _sky_irradiance(device.receivers, mi_sky), strict=True
+        )
     ]
     mi_radiance = _mi_rows(first_bounce)
     for _ in range(clusters.bounces - 1):
-        reflected = mi_reflected(device.receivers, mi_radiance)
+        reflected = _reflected_irradiance(device.receivers, mi_radiance)
         mi_radiance = _mi_rows(
             [
                 first + reflectance * incident

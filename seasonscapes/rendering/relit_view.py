@@ -270,7 +270,7 @@ def _differs_nearby(view: RelightableView, visible: np.ndarray) -> np.ndarray:
 
 
 def _at_camera(view: RelightableView, illumination: Illumination, surface: np.ndarray) -> np.ndarray:
-    """Radiance ``(H, W, 3)`` at the camera, as `radiance.apply_aerial_perspective` with the distances of the samples."""
+    """Radiance ``(H, W, 3)`` at the camera, from the air grid; see `radiance.apply_aerial_perspective`."""
     camera, pixel = view.coefficients.camera, view.coefficients.pixel
     if illumination.aerial_perspective is not None:
         transmittance, airlight = air_at(view.air, illumination.aerial_perspective)

@@ -33,8 +33,8 @@ def clear_sight(
     normal
         ``(N, 3)`` unit normals of their faces, along which the ray origins are offset.
     eye_m
-        ``(3,)`` camera position, ENU [m]; the last half metre before it is ignored, so that terrain right at a mast does
-        not block the view.
+        ``(3,)`` camera position, ENU [m]; the last half metre before it is ignored, so that terrain right at a mast
+        does not block the view.
     lift_m
         Offset of the ray origins [m]; by default just above the rounding error of float32.
 

@@ -1,9 +1,9 @@
 """Subdivision of the sphere of directions into patches, for daylight coefficients.
 
-The upper half has the usual subdivision of the sky: 145 patches (Tregenza 1987, "Subdivision of the sky hemisphere
-for luminance measurements", doi:10.1177/096032718701900103) or 577 (Reinhart & Walkenhorst 2001, each divided by two both
-ways, doi:10.1016/S0378-7788(00)00119-2). On mountains rays also escape *below* the horizontal, so that the lower half is
-subdivided too.
+The upper half has the usual subdivision of the sky: 145 patches (Tregenza 1987, "Subdivision of the sky hemisphere for
+luminance measurements", doi:10.1177/096032718701900103) or 577 (Reinhart & Walkenhorst 2001, each divided by two both
+ways, doi:10.1016/S0378-7788(00)00119-2). On mountains rays also escape *below* the horizontal, so that the lower half
+is subdivided too.
 """
 
 from __future__ import annotations
@@ -229,16 +229,16 @@ def direction_weights(patches: SkyPatches, direction: np.ndarray) -> np.ndarray:
 def sky_covariance(patches: SkyPatches, *, unrest: float = 0.15) -> np.ndarray:
     """Compute the second moments of patch radiances over a family of likely skies, each of mean radiance 1.
 
-    The family are CIE general skies (ISO 15469:2004; Kittler, Perez & Darula 1998) for sun positions over the upper half,
-    skies with narrower aureoles and with twilight arches, and ground of varying brightness.
+    The family are CIE general skies (ISO 15469:2004; Kittler, Perez & Darula 1998) for sun positions over the upper
+    half, skies with narrower aureoles and with twilight arches, and ground of varying brightness.
 
     Parameters
     ----------
     patches
         The subdivision.
     unrest
-        Relative standard deviation of each patch independently of all others (clouds). A positive value gives the matrix
-        full rank, so that any sky can be represented.
+        Relative standard deviation of each patch independently of all others (clouds). A positive value gives the
+        matrix full rank, so that any sky can be represented.
 
     Returns
     -------

@@ -1,8 +1,8 @@
 """Edge-aware smoothing of irradiance over neighbouring pixels of one surface.
 
-The irradiance of a diffuse surface varies as slowly as its normal; albedo varies faster and is not smoothed. The weights
-depend on geometry alone. They are therefore equal for all illuminations, and the result stays linear in the light.
-Increasing strides after Dammertz, Sewtz, Hanika & Lensch 2010, "Edge-avoiding À-Trous wavelet transform",
+The irradiance of a diffuse surface varies as slowly as its normal; albedo varies faster and is not smoothed. The
+weights depend on geometry alone. They are therefore equal for all illuminations, and the result stays linear in the
+light. Increasing strides after Dammertz, Sewtz, Hanika & Lensch 2010, "Edge-avoiding À-Trous wavelet transform",
 doi:10.2312/EGGH/HPG10/067-075.
 """
 
@@ -151,7 +151,18 @@ def mi_smoothed(channels: list[Any], neighbours: DeviceNeighbours) -> list[Any]:
 
 
 def upload_neighbours(neighbours: Neighbours) -> DeviceNeighbours:
-    """Copy neighbours to the device, weights in half precision."""
+    """Copy neighbours to the device, with weights in half precision.
+
+    Parameters
+    ----------
+    neighbours
+        From `edge_aware_neighbours`.
+
+    Returns
+    -------
+    DeviceNeighbours
+        The device copy, for `mi_smoothed`.
+    """
     import drjit as dr
     import mitsuba as mi
 

@@ -1,9 +1,9 @@
 """Sample points for path tracing: shuffled and Owen-scrambled Sobol points, keyed by hashes.
 
-For each random decision along a path, the k-th sample of a pixel uses the k-th point of a two-dimensional Sobol sequence
-that is scrambled independently per decision and pixel: aligned runs of 2ᵏ samples are stratified, decisions and pixels
-are independent. The generator has no state. A number depends on its key and index alone, so that images do not depend on
-the division into blocks or on threads.
+For each random decision along a path, the k-th sample of a pixel uses the k-th point of a two-dimensional Sobol
+sequence that is scrambled independently per decision and pixel: aligned runs of 2ᵏ samples are stratified, decisions
+and pixels are independent. The generator has no state. A number depends on its key and index alone, so that images do
+not depend on the division into blocks or on threads.
 
 Burley 2020, "Practical hash-based Owen scrambling", JCGT 9(4); second dimension after Ahmed 2024, "An implementation
 algorithm of 2D Sobol sequence fast, elegant, and compact", doi:10.2312/sr.20241147.
@@ -38,7 +38,18 @@ def hashed(key: Any, word: Any) -> Any:
 
 
 def uniform(key: Any) -> Any:
-    """Return a uniform number in [0, 1), ``mi.Float``, from a key ``mi.UInt32``."""
+    """Return a uniform random number of a key.
+
+    Parameters
+    ----------
+    key
+        ``mi.UInt32``.
+
+    Returns
+    -------
+    mi.Float
+        In [0, 1).
+    """
     return _fraction(hashed(key, 0))
 
 
@@ -87,7 +98,7 @@ def _permuted(bits: Any, key: Any) -> Any:
 
 
 def _pascal(index: Any) -> Any:
-    """Digits of the second Sobol dimension, lowest bit first: Pascal's triangle modulo 2 times the bits of the index."""
+    """Digits of the second Sobol dimension, lowest bit first: Pascal's triangle modulo 2 times the index's bits."""
     import mitsuba as mi
 
     for shift, mask in ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF), (16, 0x0000FFFF)):

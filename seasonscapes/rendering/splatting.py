@@ -1,7 +1,7 @@
 """Rasterisation of Gaussian splats on the Dr.Jit device: tiles, one lane per pixel, blended front to back.
 
-The image equals that of `gaussians.rasterise`, without gradients. Tiles after Kerbl et al. 2023, doi:10.1145/3592433. The
-loop of a pixel ends when its remaining transmittance is negligible.
+The image equals that of `gaussians.rasterise`, without gradients. Tiles after Kerbl et al. 2023, doi:10.1145/3592433.
+The loop of a pixel ends when its remaining transmittance is negligible.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 Light transport is linear. For each receiver (pixel or texel) the daylight coefficients of all sky patches (Tregenza &
 Waters 1983, "Daylight coefficients", doi:10.1177/096032718301500201) are stored in a low-rank directional basis,
-together with the clusters of terrain faces that its hemisphere rays hit. Sun and moon are exact: shadow rays to points of
-their discs are traced for each illumination, from the receivers and from the clusters (`light_clusters`).
+together with the clusters of terrain faces that its hemisphere rays hit. Sun and moon are exact: shadow rays to points
+of their discs are traced for each illumination, from the receivers and from the clusters (`light_clusters`).
 
 The radiance of a pixel is albedo / π · E. The albedo of the pixels and of the clusters is stored separately, so that it
 can be replaced, for example by that of another season.
@@ -95,7 +95,7 @@ class SamplingOptions:
             raise ValueError("SamplingOptions: subpixels must be a square, rays a power of two, bounces not negative")
         if self.rays % self.subpixels:
             raise ValueError(
-                f"SamplingOptions: got {self.rays} rays and {self.subpixels} subpixels, expected a multiple of subpixels"
+                f"SamplingOptions: got {self.rays} rays, expected a multiple of the {self.subpixels} subpixels"
             )
         if self.listed % 2 or not 0 < self.clusters <= 65536:
             raise ValueError("SamplingOptions: listed must be even and clusters at most 65536")
@@ -497,7 +497,7 @@ def _trace_receivers(
 ) -> ReceiverCoefficients:
     """Coefficients of N receivers with S surface points ``(N, S)`` each.
 
-    ``weight`` ``(N, S)`` are the weights of the points, ``identity`` ``(N,)`` the keys of the receivers' random numbers.
+    ``weight`` ``(N, S)`` are the weights of the points, ``identity`` ``(N,)`` the random number keys of the receivers.
     """
     count, samples = weight.shape
     sample_rays = sampling.rays // samples
