@@ -48,7 +48,7 @@ def efficacies_lm_w(direct_normal_lx: float, diffuse_lx: float, sun_elevation_de
     Examples
     --------
     >>> [round(value) for value in efficacies_lm_w(100_000.0, 12_000.0, 60.0)]
-    [106, 135]
+    [103, 134]
     """
     zenith = np.radians(90.0 - np.clip(sun_elevation_deg, 1.0, 90.0))
     cosine = np.cos(zenith)
