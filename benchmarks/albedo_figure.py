@@ -16,11 +16,11 @@ sys.path.insert(0, str(Path(__file__).parent))
 from albedo import FIT_DATE, flat, observations
 from albedo_scene import hours, lights_for, make_truth, path_traced
 
+from seasonscapes.albedo.albedo_completion import complete_known
 from seasonscapes.albedo.closed_form import solve_albedo
 from seasonscapes.albedo.forward_model import trace_texel_transport
 from seasonscapes.albedo.photographs import EIGHT_BIT, prepare_photographs
 from seasonscapes.albedo.standard_error import known_albedo
-from seasonscapes.commands.corrected_albedo import complete_known
 from seasonscapes.evaluation.webcam_faults import WebcamFaults
 from seasonscapes.exposure import develop, exposure_ev100
 from seasonscapes.images import atomic_path, srgb_from_linear

@@ -9,11 +9,11 @@ from datetime import UTC, datetime
 import numpy as np
 
 from seasonscapes.cameras.pinhole import Camera, rotation_from_angles
-from seasonscapes.daylight import light_at, moment_at
 from seasonscapes.frames import LocalFrame
 from seasonscapes.sky.illumination import Illumination
 from seasonscapes.sky.models import SkyModel
 from seasonscapes.terrain.surface import Raster, Terrain
+from seasonscapes.workflows.illumination import illumination_at, sun_moon_position
 from seasonscapes.workspace import Workspace
 
 LATITUDE_DEG, LONGITUDE_DEG = 46.55, 7.98
@@ -127,11 +127,11 @@ def lights_for(
     """Light of each time as each camera sees it ``[time][camera]``: on the land that of its median height."""
     result = []
     for time in times:
-        moment = moment_at(time, LATITUDE_DEG, LONGITUDE_DEG, GROUND_HEIGHT_M)
-        on_land = light_at(model, moment, GROUND_HEIGHT_M, workspace=workspace)
+        moment = sun_moon_position(time, LATITUDE_DEG, LONGITUDE_DEG, GROUND_HEIGHT_M)
+        on_land = illumination_at(model, moment, GROUND_HEIGHT_M, workspace=workspace)
         row = []
         for camera in cameras:
-            here = light_at(model, moment, float(camera.position_m[2]), workspace=workspace, map_height=64)
+            here = illumination_at(model, moment, float(camera.position_m[2]), workspace=workspace, map_height=64)
             row.append(replace(on_land, aerial_perspective=here.aerial_perspective, visible_sky=here.sky_radiance))
         result.append(row)
     return result

@@ -27,13 +27,12 @@ from alpinebench_scene import (
     take_pictures,
 )
 
+from seasonscapes.albedo.albedo_completion import complete_albedo
 from seasonscapes.albedo.closed_form import AlbedoFit, solve_albedo
 from seasonscapes.albedo.delighting import delight_textures
 from seasonscapes.albedo.forward_model import TexelTransport, ambient_on_texels, sun_on_texels, trace_texel_transport
 from seasonscapes.albedo.photographs import EIGHT_BIT, LINEAR, prepare_photographs
 from seasonscapes.albedo.tone_curve import fit_tone_curve, with_tone_curve
-from seasonscapes.commands.corrected_albedo import corrected_albedo
-from seasonscapes.commands.expected import RELIT_SIGMA
 from seasonscapes.evaluation.masks import land_mask
 from seasonscapes.evaluation.metrics import score
 from seasonscapes.evaluation.synthetic_webcams import SyntheticPicture
@@ -58,6 +57,7 @@ from seasonscapes.texturing.completion import complete
 from seasonscapes.texturing.inputs import PaintingInput
 from seasonscapes.texturing.painting import Painting, PaintOptions, paint_atlas
 from seasonscapes.texturing.predictors import Predictors, predictors_for
+from seasonscapes.workflows.predicted_radiance import RELATIVE_SIGMA
 from seasonscapes.workspace import default_workspace
 
 _TEXEL = SamplingOptions(subpixels=1, rays=64, listed=32, clusters=1024, rank=24)
@@ -248,7 +248,7 @@ class Bench:
             seen = replace(seen, image=np.clip(seen.image, 0.0, 1.0))
             inputs.append(PaintingInput(seen, lights[number].aerial_perspective if air else None, sigma))
         if relit is not None:
-            options = replace(options or PaintOptions(), predicted_sigma=RELIT_SIGMA)
+            options = replace(options or PaintOptions(), predicted_sigma=RELATIVE_SIGMA)
         return paint_atlas(
             inputs, self.world.terrain, self.world.atlas, self.world.bare, options=options, predicted=relit
         )
@@ -277,7 +277,7 @@ class Bench:
     def completed_albedo(self, fit: AlbedoFit, base: Texture | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Another picture of the land (left out, the satellite's, its light taken out) corrected by the seen texels; and σ."""
         base = base or self.satellite
-        return corrected_albedo(fit, base.values, self.albedo_guides, seed=self.world.seed)
+        return complete_albedo(fit, base.values, self.albedo_guides, seed=self.world.seed)
 
     def guided_albedo(self, fit: AlbedoFit) -> np.ndarray:
         """Seen texels' albedo as it is; the others' learned, the satellite's image one guide among others."""

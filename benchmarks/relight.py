@@ -250,13 +250,13 @@ class SunMarch:
 def visibility_agreement(seed: int, count: int) -> dict[str, float]:
     """Share of places and suns on which our shadow rays and the march agree, away from shadow edges."""
     from seasonscapes.frames import direction_from_angles, enu_from_geodetic
-    from seasonscapes.pipeline import MeshOptions, find_scene, load_place
     from seasonscapes.rendering.hemisphere_rays import ray_scene
     from seasonscapes.rendering.irradiance import surface_at
     from seasonscapes.rendering.mitsuba_scene import mi_mesh
     from seasonscapes.rendering.sun_visibility import cosine_seen, numbered_turn, sun_rays
     from seasonscapes.sky.illumination import Luminary
     from seasonscapes.terrain.raster import geodetic_from_map
+    from seasonscapes.workflows.place import MeshOptions, find_scene, load_place
     from seasonscapes.workspace import default_workspace
 
     place = load_place(find_scene("alpine"), default_workspace(), options=MeshOptions(mesher="grid", refine=1))
@@ -276,7 +276,9 @@ def visibility_agreement(seed: int, count: int) -> dict[str, float]:
         each = points.reshape(-1, 1)
         rays = sun_rays(
             terrain,
-            (each.origin, each.normal, each.outward),
+            each.origin,
+            each.normal,
+            each.outward,
             np.ones((len(found), 1), np.float32),
             numbered_turn(found),
         )
@@ -296,13 +298,15 @@ def visibility_agreement(seed: int, count: int) -> dict[str, float]:
 def a_year(frames: int, width_px: int) -> dict[str, float]:
     """Seconds of a year's film of the embedded scene, from frames spread over all its hours."""
     from seasonscapes.commands.timelapse import developed
-    from seasonscapes.daylight import moment_at
-    from seasonscapes.pipeline import MeshOptions, albedo_for, find_scene, load_place
     from seasonscapes.relighting.film import write_film
     from seasonscapes.scene import read_scene
     from seasonscapes.sky.models import read_sky_model
-    from seasonscapes.studio import Assignment, held_studio, render_frame
     from seasonscapes.terrain.surface import save_texture
+    from seasonscapes.workflows.albedo_sources import albedo_for
+    from seasonscapes.workflows.illumination import sun_moon_position
+    from seasonscapes.workflows.place import MeshOptions, find_scene, load_place
+    from seasonscapes.workflows.relight_session import RenderJob
+    from seasonscapes.workflows.timelapse import cached_session, render_frame
     from seasonscapes.workspace import Workspace, default_workspace
 
     path = find_scene("alpine")
@@ -310,7 +314,7 @@ def a_year(frames: int, width_px: int) -> dict[str, float]:
     start = datetime(2024, 1, 1, tzinfo=UTC)
     hours = [start + timedelta(hours=k) for k in range(8784)]
     bright = [
-        t for t in hours if moment_at(t, place.frame.latitude_deg, place.frame.longitude_deg).sun.elevation_deg > -12.0
+        t for t in hours if sun_moon_position(t, place.frame.latitude_deg, place.frame.longitude_deg).sun.elevation_deg > -12.0
     ]
     chosen = [bright[k] for k in np.linspace(0, len(bright) - 1, frames).astype(int)]
     with tempfile.TemporaryDirectory() as name:
@@ -327,7 +331,7 @@ def a_year(frames: int, width_px: int) -> dict[str, float]:
         for day in (datetime(2024, 1, 16, tzinfo=UTC), datetime(2024, 7, 16, tzinfo=UTC)):
             save_texture(albedo_for(place, day), Path(name) / f"{day:%m%d}.npz")
             dated.append((day.date().isoformat(), str(Path(name) / f"{day:%m%d}.npz")))
-        assignment = Assignment(
+        assignment = RenderJob(
             str(path),
             name,
             MeshOptions(),
@@ -337,7 +341,7 @@ def a_year(frames: int, width_px: int) -> dict[str, float]:
             albedo=tuple(dated),
         )
         clock = {"coefficients": time.perf_counter()}
-        held_studio(assignment)
+        cached_session(assignment)
         clock["frames"] = time.perf_counter()
         cpu = time.process_time()
         for index, each in enumerate(chosen):

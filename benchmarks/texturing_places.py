@@ -11,7 +11,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from seasonscapes.daylight import light_at, moment_at
 from seasonscapes.images import linear_from_srgb, srgb_from_linear
 from seasonscapes.sky.ephemeris import sun_position
 from seasonscapes.sky.models import read_sky_model
@@ -24,6 +23,7 @@ from seasonscapes.terrain.texels import texel_positions
 from seasonscapes.terrain.unwrap import unwrap
 from seasonscapes.texturing.predictors import Predictors, stack_predictors
 from seasonscapes.texturing.terrain_features import terrain_features
+from seasonscapes.workflows.illumination import illumination_at, sun_moon_position
 from seasonscapes.workspace import default_workspace
 
 # ETM+ gain and bias of bands 3, 2, 1 [W m⁻² sr⁻¹ µm⁻¹], as its README gives them.
@@ -162,8 +162,8 @@ def irradiance_of(terrain: Terrain, albedo: np.ndarray, positions: np.ndarray, w
     from seasonscapes.rendering.mitsuba_scene import build_scene
 
     height_m = float(np.nanmedian(positions[..., 2]))
-    moment = moment_at(when, frame.latitude_deg, frame.longitude_deg, height_m)
-    light = light_at(read_sky_model("clear"), moment, height_m, workspace=default_workspace())
+    moment = sun_moon_position(when, frame.latitude_deg, frame.longitude_deg, height_m)
+    light = illumination_at(read_sky_model("clear"), moment, height_m, workspace=default_workspace())
     stage = build_scene(terrain, albedo, light)
     result = np.zeros((positions.shape[0] * positions.shape[1], 3), np.float32)
     for index, _, (found,) in irradiance_blocks(ray_scene(stage.mi_terrain), positions.reshape(-1, 3), [light]):

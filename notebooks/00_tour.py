@@ -21,14 +21,16 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 
-from seasonscapes.daylight import light_at, light_for, moment_at
 from seasonscapes.exposure import develop, exposure_ev100
 from seasonscapes.images import srgb_from_linear
-from seasonscapes.pipeline import albedo_for, camera_for, load_place
 from seasonscapes.rendering.mitsuba_scene import build_scene
 from seasonscapes.rendering.radiance import render_view
 from seasonscapes.sky.models import read_sky_model
 from seasonscapes.sky.report import dome_picture
+from seasonscapes.workflows.albedo_sources import albedo_for
+from seasonscapes.workflows.illumination import illumination_at, illumination_for_camera, sun_moon_position
+from seasonscapes.workflows.place import load_place
+from seasonscapes.workflows.views import camera_for
 from seasonscapes.workspace import default_workspace
 
 # %% [markdown]
@@ -44,8 +46,8 @@ print(f"{len(place.terrain.faces):,} triangles, texels of {place.atlas.texel_p50
 
 # %%
 evening = datetime(2024, 9, 18, 17, 5, tzinfo=UTC)
-moment = moment_at(evening, place.frame.latitude_deg, place.frame.longitude_deg)
-sky = light_at(read_sky_model("clear"), moment, 1500.0, workspace=place.workspace)
+moment = sun_moon_position(evening, place.frame.latitude_deg, place.frame.longitude_deg)
+sky = illumination_at(read_sky_model("clear"), moment, 1500.0, workspace=place.workspace)
 plt.imshow(srgb_from_linear(dome_picture(sky, 400)))
 plt.title(f"sun at {moment.sun.elevation_deg:.1f}°")
 _ = plt.axis("off")
@@ -53,7 +55,7 @@ _ = plt.axis("off")
 # The view at that hour: radiance in cd/m², developed as a camera would.
 
 # %%
-light, _ = light_for(place, camera, read_sky_model("clear"), evening)
+light, _ = illumination_for_camera(place, camera, read_sky_model("clear"), evening)
 view = render_view(build_scene(place.terrain, albedo_for(place, evening).values, light), camera, spp=16)
 plt.figure(figsize=(9, 6))
 plt.imshow(srgb_from_linear(develop(view.radiance, exposure_ev100(view.radiance))))

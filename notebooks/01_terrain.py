@@ -26,10 +26,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from seasonscapes.cameras.pinhole import camera_at
-from seasonscapes.pipeline import MeshOptions, albedo_for, load_place
 from seasonscapes.rendering.gbuffer import trace_gbuffer
 from seasonscapes.rendering.hemisphere_rays import ray_scene
 from seasonscapes.rendering.mitsuba_scene import RenderScene, mi_mesh
+from seasonscapes.workflows.albedo_sources import albedo_for
+from seasonscapes.workflows.place import MeshOptions, load_place
 from seasonscapes.workspace import default_workspace
 
 # %% [markdown]

@@ -24,13 +24,13 @@ from datetime import UTC, datetime, timedelta
 import matplotlib.pyplot as plt
 import numpy as np
 
-from seasonscapes.daylight import light_at, moment_at
 from seasonscapes.exposure import exposure_ev100
 from seasonscapes.images import srgb_from_linear
 from seasonscapes.sky.ephemeris import sun_position
 from seasonscapes.sky.illumination import global_horizontal_illuminance
 from seasonscapes.sky.models import read_sky_model
 from seasonscapes.sky.report import dome_picture
+from seasonscapes.workflows.illumination import illumination_at, sun_moon_position
 from seasonscapes.workspace import default_workspace
 
 LATITUDE_DEG, LONGITUDE_DEG, HEIGHT_M = 46.55, 7.98, 2000.0
@@ -51,8 +51,8 @@ _ = plt.legend()
 
 # %%
 def light(model: str, time: datetime):
-    moment = moment_at(time, LATITUDE_DEG, LONGITUDE_DEG, HEIGHT_M)
-    return light_at(read_sky_model(model), moment, HEIGHT_M, workspace=default_workspace(), with_air=False)
+    moment = sun_moon_position(time, LATITUDE_DEG, LONGITUDE_DEG, HEIGHT_M)
+    return illumination_at(read_sky_model(model), moment, HEIGHT_M, workspace=default_workspace(), with_air=False)
 
 
 # %% [markdown]

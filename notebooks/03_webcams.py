@@ -30,12 +30,14 @@ from seasonscapes.calibration.evidence import Correspondences, Priors
 from seasonscapes.calibration.overlay import draw_overlay
 from seasonscapes.calibration.resection import resect
 from seasonscapes.cameras.panorama import panorama_from_angles, split_panorama
-from seasonscapes.daylight import light_for
 from seasonscapes.evaluation.splits import held_out_hours, refuse_leaks, use_of
 from seasonscapes.evaluation.synthetic_webcams import WebcamInstant, webcam_series
 from seasonscapes.evaluation.webcam_faults import CLEAN, SEVERE, TYPICAL, PoseSigmas, degrade, perturb_pose
-from seasonscapes.pipeline import albedo_for, camera_for, load_place
 from seasonscapes.sky.models import read_sky_model
+from seasonscapes.workflows.albedo_sources import albedo_for
+from seasonscapes.workflows.illumination import illumination_for_camera
+from seasonscapes.workflows.place import load_place
+from seasonscapes.workflows.views import camera_for
 from seasonscapes.workspace import default_workspace
 
 # %% [markdown]
@@ -48,7 +50,7 @@ hours = []
 for hour in (7, 9, 12, 15):
     time = datetime(2024, 9, 11, hour, tzinfo=UTC)
     hours.append(
-        WebcamInstant(time, light_for(place, camera, read_sky_model("clear"), time)[0], albedo_for(place, time).values)
+        WebcamInstant(time, illumination_for_camera(place, camera, read_sky_model("clear"), time)[0], albedo_for(place, time).values)
     )
 pictures = webcam_series(place.terrain, "west", camera, hours)
 figure, axes = plt.subplots(1, 4, figsize=(15, 3))
@@ -80,7 +82,7 @@ pixel = chosen[:, ::-1] + 0.5 + rng.normal(0.0, 0.5, (12, 2))
 pixel[:2] += 30.0
 points = Correspondences(pixel, truth.position[chosen[:, 0], chosen[:, 1]])
 solved = resect(start, points, priors=Priors(horizontal_m=5.0, vertical_m=5.0, focal=0.02))
-print(f"heading was off by {off['heading_deg']:+.2f}°; set aside: {np.flatnonzero(solved.outlier).tolist()}")
+print(f"heading was off by {off['heading_deg']:+.2f}°; outliers: {np.flatnonzero(solved.outlier).tolist()}")
 print(f"{solved.inlier_rms_px:.2f} px; heading ± {solved.sigma['heading_deg']:.3f}°")
 plt.figure(figsize=(9, 6))
 plt.imshow(draw_overlay(pictures[1].encoded, solved, points=points))

@@ -25,14 +25,12 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from seasonscapes.daylight import light_for
 from seasonscapes.evaluation.figures import comparison
 from seasonscapes.evaluation.masks import land_mask
 from seasonscapes.evaluation.metrics import score
 from seasonscapes.evaluation.synthetic_webcams import WebcamInstant, webcam_series
 from seasonscapes.exposure import develop, exposure_ev100
 from seasonscapes.images import srgb_from_linear
-from seasonscapes.pipeline import MeshOptions, albedo_for, camera_for, load_place
 from seasonscapes.rendering.hemisphere_rays import ray_scene
 from seasonscapes.rendering.mitsuba_scene import build_scene, mi_mesh
 from seasonscapes.rendering.radiance import apply_aerial_perspective, render_view
@@ -44,6 +42,10 @@ from seasonscapes.texturing.completion import complete
 from seasonscapes.texturing.inputs import PaintingInput
 from seasonscapes.texturing.painting import paint_atlas
 from seasonscapes.texturing.predictors import predictors_for
+from seasonscapes.workflows.albedo_sources import albedo_for
+from seasonscapes.workflows.illumination import illumination_for_camera
+from seasonscapes.workflows.place import MeshOptions, load_place
+from seasonscapes.workflows.views import camera_for
 from seasonscapes.workspace import default_workspace
 
 # %% [markdown]
@@ -57,7 +59,7 @@ sampling = SamplingOptions(subpixels=4, shades=16, rays=64, clusters=1024, liste
 shots, shown = [], []
 for name in ("west", "middle", "south"):
     camera = camera_for(place, place.scene.camera(name), size_px=(210, 140))
-    light, _ = light_for(place, camera, model, time)
+    light, _ = illumination_for_camera(place, camera, model, time)
     picture = webcam_series(
         place.terrain, name, camera, [WebcamInstant(time, light, albedo.values)], sampling=sampling
     )[0]
@@ -108,7 +110,7 @@ for axis, (method, values) in zip(axes, completed.items(), strict=True):
 
 # %%
 camera = camera_for(place, place.scene.camera("unseen"), size_px=(210, 140))
-stage = build_scene(place.terrain, albedo.values, light_for(place, camera, model, time)[0])
+stage = build_scene(place.terrain, albedo.values, illumination_for_camera(place, camera, model, time)[0])
 truth = render_view(stage, camera, spp=32)
 
 

@@ -29,14 +29,16 @@ from seasonscapes.albedo.closed_form import solve_albedo
 from seasonscapes.albedo.forward_model import trace_texel_transport
 from seasonscapes.albedo.photographs import EIGHT_BIT, prepare_photographs
 from seasonscapes.albedo.standard_error import texel_sigma, times_sunlit
-from seasonscapes.daylight import light_for
 from seasonscapes.evaluation.surfaces import albedo_error
 from seasonscapes.evaluation.synthetic_webcams import WebcamInstant, webcam_series
 from seasonscapes.evaluation.webcam_faults import WebcamFaults
 from seasonscapes.images import srgb_from_linear
-from seasonscapes.pipeline import MeshOptions, albedo_for, camera_for, load_place
 from seasonscapes.rendering.transport import SamplingOptions
 from seasonscapes.sky.models import read_sky_model
+from seasonscapes.workflows.albedo_sources import albedo_for
+from seasonscapes.workflows.illumination import illumination_for_camera
+from seasonscapes.workflows.place import MeshOptions, load_place
+from seasonscapes.workflows.views import camera_for
 from seasonscapes.workspace import default_workspace
 
 # %% [markdown]
@@ -51,7 +53,7 @@ observations, lights, shown = [], [], []
 for name in ("west", "south"):
     camera = camera_for(place, place.scene.camera(name), size_px=(180, 120))
     times = [day.replace(hour=hour) for hour in (7, 10, 13, 15)]
-    hours = [WebcamInstant(time, light_for(place, camera, model, time)[0], truth) for time in times]
+    hours = [WebcamInstant(time, illumination_for_camera(place, camera, model, time)[0], truth) for time in times]
     pictures = webcam_series(
         place.terrain, name, camera, hours, faults=WebcamFaults(tone_strength=0.0), sampling=sampling
     )

@@ -27,18 +27,20 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from seasonscapes.daylight import light_for
 from seasonscapes.evaluation.masks import land_mask
 from seasonscapes.evaluation.metrics import score
 from seasonscapes.exposure import develop, exposure_ev100
 from seasonscapes.images import srgb_from_linear
-from seasonscapes.pipeline import albedo_for, camera_for, load_place
 from seasonscapes.rendering.hemisphere_rays import ray_scene
 from seasonscapes.rendering.mitsuba_scene import RenderScene, build_scene, mi_mesh, set_albedo
 from seasonscapes.rendering.radiance import render_view
 from seasonscapes.rendering.relit_view import cluster_albedo, relight_view, relightable_view, with_albedo
 from seasonscapes.rendering.transport import SamplingOptions, trace_view, view_albedo
 from seasonscapes.sky.models import read_sky_model
+from seasonscapes.workflows.albedo_sources import albedo_for
+from seasonscapes.workflows.illumination import illumination_for_camera
+from seasonscapes.workflows.place import load_place
+from seasonscapes.workflows.views import camera_for
 from seasonscapes.workspace import default_workspace
 
 
@@ -67,7 +69,7 @@ print(f"traced in {clock.perf_counter() - start:.1f} s")
 # %%
 model = read_sky_model("clear")
 hours = [autumn + timedelta(hours=hour) for hour in (6.0, 8.0, 11.0, 14.0, 16.5, 17.6)]
-lights = [light_for(place, camera, model, hour)[0] for hour in hours]
+lights = [illumination_for_camera(place, camera, model, hour)[0] for hour in hours]
 start = clock.perf_counter()
 views = [relight_view(ready, light) for light in lights]
 print(f"{(clock.perf_counter() - start) / len(views):.2f} s a frame")
@@ -96,6 +98,6 @@ for axis, (month, day) in zip(axes, ((2, 10), (5, 20), (7, 20)), strict=True):
     colours = albedo_for(place, noon).values
     set_albedo(RenderScene(land.mi_scene, land.mi_terrain, lights[0], 0.0), colours)
     clothed = with_albedo(ready, view_albedo(land, coefficients), cluster_albedo(coefficients, colours))
-    axis.imshow(shown(relight_view(clothed, light_for(place, camera, model, noon)[0]).radiance))
+    axis.imshow(shown(relight_view(clothed, illumination_for_camera(place, camera, model, noon)[0]).radiance))
     axis.set_title(f"{noon:%d %B}")
     axis.axis("off")

@@ -26,7 +26,6 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from seasonscapes.daylight import light_at, moment_at
 from seasonscapes.gaussians.appearance import Appearance, colours_at, fourier_embedding
 from seasonscapes.gaussians.disc_transport import (
     light_state,
@@ -39,12 +38,14 @@ from seasonscapes.gaussians.surfels import surfel_albedo, terrain_surfels
 from seasonscapes.gaussians.training import Schedule, surface_targets, train
 from seasonscapes.gaussians.training_views import facing, overview_cameras
 from seasonscapes.images import srgb_from_linear
-from seasonscapes.pipeline import MeshOptions, albedo_for, load_place
 from seasonscapes.rendering.hemisphere_rays import ray_scene
 from seasonscapes.rendering.mitsuba_scene import mi_mesh
 from seasonscapes.rendering.relit_view import relight_view, relightable_view
 from seasonscapes.rendering.transport import SamplingOptions, trace_view
 from seasonscapes.sky.models import read_sky_model
+from seasonscapes.workflows.albedo_sources import albedo_for
+from seasonscapes.workflows.illumination import illumination_at, sun_moon_position
+from seasonscapes.workflows.place import MeshOptions, load_place
 from seasonscapes.workspace import default_workspace
 
 choose_threads(1)
@@ -71,7 +72,7 @@ model, at = read_sky_model("clear"), (place.frame.latitude_deg, place.frame.long
 
 
 def lit(time: datetime):
-    light = light_at(model, moment_at(time, *at), 2000.0, workspace=place.workspace)
+    light = illumination_at(model, sun_moon_position(time, *at), 2000.0, workspace=place.workspace)
     return light, light_state(transport, light, float(time.timetuple().tm_yday))
 
 

@@ -33,14 +33,16 @@ from seasonscapes.albedo.forward_model import trace_texel_transport
 from seasonscapes.albedo.inverse import InverseOptions, refine_albedo
 from seasonscapes.albedo.photographs import prepare_photographs
 from seasonscapes.cameras.observation import Observation
-from seasonscapes.daylight import light_for
 from seasonscapes.evaluation.surfaces import albedo_error
 from seasonscapes.images import srgb_from_linear
-from seasonscapes.pipeline import MeshOptions, albedo_for, camera_for, load_place
 from seasonscapes.rendering.mitsuba_scene import build_scene
 from seasonscapes.rendering.radiance import render_view
 from seasonscapes.rendering.transport import SamplingOptions
 from seasonscapes.sky.models import read_sky_model
+from seasonscapes.workflows.albedo_sources import albedo_for
+from seasonscapes.workflows.illumination import illumination_for_camera
+from seasonscapes.workflows.place import MeshOptions, load_place
+from seasonscapes.workflows.views import camera_for
 from seasonscapes.workspace import default_workspace
 
 # %% [markdown]
@@ -55,7 +57,7 @@ for name in ("west", "south"):
     camera = camera_for(place, place.scene.camera(name), size_px=(90, 60))
     for hour in (9, 14):
         time = day.replace(hour=hour)
-        light, _ = light_for(place, camera, model, time)
+        light, _ = illumination_for_camera(place, camera, model, time)
         image = render_view(build_scene(place.terrain, truth, light), camera, spp=32).radiance
         observations.append(Observation(image, np.ones(image.shape[:2], bool), camera, time, name))
         lights.append(light)

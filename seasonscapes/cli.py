@@ -1,4 +1,4 @@
-"""The command line. Verbs live in `seasonscapes.commands` and are imported only when called."""
+"""The command line. Commands live in `seasonscapes.commands` and are imported only when they are called."""
 
 from __future__ import annotations
 
@@ -9,59 +9,61 @@ import sys
 from cyclopts import App, Parameter
 
 from seasonscapes import __version__
-from seasonscapes.errors import InputError
+from seasonscapes.commands.console import interruptible, show_messages
+from seasonscapes.errors import SeasonscapesError
 
 app = App(
     name="seasonscapes",
-    help="Light a real mountain landscape for any date and hour.",
+    help="Physically-based relighting of mountain landscapes: any place, any date, any hour.",
     version=__version__,
     help_flags=["--help", "-h"],
     help_format="plaintext",
-    # Nobody asks for an empty list of albedos.
+    # An empty list of albedos is never asked for.
     default_parameter=Parameter(negative_iterable=()),
 )
-app.command("seasonscapes.commands.render:render", help="Render a view of a place at a date and hour.")
-app.command("seasonscapes.commands.paint:paint", help="Paint calibrated pictures of one time into the place's texture.")
-app.command("seasonscapes.commands.inpaint:inpaint", help="Complete a painted texture where no camera saw.")
-app.command(
-    "seasonscapes.commands.path:path", help="Lay a path of views over a place, clear of the ground, with a map."
+
+# Name, module, and what the command does.
+COMMANDS = (
+    ("render", "render", "Render a view of a place at a date and hour."),
+    ("timelapse", "timelapse", "Film a view through hours or seasons."),
+    ("lit-texture", "lit_texture", "Export a place's texture as lit at an hour."),
+    ("irradiance", "irradiance", "Map the irradiance of the ground at an hour or over a period."),
+    ("sky", "sky", "Report the light of a place at an instant, and picture the sky dome."),
+    ("terrain", "terrain", "Build a place's terrain and report its quality."),
+    ("webcams", "webcams", "List, check and map a scene's webcams and their pictures."),
+    ("calibrate", "calibrate", "Calibrate a webcam from matched points or the skyline."),
+    ("annotate", "annotate", "Match points of a photograph and the terrain on a local page."),
+    ("paint", "paint", "Paint calibrated pictures of one time into the place's texture."),
+    ("inpaint", "inpaint", "Complete a painted texture where no camera saw the surface."),
+    ("path", "path", "Make a camera path over a place, clear of the ground, with a map."),
+    ("albedo", "albedo", "Recover the albedo of a place from its photographs."),
+    ("distill", "distill", "Distil a Gaussian model of a place."),
+    ("splat", "splat", "Render distilled Gaussians at any hour, or bake them for other programs."),
+    ("run", "run", "From photographs to pictures of any hour: all stages, resumable."),
+    ("evaluate", "evaluate", "Score pictures against the truth."),
+    ("info", "info", "Print the provenance of a file."),
+    ("demo", "demo", "Picture the embedded scene through a day, a night and a year."),
+    ("doctor", "doctor", "Report what this machine can do, and what is missing."),
 )
-app.command("seasonscapes.commands.evaluate:evaluate", help="Score pictures against the truth, masked honestly.")
-app.command("seasonscapes.commands.albedo:albedo", help="Take the light out of a place's photographs.")
-app.command("seasonscapes.commands.run:run", help="From photographs to pictures of any hour, all stages, resumable.")
-app.command("seasonscapes.commands.distill:distill", help="Teach Gaussians the light of a place.")
-app.command(
-    "seasonscapes.commands.splat:splat", help="Render distilled Gaussians at any hour, or bake them for others."
-)
-app.command("seasonscapes.commands.timelapse:timelapse", help="Film a view through hours or seasons.")
-app.command(
-    "seasonscapes.commands.lit:lit_texture", name="lit-texture", help="Export a place's texture as lit at an hour."
-)
-app.command(
-    "seasonscapes.commands.lit:irradiance",
-    help="Map what the sun and sky give the ground, at an hour or over a period.",
-)
-app.command("seasonscapes.commands.sky:sky", help="Tell the light of a place at an instant, and picture the dome.")
-app.command("seasonscapes.commands.terrain:terrain", help="Build a place's terrain and report how good it is.")
-app.command("seasonscapes.commands.webcams:webcams", help="List, check and map a scene's webcams and their pictures.")
-app.command("seasonscapes.commands.calibrate:calibrate", help="Calibrate a webcam from matched points or the skyline.")
-app.command(
-    "seasonscapes.commands.calibrate:annotate", help="Match points of a photograph and the terrain on a local page."
-)
-app.command("seasonscapes.commands.info:info", help="Print what a file is, and what it was made from.")
-app.command("seasonscapes.commands.demo:demo", help="Picture the embedded scene through a day, a night and a year.")
-app.command("seasonscapes.commands.doctor:doctor", help="Say what this machine can do, and what is missing.")
+for _name, _module, _help in COMMANDS:
+    app.command(f"seasonscapes.commands.{_module}:{_module}_command", name=_name, help=_help)
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run one verb. Exit codes: 0 well, 2 the user's input, 130 interrupted; a bug shows its traceback (1)."""
-    tokens = sys.argv[1:] if arguments is None else arguments
-    from seasonscapes.commands.talk import interruptible
+    """Run one command.
 
+    Returns
+    -------
+    int
+        Exit code: 0 for success, 2 for a mistake in the user's input, 130 for an interruption. Any other exception
+        is a bug and shows its traceback (exit code 1).
+    """
+    tokens = sys.argv[1:] if arguments is None else arguments
+    show_messages()
     try:
         with interruptible():
             app(tokens, exit_on_error=True, print_error=True, result_action="return_value")
-    except InputError as error:
+    except SeasonscapesError as error:
         if "--json" in tokens:
             print(json.dumps({"error": str(error)}))
         print(f"seasonscapes: {error}", file=sys.stderr)

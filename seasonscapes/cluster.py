@@ -1,37 +1,38 @@
-"""Frames on many processes or machines by Dask.
+"""Independent tasks on many processes or machines through Dask.
 
-Workers keep place and coefficients warm, write each frame atomically into the shared workspace and return a small
-record. A killed worker takes nothing with it: its frames are handed to others, which keep what is already there.
+Tasks write their results atomically to a shared folder and return small records. When a worker dies, its tasks are
+rescheduled on other workers, which keep the results that are already there.
 """
 
 from __future__ import annotations
 
 import os
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from seasonscapes.errors import InputError
-from seasonscapes.studio import Assignment, render_frame
 
-# How often a frame's worker may die before the frame itself is blamed.
+Item = TypeVar("Item")
+# Deaths of workers that one task survives before the task itself is reported as failed.
 _DEATHS = 10
-# Frames handed out ahead for each worker.
+# Tasks submitted ahead for each worker.
 _AHEAD = 4
 
 
-def frames_on_cluster(
-    cluster: str, assignment: Assignment, times: list[datetime], *, exr_folder: str | None = None
-) -> Iterator[dict]:
-    """The records of frames as they are done, in any order; see `studio.render_frame`.
+def run_on_cluster(cluster: str, task: Callable[[Item], dict], items: Iterable[Item]) -> Iterator[dict]:
+    """Run a task for every item and give the records as they are done, in any order.
 
     Parameters
     ----------
     cluster
-        ``local:N``, ``tcp://HOST:PORT`` of a running scheduler, or ``slurm:FILE``.
+        ``local:N`` worker processes, ``tcp://HOST:PORT`` of a running scheduler, or ``slurm:FILE``.
+    task
+        A function that can be pickled; see `run_by`.
+    items
+        Its arguments, one for each call.
 
     Raises
     ------
@@ -39,14 +40,14 @@ def frames_on_cluster(
         For a cluster that cannot be reached, or a file that does not describe one.
     """
     with connected(cluster) as client:
-        yield from frames_by(client, assignment, times, exr_folder)
+        yield from run_by(client, task, items)
 
 
 @contextmanager
 def connected(cluster: str) -> Iterator[Any]:
-    """A Dask client of a cluster, which ends with the block if it was started for it."""
+    """A Dask client of a cluster; a cluster that was started for it ends with the block."""
     try:
-        import dask
+        import dask.config
         from distributed import Client
     except ImportError:
         raise InputError("--cluster", "Dask is not installed", cure="pip install 'seasonscapes[cluster]'") from None
@@ -69,7 +70,7 @@ def connected(cluster: str) -> Iterator[Any]:
 
 
 def _own_cores(workers: int) -> Any:
-    """Gives each of so many workers of this machine its own cores, so that their threads do not fight over all of them."""
+    """A plugin that pins each of the machine's workers to its own cores, so that their threads do not compete."""
     from distributed import WorkerPlugin
 
     class OwnCores(WorkerPlugin):
@@ -94,7 +95,7 @@ def _started(cluster: str) -> Any:
             threads_per_worker=1,
             processes=True,
             host="127.0.0.1",
-            dashboard_address=None,
+            dashboard_address=None,  # pyright: ignore[reportArgumentType]
             memory_limit=0,
         )
     if kind == "slurm" and rest:
@@ -105,42 +106,42 @@ def _started(cluster: str) -> Any:
 
 
 def _slurm(path: Path) -> Any:
-    """A cluster of SLURM jobs from a TOML file: ``jobs = N`` and a table ``[slurm]`` of what each job asks for."""
+    """A cluster of SLURM jobs from a TOML file: ``jobs = N`` and a table ``[slurm]`` of the resources of each job."""
     if not path.is_file():
         raise InputError("--cluster", "no such file", got=str(path))
     try:
         table = tomllib.loads(path.read_text())
     except tomllib.TOMLDecodeError as error:
         raise InputError(path, f"not TOML: {error}") from None
-    jobs, wishes = table.get("jobs"), table.get("slurm")
-    if not isinstance(jobs, int) or jobs < 1 or not isinstance(wishes, dict) or set(table) - {"jobs", "slurm"}:
+    jobs, resources = table.get("jobs"), table.get("slurm")
+    if not isinstance(jobs, int) or jobs < 1 or not isinstance(resources, dict) or set(table) - {"jobs", "slurm"}:
         raise InputError(
             path,
             "does not describe a cluster",
             expected="jobs = 8 and a table [slurm] with cores, memory, walltime, queue, account",
         )
-    from dask_jobqueue import SLURMCluster
+    from dask_jobqueue.slurm import SLURMCluster
 
     try:
-        cluster = SLURMCluster(**{"processes": 1, **wishes})
+        cluster = SLURMCluster(**{"processes": 1, **resources})
     except (TypeError, ValueError) as error:
         raise InputError(path, f"[slurm]: {error}") from None
     cluster.scale(jobs=jobs)
     return cluster
 
 
-def frames_by(client: Any, assignment: Assignment, times: list[datetime], exr_folder: str | None) -> Iterator[dict]:
-    """The records of frames that a client's workers render, in the order in which they are done."""
+def run_by(client: Any, task: Callable[[Item], dict], items: Iterable[Item]) -> Iterator[dict]:
+    """Run a task for every item on a Dask client's workers and give the records as they are done."""
     from distributed import as_completed
 
-    pending = iter(times)
+    pending = iter(items)
     workers = max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
 
-    def submit(time: datetime) -> Any:
-        # Impure, so that a second run asks again: only the workspace knows what is whole.
-        return client.submit(render_frame, assignment, time, exr_folder=exr_folder, pure=False)
+    def submit(item: Item) -> Any:
+        # Impure, so that a second run calls the task again: the task itself knows which results exist.
+        return client.submit(task, item, pure=False)
 
-    first = [submit(time) for _, time in zip(range(_AHEAD * workers), pending, strict=False)]
+    first = [submit(item) for _, item in zip(range(_AHEAD * workers), pending, strict=False)]
     running = as_completed(first)
     for future in running:
         yield future.result()

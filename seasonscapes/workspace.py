@@ -1,7 +1,8 @@
-"""The workspace: a folder of built artefacts, each named by the hash of everything it was made from.
+"""The workspace: a folder of built artefacts, each named by the hash of its inputs and of the code that made it.
 
-An artefact is one file and a manifest beside it (``NAME.json``) that is written last. What has no manifest does not
-exist; what has one is whole and fresh by construction, since another input has another name.
+An artefact is one file with a manifest beside it (``NAME.json``), which is written last. An artefact without a manifest
+is ignored. The name hashes the input values, the content of input files and the source of the modules that build the
+artefact (`seasonscapes.source_hash`), so that other inputs or other code never reuse it.
 """
 
 from __future__ import annotations
@@ -13,24 +14,32 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from datetime import date, datetime
 from pathlib import Path
 from typing import Any, TypeVar
 
 from seasonscapes import __version__
 from seasonscapes.images import atomic_path
+from seasonscapes.source_hash import source_hash
 
 Value = TypeVar("Value")
 
 
 @dataclass(frozen=True)
 class Workspace:
-    """A folder for built artefacts; `default_workspace` says where when the user does not."""
+    """A folder for built artefacts; see `default_workspace`.
+
+    Parameters
+    ----------
+    folder
+        Created when the first artefact is written.
+    """
 
     folder: Path
 
 
 def default_workspace() -> Workspace:
-    """``SEASONSCAPES_WORKSPACE``, else the user's cache folder of this platform."""
+    """Return the workspace in ``SEASONSCAPES_WORKSPACE``, or else in the user's cache folder of this platform."""
     given = os.environ.get("SEASONSCAPES_WORKSPACE")
     if given:
         return Workspace(Path(given))
@@ -41,7 +50,7 @@ def default_workspace() -> Workspace:
 
 
 def file_hash(path: str | os.PathLike) -> str:
-    """SHA-256 of a file's content; of the name alone for GDAL's virtual files."""
+    """SHA-256 of a file's content; of the name alone for GDAL's virtual files (``/vsi...``)."""
     if os.fspath(path).startswith("/vsi"):
         return hashlib.sha256(os.fspath(path).encode()).hexdigest()
     with open(path, "rb") as file:
@@ -49,17 +58,49 @@ def file_hash(path: str | os.PathLike) -> str:
 
 
 def content_key(inputs: dict) -> str:
-    """A short name for plain values (as JSON): equal inputs, equal names, on every machine."""
-    text = json.dumps(inputs, sort_keys=True, default=_plain)
+    """A short name for plain values: equal inputs give equal names on every machine.
+
+    Parameters
+    ----------
+    inputs
+        Values that JSON can hold, dates, paths, dataclasses and pydantic models.
+
+    Returns
+    -------
+    str
+        16 hexadecimal digits.
+
+    Raises
+    ------
+    TypeError
+        For values of other types.
+
+    Examples
+    --------
+    >>> from seasonscapes.workspace import content_key
+    >>> content_key({"size": 3, "kind": "grid"}) == content_key({"kind": "grid", "size": 3})
+    True
+    """
+    text = json.dumps(inputs, sort_keys=True, default=plain_value)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def _plain(value: Any) -> Any:
+def plain_value(value: Any) -> Any:
+    """Convert what JSON cannot hold (models, dataclasses, dates, paths) to what it can; `TypeError` for other types."""
     if hasattr(value, "model_dump"):
         return value.model_dump(mode="json")
     if hasattr(value, "__dataclass_fields__"):
         return {name: getattr(value, name) for name in value.__dataclass_fields__}
+    if isinstance(value, (date, datetime)):
+        return value.isoformat()
+    if isinstance(value, Path):
+        return str(value)
     raise TypeError(f"content_key: cannot name a {type(value).__name__}")
+
+
+def artefact_key(inputs: dict, code: tuple[str, ...]) -> str:
+    """The key of an artefact: `content_key` of its inputs and of the source of the modules ``code`` that build it."""
+    return content_key({"inputs": inputs, "code": source_hash(*code)})
 
 
 def build_once(
@@ -67,27 +108,34 @@ def build_once(
     name: str,
     inputs: dict,
     *,
+    code: tuple[str, ...],
     suffix: str,
     build: Callable[[], Value],
     save: Callable[[Value, Path], None],
     load: Callable[[Path], Value],
 ) -> Value:
-    """Load the artefact of these inputs, or build it, save it atomically and write its manifest.
+    """Load the artefact of these inputs and this code, or build it, save it atomically and write its manifest.
 
     Parameters
     ----------
+    workspace
+        Where artefacts lie.
     name
-        Stage and place, as in ``alpine/terrain``.
+        Stage and place, such as ``alpine/terrain``.
     inputs
-        Plain values that decide the result, hashes of files among them.
+        Plain values that determine the result, hashes of input files among them.
+    code
+        Modules below ``seasonscapes`` whose source (with everything that they import) determines the result.
     suffix
         Of the artefact's file.
+    build, save, load
+        Make the value; write it to a path; read it from a path.
 
     Notes
     -----
     Two processes that build the same artefact at once both succeed: each renames a whole file onto the same name.
     """
-    path = workspace.folder / f"{name}-{content_key(inputs)}{suffix}"
+    path = workspace.folder / f"{name}-{artefact_key(inputs, code)}{suffix}"
     manifest = path.with_name(path.name + ".json")
     if manifest.is_file() and path.is_file():
         return load(path)
@@ -95,7 +143,8 @@ def build_once(
     value = build()
     with atomic_path(path) as temporary:
         save(value, temporary)
-    record = {"inputs": inputs, "version": __version__, "seconds": round(time.perf_counter() - start, 3)}
+    seconds = round(time.perf_counter() - start, 3)
+    record = {"inputs": inputs, "code": source_hash(*code), "modules": code, "version": __version__, "seconds": seconds}
     with atomic_path(manifest) as temporary:
-        temporary.write_text(json.dumps(record, indent=1, sort_keys=True, default=_plain) + "\n")
+        temporary.write_text(json.dumps(record, indent=1, sort_keys=True, default=plain_value) + "\n")
     return value

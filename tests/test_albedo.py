@@ -8,6 +8,7 @@ import pytest
 from albedo_cases import Case, case, psnr
 
 from seasonscapes.albedo import corrections, equations, haze, season_grouping, tone_curve
+from seasonscapes.albedo.albedo_completion import complete_known
 from seasonscapes.albedo.closed_form import SolverOptions, solve_albedo
 from seasonscapes.albedo.differentiable_views import SKY, differentiable_views, mi_picture
 from seasonscapes.albedo.forward_model import ambient_on_texels, predicted_surface_radiance
@@ -15,7 +16,7 @@ from seasonscapes.albedo.inverse import ExtraUnknown, InverseOptions, refine_alb
 from seasonscapes.albedo.painted import painted_radiance
 from seasonscapes.albedo.photographs import EIGHT_BIT, AlbedoPhotograph, prepare_photographs
 from seasonscapes.albedo.standard_error import KnownAlbedo, finite_sigma, known_albedo
-from seasonscapes.commands.corrected_albedo import complete_known
+from seasonscapes.errors import NotEnoughEvidence, NoUsablePixels
 from seasonscapes.evaluation.webcam_faults import WebcamFaults, degrade
 from seasonscapes.frames import direction_from_angles
 from seasonscapes.images import linear_from_srgb
@@ -219,7 +220,7 @@ def test_all_clipped_is_an_error(place, photographs):
     white = [
         replace(s, observation=replace(s.observation, image=np.ones_like(s.observation.image))) for s in photographs
     ]
-    with pytest.raises(ValueError, match="all clipped"):
+    with pytest.raises(NoUsablePixels, match="all clipped"):
         solve_albedo(place.transport, white, noise_model=EIGHT_BIT)
 
 
@@ -232,13 +233,13 @@ def test_night_is_an_error(place, photographs):
         )
         for s in photographs
     ]
-    with pytest.raises(ValueError, match="no photograph has any light"):
+    with pytest.raises(NotEnoughEvidence, match="no photograph has any light"):
         solve_albedo(place.transport, dark)
 
 
 def test_nothing_fixes_the_exposure(place, photographs):
     blind = [replace(s, gain=None, observation=replace(s.observation, mask=mask_of_terrain(s))) for s in photographs]
-    with pytest.raises(ValueError, match="nothing fixes the exposure"):
+    with pytest.raises(NotEnoughEvidence, match="nothing fixes the exposure"):
         solve_albedo(place.transport, blind)
 
 
@@ -308,7 +309,7 @@ def test_refinement_saves_resumes_and_takes_extras(place, photographs, clean, tm
 
 
 def test_refinement_refuses(place, photographs, clean):
-    with pytest.raises(ValueError, match="two photographs"):
+    with pytest.raises(NotEnoughEvidence, match="two photographs"):
         refine_albedo(place.terrain, place.transport, photographs[:1], clean)
     with pytest.raises(ValueError, match="colour"):
         refine_albedo(place.terrain, place.transport, photographs, clean, options=InverseOptions(unknowns=("colour",)))

@@ -11,14 +11,15 @@ from places import write_place
 
 from seasonscapes.calibration.calibration_file import read_calibration
 from seasonscapes.cameras.observation import ManifestRow, write_manifest
-from seasonscapes.cameras.pinhole import project
+from seasonscapes.cameras.pinhole import pose_in_frame, project
 from seasonscapes.cli import main
-from seasonscapes.commands.webcam_shots import _write_pose, pose_in_frame
 from seasonscapes.evaluation.webcam_faults import PoseSigmas
 from seasonscapes.frames import LocalFrame, enu_from_geodetic
 from seasonscapes.images import write_png8
-from seasonscapes.pipeline import camera_for, load_place
 from seasonscapes.terrain.surface import load_texture
+from seasonscapes.workflows.place import load_place
+from seasonscapes.workflows.synthetic_photographs import write_pose
+from seasonscapes.workflows.views import camera_for
 from seasonscapes.workspace import Workspace
 
 NOON = datetime(2024, 9, 1, 10, tzinfo=UTC)
@@ -35,7 +36,7 @@ def town(tmp_path_factory):
     picture[:30] = [120, 150, 200]
     write_png8(folder / "pictures" / "south.png", picture)
     write_manifest(folder / "pictures" / "manifest.csv", [ManifestRow("south", NOON, "south.png")])
-    _write_pose(folder / "poses" / "south_calibration.json", "south", camera, PoseSigmas(heading_deg=0.02), place.frame)
+    write_pose(folder / "poses" / "south_calibration.json", "south", camera, PoseSigmas(heading_deg=0.02), place.frame)
     return folder, scene, camera
 
 

@@ -6,9 +6,8 @@ import cv2
 import numpy as np
 import places
 import pytest
+from command_line import command
 
-from seasonscapes.commands.inpaint import inpaint
-from seasonscapes.commands.options import SkyOptions, ViewOptions
 from seasonscapes.errors import InputError
 from seasonscapes.frames import LocalFrame
 from seasonscapes.terrain.hole_filling import harmonic_fill
@@ -314,16 +313,18 @@ def hill(tmp_path, monkeypatch):
 def test_inpaint_writes_a_texture_and_figures(hill, tmp_path, capsys):
     path, texture = hill
     output = tmp_path / "done.npz"
-    inpaint(
-        str(path),
+    command(
+        "inpaint",
+        path,
         time="2024-09-01T10:00",
         texture=tmp_path / "painted.npz",
         fast=True,
         output=output,
         json=True,
         figures=tmp_path / "fig",
-        view=ViewOptions(camera="south", size="96x64"),
-        sky=SkyOptions(sky="hosek"),
+        camera="south",
+        size="96x64",
+        sky="hosek",
     )
     record = json.loads(capsys.readouterr().out)
     seen = texture.weight > 0.0
@@ -358,5 +359,5 @@ def test_inpaint_says_what_is_wrong(hill, tmp_path):
         ({"texture": empty, "detail": 2.0}, "out of range"),
     ):
         with pytest.raises(InputError, match=text):
-            inpaint(str(path), time="2024-09-01T10:00", output=tmp_path / "done.npz", **options)
+            command("inpaint", path, time="2024-09-01T10:00", output=tmp_path / "done.npz", **options)
     assert not (tmp_path / "done.npz").exists()

@@ -6,10 +6,11 @@ import numpy as np
 import places
 import pytest
 
-from seasonscapes.daylight import light_at, light_for, moment_at
-from seasonscapes.pipeline import camera_for, load_place
 from seasonscapes.sky.illumination import global_horizontal_illuminance, luminance
 from seasonscapes.sky.models import read_sky_model, with_overrides
+from seasonscapes.workflows.illumination import illumination_at, illumination_for_camera, sun_moon_position
+from seasonscapes.workflows.place import load_place
+from seasonscapes.workflows.views import camera_for
 from seasonscapes.workspace import Workspace
 
 PLACE = (46.55, 7.98)
@@ -27,12 +28,12 @@ def test_hosek_and_atmosphere_agree_by_day(workspace, time):
     The Hosek-Wilkie fit is one of a path tracer with another haze, so single directions differ by up to a factor of
     1.6; what falls on the ground is what both must agree on.
     """
-    moment = moment_at(datetime.fromisoformat(time).replace(tzinfo=UTC), *PLACE)
+    moment = sun_moon_position(datetime.fromisoformat(time).replace(tzinfo=UTC), *PLACE)
     assert moment.sun.elevation_deg > 29.0
     lux = [
         luminance(
             global_horizontal_illuminance(
-                light_at(with_overrides(read_sky_model(name), turbidity=3.0), moment, 0.0, workspace=workspace)
+                illumination_at(with_overrides(read_sky_model(name), turbidity=3.0), moment, 0.0, workspace=workspace)
             )
         )
         for name in ("hosek", "clear")
@@ -41,12 +42,12 @@ def test_hosek_and_atmosphere_agree_by_day(workspace, time):
 
 
 def test_tables_are_kept_in_the_workspace(workspace):
-    moment = moment_at(datetime(2024, 6, 20, 11, 0, tzinfo=UTC), *PLACE)
+    moment = sun_moon_position(datetime(2024, 6, 20, 11, 0, tzinfo=UTC), *PLACE)
     model = with_overrides(read_sky_model("clear"), turbidity=3.0)
-    first = light_at(model, moment, 500.0, workspace=workspace)
+    first = illumination_at(model, moment, 500.0, workspace=workspace)
     files = {path: path.stat().st_mtime_ns for path in workspace.folder.rglob("tables-*.npz")}
     assert files
-    again = light_at(model, moment, 500.0, workspace=workspace)
+    again = illumination_at(model, moment, 500.0, workspace=workspace)
     np.testing.assert_array_equal(first.sky_radiance, again.sky_radiance)
     assert files == {path: path.stat().st_mtime_ns for path in workspace.folder.rglob("tables-*.npz")}
 
@@ -56,7 +57,7 @@ def test_light_of_a_place_is_lit_below_and_seen_from_the_camera(tmp_path, worksp
     view = place.scene.camera(None).model_copy(update={"above_ground_m": None, "height_m": 4500.0})
     camera = camera_for(place, view, size_px=(32, 24))
     model = with_overrides(read_sky_model("clear"), turbidity=3.0)
-    light, moment = light_for(place, camera, model, datetime(2024, 9, 1, 10, 0, tzinfo=UTC))
+    light, moment = illumination_for_camera(place, camera, model, datetime(2024, 9, 1, 10, 0, tzinfo=UTC))
     np.testing.assert_allclose(light.sun.direction, moment.sun.direction, atol=1e-12)
     zenith = luminance(light.sky_radiance[0].mean(axis=0)), luminance(light.visible_sky[0].mean(axis=0))
     assert zenith[1] < 0.8 * zenith[0], "the zenith over a high camera is darker than over the land"

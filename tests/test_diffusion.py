@@ -10,17 +10,13 @@ from itertools import pairwise
 import numpy as np
 import places
 import pytest
+from command_line import command
 from PIL import Image
 
 from seasonscapes.cameras.path_file import save_path
 from seasonscapes.cameras.pinhole import camera_at
 from seasonscapes.cameras.trajectory import cameras_along_path
-from seasonscapes.commands import inpaint_path
-from seasonscapes.commands.inpaint import inpaint
-from seasonscapes.commands.inpaint_path import DiffusionOptions
-from seasonscapes.commands.options import PlaceOptions
 from seasonscapes.errors import InputError
-from seasonscapes.pipeline import MeshOptions, load_place
 from seasonscapes.rendering.gbuffer import trace_gbuffer
 from seasonscapes.rendering.hemisphere_rays import ray_scene
 from seasonscapes.rendering.mitsuba_scene import RenderScene, mi_mesh
@@ -44,6 +40,8 @@ from seasonscapes.texturing.view_conditions import (
     red_pixels,
     white_radiance,
 )
+from seasonscapes.workflows import path_completion
+from seasonscapes.workflows.place import MeshOptions, load_place
 from seasonscapes.workspace import Workspace
 
 pytest.importorskip("diffusers", reason="the extra 'diffusion' is not installed")
@@ -607,16 +605,18 @@ def run(hill, weights, tmp_path_factory):
 
     def call(output, **flags):
         options = {"path": folder / "path.json", "weights": weights, "steps": 2, "dilate_px": 2, "least_hole": 0.0}
-        inpaint(
-            str(land.path),
+        command(
+            "inpaint",
+            land.path,
             time="2024-09-01T10:00",
             texture=folder / "painted.npz",
             method="diffusion",
             fast=True,
             output=output,
             json=True,
-            place=PlaceOptions(texel_m=TEXEL_M, workspace=folder / "work"),
-            diffusion=DiffusionOptions(**(options | flags)),
+            texel_m=TEXEL_M,
+            workspace=folder / "work",
+            **(options | flags),
         )
 
     return call
@@ -644,7 +644,7 @@ def test_end_to_end_interrupted_and_resumed(run, hill, tmp_path, capsys, monkeyp
         assert not stored["sigma"][seen].any()
         assert (stored["sigma"][~seen] > 0.0).mean() > 0.99
 
-    real, count = inpaint_path._painter, []
+    real, count = path_completion._painter, []
 
     def fails_at_third(*args):
         painter, identity = real(*args)
@@ -660,7 +660,7 @@ def test_end_to_end_interrupted_and_resumed(run, hill, tmp_path, capsys, monkeyp
 
         return Failing(), identity
 
-    monkeypatch.setattr(inpaint_path, "_painter", fails_at_third)
+    monkeypatch.setattr(path_completion, "_painter", fails_at_third)
     with pytest.raises(InputError, match="memory ran out"):
         run(tmp_path / "resumed.npz", **flags)
     assert not (tmp_path / "resumed.npz").exists()

@@ -5,11 +5,12 @@ import json
 
 import numpy as np
 import pytest
+from command_line import command
 
-from seasonscapes.commands.evaluate import evaluate, matching_gain
 from seasonscapes.errors import InputError
 from seasonscapes.evaluation.figures import comparison, error_colours, steepest_window
 from seasonscapes.evaluation.metrics import psnr_db
+from seasonscapes.evaluation.picture_pairs import matching_gain
 from seasonscapes.images import read_image_linear, write_exr, write_png8
 
 HEIGHT, WIDTH = 48, 64
@@ -34,8 +35,13 @@ def record_of(capsys) -> dict:
 
 
 def test_scores_folders_and_writes_tables(folders, capsys):
-    evaluate(
-        truth=folders / "truth", pictures=folders / "made", table=folders / "t.csv", figures=folders / "f", json=True
+    command(
+        "evaluate",
+        truth=folders / "truth",
+        pictures=folders / "made",
+        table=folders / "t.csv",
+        figures=folders / "f",
+        json=True,
     )
     record = record_of(capsys)
     expected = psnr_db(levels(0) / 255.0, (levels(0) + 10) / 255.0)
@@ -46,7 +52,7 @@ def test_scores_folders_and_writes_tables(folders, capsys):
     with open(folders / "t.csv") as file:
         assert float(next(csv.DictReader(file))["psnr_db"]) == pytest.approx(expected, abs=1e-3)
     assert read_image_linear(folders / "f" / "a_comparison.png").shape[1] > 3 * WIDTH
-    evaluate(truth=folders / "truth", pictures=folders / "made", table=folders / "t.md")
+    command("evaluate", truth=folders / "truth", pictures=folders / "made", table=folders / "t.md")
     assert (folders / "t.md").read_text().startswith("| picture")
     assert "mean" in capsys.readouterr().out
 
@@ -57,7 +63,8 @@ def test_masks_and_modes(folders, capsys):
     write_png8(folders / "mask.png", half)
     scores = {}
     for mode in ("valid", "paper"):
-        evaluate(
+        command(
+            "evaluate",
             truth=folders / "truth" / "a.png",
             pictures=folders / "made" / "a.png",
             mask=folders / "mask.png",
@@ -77,9 +84,9 @@ def test_radiance_is_developed_alike_and_masked_by_depth(tmp_path, capsys):
     spoilt[:16] *= 3.0
     write_exr(tmp_path / "truth.exr", {"": truth, "depth": depth})
     write_exr(tmp_path / "made.exr", {"": 2.0 * spoilt})
-    evaluate(truth=tmp_path / "truth.exr", pictures=tmp_path / "made.exr", json=True)
+    command("evaluate", truth=tmp_path / "truth.exr", pictures=tmp_path / "made.exr", json=True)
     plain = record_of(capsys)["pictures"][0]
-    evaluate(truth=tmp_path / "truth.exr", pictures=tmp_path / "made.exr", match="gain", json=True)
+    command("evaluate", truth=tmp_path / "truth.exr", pictures=tmp_path / "made.exr", match="gain", json=True)
     matched = record_of(capsys)["pictures"][0]
     assert plain["mask_share"] == pytest.approx((HEIGHT - 16) / HEIGHT)
     assert plain["psnr_db"] < 25.0 < 40.0 < matched["psnr_db"]
@@ -89,9 +96,9 @@ def test_radiance_is_developed_alike_and_masked_by_depth(tmp_path, capsys):
 def test_what_was_used_is_refused(folders):
     write_png8(folders / "used" / "other_name.png", levels(1))
     with pytest.raises(InputError, match="not held out"):
-        evaluate(truth=folders / "truth", pictures=folders / "made", used=(folders / "used",))
+        command("evaluate", truth=folders / "truth", pictures=folders / "made", used=(folders / "used",))
     with pytest.raises(InputError, match="--used"):
-        evaluate(truth=folders / "truth", pictures=folders / "made", used=(folders / "nowhere",))
+        command("evaluate", truth=folders / "truth", pictures=folders / "made", used=(folders / "nowhere",))
 
 
 def test_errors_of_the_user(folders):
@@ -110,16 +117,16 @@ def test_errors_of_the_user(folders):
     ]
     for arguments, message in cases:
         with pytest.raises(InputError, match=message):
-            evaluate(**arguments)
+            command("evaluate", **arguments)
     write_png8(folders / "small.png", levels(0)[:20])
     with pytest.raises(InputError, match="another size"):
-        evaluate(truth=truth / "a.png", pictures=folders / "small.png")
+        command("evaluate", truth=truth / "a.png", pictures=folders / "small.png")
     (folders / "broken.png").write_bytes(b"no picture")
     with pytest.raises(InputError, match="not a readable picture"):
-        evaluate(truth=truth / "a.png", pictures=folders / "broken.png")
+        command("evaluate", truth=truth / "a.png", pictures=folders / "broken.png")
     write_exr(folders / "linear.exr", {"": np.ones((HEIGHT, WIDTH, 3), np.float32)})
     with pytest.raises(InputError, match="cannot be compared"):
-        evaluate(truth=truth / "a.png", pictures=folders / "linear.exr")
+        command("evaluate", truth=truth / "a.png", pictures=folders / "linear.exr")
 
 
 def test_comparison_sheet():

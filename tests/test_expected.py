@@ -16,9 +16,9 @@ def place(tmp_path_factory):
     """A folder with a scene, its true albedo of the day as a file, and what the land truly sends then."""
     from datetime import UTC, datetime
 
-    from seasonscapes.commands.expected import expected_radiance
-    from seasonscapes.pipeline import MeshOptions, albedo_for, load_place
-    from seasonscapes.sky.models import read_sky_model
+    from seasonscapes.workflows.albedo_sources import albedo_for, load_albedo
+    from seasonscapes.workflows.place import MeshOptions, load_place
+    from seasonscapes.workflows.predicted_radiance import predict_radiance
     from seasonscapes.workspace import Workspace
 
     folder = tmp_path_factory.mktemp("expected")
@@ -29,7 +29,8 @@ def place(tmp_path_factory):
     true = albedo_for(land, utc)
     with atomic_path(folder / "albedo.npz") as temporary:
         save_texture(Texture(true.values, np.ones_like(true.weight)), temporary)
-    radiance = expected_radiance(land, folder / "albedo.npz", utc, read_sky_model("hosek"))
+    albedo = load_albedo(land, folder / "albedo.npz", utc.date())
+    radiance = predict_radiance(land, albedo, utc, sky="hosek")
     return folder, radiance.values
 
 

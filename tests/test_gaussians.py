@@ -15,7 +15,7 @@ from test_rendering import FRAME, heightfield, looking_down, sun_at  # noqa: E40
 
 from seasonscapes.cameras.exchange import NamedView, read_colmap, read_transforms  # noqa: E402
 from seasonscapes.cameras.pinhole import Camera, rotation_from_angles  # noqa: E402
-from seasonscapes.cli import app, main  # noqa: E402
+from seasonscapes.cli import main  # noqa: E402
 from seasonscapes.errors import InputError, NoTerrainInView  # noqa: E402
 from seasonscapes.frames import equirectangular_directions  # noqa: E402
 from seasonscapes.gaussians.appearance import Appearance, colours_at, fourier_embedding, light_tensors  # noqa: E402
@@ -66,9 +66,6 @@ from seasonscapes.sky.illumination import Illumination, global_horizontal_illumi
 from seasonscapes.terrain.attributes import vertex_normals  # noqa: E402
 
 choose_threads(1)
-for _verb in ("distill", "splat"):
-    if _verb not in list(app):
-        app.command(f"seasonscapes.commands.{_verb}:{_verb}")
 CAMERA = Camera(24, 20, 26.0, 24.0, 12.5, 9.5, np.eye(4))
 
 

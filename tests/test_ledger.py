@@ -5,7 +5,7 @@ import json
 import pytest
 
 from seasonscapes.errors import InputError
-from seasonscapes.ledger import Stage, run_stages
+from seasonscapes.workflows.stage_runner import Stage, run_stages
 
 
 class Chain:

@@ -16,14 +16,16 @@ import pytest
 from seasonscapes.albedo.seasons import season_weights
 from seasonscapes.cli import main
 from seasonscapes.errors import InputError
-from seasonscapes.pipeline import MeshOptions, dated_albedos, load_place
 from seasonscapes.relighting.exposure_smoothing import smoothed_ev100
 from seasonscapes.relighting.film import write_film
 from seasonscapes.relighting.frame_file import frame_ev100, load_frame, save_frame
 from seasonscapes.relighting.luminous_efficacy import efficacies_lm_w
 from seasonscapes.scene import read_scene
 from seasonscapes.sky.models import read_sky_model
-from seasonscapes.studio import Assignment, frames_folder, open_studio, render_frame, shard, view_at
+from seasonscapes.workflows.albedo_sources import dated_albedos
+from seasonscapes.workflows.place import MeshOptions, load_place
+from seasonscapes.workflows.relight_session import RenderJob, open_session, view_at
+from seasonscapes.workflows.timelapse import frames_folder, render_frame, shard
 from seasonscapes.workspace import Workspace
 
 NOON = datetime(2024, 6, 21, 11, tzinfo=UTC)
@@ -31,11 +33,11 @@ SIZE = (48, 32)
 
 
 @pytest.fixture(scope="module")
-def hill(tmp_path_factory) -> Assignment:
+def hill(tmp_path_factory) -> RenderJob:
     """A hill of 3 km under the Hosek sky, whose light costs little."""
     folder = tmp_path_factory.mktemp("hill")
     path = places.write_place(folder)
-    return Assignment(
+    return RenderJob(
         str(path),
         str(folder / "workspace"),
         MeshOptions(),
@@ -46,7 +48,7 @@ def hill(tmp_path_factory) -> Assignment:
     )
 
 
-def place_of(assignment: Assignment):
+def place_of(assignment: RenderJob):
     return load_place(Path(assignment.scene), Workspace(Path(assignment.workspace)))
 
 
@@ -109,7 +111,7 @@ def test_a_film_plays(tmp_path):
     assert about["fps"] == 2.0
     frames = [np.frombuffer(frame, np.uint8).mean() for frame in reader]
     np.testing.assert_allclose(frames, [0.5, 63.5, 127.5, 255.0], atol=4.0)
-    with pytest.raises(ValueError, match="no picture"):
+    with pytest.raises(ValueError, match="got no images"):
         write_film(tmp_path / "empty.mp4", iter([]))
     assert [path.name for path in tmp_path.iterdir()] == ["f.mp4"]
 
@@ -119,7 +121,7 @@ def test_a_frame_equals_path_tracing(hill):
     from seasonscapes.rendering.mitsuba_scene import build_scene
     from seasonscapes.rendering.radiance import render_view
 
-    studio = open_studio(hill)
+    studio = open_session(hill)
     view, light, _ = view_at(studio, NOON)
     scene = build_scene(studio.place.terrain, studio_albedo(studio), light)
     reference = render_view(scene, studio.camera, spp=512)
@@ -131,7 +133,7 @@ def test_a_frame_equals_path_tracing(hill):
 
 
 def studio_albedo(studio):
-    from seasonscapes.pipeline import albedo_for
+    from seasonscapes.workflows.albedo_sources import albedo_for
 
     return albedo_for(studio.place, NOON).values
 
@@ -148,7 +150,7 @@ def test_dated_albedos_dress_the_view(hill, tmp_path):
     for day, level in (("2024-03-22", 0.1), ("2024-09-19", 0.3)):
         save_texture(Texture(np.full(shape, level, np.float32)), tmp_path / f"{day}.npz")
         pairs.append((day, str(tmp_path / f"{day}.npz")))
-    dressed = open_studio(replace(hill, albedo=tuple(pairs)))
+    dressed = open_session(replace(hill, albedo=tuple(pairs)))
     pictures = [
         view_at(dressed, datetime(2024, month, day, 11, tzinfo=UTC))[0] for month, day in ((3, 22), (6, 20), (9, 19))
     ]
@@ -163,9 +165,9 @@ def test_dated_albedos_dress_the_view(hill, tmp_path):
     assert [round(weight, 2) for _, weight in weights] == [0.5, 0.5]
     np.testing.assert_allclose(middle.coefficients.albedo[middle.coefficients.coverage == 1.0], 0.2, atol=2e-3)
     with pytest.raises(InputError, match="no such file"):
-        open_studio(replace(hill, albedo=(("2024-03-22", "missing.npz"),)))
+        open_session(replace(hill, albedo=(("2024-03-22", "missing.npz"),)))
     with pytest.raises(InputError, match="not a date"):
-        open_studio(replace(hill, albedo=(("March", pairs[0][1]),)))
+        open_session(replace(hill, albedo=(("March", pairs[0][1]),)))
 
 
 def test_shards_are_a_partition():
@@ -177,7 +179,7 @@ def test_shards_are_a_partition():
             shard(times, wrong)
 
 
-def arguments(hill: Assignment, output: Path, *more: str) -> list[str]:
+def arguments(hill: RenderJob, output: Path, *more: str) -> list[str]:
     return [
         "timelapse",
         hill.scene,
@@ -365,17 +367,17 @@ def test_watts_agree_with_pvlib():
     import pandas as pd
     import pvlib
 
-    from seasonscapes.daylight import light_at, moment_at
     from seasonscapes.relighting.lit_texture import _efficacies
     from seasonscapes.sky.illumination import diffuse_horizontal_illuminance, direct_horizontal_illuminance, luminance
+    from seasonscapes.workflows.illumination import illumination_at, sun_moon_position
     from seasonscapes.workspace import default_workspace
 
     when = datetime(2024, 6, 21, 11, 20, tzinfo=UTC)
     place = pvlib.location.Location(46.55, 7.98, altitude=2000.0)
     expected = place.get_clearsky(pd.DatetimeIndex([when]), linke_turbidity=2.6).iloc[0]
-    light = light_at(
+    light = illumination_at(
         read_sky_model("clear"),
-        moment_at(when, 46.55, 7.98, 2000.0),
+        sun_moon_position(when, 46.55, 7.98, 2000.0),
         2000.0,
         workspace=default_workspace(),
         with_air=False,
@@ -390,16 +392,16 @@ def test_irradiance_map_of_a_hill(hill, tmp_path, capsys):
     """Flat ground gets sun × sine of its elevation; sun and sky arrive as the report of the sky says."""
     import rasterio
 
-    from seasonscapes.daylight import light_at, moment_at
     from seasonscapes.sky.illumination import global_horizontal_illuminance, luminance
+    from seasonscapes.workflows.illumination import illumination_at, sun_moon_position
 
     common = ["irradiance", hill.scene, "--workspace", hill.workspace, "--sky", "hosek", "--rays", "64", "--json"]
     assert main([*common, "--time", "2024-06-21T11:00Z", "-o", str(tmp_path / "a.tif")]) == 0
     record = json.loads(capsys.readouterr().out)
     place = place_of(hill)
     height_m = float(np.median(place.elevation.values))
-    moment = moment_at(NOON, place.frame.latitude_deg, place.frame.longitude_deg, height_m)
-    light = light_at(hill.model, moment, height_m, workspace=place.workspace)
+    moment = sun_moon_position(NOON, place.frame.latitude_deg, place.frame.longitude_deg, height_m)
+    light = illumination_at(hill.model, moment, height_m, workspace=place.workspace)
     with rasterio.open(tmp_path / "a.tif") as file:
         assert file.descriptions == ("total W/m2", "direct W/m2", "sky W/m2", "reflected W/m2", "total lx")
         assert file.crs.to_epsg() == 32632

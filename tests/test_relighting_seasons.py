@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import places
 import pytest
+from seasonscapes.studio import dressed_view
 
 from seasonscapes.albedo.seasons import (
     albedo_at,
@@ -17,12 +18,13 @@ from seasonscapes.albedo.seasons import (
     snowline_fraction,
 )
 from seasonscapes.cli import main
-from seasonscapes.pipeline import MeshOptions, albedo_of_day, dated_albedos, load_place
 from seasonscapes.scene import read_scene
 from seasonscapes.sky.models import read_sky_model
-from seasonscapes.studio import Assignment, dressed_view, open_studio
 from seasonscapes.terrain.attributes import TerrainAttributes, texel_attributes
 from seasonscapes.terrain.surface import Texture, load_texture, save_texture
+from seasonscapes.workflows.albedo_sources import albedo_of_day, dated_albedos
+from seasonscapes.workflows.place import MeshOptions, load_place
+from seasonscapes.workflows.relight_session import RenderJob, open_session
 from seasonscapes.workspace import Workspace
 
 BARE, WHITE = np.array([0.12, 0.14, 0.05], np.float32), np.array([0.80, 0.80, 0.82], np.float32)
@@ -178,7 +180,7 @@ def test_albedo_at_knows_its_dates():
 
 
 @pytest.fixture(scope="module")
-def mountain(tmp_path_factory) -> Assignment:
+def mountain(tmp_path_factory) -> RenderJob:
     """A cone of 900 m, white on the tenth of April and green in July but for its summit, seen from the south."""
     folder = tmp_path_factory.mktemp("mountain")
     seen = places.SCENE.replace("46.5405", "46.5385").replace("120.0", "500.0").replace("-8.0", "3.0")
@@ -195,7 +197,7 @@ def mountain(tmp_path_factory) -> Assignment:
         values[texel] = snow_above(ground, line_m, by_north_m=150.0)
         save_texture(Texture(values.reshape(*shape, 3)), folder / f"{day}.npz")
         pairs.append((day.isoformat(), str(folder / f"{day}.npz")))
-    return Assignment(
+    return RenderJob(
         str(path),
         str(folder / "workspace"),
         MeshOptions(),
@@ -239,7 +241,7 @@ def test_a_film_of_a_spring(mountain):
     """In the view's own pixels, as frames are lit."""
     from dataclasses import replace
 
-    studio = open_studio(mountain)
+    studio = open_session(mountain)
     land = studio.coefficients.coverage == 1.0
     height_m = studio.coefficients.sample_origin[land][:, 0, 2]
     film = [dressed_view(studio, day).coefficients.albedo[land] for day in DAYS]
@@ -247,7 +249,7 @@ def test_a_film_of_a_spring(mountain):
     assert np.diff(rows, axis=0).max() <= 1e-6
     assert np.diff(rows, axis=1).min() > -0.1
     assert rows[0].mean() > rows[5].mean() + 0.1 > rows[-1].mean() + 0.2
-    faded = open_studio(replace(mountain, season="blended"))
+    faded = open_session(replace(mountain, season="blended"))
     middle = dressed_view(faded, DAYS[5]).coefficients.albedo[land]
     assert half_done(film[5]) < 0.5 * half_done(middle)
     # On the dates themselves both wear the very same.
@@ -282,9 +284,9 @@ def test_timelapse_moves_the_snow_line(mountain, tmp_path, capsys):
 
 def test_frames_of_a_day_have_its_line(mountain):
     """The light moves through a day, the snow does not; another day has another line."""
-    from seasonscapes.studio import view_at
+    from seasonscapes.workflows.relight_session import view_at
 
-    studio = open_studio(mountain)
+    studio = open_session(mountain)
     times = [datetime(2023, month, 20, hour, tzinfo=UTC) for month, hour in ((5, 8), (5, 15), (6, 15))]
     worn = []
     for time in times:
@@ -326,8 +328,8 @@ def test_render_wears_dated_albedos(mountain, tmp_path, capsys):
 
 
 def test_distill_takes_dates_of_any_years(mountain):
-    from seasonscapes.commands.distill import dated_textures
     from seasonscapes.errors import InputError
+    from seasonscapes.workflows.distillation import dated_textures
 
     place = load_place(Path(mountain.scene), Workspace(Path(mountain.workspace)))
     (_, snowy), (_, green) = mountain.albedo

@@ -12,13 +12,17 @@ from seasonscapes.calibration.pose_model import values_of
 from seasonscapes.calibration.resection import Calibration
 from seasonscapes.cameras.observation import ManifestRow, read_manifest, write_manifest
 from seasonscapes.cameras.pinhole import Camera
-from seasonscapes.commands.options import PlaceOptions, SkyOptions, ViewOptions
-from seasonscapes.commands.run import Job, RunEffort, stages_of
-from seasonscapes.commands.run_webcams import RunPictures
 from seasonscapes.errors import InputError
 from seasonscapes.frames import LocalFrame
 from seasonscapes.images import write_png8
-from seasonscapes.ledger import run_stages
+from seasonscapes.sky.models import read_sky_model
+from seasonscapes.workflows.distillation import DistilOptions
+from seasonscapes.workflows.full_run import RunJob, stages_of
+from seasonscapes.workflows.photograph_files import PhotographSources
+from seasonscapes.workflows.place import MeshOptions, load_place
+from seasonscapes.workflows.run_photographs import RunPhotographs
+from seasonscapes.workflows.stage_runner import run_stages
+from seasonscapes.workspace import Workspace
 
 NOON = datetime(2024, 9, 1, 10, tzinfo=UTC)
 AFTER = ["albedo", "paint", "inpaint", "relight", "distil", "splat"]
@@ -56,21 +60,18 @@ class Real:
             self.folder / "records" / f"{webcam}_calibration.json", webcam, solved, LocalFrame(46.55, 7.98)
         )
 
-    def job(self, **changed) -> Job:
-        pictures = RunPictures(
-            manifest=self.inputs / "manifest.csv", calibrations=self.folder / "records", masks=self.folder / "masks"
-        )
-        times = tuple((NOON + timedelta(hours=hour)).isoformat() for hour in range(2))
-        job = Job(
-            str(self.scene),
+    def job(self, **changed) -> RunJob:
+        sources = PhotographSources(self.inputs / "manifest.csv", self.folder / "records", self.folder / "masks")
+        place = load_place(self.scene, Workspace(self.folder / "work"), options=MeshOptions(texel_m=50.0))
+        times = tuple(NOON + timedelta(hours=hour) for hour in range(2))
+        job = RunJob(
+            place,
             times,
-            (NOON.isoformat(),),
-            pictures,
-            RunEffort(),
-            ViewOptions(size="12x8"),
-            SkyOptions(sky="hosek"),
-            PlaceOptions(workspace=self.folder / "work", texel_m=50.0),
-            0,
+            (NOON,),
+            place.scene.camera(None),
+            (12, 8),
+            read_sky_model("hosek"),
+            RunPhotographs(sources),
         )
         return replace(job, **changed)
 
@@ -91,7 +92,7 @@ class Real:
 
             return replace(stage, build=build)
 
-        run_stages(self.folder / "run", [counted(stage) for stage in stages_of(job, job.place.load(job.scene))])
+        run_stages(self.folder / "run", [counted(stage) for stage in stages_of(job)])
         return made
 
 
@@ -168,8 +169,8 @@ def test_changed_heights_or_imagery_are_noticed(real):
 
 
 def test_arguments_of_later_stages_leave_the_earlier_ones_fresh(real):
-    assert real.made(effort=RunEffort(steps=3)) == ["distil", "splat"]
-    assert real.made(effort=RunEffort(steps=3), hours=((NOON + timedelta(hours=5)).isoformat(),)) == [
+    assert real.made(distil=DistilOptions(steps=3)) == ["distil", "splat"]
+    assert real.made(distil=DistilOptions(steps=3), hours=((NOON + timedelta(hours=5)).isoformat(),)) == [
         "relight",
         "splat",
     ]
@@ -182,26 +183,18 @@ def test_photographs_of_a_synthetic_scene_are_keyed_by_how_they_are_taken(tmp_pa
 
     def key(text=MASSIF, **pictures) -> dict:
         (tmp_path / "little.toml").write_text(text)
-        place = PlaceOptions(workspace=tmp_path / "work", texel_m=240.0, refine=1)
-        job = Job(
-            str(tmp_path / "little.toml"),
-            (NOON.isoformat(),),
-            (NOON.isoformat(),),
-            RunPictures(**pictures),
-            RunEffort(),
-            ViewOptions(),
-            SkyOptions(sky="hosek"),
-            place,
-            0,
-        )
-        return stages_of(job, place.load(job.scene))[0].inputs
+        options = MeshOptions(texel_m=240.0, refine=1)
+        place = load_place(tmp_path / "little.toml", Workspace(tmp_path / "work"), options=options)
+        model, photographs = read_sky_model("hosek"), RunPhotographs(**pictures)
+        job = RunJob(place, (NOON,), (NOON,), place.scene.camera(None), (768, 512), model, photographs)
+        return stages_of(job)[0].inputs
 
     plain = key()
     assert plain == key()
     others = [
-        key(photo_size="720x120"),
-        key(photo_kind="perspective"),
-        key(leave_out="meadow"),
+        key(size_px=(720, 120)),
+        key(kind="perspective", size_px=(720, 480)),
+        key(leave_out=frozenset({"meadow"})),
         key(MASSIF.replace("60.0\nheading_deg = 164.3", "70.0\nheading_deg = 164.3")),
     ]
     assert all(other != plain for other in others)

@@ -6,8 +6,9 @@ import pytest
 import rasterio
 
 from seasonscapes.declaration import InputError
-from seasonscapes.pipeline import MeshOptions, camera_for, load_place
 from seasonscapes.scene import read_scene
+from seasonscapes.workflows.place import MeshOptions, load_place
+from seasonscapes.workflows.views import camera_for
 from seasonscapes.workspace import Workspace
 
 
@@ -130,7 +131,7 @@ def in_feet_and_a_half(values, profile):
 def test_each_bad_raster_has_its_line(tmp_path, name, change, message):
     from datetime import UTC, datetime
 
-    from seasonscapes.pipeline import albedo_for
+    from seasonscapes.workflows.albedo_sources import albedo_for
 
     path = places.write_place(tmp_path)
     spoil(tmp_path / name, change)

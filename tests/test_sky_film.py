@@ -188,7 +188,8 @@ def test_light_for_a_film_takes_its_tables_from_the_workspace(tmp_path, looked_u
     """Once they lie there, a second process sees the same sky to the digit; the sky behind the land is the picture's."""
     import places
 
-    from seasonscapes.pipeline import camera_for, load_place
+    from seasonscapes.workflows.place import load_place
+    from seasonscapes.workflows.views import camera_for
 
     asked = []
 

@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 import places
 import pytest
+from command_line import command
 from PIL import Image
 from scipy.spatial import cKDTree
 
@@ -20,13 +21,11 @@ from seasonscapes.cameras.trajectory import (
     roll_of,
     views_along,
 )
-from seasonscapes.commands.options import PlaceOptions
-from seasonscapes.commands.path import path
 from seasonscapes.errors import InputError, InvalidPath
 from seasonscapes.frames import LocalFrame, enu_from_geodetic
-from seasonscapes.workflows.camera_paths import waypoint_cameras
-from seasonscapes.workflows.place import MeshOptions, find_scene, load_place
-from seasonscapes.workflows.views import local_ground
+from seasonscapes.workflows.camera_paths import Waypoint, waypoint_cameras
+from seasonscapes.workflows.place import MeshOptions, find_scene, ground_height_m, load_place
+from seasonscapes.workflows.views import camera_for, local_ground
 from seasonscapes.workspace import Workspace
 
 FRAME = LocalFrame(46.55, 7.98, 1000.0, 0.13)
@@ -217,7 +216,13 @@ def test_clearance_on_the_embedded_scene_by_rays(alpine, curve):
     from seasonscapes.rendering.hemisphere_rays import ray_scene
     from seasonscapes.rendering.mitsuba_scene import RenderScene, mi_mesh
 
-    known = waypoint_cameras(alpine, ["aerial", "meadow", "lake", "46.55,7.95,+80", "ridge"], 60.0, (96, 64))
+    named = {
+        name: camera_for(alpine, alpine.scene.camera(name), size_px=(96, 64))
+        for name in ("aerial", "meadow", "lake", "ridge")
+    }
+    free = Waypoint(46.55, 7.95, ground_height_m(alpine, 46.55, 7.95, where="free") + 80.0)
+    given = [named["aerial"], named["meadow"], named["lake"], free, named["ridge"]]
+    known = waypoint_cameras(alpine, given, fov_deg=60.0, size_px=(96, 64))
     terrain = ray_scene(mi_mesh(alpine.terrain, np.full(3, 0.2)))
 
     def above(line):
@@ -365,8 +370,9 @@ def scene(tmp_path, monkeypatch):
 
 
 def test_the_verb_writes_a_path_and_a_map(scene, tmp_path, capsys):
-    path(
-        str(scene),
+    command(
+        "path",
+        scene,
         via=["south", "46.5505,7.9805,+60", "46.56,7.97,1500"],
         views=12,
         clearance_m=40.0,
@@ -378,7 +384,7 @@ def test_the_verb_writes_a_path_and_a_map(scene, tmp_path, capsys):
     record = json.loads(capsys.readouterr().out)
     assert record["views"] == 12
     assert record["lowest_above_ground_m"] >= 40.0
-    land = PlaceOptions().load(str(scene))
+    land = load_place(scene)
     views = load_path(tmp_path / "p.json", land.frame)
     assert [len(views), views[0].width_px, views[0].height_px] == [12, 96, 64]
     assert view_record(views[0], land.frame)["heading_deg"] == pytest.approx(0.0, abs=1e-3)
@@ -397,10 +403,10 @@ def test_the_verb_writes_a_path_and_a_map(scene, tmp_path, capsys):
 
 def test_the_verb_reads_reference_files(scene, tmp_path, capsys):
     file = reference_file(tmp_path)
-    path(str(scene), reference=file, kind="unrefined", output=tmp_path / "p.json", clearance_m=0.0, json=True)
+    command("path", scene, reference=file, kind="unrefined", output=tmp_path / "p.json", clearance_m=0.0, json=True)
     record = json.loads(capsys.readouterr().out)
     assert (record["views"], record["curve"]) == (10, "linear")
-    views = load_path(tmp_path / "p.json", PlaceOptions().load(str(scene)).frame)
+    views = load_path(tmp_path / "p.json", load_place(scene).frame)
     assert (views[0].width_px, views[0].fx, views[0].fy) == (1536, pytest.approx(500.0), pytest.approx(700.0))
 
 
@@ -418,5 +424,5 @@ def test_the_verb_says_what_is_wrong(scene, tmp_path):
         ({"reference": tmp_path / "none.json"}, "none.json"),
     ):
         with pytest.raises(InputError, match=words):
-            path(str(scene), output=tmp_path / "p.json", **flags)
+            command("path", scene, output=tmp_path / "p.json", **flags)
     assert not (tmp_path / "p.json").exists()

@@ -1,5 +1,6 @@
 """Synthetic webcams' files: one function photographs for `run`, `paint` and `albedo`; finished ones are kept."""
 
+import logging
 from dataclasses import replace
 from datetime import UTC, datetime
 
@@ -11,15 +12,19 @@ from seasonscapes.calibration.calibration_file import read_calibration
 from seasonscapes.calibration.skyline import encoded_from_file
 from seasonscapes.cameras.observation import read_manifest
 from seasonscapes.cameras.panorama import Panorama, level_panorama
-from seasonscapes.commands.albedo import _opened, _with_terrain
-from seasonscapes.commands.options import PlaceOptions, SkyOptions
-from seasonscapes.commands.paint import chosen_cameras
-from seasonscapes.commands.webcam_shots import calibrated_views, make_webcam_series, photographs, rows_at, shots_of
-from seasonscapes.errors import InputError
+from seasonscapes.errors import InputError, NoTerrainInView
 from seasonscapes.evaluation import synthetic_webcams
 from seasonscapes.rendering.hemisphere_rays import ray_scene
 from seasonscapes.rendering.mitsuba_scene import mi_mesh
 from seasonscapes.rendering.transport import SamplingOptions
+from seasonscapes.sky.models import read_sky_model
+from seasonscapes.workflows.albedo_recovery import with_terrain
+from seasonscapes.workflows.painting import painting_inputs
+from seasonscapes.workflows.photograph_files import observations, photographs_at, rows_at, uncalibrated
+from seasonscapes.workflows.place import MeshOptions, load_place
+from seasonscapes.workflows.synthetic_photographs import photograph_each, photograph_series
+from seasonscapes.workflows.views import scene_cameras
+from seasonscapes.workspace import Workspace
 
 TIMES = [datetime(2024, 7, 20, hour, tzinfo=UTC) for hour in (8, 13)]
 
@@ -29,23 +34,22 @@ def taken(tmp_path_factory):
     """A place, its two webcams as panoramas, and where their pictures lie."""
     folder = tmp_path_factory.mktemp("webcams")
     (folder / "little.toml").write_text(MASSIF)
-    place = PlaceOptions(workspace=folder / "work", texel_m=240.0, refine=1, max_error_m=20.0).load(
-        str(folder / "little.toml")
-    )
+    options = MeshOptions(texel_m=240.0, refine=1, max_error_m=20.0)
+    place = load_place(folder / "little.toml", Workspace(folder / "work"), options=options)
     size = (240, 48)
     cameras = {
-        name: level_panorama(camera, place.frame, size) for name, camera in chosen_cameras(place, None, size).items()
+        name: level_panorama(camera, place.frame, size) for name, camera in scene_cameras(place, size_px=size).items()
     }
     before = synthetic_webcams.webcam_series.__kwdefaults__["sampling"]
     synthetic_webcams.webcam_series.__kwdefaults__["sampling"] = SamplingOptions(4, 4, 16, 1, 64, 16, 8)
-    model = SkyOptions(sky="hosek").model()
-    yield place, cameras, model, make_webcam_series(place, TIMES, model, folder / "shots", cameras=cameras)
+    model = read_sky_model("hosek")
+    yield place, cameras, model, photograph_series(place, TIMES, model, folder / "shots", cameras=cameras)
     synthetic_webcams.webcam_series.__kwdefaults__["sampling"] = before
 
 
 def test_a_level_panorama_turns_about_the_cameras_own_vertical(taken):
     place, cameras, _, _ = taken
-    views = chosen_cameras(place, None, (240, 48))
+    views = scene_cameras(place, size_px=(240, 48))
     from seasonscapes.calibration.pose_model import angles_from_rotation
     from seasonscapes.frames import geodetic_from_enu, local_axes
 
@@ -63,7 +67,7 @@ def test_the_files_are_what_was_photographed(taken):
     place, cameras, model, sources = taken
     rows = read_manifest(sources.manifest)
     assert [(row.webcam, row.time) for row in rows] == [(name, time) for name in cameras for time in TIMES]
-    made = dict(photographs(place, TIMES, model, {"meadow": cameras["meadow"]}))["meadow"]
+    made = dict(photograph_each(place, TIMES, model, {"meadow": cameras["meadow"]}))["meadow"]
     assert made[0].observation.camera.fx == cameras["meadow"].fx
     exact = encoded_from_file(sources.manifest.parent / rows[2].path)
     # Poses apart, the pictures of `albedo --synthetic-webcams` are those that `run` writes.
@@ -78,40 +82,39 @@ def test_finished_webcams_are_kept_and_others_made(taken):
     lost = next(folder.glob("meadow_*.png"))
     content = lost.read_bytes()
     lost.unlink()
-    make_webcam_series(place, TIMES, model, folder, cameras=cameras)
+    photograph_series(place, TIMES, model, folder, cameras=cameras)
     assert lost.read_bytes() == content
     again = {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
     assert again.keys() == files.keys()
     assert all(again[name] == files[name] for name in files if name.startswith("aerial"))
 
 
-def test_views_of_panoramas_serve_paint_and_albedo_alike(taken, tmp_path, capsys):
+def test_views_of_panoramas_serve_paint_and_albedo_alike(taken, tmp_path, caplog):
     place, _, model, sources = taken
     rows = rows_at(sources, TIMES[0], within_min=1.0)
-    views, without = calibrated_views(rows, sources, place.frame)
-    assert without == []
-    assert [pose.webcam for pose, _ in views] == ["aerial", "meadow"]
-    inputs, _ = shots_of(place, rows, sources, model)
-    opened = _opened(place, TIMES[:1], (sources.manifest, sources.calibrations, None), 1.0)
-    for item, one in zip(inputs, opened, strict=True):
-        assert item.observation.webcam == one.webcam
-        np.testing.assert_array_equal(item.observation.image, one.image)
+    assert uncalibrated(rows, sources) == []
+    opened = photographs_at(place, sources, TIMES[:1], within_min=1.0)
+    assert {each.webcam.split("/")[0] for each in opened} == {"aerial", "meadow"}
+    for painting_input, photograph in zip(painting_inputs(place, opened, model), opened, strict=True):
+        assert painting_input.observation.webcam == photograph.webcam
+        assert painting_input.pose_sigma["heading_deg"] == 0.01
+        np.testing.assert_array_equal(painting_input.observation.image, photograph.image)
 
     # Parts of a panorama that show sky alone are left out, and so is what a mask leaves nothing of.
     class Traced:
         ray_scene = ray_scene(mi_mesh(place.terrain, np.full(3, 0.2)))
 
-    kept = _with_terrain(Traced, opened)
-    said = capsys.readouterr().err
+    with caplog.at_level(logging.INFO, logger="seasonscapes"):
+        kept = with_terrain(Traced, opened)
     assert 0 < len(kept) < len(opened)
-    assert "left out: aerial/0: it sees none of the terrain" in said
+    assert "left out: aerial/0: it sees none of the terrain" in caplog.text
     nothing = [replace(one, mask=np.zeros_like(one.mask)) for one in opened]
-    with pytest.raises(InputError, match="no photograph shows any of the terrain"):
-        _with_terrain(Traced, nothing)
+    with pytest.raises(NoTerrainInView, match="no photograph shows any of the terrain"):
+        with_terrain(Traced, nothing)
     with pytest.raises(InputError, match="holds no calibration"):
-        calibrated_views(rows, replace(sources, calibrations=tmp_path), place.frame)
+        observations(rows, replace(sources, calibrations=tmp_path), place.frame)
     with pytest.raises(InputError, match="--times: no picture within"):
-        _opened(place, [TIMES[0].replace(month=3)], (sources.manifest, sources.calibrations, None), 1.0)
+        photographs_at(place, sources, [TIMES[0].replace(month=3)], within_min=1.0)
 
 
 def test_a_webcam_that_sees_no_land_is_named(taken):
@@ -119,4 +122,4 @@ def test_a_webcam_that_sees_no_land_is_named(taken):
     pose = cameras["aerial"].world_from_camera.copy()
     pose[:3, 3] = [0.0, 0.0, 8900.0]  # the land lies below its rows
     with pytest.raises(InputError, match="camera 'high': sees no terrain"):
-        list(photographs(place, TIMES[:1], model, {"high": replace(cameras["aerial"], world_from_camera=pose)}))
+        list(photograph_each(place, TIMES[:1], model, {"high": replace(cameras["aerial"], world_from_camera=pose)}))

@@ -9,7 +9,7 @@ import platform
 import sys
 
 from seasonscapes import __version__
-from seasonscapes.commands.talk import finish
+from seasonscapes.commands.console import print_result
 from seasonscapes.rendering.backend import LLVM_CURE, choose_backend, cuda_devices, find_llvm, probe_in_child
 
 # What each extra of the package brings, by the module that shows it is there.
@@ -17,16 +17,13 @@ EXTRAS = {
     "gaussians": "torch",
     "diffusion": "diffusers",
     "poisson": "open3d",
-    "viewer": "viser",
     "cluster": "distributed",
-    "data": "pystac_client",
-    "denoise": "pyoidn",
     "metrics": "flip_evaluator",
 }
 
 
-def doctor(*, json: bool = False) -> None:
-    """Say what this machine can do: Python, renderer, libLLVM, extras, and a short test render.
+def doctor_command(*, json: bool = False) -> None:
+    """Report what this machine can do: Python, renderer, libLLVM, extras, and a short test render.
 
     Never crashes: the test render runs in a process of its own, and a libLLVM that would abort is named instead.
 
@@ -71,7 +68,7 @@ def doctor(*, json: bool = False) -> None:
     ]
     if backend.device == "scalar":
         lines.append(f"advice        {LLVM_CURE}")
-    finish(record, lines, as_json=json)
+    print_result(record, lines, as_json=json)
     if not works:
         sys.exit(1)
 

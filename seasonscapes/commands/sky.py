@@ -7,12 +7,13 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from seasonscapes.commands.arguments import check_suffix, parse_at
+from seasonscapes.commands.console import message, print_result, progress_bars
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
-from seasonscapes.commands.talk import check_suffix, finish, parse_at, say
 from seasonscapes.errors import InputError
 
 
-def sky(
+def sky_command(
     scene: str | None = None,
     *,
     time: str,
@@ -22,7 +23,7 @@ def sky(
     place: PlaceOptions | None = None,
     json: bool = False,
 ) -> None:
-    """Tell the light of a place at an instant: sun, moon, twilight, illuminance, colour; and picture the dome.
+    """Report the light of a place at an instant: sun, moon, twilight, illuminance, colour; and picture the sky dome.
 
     Parameters
     ----------
@@ -33,27 +34,27 @@ def sky(
     at
         LAT,LON,HEIGHT instead of a scene; sea level when the height is left out.
     output
-        A .png of the dome (a map of the sky: north up, east right), or an .exr of the whole sphere.
+        A .png of the dome (north up, east right), or an .exr of the whole sphere.
     json
         Print one machine-readable record.
     """
     from seasonscapes.civil_time import resolve_time
-    from seasonscapes.daylight import light_at, moment_at
     from seasonscapes.images import write_exr, write_png
     from seasonscapes.sky.report import dome_picture, record_lines, sky_record
+    from seasonscapes.workflows.illumination import illumination_at, sun_moon_position
 
-    place = place or PlaceOptions()
+    options = place or PlaceOptions()
     if (scene is None) == (at is None):
         raise InputError("sky", "give either a scene or --at LAT,LON,HEIGHT", got="both" if at else "neither")
     if output is not None:
         check_suffix(output, (".png", ".exr"))
     model = (sky or SkyOptions()).model()
-    latitude, longitude, height_m = _standpoint(scene, at, place)
+    latitude, longitude, height_m = _standpoint(scene, at, options)
     resolved = resolve_time(time, latitude, longitude)
-    say(resolved.reading)
-    moment = moment_at(resolved.utc, latitude, longitude, height_m)
-    light = light_at(model, moment, height_m, workspace=place.folder())
-    record = sky_record(light, resolved.utc, moment.sun, moment.moon, latitude, longitude, zone=resolved.zone)
+    message(resolved.reading)
+    position = sun_moon_position(resolved.utc, latitude, longitude, height_m)
+    light = illumination_at(model, position, height_m, workspace=options.folder())
+    record = sky_record(light, resolved.utc, position.sun, position.moon, latitude, longitude, zone=resolved.zone)
     record["place"] = {"latitude_deg": latitude, "longitude_deg": longitude, "height_m": height_m}
     if output is not None:
         if output.suffix.lower() == ".png":
@@ -61,16 +62,15 @@ def sky(
         else:
             write_exr(output, {"": light.sky_radiance}, header={"seasonscapes:sky": record})
         record["output"] = str(output)
-    finish(record, record_lines(record), as_json=json)
+    print_result(record, record_lines(record), as_json=json)
 
 
-def _standpoint(scene: str | None, at: str | None, place: PlaceOptions) -> tuple[float, float, float]:
-    """Latitude, longitude [deg] and the height [m] at which one stands."""
+def _standpoint(scene: str | None, at: str | None, options: PlaceOptions) -> tuple[float, float, float]:
+    """Latitude, longitude [deg] and height [m] of the observer."""
     if at is None:
-        from seasonscapes.daylight import median_height_m
-
-        land = place.load(str(scene))
-        return land.frame.latitude_deg, land.frame.longitude_deg, median_height_m(land)
+        with progress_bars() as progress:
+            place = options.load(str(scene), progress)
+        return place.frame.latitude_deg, place.frame.longitude_deg, place.median_height_m
     latitude, longitude, height, _ = parse_at(at)
     if height is None and "+" in at:
         raise InputError("--at", "without a scene there is no ground to stand above", got=at, expected="LAT,LON,HEIGHT")

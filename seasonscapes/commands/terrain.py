@@ -7,12 +7,12 @@ import sys
 import time as clock
 from dataclasses import asdict
 
+from seasonscapes.commands.console import message, print_result, progress_bars
 from seasonscapes.commands.options import PlaceOptions
-from seasonscapes.commands.talk import finish, say
 
 
-def terrain(scene: str, *, options: PlaceOptions | None = None, json: bool = False) -> None:
-    """Build a place's terrain and report how good it is.
+def terrain_command(scene: str, *, options: PlaceOptions | None = None, json: bool = False) -> None:
+    """Build a place's terrain and report its triangles, vertical errors and texel density.
 
     Parameters
     ----------
@@ -24,11 +24,12 @@ def terrain(scene: str, *, options: PlaceOptions | None = None, json: bool = Fal
     from seasonscapes.terrain.mesh import mesh_report
 
     start = clock.perf_counter()
-    place = (options or PlaceOptions()).load(scene)
+    with progress_bars() as progress:
+        place = (options or PlaceOptions()).load(scene, progress)
     seconds = clock.perf_counter() - start
     if place.fill.filled_cells:
         fill = place.fill
-        say(
+        message(
             f"filled {fill.filled_cells} cells without data ({100 * fill.share:.2f} %) in {fill.holes} holes, "
             f"the largest of {fill.largest_hole_cells} cells"
         )
@@ -45,16 +46,16 @@ def terrain(scene: str, *, options: PlaceOptions | None = None, json: bool = Fal
         "peak_gb": round(peak_gb, 3),
     }
     height, width = place.elevation.values.shape[:2]
-    texels = place.atlas
+    atlas = place.atlas
     lines = [
         f"{place.scene.title or place.scene.name}: {width} × {height} samples, frame at {place.frame.latitude_deg:.5f}°, "
         f"{place.frame.longitude_deg:.5f}°",
         f"triangles  {report.triangles:,}, {report.triangles / report.grid_triangles:.2f} times the raster's own grid",
         f"vertical   RMSE {report.vertical_rmse_m:.2f} m, largest {report.vertical_max_m:.2f} m, "
         f"over {report.samples:,} samples",
-        f"texels     {texels.width_px} × {texels.height_px}, {texels.texel_p50_m:.2f} m on the surface "
-        f"({texels.texel_p1_m:.2f} to {texels.texel_p99_m:.2f}), {100 * texels.utilization:.0f} % used, "
-        f"{texels.charts} charts",
+        f"texels     {atlas.width_px} × {atlas.height_px}, {atlas.texel_p50_m:.2f} m on the surface "
+        f"({atlas.texel_p1_m:.2f} to {atlas.texel_p99_m:.2f}), {100 * atlas.utilization:.0f} % used, "
+        f"{atlas.charts} charts",
         f"cost       {seconds:.1f} s, {peak_gb:.2f} GB at most",
     ]
-    finish(record, lines, as_json=json)
+    print_result(record, lines, as_json=json)

@@ -5,15 +5,20 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from seasonscapes.commands.talk import finish, say
-from seasonscapes.errors import InputError
+from seasonscapes.commands.arguments import check_suffix
+from seasonscapes.commands.console import message, print_result
+
+if TYPE_CHECKING:
+    from seasonscapes.workflows.webcam_inspection import WebcamInspection
+
+_MOST_PROBLEMS = 50
 
 
-def webcams(
+def webcams_command(
     scene: str,
     *,
     pictures: Path | None = None,
@@ -25,7 +30,7 @@ def webcams(
     allow_outside: bool = False,
     json: bool = False,
 ) -> None:
-    """List a scene's webcams, check their heights and pictures, and draw a map of what they see.
+    """List a scene's webcams, check their heights and pictures, and draw a map of their fields of view.
 
     Parameters
     ----------
@@ -43,82 +48,53 @@ def webcams(
     elevation
         A raster to check the cameras' heights against; default the scene's own.
     output
-        A .png map: where they stand, what they cover, headings.
+        A .png map: positions, fields of view, headings.
     allow_outside
         Let the scene file name data outside its folder.
     json
         Print one machine-readable record.
     """
-    from seasonscapes.cameras.observation import (
-        REFERENCE_LAYOUT,
-        check_pictures,
-        read_manifest,
-        scan_folder,
-        write_manifest,
-    )
     from seasonscapes.cameras.webcam import draw_webcam_map, webcam_heading_deg
     from seasonscapes.images import write_png8
-    from seasonscapes.pipeline import find_scene
-    from seasonscapes.scene import read_scene
+    from seasonscapes.workflows.webcam_inspection import inspect_webcams, scene_with_webcams
 
-    path = find_scene(scene)
-    place = read_scene(path, allow_outside=allow_outside)
-    if not place.webcams:
-        raise InputError(path, "names no webcam", cure="add [[webcam]] tables; scenes/bernese_highlands.toml shows how")
-    if output is not None and output.suffix.lower() != ".png":
-        raise InputError("--output", "unknown kind of picture", got=str(output), expected="a name that ends in .png")
-    source = elevation if elevation is not None else place.elevation and place.elevation.file
-    heights = _heights(place, source)
-    rows, problems = [], []
-    if pictures is not None:
-        rows, problems = scan_folder(pictures, place.webcams, layout=layout or REFERENCE_LAYOUT)
-        problems += check_pictures(rows, pictures, place.webcams, decode=decode)
-        if manifest is not None:
-            bad = {problem.path for problem in problems}
-            write_manifest(manifest, [row for row in rows if row.path not in bad])
-            say(f"manifest: {manifest}")
-    elif manifest is not None:
-        rows = read_manifest(manifest)
-        problems = check_pictures(rows, manifest.parent, place.webcams, decode=decode)
     if output is not None:
-        write_png8(output, draw_webcam_map(place.webcams))
-    counts = Counter(row.webcam for row in rows)
+        check_suffix(output, (".png",))
+    read = scene_with_webcams(scene, allow_outside=allow_outside)
+    found = inspect_webcams(
+        read, pictures=pictures, layout=layout, manifest=manifest, decode=decode, elevation=elevation
+    )
+    if pictures is not None and manifest is not None:
+        message(f"manifest: {manifest}")
+    if output is not None:
+        write_png8(output, draw_webcam_map(read.webcams))
+    counts = Counter(row.webcam for row in found.rows)
     record = {
-        "scene": place.name,
+        "scene": read.name,
         "webcams": [
             {**webcam.model_dump(), "heading_deg": webcam_heading_deg(webcam), "pictures": counts[webcam.id]}
-            for webcam in place.webcams
+            for webcam in read.webcams
         ],
-        "heights": [asdict(check) for check in heights],
-        "pictures": len(rows),
-        "problems": [asdict(problem) for problem in problems],
+        "heights": [asdict(check) for check in found.heights],
+        "pictures": len(found.rows),
+        "problems": [asdict(problem) for problem in found.problems],
     }
-    verdicts = {check.webcam_id: check.verdict for check in heights}
+    print_result(record, _lines(found, counts), as_json=json)
+
+
+def _lines(found: WebcamInspection, counts: Counter) -> list[str]:
+    from seasonscapes.cameras.webcam import webcam_heading_deg
+
+    rows, problems, webcams = found.rows, found.problems, found.scene.webcams
+    verdicts = {check.webcam_id: check.verdict for check in found.heights}
     lines = [
         f"{webcam.id:<14} {webcam.latitude_deg:.5f}, {webcam.longitude_deg:.5f}  {webcam.projection:<15} "
         f"{webcam.horizontal_fov_deg:5.1f}° about {webcam_heading_deg(webcam):5.1f}°  "
         f"{verdicts.get(webcam.id, 'height unchecked')}{f'  {counts[webcam.id]} pictures' if rows else ''}"
-        for webcam in place.webcams
+        for webcam in webcams
     ]
-    lines.append(
-        f"{len(place.webcams)} webcams" + (f", {len(rows)} pictures, {len(problems)} problems" if rows else "")
-    )
-    lines += [f"{problem.kind}: {problem.path}: {problem.detail}" for problem in problems[:50]]
-    if len(problems) > 50:
-        lines.append(f"… and {len(problems) - 50} more problems; --json lists all")
-    finish(record, lines, as_json=json)
-
-
-def _heights(place, source) -> list:
-    """Each webcam's height against the terrain; nothing where there is no raster."""
-    from seasonscapes.cameras.webcam import check_heights
-    from seasonscapes.terrain.raster import map_from_geodetic, read_elevation, sample_raster
-
-    if source is None:
-        return []
-    bounds = place.area.bounds_deg if place.area is not None else None
-    raster = read_elevation(source, bounds_deg=bounds)
-    x, y = map_from_geodetic(
-        raster.crs, [w.latitude_deg for w in place.webcams], [w.longitude_deg for w in place.webcams]
-    )
-    return check_heights(place.webcams, sample_raster(raster, x, y)[..., 0])
+    lines.append(f"{len(webcams)} webcams" + (f", {len(rows)} pictures, {len(problems)} problems" if rows else ""))
+    lines += [f"{problem.kind}: {problem.path}: {problem.detail}" for problem in problems[:_MOST_PROBLEMS]]
+    if len(problems) > _MOST_PROBLEMS:
+        lines.append(f"… and {len(problems) - _MOST_PROBLEMS} more problems; --json lists all")
+    return lines

@@ -1,4 +1,4 @@
-"""A map of a path: shaded relief, the way, where its views look, and heights along it."""
+"""A map of a camera path: shaded relief, the path, fields of view, and a height profile."""
 
 from __future__ import annotations
 
@@ -10,49 +10,56 @@ import numpy as np
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.cameras.trajectory import Ground
 from seasonscapes.frames import geodetic_from_enu
-from seasonscapes.pipeline import Place
 from seasonscapes.terrain.raster import map_from_geodetic
+from seasonscapes.workflows.place import Place
 
 _MAP_PX, _PROFILE_PX = 1200, 220
 
 
-def draw_path_map(land: Place, cameras: Sequence[Camera], waypoints: Sequence[Camera], ground: Ground) -> np.ndarray:
-    """A picture ``(H, W, 3)`` uint8: the map above, a profile below.
+def draw_path_map(place: Place, cameras: Sequence[Camera], waypoints: Sequence[Camera], ground: Ground) -> np.ndarray:
+    """Draw a camera path: a map with shaded relief above, a height profile below.
 
     Parameters
     ----------
+    place
+        The place that the path lies in.
     cameras
         The views.
     waypoints
         Drawn with their numbers.
     ground
-        Heights of the ground in the local frame.
+        Heights of the ground in the local frame, as a function of east and north [m].
+
+    Returns
+    -------
+    numpy.ndarray
+        Picture ``(H, W, 3)`` uint8 sRGB.
     """
-    relief, pixel = _relief(land)
+    relief, pixel = _relief(place)
     positions = np.array([camera.position_m for camera in cameras])
     picture = _drawn(relief, pixel, cameras, waypoints)
     return np.concatenate([picture, _profile(positions, ground(positions[:, :2]), picture.shape[1])])
 
 
-def _relief(land: Place) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-    """Shaded relief ``(H, W, 3)`` uint8, and a function from ENU places to its pixels."""
-    heights = land.elevation.values[..., 0]
+def _relief(place: Place) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
+    """Shaded relief ``(H, W, 3)`` uint8, and a function from positions [m, east-north-up] to its pixels."""
+    heights = place.elevation.values[..., 0]
     scale = _MAP_PX / max(heights.shape)
     shape = (max(2, round(heights.shape[1] * scale)), max(2, round(heights.shape[0] * scale)))
     small = cv2.resize(
         np.ascontiguousarray(heights), shape, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     )
-    extent = np.ptp(land.terrain.vertices[:, :2].astype(float), axis=0)
+    extent = np.ptp(place.terrain.vertices[:, :2].astype(float), axis=0)
     down, right = np.gradient(small, float(extent[1]) / shape[1], float(extent[0]) / shape[0])
-    # From the north-west, as maps are.
+    # Light from the north-west, the convention of maps.
     light = (0.5 * right + 0.5 * down + 0.7) / np.sqrt(1.0 + down**2 + right**2)
     height = (small - np.nanmin(small)) / max(float(np.nanmax(small) - np.nanmin(small)), 1.0)
     grey = np.clip(60.0 + 130.0 * np.clip(light, 0.0, 1.2) + 40.0 * height, 0.0, 255.0)
-    inverse = ~land.elevation.transform
+    inverse = ~place.elevation.transform
 
     def pixel(places_m: np.ndarray) -> np.ndarray:
-        latitude, longitude, _ = geodetic_from_enu(land.frame, places_m)
-        x, y = map_from_geodetic(land.elevation.crs, latitude, longitude)
+        latitude, longitude, _ = geodetic_from_enu(place.frame, places_m)
+        x, y = map_from_geodetic(place.elevation.crs, latitude, longitude)
         column, row = inverse.a * x + inverse.b * y + inverse.c, inverse.d * x + inverse.e * y + inverse.f
         return np.stack([np.asarray(column) * scale, np.asarray(row) * scale], axis=-1)
 
@@ -60,7 +67,7 @@ def _relief(land: Place) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]
 
 
 def _drawn(relief: np.ndarray, pixel: Callable, cameras: Sequence[Camera], waypoints: Sequence[Camera]) -> np.ndarray:
-    """The way in red, sights in yellow, waypoints in blue."""
+    """The path in red, fields of view in yellow, waypoints in blue."""
     picture = np.ascontiguousarray(relief)
     positions = np.array([camera.position_m for camera in cameras])
     line = pixel(positions)
@@ -95,14 +102,14 @@ def _point(place: np.ndarray) -> tuple[int, int]:
 
 
 def _profile(positions: np.ndarray, ground_m: np.ndarray, width_px: int) -> np.ndarray:
-    """Heights of path and ground along the way, ``(h, width_px, 3)`` uint8."""
+    """Heights of path and ground along the path, ``(h, width_px, 3)`` uint8."""
     picture = np.full((_PROFILE_PX, width_px, 3), 245, np.uint8)
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
     heights = np.concatenate([positions[:, 2], ground_m[np.isfinite(ground_m)]])
     low, high = float(heights.min()) - 50.0, float(heights.max()) + 50.0
     x = 10.0 + way / max(way[-1], 1.0) * (width_px - 20.0)
 
-    def y(height_m):
+    def y(height_m: np.ndarray) -> np.ndarray:
         return (_PROFILE_PX - 12.0) - (np.asarray(height_m) - low) / (high - low) * (_PROFILE_PX - 24.0)
 
     solid = np.nan_to_num(ground_m, nan=low)

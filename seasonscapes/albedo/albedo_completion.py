@@ -1,0 +1,83 @@
+"""Completion of a recovered albedo: an orthoimage corrected by what photographs measured, each weighted by its error."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from seasonscapes.albedo.closed_form import HIGHEST, LOWEST, AlbedoFit
+from seasonscapes.albedo.standard_error import KnownAlbedo, finite_sigma
+from seasonscapes.terrain.surface import Texture
+from seasonscapes.texturing.completion import complete
+from seasonscapes.texturing.predictors import Predictors
+
+
+def complete_albedo(
+    fit: AlbedoFit,
+    base: np.ndarray | None,
+    predictors: Predictors,
+    *,
+    seed: int = 0,
+    progress: Callable[[float], None] | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Estimate the albedo of every texel of the surface, and its standard error.
+
+    Parameters
+    ----------
+    fit
+        The albedo that photographs determined.
+    base
+        ``(R, S, 3)`` albedo from another source, of any scale, NaN where unknown. ``None`` where there is none: gaps
+        are then predicted from relief alone and measured texels stay as they are.
+    predictors
+        Relief only: an albedo depends on no hour's sun, and the base is given separately.
+    seed
+        Of the regression.
+    progress
+        Called with the finished share.
+
+    Returns
+    -------
+    albedo : numpy.ndarray
+        ``(R, S, 3)``, clipped to physical limits.
+    sigma : numpy.ndarray
+        Standard error ``(R, S)`` float32.
+    """
+    sigma = finite_sigma(fit)
+    # Relative precision: the completion compares cube roots, in which equal relative errors are about equally large.
+    weight = np.square(fit.albedo[..., 1] / np.maximum(sigma, 1e-4)).astype(np.float32)
+    completed = complete(Texture(fit.albedo, weight), predictors, base=base, fast=True, seed=seed, progress=progress)
+    values = np.clip(completed.values, LOWEST, HIGHEST)
+    if base is None:
+        return values, np.where(weight > 0.0, sigma, completed.sigma).astype(np.float32)
+    combined = 1.0 / np.sqrt(1.0 / np.square(np.maximum(completed.sigma, 1e-6)) + 1.0 / np.square(sigma))
+    return values, combined.astype(np.float32)
+
+
+def complete_known(
+    known: KnownAlbedo,
+    fit: AlbedoFit,
+    base: np.ndarray | None,
+    predictors: Predictors,
+    *,
+    progress: Callable[[float], None] | None = None,
+) -> KnownAlbedo:
+    """Fill the texels of the surface that no photograph measured; they are marked as completed (source 2).
+
+    Parameters
+    ----------
+    known, fit
+        The measured albedo and the fit that it comes from.
+    base, predictors, progress
+        See `complete_albedo`.
+
+    Returns
+    -------
+    KnownAlbedo
+        With a finite σ on the whole surface.
+    """
+    albedo, sigma = complete_albedo(fit, base, predictors, progress=progress)
+    source = np.where(predictors.surface & (known.source != 1), np.uint8(2), known.source)
+    return replace(known, albedo=albedo, sigma=np.where(predictors.surface, sigma, np.float32(np.inf)), source=source)

@@ -1,0 +1,129 @@
+"""Arguments as text on the command line, parsed into values; every mistake is one `InputError` that names the flag."""
+
+from __future__ import annotations
+
+import re
+from datetime import date, datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from seasonscapes.commands.console import message
+from seasonscapes.errors import InputError
+
+if TYPE_CHECKING:
+    from seasonscapes.workflows.albedo_sources import AlbedoFile
+
+
+def check_range(flag: str, value: float, low: float, high: float) -> None:
+    """`InputError` about a flag whose value is not within [low, high]."""
+    if not low <= value <= high:
+        raise InputError(flag, "out of range", got=value, expected=f"{low:g} to {high:g}")
+
+
+def check_choice(flag: str, value: str, choices: tuple[str, ...]) -> None:
+    """`InputError` about a flag whose value is not one of the choices."""
+    if value not in choices:
+        raise InputError(flag, "unknown", got=value, expected=", ".join(choices))
+
+
+def check_suffix(output: Path, suffixes: tuple[str, ...], *, flag: str = "--output") -> None:
+    """`InputError` about a path whose name does not end in one of the suffixes."""
+    if output.suffix.lower() not in suffixes:
+        expected = "a name that ends in " + " or ".join(suffixes)
+        raise InputError(flag, "unknown kind of file", got=str(output), expected=expected)
+
+
+def parse_size(text: str, *, flag: str = "--size") -> tuple[int, int]:
+    """``1536x1024`` as width and height [px]."""
+    match = re.fullmatch(r"(\d{1,5})[x×](\d{1,5})", text.strip())
+    if not match or not (1 <= int(match[1]) <= 32768 and 1 <= int(match[2]) <= 32768):
+        raise InputError(flag, "not a picture size", got=text, expected="WIDTHxHEIGHT in pixels, such as 1536x1024")
+    return int(match[1]), int(match[2])
+
+
+def parse_at(text: str, *, flag: str = "--at") -> tuple[float, float, float | None, float | None]:
+    """``LAT,LON``, ``LAT,LON,HEIGHT`` or ``LAT,LON,+ABOVE``: latitude, longitude, height [m], above ground [m].
+
+    Without a third number the position is 2 m above the ground.
+    """
+    expected = "LAT,LON or LAT,LON,HEIGHT or LAT,LON,+ABOVE_GROUND, such as 46.57,7.96,+50"
+    parts = [part.strip() for part in text.split(",")]
+    try:
+        numbers = [float(part) for part in parts]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (2, 3):
+        raise InputError(flag, "not a place", got=text, expected=expected)
+    if not (-90.0 <= numbers[0] <= 90.0 and -180.0 <= numbers[1] <= 180.0):
+        cure = "is the order latitude, longitude, in degrees?"
+        raise InputError(flag, "latitude or longitude out of range", got=text, expected=expected, cure=cure)
+    if len(numbers) == 2:
+        return numbers[0], numbers[1], None, 2.0
+    if parts[2].startswith("+"):
+        if numbers[2] <= 0.0:
+            raise InputError(flag, "the height above ground must be positive", got=text)
+        return numbers[0], numbers[1], None, numbers[2]
+    return numbers[0], numbers[1], numbers[2], None
+
+
+def parse_duration(flag: str, text: str) -> timedelta:
+    """``90s``, ``10min``, ``1h``, ``1d`` as a length of time of at least a second."""
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(s|min|m|h|d)", text.strip())
+    unit = {"s": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
+    if not match or float(match[1]) * unit[match[2]] < 1.0:
+        expected = "a number and s, min, h or d, such as 10min"
+        raise InputError(flag, "not a length of time of at least a second", got=text, expected=expected)
+    return timedelta(seconds=float(match[1]) * unit[match[2]])
+
+
+def parse_time(text: str, latitude_deg: float, longitude_deg: float) -> datetime:
+    """An instant in UTC; what a civil time was taken to mean is printed."""
+    from seasonscapes.civil_time import resolve_time
+
+    resolved = resolve_time(text, latitude_deg, longitude_deg)
+    message(resolved.reading)
+    return resolved.utc
+
+
+def listed(text: str) -> list[str]:
+    """Items separated by commas, or the lines of a file (comments after ``#``)."""
+    path = Path(text)
+    try:
+        is_file = path.is_file()
+    except OSError:  # a list of times can be longer than a file name
+        is_file = False
+    if is_file:
+        lines = (line.split("#")[0].strip() for line in path.read_text(encoding="utf-8").splitlines())
+        return [line for line in lines if line]
+    return [part.strip() for part in text.split(",") if part.strip()]
+
+
+def parse_times(flag: str, text: str, latitude_deg: float, longitude_deg: float) -> list[datetime]:
+    """Instants in UTC, in order, without repetition; see `listed`."""
+    from seasonscapes.civil_time import resolve_time
+
+    readings = [resolve_time(item, latitude_deg, longitude_deg) for item in listed(text)]
+    if not readings:
+        raise InputError(flag, "no time in it", got=text)
+    message(f"{len(readings)} times, the first one {readings[0].reading}")
+    return sorted({reading.utc for reading in readings})
+
+
+def parse_names(text: str | None) -> set[str]:
+    """Names separated by commas."""
+    return {name.strip() for name in (text or "").split(",")} - {""}
+
+
+def parse_albedo(text: str) -> AlbedoFile:
+    """``DATE=FILE.npz`` as a dated albedo file."""
+    from seasonscapes.workflows.albedo_sources import AlbedoFile
+
+    expected = "DATE=FILE.npz, such as 2024-07-20=summer.npz"
+    day, equals, name = text.partition("=")
+    if not equals or not name:
+        raise InputError("--albedo", "not a dated texture", got=text, expected=expected)
+    try:
+        when = date.fromisoformat(day.strip())
+    except ValueError:
+        raise InputError("--albedo", "not a date", got=day, expected=expected) from None
+    return AlbedoFile(when, Path(name.strip()).resolve())

@@ -1,0 +1,97 @@
+"""Console output: one result on stdout, progress bars and log messages on stderr, and interruption by Ctrl-C."""
+
+from __future__ import annotations
+
+import json
+import logging
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from seasonscapes.progress import Progress
+
+
+class _StderrHandler(logging.Handler):
+    """Prints log messages as plain lines on the present stderr."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        print(self.format(record), file=sys.stderr, flush=True)
+
+
+def show_messages() -> None:
+    """Show the package's log messages of level INFO and above on stderr."""
+    logger = logging.getLogger("seasonscapes")
+    if not any(isinstance(handler, _StderrHandler) for handler in logger.handlers):
+        logger.addHandler(_StderrHandler())
+    logger.setLevel(logging.INFO)
+
+
+def message(line: str) -> None:
+    """Print a line for people on stderr."""
+    print(line, file=sys.stderr, flush=True)
+
+
+def print_result(record: dict[str, Any], lines: list[str], *, as_json: bool) -> None:
+    """Print a command's result on stdout: one JSON record, or lines for people."""
+    print(json.dumps(record, default=float) if as_json else "\n".join(lines), flush=True)
+
+
+@contextmanager
+def progress_bars() -> Iterator[Progress]:
+    """Show a bar with the remaining time for each task on stderr; nothing is shown where stderr is no terminal."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bars:
+        tasks: dict[str, Any] = {}
+
+        def report(task: str, fraction: float) -> None:
+            if _interrupted.is_set():
+                raise KeyboardInterrupt
+            if task not in tasks:
+                tasks[task] = bars.add_task(task, total=1.0)
+            bars.update(tasks[task], completed=fraction)
+
+        yield report
+
+
+# Native code may swallow a KeyboardInterrupt that is raised while it calls back into Python; this event keeps it.
+_interrupted = threading.Event()
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """End the block on Ctrl-C: at once, or at the next progress report where native code swallowed the exception."""
+    _interrupted.clear()
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def handle(number: int, frame: Any) -> None:
+        _interrupted.set()
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, handle)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -1,0 +1,76 @@
+"""Flags of ``seasonscapes run``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cyclopts import Parameter
+
+from seasonscapes.commands.arguments import parse_names, parse_size
+
+if TYPE_CHECKING:
+    from seasonscapes.workflows.distillation import DistilOptions
+    from seasonscapes.workflows.run_photographs import RunPhotographs
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class RunPictureOptions:
+    """The photographs."""
+
+    manifest: Path | None = None
+    """The .csv of `seasonscapes webcams --manifest`; left out, a synthetic scene is photographed from its cameras."""
+    calibrations: Path = Path("out/calibration")
+    """Of a real scene: folder of the records of `seasonscapes calibrate`."""
+    masks: Path | None = None
+    """Folder of WEBCAM.png, black where something stands before the landscape."""
+    within_min: float = 30.0
+    """Of a real scene: use each webcam's picture that is nearest to a time, within so many minutes."""
+    leave_out: str | None = None
+    """Of a synthetic scene: cameras that take no picture, with commas between."""
+    photo_kind: str = "panorama"
+    """Of a synthetic scene's webcams: panorama (a full circle, cylindrical) or perspective."""
+    photo_size: str | None = None
+    """Of a synthetic scene's webcams; default 2048x384, in perspective 720x480."""
+
+    def values(self) -> RunPhotographs:
+        """The flags as one value."""
+        from seasonscapes.workflows.photograph_files import PhotographSources
+        from seasonscapes.workflows.run_photographs import PHOTO_SIZES, RunPhotographs
+
+        size_px = PHOTO_SIZES.get(self.photo_kind, (1, 1))
+        if self.photo_size is not None:
+            size_px = parse_size(self.photo_size, flag="--photo-size")
+        sources = None
+        if self.manifest is not None:
+            sources = PhotographSources(self.manifest, self.calibrations, self.masks)
+        return RunPhotographs(
+            sources, self.masks, self.within_min, frozenset(parse_names(self.leave_out)), self.photo_kind, size_px
+        )
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class RunEffort:
+    """Size and effort of the Gaussian model."""
+
+    discs: int = 160
+    """Gaussians along the longer side of the terrain."""
+    steps: int = 1500
+    """Training steps on the surface."""
+    picture_steps: int = 120
+    """Training steps on images."""
+    suns: int = 24
+    """Instants to train on."""
+    views: int = 3
+    """Cameras around the terrain for training images; 0 trains on the surface alone."""
+
+    def values(self) -> DistilOptions:
+        """The flags as one value."""
+        from seasonscapes.workflows.distillation import DistilOptions
+
+        return DistilOptions(
+            discs=self.discs, suns=self.suns, views=self.views, steps=self.steps, picture_steps=self.picture_steps
+        )

@@ -1,0 +1,113 @@
+"""Flags about views and instants that several commands share, and the values that they stand for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from seasonscapes.commands.arguments import check_range, parse_at, parse_duration, parse_size, parse_times
+from seasonscapes.commands.console import message
+from seasonscapes.errors import InputError
+
+if TYPE_CHECKING:
+    from seasonscapes.cameras.pinhole import Camera
+    from seasonscapes.scene import NamedCamera, SceneFile
+    from seasonscapes.workflows.place import Place
+
+_MOST_FRAMES = 200_000
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class ViewOptions:
+    """From where to look."""
+
+    camera: str | None = None
+    """A camera that the scene names; the first one when left out."""
+    at: str | None = None
+    """A position instead: LAT,LON or LAT,LON,HEIGHT or LAT,LON,+ABOVE_GROUND."""
+    heading: float | None = None
+    """Of --at: azimuth clockwise from north, in degrees."""
+    pitch: float = 0.0
+    """Of --at: elevation of the view, in degrees."""
+    fov: float = 60.0
+    """Of --at: horizontal field of view, in degrees."""
+    size: str = "1536x1024"
+    """WIDTHxHEIGHT in pixels."""
+
+    def size_px(self) -> tuple[int, int]:
+        """Width and height."""
+        return parse_size(self.size)
+
+    def chosen(self, scene: SceneFile) -> NamedCamera:
+        """The scene's camera of that name, or the view that ``--at`` describes."""
+        from seasonscapes.scene import NamedCamera
+
+        if self.at is None:
+            if self.heading is not None:
+                raise InputError("--heading", "goes with --at", cure="name a place with --at LAT,LON,+ABOVE_GROUND")
+            return scene.camera(self.camera)
+        if self.camera is not None:
+            raise InputError("--camera", "and --at name two views", cure="drop one of them")
+        if self.heading is None:
+            expected = "the azimuth to look at, clockwise from north, in degrees"
+            raise InputError("--heading", "missing", expected=expected)
+        check_range("--heading", self.heading, -360.0, 360.0)
+        check_range("--pitch", self.pitch, -90.0, 90.0)
+        check_range("--fov", self.fov, 1.0, 169.0)
+        latitude, longitude, height, above = parse_at(self.at)
+        return NamedCamera(
+            name="at",
+            latitude_deg=latitude,
+            longitude_deg=longitude,
+            height_m=height,
+            above_ground_m=above,
+            heading_deg=self.heading,
+            pitch_deg=self.pitch,
+            fov_deg=self.fov,
+        )
+
+    def pinhole(self, place: Place) -> Camera:
+        """The camera of the chosen view."""
+        from seasonscapes.workflows.views import camera_for
+
+        where = "--camera" if self.at is None else "--at"
+        return camera_for(place, self.chosen(place.scene), size_px=self.size_px(), where=where)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class WhenOptions:
+    """Which instants."""
+
+    start: Annotated[str | None, Parameter(name="--from")] = None
+    """First frame, ISO 8601; without an offset it is civil time at the camera."""
+    to: str | None = None
+    """Last frame."""
+    every: str = "10min"
+    """Time between frames: a number and s, min, h or d."""
+    times: str | None = None
+    """Instants instead: separated by commas, or a file with one in each line."""
+
+    def instants(self, latitude_deg: float, longitude_deg: float) -> list[datetime]:
+        """Aware UTC times, in order."""
+        from seasonscapes.civil_time import resolve_time
+
+        if self.times is not None:
+            if self.start is not None or self.to is not None:
+                raise InputError("--times", "and --from … --to name two sets of frames", cure="drop one of them")
+            return parse_times("--times", self.times, latitude_deg, longitude_deg)
+        if self.start is None or self.to is None:
+            raise InputError("--from", "and --to are needed", cure="give both, or --times")
+        first, last = (resolve_time(text, latitude_deg, longitude_deg) for text in (self.start, self.to))
+        message(f"from {first.reading}")
+        message(f"to {last.reading}")
+        if last.utc < first.utc:
+            raise InputError("--to", "lies before --from", got=self.to)
+        step = parse_duration("--every", self.every)
+        count = int((last.utc - first.utc) / step) + 1
+        check_range("--every", count, 1, _MOST_FRAMES)
+        return [first.utc + index * step for index in range(count)]

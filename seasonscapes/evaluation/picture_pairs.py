@@ -1,0 +1,258 @@
+"""Pairs of true and estimated pictures on disk: matched by name, brought to one exposure, masked, scored."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from seasonscapes.errors import InputError, UnreadableImage
+from seasonscapes.evaluation.figures import comparison
+from seasonscapes.evaluation.masks import land_mask
+from seasonscapes.evaluation.metrics import Score, score
+from seasonscapes.evaluation.splits import file_content_hash
+from seasonscapes.evaluation.tables import table_lines
+from seasonscapes.exposure import develop, exposure_ev100
+from seasonscapes.images import atomic_path, read_exr, read_image_linear, srgb_from_linear, write_png8
+
+_ENCODED, _LINEAR = (".png", ".jpg", ".jpeg"), (".exr",)
+MATCHES = ("none", "gain")
+
+
+@dataclass(frozen=True)
+class MaskOptions:
+    """Which pixels are scored.
+
+    Parameters
+    ----------
+    mask
+        A ``.png`` whose white pixels count, or a folder of them by name; ``None`` for none.
+    near_m, far_m
+        Least and greatest distance [m], where the truth holds depth.
+    """
+
+    mask: Path | None = None
+    near_m: float = 60.0
+    far_m: float = float("inf")
+
+
+@dataclass(frozen=True)
+class PicturePair:
+    """Truth and picture ``(H, W, 3)``, sRGB-encoded, and the truth's depth ``(H, W)`` [m] where its file holds it."""
+
+    truth: np.ndarray
+    picture: np.ndarray
+    depth_m: np.ndarray | None
+
+
+def paired(truth: Path, pictures: Path) -> dict[str, tuple[Path, Path]]:
+    """Match true and estimated pictures by file name without extension.
+
+    Parameters
+    ----------
+    truth, pictures
+        Two files, or two folders.
+
+    Returns
+    -------
+    dict
+        Name to the paths of truth and picture.
+
+    Raises
+    ------
+    InputError
+        Where a picture is missing for a truth, or there is nothing to pair.
+    """
+    for flag, path in (("--truth", truth), ("--pictures", pictures)):
+        if not path.exists():
+            raise InputError(flag, "no such file or folder", got=str(path))
+    if truth.is_file() and pictures.is_file():
+        return {pictures.stem: (truth, pictures)}
+    if truth.is_file() or pictures.is_file():
+        raise InputError("--pictures", "a file and a folder", expected="two files, or two folders")
+    true, made = (_by_stem(flag, path) for flag, path in (("--truth", truth), ("--pictures", pictures)))
+    missing = sorted(set(true) - set(made))
+    if missing:
+        cure = "every truth is scored, so that none can be left out silently"
+        problem = f"no picture for {len(missing)} of {len(true)} truths, the first"
+        raise InputError("--pictures", problem, got=missing[0], cure=cure)
+    return {name: (true[name], made[name]) for name in sorted(true)}
+
+
+def _by_stem(flag: str, folder: Path) -> dict[str, Path]:
+    found: dict[str, Path] = {}
+    for path in sorted(folder.iterdir()):
+        if path.suffix.lower() not in _ENCODED + _LINEAR:
+            continue
+        if path.stem in found:
+            raise InputError(flag, "two pictures of one name", got=f"{found[path.stem].name}, {path.name}")
+        found[path.stem] = path
+    if not found:
+        expected = "names that end in .png, .jpg or .exr"
+        raise InputError(flag, "no pictures in the folder", got=str(folder), expected=expected)
+    return found
+
+
+def read_pair(true_path: Path, path: Path, *, match: str = "none") -> PicturePair:
+    """Read two pictures; radiances are developed with the truth's exposure.
+
+    Parameters
+    ----------
+    true_path, path
+        Two ``.exr`` files, or two ``.png`` or ``.jpg`` files, of one size.
+    match
+        ``"none"``, or ``"gain"``: scale each colour of the picture by the median ratio to the truth first.
+
+    Raises
+    ------
+    InputError
+        Where the files cannot be read or compared.
+    """
+    linear = [each.suffix.lower() in _LINEAR for each in (true_path, path)]
+    if linear[0] != linear[1]:
+        got, expected = f"{true_path.name}, {path.name}", "two .exr, or two of .png and .jpg"
+        raise InputError(path, "radiance and a developed picture cannot be compared", got=got, expected=expected)
+    (true, depth), (made, _) = _read(true_path), _read(path)
+    if true.shape != made.shape:
+        got, expected = (f"{each.shape[1]}x{each.shape[0]}" for each in (made, true))
+        raise InputError(path, "another size than the truth", got=got, expected=expected)
+    if match == "gain":
+        made = made * matching_gain(true, made)
+    if linear[0]:
+        ev100 = exposure_ev100(true)
+        true, made = develop(true, ev100), develop(made, ev100)
+    true, made = (srgb_from_linear(np.clip(each, 0.0, 1.0)) for each in (true, made))
+    return PicturePair(true, made, depth)
+
+
+def _read(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    try:
+        if path.suffix.lower() not in _LINEAR:
+            return read_image_linear(path), None
+        layers, _ = read_exr(path)
+    except (UnreadableImage, RuntimeError, OSError) as error:
+        raise InputError(path, f"not a readable picture: {error}") from None
+    if "" not in layers or layers[""].ndim != 3:
+        raise InputError(path, "holds no colours", got=", ".join(map(repr, layers)), expected="channels R, G and B")
+    return layers[""], layers.get("depth")
+
+
+def matching_gain(truth: np.ndarray, picture: np.ndarray) -> np.ndarray:
+    """Factors ``(3,)`` that scale a linear picture to the truth: median ratios over pixels that are neither black nor clipped.
+
+    Parameters
+    ----------
+    truth, picture
+        Linear values ``(H, W, 3)``.
+    """
+    gains = np.ones(3)
+    for channel in range(3):
+        a, b = truth[..., channel], picture[..., channel]
+        kept = np.isfinite(a) & np.isfinite(b) & (a > 1e-3 * np.nanmax(a)) & (b > 1e-3 * np.nanmax(b))
+        kept &= a < 0.98 * np.nanmax(a)
+        if kept.any():
+            gains[channel] = np.exp(np.median(np.log(a[kept] / b[kept])))
+    return gains
+
+
+def mask_of(name: str, pair: PicturePair, options: MaskOptions) -> np.ndarray | None:
+    """Pixels ``(H, W)`` bool that are scored: white in the mask and, where depth is known, terrain at the right distance.
+
+    Raises
+    ------
+    InputError
+        For a mask that is missing or of another size.
+    """
+    chosen = None
+    if pair.depth_m is not None:
+        depth = np.where(np.isnan(pair.depth_m), np.inf, pair.depth_m)
+        chosen = land_mask(depth, near_m=options.near_m, far_m=options.far_m)
+    if options.mask is None:
+        return chosen
+    path = options.mask / f"{name}.png" if options.mask.is_dir() else options.mask
+    if not path.is_file():
+        raise InputError("--mask", "no such mask", got=str(path))
+    white = _read(path)[0].max(axis=2) > 0.5
+    if white.shape != pair.truth.shape[:2]:
+        got, expected = (f"{shape[1]}x{shape[0]}" for shape in (white.shape, pair.truth.shape))
+        raise InputError(path, "another size than the truth", got=got, expected=expected)
+    return white if chosen is None else white & chosen
+
+
+def refuse_used(truths: Sequence[Path], used: Sequence[Path]) -> None:
+    """`InputError` where a truth's pixels are among those of used pictures; copies under other names are found too.
+
+    Parameters
+    ----------
+    truths
+        Files that are to be scored.
+    used
+        Files, or folders of files, used for painting, guidance or training.
+    """
+    files = []
+    for path in used:
+        if not path.exists():
+            raise InputError("--used", "no such file or folder", got=str(path))
+        files += sorted(path.rglob("*")) if path.is_dir() else [path]
+    try:
+        known = {file_content_hash(path): path for path in files if path.suffix.lower() in _ENCODED}
+        for path in truths:
+            if path.suffix.lower() in _ENCODED and (match := known.get(file_content_hash(path))) is not None:
+                problem = "this truth is not held out: it has the pixels of a picture that was used"
+                raise InputError(path, problem, got=str(match))
+    except UnreadableImage as error:
+        raise InputError("--used", str(error)) from None
+
+
+def score_pair(
+    true_path: Path,
+    path: Path,
+    name: str,
+    *,
+    masks: MaskOptions,
+    mode: str = "valid",
+    match: str = "none",
+    lpips: Callable | None = None,
+    figure: Path | None = None,
+) -> Score:
+    """Score one pair of files, and write a comparison figure where asked for.
+
+    Parameters
+    ----------
+    true_path, path, name
+        The files, and the pair's name, by which its mask is found.
+    masks, mode, match
+        See `mask_of`, `metrics.score` and `read_pair`.
+    lpips
+        A function that measures LPIPS; ``None`` leaves it out.
+    figure
+        A ``.png`` to write.
+
+    Raises
+    ------
+    InputError
+        Where the pair cannot be compared, or no pixel is left to score.
+    """
+    pair = read_pair(true_path, path, match=match)
+    mask = mask_of(name, pair, masks)
+    if mask is not None and not mask.any():
+        raise InputError(path, "no pixel is left to score", cure="check --mask, --near-m and --far-m")
+    found = score(pair.truth, pair.picture, mask, mode=mode, lpips=lpips)
+    if figure is not None:
+        sheet = comparison({"truth": pair.truth, "picture": pair.picture}, mask=mask)
+        write_png8(figure, np.round(255.0 * sheet).astype(np.uint8))
+    return found
+
+
+def write_table(path: Path, rows: Sequence[dict]) -> None:
+    """Write scores as ``.csv`` or Markdown (``.md``), atomically."""
+    with atomic_path(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
+        if path.suffix.lower() == ".md":
+            file.write("\n".join(table_lines(rows, markdown=True)) + "\n")
+            return
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)

@@ -1,0 +1,384 @@
+"""Albedo recovery: the light of known hours removed from photographs, and the result completed."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from datetime import date, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from seasonscapes.cameras.pinhole import view_in_frame
+from seasonscapes.errors import NoTerrainInView
+from seasonscapes.progress import Progress, task_progress
+from seasonscapes.sky.models import SkyModel, with_overrides
+from seasonscapes.terrain.surface import Texture
+from seasonscapes.workflows.albedo_sources import albedo_for, orthoimage
+from seasonscapes.workflows.illumination import illumination_for_camera, sky_model
+from seasonscapes.workflows.place import Place
+
+if TYPE_CHECKING:
+    from seasonscapes.albedo.closed_form import AlbedoFit
+    from seasonscapes.albedo.forward_model import TexelTransport
+    from seasonscapes.albedo.photographs import AlbedoPhotograph
+    from seasonscapes.albedo.seasons import DatedAlbedo
+    from seasonscapes.albedo.standard_error import KnownAlbedo
+    from seasonscapes.cameras.observation import Observation
+    from seasonscapes.sky.illumination import Illumination
+
+log = logging.getLogger(__name__)
+
+# Webcams resolve no finer where they look farther than some kilometres; coefficients of finer atlases take long.
+TEXEL_M = 20.0
+
+
+@dataclass(frozen=True)
+class RecoveryOptions:
+    """How to recover an albedo.
+
+    Parameters
+    ----------
+    fit_haze
+        Search the visibility that explains the photographs best.
+    fit_curve
+        Search the strength of the cameras' tone curve.
+    iterations
+        Iterations of differentiable rendering after the closed form; 0 for none.
+    """
+
+    fit_haze: bool = False
+    fit_curve: bool = False
+    iterations: int = 0
+
+
+@dataclass(frozen=True)
+class RecoveredAlbedo:
+    """An albedo recovered from photographs of one season; made by `recover_albedo`.
+
+    Parameters
+    ----------
+    day
+        Date of the first photograph.
+    known
+        Albedo ``(R, S, 3)``, standard error, times sunlit and source (1 measured, 2 completed) of each texel.
+    fit
+        The closed-form (or refined) fit: gains, residuals.
+    photographs
+        The photographs used, with their light.
+    atlas_id
+        Identity of the UV atlas.
+    facts
+        Plain values: fitted visibility and tone curve.
+    """
+
+    day: date
+    known: KnownAlbedo
+    fit: AlbedoFit
+    photographs: list[AlbedoPhotograph] = field(repr=False)
+    atlas_id: str
+    facts: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def texture(self) -> Texture:
+        """The albedo as a texture; ``weight`` is ``1 / σ²`` where photographs measured it and 0 elsewhere."""
+        known = self.known
+        weight = np.where(known.source == 1, 1.0 / np.maximum(known.sigma, 1e-4) ** 2, 0.0).astype(np.float32)
+        return Texture(known.albedo, weight, self.atlas_id)
+
+    def dated(self) -> DatedAlbedo:
+        """The albedo with its date, for `render`, `relight_session` and others."""
+        import hashlib
+
+        from seasonscapes.albedo.seasons import DatedAlbedo
+
+        content = hashlib.sha256(self.known.albedo.tobytes()).hexdigest()
+        return DatedAlbedo(self.day, content, lambda: self.texture)
+
+    def save(self, path: str | Path) -> None:
+        """Write a ``.npz`` file, atomically; `load_albedo` and ``--albedo`` read it."""
+        from seasonscapes.images import atomic_path
+
+        known, texture = self.known, self.texture
+        with atomic_path(Path(path)) as temporary, open(temporary, "wb") as file:
+            np.savez_compressed(
+                file,
+                values=known.albedo,
+                weight=texture.weight,
+                sigma=known.sigma,
+                sunlit=known.sunlit,
+                source=known.source,
+                gains=self.fit.gains,
+                residual=self.fit.residual,
+                atlas_id=self.atlas_id,
+                date=self.day.isoformat(),
+            )
+
+
+def recover_albedo(
+    place: Place,
+    photographs: Sequence[Observation],
+    *,
+    sky: str | Path | SkyModel = "clear",
+    options: RecoveryOptions | None = None,
+    progress: Progress | None = None,
+) -> RecoveredAlbedo:
+    """Recover the albedo of a place from photographs of several hours of one season, whose light is known.
+
+    Where no photograph shows the surface, and as far as one shows it badly, the albedo is the scene's image corrected
+    by what the photographs show elsewhere; without an image it is predicted from relief.
+
+    Parameters
+    ----------
+    place
+        The place.
+    photographs
+        Such as `open_photographs` gives; their cameras are converted to the place's frame.
+    sky
+        The sky model of all photographs.
+    options
+        What to fit besides the albedo.
+    progress
+        Called with a task and its finished share.
+
+    Returns
+    -------
+    RecoveredAlbedo
+        Linear reflectance with a standard error for each texel.
+
+    Raises
+    ------
+    NoTerrainInView
+        Where no photograph shows any of the terrain.
+    NoUsablePixels
+        Where all pixels on terrain are masked or clipped.
+
+    Notes
+    -----
+    Robust (Cauchy) least squares in image space over all photographs with per-texel daylight coefficients; exposures
+    come from the sky in each photograph. See `albedo.closed_form`.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import seasonscapes as ss
+    >>> place = ss.load_place("alpine_small")
+    >>> times = ["2024-07-20T10:00", "2024-07-20T15:00"]
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     sources = ss.synthetic_photographs(place, times, folder, sky="hosek", size_px=(48, 32))
+    ...     photographs = ss.open_photographs(place, sources.manifest, sources.calibrations, times)
+    >>> recovered = ss.recover_albedo(place, photographs, sky="hosek")
+    >>> recovered.known.albedo.shape == (*place.texture_shape, 3)
+    True
+    """
+    from seasonscapes.rendering.backend import use_backend
+
+    options, model = options or RecoveryOptions(), sky_model(sky)
+    use_backend(gradients=options.iterations > 0)
+    in_frame = [replace(each, camera=view_in_frame(each.camera, place.frame)) for each in photographs]
+    transport, prepared, facts = _prepared(place, in_frame, model, options, progress)
+    fit, known = _solved(place, transport, prepared, options.iterations, progress)
+    day = min(each.observation.time for each in prepared).date()
+    return RecoveredAlbedo(day, known, fit, prepared, place.atlas_id, facts)
+
+
+def _illuminations(place: Place, photographs: Sequence[Observation], model: SkyModel) -> list[Illumination]:
+    """The light of each photograph as seen from its camera; cameras of one position and instant share it."""
+    lights: dict = {}
+    for photograph in photographs:
+        key = (photograph.time, photograph.camera.position_m.tobytes())
+        if key not in lights:
+            lights[key] = illumination_for_camera(place, photograph.camera, model, photograph.time)[0]
+    return [lights[each.time, each.camera.position_m.tobytes()] for each in photographs]
+
+
+def with_terrain(transport: TexelTransport, photographs: Sequence[Observation]) -> list[Observation]:
+    """The photographs whose unmasked pixels show terrain; others (parts of a panorama may be all sky) are logged.
+
+    Raises
+    ------
+    NoTerrainInView
+        Where none is left.
+    """
+    from seasonscapes.rendering.sightlines import faces_met
+
+    terrain_of: dict[bytes, np.ndarray] = {}
+    kept, empty = [], set()
+    for photograph in photographs:
+        camera = photograph.camera
+        key = repr((photograph.webcam, camera.width_px, camera.height_px, camera.fx)).encode()
+        key += camera.world_from_camera.tobytes()
+        if key not in terrain_of:
+            terrain_of[key] = faces_met(transport.ray_scene, camera) >= 0
+        if (terrain_of[key] & photograph.mask).any():
+            kept.append(photograph)
+        else:
+            empty.add(photograph.webcam)
+    for name in sorted(empty):
+        log.info("left out: %s: it sees none of the terrain", name)
+    if not kept:
+        raise NoTerrainInView("albedo: no photograph shows any of the terrain")
+    return kept
+
+
+def _prepared(
+    place: Place, photographs: list[Observation], model: SkyModel, options: RecoveryOptions, progress: Progress | None
+) -> tuple[TexelTransport, list[AlbedoPhotograph], dict[str, Any]]:
+    """Texel transport and photographs with their light; tone curve and visibility fitted where asked for."""
+    from seasonscapes.albedo.forward_model import trace_texel_transport
+    from seasonscapes.albedo.haze import fit_visibility
+    from seasonscapes.albedo.photographs import EIGHT_BIT, prepare_photographs
+    from seasonscapes.albedo.tone_curve import fit_tone_curve, with_tone_curve
+
+    facts: dict[str, Any] = {}
+    report = task_progress(progress, "daylight of the atlas")
+    transport = trace_texel_transport(place.terrain, place.texture_shape, progress=report)
+    photographs = with_terrain(transport, photographs)
+    lights = _illuminations(place, photographs, model)
+    report = task_progress(progress, "footprints of the photographs")
+    prepared = prepare_photographs(transport, photographs, lights, progress=report)
+    if options.fit_curve:
+        curve = fit_tone_curve(transport, prepared, progress=task_progress(progress, "tone curve"))
+        prepared = with_tone_curve(prepared, curve.strength)
+        facts["curve_strength"] = round(curve.strength, 3)
+        log.info("tone curve: strength %.2f", curve.strength)
+    if options.fit_haze:
+
+        def lights_of(visibility_km: float) -> list[Illumination]:
+            return _illuminations(place, photographs, with_overrides(model, visibility_km=visibility_km))
+
+        report = task_progress(progress, "visibility")
+        found = fit_visibility(transport, prepared, lights_of, noise_model=EIGHT_BIT, progress=report)
+        facts["visibility_km"] = round(found.visibility_km, 1)
+        log.info("visibility %.0f km", found.visibility_km)
+        hazy = lights_of(found.visibility_km)
+        prepared = [replace(each, light=light) for each, light in zip(prepared, hazy, strict=True)]
+    return transport, prepared, facts
+
+
+def _solved(
+    place: Place,
+    transport: TexelTransport,
+    photographs: list[AlbedoPhotograph],
+    iterations: int,
+    progress: Progress | None,
+) -> tuple[AlbedoFit, KnownAlbedo]:
+    from seasonscapes.albedo.albedo_completion import complete_known
+    from seasonscapes.albedo.closed_form import solve_albedo
+    from seasonscapes.albedo.inverse import InverseOptions, refine_albedo
+    from seasonscapes.albedo.photographs import EIGHT_BIT
+    from seasonscapes.albedo.standard_error import known_albedo
+    from seasonscapes.texturing.predictors import predictors_for
+
+    report = task_progress(progress, "albedo")
+    fit = solve_albedo(transport, photographs, noise_model=EIGHT_BIT, progress=report)
+    if iterations:
+        options = InverseOptions(iterations=iterations, levels=(1,))
+        refine = task_progress(progress, "differentiable rendering")
+        fit = refine_albedo(
+            place.terrain,
+            transport,
+            photographs,
+            fit,
+            noise_model=EIGHT_BIT,
+            options=options,
+            callbacks=[lambda state: refine(state.iteration / iterations)],
+        ).fit
+    known = known_albedo(transport, photographs, fit)
+    image = orthoimage(place, photographs[0].observation.time)
+    base = None if image is None else np.where(image.weight[..., None] > 0.0, image.values, np.float32(np.nan))
+    report = task_progress(progress, "completing")
+    return fit, complete_known(known, fit, base, predictors_for(place.terrain, place.atlas), progress=report)
+
+
+def save_albedo_figures(recovered: RecoveredAlbedo, output: Path) -> dict[str, str]:
+    """Write pictures beside an albedo file: the albedo, what was measured, and σ (white is 0.1); their paths."""
+    from seasonscapes.images import write_png
+
+    known = recovered.known
+    sigma = np.clip(np.nan_to_num(known.sigma, posinf=1.0) / 0.1, 0.0, 1.0)
+    pictures: dict[str, np.ndarray] = {
+        "albedo": known.albedo,
+        "measured": (known.source == 1)[..., None] * known.albedo,
+        "sigma": np.repeat(sigma[..., None], 3, 2),
+    }
+    paths = {}
+    for name, image in pictures.items():
+        path = output.with_name(f"{output.stem}_{name}.png")
+        write_png(path, np.clip(image, 0.0, 1.0))
+        paths[name] = str(path)
+    return paths
+
+
+def error_against_truth(place: Place, recovered: RecoveredAlbedo) -> dict[str, float]:
+    """PSNR [dB] and relative error over measured texels of a synthetic place, whose albedo is known."""
+    truth, measured = albedo_for(place, recovered.day).values, recovered.known.source == 1
+    error = recovered.known.albedo[measured] - truth[measured]
+    return {
+        "true_psnr_db": round(float(-10.0 * np.log10(np.mean(error**2))), 2),
+        "true_relative_error": round(float(np.abs(error).sum() / truth[measured].sum()), 4),
+    }
+
+
+def delight(
+    place: Place,
+    image: Texture,
+    time: str | datetime,
+    *,
+    sky: str | Path | SkyModel = "clear",
+    progress: Progress | None = None,
+) -> Texture:
+    """Remove the light of a known hour from an image that lies in a place's texture, such as an orthophoto.
+
+    Parameters
+    ----------
+    place
+        The place.
+    image
+        Radiance ``(R, S, 3)`` [cd/m²] of the surface, or proportional to it, in the place's atlas; ``weight`` is 0 where
+        there is none.
+    time
+        When it was taken: an aware datetime, or ISO 8601 text; without offset it is civil time at the place.
+    sky
+        The sky model of that hour.
+    progress
+        Called with a task and its finished share.
+
+    Returns
+    -------
+    Texture
+        Albedo ``(R, S, 3)``; ``weight`` is 0 where it is unknown.
+
+    Raises
+    ------
+    AtlasMismatch
+        For an image of another atlas.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import seasonscapes as ss
+    >>> place = ss.load_place("alpine_small")
+    >>> lit = ss.lit_texture(place, "2024-07-20T13:30", sky="hosek", rays=16)
+    >>> albedo = ss.delight(place, ss.Texture(lit.radiance), "2024-07-20T13:30", sky="hosek")
+    >>> known = albedo.weight > 0.0
+    >>> bool(np.median(np.abs(albedo.values[known] / lit.albedo[known] - 1.0)) < 0.2)
+    True
+    """
+    from seasonscapes.albedo.delighting import delight_textures
+    from seasonscapes.albedo.forward_model import trace_texel_transport
+    from seasonscapes.rendering.backend import use_backend
+    from seasonscapes.workflows.illumination import illumination_on_terrain
+    from seasonscapes.workflows.place import utc_at
+
+    use_backend()
+    place.require_texture(image, what="image")
+    light, _ = illumination_on_terrain(place, sky_model(sky), utc_at(place, time))
+    report = task_progress(progress, "daylight of the atlas")
+    transport = trace_texel_transport(place.terrain, place.texture_shape, progress=report)
+    radiance = np.where(image.weight[..., None] > 0.0, image.values, np.float32(np.nan))
+    albedo, _ = delight_textures(transport, [radiance], [light])
+    known = np.isfinite(albedo).all(axis=2)
+    return Texture(np.nan_to_num(albedo), np.asarray(known, np.float32), place.atlas_id)

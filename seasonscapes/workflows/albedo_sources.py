@@ -1,0 +1,360 @@
+"""The albedo of a place by date: from the synthetic massif, the scene's image, or recovered albedo files."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import date, datetime, timedelta
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from zipfile import BadZipFile
+
+import numpy as np
+
+from seasonscapes.albedo.seasons import (
+    SEASONS,
+    DatedAlbedo,
+    day_number,
+    interpolate_albedo,
+    season_weights,
+    snow_transition,
+    snowline_fraction,
+)
+from seasonscapes.errors import InputError
+from seasonscapes.source_hash import source_hash
+from seasonscapes.terrain.surface import Raster, Texture, load_texture, save_texture
+from seasonscapes.workflows.place import Place
+from seasonscapes.workspace import build_once, file_hash
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+log = logging.getLogger(__name__)
+
+_IMAGE_CODE = ("terrain.imagery",)
+_SYNTHETIC_CODE = ("terrain.imagery", "terrain.synthetic")
+_TRANSITION_CODE = ("albedo.seasons", "albedo.closed_form", "terrain.attributes")
+# Where a scene has no image, the ground is uniformly grey: between rock and meadow.
+GREY_ALBEDO = 0.2
+# A synthetic place has no satellite; its albedo of this day of the year stands for a summer image.
+_IMAGE_DAY = 205
+# The albedo of a synthetic place is known for every day; films interpolate between these days of each month.
+_FILM_DAYS = (1, 16)
+
+
+@dataclass(frozen=True)
+class AlbedoFile:
+    """A recovered albedo texture on disk and the date that it is valid for.
+
+    Parameters
+    ----------
+    day
+        The date.
+    path
+        A ``.npz`` file of `terrain.surface.save_texture` or of ``seasonscapes albedo``.
+    """
+
+    day: date
+    path: Path
+
+
+def albedo_for(place: Place, day: date) -> Texture:
+    """Return the albedo texture of a date: the synthetic truth of that day, or the scene's image.
+
+    Parameters
+    ----------
+    place
+        The place.
+    day
+        A date or datetime; it matters for synthetic places alone.
+
+    Returns
+    -------
+    Texture
+        Linear reflectance in [0, 1]. ``weight`` is 0 where the image does not reach; the albedo there is the image's
+        median colour. Without an image it is uniformly 0.2, of weight 0.
+    """
+    from seasonscapes.terrain.imagery import bake_imagery
+
+    inputs: dict[str, Any] = {"terrain": place.key}
+    if place.synthetic is not None:
+        day_of_year = day.timetuple().tm_yday
+        texture = build_once(
+            place.workspace,
+            f"{place.scene.name}/albedo-day{day_of_year:03d}",
+            inputs | {"day_of_year": day_of_year},
+            code=_SYNTHETIC_CODE,
+            suffix=".npz",
+            build=lambda: bake_imagery(place.terrain, place.atlas, _synthetic_image(place, day_of_year)),
+            save=save_texture,
+            load=load_texture,
+        )
+        return replace(texture, atlas_id=place.atlas_id)
+    imagery = place.scene.imagery
+    if imagery is None:
+        values = np.full((*place.texture_shape, 3), GREY_ALBEDO, np.float32)
+        return Texture(values, np.zeros(place.texture_shape, np.float32), place.atlas_id)
+    inputs.update(imagery=imagery.model_copy(update={"file": Path(imagery.file).name}), hash=file_hash(imagery.file))
+    texture = build_once(
+        place.workspace,
+        f"{place.scene.name}/albedo",
+        inputs,
+        code=_IMAGE_CODE,
+        suffix=".npz",
+        build=lambda: _baked_image(place),
+        save=save_texture,
+        load=load_texture,
+    )
+    return replace(texture, atlas_id=place.atlas_id)
+
+
+def orthoimage(place: Place, day: date) -> Texture | None:
+    """Return the scene's image in the atlas (``weight`` 0 where it does not reach), or ``None`` without one.
+
+    The image of a synthetic place is its albedo of a summer day; only the year of ``day`` matters.
+    """
+    if place.synthetic is not None:
+        return albedo_for(place, day.replace(month=1, day=1) + timedelta(days=_IMAGE_DAY - 1))
+    return None if place.scene.imagery is None else albedo_for(place, day)
+
+
+def dated_albedos(place: Place, files: Sequence[AlbedoFile] = ()) -> list[DatedAlbedo]:
+    """Return the albedos of a place through the year, by date.
+
+    Parameters
+    ----------
+    place
+        The place.
+    files
+        Recovered albedos to use instead of the scene's own.
+
+    Returns
+    -------
+    list of DatedAlbedo
+        Sorted by date; textures are read when they are needed.
+
+    Raises
+    ------
+    InputError
+        For a file that is missing or no texture; `errors.AtlasMismatch` (when it is read) for one of another atlas.
+    """
+    if files:
+        return sorted((_from_file(place, file) for file in files), key=lambda dated: dated.day)
+    if place.synthetic is None:
+        midsummer = datetime(2024, 7, 1)
+        imagery = place.scene.imagery
+        content = (
+            "grey"
+            if imagery is None
+            else ":".join((imagery.model_dump_json(), file_hash(imagery.file), source_hash(*_IMAGE_CODE)))
+        )
+        return [DatedAlbedo(midsummer.date(), content, lambda: albedo_for(place, midsummer))]
+    days = [datetime(2024, month, day) for month in range(1, 13) for day in _FILM_DAYS]
+    return [
+        DatedAlbedo(
+            day.date(),
+            f"synthetic:{day.timetuple().tm_yday}:{source_hash(*_SYNTHETIC_CODE)}",
+            partial(albedo_for, place, day),
+        )
+        for day in days
+    ]
+
+
+def load_albedo(place: Place, path: str | Path, day: date | str | None = None) -> DatedAlbedo:
+    """Return a recovered albedo file as a dated albedo of a place.
+
+    Parameters
+    ----------
+    place
+        The place whose atlas the texture belongs to.
+    path
+        A ``.npz`` file that ``seasonscapes albedo`` or `RecoveredAlbedo.save` wrote.
+    day
+        The date it is valid for (date or ISO 8601); default: the date that the file states.
+
+    Returns
+    -------
+    DatedAlbedo
+        The texture is read when it is needed.
+
+    Raises
+    ------
+    InputError
+        Where the file is missing or no texture, or states no date and none is given.
+    """
+    path = Path(path)
+    if day is None:
+        day = albedo_date(path)
+        if day is None:
+            raise InputError(path, "states no date", cure="give one: load_albedo(place, path, day='2024-07-20')")
+    return _from_file(place, AlbedoFile(date.fromisoformat(day) if isinstance(day, str) else day, path))
+
+
+def albedo_date(path: Path) -> date | None:
+    """The date that an albedo file states, or ``None``; `InputError` where it is missing or no ``.npz`` file."""
+    _require_texture_file(path)
+    with np.load(path, allow_pickle=False) as stored:
+        return date.fromisoformat(str(stored["date"])) if "date" in stored else None
+
+
+def _require_texture_file(path: Path) -> None:
+    if not path.is_file():
+        raise InputError("--albedo", "no such file", got=str(path))
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            names = set(stored.files)
+    except (BadZipFile, ValueError, EOFError, AttributeError):
+        raise InputError(path, "not an albedo texture", expected="a .npz file of `seasonscapes albedo`") from None
+    if not {"values", "weight"} <= names:
+        raise InputError(path, "not an albedo texture", got=", ".join(sorted(names)), expected="values and weight")
+
+
+def _from_file(place: Place, file: AlbedoFile) -> DatedAlbedo:
+    _require_texture_file(file.path)
+    return DatedAlbedo(
+        file.day, file_hash(file.path), lambda: place.require_texture(load_texture(file.path), what=str(file.path))
+    )
+
+
+def require_season(season: str, *, where: str = "season") -> None:
+    """`InputError` for a way of interpolating between dated albedos that does not exist."""
+    if season not in SEASONS:
+        raise InputError(where, "unknown", got=season, expected=", ".join(SEASONS))
+
+
+def snow_transition_between(place: Place, first: DatedAlbedo, second: DatedAlbedo) -> Texture:
+    """When each texel changes between two dated albedos, see `albedo.seasons.snow_transition`; kept in the workspace."""
+
+    def build() -> Texture:
+        from seasonscapes.albedo.closed_form import fill_nearest
+        from seasonscapes.terrain.attributes import texel_attributes
+
+        shape = place.texture_shape
+        attributes, texel = texel_attributes(place.terrain, shape)
+        values, weight = np.zeros((shape[0] * shape[1], 3), np.float32), np.zeros(shape, np.float32)
+        weight.reshape(-1)[texel] = 1.0
+        both = (dated.load().values.reshape(-1, 3)[texel] for dated in (first, second))
+        values[texel] = snow_transition(attributes, *both)
+        # Bilinear look-ups at the rim reach texels beyond the surface.
+        return Texture(fill_nearest(values.reshape(*shape, 3), weight), weight, place.atlas_id)
+
+    return build_once(
+        place.workspace,
+        f"{place.scene.name}/snow-transition",
+        {"terrain": place.key, "dated": [first.content, second.content]},
+        code=_TRANSITION_CODE,
+        suffix=".npz",
+        build=build,
+        save=save_texture,
+        load=load_texture,
+    )
+
+
+def albedo_of_day(place: Place, dated: Sequence[DatedAlbedo], day: date, *, season: str = "blended") -> Texture:
+    """Interpolate a place's albedo on a day from dated albedos.
+
+    Parameters
+    ----------
+    place
+        The place.
+    dated
+        Albedos with their dates, sorted.
+    day
+        The day; on a date of ``dated`` the result is that texture to the bit.
+    season
+        ``"blended"``, ``"nearest"`` or ``"snow-line"``; see `albedo.seasons.season_weights`.
+
+    Returns
+    -------
+    Texture
+        Linear reflectance in [0, 1].
+    """
+    weights = season_weights([each.day for each in dated], day, season=season)
+    textures = [dated[index].load() for index, _ in weights]
+    if len(weights) == 1:
+        return textures[0]
+    first, second = (dated[index] for index, _ in weights)
+    fraction, weight = weights[1][1], np.minimum(textures[0].weight, textures[1].weight)
+    if season == "snow-line":
+        transition = snow_transition_between(place, first, second).values
+        snowline = snowline_fraction(*(day_number(each) for each in (first.day, second.day, day)))
+    else:
+        transition, snowline = np.zeros_like(textures[0].values), fraction
+    values = interpolate_albedo((textures[0].values, textures[1].values), transition, fraction, snowline)
+    return Texture(values, weight, place.atlas_id)
+
+
+def chosen_albedo(
+    place: Place,
+    day: date,
+    albedo: Texture | DatedAlbedo | Iterable[DatedAlbedo] | None = None,
+    *,
+    season: str = "blended",
+) -> Texture:
+    """Resolve the ``albedo`` argument of a workflow to a texture of the place on a day.
+
+    Parameters
+    ----------
+    place, day
+        The place and the date.
+    albedo
+        A texture of the place's atlas, one or several dated albedos, or ``None`` for the scene's own albedo.
+    season
+        How to interpolate between dated albedos.
+
+    Raises
+    ------
+    AtlasMismatch
+        For a texture of another atlas.
+    InputError
+        For an unknown ``season``.
+    """
+    require_season(season)
+    if albedo is None:
+        return albedo_for(place, day)
+    if isinstance(albedo, Texture):
+        return place.require_texture(albedo, what="albedo")
+    dated = [albedo] if isinstance(albedo, DatedAlbedo) else sorted(albedo, key=lambda each: each.day)
+    return albedo_of_day(place, dated, day, season=season)
+
+
+def _synthetic_image(place: Place, day_of_year: int) -> Raster:
+    """The true albedo of a synthetic place on its own finer grid."""
+    from affine import Affine
+
+    from seasonscapes.terrain.synthetic import alpine_albedo
+
+    assert place.synthetic is not None
+    assert place.scene.elevation is not None
+    declared = place.scene.elevation.synthetic
+    assert declared is not None
+    # The albedo's own detail comes in powers of two of the massif's cells.
+    ratio = place.synthetic.spacing_m / declared.detail_m
+    upsample = 2 ** int(np.clip(round(np.log2(ratio)), 0, 3))
+    values = alpine_albedo(place.synthetic, day_of_year, upsample=upsample)
+    elevation = place.synthetic.elevation
+    return Raster(values, elevation.transform * Affine.scale(1.0 / upsample), elevation.crs)
+
+
+def _baked_image(place: Place) -> Texture:
+    from seasonscapes.terrain.imagery import bake_imagery, read_imagery
+    from seasonscapes.terrain.raster import bounds_geographic
+
+    imagery = place.scene.imagery
+    assert imagery is not None
+    # Imagery far finer than the texels is averaged while it is read.
+    image = read_imagery(
+        imagery.file,
+        bounds_deg=bounds_geographic(place.elevation),
+        bands=tuple(imagery.bands) if imagery.bands else None,
+        finest_m=0.5 * place.atlas.texel_p50_m,
+        encoding=imagery.encoding,
+        full_scale=imagery.full_scale,
+    )
+    texture = bake_imagery(place.terrain, place.atlas, image)
+    values = np.clip(texture.values * imagery.reflectance_scale, 0.0, 0.95)
+    covered = texture.weight > 0.0
+    values[~covered] = np.median(values[covered], axis=0)
+    return replace(texture, values=values)

@@ -1,0 +1,374 @@
+"""Distillation: a Gaussian model of a place trained on its path-traced light of many dates and hours."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from importlib.util import find_spec
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from seasonscapes.albedo.seasons import DatedAlbedo, day_number
+from seasonscapes.errors import InputError
+from seasonscapes.progress import Progress, each_reported, task_progress
+from seasonscapes.sky.models import SkyModel
+from seasonscapes.workflows.albedo_sources import albedo_for
+from seasonscapes.workflows.illumination import illumination_at, sky_model, sun_moon_position
+from seasonscapes.workflows.place import Place
+
+if TYPE_CHECKING:
+    from seasonscapes.cameras.pinhole import Camera
+    from seasonscapes.gaussians.disc_transport import DiscTransport, LightState
+    from seasonscapes.gaussians.losses import TrainingFrame
+    from seasonscapes.gaussians.model import GaussianModel
+    from seasonscapes.gaussians.surfels import Surfels
+    from seasonscapes.gaussians.training import SurfaceTargets
+    from seasonscapes.sky.illumination import Illumination
+
+log = logging.getLogger(__name__)
+
+KINDS = ("full", "physical", "sun")
+_YEAR = 2024
+# A scene with one image has one albedo for the whole year.
+_ONE_DAY = 200.0
+
+
+@dataclass(frozen=True)
+class DistilOptions:
+    """How to distil.
+
+    Parameters
+    ----------
+    discs
+        Gaussians along the longer side of the terrain.
+    suns
+        Instants to train on, at random hours of the dates' days.
+    dates
+        Dates of the year whose albedo is stored separately, for scenes that know their albedo of every day.
+    views, view_px
+        Cameras around the terrain for training images, and the size of these [px]; 0 trains on the surface alone.
+    steps, picture_steps
+        Training steps on the surface, and on images.
+    kind
+        ``"full"`` (physics and a network), ``"physical"`` (no network) or ``"sun"`` (a network alone, for comparison).
+    """
+
+    discs: int = 320
+    suns: int = 32
+    dates: int = 4
+    views: int = 3
+    view_px: int = 256
+    steps: int = 2500
+    picture_steps: int = 240
+    kind: str = "full"
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise InputError("--kind", "unknown kind", got=self.kind, expected=", ".join(KINDS))
+
+
+@dataclass(frozen=True)
+class DistillationData:
+    """Everything that a model is trained on.
+
+    Parameters
+    ----------
+    surfels
+        N discs on the terrain.
+    albedo, around
+        Of each date: albedo of the discs ``(M, N, 3)``, and its mean over their neighbourhoods.
+    days
+        Days of the year of the dates.
+    transport
+        Light transport of the discs.
+    targets
+        Light states and target colours of the discs.
+    times
+        Instants, aware UTC.
+    frames, cameras
+        Training images, camera by camera, and the cameras.
+    """
+
+    surfels: Surfels
+    albedo: np.ndarray
+    around: np.ndarray
+    days: list[float]
+    transport: DiscTransport
+    targets: SurfaceTargets
+    times: list[datetime]
+    frames: list[TrainingFrame]
+    cameras: list[Camera]
+
+
+@dataclass(frozen=True)
+class Distilled:
+    """A distilled model, what it was trained on, and the loss of every step."""
+
+    model: GaussianModel
+    data: DistillationData
+    losses: list[float]
+
+
+def require_torch() -> None:
+    """`InputError` where the extra that Gaussians need is missing."""
+    if find_spec("torch") is None or find_spec("safetensors") is None:
+        raise InputError("gaussians", "PyTorch is not installed", cure="pip install 'seasonscapes[gaussians]'")
+
+
+def distil(
+    place: Place,
+    *,
+    sky: str | Path | SkyModel = "clear",
+    albedo: Sequence[DatedAlbedo] | DatedAlbedo | None = None,
+    options: DistilOptions | None = None,
+    seed: int = 0,
+    checkpoint: Path | None = None,
+    progress: Progress | None = None,
+) -> GaussianModel:
+    """Distil a Gaussian model of a place, which is then lit for any date and hour in milliseconds.
+
+    Parameters
+    ----------
+    place
+        The place.
+    sky
+        A sky model, its name or its file.
+    albedo
+        Dated albedos, or ``None`` for the scene's own.
+    options
+        Size of the model and effort of the training.
+    seed
+        Equal seeds give equal models.
+    checkpoint
+        A file that an interrupted training continues from; removed by the caller when the model is saved.
+    progress
+        Called with a task and its finished share.
+
+    Returns
+    -------
+    GaussianModel
+        For `render_gaussians`; `gaussians.model.save_model` writes it.
+
+    Raises
+    ------
+    InputError
+        Where PyTorch is missing, or two albedos have the same day of the year.
+
+    Examples
+    --------
+    >>> import seasonscapes as ss
+    >>> place = ss.load_place("alpine_small")
+    >>> quick = ss.DistilOptions(discs=12, suns=2, dates=1, views=0, steps=2, picture_steps=0)
+    >>> model = ss.distil(place, sky="hosek", options=quick)
+    >>> camera = ss.camera(place, "aerial", size_px=(48, 32))
+    >>> ss.render_gaussians(model, place, camera, "2024-07-20T13:30", sky="hosek").radiance.shape
+    (32, 48, 3)
+    """
+    return distil_with_data(
+        place, sky=sky, albedo=albedo, options=options, seed=seed, checkpoint=checkpoint, progress=progress
+    ).model
+
+
+def distil_with_data(
+    place: Place,
+    *,
+    sky: str | Path | SkyModel = "clear",
+    albedo: Sequence[DatedAlbedo] | DatedAlbedo | None = None,
+    options: DistilOptions | None = None,
+    seed: int = 0,
+    checkpoint: Path | None = None,
+    progress: Progress | None = None,
+) -> Distilled:
+    """`distil`, with the training data and losses."""
+    require_torch()
+    from seasonscapes.gaussians.appearance import Appearance, fourier_embedding
+    from seasonscapes.gaussians.model import model_from
+    from seasonscapes.gaussians.rasterise import choose_threads
+    from seasonscapes.gaussians.splat_view import learned_numbers
+    from seasonscapes.gaussians.training import Schedule, train
+
+    options = options or DistilOptions()
+    choose_threads(1)
+    dated = [albedo] if isinstance(albedo, DatedAlbedo) else list(albedo or ())
+    data = distillation_data(place, sky_model(sky), dated, options, seed=seed, progress=progress)
+    appearance = Appearance(
+        options.kind,
+        data.albedo,
+        data.around,
+        data.transport,
+        fourier_embedding(data.surfels.means, seed=seed),
+        times=options.suns,
+        seed=seed,
+    )
+    losses = train(
+        appearance,
+        data.targets,
+        data.frames,
+        Schedule(options.steps, options.picture_steps),
+        seed=seed,
+        checkpoint=checkpoint,
+        progress=task_progress(progress, "distilling"),
+    )
+    note = {"scene": place.scene.name, "seed": seed, "suns": options.suns, "attribution": place.scene.attribution}
+    model = model_from(
+        data.surfels,
+        data.albedo,
+        data.days,
+        data.transport,
+        kind=options.kind,
+        frame=place.frame,
+        appearance=learned_numbers(appearance),
+        note=note,
+    )
+    return Distilled(model, data, losses)
+
+
+def dated_textures(place: Place, dated: Sequence[DatedAlbedo], dates: int) -> list[tuple[float, np.ndarray]]:
+    """Days of the year and albedo textures ``(R, S, 3)``: the given ones, or the scene's own of so many dates.
+
+    Raises
+    ------
+    InputError
+        Where two given albedos have the same day of the year.
+    """
+    if dated:
+        found = sorted(((day_number(each.day), each.load().values) for each in dated), key=lambda pair: pair[0])
+        if any(first[0] == second[0] for first, second in pairwise(found)):
+            raise InputError("--albedo", "names a day of the year twice", cure="give one albedo for each")
+        return found
+    days = [_ONE_DAY]
+    if place.synthetic is not None:
+        days = np.linspace(15.0, 366.0 + 15.0, dates + 1)[:-1].round().tolist()
+    noon = datetime(_YEAR, 1, 1, 12, tzinfo=UTC)
+    return [(day, albedo_for(place, noon + timedelta(days=day - 1)).values) for day in days]
+
+
+def distillation_data(
+    place: Place,
+    model: SkyModel,
+    dated: Sequence[DatedAlbedo],
+    options: DistilOptions,
+    *,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> DistillationData:
+    """Trace the training targets: each date has its own albedo, and with it its own interreflection.
+
+    Parameters
+    ----------
+    place, model, dated
+        The place, the sky model, and given albedos (empty: the scene's own).
+    options, seed
+        Size and randomness.
+    progress
+        Called with a task and its finished share.
+    """
+    from seasonscapes.gaussians.disc_transport import (
+        light_state,
+        neighbourhood_mean,
+        surfel_irradiance,
+        trace_disc_transport,
+    )
+    from seasonscapes.gaussians.surfels import surfel_albedo, terrain_surfels
+    from seasonscapes.gaussians.training import surface_targets
+    from seasonscapes.gaussians.training_views import overview_cameras, relit_frames
+    from seasonscapes.rendering.hemisphere_rays import ray_scene
+    from seasonscapes.rendering.mitsuba_scene import mi_mesh
+
+    pairs = dated_textures(place, dated, options.dates)
+    days, textures = [day for day, _ in pairs], [texture for _, texture in pairs]
+    extent_m = float(np.ptp(place.terrain.vertices[:, :2], axis=0).max())
+    surfels = terrain_surfels(place.terrain, extent_m / options.discs)
+    albedo = np.stack([surfel_albedo(surfels, texture) for texture in textures])
+    around = np.stack([neighbourhood_mean(surfels.means, each, surfels.plan.spacing_m) for each in albedo])
+    seasons = [number % len(days) for number in range(options.suns)]
+    lights, times = draw_lights(place, model, [days[season] for season in seasons], seed=seed, progress=progress)
+    received = np.empty((options.suns, len(surfels.means), 3), np.float32)
+    transport, states, frames = None, [], []
+    cameras = overview_cameras(place.terrain, options.views, size_px=options.view_px, first_deg=30.0)
+    for season, texture in enumerate(textures):
+        own = [number for number in range(options.suns) if seasons[number] == season]
+        scene = ray_scene(mi_mesh(place.terrain, texture))
+        if transport is None:
+            report = task_progress(progress, "transport")
+            transport = trace_disc_transport(scene, surfels, albedo[season], rays=64, seed=seed, progress=report)
+            states = [
+                light_state(transport, light, float(at.timetuple().tm_yday))
+                for light, at in zip(lights, times, strict=True)
+            ]
+        if own:
+            report = task_progress(progress, f"surface, date {season + 1} of {len(days)}")
+            received[own] = surfel_irradiance(
+                scene, surfels, [lights[number] for number in own], rays=128, seed=seed, progress=report
+            )
+        # Images of one date suffice: they determine the splats' width, not the season.
+        if season == len(days) // 2 and options.views and own:
+            wanted = [(number, lights[number], states[number]) for number in own]
+            report = task_progress(progress, "pictures")
+            frames = relit_frames(scene, surfels, cameras, wanted, seed=seed, progress=report)
+    assert transport is not None, "there is at least one date"
+    targets = surface_targets(states, seasons, albedo, received)
+    return DistillationData(surfels, albedo, around, days, transport, targets, times, frames, cameras)
+
+
+def draw_lights(
+    place: Place, model: SkyModel, days: Sequence[float], *, seed: int = 0, progress: Progress | None = None
+) -> tuple[list[Illumination], list[datetime]]:
+    """One illumination for each day of the year, at a random hour with the sun above 2°, or the best of 64 tries."""
+    rng, height_m, frame = np.random.default_rng(seed), place.median_height_m, place.frame
+    lights, times = [], []
+    for day in each_reported(days, len(days), progress, "light"):
+        tried = []
+        while len(tried) < 64 and not (tried and tried[-1].sun.elevation_deg > 2.0):
+            hours = float(rng.uniform(0.0, 24.0))
+            at = datetime(_YEAR, 1, 1, tzinfo=UTC) + timedelta(days=day - 1, hours=hours)
+            tried.append(sun_moon_position(at, frame.latitude_deg, frame.longitude_deg, height_m))
+        candidates = tried[-1:] if tried[-1].sun.elevation_deg > 2.0 else tried
+        best = max(candidates, key=lambda position: position.sun.elevation_deg)
+        lights.append(illumination_at(model, best, height_m, workspace=place.workspace))
+        times.append(best.time)
+    log.info("%d instants, %s to %s UTC", len(days), f"{min(times):%d %b %H:%M}", f"{max(times):%d %b %H:%M}")
+    return lights, times
+
+
+def export_training_views(folder: Path, place: Place, data: DistillationData) -> None:
+    """Write the training images as PNG, with cameras, times and suns for other trainers (nerfstudio, COLMAP)."""
+    from seasonscapes.cameras.exchange import NamedView
+    from seasonscapes.gaussians.interchange import BakedSplats, TrainingView, write_training_views
+    from seasonscapes.images import srgb_from_linear, write_png
+
+    per_camera, views = len(data.frames) // max(len(data.cameras), 1), []
+    for number, frame in enumerate(data.frames):
+        name = f"images/{number:04d}.png"
+        write_png(folder / name, np.clip(frame.image, 0.0, 1.0))
+        view = NamedView(f"{number:04d}", data.cameras[number // per_camera], name, data.times[frame.time])
+        views.append(TrainingView(view, _state(data, frame.time)))
+    surfels = data.surfels
+    rgb = srgb_from_linear(data.albedo[len(data.days) // 2]).astype(np.float32)
+    splats = BakedSplats(surfels.means, surfels.quaternions, surfels.log_scales, surfels.opacity_logits, rgb)
+    write_training_views(folder, views, splats, place.frame)
+
+
+def _state(data: DistillationData, time: int) -> LightState:
+    return data.targets.states[time]
+
+
+def distillation_record(place: Place, distilled: Distilled) -> dict[str, Any]:
+    """Plain values about a distilled model."""
+    from seasonscapes.gaussians.model import bytes_each
+
+    surfels, losses = distilled.data.surfels, distilled.losses
+    return {
+        "scene": place.scene.name,
+        "gaussians": len(surfels.means),
+        "spacing_m": round(surfels.plan.spacing_m, 2),
+        "bytes_per_gaussian": round(bytes_each(distilled.model), 1),
+        "suns": len(distilled.data.times),
+        "dates": distilled.data.days,
+        "loss": losses[-1] if losses else None,
+    }

@@ -1,0 +1,135 @@
+"""Views of a distilled Gaussian model at any instant, and its Gaussians baked for other programs."""
+
+from __future__ import annotations
+
+import time as clock
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from seasonscapes.cameras.pinhole import view_in_frame
+from seasonscapes.errors import InputError
+from seasonscapes.sky.models import SkyModel
+from seasonscapes.workflows.distillation import require_torch
+from seasonscapes.workflows.illumination import illumination_for_camera, sky_model
+from seasonscapes.workflows.place import Place, utc_at
+
+if TYPE_CHECKING:
+    from seasonscapes.cameras.pinhole import Camera
+    from seasonscapes.gaussians.interchange import BakedSplats
+    from seasonscapes.gaussians.model import GaussianModel
+    from seasonscapes.gaussians.splat_view import SplatView
+    from seasonscapes.sky.illumination import Illumination
+
+
+def day_of_year(time: datetime) -> float:
+    """Day of the year with the hour as its fraction; the first of January begins at 1."""
+    return time.timetuple().tm_yday + time.hour / 24.0
+
+
+def require_scene(model: GaussianModel, place: Place) -> None:
+    """`InputError` where a model was distilled from another scene."""
+    if model.note.get("scene") != place.scene.name:
+        got = str(model.note.get("scene"))
+        raise InputError("--model", "was distilled from another scene", got=got, expected=place.scene.name)
+
+
+def render_gaussians(
+    model: GaussianModel,
+    place: Place,
+    camera: Camera,
+    time: str | datetime,
+    *,
+    sky: str | Path | SkyModel = "clear",
+    subpixels: int = 2,
+    device: str = "cpu",
+) -> SplatView:
+    """Render a distilled model at a date and hour.
+
+    Parameters
+    ----------
+    model
+        Of `distil`, or `gaussians.model.load_model`.
+    place
+        The place that it was distilled from.
+    camera
+        A camera; one calibrated in another frame is converted to the place's.
+    time
+        An aware datetime, or ISO 8601 text; without offset it is civil time at the place.
+    sky
+        A sky model, its name or its file.
+    subpixels
+        Samples along a pixel's side.
+    device
+        ``"cpu"``, or ``"cuda"`` (needs gsplat).
+
+    Returns
+    -------
+    SplatView
+        Radiance ``(H, W, 3)`` [cd/m²], surface radiance, coverage and depth.
+
+    Raises
+    ------
+    InputError
+        For a model of another scene.
+    NoTerrainInView
+        Where no Gaussian is in view.
+
+    Examples
+    --------
+    See `distil`.
+    """
+    require_torch()
+    from seasonscapes.gaussians.rasterise import choose_threads
+    from seasonscapes.gaussians.splat_view import render_model
+
+    choose_threads(1)
+    require_scene(model, place)
+    camera = view_in_frame(camera, place.frame)
+    utc = utc_at(place, time)
+    light, _ = illumination_for_camera(place, camera, sky_model(sky), utc)
+    return render_model(model, camera, light, day_of_year(utc), subpixels=subpixels, device=device)
+
+
+def timed_view(
+    model: GaussianModel, camera: Camera, light: Illumination, day: float, *, subpixels: int, device: str
+) -> tuple[SplatView, dict[str, float]]:
+    """`render_gaussians` for a known light, and the milliseconds of colouring and rasterisation."""
+    from seasonscapes.gaussians.splat_view import model_colours, render_model
+
+    start = clock.perf_counter()
+    colours = model_colours(model, light, day)
+    middle = clock.perf_counter()
+    view = render_model(model, camera, light, day, colours=colours, subpixels=subpixels, device=device)
+    end = clock.perf_counter()
+    return view, {"colours_ms": round(1e3 * (middle - start), 1), "render_ms": round(1e3 * (end - middle), 1)}
+
+
+def bake_gaussians(
+    model: GaussianModel, light: Illumination, day: float, *, exposure: str | float = "auto"
+) -> tuple[BakedSplats, float]:
+    """All Gaussians of one instant in display colours, and the EV100 of their exposure.
+
+    Parameters
+    ----------
+    model
+        The model.
+    light, day
+        Illumination, and day of the year.
+    exposure
+        ``"auto"`` or ``"eye"`` expose for a grey card in the open; or EV100.
+    """
+    from seasonscapes.exposure import develop, exposure_ev100
+    from seasonscapes.gaussians.interchange import BakedSplats
+    from seasonscapes.gaussians.splat_view import model_colours
+    from seasonscapes.images import srgb_from_linear
+
+    colours, state = model_colours(model, light, day)
+    radiance = colours * np.float32(state.global_lx / np.pi)
+    card = np.full((1, 1, 3), 0.18 * state.global_lx / np.pi)
+    ev100 = exposure_ev100(card, exposure)
+    rgb = srgb_from_linear(develop(radiance[None], ev100, eye=exposure == "eye"))[0].astype(np.float32)
+    splats = BakedSplats(model.means, model.quaternions, model.log_scales, model.opacity_logits, rgb)
+    return splats, ev100

@@ -1,0 +1,237 @@
+"""Calibrated photographs of a place: chosen by time from a manifest, opened with their poses, masked and rectified."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from seasonscapes.cameras.pinhole import view_in_frame
+from seasonscapes.errors import InputError, UnreadableImage
+from seasonscapes.progress import Progress, each_reported
+from seasonscapes.workflows.place import Place, utc_at
+
+if TYPE_CHECKING:
+    from seasonscapes.calibration.calibration_file import CalibratedWebcam
+    from seasonscapes.cameras.observation import ManifestRow, Observation
+    from seasonscapes.frames import LocalFrame
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class PhotographSources:
+    """Where photographs and their poses lie.
+
+    Parameters
+    ----------
+    manifest
+        The ``.csv`` that ``seasonscapes webcams --manifest`` wrote.
+    calibrations
+        Folder of ``WEBCAM_calibration.json``, as ``seasonscapes calibrate`` writes them.
+    masks
+        Folder of ``WEBCAM.png``, black where something stands before the landscape; optional.
+    """
+
+    manifest: Path
+    calibrations: Path
+    masks: Path | None = None
+
+    def calibration_of(self, webcam: str) -> Path:
+        """The calibration record of a webcam, whether it exists or not."""
+        return self.calibrations / f"{webcam}_calibration.json"
+
+
+def open_photographs(
+    place: Place,
+    manifest: str | Path,
+    calibrations: str | Path,
+    times: str | datetime | Sequence[str | datetime],
+    *,
+    masks: str | Path | None = None,
+    within_min: float = 30.0,
+    progress: Progress | None = None,
+) -> list[Observation]:
+    """Open the photographs nearest to some times, with their calibrated poses, in a place's frame.
+
+    Parameters
+    ----------
+    place
+        The place.
+    manifest
+        A ``.csv`` of ``seasonscapes webcams --manifest``.
+    calibrations
+        Folder of ``WEBCAM_calibration.json``, as ``seasonscapes calibrate`` writes them.
+    times
+        Aware datetimes, or ISO 8601 text; without offset it is civil time at the place.
+    masks
+        Folder of ``WEBCAM.png``, black where something stands before the landscape.
+    within_min
+        Use each webcam's photograph nearest to a time, within so many minutes.
+    progress
+        Called with a task and its finished share.
+
+    Returns
+    -------
+    list of Observation
+        Linear images ``(H, W, 3)`` with masks, cameras in the place's frame and pose uncertainties. A panorama gives
+        several perspective views. Webcams without a calibration are left out and logged.
+
+    Raises
+    ------
+    InputError
+        Where no photograph is near enough, none is calibrated, or a file is damaged.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import seasonscapes as ss
+    >>> place = ss.load_place("alpine_small")
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     sources = ss.synthetic_photographs(place, ["2024-07-20T13:30"], folder, sky="hosek", size_px=(48, 32))
+    ...     photographs = ss.open_photographs(place, sources.manifest, sources.calibrations, "2024-07-20T13:30")
+    >>> len(photographs), photographs[0].image.shape
+    (2, (32, 48, 3))
+    """
+    wanted = [times] if isinstance(times, (str, datetime)) else list(times)
+    sources = PhotographSources(Path(manifest), Path(calibrations), None if masks is None else Path(masks))
+    utc = [utc_at(place, time) for time in wanted]
+    return photographs_at(place, sources, utc, within_min=within_min, where="times", progress=progress)
+
+
+def photographs_at(
+    place: Place,
+    sources: PhotographSources,
+    times: Sequence[datetime],
+    *,
+    within_min: float = 30.0,
+    where: str = "--times",
+    progress: Progress | None = None,
+) -> list[Observation]:
+    """`open_photographs` from given sources at UTC times; ``where`` is what an error message calls the times."""
+    near = [rows_at(sources, time, within_min=within_min, where=where) for time in times]
+    rows = {row.path: row for group in near for row in group}
+    return observations(list(rows.values()), sources, place.frame, progress=progress)
+
+
+def rows_at(
+    sources: PhotographSources, time: datetime, *, within_min: float, where: str = "--time"
+) -> list[ManifestRow]:
+    """Return each webcam's photograph nearest to a time.
+
+    Parameters
+    ----------
+    sources
+        Its manifest is read.
+    time
+        Aware.
+    within_min
+        Largest difference in time [min].
+    where
+        What an error message calls the time.
+
+    Raises
+    ------
+    InputError
+        Where no photograph is near enough; it names the nearest one.
+    """
+    from seasonscapes.cameras.observation import read_manifest
+
+    nearest: dict[str, ManifestRow] = {}
+    rows = read_manifest(sources.manifest)
+    for row in sorted(rows, key=lambda row: (abs(row.time - time), row.path)):
+        if abs(row.time - time) <= timedelta(minutes=within_min):
+            nearest.setdefault(row.webcam, row)
+    if not nearest:
+        expected = "the manifest is empty"
+        if rows:
+            closest = min(rows, key=lambda row: abs(row.time - time))
+            expected = f"the nearest is {closest.webcam} at {closest.time.isoformat()}"
+        raise InputError(where, f"no picture within {within_min:g} minutes", got=time.isoformat(), expected=expected)
+    return [nearest[name] for name in sorted(nearest)]
+
+
+def uncalibrated(rows: Sequence[ManifestRow], sources: PhotographSources) -> list[str]:
+    """Webcams of photographs that have no calibration record."""
+    return sorted({row.webcam for row in rows if not sources.calibration_of(row.webcam).is_file()})
+
+
+def observations(
+    rows: Sequence[ManifestRow], sources: PhotographSources, frame: LocalFrame, *, progress: Progress | None = None
+) -> list[Observation]:
+    """Open photographs as pinhole observations in a frame; webcams without a calibration are left out and logged.
+
+    Raises
+    ------
+    InputError
+        Where no webcam is calibrated.
+    """
+    from seasonscapes.calibration.calibration_file import read_calibration
+
+    opened: list[Observation] = []
+    for row in each_reported(rows, len(rows), progress, "opening photographs"):
+        record = sources.calibration_of(row.webcam)
+        if record.is_file():
+            opened += opened_views(row, sources, read_calibration(record), frame)
+    without = uncalibrated(rows, sources)
+    if not opened:
+        raise InputError(
+            sources.calibrations,
+            "holds no calibration of a webcam with a picture at that time",
+            got=", ".join(without),
+            cure="seasonscapes calibrate SCENE --webcam ... -o FOLDER",
+        )
+    for name in without:
+        log.info("left out: %s: no calibration", name)
+    return opened
+
+
+def opened_views(
+    row: ManifestRow, sources: PhotographSources, calibrated: CalibratedWebcam, frame: LocalFrame
+) -> list[Observation]:
+    """Open one photograph as pinhole observations in a frame: rectified, or cut out of its panorama."""
+    from seasonscapes.cameras.lens import rectify
+    from seasonscapes.cameras.observation import Observation, open_observation
+    from seasonscapes.cameras.panorama import Panorama, cut_view, split_panorama
+
+    view, sigma = view_in_frame(calibrated.view, frame), calibrated.sigma
+    picture = open_observation(row, sources.manifest.parent, view)
+    mask = _mask(sources, row.webcam, picture.mask.shape)
+    mask_image = np.repeat(mask[..., None], 3, axis=2).astype(np.float32)
+    if not isinstance(view, Panorama):
+        if not calibrated.k1:
+            return [replace(picture, mask=mask, pose_sigma=sigma)]
+        image, inside = rectify(picture.image, view, calibrated.k1)
+        kept = rectify(mask_image, view, calibrated.k1)[0][..., 0] > 0.99
+        return [Observation(image.astype(np.float32), inside & kept, view, row.time, row.webcam, sigma)]
+    views = []
+    for number, camera in enumerate(split_panorama(view)):
+        image, inside = cut_view(picture.image, view, camera)
+        kept = cut_view(mask_image, view, camera)[0][..., 0] > 0.99
+        views.append(Observation(image, inside & kept, camera, row.time, f"{row.webcam}/{number}", sigma))
+    return views
+
+
+def _mask(sources: PhotographSources, webcam: str, shape: tuple[int, ...]) -> np.ndarray:
+    from seasonscapes.images import read_image_linear
+
+    path = None if sources.masks is None else sources.masks / f"{webcam}.png"
+    if path is None or not path.is_file():
+        return np.ones(shape, bool)
+    try:
+        mask = read_image_linear(path).max(axis=2) > 0.5
+    except UnreadableImage:
+        raise InputError(path, "not a readable picture") from None
+    if mask.shape != shape:
+        raise InputError(
+            path,
+            "the mask has another size than its webcam's pictures",
+            got=f"{mask.shape[1]} x {mask.shape[0]}",
+            expected=f"{shape[1]} x {shape[0]}",
+        )
+    return mask

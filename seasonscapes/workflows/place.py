@@ -1,0 +1,271 @@
+"""Places: a scene file with its rasters read and its terrain built."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from seasonscapes import bundled
+from seasonscapes.errors import InputError
+from seasonscapes.frames import LocalFrame
+from seasonscapes.progress import Progress, task_progress
+from seasonscapes.scene import SceneFile, read_scene
+from seasonscapes.source_hash import source_hash
+from seasonscapes.terrain.surface import Raster, Terrain, Texture, atlas_identity, require_atlas
+from seasonscapes.workflows.terrain_building import MeshOptions
+from seasonscapes.workspace import Workspace, build_once, default_workspace, file_hash
+
+if TYPE_CHECKING:
+    from seasonscapes.terrain.raster import FillReport
+    from seasonscapes.terrain.synthetic import SyntheticMassif
+    from seasonscapes.terrain.unwrap import Atlas
+
+__all__ = ["MeshOptions", "Place", "find_scene", "ground_height_m", "load_place", "utc_at"]
+
+# Includes the synthetic massif's own modules.
+_TERRAIN_CODE = ("workflows.terrain_building",)
+_MASSIF_CODE = ("terrain.synthetic",)
+
+
+@dataclass(frozen=True)
+class Place:
+    """A scene file with its elevation read and its terrain built; made by `load_place`.
+
+    Parameters
+    ----------
+    path
+        The scene file.
+    scene
+        What the scene file states.
+    frame
+        The local east-north-up frame of all positions [m] and directions.
+    elevation
+        Heights ``(H, W, 1)`` [m] in the scene's vertical datum, holes filled.
+    fill
+        Which holes were filled.
+    terrain
+        The triangulated surface with texture coordinates.
+    atlas
+        Size and quality of the UV atlas.
+    synthetic
+        The synthetic massif, where the scene is one.
+    key
+        Plain values that determine the terrain; part of the key of every artefact made from it.
+    workspace
+        Where built artefacts are kept.
+    options
+        How the terrain was meshed and unwrapped.
+    """
+
+    path: Path
+    scene: SceneFile
+    frame: LocalFrame
+    elevation: Raster
+    fill: FillReport
+    terrain: Terrain
+    atlas: Atlas
+    synthetic: SyntheticMassif | None
+    key: dict
+    workspace: Workspace
+    options: MeshOptions
+
+    @property
+    def texture_shape(self) -> tuple[int, int]:
+        """Rows and columns of the place's textures [texels]."""
+        return self.atlas.height_px, self.atlas.width_px
+
+    @cached_property
+    def atlas_id(self) -> str:
+        """Identity of the UV atlas, which textures of this place carry; see `terrain.surface.atlas_identity`."""
+        return atlas_identity(self.terrain, self.atlas.width_px, self.atlas.height_px)
+
+    @cached_property
+    def median_height_m(self) -> float:
+        """Median height of the terrain [m]; sun, sky and interreflection are computed for this height."""
+        return float(np.median(self.elevation.values))
+
+    def require_texture(self, texture: Texture, *, what: str = "texture") -> Texture:
+        """Return the texture, or raise `errors.AtlasMismatch` where it belongs to another atlas."""
+        require_atlas(texture, self.atlas_id, self.texture_shape, what=what)
+        return texture
+
+
+def find_scene(scene: str | Path) -> Path:
+    """Return the path of a scene file, or of a bundled scene by its bare name (``alpine``).
+
+    Raises
+    ------
+    InputError
+        Where there is neither; it lists the bundled scenes.
+    """
+    path = Path(scene)
+    if path.suffix == ".toml" or path.is_file():
+        return path
+    return bundled.bundled_path("scenes", str(scene))
+
+
+def load_place(
+    scene: str | Path = "alpine",
+    workspace: Workspace | None = None,
+    *,
+    options: MeshOptions | None = None,
+    allow_outside: bool = False,
+    progress: Progress | None = None,
+) -> Place:
+    """Read a scene file and its elevation, and build its terrain, or load the terrain built before.
+
+    Parameters
+    ----------
+    scene
+        A scene file (``.toml``), or the name of a bundled scene: ``"alpine"`` or ``"alpine_small"``.
+    workspace
+        Where built artefacts are kept; default `workspace.default_workspace`.
+    options
+        How to mesh and unwrap; default: decided by the data.
+    allow_outside
+        Let the scene file name rasters outside its own folder.
+    progress
+        Called with a task and its finished share.
+
+    Returns
+    -------
+    Place
+        With a terrain in east-north-up metres about the scene's origin.
+
+    Raises
+    ------
+    InputError
+        One line about what is wrong with the scene file or its rasters.
+
+    Examples
+    --------
+    >>> import seasonscapes as ss
+    >>> place = ss.load_place("alpine_small")
+    >>> place.terrain.vertices.shape[1], place.scene.cameras[0].name
+    (3, 'aerial')
+    """
+    path, options = find_scene(scene), options or MeshOptions()
+    declared = read_scene(path, allow_outside=allow_outside)
+    if declared.elevation is None:
+        raise InputError(path, "names no elevation raster", cure='add a table [elevation] with file = "dem.tif"')
+    workspace = workspace or default_workspace()
+    from seasonscapes.workflows import terrain_building
+
+    report = task_progress(progress, "terrain")
+    report(0.0)
+    massif = None if declared.elevation.synthetic is None else _massif(declared, workspace)
+    elevation, fill = terrain_building.read_heights(declared, massif, where=f"{path}: elevation.file")
+    report(0.3)
+    frame = terrain_building.local_frame(declared, elevation)
+    source = declared.elevation.file
+    key = {
+        "code": source_hash(*_TERRAIN_CODE),
+        "elevation": declared.elevation.model_copy(update={"file": source and Path(source).name}),
+        "elevation_hash": source and file_hash(source),
+        "imagery_hash": declared.imagery and file_hash(declared.imagery.file) if options.texel_m is None else None,
+        "area": declared.area,
+        "frame": frame,
+        "options": options,
+    }
+    terrain, atlas = build_once(
+        workspace,
+        f"{declared.name}/terrain",
+        key,
+        code=_TERRAIN_CODE,
+        suffix=".npz",
+        build=lambda: terrain_building.build_terrain(elevation, frame, declared, options),
+        save=terrain_building.save_built_terrain,
+        load=terrain_building.load_built_terrain,
+    )
+    report(1.0)
+    return Place(path, declared, frame, elevation, fill, terrain, atlas, massif, key, workspace, options)
+
+
+def _massif(scene: SceneFile, workspace: Workspace) -> SyntheticMassif:
+    from seasonscapes.workflows import terrain_building
+
+    assert scene.elevation is not None
+    assert scene.elevation.synthetic is not None
+    declared = scene.elevation.synthetic
+    return build_once(
+        workspace,
+        f"{scene.name}/massif",
+        {"synthetic": declared},
+        code=_MASSIF_CODE,
+        suffix=".npz",
+        build=lambda: terrain_building.build_massif(declared),
+        save=terrain_building.save_massif,
+        load=terrain_building.load_massif,
+    )
+
+
+def ground_height_m(place: Place, latitude_deg: float, longitude_deg: float, *, where: str) -> float:
+    """Height of the terrain at a position in the scene's vertical datum [m].
+
+    Parameters
+    ----------
+    place
+        The place.
+    latitude_deg, longitude_deg
+        WGS 84 position [deg].
+    where
+        What an error message calls the position, such as a flag.
+
+    Raises
+    ------
+    InputError
+        Outside the elevation raster.
+    """
+    from seasonscapes.terrain.raster import bounds_geographic
+
+    height = float(_height_or_nan(place, latitude_deg, longitude_deg))
+    if not np.isfinite(height):
+        west, south, east, north = bounds_geographic(place.elevation)
+        raise InputError(
+            where,
+            "the place lies outside the elevation raster",
+            got=f"{latitude_deg}, {longitude_deg}",
+            expected=f"latitude {south:.4f} … {north:.4f}, longitude {west:.4f} … {east:.4f}",
+        )
+    return height
+
+
+def _height_or_nan(place: Place, latitude_deg: float, longitude_deg: float) -> float:
+    from seasonscapes.terrain.raster import map_from_geodetic, sample_raster
+
+    x, y = map_from_geodetic(place.elevation.crs, latitude_deg, longitude_deg)
+    return float(sample_raster(place.elevation, x, y)[..., 0])
+
+
+def utc_at(place: Place, time: str | datetime) -> datetime:
+    """Return the UTC instant of a time at a place.
+
+    Parameters
+    ----------
+    place
+        Its origin decides the time zone.
+    time
+        An aware datetime, or ISO 8601 text. A time without offset is civil time at the place.
+
+    Returns
+    -------
+    datetime.datetime
+        Aware, in UTC.
+
+    Raises
+    ------
+    InputError
+        For text that is no time, and for civil times that daylight saving skips or repeats.
+    """
+    from seasonscapes.civil_time import resolve_time
+
+    if isinstance(time, datetime):
+        if time.tzinfo is not None:
+            return time.astimezone(UTC)
+        time = time.isoformat()
+    return resolve_time(time, place.frame.latitude_deg, place.frame.longitude_deg).utc

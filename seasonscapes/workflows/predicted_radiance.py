@@ -1,0 +1,113 @@
+"""Per-texel radiance predicted from a recovered albedo at one instant.
+
+A prior for the radiometric calibration of photographs, and for the completion of what they paint.
+"""
+
+from __future__ import annotations
+
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from seasonscapes.progress import Progress, task_progress
+from seasonscapes.sky.models import SkyModel
+from seasonscapes.terrain.surface import Texture, load_texture, save_texture
+from seasonscapes.workflows.albedo_sources import load_albedo
+from seasonscapes.workflows.illumination import illumination_on_terrain, sky_model
+from seasonscapes.workflows.place import Place, utc_at
+from seasonscapes.workspace import build_once
+
+if TYPE_CHECKING:
+    from seasonscapes.albedo.seasons import DatedAlbedo
+
+_CODE = ("workflows.predicted_radiance",)
+_RAYS = 64
+# Relative standard error of radiance predicted from an albedo that photographs gave. It determines the exposure of a
+# photograph better than the sky in it does.
+RELATIVE_SIGMA = 0.2
+
+
+def predict_radiance(
+    place: Place,
+    albedo: DatedAlbedo,
+    time: str | datetime,
+    *,
+    sky: str | Path | SkyModel = "clear",
+    progress: Progress | None = None,
+) -> Texture:
+    """Predict the radiance that leaves every texel at an instant; kept in the workspace.
+
+    Parameters
+    ----------
+    place
+        The place.
+    albedo
+        A recovered albedo of the place's atlas; see `load_albedo`.
+    time
+        An aware datetime, or ISO 8601 text; without offset it is civil time at the place.
+    sky
+        A sky model, its name or its file.
+    progress
+        Called with a task and its finished share.
+
+    Returns
+    -------
+    Texture
+        Radiance ``(R, S, 3)`` [cd/m²]; ``weight`` is the albedo's: 0 where no photograph measured it.
+
+    Raises
+    ------
+    AtlasMismatch
+        Where the albedo belongs to another atlas.
+    """
+    model, utc = sky_model(sky), utc_at(place, time)
+    texture = place.require_texture(albedo.load(), what="albedo")
+    return build_once(
+        place.workspace,
+        f"{place.scene.name}/predicted",
+        {"place": place.key, "albedo": albedo.content, "time": utc, "sky": model},
+        code=_CODE,
+        suffix=".npz",
+        build=lambda: _relit(place, texture, utc, model, progress),
+        save=save_texture,
+        load=load_texture,
+    )
+
+
+def measured_radiance(
+    place: Place, path: Path, utc: datetime, model: SkyModel, *, progress: Progress | None = None
+) -> np.ndarray:
+    """Predicted radiance ``(R, S, 3)`` [cd/m²] of the texels whose albedo a file states as measured, NaN elsewhere."""
+    predicted = predict_radiance(place, load_albedo(place, path, utc.date()), utc, sky=model, progress=progress)
+    return np.where((predicted.weight > 0.0)[..., None], predicted.values, np.float32(np.nan))
+
+
+def albedo_relative_sigma(path: Path) -> np.ndarray:
+    """Relative standard error ``(R, S)`` float32 of an albedo file; `RELATIVE_SIGMA` where it states none."""
+    with np.load(path, allow_pickle=False) as stored:
+        values = stored["values"]
+        sigma = stored["sigma"] if "sigma" in stored else np.full(values.shape[:2], np.inf, np.float32)
+    relative = sigma / np.maximum(values[..., 1], 1e-3)
+    return np.where(np.isfinite(relative), relative, RELATIVE_SIGMA).astype(np.float32)
+
+
+def _relit(place: Place, albedo: Texture, utc: datetime, model: SkyModel, progress: Progress | None) -> Texture:
+    from seasonscapes.relighting.lit_texture import bake_lit_texture
+    from seasonscapes.rendering.hemisphere_rays import ray_scene
+    from seasonscapes.rendering.mitsuba_scene import mi_mesh
+    from seasonscapes.rendering.transport import SamplingOptions
+    from seasonscapes.terrain.texels import texel_positions
+
+    light, _ = illumination_on_terrain(place, model, utc)
+    positions, _ = texel_positions(place.terrain, place.atlas.width_px, place.atlas.height_px)
+    lit = bake_lit_texture(
+        ray_scene(mi_mesh(place.terrain, albedo.values)),
+        positions,
+        albedo.values,
+        light,
+        sampling=SamplingOptions(subpixels=1, rays=_RAYS),
+        progress=task_progress(progress, "relighting the albedo"),
+    )
+    return Texture(lit.radiance.astype(np.float32), albedo.weight, place.atlas_id)

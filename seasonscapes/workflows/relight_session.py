@@ -1,0 +1,449 @@
+"""A view of a place under any light: daylight coefficients traced once, then one cheap evaluation per instant.
+
+A `RenderJob` states everything by plain values, so that another process, or another machine with the same workspace,
+opens the same session and renders the same frame to the digit. `open_session` turns a job into a `RelightSession`.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from datetime import date, datetime
+from functools import reduce
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from seasonscapes.albedo.seasons import DatedAlbedo, day_number, interpolate_albedo, season_weights, snowline_fraction
+from seasonscapes.cameras.pinhole import Camera, view_in_frame
+from seasonscapes.progress import Progress, task_progress
+from seasonscapes.scene import NamedCamera
+from seasonscapes.sky.illumination import Illumination
+from seasonscapes.sky.models import SkyModel
+from seasonscapes.terrain.surface import Texture
+from seasonscapes.workflows.albedo_sources import AlbedoFile, dated_albedos, require_season, snow_transition_between
+from seasonscapes.workflows.illumination import (
+    SunMoonPosition,
+    illumination_for_camera,
+    sky_model,
+    tabulate_illumination,
+)
+from seasonscapes.workflows.place import MeshOptions, Place, load_place, utc_at
+from seasonscapes.workflows.views import camera_for
+from seasonscapes.workspace import Workspace, artefact_key, build_once
+
+if TYPE_CHECKING:
+    from seasonscapes.cameras.panorama import Panorama
+    from seasonscapes.rendering.hemisphere_rays import RayScene
+    from seasonscapes.rendering.radiance import RenderedView
+    from seasonscapes.rendering.relit_view import RelightableView
+    from seasonscapes.rendering.transport import ViewCoefficients
+
+_COEFFICIENTS_CODE = ("rendering.transport", "rendering.coefficients_file")
+_VIEW_ALBEDO_CODE = ("rendering.transport", "rendering.relit_view")
+FRAME_CODE = ("workflows.relight_session", "relighting.frame_file")
+# Rows of the sky maps. Without clouds half as many as usual change an image by less than about 0.1 % in the mean: the
+# coefficients average over patches of 7°, and the sky behind the terrain is evaluated by the atmosphere model itself.
+_CLOUDY_ROWS, _CLEAR_ROWS = 128, 64
+
+
+@dataclass(frozen=True)
+class RenderJob:
+    """What to render, by plain values that can be sent to another process.
+
+    Parameters
+    ----------
+    scene, workspace
+        Paths; every worker must reach both.
+    mesh
+        How the terrain is built.
+    view
+        Position, angles and field of view of the camera.
+    size_px
+        Width and height [px].
+    sky
+        The sky model.
+    albedo
+        Recovered albedos that replace the scene's own; empty: the scene's own.
+    season
+        How to interpolate between dated albedos, see `albedo.seasons.season_weights`.
+    base_day
+        Date of the albedo that the coefficients are traced with: near the film's, since the weights of a pixel's
+        samples depend on it a little.
+    seed
+        Of the coefficients.
+    device
+        ``"auto"``, ``"cuda"`` or ``"llvm"``.
+    allow_outside
+        Let the scene file name rasters outside its folder.
+    """
+
+    scene: Path
+    workspace: Path
+    mesh: MeshOptions
+    view: NamedCamera
+    size_px: tuple[int, int]
+    sky: SkyModel
+    albedo: tuple[AlbedoFile, ...] = ()
+    season: str = "blended"
+    base_day: date = date(2024, 7, 1)
+    seed: int = 0
+    device: str = "auto"
+    allow_outside: bool = False
+
+
+@dataclass
+class RelightSession:
+    """Daylight coefficients of one camera of a place, ready for any instant; made by `relight_session`.
+
+    Parameters
+    ----------
+    place, camera
+        The place and the camera, whose pose is in the place's frame.
+    sky
+        The sky model.
+    season
+        How to interpolate between dated albedos.
+    dated, base
+        Dated albedos, and the one that the coefficients were traced with.
+    seed
+        Of the coefficients.
+    view_key
+        Plain values that determine the camera, for artefact keys.
+    coefficients, ray_scene, relightable
+        The traced transport and its copy on the device.
+    """
+
+    place: Place
+    camera: Camera | Panorama
+    sky: SkyModel
+    season: str
+    dated: list[DatedAlbedo]
+    base: DatedAlbedo
+    seed: int
+    view_key: dict
+    coefficients: ViewCoefficients
+    ray_scene: RayScene
+    relightable: RelightableView
+    _albedos: dict[int, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, repr=False)
+    _transitions: dict[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, repr=False)
+    _current: tuple[list[tuple[int, float]], RelightableView] | None = field(default=None, repr=False)
+
+
+def relight_session(
+    place: Place,
+    camera: Camera | Panorama,
+    *,
+    sky: str | Path | SkyModel = "clear",
+    albedo: Texture | DatedAlbedo | Sequence[DatedAlbedo] | None = None,
+    season: str = "blended",
+    base_day: date | None = None,
+    seed: int = 0,
+    device: str = "auto",
+    progress: Progress | None = None,
+) -> RelightSession:
+    """Trace the light transport of a view once, so that every instant costs a fraction of a second.
+
+    Coefficients are kept in the place's workspace and loaded from there the next time.
+
+    Parameters
+    ----------
+    place
+        The place.
+    camera
+        A camera or panorama; one calibrated in another frame is converted to the place's.
+    sky
+        A sky model, its name or its file.
+    albedo
+        One or several dated albedos, a texture of the place's atlas, or ``None`` for the scene's own.
+    season
+        ``"blended"``, ``"nearest"`` or ``"snow-line"``; how to interpolate between dated albedos.
+    base_day
+        Date of the albedo that the transport is traced with; default midsummer.
+    seed
+        Equal seeds give equal results.
+    device
+        ``"auto"``, ``"cuda"`` or ``"llvm"``.
+    progress
+        Called with a task and its finished share.
+
+    Returns
+    -------
+    RelightSession
+        Give it to `relight`.
+
+    Raises
+    ------
+    NoTerrainInView
+        Where the camera sees no terrain.
+    FrameMismatch, AtlasMismatch
+        For a camera without a frame, or a texture of another atlas.
+
+    Examples
+    --------
+    >>> import seasonscapes as ss
+    >>> place = ss.load_place("alpine_small")
+    >>> camera = ss.camera(place, "aerial", size_px=(48, 32))
+    >>> session = ss.relight_session(place, camera, sky="hosek")
+    >>> views = [ss.relight(session, f"2024-07-20T{hour}:00") for hour in (10, 16)]
+    >>> views[0].radiance.shape
+    (32, 48, 3)
+    """
+    require_season(season)
+    if albedo is None:
+        dated = dated_albedos(place)
+    elif isinstance(albedo, Texture):
+        dated = [_undated(place, albedo)]
+    else:
+        dated = [albedo] if isinstance(albedo, DatedAlbedo) else sorted(albedo, key=lambda each: each.day)
+    camera = view_in_frame(camera, place.frame)
+    return _traced_session(
+        place,
+        camera,
+        _camera_values(camera),
+        sky_model(sky),
+        dated,
+        season=season,
+        base_day=base_day or date(2024, 7, 1),
+        seed=seed,
+        device=device,
+        progress=progress,
+    )
+
+
+def relight(session: RelightSession, time: str | datetime) -> RenderedView:
+    """Render a session's view at an instant from its daylight coefficients.
+
+    Equals path tracing with the same number of bounces in expectation, without its noise.
+
+    Parameters
+    ----------
+    session
+        Of `relight_session`.
+    time
+        An aware datetime, or ISO 8601 text; without offset it is civil time at the place.
+
+    Returns
+    -------
+    RenderedView
+        Radiance ``(H, W, 3)`` [cd/m²], coverage and G-buffer.
+
+    Raises
+    ------
+    InputError
+        For a time that is none.
+
+    Examples
+    --------
+    See `relight_session`.
+    """
+    return view_at(session, utc_at(session.place, time))[0]
+
+
+def open_session(job: RenderJob, *, progress: Progress | None = None) -> RelightSession:
+    """Load a job's place and its daylight coefficients, or trace them where the workspace has none.
+
+    Raises
+    ------
+    InputError
+        For mistakes in the scene or the view.
+    NoTerrainInView
+        Where the camera sees no terrain.
+    """
+    place = load_place(
+        job.scene, Workspace(job.workspace), options=job.mesh, allow_outside=job.allow_outside, progress=progress
+    )
+    return session_of(job, place, progress=progress)
+
+
+def session_of(job: RenderJob, place: Place, *, progress: Progress | None = None) -> RelightSession:
+    """The session of a job whose place is loaded already; see `open_session`."""
+    camera = camera_for(place, job.view, size_px=job.size_px)
+    return _traced_session(
+        place,
+        camera,
+        {"view": job.view, "size": job.size_px},
+        job.sky,
+        dated_albedos(place, job.albedo),
+        season=job.season,
+        base_day=job.base_day,
+        seed=job.seed,
+        device=job.device,
+        progress=progress,
+    )
+
+
+def _traced_session(
+    place: Place,
+    camera: Camera | Panorama,
+    view_key: dict,
+    sky: SkyModel,
+    dated: list[DatedAlbedo],
+    *,
+    season: str,
+    base_day: date,
+    seed: int,
+    device: str,
+    progress: Progress | None,
+) -> RelightSession:
+    from seasonscapes.rendering.backend import use_backend
+    from seasonscapes.rendering.hemisphere_rays import ray_scene
+    from seasonscapes.rendering.mitsuba_scene import mi_mesh
+    from seasonscapes.rendering.relit_view import relightable_view
+
+    use_backend(device)
+    base = nearest_albedo(dated, base_day)
+    scene = ray_scene(mi_mesh(place.terrain, base.load().values))
+    tabulate_illumination(place, camera, sky, progress=task_progress(progress, "light transport", end=0.1))
+    inputs = {"place": place.key, **view_key, "albedo": _identity(base), "seed": seed}
+    coefficients = _coefficients(place, camera, scene, inputs, seed, progress)
+    relightable = relightable_view(scene, coefficients)
+    return RelightSession(place, camera, sky, season, dated, base, seed, view_key, coefficients, scene, relightable)
+
+
+def _coefficients(
+    place: Place, camera: Camera | Panorama, scene: RayScene, inputs: dict, seed: int, progress: Progress | None
+) -> ViewCoefficients:
+    from seasonscapes.rendering.coefficients_file import load_coefficients, save_coefficients
+    from seasonscapes.rendering.transport import SamplingOptions, ViewCoefficients, trace_view
+
+    sampling = SamplingOptions()
+    key = artefact_key(inputs | {"sampling": asdict(sampling)}, _COEFFICIENTS_CODE)
+    folder = place.workspace.folder / f"{place.scene.name}/coefficients-{key}"
+    if not (folder / "coefficients.json").is_file():
+        report = task_progress(progress, "light transport", start=0.1)
+        save_coefficients(folder, trace_view(scene, camera, sampling, seed=seed, progress=report), key=key)
+    coefficients = load_coefficients(folder, key=key)
+    assert isinstance(coefficients, ViewCoefficients)
+    return coefficients
+
+
+def _camera_values(camera: Camera | Panorama) -> dict:
+    names = ("width_px", "height_px", "fx", "fy", "cx", "cy")
+    numbers = {name: float(getattr(camera, name)) for name in names}
+    kind = getattr(camera, "projection", "pinhole")
+    return {"camera": {"kind": kind, "pose": camera.world_from_camera.tolist(), **numbers}}
+
+
+def _undated(place: Place, texture: Texture) -> DatedAlbedo:
+    import hashlib
+
+    place.require_texture(texture, what="albedo")
+    content = hashlib.sha256(texture.values.tobytes()).hexdigest()
+    return DatedAlbedo(date(2024, 7, 1), content, lambda: texture)
+
+
+def _identity(dated: DatedAlbedo) -> dict:
+    return {"date": dated.day.isoformat(), "content": dated.content}
+
+
+def nearest_albedo(dated: Sequence[DatedAlbedo], day: date) -> DatedAlbedo:
+    """The dated albedo nearest to a day of the year."""
+    return dated[season_weights([each.day for each in dated], day, season="nearest")[0][0]]
+
+
+def job_key(job: RenderJob, place: Place, dated: Sequence[DatedAlbedo]) -> str:
+    """Name of everything that determines a job's frames but their times; ``dated`` are the job's albedos."""
+    inputs = {
+        "place": place.key,
+        "view": job.view,
+        "size": job.size_px,
+        "sky": job.sky,
+        "albedo": [_identity(each) for each in dated],
+        "base": _identity(nearest_albedo(dated, job.base_day)),
+        "season": job.season,
+        "seed": job.seed,
+    }
+    return artefact_key(inputs, FRAME_CODE)
+
+
+def view_at(session: RelightSession, time: datetime) -> tuple[RenderedView, Illumination, SunMoonPosition]:
+    """The view at an aware instant, its illumination, and the positions of sun and moon."""
+    from seasonscapes.rendering.relit_view import relight_view
+
+    rows = _CLOUDY_ROWS if session.sky.cloudiness > 0.0 else _CLEAR_ROWS
+    light, position = illumination_for_camera(
+        session.place, session.camera, session.sky, time, map_height=rows, by_elevation=True
+    )
+    return relight_view(_with_albedo_of(session, time.date()), light), light, position
+
+
+def _with_albedo_of(session: RelightSession, day: date) -> RelightableView:
+    """The relightable view with the albedo of a day; the last one is kept."""
+    from seasonscapes.rendering.relit_view import with_albedo
+
+    weights = season_weights([each.day for each in session.dated], day, season=session.season)
+    if len(session.dated) == 1:
+        return session.relightable
+    if session._current is None or session._current[0] != weights:
+        for index, _ in weights:
+            if index not in session._albedos:
+                session._albedos[index] = _view_albedo(session, session.dated[index])
+        session._current = (weights, with_albedo(session.relightable, *_interpolated(session, weights, day)))
+    return session._current[1]
+
+
+def _interpolated(session: RelightSession, weights: list[tuple[int, float]], day: date) -> list[np.ndarray]:
+    """Albedo of the view's pixels and of its light clusters, interpolated between the dated albedos nearest to a day."""
+    parts = [session._albedos[index] for index, _ in weights]
+    if len(parts) == 1 or session.season != "snow-line":
+        scaled = [[weight * part[k] for part, (_, weight) in zip(parts, weights, strict=True)] for k in range(2)]
+        return [reduce(operator.add, terms) for terms in scaled]
+    pair = [session.dated[index] for index, _ in weights]
+    name = f"turning:{pair[0].content}:{pair[1].content}"
+    if name not in session._transitions:
+        # The time of transition is a texture like any other, and averaged over pixels like an albedo.
+        transition = DatedAlbedo(pair[0].day, name, lambda: snow_transition_between(session.place, *pair))
+        pixels, clusters = _view_albedo(session, transition)
+        coverage = np.maximum(session.coefficients.coverage[:, None], 1e-3)
+        session._transitions = {name: (pixels / coverage, clusters)}
+    snowline = snowline_fraction(*(day_number(each) for each in (pair[0].day, pair[1].day, day)))
+    return [
+        interpolate_albedo((parts[0][k], parts[1][k]), transition, weights[1][1], snowline)
+        for k, transition in enumerate(session._transitions[name])
+    ]
+
+
+def _view_albedo(session: RelightSession, dated: DatedAlbedo) -> tuple[np.ndarray, np.ndarray]:
+    """Mean albedo of the view's pixels and of its light clusters for a dated texture; kept in the workspace."""
+    from seasonscapes.rendering.mitsuba_scene import set_albedo
+    from seasonscapes.rendering.relit_view import cluster_albedo
+    from seasonscapes.rendering.transport import view_albedo
+
+    place = session.place
+
+    def build() -> tuple[np.ndarray, np.ndarray]:
+        texture = dated.load().values
+        set_albedo(session.ray_scene, texture)
+        pixels = view_albedo(session.ray_scene, session.coefficients).astype(np.float16)
+        return pixels, cluster_albedo(session.coefficients, texture).astype(np.float16)
+
+    inputs = {
+        "place": place.key,
+        **session.view_key,
+        "albedo": _identity(dated),
+        "base": _identity(session.base),
+        "seed": session.seed,
+    }
+    pixels, clusters = build_once(
+        place.workspace,
+        f"{place.scene.name}/view-albedo",
+        inputs,
+        code=_VIEW_ALBEDO_CODE,
+        suffix=".npz",
+        build=build,
+        save=_save_view_albedo,
+        load=_load_view_albedo,
+    )
+    return pixels.astype(np.float32), clusters.astype(np.float32)
+
+
+def _save_view_albedo(albedo: tuple[np.ndarray, np.ndarray], path: Path) -> None:
+    np.savez(path, pixels=albedo[0], clusters=albedo[1])
+
+
+def _load_view_albedo(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    with np.load(path) as file:
+        return file["pixels"], file["clusters"]

@@ -1,0 +1,264 @@
+"""Time-lapses: render frames into the workspace, here or on a cluster, then expose them together as a film."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import UTC, date, datetime, timedelta
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from seasonscapes import __version__
+from seasonscapes.errors import InputError
+from seasonscapes.exposure import develop, exposure_ev100
+from seasonscapes.progress import Progress, each_reported
+from seasonscapes.relighting.frame_file import frame_ev100, frame_name, load_frame, save_frame, time_stamp
+from seasonscapes.workflows.place import Place
+from seasonscapes.workflows.relight_session import RelightSession, RenderJob, job_key, open_session, session_of, view_at
+from seasonscapes.workspace import content_key
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class FilmLook:
+    """How rendered frames become pictures.
+
+    Parameters
+    ----------
+    exposure
+        ``"auto"`` (a camera), ``"eye"`` (an adapted observer), or a fixed EV100.
+    smooth_s
+        Width of the temporal smoothing of the exposure [s]; 0 exposes each frame by itself.
+    fps
+        Frames per second of a film.
+    """
+
+    exposure: str | float = "auto"
+    smooth_s: float = 900.0
+    fps: float = 24.0
+
+
+def base_day_of(times: Sequence[datetime]) -> date:
+    """Date of the albedo that a film's coefficients are traced with: its first day; midsummer for half a year or more."""
+    return date(2024, 7, 1) if times[-1] - times[0] > timedelta(days=180) else times[0].date()
+
+
+_sessions: dict[str, RelightSession] = {}
+
+
+def cached_session(job: RenderJob, *, place: Place | None = None, progress: Progress | None = None) -> RelightSession:
+    """Return the session of a job, kept in this process; only the last one, since a terrain is large.
+
+    Parameters
+    ----------
+    job
+        What to render.
+    place
+        The job's place, where it is loaded already.
+    progress
+        Called with a task and its finished share.
+    """
+    name = content_key({"job": job})
+    if name not in _sessions:
+        _sessions.clear()
+        if place is None:
+            _sessions[name] = open_session(job, progress=progress)
+        else:
+            _sessions[name] = session_of(job, place, progress=progress)
+    return _sessions[name]
+
+
+def frames_folder(job: RenderJob, session: RelightSession) -> Path:
+    """The folder of a job's frames in the workspace; other jobs have other folders, so frames never mix."""
+    place = session.place
+    return place.workspace.folder / f"{place.scene.name}/frames-{job_key(job, place, session.dated)}"
+
+
+def render_frame(job: RenderJob, time: datetime, *, exr_folder: Path | None = None) -> dict:
+    """Render one frame into the workspace, unless it is there.
+
+    Parameters
+    ----------
+    job
+        What to render.
+    time
+        Aware, UTC.
+    exr_folder
+        Also write absolute radiance in full precision there.
+
+    Returns
+    -------
+    dict
+        ``time_utc``, ``metered_ev100``, and ``rendered``: whether it was rendered by this call.
+    """
+    session = cached_session(job)
+    path = frames_folder(job, session) / frame_name(time)
+    copy = None if exr_folder is None else exr_folder / frame_name(time)
+    if path.is_file() and (copy is None or copy.is_file()):
+        return {"time_utc": time.isoformat(), "metered_ev100": frame_ev100(path), "rendered": False}
+    view, light, position = view_at(session, time)
+    metered = exposure_ev100(view.radiance, "auto")
+    scene = session.place.scene
+    record = {
+        "time_utc": time.astimezone(UTC).isoformat(),
+        "scene": scene.name,
+        "camera": job.view.name,
+        "sun": {"azimuth_deg": float(position.sun.azimuth_deg), "elevation_deg": float(position.sun.elevation_deg)},
+        "sky": light.model,
+        "attribution": scene.attribution,
+    }
+    if copy is not None:
+        from seasonscapes.images import write_exr
+
+        layers = {"": view.radiance, "alpha": view.coverage, "depth": view.gbuffer.depth}
+        header = {"seasonscapes:provenance": record, "seasonscapes:units": "cd/m2"}
+        write_exr(copy, layers, header=header)
+    save_frame(path, view.radiance, metered_ev100=metered, record=record)
+    return {"time_utc": time.isoformat(), "metered_ev100": metered, "rendered": True}
+
+
+def render_frames(
+    job: RenderJob,
+    times: Sequence[datetime],
+    *,
+    cluster: str | None = None,
+    exr_folder: Path | None = None,
+    place: Place | None = None,
+    progress: Progress | None = None,
+) -> int:
+    """Render the frames of a job that are missing in the workspace, in this process or on a cluster.
+
+    Parameters
+    ----------
+    job
+        What to render.
+    times
+        Aware UTC instants.
+    cluster
+        ``local:N``, ``tcp://HOST:PORT`` of a Dask scheduler, or ``slurm:FILE``; ``None`` renders in this process.
+    exr_folder
+        Also write every frame there in full precision.
+    place
+        The job's place, where it is loaded already.
+    progress
+        Called with a task and its finished share.
+
+    Returns
+    -------
+    int
+        How many frames were rendered now.
+
+    Raises
+    ------
+    NoTerrainInView
+        Where the camera sees no terrain.
+    InputError
+        For a cluster that cannot be reached.
+    """
+    session = cached_session(job, place=place, progress=progress)
+    log.info("light transport ready: %d pixels of terrain", len(session.coefficients.pixel))
+    task = partial(render_frame, job, exr_folder=exr_folder)
+    if cluster is None:
+        results = map(task, times)
+    else:
+        from seasonscapes.cluster import run_on_cluster
+
+        results = run_on_cluster(cluster, task, times)
+    return sum(record["rendered"] for record in each_reported(results, len(times), progress, "frames"))
+
+
+def develop_film(
+    job: RenderJob,
+    times: Sequence[datetime],
+    output: Path,
+    look: FilmLook | None = None,
+    *,
+    progress: Progress | None = None,
+) -> list[Path]:
+    """Expose a job's rendered frames together and write them as a film or as pictures.
+
+    Parameters
+    ----------
+    job, times
+        Whose frames; all of them must have been rendered.
+    output
+        A ``.mp4`` file, or a folder for ``.png`` pictures.
+    look
+        Exposure, smoothing and frame rate.
+    progress
+        Called with a task and its finished share.
+
+    Returns
+    -------
+    list of pathlib.Path
+        The files written.
+    """
+    from seasonscapes.images import write_png
+    from seasonscapes.relighting.film import write_film
+
+    look = look or FilmLook()
+    scene = cached_session(job).place.scene
+    about = {
+        "scene": scene.name,
+        "camera": job.view.name,
+        "sky": job.sky.name,
+        "season": job.season,
+        "seed": job.seed,
+        "attribution": scene.attribution,
+        "seasonscapes": __version__,
+    }
+    pictures = each_reported(developed_frames(job, times, look), len(times), progress, "developing")
+    if output.suffix.lower() == ".mp4":
+        span = {"from_utc": times[0].isoformat(), "to_utc": times[-1].isoformat()}
+        write_film(output, pictures, fps=look.fps, note=json.dumps(about | span))
+        return [output]
+    paths = [output / f"{time_stamp(time)}.png" for time in times]
+    for time, path, picture in zip(times, paths, pictures, strict=True):
+        metadata = {"seasonscapes": json.dumps(about | {"time_utc": time.isoformat()})}
+        write_png(path, picture, metadata=metadata)
+    return paths
+
+
+def developed_frames(job: RenderJob, times: Sequence[datetime], look: FilmLook) -> Iterator[np.ndarray]:
+    """Display-linear pictures ``(H, W, 3)`` of rendered frames, one at a time, with smoothed exposure."""
+    from seasonscapes.relighting.exposure_smoothing import smoothed_ev100
+
+    folder = frames_folder(job, cached_session(job))
+    paths = [folder / frame_name(time) for time in times]
+    seconds = np.array([time.timestamp() for time in times])
+    smooth_s = look.smooth_s
+    if look.exposure == "auto":
+        metered = np.array([frame_ev100(path) for path in paths])
+    elif look.exposure == "eye":
+        metered = np.array([exposure_ev100(load_frame(path)[0], "eye") for path in paths])
+    else:
+        metered, smooth_s = np.full(len(paths), float(look.exposure)), 0.0
+    for path, ev100 in zip(paths, smoothed_ev100(seconds, metered, window_s=smooth_s), strict=True):
+        yield develop(load_frame(path)[0], float(ev100), eye=look.exposure == "eye")
+
+
+def remove_frames(job: RenderJob, times: Sequence[datetime]) -> None:
+    """Remove a job's undeveloped frames of these instants from the workspace."""
+    folder = frames_folder(job, cached_session(job))
+    for time in times:
+        (folder / frame_name(time)).unlink(missing_ok=True)
+    if folder.is_dir() and not any(folder.iterdir()):
+        folder.rmdir()
+
+
+def shard(times: Sequence[datetime], part: int, parts: int) -> list[datetime]:
+    """Part ``part`` of ``parts`` (1 ≤ part ≤ parts) of a list of times: every ``parts``-th one.
+
+    Raises
+    ------
+    InputError
+        Where ``part`` is out of range.
+    """
+    if not 1 <= part <= parts:
+        raise InputError("shard", "no such part", got=f"{part}/{parts}", expected="1 ≤ part ≤ parts")
+    return list(times[part - 1 :: parts])

@@ -1,0 +1,143 @@
+"""Path-traced views of a place."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from seasonscapes import __version__
+from seasonscapes.cameras.pinhole import view_in_frame
+from seasonscapes.progress import Progress, task_progress
+from seasonscapes.sky.models import SkyModel
+from seasonscapes.workflows.albedo_sources import chosen_albedo
+from seasonscapes.workflows.illumination import SunMoonPosition, illumination_for_camera, sky_model
+from seasonscapes.workflows.place import Place, utc_at
+from seasonscapes.workflows.views import camera_geodetic
+from seasonscapes.workspace import content_key
+
+if TYPE_CHECKING:
+    from seasonscapes.albedo.seasons import DatedAlbedo
+    from seasonscapes.cameras.panorama import Panorama
+    from seasonscapes.cameras.pinhole import Camera
+    from seasonscapes.rendering.radiance import RenderedView
+    from seasonscapes.sky.illumination import Illumination
+    from seasonscapes.terrain.surface import Texture
+
+
+def render(
+    place: Place,
+    camera: Camera | Panorama,
+    time: str | datetime,
+    *,
+    sky: str | Path | SkyModel = "clear",
+    albedo: Texture | DatedAlbedo | Sequence[DatedAlbedo] | None = None,
+    season: str = "blended",
+    spp: int = 32,
+    max_depth: int = 6,
+    seed: int = 0,
+    device: str = "auto",
+    progress: Progress | None = None,
+) -> RenderedView:
+    """Path trace a view of a place at a date and hour.
+
+    Parameters
+    ----------
+    place
+        The place.
+    camera
+        A camera or panorama; one calibrated in another frame is converted to the place's.
+    time
+        An aware datetime, or ISO 8601 text; without offset it is civil time at the place.
+    sky
+        A sky model, its name or its file; see `sky_model`.
+    albedo
+        A texture of the place's atlas, one or several dated albedos, or ``None`` for the scene's own.
+    season
+        ``"blended"``, ``"nearest"`` or ``"snow-line"``: how to interpolate between dated albedos.
+    spp
+        Samples per pixel; powers of two are best.
+    max_depth
+        Largest number of edges of a light path; 2 is direct light only.
+    seed
+        Equal seeds give equal pictures.
+    device
+        ``"auto"``, ``"cuda"``, ``"llvm"`` or ``"scalar"``.
+    progress
+        Called with a task and its finished share.
+
+    Returns
+    -------
+    RenderedView
+        ``radiance`` ``(H, W, 3)`` scene-linear photometric Rec.709 [cd/m²], coverage, G-buffer and provenance.
+
+    Raises
+    ------
+    InputError
+        For a time, sky model or season that does not exist.
+    FrameMismatch, AtlasMismatch
+        For a camera without a frame, or a texture of another atlas.
+
+    Notes
+    -----
+    Unidirectional path tracing with next-event estimation of sun and moon and Owen-scrambled Sobol points; aerial
+    perspective is applied by the distance of each pixel. See `rendering.path_tracer`.
+
+    Examples
+    --------
+    >>> import seasonscapes as ss
+    >>> place = ss.load_place("alpine_small")
+    >>> camera = ss.camera(place, "aerial", size_px=(48, 32))
+    >>> view = ss.render(place, camera, "2024-07-20T13:30", sky="hosek", spp=4)
+    >>> view.radiance.shape, view.provenance["scene"]
+    ((32, 48, 3), 'alpine_small')
+    """
+    from seasonscapes.rendering.backend import use_backend
+    from seasonscapes.rendering.mitsuba_scene import build_scene
+    from seasonscapes.rendering.radiance import render_view
+
+    backend = use_backend(device)
+    camera = view_in_frame(camera, place.frame)
+    utc = utc_at(place, time)
+    light, position = illumination_for_camera(place, camera, sky_model(sky), utc)
+    texture = chosen_albedo(place, utc.date(), albedo, season=season)
+    view = render_view(
+        build_scene(place.terrain, texture.values, light),
+        camera,
+        spp=spp,
+        seed=seed,
+        max_depth=max_depth,
+        progress=task_progress(progress, "path tracing"),
+    )
+    record = view_record(place, camera, light, position)
+    record |= {"spp": spp, "max_depth": max_depth, "seed": seed, "variant": backend.variant}
+    return replace(view, provenance=record)
+
+
+def view_record(
+    place: Place, camera: Camera | Panorama, light: Illumination, position: SunMoonPosition
+) -> dict[str, Any]:
+    """Plain values about a rendered view: scene, camera, time, sun and sky, for files and reports."""
+    latitude, longitude, height = camera_geodetic(place, camera)
+    return {
+        "scene": place.scene.name,
+        "time_utc": position.time.astimezone(UTC).isoformat(),
+        "sun": sun_angles(position),
+        "sky": light.model,
+        "size_px": [camera.width_px, camera.height_px],
+        "gps": {"latitude_deg": latitude, "longitude_deg": longitude, "height_m": height},
+        "frame": dict(place.frame.__dict__),
+        "world_from_camera": camera.world_from_camera.tolist(),
+        "intrinsics": [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]],
+        "attribution": place.scene.attribution,
+        "scene_key": content_key(place.key),
+        "seasonscapes": __version__,
+    }
+
+
+def sun_angles(position: SunMoonPosition) -> dict[str, float]:
+    """Azimuth and elevation of the sun [deg] as plain numbers."""
+    sun = position.sun
+    return {"azimuth_deg": float(sun.azimuth_deg), "elevation_deg": float(sun.elevation_deg)}

@@ -1,0 +1,176 @@
+"""Cameras of a place: the scene's named ones, free positions, and views calibrated in other frames."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from seasonscapes.errors import InputError
+from seasonscapes.frames import geodetic_from_enu
+from seasonscapes.scene import NamedCamera, camera_from_place
+from seasonscapes.workflows.place import Place, ground_height_m
+
+if TYPE_CHECKING:
+    from seasonscapes.cameras.panorama import Panorama
+    from seasonscapes.cameras.pinhole import Camera
+
+__all__ = ["camera", "camera_for", "camera_geodetic", "scene_cameras"]
+
+
+def camera(
+    place: Place,
+    name: str | None = None,
+    *,
+    position: tuple[float, float] | None = None,
+    height_m: float | None = None,
+    above_ground_m: float | None = None,
+    heading_deg: float | None = None,
+    pitch_deg: float = 0.0,
+    roll_deg: float = 0.0,
+    fov_deg: float = 60.0,
+    size_px: tuple[int, int] = (1536, 1024),
+) -> Camera:
+    """Return a pinhole camera of a place: one that the scene file names, or one at a free position.
+
+    Parameters
+    ----------
+    place
+        The place.
+    name
+        A camera of the scene file; its first one where neither ``name`` nor ``position`` is given.
+    position
+        Latitude and longitude [deg, WGS 84] of a free position instead.
+    height_m, above_ground_m
+        Of a free position: height in the scene's vertical datum [m], or height above the ground [m] (default 2 m).
+    heading_deg, pitch_deg, roll_deg
+        Of a free position: azimuth clockwise from true north, elevation and roll of the optical axis [deg].
+    fov_deg
+        Of a free position: horizontal field of view [deg].
+    size_px
+        Width and height of the image [px].
+
+    Returns
+    -------
+    Camera
+        With its pose in the place's frame.
+
+    Raises
+    ------
+    InputError
+        For an unknown name, a position outside the raster or below the ground, or a missing heading.
+
+    Examples
+    --------
+    >>> import seasonscapes as ss
+    >>> place = ss.load_place("alpine_small")
+    >>> ss.camera(place, "meadow", size_px=(96, 64)).width_px
+    96
+    >>> free = ss.camera(place, position=(46.556, 7.98), above_ground_m=30.0, heading_deg=180.0)
+    >>> free.frame == place.frame
+    True
+    """
+    if position is None:
+        return camera_for(place, place.scene.camera(name, where="camera"), size_px=size_px, where="camera")
+    if name is not None:
+        raise InputError("camera", "give either a name or a position", got=f"{name} and {position}")
+    if heading_deg is None:
+        raise InputError("camera", "heading_deg is missing", expected="the azimuth of the optical axis [deg]")
+    if height_m is None and above_ground_m is None:
+        above_ground_m = 2.0
+    free = NamedCamera(
+        name="free",
+        latitude_deg=float(position[0]),
+        longitude_deg=float(position[1]),
+        height_m=height_m,
+        above_ground_m=above_ground_m,
+        heading_deg=float(heading_deg),
+        pitch_deg=float(pitch_deg),
+        roll_deg=float(roll_deg),
+        fov_deg=float(fov_deg),
+    )
+    return camera_for(place, free, size_px=size_px, where="camera")
+
+
+def camera_for(place: Place, view: NamedCamera, *, size_px: tuple[int, int], where: str = "--camera") -> Camera:
+    """Return the pinhole camera of a named view.
+
+    Parameters
+    ----------
+    place
+        The place.
+    view
+        Position, angles and field of view, as a scene file states them.
+    size_px
+        Width and height [px].
+    where
+        What an error message calls the view.
+
+    Raises
+    ------
+    InputError
+        Where it stands below the ground or, given above ground, outside the raster.
+    """
+    from seasonscapes.terrain.raster import map_from_geodetic, sample_raster
+
+    if view.above_ground_m is not None:
+        ground = ground_height_m(place, view.latitude_deg, view.longitude_deg, where=where)
+    else:
+        x, y = map_from_geodetic(place.elevation.crs, view.latitude_deg, view.longitude_deg)
+        ground = float(sample_raster(place.elevation, x, y)[..., 0])  # NaN outside the raster
+        if view.height_m is not None and view.height_m < ground:
+            raise InputError(
+                where,
+                f"'{view.name}' stands below the ground",
+                got=f"{view.height_m:g} m",
+                expected=f"above {ground:.1f} m",
+                cure="give above_ground_m instead",
+            )
+    return camera_from_place(place.frame, view, ground, size_px=size_px)
+
+
+def camera_geodetic(place: Place, view: Camera | Panorama) -> tuple[float, float, float]:
+    """Latitude, longitude [deg] and height [m] of a camera whose pose is in the place's frame."""
+    latitude, longitude, height = geodetic_from_enu(place.frame, view.position_m)
+    return float(latitude), float(longitude), float(height)
+
+
+def scene_cameras(place: Place, *, leave_out: set[str] | None = None, size_px: tuple[int, int]) -> dict[str, Camera]:
+    """The cameras that the scene file names, by name, without those in ``leave_out``.
+
+    Raises
+    ------
+    InputError
+        For a name in ``leave_out`` that the scene does not have, and where no camera is left.
+    """
+    leave_out = leave_out or set()
+    known = [named.name for named in place.scene.cameras]
+    for name in sorted(leave_out - set(known)):
+        raise InputError("--leave-out", "no such camera", got=name, expected="of " + ", ".join(known))
+    chosen = {
+        named.name: camera_for(place, named, size_px=size_px)
+        for named in place.scene.cameras
+        if named.name not in leave_out
+    }
+    if not chosen:
+        raise InputError("--leave-out", "leaves no camera", got=", ".join(sorted(leave_out)))
+    return chosen
+
+
+def local_ground(place: Place):
+    """Heights of the ground in the local frame as a function of positions ``(N, 2)`` east, north [m]; NaN outside."""
+    from seasonscapes.frames import enu_from_geodetic
+    from seasonscapes.terrain.raster import map_from_geodetic, sample_raster
+
+    def heights(positions: np.ndarray) -> np.ndarray:
+        up = np.zeros(len(positions))
+        # The local vertical differs from the frame's, so a point's height shifts it sideways; two rounds converge.
+        for _ in range(2):
+            latitude, longitude, _ = geodetic_from_enu(place.frame, np.column_stack([positions, up]))
+            height = sample_raster(place.elevation, *map_from_geodetic(place.elevation.crs, latitude, longitude))[
+                ..., 0
+            ]
+            up = enu_from_geodetic(place.frame, latitude, longitude, np.nan_to_num(height))[..., 2]
+        return np.where(np.isfinite(height), up, np.nan)
+
+    return heights

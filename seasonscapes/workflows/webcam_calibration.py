@@ -1,0 +1,249 @@
+"""Calibration of webcams: by matched points, by the skyline, or both; and of synthetic webcams by their skylines."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from seasonscapes.errors import InputError, NotEnoughEvidence, UnreadableImage
+from seasonscapes.frames import LocalFrame, local_axes
+from seasonscapes.workflows.place import Place
+from seasonscapes.workflows.webcam_inspection import scene_with_webcams
+
+if TYPE_CHECKING:
+    from seasonscapes.calibration.evidence import Correspondences
+    from seasonscapes.calibration.resection import Calibration
+    from seasonscapes.calibration.terrain_horizon import Horizon
+    from seasonscapes.cameras.panorama import Panorama
+    from seasonscapes.cameras.pinhole import Camera
+    from seasonscapes.cameras.webcam import Webcam
+    from seasonscapes.terrain.surface import Raster
+
+# Largest error of the compass heading that the first guess of a synthetic webcam has [deg].
+_COMPASS_DEG = 3.0
+
+
+@dataclass(frozen=True)
+class WebcamStation:
+    """A webcam at its stated position, with the terrain around it.
+
+    Parameters
+    ----------
+    webcam
+        The facts that the scene file states.
+    view
+        The uncalibrated camera that they describe, in ``frame``.
+    frame
+        A local frame with its origin at the webcam.
+    axes
+        The webcam's east, north and up as rows ``(3, 3)``.
+    rasters
+        Elevation rasters, the finest first.
+    """
+
+    webcam: Webcam
+    view: Camera | Panorama
+    frame: LocalFrame
+    axes: np.ndarray
+    rasters: list[Raster]
+
+
+@dataclass(frozen=True)
+class WebcamCalibration:
+    """The calibration of one picture and how reliable it is.
+
+    Parameters
+    ----------
+    station
+        The webcam.
+    solution
+        The solved view with its covariance.
+    horizon
+        The terrain's horizon at the solved position.
+    points
+        The matched points, where there were some.
+    doubts
+        Why the result is not reliable; empty where it is.
+    """
+
+    station: WebcamStation
+    solution: Calibration
+    horizon: Horizon | None
+    points: Correspondences | None
+    doubts: tuple[str, ...] = ()
+
+
+def webcam_station(
+    scene: str,
+    webcam: str | None = None,
+    *,
+    elevation: Path | None = None,
+    context: Path | None = None,
+    allow_outside: bool = False,
+) -> WebcamStation:
+    """Read a scene's webcam and the terrain around it.
+
+    Parameters
+    ----------
+    scene
+        A scene file with ``[[webcam]]`` tables, or a bundled one.
+    webcam
+        Which of them; may be left out where there is one.
+    elevation
+        A raster of heights; default the scene's own.
+    context
+        A coarser raster for the mountains beyond it.
+    allow_outside
+        Let the scene file name data outside its folder.
+
+    Raises
+    ------
+    InputError
+        For an unknown webcam, a missing raster, or a webcam outside it.
+    """
+    from seasonscapes.cameras.webcam import find_webcam, webcam_model
+    from seasonscapes.terrain.raster import fill_nodata, map_from_geodetic, read_elevation, sample_raster
+
+    read = scene_with_webcams(scene, allow_outside=allow_outside)
+    if webcam is None and len(read.webcams) > 1:
+        raise InputError("--webcam", "missing", expected="one of " + ", ".join(w.id for w in read.webcams))
+    found = read.webcams[0] if webcam is None else find_webcam(read.webcams, webcam)
+    first = elevation or (read.elevation and read.elevation.file)
+    if first is None:
+        raise InputError(scene, "names no elevation raster", cure="give one with --elevation FILE")
+    files = [file for file in (first, context) if file is not None]
+    rasters = [fill_nodata(read_elevation(file), where=str(file))[0] for file in files]
+    x, y = map_from_geodetic(rasters[0].crs, found.latitude_deg, found.longitude_deg)
+    ground = float(sample_raster(rasters[0], x, y)[..., 0])
+    if not np.isfinite(ground):
+        raise InputError("--webcam", f"'{found.id}' stands outside the elevation raster")
+    frame = LocalFrame(found.latitude_deg, found.longitude_deg, 0.0, read.refraction_k)
+    view = webcam_model(found, frame, ground_m=ground)
+    axes = local_axes(frame, found.latitude_deg, found.longitude_deg)
+    return WebcamStation(found, view, frame, axes, rasters)
+
+
+def read_picture(path: Path, where: str) -> np.ndarray:
+    """A picture file as ``(H, W, 3)`` uint8 sRGB; `InputError` about ``where`` where it is none."""
+    from seasonscapes.calibration.skyline import encoded_from_file
+
+    if not path.is_file():
+        raise InputError(where, "no such file", got=str(path))
+    try:
+        return encoded_from_file(path)
+    except UnreadableImage:
+        raise InputError(where, "not a readable picture", got=str(path)) from None
+
+
+def calibrate(
+    station: WebcamStation,
+    picture: np.ndarray,
+    *,
+    points: Correspondences | None = None,
+    skyline: bool = False,
+    mask: np.ndarray | None = None,
+    radial: bool = False,
+) -> WebcamCalibration:
+    """Calibrate a webcam's pose and lens from matched points, from the skyline, or both.
+
+    Parameters
+    ----------
+    station
+        Of `webcam_station`.
+    picture
+        ``(H, W, 3)`` uint8 sRGB, in full size.
+    points
+        Matches between pixels and terrain positions.
+    skyline
+        Align to the terrain's skyline and ridges within 12° of the stated heading.
+    mask
+        ``(H, W)`` bool, False where something stands before the landscape.
+    radial
+        Solve for one radial lens term too (needs points).
+
+    Returns
+    -------
+    WebcamCalibration
+        The pose in the station's frame, with standard deviations and doubts.
+
+    Raises
+    ------
+    InputError
+        Where neither points nor the skyline are to be used.
+    NotEnoughEvidence
+        Where they do not determine the pose.
+    """
+    from seasonscapes.calibration.evidence import Priors
+    from seasonscapes.calibration.resection import resect
+    from seasonscapes.calibration.skyline import align_to_skyline
+    from seasonscapes.calibration.terrain_horizon import horizon_from
+
+    webcam = station.webcam
+    if skyline:
+        fit = align_to_skyline(
+            picture, station.view, station.rasters, station.frame, mask=mask, points=points, k1=webcam.radial_k1
+        )
+        if fit.calibration is None:
+            raise NotEnoughEvidence("; ".join(fit.doubts))
+        return WebcamCalibration(station, fit.calibration, fit.horizon, points, fit.doubts)
+    if points is None:
+        raise InputError("calibrate", "no evidence", cure="give --points FILE, --skyline, or both")
+    sigma_m = webcam.position_sigma_m
+    priors = Priors(horizontal_m=sigma_m, vertical_m=sigma_m, k1=np.inf if radial else 0.0)
+    solution = resect(station.view, points, priors=priors, k1=webcam.radial_k1, axes=station.axes)
+    horizon = horizon_from(station.rasters, station.frame, solution.view.position_m, below_ground_m=40.0)
+    return WebcamCalibration(station, solution, horizon, points)
+
+
+def calibrate_by_skylines(
+    place: Place, pictures: Mapping[str, Path], records: Path, output: Path, *, seed: int
+) -> tuple[list[Path], dict[str, str]]:
+    """Calibrate synthetic webcams by their skylines, from a first guess with a compass error.
+
+    Parameters
+    ----------
+    place
+        The place.
+    pictures
+        Photograph of each webcam.
+    records
+        Folder of calibration records with the stated poses.
+    output
+        Folder for the new records; records that exist there are kept.
+    seed
+        Of the compass errors.
+
+    Returns
+    -------
+    list of pathlib.Path, dict
+        The records written, and the reason for each webcam that could not be calibrated reliably.
+    """
+    from seasonscapes.calibration.calibration_file import read_calibration, write_calibration
+    from seasonscapes.calibration.pose_model import values_of, view_from_values
+    from seasonscapes.calibration.skyline import align_to_skyline, encoded_from_file
+
+    files, doubts = [], {}
+    for record in sorted(records.glob("*_calibration.json")):
+        if not (output / record.name).is_file():
+            stated = read_calibration(record)
+            rng = np.random.default_rng([seed, zlib.crc32(stated.webcam.encode())])
+            values = values_of(stated.view, np.eye(3))
+            values[0] += rng.uniform(-_COMPASS_DEG, _COMPASS_DEG)
+            guess = view_from_values(stated.view, np.eye(3), values)
+            try:
+                image = encoded_from_file(pictures[stated.webcam])
+                fit = align_to_skyline(image, guess, [place.elevation], stated.frame)
+            except NotEnoughEvidence as error:
+                doubts[stated.webcam] = str(error)
+                continue
+            if fit.calibration is None or fit.doubts:
+                doubts[stated.webcam] = ", ".join(fit.doubts)
+                continue
+            write_calibration(output / record.name, stated.webcam, fit.calibration, stated.frame)
+        files.append(output / record.name)
+    return files, doubts
