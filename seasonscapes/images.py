@@ -105,7 +105,7 @@ def auto_exposure_ev100(image: np.ndarray, mask: np.ndarray | None = None) -> fl
     image
         Scene-linear image ``(H, W, 3)`` [cd/m²].
     mask
-        Pixels to meter ``(H, W)``, boolean; all where left out.
+        Pixels to meter ``(H, W)``, boolean; all if omitted.
 
     Returns
     -------

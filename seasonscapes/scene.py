@@ -103,7 +103,7 @@ class Elevation(Declaration):
     file
         Raster file, relative to the scene file's folder.
     band
-        Band of the file, counted from 1; the first where left out.
+        Band of the file, counted from 1; the first if omitted.
     synthetic
         Synthetic terrain in place of a file.
     max_hole_share

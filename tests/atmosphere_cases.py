@@ -17,7 +17,7 @@ from seasonscapes.sky.clear_sky import (
     sun_luminary,
     true_elevation_deg,
 )
-from seasonscapes.sky.curved_rays import sun_transfer, towards_sun, trace_curved_rays
+from seasonscapes.sky.curved_rays import slant_columns_to_sun, sun_transfer, trace_curved_rays
 from seasonscapes.sky.illumination import diffuse_horizontal_illuminance, direct_horizontal_illuminance, luminance
 from seasonscapes.sky.observer_radiance import observed_sky, observer_view, sky_radiance
 from seasonscapes.sky.ray_cells import sample_cells, scattering_per_m
@@ -148,9 +148,11 @@ def dense_airlight(
     edges = np.linspace(0.0, 1.0, cells + 1)[None] ** 1.5 * min(distance_m, paths.distance_m[0, -1])
     samples = sample_cells(atmosphere, scaled, paths, edges)
     turn = np.radians([azimuth_deg - sun_azimuth_deg])
-    sine, geometry = sun_geometry(samples, np.radians([elevation_deg]), np.array([true_rad]), turn)
-    column, share = towards_sun(atmosphere, tables.sun_columns, samples.height_m[..., None], np.arcsin(sine))
-    arriving = (np.exp(-(column @ scaled.extinction)) * share[..., None])[0, :, 0]
+    geometry = sun_geometry(samples, np.radians([elevation_deg]), np.array([true_rad]), turn)
+    column, visible = slant_columns_to_sun(
+        atmosphere, tables.sun_columns, samples.height_m[..., None], np.arcsin(geometry.sun_sine)
+    )
+    arriving = (np.exp(-(column @ scaled.extinction)) * visible[..., None])[0, :, 0]
     sigma = (scattering_per_m(atmosphere, plain, samples.height_m) * samples.weight)[:, 0]
     diffuse = (diffuse_source(atmosphere, scaled, tables.moments, samples, geometry)[0, :, 0] * samples.weight[0]).sum(
         0

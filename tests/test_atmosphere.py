@@ -18,6 +18,7 @@ from atmosphere_cases import (
 from seasonscapes.frames import direction_from_angles, equirectangular_directions
 from seasonscapes.sky.atmosphere import Atmosphere, optics
 from seasonscapes.sky.clear_sky import (
+    LuminarySource,
     illumination_from_atmosphere,
     load_tables,
     save_tables,
@@ -132,7 +133,7 @@ def test_nothing_is_lost_where_nothing_absorbs():
 def test_luminaries_add_up_and_scale():
     tables, one, other = tables_of(), direction_from_angles(30.0, 20.0), direction_from_angles(200.0, 50.0)
     spectrum = np.linspace(1.0, 2.0, 9) * 1e-6
-    both = illumination_from_atmosphere(tables, one, 800.0, moon=(other, spectrum, 0.26), shape=(16, 32))
+    both = illumination_from_atmosphere(tables, one, 800.0, moon=LuminarySource(other, spectrum, 0.26), shape=(16, 32))
     sun = sky_radiance_map(tables, one, 800.0, shape=(16, 32))
     moon = sky_radiance_map(tables, other, 800.0, shape=(16, 32), irradiance=spectrum)
     np.testing.assert_allclose(both.sky_radiance, sun + moon, rtol=1e-5)

@@ -126,9 +126,9 @@ def test_sky_and_airlight_share_one_view():
     assert observer_view(tables, 700.0) is view
     light = observed_sky(tables, view, sun, np.radians(15.0), np.ones(9))
     parts = airlight(tables, view, np.radians(15.0), np.ones(9))
-    assert parts.shape == (*light.parts.shape[:2], view.near_depth.shape[1], 10)
+    assert parts.shape == (*light.components.shape[:2], view.near_depth.shape[1], 10)
     above = view.elevation_rad > view.horizon_rad
-    np.testing.assert_allclose(parts[above, :, -1, :9], light.parts[above, :, :9], rtol=0.05, atol=1.0)
+    np.testing.assert_allclose(parts[above, :, -1, :9], light.components[above, :, :9], rtol=0.05, atol=1.0)
     sky = sky_radiance_map(tables, sun, 700.0, shape=(4, 8))
     assert np.isfinite(sky).all()
     assert (sky_radiance(light, direction_from_angles(np.arange(0.0, 360.0, 30.0), 60.0)) > 0.0).all()

@@ -3,9 +3,11 @@
 import json
 
 import colour
+import cv2
 import numpy as np
 import pytest
 
+from seasonscapes.errors import UnreadableImage
 from seasonscapes.images import (
     atomic_path,
     auto_exposure_ev100,
@@ -70,8 +72,14 @@ def test_missing_and_broken_pictures_are_named(tmp_path):
     with pytest.raises(FileNotFoundError):
         read_image_linear(tmp_path / "none.png")
     (tmp_path / "bad.png").write_bytes(b"not a picture")
-    with pytest.raises(ValueError, match=r"bad\.png"):
+    with pytest.raises(UnreadableImage, match=r"bad\.png"):
         read_image_linear(tmp_path / "bad.png")
+    cv2.imwrite(str(tmp_path / "float.tif"), np.ones((4, 4, 3), np.float32))
+    with pytest.raises(UnreadableImage, match=r"float\.tif.*got float32 pixels"):
+        read_image_linear(tmp_path / "float.tif")
+    (tmp_path / "bad.exr").write_bytes(b"not a picture")
+    with pytest.raises(UnreadableImage, match=r"bad\.exr"):
+        read_exr(tmp_path / "bad.exr")
 
 
 def test_auto_exposure_of_a_sunny_grey_card():

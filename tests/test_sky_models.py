@@ -152,9 +152,9 @@ def test_overrides_set_what_they_say():
         ("clear", {"turbidity": float("nan")}, "--turbidity: outside the range"),
         ("clear", {"turbidity": 3.0, "visibility_km": 30.0}, "--turbidity: and --visibility-km both set the haze"),
         ("clear", {"cloudiness": 1.5}, "--cloudiness: out of range; got 1.5; expected 0 to 1"),
-        ("overcast", {"cloudiness": 0.5}, "--cloudiness: sky model 'overcast' is a closed layer already"),
-        ("overcast", {"turbidity": 3.0}, "--turbidity: sky model 'overcast' does not know it"),
-        ("hosek", {"ozone_du": 300.0}, "--ozone-du: sky model 'hosek' does not know it"),
+        ("overcast", {"cloudiness": 0.5}, "--cloudiness: sky model 'overcast' is a closed cloud layer already"),
+        ("overcast", {"turbidity": 3.0}, "--turbidity: sky model 'overcast' does not support it"),
+        ("hosek", {"ozone_du": 300.0}, "--ozone-du: sky model 'hosek' does not support it"),
         (
             "hosek",
             {"turbidity": 11.0},
@@ -178,7 +178,9 @@ def test_the_ends_of_every_range_are_possible(name):
 
 def test_models_refuse_what_they_cannot():
     hosek, overcast = read_sky_model("hosek"), read_sky_model("overcast")
-    with pytest.raises(InputError, match=r"^sky model 'hosek': the sun stands at -3.00°; expected 0° to 90°; choose"):
+    with pytest.raises(
+        InputError, match=r"^sky model 'hosek': the solar elevation is -3.00°; expected 0° to 90°; choose"
+    ):
         check_valid(hosek, -3.0, 1000.0)
     with pytest.raises(InputError, match=r"^sky model 'overcast': the observer is at 4500 m; expected 0 to 4000 m$"):
         illuminate(overcast, sun_at(30.0), height_m=4500.0)

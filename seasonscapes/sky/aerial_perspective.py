@@ -1,4 +1,4 @@
-"""Aerial perspective: what the air between an observer and a mountain takes away and adds."""
+"""Aerial perspective from the atmosphere model: tabulated transmittance and airlight along an observer's rays."""
 
 from __future__ import annotations
 
@@ -7,37 +7,37 @@ from dataclasses import dataclass
 import numpy as np
 
 from seasonscapes.frames import angles_from_direction
-from seasonscapes.sky.along_rays import parts_along
+from seasonscapes.sky.along_rays import radiance_components
 from seasonscapes.sky.observer_radiance import (
     DISTANCE_EDGES_M,
     ObserverView,
     ScatteredRadiance,
-    azimuths_filled,
-    column_of,
+    apply_phase_functions,
+    azimuth_index,
     diffuse_at_observer,
-    interpolated,
-    row_of,
+    elevation_index,
+    interpolate_azimuths,
+    interpolate_multilinear,
     sky_radiance,
-    with_phases,
 )
 from seasonscapes.sky.scattering import AtmosphereTables
 from seasonscapes.sky.spectrum import rgb_from_transfer
 
-_CHUNK = 1 << 16
+_CHUNK = 1 << 16  # rays whose intermediate arrays fit the processor's cache
 
 
 @dataclass(frozen=True)
 class TabulatedAerialPerspective:
-    """Aerial perspective for one viewer; see `seasonscapes.sky.illumination.AerialPerspective`.
+    """Tabulated `seasonscapes.sky.illumination.AerialPerspective` of one observer.
 
     Parameters
     ----------
     horizon_rad
         As in `ObserverView`.
     depth_rgb
-        ``(K, M, 3)`` minus the logarithm of the transmittance up to each of the fixed distances.
+        Optical depth (negative logarithm of the transmittance) up to each of `DISTANCE_EDGES_M` ``(K, M, 3)``.
     lights
-        Sky of every luminary, with its parts up to each distance ``(K, A, M, 10)``.
+        For each luminary its sky radiance and its components up to each distance ``(K, A, M, 10)``.
     """
 
     horizon_rad: float
@@ -45,70 +45,108 @@ class TabulatedAerialPerspective:
     lights: tuple[tuple[ScatteredRadiance, np.ndarray], ...]
 
     def __call__(self, depth_m: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Transmittance ``(..., 3)`` and airlight ``(..., 3)`` [cd/m²] up to a distance along a direction.
+        """Evaluate transmittance and airlight up to a distance along directions.
 
-        Airlight at infinite depth is the sky itself, or the model's own ground seen through the air.
+        The transmittance of an RGB channel is the mean over the bands, weighted by the radiance of a grey surface near
+        the observer: exact for grey surfaces, within a few per cent for strongly coloured distant surfaces.
 
-        The transmittance of an RGB channel is the mean over the bands, weighted by what a grey surface near the viewer
-        sends: exact for grey surfaces, within a few per cent for strongly coloured ones far away.
+        Parameters
+        ----------
+        depth_m
+            Distance from the observer along the ray ``(...)`` [m]; infinite for a ray without surface.
+        direction
+            Unit viewing directions ``(..., 3)``.
+
+        Returns
+        -------
+        transmittance
+            ``(..., 3)`` in [0, 1].
+        airlight
+            ``(..., 3)`` [cd/m²]; at infinite distance the sky radiance, or below the horizon the radiance of the
+            model's ground through the air.
         """
         direction = np.asarray(direction, float)
         depth = np.broadcast_to(np.asarray(depth_m, float), direction.shape[:-1])
         flat, flat_depth = direction.reshape(-1, 3), depth.ravel()
         transmittance, airlight = np.empty(flat.shape), np.empty(flat.shape)
-        # Pieces that fit the processor's cache.
         for start in range(0, len(flat), _CHUNK):
-            part = slice(start, start + _CHUNK)
-            transmittance[part], airlight[part] = self._piece(flat_depth[part], flat[part])
+            chunk = slice(start, start + _CHUNK)
+            transmittance[chunk], airlight[chunk] = self._evaluate(flat_depth[chunk], flat[chunk])
         return transmittance.reshape(direction.shape), airlight.reshape(direction.shape)
 
-    def _piece(self, depth_m: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _evaluate(self, depth_m: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         azimuth_deg, elevation_deg = angles_from_direction(direction)
-        row, fr = row_of(np.radians(elevation_deg), self.horizon_rad)
+        row, fr = elevation_index(np.radians(elevation_deg), self.horizon_rad)
         finite = np.minimum(depth_m, DISTANCE_EDGES_M[-1])
         cell = np.clip(np.searchsorted(DISTANCE_EDGES_M, finite, side="right") - 1, 0, len(DISTANCE_EDGES_M) - 2)
         fd = (finite - DISTANCE_EDGES_M[cell]) / (DISTANCE_EDGES_M[cell + 1] - DISTANCE_EDGES_M[cell])
-        transmittance = np.exp(-interpolated(self.depth_rgb, ((row, fr), (cell, fd))))
-        airlight, endless = np.zeros(direction.shape), np.isinf(depth_m)
-        ending = ~endless
+        transmittance = np.exp(-interpolate_multilinear(self.depth_rgb, ((row, fr), (cell, fd))))
+        airlight, to_infinity = np.zeros(direction.shape), np.isinf(depth_m)
+        to_surface = ~to_infinity
         for light, near in self.lights:
-            airlight[endless] += sky_radiance(light, direction[endless])
-            column, fa = column_of(azimuth_deg, light.luminary_direction)
-            places = tuple((index[ending], share[ending]) for index, share in ((row, fr), (column, fa), (cell, fd)))
-            airlight[ending] += with_phases(
-                light, interpolated(near, places), direction[ending] @ light.luminary_direction
+            airlight[to_infinity] += sky_radiance(light, direction[to_infinity])
+            column, fa = azimuth_index(azimuth_deg, light.luminary_direction)
+            coordinates = tuple(
+                (index[to_surface], fraction[to_surface]) for index, fraction in ((row, fr), (column, fa), (cell, fd))
             )
-        # Colours outside Rec.709 have a negative channel; no light of a picture may be negative.
+            airlight[to_surface] += apply_phase_functions(
+                light, interpolate_multilinear(near, coordinates), direction[to_surface] @ light.luminary_direction
+            )
+        # Colours outside the Rec.709 gamut have a negative channel; clip, as images must not be negative.
         return transmittance, np.maximum(airlight, 0.0)
 
 
 def tabulate_aerial_perspective(
     view: ObserverView, lights: tuple[tuple[ScatteredRadiance, np.ndarray], ...], illuminant: np.ndarray
 ) -> TabulatedAerialPerspective:
-    """Aerial perspective of an observer under luminaries.
+    """Tabulate the aerial perspective of an observer.
 
     Parameters
     ----------
+    view
+        Rays of the observer.
     lights
-        For each luminary its sky, and what `airlight` gives.
+        For each luminary its sky radiance, from `observed_sky`, and its components, from `airlight`.
     illuminant
-        Transfer ``(B,)`` of the light by which surfaces are seen; it weighs the bands' transmittances.
+        Spectrum of the light on surfaces as a transfer ``(B,)``; weights the transmittances of the bands.
+
+    Returns
+    -------
+    TabulatedAerialPerspective
+        Aerial perspective.
     """
     weights = rgb_from_transfer() * illuminant
     bands = np.exp(-view.near_depth)
-    # Far away only red is left, which lies outside Rec.709: a mean with negative weights, kept within the bands' own.
-    least, most = bands.min(axis=-1, keepdims=True), bands.max(axis=-1, keepdims=True)
-    seen = np.clip(bands @ weights.T / weights.sum(axis=1), least, most)
-    return TabulatedAerialPerspective(view.horizon_rad, -np.log(np.maximum(seen, 1e-30)).astype(np.float32), lights)
+    # At large distances only deep red remains, which lies outside the Rec.709 gamut, so that the weighted mean can leave
+    # the range of the bands' transmittances; clip it to that range.
+    low, high = bands.min(axis=-1, keepdims=True), bands.max(axis=-1, keepdims=True)
+    rgb = np.clip(bands @ weights.T / weights.sum(axis=1), low, high)
+    return TabulatedAerialPerspective(view.horizon_rad, -np.log(np.maximum(rgb, 1e-30)).astype(np.float32), lights)
 
 
 def airlight(
     tables: AtmosphereTables, view: ObserverView, true_elevation_rad: float, irradiance: np.ndarray
 ) -> np.ndarray:
-    """Parts of a luminary's light up to each of the fixed distances ``(K, A, M, 10)``; arguments of `observed_sky`."""
-    colours, diffuse = (
-        rgb_from_transfer() * irradiance,
-        diffuse_at_observer(tables, view, true_elevation_rad, near=True),
-    )
-    filled = azimuths_filled(parts_along(tables, view.near, true_elevation_rad, colours, diffuse, cumulative=True))
-    return np.concatenate([np.zeros_like(filled[:, :, :1]), filled], axis=2)
+    """Integrate the components of a luminary's airlight up to each of `DISTANCE_EDGES_M`.
+
+    Parameters
+    ----------
+    tables
+        Tables of the atmosphere.
+    view
+        Rays of the observer.
+    true_elevation_rad
+        True elevation of the luminary [rad].
+    irradiance
+        Extraterrestrial spectral irradiance over that of the sun at 1 au ``(B,)``.
+
+    Returns
+    -------
+    ndarray
+        Components ``(K, A, M, 10)`` as in `ScatteredRadiance`.
+    """
+    rgb_matrix = rgb_from_transfer() * irradiance
+    diffuse = diffuse_at_observer(tables, view, true_elevation_rad, near=True)
+    components = radiance_components(tables, view.near, true_elevation_rad, rgb_matrix, diffuse, cumulative=True)
+    components = interpolate_azimuths(components)
+    return np.concatenate([np.zeros_like(components[:, :, :1]), components], axis=2)

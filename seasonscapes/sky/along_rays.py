@@ -1,7 +1,8 @@
-"""Light of one luminary that rays gather on their way to an observer: scattered once, more than once, and the ground's.
+"""Radiance of one luminary integrated along rays: single scattering, multiple scattering and ground reflection.
 
-What is scattered once follows the shadow of the Earth, cell by cell, and is worked out for every sun. The diffuse rest
-is most of the work and smooth in the sun's elevation: for many suns it comes from a table (`elevation_table`).
+Single scattering depends on the Earth's shadow in each cell and is computed for every solar position. Multiple
+scattering takes most of the time and is smooth in solar elevation; for many solar positions it is interpolated in a
+table (`elevation_table`).
 """
 
 from __future__ import annotations
@@ -10,60 +11,68 @@ import numpy as np
 
 from seasonscapes.images import REC709_LUMINANCE
 from seasonscapes.sky.atmosphere import delta_scaled, optics
-from seasonscapes.sky.curved_rays import sun_transfer, towards_sun
-from seasonscapes.sky.ray_cells import CellSamples, local_sun, scattering_per_m
+from seasonscapes.sky.curved_rays import slant_columns_to_sun, sun_transfer
+from seasonscapes.sky.ray_cells import CellSamples, local_sun_sine, scattering_per_m
 from seasonscapes.sky.scattering import AtmosphereTables
 from seasonscapes.sky.sh_moments import HARMONIC_ORDER, diffuse_source, sun_geometry, sun_index
 from seasonscapes.sky.spectrum import WAVELENGTHS_NM, rgb_from_transfer
 
-# From the luminary's azimuth to the opposite one.
+# Azimuths between the luminary's (0) and the opposite one (π).
 AZIMUTHS = 12
 AZIMUTHS_RAD = (np.arange(AZIMUTHS) + 0.5) * np.pi / AZIMUTHS
 
 
-def parts_along(
+def radiance_components(
     tables: AtmosphereTables,
     samples: CellSamples,
-    sun_rad: float,
-    colours: np.ndarray,
+    sun_elevation_rad: float,
+    rgb_matrix: np.ndarray,
     diffuse: np.ndarray,
     *,
     cumulative: bool = False,
 ) -> np.ndarray:
-    """Light ``(K, A, M or 1, 10)`` of one luminary: once by gas, once by aerosol, all else, and the aerosol's column.
-
-    Light scattered once is over its phase function. The last part is the mean column of aerosol along sun, scattering
-    point and eye.
+    """Integrate the components of one luminary's scattered radiance along rays.
 
     Parameters
     ----------
-    sun_rad
-        True elevation of the luminary.
-    colours
-        ``(3, B)`` weights of the bands' transfers.
+    tables
+        Tables of the atmosphere.
+    samples
+        M cells on each of K rays.
+    sun_elevation_rad
+        True elevation of the luminary [rad].
+    rgb_matrix
+        Matrix from band transfers to RGB ``(3, B)``.
     diffuse
-        Transfers of all else ``(K, A, M or 1, B)``.
+        Transfers of all other light ``(K, A, M or 1, B)``, from `diffuse_along`.
     cumulative
-        Up to the end of each of M cells, or of the whole ray.
+        Integrate up to the end of each of the M cells in place of the whole ray.
+
+    Returns
+    -------
+    ndarray
+        ``(K, A, M or 1, 10)`` for A azimuths, float32: RGB scattered once by gas and RGB scattered once by aerosol,
+        both divided by their phase functions; RGB of all other light; and the mean aerosol column along the path
+        luminary - scattering point - observer, in vertical columns.
     """
     atmosphere = tables.atmosphere
-    plain = optics(atmosphere)
-    scaled = delta_scaled(plain, HARMONIC_ORDER)
-    sine = local_sun(samples.turn_rad[..., None], sun_rad, np.cos(AZIMUTHS_RAD))
-    column, share = towards_sun(atmosphere, tables.sun_columns, samples.height_m[..., None], np.arcsin(sine))
-    arriving = np.exp((column @ -scaled.extinction).astype(np.float32)) * share[..., None].astype(np.float32)
-    # Scattering with the full coefficient, attenuation with the scaled one: TMS.
-    gas, aerosol = scattering_per_m(atmosphere, plain, samples.height_m) * samples.weight
-    # The column is weighed by the luminance that each cell scatters.
+    unscaled = optics(atmosphere)
+    scaled = delta_scaled(unscaled, HARMONIC_ORDER)
+    sine = local_sun_sine(samples.central_angle_rad[..., None], sun_elevation_rad, np.cos(AZIMUTHS_RAD))
+    column, visible = slant_columns_to_sun(atmosphere, tables.sun_columns, samples.height_m[..., None], np.arcsin(sine))
+    arriving = np.exp((column @ -scaled.extinction).astype(np.float32)) * visible[..., None].astype(np.float32)
+    # TMS method: scattering with the unscaled coefficient, attenuation with the scaled one.
+    gas, aerosol = scattering_per_m(atmosphere, unscaled, samples.height_m) * samples.weight
+    # The mean aerosol column is weighted by the luminance scattered in each cell.
     luminance = aerosol * (REC709_LUMINANCE @ rgb_from_transfer())
-    weights = [gas[..., None] * colours.T, aerosol[..., None] * colours.T, luminance[..., None]]
+    weights = [gas[..., None] * rgb_matrix.T, aerosol[..., None] * rgb_matrix.T, luminance[..., None]]
     once = arriving @ np.concatenate(weights, axis=-1).astype(np.float32)
-    bright = once[..., 6:] + np.float32(1e-30)
-    passed = bright * (column[..., 1] + samples.aerosol_column[..., None]).astype(np.float32)[..., None]
-    terms = np.concatenate([once[..., :6], passed, bright], axis=-1).swapaxes(1, 2)
+    scattered = once[..., 6:] + np.float32(1e-30)
+    weighted_column = scattered * (column[..., 1] + samples.aerosol_column[..., None]).astype(np.float32)[..., None]
+    terms = np.concatenate([once[..., :6], weighted_column, scattered], axis=-1).swapaxes(1, 2)
     terms = np.cumsum(terms, axis=2) if cumulative else terms.sum(axis=2, keepdims=True)
     return np.concatenate(
-        [terms[..., :6], diffuse @ colours.T.astype(np.float32), terms[..., 6:7] / terms[..., 7:]], -1
+        [terms[..., :6], diffuse @ rgb_matrix.T.astype(np.float32), terms[..., 6:7] / terms[..., 7:]], -1
     )
 
 
@@ -71,31 +80,64 @@ def diffuse_along(
     tables: AtmosphereTables,
     samples: CellSamples,
     elevation_rad: np.ndarray,
-    suns_rad: np.ndarray,
+    sun_elevations_rad: np.ndarray,
     *,
     cumulative: bool = False,
 ) -> np.ndarray:
-    """Transfers ``(N, K, A, M or 1, B)`` of diffuse light along rays of K elevations under N suns [rad].
+    """Integrate diffuse light scattered towards the observer along rays.
 
-    Diffuse is what was scattered, or sent back by the ground, before it was scattered towards the observer.
+    Diffuse light was scattered, or reflected by the ground, at least once before it is scattered into the ray.
+
+    Parameters
+    ----------
+    tables
+        Tables of the atmosphere.
+    samples
+        M cells on each of K rays.
+    elevation_rad
+        Elevation of the rays at the observer ``(K,)`` [rad].
+    sun_elevations_rad
+        True elevations of the luminary ``(N,)`` [rad].
+    cumulative
+        Integrate up to the end of each of the M cells in place of the whole ray.
+
+    Returns
+    -------
+    ndarray
+        Transfers ``(N, K, A, M or 1, B)`` [1/sr] for A azimuths, float32.
     """
     scaled = delta_scaled(optics(tables.atmosphere), HARMONIC_ORDER)
-    suns, azimuths = (part.ravel() for part in np.meshgrid(suns_rad, AZIMUTHS_RAD, indexing="ij"))
-    _, geometry = sun_geometry(samples, elevation_rad, suns, azimuths)
+    suns, azimuths = (grid.ravel() for grid in np.meshgrid(sun_elevations_rad, AZIMUTHS_RAD, indexing="ij"))
+    geometry = sun_geometry(samples, elevation_rad, suns, azimuths)
     source = diffuse_source(tables.atmosphere, scaled, tables.moments, samples, geometry)
     source *= samples.weight[:, :, None].astype(np.float32)
     source = np.cumsum(source, axis=1) if cumulative else source.sum(axis=1, keepdims=True)
-    by_sun = source.reshape(*source.shape[:2], len(suns_rad), AZIMUTHS, source.shape[-1])
+    by_sun = source.reshape(*source.shape[:2], len(sun_elevations_rad), AZIMUTHS, source.shape[-1])
     return by_sun.transpose(2, 0, 3, 1, 4)
 
 
-def ground_along(tables: AtmosphereTables, samples: CellSamples, sun_rad: float) -> np.ndarray:
-    """Transfers ``(K, A, B)`` of what the ground sends along rays that end on it."""
+def ground_along(tables: AtmosphereTables, samples: CellSamples, sun_elevation_rad: float) -> np.ndarray:
+    """Compute the attenuated radiance of the ground along rays that end on it.
+
+    Parameters
+    ----------
+    tables
+        Tables of the atmosphere.
+    samples
+        Cells on each of K rays.
+    sun_elevation_rad
+        True elevation of the luminary [rad].
+
+    Returns
+    -------
+    ndarray
+        Transfers ``(K, A, B)`` [1/sr] for A azimuths; zero for rays that do not end on the ground.
+    """
     atmosphere = tables.atmosphere
     scaled = delta_scaled(optics(atmosphere), HARMONIC_ORDER)
-    sine = local_sun(samples.paths.turn_rad[:, -1, None], sun_rad, np.cos(AZIMUTHS_RAD))
-    index, share = sun_index(sine)
-    share = share[..., None]
+    sine = local_sun_sine(samples.edges.central_angle_rad[:, -1, None], sun_elevation_rad, np.cos(AZIMUTHS_RAD))
+    index, fraction = sun_index(sine)
+    fraction = fraction[..., None]
     table = tables.moments.ground_irradiance
     direct = (
         sun_transfer(
@@ -103,7 +145,7 @@ def ground_along(tables: AtmosphereTables, samples: CellSamples, sun_rad: float)
         )
         * np.maximum(sine, 0.0)[..., None]
     )
-    irradiance = direct + table[index] * (1.0 - share) + table[index + 1] * share
+    irradiance = direct + table[index] * (1.0 - fraction) + table[index + 1] * fraction
     albedo = np.broadcast_to(np.asarray(atmosphere.ground_albedo, float), WAVELENGTHS_NM.shape)
-    ends = np.where(samples.paths.ends_on_ground[:, None], samples.end_transmittance, 0.0)
-    return irradiance * ends[:, None, :] * albedo / np.pi
+    transmittance = np.where(samples.edges.ends_on_ground[:, None], samples.end_transmittance, 0.0)
+    return irradiance * transmittance[:, None, :] * albedo / np.pi

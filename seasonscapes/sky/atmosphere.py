@@ -1,7 +1,8 @@
-"""What the air is made of: gas, aerosol and ozone by height, and how each band meets them.
+"""Optical model of the atmosphere: profiles, optical depths and phase functions of gas, aerosol and ozone.
 
-Three constituents, each a vertical profile that integrates to one from the ground to the top, times a vertical optical
-depth per band. An optical depth along any path is then three column integrals that know nothing of wavelength.
+Each of the three constituents is a vertical profile, normalised to a unit column from the ground to the top of the
+atmosphere, times a vertical optical depth per spectral band. The optical depth along any path therefore follows from
+three column integrals that do not depend on wavelength.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from seasonscapes.frames import MEAN_RADIUS_M
 from seasonscapes.sky.spectrum import WAVELENGTHS_NM, angstrom_ratio, ozone_optical_depth_per_du, rayleigh_optical_depth
@@ -18,37 +20,43 @@ TOP_HEIGHT_M = 100e3
 STANDARD_PRESSURE_HPA = 1013.25
 # Refractivity n - 1 of standard air at 550 nm and sea level (Ciddor 1996).
 SEA_LEVEL_REFRACTIVITY = 2.78e-4
-# Koschmieder's constant -ln 0.02: contrast of 2 % at the meteorological range V.
+# Koschmieder's constant -ln 0.02, for a contrast of 2 % at the meteorological range V.
 KOSCHMIEDER = 3.912
 # Depolarisation of air (Bates 1984; Bodhaine et al. 1999) as Chandrasekhar's γ = ρ / (2 - ρ), ρ = 0.0279.
 _GAMMA = 0.0279 / (2.0 - 0.0279)
-_BACKWARD_LOBE_G, _BACKWARD_SHARE = -0.35, 0.05
+_BACKWARD_LOBE_G, _BACKWARD_WEIGHT = -0.35, 0.05
 
 
 @dataclass(frozen=True)
 class Atmosphere:
-    """A clear or hazy atmosphere. The defaults are a clear day in the Alps.
+    """Parameters of a cloudless atmosphere. The defaults describe a clear day in the Alps.
 
     Parameters
     ----------
     aerosol_optical_depth_500nm
-        Vertical, from the ground up. 0.05 is a very clean mountain day, 0.1 clear, 0.4 hazy.
+        Vertical optical depth above the ground at 500 nm: 0.05 on a very clean mountain day, 0.1 clear, 0.4 hazy.
     angstrom_exponent
-        0 for large grains (fog, coarse dust), 1.3 for continental haze.
+        Ångström exponent: 0 for large particles (fog, coarse dust), 1.3 for continental haze.
     aerosol_scale_height_m
-        Aerosol thins as ``exp(-h / scale)``; infinite is a homogeneous layer up to `TOP_HEIGHT_M`.
+        Scale height of the aerosol density ``exp(-h / scale)`` [m]; infinite for a homogeneous layer up to
+        `TOP_HEIGHT_M`.
     single_scattering_albedo, asymmetry
-        Of the aerosol, the same in every band.
+        Single-scattering albedo and mean cosine of the aerosol, equal in all bands.
     ozone_du
         Ozone column [DU].
     ground_albedo
-        Lambertian albedo of the ground beneath the whole sky; ``(9,)`` bands or one number.
+        Lambertian albedo of the ground; one number, or ``(9,)`` bands.
     ground_height_m
-        Height of that ground [m].
+        Height of the ground [m].
     pressure_hpa
-        Pressure at sea level [hPa]; 0 takes the gas away.
+        Pressure at sea level [hPa]; 0 removes the gas.
     refraction
-        Whether light bends. Without it apparent and true directions are the same.
+        Whether rays are refracted; without refraction apparent and true directions are equal.
+
+    Raises
+    ------
+    ValueError
+        If a parameter is out of range.
     """
 
     aerosol_optical_depth_500nm: float = 0.10
@@ -62,7 +70,7 @@ class Atmosphere:
     pressure_hpa: float = STANDARD_PRESSURE_HPA
     refraction: bool = True
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         bounds = {
             "aerosol_optical_depth_500nm": (0.0, 50.0),
             "angstrom_exponent": (-1.0, 4.0),
@@ -82,20 +90,20 @@ class Atmosphere:
 
     @property
     def ground_radius_m(self) -> float:
-        """Distance of the ground from the Earth's centre [m]."""
+        """Radius of the ground about the Earth's centre [m]."""
         return MEAN_RADIUS_M + self.ground_height_m
 
 
 @dataclass(frozen=True)
 class Optics:
-    """Vertical optical depths and phase functions of an atmosphere, per constituent (gas, aerosol, ozone) and band.
+    """Vertical optical depths of an atmosphere per constituent (gas, aerosol, ozone) and band, and aerosol moments.
 
     Parameters
     ----------
     extinction
-        ``(3, B)`` vertical optical depth from the ground up.
+        Vertical optical depth above the ground ``(3, B)``.
     scattering
-        ``(3, B)`` its scattering part.
+        Vertical scattering optical depth ``(3, B)``.
     aerosol_moments
         Legendre moments χ_l ``(L + 1,)`` of the aerosol's phase function (χ_0 = 1).
     """
@@ -106,7 +114,18 @@ class Optics:
 
 
 def visibility_extinction_per_m(visibility_m: float) -> float:
-    """Extinction at 550 nm of air with a meteorological range [1/m]: Koschmieder's ``3.912 / V``."""
+    """Compute the extinction coefficient at 550 nm from the meteorological range, Koschmieder's ``3.912 / V``.
+
+    Parameters
+    ----------
+    visibility_m
+        Meteorological range V [m].
+
+    Returns
+    -------
+    float
+        Extinction coefficient [1/m].
+    """
     return KOSCHMIEDER / visibility_m
 
 
@@ -118,26 +137,53 @@ def aerosol_optical_depth_from_visibility(
     aerosol_scale_height_m: float = 2000.0,
     ground_height_m: float = 0.0,
 ) -> float:
-    """Aerosol optical depth at 500 nm that gives a meteorological range at a height.
+    """Compute the aerosol optical depth at 500 nm that gives a meteorological range at a height.
 
-    The aerosol makes up what gas leaves of ``3.912 / V`` at 550 nm.
+    The extinction of the aerosol at 550 nm is ``3.912 / V`` less the extinction of the gas.
+
+    Parameters
+    ----------
+    visibility_m
+        Meteorological range V [m].
+    height_m
+        Height at which the range holds [m].
+    angstrom_exponent, aerosol_scale_height_m, ground_height_m
+        As in `Atmosphere`.
+
+    Returns
+    -------
+    float
+        Vertical aerosol optical depth at 500 nm.
 
     Raises
     ------
     ValueError
-        Where pure air alone is hazier than asked (about 340 km at sea level).
+        If the range exceeds that of aerosol-free air (about 340 km at sea level).
     """
     atmosphere = Atmosphere(1.0, angstrom_exponent, aerosol_scale_height_m, ground_height_m=ground_height_m)
     gas, aerosol, _ = constituent_densities(atmosphere, height_m)
-    rest = visibility_extinction_per_m(visibility_m) - gas * rayleigh_optical_depth(550.0)
-    if rest < 0.0:
+    aerosol_extinction = visibility_extinction_per_m(visibility_m) - gas * rayleigh_optical_depth(550.0)
+    if aerosol_extinction < 0.0:
         limit = KOSCHMIEDER / (gas * rayleigh_optical_depth(550.0))
         raise ValueError(f"visibility: got {visibility_m / 1e3:g} km, expected at most {limit / 1e3:.0f} km (pure air)")
-    return float(rest / (aerosol * angstrom_ratio(angstrom_exponent, 500.0, 550.0)))
+    return float(aerosol_extinction / (aerosol * angstrom_ratio(angstrom_exponent, 500.0, 550.0)))
 
 
 def visibility_from_atmosphere(atmosphere: Atmosphere, height_m: float = 0.0) -> float:
-    """Meteorological range at a height [m], the inverse of `aerosol_optical_depth_from_visibility`."""
+    """Compute the meteorological range at a height; the inverse of `aerosol_optical_depth_from_visibility`.
+
+    Parameters
+    ----------
+    atmosphere
+        Atmosphere.
+    height_m
+        Height [m].
+
+    Returns
+    -------
+    float
+        Meteorological range [m].
+    """
     gas, aerosol, _ = constituent_densities(atmosphere, height_m)
     pressure = atmosphere.pressure_hpa / STANDARD_PRESSURE_HPA
     depth = atmosphere.aerosol_optical_depth_500nm * angstrom_ratio(atmosphere.angstrom_exponent, 500.0, 550.0)
@@ -145,14 +191,26 @@ def visibility_from_atmosphere(atmosphere: Atmosphere, height_m: float = 0.0) ->
 
 
 def aerosol_optical_depth_from_turbidity(turbidity: float, *, angstrom_exponent: float = 1.3) -> float:
-    """Aerosol optical depth at 500 nm of a turbidity ``T = (τ_gas + τ_aerosol) / τ_gas`` at 550 nm.
+    """Compute the aerosol optical depth at 500 nm from the turbidity ``T = (τ_gas + τ_aerosol) / τ_gas``.
 
     The definition of Preetham et al. (1999), doi:10.1145/311535.311545, taken at sea level and at 550 nm.
+
+    Parameters
+    ----------
+    turbidity
+        Turbidity T, at least 1.
+    angstrom_exponent
+        As in `Atmosphere`.
+
+    Returns
+    -------
+    float
+        Vertical aerosol optical depth at 500 nm.
 
     Raises
     ------
     ValueError
-        For a turbidity below 1.
+        If the turbidity is below 1.
     """
     if not turbidity >= 1.0:
         raise ValueError(f"turbidity: got {turbidity}, expected at least 1")
@@ -160,65 +218,136 @@ def aerosol_optical_depth_from_turbidity(turbidity: float, *, angstrom_exponent:
 
 
 def optics(atmosphere: Atmosphere, *, order: int = 64) -> Optics:
-    """Optical depths and aerosol moments up to ``order`` of an atmosphere."""
+    """Compute the optical depths and aerosol moments of an atmosphere.
+
+    Parameters
+    ----------
+    atmosphere
+        Atmosphere.
+    order
+        Highest Legendre order of the aerosol moments.
+
+    Returns
+    -------
+    Optics
+        Optical properties in the bands of `spectrum.WAVELENGTHS_NM`.
+    """
     aerosol = atmosphere.aerosol_optical_depth_500nm * angstrom_ratio(atmosphere.angstrom_exponent, 500.0)
-    gas = rayleigh_optical_depth() * _gas_share(atmosphere)
+    gas = rayleigh_optical_depth() * _relative_pressure(atmosphere)
     extinction = np.stack([gas, aerosol, ozone_optical_depth_per_du() * atmosphere.ozone_du])
     scattering = extinction * np.array([[1.0], [atmosphere.single_scattering_albedo], [0.0]])
     forward_g, powers = _forward_lobe_g(atmosphere.asymmetry), np.arange(order + 1)
-    moments = (1.0 - _BACKWARD_SHARE) * forward_g**powers + _BACKWARD_SHARE * _BACKWARD_LOBE_G**powers
+    moments = (1.0 - _BACKWARD_WEIGHT) * forward_g**powers + _BACKWARD_WEIGHT * _BACKWARD_LOBE_G**powers
     return Optics(extinction, scattering, moments)
 
 
 def delta_scaled(optics_: Optics, order: int) -> Optics:
-    """The similar atmosphere whose aerosol phase function ends at a Legendre order: Wiscombe's delta-M method.
+    """Apply delta-M scaling: truncate the aerosol phase function at a Legendre order.
 
-    The forward peak, a share ``f = χ_{order+1}`` of what aerosol scatters, counts as not scattered at all
+    The forward peak, a fraction ``f = χ_{order+1}`` of the light scattered by aerosol, is treated as unscattered
     (Wiscombe 1977, eqs. 15 to 20, doi:10.1175/1520-0469(1977)034<1408:TDMRYA>2.0.CO;2).
+
+    Parameters
+    ----------
+    optics_
+        Unscaled optical properties with moments beyond ``order``.
+    order
+        Truncation order L.
+
+    Returns
+    -------
+    Optics
+        Scaled optical properties with moments ``(L + 1,)``.
     """
-    share = optics_.aerosol_moments[order + 1]
-    peak = share * optics_.scattering[1]
-    taken = np.stack([np.zeros_like(peak), peak, np.zeros_like(peak)])
-    moments = (optics_.aerosol_moments[: order + 1] - share) / (1.0 - share)
-    return Optics(optics_.extinction - taken, optics_.scattering - taken, moments)
+    peak_fraction = optics_.aerosol_moments[order + 1]
+    peak = peak_fraction * optics_.scattering[1]
+    removed = np.stack([np.zeros_like(peak), peak, np.zeros_like(peak)])
+    moments = (optics_.aerosol_moments[: order + 1] - peak_fraction) / (1.0 - peak_fraction)
+    return Optics(optics_.extinction - removed, optics_.scattering - removed, moments)
 
 
 def gas_moments(order: int) -> np.ndarray:
-    """Legendre moments χ_l ``(order + 1,)`` of the Rayleigh phase function with depolarisation."""
+    """Return the Legendre moments of the Rayleigh phase function with depolarisation.
+
+    Parameters
+    ----------
+    order
+        Highest Legendre order, at least 2.
+
+    Returns
+    -------
+    ndarray
+        Moments χ_l ``(order + 1,)`` with χ_0 = 1.
+    """
     moments = np.zeros(order + 1)
     moments[[0, 2]] = 1.0, 0.1 * (1.0 - _GAMMA) / (1.0 + 2.0 * _GAMMA)
     return moments
 
 
-def gas_phase(cosine) -> np.ndarray:
-    """Rayleigh phase function with depolarisation [1/sr] (Chandrasekhar 1950, § 18; Bucholtz 1995, eq. 12)."""
+def gas_phase(cosine: ArrayLike) -> np.ndarray:
+    """Evaluate the Rayleigh phase function with depolarisation (Chandrasekhar 1950, § 18; Bucholtz 1995, eq. 12).
+
+    Parameters
+    ----------
+    cosine
+        Cosine of the scattering angle ``(...)``.
+
+    Returns
+    -------
+    ndarray
+        Phase function ``(...)`` [1/sr].
+    """
     square = np.asarray(cosine) ** 2
     return 3.0 / (16.0 * np.pi * (1.0 + 2.0 * _GAMMA)) * ((1.0 + 3.0 * _GAMMA) + (1.0 - _GAMMA) * square)
 
 
-def aerosol_phase(cosine, asymmetry: float) -> np.ndarray:
-    """Phase function of aerosol [1/sr]: two Henyey-Greenstein lobes with a given mean cosine.
+def aerosol_phase(cosine: ArrayLike, asymmetry: float) -> np.ndarray:
+    """Evaluate the aerosol phase function, a sum of two Henyey-Greenstein lobes with a given mean cosine.
 
-    A share of 5 % goes into a backward lobe of g = -0.35, as natural aerosols do (Kattawar 1975,
-    doi:10.1016/0022-4073(75)90035-3); the forward lobe takes the rest of the asymmetry.
+    The backward lobe of g = -0.35 has a weight of 5 %, as for natural aerosols (Kattawar 1975,
+    doi:10.1016/0022-4073(75)90035-3); g of the forward lobe follows from the mean cosine.
+
+    Parameters
+    ----------
+    cosine
+        Cosine of the scattering angle ``(...)``.
+    asymmetry
+        Mean cosine of the scattering angle.
+
+    Returns
+    -------
+    ndarray
+        Phase function ``(...)`` [1/sr].
     """
     forward = _henyey_greenstein(cosine, _forward_lobe_g(asymmetry))
-    return (1.0 - _BACKWARD_SHARE) * forward + _BACKWARD_SHARE * _henyey_greenstein(cosine, _BACKWARD_LOBE_G)
+    return (1.0 - _BACKWARD_WEIGHT) * forward + _BACKWARD_WEIGHT * _henyey_greenstein(cosine, _BACKWARD_LOBE_G)
 
 
-def _henyey_greenstein(cosine, g: float) -> np.ndarray:
+def _henyey_greenstein(cosine: ArrayLike, g: float) -> np.ndarray:
     square = 1.0 + g**2 - 2.0 * g * np.asarray(cosine)
     return (1.0 - g**2) / (4.0 * np.pi) / (square * np.sqrt(square))
 
 
 def _forward_lobe_g(asymmetry: float) -> float:
-    return (asymmetry - _BACKWARD_SHARE * _BACKWARD_LOBE_G) / (1.0 - _BACKWARD_SHARE)
+    return (asymmetry - _BACKWARD_WEIGHT * _BACKWARD_LOBE_G) / (1.0 - _BACKWARD_WEIGHT)
 
 
-def constituent_densities(atmosphere: Atmosphere, height_m) -> np.ndarray:
-    """Share of each vertical column per metre ``(3, ...)`` [1/m]: gas, aerosol, ozone.
+def constituent_densities(atmosphere: Atmosphere, height_m: ArrayLike) -> np.ndarray:
+    """Evaluate the normalised density profiles of gas, aerosol and ozone.
 
-    Gas counts from sea level up (pressure says how much there is); aerosol and ozone from the ground up.
+    The unit column of gas and of ozone begins at sea level, that of aerosol at the ground.
+
+    Parameters
+    ----------
+    atmosphere
+        Atmosphere.
+    height_m
+        Height ``(...)`` [m].
+
+    Returns
+    -------
+    ndarray
+        Densities in units of the vertical columns ``(3, ...)`` [1/m].
     """
     height = np.asarray(height_m, float)
     knots, gas, ozone, _ = _standard_profiles()
@@ -231,24 +360,39 @@ def constituent_densities(atmosphere: Atmosphere, height_m) -> np.ndarray:
     return np.stack([np.exp(np.interp(height, knots, gas)), aerosol, np.interp(height, knots, ozone)])
 
 
-def refractivity(atmosphere: Atmosphere, height_m) -> tuple[np.ndarray, np.ndarray]:
-    """Refractivity n - 1 and its gradient [1/m] at heights; zeros where the atmosphere does not refract."""
+def refractivity(atmosphere: Atmosphere, height_m: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Evaluate the refractivity and its vertical gradient; both are zero for an atmosphere without refraction.
+
+    Parameters
+    ----------
+    atmosphere
+        Atmosphere.
+    height_m
+        Height ``(...)`` [m].
+
+    Returns
+    -------
+    refractivity
+        n - 1 ``(...)``.
+    gradient
+        Derivative by height ``(...)`` [1/m].
+    """
     height = np.asarray(height_m, float)
     if not atmosphere.refraction:
         return np.zeros_like(height), np.zeros_like(height)
     knots, gas, _, slope = _standard_profiles()
-    sea_level = SEA_LEVEL_REFRACTIVITY * _gas_share(atmosphere)
+    sea_level = SEA_LEVEL_REFRACTIVITY * _relative_pressure(atmosphere)
     value = sea_level * np.exp(np.interp(height, knots, gas) - np.interp(0.0, knots, gas))
     return value, value * np.interp(height, knots, slope)
 
 
-def _gas_share(atmosphere: Atmosphere) -> float:
+def _relative_pressure(atmosphere: Atmosphere) -> float:
     return atmosphere.pressure_hpa / STANDARD_PRESSURE_HPA
 
 
 @cache
 def _standard_profiles() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Knots [m], log of the gas profile, the ozone profile, both of unit columns [1/m], and the gas's log slope [1/m].
+    """Standard profiles: heights [m], log gas density and ozone density for unit columns [1/m], log gas gradient [1/m].
 
     Gas: density of the U.S. Standard Atmosphere 1976 (layers of constant lapse rate, table 4) continued above 84.852 km
     with a scale height of 5.7 km. Ozone: the mid-latitude number density of the same, table 17 (Krueger & Minzner).
@@ -256,17 +400,19 @@ def _standard_profiles() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray
     knots = np.arange(-500.0, TOP_HEIGHT_M + 1.0, 250.0)
     geopotential = 6356766.0 * knots / (6356766.0 + knots)
     bases = np.array([0.0, 11e3, 20e3, 32e3, 47e3, 51e3, 71e3])
-    lapse = np.array([-6.5e-3, 0.0, 1e-3, 2.8e-3, 0.0, -2.8e-3, -2e-3])
+    lapse = [-6.5e-3, 0.0, 1e-3, 2.8e-3, 0.0, -2.8e-3, -2e-3]
     temperature, log_pressure = [288.15], [0.0]
     gravity = 9.80665 * 0.0289644 / 8.31432
 
-    def layer(t0, p0, rate, rise):
+    def layer(t0: float, p0: float, rate: float, rise: float) -> tuple[float, float]:
+        """Temperature [K] and log pressure at a height above the base of a layer."""
         t1 = t0 + rate * rise
         return t1, p0 - gravity * (np.log(t1 / t0) / rate if rate else rise / t0)
 
     for base, following, rate in zip(bases[:-1], bases[1:], lapse[:-1], strict=True):
         t, p = layer(temperature[-1], log_pressure[-1], rate, following - base)
-        temperature.append(t), log_pressure.append(p)
+        temperature.append(t)
+        log_pressure.append(p)
     index = np.clip(np.searchsorted(bases, geopotential, side="right") - 1, 0, 6)
     states = [
         layer(temperature[i], log_pressure[i], lapse[i], min(h, 84852.0) - bases[i])

@@ -1,21 +1,22 @@
-"""The clear and hazy sky of every hour: radiance map, sun or moon, and the air between viewer and mountain.
+"""Illumination by clear or hazy skies at any solar elevation: sky radiance, sun and moon, and aerial perspective.
 
-`atmosphere_tables` does the slow part once for an atmosphere; everything that knows a time is quick. Any luminary goes
-the same way: a direction and its spectral irradiance above the air as a share of the sun's (`irradiance`), and the
-skies of several luminaries add up.
+`atmosphere_tables` computes the expensive, time-independent tables of an atmosphere. Every luminary is described by its
+direction and its extraterrestrial spectral irradiance relative to the sun's (``irradiance``); the sky radiances of
+several luminaries are added.
 
-Polarisation is left out (a scalar theory errs by up to 5 % of a clear sky's radiance in single directions), and so are
-water vapour and oxygen, whose lines lie where the eye hardly sees.
+Polarisation is neglected (the error of a scalar theory is up to 5 % of a clear sky's radiance in single directions), and
+so is absorption by water vapour and oxygen, whose lines lie at wavelengths of low luminous efficiency.
 """
 
 from __future__ import annotations
 
 import json
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from os import PathLike
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from seasonscapes.frames import angles_from_direction
 from seasonscapes.images import atomic_path
@@ -33,6 +34,7 @@ __all__ = [
     "TABLES_REVISION",
     "Atmosphere",
     "AtmosphereTables",
+    "LuminarySource",
     "atmosphere_tables",
     "illumination_from_atmosphere",
     "load_tables",
@@ -42,161 +44,241 @@ __all__ = [
     "true_elevation_deg",
 ]
 
-# Raised whenever the tables of an equal atmosphere change.
+# Increment whenever the tables of an unchanged atmosphere change.
 TABLES_REVISION = 4
-# Below this normal illuminance a luminary casts no visible shadow [lx].
-_FAINTEST_LX = 1e-6
+# A luminary of less normal illuminance is omitted [lx].
+_MIN_NORMAL_LX = 1e-6
 
 
-def true_elevation_deg(atmosphere: Atmosphere, apparent_elevation_deg, height_m: float) -> np.ndarray:
-    """Elevation without refraction of a body that appears at an elevation [deg]: the inverse of the ephemeris' lift."""
+@dataclass(frozen=True)
+class LuminarySource:
+    """Luminary above the atmosphere.
+
+    Parameters
+    ----------
+    direction
+        Apparent unit vector towards the luminary ``(3,)``.
+    irradiance
+        Extraterrestrial spectral irradiance over that of the sun at 1 au; a number or ``(9,)`` bands.
+    angular_radius_deg
+        Angular radius of the disc [deg].
+    """
+
+    direction: np.ndarray
+    irradiance: ArrayLike
+    angular_radius_deg: float
+
+
+def true_elevation_deg(atmosphere: Atmosphere, apparent_elevation_deg: ArrayLike, height_m: float) -> np.ndarray:
+    """Compute the true elevation of a body from its apparent elevation; the inverse of `ephemeris.refraction_deg`.
+
+    Parameters
+    ----------
+    atmosphere
+        Atmosphere; without refraction the elevation is returned unchanged.
+    apparent_elevation_deg
+        Apparent elevation ``(...)`` [deg].
+    height_m
+        Height of the observer [m].
+
+    Returns
+    -------
+    ndarray
+        Elevation without refraction ``(...)`` [deg].
+    """
     apparent = np.asarray(apparent_elevation_deg, float)
     if not atmosphere.refraction:
         return apparent
     true = np.concatenate([np.linspace(-90.0, -8.0, 10), np.linspace(-7.5, 3.0, 400), np.linspace(3.1, 90.0, 400)])
-    pressure_hpa = float(standard_pressure_hpa(min(height_m, 3e4)))  # whose formula ends there
+    pressure_hpa = float(standard_pressure_hpa(min(height_m, 3e4)))  # the formula is undefined at greater heights
     lifted = true + refraction_deg(true, pressure_hpa=pressure_hpa)
     return np.interp(apparent, lifted, true)
 
 
 def sky_radiance_map(
     tables: AtmosphereTables,
-    sun_direction,
+    sun_direction: ArrayLike,
     observer_height_m: float,
     *,
     shape: tuple[int, int] = (128, 256),
-    irradiance=1.0,
+    irradiance: ArrayLike = 1.0,
 ) -> np.ndarray:
-    """Radiance of the whole sphere around an observer, without the sun's disc.
+    """Compute the map of sky radiance around an observer, without the luminary's disc.
 
     Parameters
     ----------
+    tables
+        Tables of the atmosphere.
     sun_direction
         Apparent unit vector ``(3,)`` towards the sun, or towards another luminary.
     observer_height_m
-        In the heights of the atmosphere's ground [m]; lifted to a metre above that ground.
+        Height of the observer, in the datum of the atmosphere's ground [m]; raised to one metre above that ground.
     shape
         Rows and columns of the equirectangular map.
     irradiance
-        Spectral irradiance above the air over the sun's at 1 au, a number or ``(9,)`` bands.
+        Extraterrestrial spectral irradiance over that of the sun at 1 au; a number or ``(9,)`` bands.
 
     Returns
     -------
     ndarray
-        ``shape + (3,)`` float32, photometric linear Rec.709 [cd/m²]. Below the horizon: the model's sunlit ground
-        through the air.
+        ``shape + (3,)`` float32, photometric linear Rec.709 [cd/m²]. Rows below the horizon hold the radiance of the
+        model's sunlit ground through the air.
+
+    Raises
+    ------
+    ValueError
+        If the direction is not a unit vector, or the observer is not below the top of the atmosphere.
     """
     direction, view = _unit(sun_direction), observer_view(tables, observer_height_m)
     true_rad = _true_rad(tables.atmosphere, direction, observer_height_m)
     light = observed_sky(tables, view, direction, true_rad, _bands(irradiance))
-    return _map_of((light,), shape)
+    return _radiance_map((light,), shape)
 
 
 def sun_luminary(
     tables: AtmosphereTables,
-    sun_direction,
+    sun_direction: ArrayLike,
     observer_height_m: float,
     distance_au: float = 1.0,
     *,
-    irradiance=1.0,
+    irradiance: ArrayLike = 1.0,
     angular_radius_deg: float | None = None,
 ) -> Luminary | None:
-    """The sun (or another luminary) as it shines through the air on a plane facing it.
+    """Compute the directional source of the sun, or of another luminary, attenuated by the atmosphere.
 
-    The share of its disc below the horizon of the model's ground is taken away, so that it sets gradually; limb
-    darkening is left out.
+    Only the fraction of the disc above the horizon of the model's ground contributes, so that the luminary sets
+    gradually. Limb darkening is neglected.
 
     Parameters
     ----------
-    distance_au
-        Irradiance falls with its square, and the sun's disc with it.
-    irradiance
+    tables
+        Tables of the atmosphere.
+    sun_direction, observer_height_m, irradiance
         As in `sky_radiance_map`.
+    distance_au
+        Distance by which the irradiance and the angular radius of the sun are scaled [au].
     angular_radius_deg
-        Of a luminary other than the sun [deg].
+        Angular radius of a luminary other than the sun [deg].
 
     Returns
     -------
     Luminary or None
-        ``None`` where it has set or gives less than a microlux.
+        ``None`` if the luminary is below the horizon or its normal illuminance is below one microlux.
+
+    Raises
+    ------
+    ValueError
+        If the direction is not a unit vector.
     """
     direction = _unit(sun_direction)
     radius = SUN_RADIUS_DEG / distance_au if angular_radius_deg is None else angular_radius_deg
     transfer = _direct_transfer(tables, direction, observer_height_m, radius)
     illuminance = rgb_from_transfer() @ (transfer * np.asarray(irradiance) / distance_au**2)
-    if illuminance.max() < _FAINTEST_LX:
+    if illuminance.max() < _MIN_NORMAL_LX:
         return None
     return Luminary(direction, illuminance, radius)
 
 
 def illumination_from_atmosphere(
     tables: AtmosphereTables,
-    sun_direction,
+    sun_direction: ArrayLike,
     observer_height_m: float,
     *,
     distance_au: float = 1.0,
-    moon: tuple | None = None,
+    moon: LuminarySource | None = None,
     shape: tuple[int, int] = (128, 256),
     with_air: bool = True,
 ) -> Illumination:
-    """All the light of one instant for an observer: sun, sky, moon and aerial perspective.
+    """Compute the illumination of one instant for an observer: sun, sky, moon and aerial perspective.
 
     Parameters
     ----------
+    tables
+        Tables of the atmosphere.
     sun_direction
-        Apparent unit vector ``(3,)`` towards the sun.
+        Apparent unit vector towards the sun ``(3,)``.
     observer_height_m
-        As in `sky_radiance_map`.
+        As in `sky_radiance_map` [m].
     distance_au
-        Of the sun.
+        Distance of the sun [au].
     moon
-        Apparent direction ``(3,)``, irradiance above the air over the sun's at 1 au, and angular radius [deg] of the
-        moon; left out, there is none.
+        The moon as a source above the atmosphere, or ``None``.
     shape
-        Of the radiance map.
+        Rows and columns of the sky map.
     with_air
-        Whether to work out the aerial perspective too, the larger part of the time; without, it is ``None``.
+        Whether to compute the aerial perspective, which takes most of the time; otherwise it is ``None``.
+
+    Returns
+    -------
+    Illumination
+        Illumination without frame and time.
+
+    Raises
+    ------
+    ValueError
+        If a direction is not a unit vector, or the observer is not below the top of the atmosphere.
     """
-    sources = [(_unit(sun_direction), _bands(1.0 / distance_au**2), SUN_RADIUS_DEG / distance_au)]
+    sources = [LuminarySource(_unit(sun_direction), 1.0 / distance_au**2, SUN_RADIUS_DEG / distance_au)]
     if moon is not None:
-        sources.append((_unit(moon[0]), _bands(moon[1]), moon[2]))
+        sources.append(replace(moon, direction=_unit(moon.direction)))
+    directions = [source.direction for source in sources]
+    irradiances = [_bands(source.irradiance) for source in sources]
     view = observer_view(tables, observer_height_m)
-    true_rad = [_true_rad(tables.atmosphere, direction, observer_height_m) for direction, _, _ in sources]
-    # numpy lets go of the interpreter while it works: sky and air of each luminary side by side.
+    true_rad = [_true_rad(tables.atmosphere, direction, observer_height_m) for direction in directions]
+    # numpy releases the interpreter lock, so sky and airlight of the luminaries are computed in parallel.
     with ThreadPoolExecutor(2) as pool:
         skies = [
             pool.submit(observed_sky, tables, view, direction, true, irradiance)
-            for (direction, irradiance, _), true in zip(sources, true_rad, strict=True)
+            for direction, irradiance, true in zip(directions, irradiances, true_rad, strict=True)
         ]
-        near = [
+        airlights = [
             pool.submit(airlight, tables, view, true, irradiance)
-            for (_, irradiance, _), true in zip(sources, true_rad, strict=True)
+            for irradiance, true in zip(irradiances, true_rad, strict=True)
             if with_air
         ]
-        lights = tuple(sky.result() for sky in skies)
-        radiance = _map_of(lights, shape)
-        airs = tuple(air.result() for air in near)
+        lights = tuple(future.result() for future in skies)
+        radiance = _radiance_map(lights, shape)
+        components = tuple(future.result() for future in airlights)
     luminaries = [
-        sun_luminary(tables, direction, observer_height_m, irradiance=irradiance, angular_radius_deg=radius)
-        for direction, irradiance, radius in sources
+        sun_luminary(
+            tables,
+            source.direction,
+            observer_height_m,
+            irradiance=irradiance,
+            angular_radius_deg=source.angular_radius_deg,
+        )
+        for source, irradiance in zip(sources, irradiances, strict=True)
     ]
-    illuminant = sum(
-        irradiance * _surface_transfer(tables, direction, observer_height_m, true)
-        for (direction, irradiance, _), true in zip(sources, true_rad, strict=True)
-    )
+    aerial_perspective = None
+    if with_air:
+        illuminant = np.asarray(
+            sum(
+                irradiance * _surface_transfer(tables, direction, observer_height_m, true)
+                for direction, irradiance, true in zip(directions, irradiances, true_rad, strict=True)
+            )
+        )
+        aerial_perspective = tabulate_aerial_perspective(
+            view, tuple(zip(lights, components, strict=True)), illuminant + 1e-12
+        )
     return Illumination(
         sky_radiance=radiance,
         sun=luminaries[0],
         moon=luminaries[1] if moon is not None else None,
-        aerial_perspective=tabulate_aerial_perspective(view, tuple(zip(lights, airs, strict=True)), illuminant + 1e-12)
-        if with_air
-        else None,
+        aerial_perspective=aerial_perspective,
         model={"kind": "atmosphere", "observer_height_m": float(observer_height_m), **asdict(tables.atmosphere)},
     )
 
 
-def save_tables(path: str | PathLike, tables: AtmosphereTables) -> None:
-    """Write tables to one ``.npz`` file, atomically."""
+def save_tables(path: str | PathLike[str], tables: AtmosphereTables) -> None:
+    """Write tables to one ``.npz`` file, atomically; ``diffuse_of`` is not stored.
+
+    Parameters
+    ----------
+    path
+        Destination.
+    tables
+        Tables of an atmosphere.
+    """
     with atomic_path(path) as temporary:
         np.savez_compressed(
             temporary,
@@ -210,13 +292,23 @@ def save_tables(path: str | PathLike, tables: AtmosphereTables) -> None:
         )
 
 
-def load_tables(path: str | PathLike) -> AtmosphereTables:
-    """Tables of `save_tables`.
+def load_tables(path: str | PathLike[str]) -> AtmosphereTables:
+    """Read tables of `save_tables`.
+
+    Parameters
+    ----------
+    path
+        ``.npz`` file.
+
+    Returns
+    -------
+    AtmosphereTables
+        Tables without ``diffuse_of``.
 
     Raises
     ------
     ValueError
-        For a file of another revision; compute it anew.
+        If the file was written by another revision and must be recomputed.
     """
     with np.load(path, allow_pickle=False) as file:
         if "revision" not in file or int(file["revision"]) != TABLES_REVISION:
@@ -231,14 +323,14 @@ def load_tables(path: str | PathLike) -> AtmosphereTables:
         )
 
 
-def _unit(direction) -> np.ndarray:
+def _unit(direction: ArrayLike) -> np.ndarray:
     direction = np.asarray(direction, float)
     if direction.shape != (3,) or not abs(np.linalg.norm(direction) - 1.0) < 1e-3:
         raise ValueError(f"direction: got {direction}, expected a unit vector (3,)")
     return direction / np.linalg.norm(direction)
 
 
-def _bands(irradiance) -> np.ndarray:
+def _bands(irradiance: ArrayLike) -> np.ndarray:
     return np.broadcast_to(np.asarray(irradiance, float), WAVELENGTHS_NM.shape)
 
 
@@ -247,13 +339,13 @@ def _true_rad(atmosphere: Atmosphere, direction: np.ndarray, height_m: float) ->
     return float(np.radians(true_elevation_deg(atmosphere, apparent_deg, height_m)))
 
 
-def _map_of(lights: tuple[ScatteredRadiance, ...], shape: tuple[int, int]) -> np.ndarray:
-    """Pixel means over two by two directions, which settles the horizon's row and the sun's aureole."""
+def _radiance_map(lights: tuple[ScatteredRadiance, ...], shape: tuple[int, int]) -> np.ndarray:
+    """Sky map of 2 × 2 samples per pixel, which antialiases the row at the horizon and the solar aureole."""
     height, width = shape
     elevation_deg = 90.0 - (np.arange(2 * height) + 0.5) * (90.0 / height)
     azimuth_deg = (np.arange(2 * width) + 0.5) * (180.0 / width)
-    radiance = sum(sky_radiance_grid(light, elevation_deg, azimuth_deg) for light in lights)
-    # Colours outside Rec.709 have a negative channel; no light of a map may be negative.
+    radiance = np.asarray(sum(sky_radiance_grid(light, elevation_deg, azimuth_deg) for light in lights))
+    # Colours outside the Rec.709 gamut have a negative channel; clip, as radiance must not be negative.
     return np.maximum(radiance.reshape(height, 2, width, 2, 3).mean(axis=(1, 3)), 0.0).astype(np.float32)
 
 
@@ -271,8 +363,8 @@ def _direct_transfer(tables: AtmosphereTables, direction: np.ndarray, height_m: 
 
 
 def _surface_transfer(tables: AtmosphereTables, direction: np.ndarray, height_m: float, true_rad: float) -> np.ndarray:
-    """Light on a steep grey surface near the observer: half of the sun, and the sky's ground irradiance."""
-    index, share = sun_index(np.sin(true_rad))
+    """Irradiance transfer of a steep surface near the observer: half of the direct and the whole diffuse one."""
+    index, fraction = sun_index(np.sin(true_rad))
     table = tables.moments.ground_irradiance
-    diffuse = table[index] * (1.0 - share) + table[index + 1] * share
+    diffuse = table[index] * (1.0 - fraction) + table[index + 1] * fraction
     return 0.5 * _direct_transfer(tables, direction, height_m, SUN_RADIUS_DEG) + diffuse

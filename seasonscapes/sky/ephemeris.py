@@ -1,17 +1,17 @@
-"""Where the sun and the moon stand: apparent topocentric places, refraction, and the events of a day.
+"""Ephemeris of sun and moon: apparent topocentric positions, atmospheric refraction, rise, set and twilights.
 
-Positions come from JPL's DE421 through skyfield, entirely offline. What is *apparent* here is what an eye or a camera
-at the place sees: light time, aberration, parallax and refraction are all in it.
+Positions are computed from JPL's DE421 with skyfield, without network access. *Apparent* positions are corrected for
+light time, aberration, parallax and refraction.
 
 Refraction follows Saemundsson (1986), the formula of NREL's Solar Position Algorithm (Reda & Andreas 2004, eq. 42),
-which maps true to apparent elevation. SPA switches it off with a step where the upper limb sets. A step in a sun's
-direction is a step in a picture's light, so here it stays in full down to a true elevation of -1°, and fades smoothly
-to nothing at -6°, the end of civil twilight; below that a ray from the sun no longer reaches the air near the
-observer. Apparent elevation is continuous and rises strictly with true elevation everywhere.
+which maps true to apparent elevation. SPA sets it to zero, with a step, where the upper limb sets. A step in the sun's
+direction would be a step in illumination, so here refraction applies in full down to a true elevation of -1° and fades
+smoothly to zero at -6°, the end of civil twilight, below which sunlight does not reach the air near the observer.
+Apparent elevation is a continuous and strictly increasing function of true elevation.
 
-Time: Earth rotation is UT1. UTC is within 0.9 s of it from 1972 on, where the difference is taken from the IERS table
-that skyfield ships. Before 1972, and after that table ends, civil UTC is taken *as* UT1: a guess at future leap
-seconds would otherwise turn the sky by up to 0.01°.
+Time: Earth rotation follows UT1. UTC differs from it by less than 0.9 s since 1972, and the difference is taken from the
+IERS table included in skyfield. Before 1972, and after the end of that table, civil UTC is taken *as* UT1, because an
+assumption about future leap seconds would rotate the sky by up to 0.01°.
 """
 
 from __future__ import annotations
@@ -21,9 +21,10 @@ from dataclasses import dataclass, fields
 from datetime import UTC, datetime, timedelta, tzinfo
 from datetime import date as Date
 from functools import lru_cache
-from typing import Any
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from seasonscapes.declaration import InputError
 from seasonscapes.frames import direction_from_angles
@@ -32,27 +33,30 @@ SUN_RADIUS_KM = 695_700.0  # IAU 2015 resolution B3, nominal
 MOON_RADIUS_KM = 1737.4  # IAU WGCCRE 2015, mean
 _AU_KM = 149_597_870.7
 
-# Elevation of the sun's centre at which its upper limb stands on a sea-level horizon: 34' refraction + 16' radius.
+# Elevation of the sun's centre when its upper limb touches a sea-level horizon: 34' refraction + 16' radius.
 SUNRISE_ELEVATION_DEG = -50.0 / 60.0
 CIVIL_DEG, NAUTICAL_DEG, ASTRONOMICAL_DEG = -6.0, -12.0, -18.0
 
 _FADE_FROM_DEG, _FADE_TO_DEG = -1.0, -6.0
-# Below its turning point Saemundsson's formula runs towards a pole at -5.11°; it is held from there on.
+# Below its turning point Saemundsson's formula tends to a pole at -5.11°; its argument is clamped there.
 _TURNING_POINT_DEG = np.sqrt(10.3) - 5.11
+
+# skyfield's annotations lose the types of `reify` properties, of sums of vectors and of scalar against array results.
+_Skyfield: TypeAlias = Any
 
 
 @dataclass(frozen=True)
 class SolarPosition:
-    """Where the sun stands; scalars for one instant, arrays ``(T,)`` for many.
+    """Position of the sun; scalars for one instant, arrays ``(T,)`` for many.
 
     Parameters
     ----------
     azimuth_deg
-        Clockwise from true north [deg].
+        Azimuth clockwise from true north [deg].
     elevation_deg
-        Apparent, refracted [deg].
+        Apparent (refracted) elevation [deg].
     true_elevation_deg
-        Topocentric without refraction [deg].
+        Topocentric elevation without refraction [deg].
     distance_au
         Distance from the observer [au].
     """
@@ -69,13 +73,13 @@ class SolarPosition:
 
     @property
     def angular_radius_deg(self) -> float:
-        """Angular radius of the disc, before refraction flattens it [deg]."""
-        return np.degrees(np.arcsin(SUN_RADIUS_KM / (np.asarray(self.distance_au) * _AU_KM)))[()]
+        """Angular radius of the disc without flattening by refraction [deg]."""
+        return _unwrapped(np.degrees(np.arcsin(SUN_RADIUS_KM / (np.asarray(self.distance_au) * _AU_KM))))
 
 
 @dataclass(frozen=True)
 class LunarPosition:
-    """Where the moon stands and how it is lit; scalars for one instant, arrays ``(T,)`` for many.
+    """Position and phase of the moon; scalars for one instant, arrays ``(T,)`` for many.
 
     Parameters
     ----------
@@ -86,9 +90,9 @@ class LunarPosition:
     sun_distance_au
         Distance between moon and sun [au].
     phase_angle_deg
-        Angle sun-moon-observer: 0 full, 180 new [deg].
+        Angle sun-moon-observer, 0 at full and 180 at new moon [deg].
     illuminated_fraction
-        Share of the disc that is sunlit, in [0, 1].
+        Sunlit fraction of the disc in [0, 1].
     waxing
         True from new to full moon.
     """
@@ -110,15 +114,27 @@ class LunarPosition:
     @property
     def angular_radius_deg(self) -> float:
         """Angular radius of the disc [deg]."""
-        return np.degrees(np.arcsin(MOON_RADIUS_KM / np.asarray(self.distance_km)))[()]
+        return _unwrapped(np.degrees(np.arcsin(MOON_RADIUS_KM / np.asarray(self.distance_km))))
+
+
+Position = TypeVar("Position", SolarPosition, LunarPosition)
 
 
 @dataclass(frozen=True)
 class SunEvents:
-    """The sun's events of one solar day, from midnight to midnight about its culmination; aware UTC datetimes.
+    """Sun events of one solar day, from midnight to midnight about the culmination; aware UTC datetimes.
 
-    A dusk that falls after civil midnight therefore still belongs to the day it ends. ``None`` where the sun does not
-    cross that elevation, which is never an error: it is polar day, polar night, or a white night.
+    A dusk after civil midnight therefore belongs to the solar day that it ends. Events are ``None`` if the sun does not
+    cross the elevation, as in polar day, polar night and white nights.
+
+    Parameters
+    ----------
+    solar_noon
+        Culmination of the sun.
+    sunrise, sunset
+        Elevation `SUNRISE_ELEVATION_DEG`.
+    civil_dawn, civil_dusk, nautical_dawn, nautical_dusk, astronomical_dawn, astronomical_dusk
+        Elevations of -6°, -12° and -18°.
     """
 
     solar_noon: datetime
@@ -132,22 +148,48 @@ class SunEvents:
     astronomical_dusk: datetime | None
 
 
-def standard_pressure_hpa(height_m) -> float:
-    """Pressure of the ICAO standard atmosphere below 11 km [hPa]."""
-    return 1013.25 * (1.0 - 2.25577e-5 * np.asarray(height_m, float))[()] ** 5.25588
+def standard_pressure_hpa(height_m: ArrayLike) -> float:
+    """Compute the pressure of the ICAO standard atmosphere below 11 km.
+
+    Parameters
+    ----------
+    height_m
+        Height above sea level ``(...)`` [m].
+
+    Returns
+    -------
+    float
+        Pressure [hPa]; an array ``(...)`` for an array of heights.
+    """
+    return 1013.25 * _unwrapped(1.0 - 2.25577e-5 * np.asarray(height_m, float)) ** 5.25588
 
 
-def refraction_deg(true_elevation_deg, *, pressure_hpa: float = 1013.25, temperature_c: float = 10.0):
-    """By how much the air lifts a body seen from the ground [deg]; see the module's text for what happens below 0°.
+def refraction_deg(
+    true_elevation_deg: ArrayLike, *, pressure_hpa: float = 1013.25, temperature_c: float = 10.0
+) -> np.ndarray:
+    """Compute the refraction of a body observed from the ground, apparent minus true elevation.
 
-    Saemundsson, Sky & Telescope 72 (1986) 70, scaled as in Reda & Andreas (2004), eq. 42.
+    Saemundsson, Sky & Telescope 72 (1986) 70, scaled as in Reda & Andreas (2004), eq. 42. It fades to zero between true
+    elevations of -1° and -6°, see the module's documentation.
+
+    Parameters
+    ----------
+    true_elevation_deg
+        True elevation ``(...)`` [deg].
+    pressure_hpa, temperature_c
+        Pressure [hPa] and temperature [°C] of the air at the observer.
+
+    Returns
+    -------
+    ndarray
+        Refraction ``(...)`` [deg]; a scalar for a scalar elevation.
     """
     true = np.asarray(true_elevation_deg, float)
-    held = np.maximum(true, _TURNING_POINT_DEG)
+    clamped = np.maximum(true, _TURNING_POINT_DEG)
     lift = (pressure_hpa / 1010.0) * (283.0 / (273.0 + temperature_c)) * 1.02 / 60.0
-    lift = lift / np.tan(np.radians(held + 10.3 / (held + 5.11)))
-    share = np.clip((true - _FADE_TO_DEG) / (_FADE_FROM_DEG - _FADE_TO_DEG), 0.0, 1.0)
-    return (lift * share**2 * (3.0 - 2.0 * share))[()]
+    lift = lift / np.tan(np.radians(clamped + 10.3 / (clamped + 5.11)))
+    fade = np.clip((true - _FADE_TO_DEG) / (_FADE_FROM_DEG - _FADE_TO_DEG), 0.0, 1.0)
+    return _unwrapped(lift * fade**2 * (3.0 - 2.0 * fade))
 
 
 def sun_position(
@@ -160,37 +202,43 @@ def sun_position(
     temperature_c: float = 10.0,
     delta_t_s: float | None = None,
 ) -> SolarPosition:
-    """Apparent topocentric place of the sun.
+    """Compute the apparent topocentric position of the sun.
 
     Parameters
     ----------
     time
-        Aware datetime, or a sequence of them ``(T,)``.
+        Aware datetime, or a sequence of T aware datetimes.
     latitude_deg, longitude_deg
-        WGS 84 [deg].
+        WGS 84 position of the observer [deg].
     height_m
-        Of the observer [m].
+        Height of the observer [m].
     pressure_hpa, temperature_c
-        Air at the observer, for refraction [hPa], [°C]. Pressure follows from the height where left out.
+        Pressure [hPa] and temperature [°C] of the air at the observer, for refraction. Without a pressure that of the
+        standard atmosphere at the observer's height is used.
     delta_t_s
-        TT - UT1 [s]. Where given, ``time`` is taken as UT1, as NREL SPA does.
+        TT - UT1 [s]. If given, ``time`` is taken as UT1, as in NREL SPA.
+
+    Returns
+    -------
+    SolarPosition
+        Scalars for one datetime, arrays ``(T,)`` for a sequence.
 
     Raises
     ------
     ValueError
-        For a naive datetime or an impossible latitude.
+        If a datetime is naive, or the position is out of range.
     InputError
-        For a time outside the ephemeris (1899-07-29 to 2053-10-07).
+        If a time is outside the ephemeris (1899-07-29 to 2053-10-07).
     """
     when = _skyfield_time(time, delta_t_s)
     kernel, observer = _kernel(), _observer(latitude_deg, longitude_deg, height_m)
     elevation, azimuth, distance = observer.at(when).observe(kernel["sun"]).apparent().altaz()
     lift = _lift(elevation.degrees, height_m, pressure_hpa, temperature_c)
     return SolarPosition(
-        azimuth_deg=_shaped(azimuth.degrees, time),
-        elevation_deg=_shaped(elevation.degrees + lift, time),
-        true_elevation_deg=_shaped(elevation.degrees, time),
-        distance_au=_shaped(distance.au, time),
+        azimuth_deg=_scalar_or_array(azimuth.degrees, time),
+        elevation_deg=_scalar_or_array(elevation.degrees + lift, time),
+        true_elevation_deg=_scalar_or_array(elevation.degrees, time),
+        distance_au=_scalar_or_array(distance.au, time),
     )
 
 
@@ -203,47 +251,77 @@ def moon_position(
     pressure_hpa: float | None = None,
     temperature_c: float = 10.0,
 ) -> LunarPosition:
-    """Apparent topocentric place, distance and phase of the moon; parameters and errors as in `sun_position`."""
+    """Compute the apparent topocentric position, distance and phase of the moon.
+
+    Parameters
+    ----------
+    time, latitude_deg, longitude_deg, height_m, pressure_hpa, temperature_c
+        As in `sun_position`.
+
+    Returns
+    -------
+    LunarPosition
+        Scalars for one datetime, arrays ``(T,)`` for a sequence.
+
+    Raises
+    ------
+    ValueError, InputError
+        As in `sun_position`.
+    """
     when = _skyfield_time(time, None)
-    kernel, place = _kernel(), _observer(latitude_deg, longitude_deg, height_m).at(when)
-    seen = place.observe(kernel["moon"])
-    elevation, azimuth, distance = seen.apparent().altaz()
+    kernel, observer = _kernel(), _observer(latitude_deg, longitude_deg, height_m).at(when)
+    moon = observer.observe(kernel["moon"])
+    elevation, azimuth, distance = moon.apparent().altaz()
     lift = _lift(elevation.degrees, height_m, pressure_hpa, temperature_c)
-    # Light that reaches us now left the sun a moment before it met the moon: shift the sun's place alike.
-    to_sun = place.observe(kernel["sun"]).position.km - seen.position.km
-    to_observer = -seen.position.km
+    # Both astrometric positions are corrected for light time to the observer, which suffices for the phase.
+    to_sun = observer.observe(kernel["sun"]).position.km - moon.position.km
+    to_observer = -moon.position.km
     cosine = np.sum(to_sun * to_observer, axis=0) / np.linalg.norm(to_sun, axis=0) / np.linalg.norm(to_observer, axis=0)
     cosine = np.clip(cosine, -1.0, 1.0)
-    # The moon waxes while it stands east of the sun in ecliptic longitude.
-    longitudes = [place.observe(kernel[body]).apparent().ecliptic_latlon("date")[1].degrees for body in ("moon", "sun")]
+    # The moon is waxing while it is east of the sun in ecliptic longitude.
+    longitudes = [
+        observer.observe(kernel[body]).apparent().ecliptic_latlon("date")[1].degrees for body in ("moon", "sun")
+    ]
     return LunarPosition(
-        azimuth_deg=_shaped(azimuth.degrees, time),
-        elevation_deg=_shaped(elevation.degrees + lift, time),
-        true_elevation_deg=_shaped(elevation.degrees, time),
-        distance_km=_shaped(distance.km, time),
-        sun_distance_au=_shaped(np.linalg.norm(to_sun, axis=0) / _AU_KM, time),
-        phase_angle_deg=_shaped(np.degrees(np.arccos(cosine)), time),
-        illuminated_fraction=_shaped(0.5 * (1.0 + cosine), time),
-        waxing=_shaped((longitudes[0] - longitudes[1]) % 360.0 < 180.0, time),
+        azimuth_deg=_scalar_or_array(azimuth.degrees, time),
+        elevation_deg=_scalar_or_array(elevation.degrees + lift, time),
+        true_elevation_deg=_scalar_or_array(elevation.degrees, time),
+        distance_km=_scalar_or_array(distance.km, time),
+        sun_distance_au=_scalar_or_array(np.linalg.norm(to_sun, axis=0) / _AU_KM, time),
+        phase_angle_deg=_scalar_or_array(np.degrees(np.arccos(cosine)), time),
+        illuminated_fraction=_scalar_or_array(0.5 * (1.0 + cosine), time),
+        waxing=_scalar_or_array((longitudes[0] - longitudes[1]) % 360.0 < 180.0, time),
     )
 
 
 def sun_events(date: Date, latitude_deg: float, longitude_deg: float, tz: tzinfo = UTC) -> SunEvents:
-    """Sunrise, sunset, solar noon and twilights of the solar day that culminates on a civil date.
+    """Compute sunrise, sunset, solar noon and twilights of the solar day that culminates on a civil date.
 
     Parameters
     ----------
     date
         Civil date at the place.
     latitude_deg, longitude_deg
-        WGS 84 [deg].
+        WGS 84 position [deg].
     tz
         Time zone of the civil date.
 
+    Returns
+    -------
+    SunEvents
+        Aware UTC datetimes, or ``None`` for events that do not occur.
+
+    Raises
+    ------
+    ValueError
+        If the position is out of range.
+    InputError
+        If the date is outside the ephemeris.
+
     Notes
     -----
-    By convention for a flat horizon at sea level: centre of the sun at -50', -6°, -12° and -18°. A mountain's own
-    horizon is the renderer's business.
+    By convention for a flat horizon at sea level: centre of the sun at -50', -6°, -12° and -18°. The horizon of the
+    terrain is not taken into account.
     """
     from skyfield import almanac
 
@@ -257,18 +335,18 @@ def sun_events(date: Date, latitude_deg: float, longitude_deg: float, tz: tzinfo
         return observer.at(when).observe(sun).apparent().altaz()[0].degrees
 
     levels = np.array([SUNRISE_ELEVATION_DEG, CIVIL_DEG, NAUTICAL_DEG, ASTRONOMICAL_DEG])
-    found = [
-        None if np.isnan(days) else _civil(scale.tt_jd(noon.whole, noon.tt_fraction + days))
+    events = [
+        None if np.isnan(days) else _utc_datetime(scale.tt_jd(noon.whole, noon.tt_fraction + days))
         for days in _crossings(elevation_deg, levels).ravel()
     ]
-    return SunEvents(_civil(noon), *found)
+    return SunEvents(_utc_datetime(noon), *events)
 
 
 def _crossings(elevation_deg: Callable[[np.ndarray], np.ndarray], levels: np.ndarray) -> np.ndarray:
-    """Days from noon ``(L, 2)`` of the last rise through each level before noon and the first fall after it, or NaN.
+    """Days from noon ``(L, 2)`` of the last upward crossing of each level before noon and the first downward one after it.
 
-    skyfield's own search divides by zero where a sun only just fails to rise; a coarse scan and a few rounds of the
-    secant rule cannot.
+    NaN where there is no crossing. skyfield's own search divides by zero when the culmination only just fails to reach
+    a level; a coarse scan followed by the secant method is robust there.
     """
     grid = np.linspace(-0.5, 0.5, 145)
     above = elevation_deg(grid)[None, :] >= levels[:, None]
@@ -288,35 +366,55 @@ def _crossings(elevation_deg: Callable[[np.ndarray], np.ndarray], levels: np.nda
     return np.where(missing, np.nan, guess)
 
 
-def at_index(position: Any, index: int) -> Any:
-    """The scalar position of one instant out of a position of many."""
+def at_index(position: Position, index: int) -> Position:
+    """Extract the position at one instant from positions at many instants.
+
+    Parameters
+    ----------
+    position
+        `SolarPosition` or `LunarPosition` of arrays ``(T,)``.
+    index
+        Index of the instant.
+
+    Returns
+    -------
+    SolarPosition or LunarPosition
+        Position of scalars.
+    """
     values = {field.name: getattr(position, field.name)[index] for field in fields(position)}
     return type(position)(**{name: value.item() for name, value in values.items()})
 
 
-def _lift(true_elevation_deg, height_m: float, pressure_hpa: float | None, temperature_c: float):
+def _lift(
+    true_elevation_deg: ArrayLike, height_m: float, pressure_hpa: float | None, temperature_c: float
+) -> np.ndarray:
     pressure = standard_pressure_hpa(height_m) if pressure_hpa is None else pressure_hpa
     return refraction_deg(true_elevation_deg, pressure_hpa=pressure, temperature_c=temperature_c)
 
 
-def _shaped(values, time):
-    """Python scalars for one instant, arrays for a sequence."""
+def _unwrapped(values: np.ndarray) -> Any:
+    """Scalar of a zero-dimensional array, otherwise the array itself."""
+    return values[()]
+
+
+def _scalar_or_array(values: ArrayLike, time: datetime | Sequence[datetime]) -> Any:
+    """Python scalar for one instant, array for a sequence."""
     return np.asarray(values).reshape(-1)[0].item() if isinstance(time, datetime) else np.asarray(values)
 
 
 @lru_cache(maxsize=1)
-def _kernel():
+def _kernel() -> _Skyfield:
     from importlib.resources import as_file, files
 
     from skyfield.jpllib import SpiceKernel
 
-    # Not through skyfield_data's own function: that one warns about the age of a file which is not used here.
+    # skyfield_data's own function would warn about the age of another file, which is not used here.
     with as_file(files("skyfield_data") / "data" / "de421.bsp") as path:
         return SpiceKernel(str(path))
 
 
 @lru_cache(maxsize=4)
-def _timescale(delta_t_s: float | None = None):
+def _timescale(delta_t_s: float | None = None) -> _Skyfield:
     from skyfield.api import load
     from skyfield.timelib import Timescale
 
@@ -326,7 +424,7 @@ def _timescale(delta_t_s: float | None = None):
     return Timescale(lambda tt: np.full(np.shape(tt), delta_t_s)[()], scale.leap_dates, scale.leap_offsets)
 
 
-def _observer(latitude_deg: float, longitude_deg: float, height_m: float):
+def _observer(latitude_deg: float, longitude_deg: float, height_m: float) -> _Skyfield:
     from skyfield.api import wgs84
 
     if not (-90.0 <= latitude_deg <= 90.0 and -360.0 <= longitude_deg <= 360.0):
@@ -334,18 +432,18 @@ def _observer(latitude_deg: float, longitude_deg: float, height_m: float):
     return _kernel()["earth"] + wgs84.latlon(latitude_deg, longitude_deg, elevation_m=height_m)
 
 
-# Julian dates of 1972-01-01, and of the first and last whole day that the kernel covers.
+# Julian dates of 1972-01-01, and of the first and last whole day of the kernel.
 _UTC_BEGINS_JD, _FIRST_JD, _LAST_JD = 2441317.5, 2414865.5, 2471182.5
 
 
-def _skyfield_time(time: datetime | Sequence[datetime], delta_t_s: float | None):
-    """A skyfield Time, scalar or ``(T,)``, by the rule for UT1 in the module's text."""
+def _skyfield_time(time: datetime | Sequence[datetime], delta_t_s: float | None) -> _Skyfield:
+    """A skyfield Time, scalar or ``(T,)``, by the rule for UT1 in the module's documentation."""
     times = [time] if isinstance(time, datetime) else list(time)
-    for one in times:
-        if not isinstance(one, datetime) or one.utcoffset() is None:
-            raise ValueError(f"time: got {one!r}, expected aware datetimes (with a time zone)")
+    for instant in times:
+        if not isinstance(instant, datetime) or instant.utcoffset() is None:
+            raise ValueError(f"time: got {instant!r}, expected aware datetimes (with a time zone)")
     epoch = datetime(2000, 1, 1, 12, tzinfo=UTC)
-    seconds = np.array([(one - epoch) / timedelta(seconds=1) for one in times])
+    seconds = np.array([(instant - epoch) / timedelta(seconds=1) for instant in times])
     whole, fraction = np.divmod(seconds, 86400.0)
     whole, fraction = whole + 2451545.0, fraction / 86400.0
     if np.any((whole + fraction < _FIRST_JD) | (whole + fraction > _LAST_JD)):
@@ -354,18 +452,18 @@ def _skyfield_time(time: datetime | Sequence[datetime], delta_t_s: float | None)
             "time", "outside the ephemeris of sun and moon", got=wrong.isoformat(), expected="1899-07-29 to 2053-10-07"
         )
     scale = _timescale(delta_t_s)
-    # ΔT varies by seconds a year, so that one look-up at UT1 instead of TT is exact enough (< 1 µs).
+    # ΔT changes by seconds per year, so that evaluating it at UT1 instead of TT is exact enough (< 1 µs).
     terrestrial = fraction + scale.delta_t_function(whole + fraction) / 86400.0
     if delta_t_s is None:
-        known = (whole + fraction >= _UTC_BEGINS_JD) & (whole + fraction < scale.delta_t_table[0][-1])
-        from_utc = scale.from_datetimes([one.astimezone(UTC) for one in times])
-        terrestrial = np.where(known, from_utc.tt_fraction + (from_utc.whole - whole), terrestrial)
+        in_table = (whole + fraction >= _UTC_BEGINS_JD) & (whole + fraction < scale.delta_t_table[0][-1])
+        from_utc = scale.from_datetimes([instant.astimezone(UTC) for instant in times])
+        terrestrial = np.where(in_table, from_utc.tt_fraction + (from_utc.whole - whole), terrestrial)
     when = scale.tt_jd(whole, terrestrial)
     return when[0] if isinstance(time, datetime) else when
 
 
-def _civil(when) -> datetime:
-    """Aware UTC of a skyfield Time, the inverse of `_skyfield_time`, rounded to a millisecond."""
+def _utc_datetime(when: _Skyfield) -> datetime:
+    """Aware UTC datetime of a skyfield Time rounded to a millisecond; the inverse of `_skyfield_time`."""
     if _UTC_BEGINS_JD <= when.tt < _timescale().delta_t_table[0][-1]:
         utc = when.utc_datetime()
     else:

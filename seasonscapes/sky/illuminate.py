@@ -1,4 +1,4 @@
-"""From a declared sky model and the places of sun and moon to the light of an instant."""
+"""Illumination of one instant from a sky model and the positions of sun and moon."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 
 from seasonscapes.sky.atmosphere import Atmosphere
-from seasonscapes.sky.clear_sky import AtmosphereTables, atmosphere_tables, illumination_from_atmosphere
+from seasonscapes.sky.clear_sky import AtmosphereTables, LuminarySource, atmosphere_tables, illumination_from_atmosphere
 from seasonscapes.sky.clouds import with_clouds
 from seasonscapes.sky.ephemeris import LunarPosition, SolarPosition
 from seasonscapes.sky.illumination import Illumination, diffuse_horizontal_illuminance, luminance
@@ -28,13 +28,25 @@ from seasonscapes.sky.spectrum import WAVELENGTHS_NM, angstrom_ratio, rayleigh_o
 TablesOf = Callable[[Atmosphere], AtmosphereTables]
 HosekOf = Callable[..., Illumination]
 
-# The moon is left out where it cannot matter: under 1e-3 of the sun's light, or of the night sky's.
-_SUN_OUTSHINES_DEG, _MOON_GONE_DEG = 0.0, -9.0
+# Moonlight is omitted if the sun is above, or the moon below, these elevations, where it contributes less than 1e-3 of
+# the sunlight or of the night sky's light.
+_MAX_SUN_FOR_MOONLIGHT_DEG, _MIN_MOON_DEG = 0.0, -9.0
 
 
 @lru_cache(maxsize=4)
 def tables_in_memory(atmosphere: Atmosphere) -> AtmosphereTables:
-    """`atmosphere_tables`, kept for the life of the process. A workspace passes its own, kept on disk."""
+    """Compute `atmosphere_tables` with a cache in memory.
+
+    Parameters
+    ----------
+    atmosphere
+        Atmosphere.
+
+    Returns
+    -------
+    AtmosphereTables
+        Tables of the atmosphere.
+    """
     return atmosphere_tables(atmosphere)
 
 
@@ -49,36 +61,41 @@ def illuminate(
     tables_of: TablesOf = tables_in_memory,
     hosek: HosekOf | None = None,
 ) -> Illumination:
-    """All the light of one instant at one place under a sky model.
+    """Compute the illumination of one instant at one place under a sky model.
 
     Parameters
     ----------
     model
-        From `models.read_sky_model`, with or without overrides.
+        Sky model, from `models.read_sky_model`.
     sun, moon
-        Where they stand, of the same instant and place; without a moon there is no moonlight.
+        Positions at the same instant and place; without a moon there is no moonlight.
     height_m
-        Of the observer [m].
+        Height of the observer [m].
     map_height
         Rows of the sky map; it has twice as many columns.
     with_air
-        Without, atmosphere models leave out aerial perspective, the larger part of their time.
+        Whether atmosphere models compute the aerial perspective, which takes most of their time.
     tables_of
-        Gives the tables of an atmosphere; the default computes them once a process, in tens of seconds.
+        Function that returns the tables of an atmosphere, for example from a cache on disk. The default computes them
+        once per process, in tens of seconds.
     hosek
-        For models of kind ``hosek`` only, whose evaluation is the renderer's:
-        `seasonscapes.rendering.hosek.hosek_illumination`.
+        Function that evaluates models of kind ``hosek``: `seasonscapes.rendering.hosek.hosek_illumination`.
+
+    Returns
+    -------
+    Illumination
+        Illumination without frame and time.
 
     Raises
     ------
     InputError
-        Where sun or observer are outside the model's valid range.
+        If sun or observer are outside the model's valid range.
     ValueError
-        For a model of kind ``hosek`` without ``hosek``.
+        If the model is of kind ``hosek`` and ``hosek`` is omitted, or of an unknown class.
     """
     check_valid(model, float(sun.elevation_deg), height_m)
     if isinstance(model, OvercastModel):
-        return _named(model, _overcast(model, sun, moon, height_m, map_height))
+        return _with_provenance(model, _overcast_illumination(model, sun, moon, height_m, map_height))
     if isinstance(model, HosekModel):
         if hosek is None:
             raise ValueError("kind 'hosek' is evaluated by the renderer: pass hosek=rendering.hosek.hosek_illumination")
@@ -88,37 +105,43 @@ def illuminate(
             ground_albedo=model.ground.albedo,
             shape=(map_height, 2 * map_height),
         )
-        return _named(model, _clouded(model, clear, sun, None))
+        return _with_provenance(model, _add_clouds(model, clear, sun, None))
     if isinstance(model, AtmosphereModel):
-        moon = _worth_having(sun, moon)
-        clear = _atmosphere(model, sun, moon, height_m, (map_height, with_air), tables_of)
-        return _named(model, _clouded(model, clear, sun, moon))
+        moon = _significant_moon(sun, moon)
+        clear = _clear_illumination(
+            model, sun, moon, height_m=height_m, map_height=map_height, with_air=with_air, tables_of=tables_of
+        )
+        return _with_provenance(model, _add_clouds(model, clear, sun, moon))
     raise ValueError(f"model: got {type(model).__name__}, expected one of `models.KINDS`")
 
 
-def _named(model: SkyModel, illumination: Illumination) -> Illumination:
+def _with_provenance(model: SkyModel, illumination: Illumination) -> Illumination:
     record = {"name": model.name, **illumination.model}
     return replace(illumination, model={**record, "cloudiness": model.cloudiness})
 
 
-def _worth_having(sun: SolarPosition, moon: LunarPosition | None) -> LunarPosition | None:
-    if moon is None or sun.elevation_deg > _SUN_OUTSHINES_DEG or moon.elevation_deg < _MOON_GONE_DEG:
+def _significant_moon(sun: SolarPosition, moon: LunarPosition | None) -> LunarPosition | None:
+    """The moon, or ``None`` if its light is negligible."""
+    if moon is None or sun.elevation_deg > _MAX_SUN_FOR_MOONLIGHT_DEG or moon.elevation_deg < _MIN_MOON_DEG:
         return None
     return moon
 
 
-def _atmosphere(
+def _clear_illumination(
     model: AtmosphereModel,
     sun: SolarPosition,
     moon: LunarPosition | None,
+    *,
     height_m: float,
-    extent: tuple[int, bool],
+    map_height: int,
+    with_air: bool,
     tables_of: TablesOf,
 ) -> Illumination:
-    map_height, with_air = extent
+    """Illumination by the clear atmosphere and the night sky."""
     source = None
     if moon is not None:
-        source = (moon.direction, moon_to_sun_ratio(moon, WAVELENGTHS_NM), float(moon.angular_radius_deg))
+        ratio = moon_to_sun_ratio(moon, WAVELENGTHS_NM)
+        source = LuminarySource(moon.direction, ratio, float(moon.angular_radius_deg))
     clear = illumination_from_atmosphere(
         tables_of(atmosphere_of(model)),
         sun.direction,
@@ -139,12 +162,12 @@ def _atmosphere(
     return replace(clear, sky_radiance=(clear.sky_radiance + night).astype(np.float32))
 
 
-def _overcast(
+def _overcast_illumination(
     model: OvercastModel, sun: SolarPosition, moon: LunarPosition | None, height_m: float, map_height: int
 ) -> Illumination:
     return overcast(
         sun,
-        _worth_having(sun, moon),
+        _significant_moon(sun, moon),
         height_m=height_m,
         map_height=map_height,
         visibility_km=model.visibility_km,
@@ -153,12 +176,16 @@ def _overcast(
     )
 
 
-def _clouded(model: SkyModel, clear: Illumination, sun: SolarPosition, moon: LunarPosition | None) -> Illumination:
-    """Clouds lit by sun, moon and night sky, each let through by its own share; no jump as one takes over."""
+def _add_clouds(model: SkyModel, clear: Illumination, sun: SolarPosition, moon: LunarPosition | None) -> Illumination:
+    """Apply the model's cloudiness, with transmission and colour averaged over sun, moon and night sky.
+
+    The weights are the clear-sky illuminances, so that the result is continuous when the dominant source changes.
+    """
     if model.cloudiness == 0.0:
         return clear
     night = float(luminance(diffuse_horizontal_illuminance(night_sky_radiance(32, 8))))
-    lights = [
+    # Illuminance, transmission and colour of each source.
+    sources = [
         (
             clear_illuminance_lx(sun.elevation_deg),
             cloud_transmission(sun.elevation_deg),
@@ -166,14 +193,14 @@ def _clouded(model: SkyModel, clear: Illumination, sun: SolarPosition, moon: Lun
         ),
         (night, cloud_transmission(-20.0), daylight_rgb(4900.0)),
     ]
-    source = sun.direction
+    dominant = sun.direction
     if moon is not None:
         ratio = float(moon_to_sun_ratio(moon, 555.0))
         moonlight = ratio * clear_illuminance_lx(moon.elevation_deg)
-        lights.append((moonlight, cloud_transmission(moon.elevation_deg), daylight_rgb(DAY_CCT_K)))
-        source = moon.direction if moonlight > lights[0][0] else source
-    amounts = np.array([float(amount) for amount, _, _ in lights])
-    shares = amounts / amounts.sum()
-    transmission = float(sum(share * light[1] for share, light in zip(shares, lights, strict=True)))
-    colour = sum(share * light[2] for share, light in zip(shares, lights, strict=True))
-    return with_clouds(clear, model.cloudiness, source, transmission=transmission, colour=colour)
+        sources.append((moonlight, cloud_transmission(moon.elevation_deg), daylight_rgb(DAY_CCT_K)))
+        dominant = moon.direction if moonlight > sources[0][0] else dominant
+    illuminances = np.array([float(illuminance) for illuminance, _, _ in sources])
+    weights = illuminances / illuminances.sum()
+    transmission = float(sum(weight * source[1] for weight, source in zip(weights, sources, strict=True)))
+    colour = np.asarray(sum(weight * source[2] for weight, source in zip(weights, sources, strict=True)))
+    return with_clouds(clear, model.cloudiness, dominant, transmission=transmission, colour=colour)

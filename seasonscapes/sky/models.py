@@ -1,4 +1,4 @@
-"""Sky models as declarations: what a file in ``sun_models/`` says, overrides from the command line, valid ranges."""
+"""Declarative sky models: TOML files in ``sun_models/``, command-line overrides and valid ranges."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from seasonscapes.sky.atmosphere import (
 )
 
 Interval = Annotated[list[float], Field(min_length=2, max_length=2)]
-Share = Annotated[float, Field(ge=0.0, le=1.0)]
+UnitInterval = Annotated[float, Field(ge=0.0, le=1.0)]
 
 
-class Valid(Declaration):
-    """Where a model holds, ``[low, high]`` each. A parameter that is not listed is one the model does not know.
+class ValidRange(Declaration):
+    """Valid ranges of a sky model, each ``[low, high]``; an override without range is not supported by the model.
 
     Parameters
     ----------
     sun_elevation_deg
-        Of the apparent sun [deg].
+        Apparent solar elevation [deg].
     height_m
-        Of the observer [m].
+        Height of the observer [m].
     turbidity, visibility_km, ozone_du
-        Of the overrides.
+        Overrides, see `with_overrides`.
     """
 
     sun_elevation_deg: Interval
@@ -48,53 +48,87 @@ class Valid(Declaration):
 
 
 class Aerosol(Declaration):
-    """Haze or dust: its vertical optical depth, how that falls with wavelength and height, how it scatters."""
+    """Aerosol (haze or dust) of an atmosphere model.
+
+    Parameters
+    ----------
+    optical_depth_500nm
+        Vertical optical depth at 500 nm.
+    angstrom_exponent
+        Ångström exponent of its wavelength dependence.
+    scale_height_m
+        Scale height of its density [m].
+    single_scattering_albedo, asymmetry
+        Single-scattering albedo and mean cosine of scattering.
+    """
 
     optical_depth_500nm: float = Field(ge=0.0, le=5.0)
     angstrom_exponent: float = Field(ge=-1.0, le=4.0)
     scale_height_m: float = Field(ge=50.0, le=20_000.0)
-    single_scattering_albedo: Share
+    single_scattering_albedo: UnitInterval
     asymmetry: float = Field(ge=0.0, le=0.85)
 
 
 class Ozone(Declaration):
-    """The ozone column, in Dobson units."""
+    """Ozone of an atmosphere model.
+
+    Parameters
+    ----------
+    column_du
+        Vertical column [DU].
+    """
 
     column_du: float = Field(ge=0.0, le=1000.0)
 
 
 class GroundModel(Declaration):
-    """What lies below the sky: its mean albedo, and the height of the lowland from which haze counts [m]."""
+    """Ground of a sky model.
 
-    albedo: Share
+    Parameters
+    ----------
+    albedo
+        Mean albedo.
+    height_m
+        Height of the lowland, at which the aerosol column begins [m].
+    """
+
+    albedo: UnitInterval
     height_m: float = Field(default=0.0, ge=-500.0, le=6000.0)
 
 
 class SkyModel(Declaration):
-    """What every sky model says.
+    """Fields common to all sky models.
 
     Parameters
     ----------
     name
-        The file's stem, where the file does not say it.
+        Name of the model; the file's stem if omitted.
     description, sources
-        For people; where the numbers come from.
+        Human-readable description, and references of the numbers.
     ground, valid
-        See `GroundModel`, `Valid`.
+        See `GroundModel` and `ValidRange`.
     cloudiness
-        Share of the sky that clouds cover, in [0, 1]; see `sky.clouds`.
+        Cloud fraction in [0, 1]; see `sky.clouds`.
     """
 
     name: str = ""
     description: str
     sources: list[str] = Field(min_length=1)
     ground: GroundModel
-    valid: Valid
-    cloudiness: Share = 0.0
+    valid: ValidRange
+    cloudiness: UnitInterval = 0.0
 
 
 class AtmosphereModel(SkyModel):
-    """Clear or hazy air at any hour, spectral and with multiple scattering (`sky.clear_sky`)."""
+    """Clear or hazy atmosphere at any solar elevation, spectral with multiple scattering (`sky.clear_sky`).
+
+    Parameters
+    ----------
+    kind
+        ``atmosphere``.
+    aerosol, ozone
+        See `Aerosol` and `Ozone`.
+    """
 
     kind: Literal["atmosphere"] = "atmosphere"
     aerosol: Aerosol
@@ -102,7 +136,17 @@ class AtmosphereModel(SkyModel):
 
 
 class OvercastModel(SkyModel):
-    """A closed layer of cloud at any hour (`sky.overcast`)."""
+    """Closed cloud layer at any solar elevation (`sky.overcast`).
+
+    Parameters
+    ----------
+    kind
+        ``overcast``.
+    distribution
+        CIE standard overcast or CIE intermediate luminance distribution.
+    visibility_km
+        Meteorological range below the layer [km].
+    """
 
     kind: Literal["overcast"] = "overcast"
     distribution: Literal["standard", "intermediate"] = "standard"
@@ -110,7 +154,15 @@ class OvercastModel(SkyModel):
 
 
 class HosekModel(SkyModel):
-    """The Hosek-Wilkie sky, evaluated by the renderer (`rendering.hosek`)."""
+    """Hosek-Wilkie sky, evaluated by the renderer (`rendering.hosek`).
+
+    Parameters
+    ----------
+    kind
+        ``hosek``.
+    turbidity
+        Turbidity of the atmosphere.
+    """
 
     kind: Literal["hosek"] = "hosek"
     turbidity: float = Field(ge=1.0, le=10.0)
@@ -120,12 +172,22 @@ KINDS: dict[str, type[SkyModel]] = {"atmosphere": AtmosphereModel, "overcast": O
 
 
 def read_sky_model(name_or_path: str | Path) -> SkyModel:
-    """A bundled sky model by its name (``clear``), or one from a TOML file.
+    """Read a sky model from a TOML file or from the bundled files.
+
+    Parameters
+    ----------
+    name_or_path
+        Name of a bundled model, such as ``clear``, or path of a TOML file.
+
+    Returns
+    -------
+    SkyModel
+        Validated model of the class in `KINDS`.
 
     Raises
     ------
     InputError
-        One line: no such model, or what is wrong in the file.
+        If there is no such model, or the file is invalid.
     """
     path = Path(name_or_path)
     if path.suffix != ".toml" and not path.is_file():
@@ -151,23 +213,31 @@ def with_overrides(
     ozone_du: float | None = None,
     cloudiness: float | None = None,
 ) -> SkyModel:
-    """The model with the flags of the command line applied.
+    """Apply overrides, such as those of the command line, to a sky model.
 
     Parameters
     ----------
+    model
+        Sky model.
     turbidity
         ``(τ_gas + τ_haze) / τ_gas`` at sea level and 550 nm (Preetham et al. 1999).
     visibility_km
-        Meteorological range at the height of the model's ground, 2 % contrast at 550 nm [km].
+        Meteorological range at the height of the model's ground, for a contrast of 2 % at 550 nm [km].
     ozone_du
         Ozone column [DU].
     cloudiness
-        Share of the sky covered, in [0, 1].
+        Cloud fraction in [0, 1].
+
+    Returns
+    -------
+    SkyModel
+        Copy of the model with the overrides applied.
 
     Raises
     ------
     InputError
-        For a value outside the model's range, a parameter it does not know, or two that set the same thing.
+        If a value is outside the model's valid range, the model does not support an override, or both turbidity and
+        visibility are given.
     """
     given = {"turbidity": turbidity, "visibility_km": visibility_km, "ozone_du": ozone_du}
     for parameter, value in given.items():
@@ -181,12 +251,12 @@ def with_overrides(
         if isinstance(model, OvercastModel):
             raise InputError(
                 "--cloudiness",
-                f"sky model '{model.name}' is a closed layer already",
+                f"sky model '{model.name}' is a closed cloud layer already",
                 cure="choose a clear model, such as --sky clear",
             )
         model = model.model_copy(update={"cloudiness": float(cloudiness)})
     if isinstance(model, AtmosphereModel):
-        return _hazed(model, turbidity, visibility_km, ozone_du)
+        return _with_aerosol_and_ozone(model, turbidity, visibility_km, ozone_du)
     if isinstance(model, OvercastModel) and visibility_km is not None:
         return model.model_copy(update={"visibility_km": float(visibility_km)})
     if isinstance(model, HosekModel) and turbidity is not None:
@@ -195,13 +265,28 @@ def with_overrides(
 
 
 def check_valid(model: SkyModel, sun_elevation_deg: float, height_m: float) -> None:
-    """`InputError`, one line, where the sun or the observer is outside the model's range."""
+    """Check that sun and observer are within the valid range of a sky model.
+
+    Parameters
+    ----------
+    model
+        Sky model.
+    sun_elevation_deg
+        Apparent solar elevation [deg].
+    height_m
+        Height of the observer [m].
+
+    Raises
+    ------
+    InputError
+        If the sun or the observer is outside the model's range.
+    """
     low, high = model.valid.sun_elevation_deg
     if not low <= sun_elevation_deg <= high:
         cure = "choose an atmosphere model, such as --sky clear" if isinstance(model, HosekModel) else None
         raise InputError(
             f"sky model '{model.name}'",
-            f"the sun stands at {sun_elevation_deg:.2f}°",
+            f"the solar elevation is {sun_elevation_deg:.2f}°",
             expected=f"{low:g}° to {high:g}°",
             cure=cure,
         )
@@ -213,7 +298,18 @@ def check_valid(model: SkyModel, sun_elevation_deg: float, height_m: float) -> N
 
 
 def atmosphere_of(model: AtmosphereModel) -> Atmosphere:
-    """The air that an atmosphere model declares."""
+    """Convert an atmosphere model to the parameters of the radiative-transfer model.
+
+    Parameters
+    ----------
+    model
+        Atmosphere model.
+
+    Returns
+    -------
+    Atmosphere
+        Parameters of the atmosphere.
+    """
     return Atmosphere(
         aerosol_optical_depth_500nm=model.aerosol.optical_depth_500nm,
         angstrom_exponent=model.aerosol.angstrom_exponent,
@@ -227,7 +323,18 @@ def atmosphere_of(model: AtmosphereModel) -> Atmosphere:
 
 
 def visibility_km(model: SkyModel) -> float | None:
-    """Meteorological range at the model's ground [km]; ``None`` for a model without air."""
+    """Compute the meteorological range at the model's ground.
+
+    Parameters
+    ----------
+    model
+        Sky model.
+
+    Returns
+    -------
+    float or None
+        Meteorological range [km]; ``None`` for a model without aerial perspective.
+    """
     if isinstance(model, AtmosphereModel):
         return visibility_from_atmosphere(atmosphere_of(model), model.ground.height_m) / 1000.0
     return model.visibility_km if isinstance(model, OvercastModel) else None
@@ -236,7 +343,7 @@ def visibility_km(model: SkyModel) -> float | None:
 def _check_override(model: SkyModel, parameter: str, value: float) -> None:
     flag, interval = "--" + parameter.replace("_", "-"), getattr(model.valid, parameter)
     if interval is None:
-        raise InputError(flag, f"sky model '{model.name}' does not know it")
+        raise InputError(flag, f"sky model '{model.name}' does not support it")
     low, high = interval
     if not low <= value <= high:
         raise InputError(
@@ -244,7 +351,7 @@ def _check_override(model: SkyModel, parameter: str, value: float) -> None:
         )
 
 
-def _hazed(
+def _with_aerosol_and_ozone(
     model: AtmosphereModel, turbidity: float | None, visibility: float | None, ozone_du: float | None
 ) -> AtmosphereModel:
     aerosol, ozone = model.aerosol, model.ozone

@@ -1,16 +1,17 @@
-"""The lights of the night: the moon as a source above the air, and the floor of airglow, zodiacal light and stars.
+"""Light sources of the night: irradiance of the moon, and background radiance of airglow, zodiacal light and stars.
 
-The moon goes through the same atmosphere as the sun: `moon_to_sun_ratio` says by how much its spectral irradiance
-differs from the sun's, and everything an atmosphere computes for sunlight from the moon's direction scales by it.
-An eclipse of the moon is not modelled.
+Moonlight is computed by the same atmosphere model as sunlight: `moon_to_sun_ratio` is the ratio of the moon's
+extraterrestrial spectral irradiance to the sun's, by which results for sunlight from the moon's direction are scaled.
+Lunar eclipses are not modelled.
 
-Single stars are left out: no dependency ships a star catalogue (skyfield reads Hipparcos over the network only).
-Their light is part of the floor.
+Individual stars are not modelled either, because no dependency includes a star catalogue (skyfield downloads Hipparcos);
+their mean radiance is part of the background.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from seasonscapes.frames import equirectangular_directions
 from seasonscapes.sky.ephemeris import LunarPosition
@@ -21,12 +22,12 @@ from seasonscapes.sky.illumination import diffuse_horizontal_illuminance
 SUN_MAGNITUDE_V, FULL_MOON_MAGNITUDE_V = -26.76, -12.73
 _MEAN_MOON_DISTANCE_KM = 384_400.0
 
-# Opposition surge: 35 % at full moon (Krisciunas & Schaefer 1991), decaying with the width that the ROLO model
-# finds for it at every wavelength (Kieffer & Stone 2005, table 5: p1 = 4.06°).
+# Opposition surge: 35 % at full moon (Krisciunas & Schaefer 1991), decaying with the wavelength-independent width of
+# the ROLO model (Kieffer & Stone 2005, table 5: p1 = 4.06°).
 _SURGE, _SURGE_WIDTH_DEG = 0.35, 4.06
 
-# The moon's spectral slope: (B - V) = 0.92 against the sun's 0.65 makes its reflectance at 440 nm 0.78 of that at
-# 550 nm (Allen § 66); highland and mare spectra are straight lines over the visible range.
+# Spectral slope of lunar reflectance: (B - V) = 0.92, compared with the sun's 0.65, gives a reflectance at 440 nm of
+# 0.78 of that at 550 nm (Allen § 66); highland and mare spectra are linear over the visible range.
 _MOON_SLOPE = 1.1
 
 # Luminance of 1 S10, a tenth-magnitude (V) star spread over a square degree: 27.78 mag/arcsec². 10.8e4 cd/m² is the
@@ -34,30 +35,40 @@ _MOON_SLOPE = 1.1
 CANDELA_OF_ZERO_MAGNITUDE = 10.8e4
 S10_CD_M2 = CANDELA_OF_ZERO_MAGNITUDE * 10.0 ** (-0.4 * 27.78)
 
-# Above the lower air, at the zenith, at a middle phase of the solar cycle (Roach & Gordon 1973; Benn & Ellison 1998;
-# Leinert et al. 1998): airglow 145 S10, zodiacal light 95 S10, stars and Milky Way on average over the sky 105 S10.
-# Through the air that is the 21.6 mag/arcsec² which Garstang (1989) and Cinzano et al. (2001) take for a natural sky.
+# Zenith luminances above the lower atmosphere at a middle phase of the solar cycle (Roach & Gordon 1973; Benn & Ellison 1998;
+# Leinert et al. 1998): airglow 145 S10, zodiacal light 95 S10, mean of stars and Milky Way 105 S10.
+# After extinction this gives the 21.6 mag/arcsec² of a natural sky of Garstang (1989) and Cinzano et al. (2001).
 AIRGLOW_CD_M2, ZODIACAL_CD_M2, STARLIGHT_CD_M2 = 145.0 * S10_CD_M2, 95.0 * S10_CD_M2, 105.0 * S10_CD_M2
 
 # Linear Rec.709 at luminance 1. Airglow: O I 557.7 nm 250 R, Na 589.3 nm 60 R, O I 630 nm 100 R and a flat continuum
-# of 0.3 R/Å (Roach & Gordon 1973, ch. 3), which together also make the 145 S10 above. Zodiacal light: a Planckian of
-# 5600 K, a sun slightly reddened (Leinert et al. 1998, § 8.4). Starlight: 4900 K, that is B - V = 0.8.
+# of 0.3 R/Å (Roach & Gordon 1973, ch. 3), whose sum agrees with the 145 S10 above. Zodiacal light: a Planckian of
+# 5600 K, a slightly reddened solar spectrum (Leinert et al. 1998, § 8.4). Starlight: 4900 K, that is B - V = 0.8.
 AIRGLOW_RGB = np.array([1.05602, 1.03358, 0.50235])
 ZODIACAL_RGB = np.array([1.13231, 0.97270, 0.88077])
 STARLIGHT_RGB = np.array([1.22929, 0.95798, 0.74095])
 
 _AIRGLOW_HEIGHT_KM, _EARTH_RADIUS_KM = 90.0, 6371.0
-# A wide source loses less in the air than a star does, since neighbouring directions scatter light back into each
-# other. Leinert et al. (1998, § 5.2) find an effective optical depth of 0.5 to 0.75 of the true one.
-_DIFFUSE_SHARE = 0.6
+# Extinction of an extended source is less than that of a star, since light is scattered into the line of sight from
+# neighbouring directions. Leinert et al. (1998, § 5.2) find an effective optical depth of 0.5 to 0.75 of the true one.
+_EXTENDED_SOURCE_FACTOR = 0.6
 
 
 def moon_magnitude(moon: LunarPosition) -> float:
-    """Apparent V magnitude of the moon above the atmosphere.
+    """Compute the apparent V magnitude of the moon above the atmosphere.
 
     ``V = -12.73 + 0.026 |α| + 4e-9 α⁴`` with the phase angle α [deg] (Allen; Krisciunas & Schaefer 1991, eq. 9),
-    the opposition surge, and the distances moon-observer and moon-sun. Between 2° and 90° the curve is within 0.03 mag
-    of the ROLO model's (Kieffer & Stone 2005), and as bright as it within 7 %.
+    corrected for the opposition surge and for the distances moon-observer and moon-sun. Between 2° and 90° the phase
+    curve is within 0.03 mag of the ROLO model's (Kieffer & Stone 2005), and the brightness within 7 %.
+
+    Parameters
+    ----------
+    moon
+        Position and phase.
+
+    Returns
+    -------
+    float
+        Apparent V magnitude; an array ``(T,)`` for many instants.
     """
     phase = np.abs(moon.phase_angle_deg)
     surge = 1.0 + _SURGE * np.exp(-phase / _SURGE_WIDTH_DEG)
@@ -65,30 +76,58 @@ def moon_magnitude(moon: LunarPosition) -> float:
     return FULL_MOON_MAGNITUDE_V + 0.026 * phase + 4e-9 * phase**4 - 2.5 * np.log10(surge) + 5.0 * np.log10(distances)
 
 
-def moon_to_sun_ratio(moon: LunarPosition, wavelength_nm) -> np.ndarray:
-    """Spectral irradiance of the moon over that of the sun at 1 au, both above the atmosphere, ``(B,)``.
+def moon_to_sun_ratio(moon: LunarPosition, wavelength_nm: ArrayLike) -> np.ndarray:
+    """Compute the extraterrestrial spectral irradiance of the moon over that of the sun at 1 au.
 
-    Multiply anything that holds for sunlight of 1 au from the moon's direction by it. The phase angle's own slight
-    reddening is left out (under 5 %).
+    Reddening with phase angle is neglected (under 5 %).
 
     Parameters
     ----------
+    moon
+        Position and phase.
     wavelength_nm
-        ``(B,)`` [nm], 360 to 830.
+        Wavelength ``(B,)`` [nm], 360 to 830.
+
+    Returns
+    -------
+    ndarray
+        Ratio ``(B,)``.
     """
     wavelength = np.asarray(wavelength_nm, float)
     visual = 10.0 ** (-0.4 * (moon_magnitude(moon) - SUN_MAGNITUDE_V))
     return visual * (1.0 + _MOON_SLOPE * (wavelength / 550.0 - 1.0))
 
 
-def van_rhijn(elevation_deg) -> np.ndarray:
-    """Brightening of a thin glowing layer at 90 km towards the horizon, 1 at the zenith (van Rhijn 1921)."""
-    share = _EARTH_RADIUS_KM / (_EARTH_RADIUS_KM + _AIRGLOW_HEIGHT_KM)
-    return 1.0 / np.sqrt(1.0 - (share * np.cos(np.radians(elevation_deg))) ** 2)
+def van_rhijn(elevation_deg: ArrayLike) -> np.ndarray:
+    """Compute the radiance of a thin emitting layer at 90 km relative to the zenith (van Rhijn 1921).
+
+    Parameters
+    ----------
+    elevation_deg
+        Elevation ``(...)`` [deg].
+
+    Returns
+    -------
+    ndarray
+        Relative radiance ``(...)``, 1 at the zenith.
+    """
+    radius_ratio = _EARTH_RADIUS_KM / (_EARTH_RADIUS_KM + _AIRGLOW_HEIGHT_KM)
+    return 1.0 / np.sqrt(1.0 - (radius_ratio * np.cos(np.radians(elevation_deg))) ** 2)
 
 
-def air_mass(elevation_deg) -> np.ndarray:
-    """Relative air mass (Kasten & Young 1989); held at its horizon value of 38 below 0°."""
+def air_mass(elevation_deg: ArrayLike) -> np.ndarray:
+    """Compute the relative air mass (Kasten & Young 1989).
+
+    Parameters
+    ----------
+    elevation_deg
+        Apparent elevation ``(...)`` [deg].
+
+    Returns
+    -------
+    ndarray
+        Relative air mass ``(...)``, 1 at the zenith; below 0° the value of 38 at the horizon.
+    """
     elevation = np.maximum(np.asarray(elevation_deg, float), 0.0)
     return 1.0 / (np.sin(np.radians(elevation)) + 0.50572 * (elevation + 6.07995) ** -1.6364)
 
@@ -96,28 +135,33 @@ def air_mass(elevation_deg) -> np.ndarray:
 def night_sky_radiance(
     height: int, width: int, *, height_m: float = 0.0, optical_depth: float = 0.19, ground_albedo: float = 0.2
 ) -> np.ndarray:
-    """Radiance of the moonless night sky far from any lamp, ``(height, width, 3)`` [cd/m²], as in `Illumination`.
+    """Compute the radiance map of the moonless night sky without artificial light.
 
-    About 21.6 mag/arcsec² at the zenith and 0.95 mlx on the ground. It varies by a factor of two in nature, with
-    season, solar activity and the Milky Way's place; here it is the same at every azimuth.
+    About 21.6 mag/arcsec² at the zenith and 0.95 mlx on the ground. The natural variation with season, solar activity
+    and the position of the Milky Way is a factor of two; here the radiance does not depend on azimuth.
 
     Parameters
     ----------
     height, width
-        Size of the equirectangular map.
+        Rows and columns of the equirectangular map.
     height_m
-        Of the observer; thins the air above [m].
+        Height of the observer, which reduces the optical depth of the air above [m].
     optical_depth
         Vertical optical depth at sea level in V, scattering and absorption.
     ground_albedo
-        Rows below the horizon hold a Lambertian ground lit by the rows above.
+        Albedo of the Lambertian ground in the rows below the horizon, which is illuminated by the rows above.
+
+    Returns
+    -------
+    ndarray
+        Radiance ``(height, width, 3)`` [cd/m²], in the layout of `Illumination`.
     """
     up = equirectangular_directions(height, width)[:, 0, 2]
     elevation_deg = np.degrees(np.arcsin(np.clip(up, -1.0, 1.0)))
-    depth = _DIFFUSE_SHARE * optical_depth * np.exp(-height_m / 8000.0)
-    glow = van_rhijn(elevation_deg)[:, None] * AIRGLOW_CD_M2 * AIRGLOW_RGB
-    beyond = ZODIACAL_CD_M2 * ZODIACAL_RGB + STARLIGHT_CD_M2 * STARLIGHT_RGB
-    rows = (glow + beyond) * np.exp(-depth * air_mass(elevation_deg))[:, None]
+    depth = _EXTENDED_SOURCE_FACTOR * optical_depth * np.exp(-height_m / 8000.0)
+    airglow = van_rhijn(elevation_deg)[:, None] * AIRGLOW_CD_M2 * AIRGLOW_RGB
+    extraterrestrial = ZODIACAL_CD_M2 * ZODIACAL_RGB + STARLIGHT_CD_M2 * STARLIGHT_RGB
+    rows = (airglow + extraterrestrial) * np.exp(-depth * air_mass(elevation_deg))[:, None]
     rows[up <= 0.0] = 0.0
     sky = np.broadcast_to(rows[:, None, :], (height, width, 3)).copy()
     sky[up <= 0.0] = ground_albedo / np.pi * diffuse_horizontal_illuminance(sky)

@@ -1,8 +1,8 @@
-"""What one observer sees of the sky: scattered light along whole rays, under any luminary.
+"""Sky radiance for one observer: scattered light along whole rays, for any luminary.
 
-For each ray three sums are kept apart, light scattered once by gas, once by aerosol, and everything else. Without their
-phase functions the first two are smooth in azimuth (Bruneton & Neyret 2008, § 4), so few azimuths do, and the aureole
-is as sharp as its phase function wherever it is looked up.
+Three components are tabulated separately for each ray: light scattered once by gas, once by aerosol, and all other
+light. Divided by their phase functions the first two are smooth in azimuth (Bruneton & Neyret 2008, § 4). A few azimuths
+are therefore sufficient, and the phase functions are evaluated at the exact scattering angle of each direction.
 """
 
 from __future__ import annotations
@@ -14,41 +14,43 @@ from functools import lru_cache
 import numpy as np
 
 from seasonscapes.frames import angles_from_direction, direction_from_angles
-from seasonscapes.sky.along_rays import AZIMUTHS, AZIMUTHS_RAD, diffuse_along, ground_along, parts_along
+from seasonscapes.sky.along_rays import AZIMUTHS, AZIMUTHS_RAD, diffuse_along, ground_along, radiance_components
 from seasonscapes.sky.atmosphere import TOP_HEIGHT_M, Atmosphere, delta_scaled, gas_phase, optics
 from seasonscapes.sky.aureole import spread_aerosol_phase
-from seasonscapes.sky.curved_rays import equal_cells, horizon_elevation_rad, resampled, trace_curved_rays
-from seasonscapes.sky.elevation_table import at_elevation, by_elevation
+from seasonscapes.sky.curved_rays import cell_edges_m, horizon_elevation_rad, resample_rays, trace_curved_rays
+from seasonscapes.sky.elevation_table import interpolate_at_elevation, tabulate_by_elevation
 from seasonscapes.sky.ray_cells import CellSamples, cell_columns, sample_cells
 from seasonscapes.sky.scattering import AtmosphereTables
 from seasonscapes.sky.sh_moments import HARMONIC_ORDER
 from seasonscapes.sky.spectrum import WAVELENGTHS_NM, rgb_from_transfer
 
-_ABOVE, _BELOW, _AZIMUTHS_OUT, _CELLS = 44, 20, 49, 36
-_SPACING_ABOVE, _SPACING_BELOW = 2.5, 3.0
-# Aerial perspective is tabulated up to these distances, and down to this far below the model's ground.
+_ROWS_ABOVE, _ROWS_BELOW, _TABLE_AZIMUTHS, _CELLS = 44, 20, 49, 36
+# Exponents of the row spacing in elevation above and below the horizon.
+_EXPONENT_ABOVE, _EXPONENT_BELOW = 2.5, 3.0
+# Aerial perspective is tabulated at these distances, and down to this depth below the model's ground.
 DISTANCE_EDGES_M = np.concatenate([400e3 * np.linspace(0.0, 1.0, 41) ** 3, [520e3, 700e3, 950e3, 1300e3]])
-_CELLAR_M = 2000.0
+_DEPTH_BELOW_GROUND_M = 2000.0
 
 
 @dataclass(frozen=True)
 class ObserverView:
-    """The rays of an observer at one height, which do not know the time.
+    """Rays of an observer at one height, independent of the luminary.
 
     Parameters
     ----------
     height_m
-        Of the observer, at least a metre above the model's ground [m].
+        Height of the observer, at least one metre above the model's ground [m].
     horizon_rad
-        Apparent elevation of the ground's horizon.
+        Apparent elevation of the ground's horizon [rad].
     elevation_rad
-        ``(K,)``: from the nadir up to just below the horizon, then from just above it to the zenith.
+        Apparent elevations of the rays ``(K,)`` [rad]: from the nadir to just below the horizon, then from just above
+        it to the zenith.
     sky
         Cells along whole rays.
     near
-        Cells between fixed distances, for aerial perspective.
+        Cells between the distances `DISTANCE_EDGES_M`, for aerial perspective.
     near_depth
-        Optical depth ``(K, M, B)`` up to those distances, without any scaling.
+        Unscaled optical depth up to these distances ``(K, M, B)``.
     """
 
     height_m: float
@@ -61,59 +63,73 @@ class ObserverView:
 
 @dataclass(frozen=True)
 class ScatteredRadiance:
-    """Light of one luminary scattered towards an observer, ready to be looked up in any direction.
+    """Table of the radiance of one luminary scattered towards an observer; evaluate it with `sky_radiance`.
 
     Parameters
     ----------
     luminary_direction
-        Apparent unit vector towards the source ``(3,)``.
+        Apparent unit vector towards the luminary ``(3,)``.
     aerosol_depth
-        Vertical scattering depth of the aerosol for red, green and blue ``(3,)``.
+        Vertical aerosol scattering depth for red, green and blue ``(3,)``.
     asymmetry
-        Of the aerosol.
+        Mean cosine of aerosol scattering.
     horizon_rad
         As in `ObserverView`.
-    parts
-        ``(K, A, 10)``: by elevation and azimuth from the source, what gas and aerosol scatter once, over their phase
-        functions, and all else, as photometric RGB [cd/m²]; and the mean column of aerosol on the light's way.
+    components
+        ``(K, A, 10)`` by elevation and by azimuth from the luminary, as in `along_rays.radiance_components`:
+        photometric RGB scattered once by gas and once by aerosol, divided by their phase functions [cd/m² sr]; RGB of
+        all other light [cd/m²]; and the mean aerosol column along the light path.
     """
 
     luminary_direction: np.ndarray
     aerosol_depth: np.ndarray
     asymmetry: float
     horizon_rad: float
-    parts: np.ndarray
+    components: np.ndarray
 
 
 @lru_cache(maxsize=8)
-def _view(atmosphere, height_m: float) -> ObserverView:
+def _view(atmosphere: Atmosphere, height_m: float) -> ObserverView:
     horizon = float(horizon_elevation_rad(atmosphere, height_m))
-    up = np.linspace(0.0, 1.0, _ABOVE) ** _SPACING_ABOVE
-    down = np.linspace(1.0, 0.0, _BELOW) ** _SPACING_BELOW
+    up = np.linspace(0.0, 1.0, _ROWS_ABOVE) ** _EXPONENT_ABOVE
+    down = np.linspace(1.0, 0.0, _ROWS_BELOW) ** _EXPONENT_BELOW
     gap = 1e-5
     below, above = horizon - gap - (np.pi / 2 + horizon - gap) * down, horizon + gap + (np.pi / 2 - horizon - gap) * up
     elevation = np.concatenate([below, above])
-    paths = trace_curved_rays(atmosphere, height_m, elevation)
-    plain = optics(atmosphere)
-    scaled = delta_scaled(plain, HARMONIC_ORDER)
-    sky = sample_cells(atmosphere, scaled, paths, equal_cells(atmosphere, paths, _CELLS))
-    # A mountain may stand a little below the model's ground, as it does where that is a mean of hills and valleys.
-    deeper = trace_curved_rays(atmosphere, height_m, elevation, floor_m=atmosphere.ground_height_m - _CELLAR_M)
+    rays = trace_curved_rays(atmosphere, height_m, elevation)
+    unscaled = optics(atmosphere)
+    scaled = delta_scaled(unscaled, HARMONIC_ORDER)
+    sky = sample_cells(atmosphere, scaled, rays, cell_edges_m(atmosphere, rays, _CELLS))
+    # Terrain may lie below the model's ground, which is a mean of hills and valleys.
+    floor_m = atmosphere.ground_height_m - _DEPTH_BELOW_GROUND_M
+    deeper = trace_curved_rays(atmosphere, height_m, elevation, floor_m=floor_m)
     edges = np.minimum(DISTANCE_EDGES_M, deeper.distance_m[:, -1:])
     near = sample_cells(atmosphere, scaled, deeper, edges)
-    middles = resampled(deeper, 0.5 * (edges[:, 1:] + edges[:, :-1]))
-    depth = np.einsum("cks,cb->ksb", cell_columns(atmosphere, near.paths, middles), plain.extinction)
+    midpoints = resample_rays(deeper, 0.5 * (edges[:, 1:] + edges[:, :-1]))
+    depth = np.einsum("cks,cb->ksb", cell_columns(atmosphere, near.edges, midpoints), unscaled.extinction)
     depth = np.concatenate([np.zeros_like(depth[:, :1]), np.cumsum(depth, axis=1)], axis=1)
     return ObserverView(height_m, horizon, elevation, sky, near, depth)
 
 
 def observer_view(tables: AtmosphereTables, height_m: float) -> ObserverView:
-    """The rays of an observer at a height [m]; kept for the next call.
+    """Return the rays of an observer; the results of the last calls are cached.
+
+    Parameters
+    ----------
+    tables
+        Tables of the atmosphere.
+    height_m
+        Height of the observer [m]; raised to one metre above the model's ground.
+
+    Returns
+    -------
+    ObserverView
+        Rays of the observer.
 
     Raises
     ------
     ValueError
-        Above the top of the air.
+        If the observer is not below the top of the atmosphere.
     """
     if not height_m < TOP_HEIGHT_M:
         raise ValueError(f"observer_height_m: got {height_m}, expected less than {TOP_HEIGHT_M:g}")
@@ -127,41 +143,62 @@ def observed_sky(
     true_elevation_rad: float,
     irradiance: np.ndarray,
 ) -> ScatteredRadiance:
-    """Sky of a luminary for an observer.
+    """Tabulate the sky radiance of one luminary for an observer.
 
     Parameters
     ----------
+    tables
+        Tables of the atmosphere.
+    view
+        Rays of the observer.
     luminary_direction
-        Apparent unit vector ``(3,)`` towards it.
+        Apparent unit vector towards the luminary ``(3,)``.
     true_elevation_rad
-        Its elevation without refraction.
+        True (unrefracted) elevation of the luminary [rad].
     irradiance
-        Spectral irradiance above the air over that of the sun at 1 au ``(B,)``.
+        Extraterrestrial spectral irradiance over that of the sun at 1 au ``(B,)``.
+
+    Returns
+    -------
+    ScatteredRadiance
+        Table for `sky_radiance`.
     """
-    colours = rgb_from_transfer() * irradiance
-    parts = parts_along(
-        tables, view.sky, true_elevation_rad, colours, diffuse_at_observer(tables, view, true_elevation_rad)
-    )
-    parts = parts[:, :, 0]
-    parts[:, :, 6:9] += (ground_along(tables, view.sky, true_elevation_rad) @ colours.T).astype(np.float32)
+    rgb_matrix = rgb_from_transfer() * irradiance
+    diffuse = diffuse_at_observer(tables, view, true_elevation_rad)
+    components = radiance_components(tables, view.sky, true_elevation_rad, rgb_matrix, diffuse)[:, :, 0]
+    components[:, :, 6:9] += (ground_along(tables, view.sky, true_elevation_rad) @ rgb_matrix.T).astype(np.float32)
     return ScatteredRadiance(
         np.asarray(luminary_direction, float),
         _rgb_aerosol_depth(tables.atmosphere),
         tables.atmosphere.asymmetry,
         view.horizon_rad,
-        azimuths_filled(parts),
+        interpolate_azimuths(components),
     )
 
 
 def diffuse_at_observer(
     tables: AtmosphereTables, view: ObserverView, true_elevation_rad: float, *, near: bool = False
 ) -> np.ndarray:
-    """Transfers of diffuse light along whole rays ``(K, A, 1, B)``, or up to each of the fixed distances but the first.
+    """Compute diffuse light along the rays of an observer, or interpolate it if the tables have ``diffuse_of``.
 
-    They are worked out for this sun, or looked up where the tables came with diffuse light by the sun's elevation.
+    Parameters
+    ----------
+    tables
+        Tables of the atmosphere.
+    view
+        Rays of the observer.
+    true_elevation_rad
+        True elevation of the luminary [rad].
+    near
+        Integrate up to each of the distances `DISTANCE_EDGES_M` after the first, in place of whole rays.
+
+    Returns
+    -------
+    ndarray
+        Transfers ``(K, A, M or 1, B)`` [1/sr].
     """
     if tables.diffuse_of is not None:
-        return at_elevation(tables.diffuse_of(view.height_m, near), true_elevation_rad)
+        return interpolate_at_elevation(tables.diffuse_of(view.height_m, near), true_elevation_rad)
     samples = view.near if near else view.sky
     return diffuse_along(tables, samples, view.elevation_rad, np.array([true_elevation_rad]), cumulative=near)[0]
 
@@ -169,88 +206,207 @@ def diffuse_at_observer(
 def diffuse_by_elevation(
     tables: AtmosphereTables, height_m: float, near: bool, *, progress: Callable[[float], None] | None = None
 ) -> np.ndarray:
-    """`diffuse_at_observer` of every sun, as a table of `elevation_table`; some seconds."""
+    """Tabulate `diffuse_at_observer` by solar elevation; takes some seconds.
+
+    Parameters
+    ----------
+    tables
+        Tables of the atmosphere.
+    height_m
+        Height of the observer [m].
+    near
+        As in `diffuse_at_observer`.
+    progress
+        Called with the completed fraction.
+
+    Returns
+    -------
+    ndarray
+        Table of `elevation_table.tabulate_by_elevation`.
+    """
     view = observer_view(tables, height_m)
     samples = view.near if near else view.sky
-    return by_elevation(
+    return tabulate_by_elevation(
         lambda suns: diffuse_along(tables, samples, view.elevation_rad, suns, cumulative=near), progress=progress
     )
 
 
 def sky_radiance(light: ScatteredRadiance, direction: np.ndarray) -> np.ndarray:
-    """Radiance ``(..., 3)`` [cd/m²] of the sky, or of the ground through the air, in directions ``(..., 3)``."""
+    """Evaluate the radiance of the sky, or of the ground through the air, without the luminary's disc.
+
+    Parameters
+    ----------
+    light
+        Table of `observed_sky`.
+    direction
+        Unit vectors ``(..., 3)``.
+
+    Returns
+    -------
+    ndarray
+        Radiance ``(..., 3)`` [cd/m²].
+    """
     azimuth_deg, elevation_deg = angles_from_direction(direction)
-    row, column = row_of(np.radians(elevation_deg), light.horizon_rad), column_of(azimuth_deg, light.luminary_direction)
-    places = tuple((index.ravel(), share.ravel()) for index, share in (row, column))
-    parts = interpolated(light.parts, places).reshape(*direction.shape[:-1], light.parts.shape[-1])
-    return with_phases(light, parts, direction @ light.luminary_direction)
+    row = elevation_index(np.radians(elevation_deg), light.horizon_rad)
+    column = azimuth_index(azimuth_deg, light.luminary_direction)
+    coordinates = tuple((index.ravel(), fraction.ravel()) for index, fraction in (row, column))
+    components = interpolate_multilinear(light.components, coordinates)
+    components = components.reshape(*direction.shape[:-1], light.components.shape[-1])
+    return apply_phase_functions(light, components, direction @ light.luminary_direction)
 
 
 def sky_radiance_grid(light: ScatteredRadiance, elevation_deg: np.ndarray, azimuth_deg: np.ndarray) -> np.ndarray:
-    """`sky_radiance` ``(R, C, 3)`` of R elevations crossed with C azimuths [deg]: each axis is interpolated once."""
-    row, fr = row_of(np.radians(elevation_deg), light.horizon_rad)
-    column, fa = column_of(azimuth_deg, light.luminary_direction)
+    """Evaluate `sky_radiance` on a grid of elevations and azimuths, interpolating each axis once.
+
+    Parameters
+    ----------
+    light
+        Table of `observed_sky`.
+    elevation_deg
+        Elevations ``(R,)`` [deg].
+    azimuth_deg
+        Azimuths clockwise from north ``(C,)`` [deg].
+
+    Returns
+    -------
+    ndarray
+        Radiance ``(R, C, 3)`` [cd/m²].
+    """
+    row, fr = elevation_index(np.radians(elevation_deg), light.horizon_rad)
+    column, fa = azimuth_index(azimuth_deg, light.luminary_direction)
     fr, fa = fr[:, None, None].astype(np.float32), fa[:, None].astype(np.float32)
-    rows = light.parts[row] * (1.0 - fr) + light.parts[row + 1] * fr
-    parts = rows[:, column] * (1.0 - fa) + rows[:, column + 1] * fa
+    rows = light.components[row] * (1.0 - fr) + light.components[row + 1] * fr
+    components = rows[:, column] * (1.0 - fa) + rows[:, column + 1] * fa
     direction = direction_from_angles(azimuth_deg[None, :], elevation_deg[:, None])
-    return with_phases(light, parts, direction @ light.luminary_direction)
+    return apply_phase_functions(light, components, direction @ light.luminary_direction)
 
 
-def interpolated(table: np.ndarray, places: tuple[tuple[np.ndarray, np.ndarray], ...]) -> np.ndarray:
-    """Multilinear interpolation ``(N, ...)`` in a table's first axes, at pairs of index ``(N,)`` and share ``(N,)``."""
-    axes = len(places)
+def interpolate_multilinear(table: np.ndarray, coordinates: tuple[tuple[np.ndarray, np.ndarray], ...]) -> np.ndarray:
+    """Interpolate a table multilinearly in its leading axes.
+
+    Parameters
+    ----------
+    table
+        Values with one leading axis for each pair of ``coordinates``.
+    coordinates
+        Index ``(N,)`` and fraction towards the next index ``(N,)`` for each interpolated axis.
+
+    Returns
+    -------
+    ndarray
+        Interpolated values ``(N, ...)``, float32.
+    """
+    axes = len(coordinates)
     rows = table.reshape(int(np.prod(table.shape[:axes])), -1)
     strides = np.cumprod((1, *table.shape[axes - 1 : 0 : -1]))[::-1]
-    base = sum(index * stride for (index, _), stride in zip(places, strides, strict=True))
+    base = np.asarray(sum(index * stride for (index, _), stride in zip(coordinates, strides, strict=True)))
     out = np.zeros((len(base), rows.shape[1]), np.float32)
     for corner in np.ndindex(*(2,) * axes):
-        weight = np.prod([share if up else 1.0 - share for up, (_, share) in zip(corner, places, strict=True)], axis=0)
+        factors = [
+            fraction if upper else 1.0 - fraction for upper, (_, fraction) in zip(corner, coordinates, strict=True)
+        ]
+        weight = np.prod(factors, axis=0)
         out += np.take(rows, base + int(np.dot(corner, strides)), axis=0) * weight.astype(np.float32)[:, None]
     return out.reshape(len(base), *table.shape[axes:])
 
 
-def with_phases(light: ScatteredRadiance, parts: np.ndarray, cosine: np.ndarray) -> np.ndarray:
-    """Radiance ``(..., 3)`` [cd/m²] of parts ``(..., 10)`` at angles ``(...)`` from the source, given by their cosines."""
+def apply_phase_functions(light: ScatteredRadiance, components: np.ndarray, cosine: np.ndarray) -> np.ndarray:
+    """Sum interpolated components to radiance, with single scattering multiplied by its phase functions.
+
+    Parameters
+    ----------
+    light
+        Table of the components.
+    components
+        Interpolated components ``(..., 10)``.
+    cosine
+        Cosine of the angle from the luminary ``(...)``.
+
+    Returns
+    -------
+    ndarray
+        Radiance ``(..., 3)`` [cd/m²].
+    """
     cosine = np.clip(cosine, -1.0, 1.0)
-    depth = parts[..., 9:] * light.aerosol_depth.astype(np.float32)
+    depth = components[..., 9:] * light.aerosol_depth.astype(np.float32)
     aerosol = spread_aerosol_phase(cosine, depth, light.asymmetry, HARMONIC_ORDER)
     gas = gas_phase(cosine)[..., None].astype(np.float32)
-    return parts[..., :3] * gas + parts[..., 3:6] * aerosol + parts[..., 6:9]
+    return components[..., :3] * gas + components[..., 3:6] * aerosol + components[..., 6:9]
 
 
 def _rgb_aerosol_depth(atmosphere: Atmosphere) -> np.ndarray:
-    """Scattering depth ``(3,)`` at the middles of the three primaries."""
+    """Vertical aerosol scattering depth ``(3,)`` at the central wavelengths of the three primaries."""
     return np.interp([610.0, 550.0, 465.0], WAVELENGTHS_NM, optics(atmosphere).scattering[1])
 
 
-def azimuths_filled(parts: np.ndarray) -> np.ndarray:
-    """Cosine series through the computed azimuths, at an even grid from 0 to π: ``(K, A, ...)`` → ``(K, A', ...)``."""
-    outer = np.linspace(0.0, np.pi, _AZIMUTHS_OUT)
+def interpolate_azimuths(components: np.ndarray) -> np.ndarray:
+    """Interpolate components by a cosine series in azimuth on a uniform grid from 0 to π.
+
+    Parameters
+    ----------
+    components
+        Values at `along_rays.AZIMUTHS_RAD` ``(K, A, ...)``.
+
+    Returns
+    -------
+    ndarray
+        Values on the grid of the tables ``(K, A', ...)``.
+    """
+    azimuths = np.linspace(0.0, np.pi, _TABLE_AZIMUTHS)
     order = np.arange(AZIMUTHS)
     forward = np.cos(np.outer(order, AZIMUTHS_RAD)) * (2.0 / AZIMUTHS)
     forward[0] *= 0.5
-    series = (np.cos(np.outer(outer, order)) @ forward).astype(np.float32)
-    filled = series @ parts.reshape(len(parts), AZIMUTHS, -1)
-    return filled.reshape(len(parts), _AZIMUTHS_OUT, *parts.shape[2:])
+    series = (np.cos(np.outer(azimuths, order)) @ forward).astype(np.float32)
+    interpolated = series @ components.reshape(len(components), AZIMUTHS, -1)
+    return interpolated.reshape(len(components), _TABLE_AZIMUTHS, *components.shape[2:])
 
 
-def row_of(elevation_rad: np.ndarray, horizon_rad: float) -> tuple[np.ndarray, np.ndarray]:
-    """Row below and share towards the next in the tables of a `ObserverView`, never across the horizon."""
+def elevation_index(elevation_rad: np.ndarray, horizon_rad: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the interpolation index and fraction of elevations in the rows of `ObserverView`.
+
+    Rows above and below the horizon are never mixed.
+
+    Parameters
+    ----------
+    elevation_rad
+        Apparent elevation ``(...)`` [rad].
+    horizon_rad
+        Apparent elevation of the horizon [rad].
+
+    Returns
+    -------
+    index, fraction
+        Lower row and fraction towards the next ``(...)``.
+    """
     up = np.maximum(elevation_rad - horizon_rad, 0.0) / (np.pi / 2 - horizon_rad)
     down = np.maximum(horizon_rad - elevation_rad, 0.0) / (np.pi / 2 + horizon_rad)
     above = elevation_rad >= horizon_rad
-    high = np.minimum(up, 1.0) ** (1.0 / _SPACING_ABOVE) * (_ABOVE - 1)
-    low = (1.0 - np.minimum(down, 1.0) ** (1.0 / _SPACING_BELOW)) * (_BELOW - 1)
-    first, last = np.where(above, _BELOW, 0), np.where(above, _BELOW + _ABOVE - 2, _BELOW - 2)
-    position = np.where(above, _BELOW + high, low)
+    high = np.minimum(up, 1.0) ** (1.0 / _EXPONENT_ABOVE) * (_ROWS_ABOVE - 1)
+    low = (1.0 - np.minimum(down, 1.0) ** (1.0 / _EXPONENT_BELOW)) * (_ROWS_BELOW - 1)
+    first = np.where(above, _ROWS_BELOW, 0)
+    last = np.where(above, _ROWS_BELOW + _ROWS_ABOVE - 2, _ROWS_BELOW - 2)
+    position = np.where(above, _ROWS_BELOW + high, low)
     row = np.clip(position.astype(int), first, last)
     return row, position - row
 
 
-def column_of(azimuth_deg: np.ndarray, luminary_direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def azimuth_index(azimuth_deg: np.ndarray, luminary_direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the interpolation index and fraction of azimuths in the columns of `ScatteredRadiance`.
+
+    Parameters
+    ----------
+    azimuth_deg
+        Azimuth clockwise from north ``(...)`` [deg].
+    luminary_direction
+        Vector towards the luminary ``(3,)``.
+
+    Returns
+    -------
+    index, fraction
+        Lower column and fraction towards the next ``(...)``.
+    """
     luminary_azimuth, _ = angles_from_direction(luminary_direction)
-    turn = np.abs((azimuth_deg - luminary_azimuth + 180.0) % 360.0 - 180.0)
-    position = turn * ((_AZIMUTHS_OUT - 1) / 180.0)
-    column = np.minimum(position.astype(int), _AZIMUTHS_OUT - 2)
+    difference = np.abs((azimuth_deg - luminary_azimuth + 180.0) % 360.0 - 180.0)
+    position = difference * ((_TABLE_AZIMUTHS - 1) / 180.0)
+    column = np.minimum(position.astype(int), _TABLE_AZIMUTHS - 2)
     return column, position - column

@@ -1,75 +1,143 @@
-"""Rays cut into cells: how much of what scatters in each cell reaches the ray's start."""
+"""Discretisation of rays into cells, with the transmittance-weighted length of each cell."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from seasonscapes.sky.atmosphere import Atmosphere, Optics, constituent_densities
-from seasonscapes.sky.curved_rays import CurvedRays, resampled
+from seasonscapes.sky.curved_rays import CurvedRays, resample_rays
 
 
 @dataclass(frozen=True)
 class CellSamples:
-    """Cells of rays that start at one height: everything about them that does not know the sun.
+    """Cells of K rays with a common origin: all quantities that do not depend on the sun.
 
     Parameters
     ----------
-    height_m, turn_rad, elevation_rad
-        Of the cells' middles ``(K, S)``.
+    height_m, central_angle_rad, elevation_rad
+        Height [m], angle about the Earth's centre from the origin [rad] and local elevation of the ray [rad] at the
+        midpoints of the cells ``(K, S)``.
     weight
-        ``(K, S, B)``: ∫ transmittance ds over each cell, as seen from the start [m].
+        ∫ transmittance ds over each cell, with the transmittance from the origin ``(K, S, B)`` [m].
     aerosol_column
-        ``(K, S)`` from the start to the cells' middles, in vertical columns.
+        Aerosol column from the origin to the midpoints, in vertical columns ``(K, S)``.
     end_transmittance
-        ``(K, B)`` to the end of the ray.
-    paths
-        The rays at the cells' edges.
+        Transmittance of the whole ray ``(K, B)``.
+    edges
+        The rays at the edges of the cells.
     """
 
     height_m: np.ndarray
-    turn_rad: np.ndarray
+    central_angle_rad: np.ndarray
     elevation_rad: np.ndarray
     weight: np.ndarray
     aerosol_column: np.ndarray
     end_transmittance: np.ndarray
-    paths: CurvedRays
+    edges: CurvedRays
 
 
-def sample_cells(atmosphere: Atmosphere, scaled: Optics, paths: CurvedRays, edges_m: np.ndarray) -> CellSamples:
-    """Cells between edges ``(K, S + 1)`` [m] along rays, with the transmittance-weighted length of each."""
-    middles = resampled(paths, 0.5 * (edges_m[:, 1:] + edges_m[:, :-1]))
-    ends = resampled(paths, edges_m)
-    length = np.diff(ends.distance_m, axis=1)
-    column = cell_columns(atmosphere, ends, middles)
+def sample_cells(atmosphere: Atmosphere, scaled: Optics, rays: CurvedRays, edges_m: np.ndarray) -> CellSamples:
+    """Divide rays into cells and integrate the transmittance over each cell.
+
+    Parameters
+    ----------
+    atmosphere
+        Atmosphere.
+    scaled
+        Optical depths that determine the transmittance.
+    rays
+        K rays.
+    edges_m
+        Arc lengths of the cell edges ``(K, S + 1)`` [m].
+
+    Returns
+    -------
+    CellSamples
+        S cells on each ray.
+    """
+    midpoints = resample_rays(rays, 0.5 * (edges_m[:, 1:] + edges_m[:, :-1]))
+    edges = resample_rays(rays, edges_m)
+    length = np.diff(edges.distance_m, axis=1)
+    column = cell_columns(atmosphere, edges, midpoints)
     depth = np.einsum("cks,cb->ksb", column, scaled.extinction)
     total = np.concatenate([np.zeros_like(depth[:, :1]), np.cumsum(depth, axis=1)], axis=1)
     transmittance = np.exp(-total)
-    length = np.diff(ends.distance_m, axis=1)[..., None]
+    length = np.diff(edges.distance_m, axis=1)[..., None]
     weight = transmittance[:, :-1] * -np.expm1(-depth) / np.maximum(depth, 1e-9) * length
     aerosol = np.cumsum(column[1], axis=1) - 0.5 * column[1]
     return CellSamples(
-        middles.height_m, middles.turn_rad, middles.elevation_rad, weight, aerosol, transmittance[:, -1], ends
+        midpoints.height_m,
+        midpoints.central_angle_rad,
+        midpoints.elevation_rad,
+        weight,
+        aerosol,
+        transmittance[:, -1],
+        edges,
     )
 
 
-def cell_columns(atmosphere: Atmosphere, ends: CurvedRays, middles: CurvedRays) -> np.ndarray:
-    """Columns ``(3, K, S)`` of the constituents in each cell, by Simpson's rule."""
-    density = constituent_densities(atmosphere, ends.height_m)
-    mean = (density[..., 1:] + density[..., :-1] + 4.0 * constituent_densities(atmosphere, middles.height_m)) / 6.0
-    return mean * np.diff(ends.distance_m, axis=1)
+def cell_columns(atmosphere: Atmosphere, edges: CurvedRays, midpoints: CurvedRays) -> np.ndarray:
+    """Integrate the column of each constituent over each cell by Simpson's rule.
 
+    Parameters
+    ----------
+    atmosphere
+        Atmosphere.
+    edges, midpoints
+        The rays at the edges ``(K, S + 1)`` and at the midpoints ``(K, S)`` of the cells.
 
-def local_sun(turn_rad, sun_elevation_rad, cos_azimuth) -> np.ndarray:
-    """Sine of the sun's elevation at points a turn about the Earth's centre away, towards an azimuth from the sun.
-
-    All arguments broadcast; the last is the cosine of the azimuth between ray and sun.
+    Returns
+    -------
+    ndarray
+        Columns of gas, aerosol and ozone in vertical columns ``(3, K, S)``.
     """
-    return np.cos(turn_rad) * np.sin(sun_elevation_rad) + np.sin(turn_rad) * np.cos(sun_elevation_rad) * cos_azimuth
+    density = constituent_densities(atmosphere, edges.height_m)
+    mean = (density[..., 1:] + density[..., :-1] + 4.0 * constituent_densities(atmosphere, midpoints.height_m)) / 6.0
+    return mean * np.diff(edges.distance_m, axis=1)
 
 
-def scattering_per_m(atmosphere: Atmosphere, scaled: Optics, height_m: np.ndarray) -> np.ndarray:
-    """Scattering coefficients of gas and aerosol ``(2, ..., B)`` [1/m] at heights."""
+def local_sun_sine(central_angle_rad: ArrayLike, sun_elevation_rad: ArrayLike, cos_azimuth: ArrayLike) -> np.ndarray:
+    """Compute the sine of the true solar elevation at points along a ray, by spherical trigonometry.
+
+    Parameters
+    ----------
+    central_angle_rad
+        Angle about the Earth's centre between the origin of the ray and the point ``(...)`` [rad].
+    sun_elevation_rad
+        True solar elevation at the origin ``(...)`` [rad].
+    cos_azimuth
+        Cosine of the azimuth between ray and sun at the origin ``(...)``.
+
+    Returns
+    -------
+    ndarray
+        Sine of the elevation above the horizontal plane of the point ``(...)``.
+    """
+    return (
+        np.cos(central_angle_rad) * np.sin(sun_elevation_rad)
+        + np.sin(central_angle_rad) * np.cos(sun_elevation_rad) * cos_azimuth
+    )
+
+
+def scattering_per_m(atmosphere: Atmosphere, optics: Optics, height_m: np.ndarray) -> np.ndarray:
+    """Compute the scattering coefficients of gas and aerosol.
+
+    Parameters
+    ----------
+    atmosphere
+        Atmosphere.
+    optics
+        Vertical optical depths, scaled or not.
+    height_m
+        Height ``(...)`` [m].
+
+    Returns
+    -------
+    ndarray
+        Scattering coefficients ``(2, ..., B)`` [1/m].
+    """
     density = constituent_densities(atmosphere, height_m)[:2]
-    return density[..., None] * scaled.scattering[:2].reshape(2, *(1,) * np.ndim(height_m), -1)
+    return density[..., None] * optics.scattering[:2].reshape(2, *(1,) * np.ndim(height_m), -1)

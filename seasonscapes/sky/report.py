@@ -1,4 +1,4 @@
-"""What a sky is, in numbers and as a picture of the dome."""
+"""Numerical summary of an illumination, and fish-eye pictures of the sky dome."""
 
 from __future__ import annotations
 
@@ -21,10 +21,20 @@ from seasonscapes.sky.illumination import (
 
 
 def correlated_colour_temperature_k(rgb: np.ndarray) -> float | None:
-    """Correlated colour temperature [K] of linear Rec.709 light ``(3,)``; ``None`` where it means nothing.
+    """Compute the correlated colour temperature of linear Rec.709 light (Ohno 2013, doi:10.1080/15502724.2014.839020).
 
-    Ohno (2013), doi:10.1080/15502724.2014.839020. Light farther than 0.05 from the Planckian locus in u'v', or bluer
-    than a black body of 100,000 K (twilight's zenith can be), has no correlated temperature.
+    It is undefined for light farther than 0.05 from the Planckian locus in u'v', or bluer than a black body of 100,000 K,
+    such as the zenith in twilight.
+
+    Parameters
+    ----------
+    rgb
+        Linear Rec.709 ``(3,)``.
+
+    Returns
+    -------
+    float or None
+        Correlated colour temperature [K], or ``None`` if undefined.
     """
     import colour
 
@@ -48,37 +58,34 @@ def sky_record(
     *,
     zone: str | None = None,
 ) -> dict[str, Any]:
-    """Everything about the light of an instant as plain numbers, ready for JSON.
+    """Summarise sun, moon, illuminances and sun events of an instant as JSON-serialisable values.
 
     Parameters
     ----------
     illumination
-        What `models.illuminate` gave for the instant.
+        Illumination of the instant, from `illuminate.illuminate`.
     time
         Aware datetime.
     sun, moon
-        Where they stand.
+        Positions of sun and moon.
     latitude_deg, longitude_deg
-        WGS 84 [deg], for the day's events.
+        WGS 84 position for the sun events [deg].
     zone
-        IANA name of the civil time that decides which day's events; local mean time where left out.
+        IANA name of the civil time zone that determines the date of the sun events; local mean time if omitted.
 
     Returns
     -------
     dict
-        ``illuminance_lx.direct_normal`` is that of the brighter body, named by ``direct_source``; ``null`` stands for
-        an event that does not happen, or a colour without a correlated temperature.
+        ``illuminance_lx.direct_normal`` is the illuminance of the brighter luminary, named by ``direct_source``.
+        Events that do not occur and undefined colour temperatures are ``None``.
     """
     tz = ZoneInfo(zone) if zone else timezone(timedelta(minutes=round(4.0 * longitude_deg)))
     events = sun_events(time.astimezone(tz).date(), latitude_deg, longitude_deg, tz)
-    bodies = {"sun": illumination.sun, "moon": illumination.moon}
-    source = max(
-        (name for name, body in bodies.items() if body is not None),
-        key=lambda name: _normal_lx(bodies[name]),
-        default=None,
-    )
+    candidates = {"sun": illumination.sun, "moon": illumination.moon}
+    luminaries = {name: luminary for name, luminary in candidates.items() if luminary is not None}
+    source = max(luminaries, key=lambda name: _normal_lx(luminaries[name]), default=None)
     light = {
-        "direct_normal": np.zeros(3) if source is None else np.asarray(bodies[source].normal_illuminance_lx, float),
+        "direct_normal": np.zeros(3) if source is None else np.asarray(luminaries[source].normal_illuminance_lx, float),
         "diffuse_horizontal": diffuse_horizontal_illuminance(illumination.sky_radiance),
         "global_horizontal": global_horizontal_illuminance(illumination),
     }
@@ -107,7 +114,18 @@ def sky_record(
 
 
 def record_lines(record: dict[str, Any]) -> list[str]:
-    """The record of `sky_record` as a few lines for people."""
+    """Format a record of `sky_record` as human-readable lines.
+
+    Parameters
+    ----------
+    record
+        Record of `sky_record`.
+
+    Returns
+    -------
+    list of str
+        Lines of text.
+    """
     sun, moon, lux, kelvin = record["sun"], record["moon"], record["illuminance_lx"], record["cct_k"]
 
     def clock(key: str) -> str:
@@ -133,26 +151,55 @@ def record_lines(record: dict[str, Any]) -> list[str]:
 
 
 def dome_radiance(illumination: Illumination, size_px: int = 512) -> np.ndarray:
-    """Equidistant fish-eye view of the upper half of the sky, ``(S, S, 3)`` [cd/m²]; NaN outside the horizon.
+    """Project the upper hemisphere of the sky to an equidistant fish-eye image.
 
-    Laid out like a map: north up, **east to the right** (lying on one's back one would see east on the left). The
-    distance from the middle is in proportion to the angle from the zenith. Discs of sun and moon are not in it.
+    North is up and **east to the right**, as on a map (the mirror image of the view upwards). The distance from the
+    centre is proportional to the angle from the zenith. The discs of sun and moon are not included.
+
+    Parameters
+    ----------
+    illumination
+        Illumination whose sky is shown.
+    size_px
+        Side length S [px].
+
+    Returns
+    -------
+    ndarray
+        Radiance ``(S, S, 3)`` [cd/m²]; NaN below the horizon.
     """
     axis = (np.arange(size_px) + 0.5) * (2.0 / size_px) - 1.0
     x, y = np.meshgrid(axis, -axis)
     radius = np.hypot(x, y)
     direction = direction_from_angles(np.degrees(np.arctan2(x, y)), 90.0 - 90.0 * np.minimum(radius, 1.0))
     height = illumination.sky_radiance.shape[0]
-    # Keep the look-up clear of the rows below the horizon, whose ground would bleed into the rim.
+    # Clamp the elevation so that interpolation does not use rows below the horizon, which hold ground radiance.
     direction[..., 2] = np.maximum(direction[..., 2], np.sin(np.radians(90.0 / height)))
     sky = sample_equirectangular(illumination.sky_radiance, direction)
     return np.where(radius[..., None] <= 1.0, sky, np.nan)
 
 
 def dome_picture(illumination: Illumination, size_px: int = 768, *, ev100: float | None = None) -> np.ndarray:
-    """`dome_radiance` developed for the screen with compass, elevation circles, sun and moon, ``(S, S, 3)`` in [0, 1].
+    """Render `dome_radiance` for display, annotated with compass directions, elevation circles, sun and moon.
 
-    Display-linear, ready for `images.write_png`. ``ev100`` left out, the dome's own brightness decides.
+    Parameters
+    ----------
+    illumination
+        Illumination whose sky is shown.
+    size_px
+        Side length S [px].
+    ev100
+        Exposure; metered from the dome if omitted.
+
+    Returns
+    -------
+    ndarray
+        Display-linear picture ``(S, S, 3)`` in [0, 1], for `images.write_png`.
+
+    Raises
+    ------
+    NoUsablePixels
+        If the exposure is metered and the sky has no positive luminance.
     """
     import cv2
 
@@ -163,14 +210,14 @@ def dome_picture(illumination: Illumination, size_px: int = 768, *, ev100: float
     radiance = np.where(inside[..., None], dome, 0.0)
     ev100 = auto_exposure_ev100(radiance, inside) if ev100 is None else ev100
     canvas = np.full((size_px, size_px, 3), 0.02, np.float32)
-    shown = tone_curve(expose(radiance, ev100)).clip(0.0, 1.0)
+    display = tone_curve(expose(radiance, ev100)).clip(0.0, 1.0)
     window = canvas[margin : margin + inner, margin : margin + inner]
-    window[inside] = shown[inside]
-    encoded = np.round(255.0 * srgb_from_linear(canvas)).astype(np.uint8)  # putText draws on bytes only
+    window[inside] = display[inside]
+    encoded = np.round(255.0 * srgb_from_linear(canvas)).astype(np.uint8)  # putText needs 8-bit images
     middle, scale = size_px / 2.0, inner / 2.0
     ink, thin = (235, 235, 235), max(1, size_px // 768)
 
-    def place(direction) -> tuple[int, int]:
+    def pixel_of(direction: np.ndarray) -> tuple[int, int]:
         azimuth, elevation = (np.radians(float(angle)) for angle in angles_from_direction(direction))
         radius = scale * (1.0 - elevation / (np.pi / 2.0))
         return round(middle + radius * np.sin(azimuth)), round(middle - radius * np.cos(azimuth))
@@ -187,14 +234,14 @@ def dome_picture(illumination: Illumination, size_px: int = 768, *, ev100: float
             write(f"{elevation_deg}", middle + 0.7071 * radius, middle + 0.7071 * radius, size_px / 1900)
     for name, (dx, dy) in {"N": (0, -1), "E": (1, 0), "S": (0, 1), "W": (-1, 0)}.items():
         write(name, middle + dx * (scale + margin / 2), middle + dy * (scale + margin / 2), size_px / 900)
-    for body, colour in ((illumination.sun, (255, 190, 25)), (illumination.moon, (190, 215, 255))):
-        if body is not None and body.direction[2] > 0.0:
-            cv2.circle(encoded, place(body.direction), size_px // 90, colour, 2 * thin, cv2.LINE_AA)
+    for luminary, colour in ((illumination.sun, (255, 190, 25)), (illumination.moon, (190, 215, 255))):
+        if luminary is not None and luminary.direction[2] > 0.0:
+            cv2.circle(encoded, pixel_of(luminary.direction), size_px // 90, colour, 2 * thin, cv2.LINE_AA)
     return linear_from_srgb(encoded / 255.0)
 
 
-def _normal_lx(body: Luminary) -> float:
-    return float(luminance(body.normal_illuminance_lx))
+def _normal_lx(luminary: Luminary) -> float:
+    return float(luminance(luminary.normal_illuminance_lx))
 
 
 def _event_times(events: SunEvents) -> dict[str, str | None]:

@@ -1,8 +1,8 @@
-"""Light by wavelength: nine bands that carry colour, the sun above the air, and how air meets each band.
+"""Spectral bands, optical depths per band, and conversion of spectra to photometric Rec.709.
 
-Everything the atmosphere computes is a *transfer*: spectral radiance (or irradiance) divided by the sun's spectral
-irradiance above the air, at nine wavelengths. A transfer is smooth, because the sun's Fraunhofer lines are divided out;
-their full weight is in the matrix that turns a transfer into photometric linear Rec.709.
+The atmosphere model computes *transfers*: spectral radiance (or irradiance) divided by the extraterrestrial solar
+spectral irradiance, at nine wavelengths. A transfer is a smooth function of wavelength because the Fraunhofer lines
+cancel; the matrix that converts a transfer to photometric linear Rec.709 includes the full solar spectrum.
 """
 
 from __future__ import annotations
@@ -10,20 +10,21 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 # Chosen by Nelder-Mead search so that nine samples of a transfer give the CIE XYZ of daylight, twilight and of the sun
-# through any air mass; `rgb_from_transfer` fits their weights and tests/test_atmosphere_spectrum.py states the error.
+# through any air mass; `rgb_from_transfer` fits their weights and tests/test_atmosphere_air.py bounds the error.
 WAVELENGTHS_NM = np.array([421.0, 454.0, 481.0, 516.0, 540.0, 579.0, 612.0, 646.0, 701.0])
 
-# XYZ → linear Rec.709 with the D65 white (ITU-R BT.709-6); its inverse's second row is the luminance Y in lux or cd/m².
+# XYZ → linear Rec.709 with D65 white (ITU-R BT.709-6); the second row of its inverse gives luminance Y in lux or cd/m².
 RGB_FROM_XYZ = np.linalg.inv(
     [[0.4123908, 0.3575843, 0.1804808], [0.2126390, 0.7151687, 0.0721923], [0.0193308, 0.1191948, 0.9505322]]
 )
 
 _BIN_CENTRES_NM = np.arange(365.0, 830.0, 10.0)
 
-# 683 lm/W ∫ E(λ) (x̄ ȳ z̄)(λ) dλ over bins of 10 nm [lx]: the extraterrestrial spectrum of ASTM G173-03 at 1 au against
-# the CIE 1931 2° observer. The sum is the sun's XYZ above the air: Y = 133.1 klx.
+# 683 lm/W ∫ E(λ) (x̄ ȳ z̄)(λ) dλ over bins of 10 nm [lx]: the extraterrestrial spectrum of ASTM G173-03 at 1 au weighted
+# by the CIE 1931 2° observer. The sum is the extraterrestrial XYZ of the sun: Y = 133.1 klx.
 # fmt: off
 _SOLAR_XYZ_LX = np.array([
     (1.86958, 0.0560168, 8.75148),
@@ -86,32 +87,73 @@ _OZONE_CROSS_SECTION = np.array([
 _MOLECULES_PER_M2_AND_DU = 2.687e20
 
 
-def rayleigh_optical_depth(wavelength_nm=WAVELENGTHS_NM) -> np.ndarray:
-    """Vertical Rayleigh optical depth of the whole air above 1013.25 hPa, 45° latitude, with the King factor.
+def rayleigh_optical_depth(wavelength_nm: ArrayLike = WAVELENGTHS_NM) -> np.ndarray:
+    """Compute the vertical Rayleigh optical depth at a surface pressure of 1013.25 hPa and 45° latitude.
 
-    Bodhaine et al. (1999), eq. 30, doi:10.1175/1520-0426(1999)016<1854:ORODC>2.0.CO;2.
+    Bodhaine et al. (1999), eq. 30, doi:10.1175/1520-0426(1999)016<1854:ORODC>2.0.CO;2, which includes the King factor.
+
+    Parameters
+    ----------
+    wavelength_nm
+        Wavelength ``(...)`` [nm].
+
+    Returns
+    -------
+    ndarray
+        Optical depth ``(...)``.
     """
     square = (np.asarray(wavelength_nm, float) * 1e-3) ** 2
     numerator = 1.0455996 - 341.29061 / square - 0.90230850 * square
     return 0.0021520 * numerator / (1.0 + 0.0027059889 / square - 85.968563 * square)
 
 
-def ozone_optical_depth_per_du(wavelength_nm=WAVELENGTHS_NM) -> np.ndarray:
-    """Vertical optical depth of one Dobson unit of ozone in the visible (Chappuis bands)."""
-    return np.interp(wavelength_nm, _BIN_CENTRES_NM, _OZONE_CROSS_SECTION) * _MOLECULES_PER_M2_AND_DU
+def ozone_optical_depth_per_du(wavelength_nm: ArrayLike = WAVELENGTHS_NM) -> np.ndarray:
+    """Compute the vertical optical depth of one Dobson unit of ozone in the visible range (Chappuis bands).
+
+    Parameters
+    ----------
+    wavelength_nm
+        Wavelength ``(...)`` [nm].
+
+    Returns
+    -------
+    ndarray
+        Optical depth ``(...)`` [1/DU].
+    """
+    return np.interp(np.asarray(wavelength_nm, float), _BIN_CENTRES_NM, _OZONE_CROSS_SECTION) * _MOLECULES_PER_M2_AND_DU
 
 
-def angstrom_ratio(exponent: float, reference_nm: float, wavelength_nm=WAVELENGTHS_NM) -> np.ndarray:
-    """Aerosol optical depth at a wavelength over that at a reference: Ångström's law ``(λ/λ₀)^-α``."""
+def angstrom_ratio(exponent: float, reference_nm: float, wavelength_nm: ArrayLike = WAVELENGTHS_NM) -> np.ndarray:
+    """Compute the ratio of aerosol optical depths at two wavelengths by Ångström's law ``(λ/λ₀)^-α``.
+
+    Parameters
+    ----------
+    exponent
+        Ångström exponent α.
+    reference_nm
+        Reference wavelength λ₀ [nm].
+    wavelength_nm
+        Wavelength λ ``(...)`` [nm].
+
+    Returns
+    -------
+    ndarray
+        Optical depth at λ over that at λ₀ ``(...)``.
+    """
     return (np.asarray(wavelength_nm, float) / reference_nm) ** -exponent
 
 
 @cache
 def rgb_from_transfer() -> np.ndarray:
-    """Matrix ``(3, 9)`` from a transfer to photometric linear Rec.709 [lx], or [cd/m²] from a transfer per steradian.
+    """Return the matrix from transfers to photometric linear Rec.709.
 
-    The weights are the least-squares fit, over many spectra of sun and sky, of the exact integral against the CIE
-    functions: a Gauss-like quadrature whose weight function is solar spectrum times colour-matching function.
+    The weights are a least-squares fit, over many spectra of sun and sky, of the exact integral with the CIE
+    colour-matching functions: a Gauss-like quadrature with solar spectrum times colour-matching function as weight.
+
+    Returns
+    -------
+    ndarray
+        ``(3, 9)``. The product with a transfer is in [lx], with a transfer per steradian in [cd/m²].
     """
     transfer, at_bands = _daylight_transfers(_BIN_CENTRES_NM), _daylight_transfers(WAVELENGTHS_NM)
     xyz = transfer @ _SOLAR_XYZ_LX
@@ -120,10 +162,10 @@ def rgb_from_transfer() -> np.ndarray:
 
 
 def _daylight_transfers(wavelength_nm: np.ndarray, count: int = 2000) -> np.ndarray:
-    """Transfers ``(count, len(wavelength_nm))``: any Rayleigh, ozone and aerosol path times a scattered power of λ."""
+    """Random transfers ``(count, len(wavelength_nm))``: attenuation by gas, ozone and aerosol times a power of λ."""
     random = np.random.default_rng(1987)
     rayleigh, ozone, aerosol, exponent = random.uniform(0.0, [[38.0], [12000.0], [6.0], [4.0]], (4, count))
-    # Half of the spectra have short paths: noon, and skies.
+    # The cube favours short paths, as of the sun at noon and of the sky.
     short = random.uniform(0.0, 1.0, (3, count)) ** 3
     rayleigh, ozone, aerosol = rayleigh * short[0], ozone * short[1], aerosol * short[2]
     depth = (
