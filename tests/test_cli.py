@@ -96,7 +96,7 @@ def test_a_place_of_ones_own(hill, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--time", "2024-09-01T02:00"], r"the sun stands at -\d+.*choose an atmosphere model"),
+        (["--time", "2024-09-01T02:00"], r"the solar elevation is -\d+.*choose an atmosphere model"),
         (["--time", "2024-03-31T02:30"], "offset"),
         (["--time", "noon"], "--time|time"),
         (["--time", "2024-09-01T12:00", "--camera", "north"], "no such camera"),

@@ -11,8 +11,14 @@ from atmosphere_cases import tables_of
 from seasonscapes import daylight
 from seasonscapes.frames import direction_from_angles
 from seasonscapes.sky.atmosphere import delta_scaled, gas_moments, optics
-from seasonscapes.sky.clear_sky import illumination_from_atmosphere
-from seasonscapes.sky.elevation_table import KNOTS_DEG, at_elevation, by_elevation, load_table, save_table
+from seasonscapes.sky.clear_sky import LuminarySource, illumination_from_atmosphere
+from seasonscapes.sky.elevation_table import (
+    KNOTS_DEG,
+    interpolate_at_elevation,
+    load_table,
+    save_table,
+    tabulate_by_elevation,
+)
 from seasonscapes.sky.illumination import luminance
 from seasonscapes.sky.models import atmosphere_of, read_sky_model
 from seasonscapes.sky.observer_radiance import (
@@ -77,13 +83,13 @@ def test_a_film_s_sky_is_the_picture_s(looked_up, low_deg, high_deg, bound):
 def test_the_moon_s_colour_is_kept(looked_up):
     """Moonlight has another spectrum than sunlight: each channel within 0.3 % of the brightest, not luminance alone."""
     sun, spectrum = direction_from_angles(300.0, -25.0), 2e-6 * np.linspace(0.7, 1.3, 9)
-    moon = (direction_from_angles(120.0, 17.3), spectrum, 0.26)
+    moon = LuminarySource(direction_from_angles(120.0, 17.3), spectrum, 0.26)
     exact, quick = (
         illumination_from_atmosphere(tables, sun, HEIGHT_M, moon=moon, shape=(32, 64))
         for tables in (tables_of(), looked_up)
     )
     unlike = illumination_from_atmosphere(
-        looked_up, sun, HEIGHT_M, moon=(moon[0], spectrum[::-1], 0.26), shape=(32, 64)
+        looked_up, sun, HEIGHT_M, moon=replace(moon, irradiance=spectrum[::-1]), shape=(32, 64)
     )
     scale = exact.sky_radiance.max(axis=-1, keepdims=True)
     assert (np.abs(quick.sky_radiance - exact.sky_radiance) / scale).max() < 3e-3
@@ -104,7 +110,7 @@ def test_a_table_by_elevation_is_cubic_and_fine_enough(tmp_path):
         )
 
     told: list[float] = []
-    table = by_elevation(values_of, progress=told.append)
+    table = tabulate_by_elevation(values_of, progress=told.append)
     assert told[-1] == 1.0 and sorted(told) == told  # noqa: PT018 (one statement of what progress is)
     assert len(table) == len(KNOTS_DEG)
     save_table(table, tmp_path / "t.npy")
@@ -112,12 +118,14 @@ def test_a_table_by_elevation_is_cubic_and_fine_enough(tmp_path):
     for elevation_deg in (*np.random.default_rng(4).uniform(-12.0, 3.0, 40), -12.0, 0.0, -29.99, 90.0):
         rad = np.radians(elevation_deg)
         expected = values_of(np.array([rad]))[0]
-        found = at_elevation(kept, rad)
+        found = interpolate_at_elevation(kept, rad)
         assert found.shape == (1, 2)
         rows = slice(None) if elevation_deg >= -12.0 else slice(1, 2)
         np.testing.assert_allclose(found[0, rows], expected[0, rows], rtol=1e-3)
-        np.testing.assert_array_equal(found, at_elevation(table, rad))
-    np.testing.assert_array_equal(at_elevation(kept, np.radians(-80.0)), at_elevation(kept, np.radians(KNOTS_DEG[0])))
+        np.testing.assert_array_equal(found, interpolate_at_elevation(table, rad))
+    np.testing.assert_array_equal(
+        interpolate_at_elevation(kept, np.radians(-80.0)), interpolate_at_elevation(kept, np.radians(KNOTS_DEG[0]))
+    )
 
 
 def test_diffuse_source_is_the_plain_sum_over_harmonics():
@@ -126,9 +134,9 @@ def test_diffuse_source_is_the_plain_sum_over_harmonics():
     view = observer_view(tables, HEIGHT_M)
     scaled = delta_scaled(optics(tables.atmosphere), HARMONIC_ORDER)
     suns, azimuths = np.radians([-7.3, 1.2, 33.0]), np.radians([10.0, 80.0, 170.0])
-    _, geometry = sun_geometry(view.sky, view.elevation_rad, suns, azimuths)
+    geometry = sun_geometry(view.sky, view.elevation_rad, suns, azimuths)
     found = diffuse_source(tables.atmosphere, scaled, tables.moments, view.sky, geometry)
-    index, share, cosines = geometry
+    index, share, cosines = geometry.knot_index, geometry.knot_fraction, geometry.azimuthal
     row, share_of_row = height_index(tables.atmosphere, view.sky.height_m)
     sigma = scattering_per_m(tables.atmosphere, scaled, view.sky.height_m)
     chi = np.stack([gas_moments(HARMONIC_ORDER), scaled.aerosol_moments[: HARMONIC_ORDER + 1]])
@@ -168,18 +176,20 @@ def test_film_tables_are_built_once_and_whole(tmp_path, monkeypatch):
 
     def build(tables, height_m, near):
         built.append((height_m, near))
-        return by_elevation(lambda suns: np.full((len(suns), 2), 1.0 + near))
+        return tabulate_by_elevation(lambda suns: np.full((len(suns), 2), 1.0 + near))
 
     monkeypatch.setattr(daylight, "diffuse_by_elevation", build)
     tables = tables_of()
     for _ in range(2):
         diffuse_of = daylight._diffuse_in(workspace, tables)
         for _ in range(2):
-            assert at_elevation(diffuse_of(900.0, True), 0.3) == pytest.approx(2.0, rel=1e-3)
+            assert interpolate_at_elevation(diffuse_of(900.0, True), 0.3) == pytest.approx(2.0, rel=1e-3)
     assert built == [(900.0, True)]
     (manifest,) = tmp_path.rglob("*.npy.json")
     manifest.unlink()
-    assert at_elevation(daylight._diffuse_in(workspace, tables)(900.0, True), 0.3) == pytest.approx(2.0, rel=1e-3)
+    assert interpolate_at_elevation(daylight._diffuse_in(workspace, tables)(900.0, True), 0.3) == pytest.approx(
+        2.0, rel=1e-3
+    )
     daylight._diffuse_in(workspace, tables)(901.0, True)
     assert built == [(900.0, True), (900.0, True), (901.0, True)]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
+from typing import Protocol
 
 import numpy as np
 
@@ -26,7 +27,17 @@ from seasonscapes.sky.overcast import (
 from seasonscapes.sky.spectrum import WAVELENGTHS_NM, angstrom_ratio, rayleigh_optical_depth
 
 TablesOf = Callable[[Atmosphere], AtmosphereTables]
-HosekOf = Callable[..., Illumination]
+
+
+class HosekFunction(Protocol):
+    """Evaluation of the Hosek-Wilkie sky model; `seasonscapes.rendering.hosek.hosek_illumination`."""
+
+    def __call__(
+        self, sun_direction: np.ndarray, *, turbidity: float, ground_albedo: float, shape: tuple[int, int]
+    ) -> Illumination:
+        """Compute the illumination from the apparent solar direction ``(3,)`` as a map of ``shape`` pixels."""
+        ...
+
 
 # Moonlight is omitted if the sun is above, or the moon below, these elevations, where it contributes less than 1e-3 of
 # the sunlight or of the night sky's light.
@@ -59,7 +70,7 @@ def illuminate(
     map_height: int = 128,
     with_air: bool = True,
     tables_of: TablesOf = tables_in_memory,
-    hosek: HosekOf | None = None,
+    hosek: HosekFunction | None = None,
 ) -> Illumination:
     """Compute the illumination of one instant at one place under a sky model.
 
