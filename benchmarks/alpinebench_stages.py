@@ -29,7 +29,7 @@ from alpinebench_scene import (
 
 from seasonscapes.albedo.albedo_completion import complete_albedo
 from seasonscapes.albedo.closed_form import AlbedoFit, solve_albedo
-from seasonscapes.albedo.delighting import delight_textures
+from seasonscapes.albedo.texture_delighting import delight_textures
 from seasonscapes.albedo.forward_model import TexelTransport, ambient_on_texels, sun_on_texels, trace_texel_transport
 from seasonscapes.albedo.photographs import EIGHT_BIT, LINEAR, prepare_photographs
 from seasonscapes.albedo.tone_curve import fit_tone_curve, with_tone_curve

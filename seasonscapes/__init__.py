@@ -1,3 +1,83 @@
-"""Physically-based relighting of large mountain landscapes: any place, any date, any hour."""
+"""Physically-based relighting of large mountain landscapes: any place, any date, any hour.
+
+>>> import seasonscapes as ss
+>>> place = ss.load_place("alpine_small")
+>>> camera = ss.camera(place, "meadow", size_px=(48, 32))
+>>> view = ss.render(place, camera, "2024-09-18T19:05", sky="hosek", spp=4)
+>>> picture = ss.develop(view)
+
+Names are imported from their modules when they are first used, so that ``import seasonscapes`` takes milliseconds.
+"""
+
+import importlib
+from typing import Any
 
 __version__ = "0.1.0"
+
+# Public name to the module below `seasonscapes` that defines it.
+_MODULES = {
+    # places and views
+    "load_place": "workflows.place",
+    "Place": "workflows.place",
+    "MeshOptions": "workflows.place",
+    "camera": "workflows.views",
+    "Camera": "cameras.pinhole",
+    "Panorama": "cameras.panorama",
+    "camera_path": "workflows.camera_paths",
+    # light
+    "sky_model": "workflows.illumination",
+    "SkyModel": "sky.models",
+    "illumination": "workflows.illumination",
+    "Illumination": "sky.illumination",
+    "sun_moon_position": "workflows.illumination",
+    # pictures
+    "render": "workflows.view_rendering",
+    "RenderedView": "rendering.radiance",
+    "relight_session": "workflows.relight_session",
+    "relight": "workflows.relight_session",
+    "timelapse": "workflows.timelapse",
+    "lit_texture": "workflows.received_light",
+    "irradiance_map": "workflows.received_light",
+    "develop": "workflows.pictures",
+    "save_png": "workflows.pictures",
+    "save_exr": "workflows.pictures",
+    # photographs
+    "Observation": "cameras.observation",
+    "open_photographs": "workflows.photograph_files",
+    "synthetic_photographs": "workflows.synthetic_photographs",
+    "webcam_station": "workflows.webcam_calibration",
+    "calibrate": "workflows.webcam_calibration",
+    "paint": "workflows.painting",
+    "complete": "workflows.completion",
+    "Texture": "terrain.surface",
+    # albedo
+    "recover_albedo": "workflows.albedo_recovery",
+    "RecoveryOptions": "workflows.albedo_recovery",
+    "load_albedo": "workflows.albedo_sources",
+    "predict_radiance": "workflows.predicted_radiance",
+    "delight": "workflows.delighting",
+    "differentiable_scene": "workflows.differentiable",
+    # Gaussians
+    "distil": "workflows.distillation",
+    "DistilOptions": "workflows.distillation",
+    "render_gaussians": "workflows.gaussian_views",
+    # evaluation and files
+    "score": "evaluation.metrics",
+    "Workspace": "workspace",
+    "InputError": "errors",
+    "SeasonscapesError": "errors",
+}
+
+__all__ = ["__version__", *_MODULES]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module 'seasonscapes' has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"seasonscapes.{_MODULES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

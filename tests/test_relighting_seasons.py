@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import places
 import pytest
-from seasonscapes.studio import dressed_view
 
 from seasonscapes.albedo.seasons import (
     albedo_at,
@@ -22,9 +21,9 @@ from seasonscapes.scene import read_scene
 from seasonscapes.sky.models import read_sky_model
 from seasonscapes.terrain.attributes import TerrainAttributes, texel_attributes
 from seasonscapes.terrain.surface import Texture, load_texture, save_texture
-from seasonscapes.workflows.albedo_sources import albedo_of_day, dated_albedos
+from seasonscapes.workflows.albedo_sources import AlbedoFile, albedo_of_day, dated_albedos
 from seasonscapes.workflows.place import MeshOptions, load_place
-from seasonscapes.workflows.relight_session import RenderJob, open_session
+from seasonscapes.workflows.relight_session import RenderJob, open_session, view_of_day
 from seasonscapes.workspace import Workspace
 
 BARE, WHITE = np.array([0.12, 0.14, 0.05], np.float32), np.array([0.80, 0.80, 0.82], np.float32)
@@ -196,17 +195,17 @@ def mountain(tmp_path_factory) -> RenderJob:
         values = np.tile(BARE, (shape[0] * shape[1], 1))
         values[texel] = snow_above(ground, line_m, by_north_m=150.0)
         save_texture(Texture(values.reshape(*shape, 3)), folder / f"{day}.npz")
-        pairs.append((day.isoformat(), str(folder / f"{day}.npz")))
+        pairs.append(AlbedoFile(day, folder / f"{day}.npz"))
     return RenderJob(
-        str(path),
-        str(folder / "workspace"),
+        path,
+        folder / "workspace",
         MeshOptions(),
         read_scene(path).camera(None),
         (48, 32),
         read_sky_model("hosek"),
         albedo=tuple(pairs),
         season="snow-line",
-        base_day=SNOWY.isoformat(),
+        base_day=SNOWY,
     )
 
 
@@ -229,8 +228,10 @@ def test_textures_of_a_spring(mountain):
     changed = np.mean(np.any(film[0] != film[-1], axis=1))
     assert max(half_done(values) for values in film) < 0.25 * changed
     assert half_done(faded[5]) > 0.95 * changed
-    for number, (_, name) in ((0, mountain.albedo[0]), (-1, mountain.albedo[1])):
-        np.testing.assert_array_equal(film[number], load_texture(name).values.reshape(-1, 3)[texel])
+    for number in (0, -1):
+        np.testing.assert_array_equal(
+            film[number], load_texture(mountain.albedo[number].path).values.reshape(-1, 3)[texel]
+        )
     # The lower edge of the snow climbs, as it does in truth, and does not thin out everywhere at once.
     lowest = [np.percentile(ground.height_m[snow_share(values) > 0.5], 5.0) for values in film]
     assert np.all(np.diff(lowest) >= 0.0)
@@ -241,35 +242,35 @@ def test_a_film_of_a_spring(mountain):
     """In the view's own pixels, as frames are lit."""
     from dataclasses import replace
 
-    studio = open_session(mountain)
-    land = studio.coefficients.coverage == 1.0
-    height_m = studio.coefficients.sample_origin[land][:, 0, 2]
-    film = [dressed_view(studio, day).coefficients.albedo[land] for day in DAYS]
+    session = open_session(mountain)
+    land = session.coefficients.coverage == 1.0
+    height_m = session.coefficients.sample_origin[land][:, 0, 2]
+    film = [view_of_day(session, day).coefficients.albedo[land] for day in DAYS]
     rows = np.array([by_height(height_m, values) for values in film])
     assert np.diff(rows, axis=0).max() <= 1e-6
     assert np.diff(rows, axis=1).min() > -0.1
     assert rows[0].mean() > rows[5].mean() + 0.1 > rows[-1].mean() + 0.2
     faded = open_session(replace(mountain, season="blended"))
-    middle = dressed_view(faded, DAYS[5]).coefficients.albedo[land]
+    middle = view_of_day(faded, DAYS[5]).coefficients.albedo[land]
     assert half_done(film[5]) < 0.5 * half_done(middle)
     # On the dates themselves both wear the very same.
     for number in (0, -1):
-        np.testing.assert_array_equal(film[number], dressed_view(faded, DAYS[number]).coefficients.albedo[land])
+        np.testing.assert_array_equal(film[number], view_of_day(faded, DAYS[number]).coefficients.albedo[land])
 
 
 def test_timelapse_moves_the_snow_line(mountain, tmp_path, capsys):
     common = [
         "timelapse",
-        mountain.scene,
+        str(mountain.scene),
         "--workspace",
-        mountain.workspace,
+        str(mountain.workspace),
         "--sky",
         "hosek",
         "--size",
         "48x32",
         "--json",
     ]
-    given = [part for day, name in mountain.albedo for part in ("--albedo", f"{day}={name}")]
+    given = [part for each in mountain.albedo for part in ("--albedo", f"{each.day}={each.path}")]
     when = ["--times", f"{SNOWY}T11:00Z,2023-05-20T11:00Z,{GREEN}T11:00Z"]
     pictures = {}
     for season in ("snow-line", "blended"):
@@ -286,12 +287,12 @@ def test_frames_of_a_day_have_its_line(mountain):
     """The light moves through a day, the snow does not; another day has another line."""
     from seasonscapes.workflows.relight_session import view_at
 
-    studio = open_session(mountain)
+    session = open_session(mountain)
     times = [datetime(2023, month, 20, hour, tzinfo=UTC) for month, hour in ((5, 8), (5, 15), (6, 15))]
     worn = []
     for time in times:
-        view_at(studio, time)
-        worn.append(studio.dressed[1].coefficients.albedo)
+        view_at(session, time)
+        worn.append(view_of_day(session, time.date()).coefficients.albedo)
     np.testing.assert_array_equal(worn[0], worn[1])
     assert snow_share(worn[2]).mean() < snow_share(worn[1]).mean()
 
@@ -301,16 +302,16 @@ def test_render_wears_dated_albedos(mountain, tmp_path, capsys):
 
     common = [
         "render",
-        mountain.scene,
+        str(mountain.scene),
         "--workspace",
-        mountain.workspace,
+        str(mountain.workspace),
         "--sky",
         "hosek",
         "--size",
         "48x32",
         "--spp",
         "1",
-        *[part for day, name in mountain.albedo for part in ("--albedo", f"{day}={name}")],
+        *[part for each in mountain.albedo for part in ("--albedo", f"{each.day}={each.path}")],
     ]
     worn = {}
     for season in ("snow-line", "blended", "nearest"):

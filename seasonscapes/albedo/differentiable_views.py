@@ -121,13 +121,15 @@ def _air(photograph: AlbedoPhotograph) -> tuple[np.ndarray, np.ndarray]:
     return depth, airlight
 
 
-def mi_sensor(camera: Camera | Panorama) -> Any:
+def mi_sensor(camera: Camera | Panorama, *, pixel_format: str = "rgb") -> Any:
     """Build Mitsuba's perspective sensor of a camera.
 
     Parameters
     ----------
     camera
         Perspective camera with square pixels.
+    pixel_format
+        ``"rgb"``, or ``"rgba"`` for the coverage too.
 
     Returns
     -------
@@ -147,7 +149,7 @@ def mi_sensor(camera: Camera | Panorama) -> Any:
         "type": "hdrfilm",
         "width": camera.width_px,
         "height": camera.height_px,
-        "pixel_format": "rgb",
+        "pixel_format": pixel_format,
         "component_format": "float32",
         "rfilter": {"type": "box"},
     }
@@ -214,18 +216,38 @@ def mi_picture(views: DifferentiableViews, index: int, unknowns: dict[str, Any],
         seed=2 * seed,  # pyright: ignore[reportArgumentType]
         seed_grad=2 * seed + 1,  # pyright: ignore[reportArgumentType]
     )
-    haze = unknowns.get("haze")
-    depth, airlight = views.mi_depth[index], views.mi_airlight[index]
-    if haze is None:
-        image = image * dr.exp(-depth) + airlight
-    else:
-        scale = mi.TensorXf(mi.Float(haze), shape=(1, 1, 1))
-        # In a homogeneous medium airlight is proportional to 1 - exp(-optical depth).
-        growth = (1.0 - dr.exp(-depth * scale)) / dr.fmax(1.0 - dr.exp(-depth), 1e-6)
-        image = image * dr.exp(-depth * scale) + airlight * growth
+    image = mi_through_air(image, views.mi_depth[index], views.mi_airlight[index], unknowns.get("haze"))
     if "log_gain" in unknowns:
         mi_gain = dr.exp(unknowns["log_gain"].array)
         channels = [dr.gather(mi.Float, mi_gain, mi.UInt32(3 * index + c)) for c in range(3)]
         mi_row: Any = dr.ravel(mi.Color3f(*channels))
         image = image * mi.TensorXf(mi_row, shape=(1, 1, 3))
     return image
+
+
+def mi_through_air(mi_image: Any, mi_depth: Any, mi_airlight: Any, haze: Any = None) -> Any:
+    """Apply aerial perspective to a rendered image, with a differentiable scale of its optical depth.
+
+    Parameters
+    ----------
+    mi_image
+        Radiance ``(H, W, 3)`` that leaves the terrain.
+    mi_depth, mi_airlight
+        Optical depth and airlight ``(H, W, 3)`` up to the terrain.
+    haze
+        Scale of the optical depth; ``None`` for 1.
+
+    Returns
+    -------
+    mitsuba.TensorXf
+        Radiance ``(H, W, 3)`` at the camera.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    if haze is None:
+        return mi_image * dr.exp(-mi_depth) + mi_airlight
+    scale = mi.TensorXf(mi.Float(haze), shape=(1, 1, 1))
+    # In a homogeneous medium airlight is proportional to 1 - exp(-optical depth).
+    growth = (1.0 - dr.exp(-mi_depth * scale)) / dr.fmax(1.0 - dr.exp(-mi_depth), 1e-6)
+    return mi_image * dr.exp(-mi_depth * scale) + mi_airlight * growth

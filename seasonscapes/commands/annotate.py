@@ -10,7 +10,6 @@ from cyclopts import Parameter
 
 from seasonscapes.commands.calibrate import TerrainSource
 from seasonscapes.commands.console import message
-from seasonscapes.errors import InputError
 
 
 def annotate_command(
@@ -41,17 +40,10 @@ def annotate_command(
 
     from seasonscapes.calibration.annotation import AnnotationSession, serve_session
     from seasonscapes.calibration.terrain_view import look_at_rasters
-    from seasonscapes.workflows.webcam_calibration import read_picture
+    from seasonscapes.workflows.webcam_calibration import station_picture
 
     station = (terrain or TerrainSource()).station(scene, webcam)
-    image = read_picture(picture, "--picture")
-    if image.shape[:2] != (station.view.height_px, station.view.width_px):
-        raise InputError(
-            picture,
-            "the picture has another size than its webcam",
-            got=f"{image.shape[1]} x {image.shape[0]}",
-            expected=f"{station.view.width_px} x {station.view.height_px}",
-        )
+    image = station_picture(picture, station, "--picture")
     look = partial(look_at_rasters, rasters=station.rasters, frame=station.frame)
     webcam_facts = station.webcam
     session = AnnotationSession(

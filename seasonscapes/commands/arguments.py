@@ -23,7 +23,8 @@ def check_range(flag: str, value: float, low: float, high: float) -> None:
 def check_choice(flag: str, value: str, choices: tuple[str, ...]) -> None:
     """`InputError` about a flag whose value is not one of the choices."""
     if value not in choices:
-        raise InputError(flag, "unknown", got=value, expected=", ".join(choices))
+        expected = " or ".join([", ".join(choices[:-1]), choices[-1]])
+        raise InputError(flag, f"unknown {flag.lstrip('-')}", got=value, expected=expected)
 
 
 def check_suffix(output: Path, suffixes: tuple[str, ...], *, flag: str = "--output") -> None:

@@ -76,14 +76,14 @@ def calibrate_command(
     from seasonscapes.calibration.evidence import read_points
     from seasonscapes.calibration.overlay import save_overlay
     from seasonscapes.calibration.resection import report_lines
-    from seasonscapes.workflows.webcam_calibration import calibrate, read_picture
+    from seasonscapes.workflows.webcam_calibration import calibrate, station_picture
 
     if points is None and not skyline:
         raise InputError("calibrate", "no evidence", cure="give --points FILE, --skyline, or both")
     station = (terrain or TerrainSource()).station(scene, webcam)
-    image = read_picture(picture, "--picture")
+    image = station_picture(picture, station, "--picture")
     matched = None if points is None else read_points(points, station.frame)
-    open_area = None if mask is None else read_picture(mask, "--mask").max(axis=2) > 127
+    open_area = None if mask is None else station_picture(mask, station, "--mask").max(axis=2) > 127
     try:
         found = calibrate(station, image, points=matched, skyline=skyline, mask=open_area, radial=radial)
     except NotEnoughEvidence as error:

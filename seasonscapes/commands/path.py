@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, cast, get_args
 
 from cyclopts import Parameter
 
@@ -85,6 +85,7 @@ def path_command(
             "--via", "a path needs at least two waypoints", got=via[0] if via else None, expected=EXPECTED_WAYPOINT
         )
     from seasonscapes.cameras.path_file import save_path
+    from seasonscapes.cameras.reference_poses import Kind
     from seasonscapes.cameras.trajectory import CURVES, TURNS
     from seasonscapes.frames import enu_from_geodetic
     from seasonscapes.images import write_png8
@@ -93,14 +94,14 @@ def path_command(
     from seasonscapes.workflows.views import local_ground
 
     check_choice("--curve", curve or "spline", tuple(CURVES))
+    check_choice("--kind", kind, get_args(Kind))
     check_choice("--turn", turn, tuple(TURNS))
-    check_choice("--kind", kind, ("refined", "unrefined"))
     size_px = None if size is None else parse_size(size)
     with progress_bars() as progress:
         loaded = options.load(scene, progress)
     target = None if look_at is None else enu_from_geodetic(loaded.frame, *parse_position(loaded, look_at, "--look-at"))
     if reference is not None:
-        path, meta = paths.reference_path(loaded, reference, kind=kind, size_px=size_px)
+        path, meta = paths.reference_path(loaded, reference, kind=cast(Kind, kind), size_px=size_px)
         waypoints, interpolate = path.cameras, meta["count"] is not None
         count, shape = views or meta["count"], curve or meta["curve"]
     else:

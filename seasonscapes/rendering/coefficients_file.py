@@ -21,7 +21,7 @@ from seasonscapes.rendering.hemisphere_rays import SurfacePoints
 from seasonscapes.rendering.light_clusters import LightClusters, ReceiverCoefficients
 from seasonscapes.rendering.transport import PointCoefficients, SamplingOptions, ViewCoefficients
 
-# Increment whenever the same inputs give other coefficients, or a stored field is renamed.
+# Format of the files: increment whenever a stored field is added, removed or renamed.
 REVISION = 2
 _TYPES: dict[str, type] = {
     stored.__name__: stored

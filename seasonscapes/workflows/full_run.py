@@ -140,7 +140,7 @@ def stages_of(job: RunJob, progress: Progress | None = None) -> list[Stage]:
         own: str | None = None,
     ) -> Stage:
         modules = tuple(f"workflows.{module}" for module in code)
-        return Stage(name, inputs, needs, modules, lambda folder: build(job, folder, progress), own or name)
+        return Stage(name, inputs, needs, lambda folder: build(job, folder, progress), own or name, modules)
 
     return [
         stage("pictures", pictures, (), ("run_photographs",), _pictures),

@@ -344,17 +344,16 @@ def nearest_albedo(dated: Sequence[DatedAlbedo], day: date) -> DatedAlbedo:
     return dated[season_weights([each.day for each in dated], day, season="nearest")[0][0]]
 
 
-def job_key(job: RenderJob, place: Place, dated: Sequence[DatedAlbedo]) -> str:
-    """Name of everything that determines a job's frames but their times; ``dated`` are the job's albedos."""
+def session_key(session: RelightSession) -> str:
+    """Name of everything that determines a session's frames but their times."""
     inputs = {
-        "place": place.key,
-        "view": job.view,
-        "size": job.size_px,
-        "sky": job.sky,
-        "albedo": [_identity(each) for each in dated],
-        "base": _identity(nearest_albedo(dated, job.base_day)),
-        "season": job.season,
-        "seed": job.seed,
+        "place": session.place.key,
+        **session.view_key,
+        "sky": session.sky,
+        "albedo": [_identity(dated) for dated in session.dated],
+        "base": _identity(session.base),
+        "season": session.season,
+        "seed": session.seed,
     }
     return artefact_key(inputs, FRAME_CODE)
 
@@ -367,10 +366,10 @@ def view_at(session: RelightSession, time: datetime) -> tuple[RenderedView, Illu
     light, position = illumination_for_camera(
         session.place, session.camera, session.sky, time, map_height=rows, by_elevation=True
     )
-    return relight_view(_with_albedo_of(session, time.date()), light), light, position
+    return relight_view(view_of_day(session, time.date()), light), light, position
 
 
-def _with_albedo_of(session: RelightSession, day: date) -> RelightableView:
+def view_of_day(session: RelightSession, day: date) -> RelightableView:
     """The relightable view with the albedo of a day; the last one is kept."""
     from seasonscapes.rendering.relit_view import with_albedo
 

@@ -42,20 +42,20 @@ class Stage:
         Plain values that determine its result.
     needs
         Stages whose files it reads.
-    code
-        Modules below ``seasonscapes`` whose source determines its result.
     build
         Builds it in the run's folder and returns the files that it wrote there.
     own
         Name of its own folder in the run's folder.
+    code
+        Modules below ``seasonscapes`` whose source determines its result.
     """
 
     name: str
     inputs: dict
     needs: tuple[str, ...]
-    code: tuple[str, ...]
     build: Callable[[Path], list[Path]] = field(compare=False)
     own: str | None = None
+    code: tuple[str, ...] = ()
 
 
 def stage_range(stages: Sequence[Stage], first: str | None, last: str | None) -> tuple[int, int]:

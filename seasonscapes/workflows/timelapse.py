@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,9 +18,25 @@ from seasonscapes.errors import InputError
 from seasonscapes.exposure import develop, exposure_ev100
 from seasonscapes.progress import Progress, each_reported
 from seasonscapes.relighting.frame_file import frame_ev100, frame_name, load_frame, save_frame, time_stamp
-from seasonscapes.workflows.place import Place
-from seasonscapes.workflows.relight_session import RelightSession, RenderJob, job_key, open_session, session_of, view_at
+from seasonscapes.sky.models import SkyModel
+from seasonscapes.workflows.place import Place, utc_at
+from seasonscapes.workflows.relight_session import (
+    RelightSession,
+    RenderJob,
+    open_session,
+    relight_session,
+    session_key,
+    session_of,
+    view_at,
+)
+from seasonscapes.workflows.view_rendering import sun_angles
 from seasonscapes.workspace import content_key
+
+if TYPE_CHECKING:
+    from seasonscapes.albedo.seasons import DatedAlbedo
+    from seasonscapes.cameras.panorama import Panorama
+    from seasonscapes.cameras.pinhole import Camera
+    from seasonscapes.terrain.surface import Texture
 
 log = logging.getLogger(__name__)
 
@@ -73,21 +90,34 @@ def cached_session(job: RenderJob, *, place: Place | None = None, progress: Prog
     return _sessions[name]
 
 
-def frames_folder(job: RenderJob, session: RelightSession) -> Path:
-    """The folder of a job's frames in the workspace; other jobs have other folders, so frames never mix."""
+def frames_folder(session: RelightSession) -> Path:
+    """The folder of a session's frames in the workspace; other sessions have other folders, so frames never mix."""
     place = session.place
-    return place.workspace.folder / f"{place.scene.name}/frames-{job_key(job, place, session.dated)}"
+    return place.workspace.folder / f"{place.scene.name}/frames-{session_key(session)}"
 
 
 def render_frame(job: RenderJob, time: datetime, *, exr_folder: Path | None = None) -> dict:
-    """Render one frame into the workspace, unless it is there.
+    """Render one frame of a job into the workspace, unless it is there; see `session_frame`."""
+    session = cached_session(job)
+    folder = frames_folder(session)
+    return session_frame(session, folder, time, camera_name=job.view.name, exr_folder=exr_folder)
+
+
+def session_frame(
+    session: RelightSession, folder: Path, time: datetime, *, camera_name: str = "", exr_folder: Path | None = None
+) -> dict:
+    """Render one frame of a session into a folder, unless it is there.
 
     Parameters
     ----------
-    job
-        What to render.
+    session
+        The view.
+    folder
+        For undeveloped frames.
     time
         Aware, UTC.
+    camera_name
+        For the frame's record.
     exr_folder
         Also write absolute radiance in full precision there.
 
@@ -96,8 +126,7 @@ def render_frame(job: RenderJob, time: datetime, *, exr_folder: Path | None = No
     dict
         ``time_utc``, ``metered_ev100``, and ``rendered``: whether it was rendered by this call.
     """
-    session = cached_session(job)
-    path = frames_folder(job, session) / frame_name(time)
+    path = folder / frame_name(time)
     copy = None if exr_folder is None else exr_folder / frame_name(time)
     if path.is_file() and (copy is None or copy.is_file()):
         return {"time_utc": time.isoformat(), "metered_ev100": frame_ev100(path), "rendered": False}
@@ -107,8 +136,8 @@ def render_frame(job: RenderJob, time: datetime, *, exr_folder: Path | None = No
     record = {
         "time_utc": time.astimezone(UTC).isoformat(),
         "scene": scene.name,
-        "camera": job.view.name,
-        "sun": {"azimuth_deg": float(position.sun.azimuth_deg), "elevation_deg": float(position.sun.elevation_deg)},
+        "camera": camera_name,
+        "sun": sun_angles(position),
         "sky": light.model,
         "attribution": scene.attribution,
     }
@@ -180,16 +209,48 @@ def develop_film(
     *,
     progress: Progress | None = None,
 ) -> list[Path]:
-    """Expose a job's rendered frames together and write them as a film or as pictures.
+    """Expose a job's rendered frames together and write them as a film or as pictures; see `develop_frames`."""
+    session = cached_session(job)
+    about = _about(session, job.view.name)
+    return develop_frames(frames_folder(session), times, output, look or FilmLook(), about, progress=progress)
+
+
+def _about(session: RelightSession, camera_name: str) -> dict:
+    scene = session.place.scene
+    return {
+        "scene": scene.name,
+        "camera": camera_name,
+        "sky": session.sky.name,
+        "season": session.season,
+        "seed": session.seed,
+        "attribution": scene.attribution,
+        "seasonscapes": __version__,
+    }
+
+
+def develop_frames(
+    folder: Path,
+    times: Sequence[datetime],
+    output: Path,
+    look: FilmLook,
+    about: dict,
+    *,
+    progress: Progress | None = None,
+) -> list[Path]:
+    """Expose rendered frames together and write them as a film or as pictures.
 
     Parameters
     ----------
-    job, times
-        Whose frames; all of them must have been rendered.
+    folder
+        Of the undeveloped frames.
+    times
+        Their times; all of them must have been rendered.
     output
         A ``.mp4`` file, or a folder for ``.png`` pictures.
     look
         Exposure, smoothing and frame rate.
+    about
+        Plain values for the files.
     progress
         Called with a task and its finished share.
 
@@ -201,18 +262,7 @@ def develop_film(
     from seasonscapes.images import write_png
     from seasonscapes.relighting.film import write_film
 
-    look = look or FilmLook()
-    scene = cached_session(job).place.scene
-    about = {
-        "scene": scene.name,
-        "camera": job.view.name,
-        "sky": job.sky.name,
-        "season": job.season,
-        "seed": job.seed,
-        "attribution": scene.attribution,
-        "seasonscapes": __version__,
-    }
-    pictures = each_reported(developed_frames(job, times, look), len(times), progress, "developing")
+    pictures = each_reported(developed(folder, times, look), len(times), progress, "developing")
     if output.suffix.lower() == ".mp4":
         span = {"from_utc": times[0].isoformat(), "to_utc": times[-1].isoformat()}
         write_film(output, pictures, fps=look.fps, note=json.dumps(about | span))
@@ -224,11 +274,10 @@ def develop_film(
     return paths
 
 
-def developed_frames(job: RenderJob, times: Sequence[datetime], look: FilmLook) -> Iterator[np.ndarray]:
+def developed(folder: Path, times: Sequence[datetime], look: FilmLook) -> Iterator[np.ndarray]:
     """Display-linear pictures ``(H, W, 3)`` of rendered frames, one at a time, with smoothed exposure."""
     from seasonscapes.relighting.exposure_smoothing import smoothed_ev100
 
-    folder = frames_folder(job, cached_session(job))
     paths = [folder / frame_name(time) for time in times]
     seconds = np.array([time.timestamp() for time in times])
     smooth_s = look.smooth_s
@@ -242,9 +291,80 @@ def developed_frames(job: RenderJob, times: Sequence[datetime], look: FilmLook) 
         yield develop(load_frame(path)[0], float(ev100), eye=look.exposure == "eye")
 
 
+def timelapse(
+    place: Place,
+    camera: Camera | Panorama,
+    times: Sequence[str | datetime],
+    output: str | Path,
+    *,
+    sky: str | Path | SkyModel = "clear",
+    albedo: Texture | DatedAlbedo | Sequence[DatedAlbedo] | None = None,
+    season: str = "blended",
+    look: FilmLook | None = None,
+    progress: Progress | None = None,
+) -> list[Path]:
+    """Film a view of a place through hours or seasons.
+
+    The light transport is traced once; each frame then takes a fraction of a second. Undeveloped frames are kept in
+    the workspace: an interrupted film continues, and a longer one reuses them.
+
+    Parameters
+    ----------
+    place
+        The place.
+    camera
+        A camera or panorama; one calibrated in another frame is converted to the place's.
+    times
+        Aware datetimes, or ISO 8601 text; without offset it is civil time at the place.
+    output
+        A ``.mp4`` film, or a folder for ``.png`` pictures.
+    sky
+        A sky model, its name or its file.
+    albedo
+        One or several dated albedos, a texture of the place's atlas, or ``None`` for the scene's own.
+    season
+        ``"blended"``, ``"nearest"`` or ``"snow-line"``: how to interpolate between dated albedos.
+    look
+        Exposure, its smoothing and the frame rate.
+    progress
+        Called with a task and its finished share.
+
+    Returns
+    -------
+    list of pathlib.Path
+        The film, or its pictures.
+
+    Raises
+    ------
+    NoTerrainInView
+        Where the camera sees no terrain.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import seasonscapes as ss
+    >>> place = ss.load_place("alpine_small")
+    >>> camera = ss.camera(place, "aerial", size_px=(48, 32))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     pictures = ss.timelapse(place, camera, ["2024-07-20T10:00", "2024-07-20T16:00"], folder, sky="hosek")
+    >>> [path.suffix for path in pictures]
+    ['.png', '.png']
+    """
+    utc = sorted({utc_at(place, time) for time in times})
+    if not utc:
+        raise InputError("times", "no time in it", got=str(times))
+    session = relight_session(
+        place, camera, sky=sky, albedo=albedo, season=season, base_day=base_day_of(utc), progress=progress
+    )
+    folder = frames_folder(session)
+    for time in each_reported(utc, len(utc), progress, "frames"):
+        session_frame(session, folder, time)
+    return develop_frames(folder, utc, Path(output), look or FilmLook(), _about(session, ""), progress=progress)
+
+
 def remove_frames(job: RenderJob, times: Sequence[datetime]) -> None:
     """Remove a job's undeveloped frames of these instants from the workspace."""
-    folder = frames_folder(job, cached_session(job))
+    folder = frames_folder(cached_session(job))
     for time in times:
         (folder / frame_name(time)).unlink(missing_ok=True)
     if folder.is_dir() and not any(folder.iterdir()):

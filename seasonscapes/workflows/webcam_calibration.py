@@ -140,6 +140,15 @@ def read_picture(path: Path, where: str) -> np.ndarray:
         raise InputError(where, "not a readable picture", got=str(path)) from None
 
 
+def station_picture(path: Path, station: WebcamStation, where: str) -> np.ndarray:
+    """A picture of a webcam in full size, as `read_picture` reads it; `InputError` where it has another size."""
+    image, view = read_picture(path, where), station.view
+    if image.shape[:2] != (view.height_px, view.width_px):
+        got, expected = f"{image.shape[1]} x {image.shape[0]} px", f"{view.width_px} x {view.height_px} px"
+        raise InputError(path, "the picture has another size than its webcam", got=got, expected=expected)
+    return image
+
+
 def calibrate(
     station: WebcamStation,
     picture: np.ndarray,
