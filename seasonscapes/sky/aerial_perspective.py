@@ -117,8 +117,8 @@ def tabulate_aerial_perspective(
     """
     weights = rgb_from_transfer() * illuminant
     bands = np.exp(-view.near_depth)
-    # At large distances only deep red remains, which lies outside the Rec.709 gamut, so that the weighted mean can leave
-    # the range of the bands' transmittances; clip it to that range.
+    # At large distances only deep red remains, which lies outside the Rec.709 gamut, so that the weighted mean can
+    # leave the range of the bands' transmittances; clip it to that range.
     low, high = bands.min(axis=-1, keepdims=True), bands.max(axis=-1, keepdims=True)
     rgb = np.clip(bands @ weights.T / weights.sum(axis=1), low, high)
     return TabulatedAerialPerspective(view.horizon_rad, -np.log(np.maximum(rgb, 1e-30)).astype(np.float32), lights)

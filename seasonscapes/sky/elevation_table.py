@@ -1,9 +1,9 @@
 """Tables of arrays by solar elevation, with piecewise cubic interpolation, for sequences of many solar positions.
 
-The knots subdivide the intervals of `sh_moments.SUN_ELEVATION_KNOTS_DEG`, so that they are dense in twilight and include
-the kinks of the tabulated functions. Interpolation uses the cubic polynomial through the four nearest knots. Values are
-stored in half precision (relative error 3e-4) with one scale per knot, because they decrease by nine orders of
-magnitude from day to night.
+The knots subdivide the intervals of `sh_moments.SUN_ELEVATION_KNOTS_DEG`, so that they are dense in twilight and
+include the kinks of the tabulated functions. Interpolation uses the cubic polynomial through the four nearest knots.
+Values are stored in half precision (relative error 3e-4) with one scale per knot, because they decrease by nine orders
+of magnitude from day to night.
 """
 
 from __future__ import annotations

@@ -9,9 +9,9 @@ direction would be a step in illumination, so here refraction applies in full do
 smoothly to zero at -6°, the end of civil twilight, below which sunlight does not reach the air near the observer.
 Apparent elevation is a continuous and strictly increasing function of true elevation.
 
-Time: Earth rotation follows UT1. UTC differs from it by less than 0.9 s since 1972, and the difference is taken from the
-IERS table included in skyfield. Before 1972, and after the end of that table, civil UTC is taken *as* UT1, because an
-assumption about future leap seconds would rotate the sky by up to 0.01°.
+Time: Earth rotation follows UT1. UTC differs from it by less than 0.9 s since 1972, and the difference is taken from
+the IERS table included in skyfield. Before 1972, and after the end of that table, civil UTC is taken *as* UT1, because
+an assumption about future leap seconds would rotate the sky by up to 0.01°.
 """
 
 from __future__ import annotations
@@ -343,7 +343,7 @@ def sun_events(date: Date, latitude_deg: float, longitude_deg: float, tz: tzinfo
 
 
 def _crossings(elevation_deg: Callable[[np.ndarray], np.ndarray], levels: np.ndarray) -> np.ndarray:
-    """Days from noon ``(L, 2)`` of the last upward crossing of each level before noon and the first downward one after it.
+    """Days from noon ``(L, 2)`` of the last upward crossing of each level before noon and the first downward one after.
 
     NaN where there is no crossing. skyfield's own search divides by zero when the culmination only just fails to reach
     a level; a coarse scan followed by the secant method is robust there.

@@ -4,8 +4,8 @@ Moonlight is computed by the same atmosphere model as sunlight: `moon_to_sun_rat
 extraterrestrial spectral irradiance to the sun's, by which results for sunlight from the moon's direction are scaled.
 Lunar eclipses are not modelled.
 
-Individual stars are not modelled either, because no dependency includes a star catalogue (skyfield downloads Hipparcos);
-their mean radiance is part of the background.
+Individual stars are not modelled either, because no dependency includes a star catalogue (skyfield downloads
+Hipparcos); their mean radiance is part of the background.
 """
 
 from __future__ import annotations
@@ -35,9 +35,10 @@ _MOON_SLOPE = 1.1
 CANDELA_OF_ZERO_MAGNITUDE = 10.8e4
 S10_CD_M2 = CANDELA_OF_ZERO_MAGNITUDE * 10.0 ** (-0.4 * 27.78)
 
-# Zenith luminances above the lower atmosphere at a middle phase of the solar cycle (Roach & Gordon 1973; Benn & Ellison 1998;
-# Leinert et al. 1998): airglow 145 S10, zodiacal light 95 S10, mean of stars and Milky Way 105 S10.
-# After extinction this gives the 21.6 mag/arcsec² of a natural sky of Garstang (1989) and Cinzano et al. (2001).
+# Zenith luminances above the lower atmosphere at a middle phase of the solar cycle (Roach & Gordon 1973; Benn & Ellison
+# 1998; Leinert et al. 1998): airglow 145 S10, zodiacal light 95 S10, stars and Milky Way 105 S10 as the mean over
+# the sky. After extinction this gives the 21.6 mag/arcsec² of a natural sky of Garstang (1989) and Cinzano et al.
+# (2001).
 AIRGLOW_CD_M2, ZODIACAL_CD_M2, STARLIGHT_CD_M2 = 145.0 * S10_CD_M2, 95.0 * S10_CD_M2, 105.0 * S10_CD_M2
 
 # Linear Rec.709 at luminance 1. Airglow: O I 557.7 nm 250 R, Na 589.3 nm 60 R, O I 630 nm 100 R and a flat continuum

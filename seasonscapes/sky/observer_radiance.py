@@ -1,8 +1,9 @@
 """Sky radiance for one observer: scattered light along whole rays, for any luminary.
 
 Three components are tabulated separately for each ray: light scattered once by gas, once by aerosol, and all other
-light. Divided by their phase functions the first two are smooth in azimuth (Bruneton & Neyret 2008, § 4). A few azimuths
-are therefore sufficient, and the phase functions are evaluated at the exact scattering angle of each direction.
+light. Divided by their phase functions the first two are smooth in azimuth (Bruneton & Neyret 2008, § 4). A few
+azimuths are therefore sufficient, and the phase functions are evaluated at the exact scattering angle of each
+direction.
 """
 
 from __future__ import annotations

@@ -12,8 +12,8 @@ from seasonscapes.sky.ephemeris import LunarPosition, SolarPosition
 from seasonscapes.sky.illumination import Illumination, diffuse_horizontal_illuminance, luminance
 from seasonscapes.sky.night import moon_to_sun_ratio, night_sky_radiance
 
-# Clear horizontal illuminance [lx] by solar elevation [deg]: the fits of Seidelmann (ed.), Explanatory Supplement to the
-# Astronomical Almanac (1992), § 9.3, less the night sky of 6.2e-4 lx that is included in measurements below -12°.
+# Clear horizontal illuminance [lx] by solar elevation [deg]: the fits of Seidelmann (ed.), Explanatory Supplement to
+# the Astronomical Almanac (1992), § 9.3, less the night sky of 6.2e-4 lx that is included in measurements below -12°.
 _ELEVATION_DEG = (
     -20, -18, -16, -14, -12, -10, -8, -6, -5, -4, -3, -2, -1,
     0, 1, 2, 3, 5, 7, 10, 15, 20, 30, 45, 60, 90,

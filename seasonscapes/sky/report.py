@@ -23,8 +23,8 @@ from seasonscapes.sky.illumination import (
 def correlated_colour_temperature_k(rgb: np.ndarray) -> float | None:
     """Compute the correlated colour temperature of linear Rec.709 light (Ohno 2013, doi:10.1080/15502724.2014.839020).
 
-    It is undefined for light farther than 0.05 from the Planckian locus in u'v', or bluer than a black body of 100,000 K,
-    such as the zenith in twilight.
+    It is undefined for light farther than 0.05 from the Planckian locus in u'v', or bluer than a black body of 100,000
+    K, such as the zenith in twilight.
 
     Parameters
     ----------

@@ -23,8 +23,8 @@ RGB_FROM_XYZ = np.linalg.inv(
 
 _BIN_CENTRES_NM = np.arange(365.0, 830.0, 10.0)
 
-# 683 lm/W ∫ E(λ) (x̄ ȳ z̄)(λ) dλ over bins of 10 nm [lx]: the extraterrestrial spectrum of ASTM G173-03 at 1 au weighted
-# by the CIE 1931 2° observer. The sum is the extraterrestrial XYZ of the sun: Y = 133.1 klx.
+# 683 lm/W ∫ E(λ) (x̄ ȳ z̄)(λ) dλ over bins of 10 nm [lx]: the extraterrestrial spectrum of ASTM G173-03 at 1 au
+# weighted by the CIE 1931 2° observer. The sum is the extraterrestrial XYZ of the sun: Y = 133.1 klx.
 # fmt: off
 _SOLAR_XYZ_LX = np.array([
     (1.86958, 0.0560168, 8.75148),
