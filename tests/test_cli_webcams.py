@@ -75,7 +75,7 @@ def test_the_bernese_cameras_travel_with_the_package(capsys):
     [
         (["--picture", "none.jpg", "--skyline"], "--picture: no such file"),
         (["--picture", "bad.jpg", "--skyline"], "--picture: not a readable picture"),
-        (["--picture", "small.png", "--skyline"], "got .10 x 10 px.; expected 320 x 200 px"),
+        (["--picture", "small.png", "--skyline"], """got '10 x 10 px'; expected 320 x 200 px"""),
         (["--picture", "small.png"], "no evidence"),
         (["--picture", "good.png", "--points", "none.csv"], "none.csv: no such file"),
         (["--picture", "good.png", "--points", "few.csv"], "points"),

@@ -333,9 +333,13 @@ def test_distill_takes_dates_of_any_years(mountain):
     from seasonscapes.workflows.distillation import dated_textures
 
     place = load_place(Path(mountain.scene), Workspace(Path(mountain.workspace)))
-    (_, snowy), (_, green) = mountain.albedo
-    found = dated_textures(place, [("2022-07-19", green), ("2023-04-10", snowy)], 4)
+    snowy, green = (each.path for each in mountain.albedo)
+
+    def dated(*pairs):
+        return dated_albedos(place, [AlbedoFile(date.fromisoformat(day), path) for day, path in pairs])
+
+    found = dated_textures(place, dated(("2022-07-19", green), ("2023-04-10", snowy)), 4)
     assert [day for day, _ in found] == [100.0, 200.0]
     np.testing.assert_array_equal(found[0][1], load_texture(snowy).values)
     with pytest.raises(InputError, match="twice"):
-        dated_textures(place, [("2022-07-19", green), ("2023-07-19", snowy)], 4)
+        dated_textures(place, dated(("2022-07-19", green), ("2023-07-19", snowy)), 4)

@@ -2,13 +2,11 @@
 
 from dataclasses import replace
 from datetime import UTC, datetime
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from atmosphere_cases import tables_of
 
-from seasonscapes import daylight
 from seasonscapes.frames import direction_from_angles
 from seasonscapes.sky.atmosphere import delta_scaled, gas_moments, optics
 from seasonscapes.sky.clear_sky import LuminarySource, illumination_from_atmosphere
@@ -30,6 +28,8 @@ from seasonscapes.sky.observer_radiance import (
 )
 from seasonscapes.sky.ray_cells import scattering_per_m
 from seasonscapes.sky.sh_moments import HARMONIC_ORDER, diffuse_source, height_index, sun_geometry, zonal
+from seasonscapes.workflows import illumination as illumination_module
+from seasonscapes.workspace import Workspace
 
 HEIGHT_M = 2800.0
 
@@ -172,25 +172,25 @@ def test_a_grid_of_directions_is_the_same_sky():
 
 def test_film_tables_are_built_once_and_whole(tmp_path, monkeypatch):
     """A table that has no manifest, as an interrupted run leaves it, is built anew; a finished one is read."""
-    workspace, built = daylight.Workspace(tmp_path), []
+    workspace, built = Workspace(tmp_path), []
 
     def build(tables, height_m, near):
         built.append((height_m, near))
         return tabulate_by_elevation(lambda suns: np.full((len(suns), 2), 1.0 + near))
 
-    monkeypatch.setattr(daylight, "diffuse_by_elevation", build)
+    monkeypatch.setattr(illumination_module, "diffuse_by_elevation", build)
     tables = tables_of()
     for _ in range(2):
-        diffuse_of = daylight._diffuse_in(workspace, tables)
+        diffuse_of = illumination_module._diffuse_in(workspace, tables)
         for _ in range(2):
             assert interpolate_at_elevation(diffuse_of(900.0, True), 0.3) == pytest.approx(2.0, rel=1e-3)
     assert built == [(900.0, True)]
     (manifest,) = tmp_path.rglob("*.npy.json")
     manifest.unlink()
-    assert interpolate_at_elevation(daylight._diffuse_in(workspace, tables)(900.0, True), 0.3) == pytest.approx(
-        2.0, rel=1e-3
-    )
-    daylight._diffuse_in(workspace, tables)(901.0, True)
+    assert interpolate_at_elevation(
+        illumination_module._diffuse_in(workspace, tables)(900.0, True), 0.3
+    ) == pytest.approx(2.0, rel=1e-3)
+    illumination_module._diffuse_in(workspace, tables)(901.0, True)
     assert built == [(900.0, True), (900.0, True), (901.0, True)]
 
 
@@ -209,36 +209,35 @@ def test_light_for_a_film_takes_its_tables_from_the_workspace(tmp_path, looked_u
         return looked_up.diffuse_of(HEIGHT_M, near)
 
     assert atmosphere_of(read_sky_model("clear")) == tables_of().atmosphere
-    monkeypatch.setattr(daylight, "atmosphere_tables", lambda _: tables_of())
-    monkeypatch.setattr(daylight, "diffuse_by_elevation", build)
-    place = load_place(places.write_place(tmp_path), daylight.Workspace(tmp_path / "work"))
+    monkeypatch.setattr(illumination_module, "atmosphere_tables", lambda _: tables_of())
+    monkeypatch.setattr(illumination_module, "diffuse_by_elevation", build)
+    place = load_place(places.write_place(tmp_path), Workspace(tmp_path / "work"))
     view = place.scene.camera(None).model_copy(update={"above_ground_m": None, "height_m": HEIGHT_M})
     camera, model = camera_for(place, view, size_px=(32, 24)), read_sky_model("clear")
     when, told = datetime(2024, 9, 1, 17, 50, tzinfo=UTC), []
-    daylight.tabulate_light(place, camera, model, progress=told.append)
+    illumination_module.tabulate_illumination(place, camera, model, progress=told.append)
     assert told[-1] == 1.0
-    heights = [daylight.median_height_m(place), HEIGHT_M, HEIGHT_M]
+    heights = [place.median_height_m, HEIGHT_M, HEIGHT_M]
     assert [near for _, near in asked] == [False, False, True]
     np.testing.assert_allclose([height for height, _ in asked], heights, atol=1e-3)
-    exact, moment = daylight.light_for(place, camera, model, when, map_height=16)
+    exact, moment = illumination_module.illumination_for_camera(place, camera, model, when, map_height=16)
     assert -3.0 < moment.sun.elevation_deg < 3.0
-    quick, _ = daylight.light_for(place, camera, model, when, map_height=16, tabulated=True)
-    daylight.tables_in.cache_clear()
-    again, _ = daylight.light_for(place, camera, model, when, map_height=16, tabulated=True)
+    quick, _ = illumination_module.illumination_for_camera(place, camera, model, when, map_height=16, by_elevation=True)
+    illumination_module.atmosphere_tables_in.cache_clear()
+    again, _ = illumination_module.illumination_for_camera(place, camera, model, when, map_height=16, by_elevation=True)
     assert len(asked) == 3
     assert 0.0 < worst(quick.visible_sky, exact.visible_sky) < 3e-3
     np.testing.assert_array_equal(again.visible_sky, quick.visible_sky)
     np.testing.assert_array_equal(again.sky_radiance, quick.sky_radiance)
 
 
-def test_median_height_is_worked_out_once(monkeypatch):
-    calls = []
-    median = np.median
-    monkeypatch.setattr(daylight.np, "median", lambda values: calls.append(1) or median(values))
-    first, second = (
-        SimpleNamespace(elevation=SimpleNamespace(values=np.full((3, 3, 1), level))) for level in (5.0, 7.0)
-    )
-    assert [daylight.median_height_m(place) for place in (first, second, first)] == [5.0, 7.0, 5.0]
-    assert len(calls) == 2
-    first.elevation.values = np.full((3, 3, 1), 9.0)
-    assert daylight.median_height_m(first) == 9.0
+def test_median_height_is_computed_once(tmp_path, monkeypatch):
+    import places
+
+    from seasonscapes.workflows.place import load_place
+
+    place = load_place(places.write_place(tmp_path), Workspace(tmp_path / "work"))
+    median = float(np.median(place.elevation.values))
+    assert place.median_height_m == median
+    monkeypatch.setattr(np, "median", lambda values: pytest.fail("computed again"))
+    assert place.median_height_m == median

@@ -9,7 +9,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from seasonscapes.commands.arguments import check_range, check_suffix, parse_albedo, parse_time
-from seasonscapes.commands.console import message, print_result, progress_bars
+from seasonscapes.commands.console import print_result, progress_bars
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
 from seasonscapes.commands.view_options import ViewOptions
 
@@ -93,7 +93,6 @@ def render_command(
             progress=progress,
         )
     record = picture.provenance
-    message("sun at azimuth {azimuth_deg:.2f}°, elevation {elevation_deg:.2f}° (refracted)".format(**record["sun"]))
     ev100 = exposure_ev100(picture.radiance, metering)
     record |= {
         "output": str(output),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
     from seasonscapes.rendering.radiance import RenderedView
     from seasonscapes.sky.illumination import Illumination
     from seasonscapes.terrain.surface import Texture
+
+log = logging.getLogger(__name__)
 
 
 def render(
@@ -102,6 +105,8 @@ def render(
     camera = view_in_frame(camera, place.frame)
     utc = utc_at(place, time)
     light, position = illumination_for_camera(place, camera, sky_model(sky), utc)
+    sun = sun_angles(position)
+    log.info("sun at azimuth %.2f°, elevation %.2f° (refracted)", sun["azimuth_deg"], sun["elevation_deg"])
     texture = chosen_albedo(place, utc.date(), albedo, season=season)
     view = render_view(
         build_scene(place.terrain, texture.values, light),

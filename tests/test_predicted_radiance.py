@@ -106,5 +106,5 @@ def test_another_atlas_is_refused(place, capsys):
         )
         == 2
     )
-    assert "of another atlas" in capsys.readouterr().err
+    assert "belongs to another atlas" in capsys.readouterr().err
     assert not (folder / "other").exists()

@@ -118,9 +118,9 @@ def test_a_killed_stage_goes_on_only_with_what_it_would_make_again(tmp_path):
 
 def test_a_kill_between_any_two_steps_leaves_nothing_old(tmp_path, monkeypatch):
     """Each write and removal of the ledger is killed once, where the stage had been finished and damaged."""
-    from seasonscapes import ledger
+    from seasonscapes.workflows import stage_runner
 
-    real = {name: getattr(ledger, name) for name in ("_write", "atomic_path")}
+    real = {name: getattr(stage_runner, name) for name in ("_write", "atomic_path")}
     for killed in range(8):
         folder = tmp_path / str(killed)
         half_made(folder, "a", fail=False)
@@ -135,7 +135,7 @@ def test_a_kill_between_any_two_steps_leaves_nothing_old(tmp_path, monkeypatch):
 
         with monkeypatch.context() as patch:
             for name in real:
-                patch.setattr(ledger, name, lambda *arguments, name=name: step(name, *arguments))
+                patch.setattr(stage_runner, name, lambda *arguments, name=name: step(name, *arguments))
             try:
                 half_made(folder, "a", fail=False)
             except KeyboardInterrupt:
