@@ -168,8 +168,8 @@ def test_a_run_killed_in_every_stage_ends_as_one_that_nothing_disturbed(runs):
     for number, stage in enumerate(STAGES):
         delay_s = rng.uniform(0.0, 0.6) * min(seconds[stage], 4.0)
         told = killed_in(runs, "killed", stage, delay_s)
-        assert [f"run: {name}: fresh" for name in STAGES[: max(number - 1, 0)]] == [
-            x for x in told if x.endswith(": fresh")
+        assert [f"run: {name}: up to date" for name in STAGES[: max(number - 1, 0)]] == [
+            x for x in told if x.endswith(": up to date")
         ]
         ledger = ledger_of(killed)
         assert list(ledger)[:number] == list(STAGES[:number]), (stage, delay_s)
