@@ -38,8 +38,8 @@ from seasonscapes.albedo.closed_form import AlbedoFit, solve_albedo  # noqa: E40
 from seasonscapes.albedo.corrections import CORRECTIONS, slopes_under  # noqa: E402
 from seasonscapes.albedo.forward_model import sun_on_texels, trace_texel_transport  # noqa: E402
 from seasonscapes.albedo.haze import fit_visibility  # noqa: E402
-from seasonscapes.albedo.painted import painted_radiance  # noqa: E402
 from seasonscapes.albedo.photographs import EIGHT_BIT, LINEAR, prepare_photographs  # noqa: E402
+from seasonscapes.albedo.resampled_radiance import resampled_radiance  # noqa: E402
 from seasonscapes.albedo.tone_curve import fit_tone_curve, with_tone_curve  # noqa: E402
 from seasonscapes.cameras.observation import Observation  # noqa: E402
 from seasonscapes.evaluation.webcam_faults import WebcamFaults, degrade  # noqa: E402
@@ -159,7 +159,7 @@ def terrain_pixels(truth: Truth) -> list[np.ndarray]:
     from seasonscapes.rendering.mitsuba_scene import RenderScene, mi_mesh
 
     bare = ray_scene(mi_mesh(truth.terrain, np.full(3, 0.3)))
-    scene = RenderScene(bare.mi_scene, bare.mi_terrain, None, 0.0)
+    scene = RenderScene(bare.mi_scene, bare.mi_terrain)
     return [np.isfinite(trace_gbuffer(scene, camera).depth) for camera in truth.cameras]
 
 
@@ -189,7 +189,7 @@ def ghost(guess: np.ndarray, true: np.ndarray, edges: np.ndarray) -> float:
 
 def rivals(truth: Truth, land, photographs, gains: np.ndarray, times, lights) -> dict[str, np.ndarray]:
     """Albedo ``(R, S, 3)`` by each correction: best single time and median of all times, by name."""
-    painted = painted_radiance(photographs, gains)
+    painted = resampled_radiance(photographs, gains)
     normal = np.tile([0.0, 0.0, 1.0], (truth.shape[0] * truth.shape[1], 1))
     normal[land.texel] = land.normal
     methods = {"as_it_is": lambda radiance, slopes: radiance, **CORRECTIONS}
@@ -291,7 +291,7 @@ def curve(args, truth, land, times, pictures, photographs, judge, table, numbers
     faults = WebcamFaults(tone_strength=0.4)
     seen, _ = observations(truth, times, pictures, faults, args.seed + 3)
     bent = [replace(photograph, observation=one, gain=None) for photograph, one in zip(photographs, seen, strict=True)]
-    found = fit_tone_curve(land, bent, share=0.2 if args.quick else 0.1)
+    found = fit_tone_curve(land, bent, fraction=0.2 if args.quick else 0.1)
     numbers["curve_strength_error"] = abs(found.strength - faults.tone_strength)
     fit = solve_albedo(land, with_tone_curve(bent, found.strength), noise_model=EIGHT_BIT)
     score(table, numbers, "curve", judge.scores(fit.albedo), judge)

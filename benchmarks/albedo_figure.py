@@ -16,11 +16,11 @@ sys.path.insert(0, str(Path(__file__).parent))
 from albedo import FIT_DATE, flat, observations
 from albedo_scene import hours, lights_for, make_truth, path_traced
 
-from seasonscapes.albedo.albedo_completion import complete_known
+from seasonscapes.albedo.albedo_completion import completed_estimate
 from seasonscapes.albedo.closed_form import solve_albedo
 from seasonscapes.albedo.forward_model import trace_texel_transport
 from seasonscapes.albedo.photographs import EIGHT_BIT, prepare_photographs
-from seasonscapes.albedo.standard_error import known_albedo
+from seasonscapes.albedo.standard_error import albedo_estimate
 from seasonscapes.evaluation.webcam_faults import WebcamFaults
 from seasonscapes.exposure import develop, exposure_ev100
 from seasonscapes.images import atomic_path, srgb_from_linear
@@ -48,7 +48,7 @@ def main() -> None:
     photographs = prepare_photographs(land, seen, flat(lights))
     fit = solve_albedo(land, photographs, noise_model=EIGHT_BIT)
     atlas = measure_atlas(truth.terrain, "planar", truth.albedo.shape[1], truth.albedo.shape[0])
-    found = complete_known(known_albedo(land, photographs, fit), fit, None, predictors_for(truth.terrain, atlas))
+    found = completed_estimate(albedo_estimate(land, photographs, fit), fit, None, predictors_for(truth.terrain, atlas))
     view = [args.camera]
     evening = [
         [light] for light in [lights_for(hours(FIT_DATE, 16.3), truth.cameras, model, workspace)[0][args.camera]]

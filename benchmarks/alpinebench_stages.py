@@ -60,7 +60,7 @@ from seasonscapes.texturing.predictors import Predictors, predictors_for
 from seasonscapes.workflows.predicted_radiance import RELATIVE_SIGMA
 from seasonscapes.workspace import default_workspace
 
-_TEXEL = SamplingOptions(subpixels=1, rays=64, listed=32, clusters=1024, rank=24)
+_TEXEL = SamplingOptions(shadow_samples=1, rays=64, clusters_per_receiver=32, clusters=1024, rank=24)
 _SUBPIXELS = 3
 # Days and hours that Gaussians learn from; the judged day is not among them.
 LESSONS = (
@@ -81,7 +81,7 @@ class Judge:
 
     def __init__(self, world: World, pictures: Pictures, lpips):
         self.world, self.rows, self.lpips = world, pictures.judged, lpips
-        self.scene = RenderScene(world.bare.mi_scene, world.bare.mi_terrain, None, 0.0)
+        self.scene = RenderScene(world.bare.mi_scene, world.bare.mi_terrain)
         self.uv, self.coverage, self.ready = [], [], []
         for number, camera in enumerate(world.judged):
             offset = (np.arange(_SUBPIXELS) + 0.5) / _SUBPIXELS
@@ -107,7 +107,7 @@ class Judge:
         surface = np.nan_to_num(sample_texture(radiance, self.uv[camera])).mean(axis=2)
         light = self.light(camera, at)
         light = light if air else replace(light, aerial_perspective=None)
-        stage = RenderScene(self.world.bare.mi_scene, self.world.bare.mi_terrain, light, 0.0)
+        stage = RenderScene(self.world.bare.mi_scene, self.world.bare.mi_terrain, light)
         return apply_aerial_perspective(
             stage, self.world.judged[camera], surface, self.coverage[camera], self.truth(camera, at).gbuffer
         )
@@ -295,10 +295,10 @@ class Splats:
 
     def __init__(self, bench: Bench):
         from seasonscapes.gaussians.disc_transport import light_state, trace_disc_transport
-        from seasonscapes.gaussians.rasterise import choose_threads
+        from seasonscapes.gaussians.rasterise import set_torch_threads
         from seasonscapes.gaussians.surfels import surfel_albedo, terrain_surfels
 
-        choose_threads(1)
+        set_torch_threads(1)
         self.bench, world = bench, bench.world
         self.surfels = terrain_surfels(world.terrain, world.size.disc_m)
         set_albedo(bench.judge.scene, world.albedo)
@@ -314,14 +314,14 @@ class Splats:
         from seasonscapes.gaussians.appearance import Appearance, fourier_embedding
         from seasonscapes.gaussians.disc_transport import neighbourhood_mean, surfel_irradiance
         from seasonscapes.gaussians.model import model_from
-        from seasonscapes.gaussians.splat_view import learned_numbers, model_weights, render_model
+        from seasonscapes.gaussians.splat_view import learned_parameters, model_weights, render_model
         from seasonscapes.gaussians.surfels import surfel_albedo
         from seasonscapes.gaussians.training import Schedule, surface_targets, train
 
         world, seed = self.bench.world, self.bench.world.seed
         set_albedo(self.bench.judge.scene, albedo)
         own = surfel_albedo(self.surfels, albedo)
-        around = neighbourhood_mean(self.surfels.means, own, self.surfels.plan.spacing_m)
+        around = neighbourhood_mean(self.surfels.means, own, self.surfels.grid.spacing_m)
         received = surfel_irradiance(world.bare, self.surfels, self.lights, rays=64, seed=seed)
         targets = surface_targets(self.states, [0] * len(self.states), own[None], received)
         appearance = Appearance(
@@ -341,7 +341,7 @@ class Splats:
             self.transport,
             kind="full",
             frame=world.frame,
-            appearance=learned_numbers(appearance),
+            appearance=learned_parameters(appearance),
         )
         weights = [model_weights(model, camera) for camera in world.judged]
 

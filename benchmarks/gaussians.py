@@ -109,7 +109,7 @@ class Scene:
         from seasonscapes.rendering.gbuffer import trace_gbuffer
         from seasonscapes.rendering.mitsuba_scene import RenderScene
 
-        seen = trace_gbuffer(RenderScene(self.ray_scene.mi_scene, self.mesh, None, 0.0), camera)
+        seen = trace_gbuffer(RenderScene(self.ray_scene.mi_scene, self.mesh), camera)
         return np.nansum(seen.normal * ray_directions(camera), axis=-1) > 0.0
 
     def lights(self, count: int, *, day: float | None = None):
@@ -164,7 +164,7 @@ def shadow_truth(scene: Scene, terrain, gbuffer, direction: np.ndarray) -> tuple
     from seasonscapes.rendering.mitsuba_scene import RenderScene
 
     facing = np.nan_to_num(gbuffer.normal @ direction, nan=-1.0) > 0.0
-    bare = RenderScene(terrain.mi_scene, scene.mesh, None, 0.0)
+    bare = RenderScene(terrain.mi_scene, scene.mesh)
     shown = np.zeros(facing.shape, bool)
     start = gbuffer.position[facing] + 0.5 * gbuffer.normal[facing]
     shown[facing] = ~occluded(bare, start, np.broadcast_to(direction, start.shape))
@@ -190,14 +190,14 @@ class Contest:
         from seasonscapes.gaussians.rasterise import view_weights
         from seasonscapes.gaussians.surfels import surfel_albedo, terrain_surfels
         from seasonscapes.gaussians.training import TrainingFrame, surface_targets
-        from seasonscapes.gaussians.training_views import facing
+        from seasonscapes.gaussians.training_views import front_facing_splats
 
         sizes, self.scene, self.seed = scene.sizes, scene, seed
         self.seconds: dict[str, float] = {}
         start = time.perf_counter()
         self.surfels = terrain_surfels(scene.terrain, scene.spacing_m)
         self.albedo = surfel_albedo(self.surfels, scene.albedo(SUMMER_DAY))
-        self.around = neighbourhood_mean(self.surfels.means, self.albedo, self.surfels.plan.spacing_m)
+        self.around = neighbourhood_mean(self.surfels.means, self.albedo, self.surfels.grid.spacing_m)
         self.transport = trace_disc_transport(scene.ray_scene, self.surfels, self.albedo, rays=64, seed=seed)
         self.seconds["transport"] = time.perf_counter() - start
         self.lights, days = scene.lights(sizes.suns + sizes.held_out)
@@ -205,7 +205,7 @@ class Contest:
         self.suns, self.held_out = sizes.suns, range(sizes.suns, sizes.suns + sizes.held_out)
         self.weights = []
         for camera in scene.cameras:
-            self.weights.append(view_weights(facing(self.surfels, camera), camera, subpixels=2))
+            self.weights.append(view_weights(front_facing_splats(self.surfels, camera), camera, subpixels=2))
         if not learn:
             return
         start = time.perf_counter()
@@ -315,7 +315,7 @@ class Contest:
         from seasonscapes.rendering.mitsuba_scene import RenderScene
 
         scene, both, either = self.scene, 0, 0
-        bare = RenderScene(scene.ray_scene.mi_scene, scene.mesh, None, 0.0)
+        bare = RenderScene(scene.ray_scene.mi_scene, scene.mesh)
         seen_by = [(trace_gbuffer(bare, camera), ~scene.underside(camera)) for camera in scene.cameras]
         for t in self.held_out:
             direction = torch.as_tensor(self.states[t].bodies[0][0])
@@ -344,7 +344,7 @@ def seasons(contest: Contest, appearance) -> dict[str, float]:
     scene, surfels = contest.scene, contest.surfels
     true = {day: scene.albedo(day) for day in SPRING_DAYS}
     dated = np.stack([surfel_albedo(surfels, true[day]) for day in (SPRING_DAYS[0], SPRING_DAYS[2])])
-    ground = attributes_at(surfels.means, surfels.normals, surfels.plan.spacing_m)
+    ground = attributes_at(surfels.means, surfels.normals, surfels.grid.spacing_m)
     result, held = {}, (appearance.albedo, appearance.neighbourhood_albedo)
     for number, day in enumerate(SPRING_DAYS):
         lights, _ = scene.lights(3, day=day)
@@ -354,7 +354,7 @@ def seasons(contest: Contest, appearance) -> dict[str, float]:
         if number == 1:
             guesses["_mean"] = dated.mean(axis=0)
         for name, albedo in guesses.items():
-            around = neighbourhood_mean(surfels.means, albedo, surfels.plan.spacing_m)
+            around = neighbourhood_mean(surfels.means, albedo, surfels.grid.spacing_m)
             appearance.albedo, appearance.neighbourhood_albedo = (
                 torch.as_tensor(albedo)[None],
                 torch.as_tensor(around)[None],
@@ -379,14 +379,14 @@ def speed(contest: Contest, appearance) -> dict[str, float]:
     from seasonscapes.gaussians.appearance import colours_at
     from seasonscapes.gaussians.rasterise import rotations, splat_colours, view_weights
     from seasonscapes.gaussians.splat_view import SPLAT_LIMITS
-    from seasonscapes.gaussians.training_views import facing
+    from seasonscapes.gaussians.training_views import front_facing_splats
     from seasonscapes.rendering.mitsuba_scene import relight
     from seasonscapes.rendering.radiance import path_trace
     from seasonscapes.rendering.splatting import finer_camera, splat_layers, upload_splats
 
     scene, surfels, t = contest.scene, contest.surfels, contest.held_out[0]
     camera = finer_camera(scene.cameras[0], scene.sizes.speed_px // scene.cameras[0].width_px)
-    splats = facing(surfels, camera)
+    splats = front_facing_splats(surfels, camera)
     axes = rotations(splats.quaternions) * splats.log_scales.exp()[:, None, :]
     opacity = 1.0 / (1.0 + np.exp(-surfels.opacity_logits))
     ready = upload_splats(surfels.means, axes.numpy(), opacity)
@@ -397,7 +397,7 @@ def speed(contest: Contest, appearance) -> dict[str, float]:
     weights = view_weights(splats, camera)
     still = best(lambda: splat_colours(weights, colours))
     drawn, covered = splat_layers(ready, colours, camera, SPLAT_LIMITS)
-    lit = relight(scene.mesh, contest.lights[t], max_height_m=float(scene.terrain.vertices[:, 2].max()))
+    lit = relight(scene.mesh, contest.lights[t])
     # Errors are compared in the middle of the picture, 3/8 of its side; times are those of all of it.
     side = camera.width_px * 3 // 8
     edge = (camera.width_px - side) // 2
@@ -466,8 +466,8 @@ def contact_sheet(contest: Contest, appearance, path: str) -> None:
 
 def packed_scores(contest: Contest, appearance) -> dict[str, float]:
     """Bytes for each Gaussian on disk, and what packing costs in PSNR."""
-    from seasonscapes.gaussians.model import bytes_each, model_from, packed, unpacked
-    from seasonscapes.gaussians.splat_view import appearance_of, learned_numbers
+    from seasonscapes.gaussians.model import bytes_per_gaussian, model_from, pack_model, unpack_model
+    from seasonscapes.gaussians.splat_view import appearance_of, learned_parameters
 
     model = model_from(
         contest.surfels,
@@ -476,10 +476,10 @@ def packed_scores(contest: Contest, appearance) -> dict[str, float]:
         contest.transport,
         kind="full",
         frame=contest.scene.frame,
-        appearance=learned_numbers(appearance),
+        appearance=learned_parameters(appearance),
     )
-    again = contest.score(appearance_of(unpacked(*packed(model))))
-    return {"bytes_per_gaussian": bytes_each(model), "packed_held_out_hour_psnr_db": again[0]}
+    again = contest.score(appearance_of(unpack_model(*pack_model(model))))
+    return {"bytes_per_gaussian": bytes_per_gaussian(model), "packed_held_out_hour_psnr_db": again[0]}
 
 
 def main() -> None:
@@ -493,9 +493,9 @@ def main() -> None:
     parser.add_argument("--picture", default=None, help="write the contact sheet here")
     arguments = parser.parse_args()
     seed = secrets.randbelow(10_000) if arguments.seed is None else arguments.seed
-    from seasonscapes.gaussians.rasterise import choose_threads
+    from seasonscapes.gaussians.rasterise import set_torch_threads
 
-    choose_threads(1)
+    set_torch_threads(1)
     start = time.perf_counter()
     only = [name for name in arguments.only.split(",") if name]
     contest = Contest(

@@ -33,10 +33,10 @@ from seasonscapes.gaussians.disc_transport import (
     surfel_irradiance,
     trace_disc_transport,
 )
-from seasonscapes.gaussians.rasterise import choose_threads, splat_colours, view_weights
+from seasonscapes.gaussians.rasterise import set_torch_threads, splat_colours, view_weights
 from seasonscapes.gaussians.surfels import surfel_albedo, terrain_surfels
 from seasonscapes.gaussians.training import Schedule, surface_targets, train
-from seasonscapes.gaussians.training_views import facing, overview_cameras
+from seasonscapes.gaussians.training_views import front_facing_splats, overview_cameras
 from seasonscapes.images import srgb_from_linear
 from seasonscapes.rendering.hemisphere_rays import ray_scene
 from seasonscapes.rendering.mitsuba_scene import mi_mesh
@@ -48,7 +48,7 @@ from seasonscapes.workflows.illumination import illumination_at, sun_moon_positi
 from seasonscapes.workflows.place import MeshOptions, load_place
 from seasonscapes.workspace import default_workspace
 
-choose_threads(1)
+set_torch_threads(1)
 
 # %% [markdown]
 # Discs, one for every 75 m of ground, and how light reaches them.
@@ -60,7 +60,7 @@ texture = albedo_for(place, day).values
 land = ray_scene(mi_mesh(place.terrain, texture))
 surfels = terrain_surfels(place.terrain, 75.0)
 albedo = surfel_albedo(surfels, texture)
-around = neighbourhood_mean(surfels.means, albedo, surfels.plan.spacing_m)
+around = neighbourhood_mean(surfels.means, albedo, surfels.grid.spacing_m)
 transport = trace_disc_transport(land, surfels, albedo, rays=64)
 print(f"{len(albedo):,} discs, mean sky-view factor {transport.open_sky.mean():.2f}")
 
@@ -98,10 +98,10 @@ _ = plt.ylabel("loss")
 camera = overview_cameras(place.terrain, 1, size_px=160, first_deg=200.0)[0]
 light, state = lit(day + timedelta(hours=7.5))
 ready = relightable_view(
-    land, trace_view(land, camera, SamplingOptions(subpixels=4, shades=16, rays=128, clusters=2048, listed=32, rank=24))
+    land, trace_view(land, camera, SamplingOptions(shadow_samples=4, albedo_samples=16, rays=128, clusters=2048, clusters_per_receiver=32, rank=24))
 )
 truth = relight_view(ready, light).surface * np.float32(np.pi / state.global_lx)
-weights = view_weights(facing(surfels, camera), camera, subpixels=2)
+weights = view_weights(front_facing_splats(surfels, camera), camera, subpixels=2)
 splats = splat_colours(weights, colours_at(appearance, state)) / np.maximum(weights.coverage, 1e-3)[..., None]
 pair = [srgb_from_linear(picture) for picture in (truth, splats)]
 solid = (ready.coverage > 0.999) & (weights.coverage > 0.5)

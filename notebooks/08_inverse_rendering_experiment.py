@@ -67,7 +67,7 @@ for name in ("west", "south"):
 
 # %%
 land = trace_texel_transport(
-    place.terrain, truth.shape[:2], sampling=SamplingOptions(subpixels=1, rays=64, listed=32, clusters=1024, rank=24)
+    place.terrain, truth.shape[:2], sampling=SamplingOptions(shadow_samples=1, rays=64, clusters_per_receiver=32, clusters=1024, rank=24)
 )
 photographs = prepare_photographs(land, observations, lights, gains=[np.ones(3)] * len(lights))
 closed = solve_albedo(land, photographs)
@@ -84,7 +84,7 @@ options = InverseOptions(
     unknowns=("albedo", "log_gain"),
     levels=(4, 1),
     iterations=16,
-    pictures=2,
+    photographs_per_iteration=2,
     spp=4,
     check_every=8,
     steps={"albedo": 0.03, "log_gain": 0.02},

@@ -8,14 +8,14 @@ import pytest
 from albedo_cases import Case, case, psnr
 
 from seasonscapes.albedo import corrections, equations, haze, season_grouping, tone_curve
-from seasonscapes.albedo.albedo_completion import complete_known
+from seasonscapes.albedo.albedo_completion import completed_estimate
 from seasonscapes.albedo.closed_form import SolverOptions, solve_albedo
 from seasonscapes.albedo.differentiable_views import SKY, differentiable_views, mi_picture
 from seasonscapes.albedo.forward_model import ambient_on_texels, predicted_surface_radiance
 from seasonscapes.albedo.inverse import ExtraUnknown, InverseOptions, refine_albedo
-from seasonscapes.albedo.painted import painted_radiance
 from seasonscapes.albedo.photographs import EIGHT_BIT, AlbedoPhotograph, prepare_photographs
-from seasonscapes.albedo.standard_error import KnownAlbedo, finite_sigma, known_albedo
+from seasonscapes.albedo.resampled_radiance import resampled_radiance
+from seasonscapes.albedo.standard_error import AlbedoEstimate, albedo_estimate, observed_sigma
 from seasonscapes.errors import NotEnoughEvidence, NoUsablePixels
 from seasonscapes.evaluation.webcam_faults import WebcamFaults, degrade
 from seasonscapes.frames import direction_from_angles
@@ -129,7 +129,7 @@ def test_webcam_pictures(place, photographs):
 
 
 def test_corrections_are_far_behind(place, photographs, clean):
-    painted = painted_radiance(photographs, clean.gains)
+    painted = resampled_radiance(photographs, clean.gains)
     normal = np.tile([0.0, 0.0, 1.0], (place.albedo.size // 3, 1))
     normal[place.transport.texel] = place.transport.normal
     seen, best = clean.pixel_count >= 1.0, 0.0
@@ -163,7 +163,7 @@ def test_wrong_light_is_clearly_worse(place, clean, wrong):
 
 def test_response_curve_is_found(place, photographs):
     bent = webcam_shots(place, photographs, WebcamFaults(tone_strength=0.4, exposure_sigma_ev=0.2))
-    found = tone_curve.fit_tone_curve(place.transport, bent, share=0.5)
+    found = tone_curve.fit_tone_curve(place.transport, bent, fraction=0.5)
     assert found.strength == pytest.approx(0.4, abs=0.15)
     levels = np.linspace(0.0, 1.0, 50)
     curve = 0.6 * levels + 0.4 * levels**2 * (3.0 - 2.0 * levels)
@@ -198,7 +198,7 @@ def test_visibility_is_found(place, photographs):
     def lights_of(visibility_km):
         return [replace(photograph.light, aerial_perspective=Fog(visibility_km)) for photograph in photographs]
 
-    found = haze.fit_visibility(place.transport, hazy, lights_of, visibilities_km=(2.5, 4.0, 8.0, 16.0), share=0.5)
+    found = haze.fit_visibility(place.transport, hazy, lights_of, visibilities_km=(2.5, 4.0, 8.0, 16.0), fraction=0.5)
     assert found.visibility_km == pytest.approx(true_km, rel=0.15)
     mixed = haze.mixed_light(lights_of(4.0)[0], lights_of(8.0)[0], 0.5).aerial_perspective
     between = 1.0 / (0.5 / 4.0 + 0.5 / 8.0)
@@ -319,7 +319,7 @@ def test_refinement_refuses(place, photographs, clean):
 
 
 def test_uncertainty_ranks_errors_and_gaps_are_marked(place, photographs, clean):
-    known = known_albedo(place.transport, photographs, clean)
+    known = albedo_estimate(place.transport, photographs, clean)
     measured = known.source == 1
     error = np.abs(known.albedo - place.albedo)[..., 1]
     low, high = np.quantile(known.sigma[measured], [0.33, 0.67])
@@ -334,7 +334,7 @@ def test_gaps_are_completed_and_marked(place, photographs, clean):
     """From relief alone they beat one colour for all; from an image that is too dark and noisy, by far."""
     height, width = place.albedo.shape[:2]
     predictors = predictors_for(place.terrain, measure_atlas(place.terrain, "planar", width, height))
-    known = known_albedo(place.transport, photographs, clean)
+    known = albedo_estimate(place.transport, photographs, clean)
     measured = known.source == 1
     gap = predictors.surface & ~measured
 
@@ -342,24 +342,24 @@ def test_gaps_are_completed_and_marked(place, photographs, clean):
         return float(np.abs(albedo - place.albedo)[gap].mean())
 
     flat = error(np.broadcast_to(np.median(place.albedo[measured], axis=0), place.albedo.shape))
-    bare = complete_known(known, clean, None, predictors)
+    bare = completed_estimate(known, clean, None, predictors)
     assert (bare.source[gap] == 2).all()
     assert (bare.source[measured] == 1).all()
     assert np.isfinite(bare.sigma[predictors.surface]).all()
     assert error(bare.albedo) < flat
     image = 0.6 * place.albedo * np.random.default_rng(1).normal(1.0, 0.1, place.albedo.shape)
     image = np.maximum(image, 0.01).astype(np.float32)
-    corrected = complete_known(known, clean, image, predictors)
+    corrected = completed_estimate(known, clean, image, predictors)
     assert error(corrected.albedo) < 0.6 * min(error(bare.albedo), error(image))
     seen = clean.pixel_count >= 0.5
-    poor = seen & (finite_sigma(clean) > np.quantile(finite_sigma(clean)[seen], 0.9))
-    well = seen & (finite_sigma(clean) < np.median(finite_sigma(clean)[seen]))
+    poor = seen & (observed_sigma(clean) > np.quantile(observed_sigma(clean)[seen], 0.9))
+    well = seen & (observed_sigma(clean) < np.median(observed_sigma(clean)[seen]))
     before, after = (np.abs(values - place.albedo).mean(axis=2) for values in (clean.albedo, corrected.albedo))
     assert after[poor].mean() < 0.8 * before[poor].mean(), "what was seen badly gives way"
     assert after[well].mean() < 1.1 * before[well].mean(), "what was seen well stays"
 
 
-def _snow_above(line_m: float) -> KnownAlbedo:
+def _snow_above(line_m: float) -> AlbedoEstimate:
     """A cone with snow above a line that is 400 m higher in the south."""
     side = 60
     row, column = np.divmod(np.arange(side * side), side)
@@ -369,7 +369,7 @@ def _snow_above(line_m: float) -> KnownAlbedo:
     bare = np.array([0.15, 0.12, 0.06])
     albedo = (bare + share[:, None] * (0.8 - bare)).reshape(side, side, 3).astype(np.float32)
     every = np.ones((side, side), np.uint8)
-    return KnownAlbedo(albedo, np.full((side, side), 0.01, np.float32), every, every)
+    return AlbedoEstimate(albedo, np.full((side, side), 0.01, np.float32), every, every)
 
 
 def test_dates_are_grouped_by_their_snow():

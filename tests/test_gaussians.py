@@ -33,12 +33,12 @@ from seasonscapes.gaussians.interchange import (  # noqa: E402
     write_ply,
     write_training_views,
 )
-from seasonscapes.gaussians.model import GaussianModel, bytes_each, load_model, model_from, save_model  # noqa: E402
+from seasonscapes.gaussians.model import GaussianModel, bytes_per_gaussian, load_model, model_from, save_model  # noqa: E402
 from seasonscapes.gaussians.rasterise import (  # noqa: E402
     Splats,
-    choose_threads,
     rasterise,
     rotations,
+    set_torch_threads,
     splat_colours,
     splats_from,
     view_weights,
@@ -48,13 +48,13 @@ from seasonscapes.gaussians.rasterise_reference import rasterise_reference  # no
 from seasonscapes.gaussians.splat_view import (  # noqa: E402
     SPLAT_LIMITS,
     draw_layers,
-    learned_numbers,
+    learned_parameters,
     model_colours,
     model_weights,
     render_model,
 )
 from seasonscapes.gaussians.surfels import axes_from_quaternions, surfel_albedo, terrain_surfels  # noqa: E402
-from seasonscapes.gaussians.tile_tree import joined_shapes, select_tiles, tile_bounds, tile_discs, tile_tree  # noqa: E402
+from seasonscapes.gaussians.tile_tree import concatenate_tiles, select_tiles, tile_bounds, tile_discs, tile_tree  # noqa: E402
 from seasonscapes.gaussians.training import Schedule, SurfaceTargets, TrainingFrame, fit_code, surface_targets, train  # noqa: E402
 from seasonscapes.rendering.hemisphere_rays import ray_scene  # noqa: E402
 from seasonscapes.rendering.horizon_angles import horizon_angles  # noqa: E402
@@ -65,7 +65,7 @@ from seasonscapes.rendering.splatting import splat_layers, upload_splats  # noqa
 from seasonscapes.sky.illumination import Illumination, global_horizontal_illuminance  # noqa: E402
 from seasonscapes.terrain.attributes import vertex_normals  # noqa: E402
 
-choose_threads(1)
+set_torch_threads(1)
 CAMERA = Camera(24, 20, 26.0, 24.0, 12.5, 9.5, np.eye(4))
 
 
@@ -182,7 +182,7 @@ LIGHTS = [light(100.0, 12.0), light(180.0, 40.0), light(250.0, 25.0)]
 
 def appearance(hill, kind: str = "full", *, seed: int = 0, times: int = 3) -> Appearance:
     _, surfels, _, albedo, transport = hill
-    around = neighbourhood_mean(surfels.means, albedo, surfels.plan.spacing_m)
+    around = neighbourhood_mean(surfels.means, albedo, surfels.grid.spacing_m)
     return Appearance(
         kind, albedo[None], around[None], transport, fourier_embedding(surfels.means), times=times, seed=seed
     )
@@ -323,7 +323,7 @@ def model(hill, told) -> GaussianModel:
         transport,
         kind="full",
         frame=FRAME,
-        appearance=learned_numbers(trained),
+        appearance=learned_parameters(trained),
         note={"seed": 0},
     )
 
@@ -341,7 +341,7 @@ def test_model_survives_its_file(model, tmp_path):
     for each in LIGHTS:
         before, after = model_colours(model, each, 100.0)[0], model_colours(again, each, 100.0)[0]
         assert np.sqrt(np.mean((after - before) ** 2)) < 0.01 * before.mean()
-    assert bytes_each(model) <= 100.5
+    assert bytes_per_gaussian(model) <= 100.5
     (tmp_path / "other.safetensors").write_bytes(b"no")
     with pytest.raises(InputError, match="not a safetensors file"):
         load_model(tmp_path / "other.safetensors")
@@ -357,7 +357,7 @@ def test_a_picture_has_terrain_air_and_sky(hill, model):
     np.testing.assert_allclose(view.radiance[0, 0], [2000.0, 2600.0, 3600.0], rtol=0.01)
     assert np.isinf(view.depth[0, 0])
     mesh = hill[2]
-    truth, covered = path_trace(relight(mesh, LIGHTS[1], max_height_m=160.0), camera, spp=64)
+    truth, covered = path_trace(relight(mesh, LIGHTS[1]), camera, spp=64)
     solid = (covered > 0.999) & (view.coverage > 0.999)
     assert view.surface[solid].mean() == pytest.approx(truth[solid].mean(), rel=0.03)
 
@@ -558,7 +558,7 @@ def test_tiles_cover_the_land_once_and_are_fine_where_near():
     assert max(far) < 4
     normals = vertex_normals(terrain)
     made = [tile_discs(terrain, tree, tile, normals=normals) for tile in tiles]
-    shapes = joined_shapes(made, low)
+    shapes = concatenate_tiles(made, low)
     assert len(shapes[0]) == sum(16 * 16 for _ in tiles)
     pose[:3, 3] = 0.0
     coverage = view_weights(splats_from(*shapes), replace(low, world_from_camera=pose), subpixels=2).coverage

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from seasonscapes.albedo.closed_form import HIGHEST, LOWEST, AlbedoFit
-from seasonscapes.albedo.standard_error import KnownAlbedo, finite_sigma
+from seasonscapes.albedo.standard_error import AlbedoEstimate, observed_sigma
 from seasonscapes.terrain.surface import Texture
 from seasonscapes.texturing.completion import complete
 from seasonscapes.texturing.predictors import Predictors
@@ -45,10 +45,16 @@ def complete_albedo(
     sigma : numpy.ndarray
         Standard error ``(R, S)`` float32.
     """
-    sigma = finite_sigma(fit)
+    sigma = observed_sigma(fit)
     # Relative precision: the completion compares cube roots, in which equal relative errors are about equally large.
     weight = np.square(fit.albedo[..., 1] / np.maximum(sigma, 1e-4)).astype(np.float32)
-    completed = complete(Texture(fit.albedo, weight), predictors, base=base, fast=True, seed=seed, progress=progress)
+    completed = complete(
+        Texture(fit.albedo, weight),
+        predictors,
+        base=base,
+        options=CompletionOptions(fast=True, seed=seed),
+        progress=progress,
+    )
     values = np.clip(completed.values, LOWEST, HIGHEST)
     if base is None:
         return values, np.where(weight > 0.0, sigma, completed.sigma).astype(np.float32)
@@ -56,14 +62,14 @@ def complete_albedo(
     return values, combined.astype(np.float32)
 
 
-def complete_known(
-    known: KnownAlbedo,
+def completed_estimate(
+    known: AlbedoEstimate,
     fit: AlbedoFit,
     base: np.ndarray | None,
     predictors: Predictors,
     *,
     progress: Callable[[float], None] | None = None,
-) -> KnownAlbedo:
+) -> AlbedoEstimate:
     """Fill the texels of the surface that no photograph measured; they are marked as completed (source 2).
 
     Parameters
@@ -75,7 +81,7 @@ def complete_known(
 
     Returns
     -------
-    KnownAlbedo
+    AlbedoEstimate
         With a finite σ on the whole surface.
     """
     albedo, sigma = complete_albedo(fit, base, predictors, progress=progress)

@@ -48,35 +48,35 @@ class MixedAir:
     ----------
     first, second
         Aerial perspectives of the two visibilities.
-    share
+    fraction
         Weight of the second, in [0, 1].
     """
 
     first: AerialPerspective
     second: AerialPerspective
-    share: float
+    fraction: float
 
     def __call__(self, depth_m: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return transmittance and airlight; see `AerialPerspective`."""
         first, second = self.first(depth_m, direction), self.second(depth_m, direction)
-        return _mixed(first[0], second[0], self.share), _mixed(first[1], second[1], self.share)
+        return _mixed(first[0], second[0], self.fraction), _mixed(first[1], second[1], self.fraction)
 
 
-def _mixed(a: np.ndarray, b: np.ndarray, share: float) -> np.ndarray:
+def _mixed(a: np.ndarray, b: np.ndarray, fraction: float) -> np.ndarray:
     """Geometric interpolation; zero where both values are zero."""
     tiny = 1e-12
-    mixed = np.exp((1.0 - share) * np.log(np.maximum(a, tiny)) + share * np.log(np.maximum(b, tiny)))
+    mixed = np.exp((1.0 - fraction) * np.log(np.maximum(a, tiny)) + fraction * np.log(np.maximum(b, tiny)))
     return np.where((np.asarray(a) <= 0.0) & (np.asarray(b) <= 0.0), 0.0, mixed)
 
 
-def mixed_light(first: Illumination, second: Illumination, share: float) -> Illumination:
+def mixed_light(first: Illumination, second: Illumination, fraction: float) -> Illumination:
     """Interpolate geometrically between two lights of one instant under different visibility.
 
     Parameters
     ----------
     first, second
         The two lights.
-    share
+    fraction
         Weight of the second, in [0, 1].
 
     Returns
@@ -88,15 +88,15 @@ def mixed_light(first: Illumination, second: Illumination, share: float) -> Illu
     def body(a: Luminary | None, b: Luminary | None) -> Luminary | None:
         if a is None or b is None:
             return a if b is None else b
-        return replace(a, normal_illuminance_lx=_mixed(a.normal_illuminance_lx, b.normal_illuminance_lx, share))
+        return replace(a, normal_illuminance_lx=_mixed(a.normal_illuminance_lx, b.normal_illuminance_lx, fraction))
 
     air = None
     if first.aerial_perspective is not None and second.aerial_perspective is not None:
-        air = MixedAir(first.aerial_perspective, second.aerial_perspective, share)
-    sky = _mixed(first.sky_radiance, second.sky_radiance, share).astype(np.float32)
+        air = MixedAir(first.aerial_perspective, second.aerial_perspective, fraction)
+    sky = _mixed(first.sky_radiance, second.sky_radiance, fraction).astype(np.float32)
     visible = None
     if first.visible_sky is not None and second.visible_sky is not None:
-        visible = _mixed(first.visible_sky, second.visible_sky, share).astype(np.float32)
+        visible = _mixed(first.visible_sky, second.visible_sky, fraction).astype(np.float32)
     return replace(
         first,
         sky_radiance=sky,
@@ -114,7 +114,7 @@ def fit_visibility(
     *,
     visibilities_km: Sequence[float] = VISIBILITIES_KM,
     noise_model: NoiseModel = LINEAR,
-    share: float = 0.2,
+    fraction: float = 0.2,
     seed: int = 0,
     start: AlbedoFit | None = None,
     progress: Callable[[float], None] | None = None,
@@ -134,7 +134,7 @@ def fit_visibility(
         Nodes of the search [km], at least three.
     noise_model
         Standard deviations that weight the residuals.
-    share
+    fraction
         Fraction of the pixels used.
     seed
         Seed of the drawn pixels.
@@ -159,7 +159,7 @@ def fit_visibility(
     nodes = sorted(map(float, visibilities_km))
     if len(nodes) < 3:
         raise ValueError(f"fit_visibility: got {len(nodes)} visibilities, expected at least three")
-    thinned = thinned_photographs(photographs, share, seed)
+    thinned = thinned_photographs(photographs, fraction, seed)
     lights: dict[float, Sequence[Illumination]] = {}
     costs: dict[float, float] = {}
     albedo = None if start is None else start.albedo
@@ -209,8 +209,8 @@ def _lights_at(
     upper = next(i for i, value in enumerate(nodes) if value > visibility_km)
     low, high = nodes[upper - 1], nodes[upper]
     # The logarithm of light is almost linear in extinction, which is proportional to 1 / visibility.
-    share = (1.0 / visibility_km - 1.0 / low) / (1.0 / high - 1.0 / low)
-    return [mixed_light(a, b, share) for a, b in zip(node(low), node(high), strict=True)]
+    fraction = (1.0 / visibility_km - 1.0 / low) / (1.0 / high - 1.0 / low)
+    return [mixed_light(a, b, fraction) for a, b in zip(node(low), node(high), strict=True)]
 
 
 def _parabola_minimum(x: Sequence[float], y: Sequence[float]) -> float:

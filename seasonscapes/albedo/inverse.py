@@ -57,8 +57,8 @@ class InverseOptions:
         Resolution of the albedo correction in each stage: 4 means one value per 4 × 4 texels, 1 the texels themselves.
     iterations
         Iterations in each stage.
-    pictures
-        Photographs per iteration.
+    photographs_per_iteration
+        Photographs drawn in each iteration.
     spp
         Samples per pixel.
     max_depth
@@ -77,7 +77,7 @@ class InverseOptions:
     unknowns: tuple[str, ...] = ("albedo", "log_gain")
     levels: tuple[int, ...] = (4, 1)
     iterations: int = 60
-    pictures: int = 2
+    photographs_per_iteration: int = 2
     spp: int = 8
     max_depth: int = 6
     held_out: float = 0.12
@@ -276,7 +276,9 @@ def _run_stage(
     rng = np.random.default_rng((options.seed, state.stage, first))
     mean: dict[str, np.ndarray] | None = None
     for iteration in range(first, options.iterations):
-        chosen = rng.choice(problem.training, min(options.pictures, len(problem.training)), replace=False)
+        chosen = rng.choice(
+            problem.training, min(options.photographs_per_iteration, len(problem.training)), replace=False
+        )
         loss = 0.0
         for index in chosen:
             unknowns = _unknowns(problem, optimizer, base, level, state.values)

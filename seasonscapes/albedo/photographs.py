@@ -147,14 +147,14 @@ def prepare_photographs(
     return [photographs[i] for i in range(len(observations))]
 
 
-def thinned_photographs(photographs: Sequence[AlbedoPhotograph], share: float, seed: int) -> list[AlbedoPhotograph]:
+def thinned_photographs(photographs: Sequence[AlbedoPhotograph], fraction: float, seed: int) -> list[AlbedoPhotograph]:
     """Draw a random subset of the terrain pixels of photographs.
 
     Parameters
     ----------
     photographs
         Photographs of one camera share their footprints, and receive the same subset.
-    share
+    fraction
         Fraction of the pixels to keep.
     seed
         Seed of the draw.
@@ -164,14 +164,14 @@ def thinned_photographs(photographs: Sequence[AlbedoPhotograph], share: float, s
     list of AlbedoPhotograph
         Photographs in the same order.
     """
-    if share >= 1.0:
+    if fraction >= 1.0:
         return list(photographs)
     rng = np.random.default_rng(seed)
     thinned: dict[int, tuple[Footprints, CameraAtmosphere]] = {}
     result = []
     for photograph in photographs:
         if id(photograph.footprints) not in thinned:
-            part = thinned_footprints(photograph.footprints, rng.random(len(photograph.footprints.pixel)) < share)
+            part = thinned_footprints(photograph.footprints, rng.random(len(photograph.footprints.pixel)) < fraction)
             thinned[id(photograph.footprints)] = (part, replace(camera_atmosphere(part), sky=photograph.atmosphere.sky))
         footprints, atmosphere = thinned[id(photograph.footprints)]
         result.append(replace(photograph, footprints=footprints, atmosphere=atmosphere))

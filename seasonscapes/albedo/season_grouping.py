@@ -9,14 +9,14 @@ from datetime import date
 import numpy as np
 
 from seasonscapes.albedo.seasons import day_number, snow_share
-from seasonscapes.albedo.standard_error import KnownAlbedo
+from seasonscapes.albedo.standard_error import AlbedoEstimate
 
 # Two dates belong to one season if the fraction of texels whose snow changed is below the first limit, and the fraction
 # whose colour changed is below the second.
 _SNOW_CHANGED, _COLOUR_CHANGED = 0.04, 0.12
 
 
-def group_dates(days: Sequence[date], known: Sequence[KnownAlbedo]) -> list[list[int]]:
+def group_dates(days: Sequence[date], known: Sequence[AlbedoEstimate]) -> list[list[int]]:
     """Group dates that are consecutive in the year and have the same snow cover and colours.
 
     Only texels measured on both of two dates are compared.
@@ -48,7 +48,7 @@ def group_dates(days: Sequence[date], known: Sequence[KnownAlbedo]) -> list[list
     return groups
 
 
-def _same_season(a: KnownAlbedo, b: KnownAlbedo) -> bool:
+def _same_season(a: AlbedoEstimate, b: AlbedoEstimate) -> bool:
     both = (a.source == 1) & (b.source == 1)
     if both.sum() < 20:
         return False
@@ -58,7 +58,7 @@ def _same_season(a: KnownAlbedo, b: KnownAlbedo) -> bool:
     return bool(snow.mean() < _SNOW_CHANGED and colour.mean() < _COLOUR_CHANGED)
 
 
-def share_unchanged(dated: Sequence[KnownAlbedo]) -> list[KnownAlbedo]:
+def share_unchanged(dated: Sequence[AlbedoEstimate]) -> list[AlbedoEstimate]:
     """Replace texels that did not change between dates by their inverse-variance weighted mean.
 
     A texel is unchanged if it is measured on at least two dates and agrees with the mean within two standard deviations
@@ -72,7 +72,7 @@ def share_unchanged(dated: Sequence[KnownAlbedo]) -> list[KnownAlbedo]:
 
     Returns
     -------
-    list of KnownAlbedo
+    list of AlbedoEstimate
         Albedos in the same order, with joint means and standard deviations.
     """
     if len(dated) < 2:

@@ -25,7 +25,7 @@ _POOR, _FEWEST_PIXELS = 0.35, 0.5
 
 
 @dataclass(frozen=True)
-class KnownAlbedo:
+class AlbedoEstimate:
     """An albedo texture with its uncertainty.
 
     Parameters
@@ -72,7 +72,7 @@ def texel_sigma(fit: AlbedoFit) -> np.ndarray:
     return np.where((fit.pixel_count > 0.0) & (fit.information > 0.0), sigma, np.inf).astype(np.float32)
 
 
-def finite_sigma(fit: AlbedoFit) -> np.ndarray:
+def observed_sigma(fit: AlbedoFit) -> np.ndarray:
     """Standard deviation of all observed texels, poorly determined ones included, for use in weights.
 
     Parameters
@@ -113,7 +113,9 @@ def times_sunlit(photographs: Sequence[AlbedoPhotograph]) -> np.ndarray:
     return np.minimum(count, 255).astype(np.uint8).reshape(shape)
 
 
-def known_albedo(transport: TexelTransport, photographs: Sequence[AlbedoPhotograph], fit: AlbedoFit) -> KnownAlbedo:
+def albedo_estimate(
+    transport: TexelTransport, photographs: Sequence[AlbedoPhotograph], fit: AlbedoFit
+) -> AlbedoEstimate:
     """Combine the albedo of a fit with its uncertainty.
 
     Parameters
@@ -127,7 +129,7 @@ def known_albedo(transport: TexelTransport, photographs: Sequence[AlbedoPhotogra
 
     Returns
     -------
-    KnownAlbedo
+    AlbedoEstimate
         Texels that are not measured hold the median albedo with infinite standard deviation.
 
     Raises
@@ -135,12 +137,12 @@ def known_albedo(transport: TexelTransport, photographs: Sequence[AlbedoPhotogra
     NotEnoughEvidence
         If no texel is measured.
     """
-    sigma = finite_sigma(fit)
+    sigma = observed_sigma(fit)
     measured = np.zeros(transport.shape[0] * transport.shape[1], bool)
     measured[transport.texel] = True
     measured = measured.reshape(transport.shape) & (sigma < _POOR * fit.albedo[..., 1] + 0.02)
     if not measured.any():
-        raise NotEnoughEvidence("known_albedo: no texel is measured: too few pixels or too large a standard error")
+        raise NotEnoughEvidence("albedo_estimate: no texel is measured: too few pixels or too large a standard error")
     albedo = np.where(measured[..., None], fit.albedo, np.median(fit.albedo[measured], axis=0)).astype(np.float32)
     sigma = np.where(measured, sigma, np.inf).astype(np.float32)
-    return KnownAlbedo(albedo, sigma, times_sunlit(photographs), measured.astype(np.uint8))
+    return AlbedoEstimate(albedo, sigma, times_sunlit(photographs), measured.astype(np.uint8))

@@ -92,7 +92,7 @@ def fit_tone_curve(
     *,
     strengths: Sequence[float] = STRENGTHS,
     noise_model: NoiseModel = EIGHT_BIT,
-    share: float = 0.2,
+    fraction: float = 0.2,
     start: AlbedoFit | None = None,
     seed: int = 0,
     progress: Callable[[float], None] | None = None,
@@ -109,7 +109,7 @@ def fit_tone_curve(
         Strengths to try, rising, at least three; the minimum is refined by a parabola.
     noise_model
         Standard deviations that weight the residuals.
-    share
+    fraction
         Fraction of the pixels used.
     start
         Initial albedo fit.
@@ -133,7 +133,7 @@ def fit_tone_curve(
     report = progress or (lambda fraction: None)
     if len(strengths) < 3:
         raise ValueError(f"fit_tone_curve: got {len(strengths)} strengths, expected at least three")
-    thinned = thinned_photographs(photographs, share, seed)
+    thinned = thinned_photographs(photographs, fraction, seed)
     costs: dict[float, float] = {}
 
     def cost_at(strength: float) -> float:

@@ -64,13 +64,13 @@ def splat_command(
     from seasonscapes.exposure import develop, exposure_ev100, parse_exposure
     from seasonscapes.gaussians.interchange import write_gltf, write_ply
     from seasonscapes.gaussians.model import load_model
-    from seasonscapes.gaussians.rasterise import choose_threads
+    from seasonscapes.gaussians.rasterise import set_torch_threads
     from seasonscapes.images import write_exr
     from seasonscapes.workflows.illumination import illumination_for_camera
     from seasonscapes.workflows.pictures import png_metadata, save_png
     from seasonscapes.workflows.view_rendering import sun_angles
 
-    choose_threads(1)
+    set_torch_threads(1)
     metering, size_px, declared = parse_exposure(exposure), view.size_px(), sky.model()
     splats = load_model(model)
     with progress_bars() as progress:

@@ -17,7 +17,7 @@ import numpy as np
 from seasonscapes.frames import direction_from_angles
 from seasonscapes.gaussians.surfels import Surfels
 from seasonscapes.sky.illumination import Illumination, Luminary, global_horizontal_illuminance, uniform_sky
-from seasonscapes.terrain.attributes import plan_blur
+from seasonscapes.terrain.attributes import horizontal_gaussian_mean
 
 if TYPE_CHECKING:
     from seasonscapes.rendering.hemisphere_rays import RayScene
@@ -178,10 +178,10 @@ def trace_disc_transport(
         progress=lambda fraction: report(0.4 + 0.4 * fraction),
     )
     device_points = upload_points(ray_scene, traced)
-    surroundings = neighbourhood_mean(surfels.means, albedo, surfels.plan.spacing_m).mean(axis=1)
+    surroundings = neighbourhood_mean(surfels.means, albedo, surfels.grid.spacing_m).mean(axis=1)
 
     def reflected(light: Illumination) -> np.ndarray:
-        return irradiance(device_points, light, sun_rays_each=1).bounce.mean(axis=1)
+        return irradiance(device_points, light, sun_rays_per_point=1).bounce.mean(axis=1)
 
     bounce = _bounce_coefficients(reflected) / surroundings
     report(1.0)
@@ -226,7 +226,7 @@ def centre_coefficients(
     from seasonscapes.rendering.irradiance import surface_at
     from seasonscapes.rendering.transport import SamplingOptions, trace_points
 
-    points, found = surface_at(ray_scene, surfels.places[:, surfels.places.shape[1] // 2 - 3])
+    points, found = surface_at(ray_scene, surfels.sample_points[:, surfels.sample_points.shape[1] // 2 - 3])
     if len(found) != len(surfels.means):
         raise ValueError(
             f"{len(surfels.means) - len(found)} discs have no terrain below them; "
@@ -265,7 +265,7 @@ def neighbourhood_mean(means: np.ndarray, albedo: np.ndarray, spacing_m: float) 
     numpy.ndarray
         ``(N, 3)``, at least 0.001.
     """
-    return np.maximum(plan_blur(means, albedo, spacing_m, NEIGHBOURHOOD_SIGMA_M), 1e-3)
+    return np.maximum(horizontal_gaussian_mean(means, albedo, spacing_m, NEIGHBOURHOOD_SIGMA_M), 1e-3)
 
 
 @dataclass(frozen=True)
@@ -380,13 +380,13 @@ def surfel_irradiance(
     """
     from seasonscapes.rendering.irradiance import irradiance, surface_at, upload_points
     from seasonscapes.rendering.receivers import luminaries
-    from seasonscapes.rendering.sun_visibility import cosine_seen, numbered_turn, sun_rays
+    from seasonscapes.rendering.sun_visibility import hashed_disc_offset, sun_rays, visible_cosine
 
     report = progress or (lambda fraction: None)
     device_points = upload_points(ray_scene, centre_coefficients(ray_scene, surfels, rays=rays, rank=32, seed=seed))
     report(0.3)
-    count, samples = surfels.places.shape[:2]
-    points, found = surface_at(ray_scene, surfels.places.reshape(-1, 3))
+    count, samples = surfels.sample_points.shape[:2]
+    points, found = surface_at(ray_scene, surfels.sample_points.reshape(-1, 3))
     if len(found) != count * samples:
         raise ValueError("sample points of discs have no terrain below them; use the terrain the discs were made from")
     points = points.reshape(count, samples)
@@ -394,15 +394,15 @@ def surfel_irradiance(
         ray_scene,
         points.origin,
         points.normal,
-        points.outward,
+        points.geometric_normal,
         np.full((count, samples), 1.0 / samples, np.float32),
-        numbered_turn(np.arange(count)),
+        hashed_disc_offset(np.arange(count)),
     )
     result = np.empty((len(lights), count, 3), np.float32)
     for number, light in enumerate(lights):
-        received = irradiance(device_points, light, sun_rays_each=1)
+        received = irradiance(device_points, light, sun_rays_per_point=1)
         result[number] = received.sky + received.bounce
         for body in luminaries(light):
-            result[number] += cosine_seen(sun, body).mean(axis=1)[:, None] * np.asarray(body.normal_illuminance_lx)
+            result[number] += visible_cosine(sun, body).mean(axis=1)[:, None] * np.asarray(body.normal_illuminance_lx)
         report(0.3 + 0.7 * (number + 1) / len(lights))
     return result

@@ -146,7 +146,9 @@ def training_picture(frame: TrainingFrame) -> TrainingPicture:
         (data.astype(np.float32), number[matrix.indices], matrix.indptr), shape=(pixels, len(discs))
     )
     mask = torch.as_tensor(frame.mask & (frame.weights.coverage > 0.5))
-    target = torch.where(mask[..., None], encoded(torch.as_tensor(np.nan_to_num(frame.image).astype(np.float32))), 0.0)
+    target = torch.where(
+        mask[..., None], srgb_encoded(torch.as_tensor(np.nan_to_num(frame.image).astype(np.float32))), 0.0
+    )
     return TrainingPicture(
         torch.as_tensor(discs.astype(np.int64)), forward, forward.T.tocsr(), torch.tensor(frame.time), target, mask
     )
@@ -167,7 +169,7 @@ class SparseProduct(torch.autograd.Function):
         return torch.from_numpy(context.transpose @ gradient.contiguous().numpy()), None, None
 
 
-def encoded(linear: torch.Tensor) -> torch.Tensor:
+def srgb_encoded(linear: torch.Tensor) -> torch.Tensor:
     """Encode linear values as sRGB, extended along the same curve above 1 so that gradients do not vanish there.
 
     Parameters
@@ -202,7 +204,7 @@ def picture_loss(appearance: Appearance, lights: LightTensors, picture: Training
         Scalar loss.
     """
     values = appearance(picture.discs, picture.time, lights)
-    image = encoded(SparseProduct.apply(values, picture.forward, picture.backward)).reshape(picture.target.shape)
+    image = srgb_encoded(SparseProduct.apply(values, picture.forward, picture.backward)).reshape(picture.target.shape)
     image = torch.where(picture.mask[..., None], image, 0.0)
     usable_fraction = picture.mask.float().mean()
     difference = (image - picture.target).abs().mean() / usable_fraction

@@ -55,7 +55,7 @@ class GaussianModel:
         network's ``mlp.*``.
     kind
         Kind of appearance, a name in `appearance.KINDS`.
-    plan, cell
+    grid, cell
         Grid of the discs, see `surfels.Surfels`.
     frame
         Local frame of the positions.
@@ -78,7 +78,7 @@ class GaussianModel:
     transport: DiscTransport
     appearance: dict[str, np.ndarray]
     kind: str
-    plan: SurfelGrid
+    grid: SurfelGrid
     cell: np.ndarray
     frame: LocalFrame
     note: dict[str, Any] = field(default_factory=dict)
@@ -117,7 +117,7 @@ class GaussianModel:
         """
         if len(self.days) == 1:
             return self.albedo[0]
-        attributes = attributes_at(self.means, self.transport.normals, self.plan.spacing_m)
+        attributes = attributes_at(self.means, self.transport.normals, self.grid.spacing_m)
         return albedo_at(self.albedo, self.days, day, attributes)
 
 
@@ -149,7 +149,7 @@ def model_from(
     frame
         Local frame of the positions.
     appearance
-        Learned parameters by name, from `splat_view.learned_numbers`.
+        Learned parameters by name, from `splat_view.learned_parameters`.
     note
         Plain values that record how the model was made.
 
@@ -171,7 +171,7 @@ def model_from(
         transport,
         learned,
         kind,
-        surfels.plan,
+        surfels.grid,
         surfels.cell,
         frame,
         note or {},
@@ -195,7 +195,7 @@ def save_model(model: GaussianModel, path: str | os.PathLike[str]) -> None:
     """
     from safetensors.numpy import save_file
 
-    tensors, header = packed(model)
+    tensors, header = pack_model(model)
     with atomic_path(path) as temporary:
         save_file(
             {name: np.ascontiguousarray(values) for name, values in tensors.items()},
@@ -235,10 +235,10 @@ def load_model(path: str | os.PathLike[str]) -> GaussianModel:
         raise InputError(where, f"not a safetensors file: {error}") from None
     if metadata.get("format") != FORMAT:
         raise InputError(where, "not a Gaussian model", got=str(metadata.get("format")), expected=FORMAT)
-    return unpacked(tensors, json.loads(metadata["facts"]))
+    return unpack_model(tensors, json.loads(metadata["facts"]))
 
 
-def packed(model: GaussianModel) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def pack_model(model: GaussianModel) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Quantise the arrays of a model for storage.
 
     Parameters
@@ -258,13 +258,13 @@ def packed(model: GaussianModel) -> tuple[dict[str, np.ndarray], dict[str, Any]]
     ValueError
         If the geometry does not follow from grid and normals, so that it would be lost.
     """
-    shape = disc_shapes(model.transport.normals, model.plan.spacing_m)
+    shape = disc_shapes(model.transport.normals, model.grid.spacing_m)
     for name, expected in zip(("quaternions", "log_scales", "opacity_logits"), shape, strict=True):
         if not np.allclose(getattr(model, name), expected, atol=1e-3):
             raise ValueError(
                 f"save_model: {name} do not follow from the discs' grid and normals; export a .ply instead"
             )
-    occupied = np.zeros(model.plan.columns * model.plan.rows, bool)
+    occupied = np.zeros(model.grid.columns * model.grid.rows, bool)
     occupied[model.cell] = True
     low, high = float(model.means[:, 2].min()), float(model.means[:, 2].max())
     step = max(high - low, 1e-3) / 65535.0
@@ -288,7 +288,7 @@ def packed(model: GaussianModel) -> tuple[dict[str, np.ndarray], dict[str, Any]]
         "kind": model.kind,
         "days": model.days.tolist(),
         "height": [low, step],
-        "plan": asdict(model.plan),
+        "plan": asdict(model.grid),
         "frame": asdict(model.frame),
         "note": model.note,
         "patches": transport.patches,
@@ -297,28 +297,28 @@ def packed(model: GaussianModel) -> tuple[dict[str, np.ndarray], dict[str, Any]]
     return tensors, header
 
 
-def unpacked(tensors: dict[str, np.ndarray], header: dict[str, Any]) -> GaussianModel:
-    """Restore a model from `packed` arrays.
+def unpack_model(tensors: dict[str, np.ndarray], header: dict[str, Any]) -> GaussianModel:
+    """Restore a model from the arrays of `pack_model`.
 
     Parameters
     ----------
     tensors
         Arrays by name.
     header
-        Plain values, both from `packed`.
+        Plain values, both from `pack_model`.
 
     Returns
     -------
     GaussianModel
         The model, up to quantisation.
     """
-    plan, (low, step) = SurfelGrid(**header["plan"]), header["height"]
-    cell = np.flatnonzero(np.unpackbits(tensors["taken"])[: plan.columns * plan.rows]).astype(np.int32)
-    row, column = np.divmod(cell, plan.columns)
+    grid, (low, step) = SurfelGrid(**header["plan"]), header["height"]
+    cell = np.flatnonzero(np.unpackbits(tensors["taken"])[: grid.columns * grid.rows]).astype(np.int32)
+    row, column = np.divmod(cell, grid.columns)
     means = np.stack(
         [
-            plan.west_m + (column + 0.5) * plan.east_step_m,
-            plan.north_m - (row + 0.5) * plan.north_step_m,
+            grid.west_m + (column + 0.5) * grid.east_step_m,
+            grid.north_m - (row + 0.5) * grid.north_step_m,
             low + tensors["height"] * step,
         ],
         axis=1,
@@ -339,21 +339,21 @@ def unpacked(tensors: dict[str, np.ndarray], header: dict[str, Any]) -> Gaussian
     albedo = ((tensors["albedo"] / np.float32(255.0)) ** 2).astype(np.float32)
     return GaussianModel(
         means,
-        *disc_shapes(normals, plan.spacing_m),
+        *disc_shapes(normals, grid.spacing_m),
         features,
         albedo,
         np.array(header["days"]),
         transport,
         appearance,
         header["kind"],
-        plan,
+        grid,
         cell,
         LocalFrame(**header["frame"]),
         header["note"],
     )
 
 
-def bytes_each(model: GaussianModel) -> float:
+def bytes_per_gaussian(model: GaussianModel) -> float:
     """Compute the storage per Gaussian, with one date of albedo and without shared arrays.
 
     Parameters
@@ -366,7 +366,7 @@ def bytes_each(model: GaussianModel) -> float:
     float
         Bytes per Gaussian.
     """
-    tensors, _ = packed(model)
+    tensors, _ = pack_model(model)
     count = len(model.means)
     own = {
         name: values.nbytes

@@ -109,7 +109,7 @@ class ViewWeights:
         return np.asarray(self.matrix.sum(axis=1), np.float32).reshape(self.height_px, self.width_px)
 
 
-def choose_threads(threads: int = 1) -> None:
+def set_torch_threads(threads: int = 1) -> None:
     """Set the number of torch threads.
 
     The default number must not be used: idle threads spin, and two were 10 to 30 times slower than one.

@@ -74,7 +74,7 @@ def appearance_of(model: GaussianModel, *, albedo: np.ndarray | None = None, see
         Module with the model's learned parameters.
     """
     dated = model.albedo if albedo is None else albedo[None]
-    surroundings = np.stack([neighbourhood_mean(model.means, values, model.plan.spacing_m) for values in dated])
+    surroundings = np.stack([neighbourhood_mean(model.means, values, model.grid.spacing_m) for values in dated])
     embedding = model.features if model.features.shape[1] else fourier_embedding(model.means)
     codes = model.appearance.get("codes")
     times = 1 if codes is None else len(codes)
@@ -85,7 +85,7 @@ def appearance_of(model: GaussianModel, *, albedo: np.ndarray | None = None, see
     return appearance
 
 
-def learned_numbers(appearance: Appearance) -> dict[str, np.ndarray]:
+def learned_parameters(appearance: Appearance) -> dict[str, np.ndarray]:
     """Copy the trainable parameters of an appearance to numpy, for `model.model_from`.
 
     Parameters
@@ -332,7 +332,7 @@ def composite_with_air(
     numpy.ndarray
         ``(H, W, 3)`` float32 radiance at the camera [cd/m²].
     """
-    from seasonscapes.rendering.air_grid import open_sky, sky_grid
+    from seasonscapes.rendering.air_grid import sky_grid, sky_pixel_radiance
 
     image = surface.reshape(-1, 3).astype(np.float32)
     flat_coverage = coverage.ravel()
@@ -342,7 +342,7 @@ def composite_with_air(
         image[terrain] = image[terrain] * transmittance + airlight * flat_coverage[terrain, None]
     open_pixels = np.flatnonzero(flat_coverage < 1.0)
     if len(open_pixels):
-        sky = open_sky(sky_grid(camera, open_pixels), illumination, float(np.degrees(1.0 / camera.fx)))
+        sky = sky_pixel_radiance(sky_grid(camera, open_pixels), illumination, float(np.degrees(1.0 / camera.fx)))
         image[open_pixels] += (1.0 - flat_coverage[open_pixels, None]) * sky
     return image.reshape(surface.shape)
 
@@ -351,11 +351,11 @@ def _air(
     camera: Camera, air: AerialPerspective, pixel: np.ndarray, depth_m: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Transmittance and airlight ``(n, 3)`` of pixels: from a coarse grid, or pixel by pixel on the scalar variant."""
-    from seasonscapes.rendering.air_grid import air_at, air_places
+    from seasonscapes.rendering.air_grid import air_grid, interpolate_air
 
     if use_backend().device == "scalar":
         row, column = np.divmod(pixel, camera.width_px)
         transmittance, airlight = air(depth_m, ray_directions(camera, np.stack([column, row], axis=-1) + 0.5))
         return np.asarray(transmittance, np.float32), np.asarray(airlight, np.float32)
     no_mixed_pixels = (np.zeros(0, np.int64), np.zeros((0, 1), np.float32))
-    return air_at(air_places(camera, pixel, depth_m, *no_mixed_pixels), air)
+    return interpolate_air(air_grid(camera, pixel, depth_m, *no_mixed_pixels), air)

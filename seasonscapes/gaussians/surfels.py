@@ -60,7 +60,7 @@ class Surfels:
 
     Parameters
     ----------
-    plan, cell
+    grid, cell
         The grid, and each disc's flat index in it ``(N,)`` int32, rows from the north.
     means
         ``(N, 3)`` float32 ENU [m].
@@ -72,20 +72,20 @@ class Surfels:
         ``(N,)`` float32.
     normals
         ``(N, 3)`` float32 mean shading normal over the cell; its length is below 1 where the surface is rough.
-    places
+    sample_points
         ``(N, S, 3)`` float32 sample points of each cell on the surface, ENU [m].
     uv
         ``(N, S, 2)`` float32 atlas coordinates of the sample points.
     """
 
-    plan: SurfelGrid
+    grid: SurfelGrid
     cell: np.ndarray
     means: np.ndarray
     quaternions: np.ndarray
     log_scales: np.ndarray
     opacity_logits: np.ndarray
     normals: np.ndarray
-    places: np.ndarray
+    sample_points: np.ndarray
     uv: np.ndarray
 
 
@@ -128,11 +128,11 @@ def terrain_surfels(
         raise ValueError(
             f"spacing_m: got {spacing_m}, expected at most the grid's width of {min(east - west, north - south):.0f} m"
         )
-    plan = SurfelGrid(
+    grid = SurfelGrid(
         float(west), float(north), float(east - west) / columns, float(north - south) / rows, columns, rows
     )
     normals = vertex_normals(terrain) if normals is None else normals
-    positions, normals, uv = _cells(_within(terrain, (west, south, east, north)), plan, normals)
+    positions, normals, uv = _cells(_within(terrain, (west, south, east, north)), grid, normals)
     whole = np.isfinite(positions).all(axis=(1, 2))
     if not whole.any():
         raise ValueError(
@@ -141,9 +141,9 @@ def terrain_surfels(
     positions, normals, uv = positions[whole], normals[whole], uv[whole]
     means = positions.mean(axis=1, dtype=np.float64).astype(np.float32)
     mean_normal = normals.mean(axis=1)
-    shape = disc_shapes(mean_normal, plan.spacing_m)
+    shape = disc_shapes(mean_normal, grid.spacing_m)
     return Surfels(
-        plan, np.flatnonzero(whole).astype(np.int32), means, *shape, mean_normal.astype(np.float32), positions, uv
+        grid, np.flatnonzero(whole).astype(np.int32), means, *shape, mean_normal.astype(np.float32), positions, uv
     )
 
 
@@ -180,11 +180,11 @@ def disc_shapes(normals: np.ndarray, spacing_m: float) -> tuple[np.ndarray, np.n
     )
 
 
-def _cells(terrain: Terrain, plan: SurfelGrid, at_vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _cells(terrain: Terrain, grid: SurfelGrid, at_vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Positions, normals and atlas coordinates ``(cells, S, ...)`` of the cells' sample points; NaN off the terrain."""
-    width, height = plan.columns, plan.rows
-    low = np.array([plan.west_m, plan.north_m - height * plan.north_step_m])
-    flat = (terrain.vertices[:, :2] - low) / [width * plan.east_step_m, height * plan.north_step_m]
+    width, height = grid.columns, grid.rows
+    low = np.array([grid.west_m, grid.north_m - height * grid.north_step_m])
+    flat = (terrain.vertices[:, :2] - low) / [width * grid.east_step_m, height * grid.north_step_m]
     top_down = replace(terrain, uv=flat)
     columns, rows = width * SUBCELLS, height * SUBCELLS
     positions, face_id = texel_positions(top_down, columns, rows)

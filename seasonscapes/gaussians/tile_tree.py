@@ -202,11 +202,11 @@ def tile_discs(terrain: Terrain, tree: TileTree, tile: TreeTile, *, normals: np.
     bounds = tile_bounds(tree, tile)
     surfels = terrain_surfels(terrain, tree.spacing_m(tile.level), bounds_m=bounds, normals=normals)
     origin = np.array([0.5 * (bounds[0] + bounds[2]), 0.5 * (bounds[1] + bounds[3]), tree.low_m])
-    means = surfels.places.mean(axis=1, dtype=np.float64) - origin
+    means = surfels.sample_points.mean(axis=1, dtype=np.float64) - origin
     return TileDiscs(tile, origin, replace(surfels, means=means.astype(np.float32)))
 
 
-def joined_shapes(tiles: list[TileDiscs], camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def concatenate_tiles(tiles: list[TileDiscs], camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Concatenate the discs of tiles, relative to a camera.
 
     They are to be rendered by the same camera moved to the origin, so that near discs have small coordinates.

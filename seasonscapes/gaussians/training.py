@@ -26,12 +26,12 @@ from seasonscapes.gaussians.disc_transport import LightState
 from seasonscapes.gaussians.losses import (
     SparseProduct,
     TrainingFrame,
-    encoded,
     picture_loss,
+    srgb_encoded,
     surface_loss,
     training_picture,
 )
-from seasonscapes.gaussians.rasterise import choose_threads
+from seasonscapes.gaussians.rasterise import set_torch_threads
 from seasonscapes.images import atomic_path
 
 Progress = Callable[[float], None]
@@ -64,7 +64,7 @@ class Schedule:
     checkpoint_every
         Steps between checkpoints.
     threads
-        Number of torch threads; see `rasterise.choose_threads`.
+        Number of torch threads; see `rasterise.set_torch_threads`.
 
     Raises
     ------
@@ -188,7 +188,7 @@ def train(
         If the loss is not finite.
     """
     schedule = schedule or Schedule()
-    choose_threads(schedule.threads)
+    set_torch_threads(schedule.threads)
     if not frames:
         schedule = replace(schedule, picture_steps=0)
     optimiser = _optimiser(appearance)
@@ -289,7 +289,7 @@ def fit_code(
         weights = weights[:, visible]
         values = appearance(picture.discs[torch.from_numpy(visible).long()], picture.time, lights, code)
         pixels = SparseProduct.apply(values, weights, weights.T.tocsr())
-        loss = (encoded(pixels) - picture.target.reshape(-1, 3)[chosen]).abs().mean()
+        loss = (srgb_encoded(pixels) - picture.target.reshape(-1, 3)[chosen]).abs().mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()

@@ -99,7 +99,7 @@ def relit_frames(
         view = relightable_view(
             ray_scene, trace_view(ray_scene, camera, SamplingOptions(rays=256, clusters=LIGHT_CLUSTERS), seed=seed)
         )
-        weights = view_weights(facing(surfels, camera), camera, subpixels=2)
+        weights = view_weights(front_facing_splats(surfels, camera), camera, subpixels=2)
         for time, light, state in lights:
             image = relight_view(view, light).surface * np.float32(np.pi / state.global_lx)
             frames.append(TrainingFrame(weights, time, image, view.coverage > 0.999))
@@ -108,7 +108,7 @@ def relit_frames(
     return frames
 
 
-def facing(surfels: Surfels, camera: Camera) -> Splats:
+def front_facing_splats(surfels: Surfels, camera: Camera) -> Splats:
     """Return discs as splats with back-face culling, as `splat_view.splats_of`.
 
     Parameters

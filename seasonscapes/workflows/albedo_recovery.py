@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from seasonscapes.albedo.forward_model import TexelTransport
     from seasonscapes.albedo.photographs import AlbedoPhotograph
     from seasonscapes.albedo.seasons import DatedAlbedo
-    from seasonscapes.albedo.standard_error import KnownAlbedo
+    from seasonscapes.albedo.standard_error import AlbedoEstimate
     from seasonscapes.cameras.observation import Observation
     from seasonscapes.sky.illumination import Illumination
 
@@ -75,7 +75,7 @@ class RecoveredAlbedo:
     """
 
     day: date
-    known: KnownAlbedo
+    known: AlbedoEstimate
     fit: AlbedoFit
     photographs: list[AlbedoPhotograph] = field(repr=False)
     atlas_id: str
@@ -202,7 +202,7 @@ def with_terrain(transport: TexelTransport, photographs: Sequence[Observation]) 
     NoTerrainInView
         Where none is left.
     """
-    from seasonscapes.rendering.sightlines import faces_met
+    from seasonscapes.rendering.sightlines import visible_faces
 
     terrain_of: dict[bytes, np.ndarray] = {}
     kept, empty = [], set()
@@ -211,7 +211,7 @@ def with_terrain(transport: TexelTransport, photographs: Sequence[Observation]) 
         key = repr((photograph.webcam, camera.width_px, camera.height_px, camera.fx)).encode()
         key += camera.world_from_camera.tobytes()
         if key not in terrain_of:
-            terrain_of[key] = faces_met(transport.ray_scene, camera) >= 0
+            terrain_of[key] = visible_faces(transport.ray_scene, camera) >= 0
         if (terrain_of[key] & photograph.mask).any():
             kept.append(photograph)
         else:
@@ -264,12 +264,12 @@ def _solved(
     photographs: list[AlbedoPhotograph],
     iterations: int,
     progress: Progress | None,
-) -> tuple[AlbedoFit, KnownAlbedo]:
-    from seasonscapes.albedo.albedo_completion import complete_known
+) -> tuple[AlbedoFit, AlbedoEstimate]:
+    from seasonscapes.albedo.albedo_completion import completed_estimate
     from seasonscapes.albedo.closed_form import solve_albedo
     from seasonscapes.albedo.inverse import InverseOptions, refine_albedo
     from seasonscapes.albedo.photographs import EIGHT_BIT
-    from seasonscapes.albedo.standard_error import known_albedo
+    from seasonscapes.albedo.standard_error import albedo_estimate
     from seasonscapes.texturing.predictors import predictors_for
 
     report = task_progress(progress, "albedo")
@@ -286,11 +286,11 @@ def _solved(
             options=options,
             callbacks=[lambda state: refine(state.iteration / iterations)],
         ).fit
-    known = known_albedo(transport, photographs, fit)
+    known = albedo_estimate(transport, photographs, fit)
     image = orthoimage(place, photographs[0].observation.time)
     base = None if image is None else np.where(image.weight[..., None] > 0.0, image.values, np.float32(np.nan))
     report = task_progress(progress, "completing")
-    return fit, complete_known(known, fit, base, predictors_for(place.terrain, place.atlas), progress=report)
+    return fit, completed_estimate(known, fit, base, predictors_for(place.terrain, place.atlas), progress=report)
 
 
 def save_albedo_figures(recovered: RecoveredAlbedo, output: Path) -> dict[str, str]:

@@ -188,12 +188,12 @@ def distil_with_data(
     require_torch()
     from seasonscapes.gaussians.appearance import Appearance, fourier_embedding
     from seasonscapes.gaussians.model import model_from
-    from seasonscapes.gaussians.rasterise import choose_threads
-    from seasonscapes.gaussians.splat_view import learned_numbers
+    from seasonscapes.gaussians.rasterise import set_torch_threads
+    from seasonscapes.gaussians.splat_view import learned_parameters
     from seasonscapes.gaussians.training import Schedule, train
 
     options = options or DistilOptions()
-    choose_threads(1)
+    set_torch_threads(1)
     dated = [albedo] if isinstance(albedo, DatedAlbedo) else list(albedo or ())
     data = distillation_data(place, sky_model(sky), dated, options, seed=seed, progress=progress)
     appearance = Appearance(
@@ -222,7 +222,7 @@ def distil_with_data(
         data.transport,
         kind=options.kind,
         frame=place.frame,
-        appearance=learned_numbers(appearance),
+        appearance=learned_parameters(appearance),
         note=note,
     )
     return Distilled(model, data, losses)
@@ -285,7 +285,7 @@ def distillation_data(
     extent_m = float(np.ptp(place.terrain.vertices[:, :2], axis=0).max())
     surfels = terrain_surfels(place.terrain, extent_m / options.discs)
     albedo = np.stack([surfel_albedo(surfels, texture) for texture in textures])
-    around = np.stack([neighbourhood_mean(surfels.means, each, surfels.plan.spacing_m) for each in albedo])
+    around = np.stack([neighbourhood_mean(surfels.means, each, surfels.grid.spacing_m) for each in albedo])
     seasons = [number % len(days) for number in range(options.suns)]
     lights, times = draw_lights(place, model, [days[season] for season in seasons], seed=seed, progress=progress)
     received = np.empty((options.suns, len(surfels.means), 3), np.float32)
@@ -360,14 +360,14 @@ def _state(data: DistillationData, time: int) -> LightState:
 
 def distillation_record(place: Place, distilled: Distilled) -> dict[str, Any]:
     """Plain values about a distilled model."""
-    from seasonscapes.gaussians.model import bytes_each
+    from seasonscapes.gaussians.model import bytes_per_gaussian
 
     surfels, losses = distilled.data.surfels, distilled.losses
     return {
         "scene": place.scene.name,
         "gaussians": len(surfels.means),
-        "spacing_m": round(surfels.plan.spacing_m, 2),
-        "bytes_per_gaussian": round(bytes_each(distilled.model), 1),
+        "spacing_m": round(surfels.grid.spacing_m, 2),
+        "bytes_per_gaussian": round(bytes_per_gaussian(distilled.model), 1),
         "suns": len(distilled.data.times),
         "dates": distilled.data.days,
         "loss": losses[-1] if losses else None,

@@ -82,10 +82,10 @@ def render_gaussians(
     See `distil`.
     """
     require_torch()
-    from seasonscapes.gaussians.rasterise import choose_threads
+    from seasonscapes.gaussians.rasterise import set_torch_threads
     from seasonscapes.gaussians.splat_view import render_model
 
-    choose_threads(1)
+    set_torch_threads(1)
     require_scene(model, place)
     camera = view_in_frame(camera, place.frame)
     utc = utc_at(place, time)

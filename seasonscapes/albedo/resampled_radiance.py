@@ -12,7 +12,7 @@ from seasonscapes.albedo.forward_model import aerial_perspective_of
 from seasonscapes.albedo.photographs import AlbedoPhotograph
 
 
-def painted_radiance(photographs: Sequence[AlbedoPhotograph], gains: np.ndarray) -> dict[datetime, np.ndarray]:
+def resampled_radiance(photographs: Sequence[AlbedoPhotograph], gains: np.ndarray) -> dict[datetime, np.ndarray]:
     """Resample photographs onto the texture, one radiance texture per time.
 
     Gains and aerial perspective are removed, so that the texture is the product of illuminance and albedo. Each texel
