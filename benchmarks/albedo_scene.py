@@ -81,7 +81,7 @@ def low_cameras(terrain: Terrain, count: int, size_px: tuple[int, int], seed: in
     from seasonscapes.rendering.mitsuba_scene import RenderScene, mi_mesh
 
     bare = ray_scene(mi_mesh(terrain, np.full(3, 0.3)))
-    scene = RenderScene(bare.mi_scene, bare.mi_terrain, None, 0.0)
+    scene = RenderScene(bare.mi_scene, bare.mi_terrain)
     rng = np.random.default_rng(seed)
     reach = float(np.abs(terrain.vertices[:, :2]).max())
     candidates, views = [], []
@@ -157,14 +157,8 @@ def path_traced(
     from seasonscapes.rendering.radiance import render_view
 
     mesh = mi_mesh(truth.terrain, albedo)
-    top = float(truth.terrain.vertices[:, 2].max())
     chosen = range(len(truth.cameras)) if cameras is None else cameras
     return [
-        [
-            render_view(
-                relight(mesh, row[c], max_height_m=top), truth.cameras[c], spp=spp, seed=seed + 97 * t + c
-            ).radiance
-            for c in chosen
-        ]
+        [render_view(relight(mesh, row[c]), truth.cameras[c], spp=spp, seed=seed + 97 * t + c).radiance for c in chosen]
         for t, row in enumerate(lights)
     ]

@@ -15,12 +15,12 @@ sys.path.insert(0, str(Path(__file__).parent))
 from albedo_scene import LATITUDE_DEG, LONGITUDE_DEG, hours, lights_for
 
 from seasonscapes.calibration.evidence import Correspondences, Priors
-from seasonscapes.calibration.pose_model import values_of
+from seasonscapes.calibration.pose_model import parameters_of_view
 from seasonscapes.calibration.resection import Calibration, resect
 from seasonscapes.cameras.observation import Observation
 from seasonscapes.cameras.panorama import Panorama, cut_view, split_panorama
 from seasonscapes.cameras.pinhole import Camera, rotation_from_angles
-from seasonscapes.evaluation.splits import held_out_hours, refuse_leaks, use_of
+from seasonscapes.evaluation.splits import held_out_times, check_no_leakage, picture_use
 from seasonscapes.evaluation.synthetic_webcams import SyntheticPicture, WebcamInstant, webcam_series
 from seasonscapes.evaluation.webcam_faults import TYPICAL, PoseSigmas, perturb_pose
 from seasonscapes.frames import LocalFrame
@@ -77,8 +77,8 @@ class Size:
     ablated: int = 8
 
 
-_WEB = SamplingOptions(subpixels=4, shades=16, rays=64, clusters=1024, listed=32, rank=24)
-_FINE = SamplingOptions(subpixels=4, shades=16, rays=128, clusters=4096, listed=32, rank=24)
+_WEB = SamplingOptions(shadow_samples=4, albedo_samples=16, rays=64, clusters=1024, clusters_per_receiver=32, rank=24)
+_FINE = SamplingOptions(shadow_samples=4, albedo_samples=16, rays=128, clusters=4096, clusters_per_receiver=32, rank=24)
 _QUICK_HOURS = (7.0, 8.5, 10.0, 12.0, 14.0, 15.5)
 SIZES = {
     "tiny": Size((3000.0, 3000.0), 60.0, 30.0, 2, 75.0, 96, 1, (144, 96), (8.5, 10.0, 14.0), _WEB, 60.0),
@@ -216,7 +216,7 @@ def make_world(seed: int, size: Size, data: Path | None = None) -> World:
     bare = ray_scene(mi_mesh(terrain, albedo))
     painting, judged = choose_cameras(terrain, bare, size, seed)
     times = hours(DATE, *size.clock)
-    painted_hours, held_hours = held_out_hours(times, 3)
+    painted_hours, held_hours = held_out_times(times, 3)
     sky = with_overrides(read_sky_model("clear"), visibility_km=60.0)
     lights = lights_for(times, [*painting, *judged], sky, default_workspace())
     return World(
@@ -242,7 +242,7 @@ def choose_cameras(terrain: Terrain, bare: RayScene, size: Size, seed: int) -> t
 
     Chosen by geometry alone, as webcams of one valley do look at the same mountains.
     """
-    scene = RenderScene(bare.mi_scene, bare.mi_terrain, None, 0.0)
+    scene = RenderScene(bare.mi_scene, bare.mi_terrain)
     rng, reach = np.random.default_rng(seed), np.abs(terrain.vertices[:, :2]).max(axis=0)
     found: list[tuple[Camera, np.ndarray]] = []
     for _ in range(120 + 4 * (size.webcams + size.judged)):
@@ -329,14 +329,14 @@ def take_pictures(world: World) -> Pictures:
     calibrated = [calibrated_by_clicks(world, c, pictures[0]) for c, pictures in enumerate(painting)]
     made = Pictures(painting, judged, calibrated)
     used = [
-        use_of(picture.observation, "painting")
+        picture_use(picture.observation, "painting")
         for row in painting
         for picture in row
         if picture.observation.time in world.painted_hours
     ]
-    seen = [use_of(picture.observation, "evaluation") for row in judged for picture in row]
-    refuse_leaks(seen, used, kind="view")
-    refuse_leaks([use for use in seen if use.time in world.held_hours], used, kind="hour")
+    seen = [picture_use(picture.observation, "evaluation") for row in judged for picture in row]
+    check_no_leakage(seen, used, kind="view")
+    check_no_leakage([use for use in seen if use.time in world.held_hours], used, kind="hour")
     return made
 
 
@@ -363,7 +363,7 @@ def calibrated_by_clicks(world: World, number: int, picture: SyntheticPicture) -
 
 def pose_errors(calibrated: Calibration, truth: Panorama) -> tuple[float, float]:
     """Heading error [deg] and distance of the place [m]."""
-    off = calibrated.values - values_of(truth, np.eye(3))
+    off = calibrated.values - parameters_of_view(truth, np.eye(3))
     return abs((off[0] + 180.0) % 360.0 - 180.0), float(np.linalg.norm(off[3:6]))
 
 

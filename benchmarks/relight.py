@@ -189,7 +189,9 @@ def sun_ray_throughput(terrain, ready, light) -> dict[str, float]:
     sun = mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in light.sun.direction))
     shown = np.array(ready.rays.mi_weight).astype(np.float32) > 0.0
     origin = np.stack([np.array(axis) for axis in ready.rays.mi_origin], axis=-1)[shown]
-    normal = np.stack([np.array(column) for column in ready.rays.mi_outward], axis=-1)[shown].astype(np.float32)
+    normal = np.stack([np.array(column) for column in ready.rays.mi_geometric_normal], axis=-1)[shown].astype(
+        np.float32
+    )
     facing = origin[normal @ light.sun.direction.astype(np.float32) > 0.0]
     step = 1 << 22
     parts = [mi.Point3f(np.ascontiguousarray(facing[i : i + step].T)) for i in range(0, len(facing), step)]
@@ -253,7 +255,7 @@ def visibility_agreement(seed: int, count: int) -> dict[str, float]:
     from seasonscapes.rendering.hemisphere_rays import ray_scene
     from seasonscapes.rendering.irradiance import surface_at
     from seasonscapes.rendering.mitsuba_scene import mi_mesh
-    from seasonscapes.rendering.sun_visibility import cosine_seen, numbered_turn, sun_rays
+    from seasonscapes.rendering.sun_visibility import hashed_disc_offset, sun_rays, visible_cosine
     from seasonscapes.sky.illumination import Luminary
     from seasonscapes.terrain.raster import geodetic_from_map
     from seasonscapes.workflows.place import MeshOptions, find_scene, load_place
@@ -278,13 +280,13 @@ def visibility_agreement(seed: int, count: int) -> dict[str, float]:
             terrain,
             each.origin,
             each.normal,
-            each.outward,
+            each.geometric_normal,
             np.ones((len(found), 1), np.float32),
-            numbered_turn(found),
+            hashed_disc_offset(found),
         )
-        seen = cosine_seen(rays, sun)[:, 0] > 0.0
+        seen = visible_cosine(rays, sun)[:, 0] > 0.0
         # Only places that face the sun: on the others there is nothing to ask.
-        facing = np.minimum(points.outward @ direction, points.normal @ direction) > 0.1
+        facing = np.minimum(points.geometric_normal @ direction, points.normal @ direction) > 0.1
         margin = march.clearance_deg(points.origin.astype(float), direction, 5.0, 12000.0)
         sure = facing & (np.abs(margin) > 0.5)
         agree += int((seen == (margin > 0.0))[sure].sum())
@@ -298,7 +300,7 @@ def visibility_agreement(seed: int, count: int) -> dict[str, float]:
 def a_year(frames: int, width_px: int) -> dict[str, float]:
     """Seconds of a year's film of the embedded scene, from frames spread over all its hours."""
     from seasonscapes.commands.timelapse import developed
-    from seasonscapes.relighting.film import write_film
+    from seasonscapes.relighting.film import write_video
     from seasonscapes.scene import read_scene
     from seasonscapes.sky.models import read_sky_model
     from seasonscapes.terrain.surface import save_texture
@@ -314,7 +316,9 @@ def a_year(frames: int, width_px: int) -> dict[str, float]:
     start = datetime(2024, 1, 1, tzinfo=UTC)
     hours = [start + timedelta(hours=k) for k in range(8784)]
     bright = [
-        t for t in hours if sun_moon_position(t, place.frame.latitude_deg, place.frame.longitude_deg).sun.elevation_deg > -12.0
+        t
+        for t in hours
+        if sun_moon_position(t, place.frame.latitude_deg, place.frame.longitude_deg).sun.elevation_deg > -12.0
     ]
     chosen = [bright[k] for k in np.linspace(0, len(bright) - 1, frames).astype(int)]
     with tempfile.TemporaryDirectory() as name:
@@ -353,7 +357,7 @@ def a_year(frames: int, width_px: int) -> dict[str, float]:
                 )
         cpu = time.process_time() - cpu
         clock["film"] = time.perf_counter()
-        write_film(Path(name) / "year.mp4", developed(assignment, chosen, metering="auto", window_s=900.0))
+        write_video(Path(name) / "year.mp4", developed(assignment, chosen, metering="auto", window_s=900.0))
         clock["end"] = time.perf_counter()
     share = len(bright) / frames
     return {

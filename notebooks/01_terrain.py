@@ -88,7 +88,7 @@ camera = camera_at(
     place.frame, 46.5712, 7.98, 3200.0, heading_deg=180.0, pitch_deg=-18.0, fov_deg=60.0, size_px=(420, 280)
 )
 land = ray_scene(mi_mesh(place.terrain, np.full(3, 0.3)))
-seen = trace_gbuffer(RenderScene(land.mi_scene, land.mi_terrain, None, 0.0), camera)
+seen = trace_gbuffer(RenderScene(land.mi_scene, land.mi_terrain), camera)
 figure, axes = plt.subplots(1, 2, figsize=(12, 4))
 shown = axes[0].imshow(seen.depth / 1000.0)
 figure.colorbar(shown, ax=axes[0], label="km")

@@ -52,7 +52,9 @@ _ = plt.legend()
 # %%
 def light(model: str, time: datetime):
     moment = sun_moon_position(time, LATITUDE_DEG, LONGITUDE_DEG, HEIGHT_M)
-    return illumination_at(read_sky_model(model), moment, HEIGHT_M, workspace=default_workspace(), with_air=False)
+    return illumination_at(
+        read_sky_model(model), moment, HEIGHT_M, workspace=default_workspace(), with_aerial_perspective=False
+    )
 
 
 # %% [markdown]

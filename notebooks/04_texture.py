@@ -25,8 +25,8 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from seasonscapes.evaluation.figures import comparison
-from seasonscapes.evaluation.masks import land_mask
+from seasonscapes.evaluation.figures import comparison_figure
+from seasonscapes.evaluation.masks import terrain_mask
 from seasonscapes.evaluation.metrics import score
 from seasonscapes.evaluation.synthetic_webcams import WebcamInstant, webcam_series
 from seasonscapes.exposure import develop, exposure_ev100
@@ -38,9 +38,9 @@ from seasonscapes.rendering.transport import SamplingOptions
 from seasonscapes.sky.ephemeris import sun_position
 from seasonscapes.sky.models import read_sky_model
 from seasonscapes.terrain.surface import sample_texture
-from seasonscapes.texturing.completion import complete
+from seasonscapes.texturing.completion import CompletionOptions, complete
 from seasonscapes.texturing.inputs import PaintingInput
-from seasonscapes.texturing.painting import paint_atlas
+from seasonscapes.texturing.painting import PaintTarget, paint_atlas
 from seasonscapes.texturing.predictors import predictors_for
 from seasonscapes.workflows.albedo_sources import albedo_for
 from seasonscapes.workflows.illumination import illumination_for_camera
@@ -55,7 +55,9 @@ from seasonscapes.workspace import default_workspace
 place = load_place(Path("small.toml"), default_workspace(), options=MeshOptions(texel_m=25.0))
 time, model = datetime(2024, 9, 11, 9, tzinfo=UTC), read_sky_model("clear")
 albedo = albedo_for(place, time)
-sampling = SamplingOptions(subpixels=4, shades=16, rays=64, clusters=1024, listed=32, rank=24)
+sampling = SamplingOptions(
+    shadow_samples=4, albedo_samples=16, rays=64, clusters=1024, clusters_per_receiver=32, rank=24
+)
 shots, shown = [], []
 for name in ("west", "middle", "south"):
     camera = camera_for(place, place.scene.camera(name), size_px=(210, 140))
@@ -74,7 +76,7 @@ _ = plt.axis("off")
 
 # %%
 land = ray_scene(mi_mesh(place.terrain, albedo.values))
-painting = paint_atlas(shots, place.terrain, place.atlas, land)
+painting = paint_atlas(shots, PaintTarget(place.terrain, place.atlas, land))
 figure, axes = plt.subplots(1, 2, figsize=(12, 5))
 axes[0].imshow(srgb_from_linear(develop(painting.texture.values, exposure_ev100(painting.texture.values))))
 axes[1].imshow(painting.coverage, cmap="viridis")
@@ -97,7 +99,8 @@ guides = predictors_for(
     day_suns=np.asarray(sun_position(day, *at).direction),
 )
 completed = {
-    method: complete(painting.texture, guides, method=method, fast=True).values for method in ("guided", "telea")
+    method: complete(painting.texture, guides, options=CompletionOptions(method, fast=True)).values
+    for method in ("guided", "telea")
 }
 figure, axes = plt.subplots(1, 2, figsize=(12, 5))
 for axis, (method, values) in zip(axes, completed.items(), strict=True):
@@ -121,11 +124,11 @@ def view(texture: np.ndarray) -> np.ndarray:
     )
 
 
-ev100, mask = exposure_ev100(truth.radiance), land_mask(truth.gbuffer.depth)
+ev100, mask = exposure_ev100(truth.radiance), terrain_mask(truth.gbuffer.depth)
 pictures = {"truth": truth.radiance} | {method: view(values) for method, values in completed.items()}
 pictures = {name: srgb_from_linear(develop(radiance, ev100)) for name, radiance in pictures.items()}
 for method in completed:
     print(method, score(pictures["truth"], pictures[method], mask))
 plt.figure(figsize=(16, 4))
-plt.imshow(comparison(pictures, mask=mask))
+plt.imshow(comparison_figure(pictures, mask=mask))
 _ = plt.axis("off")

@@ -48,7 +48,9 @@ from seasonscapes.workspace import default_workspace
 place = load_place(Path("small.toml"), default_workspace(), options=MeshOptions(texel_m=40.0))
 day, model = datetime(2024, 9, 11, tzinfo=UTC), read_sky_model("clear")
 truth = albedo_for(place, day).values
-sampling = SamplingOptions(subpixels=4, shades=16, rays=64, clusters=1024, listed=32, rank=24)
+sampling = SamplingOptions(
+    shadow_samples=4, albedo_samples=16, rays=64, clusters=1024, clusters_per_receiver=32, rank=24
+)
 observations, lights, shown = [], [], []
 for name in ("west", "south"):
     camera = camera_for(place, place.scene.camera(name), size_px=(180, 120))
@@ -70,7 +72,9 @@ _ = plt.axis("off")
 
 # %%
 land = trace_texel_transport(
-    place.terrain, truth.shape[:2], sampling=SamplingOptions(subpixels=1, rays=64, listed=32, clusters=1024, rank=24)
+    place.terrain,
+    truth.shape[:2],
+    sampling=SamplingOptions(shadow_samples=1, rays=64, clusters_per_receiver=32, clusters=1024, rank=24),
 )
 photographs = prepare_photographs(land, observations, lights)
 fit = solve_albedo(land, photographs, noise_model=EIGHT_BIT)

@@ -27,12 +27,12 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from seasonscapes.evaluation.masks import land_mask
+from seasonscapes.evaluation.masks import terrain_mask
 from seasonscapes.evaluation.metrics import score
 from seasonscapes.exposure import develop, exposure_ev100
 from seasonscapes.images import srgb_from_linear
 from seasonscapes.rendering.hemisphere_rays import ray_scene
-from seasonscapes.rendering.mitsuba_scene import RenderScene, build_scene, mi_mesh, set_albedo
+from seasonscapes.rendering.mitsuba_scene import build_scene, mi_mesh, set_albedo
 from seasonscapes.rendering.radiance import render_view
 from seasonscapes.rendering.relit_view import cluster_albedo, relight_view, relightable_view, with_albedo
 from seasonscapes.rendering.transport import SamplingOptions, trace_view, view_albedo
@@ -58,7 +58,9 @@ autumn = datetime(2024, 9, 18, tzinfo=UTC)
 land = ray_scene(mi_mesh(place.terrain, albedo_for(place, autumn).values))
 start = clock.perf_counter()
 coefficients = trace_view(
-    land, camera, SamplingOptions(subpixels=4, shades=16, rays=128, clusters=2048, listed=32, rank=24)
+    land,
+    camera,
+    SamplingOptions(shadow_samples=4, albedo_samples=16, rays=128, clusters=2048, clusters_per_receiver=32, rank=24),
 )
 ready = relightable_view(land, coefficients)
 print(f"traced in {clock.perf_counter() - start:.1f} s")
@@ -86,7 +88,7 @@ for axis, hour, view in zip(axes.ravel(), hours, views, strict=True):
 traced = render_view(build_scene(place.terrain, albedo_for(place, autumn).values, lights[2]), camera, spp=64)
 ev100 = exposure_ev100(traced.radiance)
 pair = [srgb_from_linear(develop(radiance, ev100)) for radiance in (traced.radiance, views[2].radiance)]
-print(score(*pair, land_mask(traced.gbuffer.depth)))
+print(score(*pair, terrain_mask(traced.gbuffer.depth)))
 
 # %% [markdown]
 # Seasons: the same coefficients with another day's colours.
@@ -96,7 +98,7 @@ figure, axes = plt.subplots(1, 3, figsize=(14, 3.4))
 for axis, (month, day) in zip(axes, ((2, 10), (5, 20), (7, 20)), strict=True):
     noon = datetime(2024, month, day, 11, tzinfo=UTC)
     colours = albedo_for(place, noon).values
-    set_albedo(RenderScene(land.mi_scene, land.mi_terrain, lights[0], 0.0), colours)
+    set_albedo(land, colours)
     clothed = with_albedo(ready, view_albedo(land, coefficients), cluster_albedo(coefficients, colours))
     axis.imshow(shown(relight_view(clothed, illumination_for_camera(place, camera, model, noon)[0]).radiance))
     axis.set_title(f"{noon:%d %B}")

@@ -24,6 +24,7 @@ from seasonscapes.errors import NoUsablePixels, UnreadableImage
 METER_CONSTANT = 12.5 / 100.0
 # Luminance that just saturates a sensor at EV100 = 0: 78 / (S q) with q = 0.65 (ISO 12232; Lagarde & de Rousiers 2014).
 SATURATION_LUMINANCE = 1.2
+# Luminance weights of linear Rec.709 (ITU-R BT.709): Y = w · rgb. In photometric RGB, Y is in lux or cd/m².
 REC709_LUMINANCE = np.array([0.2126390, 0.7151687, 0.0721923])
 
 

@@ -321,7 +321,7 @@ def read_scene(path: str | Path, *, allow_outside: bool = False) -> SceneFile:
     return scene.model_copy(update=updates)
 
 
-def camera_from_place(
+def camera_from_named_view(
     frame: LocalFrame, view: NamedCamera, ground_height_m: float, *, size_px: tuple[int, int]
 ) -> Camera:
     """Build the pinhole camera of a named viewpoint.

@@ -65,16 +65,18 @@ def case() -> Case:
     albedo = bake_imagery(terrain, atlas, image).values
     cameras = [_camera(terrain, *mast) for mast in MASTS]
     lights = [hosek_illumination(direction_from_angles(*sun), shape=(64, 128)) for sun in SUNS_DEG]
-    mesh, top = mi_mesh(terrain, albedo), float(terrain.vertices[:, 2].max())
+    mesh = mi_mesh(terrain, albedo)
     pictures = [
         [
-            render_view(relight(mesh, light, max_height_m=top), camera, spp=64, seed=10 * t + c).radiance
+            render_view(relight(mesh, light), camera, spp=64, seed=10 * t + c).radiance
             for c, camera in enumerate(cameras)
         ]
         for t, light in enumerate(lights)
     ]
     transport = trace_texel_transport(
-        terrain, albedo.shape[:2], sampling=SamplingOptions(subpixels=1, rays=128, listed=64, clusters=1024, rank=24)
+        terrain,
+        albedo.shape[:2],
+        sampling=SamplingOptions(shadow_samples=1, rays=128, clusters_per_receiver=64, clusters=1024, rank=24),
     )
     return Case(place, terrain, albedo, cameras, lights, pictures, transport)
 

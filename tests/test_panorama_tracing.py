@@ -16,11 +16,11 @@ from seasonscapes.rendering.hemisphere_rays import ray_scene
 from seasonscapes.rendering.mitsuba_scene import mi_mesh, relight
 from seasonscapes.rendering.radiance import render_view
 from seasonscapes.rendering.relit_view import relight_view, relightable_view
-from seasonscapes.rendering.sightlines import faces_met
+from seasonscapes.rendering.sightlines import visible_faces
 from seasonscapes.rendering.transport import SamplingOptions, trace_view
 from seasonscapes.sky.illumination import Illumination
 
-EFFORT = SamplingOptions(subpixels=16, shades=64, rays=128, clusters=1024)
+EFFORT = SamplingOptions(shadow_samples=16, albedo_samples=64, rays=128, clusters=1024)
 TERRAIN = heightfield(lambda e, n: 0.0006 * (e**2 + n**2) + 25.0 * np.sin(e / 55.0) * np.cos(n / 40.0 + e / 90.0))
 
 
@@ -78,7 +78,7 @@ def test_a_panorama_is_path_traced_to_the_same_picture(land):
     panorama = panorama_at(300.0, size_px=(360, 80))
     bare = ray_scene(land)
     relit = relight_view(relightable_view(bare, trace_view(bare, panorama, EFFORT)), LIGHT).radiance
-    traced = render_view(relight(land, LIGHT, max_height_m=300.0), panorama, spp=128).radiance
+    traced = render_view(relight(land, LIGHT), panorama, spp=128).radiance
     assert relit.mean() / traced.mean() == pytest.approx(1.0, abs=0.01)
     assert np.median(np.abs(relit - traced) / traced.mean(axis=2, keepdims=True)) < 0.02
 
@@ -88,7 +88,9 @@ def test_each_pixel_shows_the_place_that_projects_to_it(land, projection):
     """Neither mirrored nor turned; and the sampled rays of the renderer are those of the camera model."""
     panorama = panorama_at(100.0, projection, tilt_deg=3.0)
     bare = ray_scene(land)
-    coefficients = trace_view(bare, panorama, SamplingOptions(subpixels=4, shades=4, rays=16, clusters=64, bounces=0))
+    coefficients = trace_view(
+        bare, panorama, SamplingOptions(shadow_samples=4, albedo_samples=4, rays=16, clusters=64, bounces=0)
+    )
     ready = relightable_view(bare, coefficients)
     seen = np.isfinite(ready.gbuffer.depth)
     row, column = np.nonzero(seen)
@@ -104,7 +106,7 @@ def test_each_pixel_shows_the_place_that_projects_to_it(land, projection):
     # A place in the east (column 80 of 360 from a heading of 100°) is left of the middle by ten degrees.
     east, _ = project_panorama(panorama, panorama.position_m + np.array([500.0, 0.0, 0.0]))
     assert east[0] == pytest.approx(720 * (170.0 / 360.0), abs=2.0)
-    assert (faces_met(bare, panorama) >= 0).mean() == pytest.approx(seen.mean(), abs=0.01)
+    assert (visible_faces(bare, panorama) >= 0).mean() == pytest.approx(seen.mean(), abs=0.01)
 
 
 def test_the_last_column_meets_the_first(land):
@@ -126,7 +128,7 @@ def test_the_last_column_meets_the_first(land):
 def test_a_webcam_series_of_panoramas(tmp_path):
     panorama = panorama_at(80.0, size_px=(300, 66))
     time = datetime(2024, 7, 20, 10, tzinfo=UTC)
-    sampling = SamplingOptions(subpixels=4, shades=16, rays=64, clusters=256)
+    sampling = SamplingOptions(shadow_samples=4, albedo_samples=16, rays=64, clusters=256)
     poses = PoseSigmas(1.0, 1.0, 0.5, 0.2, 0.2, 0.05)
     made = webcam_series(
         TERRAIN,
@@ -154,7 +156,9 @@ def test_a_webcam_series_of_panoramas(tmp_path):
 def test_coefficients_of_a_panorama_are_kept_in_files(land, tmp_path):
     bare = ray_scene(land)
     made = trace_view(
-        bare, panorama_at(0.0, size_px=(90, 20)), SamplingOptions(subpixels=4, shades=4, rays=16, clusters=64)
+        bare,
+        panorama_at(0.0, size_px=(90, 20)),
+        SamplingOptions(shadow_samples=4, albedo_samples=4, rays=16, clusters=64),
     )
     save_coefficients(tmp_path / "view", made)
     again = load_coefficients(tmp_path / "view")

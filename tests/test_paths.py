@@ -144,4 +144,4 @@ def test_an_unknown_light_is_refused():
     scene = build_scene(PLANE, np.ones(3), full_light())
     lamp = mi.load_dict({"type": "scene", "terrain": scene.mi_terrain, "lamp": {"type": "point"}})
     with pytest.raises(ValueError, match="got 1 emitters, expected 2"):
-        path_trace(RenderScene(lamp, scene.mi_terrain, scene.illumination, 0.0), CAMERA, spp=1)
+        path_trace(RenderScene(lamp, scene.mi_terrain, scene.illumination), CAMERA, spp=1)

@@ -18,7 +18,7 @@ from seasonscapes.albedo.seasons import season_weights
 from seasonscapes.cli import main
 from seasonscapes.errors import AtlasMismatch, InputError
 from seasonscapes.relighting.exposure_smoothing import smoothed_ev100
-from seasonscapes.relighting.film import write_film
+from seasonscapes.relighting.film import write_video
 from seasonscapes.relighting.frame_file import frame_ev100, load_frame, save_frame
 from seasonscapes.relighting.luminous_efficacy import efficacies_lm_w
 from seasonscapes.scene import read_scene
@@ -94,7 +94,7 @@ def test_frame_files_hold_night_and_day(tmp_path, level):
     radiance = (level * np.random.default_rng(1).uniform(0.01, 3.0, (8, 6, 3))).astype(np.float32)
     radiance[0, 0] = 1.6e9  # the sun's disc
     metered = float(np.log2(level / 0.125))
-    save_frame(tmp_path / "a.exr", radiance, metered_ev100=metered, record={"scene": "x"})
+    save_frame(tmp_path / "a.exr", radiance, metered_ev100=metered, provenance={"scene": "x"})
     back, ev100 = load_frame(tmp_path / "a.exr")
     np.testing.assert_allclose(back[1:], radiance[1:], rtol=1e-3)
     assert ev100 == frame_ev100(tmp_path / "a.exr") == pytest.approx(metered, abs=1e-5)
@@ -104,8 +104,8 @@ def test_frame_files_hold_night_and_day(tmp_path, level):
 def test_a_film_plays(tmp_path):
     import imageio_ffmpeg
 
-    shades = [np.full((33, 48, 3), level, np.float32) for level in (0.0, 0.05, 0.21404, 1.0)]
-    assert write_film(tmp_path / "f.mp4", iter(shades), fps=2.0) == 4
+    images = [np.full((33, 48, 3), level, np.float32) for level in (0.0, 0.05, 0.21404, 1.0)]
+    assert write_video(tmp_path / "f.mp4", iter(images), fps=2.0) == 4
     reader = imageio_ffmpeg.read_frames(str(tmp_path / "f.mp4"))
     about = next(reader)
     assert about["size"] == (48, 32)
@@ -113,7 +113,7 @@ def test_a_film_plays(tmp_path):
     frames = [np.frombuffer(frame, np.uint8).mean() for frame in reader]
     np.testing.assert_allclose(frames, [0.5, 63.5, 127.5, 255.0], atol=4.0)
     with pytest.raises(ValueError, match="got no images"):
-        write_film(tmp_path / "empty.mp4", iter([]))
+        write_video(tmp_path / "empty.mp4", iter([]))
     assert [path.name for path in tmp_path.iterdir()] == ["f.mp4"]
 
 
@@ -380,7 +380,7 @@ def test_watts_agree_with_pvlib():
         sun_moon_position(when, 46.55, 7.98, 2000.0),
         2000.0,
         workspace=default_workspace(),
-        with_air=False,
+        with_aerial_perspective=False,
     )
     direct, diffuse = _efficacies(light)
     beam = luminance(direct_horizontal_illuminance(light.sun)) / direct

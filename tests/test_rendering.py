@@ -235,7 +235,7 @@ def test_blocks_do_not_change_the_expectation(monkeypatch):
 
 def test_relight_keeps_the_terrain():
     scene = build_scene(PLANE, np.full(3, 0.5), sun_at(90.0, 30.0))
-    other = relight(scene.mi_terrain, sun_at(90.0, 60.0), max_height_m=scene.max_height_m)
+    other = relight(scene.mi_terrain, sun_at(90.0, 60.0))
     low = path_trace(scene, looking_down(size=8), spp=4)[0].mean()
     high = path_trace(other, looking_down(size=8), spp=4)[0].mean()
     assert high / low == pytest.approx(np.sin(np.radians(60.0)) / np.sin(np.radians(30.0)), rel=1e-3)

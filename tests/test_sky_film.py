@@ -18,7 +18,7 @@ from seasonscapes.sky.elevation_table import (
     tabulate_by_elevation,
 )
 from seasonscapes.sky.illumination import luminance
-from seasonscapes.sky.models import atmosphere_of, read_sky_model
+from seasonscapes.sky.models import atmosphere_from_model, read_sky_model
 from seasonscapes.sky.observer_radiance import (
     diffuse_by_elevation,
     observed_sky,
@@ -208,7 +208,7 @@ def test_light_for_a_film_takes_its_tables_from_the_workspace(tmp_path, looked_u
         # The land's own sky is not compared here, so the camera's table will do for its height too.
         return looked_up.diffuse_of(HEIGHT_M, near)
 
-    assert atmosphere_of(read_sky_model("clear")) == tables_of().atmosphere
+    assert atmosphere_from_model(read_sky_model("clear")) == tables_of().atmosphere
     monkeypatch.setattr(illumination_module, "atmosphere_tables", lambda _: tables_of())
     monkeypatch.setattr(illumination_module, "diffuse_by_elevation", build)
     place = load_place(places.write_place(tmp_path), Workspace(tmp_path / "work"))

@@ -20,7 +20,7 @@ from seasonscapes.sky.illumination import (
     global_horizontal_illuminance,
     luminance,
 )
-from seasonscapes.sky.models import atmosphere_of, check_valid, read_sky_model, visibility_km, with_overrides
+from seasonscapes.sky.models import atmosphere_from_model, check_valid, read_sky_model, visibility_km, with_overrides
 from seasonscapes.sky.report import (
     correlated_colour_temperature_k,
     dome_picture,
@@ -75,7 +75,7 @@ def test_models_are_what_their_names_say():
     assert ranges["hazy"] < 20 < ranges["saharan_dust"] < 30 < ranges["clear"] < 80 < ranges["alpine_winter"]
     assert read_sky_model("alpine_winter").ground.albedo > 0.5
     assert read_sky_model("saharan_dust").aerosol.angstrom_exponent < 0.5
-    air = atmosphere_of(read_sky_model("hazy"))
+    air = atmosphere_from_model(read_sky_model("hazy"))
     assert (air.aerosol_optical_depth_500nm, air.ozone_du, air.ground_albedo) == (0.40, 320.0, 0.2)
 
 
@@ -173,7 +173,7 @@ def test_the_ends_of_every_range_are_possible(name):
     model = read_sky_model(name)
     for parameter in ("turbidity", "visibility_km", "ozone_du"):
         for end in getattr(model.valid, parameter):
-            atmosphere_of(with_overrides(model, **{parameter: end}))
+            atmosphere_from_model(with_overrides(model, **{parameter: end}))
 
 
 def test_models_refuse_what_they_cannot():

@@ -93,10 +93,10 @@ def test_erosion_leaves_few_pits(fine):
     z = heights(fine).astype(float)
     lattice = flow.jittered_lattice(6000.0, 30.0, 0.0, np.random.default_rng(0))
     dry = fine.shore_m > 0.0
-    routes = flow.route_flow(np.where(dry, z, -1.0), flow.links_of(lattice), lattice.border | ~dry)
+    routes = flow.route_flow(np.where(dry, z, -1.0), flow.lattice_links(lattice), lattice.border | ~dry)
     assert routes.pits / z.size < 0.012
     rough = z + np.random.default_rng(0).normal(0.0, 30.0, z.shape)
-    assert flow.route_flow(rough, flow.links_of(lattice), lattice.border).pits > 5 * routes.pits
+    assert flow.route_flow(rough, flow.lattice_links(lattice), lattice.border).pits > 5 * routes.pits
 
 
 def test_classes_keep_to_their_heights(fine):
@@ -269,7 +269,7 @@ def test_catchments_agree_with_the_slow_twin():
     rng = np.random.default_rng(4)
     lattice = flow.jittered_lattice(300.0, 25.0, 0.38, rng)
     z = np.hypot(lattice.east_m - 40.0, lattice.north_m) * -1.0 + 500.0 + 0.2 * rng.random(lattice.east_m.shape)
-    links = flow.links_of(lattice)
+    links = flow.lattice_links(lattice)
     routes = flow.route_flow(z, links, lattice.border)
     assert routes.pits == 0
     area = flow.accumulate(routes, np.ones(z.shape))
@@ -282,7 +282,7 @@ def test_pits_spill_over_their_lowest_pass():
     z = 100.0 - 0.05 * np.hypot(lattice.east_m, lattice.north_m)
     z[10, 8:13] = 20.0  # a trough that nothing drains
     z[10, 13:] = np.linspace(60.0, 50.0, 8)  # its lowest rim leads east
-    routes = flow.route_flow(z, flow.links_of(lattice), lattice.border)
+    routes = flow.route_flow(z, flow.lattice_links(lattice), lattice.border)
     assert routes.pits >= 1
     area = flow.accumulate(routes, np.ones(z.shape))
     assert area[lattice.border].sum() == z.size
@@ -309,15 +309,15 @@ def test_a_plane_comes_back_from_the_jittered_lattice():
     plane = 3.0 + 0.4 * lattice.east_m - 0.7 * lattice.north_m
     expected = 3.0 + 0.4 * regular.east_m - 0.7 * regular.north_m
     inner = np.s_[1:-1, 1:-1]
-    assert flow.on_grid(plane, lattice)[inner] == pytest.approx(expected[inner], abs=1e-6)
+    assert flow.resample_to_grid(plane, lattice)[inner] == pytest.approx(expected[inner], abs=1e-6)
 
 
 def test_slumping_moves_but_neither_makes_nor_loses_rock():
     lattice = flow.jittered_lattice(400.0, 20.0, 0.3, np.random.default_rng(1))
     z = np.where(np.hypot(lattice.east_m, lattice.north_m) < 100.0, 200.0, 0.0)
     limit = np.full(z.shape, 0.7)
-    links = flow.links_of(lattice)
-    settled = flow.slump(z, links, limit, 400)
+    links = flow.lattice_links(lattice)
+    settled = flow.relax_slopes(z, links, limit, 400)
     assert settled.sum() == pytest.approx(z.sum(), rel=1e-9)
     steepest = max(
         np.abs((settled[a] - settled[b]) / d).max()

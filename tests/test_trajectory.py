@@ -229,7 +229,7 @@ def test_clearance_on_the_embedded_scene_by_rays(alpine, curve):
         places_m = line.position(np.linspace(0.0, line.length_m, 4000))
         high = places_m + np.array([0.0, 0.0, 5000.0])
         down = np.broadcast_to([0.0, 0.0, -1.0], high.shape)
-        return trace_rays(RenderScene(terrain.mi_scene, terrain.mi_terrain, None, 0.0), high, down).depth - 5000.0
+        return trace_rays(RenderScene(terrain.mi_scene, terrain.mi_terrain), high, down).depth - 5000.0
 
     bare = curve_through(places_of(known), curve=curve)
     line, most = lift_above_ground(bare, local_ground(alpine), 50.0)

@@ -26,7 +26,7 @@ from seasonscapes.rendering.sky_patches import (
 from seasonscapes.rendering.transport import SamplingOptions, trace_points, trace_view, view_albedo
 from seasonscapes.sky.illumination import Illumination, uniform_sky
 
-QUICK = SamplingOptions(rays=128, clusters=1024, listed=32)
+QUICK = SamplingOptions(rays=128, clusters=1024, clusters_per_receiver=32)
 ALBEDO = np.array([0.55, 0.45, 0.35])
 
 
@@ -60,7 +60,7 @@ LIGHTS = {
 def test_relit_view_equals_path_tracing(valley, name):
     """In the mean within 1 %, and pixel by pixel within 4 % of the picture's mean (noise of both included)."""
     mesh, camera, ready = valley
-    reference, _ = path_trace(relight(mesh, LIGHTS[name], max_height_m=180.0), camera, spp=512, max_depth=6)
+    reference, _ = path_trace(relight(mesh, LIGHTS[name]), camera, spp=512, max_depth=6)
     relit = relight_view(ready, LIGHTS[name]).surface
     assert relit.mean() / reference.mean() == pytest.approx(1.0, abs=0.01)
     assert np.sqrt(np.mean((relit - reference) ** 2)) < 0.04 * reference.mean()
@@ -73,8 +73,8 @@ def test_bounces_are_as_many_as_asked_for(bounces, max_depth):
     mesh, camera, light = mi_mesh(bowl, np.full(3, 0.9)), looking_down(300.0, size=16, view_m=300.0), LIGHTS["sun"]
     view = trace_view(ray_scene(mesh), camera, SamplingOptions(rays=256, clusters=1024, bounces=bounces))
     relit = relight_view(relightable_view(ray_scene(mesh), view), light).surface.mean()
-    reference = path_trace(relight(mesh, light, max_height_m=1000.0), camera, spp=1024, max_depth=max_depth)[0].mean()
-    deeper = path_trace(relight(mesh, light, max_height_m=1000.0), camera, spp=1024, max_depth=max_depth + 1)[0].mean()
+    reference = path_trace(relight(mesh, light), camera, spp=1024, max_depth=max_depth)[0].mean()
+    deeper = path_trace(relight(mesh, light), camera, spp=1024, max_depth=max_depth + 1)[0].mean()
     assert relit == pytest.approx(reference, rel=0.01)
     assert deeper > 1.03 * reference, "the bowl must tell the depths apart"
 
@@ -112,7 +112,7 @@ def test_penumbra_is_as_wide_as_the_disc():
     pose[:3, 3] = [-200.0, 0.0, 1500.0]
     camera = Camera(256, 8, 256 * 15.0, 256 * 15.0, 128.0, 4.0, pose)  # 100 m wide
     light = sun_at(90.0, 45.0, radius_deg=2.0)
-    view = trace_view(ray_scene(mesh), camera, SamplingOptions(rays=64, subpixels=64, bounces=0, clusters=1))
+    view = trace_view(ray_scene(mesh), camera, SamplingOptions(rays=64, shadow_samples=64, bounces=0, clusters=1))
     profile = relight_view(relightable_view(ray_scene(mesh), view), light).surface[..., 1].mean(axis=0)
     profile /= 1.0e5 / np.pi * np.sin(np.radians(45.0))
     edge_m = terrain.vertices[terrain.vertices[:, 2] > 100.0][:, 0].min()
@@ -139,7 +139,7 @@ def test_air_and_background_are_those_of_render_view():
     pose[:3, :3] = rotation_from_angles(20.0, 0.0)
     pose[:3, 3] = [-100.0, -450.0, 120.0]
     camera = Camera(96, 64, 90.0, 90.0, 48.0, 32.0, pose)
-    reference = render_view(relight(mesh, light, max_height_m=80.0), camera, spp=256)
+    reference = render_view(relight(mesh, light), camera, spp=256)
     view = relight_view(
         relightable_view(ray_scene(mesh), trace_view(ray_scene(mesh), camera, SamplingOptions(clusters=2048))), light
     )
@@ -160,7 +160,7 @@ def test_another_albedo_in_place_of_the_first():
     mesh = mi_mesh(PLANE, texture)
     terrain, camera = ray_scene(mesh), looking_down(size=8)
     view = trace_view(terrain, camera, QUICK)
-    scene = relight(mesh, uniform_sky(1.0), max_height_m=0.0)
+    scene = relight(mesh, uniform_sky(1.0))
     set_albedo(scene, 3.0 * texture)
     np.testing.assert_allclose(view_albedo(terrain, view), 3.0 * view.albedo, rtol=1e-5)
 
@@ -174,10 +174,10 @@ def test_irradiance_of_places():
     place[3] = np.nan
     points, index = surface_at(terrain, place)
     assert sorted(set(range(41)) - set(index)) == [3]
-    coefficients = trace_points(terrain, points, SamplingOptions(rays=1024, clusters=2048, listed=128))
-    received = irradiance(upload_points(terrain, coefficients), light, sun_rays_each=64)
+    coefficients = trace_points(terrain, points, SamplingOptions(rays=1024, clusters=2048, clusters_per_receiver=128))
+    received = irradiance(upload_points(terrain, coefficients), light, sun_rays_per_point=64)
     # Looking straight down with pixels of a millimetre: radiance = albedo / π · E.
-    scene = relight(mesh, light, max_height_m=100.0)
+    scene = relight(mesh, light)
     total, direct = np.empty((40, 3)), np.empty((40, 3))
     for k in range(40):
         pose = np.eye(4)
@@ -303,7 +303,9 @@ def test_sender_lists_are_in_proportion():
     assert listed[0].max() == 0
 
 
-@pytest.mark.parametrize("wrong", [{"subpixels": 15}, {"rays": 100}, {"rays": 8}, {"listed": 3}, {"clusters": 1 << 17}])
+@pytest.mark.parametrize(
+    "wrong", [{"shadow_samples": 15}, {"rays": 100}, {"rays": 8}, {"clusters_per_receiver": 3}, {"clusters": 1 << 17}]
+)
 def test_sampling_options_refuse(wrong):
     with pytest.raises(ValueError, match="SamplingOptions"):
         SamplingOptions(**wrong)

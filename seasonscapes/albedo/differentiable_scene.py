@@ -20,7 +20,7 @@ from seasonscapes.cameras.pinhole import Camera, ray_directions
 from seasonscapes.frames import geodetic_from_enu, local_axes
 from seasonscapes.rendering.backend import use_backend
 from seasonscapes.rendering.gbuffer import trace_gbuffer
-from seasonscapes.rendering.mitsuba_scene import background, mi_mesh, relight
+from seasonscapes.rendering.mitsuba_scene import mi_mesh, relight, sky_radiance_towards
 from seasonscapes.sky.illumination import Illumination
 from seasonscapes.terrain.surface import Terrain
 
@@ -201,7 +201,7 @@ def build_differentiable_scene(
         cy=camera.cy + margin_px,
     )
     mi_terrain = mi_mesh(terrain, albedo)
-    scene = relight(mi_terrain, light, max_height_m=float(terrain.vertices[:, 2].max()))
+    scene = relight(mi_terrain, light)
     mi_params = mi.traverse(scene.mi_scene)
     depth, airlight, sky = _air_and_sky(scene, wide, light)
     latitude, longitude, _ = geodetic_from_enu(terrain.frame, camera.position_m)
@@ -230,7 +230,7 @@ def _air_and_sky(scene: Any, camera: Camera, light: Illumination) -> tuple[np.nd
     if light.aerial_perspective is not None:
         transmittance, air = light.aerial_perspective(distance[terrain], direction[terrain])
         depth[terrain], airlight[terrain] = -np.log(np.maximum(transmittance, 1e-6)), air
-    sky = background(light, direction, float(np.degrees(1.0 / camera.fx))).astype(np.float32)
+    sky = sky_radiance_towards(light, direction, float(np.degrees(1.0 / camera.fx))).astype(np.float32)
     return depth, airlight, sky
 
 

@@ -90,7 +90,6 @@ def differentiable_views(
     import mitsuba as mi
 
     mesh = mi_mesh(terrain, albedo, smooth=smooth)
-    top = float(terrain.vertices[:, 2].max())
     scene_of_light: dict[tuple[int, int, int], tuple[Any, Any, np.ndarray | None]] = {}
     scenes, params, suns, depths, airlights = [], [], [], [], []
     for photograph in photographs:
@@ -98,7 +97,7 @@ def differentiable_views(
         # Cameras of one instant share sun and sky map, but not aerial perspective.
         key = (id(light.sky_radiance), id(light.sun), id(light.moon))
         if key not in scene_of_light:
-            mi_scene = relight(mesh, light, max_height_m=top).mi_scene
+            mi_scene = relight(mesh, light).mi_scene
             mi_values = mi.traverse(mi_scene)
             scene_of_light[key] = mi_scene, mi_values, np.array(mi_values[SUN]).ravel() if SUN in mi_values else None
         for column, value in zip((scenes, params, suns), scene_of_light[key], strict=True):

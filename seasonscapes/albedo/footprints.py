@@ -18,7 +18,7 @@ from seasonscapes.cameras.panorama import Panorama
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.errors import NoTerrainInView
 from seasonscapes.rendering.hemisphere_rays import RayScene, SurfacePoints
-from seasonscapes.rendering.sun_visibility import cosine_seen, pixel_turn, sun_rays
+from seasonscapes.rendering.sun_visibility import bayer_disc_offset, sun_rays, visible_cosine
 from seasonscapes.rendering.view_samples import view_samples
 from seasonscapes.sky.illumination import Luminary
 
@@ -191,16 +191,16 @@ def _block_entries(
         terrain,
         points.origin,
         points.normal,
-        points.outward,
+        points.geometric_normal,
         hit.astype(np.float32),
-        pixel_turn(pixel, camera.width_px, rays),
+        bayer_disc_offset(pixel, camera.width_px, rays),
     )
     lit = np.full((len(luminaries), count), np.nan, np.float32)
     sunlit = []
     for t, bodies in enumerate(luminaries):
         sunlit.append([])
         for number, body in enumerate(bodies):
-            cosine = cosine_seen(shadow_rays, body)
+            cosine = visible_cosine(shadow_rays, body)
             # The four texels of a sample share its cosine.
             values = np.bincount(entry, weight * np.repeat(cosine.ravel(), 4), len(columns))
             sunlit[t].append(values.astype(np.float32))

@@ -17,11 +17,11 @@ import cv2
 import numpy as np
 
 from seasonscapes.albedo.footprints import Footprints
-from seasonscapes.rendering.air_grid import AirPlaces, SkyGrid, air_at, air_places, open_sky, sky_grid
+from seasonscapes.rendering.air_grid import AirGrid, SkyGrid, air_grid, interpolate_air, sky_grid, sky_pixel_radiance
 from seasonscapes.rendering.hemisphere_rays import RayScene, ray_scene, texture_at
 from seasonscapes.rendering.irradiance import DevicePoints, surface_at, upload_points
-from seasonscapes.rendering.receivers import DeviceClusters, arriving, light_clusters, luminaries
-from seasonscapes.rendering.sun_visibility import cosine_seen
+from seasonscapes.rendering.receivers import DeviceClusters, incident_light, light_clusters, luminaries
+from seasonscapes.rendering.sun_visibility import visible_cosine
 from seasonscapes.rendering.transport import SamplingOptions, trace_points
 from seasonscapes.sky.illumination import Illumination
 from seasonscapes.terrain.surface import Terrain
@@ -29,7 +29,7 @@ from seasonscapes.terrain.texels import texel_positions
 
 Progress = Callable[[float], None]
 # Texels need fewer rays than pixels: every footprint averages over neighbouring texels.
-TEXEL_SAMPLING = SamplingOptions(subpixels=1, rays=512, listed=64, clusters=8192, rank=32)
+TEXEL_SAMPLING = SamplingOptions(shadow_samples=1, rays=512, clusters_per_receiver=64, clusters=8192, rank=32)
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ def ambient_on_texels(transport: TexelTransport, light: Illumination, albedo: np
         if albedo is None
         else clusters_with_albedo(clusters, albedo)
     )
-    sky, bounce = arriving(transport.device_points.receivers, light_clusters(clusters, light))
+    sky, bounce = incident_light(transport.device_points.receivers, light_clusters(clusters, light))
     ambient = np.zeros((transport.shape[0] * transport.shape[1], 3), np.float32)
     ambient[transport.texel] = np.float32(np.pi) * (sky + bounce)
     return ambient
@@ -173,7 +173,7 @@ def sun_on_texels(transport: TexelTransport, light: Illumination) -> np.ndarray:
     """
     sun = np.zeros((transport.shape[0] * transport.shape[1], 3), np.float32)
     for body in luminaries(light):
-        cosine = cosine_seen(transport.device_points.rays, body, each=4)
+        cosine = visible_cosine(transport.device_points.rays, body, rays_per_sample=4)
         sun[transport.texel] += cosine * np.asarray(body.normal_illuminance_lx, np.float32)
     return sun
 
@@ -192,7 +192,7 @@ class CameraAtmosphere:
         Angle of a pixel at the image centre [°].
     """
 
-    air: AirPlaces
+    air: AirGrid
     sky: SkyGrid
     pixel_angle_deg: float
 
@@ -224,7 +224,7 @@ def camera_atmosphere(footprints: Footprints, *, sky_pixels: int = 4000, seed: i
         open_pixels = np.sort(np.random.default_rng(seed).choice(open_pixels, sky_pixels, replace=False))
     no_mixed_pixels = (np.empty(0, np.int64), np.empty((0, 1), np.float32))
     return CameraAtmosphere(
-        air_places(camera, footprints.pixel, footprints.distance_m, *no_mixed_pixels),
+        air_grid(camera, footprints.pixel, footprints.distance_m, *no_mixed_pixels),
         sky_grid(camera, open_pixels),
         float(np.degrees(1.0 / camera.fx)),
     )
@@ -251,7 +251,7 @@ def aerial_perspective_of(
     """
     if light.aerial_perspective is None:
         return np.ones((count, 3), np.float32), np.zeros((count, 3), np.float32)
-    transmittance, airlight = air_at(atmosphere.air, light.aerial_perspective)
+    transmittance, airlight = interpolate_air(atmosphere.air, light.aerial_perspective)
     return np.ascontiguousarray(transmittance, np.float32), np.ascontiguousarray(airlight, np.float32)
 
 
@@ -270,7 +270,7 @@ def sky_radiance_of(atmosphere: CameraAtmosphere, light: Illumination) -> np.nda
     numpy.ndarray
         ``(K, 3)`` [cd/m²] at the pixels ``atmosphere.sky.pixel``.
     """
-    return open_sky(atmosphere.sky, replace(light, sun=None, moon=None), atmosphere.pixel_angle_deg)
+    return sky_pixel_radiance(atmosphere.sky, replace(light, sun=None, moon=None), atmosphere.pixel_angle_deg)
 
 
 def predicted_surface_radiance(

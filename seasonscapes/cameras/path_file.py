@@ -53,7 +53,7 @@ def view_record(camera: Camera, frame: LocalFrame) -> dict[str, float]:
     return dict(zip(_POSE, numbers, strict=True)) | {name: float(getattr(camera, name)) for name in _INTRINSICS}
 
 
-def camera_of(record: Mapping[str, float], frame: LocalFrame, size_px: tuple[int, int]) -> Camera:
+def camera_from_record(record: Mapping[str, float], frame: LocalFrame, size_px: tuple[int, int]) -> Camera:
     """Create a camera from a record; the inverse of `view_record`.
 
     Parameters
@@ -141,7 +141,7 @@ def load_path(path: Path, frame: LocalFrame) -> list[Camera]:
         )
     try:
         size = int(table["size_px"][0]), int(table["size_px"][1])
-        cameras = [camera_of(record, frame, size) for record in table["views"]]
+        cameras = [camera_from_record(record, frame, size) for record in table["views"]]
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise InputError(path, f"not a valid camera path: {error!r}") from None
     if not cameras:

@@ -126,7 +126,7 @@ def _view(record: _Record, frame: LocalFrame, kind: Kind, where: str) -> Referen
     fx, fy, cx, cy = record.intrinsics
     k = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     if kind == "refined":
-        k, rotation = unstretch(k, rotation, latitude)
+        k, rotation = metric_from_grid(k, rotation, latitude)
     pose = np.eye(4)
     pose[:3, :3] = local_axes(frame, latitude, longitude).T @ _SEU_FROM_ENU.T @ rotation
     pose[:3, 3] = enu_from_geodetic(frame, latitude, longitude, height)
@@ -189,7 +189,7 @@ def steps_per_metre(latitude_deg: float) -> np.ndarray:
     )
 
 
-def unstretch(k: np.ndarray, grid_from_camera: np.ndarray, latitude_deg: float) -> tuple[np.ndarray, np.ndarray]:
+def metric_from_grid(k: np.ndarray, grid_from_camera: np.ndarray, latitude_deg: float) -> tuple[np.ndarray, np.ndarray]:
     """Convert a camera from the anisotropic reference grid to metric space.
 
     Parameters
@@ -211,8 +211,10 @@ def unstretch(k: np.ndarray, grid_from_camera: np.ndarray, latitude_deg: float) 
     return _rq_decomposition(k @ grid_from_camera.T @ np.diag(steps_per_metre(latitude_deg)))
 
 
-def stretch(k: np.ndarray, world_from_camera: np.ndarray, latitude_deg: float) -> tuple[np.ndarray, np.ndarray]:
-    """Convert a camera from metric space to the anisotropic reference grid; the inverse of `unstretch`.
+def grid_from_metric(
+    k: np.ndarray, world_from_camera: np.ndarray, latitude_deg: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Convert a camera from metric space to the anisotropic reference grid; the inverse of `metric_from_grid`.
 
     Parameters
     ----------
@@ -271,7 +273,7 @@ def reference_records(
         rotation = _SEU_FROM_ENU @ local_axes(frame, latitude, longitude) @ camera.world_from_camera[:3, :3]
         k = np.array([[camera.fx, view.skew_px, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
         if kind == "refined":
-            k, rotation = stretch(k, rotation, latitude)
+            k, rotation = grid_from_metric(k, rotation, latitude)
         matrix = np.eye(4)
         matrix[:3, :3] = rotation @ np.diag([1.0, -1.0, -1.0])
         matrix[:3, 3] = longitude, latitude, height

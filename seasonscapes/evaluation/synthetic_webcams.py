@@ -24,7 +24,7 @@ from seasonscapes.evaluation.webcam_faults import (
 from seasonscapes.images import linear_from_srgb
 from seasonscapes.rendering.gbuffer import GBuffer
 from seasonscapes.rendering.hemisphere_rays import ray_scene
-from seasonscapes.rendering.mitsuba_scene import RenderScene, mi_mesh, set_albedo
+from seasonscapes.rendering.mitsuba_scene import mi_mesh, set_albedo
 from seasonscapes.rendering.relit_view import relight_view, relightable_view
 from seasonscapes.rendering.transport import SamplingOptions, trace_view, view_albedo
 from seasonscapes.sky.illumination import Illumination
@@ -32,7 +32,7 @@ from seasonscapes.terrain.surface import Terrain
 
 Progress = Callable[[float], None]
 # Sampling for images of 720 x 480 px in a few seconds each, with noise well below the quantisation of 8 bits.
-QUICK = SamplingOptions(subpixels=4, shades=16, rays=128, clusters=2048, listed=32, rank=24)
+QUICK = SamplingOptions(shadow_samples=4, albedo_samples=16, rays=128, clusters=2048, clusters_per_receiver=32, rank=24)
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ def webcam_series(
     pictures, current_albedo = [], instants[0].albedo
     for index, instant in enumerate(instants):
         if instant.albedo is not current_albedo:
-            set_albedo(RenderScene(unlit.mi_scene, unlit.mi_terrain, instant.illumination, 0.0), instant.albedo)
+            set_albedo(unlit, instant.albedo)
             coefficients = replace(coefficients, albedo=view_albedo(unlit, coefficients))
             current_albedo = instant.albedo
         view = relight_view(relightable_view(unlit, coefficients), instant.illumination)

@@ -30,7 +30,7 @@ from seasonscapes.gaussians.disc_transport import (
     LightState,
     bounce_terms,
 )
-from seasonscapes.sky.illumination import LUMINANCE_WEIGHTS
+from seasonscapes.images import REC709_LUMINANCE
 
 # Ablations by network input: `code` a free vector per training time, as in WildGaussians; `sun` the time embedding
 # alone; `physical` no network at all; `full` physical shading, its features and the time embedding.
@@ -127,9 +127,9 @@ def time_features(state: LightState) -> np.ndarray:
         [
             *body,
             float(body @ body > 0.0),
-            np.log1p(strength @ LUMINANCE_WEIGHTS),
+            np.log1p(strength @ REC709_LUMINANCE),
             strength[0] - strength[2],
-            sky @ LUMINANCE_WEIGHTS,
+            sky @ REC709_LUMINANCE,
             sky[2] - sky[0],
             (np.log10(state.global_lx) - 4.5) / 2.0,
             np.sin(season),

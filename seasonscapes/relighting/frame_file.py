@@ -20,7 +20,7 @@ from seasonscapes.images import SATURATION_LUMINANCE, read_exr, write_exr
 _LARGEST = 60000.0
 
 
-def save_frame(path: Path, radiance: np.ndarray, *, metered_ev100: float, record: dict[str, Any]) -> None:
+def save_frame(path: Path, radiance: np.ndarray, *, metered_ev100: float, provenance: dict[str, Any]) -> None:
     """Write a frame, atomically.
 
     Parameters
@@ -31,11 +31,11 @@ def save_frame(path: Path, radiance: np.ndarray, *, metered_ev100: float, record
         ``(H, W, 3)`` scene-linear radiance [cd/m²].
     metered_ev100
         Metered exposure of the frame [EV100].
-    record
+    provenance
         Provenance: plain values, stored in the header of the file.
     """
     scale = SATURATION_LUMINANCE * 2.0**metered_ev100
-    header = {"seasonscapes:metered_ev100": float(metered_ev100), "seasonscapes:provenance": record}
+    header = {"seasonscapes:metered_ev100": float(metered_ev100), "seasonscapes:provenance": provenance}
     write_exr(path, {"": np.minimum(radiance / scale, _LARGEST)}, header=header, half=True)
 
 

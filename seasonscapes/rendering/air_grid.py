@@ -15,7 +15,7 @@ import numpy as np
 
 from seasonscapes.cameras.panorama import Panorama, view_directions
 from seasonscapes.cameras.pinhole import Camera
-from seasonscapes.rendering.mitsuba_scene import background
+from seasonscapes.rendering.mitsuba_scene import sky_radiance_towards
 from seasonscapes.sky.illumination import AerialPerspective, Illumination
 
 # Largest spacing of the nodes, in angle and in pixels.
@@ -26,8 +26,8 @@ _AUREOLE_DEG = 4.0
 
 
 @dataclass(frozen=True)
-class AirPlaces:
-    """Positions of a view's n terrain pixels in the grid at which aerial perspective is evaluated.
+class AirGrid:
+    """Grid at which aerial perspective is evaluated, and the positions of a view's n terrain pixels in it.
 
     Parameters
     ----------
@@ -64,9 +64,9 @@ def _node_directions(camera: Camera | Panorama, step: int) -> np.ndarray:
     return view_directions(camera, np.stack(np.meshgrid(x, y), axis=-1))
 
 
-def air_places(
+def air_grid(
     camera: Camera | Panorama, pixel: np.ndarray, depth_m: np.ndarray, mixed: np.ndarray, mixed_distance_m: np.ndarray
-) -> AirPlaces:
+) -> AirGrid:
     """Build the grid of aerial perspective for the terrain pixels of a view.
 
     Parameters
@@ -84,8 +84,8 @@ def air_places(
 
     Returns
     -------
-    AirPlaces
-        Grid nodes and the positions of the pixels between them, for `air_at`.
+    AirGrid
+        Grid nodes and the positions of the pixels between them, for `interpolate_air`.
     """
     on_terrain = np.isfinite(mixed_distance_m)
     low, high = (
@@ -108,7 +108,7 @@ def air_places(
         return mi.Point3f(*(mi.Float(np.ascontiguousarray(values, np.float32)) for values in columns))
 
     samples = np.repeat(pixel[mixed], mixed_distance_m.shape[1])
-    return AirPlaces(
+    return AirGrid(
         nodes,
         depths,
         coordinates(pixel, depth_m),
@@ -118,13 +118,13 @@ def air_places(
     )
 
 
-def air_at(places: AirPlaces, air: AerialPerspective) -> tuple[np.ndarray, np.ndarray]:
+def interpolate_air(grid: AirGrid, air: AerialPerspective) -> tuple[np.ndarray, np.ndarray]:
     """Interpolate aerial perspective at the terrain pixels of a view.
 
     Parameters
     ----------
-    places
-        From `air_places`.
+    grid
+        From `air_grid`.
     air
         Aerial perspective of the illumination; evaluated at the grid nodes.
 
@@ -138,18 +138,18 @@ def air_at(places: AirPlaces, air: AerialPerspective) -> tuple[np.ndarray, np.nd
     import drjit as dr
     import mitsuba as mi
 
-    shape = (_SLICES, *places.direction.shape[:2])
-    depth = np.broadcast_to(places.depth_m[:, None, None], shape)
-    parts = air(depth, np.broadcast_to(places.direction, (*shape, 3)))
+    shape = (_SLICES, *grid.direction.shape[:2])
+    depth = np.broadcast_to(grid.depth_m[:, None, None], shape)
+    parts = air(depth, np.broadcast_to(grid.direction, (*shape, 3)))
     nodes = np.concatenate([np.broadcast_to(part, (*shape, 3)) for part in parts], axis=-1).astype(np.float32)
     # The stub of Dr.Jit gives the texture types as `object`.
     texture: Any = mi.Texture3f(  # pyright: ignore[reportCallIssue]
         mi.TensorXf(np.ascontiguousarray(nodes)), wrap_mode=dr.WrapMode.Clamp
     )
-    values = np.array(texture.eval(places.mi_coordinate)).T.copy()
-    if len(places.mixed):
-        samples = np.array(texture.eval(places.mi_sample_coordinate)).T.reshape(*places.sample_weight.shape, 6)
-        values[places.mixed] = np.einsum("ks,ksc->kc", places.sample_weight, samples)
+    values = np.array(texture.eval(grid.mi_coordinate)).T.copy()
+    if len(grid.mixed):
+        samples = np.array(texture.eval(grid.mi_sample_coordinate)).T.reshape(*grid.sample_weight.shape, 6)
+        values[grid.mixed] = np.einsum("ks,ksc->kc", grid.sample_weight, samples)
     return values[:, :3], values[:, 3:]
 
 
@@ -192,7 +192,7 @@ def sky_grid(camera: Camera | Panorama, pixel: np.ndarray) -> SkyGrid:
     Returns
     -------
     SkyGrid
-        Grid nodes and bilinear weights, for `open_sky`.
+        Grid nodes and bilinear weights, for `sky_pixel_radiance`.
     """
     step = _step_px(camera, _SKY_STEP_DEG, _SKY_STEP_PX)
     node_direction = _node_directions(camera, step)
@@ -210,7 +210,7 @@ def sky_grid(camera: Camera | Panorama, pixel: np.ndarray) -> SkyGrid:
     return SkyGrid(pixel, node_direction, used, corner, weight, direction.astype(np.float32))
 
 
-def open_sky(grid: SkyGrid, illumination: Illumination, pixel_angle_deg: float) -> np.ndarray:
+def sky_pixel_radiance(grid: SkyGrid, illumination: Illumination, pixel_angle_deg: float) -> np.ndarray:
     """Radiance of the sky pixels of a view, with the discs of sun and moon.
 
     Parameters
@@ -220,7 +220,8 @@ def open_sky(grid: SkyGrid, illumination: Illumination, pixel_angle_deg: float) 
     illumination
         Sky, sun, moon and aerial perspective.
     pixel_angle_deg
-        Angular size of a pixel [deg], over which the edges of the discs are spread; see `mitsuba_scene.background`.
+        Angular size of a pixel [deg], over which the edges of the discs are spread; see
+        `mitsuba_scene.sky_radiance_towards`.
 
     Returns
     -------
@@ -229,7 +230,9 @@ def open_sky(grid: SkyGrid, illumination: Illumination, pixel_angle_deg: float) 
     """
     without_discs = replace(illumination, sun=None, moon=None)
     at_nodes = np.zeros((len(grid.used), 3), np.float32)
-    at_nodes[grid.used] = background(without_discs, grid.node_direction.reshape(-1, 3)[grid.used], pixel_angle_deg)
+    at_nodes[grid.used] = sky_radiance_towards(
+        without_discs, grid.node_direction.reshape(-1, 3)[grid.used], pixel_angle_deg
+    )
     sky = np.zeros((len(grid.direction), 3), np.float32)
     for corner, weight in zip(grid.corner, grid.weight, strict=True):
         sky += at_nodes[corner] * weight[:, None]
@@ -238,5 +241,7 @@ def open_sky(grid: SkyGrid, illumination: Illumination, pixel_angle_deg: float) 
         if body is not None:
             in_aureole |= grid.direction @ np.asarray(body.direction, np.float32) > np.cos(np.radians(_AUREOLE_DEG))
     if in_aureole.any():
-        sky[in_aureole] = background(illumination, grid.direction[in_aureole].astype(np.float64), pixel_angle_deg)
+        sky[in_aureole] = sky_radiance_towards(
+            illumination, grid.direction[in_aureole].astype(np.float64), pixel_angle_deg
+        )
     return sky

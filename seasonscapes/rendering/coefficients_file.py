@@ -22,7 +22,7 @@ from seasonscapes.rendering.light_clusters import LightClusters, ReceiverCoeffic
 from seasonscapes.rendering.transport import PointCoefficients, SamplingOptions, ViewCoefficients
 
 # Format of the files: increment whenever a stored field is added, removed or renamed.
-REVISION = 2
+REVISION = 3
 _TYPES: dict[str, type] = {
     stored.__name__: stored
     for stored in (

@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 
-from seasonscapes.rendering.sky_patches import SkyPatches, sky_covariance, sky_patches
+from seasonscapes.rendering.sky_patches import SkyPatches, sky_patches, sky_second_moments
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class DirectionBasis:
 @cache
 def _roots(name: str) -> tuple[np.ndarray, np.ndarray]:
     """Symmetric square root of the covariance of skies, and the inverse of that root, ``(P, P)`` each."""
-    values, vectors = np.linalg.eigh(sky_covariance(sky_patches(name)))
+    values, vectors = np.linalg.eigh(sky_second_moments(sky_patches(name)))
     root = np.sqrt(np.maximum(values, 1e-9))
     return (vectors * root) @ vectors.T, (vectors / root) @ vectors.T
 

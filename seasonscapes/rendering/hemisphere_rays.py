@@ -50,7 +50,7 @@ class SurfacePoints:
         ``(..., 3)`` float32 positions, ENU [m], offset along the geometric normal as Mitsuba offsets its rays.
     normal
         ``(..., 3)`` float32 unit shading normals.
-    outward
+    geometric_normal
         ``(..., 3)`` float32 unit geometric normals.
     albedo
         ``(..., 3)`` float32; zero where the surface was hit from its back.
@@ -60,7 +60,7 @@ class SurfacePoints:
 
     origin: np.ndarray
     normal: np.ndarray
-    outward: np.ndarray
+    geometric_normal: np.ndarray
     albedo: np.ndarray
     uv: np.ndarray
 
@@ -261,13 +261,13 @@ def _gather_block(
     point = lane // per_point
     index = lane - point * per_point + dr.gather(mi.UInt32, mi.UInt32(first), point)
     key = hashed(dr.gather(mi.UInt32, mi.UInt32(scramble), point), _HEMISPHERE)
-    mi_normal, mi_outward = (
+    mi_normal, mi_geometric_normal = (
         cast(Any, dr.gather(mi.Normal3f, mi.Normal3f(point3(normals)), point))  # the stubs reject normals as vectors
-        for normals in (points.normal, points.outward)
+        for normals in (points.normal, points.geometric_normal)
     )
     direction = mi.Frame3f(mi_normal).to_world(mi.warp.square_to_cosine_hemisphere(sobol_pair(key, index)))
     # With interpolated normals some rays enter the facet; they are black, as in a path tracer.
-    outside = dr.dot(direction, mi_outward) > 0.0
+    outside = dr.dot(direction, mi_geometric_normal) > 0.0
     ray = mi.Ray3f(dr.gather(mi.Point3f, point3(points.origin), point), direction)
     preliminary = terrain.mi_scene.ray_intersect_preliminary(ray, active=outside)
     interaction = preliminary.compute_surface_interaction(ray, mi.RayFlags.Minimal, outside)
@@ -307,9 +307,11 @@ def trace_bounce(terrain: RayScene, points: SurfacePoints, seed: int) -> tuple[S
     key = hashed(hashed(dr.arange(mi.UInt32, len(points.origin)), dr.opaque(mi.UInt32, seed)), _BOUNCE)
     square = mi.Point2f(uniform(hashed(key, 0)), uniform(hashed(key, 1)))
     # The stubs reject normals as vectors.
-    mi_normal, mi_outward = (cast(Any, mi.Normal3f(point3(normals))) for normals in (points.normal, points.outward))
+    mi_normal, mi_geometric_normal = (
+        cast(Any, mi.Normal3f(point3(normals))) for normals in (points.normal, points.geometric_normal)
+    )
     direction = mi.Frame3f(mi_normal).to_world(mi.warp.square_to_cosine_hemisphere(square))
-    outside = dr.dot(direction, mi_outward) > 0.0
+    outside = dr.dot(direction, mi_geometric_normal) > 0.0
     interaction = terrain.mi_scene.ray_intersect(mi.Ray3f(point3(points.origin), direction), active=outside)
     valid = interaction.is_valid() & (dr.dot(interaction.n, direction) < 0.0)
     hit = np.array(valid)

@@ -15,13 +15,13 @@ from seasonscapes.rendering.receivers import (
     ClusterLight,
     DeviceClusters,
     DeviceReceivers,
-    arriving,
+    incident_light,
     light_clusters,
     luminaries,
     upload_clusters,
     upload_receivers,
 )
-from seasonscapes.rendering.sun_visibility import SunRays, cosine_seen, numbered_turn, sun_rays
+from seasonscapes.rendering.sun_visibility import SunRays, hashed_disc_offset, sun_rays, visible_cosine
 from seasonscapes.rendering.transport import PointCoefficients, SamplingOptions, prepare_transport, trace_points
 from seasonscapes.sky.illumination import Illumination
 
@@ -147,11 +147,13 @@ def upload_points(terrain: RayScene, coefficients: PointCoefficients) -> DeviceP
 def _shadow_rays(terrain: RayScene, points: SurfacePoints, number: np.ndarray) -> SunRays:
     samples = points.reshape(-1, 1)
     weight = np.ones(samples.origin.shape[:2], np.float32)
-    return sun_rays(terrain, samples.origin, samples.normal, samples.outward, weight, numbered_turn(number))
+    return sun_rays(
+        terrain, samples.origin, samples.normal, samples.geometric_normal, weight, hashed_disc_offset(number)
+    )
 
 
 def irradiance(
-    device: DevicePoints, illumination: Illumination, light: ClusterLight | None = None, *, sun_rays_each: int = 4
+    device: DevicePoints, illumination: Illumination, light: ClusterLight | None = None, *, sun_rays_per_point: int = 4
 ) -> Irradiance:
     """Compute the illuminance of surface points under an illumination.
 
@@ -163,7 +165,7 @@ def irradiance(
         Sky, sun and moon.
     light
         From `receivers.light_clusters` for the same illumination, if it is reused for several blocks of points.
-    sun_rays_each
+    sun_rays_per_point
         Shadow rays per point, to different points of the disc.
 
     Returns
@@ -171,10 +173,12 @@ def irradiance(
     Irradiance
         ``(N, 3)`` illuminances [lx].
     """
-    sky, bounce = arriving(device.receivers, light or light_clusters(device.clusters, illumination))
+    sky, bounce = incident_light(device.receivers, light or light_clusters(device.clusters, illumination))
     sun = np.zeros_like(sky)
     for body in luminaries(illumination):
-        sun += cosine_seen(device.rays, body, each=sun_rays_each) * np.asarray(body.normal_illuminance_lx, np.float32)
+        sun += visible_cosine(device.rays, body, rays_per_sample=sun_rays_per_point) * np.asarray(
+            body.normal_illuminance_lx, np.float32
+        )
     return Irradiance(sun, np.float32(np.pi) * sky, np.float32(np.pi) * bounce)
 
 

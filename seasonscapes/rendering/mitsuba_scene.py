@@ -29,7 +29,7 @@ class _HasTerrain(Protocol):
 
 @dataclass(frozen=True)
 class RenderScene:
-    """A Mitsuba scene of a terrain under one illumination.
+    """A Mitsuba scene of a terrain, under one illumination or without light.
 
     Parameters
     ----------
@@ -38,15 +38,12 @@ class RenderScene:
     mi_terrain
         Mesh and material, which `relight` reuses for other illuminations.
     illumination
-        Sky, sun, moon and aerial perspective.
-    max_height_m
-        Highest vertex of the terrain, up [m].
+        Sky, sun, moon and aerial perspective; ``None`` for a scene without light, of which only the geometry is used.
     """
 
     mi_scene: Any
     mi_terrain: Any
-    illumination: Illumination
-    max_height_m: float
+    illumination: Illumination | None = None
 
 
 def mi_mesh(terrain: Terrain, albedo: np.ndarray, *, smooth: bool = True) -> Any:
@@ -185,7 +182,7 @@ def mi_sky(sky_radiance: np.ndarray) -> Any:
     )
 
 
-def relight(mi_terrain: Any, illumination: Illumination, *, max_height_m: float) -> RenderScene:
+def relight(mi_terrain: Any, illumination: Illumination) -> RenderScene:
     """Create a scene of a terrain under an illumination.
 
     A black sky, and luminaries without illuminance, are omitted.
@@ -196,8 +193,6 @@ def relight(mi_terrain: Any, illumination: Illumination, *, max_height_m: float)
         Mesh from `mi_mesh`, or ``mi_terrain`` of another scene.
     illumination
         Sky, sun, moon and aerial perspective.
-    max_height_m
-        Highest vertex of the terrain, up [m].
 
     Returns
     -------
@@ -220,7 +215,7 @@ def relight(mi_terrain: Any, illumination: Illumination, *, max_height_m: float)
             members[name] = mi_luminary(luminary)
     if len(members) == 2:
         raise ValueError("relight: the illumination has no light at all; expected a sky, sun or moon that is not black")
-    return RenderScene(mi.load_dict(members), mi_terrain, illumination, max_height_m)
+    return RenderScene(mi.load_dict(members), mi_terrain, illumination)
 
 
 def build_scene(
@@ -249,9 +244,7 @@ def build_scene(
     ValueError
         If the illumination has no light.
     """
-    return relight(
-        mi_mesh(terrain, albedo, smooth=smooth), illumination, max_height_m=float(terrain.vertices[:, 2].max())
-    )
+    return relight(mi_mesh(terrain, albedo, smooth=smooth), illumination)
 
 
 def set_albedo(scene: _HasTerrain, albedo: np.ndarray) -> None:
@@ -272,7 +265,7 @@ def set_albedo(scene: _HasTerrain, albedo: np.ndarray) -> None:
     parameters.update()
 
 
-def background(illumination: Illumination, direction: np.ndarray, pixel_angle_deg: float) -> np.ndarray:
+def sky_radiance_towards(illumination: Illumination, direction: np.ndarray, pixel_angle_deg: float) -> np.ndarray:
     """Compute the radiance of the sky along view directions, with the discs of sun and moon.
 
     The edges of the discs are blurred over one pixel against aliasing. With aerial perspective the sky is its airlight

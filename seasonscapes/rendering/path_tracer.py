@@ -109,6 +109,8 @@ def _upload_luminary(luminary: Luminary) -> _DeviceLuminary:
 
 
 def _luminaries(scene: RenderScene) -> list[_DeviceLuminary]:
+    if scene.illumination is None:
+        raise ValueError("path tracer: got a scene without illumination, expected one from `mitsuba_scene.relight`")
     bodies = (scene.illumination.sun, scene.illumination.moon)
     bright = [body for body in bodies if body is not None and np.max(body.normal_illuminance_lx) > 0.0]
     emitters, expected = len(scene.mi_scene.emitters()), len(bright) + (scene.mi_scene.environment() is not None)

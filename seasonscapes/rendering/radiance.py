@@ -12,7 +12,7 @@ from seasonscapes.cameras.panorama import Panorama, view_directions
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.rendering.backend import use_backend
 from seasonscapes.rendering.gbuffer import GBuffer, trace_gbuffer
-from seasonscapes.rendering.mitsuba_scene import RenderScene, background
+from seasonscapes.rendering.mitsuba_scene import RenderScene, sky_radiance_towards
 from seasonscapes.sky.illumination import AerialPerspective
 
 # Samples per kernel launch: about 50 MB on the LLVM backend; more are not faster.
@@ -103,7 +103,8 @@ def path_trace(
     Raises
     ------
     ValueError
-        If ``spp`` or ``max_depth`` is too small, or the camera is not supported by the scalar variant.
+        If ``spp`` or ``max_depth`` is too small, the scene has no illumination, or the camera is not supported by the
+        scalar variant.
     FloatingPointError
         If a radiance is not finite.
     """
@@ -248,8 +249,17 @@ def apply_aerial_perspective(
     -------
     numpy.ndarray
         ``(H, W, 3)`` float32 radiance at the camera [cd/m²].
+
+    Raises
+    ------
+    ValueError
+        If the scene has no illumination.
     """
     illumination = scene.illumination
+    if illumination is None:
+        raise ValueError(
+            "apply_aerial_perspective: got a scene without illumination, expected one from `mitsuba_scene.relight`"
+        )
     direction = view_directions(camera)
     open_sky = (1.0 - coverage)[..., None]
     image = surface.astype(np.float64)
@@ -266,7 +276,7 @@ def apply_aerial_perspective(
     if np.any(open_sky > 0.0):
         pixel_angle_deg = float(np.degrees(1.0 / camera.fx))
         rows = np.any(open_sky[..., 0] > 0.0, axis=1)
-        image[rows] += open_sky[rows] * background(illumination, direction[rows], pixel_angle_deg)
+        image[rows] += open_sky[rows] * sky_radiance_towards(illumination, direction[rows], pixel_angle_deg)
     return image.astype(np.float32)
 
 

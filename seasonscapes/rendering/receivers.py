@@ -15,7 +15,7 @@ from seasonscapes.rendering.hemisphere_rays import RayScene
 from seasonscapes.rendering.light_clusters import LightClusters, ReceiverCoefficients
 from seasonscapes.rendering.sky_patches import patch_radiance, sky_patches
 from seasonscapes.rendering.smoothing import DeviceNeighbours, Neighbours, mi_smoothed, upload_neighbours
-from seasonscapes.rendering.sun_visibility import SunRays, cosine_seen, numbered_turn, sun_rays
+from seasonscapes.rendering.sun_visibility import SunRays, hashed_disc_offset, sun_rays, visible_cosine
 from seasonscapes.sky.illumination import Illumination, Luminary, luminance
 
 # A moon (or setting sun) whose illuminance is less than this fraction of the sky's casts no visible shadow.
@@ -123,12 +123,17 @@ def upload_clusters(terrain: RayScene, clusters: LightClusters) -> DeviceCluster
     points = clusters.points
     shape = points.origin.shape[:2]
     rays = sun_rays(
-        terrain, points.origin, points.normal, points.outward, np.ones(shape), numbered_turn(np.arange(shape[0]))
+        terrain,
+        points.origin,
+        points.normal,
+        points.geometric_normal,
+        np.ones(shape),
+        hashed_disc_offset(np.arange(shape[0])),
     )
     return DeviceClusters(clusters, upload_receivers(clusters.receivers), rays)
 
 
-def arriving(device: DeviceReceivers, light: ClusterLight) -> tuple[np.ndarray, np.ndarray]:
+def incident_light(device: DeviceReceivers, light: ClusterLight) -> tuple[np.ndarray, np.ndarray]:
     """Compute the irradiance of receivers from the sky and from clusters.
 
     Parameters
@@ -215,7 +220,7 @@ def light_clusters(device: DeviceClusters, illumination: Illumination) -> Cluste
     Returns
     -------
     ClusterLight
-        Sky in the directional basis and radiance of the clusters, for `arriving`.
+        Sky in the directional basis and radiance of the clusters, for `incident_light`.
     """
     import drjit as dr
     import mitsuba as mi
@@ -228,7 +233,7 @@ def light_clusters(device: DeviceClusters, illumination: Illumination) -> Cluste
     albedo = clusters.points.albedo
     sunlit = np.zeros((len(albedo), 3), np.float32)
     for body in luminaries(illumination):
-        cosine = cosine_seen(device.rays, body)[..., None]
+        cosine = visible_cosine(device.rays, body)[..., None]
         sunlit += (cosine * albedo).mean(axis=1) * (np.asarray(body.normal_illuminance_lx, np.float32) / np.pi)
     mean_albedo = [mi.Float(np.ascontiguousarray(column)) for column in albedo.mean(axis=1).T]
     from_sun = [mi.Float(np.ascontiguousarray(column)) for column in sunlit.T]

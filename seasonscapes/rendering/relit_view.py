@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from seasonscapes.rendering.air_grid import AirPlaces, SkyGrid, air_at, air_places, open_sky, sky_grid
+from seasonscapes.rendering.air_grid import AirGrid, SkyGrid, air_grid, interpolate_air, sky_grid, sky_pixel_radiance
 from seasonscapes.rendering.gbuffer import GBuffer, trace_gbuffer
 from seasonscapes.rendering.hemisphere_rays import RayScene, texture_at
 from seasonscapes.rendering.mitsuba_scene import RenderScene
@@ -18,13 +18,19 @@ from seasonscapes.rendering.radiance import RenderedView
 from seasonscapes.rendering.receivers import (
     DeviceClusters,
     DeviceReceivers,
-    arriving,
+    incident_light,
     light_clusters,
     luminaries,
     upload_clusters,
     upload_receivers,
 )
-from seasonscapes.rendering.sun_visibility import SunRays, first_sample_visible, incidence, pixel_turn, sun_rays
+from seasonscapes.rendering.sun_visibility import (
+    SunRays,
+    bayer_disc_offset,
+    first_sample_visible,
+    sum_incidence,
+    sun_rays,
+)
 from seasonscapes.rendering.transport import ViewCoefficients, view_neighbours
 from seasonscapes.sky.illumination import Illumination, Luminary
 
@@ -73,7 +79,7 @@ class RelightableView:
     silhouette: np.ndarray
     gbuffer: GBuffer
     coverage: np.ndarray
-    air: AirPlaces
+    air: AirGrid
     sky: SkyGrid
 
 
@@ -98,11 +104,11 @@ def relightable_view(terrain: RayScene, coefficients: ViewCoefficients) -> Relig
     coverage.reshape(-1)[pixel] = coefficients.coverage
     silhouette = (farthest > nearest * _DEPTH_RATIO) | (coefficients.coverage < 1.0)
     # A G-buffer depends on geometry alone, so that the scene needs no illumination.
-    scene = RenderScene(terrain.mi_scene, terrain.mi_terrain, None, 0.0)  # pyright: ignore[reportArgumentType]
+    scene = RenderScene(terrain.mi_scene, terrain.mi_terrain)
     gbuffer = trace_gbuffer(scene, camera)
     centre_m = gbuffer.depth.reshape(-1)[pixel]
     mixed = np.flatnonzero((farthest > nearest * _AIR_RATIO) | ~np.isfinite(centre_m))
-    air = air_places(camera, pixel, np.where(np.isfinite(centre_m), centre_m, nearest), mixed, distance[mixed])
+    air = air_grid(camera, pixel, np.where(np.isfinite(centre_m), centre_m, nearest), mixed, distance[mixed])
     passes = [view_neighbours(coefficients, stride=stride, sharpness=_BOUNCE_SHARPNESS) for stride in _BOUNCE_STRIDES]
     rays = sun_rays(
         terrain,
@@ -110,7 +116,7 @@ def relightable_view(terrain: RayScene, coefficients: ViewCoefficients) -> Relig
         coefficients.sample_normal,
         coefficients.sample_outward,
         coefficients.sample_weight,
-        pixel_turn(pixel, camera.width_px, coefficients.sampling.subpixels),
+        bayer_disc_offset(pixel, camera.width_px, coefficients.sampling.shadow_samples),
     )
     return RelightableView(
         coefficients,
@@ -220,7 +226,7 @@ def relit_surface_radiance(view: RelightableView, illumination: Illumination) ->
     numpy.ndarray
         ``(n, 3)`` float32 [cd/m²], averaged over the pixel with the sky counted as black.
     """
-    direct, reflected = arriving(view.receivers, light_clusters(view.clusters, illumination))
+    direct, reflected = incident_light(view.receivers, light_clusters(view.clusters, illumination))
     total = direct + reflected
     for body in luminaries(illumination):
         light = np.asarray(body.normal_illuminance_lx, np.float32) / np.float32(np.pi)
@@ -250,7 +256,7 @@ def sun_cosine(view: RelightableView, luminary: Luminary) -> np.ndarray:
     visible = first_sample_visible(view.rays, luminary)
     mixed = np.flatnonzero(_differs_nearby(view, visible) | view.silhouette | (visible & (cosine < _GRAZING)))
     result = np.where(visible, cosine, 0.0)
-    sunlit, unoccluded = incidence(view.rays, luminary, mixed)
+    sunlit, unoccluded = sum_incidence(view.rays, luminary, mixed)
     # The mean normal averages many more samples than the shadow rays: these only determine the sunlit fraction.
     reliable = (cosine[mixed] > _GRAZING) & (unoccluded > _GRAZING)
     ratio = np.where(reliable, cosine[mixed] / np.where(reliable, unoccluded, 1.0), 1.0)
@@ -273,11 +279,11 @@ def _at_camera(view: RelightableView, illumination: Illumination, surface: np.nd
     """Radiance ``(H, W, 3)`` at the camera, from the air grid; see `radiance.apply_aerial_perspective`."""
     camera, pixel = view.coefficients.camera, view.coefficients.pixel
     if illumination.aerial_perspective is not None:
-        transmittance, airlight = air_at(view.air, illumination.aerial_perspective)
+        transmittance, airlight = interpolate_air(view.air, illumination.aerial_perspective)
         surface = surface * transmittance + airlight * view.coefficients.coverage[:, None]
     image = np.zeros((camera.height_px * camera.width_px, 3), np.float32)
     image[pixel] = surface
     if len(view.sky.pixel):
-        sky = open_sky(view.sky, illumination, float(np.degrees(1.0 / camera.fx)))
+        sky = sky_pixel_radiance(view.sky, illumination, float(np.degrees(1.0 / camera.fx)))
         image[view.sky.pixel] += (1.0 - view.coverage.reshape(-1)[view.sky.pixel])[:, None] * sky
     return image.reshape(*view.coverage.shape, 3)

@@ -16,11 +16,16 @@ from seasonscapes.rendering.hemisphere_rays import RayScene
 LANES = 1 << 22
 # Offset of ray origins in units in the last place of their largest coordinate: 8 mm at 16 km. With less, rays would hit
 # the face they start from; with more, they would pass over the edge of a ridge.
-_LIFT_ULP = 8.0
+_OFFSET_ULP = 8.0
 
 
-def clear_sight(
-    terrain: RayScene, position_m: np.ndarray, normal: np.ndarray, eye_m: np.ndarray, *, lift_m: float | None = None
+def line_of_sight(
+    terrain: RayScene,
+    position_m: np.ndarray,
+    normal: np.ndarray,
+    camera_m: np.ndarray,
+    *,
+    offset_m: float | None = None,
 ) -> np.ndarray:
     """Test whether the line of sight between points on the terrain and a camera position is unobstructed.
 
@@ -32,10 +37,10 @@ def clear_sight(
         ``(N, 3)`` points on the surface, ENU [m].
     normal
         ``(N, 3)`` unit normals of their faces, along which the ray origins are offset.
-    eye_m
+    camera_m
         ``(3,)`` camera position, ENU [m]; the last half metre before it is ignored, so that terrain right at a mast
         does not block the view.
-    lift_m
+    offset_m
         Offset of the ray origins [m]; by default just above the rounding error of float32.
 
     Returns
@@ -44,33 +49,33 @@ def clear_sight(
         ``(N,)`` bool.
     """
     position_m, normal = np.asarray(position_m, np.float32), np.asarray(normal, np.float32)
-    clear = np.empty(len(position_m), bool)
-    for start in range(0, len(clear), LANES):
+    unobstructed = np.empty(len(position_m), bool)
+    for start in range(0, len(unobstructed), LANES):
         part = slice(start, start + LANES)
-        clear[part] = _clear_block(terrain, position_m[part], normal[part], eye_m, lift_m)
-    return clear
+        unobstructed[part] = _unobstructed(terrain, position_m[part], normal[part], camera_m, offset_m)
+    return unobstructed
 
 
-def _clear_block(
-    terrain: RayScene, position_m: np.ndarray, normal: np.ndarray, eye_m: np.ndarray, lift_m: float | None
+def _unobstructed(
+    terrain: RayScene, position_m: np.ndarray, normal: np.ndarray, camera_m: np.ndarray, offset_m: float | None
 ) -> np.ndarray:
     import drjit as dr
     import mitsuba as mi
 
     # Opaque: literals would be compiled into the kernel, and every camera would need a compilation of its own.
-    eye = mi.Point3f(*(dr.opaque(mi.Float, float(value)) for value in eye_m))
+    camera = mi.Point3f(*(dr.opaque(mi.Float, float(value)) for value in camera_m))
     surface = mi.Point3f(point3(position_m))
-    rounding = dr.max(dr.abs(surface)) * dr.opaque(mi.Float, _LIFT_ULP * float(np.finfo(np.float32).eps))
-    offset: Any = dr.maximum(rounding, 1e-3) if lift_m is None else dr.opaque(mi.Float, float(lift_m))
+    rounding = dr.max(dr.abs(surface)) * dr.opaque(mi.Float, _OFFSET_ULP * float(np.finfo(np.float32).eps))
+    offset: Any = dr.maximum(rounding, 1e-3) if offset_m is None else dr.opaque(mi.Float, float(offset_m))
     origin = surface + mi.Vector3f(point3(normal)) * offset
-    direction = eye - origin
+    direction = camera - origin
     distance = dr.norm(direction)
     ray = mi.Ray3f(origin, direction / distance)
     ray.maxt = dr.maximum(distance - NEAR_M, 0.0)
     return ~np.array(terrain.mi_scene.ray_test(ray))
 
 
-def faces_met(terrain: RayScene, camera: Camera | Panorama) -> np.ndarray:
+def visible_faces(terrain: RayScene, camera: Camera | Panorama) -> np.ndarray:
     """Find the face that is visible at each pixel centre.
 
     Parameters

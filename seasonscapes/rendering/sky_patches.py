@@ -226,7 +226,7 @@ def direction_weights(patches: SkyPatches, direction: np.ndarray) -> np.ndarray:
     return weights
 
 
-def sky_covariance(patches: SkyPatches, *, unrest: float = 0.15) -> np.ndarray:
+def sky_second_moments(patches: SkyPatches, *, patch_sigma: float = 0.15) -> np.ndarray:
     """Compute the second moments of patch radiances over a family of likely skies, each of mean radiance 1.
 
     The family are CIE general skies (ISO 15469:2004; Kittler, Perez & Darula 1998) for sun positions over the upper
@@ -236,8 +236,8 @@ def sky_covariance(patches: SkyPatches, *, unrest: float = 0.15) -> np.ndarray:
     ----------
     patches
         The subdivision.
-    unrest
-        Relative standard deviation of each patch independently of all others (clouds). A positive value gives the
+    patch_sigma
+        Relative standard deviation of the radiance of each patch, independent of all others (clouds). A positive value gives the
         matrix full rank, so that any sky can be represented.
 
     Returns
@@ -270,4 +270,4 @@ def sky_covariance(patches: SkyPatches, *, unrest: float = 0.15) -> np.ndarray:
     values /= share @ values
     covariance = values @ values.T / values.shape[1]
     below = (~above).astype(float)
-    return covariance + 0.3 * np.outer(below, below) + np.diag(unrest**2 * np.ones(patches.size))
+    return covariance + 0.3 * np.outer(below, below) + np.diag(patch_sigma**2 * np.ones(patches.size))

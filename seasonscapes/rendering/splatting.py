@@ -25,9 +25,9 @@ class SplatLimits(NamedTuple):
 
     Parameters
     ----------
-    alpha_cut
+    min_alpha
         Least opacity that is drawn.
-    alpha_most
+    max_alpha
         Largest opacity of a splat in a pixel.
     pixel_variance
         Variance of the pixel filter [px²].
@@ -37,8 +37,8 @@ class SplatLimits(NamedTuple):
         Omit splats whose third axis points away from the camera.
     """
 
-    alpha_cut: float
-    alpha_most: float
+    min_alpha: float
+    max_alpha: float
     pixel_variance: float
     near_m: float
     one_sided: bool = False
@@ -121,7 +121,7 @@ def upload_splats(means: np.ndarray, axes: np.ndarray, opacity: np.ndarray) -> D
 
 
 def splat_layers(
-    splats: DeviceSplats, layers: np.ndarray, camera: Camera, cuts: SplatLimits
+    splats: DeviceSplats, layers: np.ndarray, camera: Camera, limits: SplatLimits
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rasterise splats: blend their values front to back over black.
 
@@ -133,7 +133,7 @@ def splat_layers(
         ``(N, C)`` values of the splats, such as colours and distance.
     camera
         The view.
-    cuts
+    limits
         Limits of rasterisation.
 
     Returns
@@ -146,7 +146,7 @@ def splat_layers(
     import drjit as dr
     import mitsuba as mi
 
-    projected = _project(splats, camera, cuts)
+    projected = _project(splats, camera, limits)
     index, start = _tile_lists(projected, camera)
     if len(index) == 0:
         shape = (camera.height_px, camera.width_px)
@@ -160,7 +160,7 @@ def splat_layers(
     mi_start = mi.UInt32(start)
     channels = [mi.Float(np.ascontiguousarray(channel, np.float32)) for channel in layers.T]
     order = mi.UInt32(index)
-    most, least = dr.opaque(mi.Float, cuts.alpha_most), dr.opaque(mi.Float, cuts.alpha_cut)
+    most, least = dr.opaque(mi.Float, limits.max_alpha), dr.opaque(mi.Float, limits.min_alpha)
 
     parameters = (
         projected.mi_x,
@@ -218,7 +218,7 @@ class _ProjectedSplats:
     mi_extent_y: Any
 
 
-def _project(splats: DeviceSplats, camera: Camera, cuts: SplatLimits) -> _ProjectedSplats:
+def _project(splats: DeviceSplats, camera: Camera, limits: SplatLimits) -> _ProjectedSplats:
     import drjit as dr
     import mitsuba as mi
 
@@ -232,17 +232,17 @@ def _project(splats: DeviceSplats, camera: Camera, cuts: SplatLimits) -> _Projec
     # As in 3DGS, the derivative of the projection is evaluated at most 30 % outside of the image.
     limits = number(0.65 * camera.width_px / camera.fx), number(0.65 * camera.height_px / camera.fy)
     u, v = (dr.clip(side / z, -limit, limit) for side, limit in zip((x, y), limits, strict=True))
-    xx, xy, yy = number(cuts.pixel_variance), mi.Float(0.0), number(cuts.pixel_variance)
+    xx, xy, yy = number(limits.pixel_variance), mi.Float(0.0), number(limits.pixel_variance)
     for axis in splats.mi_axes:
         a, b, c = (dr.dot(axis, camera_axis) for camera_axis in camera_axes)
         across, down = fx / z * (a - u * c), fy / z * (b - v * c)
         xx, xy, yy = dr.fma(across, across, xx), dr.fma(across, down, xy), dr.fma(down, down, yy)
     determinant = xx * yy - xy * xy
-    visible = (z > number(cuts.near_m)) & (splats.mi_opacity >= number(cuts.alpha_cut))
-    if cuts.one_sided:
+    visible = (z > number(limits.near_m)) & (splats.mi_opacity >= number(limits.min_alpha))
+    if limits.one_sided:
         visible &= dr.dot(local, splats.mi_axes[2]) < 0.0
     # Distance from the centre, in standard deviations, at which the opacity falls to the least one.
-    extent = dr.sqrt(dr.maximum(2.0 * dr.log(splats.mi_opacity / number(max(cuts.alpha_cut, 1e-30))), 0.0))
+    extent = dr.sqrt(dr.maximum(2.0 * dr.log(splats.mi_opacity / number(max(limits.min_alpha, 1e-30))), 0.0))
     columns = (
         fx * x / z + number(camera.cx),
         fy * y / z + number(camera.cy),

@@ -35,7 +35,7 @@ class SunRays:
         The occluding terrain.
     mi_origin
         ``mi.Point3f`` of N · S lanes, the samples of a receiver side by side.
-    mi_normal, mi_outward
+    mi_normal, mi_geometric_normal
         Shading and geometric normals, three ``mi.Float16`` arrays each.
     mi_weight
         ``mi.Float16``: weight of each sample in its receiver.
@@ -48,7 +48,7 @@ class SunRays:
     terrain: RayScene
     mi_origin: Any
     mi_normal: list[Any]
-    mi_outward: list[Any]
+    mi_geometric_normal: list[Any]
     mi_weight: Any
     mi_disc_offset: Any
     samples: int
@@ -65,7 +65,7 @@ def sun_rays(
     terrain: RayScene,
     origin_m: np.ndarray,
     normal: np.ndarray,
-    outward: np.ndarray,
+    geometric_normal: np.ndarray,
     weight: np.ndarray,
     disc_offset: np.ndarray,
 ) -> SunRays:
@@ -77,13 +77,13 @@ def sun_rays(
         The occluding terrain.
     origin_m
         ``(N, S, 3)`` origins of the rays, off the surface, ENU [m].
-    normal, outward
+    normal, geometric_normal
         ``(N, S, 3)`` unit shading normals and unit geometric normals.
     weight
         ``(N, S)`` weight of each sample in its receiver, 0 for samples that are not on the terrain.
     disc_offset
         ``(N,)`` integers. The samples of a receiver use successive points of the disc, beginning with this one;
-        different offsets of neighbouring receivers dither penumbrae, see `pixel_turn`.
+        different offsets of neighbouring receivers dither penumbrae, see `bayer_disc_offset`.
 
     Returns
     -------
@@ -94,17 +94,17 @@ def sun_rays(
     import mitsuba as mi
 
     mi_origin = point3(np.asarray(origin_m).reshape(-1, 3))
-    mi_normal, mi_outward = (
+    mi_normal, mi_geometric_normal = (
         [mi.Float16(np.ascontiguousarray(column, np.float16)) for column in np.asarray(values).reshape(-1, 3).T]
-        for values in (normal, outward)
+        for values in (normal, geometric_normal)
     )
     mi_weight = mi.Float16(np.ascontiguousarray(weight, np.float16).ravel())
     mi_disc_offset = mi.UInt32((np.asarray(disc_offset, np.int64) % 256).astype(np.uint32))
-    dr.eval(mi_origin, mi_normal, mi_outward, mi_weight, mi_disc_offset)
-    return SunRays(terrain, mi_origin, mi_normal, mi_outward, mi_weight, mi_disc_offset, weight.shape[1])
+    dr.eval(mi_origin, mi_normal, mi_geometric_normal, mi_weight, mi_disc_offset)
+    return SunRays(terrain, mi_origin, mi_normal, mi_geometric_normal, mi_weight, mi_disc_offset, weight.shape[1])
 
 
-def pixel_turn(pixel: np.ndarray, width_px: int, samples: int) -> np.ndarray:
+def bayer_disc_offset(pixel: np.ndarray, width_px: int, samples: int) -> np.ndarray:
     """Compute the disc offsets of pixels: the 16 pixels of each 4 × 4 block have different ones (Bayer's matrix).
 
     Parameters
@@ -125,7 +125,7 @@ def pixel_turn(pixel: np.ndarray, width_px: int, samples: int) -> np.ndarray:
     return _BAYER[row % 4, column % 4] * max(samples // 16, 1)
 
 
-def numbered_turn(number: np.ndarray) -> np.ndarray:
+def hashed_disc_offset(number: np.ndarray) -> np.ndarray:
     """Compute the disc offsets of receivers that are no pixels, by Knuth's multiplicative hash.
 
     Parameters
@@ -198,7 +198,7 @@ def first_sample_visible(rays: SunRays, luminary: Luminary) -> np.ndarray:
     return result
 
 
-def incidence(rays: SunRays, luminary: Luminary, receiver: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def sum_incidence(rays: SunRays, luminary: Luminary, receiver: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Sum the cosine of incidence over the samples of receivers, with and without occlusion.
 
     Parameters
@@ -238,7 +238,7 @@ def incidence(rays: SunRays, luminary: Luminary, receiver: np.ndarray) -> tuple[
     return sums[0], sums[1]
 
 
-def cosine_seen(rays: SunRays, luminary: Luminary, *, each: int = 1) -> np.ndarray:
+def visible_cosine(rays: SunRays, luminary: Luminary, *, rays_per_sample: int = 1) -> np.ndarray:
     """Compute cosine of incidence × visibility of the luminary for all samples.
 
     Parameters
@@ -247,7 +247,7 @@ def cosine_seen(rays: SunRays, luminary: Luminary, *, each: int = 1) -> np.ndarr
         Shadow rays of N receivers with S samples each.
     luminary
         Sun or moon.
-    each
+    rays_per_sample
         Shadow rays per sample, to different points of the disc.
 
     Returns
@@ -258,18 +258,18 @@ def cosine_seen(rays: SunRays, luminary: Luminary, *, each: int = 1) -> np.ndarr
     import drjit as dr
     import mitsuba as mi
 
-    disc = _mi_disc(luminary, rays.samples * each)
+    disc = _mi_disc(luminary, rays.samples * rays_per_sample)
     result = np.empty(rays.receivers * rays.samples, np.float32)
-    step = max(1, LANES // each)
+    step = max(1, LANES // rays_per_sample)
     for start in range(0, len(result), step):
         count = min(step, len(result) - start)
-        index = dr.arange(mi.UInt32, count * each)
-        sample = index // dr.opaque(mi.UInt32, each)
-        shift = (index - sample * dr.opaque(mi.UInt32, each)) * dr.opaque(mi.UInt32, rays.samples)
+        index = dr.arange(mi.UInt32, count * rays_per_sample)
+        sample = index // dr.opaque(mi.UInt32, rays_per_sample)
+        shift = (index - sample * dr.opaque(mi.UInt32, rays_per_sample)) * dr.opaque(mi.UInt32, rays.samples)
         visible, cosine, _ = _visible(rays, disc, sample + dr.opaque(mi.UInt32, start), shift)
-        visible_cosine = dr.select(visible, cosine, 0.0)
-        dr.eval(visible_cosine)
-        result[start : start + count] = np.array(dr.block_sum(visible_cosine, each)) / each
+        lanes = dr.select(visible, cosine, 0.0)
+        dr.eval(lanes)
+        result[start : start + count] = np.array(dr.block_sum(lanes, rays_per_sample)) / rays_per_sample
     return result.reshape(-1, rays.samples)
 
 
@@ -291,15 +291,15 @@ def _visible(rays: SunRays, disc: _Disc, lane: Any, shift: Any = 0) -> tuple[Any
     import drjit as dr
     import mitsuba as mi
 
-    cosine, outward = (
+    cosine, geometric_cosine = (
         sum(
             mi.Float(dr.gather(mi.Float16, column, lane)) * axis
             for column, axis in zip(columns, disc.mi_centre, strict=True)
         )
-        for columns in (rays.mi_normal, rays.mi_outward)
+        for columns in (rays.mi_normal, rays.mi_geometric_normal)
     )
     weight = mi.Float(dr.gather(mi.Float16, rays.mi_weight, lane))
-    active = (cosine > 0.0) & (outward > 0.0) & (weight > 0.0)
+    active = (cosine > 0.0) & (geometric_cosine > 0.0) & (weight > 0.0)
     samples = dr.opaque(mi.UInt32, rays.samples)
     receiver = lane // samples
     disc_point = lane - receiver * samples + dr.gather(mi.UInt32, rays.mi_disc_offset, receiver) + shift

@@ -58,9 +58,9 @@ class SamplingOptions:
 
     Parameters
     ----------
-    subpixels
+    shadow_samples
         Number S of samples per pixel from which shadow rays start, a square.
-    shades
+    albedo_samples
         Samples per pixel for its mean albedo and normal, a square.
     rays
         Hemisphere rays per receiver, a power of two.
@@ -68,7 +68,7 @@ class SamplingOptions:
         Number of surfaces between light and receiver; 4 equals ``max_depth=6`` of the path tracer.
     clusters
         Number M of clusters of faces, a power of two up to 65,536.
-    listed
+    clusters_per_receiver
         Number K of clusters stored per receiver, even.
     rank
         Number r of daylight coefficients stored per receiver.
@@ -81,24 +81,30 @@ class SamplingOptions:
         If a number violates these conditions.
     """
 
-    subpixels: int = 16
-    shades: int = 64
+    shadow_samples: int = 16
+    albedo_samples: int = 64
     rays: int = 512
     bounces: int = 4
     clusters: int = 16384
-    listed: int = 64
+    clusters_per_receiver: int = 64
     rank: int = 32
     patches: str = "reinhart"
 
     def __post_init__(self):
-        if round(self.subpixels**0.5) ** 2 != self.subpixels or self.rays & (self.rays - 1) or self.bounces < 0:
-            raise ValueError("SamplingOptions: subpixels must be a square, rays a power of two, bounces not negative")
-        if self.rays % self.subpixels:
+        if (
+            round(self.shadow_samples**0.5) ** 2 != self.shadow_samples
+            or self.rays & (self.rays - 1)
+            or self.bounces < 0
+        ):
             raise ValueError(
-                f"SamplingOptions: got {self.rays} rays, expected a multiple of the {self.subpixels} subpixels"
+                "SamplingOptions: shadow_samples must be a square, rays a power of two, bounces not negative"
             )
-        if self.listed % 2 or not 0 < self.clusters <= 65536:
-            raise ValueError("SamplingOptions: listed must be even and clusters at most 65536")
+        if self.rays % self.shadow_samples:
+            raise ValueError(
+                f"SamplingOptions: got {self.rays} rays, expected a multiple of the {self.shadow_samples} shadow_samples"
+            )
+        if self.clusters_per_receiver % 2 or not 0 < self.clusters <= 65536:
+            raise ValueError("SamplingOptions: clusters_per_receiver must be even and clusters at most 65536")
 
 
 @dataclass(frozen=True)
@@ -423,7 +429,7 @@ def _zero_receivers(basis: DirectionBasis, sampling: SamplingOptions) -> Receive
     """A single receiver that receives no light."""
     return ReceiverCoefficients(
         np.zeros((1, basis.projection.shape[1]), np.float16),
-        np.zeros((1, sampling.listed), np.uint16),
+        np.zeros((1, sampling.clusters_per_receiver), np.uint16),
         np.zeros(1, np.float16),
     )
 
@@ -445,12 +451,12 @@ def _view_rows(
     seed: int,
 ) -> tuple[_PixelArrays, ReceiverCoefficients] | None:
     """Coefficients of the terrain pixels in some image rows; ``None`` if no pixel shows terrain."""
-    points, hit, pixel = view_samples(terrain, camera, rows, sampling.subpixels, seed)
+    points, hit, pixel = view_samples(terrain, camera, rows, sampling.shadow_samples, seed)
     if len(pixel) == 0:
         return None
     weight = sample_weights(points.albedo, hit)
     row_pixel = pixel - rows.start * camera.width_px
-    albedo, normal, coverage = pixel_moments(terrain, camera, rows, sampling.shades, seed)
+    albedo, normal, coverage = pixel_moments(terrain, camera, rows, sampling.albedo_samples, seed)
     receivers = _trace_receivers(terrain, shared, points, weight, pixel.astype(np.uint32), sampling, seed)
     arrays = _PixelArrays(
         pixel,
@@ -459,7 +465,7 @@ def _view_rows(
         normal[row_pixel],
         points.origin,
         points.normal.astype(np.float16),
-        points.outward.astype(np.float16),
+        points.geometric_normal.astype(np.float16),
         weight.astype(np.float16),
     )
     return arrays, receivers
@@ -481,7 +487,7 @@ def view_albedo(terrain: RayScene, coefficients: ViewCoefficients) -> np.ndarray
         ``(n, 3)`` float32; the sky counts as black.
     """
     camera, sampling = coefficients.camera, coefficients.sampling
-    return pixel_moments(terrain, camera, range(camera.height_px), sampling.shades, coefficients.seed)[0][
+    return pixel_moments(terrain, camera, range(camera.height_px), sampling.albedo_samples, coefficients.seed)[0][
         coefficients.pixel
     ]
 
@@ -516,7 +522,7 @@ def _trace_receivers(
     patch, hit = patch.reshape(count, -1), hit.reshape(count, -1)
     ray_weight = np.repeat(weight / np.float32(sample_rays), sample_rays, axis=1)
     direct = patch_sums(patch, np.where(hit == ESCAPED, ray_weight, 0.0), shared.basis.projection)
-    cluster, share = cluster_lists(hit, ray_weight, sampling.listed, start=hash_to_unit(identity, seed))
+    cluster, share = cluster_lists(hit, ray_weight, sampling.clusters_per_receiver, start=hash_to_unit(identity, seed))
     return ReceiverCoefficients(direct.astype(np.float16), cluster, share.astype(np.float16))
 
 

@@ -8,10 +8,10 @@ import numpy as np
 
 from seasonscapes.cameras.panorama import Panorama
 from seasonscapes.cameras.pinhole import Camera
+from seasonscapes.images import REC709_LUMINANCE
 from seasonscapes.rendering.gbuffer import mi_rays
 from seasonscapes.rendering.hemisphere_rays import LANES, RayScene, SurfacePoints, front_side, surface_points
 from seasonscapes.rendering.sobol import hashed, sobol_pair
-from seasonscapes.sky.illumination import LUMINANCE_WEIGHTS
 
 # Key of the random number stream, mixed into its hashes.
 _PIXEL = 103
@@ -79,7 +79,7 @@ def sample_weights(albedo: np.ndarray, hit: np.ndarray) -> np.ndarray:
     numpy.ndarray
         ``(n, S)`` float32, sum 1 per pixel; uniform over the terrain samples of pixels whose albedo is zero.
     """
-    luminous = albedo @ LUMINANCE_WEIGHTS.astype(np.float32)
+    luminous = albedo @ REC709_LUMINANCE.astype(np.float32)
     luminous = np.where((luminous.sum(axis=1) > 0.0)[:, None], luminous, hit)
     return (luminous / luminous.sum(axis=1, keepdims=True)).astype(np.float32)
 
@@ -173,7 +173,7 @@ def pixel_moments(
         albedo = interaction.bsdf().eval_diffuse_reflectance(interaction, front)
         albedo = dr.select(front, albedo, mi.Color3f(0.0))
         # A small constant weight defines the normal of black pixels too.
-        weight = dr.dot(albedo, mi.Color3f(*LUMINANCE_WEIGHTS.tolist())) + dr.select(valid, mi.Float(1e-6), 0.0)
+        weight = dr.dot(albedo, mi.Color3f(*REC709_LUMINANCE.tolist())) + dr.select(valid, mi.Float(1e-6), 0.0)
         lanes = [*albedo, *(weight * interaction.sh_frame.n), weight, dr.select(valid, mi.Float(1.0), 0.0)]
         sums = [dr.block_sum(values, count) for values in lanes]
         dr.eval(sums)

@@ -187,7 +187,7 @@ def illumination_from_atmosphere(
     distance_au: float = 1.0,
     moon: LuminarySource | None = None,
     shape: tuple[int, int] = (128, 256),
-    with_air: bool = True,
+    with_aerial_perspective: bool = True,
 ) -> Illumination:
     """Compute the illumination of one instant for an observer: sun, sky, moon and aerial perspective.
 
@@ -205,7 +205,7 @@ def illumination_from_atmosphere(
         The moon as a source above the atmosphere, or ``None``.
     shape
         Rows and columns of the sky map.
-    with_air
+    with_aerial_perspective
         Whether to compute the aerial perspective, which takes most of the time; otherwise it is ``None``.
 
     Returns
@@ -234,7 +234,7 @@ def illumination_from_atmosphere(
         airlights = [
             pool.submit(airlight, tables, view, true, irradiance)
             for irradiance, true in zip(irradiances, true_rad, strict=True)
-            if with_air
+            if with_aerial_perspective
         ]
         lights = tuple(future.result() for future in skies)
         radiance = _radiance_map(lights, shape)
@@ -250,7 +250,7 @@ def illumination_from_atmosphere(
         for source, irradiance in zip(sources, irradiances, strict=True)
     ]
     aerial_perspective = None
-    if with_air:
+    if with_aerial_perspective:
         illuminant = np.asarray(
             sum(
                 irradiance * _surface_transfer(tables, direction, observer_height_m, true)

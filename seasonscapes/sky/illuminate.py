@@ -14,7 +14,14 @@ from seasonscapes.sky.clear_sky import AtmosphereTables, LuminarySource, atmosph
 from seasonscapes.sky.clouds import with_clouds
 from seasonscapes.sky.ephemeris import LunarPosition, SolarPosition
 from seasonscapes.sky.illumination import Illumination, diffuse_horizontal_illuminance, luminance
-from seasonscapes.sky.models import AtmosphereModel, HosekModel, OvercastModel, SkyModel, atmosphere_of, check_valid
+from seasonscapes.sky.models import (
+    AtmosphereModel,
+    HosekModel,
+    OvercastModel,
+    SkyModel,
+    atmosphere_from_model,
+    check_valid,
+)
 from seasonscapes.sky.night import moon_to_sun_ratio, night_sky_radiance
 from seasonscapes.sky.overcast import (
     DAY_CCT_K,
@@ -68,7 +75,7 @@ def illuminate(
     *,
     height_m: float = 0.0,
     map_height: int = 128,
-    with_air: bool = True,
+    with_aerial_perspective: bool = True,
     tables_of: TablesOf = tables_in_memory,
     hosek: HosekFunction | None = None,
 ) -> Illumination:
@@ -84,7 +91,7 @@ def illuminate(
         Height of the observer [m].
     map_height
         Rows of the sky map; it has twice as many columns.
-    with_air
+    with_aerial_perspective
         Whether atmosphere models compute the aerial perspective, which takes most of their time.
     tables_of
         Function that returns the tables of an atmosphere, for example from a cache on disk. The default computes them
@@ -120,7 +127,13 @@ def illuminate(
     if isinstance(model, AtmosphereModel):
         moon = _significant_moon(sun, moon)
         clear = _clear_illumination(
-            model, sun, moon, height_m=height_m, map_height=map_height, with_air=with_air, tables_of=tables_of
+            model,
+            sun,
+            moon,
+            height_m=height_m,
+            map_height=map_height,
+            with_aerial_perspective=with_aerial_perspective,
+            tables_of=tables_of,
         )
         return _with_provenance(model, _add_clouds(model, clear, sun, moon))
     raise ValueError(f"model: got {type(model).__name__}, expected one of `models.KINDS`")
@@ -145,7 +158,7 @@ def _clear_illumination(
     *,
     height_m: float,
     map_height: int,
-    with_air: bool,
+    with_aerial_perspective: bool,
     tables_of: TablesOf,
 ) -> Illumination:
     """Illumination by the clear atmosphere and the night sky."""
@@ -154,13 +167,13 @@ def _clear_illumination(
         ratio = moon_to_sun_ratio(moon, WAVELENGTHS_NM)
         source = LuminarySource(moon.direction, ratio, float(moon.angular_radius_deg))
     clear = illumination_from_atmosphere(
-        tables_of(atmosphere_of(model)),
+        tables_of(atmosphere_from_model(model)),
         sun.direction,
         height_m,
         distance_au=float(sun.distance_au),
         moon=source,
         shape=(map_height, 2 * map_height),
-        with_air=with_air,
+        with_aerial_perspective=with_aerial_perspective,
     )
     haze = model.aerosol.optical_depth_500nm * float(angstrom_ratio(model.aerosol.angstrom_exponent, 500.0, 550.0))
     night = night_sky_radiance(

@@ -13,9 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from seasonscapes.frames import LocalFrame, equirectangular_directions
-
-# Luminance weights of linear Rec.709 (ITU-R BT.709): Y = w · rgb. In photometric RGB, Y is in lux or cd/m².
-LUMINANCE_WEIGHTS = np.array([0.2126390, 0.7151687, 0.0721923])
+from seasonscapes.images import REC709_LUMINANCE
 
 
 @dataclass(frozen=True)
@@ -108,7 +106,7 @@ def luminance(rgb: np.ndarray) -> np.ndarray:
     ndarray
         Luminance ``(...)`` in the unit of ``rgb``.
     """
-    return np.asarray(rgb) @ LUMINANCE_WEIGHTS
+    return np.asarray(rgb) @ REC709_LUMINANCE
 
 
 def diffuse_horizontal_illuminance(sky_radiance: np.ndarray) -> np.ndarray:

@@ -297,7 +297,7 @@ def check_valid(model: SkyModel, sun_elevation_deg: float, height_m: float) -> N
         )
 
 
-def atmosphere_of(model: AtmosphereModel) -> Atmosphere:
+def atmosphere_from_model(model: AtmosphereModel) -> Atmosphere:
     """Convert an atmosphere model to the parameters of the radiative-transfer model.
 
     Parameters
@@ -336,7 +336,7 @@ def visibility_km(model: SkyModel) -> float | None:
         Meteorological range [km]; ``None`` for a model without aerial perspective.
     """
     if isinstance(model, AtmosphereModel):
-        return visibility_from_atmosphere(atmosphere_of(model), model.ground.height_m) / 1000.0
+        return visibility_from_atmosphere(atmosphere_from_model(model), model.ground.height_m) / 1000.0
     return model.visibility_km if isinstance(model, OvercastModel) else None
 
 

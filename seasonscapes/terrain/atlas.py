@@ -68,7 +68,7 @@ def planar_uv(vertices: np.ndarray) -> np.ndarray:
     return np.clip(uv, 0.0, 1.0, out=uv)
 
 
-def plan_size(terrain: Terrain, texel_m: float | None, max_side_px: int) -> tuple[np.ndarray, float, int, int]:
+def texel_grid(terrain: Terrain, texel_m: float | None, max_side_px: int) -> tuple[np.ndarray, float, int, int]:
     """Compute origin, texel size and dimensions of a top-down texture grid with square texels.
 
     Parameters

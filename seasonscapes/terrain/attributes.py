@@ -51,7 +51,7 @@ def attributes_at(position_m: np.ndarray, normal: np.ndarray, spacing_m: float) 
     """
     unit = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
     height = position_m[:, 2:].astype(np.float32)
-    mean_height = plan_blur(position_m, height, max(spacing_m, _MIN_SPACING_M), _CONCAVITY_SIGMA_M)
+    mean_height = horizontal_gaussian_mean(position_m, height, max(spacing_m, _MIN_SPACING_M), _CONCAVITY_SIGMA_M)
     return TerrainAttributes(height[:, 0], unit.astype(np.float32), (mean_height - height)[:, 0])
 
 
@@ -109,7 +109,9 @@ def vertex_normals(terrain: Terrain) -> np.ndarray:
     return (total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)).astype(np.float32)
 
 
-def plan_blur(position_m: np.ndarray, values: np.ndarray, spacing_m: float, sigma_m: float) -> np.ndarray:
+def horizontal_gaussian_mean(
+    position_m: np.ndarray, values: np.ndarray, spacing_m: float, sigma_m: float
+) -> np.ndarray:
     """Smooth scattered values with a horizontal Gaussian kernel (normalised convolution on a grid).
 
     Values are binned into square cells; the Gaussian of the sums is divided by the Gaussian of the counts.

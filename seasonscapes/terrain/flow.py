@@ -85,7 +85,7 @@ class Links:
     length_m: tuple[np.ndarray, ...]
 
 
-def links_of(lattice: Lattice) -> Links:
+def lattice_links(lattice: Lattice) -> Links:
     """Build the links of a lattice to the east, south-west, south and south-east.
 
     Parameters
@@ -231,7 +231,7 @@ def accumulate(routes: FlowRoutes, amount: np.ndarray) -> np.ndarray:
     return total[:-1].reshape(amount.shape)
 
 
-def recur(routes: FlowRoutes, constant: np.ndarray, factor: np.ndarray) -> np.ndarray:
+def solve_recurrence(routes: FlowRoutes, constant: np.ndarray, factor: np.ndarray) -> np.ndarray:
     """Solve the linear recurrence ``z = constant + factor * z[receiver]`` along the drainage network.
 
     Parameters
@@ -274,10 +274,10 @@ def incise(elevation: np.ndarray, routes: FlowRoutes, rate_m: np.ndarray) -> np.
     """
     inside = routes.distance_m > 0.0
     courant = np.where(inside, rate_m / np.where(inside, routes.distance_m, 1.0), 0.0)
-    return recur(routes, elevation / (1.0 + courant), courant / (1.0 + courant))
+    return solve_recurrence(routes, elevation / (1.0 + courant), courant / (1.0 + courant))
 
 
-def slump(elevation: np.ndarray, links: Links, limit: np.ndarray, rounds: int) -> np.ndarray:
+def relax_slopes(elevation: np.ndarray, links: Links, limit: np.ndarray, rounds: int) -> np.ndarray:
     """Relax slopes above a critical gradient by moving material downhill (thermal erosion).
 
     Parameters
@@ -309,7 +309,7 @@ def slump(elevation: np.ndarray, links: Links, limit: np.ndarray, rounds: int) -
     return z
 
 
-def on_grid(values: np.ndarray, lattice: Lattice) -> np.ndarray:
+def resample_to_grid(values: np.ndarray, lattice: Lattice) -> np.ndarray:
     """Resample values from a jittered lattice to the regular grid by moving least squares.
 
     At each grid point a plane is fitted to the 3 × 3 neighbourhood with Gaussian weights; linear functions are

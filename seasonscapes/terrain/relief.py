@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from seasonscapes.declaration import InputError
-from seasonscapes.terrain.atlas import Atlas, measure_atlas, plan_size, require_unfolded, singular_values
+from seasonscapes.terrain.atlas import Atlas, measure_atlas, require_unfolded, singular_values, texel_grid
 from seasonscapes.terrain.surface import Terrain
 
 # The direct factorisation of a million unknowns takes about half a minute and 3 GB.
@@ -52,7 +52,7 @@ def relief_atlas(terrain: Terrain, texel_m: float | None, max_side_px: int) -> t
             expected=f"at most {MAX_FACES}",
             cure="use the adaptive mesher with a larger error bound, or the planar atlas",
         )
-    _, _, width, height = plan_size(terrain, texel_m, max_side_px)
+    _, _, width, height = texel_grid(terrain, texel_m, max_side_px)
     rim = boundary_loop(terrain.faces, len(terrain.vertices))
     uv = _rim_on_rectangle(terrain, rim)
     i, j, weight = _mean_value_weights(terrain)

@@ -120,7 +120,7 @@ def massif_layout(seed: int) -> MassifLayout:
     return MassifLayout(points_along(_CRESTS, sag=1.0 / 12.0), points_along(_VALLEYS), points_along(_VALLEYS[:1]), seed)
 
 
-def warped(lattice: Lattice, seed: int) -> Lattice:
+def warped_lattice(lattice: Lattice, seed: int) -> Lattice:
     """Apply domain warping: displace a lattice by smooth random noise of four octaves.
 
     Parameters
@@ -149,7 +149,7 @@ def _inverse_distance(points: np.ndarray, values: np.ndarray, position: np.ndarr
     return (weight * values[index]).sum(-1) / weight.sum(-1), distance[..., 0]
 
 
-def sketched_heights(layout: MassifLayout, lattice: Lattice) -> np.ndarray:
+def initial_heights(layout: MassifLayout, lattice: Lattice) -> np.ndarray:
     """Compute the initial surface by interpolation between valley and crest lines with a concave-up profile.
 
     Parameters
@@ -164,7 +164,7 @@ def sketched_heights(layout: MassifLayout, lattice: Lattice) -> np.ndarray:
     numpy.ndarray
         Heights ``(H, W)`` [m].
     """
-    warped_points = warped(lattice, layout.seed)
+    warped_points = warped_lattice(lattice, layout.seed)
     position = np.stack([warped_points.east_m, warped_points.north_m], -1)
     low, to_valley = _inverse_distance(layout.valleys, layout.valleys[:, 2], position)
     high, to_crest = _inverse_distance(layout.crests, layout.crests[:, 2], position)
@@ -176,12 +176,12 @@ def _unwarped_positions(points: np.ndarray, seed: int) -> np.ndarray:
     """Positions ``(P, 2)`` [m] that the domain warping maps to the layout's points ``(P, 3)`` (fixed-point iteration)."""
     at = points[:, :2].copy()
     for _ in range(4):
-        warped_points = warped(Lattice(at[:, 0], at[:, 1], 0.0), seed)
+        warped_points = warped_lattice(Lattice(at[:, 0], at[:, 1], 0.0), seed)
         at += points[:, :2] - np.stack([warped_points.east_m, warped_points.north_m], -1)
     return at
 
 
-def anchoring(z: np.ndarray, lattice: Lattice, layout: MassifLayout) -> np.ndarray:
+def height_correction(z: np.ndarray, lattice: Lattice, layout: MassifLayout) -> np.ndarray:
     """Compute a smooth correction that restores the layout's heights along crests and valleys after erosion.
 
     Parameters
@@ -272,7 +272,7 @@ def valley_floor(layout: MassifLayout, lattice: Lattice) -> ValleyFloor:
     ValleyFloor
         Floor height, and signed distances to floor edge and shore.
     """
-    warped_points = warped(lattice, layout.seed)
+    warped_points = warped_lattice(lattice, layout.seed)
     points = layout.valleys[layout.valleys[:, 2] < 1010.0]
     distance, index = cKDTree(points[:, :2]).query(np.stack([warped_points.east_m, warped_points.north_m], -1), k=12)
     weight = 1.0 / (distance + 60.0) ** 3

@@ -18,10 +18,10 @@ from seasonscapes.terrain.flow import (
     accumulate,
     incise,
     jittered_lattice,
-    links_of,
-    on_grid,
+    lattice_links,
+    relax_slopes,
+    resample_to_grid,
     route_flow,
-    slump,
 )
 from seasonscapes.terrain.noise import fractal_noise, spline_noise, warped_noise
 from seasonscapes.terrain.synthetic_ice import grow_ice
@@ -30,9 +30,9 @@ from seasonscapes.terrain.synthetic_layout import (
     LEDGES_M,
     MassifLayout,
     ValleyFloor,
-    anchoring,
+    height_correction,
+    initial_heights,
     massif_layout,
-    sketched_heights,
     strata_level_m,
     valley_floor,
 )
@@ -140,7 +140,7 @@ def _erode(z: np.ndarray, lattice: Lattice, seed: int, stage: _Stage, erodibilit
     ``erodibility`` ``(H, W)`` in [0, 1] scales the incision; see `_erodibility`.
     """
     spacing = stage.spacing_m
-    outlets, links = lattice.border, links_of(lattice)
+    outlets, links = lattice.border, lattice_links(lattice)
     cell_area = np.full(z.shape, spacing**2)
     axis = (np.arange(z.shape[0]) - (z.shape[0] - 1) / 2.0) * spacing
     rock_factor = np.exp(0.30 * fractal_noise(seed + 41, 1400.0, axis, -axis, octaves=6, gain=0.6))
@@ -150,7 +150,7 @@ def _erode(z: np.ndarray, lattice: Lattice, seed: int, stage: _Stage, erodibilit
         routes = route_flow(z, links, outlets)
         area = accumulate(routes, cell_area)
         z = incise(z, routes, stage.incision_m * rock_factor * erodibility * (area / 1e6) ** 0.4)
-        z = slump(z, links, limit, 2)
+        z = relax_slopes(z, links, limit, 2)
         z = z + _lowpass(target - z, stage.uplift_scale_m, spacing)
     return z
 
@@ -281,11 +281,11 @@ def _stage_surface(
     z = z + stage.noise_m * erodibility * steep * _lowpass(rng.normal(0.0, 3.0, z.shape), 1.2 * spacing, spacing)
     z = _erode(z, lattice, layout.seed, stage, erodibility)
     if spacing >= 30.0:
-        z = z + _sample(anchoring(z, lattice, layout), 120.0, lattice)
+        z = z + _sample(height_correction(z, lattice, layout), 120.0, lattice)
     if spacing == 60.0:
-        routes = route_flow(z, links_of(lattice), lattice.border)
+        routes = route_flow(z, lattice_links(lattice), lattice.border)
         z = _carve_troughs(z, accumulate(routes, np.full(z.shape, spacing**2)), spacing)
-    z = on_grid(z, lattice)
+    z = resample_to_grid(z, lattice)
     above = np.maximum(z - _lowpass(z, 1.5 * spacing, spacing), 0.0)
     z = z + stage.sharpening * above * np.clip((z - 1700.0) / 900.0, 0.0, 1.0)
     regular = _regular_lattice((z.shape[0] - 1) // 2 * spacing, spacing)
@@ -327,7 +327,7 @@ def relief(half_m: float, spacing_m: float, seed: int) -> Relief:
         spacing = stage.spacing_m
         rng = np.random.default_rng(seed + int(spacing))
         lattice = jittered_lattice(half_m + stage.margin_m, spacing, 0.38, rng)
-        z = sketched_heights(layout, lattice) if z is None else _sample(z, 2.0 * spacing, lattice)
+        z = initial_heights(layout, lattice) if z is None else _sample(z, 2.0 * spacing, lattice)
         z = _stage_surface(z, lattice, layout, floor, stage, _erodibility(z, spacing, ice, lattice))
         if spacing == 60.0:
             ice = _ice_sheet(z)
@@ -338,7 +338,7 @@ def relief(half_m: float, spacing_m: float, seed: int) -> Relief:
     assert debris is not None
     if spacing_m < 60.0:
         lattice = _regular_lattice((z.shape[0] - 1) // 2 * spacing_m, spacing_m)
-        routes = route_flow(z, links_of(lattice), lattice.border)
+        routes = route_flow(z, lattice_links(lattice), lattice.border)
         z = _add_talus(z, accumulate(routes, np.full(z.shape, spacing_m**2)), spacing_m)
     edge = (z.shape[0] - 1) // 2 - round(half_m / spacing_m)
     z = z[edge:-edge, edge:-edge]
@@ -351,6 +351,6 @@ def relief(half_m: float, spacing_m: float, seed: int) -> Relief:
     beach_weight = np.clip(1.0 - floor.shore_m / 70.0, 0.0, 1.0)
     z = np.maximum(z + beach_weight * (beach - z), beach - 0.08 * np.maximum(floor.shore_m - 100.0, 0.0))
     z = np.where(floor.shore_m < 0.0, LAKE_LEVEL_M, z)
-    routes = route_flow(z, links_of(regular), regular.border)
+    routes = route_flow(z, lattice_links(regular), regular.border)
     debris = np.clip(_sample(debris, 60.0, regular, order=1), 0.0, 1.0)
     return Relief(z, thickness, debris, accumulate(routes, np.full(z.shape, spacing_m**2)), floor)

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from seasonscapes.terrain.atlas import Atlas, measure_atlas, plan_size, require_unfolded
+from seasonscapes.terrain.atlas import Atlas, measure_atlas, require_unfolded, texel_grid
 from seasonscapes.terrain.charts import chart_atlas
 from seasonscapes.terrain.relief import relief_atlas
 from seasonscapes.terrain.surface import Terrain
@@ -78,7 +78,7 @@ def planar_atlas(terrain: Terrain, texel_m: float | None, max_side_px: int) -> t
     InputError
         The surface folds over in horizontal projection, or the atlas exceeds ``max_side_px``.
     """
-    low, texel_m, width, height = plan_size(terrain, texel_m, max_side_px)
+    low, texel_m, width, height = texel_grid(terrain, texel_m, max_side_px)
     uv = ((terrain.vertices[:, :2] - low) / (texel_m * np.array([width, height]))).astype(np.float32)
     terrain = replace(terrain, uv=uv)
     require_unfolded(terrain, "planar", cure="use the xatlas atlas, or an origin nearer to the terrain")

@@ -181,7 +181,7 @@ class _PanelRenderer:
 
         if self.day != day:
             self.day, self.mi_mesh = day, mi_mesh(self.place.terrain, albedo_for(self.place, day).values)
-        return relight(self.mi_mesh, light, max_height_m=float(self.place.terrain.vertices[:, 2].max()))
+        return relight(self.mi_mesh, light)
 
 
 def contact_sheet(path: Path, pictures: list[Path], captions: list[str], *, columns: int) -> None:

@@ -23,7 +23,7 @@ from seasonscapes.sky.elevation_table import load_table, save_table
 from seasonscapes.sky.ephemeris import LunarPosition, SolarPosition, moon_position, sun_position
 from seasonscapes.sky.illuminate import illuminate
 from seasonscapes.sky.illumination import Illumination
-from seasonscapes.sky.models import AtmosphereModel, SkyModel, atmosphere_of, read_sky_model, with_overrides
+from seasonscapes.sky.models import AtmosphereModel, SkyModel, atmosphere_from_model, read_sky_model, with_overrides
 from seasonscapes.sky.observer_radiance import diffuse_by_elevation, observer_view
 from seasonscapes.workflows.place import Place, utc_at
 from seasonscapes.workflows.views import camera_geodetic
@@ -238,7 +238,7 @@ def illumination_at(
     *,
     workspace: Workspace,
     map_height: int = 128,
-    with_air: bool = True,
+    with_aerial_perspective: bool = True,
     by_elevation: bool = False,
 ) -> Illumination:
     """Compute the light for an observer at a height.
@@ -255,7 +255,7 @@ def illumination_at(
         Where atmosphere tables are kept.
     map_height
         Rows of the sky map.
-    with_air
+    with_aerial_perspective
         Whether to compute the aerial perspective.
     by_elevation
         See `atmosphere_tables_in`.
@@ -268,7 +268,7 @@ def illumination_at(
         position.moon,
         height_m=height_m,
         map_height=map_height,
-        with_air=with_air,
+        with_aerial_perspective=with_aerial_perspective,
         tables_of=atmosphere_tables_in(workspace, by_elevation=by_elevation),
         hosek=hosek_illumination,
     )
@@ -309,7 +309,7 @@ def illumination_for_camera(
         place.median_height_m,
         workspace=place.workspace,
         map_height=map_height,
-        with_air=False,
+        with_aerial_perspective=False,
         by_elevation=by_elevation,
     )
     at_camera = illumination_at(
@@ -332,7 +332,9 @@ def illumination_for_camera(
 def illumination_on_terrain(place: Place, model: SkyModel, time: datetime) -> tuple[Illumination, SunMoonPosition]:
     """Compute the light that a place's terrain receives, without aerial perspective, and where sun and moon stand."""
     position = _position_of(place, time)
-    light = illumination_at(model, position, place.median_height_m, workspace=place.workspace, with_air=False)
+    light = illumination_at(
+        model, position, place.median_height_m, workspace=place.workspace, with_aerial_perspective=False
+    )
     return replace(light, frame=place.frame), position
 
 
@@ -346,7 +348,7 @@ def tabulate_illumination(
     """Build the tables that `illumination_for_camera` uses with ``by_elevation``, before other processes need them."""
     if not isinstance(model, AtmosphereModel):
         return
-    tables = atmosphere_tables_in(place.workspace, by_elevation=True)(atmosphere_of(model))
+    tables = atmosphere_tables_in(place.workspace, by_elevation=True)(atmosphere_from_model(model))
     assert tables.diffuse_of is not None
     camera_m = camera_geodetic(place, camera)[2]
     wanted = [(place.median_height_m, False), (camera_m, False), (camera_m, True)]

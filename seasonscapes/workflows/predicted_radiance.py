@@ -107,7 +107,7 @@ def _relit(place: Place, albedo: Texture, utc: datetime, model: SkyModel, progre
         positions,
         albedo.values,
         light,
-        sampling=SamplingOptions(subpixels=1, rays=_RAYS),
+        sampling=SamplingOptions(shadow_samples=1, rays=_RAYS),
         progress=task_progress(progress, "relighting the albedo"),
     )
     return Texture(lit.radiance.astype(np.float32), albedo.weight, place.atlas_id)

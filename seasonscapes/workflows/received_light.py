@@ -104,7 +104,7 @@ def lit_texture(
         positions,
         texture.values,
         light,
-        sampling=SamplingOptions(subpixels=1, rays=rays),
+        sampling=SamplingOptions(shadow_samples=1, rays=rays),
         seed=seed,
         progress=task_progress(progress, "baking"),
     )
@@ -221,7 +221,7 @@ def irradiance_map(
         positions,
         lights,
         hours,
-        sampling=SamplingOptions(subpixels=1, rays=rays),
+        sampling=SamplingOptions(shadow_samples=1, rays=rays),
         search_m=_SEARCH_M,
         seed=seed,
         progress=task_progress(progress, "irradiance"),
@@ -254,7 +254,9 @@ def _illuminated(
         position = sun_moon_position(time, frame.latitude_deg, frame.longitude_deg, ground_m)
         if position.sun.elevation_deg > _DARK_BELOW_DEG:
             lights.append(
-                illumination_at(model, position, ground_m, workspace=place.workspace, map_height=64, with_air=False)
+                illumination_at(
+                    model, position, ground_m, workspace=place.workspace, map_height=64, with_aerial_perspective=False
+                )
             )
             kept.append(index)
     if not lights:

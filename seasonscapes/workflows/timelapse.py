@@ -147,7 +147,7 @@ def session_frame(
         layers = {"": view.radiance, "alpha": view.coverage, "depth": view.gbuffer.depth}
         header = {"seasonscapes:provenance": record, "seasonscapes:units": "cd/m2"}
         write_exr(copy, layers, header=header)
-    save_frame(path, view.radiance, metered_ev100=metered, record=record)
+    save_frame(path, view.radiance, metered_ev100=metered, provenance=record)
     return {"time_utc": time.isoformat(), "metered_ev100": metered, "rendered": True}
 
 
@@ -260,12 +260,12 @@ def develop_frames(
         The files written.
     """
     from seasonscapes.images import write_png
-    from seasonscapes.relighting.film import write_film
+    from seasonscapes.relighting.film import write_video
 
     pictures = each_reported(developed(folder, times, look), len(times), progress, "developing")
     if output.suffix.lower() == ".mp4":
         span = {"from_utc": times[0].isoformat(), "to_utc": times[-1].isoformat()}
-        write_film(output, pictures, fps=look.fps, note=json.dumps(about | span))
+        write_video(output, pictures, fps=look.fps, comment=json.dumps(about | span))
         return [output]
     paths = [output / f"{time_stamp(time)}.png" for time in times]
     for time, path, picture in zip(times, paths, pictures, strict=True):

@@ -8,7 +8,7 @@ import numpy as np
 
 from seasonscapes.errors import InputError
 from seasonscapes.frames import geodetic_from_enu
-from seasonscapes.scene import NamedCamera, camera_from_place
+from seasonscapes.scene import NamedCamera, camera_from_named_view
 from seasonscapes.workflows.place import Place, ground_height_m
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ def camera_for(place: Place, view: NamedCamera, *, size_px: tuple[int, int], whe
                 expected=f"above {ground:.1f} m",
                 cure="give above_ground_m instead",
             )
-    return camera_from_place(place.frame, view, ground, size_px=size_px)
+    return camera_from_named_view(place.frame, view, ground, size_px=size_px)
 
 
 def camera_geodetic(place: Place, view: Camera | Panorama) -> tuple[float, float, float]:
