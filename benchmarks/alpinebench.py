@@ -46,13 +46,13 @@ from albedo_scene import hours, lights_for  # noqa: E402
 from alpinebench_scene import DATE, SIZES, pose_errors  # noqa: E402
 from alpinebench_stages import Bench, Splats  # noqa: E402
 
-from seasonscapes.evaluation.figures import comparison, side_by_side, steepest_window  # noqa: E402
+from seasonscapes.evaluation.figures import comparison_figure, image_row, steepest_window  # noqa: E402
 from seasonscapes.evaluation.lpips import load_lpips, missing_lpips  # noqa: E402
 from seasonscapes.evaluation.surfaces import albedo_error  # noqa: E402
 from seasonscapes.evaluation.tables import by_distance, drop, table_lines  # noqa: E402
 from seasonscapes.exposure import develop, exposure_ev100  # noqa: E402
 from seasonscapes.images import atomic_path, linear_from_srgb, srgb_from_linear, write_png8  # noqa: E402
-from seasonscapes.relighting.film import write_film  # noqa: E402
+from seasonscapes.relighting.film import write_video  # noqa: E402
 from seasonscapes.rendering.relit_view import relight_view  # noqa: E402
 from seasonscapes.sky.illumination import global_horizontal_illuminance  # noqa: E402
 from seasonscapes.terrain.surface import Texture  # noqa: E402
@@ -159,7 +159,7 @@ def painting_ablations(bench: Bench, whole: dict, without: dict[str, dict]) -> d
     rows = Rows()
     rows["full"] = texture_scores(bench, refilled("guided"))
     everywhere = mock.patch(
-        "seasonscapes.texturing.painting.by_ray",
+        "seasonscapes.texturing.painting.visible_by_ray",
         lambda terrain, camera, surface, sight: np.ones(len(surface.texel), bool),
     )
     with everywhere:
@@ -312,7 +312,7 @@ def save_figures(bench: Bench, whole: dict, folder: Path) -> None:
         ours = judge.of_texture(whole["textures"][at], 0, at) if name == "painted" else whole["relit"](0, at)
         true = judge.truth(0, at)
         shown = {"truth": true.radiance, "ours": ours, "satellite only": satellite(0, at)}
-        sheet = comparison(
+        sheet = comparison_figure(
             {key: judge.developed(value, 0, at) for key, value in shown.items()},
             mask=judge.mask(0),
             window=steepest_window(true.gbuffer.normal, true.gbuffer.depth),
@@ -333,8 +333,8 @@ def save_day(bench: Bench, whole: dict, folder: Path) -> None:
         shown = {name: np.maximum(relight_view(view, light).radiance, 0.0) for name, view in views.items()}
         shown["satellite only"] = judge.in_sight(bench.from_above.values, shown["truth"])
         ev100 = exposure_ev100(shown["truth"])
-        sheets.append(side_by_side({name: srgb_from_linear(develop(value, ev100)) for name, value in shown.items()}))
-    write_film(folder / "alpinebench_day.mp4", (linear_from_srgb(sheet) for sheet in sheets), fps=8.0)
+        sheets.append(image_row({name: srgb_from_linear(develop(value, ev100)) for name, value in shown.items()}))
+    write_video(folder / "alpinebench_day.mp4", (linear_from_srgb(sheet) for sheet in sheets), fps=8.0)
     frames = [Image.fromarray(np.round(255.0 * sheet).astype(np.uint8)) for sheet in sheets]
     with atomic_path(folder / "alpinebench_day.webp") as temporary:
         frames[0].save(temporary, "WEBP", save_all=True, append_images=frames[1:], duration=125, loop=0, quality=70)

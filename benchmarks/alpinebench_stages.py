@@ -29,11 +29,11 @@ from alpinebench_scene import (
 
 from seasonscapes.albedo.albedo_completion import complete_albedo
 from seasonscapes.albedo.closed_form import AlbedoFit, solve_albedo
-from seasonscapes.albedo.texture_delighting import delight_textures
 from seasonscapes.albedo.forward_model import TexelTransport, ambient_on_texels, sun_on_texels, trace_texel_transport
 from seasonscapes.albedo.photographs import EIGHT_BIT, LINEAR, prepare_photographs
+from seasonscapes.albedo.texture_delighting import delight_textures
 from seasonscapes.albedo.tone_curve import fit_tone_curve, with_tone_curve
-from seasonscapes.evaluation.masks import land_mask
+from seasonscapes.evaluation.masks import terrain_mask
 from seasonscapes.evaluation.metrics import score
 from seasonscapes.evaluation.synthetic_webcams import SyntheticPicture
 from seasonscapes.exposure import develop, exposure_ev100
@@ -53,10 +53,11 @@ from seasonscapes.sky.ephemeris import sun_position
 from seasonscapes.sky.illumination import Illumination, global_horizontal_illuminance
 from seasonscapes.terrain.surface import Texture, sample_texture
 from seasonscapes.texturing.bayesian_fusion import fuse_with_albedo
-from seasonscapes.texturing.completion import complete
+from seasonscapes.texturing.completion import CompletionOptions, complete
 from seasonscapes.texturing.inputs import PaintingInput
-from seasonscapes.texturing.painting import Painting, PaintOptions, paint_atlas
+from seasonscapes.texturing.painting import Painting, PaintOptions, PaintTarget, paint_atlas
 from seasonscapes.texturing.predictors import Predictors, predictors_for
+from seasonscapes.texturing.radiometric_fit import RadiometricReference
 from seasonscapes.workflows.predicted_radiance import RELATIVE_SIGMA
 from seasonscapes.workspace import default_workspace
 
@@ -136,7 +137,7 @@ class Judge:
         return relit
 
     def mask(self, camera: int) -> np.ndarray:
-        return land_mask(self.rows[camera][0].gbuffer.depth, near_m=NEAR_M)
+        return terrain_mask(self.rows[camera][0].gbuffer.depth, near_m=NEAR_M)
 
     def developed(self, radiance: np.ndarray, camera: int, at: datetime) -> np.ndarray:
         """With the exposure of the truth, sRGB-encoded."""
@@ -245,16 +246,16 @@ class Bench:
         gain = clean_gain(self.pictures, self.world, at) if clean else None
         inputs = []
         for seen, sigma, number in observed(self.pictures, self.world, at, gain=gain, true_pose=true_pose):
-            seen = replace(seen, image=np.clip(seen.image, 0.0, 1.0))
-            inputs.append(PaintingInput(seen, lights[number].aerial_perspective if air else None, sigma))
-        if relit is not None:
-            options = replace(options or PaintOptions(), predicted_sigma=RELATIVE_SIGMA)
-        return paint_atlas(
-            inputs, self.world.terrain, self.world.atlas, self.world.bare, options=options, predicted=relit
-        )
+            seen = replace(seen, image=np.clip(seen.image, 0.0, 1.0), pose_sigma=sigma)
+            inputs.append(PaintingInput(seen, lights[number].aerial_perspective if air else None))
+        reference = None if relit is None else RadiometricReference(relit, RELATIVE_SIGMA)
+        target = PaintTarget(self.world.terrain, self.world.atlas, self.world.bare)
+        return paint_atlas(inputs, target, options=options, reference=reference)
 
     def completed(self, texture: Texture, at: datetime, *, method: str = "guided") -> np.ndarray:
-        return complete(texture, self.predictors[at], method=method, fast=True, seed=self.world.seed).values
+        return complete(
+            texture, self.predictors[at], options=CompletionOptions(method, fast=True, seed=self.world.seed)
+        ).values
 
     def fused(self, texture: Texture, at: datetime, told: np.ndarray, sigma: np.ndarray) -> np.ndarray:
         """A painting and what an albedo of relative error ``sigma``, relit, says of the hour."""
@@ -283,7 +284,11 @@ class Bench:
         """Seen texels' albedo as it is; the others' learned, the satellite's image one guide among others."""
         predictors = predictors_for(self.world.terrain, self.world.atlas, satellite=self.satellite)
         texture = Texture(fit.albedo, (fit.pixel_count >= 0.5).astype(np.float32))
-        return np.clip(complete(texture, predictors, fast=True, seed=self.world.seed).values, 0.004, 0.98)
+        return np.clip(
+            complete(texture, predictors, options=CompletionOptions(fast=True, seed=self.world.seed)).values,
+            0.004,
+            0.98,
+        )
 
     def seen_texels(self) -> np.ndarray:
         """Texels ``(R, S)`` that painting at true poses reaches, at the first painted hour."""

@@ -24,18 +24,18 @@ import texturing_places as places
 import texturing_rivals as rivals
 
 from seasonscapes.terrain.surface import Texture, sample_texture
-from seasonscapes.texturing.completion import Completed, complete
+from seasonscapes.texturing.completion import CompletedTexture, CompletionOptions, complete
 from seasonscapes.texturing.predictors import Predictors, stack_predictors
 from seasonscapes.texturing.terrain_features import terrain_features
 
 SEASONS = {"winter": (32, 11.0), "autumn": (288, 14.0), "spring": (135, 8.0)}
 
 
-def completed(bed: places.Testbed, predictors: Predictors | None = None, **options) -> tuple[Completed, float]:
+def completed(bed: places.Testbed, predictors: Predictors | None = None, **options) -> tuple[CompletedTexture, float]:
     """The product's own completion and its processor time [s]."""
     texture = Texture(np.where(bed.seen[..., None], bed.truth, np.nan).astype(np.float32), bed.seen.astype(np.float32))
     start = time.process_time()
-    result = complete(texture, predictors or bed.predictors, **options)
+    result = complete(texture, predictors or bed.predictors, options=CompletionOptions(**options))
     seconds = time.process_time() - start
     if not np.array_equal(result.values[bed.seen], bed.truth[bed.seen]):
         raise AssertionError("painted texels have changed")

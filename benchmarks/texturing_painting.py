@@ -25,7 +25,7 @@ sys.path.append(str(HERE.parent / "tests"))
 from albedo_scene import Truth, hours, lights_for, make_truth, terrain_and_albedo  # noqa: E402
 from oracles_visibility import BinnedTriangles  # noqa: E402
 
-from seasonscapes.evaluation.synthetic_webcams import SyntheticPicture, WebcamInstant, webcam_series  # noqa: E402
+from seasonscapes.evaluation.synthetic_webcams import SyntheticPicture, WebcamInstant, WebcamOptions, webcam_series  # noqa: E402
 from seasonscapes.evaluation.webcam_faults import TYPICAL, PoseSigmas, add_foreground, degrade, perturb_pose  # noqa: E402
 from seasonscapes.images import expose, linear_from_srgb, srgb_from_linear  # noqa: E402
 from seasonscapes.rendering.gbuffer import trace_gbuffer  # noqa: E402
@@ -37,14 +37,14 @@ from seasonscapes.sky.models import read_sky_model, with_overrides  # noqa: E402
 from seasonscapes.terrain.atlas import measure_atlas  # noqa: E402
 from seasonscapes.terrain.surface import Texture, sample_texture  # noqa: E402
 from seasonscapes.texturing.atlas_tiles import AtlasTile, tile_surface, tiling  # noqa: E402
-from seasonscapes.texturing.foreground import foreground_mask, predict_in_folds  # noqa: E402
+from seasonscapes.texturing.foreground import cross_validated_prediction, foreground_mask  # noqa: E402
 from seasonscapes.texturing.inputs import PaintingInput, prepare_input  # noqa: E402
-from seasonscapes.texturing.painting import PaintOptions, paint_atlas  # noqa: E402
+from seasonscapes.texturing.painting import PaintOptions, PaintTarget, paint_atlas  # noqa: E402
 from seasonscapes.texturing.predictors import predictors_for  # noqa: E402
-from seasonscapes.texturing.visibility import by_depth, by_faces, by_ray, project_texels  # noqa: E402
+from seasonscapes.texturing.visibility import project_texels, visible_by_depth, visible_by_faces, visible_by_ray  # noqa: E402
 from seasonscapes.workspace import default_workspace  # noqa: E402
 
-EFFORT = SamplingOptions(subpixels=4, shades=16, rays=64, clusters=1024, listed=32, rank=24)
+EFFORT = SamplingOptions(shadow_samples=4, albedo_samples=16, rays=64, clusters=1024, clusters_per_receiver=32, rank=24)
 SKY_KM = 60.0
 
 
@@ -82,8 +82,7 @@ def make_stage(seed: int, *, quick: bool) -> Stage:
             f"webcam-{n}",
             camera,
             [WebcamInstant(when[0], light, truth.albedo)],
-            faults=TYPICAL,
-            sampling=EFFORT,
+            options=WebcamOptions(TYPICAL, sampling=EFFORT),
             seed=seed,
         )[0]
         for n, (camera, light) in enumerate(zip(truth.cameras, lights, strict=True))
@@ -119,6 +118,11 @@ def shots_of(stage: Stage, **changes) -> list[PaintingInput]:
     ]
 
 
+def target_of(stage: Stage) -> PaintTarget:
+    """The stage's terrain and atlas."""
+    return PaintTarget(stage.truth.terrain, stage.atlas, stage.terrain)
+
+
 def land_truth(stage: Stage, texel: np.ndarray, *, seed: int) -> np.ndarray:
     """Radiance ``(N, 3)`` [cd/m²] that texels truly send (NaN where no surface is found)."""
     surface = tile_surface(tiling(stage.truth.terrain, stage.atlas, tile_px=1 << 14), whole(stage))
@@ -151,7 +155,7 @@ def visibility(stage: Stage, *, seed: int, rays: int) -> dict:
     terrain, rng = stage.truth.terrain, np.random.default_rng(seed)
     surface = tile_surface(tiling(terrain, stage.atlas, tile_px=1 << 14), whole(stage))
     oracle = BinnedTriangles(terrain.vertices, terrain.faces)
-    scene = RenderScene(stage.terrain.mi_scene, stage.terrain.mi_terrain, None, 0.0)
+    scene = RenderScene(stage.terrain.mi_scene, stage.terrain.mi_terrain)
     truth, grazing, found, seconds, count = [], [], {}, 0.0, 0
     for camera in stage.truth.cameras:
         sight = project_texels(camera, surface)
@@ -164,16 +168,16 @@ def visibility(stage: Stage, *, seed: int, rays: int) -> dict:
         grazing.append(seen.cosine < 0.2)
         depth = trace_gbuffer(scene, camera).depth
         modes = {
-            "ray": by_ray(stage.terrain, camera, places, seen),
-            "ray_lifted_2m": by_ray(stage.terrain, camera, places, seen, lift_m=2.0),
-            "depth": by_depth(depth, seen),
-            "depth_2pc": by_depth(depth, seen, tolerance=0.02),
-            "faces": by_faces(stage.terrain, camera, places, seen),
+            "ray": visible_by_ray(stage.terrain, camera, places, seen),
+            "ray_lifted_2m": visible_by_ray(stage.terrain, camera, places, seen, lift_m=2.0),
+            "depth": visible_by_depth(depth, seen),
+            "depth_2pc": visible_by_depth(depth, seen, tolerance=0.02),
+            "faces": visible_by_faces(stage.terrain, camera, places, seen),
         }
         for name, value in modes.items():
             found.setdefault(name, []).append(value)
         start = time.process_time()
-        by_ray(stage.terrain, camera, surface, project_texels(camera, surface))
+        visible_by_ray(stage.terrain, camera, surface, project_texels(camera, surface))
         seconds, count = seconds + time.process_time() - start, count + len(surface.texel)
     truth, grazing = np.concatenate(truth), np.concatenate(grazing)
     numbers = {"visibility_mtexel_per_cpu_s": count / 1e6 / seconds, "visibility_samples": len(truth)}
@@ -189,7 +193,7 @@ def visibility(stage: Stage, *, seed: int, rays: int) -> dict:
 
 def radiometry(stage: Stage, *, seed: int, texels: int = 20_000) -> dict:
     """Painted texels against the truth: one gain for all, gains, gains and haze; and the paper's first-come order."""
-    inputs, terrain, rng = shots_of(stage), stage.truth.terrain, np.random.default_rng(seed)
+    inputs, rng = shots_of(stage), np.random.default_rng(seed)
     numbers, sample, truth = {}, None, None
     raw = [replace(item, air=None) for item in inputs]
     kinds = {
@@ -200,7 +204,7 @@ def radiometry(stage: Stage, *, seed: int, texels: int = 20_000) -> dict:
     }
     for name, options in kinds.items():
         start = time.process_time()
-        painting = paint_atlas(raw if name == "plain" else inputs, terrain, stage.atlas, stage.terrain, options=options)
+        painting = paint_atlas(raw if name == "plain" else inputs, target_of(stage), options=options)
         seconds = time.process_time() - start
         if sample is None:
             painted = np.flatnonzero(painting.texture.weight.ravel() > 0.0)
@@ -235,9 +239,7 @@ def reprojection(stage: Stage) -> dict:
         gain = 0.25 / float(np.percentile(picture.surface, 99.0))
         image = np.clip(picture.surface * gain, 0.0, 1.0).astype(np.float32)
         item = PaintingInput(replace(picture.observation, image=image, camera=picture.camera))
-        painting = paint_atlas(
-            [item], stage.truth.terrain, stage.atlas, stage.terrain, options=PaintOptions(fit_gains=False)
-        )
+        painting = paint_atlas([item], target_of(stage), options=PaintOptions(fit_gains=False))
         covered = (
             sample_texture((painting.texture.weight > 0)[..., None].astype(np.float32), picture.gbuffer.uv)[..., 0]
             > 0.999
@@ -281,16 +283,17 @@ def guard(stage: Stage, *, seed: int, texels: int = 12_000) -> dict:
     inputs = [
         replace(
             item,
-            pose_sigma={"heading_deg": 0.2, "tilt_deg": 0.1},
-            observation=replace(item.observation, camera=perturb_pose(item.observation.camera, sigmas, rng)[0]),
+            observation=replace(
+                item.observation,
+                camera=perturb_pose(item.observation.camera, sigmas, rng)[0],
+                pose_sigma={"heading_deg": 0.2, "tilt_deg": 0.1},
+            ),
         )
         for item in shots_of(stage)
     ]
     numbers, sample = {}, None
     for name, kept in (("unguarded", False), ("guarded", True)):
-        painting = paint_atlas(
-            inputs, stage.truth.terrain, stage.atlas, stage.terrain, options=PaintOptions(guard=kept)
-        )
+        painting = paint_atlas(inputs, target_of(stage), options=PaintOptions(guard=kept))
         painted = painting.texture.weight.ravel() > 0.0
         if sample is None:
             sample = np.sort(rng.permutation(np.flatnonzero(painted))[:texels])
@@ -306,7 +309,7 @@ def rejection(stage: Stage, *, seed: int, texels: int = 12_000) -> dict:
     from seasonscapes.texturing.regression_fill import fit_regression, predict
 
     terrain, inputs = stage.truth.terrain, shots_of(stage)
-    first = paint_atlas(inputs, terrain, stage.atlas, stage.terrain)
+    first = paint_atlas(inputs, target_of(stage))
     sun = stage.lights[0].sun
     # The land in another season serves as the satellite's image.
     summer = terrain_and_albedo(stage.truth.place, stage.truth.spacing_m, stage.texel_m, 190)[1]
@@ -319,27 +322,25 @@ def rejection(stage: Stage, *, seed: int, texels: int = 12_000) -> dict:
         return lambda other: predict(regression, other)[0]
 
     pictures = {picture.observation.webcam: picture for picture in stage.pictures}
-    cut, scene = tiling(terrain, stage.atlas), RenderScene(stage.terrain.mi_scene, stage.terrain.mi_terrain, None, 0.0)
+    cut, scene = tiling(terrain, stage.atlas), RenderScene(stage.terrain.mi_scene, stage.terrain.mi_terrain)
     ready = [prepare_input(item, stage.terrain, cut) for item in inputs]
     uvs = [trace_gbuffer(scene, item.observation.camera).uv for item in inputs]
     rejects, painting = [None] * len(inputs), first
     # What was found at first no longer teaches the regression.
     for _ in range(2):
-        expected = predict_in_folds(painting.texture, predictors.values, fit, seed=seed)
+        expected = cross_validated_prediction(painting.texture, predictors.values, fit, seed=seed)
         number = {name: k for k, name in enumerate(first.webcams)}
         rejects = [
             foreground_mask(r, number[r.painting_input.observation.webcam], painting.radiometry, expected, uv)
             for r, uv in zip(ready, uvs, strict=True)
         ]
-        painting = paint_atlas(inputs, terrain, stage.atlas, stage.terrain, rejects=rejects)
+        painting = paint_atlas(inputs, target_of(stage), rejects=rejects)
     found, false = [], []
     for item, mask, uv in zip(inputs, rejects, uvs, strict=True):
         land, front = np.isfinite(uv).all(axis=2), pictures[item.observation.webcam].foreground
         found.append((np.count_nonzero(mask & front & land), np.count_nonzero(front & land)))
         false.append((np.count_nonzero(mask & ~front & land), np.count_nonzero(~front & land)))
-    oracle = paint_atlas(
-        inputs, terrain, stage.atlas, stage.terrain, rejects=[pictures[s.observation.webcam].foreground for s in inputs]
-    )
+    oracle = paint_atlas(inputs, target_of(stage), rejects=[pictures[s.observation.webcam].foreground for s in inputs])
     painted = np.flatnonzero(first.texture.weight.ravel() > 0.0)
     sample = np.sort(np.random.default_rng(seed).permutation(painted)[:texels])
     truth = land_truth(stage, sample, seed=seed)

@@ -7,7 +7,7 @@ from test_completion import SIDE, made_up_land, painted
 
 from seasonscapes.terrain.surface import Texture
 from seasonscapes.texturing.bayesian_fusion import fuse_with_albedo
-from seasonscapes.texturing.completion import complete
+from seasonscapes.texturing.completion import CompletionOptions, complete
 from seasonscapes.texturing.predictors import stack_predictors
 from seasonscapes.texturing.texel_weights import fit_variance_by_weight
 
@@ -116,6 +116,6 @@ def test_refuses(land):
     with pytest.raises(ValueError, match="base"):
         complete(painted(truth, seen), predictors, base=base[:-1])
     with pytest.raises(ValueError, match="expected guided"):
-        complete(painted(truth, seen), predictors, base=base, method="membrane")
+        complete(painted(truth, seen), predictors, base=base, options=CompletionOptions("membrane"))
     with pytest.raises(ValueError, match="fuse"):
         fuse_with_albedo(painted(truth, seen), base[:-1], np.ones(seen.shape), predictors)

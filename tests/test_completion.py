@@ -14,7 +14,7 @@ from seasonscapes.terrain.hole_filling import harmonic_fill
 from seasonscapes.terrain.mesh import build_mesh
 from seasonscapes.terrain.surface import Raster, Texture, load_texture, save_texture
 from seasonscapes.terrain.unwrap import unwrap
-from seasonscapes.texturing.completion import INPAINTERS, complete
+from seasonscapes.texturing.completion import INPAINTERS, CompletionOptions, complete
 from seasonscapes.texturing.predictors import predictors_for, stack_predictors
 from seasonscapes.texturing.smooth_fill import membrane_fill, propagate, push_pull, telea_fill
 from seasonscapes.texturing.terrain_features import horizon_tangent, sun_margin_deg, terrain_features
@@ -154,7 +154,7 @@ def filled():
         truth,
         seen,
         predictors,
-        {name: complete(painted(truth, seen), predictors, method=name) for name in INPAINTERS},
+        {name: complete(painted(truth, seen), predictors, options=CompletionOptions(name)) for name in INPAINTERS},
     )
 
 
@@ -193,7 +193,10 @@ def test_controls_lower_the_score(filled):
     score = hidden_psnr(done["guided"].values, truth, seen)
     shuffled = predictors.values.reshape(-1, len(predictors.names))[np.random.default_rng(0).permutation(seen.size)]
     permuted = stack_predictors(dict(zip(predictors.names, shuffled.T.reshape(-1, *seen.shape), strict=True)))
-    assert hidden_psnr(complete(painted(truth, seen), permuted, fast=True).values, truth, seen) < score - 5.0
+    assert (
+        hidden_psnr(complete(painted(truth, seen), permuted, options=CompletionOptions(fast=True)).values, truth, seen)
+        < score - 5.0
+    )
     names = predictors.names
     moved = {name: predictors.values[..., i] for i, name in enumerate(names)}
     moved |= {name: np.roll(moved[name], 23, axis=1) for name in names if name.startswith("sun")}
@@ -204,9 +207,11 @@ def test_controls_lower_the_score(filled):
 def test_fast_and_seeds(filled):
     truth, seen, predictors, done = filled
     texture = painted(truth, seen)
-    fast = complete(texture, predictors, fast=True)
+    fast = complete(texture, predictors, options=CompletionOptions(fast=True))
     assert hidden_psnr(fast.values, truth, seen) > hidden_psnr(done["membrane"].values, truth, seen) + 4.0
-    np.testing.assert_array_equal(fast.values, complete(texture, predictors, fast=True).values)
+    np.testing.assert_array_equal(
+        fast.values, complete(texture, predictors, options=CompletionOptions(fast=True)).values
+    )
 
 
 def test_grain_is_the_seen_land_s_and_touches_no_painted_texel(filled):
@@ -215,7 +220,7 @@ def test_grain_is_the_seen_land_s_and_touches_no_painted_texel(filled):
         np.float32
     )
     texture = painted(rough, seen)
-    plain, grained = (complete(texture, predictors, fast=True, detail=d) for d in (0.0, 1.0))
+    plain, grained = (complete(texture, predictors, options=CompletionOptions(fast=True, detail=d)) for d in (0.0, 1.0))
     np.testing.assert_array_equal(grained.values[seen], rough[seen])
 
     def grain(values):
@@ -256,7 +261,9 @@ def test_all_painted_none_painted_and_nonsense():
     with pytest.raises(ValueError, match="no painted texel"):
         complete(Texture(np.full_like(truth, np.nan)), predictors)
     with pytest.raises(ValueError, match="expected one of guided, membrane, telea"):
-        complete(Texture(truth), predictors, method="magic")
+        CompletionOptions("magic")
+    with pytest.raises(ValueError, match="expected 0 to 1"):
+        CompletionOptions(detail=1.1)
     with pytest.raises(ValueError, match="negative"):
         complete(Texture(-truth), predictors)
     with pytest.raises(ValueError, match="the texture"):
@@ -264,7 +271,7 @@ def test_all_painted_none_painted_and_nonsense():
     one = np.zeros(seen.shape, bool)
     one[40, 40] = True
     for name in INPAINTERS:
-        lonely = complete(painted(truth, one), predictors, method=name)
+        lonely = complete(painted(truth, one), predictors, options=CompletionOptions(name))
         np.testing.assert_allclose(lonely.values, np.broadcast_to(truth[40, 40], truth.shape), rtol=1e-3)
         assert (lonely.sigma[~one] > 0.3 * truth[40, 40].mean()).all()
 
@@ -286,7 +293,7 @@ def test_charts_that_lie_apart_are_neighbours_on_the_land():
     assert np.nanmax(np.abs(back - truth)[predictors.surface]) < 0.1
     seen = predictors.surface & (np.abs(east - 0.5) > 0.12)
     for method in ("membrane", "telea", "guided"):
-        done = complete(painted(truth, seen), predictors, method=method)
+        done = complete(painted(truth, seen), predictors, options=CompletionOptions(method))
         hole = predictors.surface & ~seen
         assert np.isfinite(done.values).all()
         assert np.sqrt(np.mean((done.values - truth)[hole] ** 2)) < 0.15, method  # a constant: 0.25 or more

@@ -26,18 +26,18 @@ from seasonscapes.texturing.path_inpainting import (
     InpaintingState,
     PathInpaintingInputs,
     PathInpaintingOptions,
-    frames_of,
     inpaint_along_path,
+    textured_frames,
 )
 from seasonscapes.texturing.prompts import prompt_for
 from seasonscapes.texturing.view_conditions import (
-    Conditions,
+    ViewConditions,
     decode,
     depth_picture,
     dilated,
     encode,
-    look_up,
     red_pixels,
+    sample_covered,
     white_radiance,
 )
 from seasonscapes.workflows import path_completion
@@ -49,7 +49,13 @@ pytest.importorskip("diffusers", reason="the extra 'diffusion' is not installed"
 import torch
 from tiny_diffusion import ADAPTER, BASE, DEPTH, INPAINT, write_tiny_weights
 
-from seasonscapes.texturing.diffusion import DiffusionSettings, Machine, load_painter, needed_parts, whole_cells
+from seasonscapes.texturing.diffusion import (
+    DeviceSettings,
+    DiffusionSettings,
+    load_inpainter,
+    required_parts,
+    whole_cells,
+)
 from seasonscapes.texturing.model_weights import WeightNames, find_weights, weights_fingerprint
 
 HEIGHT, WIDTH = 50, 70  # not divisible by 8
@@ -87,7 +93,7 @@ def test_a_view_from_a_mast_has_its_foot_in_white(hill):
     land, _, _ = hill
     view = camera_at(land.frame, 46.5405, 7.98, 1120.0, heading_deg=0.0, pitch_deg=-8.0, size_px=(48, 32))
     terrain = ray_scene(mi_mesh(land.terrain, np.full(3, 0.2)))
-    picture = depth_picture(trace_gbuffer(RenderScene(terrain.mi_scene, terrain.mi_terrain, None, 0.0), view).depth)
+    picture = depth_picture(trace_gbuffer(RenderScene(terrain.mi_scene, terrain.mi_terrain), view).depth)
     assert picture[-1].min() > 0.8
     assert picture[-1].mean() > picture[16].mean() + 0.2
 
@@ -109,10 +115,10 @@ def test_holes_are_where_coverage_ends_and_look_no_colour_from_there():
     values[:, 4:], covered[:, 4:] = 1e6, False
     u = np.linspace(0.01, 0.99, 99)
     uv = np.stack([u, np.full_like(u, 0.5)], axis=-1)[None]
-    radiance, known = look_up(values, covered, uv)
+    radiance, known = sample_covered(values, covered, uv)
     np.testing.assert_array_equal(known[0], u <= 0.5)
     np.testing.assert_allclose(radiance[known], 5.0)
-    assert not look_up(values, covered, np.full((1, 3, 2), np.nan))[1].any()
+    assert not sample_covered(values, covered, np.full((1, 3, 2), np.nan))[1].any()
 
 
 def test_red_is_a_hole_to_the_reference_and_so_is_autumn():
@@ -159,7 +165,7 @@ def made_up_view(seed=5):
     hole = np.zeros((HEIGHT, WIDTH), bool)
     hole[:, 30:] = True
     depth = np.broadcast_to(np.linspace(0.1, 1.0, HEIGHT, dtype=np.float32)[:, None], hole.shape).copy()
-    return Conditions(picture, hole, depth, seed)
+    return ViewConditions(picture, hole, depth, seed)
 
 
 GUIDE = np.random.default_rng(3).random((40, 60, 3))
@@ -167,14 +173,14 @@ SETTINGS = DiffusionSettings(prompt="A mountain in summer", steps=3)
 
 
 @pytest.fixture(scope="module")
-def painter(weights):
-    return load_painter(weights, SETTINGS, image=GUIDE)
+def inpainter(weights):
+    return load_inpainter(weights, SETTINGS, image=GUIDE)
 
 
-def test_every_condition_changes_the_output(weights, painter):
+def test_every_condition_changes_the_output(weights, inpainter):
     """One factor at a time: what is asked, each ControlNet and what it is shown, the guide image, the sampler."""
     view = made_up_view()
-    base = painter(view)
+    base = inpainter(view)
     assert base.shape == (HEIGHT, WIDTH, 3)
     assert base.min() >= 0.0
     assert base.max() <= 1.0
@@ -183,7 +189,7 @@ def test_every_condition_changes_the_output(weights, painter):
         return float(np.abs(picture - base)[view.hole].mean())
 
     changed = {
-        name: moved(load_painter(weights, replace(SETTINGS, **change), image=GUIDE)(view))
+        name: moved(load_inpainter(weights, replace(SETTINGS, **change), image=GUIDE)(view))
         for name, change in {
             "other prompt": {"prompt": "A lake in winter"},
             "no prompt": {"prompt": ""},
@@ -199,24 +205,24 @@ def test_every_condition_changes_the_output(weights, painter):
             "strength": {"strength": 0.7},
         }.items()
     }
-    changed["other image"] = moved(load_painter(weights, SETTINGS, image=1.0 - GUIDE)(view))
-    changed["depth inverted"] = moved(painter(replace(view, depth=1.0 - view.depth)))
-    changed["other picture"] = moved(painter(replace(view, picture=1.0 - view.picture)))
-    changed["other hole"] = moved(painter(replace(view, hole=~view.hole)))
-    changed["other seed"] = moved(painter(replace(view, seed=6)))
+    changed["other image"] = moved(load_inpainter(weights, SETTINGS, image=1.0 - GUIDE)(view))
+    changed["depth inverted"] = moved(inpainter(replace(view, depth=1.0 - view.depth)))
+    changed["other picture"] = moved(inpainter(replace(view, picture=1.0 - view.picture)))
+    changed["other hole"] = moved(inpainter(replace(view, hole=~view.hole)))
+    changed["other seed"] = moved(inpainter(replace(view, seed=6)))
     assert min(changed.values()) > 1e-5, changed
     assert changed["other seed"] > 1e-2
 
 
-def test_equal_seeds_give_equal_pictures(weights, painter):
+def test_equal_seeds_give_equal_pictures(weights, inpainter):
     view = made_up_view()
-    np.testing.assert_array_equal(painter(view), painter(view))
-    np.testing.assert_array_equal(load_painter(weights, SETTINGS, image=GUIDE)(view), painter(view))
+    np.testing.assert_array_equal(inpainter(view), inpainter(view))
+    np.testing.assert_array_equal(load_inpainter(weights, SETTINGS, image=GUIDE)(view), inpainter(view))
 
 
 def test_progress_and_number_formats(weights, monkeypatch):
     shares = []
-    small = load_painter(weights, replace(SETTINGS, strength=0.7), machine=Machine("cpu", "bfloat16"))
+    small = load_inpainter(weights, replace(SETTINGS, strength=0.7), device_settings=DeviceSettings("cpu", "bfloat16"))
     found = small(made_up_view(), shares.append)
     assert np.isfinite(found).all()
     np.testing.assert_allclose(shares, [0.5, 1.0])
@@ -232,10 +238,10 @@ def test_only_what_counts_is_looked_for(weights, tmp_path):
     shutil.copytree(weights / BASE, tmp_path / BASE)
     shutil.copytree(weights / INPAINT, tmp_path / INPAINT)
     # Without depth and without a guide image neither is needed.
-    assert needed_parts(replace(SETTINGS, depth_scale=0.0), False) == ["base", "inpaint"]
-    load_painter(tmp_path, replace(SETTINGS, depth_scale=0.0))
+    assert required_parts(replace(SETTINGS, depth_scale=0.0), False) == ["base", "inpaint"]
+    load_inpainter(tmp_path, replace(SETTINGS, depth_scale=0.0))
     with pytest.raises(InputError, match="the depth weights"):
-        load_painter(tmp_path, SETTINGS)
+        load_inpainter(tmp_path, SETTINGS)
 
 
 def test_hub_names_stand_for_folders(weights):
@@ -290,7 +296,7 @@ def test_wrong_and_half_downloaded_weights(weights, tmp_path):
         shutil.copytree(weights, copy)
         change(copy)
         with pytest.raises(InputError) as caught:
-            load_painter(copy, SETTINGS, image=GUIDE)
+            load_inpainter(copy, SETTINGS, image=GUIDE)
         assert "\n" not in str(caught.value)
         assert part in str(caught.value)
         return str(caught.value)
@@ -330,45 +336,45 @@ def test_weights_by_shards_and_in_half_precision(weights, tmp_path):
     names = WeightNames(depth=str(half))
     view = made_up_view()
     np.testing.assert_array_equal(
-        load_painter(weights, SETTINGS, names=names)(view), load_painter(weights, SETTINGS)(view)
+        load_inpainter(weights, SETTINGS, names=names)(view), load_inpainter(weights, SETTINGS)(view)
     )
 
 
-def test_memory_that_runs_out_is_one_line(painter, monkeypatch):
+def test_memory_that_runs_out_is_one_line(inpainter, monkeypatch):
     def full(*_args, **_kwargs):
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB.\nMore lines follow.")
 
-    monkeypatch.setattr(type(painter.pipe), "__call__", full)
+    monkeypatch.setattr(type(inpainter.pipe), "__call__", full)
     with pytest.raises(InputError) as caught:
-        painter(made_up_view())
+        inpainter(made_up_view())
     text = str(caught.value)
     assert "\n" not in text
     for words in ("memory ran out at 70 × 50", "20.00 GiB", "finished views are kept", "--offload", "--size"):
         assert words in text
 
 
-def test_a_model_that_overflows(painter, monkeypatch):
+def test_a_model_that_overflows(inpainter, monkeypatch):
     class Output:
         images = np.full((1, 56, 72, 3), np.nan)
 
-    monkeypatch.setattr(type(painter.pipe), "__call__", lambda *_a, **_k: Output)
+    monkeypatch.setattr(type(inpainter.pipe), "__call__", lambda *_a, **_k: Output)
     with pytest.raises(InputError, match="bfloat16"):
-        painter(made_up_view())
+        inpainter(made_up_view())
 
 
 def test_machines_and_settings_that_cannot_be(weights, monkeypatch):
     with pytest.raises(InputError, match="unknown device"):
-        load_painter(weights, SETTINGS, machine=Machine("abacus"))
+        load_inpainter(weights, SETTINGS, device_settings=DeviceSettings("abacus"))
     with pytest.raises(InputError, match="unknown number format"):
-        load_painter(weights, SETTINGS, machine=Machine(dtype="float7"))
+        load_inpainter(weights, SETTINGS, device_settings=DeviceSettings(dtype="float7"))
     if not torch.cuda.is_available():
         with pytest.raises(InputError, match="no CUDA GPU"):
-            load_painter(weights, SETTINGS, machine=Machine("cuda"))
+            load_inpainter(weights, SETTINGS, device_settings=DeviceSettings("cuda"))
     with pytest.raises(ValueError, match="leave none to do"):
         DiffusionSettings(steps=2, strength=0.3)
     monkeypatch.setitem(sys.modules, "diffusers", None)
     with pytest.raises(InputError, match=r"diffusers is not installed; pip install 'seasonscapes\[diffusion\]'"):
-        load_painter(weights, SETTINGS)
+        load_inpainter(weights, SETTINGS)
 
 
 # ---------------------------------------------------------------------------------------------- the loop
@@ -477,7 +483,7 @@ def test_views_draw_their_own_seeds_and_walks_repeat(hill):
     np.testing.assert_array_equal(first.values, second.values)
     assert len(set(seeds)) == 4
     other, _ = walked(hill, options=replace(OPTIONS, seed=8))
-    assert np.abs(other.values - first.values)[first.imagined].max() > 1.0
+    assert np.abs(other.values - first.values)[first.generated].max() > 1.0
 
 
 def test_killed_in_the_middle_it_goes_on_with_the_same_result(hill, tmp_path):
@@ -545,7 +551,7 @@ def test_hybrid_shows_the_model_a_completion(hill):
     state, _ = walked(hill, lambda view, tell: views.append(view) or view.picture, base=base)
     white = white_radiance(state.values, state.painted)
     expected = encode(np.float32([100.0, 200.0, 1200.0]), white)
-    inside = state.imagined.copy()
+    inside = state.generated.copy()
     assert np.median(np.abs(encode(state.values[inside], white) - expected)) < 0.01
     # Without it, holes show their rims' colours.
     plain = []
@@ -586,7 +592,7 @@ def test_a_model_that_misbehaves_and_nothing_painted(hill):
 def test_frames_show_the_finished_texture(hill):
     land, _, cameras = hill
     values = np.full((land.atlas.height_px, land.atlas.width_px, 3), 500.0, np.float32)
-    frames = list(frames_of(values, cameras[:2], walk_on(hill).terrain, 1000.0))
+    frames = list(textured_frames(values, cameras[:2], walk_on(hill).terrain, 1000.0))
     assert len(frames) == 2
     assert frames[0].shape == (34, 50, 3)
     np.testing.assert_allclose(frames[0][-1], 0.5, atol=2e-3)
@@ -644,10 +650,10 @@ def test_end_to_end_interrupted_and_resumed(run, hill, tmp_path, capsys, monkeyp
         assert not stored["sigma"][seen].any()
         assert (stored["sigma"][~seen] > 0.0).mean() > 0.99
 
-    real, count = path_completion._painter, []
+    real, count = path_completion._load_inpainter, []
 
     def fails_at_third(*args):
-        painter, identity = real(*args)
+        inpainter, identity = real(*args)
 
         class Failing:
             slow, device = False, "cpu"
@@ -656,11 +662,11 @@ def test_end_to_end_interrupted_and_resumed(run, hill, tmp_path, capsys, monkeyp
                 count.append(view.seed)
                 if len(count) == 3:
                     raise InputError("--device", "the GPU's memory ran out")
-                return painter(view, tell)
+                return inpainter(view, tell)
 
         return Failing(), identity
 
-    monkeypatch.setattr(path_completion, "_painter", fails_at_third)
+    monkeypatch.setattr(path_completion, "_load_inpainter", fails_at_third)
     with pytest.raises(InputError, match="memory ran out"):
         run(tmp_path / "resumed.npz", **flags)
     assert not (tmp_path / "resumed.npz").exists()

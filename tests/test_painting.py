@@ -34,14 +34,14 @@ from seasonscapes.terrain.surface import load_texture, sample_texture
 from seasonscapes.terrain.texels import texel_positions
 from seasonscapes.terrain.unwrap import unwrap
 from seasonscapes.texturing.atlas_tiles import tile_surface, tiles_of, tiling
-from seasonscapes.texturing.foreground import foreground_mask, predict_in_folds
+from seasonscapes.texturing.foreground import cross_validated_prediction, foreground_mask
 from seasonscapes.texturing.inputs import PaintingInput, prepare_input, sample_input
-from seasonscapes.texturing.painting import PaintOptions, paint_atlas, prepare_inputs
+from seasonscapes.texturing.painting import PaintOptions, PaintTarget, paint_atlas, paint_tile, prepare_inputs
 from seasonscapes.texturing.painting_file import load_painting, save_painting, write_figures
 from seasonscapes.texturing.radiometric_fit import RadiometricFit, fit_radiometry, invert_contrast, radiance_at_surface
 from seasonscapes.texturing.silhouette import depth_jumps, pose_sigma_px, silhouette_guard
 from seasonscapes.texturing.texel_weights import sharpened, texel_weight
-from seasonscapes.texturing.visibility import by_depth, by_faces, by_ray, project_texels
+from seasonscapes.texturing.visibility import project_texels, visible_by_depth, visible_by_faces, visible_by_ray
 
 NOON = datetime(2024, 9, 1, 12, tzinfo=UTC)
 SKY = np.array([3000.0, 4000.0, 6000.0])
@@ -64,6 +64,7 @@ class Land:
     def __init__(self, height, *, count=121, side_m=1200.0, texel_m=5.0):
         self.terrain, self.atlas = unwrap(heightfield(height, count=count, side_m=side_m), texel_m=texel_m)
         self.ray_scene = ray_scene(mi_mesh(self.terrain, np.full(3, 0.3)))
+        self.target = PaintTarget(self.terrain, self.atlas, self.ray_scene)
         self.cut = tiling(self.terrain, self.atlas)
         place, _ = texel_positions(self.terrain, self.atlas.width_px, self.atlas.height_px)
         e, n = place[..., 0], place[..., 1]
@@ -72,7 +73,7 @@ class Land:
 
     def look(self, camera):
         """The G-buffer of a camera."""
-        return trace_gbuffer(RenderScene(self.ray_scene.mi_scene, self.ray_scene.mi_terrain, None, 0.0), camera)
+        return trace_gbuffer(RenderScene(self.ray_scene.mi_scene, self.ray_scene.mi_terrain), camera)
 
     def picture(self, camera, air=None) -> np.ndarray:
         """Radiance at a camera, through the air, against a sky of one colour."""
@@ -98,9 +99,7 @@ class Land:
 
     def paint(self, inputs, **options):
         """Painted with no near limit."""
-        return paint_atlas(
-            inputs, self.terrain, self.atlas, self.ray_scene, options=PaintOptions(near_m=1.0, **options)
-        )
+        return paint_atlas(inputs, self.target, options=PaintOptions(near_m=1.0, **options))
 
 
 def hills(e, n):
@@ -145,7 +144,7 @@ def test_rays_agree_with_a_scalar_oracle(land, cameras):
         inside, grazing = np.flatnonzero(sight.inside), np.flatnonzero(sight.inside & (sight.cosine < 0.2))
         some = np.concatenate([rng.permutation(inside)[:200], rng.permutation(grazing)[:100]])
         truth = oracle.sees(surface.position_m[some], surface.face[some], camera.position_m)
-        seen = by_ray(land.ray_scene, camera, surface[some], sight[some])
+        seen = visible_by_ray(land.ray_scene, camera, surface[some], sight[some])
         assert 0.2 < truth.mean() < 0.98, "the sample must hold seen and hidden texels"
         assert np.count_nonzero(seen & ~truth) <= 0.001 * seen.sum()
         assert np.count_nonzero(seen & truth) >= 0.995 * truth.sum()
@@ -157,9 +156,9 @@ def test_other_visibility_tests_are_worse(land, cameras):
     wrong = {"depth": 0, "faces": 0}
     for camera in cameras:
         sight = project_texels(camera, surface)
-        truth = by_ray(land.ray_scene, camera, surface, sight)
-        wrong["depth"] += np.count_nonzero(by_depth(land.look(camera).depth, sight) != truth)
-        wrong["faces"] += np.count_nonzero(by_faces(land.ray_scene, camera, surface, sight) != truth)
+        truth = visible_by_ray(land.ray_scene, camera, surface, sight)
+        wrong["depth"] += np.count_nonzero(visible_by_depth(land.look(camera).depth, sight) != truth)
+        wrong["faces"] += np.count_nonzero(visible_by_faces(land.ray_scene, camera, surface, sight) != truth)
     assert min(wrong.values()) > 500
 
 
@@ -346,12 +345,12 @@ def test_tiles_change_nothing_and_resume(land, cameras, tmp_path, monkeypatch):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        paint_atlas(inputs, land.terrain, land.atlas, land.ray_scene, options=cut, resume=tmp_path, progress=stop)
+        paint_atlas(inputs, land.target, options=cut, resume=tmp_path, progress=stop)
     done = sorted(tmp_path.glob("tile-*.npz"))
     assert 0 < len(done) < 9
     assert not list(tmp_path.glob(".*"))
     stamps = [path.stat().st_mtime_ns for path in done]
-    again = paint_atlas(inputs, land.terrain, land.atlas, land.ray_scene, options=cut, resume=tmp_path)
+    again = paint_atlas(inputs, land.target, options=cut, resume=tmp_path)
     assert [path.stat().st_mtime_ns for path in done] == stamps, "finished tiles are not painted again"
     assert same(whole, again)
 
@@ -399,11 +398,39 @@ def test_unpainted_is_told_by_weight_not_by_colour(land, cameras):
     assert (painting.best[~painted] == -1).all()
 
 
+def test_more_cameras_than_eight_bits_hold(land, cameras):
+    """The number of contributing cameras does not wrap at 256."""
+    count, atlas_tiling = 300, tiling(land.terrain, land.atlas, tile_px=32)
+    prepared = prepare_input(land.item(cameras[0], "one"), land.ray_scene, atlas_tiling)
+    radiometry = RadiometricFit(np.zeros((count, 3)), np.zeros((count, 3)), np.ones(count))
+    tiles = (
+        paint_tile([prepared] * count, land.ray_scene, atlas_tiling, tile, radiometry)
+        for tile in tiles_of(atlas_tiling)
+        if paint_tile([prepared], land.ray_scene, atlas_tiling, tile, radiometry).coverage.any()
+    )
+    painted = next(tiles)
+    assert set(np.unique(painted.coverage)) <= {0, count}
+    assert painted.coverage.max() == count
+
+
+def test_the_pose_error_of_the_observation_guards_silhouettes(land, cameras):
+    exact = land.item(cameras[0], "one")
+    uncertain = replace(exact, observation=replace(exact.observation, pose_sigma={"heading_deg": 0.5}))
+    sure, unsure = (prepare_input(item, land.ray_scene, land.cut).confidence for item in (exact, uncertain))
+    assert (unsure <= sure).all()
+    assert unsure.sum() < 0.95 * sure.sum()
+
+
 def test_painting_on_disk(land, cameras, tmp_path):
     painting = land.paint([land.item(c, f"cam-{k}") for k, c in enumerate(cameras)])
     save_painting(painting, tmp_path / "p.npz")
     back = load_painting(tmp_path / "p.npz")
     assert same(painting, back)
+    assert back.texture.atlas_id is None
+    assert back.coverage.dtype == painting.coverage.dtype
+    identified = replace(painting, texture=replace(painting.texture, atlas_id="0123456789abcdef"))
+    save_painting(identified, tmp_path / "identified.npz")
+    assert load_painting(tmp_path / "identified.npz").texture.atlas_id == "0123456789abcdef"
     assert back.webcams == painting.webcams
     np.testing.assert_allclose(back.radiometry.log_gain, painting.radiometry.log_gain)
     np.testing.assert_array_equal(load_texture(tmp_path / "p.npz").values, painting.texture.values)
@@ -444,11 +471,11 @@ def test_predictions_owe_nothing_to_their_own_fold(land):
         return lambda z: np.column_stack([z, np.ones(len(z))]) @ solution
 
     spoilt = Texture(land.radiance.copy())
-    clean = predict_in_folds(spoilt, predictors, fit)
+    clean = cross_validated_prediction(spoilt, predictors, fit)
     assert len(seen) == 4
     assert np.isfinite(clean).all()
     spoilt.values[:20, :20] *= 50.0
-    again = predict_in_folds(Texture(spoilt.values), predictors, fit)
+    again = cross_validated_prediction(Texture(spoilt.values), predictors, fit)
     inner = np.log(again[:16, :16] / clean[:16, :16])
     assert np.abs(inner).max() < 1.5, "a block that is fifty times too bright does not predict itself"
 
@@ -484,9 +511,7 @@ def test_atlas_of_charts_is_painted_too():
     item = cliffs.item(camera_towards((-500.0, -450.0, 170.0), (0.0, 0.0, 0.0)), "one")
     painting = paint_atlas(
         [item],
-        terrain,
-        atlas,
-        ray_scene(mi_mesh(terrain, np.full(3, 0.3))),
+        PaintTarget(terrain, atlas, ray_scene(mi_mesh(terrain, np.full(3, 0.3)))),
         options=PaintOptions(near_m=1.0, fit_gains=False),
     )
     place, _ = texel_positions(terrain, atlas.width_px, atlas.height_px)

@@ -9,7 +9,7 @@ import pytest
 from places import MASSIF
 
 from seasonscapes.calibration.calibration_file import read_calibration
-from seasonscapes.calibration.skyline import encoded_from_file
+from seasonscapes.calibration.skyline import read_image_srgb8
 from seasonscapes.cameras.observation import read_manifest
 from seasonscapes.cameras.panorama import Panorama, level_panorama
 from seasonscapes.errors import InputError, NoTerrainInView
@@ -40,11 +40,11 @@ def taken(tmp_path_factory):
     cameras = {
         name: level_panorama(camera, place.frame, size) for name, camera in scene_cameras(place, size_px=size).items()
     }
-    before = synthetic_webcams.webcam_series.__kwdefaults__["sampling"]
-    synthetic_webcams.webcam_series.__kwdefaults__["sampling"] = SamplingOptions(4, 4, 16, 1, 64, 16, 8)
+    before = synthetic_webcams.QUICK
+    synthetic_webcams.QUICK = SamplingOptions(4, 4, 16, 1, 64, 16, 8)
     model = read_sky_model("hosek")
     yield place, cameras, model, photograph_series(place, TIMES, model, folder / "shots", cameras=cameras)
-    synthetic_webcams.webcam_series.__kwdefaults__["sampling"] = before
+    synthetic_webcams.QUICK = before
 
 
 def test_a_level_panorama_turns_about_the_cameras_own_vertical(taken):
@@ -69,7 +69,7 @@ def test_the_files_are_what_was_photographed(taken):
     assert [(row.webcam, row.time) for row in rows] == [(name, time) for name in cameras for time in TIMES]
     made = dict(photograph_each(place, TIMES, model, {"meadow": cameras["meadow"]}))["meadow"]
     assert made[0].observation.camera.fx == cameras["meadow"].fx
-    exact = encoded_from_file(sources.manifest.parent / rows[2].path)
+    exact = read_image_srgb8(sources.manifest.parent / rows[2].path)
     # Poses apart, the pictures of `albedo --synthetic-webcams` are those that `run` writes.
     np.testing.assert_array_equal(made[0].encoded, exact)
     assert isinstance(read_calibration(sources.calibrations / "meadow_calibration.json").view, Panorama)
@@ -97,7 +97,7 @@ def test_views_of_panoramas_serve_paint_and_albedo_alike(taken, tmp_path, caplog
     assert {each.webcam.split("/")[0] for each in opened} == {"aerial", "meadow"}
     for painting_input, photograph in zip(painting_inputs(place, opened, model), opened, strict=True):
         assert painting_input.observation.webcam == photograph.webcam
-        assert painting_input.pose_sigma["heading_deg"] == 0.01
+        assert painting_input.observation.pose_sigma["heading_deg"] == 0.01
         np.testing.assert_array_equal(painting_input.observation.image, photograph.image)
 
     # Parts of a panorama that show sky alone are left out, and so is what a mask leaves nothing of.

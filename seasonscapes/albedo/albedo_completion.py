@@ -10,7 +10,7 @@ import numpy as np
 from seasonscapes.albedo.closed_form import HIGHEST, LOWEST, AlbedoFit
 from seasonscapes.albedo.standard_error import AlbedoEstimate, observed_sigma
 from seasonscapes.terrain.surface import Texture
-from seasonscapes.texturing.completion import complete
+from seasonscapes.texturing.completion import CompletionOptions, complete
 from seasonscapes.texturing.predictors import Predictors
 
 

@@ -69,7 +69,7 @@ class DiffusionOptions:
 
     def values(self) -> PathCompletionOptions:
         """The flags as one value; `InputError` about flags that cannot work, before anything is built."""
-        from seasonscapes.texturing.diffusion import Machine
+        from seasonscapes.texturing.diffusion import DeviceSettings
         from seasonscapes.texturing.model_weights import WeightNames
         from seasonscapes.texturing.view_conditions import MASKS
         from seasonscapes.workflows.path_completion import CONDITIONS, PathCompletionOptions
@@ -102,7 +102,7 @@ class DiffusionOptions:
             frames=self.frames,
             film=self.film,
             fps=self.fps,
-            machine=Machine(self.device, self.dtype, self.offload),
+            device_settings=DeviceSettings(self.device, self.dtype, self.offload),
         )
         check_range("--steps", self.steps, 1, 1000)
         check_range("--guidance", self.guidance, 1.0, 100.0)

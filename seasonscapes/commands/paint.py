@@ -51,15 +51,16 @@ def paint_command(
         Print one machine-readable record.
     """
     from seasonscapes.images import atomic_path
-    from seasonscapes.texturing.painting import MODES, PaintOptions
+    from seasonscapes.texturing.painting import PAINT_MODES, PaintOptions
     from seasonscapes.texturing.painting_file import save_painting, write_figures
+    from seasonscapes.texturing.radiometric_fit import RadiometricReference
     from seasonscapes.workflows.painting import painting_of, painting_record
     from seasonscapes.workflows.photograph_files import rows_at, uncalibrated
     from seasonscapes.workflows.predicted_radiance import RELATIVE_SIGMA, measured_radiance
 
     pictures, sky, options = pictures or PictureOptions(), sky or SkyOptions(), place or PlaceOptions()
     start = clock.perf_counter()
-    check_choice("--mode", mode, MODES)
+    check_choice("--mode", mode, PAINT_MODES)
     check_range("--near-m", near_m, 0.0, 1e5)
     check_range("--within-min", pictures.within_min, 0.0, 1e6)
     model, _ = sky.model(), parse_size(pictures.size)
@@ -69,11 +70,11 @@ def paint_command(
         # First of all: a wrong albedo file is refused before any picture is opened.
         predicted = None if albedo is None else measured_radiance(loaded, albedo, utc, model, progress=progress)
         sources = pictures.sources(loaded, utc, model, progress)
-        sigma = 1.0 if albedo is None else RELATIVE_SIGMA
-        how = PaintOptions(mode=mode, fit_gains=harmonise, fit_haze=harmonise, near_m=near_m, predicted_sigma=sigma)
+        reference = None if predicted is None else RadiometricReference(predicted, RELATIVE_SIGMA)
+        how = PaintOptions(mode=mode, fit_gains=harmonise, fit_haze=harmonise, near_m=near_m)
         within = pictures.within_min
         painting = painting_of(
-            loaded, sources, utc, model, how, within_min=within, predicted=predicted, progress=progress
+            loaded, sources, utc, model, how, within_min=within, reference=reference, progress=progress
         )
     for line in painting.skipped:
         message(f"left out: {line}")

@@ -12,7 +12,7 @@ import numpy as np
 
 from seasonscapes.errors import AtlasMismatch
 from seasonscapes.terrain.surface import Texture
-from seasonscapes.texturing.completion import Completed, painted_texels
+from seasonscapes.texturing.completion import CompletedTexture, painted_texels
 from seasonscapes.texturing.predictors import Predictors
 from seasonscapes.texturing.regression_fill import propagate_residual
 from seasonscapes.texturing.texel_weights import fit_variance_by_weight
@@ -21,7 +21,9 @@ from seasonscapes.texturing.texel_weights import fit_variance_by_weight
 _LIGHT_SIGMA, _IMAGE_SIGMA = 0.05, 0.05
 
 
-def fuse_with_albedo(texture: Texture, base: np.ndarray, base_sigma: np.ndarray, predictors: Predictors) -> Completed:
+def fuse_with_albedo(
+    texture: Texture, base: np.ndarray, base_sigma: np.ndarray, predictors: Predictors
+) -> CompletedTexture:
     """Compute the posterior mean of painted texels and a relit albedo, in logarithms.
 
     Parameters
@@ -37,7 +39,7 @@ def fuse_with_albedo(texture: Texture, base: np.ndarray, base_sigma: np.ndarray,
 
     Returns
     -------
-    Completed
+    CompletedTexture
         The posterior mean and its standard error; the base where nothing is painted.
 
     Raises
@@ -57,7 +59,7 @@ def fuse_with_albedo(texture: Texture, base: np.ndarray, base_sigma: np.ndarray,
     known = painted_texels(texture) & predictors.surface & (base > 0.0).all(axis=2) & (texture.values > 0.0).all(axis=2)
     base_variance = np.minimum(base_sigma, 1.0).astype(np.float32) ** 2 + np.float32(_LIGHT_SIGMA**2)
     if not known.any():
-        return Completed(base.astype(np.float32), base[..., 1] * np.sqrt(base_variance), known)
+        return CompletedTexture(base.astype(np.float32), base[..., 1] * np.sqrt(base_variance), known)
     log_ratio = np.zeros_like(base, dtype=np.float32)
     log_ratio[known] = np.log(texture.values[known] / base[known])
     weight = texture.weight[known]
@@ -69,4 +71,4 @@ def fuse_with_albedo(texture: Texture, base: np.ndarray, base_sigma: np.ndarray,
     residual = log_ratio * share[..., None]
     correction = np.where(known[..., None], residual, propagate_residual(residual, known, predictors))
     values = (base * np.exp(np.where(predictors.surface[..., None], correction, 0.0))).astype(np.float32)
-    return Completed(values, values[..., 1] * np.sqrt(base_variance * (1.0 - share)), known)
+    return CompletedTexture(values, values[..., 1] * np.sqrt(base_variance * (1.0 - share)), known)

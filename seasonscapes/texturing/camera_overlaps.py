@@ -9,8 +9,8 @@ import numpy as np
 
 from seasonscapes.rendering.hemisphere_rays import RayScene
 from seasonscapes.texturing.atlas_tiles import TexelSurface
-from seasonscapes.texturing.inputs import PreparedInput, air_to, sample_input, texel_extent_px
-from seasonscapes.texturing.visibility import by_ray, project_texels
+from seasonscapes.texturing.inputs import PreparedInput, sample_input, texel_extent_px, transmittance_and_airlight
+from seasonscapes.texturing.visibility import project_texels, visible_by_ray
 
 # Compared values are means over footprints of this many texel sides, so that cameras of different resolution agree.
 _FOOTPRINT_TEXELS = 4.0
@@ -95,7 +95,7 @@ def find_overlaps(inputs: Sequence[PreparedInput], terrain: RayScene) -> Overlap
             if second == first or not len(usable):
                 continue
             camera, points = partner.painting_input.camera, prepared.probes[usable]
-            index = usable[by_ray(terrain, camera, points, project_texels(camera, points))]
+            index = usable[visible_by_ray(terrain, camera, points, project_texels(camera, points))]
             partner_samples, valid = _sample_points(partner, second, prepared.probes[index])
             own_parts.append(samples[index[valid]])
             other_parts.append(partner_samples[valid])
@@ -119,7 +119,9 @@ def _sample_points(prepared: PreparedInput, number: int, points: TexelSurface) -
         & (confidence > _MIN_CONFIDENCE)
         & (value > 1e-4).all(axis=1)
     )
-    return CameraSamples(np.full(len(value), number), value, *air_to(prepared, points.position_m)), valid
+    return CameraSamples(
+        np.full(len(value), number), value, *transmittance_and_airlight(prepared, points.position_m)
+    ), valid
 
 
 def _no_samples() -> CameraSamples:

@@ -23,7 +23,7 @@ Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)
-class Completed:
+class CompletedTexture:
     """A texture without holes.
 
     Parameters
@@ -146,17 +146,47 @@ def _smooth_fill(
 INPAINTERS: dict[str, Inpainter] = {"guided": regression_fill, "membrane": membrane, "telea": telea}
 
 
+@dataclass(frozen=True)
+class CompletionOptions:
+    """Method and effort of `complete`.
+
+    Parameters
+    ----------
+    method
+        A name of `INPAINTERS`; ``guided`` if there is a base.
+    detail
+        Strength of synthesised grain in [0, 1]: 0 for albedo recovery, about 0.6 for visualisation.
+    fast
+        Trade some accuracy for time.
+    seed
+        Equal seeds give equal textures.
+
+    Raises
+    ------
+    ValueError
+        Unknown method, or ``detail`` out of range.
+    """
+
+    method: str = "guided"
+    detail: float = 0.0
+    fast: bool = False
+    seed: int = 0
+
+    def __post_init__(self):
+        if self.method not in INPAINTERS:
+            raise ValueError(f"method: got {self.method!r}, expected one of {', '.join(INPAINTERS)}")
+        if not 0.0 <= self.detail <= 1.0:
+            raise ValueError(f"detail: got {self.detail}, expected 0 to 1")
+
+
 def complete(
     texture: Texture,
     predictors: Predictors,
     *,
     base: np.ndarray | None = None,
-    method: str = "guided",
-    detail: float = 0.0,
-    fast: bool = False,
-    seed: int = 0,
+    options: CompletionOptions | None = None,
     progress: Progress | None = None,
-) -> Completed:
+) -> CompletedTexture:
     """Fill every unpainted texel of a texture.
 
     Parameters
@@ -170,20 +200,14 @@ def complete(
         ``(R, S, 3)`` estimate of every texel from another source, in the texture's unit (for an albedo: an orthophoto
         without its illumination), NaN where unknown. It is corrected by the painted texels, which in turn are shrunk
         towards it according to their ``weight``; see `residual_correction`.
-    method
-        A name of `INPAINTERS`; ``guided`` if there is a base.
-    detail
-        Strength of synthesised grain in [0, 1]: 0 for albedo recovery, about 0.6 for visualisation.
-    fast
-        Trade some accuracy for time.
-    seed
-        Equal seeds give equal textures.
+    options
+        Method and effort; defaults to `CompletionOptions()`.
     progress
         Called with the finished fraction.
 
     Returns
     -------
-    Completed
+    CompletedTexture
         The complete texture with its standard error.
 
     Raises
@@ -193,19 +217,16 @@ def complete(
     AtlasMismatch
         ``predictors`` belong to a texture of another size.
     ValueError
-        Unknown method, ``detail`` out of range, a base of another size or with another method than ``guided``, or a
-        negative painted value.
+        A base of another size or with another method than ``guided``, or a negative painted value.
     """
-    if method not in INPAINTERS:
-        raise ValueError(f"method: got {method!r}, expected one of {', '.join(INPAINTERS)}")
+    options = options or CompletionOptions()
+    method, fast, seed = options.method, options.fast, options.seed
     if predictors.surface.shape != texture.weight.shape:
         raise AtlasMismatch(f"complete: predictors are {predictors.surface.shape}, the texture {texture.weight.shape}")
     if base is not None and (base.shape != texture.values.shape or method != "guided"):
         raise ValueError(
             f"base: {base.shape} for a texture {texture.values.shape} and method {method!r}, expected guided"
         )
-    if not 0.0 <= detail <= 1.0:
-        raise ValueError(f"detail: got {detail}, expected 0 to 1")
     report = progress or (lambda fraction: None)
     painted = painted_texels(texture)
     known = painted & predictors.surface
@@ -236,8 +257,8 @@ def complete(
                 encoded, known_weight, encoded_base, predictors, fast=fast, seed=seed, progress=report_filling
             )
             brightest = max(float(encoded[known].max()), float(np.nanmax(encoded_base[predictors.surface])))
-        if detail > 0.0:
-            filled = add_detail(filled, known, predictors, strength=detail, seed=seed)
+        if options.detail > 0.0:
+            filled = add_detail(filled, known, predictors, strength=options.detail, seed=seed)
         # Cubing amplifies small errors of bright texels; no filled texel may be brighter than all known ones.
         values[changed] = scale * np.clip(filled[changed], 0.0, brightest) ** 3
         sigma[changed] = scale * error[changed]
@@ -247,7 +268,7 @@ def complete(
         extended = push_pull(np.concatenate([values, sigma[..., None]], -1), (~off_surface).astype(np.float32))
         values[off_surface], sigma[off_surface] = extended[off_surface][:, :3], extended[off_surface][:, 3]
     report(1.0)
-    return Completed(values, sigma, painted)
+    return CompletedTexture(values, sigma, painted)
 
 
 def painted_texels(texture: Texture) -> np.ndarray:

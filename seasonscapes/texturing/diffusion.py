@@ -16,7 +16,7 @@ import numpy as np
 from seasonscapes.errors import InputError
 from seasonscapes.texturing.model_weights import WeightNames, find_weights, variant_of
 from seasonscapes.texturing.prompts import NEGATIVE
-from seasonscapes.texturing.view_conditions import Conditions
+from seasonscapes.texturing.view_conditions import ViewConditions
 
 # Pixels per side of a latent cell.
 _CELL_PX = 8
@@ -69,7 +69,7 @@ class DiffusionSettings:
 
 
 @dataclass(frozen=True)
-class Machine:
+class DeviceSettings:
     """Device and number format of the model.
 
     Parameters
@@ -88,8 +88,8 @@ class Machine:
 
 
 @dataclass(frozen=True)
-class Painter:
-    """A loaded image model, called with `Conditions`.
+class DiffusionInpainter:
+    """A loaded image model, called with `ViewConditions`.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ class Painter:
         """Whether a large model runs on a CPU."""
         return self.device == "cpu" and sum(p.numel() for p in self.pipe.unet.parameters()) > _LARGE
 
-    def __call__(self, view: Conditions, progress: Progress | None = None) -> np.ndarray:
+    def __call__(self, view: ViewConditions, progress: Progress | None = None) -> np.ndarray:
         """Inpaint the hole of a view.
 
         Parameters
@@ -154,14 +154,14 @@ def _first_line(error: Exception) -> str:
     return (str(error).strip().splitlines() or [""])[0][:160]
 
 
-def load_painter(
+def load_inpainter(
     folder: Path | None,
     settings: DiffusionSettings,
     *,
     names: WeightNames | None = None,
-    machine: Machine | None = None,
+    device_settings: DeviceSettings | None = None,
     image: np.ndarray | None = None,
-) -> Painter:
+) -> DiffusionInpainter:
     """Load the parts of the image model that the settings need.
 
     Parameters
@@ -172,15 +172,15 @@ def load_painter(
         Settings of the sampler.
     names
         Hub names or folders of the parts; defaults to `WeightNames()`.
-    machine
-        Device and number format; defaults to `Machine()`.
+    device_settings
+        Device and number format; defaults to `DeviceSettings()`.
     image
         Image prompt ``(h, w, 3)``, sRGB-encoded in [0, 1], such as a webcam photograph of the same hour; without one
         the IP-Adapter is not used.
 
     Returns
     -------
-    Painter
+    DiffusionInpainter
         The loaded model.
 
     Raises
@@ -189,27 +189,27 @@ def load_painter(
         Weights that are missing, wrong, incomplete or incompatible with each other; a missing package; an unknown or
         unavailable device.
     """
-    names, machine = names or WeightNames(), machine or Machine()
+    names, device_settings = names or WeightNames(), device_settings or DeviceSettings()
     folders = {
-        part: find_weights(folder, part, getattr(names, part)) for part in needed_parts(settings, image is not None)
+        part: find_weights(folder, part, getattr(names, part)) for part in required_parts(settings, image is not None)
     }
     _require_extra()
-    device, dtype = _device_of(machine)
+    device, dtype = _device_of(device_settings)
     pipe = _assemble(folders, dtype)
     embeds = None
     if image is not None and settings.image_scale > 0.0:
         embeds = _encode_image_prompt(pipe, folders["adapter"], image, settings, device)
-    if machine.offload and device != "cpu":
+    if device_settings.offload and device != "cpu":
         pipe.enable_model_cpu_offload(device=device)
         # Decoding a large picture at once needs more memory than any other step; tiles cause slight colour differences.
         pipe.vae.enable_tiling()
     else:
         pipe.to(device)
     pipe.set_progress_bar_config(disable=True)
-    return Painter(pipe, settings, embeds, device)
+    return DiffusionInpainter(pipe, settings, embeds, device)
 
 
-def needed_parts(settings: DiffusionSettings, with_image: bool) -> list[str]:
+def required_parts(settings: DiffusionSettings, with_image: bool) -> list[str]:
     """Return the parts of the model that the settings need.
 
     Parameters
@@ -251,10 +251,10 @@ def _require_extra() -> None:
     transformers.utils.logging.disable_progress_bar()
 
 
-def _device_of(machine: Machine) -> tuple[str, Any]:
+def _device_of(device_settings: DeviceSettings) -> tuple[str, Any]:
     import torch
 
-    device = machine.device
+    device = device_settings.device
     if device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"
     if device not in ("cpu", "cuda"):
@@ -264,7 +264,7 @@ def _device_of(machine: Machine) -> tuple[str, Any]:
             "--device", "no CUDA GPU is usable here", got="cuda", cure="leave --device out to run on the CPU"
         )
     dtypes = {"float16": torch.float16, "bfloat16": torch.bfloat16, "float32": torch.float32}
-    name = machine.dtype if machine.dtype != "auto" else ("float16" if device == "cuda" else "float32")
+    name = device_settings.dtype if device_settings.dtype != "auto" else ("float16" if device == "cuda" else "float32")
     if name not in dtypes:
         raise InputError("--dtype", "unknown number format", got=name, expected="auto, " + ", ".join(dtypes))
     return device, dtypes[name]
@@ -365,10 +365,10 @@ def _encode_image_prompt(pipe: Any, folder: Path, image: np.ndarray, settings: D
         return pipe.prepare_ip_adapter_image_embeds(prompt_image, None, device, 1, settings.guidance > 1.0)
 
 
-def _inpaint(painter: Painter, view: Conditions, report: Progress) -> np.ndarray:
+def _inpaint(inpainter: DiffusionInpainter, view: ViewConditions, report: Progress) -> np.ndarray:
     import torch
 
-    settings, pipe = painter.settings, painter.pipe
+    settings, pipe = inpainter.settings, inpainter.pipe
     height, width = view.hole.shape
     padding = ((0, -height % _CELL_PX), (0, -width % _CELL_PX))
     picture = np.pad(view.picture, (*padding, (0, 0)), mode="edge")
@@ -402,7 +402,7 @@ def _inpaint(painter: Painter, view: Conditions, report: Progress) -> np.ndarray
             output_type="np",
             # Noise from the CPU generator is the same on every device.
             generator=torch.Generator("cpu").manual_seed(view.seed),
-            ip_adapter_image_embeds=painter.image_embeds,
+            ip_adapter_image_embeds=inpainter.image_embeds,
             callback_on_step_end=after_step,
         ).images[0]
     if not np.isfinite(result).all():

@@ -14,7 +14,7 @@ import numpy as np
 
 from seasonscapes.cameras.pinhole import ray_directions
 from seasonscapes.terrain.surface import Texture, sample_texture
-from seasonscapes.texturing.inputs import PreparedInput, air_to
+from seasonscapes.texturing.inputs import PreparedInput, transmittance_and_airlight
 from seasonscapes.texturing.radiometric_fit import RadiometricFit, radiance_at_surface
 
 # A regression: called with predictors (n, G) and log radiance (n, 3), it returns a function from predictors to log
@@ -54,7 +54,7 @@ def foreground_mask(
         Gains, contrasts and haze.
     predicted
         ``(R, S, 3)`` radiance [cd/m²] of the terrain, predicted without the texels of the same block
-        (`predict_in_folds`); NaN where unknown.
+        (`cross_validated_prediction`); NaN where unknown.
     uv
         ``(H, W, 2)`` texture coordinates of the input's G-buffer.
     outlier
@@ -100,7 +100,7 @@ def _log_ratio(
     position = camera.position_m + ray_directions(camera)[known] * prepared.depth_m[known][:, None]
     coverage = cv2.blur(usable.astype(np.float32), (3, 3))
     value = cv2.blur(prepared.levels[0][..., :3] * usable[..., None], (3, 3))[known] / coverage[known][:, None]
-    observed, _ = radiance_at_surface(value, number, air_to(prepared, position), radiometry)
+    observed, _ = radiance_at_surface(value, number, transmittance_and_airlight(prepared, position), radiometry)
     log_ratio[known] = np.log(np.maximum(observed, 1e-6)) - np.log(expected[known])
     return log_ratio, known
 
@@ -119,7 +119,7 @@ def _standardised(log_ratio: np.ndarray, log_depth: np.ndarray) -> np.ndarray:
     return result
 
 
-def predict_in_folds(
+def cross_validated_prediction(
     texture: Texture, predictors: np.ndarray, fit: Fit, *, folds: int = 4, samples: int = 20_000, seed: int = 0
 ) -> np.ndarray:
     """Predict the radiance of every texel by regression, each fold from the texels of the other folds.

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import datetime
 
 import cv2
@@ -36,22 +35,19 @@ PROBES, _PROBE_SEED = 4000, 20240918
 
 @dataclass(frozen=True)
 class PaintingInput:
-    """An observation to paint, with the uncertainty of its pose and the air between camera and terrain.
+    """An observation to paint, with the air between camera and terrain.
 
     Parameters
     ----------
     observation
         Photograph by a perspective camera. Its image is the decoded sRGB of the file in [0, 1], of unknown exposure and
-        white balance.
+        white balance. Near silhouettes its ``pose_sigma`` reduces the confidence of pixels.
     air
         Aerial perspective between camera and terrain at the time of the photograph; ``None`` for none.
-    pose_sigma
-        Standard deviations of the pose by the names of a calibration record; missing names count as exact.
     """
 
     observation: Observation
     air: AerialPerspective | None = None
-    pose_sigma: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def camera(self) -> Camera:
@@ -147,7 +143,7 @@ def prepare_input(
     image = np.where(usable[..., None], observation.image, 0.0).astype(np.float32)
     confidence = usable * exposure_confidence(image)
     if guard:
-        confidence = confidence * silhouette_guard(depth, pose_sigma_px(camera, painting_input.pose_sigma, depth))
+        confidence = confidence * silhouette_guard(depth, pose_sigma_px(camera, observation.pose_sigma, depth))
     pixel = np.flatnonzero(confidence > 0.5)
     pixel = np.random.default_rng(_PROBE_SEED).permutation(pixel)[:PROBES]
     side_m = _texel_side_m(atlas_tiling)
@@ -185,7 +181,7 @@ def unlit_scene(terrain: RayScene) -> RenderScene:
     RenderScene
         For `trace_gbuffer` alone.
     """
-    return RenderScene(terrain.mi_scene, terrain.mi_terrain, None, 0.0)  # pyright: ignore[reportArgumentType]
+    return RenderScene(terrain.mi_scene, terrain.mi_terrain)
 
 
 def _texel_side_m(atlas_tiling: AtlasTiling) -> float:
@@ -255,7 +251,7 @@ def horizon_radiance(painting_input: PaintingInput) -> float:
     return float(np.mean(air(np.full(len(horizon), np.inf), horizon)[1]))
 
 
-def air_to(prepared: PreparedInput, position_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def transmittance_and_airlight(prepared: PreparedInput, position_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return transmittance and airlight between an input's camera and points.
 
     Parameters

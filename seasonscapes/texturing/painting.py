@@ -28,16 +28,22 @@ from seasonscapes.texturing.inputs import (
     NEAR_M,
     PaintingInput,
     PreparedInput,
-    air_to,
     prepare_input,
     sample_input,
     texel_extent_px,
+    transmittance_and_airlight,
 )
-from seasonscapes.texturing.radiometric_fit import RadiometricFit, common_gain, fit_radiometry, radiance_at_surface
+from seasonscapes.texturing.radiometric_fit import (
+    RadiometricFit,
+    RadiometricReference,
+    common_gain,
+    fit_radiometry,
+    radiance_at_surface,
+)
 from seasonscapes.texturing.texel_weights import sharpened, texel_weight
-from seasonscapes.texturing.visibility import by_ray, project_texels
+from seasonscapes.texturing.visibility import project_texels, visible_by_ray
 
-MODES = ("weighted", "first")
+PAINT_MODES = ("weighted", "first")
 Progress = Callable[[float], None]
 # A camera with a smaller weight does not paint a texel.
 _MIN_WEIGHT = 1e-4
@@ -56,7 +62,7 @@ class Painting:
         ``(R, S)`` int16 index into ``webcams`` of the camera with the greatest weight (in mode ``first``, of the camera
         that painted the texel); −1 where none did.
     coverage
-        ``(R, S)`` uint8 number of contributing cameras.
+        ``(R, S)`` uint16 number of contributing cameras.
     webcams
         Names of the cameras used.
     radiometry
@@ -84,8 +90,6 @@ class PaintOptions:
         visible from, as the paper does.
     fit_gains, fit_haze
         Fit each camera's exposure and white balance, and the common haze.
-    predicted_sigma
-        As in `fit_radiometry`.
     guard
         Reduce the confidence of pixels near silhouettes.
     near_m
@@ -102,26 +106,41 @@ class PaintOptions:
     mode: str = "weighted"
     fit_gains: bool = True
     fit_haze: bool = True
-    predicted_sigma: float = 1.0
     guard: bool = True
     near_m: float = NEAR_M
     tile_px: int = TILE_PX
 
     def __post_init__(self):
-        if self.mode not in MODES:
-            raise ValueError(f"PaintOptions: mode {self.mode!r}, expected one of {', '.join(MODES)}")
+        if self.mode not in PAINT_MODES:
+            raise ValueError(f"PaintOptions: mode {self.mode!r}, expected one of {', '.join(PAINT_MODES)}")
+
+
+@dataclass(frozen=True)
+class PaintTarget:
+    """The surface and atlas that photographs are projected to.
+
+    Parameters
+    ----------
+    terrain
+        The surface with its texture coordinates.
+    atlas
+        Size of the atlas.
+    ray_scene
+        Ray-tracing scene of the same terrain (`hemisphere_rays.ray_scene`).
+    """
+
+    terrain: Terrain
+    atlas: Atlas
+    ray_scene: RayScene
 
 
 def paint_atlas(
     inputs: Sequence[PaintingInput],
-    terrain: Terrain,
-    atlas: Atlas,
-    ray_scene: RayScene,
+    target: PaintTarget,
     *,
     options: PaintOptions | None = None,
-    predicted: np.ndarray | None = None,
+    reference: RadiometricReference | None = None,
     rejects: Sequence[np.ndarray | None] | None = None,
-    radiance: float | None = None,
     resume: Path | None = None,
     progress: Progress | None = None,
 ) -> Painting:
@@ -131,20 +150,14 @@ def paint_atlas(
     ----------
     inputs
         Photographs. Their order is irrelevant in mode ``weighted`` and the order of precedence in mode ``first``.
-    terrain
-        The surface with its texture coordinates.
-    atlas
-        Size of the atlas.
-    ray_scene
-        Ray-tracing scene of the same terrain (`hemisphere_rays.ray_scene`).
+    target
+        Terrain and atlas to paint.
     options
         Defaults to `PaintOptions()`.
-    predicted
-        As in `fit_radiometry`.
+    reference
+        Predicted radiance and scale for `fit_radiometry`; defaults to `RadiometricReference()`.
     rejects
         For each input a mask ``(H, W)`` bool of pixels to exclude, or ``None``; see `foreground.foreground_mask`.
-    radiance
-        As in `fit_radiometry`.
     resume
         Folder for finished tiles, from which an interrupted call continues. It must be specific to these arguments;
         the caller chooses its name.
@@ -164,7 +177,8 @@ def paint_atlas(
         ``rejects`` and ``inputs`` differ in number.
     """
     options, report = options or PaintOptions(), progress or (lambda fraction: None)
-    atlas_tiling = tiling(terrain, atlas, tile_px=options.tile_px)
+    reference, ray_scene = reference or RadiometricReference(), target.ray_scene
+    atlas_tiling = tiling(target.terrain, target.atlas, tile_px=options.tile_px)
     prepared, skipped = prepare_inputs(
         inputs, ray_scene, atlas_tiling, options, rejects=rejects, progress=lambda fraction: report(0.2 * fraction)
     )
@@ -173,18 +187,11 @@ def paint_atlas(
             "paint: no photograph has usable pixels: " + "; ".join(skipped or ["no photographs given"])
         )
     if options.fit_gains:
-        radiometry = fit_radiometry(
-            prepared,
-            ray_scene,
-            predicted=predicted,
-            predicted_sigma=options.predicted_sigma,
-            fit_haze=options.fit_haze,
-            radiance=radiance,
-        )
+        radiometry = fit_radiometry(prepared, ray_scene, reference=reference, fit_haze=options.fit_haze)
     else:
-        radiometry = common_gain(prepared, radiance=radiance)
+        radiometry = common_gain(prepared, radiance=reference.radiance)
     report(0.3)
-    painting = _empty_painting(atlas, prepared, radiometry, skipped)
+    painting = _empty_painting(target.atlas, prepared, radiometry, skipped)
     tiles = list(tiles_of(atlas_tiling))
     for number, tile in enumerate(tiles):
         painted_tile = _load_or_paint(
@@ -313,7 +320,7 @@ def paint_tile(
     """
     size = tile.height * tile.width
     weighted_sum, greatest = np.zeros((size, 3)), np.zeros(size, np.float32)
-    weights, best, coverage = np.zeros(size), np.full(size, -1, np.int16), np.zeros(size, np.uint8)
+    weights, best, coverage = np.zeros(size), np.full(size, -1, np.int16), np.zeros(size, np.uint16)
     visible = [number for number, candidate in enumerate(prepared) if is_tile_visible(candidate.blocks, tile)]
     surface = tile_surface(atlas_tiling, tile) if visible else None
     for number in visible:
@@ -382,8 +389,8 @@ def input_texels(
     weight = texel_weight(projected.cosine, px_per_texel) * confidence
     keep = np.flatnonzero(weight > _MIN_WEIGHT)
     # Shadow rays are the costliest test and come last.
-    keep = keep[by_ray(ray_scene, camera, surface[keep], projected[keep])]
-    air = air_to(prepared, surface.position_m[keep])
+    keep = keep[visible_by_ray(ray_scene, camera, surface[keep], projected[keep])]
+    air = transmittance_and_airlight(prepared, surface.position_m[keep])
     radiance, surface_share = radiance_at_surface(value[keep], number, air, radiometry)
     return surface.texel[keep], radiance, weight[keep] * surface_share**2
 
@@ -394,7 +401,8 @@ def _empty_painting(
     shape = (atlas.height_px, atlas.width_px)
     texture = Texture(np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32))
     names = tuple(used.painting_input.observation.webcam for used in prepared)
-    return Painting(texture, np.full(shape, -1, np.int16), np.zeros(shape, np.uint8), names, radiometry, tuple(skipped))
+    best, coverage = np.full(shape, -1, np.int16), np.zeros(shape, np.uint16)
+    return Painting(texture, best, coverage, names, radiometry, tuple(skipped))
 
 
 def _write_tile(painting: Painting, tile: AtlasTile, painted_tile: _PaintedTile) -> None:

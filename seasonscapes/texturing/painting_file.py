@@ -34,6 +34,7 @@ def save_painting(painting: Painting, path: str | os.PathLike) -> None:
     """
     radiometry = {name: np.asarray(value).tolist() for name, value in asdict(painting.radiometry).items()}
     note = {"webcams": painting.webcams, "skipped": painting.skipped, "radiometry": radiometry}
+    identity: dict[str, Any] = {} if painting.texture.atlas_id is None else {"atlas_id": painting.texture.atlas_id}
     np.savez(
         path,
         values=painting.texture.values,
@@ -41,6 +42,7 @@ def save_painting(painting: Painting, path: str | os.PathLike) -> None:
         best=painting.best,
         coverage=painting.coverage,
         note=json.dumps(note),
+        **identity,
     )
 
 
@@ -64,10 +66,12 @@ def load_painting(path: str | os.PathLike) -> Painting:
         arrays: dict[str, Any] = {
             name: np.array(value) if isinstance(value, list) else value for name, value in radiometry.items()
         }
+        atlas_id = str(stored["atlas_id"]) if "atlas_id" in stored else None
         return Painting(
-            Texture(stored["values"], stored["weight"]),
+            Texture(stored["values"], stored["weight"], atlas_id),
             stored["best"],
-            stored["coverage"],
+            # Files of earlier versions have 8 bits.
+            stored["coverage"].astype(np.uint16),
             tuple(note["webcams"]),
             RadiometricFit(**arrays),
             tuple(note["skipped"]),

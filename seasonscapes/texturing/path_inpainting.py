@@ -29,20 +29,20 @@ from seasonscapes.texturing.radiometric_fit import RadiometricFit
 from seasonscapes.texturing.smooth_fill import push_pull
 from seasonscapes.texturing.view_conditions import (
     MASKS,
-    Conditions,
+    ViewConditions,
     decode,
     depth_picture,
     dilated,
     encode,
-    look_up,
     plain_sky,
     red_pixels,
+    sample_covered,
     white_radiance,
 )
 
 # An image model: returns a view with its hole inpainted, sRGB-encoded ``(H, W, 3)``. The second argument is called with
 # the finished fraction.
-Inpaint = Callable[[Conditions, Callable[[float], None]], np.ndarray]
+ImageModel = Callable[[ViewConditions, Callable[[float], None]], np.ndarray]
 # Factor that keeps white of the image model below the exposure limit above which photographs count as clipped.
 _HEADROOM = 0.85
 # Where a smaller fraction of the terrain is a hole, a view is first tested for texels that it can give a value.
@@ -141,7 +141,7 @@ class InpaintingState:
         self.covered = self.painted.copy()
 
     @property
-    def imagined(self) -> np.ndarray:
+    def generated(self) -> np.ndarray:
         """Texels ``(R, S)`` bool with a value from the image model."""
         return self.covered & ~self.painted
 
@@ -172,7 +172,7 @@ class InpaintingState:
 def inpaint_along_path(
     inputs: PathInpaintingInputs,
     state: InpaintingState,
-    inpaint: Inpaint,
+    image_model: ImageModel,
     options: PathInpaintingOptions,
     *,
     folder: Path | None = None,
@@ -186,8 +186,8 @@ def inpaint_along_path(
         Texture, path and terrain.
     state
         State of ``inputs.texture``; it is updated in place.
-    inpaint
-        The image model.
+    image_model
+        Inpaints the holes of each view.
     options
         Mask, thresholds and seed.
     folder
@@ -220,7 +220,7 @@ def inpaint_along_path(
             def report_view(fraction: float, index: int = index) -> None:
                 report((index + fraction) / count)
 
-            step, pictures = _inpaint_view(inputs, state, inpaint, options, index, white, report_view)
+            step, pictures = _inpaint_view(inputs, state, image_model, options, index, white, report_view)
             if folder is not None:
                 save_step(folder, step, pictures)
         state.superpose(step)
@@ -231,7 +231,7 @@ def inpaint_along_path(
 def _inpaint_view(
     inputs: PathInpaintingInputs,
     state: InpaintingState,
-    inpaint: Inpaint,
+    image_model: ImageModel,
     options: PathInpaintingOptions,
     index: int,
     white: float,
@@ -258,7 +258,7 @@ def _inpaint_view(
     mask = dilated(target, options.dilate_px)
     depth = depth_picture(gbuffer.depth)
     seed = int(np.random.SeedSequence((options.seed, index)).generate_state(1, np.uint64)[0] >> 1)
-    result = np.asarray(inpaint(Conditions(initial, mask, depth, seed), report), np.float32)
+    result = np.asarray(image_model(ViewConditions(initial, mask, depth, seed), report), np.float32)
     if result.shape != shown.shape or not np.isfinite(result).all():
         raise ValueError(f"view {index}: the image model returned {result.shape}, or values that are not finite")
     composed = np.where(target[..., None], np.clip(result, 0.0, 1.0), shown)
@@ -292,7 +292,7 @@ def partial_view(
         ``(H, W)`` bool: terrain pixels without a value.
     """
     terrain = np.isfinite(gbuffer.depth)
-    radiance, known = look_up(state.values, state.covered, gbuffer.uv)
+    radiance, known = sample_covered(state.values, state.covered, gbuffer.uv)
     picture = encode(radiance, white)
     hole = terrain & ~known
     if options.mask == "hsv":
@@ -312,7 +312,7 @@ def _initial_picture(
     known = ~target
     picture = shown
     if inputs.base is not None:
-        fill, _ = look_up(inputs.base, np.ones(inputs.base.shape[:2], bool), gbuffer.uv)
+        fill, _ = sample_covered(inputs.base, np.ones(inputs.base.shape[:2], bool), gbuffer.uv)
         picture = np.where(hole[..., None], encode(fill, white), picture)
         known = known | hole
     if not known.any():
@@ -370,7 +370,7 @@ def back_project(
     return np.concatenate(texels), np.concatenate(values).astype(np.float32)
 
 
-def frames_of(
+def textured_frames(
     values: np.ndarray, cameras: Sequence[Camera], terrain: RayScene, white: float, *, cloudiness: float = 0.0
 ) -> Iterator[np.ndarray]:
     """Render a complete texture along a path, one frame at a time.
@@ -397,7 +397,7 @@ def frames_of(
     everywhere = np.ones(values.shape[:2], bool)
     for camera in cameras:
         gbuffer = trace_gbuffer(scene, camera)
-        radiance, _ = look_up(values, everywhere, gbuffer.uv)
+        radiance, _ = sample_covered(values, everywhere, gbuffer.uv)
         sky = plain_sky(ray_directions(camera), cloudiness=cloudiness)
         covered = np.isfinite(gbuffer.depth)[..., None]
         yield linear_from_srgb(np.where(covered, encode(radiance, white), sky))

@@ -68,6 +68,27 @@ class RadiometricFit:
     scatter_after: float = float("nan")
 
 
+@dataclass(frozen=True)
+class RadiometricReference:
+    """Radiance that determines the absolute scale of a radiometric fit.
+
+    Parameters
+    ----------
+    predicted
+        ``(R, S, 3)`` predicted radiance [cd/m²] of the surface, NaN where unknown, or ``None``. It links cameras without
+        common points, and all of them to the absolute scale.
+    predicted_sigma
+        Standard error of its logarithm: about 1 for a regression on a satellite image, 0.2 for a relit albedo.
+    radiance
+        Median radiance of the surface [cd/m²], used where no image shows any sky. ``None``: a quarter of the sky
+        model's radiance at the horizon, or 1 (relative values) without a sky model.
+    """
+
+    predicted: np.ndarray | None = None
+    predicted_sigma: float = 1.0
+    radiance: float | None = None
+
+
 def invert_contrast(value: np.ndarray, contrast: np.ndarray | float) -> np.ndarray:
     """Invert a camera's contrast curve.
 
@@ -168,7 +189,7 @@ def common_gain(inputs: Sequence[PreparedInput], *, radiance: float | None = Non
     inputs
         Prepared photographs.
     radiance
-        As in `fit_radiometry`.
+        As in `RadiometricReference`.
 
     Returns
     -------
@@ -186,11 +207,9 @@ def fit_radiometry(
     inputs: Sequence[PreparedInput],
     terrain: RayScene,
     *,
-    predicted: np.ndarray | None = None,
-    predicted_sigma: float = 1.0,
+    reference: RadiometricReference | None = None,
     fit_haze: bool = True,
     fit_contrast: bool = True,
-    radiance: float | None = None,
 ) -> RadiometricFit:
     """Fit gains, contrasts and haze to all surface points visible from two cameras.
 
@@ -200,27 +219,22 @@ def fit_radiometry(
         Prepared photographs.
     terrain
         Ray-tracing scene of the terrain.
-    predicted
-        ``(R, S, 3)`` predicted radiance [cd/m²] of the surface, NaN where unknown. It links cameras without common
-        points, and all of them to the absolute scale.
-    predicted_sigma
-        Standard error of its logarithm: about 1 for a regression on a satellite image, 0.2 for a relit albedo.
+    reference
+        Predicted radiance and scale; defaults to `RadiometricReference()`.
     fit_haze
         Fit the haze exponent; otherwise it is 1.
     fit_contrast
         Fit the contrasts; otherwise they are 1.
-    radiance
-        Median radiance of the surface [cd/m²], used where no image shows any sky. ``None``: a quarter of the sky
-        model's radiance at the horizon, or 1 (relative values) without a sky model.
 
     Returns
     -------
     RadiometricFit
         Absolute where sky is in view: its radiance is the sky model's.
     """
-    count = len(inputs)
+    reference = reference or RadiometricReference()
+    radiance, count = reference.radiance, len(inputs)
     overlaps = find_overlaps(inputs, terrain)
-    expected = None if predicted is None else _log_predicted(predicted, overlaps.single_uv)
+    expected = None if reference.predicted is None else _log_predicted(reference.predicted, overlaps.single_uv)
     radiometry = RadiometricFit(np.zeros((count, 3)), np.zeros((count, 3)), np.ones(count), overlaps=len(overlaps.uv))
     radiometry = replace(radiometry, log_gain=_gain_prior(inputs, radiometry, radiance).mean)
     radiometry = _with_sky_gain(inputs, radiometry, radiance)
@@ -233,7 +247,7 @@ def fit_radiometry(
         radiometry = replace(radiometry, haze=_INITIAL_HAZE)
     for _ in range(_ITERATIONS):
         prior = _gain_prior(inputs, radiometry, radiance)
-        step = _gauss_newton_step(overlaps, expected, predicted_sigma, radiometry, prior, free)
+        step = _gauss_newton_step(overlaps, expected, reference.predicted_sigma, radiometry, prior, free)
         # Contrast and haze are strongly nonlinear, gains nearly linear.
         step[3 * count :] = np.clip(step[3 * count :], -_MAX_STEP, _MAX_STEP)
         radiometry = _with_sky_gain(inputs, _apply_step(radiometry, step), radiance)

@@ -27,7 +27,7 @@ _BRIGHTEST_PAINTED = 0.85
 
 
 @dataclass(frozen=True)
-class Conditions:
+class ViewConditions:
     """Inputs of an image model for one view.
 
     Parameters
@@ -130,7 +130,7 @@ def depth_picture(depth_m: np.ndarray) -> np.ndarray:
     return picture
 
 
-def look_up(values: np.ndarray, covered: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def sample_covered(values: np.ndarray, covered: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Sample a texture with holes bilinearly, ignoring texels without a value.
 
     Parameters

@@ -1,7 +1,7 @@
 """Visibility of texels from a camera, by one shadow ray per texel from the surface to the camera.
 
-`by_depth` and `by_faces` implement the usual alternatives for comparison: a depth map leaks at ridges and loses slopes
-at grazing incidence, and marking every face that any pixel hits as visible leaks behind every ridge.
+`visible_by_depth` and `visible_by_faces` implement the usual alternatives for comparison: a depth map leaks at ridges
+and loses slopes at grazing incidence, and marking every face that any pixel hits as visible leaks behind every ridge.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ import numpy as np
 
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.rendering.hemisphere_rays import RayScene
-from seasonscapes.rendering.sightlines import clear_sight, faces_met
+from seasonscapes.rendering.sightlines import line_of_sight, visible_faces
 from seasonscapes.texturing.atlas_tiles import TexelSurface
 
-# Relative tolerance of `by_depth`.
+# Relative tolerance of `visible_by_depth`.
 _DEPTH_TOLERANCE = 0.005
 
 
@@ -72,7 +72,7 @@ def project_texels(camera: Camera, surface: TexelSurface) -> ProjectedTexels:
     return ProjectedTexels(np.stack([x, y], axis=-1), distance, cosine, inside)
 
 
-def by_ray(
+def visible_by_ray(
     terrain: RayScene, camera: Camera, surface: TexelSurface, projected: ProjectedTexels, *, lift_m: float | None = None
 ) -> np.ndarray:
     """Return which surface points are visible from a camera, by one shadow ray each.
@@ -89,7 +89,7 @@ def by_ray(
         Their projection, from `project_texels`.
     lift_m
         Offset of the ray origins along the normals [m]; ``None`` for just beyond the rounding of float32. See
-        `sightlines.clear_sight`.
+        `sightlines.line_of_sight`.
 
     Returns
     -------
@@ -99,13 +99,15 @@ def by_ray(
     visible = projected.inside.copy()
     index = np.flatnonzero(visible)
     if len(index):
-        visible[index] = clear_sight(
-            terrain, surface.position_m[index], surface.normal[index], camera.position_m, lift_m=lift_m
+        visible[index] = line_of_sight(
+            terrain, surface.position_m[index], surface.normal[index], camera.position_m, offset_m=lift_m
         )
     return visible
 
 
-def by_depth(depth_m: np.ndarray, projected: ProjectedTexels, *, tolerance: float = _DEPTH_TOLERANCE) -> np.ndarray:
+def visible_by_depth(
+    depth_m: np.ndarray, projected: ProjectedTexels, *, tolerance: float = _DEPTH_TOLERANCE
+) -> np.ndarray:
     """Return which surface points are visible, by comparison with a depth map.
 
     Parameters
@@ -129,7 +131,9 @@ def by_depth(depth_m: np.ndarray, projected: ProjectedTexels, *, tolerance: floa
     return visible
 
 
-def by_faces(terrain: RayScene, camera: Camera, surface: TexelSurface, projected: ProjectedTexels) -> np.ndarray:
+def visible_by_faces(
+    terrain: RayScene, camera: Camera, surface: TexelSurface, projected: ProjectedTexels
+) -> np.ndarray:
     """Return which surface points are visible, taking each face that any pixel's ray hits as visible as a whole.
 
     Parameters
@@ -148,5 +152,5 @@ def by_faces(terrain: RayScene, camera: Camera, surface: TexelSurface, projected
     ndarray
         ``(N,)`` bool.
     """
-    hit = np.unique(faces_met(terrain, camera))
+    hit = np.unique(visible_faces(terrain, camera))
     return projected.inside & np.isin(surface.face, hit[hit >= 0])

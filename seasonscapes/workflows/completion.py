@@ -12,7 +12,7 @@ import numpy as np
 from seasonscapes.errors import InputError
 from seasonscapes.progress import Progress, task_progress
 from seasonscapes.terrain.surface import Texture, load_texture
-from seasonscapes.texturing.completion import Completed
+from seasonscapes.texturing.completion import CompletedTexture
 from seasonscapes.workflows.albedo_sources import orthoimage
 from seasonscapes.workflows.illumination import illumination_for_camera
 from seasonscapes.workflows.place import Place, utc_at
@@ -36,7 +36,7 @@ def complete(
     fast: bool = False,
     seed: int = 0,
     progress: Progress | None = None,
-) -> Completed:
+) -> CompletedTexture:
     """Complete a painted texture where no camera saw the surface.
 
     Parameters
@@ -62,7 +62,7 @@ def complete(
 
     Returns
     -------
-    Completed
+    CompletedTexture
         ``values`` ``(R, S, 3)`` [cd/m²], ``sigma`` ``(R, S)`` and which texels were painted.
 
     Raises
@@ -83,16 +83,14 @@ def complete(
     >>> bool(np.isfinite(completed.values).all())
     True
     """
+    from seasonscapes.texturing.completion import CompletionOptions
     from seasonscapes.texturing.completion import complete as complete_texture
 
     place.require_texture(texture)
     return complete_texture(
         texture,
         predictors_at(place, utc_at(place, time), predicted),
-        method=method,
-        detail=detail,
-        fast=fast,
-        seed=seed,
+        options=CompletionOptions(method, detail, fast, seed),
         progress=task_progress(progress, f"completing ({method})"),
     )
 
@@ -149,7 +147,7 @@ def read_painted(path: Path, place: Place) -> Texture:
     return texture
 
 
-def save_completed(completed: Completed, painted: Texture, path: Path) -> None:
+def save_completed(completed: CompletedTexture, painted: Texture, path: Path) -> None:
     """Write a ``.npz`` that `load_texture` reads: values, the painting's weight (0 where filled), and σ."""
     weight = np.where(completed.painted, painted.weight, np.float32(0.0)).astype(np.float32)
     arrays = {"values": completed.values, "weight": weight, "sigma": completed.sigma}
@@ -158,7 +156,7 @@ def save_completed(completed: Completed, painted: Texture, path: Path) -> None:
     np.savez(path, **arrays)  # pyright: ignore[reportArgumentType]  # numpy's stub takes **arrays for allow_pickle
 
 
-def completion_record(completed: Completed, surface: np.ndarray) -> dict:
+def completion_record(completed: CompletedTexture, surface: np.ndarray) -> dict:
     """Plain numbers about a completion: texels of the surface ``(R, S)``, filled share, medians over filled texels."""
     hole = surface & ~completed.painted
     return {
@@ -173,7 +171,7 @@ def _median(values: np.ndarray) -> float:
     return float(np.median(values)) if values.size else 0.0
 
 
-def save_texture_figures(folder: Path, place: Place, completed: Completed) -> list[Path]:
+def save_texture_figures(folder: Path, place: Place, completed: CompletedTexture) -> list[Path]:
     """Write pictures of the texture before and after completion, and of σ relative to its 99th percentile."""
     from seasonscapes.exposure import develop, exposure_ev100
     from seasonscapes.images import write_png
@@ -203,7 +201,14 @@ def _shrunk(values: np.ndarray, factor: int) -> np.ndarray:
 
 
 def save_view_figures(
-    folder: Path, place: Place, completed: Completed, camera: Camera, model: SkyModel, utc: datetime, *, name: str
+    folder: Path,
+    place: Place,
+    completed: CompletedTexture,
+    camera: Camera,
+    model: SkyModel,
+    utc: datetime,
+    *,
+    name: str,
 ) -> list[Path]:
     """Write pictures of the textured terrain as a camera observes it at that hour, before and after completion."""
     from seasonscapes.exposure import develop, exposure_ev100

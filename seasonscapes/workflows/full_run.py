@@ -217,6 +217,7 @@ def _albedo(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
 
 def _paint(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
     from seasonscapes.texturing.painting_file import save_painting, write_figures
+    from seasonscapes.texturing.radiometric_fit import RadiometricReference
 
     files = []
     for time in job.times:
@@ -227,9 +228,9 @@ def _paint(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
             _sources(folder),
             time,
             job.sky,
-            PaintOptions(predicted_sigma=RELATIVE_SIGMA),
+            PaintOptions(),
             within_min=job.photographs.within_min,
-            predicted=predicted,
+            reference=RadiometricReference(predicted, RELATIVE_SIGMA),
             progress=progress,
         )
         with atomic_path(own / "painted.npz") as temporary:

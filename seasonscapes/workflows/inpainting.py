@@ -11,7 +11,7 @@ from seasonscapes.errors import InputError
 from seasonscapes.progress import Progress, task_progress
 from seasonscapes.sky.models import SkyModel
 from seasonscapes.terrain.surface import Texture
-from seasonscapes.texturing.completion import INPAINTERS, Completed
+from seasonscapes.texturing.completion import INPAINTERS, CompletedTexture, CompletionOptions
 from seasonscapes.workflows.albedo_sources import load_albedo
 from seasonscapes.workflows.completion import completion_record, predictors_at
 from seasonscapes.workflows.place import Place
@@ -64,7 +64,7 @@ class InpaintOptions:
 class Inpainted:
     """A completed texture and plain values about it."""
 
-    completed: Completed
+    completed: CompletedTexture
     record: dict[str, Any] = field(default_factory=dict)
 
 
@@ -121,21 +121,19 @@ def inpaint(
         predictors = predictors_at(place, utc, predicted)
         record["guides"] = list(predictors.names)
         if options.diffusion is not None:
-            from seasonscapes.workflows.path_completion import CompletionOptions, complete_along_path
+            from seasonscapes.workflows.path_completion import SkyState, complete_along_path
 
-            effort = CompletionOptions(options.detail, options.fast, options.seed, cloudiness_of(sky))
+            completion = CompletionOptions(detail=options.detail, fast=options.fast, seed=options.seed)
+            sky_state = SkyState(utc, cloudiness_of(sky))
             completed, facts = complete_along_path(
-                place, painted, predictors, utc, options.diffusion, effort, progress=progress
+                place, painted, predictors, sky_state, options.diffusion, completion, progress=progress
             )
             record |= facts
         else:
             completed = complete_texture(
                 painted,
                 predictors,
-                method=options.method,
-                detail=options.detail,
-                fast=options.fast,
-                seed=options.seed,
+                options=CompletionOptions(options.method, options.detail, options.fast, options.seed),
                 progress=task_progress(progress, f"completing ({options.method})"),
             )
     return Inpainted(completed, completion_record(completed, predictors.surface) | record)

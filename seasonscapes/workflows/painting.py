@@ -25,6 +25,7 @@ from seasonscapes.workspace import artefact_key, build_once, file_hash
 if TYPE_CHECKING:
     from seasonscapes.cameras.observation import ManifestRow, Observation
     from seasonscapes.texturing.inputs import PaintingInput
+    from seasonscapes.texturing.radiometric_fit import RadiometricReference
 
 log = logging.getLogger(__name__)
 
@@ -39,7 +40,7 @@ def paint(
     *,
     sky: str | Path | SkyModel = "clear",
     options: PaintOptions | None = None,
-    predicted: np.ndarray | None = None,
+    reference: RadiometricReference | None = None,
     resume: Path | None = None,
     progress: Progress | None = None,
 ) -> Painting:
@@ -55,9 +56,9 @@ def paint(
         The sky model of that time: it gives the aerial perspective and the scale of radiance.
     options
         Mode, radiometric fit and limits.
-    predicted
-        Radiance ``(R, S, 3)`` [cd/m²] expected from a recovered albedo, NaN where unknown; see `predict_radiance`. It
-        determines exposures better than the sky does.
+    reference
+        Radiance predicted from a recovered albedo (see `predict_radiance`) with its relative error. It determines
+        exposures better than the sky does.
     resume
         Folder for finished tiles, with which an interrupted painting continues.
     progress
@@ -87,16 +88,14 @@ def paint(
     """
     from seasonscapes.rendering.hemisphere_rays import ray_scene
     from seasonscapes.rendering.mitsuba_scene import mi_mesh
-    from seasonscapes.texturing.painting import paint_atlas
+    from seasonscapes.texturing.painting import PaintTarget, paint_atlas
 
     inputs = painting_inputs(place, photographs, sky_model(sky))
     painting = paint_atlas(
         inputs,
-        place.terrain,
-        place.atlas,
-        ray_scene(mi_mesh(place.terrain, np.full(3, 0.2))),
+        PaintTarget(place.terrain, place.atlas, ray_scene(mi_mesh(place.terrain, np.full(3, 0.2)))),
         options=options,
-        predicted=predicted,
+        reference=reference,
         resume=resume,
         progress=task_progress(progress, "painting"),
     )
@@ -115,7 +114,7 @@ def painting_inputs(place: Place, photographs: Sequence[Observation], model: Sky
         if key not in airs:
             light, _ = illumination_for_camera(place, camera, model, photograph.time)
             airs[key] = light.aerial_perspective
-        inputs.append(PaintingInput(replace(photograph, camera=camera), airs[key], photograph.pose_sigma))
+        inputs.append(PaintingInput(replace(photograph, camera=camera), airs[key]))
     return inputs
 
 
@@ -127,7 +126,7 @@ def painting_of(
     options: PaintOptions,
     *,
     within_min: float = 30.0,
-    predicted: np.ndarray | None = None,
+    reference: RadiometricReference | None = None,
     progress: Progress | None = None,
 ) -> Painting:
     """The painting of a time from files, or from the workspace where equal files were painted before.
@@ -140,7 +139,7 @@ def painting_of(
         The place; manifest, calibrations and masks.
     utc
         The time, aware.
-    model, options, predicted
+    model, options, reference
         See `paint`.
     within_min
         Largest difference in time of a photograph [min].
@@ -158,13 +157,18 @@ def painting_of(
 
     rows = rows_at(sources, utc, within_min=within_min)
     inputs = {"place": place.key, "sky": model, "options": options, "files": _hashes(sources, rows)}
-    if predicted is not None:
-        inputs["predicted"] = hashlib.sha256(predicted.tobytes()).hexdigest()
+    if reference is not None:
+        predicted = reference.predicted
+        inputs["reference"] = {
+            "predicted": None if predicted is None else hashlib.sha256(predicted.tobytes()).hexdigest(),
+            "predicted_sigma": reference.predicted_sigma,
+            "radiance": reference.radiance,
+        }
     tiles = place.workspace.folder / place.scene.name / f"tiles-{artefact_key(inputs, _CODE)}"
 
     def build() -> Painting:
         opened = observations(rows, sources, place.frame, progress=progress)
-        return paint(place, opened, sky=model, options=options, predicted=predicted, resume=tiles, progress=progress)
+        return paint(place, opened, sky=model, options=options, reference=reference, resume=tiles, progress=progress)
 
     painting = build_once(
         place.workspace,

@@ -6,7 +6,7 @@ import hashlib
 import logging
 import time as clock
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,15 +16,15 @@ import numpy as np
 from seasonscapes.errors import InputError, UnreadableImage
 from seasonscapes.progress import Progress, each_reported, task_progress
 from seasonscapes.terrain.surface import Texture
-from seasonscapes.texturing.diffusion import DiffusionSettings, Machine
+from seasonscapes.texturing.diffusion import DeviceSettings, DiffusionSettings
 from seasonscapes.texturing.model_weights import WeightNames
 from seasonscapes.workflows.place import Place
 from seasonscapes.workspace import artefact_key, file_hash
 
 if TYPE_CHECKING:
-    from seasonscapes.texturing.completion import Completed
-    from seasonscapes.texturing.diffusion import Painter
-    from seasonscapes.texturing.path_inpainting import InpaintingState, PathInpaintingInputs
+    from seasonscapes.texturing.completion import CompletedTexture, CompletionOptions
+    from seasonscapes.texturing.diffusion import DiffusionInpainter
+    from seasonscapes.texturing.path_inpainting import InpaintingState, PathInpaintingInputs, PathInpaintingOptions
     from seasonscapes.texturing.predictors import Predictors
 
 log = logging.getLogger(__name__)
@@ -70,7 +70,7 @@ class PathCompletionOptions:
         Folder for views; ``None`` is the workspace. An interrupted run resumes there.
     film, fps
         An ``.mp4`` along the path with the finished texture.
-    machine
+    device_settings
         Device, number format and offloading.
     """
 
@@ -91,7 +91,7 @@ class PathCompletionOptions:
     frames: Path | None = None
     film: Path | None = None
     fps: float = 24.0
-    machine: Machine = field(default_factory=Machine)
+    device_settings: DeviceSettings = field(default_factory=DeviceSettings)
 
     @property
     def effective_strength(self) -> float:
@@ -113,12 +113,18 @@ class PathCompletionOptions:
 
 
 @dataclass(frozen=True)
-class CompletionOptions:
-    """Effort and randomness of the completion by regression, and the cloudiness of the frames' sky."""
+class SkyState:
+    """Time and cloudiness of the photographs, from which the prompt and the sky of the frames are made.
 
-    detail: float = 0.0
-    fast: bool = False
-    seed: int = 0
+    Parameters
+    ----------
+    utc
+        Time of the photographs, aware.
+    cloudiness
+        Fraction of the sky covered by clouds, in [0, 1].
+    """
+
+    utc: datetime
     cloudiness: float = 0.0
 
 
@@ -126,28 +132,30 @@ def complete_along_path(
     place: Place,
     painted: Texture,
     predictors: Predictors,
-    utc: datetime,
+    sky: SkyState,
     options: PathCompletionOptions,
-    effort: CompletionOptions,
+    completion: CompletionOptions,
     *,
     progress: Progress | None = None,
-) -> tuple[Completed, dict[str, Any]]:
+) -> tuple[CompletedTexture, dict[str, Any]]:
     """Paint along the path with an image model, complete the rest by regression, and film the result.
 
     Parameters
     ----------
     place, painted, predictors
         The place, its painted texture and the predictors of the regression.
-    utc
-        The time of the photographs, aware.
-    options, effort
-        How to paint and how to complete.
+    sky
+        Time and cloudiness of the photographs.
+    options
+        Options of the image model and its views.
+    completion
+        Method and effort of the completion of the remaining texels; its seed is the image model's too.
     progress
         Called with a task and its finished share.
 
     Returns
     -------
-    Completed, dict
+    CompletedTexture, dict
         The completed texture, and plain values about views, coverage, prompt and weights.
 
     Raises
@@ -160,21 +168,23 @@ def complete_along_path(
     from seasonscapes.rendering.mitsuba_scene import mi_mesh
     from seasonscapes.texturing.atlas_tiles import tiling
     from seasonscapes.texturing.completion import complete
-    from seasonscapes.texturing.path_inpainting import InpaintingState, PathInpaintingInputs
+    from seasonscapes.texturing.path_inpainting import InpaintingState, PathInpaintingInputs, PathInpaintingOptions
 
     cameras = load_path(options.path, place.frame)
-    prompt = options.prompt if options.prompt is not None else prompt_of(place, utc, effort.cloudiness)
-    painter, identity = _painter(options, prompt)
+    prompt = options.prompt if options.prompt is not None else prompt_of(place, sky.utc, sky.cloudiness)
+    inpainter, identity = _load_inpainter(options, prompt)
     if "prompt" not in options.without:
         log.info("prompt: %s", prompt)
-    if painter.slow:
+    if inpainter.slow:
         log.info("on a CPU these weights take over an hour for each view of 1536 × 1024 with 50 steps; use a GPU")
 
-    def regression(texture: Texture, detail: float, task: str) -> Completed:
-        report = task_progress(progress, task)
-        return complete(texture, predictors, detail=detail, fast=effort.fast, seed=effort.seed, progress=report)
+    method = completion.method
 
-    alone = regression(painted, 0.0, "completing (guided)") if options.hybrid else None
+    def regression(texture: Texture, detail: float, task: str) -> CompletedTexture:
+        report = task_progress(progress, task)
+        return complete(texture, predictors, options=replace(completion, detail=detail), progress=report)
+
+    alone = regression(painted, 0.0, f"completing ({method})") if options.hybrid else None
     inputs = PathInpaintingInputs(
         painted,
         cameras,
@@ -183,29 +193,32 @@ def complete_along_path(
         None if alone is None else alone.values,
     )
     state = InpaintingState(painted)
-    folder = _views_folder(place, painted, options, effort, identity)
-    facts = _painted_views(inputs, state, painter, options, effort, folder, predictors.surface, progress)
-    rest = regression(state.texture(), effort.detail, "completing the rest (guided)")
+    view_options = PathInpaintingOptions(
+        options.mask, options.dilate_px, options.least_hole, options.paint_sky, sky.cloudiness, completion.seed
+    )
+    folder = _views_folder(place, painted, options, completion, {"cloudiness": sky.cloudiness, **identity})
+    facts = _painted_views(inputs, state, inpainter, view_options, folder, predictors.surface, progress)
+    rest = regression(state.texture(), completion.detail, f"completing the rest ({method})")
     completed = join_completions(
-        rest, alone or regression(painted, 0.0, "error of the imagined texels (guided)"), state
+        rest, alone or regression(painted, 0.0, f"error of the generated texels ({method})"), state
     )
     facts |= {"prompt": prompt, "views_folder": str(folder), "weights": identity["weights"], "film": None}
     if options.film is not None:
-        facts["film"] = _film(inputs, state, completed.values, options, effort, progress)
+        facts["film"] = _film(inputs, state, completed.values, options, sky.cloudiness, progress)
     return completed, facts
 
 
-def join_completions(rest: Completed, alone: Completed, state: InpaintingState) -> Completed:
+def join_completions(rest: CompletedTexture, alone: CompletedTexture, state: InpaintingState) -> CompletedTexture:
     """Join the completion of what the model left open with the texels that it painted; painted texels do not change.
 
-    Imagined texels have no standard error of their own. It is set to the error of a completion from the painted texels
+    Generated texels have no standard error of their own. It is set to the error of a completion from the painted texels
     alone, plus the difference between the two.
     """
-    from seasonscapes.texturing.completion import Completed
+    from seasonscapes.texturing.completion import CompletedTexture
 
     difference = np.mean((rest.values - alone.values) ** 2, axis=2)
-    sigma = np.where(state.imagined, np.sqrt(alone.sigma**2 + difference), rest.sigma).astype(np.float32)
-    return Completed(rest.values, sigma, state.painted)
+    sigma = np.where(state.generated, np.sqrt(alone.sigma**2 + difference), rest.sigma).astype(np.float32)
+    return CompletedTexture(rest.values, sigma, state.painted)
 
 
 def prompt_of(place: Place, utc: datetime, cloudiness: float) -> str:
@@ -218,25 +231,27 @@ def prompt_of(place: Place, utc: datetime, cloudiness: float) -> str:
     return prompt_for(utc, latitude, float(sun.elevation_deg), cloudiness=cloudiness)
 
 
-def _painter(options: PathCompletionOptions, prompt: str) -> tuple[Painter, dict[str, Any]]:
+def _load_inpainter(options: PathCompletionOptions, prompt: str) -> tuple[DiffusionInpainter, dict[str, Any]]:
     """The loaded model, and plain values that identify it."""
-    from seasonscapes.texturing.diffusion import load_painter, needed_parts
+    from seasonscapes.texturing.diffusion import load_inpainter, required_parts
     from seasonscapes.texturing.model_weights import find_weights, weights_fingerprint
 
     names = options.names
     image = None if options.guide_image is None else _guide_picture(options.guide_image)
     settings = options.settings(prompt)
-    painter = load_painter(options.weights, settings, names=names, machine=options.machine, image=image)
+    inpainter = load_inpainter(
+        options.weights, settings, names=names, device_settings=options.device_settings, image=image
+    )
     prints = {}
-    for part in needed_parts(settings, image is not None):
+    for part in required_parts(settings, image is not None):
         name = getattr(names, part)
         prints[part] = weights_fingerprint(find_weights(options.weights, part, name), part, name)
-    return painter, {
+    return inpainter, {
         "weights": prints,
         "settings": settings,
         "guide": None if options.guide_image is None else file_hash(options.guide_image),
-        "device": painter.device,
-        "dtype": options.machine.dtype,
+        "device": inpainter.device,
+        "dtype": options.device_settings.dtype,
     }
 
 
@@ -250,7 +265,11 @@ def _guide_picture(path: Path) -> np.ndarray:
 
 
 def _views_folder(
-    place: Place, painted: Texture, options: PathCompletionOptions, effort: CompletionOptions, identity: dict[str, Any]
+    place: Place,
+    painted: Texture,
+    options: PathCompletionOptions,
+    completion: CompletionOptions,
+    identity: dict[str, Any],
 ) -> Path:
     """The folder of the views of exactly this run."""
     texture = hashlib.sha256(painted.values.tobytes() + painted.weight.tobytes()).hexdigest()
@@ -259,9 +278,8 @@ def _views_folder(
         "texture": texture,
         "path": file_hash(options.path),
         "hybrid": options.hybrid,
-        "fast": effort.fast and options.hybrid,
-        "seed": effort.seed,
-        "cloudiness": effort.cloudiness,
+        "regression": [completion.method, completion.fast] if options.hybrid else None,
+        "seed": completion.seed,
         "mask": options.mask,
         "dilate": options.dilate_px,
         "least": options.least_hole,
@@ -275,23 +293,19 @@ def _views_folder(
 def _painted_views(
     inputs: PathInpaintingInputs,
     state: InpaintingState,
-    painter: Painter,
-    options: PathCompletionOptions,
-    effort: CompletionOptions,
+    inpainter: DiffusionInpainter,
+    options: PathInpaintingOptions,
     folder: Path,
     surface: np.ndarray,
     progress: Progress | None,
 ) -> dict[str, Any]:
     """Paint all views; coverage of the surface before and after each one, and the time of each."""
-    from seasonscapes.texturing.path_inpainting import PathInpaintingOptions, inpaint_along_path
+    from seasonscapes.texturing.path_inpainting import inpaint_along_path
 
-    how = PathInpaintingOptions(
-        options.mask, options.dilate_px, options.least_hole, options.paint_sky, effort.cloudiness, effort.seed
-    )
     size = max(int(surface.sum()), 1)
     coverage, seconds, skipped, before = [float((state.covered & surface).sum() / size)], [], 0, clock.perf_counter()
     report = task_progress(progress, f"painting {len(inputs.cameras)} views")
-    for step in inpaint_along_path(inputs, state, painter, how, folder=folder, progress=report):
+    for step in inpaint_along_path(inputs, state, inpainter, options, folder=folder, progress=report):
         now = clock.perf_counter()
         seconds, before = seconds + ([] if step.skipped else [now - before]), now
         skipped += step.skipped
@@ -305,17 +319,15 @@ def _film(
     state: InpaintingState,
     values: np.ndarray,
     options: PathCompletionOptions,
-    effort: CompletionOptions,
+    cloudiness: float,
     progress: Progress | None,
 ) -> str:
-    from seasonscapes.relighting.film import write_film
-    from seasonscapes.texturing.path_inpainting import frames_of
+    from seasonscapes.relighting.film import write_video
+    from seasonscapes.texturing.path_inpainting import textured_frames
     from seasonscapes.texturing.view_conditions import white_radiance
 
     assert options.film is not None
     white = white_radiance(state.values, state.painted)
-    frames: Iterator[np.ndarray] = frames_of(
-        values, inputs.cameras, inputs.terrain, white, cloudiness=effort.cloudiness
-    )
-    write_film(options.film, each_reported(frames, len(inputs.cameras), progress, "filming"), fps=options.fps)
+    frames: Iterator[np.ndarray] = textured_frames(values, inputs.cameras, inputs.terrain, white, cloudiness=cloudiness)
+    write_video(options.film, each_reported(frames, len(inputs.cameras), progress, "filming"), fps=options.fps)
     return str(options.film)
