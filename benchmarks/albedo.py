@@ -34,7 +34,7 @@ sys.path.insert(0, str(HERE))
 
 from albedo_scene import Truth, hours, lights_for, make_truth, path_traced  # noqa: E402
 
-from seasonscapes.albedo.closed_form import AlbedoFit, solve_albedo  # noqa: E402
+from seasonscapes.albedo.closed_form import AlbedoFit, SearchOptions, solve_albedo  # noqa: E402
 from seasonscapes.albedo.corrections import CORRECTIONS, slopes_under  # noqa: E402
 from seasonscapes.albedo.forward_model import sun_on_texels, trace_texel_transport  # noqa: E402
 from seasonscapes.albedo.haze import fit_visibility  # noqa: E402
@@ -291,7 +291,7 @@ def curve(args, truth, land, times, pictures, photographs, judge, table, numbers
     faults = WebcamFaults(tone_strength=0.4)
     seen, _ = observations(truth, times, pictures, faults, args.seed + 3)
     bent = [replace(photograph, observation=one, gain=None) for photograph, one in zip(photographs, seen, strict=True)]
-    found = fit_tone_curve(land, bent, fraction=0.2 if args.quick else 0.1)
+    found = fit_tone_curve(land, bent, search=SearchOptions(fraction=0.2 if args.quick else 0.1))
     numbers["curve_strength_error"] = abs(found.strength - faults.tone_strength)
     fit = solve_albedo(land, with_tone_curve(bent, found.strength), noise_model=EIGHT_BIT)
     score(table, numbers, "curve", judge.scores(fit.albedo), judge)

@@ -344,9 +344,8 @@ class Splats:
             own[None],
             [DAY_OF_YEAR],
             self.transport,
-            kind="full",
+            learned_parameters(appearance),
             frame=world.frame,
-            appearance=learned_parameters(appearance),
         )
         weights = [model_weights(model, camera) for camera in world.judged]
 

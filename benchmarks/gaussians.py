@@ -474,9 +474,8 @@ def packed_scores(contest: Contest, appearance) -> dict[str, float]:
         contest.albedo[None],
         [SUMMER_DAY],
         contest.transport,
-        kind="full",
+        learned_parameters(appearance),
         frame=contest.scene.frame,
-        appearance=learned_parameters(appearance),
     )
     again = contest.score(appearance_of(unpack_model(*pack_model(model))))
     return {"bytes_per_gaussian": bytes_per_gaussian(model), "packed_held_out_hour_psnr_db": again[0]}

@@ -9,7 +9,7 @@ from albedo_cases import Case, case, psnr
 
 from seasonscapes.albedo import corrections, equations, haze, season_grouping, tone_curve
 from seasonscapes.albedo.albedo_completion import completed_estimate
-from seasonscapes.albedo.closed_form import SolverOptions, solve_albedo
+from seasonscapes.albedo.closed_form import SearchOptions, SolverOptions, solve_albedo
 from seasonscapes.albedo.differentiable_views import SKY, differentiable_views, mi_picture
 from seasonscapes.albedo.forward_model import ambient_on_texels, predicted_surface_radiance
 from seasonscapes.albedo.inverse import ExtraUnknown, InverseOptions, refine_albedo
@@ -163,7 +163,7 @@ def test_wrong_light_is_clearly_worse(place, clean, wrong):
 
 def test_response_curve_is_found(place, photographs):
     bent = webcam_shots(place, photographs, WebcamFaults(tone_strength=0.4, exposure_sigma_ev=0.2))
-    found = tone_curve.fit_tone_curve(place.transport, bent, fraction=0.5)
+    found = tone_curve.fit_tone_curve(place.transport, bent, search=SearchOptions(fraction=0.5))
     assert found.strength == pytest.approx(0.4, abs=0.15)
     levels = np.linspace(0.0, 1.0, 50)
     curve = 0.6 * levels + 0.4 * levels**2 * (3.0 - 2.0 * levels)
@@ -198,7 +198,9 @@ def test_visibility_is_found(place, photographs):
     def lights_of(visibility_km):
         return [replace(photograph.light, aerial_perspective=Fog(visibility_km)) for photograph in photographs]
 
-    found = haze.fit_visibility(place.transport, hazy, lights_of, visibilities_km=(2.5, 4.0, 8.0, 16.0), fraction=0.5)
+    found = haze.fit_visibility(
+        place.transport, hazy, lights_of, visibilities_km=(2.5, 4.0, 8.0, 16.0), search=SearchOptions(fraction=0.5)
+    )
     assert found.visibility_km == pytest.approx(true_km, rel=0.15)
     mixed = haze.mixed_light(lights_of(4.0)[0], lights_of(8.0)[0], 0.5).aerial_perspective
     between = 1.0 / (0.5 / 4.0 + 0.5 / 8.0)
@@ -235,6 +237,10 @@ def test_night_is_an_error(place, photographs):
     ]
     with pytest.raises(NotEnoughEvidence, match="no photograph has any light"):
         solve_albedo(place.transport, dark)
+    few = solve_albedo(place.transport, [*dark, photographs[0]], solver=SolverOptions(rounds=1))
+    assert (few.pixel_count > 0.0).any(), "one photograph with light is enough"
+    overcast = [replace(s, light=replace(s.light, sky_radiance=photographs[0].light.sky_radiance)) for s in dark]
+    solve_albedo(place.transport, overcast, solver=SolverOptions(rounds=1))
 
 
 def test_nothing_fixes_the_exposure(place, photographs):
@@ -303,9 +309,33 @@ def test_refinement_saves_resumes_and_takes_extras(place, photographs, clean, tm
     again = refine_albedo(place.terrain, place.transport, photographs, poor, options=options, resume=file)
     assert len(again.history) == len(done.history), "a finished state has nothing left to do"
     brighter = {SKY: ExtraUnknown(np.array([1.3]), low=0.1, high=3.0, step=0.02)}
-    options = InverseOptions(unknowns=(), levels=(1,), iterations=20, check_every=5, spp=4)
-    found = refine_albedo(place.terrain, place.transport, photographs, clean, options=options, extra=brighter)
+    options = InverseOptions(unknowns=(), extra=brighter, levels=(1,), iterations=20, check_every=5, spp=4)
+    found = refine_albedo(place.terrain, place.transport, photographs, clean, options=options)
     assert abs(found.values[SKY][0] - 1.0) < 0.2, "the sky's own scale is found again"
+
+
+def test_an_interrupted_refinement_continues(place, photographs, tmp_path):
+    """Up to the rounding of gradients, which the renderer sums in no fixed order."""
+    poor = solve_albedo(place.transport, photographs, solver=SolverOptions(rounds=1))
+    options = InverseOptions(levels=(4, 1), iterations=9, check_every=3, spp=4)
+    problem = (place.terrain, place.transport, photographs, poor)
+    whole = refine_albedo(*problem, options=options)
+    for stage, iteration in ((0, 3), (0, 9), (1, 6)):
+        file = tmp_path / f"{stage}_{iteration}.npz"
+
+        def interrupt(state, at=(stage, iteration)):
+            state.stop = (state.stage, state.iteration) == at
+
+        part = refine_albedo(*problem, options=options, callbacks=[interrupt], resume=file)
+        assert len(part.history) == stage * 9 + iteration
+        again = refine_albedo(*problem, options=options, resume=file)
+        assert len(again.history) == len(whole.history)
+        for name in ("loss", "held_out"):
+            values = [[record.get(name, 0.0) for record in fit.history] for fit in (again, whole)]
+            np.testing.assert_allclose(*values, rtol=1e-3)
+        # Adam normalises gradients, so that single texels of tiny gradient may differ by more than rounding.
+        assert np.abs(again.values["albedo"] - whole.values["albedo"]).mean() < 1e-5
+        np.testing.assert_allclose(again.values["log_gain"], whole.values["log_gain"], atol=1e-4)
 
 
 def test_refinement_refuses(place, photographs, clean):

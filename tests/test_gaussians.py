@@ -47,6 +47,7 @@ from seasonscapes.gaussians.rasterise_cuda import rasterise_cuda  # noqa: E402
 from seasonscapes.gaussians.rasterise_reference import rasterise_reference  # noqa: E402
 from seasonscapes.gaussians.splat_view import (  # noqa: E402
     SPLAT_LIMITS,
+    RasterOptions,
     draw_layers,
     learned_parameters,
     model_colours,
@@ -321,9 +322,8 @@ def model(hill, told) -> GaussianModel:
         np.stack([albedo, 0.5 * albedo]),
         [100.0, 200.0],
         transport,
-        kind="full",
+        learned_parameters(trained),
         frame=FRAME,
-        appearance=learned_parameters(trained),
         note={"seed": 0},
     )
 
@@ -624,10 +624,10 @@ def test_backs_of_discs_are_not_drawn(hill, model):
     """From above, with and without: the same picture; from below, none."""
     camera = looking_down(size=48, view_m=900.0)
     layers = model.albedo[0]
-    image, _ = draw_layers(model, camera, layers, subpixels=2)
+    image, _ = draw_layers(model, camera, layers, RasterOptions(subpixels=2))
     weights = view_weights(splats_of_surfels(hill[1]), camera, subpixels=2)
     np.testing.assert_allclose(image, splat_colours(weights, layers), atol=0.01)
     pose = np.eye(4)
     pose[:3, 3] = [0.0, 0.0, -800.0]
     with pytest.raises(NoTerrainInView, match="no Gaussian in the camera's view"):
-        draw_layers(model, replace(camera, world_from_camera=pose), layers)
+        draw_layers(model, replace(camera, world_from_camera=pose), layers, RasterOptions(subpixels=1))

@@ -9,6 +9,8 @@ import places
 import pytest
 
 from seasonscapes.albedo.seasons import (
+    AlbedoSeries,
+    DatedAlbedo,
     albedo_at,
     interpolate_albedo,
     neighbouring_dates,
@@ -173,6 +175,20 @@ def test_albedo_at_knows_its_dates():
     for wrong in ((dated[:0], (), 1.0), (dated, days, float("nan"))):
         with pytest.raises(ValueError, match="albedo_at"):
             albedo_at(*wrong, ground)
+
+
+def test_a_series_is_sorted_and_checked():
+    dated = tuple(
+        DatedAlbedo(day, str(day), lambda: Texture(np.zeros((1, 1, 3))))
+        for day in (date(2023, 8, 1), date(2022, 4, 10))
+    )
+    series = AlbedoSeries(dated)
+    assert [each.day.month for each in series.dated] == [4, 8]
+    assert series == AlbedoSeries(dated[::-1], "blended")
+    with pytest.raises(ValueError, match="no dated albedo"):
+        AlbedoSeries(())
+    with pytest.raises(ValueError, match="'monsoon'"):
+        AlbedoSeries(dated, "monsoon")
 
 
 # --------------------------------------------------------------------------------------------------- films of a place

@@ -1,4 +1,4 @@
-"""Completion of a recovered albedo: an orthoimage corrected by what photographs measured, each weighted by its error."""
+"""Completion of a recovered albedo: an orthoimage corrected by the measured texels, both weighted by their variances."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ def complete_albedo(
     Parameters
     ----------
     fit
-        The albedo that photographs determined.
+        Albedo measured by photographs.
     base
-        ``(R, S, 3)`` albedo from another source, of any scale, NaN where unknown. ``None`` where there is none: gaps
-        are then predicted from relief alone and measured texels stay as they are.
+        ``(R, S, 3)`` albedo from another source, of any scale, NaN where unknown. If ``None``, gaps are predicted from
+        relief alone, and measured texels do not change.
     predictors
-        Relief only: an albedo depends on no hour's sun, and the base is given separately.
+        Relief predictors, without those of the sun's position, since albedo does not depend on it.
     seed
-        Of the regression.
+        Seed of the regression.
     progress
-        Called with the finished share.
+        Called with the finished fraction.
 
     Returns
     -------
@@ -63,7 +63,7 @@ def complete_albedo(
 
 
 def completed_estimate(
-    known: AlbedoEstimate,
+    estimate: AlbedoEstimate,
     fit: AlbedoFit,
     base: np.ndarray | None,
     predictors: Predictors,
@@ -74,7 +74,7 @@ def completed_estimate(
 
     Parameters
     ----------
-    known, fit
+    estimate, fit
         The measured albedo and the fit that it comes from.
     base, predictors, progress
         See `complete_albedo`.
@@ -85,5 +85,7 @@ def completed_estimate(
         With a finite σ on the whole surface.
     """
     albedo, sigma = complete_albedo(fit, base, predictors, progress=progress)
-    source = np.where(predictors.surface & (known.source != 1), np.uint8(2), known.source)
-    return replace(known, albedo=albedo, sigma=np.where(predictors.surface, sigma, np.float32(np.inf)), source=source)
+    source = np.where(predictors.surface & (estimate.source != 1), np.uint8(2), estimate.source)
+    return replace(
+        estimate, albedo=albedo, sigma=np.where(predictors.surface, sigma, np.float32(np.inf)), source=source
+    )

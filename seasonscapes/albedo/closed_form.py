@@ -78,6 +78,8 @@ class AlbedoFit:
         Robust cost per pixel, comparable between fits of the same photographs.
     history
         ``round``, ``cost`` and median ``residual`` of each outer iteration.
+    noise_model
+        Standard deviations that weighted the residuals.
     """
 
     albedo: np.ndarray
@@ -87,6 +89,29 @@ class AlbedoFit:
     residual: np.ndarray
     cost: float
     history: list[dict[str, float]] = field(default_factory=list)
+    noise_model: NoiseModel = LINEAR
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """Options of a search over one unknown of the light or the camera, with one albedo fit for each candidate value.
+
+    Parameters
+    ----------
+    fraction
+        Fraction of the terrain pixels used.
+    seed
+        Seed of the drawn pixels.
+    start
+        Initial albedo fit.
+    solver
+        Numbers of iterations of each albedo fit.
+    """
+
+    fraction: float = 0.2
+    seed: int = 0
+    start: AlbedoFit | None = None
+    solver: SolverOptions = SolverOptions(rounds=3, iterations=8)
 
 
 def solve_albedo(
@@ -152,7 +177,7 @@ def solve_albedo(
     albedo = fill_nearest(albedo.reshape(*transport.shape, 3), pixel_count)
     gains = np.stack([1.0 / equations.inverse_gain for equations in systems])
     information = np.where(observed, diagonal[:, 1], 0.0).reshape(transport.shape).astype(np.float32)
-    return AlbedoFit(albedo, pixel_count, information, gains, residual, cost, history)
+    return AlbedoFit(albedo, pixel_count, information, gains, residual, cost, history, noise_model)
 
 
 def _unique(items: Sequence[_Item]) -> list[_Item]:
@@ -160,17 +185,10 @@ def _unique(items: Sequence[_Item]) -> list[_Item]:
 
 
 def _require_usable(systems: list[PhotographEquations]) -> None:
-    counts = [int(equations.usable[:, 0].sum()) for equations in systems]
-    if sum(counts) == 0:
+    if not any(equations.usable.any() for equations in systems):
         raise NoUsablePixels("solve_albedo: no usable pixel in any photograph: all clipped, black or masked")
-    dark = [
-        equations
-        for equations in systems
-        if not equations.luminary_lx
-        and equations.ambient.max() <= 0.0
-        and equations.photograph.light.sky_radiance.max() <= 0.0
-    ]
-    if len(dark) == len(systems):
+    # Interreflection needs no test of its own: it is zero where no luminary and no sky emits light.
+    if not any(equations.luminary_lx or equations.photograph.light.sky_radiance.max() > 0.0 for equations in systems):
         raise NotEnoughEvidence("solve_albedo: no photograph has any light")
     anchored = any(not equations.projected or equations.airlight.max() > 0.0 for equations in systems)
     if not anchored:
@@ -325,9 +343,9 @@ def fill_nearest(values: np.ndarray, pixel_count: np.ndarray) -> np.ndarray:
 
 
 def pixel_weights(
-    transport: TexelTransport, photographs: Sequence[AlbedoPhotograph], fit: AlbedoFit, noise_model: NoiseModel = LINEAR
+    transport: TexelTransport, photographs: Sequence[AlbedoPhotograph], fit: AlbedoFit
 ) -> list[np.ndarray]:
-    """Compute the robust weights of all terrain pixels under a finished fit.
+    """Compute the robust weights of all terrain pixels under a finished fit and its noise model.
 
     Parameters
     ----------
@@ -337,8 +355,6 @@ def pixel_weights(
         The K photographs of the fit.
     fit
         Result of `solve_albedo`.
-    noise_model
-        Standard deviations that weight the residuals.
 
     Returns
     -------
@@ -349,9 +365,9 @@ def pixel_weights(
     albedo = fit.albedo.reshape(size, 3)
     weights = []
     for photograph, gain in zip(photographs, fit.gains, strict=True):
-        equations = equations_of(replace(photograph, gain=np.asarray(gain, float)), noise_model, size)
+        equations = equations_of(replace(photograph, gain=np.asarray(gain, float)), fit.noise_model, size)
         equations.ambient = ambient_on_texels(transport, photograph.light, fit.albedo)
-        reweight([equations], albedo, noise_model, robust=True)
+        reweight([equations], albedo, fit.noise_model, robust=True)
         assert equations.weight is not None
         weights.append(equations.weight)
     return weights

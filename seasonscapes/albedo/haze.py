@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from seasonscapes.albedo.closed_form import AlbedoFit, SolverOptions, solve_albedo
+from seasonscapes.albedo.closed_form import SearchOptions, solve_albedo
 from seasonscapes.albedo.forward_model import TexelTransport
 from seasonscapes.albedo.photographs import LINEAR, AlbedoPhotograph, NoiseModel, thinned_photographs
 from seasonscapes.sky.illumination import AerialPerspective, Illumination, Luminary
@@ -21,7 +21,6 @@ from seasonscapes.sky.illumination import AerialPerspective, Illumination, Lumin
 LightsOf = Callable[[float], Sequence[Illumination]]
 # Geometric steps of about 1.65, from thick haze to polar air [km].
 VISIBILITIES_KM = (12.0, 20.0, 33.0, 55.0, 90.0, 150.0)
-_QUICK = SolverOptions(rounds=3, iterations=8)
 
 
 @dataclass(frozen=True)
@@ -114,9 +113,7 @@ def fit_visibility(
     *,
     visibilities_km: Sequence[float] = VISIBILITIES_KM,
     noise_model: NoiseModel = LINEAR,
-    fraction: float = 0.2,
-    seed: int = 0,
-    start: AlbedoFit | None = None,
+    search: SearchOptions | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> HazeFit:
     """Estimate the meteorological range at which the albedo fit has the least robust cost.
@@ -134,12 +131,8 @@ def fit_visibility(
         Nodes of the search [km], at least three.
     noise_model
         Standard deviations that weight the residuals.
-    fraction
-        Fraction of the pixels used.
-    seed
-        Seed of the drawn pixels.
-    start
-        Initial albedo fit.
+    search
+        Pixels, initial albedo and iterations of each trial fit; defaults if omitted.
     progress
         Called with the estimated finished fraction.
 
@@ -155,21 +148,21 @@ def fit_visibility(
     NoUsablePixels, NotEnoughEvidence
         See `closed_form.solve_albedo`.
     """
-    report = progress or (lambda fraction: None)
+    report, search = progress or (lambda fraction: None), search or SearchOptions()
     nodes = sorted(map(float, visibilities_km))
     if len(nodes) < 3:
         raise ValueError(f"fit_visibility: got {len(nodes)} visibilities, expected at least three")
-    thinned = thinned_photographs(photographs, fraction, seed)
+    thinned = thinned_photographs(photographs, search.fraction, search.seed)
     lights: dict[float, Sequence[Illumination]] = {}
     costs: dict[float, float] = {}
-    albedo = None if start is None else start.albedo
+    albedo = None if search.start is None else search.start.albedo
 
     def cost_at(visibility_km: float) -> float:
         nonlocal albedo
         if visibility_km not in costs:
             tried_lights = _lights_at(visibility_km, nodes, lights, lights_of)
             relit = [replace(photograph, light=light) for photograph, light in zip(thinned, tried_lights, strict=True)]
-            fit = solve_albedo(transport, relit, noise_model=noise_model, solver=_QUICK, start=albedo)
+            fit = solve_albedo(transport, relit, noise_model=noise_model, solver=search.solver, start=albedo)
             albedo, costs[visibility_km] = fit.albedo, fit.cost
             report(min(1.0, len(costs) / 8.0))
         return costs[visibility_km]

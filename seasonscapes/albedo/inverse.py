@@ -2,7 +2,7 @@
 
 The closed form's approximations (interreflection by outer iterations, haze by search, given sun and sky) are replaced
 by one loss over one set of unknowns: albedo texture, gains, scales of sun and sky, haze, and any Mitsuba parameters
-named in ``extra``. The optimiser is Adam with bounds; pixels have the weights of the closed form; texture corrections
+named in `InverseOptions.extra`. The optimiser is Adam with bounds; pixels have the weights of the closed form; texture corrections
 proceed from coarse to fine; held-out photographs control the step size and early stopping.
 """
 
@@ -19,7 +19,7 @@ import numpy as np
 from seasonscapes.albedo.closed_form import HIGHEST, LOWEST, AlbedoFit, pixel_weights
 from seasonscapes.albedo.differentiable_views import DifferentiableViews, differentiable_views, mi_picture
 from seasonscapes.albedo.forward_model import TexelTransport
-from seasonscapes.albedo.photographs import LINEAR, AlbedoPhotograph, NoiseModel
+from seasonscapes.albedo.photographs import AlbedoPhotograph
 from seasonscapes.errors import NotEnoughEvidence
 from seasonscapes.images import atomic_path
 from seasonscapes.terrain.surface import Terrain
@@ -53,6 +53,8 @@ class InverseOptions:
     ----------
     unknowns
         Names out of ``albedo``, ``log_gain``, ``sun``, ``sky`` and ``haze``.
+    extra
+        Further unknowns, by Mitsuba's key (``sky.data``, ``terrain.vertex_positions``, …).
     levels
         Resolution of the albedo correction in each stage: 4 means one value per 4 × 4 texels, 1 the texels themselves.
     iterations
@@ -75,6 +77,7 @@ class InverseOptions:
     """
 
     unknowns: tuple[str, ...] = ("albedo", "log_gain")
+    extra: Mapping[str, ExtraUnknown] = field(default_factory=dict)
     levels: tuple[int, ...] = (4, 1)
     iterations: int = 60
     photographs_per_iteration: int = 2
@@ -112,6 +115,8 @@ class IterationState:
 
 
 Callback = Callable[[IterationState], None]
+# A stage ends when the validation loss has risen this many times.
+_MOST_FAILURES = 3
 
 
 @dataclass(frozen=True)
@@ -139,9 +144,7 @@ def refine_albedo(
     photographs: Sequence[AlbedoPhotograph],
     start: AlbedoFit,
     *,
-    noise_model: NoiseModel = LINEAR,
     options: InverseOptions | None = None,
-    extra: Mapping[str, ExtraUnknown] | None = None,
     callbacks: Sequence[Callback] = (),
     resume: Path | None = None,
 ) -> InverseFit:
@@ -156,17 +159,14 @@ def refine_albedo(
     photographs
         K photographs, at least two.
     start
-        Closed-form fit of these photographs.
-    noise_model
-        Standard deviations that weight the residuals.
+        Closed-form fit of these photographs; its noise model weights the residuals.
     options
         Unknowns, iterations and steps; defaults if omitted.
-    extra
-        Further unknowns, by Mitsuba's key (``sky.data``, ``terrain.vertex_positions``, …).
     callbacks
         Called with the `IterationState` after each iteration.
     resume
-        Checkpoint file (``.npz``), written at every validation and read if it exists.
+        Checkpoint file (``.npz``), written at every validation and read if it exists. It holds the state of the
+        optimiser and of the random numbers, so that an interrupted refinement continues as an uninterrupted one would.
 
     Returns
     -------
@@ -181,28 +181,30 @@ def refine_albedo(
         If there are fewer than two photographs.
     ValueError
         If an unknown is not supported, or a camera is a panorama or has pixels that are not square.
+
+    Notes
+    -----
+    Results of equal seeds agree up to rounding only, because the renderer sums gradients over threads in no fixed
+    order; Adam normalises gradients, so that single texels of tiny gradient may differ by a fraction of a step.
     """
-    options, extra = options or InverseOptions(), dict(extra or {})
+    options = options or InverseOptions()
     if len(photographs) < 2:
         raise NotEnoughEvidence("refine_albedo: at least two photographs are needed, one of them for validation")
     unsupported = set(options.unknowns) - {"albedo", "log_gain", "sun", "sky", "haze"}
     if unsupported:
         raise ValueError(
-            f"refine_albedo: unsupported unknowns {', '.join(sorted(unsupported))}; pass Mitsuba parameters in extra"
+            f"refine_albedo: unsupported unknowns {', '.join(sorted(unsupported))}; "
+            "pass Mitsuba parameters in options.extra"
         )
     views = differentiable_views(terrain, start.albedo, photographs, max_depth=options.max_depth)
-    problem = _Problem(
-        views, _targets(transport, photographs, start, noise_model), options, extra, *_split(len(photographs), options)
-    )
-    state = (
-        _load(resume)
-        if resume is not None and resume.is_file()
-        else IterationState(_start_values(start, options, extra))
-    )
-    for stage in range(state.stage, len(options.levels)):
-        first = state.iteration if stage == state.stage else 0
-        state.stage = stage
-        _run_stage(problem, state, first, callbacks, resume)
+    problem = _Problem(views, _targets(transport, photographs, start), options, *_split(len(photographs), options))
+    state, stage = IterationState(_start_values(start, options)), None
+    if resume is not None and resume.is_file():
+        state, stage = _load(problem, resume)
+    for number in range(state.stage, len(options.levels)):
+        if number > state.stage:
+            state.stage, state.iteration, stage = number, 0, None
+        _run_stage(problem, state, stage or _start_stage(problem, state), callbacks, resume)
         if state.stop:
             break
     values = state.values
@@ -218,7 +220,6 @@ class _Problem:
     views: DifferentiableViews
     targets: list[tuple[Any, Any]]
     options: InverseOptions
-    extra: dict[str, ExtraUnknown]
     training: np.ndarray
     validation: np.ndarray
 
@@ -231,14 +232,14 @@ def _split(count: int, options: InverseOptions) -> tuple[np.ndarray, np.ndarray]
 
 
 def _targets(
-    transport: TexelTransport, photographs: Sequence[AlbedoPhotograph], start: AlbedoFit, noise_model: NoiseModel
+    transport: TexelTransport, photographs: Sequence[AlbedoPhotograph], start: AlbedoFit
 ) -> list[tuple[Any, Any]]:
     """Each photograph ``(H, W, 3)`` and the root of its pixels' weights [1 / pixel value], as tensors."""
     import mitsuba as mi
 
     targets = []
     for photograph, weight, gain in zip(
-        photographs, pixel_weights(transport, photographs, start, noise_model), start.gains, strict=True
+        photographs, pixel_weights(transport, photographs, start), start.gains, strict=True
     ):
         camera = photograph.footprints.camera
         image = np.zeros((camera.height_px * camera.width_px, 3), np.float32)
@@ -254,69 +255,107 @@ def _targets(
     return targets
 
 
-def _start_values(start: AlbedoFit, options: InverseOptions, extra: dict[str, ExtraUnknown]) -> dict[str, np.ndarray]:
+def _start_values(start: AlbedoFit, options: InverseOptions) -> dict[str, np.ndarray]:
     # Gains are always present, because pictures have their own unit; they change only if they are unknowns.
     values = {"albedo": start.albedo.astype(np.float32), "log_gain": np.log(start.gains).astype(np.float32)}
     values |= {name: np.ones(1, np.float32) for name in ("sun", "sky", "haze") if name in options.unknowns}
-    return values | {name: np.asarray(unknown.start, np.float32) for name, unknown in extra.items()}
+    return values | {name: np.asarray(unknown.start, np.float32) for name, unknown in options.extra.items()}
+
+
+@dataclass
+class _StageState:
+    """State of the optimisation at one resolution, besides `IterationState`.
+
+    Parameters
+    ----------
+    base
+        ``(R, S, 3)`` albedo at the start of the stage, which a correction multiplies.
+    optimizer
+        Mitsuba's Adam with the current values and their moments.
+    rng
+        Generator of mini-batches and render seeds.
+    best
+        Lowest validation loss.
+    mean
+        Running mean of the iterates by name; ``None`` before the first iteration.
+    step_scale, failures
+        Factor of the learning rates, and number of validations at which the loss rose.
+    """
+
+    base: np.ndarray
+    optimizer: Any
+    rng: np.random.Generator
+    best: float
+    mean: dict[str, np.ndarray] | None = None
+    step_scale: float = 1.0
+    failures: int = 0
+
+
+def _start_stage(problem: _Problem, state: IterationState) -> _StageState:
+    rng = np.random.default_rng((problem.options.seed, state.stage, state.iteration))
+    optimizer = _optimizer(problem, state.values, problem.options.levels[state.stage])
+    return _StageState(state.values["albedo"], optimizer, rng, _validation_loss(problem, state.values))
 
 
 def _run_stage(
-    problem: _Problem, state: IterationState, first: int, callbacks: Sequence[Callback], resume: Path | None
+    problem: _Problem, state: IterationState, stage: _StageState, callbacks: Sequence[Callback], resume: Path | None
 ) -> None:
-    """Optimise at one resolution, from iteration ``first`` on, and update ``state``."""
+    """Optimise at one resolution, from ``state.iteration`` on, and update ``state``."""
     import drjit as dr
 
     options = problem.options
-    level = options.levels[state.stage]
-    base = state.values["albedo"]
-    optimizer = _optimizer(problem, state.values, level)
-    step_scale, failures = 1.0, 0
-    best = _validation_loss(problem, state.values)
-    rng = np.random.default_rng((options.seed, state.stage, first))
-    mean: dict[str, np.ndarray] | None = None
-    for iteration in range(first, options.iterations):
-        chosen = rng.choice(
-            problem.training, min(options.photographs_per_iteration, len(problem.training)), replace=False
-        )
+    optimizer, rng = stage.optimizer, stage.rng
+    batch = min(options.photographs_per_iteration, len(problem.training))
+    for iteration in range(state.iteration, options.iterations):
+        # Here and not after the callbacks only, because a finished stage may be resumed.
+        if state.stop or stage.failures >= _MOST_FAILURES:
+            break
+        chosen = rng.choice(problem.training, batch, replace=False)
         loss = 0.0
         for index in chosen:
-            unknowns = _unknowns(problem, optimizer, base, level, state.values)
+            unknowns = _unknowns(optimizer, stage.base, state.values)
             part = _loss(problem, int(index), unknowns, seed=int(rng.integers(2**30)))
             dr.backward(part / float(len(chosen)))
             loss += float(part.array[0]) / len(chosen)
         optimizer.step()
         _clip_to_bounds(problem, optimizer)
-        current = _current_values(problem, optimizer, base, level, state.values)
+        current = _current_values(optimizer, stage.base, state.values)
         # Iterates of a stochastic optimiser scatter about the minimum; their running mean is closer to it.
+        mean = stage.mean
         mean = current if mean is None else {name: 0.9 * mean[name] + 0.1 * current[name] for name in current}
-        state.iteration = iteration + 1
+        stage.mean, state.iteration = mean, iteration + 1
         record = {"stage": float(state.stage), "iteration": float(iteration), "loss": loss}
         if (iteration + 1) % options.check_every == 0 or iteration + 1 == options.iterations:
-            validation = _validation_loss(problem, mean)
-            record["held_out"] = validation
-            if validation < best:
-                best, state.values = validation, mean
-            else:
-                failures, step_scale = failures + 1, 0.5 * step_scale
-                optimizer.set_learning_rate(
-                    {name: step_scale * step for name, step in _learning_rates(problem, level).items()}
-                )
+            record["held_out"] = _validation_loss(problem, mean)
+            _judge(problem, state, stage, record["held_out"])
         state.history.append(record)
         if "held_out" in record and resume is not None:
-            _save(state, resume)
+            _save(state, stage, resume)
         for callback in callbacks:
             callback(state)
-        if state.stop or failures >= 3:
-            break
-    state.iteration = options.iterations if failures >= 3 else state.iteration
+    state.iteration = options.iterations if stage.failures >= _MOST_FAILURES else state.iteration
+
+
+def _judge(problem: _Problem, state: IterationState, stage: _StageState, validation: float) -> None:
+    """Keep the mean of the iterates if it lowers the validation loss; halve the learning rates otherwise."""
+    assert stage.mean is not None
+    if validation < stage.best:
+        stage.best, state.values = validation, stage.mean
+    else:
+        stage.failures, stage.step_scale = stage.failures + 1, 0.5 * stage.step_scale
+        _set_learning_rates(problem, state, stage)
+
+
+def _set_learning_rates(problem: _Problem, state: IterationState, stage: _StageState) -> None:
+    rates = _learning_rates(problem, problem.options.levels[state.stage])
+    stage.optimizer.set_learning_rate({name: stage.step_scale * rate for name, rate in rates.items()})
 
 
 def _learning_rates(problem: _Problem, level: int) -> dict[str, float]:
     """Learning rate of each unknown, by its name in the optimiser."""
     names = {"albedo": "albedo" if level == 1 else "correction"}
     rates = {names.get(name, name): problem.options.steps[name] for name in problem.options.unknowns}
-    return rates | {name: unknown.step for name, unknown in problem.extra.items()}
+    return rates | {name: unknown.step for name, unknown in problem.options.extra.items()}
 
 
 def _optimizer(problem: _Problem, values: dict[str, np.ndarray], level: int) -> Any:
@@ -336,9 +375,7 @@ def _optimizer(problem: _Problem, values: dict[str, np.ndarray], level: int) -> 
     return optimizer
 
 
-def _unknowns(
-    problem: _Problem, optimizer: Any, base: np.ndarray, level: int, values: dict[str, np.ndarray]
-) -> dict[str, Any]:
+def _unknowns(optimizer: Any, base: np.ndarray, values: dict[str, np.ndarray]) -> dict[str, Any]:
     """All unknowns as input of `mi_picture`; those of the optimiser carry gradients."""
     import drjit as dr
     import mitsuba as mi
@@ -402,35 +439,66 @@ def _clip_to_bounds(problem: _Problem, optimizer: Any) -> None:
         "sun": (0.05, 20.0),
         "sky": (0.05, 20.0),
         "haze": (0.0, 20.0),
-    } | {name: (unknown.low, unknown.high) for name, unknown in problem.extra.items()}
+    } | {name: (unknown.low, unknown.high) for name, unknown in problem.options.extra.items()}
     for name in optimizer.keys():  # noqa: SIM118 (not a dict)
         if name in limits:
             optimizer[name] = dr.clip(dr.detach(optimizer[name]), *limits[name])
 
 
-def _current_values(
-    problem: _Problem, optimizer: Any, base: np.ndarray, level: int, values: dict[str, np.ndarray]
-) -> dict[str, np.ndarray]:
+def _current_values(optimizer: Any, base: np.ndarray, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The optimiser's values as numpy arrays, and all others unchanged."""
     import drjit as dr
 
     with dr.suspend_grad():
-        unknowns = _unknowns(problem, optimizer, base, level, values)
+        unknowns = _unknowns(optimizer, base, values)
         current = {name: np.array(value, np.float32).reshape(values[name].shape) for name, value in unknowns.items()}
     if "albedo" in current:
         current["albedo"] = np.clip(current["albedo"], LOWEST, HIGHEST)
     return values | current
 
 
-def _save(state: IterationState, path: Path) -> None:
+def _save(state: IterationState, stage: _StageState, path: Path) -> None:
+    note: dict[str, Any] = {"stage": state.stage, "iteration": state.iteration, "history": state.history}
+    note |= {"best": stage.best, "step_scale": stage.step_scale, "failures": stage.failures}
+    note["rng"] = stage.rng.bit_generator.state
+    arrays: dict[str, Any] = {f"value:{name}": value for name, value in state.values.items()}
+    arrays |= {f"mean:{name}": value for name, value in (stage.mean or {}).items()}
+    arrays["base"] = stage.base
+    for name, (value, _, _, (steps, first, second, _)) in stage.optimizer.state.items():
+        arrays |= {f"adam:{name}": np.array(value), f"first moment:{name}": np.array(first)}
+        arrays |= {f"second moment:{name}": np.array(second), f"steps:{name}": np.array(steps)}
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        note = json.dumps({"stage": state.stage, "iteration": state.iteration, "history": state.history})
-        arrays: dict[str, Any] = {f"value:{name}": value for name, value in state.values.items()}
-        np.savez(file, note=note, **arrays)
+        np.savez(file, note=json.dumps(note), **arrays)
 
 
-def _load(path: Path) -> IterationState:
+def _load(problem: _Problem, path: Path) -> tuple[IterationState, _StageState | None]:
+    """State of a checkpoint, and of its stage unless the file lacks it."""
     with np.load(path, allow_pickle=False) as file:
         note = json.loads(str(file["note"]))
-        values = {name.removeprefix("value:"): file[name] for name in file.files if name.startswith("value:")}
-    return IterationState(values, note["stage"], note["iteration"], note["history"])
+        arrays = {name: file[name] for name in file.files if name != "note"}
+    state = IterationState(_named(arrays, "value:"), note["stage"], note["iteration"], note["history"])
+    if "rng" not in note:
+        return state, None
+    optimizer = _optimizer(problem, state.values, problem.options.levels[state.stage])
+    _restore_optimizer(optimizer, arrays)
+    rng = np.random.default_rng()
+    rng.bit_generator.state = note["rng"]
+    mean = _named(arrays, "mean:")
+    stage = _StageState(arrays["base"], optimizer, rng, note["best"], mean, note["step_scale"], note["failures"])
+    _set_learning_rates(problem, state, stage)
+    return state, stage
+
+
+def _named(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+    return {name.removeprefix(prefix): value for name, value in arrays.items() if name.startswith(prefix)}
+
+
+def _restore_optimizer(optimizer: Any, arrays: dict[str, np.ndarray]) -> None:
+    """Set the values and moments of Adam to those of a checkpoint."""
+    import mitsuba as mi
+
+    for name, value in _named(arrays, "adam:").items():
+        optimizer[name] = type(optimizer[name])(value)
+        moments = mi.Float(arrays[f"first moment:{name}"]), mi.Float(arrays[f"second moment:{name}"])
+        steps = mi.UInt32(arrays[f"steps:{name}"])
+        optimizer.state[name] = (*optimizer.state[name][:3], (steps, *moments, None))

@@ -16,7 +16,7 @@ from seasonscapes.albedo.standard_error import AlbedoEstimate
 _SNOW_CHANGED, _COLOUR_CHANGED = 0.04, 0.12
 
 
-def group_dates(days: Sequence[date], known: Sequence[AlbedoEstimate]) -> list[list[int]]:
+def group_dates(days: Sequence[date], estimates: Sequence[AlbedoEstimate]) -> list[list[int]]:
     """Group dates that are consecutive in the year and have the same snow cover and colours.
 
     Only texels measured on both of two dates are compared.
@@ -25,7 +25,7 @@ def group_dates(days: Sequence[date], known: Sequence[AlbedoEstimate]) -> list[l
     ----------
     days
         Dates, in any order and of any years.
-    known
+    estimates
         Albedo of each date.
 
     Returns
@@ -38,12 +38,12 @@ def group_dates(days: Sequence[date], known: Sequence[AlbedoEstimate]) -> list[l
     order = sorted(range(len(days)), key=lambda i: day_number(days[i]))
     groups = [[order[0]]]
     for index in order[1:]:
-        if _same_season(known[groups[-1][-1]], known[index]):
+        if _same_season(estimates[groups[-1][-1]], estimates[index]):
             groups[-1].append(index)
         else:
             groups.append([index])
     # The year is cyclic: a season may contain December and January.
-    if len(groups) > 1 and _same_season(known[groups[-1][-1]], known[groups[0][0]]):
+    if len(groups) > 1 and _same_season(estimates[groups[-1][-1]], estimates[groups[0][0]]):
         groups[0] = groups.pop() + groups[0]
     return groups
 
@@ -58,7 +58,7 @@ def _same_season(a: AlbedoEstimate, b: AlbedoEstimate) -> bool:
     return bool(snow.mean() < _SNOW_CHANGED and colour.mean() < _COLOUR_CHANGED)
 
 
-def share_unchanged(dated: Sequence[AlbedoEstimate]) -> list[AlbedoEstimate]:
+def share_unchanged(estimates: Sequence[AlbedoEstimate]) -> list[AlbedoEstimate]:
     """Replace texels that did not change between dates by their inverse-variance weighted mean.
 
     A texel is unchanged if it is measured on at least two dates and agrees with the mean within two standard deviations
@@ -67,7 +67,7 @@ def share_unchanged(dated: Sequence[AlbedoEstimate]) -> list[AlbedoEstimate]:
 
     Parameters
     ----------
-    dated
+    estimates
         Albedos of several dates.
 
     Returns
@@ -75,11 +75,11 @@ def share_unchanged(dated: Sequence[AlbedoEstimate]) -> list[AlbedoEstimate]:
     list of AlbedoEstimate
         Albedos in the same order, with joint means and standard deviations.
     """
-    if len(dated) < 2:
-        return list(dated)
-    values = np.stack([known.albedo for known in dated])
-    sigma = np.stack([known.sigma for known in dated])
-    measured = np.stack([known.source == 1 for known in dated])
+    if len(estimates) < 2:
+        return list(estimates)
+    values = np.stack([estimate.albedo for estimate in estimates])
+    sigma = np.stack([estimate.sigma for estimate in estimates])
+    measured = np.stack([estimate.source == 1 for estimate in estimates])
     weight = np.where(measured, 1.0 / np.maximum(sigma, 1e-4) ** 2, 0.0)
     total = weight.sum(axis=0)
     mean = (weight[..., None] * values).sum(axis=0) / np.maximum(total, 1e-12)[..., None]
@@ -87,15 +87,15 @@ def share_unchanged(dated: Sequence[AlbedoEstimate]) -> list[AlbedoEstimate]:
     unchanged = (measured.sum(axis=0) >= 2) & (deviation < 2.0)
     joint_sigma = 1.0 / np.sqrt(np.maximum(total, 1e-12))
     result = []
-    for known, was_measured in zip(dated, measured, strict=True):
-        same_snow = np.abs(snow_share(known.albedo) - snow_share(mean)) < 0.5
+    for estimate, was_measured in zip(estimates, measured, strict=True):
+        same_snow = np.abs(snow_share(estimate.albedo) - snow_share(mean)) < 0.5
         use = unchanged & (was_measured | same_snow)
         result.append(
             replace(
-                known,
-                albedo=np.where(use[..., None], mean, known.albedo).astype(np.float32),
-                sigma=np.where(use, joint_sigma, known.sigma).astype(np.float32),
-                source=np.where(use, 1, known.source).astype(np.uint8),
+                estimate,
+                albedo=np.where(use[..., None], mean, estimate.albedo).astype(np.float32),
+                sigma=np.where(use, joint_sigma, estimate.sigma).astype(np.float32),
+                source=np.where(use, 1, estimate.source).astype(np.uint8),
             )
         )
     return result

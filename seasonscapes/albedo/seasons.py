@@ -61,6 +61,42 @@ class DatedAlbedo:
     load: Callable[[], Texture]
 
 
+@dataclass(frozen=True)
+class AlbedoSeries:
+    """Dated albedos of a place and how to interpolate between them.
+
+    Parameters
+    ----------
+    dated
+        Albedo textures, at least one; sorted by date on construction.
+    season
+        Interpolation between the dates, a name in `SEASONS`: ``blended`` linearly in time, ``nearest`` not at all,
+        ``snow-line`` with a moving snow line (`interpolate_albedo`).
+
+    Raises
+    ------
+    ValueError
+        If there is no date, or the season is unknown.
+
+    Examples
+    --------
+    >>> days = date(2024, 8, 1), date(2024, 2, 1)
+    >>> series = AlbedoSeries(tuple(DatedAlbedo(day, "", lambda: None) for day in days), "snow-line")
+    >>> [dated.day.month for dated in series.dated]
+    [2, 8]
+    """
+
+    dated: tuple[DatedAlbedo, ...]
+    season: str = "blended"
+
+    def __post_init__(self) -> None:
+        if not self.dated:
+            raise ValueError("AlbedoSeries: no dated albedo, expected at least one")
+        if self.season not in SEASONS:
+            raise ValueError(f"AlbedoSeries: season: got {self.season!r}, expected one of {', '.join(SEASONS)}")
+        object.__setattr__(self, "dated", tuple(sorted(self.dated, key=lambda dated: dated.day)))
+
+
 def snow_share(albedo: np.ndarray) -> np.ndarray:
     """Estimate the snow-covered fraction of surfaces from their albedo.
 

@@ -12,12 +12,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from seasonscapes.albedo.closed_form import AlbedoFit, SolverOptions, solve_albedo
+from seasonscapes.albedo.closed_form import SearchOptions, solve_albedo
 from seasonscapes.albedo.forward_model import TexelTransport
 from seasonscapes.albedo.photographs import EIGHT_BIT, AlbedoPhotograph, NoiseModel, thinned_photographs
 from seasonscapes.images import linear_from_srgb, srgb_from_linear
 
-_QUICK = SolverOptions(rounds=3, iterations=8)
 STRENGTHS = (0.0, 0.2, 0.4, 0.6)
 
 
@@ -92,9 +91,7 @@ def fit_tone_curve(
     *,
     strengths: Sequence[float] = STRENGTHS,
     noise_model: NoiseModel = EIGHT_BIT,
-    fraction: float = 0.2,
-    start: AlbedoFit | None = None,
-    seed: int = 0,
+    search: SearchOptions | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> ToneCurveFit:
     """Estimate the strength of the S-curve that all photographs share (one type of webcam).
@@ -109,12 +106,8 @@ def fit_tone_curve(
         Strengths to try, rising, at least three; the minimum is refined by a parabola.
     noise_model
         Standard deviations that weight the residuals.
-    fraction
-        Fraction of the pixels used.
-    start
-        Initial albedo fit.
-    seed
-        Seed of the drawn pixels.
+    search
+        Pixels, initial albedo and iterations of each trial fit; defaults if omitted.
     progress
         Called with the finished fraction.
 
@@ -130,10 +123,10 @@ def fit_tone_curve(
     NoUsablePixels, NotEnoughEvidence
         See `closed_form.solve_albedo`.
     """
-    report = progress or (lambda fraction: None)
+    report, search = progress or (lambda fraction: None), search or SearchOptions()
     if len(strengths) < 3:
         raise ValueError(f"fit_tone_curve: got {len(strengths)} strengths, expected at least three")
-    thinned = thinned_photographs(photographs, fraction, seed)
+    thinned = thinned_photographs(photographs, search.fraction, search.seed)
     costs: dict[float, float] = {}
 
     def cost_at(strength: float) -> float:
@@ -141,8 +134,8 @@ def fit_tone_curve(
             transport,
             with_tone_curve(thinned, strength),
             noise_model=noise_model,
-            solver=_QUICK,
-            start=None if start is None else start.albedo,
+            solver=search.solver,
+            start=None if search.start is None else search.start.albedo,
         )
         costs[strength] = fit.cost
         report(len(costs) / (len(strengths) + 1))

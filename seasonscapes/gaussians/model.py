@@ -121,15 +121,30 @@ class GaussianModel:
         return albedo_at(self.albedo, self.days, day, attributes)
 
 
+@dataclass(frozen=True)
+class LearnedParameters:
+    """Trained parameters of an appearance, from `splat_view.learned_parameters`.
+
+    Parameters
+    ----------
+    kind
+        Kind of appearance, a name in `appearance.KINDS`.
+    arrays
+        Parameters by name: those of `GaussianModel.appearance`, and ``embedding (N, D)`` unless the kind has no network.
+    """
+
+    kind: str
+    arrays: dict[str, np.ndarray]
+
+
 def model_from(
     surfels: Surfels,
     albedo: np.ndarray,
     days: Sequence[float] | np.ndarray,
     transport: DiscTransport,
+    learned: LearnedParameters,
     *,
-    kind: str,
     frame: LocalFrame,
-    appearance: dict[str, np.ndarray],
     note: dict[str, Any] | None = None,
 ) -> GaussianModel:
     """Assemble a model from discs, dated albedos, transport and learned parameters.
@@ -144,12 +159,10 @@ def model_from(
         ``(M,)`` days of the year of these dates, rising.
     transport
         Light transport of the discs.
-    kind
-        Kind of appearance, a name in `appearance.KINDS`.
+    learned
+        Trained parameters of the appearance.
     frame
         Local frame of the positions.
-    appearance
-        Learned parameters by name, from `splat_view.learned_parameters`.
     note
         Plain values that record how the model was made.
 
@@ -158,8 +171,8 @@ def model_from(
     GaussianModel
         Relightable model.
     """
-    learned = dict(appearance)
-    features = learned.pop("embedding", np.zeros((len(surfels.means), 0), np.float32))
+    parameters = dict(learned.arrays)
+    features = parameters.pop("embedding", np.zeros((len(surfels.means), 0), np.float32))
     return GaussianModel(
         surfels.means,
         surfels.quaternions,
@@ -169,8 +182,8 @@ def model_from(
         np.asarray(albedo, np.float32),
         np.asarray(days, np.float64),
         transport,
-        learned,
-        kind,
+        parameters,
+        learned.kind,
         surfels.grid,
         surfels.cell,
         frame,

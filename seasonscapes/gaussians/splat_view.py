@@ -11,7 +11,7 @@ from seasonscapes.cameras.pinhole import Camera, ray_directions
 from seasonscapes.errors import NoTerrainInView
 from seasonscapes.gaussians.appearance import Appearance, colours_at, fourier_embedding
 from seasonscapes.gaussians.disc_transport import LightState, light_state, neighbourhood_mean
-from seasonscapes.gaussians.model import GaussianModel
+from seasonscapes.gaussians.model import GaussianModel, LearnedParameters
 from seasonscapes.gaussians.rasterise import (
     ALPHA_CUT,
     ALPHA_MOST,
@@ -32,6 +32,22 @@ from seasonscapes.sky.illumination import AerialPerspective, Illumination
 FULL_COVERAGE = 0.85
 NOTHING_IN_VIEW = "no Gaussian in the camera's view; it may face away from the terrain or be inside the mountain"
 SPLAT_LIMITS = SplatLimits(ALPHA_CUT, ALPHA_MOST, PIXEL_VARIANCE, NEAR_M, one_sided=True)
+
+
+@dataclass(frozen=True)
+class RasterOptions:
+    """Options of rasterisation.
+
+    Parameters
+    ----------
+    subpixels
+        Samples along a pixel's side; not used on CUDA.
+    device
+        ``cpu``, or ``cuda`` with gsplat.
+    """
+
+    subpixels: int = 2
+    device: str = "cpu"
 
 
 @dataclass(frozen=True)
@@ -85,7 +101,7 @@ def appearance_of(model: GaussianModel, *, albedo: np.ndarray | None = None, see
     return appearance
 
 
-def learned_parameters(appearance: Appearance) -> dict[str, np.ndarray]:
+def learned_parameters(appearance: Appearance) -> LearnedParameters:
     """Copy the trainable parameters of an appearance to numpy, for `model.model_from`.
 
     Parameters
@@ -95,10 +111,11 @@ def learned_parameters(appearance: Appearance) -> dict[str, np.ndarray]:
 
     Returns
     -------
-    dict
-        Arrays by parameter name.
+    LearnedParameters
+        Kind of the appearance, and arrays by parameter name.
     """
-    return {name: parameter.detach().numpy().copy() for name, parameter in appearance.named_parameters()}
+    arrays = {name: parameter.detach().numpy().copy() for name, parameter in appearance.named_parameters()}
+    return LearnedParameters(appearance.kind, arrays)
 
 
 def model_colours(model: GaussianModel, illumination: Illumination, day: float) -> tuple[np.ndarray, LightState]:
@@ -188,8 +205,7 @@ def render_model(
     *,
     weights: ViewWeights | None = None,
     colours: tuple[np.ndarray, LightState] | None = None,
-    subpixels: int = 2,
-    device: str = "cpu",
+    raster: RasterOptions | None = None,
 ) -> SplatView:
     """Render a Gaussian model for a camera under a light.
 
@@ -205,10 +221,8 @@ def render_model(
         Day of the year, for the albedo.
     weights, colours
         Results of `model_weights` and `model_colours`, if one of them is reused for many pictures.
-    subpixels
-        Samples along a pixel's side, if ``weights`` are not given.
-    device
-        ``cpu``, or ``cuda`` with gsplat.
+    raster
+        Subpixels and device of the rasteriser, if ``weights`` are not given; defaults if omitted.
 
     Returns
     -------
@@ -224,13 +238,14 @@ def render_model(
     InputError
         If CUDA is requested but not available.
     """
+    raster = raster or RasterOptions()
     values, state = colours or model_colours(model, illumination, day)
     distance = np.linalg.norm(model.means - camera.position_m.astype(np.float32), axis=1)
     layers = np.concatenate([values * np.float32(state.global_lx / np.pi), distance[:, None]], axis=1)
     if weights is not None:
         blended, coverage = splat_colours(weights, layers), weights.coverage
     else:
-        blended, coverage = draw_layers(model, camera, layers, subpixels=subpixels, device=device)
+        blended, coverage = draw_layers(model, camera, layers, raster)
     # Neighbouring discs leave gaps of a few per cent, through which the sky must not shine.
     solid = np.clip(coverage / FULL_COVERAGE, 0.0, 1.0)
     mean = blended / np.maximum(coverage, 1e-6)[..., None]
@@ -241,7 +256,7 @@ def render_model(
 
 
 def draw_layers(
-    model: GaussianModel, camera: Camera, layers: np.ndarray, *, subpixels: int = 1, device: str = "cpu"
+    model: GaussianModel, camera: Camera, layers: np.ndarray, raster: RasterOptions
 ) -> tuple[np.ndarray, np.ndarray]:
     """Blend layers of the Gaussians with the fastest rasteriser of a device.
 
@@ -255,10 +270,8 @@ def draw_layers(
         The view.
     layers
         ``(N, C)`` values to blend.
-    subpixels
-        Samples along a pixel's side; not used on CUDA.
-    device
-        ``cpu``, or ``cuda`` with gsplat.
+    raster
+        Subpixels and device of the rasteriser.
 
     Returns
     -------
@@ -272,16 +285,17 @@ def draw_layers(
     InputError
         If CUDA is requested but not available.
     """
-    if device == "cuda":
+    if raster.device == "cuda":
         from seasonscapes.gaussians.rasterise_cuda import rasterise_cuda
 
         splats = splats_of(model, viewpoint_m=camera.position_m)
         cuda_picture, cuda_coverage = rasterise_cuda(splats, torch.from_numpy(layers), camera)
         blended, coverage = cuda_picture.detach().cpu().numpy(), cuda_coverage.detach().cpu().numpy()
     elif use_backend().device == "scalar":
-        weights = model_weights(model, camera, subpixels=subpixels)
+        weights = model_weights(model, camera, subpixels=raster.subpixels)
         blended, coverage = splat_colours(weights, layers), weights.coverage
     else:
+        subpixels = raster.subpixels
         fine = finer_camera(camera, subpixels)
         blended, coverage = splat_layers(upload_model(model), layers, fine, SPLAT_LIMITS)
         shape = (camera.height_px, subpixels, camera.width_px, subpixels)

@@ -282,7 +282,6 @@ def _solved(
             transport,
             photographs,
             fit,
-            noise_model=EIGHT_BIT,
             options=options,
             callbacks=[lambda state: refine(state.iteration / iterations)],
         ).fit

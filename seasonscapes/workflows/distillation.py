@@ -220,9 +220,8 @@ def distil_with_data(
         data.albedo,
         data.days,
         data.transport,
-        kind=options.kind,
+        learned_parameters(appearance),
         frame=place.frame,
-        appearance=learned_parameters(appearance),
         note=note,
     )
     return Distilled(model, data, losses)

@@ -83,26 +83,26 @@ def render_gaussians(
     """
     require_torch()
     from seasonscapes.gaussians.rasterise import set_torch_threads
-    from seasonscapes.gaussians.splat_view import render_model
+    from seasonscapes.gaussians.splat_view import RasterOptions, render_model
 
     set_torch_threads(1)
     require_scene(model, place)
     camera = view_in_frame(camera, place.frame)
     utc = utc_at(place, time)
     light, _ = illumination_for_camera(place, camera, sky_model(sky), utc)
-    return render_model(model, camera, light, day_of_year(utc), subpixels=subpixels, device=device)
+    return render_model(model, camera, light, day_of_year(utc), raster=RasterOptions(subpixels, device))
 
 
 def timed_view(
     model: GaussianModel, camera: Camera, light: Illumination, day: float, *, subpixels: int, device: str
 ) -> tuple[SplatView, dict[str, float]]:
     """`render_gaussians` for a known light, and the milliseconds of colouring and rasterisation."""
-    from seasonscapes.gaussians.splat_view import model_colours, render_model
+    from seasonscapes.gaussians.splat_view import RasterOptions, model_colours, render_model
 
     start = clock.perf_counter()
     colours = model_colours(model, light, day)
     middle = clock.perf_counter()
-    view = render_model(model, camera, light, day, colours=colours, subpixels=subpixels, device=device)
+    view = render_model(model, camera, light, day, colours=colours, raster=RasterOptions(subpixels, device))
     end = clock.perf_counter()
     return view, {"colours_ms": round(1e3 * (middle - start), 1), "render_ms": round(1e3 * (end - middle), 1)}
 
