@@ -20,8 +20,8 @@ from seasonscapes.calibration.resection import Calibration, resect
 from seasonscapes.cameras.observation import Observation
 from seasonscapes.cameras.panorama import Panorama, cut_view, split_panorama
 from seasonscapes.cameras.pinhole import Camera, rotation_from_angles
-from seasonscapes.evaluation.splits import held_out_times, check_no_leakage, picture_use
-from seasonscapes.evaluation.synthetic_webcams import SyntheticPicture, WebcamInstant, webcam_series
+from seasonscapes.evaluation.splits import check_no_leakage, held_out_times, picture_use
+from seasonscapes.evaluation.synthetic_webcams import SyntheticPicture, WebcamInstant, WebcamOptions, webcam_series
 from seasonscapes.evaluation.webcam_faults import TYPICAL, PoseSigmas, perturb_pose
 from seasonscapes.frames import LocalFrame
 from seasonscapes.rendering.gbuffer import trace_gbuffer
@@ -344,9 +344,8 @@ def series(world: World, number: int, name: str) -> list[SyntheticPicture]:
     """Pictures of one webcam at all hours, at full physics and with a webcam's faults."""
     camera = [*world.painting, *world.judged][number]
     made = [WebcamInstant(time, world.lights[time][number], world.albedo) for time in world.hours]
-    return webcam_series(
-        world.terrain, name, camera, made, faults=TYPICAL, sampling=world.size.sampling, seed=world.seed
-    )
+    options = WebcamOptions(TYPICAL, sampling=world.size.sampling)
+    return webcam_series(world.terrain, name, camera, made, options=options, seed=world.seed)
 
 
 def calibrated_by_clicks(world: World, number: int, picture: SyntheticPicture) -> Calibration:
@@ -363,7 +362,7 @@ def calibrated_by_clicks(world: World, number: int, picture: SyntheticPicture) -
 
 def pose_errors(calibrated: Calibration, truth: Panorama) -> tuple[float, float]:
     """Heading error [deg] and distance of the place [m]."""
-    off = calibrated.values - parameters_of_view(truth, np.eye(3))
+    off = calibrated.parameters - parameters_of_view(truth, np.eye(3))
     return abs((off[0] + 180.0) % 360.0 - 180.0), float(np.linalg.norm(off[3:6]))
 
 

@@ -21,9 +21,9 @@ import numpy as np
 
 from seasonscapes.calibration.evidence import Correspondences, Priors
 from seasonscapes.calibration.overlay import save_overlay
-from seasonscapes.calibration.pose_model import values_of
-from seasonscapes.calibration.resection import leave_one_out, resect
-from seasonscapes.calibration.skyline import SearchRange, align_to_skyline, encoded_from_file
+from seasonscapes.calibration.pose_model import parameters_of_view
+from seasonscapes.calibration.resection import ResectionOptions, leave_one_out, resect
+from seasonscapes.calibration.skyline import SearchRange, align_to_skyline, read_image_srgb8
 from seasonscapes.cameras.pinhole import camera_at
 from seasonscapes.evaluation.calibration_pictures import picture_trial
 from seasonscapes.evaluation.calibration_trials import point_trial, score_points
@@ -32,6 +32,7 @@ from seasonscapes.terrain.crs import geodetic_from_map
 from seasonscapes.terrain.raster import read_elevation
 
 TRIAL_SEARCH = SearchRange(priors=Priors(tilt_deg=2.0, roll_deg=1.0, horizontal_m=3.0, vertical_m=2.0, focal=0.0))
+SQUARES = ResectionOptions(loss="squares")
 
 
 def apart(a: float, b: float) -> float:
@@ -96,7 +97,7 @@ def by_skyline(trials: int, seed: int) -> dict:
 def _error(fit, trial) -> float:
     if fit.calibration is None:
         return 180.0
-    return apart(fit.calibration.values[0], values_of(trial.truth, fit.horizon.axes)[0])
+    return apart(fit.calibration.parameters[0], parameters_of_view(trial.truth, fit.horizon.axes)[0])
 
 
 def finse(folder: Path, figures: Path | None) -> dict:
@@ -112,19 +113,20 @@ def finse(folder: Path, figures: Path | None) -> dict:
     )
     start = camera_at(frame, latitude, longitude, 1212.0, heading_deg=66.0, fov_deg=65.8, size_px=(1920, 1080))
     priors = Priors(k1=np.inf)
-    everyone = resect(start, points, priors=priors, loss="squares")
+    everyone = resect(start, points, priors=priors, options=SQUARES)
     robust = resect(start, points, priors=priors)
-    left_out = leave_one_out(start, points, priors=priors, loss="squares")
+    left_out = leave_one_out(start, points, priors=priors, options=SQUARES)
     rasters = [read_elevation(folder / "dsm_4m.tif"), read_elevation(folder / "dem_context_aster_100m.tif")]
     search = SearchRange(
         tilt_deg=10.0,
         focal=0.06,
         priors=Priors(tilt_deg=10.0, roll_deg=3.0, horizontal_m=3.0, vertical_m=3.0, focal=0.05, k1=0.1),
+        k1=-0.2,
     )
-    image = encoded_from_file(folder / "2019-05-24_12-00-01.jpg")
+    image = read_image_srgb8(folder / "2019-05-24_12-00-01.jpg")
     mask = np.ones(image.shape[:2], bool)
     mask[:60] = False
-    fit = align_to_skyline(image, start, rasters, frame, mask=mask, search=search, k1=-0.2)
+    fit = align_to_skyline(image, start, rasters, frame, mask=mask, search=search)
     if figures:
         save_overlay(
             figures / "finse_points.png", image, robust, points=points, horizon=fit.horizon, title="Finse, points"
@@ -136,7 +138,7 @@ def finse(folder: Path, figures: Path | None) -> dict:
         "finse_rms_px": everyone.rms_px,
         "finse_inlier_rms_px": robust.inlier_rms_px,
         "finse_leave_one_out_px": float(np.sqrt(np.mean(np.sum(left_out**2, axis=1)))),
-        "finse_skyline_minus_points_deg": apart(fit.calibration.values[0], robust.values[0]),
+        "finse_skyline_minus_points_deg": apart(fit.calibration.parameters[0], robust.parameters[0]),
         "finse_skyline_sigma_deg": fit.heading_sigma_deg,
         "finse_skyline_trusted": int(fit.reliable),
     }
@@ -154,10 +156,10 @@ def aletsch(folder: Path, figures: Path | None) -> dict:
         frame, 46.4314217, 8.0932999, 2929.0, heading_deg=-63.37, pitch_deg=-11.28, fov_deg=63.08, size_px=(1024, 763)
     )
     rasters, numbers = [read_elevation(folder / "dem_aster_25m.tif")], {}
-    image = encoded_from_file(folder / "photo_07861v.jpg")
+    image = read_image_srgb8(folder / "photo_07861v.jpg")
     for sigma_m in (5.0, 10.0):
         priors = Priors(horizontal_m=sigma_m, vertical_m=sigma_m)
-        solved = resect(start, points, priors=priors, loss="squares")
+        solved = resect(start, points, priors=priors, options=SQUARES)
         search = SearchRange(
             heading_deg=10.0,
             tilt_deg=5.0,
@@ -167,10 +169,10 @@ def aletsch(folder: Path, figures: Path | None) -> dict:
         )
         fit = align_to_skyline(image, start, rasters, frame, search=search)
         numbers[f"aletsch_skyline_minus_points_deg_gps{sigma_m:.0f}m"] = apart(
-            fit.calibration.values[0], solved.values[0]
+            fit.calibration.parameters[0], solved.parameters[0]
         )
         numbers[f"aletsch_points_sigma_deg_gps{sigma_m:.0f}m"] = solved.sigma["heading_deg"]
-    free = resect(start, points, priors=Priors(horizontal_m=np.inf, vertical_m=np.inf), loss="squares")
+    free = resect(start, points, priors=Priors(horizontal_m=np.inf, vertical_m=np.inf), options=SQUARES)
     numbers["aletsch_rms_px"] = free.rms_px
     if figures:
         save_overlay(figures / "aletsch_points.png", image, free, points=points, title="Aletsch, points")

@@ -311,7 +311,7 @@ def without_image(bed: Testbed) -> Testbed:
 def _finse_painted(folder: Path):
     """Heights, spacing, camera cell, and both photographs ``(H, W, 3)`` on the ground (linear, NaN where not seen)."""
     from seasonscapes.calibration.evidence import Correspondences, Priors
-    from seasonscapes.calibration.pose_model import project_values
+    from seasonscapes.calibration.pose_model import project_with_parameters
     from seasonscapes.calibration.resection import resect
     from seasonscapes.cameras.pinhole import camera_at
     from seasonscapes.frames import LocalFrame, enu_from_geodetic
@@ -332,9 +332,9 @@ def _finse_painted(folder: Path):
     c, r = np.meshgrid(np.arange(z.shape[1]) + 0.5, np.arange(z.shape[0]) + 0.5)
     east, north = raster.transform * (c.ravel(), r.ravel())
     places = enu_from_geodetic(frame, *geodetic_from_map("EPSG:25832", east, north), np.nan_to_num(z).ravel())
-    pixel, in_front = project_values(start, np.eye(3), pose.values, places)
+    pixel, in_front = project_with_parameters(start, np.eye(3), pose.parameters, places)
     pixel = pixel.reshape(*z.shape, 2)
-    away_m = np.linalg.norm(places - pose.values[3:6], axis=1).reshape(z.shape)
+    away_m = np.linalg.norm(places - pose.parameters[3:6], axis=1).reshape(z.shape)
     stand = ((419169.2 - raster.transform.c) / 4.0 - 0.5, (raster.transform.f - 6718421.3) / 4.0 - 0.5, 1215.3)
     filled = np.where(np.isfinite(z), z, 1000.0).astype(np.float32)
     sees = viewshed(filled, 4.0, stand, 62.3, 70.0) & np.isfinite(z) & in_front.reshape(z.shape) & (away_m > 60.0)

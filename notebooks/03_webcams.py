@@ -30,7 +30,7 @@ from seasonscapes.calibration.evidence import Correspondences, Priors
 from seasonscapes.calibration.overlay import draw_overlay
 from seasonscapes.calibration.resection import resect
 from seasonscapes.cameras.panorama import panorama_from_angles, split_panorama
-from seasonscapes.evaluation.splits import held_out_hours, refuse_leaks, use_of
+from seasonscapes.evaluation.splits import check_no_leakage, held_out_times, picture_use
 from seasonscapes.evaluation.synthetic_webcams import WebcamInstant, webcam_series
 from seasonscapes.evaluation.webcam_faults import CLEAN, SEVERE, TYPICAL, PoseSigmas, degrade, perturb_pose
 from seasonscapes.sky.models import read_sky_model
@@ -50,7 +50,11 @@ hours = []
 for hour in (7, 9, 12, 15):
     time = datetime(2024, 9, 11, hour, tzinfo=UTC)
     hours.append(
-        WebcamInstant(time, illumination_for_camera(place, camera, read_sky_model("clear"), time)[0], albedo_for(place, time).values)
+        WebcamInstant(
+            time,
+            illumination_for_camera(place, camera, read_sky_model("clear"), time)[0],
+            albedo_for(place, time).values,
+        )
     )
 pictures = webcam_series(place.terrain, "west", camera, hours)
 figure, axes = plt.subplots(1, 4, figsize=(15, 3))
@@ -101,11 +105,11 @@ print([f"{view.width_px} x {view.height_px}" for view in split_panorama(panorama
 # What is judged must not have been used: hours are held out, and a leak is refused by webcam, instant and pixels.
 
 # %%
-used, held = held_out_hours([hour.time for hour in hours], 2)
-painting = [use_of(picture.observation, "painting") for picture in pictures if picture.observation.time in used]
-judged = [use_of(picture.observation, "evaluation") for picture in pictures if picture.observation.time in held]
-refuse_leaks(judged, painting, kind="hour")
+used, held = held_out_times([hour.time for hour in hours], 2)
+painting = [picture_use(picture.observation, "painting") for picture in pictures if picture.observation.time in used]
+judged = [picture_use(picture.observation, "evaluation") for picture in pictures if picture.observation.time in held]
+check_no_leakage(judged, painting, kind="hour")
 try:
-    refuse_leaks([use_of(pictures[0].observation, "evaluation")], painting)
+    check_no_leakage([picture_use(pictures[0].observation, "evaluation")], painting)
 except ValueError as leak:
     print(leak)

@@ -28,7 +28,7 @@ import numpy as np
 from seasonscapes.evaluation.figures import comparison_figure
 from seasonscapes.evaluation.masks import terrain_mask
 from seasonscapes.evaluation.metrics import score
-from seasonscapes.evaluation.synthetic_webcams import WebcamInstant, webcam_series
+from seasonscapes.evaluation.synthetic_webcams import WebcamInstant, WebcamOptions, webcam_series
 from seasonscapes.exposure import develop, exposure_ev100
 from seasonscapes.images import srgb_from_linear
 from seasonscapes.rendering.hemisphere_rays import ray_scene
@@ -62,9 +62,8 @@ shots, shown = [], []
 for name in ("west", "middle", "south"):
     camera = camera_for(place, place.scene.camera(name), size_px=(210, 140))
     light, _ = illumination_for_camera(place, camera, model, time)
-    picture = webcam_series(
-        place.terrain, name, camera, [WebcamInstant(time, light, albedo.values)], sampling=sampling
-    )[0]
+    instant, options = WebcamInstant(time, light, albedo.values), WebcamOptions(sampling=sampling)
+    picture = webcam_series(place.terrain, name, camera, [instant], options=options)[0]
     shots.append(PaintingInput(picture.observation, light.aerial_perspective))
     shown.append(picture.encoded)
 plt.figure(figsize=(14, 4))

@@ -30,7 +30,7 @@ from seasonscapes.albedo.forward_model import trace_texel_transport
 from seasonscapes.albedo.photographs import EIGHT_BIT, prepare_photographs
 from seasonscapes.albedo.standard_error import texel_sigma, times_sunlit
 from seasonscapes.evaluation.surfaces import albedo_error
-from seasonscapes.evaluation.synthetic_webcams import WebcamInstant, webcam_series
+from seasonscapes.evaluation.synthetic_webcams import WebcamInstant, WebcamOptions, webcam_series
 from seasonscapes.evaluation.webcam_faults import WebcamFaults
 from seasonscapes.images import srgb_from_linear
 from seasonscapes.rendering.transport import SamplingOptions
@@ -56,9 +56,8 @@ for name in ("west", "south"):
     camera = camera_for(place, place.scene.camera(name), size_px=(180, 120))
     times = [day.replace(hour=hour) for hour in (7, 10, 13, 15)]
     hours = [WebcamInstant(time, illumination_for_camera(place, camera, model, time)[0], truth) for time in times]
-    pictures = webcam_series(
-        place.terrain, name, camera, hours, faults=WebcamFaults(tone_strength=0.0), sampling=sampling
-    )
+    options = WebcamOptions(WebcamFaults(tone_strength=0.0), sampling=sampling)
+    pictures = webcam_series(place.terrain, name, camera, hours, options=options)
     observations += [picture.observation for picture in pictures]
     lights += [hour.illumination for hour in hours]
     shown.append(np.concatenate([picture.encoded for picture in pictures], axis=1))

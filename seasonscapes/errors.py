@@ -45,6 +45,10 @@ class NoTerrainInView(SeasonscapesError, ValueError):
     """A camera's image shows no part of the terrain."""
 
 
+class CameraBelowGround(SeasonscapesError, ValueError):
+    """A camera lies below the terrain surface."""
+
+
 class NoUsablePixels(SeasonscapesError, ValueError):
     """No pixel of the given photographs can be used: all are masked, clipped, too near or show no terrain."""
 
@@ -55,6 +59,10 @@ class NotEnoughEvidence(SeasonscapesError, ValueError):
 
 class UnreadableImage(SeasonscapesError, ValueError):
     """A file is not an image that can be decoded."""
+
+
+class ImageSizeMismatch(SeasonscapesError, ValueError):
+    """An image has another size than the view that it is used with."""
 
 
 class InvalidPath(SeasonscapesError, ValueError):

@@ -4,6 +4,7 @@ import json
 import shutil
 import urllib.error
 import urllib.request
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -12,8 +13,8 @@ import pytest
 from seasonscapes.calibration.annotation import (
     AnnotationSession,
     add_match,
-    describe_position,
     position_at,
+    project_to_photograph,
     remove_last_match,
     save_session,
     serve_session,
@@ -22,9 +23,9 @@ from seasonscapes.calibration.annotation import (
 )
 from seasonscapes.calibration.calibration_file import read_calibration
 from seasonscapes.calibration.evidence import Priors, read_points
-from seasonscapes.calibration.pose_model import project_values, values_of
-from seasonscapes.calibration.terrain_view import look_at_rasters, look_with, scaled_view
-from seasonscapes.declaration import InputError
+from seasonscapes.calibration.pose_model import parameters_of_view, project_with_parameters
+from seasonscapes.calibration.terrain_view import march_terrain_view, scaled_view, trace_terrain_view
+from seasonscapes.errors import ImageSizeMismatch, InputError
 from seasonscapes.evaluation.calibration_pictures import picture_trial
 
 SIZE = (640, 427)
@@ -32,12 +33,12 @@ SIZE = (640, 427)
 
 @pytest.fixture(scope="module")
 def trial():
-    return picture_trial(np.random.default_rng(2), size_px=SIZE, covered=0.0, heading_off_deg=4.0)
+    return picture_trial(np.random.default_rng(2), size_px=SIZE, covered=0.0, heading_error_deg=4.0)
 
 
 @pytest.fixture
 def session(trial, tmp_path):
-    look = partial(look_at_rasters, rasters=trial.rasters, frame=trial.frame, nearest_m=120.0)
+    look = partial(march_terrain_view, rasters=trial.rasters, frame=trial.frame, nearest_m=120.0)
     return AnnotationSession(
         "HUT",
         trial.image,
@@ -50,7 +51,9 @@ def session(trial, tmp_path):
 
 
 def true_pixel(trial, position):
-    return project_values(trial.truth, np.eye(3), values_of(trial.truth, np.eye(3)), position[None])[0][0]
+    return project_with_parameters(trial.truth, np.eye(3), parameters_of_view(trial.truth, np.eye(3)), position[None])[
+        0
+    ][0]
 
 
 def good_places(session, trial, count):
@@ -74,18 +77,20 @@ def good_places(session, trial, count):
 def test_what_is_picked_is_the_first_surface_and_the_sky_is_refused(session, trial):
     y, x = np.argwhere(np.isfinite(session.terrain_view.distance_m))[5000]
     place = position_at(session, (x + 0.5, y + 0.5))
-    pixel, _ = project_values(
-        session.rendered_view, np.eye(3), values_of(session.rendered_view, np.eye(3)), place[None]
+    pixel, _ = project_with_parameters(
+        session.rendered_view, np.eye(3), parameters_of_view(session.rendered_view, np.eye(3)), place[None]
     )
     assert np.abs(pixel[0] - [x + 0.5, y + 0.5]).max() < 1.0
     sky = np.argwhere(~np.isfinite(session.terrain_view.distance_m))[0]
     with pytest.raises(ValueError, match="is sky"):
         add_match(session, (5, 5), (sky[1], sky[0]))
-    assert describe_position(session, (sky[1], sky[0])) is None
+    assert project_to_photograph(session, (sky[1], sky[0])) is None
     with pytest.raises(ValueError, match="outside the photograph"):
         add_match(session, (SIZE[0] + 9, 5), (x, y))
     with pytest.raises(ValueError, match="no match to remove"):
         remove_last_match(session)
+    with pytest.raises(ImageSizeMismatch, match="the image is 639 x 427 px"):
+        replace(session, image=session.image[:, 1:])
 
 
 def test_pairs_solve_to_the_truth_and_are_saved(session, trial):
@@ -96,8 +101,8 @@ def test_pairs_solve_to_the_truth_and_are_saved(session, trial):
     after = [np.subtract(p["projected"], p["photo"]) for p in session_state(session)["pairs"]]
     assert np.abs(before).max() > 20.0
     assert np.abs(after).max() < 0.05
-    heading = values_of(trial.truth, np.eye(3))[0]
-    assert session.solution.values[0] == pytest.approx(heading, abs=0.02)
+    heading = parameters_of_view(trial.truth, np.eye(3))[0]
+    assert session.solution.parameters[0] == pytest.approx(heading, abs=0.02)
     points, record = save_session(session)
     assert len(read_points(points, trial.frame)) == 8
     again = read_calibration(record)
@@ -109,9 +114,9 @@ def test_pairs_solve_to_the_truth_and_are_saved(session, trial):
 
 
 def test_a_renderer_can_take_the_marchers_place(session, trial):
-    """`look_with` hands over rays and takes a G-buffer: here the marcher's own, ray by ray."""
+    """`trace_terrain_view` hands over rays and takes a G-buffer: here the marcher's own, ray by ray."""
     view = scaled_view(trial.start, 64)
-    seen = look_at_rasters(view, trial.rasters, trial.frame, nearest_m=120.0)
+    seen = march_terrain_view(view, trial.rasters, trial.frame, nearest_m=120.0)
 
     class Hit:
         depth, normal, position = seen.distance_m, seen.normal, seen.position_m
@@ -122,7 +127,7 @@ def test_a_renderer_can_take_the_marchers_place(session, trial):
         given["shape"], given["unit"] = direction.shape, np.linalg.norm(direction, axis=-1)
         return Hit
 
-    assert np.array_equal(look_with(view, trace).distance_m, seen.distance_m)
+    assert np.array_equal(trace_terrain_view(view, trace).distance_m, seen.distance_m)
     assert given["shape"] == (view.height_px, 64, 3)
     assert np.allclose(given["unit"], 1.0)
 
@@ -226,7 +231,7 @@ def test_the_page_from_click_to_file_in_chromium(session, trial, browser):
         until(lambda: data("solved") == "true")
         until(lambda: "heading" in message())
         # Half a screen pixel of clicking is what remains.
-        error = abs(session.solution.values[0] - values_of(trial.truth, np.eye(3))[0])
+        error = abs(session.solution.parameters[0] - parameters_of_view(trial.truth, np.eye(3))[0])
         assert error < 0.15
         # Live reprojection: hovering shows where a point of the terrain falls in the photograph.
         until(lambda: browser.execute_script("return panes.terrain.image.complete"))

@@ -5,16 +5,17 @@ import csv
 import numpy as np
 import pytest
 
-from seasonscapes.calibration.evidence import Correspondences, Priors, read_points, take, write_points
+from seasonscapes.calibration.evidence import Correspondences, Priors, read_points, select_points, write_points
 from seasonscapes.calibration.pose_model import angles_from_rotation
-from seasonscapes.calibration.resection import leave_one_out, report_lines, resect
+from seasonscapes.calibration.resection import ResectionOptions, leave_one_out, report_lines, resect
 from seasonscapes.cameras.panorama import project_panorama
 from seasonscapes.cameras.pinhole import Camera, camera_at, project, rotation_from_angles
-from seasonscapes.declaration import InputError
+from seasonscapes.errors import CameraBelowGround, InputError
 from seasonscapes.evaluation.calibration_trials import point_trial, reproject, score_points
 from seasonscapes.frames import LocalFrame, enu_from_geodetic
 
 FREE = Priors(horizontal_m=np.inf, vertical_m=np.inf)
+SQUARES = ResectionOptions(loss="squares")
 
 
 def test_angles_are_the_inverse_of_the_rotation():
@@ -36,7 +37,7 @@ def test_the_solver_projects_as_the_cameras_do(panoramic):
 @pytest.mark.parametrize("loss", ["cauchy", "l1", "squares"])
 def test_clean_matches_give_the_truth_to_the_last_digit(panoramic, loss):
     trial = point_trial(np.random.default_rng(5), panoramic=panoramic, noise_px=0.0, outlier_share=0.0)
-    solved = resect(trial.start, trial.points, priors=FREE, loss=loss)
+    solved = resect(trial.start, trial.points, priors=FREE, options=ResectionOptions(loss=loss))
     assert np.abs(solved.view.position_m - trial.truth.position_m).max() < 1e-3
     assert np.abs(solved.view.world_from_camera - trial.truth.world_from_camera)[:3, :3].max() < 1e-6
     assert solved.view.fy == pytest.approx(trial.truth.fy, rel=1e-6)
@@ -66,7 +67,7 @@ def test_200_trials_with_a_fifth_of_the_matches_wrong_keep_what_they_state():
 
 def test_a_start_40_degrees_off_does_no_harm():
     for seed in range(6):
-        trial = point_trial(np.random.default_rng(seed), panoramic=seed % 2 == 0, heading_off_deg=40.0)
+        trial = point_trial(np.random.default_rng(seed), panoramic=seed % 2 == 0, heading_error_deg=40.0)
         assert score_points(trial, noise_px=1.0).heading_error_deg < 0.06
 
 
@@ -96,7 +97,7 @@ def test_an_unknown_held_fixed_stays_and_has_no_error():
 
 def broken(points, how):
     if how == "few":
-        return take(points, [0, 1])
+        return select_points(points, [0, 1])
     if how == "mirror x":
         return Correspondences(np.array([3072.0, 0.0]) + points.pixel * [-1, 1], points.position_m)
     if how == "mirror y":
@@ -142,8 +143,9 @@ def test_nan_and_a_camera_below_ground_and_no_evidence_are_refused():
     with pytest.raises(ValueError, match="point 3 holds NaN"):
         Correspondences(pixel, trial.points.position_m)
     height = trial.truth.position_m[2]
-    with pytest.raises(ValueError, match=r"the start puts the camera \d+ m below ground"):
-        resect(trial.start, trial.points, ground_m=lambda e, n: height + 100.0)
+    options = ResectionOptions(ground_m=lambda e, n: height + 100.0)
+    with pytest.raises(CameraBelowGround, match=r"the start puts the camera \d+ m below ground"):
+        resect(trial.start, trial.points, options=options)
     with pytest.raises(ValueError, match="neither points nor a skyline"):
         resect(trial.start)
     with pytest.raises(ValueError, match="must not be negative or NaN"):
@@ -152,9 +154,9 @@ def test_nan_and_a_camera_below_ground_and_no_evidence_are_refused():
 
 def test_undetermined_unknowns_are_named():
     trial = point_trial(np.random.default_rng(3), panoramic=False, count=12, outlier_share=0.0, noise_px=0.0)
-    one = take(trial.points, np.zeros(8, int))
+    one = select_points(trial.points, np.zeros(8, int))
     with pytest.raises(ValueError, match=r"leaves (focal|roll_deg|tilt_deg|heading_deg) undetermined"):
-        resect(trial.start, one, noise_px=1.0)
+        resect(trial.start, one, options=ResectionOptions(noise_px=1.0))
 
 
 def test_points_survive_their_file(tmp_path):
@@ -199,11 +201,11 @@ def finse(folder):
 def test_finse_resection_with_one_radial_term(data_dir):
     start, points = finse(data_dir)
     priors = Priors(k1=np.inf)
-    solved = resect(start, points, priors=priors, loss="squares")
+    solved = resect(start, points, priors=priors, options=SQUARES)
     assert solved.rms_px < 5.55  # 5.51, the least-squares optimum of this model over all 45 points
     assert solved.k1 == pytest.approx(-0.266, abs=0.01)
-    assert solved.values[0] == pytest.approx(61.0, abs=0.1)
-    without = leave_one_out(start, points, priors=priors, loss="squares")
+    assert solved.parameters[0] == pytest.approx(61.0, abs=0.1)
+    without = leave_one_out(start, points, priors=priors, options=SQUARES)
     assert np.sqrt(np.mean(np.sum(without**2, axis=1))) < 6.5  # 5.96
     assert resect(start, points, priors=priors).inlier_rms_px < 4.6
 
@@ -222,6 +224,6 @@ def test_aletsch_resection(data_dir):
     start: Camera = camera_at(
         frame, 46.4314217, 8.0932999, 2929.0, heading_deg=-63.37, pitch_deg=-11.3, fov_deg=63.08, size_px=(1024, 763)
     )
-    solved = resect(start, points, priors=Priors(horizontal_m=100.0, vertical_m=100.0), loss="squares")
+    solved = resect(start, points, priors=Priors(horizontal_m=100.0, vertical_m=100.0), options=SQUARES)
     assert solved.rms_px < 8.0
-    assert solved.values[0] == pytest.approx(296.9, abs=0.3)
+    assert solved.parameters[0] == pytest.approx(296.9, abs=0.3)

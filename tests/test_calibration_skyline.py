@@ -6,14 +6,21 @@ import numpy as np
 import pytest
 from affine import Affine
 
-from seasonscapes.calibration.boundary_map import boundary_map, picture_area
+from seasonscapes.calibration.boundary_map import boundary_map, detect_border_mask
 from seasonscapes.calibration.evidence import Correspondences, Priors
 from seasonscapes.calibration.overlay import draw_overlay, save_overlay
-from seasonscapes.calibration.pose_model import project_values, values_of, view_from_values
+from seasonscapes.calibration.pose_model import parameters_of_view, project_with_parameters, view_from_parameters
 from seasonscapes.calibration.resection import resect
-from seasonscapes.calibration.skyline import SearchRange, align_to_skyline, encoded_from_file
-from seasonscapes.calibration.terrain_horizon import horizon_from, terrain_height, terrain_profile
+from seasonscapes.calibration.skyline import SearchRange, align_to_skyline, read_image_srgb8
+from seasonscapes.calibration.terrain_horizon import (
+    HorizonOptions,
+    cell_size_m,
+    horizon_from,
+    terrain_height,
+    terrain_profile,
+)
 from seasonscapes.cameras.pinhole import camera_at
+from seasonscapes.errors import CameraBelowGround, ImageSizeMismatch
 from seasonscapes.evaluation.calibration_pictures import panorama_trial, picture_trial
 from seasonscapes.frames import MEAN_RADIUS_M, LocalFrame, enu_from_geodetic, geodetic_from_enu
 from seasonscapes.terrain.crs import geodetic_from_map, map_from_geodetic
@@ -66,7 +73,8 @@ def test_a_cone_is_seen_at_its_summit_and_true_north_is_not_grid_north():
     north = y + 15_000 - (np.arange(cells) + 0.5) * cell
     height = np.maximum(2500.0 - 0.8 * np.hypot(east[None] - x, north[:, None] - y), 300.0).astype(np.float32)
     raster = Raster(height[..., None], Affine(cell, 0, x - 15_000, 0, -cell, y + 15_000), CRS)
-    horizon = horizon_from([raster], frame, [0, 0, 700.0], azimuth_deg=np.arange(-10, 10, 0.05), below_ground_m=50.0)
+    options = HorizonOptions(below_ground_m=50.0)
+    horizon = horizon_from([raster], frame, [0, 0, 700.0], azimuth_deg=np.arange(-10, 10, 0.05), options=options)
     summit = horizon.azimuth_deg[np.argmax(horizon.skyline_elevation_deg)]
     assert abs(summit) < 0.15
     grid = np.degrees(np.arctan2(*(np.array([x, y]) - np.ravel(map_from_geodetic(CRS, 46.6, 7.6)))))
@@ -113,8 +121,18 @@ def test_terrain_that_ends_rising_gives_no_horizon_and_a_finer_raster_goes_first
     fine = raster_of(lambda e, n: np.full(np.broadcast(e, n).shape, 99.0), cells=40)
     latitude, longitude = geodetic_from_map(CRS, np.array([EAST, EAST + 9000.0]), np.array([NORTH, NORTH]))
     assert terrain_height([fine, coarse], latitude, longitude) == pytest.approx([99.0, 10.0])
-    with pytest.raises(ValueError, match="94 m below ground"):
+    with pytest.raises(CameraBelowGround, match="94 m below ground"):
         horizon_from([fine, coarse], frame_at_middle(), [0.0, 0.0, 5.0])
+
+
+@pytest.mark.parametrize("turned_deg", [0.0, 30.0])
+def test_cell_size_of_rasters_in_metres_and_in_degrees(turned_deg):
+    values, turn = np.zeros((2, 2, 1), np.float32), Affine.rotation(turned_deg)
+    assert cell_size_m(Raster(values, turn * Affine.scale(25.0, -25.0), CRS)) == pytest.approx(25.0)
+    assert cell_size_m(Raster(values, turn * Affine.scale(0.05, -0.05), CRS)) == pytest.approx(0.05)
+    arc_second = Affine.scale(1 / 3600, -1 / 3600)
+    assert cell_size_m(Raster(values, turn * arc_second, "EPSG:4326")) == pytest.approx(30.9, abs=0.05)
+    assert cell_size_m(Raster(values, turn * Affine.scale(0.25, -0.25), "EPSG:4326")) == pytest.approx(27_800, abs=5)
 
 
 @pytest.fixture(scope="module")
@@ -128,23 +146,24 @@ def fit(trial):
 
 
 def heading_error(fit, trial):
-    truth = values_of(trial.truth, fit.horizon.axes)[0]
-    return abs((fit.calibration.values[0] - truth + 180.0) % 360.0 - 180.0)
+    truth = parameters_of_view(trial.truth, fit.horizon.axes)[0]
+    return abs((fit.calibration.parameters[0] - truth + 180.0) % 360.0 - 180.0)
 
 
 def test_the_drawn_skyline_is_where_the_horizon_says(trial):
     """Two independent roads: the picture was ray-cast pixel by pixel, the horizon projected point by point."""
     position = trial.truth.position_m
-    heading = values_of(trial.truth, np.eye(3))[0]
+    heading = parameters_of_view(trial.truth, np.eye(3))[0]
     horizon = horizon_from(
         trial.rasters,
         trial.frame,
         position,
         azimuth_deg=heading + np.arange(-30, 30, 0.05),
-        nearest_m=120.0,
-        below_ground_m=40.0,
+        options=HorizonOptions(nearest_m=120.0, below_ground_m=40.0),
     )
-    pixel, front = project_values(trial.truth, np.eye(3), values_of(trial.truth, np.eye(3)), horizon.skyline_m)
+    pixel, front = project_with_parameters(
+        trial.truth, np.eye(3), parameters_of_view(trial.truth, np.eye(3)), horizon.skyline_m
+    )
     pixel = pixel[front & np.isfinite(pixel).all(1)]
     columns = np.arange(SIZE[0])
     rows = np.interp(columns + 0.5, pixel[:, 0], pixel[:, 1])
@@ -166,8 +185,8 @@ def test_a_full_panorama_finds_its_heading_its_horizon_row_and_its_lean():
     fit = align_to_skyline(trial.image, trial.start, trial.rasters, trial.frame, search=search)
     assert fit.reliable, fit.doubts
     assert heading_error(fit, trial) < 0.1
-    truth = values_of(trial.truth, fit.horizon.axes)
-    assert fit.calibration.values[1:3] == pytest.approx(truth[1:3], abs=0.1)
+    truth = parameters_of_view(trial.truth, fit.horizon.axes)
+    assert fit.calibration.parameters[1:3] == pytest.approx(truth[1:3], abs=0.1)
     assert fit.calibration.view.cy == pytest.approx(trial.truth.cy, abs=1.5)
 
 
@@ -193,19 +212,19 @@ def test_fog_is_not_trusted(seed, visibility_m):
 
 def test_the_wrong_mountains_are_not_trusted(trial):
     """The same picture looked for 130° away, where other summits stand."""
-    values = values_of(trial.start, np.eye(3))
+    values = parameters_of_view(trial.start, np.eye(3))
     values[0] += 130.0
-    elsewhere = view_from_values(trial.start, np.eye(3), values)
+    elsewhere = view_from_parameters(trial.start, np.eye(3), values)
     fit = align_to_skyline(trial.image, elsewhere, trial.rasters, trial.frame, mask=trial.mask, search=TRIAL_SEARCH)
     assert not fit.reliable
 
 
 def test_points_and_skyline_together(trial, fit):
     horizon = fit.horizon
-    truth = values_of(trial.truth, np.eye(3))
+    truth = parameters_of_view(trial.truth, np.eye(3))
     position = horizon.edges_m[::400] if len(horizon.edges_m) > 1600 else horizon.skyline_m[100:-100:150]
     position = position[np.isfinite(position).all(1)]
-    pixel, front = project_values(trial.truth, np.eye(3), truth, position)
+    pixel, front = project_with_parameters(trial.truth, np.eye(3), truth, position)
     inside = front & (pixel[:, 0] > 0) & (pixel[:, 0] < SIZE[0]) & (pixel[:, 1] > 0) & (pixel[:, 1] < SIZE[1])
     points = Correspondences(pixel[inside], position[inside])
     assert len(points) >= 3
@@ -216,9 +235,11 @@ def test_points_and_skyline_together(trial, fit):
     assert len(both.calibration.names) == len(points)
 
 
-def test_a_picture_of_another_size_is_refused(trial):
-    with pytest.raises(ValueError, match="the image is 799 x 534 px"):
+def test_a_picture_of_another_size_is_refused(trial, fit):
+    with pytest.raises(ImageSizeMismatch, match="the image is 799 x 534 px"):
         align_to_skyline(trial.image[:, 1:], trial.start, trial.rasters, trial.frame)
+    with pytest.raises(ImageSizeMismatch, match="the image is 799 x 534 px"):
+        draw_overlay(trial.image[:, 1:], fit.calibration)
     with pytest.raises(ValueError, match="expected \\(H, W, 3\\) uint8"):
         boundary_map(trial.image.astype(float), None, 10.0)
     with pytest.raises(ValueError, match="leaves 0 %"):
@@ -228,7 +249,7 @@ def test_a_picture_of_another_size_is_refused(trial):
 def test_a_uniform_frame_is_recognised():
     image = np.full((200, 300, 3), 250, np.uint8)
     image[20:180, 30:270] = np.random.default_rng(0).integers(0, 200, (160, 240, 3), np.uint8)
-    mask = picture_area(image)
+    mask = detect_border_mask(image)
     assert not mask[:20].any()
     assert not mask[:, :30].any()
     assert mask[30:170, 40:260].all()
@@ -240,7 +261,7 @@ def test_the_overlay_shows_ridges_points_and_arrows(tmp_path, trial, fit):
     assert red.any(axis=0).mean() > 0.5
     save_overlay(tmp_path / "o.png", trial.image, fit.calibration, horizon=fit.horizon)
     assert np.array_equal(
-        encoded_from_file(tmp_path / "o.png"), draw_overlay(trial.image, fit.calibration, horizon=fit.horizon)
+        read_image_srgb8(tmp_path / "o.png"), draw_overlay(trial.image, fit.calibration, horizon=fit.horizon)
     )
 
 
@@ -267,9 +288,10 @@ def test_finse_by_its_skyline_alone(data_dir):
         tilt_deg=10.0,
         focal=0.06,
         priors=Priors(tilt_deg=10.0, roll_deg=3.0, horizontal_m=3.0, vertical_m=3.0, focal=0.05, k1=0.1),
+        k1=-0.2,
     )
-    image = encoded_from_file(folder / "2019-05-24_12-00-01.jpg")
+    image = read_image_srgb8(folder / "2019-05-24_12-00-01.jpg")
     mask = np.ones(image.shape[:2], bool)
     mask[:60] = False  # the camera's lettering
-    fit = align_to_skyline(image, start, rasters, frame, mask=mask, search=search, k1=-0.2)
-    assert abs(fit.calibration.values[0] - by_points.values[0]) < 0.3
+    fit = align_to_skyline(image, start, rasters, frame, mask=mask, search=search)
+    assert abs(fit.calibration.parameters[0] - by_points.parameters[0]) < 0.3

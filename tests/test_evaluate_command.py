@@ -8,7 +8,7 @@ import pytest
 from command_line import command
 
 from seasonscapes.errors import InputError
-from seasonscapes.evaluation.figures import comparison, error_colours, steepest_window
+from seasonscapes.evaluation.figures import comparison_figure, error_colours, steepest_window
 from seasonscapes.evaluation.metrics import psnr_db
 from seasonscapes.evaluation.picture_pairs import matching_gain
 from seasonscapes.images import read_image_linear, write_exr, write_png8
@@ -133,18 +133,18 @@ def test_comparison_sheet():
     a, b = levels(0) / 255.0, levels(1) / 255.0
     mask = np.ones((HEIGHT, WIDTH), bool)
     mask[:24] = False
-    sheet = comparison({"truth": a, "ours": b, "other": a}, mask=mask, window=(10, 20, 20, 16))
+    sheet = comparison_figure({"truth": a, "ours": b, "other": a}, mask=mask, window=(10, 20, 20, 16))
     assert sheet.shape[1] == 4 * (WIDTH + 4)
     assert sheet.shape[0] > 2 * HEIGHT
     assert 0.0 <= sheet.min() <= sheet.max() <= 1.0
-    plain = comparison({"truth": a, "ours": b}, mask=mask)
+    plain = comparison_figure({"truth": a, "ours": b}, mask=mask)
     head = plain.shape[0] - HEIGHT - 4
     assert np.array_equal(plain[head + 24 : head + HEIGHT, :WIDTH], a[24:])
     difference = plain[head : head + HEIGHT, -WIDTH - 4 : -4]
     assert difference[:24] == pytest.approx(np.broadcast_to([0.0, 0.0, 0.02], (24, WIDTH, 3)))
     assert error_colours(np.array([[1.0]]))[0, 0] == pytest.approx([0.99, 0.99, 0.75])
     with pytest.raises(ValueError, match="at least one more"):
-        comparison({"truth": a})
+        comparison_figure({"truth": a})
 
 
 def test_steepest_window_finds_the_cliff():

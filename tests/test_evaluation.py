@@ -7,8 +7,9 @@ import pytest
 
 from seasonscapes.cameras.observation import Observation
 from seasonscapes.cameras.pinhole import Camera
-from seasonscapes.evaluation.lpips import lpips_of, missing_lpips
-from seasonscapes.evaluation.masks import land_mask, reference_mask
+from seasonscapes.errors import InputError
+from seasonscapes.evaluation.lpips import load_lpips, lpips_of, missing_lpips
+from seasonscapes.evaluation.masks import reference_mask, terrain_mask
 from seasonscapes.evaluation.metrics import (
     angle_deg,
     colour_angle_deg,
@@ -23,13 +24,13 @@ from seasonscapes.evaluation.metrics import (
 from seasonscapes.evaluation.splits import (
     LeakageError,
     PictureUse,
+    check_no_leakage,
     content_hash,
     file_content_hash,
-    held_out_hours,
+    held_out_times,
     held_out_views,
     observation_hash,
-    refuse_leaks,
-    use_of,
+    picture_use,
     webcam_of,
 )
 from seasonscapes.evaluation.surfaces import albedo_error, shadow_iou
@@ -230,17 +231,37 @@ def test_lpips_says_why_it_is_absent(tmp_path, monkeypatch):
         lpips_of({}, {})
 
 
+def test_lpips_names_the_file_that_holds_other_weights(tmp_path):
+    import torch
+
+    network, linear = random_weights()
+    for other in ({}, [1.0]):
+        torch.save(network, tmp_path / "alexnet.pth")
+        torch.save(other, tmp_path / "lpips_alex.pth")
+        with pytest.raises(InputError, match=r"lpips_alex\.pth: .* 5 of 5 keys are missing; expected the key lin0"):
+            load_lpips(tmp_path)
+    torch.save(linear, tmp_path / "lpips_alex.pth")
+    picture = np.random.default_rng(0).random((40, 40, 3))
+    assert load_lpips(tmp_path)(picture, 0.5 * picture) == lpips_of(network, linear)(picture, 0.5 * picture)
+    del network["features.3.bias"]
+    torch.save(network, tmp_path / "alexnet.pth")
+    with pytest.raises(
+        InputError, match=r"alexnet\.pth: .* 1 of 10 keys are missing; expected the key features\.3\.bias"
+    ):
+        load_lpips(tmp_path)
+
+
 # ---------------------------------------------------------------------------------------------- masks
 
 
 def test_land_mask_by_metric_depth():
     depth = np.array([[10.0, 60.0, 500.0, 9000.0, np.inf]])
-    assert land_mask(depth).tolist() == [[False, True, True, True, False]]
-    assert land_mask(depth, near_m=0.0, far_m=1000.0).tolist() == [[True, True, True, False, False]]
+    assert terrain_mask(depth).tolist() == [[False, True, True, True, False]]
+    assert terrain_mask(depth, near_m=0.0, far_m=1000.0).tolist() == [[True, True, True, False, False]]
     with pytest.raises(ValueError, match="NaN"):
-        land_mask(np.array([[np.nan]]))
+        terrain_mask(np.array([[np.nan]]))
     with pytest.raises(ValueError, match="near_m"):
-        land_mask(depth, near_m=100.0, far_m=50.0)
+        terrain_mask(depth, near_m=100.0, far_m=50.0)
 
 
 def test_reference_mask_drops_sky_and_the_near():
@@ -344,27 +365,27 @@ def test_held_out_views_keep_panoramas_together():
 
 def test_held_out_hours_lie_between_used_ones():
     times = [NOON + timedelta(hours=h) for h in (3, 0, 1, 2, 4)]
-    used, held = held_out_hours(times, 2)
+    used, held = held_out_times(times, 2)
     assert held == (NOON + timedelta(hours=1), NOON + timedelta(hours=3))
     assert used[0] < held[0] < used[-1]
     for arguments in [(times, 1), (times[:1], 2), ([NOON, NOON], 2)]:
-        with pytest.raises(ValueError, match="held_out_hours"):
-            held_out_hours(*arguments)
+        with pytest.raises(ValueError, match="held_out_times"):
+            held_out_times(*arguments)
 
 
 def test_leaks_are_refused_by_webcam_and_time():
     paint = [PictureUse("a", NOON, "painting"), PictureUse("b/1", NOON, "guidance")]
     later = NOON + timedelta(hours=1)
-    refuse_leaks([PictureUse("c", NOON, "evaluation"), PictureUse("a", later, "evaluation")], paint)
+    check_no_leakage([PictureUse("c", NOON, "evaluation"), PictureUse("a", later, "evaluation")], paint)
     zurich = NOON.astimezone(timezone(timedelta(hours=2)))
     with pytest.raises(LeakageError, match=r"a at 2024-09-18T11:00:00\+00:00 was used for painting"):
-        refuse_leaks([PictureUse("a", zurich, "evaluation")], paint)
+        check_no_leakage([PictureUse("a", zurich, "evaluation")], paint)
     with pytest.raises(LeakageError, match="guidance"):  # another view of the same panorama at the same instant
-        refuse_leaks([PictureUse("b/2", NOON, "evaluation")], paint)
+        check_no_leakage([PictureUse("b/2", NOON, "evaluation")], paint)
     with pytest.raises(LeakageError, match="same webcam, at"):
-        refuse_leaks([PictureUse("a", later, "evaluation")], paint, kind="view")
+        check_no_leakage([PictureUse("a", later, "evaluation")], paint, kind="view")
     with pytest.raises(LeakageError, match="same instant, at a"):
-        refuse_leaks([PictureUse("c", NOON, "evaluation")], paint, kind="hour")
+        check_no_leakage([PictureUse("c", NOON, "evaluation")], paint, kind="hour")
 
 
 def test_leaks_are_refused_by_content(tmp_path):
@@ -375,7 +396,7 @@ def test_leaks_are_refused_by_content(tmp_path):
     assert content_hash(levels) == observation_hash(seen) == file_content_hash(tmp_path / "copy.png")
     renamed = PictureUse("elsewhere", NOON + timedelta(days=1), "evaluation", file_content_hash(tmp_path / "copy.png"))
     with pytest.raises(LeakageError, match="same pixels"):
-        refuse_leaks([renamed], [use_of(seen, "training")])
+        check_no_leakage([renamed], [picture_use(seen, "training")])
     levels[0, 0, 0] ^= 1
     assert content_hash(levels) != observation_hash(seen)
 
@@ -386,7 +407,7 @@ def test_uses_must_be_plain():
     with pytest.raises(ValueError, match="offset"):
         PictureUse("a", NOON.replace(tzinfo=None), "painting")
     with pytest.raises(ValueError, match="kind"):
-        refuse_leaks([], [], kind="year")
+        check_no_leakage([], [], kind="year")
     with pytest.raises(ValueError, match="uint8"):
         content_hash(np.zeros((2, 2, 3)))
 

@@ -9,7 +9,7 @@ from test_transport import gradient_sky
 
 from seasonscapes.cameras.panorama import cut_view, panorama_from_angles, project_panorama, split_panorama
 from seasonscapes.cameras.pinhole import rotation_from_angles
-from seasonscapes.evaluation.synthetic_webcams import WebcamInstant, webcam_series
+from seasonscapes.evaluation.synthetic_webcams import WebcamInstant, WebcamOptions, webcam_series
 from seasonscapes.evaluation.webcam_faults import CLEAN, PoseSigmas, perturb_pose
 from seasonscapes.rendering.coefficients_file import load_coefficients, save_coefficients
 from seasonscapes.rendering.hemisphere_rays import ray_scene
@@ -130,16 +130,8 @@ def test_a_webcam_series_of_panoramas(tmp_path):
     time = datetime(2024, 7, 20, 10, tzinfo=UTC)
     sampling = SamplingOptions(shadow_samples=4, albedo_samples=16, rays=64, clusters=256)
     poses = PoseSigmas(1.0, 1.0, 0.5, 0.2, 0.2, 0.05)
-    made = webcam_series(
-        TERRAIN,
-        "round",
-        panorama,
-        [WebcamInstant(time, LIGHT, colours())],
-        faults=CLEAN,
-        poses=poses,
-        foreground=True,
-        sampling=sampling,
-    )[0]
+    options = WebcamOptions(CLEAN, poses, foreground=True, sampling=sampling)
+    made = webcam_series(TERRAIN, "round", panorama, [WebcamInstant(time, LIGHT, colours())], options=options)[0]
     assert made.encoded.shape == made.radiance.shape == (66, 300, 3)
     assert made.camera is panorama
     believed = made.observation.camera

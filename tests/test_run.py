@@ -23,7 +23,7 @@ from seasonscapes.evaluation import synthetic_webcams
 from seasonscapes.rendering import transport
 transport.SamplingOptions.__init__.__defaults__ = (4, 16, 64, 4, 512, 32, 16, "reinhart")
 transport._PILOTS = 1 << 14
-synthetic_webcams.webcam_series.__kwdefaults__["sampling"] = transport.SamplingOptions()
+synthetic_webcams.QUICK = transport.SamplingOptions()
 from seasonscapes.cli import main
 sys.exit(main(sys.argv[1:]))
 """

@@ -8,7 +8,7 @@ import pytest
 from places import MASSIF, SCENE, hill_heights, write_place, write_raster
 
 from seasonscapes.calibration.calibration_file import write_calibration
-from seasonscapes.calibration.pose_model import values_of
+from seasonscapes.calibration.pose_model import parameters_of_view
 from seasonscapes.calibration.resection import Calibration
 from seasonscapes.cameras.observation import ManifestRow, read_manifest, write_manifest
 from seasonscapes.cameras.pinhole import Camera
@@ -54,7 +54,7 @@ class Real:
     def record(self, webcam, focal=10.0):
         camera = Camera(12, 8, focal, focal, 6.0, 4.0, np.eye(4))
         solved = Calibration(
-            camera, 0.0, values_of(camera, np.eye(3)), np.eye(9), (), np.zeros((0, 2)), np.zeros(0, bool), 0.0
+            camera, 0.0, parameters_of_view(camera, np.eye(3)), np.eye(9), (), np.zeros((0, 2)), np.zeros(0, bool), 0.0
         )
         write_calibration(
             self.folder / "records" / f"{webcam}_calibration.json", webcam, solved, LocalFrame(46.55, 7.98)

@@ -21,9 +21,10 @@ import numpy as np
 
 from seasonscapes.calibration.calibration_file import write_calibration
 from seasonscapes.calibration.evidence import Correspondences, Priors, write_points
-from seasonscapes.calibration.pose_model import View, project_values, values_of
+from seasonscapes.calibration.pose_model import View, parameters_of_view, project_with_parameters
 from seasonscapes.calibration.resection import Calibration, report_lines, resect
 from seasonscapes.calibration.terrain_view import TerrainView, scaled_view, shaded_relief
+from seasonscapes.errors import ImageSizeMismatch
 from seasonscapes.frames import LocalFrame, geodetic_from_enu, local_axes
 
 _MAX_REQUEST_BYTES = 10_000
@@ -46,8 +47,8 @@ class AnnotationSession:
     frame
         Local frame of the scene.
     render
-        Function that computes the terrain view of a camera or panorama: `terrain_view.look_at_rasters` with its rasters
-        and frame bound, or `terrain_view.look_with` with a ray caster bound.
+        Function that computes the terrain view of a camera or panorama: `terrain_view.march_terrain_view` with its rasters
+        and frame bound, or `terrain_view.trace_terrain_view` with a ray caster bound.
     folder
         Folder of ``<webcam>_points.csv`` and ``<webcam>_calibration.json``.
     priors
@@ -67,7 +68,7 @@ class AnnotationSession:
 
     Raises
     ------
-    ValueError
+    ImageSizeMismatch
         If the photograph and the view differ in size.
     """
 
@@ -91,7 +92,7 @@ class AnnotationSession:
 
     def __post_init__(self):
         if self.image.shape[:2] != (self.start.height_px, self.start.width_px):
-            raise ValueError(
+            raise ImageSizeMismatch(
                 f"AnnotationSession: the image is {self.image.shape[1]} x {self.image.shape[0]} px, expected "
                 f"{self.start.width_px} x {self.start.height_px} as the view"
             )
@@ -117,8 +118,8 @@ def render_terrain(session: AnnotationSession) -> None:
     session.version += 1
     if session.position_m:
         axes = np.eye(3)
-        values = values_of(session.rendered_view, axes)
-        pixel, _ = project_values(session.rendered_view, axes, values, np.array(session.position_m))
+        parameters = parameters_of_view(session.rendered_view, axes)
+        pixel, _ = project_with_parameters(session.rendered_view, axes, parameters, np.array(session.position_m))
         session.terrain_pixel = pixel.tolist()
 
 
@@ -152,7 +153,7 @@ def position_at(session: AnnotationSession, terrain_pixel: Sequence[float]) -> n
     return position
 
 
-def describe_position(session: AnnotationSession, terrain_pixel: Sequence[float]) -> list[float] | None:
+def project_to_photograph(session: AnnotationSession, terrain_pixel: Sequence[float]) -> list[float] | None:
     """Project a pixel of the rendered terrain into the photograph, with the current view.
 
     Parameters
@@ -278,7 +279,7 @@ def _project(session: AnnotationSession, position: np.ndarray) -> list[list[floa
     """Pixels of world points ``(N, 3)`` in the photograph; ``None`` behind the camera."""
     axes = np.eye(3)
     k1 = session.k1 if session.solution is None else session.solution.k1
-    pixel, in_front = project_values(session.view, axes, values_of(session.view, axes, k1), position)
+    pixel, in_front = project_with_parameters(session.view, axes, parameters_of_view(session.view, axes, k1), position)
     return [xy.tolist() if visible else None for xy, visible in zip(pixel, in_front, strict=True)]
 
 
@@ -312,7 +313,9 @@ def session_state(session: AnnotationSession) -> dict[str, Any]:
     summary = (
         ""
         if solution is None
-        else (f"heading {solution.values[0]:.2f} ± {solution.sigma['heading_deg']:.2f}°, RMS {solution.rms_px:.1f} px")
+        else (
+            f"heading {solution.parameters[0]:.2f} ± {solution.sigma['heading_deg']:.2f}°, RMS {solution.rms_px:.1f} px"
+        )
     )
     return {
         "pairs": pairs,
@@ -356,7 +359,7 @@ def _actions(session: AnnotationSession) -> dict[str, Callable[[_Json], _Json]]:
 
     return {
         "/state": lambda body: session_state(session),
-        "/where": lambda body: {"photo": describe_position(session, body["terrain"])},
+        "/where": lambda body: {"photo": project_to_photograph(session, body["terrain"])},
         "/pick": returning_state(lambda body: add_match(session, body["photo"], body["terrain"])),
         "/undo": returning_state(lambda body: remove_last_match(session)),
         "/solve": returning_state(lambda body: solve_session(session)),

@@ -66,7 +66,7 @@ class EdgeMatches:
     strength: np.ndarray
 
 
-def picture_area(encoded: np.ndarray) -> np.ndarray:
+def detect_border_mask(encoded: np.ndarray) -> np.ndarray:
     """Detect a uniform border around an image (mount of a print, letterbox).
 
     Parameters
@@ -100,7 +100,7 @@ def boundary_map(encoded: np.ndarray, mask: np.ndarray | None, pixels_per_degree
     encoded
         Image ``(H, W, 3)`` uint8 sRGB.
     mask
-        ``(H, W)`` bool, False where foreground occludes the landscape; `picture_area` if ``None``.
+        ``(H, W)`` bool, False where foreground occludes the landscape; `detect_border_mask` if ``None``.
     pixels_per_degree
         Angular resolution of the image [px/°].
 
@@ -116,7 +116,7 @@ def boundary_map(encoded: np.ndarray, mask: np.ndarray | None, pixels_per_degree
     ValueError
         If the image or the mask has the wrong shape or type.
     """
-    mask = picture_area(encoded) if mask is None else np.asarray(mask, bool)
+    mask = detect_border_mask(encoded) if mask is None else np.asarray(mask, bool)
     if encoded.ndim != 3 or encoded.dtype != np.uint8:
         raise ValueError(f"boundary_map: got {encoded.dtype} {encoded.shape}, expected (H, W, 3) uint8")
     if mask.shape != encoded.shape[:2]:

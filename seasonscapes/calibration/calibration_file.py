@@ -73,7 +73,7 @@ def write_calibration(path: Path, webcam: str, calibration: Calibration, frame: 
         "latitude_deg": latitude,
         "longitude_deg": longitude,
         "height_m": height,
-        "angles_deg": dict(zip(("heading", "tilt", "roll"), calibration.values[:3].tolist(), strict=True)),
+        "angles_deg": dict(zip(("heading", "tilt", "roll"), calibration.parameters[:3].tolist(), strict=True)),
         "sigma": calibration.sigma,
         "frame": {
             "latitude_deg": frame.latitude_deg,

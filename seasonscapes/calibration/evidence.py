@@ -59,7 +59,7 @@ class Correspondences:
         return len(self.pixel)
 
 
-def take(points: Correspondences, index: np.ndarray | Sequence[int] | slice) -> Correspondences:
+def select_points(points: Correspondences, index: np.ndarray | Sequence[int] | slice) -> Correspondences:
     """Return a subset of the correspondences.
 
     Parameters

@@ -8,10 +8,11 @@ import cv2
 import numpy as np
 
 from seasonscapes.calibration.evidence import Correspondences
-from seasonscapes.calibration.pose_model import project_values, values_of
+from seasonscapes.calibration.pose_model import parameters_of_view, project_with_parameters
 from seasonscapes.calibration.resection import Calibration
 from seasonscapes.calibration.terrain_horizon import Horizon
 from seasonscapes.cameras.panorama import Panorama
+from seasonscapes.errors import ImageSizeMismatch
 from seasonscapes.images import write_png8
 
 # Colours, sRGB.
@@ -56,24 +57,24 @@ def draw_overlay(
 
     Raises
     ------
-    ValueError
+    ImageSizeMismatch
         If the photograph and the calibrated view differ in size.
     """
     view = calibration.view
     if image.shape[:2] != (view.height_px, view.width_px):
-        raise ValueError(
+        raise ImageSizeMismatch(
             f"draw_overlay: the image is {image.shape[1]} x {image.shape[0]} px, expected "
             f"{view.width_px} x {view.height_px} as the view"
         )
     canvas = np.ascontiguousarray(image[..., :3]).copy()
     thickness = max(1, round(view.height_px / 700))
-    axes = np.eye(3) if horizon is None else horizon.axes
-    values = values_of(view, axes, calibration.k1)
     if horizon is not None:
+        axes = np.eye(3)
+        parameters = parameters_of_view(view, axes, calibration.k1)
         for position, colour in ((horizon.edges_m, _RIDGE), (horizon.skyline_m, _SKYLINE)):
             position = position[np.isfinite(position).all(axis=1)]
             if len(position):
-                pixel, in_front = project_values(view, axes, values, position)
+                pixel, in_front = project_with_parameters(view, axes, parameters, position)
                 _draw_dots(canvas, pixel[in_front], colour, thickness)
     if points is not None and len(points):
         _draw_points(canvas, calibration, points, thickness)
@@ -81,7 +82,7 @@ def draw_overlay(
     if len(calibration.names):
         caption.append(f"RMS {calibration.rms_px:.1f} px of {len(calibration.names)} points")
     if np.isfinite(calibration.skyline_rms_px):
-        caption.append(f"heading {calibration.values[0]:.2f} +- {calibration.sigma['heading_deg']:.2f} deg")
+        caption.append(f"heading {calibration.parameters[0]:.2f} +- {calibration.sigma['heading_deg']:.2f} deg")
     if caption:
         _draw_caption(canvas, ", ".join(caption))
     return canvas

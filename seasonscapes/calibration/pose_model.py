@@ -44,7 +44,7 @@ def angles_from_rotation(rotation: np.ndarray) -> tuple[float, float, float]:
     return float(heading % 360.0), float(pitch), float(roll)
 
 
-def values_of(view: View, axes: np.ndarray, k1: float = 0.0) -> np.ndarray:
+def parameters_of_view(view: View, axes: np.ndarray, k1: float = 0.0) -> np.ndarray:
     """Return the calibration parameters of a view.
 
     Parameters
@@ -65,14 +65,14 @@ def values_of(view: View, axes: np.ndarray, k1: float = 0.0) -> np.ndarray:
     return np.array([*angles, *view.position_m, 0.0, k1, 0.0])
 
 
-def _rotation(axes: np.ndarray, values: np.ndarray) -> np.ndarray:
+def _rotation(axes: np.ndarray, parameters: np.ndarray) -> np.ndarray:
     """``world_from_camera`` rotation ``(3, 3)``: as `rotation_from_angles` about ``axes``.
 
     Scalar arithmetic, because solvers call this function for every residual evaluation.
     """
-    sin_h, cos_h = math.sin(math.radians(values[0])), math.cos(math.radians(values[0]))
-    sin_p, cos_p = math.sin(math.radians(values[1])), math.cos(math.radians(values[1]))
-    sin_r, cos_r = math.sin(math.radians(values[2])), math.cos(math.radians(values[2]))
+    sin_h, cos_h = math.sin(math.radians(parameters[0])), math.cos(math.radians(parameters[0]))
+    sin_p, cos_p = math.sin(math.radians(parameters[1])), math.cos(math.radians(parameters[1]))
+    sin_r, cos_r = math.sin(math.radians(parameters[2])), math.cos(math.radians(parameters[2]))
     right, down = (cos_h, -sin_h, 0.0), (sin_p * sin_h, sin_p * cos_h, -cos_p)
     rolled = [(cos_r * r + sin_r * d, cos_r * d - sin_r * r) for r, d in zip(right, down, strict=True)]
     forward = (sin_h * cos_p, cos_h * cos_p, sin_p)
@@ -87,7 +87,7 @@ def _focal_scales(start: View, log_scale: float) -> tuple[float, float]:
     return (1.0 if start.full_circle else max(scale, start.width_px / (2.0 * math.pi * start.fx))), scale
 
 
-def view_from_values(start: View, axes: np.ndarray, values: np.ndarray) -> View:
+def view_from_parameters(start: View, axes: np.ndarray, parameters: np.ndarray) -> View:
     """Return the ideal pinhole camera or panorama with given calibration parameters.
 
     Parameters
@@ -96,23 +96,25 @@ def view_from_values(start: View, axes: np.ndarray, values: np.ndarray) -> View:
         View that the field-of-view scale and the horizon offset refer to.
     axes
         East, north and up at the camera, rows ``(3, 3)``.
-    values
-        Parameters ``(9,)``; ``values[7]`` (``k1``) is not part of a view and is left to the caller.
+    parameters
+        Parameters ``(9,)``; ``parameters[7]`` (``k1``) is not part of a view and is left to the caller.
 
     Returns
     -------
     Camera or Panorama
-        As ``start``, with the pose, focal lengths and horizon row of ``values``.
+        As ``start``, with the pose, focal lengths and horizon row of ``parameters``.
     """
     pose = np.eye(4)
-    pose[:3, :3] = _rotation(axes, values)
-    pose[:3, 3] = values[3:6]
-    scale_x, scale_y = _focal_scales(start, values[6])
-    return replace(start, fx=start.fx * scale_x, fy=start.fy * scale_y, cy=start.cy + values[8], world_from_camera=pose)
+    pose[:3, :3] = _rotation(axes, parameters)
+    pose[:3, 3] = parameters[3:6]
+    scale_x, scale_y = _focal_scales(start, parameters[6])
+    return replace(
+        start, fx=start.fx * scale_x, fy=start.fy * scale_y, cy=start.cy + parameters[8], world_from_camera=pose
+    )
 
 
-def project_values(
-    start: View, axes: np.ndarray, values: np.ndarray, position_m: np.ndarray
+def project_with_parameters(
+    start: View, axes: np.ndarray, parameters: np.ndarray, position_m: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Project world points to lens pixels with given calibration parameters.
 
@@ -125,7 +127,7 @@ def project_values(
         View that the field-of-view scale and the horizon offset refer to.
     axes
         East, north and up at the camera, rows ``(3, 3)``.
-    values
+    parameters
         Parameters ``(9,)``.
     position_m
         World points ``(N, 3)`` [m].
@@ -137,18 +139,18 @@ def project_values(
     in_front : ndarray
         ``(N,)`` bool, True where the point lies in front of the camera.
     """
-    local = (position_m - values[3:6]) @ _rotation(axes, values)
-    scale_x, scale_y = _focal_scales(start, values[6])
+    local = (position_m - parameters[3:6]) @ _rotation(axes, parameters)
+    scale_x, scale_y = _focal_scales(start, parameters[6])
     centre = np.array([start.cx, start.cy])
     if isinstance(start, Panorama):
         pixel, distance = project_local(start, local)
-        return (pixel - centre) * [scale_x, scale_y] + centre + [0.0, values[8]], distance > 0
+        return (pixel - centre) * [scale_x, scale_y] + centre + [0.0, parameters[8]], distance > 0
     depth = local[:, 2]
     normalised = local[:, :2] / np.maximum(depth, 0.02 * np.sqrt(np.sum(local**2, axis=1)))[:, None]
-    if values[7]:
+    if parameters[7]:
         radius = np.sqrt(np.sum(normalised**2, axis=1, keepdims=True))
-        normalised = normalised * _distortion_factor(radius, values[7])
-    return normalised * [start.fx * scale_x, start.fy * scale_y] + centre + [0.0, values[8]], depth > 0
+        normalised = normalised * _distortion_factor(radius, parameters[7])
+    return normalised * [start.fx * scale_x, start.fy * scale_y] + centre + [0.0, parameters[8]], depth > 0
 
 
 def _distortion_factor(radius: np.ndarray, k1: float) -> np.ndarray:
@@ -162,14 +164,14 @@ def _distortion_factor(radius: np.ndarray, k1: float) -> np.ndarray:
 
 
 def pixel_error(
-    start: View, axes: np.ndarray, values: np.ndarray, points: Correspondences
+    start: View, axes: np.ndarray, parameters: np.ndarray, points: Correspondences
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute reprojection errors of correspondences.
 
     Parameters
     ----------
-    start, axes, values
-        View, axes and parameters as in `project_values`.
+    start, axes, parameters
+        View, axes and parameters as in `project_with_parameters`.
     points
         Correspondences of N points.
 
@@ -180,7 +182,7 @@ def pixel_error(
     in_front : ndarray
         ``(N,)`` bool, True where the point lies in front of the camera.
     """
-    pixel, in_front = project_values(start, axes, values, points.position_m)
+    pixel, in_front = project_with_parameters(start, axes, parameters, points.position_m)
     error = pixel - points.pixel
     if isinstance(start, Panorama):
         circle = 2.0 * np.pi * start.fx

@@ -10,15 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, TypedDict, Unpack
+from typing import Literal
 
 import numpy as np
 
-from seasonscapes.calibration.evidence import PARAMETERS, Correspondences, Priors, take
+from seasonscapes.calibration.evidence import PARAMETERS, Correspondences, Priors, select_points
 from seasonscapes.calibration.initial_rotation import check_orientation, rotation_among_pairs
-from seasonscapes.calibration.pose_model import View, pixel_error, values_of, view_from_values
+from seasonscapes.calibration.pose_model import View, parameters_of_view, pixel_error, view_from_parameters
 from seasonscapes.cameras.pinhole import Camera
-from seasonscapes.errors import NotEnoughEvidence
+from seasonscapes.errors import CameraBelowGround, NotEnoughEvidence
 
 Loss = Literal["cauchy", "l1", "squares"]
 # Threshold on the residual of an inlier [standard deviations]: probability 0.999 of two pixel coordinates (χ², 2 dof).
@@ -38,7 +38,7 @@ class Calibration:
         `Camera` (the ideal pinhole without the distortion ``k1``) or `Panorama`.
     k1
         Radial distortion coefficient.
-    values, covariance
+    parameters, covariance
         Parameters ``(9,)`` in the order of `PARAMETERS` and their covariance ``(9, 9)``; zero variance where fixed.
     names, residual_px, outlier
         Of each correspondence: name, projected minus observed pixel ``(N, 2)`` [px], and whether it was rejected as an
@@ -51,7 +51,7 @@ class Calibration:
 
     view: View
     k1: float
-    values: np.ndarray
+    parameters: np.ndarray
     covariance: np.ndarray
     names: tuple[str, ...]
     residual_px: np.ndarray
@@ -128,18 +128,40 @@ class ResectionProblem:
         return self.sigmas > 0
 
 
+@dataclass(frozen=True)
+class ResectionOptions:
+    """Options of the minimisation of `resect`.
+
+    Parameters
+    ----------
+    loss
+        Loss of the correspondences while outliers are identified: ``"cauchy"``, ``"l1"`` (soft L1), or ``"squares"``,
+        which rejects none.
+    noise_px
+        Standard deviation of a pixel coordinate [px]. If omitted, it is estimated from the residuals, and the standard
+        deviations of the result are widened for the few degrees of freedom (Student's t).
+    guess
+        Initial parameters ``(9,)`` where a better estimate than the mean of the priors exists.
+    ground_m
+        Function that returns the terrain height in the frame [m] at (east, north) [m]; enables a check that the camera
+        is above the ground.
+    """
+
+    loss: Loss = "cauchy"
+    noise_px: float | None = None
+    guess: np.ndarray | None = None
+    ground_m: Callable[[float, float], float] | None = None
+
+
 def resect(
     start: View,
     points: Correspondences | None = None,
     *,
-    priors: Priors | None = None,
     skyline: SkylineEvidence | None = None,
-    loss: Loss = "cauchy",
-    noise_px: float | None = None,
+    priors: Priors | None = None,
     k1: float = 0.0,
     axes: np.ndarray | None = None,
-    guess: np.ndarray | None = None,
-    ground_m: Callable[[float, float], float] | None = None,
+    options: ResectionOptions | None = None,
 ) -> Calibration:
     """Estimate the pose and field of view of one camera or panorama.
 
@@ -151,21 +173,12 @@ def resect(
         Evidence; at least one of the two is required.
     priors
         Standard deviations about the start; `Priors()` if omitted.
-    loss
-        Loss of the correspondences while outliers are identified: ``"cauchy"``, ``"l1"`` (soft L1), or ``"squares"``,
-        which rejects none.
-    noise_px
-        Standard deviation of a pixel coordinate [px]. If omitted, it is estimated from the residuals, and the standard
-        deviations of the result are widened for the few degrees of freedom (Student's t).
     k1
-        Initial radial distortion coefficient.
+        Radial distortion coefficient of the start.
     axes
         East, north and up at the camera, rows ``(3, 3)``; those of the frame's origin if omitted.
-    guess
-        Initial parameters ``(9,)`` where a better estimate than the mean of the priors exists.
-    ground_m
-        Function that returns the terrain height in the frame [m] at (east, north) [m]; enables a check that the camera
-        is above the ground.
+    options
+        Loss, noise, initial parameters and ground; `ResectionOptions()` if omitted.
 
     Returns
     -------
@@ -176,52 +189,51 @@ def resect(
     ------
     NotEnoughEvidence
         If there are fewer points than unknowns without a prior require, the points are mirrored, flipped, in reverse
-        order, behind the camera or have no common pose, a parameter remains undetermined, or the camera is below the
-        ground.
+        order, behind the camera or have no common pose, or a parameter remains undetermined.
+    CameraBelowGround
+        If the start or the solution lies more than 5 m below the ground.
     ValueError
         If neither points nor a skyline are given.
     """
-    priors = priors or Priors()
+    priors, options = priors or Priors(), options or ResectionOptions()
     axes = np.eye(3) if axes is None else np.asarray(axes, float)
     sigmas = priors.sigmas
     # A panorama has no radial distortion; the horizon row of a perspective camera is not separable from its tilt.
     sigmas[8 if isinstance(start, Camera) else 7] = 0.0
-    origin = values_of(start, axes, k1)
-    if ground_m is not None:
-        _check_above_ground(origin, ground_m, "the start")
+    origin = parameters_of_view(start, axes, k1)
+    if options.ground_m is not None:
+        _check_above_ground(origin, options.ground_m, "the start")
     if points is None and skyline is None:
         raise ValueError("resect: neither points nor a skyline given")
-    values = origin.copy() if guess is None else np.array(guess, float)
+    parameters = origin.copy() if options.guess is None else np.array(options.guess, float)
     if points is not None and (len(points) or skyline is None):
         _check_point_count(len(points), sigmas, skyline is not None)
         rotation = rotation_among_pairs(start, k1, points)
         check_orientation(start, k1, points, rotation, axes)
-        values[:3] = values_of(_with_rotation(start, rotation), axes)[:3]
+        parameters[:3] = parameters_of_view(_with_rotation(start, rotation), axes)[:3]
         for angle in range(3):
             if sigmas[angle] == 0.0:
-                values[angle] = origin[angle]
+                parameters[angle] = origin[angle]
     if points is None:
         points = Correspondences(np.empty((0, 2)), np.empty((0, 3)))
     problem = ResectionProblem(start, axes, origin, sigmas, points, skyline)
-    values, outlier, noise = _solve(problem, values, loss, noise_px)
-    calibration = _calibration(problem, values, outlier, noise, widen=noise_px is None)
-    if ground_m is not None:
-        _check_above_ground(values, ground_m, "the solution")
+    parameters, outlier, noise = _solve(problem, parameters, options.loss, options.noise_px)
+    calibration = _calibration(problem, parameters, outlier, noise, widen=options.noise_px is None)
+    if options.ground_m is not None:
+        _check_above_ground(parameters, options.ground_m, "the solution")
     return calibration
 
 
-class _ResectOptions(TypedDict, total=False):
-    priors: Priors | None
-    skyline: SkylineEvidence | None
-    loss: Loss
-    noise_px: float | None
-    k1: float
-    axes: np.ndarray | None
-    guess: np.ndarray | None
-    ground_m: Callable[[float, float], float] | None
-
-
-def leave_one_out(start: View, points: Correspondences, **options: Unpack[_ResectOptions]) -> np.ndarray:
+def leave_one_out(
+    start: View,
+    points: Correspondences,
+    *,
+    skyline: SkylineEvidence | None = None,
+    priors: Priors | None = None,
+    k1: float = 0.0,
+    axes: np.ndarray | None = None,
+    options: ResectionOptions | None = None,
+) -> np.ndarray:
     """Compute leave-one-out reprojection errors: each point is predicted by a resection from all other points.
 
     Parameters
@@ -230,8 +242,8 @@ def leave_one_out(start: View, points: Correspondences, **options: Unpack[_Resec
         Approximate view.
     points
         Correspondences of N points.
-    **options
-        Keyword arguments of `resect`.
+    skyline, priors, k1, axes, options
+        As in `resect`.
 
     Returns
     -------
@@ -240,13 +252,15 @@ def leave_one_out(start: View, points: Correspondences, **options: Unpack[_Resec
 
     Raises
     ------
-    NotEnoughEvidence
+    NotEnoughEvidence, CameraBelowGround
         As `resect`.
     """
-    errors, axes = np.empty((len(points), 2)), np.eye(3)
+    errors, frame_axes = np.empty((len(points), 2)), np.eye(3)
     for i in range(len(points)):
-        solved = resect(start, take(points, np.arange(len(points)) != i), **options)
-        errors[i] = pixel_error(solved.view, axes, values_of(solved.view, axes, solved.k1), take(points, [i]))[0][0]
+        others = select_points(points, np.arange(len(points)) != i)
+        solved = resect(start, others, skyline=skyline, priors=priors, k1=k1, axes=axes, options=options)
+        parameters = parameters_of_view(solved.view, frame_axes, solved.k1)
+        errors[i] = pixel_error(solved.view, frame_axes, parameters, select_points(points, [i]))[0][0]
     return errors
 
 
@@ -264,29 +278,29 @@ def _check_point_count(count: int, sigmas: np.ndarray, has_skyline: bool) -> Non
 
 
 def _check_above_ground(
-    values: np.ndarray, ground_m: Callable[[float, float], float], what: str, *, tolerance_m: float = 5.0
+    parameters: np.ndarray, ground_m: Callable[[float, float], float], what: str, *, tolerance_m: float = 5.0
 ) -> None:
-    below = float(ground_m(values[3], values[4])) - values[5]
+    below = float(ground_m(parameters[3], parameters[4])) - parameters[5]
     if below > tolerance_m:
-        raise NotEnoughEvidence(
+        raise CameraBelowGround(
             f"{what} puts the camera {below:.0f} m below ground; check its height and vertical datum"
         )
 
 
 def _residual_rows(
-    problem: ResectionProblem, values: np.ndarray, noise: float, robust_loss: _RobustLoss | None, inlier: np.ndarray
+    problem: ResectionProblem, parameters: np.ndarray, noise: float, robust_loss: _RobustLoss | None, inlier: np.ndarray
 ) -> np.ndarray:
     """Whitened residuals of inlier points (with a robust loss or none), skyline and priors, concatenated."""
     rows = []
     if len(problem.points):
-        error = _errors(problem, values)[inlier] / noise
+        error = _errors(problem, parameters)[inlier] / noise
         rows.append((error if robust_loss is None else robust_loss(error)).ravel())
     if problem.skyline is not None:
-        view = view_from_values(problem.start, problem.axes, values)
-        residual = problem.skyline.residuals(view, values[7])
+        view = view_from_parameters(problem.start, problem.axes, parameters)
+        residual = problem.skyline.residuals(view, parameters[7])
         rows.append(_cauchy(residual[:, None] / problem.skyline.sigma_px, 2.0).ravel())
     has_prior = problem.free & np.isfinite(problem.sigmas)
-    offset = values - problem.origin
+    offset = parameters - problem.origin
     offset[0] = (offset[0] + 180.0) % 360.0 - 180.0
     rows.append(offset[has_prior] / problem.sigmas[has_prior])
     return np.concatenate(rows)
@@ -308,7 +322,7 @@ def _soft_l1(error: np.ndarray, scale: float) -> np.ndarray:
 
 def _minimise(
     problem: ResectionProblem,
-    values: np.ndarray,
+    parameters: np.ndarray,
     noise: float,
     robust_loss: _RobustLoss | None,
     inlier: np.ndarray,
@@ -320,23 +334,23 @@ def _minimise(
 
     free = problem.free
 
-    def residual_rows(free_values: np.ndarray) -> np.ndarray:
-        trial = values.copy()
-        trial[free] = free_values
+    def residual_rows(free_parameters: np.ndarray) -> np.ndarray:
+        trial = parameters.copy()
+        trial[free] = free_parameters
         return _residual_rows(problem, trial, noise, robust_loss, inlier)
 
     # Characteristic steps of comparable effect on the residuals: [deg], [m], relative, k1, [px].
     scale = np.array([0.1, 0.1, 0.1, 10.0, 10.0, 10.0, 0.01, 0.02, 5.0])[free]
     solution = least_squares(
-        residual_rows, values[free], x_scale=scale, xtol=tolerance, ftol=tolerance, gtol=tolerance, max_nfev=200
+        residual_rows, parameters[free], x_scale=scale, xtol=tolerance, ftol=tolerance, gtol=tolerance, max_nfev=200
     )
-    result = values.copy()
+    result = parameters.copy()
     result[free] = solution.x
     return result, solution.jac
 
 
 def _solve(
-    problem: ResectionProblem, values: np.ndarray, loss: Loss, noise_px: float | None
+    problem: ResectionProblem, parameters: np.ndarray, loss: Loss, noise_px: float | None
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Parameters ``(9,)``, outliers ``(N,)`` and noise [px]: a robust loss of decreasing width, then least squares."""
     count = len(problem.points)
@@ -344,43 +358,45 @@ def _solve(
     noise = noise_px or 1.0
     if not count:
         for _ in range(3):
-            values, _ = _minimise(problem, values, noise, None, all_points)
-        return values, ~all_points, noise
+            parameters, _ = _minimise(problem, parameters, noise, None, all_points)
+        return parameters, ~all_points, noise
     if loss == "squares":
         for _ in range(2 if noise_px is None else 1):
-            values, jacobian = _minimise(problem, values, noise, None, all_points)
-            noise = noise_px or _rms_noise(problem, values, all_points, _effective_parameters(problem, jacobian))
-        return values, ~all_points, noise
+            parameters, jacobian = _minimise(problem, parameters, noise, None, all_points)
+            noise = noise_px or _rms_noise(problem, parameters, all_points, _effective_parameters(problem, jacobian))
+        return parameters, ~all_points, noise
     widest = max(0.005 * problem.start.width_px / noise, 3.0)
     for scale in (widest, widest / 5.0, 1.0):
-        values, _ = _minimise(problem, values, noise, lambda e, c=scale: _soft_l1(e, c), all_points, tolerance=1e-4)
+        parameters, _ = _minimise(
+            problem, parameters, noise, lambda e, c=scale: _soft_l1(e, c), all_points, tolerance=1e-4
+        )
     robust_loss = _cauchy if loss == "cauchy" else _soft_l1
     for _ in range(3):
         if noise_px is None:
-            noise = _median_noise(problem, values)
-        values, _ = _minimise(problem, values, noise, lambda e: robust_loss(e, 2.0), all_points, tolerance=1e-6)
-    values, inlier, noise = _refine_inliers(problem, values, all_points, noise, noise_px)
-    return _test_influential_points(problem, values, inlier, noise, noise_px)
+            noise = _median_noise(problem, parameters)
+        parameters, _ = _minimise(problem, parameters, noise, lambda e: robust_loss(e, 2.0), all_points, tolerance=1e-6)
+    parameters, inlier, noise = _refine_inliers(problem, parameters, all_points, noise, noise_px)
+    return _test_influential_points(problem, parameters, inlier, noise, noise_px)
 
 
 def _refine_inliers(
-    problem: ResectionProblem, values: np.ndarray, inlier: np.ndarray, noise: float, noise_px: float | None
+    problem: ResectionProblem, parameters: np.ndarray, inlier: np.ndarray, noise: float, noise_px: float | None
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Alternate least squares over the inliers and their classification until the inliers no longer change."""
-    parameters = float(problem.free.sum())
+    parameter_count = float(problem.free.sum())
     for _ in range(8):
-        error = np.linalg.norm(_errors(problem, values), axis=1)
-        selected = error <= _outlier_threshold(2 * int(inlier.sum()) - parameters, noise_px is None) * noise
+        error = np.linalg.norm(_errors(problem, parameters), axis=1)
+        selected = error <= _outlier_threshold(2 * int(inlier.sum()) - parameter_count, noise_px is None) * noise
         _check_agreement(problem, selected, error)
-        values, jacobian = _minimise(problem, values, noise, None, selected)
-        parameters = _effective_parameters(problem, jacobian)
+        parameters, jacobian = _minimise(problem, parameters, noise, None, selected)
+        parameter_count = _effective_parameters(problem, jacobian)
         if noise_px is None:
-            noise = _rms_noise(problem, values, selected, parameters)
+            noise = _rms_noise(problem, parameters, selected, parameter_count)
         converged = (selected == inlier).all()
         inlier = selected
         if converged:
             break
-    return values, inlier, noise
+    return parameters, inlier, noise
 
 
 def _outlier_threshold(degrees_of_freedom: float, noise_is_estimated: bool) -> float:
@@ -403,15 +419,15 @@ def _effective_parameters(problem: ResectionProblem, jacobian: np.ndarray) -> fl
 
 
 def _test_influential_points(
-    problem: ResectionProblem, values: np.ndarray, inlier: np.ndarray, noise: float, noise_px: float | None
+    problem: ResectionProblem, parameters: np.ndarray, inlier: np.ndarray, noise: float, noise_px: float | None
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Omit each point of high leverage in turn and keep the solution of the smallest truncated sum of squares.
 
     An isolated outlier pulls the solution towards itself and leaves a small residual. Large sets are not affected.
     """
     if inlier.sum() > 40 or inlier.sum() <= 4:
-        return values, ~inlier, noise
-    _, jacobian = _minimise(problem, values, noise, None, inlier)
+        return parameters, ~inlier, noise
+    _, jacobian = _minimise(problem, parameters, noise, None, inlier)
     threshold = _outlier_threshold(2 * int(inlier.sum()) - _effective_parameters(problem, jacobian), noise_px is None)
     # The first rows of the Jacobian are the x and y residuals of the inliers, alternating.
     hat = np.einsum("ij,jk,ik->i", jacobian, np.linalg.pinv(jacobian.T @ jacobian), jacobian)
@@ -422,37 +438,37 @@ def _test_influential_points(
         other_rows = _residual_rows(problem, trial, noise, None, np.zeros(len(problem.points), bool))
         return float(np.sum(np.minimum(error, threshold) ** 2) + np.sum(other_rows**2))
 
-    best, best_cost = values, cost(values)
+    best, best_cost = parameters, cost(parameters)
     for index in np.flatnonzero(inlier)[leverage > 0.5]:
         remaining = inlier.copy()
         remaining[index] = False
-        trial, _ = _minimise(problem, values, noise, lambda e: _cauchy(e, 2.0), remaining, tolerance=1e-6)
+        trial, _ = _minimise(problem, parameters, noise, lambda e: _cauchy(e, 2.0), remaining, tolerance=1e-6)
         trial, _ = _minimise(problem, trial, noise, lambda e: _cauchy(e, 2.0), np.ones_like(inlier), tolerance=1e-6)
         trial_cost = cost(trial)
         if trial_cost < best_cost - 1.0:
             best, best_cost = trial, trial_cost
-    if best is not values:
-        values, inlier, noise = _refine_inliers(problem, best, inlier, noise, noise_px)
-    return values, ~inlier, noise
+    if best is not parameters:
+        parameters, inlier, noise = _refine_inliers(problem, best, inlier, noise, noise_px)
+    return parameters, ~inlier, noise
 
 
-def _errors(problem: ResectionProblem, values: np.ndarray) -> np.ndarray:
-    return pixel_error(problem.start, problem.axes, values, problem.points)[0]
+def _errors(problem: ResectionProblem, parameters: np.ndarray) -> np.ndarray:
+    return pixel_error(problem.start, problem.axes, parameters, problem.points)[0]
 
 
-def _median_noise(problem: ResectionProblem, values: np.ndarray) -> float:
+def _median_noise(problem: ResectionProblem, parameters: np.ndarray) -> float:
     """Standard deviation of a pixel coordinate [px] from the median residual, corrected for the fitted parameters."""
     count = len(problem.points)
     unfitted_fraction = max(1.0 - float(problem.free.sum()) / (2.0 * count), 0.2)
     # The median of a Rayleigh distribution is 1.1774 sigma.
-    median = float(np.median(np.linalg.norm(_errors(problem, values), axis=1)))
+    median = float(np.median(np.linalg.norm(_errors(problem, parameters), axis=1)))
     return max(median / 1.1774 / np.sqrt(unfitted_fraction), 1e-3)
 
 
-def _rms_noise(problem: ResectionProblem, values: np.ndarray, inlier: np.ndarray, parameters: float) -> float:
+def _rms_noise(problem: ResectionProblem, parameters: np.ndarray, inlier: np.ndarray, parameter_count: float) -> float:
     """Standard deviation of a pixel coordinate [px] from the squared residuals of the inliers."""
-    degrees_of_freedom = max(2.0 * inlier.sum() - parameters, 1.0)
-    return max(float(np.sqrt(np.sum(_errors(problem, values)[inlier] ** 2) / degrees_of_freedom)), 1e-6)
+    degrees_of_freedom = max(2.0 * inlier.sum() - parameter_count, 1.0)
+    return max(float(np.sqrt(np.sum(_errors(problem, parameters)[inlier] ** 2) / degrees_of_freedom)), 1e-6)
 
 
 def _check_agreement(problem: ResectionProblem, inlier: np.ndarray, error: np.ndarray) -> None:
@@ -467,17 +483,17 @@ def _check_agreement(problem: ResectionProblem, inlier: np.ndarray, error: np.nd
 
 
 def _calibration(
-    problem: ResectionProblem, values: np.ndarray, outlier: np.ndarray, noise: float, *, widen: bool
+    problem: ResectionProblem, parameters: np.ndarray, outlier: np.ndarray, noise: float, *, widen: bool
 ) -> Calibration:
     """Assemble the result: covariance (widened for an estimated noise), residuals and skyline residuals."""
-    view, k1 = view_from_values(problem.start, problem.axes, values), float(values[7])
-    residual, in_front = pixel_error(problem.start, problem.axes, values, problem.points)
+    view, k1 = view_from_parameters(problem.start, problem.axes, parameters), float(parameters[7])
+    residual, in_front = pixel_error(problem.start, problem.axes, parameters, problem.points)
     if not in_front.all():
         names = ", ".join(np.array(problem.points.names)[~in_front])
         raise NotEnoughEvidence(
             f"behind the camera: {names}; a correspondence is wrong, or the camera faces another direction"
         )
-    _, jacobian = _minimise(problem, values, noise, None, ~outlier)
+    _, jacobian = _minimise(problem, parameters, noise, None, ~outlier)
     covariance = _covariance(problem, jacobian)
     if widen and len(residual):
         from scipy.stats import t
@@ -490,9 +506,9 @@ def _calibration(
         skyline_residual = problem.skyline.residuals(view, k1)
         agrees = np.abs(skyline_residual) < 3.0 * problem.skyline.sigma_px
         skyline_rms = float(np.sqrt(np.mean(skyline_residual[agrees] ** 2))) if agrees.any() else float("nan")
-    values = values.copy()
-    values[0] %= 360.0
-    return Calibration(view, k1, values, covariance, problem.points.names, residual, outlier, noise, skyline_rms)
+    parameters = parameters.copy()
+    parameters[0] %= 360.0
+    return Calibration(view, k1, parameters, covariance, problem.points.names, residual, outlier, noise, skyline_rms)
 
 
 def _covariance(problem: ResectionProblem, jacobian: np.ndarray) -> np.ndarray:
@@ -526,7 +542,7 @@ def report_lines(calibration: Calibration) -> Sequence[str]:
         with its residual [px].
     """
     lines = []
-    for name, value in zip(PARAMETERS, calibration.values, strict=True):
+    for name, value in zip(PARAMETERS, calibration.parameters, strict=True):
         sigma = calibration.sigma[name]
         displayed = float(np.exp(value)) if name == "focal" else float(value)
         lines.append(f"{name:12s} {displayed:14.4f}  {'fixed' if sigma == 0 else f'± {sigma:.4f}'}")

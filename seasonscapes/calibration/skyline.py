@@ -17,11 +17,11 @@ import numpy as np
 
 from seasonscapes.calibration.boundary_map import BoundaryMap, boundary_map, edge_near
 from seasonscapes.calibration.evidence import Correspondences, Priors
-from seasonscapes.calibration.pose_model import View, project_values, values_of, view_from_values
-from seasonscapes.calibration.resection import Calibration, SkylineEvidence, resect
-from seasonscapes.calibration.terrain_horizon import Horizon, horizon_from
+from seasonscapes.calibration.pose_model import View, parameters_of_view, project_with_parameters, view_from_parameters
+from seasonscapes.calibration.resection import Calibration, ResectionOptions, SkylineEvidence, resect
+from seasonscapes.calibration.terrain_horizon import Horizon, HorizonOptions, cell_size_m, horizon_from
 from seasonscapes.cameras.panorama import Panorama
-from seasonscapes.errors import UnreadableImage
+from seasonscapes.errors import ImageSizeMismatch, UnreadableImage
 from seasonscapes.frames import LocalFrame, geodetic_from_enu, local_axes
 from seasonscapes.terrain.surface import Raster
 
@@ -41,6 +41,8 @@ class SearchRange:
         Half ranges [deg]. For a panorama ``tilt_deg`` is also the half range of its horizon row, as an angle.
     focal
         Half range of the field-of-view scale, relative.
+    k1
+        Radial distortion coefficient of the start; it is not searched, and refined only where ``priors`` let it vary.
     terrain_sigma_m
         Standard deviation of the terrain height [m]; a third of a raster cell if ``None``.
     priors
@@ -51,6 +53,7 @@ class SearchRange:
     tilt_deg: float = 4.0
     roll_deg: float = 2.0
     focal: float = 0.0
+    k1: float = 0.0
     terrain_sigma_m: float | None = None
     priors: Priors = field(
         default_factory=lambda: Priors(tilt_deg=3.0, roll_deg=2.0, horizontal_m=3.0, vertical_m=3.0, focal=0.02)
@@ -145,7 +148,6 @@ def align_to_skyline(
     mask: np.ndarray | None = None,
     search: SearchRange | None = None,
     points: Correspondences | None = None,
-    k1: float = 0.0,
 ) -> SkylineFit:
     """Estimate the pose of a view from its skyline, or from skyline and correspondences together.
 
@@ -165,8 +167,6 @@ def align_to_skyline(
         Search range; `SearchRange()` if omitted.
     points
         Correspondences used in addition.
-    k1
-        Radial distortion coefficient.
 
     Returns
     -------
@@ -176,34 +176,31 @@ def align_to_skyline(
     Raises
     ------
     NoTerrainInView
-        If no terrain is visible from the start position, or the position lies below the ground.
+        If no terrain is visible from the start position.
+    CameraBelowGround
+        If the start position lies more than 40 m below the ground.
     NoUsablePixels
         If the mask leaves less than 5 % of the image.
     NotEnoughEvidence
         If the correspondences contradict each other, or a parameter remains undetermined.
-    ValueError
+    ImageSizeMismatch
         If the image and the view differ in size.
     """
     search = search or SearchRange()
     if image.shape[:2] != (start.height_px, start.width_px):
-        raise ValueError(
+        raise ImageSizeMismatch(
             f"align_to_skyline: the image is {image.shape[1]} x {image.shape[0]} px, expected "
             f"{start.width_px} x {start.height_px} as the view"
         )
     latitude, longitude, _ = geodetic_from_enu(frame, start.position_m)
     axes = local_axes(frame, float(latitude), float(longitude))
-    origin = values_of(start, axes, k1)
+    origin = parameters_of_view(start, axes, search.k1)
     azimuth = _azimuths(start, origin, search)
-    horizon = horizon_from(
-        rasters,
-        frame,
-        start.position_m,
-        azimuth_deg=azimuth,
-        nearest_m=max(60.0, 3.0 * _cell_m(rasters[0])),
-        below_ground_m=40.0,
-    )
+    cell_m = cell_size_m(rasters[0])
+    options = HorizonOptions(nearest_m=max(60.0, 3.0 * cell_m), below_ground_m=40.0)
+    horizon = horizon_from(rasters, frame, start.position_m, azimuth_deg=azimuth, options=options)
     boundary = boundary_map(image, mask, start.fy * np.pi / 180.0)
-    terrain_sigma_m = search.terrain_sigma_m or _cell_m(rasters[0]) / 3.0
+    terrain_sigma_m = search.terrain_sigma_m or cell_m / 3.0
     problem = _SkylineProblem(start, axes, origin, horizon, terrain_sigma_m, boundary, search, points)
     poses, scores = _search_poses(problem)
     refined = [_refine(problem, poses[index]) for index in _best_distinct(poses, scores, 6)]
@@ -212,12 +209,6 @@ def align_to_skyline(
         reason = "no pose in the search range coincides with image edges"
         return SkylineFit(None, False, 0.0, 0.0, float("inf"), 0.0, (reason,), horizon)
     return _assess(problem, fits)
-
-
-def _cell_m(raster: Raster) -> float:
-    """Cell size [m]; rasters in degrees are recognised by their small cells."""
-    size = float(np.sqrt(abs(raster.transform.determinant)))
-    return size * 111_195.0 if size < 0.1 else size
 
 
 def _azimuths(start: View, origin: np.ndarray, search: SearchRange) -> np.ndarray:
@@ -256,9 +247,9 @@ def _search_poses(problem: _SkylineProblem) -> tuple[np.ndarray, np.ndarray]:
     for roll in np.zeros(1) if is_panorama else _steps(search.roll_deg, 1.0):
         for log_scale in _steps(np.log1p(search.focal), 0.03):
             for heading in headings:
-                values = problem.origin + np.array([heading, 0.0, roll, 0, 0, 0, log_scale, 0, 0])
-                scores.append(_pose_scores(problem, values, skyline, edges, row_shift))
-                poses.append(values + tilt_offsets)
+                parameters = problem.origin + np.array([heading, 0.0, roll, 0, 0, 0, log_scale, 0, 0])
+                scores.append(_pose_scores(problem, parameters, skyline, edges, row_shift))
+                poses.append(parameters + tilt_offsets)
     return np.concatenate(poses), np.concatenate(scores)
 
 
@@ -268,25 +259,29 @@ def _steps(half: float, step: float) -> np.ndarray:
 
 
 def _pose_scores(
-    problem: _SkylineProblem, values: np.ndarray, skyline: np.ndarray, edges: np.ndarray, row_shift: np.ndarray
+    problem: _SkylineProblem, parameters: np.ndarray, skyline: np.ndarray, edges: np.ndarray, row_shift: np.ndarray
 ) -> np.ndarray:
     """Score ``(S,)`` of parameters ``(9,)`` at each downward shift in coarse pixels: skyline and a quarter of ridges."""
     boundary = problem.boundary
-    score = _mean_likelihood(problem, values, skyline, boundary.coarse, row_shift)
+    score = _mean_likelihood(problem, parameters, skyline, boundary.coarse, row_shift)
     if len(edges) > 20:
-        score = score + 0.25 * _mean_likelihood(problem, values, edges, boundary.coarse_edges, row_shift)
+        score = score + 0.25 * _mean_likelihood(problem, parameters, edges, boundary.coarse_edges, row_shift)
     return score
 
 
 def _mean_likelihood(
-    problem: _SkylineProblem, values: np.ndarray, position: np.ndarray, likelihood: np.ndarray, row_shift: np.ndarray
+    problem: _SkylineProblem,
+    parameters: np.ndarray,
+    position: np.ndarray,
+    likelihood: np.ndarray,
+    row_shift: np.ndarray,
 ) -> np.ndarray:
     """Mean likelihood ``(S,)`` along a projected line for each downward shift in coarse pixels.
 
     Points above or below the image count as zero, so that a pose is scored over all columns. Masked pixels are omitted.
     """
     start = problem.start
-    pixel, in_front = project_values(start, problem.axes, values, position)
+    pixel, in_front = project_with_parameters(start, problem.axes, parameters, position)
     column = np.floor(pixel[:, 0] * problem.boundary.scale).astype(int)
     if isinstance(start, Panorama) and start.full_circle:
         column %= likelihood.shape[1]
@@ -312,38 +307,37 @@ def _best_distinct(poses: np.ndarray, scores: np.ndarray, count: int) -> list[in
     return chosen
 
 
-def _refine(problem: _SkylineProblem, values: np.ndarray) -> tuple[Calibration, float] | None:
+def _refine(problem: _SkylineProblem, parameters: np.ndarray) -> tuple[Calibration, float] | None:
     """Calibrate to the edges nearest to the projected horizon, with decreasing search distance; and the final score.
 
     ``None`` if too little of the horizon lies near edges.
     """
     start, search = problem.start, problem.search
-    values = _maximise_score(problem, values)
+    parameters = _maximise_score(problem, parameters)
     priors = replace(search.priors, heading_deg=np.inf)
     if isinstance(start, Panorama) and not priors.horizon_px:
         priors = replace(priors, horizon_px=search.tilt_deg * start.fy * np.pi / 180.0)
     calibration = None
     coarse_px = 1.0 / problem.boundary.scale
     for reach in (8.0 * coarse_px, 4.0 * coarse_px, 2.5 * coarse_px, 2.0 * coarse_px):
-        evidence = _skyline_evidence(problem, values, reach)
+        evidence = _skyline_evidence(problem, parameters, reach)
         if evidence is None:
             return None
         calibration = resect(
             start,
             problem.points,
-            priors=priors,
-            axes=problem.axes,
-            k1=float(values[7]),
-            guess=values,
             skyline=evidence,
-            noise_px=None if problem.points else 1.0,
+            priors=priors,
+            k1=float(parameters[7]),
+            axes=problem.axes,
+            options=ResectionOptions(noise_px=None if problem.points else 1.0, guess=parameters),
         )
-        values = calibration.values
+        parameters = calibration.parameters
     assert calibration is not None
-    return calibration, _score(problem, values)
+    return calibration, _score(problem, parameters)
 
 
-def _maximise_score(problem: _SkylineProblem, values: np.ndarray) -> np.ndarray:
+def _maximise_score(problem: _SkylineProblem, parameters: np.ndarray) -> np.ndarray:
     """Parameters of the local maximum of the score in heading, tilt, roll and scale (Nelder & Mead 1965).
 
     Starting the edge search there, edges on both sides of a summit are found; a search across nearly horizontal lines
@@ -356,12 +350,12 @@ def _maximise_score(problem: _SkylineProblem, values: np.ndarray) -> np.ndarray:
     ranges = np.array([search.heading_deg, search.tilt_deg, search.roll_deg, 0, 0, 0, search.focal, 0, horizon_range])
     free = np.flatnonzero(ranges > 0)
     size = np.array([0.5, 0.4, 0.6, 0, 0, 0, 0.03, 0, 0.4 * start.fy * np.pi / 180.0])[free]
-    skyline = _visible_subset(problem, values, problem.skyline_m, 600)
-    edges = _visible_subset(problem, values, horizon.edges_m, 300) if len(horizon.edges_m) else horizon.edges_m
+    skyline = _visible_subset(problem, parameters, problem.skyline_m, 600)
+    edges = _visible_subset(problem, parameters, horizon.edges_m, 300) if len(horizon.edges_m) else horizon.edges_m
     no_shift = np.zeros(1, int)
 
     def loss(unit: np.ndarray) -> float:
-        trial = values.copy()
+        trial = parameters.copy()
         trial[free] += unit * size
         return -_pose_scores(problem, trial, skyline, edges, no_shift)[0]
 
@@ -372,13 +366,13 @@ def _maximise_score(problem: _SkylineProblem, values: np.ndarray) -> np.ndarray:
         method="Nelder-Mead",
         options={"initial_simplex": simplex, "maxfev": 250, "xatol": 0.02, "fatol": 1e-4},
     )
-    best = values.copy()
+    best = parameters.copy()
     if minimum.fun < loss(np.zeros(len(free))):
         best[free] += minimum.x * size
     return best
 
 
-def _skyline_evidence(problem: _SkylineProblem, values: np.ndarray, reach: float) -> SkylineEvidence | None:
+def _skyline_evidence(problem: _SkylineProblem, parameters: np.ndarray, reach: float) -> SkylineEvidence | None:
     """Residuals of horizon and ridge points against the edges within ``reach`` pixels across their lines.
 
     A point is weighted by the likelihood of its edge and by the angle of the terrain's height error at its distance.
@@ -391,9 +385,9 @@ def _skyline_evidence(problem: _SkylineProblem, values: np.ndarray, reach: float
     for position, sigma_factor, is_skyline in lines:
         if len(position) < 5:
             continue
-        position = _visible_subset(problem, values, position, _MAX_POINTS)
-        pixel, in_front = project_values(start, axes, values, position)
-        blur = start.fy * problem.terrain_sigma_m / np.linalg.norm(position - values[3:6], axis=1)
+        position = _visible_subset(problem, parameters, position, _MAX_POINTS)
+        pixel, in_front = project_with_parameters(start, axes, parameters, position)
+        blur = start.fy * problem.terrain_sigma_m / np.linalg.norm(position - parameters[3:6], axis=1)
         reach_px = reach + 2.0 * np.minimum(blur, 2.0 * reach)
         edge = edge_near(problem.boundary, pixel, in_front, reach_px, is_skyline)
         if edge is None:
@@ -407,29 +401,29 @@ def _skyline_evidence(problem: _SkylineProblem, values: np.ndarray, reach: float
     points, target, normal, weight = (np.concatenate(part) for part in (points, target, normal, weight))
 
     def residuals(view: View, k1: float) -> np.ndarray:
-        pixel, _ = project_values(view, axes, values_of(view, axes, k1), points)
+        pixel, _ = project_with_parameters(view, axes, parameters_of_view(view, axes, k1), points)
         error = pixel - target
         if isinstance(view, Panorama):
             circle = 2.0 * np.pi * view.fx
             error[:, 0] -= circle * np.round(error[:, 0] / circle)
         return np.sum(error * normal, axis=1) * weight
 
-    initial = residuals(view_from_values(start, axes, values), values[7])
+    initial = residuals(view_from_parameters(start, axes, parameters), parameters[7])
     spread = max(1.4826 * float(np.median(np.abs(initial - np.median(initial)))), 0.5)
     # Errors of neighbouring columns are correlated: one independent residual per correlation length.
     return SkylineEvidence(residuals, spread * np.sqrt(_correlation_length(initial)))
 
 
-def _visible_subset(problem: _SkylineProblem, values: np.ndarray, position: np.ndarray, count: int) -> np.ndarray:
+def _visible_subset(problem: _SkylineProblem, parameters: np.ndarray, position: np.ndarray, count: int) -> np.ndarray:
     """About ``count`` points, evenly selected from those that project into the image columns."""
-    pixel, in_front = project_values(problem.start, problem.axes, values, position)
+    pixel, in_front = project_with_parameters(problem.start, problem.axes, parameters, position)
     inside = np.flatnonzero(in_front & (pixel[:, 0] > 0) & (pixel[:, 0] < problem.start.width_px))
     return position[inside[:: max(1, len(inside) // count)]]
 
 
-def _score(problem: _SkylineProblem, values: np.ndarray) -> float:
+def _score(problem: _SkylineProblem, parameters: np.ndarray) -> float:
     """Score of a refined pose over all points of the horizon and ridges."""
-    return float(_pose_scores(problem, values, problem.skyline_m, problem.horizon.edges_m, np.zeros(1, int))[0])
+    return float(_pose_scores(problem, parameters, problem.skyline_m, problem.horizon.edges_m, np.zeros(1, int))[0])
 
 
 def _correlation_length(residual: np.ndarray) -> float:
@@ -447,9 +441,9 @@ def _correlation_length(residual: np.ndarray) -> float:
     return total
 
 
-def _edge_coverage(problem: _SkylineProblem, view: View, values: np.ndarray) -> tuple[float, float]:
+def _edge_coverage(problem: _SkylineProblem, view: View, parameters: np.ndarray) -> tuple[float, float]:
     """Fraction of the visible horizon within three coarse pixels of a boundary, less chance; fraction of columns."""
-    pixel, in_front = project_values(view, problem.axes, values, problem.skyline_m)
+    pixel, in_front = project_with_parameters(view, problem.axes, parameters, problem.skyline_m)
     # Parts of the horizon above or below the image are not counted.
     in_front = in_front & (pixel[:, 1] > 0) & (pixel[:, 1] < view.height_px)
     near, inside = _sample_near(problem.boundary, view, pixel, in_front)
@@ -486,15 +480,15 @@ def _assess(problem: _SkylineProblem, fits: list[tuple[Calibration, float]]) -> 
     """Select the fit of the highest score and test its reliability."""
     calibration, score = max(fits, key=lambda fit: fit[1])
     view, search = calibration.view, problem.search
-    values = values_of(view, problem.axes, calibration.k1)
+    parameters = parameters_of_view(view, problem.axes, calibration.k1)
 
     def heading_difference(a: float, b: float) -> float:
         return abs((a - b + 180.0) % 360.0 - 180.0)
 
-    other_scores = [other for fit, other in fits if heading_difference(fit.values[0], values[0]) > 1.0]
+    other_scores = [other for fit, other in fits if heading_difference(fit.parameters[0], parameters[0]) > 1.0]
     score_ratio = score / max(max(other_scores), 1e-6) if other_scores else float("inf")
-    offset = (values[0] - problem.origin[0] + 180.0) % 360.0 - 180.0
-    edge_fraction, column_fraction = _edge_coverage(problem, view, values)
+    offset = (parameters[0] - problem.origin[0] + 180.0) % 360.0 - 180.0
+    edge_fraction, column_fraction = _edge_coverage(problem, view, parameters)
     sigma = calibration.sigma["heading_deg"]
     doubts = []
     if edge_fraction < MIN_EDGE_FRACTION:
@@ -520,7 +514,7 @@ def _assess(problem: _SkylineProblem, fits: list[tuple[Calibration, float]]) -> 
     )
 
 
-def encoded_from_file(path: str | os.PathLike[str]) -> np.ndarray:
+def read_image_srgb8(path: str | os.PathLike[str]) -> np.ndarray:
     """Read an image file as 8-bit sRGB.
 
     Parameters

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from seasonscapes.errors import NoTerrainInView
+from seasonscapes.errors import CameraBelowGround, NoTerrainInView
 from seasonscapes.frames import LocalFrame, enu_from_geodetic, geodetic_from_enu, local_axes
-from seasonscapes.terrain.crs import map_from_geodetic, raster_pixels
+from seasonscapes.terrain.crs import horizontal_crs, map_from_geodetic, raster_pixels
 from seasonscapes.terrain.raster import sample_raster
 from seasonscapes.terrain.surface import Raster
 
@@ -174,16 +174,35 @@ def _horner(coefficients: np.ndarray, x: np.ndarray) -> np.ndarray:
     return total
 
 
+@dataclass(frozen=True)
+class HorizonOptions:
+    """Range of distances and thresholds of `horizon_from`.
+
+    Parameters
+    ----------
+    nearest_m
+        Terrain nearer than this distance is ignored, because the ground next to a mast would occlude everything [m].
+    reach_m
+        Maximum distance [m].
+    min_gap
+        Minimum `Horizon.edge_gap` of a ridge edge.
+    below_ground_m
+        Tolerated depth of the viewpoint below the terrain, for the uncertainty of the heights [m].
+    """
+
+    nearest_m: float = 30.0
+    reach_m: float = 60e3
+    min_gap: float = 0.15
+    below_ground_m: float = 5.0
+
+
 def horizon_from(
     rasters: Sequence[Raster],
     frame: LocalFrame,
     position_m: ArrayLike,
     *,
     azimuth_deg: np.ndarray | None = None,
-    nearest_m: float = 30.0,
-    reach_m: float = 60e3,
-    least_gap: float = 0.15,
-    below_ground_m: float = 5.0,
+    options: HorizonOptions | None = None,
 ) -> Horizon:
     """Compute the terrain horizon of a viewpoint.
 
@@ -197,14 +216,8 @@ def horizon_from(
         Viewpoint ``(3,)`` in the frame [m].
     azimuth_deg
         Increasing azimuths ``(A,)`` [deg]; the full circle in steps of 0.1° if omitted.
-    nearest_m
-        Terrain nearer than this distance is ignored, because the ground next to a mast would occlude everything [m].
-    reach_m
-        Maximum distance [m].
-    least_gap
-        Minimum `Horizon.edge_gap` of a ridge edge.
-    below_ground_m
-        Tolerated depth of the viewpoint below the terrain, for the uncertainty of the heights [m].
+    options
+        Range of distances and thresholds; `HorizonOptions()` if omitted.
 
     Returns
     -------
@@ -214,16 +227,18 @@ def horizon_from(
     Raises
     ------
     NoTerrainInView
-        If no ray intersects terrain, or the viewpoint lies too far below the ground.
+        If no ray intersects terrain.
+    CameraBelowGround
+        If the viewpoint lies more than ``options.below_ground_m`` below the ground.
     """
+    options = options or HorizonOptions()
     position = np.asarray(position_m, float)
     latitude, longitude, height = (float(v) for v in geodetic_from_enu(frame, position))
     axes = local_axes(frame, latitude, longitude)
     depth = float(terrain_height(rasters, [latitude], [longitude])[0]) - height
-    if depth > below_ground_m:
-        raise NoTerrainInView(f"the camera is {depth:.0f} m below ground; check its height and vertical datum")
-    cell = _cell_m(rasters[0])
-    distance = _distances(nearest_m, reach_m, 0.7 * cell)
+    if depth > options.below_ground_m:
+        raise CameraBelowGround(f"the camera is {depth:.0f} m below ground; check its height and vertical datum")
+    distance = _distances(options.nearest_m, options.reach_m, 0.7 * cell_size_m(rasters[0]))
     azimuth_deg = np.arange(3600) * 0.1 if azimuth_deg is None else np.asarray(azimuth_deg, float)
     skyline, elevation, edges, gaps = [], [], [], []
     # Blocks of azimuths bound the memory to some hundred megabytes.
@@ -231,7 +246,7 @@ def horizon_from(
         points = terrain_profile(rasters, frame, position, part, distance)
         local = (points - position) @ axes.T
         slope = local[..., 2] / np.hypot(local[..., 0], local[..., 1])
-        top, has_skyline, ridge, gap = _visible_ridges(slope, distance, least_gap)
+        top, has_skyline, ridge, gap = _visible_ridges(slope, distance, options.min_gap)
         rows = np.arange(len(part))
         skyline.append(np.where(has_skyline[:, None], points[rows, top], np.nan))
         elevation.append(np.where(has_skyline, np.degrees(np.arctan(slope[rows, top])), np.nan))
@@ -245,10 +260,21 @@ def horizon_from(
     )
 
 
-def _cell_m(raster: Raster) -> float:
-    """Cell size [m]; rasters in degrees are recognised by their small cells."""
+def cell_size_m(raster: Raster) -> float:
+    """Return the side of a square of the area of a raster cell.
+
+    Parameters
+    ----------
+    raster
+        Raster in metres or, with a geographic CRS, in degrees.
+
+    Returns
+    -------
+    float
+        Cell size [m]; degrees are converted with the length of a degree of latitude.
+    """
     size = float(np.sqrt(abs(raster.transform.determinant)))
-    return size * 111_195.0 if abs(raster.transform.a) < 0.1 else size
+    return size * 111_195.0 if horizontal_crs(raster.crs).is_geographic else size
 
 
 def _distances(nearest_m: float, reach_m: float, step_m: float) -> np.ndarray:
@@ -260,7 +286,7 @@ def _distances(nearest_m: float, reach_m: float, step_m: float) -> np.ndarray:
 
 
 def _visible_ridges(
-    slope: np.ndarray, distance: np.ndarray, least_gap: float
+    slope: np.ndarray, distance: np.ndarray, min_gap: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Skyline index ``(A,)``, whether there is a skyline ``(A,)``, mask of ridge edges ``(A, R)``, their gaps ``(E,)``."""
     filled = np.where(np.isfinite(slope), slope, -np.inf)
@@ -277,5 +303,5 @@ def _visible_ridges(
     behind = distance[np.minimum(after, slope.shape[1] - 1)]
     gap = np.where(after < slope.shape[1], behind / distance - 1.0, 0.0)
     # At least one occluded sample must lie in between; a large sampling step alone is no gap.
-    ridge = visible & (gap > least_gap) & (after > np.arange(slope.shape[1]) + 1)
+    ridge = visible & (gap > min_gap) & (after > np.arange(slope.shape[1]) + 1)
     return top, has_skyline, ridge, gap[ridge]

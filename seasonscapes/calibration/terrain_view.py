@@ -74,7 +74,7 @@ def scaled_view(view: View, width_px: int) -> View:
     )
 
 
-def look_with(view: View, trace: Callable[[np.ndarray, np.ndarray], _SurfaceHits]) -> TerrainView:
+def trace_terrain_view(view: View, trace: Callable[[np.ndarray, np.ndarray], _SurfaceHits]) -> TerrainView:
     """Compute a terrain view with a ray caster.
 
     Parameters
@@ -96,7 +96,7 @@ def look_with(view: View, trace: Callable[[np.ndarray, np.ndarray], _SurfaceHits
     return TerrainView(np.asarray(hit.depth, float), normal, np.asarray(hit.position, float))
 
 
-def look_at_rasters(
+def march_terrain_view(
     view: View, rasters: Sequence[Raster], frame: LocalFrame, *, nearest_m: float = 60.0, reach_m: float = 60e3
 ) -> TerrainView:
     """Compute a terrain view by marching over elevation rasters once per azimuth, without a renderer.

@@ -39,12 +39,12 @@ def annotate_command(
     from functools import partial
 
     from seasonscapes.calibration.annotation import AnnotationSession, serve_session
-    from seasonscapes.calibration.terrain_view import look_at_rasters
+    from seasonscapes.calibration.terrain_view import march_terrain_view
     from seasonscapes.workflows.webcam_calibration import station_picture
 
     station = (terrain or TerrainSource()).station(scene, webcam)
     image = station_picture(picture, station, "--picture")
-    look = partial(look_at_rasters, rasters=station.rasters, frame=station.frame)
+    look = partial(march_terrain_view, rasters=station.rasters, frame=station.frame)
     webcam_facts = station.webcam
     session = AnnotationSession(
         webcam_facts.id, image, station.view, station.frame, look, output, k1=webcam_facts.radial_k1

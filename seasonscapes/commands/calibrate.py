@@ -99,7 +99,7 @@ def calibrate_command(
         "reliable": not found.doubts,
         "doubts": list(found.doubts),
         "sigma": solution.sigma,
-        "values": solution.values.tolist(),
+        "values": solution.parameters.tolist(),
         "rms_px": solution.rms_px,
         "outliers": list(solution.outlier_names),
         "calibration": str(record_file),

@@ -72,13 +72,12 @@ def evaluate_command(
     found = pairs.paired(truth, pictures)
     pairs.refuse_used([true_path for true_path, _ in found.values()], used)
     measure, why = _lpips(lpips)
-    masks, rows = pairs.MaskOptions(mask, near_m, far_m), []
+    options = pairs.ScoreOptions(pairs.MaskOptions(mask, near_m, far_m), mode, match, measure)
+    rows = []
     with progress_bars() as progress:
         for number, (name, (true_path, path)) in enumerate(found.items()):
             figure = None if figures is None else figures / f"{name}_comparison.png"
-            score = pairs.score_pair(
-                true_path, path, name, masks=masks, mode=mode, match=match, lpips=measure, figure=figure
-            )
+            score = pairs.score_pair(true_path, path, name, options=options, figure=figure)
             rows.append({"picture": name} | score.record())
             progress(f"scoring {len(found)} pictures", (number + 1) / len(found))
     totals = summary([{key: value for key, value in row.items() if key != "picture"} for row in rows])

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 from affine import Affine
 
-from seasonscapes.calibration.pose_model import View, values_of, view_from_values
-from seasonscapes.calibration.terrain_horizon import horizon_from, terrain_height
-from seasonscapes.calibration.terrain_view import look_at_rasters
+from seasonscapes.calibration.pose_model import View, parameters_of_view, view_from_parameters
+from seasonscapes.calibration.terrain_horizon import HorizonOptions, horizon_from, terrain_height
+from seasonscapes.calibration.terrain_view import march_terrain_view
 from seasonscapes.cameras.panorama import panorama_from_angles
 from seasonscapes.cameras.pinhole import camera_at, rotation_from_angles
 from seasonscapes.frames import LocalFrame
@@ -88,7 +88,7 @@ def picture_trial(
     *,
     visibility_m: float | None = None,
     covered: float | None = None,
-    heading_off_deg: float | None = None,
+    heading_error_deg: float | None = None,
     size_px: tuple[int, int] = (1280, 854),
 ) -> PictureTrial:
     """Generate one trial with a perspective camera.
@@ -102,7 +102,7 @@ def picture_trial(
         hundred metres hides the skyline.
     covered
         Fraction of the columns in which masked foreground rises above the skyline; uniform in [0, 0.35] if omitted.
-    heading_off_deg
+    heading_error_deg
         Heading error of the start [deg]; uniform within ±10 if omitted.
     size_px
         Width and height of the image [px].
@@ -126,21 +126,21 @@ def picture_trial(
         fov_deg=fov,
         size_px=size_px,
     )
-    view = look_at_rasters(truth, [raster], frame, nearest_m=120.0, reach_m=40e3)
+    view = march_terrain_view(truth, [raster], frame, nearest_m=120.0, reach_m=40e3)
     distance, normal, offset = view.distance_m, view.normal, view.position_m - truth.position_m
     covered = rng.uniform(0.0, 0.35) if covered is None else covered
     if visibility_m is None:
         visibility_m = float(np.exp(rng.uniform(np.log(20e3), np.log(150e3))))
     image = _shade(distance, normal, offset, rng, visibility_m)
     image, mask = _add_roof(image, covered, rng)
-    values = values_of(truth, np.eye(3))
-    values[0] += rng.uniform(-10, 10) if heading_off_deg is None else heading_off_deg
-    values[1:3] += [rng.normal(0, 1.0), -values[2]]
-    values[3:6] += rng.normal(0, 1.0, 3) * [3.0, 3.0, 2.0]
+    parameters = parameters_of_view(truth, np.eye(3))
+    parameters[0] += rng.uniform(-10, 10) if heading_error_deg is None else heading_error_deg
+    parameters[1:3] += [rng.normal(0, 1.0), -parameters[2]]
+    parameters[3:6] += rng.normal(0, 1.0, 3) * [3.0, 3.0, 2.0]
     error = cv2.GaussianBlur(rng.normal(size=(_CELLS, _CELLS)).astype(np.float32), (0, 0), 1.5)
     measured = replace(raster, values=raster.values + (5.0 * error / error.std())[..., None])
     return PictureTrial(
-        image, mask, np.isinf(distance), truth, view_from_values(truth, np.eye(3), values), (measured,), frame
+        image, mask, np.isinf(distance), truth, view_from_parameters(truth, np.eye(3), parameters), (measured,), frame
     )
 
 
@@ -172,14 +172,20 @@ def panorama_trial(rng: np.random.Generator, *, size_px: tuple[int, int] = (3600
         pose=pose,
         horizon_row_px=size_px[1] * rng.uniform(0.45, 0.55),
     )
-    view = look_at_rasters(truth, [raster], frame, nearest_m=120.0, reach_m=40e3)
+    view = march_terrain_view(truth, [raster], frame, nearest_m=120.0, reach_m=40e3)
     image = _shade(view.distance_m, view.normal, view.position_m - truth.position_m, rng, 60e3)
-    values = values_of(truth, np.eye(3))
-    values[:3] = values[0] + rng.uniform(-10, 10), 0.0, 0.0
-    values[8] = rng.uniform(-1.5, 1.5) * truth.fy * np.pi / 180.0
+    parameters = parameters_of_view(truth, np.eye(3))
+    parameters[:3] = parameters[0] + rng.uniform(-10, 10), 0.0, 0.0
+    parameters[8] = rng.uniform(-1.5, 1.5) * truth.fy * np.pi / 180.0
     mask = np.ones(image.shape[:2], bool)
     return PictureTrial(
-        image, mask, np.isinf(view.distance_m), truth, view_from_values(truth, np.eye(3), values), (raster,), frame
+        image,
+        mask,
+        np.isinf(view.distance_m),
+        truth,
+        view_from_parameters(truth, np.eye(3), parameters),
+        (raster,),
+        frame,
     )
 
 
@@ -202,7 +208,8 @@ def _open_heading(
 ) -> tuple[float, float]:
     """A heading with a wide view, as is typical of webcams, and the median elevation of its skyline [deg]."""
     position = np.array([0.0, 0.0, height_m])
-    horizon = horizon_from([raster], frame, position, azimuth_deg=np.arange(0.0, 360.0, 1.0), nearest_m=120.0)
+    azimuth_deg, options = np.arange(0.0, 360.0, 1.0), HorizonOptions(nearest_m=120.0)
+    horizon = horizon_from([raster], frame, position, azimuth_deg=azimuth_deg, options=options)
     elevation = np.nan_to_num(horizon.skyline_elevation_deg, nan=30.0)
     distance = np.linalg.norm(np.nan_to_num(horizon.skyline_m) - position, axis=1)
     half = int(fov_deg / 2)

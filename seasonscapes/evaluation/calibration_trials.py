@@ -7,8 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from seasonscapes.calibration.evidence import Correspondences, Priors
-from seasonscapes.calibration.pose_model import View, bearings, project_values, values_of, view_from_values
-from seasonscapes.calibration.resection import Calibration, Loss, resect
+from seasonscapes.calibration.pose_model import (
+    View,
+    bearings,
+    parameters_of_view,
+    project_with_parameters,
+    view_from_parameters,
+)
+from seasonscapes.calibration.resection import Calibration, Loss, ResectionOptions, resect
 from seasonscapes.cameras.panorama import panorama_from_angles
 from seasonscapes.cameras.pinhole import Camera, rotation_from_angles
 
@@ -46,7 +52,7 @@ def point_trial(
     count: int = 12,
     noise_px: float = 1.0,
     outlier_share: float = 0.2,
-    heading_off_deg: float = 5.0,
+    heading_error_deg: float = 5.0,
 ) -> PointTrial:
     """Generate correspondences at distances of 200 m to 15 km, spread over the image.
 
@@ -63,7 +69,7 @@ def point_trial(
         Standard deviation of a pixel coordinate [px].
     outlier_share
         Fraction of outliers, which are displaced by 20 to 400 px.
-    heading_off_deg
+    heading_error_deg
         Absolute heading error of the start [deg].
 
     Returns
@@ -90,13 +96,15 @@ def point_trial(
     outlier[rng.permutation(count)[: round(outlier_share * count)]] = True
     angle = rng.uniform(0, 2 * np.pi, outlier.sum())
     observed[outlier] += rng.uniform(20, 400, (outlier.sum(), 1)) * np.stack([np.cos(angle), np.sin(angle)], -1)
-    values = values_of(truth, np.eye(3))
-    values[0] += rng.choice([-1.0, 1.0]) * heading_off_deg
-    values[1:3] += rng.normal(0, 1.0, 2)
+    parameters = parameters_of_view(truth, np.eye(3))
+    parameters[0] += rng.choice([-1.0, 1.0]) * heading_error_deg
+    parameters[1:3] += rng.normal(0, 1.0, 2)
     offset = rng.normal(size=3)
-    values[3:6] += START_OFFSET_M * offset / np.linalg.norm(offset)
-    values[6] += rng.normal(0, 0.02)
-    return PointTrial(truth, view_from_values(truth, np.eye(3), values), Correspondences(observed, position), outlier)
+    parameters[3:6] += START_OFFSET_M * offset / np.linalg.norm(offset)
+    parameters[6] += rng.normal(0, 0.02)
+    return PointTrial(
+        truth, view_from_parameters(truth, np.eye(3), parameters), Correspondences(observed, position), outlier
+    )
 
 
 @dataclass(frozen=True)
@@ -134,7 +142,7 @@ def score_points(trial: PointTrial, *, noise_px: float | None = None, loss: Loss
     noise_px
         Standard deviation of a pixel coordinate [px]; estimated if ``None``.
     loss
-        Robust loss, as in `resect`.
+        Robust loss, as in `ResectionOptions`.
 
     Returns
     -------
@@ -147,9 +155,10 @@ def score_points(trial: PointTrial, *, noise_px: float | None = None, loss: Loss
         As `resect`.
     """
     priors = Priors(horizontal_m=START_SIGMA_M, vertical_m=START_SIGMA_M)
-    solved: Calibration = resect(trial.start, trial.points, priors=priors, noise_px=noise_px, loss=loss)
-    truth = values_of(trial.truth, np.eye(3))
-    error = solved.values - truth
+    options = ResectionOptions(loss=loss, noise_px=noise_px)
+    solved: Calibration = resect(trial.start, trial.points, priors=priors, options=options)
+    truth = parameters_of_view(trial.truth, np.eye(3))
+    error = solved.parameters - truth
     sigma = np.array([solved.sigma[name] for name in ("east_m", "north_m", "up_m")])
     return PointScore(
         abs((error[0] + 180.0) % 360.0 - 180.0),
@@ -174,4 +183,4 @@ def reproject(trial: PointTrial) -> np.ndarray:
         True pixels ``(N, 2)``.
     """
     axes = np.eye(3)
-    return project_values(trial.truth, axes, values_of(trial.truth, axes), trial.points.position_m)[0]
+    return project_with_parameters(trial.truth, axes, parameters_of_view(trial.truth, axes), trial.points.position_m)[0]

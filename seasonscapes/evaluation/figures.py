@@ -17,7 +17,7 @@ _ERROR_COLOURS = np.array(
 )
 
 
-def comparison(
+def comparison_figure(
     pictures: Mapping[str, np.ndarray],
     *,
     mask: np.ndarray | None = None,
@@ -48,10 +48,12 @@ def comparison(
         If there are fewer than two images, or their shapes differ.
     """
     if len(pictures) < 2:
-        raise ValueError(f"comparison: got {len(pictures)} images, expected the ground truth and at least one more")
+        raise ValueError(
+            f"comparison_figure: got {len(pictures)} images, expected the ground truth and at least one more"
+        )
     names, images = list(pictures), [np.asarray(picture, np.float64) for picture in pictures.values()]
     if len({image.shape for image in images}) != 1:
-        raise ValueError(f"comparison: got shapes {[image.shape for image in images]}, expected equal shapes")
+        raise ValueError(f"comparison_figure: got shapes {[image.shape for image in images]}, expected equal shapes")
     mask = np.ones(images[0].shape[:2], bool) if mask is None else mask
     error = error_colours(np.where(mask, flip_map(images[0], np.where(mask[..., None], images[1], images[0])), 0.0))
     rows = [_row([_brighten_masked(image, mask) for image in images] + [error], [*names, f"difference of {names[1]}"])]
@@ -68,7 +70,7 @@ def comparison(
     return np.concatenate(rows)
 
 
-def side_by_side(pictures: Mapping[str, np.ndarray]) -> np.ndarray:
+def image_row(pictures: Mapping[str, np.ndarray]) -> np.ndarray:
     """Compose a row of labelled images.
 
     Parameters
@@ -88,7 +90,7 @@ def side_by_side(pictures: Mapping[str, np.ndarray]) -> np.ndarray:
     """
     images = [np.asarray(picture, np.float64) for picture in pictures.values()]
     if len({image.shape for image in images}) != 1:
-        raise ValueError(f"side_by_side: got shapes {[image.shape for image in images]}, expected equal shapes")
+        raise ValueError(f"image_row: got shapes {[image.shape for image in images]}, expected equal shapes")
     return _row(images, list(pictures))
 
 

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from seasonscapes.errors import InputError
+
 if TYPE_CHECKING:
     import torch
 
@@ -23,6 +25,8 @@ ENVIRONMENT = "SEASONSCAPES_LPIPS"
 _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 # Convolutional layers: index in torchvision's `features`, stride, padding, and whether max pooling precedes it.
 _LAYERS = ((0, 4, 2, False), (3, 1, 2, True), (6, 1, 1, True), (8, 1, 1, False), (10, 1, 1, False))
+_NETWORK_KEYS = tuple(f"features.{n}.{kind}" for n, *_ in _LAYERS for kind in ("weight", "bias"))
+_LINEAR_KEYS = tuple(f"lin{i}.model.1.weight" for i in range(len(_LAYERS)))
 _SMALLEST_PX = 31
 Lpips = Callable[[np.ndarray, np.ndarray, np.ndarray | None], float]
 
@@ -65,8 +69,8 @@ def load_lpips(folder: Path | None = None) -> Lpips:
     ------
     FileNotFoundError
         If a weight file is missing (`missing_lpips`).
-    ValueError
-        If the files contain other weights.
+    InputError
+        If a file contains other weights.
     """
     reason = missing_lpips(folder)
     if reason is not None:
@@ -75,6 +79,11 @@ def load_lpips(folder: Path | None = None) -> Lpips:
 
     folder = folder or Path(os.environ[ENVIRONMENT])
     network, linear = (torch.load(folder / name, map_location="cpu", weights_only=True) for name in WEIGHTS)
+    for name, weights, keys in zip(WEIGHTS, (network, linear), (_NETWORK_KEYS, _LINEAR_KEYS), strict=True):
+        missing = [key for key in keys if not isinstance(weights, Mapping) or key not in weights]
+        if missing:
+            problem = f"not the weights of LPIPS: {len(missing)} of {len(keys)} keys are missing"
+            raise InputError(folder / name, problem, expected=f"the key {missing[0]}")
     return lpips_of(network, linear)
 
 

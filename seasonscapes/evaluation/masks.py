@@ -8,7 +8,7 @@ import numpy as np
 NEAR_M = 60.0
 
 
-def land_mask(depth_m: np.ndarray, *, near_m: float = NEAR_M, far_m: float = np.inf) -> np.ndarray:
+def terrain_mask(depth_m: np.ndarray, *, near_m: float = NEAR_M, far_m: float = np.inf) -> np.ndarray:
     """Return the mask of pixels that show terrain between two distances.
 
     Parameters
@@ -30,14 +30,14 @@ def land_mask(depth_m: np.ndarray, *, near_m: float = NEAR_M, far_m: float = np.
 
     Examples
     --------
-    >>> land_mask(np.array([[10.0, 500.0, np.inf]]))
+    >>> terrain_mask(np.array([[10.0, 500.0, np.inf]]))
     array([[False,  True, False]])
     """
     depth_m = np.asarray(depth_m)
     if not (depth_m >= 0.0).all():
-        raise ValueError("land_mask: depth is negative or NaN")
+        raise ValueError("terrain_mask: depth is negative or NaN")
     if not 0.0 <= near_m < far_m:
-        raise ValueError(f"land_mask: got near_m = {near_m}, far_m = {far_m}, expected 0 ≤ near_m < far_m")
+        raise ValueError(f"terrain_mask: got near_m = {near_m}, far_m = {far_m}, expected 0 ≤ near_m < far_m")
     return np.isfinite(depth_m) & (depth_m >= near_m) & (depth_m <= far_m)
 
 

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from seasonscapes.errors import InputError, UnreadableImage
-from seasonscapes.evaluation.figures import comparison
-from seasonscapes.evaluation.masks import land_mask
+from seasonscapes.evaluation.figures import comparison_figure
+from seasonscapes.evaluation.lpips import Lpips
+from seasonscapes.evaluation.masks import terrain_mask
 from seasonscapes.evaluation.metrics import Score, score
 from seasonscapes.evaluation.splits import file_content_hash
 from seasonscapes.evaluation.tables import table_lines
@@ -37,6 +38,28 @@ class MaskOptions:
     mask: Path | None = None
     near_m: float = 60.0
     far_m: float = float("inf")
+
+
+@dataclass(frozen=True)
+class ScoreOptions:
+    """How a pair of pictures is compared.
+
+    Parameters
+    ----------
+    masks
+        Pixels that are scored.
+    mode
+        Mode of `metrics.score`.
+    match
+        One of `MATCHES`: ``"none"``, or ``"gain"`` to scale each colour of the picture to the truth first.
+    lpips
+        LPIPS function (`lpips.load_lpips`), or ``None`` to omit that metric.
+    """
+
+    masks: MaskOptions = MaskOptions()
+    mode: str = "valid"
+    match: str = "none"
+    lpips: Lpips | None = None
 
 
 @dataclass(frozen=True)
@@ -169,7 +192,7 @@ def mask_of(name: str, pair: PicturePair, options: MaskOptions) -> np.ndarray | 
     chosen = None
     if pair.depth_m is not None:
         depth = np.where(np.isnan(pair.depth_m), np.inf, pair.depth_m)
-        chosen = land_mask(depth, near_m=options.near_m, far_m=options.far_m)
+        chosen = terrain_mask(depth, near_m=options.near_m, far_m=options.far_m)
     if options.mask is None:
         return chosen
     path = options.mask / f"{name}.png" if options.mask.is_dir() else options.mask
@@ -208,43 +231,41 @@ def refuse_used(truths: Sequence[Path], used: Sequence[Path]) -> None:
 
 
 def score_pair(
-    true_path: Path,
-    path: Path,
-    name: str,
-    *,
-    masks: MaskOptions,
-    mode: str = "valid",
-    match: str = "none",
-    lpips: Callable | None = None,
-    figure: Path | None = None,
+    true_path: Path, path: Path, name: str, *, options: ScoreOptions | None = None, figure: Path | None = None
 ) -> Score:
-    """Score one pair of files, and write a comparison figure where asked for.
+    """Compute the metrics of one pair of files and optionally write a comparison figure.
 
     Parameters
     ----------
-    true_path, path, name
-        The files, and the pair's name, by which its mask is found.
-    masks, mode, match
-        See `mask_of`, `metrics.score` and `read_pair`.
-    lpips
-        A function that measures LPIPS; ``None`` leaves it out.
+    true_path, path
+        Files of truth and picture.
+    name
+        Name of the pair, which selects its mask in a folder of masks.
+    options
+        Mask, mode, exposure matching and LPIPS; `ScoreOptions()` if omitted.
     figure
-        A ``.png`` to write.
+        PNG file to write, or ``None``.
+
+    Returns
+    -------
+    Score
+        Metrics of the picture.
 
     Raises
     ------
     InputError
-        Where the pair cannot be compared, or no pixel is left to score.
+        If the pair cannot be compared, or no pixel is left to score.
     """
-    pair = read_pair(true_path, path, match=match)
-    mask = mask_of(name, pair, masks)
+    options = options or ScoreOptions()
+    pair = read_pair(true_path, path, match=options.match)
+    mask = mask_of(name, pair, options.masks)
     if mask is not None and not mask.any():
         raise InputError(path, "no pixel is left to score", cure="check --mask, --near-m and --far-m")
-    found = score(pair.truth, pair.picture, mask, mode=mode, lpips=lpips)
+    result = score(pair.truth, pair.picture, mask, mode=options.mode, lpips=options.lpips)
     if figure is not None:
-        sheet = comparison({"truth": pair.truth, "picture": pair.picture}, mask=mask)
+        sheet = comparison_figure({"truth": pair.truth, "picture": pair.picture}, mask=mask)
         write_png8(figure, np.round(255.0 * sheet).astype(np.uint8))
-    return found
+    return result
 
 
 def write_table(path: Path, rows: Sequence[dict]) -> None:

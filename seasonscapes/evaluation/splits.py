@@ -60,7 +60,7 @@ class PictureUse:
         return self.time.astimezone(UTC)
 
 
-def use_of(observation: Observation, purpose: str) -> PictureUse:
+def picture_use(observation: Observation, purpose: str) -> PictureUse:
     """Describe the use of an observation, with the hash of its content.
 
     Parameters
@@ -169,7 +169,7 @@ def held_out_views(webcams: Sequence[str], count: int, *, seed: int = 0) -> tupl
     )
 
 
-def held_out_hours(
+def held_out_times(
     times: Sequence[datetime], every: int, *, first: int = 1
 ) -> tuple[tuple[datetime, ...], tuple[datetime, ...]]:
     """Split times into those to use and those to evaluate: every ``every``-th time in order is held out.
@@ -199,7 +199,7 @@ def held_out_hours(
     held_out = ordered[first::every] if every >= 2 else []
     if not held_out or len(set(ordered)) != len(ordered):
         raise ValueError(
-            f"held_out_hours: got every = {every} and {len(ordered)} times, expected distinct times and every ≥ 2"
+            f"held_out_times: got every = {every} and {len(ordered)} times, expected distinct times and every ≥ 2"
         )
     return tuple(time for time in ordered if time not in held_out), tuple(held_out)
 
@@ -225,7 +225,7 @@ def webcam_of(name: str) -> str:
     return name.split("/", 1)[0]
 
 
-def refuse_leaks(evaluated: Sequence[PictureUse], used: Sequence[PictureUse], *, kind: str = "picture") -> None:
+def check_no_leakage(evaluated: Sequence[PictureUse], used: Sequence[PictureUse], *, kind: str = "picture") -> None:
     """Check that no image to be evaluated was used for painting, guidance or training.
 
     Parameters
@@ -246,7 +246,7 @@ def refuse_leaks(evaluated: Sequence[PictureUse], used: Sequence[PictureUse], *,
         If the criterion is unknown.
     """
     if kind not in KINDS:
-        raise ValueError(f"refuse_leaks: got kind {kind!r}, expected one of {', '.join(KINDS)}")
+        raise ValueError(f"check_no_leakage: got kind {kind!r}, expected one of {', '.join(KINDS)}")
     leaks = [
         f"{image.webcam} at {image.instant.isoformat()} was used for {other.purpose} ({reason})"
         for image in evaluated

@@ -88,16 +88,35 @@ class SyntheticPicture:
     gbuffer: GBuffer
 
 
+@dataclass(frozen=True)
+class WebcamOptions:
+    """How the images of a synthetic webcam are rendered and degraded.
+
+    Parameters
+    ----------
+    faults
+        Exposure, white balance, tone curve, noise and compression of the webcam.
+    poses
+        Standard deviations of the pose error of the observations; exact poses if ``None``.
+    foreground
+        Whether to add houses and a mast.
+    sampling
+        Sampling of the light transport; `QUICK` if ``None``.
+    """
+
+    faults: WebcamFaults = TYPICAL
+    poses: PoseSigmas | None = None
+    foreground: bool = False
+    sampling: SamplingOptions | None = None
+
+
 def webcam_series(
     terrain: Terrain,
     webcam: str,
     camera: Camera | Panorama,
     instants: Sequence[WebcamInstant],
     *,
-    faults: WebcamFaults = TYPICAL,
-    poses: PoseSigmas | None = None,
-    foreground: bool = False,
-    sampling: SamplingOptions = QUICK,
+    options: WebcamOptions | None = None,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> list[SyntheticPicture]:
@@ -114,14 +133,8 @@ def webcam_series(
         Camera or panorama at the true pose.
     instants
         Light and albedo of each image.
-    faults
-        Exposure, white balance, tone curve, noise and compression of the webcam.
-    poses
-        Standard deviations of the pose error of the observations; exact poses if omitted.
-    foreground
-        Whether to add houses and a mast.
-    sampling
-        Sampling of the light transport.
+    options
+        Faults, pose errors, foreground and sampling; `WebcamOptions()` if omitted.
     seed
         Seed of the random numbers.
     progress
@@ -134,15 +147,16 @@ def webcam_series(
 
     Raises
     ------
-    ValueError
+    NoTerrainInView
         If no terrain is visible from the camera (raised by `trace_view`).
     """
-    report = progress or (lambda fraction: None)
+    options, report = options or WebcamOptions(), progress or (lambda fraction: None)
     rng = np.random.default_rng([seed, zlib.crc32(webcam.encode())])
-    perturbed, _ = perturb_pose(camera, poses or PoseSigmas(), rng)
+    perturbed, _ = perturb_pose(camera, options.poses or PoseSigmas(), rng)
     foreground_seed = int(rng.integers(2**32))
     mesh = mi_mesh(terrain, instants[0].albedo)
     unlit = ray_scene(mesh)
+    sampling = options.sampling or QUICK
     coefficients = trace_view(unlit, camera, sampling, seed=seed, progress=lambda f: report(0.7 * f))
     pictures, current_albedo = [], instants[0].albedo
     for index, instant in enumerate(instants):
@@ -152,9 +166,9 @@ def webcam_series(
             current_albedo = instant.albedo
         view = relight_view(relightable_view(unlit, coefficients), instant.illumination)
         radiance, in_foreground = np.maximum(view.radiance, 0.0), np.zeros(view.coverage.shape, bool)
-        if foreground:
+        if options.foreground:
             radiance, in_foreground = add_foreground(radiance, np.random.default_rng(foreground_seed))
-        encoded, development = degrade(radiance, faults, rng)
+        encoded, development = degrade(radiance, options.faults, rng)
         observation = Observation(
             linear_from_srgb(encoded / np.float32(255.0)),
             np.ones(in_foreground.shape, bool),

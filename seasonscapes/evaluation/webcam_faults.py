@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from seasonscapes.calibration.pose_model import View, values_of, view_from_values
+from seasonscapes.calibration.pose_model import View, parameters_of_view, view_from_parameters
 from seasonscapes.cameras.pinhole import rotation_from_angles
 from seasonscapes.images import (
     METER_CONSTANT,
@@ -259,9 +259,9 @@ def perturb_pose(camera: View, sigmas: PoseSigmas, rng: np.random.Generator) -> 
     pose = camera.world_from_camera.copy()
     pose[:3, :3] = heading_rotation @ pose[:3, :3] @ camera_rotation
     pose[:3, 3] += [error["east_m"], error["north_m"], error["up_m"]]
-    values = values_of(camera, np.eye(3))
-    values[6] = error["log_focal"]
-    scaled = view_from_values(camera, np.eye(3), values)
+    parameters = parameters_of_view(camera, np.eye(3))
+    parameters[6] = error["log_focal"]
+    scaled = view_from_parameters(camera, np.eye(3), parameters)
     return replace(camera, fx=scaled.fx, fy=scaled.fy, world_from_camera=pose), error
 
 

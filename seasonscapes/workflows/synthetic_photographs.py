@@ -151,9 +151,10 @@ def photograph_each(
     InputError
         Where a camera sees no terrain.
     """
-    from seasonscapes.evaluation.synthetic_webcams import WebcamInstant, webcam_series
+    from seasonscapes.evaluation.synthetic_webcams import WebcamInstant, WebcamOptions, webcam_series
 
     albedos: dict[int, np.ndarray] = {}
+    options = WebcamOptions(poses=poses)
     task = f"photographing from {len(cameras)} webcams"
     for number, (name, camera) in enumerate(cameras.items()):
         instants = []
@@ -165,7 +166,7 @@ def photograph_each(
             instants.append(WebcamInstant(time, light, albedos[day]))
         report = task_progress(progress, task, start=number / len(cameras), end=(number + 1) / len(cameras))
         try:
-            pictures = webcam_series(place.terrain, name, camera, instants, poses=poses, seed=seed, progress=report)
+            pictures = webcam_series(place.terrain, name, camera, instants, options=options, seed=seed, progress=report)
         except NoTerrainInView:
             raise InputError(f"camera '{name}'", "sees no terrain", cure=f"--leave-out {name}") from None
         yield name, pictures
@@ -174,7 +175,7 @@ def photograph_each(
 def write_pose(path: Path, name: str, camera: Camera | Panorama, sigmas: PoseSigmas, frame: LocalFrame) -> None:
     """Write a synthetic webcam's pose as a calibration record with the stated standard deviations."""
     from seasonscapes.calibration.calibration_file import write_calibration
-    from seasonscapes.calibration.pose_model import values_of
+    from seasonscapes.calibration.pose_model import parameters_of_view
     from seasonscapes.calibration.resection import Calibration
 
     deviations = [
@@ -191,7 +192,7 @@ def write_pose(path: Path, name: str, camera: Camera | Panorama, sigmas: PoseSig
     solved = Calibration(
         camera,
         0.0,
-        values_of(camera, np.eye(3)),
+        parameters_of_view(camera, np.eye(3)),
         np.diag(np.square(deviations)),
         (),
         np.zeros((0, 2)),

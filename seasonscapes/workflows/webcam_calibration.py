@@ -130,12 +130,12 @@ def webcam_station(
 
 def read_picture(path: Path, where: str) -> np.ndarray:
     """A picture file as ``(H, W, 3)`` uint8 sRGB; `InputError` about ``where`` where it is none."""
-    from seasonscapes.calibration.skyline import encoded_from_file
+    from seasonscapes.calibration.skyline import read_image_srgb8
 
     if not path.is_file():
         raise InputError(where, "no such file", got=str(path))
     try:
-        return encoded_from_file(path)
+        return read_image_srgb8(path)
     except UnreadableImage:
         raise InputError(where, "not a readable picture", got=str(path)) from None
 
@@ -189,13 +189,14 @@ def calibrate(
     """
     from seasonscapes.calibration.evidence import Priors
     from seasonscapes.calibration.resection import resect
-    from seasonscapes.calibration.skyline import align_to_skyline
-    from seasonscapes.calibration.terrain_horizon import horizon_from
+    from seasonscapes.calibration.skyline import SearchRange, align_to_skyline
+    from seasonscapes.calibration.terrain_horizon import HorizonOptions, horizon_from
 
     webcam = station.webcam
     if skyline:
+        search = SearchRange(k1=webcam.radial_k1)
         fit = align_to_skyline(
-            picture, station.view, station.rasters, station.frame, mask=mask, points=points, k1=webcam.radial_k1
+            picture, station.view, station.rasters, station.frame, mask=mask, search=search, points=points
         )
         if fit.calibration is None:
             raise NotEnoughEvidence("; ".join(fit.doubts))
@@ -205,7 +206,8 @@ def calibrate(
     sigma_m = webcam.position_sigma_m
     priors = Priors(horizontal_m=sigma_m, vertical_m=sigma_m, k1=np.inf if radial else 0.0)
     solution = resect(station.view, points, priors=priors, k1=webcam.radial_k1, axes=station.axes)
-    horizon = horizon_from(station.rasters, station.frame, solution.view.position_m, below_ground_m=40.0)
+    options = HorizonOptions(below_ground_m=40.0)
+    horizon = horizon_from(station.rasters, station.frame, solution.view.position_m, options=options)
     return WebcamCalibration(station, solution, horizon, points)
 
 
@@ -233,19 +235,19 @@ def calibrate_by_skylines(
         The records written, and the reason for each webcam that could not be calibrated reliably.
     """
     from seasonscapes.calibration.calibration_file import read_calibration, write_calibration
-    from seasonscapes.calibration.pose_model import values_of, view_from_values
-    from seasonscapes.calibration.skyline import align_to_skyline, encoded_from_file
+    from seasonscapes.calibration.pose_model import parameters_of_view, view_from_parameters
+    from seasonscapes.calibration.skyline import align_to_skyline, read_image_srgb8
 
     files, doubts = [], {}
     for record in sorted(records.glob("*_calibration.json")):
         if not (output / record.name).is_file():
             stated = read_calibration(record)
             rng = np.random.default_rng([seed, zlib.crc32(stated.webcam.encode())])
-            values = values_of(stated.view, np.eye(3))
-            values[0] += rng.uniform(-_COMPASS_DEG, _COMPASS_DEG)
-            guess = view_from_values(stated.view, np.eye(3), values)
+            parameters = parameters_of_view(stated.view, np.eye(3))
+            parameters[0] += rng.uniform(-_COMPASS_DEG, _COMPASS_DEG)
+            guess = view_from_parameters(stated.view, np.eye(3), parameters)
             try:
-                image = encoded_from_file(pictures[stated.webcam])
+                image = read_image_srgb8(pictures[stated.webcam])
                 fit = align_to_skyline(image, guess, [place.elevation], stated.frame)
             except NotEnoughEvidence as error:
                 doubts[stated.webcam] = str(error)
