@@ -18,7 +18,7 @@ import numpy as np
 
 from seasonscapes.sky.clear_sky import AtmosphereTables
 from seasonscapes.sky.ephemeris import LunarPosition, SolarPosition, refraction_deg
-from seasonscapes.sky.illuminate import illuminate, tables_in_memory
+from seasonscapes.sky.illuminate import SkyEvaluators, illuminate, tables_in_memory
 from seasonscapes.sky.illumination import global_horizontal_illuminance, luminance
 from seasonscapes.sky.models import SkyModel, read_sky_model
 
@@ -69,10 +69,10 @@ def night_rows(tables: AtmosphereTables | None = None, *, model: SkyModel | None
         The bundled ``clear`` where left out.
     """
     model = model or read_sky_model("clear")
-    tables_of = tables_in_memory if tables is None else lambda _: tables
+    evaluators = SkyEvaluators(tables_in_memory if tables is None else lambda _: tables)
 
     def ours(sun: SolarPosition, moon: LunarPosition | None = None) -> float:
-        light = illuminate(model, sun, moon, map_height=64, tables_of=tables_of)
+        light = illuminate(model, sun, moon, map_height=64, evaluators=evaluators)
         return float(luminance(global_horizontal_illuminance(light)))
 
     rows = []

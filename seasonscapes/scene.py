@@ -147,13 +147,11 @@ class Imagery(Declaration):
     reflectance_scale: float = Field(default=0.5, gt=0.0, le=2.0)
 
 
-class NamedCamera(Declaration):
-    """Named viewpoint with its viewing direction and field of view.
+class Viewpoint(Declaration):
+    """Position of a camera with its viewing direction and field of view.
 
     Parameters
     ----------
-    name
-        Unique name of the camera.
     latitude_deg, longitude_deg
         WGS 84 position [deg].
     height_m
@@ -170,7 +168,6 @@ class NamedCamera(Declaration):
         Horizontal field of view [deg].
     """
 
-    name: str = Field(min_length=1)
     latitude_deg: float = Latitude
     longitude_deg: float = Longitude
     height_m: float | None = Field(default=None, ge=-500.0, le=100_000.0)
@@ -181,10 +178,22 @@ class NamedCamera(Declaration):
     fov_deg: float = Field(default=60.0, gt=0.0, lt=170.0)
 
     @model_validator(mode="after")
-    def _one_height(self) -> NamedCamera:
+    def _one_height(self) -> Viewpoint:
         if (self.height_m is None) == (self.above_ground_m is None):
             raise ValueError("give either 'height_m' (in the scene's vertical datum) or 'above_ground_m'")
         return self
+
+
+class NamedCamera(Viewpoint):
+    """Viewpoint with a name.
+
+    Parameters
+    ----------
+    name
+        Unique name of the camera.
+    """
+
+    name: str = Field(min_length=1)
 
 
 class SceneFile(Declaration):
@@ -322,16 +331,16 @@ def read_scene(path: str | Path, *, allow_outside: bool = False) -> SceneFile:
 
 
 def camera_from_named_view(
-    frame: LocalFrame, view: NamedCamera, ground_height_m: float, *, size_px: tuple[int, int]
+    frame: LocalFrame, view: Viewpoint, ground_height_m: float, *, size_px: tuple[int, int]
 ) -> Camera:
-    """Build the pinhole camera of a named viewpoint.
+    """Build the pinhole camera of a viewpoint.
 
     Parameters
     ----------
     frame
         Local frame of the scene.
     view
-        Named viewpoint.
+        Viewpoint, such as a named camera of the scene.
     ground_height_m
         Height of the terrain at the viewpoint in the scene's vertical datum [m].
     size_px
@@ -345,7 +354,7 @@ def camera_from_named_view(
     if view.height_m is not None:
         height_m = view.height_m
     else:
-        assert view.above_ground_m is not None  # validated by `NamedCamera`
+        assert view.above_ground_m is not None  # validated by `Viewpoint`
         height_m = ground_height_m + float(view.above_ground_m)
     return camera_at(
         frame,

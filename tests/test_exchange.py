@@ -125,12 +125,31 @@ def test_opencv_projects_the_same_points_with_distortion(tmp_path):
         ("transforms.json", "[]", "not a JSON object"),
         ("transforms.json", "{", "not valid JSON"),
         ("cameras.txt", "1 OPENCV 10 10 5 5 5 5 0 0 0 0\n", "camera model OPENCV has distortion"),
+        ("cameras.txt", "# ids\n1 PINHOLE 10 10 5 5 5\n", r"cameras.txt: line 2: wrong number of PINHOLE .* got 3"),
+        ("cameras.txt", "1 SIMPLE_PINHOLE 10 10\n", r"line 1: wrong number of SIMPLE_PINHOLE .* got 0; expected 3"),
+        ("cameras.txt", "1 PINHOLE\n", r"cameras.txt: line 1: too few values"),
+        ("cameras.txt", "1 PINHOLE 10 10 5 5 5 wide\n", r"cameras.txt: line 1: not a number: .*wide"),
     ],
 )
 def test_foreign_files_that_do_not_fit_say_so(tmp_path, name, text, message):
     (tmp_path / name).write_text(text)
     with pytest.raises(InputError, match=message):
         read_transforms(tmp_path / name) if name.endswith("json") else read_colmap(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("1 1 0 0 0 0 0 0 2 a.jpg", r"images.txt: line 3: no such camera in cameras.txt; got '2'"),
+        ("1 1 0 0 0 0 0 0 1", r"images.txt: line 3: too few values for an image; got 9"),
+        ("1 1 0 0 east 0 0 0 1 a.jpg", r"images.txt: line 3: not a number"),
+    ],
+)
+def test_images_that_do_not_fit_are_named_by_file_and_line(tmp_path, line, message):
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 10 10 5 5 5 5\n")
+    (tmp_path / "images.txt").write_text(f"1 1 0 0 0 0 0 0 1 first.jpg\n\n{line}\n\n")
+    with pytest.raises(InputError, match=message):
+        read_colmap(tmp_path)
 
 
 def test_stretching_and_back_is_the_identity_and_the_steps_are_those_measured():

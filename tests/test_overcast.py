@@ -1,9 +1,12 @@
 """Closed and broken skies: closed forms of the CIE distributions, absolute levels, monotone mixing."""
 
+from dataclasses import replace
+from datetime import UTC, datetime
+
 import numpy as np
 import pytest
 
-from seasonscapes.frames import direction_from_angles, equirectangular_directions
+from seasonscapes.frames import LocalFrame, direction_from_angles, equirectangular_directions
 from seasonscapes.sky.clouds import with_clouds
 from seasonscapes.sky.ephemeris import LunarPosition, SolarPosition
 from seasonscapes.sky.illumination import (
@@ -111,6 +114,27 @@ def test_overcast_at_noon_twilight_and_night():
     assert 1e-4 < luminance(global_horizontal_illuminance(night)) < 6e-4
     moonlit = overcast(sun_at(-30.0), LunarPosition(0.0, 45.0, 45.0, 384400.0, 1.0, 4.0, 0.998, True), map_height=32)
     assert 0.02 < luminance(global_horizontal_illuminance(moonlit)) < 0.08  # a fifth of 0.2 lx
+
+
+def test_grey_air_is_opaque_at_infinity_downwards():
+    elevation = np.array([-90.0, -60.0, -30.0, -5.0, -1e-6, 0.0])
+    air = grey_air(20.0, np.array([800.0, 900.0, 1000.0]))
+    transmittance, airlight = air(np.full(6, np.inf), direction_from_angles(0.0, elevation))
+    assert np.all(transmittance == 0.0)
+    assert np.all(airlight == air.airlight)
+
+
+def test_clouds_keep_frame_and_time_and_cover_the_visible_sky():
+    towards = direction_from_angles(135.0, 40.0)
+    below = np.full((32, 64, 3), 2000.0, np.float32)
+    frame, time = LocalFrame(46.5, 7.9, 1000.0), datetime(2024, 7, 20, 12, tzinfo=UTC)
+    clear = Illumination(below, Luminary(towards, np.full(3, 80e3), 0.267), frame=frame, time=time)
+    assert with_clouds(clear, 0.6, towards).visible_sky is None
+    cloudy = with_clouds(replace(clear, visible_sky=0.5 * below), 0.6, towards)
+    assert (cloudy.frame, cloudy.time) == (frame, time)
+    assert cloudy.visible_sky.dtype == np.float32
+    # The clouds are the same; the clear part of the sky is half as bright at the height of the camera.
+    np.testing.assert_allclose((cloudy.sky_radiance - cloudy.visible_sky)[:16], 0.4 * 1000.0, rtol=1e-4)
 
 
 def test_grey_air_is_koschmieder_along_the_horizon_and_thins_upwards():

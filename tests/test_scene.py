@@ -6,7 +6,8 @@ import pytest
 import rasterio
 
 from seasonscapes.declaration import InputError
-from seasonscapes.scene import read_scene
+from seasonscapes.frames import LocalFrame
+from seasonscapes.scene import NamedCamera, Viewpoint, camera_from_named_view, read_scene
 from seasonscapes.workflows.place import MeshOptions, load_place
 from seasonscapes.workflows.views import camera_for
 from seasonscapes.workspace import Workspace
@@ -193,3 +194,12 @@ def test_the_second_load_reads_what_the_first_built(tmp_path):
 def test_unknown_options_are_named(options, message):
     with pytest.raises(InputError, match=message):
         MeshOptions(**options)
+
+
+def test_a_viewpoint_needs_no_name_and_one_height():
+    numbers = {"latitude_deg": 46.54, "longitude_deg": 7.98, "heading_deg": 30.0, "above_ground_m": 50.0}
+    free, named = Viewpoint(**numbers), NamedCamera(name="south", **numbers)
+    cameras = [camera_from_named_view(LocalFrame(46.5, 7.9), view, 900.0, size_px=(30, 20)) for view in (free, named)]
+    np.testing.assert_array_equal(cameras[0].world_from_camera, cameras[1].world_from_camera)
+    with pytest.raises(ValueError, match="either 'height_m'"):
+        Viewpoint(**numbers, height_m=1000.0)

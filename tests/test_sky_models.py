@@ -10,8 +10,9 @@ import pytest
 
 from seasonscapes.bundled import bundled_folder, bundled_names, bundled_path
 from seasonscapes.declaration import InputError
+from seasonscapes.sky.colour_temperature import correlated_colour_temperature_k
 from seasonscapes.sky.ephemeris import LunarPosition, SolarPosition, moon_position, sun_position
-from seasonscapes.sky.illuminate import illuminate
+from seasonscapes.sky.illuminate import SkyEvaluators, illuminate
 from seasonscapes.sky.illumination import (
     Illumination,
     Luminary,
@@ -21,13 +22,7 @@ from seasonscapes.sky.illumination import (
     luminance,
 )
 from seasonscapes.sky.models import atmosphere_from_model, check_valid, read_sky_model, visibility_km, with_overrides
-from seasonscapes.sky.report import (
-    correlated_colour_temperature_k,
-    dome_picture,
-    dome_radiance,
-    record_lines,
-    sky_record,
-)
+from seasonscapes.sky.report import dome_picture, dome_radiance, record_lines, sky_record
 
 NAMES = ["alpine_winter", "clear", "hazy", "hosek", "overcast", "saharan_dust"]
 NO_MOON = None
@@ -201,13 +196,19 @@ def test_hosek_goes_through_the_renderer_that_is_handed_in():
         return Illumination(sky, Luminary(direction, np.full(3, 80e3), 0.267), model={"kind": "hosek"})
 
     light = illuminate(
-        with_overrides(read_sky_model("hosek"), turbidity=4.0), sun_at(30.0), map_height=32, hosek=stand_in
+        with_overrides(read_sky_model("hosek"), turbidity=4.0),
+        sun_at(30.0),
+        map_height=32,
+        evaluators=SkyEvaluators(hosek=stand_in),
     )
     assert (asked["turbidity"], asked["shape"], asked["ground_albedo"]) == (4.0, (32, 64), 0.2)
     assert np.allclose(asked["direction"], sun_at(30.0).direction)
     assert light.model["name"] == "hosek"
     cloudy = illuminate(
-        with_overrides(read_sky_model("hosek"), cloudiness=0.7), sun_at(30.0), map_height=32, hosek=stand_in
+        with_overrides(read_sky_model("hosek"), cloudiness=0.7),
+        sun_at(30.0),
+        map_height=32,
+        evaluators=SkyEvaluators(hosek=stand_in),
     )
     assert luminance(cloudy.sun.normal_illuminance_lx) < luminance(light.sun.normal_illuminance_lx)
 
@@ -216,7 +217,7 @@ def test_clear_day_twilight_and_night(quick_tables):
     clear = read_sky_model("clear")
 
     def lx(sun_deg, moon=NO_MOON):
-        light = illuminate(clear, sun_at(sun_deg), moon, map_height=32, tables_of=quick_tables)
+        light = illuminate(clear, sun_at(sun_deg), moon, map_height=32, evaluators=SkyEvaluators(quick_tables))
         return float(luminance(global_horizontal_illuminance(light))), light
 
     noon, light = lx(60.0, full_moon_at(30.0))
@@ -242,7 +243,9 @@ def test_no_jump_where_moon_and_sun_take_turns(quick_tables):
     clear = with_overrides(read_sky_model("clear"), cloudiness=0.5)
 
     def lx(sun_deg, moon_deg):
-        light = illuminate(clear, sun_at(sun_deg), full_moon_at(moon_deg), map_height=16, tables_of=quick_tables)
+        light = illuminate(
+            clear, sun_at(sun_deg), full_moon_at(moon_deg), map_height=16, evaluators=SkyEvaluators(quick_tables)
+        )
         return float(luminance(global_horizontal_illuminance(light)))
 
     assert lx(0.001, 40.0) == pytest.approx(lx(-0.001, 40.0), rel=2e-3)
@@ -254,7 +257,7 @@ def test_cloudiness_reaches_the_light_of_day_and_of_the_moon(quick_tables):
         total, direct = [], []
         for cloudiness in (0.0, 0.3, 0.7, 1.0):
             model = with_overrides(read_sky_model("clear"), cloudiness=cloudiness)
-            light = illuminate(model, sun, moon, map_height=32, tables_of=quick_tables)
+            light = illuminate(model, sun, moon, map_height=32, evaluators=SkyEvaluators(quick_tables))
             total.append(luminance(global_horizontal_illuminance(light)))
             direct.append(luminance(direct_horizontal_illuminance(light.sun or light.moon)))
             assert light.model["cloudiness"] == cloudiness

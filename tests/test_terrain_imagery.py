@@ -10,7 +10,7 @@ from seasonscapes.declaration import InputError
 from seasonscapes.frames import LocalFrame, geodetic_from_enu
 from seasonscapes.terrain.imagery import bake_imagery, dilate, image_pixels, pixel_map, read_imagery
 from seasonscapes.terrain.mesh import build_mesh
-from seasonscapes.terrain.surface import Raster, Texture
+from seasonscapes.terrain.surface import Raster, Texture, atlas_identity
 from seasonscapes.terrain.texels import texel_coordinates, texel_positions
 from seasonscapes.terrain.unwrap import ATLASES, unwrap
 
@@ -166,6 +166,13 @@ def test_fitted_map_agrees_with_the_exact_one(terrain):
     low, high = terrain.vertices.min(0), terrain.vertices.max(0)
     points = rng.uniform(low, high, (5000, 3))
     assert np.abs(fitted(points) - image_pixels(FRAME, image, points)).max() < 0.002
+
+
+def test_baked_textures_belong_to_the_atlas_of_the_terrain(terrain):
+    unwrapped, atlas = unwrap(terrain, kind="planar", texel_m=80.0)
+    texture = bake_imagery(unwrapped, atlas, utm_board(80.0))
+    assert texture.atlas_id == atlas_identity(unwrapped, atlas.width_px, atlas.height_px)
+    assert dilate(texture, texture.weight > 0.0, 1).atlas_id == texture.atlas_id
 
 
 def test_dilation_repeats_the_rim_and_nothing_else():

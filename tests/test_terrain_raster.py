@@ -10,6 +10,7 @@ from terrain_cases import hill, hill_lv95, raster_of, write_tiff
 from seasonscapes.declaration import InputError
 from seasonscapes.frames import LocalFrame
 from seasonscapes.terrain.crs import geodetic_from_map, map_from_geodetic
+from seasonscapes.terrain.hole_filling import harmonic_fill
 from seasonscapes.terrain.raster import (
     bounds_geographic,
     centre_frame,
@@ -330,3 +331,11 @@ def test_filling_refuses_emptiness():
         InputError, match=r"dem.tif: too much of the area has no data; got '50.0 %'; expected at most 25 %"
     ):
         fill_nodata(_with_hole(np.ones((4, 4)), half), where="dem.tif")
+
+
+def test_a_fill_that_does_not_converge_names_its_function(monkeypatch):
+    monkeypatch.setattr("scipy.sparse.linalg.cg", lambda _matrix, known, **_options: (known, 7))
+    hole = np.zeros((4, 4), bool)
+    hole[1, 1:3] = True
+    with pytest.raises(ValueError, match="harmonic_fill: conjugate gradients did not converge in 7 steps"):
+        harmonic_fill(np.ones((4, 4)), hole)

@@ -14,6 +14,7 @@ from seasonscapes.cameras.path_file import load_path, read_reference_path, resiz
 from seasonscapes.cameras.pinhole import Camera, camera_at, project, rotation_from_angles
 from seasonscapes.cameras.trajectory import (
     CURVES,
+    GroundClearance,
     cameras_along_path,
     curve_through,
     height_above_ground,
@@ -192,6 +193,20 @@ def test_a_path_is_lifted_over_a_hill_and_stays_smooth():
     assert np.abs(before - after).max() < 1e-6
     steps = np.linalg.norm(np.diff(lifted.position(s), axis=0), axis=1)
     assert steps.max() / steps.min() < 1.01
+
+
+def test_the_lift_is_the_largest_height_added():
+    line = curve_through(places_of(waypoints()))
+    lifted, most = lift_above_ground(line, hill, 60.0)
+    assert most == pytest.approx(lifted.lift(lifted.lift.x).max(), rel=1e-12)
+    s = np.linspace(0.0, lifted.length_m, 20001)
+    u = lifted.parameter(s)
+    assert most == pytest.approx((lifted.at_parameter(u) - line.at_parameter(u))[:, 2].max(), abs=0.1)
+
+
+def test_cameras_along_a_path_keep_their_clearance():
+    views = cameras_along_path(waypoints(), 200, clearance=GroundClearance(hill, 60.0))
+    assert height_above_ground(places_of(views), hill, 60.0).min() >= 60.0
 
 
 def test_high_above_the_ground_nothing_is_lifted_and_off_the_land_there_is_none():

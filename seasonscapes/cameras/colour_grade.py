@@ -302,12 +302,12 @@ def fit_response_curve(
         use = (x > 0.02) & (x < 0.98) & (y > 0)
         if use.sum() < 20:
             raise NotEnoughEvidence(
-                f"fit_response: {int(use.sum())} usable pairs in channel {channel}, at least 20 are needed"
+                f"fit_response_curve: {int(use.sum())} usable pairs in channel {channel}, at least 20 are needed"
             )
         target = np.log(y[use]) - np.log(np.maximum(linear_from_srgb(x[use]).astype(float), 1e-9))
         if np.corrcoef(np.log(y[use]), x[use])[0, 1] < 0.3:
             raise NotEnoughEvidence(
-                "fit_response: encoded values and light do not rise together; the pairs may be mismatched"
+                "fit_response_curve: encoded values and light do not rise together; the pairs may be mismatched"
             )
         basis = CubicSpline(positions, np.eye(knots), bc_type="natural")(np.clip(x[use], positions[0], positions[-1]))
         # Errors are assumed uniform in the encoded value x: the weight is dx / d log(light) for a gamma of about 2.2.

@@ -102,37 +102,60 @@ def read_colmap(folder: Path) -> list[NamedView]:
     Raises
     ------
     InputError
-        A file is missing, or a camera model is neither PINHOLE nor SIMPLE_PINHOLE.
+        A file is missing, a camera model is neither PINHOLE nor SIMPLE_PINHOLE, a line is not in the format, or an
+        image has an unknown camera; the message names file and line.
     """
     from scipy.spatial.transform import Rotation
 
     intrinsics = {}
-    for line in _lines(folder / "cameras.txt"):
-        number, model, width, height, *values = line.split()
-        numbers = [float(v) for v in values]
-        if model == "SIMPLE_PINHOLE":
-            numbers = [numbers[0], *numbers]
-        elif model != "PINHOLE":
-            raise InputError(
-                folder / "cameras.txt",
-                f"camera model {model} has distortion",
-                expected="PINHOLE",
-                cure="undistort the images first (colmap image_undistorter)",
-            )
-        intrinsics[number] = (int(width), int(height), *numbers)
+    for where, line in _lines(folder / "cameras.txt"):
+        number, *fields = line.split()
+        intrinsics[number] = _colmap_intrinsics(fields, where)
     views = []
     # Every second line lists 2-D points and may be blank: blank lines must be kept until lines are paired.
-    for line in _lines(folder / "images.txt", keep_blank=True)[::2]:
+    for where, line in _lines(folder / "images.txt", keep_blank=True)[::2]:
         if not line.strip():
             continue
-        _, *values, number, name = line.split(maxsplit=9)
-        w, x, y, z, *translation = (float(v) for v in values)
+        fields = line.split(maxsplit=9)
+        if len(fields) < 10:
+            raise InputError(where, "too few values for an image", got=len(fields), expected="10")
+        _, *values, number, name = fields
+        w, x, y, z, *translation = _floats(values, where)
+        if number not in intrinsics:
+            raise InputError(where, "no such camera in cameras.txt", got=number)
         pose = np.eye(4)
         pose[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix().T
         pose[:3, 3] = -pose[:3, :3] @ translation
-        width, height, fx, fy, cx, cy = intrinsics[number]
-        views.append(NamedView(name, Camera(width, height, fx, fy, cx, cy, pose), name))
+        views.append(NamedView(name, Camera(*intrinsics[number], pose), name))
     return views
+
+
+def _colmap_intrinsics(fields: list[str], where: str) -> tuple[int, int, float, float, float, float]:
+    """Width, height, fx, fy, cx and cy from the fields of a line of ``cameras.txt`` after the camera's number."""
+    if len(fields) < 3:
+        raise InputError(where, "too few values for a camera")
+    model = fields[0]
+    parameters = {"PINHOLE": 4, "SIMPLE_PINHOLE": 3}
+    if model not in parameters:
+        raise InputError(
+            where,
+            f"camera model {model} has distortion",
+            expected="PINHOLE",
+            cure="undistort the images first (colmap image_undistorter)",
+        )
+    count = len(fields) - 3
+    if count != parameters[model]:
+        raise InputError(where, f"wrong number of {model} parameters", got=count, expected=str(parameters[model]))
+    width, height, *numbers = _floats(fields[1:], where)
+    fx, fy, cx, cy = numbers if model == "PINHOLE" else (numbers[0], *numbers)
+    return int(width), int(height), fx, fy, cx, cy
+
+
+def _floats(fields: list[str], where: str) -> list[float]:
+    try:
+        return [float(field) for field in fields]
+    except ValueError as error:
+        raise InputError(where, f"not a number: {error}") from None
 
 
 def write_transforms(path: Path, views: Sequence[NamedView], frame: LocalFrame) -> None:
@@ -381,8 +404,13 @@ def _write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def _lines(path: Path, *, keep_blank: bool = False) -> list[str]:
+def _lines(path: Path, *, keep_blank: bool = False) -> list[tuple[str, str]]:
+    """Lines of a file that are no comments, each with file name and line number for messages."""
     if not path.is_file():
         raise InputError(path, "no such file")
-    rows = [row for row in path.read_text(encoding="utf-8").splitlines() if not row.startswith("#")]
-    return rows if keep_blank else [row for row in rows if row.strip()]
+    rows = enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
+    return [
+        (f"{path}: line {number}", row)
+        for number, row in rows
+        if not row.startswith("#") and (keep_blank or row.strip())
+    ]

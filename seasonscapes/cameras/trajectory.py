@@ -209,6 +209,22 @@ def _with_arc_lengths(base: PPoly, lift: PPoly | None, knots: np.ndarray) -> Cur
     return Curve(base, lift, knots, np.stack([ends, np.concatenate([[0.0], np.cumsum(lengths)])]))
 
 
+@dataclass(frozen=True)
+class GroundClearance:
+    """Least height of a path above the terrain.
+
+    Parameters
+    ----------
+    ground
+        Terrain height as a function of position.
+    clearance_m
+        Least height above the terrain [m]; see `lift_above_ground`.
+    """
+
+    ground: Ground
+    clearance_m: float
+
+
 def lift_above_ground(curve: Curve, ground: Ground, clearance_m: float) -> tuple[Curve, float]:
     """Raise a curve smoothly where its clearance above the terrain is too small.
 
@@ -226,7 +242,7 @@ def lift_above_ground(curve: Curve, ground: Ground, clearance_m: float) -> tuple
     curve
         The curve with a cubic spline added to its heights; waypoints may be raised, too.
     lift_m
-        Upper bound of the added height [m]; 0 if the curve is unchanged.
+        Largest added height [m]; 0 if the curve is unchanged.
 
     Raises
     ------
@@ -236,7 +252,7 @@ def lift_above_ground(curve: Curve, ground: Ground, clearance_m: float) -> tuple
     from scipy.interpolate import CubicSpline
     from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
-    total_lift_m = 0.0
+    largest_lift_m = 0.0
     count = int(np.clip(curve.length_m / _SAMPLE_M, 200, _MAX_SAMPLES))
     # The width of the filters limits the slope of the added height.
     reach = max(4, int(np.ceil(max(8.0 * clearance_m, 100.0) / curve.length_m * count)))
@@ -250,12 +266,12 @@ def lift_above_ground(curve: Curve, ground: Ground, clearance_m: float) -> tuple
         required = np.where(missing > -0.5, missing + 0.5, 0.0)
         widened = maximum_filter1d(np.maximum(required, 0.0), 2 * reach + 1, mode="nearest")
         added = gaussian_filter1d(widened, reach / 3.0, mode="nearest", truncate=3.0)
-        total_lift_m += float(added.max())
         total = added if curve.lift is None else added + curve.lift(u)
+        largest_lift_m = float(total.max())
         curve = _with_arc_lengths(curve.base, CubicSpline(u, total, bc_type="natural"), curve.knots)
     else:
         raise InvalidPath(f"the path could not be kept {clearance_m:g} m above the ground; move its waypoints upwards")
-    return curve, total_lift_m
+    return curve, largest_lift_m
 
 
 def height_above_ground(positions_m: np.ndarray, ground: Ground, around_m: float) -> np.ndarray:
@@ -292,7 +308,7 @@ def cameras_along_path(
     turn: str = "smooth",
     look_at_m: np.ndarray | None = None,
     closed: bool = False,
-    clear_of: tuple[Ground, float] | None = None,
+    clearance: GroundClearance | None = None,
 ) -> list[Camera]:
     """Interpolate cameras between waypoints, equally spaced in arc length.
 
@@ -312,8 +328,8 @@ def cameras_along_path(
         Position ``(3,)`` east-north-up [m] that all cameras are directed to, instead of interpolated rotations.
     closed
         Whether the path returns to the first waypoint.
-    clear_of
-        Terrain height as a function of position, and least clearance [m]; see `lift_above_ground`.
+    clearance
+        Terrain and least height above it; ``None`` follows the waypoints alone.
 
     Returns
     -------
@@ -333,8 +349,8 @@ def cameras_along_path(
         raise ValueError(f"turn: got {turn!r}, expected one of {', '.join(TURNS)}")
     waypoints = [*waypoints, waypoints[0]] if closed else list(waypoints)
     path = curve_through(np.array([camera.position_m for camera in waypoints]), curve=curve, closed=closed)
-    if clear_of is not None:
-        path, _ = lift_above_ground(path, *clear_of)
+    if clearance is not None:
+        path, _ = lift_above_ground(path, clearance.ground, clearance.clearance_m)
     return views_along(path, waypoints, count, turn=turn, look_at_m=look_at_m, closed=closed)
 
 

@@ -111,11 +111,30 @@ class IntegratedIrradiance:
     sunlit: np.ndarray
 
 
+@dataclass(frozen=True)
+class IlluminationSeries:
+    """Illuminations at T instants, with the weights of a sum over time.
+
+    Parameters
+    ----------
+    lights
+        Illuminations at the instants.
+    weights
+        ``(T,)`` weight of each instant: hours for an insolation in Wh/m², 1 for a single instant.
+    """
+
+    lights: Sequence[Illumination]
+    weights: np.ndarray
+
+    def __post_init__(self):
+        if len(self.lights) != len(self.weights):
+            raise ValueError(f"IlluminationSeries: got {len(self.lights)} lights and {len(self.weights)} weights")
+
+
 def integrate_irradiance(
     terrain: RayScene,
     positions: np.ndarray,
-    lights: Sequence[Illumination],
-    weights: np.ndarray,
+    series: IlluminationSeries,
     *,
     sampling: SamplingOptions | None = None,
     search_m: float = 2.0,
@@ -130,10 +149,8 @@ def integrate_irradiance(
         From `rendering.hemisphere_rays.ray_scene`.
     positions
         ``(N, 3)`` positions on the terrain, ENU [m]; NaN for none.
-    lights
-        Illuminations at the T instants.
-    weights
-        ``(T,)`` weight of each instant: hours for an insolation in Wh/m², 1 for a single instant.
+    series
+        Illuminations at the instants and their weights.
     sampling
         Sampling options; defaults if ``None``.
     search_m
@@ -153,12 +170,16 @@ def integrate_irradiance(
     ValueError
         If none of the positions lies on the terrain.
     """
-    efficacies = [_efficacies(light) for light in lights]
+    efficacies = [_efficacies(light) for light in series.lights]
     sums = np.full((len(positions), 5), np.nan, np.float32)
-    blocks = irradiance_blocks(terrain, positions, lights, sampling, seed=seed, search_m=search_m, progress=progress)
+    blocks = irradiance_blocks(
+        terrain, positions, series.lights, sampling, seed=seed, search_m=search_m, progress=progress
+    )
     for index, points, results in blocks:
         total = np.zeros((len(index), 5), np.float64)
-        for light, weight, (direct, diffuse), received in zip(lights, weights, efficacies, results, strict=True):
+        for light, weight, (direct, diffuse), received in zip(
+            series.lights, series.weights, efficacies, results, strict=True
+        ):
             sun, sky, bounce = (luminance(values) for values in (received.sun, received.sky, received.bounce))
             total[:, 0] += weight * sun / direct
             total[:, 1] += weight * sky / diffuse

@@ -72,7 +72,7 @@ def with_clouds(
     Returns
     -------
     Illumination
-        Illumination without frame and time.
+        Illumination with the frame, the time and, under the same clouds, the ``visible_sky`` of ``clear``.
 
     Raises
     ------
@@ -94,23 +94,29 @@ def with_clouds(
     total = float(luminance(direct + diffuse)) * dimming
     from_clouds = total - float(luminance(direct)) * direct_factor - float(luminance(diffuse)) * clear_fraction
     grey = max(from_clouds, 0.0) * (overcast_rgb(elevation_deg) if colour is None else colour)
-    height = clear.sky_radiance.shape[0]
-    broken = overcast_sky_radiance(grey, height, ground_albedo=0.0, source_direction=source_direction)
-    closed = overcast_sky_radiance(grey, height, ground_albedo=0.0)
-    sky = clear_fraction * (clear.sky_radiance + broken) + cloudiness * closed
     # Rows below the horizon show ground, whose radiance is proportional to the illuminance on it.
-    ratio = (direct * direct_factor + diffuse * clear_fraction + grey) / np.maximum(direct + diffuse, 1e-12)
-    below = equirectangular_directions(height, 2 * height)[:, 0, 2] <= 0.0
-    sky[below] = clear.sky_radiance[below] * ratio
+    ground_ratio = (direct * direct_factor + diffuse * clear_fraction + grey) / np.maximum(direct + diffuse, 1e-12)
+
+    def cloudy(clear_radiance: np.ndarray) -> np.ndarray:
+        height = clear_radiance.shape[0]
+        broken = overcast_sky_radiance(grey, height, ground_albedo=0.0, source_direction=source_direction)
+        closed = overcast_sky_radiance(grey, height, ground_albedo=0.0)
+        sky = clear_fraction * (clear_radiance + broken) + cloudiness * closed
+        below = equirectangular_directions(height, 2 * height)[:, 0, 2] <= 0.0
+        sky[below] = clear_radiance[below] * ground_ratio
+        return sky.astype(np.float32)
+
     air = clear.aerial_perspective
     if air is not None:
         horizon = standard_overcast(0.0) * cloudiness * grey + clear_fraction * grey / np.pi
         air = _CloudyAerialPerspective(air, clear_fraction, horizon)
-    return Illumination(
-        sky_radiance=sky.astype(np.float32),
+    return replace(
+        clear,
+        sky_radiance=cloudy(clear.sky_radiance),
         sun=_attenuated(clear.sun, direct_factor, cloudiness),
         moon=_attenuated(clear.moon, direct_factor, cloudiness),
         aerial_perspective=air,
+        visible_sky=None if clear.visible_sky is None else cloudy(clear.visible_sky),
         model={**clear.model, "cloudiness": cloudiness},
     )
 

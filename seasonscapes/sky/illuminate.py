@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Protocol
 
@@ -68,6 +68,23 @@ def tables_in_memory(atmosphere: Atmosphere) -> AtmosphereTables:
     return atmosphere_tables(atmosphere)
 
 
+@dataclass(frozen=True)
+class SkyEvaluators:
+    """Functions on which the evaluation of sky models depends.
+
+    Parameters
+    ----------
+    tables_of
+        Function that returns the tables of an atmosphere, for example from a cache on disk. The default computes them
+        once per process, in tens of seconds.
+    hosek
+        Function that evaluates models of kind ``hosek``: `seasonscapes.rendering.hosek.hosek_illumination`.
+    """
+
+    tables_of: TablesOf = tables_in_memory
+    hosek: HosekFunction | None = None
+
+
 def illuminate(
     model: SkyModel,
     sun: SolarPosition,
@@ -76,8 +93,7 @@ def illuminate(
     height_m: float = 0.0,
     map_height: int = 128,
     with_aerial_perspective: bool = True,
-    tables_of: TablesOf = tables_in_memory,
-    hosek: HosekFunction | None = None,
+    evaluators: SkyEvaluators | None = None,
 ) -> Illumination:
     """Compute the illumination of one instant at one place under a sky model.
 
@@ -93,11 +109,8 @@ def illuminate(
         Rows of the sky map; it has twice as many columns.
     with_aerial_perspective
         Whether atmosphere models compute the aerial perspective, which takes most of their time.
-    tables_of
-        Function that returns the tables of an atmosphere, for example from a cache on disk. The default computes them
-        once per process, in tens of seconds.
-    hosek
-        Function that evaluates models of kind ``hosek``: `seasonscapes.rendering.hosek.hosek_illumination`.
+    evaluators
+        Tables of atmospheres and evaluation of models of kind ``hosek``; the defaults of `SkyEvaluators` if ``None``.
 
     Returns
     -------
@@ -109,15 +122,19 @@ def illuminate(
     InputError
         If sun or observer are outside the model's valid range.
     ValueError
-        If the model is of kind ``hosek`` and ``hosek`` is omitted, or of an unknown class.
+        If the model is of kind ``hosek`` and ``evaluators.hosek`` is omitted, or of an unknown class.
     """
+    evaluators = evaluators or SkyEvaluators()
     check_valid(model, float(sun.elevation_deg), height_m)
     if isinstance(model, OvercastModel):
         return _with_provenance(model, _overcast_illumination(model, sun, moon, height_m, map_height))
     if isinstance(model, HosekModel):
-        if hosek is None:
-            raise ValueError("kind 'hosek' is evaluated by the renderer: pass hosek=rendering.hosek.hosek_illumination")
-        clear = hosek(
+        if evaluators.hosek is None:
+            raise ValueError(
+                "kind 'hosek' is evaluated by the renderer: pass "
+                "evaluators=SkyEvaluators(hosek=rendering.hosek.hosek_illumination)"
+            )
+        clear = evaluators.hosek(
             sun.direction,
             turbidity=model.turbidity,
             ground_albedo=model.ground.albedo,
@@ -133,7 +150,7 @@ def illuminate(
             height_m=height_m,
             map_height=map_height,
             with_aerial_perspective=with_aerial_perspective,
-            tables_of=tables_of,
+            tables_of=evaluators.tables_of,
         )
         return _with_provenance(model, _add_clouds(model, clear, sun, moon))
     raise ValueError(f"model: got {type(model).__name__}, expected one of `models.KINDS`")

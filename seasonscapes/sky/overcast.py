@@ -207,10 +207,11 @@ class GreyAir:
         depth, rise = np.asarray(depth_m, float), np.asarray(direction, float)[..., 2]
         optical = np.zeros((*np.broadcast_shapes(depth.shape, rise.shape), 3))
         for extinction, scale in zip(self.extinction_per_m, self.scale_height_m, strict=True):
-            # ∫ exp(-s sin e / H) ds in closed form; the limit of 700 avoids overflow where transmittance is zero.
+            # ∫ exp(-s sin e / H) ds in closed form; the limit avoids overflow where transmittance is zero, also after
+            # the division by the least slope.
             slope = np.where(np.abs(rise) < 1e-9, 1e-9, rise) / scale
             with np.errstate(invalid="ignore"):
-                path = -np.expm1(np.clip(-depth * slope, -700.0, 700.0)) / slope
+                path = -np.expm1(np.clip(-depth * slope, -600.0, 600.0)) / slope
             optical += path[..., None] * extinction
         transmittance = np.exp(-optical)
         return transmittance, (1.0 - transmittance) * self.airlight

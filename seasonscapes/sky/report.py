@@ -10,6 +10,7 @@ import numpy as np
 
 from seasonscapes.frames import angles_from_direction, direction_from_angles, sample_equirectangular
 from seasonscapes.images import auto_exposure_ev100, expose, linear_from_srgb, srgb_from_linear, tone_curve
+from seasonscapes.sky.colour_temperature import correlated_colour_temperature_k
 from seasonscapes.sky.ephemeris import LunarPosition, SolarPosition, SunEvents, sun_events
 from seasonscapes.sky.illumination import (
     Illumination,
@@ -18,34 +19,6 @@ from seasonscapes.sky.illumination import (
     global_horizontal_illuminance,
     luminance,
 )
-
-
-def correlated_colour_temperature_k(rgb: np.ndarray) -> float | None:
-    """Compute the correlated colour temperature of linear Rec.709 light (Ohno 2013, doi:10.1080/15502724.2014.839020).
-
-    It is undefined for light farther than 0.05 from the Planckian locus in u'v', or bluer than a black body of 100,000
-    K, such as the zenith in twilight.
-
-    Parameters
-    ----------
-    rgb
-        Linear Rec.709 ``(3,)``.
-
-    Returns
-    -------
-    float or None
-        Correlated colour temperature [K], or ``None`` if undefined.
-    """
-    import colour
-
-    xyz = np.asarray(colour.RGB_COLOURSPACES["ITU-R BT.709"].matrix_RGB_to_XYZ) @ np.asarray(rgb, float)
-    if not np.all(np.isfinite(xyz)) or xyz.sum() <= 0.0 or np.any(xyz < 0.0):
-        return None
-    uv = colour.UCS_to_uv(colour.XYZ_to_UCS(xyz))
-    kelvin, distance = colour.temperature.uv_to_CCT_Ohno2013(uv)
-    if not (1000.0 < kelvin < 99_000.0) or abs(distance) > 0.05:
-        return None
-    return float(kelvin)
 
 
 def sky_record(

@@ -56,7 +56,7 @@ def harmonic_fill(values: np.ndarray, hole: np.ndarray) -> np.ndarray:
     limit = 20 * (height + width)
     solution, failed = cg(laplacian, known, x0=guess[hole], rtol=0.0, atol=1e-3, maxiter=limit, M=jacobi)
     if failed:
-        raise ValueError(f"fill_nodata: conjugate gradients did not converge in {failed} steps")
+        raise ValueError(f"harmonic_fill: conjugate gradients did not converge in {failed} steps")
     filled = values.copy()
     filled[hole] = solution
     return filled

@@ -15,7 +15,7 @@ from seasonscapes.images import linear_from_srgb
 from seasonscapes.terrain.atlas import Atlas
 from seasonscapes.terrain.crs import raster_pixels
 from seasonscapes.terrain.raster import read_raster
-from seasonscapes.terrain.surface import Raster, Terrain, Texture
+from seasonscapes.terrain.surface import Raster, Terrain, Texture, atlas_identity
 from seasonscapes.terrain.texels import texel_coordinates, texel_positions
 
 ENCODINGS = ("srgb", "linear")
@@ -118,6 +118,7 @@ def bake_imagery(terrain: Terrain, atlas: Atlas, image: Raster, *, gutter_px: in
     -------
     Texture
         ``weight`` is the fraction of the footprint that the image covers; 0 outside the image and outside the charts.
+        ``atlas_id`` is that of the terrain's atlas.
 
     Raises
     ------
@@ -137,7 +138,8 @@ def bake_imagery(terrain: Terrain, atlas: Atlas, image: Raster, *, gutter_px: in
         values.reshape(-1, 3)[part], weight.ravel()[part] = rgb, coverage
     if not weight.any():
         raise InputError("imagery", "the image covers none of the terrain", cure="check the CRS of both files")
-    return dilate(Texture(values, weight), face_id >= 0, gutter_px)
+    atlas_id = atlas_identity(terrain, atlas.width_px, atlas.height_px)
+    return dilate(Texture(values, weight, atlas_id), face_id >= 0, gutter_px)
 
 
 def image_pixels(frame: LocalFrame, image: Raster, positions: np.ndarray) -> np.ndarray:
@@ -305,7 +307,7 @@ def dilate(texture: Texture, covered: np.ndarray, gutter_px: int) -> Texture:
     Returns
     -------
     Texture
-        The extended texture, without ``atlas_id``.
+        The extended texture of the same atlas.
     """
     values, weight, known = texture.values.copy(), texture.weight.copy(), covered.copy()
     for _ in range(gutter_px):
@@ -324,7 +326,7 @@ def dilate(texture: Texture, covered: np.ndarray, gutter_px: int) -> Texture:
         values[rim_row, rim_column] = total / np.maximum(total_weight, 1e-12)[:, None]
         weight[rim_row, rim_column] = total_weight / count
         known[rim_row, rim_column] = True
-    return Texture(values, weight)
+    return replace(texture, values=values, weight=weight)
 
 
 def _grown(mask: np.ndarray) -> np.ndarray:

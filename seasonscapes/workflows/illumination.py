@@ -21,7 +21,7 @@ from seasonscapes.sky.atmosphere import Atmosphere
 from seasonscapes.sky.clear_sky import AtmosphereTables, atmosphere_tables, load_tables, save_tables
 from seasonscapes.sky.elevation_table import load_table, save_table
 from seasonscapes.sky.ephemeris import LunarPosition, SolarPosition, moon_position, sun_position
-from seasonscapes.sky.illuminate import illuminate
+from seasonscapes.sky.illuminate import SkyEvaluators, illuminate
 from seasonscapes.sky.illumination import Illumination
 from seasonscapes.sky.models import AtmosphereModel, SkyModel, atmosphere_from_model, read_sky_model, with_overrides
 from seasonscapes.sky.observer_radiance import diffuse_by_elevation, observer_view
@@ -269,8 +269,7 @@ def illumination_at(
         height_m=height_m,
         map_height=map_height,
         with_aerial_perspective=with_aerial_perspective,
-        tables_of=atmosphere_tables_in(workspace, by_elevation=by_elevation),
-        hosek=hosek_illumination,
+        evaluators=SkyEvaluators(atmosphere_tables_in(workspace, by_elevation=by_elevation), hosek_illumination),
     )
     return replace(light, time=position.time)
 

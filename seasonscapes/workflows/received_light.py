@@ -195,7 +195,7 @@ def irradiance_map(
     >>> sorted(received.bands)[0]
     'direct W/m2'
     """
-    from seasonscapes.relighting.lit_texture import integrate_irradiance
+    from seasonscapes.relighting.lit_texture import IlluminationSeries, integrate_irradiance
     from seasonscapes.rendering.backend import use_backend
     from seasonscapes.rendering.hemisphere_rays import ray_scene
     from seasonscapes.rendering.mitsuba_scene import mi_mesh
@@ -219,8 +219,7 @@ def irradiance_map(
     received = integrate_irradiance(
         ray_scene(mi_mesh(place.terrain, texture.values)),
         positions,
-        lights,
-        hours,
+        IlluminationSeries(lights, hours),
         sampling=SamplingOptions(shadow_samples=1, rays=rays),
         search_m=_SEARCH_M,
         seed=seed,
