@@ -28,7 +28,7 @@ from alpinebench_scene import (
 )
 
 from seasonscapes.albedo.albedo_completion import complete_albedo
-from seasonscapes.albedo.closed_form import AlbedoFit, solve_albedo
+from seasonscapes.albedo.closed_form import AlbedoFit, SearchOptions, solve_albedo
 from seasonscapes.albedo.forward_model import TexelTransport, ambient_on_texels, sun_on_texels, trace_texel_transport
 from seasonscapes.albedo.photographs import EIGHT_BIT, LINEAR, prepare_photographs
 from seasonscapes.albedo.texture_delighting import delight_textures
@@ -272,7 +272,8 @@ class Bench:
                 gains.append(np.ones(3) if clean else None)
         inputs = prepare_photographs(self.land, seen, lights, gains=gains, seed=self.world.seed)
         if response and not clean:
-            inputs = with_tone_curve(inputs, fit_tone_curve(self.land, inputs, seed=self.world.seed).strength)
+            curve = fit_tone_curve(self.land, inputs, search=SearchOptions(seed=self.world.seed))
+            inputs = with_tone_curve(inputs, curve.strength)
         return solve_albedo(self.land, inputs, noise_model=LINEAR if clean else EIGHT_BIT)
 
     def completed_albedo(self, fit: AlbedoFit, base: Texture | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -340,12 +341,7 @@ class Splats:
         )
         train(appearance, targets, schedule=Schedule(surface_steps=600), seed=seed)
         model = model_from(
-            self.surfels,
-            own[None],
-            [DAY_OF_YEAR],
-            self.transport,
-            learned_parameters(appearance),
-            frame=world.frame,
+            self.surfels, own[None], [DAY_OF_YEAR], self.transport, learned_parameters(appearance), frame=world.frame
         )
         weights = [model_weights(model, camera) for camera in world.judged]
 

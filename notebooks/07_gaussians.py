@@ -98,7 +98,14 @@ _ = plt.ylabel("loss")
 camera = overview_cameras(place.terrain, 1, size_px=160, first_deg=200.0)[0]
 light, state = lit(day + timedelta(hours=7.5))
 ready = relightable_view(
-    land, trace_view(land, camera, SamplingOptions(shadow_samples=4, albedo_samples=16, rays=128, clusters=2048, clusters_per_receiver=32, rank=24))
+    land,
+    trace_view(
+        land,
+        camera,
+        SamplingOptions(
+            shadow_samples=4, albedo_samples=16, rays=128, clusters=2048, clusters_per_receiver=32, rank=24
+        ),
+    ),
 )
 truth = relight_view(ready, light).surface * np.float32(np.pi / state.global_lx)
 weights = view_weights(front_facing_splats(surfels, camera), camera, subpixels=2)

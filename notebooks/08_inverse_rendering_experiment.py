@@ -67,7 +67,9 @@ for name in ("west", "south"):
 
 # %%
 land = trace_texel_transport(
-    place.terrain, truth.shape[:2], sampling=SamplingOptions(shadow_samples=1, rays=64, clusters_per_receiver=32, clusters=1024, rank=24)
+    place.terrain,
+    truth.shape[:2],
+    sampling=SamplingOptions(shadow_samples=1, rays=64, clusters_per_receiver=32, clusters=1024, rank=24),
 )
 photographs = prepare_photographs(land, observations, lights, gains=[np.ones(3)] * len(lights))
 closed = solve_albedo(land, photographs)
