@@ -70,7 +70,7 @@ def evaluate_command(
     if table is not None:
         check_suffix(table, (".csv", ".md"), flag="--table")
     found = pairs.paired(truth, pictures)
-    pairs.refuse_used([true_path for true_path, _ in found.values()], used)
+    pairs.check_files_held_out([true_path for true_path, _ in found.values()], used)
     measure, why = _lpips(lpips)
     options = pairs.ScoreOptions(pairs.MaskOptions(mask, near_m, far_m), mode, match, measure)
     rows = []

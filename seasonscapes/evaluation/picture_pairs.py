@@ -1,4 +1,4 @@
-"""Pairs of true and estimated pictures on disk: matched by name, brought to one exposure, masked, scored."""
+"""Evaluation of picture files: pairing by name, development at a common exposure, masking and metrics."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,14 +26,14 @@ MATCHES = ("none", "gain")
 
 @dataclass(frozen=True)
 class MaskOptions:
-    """Which pixels are scored.
+    """Pixels that are scored.
 
     Parameters
     ----------
     mask
-        A ``.png`` whose white pixels count, or a folder of them by name; ``None`` for none.
+        PNG file whose white pixels are scored, or a folder of such files by name; ``None`` for no mask.
     near_m, far_m
-        Least and greatest distance [m], where the truth holds depth.
+        Minimum and maximum distance [m], applied if the file of the truth contains depth.
     """
 
     mask: Path | None = None
@@ -64,7 +65,15 @@ class ScoreOptions:
 
 @dataclass(frozen=True)
 class PicturePair:
-    """Truth and picture ``(H, W, 3)``, sRGB-encoded, and the truth's depth ``(H, W)`` [m] where its file holds it."""
+    """A picture and its ground truth.
+
+    Parameters
+    ----------
+    truth, picture
+        Images ``(H, W, 3)``, sRGB-encoded in [0, 1].
+    depth_m
+        Distance ``(H, W)`` of the truth [m], or ``None`` if its file contains no depth.
+    """
 
     truth: np.ndarray
     picture: np.ndarray
@@ -82,12 +91,12 @@ def paired(truth: Path, pictures: Path) -> dict[str, tuple[Path, Path]]:
     Returns
     -------
     dict
-        Name to the paths of truth and picture.
+        Paths of truth and picture by name.
 
     Raises
     ------
     InputError
-        Where a picture is missing for a truth, or there is nothing to pair.
+        If a truth has no picture, a name occurs twice, or a file or folder is missing or empty.
     """
     for flag, path in (("--truth", truth), ("--pictures", pictures)):
         if not path.exists():
@@ -120,35 +129,40 @@ def _by_stem(flag: str, folder: Path) -> dict[str, Path]:
 
 
 def read_pair(true_path: Path, path: Path, *, match: str = "none") -> PicturePair:
-    """Read two pictures; radiances are developed with the truth's exposure.
+    """Read a picture and its truth; radiance is developed with the exposure of the truth.
 
     Parameters
     ----------
     true_path, path
-        Two ``.exr`` files, or two ``.png`` or ``.jpg`` files, of one size.
+        Files of truth and picture: both ``.exr``, or both ``.png`` or ``.jpg``; of equal size.
     match
-        ``"none"``, or ``"gain"``: scale each colour of the picture by the median ratio to the truth first.
+        ``"none"``, or ``"gain"`` to scale each colour of the picture by its `matching_gain` first.
+
+    Returns
+    -------
+    PicturePair
+        Encoded images and the depth of the truth.
 
     Raises
     ------
     InputError
-        Where the files cannot be read or compared.
+        If the files cannot be read or compared.
     """
-    linear = [each.suffix.lower() in _LINEAR for each in (true_path, path)]
-    if linear[0] != linear[1]:
+    is_linear = [file.suffix.lower() in _LINEAR for file in (true_path, path)]
+    if is_linear[0] != is_linear[1]:
         got, expected = f"{true_path.name}, {path.name}", "two .exr, or two of .png and .jpg"
         raise InputError(path, "radiance and a developed picture cannot be compared", got=got, expected=expected)
-    (true, depth), (made, _) = _read(true_path), _read(path)
-    if true.shape != made.shape:
-        got, expected = (f"{each.shape[1]}x{each.shape[0]}" for each in (made, true))
+    (truth, depth), (picture, _) = _read(true_path), _read(path)
+    if truth.shape != picture.shape:
+        got, expected = (f"{image.shape[1]}x{image.shape[0]}" for image in (picture, truth))
         raise InputError(path, "another size than the truth", got=got, expected=expected)
     if match == "gain":
-        made = made * matching_gain(true, made)
-    if linear[0]:
-        ev100 = exposure_ev100(true)
-        true, made = develop(true, ev100), develop(made, ev100)
-    true, made = (srgb_from_linear(np.clip(each, 0.0, 1.0)) for each in (true, made))
-    return PicturePair(true, made, depth)
+        picture = picture * matching_gain(truth, picture)
+    if is_linear[0]:
+        ev100 = exposure_ev100(truth)
+        truth, picture = develop(truth, ev100), develop(picture, ev100)
+    truth, picture = (srgb_from_linear(np.clip(image, 0.0, 1.0)) for image in (truth, picture))
+    return PicturePair(truth, picture, depth)
 
 
 def _read(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
@@ -164,37 +178,56 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def matching_gain(truth: np.ndarray, picture: np.ndarray) -> np.ndarray:
-    """Factors ``(3,)`` that scale a linear picture to the truth: median ratios over pixels that are neither black nor clipped.
+    """Compute the gains that scale a linear picture to the truth: median ratios over pixels neither black nor clipped.
 
     Parameters
     ----------
     truth, picture
-        Linear values ``(H, W, 3)``.
+        Linear images ``(H, W, 3)``.
+
+    Returns
+    -------
+    ndarray
+        One gain per colour ``(3,)``; 1 if no pixel is usable.
     """
     gains = np.ones(3)
     for channel in range(3):
         a, b = truth[..., channel], picture[..., channel]
-        kept = np.isfinite(a) & np.isfinite(b) & (a > 1e-3 * np.nanmax(a)) & (b > 1e-3 * np.nanmax(b))
-        kept &= a < 0.98 * np.nanmax(a)
-        if kept.any():
-            gains[channel] = np.exp(np.median(np.log(a[kept] / b[kept])))
+        usable = np.isfinite(a) & np.isfinite(b) & (a > 1e-3 * np.nanmax(a)) & (b > 1e-3 * np.nanmax(b))
+        usable &= a < 0.98 * np.nanmax(a)
+        if usable.any():
+            gains[channel] = np.exp(np.median(np.log(a[usable] / b[usable])))
     return gains
 
 
 def mask_of(name: str, pair: PicturePair, options: MaskOptions) -> np.ndarray | None:
-    """Pixels ``(H, W)`` bool that are scored: white in the mask and, where depth is known, terrain at the right distance.
+    """Return the mask of scored pixels: white in the mask file and, with depth, terrain within the distances.
+
+    Parameters
+    ----------
+    name
+        Name of the pair, which selects its file in a folder of masks.
+    pair
+        Picture and truth.
+    options
+        Mask files and range of distances.
+
+    Returns
+    -------
+    ndarray or None
+        ``(H, W)`` bool; ``None`` if there is neither a mask nor depth.
 
     Raises
     ------
     InputError
-        For a mask that is missing or of another size.
+        If the mask is missing or of another size.
     """
-    chosen = None
+    terrain = None
     if pair.depth_m is not None:
         depth = np.where(np.isnan(pair.depth_m), np.inf, pair.depth_m)
-        chosen = terrain_mask(depth, near_m=options.near_m, far_m=options.far_m)
+        terrain = terrain_mask(depth, near_m=options.near_m, far_m=options.far_m)
     if options.mask is None:
-        return chosen
+        return terrain
     path = options.mask / f"{name}.png" if options.mask.is_dir() else options.mask
     if not path.is_file():
         raise InputError("--mask", "no such mask", got=str(path))
@@ -202,18 +235,23 @@ def mask_of(name: str, pair: PicturePair, options: MaskOptions) -> np.ndarray | 
     if white.shape != pair.truth.shape[:2]:
         got, expected = (f"{shape[1]}x{shape[0]}" for shape in (white.shape, pair.truth.shape))
         raise InputError(path, "another size than the truth", got=got, expected=expected)
-    return white if chosen is None else white & chosen
+    return white if terrain is None else white & terrain
 
 
-def refuse_used(truths: Sequence[Path], used: Sequence[Path]) -> None:
-    """`InputError` where a truth's pixels are among those of used pictures; copies under other names are found too.
+def check_files_held_out(truths: Sequence[Path], used: Sequence[Path]) -> None:
+    """Check that no truth has the pixels of a picture that was used as an input, under whatever name.
 
     Parameters
     ----------
     truths
-        Files that are to be scored.
+        Files to be scored.
     used
         Files, or folders of files, used for painting, guidance or training.
+
+    Raises
+    ------
+    InputError
+        If a truth was used, or a used file is missing or unreadable.
     """
     files = []
     for path in used:
@@ -268,8 +306,16 @@ def score_pair(
     return result
 
 
-def write_table(path: Path, rows: Sequence[dict]) -> None:
-    """Write scores as ``.csv`` or Markdown (``.md``), atomically."""
+def write_table(path: Path, rows: Sequence[dict[str, Any]]) -> None:
+    """Write scores to a table; the file appears atomically.
+
+    Parameters
+    ----------
+    path
+        File to write: Markdown if it ends in ``.md``, otherwise CSV.
+    rows
+        Values by column name, at least one row; all rows have the columns of the first.
+    """
     with atomic_path(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         if path.suffix.lower() == ".md":
             file.write("\n".join(table_lines(rows, markdown=True)) + "\n")
