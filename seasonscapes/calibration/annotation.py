@@ -47,8 +47,8 @@ class AnnotationSession:
     frame
         Local frame of the scene.
     render
-        Function that computes the terrain view of a camera or panorama: `terrain_view.march_terrain_view` with its rasters
-        and frame bound, or `terrain_view.trace_terrain_view` with a ray caster bound.
+        Function that computes the terrain view of a camera or panorama: `terrain_view.march_terrain_view` with its
+        rasters and frame bound, or `terrain_view.trace_terrain_view` with a ray caster bound.
     folder
         Folder of ``<webcam>_points.csv`` and ``<webcam>_calibration.json``.
     priors
