@@ -1,34 +1,48 @@
-# make demo   pictures of the embedded scene in out/demo/
+# make demo   pictures of the bundled scene in out/demo/
 # make test   the tests
-# Both make their own virtual environment in .venv, see to a working libLLVM, and may be run again and again.
+# make lint   style, types and layers: ruff, pyright, import-linter
+# Each makes the virtual environment .venv if it is missing, finds or installs libLLVM where it is needed, and can be
+# repeated at will. PYTHON=python3.12 chooses the interpreter, CONSTRAINTS=constraints.txt installs the tested versions.
 
 PYTHON ?= python3
+CONSTRAINTS ?=
 VENV := .venv
 BIN := $(VENV)/bin
-STAMP := $(VENV)/.installed
+BASE := $(VENV)/.installed
+DEV := $(VENV)/.installed-dev
 
-.PHONY: demo test lint llvm venv clean help
+.PHONY: demo test lint venv dev llvm clean help
 help:
-	@sed -n '1,3p' Makefile
+	@sed -n '1,5p' Makefile
 
 # A new pyproject.toml installs anew; otherwise the environment is left as it is.
-$(STAMP): pyproject.toml tools/install.sh
-	@sh tools/install.sh "$(PYTHON)" "$(VENV)"
-	@touch $(STAMP)
+$(BASE): pyproject.toml tools/install.sh
+	@sh tools/install.sh "$(PYTHON)" "$(VENV)" "" "$(CONSTRAINTS)"
+	@touch $(BASE)
 
-venv: $(STAMP)
+# The developer's tools, with all extras: PyTorch, diffusers and Dask are tested too.
+$(DEV): pyproject.toml tools/install.sh
+	@sh tools/install.sh "$(PYTHON)" "$(VENV)" "[dev]" "$(CONSTRAINTS)"
+	@touch $(BASE) $(DEV)
+
+venv: $(BASE)
+
+dev: $(DEV)
 
 llvm:
 	@sh tools/llvm.sh
 
-demo: llvm $(STAMP)
+demo: llvm $(BASE)
 	$(BIN)/seasonscapes demo -o out/demo
 
-test: llvm $(STAMP)
-	$(BIN)/python -m pytest -q
+test: llvm $(DEV)
+	$(BIN)/python -m pytest -q -n 2
 
-lint: $(STAMP)
-	$(BIN)/ruff check . && $(BIN)/ruff format --check .
+lint: $(DEV)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+	$(BIN)/lint-imports
 
 clean:
 	rm -rf $(VENV) out

@@ -299,16 +299,15 @@ def visibility_agreement(seed: int, count: int) -> dict[str, float]:
 
 def a_year(frames: int, width_px: int) -> dict[str, float]:
     """Seconds of a year's film of the embedded scene, from frames spread over all its hours."""
-    from seasonscapes.commands.timelapse import developed
     from seasonscapes.relighting.film import write_video
     from seasonscapes.scene import read_scene
     from seasonscapes.sky.models import read_sky_model
     from seasonscapes.terrain.surface import save_texture
-    from seasonscapes.workflows.albedo_sources import albedo_for
+    from seasonscapes.workflows.albedo_sources import AlbedoFile, albedo_for
     from seasonscapes.workflows.illumination import sun_moon_position
     from seasonscapes.workflows.place import MeshOptions, find_scene, load_place
     from seasonscapes.workflows.relight_session import RenderJob
-    from seasonscapes.workflows.timelapse import cached_session, render_frame
+    from seasonscapes.workflows.timelapse import FilmLook, cached_session, developed, frames_folder, render_frame
     from seasonscapes.workspace import Workspace, default_workspace
 
     path = find_scene("alpine")
@@ -334,10 +333,10 @@ def a_year(frames: int, width_px: int) -> dict[str, float]:
         dated = []
         for day in (datetime(2024, 1, 16, tzinfo=UTC), datetime(2024, 7, 16, tzinfo=UTC)):
             save_texture(albedo_for(place, day), Path(name) / f"{day:%m%d}.npz")
-            dated.append((day.date().isoformat(), str(Path(name) / f"{day:%m%d}.npz")))
+            dated.append(AlbedoFile(day.date(), Path(name) / f"{day:%m%d}.npz"))
         assignment = RenderJob(
-            str(path),
-            name,
+            path,
+            Path(name),
             MeshOptions(),
             read_scene(path).camera(None),
             (width_px, width_px * 2 // 3),
@@ -345,7 +344,7 @@ def a_year(frames: int, width_px: int) -> dict[str, float]:
             albedo=tuple(dated),
         )
         clock = {"coefficients": time.perf_counter()}
-        cached_session(assignment)
+        session = cached_session(assignment)
         clock["frames"] = time.perf_counter()
         cpu = time.process_time()
         for index, each in enumerate(chosen):
@@ -357,7 +356,7 @@ def a_year(frames: int, width_px: int) -> dict[str, float]:
                 )
         cpu = time.process_time() - cpu
         clock["film"] = time.perf_counter()
-        write_video(Path(name) / "year.mp4", developed(assignment, chosen, metering="auto", window_s=900.0))
+        write_video(Path(name) / "year.mp4", developed(frames_folder(session), chosen, FilmLook()))
         clock["end"] = time.perf_counter()
     share = len(bright) / frames
     return {

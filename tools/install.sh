@@ -1,7 +1,8 @@
 #!/bin/sh
-# Make a virtual environment and install the package with what its tests need: tools/install.sh PYTHON VENV
+# Make a virtual environment and install the package into it: tools/install.sh PYTHON VENV [EXTRAS] [CONSTRAINTS]
+# EXTRAS in brackets, such as '[dev]'; CONSTRAINTS is a file of pinned versions.
 set -eu
-python=$1 venv=$2
+python=$1 venv=$2 extras=${3:-} constraints=${4:-}
 "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null \
     || { echo "install: $python is missing or older than Python 3.11; name one with: make PYTHON=python3.12 ..." >&2; exit 1; }
 if [ ! -x "$venv/bin/python" ]; then
@@ -17,5 +18,5 @@ if [ ! -x "$venv/bin/python" ]; then
         fi
     }
 fi
-echo "install: seasonscapes and its tests' needs into $venv"
-"$venv/bin/python" -m pip install -q --disable-pip-version-check -e '.[dev]'
+echo "install: seasonscapes$extras into $venv"
+"$venv/bin/python" -m pip install -q --disable-pip-version-check ${constraints:+-c "$constraints"} -e ".$extras"

@@ -230,8 +230,8 @@ def _project(splats: DeviceSplats, camera: Camera, limits: SplatLimits) -> _Proj
     x, y, z = (dr.dot(local, axis) for axis in camera_axes)
     fx, fy = number(camera.fx), number(camera.fy)
     # As in 3DGS, the derivative of the projection is evaluated at most 30 % outside of the image.
-    limits = number(0.65 * camera.width_px / camera.fx), number(0.65 * camera.height_px / camera.fy)
-    u, v = (dr.clip(side / z, -limit, limit) for side, limit in zip((x, y), limits, strict=True))
+    slope_limits = number(0.65 * camera.width_px / camera.fx), number(0.65 * camera.height_px / camera.fy)
+    u, v = (dr.clip(side / z, -limit, limit) for side, limit in zip((x, y), slope_limits, strict=True))
     xx, xy, yy = number(limits.pixel_variance), mi.Float(0.0), number(limits.pixel_variance)
     for axis in splats.mi_axes:
         a, b, c = (dr.dot(axis, camera_axis) for camera_axis in camera_axes)
