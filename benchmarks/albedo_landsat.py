@@ -47,8 +47,8 @@ def main() -> None:
 def measure(folder: Path, seed: int) -> dict[str, float]:
     """Correlations by date, band and method; printed as a table."""
     from seasonscapes.albedo.corrections import CORRECTIONS, slopes_under
-    from seasonscapes.albedo.texture_delighting import delight_textures
     from seasonscapes.albedo.forward_model import trace_texel_transport
+    from seasonscapes.albedo.texture_delighting import delight_textures
     from seasonscapes.frames import direction_from_angles
     from seasonscapes.rendering.backend import use_backend
 
