@@ -107,7 +107,7 @@ def read_colmap(folder: Path) -> list[NamedView]:
     """
     from scipy.spatial.transform import Rotation
 
-    intrinsics = {}
+    intrinsics: dict[str, tuple[int, int, float, float, float, float]] = {}
     for where, line in _lines(folder / "cameras.txt"):
         number, *fields = line.split()
         intrinsics[number] = _colmap_intrinsics(fields, where)
@@ -126,7 +126,8 @@ def read_colmap(folder: Path) -> list[NamedView]:
         pose = np.eye(4)
         pose[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix().T
         pose[:3, 3] = -pose[:3, :3] @ translation
-        views.append(NamedView(name, Camera(*intrinsics[number], pose), name))
+        width, height, fx, fy, cx, cy = intrinsics[number]
+        views.append(NamedView(name, Camera(width, height, fx, fy, cx, cy, pose), name))
     return views
 
 
