@@ -183,7 +183,7 @@ def sun_ray_throughput(terrain, ready, light) -> dict[str, float]:
     import drjit as dr
     import mitsuba as mi
 
-    from seasonscapes.rendering.sun_visibility import incidence
+    from seasonscapes.rendering.sun_visibility import sum_incidence
 
     every = np.arange(ready.rays.receivers)
     sun = mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in light.sun.direction))
@@ -203,7 +203,7 @@ def sun_ray_throughput(terrain, ready, light) -> dict[str, float]:
 
     times: dict[str, list] = {"ours": [], "bare": []}
     for turn in range(6):
-        for name, call in (("ours", lambda: incidence(ready.rays, light.sun, every)), ("bare", bare)):
+        for name, call in (("ours", lambda: sum_incidence(ready.rays, light.sun, every)), ("bare", bare)):
             start = time.process_time()
             call()
             if turn:
