@@ -81,7 +81,7 @@ def albedo_for(place: Place, day: date) -> Texture:
     inputs: dict[str, Any] = {"terrain": place.key}
     if place.synthetic is not None:
         day_of_year = day.timetuple().tm_yday
-        texture = build_once(
+        return build_once(
             place.workspace,
             f"{place.scene.name}/albedo-day{day_of_year:03d}",
             inputs | {"day_of_year": day_of_year},
@@ -91,13 +91,12 @@ def albedo_for(place: Place, day: date) -> Texture:
             save=save_texture,
             load=load_texture,
         )
-        return replace(texture, atlas_id=place.atlas_id)
     imagery = place.scene.imagery
     if imagery is None:
         values = np.full((*place.texture_shape, 3), GREY_ALBEDO, np.float32)
         return Texture(values, np.zeros(place.texture_shape, np.float32), place.atlas_id)
     inputs.update(imagery=imagery.model_copy(update={"file": Path(imagery.file).name}), hash=file_hash(imagery.file))
-    texture = build_once(
+    return build_once(
         place.workspace,
         f"{place.scene.name}/albedo",
         inputs,
@@ -107,7 +106,6 @@ def albedo_for(place: Place, day: date) -> Texture:
         save=save_texture,
         load=load_texture,
     )
-    return replace(texture, atlas_id=place.atlas_id)
 
 
 def orthoimage(place: Place, day: date) -> Texture | None:
