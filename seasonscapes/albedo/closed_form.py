@@ -25,6 +25,7 @@ from seasonscapes.albedo.equations import (
     equations_of,
     forward_product,
     projected_gain,
+    radiance_floor,
     reweight,
     squared_adjoint,
 )
@@ -303,7 +304,7 @@ def _assess(
         if equations.projected:
             equations.inverse_gain = projected_gain(equations, radiance)
         h = equations.inverse_gain.astype(np.float32)
-        floor = 1e-3 * float(np.median(radiance)) + 1e-9
+        floor = radiance_floor(radiance)
         relative = (h * equations.picture - radiance) / (radiance + floor)
         sigma = np.sqrt(noise_model.model**2 + (equations.noise * h / (radiance + floor)) ** 2)
         keep = equations.usable[:, 0]

@@ -246,13 +246,18 @@ def reweight(systems: list[PhotographEquations], albedo: np.ndarray, noise_model
         # Highest where a shadow's edge divides the pixel.
         penumbra = np.nan_to_num(4.0 * lit * (1.0 - lit)).astype(np.float32)[:, None]
         noise = equations.noise * equations.inverse_gain.astype(np.float32)
-        floor = 1e-3 * float(np.median(radiance)) + 1e-9
+        floor = radiance_floor(radiance)
         variance = (noise_model.model * radiance) ** 2 + (noise_model.edge * sun * penumbra) ** 2 + noise**2 + floor**2
         equations.weight = np.where(equations.usable, 1.0 / variance, 0.0).astype(np.float32)
         if robust:
             h = equations.inverse_gain.astype(np.float32)
             residual = (h * equations.picture - radiance) * np.sqrt(equations.weight)
             equations.weight *= _cauchy(residual, equations.usable)
+
+
+def radiance_floor(radiance: np.ndarray) -> float:
+    """Return the radiance below which relative residuals are not meaningful: a thousandth of the median, above zero."""
+    return 1e-3 * float(np.median(radiance)) + 1e-9
 
 
 def _cauchy(residual: np.ndarray, usable: np.ndarray) -> np.ndarray:
