@@ -167,9 +167,9 @@ def recover_albedo(
     >>> place = ss.load_place("alpine_small")
     >>> times = ["2024-07-20T10:00", "2024-07-20T15:00"]
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     sources = ss.synthetic_photographs(place, times, folder, sky="hosek", size_px=(48, 32))
+    ...     sources = ss.synthetic_photographs(place, times, folder, sky="clear", size_px=(96, 64))
     ...     photographs = ss.open_photographs(place, sources.manifest, sources.calibrations, times)
-    >>> recovered = ss.recover_albedo(place, photographs, sky="hosek")
+    >>> recovered = ss.recover_albedo(place, photographs, sky="clear")
     >>> recovered.known.albedo.shape == (*place.texture_shape, 3)
     True
     """
