@@ -303,7 +303,7 @@ def a_year(frames: int, width_px: int) -> dict[str, float]:
     from seasonscapes.scene import read_scene
     from seasonscapes.sky.models import read_sky_model
     from seasonscapes.terrain.surface import save_texture
-    from seasonscapes.workflows.albedo_sources import AlbedoFile, albedo_for
+    from seasonscapes.workflows.albedo_sources import AlbedoFile, scene_albedo
     from seasonscapes.workflows.illumination import sun_moon_position
     from seasonscapes.workflows.place import MeshOptions, find_scene, load_place
     from seasonscapes.workflows.relight_session import RenderJob
@@ -332,7 +332,7 @@ def a_year(frames: int, width_px: int) -> dict[str, float]:
         # Two dated albedos, as a real place may have: each frame wears a blend of them.
         dated = []
         for day in (datetime(2024, 1, 16, tzinfo=UTC), datetime(2024, 7, 16, tzinfo=UTC)):
-            save_texture(albedo_for(place, day), Path(name) / f"{day:%m%d}.npz")
+            save_texture(scene_albedo(place, day), Path(name) / f"{day:%m%d}.npz")
             dated.append(AlbedoFile(day.date(), Path(name) / f"{day:%m%d}.npz"))
         assignment = RenderJob(
             path,

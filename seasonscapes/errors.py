@@ -25,6 +25,15 @@ class InputError(SeasonscapesError):
         What is wrong.
     got, expected, cure
         The value found, the value expected, and how to correct it.
+
+    Examples
+    --------
+    >>> import seasonscapes as ss
+    >>> try:
+    ...     ss.load_place("nowhere.toml")
+    ... except ss.InputError as error:
+    ...     print(error.problem)
+    no such file
     """
 
     def __init__(

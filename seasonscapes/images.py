@@ -73,6 +73,13 @@ def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
     -------
     ndarray
         Encoded values in [0, 1] ``(...)``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import seasonscapes as ss
+    >>> ss.srgb_from_linear(np.array([0.0, 0.2140411, 1.0])).round(4)
+    array([0. , 0.5, 1. ])
     """
     linear = np.clip(linear, 0.0, 1.0)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.power(linear, 1.0 / 2.4) - 0.055)

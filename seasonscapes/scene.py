@@ -166,6 +166,12 @@ class Viewpoint(Declaration):
         Rotation about the viewing direction; positive lowers the right-hand side [deg].
     fov_deg
         Horizontal field of view [deg].
+
+    Examples
+    --------
+    >>> import seasonscapes as ss
+    >>> ss.Viewpoint(latitude_deg=46.556, longitude_deg=7.98, above_ground_m=2.0, heading_deg=180.0).fov_deg
+    60.0
     """
 
     latitude_deg: float = Latitude

@@ -33,6 +33,16 @@ class Workspace:
     ----------
     folder
         Created when the first artefact is written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import seasonscapes as ss
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     place = ss.load_place("alpine_small", ss.Workspace(Path(folder)))
+    ...     sorted(path.name for path in Path(folder).iterdir())
+    ['alpine_small']
     """
 
     folder: Path

@@ -19,7 +19,7 @@ from seasonscapes.texturing.predictors import predictors_for, stack_predictors
 from seasonscapes.texturing.smooth_fill import membrane_fill, propagate, push_pull, telea_fill
 from seasonscapes.texturing.terrain_features import horizon_tangent, sun_margin_deg, terrain_features
 from seasonscapes.texturing.top_down_grid import from_grid, to_grid
-from seasonscapes.workflows.albedo_sources import albedo_for
+from seasonscapes.workflows.albedo_sources import scene_albedo
 from seasonscapes.workflows.place import MeshOptions, load_place
 from seasonscapes.workspace import Workspace
 
@@ -307,7 +307,7 @@ def hill(tmp_path, monkeypatch):
     monkeypatch.setenv("SEASONSCAPES_WORKSPACE", str(tmp_path / "work"))
     path = places.write_place(tmp_path / "scene")
     place = load_place(path, Workspace(tmp_path / "work"), options=MeshOptions())
-    albedo = albedo_for(place, None)
+    albedo = scene_albedo(place, None)
     seen = np.ones(albedo.weight.shape, bool)
     seen[30:50, 12:70] = False
     texture = Texture(

@@ -16,7 +16,7 @@ def place(tmp_path_factory):
     """A folder with a scene, its true albedo of the day as a file, and what the land truly sends then."""
     from datetime import UTC, datetime
 
-    from seasonscapes.workflows.albedo_sources import albedo_for, load_albedo
+    from seasonscapes.workflows.albedo_sources import load_albedo, scene_albedo
     from seasonscapes.workflows.place import MeshOptions, load_place
     from seasonscapes.workflows.predicted_radiance import predict_radiance
     from seasonscapes.workspace import Workspace
@@ -26,7 +26,7 @@ def place(tmp_path_factory):
     scene.write_text(MASSIF)
     land = load_place(scene, Workspace(folder / "work"), options=MeshOptions(texel_m=60.0))
     utc = datetime(2024, 7, 20, 8, 0, tzinfo=UTC)
-    true = albedo_for(land, utc)
+    true = scene_albedo(land, utc)
     with atomic_path(folder / "albedo.npz") as temporary:
         save_texture(Texture(true.values, np.ones_like(true.weight)), temporary)
     albedo = load_albedo(land, folder / "albedo.npz", utc.date())

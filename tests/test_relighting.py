@@ -134,9 +134,9 @@ def test_a_frame_equals_path_tracing(hill):
 
 
 def session_albedo(session):
-    from seasonscapes.workflows.albedo_sources import albedo_for
+    from seasonscapes.workflows.albedo_sources import scene_albedo
 
-    return albedo_for(session.place, NOON).values
+    return scene_albedo(session.place, NOON).values
 
 
 def test_dated_albedos_dress_the_view(hill, tmp_path):

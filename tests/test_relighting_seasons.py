@@ -235,8 +235,10 @@ def test_textures_of_a_spring(mountain):
     place = load_place(Path(mountain.scene), Workspace(Path(mountain.workspace)))
     dated = dated_albedos(place, mountain.albedo)
     ground, texel = texel_attributes(place.terrain, (place.atlas.height_px, place.atlas.width_px))
-    film = [albedo_of_day(place, dated, day, season="snow-line").values.reshape(-1, 3)[texel] for day in DAYS]
-    faded = [albedo_of_day(place, dated, day, season="blended").values.reshape(-1, 3)[texel] for day in DAYS]
+    film = [
+        albedo_of_day(place, AlbedoSeries(tuple(dated), "snow-line"), day).values.reshape(-1, 3)[texel] for day in DAYS
+    ]
+    faded = [albedo_of_day(place, AlbedoSeries(tuple(dated)), day).values.reshape(-1, 3)[texel] for day in DAYS]
     rows = np.array([by_height(ground.height_m, values) for values in film])
     assert np.diff(rows, axis=1).min() > -0.02, "more snow the higher"
     assert np.diff(rows, axis=0).max() <= 1e-6, "less snow the later"

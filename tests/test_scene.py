@@ -132,12 +132,12 @@ def in_feet_and_a_half(values, profile):
 def test_each_bad_raster_has_its_line(tmp_path, name, change, message):
     from datetime import UTC, datetime
 
-    from seasonscapes.workflows.albedo_sources import albedo_for
+    from seasonscapes.workflows.albedo_sources import scene_albedo
 
     path = places.write_place(tmp_path)
     spoil(tmp_path / name, change)
     with pytest.raises(InputError, match=message) as error:
-        albedo_for(load_place(path, Workspace(tmp_path / "work")), datetime(2024, 9, 1, tzinfo=UTC))
+        scene_albedo(load_place(path, Workspace(tmp_path / "work")), datetime(2024, 9, 1, tzinfo=UTC))
     assert "\n" not in str(error.value)
     assert "tif" in str(error.value) or "hill.toml" in str(error.value)
 

@@ -80,6 +80,8 @@ class AlbedoSeries:
 
     Examples
     --------
+    >>> from datetime import date
+    >>> from seasonscapes.albedo.seasons import AlbedoSeries, DatedAlbedo
     >>> days = date(2024, 8, 1), date(2024, 2, 1)
     >>> series = AlbedoSeries(tuple(DatedAlbedo(day, "", lambda: None) for day in days), "snow-line")
     >>> [dated.day.month for dated in series.dated]

@@ -33,6 +33,14 @@ class Correspondences:
     ------
     ValueError
         If the shapes do not match, or a coordinate is NaN or infinite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import seasonscapes as ss
+    >>> points = ss.Correspondences(np.array([[120.5, 80.0]]), np.array([[310.0, 2050.0, 2890.0]]))
+    >>> points.names
+    ('1',)
     """
 
     pixel: np.ndarray

@@ -48,6 +48,17 @@ class Observation:
         Id of the webcam.
     pose_sigma
         Standard deviations of pose parameters, by the names of a calibration record; missing parameters are exact.
+
+    Examples
+    --------
+    >>> from datetime import UTC, datetime
+    >>> import numpy as np
+    >>> import seasonscapes as ss
+    >>> place = ss.load_place("alpine_small")
+    >>> camera = ss.camera(place, "aerial", size_px=(48, 32))
+    >>> image, mask = np.full((32, 48, 3), 0.2, np.float32), np.ones((32, 48), bool)
+    >>> ss.Observation(image, mask, camera, datetime(2024, 7, 20, 11, 30, tzinfo=UTC), "aerial").webcam
+    'aerial'
     """
 
     image: np.ndarray

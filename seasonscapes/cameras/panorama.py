@@ -45,6 +45,16 @@ class Panorama:
         forward. The y axis of a level camera is vertical.
     frame
         Local frame of ``world_from_camera``; ``None`` if unknown. See `pinhole.view_in_frame`.
+
+    Examples
+    --------
+    >>> import seasonscapes as ss
+    >>> place = ss.load_place("alpine_small")
+    >>> pose = ss.camera(place, "aerial").world_from_camera
+    >>> panorama = ss.Panorama("cylindrical", 360, 60, 57.3, 57.3, 180.0, 30.0, pose, frame=place.frame)
+    >>> view = ss.render(place, panorama, "2024-07-20T13:30", sky="hosek", spp=1)
+    >>> view.radiance.shape
+    (60, 360, 3)
     """
 
     projection: Projection

@@ -41,6 +41,14 @@ class Camera:
         Rigid transform ``(4, 4)`` float64 with OpenCV axes: x right, y down, z forward. World is east-north-up [m].
     frame
         Local frame of ``world_from_camera``; ``None`` if unknown. See `view_in_frame`.
+
+    Examples
+    --------
+    >>> import seasonscapes as ss
+    >>> place = ss.load_place("alpine_small")
+    >>> camera = ss.camera(place, "aerial", size_px=(96, 64))
+    >>> camera.width_px, camera.world_from_camera.shape
+    (96, (4, 4))
     """
 
     width_px: int

@@ -61,16 +61,18 @@ def irradiance_command(
         raise InputError("--time", "give either an instant or a period", got=got, cure=cure)
     import numpy as np
 
+    from seasonscapes.rendering.backend import use_backend
     from seasonscapes.workflows.received_light import irradiance_map, require_rays
 
     require_rays(rays, where="--rays")
     model = sky.model()
+    use_backend(device)
     with progress_bars() as progress:
         loaded = options.load(scene, progress)
         at = (loaded.frame.latitude_deg, loaded.frame.longitude_deg)
         times = parse_time(time, *at) if time is not None else (when or WhenOptions()).instants(*at)
         received = irradiance_map(
-            loaded, times, sky=model, spacing_m=spacing_m, rays=rays, seed=seed, device=device, progress=progress
+            loaded, times, sky=model, spacing_m=spacing_m, rays=rays, seed=seed, progress=progress
         )
     received.save(output)
     mean = {name: round(float(np.nanmean(values)), 4) for name, values in received.bands.items()}

@@ -61,6 +61,7 @@ def lit_texture_command(
     check_suffix(output, (".png", ".glb", ".exr"))
     from seasonscapes.exposure import develop, exposure_ev100, parse_exposure
     from seasonscapes.images import write_exr
+    from seasonscapes.rendering.backend import use_backend
     from seasonscapes.workflows.albedo_sources import load_albedo
     from seasonscapes.workflows.illumination import illumination_on_terrain
     from seasonscapes.workflows.pictures import png_metadata, save_png
@@ -69,11 +70,12 @@ def lit_texture_command(
 
     require_rays(rays, where="--rays")
     metering, model = parse_exposure(exposure), sky.model()
+    use_backend(device)
     with progress_bars() as progress:
         loaded = options.load(scene, progress)
         utc = parse_time(time, loaded.frame.latitude_deg, loaded.frame.longitude_deg)
         given = None if albedo is None else load_albedo(loaded, albedo, utc.date())
-        lit = lit_texture(loaded, utc, sky=model, albedo=given, rays=rays, seed=seed, device=device, progress=progress)
+        lit = lit_texture(loaded, utc, sky=model, albedo=given, rays=rays, seed=seed, progress=progress)
     light, position = illumination_on_terrain(loaded, model, utc)
     record: dict[str, Any] = {
         "scene": scene,

@@ -64,6 +64,7 @@ def render_command(
     check_range("--spp", spp, 1, 1 << 20)
     check_range("--max-depth", max_depth, 2, 1000)
     check_range("--seed", seed, 0, 2**32)
+    from seasonscapes.albedo.seasons import AlbedoSeries
     from seasonscapes.exposure import develop, exposure_ev100, parse_exposure
     from seasonscapes.rendering.backend import use_backend
     from seasonscapes.workflows.albedo_sources import chosen_albedo, dated_albedos, require_season
@@ -78,26 +79,19 @@ def render_command(
         loaded = options.load(scene, progress)
         chosen, camera = view.chosen(loaded.scene), view.pinhole(loaded)
         utc = parse_time(time, chosen.latitude_deg, chosen.longitude_deg)
-        dated = dated_albedos(loaded, files) if files else None
-        texture = chosen_albedo(loaded, utc.date(), dated, season=season)
+        series = AlbedoSeries(tuple(dated_albedos(loaded, files)), season) if files else None
+        texture = chosen_albedo(loaded, utc.date(), series)
         picture = render(
-            loaded,
-            camera,
-            utc,
-            sky=model,
-            albedo=texture,
-            spp=spp,
-            max_depth=max_depth,
-            seed=seed,
-            device=device,
-            progress=progress,
+            loaded, camera, utc, sky=model, albedo=texture, spp=spp, max_depth=max_depth, seed=seed, progress=progress
         )
     record = picture.provenance
     ev100 = exposure_ev100(picture.radiance, metering)
     record |= {
         "output": str(output),
         "camera": chosen.name,
-        "albedo": [{"date": each.day.isoformat(), "content": each.content} for each in dated or ()],
+        "albedo": [
+            {"date": each.day.isoformat(), "content": each.content} for each in (series.dated if series else ())
+        ],
         "season": season,
         "exposure_ev100": round(ev100, 3),
     }

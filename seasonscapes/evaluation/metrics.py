@@ -88,6 +88,15 @@ def score(
         If the mask contains no pixel.
     ValueError
         If the shapes differ, values within the mask are not finite or outside [0, 1], or the mode is unknown.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import seasonscapes as ss
+    >>> truth = np.random.default_rng(0).random((32, 48, 3))
+    >>> result = ss.score(truth, np.clip(truth + 0.1, 0.0, 1.0))
+    >>> bool(15.0 < result.psnr_db < 25.0)
+    True
     """
     truth, picture, mask = _validated(truth, picture, mask, mode)
     return Score(

@@ -37,6 +37,14 @@ class RenderedView:
         First surfaces at pixel centres.
     provenance
         Plain values that describe the rendering (scene, camera, time, sun, sky, samples), stored in image files.
+
+    Examples
+    --------
+    >>> import seasonscapes as ss
+    >>> place = ss.load_place("alpine_small")
+    >>> view = ss.render(place, ss.camera(place, "aerial", size_px=(48, 32)), "2024-07-20T13:30", sky="hosek", spp=1)
+    >>> view.coverage.shape, view.gbuffer.depth.shape
+    ((32, 48), (32, 48))
     """
 
     radiance: np.ndarray

@@ -81,6 +81,14 @@ class Illumination:
         Local frame of all directions; ``None`` if unknown.
     time
         Aware datetime; ``None`` if the illumination does not belong to an instant.
+
+    Examples
+    --------
+    >>> import seasonscapes as ss
+    >>> place = ss.load_place("alpine_small")
+    >>> light = ss.illumination(place, "2024-07-20T13:30", sky="hosek")
+    >>> light.model["name"], light.sky_radiance.shape[2]
+    ('hosek', 3)
     """
 
     sky_radiance: np.ndarray

@@ -173,6 +173,13 @@ def dome_picture(illumination: Illumination, size_px: int = 768, *, ev100: float
     ------
     NoUsablePixels
         If the exposure is metered and the sky has no positive luminance.
+
+    Examples
+    --------
+    >>> import seasonscapes as ss
+    >>> place = ss.load_place("alpine_small")
+    >>> ss.dome_picture(ss.illumination(place, "2024-07-20T13:30", sky="hosek"), 140).shape
+    (140, 140, 3)
     """
     import cv2
 

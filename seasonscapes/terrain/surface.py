@@ -69,6 +69,15 @@ class Texture:
         ``(R, S)`` float32 weight of the observations, 0 for unobserved texels; ones if left out.
     atlas_id
         Identifier of the UV atlas that the texture belongs to, see `atlas_identity`; ``None`` if unknown.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import seasonscapes as ss
+    >>> place = ss.load_place("alpine_small")
+    >>> grey = ss.Texture(np.full((*place.texture_shape, 3), 0.2, np.float32), atlas_id=place.atlas_id)
+    >>> camera = ss.camera(place, "aerial", size_px=(48, 32))
+    >>> view = ss.render(place, camera, "2024-07-20T13:30", sky="hosek", albedo=grey, spp=1)
     """
 
     values: np.ndarray

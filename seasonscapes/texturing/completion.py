@@ -165,6 +165,12 @@ class CompletionOptions:
     ------
     ValueError
         Unknown method, or ``detail`` out of range.
+
+    Examples
+    --------
+    >>> import seasonscapes as ss
+    >>> ss.CompletionOptions("membrane").detail
+    0.0
     """
 
     method: str = "guided"

@@ -16,7 +16,7 @@ from seasonscapes.errors import NoTerrainInView
 from seasonscapes.progress import Progress, task_progress
 from seasonscapes.sky.models import SkyModel, with_overrides
 from seasonscapes.terrain.surface import Texture
-from seasonscapes.workflows.albedo_sources import albedo_for, orthoimage
+from seasonscapes.workflows.albedo_sources import orthoimage, scene_albedo
 from seasonscapes.workflows.illumination import illumination_for_camera, sky_model
 from seasonscapes.workflows.place import Place
 
@@ -47,6 +47,12 @@ class RecoveryOptions:
         Search the strength of the cameras' tone curve.
     iterations
         Iterations of differentiable rendering after the closed form; 0 for none.
+
+    Examples
+    --------
+    >>> import seasonscapes as ss
+    >>> ss.RecoveryOptions(fit_haze=True).iterations
+    0
     """
 
     fit_haze: bool = False
@@ -166,10 +172,11 @@ def recover_albedo(
     >>> import seasonscapes as ss
     >>> place = ss.load_place("alpine_small")
     >>> times = ["2024-07-20T10:00", "2024-07-20T15:00"]
+    >>> camera = ss.camera(place, "aerial", size_px=(96, 64))
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     sources = ss.synthetic_photographs(place, times, folder, sky="clear", size_px=(96, 64))
+    ...     sources = ss.synthetic_photographs(place, times, folder, cameras={"aerial": camera})
     ...     photographs = ss.open_photographs(place, sources.manifest, sources.calibrations, times)
-    >>> recovered = ss.recover_albedo(place, photographs, sky="clear")
+    >>> recovered = ss.recover_albedo(place, photographs)
     >>> recovered.known.albedo.shape == (*place.texture_shape, 3)
     True
     """
@@ -313,7 +320,7 @@ def save_albedo_figures(recovered: RecoveredAlbedo, output: Path) -> dict[str, s
 
 def error_against_truth(place: Place, recovered: RecoveredAlbedo) -> dict[str, float]:
     """PSNR [dB] and relative error over measured texels of a synthetic place, whose albedo is known."""
-    truth, measured = albedo_for(place, recovered.day).values, recovered.known.source == 1
+    truth, measured = scene_albedo(place, recovered.day).values, recovered.known.source == 1
     error = recovered.known.albedo[measured] - truth[measured]
     return {
         "true_psnr_db": round(float(-10.0 * np.log10(np.mean(error**2))), 2),

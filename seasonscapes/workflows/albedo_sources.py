@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 from datetime import date, datetime, timedelta
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
 
 from seasonscapes.albedo.seasons import (
     SEASONS,
+    AlbedoSeries,
     DatedAlbedo,
     day_number,
     interpolate_albedo,
@@ -28,8 +29,9 @@ from seasonscapes.terrain.surface import Raster, Texture, load_texture, save_tex
 from seasonscapes.workflows.place import Place
 from seasonscapes.workspace import build_once, file_hash
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable
+# What workflows accept as ``albedo``: a texture of the place's atlas, an albedo of one date, albedos of several dates
+# with their interpolation, or ``None`` for the scene's own.
+AlbedoSource = Texture | DatedAlbedo | AlbedoSeries | None
 
 log = logging.getLogger(__name__)
 
@@ -60,7 +62,7 @@ class AlbedoFile:
     path: Path
 
 
-def albedo_for(place: Place, day: date) -> Texture:
+def scene_albedo(place: Place, day: date) -> Texture:
     """Return the albedo texture of a date: the synthetic truth of that day, or the scene's image.
 
     Parameters
@@ -75,6 +77,15 @@ def albedo_for(place: Place, day: date) -> Texture:
     Texture
         Linear reflectance in [0, 1]. ``weight`` is 0 where the image does not reach; the albedo there is the image's
         median colour. Without an image it is uniformly 0.2, of weight 0.
+
+    Examples
+    --------
+    >>> from datetime import date
+    >>> import seasonscapes as ss
+    >>> place = ss.load_place("alpine_small")
+    >>> summer, winter = (ss.scene_albedo(place, date(2024, month, 15)).values.mean() for month in (7, 1))
+    >>> bool(winter > summer)
+    True
     """
     from seasonscapes.terrain.imagery import bake_imagery
 
@@ -114,8 +125,8 @@ def orthoimage(place: Place, day: date) -> Texture | None:
     The image of a synthetic place is its albedo of a summer day; only the year of ``day`` matters.
     """
     if place.synthetic is not None:
-        return albedo_for(place, day.replace(month=1, day=1) + timedelta(days=_IMAGE_DAY - 1))
-    return None if place.scene.imagery is None else albedo_for(place, day)
+        return scene_albedo(place, day.replace(month=1, day=1) + timedelta(days=_IMAGE_DAY - 1))
+    return None if place.scene.imagery is None else scene_albedo(place, day)
 
 
 def dated_albedos(place: Place, files: Sequence[AlbedoFile] = ()) -> list[DatedAlbedo]:
@@ -148,13 +159,13 @@ def dated_albedos(place: Place, files: Sequence[AlbedoFile] = ()) -> list[DatedA
             if imagery is None
             else ":".join((imagery.model_dump_json(), file_hash(imagery.file), source_hash(*_IMAGE_CODE)))
         )
-        return [DatedAlbedo(midsummer.date(), content, lambda: albedo_for(place, midsummer))]
+        return [DatedAlbedo(midsummer.date(), content, lambda: scene_albedo(place, midsummer))]
     days = [datetime(2024, month, day) for month in range(1, 13) for day in _FILM_DAYS]
     return [
         DatedAlbedo(
             day.date(),
             f"synthetic:{day.timetuple().tm_yday}:{source_hash(*_SYNTHETIC_CODE)}",
-            partial(albedo_for, place, day),
+            partial(scene_albedo, place, day),
         )
         for day in days
     ]
@@ -181,6 +192,20 @@ def load_albedo(place: Place, path: str | Path, day: date | str | None = None) -
     ------
     InputError
         Where the file is missing or no texture, or states no date and none is given.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import numpy as np
+    >>> import seasonscapes as ss
+    >>> place = ss.load_place("alpine_small")
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     values = np.full((*place.texture_shape, 3), 0.2, np.float32)
+    ...     np.savez(f"{folder}/albedo.npz", values=values, weight=values[..., 0], atlas_id=place.atlas_id)
+    ...     albedo = ss.load_albedo(place, f"{folder}/albedo.npz", "2024-07-20")
+    ...     light = ss.predict_radiance(place, albedo, "2024-07-20T13:30", sky="hosek")
+    >>> albedo.day.isoformat()
+    '2024-07-20'
     """
     path = Path(path)
     if day is None:
@@ -250,32 +275,31 @@ def snow_transition_between(place: Place, first: DatedAlbedo, second: DatedAlbed
     )
 
 
-def albedo_of_day(place: Place, dated: Sequence[DatedAlbedo], day: date, *, season: str = "blended") -> Texture:
+def albedo_of_day(place: Place, series: AlbedoSeries, day: date) -> Texture:
     """Interpolate a place's albedo on a day from dated albedos.
 
     Parameters
     ----------
     place
         The place.
-    dated
-        Albedos with their dates, sorted.
+    series
+        Albedos with their dates and their interpolation.
     day
-        The day; on a date of ``dated`` the result is that texture to the bit.
-    season
-        ``"blended"``, ``"nearest"`` or ``"snow-line"``; see `albedo.seasons.season_weights`.
+        The day; on a date of ``series`` the result is that texture to the bit.
 
     Returns
     -------
     Texture
         Linear reflectance in [0, 1].
     """
-    weights = season_weights([each.day for each in dated], day, season=season)
+    dated = series.dated
+    weights = season_weights([each.day for each in dated], day, season=series.season)
     textures = [dated[index].load() for index, _ in weights]
     if len(weights) == 1:
         return textures[0]
     first, second = (dated[index] for index, _ in weights)
     fraction, weight = weights[1][1], np.minimum(textures[0].weight, textures[1].weight)
-    if season == "snow-line":
+    if series.season == "snow-line":
         transition = snow_transition_between(place, first, second).values
         snowline = snowline_fraction(*(day_number(each) for each in (first.day, second.day, day)))
     else:
@@ -284,13 +308,7 @@ def albedo_of_day(place: Place, dated: Sequence[DatedAlbedo], day: date, *, seas
     return Texture(values, weight, place.atlas_id)
 
 
-def chosen_albedo(
-    place: Place,
-    day: date,
-    albedo: Texture | DatedAlbedo | Iterable[DatedAlbedo] | None = None,
-    *,
-    season: str = "blended",
-) -> Texture:
+def chosen_albedo(place: Place, day: date, albedo: AlbedoSource = None) -> Texture:
     """Resolve the ``albedo`` argument of a workflow to a texture of the place on a day.
 
     Parameters
@@ -298,24 +316,18 @@ def chosen_albedo(
     place, day
         The place and the date.
     albedo
-        A texture of the place's atlas, one or several dated albedos, or ``None`` for the scene's own albedo.
-    season
-        How to interpolate between dated albedos.
+        A texture of the place's atlas, a dated albedo, a series of them, or ``None`` for the scene's own albedo.
 
     Raises
     ------
     AtlasMismatch
         For a texture of another atlas.
-    InputError
-        For an unknown ``season``.
     """
-    require_season(season)
     if albedo is None:
-        return albedo_for(place, day)
+        return scene_albedo(place, day)
     if isinstance(albedo, Texture):
         return place.require_texture(albedo, what="albedo")
-    dated = [albedo] if isinstance(albedo, DatedAlbedo) else sorted(albedo, key=lambda each: each.day)
-    return albedo_of_day(place, dated, day, season=season)
+    return albedo_of_day(place, AlbedoSeries((albedo,)) if isinstance(albedo, DatedAlbedo) else albedo, day)
 
 
 def _synthetic_image(place: Place, day_of_year: int) -> Raster:

@@ -12,10 +12,10 @@ import numpy as np
 from seasonscapes.errors import InputError
 from seasonscapes.progress import Progress, task_progress
 from seasonscapes.terrain.surface import Texture, load_texture
-from seasonscapes.texturing.completion import CompletedTexture
+from seasonscapes.texturing.completion import CompletedTexture, CompletionOptions
 from seasonscapes.workflows.albedo_sources import orthoimage
-from seasonscapes.workflows.illumination import illumination_for_camera
 from seasonscapes.workflows.place import Place, utc_at
+from seasonscapes.workflows.view_rendering import textured_view
 
 if TYPE_CHECKING:
     from seasonscapes.cameras.pinhole import Camera
@@ -30,11 +30,8 @@ def complete(
     texture: Texture,
     time: str | datetime,
     *,
-    method: str = "guided",
     predicted: Texture | None = None,
-    detail: float = 0.0,
-    fast: bool = False,
-    seed: int = 0,
+    options: CompletionOptions | None = None,
     progress: Progress | None = None,
 ) -> CompletedTexture:
     """Complete a painted texture where no camera saw the surface.
@@ -47,16 +44,10 @@ def complete(
         Painted radiance with weights (0 where unpainted), such as ``painting.texture``.
     time
         When the photographs were taken: an aware datetime, or ISO 8601 text (civil time at the place without offset).
-    method
-        ``"guided"`` (regression on the orthoimage, relief and sun), ``"membrane"`` (Laplace's equation) or ``"telea"``.
     predicted
         Radiance predicted from a recovered albedo, as a further predictor; see `predict_radiance`.
-    detail
-        Strength of synthesised grain in [0, 1]; 0 for measurements, about 0.6 for pictures.
-    fast
-        A little less accurate, about three times as fast.
-    seed
-        Equal seeds give equal textures.
+    options
+        Method, grain, effort and seed; default: the guided method without grain.
     progress
         Called with a task and its finished share.
 
@@ -69,9 +60,6 @@ def complete(
     ------
     AtlasMismatch
         For a texture of another atlas.
-    ValueError
-        For an unknown method.
-
     Examples
     --------
     >>> import numpy as np
@@ -79,19 +67,19 @@ def complete(
     >>> place = ss.load_place("alpine_small")
     >>> weight = (np.random.default_rng(0).random(place.texture_shape) < 0.5).astype(np.float32)
     >>> painted = ss.Texture(np.full((*place.texture_shape, 3), 2000.0, np.float32), weight)
-    >>> completed = ss.complete(place, painted, "2024-07-20T13:30", method="membrane")
+    >>> completed = ss.complete(place, painted, "2024-07-20T13:30", options=ss.CompletionOptions("membrane"))
     >>> bool(np.isfinite(completed.values).all())
     True
     """
-    from seasonscapes.texturing.completion import CompletionOptions
     from seasonscapes.texturing.completion import complete as complete_texture
 
+    options = options or CompletionOptions()
     place.require_texture(texture)
     return complete_texture(
         texture,
         predictors_at(place, utc_at(place, time), predicted),
-        options=CompletionOptions(method, detail, fast, seed),
-        progress=task_progress(progress, f"completing ({method})"),
+        options=options,
+        progress=task_progress(progress, f"completing ({options.method})"),
     )
 
 
@@ -213,20 +201,12 @@ def save_view_figures(
     """Write pictures of the textured terrain as a camera observes it at that hour, before and after completion."""
     from seasonscapes.exposure import develop, exposure_ev100
     from seasonscapes.images import write_png
-    from seasonscapes.rendering.gbuffer import trace_gbuffer
-    from seasonscapes.rendering.mitsuba_scene import build_scene
-    from seasonscapes.rendering.radiance import apply_aerial_perspective
     from seasonscapes.terrain.surface import sample_texture
 
-    light, _ = illumination_for_camera(place, camera, model, utc)
-    scene = build_scene(place.terrain, np.full(3, 0.2, np.float32), light)
-    gbuffer = trace_gbuffer(scene, camera)
-    coverage = np.isfinite(gbuffer.depth).astype(np.float32)
-    surface = np.nan_to_num(sample_texture(completed.values, gbuffer.uv))
-    painted = np.nan_to_num(sample_texture(completed.painted[..., None].astype(np.float32), gbuffer.uv), nan=1.0)
-    picture = apply_aerial_perspective(scene, camera, surface, coverage, gbuffer)
-    after = develop(picture, exposure_ev100(picture))
-    pictures = {"before": after * painted + 0.05 * (1.0 - painted), "after": after}
+    view = textured_view(place, completed.values, camera, utc, sky=model)
+    painted = sample_texture(completed.painted[..., None].astype(np.float32), view.gbuffer.uv)
+    after = develop(view.radiance, exposure_ev100(view.radiance))
+    pictures = {"before": after * np.nan_to_num(painted) + 0.05 * (1.0 - np.nan_to_num(painted)), "after": after}
     paths = [folder / f"{place.scene.name}_{name}_{stage}.png" for stage in pictures]
     for path, shown in zip(paths, pictures.values(), strict=True):
         write_png(path, shown)

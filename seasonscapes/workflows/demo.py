@@ -17,7 +17,7 @@ from seasonscapes.progress import Progress, each_reported
 from seasonscapes.scene import NamedCamera
 from seasonscapes.sky.models import read_sky_model
 from seasonscapes.source_hash import source_hash
-from seasonscapes.workflows.albedo_sources import albedo_for
+from seasonscapes.workflows.albedo_sources import scene_albedo
 from seasonscapes.workflows.illumination import illumination_for_camera
 from seasonscapes.workflows.place import MeshOptions, Place
 from seasonscapes.workflows.relight_session import RenderJob
@@ -180,7 +180,7 @@ class _PanelRenderer:
         from seasonscapes.rendering.mitsuba_scene import mi_mesh, relight
 
         if self.day != day:
-            self.day, self.mi_mesh = day, mi_mesh(self.place.terrain, albedo_for(self.place, day).values)
+            self.day, self.mi_mesh = day, mi_mesh(self.place.terrain, scene_albedo(self.place, day).values)
         return relight(self.mi_mesh, light)
 
 

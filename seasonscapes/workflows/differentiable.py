@@ -8,14 +8,12 @@ from typing import TYPE_CHECKING
 
 from seasonscapes.cameras.pinhole import Camera, view_in_frame
 from seasonscapes.sky.models import SkyModel
-from seasonscapes.workflows.albedo_sources import chosen_albedo
+from seasonscapes.workflows.albedo_sources import AlbedoSource, chosen_albedo
 from seasonscapes.workflows.illumination import illumination_for_camera, sky_model
 from seasonscapes.workflows.place import Place, utc_at
 
 if TYPE_CHECKING:
     from seasonscapes.albedo.differentiable_scene import DifferentiableScene
-    from seasonscapes.albedo.seasons import DatedAlbedo
-    from seasonscapes.terrain.surface import Texture
 
 
 def differentiable_scene(
@@ -24,7 +22,7 @@ def differentiable_scene(
     time: str | datetime,
     *,
     sky: str | Path | SkyModel = "clear",
-    albedo: Texture | DatedAlbedo | None = None,
+    albedo: AlbedoSource = None,
     max_depth: int = 6,
     margin_px: int = 16,
 ) -> DifferentiableScene:
@@ -41,7 +39,7 @@ def differentiable_scene(
     sky
         A sky model, its name or its file.
     albedo
-        Initial albedo: a texture of the place's atlas, a dated albedo, or ``None`` for the scene's own.
+        Initial albedo: a texture of the place's atlas, a dated albedo, an `AlbedoSeries`, or ``None`` for the scene's own.
     max_depth
         Largest number of edges of a light path.
     margin_px

@@ -17,7 +17,7 @@ from seasonscapes.albedo.seasons import DatedAlbedo, day_number
 from seasonscapes.errors import InputError
 from seasonscapes.progress import Progress, each_reported, task_progress
 from seasonscapes.sky.models import SkyModel
-from seasonscapes.workflows.albedo_sources import albedo_for
+from seasonscapes.workflows.albedo_sources import scene_albedo
 from seasonscapes.workflows.illumination import illumination_at, sky_model, sun_moon_position
 from seasonscapes.workflows.place import Place
 
@@ -56,6 +56,12 @@ class DistilOptions:
         Training steps on the surface, and on images.
     kind
         ``"full"`` (physics and a network), ``"physical"`` (no network) or ``"sun"`` (a network alone, for comparison).
+
+    Examples
+    --------
+    >>> import seasonscapes as ss
+    >>> ss.DistilOptions(discs=80, suns=8).kind
+    'full'
     """
 
     discs: int = 320
@@ -244,7 +250,7 @@ def dated_textures(place: Place, dated: Sequence[DatedAlbedo], dates: int) -> li
     if place.synthetic is not None:
         days = np.linspace(15.0, 366.0 + 15.0, dates + 1)[:-1].round().tolist()
     noon = datetime(_YEAR, 1, 1, 12, tzinfo=UTC)
-    return [(day, albedo_for(place, noon + timedelta(days=day - 1)).values) for day in days]
+    return [(day, scene_albedo(place, noon + timedelta(days=day - 1)).values) for day in days]
 
 
 def distillation_data(

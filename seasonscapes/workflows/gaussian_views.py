@@ -79,7 +79,14 @@ def render_gaussians(
 
     Examples
     --------
-    See `distil`.
+    >>> import seasonscapes as ss
+    >>> place = ss.load_place("alpine_small")
+    >>> quick = ss.DistilOptions(discs=12, suns=2, dates=1, views=0, steps=2, picture_steps=0)
+    >>> model = ss.distil(place, sky="hosek", options=quick)
+    >>> camera = ss.camera(place, "aerial", size_px=(48, 32))
+    >>> noon = ss.render_gaussians(model, place, camera, "2024-07-20T13:30", sky="hosek")
+    >>> noon.radiance.shape, noon.coverage.shape
+    ((32, 48, 3), (32, 48))
     """
     require_torch()
     from seasonscapes.gaussians.rasterise import set_torch_threads

@@ -79,8 +79,9 @@ def paint(
     >>> import tempfile
     >>> import seasonscapes as ss
     >>> place = ss.load_place("alpine_small")
+    >>> camera = ss.camera(place, "aerial", size_px=(48, 32))
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     sources = ss.synthetic_photographs(place, ["2024-07-20T13:30"], folder, sky="hosek", size_px=(48, 32))
+    ...     sources = ss.synthetic_photographs(place, ["2024-07-20T13:30"], folder, sky="hosek", cameras={"aerial": camera})
     ...     photographs = ss.open_photographs(place, sources.manifest, sources.calibrations, "2024-07-20T13:30")
     >>> painting = ss.paint(place, photographs, sky="hosek")
     >>> bool((painting.texture.weight > 0.0).any())

@@ -92,11 +92,12 @@ def open_photographs(
     >>> import tempfile
     >>> import seasonscapes as ss
     >>> place = ss.load_place("alpine_small")
+    >>> camera = ss.camera(place, "aerial", size_px=(48, 32))
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     sources = ss.synthetic_photographs(place, ["2024-07-20T13:30"], folder, sky="hosek", size_px=(48, 32))
+    ...     sources = ss.synthetic_photographs(place, ["2024-07-20T13:30"], folder, sky="hosek", cameras={"aerial": camera})
     ...     photographs = ss.open_photographs(place, sources.manifest, sources.calibrations, "2024-07-20T13:30")
     >>> len(photographs), photographs[0].image.shape
-    (2, (32, 48, 3))
+    (1, (32, 48, 3))
     """
     wanted = [times] if isinstance(times, (str, datetime)) else list(times)
     sources = PhotographSources(Path(manifest), Path(calibrations), None if masks is None else Path(masks))

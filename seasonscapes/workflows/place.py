@@ -60,6 +60,13 @@ class Place:
         Where built artefacts are kept.
     options
         How the terrain was meshed and unwrapped.
+
+    Examples
+    --------
+    >>> import seasonscapes as ss
+    >>> place = ss.load_place("alpine_small")
+    >>> place.terrain.faces.shape[1], place.texture_shape == (place.atlas.height_px, place.atlas.width_px)
+    (3, True)
     """
 
     path: Path

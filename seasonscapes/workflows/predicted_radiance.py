@@ -61,6 +61,20 @@ def predict_radiance(
     ------
     AtlasMismatch
         Where the albedo belongs to another atlas.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import numpy as np
+    >>> import seasonscapes as ss
+    >>> place = ss.load_place("alpine_small")
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     values = np.full((*place.texture_shape, 3), 0.2, np.float32)
+    ...     np.savez(f"{folder}/albedo.npz", values=values, weight=values[..., 0], atlas_id=place.atlas_id)
+    ...     albedo = ss.load_albedo(place, f"{folder}/albedo.npz", "2024-07-20")
+    ...     radiance = ss.predict_radiance(place, albedo, "2024-07-20T13:30", sky="hosek")
+    >>> radiance.values.shape == (*place.texture_shape, 3)
+    True
     """
     model, utc = sky_model(sky), utc_at(place, time)
     texture = place.require_texture(albedo.load(), what="albedo")

@@ -15,17 +15,15 @@ from seasonscapes.errors import InputError
 from seasonscapes.progress import Progress, each_reported, task_progress
 from seasonscapes.sky.models import SkyModel
 from seasonscapes.terrain.surface import Raster
-from seasonscapes.workflows.albedo_sources import chosen_albedo
+from seasonscapes.workflows.albedo_sources import AlbedoSource, chosen_albedo
 from seasonscapes.workflows.illumination import illumination_at, illumination_on_terrain, sky_model, sun_moon_position
 from seasonscapes.workflows.place import Place, utc_at
 from seasonscapes.workflows.terrain_building import sample_spacing_m
 from seasonscapes.workflows.view_rendering import sun_angles
 
 if TYPE_CHECKING:
-    from seasonscapes.albedo.seasons import DatedAlbedo
     from seasonscapes.relighting.lit_texture import IntegratedIrradiance, LitTexture
     from seasonscapes.sky.illumination import Illumination
-    from seasonscapes.terrain.surface import Texture
 
 # All illuminations of a period are kept in memory, 100 kB each.
 _MOST_INSTANTS = 9000
@@ -40,10 +38,9 @@ def lit_texture(
     time: str | datetime,
     *,
     sky: str | Path | SkyModel = "clear",
-    albedo: Texture | DatedAlbedo | Sequence[DatedAlbedo] | None = None,
+    albedo: AlbedoSource = None,
     rays: int = 128,
     seed: int = 0,
-    device: str = "auto",
     progress: Progress | None = None,
 ) -> LitTexture:
     """Compute the light that every texel of a place receives and reflects at an instant.
@@ -57,13 +54,11 @@ def lit_texture(
     sky
         A sky model, its name or its file.
     albedo
-        A texture of the place's atlas, dated albedos, or ``None`` for the scene's own.
+        A texture of the place's atlas, a dated albedo, an `AlbedoSeries`, or ``None`` for the scene's own.
     rays
         Rays over the hemisphere of each texel; a power of two from 16 to 4096.
     seed
         Equal seeds give equal textures.
-    device
-        ``"auto"``, ``"cuda"`` or ``"llvm"``.
     progress
         Called with a task and its finished share.
 
@@ -94,7 +89,7 @@ def lit_texture(
     from seasonscapes.terrain.texels import texel_positions
 
     require_rays(rays)
-    use_backend(device)
+    use_backend()
     utc = utc_at(place, time)
     light, _ = illumination_on_terrain(place, sky_model(sky), utc)
     texture = chosen_albedo(place, utc.date(), albedo)
@@ -139,11 +134,10 @@ def irradiance_map(
     times: str | datetime | Sequence[datetime],
     *,
     sky: str | Path | SkyModel = "clear",
-    albedo: Texture | DatedAlbedo | Sequence[DatedAlbedo] | None = None,
+    albedo: AlbedoSource = None,
     spacing_m: float | None = None,
     rays: int = 128,
     seed: int = 0,
-    device: str = "auto",
     progress: Progress | None = None,
 ) -> IrradianceMap:
     """Map the irradiance of the terrain at an instant, or integrate it over a period.
@@ -160,15 +154,13 @@ def irradiance_map(
     sky
         A sky model, its name or its file.
     albedo
-        A texture of the place's atlas, dated albedos, or ``None`` for the scene's own.
+        A texture of the place's atlas, a dated albedo, an `AlbedoSeries`, or ``None`` for the scene's own.
     spacing_m
         Side of the map's cells [m]; default that of the elevation raster.
     rays
         Rays over the hemisphere of each cell; a power of two from 16 to 4096.
     seed
         Equal seeds give equal maps.
-    device
-        ``"auto"``, ``"cuda"`` or ``"llvm"``.
     progress
         Called with a task and its finished share.
 
@@ -202,7 +194,7 @@ def irradiance_map(
     from seasonscapes.rendering.transport import SamplingOptions
 
     require_rays(rays)
-    use_backend(device)
+    use_backend()
     model = sky_model(sky)
     if isinstance(times, (str, datetime)):
         utc = utc_at(place, times)

@@ -7,7 +7,6 @@ opens the same session and renders the same frame to the digit. `open_session` t
 from __future__ import annotations
 
 import operator
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import date, datetime
 from functools import reduce
@@ -16,14 +15,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from seasonscapes.albedo.seasons import DatedAlbedo, day_number, interpolate_albedo, season_weights, snowline_fraction
+from seasonscapes.albedo.seasons import (
+    AlbedoSeries,
+    DatedAlbedo,
+    day_number,
+    interpolate_albedo,
+    season_weights,
+    snowline_fraction,
+)
 from seasonscapes.cameras.pinhole import Camera, view_in_frame
 from seasonscapes.progress import Progress, task_progress
 from seasonscapes.scene import NamedCamera
 from seasonscapes.sky.illumination import Illumination
 from seasonscapes.sky.models import SkyModel
 from seasonscapes.terrain.surface import Texture
-from seasonscapes.workflows.albedo_sources import AlbedoFile, dated_albedos, require_season, snow_transition_between
+from seasonscapes.workflows.albedo_sources import AlbedoFile, AlbedoSource, dated_albedos, snow_transition_between
 from seasonscapes.workflows.illumination import (
     SunMoonPosition,
     illumination_for_camera,
@@ -47,6 +53,7 @@ FRAME_CODE = ("workflows.relight_session", "relighting.frame_file")
 # Rows of the sky maps. Without clouds half as many as usual change an image by less than about 0.1 % in the mean: the
 # coefficients average over patches of 7°, and the sky behind the terrain is evaluated by the atmosphere model itself.
 _CLOUDY_ROWS, _CLEAR_ROWS = 128, 64
+_MIDSUMMER = date(2024, 7, 1)
 
 
 @dataclass(frozen=True)
@@ -88,7 +95,7 @@ class RenderJob:
     sky: SkyModel
     albedo: tuple[AlbedoFile, ...] = ()
     season: str = "blended"
-    base_day: date = date(2024, 7, 1)
+    base_day: date = _MIDSUMMER
     seed: int = 0
     device: str = "auto"
     allow_outside: bool = False
@@ -104,14 +111,10 @@ class RelightSession:
         The place and the camera, whose pose is in the place's frame.
     sky
         The sky model.
-    season
-        How to interpolate between dated albedos.
-    dated, base
-        Dated albedos, and the one that the coefficients were traced with.
+    albedo, base
+        Dated albedos with their interpolation, and the one that the coefficients were traced with.
     seed
         Of the coefficients.
-    view_key
-        Plain values that determine the camera, for artefact keys.
     coefficients, ray_scene, relightable
         The traced transport and its copy on the device.
     """
@@ -119,11 +122,9 @@ class RelightSession:
     place: Place
     camera: Camera | Panorama
     sky: SkyModel
-    season: str
-    dated: list[DatedAlbedo]
+    albedo: AlbedoSeries
     base: DatedAlbedo
     seed: int
-    view_key: dict
     coefficients: ViewCoefficients
     ray_scene: RayScene
     relightable: RelightableView
@@ -137,11 +138,9 @@ def relight_session(
     camera: Camera | Panorama,
     *,
     sky: str | Path | SkyModel = "clear",
-    albedo: Texture | DatedAlbedo | Sequence[DatedAlbedo] | None = None,
-    season: str = "blended",
-    base_day: date | None = None,
+    albedo: AlbedoSource = None,
+    base_day: date = _MIDSUMMER,
     seed: int = 0,
-    device: str = "auto",
     progress: Progress | None = None,
 ) -> RelightSession:
     """Trace the light transport of a view once, so that every instant costs a fraction of a second.
@@ -157,15 +156,11 @@ def relight_session(
     sky
         A sky model, its name or its file.
     albedo
-        One or several dated albedos, a texture of the place's atlas, or ``None`` for the scene's own.
-    season
-        ``"blended"``, ``"nearest"`` or ``"snow-line"``; how to interpolate between dated albedos.
+        A texture of the place's atlas, a dated albedo, an `AlbedoSeries`, or ``None`` for the scene's own.
     base_day
-        Date of the albedo that the transport is traced with; default midsummer.
+        Date of the albedo that the transport is traced with; best one of those that are to be rendered.
     seed
         Equal seeds give equal results.
-    device
-        ``"auto"``, ``"cuda"`` or ``"llvm"``.
     progress
         Called with a task and its finished share.
 
@@ -191,26 +186,24 @@ def relight_session(
     >>> views[0].radiance.shape
     (32, 48, 3)
     """
-    require_season(season)
+    from seasonscapes.rendering.hemisphere_rays import ray_scene
+    from seasonscapes.rendering.mitsuba_scene import mi_mesh
+    from seasonscapes.rendering.relit_view import relightable_view
+
+    if isinstance(albedo, Texture):
+        albedo = _undated(place, albedo)
     if albedo is None:
-        dated = dated_albedos(place)
-    elif isinstance(albedo, Texture):
-        dated = [_undated(place, albedo)]
-    else:
-        dated = [albedo] if isinstance(albedo, DatedAlbedo) else sorted(albedo, key=lambda each: each.day)
-    camera = view_in_frame(camera, place.frame)
-    return _traced_session(
-        place,
-        camera,
-        _camera_values(camera),
-        sky_model(sky),
-        dated,
-        season=season,
-        base_day=base_day or date(2024, 7, 1),
-        seed=seed,
-        device=device,
-        progress=progress,
-    )
+        albedo = AlbedoSeries(tuple(dated_albedos(place)))
+    elif isinstance(albedo, DatedAlbedo):
+        albedo = AlbedoSeries((albedo,))
+    camera, model = view_in_frame(camera, place.frame), sky_model(sky)
+    base = nearest_albedo(albedo, base_day)
+    scene = ray_scene(mi_mesh(place.terrain, base.load().values))
+    tabulate_illumination(place, camera, model, progress=task_progress(progress, "light transport", end=0.1))
+    inputs = {"place": place.key, **_camera_values(camera), "albedo": _identity(base), "seed": seed}
+    coefficients = _coefficients(place, camera, scene, inputs, seed, progress)
+    relightable = relightable_view(scene, coefficients)
+    return RelightSession(place, camera, model, albedo, base, seed, coefficients, scene, relightable)
 
 
 def relight(session: RelightSession, time: str | datetime) -> RenderedView:
@@ -237,7 +230,12 @@ def relight(session: RelightSession, time: str | datetime) -> RenderedView:
 
     Examples
     --------
-    See `relight_session`.
+    >>> import seasonscapes as ss
+    >>> place = ss.load_place("alpine_small")
+    >>> session = ss.relight_session(place, ss.camera(place, "aerial", size_px=(48, 32)), sky="hosek")
+    >>> morning, noon = (ss.relight(session, f"2024-07-20T{hour}:00") for hour in ("07", "13"))
+    >>> bool(morning.radiance.mean() < noon.radiance.mean())
+    True
     """
     return view_at(session, utc_at(session.place, time))[0]
 
@@ -260,47 +258,18 @@ def open_session(job: RenderJob, *, progress: Progress | None = None) -> Relight
 
 def session_of(job: RenderJob, place: Place, *, progress: Progress | None = None) -> RelightSession:
     """The session of a job whose place is loaded already; see `open_session`."""
-    camera = camera_for(place, job.view, size_px=job.size_px)
-    return _traced_session(
+    from seasonscapes.rendering.backend import use_backend
+
+    use_backend(job.device)
+    return relight_session(
         place,
-        camera,
-        {"view": job.view, "size": job.size_px},
-        job.sky,
-        dated_albedos(place, job.albedo),
-        season=job.season,
+        camera_for(place, job.view, size_px=job.size_px),
+        sky=job.sky,
+        albedo=AlbedoSeries(tuple(dated_albedos(place, job.albedo)), job.season),
         base_day=job.base_day,
         seed=job.seed,
-        device=job.device,
         progress=progress,
     )
-
-
-def _traced_session(
-    place: Place,
-    camera: Camera | Panorama,
-    view_key: dict,
-    sky: SkyModel,
-    dated: list[DatedAlbedo],
-    *,
-    season: str,
-    base_day: date,
-    seed: int,
-    device: str,
-    progress: Progress | None,
-) -> RelightSession:
-    from seasonscapes.rendering.backend import use_backend
-    from seasonscapes.rendering.hemisphere_rays import ray_scene
-    from seasonscapes.rendering.mitsuba_scene import mi_mesh
-    from seasonscapes.rendering.relit_view import relightable_view
-
-    use_backend(device)
-    base = nearest_albedo(dated, base_day)
-    scene = ray_scene(mi_mesh(place.terrain, base.load().values))
-    tabulate_illumination(place, camera, sky, progress=task_progress(progress, "light transport", end=0.1))
-    inputs = {"place": place.key, **view_key, "albedo": _identity(base), "seed": seed}
-    coefficients = _coefficients(place, camera, scene, inputs, seed, progress)
-    relightable = relightable_view(scene, coefficients)
-    return RelightSession(place, camera, sky, season, dated, base, seed, view_key, coefficients, scene, relightable)
 
 
 def _coefficients(
@@ -324,7 +293,9 @@ def _camera_values(camera: Camera | Panorama) -> dict:
     names = ("width_px", "height_px", "fx", "fy", "cx", "cy")
     numbers = {name: float(getattr(camera, name)) for name in names}
     kind = getattr(camera, "projection", "pinhole")
-    return {"camera": {"kind": kind, "pose": camera.world_from_camera.tolist(), **numbers}}
+    # Another machine may compute the same pose with another last digit.
+    pose = np.round(camera.world_from_camera, 9).tolist()
+    return {"camera": {"kind": kind, "pose": pose, **numbers}}
 
 
 def _undated(place: Place, texture: Texture) -> DatedAlbedo:
@@ -332,27 +303,27 @@ def _undated(place: Place, texture: Texture) -> DatedAlbedo:
 
     place.require_texture(texture, what="albedo")
     content = hashlib.sha256(texture.values.tobytes()).hexdigest()
-    return DatedAlbedo(date(2024, 7, 1), content, lambda: texture)
+    return DatedAlbedo(_MIDSUMMER, content, lambda: texture)
 
 
 def _identity(dated: DatedAlbedo) -> dict:
     return {"date": dated.day.isoformat(), "content": dated.content}
 
 
-def nearest_albedo(dated: Sequence[DatedAlbedo], day: date) -> DatedAlbedo:
+def nearest_albedo(albedo: AlbedoSeries, day: date) -> DatedAlbedo:
     """The dated albedo nearest to a day of the year."""
-    return dated[season_weights([each.day for each in dated], day, season="nearest")[0][0]]
+    return albedo.dated[season_weights([each.day for each in albedo.dated], day, season="nearest")[0][0]]
 
 
 def session_key(session: RelightSession) -> str:
     """Name of everything that determines a session's frames but their times."""
     inputs = {
         "place": session.place.key,
-        **session.view_key,
+        **_camera_values(session.camera),
         "sky": session.sky,
-        "albedo": [_identity(dated) for dated in session.dated],
+        "albedo": [_identity(dated) for dated in session.albedo.dated],
         "base": _identity(session.base),
-        "season": session.season,
+        "season": session.albedo.season,
         "seed": session.seed,
     }
     return artefact_key(inputs, FRAME_CODE)
@@ -373,13 +344,14 @@ def view_of_day(session: RelightSession, day: date) -> RelightableView:
     """The relightable view with the albedo of a day; the last one is kept."""
     from seasonscapes.rendering.relit_view import with_albedo
 
-    weights = season_weights([each.day for each in session.dated], day, season=session.season)
-    if len(session.dated) == 1:
+    dated = session.albedo.dated
+    if len(dated) == 1:
         return session.relightable
+    weights = season_weights([each.day for each in dated], day, season=session.albedo.season)
     if session._current is None or session._current[0] != weights:
         for index, _ in weights:
             if index not in session._albedos:
-                session._albedos[index] = _view_albedo(session, session.dated[index])
+                session._albedos[index] = _view_albedo(session, dated[index])
         session._current = (weights, with_albedo(session.relightable, *_interpolated(session, weights, day)))
     return session._current[1]
 
@@ -387,10 +359,10 @@ def view_of_day(session: RelightSession, day: date) -> RelightableView:
 def _interpolated(session: RelightSession, weights: list[tuple[int, float]], day: date) -> list[np.ndarray]:
     """Albedo of the view's pixels and of its light clusters, interpolated between the dated albedos nearest to a day."""
     parts = [session._albedos[index] for index, _ in weights]
-    if len(parts) == 1 or session.season != "snow-line":
+    if len(parts) == 1 or session.albedo.season != "snow-line":
         scaled = [[weight * part[k] for part, (_, weight) in zip(parts, weights, strict=True)] for k in range(2)]
         return [reduce(operator.add, terms) for terms in scaled]
-    pair = [session.dated[index] for index, _ in weights]
+    pair = [session.albedo.dated[index] for index, _ in weights]
     name = f"turning:{pair[0].content}:{pair[1].content}"
     if name not in session._transitions:
         # The time of transition is a texture like any other, and averaged over pixels like an albedo.
@@ -421,7 +393,7 @@ def _view_albedo(session: RelightSession, dated: DatedAlbedo) -> tuple[np.ndarra
 
     inputs = {
         "place": place.key,
-        **session.view_key,
+        **_camera_values(session.camera),
         "albedo": _identity(dated),
         "base": _identity(session.base),
         "seed": session.seed,

@@ -13,7 +13,7 @@ import numpy as np
 from seasonscapes.errors import InputError, NoTerrainInView
 from seasonscapes.progress import Progress, task_progress
 from seasonscapes.sky.models import SkyModel
-from seasonscapes.workflows.albedo_sources import albedo_for
+from seasonscapes.workflows.albedo_sources import scene_albedo
 from seasonscapes.workflows.illumination import illumination_for_camera, sky_model
 from seasonscapes.workflows.photograph_files import PhotographSources
 from seasonscapes.workflows.place import Place, utc_at
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+_SIZE_PX = (720, 480)
 PHOTOGRAPHS_CODE = ("workflows.synthetic_photographs",)
 
 
@@ -40,7 +41,6 @@ def synthetic_photographs(
     *,
     sky: str | Path | SkyModel = "clear",
     cameras: Mapping[str, Camera | Panorama] | None = None,
-    size_px: tuple[int, int] = (720, 480),
     seed: int = 0,
     progress: Progress | None = None,
 ) -> PhotographSources:
@@ -60,9 +60,7 @@ def synthetic_photographs(
     sky
         A sky model, its name or its file.
     cameras
-        Webcams by name; default: all cameras of the scene file, of size ``size_px``.
-    size_px
-        Of the default cameras [px].
+        Webcams by name; default: all cameras of the scene file, 720 × 480 px.
     seed
         Equal seeds give equal photographs.
     progress
@@ -80,10 +78,17 @@ def synthetic_photographs(
 
     Examples
     --------
-    See `open_photographs`.
+    >>> import tempfile
+    >>> import seasonscapes as ss
+    >>> place = ss.load_place("alpine_small")
+    >>> camera = ss.camera(place, "aerial", size_px=(48, 32))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     sources = ss.synthetic_photographs(place, ["2024-07-20T13:30"], folder, cameras={"aerial": camera})
+    ...     sources.manifest.name, sources.calibration_of("aerial").is_file()
+    ('manifest.csv', True)
     """
     require_synthetic(place)
-    chosen = scene_cameras(place, size_px=size_px) if cameras is None else cameras
+    chosen = scene_cameras(place, size_px=_SIZE_PX) if cameras is None else cameras
     utc = [utc_at(place, time) for time in times]
     return photograph_series(place, utc, sky_model(sky), Path(folder), cameras=chosen, seed=seed, progress=progress)
 
@@ -161,7 +166,7 @@ def photograph_each(
         for time in times:
             day = time.timetuple().tm_yday
             if day not in albedos:
-                albedos[day] = albedo_for(place, time).values
+                albedos[day] = scene_albedo(place, time).values
             light = illumination_for_camera(place, camera, model, time)[0]
             instants.append(WebcamInstant(time, light, albedos[day]))
         report = task_progress(progress, task, start=number / len(cameras), end=(number + 1) / len(cameras))

@@ -55,6 +55,14 @@ class MeshOptions:
         Side of a texel [m]. Default: as fine as the imagery, at most ``max_side_px`` texels on a side.
     max_side_px
         Largest side of a texture [texels].
+
+    Examples
+    --------
+    >>> import seasonscapes as ss
+    >>> coarse = ss.load_place("alpine_small", options=ss.MeshOptions(max_error_m=20.0))
+    >>> fine = ss.load_place("alpine_small", options=ss.MeshOptions(max_error_m=5.0))
+    >>> len(coarse.terrain.faces) < len(fine.terrain.faces)
+    True
     """
 
     mesher: str = "adaptive"

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,25 +17,17 @@ from seasonscapes.errors import InputError
 from seasonscapes.exposure import develop, exposure_ev100
 from seasonscapes.progress import Progress, each_reported
 from seasonscapes.relighting.frame_file import frame_ev100, frame_name, load_frame, save_frame, time_stamp
-from seasonscapes.sky.models import SkyModel
 from seasonscapes.workflows.place import Place, utc_at
 from seasonscapes.workflows.relight_session import (
     RelightSession,
     RenderJob,
     open_session,
-    relight_session,
     session_key,
     session_of,
     view_at,
 )
 from seasonscapes.workflows.view_rendering import sun_angles
 from seasonscapes.workspace import content_key
-
-if TYPE_CHECKING:
-    from seasonscapes.albedo.seasons import DatedAlbedo
-    from seasonscapes.cameras.panorama import Panorama
-    from seasonscapes.cameras.pinhole import Camera
-    from seasonscapes.terrain.surface import Texture
 
 log = logging.getLogger(__name__)
 
@@ -221,7 +212,7 @@ def _about(session: RelightSession, camera_name: str) -> dict:
         "scene": scene.name,
         "camera": camera_name,
         "sky": session.sky.name,
-        "season": session.season,
+        "season": session.albedo.season,
         "seed": session.seed,
         "attribution": scene.attribution,
         "seasonscapes": __version__,
@@ -292,38 +283,26 @@ def developed(folder: Path, times: Sequence[datetime], look: FilmLook) -> Iterat
 
 
 def timelapse(
-    place: Place,
-    camera: Camera | Panorama,
+    session: RelightSession,
     times: Sequence[str | datetime],
     output: str | Path,
     *,
-    sky: str | Path | SkyModel = "clear",
-    albedo: Texture | DatedAlbedo | Sequence[DatedAlbedo] | None = None,
-    season: str = "blended",
     look: FilmLook | None = None,
     progress: Progress | None = None,
 ) -> list[Path]:
     """Film a view of a place through hours or seasons.
 
-    The light transport is traced once; each frame then takes a fraction of a second. Undeveloped frames are kept in
-    the workspace: an interrupted film continues, and a longer one reuses them.
+    Each frame takes a fraction of a second. Undeveloped frames are kept in the workspace: an interrupted film
+    continues, and a longer one reuses them.
 
     Parameters
     ----------
-    place
-        The place.
-    camera
-        A camera or panorama; one calibrated in another frame is converted to the place's.
+    session
+        The view with its light transport, of `relight_session`.
     times
         Aware datetimes, or ISO 8601 text; without offset it is civil time at the place.
     output
         A ``.mp4`` film, or a folder for ``.png`` pictures.
-    sky
-        A sky model, its name or its file.
-    albedo
-        One or several dated albedos, a texture of the place's atlas, or ``None`` for the scene's own.
-    season
-        ``"blended"``, ``"nearest"`` or ``"snow-line"``: how to interpolate between dated albedos.
     look
         Exposure, its smoothing and the frame rate.
     progress
@@ -336,8 +315,8 @@ def timelapse(
 
     Raises
     ------
-    NoTerrainInView
-        Where the camera sees no terrain.
+    InputError
+        Without any time, or for one that is none.
 
     Examples
     --------
@@ -345,17 +324,15 @@ def timelapse(
     >>> import seasonscapes as ss
     >>> place = ss.load_place("alpine_small")
     >>> camera = ss.camera(place, "aerial", size_px=(48, 32))
+    >>> session = ss.relight_session(place, camera, sky="hosek")
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     pictures = ss.timelapse(place, camera, ["2024-07-20T10:00", "2024-07-20T16:00"], folder, sky="hosek")
+    ...     pictures = ss.timelapse(session, ["2024-07-20T10:00", "2024-07-20T16:00"], folder)
     >>> [path.suffix for path in pictures]
     ['.png', '.png']
     """
-    utc = sorted({utc_at(place, time) for time in times})
+    utc = sorted({utc_at(session.place, time) for time in times})
     if not utc:
         raise InputError("times", "no time in it", got=str(times))
-    session = relight_session(
-        place, camera, sky=sky, albedo=albedo, season=season, base_day=base_day_of(utc), progress=progress
-    )
     folder = frames_folder(session)
     for time in each_reported(utc, len(utc), progress, "frames"):
         session_frame(session, folder, time)

@@ -3,29 +3,28 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from seasonscapes import __version__
 from seasonscapes.cameras.pinhole import view_in_frame
 from seasonscapes.progress import Progress, task_progress
 from seasonscapes.sky.models import SkyModel
-from seasonscapes.workflows.albedo_sources import chosen_albedo
+from seasonscapes.workflows.albedo_sources import AlbedoSource, chosen_albedo
 from seasonscapes.workflows.illumination import SunMoonPosition, illumination_for_camera, sky_model
 from seasonscapes.workflows.place import Place, utc_at
 from seasonscapes.workflows.views import camera_geodetic
 from seasonscapes.workspace import content_key
 
 if TYPE_CHECKING:
-    from seasonscapes.albedo.seasons import DatedAlbedo
     from seasonscapes.cameras.panorama import Panorama
     from seasonscapes.cameras.pinhole import Camera
     from seasonscapes.rendering.radiance import RenderedView
     from seasonscapes.sky.illumination import Illumination
-    from seasonscapes.terrain.surface import Texture
 
 log = logging.getLogger(__name__)
 
@@ -36,12 +35,10 @@ def render(
     time: str | datetime,
     *,
     sky: str | Path | SkyModel = "clear",
-    albedo: Texture | DatedAlbedo | Sequence[DatedAlbedo] | None = None,
-    season: str = "blended",
+    albedo: AlbedoSource = None,
     spp: int = 32,
     max_depth: int = 6,
     seed: int = 0,
-    device: str = "auto",
     progress: Progress | None = None,
 ) -> RenderedView:
     """Path trace a view of a place at a date and hour.
@@ -57,17 +54,13 @@ def render(
     sky
         A sky model, its name or its file; see `sky_model`.
     albedo
-        A texture of the place's atlas, one or several dated albedos, or ``None`` for the scene's own.
-    season
-        ``"blended"``, ``"nearest"`` or ``"snow-line"``: how to interpolate between dated albedos.
+        A texture of the place's atlas, a dated albedo, an `AlbedoSeries`, or ``None`` for the scene's own.
     spp
         Samples per pixel; powers of two are best.
     max_depth
         Largest number of edges of a light path; 2 is direct light only.
     seed
         Equal seeds give equal pictures.
-    device
-        ``"auto"``, ``"cuda"``, ``"llvm"`` or ``"scalar"``.
     progress
         Called with a task and its finished share.
 
@@ -79,7 +72,7 @@ def render(
     Raises
     ------
     InputError
-        For a time, sky model or season that does not exist.
+        For a time or sky model that does not exist.
     FrameMismatch, AtlasMismatch
         For a camera without a frame, or a texture of another atlas.
 
@@ -101,13 +94,13 @@ def render(
     from seasonscapes.rendering.mitsuba_scene import build_scene
     from seasonscapes.rendering.radiance import render_view
 
-    backend = use_backend(device)
+    backend = use_backend()
     camera = view_in_frame(camera, place.frame)
     utc = utc_at(place, time)
     light, position = illumination_for_camera(place, camera, sky_model(sky), utc)
     sun = sun_angles(position)
     log.info("sun at azimuth %.2f°, elevation %.2f° (refracted)", sun["azimuth_deg"], sun["elevation_deg"])
-    texture = chosen_albedo(place, utc.date(), albedo, season=season)
+    texture = chosen_albedo(place, utc.date(), albedo)
     view = render_view(
         build_scene(place.terrain, texture.values, light),
         camera,
@@ -119,6 +112,67 @@ def render(
     record = view_record(place, camera, light, position)
     record |= {"spp": spp, "max_depth": max_depth, "seed": seed, "variant": backend.variant}
     return replace(view, provenance=record)
+
+
+def textured_view(
+    place: Place,
+    radiance: np.ndarray,
+    camera: Camera | Panorama,
+    time: str | datetime,
+    *,
+    sky: str | Path | SkyModel = "clear",
+) -> RenderedView:
+    """View a place whose texture holds radiance instead of albedo: nothing is relit, the air and the sky are added.
+
+    Parameters
+    ----------
+    place
+        The place.
+    radiance
+        ``(R, S, 3)`` radiance of the surface in the place's atlas [cd/m²], such as ``complete(...).values``.
+    camera
+        A camera or panorama; one calibrated in another frame is converted to the place's.
+    time
+        Of the air and the sky: an aware datetime, or ISO 8601 text (civil time at the place without offset).
+    sky
+        A sky model, its name or its file.
+
+    Returns
+    -------
+    RenderedView
+        ``radiance`` ``(H, W, 3)`` at the camera [cd/m²], sampled at pixel centres.
+
+    Raises
+    ------
+    InputError
+        For a time or sky model that does not exist.
+    FrameMismatch
+        For a camera without a frame.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import seasonscapes as ss
+    >>> place = ss.load_place("alpine_small")
+    >>> camera = ss.camera(place, "aerial", size_px=(48, 32))
+    >>> texture = np.full((*place.texture_shape, 3), 3000.0, np.float32)
+    >>> view = ss.textured_view(place, texture, camera, "2024-07-20T13:30", sky="hosek")
+    >>> float(view.surface.max())
+    3000.0
+    """
+    from seasonscapes.rendering.gbuffer import trace_gbuffer
+    from seasonscapes.rendering.mitsuba_scene import build_scene
+    from seasonscapes.rendering.radiance import RenderedView, apply_aerial_perspective
+    from seasonscapes.terrain.surface import sample_texture
+
+    camera = view_in_frame(camera, place.frame)
+    light, position = illumination_for_camera(place, camera, sky_model(sky), utc_at(place, time))
+    scene = build_scene(place.terrain, np.full(3, 0.2, np.float32), light)
+    gbuffer = trace_gbuffer(scene, camera)
+    coverage = np.isfinite(gbuffer.depth).astype(np.float32)
+    surface = np.nan_to_num(sample_texture(radiance, gbuffer.uv))
+    image = apply_aerial_perspective(scene, camera, surface, coverage, gbuffer)
+    return RenderedView(image, surface, coverage, gbuffer, view_record(place, camera, light, position))
 
 
 def view_record(

@@ -8,7 +8,7 @@ import numpy as np
 
 from seasonscapes.errors import InputError
 from seasonscapes.frames import geodetic_from_enu
-from seasonscapes.scene import NamedCamera, camera_from_named_view
+from seasonscapes.scene import NamedCamera, Viewpoint, camera_from_named_view
 from seasonscapes.workflows.place import Place, ground_height_m
 
 if TYPE_CHECKING:
@@ -18,35 +18,16 @@ if TYPE_CHECKING:
 __all__ = ["camera", "camera_for", "camera_geodetic", "scene_cameras"]
 
 
-def camera(
-    place: Place,
-    name: str | None = None,
-    *,
-    position: tuple[float, float] | None = None,
-    height_m: float | None = None,
-    above_ground_m: float | None = None,
-    heading_deg: float | None = None,
-    pitch_deg: float = 0.0,
-    roll_deg: float = 0.0,
-    fov_deg: float = 60.0,
-    size_px: tuple[int, int] = (1536, 1024),
-) -> Camera:
+def camera(place: Place, view: str | Viewpoint | None = None, *, size_px: tuple[int, int] = (1536, 1024)) -> Camera:
     """Return a pinhole camera of a place: one that the scene file names, or one at a free position.
 
     Parameters
     ----------
     place
         The place.
-    name
-        A camera of the scene file; its first one where neither ``name`` nor ``position`` is given.
-    position
-        Latitude and longitude [deg, WGS 84] of a free position instead.
-    height_m, above_ground_m
-        Of a free position: height in the scene's vertical datum [m], or height above the ground [m] (default 2 m).
-    heading_deg, pitch_deg, roll_deg
-        Of a free position: azimuth clockwise from true north, elevation and roll of the optical axis [deg].
-    fov_deg
-        Of a free position: horizontal field of view [deg].
+    view
+        Name of a camera of the scene file, or a position with viewing direction and field of view; default the scene
+        file's first camera.
     size_px
         Width and height of the image [px].
 
@@ -58,7 +39,7 @@ def camera(
     Raises
     ------
     InputError
-        For an unknown name, a position outside the raster or below the ground, or a missing heading.
+        For an unknown name, or a position outside the raster or below the ground.
 
     Examples
     --------
@@ -66,34 +47,17 @@ def camera(
     >>> place = ss.load_place("alpine_small")
     >>> ss.camera(place, "meadow", size_px=(96, 64)).width_px
     96
-    >>> free = ss.camera(place, position=(46.556, 7.98), above_ground_m=30.0, heading_deg=180.0)
-    >>> free.frame == place.frame
+    >>> above = ss.Viewpoint(latitude_deg=46.556, longitude_deg=7.98, above_ground_m=30.0, heading_deg=180.0)
+    >>> ss.camera(place, above).frame == place.frame
     True
     """
-    if position is None:
-        return camera_for(place, place.scene.camera(name, where="camera"), size_px=size_px, where="camera")
-    if name is not None:
-        raise InputError("camera", "give either a name or a position", got=f"{name} and {position}")
-    if heading_deg is None:
-        raise InputError("camera", "heading_deg is missing", expected="the azimuth of the optical axis [deg]")
-    if height_m is None and above_ground_m is None:
-        above_ground_m = 2.0
-    free = NamedCamera(
-        name="free",
-        latitude_deg=float(position[0]),
-        longitude_deg=float(position[1]),
-        height_m=height_m,
-        above_ground_m=above_ground_m,
-        heading_deg=float(heading_deg),
-        pitch_deg=float(pitch_deg),
-        roll_deg=float(roll_deg),
-        fov_deg=float(fov_deg),
-    )
-    return camera_for(place, free, size_px=size_px, where="camera")
+    if not isinstance(view, Viewpoint):
+        view = place.scene.camera(view, where="camera")
+    return camera_for(place, view, size_px=size_px, where="camera")
 
 
-def camera_for(place: Place, view: NamedCamera, *, size_px: tuple[int, int], where: str = "--camera") -> Camera:
-    """Return the pinhole camera of a named view.
+def camera_for(place: Place, view: Viewpoint, *, size_px: tuple[int, int], where: str = "--camera") -> Camera:
+    """Return the pinhole camera of a viewpoint.
 
     Parameters
     ----------
@@ -121,7 +85,9 @@ def camera_for(place: Place, view: NamedCamera, *, size_px: tuple[int, int], whe
         if view.height_m is not None and view.height_m < ground:
             raise InputError(
                 where,
-                f"'{view.name}' stands below the ground",
+                f"'{view.name}' stands below the ground"
+                if isinstance(view, NamedCamera)
+                else "stands below the ground",
                 got=f"{view.height_m:g} m",
                 expected=f"above {ground:.1f} m",
                 cure="give above_ground_m instead",
