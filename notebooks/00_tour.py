@@ -2,6 +2,11 @@
 # jupyter:
 #   jupytext:
 #     formats: ipynb,py:percent
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
 #   kernelspec:
 #     display_name: Python 3
 #     language: python
@@ -12,56 +17,43 @@
 # # A tour: any date and hour of a place
 #
 # A corner of a synthetic massif in the Bernese Oberland, whose albedo is known for every day of the year. With
-# `find_scene("alpine")` instead of `Path("small.toml")` it is the whole embedded scene, which takes some minutes the first
-# time.
+# `ss.load_place("alpine")` it is the whole embedded scene, which takes some minutes the first time; with
+# `ss.load_place("my_valley.toml")` it is a real valley.
 
 # %%
-from datetime import UTC, datetime
-from pathlib import Path
-
 import matplotlib.pyplot as plt
 
-from seasonscapes.exposure import develop, exposure_ev100
-from seasonscapes.images import srgb_from_linear
-from seasonscapes.rendering.mitsuba_scene import build_scene
-from seasonscapes.rendering.radiance import render_view
-from seasonscapes.sky.models import read_sky_model
-from seasonscapes.sky.report import dome_picture
-from seasonscapes.workflows.albedo_sources import albedo_for
-from seasonscapes.workflows.illumination import illumination_at, illumination_for_camera, sun_moon_position
-from seasonscapes.workflows.place import load_place
-from seasonscapes.workflows.views import camera_for
-from seasonscapes.workspace import default_workspace
+import seasonscapes as ss
 
 # %% [markdown]
 # Terrain and camera. The first time builds the massif; later it is read from the workspace.
 
 # %%
-place = load_place(Path("small.toml"), default_workspace())
-camera = camera_for(place, place.scene.camera(None), size_px=(384, 256))
+place = ss.load_place("small.toml")
+camera = ss.camera(place, "west", size_px=(384, 256))
 print(f"{len(place.terrain.faces):,} triangles, texels of {place.atlas.texel_p50_m:.1f} m")
 
 # %% [markdown]
-# The sky of an evening in September, as a map of the dome.
+# The sky of an evening in September, as a fish-eye camera sees it. Without a UTC offset the time is civil time at the place.
 
 # %%
-evening = datetime(2024, 9, 18, 17, 5, tzinfo=UTC)
-moment = sun_moon_position(evening, place.frame.latitude_deg, place.frame.longitude_deg)
-sky = illumination_at(read_sky_model("clear"), moment, 1500.0, workspace=place.workspace)
-plt.imshow(srgb_from_linear(dome_picture(sky, 400)))
-plt.title(f"sun at {moment.sun.elevation_deg:.1f}°")
+evening = "2024-09-18T19:05"
+light = ss.illumination(place, evening)
+plt.imshow(ss.srgb_from_linear(ss.dome_picture(light, 400)))
+plt.title(f"sun {light.sun.elevation_deg:.1f}° above the horizon")
 _ = plt.axis("off")
+
 # %% [markdown]
-# The view at that hour: radiance in cd/m², developed as a camera would.
+# The view at that hour: path-traced radiance in cd/m², developed as a camera would.
 
 # %%
-light, _ = illumination_for_camera(place, camera, read_sky_model("clear"), evening)
-view = render_view(build_scene(place.terrain, albedo_for(place, evening).values, light), camera, spp=16)
+view = ss.render(place, camera, evening, spp=16)
 plt.figure(figsize=(9, 6))
-plt.imshow(srgb_from_linear(develop(view.radiance, exposure_ev100(view.radiance))))
+plt.imshow(ss.srgb_from_linear(ss.develop(view)))
 _ = plt.axis("off")
+
 # %% [markdown]
-# What each pixel sees: distance along the ray, in kilometres.
+# Distance along the ray of each pixel, in kilometres.
 
 # %%
 plt.imshow(view.gbuffer.depth / 1000.0, cmap="viridis")

@@ -14,81 +14,66 @@
 # ---
 
 # %% [markdown]
-# # Terrain: from a raster to a mesh with a texture
+# # Terrain: from an elevation raster to a mesh with a texture atlas
 #
-# `small.toml` names a small synthetic massif; a real place names a GeoTIFF instead, and all of this stays the same.
+# `small.toml` names a small synthetic massif. A real place names a GeoTIFF instead; everything below stays the same.
 
 # %%
-from datetime import UTC, datetime
-from pathlib import Path
-
 import matplotlib.pyplot as plt
 import numpy as np
 
-from seasonscapes.cameras.pinhole import camera_at
-from seasonscapes.rendering.gbuffer import trace_gbuffer
-from seasonscapes.rendering.hemisphere_rays import ray_scene
-from seasonscapes.rendering.mitsuba_scene import RenderScene, mi_mesh
-from seasonscapes.workflows.albedo_sources import albedo_for
-from seasonscapes.workflows.place import MeshOptions, load_place
-from seasonscapes.workspace import default_workspace
+import seasonscapes as ss
 
 # %% [markdown]
-# The elevation raster, as hillshade. Heights are in the raster's own vertical datum.
+# The elevation raster as a hillshade. Heights are in the raster's own vertical datum.
 
 # %%
-place = load_place(Path("small.toml"), default_workspace())
+place = ss.load_place("small.toml")
 heights = place.elevation.values[..., 0]
 down, across = np.gradient(heights, place.elevation.transform.a)
-light = np.array([-1.0, 1.0, 1.2]) / np.linalg.norm([-1.0, 1.0, 1.2])
-shade = (-across * light[0] + down * light[1] + light[2]) / np.sqrt(1.0 + across**2 + down**2)
-plt.imshow(np.clip(shade, 0, 1), cmap="gray")
+towards_light = np.array([-1.0, 1.0, 1.2]) / np.linalg.norm([-1.0, 1.0, 1.2])
+shade = -across * towards_light[0] + down * towards_light[1] + towards_light[2]
+plt.imshow(np.clip(shade / np.sqrt(1.0 + across**2 + down**2), 0, 1), cmap="gray")
 plt.title(f"{heights.min():.0f} to {heights.max():.0f} m")
 _ = plt.axis("off")
 
 # %% [markdown]
-# The mesh is as fine as its error bound asks for: flat ground needs few triangles. Coordinates are east, north and up in
-# metres about the scene's centre, through the ellipsoid, so that the Earth's curvature comes by itself.
+# The mesh is simplified to an error bound: flat ground needs few triangles. Coordinates are east, north and up in metres
+# about the scene's origin, computed through the ellipsoid, so that they include the Earth's curvature.
 
 # %%
 bounds_m = [20.0, 10.0, 5.0, 2.0]
-counts = [
-    len(load_place(Path("small.toml"), default_workspace(), options=MeshOptions(max_error_m=bound)).terrain.faces)
-    for bound in bounds_m
-]
-plt.loglog(bounds_m, counts, "o-")
+places = [ss.load_place("small.toml", options=ss.MeshOptions(max_error_m=bound)) for bound in bounds_m]
+plt.loglog(bounds_m, [len(each.terrain.faces) for each in places], "o-")
 plt.xlabel("error bound [m]")
 plt.ylabel("triangles")
 _ = plt.title(f"the default has {len(place.terrain.faces):,}")
 
 # %% [markdown]
-# The texture atlas: every triangle has its texels, and none overlap. Texels on steep ground are stretched.
+# The texture atlas: every triangle has texels of its own, and none overlap. Texels on steep ground are stretched.
 
 # %%
 atlas = place.atlas
-print(
-    f"{atlas.width_px} x {atlas.height_px} texels, median side {atlas.texel_p50_m:.1f} m, 99th percentile {atlas.texel_p99_m:.1f} m"
-)
+print(f"{atlas.width_px} x {atlas.height_px} texels")
+print(f"median side {atlas.texel_p50_m:.1f} m, 99th percentile {atlas.texel_p99_m:.1f} m")
 
 # %% [markdown]
-# Albedo through the year. A synthetic place knows its own truth: forest, meadow, rock, glacier, and snow that comes and goes.
+# Albedo through the year. A synthetic place has a true albedo for every day: forest, meadow, rock, glacier and seasonal
+# snow.
 
 # %%
 figure, axes = plt.subplots(1, 4, figsize=(14, 4))
 for axis, month in zip(axes, (1, 4, 7, 10), strict=True):
-    axis.imshow(np.clip(albedo_for(place, datetime(2024, month, 15, tzinfo=UTC)).values, 0, 1) ** (1 / 2.2))
+    axis.imshow(ss.srgb_from_linear(ss.scene_albedo(place, f"2024-{month:02d}-15").values))
     axis.set_title(f"{month:02d}-15")
     axis.axis("off")
 
 # %% [markdown]
-# Rays tell what a camera sees: distance, normal, and where in the texture.
+# A rendered view also holds its G-buffer: distance, position, normal and texture coordinates of each pixel.
 
 # %%
-camera = camera_at(
-    place.frame, 46.5712, 7.98, 3200.0, heading_deg=180.0, pitch_deg=-18.0, fov_deg=60.0, size_px=(420, 280)
-)
-land = ray_scene(mi_mesh(place.terrain, np.full(3, 0.3)))
-seen = trace_gbuffer(RenderScene(land.mi_scene, land.mi_terrain), camera)
+above = ss.Viewpoint(latitude_deg=46.5712, longitude_deg=7.98, height_m=3200.0, heading_deg=180.0, pitch_deg=-18.0)
+seen = ss.render(place, ss.camera(place, above, size_px=(420, 280)), "2024-07-15T13:00", spp=1).gbuffer
 figure, axes = plt.subplots(1, 2, figsize=(12, 4))
 shown = axes[0].imshow(seen.depth / 1000.0)
 figure.colorbar(shown, ax=axes[0], label="km")

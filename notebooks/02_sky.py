@@ -16,84 +16,59 @@
 # %% [markdown]
 # # Sky: the light of any instant
 #
-# Where sun and moon stand follows from time and place; what the sky sends follows from a model of the atmosphere.
+# Time and place give the positions of sun and moon; a model of the atmosphere gives the radiance of the sky.
 
 # %%
-from datetime import UTC, datetime, timedelta
-
 import matplotlib.pyplot as plt
 import numpy as np
 
-from seasonscapes.exposure import exposure_ev100
-from seasonscapes.images import srgb_from_linear
-from seasonscapes.sky.ephemeris import sun_position
-from seasonscapes.sky.illumination import global_horizontal_illuminance
-from seasonscapes.sky.models import read_sky_model
-from seasonscapes.sky.report import dome_picture
-from seasonscapes.workflows.illumination import illumination_at, sun_moon_position
-from seasonscapes.workspace import default_workspace
+import seasonscapes as ss
 
-LATITUDE_DEG, LONGITUDE_DEG, HEIGHT_M = 46.55, 7.98, 2000.0
+place = ss.load_place("small.toml")
 
 # %% [markdown]
-# The sun's path on three days of the year.
+# The path of the sun on three days of the year.
 
 # %%
-for month in (3, 6, 12):
-    hours = [datetime(2024, month, 21, tzinfo=UTC) + timedelta(minutes=20 * k) for k in range(72)]
-    sun = sun_position(hours, LATITUDE_DEG, LONGITUDE_DEG, HEIGHT_M)
-    up = np.asarray(sun.elevation_deg) > 0
-    plt.plot(np.asarray(sun.azimuth_deg)[up], np.asarray(sun.elevation_deg)[up], label=f"{month:02d}-21")
+for day in ("2024-03-21", "2024-06-21", "2024-12-21"):
+    suns = [ss.sun_moon_position(f"{day}T{hour:02d}:00Z", 46.55, 7.98).sun for hour in range(4, 20)]
+    suns = [sun for sun in suns if sun.elevation_deg > 0.0]
+    plt.plot([sun.azimuth_deg for sun in suns], [sun.elevation_deg for sun in suns], "o-", label=day)
 plt.xlabel("azimuth [°], clockwise from north")
 plt.ylabel("apparent elevation [°]")
 _ = plt.legend()
 
-
-# %%
-def light(model: str, time: datetime):
-    moment = sun_moon_position(time, LATITUDE_DEG, LONGITUDE_DEG, HEIGHT_M)
-    return illumination_at(
-        read_sky_model(model), moment, HEIGHT_M, workspace=default_workspace(), with_aerial_perspective=False
-    )
-
-
 # %% [markdown]
-# Domes as a fish-eye sees them, each exposed for itself: noon, low sun, twilight.
+# The sky as a fish-eye camera sees it, each exposed for itself: noon, low sun, twilight.
 
 # %%
 figure, axes = plt.subplots(1, 3, figsize=(13, 4.5))
-for axis, hour in zip(axes, (11.0, 17.0, 18.0), strict=True):
-    sky = light("clear", datetime(2024, 9, 18, tzinfo=UTC) + timedelta(hours=hour))
-    axis.imshow(srgb_from_linear(dome_picture(sky, 300)))
-    axis.set_title(f"{hour:04.1f} h UTC")
+for axis, hour in zip(axes, ("11:00", "17:00", "18:00"), strict=True):
+    light = ss.illumination(place, f"2024-09-18T{hour}Z")
+    axis.imshow(ss.srgb_from_linear(ss.dome_picture(light, 300)))
+    axis.set_title(f"{hour} UTC")
     axis.axis("off")
 
 # %% [markdown]
-# The same noon under other airs.
+# Noon under other skies, with the illuminance of level ground.
 
 # %%
-noon = datetime(2024, 7, 20, 11, 30, tzinfo=UTC)
-figure, axes = plt.subplots(1, 2, figsize=(9, 4.5))
-for axis, model in zip(axes, ("clear", "overcast"), strict=True):
-    sky = light(model, noon)
-    axis.imshow(srgb_from_linear(dome_picture(sky, 300)))
-    axis.set_title(f"{model}: {global_horizontal_illuminance(sky)[1]:,.0f} lx")
+figure, axes = plt.subplots(1, 3, figsize=(13, 4.5))
+skies = {"clear": ss.sky_model("clear"), "hazy": ss.sky_model("clear", visibility_km=15.0), "overcast": "overcast"}
+for axis, (name, sky) in zip(axes, skies.items(), strict=True):
+    light = ss.illumination(place, "2024-07-20T11:30Z", sky=sky)
+    axis.imshow(ss.srgb_from_linear(ss.dome_picture(light, 300)))
+    axis.set_title(f"{name}: {light.global_horizontal_lx[1]:,.0f} lx")
     axis.axis("off")
 
 # %% [markdown]
-# Illuminance on level ground from noon to midnight, over ten decades, without a step at sunset: night is moonlight, stars
-# and airglow.
+# Illuminance of level ground from noon to midnight, over ten decades and without a step at sunset. At night moonlight,
+# stars and airglow remain.
 
 # %%
-times = [datetime(2024, 9, 17, 11, tzinfo=UTC) + timedelta(minutes=30 * k) for k in range(26)]
-lux = [global_horizontal_illuminance(light("clear", time))[1] for time in times]
-plt.semilogy([time.hour + time.minute / 60 for time in times[:-1]], lux[:-1])
+hours = np.arange(11.0, 24.0, 0.5)
+times = [f"2024-09-17T{int(hour):02d}:{int(60 * (hour % 1)):02d}Z" for hour in hours]
+plt.semilogy(hours, [ss.illumination(place, time).global_horizontal_lx[1] for time in times])
 plt.xlabel("hour, UTC")
 plt.ylabel("lx (green)")
-_ = plt.title("a full-moon night")
-
-# %% [markdown]
-# Exposure that a camera's meter would choose for the dome, in EV at ISO 100.
-
-# %%
-print({f"{time:%H:%M}": round(exposure_ev100(light("clear", time).sky_radiance), 1) for time in times[::6]})
+_ = plt.title("a night with a full moon")

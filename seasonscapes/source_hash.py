@@ -19,8 +19,8 @@ def source_hash(*modules: str) -> str:
     """Hash the source of modules together with all modules of this package that they import, directly or indirectly.
 
     Imports inside functions count; imports for type checking do not. Comments, docstrings and layout do not change the
-    hash; another minor version of Python does. Two versions of the program with equal hashes compute equal results for equal inputs (apart from third-party
-    packages, which are not hashed).
+    hash; another minor version of Python does. Two versions of the program with equal hashes compute equal results for
+    equal inputs (apart from third-party packages, which are not hashed).
 
     Parameters
     ----------

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+import seasonscapes as ss
+
 FOLDER = Path(__file__).parents[1] / "notebooks"
 NAMES = sorted(path.stem for path in FOLDER.glob("*.py"))
 
@@ -42,12 +44,18 @@ def test_paired_short_and_clean(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_public_names_only(name):
+def test_the_public_interface_alone(name):
+    imports, used = [], set()
     for node in ast.walk(ast.parse((FOLDER / f"{name}.py").read_text())):
-        if isinstance(node, ast.ImportFrom):
-            assert not any(alias.name.startswith("_") for alias in node.names)
+        if isinstance(node, (ast.Import, ast.ImportFrom)):
+            imports.append(ast.unparse(node))
         if isinstance(node, ast.Attribute):
             assert not node.attr.startswith("_")
+            if isinstance(node.value, ast.Name) and node.value.id == "ss":
+                used.add(node.attr)
+    assert len(imports) <= 3
+    assert [each for each in imports if "seasonscapes" in each] == ["import seasonscapes as ss"]
+    assert used <= set(ss.__all__)
 
 
 @pytest.fixture(scope="module")

@@ -109,6 +109,29 @@ class DifferentiableScene:
             image = image * mi.TensorXf(dr.exp(mi.Float(unknowns["log_gain"])), shape=(1, 1, 1))
         return image
 
+    def optimizer(self, start: Mapping[str, Any], *, step: float = 0.05) -> Any:
+        """Make an optimiser of unknowns of `render`.
+
+        Parameters
+        ----------
+        start
+            First value of each unknown: a number, or an array ``(R, S, 3)`` for ``albedo``.
+        step
+            Learning rate.
+
+        Returns
+        -------
+        mitsuba.ad.Adam
+            A mapping of the unknowns' current values; ``step()`` follows the gradients (Kingma & Ba 2015,
+            arXiv:1412.6980).
+        """
+        import mitsuba as mi
+
+        mi_optimizer = mi.ad.Adam(lr=step)
+        for name, value in start.items():
+            mi_optimizer[name] = mi.Float(value) if np.ndim(value) == 0 else mi.TensorXf(value)
+        return mi_optimizer
+
     def _update(self, unknowns: Mapping[str, Any]) -> None:
         import mitsuba as mi
 

@@ -34,6 +34,16 @@ class Luminary:
     normal_illuminance_lx: np.ndarray
     angular_radius_deg: float
 
+    @property
+    def azimuth_deg(self) -> float:
+        """Apparent azimuth, clockwise from north [deg]."""
+        return float(np.degrees(np.arctan2(self.direction[0], self.direction[1])) % 360.0)
+
+    @property
+    def elevation_deg(self) -> float:
+        """Apparent elevation [deg]."""
+        return float(np.degrees(np.arcsin(np.clip(self.direction[2], -1.0, 1.0))))
+
 
 class AerialPerspective(Protocol):
     """Transmittance and airlight of the air between a viewer and a surface."""
@@ -99,6 +109,11 @@ class Illumination:
     model: dict[str, Any] = field(default_factory=dict)
     frame: LocalFrame | None = None
     time: datetime | None = None
+
+    @property
+    def global_horizontal_lx(self) -> np.ndarray:
+        """Illuminance ``(3,)`` of level ground from sun, moon and sky [lx]; see `global_horizontal_illuminance`."""
+        return global_horizontal_illuminance(self)
 
 
 def luminance(rgb: np.ndarray) -> np.ndarray:

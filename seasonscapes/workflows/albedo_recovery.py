@@ -68,7 +68,7 @@ class RecoveredAlbedo:
     ----------
     day
         Date of the first photograph.
-    known
+    estimate
         Albedo ``(R, S, 3)``, standard error, times sunlit and source (1 measured, 2 completed) of each texel.
     fit
         The closed-form (or refined) fit: gains, residuals.
@@ -81,7 +81,7 @@ class RecoveredAlbedo:
     """
 
     day: date
-    known: AlbedoEstimate
+    estimate: AlbedoEstimate
     fit: AlbedoFit
     photographs: list[AlbedoPhotograph] = field(repr=False)
     atlas_id: str
@@ -90,7 +90,7 @@ class RecoveredAlbedo:
     @property
     def texture(self) -> Texture:
         """The albedo as a texture; ``weight`` is ``1 / σ²`` where photographs measured it and 0 elsewhere."""
-        known = self.known
+        known = self.estimate
         weight = np.where(known.source == 1, 1.0 / np.maximum(known.sigma, 1e-4) ** 2, 0.0).astype(np.float32)
         return Texture(known.albedo, weight, self.atlas_id)
 
@@ -100,14 +100,14 @@ class RecoveredAlbedo:
 
         from seasonscapes.albedo.seasons import DatedAlbedo
 
-        content = hashlib.sha256(self.known.albedo.tobytes()).hexdigest()
+        content = hashlib.sha256(self.estimate.albedo.tobytes()).hexdigest()
         return DatedAlbedo(self.day, content, lambda: self.texture)
 
     def save(self, path: str | Path) -> None:
         """Write a ``.npz`` file, atomically; `load_albedo` and ``--albedo`` read it."""
         from seasonscapes.images import atomic_path
 
-        known, texture = self.known, self.texture
+        known, texture = self.estimate, self.texture
         with atomic_path(Path(path)) as temporary, open(temporary, "wb") as file:
             np.savez_compressed(
                 file,
@@ -177,7 +177,7 @@ def recover_albedo(
     ...     sources = ss.synthetic_photographs(place, times, folder, cameras={"aerial": camera})
     ...     photographs = ss.open_photographs(place, sources.manifest, sources.calibrations, times)
     >>> recovered = ss.recover_albedo(place, photographs)
-    >>> recovered.known.albedo.shape == (*place.texture_shape, 3)
+    >>> recovered.estimate.albedo.shape == (*place.texture_shape, 3)
     True
     """
     from seasonscapes.rendering.backend import use_backend
@@ -303,7 +303,7 @@ def save_albedo_figures(recovered: RecoveredAlbedo, output: Path) -> dict[str, s
     """Write pictures beside an albedo file: the albedo, what was measured, and σ (white is 0.1); their paths."""
     from seasonscapes.images import write_png
 
-    known = recovered.known
+    known = recovered.estimate
     sigma = np.clip(np.nan_to_num(known.sigma, posinf=1.0) / 0.1, 0.0, 1.0)
     pictures: dict[str, np.ndarray] = {
         "albedo": known.albedo,
@@ -320,8 +320,8 @@ def save_albedo_figures(recovered: RecoveredAlbedo, output: Path) -> dict[str, s
 
 def error_against_truth(place: Place, recovered: RecoveredAlbedo) -> dict[str, float]:
     """PSNR [dB] and relative error over measured texels of a synthetic place, whose albedo is known."""
-    truth, measured = scene_albedo(place, recovered.day).values, recovered.known.source == 1
-    error = recovered.known.albedo[measured] - truth[measured]
+    truth, measured = scene_albedo(place, recovered.day).values, recovered.estimate.source == 1
+    error = recovered.estimate.albedo[measured] - truth[measured]
     return {
         "true_psnr_db": round(float(-10.0 * np.log10(np.mean(error**2))), 2),
         "true_relative_error": round(float(np.abs(error).sum() / truth[measured].sum()), 4),

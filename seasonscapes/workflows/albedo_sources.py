@@ -62,7 +62,7 @@ class AlbedoFile:
     path: Path
 
 
-def scene_albedo(place: Place, day: date) -> Texture:
+def scene_albedo(place: Place, day: date | str) -> Texture:
     """Return the albedo texture of a date: the synthetic truth of that day, or the scene's image.
 
     Parameters
@@ -70,7 +70,7 @@ def scene_albedo(place: Place, day: date) -> Texture:
     place
         The place.
     day
-        A date or datetime; it matters for synthetic places alone.
+        A date, datetime or ISO 8601 text; it matters for synthetic places alone.
 
     Returns
     -------
@@ -89,6 +89,7 @@ def scene_albedo(place: Place, day: date) -> Texture:
     """
     from seasonscapes.terrain.imagery import bake_imagery
 
+    day = date.fromisoformat(day) if isinstance(day, str) else day
     inputs: dict[str, Any] = {"terrain": place.key}
     if place.synthetic is not None:
         day_of_year = day.timetuple().tm_yday

@@ -210,7 +210,7 @@ def _albedo(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
         {"webcam": each.webcam, "time_utc": each.time.isoformat(), "residual": round(float(residual), 4)}
         for each, residual in zip(observations, recovered.fit.residual, strict=True)
     ]
-    facts = {"measured_share": float((recovered.known.source == 1).mean()), **recovered.facts}
+    facts = {"measured_share": float((recovered.estimate.source == 1).mean()), **recovered.facts}
     _write_record(path.with_suffix(".json"), facts | {"photographs": residuals})
     return [path]
 

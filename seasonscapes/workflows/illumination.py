@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from seasonscapes.civil_time import resolve_time
 from seasonscapes.progress import TaskProgress
 from seasonscapes.sky.atmosphere import Atmosphere
 from seasonscapes.sky.clear_sky import AtmosphereTables, atmosphere_tables, load_tables, save_tables
@@ -55,14 +56,14 @@ class SunMoonPosition:
 
 
 def sun_moon_position(
-    time: datetime, latitude_deg: float, longitude_deg: float, height_m: float = 0.0
+    time: str | datetime, latitude_deg: float, longitude_deg: float, height_m: float = 0.0
 ) -> SunMoonPosition:
     """Return the positions of sun and moon.
 
     Parameters
     ----------
     time
-        An aware datetime.
+        An aware datetime, or ISO 8601 text; without offset it is civil time at the position.
     latitude_deg, longitude_deg, height_m
         WGS 84 position of the observer [deg, m].
 
@@ -78,12 +79,13 @@ def sun_moon_position(
 
     Examples
     --------
-    >>> from datetime import UTC, datetime
     >>> import seasonscapes as ss
-    >>> position = ss.sun_moon_position(datetime(2024, 6, 20, 11, 30, tzinfo=UTC), 46.55, 7.98)
+    >>> position = ss.sun_moon_position("2024-06-20T13:30", 46.55, 7.98)
     >>> round(float(position.sun.elevation_deg), 1)
     66.9
     """
+    if isinstance(time, str):
+        time = resolve_time(time, latitude_deg, longitude_deg).utc
     return SunMoonPosition(
         time,
         sun_position(time, latitude_deg, longitude_deg, height_m),

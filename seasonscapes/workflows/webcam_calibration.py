@@ -119,6 +119,7 @@ def webcam_station(
     >>> profile = {"driver": "GTiff", "height": rows, "width": columns, "count": 1, "dtype": "float32"}
     >>> scene = '''
     ... name = "valley"
+    ... attribution = "of the example"
     ... [[webcam]]
     ... id = "hut"
     ... latitude_deg = 46.556
