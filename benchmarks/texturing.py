@@ -129,7 +129,7 @@ def held_out_view(bed: places.Testbed, figures: Path | None) -> dict[str, float]
     from seasonscapes.cameras.pinhole import Camera, rotation_from_angles
     from seasonscapes.rendering.gbuffer import trace_gbuffer
     from seasonscapes.rendering.hemisphere_rays import ray_scene
-    from seasonscapes.rendering.mitsuba_scene import mi_mesh
+    from seasonscapes.rendering.mitsuba_scene import RenderScene, mi_mesh
 
     (column, row, height), heading = bed.held_out
     low = bed.terrain.vertices[:, :2].min(axis=0)
@@ -141,7 +141,8 @@ def held_out_view(bed: places.Testbed, figures: Path | None) -> dict[str, float]
         height,
     ]
     camera = Camera(768, 512, 500.0, 500.0, 384.0, 256.0, pose)
-    gbuffer = trace_gbuffer(ray_scene(mi_mesh(bed.terrain, np.full(3, 0.2))), camera)
+    land = ray_scene(mi_mesh(bed.terrain, np.full(3, 0.2)))
+    gbuffer = trace_gbuffer(RenderScene(land.mi_scene, land.mi_terrain), camera)
     seen = np.nan_to_num(sample_texture(bed.seen[..., None].astype(np.float32), gbuffer.uv)[..., 0], nan=1.0)
     unseen = seen < 0.5
     shown = bed.shown(bed.truth)

@@ -9,7 +9,8 @@ import sys
 from cyclopts import App, Parameter
 
 from seasonscapes import __version__
-from seasonscapes.commands.console import interruptible, show_messages
+from seasonscapes.commands.console import show_messages
+from seasonscapes.commands.interruption import interruptible
 from seasonscapes.errors import SeasonscapesError
 
 app = App(

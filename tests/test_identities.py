@@ -40,31 +40,32 @@ def test_a_camera_of_another_frame_sees_the_same(place):
     np.testing.assert_allclose(same[both], depth[both], rtol=2e-3)
 
 
-@pytest.mark.parametrize("use", ["render", "relight_session", "differentiable_scene"])
+CAMERA_USES = {
+    "render": lambda place, camera: ss.render(place, camera, TIME, sky="hosek"),
+    "relight_session": lambda place, camera: ss.relight_session(place, camera, sky="hosek"),
+    "differentiable_scene": lambda place, camera: ss.differentiable_scene(place, camera, TIME, sky="hosek"),
+}
+TEXTURE_USES = {
+    "render": lambda place, camera, texture: ss.render(place, camera, TIME, sky="hosek", albedo=texture),
+    "relight_session": lambda place, camera, texture: ss.relight_session(place, camera, sky="hosek", albedo=texture),
+    "lit_texture": lambda place, camera, texture: ss.lit_texture(place, TIME, sky="hosek", albedo=texture),
+    "complete": lambda place, camera, texture: ss.complete(place, texture, TIME),
+}
+
+
+@pytest.mark.parametrize("use", CAMERA_USES)
 def test_a_camera_without_a_frame_is_refused(place, use):
     camera = replace(ss.camera(place, "aerial", size_px=(48, 32)), frame=None)
     with pytest.raises(FrameMismatch, match="frame"):
-        if use == "relight_session":
-            ss.relight_session(place, camera, sky="hosek")
-        else:
-            getattr(ss, use)(place, camera, TIME, sky="hosek")
+        CAMERA_USES[use](place, camera)
 
 
-@pytest.mark.parametrize("use", ["render", "relight_session", "lit_texture", "complete"])
+@pytest.mark.parametrize("use", TEXTURE_USES)
 def test_a_texture_of_another_atlas_is_refused(place, use):
     values = np.full((*place.texture_shape, 3), 0.2, np.float32)
     foreign = ss.Texture(values, values[..., 0], atlas_id="another")
-    camera = ss.camera(place, "aerial", size_px=(48, 32))
     with pytest.raises(AtlasMismatch, match="another atlas"):
-        match use:
-            case "render":
-                ss.render(place, camera, TIME, sky="hosek", albedo=foreign)
-            case "relight_session":
-                ss.relight_session(place, camera, sky="hosek", albedo=foreign)
-            case "lit_texture":
-                ss.lit_texture(place, TIME, sky="hosek", albedo=foreign)
-            case "complete":
-                ss.complete(place, foreign, TIME)
+        TEXTURE_USES[use](place, ss.camera(place, "aerial", size_px=(48, 32)), foreign)
 
 
 def test_a_texture_of_another_size_is_refused(place):

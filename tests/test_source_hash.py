@@ -58,5 +58,5 @@ def test_imports_inside_functions_count():
 
 
 def test_a_module_that_does_not_exist():
-    with pytest.raises(ValueError, match="terrain.nowhere"):
+    with pytest.raises(ValueError, match=r"terrain\.nowhere"):
         source_hash("terrain.nowhere")

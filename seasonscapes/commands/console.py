@@ -1,16 +1,15 @@
-"""Console output: one result on stdout, progress bars and log messages on stderr, and interruption by Ctrl-C."""
+"""Console output: one result on stdout, progress bars and log messages on stderr."""
 
 from __future__ import annotations
 
 import json
 import logging
-import signal
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from seasonscapes.commands.interruption import raise_if_interrupted
 from seasonscapes.progress import Progress
 
 
@@ -65,33 +64,9 @@ def progress_bars() -> Iterator[Progress]:
         tasks: dict[str, Any] = {}
 
         def report(task: str, fraction: float) -> None:
-            if _interrupted.is_set():
-                raise KeyboardInterrupt
+            raise_if_interrupted()
             if task not in tasks:
                 tasks[task] = bars.add_task(task, total=1.0)
             bars.update(tasks[task], completed=fraction)
 
         yield report
-
-
-# Native code may swallow a KeyboardInterrupt that is raised while it calls back into Python; this event keeps it.
-_interrupted = threading.Event()
-
-
-@contextmanager
-def interruptible() -> Iterator[None]:
-    """End the block on Ctrl-C: at once, or at the next progress report where native code swallowed the exception."""
-    _interrupted.clear()
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def handle(number: int, frame: Any) -> None:
-        _interrupted.set()
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGINT, handle)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import re
 import time as clock
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -14,28 +12,8 @@ from seasonscapes.commands.arguments import check_range, parse_albedo, parse_dur
 from seasonscapes.commands.console import print_result, progress_bars
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
 from seasonscapes.commands.view_options import ViewOptions, WhenOptions
+from seasonscapes.commands.work_options import WorkOptions
 from seasonscapes.errors import InputError
-
-
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
-class WorkOptions:
-    """Where frames are rendered."""
-
-    cluster: str | None = None
-    """local:N worker processes, tcp://HOST:PORT of a Dask scheduler, or slurm:FILE."""
-    shard: str | None = None
-    """Only the part i/N of the frames, with no film made; any number of machines share a workspace."""
-
-    def part(self) -> tuple[int, int] | None:
-        """The part i/N as two numbers."""
-        if self.shard is None:
-            return None
-        match = re.fullmatch(r"(\d+)/(\d+)", self.shard)
-        if match is None or not 1 <= int(match[1]) <= int(match[2]):
-            expected = "i/N with 1 ≤ i ≤ N, such as 3/8"
-            raise InputError("--shard", "not a part of the whole", got=self.shard, expected=expected)
-        return int(match[1]), int(match[2])
 
 
 def timelapse_command(

@@ -73,7 +73,7 @@ def project_texels(camera: Camera, surface: TexelSurface) -> ProjectedTexels:
 
 
 def visible_by_ray(
-    terrain: RayScene, camera: Camera, surface: TexelSurface, projected: ProjectedTexels, *, lift_m: float | None = None
+    terrain: RayScene, camera: Camera, surface: TexelSurface, projected: ProjectedTexels, *, offset_m: float | None = None
 ) -> np.ndarray:
     """Return which surface points are visible from a camera, by one shadow ray each.
 
@@ -87,7 +87,7 @@ def visible_by_ray(
         N surface points.
     projected
         Their projection, from `project_texels`.
-    lift_m
+    offset_m
         Offset of the ray origins along the normals [m]; ``None`` for just beyond the rounding of float32. See
         `sightlines.line_of_sight`.
 
@@ -100,7 +100,7 @@ def visible_by_ray(
     index = np.flatnonzero(visible)
     if len(index):
         visible[index] = line_of_sight(
-            terrain, surface.position_m[index], surface.normal[index], camera.position_m, offset_m=lift_m
+            terrain, surface.position_m[index], surface.normal[index], camera.position_m, offset_m=offset_m
         )
     return visible
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from seasonscapes.cameras.pinhole import view_in_frame
-from seasonscapes.errors import InputError, NotEnoughEvidence, UnreadableImage
+from seasonscapes.errors import CameraBelowGround, InputError, NotEnoughEvidence, NoUsablePixels, UnreadableImage
 from seasonscapes.frames import LocalFrame, local_axes
 from seasonscapes.workflows.place import Place
 from seasonscapes.workflows.views import camera_geodetic
@@ -360,7 +360,7 @@ def calibrate_by_skylines(
             try:
                 image = read_image_srgb8(pictures[stated.webcam])
                 fit = align_to_skyline(image, guess, [place.elevation], stated.frame)
-            except NotEnoughEvidence as error:
+            except (NotEnoughEvidence, CameraBelowGround, NoUsablePixels) as error:
                 doubts[stated.webcam] = str(error)
                 continue
             if fit.calibration is None or fit.doubts:
