@@ -78,8 +78,8 @@ def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
     --------
     >>> import numpy as np
     >>> import seasonscapes as ss
-    >>> ss.srgb_from_linear(np.array([0.0, 0.2140411, 1.0])).round(4)
-    array([0. , 0.5, 1. ])
+    >>> ss.srgb_from_linear(np.array([0.0, 0.2140411, 1.0])).round(4).tolist()
+    [0.0, 0.5, 1.0]
     """
     linear = np.clip(linear, 0.0, 1.0)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.power(linear, 1.0 / 2.4) - 0.055)

@@ -120,6 +120,7 @@ def webcam_station(
     >>> scene = '''
     ... name = "valley"
     ... attribution = "of the example"
+    ... vertical_datum = "local"
     ... [[webcam]]
     ... id = "hut"
     ... latitude_deg = 46.556
