@@ -168,9 +168,10 @@ def test_a_run_killed_in_every_stage_ends_as_one_that_nothing_disturbed(runs):
     for number, stage in enumerate(STAGES):
         delay_s = rng.uniform(0.0, 0.6) * min(seconds[stage], 4.0)
         told = killed_in(runs, "killed", stage, delay_s)
-        assert [f"run: {name}: up to date" for name in STAGES[: max(number - 1, 0)]] == [
-            x for x in told if x.endswith(": up to date")
-        ]
+        kept = [line for line in told if line.endswith(": up to date")]
+        assert kept == [f"run: {name}: up to date" for name in STAGES[: len(kept)]]
+        # On a loaded machine the stage before may have ended before the signal came.
+        assert len(kept) in (max(number - 1, 0), number)
         ledger = ledger_of(killed)
         assert list(ledger)[:number] == list(STAGES[:number]), (stage, delay_s)
         for entry in ledger.values():
