@@ -169,7 +169,7 @@ def visibility(stage: Stage, *, seed: int, rays: int) -> dict:
         depth = trace_gbuffer(scene, camera).depth
         modes = {
             "ray": visible_by_ray(stage.terrain, camera, places, seen),
-            "ray_lifted_2m": visible_by_ray(stage.terrain, camera, places, seen, lift_m=2.0),
+            "ray_lifted_2m": visible_by_ray(stage.terrain, camera, places, seen, offset_m=2.0),
             "depth": visible_by_depth(depth, seen),
             "depth_2pc": visible_by_depth(depth, seen, tolerance=0.02),
             "faces": visible_by_faces(stage.terrain, camera, places, seen),

@@ -13,11 +13,10 @@ import numpy as np
 from seasonscapes.rendering.backend import point3, use_backend
 from seasonscapes.rendering.sky_patches import SkyPatches, mi_patch_of
 from seasonscapes.rendering.sobol import hashed, sobol_pair, uniform
+from seasonscapes.rendering.terrain_material import leaving_points
 
 # Rays in one kernel launch; bounds the memory.
 LANES = 1 << 22
-# Mitsuba's math::RayEpsilon in single precision.
-RAY_EPSILON = float(np.finfo(np.float32).epsneg) * 1500.0
 # Labels of rays that hit no cluster: the ray reaches the sky, or a surface that reflects no light.
 ESCAPED, ABSORBED = -1, -2
 # Keys of the random number streams, mixed into their hashes.
@@ -47,11 +46,11 @@ class SurfacePoints:
     Parameters
     ----------
     origin
-        ``(..., 3)`` float32 positions, ENU [m], offset along the geometric normal as Mitsuba offsets its rays.
+        ``(..., 3)`` float32 positions, ENU [m], off the surface; see `terrain_material.leaving_points`.
     normal
         ``(..., 3)`` float32 unit shading normals.
     geometric_normal
-        ``(..., 3)`` float32 unit geometric normals.
+        ``(..., 3)`` float32 unit normals of the surface at ``origin``: rays on its other side enter the surface.
     albedo
         ``(..., 3)`` float32; zero where the surface was hit from its back.
     uv
@@ -116,7 +115,9 @@ def ray_scene(mi_terrain: Any) -> RayScene:
 
 
 def front_side(interaction: Any, active: Any) -> Any:
-    """Return a mask of the lanes that hit the front of a surface, by its shading and its geometric normal.
+    """Return a mask of the lanes that hit the front of a facet.
+
+    The shading normal does not matter: near silhouettes it may face away from the viewer on facets that are visible.
 
     Parameters
     ----------
@@ -132,11 +133,10 @@ def front_side(interaction: Any, active: Any) -> Any:
     """
     import drjit as dr
 
-    towards = interaction.to_world(interaction.wi)
-    return active & (dr.dot(interaction.sh_frame.n, towards) > 0.0) & (dr.dot(interaction.n, towards) > 0.0)
+    return active & (dr.dot(interaction.n, interaction.to_world(interaction.wi)) > 0.0)
 
 
-def surface_points(interaction: Any, active: Any) -> SurfacePoints:
+def surface_points(terrain: RayScene, interaction: Any, active: Any) -> SurfacePoints:
     """Copy the surface points of an intersection from the device.
 
     The front is the side of the geometric normal (terrain faces are counter-clockwise from above). The back of a
@@ -144,6 +144,8 @@ def surface_points(interaction: Any, active: Any) -> SurfacePoints:
 
     Parameters
     ----------
+    terrain
+        The terrain.
     interaction
         ``mi.SurfaceInteraction3f`` of N lanes.
     active
@@ -158,10 +160,10 @@ def surface_points(interaction: Any, active: Any) -> SurfacePoints:
     import mitsuba as mi
 
     front = front_side(interaction, active)
-    albedo = dr.select(front, interaction.bsdf().eval_diffuse_reflectance(interaction, front), mi.Color3f(0.0))
-    # The offset of Mitsuba's Interaction::offset_p, so that contact shadows equal those of the path tracer.
-    offset = (1.0 + dr.max(dr.abs(interaction.p))) * RAY_EPSILON
-    lanes = (interaction.p + interaction.n * offset, interaction.sh_frame.n, interaction.n, albedo, interaction.uv)
+    material = terrain.mi_terrain.bsdf()
+    albedo = dr.select(front, material.eval_diffuse_reflectance(interaction, front), mi.Color3f(0.0))
+    origin, outward, normal = leaving_points(material, interaction, active)
+    lanes = (origin, normal, outward, albedo, interaction.uv)
     dr.eval(lanes)
     points = SurfacePoints(*(np.ascontiguousarray(np.array(values).T) for values in lanes))
     points.uv[:, 1] = 1.0 - points.uv[:, 1]
@@ -315,4 +317,4 @@ def trace_bounce(terrain: RayScene, points: SurfacePoints, seed: int) -> tuple[S
     interaction = terrain.mi_scene.ray_intersect(mi.Ray3f(point3(points.origin), direction), active=outside)
     valid = interaction.is_valid() & (dr.dot(interaction.n, direction) < 0.0)
     hit = np.array(valid)
-    return surface_points(interaction, valid)[hit], np.array(interaction.prim_index)[hit], hit
+    return surface_points(terrain, interaction, valid)[hit], np.array(interaction.prim_index)[hit], hit

@@ -118,7 +118,7 @@ def _surface_below(terrain: RayScene, start_m: np.ndarray, search_m: float) -> t
     ray = mi.Ray3f(point3(start_m.astype(np.float32)), mi.Vector3f(0.0, 0.0, -1.0))
     interaction = terrain.mi_scene.ray_intersect(ray)
     found: Any = interaction.is_valid() & (interaction.t < 2.0 * search_m)
-    return surface_points(interaction, found), np.array(found)
+    return surface_points(terrain, interaction, found), np.array(found)
 
 
 def upload_points(terrain: RayScene, coefficients: PointCoefficients) -> DevicePoints:

@@ -13,6 +13,7 @@ import numpy as np
 
 from seasonscapes.frames import equirectangular_directions, sample_equirectangular
 from seasonscapes.rendering.backend import use_backend
+from seasonscapes.rendering.terrain_material import terrain_material
 from seasonscapes.sky.illumination import Illumination, Luminary
 from seasonscapes.terrain.attributes import vertex_normals
 from seasonscapes.terrain.surface import Terrain
@@ -56,7 +57,8 @@ def mi_mesh(terrain: Terrain, albedo: np.ndarray, *, smooth: bool = True) -> Any
     albedo
         ``(R, S, 3)`` linear Rec.709 reflectance with row 0 at v = 1, or ``(3,)`` for a uniform colour.
     smooth
-        Interpolate vertex normals for shading; otherwise each triangle is flat.
+        Shade with the normals of the terrain's surface, or without one with interpolated vertex normals; otherwise each
+        triangle is flat.
 
     Returns
     -------
@@ -78,7 +80,7 @@ def mi_mesh(terrain: Terrain, albedo: np.ndarray, *, smooth: bool = True) -> Any
             "wrap_mode": "clamp",
         }
     properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict({"type": "diffuse", "reflectance": reflectance})
+    properties["bsdf"] = terrain_material(reflectance, terrain.surface if smooth else None)
     mesh = mi.Mesh(
         "terrain",
         len(terrain.vertices),

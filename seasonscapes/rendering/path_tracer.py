@@ -18,6 +18,7 @@ from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.rendering.gbuffer import mi_rays
 from seasonscapes.rendering.mitsuba_scene import LUMINARY_DISTANCE_M, RenderScene
 from seasonscapes.rendering.sobol import hashed, sobol_pair, uniform
+from seasonscapes.rendering.terrain_material import leaving_points
 from seasonscapes.sky.illumination import Luminary
 
 # Farther hits are the polygons of sun and moon, which only Mitsuba's own integrators use.
@@ -26,7 +27,7 @@ FAR_M = 0.1 * LUMINARY_DISTANCE_M
 # the least noise in equal time among 1 and 2 times √throughput and throughput, for albedos of 0.1 to 0.5.
 SURVIVAL = 2.0
 # Keys of the random decisions at a path vertex, mixed into their hashes.
-_PIXEL, _BOUNCE, _LOBE, _SURVIVAL, _LUMINARY = range(5)
+_PIXEL, _BOUNCE, _SURVIVAL, _LUMINARY = 0, 1, 3, 4
 
 
 @dataclass(frozen=True)
@@ -129,6 +130,7 @@ def _trace(scene: RenderScene, ray: Any, sample_key: Any, index: Any, max_depth:
     import mitsuba as mi
 
     mi_terrain, mi_sky, luminaries = scene.mi_terrain, scene.mi_scene.environment(), _luminaries(scene)
+    material = mi_terrain.bsdf()
 
     def step(ray: Any, radiance: Any, throughput: Any, depth: Any, active: Any, on_terrain: Any) -> tuple[Any, ...]:
         preliminary = scene.mi_scene.ray_intersect_preliminary(ray, coherent=depth == 0, active=active)
@@ -141,16 +143,15 @@ def _trace(scene: RenderScene, ray: Any, sample_key: Any, index: Any, max_depth:
         throughput /= survival
         # Called on the mesh: the same call on the scene would first look up the shape of each lane.
         surface = mi_terrain.compute_surface_interaction(ray, preliminary, mi.RayFlags.All, active)
-        surface.sh_frame = mi.Frame3f(surface.sh_frame.n)
-        surface.wi = surface.to_local(-ray.d)
-        light = _direct_light(scene, luminaries, surface, key, index, active, depth == 0)
+        active &= dr.dot(surface.n, ray.d) < 0.0
+        origin, outward, normal = leaving_points(material, surface, active)
+        throughput = dr.select(active, throughput * material.eval_diffuse_reflectance(surface, active), throughput)
+        light = _direct_light(scene, luminaries, (origin, outward, normal), key, index, active, depth == 0)
         radiance += dr.select(active, throughput * light, 0.0)
-        sample, weight = mi_terrain.bsdf().sample(
-            mi.BSDFContext(), surface, uniform(hashed(key, _LOBE)), sobol_pair(hashed(key, _BOUNCE), index), active
-        )
-        throughput = dr.select(active, throughput * weight, throughput)
-        ray = surface.spawn_ray(surface.to_world(sample.wo))
-        return ray, radiance, throughput, depth + 1, active & (dr.max(throughput) > 0.0), on_terrain
+        direction = mi.warp.square_to_cosine_hemisphere(sobol_pair(hashed(key, _BOUNCE), index))
+        direction = mi.Frame3f(normal).to_world(direction)
+        active &= (dr.max(throughput) > 0.0) & (dr.dot(direction, outward) > 0.0)
+        return mi.Ray3f(origin, direction), radiance, throughput, depth + 1, active, on_terrain
 
     start = (mi.Ray3f(ray), mi.Color3f(0.0), mi.Color3f(1.0), mi.UInt32(0), mi.Bool(True), mi.Bool(False))
     _, radiance, _, _, _, on_terrain = dr.while_loop(start, lambda *state: state[4], step, label="path over terrain")
@@ -171,23 +172,24 @@ def _sky_radiance(mi_sky: Any, direction: Any, throughput: Any, escaped: Any) ->
 def _direct_light(
     scene: RenderScene,
     luminaries: list[_DeviceLuminary],
-    surface: Any,
+    leaving: tuple[Any, Any, Any],
     key: Any,
     index: Any,
     active: Any,
     coherent: Any,
 ) -> Any:
-    """Reflected radiance of direct light from sun and moon, with one shadow ray for each."""
+    """Radiance that a white surface reflects of the direct light of sun and moon, with one shadow ray for each."""
     import mitsuba as mi
 
+    origin, outward, normal = leaving
     total = mi.Color3f(0.0)
     for number, luminary in enumerate(luminaries):
         point = sobol_pair(hashed(key, _LUMINARY + number), index)
         direction = luminary.mi_frame.to_world(mi.warp.square_to_uniform_cone(point, luminary.mi_cos_radius))
-        value = scene.mi_terrain.bsdf().eval(mi.BSDFContext(), surface, surface.to_local(direction), active)
-        facing = active & (dr.max(value) > 0.0)
-        ray = surface.spawn_ray(direction)
+        cosine = dr.dot(normal, direction)
+        facing = active & (cosine > 0.0) & (dr.dot(outward, direction) > 0.0)
+        ray = mi.Ray3f(origin, direction)
         ray.maxt = FAR_M
         shadowed = scene.mi_scene.ray_test(ray, coherent=coherent, active=facing)
-        total += dr.select(facing & ~shadowed, value * luminary.mi_illuminance, 0.0)
+        total += dr.select(facing & ~shadowed, cosine * dr.inv_pi * luminary.mi_illuminance, 0.0)
     return total

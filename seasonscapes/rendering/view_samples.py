@@ -12,6 +12,7 @@ from seasonscapes.images import REC709_LUMINANCE
 from seasonscapes.rendering.gbuffer import mi_rays
 from seasonscapes.rendering.hemisphere_rays import LANES, RayScene, SurfacePoints, front_side, surface_points
 from seasonscapes.rendering.sobol import hashed, sobol_pair
+from seasonscapes.rendering.terrain_material import shading_normal
 
 # Key of the random number stream, mixed into its hashes.
 _PIXEL = 103
@@ -111,7 +112,7 @@ def camera_points(
     """
     interaction = _mi_camera_rays(terrain, camera, rows, count, seed)
     valid = interaction.is_valid()
-    return surface_points(interaction, valid), np.array(valid)
+    return surface_points(terrain, interaction, valid), np.array(valid)
 
 
 def _mi_camera_rays(terrain: RayScene, camera: Camera | Panorama, rows: range, count: int, seed: int) -> Any:
@@ -170,11 +171,17 @@ def pixel_moments(
         interaction = _mi_camera_rays(terrain, camera, block, count, seed)
         valid = interaction.is_valid()
         front = front_side(interaction, valid)
-        albedo = interaction.bsdf().eval_diffuse_reflectance(interaction, front)
+        material = terrain.mi_terrain.bsdf()
+        albedo = material.eval_diffuse_reflectance(interaction, front)
         albedo = dr.select(front, albedo, mi.Color3f(0.0))
         # A small constant weight defines the normal of black pixels too.
         weight = dr.dot(albedo, mi.Color3f(*REC709_LUMINANCE.tolist())) + dr.select(valid, mi.Float(1e-6), 0.0)
-        lanes = [*albedo, *(weight * interaction.sh_frame.n), weight, dr.select(valid, mi.Float(1.0), 0.0)]
+        lanes = [
+            *albedo,
+            *(weight * shading_normal(material, interaction, valid)),
+            weight,
+            dr.select(valid, mi.Float(1.0), 0.0),
+        ]
         sums = [dr.block_sum(values, count) for values in lanes]
         dr.eval(sums)
         parts.append(np.stack([np.array(values) for values in sums], axis=-1))

@@ -104,4 +104,4 @@ def _merge_blocks(terrain: Terrain, builder: Any, blocks: Sequence[np.ndarray]) 
     if np.median(signed_uv_areas(uv, faces)) < 0.0:
         # xatlas has v along image rows; here v points upwards.
         uv[:, 1] = 1.0 - uv[:, 1]
-    return Terrain(np.concatenate(vertices), faces, uv, terrain.frame)
+    return Terrain(np.concatenate(vertices), faces, uv, terrain.frame, terrain.surface)

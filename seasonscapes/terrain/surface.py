@@ -36,6 +36,62 @@ class Raster:
 
 
 @dataclass(frozen=True)
+class SurfaceGrid:
+    """Up coordinates of the terrain on a regular horizontal grid, from which shading takes its normals.
+
+    Parameters
+    ----------
+    corner_m
+        West and north: position of the first node [m, east-north].
+    step_m
+        Distance of neighbouring nodes towards east and towards south [m].
+    up_m
+        ``(R, S)`` float32 up coordinates of the nodes [m]; rows run from north to south.
+    """
+
+    corner_m: tuple[float, float]
+    step_m: tuple[float, float]
+    up_m: np.ndarray
+
+    def slopes(self) -> np.ndarray:
+        """Slopes towards east and north, and the up coordinate, of all nodes: ``(R, S, 3)`` float32.
+
+        Central differences; one-sided at the rim.
+        """
+        result = np.empty((*self.up_m.shape, 3), np.float32)
+        south, east = np.gradient(self.up_m, self.step_m[1], self.step_m[0])
+        result[..., 0], result[..., 1], result[..., 2] = east, -south, self.up_m
+        return result
+
+    def sample(self, position_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Interpolate the surface bilinearly.
+
+        Parameters
+        ----------
+        position_m
+            ``(N, 2)`` or ``(N, 3)`` positions, east-north(-up) [m]; heights are not used.
+
+        Returns
+        -------
+        up_m
+            ``(N,)`` float64 up coordinates; at the rim's beyond it.
+        normal
+            ``(N, 3)`` float32 unit normals of the interpolated slopes.
+        """
+        from scipy.ndimage import map_coordinates
+
+        position = np.asarray(position_m, np.float64)
+        column = (position[:, 0] - self.corner_m[0]) / self.step_m[0]
+        row = (self.corner_m[1] - position[:, 1]) / self.step_m[1]
+        east, north, up = (
+            map_coordinates(values, [row, column], order=1, mode="nearest", output=np.float64)
+            for values in np.moveaxis(self.slopes(), -1, 0)
+        )
+        normal = np.stack([-east, -north, np.ones_like(up)], axis=1)
+        return up, (normal / np.linalg.norm(normal, axis=1, keepdims=True)).astype(np.float32)
+
+
+@dataclass(frozen=True)
 class Terrain:
     """A triangulated terrain surface with texture coordinates.
 
@@ -49,12 +105,15 @@ class Terrain:
         ``(V, 2)`` float32 in [0, 1]; v points upwards: v = 1 is the upper edge of row 0 of a texture.
     frame
         Local frame of the vertices.
+    surface
+        The smooth surface that the triangles approximate; ``None``: shading interpolates normals of the triangles.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     uv: np.ndarray
     frame: LocalFrame
+    surface: SurfaceGrid | None = None
 
 
 @dataclass(frozen=True)
@@ -155,9 +214,11 @@ def save_terrain(terrain: Terrain, path: str | os.PathLike[str], *, note: dict[s
         JSON-serialisable metadata.
     """
     frame = np.array([getattr(terrain.frame, name) for name in LocalFrame.__dataclass_fields__], np.float64)
-    np.savez(
-        path, vertices=terrain.vertices, faces=terrain.faces, uv=terrain.uv, frame=frame, note=json.dumps(note or {})
-    )
+    arrays: dict[str, Any] = {"vertices": terrain.vertices, "faces": terrain.faces, "uv": terrain.uv, "frame": frame}
+    if terrain.surface is not None:
+        arrays["surface_up_m"] = terrain.surface.up_m
+        arrays["surface_grid"] = np.array([*terrain.surface.corner_m, *terrain.surface.step_m])
+    np.savez(path, note=json.dumps(note or {}), **arrays)
 
 
 def load_terrain(path: str | os.PathLike[str]) -> tuple[Terrain, dict[str, Any]]:
@@ -177,7 +238,12 @@ def load_terrain(path: str | os.PathLike[str]) -> tuple[Terrain, dict[str, Any]]
     """
     with np.load(path, allow_pickle=False) as stored:
         frame = LocalFrame(*map(float, stored["frame"]))
-        return Terrain(stored["vertices"], stored["faces"], stored["uv"], frame), json.loads(str(stored["note"]))
+        surface = None
+        if "surface_grid" in stored:
+            west, north, *step = map(float, stored["surface_grid"])
+            surface = SurfaceGrid((west, north), (step[0], step[1]), stored["surface_up_m"])
+        terrain = Terrain(stored["vertices"], stored["faces"], stored["uv"], frame, surface)
+        return terrain, json.loads(str(stored["note"]))
 
 
 def save_texture(texture: Texture, path: str | os.PathLike[str]) -> None:

@@ -73,7 +73,12 @@ def project_texels(camera: Camera, surface: TexelSurface) -> ProjectedTexels:
 
 
 def visible_by_ray(
-    terrain: RayScene, camera: Camera, surface: TexelSurface, projected: ProjectedTexels, *, offset_m: float | None = None
+    terrain: RayScene,
+    camera: Camera,
+    surface: TexelSurface,
+    projected: ProjectedTexels,
+    *,
+    offset_m: float | None = None,
 ) -> np.ndarray:
     """Return which surface points are visible from a camera, by one shadow ray each.
 

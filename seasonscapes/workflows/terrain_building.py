@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +15,7 @@ from seasonscapes.terrain.mesh import MESHERS, build_mesh
 from seasonscapes.terrain.raster import bounds_geographic, centre_frame, fill_nodata, read_elevation
 from seasonscapes.terrain.refine import refine_raster, refinement_factor
 from seasonscapes.terrain.surface import Raster, Terrain, load_terrain, save_terrain
+from seasonscapes.terrain.surface_grid import surface_grid
 from seasonscapes.terrain.synthetic import alpine_massif, load_massif, save_massif
 from seasonscapes.terrain.unwrap import ATLASES, Atlas, unwrap
 
@@ -150,7 +151,13 @@ def build_terrain(
     spacing_m = sample_spacing_m(elevation)
     factor = options.refine or refinement_factor(elevation.values[..., 0].size, spacing_m)
     bound = options.max_error_m or min(5.0, spacing_m / factor / 15.0)
-    terrain = build_mesh(refine_raster(elevation, factor), frame, mesher=options.mesher, max_error_m=bound)
+    refined = refine_raster(elevation, factor)
+    terrain = build_mesh(refined, frame, mesher=options.mesher, max_error_m=bound)
+    if options.mesher != "poisson":
+        (west, south), (east, north) = (
+            getattr(terrain.vertices[:, :2].astype(np.float64), end)(axis=0) for end in ("min", "max")
+        )
+        terrain = replace(terrain, surface=surface_grid(refined, frame, (west, south, east, north)))
     texel_m = _texel_m(terrain, elevation, scene, options)
     return unwrap(terrain, kind=options.atlas, texel_m=texel_m, max_side_px=options.max_side_px)
 

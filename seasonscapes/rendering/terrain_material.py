@@ -1,0 +1,199 @@
+"""Lambertian material of terrain whose normals come from a smooth surface instead of the triangles.
+
+The triangles decide what is visible. Slopes for shading are those of the heights (`terrain.surface.SurfaceGrid`), so that
+large facets shade like the ground that they approximate: a plain stays level up to the foot of a cliff, and shaded
+slopes show no triangles. A facet is lit and seen as the surface that it approximates:
+
+* It reflects towards every viewer that sees its front, also where the smooth normal faces away from the viewer. Normals
+  that face away would otherwise make black slivers along crests.
+* Rays start from the smooth surface where this lies above the facet (cf. Hanika 2021, "Hacking the shadow terminator",
+  in Ray Tracing Gems II, doi:10.1007/978-1-4842-7185-8_4), and not from the facet, whose plane would cut them off.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from seasonscapes.rendering.backend import use_backend
+from seasonscapes.terrain.surface import SurfaceGrid
+
+# Mitsuba's math::RayEpsilon in single precision.
+RAY_EPSILON = float(np.finfo(np.float32).epsneg) * 1500.0
+_PLUGIN = "seasonscapes_terrain"
+_registered: set[str] = set()
+
+
+class DeviceSurface:
+    """A `SurfaceGrid` on the Dr.Jit device.
+
+    Parameters
+    ----------
+    grid
+        The surface.
+    """
+
+    def __init__(self, grid: SurfaceGrid) -> None:
+        import drjit as dr
+        import mitsuba as mi
+
+        rows, columns = grid.up_m.shape
+        # Without the texture units of a GPU, whose interpolation weights have 8 bits.
+        self._mi_texture: Any = mi.Texture2f(  # pyright: ignore[reportCallIssue]
+            mi.TensorXf(grid.slopes()), use_accel=False, wrap_mode=dr.WrapMode.Clamp
+        )
+        (west, north), (east_step, south_step) = grid.corner_m, grid.step_m
+        self._mi_scale = mi.Point2f(dr.opaque(mi.Float, 1.0 / (east_step * columns)), -1.0 / (south_step * rows))
+        self._mi_offset = mi.Point2f(
+            dr.opaque(mi.Float, 0.5 / columns - west / (east_step * columns)), 0.5 / rows + north / (south_step * rows)
+        )
+
+    def sample(self, mi_position: Any, active: Any = True) -> tuple[Any, Any]:
+        """Return the unit normal ``mi.Normal3f`` and the up coordinate ``mi.Float`` [m] of the surface at positions."""
+        import drjit as dr
+        import mitsuba as mi
+
+        uv = dr.fma(mi.Point2f(mi_position.x, mi_position.y), self._mi_scale, self._mi_offset)
+        east, north, up = self._mi_texture.eval(uv, active)
+        return dr.normalize(mi.Normal3f(-east, -north, 1.0)), up
+
+
+def shading_normal(material: Any, interaction: Any, active: Any = True) -> Any:
+    """Return the shading normal of surface interactions on terrain.
+
+    Parameters
+    ----------
+    material
+        Of the terrain's mesh.
+    interaction
+        ``mi.SurfaceInteraction3f``.
+    active
+        ``mi.Bool``.
+
+    Returns
+    -------
+    mi.Normal3f
+        Of the smooth surface, or interpolated over the facet where the terrain has none.
+    """
+    surface = getattr(material, "surface", None)
+    return interaction.sh_frame.n if surface is None else surface.sample(interaction.p, active)[0]
+
+
+def leaving_points(material: Any, interaction: Any, active: Any = True) -> tuple[Any, Any, Any]:
+    """Return where rays leave a surface: their origins, the normal of the surface there, and the shading normal.
+
+    Parameters
+    ----------
+    material
+        Of the terrain's mesh.
+    interaction
+        ``mi.SurfaceInteraction3f``.
+    active
+        ``mi.Bool``.
+
+    Returns
+    -------
+    origin
+        ``mi.Point3f`` off the surface by the offset of Mitsuba's own rays, and lifted to the smooth surface where this
+        lies above the facet.
+    outward
+        ``mi.Normal3f``; rays on its other side enter the surface.
+    normal
+        ``mi.Normal3f`` for shading.
+    """
+    import drjit as dr
+
+    offset = (1.0 + dr.max(dr.abs(interaction.p))) * RAY_EPSILON
+    surface = getattr(material, "surface", None)
+    if surface is None:
+        return interaction.p + interaction.n * offset, interaction.n, interaction.sh_frame.n
+    normal, up = surface.sample(interaction.p, active)
+    # The distance to a slope is less than the vertical one.
+    lift = dr.maximum(up - interaction.p.z, 0.0) * normal.z
+    return interaction.p + interaction.n * offset + normal * lift, normal, normal
+
+
+def terrain_material(reflectance: dict[str, Any], surface: SurfaceGrid | None) -> Any:
+    """Create the material of a terrain.
+
+    Parameters
+    ----------
+    reflectance
+        Mitsuba's dictionary of a texture.
+    surface
+        The smooth surface; ``None`` gives Mitsuba's own diffuse material with the normals of the mesh, and so does the
+        scalar variant, which would call Python for every sample.
+
+    Returns
+    -------
+    mi.BSDF
+        Lambertian, one-sided.
+    """
+    import mitsuba as mi
+
+    if surface is None or use_backend().device == "scalar":
+        return mi.load_dict({"type": "diffuse", "reflectance": reflectance})
+    variant = mi.variant()
+    assert variant is not None
+    if variant not in _registered:
+        mi.register_bsdf(_PLUGIN, _material_class())
+        _registered.add(variant)
+    material: Any = mi.load_dict({"type": _PLUGIN, "reflectance": reflectance})
+    material.surface = DeviceSurface(surface)
+    return material
+
+
+def _material_class() -> Any:
+    """The material as a plug-in of the present variant of Mitsuba."""
+    import drjit as dr
+    import mitsuba as mi
+
+    class TerrainMaterial(mi.BSDF):
+        """Lambertian reflection about the normals of ``surface``, whatever the normals of the mesh."""
+
+        def __init__(self, properties: Any) -> None:
+            super().__init__(properties)
+            self.reflectance = properties["reflectance"]
+            self.surface: Any = None
+            flags = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
+            self.m_components, self.m_flags = [flags], flags
+
+        def _normal(self, si: Any, active: Any) -> Any:
+            return self.surface.sample(si.p, active)[0]
+
+        def _front(self, si: Any, active: Any) -> Any:
+            return active & (dr.dot(si.n, si.to_world(si.wi)) > 0.0)
+
+        def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any) -> Any:
+            local = mi.warp.square_to_cosine_hemisphere(sample2)
+            active = self._front(si, active)
+            result = dr.zeros(mi.BSDFSample3f)
+            result.wo = si.to_local(mi.Frame3f(self._normal(si, active)).to_world(local))
+            result.pdf = mi.warp.square_to_cosine_hemisphere_pdf(local)
+            result.eta = 1.0
+            result.sampled_type = mi.UInt32(int(self.m_flags))
+            result.sampled_component = mi.UInt32(0)
+            return result, dr.select(active, self.reflectance.eval(si, active), 0.0)
+
+        def eval(self, ctx: Any, si: Any, wo: Any, active: Any) -> Any:
+            return self.eval_pdf(ctx, si, wo, active)[0]
+
+        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any) -> Any:
+            return self.eval_pdf(ctx, si, wo, active)[1]
+
+        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any) -> Any:
+            active = self._front(si, active)
+            cosine = dr.maximum(dr.dot(self._normal(si, active), si.to_world(wo)), 0.0) * dr.inv_pi
+            return (dr.select(active, self.reflectance.eval(si, active) * cosine, 0.0), dr.select(active, cosine, 0.0))
+
+        def eval_diffuse_reflectance(self, si: Any, active: Any) -> Any:
+            return self.reflectance.eval(si, active)
+
+        def traverse(self, callback: Any) -> None:
+            callback.put("reflectance", self.reflectance, mi.ParamFlags.Differentiable)
+
+        def to_string(self) -> str:
+            return "TerrainMaterial[]"
+
+    return TerrainMaterial
