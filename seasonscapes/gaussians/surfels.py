@@ -193,8 +193,11 @@ def _cells(terrain: Terrain, grid: SurfelGrid, at_vertices: np.ndarray) -> tuple
     corners = terrain.faces[face_id.ravel()[covered]]
     centre = np.stack([covered % columns, covered // columns], axis=-1) + 0.5
     weights = barycentric(texel_coordinates(flat, columns, rows)[corners], centre)
-    normal = np.einsum("nk,nkc->nc", weights, at_vertices[corners])
-    normals[covered] = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    if terrain.surface is None:
+        normal = np.einsum("nk,nkc->nc", weights, at_vertices[corners])
+        normals[covered] = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    else:
+        normals[covered] = terrain.surface.sample(positions.reshape(-1, 3)[covered])[1]
     uv[covered] = np.einsum("nk,nkc->nc", weights, terrain.uv[corners])
 
     def by_cell(values: np.ndarray) -> np.ndarray:

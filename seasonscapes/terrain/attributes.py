@@ -78,7 +78,10 @@ def texel_attributes(terrain: Terrain, shape: tuple[int, int]) -> tuple[TerrainA
     corners = terrain.faces[face_id.ravel()[texel]]
     centre = np.stack([texel % width, texel // width], axis=-1) + 0.5
     weights = barycentric(texel_coordinates(terrain.uv, width, height)[corners], centre)
-    normal = np.einsum("nk,nkc->nc", weights, vertex_normals(terrain)[corners])
+    if terrain.surface is None:
+        normal = np.einsum("nk,nkc->nc", weights, vertex_normals(terrain)[corners])
+    else:
+        normal = terrain.surface.sample(position.reshape(-1, 3)[texel])[1]
     area_m2 = float(np.prod(np.ptp(terrain.vertices[:, :2].astype(np.float64), axis=0)))
     return attributes_at(position.reshape(-1, 3)[texel], normal, np.sqrt(area_m2 / max(len(texel), 1))), texel
 

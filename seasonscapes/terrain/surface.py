@@ -116,6 +116,34 @@ class Terrain:
     surface: SurfaceGrid | None = None
 
 
+def mesh_up_m(terrain: Terrain, position_m: np.ndarray) -> float:
+    """Find the up coordinate of the uppermost triangle at a horizontal position.
+
+    Parameters
+    ----------
+    terrain
+        The mesh.
+    position_m
+        ``(2,)`` or ``(3,)`` position, east-north(-up) [m]; the height is not used.
+
+    Returns
+    -------
+    float
+        Up coordinate [m]; NaN where no triangle covers the position.
+    """
+    point = np.asarray(position_m, np.float64)[:2]
+    corners = terrain.vertices[terrain.faces, :2]
+    near = (corners.min(axis=1) <= point + 1e-3).all(axis=1) & (corners.max(axis=1) >= point - 1e-3).all(axis=1)
+    a, b, c = np.moveaxis(terrain.vertices[terrain.faces[near]].astype(np.float64), 1, 0)
+    matrix = np.stack([(b - a)[:, :2], (c - a)[:, :2]], axis=2)
+    determinant = np.linalg.det(matrix)
+    plain = np.abs(determinant) > 1e-9
+    weights = np.linalg.solve(matrix[plain], (point - a[plain, :2])[..., None])[..., 0]
+    inside = (weights >= -1e-6).all(axis=1) & (weights.sum(axis=1) <= 1.0 + 1e-6)
+    up = a[plain, 2] + weights[:, 0] * (b - a)[plain, 2] + weights[:, 1] * (c - a)[plain, 2]
+    return float(up[inside].max()) if inside.any() else float("nan")
+
+
 @dataclass(frozen=True)
 class Texture:
     """An image over the UV atlas of a terrain.

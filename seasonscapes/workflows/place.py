@@ -12,11 +12,11 @@ import numpy as np
 
 from seasonscapes import bundled
 from seasonscapes.errors import InputError
-from seasonscapes.frames import LocalFrame
+from seasonscapes.frames import LocalFrame, enu_from_geodetic
 from seasonscapes.progress import Progress, task_progress
 from seasonscapes.scene import SceneFile, read_scene
 from seasonscapes.source_hash import source_hash
-from seasonscapes.terrain.surface import Raster, Terrain, Texture, atlas_identity, require_atlas
+from seasonscapes.terrain.surface import Raster, Terrain, Texture, atlas_identity, mesh_up_m, require_atlas
 from seasonscapes.workflows.terrain_building import MeshOptions
 from seasonscapes.workspace import Workspace, build_once, default_workspace, file_hash
 
@@ -212,7 +212,10 @@ def _massif(scene: SceneFile, workspace: Workspace) -> SyntheticMassif:
 
 
 def ground_height_m(place: Place, latitude_deg: float, longitude_deg: float, *, where: str) -> float:
-    """Height of the terrain at a position in the scene's vertical datum [m].
+    """Height of the rendered terrain at a position in the scene's vertical datum [m].
+
+    The mesh may lie above the heights of the raster, most of all on summits, since it follows a smooth surface through
+    the samples: a camera 2 m above the raster could stand inside it.
 
     Parameters
     ----------
@@ -230,7 +233,7 @@ def ground_height_m(place: Place, latitude_deg: float, longitude_deg: float, *, 
     """
     from seasonscapes.terrain.raster import bounds_geographic
 
-    height = float(_height_or_nan(place, latitude_deg, longitude_deg))
+    height = ground_or_nan(place, latitude_deg, longitude_deg)
     if not np.isfinite(height):
         west, south, east, north = bounds_geographic(place.elevation)
         raise InputError(
@@ -242,11 +245,15 @@ def ground_height_m(place: Place, latitude_deg: float, longitude_deg: float, *, 
     return height
 
 
-def _height_or_nan(place: Place, latitude_deg: float, longitude_deg: float) -> float:
+def ground_or_nan(place: Place, latitude_deg: float, longitude_deg: float) -> float:
+    """`ground_height_m`, or NaN outside the elevation raster."""
     from seasonscapes.terrain.raster import map_from_geodetic, sample_raster
 
     x, y = map_from_geodetic(place.elevation.crs, latitude_deg, longitude_deg)
-    return float(sample_raster(place.elevation, x, y)[..., 0])
+    height = float(sample_raster(place.elevation, x, y)[..., 0])
+    position = enu_from_geodetic(place.frame, latitude_deg, longitude_deg, np.nan_to_num(height))
+    rendered = mesh_up_m(place.terrain, position)
+    return height + (rendered - float(position[2])) if np.isfinite(rendered) else height
 
 
 def utc_at(place: Place, time: str | datetime) -> datetime:

@@ -9,7 +9,7 @@ import numpy as np
 from seasonscapes.errors import InputError
 from seasonscapes.frames import geodetic_from_enu
 from seasonscapes.scene import NamedCamera, Viewpoint, camera_from_named_view
-from seasonscapes.workflows.place import Place, ground_height_m
+from seasonscapes.workflows.place import Place, ground_height_m, ground_or_nan
 
 if TYPE_CHECKING:
     from seasonscapes.cameras.panorama import Panorama
@@ -75,13 +75,10 @@ def camera_for(place: Place, view: Viewpoint, *, size_px: tuple[int, int], where
     InputError
         Where it stands below the ground or, given above ground, outside the raster.
     """
-    from seasonscapes.terrain.raster import map_from_geodetic, sample_raster
-
     if view.above_ground_m is not None:
         ground = ground_height_m(place, view.latitude_deg, view.longitude_deg, where=where)
     else:
-        x, y = map_from_geodetic(place.elevation.crs, view.latitude_deg, view.longitude_deg)
-        ground = float(sample_raster(place.elevation, x, y)[..., 0])  # NaN outside the raster
+        ground = ground_or_nan(place, view.latitude_deg, view.longitude_deg)
         if view.height_m is not None and view.height_m < ground:
             raise InputError(
                 where,
