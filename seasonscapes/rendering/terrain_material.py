@@ -168,7 +168,7 @@ def _material_class() -> Any:
         def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any) -> Any:
             local = mi.warp.square_to_cosine_hemisphere(sample2)
             active = self._front(si, active)
-            result = dr.zeros(mi.BSDFSample3f)
+            result: Any = dr.zeros(mi.BSDFSample3f)
             result.wo = si.to_local(mi.Frame3f(self._normal(si, active)).to_world(local))
             result.pdf = mi.warp.square_to_cosine_hemisphere_pdf(local)
             result.eta = 1.0
