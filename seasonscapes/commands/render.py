@@ -22,8 +22,9 @@ def render_command(
     sky: SkyOptions | None = None,
     albedo: list[str] | None = None,
     season: str = "blended",
-    spp: int = 32,
-    max_depth: int = 6,
+    engine: str = "auto",
+    spp: int | None = None,
+    max_depth: int | None = None,
     exposure: str = "auto",
     seed: int = 0,
     output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("out/render.png"),
@@ -43,10 +44,13 @@ def render_command(
         DATE=FILE.npz, may be repeated: recovered albedos of a date instead of the scene's own.
     season
         How to interpolate between them: blended, nearest or snow-line, as of timelapse.
+    engine
+        transport (light transport of the view, kept for its next picture, no grain), path (path tracing, the reference),
+        or auto: path where --spp or --max-depth is given, else transport.
     spp
-        Samples per pixel; powers of two are best.
+        Of path tracing: samples per pixel, default 32; powers of two are best.
     max_depth
-        Longest light path; 2 is direct light only.
+        Of path tracing: longest light path, default 6; 2 is direct light only.
     exposure
         auto (a camera), eye (an adapted observer), or an exposure value EV100 (15 is a sunny day).
     seed
@@ -61,8 +65,10 @@ def render_command(
     start = clock.perf_counter()
     view, sky, options = view or ViewOptions(), sky or SkyOptions(), place or PlaceOptions()
     check_suffix(output, (".png", ".exr"))
-    check_range("--spp", spp, 1, 1 << 20)
-    check_range("--max-depth", max_depth, 2, 1000)
+    if spp is not None:
+        check_range("--spp", spp, 1, 1 << 20)
+    if max_depth is not None:
+        check_range("--max-depth", max_depth, 2, 1000)
     check_range("--seed", seed, 0, 2**32)
     from seasonscapes.albedo.seasons import AlbedoSeries
     from seasonscapes.exposure import develop, exposure_ev100, parse_exposure
@@ -101,5 +107,6 @@ def render_command(
     else:
         save_exr(output, picture, albedo=texture, header={"seasonscapes:view": chosen.model_dump()})
     record["seconds"] = round(clock.perf_counter() - start, 2)
-    facts = f"{spp} samples per pixel, EV {ev100:.1f}, {record['seconds']} s, {record['variant']}"
+    how = "light transport" if record["engine"] == "transport" else f"{record['spp']} samples per pixel"
+    facts = f"{how}, EV {ev100:.1f}, {record['seconds']} s, {record['variant']}"
     print_result(record, [f"{output}  ({size_px[0]} × {size_px[1]}, {facts})"], as_json=json)

@@ -154,7 +154,7 @@ def _material_class() -> Any:
 
         def __init__(self, properties: Any) -> None:
             super().__init__(properties)
-            self.reflectance = properties["reflectance"]
+            self.reflectance = properties.get_texture("reflectance")
             self.surface: Any = None
             flags = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
             self.m_components, self.m_flags = [flags], flags

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from seasonscapes.rendering.hemisphere_rays import RayScene
     from seasonscapes.rendering.radiance import RenderedView
     from seasonscapes.rendering.relit_view import RelightableView
-    from seasonscapes.rendering.transport import ViewCoefficients
+    from seasonscapes.rendering.transport import SamplingOptions, ViewCoefficients
 
 _COEFFICIENTS_CODE = ("rendering.transport", "rendering.coefficients_file")
 _VIEW_ALBEDO_CODE = ("rendering.transport", "rendering.relit_view")
@@ -141,6 +141,7 @@ def relight_session(
     albedo: AlbedoSource = None,
     base_day: date = _MIDSUMMER,
     seed: int = 0,
+    sampling: SamplingOptions | None = None,
     progress: Progress | None = None,
 ) -> RelightSession:
     """Trace the light transport of a view once, so that every instant costs a fraction of a second.
@@ -161,6 +162,8 @@ def relight_session(
         Date of the albedo that the transport is traced with; best one of those that are to be rendered.
     seed
         Equal seeds give equal results.
+    sampling
+        Number of samples and rays; the default suits films, whose frames share the coefficients.
     progress
         Called with a task and its finished share.
 
@@ -201,7 +204,7 @@ def relight_session(
     scene = ray_scene(mi_mesh(place.terrain, base.load().values))
     tabulate_illumination(place, camera, model, progress=task_progress(progress, "light transport", end=0.1))
     inputs = {"place": place.key, **_camera_values(camera), "albedo": _identity(base), "seed": seed}
-    coefficients = _coefficients(place, camera, scene, inputs, seed, progress)
+    coefficients = _coefficients(place, camera, scene, inputs, seed, sampling, progress)
     relightable = relightable_view(scene, coefficients)
     return RelightSession(place, camera, model, albedo, base, seed, coefficients, scene, relightable)
 
@@ -273,12 +276,18 @@ def session_of(job: RenderJob, place: Place, *, progress: Progress | None = None
 
 
 def _coefficients(
-    place: Place, camera: Camera | Panorama, scene: RayScene, inputs: dict, seed: int, progress: Progress | None
+    place: Place,
+    camera: Camera | Panorama,
+    scene: RayScene,
+    inputs: dict,
+    seed: int,
+    sampling: SamplingOptions | None,
+    progress: Progress | None,
 ) -> ViewCoefficients:
     from seasonscapes.rendering.coefficients_file import load_coefficients, save_coefficients
     from seasonscapes.rendering.transport import SamplingOptions, ViewCoefficients, trace_view
 
-    sampling = SamplingOptions()
+    sampling = sampling or SamplingOptions()
     key = artefact_key(inputs | {"sampling": asdict(sampling)}, _COEFFICIENTS_CODE)
     folder = place.workspace.folder / f"{place.scene.name}/coefficients-{key}"
     if not (folder / "coefficients.json").is_file():
