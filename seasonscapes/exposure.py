@@ -11,7 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from seasonscapes.errors import InputError
-from seasonscapes.images import METER_CONSTANT, REC709_LUMINANCE, auto_exposure_ev100, expose, tone_curve
+from seasonscapes.images import EXPOSURE_GAIN, METER_CONSTANT, REC709_LUMINANCE, auto_exposure_ev100, expose, tone_curve
+from seasonscapes.photo_look import balanced, highlight_stops, photo_curve
 
 # Below this metered EV the scene is under-exposed by a quarter stop for each stop below it, by at most three stops.
 _DIM_EV, _DIM_SLOPE, _MAX_UNDEREXPOSURE = 4.0, 0.25, 3.0
@@ -23,6 +24,7 @@ _SCOTOPIC = np.array([0.0627, 0.6072, 0.3301])
 _NIGHT_TINT = np.array([0.62, 0.80, 1.35])
 
 MODES = ("auto", "eye")
+LOOKS = ("neutral", "photo")
 
 
 def parse_exposure(text: str) -> str | float:
@@ -56,7 +58,7 @@ def parse_exposure(text: str) -> str | float:
     return value
 
 
-def exposure_ev100(image: np.ndarray, exposure: str | float = "auto") -> float:
+def exposure_ev100(image: np.ndarray, exposure: str | float = "auto", *, look: str = "neutral") -> float:
     """Compute the EV100 of an image under an exposure mode.
 
     Parameters
@@ -65,6 +67,8 @@ def exposure_ev100(image: np.ndarray, exposure: str | float = "auto") -> float:
         Scene-linear image ``(H, W, 3)`` [cd/m²].
     exposure
         One of `MODES`, or an EV100, which is returned unchanged.
+    look
+        One of `LOOKS`; ``photo`` brings the highlights near white.
 
     Returns
     -------
@@ -84,7 +88,8 @@ def exposure_ev100(image: np.ndarray, exposure: str | float = "auto") -> float:
         raise ValueError(f"exposure: got {exposure!r}, expected one of {', '.join(MODES)} or a number")
     metered = auto_exposure_ev100(image)
     if exposure == "auto":
-        return metered + float(np.clip(_DIM_SLOPE * (_DIM_EV - metered), 0.0, _MAX_UNDEREXPOSURE))
+        metered += float(np.clip(_DIM_SLOPE * (_DIM_EV - metered), 0.0, _MAX_UNDEREXPOSURE))
+        return metered - (highlight_stops(expose(image, metered) * EXPOSURE_GAIN, metered) if look == "photo" else 0.0)
     return metered + _adaptation_stops(METER_CONSTANT * 2.0**metered)
 
 
@@ -100,7 +105,14 @@ def _adaptation_stops(luminance: float) -> float:
     return float(max(np.log2(key(1000.0) / key(luminance)), 0.0))
 
 
-def develop(image: np.ndarray, ev100: float, *, eye: bool = False) -> np.ndarray:
+def develop(
+    image: np.ndarray,
+    ev100: float,
+    *,
+    eye: bool = False,
+    look: str = "neutral",
+    white: tuple[float, float, float] | None = None,
+) -> np.ndarray:
     """Convert a scene-linear image to a display-linear picture.
 
     Parameters
@@ -111,14 +123,28 @@ def develop(image: np.ndarray, ev100: float, *, eye: bool = False) -> np.ndarray
         Exposure, from `exposure_ev100`.
     eye
         Model rod vision: dim pixels are desaturated and shifted towards blue (the Purkinje shift).
+    look
+        ``neutral``, linear up to a shoulder, or ``photo``, see `photo_look`.
+    white
+        Of the look ``photo``: the colour that becomes neutral, linear Rec.709.
 
     Returns
     -------
     ndarray
         Display-linear picture ``(H, W, 3)`` in [0, 1].
+
+    Raises
+    ------
+    InputError
+        For an unknown look.
     """
+    if look not in LOOKS:
+        raise InputError("--look", "unknown look", got=look, expected=", ".join(LOOKS))
     if eye:
         image = _blend_rod_vision(np.asarray(image, np.float64))
+    if look == "photo":
+        image = image if white is None else balanced(image, white)
+        return photo_curve(expose(image, ev100) * EXPOSURE_GAIN)
     return tone_curve(expose(image, ev100))
 
 

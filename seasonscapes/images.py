@@ -154,7 +154,7 @@ def expose(image: np.ndarray, ev100: float) -> np.ndarray:
 
 # Shape of the tone curve: a constant gain, linear (no toe) up to the start of the shoulder, then a long soft shoulder.
 _SHOULDER_START, _WHITE = 0.30, 8.0
-_EXPOSURE_GAIN = 1.6
+EXPOSURE_GAIN = 1.6
 
 
 def tone_curve(exposed: np.ndarray) -> np.ndarray:
@@ -175,7 +175,7 @@ def tone_curve(exposed: np.ndarray) -> np.ndarray:
     ndarray
         Display-linear values in [0, 1] ``(..., 3)``, float32.
     """
-    colour = np.maximum(np.asarray(exposed, np.float32) * _EXPOSURE_GAIN, 0.0)
+    colour = np.maximum(np.asarray(exposed, np.float32) * EXPOSURE_GAIN, 0.0)
     peak = colour.max(axis=-1, keepdims=True)
     start, span = _SHOULDER_START, 1.0 - _SHOULDER_START
     excess = np.maximum(peak - start, 0.0)

@@ -19,7 +19,7 @@ from seasonscapes.cli import main
 from seasonscapes.errors import AtlasMismatch, InputError
 from seasonscapes.relighting.exposure_smoothing import smoothed_ev100
 from seasonscapes.relighting.film import write_video
-from seasonscapes.relighting.frame_file import frame_ev100, load_frame, save_frame
+from seasonscapes.relighting.frame_file import frame_header, load_frame, save_frame
 from seasonscapes.relighting.luminous_efficacy import efficacies_lm_w
 from seasonscapes.scene import read_scene
 from seasonscapes.sky.models import read_sky_model
@@ -97,7 +97,7 @@ def test_frame_files_hold_night_and_day(tmp_path, level):
     save_frame(tmp_path / "a.exr", radiance, metered_ev100=metered, provenance={"scene": "x"})
     back, ev100 = load_frame(tmp_path / "a.exr")
     np.testing.assert_allclose(back[1:], radiance[1:], rtol=1e-3)
-    assert ev100 == frame_ev100(tmp_path / "a.exr") == pytest.approx(metered, abs=1e-5)
+    assert ev100 == frame_header(tmp_path / "a.exr")[0] == pytest.approx(metered, abs=1e-5)
     assert np.isfinite(back).all()
 
 

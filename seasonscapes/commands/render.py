@@ -10,6 +10,7 @@ from cyclopts import Parameter
 
 from seasonscapes.commands.arguments import check_range, check_suffix, parse_albedo, parse_time
 from seasonscapes.commands.console import print_result, progress_bars
+from seasonscapes.commands.look_options import LookOptions
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
 from seasonscapes.commands.view_options import ViewOptions
 
@@ -20,12 +21,12 @@ def render_command(
     time: str,
     view: ViewOptions | None = None,
     sky: SkyOptions | None = None,
+    look: LookOptions | None = None,
     albedo: list[str] | None = None,
     season: str = "blended",
     engine: str = "auto",
     spp: int | None = None,
     max_depth: int | None = None,
-    exposure: str = "auto",
     seed: int = 0,
     output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("out/render.png"),
     place: PlaceOptions | None = None,
@@ -51,8 +52,6 @@ def render_command(
         Of path tracing: samples per pixel, default 32; powers of two are best.
     max_depth
         Of path tracing: longest light path, default 6; 2 is direct light only.
-    exposure
-        auto (a camera), eye (an adapted observer), or an exposure value EV100 (15 is a sunny day).
     seed
         Equal seeds give equal pictures.
     output
@@ -63,7 +62,12 @@ def render_command(
         Print one machine-readable record.
     """
     start = clock.perf_counter()
-    view, sky, options = view or ViewOptions(), sky or SkyOptions(), place or PlaceOptions()
+    view, sky, look, options = (
+        view or ViewOptions(),
+        sky or SkyOptions(),
+        look or LookOptions(),
+        place or PlaceOptions(),
+    )
     check_suffix(output, (".png", ".exr"))
     if spp is not None:
         check_range("--spp", spp, 1, 1 << 20)
@@ -71,13 +75,13 @@ def render_command(
         check_range("--max-depth", max_depth, 2, 1000)
     check_range("--seed", seed, 0, 2**32)
     from seasonscapes.albedo.seasons import AlbedoSeries
-    from seasonscapes.exposure import develop, exposure_ev100, parse_exposure
     from seasonscapes.rendering.backend import use_backend
     from seasonscapes.workflows.albedo_sources import chosen_albedo, dated_albedos, require_season
     from seasonscapes.workflows.pictures import png_metadata, save_exr, save_png
     from seasonscapes.workflows.view_rendering import render
 
-    metering, size_px, model = parse_exposure(exposure), view.size_px(), sky.model()
+    look.metering()
+    size_px, model = view.size_px(), sky.model()
     require_season(season, where="--season")
     files = [parse_albedo(text) for text in albedo or ()]
     use_backend(device)
@@ -88,10 +92,19 @@ def render_command(
         series = AlbedoSeries(tuple(dated_albedos(loaded, files)), season) if files else None
         texture = chosen_albedo(loaded, utc.date(), series)
         picture = render(
-            loaded, camera, utc, sky=model, albedo=texture, spp=spp, max_depth=max_depth, seed=seed, progress=progress
+            loaded,
+            camera,
+            utc,
+            sky=model,
+            albedo=texture,
+            engine=engine,
+            spp=spp,
+            max_depth=max_depth,
+            seed=seed,
+            progress=progress,
         )
     record = picture.provenance
-    ev100 = exposure_ev100(picture.radiance, metering)
+    ev100 = look.ev100(picture.radiance)
     record |= {
         "output": str(output),
         "camera": chosen.name,
@@ -102,8 +115,7 @@ def render_command(
         "exposure_ev100": round(ev100, 3),
     }
     if output.suffix.lower() == ".png":
-        shown = develop(picture.radiance, ev100, eye=metering == "eye")
-        save_png(output, shown, metadata=png_metadata(record))
+        save_png(output, look.develop(picture.radiance, record["white_rgb"]), metadata=png_metadata(record))
     else:
         save_exr(output, picture, albedo=texture, header={"seasonscapes:view": chosen.model_dump()})
     record["seconds"] = round(clock.perf_counter() - start, 2)

@@ -12,6 +12,7 @@ from cyclopts import Parameter
 from seasonscapes import __version__
 from seasonscapes.commands.arguments import check_choice, check_range, check_suffix, parse_time
 from seasonscapes.commands.console import print_result, progress_bars
+from seasonscapes.commands.look_options import LookOptions
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
 from seasonscapes.commands.view_options import ViewOptions
 from seasonscapes.errors import InputError, NoTerrainInView
@@ -24,7 +25,7 @@ def splat_command(
     model: Path = Path("out/gaussians.safetensors"),
     view: ViewOptions | None = None,
     sky: SkyOptions | None = None,
-    exposure: str = "auto",
+    look: LookOptions | None = None,
     subpixels: int = 2,
     output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("out/splat.png"),
     place: PlaceOptions | None = None,
@@ -41,8 +42,6 @@ def splat_command(
         ISO 8601, such as 2024-09-01T12:00. Without an offset it is civil time at the camera.
     model
         From `seasonscapes distill`.
-    exposure
-        auto (a camera), eye (an adapted observer), or an exposure value EV100 (15 is a sunny day).
     subpixels
         Samples along a pixel's side; 1 is four times as fast as 2.
     output
@@ -52,7 +51,12 @@ def splat_command(
     json
         Print one machine-readable record.
     """
-    view, sky, options = view or ViewOptions(), sky or SkyOptions(), place or PlaceOptions()
+    view, sky, look, options = (
+        view or ViewOptions(),
+        sky or SkyOptions(),
+        look or LookOptions(),
+        place or PlaceOptions(),
+    )
     start = clock.perf_counter()
     check_suffix(output, (".png", ".exr", ".ply", ".glb"))
     check_range("--subpixels", subpixels, 1, 4)
@@ -61,7 +65,6 @@ def splat_command(
     from seasonscapes.workflows.distillation import require_torch
 
     require_torch()
-    from seasonscapes.exposure import develop, exposure_ev100, parse_exposure
     from seasonscapes.gaussians.interchange import write_gltf, write_ply
     from seasonscapes.gaussians.model import load_model
     from seasonscapes.gaussians.rasterise import set_torch_threads
@@ -71,7 +74,7 @@ def splat_command(
     from seasonscapes.workflows.view_rendering import sun_angles
 
     set_torch_threads(1)
-    metering, size_px, declared = parse_exposure(exposure), view.size_px(), sky.model()
+    metering, size_px, declared = look.metering(), view.size_px(), sky.model()
     splats = load_model(model)
     with progress_bars() as progress:
         loaded = options.load(scene, progress)
@@ -98,11 +101,10 @@ def splat_command(
             picture, times_ms = gaussians.timed_view(splats, camera, light, day, subpixels=subpixels, device=device)
         except NoTerrainInView as error:
             raise InputError("--camera", str(error)) from None
-        ev100 = exposure_ev100(picture.radiance, metering)
+        ev100 = look.ev100(picture.radiance)
         record |= {"camera": chosen.name, "size_px": list(size_px), **times_ms, "exposure_ev100": round(ev100, 3)}
         if suffix == ".png":
-            shown = develop(picture.radiance, ev100, eye=metering == "eye")
-            save_png(output, shown, metadata=png_metadata(record))
+            save_png(output, look.develop(picture.radiance, light.white_rgb), metadata=png_metadata(record))
         else:
             layers = {"": picture.radiance, "surface": picture.surface, "alpha": picture.coverage}
             layers |= {"depth": picture.depth}

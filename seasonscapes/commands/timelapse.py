@@ -10,6 +10,7 @@ from cyclopts import Parameter
 
 from seasonscapes.commands.arguments import check_range, parse_albedo, parse_duration
 from seasonscapes.commands.console import print_result, progress_bars
+from seasonscapes.commands.look_options import LookOptions
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
 from seasonscapes.commands.view_options import ViewOptions, WhenOptions
 from seasonscapes.commands.work_options import WorkOptions
@@ -24,7 +25,7 @@ def timelapse_command(
     sky: SkyOptions | None = None,
     season: str = "blended",
     albedo: list[str] | None = None,
-    exposure: str = "auto",
+    look: LookOptions | None = None,
     smooth: str = "15min",
     fps: float = 24.0,
     exr: bool = False,
@@ -48,8 +49,6 @@ def timelapse_command(
         Between dated albedos: blended (linear), nearest, or snow-line (the snow line moves place by place).
     albedo
         DATE=FILE.npz, may be repeated: recovered albedos of a date instead of the scene's own.
-    exposure
-        auto (a camera), eye (an adapted observer), or an exposure value EV100.
     smooth
         Time constant of the exposure; 0s exposes each frame by itself.
     fps
@@ -69,8 +68,7 @@ def timelapse_command(
     """
     start = clock.perf_counter()
     when, view, sky = when or WhenOptions(), view or ViewOptions(), sky or SkyOptions()
-    work, place = work or WorkOptions(), place or PlaceOptions()
-    from seasonscapes.exposure import parse_exposure
+    work, place, look = work or WorkOptions(), place or PlaceOptions(), look or LookOptions()
     from seasonscapes.scene import read_scene
     from seasonscapes.workflows import timelapse as films
     from seasonscapes.workflows.albedo_sources import require_season
@@ -78,7 +76,7 @@ def timelapse_command(
     from seasonscapes.workflows.relight_session import RenderJob
 
     smooth_s = 0.0 if smooth in ("0", "0s") else parse_duration("--smooth", smooth).total_seconds()
-    look = films.FilmLook(parse_exposure(exposure), smooth_s, fps)
+    film_look = films.FilmLook(look.metering(), smooth_s, fps, look.look, look.white_balance)
     require_season(season, where="--season")
     if output.suffix.lower() not in (".mp4", ""):
         expected = "a name that ends in .mp4, or a folder"
@@ -111,7 +109,7 @@ def timelapse_command(
             job, chosen_times, cluster=work.cluster, exr_folder=exr_folder, progress=progress
         )
         if part is None:
-            films.develop_film(job, times, output, look, progress=progress)
+            films.develop_film(job, times, output, film_look, progress=progress)
             if not keep_frames:
                 films.remove_frames(job, times)
     record = {"scene": scene, "camera": chosen.name, "frames": len(chosen_times), "rendered": rendered}

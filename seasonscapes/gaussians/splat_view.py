@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -64,12 +65,15 @@ class SplatView:
         ``(H, W)`` fraction of each pixel that is terrain.
     depth
         ``(H, W)`` mean distance of the splats along the ray [m]; infinite where there are none.
+    provenance
+        Plain values about the view.
     """
 
     radiance: np.ndarray
     surface: np.ndarray
     coverage: np.ndarray
     depth: np.ndarray
+    provenance: dict[str, Any] = field(default_factory=dict)
 
 
 def appearance_of(model: GaussianModel, *, albedo: np.ndarray | None = None, seed: int = 0) -> Appearance:

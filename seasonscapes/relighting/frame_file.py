@@ -7,6 +7,7 @@ precision.
 
 from __future__ import annotations
 
+import json
 import os
 from datetime import datetime
 from pathlib import Path
@@ -59,8 +60,8 @@ def load_frame(path: Path) -> tuple[np.ndarray, float]:
     return layers[""].astype(np.float32) * np.float32(SATURATION_LUMINANCE * 2.0**metered), metered
 
 
-def frame_ev100(path: Path) -> float:
-    """Read the metered exposure of a frame [EV100], without its pixels.
+def frame_header(path: Path) -> tuple[float, dict[str, Any]]:
+    """Read the metered exposure and the provenance of a frame, without its pixels.
 
     Parameters
     ----------
@@ -69,13 +70,18 @@ def frame_ev100(path: Path) -> float:
 
     Returns
     -------
-    float
+    metered_ev100
         Metered exposure [EV100].
+    provenance
+        As given to `save_frame`.
     """
     import OpenEXR
 
     with OpenEXR.File(os.fspath(path), header_only=True) as file:
-        return float(file.header()["seasonscapes:metered_ev100"])
+        header = file.header()
+        provenance = header["seasonscapes:provenance"]
+        provenance = json.loads(provenance) if isinstance(provenance, str) else provenance
+        return float(header["seasonscapes:metered_ev100"]), provenance
 
 
 def time_stamp(time: datetime) -> str:

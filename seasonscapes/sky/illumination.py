@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from seasonscapes.frames import LocalFrame, equirectangular_directions
 from seasonscapes.images import REC709_LUMINANCE
+from seasonscapes.photo_look import white_point
 
 
 @dataclass(frozen=True)
@@ -114,6 +115,11 @@ class Illumination:
     def global_horizontal_lx(self) -> np.ndarray:
         """Illuminance ``(3,)`` of level ground from sun, moon and sky [lx]; see `global_horizontal_illuminance`."""
         return global_horizontal_illuminance(self)
+
+    @property
+    def white_rgb(self) -> tuple[float, float, float]:
+        """The colour that a camera takes for white under this light, linear Rec.709; see `photo_look.white_point`."""
+        return white_point(None if self.sun is None else np.asarray(self.sun.normal_illuminance_lx))
 
 
 def luminance(rgb: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from seasonscapes.civil_time import resolve_time
-from seasonscapes.exposure import develop, exposure_ev100
+from seasonscapes.exposure import exposure_ev100
 from seasonscapes.images import write_png, write_png8
 from seasonscapes.progress import Progress, each_reported
 from seasonscapes.scene import NamedCamera
@@ -19,6 +19,7 @@ from seasonscapes.sky.models import read_sky_model
 from seasonscapes.source_hash import source_hash
 from seasonscapes.workflows.albedo_sources import scene_albedo
 from seasonscapes.workflows.illumination import illumination_for_camera
+from seasonscapes.workflows.pictures import develop
 from seasonscapes.workflows.place import MeshOptions, Place
 from seasonscapes.workflows.relight_session import RenderJob
 from seasonscapes.workflows.timelapse import FilmLook, develop_film, render_frames
@@ -27,6 +28,7 @@ from seasonscapes.workspace import content_key
 
 if TYPE_CHECKING:
     from seasonscapes.rendering.mitsuba_scene import RenderScene
+    from seasonscapes.rendering.radiance import RenderedView
 
 log = logging.getLogger(__name__)
 
@@ -161,12 +163,12 @@ class _PanelRenderer:
             with Image.open(path) as image:
                 if image.info.get("seasonscapes:panel") == key:
                     return path
-        radiance, ev100 = self._radiance(panel, size_px)
+        view, ev100 = self._view(panel, size_px)
         log.info("demo: %s  %s; EV %.1f", path.name, panel.caption, ev100)
-        write_png(path, develop(radiance, ev100), metadata={"seasonscapes:panel": key})
+        write_png(path, develop(view, exposure=ev100), metadata={"seasonscapes:panel": key})
         return path
 
-    def _radiance(self, panel: Panel, size_px: tuple[int, int]) -> tuple[np.ndarray, float]:
+    def _view(self, panel: Panel, size_px: tuple[int, int]) -> tuple[RenderedView, float]:
         from seasonscapes.rendering.radiance import render_view
 
         place, view = self.place, self.view
@@ -174,7 +176,9 @@ class _PanelRenderer:
         camera = camera_for(place, view, size_px=size_px)
         light, _ = illumination_for_camera(place, camera, read_sky_model(panel.sky), time)
         picture = render_view(self._scene(time.date(), light), camera, spp=self.spp)
-        return picture.radiance, exposure_ev100(picture.radiance)
+        return replace(picture, provenance={"white_rgb": light.white_rgb}), exposure_ev100(
+            picture.radiance, look="photo"
+        )
 
     def _scene(self, day: date, light: Any) -> RenderScene:
         from seasonscapes.rendering.mitsuba_scene import mi_mesh, relight

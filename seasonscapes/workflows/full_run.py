@@ -9,9 +9,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from seasonscapes.exposure import develop, exposure_ev100
+from seasonscapes.exposure import exposure_ev100
 from seasonscapes.images import atomic_path, write_png
 from seasonscapes.progress import Progress
 from seasonscapes.relighting.frame_file import time_stamp
@@ -26,6 +24,7 @@ from seasonscapes.workflows.gaussian_views import render_gaussians
 from seasonscapes.workflows.inpainting import InpaintOptions, inpaint
 from seasonscapes.workflows.painting import painting_of, painting_record
 from seasonscapes.workflows.photograph_files import PhotographSources, photographs_at
+from seasonscapes.workflows.pictures import develop
 from seasonscapes.workflows.place import Place
 from seasonscapes.workflows.predicted_radiance import RELATIVE_SIGMA, measured_radiance
 from seasonscapes.workflows.relight_session import RenderJob
@@ -307,7 +306,7 @@ def _splat(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
     camera = camera_for(job.place, job.view, size_px=job.size_px)
     for hour in _unique(job.hours):
         view = render_gaussians(model, job.place, camera, hour, sky=job.sky)
-        ev100 = exposure_ev100(view.radiance)
+        ev100 = exposure_ev100(view.radiance, look="photo")
         record = {
             "scene": job.place.scene.name,
             "camera": job.view.name,
@@ -316,7 +315,7 @@ def _splat(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
             "attribution": job.place.scene.attribution,
         }
         paths.append(own / f"{time_stamp(hour)}.png")
-        write_png(paths[-1], np.asarray(develop(view.radiance, ev100)), metadata={"seasonscapes": json.dumps(record)})
+        write_png(paths[-1], develop(view, exposure=ev100), metadata={"seasonscapes": json.dumps(record)})
     return paths
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time as clock
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -97,7 +98,8 @@ def render_gaussians(
     camera = view_in_frame(camera, place.frame)
     utc = utc_at(place, time)
     light, _ = illumination_for_camera(place, camera, sky_model(sky), utc)
-    return render_model(model, camera, light, day_of_year(utc), raster=RasterOptions(subpixels, device))
+    view = render_model(model, camera, light, day_of_year(utc), raster=RasterOptions(subpixels, device))
+    return replace(view, provenance={"white_rgb": light.white_rgb})
 
 
 def timed_view(

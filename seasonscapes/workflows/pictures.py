@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from seasonscapes import exposure as exposures
+from seasonscapes.errors import InputError
 from seasonscapes.images import write_exr, write_png
+from seasonscapes.photo_look import DAYLIGHT_RGB
 
 if TYPE_CHECKING:
     from seasonscapes.gaussians.splat_view import SplatView
@@ -18,8 +20,17 @@ if TYPE_CHECKING:
     from seasonscapes.terrain.surface import Texture
 
 
-def develop(picture: RenderedView | SplatView | np.ndarray, *, exposure: str | float = "auto") -> np.ndarray:
-    """Turn scene-linear radiance into a picture for the screen: exposure, then the tone curve.
+WHITE_BALANCES = ("sun", "daylight", "none")
+
+
+def develop(
+    picture: RenderedView | SplatView | np.ndarray,
+    *,
+    exposure: str | float = "auto",
+    look: str = "photo",
+    white_balance: str = "sun",
+) -> np.ndarray:
+    """Turn scene-linear radiance into a picture for the screen: exposure, white balance and tone curve.
 
     Parameters
     ----------
@@ -27,6 +38,11 @@ def develop(picture: RenderedView | SplatView | np.ndarray, *, exposure: str | f
         A rendered view, or radiance ``(H, W, 3)`` photometric linear Rec.709 [cd/m²].
     exposure
         ``"auto"`` (a camera's metering), ``"eye"`` (an adapted observer), or EV100 (15 is a sunny day).
+    look
+        ``"photo"`` (the contrast and white balance of a camera) or ``"neutral"`` (linear up to a shoulder).
+    white_balance
+        Of the look ``"photo"``: ``"sun"`` (the colour of the sun of a rendered view), ``"daylight"`` (5,500 K) or
+        ``"none"``.
 
     Returns
     -------
@@ -37,6 +53,8 @@ def develop(picture: RenderedView | SplatView | np.ndarray, *, exposure: str | f
     ------
     ValueError
         For an unknown exposure.
+    InputError
+        For an unknown look or white balance.
 
     Examples
     --------
@@ -47,8 +65,24 @@ def develop(picture: RenderedView | SplatView | np.ndarray, *, exposure: str | f
     ((4, 6, 3), True)
     """
     radiance = picture if isinstance(picture, np.ndarray) else picture.radiance
-    ev100 = exposures.exposure_ev100(radiance, exposure)
-    return exposures.develop(radiance, ev100, eye=exposure == "eye")
+    record = getattr(picture, "provenance", {})
+    ev100 = exposures.exposure_ev100(radiance, exposure, look=look)
+    white = balance_rgb(white_balance, record.get("white_rgb"))
+    return exposures.develop(radiance, ev100, eye=exposure == "eye", look=look, white=white)
+
+
+def balance_rgb(
+    white_balance: str, sun_white: Sequence[float] | None = None, *, where: str = "--white-balance"
+) -> tuple[float, float, float] | None:
+    """The colour that becomes neutral: of ``sun`` the given one; `InputError` for an unknown white balance."""
+    if white_balance not in WHITE_BALANCES:
+        raise InputError(where, "unknown white balance", got=white_balance, expected=", ".join(WHITE_BALANCES))
+    if white_balance == "daylight":
+        return DAYLIGHT_RGB
+    if white_balance == "none" or sun_white is None:
+        return None
+    red, green, blue = sun_white
+    return red, green, blue
 
 
 def save_png(path: str | Path, picture: np.ndarray, *, metadata: Mapping[str, str] | None = None) -> None:

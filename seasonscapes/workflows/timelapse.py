@@ -16,7 +16,8 @@ from seasonscapes import __version__
 from seasonscapes.errors import InputError
 from seasonscapes.exposure import develop, exposure_ev100
 from seasonscapes.progress import Progress, each_reported
-from seasonscapes.relighting.frame_file import frame_ev100, frame_name, load_frame, save_frame, time_stamp
+from seasonscapes.relighting.frame_file import frame_header, frame_name, load_frame, save_frame, time_stamp
+from seasonscapes.workflows.pictures import balance_rgb
 from seasonscapes.workflows.place import Place, utc_at
 from seasonscapes.workflows.relight_session import (
     RelightSession,
@@ -44,11 +45,17 @@ class FilmLook:
         Width of the temporal smoothing of the exposure [s]; 0 exposes each frame by itself.
     fps
         Frames per second of a film.
+    look
+        ``"photo"`` or ``"neutral"``; see `pictures.develop`.
+    white_balance
+        Of the look ``"photo"``: ``"sun"``, ``"daylight"`` or ``"none"``.
     """
 
     exposure: str | float = "auto"
     smooth_s: float = 900.0
     fps: float = 24.0
+    look: str = "photo"
+    white_balance: str = "sun"
 
 
 def base_day_of(times: Sequence[datetime]) -> date:
@@ -120,7 +127,7 @@ def session_frame(
     path = folder / frame_name(time)
     copy = None if exr_folder is None else exr_folder / frame_name(time)
     if path.is_file() and (copy is None or copy.is_file()):
-        return {"time_utc": time.isoformat(), "metered_ev100": frame_ev100(path), "rendered": False}
+        return {"time_utc": time.isoformat(), "metered_ev100": frame_header(path)[0], "rendered": False}
     view, light, position = view_at(session, time)
     metered = exposure_ev100(view.radiance, "auto")
     scene = session.place.scene
@@ -130,6 +137,8 @@ def session_frame(
         "camera": camera_name,
         "sun": sun_angles(position),
         "sky": light.model,
+        "white_rgb": light.white_rgb,
+        "photo_ev100": exposure_ev100(view.radiance, "auto", look="photo"),
         "attribution": scene.attribution,
     }
     if copy is not None:
@@ -272,14 +281,17 @@ def developed(folder: Path, times: Sequence[datetime], look: FilmLook) -> Iterat
     paths = [folder / frame_name(time) for time in times]
     seconds = np.array([time.timestamp() for time in times])
     smooth_s = look.smooth_s
+    headers = [frame_header(path) for path in paths]
+    whites = [balance_rgb(look.white_balance, record["white_rgb"]) for _, record in headers]
     if look.exposure == "auto":
-        metered = np.array([frame_ev100(path) for path in paths])
+        metered = np.array([record["photo_ev100"] if look.look == "photo" else ev for ev, record in headers])
     elif look.exposure == "eye":
         metered = np.array([exposure_ev100(load_frame(path)[0], "eye") for path in paths])
     else:
         metered, smooth_s = np.full(len(paths), float(look.exposure)), 0.0
-    for path, ev100 in zip(paths, smoothed_ev100(seconds, metered, window_s=smooth_s), strict=True):
-        yield develop(load_frame(path)[0], float(ev100), eye=look.exposure == "eye")
+    smoothed = smoothed_ev100(seconds, metered, window_s=smooth_s)
+    for path, ev100, white in zip(paths, smoothed, whites, strict=True):
+        yield develop(load_frame(path)[0], float(ev100), eye=look.exposure == "eye", look=look.look, white=white)
 
 
 def timelapse(

@@ -232,6 +232,7 @@ def view_record(
         "time_utc": position.time.astimezone(UTC).isoformat(),
         "sun": sun_angles(position),
         "sky": light.model,
+        "white_rgb": light.white_rgb,
         "size_px": [camera.width_px, camera.height_px],
         "gps": {"latitude_deg": latitude, "longitude_deg": longitude, "height_m": height},
         "frame": dict(place.frame.__dict__),

@@ -1,0 +1,106 @@
+"""The look of a photograph: white balance for the colour of the sun, metering that keeps highlights, a filmic curve.
+
+Scene-linear radiance shown as it is looks flat and grey-blue beside a photograph. Cameras balance white for sunlight,
+place the highlights near white, and apply a curve of higher contrast. All constants were chosen by eye on ten renders
+beside photographs of mountains; nothing in the chain of measurements uses them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from seasonscapes.images import REC709_LUMINANCE
+
+# CIE daylight of 5,500 K in linear Rec.709, the balance of daylight film.
+DAYLIGHT_RGB = (1.118, 0.982, 0.818)
+# The camera's balance follows the sun's colour this far only: a low sun stays warm in the picture.
+_MOST_RED, _LEAST_BLUE = 1.14, 0.86
+# Linear Rec.709 to the cone responses of Bradford's chromatic adaptation (Lindbloom; ICC.1:2022, annex E).
+_BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
+_XYZ = np.array(
+    [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
+)
+_CONES = _BRADFORD @ _XYZ
+# Highlights: this percentile of the exposed luminance is moved towards this value, by at most these stops.
+_HIGHLIGHT_PERCENTILE, _HIGHLIGHT, _STOPS = 97.0, 0.8, (-0.3, 0.9)
+# Below this EV the picture is a night's, which stays dark.
+_DIM_EV = 4.0
+# Contrast of the curve in log-log about middle grey, and the share of its per-channel form, which saturates colours.
+_CONTRAST, _PER_CHANNEL, _GREY = 1.6, 0.6, 0.18
+
+
+def white_point(sun_lx: np.ndarray | None) -> tuple[float, float, float]:
+    """Return the colour that a camera takes for white, linear Rec.709 of luminance 1.
+
+    Parameters
+    ----------
+    sun_lx
+        Normal illuminance ``(3,)`` of the sun; ``None`` without one (then the balance is neutral).
+    """
+    if sun_lx is None or not sun_lx[1] > 0.0:
+        return (1.0, 1.0, 1.0)
+    white = np.array([min(sun_lx[0] / sun_lx[1], _MOST_RED), 1.0, max(sun_lx[2] / sun_lx[1], _LEAST_BLUE)])
+    red, green, blue = white / (white @ REC709_LUMINANCE)
+    return float(red), float(green), float(blue)
+
+
+def balanced(image: np.ndarray, white: tuple[float, float, float]) -> np.ndarray:
+    """Adapt an image so that ``white`` becomes neutral (von Kries scaling of Bradford's cone responses).
+
+    Parameters
+    ----------
+    image
+        ``(..., 3)`` linear Rec.709.
+    white
+        Linear Rec.709.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(..., 3)``, not negative.
+    """
+    gains = (_CONES @ np.ones(3)) / (_CONES @ np.asarray(white, float))
+    matrix = np.linalg.inv(_CONES) @ np.diag(gains) @ _CONES
+    return np.maximum(np.asarray(image) @ matrix.T.astype(np.float32), 0.0)
+
+
+def highlight_stops(exposed: np.ndarray, ev100: float) -> float:
+    """Stops by which to brighten an image that is exposed for middle grey, so that its highlights come near white.
+
+    Parameters
+    ----------
+    exposed
+        ``(H, W, 3)`` exposed linear values.
+    ev100
+        Of that exposure; nights are not brightened.
+    """
+    if ev100 < _DIM_EV:
+        return 0.0
+    luminance = np.asarray(exposed, np.float64) @ REC709_LUMINANCE
+    highlight = max(float(np.percentile(luminance[np.isfinite(luminance)], _HIGHLIGHT_PERCENTILE)), 1e-6)
+    return float(np.clip(np.log2(_HIGHLIGHT / highlight), *_STOPS))
+
+
+def photo_curve(exposed: np.ndarray) -> np.ndarray:
+    """Apply a filmic curve: a sigmoid of the logarithm (Naka & Rushton 1966) that maps middle grey to itself.
+
+    Parameters
+    ----------
+    exposed
+        ``(..., 3)`` exposed linear values, not negative.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(..., 3)`` float32 display-linear values in [0, 1).
+    """
+    colour = np.maximum(np.asarray(exposed, np.float32), 0.0)
+    half = np.float32(_GREY**_CONTRAST * (1.0 / _GREY - 1.0))
+
+    def curve(values: np.ndarray) -> np.ndarray:
+        power = values ** np.float32(_CONTRAST)
+        return power / (power + half)
+
+    peak = colour.max(axis=-1, keepdims=True)
+    kept_hue = colour * (curve(peak) / np.maximum(peak, np.float32(1e-12)))
+    return np.float32(_PER_CHANNEL) * curve(colour) + np.float32(1.0 - _PER_CHANNEL) * kept_hue
