@@ -95,6 +95,10 @@ class LunarPosition:
         Sunlit fraction of the disc in [0, 1].
     waxing
         True from new to full moon.
+    shadow_angle_deg
+        Angle between the moon's centre and the axis of the Earth's shadow, seen from the geocentre [deg].
+    geocentric_km
+        Distance from the geocentre [km].
     """
 
     azimuth_deg: float
@@ -105,6 +109,8 @@ class LunarPosition:
     phase_angle_deg: float
     illuminated_fraction: float
     waxing: bool
+    shadow_angle_deg: float = 180.0
+    geocentric_km: float = 384_400.0
 
     @property
     def direction(self) -> np.ndarray:
@@ -278,6 +284,9 @@ def moon_position(
     to_observer = -moon.position.km
     cosine = np.sum(to_sun * to_observer, axis=0) / np.linalg.norm(to_sun, axis=0) / np.linalg.norm(to_observer, axis=0)
     cosine = np.clip(cosine, -1.0, 1.0)
+    geocentric = observer.position.km - kernel["earth"].at(when).position.km
+    from_earth = [values + geocentric for values in (moon.position.km, to_sun + moon.position.km)]
+    shadow = _angle_deg(from_earth[0], -from_earth[1])
     # The moon is waxing while it is east of the sun in ecliptic longitude.
     longitudes = [
         observer.observe(kernel[body]).apparent().ecliptic_latlon("date")[1].degrees for body in ("moon", "sun")
@@ -291,7 +300,15 @@ def moon_position(
         phase_angle_deg=_scalar_or_array(np.degrees(np.arccos(cosine)), time),
         illuminated_fraction=_scalar_or_array(0.5 * (1.0 + cosine), time),
         waxing=_scalar_or_array((longitudes[0] - longitudes[1]) % 360.0 < 180.0, time),
+        shadow_angle_deg=_scalar_or_array(shadow, time),
+        geocentric_km=_scalar_or_array(np.linalg.norm(from_earth[0], axis=0), time),
     )
+
+
+def _angle_deg(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Angle [deg] between vectors ``(3, ...)``, accurate for small ones too."""
+    a, b = (vector / np.linalg.norm(vector, axis=0) for vector in (first, second))
+    return np.degrees(2.0 * np.arctan2(np.linalg.norm(a - b, axis=0), np.linalg.norm(a + b, axis=0)))
 
 
 def sun_events(date: Date, latitude_deg: float, longitude_deg: float, tz: tzinfo = UTC) -> SunEvents:

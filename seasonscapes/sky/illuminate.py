@@ -12,6 +12,7 @@ import numpy as np
 from seasonscapes.sky.atmosphere import Atmosphere
 from seasonscapes.sky.clear_sky import AtmosphereTables, LuminarySource, atmosphere_tables, illumination_from_atmosphere
 from seasonscapes.sky.clouds import with_clouds
+from seasonscapes.sky.eclipses import eclipse_record, eclipsed_sun, solar_eclipse
 from seasonscapes.sky.ephemeris import LunarPosition, SolarPosition
 from seasonscapes.sky.illumination import Illumination, diffuse_horizontal_illuminance, luminance
 from seasonscapes.sky.models import (
@@ -124,7 +125,32 @@ def illuminate(
     ValueError
         If the model is of kind ``hosek`` and ``evaluators.hosek`` is omitted, or of an unknown class.
     """
-    evaluators = evaluators or SkyEvaluators()
+    light = _uneclipsed(
+        model,
+        sun,
+        moon,
+        height_m=height_m,
+        map_height=map_height,
+        with_aerial_perspective=with_aerial_perspective,
+        evaluators=evaluators or SkyEvaluators(),
+    )
+    eclipse = None if moon is None else solar_eclipse(sun, moon)
+    light = light if eclipse is None else eclipsed_sun(light, eclipse)
+    record = eclipse_record(sun, moon)
+    return light if record is None else replace(light, model={**light.model, "eclipse": record})
+
+
+def _uneclipsed(
+    model: SkyModel,
+    sun: SolarPosition,
+    moon: LunarPosition | None,
+    *,
+    height_m: float,
+    map_height: int,
+    with_aerial_perspective: bool,
+    evaluators: SkyEvaluators,
+) -> Illumination:
+    """The illumination with an uncovered sun."""
     check_valid(model, float(sun.elevation_deg), height_m)
     if isinstance(model, OvercastModel):
         return _with_provenance(model, _overcast_illumination(model, sun, moon, height_m, map_height))

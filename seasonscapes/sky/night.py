@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from seasonscapes.frames import equirectangular_directions
+from seasonscapes.sky.eclipses import moonlight_fraction
 from seasonscapes.sky.ephemeris import LunarPosition
 from seasonscapes.sky.illumination import diffuse_horizontal_illuminance
 
@@ -80,7 +81,7 @@ def moon_magnitude(moon: LunarPosition) -> float:
 def moon_to_sun_ratio(moon: LunarPosition, wavelength_nm: ArrayLike) -> np.ndarray:
     """Compute the extraterrestrial spectral irradiance of the moon over that of the sun at 1 au.
 
-    Reddening with phase angle is neglected (under 5 %).
+    Reddening with phase angle is neglected (under 5 %); an eclipse by the Earth's shadow is not.
 
     Parameters
     ----------
@@ -96,7 +97,7 @@ def moon_to_sun_ratio(moon: LunarPosition, wavelength_nm: ArrayLike) -> np.ndarr
     """
     wavelength = np.asarray(wavelength_nm, float)
     visual = 10.0 ** (-0.4 * (moon_magnitude(moon) - SUN_MAGNITUDE_V))
-    return visual * (1.0 + _MOON_SLOPE * (wavelength / 550.0 - 1.0))
+    return visual * (1.0 + _MOON_SLOPE * (wavelength / 550.0 - 1.0)) * moonlight_fraction(moon, wavelength)
 
 
 def van_rhijn(elevation_deg: ArrayLike) -> np.ndarray:

@@ -82,6 +82,7 @@ def sky_record(
         "illuminance_rgb": {name: [float(value) for value in rgb] for name, rgb in light.items()},
         "cct_k": {name: correlated_colour_temperature_k(rgb) for name, rgb in light.items()},
         **_event_times(events),
+        "eclipse": illumination.model.get("eclipse"),
         "model": illumination.model,
     }
 
@@ -109,10 +110,13 @@ def record_lines(record: dict[str, Any]) -> list[str]:
 
     phase = f"{100.0 * moon['illuminated_fraction']:.0f} % lit, {'waxing' if moon['waxing'] else 'waning'}"
     direct = f" ({record['direct_source']})" if record["direct_source"] else ""
+    eclipse = record["eclipse"]
+    eclipses = [f"eclipse  {eclipse_text(eclipse)}"] if eclipse else []
     return [
         f"time     {record['time_utc']}",
         f"sun      azimuth {sun['azimuth_deg']:.2f}°, elevation {sun['elevation_deg']:.2f}° (refracted)",
         f"moon     azimuth {moon['azimuth_deg']:.2f}°, elevation {moon['elevation_deg']:.2f}°, {phase}",
+        *eclipses,
         f"day      sunrise {clock('sunrise_utc')}, noon {clock('solar_noon_utc')}, sunset {clock('sunset_utc')} UTC",
         f"twilight civil {clock('civil_dawn_utc')} to {clock('civil_dusk_utc')}, "
         f"nautical {clock('nautical_dawn_utc')} to {clock('nautical_dusk_utc')}, "
@@ -121,6 +125,19 @@ def record_lines(record: dict[str, Any]) -> list[str]:
         f"diffuse  {lux['diffuse_horizontal']:.4g} lx horizontal, {colour_of('diffuse_horizontal')}",
         f"global   {lux['global_horizontal']:.4g} lx horizontal, {colour_of('global_horizontal')}",
     ]
+
+
+def eclipse_text(eclipse: dict[str, Any]) -> str:
+    """One phrase about an eclipse, from its record."""
+    return f"{eclipse['kind']} eclipse of the {eclipse['of']}, magnitude {eclipse['magnitude']:.2f}"
+
+
+def moon_text(moon: LunarPosition) -> str:
+    """One phrase about the moon for pictures of a night."""
+    if moon.elevation_deg < 0.0:
+        return "moon below the horizon"
+    lit = f"{100.0 * moon.illuminated_fraction:.0f} % lit"
+    return f"moon at azimuth {moon.azimuth_deg:.2f}°, elevation {moon.elevation_deg:.2f}°, {lit}"
 
 
 def dome_radiance(illumination: Illumination, size_px: int = 512) -> np.ndarray:

@@ -303,7 +303,7 @@ def illumination_for_camera(
     by_elevation
         For many instants of one camera; see `atmosphere_tables_in`.
     """
-    position = _position_of(place, time)
+    position = position_at(place, time)
     on_terrain = illumination_at(
         model,
         position,
@@ -332,14 +332,15 @@ def illumination_for_camera(
 
 def illumination_on_terrain(place: Place, model: SkyModel, time: datetime) -> tuple[Illumination, SunMoonPosition]:
     """Compute the light that a place's terrain receives, without aerial perspective, and where sun and moon stand."""
-    position = _position_of(place, time)
+    position = position_at(place, time)
     light = illumination_at(
         model, position, place.median_height_m, workspace=place.workspace, with_aerial_perspective=False
     )
     return replace(light, frame=place.frame), position
 
 
-def _position_of(place: Place, time: datetime) -> SunMoonPosition:
+def position_at(place: Place, time: datetime) -> SunMoonPosition:
+    """Sun and moon over the origin of a place at an aware instant."""
     return sun_moon_position(time, place.frame.latitude_deg, place.frame.longitude_deg, place.median_height_m)
 
 

@@ -14,9 +14,11 @@ from seasonscapes import __version__
 from seasonscapes.cameras.pinhole import view_in_frame
 from seasonscapes.errors import InputError
 from seasonscapes.progress import Progress, task_progress
+from seasonscapes.sky.eclipses import eclipse_record
 from seasonscapes.sky.models import SkyModel
+from seasonscapes.sky.report import eclipse_text, moon_text
 from seasonscapes.workflows.albedo_sources import AlbedoSource, chosen_albedo
-from seasonscapes.workflows.illumination import SunMoonPosition, illumination_for_camera, sky_model
+from seasonscapes.workflows.illumination import SunMoonPosition, illumination_for_camera, position_at, sky_model
 from seasonscapes.workflows.place import Place, utc_at
 from seasonscapes.workflows.relight_session import relight_session, view_at
 from seasonscapes.workflows.views import camera_geodetic
@@ -30,6 +32,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+# Below this elevation of the sun the moon matters.
+_MOONLIT_BELOW_DEG = -4.0
 ENGINES = ("auto", "transport", "path")
 
 
@@ -110,8 +114,10 @@ def render(
     engine = chosen_engine(engine, path_options=spp is not None or max_depth is not None, device=backend.device)
     camera = view_in_frame(camera, place.frame)
     utc = utc_at(place, time)
+    for line in sky_lines(position_at(place, utc)):
+        log.info(line)
+    texture = chosen_albedo(place, utc.date(), albedo)
     if engine == "transport":
-        texture = chosen_albedo(place, utc.date(), albedo)
         from seasonscapes.rendering.transport import SamplingOptions
 
         # A third of the time of a film's coefficients; errors against four times their rays are 0.6 % (RMS).
@@ -122,9 +128,6 @@ def render(
         return replace(view, provenance=record | {"engine": engine, "seed": seed, "variant": backend.variant})
     spp, max_depth = 32 if spp is None else spp, 6 if max_depth is None else max_depth
     light, position = illumination_for_camera(place, camera, sky_model(sky), utc)
-    sun = sun_angles(position)
-    log.info("sun at azimuth %.2f°, elevation %.2f° (refracted)", sun["azimuth_deg"], sun["elevation_deg"])
-    texture = chosen_albedo(place, utc.date(), albedo)
     view = render_view(
         build_scene(place.terrain, texture.values, light),
         camera,
@@ -242,6 +245,16 @@ def view_record(
         "scene_key": content_key(place.key),
         "seasonscapes": __version__,
     }
+
+
+def sky_lines(position: SunMoonPosition) -> list[str]:
+    """What to tell about sun and moon: the sun's position, the moon's when it is dark, and an eclipse."""
+    sun = sun_angles(position)
+    lines = [f"sun at azimuth {sun['azimuth_deg']:.2f}°, elevation {sun['elevation_deg']:.2f}° (refracted)"]
+    if sun["elevation_deg"] < _MOONLIT_BELOW_DEG:
+        lines.append(moon_text(position.moon))
+    eclipse = eclipse_record(position.sun, position.moon)
+    return lines if eclipse is None else [*lines, eclipse_text(eclipse)]
 
 
 def sun_angles(position: SunMoonPosition) -> dict[str, float]:
