@@ -71,8 +71,8 @@ def read_declaration(path: Path, model: type[Model]) -> Model:
     Raises
     ------
     InputError
-        If the file cannot be read or does not fit the model. The message describes the first error in one line:
-        unknown key (with a suggestion), missing key, wrong type or wrong value.
+        If the file cannot be read or does not fit the model. The message names all errors in one line: unknown keys
+        (with a suggestion), missing keys, wrong types or wrong values.
     """
     return validate(read_toml(path), model, where=path)
 
@@ -102,9 +102,22 @@ def validate(table: dict[str, Any], model: type[Model], *, where: str | Path) ->
     try:
         return model.model_validate(table)
     except ValidationError as error:
-        # A misspelt key is reported twice, as unknown and as missing; only the former leads to a suggestion.
-        errors = sorted(error.errors(), key=lambda details: details["type"] != "extra_forbidden")
-        raise _input_error(errors[0], model, where) from None
+        found = sorted(error.errors(), key=lambda details: details["type"] != "extra_forbidden")
+        problems = [_input_error(details, model, where) for details in found if not _misspelt(details, found)]
+        if len(problems) == 1:
+            raise problems[0] from None
+        told = "; ".join(str(problem).removeprefix(f"{where}: ") for problem in problems)
+        raise InputError(where, f"{len(problems)} problems: {told}") from None
+
+
+def _misspelt(details: ErrorDetails, errors: list[ErrorDetails]) -> bool:
+    """Whether a missing key is also reported as an unknown one beside it, under a similar name."""
+    if details["type"] != "missing":
+        return False
+    *table, key = details["loc"]
+    unknown = [each["loc"] for each in errors if each["type"] == "extra_forbidden"]
+    beside = [str(location[-1]) for location in unknown if list(location[:-1]) == table]
+    return bool(difflib.get_close_matches(str(key), beside, n=1))
 
 
 def _input_error(details: ErrorDetails, model: type[BaseModel], where: str | Path) -> InputError:

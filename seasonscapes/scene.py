@@ -5,6 +5,7 @@ A scene file holds facts about the place only; the settings of processing stages
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,7 +16,9 @@ from seasonscapes.cameras.webcam import Webcam
 from seasonscapes.declaration import Declaration, InputError, read_declaration
 from seasonscapes.frames import STANDARD_REFRACTION_K, LocalFrame
 
-VerticalDatum = Literal["ellipsoidal", "EGM96", "EGM2008", "LN02", "NN2000", "NAVD88", "EVRF", "local"]
+log = logging.getLogger(__name__)
+
+VerticalDatum = Literal["unknown", "ellipsoidal", "EGM96", "EGM2008", "LN02", "NN2000", "NAVD88", "EVRF", "local"]
 Latitude = Field(ge=-90.0, le=90.0)
 Longitude = Field(ge=-180.0, le=180.0)
 
@@ -214,9 +217,9 @@ class SceneFile(Declaration):
     title
         Human-readable name.
     attribution
-        Credit of the data sources.
+        Credit of the data sources, written into every file made of them; may be left out for data of one's own.
     vertical_datum
-        Datum of all heights of the scene.
+        Datum of all heights of the scene; left out, heights count as metres above sea level.
     refraction_k
         Terrestrial refraction coefficient, see `LocalFrame`.
     origin, area, elevation, imagery
@@ -227,8 +230,8 @@ class SceneFile(Declaration):
 
     name: str = Field(pattern=r"^[a-z0-9][a-z0-9_-]*$")
     title: str = ""
-    attribution: str
-    vertical_datum: VerticalDatum
+    attribution: str = ""
+    vertical_datum: VerticalDatum = "unknown"
     refraction_k: float = Field(default=STANDARD_REFRACTION_K, ge=0.0, lt=0.9)
     origin: Origin | None = None
     area: Area | None = None
@@ -307,6 +310,8 @@ def read_scene(path: str | Path, *, allow_outside: bool = False) -> SceneFile:
     """
     path = Path(path)
     scene = read_declaration(path, SceneFile)
+    if "vertical_datum" not in scene.model_fields_set:
+        log.info("%s: no vertical_datum: heights count as metres above sea level", path.name)
     folder = path.resolve().parent
 
     def absolute_path(key: str, name: str) -> str:
