@@ -18,6 +18,8 @@ from seasonscapes.photo_look import balanced, highlight_stops, photo_curve
 _DIM_EV, _DIM_SLOPE, _MAX_UNDEREXPOSURE = 4.0, 0.25, 3.0
 # Mesopic range [cd/m²], within which vision changes from rods to cones (CIE 191:2010).
 _MESOPIC = (0.005, 5.0)
+# The same range for pictures by a camera [cd/m²]: below moonlight.
+_MOONLESS = (0.0004, 0.02)
 # Scotopic luminance from linear Rec.709, for the spectra of a typical display's primaries (Larson, Rushmeier & Piatko
 # 1997, doi:10.1109/2945.646233, eq. 9 through XYZ), and the bluish grey that rod vision is matched to in pictures.
 _SCOTOPIC = np.array([0.0627, 0.6072, 0.3301])
@@ -143,15 +145,17 @@ def develop(
     if eye:
         image = _blend_rod_vision(np.asarray(image, np.float64))
     if look == "photo":
+        # A moonless sky is green of airglow; cameras' night modes, like the eye, show it grey-blue.
+        image = image if eye else _blend_rod_vision(np.asarray(image, np.float64), _MOONLESS)
         image = image if white is None else balanced(image, white)
         return photo_curve(expose(image, ev100) * EXPOSURE_GAIN)
     return tone_curve(expose(image, ev100))
 
 
-def _blend_rod_vision(image: np.ndarray) -> np.ndarray:
+def _blend_rod_vision(image: np.ndarray, mesopic: tuple[float, float] = _MESOPIC) -> np.ndarray:
     """Blend an image with its scotopic grey by the position of each pixel's luminance in the mesopic range."""
     luminance = np.maximum(image @ REC709_LUMINANCE, 1e-9)
-    low, high = np.log10(_MESOPIC)
+    low, high = np.log10(mesopic)
     rod_weight = np.clip((high - np.log10(luminance)) / (high - low), 0.0, 1.0)[..., None]
     tint = _NIGHT_TINT / (_NIGHT_TINT @ REC709_LUMINANCE)
     grey = np.maximum(image @ _SCOTOPIC, 0.0)[..., None] * tint

@@ -72,10 +72,11 @@ def highlight_stops(exposed: np.ndarray, ev100: float) -> float:
     exposed
         ``(H, W, 3)`` exposed linear values.
     ev100
-        Of that exposure; nights are not brightened.
+        Of that exposure; nights are brightened by at most 0.6 stops, whatever their highlights.
     """
     if ev100 < _DIM_EV:
-        return 0.0
+        # The curve darkens shadows, and a night is all shadows.
+        return float(np.clip((_DIM_EV - ev100) / 13.0, 0.0, 0.6))
     luminance = np.asarray(exposed, np.float64) @ REC709_LUMINANCE
     highlight = max(float(np.percentile(luminance[np.isfinite(luminance)], _HIGHLIGHT_PERCENTILE)), 1e-6)
     return float(np.clip(np.log2(_HIGHLIGHT / highlight), *_STOPS))

@@ -274,7 +274,11 @@ def _map_grid(place: Place, spacing_m: float | None) -> tuple[Raster, np.ndarray
         raise InputError("--spacing-m", "too many cells", got=rows * columns, expected="at most 400,000,000")
     transform = raster.transform * Affine.scale(width / columns, height / rows)
     column, row = np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5)
-    x, y = apply_affine(transform, column.ravel(), row.ravel())
+    # The mesh ends at the outermost samples: cells on its edge or beyond are moved inside, by a thousandth at least.
+    inset = 0.5 + 1e-3
+    pixel = ~raster.transform * np.asarray(apply_affine(transform, column.ravel(), row.ravel()))
+    pixel = [np.clip(values, inset, size - inset) for values, size in zip(pixel, (width, height), strict=True)]
+    x, y = apply_affine(raster.transform, *pixel)
     heights = sample_raster(raster, x, y)[..., 0]
     latitude, longitude = geodetic_from_map(raster.crs, x, y)
     positions = enu_from_geodetic(place.frame, latitude, longitude, heights)
