@@ -2,7 +2,7 @@
 
     python benchmarks/surface.py [--quick] [--seed N] [--dem FILE] [--json FILE]
 
-The ground is a seeded fractal massif of 30 m samples, or a raster of one's own. The adaptive mesh is compared with the
+The ground is the synthetic massif at 30 m, or a raster of one's own. The adaptive mesh is compared with the
 full grid of the interpolated heights, which is what it approximates; both shade with the normals of the heights. The
 plain before a wall is compared with the direct normal irradiance times the sine of the sun's elevation. ``--quick`` takes
 6 km instead of 12 km and 16 cameras instead of 50.
@@ -19,7 +19,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from terrain import write_massif
+import rasterio
+from affine import Affine
 
 import seasonscapes as ss
 from seasonscapes.frames import geodetic_from_enu
@@ -33,6 +34,8 @@ from seasonscapes.rendering.view_samples import view_samples
 from seasonscapes.sky.illumination import Luminary
 from seasonscapes.terrain.mesh import sample_positions
 from seasonscapes.terrain.surface import mesh_up_m
+from seasonscapes.terrain.synthetic import alpine_massif
+from seasonscapes.workflows.views import terrain_for_view
 
 SUNS_DEG = ((135.0, 10.0), (180.0, 20.0), (150.0, 60.0))
 HOURS = {
@@ -61,6 +64,13 @@ def scene_file(folder: Path, name: str, dem: Path) -> Path:
     return path
 
 
+def write_heights(path: Path, heights: np.ndarray, crs: str, transform: Affine) -> None:
+    rows, columns = heights.shape
+    profile = {"driver": "GTiff", "count": 1, "height": rows, "width": columns, "dtype": "float32"}
+    with rasterio.open(path, "w", **profile, crs=crs, transform=transform) as file:
+        file.write(heights.astype(np.float32), 1)
+
+
 def load(path: Path, workspace: ss.Workspace, **options) -> ss.Place:
     return ss.load_place(path, workspace, options=ss.MeshOptions(**options), allow_outside=True)
 
@@ -76,23 +86,9 @@ def luminary(azimuth_deg: float, elevation_deg: float) -> Luminary:
 
 def plain_error(folder: Path, workspace: ss.Workspace) -> float:
     """Largest relative error of direct irradiance on the sunlit part of a level plain before a wall of 300 m."""
-    import rasterio
-    from affine import Affine
-
     heights = np.full((81, 81), 500.0, np.float32)
     heights[52:55] = 800.0
-    with rasterio.open(
-        folder / "plain.tif",
-        "w",
-        driver="GTiff",
-        count=1,
-        height=81,
-        width=81,
-        dtype="float32",
-        crs="EPSG:32632",
-        transform=Affine(30, 0, 500000 - 30 * 40.5, 0, -30, 5160000),
-    ) as file:
-        file.write(heights, 1)
+    write_heights(folder / "plain.tif", heights, "EPSG:32632", Affine(30, 0, 500000 - 30 * 40.5, 0, -30, 5160000))
     place = load(scene_file(folder, "plain", folder / "plain.tif"), workspace)
     time_utc = "2024-12-21T11:22:17Z"
     received = ss.irradiance_map(place, time_utc, rays=16).bands["direct W/m2"]
@@ -164,13 +160,18 @@ def cameras(pair: Pair, count: int, rng: np.random.Generator) -> list[tuple[ss.C
     return result
 
 
+def rays_of_view(place: ss.Place, camera: ss.Camera) -> RayScene:
+    """The adaptive mesh as it is rendered: refined near the camera."""
+    return ray_scene(mi_mesh(terrain_for_view(place, camera), GREY))
+
+
 def silhouette_errors_px(pair: Pair, views: list[tuple[ss.Camera, bool]]) -> tuple[float, float]:
     """95th percentile of the distance of the skylines of both meshes [px]: above ground, and 2 m above crests."""
     errors: dict[bool, list[np.ndarray]] = {False: [], True: []}
     for camera, crest in views:
         tall = replace(camera, height_px=camera.height_px * 8, fy=camera.fy * 8.0, cy=camera.cy * 8.0)
         tops = []
-        for scene in (pair.adaptive_rays, pair.grid_rays):
+        for scene in (rays_of_view(pair.adaptive, camera), pair.grid_rays):
             land = np.isfinite(trace_gbuffer(RenderScene(scene.mi_scene, scene.mi_terrain), tall).depth)
             tops.append(np.where(land.any(axis=0), land.argmax(axis=0), -1))
         seen = (tops[0] > 0) & (tops[1] > 0)
@@ -187,7 +188,7 @@ def shadow_border_px(pair: Pair, views: list[tuple[ss.Camera, bool]]) -> float:
         if crest:
             continue
         masks, shown = [], []
-        for scene in (pair.adaptive_rays, pair.grid_rays):
+        for scene in (rays_of_view(pair.adaptive, camera), pair.grid_rays):
             points, hit, pixel = view_samples(scene, camera, range(camera.height_px), 1, 0)
             rays = sun_rays(scene, points.origin, points.normal, points.geometric_normal, hit, np.zeros(len(pixel)))
             lit = np.zeros(camera.height_px * camera.width_px, bool)
@@ -206,10 +207,11 @@ def shadow_border_px(pair: Pair, views: list[tuple[ss.Camera, bool]]) -> float:
 
 def black_pixels(pair: Pair, views: list[tuple[ss.Camera, bool]]) -> int:
     """Terrain pixels darker than a thousandth of their picture's median, over all cameras and four hours."""
-    mesh, black = pair.adaptive_rays.mi_terrain, 0
-    for hour in HOURS.values():
-        scene = relight(mesh, ss.illumination(pair.adaptive, hour))
-        for camera, _ in views:
+    black, lights = 0, [ss.illumination(pair.adaptive, hour) for hour in HOURS.values()]
+    for camera, _ in views:
+        mesh = rays_of_view(pair.adaptive, camera).mi_terrain
+        for light in lights:
+            scene = relight(mesh, light)
             small = replace(
                 camera,
                 width_px=96,
@@ -252,7 +254,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the numbers to this file")
     arguments = parser.parse_args()
     seed = secrets.randbits(31) if arguments.seed is None else arguments.seed
-    side, count = (200, 16) if arguments.quick else (400, 50)
+    side_m, count = (6000.0, 16) if arguments.quick else (12000.0, 50)
     rng = np.random.default_rng(seed)
     with tempfile.TemporaryDirectory() as name:
         folder, workspace = Path(name), ss.Workspace(Path(name) / "workspace")
@@ -260,7 +262,8 @@ def main() -> None:
         dem = arguments.dem
         if dem is None:
             dem = folder / "massif.tif"
-            write_massif(dem, side, side, 30.0, seed)
+            massif = alpine_massif(seed=seed, size_m=side_m, spacing_m=30.0).elevation
+            write_heights(dem, massif.values[..., 0], massif.crs, massif.transform)
         path = scene_file(folder, "ground", dem)
         adaptive, grid = load(path, workspace), load(path, workspace, mesher="grid")
         pair = Pair(adaptive, grid, ray_scene(mi_mesh(adaptive.terrain, GREY)), ray_scene(mi_mesh(grid.terrain, GREY)))

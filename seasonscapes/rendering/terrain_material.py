@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from seasonscapes.frames import MEAN_RADIUS_M
 from seasonscapes.rendering.backend import use_backend
 from seasonscapes.terrain.surface import SurfaceGrid
 
@@ -38,25 +39,40 @@ class DeviceSurface:
         import drjit as dr
         import mitsuba as mi
 
-        rows, columns = grid.up_m.shape
+        rows, columns = grid.nodes.shape[:2]
         # Without the texture units of a GPU, whose interpolation weights have 8 bits.
         self._mi_texture: Any = mi.Texture2f(  # pyright: ignore[reportCallIssue]
-            mi.TensorXf(grid.slopes()), use_accel=False, wrap_mode=dr.WrapMode.Clamp
+            mi.TensorXf(grid.nodes), use_accel=False, wrap_mode=dr.WrapMode.Clamp
         )
-        (west, north), (east_step, south_step) = grid.corner_m, grid.step_m
-        self._mi_scale = mi.Point2f(dr.opaque(mi.Float, 1.0 / (east_step * columns)), -1.0 / (south_step * rows))
-        self._mi_offset = mi.Point2f(
-            dr.opaque(mi.Float, 0.5 / columns - west / (east_step * columns)), 0.5 / rows + north / (south_step * rows)
-        )
+        scaled = (grid.to_node + np.eye(1, grid.to_node.shape[1]) * 0.5) / np.array([[columns], [rows]])
+        self._degree = grid.degree
+        self._mi_terms = [[dr.opaque(mi.Float, float(value)) for value in terms] for terms in scaled]
+        self._mi_domain = [dr.opaque(mi.Float, value) for value in (*grid.domain[:2], 1.0 / grid.domain[2])]
 
     def sample(self, mi_position: Any, active: Any = True) -> tuple[Any, Any]:
         """Return the unit normal ``mi.Normal3f`` and the up coordinate ``mi.Float`` [m] of the surface at positions."""
         import drjit as dr
         import mitsuba as mi
 
-        uv = dr.fma(mi.Point2f(mi_position.x, mi_position.y), self._mi_scale, self._mi_offset)
-        east, north, up = self._mi_texture.eval(uv, active)
-        return dr.normalize(mi.Normal3f(-east, -north, 1.0)), up
+        shrink = MEAN_RADIUS_M / (MEAN_RADIUS_M + mi_position.z)
+        east = (mi_position.x * shrink - self._mi_domain[0]) * self._mi_domain[2]
+        north = (mi_position.y * shrink - self._mi_domain[1]) * self._mi_domain[2]
+        uv = mi.Point2f(*(self._polynomial(terms, east, north) for terms in self._mi_terms))
+        slope_east, slope_north, up = self._mi_texture.eval(uv, active)
+        return dr.normalize(mi.Normal3f(-slope_east, -slope_north, 1.0)), up
+
+    def _polynomial(self, terms: list[Any], east: Any, north: Any) -> Any:
+        """Horner's scheme in north within one in east; terms in the order of `terrain.surface.exponents`."""
+        import drjit as dr
+
+        rest, total = list(terms), 0.0
+        for count in range(1, self._degree + 2):
+            inner = 0.0
+            for term in reversed(rest[-count:]):
+                inner = dr.fma(inner, north, term)
+            del rest[-count:]
+            total = dr.fma(total, east, inner)
+        return total
 
 
 def shading_normal(material: Any, interaction: Any, active: Any = True) -> Any:

@@ -12,7 +12,7 @@ import numpy as np
 from affine import Affine
 
 from seasonscapes.errors import AtlasMismatch
-from seasonscapes.frames import LocalFrame
+from seasonscapes.frames import MEAN_RADIUS_M, LocalFrame
 
 
 @dataclass(frozen=True)
@@ -35,33 +35,48 @@ class Raster:
     crs: str
 
 
+def monomials(position_m: np.ndarray, domain: tuple[float, float, float], degree: int) -> np.ndarray:
+    """Terms of the polynomial of a `SurfaceGrid` at positions ``(N, 3)``: ``(N, T)``, ``east^i north^j``, i + j ≤ degree.
+
+    East and north are projected along the verticals to height zero first (to the Earth's mean radius), then scaled to
+    [-1, 1] over the domain.
+    """
+    shrink = MEAN_RADIUS_M / (MEAN_RADIUS_M + position_m[:, 2])
+    east, north = ((position_m[:, k] * shrink - domain[k]) / domain[2] for k in range(2))
+    return np.stack([east**i * north**j for i, j in exponents(degree)], axis=1)
+
+
+def exponents(degree: int) -> list[tuple[int, int]]:
+    """Exponents of east and north in the terms of `monomials`."""
+    return [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
+
+
 @dataclass(frozen=True)
 class SurfaceGrid:
-    """Up coordinates of the terrain on a regular horizontal grid, from which shading takes its normals.
+    """The smooth surface of a terrain at the samples of its raster, from which shading takes its normals.
 
     Parameters
     ----------
-    corner_m
-        West and north: position of the first node [m, east-north].
-    step_m
-        Distance of neighbouring nodes towards east and towards south [m].
-    up_m
-        ``(R, S)`` float32 up coordinates of the nodes [m]; rows run from north to south.
+    nodes
+        ``(R, S, 3)`` float32: slope towards east, slope towards north, up coordinate [m].
+    to_node
+        ``(2, T)`` polynomials of position for column and row of the nodes; see `monomials`.
+    domain
+        East and north of the polynomials' centre, and their radius [m].
     """
 
-    corner_m: tuple[float, float]
-    step_m: tuple[float, float]
-    up_m: np.ndarray
+    nodes: np.ndarray
+    to_node: np.ndarray
+    domain: tuple[float, float, float]
 
-    def slopes(self) -> np.ndarray:
-        """Slopes towards east and north, and the up coordinate, of all nodes: ``(R, S, 3)`` float32.
+    @property
+    def degree(self) -> int:
+        """Degree of the polynomials."""
+        return round((8 * self.to_node.shape[1] + 1) ** 0.5 - 3) // 2
 
-        Central differences; one-sided at the rim.
-        """
-        result = np.empty((*self.up_m.shape, 3), np.float32)
-        south, east = np.gradient(self.up_m, self.step_m[1], self.step_m[0])
-        result[..., 0], result[..., 1], result[..., 2] = east, -south, self.up_m
-        return result
+    def nodes_at(self, position_m: np.ndarray) -> np.ndarray:
+        """Column and row ``(N, 2)`` of positions ``(N, 3)`` among the nodes; integers at the nodes."""
+        return monomials(position_m, self.domain, self.degree) @ self.to_node.T
 
     def sample(self, position_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Interpolate the surface bilinearly.
@@ -69,7 +84,7 @@ class SurfaceGrid:
         Parameters
         ----------
         position_m
-            ``(N, 2)`` or ``(N, 3)`` positions, east-north(-up) [m]; heights are not used.
+            ``(N, 3)`` positions, east-north-up [m]; heights matter little.
 
         Returns
         -------
@@ -80,12 +95,10 @@ class SurfaceGrid:
         """
         from scipy.ndimage import map_coordinates
 
-        position = np.asarray(position_m, np.float64)
-        column = (position[:, 0] - self.corner_m[0]) / self.step_m[0]
-        row = (self.corner_m[1] - position[:, 1]) / self.step_m[1]
+        column, row = self.nodes_at(np.asarray(position_m, np.float64)).T
         east, north, up = (
-            map_coordinates(values, [row, column], order=1, mode="nearest", output=np.float64)
-            for values in np.moveaxis(self.slopes(), -1, 0)
+            map_coordinates(self.nodes[..., k], [row, column], order=1, mode="nearest", output=np.float64)
+            for k in range(3)
         )
         normal = np.stack([-east, -north, np.ones_like(up)], axis=1)
         return up, (normal / np.linalg.norm(normal, axis=1, keepdims=True)).astype(np.float32)
@@ -244,8 +257,8 @@ def save_terrain(terrain: Terrain, path: str | os.PathLike[str], *, note: dict[s
     frame = np.array([getattr(terrain.frame, name) for name in LocalFrame.__dataclass_fields__], np.float64)
     arrays: dict[str, Any] = {"vertices": terrain.vertices, "faces": terrain.faces, "uv": terrain.uv, "frame": frame}
     if terrain.surface is not None:
-        arrays["surface_up_m"] = terrain.surface.up_m
-        arrays["surface_grid"] = np.array([*terrain.surface.corner_m, *terrain.surface.step_m])
+        surface = terrain.surface
+        arrays |= {"surface": surface.nodes, "surface_to_node": surface.to_node, "surface_domain": surface.domain}
     np.savez(path, note=json.dumps(note or {}), **arrays)
 
 
@@ -267,9 +280,9 @@ def load_terrain(path: str | os.PathLike[str]) -> tuple[Terrain, dict[str, Any]]
     with np.load(path, allow_pickle=False) as stored:
         frame = LocalFrame(*map(float, stored["frame"]))
         surface = None
-        if "surface_grid" in stored:
-            west, north, *step = map(float, stored["surface_grid"])
-            surface = SurfaceGrid((west, north), (step[0], step[1]), stored["surface_up_m"])
+        if "surface" in stored:
+            east, north, radius = map(float, stored["surface_domain"])
+            surface = SurfaceGrid(stored["surface"], stored["surface_to_node"], (east, north, radius))
         terrain = Terrain(stored["vertices"], stored["faces"], stored["uv"], frame, surface)
         return terrain, json.loads(str(stored["note"]))
 

@@ -1,4 +1,4 @@
-"""Heights and slopes of the terrain on a regular horizontal grid: the smooth surface that a triangle mesh approximates.
+"""Heights and slopes at the samples of an elevation raster: the smooth surface that a triangle mesh approximates.
 
 A mesh within a few metres of the heights may have facets whose slope is off by many degrees, and normals interpolated
 over its large facets carry the slope of a cliff far into a plain. Shading therefore uses the slopes of the heights
@@ -9,87 +9,78 @@ from __future__ import annotations
 
 import numpy as np
 
-from seasonscapes.frames import LocalFrame, geodetic_from_enu
-from seasonscapes.terrain.crs import raster_pixels
-from seasonscapes.terrain.refine import refine_raster
-from seasonscapes.terrain.surface import Raster, SurfaceGrid
+from seasonscapes.frames import LocalFrame, enu_from_geodetic
+from seasonscapes.terrain.crs import apply_affine, geodetic_from_map
+from seasonscapes.terrain.surface import Raster, SurfaceGrid, monomials
 
-# Nodes of a grid: 12 bytes each on the device. Twice the raster's resolution as far as that allows.
-MOST_NODES = 12_000_000
-# Nodes between exact transformations of coordinates, and the heights between which they are interpolated [m].
-_COARSE, _LOW_M, _HIGH_M = 64, 0.0, 4000.0
-_ROUNDS = 3
-_STRIP = 2_000_000
+# 12 bytes each on the device; larger rasters are thinned.
+MOST_NODES = 24_000_000
+# Largest error of the polynomial from the local frame to the raster [samples].
+_MOST_ERROR = 0.02
+_DEGREES = (3, 5, 7)
+_STRIP = 500_000
 
 
-def surface_grid(raster: Raster, frame: LocalFrame, bounds_m: tuple[float, float, float, float]) -> SurfaceGrid:
-    """Resample the heights of a raster to a regular grid in the local frame.
+def surface_grid(raster: Raster, frame: LocalFrame) -> SurfaceGrid:
+    """Compute slopes and up coordinates of a raster's samples in the local frame.
 
     Parameters
     ----------
     raster
         ``values`` ``(H, W, 1)`` heights [m] without holes.
     frame
-        Local frame of the grid.
-    bounds_m
-        West, south, east and north end of the grid [m].
+        Local frame of the result.
 
     Returns
     -------
     SurfaceGrid
-        Up coordinates; beyond the raster those of its edge.
+        Nodes at the samples; at every second, third … one of a raster of more than `MOST_NODES`.
 
-    Notes
-    -----
-    The transformation from the local frame to the raster is smooth: it is computed exactly at every 64th node and
-    interpolated by cubic splines in between, linearly in height. Heights are interpolated by monotone cubics at twice
-    the raster's resolution (see `refine_raster`), then bilinearly.
+    Raises
+    ------
+    ValueError
+        Where the raster's coordinates are too distorted for a polynomial of degree 7 (more than some hundred km).
     """
-    from scipy.ndimage import map_coordinates
-
-    west, south, east, north = bounds_m
-    height, width = raster.values.shape[:2]
-    spacing = min((east - west) / max(width - 1, 1), (north - south) / max(height - 1, 1)) / 2.0
-    spacing = max(spacing, np.sqrt((east - west) * (north - south) / MOST_NODES))
-    columns, rows = (int(np.ceil(side / spacing)) + 1 for side in (east - west, north - south))
-    step = ((east - west) / (columns - 1), (north - south) / (rows - 1))
-    fine = refine_raster(raster, 2) if raster.values.size * 4 <= 4 * MOST_NODES else raster
-    pixel_of, up_of = _transformations(fine, frame, (west, north), step, (rows, columns))
-    heights = np.empty((rows, columns), np.float32)
-    strip = max(1, _STRIP // columns)
+    stride = int(np.ceil(np.sqrt(raster.values.size / MOST_NODES)))
+    heights = raster.values[::stride, ::stride, 0]
+    rows, columns = heights.shape
+    nodes = np.empty((rows, columns, 3), np.float32)
+    strip = max(4, _STRIP // columns)
     for first in range(0, rows, strip):
-        part = np.s_[first : min(first + strip, rows)]
-        height_m = np.full((part.stop - part.start, columns), np.float64(np.median(raster.values)))
-        for _ in range(_ROUNDS):
-            column, row = pixel_of(part, height_m)
-            height_m = map_coordinates(fine.values[..., 0], [row, column], order=1, mode="nearest", output=np.float64)
-        heights[part] = up_of(part, height_m)
-    return SurfaceGrid((float(west), float(north)), (float(step[0]), float(step[1])), heights)
+        # One more row on either side for the differences.
+        low, high = max(first - 1, 0), min(first + strip + 1, rows)
+        row, column = np.mgrid[low:high, 0:columns] * stride
+        x, y = apply_affine(raster.transform, column + 0.5, row + 0.5)
+        position = enu_from_geodetic(frame, *geodetic_from_map(raster.crs, x, y), heights[low:high])
+        normal = np.cross(np.gradient(position, axis=0), np.gradient(position, axis=1))
+        normal *= np.where(normal[..., 2:] < 0.0, -1.0, 1.0)
+        kept = slice(first - low, min(first + strip, rows) - low)
+        nodes[first : first + strip, :, :2] = (-normal[..., :2] / np.maximum(normal[..., 2:], 1e-6))[kept]
+        nodes[first : first + strip, :, 2] = position[kept, :, 2]
+    return SurfaceGrid(nodes, *_to_nodes(raster, frame, stride, heights))
 
 
-def _transformations(raster: Raster, frame: LocalFrame, corner_m: tuple, step_m: tuple, shape: tuple[int, int]):
-    """Pixel coordinates, and the up coordinate, of the nodes of some rows as functions of their heights."""
-    from scipy.interpolate import RectBivariateSpline
-
-    columns = shape[1]
-    row, column = (np.unique(np.r_[0 : count : max(1, min(_COARSE, (count - 1) // 4)), count - 1]) for count in shape)
-    x, y = np.meshgrid(corner_m[0] + column * step_m[0], corner_m[1] - row * step_m[1])
-    tables = []
-    for height in (_LOW_M, _HIGH_M):
-        up = np.full(x.shape, height)
-        for _ in range(_ROUNDS):
-            latitude, longitude, found = geodetic_from_enu(frame, np.stack([x, y, up], axis=-1))
-            up = up + (height - found)
-        pixel = raster_pixels(raster, latitude, longitude) - 0.5
-        tables.append(
-            [RectBivariateSpline(row, column, values, kx=3, ky=3) for values in (pixel[..., 0], pixel[..., 1], up)]
-        )
-
-    def blended(index: int, part: slice, height_m: np.ndarray) -> np.ndarray:
-        low, high = (table[index](np.arange(part.start, part.stop), np.arange(columns)) for table in tables)
-        return low + (high - low) * ((height_m - _LOW_M) / (_HIGH_M - _LOW_M))
-
-    return (
-        lambda part, height_m: (blended(0, part, height_m), blended(1, part, height_m)),
-        lambda part, height_m: blended(2, part, height_m),
+def _to_nodes(
+    raster: Raster, frame: LocalFrame, stride: int, heights: np.ndarray
+) -> tuple[np.ndarray, tuple[float, float, float]]:
+    """Polynomials from the local frame to column and row of the nodes, and the centre and radius of their domain."""
+    height, width = raster.values.shape[:2]
+    row, column = np.meshgrid(np.linspace(0, height - 1, 24), np.linspace(0, width - 1, 24), indexing="ij")
+    x, y = apply_affine(raster.transform, column + 0.5, row + 0.5)
+    latitude, longitude = geodetic_from_map(raster.crs, x, y)
+    levels = np.linspace(float(heights.min()), float(heights.max()) + 1.0, 3)
+    position = np.concatenate([enu_from_geodetic(frame, latitude, longitude, level).reshape(-1, 3) for level in levels])
+    low, high = position[:, :2].min(axis=0), position[:, :2].max(axis=0)
+    domain = (*map(float, 0.5 * (low + high)), float(0.5 * (high - low).max()))
+    target = np.tile(np.stack([column.ravel(), row.ravel()], axis=1) / stride, (len(levels), 1))
+    errors = []
+    for degree in _DEGREES:
+        terms = monomials(position, domain, degree)
+        coefficients = np.linalg.lstsq(terms, target, rcond=None)[0].T
+        errors.append(float(np.abs(terms @ coefficients.T - target).max()))
+        if errors[-1] < _MOST_ERROR:
+            return coefficients, domain
+    raise ValueError(
+        f"surface_grid: the local frame maps to the raster with errors of {min(errors):.2f} samples; expected less than "
+        f"{_MOST_ERROR}; choose a smaller [area]"
     )

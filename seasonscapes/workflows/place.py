@@ -253,6 +253,9 @@ def ground_or_nan(place: Place, latitude_deg: float, longitude_deg: float) -> fl
     height = float(sample_raster(place.elevation, x, y)[..., 0])
     position = enu_from_geodetic(place.frame, latitude_deg, longitude_deg, np.nan_to_num(height))
     rendered = mesh_up_m(place.terrain, position)
+    if place.terrain.surface is not None and np.isfinite(rendered):
+        # Near a camera the mesh is refined towards this surface.
+        rendered = max(rendered, float(place.terrain.surface.sample(position[None])[0][0]))
     return height + (rendered - float(position[2])) if np.isfinite(rendered) else height
 
 

@@ -37,7 +37,7 @@ from seasonscapes.workflows.illumination import (
     tabulate_illumination,
 )
 from seasonscapes.workflows.place import MeshOptions, Place, load_place, utc_at
-from seasonscapes.workflows.views import camera_for
+from seasonscapes.workflows.views import camera_for, terrain_for_view
 from seasonscapes.workspace import Workspace, artefact_key, build_once
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from seasonscapes.rendering.relit_view import RelightableView
     from seasonscapes.rendering.transport import SamplingOptions, ViewCoefficients
 
-_COEFFICIENTS_CODE = ("rendering.transport", "rendering.coefficients_file")
+_COEFFICIENTS_CODE = ("rendering.transport", "rendering.coefficients_file", "terrain.view_refinement")
 _VIEW_ALBEDO_CODE = ("rendering.transport", "rendering.relit_view")
 FRAME_CODE = ("workflows.relight_session", "relighting.frame_file")
 # Rows of the sky maps. Without clouds half as many as usual change an image by less than about 0.1 % in the mean: the
@@ -201,7 +201,7 @@ def relight_session(
         albedo = AlbedoSeries((albedo,))
     camera, model = view_in_frame(camera, place.frame), sky_model(sky)
     base = nearest_albedo(albedo, base_day)
-    scene = ray_scene(mi_mesh(place.terrain, base.load().values))
+    scene = ray_scene(mi_mesh(terrain_for_view(place, camera), base.load().values))
     tabulate_illumination(place, camera, model, progress=task_progress(progress, "light transport", end=0.1))
     inputs = {"place": place.key, **_camera_values(camera), "albedo": _identity(base), "seed": seed}
     coefficients = _coefficients(place, camera, scene, inputs, seed, sampling, progress)

@@ -150,14 +150,11 @@ def build_terrain(
     """Mesh an elevation raster in a local frame and unwrap it; see `terrain.mesh` and `terrain.unwrap`."""
     spacing_m = sample_spacing_m(elevation)
     factor = options.refine or refinement_factor(elevation.values[..., 0].size, spacing_m)
-    bound = options.max_error_m or min(5.0, spacing_m / factor / 15.0)
+    bound = options.max_error_m or min(5.0, spacing_m / factor / 10.0)
     refined = refine_raster(elevation, factor)
     terrain = build_mesh(refined, frame, mesher=options.mesher, max_error_m=bound)
     if options.mesher != "poisson":
-        (west, south), (east, north) = (
-            getattr(terrain.vertices[:, :2].astype(np.float64), end)(axis=0) for end in ("min", "max")
-        )
-        terrain = replace(terrain, surface=surface_grid(refined, frame, (west, south, east, north)))
+        terrain = replace(terrain, surface=surface_grid(refined, frame))
     texel_m = _texel_m(terrain, elevation, scene, options)
     return unwrap(terrain, kind=options.atlas, texel_m=texel_m, max_side_px=options.max_side_px)
 

@@ -21,7 +21,7 @@ from seasonscapes.workflows.albedo_sources import AlbedoSource, chosen_albedo
 from seasonscapes.workflows.illumination import SunMoonPosition, illumination_for_camera, position_at, sky_model
 from seasonscapes.workflows.place import Place, utc_at
 from seasonscapes.workflows.relight_session import relight_session, view_at
-from seasonscapes.workflows.views import camera_geodetic
+from seasonscapes.workflows.views import camera_geodetic, terrain_for_view
 from seasonscapes.workspace import content_key
 
 if TYPE_CHECKING:
@@ -129,7 +129,7 @@ def render(
     spp, max_depth = 32 if spp is None else spp, 6 if max_depth is None else max_depth
     light, position = illumination_for_camera(place, camera, sky_model(sky), utc)
     view = render_view(
-        build_scene(place.terrain, texture.values, light),
+        build_scene(terrain_for_view(place, camera), texture.values, light),
         camera,
         spp=spp,
         seed=seed,
@@ -217,7 +217,7 @@ def textured_view(
 
     camera = view_in_frame(camera, place.frame)
     light, position = illumination_for_camera(place, camera, sky_model(sky), utc_at(place, time))
-    scene = build_scene(place.terrain, np.full(3, 0.2, np.float32), light)
+    scene = build_scene(terrain_for_view(place, camera), np.full(3, 0.2, np.float32), light)
     gbuffer = trace_gbuffer(scene, camera)
     coverage = np.isfinite(gbuffer.depth).astype(np.float32)
     surface = np.nan_to_num(sample_texture(radiance, gbuffer.uv))

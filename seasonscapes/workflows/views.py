@@ -14,6 +14,7 @@ from seasonscapes.workflows.place import Place, ground_height_m, ground_or_nan
 if TYPE_CHECKING:
     from seasonscapes.cameras.panorama import Panorama
     from seasonscapes.cameras.pinhole import Camera
+    from seasonscapes.terrain.surface import Terrain
 
 __all__ = ["camera", "camera_for", "camera_geodetic", "scene_cameras"]
 
@@ -90,6 +91,13 @@ def camera_for(place: Place, view: Viewpoint, *, size_px: tuple[int, int], where
                 cure="give above_ground_m instead",
             )
     return camera_from_named_view(place.frame, view, ground, size_px=size_px)
+
+
+def terrain_for_view(place: Place, view: Camera | Panorama) -> Terrain:
+    """The terrain of a place, refined near a camera until its error is a quarter of a pixel."""
+    from seasonscapes.terrain.view_refinement import refined_for_view
+
+    return refined_for_view(place.terrain, view.position_m, 1.0 / float(view.fx))
 
 
 def camera_geodetic(place: Place, view: Camera | Panorama) -> tuple[float, float, float]:
