@@ -23,7 +23,7 @@ class PlaceOptions:
     mesher: str = "adaptive"
     """adaptive (error-bounded), grid (every sample), poisson (an extra)."""
     max_error_m: float | None = None
-    """Vertical bound of the adaptive mesh in metres; default a fifteenth of the samples' spacing, at most 5."""
+    """Vertical bound of the adaptive mesh in metres; default a tenth of the samples' spacing, at most 5."""
     refine: int | None = None
     """Interpolate the heights this many times finer first; default as far as it pays."""
     atlas: str = "planar"

@@ -15,8 +15,8 @@ from seasonscapes.terrain.surface import SurfaceGrid, Terrain
 
 # Points along an edge at which its distance from the surface is measured.
 _ALONG = (0.25, 0.5, 0.75)
-# Edges are not split below this length in spacings of the surface's nodes: there is no more detail.
-_LEAST_NODES = 1.25
+# Edges are not split below this length in spacings of the surface's nodes: between the nodes it is bilinear.
+_LEAST_NODES = 0.3
 _MOST_ROUNDS = 10
 # New faces at which refinement ends; each round at most doubles them.
 _MOST_FACES = 4_000_000

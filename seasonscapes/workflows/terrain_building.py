@@ -47,7 +47,7 @@ class MeshOptions:
     mesher
         ``"adaptive"`` (error-bounded triangulation), ``"grid"`` (every sample) or ``"poisson"`` (needs an extra).
     max_error_m
-        Vertical error bound of the adaptive mesh [m]. Default: a fifteenth of the sample spacing, at most 5 m.
+        Vertical error bound of the adaptive mesh [m]. Default: a tenth of the sample spacing, at most 5 m.
     refine
         Interpolate the heights this many times finer before meshing; see `terrain.refine`. Default: as far as it pays.
     atlas
