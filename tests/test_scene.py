@@ -203,3 +203,29 @@ def test_a_viewpoint_needs_no_name_and_one_height():
     np.testing.assert_array_equal(cameras[0].world_from_camera, cameras[1].world_from_camera)
     with pytest.raises(ValueError, match="either 'height_m'"):
         Viewpoint(**numbers, height_m=1000.0)
+
+
+def test_all_problems_of_a_file_are_told_at_once(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text('name = "x"\natribution = "y"\n[[camera]]\nname = "c"\nlatitude_deg = 46.0\nheading = 3\n')
+    with pytest.raises(InputError) as told:
+        read_scene(path)
+    message = str(told.value)
+    assert "3 problems" in message
+    for part in (
+        "atribution: unknown key",
+        "did you mean 'attribution'",
+        "camera[0].heading: unknown key",
+        "longitude_deg: missing",
+    ):
+        assert part in message
+    assert "\n" not in message
+
+
+def test_attribution_and_datum_may_be_left_out_and_the_default_is_told(tmp_path, caplog):
+    path = tmp_path / "scene.toml"
+    path.write_text('name = "x"\n')
+    with caplog.at_level("INFO", logger="seasonscapes"):
+        scene = read_scene(path)
+    assert (scene.attribution, scene.vertical_datum) == ("", "unknown")
+    assert "metres above sea level" in caplog.text

@@ -1,0 +1,75 @@
+"""The look of a photograph: neutral whites, kept highlights, contrast, and nights that are neither green nor black."""
+
+import numpy as np
+import pytest
+
+import seasonscapes as ss
+from seasonscapes.exposure import develop, exposure_ev100
+from seasonscapes.images import REC709_LUMINANCE
+from seasonscapes.photo_look import DAYLIGHT_RGB, balanced, highlight_stops, photo_curve, white_point
+
+
+def test_white_becomes_neutral_and_keeps_its_luminance():
+    white = white_point(np.array([126_000.0, 108_000.0, 95_000.0]))
+    assert white @ REC709_LUMINANCE == pytest.approx(1.0)
+    neutral = balanced(np.array([white]), white)[0]
+    np.testing.assert_allclose(neutral, neutral.mean(), rtol=1e-3)
+    assert neutral.mean() == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_low_sun_stays_warm_and_no_sun_is_neutral():
+    noon, low = white_point(np.array([1.16, 1.0, 0.87])), white_point(np.array([1.8, 1.0, 0.3]))
+    sunset = balanced(np.array([[1.8, 1.0, 0.3]]), low)[0]
+    assert sunset[0] > 1.3 * sunset[2]
+    assert low[0] / low[2] < 1.5
+    assert white_point(None) == (1.0, 1.0, 1.0)
+    assert noon != (1.0, 1.0, 1.0)
+
+
+def test_the_curve_keeps_grey_adds_contrast_and_never_clips():
+    ramp = np.geomspace(1e-4, 50.0, 200)[:, None] * np.ones(3)
+    shown = photo_curve(ramp)
+    assert photo_curve(np.full((1, 3), 0.18))[0, 0] == pytest.approx(0.18, abs=1e-4)
+    assert np.all(np.diff(shown[:, 1]) > 0.0)
+    assert shown.max() < 1.0
+    middle = np.log(photo_curve(np.full((1, 3), 0.2))) - np.log(photo_curve(np.full((1, 3), 0.16)))
+    assert middle[0, 0] / np.log(0.2 / 0.16) > 1.2
+
+
+def test_saturated_colours_keep_their_order():
+    shown = photo_curve(np.array([[3.0, 1.0, 0.2]]))[0]
+    assert shown[0] > shown[1] > shown[2] >= 0.0
+
+
+def test_snow_is_brightened_and_a_bright_sky_is_not():
+    snow = np.full((20, 20, 3), 0.2)
+    assert highlight_stops(snow, 15.0) == pytest.approx(0.9)
+    assert highlight_stops(np.full((20, 20, 3), 5.0), 15.0) == pytest.approx(-0.3)
+
+
+def test_a_moonless_night_is_neither_green_nor_black():
+    rng = np.random.default_rng(2)
+    # Airglow: greenish, some 1e-4 cd/m2, over a darker slope.
+    night = np.concatenate([np.full((30, 60, 3), 2e-4), np.full((30, 60, 3), 4e-5)]) * [1.0, 1.02, 0.55]
+    night = night * rng.uniform(0.9, 1.1, (60, 60, 1))
+    levels = 255.0 * ss.srgb_from_linear(ss.develop(night))
+    assert levels[:30].mean(axis=(0, 1))[2] > levels[:30].mean(axis=(0, 1))[1] * 0.98, "not olive"
+    assert levels[30:].mean() > 8.0, "not black"
+    assert levels.mean() < 110.0, "but a night"
+
+
+def test_looks_and_balances_are_checked():
+    picture = np.full((4, 6, 3), 3000.0)
+    with pytest.raises(ss.InputError, match="unknown look"):
+        ss.develop(picture, look="vivid")
+    with pytest.raises(ss.InputError, match="unknown white balance"):
+        ss.develop(picture, white_balance="tungsten")
+    warm = ss.develop(picture, white_balance="daylight")
+    assert warm[0, 0, 2] > warm[0, 0, 0], "5,500 K daylight is balanced, so that neutral radiance looks cool"
+    assert DAYLIGHT_RGB[0] > DAYLIGHT_RGB[2]
+
+
+def test_a_fixed_exposure_is_left_alone():
+    picture = np.full((4, 6, 3), 3000.0)
+    assert exposure_ev100(picture, 12.5, look="photo") == 12.5
+    np.testing.assert_array_equal(develop(picture, 12.5), develop(picture, 12.5, look="neutral"))
