@@ -18,7 +18,7 @@ from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.rendering.gbuffer import mi_rays
 from seasonscapes.rendering.mitsuba_scene import LUMINARY_DISTANCE_M, RenderScene
 from seasonscapes.rendering.sobol import hashed, sobol_pair, uniform
-from seasonscapes.rendering.terrain_material import leaving_points
+from seasonscapes.rendering.terrain_material import leaving_points, shadow_ray_start
 from seasonscapes.sky.illumination import Luminary
 
 # Farther hits are the polygons of sun and moon, which only Mitsuba's own integrators use.
@@ -182,13 +182,14 @@ def _direct_light(
     import mitsuba as mi
 
     origin, outward, normal = leaving
+    material = scene.mi_terrain.bsdf()
     total = mi.Color3f(0.0)
     for number, luminary in enumerate(luminaries):
         point = sobol_pair(hashed(key, _LUMINARY + number), index)
         direction = luminary.mi_frame.to_world(mi.warp.square_to_uniform_cone(point, luminary.mi_cos_radius))
         cosine = dr.dot(normal, direction)
         facing = active & (cosine > 0.0) & (dr.dot(outward, direction) > 0.0)
-        ray: Any = mi.Ray3f(origin, direction)
+        ray: Any = mi.Ray3f(origin + direction * shadow_ray_start(material, cosine), direction)
         ray.maxt = FAR_M
         shadowed = scene.mi_scene.ray_test(ray, coherent=coherent, active=facing)
         total += dr.select(facing & ~shadowed, cosine * dr.inv_pi * luminary.mi_illuminance, 0.0)

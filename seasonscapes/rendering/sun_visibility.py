@@ -9,6 +9,7 @@ import numpy as np
 
 from seasonscapes.rendering.backend import point3
 from seasonscapes.rendering.hemisphere_rays import RayScene
+from seasonscapes.rendering.terrain_material import shadow_ray_start
 from seasonscapes.sky.illumination import Luminary
 
 # Rays in one kernel launch; bounds the memory, and more are not faster.
@@ -304,5 +305,7 @@ def _visible(rays: SunRays, disc: _Disc, lane: Any, shift: Any = 0) -> tuple[Any
     receiver = lane // samples
     disc_point = lane - receiver * samples + dr.gather(mi.UInt32, rays.mi_disc_offset, receiver) + shift
     direction = dr.gather(mi.Vector3f, disc.mi_directions, disc_point % disc.mi_count)
-    ray = mi.Ray3f(dr.gather(mi.Point3f, rays.mi_origin, lane, active), direction)
+    origin = dr.gather(mi.Point3f, rays.mi_origin, lane, active)
+    material = rays.terrain.mi_terrain.bsdf()
+    ray = mi.Ray3f(origin + direction * shadow_ray_start(material, cosine), direction)
     return active & ~rays.terrain.mi_scene.ray_test(ray, active), cosine, weight

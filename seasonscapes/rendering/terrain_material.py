@@ -23,6 +23,8 @@ from seasonscapes.terrain.surface import SurfaceGrid
 # Mitsuba's math::RayEpsilon in single precision.
 RAY_EPSILON = float(np.finfo(np.float32).epsneg) * 1500.0
 _PLUGIN = "seasonscapes_terrain"
+# Farthest start of shadow rays, in spacings of the surface's nodes.
+_REACH_NODES = 3.0
 _registered: set[str] = set()
 
 
@@ -47,6 +49,8 @@ class DeviceSurface:
         scaled = (grid.to_node + np.eye(1, grid.to_node.shape[1]) * 0.5) / np.array([[columns], [rows]])
         self._degree = grid.degree
         self._mi_terms = [[dr.opaque(mi.Float, float(value)) for value in terms] for terms in scaled]
+        self.mi_error = dr.opaque(mi.Float, grid.mesh_error_m)
+        self.mi_reach = dr.opaque(mi.Float, _REACH_NODES * grid.spacing_m)
         self._mi_domain = [dr.opaque(mi.Float, value) for value in (*grid.domain[:2], 1.0 / grid.domain[2])]
 
     def sample(self, mi_position: Any, active: Any = True) -> tuple[Any, Any]:
@@ -92,7 +96,7 @@ def shading_normal(material: Any, interaction: Any, active: Any = True) -> Any:
     mi.Normal3f
         Of the smooth surface, or interpolated over the facet where the terrain has none.
     """
-    surface = getattr(material, "surface", None)
+    surface = device_surface(material)
     return interaction.sh_frame.n if surface is None else surface.sample(interaction.p, active)[0]
 
 
@@ -121,13 +125,41 @@ def leaving_points(material: Any, interaction: Any, active: Any = True) -> tuple
     import drjit as dr
 
     offset = (1.0 + dr.max(dr.abs(interaction.p))) * RAY_EPSILON
-    surface = getattr(material, "surface", None)
+    surface = device_surface(material)
     if surface is None:
         return interaction.p + interaction.n * offset, interaction.n, interaction.sh_frame.n
     normal, up = surface.sample(interaction.p, active)
     # The distance to a slope is less than the vertical one.
     lift = dr.maximum(up - interaction.p.z, 0.0) * normal.z
     return interaction.p + interaction.n * offset + normal * lift, normal, normal
+
+
+def device_surface(material: Any) -> DeviceSurface | None:
+    """The surface of a terrain's material; ``None`` where its triangles shade themselves."""
+    return getattr(material, "surface", None)
+
+
+def shadow_ray_start(material: Any, cosine: Any) -> Any:
+    """Return how far from the surface a shadow ray begins [m].
+
+    Facets may stand above the smooth surface by the error of the mesh. Under a low sun they would cast streaks of shadow
+    on the ground beside them, although the surface there faces the sun. A ray is followed from where it is as high above
+    the surface as the mesh may err, at most a few nodes away. If a slope rises before that, the ray begins within the
+    terrain and hits it from the inside.
+
+    Parameters
+    ----------
+    material
+        Of the terrain's mesh.
+    cosine
+        ``mi.Float``: cosine of the angle between ray and surface normal.
+    """
+    import drjit as dr
+
+    surface = device_surface(material)
+    if surface is None:
+        return 0.0
+    return dr.minimum(surface.mi_error / dr.maximum(cosine, 1e-3), surface.mi_reach)
 
 
 def terrain_material(reflectance: dict[str, Any], surface: SurfaceGrid | None) -> Any:
@@ -138,8 +170,8 @@ def terrain_material(reflectance: dict[str, Any], surface: SurfaceGrid | None) -
     reflectance
         Mitsuba's dictionary of a texture.
     surface
-        The smooth surface; ``None`` gives Mitsuba's own diffuse material with the normals of the mesh, and so does the
-        scalar variant, which would call Python for every sample.
+        The smooth surface; ``None``: normals are those of the mesh. The scalar variant, which would call Python for every
+        sample, has Mitsuba's own diffuse material with the normals of the mesh.
 
     Returns
     -------
@@ -148,7 +180,7 @@ def terrain_material(reflectance: dict[str, Any], surface: SurfaceGrid | None) -
     """
     import mitsuba as mi
 
-    if surface is None or use_backend().device == "scalar":
+    if use_backend().device == "scalar":
         return mi.load_dict({"type": "diffuse", "reflectance": reflectance})
     variant = mi.variant()
     assert variant is not None
@@ -156,7 +188,7 @@ def terrain_material(reflectance: dict[str, Any], surface: SurfaceGrid | None) -
         mi.register_bsdf(_PLUGIN, _material_class())
         _registered.add(variant)
     material: Any = mi.load_dict({"type": _PLUGIN, "reflectance": reflectance})
-    material.surface = DeviceSurface(surface)
+    material.surface = None if surface is None else DeviceSurface(surface)
     return material
 
 
@@ -176,7 +208,7 @@ def _material_class() -> Any:
             self.m_components, self.m_flags = [flags], flags
 
         def _normal(self, si: Any, active: Any) -> Any:
-            return self.surface.sample(si.p, active)[0]
+            return shading_normal(self, si, active)
 
         def _front(self, si: Any, active: Any) -> Any:
             return active & (dr.dot(si.n, si.to_world(si.wi)) > 0.0)

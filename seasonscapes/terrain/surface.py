@@ -63,16 +63,28 @@ class SurfaceGrid:
         ``(2, T)`` polynomials of position for column and row of the nodes; see `monomials`.
     domain
         East and north of the polynomials' centre, and their radius [m].
+    mesh_error_m
+        Vertical error bound of the mesh against the nodes [m].
     """
 
     nodes: np.ndarray
     to_node: np.ndarray
     domain: tuple[float, float, float]
+    mesh_error_m: float = 0.0
 
     @property
     def degree(self) -> int:
         """Degree of the polynomials."""
         return round((8 * self.to_node.shape[1] + 1) ** 0.5 - 3) // 2
+
+    @property
+    def spacing_m(self) -> float:
+        """Distance of neighbouring nodes at the centre of the domain [m]."""
+        step = self.domain[2] / 100.0
+        points = np.array([[0.0, 0.0, 0.0], [step, 0.0, 0.0], [0.0, step, 0.0]])
+        points[:, :2] += self.domain[:2]
+        node = self.nodes_at(points)
+        return float(step / np.sqrt(abs(np.linalg.det(node[1:] - node[0]))))
 
     def nodes_at(self, position_m: np.ndarray) -> np.ndarray:
         """Column and row ``(N, 2)`` of positions ``(N, 3)`` among the nodes; integers at the nodes."""
@@ -259,6 +271,7 @@ def save_terrain(terrain: Terrain, path: str | os.PathLike[str], *, note: dict[s
     if terrain.surface is not None:
         surface = terrain.surface
         arrays |= {"surface": surface.nodes, "surface_to_node": surface.to_node, "surface_domain": surface.domain}
+        arrays["surface_mesh_error_m"] = surface.mesh_error_m
     np.savez(path, note=json.dumps(note or {}), **arrays)
 
 
@@ -282,7 +295,12 @@ def load_terrain(path: str | os.PathLike[str]) -> tuple[Terrain, dict[str, Any]]
         surface = None
         if "surface" in stored:
             east, north, radius = map(float, stored["surface_domain"])
-            surface = SurfaceGrid(stored["surface"], stored["surface_to_node"], (east, north, radius))
+            surface = SurfaceGrid(
+                stored["surface"],
+                stored["surface_to_node"],
+                (east, north, radius),
+                float(stored["surface_mesh_error_m"]),
+            )
         terrain = Terrain(stored["vertices"], stored["faces"], stored["uv"], frame, surface)
         return terrain, json.loads(str(stored["note"]))
 

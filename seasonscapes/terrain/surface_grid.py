@@ -21,7 +21,7 @@ _DEGREES = (3, 5, 7)
 _STRIP = 500_000
 
 
-def surface_grid(raster: Raster, frame: LocalFrame) -> SurfaceGrid:
+def surface_grid(raster: Raster, frame: LocalFrame, *, mesh_error_m: float = 0.0) -> SurfaceGrid:
     """Compute slopes and up coordinates of a raster's samples in the local frame.
 
     Parameters
@@ -30,6 +30,8 @@ def surface_grid(raster: Raster, frame: LocalFrame) -> SurfaceGrid:
         ``values`` ``(H, W, 1)`` heights [m] without holes.
     frame
         Local frame of the result.
+    mesh_error_m
+        Vertical error bound of the mesh that approximates the surface [m].
 
     Returns
     -------
@@ -57,7 +59,7 @@ def surface_grid(raster: Raster, frame: LocalFrame) -> SurfaceGrid:
         kept = slice(first - low, min(first + strip, rows) - low)
         nodes[first : first + strip, :, :2] = (-normal[..., :2] / np.maximum(normal[..., 2:], 1e-6))[kept]
         nodes[first : first + strip, :, 2] = position[kept, :, 2]
-    return SurfaceGrid(nodes, *_to_nodes(raster, frame, stride, heights))
+    return SurfaceGrid(nodes, *_to_nodes(raster, frame, stride, heights), mesh_error_m)
 
 
 def _to_nodes(

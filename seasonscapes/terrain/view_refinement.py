@@ -50,7 +50,7 @@ def refined_for_view(
     near = _near_faces(terrain, eye_m, reach_m)
     settled, faces = [terrain.faces[~near]], terrain.faces[near]
     vertices, uv = terrain.vertices, terrain.uv
-    spacing = _node_spacing_m(terrain.surface)
+    spacing = terrain.surface.spacing_m
     visible_error = tolerance_px * pixel_angle_rad
     for _ in range(_MOST_ROUNDS):
         edges, of_face = _unique_edges(faces)
@@ -85,15 +85,6 @@ def refined_for_view(
 def _near_faces(terrain: Terrain, eye_m: np.ndarray, reach_m: float) -> np.ndarray:
     inside = np.linalg.norm(terrain.vertices[:, :2] - np.asarray(eye_m)[:2], axis=1) < reach_m
     return inside[terrain.faces].any(axis=1)
-
-
-def _node_spacing_m(surface: SurfaceGrid) -> float:
-    """Distance of neighbouring nodes at the centre of the surface [m]."""
-    step = surface.domain[2] / 100.0
-    points = np.array([[0.0, 0.0, 0.0], [step, 0.0, 0.0], [0.0, step, 0.0]])
-    points[:, :2] += surface.domain[:2]
-    node = surface.nodes_at(points)
-    return float(step / np.sqrt(abs(np.linalg.det(node[1:] - node[0]))))
 
 
 def _unique_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

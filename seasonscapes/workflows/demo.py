@@ -23,7 +23,7 @@ from seasonscapes.workflows.pictures import develop
 from seasonscapes.workflows.place import MeshOptions, Place
 from seasonscapes.workflows.relight_session import RenderJob
 from seasonscapes.workflows.timelapse import FilmLook, develop_film, render_frames
-from seasonscapes.workflows.views import camera_for
+from seasonscapes.workflows.views import camera_for, terrain_for_view
 from seasonscapes.workspace import content_key
 
 if TYPE_CHECKING:
@@ -151,6 +151,7 @@ class _PanelRenderer:
         self.place, self.view, self.folder, self.spp = place, view, folder, spp
         self.day: date | None = None
         self.mi_mesh: Any = None
+        self.terrain = terrain_for_view(place, camera_for(place, view, size_px=(768, 512)))
 
     def picture(self, name: str, panel: Panel, size_px: tuple[int, int]) -> Path:
         """Render one panel, or keep the file that was made from the same inputs."""
@@ -184,7 +185,7 @@ class _PanelRenderer:
         from seasonscapes.rendering.mitsuba_scene import mi_mesh, relight
 
         if self.day != day:
-            self.day, self.mi_mesh = day, mi_mesh(self.place.terrain, scene_albedo(self.place, day).values)
+            self.day, self.mi_mesh = day, mi_mesh(self.terrain, scene_albedo(self.place, day).values)
         return relight(self.mi_mesh, light)
 
 

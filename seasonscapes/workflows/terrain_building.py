@@ -154,7 +154,8 @@ def build_terrain(
     refined = refine_raster(elevation, factor)
     terrain = build_mesh(refined, frame, mesher=options.mesher, max_error_m=bound)
     if options.mesher != "poisson":
-        terrain = replace(terrain, surface=surface_grid(refined, frame))
+        error = bound if options.mesher == "adaptive" else 0.0
+        terrain = replace(terrain, surface=surface_grid(refined, frame, mesh_error_m=error))
     texel_m = _texel_m(terrain, elevation, scene, options)
     return unwrap(terrain, kind=options.atlas, texel_m=texel_m, max_side_px=options.max_side_px)
 
