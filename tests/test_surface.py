@@ -79,6 +79,18 @@ def test_a_plain_before_a_wall_gets_its_sunlight_everywhere(walled, kind):
     np.testing.assert_allclose(values, right, rtol=0.01)
 
 
+def test_a_low_sun_leaves_no_streaks_on_almost_flat_ground(tmp_path):
+    y, x = np.mgrid[0:90, 0:90] * 20.0
+    heights = 100.0 + 1.5 * np.sin(x / 60.0) * np.cos(y / 75.0)
+    place = place_of(tmp_path, heights, spacing_m=20.0)
+    # The sun of the midnight hours in summer at 78° N stands as low as this one in the morning.
+    band = ss.irradiance_map(place, "2024-06-21T06:50", sky="hosek", rays=16).bands["direct W/m2"]
+    slope = np.hypot(*np.gradient(heights, 20.0)).max()
+    sun = ss.illumination(place, "2024-06-21T06:50", sky="hosek").sun
+    assert np.tan(np.radians(sun.elevation_deg)) > 1.5 * slope, "no ground faces away from the sun"
+    assert band.min() > 0.2 * band.mean(), "so none of it may lie in shadow"
+
+
 @pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:4326"])
 def test_the_surface_passes_through_the_samples(tmp_path, crs):
     rng = np.random.default_rng(4)

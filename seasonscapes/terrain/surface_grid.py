@@ -73,7 +73,8 @@ def _to_nodes(
     levels = np.linspace(float(heights.min()), float(heights.max()) + 1.0, 3)
     position = np.concatenate([enu_from_geodetic(frame, latitude, longitude, level).reshape(-1, 3) for level in levels])
     low, high = position[:, :2].min(axis=0), position[:, :2].max(axis=0)
-    domain = (*map(float, 0.5 * (low + high)), float(0.5 * (high - low).max()))
+    centre, radius = 0.5 * (low + high), 0.5 * float((high - low).max())
+    domain = (float(centre[0]), float(centre[1]), radius)
     target = np.tile(np.stack([column.ravel(), row.ravel()], axis=1) / stride, (len(levels), 1))
     errors = []
     for degree in _DEGREES:
