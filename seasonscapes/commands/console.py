@@ -5,12 +5,16 @@ from __future__ import annotations
 import json
 import logging
 import sys
+import time as clock
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 from seasonscapes.commands.interruption import raise_if_interrupted
 from seasonscapes.progress import Progress
+
+# Long work tells how far it is this often where there is no terminal for a bar.
+_SECONDS_BETWEEN_LINES = 10.0
 
 
 class _StderrHandler(logging.Handler):
@@ -40,7 +44,7 @@ def print_result(record: dict[str, Any], lines: list[str], *, as_json: bool) -> 
 
 @contextmanager
 def progress_bars() -> Iterator[Progress]:
-    """Show a bar with the remaining time for each task on stderr; nothing is shown where stderr is no terminal."""
+    """Show a bar with the remaining time for each task on stderr; where that is no terminal, a line now and then."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -62,9 +66,14 @@ def progress_bars() -> Iterator[Progress]:
     console = Console(stderr=True)
     with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bars:
         tasks: dict[str, Any] = {}
+        told_s = clock.monotonic()
 
         def report(task: str, fraction: float) -> None:
+            nonlocal told_s
             raise_if_interrupted()
+            if not console.is_terminal and clock.monotonic() - told_s > _SECONDS_BETWEEN_LINES:
+                message(f"{task}: {fraction:.0%}")
+                told_s = clock.monotonic()
             if task not in tasks:
                 tasks[task] = bars.add_task(task, total=1.0)
             bars.update(tasks[task], completed=fraction)

@@ -185,7 +185,9 @@ def load_place(
         key,
         code=_TERRAIN_CODE,
         suffix=".npz",
-        build=lambda: terrain_building.build_terrain(elevation, frame, declared, options),
+        build=lambda: terrain_building.build_terrain(
+            elevation, frame, declared, options, progress=lambda share: report(0.3 + 0.7 * share)
+        ),
         save=terrain_building.save_built_terrain,
         load=terrain_building.load_built_terrain,
     )

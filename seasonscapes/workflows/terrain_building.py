@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -145,17 +146,26 @@ def sample_spacing_m(raster: Raster) -> float:
 
 
 def build_terrain(
-    elevation: Raster, frame: LocalFrame, scene: SceneFile, options: MeshOptions
+    elevation: Raster,
+    frame: LocalFrame,
+    scene: SceneFile,
+    options: MeshOptions,
+    *,
+    progress: Callable[[float], None] | None = None,
 ) -> tuple[Terrain, Atlas]:
     """Mesh an elevation raster in a local frame and unwrap it; see `terrain.mesh` and `terrain.unwrap`."""
+    report = progress or (lambda fraction: None)
     spacing_m = sample_spacing_m(elevation)
     factor = options.refine or refinement_factor(elevation.values[..., 0].size, spacing_m)
     bound = options.max_error_m or min(5.0, spacing_m / factor / 10.0)
     refined = refine_raster(elevation, factor)
+    report(0.1)
     terrain = build_mesh(refined, frame, mesher=options.mesher, max_error_m=bound)
+    report(0.6)
     if options.mesher != "poisson":
         error = bound if options.mesher == "adaptive" else 0.0
         terrain = replace(terrain, surface=surface_grid(refined, frame, mesh_error_m=error))
+    report(0.8)
     texel_m = _texel_m(terrain, elevation, scene, options)
     return unwrap(terrain, kind=options.atlas, texel_m=texel_m, max_side_px=options.max_side_px)
 
