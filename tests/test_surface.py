@@ -114,6 +114,24 @@ def test_the_surface_passes_through_the_samples(tmp_path, crs):
     assert (normal[:, 2] > 0.0).all()
 
 
+@pytest.mark.parametrize(
+    ("crs", "corner", "step"),
+    [("EPSG:4326", (5.0, 50.0), 5.0 / 300), ("EPSG:4326", (15.0, 80.0), 2.0 / 300), ("EPSG:3857", (9e5, 6e6), 200.0)],
+)
+def test_the_surface_of_wide_and_polar_rasters(crs, corner, step):
+    from seasonscapes.terrain.raster import centre_frame
+    from seasonscapes.terrain.surface import Raster
+    from seasonscapes.terrain.surface_grid import surface_grid
+
+    heights = np.random.default_rng(2).uniform(0.0, 4000.0, (300, 300, 1)).astype(np.float32)
+    raster = Raster(heights, Affine(step, 0, corner[0], 0, -step, corner[1]), crs)
+    frame = centre_frame(raster)
+    row, column = np.mgrid[0:300:7, 0:300:7]
+    position = sample_positions(raster, frame, row, column, heights[row, column, 0]).reshape(-1, 3)
+    node = surface_grid(raster, frame).nodes_at(position)
+    np.testing.assert_allclose(node, np.stack([column.ravel(), row.ravel()], axis=1), atol=0.03)
+
+
 def test_the_device_and_the_host_agree_on_the_surface(alpine):
     from seasonscapes.rendering.backend import point3
     from seasonscapes.rendering.terrain_material import DeviceSurface

@@ -15,8 +15,8 @@ from seasonscapes.terrain.surface import Raster, SurfaceGrid, monomials
 
 # 12 bytes each on the device; larger rasters are thinned.
 MOST_NODES = 24_000_000
-# Largest error of the polynomial from the local frame to the raster [samples].
-_MOST_ERROR = 0.02
+# Largest error of the polynomial from the local frame to the raster: in samples, or in metres where that is more.
+_MOST_ERROR, _MOST_ERROR_M = 0.02, 0.05
 _DEGREES = (3, 5, 7)
 _STRIP = 500_000
 
@@ -76,14 +76,15 @@ def _to_nodes(
     centre, radius = 0.5 * (low + high), 0.5 * float((high - low).max())
     domain = (float(centre[0]), float(centre[1]), radius)
     target = np.tile(np.stack([column.ravel(), row.ravel()], axis=1) / stride, (len(levels), 1))
-    errors = []
+    spacing_m = 2.0 * radius * stride / max(height, width)
+    tolerance, errors = max(_MOST_ERROR, _MOST_ERROR_M / spacing_m), []
     for degree in _DEGREES:
         terms = monomials(position, domain, degree)
         coefficients = np.linalg.lstsq(terms, target, rcond=None)[0].T
         errors.append(float(np.abs(terms @ coefficients.T - target).max()))
-        if errors[-1] < _MOST_ERROR:
+        if errors[-1] < tolerance:
             return coefficients, domain
     raise ValueError(
         f"surface_grid: the local frame maps to the raster with errors of {min(errors):.2f} samples; expected less than "
-        f"{_MOST_ERROR}; choose a smaller [area]"
+        f"{tolerance:.2f}; choose a smaller [area]"
     )
