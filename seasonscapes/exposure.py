@@ -91,8 +91,13 @@ def exposure_ev100(image: np.ndarray, exposure: str | float = "auto", *, look: s
     metered = auto_exposure_ev100(image)
     if exposure == "auto":
         metered += float(np.clip(_DIM_SLOPE * (_DIM_EV - metered), 0.0, _MAX_UNDEREXPOSURE))
-        return metered - (highlight_stops(expose(image, metered) * EXPOSURE_GAIN, metered) if look == "photo" else 0.0)
+        return photo_ev100(image, metered) if look == "photo" else metered
     return metered + _adaptation_stops(METER_CONSTANT * 2.0**metered)
+
+
+def photo_ev100(image: np.ndarray, neutral_ev100: float) -> float:
+    """The EV100 of the look ``photo``, from that of the mode ``auto``: it brings the highlights near white."""
+    return neutral_ev100 - highlight_stops(expose(image, neutral_ev100) * EXPOSURE_GAIN, neutral_ev100)
 
 
 def _adaptation_stops(luminance: float) -> float:

@@ -42,10 +42,10 @@ class LookOptions:
 
         return exposure_ev100(radiance, self.metering(), look=self.look)
 
-    def develop(self, radiance: np.ndarray, white_rgb: Sequence[float] | None) -> np.ndarray:
-        """The display-linear picture ``(H, W, 3)`` of an image ``(H, W, 3)`` [cd/m²]."""
+    def develop(self, radiance: np.ndarray, ev100: float, white_rgb: Sequence[float] | None) -> np.ndarray:
+        """The display-linear picture ``(H, W, 3)`` of an image ``(H, W, 3)`` [cd/m²] at the exposure of `ev100`."""
         from seasonscapes.exposure import develop
         from seasonscapes.workflows.pictures import balance_rgb
 
         white, eye = balance_rgb(self.white_balance, white_rgb), self.metering() == "eye"
-        return develop(radiance, self.ev100(radiance), eye=eye, look=self.look, white=white)
+        return develop(radiance, ev100, eye=eye, look=self.look, white=white)

@@ -115,7 +115,7 @@ def render_command(
         "exposure_ev100": round(ev100, 3),
     }
     if output.suffix.lower() == ".png":
-        save_png(output, look.develop(picture.radiance, record["white_rgb"]), metadata=png_metadata(record))
+        save_png(output, look.develop(picture.radiance, ev100, record["white_rgb"]), metadata=png_metadata(record))
     else:
         save_exr(output, picture, albedo=texture, header={"seasonscapes:view": chosen.model_dump()})
     record["seconds"] = round(clock.perf_counter() - start, 2)

@@ -104,7 +104,7 @@ def splat_command(
         ev100 = look.ev100(picture.radiance)
         record |= {"camera": chosen.name, "size_px": list(size_px), **times_ms, "exposure_ev100": round(ev100, 3)}
         if suffix == ".png":
-            save_png(output, look.develop(picture.radiance, light.white_rgb), metadata=png_metadata(record))
+            save_png(output, look.develop(picture.radiance, ev100, light.white_rgb), metadata=png_metadata(record))
         else:
             layers = {"": picture.radiance, "surface": picture.surface, "alpha": picture.coverage}
             layers |= {"depth": picture.depth}

@@ -12,6 +12,7 @@ slopes show no triangles. A facet is lit and seen as the surface that it approxi
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,6 @@ RAY_EPSILON = float(np.finfo(np.float32).epsneg) * 1500.0
 _PLUGIN = "seasonscapes_terrain"
 # Farthest start of shadow rays, in spacings of the surface's nodes.
 _REACH_NODES = 3.0
-_registered: set[str] = set()
 
 
 class DeviceSurface:
@@ -184,12 +184,18 @@ def terrain_material(reflectance: dict[str, Any], surface: SurfaceGrid | None) -
         return mi.load_dict({"type": "diffuse", "reflectance": reflectance})
     variant = mi.variant()
     assert variant is not None
-    if variant not in _registered:
-        mi.register_bsdf(_PLUGIN, _material_class())
-        _registered.add(variant)
+    _register(variant)
     material: Any = mi.load_dict({"type": _PLUGIN, "reflectance": reflectance})
     material.surface = None if surface is None else DeviceSurface(surface)
     return material
+
+
+@cache
+def _register(variant: str) -> None:
+    """Register the plug-in, once for each variant of Mitsuba: its class belongs to the present one."""
+    import mitsuba as mi
+
+    mi.register_bsdf(_PLUGIN, _material_class())
 
 
 def _material_class() -> Any:

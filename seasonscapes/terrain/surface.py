@@ -90,6 +90,19 @@ class SurfaceGrid:
         """Column and row ``(N, 2)`` of positions ``(N, 3)`` among the nodes; integers at the nodes."""
         return monomials(position_m, self.domain, self.degree) @ self.to_node.T
 
+    def up_at(self, position_m: np.ndarray) -> np.ndarray:
+        """Up coordinates ``(N,)`` float64 at positions ``(N, 3)`` [m]; see `sample`."""
+        return self._interpolated(position_m, (2,))[0]
+
+    def _interpolated(self, position_m: np.ndarray, channels: tuple[int, ...]) -> list[np.ndarray]:
+        from scipy.ndimage import map_coordinates
+
+        column, row = self.nodes_at(np.asarray(position_m, np.float64)).T
+        return [
+            map_coordinates(self.nodes[..., k], [row, column], order=1, mode="nearest", output=np.float64)
+            for k in channels
+        ]
+
     def sample(self, position_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Interpolate the surface bilinearly.
 
@@ -105,13 +118,7 @@ class SurfaceGrid:
         normal
             ``(N, 3)`` float32 unit normals of the interpolated slopes.
         """
-        from scipy.ndimage import map_coordinates
-
-        column, row = self.nodes_at(np.asarray(position_m, np.float64)).T
-        east, north, up = (
-            map_coordinates(self.nodes[..., k], [row, column], order=1, mode="nearest", output=np.float64)
-            for k in range(3)
-        )
+        east, north, up = self._interpolated(position_m, (0, 1, 2))
         normal = np.stack([-east, -north, np.ones_like(up)], axis=1)
         return up, (normal / np.linalg.norm(normal, axis=1, keepdims=True)).astype(np.float32)
 

@@ -73,7 +73,7 @@ def refined_for_view(
             break
         ends = edges[split]
         middle = vertices[ends].mean(axis=1, dtype=np.float64)
-        middle[:, 2] = terrain.surface.sample(middle)[0]
+        middle[:, 2] = terrain.surface.up_at(middle)
         number = np.full(len(edges), -1, np.int64)
         number[split] = len(vertices) + np.arange(len(ends))
         vertices = np.concatenate([vertices, middle.astype(np.float32)])
@@ -99,7 +99,7 @@ def _distance(position_m: np.ndarray, eye_m: np.ndarray) -> np.ndarray:
 
 
 def _deviation(surface: SurfaceGrid, position_m: np.ndarray) -> np.ndarray:
-    return np.abs(surface.sample(position_m)[0] - position_m[:, 2])
+    return np.abs(surface.up_at(position_m) - position_m[:, 2])
 
 
 def _visible(

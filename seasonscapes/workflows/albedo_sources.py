@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import date, datetime, timedelta
 from functools import partial
@@ -93,28 +93,32 @@ def scene_albedo(place: Place, day: date | str) -> Texture:
     inputs: dict[str, Any] = {"terrain": place.key}
     if place.synthetic is not None:
         day_of_year = day.timetuple().tm_yday
-        return build_once(
-            place.workspace,
-            f"{place.scene.name}/albedo-day{day_of_year:03d}",
+        return texture_once(
+            place,
+            f"albedo-day{day_of_year:03d}",
             inputs | {"day_of_year": day_of_year},
             code=_SYNTHETIC_CODE,
-            suffix=".npz",
             build=lambda: bake_imagery(place.terrain, place.atlas, _synthetic_image(place, day_of_year)),
-            save=save_texture,
-            load=load_texture,
         )
     imagery = place.scene.imagery
     if imagery is None:
         values = np.full((*place.texture_shape, 3), GREY_ALBEDO, np.float32)
         return Texture(values, np.zeros(place.texture_shape, np.float32), place.atlas_id)
     inputs.update(imagery=imagery.model_copy(update={"file": Path(imagery.file).name}), hash=file_hash(imagery.file))
+    return texture_once(place, "albedo", inputs, code=_IMAGE_CODE, build=lambda: _baked_image(place))
+
+
+def texture_once(
+    place: Place, name: str, inputs: dict[str, Any], *, code: tuple[str, ...], build: Callable[[], Texture]
+) -> Texture:
+    """A texture of a place from its workspace, or built and kept there; see `workspace.build_once`."""
     return build_once(
         place.workspace,
-        f"{place.scene.name}/albedo",
+        f"{place.scene.name}/{name}",
         inputs,
-        code=_IMAGE_CODE,
+        code=code,
         suffix=".npz",
-        build=lambda: _baked_image(place),
+        build=build,
         save=save_texture,
         load=load_texture,
     )
@@ -264,15 +268,12 @@ def snow_transition_between(place: Place, first: DatedAlbedo, second: DatedAlbed
         # Bilinear look-ups at the rim reach texels beyond the surface.
         return Texture(fill_nearest(values.reshape(*shape, 3), weight), weight, place.atlas_id)
 
-    return build_once(
-        place.workspace,
-        f"{place.scene.name}/snow-transition",
+    return texture_once(
+        place,
+        "snow-transition",
         {"terrain": place.key, "dated": [first.content, second.content]},
         code=_TRANSITION_CODE,
-        suffix=".npz",
         build=build,
-        save=save_texture,
-        load=load_texture,
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, replace
 from datetime import date, datetime, timedelta
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +30,7 @@ from seasonscapes.workspace import content_key
 if TYPE_CHECKING:
     from seasonscapes.rendering.mitsuba_scene import RenderScene
     from seasonscapes.rendering.radiance import RenderedView
+    from seasonscapes.terrain.surface import Terrain
 
 log = logging.getLogger(__name__)
 
@@ -151,7 +153,11 @@ class _PanelRenderer:
         self.place, self.view, self.folder, self.spp = place, view, folder, spp
         self.day: date | None = None
         self.mi_mesh: Any = None
-        self.terrain = terrain_for_view(place, camera_for(place, view, size_px=(768, 512)))
+
+    @cached_property
+    def terrain(self) -> Terrain:
+        """The terrain as the view needs it; made when the first panel is rendered."""
+        return terrain_for_view(self.place, camera_for(self.place, self.view, size_px=(768, 512)))
 
     def picture(self, name: str, panel: Panel, size_px: tuple[int, int]) -> Path:
         """Render one panel, or keep the file that was made from the same inputs."""

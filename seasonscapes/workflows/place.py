@@ -257,7 +257,7 @@ def ground_or_nan(place: Place, latitude_deg: float, longitude_deg: float) -> fl
     rendered = mesh_up_m(place.terrain, position)
     if place.terrain.surface is not None and np.isfinite(rendered):
         # Near a camera the mesh is refined towards this surface.
-        rendered = max(rendered, float(place.terrain.surface.sample(position[None])[0][0]))
+        rendered = max(rendered, float(place.terrain.surface.up_at(position[None])[0]))
     return height + (rendered - float(position[2])) if np.isfinite(rendered) else height
 
 

@@ -13,11 +13,10 @@ import numpy as np
 
 from seasonscapes.progress import Progress, task_progress
 from seasonscapes.sky.models import SkyModel
-from seasonscapes.terrain.surface import Texture, load_texture, save_texture
-from seasonscapes.workflows.albedo_sources import load_albedo
+from seasonscapes.terrain.surface import Texture
+from seasonscapes.workflows.albedo_sources import load_albedo, texture_once
 from seasonscapes.workflows.illumination import illumination_on_terrain, sky_model
 from seasonscapes.workflows.place import Place, utc_at
-from seasonscapes.workspace import build_once
 
 if TYPE_CHECKING:
     from seasonscapes.albedo.seasons import DatedAlbedo
@@ -78,15 +77,12 @@ def predict_radiance(
     """
     model, utc = sky_model(sky), utc_at(place, time)
     texture = place.require_texture(albedo.load(), what="albedo")
-    return build_once(
-        place.workspace,
-        f"{place.scene.name}/predicted",
+    return texture_once(
+        place,
+        "predicted",
         {"place": place.key, "albedo": albedo.content, "time": utc, "sky": model},
         code=_CODE,
-        suffix=".npz",
         build=lambda: _relit(place, texture, utc, model, progress),
-        save=save_texture,
-        load=load_texture,
     )
 
 

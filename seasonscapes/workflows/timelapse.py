@@ -14,7 +14,7 @@ import numpy as np
 
 from seasonscapes import __version__
 from seasonscapes.errors import InputError
-from seasonscapes.exposure import develop, exposure_ev100
+from seasonscapes.exposure import develop, exposure_ev100, photo_ev100
 from seasonscapes.progress import Progress, each_reported
 from seasonscapes.relighting.frame_file import frame_header, frame_name, load_frame, save_frame, time_stamp
 from seasonscapes.workflows.pictures import balance_rgb
@@ -138,7 +138,7 @@ def session_frame(
         "sun": sun_angles(position),
         "sky": light.model,
         "white_rgb": light.white_rgb,
-        "photo_ev100": exposure_ev100(view.radiance, "auto", look="photo"),
+        "photo_ev100": photo_ev100(view.radiance, metered),
         "attribution": scene.attribution,
     }
     if copy is not None:
