@@ -37,7 +37,6 @@ from seasonscapes.workflows.run_photographs import (
 )
 from seasonscapes.workflows.stage_runner import Stage, run_stages, stage_range
 from seasonscapes.workflows.views import camera_for
-from seasonscapes.workspace import file_hash
 
 STAGES = ("pictures", "calibrate", "albedo", "paint", "inpaint", "relight", "distil", "splat")
 
@@ -158,7 +157,7 @@ def _imagery(place: Place) -> dict | None:
     imagery = place.scene.imagery
     if imagery is None:
         return None
-    return {**imagery.model_dump(mode="json", exclude={"file"}), "hash": file_hash(imagery.file)}
+    return {**imagery.model_dump(mode="json", exclude={"file"}), "hash": place.scene.image_hash}
 
 
 def _sources(folder: Path) -> PhotographSources:
