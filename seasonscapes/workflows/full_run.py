@@ -269,11 +269,8 @@ def _relight(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]
         seed=job.seed,
         allow_outside=job.allow_outside,
     )
-    timelapse.render_frames(render_job, hours, place=place, progress=progress)
     look = timelapse.FilmLook(smooth_s=0.0)
-    paths = timelapse.develop_film(render_job, hours, folder / "relight", look, progress=progress)
-    timelapse.remove_frames(render_job, hours)
-    return paths
+    return timelapse.make_film(render_job, hours, folder / "relight", look, place=place, progress=progress)[0]
 
 
 def _distil(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
