@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
-from collections.abc import Iterator, Mapping
+import secrets
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -24,8 +24,27 @@ from seasonscapes.errors import NoUsablePixels, UnreadableImage
 METER_CONSTANT = 12.5 / 100.0
 # Luminance that just saturates a sensor at EV100 = 0: 78 / (S q) with q = 0.65 (ISO 12232; Lagarde & de Rousiers 2014).
 SATURATION_LUMINANCE = 1.2
+# Of a file's name in that of its temporary file.
+_STEM_CHARACTERS = 24
+_notes: list[Callable[[Path], None]] = []
 # Luminance weights of linear Rec.709 (ITU-R BT.709): Y = w · rgb. In photometric RGB, Y is in lux or cd/m².
 REC709_LUMINANCE = np.array([0.2126390, 0.7151687, 0.0721923])
+
+
+@contextmanager
+def writes_noted(note: Callable[[Path], None]) -> Iterator[None]:
+    """Context manager: ``note`` is called with each file that `atomic_path` is about to create, temporary ones included.
+
+    Parameters
+    ----------
+    note
+        Called before the file exists, from any thread of this process.
+    """
+    _notes.append(note)
+    try:
+        yield
+    finally:
+        _notes.remove(note)
 
 
 @contextmanager
@@ -47,12 +66,16 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=f".part{path.suffix}", dir=path.parent)
-    os.close(handle)
+    # Of a long name only the beginning, so that the temporary one is not too long where the name itself is not.
+    name = str(path.with_name(f".{path.stem[:_STEM_CHARACTERS]}-{secrets.token_hex(4)}.part{path.suffix}"))
+    for note in tuple(_notes):
+        note(Path(name))
+        note(path)
+    os.close(os.open(name, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
     temporary = Path(name)
     try:
         yield temporary
-        # mkstemp creates private files; set the mode that open() would have set.
+        # The temporary file is private; set the mode that open() would have set.
         umask = os.umask(0)
         os.umask(umask)
         temporary.chmod(0o666 & ~umask)
