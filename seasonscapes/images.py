@@ -6,6 +6,7 @@ sRGB encoding is used in files only. Exposure is EV100: ``luminance = 2**EV100 *
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import tempfile
@@ -24,6 +25,8 @@ from seasonscapes.errors import NoUsablePixels, UnreadableImage
 METER_CONSTANT = 12.5 / 100.0
 # Luminance that just saturates a sensor at EV100 = 0: 78 / (S q) with q = 0.65 (ISO 12232; Lagarde & de Rousiers 2014).
 SATURATION_LUMINANCE = 1.2
+# Of a file's name in that of its temporary file.
+_STEM_CHARACTERS = 24
 # Luminance weights of linear Rec.709 (ITU-R BT.709): Y = w · rgb. In photometric RGB, Y is in lux or cd/m².
 REC709_LUMINANCE = np.array([0.2126390, 0.7151687, 0.0721923])
 
@@ -32,8 +35,8 @@ REC709_LUMINANCE = np.array([0.2126390, 0.7151687, 0.0721923])
 def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     """Context manager for atomic writing: a temporary path that replaces ``path`` when the block succeeds.
 
-    After an exception in the block ``path`` is unchanged and the temporary file is removed. The temporary name keeps
-    the suffix, since many writers choose the format by it.
+    After an exception in the block ``path`` is unchanged and the temporary file is removed; an `OSError` about the
+    temporary file names ``path``. The temporary name keeps the suffix, since many writers choose the format by it.
 
     Parameters
     ----------
@@ -47,7 +50,9 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=f".part{path.suffix}", dir=path.parent)
+    # Of a long name only the beginning, so that the temporary one is not too long where the name itself is not.
+    prefix = f".{path.stem[:_STEM_CHARACTERS]}-"
+    handle, name = tempfile.mkstemp(prefix=prefix, suffix=f".part{path.suffix}", dir=path.parent)
     os.close(handle)
     temporary = Path(name)
     try:
@@ -57,8 +62,32 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
         os.umask(umask)
         temporary.chmod(0o666 & ~umask)
         os.replace(temporary, path)
+    except Exception as error:
+        trouble = _trouble_of_writing(error, name, path)
+        if trouble is None:
+            raise
+        raise trouble from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _trouble_of_writing(error: Exception, temporary: str, path: Path) -> OSError | None:
+    """The `OSError` about ``path`` that an exception stands for, or ``None`` if it is none or about another file.
+
+    A full disk is reported with the temporary name or with none; OpenEXR, safetensors and GDAL report it in exceptions of
+    their own, by the system's words.
+    """
+    if isinstance(error, OSError) and error.errno is not None:
+        if error.filename not in (None, temporary, Path(temporary)):
+            return None
+        return OSError(error.errno, error.strerror, str(path))
+    said = str(error).lower()
+    for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EIO):
+        if os.strerror(number).lower() in said:
+            return OSError(number, os.strerror(number), str(path))
+    if "failed to write" in said:
+        return OSError(errno.EIO, f"cannot be written ({error})", str(path))
+    return None
 
 
 def srgb_from_linear(linear: np.ndarray) -> np.ndarray:

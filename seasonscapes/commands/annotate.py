@@ -10,6 +10,7 @@ from cyclopts import Parameter
 
 from seasonscapes.commands.calibrate import TerrainSource
 from seasonscapes.commands.console import message
+from seasonscapes.commands.outputs import check_output_folder
 
 
 def annotate_command(
@@ -42,6 +43,7 @@ def annotate_command(
     from seasonscapes.calibration.terrain_view import march_terrain_view
     from seasonscapes.workflows.webcam_calibration import station_picture
 
+    check_output_folder(output)
     station = (terrain or TerrainSource()).station(scene, webcam)
     image = station_picture(picture, station, "--picture")
     look = partial(march_terrain_view, rasters=station.rasters, frame=station.frame)
