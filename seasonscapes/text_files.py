@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import stat
 from pathlib import Path
@@ -98,6 +99,29 @@ def read_json(path: str | os.PathLike, *, where: str | Path | None = None) -> An
         As `read_text` and `parse_json`.
     """
     return parse_json(read_text(path, where=where), where=_place(path, where))
+
+
+def json_line(value: Any) -> str:
+    """A value as one line of JSON; numbers that JSON cannot hold (NaN, infinity) are ``null``, numpy's become floats.
+
+    Examples
+    --------
+    >>> from seasonscapes.text_files import json_line
+    >>> json_line({"rms_px": float("nan")})
+    '{"rms_px": null}'
+    """
+    return json.dumps(_finite(value), allow_nan=False)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(each) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(each) for each in value]
+    if value is None or isinstance(value, (str, bool, int)):
+        return value
+    number = float(value)
+    return number if math.isfinite(number) else None
 
 
 def _place(path: str | os.PathLike, where: str | Path | None) -> str:

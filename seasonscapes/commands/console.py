@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import logging
-import math
 import os
 import sys
 import time as clock
@@ -14,6 +12,7 @@ from typing import Any, TextIO
 
 from seasonscapes.commands.interruption import raise_if_interrupted
 from seasonscapes.progress import Progress
+from seasonscapes.text_files import json_line
 
 # Long work tells how far it is this often where there is no terminal for a bar.
 _SECONDS_BETWEEN_LINES = 10.0
@@ -57,8 +56,8 @@ def message(line: str) -> None:
 
 
 def print_record(record: Any) -> None:
-    """Print one JSON value on stdout; numbers that JSON cannot hold (NaN, infinity) are ``null``."""
-    _write_line(json.dumps(_finite(record), allow_nan=False), sys.stdout)
+    """Print one JSON value on stdout; see `text_files.json_line`."""
+    _write_line(json_line(record), sys.stdout)
 
 
 def print_result(record: dict[str, Any], lines: list[str], *, as_json: bool) -> None:
@@ -67,18 +66,6 @@ def print_result(record: dict[str, Any], lines: list[str], *, as_json: bool) -> 
         print_record(record)
     else:
         _write_line("\n".join(lines), sys.stdout)
-
-
-def _finite(value: Any) -> Any:
-    """A value of JSON; what it does not know (numpy's numbers) becomes a float, what is not finite ``None``."""
-    if isinstance(value, dict):
-        return {key: _finite(each) for key, each in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(each) for each in value]
-    if value is None or isinstance(value, (str, bool, int)):
-        return value
-    number = float(value)
-    return number if math.isfinite(number) else None
 
 
 def _write_line(line: str, stream: TextIO) -> None:
