@@ -6,6 +6,7 @@ sRGB encoding is used in files only. Exposure is EV100: ``luminance = 2**EV100 *
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import secrets
@@ -51,8 +52,8 @@ def writes_noted(note: Callable[[Path], None]) -> Iterator[None]:
 def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     """Context manager for atomic writing: a temporary path that replaces ``path`` when the block succeeds.
 
-    After an exception in the block ``path`` is unchanged and the temporary file is removed. The temporary name keeps
-    the suffix, since many writers choose the format by it.
+    After an exception in the block ``path`` is unchanged and the temporary file is removed; an `OSError` about the
+    temporary file names ``path``. The temporary name keeps the suffix, since many writers choose the format by it.
 
     Parameters
     ----------
@@ -80,8 +81,32 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
         os.umask(umask)
         temporary.chmod(0o666 & ~umask)
         os.replace(temporary, path)
+    except Exception as error:
+        trouble = _trouble_of_writing(error, name, path)
+        if trouble is None:
+            raise
+        raise trouble from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _trouble_of_writing(error: Exception, temporary: str, path: Path) -> OSError | None:
+    """The `OSError` about ``path`` that an exception stands for, or ``None`` if it is none or about another file.
+
+    A full disk is reported with the temporary name or with none; OpenEXR, safetensors and GDAL report it in exceptions of
+    their own, by the system's words.
+    """
+    if isinstance(error, OSError) and error.errno is not None:
+        if error.filename not in (None, temporary, Path(temporary)):
+            return None
+        return OSError(error.errno, error.strerror, str(path))
+    said = str(error).lower()
+    for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EIO):
+        if os.strerror(number).lower() in said:
+            return OSError(number, os.strerror(number), str(path))
+    if "failed to write" in said:
+        return OSError(errno.EIO, f"cannot be written ({error})", str(path))
+    return None
 
 
 def srgb_from_linear(linear: np.ndarray) -> np.ndarray:

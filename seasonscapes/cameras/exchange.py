@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
+from seasonscapes import text_files
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.declaration import InputError
 from seasonscapes.frames import LocalFrame
@@ -389,12 +390,7 @@ def read_json(path: Path) -> dict[str, Any]:
     InputError
         The file is missing, is not valid JSON, or does not contain an object.
     """
-    try:
-        table = json.loads(Path(path).read_text(encoding="utf-8-sig"))
-    except FileNotFoundError:
-        raise InputError(path, "no such file") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(path, f"not valid JSON: {error}") from None
+    table = text_files.read_json(path)
     if not isinstance(table, dict):
         raise InputError(path, "not a JSON object", got=type(table).__name__)
     return table
@@ -407,9 +403,7 @@ def _write_text(path: Path, text: str) -> None:
 
 def _lines(path: Path, *, keep_blank: bool = False) -> list[tuple[str, str]]:
     """Lines of a file that are no comments, each with file name and line number for messages."""
-    if not path.is_file():
-        raise InputError(path, "no such file")
-    rows = enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
+    rows = enumerate(text_files.read_text(path).splitlines(), 1)
     return [
         (f"{path}: line {number}", row)
         for number, row in rows

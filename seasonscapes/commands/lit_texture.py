@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from seasonscapes.commands.arguments import check_suffix, parse_time
+from seasonscapes.commands.arguments import parse_time
 from seasonscapes.commands.console import print_result, progress_bars
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
+from seasonscapes.commands.outputs import check_output
 
 if TYPE_CHECKING:
     import numpy as np
@@ -58,7 +59,7 @@ def lit_texture_command(
     """
     start = clock.perf_counter()
     sky, options = sky or SkyOptions(), place or PlaceOptions()
-    check_suffix(output, (".png", ".glb", ".exr"))
+    check_output(output, (".png", ".glb", ".exr"))
     from seasonscapes.exposure import develop, exposure_ev100, parse_exposure
     from seasonscapes.images import write_exr
     from seasonscapes.rendering.backend import use_backend

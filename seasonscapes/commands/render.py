@@ -8,10 +8,11 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from seasonscapes.commands.arguments import check_range, check_suffix, parse_albedo, parse_time
+from seasonscapes.commands.arguments import check_range, parse_albedo, parse_time
 from seasonscapes.commands.console import print_result, progress_bars
 from seasonscapes.commands.look_options import LookOptions
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
+from seasonscapes.commands.outputs import check_output
 from seasonscapes.commands.view_options import ViewOptions
 
 
@@ -68,7 +69,7 @@ def render_command(
         look or LookOptions(),
         place or PlaceOptions(),
     )
-    check_suffix(output, (".png", ".exr"))
+    check_output(output, (".png", ".exr"))
     if spp is not None:
         check_range("--spp", spp, 1, 1 << 20)
     if max_depth is not None:

@@ -10,10 +10,11 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from seasonscapes import __version__
-from seasonscapes.commands.arguments import check_choice, check_range, check_suffix, parse_time
+from seasonscapes.commands.arguments import check_choice, check_range, parse_time
 from seasonscapes.commands.console import print_result, progress_bars
 from seasonscapes.commands.look_options import LookOptions
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
+from seasonscapes.commands.outputs import check_output
 from seasonscapes.commands.view_options import ViewOptions
 from seasonscapes.errors import InputError, NoTerrainInView
 
@@ -58,7 +59,7 @@ def splat_command(
         place or PlaceOptions(),
     )
     start = clock.perf_counter()
-    check_suffix(output, (".png", ".exr", ".ply", ".glb"))
+    check_output(output, (".png", ".exr", ".ply", ".glb"))
     check_range("--subpixels", subpixels, 1, 4)
     check_choice("--device", device, ("cpu", "cuda"))
     from seasonscapes.workflows import gaussian_views as gaussians

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from seasonscapes.errors import InputError
+from seasonscapes.text_files import parse_json, read_json
 
 
 def provenance(path: Path) -> dict:
@@ -93,7 +94,7 @@ def _npz(path: Path) -> dict:
 def _manifest(path: Path) -> dict:
     """The manifest that the workspace wrote beside an artefact."""
     beside = path.with_name(path.name + ".json")
-    return {"manifest": json.loads(beside.read_text())} if beside.is_file() else {"manifest": "none beside it"}
+    return {"manifest": read_json(beside)} if beside.is_file() else {"manifest": "none beside it"}
 
 
 def _glb(path: Path) -> dict:
@@ -135,19 +136,19 @@ def _safetensors(path: Path) -> dict:
         size = int.from_bytes(file.read(8), "little")
         if size > 100_000_000:
             raise ValueError("not a safetensors header")
-        header = json.loads(file.read(size))
+        header = parse_json(file.read(size), where=path)
     about = {key: _loaded(value) for key, value in header.pop("__metadata__", {}).items()}
     return {"tensors": {name: f"{entry['dtype']} {tuple(entry['shape'])}" for name, entry in header.items()}, **about}
 
 
 def _json(path: Path) -> dict:
-    return {"content": json.loads(path.read_text())}
+    return {"content": read_json(path)}
 
 
 def _folder(path: Path) -> dict:
     for name in ("coefficients.json", "run.json"):
         if (path / name).is_file():
-            return {"record": json.loads((path / name).read_text())}
+            return {"record": read_json(path / name)}
     raise ValueError("neither daylight coefficients nor a run")
 
 
