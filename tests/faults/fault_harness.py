@@ -42,7 +42,9 @@ def call(tokens: Iterable[str]) -> Outcome:
     out, err = (io.TextIOWrapper(io.BytesIO(), encoding="utf-8", write_through=True) for _ in range(2))
     tokens = list(tokens)
     with warnings.catch_warnings():
-        warnings.simplefilter("always")
+        warnings.simplefilter("ignore")  # as Python does with deprecations
+        for shown in (RuntimeWarning, UserWarning):
+            warnings.simplefilter("always", shown)
         warnings.showwarning = lambda message, category, filename, lineno, file=None, line=None: print(
             f"{filename}:{lineno}: {category.__name__}: {message}", file=err
         )
