@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from seasonscapes.commands.console import message
 from seasonscapes.errors import InputError
+from seasonscapes.frames import normal_longitude
 
 if TYPE_CHECKING:
     from seasonscapes.workflows.albedo_sources import AlbedoFile
@@ -55,16 +56,19 @@ def parse_at(text: str, *, flag: str = "--at") -> tuple[float, float, float | No
         numbers = []
     if len(numbers) not in (2, 3):
         raise InputError(flag, "not a place", got=text, expected=expected)
-    if not (-90.0 <= numbers[0] <= 90.0 and -180.0 <= numbers[1] <= 180.0):
+    if not (-90.0 <= numbers[0] <= 90.0 and -180.0 <= numbers[1] <= 360.0):
         cure = "is the order latitude, longitude, in degrees?"
         raise InputError(flag, "latitude or longitude out of range", got=text, expected=expected, cure=cure)
+    latitude, longitude = numbers[0], normal_longitude(numbers[1])
     if len(numbers) == 2:
-        return numbers[0], numbers[1], None, 2.0
+        return latitude, longitude, None, 2.0
+    if not -500.0 <= numbers[2] <= 100_000.0:
+        raise InputError(flag, "height out of range", got=text, expected="-500 to 100000 metres")
     if parts[2].startswith("+"):
         if numbers[2] <= 0.0:
             raise InputError(flag, "the height above ground must be positive", got=text)
-        return numbers[0], numbers[1], None, numbers[2]
-    return numbers[0], numbers[1], numbers[2], None
+        return latitude, longitude, None, numbers[2]
+    return latitude, longitude, numbers[2], None
 
 
 def parse_duration(flag: str, text: str) -> timedelta:

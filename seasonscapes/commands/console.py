@@ -18,18 +18,32 @@ _SECONDS_BETWEEN_LINES = 10.0
 
 
 class _StderrHandler(logging.Handler):
-    """Prints log messages as plain lines on the present stderr."""
+    """Prints log messages as plain lines on the present stderr, and keeps the warnings of the present command."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.warnings: list[str] = []
 
     def emit(self, record: logging.LogRecord) -> None:
-        print(self.format(record), file=sys.stderr, flush=True)
+        line = self.format(record)
+        if record.levelno >= logging.WARNING:
+            # A film reads its image for every date; one command says a thing once.
+            if line in self.warnings:
+                return
+            self.warnings.append(line)
+        print(line, file=sys.stderr, flush=True)
+
+
+_handler = _StderrHandler()
 
 
 def show_messages() -> None:
-    """Show the package's log messages of level INFO and above on stderr."""
+    """Show the package's log messages of level INFO and above on stderr, and begin a new list of warnings."""
     logger = logging.getLogger("seasonscapes")
-    if not any(isinstance(handler, _StderrHandler) for handler in logger.handlers):
-        logger.addHandler(_StderrHandler())
+    if _handler not in logger.handlers:
+        logger.addHandler(_handler)
     logger.setLevel(logging.INFO)
+    _handler.warnings.clear()
 
 
 def message(line: str) -> None:
@@ -38,7 +52,8 @@ def message(line: str) -> None:
 
 
 def print_result(record: dict[str, Any], lines: list[str], *, as_json: bool) -> None:
-    """Print a command's result on stdout: one JSON record, or lines for people."""
+    """Print a command's result on stdout: one JSON record with the command's warnings, or lines for people."""
+    record = {**record, "warnings": list(_handler.warnings)}
     print(json.dumps(record, default=float) if as_json else "\n".join(lines), flush=True)
 
 

@@ -143,7 +143,9 @@ def webcam_station(
     960
     """
     from seasonscapes.cameras.webcam import find_webcam, webcam_model
-    from seasonscapes.terrain.raster import fill_nodata, map_from_geodetic, read_elevation, sample_raster
+    from seasonscapes.terrain.crs import map_position
+    from seasonscapes.terrain.raster import fill_nodata, read_elevation, sample_raster
+    from seasonscapes.workflows.terrain_building import declared_heights
 
     read = scene_with_webcams(scene, allow_outside=allow_outside)
     if webcam is None and len(read.webcams) > 1:
@@ -153,8 +155,8 @@ def webcam_station(
     if first is None:
         raise InputError(scene, "names no elevation raster", cure="give one with --elevation FILE")
     files = [Path(file) for file in (first, context) if file is not None]
-    rasters = [fill_nodata(read_elevation(file), where=str(file))[0] for file in files]
-    x, y = map_from_geodetic(rasters[0].crs, found.latitude_deg, found.longitude_deg)
+    rasters = [fill_nodata(read_elevation(file, **declared_heights(read, file)), where=str(file))[0] for file in files]
+    x, y = map_position(rasters[0], found.latitude_deg, found.longitude_deg)
     ground = float(sample_raster(rasters[0], x, y)[..., 0])
     if not np.isfinite(ground):
         raise InputError("--webcam", f"'{found.id}' stands outside the elevation raster")

@@ -101,12 +101,14 @@ def inspect_webcams(
 def _heights(scene: SceneFile, source: Path | str | None) -> list[HeightCheck]:
     """Each webcam's height against the terrain; nothing where there is no raster."""
     from seasonscapes.cameras.webcam import check_heights
-    from seasonscapes.terrain.raster import map_from_geodetic, read_elevation, sample_raster
+    from seasonscapes.terrain.crs import map_position
+    from seasonscapes.terrain.raster import read_elevation, sample_raster
+    from seasonscapes.workflows.terrain_building import declared_heights
 
     if source is None:
         return []
     bounds = scene.area.bounds_deg if scene.area is not None else None
-    raster = read_elevation(source, bounds_deg=bounds)
+    raster = read_elevation(source, bounds_deg=bounds, **declared_heights(scene, source))
     latitudes, longitudes = zip(*((webcam.latitude_deg, webcam.longitude_deg) for webcam in scene.webcams), strict=True)
-    x, y = map_from_geodetic(raster.crs, list(latitudes), list(longitudes))
+    x, y = map_position(raster, list(latitudes), list(longitudes))
     return check_heights(scene.webcams, sample_raster(raster, x, y)[..., 0].tolist())
