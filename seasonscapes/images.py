@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
-from collections.abc import Iterator, Mapping
+import secrets
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -24,8 +24,27 @@ from seasonscapes.errors import NoUsablePixels, UnreadableImage
 METER_CONSTANT = 12.5 / 100.0
 # Luminance that just saturates a sensor at EV100 = 0: 78 / (S q) with q = 0.65 (ISO 12232; Lagarde & de Rousiers 2014).
 SATURATION_LUMINANCE = 1.2
+# Of a file's name in that of its temporary file.
+_STEM_CHARACTERS = 24
+_notes: list[Callable[[Path], None]] = []
 # Luminance weights of linear Rec.709 (ITU-R BT.709): Y = w · rgb. In photometric RGB, Y is in lux or cd/m².
 REC709_LUMINANCE = np.array([0.2126390, 0.7151687, 0.0721923])
+
+
+@contextmanager
+def writes_noted(note: Callable[[Path], None]) -> Iterator[None]:
+    """Context manager: ``note`` is called with each file that `atomic_path` is about to create, temporary ones included.
+
+    Parameters
+    ----------
+    note
+        Called before the file exists, from any thread of this process.
+    """
+    _notes.append(note)
+    try:
+        yield
+    finally:
+        _notes.remove(note)
 
 
 @contextmanager
@@ -47,12 +66,16 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=f".part{path.suffix}", dir=path.parent)
-    os.close(handle)
+    # Of a long name only the beginning, so that the temporary one is not too long where the name itself is not.
+    name = str(path.with_name(f".{path.stem[:_STEM_CHARACTERS]}-{secrets.token_hex(4)}.part{path.suffix}"))
+    for note in tuple(_notes):
+        note(Path(name))
+        note(path)
+    os.close(os.open(name, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
     temporary = Path(name)
     try:
         yield temporary
-        # mkstemp creates private files; set the mode that open() would have set.
+        # The temporary file is private; set the mode that open() would have set.
         umask = os.umask(0)
         os.umask(umask)
         temporary.chmod(0o666 & ~umask)
@@ -177,13 +200,59 @@ def tone_curve(exposed: np.ndarray) -> np.ndarray:
     """
     colour = np.maximum(np.asarray(exposed, np.float32) * EXPOSURE_GAIN, 0.0)
     peak = colour.max(axis=-1, keepdims=True)
+    compressed = _compressed_peak(peak)
+    scaled = colour * (compressed / np.maximum(peak, 1e-12))
+    whiten = _whitening(peak, compressed)
+    return scaled + (compressed - scaled) * whiten
+
+
+def linear_from_display(picture: np.ndarray, ev100: float) -> np.ndarray:
+    """Invert `expose` and `tone_curve`: from a display-linear picture to scene-linear values.
+
+    Parameters
+    ----------
+    picture
+        Display-linear values ``(..., 3)`` in [0, 1].
+    ev100
+        The exposure that it was developed with.
+
+    Returns
+    -------
+    ndarray
+        Scene-linear values ``(..., 3)`` [cd/m²], float32; of clipped highlights, the least that could be.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from seasonscapes.images import expose, linear_from_display, tone_curve
+    >>> scene = np.array([[900.0, 4000.0, 20000.0]])
+    >>> bool(np.allclose(linear_from_display(tone_curve(expose(scene, 13.0)), 13.0), scene, rtol=1e-3))
+    True
+    """
+    shown = np.asarray(picture, np.float64)
+    compressed = shown.max(axis=-1, keepdims=True)
+    # The curve of the largest channel rises to 1; its inverse is read from a table.
+    peaks = np.concatenate(
+        [np.linspace(0.0, _SHOULDER_START, 2), np.geomspace(_SHOULDER_START, 1.05 * _WHITE, 4096)[1:]]
+    )
+    peak = np.interp(compressed, _compressed_peak(peaks), peaks)
+    whiten = _whitening(peak, compressed)
+    scaled = np.maximum(shown - compressed * whiten, 0.0) / (1.0 - whiten)
+    colour = scaled * (peak / np.maximum(compressed, 1e-12))
+    return (colour / EXPOSURE_GAIN * (SATURATION_LUMINANCE * 2.0**ev100)).astype(np.float32)
+
+
+def _compressed_peak(peak: np.ndarray) -> np.ndarray:
+    """The display value of the largest channel."""
     start, span = _SHOULDER_START, 1.0 - _SHOULDER_START
     excess = np.maximum(peak - start, 0.0)
     compressed = start + span * excess / (excess + span) * (1.0 + excess * span / _WHITE**2)
-    compressed = np.where(peak > start, np.minimum(compressed, 1.0), peak)
-    scaled = colour * (compressed / np.maximum(peak, 1e-12))
-    whiten = 1.0 - 1.0 / (0.12 * np.maximum(peak - compressed, 0.0) + 1.0)
-    return scaled + (compressed - scaled) * whiten
+    return np.where(peak > start, np.minimum(compressed, 1.0), peak)
+
+
+def _whitening(peak: np.ndarray, compressed: np.ndarray) -> np.ndarray:
+    """How far a compressed colour goes to white."""
+    return 1.0 - 1.0 / (0.12 * np.maximum(peak - compressed, 0.0) + 1.0)
 
 
 def write_png(path: str | os.PathLike, image: np.ndarray, *, metadata: Mapping[str, str] | None = None) -> None:

@@ -10,8 +10,8 @@ import numpy as np
 
 from seasonscapes.errors import InputError
 from seasonscapes.images import linear_from_srgb
-from seasonscapes.terrain.raster import open_raster
 from seasonscapes.terrain.raster_bands import alpha_band, colour_table, marked_alpha
+from seasonscapes.terrain.raster_files import OWN_FOLDER, Confinement, open_raster
 
 if TYPE_CHECKING:
     from rasterio.io import DatasetReader
@@ -44,14 +44,18 @@ class ImageFacts:
 
 
 def image_facts(
-    path: str | os.PathLike[str], *, bands: tuple[int, ...] | None = None, full_scale: float | None = None
+    path: str | os.PathLike[str],
+    *,
+    bands: tuple[int, ...] | None = None,
+    full_scale: float | None = None,
+    confinement: Confinement = OWN_FOLDER,
 ) -> ImageFacts:
     """Read from a file's header which bands are colours and which value is white.
 
     Parameters
     ----------
-    path
-        Image file.
+    path, confinement
+        As in `raster_files.open_raster`.
     bands
         Declared red, green and blue band numbers, or one band; ``None`` for those that the file marks.
     full_scale
@@ -64,7 +68,7 @@ def image_facts(
         Neither one nor three colour bands; CMYK; bands that the file does not have.
     """
     where = os.fspath(path)
-    with open_raster(path) as source:
+    with open_raster(path, confinement) as source:
         told = []
         if bands is None:
             bands = _colour_bands(source, where)

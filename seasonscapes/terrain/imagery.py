@@ -15,6 +15,7 @@ from seasonscapes.terrain.atlas import Atlas
 from seasonscapes.terrain.crs import raster_pixels
 from seasonscapes.terrain.image_bands import Decoder, image_facts
 from seasonscapes.terrain.raster import read_raster
+from seasonscapes.terrain.raster_files import OWN_FOLDER, Confinement
 from seasonscapes.terrain.surface import Raster, Terrain, Texture, atlas_identity
 from seasonscapes.terrain.texels import texel_coordinates, texel_positions
 
@@ -37,12 +38,13 @@ def read_imagery(
     finest_m: float | None = None,
     encoding: str = "srgb",
     full_scale: float | None = None,
+    confinement: Confinement = OWN_FOLDER,
 ) -> Raster:
     """Read a georeferenced colour image as scene-linear Rec.709.
 
     Parameters
     ----------
-    path, bounds_deg, finest_m
+    path, bounds_deg, finest_m, confinement
         As in `read_raster`; for baking, half the texel size is sufficient for ``finest_m``.
     bands
         Red, green and blue band numbers from 1; ``None`` for the bands that the file marks as such, or its three colour
@@ -67,9 +69,11 @@ def read_imagery(
     """
     if encoding not in ENCODINGS:
         raise ValueError(f"encoding: got {encoding!r}, expected one of {', '.join(ENCODINGS)}")
-    facts = image_facts(path, bands=bands, full_scale=full_scale)
+    facts = image_facts(path, bands=bands, full_scale=full_scale, confinement=confinement)
     decode = Decoder(path, encoding, facts.full_scale)
-    raster = read_raster(path, bounds_deg=bounds_deg, bands=facts.bands, finest_m=finest_m, decode=decode)
+    raster = read_raster(
+        path, bounds_deg=bounds_deg, bands=facts.bands, finest_m=finest_m, decode=decode, confinement=confinement
+    )
     decode.check()
     # A pixel with one missing channel counts as missing.
     values = np.where(np.isfinite(raster.values).all(axis=2, keepdims=True), raster.values, np.float32(np.nan))

@@ -7,11 +7,8 @@ from __future__ import annotations
 
 import logging
 import os
-import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -26,6 +23,7 @@ from seasonscapes.terrain.hole_filling import harmonic_fill, nan_mean
 from seasonscapes.terrain.memory import check_memory
 from seasonscapes.terrain.placement import cell_sides_m, centre_deg, check_cells, check_place, checked_crs, likely_cause
 from seasonscapes.terrain.raster_bands import BandReader, band_reader
+from seasonscapes.terrain.raster_files import OWN_FOLDER, Confinement, open_raster
 from seasonscapes.terrain.surface import Raster
 
 if TYPE_CHECKING:
@@ -62,34 +60,17 @@ class FillReport:
 # ---------------------------------------------------------------------------------------------- reading
 
 
-@contextmanager
-def open_raster(path: str | os.PathLike[str]) -> Iterator[DatasetReader]:
-    """Open a raster file for reading; every trouble in the block is one `InputError` that names the file."""
-    import rasterio
-    from rasterio.errors import NotGeoreferencedWarning, RasterioError
-
-    if not os.fspath(path).startswith("/vsi") and not Path(path).is_file():
-        raise InputError(os.fspath(path), "no such file")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(path) as source:
-                yield source
-    except RasterioError as error:
-        raise InputError(os.fspath(path), f"not readable as a raster: {error}") from None
-
-
-def raster_grid(path: str | os.PathLike[str], *, bounds_deg: tuple[float, float, float, float] | None = None) -> Raster:
-    """The grid of a raster file, or of a window of it as of `read_raster`, without its values.
+def raster_grid(path: str | os.PathLike[str], confinement: Confinement = OWN_FOLDER) -> Raster:
+    """The grid of a raster file without its values.
 
     Returns
     -------
     Raster
         ``values`` of shape ``(H, W, 0)``.
     """
-    with open_raster(path) as source:
+    with open_raster(path, confinement) as source:
         crs = checked_crs(source, os.fspath(path))
-        return _grid(source, crs, _window(source, crs, bounds_deg, os.fspath(path)))
+        return _grid(source, crs, _window(source, crs, None, os.fspath(path)))
 
 
 def _grid(source: DatasetReader, crs: str, window: Window) -> Raster:
@@ -104,6 +85,7 @@ def read_elevation(
     band: int | None = None,
     unit: str | None = None,
     nodata: float | None = None,
+    confinement: Confinement = OWN_FOLDER,
 ) -> Raster:
     """Read an elevation raster of one band as heights in metres, and check that land has such heights.
 
@@ -111,7 +93,7 @@ def read_elevation(
 
     Parameters
     ----------
-    path, bounds_deg
+    path, bounds_deg, confinement
         As in `read_raster`.
     band
         Number of the band that holds the heights, from 1; required if the file has several bands.
@@ -132,7 +114,7 @@ def read_elevation(
         or heights that no landscape has.
     """
     where = os.fspath(path)
-    with open_raster(path) as source:
+    with open_raster(path, confinement) as source:
         crs = checked_crs(source, where)
         grid = _grid(source, crs, _window(source, crs, bounds_deg, where))
         reader = band_reader(source, None if band is None else (band,), where)
@@ -148,7 +130,7 @@ def read_elevation(
         declared = unit or declared_unit(source, reader.bands[0], where)
     check_cells(grid, where)
     check_memory(grid, where)
-    raster = read_raster(path, bounds_deg=bounds_deg, bands=reader.bands)
+    raster = read_raster(path, bounds_deg=bounds_deg, bands=reader.bands, confinement=confinement)
     if nodata is not None:
         raster = replace(raster, values=np.where(raster.values == nodata, np.float32(np.nan), raster.values))
     if declared is not None and declared != "metre":
@@ -165,13 +147,14 @@ def read_raster(
     bands: tuple[int, ...] | None = None,
     finest_m: float | None = None,
     decode: Callable[[np.ndarray], np.ndarray] | None = None,
+    confinement: Confinement = OWN_FOLDER,
 ) -> Raster:
-    """Read a raster in any GDAL format (GeoTIFF, SRTM ``.hgt``, VRT mosaic …), or a window of it.
+    """Read a raster (GeoTIFF, SRTM ``.hgt``, VRT mosaic …), or a window of it; see `terrain.raster_files`.
 
     Parameters
     ----------
     path
-        File, or a GDAL ``/vsi…`` path.
+        File; where ``confinement`` trusts it, also a GDAL ``/vsi…`` path.
     bounds_deg
         West, south, east, north in WGS 84 [deg]. The smallest window of whole pixels that contains them, plus a border
         of one pixel for interpolation, is read in the raster's own grid (without resampling). ``None`` for the whole
@@ -183,6 +166,8 @@ def read_raster(
         full-resolution image is never held in memory.
     decode
         Function applied to values before averaging, such as sRGB decoding.
+    confinement
+        Where the raster's files may lie; by default in its own folder.
 
     Returns
     -------
@@ -201,7 +186,7 @@ def read_raster(
     if finest_m is not None and not finest_m > 0.0:
         raise ValueError(f"finest_m: got {finest_m}, expected a positive size")
     where = os.fspath(path)
-    with open_raster(path) as source:
+    with open_raster(path, confinement) as source:
         crs = checked_crs(source, where)
         reader = band_reader(source, bands, where)
         window = _window(source, crs, bounds_deg, where)

@@ -17,9 +17,10 @@ from seasonscapes.frames import LocalFrame, enu_from_geodetic
 from seasonscapes.progress import Progress, task_progress
 from seasonscapes.scene import SceneFile, read_scene
 from seasonscapes.source_hash import source_hash
+from seasonscapes.terrain.raster_files import raster_hash
 from seasonscapes.terrain.surface import Raster, Terrain, Texture, atlas_identity, mesh_up_m, require_atlas
 from seasonscapes.workflows.terrain_building import MeshOptions
-from seasonscapes.workspace import Workspace, build_once, default_workspace, file_hash
+from seasonscapes.workspace import Workspace, build_once, default_workspace
 
 if TYPE_CHECKING:
     from seasonscapes.terrain.raster import FillReport
@@ -179,8 +180,8 @@ def load_place(
     key = {
         "code": source_hash(*_TERRAIN_CODE),
         "elevation": declared.elevation.model_copy(update={"file": source and Path(source).name}),
-        "elevation_hash": source and file_hash(source),
-        "imagery_hash": declared.imagery and file_hash(declared.imagery.file) if options.texel_m is None else None,
+        "elevation_hash": source and raster_hash(source, declared.confinement),
+        "imagery_hash": declared.image_hash if options.texel_m is None else None,
         "area": declared.area,
         "frame": frame,
         "options": options,

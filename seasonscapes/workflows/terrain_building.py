@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from seasonscapes.terrain.memory import check_memory
 from seasonscapes.terrain.mesh import MESHERS, build_mesh
 from seasonscapes.terrain.placement import cell_sides_m, check_area
 from seasonscapes.terrain.raster import bounds_geographic, centre_frame, fill_nodata, raster_grid, read_elevation
+from seasonscapes.terrain.raster_files import OWN_FOLDER
 from seasonscapes.terrain.refine import refine_raster, refinement_factor
 from seasonscapes.terrain.surface import Raster, Terrain, load_terrain, save_terrain
 from seasonscapes.terrain.surface_grid import surface_grid
@@ -32,12 +33,12 @@ __all__ = [
     "MeshOptions",
     "build_massif",
     "build_terrain",
-    "declared_heights",
     "finest_texel_m",
     "load_built_terrain",
     "load_massif",
     "local_frame",
     "read_heights",
+    "read_scene_elevation",
     "sample_spacing_m",
     "save_built_terrain",
     "save_massif",
@@ -127,19 +128,32 @@ def read_heights(scene: SceneFile, massif: SyntheticMassif | None, *, where: str
     if massif is not None:
         raster = massif.elevation
     else:
-        assert elevation.file is not None, "a scene has either a synthetic elevation or a file"
         bounds = scene.area.bounds_deg if scene.area is not None else None
-        raster = read_elevation(elevation.file, bounds_deg=bounds, **declared_heights(scene, elevation.file))
+        raster = read_scene_elevation(scene, bounds_deg=bounds)
         check_area(bounds_geographic(raster), where)
     return fill_nodata(raster, max_share=elevation.max_hole_share, where=where)
 
 
-def declared_heights(scene: SceneFile, file: str | Path) -> dict[str, Any]:
-    """What a scene file states of its own raster's band, unit and nodata, for `read_elevation`; of another one nothing."""
+def read_scene_elevation(
+    scene: SceneFile, file: str | Path | None = None, *, bounds_deg: tuple[float, float, float, float] | None = None
+) -> Raster:
+    """Read a scene's own raster of heights as its file declares it, or another ``file`` of the user's choice.
+
+    A raster that the user names may lie anywhere; what it names in turn may not.
+    """
     elevation = scene.elevation
-    if elevation is None or elevation.file is None or Path(elevation.file) != Path(file):
-        return {}
-    return {"band": elevation.band, "unit": elevation.unit, "nodata": elevation.nodata}
+    if file is not None:
+        return read_elevation(file, bounds_deg=bounds_deg, confinement=OWN_FOLDER)
+    assert elevation is not None, "callers refuse scenes without elevation"
+    assert elevation.file is not None, "a scene has either a synthetic elevation or a file"
+    return read_elevation(
+        elevation.file,
+        bounds_deg=bounds_deg,
+        band=elevation.band,
+        unit=elevation.unit,
+        nodata=elevation.nodata,
+        confinement=scene.confinement,
+    )
 
 
 def local_frame(scene: SceneFile, elevation: Raster) -> LocalFrame:
@@ -215,7 +229,7 @@ def _texel_m(terrain: Terrain, elevation: Raster, scene: SceneFile, options: Mes
     if wish is None and scene.elevation is not None and scene.elevation.synthetic is not None:
         wish = scene.elevation.synthetic.detail_m
     elif wish is None and scene.imagery is not None:
-        wish = _TEXELS_PER_PIXEL * sample_spacing_m(raster_grid(scene.imagery.file))
+        wish = _TEXELS_PER_PIXEL * sample_spacing_m(raster_grid(scene.imagery.file, scene.confinement))
     elif wish is None:
         wish = sample_spacing_m(elevation)
     return max(wish, finest_texel_m(terrain, options))
@@ -235,7 +249,10 @@ def tell_texel_wish(terrain: Terrain, scene: SceneFile, options: MeshOptions) ->
             log.warning(
                 "--texel-m: texels of %g m were asked for, but %s; choose a smaller [area]", options.texel_m, limit
             )
-    elif scene.imagery is not None and (pixel := sample_spacing_m(raster_grid(scene.imagery.file))) < 0.9 * finest:
+    elif (
+        scene.imagery is not None
+        and (pixel := sample_spacing_m(raster_grid(scene.imagery.file, scene.confinement))) < 0.9 * finest
+    ):
         log.warning(
             "%s: its pixels of %.3g m are finer than texels can be: %s; choose a smaller [area]",
             scene.imagery.file,

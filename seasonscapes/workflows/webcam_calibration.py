@@ -144,18 +144,18 @@ def webcam_station(
     """
     from seasonscapes.cameras.webcam import find_webcam, webcam_model
     from seasonscapes.terrain.crs import map_position
-    from seasonscapes.terrain.raster import fill_nodata, read_elevation, sample_raster
-    from seasonscapes.workflows.terrain_building import declared_heights
+    from seasonscapes.terrain.raster import fill_nodata, sample_raster
+    from seasonscapes.workflows.terrain_building import read_scene_elevation
 
     read = scene_with_webcams(scene, allow_outside=allow_outside)
     if webcam is None and len(read.webcams) > 1:
         raise InputError("--webcam", "missing", expected="one of " + ", ".join(w.id for w in read.webcams))
     found = read.webcams[0] if webcam is None else find_webcam(read.webcams, webcam)
-    first = elevation or (read.elevation and read.elevation.file)
-    if first is None:
+    own = read.elevation.file if read.elevation is not None else None
+    if elevation is None and own is None:
         raise InputError(scene, "names no elevation raster", cure="give one with --elevation FILE")
-    files = [Path(file) for file in (first, context) if file is not None]
-    rasters = [fill_nodata(read_elevation(file, **declared_heights(read, file)), where=str(file))[0] for file in files]
+    files = [elevation, *([] if context is None else [context])]
+    rasters = [fill_nodata(read_scene_elevation(read, file), where=str(file or own))[0] for file in files]
     x, y = map_position(rasters[0], found.latitude_deg, found.longitude_deg)
     ground = float(sample_raster(rasters[0], x, y)[..., 0])
     if not np.isfinite(ground):
