@@ -222,14 +222,14 @@ def camera_station(place: Place, camera: Camera, *, name: str = "webcam") -> Web
 
 def read_picture(path: Path, where: str) -> np.ndarray:
     """A picture file as ``(H, W, 3)`` uint8 sRGB; `InputError` about ``where`` where it is none."""
-    from seasonscapes.calibration.skyline import read_image_srgb8
+    from seasonscapes.images import read_image_srgb8
 
     if not path.is_file():
         raise InputError(where, "no such file", got=str(path))
     try:
         return read_image_srgb8(path)
-    except UnreadableImage:
-        raise InputError(where, "not a readable picture", got=str(path)) from None
+    except UnreadableImage as error:
+        raise InputError(where, str(error)) from None
 
 
 def station_picture(path: Path, station: WebcamStation, where: str) -> np.ndarray:
@@ -350,7 +350,8 @@ def calibrate_by_skylines(
     """
     from seasonscapes.calibration.calibration_file import read_calibration, write_calibration
     from seasonscapes.calibration.pose_model import parameters_of_view, view_from_parameters
-    from seasonscapes.calibration.skyline import align_to_skyline, read_image_srgb8
+    from seasonscapes.calibration.skyline import align_to_skyline
+    from seasonscapes.images import read_image_srgb8
 
     files, doubts = [], {}
     for record in sorted(records.glob("*_calibration.json")):
