@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import errno
 import json
+import logging
 import os
-import tempfile
-from collections.abc import Iterator, Mapping
+import secrets
+import warnings
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -21,14 +23,33 @@ from numpy.typing import ArrayLike
 
 from seasonscapes.errors import NoUsablePixels, UnreadableImage
 
+log = logging.getLogger(__name__)
+
 # Reflected-light meter calibration constant (ISO 2720) at ISO 100.
 METER_CONSTANT = 12.5 / 100.0
 # Luminance that just saturates a sensor at EV100 = 0: 78 / (S q) with q = 0.65 (ISO 12232; Lagarde & de Rousiers 2014).
 SATURATION_LUMINANCE = 1.2
 # Of a file's name in that of its temporary file.
 _STEM_CHARACTERS = 24
+_notes: list[Callable[[Path], None]] = []
 # Luminance weights of linear Rec.709 (ITU-R BT.709): Y = w · rgb. In photometric RGB, Y is in lux or cd/m².
 REC709_LUMINANCE = np.array([0.2126390, 0.7151687, 0.0721923])
+
+
+@contextmanager
+def writes_noted(note: Callable[[Path], None]) -> Iterator[None]:
+    """Context manager: ``note`` is called with each file that `atomic_path` is about to create, temporary ones included.
+
+    Parameters
+    ----------
+    note
+        Called before the file exists, from any thread of this process.
+    """
+    _notes.append(note)
+    try:
+        yield
+    finally:
+        _notes.remove(note)
 
 
 @contextmanager
@@ -51,13 +72,15 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     # Of a long name only the beginning, so that the temporary one is not too long where the name itself is not.
-    prefix = f".{path.stem[:_STEM_CHARACTERS]}-"
-    handle, name = tempfile.mkstemp(prefix=prefix, suffix=f".part{path.suffix}", dir=path.parent)
-    os.close(handle)
+    name = str(path.with_name(f".{path.stem[:_STEM_CHARACTERS]}-{secrets.token_hex(4)}.part{path.suffix}"))
+    for note in tuple(_notes):
+        note(Path(name))
+        note(path)
+    os.close(os.open(name, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
     temporary = Path(name)
     try:
         yield temporary
-        # mkstemp creates private files; set the mode that open() would have set.
+        # The temporary file is private; set the mode that open() would have set.
         umask = os.umask(0)
         os.umask(umask)
         temporary.chmod(0o666 & ~umask)
@@ -206,13 +229,59 @@ def tone_curve(exposed: np.ndarray) -> np.ndarray:
     """
     colour = np.maximum(np.asarray(exposed, np.float32) * EXPOSURE_GAIN, 0.0)
     peak = colour.max(axis=-1, keepdims=True)
+    compressed = _compressed_peak(peak)
+    scaled = colour * (compressed / np.maximum(peak, 1e-12))
+    whiten = _whitening(peak, compressed)
+    return scaled + (compressed - scaled) * whiten
+
+
+def linear_from_display(picture: np.ndarray, ev100: float) -> np.ndarray:
+    """Invert `expose` and `tone_curve`: from a display-linear picture to scene-linear values.
+
+    Parameters
+    ----------
+    picture
+        Display-linear values ``(..., 3)`` in [0, 1].
+    ev100
+        The exposure that it was developed with.
+
+    Returns
+    -------
+    ndarray
+        Scene-linear values ``(..., 3)`` [cd/m²], float32; of clipped highlights, the least that could be.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from seasonscapes.images import expose, linear_from_display, tone_curve
+    >>> scene = np.array([[900.0, 4000.0, 20000.0]])
+    >>> bool(np.allclose(linear_from_display(tone_curve(expose(scene, 13.0)), 13.0), scene, rtol=1e-3))
+    True
+    """
+    shown = np.asarray(picture, np.float64)
+    compressed = shown.max(axis=-1, keepdims=True)
+    # The curve of the largest channel rises to 1; its inverse is read from a table.
+    peaks = np.concatenate(
+        [np.linspace(0.0, _SHOULDER_START, 2), np.geomspace(_SHOULDER_START, 1.05 * _WHITE, 4096)[1:]]
+    )
+    peak = np.interp(compressed, _compressed_peak(peaks), peaks)
+    whiten = _whitening(peak, compressed)
+    scaled = np.maximum(shown - compressed * whiten, 0.0) / (1.0 - whiten)
+    colour = scaled * (peak / np.maximum(compressed, 1e-12))
+    return (colour / EXPOSURE_GAIN * (SATURATION_LUMINANCE * 2.0**ev100)).astype(np.float32)
+
+
+def _compressed_peak(peak: np.ndarray) -> np.ndarray:
+    """The display value of the largest channel."""
     start, span = _SHOULDER_START, 1.0 - _SHOULDER_START
     excess = np.maximum(peak - start, 0.0)
     compressed = start + span * excess / (excess + span) * (1.0 + excess * span / _WHITE**2)
-    compressed = np.where(peak > start, np.minimum(compressed, 1.0), peak)
-    scaled = colour * (compressed / np.maximum(peak, 1e-12))
-    whiten = 1.0 - 1.0 / (0.12 * np.maximum(peak - compressed, 0.0) + 1.0)
-    return scaled + (compressed - scaled) * whiten
+    return np.where(peak > start, np.minimum(compressed, 1.0), peak)
+
+
+def _whitening(peak: np.ndarray, compressed: np.ndarray) -> np.ndarray:
+    """How far a compressed colour goes to white."""
+    return 1.0 - 1.0 / (0.12 * np.maximum(peak - compressed, 0.0) + 1.0)
 
 
 def write_png(path: str | os.PathLike, image: np.ndarray, *, metadata: Mapping[str, str] | None = None) -> None:
@@ -257,13 +326,152 @@ def write_png8(path: str | os.PathLike, levels: np.ndarray, *, metadata: Mapping
         Image.fromarray(np.ascontiguousarray(levels)).save(temporary, format="PNG", pnginfo=info)
 
 
-def read_image_linear(path: str | os.PathLike) -> np.ndarray:
-    """Read an 8- or 16-bit sRGB image file as linear Rec.709.
+# Formats of photographs. Pillow reads more, and some of them run other programs (EPS).
+_PHOTO_FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "PPM", "GIF", "JPEG2000")
+_EXIF_ORIENTATION, _SIDEWAYS = 0x0112, (5, 6, 7, 8)
+# The largest webcam panoramas have some 100 megapixels; a few bytes of a file can declare any size.
+_MOST_PIXELS = 300_000_000
+
+
+@contextmanager
+def _opened(path: str | os.PathLike) -> Iterator[Any]:
+    """A photograph opened by Pillow; everything that is wrong with it in the block is one `UnreadableImage`."""
+    import struct
+    import zlib
+
+    from PIL import Image, UnidentifiedImageError
+
+    if not Path(path).is_file():
+        raise FileNotFoundError(path)
+    try:
+        with warnings.catch_warnings():
+            # Our own limit holds.
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(path, formats=_PHOTO_FORMATS) as picture:
+                if picture.width * picture.height > _MOST_PIXELS:
+                    raise UnreadableImage(
+                        f"{path}: the picture is too large; got {picture.width} x {picture.height}, expected at most "
+                        f"{_MOST_PIXELS // 1_000_000} megapixels"
+                    )
+                yield picture
+    except UnidentifiedImageError:
+        kinds = ", ".join(_PHOTO_FORMATS)
+        raise UnreadableImage(f"{path}: not a readable picture; expected {kinds} of 8 or 16 bits") from None
+    except Image.DecompressionBombError:
+        raise UnreadableImage(f"{path}: the picture is too large to be one") from None
+    except (OSError, SyntaxError, ValueError, TypeError, struct.error, zlib.error, EOFError) as error:
+        if isinstance(error, UnreadableImage):
+            raise
+        raise UnreadableImage(f"{path}: not a readable picture: {' '.join(str(error).split())}") from None
+
+
+def picture_size(path: str | os.PathLike) -> tuple[int, int, str]:
+    """Width and height [px] of a photograph as it is looked at, after its EXIF orientation, and its format.
+
+    Raises
+    ------
+    FileNotFoundError, UnreadableImage
+        As `read_image_srgb`; only the header is read.
+    """
+    with _opened(path) as picture:
+        width, height = picture.size
+        if picture.getexif().get(_EXIF_ORIENTATION) in _SIDEWAYS:
+            width, height = height, width
+        return width, height, str(picture.format)
+
+
+def read_image_srgb(path: str | os.PathLike) -> np.ndarray:
+    """Read a photograph as sRGB: turned by its EXIF orientation, with its colour profile converted.
+
+    This is the only reader of photographs, so that all commands see the same pixels at the same places.
 
     Parameters
     ----------
     path
-        Image file in a format that OpenCV decodes. EXIF orientation is ignored.
+        JPEG, PNG, TIFF, WebP, JPEG 2000, BMP, PPM or GIF of 8 or 16 bits: grey, RGB, CMYK or with a palette. Alpha is
+        ignored.
+
+    Returns
+    -------
+    ndarray
+        sRGB-encoded values ``(H, W, 3)``: uint8, or uint16 where the file has 16 bits.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the file does not exist.
+    UnreadableImage
+        If the file is no such picture, is truncated, or declares an absurd size.
+    """
+    from PIL import ImageOps
+
+    with _opened(path) as picture:
+        deep = picture.mode.startswith("I;16") or any("16" in str(tile[3]) for tile in picture.tile)
+        if picture.mode in ("F", "I") and not deep:
+            kind = "float" if picture.mode == "F" else "32-bit"
+            raise UnreadableImage(f"{path}: not a readable picture; got {kind} pixels, expected 8 or 16 bits")
+        picture.load()
+        foreign = _foreign_profile(path, picture)
+        if not deep or foreign is not None:
+            turned = ImageOps.exif_transpose(picture)
+            assert turned is not None, "a new picture where it is not asked to change in place"
+            if deep:
+                log.warning("%s: converted to sRGB with 8 of its 16 bits", path)
+            return np.ascontiguousarray(_to_srgb(path, turned, foreign))
+    # Pillow keeps 8 bits of each channel; OpenCV keeps 16, and turns by the orientation as well.
+    levels = cv2.imread(os.fspath(path), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    if levels is None or not np.issubdtype(levels.dtype, np.integer):
+        raise UnreadableImage(f"{path}: not a readable picture of 16 bits; save it without an orientation tag")
+    return np.ascontiguousarray(levels[..., ::-1])
+
+
+def _foreign_profile(path: str | os.PathLike, picture: Any) -> Any:
+    """The embedded colour profile of a picture where it is not sRGB, else ``None``."""
+    import io
+
+    from PIL import ImageCms
+
+    embedded = picture.info.get("icc_profile")
+    if not embedded:
+        return None
+    try:
+        profile = ImageCms.ImageCmsProfile(io.BytesIO(embedded))
+        name = ImageCms.getProfileDescription(profile)
+    except (ImageCms.PyCMSError, OSError):
+        log.warning("%s: its colour profile is damaged; the colours count as sRGB", path)
+        return None
+    return None if "srgb" in name.lower() else profile
+
+
+def _to_srgb(path: str | os.PathLike, picture: Any, profile: Any) -> np.ndarray:
+    """8-bit sRGB levels ``(H, W, 3)`` of a loaded picture, through its profile where there is one."""
+    from PIL import ImageCms
+
+    # Profiles are made for these modes; all others are ways of storing them.
+    if picture.mode not in ("L", "RGB", "CMYK", "LAB"):
+        picture = picture.convert("L" if picture.mode in ("1", "LA", "La", "I;16", "I;16B", "I;16L") else "RGB")
+    if profile is not None:
+        try:
+            srgb = ImageCms.createProfile("sRGB")
+            converted = ImageCms.profileToProfile(picture, profile, srgb, outputMode="RGB")
+        except ImageCms.PyCMSError as error:
+            raise UnreadableImage(f"{path}: its colour profile does not fit its pixels: {error}") from None
+        assert converted is not None, "a new picture where it is not asked to change in place"
+        log.info("%s: converted to sRGB from %s", path, ImageCms.getProfileDescription(profile).strip())
+        return np.asarray(converted)
+    if picture.mode == "CMYK":
+        log.warning("%s: made for print (CMYK) and without a colour profile; its colours are a guess", path)
+    return np.asarray(picture.convert("RGB"))
+
+
+def read_image_srgb8(path: str | os.PathLike) -> np.ndarray:
+    """`read_image_srgb` in 8 bits ``(H, W, 3)``, whatever the file has."""
+    levels = read_image_srgb(path)
+    return levels if levels.dtype == np.uint8 else np.round(levels / 257.0).astype(np.uint8)
+
+
+def read_image_linear(path: str | os.PathLike) -> np.ndarray:
+    """`read_image_srgb` decoded to linear Rec.709.
 
     Returns
     -------
@@ -272,20 +480,11 @@ def read_image_linear(path: str | os.PathLike) -> np.ndarray:
 
     Raises
     ------
-    FileNotFoundError
-        If the file does not exist.
-    UnreadableImage
-        If the file cannot be decoded, or holds no integer pixels.
+    FileNotFoundError, UnreadableImage
+        As `read_image_srgb`.
     """
-    if not Path(path).is_file():
-        raise FileNotFoundError(path)
-    encoded = cv2.imread(os.fspath(path), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
-    if encoded is None:
-        raise UnreadableImage(f"{path}: not a readable picture")
-    if not np.issubdtype(encoded.dtype, np.integer):
-        raise UnreadableImage(f"{path}: not a readable picture; got {encoded.dtype} pixels, expected 8 or 16 bits")
-    maximum = np.iinfo(encoded.dtype.name).max
-    return linear_from_srgb(encoded[..., ::-1].astype(np.float32) / maximum)
+    levels = read_image_srgb(path)
+    return linear_from_srgb(levels.astype(np.float32) / np.iinfo(levels.dtype.name).max)
 
 
 def write_exr(

@@ -93,7 +93,7 @@ def albedo_command(
                 expected = "the .csv of seasonscapes webcams --manifest"
                 cure = "for a synthetic scene: --synthetic-webcams"
                 raise InputError("--manifest", "missing", expected=expected, cure=cure)
-            sources = PhotographSources(manifest, calibrations, masks)
+            sources = PhotographSources(manifest, calibrations, masks, options.allow_outside)
             photographs = photographs_at(loaded, sources, utc, within_min=within_min, progress=progress)
         how = recovery.RecoveryOptions(fit_haze, fit_curve, iterations)
         recovered = recovery.recover_albedo(loaded, photographs, sky=model, options=how, progress=progress)
@@ -108,7 +108,7 @@ def albedo_command(
         "residual": [round(float(value), 4) for value in recovered.fit.residual],
         "gains": recovered.fit.gains.tolist(),
         **recovered.facts,
-        "figures": recovery.save_albedo_figures(recovered, output),
+        "figures": recovery.save_albedo_figures(loaded, recovered, output),
         "attribution": loaded.scene.attribution,
         "seconds": round(clock.perf_counter() - start, 1),
     }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time as clock
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
@@ -49,7 +49,7 @@ def timelapse_command(
     season
         Between dated albedos: blended (linear), nearest, or snow-line (the snow line moves place by place).
     albedo
-        DATE=FILE.npz, may be repeated: recovered albedos of a date instead of the scene's own.
+        DATE=FILE, may be repeated: albedos of a date instead of the scene's own (.npz; or .png, .exr, .glb of this atlas).
     smooth
         Time constant of the exposure; 0s exposes each frame by itself.
     fps
@@ -108,15 +108,14 @@ def timelapse_command(
         allow_outside=place.allow_outside,
     )
     chosen_times = times if part is None else films.shard(times, *part)
+    how: dict[str, Any] = {"cluster": work.cluster, "exr_folder": output.resolve() if exr else None}
     with progress_bars() as progress:
-        exr_folder = output.resolve() if exr else None
-        rendered = films.render_frames(
-            job, chosen_times, cluster=work.cluster, exr_folder=exr_folder, progress=progress
-        )
-        if part is None:
-            films.develop_film(job, times, output, film_look, progress=progress)
-            if not keep_frames:
-                films.remove_frames(job, times)
+        if part is not None:
+            rendered = films.render_frames(job, chosen_times, **how, progress=progress)
+        else:
+            rendered = films.make_film(
+                job, times, output, film_look, **how, keep_frames=keep_frames, progress=progress
+            )[1]
     record = {"scene": scene, "camera": chosen.name, "frames": len(chosen_times), "rendered": rendered}
     record |= {"output": str(output)} if part is None else {}
     record["seconds"] = round(clock.perf_counter() - start, 2)

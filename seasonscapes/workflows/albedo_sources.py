@@ -9,7 +9,6 @@ from datetime import date, datetime, timedelta
 from functools import partial
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
@@ -26,6 +25,7 @@ from seasonscapes.albedo.seasons import (
 from seasonscapes.errors import InputError
 from seasonscapes.source_hash import source_hash
 from seasonscapes.terrain.surface import Raster, Texture, load_texture, save_texture
+from seasonscapes.workflows.edited_textures import albedo_date, read_albedo, require_albedo_file
 from seasonscapes.workflows.place import Place
 from seasonscapes.workspace import build_once, file_hash
 
@@ -37,6 +37,7 @@ log = logging.getLogger(__name__)
 
 _IMAGE_CODE = ("terrain.imagery",)
 _SYNTHETIC_CODE = ("terrain.imagery", "terrain.synthetic")
+_EDITED_CODE = ("workflows.edited_textures",)
 _TRANSITION_CODE = ("albedo.seasons", "albedo.closed_form", "terrain.attributes")
 # Where a scene has no image, the ground is uniformly grey: between rock and meadow.
 GREY_ALBEDO = 0.2
@@ -55,7 +56,7 @@ class AlbedoFile:
     day
         The date.
     path
-        A ``.npz`` file of `terrain.surface.save_texture` or of ``seasonscapes albedo``.
+        What ``seasonscapes albedo`` wrote, or a picture of the atlas; see `edited_textures.read_albedo`.
     """
 
     day: date
@@ -102,10 +103,35 @@ def scene_albedo(place: Place, day: date | str) -> Texture:
         )
     imagery = place.scene.imagery
     if imagery is None:
+        log.warning("%s: names no image: the land is grey, with an albedo of %g", place.path, GREY_ALBEDO)
         values = np.full((*place.texture_shape, 3), GREY_ALBEDO, np.float32)
         return Texture(values, np.zeros(place.texture_shape, np.float32), place.atlas_id)
-    inputs.update(imagery=imagery.model_copy(update={"file": Path(imagery.file).name}), hash=file_hash(imagery.file))
-    return texture_once(place, "albedo", inputs, code=_IMAGE_CODE, build=lambda: _baked_image(place))
+    inputs.update(imagery=imagery.model_copy(update={"file": Path(imagery.file).name}), hash=place.scene.image_hash)
+    texture = texture_once(place, "albedo", inputs, code=_IMAGE_CODE, build=lambda: _baked_image(place))
+    _tell_image(place, texture)
+    return texture
+
+
+def _tell_image(place: Place, texture: Texture) -> None:
+    """Warn of what was understood of the scene's image, and of land that it does not cover."""
+    from seasonscapes.terrain.image_bands import image_facts
+    from seasonscapes.terrain.texels import covered_share
+
+    imagery = place.scene.imagery
+    assert imagery is not None
+    facts = image_facts(
+        imagery.file,
+        bands=tuple(imagery.bands) if imagery.bands else None,
+        full_scale=imagery.full_scale,
+        confinement=place.scene.confinement,
+    )
+    for line in facts.told:
+        log.warning("%s", line)
+    share = covered_share(place.terrain, texture.weight)
+    if share < 0.999:
+        log.warning(
+            "%s: the image covers %.3g %% of the land; the rest has its median colour", imagery.file, 100.0 * share
+        )
 
 
 def texture_once(
@@ -162,7 +188,7 @@ def dated_albedos(place: Place, files: Sequence[AlbedoFile] = ()) -> list[DatedA
         content = (
             "grey"
             if imagery is None
-            else ":".join((imagery.model_dump_json(), file_hash(imagery.file), source_hash(*_IMAGE_CODE)))
+            else ":".join((imagery.model_dump_json(), str(place.scene.image_hash), source_hash(*_IMAGE_CODE)))
         )
         return [DatedAlbedo(midsummer.date(), content, lambda: scene_albedo(place, midsummer))]
     days = [datetime(2024, month, day) for month in range(1, 13) for day in _FILM_DAYS]
@@ -184,7 +210,8 @@ def load_albedo(place: Place, path: str | Path, day: date | str | None = None) -
     place
         The place whose atlas the texture belongs to.
     path
-        A ``.npz`` file that ``seasonscapes albedo`` or `RecoveredAlbedo.save` wrote.
+        A ``.npz`` file that ``seasonscapes albedo`` or `RecoveredAlbedo.save` wrote; or a ``.png``, ``.exr`` or ``.glb``
+        of this place's atlas, edited elsewhere. The light that ``seasonscapes lit-texture`` put in is taken out again.
     day
         The date it is valid for (date or ISO 8601); default: the date that the file states.
 
@@ -220,30 +247,19 @@ def load_albedo(place: Place, path: str | Path, day: date | str | None = None) -
     return _from_file(place, AlbedoFile(date.fromisoformat(day) if isinstance(day, str) else day, path))
 
 
-def albedo_date(path: Path) -> date | None:
-    """The date that an albedo file states, or ``None``; `InputError` where it is missing or no ``.npz`` file."""
-    _require_texture_file(path)
-    with np.load(path, allow_pickle=False) as stored:
-        return date.fromisoformat(str(stored["date"])) if "date" in stored else None
-
-
-def _require_texture_file(path: Path) -> None:
-    if not path.is_file():
-        raise InputError("--albedo", "no such file", got=str(path))
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            names = set(stored.files)
-    except (BadZipFile, ValueError, EOFError, AttributeError):
-        raise InputError(path, "not an albedo texture", expected="a .npz file of `seasonscapes albedo`") from None
-    if not {"values", "weight"} <= names:
-        raise InputError(path, "not an albedo texture", got=", ".join(sorted(names)), expected="values and weight")
-
-
 def _from_file(place: Place, file: AlbedoFile) -> DatedAlbedo:
-    _require_texture_file(file.path)
-    return DatedAlbedo(
-        file.day, file_hash(file.path), lambda: place.require_texture(load_texture(file.path), what=str(file.path))
-    )
+    require_albedo_file(file.path)
+    content = file_hash(file.path)
+
+    def load() -> Texture:
+        if file.path.suffix.lower() == ".npz":
+            return read_albedo(place, file.path)
+        # The light of an hour is computed once for all frames and processes.
+        inputs = {"terrain": place.key, "atlas": place.atlas_id, "file": content}
+        build = partial(read_albedo, place, file.path)
+        return texture_once(place, "edited-albedo", inputs, code=_EDITED_CODE, build=build)
+
+    return DatedAlbedo(file.day, content, load)
 
 
 def require_season(season: str, *, where: str = "season") -> None:
@@ -364,6 +380,7 @@ def _baked_image(place: Place) -> Texture:
         finest_m=0.5 * place.atlas.texel_p50_m,
         encoding=imagery.encoding,
         full_scale=imagery.full_scale,
+        confinement=place.scene.confinement,
     )
     texture = bake_imagery(place.terrain, place.atlas, image)
     values = np.clip(texture.values * imagery.reflectance_scale, 0.0, 0.95)

@@ -18,8 +18,9 @@ from seasonscapes.sky.models import SkyModel
 from seasonscapes.texturing.painting import PaintOptions
 from seasonscapes.workflows import completion, timelapse
 from seasonscapes.workflows.albedo_recovery import RecoveryOptions, recover_albedo, save_albedo_figures
-from seasonscapes.workflows.albedo_sources import AlbedoFile, albedo_date, dated_albedos
+from seasonscapes.workflows.albedo_sources import AlbedoFile, dated_albedos
 from seasonscapes.workflows.distillation import DistilOptions, distil_with_data, distillation_record
+from seasonscapes.workflows.edited_textures import albedo_date
 from seasonscapes.workflows.gaussian_views import render_gaussians
 from seasonscapes.workflows.inpainting import InpaintOptions, inpaint
 from seasonscapes.workflows.painting import painting_of, painting_record
@@ -37,7 +38,6 @@ from seasonscapes.workflows.run_photographs import (
 )
 from seasonscapes.workflows.stage_runner import Stage, run_stages, stage_range
 from seasonscapes.workflows.views import camera_for
-from seasonscapes.workspace import file_hash
 
 STAGES = ("pictures", "calibrate", "albedo", "paint", "inpaint", "relight", "distil", "splat")
 
@@ -158,7 +158,7 @@ def _imagery(place: Place) -> dict | None:
     imagery = place.scene.imagery
     if imagery is None:
         return None
-    return {**imagery.model_dump(mode="json", exclude={"file"}), "hash": file_hash(imagery.file)}
+    return {**imagery.model_dump(mode="json", exclude={"file"}), "hash": place.scene.image_hash}
 
 
 def _sources(folder: Path) -> PhotographSources:
@@ -203,7 +203,7 @@ def _albedo(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
     recovered = recover_albedo(job.place, photographs, sky=job.sky, options=options, progress=progress)
     path = _albedo_path(folder)
     recovered.save(path)
-    save_albedo_figures(recovered, path)
+    save_albedo_figures(job.place, recovered, path)
     observations = [photograph.observation for photograph in recovered.photographs]
     residuals = [
         {"webcam": each.webcam, "time_utc": each.time.isoformat(), "residual": round(float(residual), 4)}
@@ -249,7 +249,7 @@ def _inpaint(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]
         result = inpaint(job.place, painted, time, job.sky, options, progress=progress)
         with atomic_path(own / "completed.npz") as temporary:
             completion.save_completed(result.completed, painted, temporary)
-        completion.save_texture_figures(own, job.place, result.completed)
+        completion.save_texture_figures(own, job.place, result.completed, time, job.sky)
         _write_record(own / "completion.json", result.record)
         files.append(own / "completed.npz")
     return files
@@ -270,11 +270,8 @@ def _relight(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]
         seed=job.seed,
         allow_outside=job.allow_outside,
     )
-    timelapse.render_frames(render_job, hours, place=place, progress=progress)
     look = timelapse.FilmLook(smooth_s=0.0)
-    paths = timelapse.develop_film(render_job, hours, folder / "relight", look, progress=progress)
-    timelapse.remove_frames(render_job, hours)
-    return paths
+    return timelapse.make_film(render_job, hours, folder / "relight", look, place=place, progress=progress)[0]
 
 
 def _distil(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:

@@ -72,9 +72,9 @@ def _png(path: Path) -> dict:
 
 
 def _tif(path: Path) -> dict:
-    import rasterio
+    from seasonscapes.terrain.raster_files import open_raster
 
-    with rasterio.open(path) as file:
+    with open_raster(path) as file:
         return {
             "size_px": [file.width, file.height],
             "crs": str(file.crs),
