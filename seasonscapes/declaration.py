@@ -12,6 +12,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
 from pydantic_core import ErrorDetails
 
 from seasonscapes.errors import InputError
+from seasonscapes.text_files import read_text
 
 __all__ = ["Declaration", "InputError", "Name", "checked_name", "read_declaration", "read_toml", "validate"]
 
@@ -73,16 +74,14 @@ def read_toml(path: Path) -> dict[str, Any]:
     Raises
     ------
     InputError
-        If the file does not exist, is a folder, or is not valid TOML.
+        If the file does not exist, is a folder, a pipe or a device, is too large, or is not valid TOML.
     """
+    text = read_text(path)
     try:
-        with open(path, "rb") as file:
-            return tomllib.load(file)
-    except FileNotFoundError:
-        raise InputError(path, "no such file") from None
-    except IsADirectoryError:
-        raise InputError(path, "this is a folder", expected="a TOML file") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise InputError(path, "not valid TOML: nested too deeply") from None
+    except ValueError as error:  # TOMLDecodeError among them, and integers of too many digits
         raise InputError(path, f"not valid TOML: {error}") from None
 
 
