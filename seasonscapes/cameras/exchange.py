@@ -10,7 +10,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import cv2
@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from seasonscapes import text_files
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.declaration import InputError
-from seasonscapes.frames import LocalFrame
+from seasonscapes.frames import LocalFrame, frame_record
 from seasonscapes.images import atomic_path
 
 # OpenCV (x right, y down, z forward) to OpenGL (x right, y up, z backward), and back.
@@ -49,7 +49,7 @@ class NamedView:
     time: datetime | None = None
 
 
-def write_colmap(folder: Path, views: Sequence[NamedView]) -> None:
+def write_colmap(folder: Path, views: Sequence[NamedView], *, image_folder: str = "") -> None:
     """Write a COLMAP text model: ``cameras.txt``, ``images.txt`` and an empty ``points3D.txt``.
 
     Each view gets its own PINHOLE camera. COLMAP stores ``camera_from_world`` as a quaternion (w first) and a
@@ -61,18 +61,22 @@ def write_colmap(folder: Path, views: Sequence[NamedView]) -> None:
         Folder of the model.
     views
         Views to write.
+    image_folder
+        The folder that readers are told to look for images in (``colmap --image_path``), as it begins the views' files;
+        the model names files relative to it.
 
     Raises
     ------
     ValueError
-        A file name contains white space, which the format does not support.
+        A file name contains white space, which the format does not support, or lies outside ``image_folder``.
     """
     from scipy.spatial.transform import Rotation
 
     cameras = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, FX, FY, CX, CY"]
     images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"]
     for number, view in enumerate(views, 1):
-        camera, name = view.camera, view.file or view.name
+        camera = view.camera
+        name = PurePosixPath(view.file or view.name).relative_to(image_folder).as_posix()
         if any(character.isspace() for character in name):
             raise ValueError(f"write_colmap: got file name {name!r}, expected one without white space")
         rotation = camera.world_from_camera[:3, :3].T
@@ -189,16 +193,7 @@ def write_transforms(path: Path, views: Sequence[NamedView], frame: LocalFrame) 
         if view.time is not None:
             record["time_utc"] = view.time.astimezone(UTC).isoformat().replace("+00:00", "Z")
         frames.append(record)
-    world = {
-        "crs": "local east-north-up [m] about the origin, through ECEF (EPSG:4978)",
-        "geographic_crs": "EPSG:4979",
-        "origin": {
-            "latitude_deg": frame.latitude_deg,
-            "longitude_deg": frame.longitude_deg,
-            "height_m": frame.height_m,
-            "refraction_k": frame.refraction_k,
-        },
-    }
+    world = frame_record(frame)
     _write_text(path, json.dumps({"camera_model": "PINHOLE", "world": world, "frames": frames}, indent=1) + "\n")
 
 

@@ -80,12 +80,11 @@ def lit_texture_command(
         lit = lit_texture(loaded, utc, sky=model, albedo=given, rays=rays, seed=seed, progress=progress)
     light, position = illumination_on_terrain(loaded, model, utc)
     record: dict[str, Any] = {
-        "scene": scene,
+        "scene": loaded.scene.name,
         "time_utc": utc.astimezone(UTC).isoformat(),
         "sun": sun_angles(position),
         "sky": light.model,
         "attribution": loaded.scene.attribution,
-        "output": str(output),
         "rays": rays,
         "seed": seed,
         "texture": texture_facts(loaded, "lit", utc=utc, sky=model, rays=rays, seed=seed),
@@ -104,17 +103,12 @@ def lit_texture_command(
             _write_model(output, loaded, picture, record)
     record["seconds"] = round(clock.perf_counter() - start, 2)
     size = f"{loaded.atlas.width_px} × {loaded.atlas.height_px} texels"
-    print_result(record, [f"{output}  ({size}, {record['seconds']} s)"], as_json=json)
+    print_result({"output": str(output), **record}, [f"{output}  ({size}, {record['seconds']} s)"], as_json=json)
 
 
 def _write_model(output: Path, place: Place, picture: np.ndarray, record: dict) -> None:
-    import json
+    from seasonscapes.export.gltf import TexturedTerrain, write_gltf
+    from seasonscapes.images import srgb8_from_linear
 
-    import numpy as np
-
-    from seasonscapes.images import srgb_from_linear
-    from seasonscapes.terrain.gltf import write_glb
-
-    levels = np.rint(srgb_from_linear(picture) * 255.0).astype(np.uint8)
-    plain = json.loads(json.dumps(record, default=float))
-    write_glb(output, place.terrain, levels, unlit=True, extras=plain)
+    about = {**place.about, **record}
+    write_gltf(output, TexturedTerrain(place.terrain, srgb8_from_linear(picture), lit=True, about=about))

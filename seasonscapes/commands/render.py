@@ -107,7 +107,6 @@ def render_command(
     record = picture.provenance
     ev100 = look.ev100(picture.radiance)
     record |= {
-        "output": str(output),
         "camera": chosen.name,
         "albedo": [
             {"date": each.day.isoformat(), "content": each.content} for each in (series.dated if series else ())
@@ -122,4 +121,4 @@ def render_command(
     record["seconds"] = round(clock.perf_counter() - start, 2)
     how = "light transport" if record["engine"] == "transport" else f"{record['spp']} samples per pixel"
     facts = f"{how}, EV {ev100:.1f}, {record['seconds']} s, {record['variant']}"
-    print_result(record, [f"{output}  ({size_px[0]} × {size_px[1]}, {facts})"], as_json=json)
+    print_result({"output": str(output), **record}, [f"{output}  ({size_px[0]} × {size_px[1]}, {facts})"], as_json=json)

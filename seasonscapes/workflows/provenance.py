@@ -97,22 +97,20 @@ def _manifest(path: Path) -> dict:
     return {"manifest": read_json(beside)} if beside.is_file() else {"manifest": "none beside it"}
 
 
-def _glb(path: Path) -> dict:
-    import pygltflib
+def _gltf(path: Path) -> dict:
+    from seasonscapes.export.gltf_file import read_gltf_table
 
-    document = pygltflib.GLTF2.load(str(path))
-    if document is None:
-        raise ValueError("no glTF document")
-    faces = sum(
-        document.accessors[p.indices].count // 3
-        for mesh in document.meshes
-        for p in mesh.primitives
-        if p.indices is not None
+    table = read_gltf_table(path)
+    indexed = (
+        table["accessors"][primitive["indices"]]["count"] // 3
+        for mesh in table.get("meshes", [])
+        for primitive in mesh["primitives"]
+        if "indices" in primitive
     )
     return {
-        "faces": faces,
-        "extensions": ", ".join(document.extensionsUsed or []) or "none",
-        "extras": document.asset.extras,
+        "faces": sum(indexed),
+        "extensions": ", ".join(table.get("extensionsUsed", [])) or "none",
+        "extras": table["asset"].get("extras", {}),
     }
 
 
@@ -158,7 +156,8 @@ READERS = {
     ".tif": _tif,
     ".tiff": _tif,
     ".npz": _npz,
-    ".glb": _glb,
+    ".glb": _gltf,
+    ".gltf": _gltf,
     ".mp4": _mp4,
     ".safetensors": _safetensors,
     ".json": _json,
