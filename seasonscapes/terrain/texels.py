@@ -147,6 +147,30 @@ def texel_positions(terrain: Terrain, width: int, height: int) -> tuple[np.ndarr
     return positions, face_id
 
 
+def covered_share(terrain: Terrain, weight: np.ndarray) -> float:
+    """Share of a surface's plan area whose texels have a weight, by the middles of its faces.
+
+    Parameters
+    ----------
+    terrain
+        Surface with UV coordinates.
+    weight
+        ``(H, W)``; 0 where a texture does not reach.
+
+    Returns
+    -------
+    float
+        In [0, 1].
+    """
+    height, width = weight.shape
+    middle = terrain.uv[terrain.faces].mean(axis=1)
+    column, row = np.floor(texel_coordinates(middle, width, height)).astype(int).T
+    covered = weight[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)] > 0.0
+    a, b, c = (terrain.vertices[terrain.faces[:, k], :2].astype(np.float64) for k in range(3))
+    area = np.abs(_cross(b - a, c - a))
+    return float(area[covered].sum() / max(area.sum(), 1e-12))
+
+
 def barycentric(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
     """Compute barycentric coordinates, clipped to the triangle.
 
