@@ -6,8 +6,9 @@ A scene file holds facts about the place only; the settings of processing stages
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, PrivateAttr, model_validator
 
@@ -151,6 +152,10 @@ class Imagery(Declaration):
     reflectance_scale: float = Field(default=0.5, gt=0.0, le=2.0)
 
 
+# A cropped picture may not hold its principal point at all.
+Share = Annotated[float, Field(ge=-2.0, le=3.0)]
+
+
 class Viewpoint(Declaration):
     """Position of a camera with its viewing direction and field of view.
 
@@ -169,7 +174,9 @@ class Viewpoint(Declaration):
     roll_deg
         Rotation about the viewing direction; positive lowers the right-hand side [deg].
     fov_deg
-        Horizontal field of view [deg].
+        Horizontal field of view of a picture with its principal point in the middle [deg]: the focal length.
+    principal_point
+        Where the optical axis meets the picture, as shares of its width (from the left) and height (from the top).
 
     Examples
     --------
@@ -186,6 +193,7 @@ class Viewpoint(Declaration):
     pitch_deg: float = Field(default=0.0, ge=-90.0, le=90.0)
     roll_deg: float = Field(default=0.0, ge=-180.0, le=180.0)
     fov_deg: float = Field(default=60.0, gt=0.0, lt=170.0)
+    principal_point: tuple[Share, Share] = (0.5, 0.5)
 
     @model_validator(mode="after")
     def _one_height(self) -> Viewpoint:
@@ -376,7 +384,7 @@ def camera_from_named_view(
     else:
         assert view.above_ground_m is not None  # validated by `Viewpoint`
         height_m = ground_height_m + float(view.above_ground_m)
-    return camera_at(
+    camera = camera_at(
         frame,
         view.latitude_deg,
         view.longitude_deg,
@@ -387,3 +395,5 @@ def camera_from_named_view(
         fov_deg=view.fov_deg,
         size_px=size_px,
     )
+    across, down = view.principal_point
+    return replace(camera, cx=across * camera.width_px, cy=down * camera.height_px)

@@ -164,7 +164,9 @@ def mesh_atlas(mesh: TexturedMesh, *, ground_albedo: float | None) -> MeshAtlas:
     tiles, shape = _shelves(sizes + [(2, 2)] * len(uniform))
     fixed = tuple((len(sizes) + index, colour) for index, colour in enumerate(uniform))
     corners, uv, normals, tile_of, point, notes = _corners(mesh, tiles, len(sizes), blocks)
-    degenerate = face_normals(corners)[1] <= 1e-14 * max(float(np.ptp(corners.reshape(-1, 3), axis=0).max()), 1e-30) ** 2
+    degenerate = (
+        face_normals(corners)[1] <= 1e-14 * max(float(np.ptp(corners.reshape(-1, 3), axis=0).max()), 1e-30) ** 2
+    )
     if degenerate.all():
         raise InputError(mesh.path, "all faces are degenerate")
     if degenerate.any():
@@ -397,4 +399,3 @@ def _ground(corners: np.ndarray, tile: Tile) -> tuple[np.ndarray, np.ndarray, np
     triangles = points[np.concatenate(faces)]
     coordinates = np.tile(np.array([tile.column + 1.0, tile.row + 1.0]), (len(triangles), 3, 1))
     return triangles, coordinates, np.tile(np.array([0.0, 0.0, 1.0]), (len(triangles), 3, 1))
-

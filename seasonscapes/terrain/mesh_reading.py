@@ -107,7 +107,9 @@ def _referenced(path: Path, name: str, allow_outside: bool, what: str) -> bytes:
     """Contents of a file that a mesh refers to."""
     where = f"{path}: {what}"
     if re.match(r"[A-Za-z][A-Za-z0-9+.-]+://", name):
-        raise InputError(where, "a file on the network", got=name, cure="download it beside the mesh, and name it there")
+        raise InputError(
+            where, "a file on the network", got=name, cure="download it beside the mesh, and name it there"
+        )
     folder, plain = path.parent.resolve(), name.replace("\\", "/")
     target = (folder / plain).resolve()
     if not allow_outside and not target.is_relative_to(folder):
@@ -388,7 +390,7 @@ def _read_ply(path: Path, allow_outside: bool) -> MeshFile:
     file, names = MeshFile(), ply_textures(path)
     if len(names) > 1:
         raise InputError(path, f"{len(names)} textures in one PLY", cure="export the mesh as GLB or OBJ")
-    stub = {name: _ONE_PIXEL for name in names}
+    stub = dict.fromkeys(names, _ONE_PIXEL)
     if names:
         file.images[Path(names[0].replace("\\", "/")).name] = _referenced(path, names[0], allow_outside, "TextureFile")
     try:
