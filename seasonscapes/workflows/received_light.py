@@ -264,6 +264,7 @@ def _map_grid(place: Place, spacing_m: float | None) -> tuple[Raster, np.ndarray
 
     from seasonscapes.frames import enu_from_geodetic
     from seasonscapes.terrain.crs import apply_affine, geodetic_from_map
+    from seasonscapes.terrain.memory import check_memory
     from seasonscapes.terrain.raster import sample_raster
 
     raster = place.elevation
@@ -274,6 +275,7 @@ def _map_grid(place: Place, spacing_m: float | None) -> tuple[Raster, np.ndarray
     rows, columns = max(1, round(height / factor)), max(1, round(width / factor))
     if rows * columns > 400_000_000:
         raise InputError("--spacing-m", "too many cells", got=rows * columns, expected="at most 400,000,000")
+    check_memory((rows, columns), "--spacing-m")
     transform = raster.transform * Affine.scale(width / columns, height / rows)
     column, row = np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5)
     # The mesh ends at the outermost samples: cells on its edge or beyond are moved inside, by a thousandth at least.
