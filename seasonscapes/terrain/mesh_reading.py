@@ -107,7 +107,9 @@ def _referenced(path: Path, name: str, allow_outside: bool, what: str) -> bytes:
     """Contents of a file that a mesh refers to."""
     where = f"{path}: {what}"
     if re.match(r"[A-Za-z][A-Za-z0-9+.-]+://", name):
-        raise InputError(where, "a file on the network", got=name, cure="download it beside the mesh, and name it there")
+        raise InputError(
+            where, "a file on the network", got=name, cure="download it beside the mesh, and name it there"
+        )
     folder, plain = path.parent.resolve(), name.replace("\\", "/")
     target = (folder / plain).resolve()
     if not allow_outside and not target.is_relative_to(folder):
@@ -225,7 +227,8 @@ def _read_gltf(path: Path, allow_outside: bool) -> MeshFile:
         if not hasattr(geometry, "faces"):
             continue
         label = getattr(getattr(geometry.visual, "material", None), "name", None)
-        image, factor, uv_transform = choice[int(label)] if label and label.isdigit() else (None, (1.0,) * 3, None)
+        plain = (None, (1.0, 1.0, 1.0), None)
+        image, factor, uv_transform = choice[int(label)] if label and label.isdigit() else plain
         uv = getattr(geometry.visual, "uv", None)
         if uv is not None and uv_transform is not None:
             uv = np.c_[uv[:, 0], 1.0 - uv[:, 1], np.ones(len(uv))] @ uv_transform.T
@@ -388,7 +391,7 @@ def _read_ply(path: Path, allow_outside: bool) -> MeshFile:
     file, names = MeshFile(), ply_textures(path)
     if len(names) > 1:
         raise InputError(path, f"{len(names)} textures in one PLY", cure="export the mesh as GLB or OBJ")
-    stub = {name: _ONE_PIXEL for name in names}
+    stub = dict.fromkeys(names, _ONE_PIXEL)
     if names:
         file.images[Path(names[0].replace("\\", "/")).name] = _referenced(path, names[0], allow_outside, "TextureFile")
     try:

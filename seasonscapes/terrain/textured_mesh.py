@@ -178,6 +178,8 @@ def numbered_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     # A random odd multiplier for each column: rows of equal hash are equal but for a chance of about N² / 2⁶⁴.
     factors = np.random.default_rng(0).integers(1, 2**63, size=(2, words.shape[1]), dtype=np.uint64) * np.uint64(2)
     key = (words * (factors[0] + np.uint64(1))).sum(axis=1, dtype=np.uint64)
-    key ^= ((words ^ (words >> np.uint64(13))) * (factors[1] + np.uint64(1))).sum(axis=1, dtype=np.uint64) >> np.uint64(7)
+    key ^= ((words ^ (words >> np.uint64(13))) * (factors[1] + np.uint64(1))).sum(axis=1, dtype=np.uint64) >> np.uint64(
+        7
+    )
     _, first, number = np.unique(key, return_index=True, return_inverse=True)
     return first, number.reshape(-1)
