@@ -260,8 +260,8 @@ def _own_mesh(part: Part, turn: np.ndarray):
     return mesh
 
 
-def eight_bit(radiance: list[np.ndarray], unit: float) -> list[np.ndarray]:
-    """Linear values after storage in 8-bit sRGB, where ``unit`` [cd/m²] is white; seams are spread."""
+def eight_bit(radiance: list[np.ndarray], unit: np.ndarray) -> list[np.ndarray]:
+    """Linear values after storage in 8-bit sRGB, where ``unit`` ``(3,)`` [cd/m²] is white; seams are spread."""
     pictures = []
     for values in radiance:
         known = np.isfinite(values).all(axis=2)
@@ -292,11 +292,11 @@ def mesh_relit(seed: int, folder: Path, *, texels: int = 192, spp: int = 256, ra
     blank = ss.load_mesh(source, placing)
     turn = blank.turn @ np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
     taken, others = "2024-07-20T10:30Z", ("2024-07-20T06:30Z", "2024-07-20T15:30Z")
-    truth = {}
-    for time in (taken, *others):
-        light, _ = mesh_light(blank, time, around)
-        truth[time] = path_traced_textures(parts, light, turn, spp=spp, seed=seed)
-    unit = float(np.nanpercentile(np.concatenate([t.ravel() for t in truth[taken]]), 99.5))
+    lights = {time: mesh_light(blank, time, around)[0] for time in (taken, *others)}
+    truth = {time: path_traced_textures(parts, light, turn, spp=spp, seed=seed) for time, light in lights.items()}
+    # A camera that balances white for the hour, and exposes half a per cent to white.
+    level = lights[taken].global_horizontal_lx / np.pi
+    unit = level * np.nanpercentile(np.concatenate([(t / level).ravel() for t in truth[taken]]), 99.5)
     lit = eight_bit(truth[taken], unit)
     write_parts(source, parts, lit)
     mesh = ss.load_mesh(source, placing)

@@ -366,8 +366,10 @@ def delight_mesh(
     whole = atlas.image([t.values * f for t, f in zip(mesh.textures, _factors(mesh), strict=True)])
     traced = texel_irradiance(transport.texels, light, atlas.chart)
     irradiance = replace(traced, bounce=lambda albedo: traced.bounce(_reflecting(atlas, albedo, known)))
-    # Texture coordinates place the image exactly.
+    # Texture coordinates place the image exactly; between vertices no shadow border can be followed.
+    only_vertices = all(texture.of_vertices for texture in mesh.textures)
     options = replace(options or DelightOptions(), register=False)
+    options = replace(options, borders=None) if only_vertices else options
     clipped = (stored >= 1.0 - 1e-4) & known[..., None]
     image = np.where(known[..., None], whole, np.float32(np.nan))
     report = task_progress(progress, "removing the light")
