@@ -357,9 +357,9 @@ def _completed(albedo: np.ndarray, clipped: np.ndarray, known: np.ndarray) -> np
         np.stack([gaussian_filter(np.where(good, albedo[..., k], 0.0), 3.0) for k in range(3)], axis=2)
         / np.maximum(share, 1e-6)[..., None]
     )
-    nearest = distance_transform_edt(~good, return_distances=False, return_indices=True)
+    nearest = np.asarray(distance_transform_edt(~good, return_distances=False, return_indices=True))
     around = np.where((share > 1e-3)[..., None], blurred, albedo[nearest[0], nearest[1]])
-    whole = ~clipped
+    whole = np.logical_not(clipped)
     ratio = np.where(whole, albedo, 0.0).sum(axis=2) / np.maximum(np.where(whole, around, 0.0).sum(axis=2), 1e-6)
     # A clipped value is a lower bound.
     guess = np.where(whole.any(axis=2)[..., None], around * ratio[..., None], around)
