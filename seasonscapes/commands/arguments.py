@@ -116,10 +116,10 @@ def parse_names(text: str | None) -> set[str]:
 
 
 def parse_albedo(text: str) -> AlbedoFile:
-    """``DATE=FILE.npz`` as a dated albedo file."""
+    """``DATE=FILE`` as a dated albedo file."""
     from seasonscapes.workflows.albedo_sources import AlbedoFile
 
-    expected = "DATE=FILE.npz, such as 2024-07-20=summer.npz"
+    expected = "DATE=FILE, such as 2024-07-20=summer.npz"
     day, equals, name = text.partition("=")
     if not equals or not name:
         raise InputError("--albedo", "not a dated texture", got=text, expected=expected)

@@ -9,7 +9,6 @@ from datetime import date, datetime, timedelta
 from functools import partial
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
@@ -26,6 +25,7 @@ from seasonscapes.albedo.seasons import (
 from seasonscapes.errors import InputError
 from seasonscapes.source_hash import source_hash
 from seasonscapes.terrain.surface import Raster, Texture, load_texture, save_texture
+from seasonscapes.workflows.edited_textures import albedo_date, read_albedo, require_albedo_file
 from seasonscapes.workflows.place import Place
 from seasonscapes.workspace import build_once, file_hash
 
@@ -37,6 +37,7 @@ log = logging.getLogger(__name__)
 
 _IMAGE_CODE = ("terrain.imagery",)
 _SYNTHETIC_CODE = ("terrain.imagery", "terrain.synthetic")
+_EDITED_CODE = ("workflows.edited_textures",)
 _TRANSITION_CODE = ("albedo.seasons", "albedo.closed_form", "terrain.attributes")
 # Where a scene has no image, the ground is uniformly grey: between rock and meadow.
 GREY_ALBEDO = 0.2
@@ -55,7 +56,7 @@ class AlbedoFile:
     day
         The date.
     path
-        A ``.npz`` file of `terrain.surface.save_texture` or of ``seasonscapes albedo``.
+        What ``seasonscapes albedo`` wrote, or a picture of the atlas; see `edited_textures.read_albedo`.
     """
 
     day: date
@@ -184,7 +185,8 @@ def load_albedo(place: Place, path: str | Path, day: date | str | None = None) -
     place
         The place whose atlas the texture belongs to.
     path
-        A ``.npz`` file that ``seasonscapes albedo`` or `RecoveredAlbedo.save` wrote.
+        A ``.npz`` file that ``seasonscapes albedo`` or `RecoveredAlbedo.save` wrote; or a ``.png``, ``.exr`` or ``.glb``
+        of this place's atlas, edited elsewhere. The light that ``seasonscapes lit-texture`` put in is taken out again.
     day
         The date it is valid for (date or ISO 8601); default: the date that the file states.
 
@@ -220,30 +222,19 @@ def load_albedo(place: Place, path: str | Path, day: date | str | None = None) -
     return _from_file(place, AlbedoFile(date.fromisoformat(day) if isinstance(day, str) else day, path))
 
 
-def albedo_date(path: Path) -> date | None:
-    """The date that an albedo file states, or ``None``; `InputError` where it is missing or no ``.npz`` file."""
-    _require_texture_file(path)
-    with np.load(path, allow_pickle=False) as stored:
-        return date.fromisoformat(str(stored["date"])) if "date" in stored else None
-
-
-def _require_texture_file(path: Path) -> None:
-    if not path.is_file():
-        raise InputError("--albedo", "no such file", got=str(path))
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            names = set(stored.files)
-    except (BadZipFile, ValueError, EOFError, AttributeError):
-        raise InputError(path, "not an albedo texture", expected="a .npz file of `seasonscapes albedo`") from None
-    if not {"values", "weight"} <= names:
-        raise InputError(path, "not an albedo texture", got=", ".join(sorted(names)), expected="values and weight")
-
-
 def _from_file(place: Place, file: AlbedoFile) -> DatedAlbedo:
-    _require_texture_file(file.path)
-    return DatedAlbedo(
-        file.day, file_hash(file.path), lambda: place.require_texture(load_texture(file.path), what=str(file.path))
-    )
+    require_albedo_file(file.path)
+    content = file_hash(file.path)
+
+    def load() -> Texture:
+        if file.path.suffix.lower() == ".npz":
+            return read_albedo(place, file.path)
+        # The light of an hour is computed once for all frames and processes.
+        inputs = {"terrain": place.key, "atlas": place.atlas_id, "file": content}
+        build = partial(read_albedo, place, file.path)
+        return texture_once(place, "edited-albedo", inputs, code=_EDITED_CODE, build=build)
+
+    return DatedAlbedo(file.day, content, load)
 
 
 def require_season(season: str, *, where: str = "season") -> None:
