@@ -296,7 +296,8 @@ def _judged(
         )
     elif lead < _LEAST_LEAD:
         reason = (
-            f"no distinct sun: suns far from the best one explain the image about as well ({lead:.1f} standard errors)"
+            f"no distinct sun: suns far from the best one, {azimuth_deg:.0f}°/{elevation_deg:.0f}°, explain the image about "
+            f"as well ({lead:.1f} standard errors)"
         )
     elif sigma[0] > _LARGEST_AZIMUTH_SIGMA_DEG or sigma[1] > _LARGEST_ELEVATION_SIGMA_DEG:
         reason = f"the sun is uncertain by {sigma[0]:.0f}° in azimuth and {sigma[1]:.0f}° in elevation"
