@@ -177,13 +177,59 @@ def tone_curve(exposed: np.ndarray) -> np.ndarray:
     """
     colour = np.maximum(np.asarray(exposed, np.float32) * EXPOSURE_GAIN, 0.0)
     peak = colour.max(axis=-1, keepdims=True)
+    compressed = _compressed_peak(peak)
+    scaled = colour * (compressed / np.maximum(peak, 1e-12))
+    whiten = _whitening(peak, compressed)
+    return scaled + (compressed - scaled) * whiten
+
+
+def linear_from_display(picture: np.ndarray, ev100: float) -> np.ndarray:
+    """Invert `expose` and `tone_curve`: from a display-linear picture to scene-linear values.
+
+    Parameters
+    ----------
+    picture
+        Display-linear values ``(..., 3)`` in [0, 1].
+    ev100
+        The exposure that it was developed with.
+
+    Returns
+    -------
+    ndarray
+        Scene-linear values ``(..., 3)`` [cd/m²], float32; of clipped highlights, the least that could be.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from seasonscapes.images import expose, linear_from_display, tone_curve
+    >>> scene = np.array([[900.0, 4000.0, 20000.0]])
+    >>> bool(np.allclose(linear_from_display(tone_curve(expose(scene, 13.0)), 13.0), scene, rtol=1e-3))
+    True
+    """
+    shown = np.asarray(picture, np.float64)
+    compressed = shown.max(axis=-1, keepdims=True)
+    # The curve of the largest channel rises to 1; its inverse is read from a table.
+    peaks = np.concatenate(
+        [np.linspace(0.0, _SHOULDER_START, 2), np.geomspace(_SHOULDER_START, 1.05 * _WHITE, 4096)[1:]]
+    )
+    peak = np.interp(compressed, _compressed_peak(peaks), peaks)
+    whiten = _whitening(peak, compressed)
+    scaled = np.maximum(shown - compressed * whiten, 0.0) / (1.0 - whiten)
+    colour = scaled * (peak / np.maximum(compressed, 1e-12))
+    return (colour / EXPOSURE_GAIN * (SATURATION_LUMINANCE * 2.0**ev100)).astype(np.float32)
+
+
+def _compressed_peak(peak: np.ndarray) -> np.ndarray:
+    """The display value of the largest channel."""
     start, span = _SHOULDER_START, 1.0 - _SHOULDER_START
     excess = np.maximum(peak - start, 0.0)
     compressed = start + span * excess / (excess + span) * (1.0 + excess * span / _WHITE**2)
-    compressed = np.where(peak > start, np.minimum(compressed, 1.0), peak)
-    scaled = colour * (compressed / np.maximum(peak, 1e-12))
-    whiten = 1.0 - 1.0 / (0.12 * np.maximum(peak - compressed, 0.0) + 1.0)
-    return scaled + (compressed - scaled) * whiten
+    return np.where(peak > start, np.minimum(compressed, 1.0), peak)
+
+
+def _whitening(peak: np.ndarray, compressed: np.ndarray) -> np.ndarray:
+    """How far a compressed colour goes to white."""
+    return 1.0 - 1.0 / (0.12 * np.maximum(peak - compressed, 0.0) + 1.0)
 
 
 def write_png(path: str | os.PathLike, image: np.ndarray, *, metadata: Mapping[str, str] | None = None) -> None:

@@ -107,7 +107,7 @@ def albedo_command(
         "residual": [round(float(value), 4) for value in recovered.fit.residual],
         "gains": recovered.fit.gains.tolist(),
         **recovered.facts,
-        "figures": recovery.save_albedo_figures(recovered, output),
+        "figures": recovery.save_albedo_figures(loaded, recovered, output),
         "attribution": loaded.scene.attribution,
         "seconds": round(clock.perf_counter() - start, 1),
     }

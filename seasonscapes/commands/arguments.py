@@ -67,6 +67,18 @@ def parse_at(text: str, *, flag: str = "--at") -> tuple[float, float, float | No
     return numbers[0], numbers[1], numbers[2], None
 
 
+def parse_sun(text: str, *, flag: str = "--sun") -> tuple[float, float]:
+    """``AZIMUTH,ELEVATION`` of the sun [deg]."""
+    expected = "AZIMUTH,ELEVATION in degrees, such as 172,38.5"
+    try:
+        azimuth_deg, elevation_deg = (float(part) for part in text.split(","))
+    except ValueError:
+        raise InputError(flag, "not a direction", got=text, expected=expected) from None
+    check_range(flag, azimuth_deg, -360.0, 360.0)
+    check_range(flag, elevation_deg, -18.0, 90.0)
+    return azimuth_deg, elevation_deg
+
+
 def parse_duration(flag: str, text: str) -> timedelta:
     """``90s``, ``10min``, ``1h``, ``1d`` as a length of time of at least a second."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(s|min|m|h|d)", text.strip())
@@ -116,10 +128,10 @@ def parse_names(text: str | None) -> set[str]:
 
 
 def parse_albedo(text: str) -> AlbedoFile:
-    """``DATE=FILE.npz`` as a dated albedo file."""
+    """``DATE=FILE`` as a dated albedo file."""
     from seasonscapes.workflows.albedo_sources import AlbedoFile
 
-    expected = "DATE=FILE.npz, such as 2024-07-20=summer.npz"
+    expected = "DATE=FILE, such as 2024-07-20=summer.npz"
     day, equals, name = text.partition("=")
     if not equals or not name:
         raise InputError("--albedo", "not a dated texture", got=text, expected=expected)

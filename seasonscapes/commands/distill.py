@@ -60,7 +60,7 @@ def distill_command(
     export_views
         Also write the training images for other trainers (nerfstudio, COLMAP) into this folder.
     albedo
-        DATE=FILE.npz, may be repeated: recovered albedos instead of the scene's own.
+        DATE=FILE, may be repeated: albedos instead of the scene's own (.npz; or .png, .exr, .glb of this atlas).
     seed
         Equal seeds give equal models.
     json

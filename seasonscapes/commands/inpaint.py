@@ -82,7 +82,7 @@ def inpaint_command(
         completion.save_completed(result.completed, painted, temporary)
     pictures: list[Path] = []
     if figures is not None:
-        pictures = completion.save_texture_figures(figures, loaded, result.completed)
+        pictures = completion.save_texture_figures(figures, loaded, result.completed, utc, model)
         if view.camera is not None or view.at is not None:
             camera, name = view.pinhole(loaded), view.chosen(loaded.scene).name
             pictures += completion.save_view_figures(figures, loaded, result.completed, camera, model, utc, name=name)

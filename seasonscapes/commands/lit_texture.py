@@ -42,7 +42,7 @@ def lit_texture_command(
     time
         ISO 8601. Without an offset it is civil time at the place.
     albedo
-        An albedo texture (.npz) to use instead of the scene's.
+        An albedo texture to use instead of the scene's: .npz, or an edited .png, .exr or .glb of this scene's atlas.
     exposure
         auto (a camera), eye (an adapted observer), or an exposure value EV100; of .png and .glb.
     rays
@@ -63,6 +63,7 @@ def lit_texture_command(
     from seasonscapes.images import write_exr
     from seasonscapes.rendering.backend import use_backend
     from seasonscapes.workflows.albedo_sources import load_albedo
+    from seasonscapes.workflows.edited_textures import texture_facts
     from seasonscapes.workflows.illumination import illumination_on_terrain
     from seasonscapes.workflows.pictures import png_metadata, save_png
     from seasonscapes.workflows.received_light import lit_texture, require_rays
@@ -86,6 +87,7 @@ def lit_texture_command(
         "output": str(output),
         "rays": rays,
         "seed": seed,
+        "texture": texture_facts(loaded, "lit", utc=utc, sky=model, rays=rays, seed=seed),
     }
     if output.suffix.lower() == ".exr":
         layers = {"": lit.radiance, "sun": lit.sun, "sky": lit.sky, "bounce": lit.bounce, "albedo": lit.albedo}
@@ -93,6 +95,7 @@ def lit_texture_command(
         write_exr(output, layers, header={"seasonscapes:provenance": record, "seasonscapes:units": units})
     else:
         record["exposure_ev100"] = exposure_ev100(lit.radiance, metering)
+        record["texture"] |= {"exposure_ev100": record["exposure_ev100"], "eye": metering == "eye"}
         picture = develop(lit.radiance, record["exposure_ev100"], eye=metering == "eye")
         if output.suffix.lower() == ".png":
             save_png(output, picture, metadata=png_metadata(record))

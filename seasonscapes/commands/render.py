@@ -42,7 +42,7 @@ def render_command(
     time
         ISO 8601, such as 2024-09-01T12:00. Without an offset it is civil time at the camera.
     albedo
-        DATE=FILE.npz, may be repeated: recovered albedos of a date instead of the scene's own.
+        DATE=FILE, may be repeated: albedos of a date instead of the scene's own (.npz; or .png, .exr, .glb of this atlas).
     season
         How to interpolate between them: blended, nearest or snow-line, as of timelapse.
     engine

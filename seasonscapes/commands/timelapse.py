@@ -48,7 +48,7 @@ def timelapse_command(
     season
         Between dated albedos: blended (linear), nearest, or snow-line (the snow line moves place by place).
     albedo
-        DATE=FILE.npz, may be repeated: recovered albedos of a date instead of the scene's own.
+        DATE=FILE, may be repeated: albedos of a date instead of the scene's own (.npz; or .png, .exr, .glb of this atlas).
     smooth
         Time constant of the exposure; 0s exposes each frame by itself.
     fps

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator
 
@@ -192,17 +192,21 @@ def read_sky_model(name_or_path: str | Path) -> SkyModel:
     path = Path(name_or_path)
     if path.suffix != ".toml" and not path.is_file():
         path = bundled_path("sun_models", str(name_or_path))
-    table = read_toml(path)
+    model = sky_model_from_table(read_toml(path), where=path)
+    return model if model.name else model.model_copy(update={"name": path.stem})
+
+
+def sky_model_from_table(table: dict[str, Any], *, where: str | Path) -> SkyModel:
+    """Validate the tables of a sky model; `InputError`, which begins with ``where``, as in `read_sky_model`."""
     kind = table.get("kind")
-    if kind not in KINDS:
+    if kind not in tuple(KINDS):
         raise InputError(
-            f"{path}: kind",
+            f"{where}: kind",
             "no such kind of sky model" if "kind" in table else "missing key",
             got=kind,
             expected="one of " + ", ".join(KINDS),
         )
-    model = validate(table, KINDS[kind], where=path)
-    return model if model.name else model.model_copy(update={"name": path.stem})
+    return validate(table, KINDS[kind], where=where)
 
 
 def with_overrides(

@@ -299,9 +299,14 @@ def _solved(
     return fit, completed_estimate(known, fit, base, predictors_for(place.terrain, place.atlas), progress=report)
 
 
-def save_albedo_figures(recovered: RecoveredAlbedo, output: Path) -> dict[str, str]:
-    """Write pictures beside an albedo file: the albedo, what was measured, and σ (white is 0.1); their paths."""
+def save_albedo_figures(place: Place, recovered: RecoveredAlbedo, output: Path) -> dict[str, str]:
+    """Write pictures beside an albedo file: the albedo, what was measured, and σ (white is 0.1); their paths.
+
+    The picture of the albedo may be edited and given back as an albedo.
+    """
     from seasonscapes.images import write_png
+    from seasonscapes.workflows.edited_textures import texture_facts
+    from seasonscapes.workflows.pictures import png_metadata
 
     known = recovered.estimate
     sigma = np.clip(np.nan_to_num(known.sigma, posinf=1.0) / 0.1, 0.0, 1.0)
@@ -313,7 +318,9 @@ def save_albedo_figures(recovered: RecoveredAlbedo, output: Path) -> dict[str, s
     paths = {}
     for name, image in pictures.items():
         path = output.with_name(f"{output.stem}_{name}.png")
-        write_png(path, np.clip(image, 0.0, 1.0))
+        facts = texture_facts(place, "albedo" if name == "albedo" else "figure", date=recovered.day.isoformat())
+        record = {"texture": facts, "attribution": place.scene.attribution}
+        write_png(path, np.clip(image, 0.0, 1.0), metadata=png_metadata(record))
         paths[name] = str(path)
     return paths
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import date, datetime, timedelta
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
@@ -24,9 +23,13 @@ from seasonscapes.albedo.seasons import (
     snowline_fraction,
 )
 from seasonscapes.errors import InputError
+from seasonscapes.scene import Imagery
 from seasonscapes.source_hash import source_hash
 from seasonscapes.terrain.surface import Raster, Texture, load_texture, save_texture
-from seasonscapes.workflows.place import Place
+from seasonscapes.workflows.delighting import UNKNOWN, delit_imagery, imagery_time
+from seasonscapes.workflows.edited_textures import albedo_date, read_albedo, require_albedo_file
+from seasonscapes.workflows.place import Place, utc_at
+from seasonscapes.workflows.scene_imagery import atlas_image
 from seasonscapes.workspace import build_once, file_hash
 
 # What workflows accept as ``albedo``: a texture of the place's atlas, an albedo of one date, albedos of several dates
@@ -35,8 +38,10 @@ AlbedoSource = Texture | DatedAlbedo | AlbedoSeries | None
 
 log = logging.getLogger(__name__)
 
-_IMAGE_CODE = ("terrain.imagery",)
+_IMAGE_CODE = ("terrain.imagery", "workflows.scene_imagery")
+_DELIT_CODE = ("workflows.delighting",)
 _SYNTHETIC_CODE = ("terrain.imagery", "terrain.synthetic")
+_EDITED_CODE = ("workflows.edited_textures",)
 _TRANSITION_CODE = ("albedo.seasons", "albedo.closed_form", "terrain.attributes")
 # Where a scene has no image, the ground is uniformly grey: between rock and meadow.
 GREY_ALBEDO = 0.2
@@ -55,7 +60,7 @@ class AlbedoFile:
     day
         The date.
     path
-        A ``.npz`` file of `terrain.surface.save_texture` or of ``seasonscapes albedo``.
+        What ``seasonscapes albedo`` wrote, or a picture of the atlas; see `edited_textures.read_albedo`.
     """
 
     day: date
@@ -105,7 +110,15 @@ def scene_albedo(place: Place, day: date | str) -> Texture:
         values = np.full((*place.texture_shape, 3), GREY_ALBEDO, np.float32)
         return Texture(values, np.zeros(place.texture_shape, np.float32), place.atlas_id)
     inputs.update(imagery=imagery.model_copy(update={"file": Path(imagery.file).name}), hash=file_hash(imagery.file))
-    return texture_once(place, "albedo", inputs, code=_IMAGE_CODE, build=lambda: _baked_image(place))
+    time = imagery_time(imagery)
+    if time is not None:
+        log.info("%s: its light is taken out", Path(imagery.file).name)
+        return texture_once(
+            place, "albedo-delit", inputs, code=_DELIT_CODE, build=lambda: delit_imagery(place, time).texture
+        )
+    if not imagery.delit:
+        _tell_light_stays(imagery.file)
+    return texture_once(place, "albedo", inputs, code=_IMAGE_CODE, build=lambda: _baked_image(place, imagery))
 
 
 def texture_once(
@@ -157,14 +170,14 @@ def dated_albedos(place: Place, files: Sequence[AlbedoFile] = ()) -> list[DatedA
     if files:
         return sorted((_from_file(place, file) for file in files), key=lambda dated: dated.day)
     if place.synthetic is None:
-        midsummer = datetime(2024, 7, 1)
-        imagery = place.scene.imagery
-        content = (
-            "grey"
-            if imagery is None
-            else ":".join((imagery.model_dump_json(), file_hash(imagery.file), source_hash(*_IMAGE_CODE)))
-        )
-        return [DatedAlbedo(midsummer.date(), content, lambda: scene_albedo(place, midsummer))]
+        day, imagery, content = date(2024, 7, 1), place.scene.imagery, "grey"
+        if imagery is not None:
+            time = imagery_time(imagery)
+            code = source_hash(*_IMAGE_CODE if time is None else _DELIT_CODE)
+            content = ":".join((imagery.model_dump_json(), file_hash(imagery.file), code))
+            if isinstance(time, str) and time != UNKNOWN:
+                day = utc_at(place, time).date()
+        return [DatedAlbedo(day, content, lambda: scene_albedo(place, day))]
     days = [datetime(2024, month, day) for month in range(1, 13) for day in _FILM_DAYS]
     return [
         DatedAlbedo(
@@ -184,7 +197,8 @@ def load_albedo(place: Place, path: str | Path, day: date | str | None = None) -
     place
         The place whose atlas the texture belongs to.
     path
-        A ``.npz`` file that ``seasonscapes albedo`` or `RecoveredAlbedo.save` wrote.
+        A ``.npz`` file that ``seasonscapes albedo`` or `RecoveredAlbedo.save` wrote; or a ``.png``, ``.exr`` or ``.glb``
+        of this place's atlas, edited elsewhere. The light that ``seasonscapes lit-texture`` put in is taken out again.
     day
         The date it is valid for (date or ISO 8601); default: the date that the file states.
 
@@ -220,30 +234,19 @@ def load_albedo(place: Place, path: str | Path, day: date | str | None = None) -
     return _from_file(place, AlbedoFile(date.fromisoformat(day) if isinstance(day, str) else day, path))
 
 
-def albedo_date(path: Path) -> date | None:
-    """The date that an albedo file states, or ``None``; `InputError` where it is missing or no ``.npz`` file."""
-    _require_texture_file(path)
-    with np.load(path, allow_pickle=False) as stored:
-        return date.fromisoformat(str(stored["date"])) if "date" in stored else None
-
-
-def _require_texture_file(path: Path) -> None:
-    if not path.is_file():
-        raise InputError("--albedo", "no such file", got=str(path))
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            names = set(stored.files)
-    except (BadZipFile, ValueError, EOFError, AttributeError):
-        raise InputError(path, "not an albedo texture", expected="a .npz file of `seasonscapes albedo`") from None
-    if not {"values", "weight"} <= names:
-        raise InputError(path, "not an albedo texture", got=", ".join(sorted(names)), expected="values and weight")
-
-
 def _from_file(place: Place, file: AlbedoFile) -> DatedAlbedo:
-    _require_texture_file(file.path)
-    return DatedAlbedo(
-        file.day, file_hash(file.path), lambda: place.require_texture(load_texture(file.path), what=str(file.path))
-    )
+    require_albedo_file(file.path)
+    content = file_hash(file.path)
+
+    def load() -> Texture:
+        if file.path.suffix.lower() == ".npz":
+            return read_albedo(place, file.path)
+        # The light of an hour is computed once for all frames and processes.
+        inputs = {"terrain": place.key, "atlas": place.atlas_id, "file": content}
+        build = partial(read_albedo, place, file.path)
+        return texture_once(place, "edited-albedo", inputs, code=_EDITED_CODE, build=build)
+
+    return DatedAlbedo(file.day, content, load)
 
 
 def require_season(season: str, *, where: str = "season") -> None:
@@ -350,23 +353,20 @@ def _synthetic_image(place: Place, day_of_year: int) -> Raster:
     return Raster(values, elevation.transform * Affine.scale(1.0 / upsample), elevation.crs)
 
 
-def _baked_image(place: Place) -> Texture:
-    from seasonscapes.terrain.imagery import bake_imagery, read_imagery
-    from seasonscapes.terrain.raster import bounds_geographic
-
-    imagery = place.scene.imagery
-    assert imagery is not None
-    # Imagery far finer than the texels is averaged while it is read.
-    image = read_imagery(
-        imagery.file,
-        bounds_deg=bounds_geographic(place.elevation),
-        bands=tuple(imagery.bands) if imagery.bands else None,
-        finest_m=0.5 * place.atlas.texel_p50_m,
-        encoding=imagery.encoding,
-        full_scale=imagery.full_scale,
-    )
-    texture = bake_imagery(place.terrain, place.atlas, image)
-    values = np.clip(texture.values * imagery.reflectance_scale, 0.0, 0.95)
-    covered = texture.weight > 0.0
+def _baked_image(place: Place, imagery: Imagery) -> Texture:
+    """The scene's image as it is, taken for an albedo."""
+    image = atlas_image(place, imagery)
+    values = np.clip(image.values * imagery.reflectance_scale, 0.0, 0.95)
+    covered = image.weight > 0.0
     values[~covered] = np.median(values[covered], axis=0)
-    return replace(texture, values=values)
+    return Texture(values, image.weight, place.atlas_id)
+
+
+@lru_cache(maxsize=64)
+def _tell_light_stays(file: str) -> None:
+    """Log once for each file that its light is not taken out."""
+    log.info(
+        '%s: the light of its hour stays in the image; to take it out, state [imagery] time = "…" (or "unknown"), '
+        "or delit = true where it holds none",
+        Path(file).name,
+    )

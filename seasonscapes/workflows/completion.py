@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from seasonscapes.texturing.predictors import Predictors
 
 _FIGURE_PX = 1024
+# Over the sky of each texel, where the light of a completed picture is computed again.
+_RAYS = 128
 
 
 def complete(
@@ -159,15 +161,23 @@ def _median(values: np.ndarray) -> float:
     return float(np.median(values)) if values.size else 0.0
 
 
-def save_texture_figures(folder: Path, place: Place, completed: CompletedTexture) -> list[Path]:
-    """Write pictures of the texture before and after completion, and of σ relative to its 99th percentile."""
+def save_texture_figures(
+    folder: Path, place: Place, completed: CompletedTexture, utc: datetime, sky: SkyModel
+) -> list[Path]:
+    """Write pictures of the texture before and after completion, and of σ relative to its 99th percentile.
+
+    The completed one may be edited and given back as an albedo where it is as large as the atlas.
+    """
     from seasonscapes.exposure import develop, exposure_ev100
     from seasonscapes.images import write_png
+    from seasonscapes.workflows.edited_textures import texture_facts
+    from seasonscapes.workflows.pictures import png_metadata
 
     shrink = max(1, -(-max(completed.painted.shape) // _FIGURE_PX))
     values = _shrunk(completed.values, shrink)
     painted = _shrunk(completed.painted[..., None].astype(np.float32), shrink)
-    after = develop(values, exposure_ev100(values))
+    ev100 = exposure_ev100(values)
+    after = develop(values, ev100)
     sigma = _shrunk(completed.sigma[..., None], shrink)
     scale = np.percentile(sigma, 99.0) or 1.0
     pictures = {
@@ -176,8 +186,10 @@ def save_texture_figures(folder: Path, place: Place, completed: CompletedTexture
         "sigma": np.repeat(np.clip(sigma / scale, 0.0, 1.0) ** 2.2, 3, axis=2),
     }
     paths = [folder / f"{place.scene.name}_texture_{name}.png" for name in pictures]
-    for path, picture in zip(paths, pictures.values(), strict=True):
-        write_png(path, picture)
+    lit = texture_facts(place, "lit", utc=utc, sky=sky, exposure_ev100=ev100, rays=_RAYS, seed=0)
+    for path, (name, picture) in zip(paths, pictures.items(), strict=True):
+        facts = lit if name == "after" and shrink == 1 else texture_facts(place, "figure")
+        write_png(path, picture, metadata=png_metadata({"texture": facts, "attribution": place.scene.attribution}))
     return paths
 
 

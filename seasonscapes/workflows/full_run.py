@@ -18,8 +18,9 @@ from seasonscapes.sky.models import SkyModel
 from seasonscapes.texturing.painting import PaintOptions
 from seasonscapes.workflows import completion, timelapse
 from seasonscapes.workflows.albedo_recovery import RecoveryOptions, recover_albedo, save_albedo_figures
-from seasonscapes.workflows.albedo_sources import AlbedoFile, albedo_date, dated_albedos
+from seasonscapes.workflows.albedo_sources import AlbedoFile, dated_albedos
 from seasonscapes.workflows.distillation import DistilOptions, distil_with_data, distillation_record
+from seasonscapes.workflows.edited_textures import albedo_date
 from seasonscapes.workflows.gaussian_views import render_gaussians
 from seasonscapes.workflows.inpainting import InpaintOptions, inpaint
 from seasonscapes.workflows.painting import painting_of, painting_record
@@ -203,7 +204,7 @@ def _albedo(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
     recovered = recover_albedo(job.place, photographs, sky=job.sky, options=options, progress=progress)
     path = _albedo_path(folder)
     recovered.save(path)
-    save_albedo_figures(recovered, path)
+    save_albedo_figures(job.place, recovered, path)
     observations = [photograph.observation for photograph in recovered.photographs]
     residuals = [
         {"webcam": each.webcam, "time_utc": each.time.isoformat(), "residual": round(float(residual), 4)}
@@ -249,7 +250,7 @@ def _inpaint(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]
         result = inpaint(job.place, painted, time, job.sky, options, progress=progress)
         with atomic_path(own / "completed.npz") as temporary:
             completion.save_completed(result.completed, painted, temporary)
-        completion.save_texture_figures(own, job.place, result.completed)
+        completion.save_texture_figures(own, job.place, result.completed, time, job.sky)
         _write_record(own / "completion.json", result.record)
         files.append(own / "completed.npz")
     return files

@@ -114,7 +114,7 @@ def inpaint(
         assert options.albedo is not None
         # Of the predictors only the surface and the charts matter: neither sun nor image is used.
         predictors = predictors_for(place.terrain, place.atlas)
-        sigma = albedo_relative_sigma(options.albedo)
+        sigma = albedo_relative_sigma(options.albedo, place.texture_shape)
         completed = fuse_with_albedo(painted, predicted.values, sigma, predictors)
         record["guides"] = ["albedo, relit"]
     else:

@@ -94,12 +94,13 @@ def measured_radiance(
     return np.where((predicted.weight > 0.0)[..., None], predicted.values, np.float32(np.nan))
 
 
-def albedo_relative_sigma(path: Path) -> np.ndarray:
+def albedo_relative_sigma(path: Path, shape: tuple[int, int]) -> np.ndarray:
     """Relative standard error ``(R, S)`` float32 of an albedo file; `RELATIVE_SIGMA` where it states none."""
-    with np.load(path, allow_pickle=False) as stored:
-        values = stored["values"]
-        sigma = stored["sigma"] if "sigma" in stored else np.full(values.shape[:2], np.inf, np.float32)
-    relative = sigma / np.maximum(values[..., 1], 1e-3)
+    relative = np.full(shape, np.inf, np.float32)
+    if path.suffix.lower() == ".npz":
+        with np.load(path, allow_pickle=False) as stored:
+            if "sigma" in stored:
+                relative = stored["sigma"] / np.maximum(stored["values"][..., 1], 1e-3)
     return np.where(np.isfinite(relative), relative, RELATIVE_SIGMA).astype(np.float32)
 
 
