@@ -28,6 +28,7 @@ from seasonscapes.terrain.mesh_reading import (
 )
 from seasonscapes.terrain.textured_mesh import MeshTexture, TexturedMesh
 
+_GLTF = (".glb", ".gltf")
 _UNLIT = "KHR_materials_unlit"
 _IMAGE_EXTENSIONS = ("EXT_texture_webp", "KHR_texture_basisu", "EXT_texture_avif")
 
@@ -81,22 +82,35 @@ def save_mesh(
     path = Path(path)
     if bits not in (None, 8, 16):
         raise InputError("--bits", "unknown depth", got=bits, expected="8 or 16")
-    suffix, source = path.suffix.lower(), mesh.path.suffix.lower()
-    gltf = (".glb", ".gltf")
     textures = [replace(t, bits=bits or t.bits) for t in mesh.textures]
-    of_vertices = any(texture.of_vertices for texture in textures)
-    same = suffix == source or (suffix in gltf and source in gltf)
-    if same and not (of_vertices and suffix != ".ply"):
-        writers: dict[str, Callable[..., list[Path]]] = {".obj": _write_obj, ".ply": _write_ply}
-        if suffix in gltf:
-            document, blob = load_document(mesh.path, allow_outside=True)
-            return _write_document(path, mesh, document, blob, textures, unlit, facts)
-        return writers[suffix](path, mesh, textures)
+    if not require_writable(path, mesh):
+        document, blob = _new_document(mesh)
+        return _write_document(path, mesh, document, blob, [t for t in textures if not t.of_vertices], unlit, facts)
+    if path.suffix.lower() in _GLTF:
+        document, blob = load_document(mesh.path, allow_outside=True)
+        return _write_document(path, mesh, document, blob, textures, unlit, facts)
+    writers: dict[str, Callable[[Path, TexturedMesh, list[MeshTexture]], list[Path]]]
+    writers = {".obj": _write_obj, ".ply": _write_ply}
+    return writers[path.suffix.lower()](path, mesh, textures)
+
+
+def require_writable(path: Path, mesh: TexturedMesh) -> bool:
+    """Whether a file keeps all but the textures of the one that was read; otherwise it is a new GLB.
+
+    Raises
+    ------
+    InputError
+        For a kind of file that this mesh cannot be written as.
+    """
+    suffix, source = path.suffix.lower(), mesh.path.suffix.lower()
+    of_vertices = any(texture.of_vertices for texture in mesh.textures)
+    same = suffix == source or (suffix in _GLTF and source in _GLTF)
+    if same and (suffix == ".ply" or not of_vertices):
+        return True
     if suffix != ".glb":
-        expected = f".glb or {source}" if not of_vertices else ".glb or, of a .ply, .ply"
+        expected = ".glb or, of a .ply, .ply" if of_vertices else f".glb or {source}"
         raise InputError(path, "this mesh cannot be written so", got=suffix, expected=expected)
-    document, blob = _new_document(mesh)
-    return _write_document(path, mesh, document, blob, [t for t in textures if not t.of_vertices], unlit, facts)
+    return False
 
 
 def _require_new(path: Path, mesh: TexturedMesh, sources: Sequence[Path]) -> None:

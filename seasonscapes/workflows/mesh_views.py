@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -158,7 +159,6 @@ def relit_mesh_view(view: MeshView, time: Time) -> RenderedView:
     light, record = mesh_light(view.mesh, time, view.surroundings)
     camera = view.relightable.coefficients.camera
     record |= {
-        "white_rgb": light.white_rgb,
         "size_px": [camera.width_px, camera.height_px],
         "world_from_camera": camera.world_from_camera.tolist(),
         "frame": dict(view.mesh.frame.__dict__),
@@ -254,3 +254,81 @@ def film_mesh(
             path = Path(folder) / frame_name(time)
             save_frame(path, picture.radiance, metered_ev100=metered, provenance=record)
         return develop_frames(Path(folder), times, output, look, about, progress=progress)
+
+
+def relit_pictures(
+    mesh: TexturedMesh,
+    hours: Sequence[Time],
+    cameras: Sequence[Camera],
+    output: Path,
+    look: FilmLook,
+    *,
+    surroundings: MeshSurroundings,
+    progress: Progress | None = None,
+) -> tuple[list[Path], dict[str, Any]]:
+    """Write a picture of a mesh, a film of several hours, or a turntable of several cameras at one hour.
+
+    Parameters
+    ----------
+    mesh
+        The mesh, whose textures are albedo.
+    hours
+        One hour; of a film aware instants.
+    cameras
+        One camera; of a turntable several.
+    output
+        ``.png`` or ``.exr``; of films and turntables ``.mp4``, or a folder.
+    look
+        Exposure and look.
+    surroundings, progress
+        See `render_mesh`.
+
+    Returns
+    -------
+    files
+        The files written.
+    record
+        Plain values about light and exposure.
+    """
+    from seasonscapes.exposure import exposure_ev100
+    from seasonscapes.workflows.pictures import png_metadata, save_exr, save_png
+
+    instants = [hour for hour in hours if isinstance(hour, datetime)]
+    if len(hours) > 1:
+        view = mesh_view(mesh, cameras[0], surroundings=surroundings, progress=progress)
+        files = film_mesh(view, instants, output, look, progress=progress)
+        return files, {"mesh": mesh.path.name, "frames": len(instants)}
+    pictures: list[np.ndarray] = []
+    ev100, record = 0.0, {}
+    # A turntable's exposure is that of its first picture.
+    for camera in cameras:
+        rendered = render_mesh(mesh, hours[0], camera, surroundings=surroundings, progress=progress)
+        if not pictures:
+            record = rendered.provenance
+            ev100 = exposure_ev100(rendered.radiance, look.exposure, look=look.look)
+            record["exposure_ev100"] = round(ev100, 3)
+        if output.suffix.lower() == ".exr":
+            save_exr(output, rendered)
+            return [output], record
+        pictures.append(_developed(rendered, ev100, look))
+    if output.suffix.lower() == ".png":
+        save_png(output, pictures[0], metadata=png_metadata(record))
+        return [output], record
+    record = {name: value for name, value in record.items() if name != "world_from_camera"} | {"views": len(pictures)}
+    if output.suffix.lower() == ".mp4":
+        from seasonscapes.relighting.film import write_video
+
+        write_video(output, pictures, fps=look.fps, comment=json.dumps(record, default=float))
+        return [output], record
+    files = [output / f"view-{number:03d}.png" for number in range(len(pictures))]
+    for path, picture in zip(files, pictures, strict=True):
+        save_png(path, picture, metadata=png_metadata(record))
+    return files, record
+
+
+def _developed(view: RenderedView, ev100: float, look: FilmLook) -> np.ndarray:
+    from seasonscapes.exposure import develop
+    from seasonscapes.workflows.pictures import balance_rgb
+
+    white = balance_rgb(look.white_balance, view.provenance["white_rgb"])
+    return develop(view.radiance, ev100, eye=look.exposure == "eye", look=look.look, white=white)

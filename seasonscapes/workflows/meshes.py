@@ -22,7 +22,13 @@ from seasonscapes.sky.models import SkyModel
 from seasonscapes.terrain.mesh_atlas import MeshAtlas, mesh_atlas
 from seasonscapes.terrain.mesh_placing import MeshPlacing, placed
 from seasonscapes.terrain.textured_mesh import TexturedMesh
-from seasonscapes.workflows.illumination import SunMoonPosition, illumination_at, sky_model, sun_moon_position
+from seasonscapes.workflows.illumination import (
+    SunMoonPosition,
+    given_sun_in_frame,
+    illumination_at,
+    sky_model,
+    sun_moon_position,
+)
 from seasonscapes.workspace import Workspace, default_workspace
 
 if TYPE_CHECKING:
@@ -202,13 +208,12 @@ def mesh_light(
     )
     angles = sun_angles(position)
     record |= {"sun": {name: round(value, 4) for name, value in angles.items()}, "sky": light.model}
+    record["white_rgb"] = light.white_rgb
     return replace(light, frame=mesh.frame), record
 
 
 def sun_of(mesh: TexturedMesh, time: Time) -> tuple[SunMoonPosition, dict[str, Any]]:
     """Sun and moon of an hour over a mesh, and plain values about where and when."""
-    from seasonscapes.sky.ephemeris import SolarPosition
-
     frame = mesh.frame
     record: dict[str, Any] = {
         "mesh": mesh.path.name,
@@ -221,15 +226,7 @@ def sun_of(mesh: TexturedMesh, time: Time) -> tuple[SunMoonPosition, dict[str, A
         "seasonscapes": __version__,
     }
     if isinstance(time, tuple):
-        azimuth, elevation = time
-        if not (-360.0 <= azimuth <= 360.0 and -18.0 <= elevation <= 90.0):
-            expected = "azimuth -360 to 360, elevation -18 to 90"
-            raise InputError("--sun", "out of range", got=f"{azimuth:g},{elevation:g}", expected=expected)
-        # No moon: where it stands is not known.
-        middle = datetime(2024, 6, 1, 12, tzinfo=UTC)
-        moon = sun_moon_position(middle, frame.latitude_deg, frame.longitude_deg, frame.height_m).moon
-        hidden = replace(moon, elevation_deg=-60.0, true_elevation_deg=-60.0)
-        return SunMoonPosition(middle, SolarPosition(azimuth, elevation, elevation, 1.0), hidden), record
+        return given_sun_in_frame(frame, *time), record
     utc = resolve_time(time, frame.latitude_deg, frame.longitude_deg).utc if isinstance(time, str) else time
     position = sun_moon_position(utc, frame.latitude_deg, frame.longitude_deg, frame.height_m)
     return position, record | {"time_utc": utc.astimezone(UTC).isoformat()}
@@ -359,9 +356,11 @@ def delight_mesh(
 
     around = surroundings or MeshSurroundings()
     light, record = mesh_light(mesh, time, around)
+    if light.sun is None and record["sun"]["elevation_deg"] <= 0.0:
+        got = f"the sun stands at {record['sun']['elevation_deg']:.1f}°"
+        raise InputError("--time", "no daylight in the textures", got=got, expected="a sun above the horizon")
     transport = transport or mesh_transport(mesh, around, progress=progress)
-    atlas = transport.atlas
-    known = transport.known
+    atlas, known = transport.atlas, transport.known
     stored = atlas.image([texture.values for texture in mesh.textures])
     whole = atlas.image([t.values * f for t, f in zip(mesh.textures, _factors(mesh), strict=True)])
     traced = texel_irradiance(transport.texels, light, atlas.chart)
