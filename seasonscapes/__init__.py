@@ -66,6 +66,14 @@ _MODULES = {
     "predict_radiance": "workflows.predicted_radiance",
     "delight": "workflows.delighting",
     "differentiable_scene": "workflows.differentiable",
+    # meshes
+    "load_mesh": "workflows.meshes",
+    "MeshPlacing": "terrain.mesh_placing",
+    "MeshSurroundings": "workflows.meshes",
+    "delight_mesh": "workflows.meshes",
+    "light_mesh": "workflows.meshes",
+    "render_mesh": "workflows.mesh_views",
+    "save_mesh": "terrain.mesh_writing",
     # Gaussians
     "distil": "workflows.distillation",
     "DistilOptions": "workflows.distillation",

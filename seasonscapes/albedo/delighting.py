@@ -206,7 +206,7 @@ def delight_image(
         shift = texture_shift(image.mean(axis=2), predicted.mean(axis=2), chart >= 0)
         if shift is not None:
             image = shifted_back(image, shift)
-            clipped = shifted_back(clipped.astype(np.float32), shift) > 0.01
+            clipped = np.asarray(shifted_back(clipped.astype(np.float32), shift) > 0.01)
             chart = np.where(np.isfinite(image).all(axis=2), light.chart, -1)
     report(0.1)
     radiance = _at_surface(np.nan_to_num(image) * scale, options.air)
@@ -345,11 +345,9 @@ def _pairs(sunlight: np.ndarray, ambient: np.ndarray, chart: np.ndarray, most: i
 
 def _completed(albedo: np.ndarray, clipped: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Albedo with its clipped channels completed: from the unclipped ones and the colour of unclipped neighbours."""
-    lost = clipped.any(axis=2)
-    if not lost.any():
-        return albedo
-    good = known & ~lost
-    if not good.any():
+    lost = np.asarray(clipped.any(axis=2))
+    good = np.asarray(known & ~lost)
+    if not lost.any() or not good.any():
         return albedo
     # Neighbours' colour: a normalised blur near by, the nearest texel where that reaches nothing.
     share = gaussian_filter(good.astype(np.float32), 3.0)
@@ -357,9 +355,9 @@ def _completed(albedo: np.ndarray, clipped: np.ndarray, known: np.ndarray) -> np
         np.stack([gaussian_filter(np.where(good, albedo[..., k], 0.0), 3.0) for k in range(3)], axis=2)
         / np.maximum(share, 1e-6)[..., None]
     )
-    nearest = distance_transform_edt(~good, return_distances=False, return_indices=True)
+    nearest = np.asarray(distance_transform_edt(~good, return_distances=False, return_indices=True))
     around = np.where((share > 1e-3)[..., None], blurred, albedo[nearest[0], nearest[1]])
-    whole = ~clipped
+    whole: np.ndarray = np.logical_not(clipped)
     ratio = np.where(whole, albedo, 0.0).sum(axis=2) / np.maximum(np.where(whole, around, 0.0).sum(axis=2), 1e-6)
     # A clipped value is a lower bound.
     guess = np.where(whole.any(axis=2)[..., None], around * ratio[..., None], around)

@@ -73,6 +73,8 @@ COMMANDS = (
     ("inpaint", "inpaint", "Complete a painted texture where no camera saw the surface."),
     ("path", "path", "Make a camera path over a place, clear of the ground, with a map."),
     ("albedo", "albedo", "Recover the albedo of a place from its photographs."),
+    ("delight", "delight", "Take the light of its hour out of an image or a textured mesh."),
+    ("relight", "relight", "Light a textured mesh anew: pictures, lit textures or a film."),
     ("distill", "distill", "Distil a Gaussian model of a place."),
     ("splat", "splat", "Render distilled Gaussians at any hour, or bake them for other programs."),
     ("run", "run", "From photographs to pictures of any hour: all stages, resumable."),

@@ -227,7 +227,8 @@ def _read_gltf(path: Path, allow_outside: bool) -> MeshFile:
         if not hasattr(geometry, "faces"):
             continue
         label = getattr(getattr(geometry.visual, "material", None), "name", None)
-        image, factor, uv_transform = choice[int(label)] if label and label.isdigit() else (None, (1.0,) * 3, None)
+        plain = (None, (1.0, 1.0, 1.0), None)
+        image, factor, uv_transform = choice[int(label)] if label and label.isdigit() else plain
         uv = getattr(geometry.visual, "uv", None)
         if uv is not None and uv_transform is not None:
             uv = np.c_[uv[:, 0], 1.0 - uv[:, 1], np.ones(len(uv))] @ uv_transform.T
