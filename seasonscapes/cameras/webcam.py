@@ -18,7 +18,7 @@ from pydantic import Field, field_validator, model_validator
 
 from seasonscapes.cameras.panorama import Panorama, panorama_from_angles
 from seasonscapes.cameras.pinhole import Camera, rotation_from_angles
-from seasonscapes.declaration import Declaration, InputError, Name, read_toml, validate
+from seasonscapes.declaration import Declaration, InputError, Name, Text, read_toml, validate
 from seasonscapes.frames import LocalFrame, enu_from_geodetic, local_axes
 
 
@@ -58,7 +58,7 @@ class Webcam(Declaration):
     """
 
     id: Name
-    name: str = ""
+    name: Text = ""
     latitude_deg: float = Field(ge=-90.0, le=90.0)
     longitude_deg: float = Field(ge=-180.0, le=180.0)
     height_m: float | None = None
