@@ -45,7 +45,9 @@ class PlaceOptions:
         """How to build the terrain; ``texel_m`` is a command's own default."""
         from seasonscapes.workflows.place import MeshOptions
 
-        return MeshOptions(self.mesher, self.max_error_m, self.refine, self.atlas, self.texel_m or texel_m)
+        return MeshOptions(
+            self.mesher, self.max_error_m, self.refine, self.atlas, texel_m if self.texel_m is None else self.texel_m
+        )
 
     def load(self, scene: str, progress: Progress | None = None, *, texel_m: float | None = None) -> Place:
         """The place of a scene file or bundled scene."""

@@ -11,7 +11,7 @@ import numpy as np
 from seasonscapes.errors import InputError
 from seasonscapes.frames import geodetic_from_enu
 from seasonscapes.scene import NamedCamera, Viewpoint, camera_from_named_view
-from seasonscapes.workflows.place import Place, ground_height_m, ground_or_nan
+from seasonscapes.workflows.place import Place, ground_height_m, ground_or_nan, require_near
 
 if TYPE_CHECKING:
     from seasonscapes.cameras.panorama import Panorama
@@ -86,6 +86,7 @@ def camera_for(place: Place, view: Viewpoint, *, size_px: tuple[int, int], where
     if view.above_ground_m is not None:
         ground = ground_height_m(place, view.latitude_deg, view.longitude_deg, where=where)
     else:
+        require_near(place, view.latitude_deg, view.longitude_deg, where=where)
         ground = ground_or_nan(place, view.latitude_deg, view.longitude_deg)
         if view.height_m is not None and view.height_m < ground:
             raise InputError(
@@ -175,16 +176,15 @@ def scene_cameras(place: Place, *, leave_out: set[str] | None = None, size_px: t
 def local_ground(place: Place):
     """Heights of the ground in the local frame as a function of positions ``(N, 2)`` east, north [m]; NaN outside."""
     from seasonscapes.frames import enu_from_geodetic
-    from seasonscapes.terrain.raster import map_from_geodetic, sample_raster
+    from seasonscapes.terrain.crs import map_position
+    from seasonscapes.terrain.raster import sample_raster
 
     def heights(positions: np.ndarray) -> np.ndarray:
         up = np.zeros(len(positions))
         # The local vertical differs from the frame's, so a point's height shifts it sideways; two rounds converge.
         for _ in range(2):
             latitude, longitude, _ = geodetic_from_enu(place.frame, np.column_stack([positions, up]))
-            height = sample_raster(place.elevation, *map_from_geodetic(place.elevation.crs, latitude, longitude))[
-                ..., 0
-            ]
+            height = sample_raster(place.elevation, *map_position(place.elevation, latitude, longitude))[..., 0]
             up = enu_from_geodetic(place.frame, latitude, longitude, np.nan_to_num(height))[..., 2]
         return np.where(np.isfinite(height), up, np.nan)
 
