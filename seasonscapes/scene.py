@@ -15,7 +15,7 @@ from pydantic import Field, PrivateAttr, model_validator
 
 from seasonscapes.cameras.pinhole import Camera, camera_at
 from seasonscapes.cameras.webcam import Webcam
-from seasonscapes.declaration import MOST_NAME_CHARACTERS, Declaration, InputError, Name, read_declaration
+from seasonscapes.declaration import MOST_NAME_CHARACTERS, Declaration, InputError, Name, Text, read_declaration
 from seasonscapes.frames import STANDARD_REFRACTION_K, Latitude, LocalFrame, Longitude
 from seasonscapes.terrain.raster_files import OWN_FOLDER, Confinement, confined_path, raster_hash
 
@@ -271,8 +271,8 @@ class SceneFile(Declaration):
     """
 
     name: str = Field(pattern=r"^[a-z0-9][a-z0-9_-]*$", max_length=MOST_NAME_CHARACTERS)
-    title: str = ""
-    attribution: str = ""
+    title: Text = ""
+    attribution: Text = ""
     vertical_datum: VerticalDatum = "unknown"
     refraction_k: float = Field(default=STANDARD_REFRACTION_K, ge=0.0, lt=0.9)
     origin: Origin | None = None
