@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from seasonscapes.workflows.place import Place
 
 _MOST_FRAMES = 200_000
+# What a view keeps of each pixel at least, in single precision: radiance, surface radiance, albedo, position and normal of
+# three numbers each, uv of two, depth and alpha.
+_BYTES_PER_PIXEL = 4 * (5 * 3 + 2 + 2)
 
 
 @Parameter(name="*")
@@ -39,8 +42,13 @@ class ViewOptions:
     """WIDTHxHEIGHT in pixels."""
 
     def size_px(self) -> tuple[int, int]:
-        """Width and height."""
-        return parse_size(self.size)
+        """Width and height; `InputError` where a picture of that size would not fit into memory."""
+        from seasonscapes.terrain.memory import require_bytes
+
+        width, height = parse_size(self.size)
+        needed = width * height * _BYTES_PER_PIXEL
+        require_bytes(needed, where="--size", got=self.size, cure="choose a smaller one")
+        return width, height
 
     def chosen(self, scene: SceneFile) -> NamedCamera:
         """The scene's camera of that name, or the view that ``--at`` describes."""
