@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import stat
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, get_args
@@ -35,9 +36,21 @@ def _value(type_: Any, tokens: Sequence[Token]) -> Any:
             raise InputError(name, "not a whole number", got=text, expected="digits, such as 12")
         if float in types and _not_finite(text) and name not in _MAY_BE_INFINITE:
             raise InputError(name, "not a finite number", got=text)
-        if Path in types and not text:
-            raise InputError(name, "an empty name", expected="the name of a file or folder")
+        if Path in types:
+            check_no_device(Path(text) if text else None, name)
     return convert(type_, tokens)
+
+
+def check_no_device(path: Path | None, flag: str) -> None:
+    """`InputError` about an empty name, a pipe or a device: some would be waited for, others never end."""
+    if path is None:
+        raise InputError(flag, "an empty name", expected="the name of a file or folder")
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError):
+        return  # whoever opens it tells what is wrong
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise InputError(flag, "this is a pipe or a device", got=str(path), expected="a file or folder")
 
 
 def _not_finite(text: str) -> bool:
