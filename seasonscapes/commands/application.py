@@ -76,6 +76,7 @@ COMMANDS = (
     ("render", "render", "Render a view of a place at a date and hour."),
     ("timelapse", "timelapse", "Film a view through hours or seasons."),
     ("lit-texture", "lit_texture", "Export a place's texture as lit at an hour."),
+    ("export", "export", "Write a place for other programs: glTF, USD, 3D Tiles, Blender."),
     ("irradiance", "irradiance", "Map the irradiance of the ground at an hour or over a period."),
     ("sky", "sky", "Report the light of a place at an instant, and picture the sky dome."),
     ("terrain", "terrain", "Build a place's terrain and report its quality."),
