@@ -12,7 +12,7 @@ states its standard error and where it comes from.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -220,7 +220,10 @@ def delight_image(
                 np.maximum(factor * light.sky + bounce, 1e-3).astype(np.float32),
                 light.visibility,
                 chart,
-                model=options.borders,
+                # Borders are good enough for the sky factor after a rough first pass.
+                model=options.borders
+                if number == options.rounds - 1
+                else replace(options.borders, levels=3, iterations=8),
             )
         sunlight = visibility[..., None] * light.sun
         if options.fit_sky:
@@ -345,8 +348,8 @@ def _pairs(sunlight: np.ndarray, ambient: np.ndarray, chart: np.ndarray, most: i
 
 def _completed(albedo: np.ndarray, clipped: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Albedo with its clipped channels completed: from the unclipped ones and the colour of unclipped neighbours."""
-    lost: np.ndarray = clipped.any(axis=2)
-    good: np.ndarray = known & ~lost
+    lost = np.asarray(clipped.any(axis=2), bool)
+    good = known & ~lost
     if not lost.any() or not good.any():
         return albedo
     # Neighbours' colour: a normalised blur near by, the nearest texel where that reaches nothing.
@@ -357,7 +360,7 @@ def _completed(albedo: np.ndarray, clipped: np.ndarray, known: np.ndarray) -> np
     )
     nearest = np.asarray(distance_transform_edt(~good, return_distances=False, return_indices=True))
     around = np.where((share > 1e-3)[..., None], blurred, albedo[nearest[0], nearest[1]])
-    whole: np.ndarray = np.logical_not(clipped)
+    whole = np.equal(clipped, np.zeros_like(clipped))
     ratio = np.where(whole, albedo, 0.0).sum(axis=2) / np.maximum(np.where(whole, around, 0.0).sum(axis=2), 1e-6)
     # A clipped value is a lower bound.
     guess = np.where(whole.any(axis=2)[..., None], around * ratio[..., None], around)
