@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from albedo_landsat import CENTRE_UM, DATES, SOLAR, correlation, light_of, path_radiance, scene
 
-# Land classes of nearly equal colour, by k-means over both dates; those with fewer steep texels are left out.
+# Land classes by k-means of band ratios of the July scene, which hardly depend on relief; those with fewer steep texels are
+# left out.
 CLASSES, LEAST_TEXELS = 4, 1500
 STEEP_DEG = 8.0
 
@@ -31,6 +33,9 @@ def landsat_numbers(data: Path, seed: int) -> dict[str, Any]:
     sampling = SamplingOptions(shadow_samples=1, rays=128, clusters_per_receiver=64, clusters=4096, rank=24)
     land = trace_texel_transport(terrain, shape, sampling=sampling, seed=seed)
     steep = np.degrees(np.arccos(np.clip(land.normal[:, 2], -1.0, 1.0))) > STEEP_DEG
+    label = land_classes(bands[next(iter(DATES))].reshape(-1, 6)[land.texel], seed)
+    kind = np.full(shape[0] * shape[1], -1)
+    kind[land.texel] = label
     results: dict[str, dict[str, np.ndarray]] = {}
     cosines = {}
     for date, (elevation, azimuth) in DATES.items():
@@ -39,7 +44,7 @@ def landsat_numbers(data: Path, seed: int) -> dict[str, Any]:
         cosines[date] = slopes.incidence
         radiance = bands[date].reshape(-1, 6)[land.texel]
         radiance = radiance - np.minimum(path_radiance(sun), np.nanpercentile(radiance, 0.1, axis=0))
-        ours = np.empty_like(radiance)
+        ours, lambertian = np.empty_like(radiance), np.empty_like(radiance)
         for triple in ([2, 1, 0], [3, 4, 5]):
             light = texel_irradiance(land, light_of(sun, CENTRE_UM[triple]))
             texture = np.full((shape[0] * shape[1], 3), np.nan, np.float32)
@@ -47,11 +52,17 @@ def landsat_numbers(data: Path, seed: int) -> dict[str, Any]:
             clipped = np.zeros((*shape, 3), bool)
             # Radiance in units where the sun's normal irradiance is that of the light.
             options = DelightOptions(radiance_per_unit=1.0e5, quantum=0.0)
-            delit = delight_image(texture.reshape(*shape, 3), clipped, light, options=options)
-            ours[:, triple] = delit.albedo.reshape(-1, 3)[land.texel]
-        results[date] = {"as_it_is": radiance, "ours": ours}
+            for result, classes in ((lambertian, None), (ours, kind.reshape(shape))):
+                chosen = replace(options, land_class=classes)
+                delit = delight_image(texture.reshape(*shape, 3), clipped, light, options=chosen)
+                result[:, triple] = delit.albedo.reshape(-1, 3)[land.texel]
+        results[date] = {"as_it_is": radiance, "ours": ours, "lambertian": lambertian}
         results[date] |= {name: correct(radiance, slopes) for name, correct in CORRECTIONS.items()}
-    label = land_classes(np.concatenate([results[date]["ours"] for date in DATES], axis=1), seed)
+        by_class = np.full_like(radiance, np.nan)
+        for number in range(CLASSES):
+            member = label == number
+            by_class[member] = CORRECTIONS["c"](radiance[member], slopes_under(land.normal[member], sun))
+        results[date]["c_by_class"] = by_class
     numbers: dict[str, Any] = {}
     names = list(results[next(iter(DATES))])
     print(
@@ -74,11 +85,11 @@ def landsat_numbers(data: Path, seed: int) -> dict[str, Any]:
 
 
 def land_classes(values: np.ndarray, seed: int) -> np.ndarray:
-    """Class ``(N,)`` of each texel by k-means of its colours' logarithms; −1 where they are unknown."""
+    """Class ``(N,)`` of each texel by k-means of the logarithms of band ratios; −1 where they are unknown."""
     from scipy.cluster.vq import kmeans2
 
-    known = np.isfinite(values).all(axis=1)
-    logarithm = np.log(np.maximum(values[known], 1e-4))
+    known = np.isfinite(values).all(axis=1) & (values > 0.0).all(axis=1)
+    logarithm = np.diff(np.log(values[known]), axis=1)
     logarithm = (logarithm - logarithm.mean(axis=0)) / logarithm.std(axis=0)
     label = np.full(len(values), -1)
     label[known] = kmeans2(logarithm, CLASSES, minit="++", rng=np.random.default_rng(seed))[1]

@@ -162,7 +162,7 @@ def possible_sun(rng: np.random.Generator) -> tuple[float, float]:
             return float(np.degrees(np.arctan2(-np.cos(declination) * np.sin(hour), north)) % 360.0), elevation
 
 
-def relief_of(terrain: Terrain, shape: tuple[int, int], *, azimuths: int = 72) -> Relief:
+def relief_of(terrain: Terrain, shape: tuple[int, int], *, azimuths: int = 48) -> Relief:
     """Normals and horizons under the texels."""
     from seasonscapes.rendering.hemisphere_rays import ray_scene
     from seasonscapes.rendering.horizon_angles import horizon_angles

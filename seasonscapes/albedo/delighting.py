@@ -97,6 +97,10 @@ class DelightOptions:
         Correct the sky's share of the light from the image.
     rounds
         Iterations of interreflection.
+    land_class
+        ``(R, S)`` integers, −1 for none: classes of land whose response to direct light is fitted one by one, so that
+        their albedo no longer depends on it. Canopies are no Lambertian surfaces, and their sunlight and shade mix
+        within a texel; see `class_response`. ``None`` treats all land as Lambertian.
     light_error, slope_error
         Relative error of the modelled light, and standard error of the cosine of incidence, for σ.
     quantum
@@ -110,6 +114,7 @@ class DelightOptions:
     borders: BorderModel | None = field(default_factory=BorderModel)
     fit_sky: bool = True
     rounds: int = 3
+    land_class: np.ndarray | None = None
     light_error: float = 0.05
     slope_error: float = 0.06
     quantum: float | None = None
@@ -235,6 +240,10 @@ def delight_image(
         bounce = light.bounce(albedo)
         report(0.1 + 0.8 * (number + 1) / options.rounds)
     known = chart >= 0
+    if options.land_class is not None:
+        kind = np.where(known & ~clipped.any(axis=2), options.land_class, -1)
+        illuminance = class_response(radiance, sunlight, illuminance - sunlight, kind)
+        albedo = np.clip(np.pi * radiance / illuminance, LOWEST, HIGHEST).astype(np.float32)
     albedo = _completed(albedo, clipped & known[..., None], known)
     sigma = _standard_error(albedo, image, light, sunlight, illuminance, deviation, options)
     lost = clipped.any(axis=2) & known
@@ -324,6 +333,54 @@ def fitted_sky_factor(
         best = int(np.clip(np.argmin(cost), 1, len(trials) - 2))
         curve = np.polyfit(trials[best - 1 : best + 2], cost[best - 1 : best + 2], 2)
         result[channel] = np.exp(np.clip(-0.5 * curve[1] / curve[0], trials[0], trials[-1]))
+    return result
+
+
+def class_response(radiance: np.ndarray, sunlight: np.ndarray, ambient: np.ndarray, kind: np.ndarray) -> np.ndarray:
+    """Effective illuminance of classes of land: with as much diffuse light as makes their albedo independent of the sun.
+
+    The C correction of Teillet et al. 1982, within each class and channel, with exact cast shadows, sky and
+    interreflection in place of the cosine of incidence alone. The mean illuminance of a class does not change.
+
+    Parameters
+    ----------
+    radiance
+        ``(R, S, 3)`` [cd/m²] that leaves the surface.
+    sunlight, ambient
+        ``(R, S, 3)`` illuminance by the sun, and by sky and other terrain [lx].
+    kind
+        ``(R, S)`` class of each texel, −1 for none; small classes stay as they are.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(R, S, 3)`` effective illuminance [lx].
+    """
+    result = (sunlight + ambient).astype(np.float32)
+    for number in np.unique(kind[kind >= 0]):
+        member = kind == number
+        if member.sum() < _LEAST_PAIRS:
+            continue
+        for channel in range(3):
+            values, sun, diffuse = (
+                array[..., channel][member].astype(float) for array in (radiance, sunlight, ambient)
+            )
+
+            def dependence(
+                logarithm: float, values: np.ndarray = values, sun: np.ndarray = sun, diffuse: np.ndarray = diffuse
+            ) -> float:
+                albedo = values / np.maximum(sun + np.exp(logarithm) * diffuse, 1e-3)
+                low, high = np.percentile(albedo, [1.0, 99.0])
+                keep = (albedo >= low) & (albedo <= high)
+                return float(np.corrcoef(albedo[keep], sun[keep])[0, 1])
+
+            # More diffuse light makes the albedo of sunlit slopes larger: the dependence rises with the factor.
+            low, high = np.log(0.2), np.log(100.0)
+            for _ in range(18):
+                middle = 0.5 * (low + high)
+                low, high = (middle, high) if dependence(middle) < 0.0 else (low, middle)
+            effective = sun + np.exp(0.5 * (low + high)) * diffuse
+            result[..., channel][member] = effective * ((sun + diffuse).mean() / effective.mean())
     return result
 
 
