@@ -221,7 +221,7 @@ def _read_gltf(path: Path, allow_outside: bool) -> MeshFile:
         )
     except Exception as error:  # trimesh lets errors of numpy and json through
         raise InputError(path, f"not a readable glTF file ({type(error).__name__}: {error})") from None
-    for node in scene.graph.nodes_geometry:
+    for node in sorted(scene.graph.nodes_geometry):
         transform, name = scene.graph[node]
         geometry = scene.geometry[name]
         if not hasattr(geometry, "faces"):

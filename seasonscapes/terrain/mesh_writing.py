@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote, unquote
 
 import numpy as np
 
@@ -147,10 +148,10 @@ def _write_document(
         name = image_name(document, index)
         if path.suffix.lower() == ".gltf" and image.uri is not None and not image.uri.startswith("data:"):
             target = path.parent / Path(name).with_suffix(file_suffix(name, texture.bits))
-            _require_new(target, mesh, [mesh.path.parent / image.uri])
+            _require_new(target, mesh, [mesh.path.parent / unquote(image.uri)])
             data = encode_texture(texture.values, texture.alpha, target.suffix, texture.bits, where)
             beside.append((target, data))
-            image.uri, image.mimeType = target.name, _mime(target.suffix)
+            image.uri, image.mimeType = quote(target.name), _mime(target.suffix)
             continue
         if image.bufferView is None:
             document.bufferViews.append(pygltflib.BufferView(buffer=0, byteOffset=0, byteLength=0))
@@ -158,7 +159,7 @@ def _write_document(
         views[image.bufferView] = encode_texture(texture.values, texture.alpha, ".png", texture.bits, where)
         image.name, image.uri, image.mimeType = image.name or name, None, "image/png"
     _plain_sources(document)
-    _embed_rest(path, mesh, document, views)
+    _embed_rest(mesh, document, views, set(order))
     data = _joined(document, blob, views)
     _mark_unlit(document, unlit)
     document.asset.extras = {**(document.asset.extras or {}), "seasonscapes": _plain(facts or {})}
@@ -205,16 +206,16 @@ def _plain_sources(document: Any) -> None:
                 listed.remove(name)
 
 
-def _embed_rest(path: Path, mesh: TexturedMesh, document: Any, views: dict[int, bytes]) -> None:
-    """Carry images that are no colour (normal maps and such) along with the file."""
+def _embed_rest(mesh: TexturedMesh, document: Any, views: dict[int, bytes], written: set[int]) -> None:
+    """Carry images that are no colour (normal maps and such) along in the file."""
     import pygltflib
 
-    for image in document.images:
-        if image.uri is None or image.uri.startswith("data:") or (path.parent / image.uri).resolve().is_file():
+    for index, image in enumerate(document.images):
+        if index in written or image.uri is None or image.uri.startswith("data:"):
             continue
-        source = mesh.path.parent / image.uri
-        if path.suffix.lower() == ".gltf" and not source.is_file():
-            continue  # one of the new textures, which is written after this
+        source = mesh.path.parent / unquote(image.uri)
+        if not source.is_file():
+            raise InputError(f"{mesh.path}: texture {index}", "no such file", got=image.uri)
         document.bufferViews.append(pygltflib.BufferView(buffer=0, byteOffset=0, byteLength=0))
         image.bufferView = len(document.bufferViews) - 1
         views[image.bufferView] = source.read_bytes()
