@@ -11,6 +11,7 @@ Conventions of the whole package:
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -46,6 +47,20 @@ class LocalFrame:
     longitude_deg: float
     height_m: float = 0.0
     refraction_k: float = 0.0
+
+
+def frame_record(frame: LocalFrame) -> dict[str, Any]:
+    """Describe a local frame as plain values for files: its coordinate reference systems and its origin."""
+    return {
+        "crs": "local east-north-up [m] about the origin, through ECEF (EPSG:4978)",
+        "geographic_crs": "EPSG:4979",
+        "origin": {
+            "latitude_deg": frame.latitude_deg,
+            "longitude_deg": frame.longitude_deg,
+            "height_m": frame.height_m,
+            "refraction_k": frame.refraction_k,
+        },
+    }
 
 
 def ecef_from_geodetic(latitude_deg: ArrayLike, longitude_deg: ArrayLike, height_m: ArrayLike) -> np.ndarray:

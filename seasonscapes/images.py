@@ -6,10 +6,12 @@ sRGB encoding is used in files only. Exposure is EV100: ``luminance = 2**EV100 *
 
 from __future__ import annotations
 
+import errno
+import io
 import json
 import os
-import tempfile
-from collections.abc import Iterator, Mapping
+import secrets
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -24,16 +26,35 @@ from seasonscapes.errors import NoUsablePixels, UnreadableImage
 METER_CONSTANT = 12.5 / 100.0
 # Luminance that just saturates a sensor at EV100 = 0: 78 / (S q) with q = 0.65 (ISO 12232; Lagarde & de Rousiers 2014).
 SATURATION_LUMINANCE = 1.2
+# Of a file's name in that of its temporary file.
+_STEM_CHARACTERS = 24
+_notes: list[Callable[[Path], None]] = []
 # Luminance weights of linear Rec.709 (ITU-R BT.709): Y = w · rgb. In photometric RGB, Y is in lux or cd/m².
 REC709_LUMINANCE = np.array([0.2126390, 0.7151687, 0.0721923])
+
+
+@contextmanager
+def writes_noted(note: Callable[[Path], None]) -> Iterator[None]:
+    """Context manager: ``note`` is called with each file that `atomic_path` is about to create, temporary ones included.
+
+    Parameters
+    ----------
+    note
+        Called before the file exists, from any thread of this process.
+    """
+    _notes.append(note)
+    try:
+        yield
+    finally:
+        _notes.remove(note)
 
 
 @contextmanager
 def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     """Context manager for atomic writing: a temporary path that replaces ``path`` when the block succeeds.
 
-    After an exception in the block ``path`` is unchanged and the temporary file is removed. The temporary name keeps
-    the suffix, since many writers choose the format by it.
+    After an exception in the block ``path`` is unchanged and the temporary file is removed; an `OSError` about the
+    temporary file names ``path``. The temporary name keeps the suffix, since many writers choose the format by it.
 
     Parameters
     ----------
@@ -47,18 +68,46 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=f".part{path.suffix}", dir=path.parent)
-    os.close(handle)
+    # Of a long name only the beginning, so that the temporary one is not too long where the name itself is not.
+    name = str(path.with_name(f".{path.stem[:_STEM_CHARACTERS]}-{secrets.token_hex(4)}.part{path.suffix}"))
+    for note in tuple(_notes):
+        note(Path(name))
+        note(path)
+    os.close(os.open(name, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
     temporary = Path(name)
     try:
         yield temporary
-        # mkstemp creates private files; set the mode that open() would have set.
+        # The temporary file is private; set the mode that open() would have set.
         umask = os.umask(0)
         os.umask(umask)
         temporary.chmod(0o666 & ~umask)
         os.replace(temporary, path)
+    except Exception as error:
+        trouble = _trouble_of_writing(error, name, path)
+        if trouble is None:
+            raise
+        raise trouble from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _trouble_of_writing(error: Exception, temporary: str, path: Path) -> OSError | None:
+    """The `OSError` about ``path`` that an exception stands for, or ``None`` if it is none or about another file.
+
+    A full disk is reported with the temporary name or with none; OpenEXR, safetensors and GDAL report it in exceptions of
+    their own, by the system's words.
+    """
+    if isinstance(error, OSError) and error.errno is not None:
+        if error.filename not in (None, temporary, Path(temporary)):
+            return None
+        return OSError(error.errno, error.strerror, str(path))
+    said = str(error).lower()
+    for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EIO):
+        if os.strerror(number).lower() in said:
+            return OSError(number, os.strerror(number), str(path))
+    if "failed to write" in said:
+        return OSError(errno.EIO, f"cannot be written ({error})", str(path))
+    return None
 
 
 def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
@@ -83,6 +132,11 @@ def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
     """
     linear = np.clip(linear, 0.0, 1.0)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.power(linear, 1.0 / 2.4) - 0.055)
+
+
+def srgb8_from_linear(linear: np.ndarray) -> np.ndarray:
+    """Encode linear values ``(...)``, clipped to [0, 1], as sRGB levels, uint8, without dithering."""
+    return np.rint(srgb_from_linear(linear) * 255.0).astype(np.uint8)
 
 
 def linear_from_srgb(encoded: ArrayLike) -> np.ndarray:
@@ -253,7 +307,7 @@ def write_png(path: str | os.PathLike, image: np.ndarray, *, metadata: Mapping[s
 
 
 def write_png8(path: str | os.PathLike, levels: np.ndarray, *, metadata: Mapping[str, str] | None = None) -> None:
-    """Write 8-bit levels as a PNG, atomically.
+    """Write 8-bit levels as a PNG, atomically; see `png8_bytes`.
 
     Parameters
     ----------
@@ -264,14 +318,39 @@ def write_png8(path: str | os.PathLike, levels: np.ndarray, *, metadata: Mapping
     metadata
         Key-value pairs for the PNG's international text chunks.
     """
+    encoded = png8_bytes(levels, metadata=metadata)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(encoded)
+
+
+def png8_bytes(levels: np.ndarray, *, metadata: Mapping[str, str] | None = None) -> bytes:
+    """Encode 8-bit levels as a PNG whose colours are declared to be sRGB.
+
+    Parameters
+    ----------
+    levels
+        sRGB-encoded levels ``(H, W, 3)``, or grey levels ``(H, W)`` (masks, counts), whose scale is not declared; uint8.
+    metadata
+        Key-value pairs for the PNG's international text chunks.
+
+    Returns
+    -------
+    bytes
+        The file's content.
+    """
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 
     info = PngInfo()
+    if levels.ndim == 3:
+        # Rendering intent 0 (perceptual); gAMA of 1 / 2.2 for readers that do not know the chunk (PNG 3rd ed., 11.3.2.5).
+        info.add(b"sRGB", b"\x00")
+        info.add(b"gAMA", (45455).to_bytes(4, "big"))
     for key, value in (metadata or {}).items():
         info.add_itxt(key, value)
-    with atomic_path(path) as temporary:
-        Image.fromarray(np.ascontiguousarray(levels)).save(temporary, format="PNG", pnginfo=info)
+    encoded = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(levels)).save(encoded, format="PNG", pnginfo=info)
+    return encoded.getvalue()
 
 
 def read_image_linear(path: str | os.PathLike) -> np.ndarray:

@@ -9,12 +9,13 @@ import logging
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, PrivateAttr, model_validator
 
 from seasonscapes.cameras.pinhole import Camera, camera_at
 from seasonscapes.cameras.webcam import Webcam
-from seasonscapes.declaration import Declaration, InputError, read_declaration
+from seasonscapes.declaration import MOST_NAME_CHARACTERS, Declaration, InputError, Name, read_declaration
 from seasonscapes.frames import STANDARD_REFRACTION_K, LocalFrame
+from seasonscapes.terrain.raster_files import OWN_FOLDER, Confinement, confined_path, raster_hash
 
 log = logging.getLogger(__name__)
 
@@ -199,10 +200,10 @@ class NamedCamera(Viewpoint):
     Parameters
     ----------
     name
-        Unique name of the camera.
+        Unique name of the camera; see `declaration.checked_name`.
     """
 
-    name: str = Field(min_length=1)
+    name: Name
 
 
 class SceneFile(Declaration):
@@ -213,7 +214,7 @@ class SceneFile(Declaration):
     Parameters
     ----------
     name
-        Identifier of lower-case letters, digits, ``_`` and ``-``.
+        Identifier of lower-case letters, digits, ``_`` and ``-``, at most 64 characters.
     title
         Human-readable name.
     attribution
@@ -228,7 +229,7 @@ class SceneFile(Declaration):
         Arrays of tables ``[[camera]]`` and ``[[webcam]]`` in the file.
     """
 
-    name: str = Field(pattern=r"^[a-z0-9][a-z0-9_-]*$")
+    name: str = Field(pattern=r"^[a-z0-9][a-z0-9_-]*$", max_length=MOST_NAME_CHARACTERS)
     title: str = ""
     attribution: str = ""
     vertical_datum: VerticalDatum = "unknown"
@@ -239,11 +240,24 @@ class SceneFile(Declaration):
     imagery: Imagery | None = None
     cameras: list[NamedCamera] = Field(default_factory=list, alias="camera")
     webcams: list[Webcam] = Field(default_factory=list, alias="webcam")
+    _confinement: Confinement = PrivateAttr(default=OWN_FOLDER)
+
+    @property
+    def confinement(self) -> Confinement:
+        """Where the files of the scene's rasters may lie; set by `read_scene`."""
+        return self._confinement
+
+    @property
+    def image_hash(self) -> str | None:
+        """Hash of the content of the scene's image, see `terrain.raster_files.raster_hash`; ``None`` without one."""
+        return None if self.imagery is None else raster_hash(self.imagery.file, self.confinement)
 
     @model_validator(mode="after")
     def _unique(self) -> SceneFile:
         for kind, names in (("cameras", [c.name for c in self.cameras]), ("webcams", [w.id for w in self.webcams])):
-            duplicate = next((name for name in names if names.count(name) > 1), None)
+            # Files are called after them, also where a file system ignores case.
+            folded = [name.casefold() for name in names]
+            duplicate = next((name for name in names if folded.count(name.casefold()) > 1), None)
             if duplicate is not None:
                 raise ValueError(f"two {kind} are named '{duplicate}'")
         return self
@@ -313,21 +327,14 @@ def read_scene(path: str | Path, *, allow_outside: bool = False) -> SceneFile:
     if "vertical_datum" not in scene.model_fields_set:
         log.info("%s: no vertical_datum: heights count as metres above sea level", path.name)
     folder = path.resolve().parent
+    confinement = Confinement(folder, allow_outside)
 
     def absolute_path(key: str, name: str) -> str:
-        # GDAL's virtual file systems (/vsicurl/, /vsizip/ …) count as outside the folder; they may access the network.
-        virtual = name.startswith("/vsi")
-        target = Path(name) if virtual else (folder / name).resolve()
-        if not allow_outside and (virtual or not target.is_relative_to(folder)):
-            raise InputError(
-                f"{path}: {key}",
-                "leads outside the scene file's folder",
-                got=name,
-                cure="move the data beside the file, or pass --allow-outside",
-            )
-        if not virtual and not target.is_file():
+        target = confined_path(name, folder, confinement, where=f"{path}: {key}")
+        # GDAL's virtual files (/vsicurl/, /vsizip/ …) remain text; whether they exist is seen when they are opened.
+        if isinstance(target, Path) and not target.is_file():
             raise InputError(f"{path}: {key}", "no such file", got=str(target))
-        return name if virtual else str(target)
+        return str(target)
 
     updates: dict[str, Any] = {}
     if scene.elevation is not None and scene.elevation.file is not None:
@@ -338,7 +345,9 @@ def read_scene(path: str | Path, *, allow_outside: bool = False) -> SceneFile:
         updates["imagery"] = scene.imagery.model_copy(
             update={"file": absolute_path("imagery.file", scene.imagery.file)}
         )
-    return scene.model_copy(update=updates)
+    scene = scene.model_copy(update=updates)
+    scene._confinement = confinement
+    return scene
 
 
 def camera_from_named_view(

@@ -13,7 +13,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from pathlib import Path
+from pathlib import Path, PurePath
 from zoneinfo import ZoneInfo
 
 import numpy as np
@@ -21,6 +21,7 @@ import numpy as np
 from seasonscapes.cameras.panorama import Panorama
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.cameras.webcam import Webcam
+from seasonscapes.declaration import checked_name
 from seasonscapes.errors import InputError, UnreadableImage
 from seasonscapes.images import atomic_path, read_image_linear
 
@@ -267,13 +268,15 @@ def write_manifest(path: Path, rows: Iterable[ManifestRow]) -> None:
             writer.writerow((row.webcam, stamp, row.path, "" if row.bytes is None else row.bytes, row.sha256))
 
 
-def read_manifest(path: Path) -> list[ManifestRow]:
+def read_manifest(path: Path, *, allow_outside: bool = False) -> list[ManifestRow]:
     """Read a manifest, without opening images.
 
     Parameters
     ----------
     path
         CSV file with the columns ``webcam``, ``time_utc``, ``path`` and optionally ``bytes``, ``sha256``.
+    allow_outside
+        Permit images outside the manifest's folder.
 
     Returns
     -------
@@ -283,7 +286,8 @@ def read_manifest(path: Path) -> list[ManifestRow]:
     Raises
     ------
     InputError
-        The file is missing or not UTF-8, a column is missing, or a line is invalid.
+        The file is missing or not UTF-8, a column is missing, or a line is invalid: no time, a webcam that is no name
+        (`declaration.checked_name`), or a path that leads out of the manifest's folder.
     """
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
@@ -293,7 +297,11 @@ def read_manifest(path: Path) -> list[ManifestRow]:
             if missing:
                 raise InputError(path, f"column {missing[0]!r} is missing", expected=",".join(COLUMNS))
             columns = [header.index(name) if name in header else None for name in COLUMNS]
-            return [_row(path, number, cells, columns) for number, cells in enumerate(reader, 2) if cells]
+            rows = [_row(path, number, cells, columns) for number, cells in enumerate(reader, 2) if cells]
+            if not allow_outside:
+                for number, row in enumerate(rows, 1):
+                    _require_below(row.path, f"{path}: row {number}")
+            return rows
     except FileNotFoundError:
         raise InputError(path, "no such file") from None
     except UnicodeDecodeError as error:
@@ -308,9 +316,20 @@ def _row(path: Path, number: int, cells: list[str], columns: list[int | None]) -
             raise ValueError(f"time_utc {stamp!r} has no offset")
         if not webcam or not name:
             raise ValueError("webcam or path is empty")
-        return ManifestRow(webcam, time.astimezone(UTC), name, int(size) if size else None, digest)
+        return ManifestRow(checked_name(webcam), time.astimezone(UTC), name, int(size) if size else None, digest)
     except (ValueError, IndexError) as error:
         raise InputError(f"{path}: line {number}", str(error), cure="write e.g. 2024-09-01T10:00:00Z") from None
+
+
+def _require_below(name: str, where: str) -> None:
+    """`InputError` for a name that leads out of the folder that it is relative to."""
+    if PurePath(name).is_absolute() or ".." in PurePath(name).parts or not name.isprintable():
+        raise InputError(
+            where,
+            "leads outside the manifest's folder",
+            got=name,
+            cure="move the pictures below it, or pass --allow-outside",
+        )
 
 
 def check_pictures(

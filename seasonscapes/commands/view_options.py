@@ -44,6 +44,7 @@ class ViewOptions:
 
     def chosen(self, scene: SceneFile) -> NamedCamera:
         """The scene's camera of that name, or the view that ``--at`` describes."""
+        from seasonscapes.declaration import validate
         from seasonscapes.scene import NamedCamera
 
         if self.at is None:
@@ -59,16 +60,17 @@ class ViewOptions:
         check_range("--pitch", self.pitch, -90.0, 90.0)
         check_range("--fov", self.fov, 1.0, 169.0)
         latitude, longitude, height, above = parse_at(self.at)
-        return NamedCamera(
-            name="at",
-            latitude_deg=latitude,
-            longitude_deg=longitude,
-            height_m=height,
-            above_ground_m=above,
-            heading_deg=self.heading,
-            pitch_deg=self.pitch,
-            fov_deg=self.fov,
-        )
+        facts = {
+            "name": "at",
+            "latitude_deg": latitude,
+            "longitude_deg": longitude,
+            "height_m": height,
+            "above_ground_m": above,
+            "heading_deg": self.heading,
+            "pitch_deg": self.pitch,
+            "fov_deg": self.fov,
+        }
+        return validate(facts, NamedCamera, where="--at")
 
     def pinhole(self, place: Place) -> Camera:
         """The camera of the chosen view."""

@@ -15,6 +15,7 @@ from seasonscapes.images import linear_from_srgb
 from seasonscapes.terrain.atlas import Atlas
 from seasonscapes.terrain.crs import raster_pixels
 from seasonscapes.terrain.raster import read_raster
+from seasonscapes.terrain.raster_files import OWN_FOLDER, Confinement
 from seasonscapes.terrain.surface import Raster, Terrain, Texture, atlas_identity
 from seasonscapes.terrain.texels import texel_coordinates, texel_positions
 
@@ -37,12 +38,13 @@ def read_imagery(
     finest_m: float | None = None,
     encoding: str = "srgb",
     full_scale: float = 255.0,
+    confinement: Confinement = OWN_FOLDER,
 ) -> Raster:
     """Read a georeferenced colour image as scene-linear Rec.709.
 
     Parameters
     ----------
-    path, bounds_deg, finest_m
+    path, bounds_deg, finest_m, confinement
         As in `read_raster`; for baking, half the texel size is sufficient for ``finest_m``.
     bands
         Red, green and blue band numbers from 1; ``None`` for the file's three colour bands, or its only band as grey.
@@ -81,7 +83,9 @@ def read_imagery(
         with np.errstate(invalid="ignore"):
             return linear_from_srgb(values / full_scale)
 
-    raster = read_raster(path, bounds_deg=bounds_deg, bands=bands, finest_m=finest_m, decode=decode)
+    raster = read_raster(
+        path, bounds_deg=bounds_deg, bands=bands, finest_m=finest_m, decode=decode, confinement=confinement
+    )
     count = raster.values.shape[2]
     if count not in (1, 3):
         raise InputError(

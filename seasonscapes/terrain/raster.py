@@ -6,10 +6,8 @@ Only horizontal positions are transformed. Heights stay in the raster's own vert
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -20,6 +18,7 @@ from seasonscapes.declaration import InputError
 from seasonscapes.frames import LocalFrame, enu_from_geodetic
 from seasonscapes.terrain.crs import apply_affine, geodetic_from_map, horizontal_crs, map_from_geodetic
 from seasonscapes.terrain.hole_filling import harmonic_fill, nan_mean
+from seasonscapes.terrain.raster_files import OWN_FOLDER, Confinement, open_raster
 from seasonscapes.terrain.surface import Raster
 
 if TYPE_CHECKING:
@@ -62,12 +61,13 @@ def read_elevation(
     *,
     bounds_deg: tuple[float, float, float, float] | None = None,
     band: int | None = None,
+    confinement: Confinement = OWN_FOLDER,
 ) -> Raster:
     """Read an elevation raster of one band and check that its values are plausible heights in metres.
 
     Parameters
     ----------
-    path, bounds_deg
+    path, bounds_deg, confinement
         As in `read_raster`.
     band
         Number of the band that holds the heights, from 1; required if the file has several bands.
@@ -82,7 +82,7 @@ def read_elevation(
     InputError
         As `read_raster`; several bands and ``band`` is ``None``; heights outside −500 … 9000 m.
     """
-    raster = read_raster(path, bounds_deg=bounds_deg, bands=None if band is None else (band,))
+    raster = read_raster(path, bounds_deg=bounds_deg, bands=None if band is None else (band,), confinement=confinement)
     count = raster.values.shape[2]
     if count != 1:
         raise InputError(
@@ -112,13 +112,14 @@ def read_raster(
     bands: tuple[int, ...] | None = None,
     finest_m: float | None = None,
     decode: Callable[[np.ndarray], np.ndarray] | None = None,
+    confinement: Confinement = OWN_FOLDER,
 ) -> Raster:
-    """Read a raster in any GDAL format (GeoTIFF, SRTM ``.hgt``, VRT mosaic …), or a window of it.
+    """Read a raster (GeoTIFF, SRTM ``.hgt``, VRT mosaic …), or a window of it; see `terrain.raster_files`.
 
     Parameters
     ----------
     path
-        File, or a GDAL ``/vsi…`` path.
+        File; where ``confinement`` trusts it, also a GDAL ``/vsi…`` path.
     bounds_deg
         West, south, east, north in WGS 84 [deg]. The smallest window of whole pixels that contains them, plus a border
         of one pixel for interpolation, is read in the raster's own grid (without resampling). ``None`` for the whole
@@ -130,6 +131,8 @@ def read_raster(
         full-resolution image is never held in memory.
     decode
         Function applied to values before averaging, such as sRGB decoding.
+    confinement
+        Where the raster's files may lie; by default in its own folder.
 
     Returns
     -------
@@ -145,25 +148,15 @@ def read_raster(
     ValueError
         ``finest_m`` is not positive, or ``bounds_deg`` is not an ordered box.
     """
-    import rasterio
-    from rasterio.errors import NotGeoreferencedWarning, RasterioError
-
-    if not os.fspath(path).startswith("/vsi") and not Path(path).is_file():
-        raise InputError(os.fspath(path), "no such file")
     if finest_m is not None and not finest_m > 0.0:
         raise ValueError(f"finest_m: got {finest_m}, expected a positive size")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(path) as source:
-                crs = _checked_crs(source, os.fspath(path))
-                bands = _checked_bands(source, bands, os.fspath(path))
-                window = _window(source, crs, bounds_deg, os.fspath(path))
-                shrink = 1 if finest_m is None else _shrink(source, crs, window, finest_m)
-                values = _read_blocks(source, bands, window, shrink, decode)
-                transform = _window_transform(source.transform, window, shrink)
-    except RasterioError as error:
-        raise InputError(os.fspath(path), f"not readable as a raster: {error}") from None
+    with open_raster(path, confinement) as source:
+        crs = _checked_crs(source, os.fspath(path))
+        bands = _checked_bands(source, bands, os.fspath(path))
+        window = _window(source, crs, bounds_deg, os.fspath(path))
+        shrink = 1 if finest_m is None else _shrink(source, crs, window, finest_m)
+        values = _read_blocks(source, bands, window, shrink, decode)
+        transform = _window_transform(source.transform, window, shrink)
     return Raster(values, transform, crs)
 
 

@@ -138,7 +138,9 @@ class Terrain:
     frame
         Local frame of the vertices.
     surface
-        The smooth surface that the triangles approximate; ``None``: shading interpolates normals of the triangles.
+        The smooth surface that the triangles approximate; ``None``: shading interpolates normals of the vertices.
+    normals
+        ``(V, 3)`` float32 unit normals of the vertices; ``None``: those of the triangles about them.
     """
 
     vertices: np.ndarray
@@ -146,6 +148,7 @@ class Terrain:
     uv: np.ndarray
     frame: LocalFrame
     surface: SurfaceGrid | None = None
+    normals: np.ndarray | None = None
 
 
 def mesh_up_m(terrain: Terrain, position_m: np.ndarray) -> float:

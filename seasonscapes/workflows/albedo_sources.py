@@ -105,7 +105,7 @@ def scene_albedo(place: Place, day: date | str) -> Texture:
     if imagery is None:
         values = np.full((*place.texture_shape, 3), GREY_ALBEDO, np.float32)
         return Texture(values, np.zeros(place.texture_shape, np.float32), place.atlas_id)
-    inputs.update(imagery=imagery.model_copy(update={"file": Path(imagery.file).name}), hash=file_hash(imagery.file))
+    inputs.update(imagery=imagery.model_copy(update={"file": Path(imagery.file).name}), hash=place.scene.image_hash)
     return texture_once(place, "albedo", inputs, code=_IMAGE_CODE, build=lambda: _baked_image(place))
 
 
@@ -163,7 +163,7 @@ def dated_albedos(place: Place, files: Sequence[AlbedoFile] = ()) -> list[DatedA
         content = (
             "grey"
             if imagery is None
-            else ":".join((imagery.model_dump_json(), file_hash(imagery.file), source_hash(*_IMAGE_CODE)))
+            else ":".join((imagery.model_dump_json(), str(place.scene.image_hash), source_hash(*_IMAGE_CODE)))
         )
         return [DatedAlbedo(midsummer.date(), content, lambda: scene_albedo(place, midsummer))]
     days = [datetime(2024, month, day) for month in range(1, 13) for day in _FILM_DAYS]
@@ -355,6 +355,7 @@ def _baked_image(place: Place) -> Texture:
         finest_m=0.5 * place.atlas.texel_p50_m,
         encoding=imagery.encoding,
         full_scale=imagery.full_scale,
+        confinement=place.scene.confinement,
     )
     texture = bake_imagery(place.terrain, place.atlas, image)
     values = np.clip(texture.values * imagery.reflectance_scale, 0.0, 0.95)

@@ -344,12 +344,12 @@ def draw_lights(
 def export_training_views(folder: Path, place: Place, data: DistillationData) -> None:
     """Write the training images as PNG, with cameras, times and suns for other trainers (nerfstudio, COLMAP)."""
     from seasonscapes.cameras.exchange import NamedView
-    from seasonscapes.gaussians.interchange import BakedSplats, TrainingView, write_training_views
+    from seasonscapes.gaussians.interchange import IMAGE_FOLDER, BakedSplats, TrainingView, write_training_views
     from seasonscapes.images import srgb_from_linear, write_png
 
     per_camera, views = len(data.frames) // max(len(data.cameras), 1), []
     for number, frame in enumerate(data.frames):
-        name = f"images/{number:04d}.png"
+        name = f"{IMAGE_FOLDER}/{number:04d}.png"
         write_png(folder / name, np.clip(frame.image, 0.0, 1.0))
         view = NamedView(f"{number:04d}", data.cameras[number // per_camera], name, data.times[frame.time])
         views.append(TrainingView(view, _state(data, frame.time)))

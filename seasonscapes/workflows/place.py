@@ -12,13 +12,14 @@ import numpy as np
 
 from seasonscapes import bundled
 from seasonscapes.errors import InputError
-from seasonscapes.frames import LocalFrame, enu_from_geodetic
+from seasonscapes.frames import LocalFrame, enu_from_geodetic, frame_record
 from seasonscapes.progress import Progress, task_progress
 from seasonscapes.scene import SceneFile, read_scene
 from seasonscapes.source_hash import source_hash
+from seasonscapes.terrain.raster_files import raster_hash
 from seasonscapes.terrain.surface import Raster, Terrain, Texture, atlas_identity, mesh_up_m, require_atlas
 from seasonscapes.workflows.terrain_building import MeshOptions
-from seasonscapes.workspace import Workspace, build_once, default_workspace, file_hash
+from seasonscapes.workspace import Workspace, build_once, default_workspace
 
 if TYPE_CHECKING:
     from seasonscapes.terrain.raster import FillReport
@@ -95,6 +96,20 @@ class Place:
     def median_height_m(self) -> float:
         """Median height of the terrain [m]; sun, sky and interreflection are computed for this height."""
         return float(np.median(self.elevation.values))
+
+    @cached_property
+    def about(self) -> dict:
+        """Plain values for the metadata of files: scene, attribution, local frame with its origin, datum and CRS."""
+        from seasonscapes.terrain.crs import crs_name
+
+        record = frame_record(self.frame)
+        record["origin"] |= {"vertical_datum": self.scene.vertical_datum}
+        return {
+            "scene": self.scene.name,
+            "attribution": self.scene.attribution,
+            **record,
+            "source_crs": crs_name(self.elevation.crs),
+        }
 
     def require_texture(self, texture: Texture, *, what: str = "texture") -> Texture:
         """Return the texture, or raise `errors.AtlasMismatch` where it belongs to another atlas."""
@@ -173,8 +188,8 @@ def load_place(
     key = {
         "code": source_hash(*_TERRAIN_CODE),
         "elevation": declared.elevation.model_copy(update={"file": source and Path(source).name}),
-        "elevation_hash": source and file_hash(source),
-        "imagery_hash": declared.imagery and file_hash(declared.imagery.file) if options.texel_m is None else None,
+        "elevation_hash": source and raster_hash(source, declared.confinement),
+        "imagery_hash": declared.image_hash if options.texel_m is None else None,
         "area": declared.area,
         "frame": frame,
         "options": options,

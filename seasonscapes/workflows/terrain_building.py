@@ -14,6 +14,7 @@ from seasonscapes.frames import LocalFrame, enu_from_geodetic
 from seasonscapes.terrain.crs import geodetic_from_map
 from seasonscapes.terrain.mesh import MESHERS, build_mesh
 from seasonscapes.terrain.raster import bounds_geographic, centre_frame, fill_nodata, read_elevation
+from seasonscapes.terrain.raster_files import open_raster
 from seasonscapes.terrain.refine import refine_raster, refinement_factor
 from seasonscapes.terrain.surface import Raster, Terrain, load_terrain, save_terrain
 from seasonscapes.terrain.surface_grid import surface_grid
@@ -110,7 +111,7 @@ def read_heights(scene: SceneFile, massif: SyntheticMassif | None, *, where: str
     else:
         assert elevation.file is not None, "a scene has either a synthetic elevation or a file"
         bounds = scene.area.bounds_deg if scene.area is not None else None
-        raster = read_elevation(elevation.file, bounds_deg=bounds, band=elevation.band)
+        raster = read_elevation(elevation.file, bounds_deg=bounds, band=elevation.band, confinement=scene.confinement)
     return fill_nodata(raster, max_share=elevation.max_hole_share, where=where)
 
 
@@ -188,16 +189,15 @@ def _texel_m(terrain: Terrain, elevation: Raster, scene: SceneFile, options: Mes
     if wish is None and scene.elevation is not None and scene.elevation.synthetic is not None:
         wish = scene.elevation.synthetic.detail_m
     elif wish is None and scene.imagery is not None:
-        wish = 0.7 * sample_spacing_m(_image_grid(scene.imagery.file))
+        wish = 0.7 * sample_spacing_m(_image_grid(scene))
     elif wish is None:
         wish = sample_spacing_m(elevation)
     extent_m = float(np.ptp(terrain.vertices[:, :2], axis=0).max())
     return max(wish, extent_m / options.max_side_px * (1.0 + 1e-9))
 
 
-def _image_grid(path: str) -> Raster:
-    """The grid of a raster file without its values."""
-    import rasterio
-
-    with rasterio.open(path) as source:
+def _image_grid(scene: SceneFile) -> Raster:
+    """The grid of a scene's image without its values."""
+    assert scene.imagery is not None
+    with open_raster(scene.imagery.file, scene.confinement) as source:
         return Raster(np.empty((source.height, source.width, 0), np.float32), source.transform, source.crs.to_string())

@@ -144,16 +144,20 @@ def webcam_station(
     """
     from seasonscapes.cameras.webcam import find_webcam, webcam_model
     from seasonscapes.terrain.raster import fill_nodata, map_from_geodetic, read_elevation, sample_raster
+    from seasonscapes.terrain.raster_files import OWN_FOLDER
 
     read = scene_with_webcams(scene, allow_outside=allow_outside)
     if webcam is None and len(read.webcams) > 1:
         raise InputError("--webcam", "missing", expected="one of " + ", ".join(w.id for w in read.webcams))
     found = read.webcams[0] if webcam is None else find_webcam(read.webcams, webcam)
-    first = elevation or (read.elevation and read.elevation.file)
+    own = read.elevation.file if read.elevation is not None else None
+    first = elevation or own
     if first is None:
         raise InputError(scene, "names no elevation raster", cure="give one with --elevation FILE")
-    files = [Path(file) for file in (first, context) if file is not None]
-    rasters = [fill_nodata(read_elevation(file), where=str(file))[0] for file in files]
+    # A raster named on the command line may lie anywhere; what it names may not.
+    files = [(first, read.confinement if elevation is None else OWN_FOLDER)]
+    files += [] if context is None else [(context, OWN_FOLDER)]
+    rasters = [fill_nodata(read_elevation(file, confinement=where), where=str(file))[0] for file, where in files]
     x, y = map_from_geodetic(rasters[0].crs, found.latitude_deg, found.longitude_deg)
     ground = float(sample_raster(rasters[0], x, y)[..., 0])
     if not np.isfinite(ground):

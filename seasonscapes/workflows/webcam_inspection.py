@@ -84,7 +84,7 @@ def inspect_webcams(
         write_manifest,
     )
 
-    heights = _heights(scene, elevation or (scene.elevation and scene.elevation.file))
+    heights = _heights(scene, elevation)
     rows, problems = [], []
     if pictures is not None:
         rows, problems = scan_folder(pictures, scene.webcams, layout=layout or REFERENCE_LAYOUT)
@@ -98,15 +98,20 @@ def inspect_webcams(
     return WebcamInspection(scene, heights, rows, problems)
 
 
-def _heights(scene: SceneFile, source: Path | str | None) -> list[HeightCheck]:
-    """Each webcam's height against the terrain; nothing where there is no raster."""
+def _heights(scene: SceneFile, elevation: Path | str | None) -> list[HeightCheck]:
+    """Each webcam's height against the given or the scene's own raster; nothing where there is none."""
     from seasonscapes.cameras.webcam import check_heights
     from seasonscapes.terrain.raster import map_from_geodetic, read_elevation, sample_raster
+    from seasonscapes.terrain.raster_files import OWN_FOLDER
 
+    own = scene.elevation.file if scene.elevation is not None else None
+    source = elevation or own
     if source is None:
         return []
     bounds = scene.area.bounds_deg if scene.area is not None else None
-    raster = read_elevation(source, bounds_deg=bounds)
+    # A raster named on the command line may lie anywhere; what it names may not.
+    confinement = scene.confinement if elevation is None else OWN_FOLDER
+    raster = read_elevation(source, bounds_deg=bounds, confinement=confinement)
     latitudes, longitudes = zip(*((webcam.latitude_deg, webcam.longitude_deg) for webcam in scene.webcams), strict=True)
     x, y = map_from_geodetic(raster.crs, list(latitudes), list(longitudes))
     return check_heights(scene.webcams, sample_raster(raster, x, y)[..., 0].tolist())
