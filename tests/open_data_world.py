@@ -19,8 +19,7 @@ Field = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 def height_m(latitude: np.ndarray, longitude: np.ndarray) -> np.ndarray:
     """Smooth mountains anywhere on Earth, slopes up to about 30°."""
-    longitude = np.asarray(longitude) % 360.0
-    north, east = latitude * 111.2, longitude * 111.3 * np.cos(np.deg2rad(latitude))
+    north, east = latitude * 111.2, np.asarray(longitude) % 360.0 * 75.0
     return 1500.0 + 500.0 * np.sin(north * 1.1) * np.sin(east * 0.9) + 120.0 * np.sin(2.3 * east + 1.7 * north)
 
 
@@ -130,7 +129,7 @@ class World:
         stored_offset: bool | None = None,
         cloud_percent: float = 3.0,
     ) -> str:
-        """An image as Sentinel-2 collection 1 has them; clouds and classes where ``classes`` says, meadow elsewhere.
+        """An image as Sentinel-2 collection 1 has them; what ``classes`` calls 9 is painted as a cloud.
 
         Numbers are shifted by 1000 from baseline 04.00 on, or as ``stored_offset`` says; ``declared`` writes scale and
         offset into the item.
@@ -143,11 +142,11 @@ class World:
         shifted = tuple(map(int, baseline.split("."))) >= (4, 0)
         shift = 0.1 if (shifted if stored_offset is None else stored_offset) else 0.0
         values = np.asarray(colours(lat, lon))
-        values = np.where(np.isin(kind10, (8, 9))[..., None], 0.8, values)
+        values = np.where((kind10 == 9)[..., None], 0.8, values)
         values = np.where((kind10 == 0)[..., None], -shift, values)
         stored = np.rint((values + shift) * 10000.0).clip(0, 65535).astype(np.uint16)
         assets = {}
-        bands = [{"nodata": 0, "data_type": "uint16", "scale": 0.0001, "offset": -shift if shifted else 0}]
+        bands = [{"nodata": 0, "data_type": "uint16", "scale": 0.0001, "offset": -0.1 if shifted else 0}]
         for key, file, band in (("red", "B04", 0), ("green", "B03", 1), ("blue", "B02", 2)):
             transform = Affine(10.0, 0.0, west, 0.0, -10.0, north)
             self.raster(folder / f"{file}.tif", stored[None, ..., band], crs, transform, nodata=0)

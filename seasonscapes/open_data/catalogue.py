@@ -14,6 +14,7 @@ from urllib.parse import urlsplit
 
 from seasonscapes.errors import InputError
 from seasonscapes.images import atomic_path
+from seasonscapes.open_data import remote
 from seasonscapes.open_data.remote import SEARCH_DAYS, TIMEOUT_S, TRIES, RemoteStore, is_older, short_hash
 from seasonscapes.open_data.sources import Source
 
@@ -144,7 +145,7 @@ def _ask(store: RemoteStore, question: dict[str, Any]) -> list[dict[str, Any]]:
     url = question["url"]
     retry = Retry(
         total=TRIES - 1,
-        backoff_factor=0.25,
+        backoff_factor=remote.FIRST_WAIT_S,
         backoff_max=20.0,
         status_forcelist=(429, 500, 502, 503, 504),
         allowed_methods=None,
@@ -165,10 +166,10 @@ def _ask(store: RemoteStore, question: dict[str, Any]) -> list[dict[str, Any]]:
             store.requests += 1
             return list(found.items_as_dicts())
         except APIError as error:
-            text = str(error)
-            if error.status_code == 404:
+            status = getattr(error, "status_code", None)  # absent where no answer came at all
+            if status == 404:
                 raise InputError(url, f"has no collection {question['collection']}, or is no catalogue") from None
-            problem = f"the catalogue does not answer ({text[:120] or error.status_code})"
+            problem = f"the catalogue does not answer ({status or type(error.__cause__).__name__})"
         except (requests.exceptions.MissingSchema, requests.exceptions.InvalidURL):
             raise InputError("--stac", "not an address", got=url, expected="https://…") from None
         except requests.exceptions.RequestException as error:

@@ -128,6 +128,7 @@ def load_heights(
     source: Source = read_source(name)
     layer: str | None = name
     boxes: list[tuple[float, float, float, float]] = []
+    all_rasters: list[Raster] = []
     while layer is not None and np.isnan(heights.values).any():
         declared = read_source(layer)
         tiles = height_tiles(store, layer, grid, catalogue_url=catalogue_url, finest_m=grid.spacing_m)
@@ -135,15 +136,19 @@ def load_heights(
         boxes += [tile.item.bounds_deg for tile in tiles]
         if rasters:
             empty = np.isnan(heights.values)
-            found = mosaic(rasters, grid)[..., 0]
+            found = mosaic(rasters, grid, extend=False)[..., 0]
             heights.values[empty] = found[empty]
             heights.shares[layer] = float((empty & np.isfinite(found)).mean())
+        all_rasters += rasters
         layer = declared.coarser
     if source.sea_without_tiles and boxes:
         sea = np.isnan(heights.values) & ~_within(grid, boxes)
         heights.values[sea] = 0.0
         if sea.any():
             heights.shares["sea"] = float(sea.mean())
+    if all_rasters and np.isnan(heights.values).any():
+        # The rim of the outermost samples.
+        heights.values = np.where(np.isnan(heights.values), mosaic(all_rasters, grid)[..., 0], heights.values)
     _check(heights, name, grid)
     return heights
 

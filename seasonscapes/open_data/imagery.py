@@ -314,12 +314,11 @@ def _stated_share(items: Sequence[Item], grid: MapGrid) -> float:
 
 @dataclass
 class _LoadedDay:
-    """Reflectance ``(H, W, 3)`` of a day, where it shows the ground, where its classes say cloud, snow or water."""
+    """Reflectance ``(H, W, 3)`` of a day, where it shows the ground, and how much of it is snow and water."""
 
     day: Day
     values: np.ndarray
     clear: np.ndarray
-    cloud: np.ndarray
     snow_share: float
     water_share: float
     used: list[AssetUse]
@@ -338,7 +337,7 @@ def _clear_share(store: RemoteStore, source: Source, grid: MapGrid, day: Day) ->
 
 
 def _class_masks(store: RemoteStore, source: Source, grid: MapGrid, day: Day) -> np.ndarray:
-    """Masks ``(H, W, 4)``: clear ground, cloud, snow, water."""
+    """Masks ``(H, W, 3)``: clear ground, snow, water."""
     classes = source.classes
     assert classes is not None
 
@@ -346,7 +345,7 @@ def _class_masks(store: RemoteStore, source: Source, grid: MapGrid, day: Day) ->
         kind = np.where(np.isfinite(values[..., 0]), values[..., 0], 0.0).astype(int)
         size = 2 * classes.margin_px + 1
         hidden = cv2.dilate((~np.isin(kind, classes.ground)).astype(np.uint8), np.ones((size, size), np.uint8))
-        parts = [hidden == 0, np.isin(kind, classes.cloud), np.isin(kind, classes.snow), np.isin(kind, classes.water)]
+        parts = [hidden == 0, np.isin(kind, classes.snow), np.isin(kind, classes.water)]
         return np.stack(parts, axis=-1).astype(np.float64)
 
     tiles = []
@@ -356,7 +355,7 @@ def _class_masks(store: RemoteStore, source: Source, grid: MapGrid, day: Day) ->
         if tile is not None:
             tiles.append(tile)
     if not tiles:
-        return np.zeros((*grid.shape, 4), bool)
+        return np.zeros((*grid.shape, 3), bool)
     return np.nan_to_num(mosaic(tiles, grid)) > 0.5
 
 
@@ -375,14 +374,14 @@ def _load_day(store: RemoteStore, name: str, source: Source, grid: MapGrid, day:
                 used.append(AssetUse(name, item, asset))
         bands.append(mosaic(tiles, grid)[..., 0] if tiles else np.full(grid.shape, np.nan, np.float32))
     values = np.stack(bands, axis=-1)
-    known = np.isfinite(values).all(axis=2)
+    known = np.asarray(np.isfinite(values).all(axis=2))
     if source.classes is None:
-        clear, cloud, snow, water = known, np.zeros_like(known), np.zeros_like(known), np.zeros_like(known)
+        clear, snow, water = known, np.zeros_like(known), np.zeros_like(known)
     else:
-        clear, cloud, snow, water = np.moveaxis(_class_masks(store, source, grid, day), -1, 0)
+        clear, snow, water = np.moveaxis(_class_masks(store, source, grid, day), -1, 0)
         clear = clear & known
     doubt = _doubt(values[clear], offsets)
-    return _LoadedDay(day, values, clear, cloud & known, float(snow.mean()), float(water.mean()), used, doubt)
+    return _LoadedDay(day, values, clear, float(snow.mean()), float(water.mean()), used, doubt)
 
 
 def _reflectance_reader(grid: MapGrid, scale: float, offset: float) -> Callable[[Any], Raster | None]:
@@ -418,7 +417,7 @@ def _doubt(values: np.ndarray, offsets: set[tuple[float, bool]]) -> str | None:
 
 
 def _keep_snow(loaded: list[_LoadedDay]) -> None:
-    """Take ground for clear that is called cloud, but is bright and alike on three days at least: it is snow."""
+    """Take ground for clear that is called cloud, or is beside one, but is bright and alike on three days: it is snow."""
     if len(loaded) < 3:
         return
     stack = np.stack([np.where(np.isfinite(each.values), each.values, np.nan).mean(axis=2) for each in loaded])
@@ -427,7 +426,7 @@ def _keep_snow(loaded: list[_LoadedDay]) -> None:
         alike = np.abs(stack - middle) <= _SNOW_SPREAD * middle
         snow = (alike.sum(axis=0) >= 3) & (middle > _SNOW_REFLECTANCE)
     for each, same in zip(loaded, alike, strict=True):
-        each.clear |= each.cloud & snow & same
+        each.clear |= snow & same
 
 
 def _clearest(loaded: list[_LoadedDay]) -> Image:
@@ -456,7 +455,7 @@ def _clearest(loaded: list[_LoadedDay]) -> Image:
 def _median(loaded: list[_LoadedDay]) -> Image:
     _keep_snow(loaded)
     stack = np.stack([np.where(each.clear[..., None], each.values, np.nan) for each in loaded])
-    known = np.isfinite(stack).any(axis=0)
+    known = np.asarray(np.isfinite(stack).any(axis=0))
     values = np.full(stack.shape[1:], np.nan, np.float32)
     values[known] = np.nanmedian(stack[:, known], axis=0)
     report = {

@@ -35,6 +35,8 @@ Value = TypeVar("Value")
 BLOCK_BYTES = 65536
 TRIES = 5
 TIMEOUT_S = (10.0, 60.0)
+# Before the second try, twice as long before each further one.
+FIRST_WAIT_S = 0.5
 # Servers are asked again whether a file of theirs has changed after so many days, a catalogue for new items after one.
 FILE_DAYS, SEARCH_DAYS = 30.0, 1.0
 _BUSY = (429, 500, 502, 503, 504)
@@ -241,7 +243,7 @@ class RemoteStore:
         for attempt in range(TRIES):
             if attempt:
                 log.info("%s: %s; trying again", host, problem)
-                time.sleep(min(max(wait_s, 0.25 * 2.0**attempt), _LONGEST_WAIT_S))
+                time.sleep(min(max(wait_s, FIRST_WAIT_S * 2.0 ** (attempt - 1)), _LONGEST_WAIT_S))
             response, problem = self._get_once(address, headers)
             if response is None:
                 continue

@@ -43,8 +43,6 @@ class Classes(Declaration):
         Asset of the classification.
     ground
         Classes of clear ground, water and snow included.
-    cloud
-        Classes of cloud proper, which may be snow taken for cloud.
     snow, water
         Classes told in the report.
     margin_px
@@ -53,7 +51,6 @@ class Classes(Declaration):
 
     asset: str
     ground: list[int] = Field(min_length=1)
-    cloud: list[int] = Field(min_length=1)
     snow: list[int] = Field(default_factory=list)
     water: list[int] = Field(default_factory=list)
     margin_px: int = Field(default=3, ge=0, le=50)

@@ -185,7 +185,7 @@ def read_tile(
     return Raster(values.astype(np.float32), blocks, crs)
 
 
-def mosaic(tiles: Sequence[Raster], grid: MapGrid) -> np.ndarray:
+def mosaic(tiles: Sequence[Raster], grid: MapGrid, *, extend: bool = True) -> np.ndarray:
     """Bring rasters onto a grid by bilinear interpolation; where several have a value, the first counts.
 
     Parameters
@@ -194,6 +194,8 @@ def mosaic(tiles: Sequence[Raster], grid: MapGrid) -> np.ndarray:
         Rasters from `read_tile`, of equal numbers of bands.
     grid
         Target.
+    extend
+        Also give values to cells half a pixel beyond the outermost centres, as the mean of the neighbours that are there.
 
     Returns
     -------
@@ -210,11 +212,12 @@ def mosaic(tiles: Sequence[Raster], grid: MapGrid) -> np.ndarray:
         for group in groups:
             column, row = _strip_pixels(grid, rows, group.crs, group.transform)
             values, weight = _bilinear(group.values, column, row)
-            sure = np.isnan(strip) & (weight[..., None] > 0.999)
+            sure = np.asarray(np.isnan(strip) & (weight[..., None] > 0.999))
             strip[sure] = values[sure]
-            some = np.isnan(weak) & (weight[..., None] > _LEAST_WEIGHT)
+            some = np.asarray(np.isnan(weak) & (weight[..., None] > _LEAST_WEIGHT))
             weak[some] = values[some]
-        result[rows] = np.where(np.isnan(strip), weak, strip)
+        if extend:
+            result[rows] = np.where(np.isnan(strip), weak, strip)
     return result
 
 
@@ -304,7 +307,7 @@ def _between(nodes: np.ndarray, width: int, height: int) -> np.ndarray:
 def _bilinear(values: np.ndarray, column: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean of the known neighbours by bilinear weights ``(H, W, C)``, and the sum of these weights ``(H, W)``."""
     height, width = values.shape[:2]
-    known = np.isfinite(values).all(axis=2)
+    known = np.asarray(np.isfinite(values).all(axis=2))
     filled = np.where(known[..., None], values, 0.0).astype(np.float32)
     outside = ~(np.isfinite(column) & np.isfinite(row))
     column = np.clip(np.where(outside, -9.0, column), -2.0, width + 1.0)

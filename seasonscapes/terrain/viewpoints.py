@@ -91,7 +91,7 @@ class _Land:
         r, c = np.rint(row + self.d_row).astype(int), np.rint(column + self.d_column).astype(int)
         inside = (r >= 0) & (r < self.mean.shape[0]) & (c >= 0) & (c < self.mean.shape[1])
         height = self.mean[np.clip(r, 0, self.mean.shape[0] - 1), np.clip(c, 0, self.mean.shape[1] - 1)]
-        return np.where(inside, (height - self.drop_m - eye_m) / (self.distance * self.cell_m), -np.inf)
+        return np.asarray(np.where(inside, (height - self.drop_m - eye_m) / (self.distance * self.cell_m), -np.inf))
 
     def geodetic(self, row: float, column: float) -> tuple[float, float]:
         """Latitude and longitude [deg] of a cell's centre."""
@@ -115,8 +115,8 @@ def _sectors(values: np.ndarray, half_deg: float) -> np.ndarray:
 def _summit(land: _Land, heights: np.ndarray) -> View:
     row, column = divmod(int(np.argmax(np.where(land.inner(0.7), land.highest, -np.inf))), land.mean.shape[1])
     slopes = land.rays(row, column, float(land.highest[row, column]) + 3.0)
-    above = np.maximum.accumulate(slopes, axis=1)
-    seen = np.isfinite(slopes) & (slopes >= above - 1e-9)
+    horizon = np.asarray(np.maximum.accumulate(np.asarray(slopes), axis=1))
+    seen = np.isfinite(slopes) & (slopes >= horizon - 1e-9)
     # A cell of a ray stands for an area that grows with the distance.
     area = np.where(seen, land.distance, 0.0)
     best = int(np.argmax(_sectors(area.sum(axis=1), 30.0)))
