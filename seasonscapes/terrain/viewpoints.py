@@ -135,7 +135,8 @@ def _summit(land: _Land, heights: np.ndarray) -> View:
 
 def _valley(land: _Land) -> View:
     smooth = gaussian_filter(land.mean, 1.0)
-    slope = np.hypot(*np.gradient(smooth, land.cell_m))
+    down, across = np.gradient(smooth, land.cell_m)
+    slope = np.hypot(down, across)
     inner = land.inner(0.8)
     low = land.mean <= np.percentile(land.mean[inner], 35.0)
     fit = np.argwhere(inner & low & (slope < np.tan(np.deg2rad(12.0))))
