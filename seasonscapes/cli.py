@@ -107,5 +107,4 @@ def _refuse(tokens: list[str], problem: str, error: BaseException | None, *, cod
 
 
 def _asks_for_json(tokens: list[str]) -> bool:
-    flags = tokens[: tokens.index("--")] if "--" in tokens else tokens
-    return any(token == "--json" or token.startswith("--json=") for token in flags)
+    return any(token == "--json" or token.startswith("--json=") for token in tokens)

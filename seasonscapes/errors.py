@@ -81,6 +81,10 @@ class UnreadableImage(SeasonscapesError, ValueError):
     """A file is not an image that can be decoded."""
 
 
+class DamagedFile(SeasonscapesError, ValueError):
+    """A stored file is not what was written: cut short, changed, exchanged, or of another version."""
+
+
 class ImageSizeMismatch(SeasonscapesError, ValueError):
     """An image has another size than the view that it is used with."""
 

@@ -6,22 +6,23 @@ A scene file holds facts about the place only; the settings of processing stages
 from __future__ import annotations
 
 import logging
+import math
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, PrivateAttr, model_validator
 
 from seasonscapes.cameras.pinhole import Camera, camera_at
 from seasonscapes.cameras.webcam import Webcam
 from seasonscapes.declaration import MOST_NAME_CHARACTERS, Declaration, InputError, Name, read_declaration
-from seasonscapes.frames import STANDARD_REFRACTION_K, LocalFrame
+from seasonscapes.frames import STANDARD_REFRACTION_K, Latitude, LocalFrame, Longitude
 from seasonscapes.terrain.raster_files import OWN_FOLDER, Confinement, confined_path, raster_hash
 
 log = logging.getLogger(__name__)
 
 VerticalDatum = Literal["unknown", "ellipsoidal", "EGM96", "EGM2008", "LN02", "NN2000", "NAVD88", "EVRF", "local"]
-Latitude = Field(ge=-90.0, le=90.0)
-Longitude = Field(ge=-180.0, le=180.0)
+HeightUnit = Literal["metre", "foot", "US survey foot", "decimetre", "centimetre", "kilometre"]
 
 
 class Origin(Declaration):
@@ -35,8 +36,8 @@ class Origin(Declaration):
         Height in the scene's vertical datum [m].
     """
 
-    latitude_deg: float = Latitude
-    longitude_deg: float = Longitude
+    latitude_deg: Latitude
+    longitude_deg: Longitude
     height_m: float = Field(default=0.0, ge=-500.0, le=9000.0)
 
 
@@ -46,26 +47,31 @@ class Area(Declaration):
     Parameters
     ----------
     west_deg, south_deg, east_deg, north_deg
-        WGS 84 bounds [deg], at most 3° apart.
+        WGS 84 bounds [deg], at most 3° of a great circle apart. Across the antimeridian ``east_deg`` is the smaller one.
     """
 
-    west_deg: float = Longitude
-    south_deg: float = Latitude
-    east_deg: float = Longitude
-    north_deg: float = Latitude
+    west_deg: Longitude
+    south_deg: Latitude
+    east_deg: Longitude
+    north_deg: Latitude
 
     @model_validator(mode="after")
     def _ordered(self) -> Area:
-        if not (self.west_deg < self.east_deg and self.south_deg < self.north_deg):
+        if not self.south_deg < self.north_deg or self.west_deg == self.east_deg:
             raise ValueError("expected west_deg < east_deg and south_deg < north_deg")
-        if self.east_deg - self.west_deg > 3.0 or self.north_deg - self.south_deg > 3.0:
+        west, south, east, north = self.bounds_deg
+        if east - west > 180.0:
+            raise ValueError("expected west_deg < east_deg and south_deg < north_deg")
+        middle = min(89.0, abs(0.5 * (south + north)))
+        if max((east - west) * math.cos(math.radians(middle)), north - south) > 3.0 + 1e-9:
             raise ValueError("spans more than 3°, too far for a single sun position and sky; choose a smaller area")
         return self
 
     @property
     def bounds_deg(self) -> tuple[float, float, float, float]:
-        """West, south, east and north bounds [deg]."""
-        return self.west_deg, self.south_deg, self.east_deg, self.north_deg
+        """West, south, east and north bounds [deg]; east is beyond 180° where the area crosses the antimeridian."""
+        east = self.east_deg + (360.0 if self.east_deg < self.west_deg else 0.0)
+        return self.west_deg, self.south_deg, east, self.north_deg
 
 
 class SyntheticElevation(Declaration):
@@ -107,7 +113,11 @@ class Elevation(Declaration):
     file
         Raster file, relative to the scene file's folder.
     band
-        Band of the file, counted from 1; the first if omitted.
+        Band of the file, counted from 1; may be left out where there is one.
+    unit
+        Unit of the file's heights; left out, the one that the file declares, else metres.
+    nodata
+        Value of the file that means no data, besides what it declares.
     synthetic
         Synthetic terrain in place of a file.
     max_hole_share
@@ -116,6 +126,8 @@ class Elevation(Declaration):
 
     file: str | None = None
     band: int | None = Field(default=None, ge=1)
+    unit: HeightUnit | None = None
+    nodata: float | None = None
     synthetic: SyntheticElevation | None = None
     max_hole_share: float = Field(default=0.25, ge=0.0, le=1.0)
 
@@ -136,9 +148,10 @@ class Imagery(Declaration):
     encoding
         Transfer function of the pixel values.
     full_scale
-        Pixel value that corresponds to 1.
+        Value that corresponds to 1, after the file's own scale and offset. Left out, it is 1 for floating-point numbers
+        and where the file has a scale, else 255.
     bands
-        Bands of the file, counted from 1.
+        Red, green and blue bands of the file, counted from 1; left out, those that the file marks.
     reflectance_scale
         Reflectance of a white pixel. Display images are contrast-stretched, so that their white is not a reflectance
         of 1; 0.5 brings the meadows and rock of an Alpine mosaic to the reflectances of field spectra.
@@ -146,9 +159,13 @@ class Imagery(Declaration):
 
     file: str
     encoding: Literal["srgb", "linear"] = "srgb"
-    full_scale: float = Field(default=255.0, gt=0.0)
+    full_scale: float | None = Field(default=None, gt=0.0)
     bands: list[int] | None = Field(default=None, min_length=1, max_length=3)
     reflectance_scale: float = Field(default=0.5, gt=0.0, le=2.0)
+
+
+# A cropped picture may not hold its principal point at all.
+Share = Annotated[float, Field(ge=-2.0, le=3.0)]
 
 
 class Viewpoint(Declaration):
@@ -169,7 +186,9 @@ class Viewpoint(Declaration):
     roll_deg
         Rotation about the viewing direction; positive lowers the right-hand side [deg].
     fov_deg
-        Horizontal field of view [deg].
+        Horizontal field of view of a picture with its principal point in the middle [deg]: the focal length.
+    principal_point
+        Where the optical axis meets the picture, as shares of its width (from the left) and height (from the top).
 
     Examples
     --------
@@ -178,14 +197,15 @@ class Viewpoint(Declaration):
     60.0
     """
 
-    latitude_deg: float = Latitude
-    longitude_deg: float = Longitude
+    latitude_deg: Latitude
+    longitude_deg: Longitude
     height_m: float | None = Field(default=None, ge=-500.0, le=100_000.0)
     above_ground_m: float | None = Field(default=None, gt=0.0, le=100_000.0)
     heading_deg: float = Field(ge=-360.0, le=360.0)
     pitch_deg: float = Field(default=0.0, ge=-90.0, le=90.0)
     roll_deg: float = Field(default=0.0, ge=-180.0, le=180.0)
     fov_deg: float = Field(default=60.0, gt=0.0, lt=170.0)
+    principal_point: tuple[Share, Share] = (0.5, 0.5)
 
     @model_validator(mode="after")
     def _one_height(self) -> Viewpoint:
@@ -376,7 +396,7 @@ def camera_from_named_view(
     else:
         assert view.above_ground_m is not None  # validated by `Viewpoint`
         height_m = ground_height_m + float(view.above_ground_m)
-    return camera_at(
+    camera = camera_at(
         frame,
         view.latitude_deg,
         view.longitude_deg,
@@ -387,3 +407,5 @@ def camera_from_named_view(
         fov_deg=view.fov_deg,
         size_px=size_px,
     )
+    across, down = view.principal_point
+    return replace(camera, cx=across * camera.width_px, cy=down * camera.height_px)

@@ -56,7 +56,15 @@ from seasonscapes.gaussians.splat_view import (  # noqa: E402
 )
 from seasonscapes.gaussians.surfels import axes_from_quaternions, surfel_albedo, terrain_surfels  # noqa: E402
 from seasonscapes.gaussians.tile_tree import concatenate_tiles, select_tiles, tile_bounds, tile_discs, tile_tree  # noqa: E402
-from seasonscapes.gaussians.training import Schedule, SurfaceTargets, TrainingFrame, fit_code, surface_targets, train  # noqa: E402
+from seasonscapes.gaussians.training import (  # noqa: E402
+    Checkpoint,
+    Schedule,
+    SurfaceTargets,
+    TrainingFrame,
+    fit_code,
+    surface_targets,
+    train,
+)
 from seasonscapes.rendering.hemisphere_rays import ray_scene  # noqa: E402
 from seasonscapes.rendering.horizon_angles import horizon_angles  # noqa: E402
 from seasonscapes.rendering.irradiance import surface_at  # noqa: E402
@@ -276,15 +284,23 @@ def test_pictures_teach_and_an_interrupted_run_goes_on(hill, told, tmp_path):
             raise Stop
 
     path = tmp_path / "run.safetensors"
+    checkpoint = Checkpoint(path, "of this sky")
     with pytest.raises(Stop):
-        train(appearance(hill), told, frames, schedule, seed=5, checkpoint=path, progress=stop_after)
+        train(appearance(hill), told, frames, schedule, seed=5, checkpoint=checkpoint, progress=stop_after)
     again = appearance(hill, seed=9)
-    rest = train(again, told, frames, schedule, seed=5, checkpoint=path)
+    rest = train(again, told, frames, schedule, seed=5, checkpoint=checkpoint)
     assert len(rest) == 30 - 16
     for one, other in zip(whole.parameters(), again.parameters(), strict=True):
         assert torch.equal(one, other)
-    with pytest.raises(ValueError, match="another run"):
-        train(appearance(hill), told, frames, schedule, seed=6, checkpoint=path)
+    with pytest.raises(InputError, match="another run; got 'another seed'"):
+        train(appearance(hill), told, frames, schedule, seed=6, checkpoint=checkpoint)
+    with pytest.raises(InputError, match="another run; got 'another scene, sky or albedo'"):
+        train(appearance(hill), told, frames, schedule, seed=5, checkpoint=replace(checkpoint, key="of another sky"))
+    content = path.read_bytes()
+    for damaged in (content[:100], content[:-7], content[:-99] + b"x" + content[-98:], b"", b"{}"):
+        path.write_bytes(damaged)
+        with pytest.raises(InputError, match="damaged"):
+            train(appearance(hill), told, frames, schedule, seed=5, checkpoint=checkpoint)
     assert not [p for p in tmp_path.iterdir() if p != path]
 
 

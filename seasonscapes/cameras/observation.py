@@ -23,7 +23,7 @@ from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.cameras.webcam import Webcam
 from seasonscapes.declaration import checked_name
 from seasonscapes.errors import InputError, UnreadableImage
-from seasonscapes.images import atomic_path, read_image_linear
+from seasonscapes.images import atomic_path, picture_size, read_image_linear, read_image_srgb
 
 COLUMNS = ("webcam", "time_utc", "path", "bytes", "sha256")
 # Folder layout of the reference repository, with placeholders for parts of the path.
@@ -382,23 +382,20 @@ def _file_problem(
     file: Path, row: ManifestRow, length: int, size: tuple[int, int], decode: bool
 ) -> tuple[str, str] | None:
     """Kind and description of the first problem of a file."""
-    from PIL import Image
-
     if length == 0:
         return "empty", "0 bytes"
     try:
-        with Image.open(file) as picture:
-            found, kind = picture.size, picture.format
-            if decode:
-                picture.load()
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        *found, kind = picture_size(file)
+        if decode:
+            read_image_srgb(file)
+    except UnreadableImage as error:
         return ("truncated" if "truncated" in str(error) else "unreadable"), str(error)
     with open(file, "rb") as stream:
         stream.seek(max(0, length - 64))
         tail = stream.read()
     if (kind == "JPEG" and b"\xff\xd9" not in tail) or (kind == "PNG" and b"IEND" not in tail):
         return "truncated", f"{length} bytes without the {kind} end marker"
-    if found != size:
+    if tuple(found) != size:
         return "wrong size", f"{found[0]} x {found[1]} px; expected {size[0]} x {size[1]}"
     if row.bytes is not None and row.bytes != length:
         return "changed", f"{length} bytes; expected {row.bytes} from the manifest"
@@ -467,10 +464,8 @@ def open_observation(row: ManifestRow, folder: Path, camera: Camera | Panorama) 
         image = read_image_linear(path)
     except FileNotFoundError:
         raise InputError(path, "no such picture") from None
-    except ValueError:
-        raise UnreadableImage(
-            f"{path}: not a readable picture; download it again or remove it from the manifest"
-        ) from None
+    except UnreadableImage as error:
+        raise UnreadableImage(f"{error}; download it again or remove it from the manifest") from None
     if image.shape[:2] != (camera.height_px, camera.width_px):
         raise InputError(
             path,

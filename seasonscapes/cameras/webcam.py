@@ -19,7 +19,7 @@ from pydantic import Field, field_validator, model_validator
 from seasonscapes.cameras.panorama import Panorama, panorama_from_angles
 from seasonscapes.cameras.pinhole import Camera, rotation_from_angles
 from seasonscapes.declaration import Declaration, InputError, Name, read_toml, validate
-from seasonscapes.frames import LocalFrame, enu_from_geodetic, local_axes
+from seasonscapes.frames import Latitude, LocalFrame, Longitude, enu_from_geodetic, local_axes
 
 
 class Webcam(Declaration):
@@ -59,10 +59,10 @@ class Webcam(Declaration):
 
     id: Name
     name: str = ""
-    latitude_deg: float = Field(ge=-90.0, le=90.0)
-    longitude_deg: float = Field(ge=-180.0, le=180.0)
-    height_m: float | None = None
-    above_ground_m: float | None = Field(default=None, ge=0.0)
+    latitude_deg: Latitude
+    longitude_deg: Longitude
+    height_m: float | None = Field(default=None, ge=-500.0, le=100_000.0)
+    above_ground_m: float | None = Field(default=None, ge=0.0, le=100_000.0)
     vertical_datum: str = "unknown"
     position_sigma_m: float = Field(default=10.0, gt=0.0)
     projection: Literal["cylindrical", "equirectangular", "perspective"]

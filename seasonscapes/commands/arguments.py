@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING
 
 from seasonscapes.commands.console import message
 from seasonscapes.errors import InputError
+from seasonscapes.frames import normal_longitude
 from seasonscapes.text_files import read_text
 
 if TYPE_CHECKING:
     from seasonscapes.workflows.albedo_sources import AlbedoFile
 
 _LONGEST_SECONDS = 366 * 86400.0
-# No observer stands lower or higher [m].
-_LOWEST_M, _HIGHEST_M = -1000.0, 20_000.0
 
 
 def check_range(flag: str, value: float, low: float, high: float) -> None:
@@ -53,19 +52,19 @@ def parse_at(text: str, *, flag: str = "--at") -> tuple[float, float, float | No
         numbers = []
     if len(numbers) not in (2, 3):
         raise InputError(flag, "not a place", got=text, expected=expected)
-    if not (-90.0 <= numbers[0] <= 90.0 and -180.0 <= numbers[1] <= 180.0):
+    if not (-90.0 <= numbers[0] <= 90.0 and -180.0 <= numbers[1] <= 360.0):
         cure = "is the order latitude, longitude, in degrees?"
         raise InputError(flag, "latitude or longitude out of range", got=text, expected=expected, cure=cure)
-    if len(numbers) == 3 and not _LOWEST_M <= numbers[2] <= _HIGHEST_M:
-        heights = f"{_LOWEST_M:g} to {_HIGHEST_M:g} m"
-        raise InputError(flag, "height out of range", got=text, expected=heights, cure="give metres")
+    latitude, longitude = numbers[0], normal_longitude(numbers[1])
     if len(numbers) == 2:
-        return numbers[0], numbers[1], None, 2.0
+        return latitude, longitude, None, 2.0
+    if not -500.0 <= numbers[2] <= 100_000.0:
+        raise InputError(flag, "height out of range", got=text, expected="-500 to 100000 metres")
     if parts[2].startswith("+"):
         if numbers[2] <= 0.0:
             raise InputError(flag, "the height above ground must be positive", got=text)
-        return numbers[0], numbers[1], None, numbers[2]
-    return numbers[0], numbers[1], numbers[2], None
+        return latitude, longitude, None, numbers[2]
+    return latitude, longitude, numbers[2], None
 
 
 def parse_duration(flag: str, text: str) -> timedelta:

@@ -19,10 +19,23 @@ _SECONDS_BETWEEN_LINES = 10.0
 
 
 class _StderrHandler(logging.Handler):
-    """Prints log messages as plain lines on the present stderr."""
+    """Prints log messages as plain lines on the present stderr, and keeps the warnings of the present command."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.warnings: list[str] = []
 
     def emit(self, record: logging.LogRecord) -> None:
-        message(self.format(record))
+        line = self.format(record)
+        if record.levelno >= logging.WARNING:
+            # A film reads its image for every date; one command says a thing once.
+            if line in self.warnings:
+                return
+            self.warnings.append(line)
+        message(line)
+
+
+_handler = _StderrHandler()
 
 
 class ReaderGone(Exception):
@@ -30,11 +43,12 @@ class ReaderGone(Exception):
 
 
 def show_messages() -> None:
-    """Show the package's log messages of level INFO and above on stderr."""
+    """Show the package's log messages of level INFO and above on stderr, and begin a new list of warnings."""
     logger = logging.getLogger("seasonscapes")
-    if not any(isinstance(handler, _StderrHandler) for handler in logger.handlers):
-        logger.addHandler(_StderrHandler())
+    if _handler not in logger.handlers:
+        logger.addHandler(_handler)
     logger.setLevel(logging.INFO)
+    _handler.warnings.clear()
 
 
 def plain_line(text: str) -> str:
@@ -61,9 +75,9 @@ def print_record(record: Any) -> None:
 
 
 def print_result(record: dict[str, Any], lines: list[str], *, as_json: bool) -> None:
-    """Print a command's result on stdout: one JSON record, or lines for people."""
+    """Print a command's result on stdout: one JSON record with the command's warnings, or lines for people."""
     if as_json:
-        print_record(record)
+        print_record({**record, "warnings": list(_handler.warnings)})
     else:
         _write_line("\n".join(lines), sys.stdout)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import glob
 import re
 from collections.abc import Callable
-from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,10 +18,9 @@ from seasonscapes.open_data.sources import Source, source_of_file
 from seasonscapes.progress import TaskProgress
 from seasonscapes.terrain.crs import apply_affine, geodetic_from_map
 from seasonscapes.terrain.mosaic import MapGrid, mosaic, read_tile
+from seasonscapes.terrain.raster_files import open_raster
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from rasterio.io import DatasetReader
 
 
@@ -114,7 +112,7 @@ def _mosaic(
 ) -> np.ndarray:
     tiles = []
     for number, raster in enumerate(rasters):
-        with opened(raster.path) as dataset:
+        with open_raster(raster.path) as dataset:
             tiles.append(read(dataset))
         if progress is not None:
             progress((number + 1) / len(rasters))
@@ -124,21 +122,8 @@ def _mosaic(
     return mosaic(tiles, grid)
 
 
-@contextmanager
-def opened(path: Path) -> Iterator[DatasetReader]:
-    """Open a raster file of the user's; `InputError` in one line where it cannot be read."""
-    import rasterio
-    from rasterio.errors import RasterioError
-
-    try:
-        with rasterio.open(path) as dataset:
-            yield dataset
-    except RasterioError as error:
-        raise InputError(path, f"not readable as a raster: {error}") from None
-
-
 def _local_raster(path: Path, kind: str) -> LocalRaster:
-    with opened(path) as dataset:
+    with open_raster(path) as dataset:
         if dataset.crs is None or dataset.transform.is_identity:
             raise InputError(path, "not georeferenced", cure="assign a CRS with: gdal_edit.py -a_srs EPSG:… FILE")
         corners_x, corners_y = np.meshgrid([0.0, dataset.width], [0.0, dataset.height])

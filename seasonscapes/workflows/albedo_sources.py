@@ -103,10 +103,35 @@ def scene_albedo(place: Place, day: date | str) -> Texture:
         )
     imagery = place.scene.imagery
     if imagery is None:
+        log.warning("%s: names no image: the land is grey, with an albedo of %g", place.path, GREY_ALBEDO)
         values = np.full((*place.texture_shape, 3), GREY_ALBEDO, np.float32)
         return Texture(values, np.zeros(place.texture_shape, np.float32), place.atlas_id)
     inputs.update(imagery=imagery.model_copy(update={"file": Path(imagery.file).name}), hash=place.scene.image_hash)
-    return texture_once(place, "albedo", inputs, code=_IMAGE_CODE, build=lambda: _baked_image(place))
+    texture = texture_once(place, "albedo", inputs, code=_IMAGE_CODE, build=lambda: _baked_image(place))
+    _tell_image(place, texture)
+    return texture
+
+
+def _tell_image(place: Place, texture: Texture) -> None:
+    """Warn of what was understood of the scene's image, and of land that it does not cover."""
+    from seasonscapes.terrain.image_bands import image_facts
+    from seasonscapes.terrain.texels import covered_share
+
+    imagery = place.scene.imagery
+    assert imagery is not None
+    facts = image_facts(
+        imagery.file,
+        bands=tuple(imagery.bands) if imagery.bands else None,
+        full_scale=imagery.full_scale,
+        confinement=place.scene.confinement,
+    )
+    for line in facts.told:
+        log.warning("%s", line)
+    share = covered_share(place.terrain, texture.weight)
+    if share < 0.999:
+        log.warning(
+            "%s: the image covers %.3g %% of the land; the rest has its median colour", imagery.file, 100.0 * share
+        )
 
 
 def texture_once(

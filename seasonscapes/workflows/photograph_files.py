@@ -239,8 +239,8 @@ def _mask(sources: PhotographSources, webcam: str, shape: tuple[int, ...]) -> np
         return np.ones(shape, bool)
     try:
         mask = read_image_linear(path).max(axis=2) > 0.5
-    except UnreadableImage:
-        raise InputError(path, "not a readable picture") from None
+    except UnreadableImage as error:
+        raise InputError(path, str(error)) from None
     if mask.shape != shape:
         raise InputError(
             path,
