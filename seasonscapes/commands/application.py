@@ -73,6 +73,7 @@ app = App(
 
 # Name, module, and what the command does.
 COMMANDS = (
+    ("fetch", "fetch", "Make the scene of a place from open data, by its coordinates."),
     ("render", "render", "Render a view of a place at a date and hour."),
     ("timelapse", "timelapse", "Film a view through hours or seasons."),
     ("lit-texture", "lit_texture", "Export a place's texture as lit at an hour."),
