@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from seasonscapes.commands.arguments import check_suffix, parse_duration, parse_time
+from seasonscapes.commands.arguments import parse_duration, parse_time
 from seasonscapes.commands.console import message, print_result, progress_bars
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
+from seasonscapes.commands.outputs import check_output, check_output_folder
 from seasonscapes.commands.view_options import ViewOptions
 from seasonscapes.errors import InputError
 
@@ -88,7 +89,9 @@ def export_command(
     if view is not None and to != "blender":
         raise InputError("--camera", "goes with --to blender", got=to)
     if exports.KINDS[to]:
-        check_suffix(output, exports.KINDS[to])
+        check_output(output, exports.KINDS[to])
+    else:
+        check_output_folder(output)
     model, options = (sky or SkyOptions()).model(), place or PlaceOptions()
     with progress_bars() as progress:
         loaded = options.load(scene, progress)
