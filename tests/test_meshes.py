@@ -320,7 +320,7 @@ class TestPlacing:
 
 def broken_file(kind: str, folder: Path) -> tuple[Path, ss.MeshPlacing | None]:
     """A mesh file with one fault."""
-    vertices, faces, uv = box_faces()
+    vertices, faces, _uv = box_faces()
     if kind == "no coordinates":
         path = write_obj(folder)
         path.write_text("\n".join(_without_uv(line) for line in path.read_text().splitlines()))
@@ -569,7 +569,7 @@ class TestLight:
 
     def test_no_daylight_is_told(self, tmp_path):
         mesh = ss.load_mesh(coloured_ball(tmp_path), ss.MeshPlacing(at=(46.5, 8.0, 1000.0)))
-        with pytest.raises(InputError, match="no daylight in the textures|sun"):
+        with pytest.raises(InputError, match=r"no daylight in the textures|sun"):
             ss.delight_mesh(mesh, "2024-07-20T23:30", surroundings=AROUND)
 
     def test_a_picture_shows_the_lit_texture(self, tmp_path):
@@ -604,7 +604,7 @@ class TestLight:
             write_glb(tmp_path, shift=(5.0, 2.0, 1.0)), ss.MeshPlacing(at=(46.5, 8.0, 0.0), north_deg=30.0)
         )
         corner = mesh.parts[0].vertices[3]
-        camera = camera_between(mesh, corner + [1.0, 4.0, 8.0], corner, size_px=(80, 60))
+        camera = camera_between(mesh, corner + np.array([1.0, 4.0, 8.0]), corner, size_px=(80, 60))
         pixel, depth = project(camera, mesh.positions[0][3])
         np.testing.assert_allclose(pixel, [40.0, 30.0], atol=1e-6)
         np.testing.assert_allclose(depth, 9.0, atol=1e-9)
