@@ -19,9 +19,9 @@ from command_line import command
 from open_data_world import World, height_m, reflectance
 from pvlib.solarposition import get_solarposition
 
-from seasonscapes.commands.fetch_arguments import parse_extent, parse_interval
 from seasonscapes.errors import InputError
 from seasonscapes.open_data import remote
+from seasonscapes.open_data.requests_as_text import parse_extent, parse_interval
 from seasonscapes.terrain.crs import geodetic_from_map
 
 ALPS = (46.55, 7.999)  # the border between two tiles runs through it
