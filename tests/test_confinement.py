@@ -110,6 +110,22 @@ def test_a_raster_that_leads_elsewhere_is_refused_before_it_is_opened(outside, t
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize(
+    "name", ["loop.tif", "x" * 300 + ".tif", "a\\u0000.tif", "sub", "dem.tif/x", "pipe", "/dev/zero"]
+)
+def test_names_that_are_no_file_have_their_line(outside, name, capsys):
+    import os
+
+    from seasonscapes.cli import main
+
+    (outside.parent / "loop.tif").symlink_to("loop.tif")
+    (outside.parent / "sub").mkdir()
+    os.mkfifo(outside.parent / "pipe")
+    outside.write_text(places.SCENE.replace('file = "dem.tif"', f'file = "{name}"'))
+    assert main(["terrain", str(outside), "--workspace", str(outside.parent / "work")]) == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
 def test_sidecars_are_confined_too(outside):
     folder, dem = outside.parent, outside.parent / "dem.tif"
     with server() as (url, asked):

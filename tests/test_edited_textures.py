@@ -136,6 +136,20 @@ def _nan(place, folder: Path) -> Path:
     return path
 
 
+def _nan_texel(place, folder: Path) -> Path:
+    path = folder / "albedo.npz"
+    values = np.full((*place.texture_shape, 3), 0.2, np.float32)
+    values[3, 4, 1] = np.nan
+    save_texture(Texture(values, values[..., 0], place.atlas_id), path)
+    return path
+
+
+def _pickle(place, folder: Path) -> Path:
+    path = folder / "albedo.npz"
+    np.savez(path, values=np.array([{}], object), weight=np.zeros(1, np.float32))
+    return path
+
+
 def _no_picture(place, folder: Path) -> Path:
     path = folder / "notes.png"
     path.write_text("no picture")
@@ -150,6 +164,8 @@ def _no_picture(place, folder: Path) -> Path:
         (_size, "another atlas"),
         (_transparent, "transparent"),
         (_nan, "not finite"),
+        (_nan_texel, "not finite"),
+        (_pickle, "never loaded"),
         (_no_picture, "not a readable picture"),
     ],
 )
