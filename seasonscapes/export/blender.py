@@ -55,7 +55,8 @@ def add_lamp(name, lamp):
 
 def add_sky():
     world = bpy.data.worlds.new("sky")
-    world.use_nodes = True
+    if world.node_tree is None:  # before Blender 5
+        world.use_nodes = True
     nodes = world.node_tree.nodes
     image = nodes.new("ShaderNodeTexEnvironment")
     image.image = bpy.data.images.load(str(FOLDER / SCENE["sky"]))
