@@ -91,6 +91,7 @@ add_sky()
 if SCENE["camera"]:
     add_camera(SCENE["camera"])
 bpy.context.scene.render.engine = "CYCLES"
+bpy.context.scene.cycles.samples = 256
 if "--render" in sys.argv:
     bpy.context.scene.render.filepath = str(Path(sys.argv[sys.argv.index("--render") + 1]).resolve())
     bpy.ops.render.render(write_still=True)

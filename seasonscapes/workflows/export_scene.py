@@ -261,8 +261,8 @@ class _Job:
         albedo = chosen_albedo(place, self.day, self.albedo)
         lamps = {}
         if self.lights:
-            # Lights are absolute; this is how to expose for them.
-            about["exposure_ev100"] = _card_ev100(self.lights[0])
+            # Lights are absolute; this is how to expose for them, at the brightest instant of several.
+            about["exposure_ev100"] = max(_card_ev100(light) for light in self.lights)
             lamps = _lamps(self.lights[0])
         return TexturedTerrain(place.terrain, srgb8_from_linear(albedo.values), False, about, lamps), {}
 
