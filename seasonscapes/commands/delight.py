@@ -8,9 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from seasonscapes.commands.arguments import check_suffix, parse_sun, parse_time
+from seasonscapes.commands.arguments import parse_sun, parse_time
 from seasonscapes.commands.console import message, print_result, progress_bars
+from seasonscapes.commands.delight_mesh import delight_mesh_file, require_no_scene_flags
+from seasonscapes.commands.mesh_options import MESH_SUFFIXES, MeshFileFlags, MeshFlags
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
+from seasonscapes.commands.outputs import check_output
 from seasonscapes.errors import InputError
 
 if TYPE_CHECKING:
@@ -28,6 +31,8 @@ def delight_command(
     output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("out/albedo.npz"),
     sky: SkyOptions | None = None,
     place: PlaceOptions | None = None,
+    mesh: MeshFlags | None = None,
+    files: MeshFileFlags | None = None,
     json: bool = False,
 ) -> None:
     """Take the light of its hour out of an image: sun, cast shadows, skylight and light from other slopes.
@@ -35,7 +40,8 @@ def delight_command(
     Parameters
     ----------
     source
-        A scene file with an image, or the name of a bundled scene.
+        A scene file with an image, or the name of a bundled scene; or a textured mesh (.glb, .gltf, .obj with MTL,
+        .ply), whose textures or vertex colours are delit.
     time
         When the image was taken, ISO 8601; without an offset it is civil time at the place. unknown: its sun is found
         from shading and cast shadows, or the command says that it cannot be told.
@@ -48,13 +54,23 @@ def delight_command(
         and mosaics are mostly corrected for it.
     output
         .npz (albedo, σ, source and visibility of the sun of each texel), .png or .exr (albedo and σ); all of
-        them can be given back with --albedo DATE=FILE.
+        them can be given back with --albedo DATE=FILE. Of a mesh: .glb, or the same kind of file with the same
+        texture coordinates.
     json
         Print one machine-readable record.
     """
     start = clock.perf_counter()
     sky, options = sky or SkyOptions(), place or PlaceOptions()
-    check_suffix(output, (".npz", ".png", ".exr"))
+    if Path(source).suffix.lower() in MESH_SUFFIXES:
+        require_no_scene_flags(place, image=image, sensor_height_m=sensor_height_m)
+        flags, written = mesh or MeshFlags(), files or MeshFileFlags()
+        delight_mesh_file(
+            Path(source), output, (time, sun), mesh=flags, files=written, sky=sky, place=options, json=json
+        )
+        return
+    if mesh is not None or files is not None:
+        raise InputError(source, "flags of meshes beside a scene", cure="leave out --at, --up, --crs, --bits and such")
+    check_output(output, (".npz", ".png", ".exr"))
     if (time is None) == (sun is None):
         raise InputError("--time", "give either --time (or --time unknown) or --sun AZIMUTH,ELEVATION")
     angles = None if sun is None else parse_sun(sun)

@@ -18,6 +18,7 @@ import numpy as np
 
 from seasonscapes.civil_time import resolve_time
 from seasonscapes.errors import InputError
+from seasonscapes.frames import LocalFrame
 from seasonscapes.progress import TaskProgress
 from seasonscapes.sky.atmosphere import Atmosphere
 from seasonscapes.sky.clear_sky import AtmosphereTables, atmosphere_tables, load_tables, save_tables
@@ -346,7 +347,12 @@ def position_at(place: Place, time: datetime) -> SunMoonPosition:
 
 
 def given_sun_position(place: Place, azimuth_deg: float, elevation_deg: float) -> SunMoonPosition:
-    """A sun at stated angles over a place, without a moon; its instant stands for no date.
+    """A sun at stated angles over a place; see `given_sun_in_frame`."""
+    return given_sun_in_frame(place.frame, azimuth_deg, elevation_deg)
+
+
+def given_sun_in_frame(frame: LocalFrame, azimuth_deg: float, elevation_deg: float) -> SunMoonPosition:
+    """A sun at stated angles over the origin of a frame, without a moon; its instant stands for no date.
 
     Raises
     ------
@@ -356,9 +362,10 @@ def given_sun_position(place: Place, azimuth_deg: float, elevation_deg: float) -
     if not (-360.0 <= azimuth_deg <= 360.0 and -18.0 <= elevation_deg <= 90.0):
         expected = "azimuth -360 to 360, elevation -18 to 90"
         raise InputError("--sun", "out of range", got=f"{azimuth_deg:g},{elevation_deg:g}", expected=expected)
-    position = position_at(place, datetime(2024, 6, 1, 12, tzinfo=UTC))
+    instant = datetime(2024, 6, 1, 12, tzinfo=UTC)
+    position = sun_moon_position(instant, frame.latitude_deg, frame.longitude_deg, frame.height_m)
     hidden = replace(position.moon, elevation_deg=-60.0, true_elevation_deg=-60.0)
-    return SunMoonPosition(position.time, SolarPosition(azimuth_deg, elevation_deg, elevation_deg, 1.0), hidden)
+    return SunMoonPosition(instant, SolarPosition(azimuth_deg, elevation_deg, elevation_deg, 1.0), hidden)
 
 
 def tabulate_illumination(

@@ -51,6 +51,7 @@ def atlas_image(place: Place, imagery: Imagery) -> AtlasImage:
         finest_m=0.5 * place.atlas.texel_p50_m,
         encoding=imagery.encoding,
         full_scale=imagery.full_scale,
+        confinement=place.scene.confinement,
     )
     texture = bake_imagery(place.terrain, place.atlas, image)
     clipped = (texture.values >= _CLIPPED[imagery.encoding]) & (texture.weight[..., None] > 0.0)
