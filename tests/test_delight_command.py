@@ -187,8 +187,10 @@ def test_mistakes_get_their_line(case, tmp_path):
         command("delight", case.scene, time="unknown", sun="150,38", output=output)
     with pytest.raises(ss.InputError, match="--sun: not a direction"):
         command("delight", case.scene, sun="south", output=output)
+    bare = case.folder / "bare.toml"
+    bare.write_text(SCENE.partition("[imagery]")[0])
     with pytest.raises(ss.InputError, match=r"no image; add a table \[imagery\]"):
-        command("delight", "alpine_small", sun="150,38", output=output)
+        command("delight", bare, sun="150,38", texel_m=60, output=output)
     with pytest.raises(ss.InputError, match="--image: no such file"):
         command("delight", case.scene, sun="150,38", image=tmp_path / "none.tif", texel_m=60, output=output)
     with pytest.raises(ss.InputError, match="--time: no daylight"):
