@@ -15,7 +15,7 @@ from pydantic import Field, PrivateAttr, model_validator
 
 from seasonscapes.cameras.pinhole import Camera, camera_at
 from seasonscapes.cameras.webcam import Webcam
-from seasonscapes.declaration import MOST_NAME_CHARACTERS, Declaration, InputError, Name, read_declaration
+from seasonscapes.declaration import MOST_NAME_CHARACTERS, Declaration, InputError, Name, Text, read_declaration
 from seasonscapes.frames import STANDARD_REFRACTION_K, Latitude, LocalFrame, Longitude
 from seasonscapes.terrain.raster_files import OWN_FOLDER, Confinement, confined_path, raster_hash
 
@@ -154,7 +154,15 @@ class Imagery(Declaration):
         Red, green and blue bands of the file, counted from 1; left out, those that the file marks.
     reflectance_scale
         Reflectance of a white pixel. Display images are contrast-stretched, so that their white is not a reflectance
-        of 1; 0.5 brings the meadows and rock of an Alpine mosaic to the reflectances of field spectra.
+        of 1; 0.5 brings the meadows and rock of an Alpine mosaic to the reflectances of field spectra. Of an image whose
+        light is taken out: the reflectance of level ground that is white in it.
+    time
+        When the image was taken, ISO 8601, without offset civil time at the place; or ``"unknown"``, then its sun is
+        estimated from shading and cast shadows. Its light is taken out before the image is used.
+    sun_deg
+        Azimuth and elevation of the sun in the image [deg], where they are known and the time is not.
+    delit
+        The image holds no light: a reflectance product, or one whose light was taken out before.
     """
 
     file: str
@@ -162,6 +170,19 @@ class Imagery(Declaration):
     full_scale: float | None = Field(default=None, gt=0.0)
     bands: list[int] | None = Field(default=None, min_length=1, max_length=3)
     reflectance_scale: float = Field(default=0.5, gt=0.0, le=2.0)
+    time: str | None = None
+    sun_deg: tuple[float, float] | None = None
+    delit: bool = False
+
+    @model_validator(mode="after")
+    def _one_light(self) -> Imagery:
+        if (self.time is not None) + (self.sun_deg is not None) + self.delit > 1:
+            raise ValueError("give one of 'time' (when it was taken), 'sun_deg' and 'delit = true' (it holds no light)")
+        if self.sun_deg is not None and not (-360.0 <= self.sun_deg[0] <= 360.0 and 0.0 < self.sun_deg[1] <= 90.0):
+            raise ValueError(
+                f"sun_deg: got {list(self.sun_deg)}, expected azimuth and elevation above the horizon [deg]"
+            )
+        return self
 
 
 # A cropped picture may not hold its principal point at all.
@@ -250,8 +271,8 @@ class SceneFile(Declaration):
     """
 
     name: str = Field(pattern=r"^[a-z0-9][a-z0-9_-]*$", max_length=MOST_NAME_CHARACTERS)
-    title: str = ""
-    attribution: str = ""
+    title: Text = ""
+    attribution: Text = ""
     vertical_datum: VerticalDatum = "unknown"
     refraction_k: float = Field(default=STANDARD_REFRACTION_K, ge=0.0, lt=0.9)
     origin: Origin | None = None

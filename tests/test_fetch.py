@@ -22,10 +22,10 @@ from places import hill_heights, write_raster
 from pvlib.solarposition import get_solarposition
 
 import seasonscapes as ss
-from seasonscapes.commands.fetch_arguments import parse_extent, parse_interval
 from seasonscapes.errors import InputError
 from seasonscapes.images import linear_from_srgb
 from seasonscapes.open_data import remote
+from seasonscapes.open_data.requests_as_text import parse_extent, parse_interval
 from seasonscapes.terrain.crs import geodetic_from_map, map_from_geodetic
 from seasonscapes.terrain.raster import sample_raster
 from seasonscapes.terrain.surface import Raster
@@ -175,7 +175,7 @@ def test_a_place_appears_from_its_coordinates(fetch, url):
     assert height_error(scene).max() < 0.3
     assert colour_error(scene).max() < 2e-3
     told = sources(scene)
-    assert told["imagery"]["time"] == "2024-07-14T10:25:31Z"
+    assert declared["imagery"]["time"] == told["imagery"]["time"] == "2024-07-14T10:25:31Z"
     sun = get_solarposition(pd.DatetimeIndex(["2024-07-14T10:25:31Z"]), *ALPS)
     assert told["imagery"]["sun"]["azimuth_deg"] == pytest.approx(float(sun["azimuth"].iloc[0]), abs=0.1)
     assert told["imagery"]["sun"]["elevation_deg"] == pytest.approx(float(sun["apparent_elevation"].iloc[0]), abs=0.1)

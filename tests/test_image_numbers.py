@@ -45,7 +45,9 @@ def colour(path, **options):
 # ---------------------------------------------------------------------------------------------- which bands
 
 
-@pytest.mark.parametrize("kinds", [[Kind.blue, Kind.green, Kind.red], [Kind.blue, Kind.green, Kind.red, Kind.undefined]])
+@pytest.mark.parametrize(
+    "kinds", [[Kind.blue, Kind.green, Kind.red], [Kind.blue, Kind.green, Kind.red, Kind.undefined]]
+)
 def test_bands_are_the_colours_that_the_file_marks(tmp_path, kinds):
     values = bands([*MEADOW[::-1], 200][: len(kinds)])
     path = written(tmp_path, values, kinds)
@@ -195,7 +197,9 @@ def test_land_without_an_image_is_told_each_time_also_from_the_workspace(tmp_pat
 def test_wishes_for_texels_that_cannot_be_met_are_told(tmp_path, scene, caplog):
     options = MeshOptions(texel_m=5.0, max_side_px=64)
     assert any("--texel-m: texels of 5 m" in line for line in told_of(scene(), caplog, tmp_path / "w", options))
-    write_tiff(tmp_path / "image.tif", bands(MEADOW, shape=(400, 400)), Affine(3, 0, 420000, 0, -3, 5160000), "EPSG:32632")
+    write_tiff(
+        tmp_path / "image.tif", bands(MEADOW, shape=(400, 400)), Affine(3, 0, 420000, 0, -3, 5160000), "EPSG:32632"
+    )
     text = '[imagery]\nfile = "image.tif"\n'
     options = MeshOptions(max_side_px=64)
     assert any("its pixels of 3 m are finer" in line for line in told_of(scene(text), caplog, tmp_path / "w", options))

@@ -12,7 +12,7 @@ states its standard error and where it comes from.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -97,6 +97,10 @@ class DelightOptions:
         Correct the sky's share of the light from the image.
     rounds
         Iterations of interreflection.
+    land_class
+        ``(R, S)`` integers, −1 for none: classes of land whose response to direct light is fitted one by one, so that
+        their albedo no longer depends on it. Canopies are no Lambertian surfaces, and their sunlight and shade mix
+        within a texel; see `class_response`. ``None`` treats all land as Lambertian.
     light_error, slope_error
         Relative error of the modelled light, and standard error of the cosine of incidence, for σ.
     quantum
@@ -110,6 +114,7 @@ class DelightOptions:
     borders: BorderModel | None = field(default_factory=BorderModel)
     fit_sky: bool = True
     rounds: int = 3
+    land_class: np.ndarray | None = None
     light_error: float = 0.05
     slope_error: float = 0.06
     quantum: float | None = None
@@ -206,7 +211,7 @@ def delight_image(
         shift = texture_shift(image.mean(axis=2), predicted.mean(axis=2), chart >= 0)
         if shift is not None:
             image = shifted_back(image, shift)
-            clipped = shifted_back(clipped.astype(np.float32), shift) > 0.01
+            clipped = np.asarray(shifted_back(clipped.astype(np.float32), shift) > 0.01)
             chart = np.where(np.isfinite(image).all(axis=2), light.chart, -1)
     report(0.1)
     radiance = _at_surface(np.nan_to_num(image) * scale, options.air)
@@ -220,7 +225,10 @@ def delight_image(
                 np.maximum(factor * light.sky + bounce, 1e-3).astype(np.float32),
                 light.visibility,
                 chart,
-                model=options.borders,
+                # Borders are good enough for the sky factor after a rough first pass.
+                model=options.borders
+                if number == options.rounds - 1
+                else replace(options.borders, levels=3, iterations=8),
             )
         sunlight = visibility[..., None] * light.sun
         if options.fit_sky:
@@ -232,6 +240,10 @@ def delight_image(
         bounce = light.bounce(albedo)
         report(0.1 + 0.8 * (number + 1) / options.rounds)
     known = chart >= 0
+    if options.land_class is not None:
+        kind = np.where(known & ~clipped.any(axis=2), options.land_class, -1)
+        illuminance = class_response(radiance, sunlight, illuminance - sunlight, kind)
+        albedo = np.clip(np.pi * radiance / illuminance, LOWEST, HIGHEST).astype(np.float32)
     albedo = _completed(albedo, clipped & known[..., None], known)
     sigma = _standard_error(albedo, image, light, sunlight, illuminance, deviation, options)
     lost = clipped.any(axis=2) & known
@@ -324,6 +336,54 @@ def fitted_sky_factor(
     return result
 
 
+def class_response(radiance: np.ndarray, sunlight: np.ndarray, ambient: np.ndarray, kind: np.ndarray) -> np.ndarray:
+    """Effective illuminance of classes of land: with as much diffuse light as makes their albedo independent of the sun.
+
+    The C correction of Teillet et al. 1982, within each class and channel, with exact cast shadows, sky and
+    interreflection in place of the cosine of incidence alone. The mean illuminance of a class does not change.
+
+    Parameters
+    ----------
+    radiance
+        ``(R, S, 3)`` [cd/m²] that leaves the surface.
+    sunlight, ambient
+        ``(R, S, 3)`` illuminance by the sun, and by sky and other terrain [lx].
+    kind
+        ``(R, S)`` class of each texel, −1 for none; small classes stay as they are.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(R, S, 3)`` effective illuminance [lx].
+    """
+    result = (sunlight + ambient).astype(np.float32)
+    for number in np.unique(kind[kind >= 0]):
+        member = kind == number
+        if member.sum() < _LEAST_PAIRS:
+            continue
+        for channel in range(3):
+            values, sun, diffuse = (
+                array[..., channel][member].astype(float) for array in (radiance, sunlight, ambient)
+            )
+
+            def dependence(
+                logarithm: float, values: np.ndarray = values, sun: np.ndarray = sun, diffuse: np.ndarray = diffuse
+            ) -> float:
+                albedo = values / np.maximum(sun + np.exp(logarithm) * diffuse, 1e-3)
+                low, high = np.percentile(albedo, [1.0, 99.0])
+                keep = (albedo >= low) & (albedo <= high)
+                return float(np.corrcoef(albedo[keep], sun[keep])[0, 1])
+
+            # More diffuse light makes the albedo of sunlit slopes larger: the dependence rises with the factor.
+            low, high = np.log(0.2), np.log(100.0)
+            for _ in range(18):
+                middle = 0.5 * (low + high)
+                low, high = (middle, high) if dependence(middle) < 0.0 else (low, middle)
+            effective = sun + np.exp(0.5 * (low + high)) * diffuse
+            result[..., channel][member] = effective * ((sun + diffuse).mean() / effective.mean())
+    return result
+
+
 def _pairs(sunlight: np.ndarray, ambient: np.ndarray, chart: np.ndarray, most: int = 40_000) -> np.ndarray:
     """Flat indices ``(N, 2)`` of texels a few apart, in the same chart, whose total light differs."""
     index = np.arange(chart.size).reshape(chart.shape)
@@ -345,11 +405,9 @@ def _pairs(sunlight: np.ndarray, ambient: np.ndarray, chart: np.ndarray, most: i
 
 def _completed(albedo: np.ndarray, clipped: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Albedo with its clipped channels completed: from the unclipped ones and the colour of unclipped neighbours."""
-    lost = clipped.any(axis=2)
-    if not lost.any():
-        return albedo
+    lost = np.asarray(clipped.any(axis=2), bool)
     good = known & ~lost
-    if not good.any():
+    if not lost.any() or not good.any():
         return albedo
     # Neighbours' colour: a normalised blur near by, the nearest texel where that reaches nothing.
     share = gaussian_filter(good.astype(np.float32), 3.0)
@@ -357,9 +415,9 @@ def _completed(albedo: np.ndarray, clipped: np.ndarray, known: np.ndarray) -> np
         np.stack([gaussian_filter(np.where(good, albedo[..., k], 0.0), 3.0) for k in range(3)], axis=2)
         / np.maximum(share, 1e-6)[..., None]
     )
-    nearest = distance_transform_edt(~good, return_distances=False, return_indices=True)
+    nearest = np.asarray(distance_transform_edt(~good, return_distances=False, return_indices=True))
     around = np.where((share > 1e-3)[..., None], blurred, albedo[nearest[0], nearest[1]])
-    whole = ~clipped
+    whole = np.equal(clipped, np.zeros_like(clipped))
     ratio = np.where(whole, albedo, 0.0).sum(axis=2) / np.maximum(np.where(whole, around, 0.0).sum(axis=2), 1e-6)
     # A clipped value is a lower bound.
     guess = np.where(whole.any(axis=2)[..., None], around * ratio[..., None], around)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import stat
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, get_args
@@ -35,9 +36,21 @@ def _value(type_: Any, tokens: Sequence[Token]) -> Any:
             raise InputError(name, "not a whole number", got=text, expected="digits, such as 12")
         if float in types and _not_finite(text) and name not in _MAY_BE_INFINITE:
             raise InputError(name, "not a finite number", got=text)
-        if Path in types and not text:
-            raise InputError(name, "an empty name", expected="the name of a file or folder")
+        if Path in types:
+            check_no_device(Path(text) if text else None, name)
     return convert(type_, tokens)
+
+
+def check_no_device(path: Path | None, flag: str) -> None:
+    """`InputError` about an empty name, a pipe or a device: some would be waited for, others never end."""
+    if path is None:
+        raise InputError(flag, "an empty name", expected="the name of a file or folder")
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError):
+        return  # whoever opens it tells what is wrong
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise InputError(flag, "this is a pipe or a device", got=str(path), expected="a file or folder")
 
 
 def _not_finite(text: str) -> bool:
@@ -64,6 +77,7 @@ COMMANDS = (
     ("render", "render", "Render a view of a place at a date and hour."),
     ("timelapse", "timelapse", "Film a view through hours or seasons."),
     ("lit-texture", "lit_texture", "Export a place's texture as lit at an hour."),
+    ("export", "export", "Write a place for other programs: glTF, USD, 3D Tiles, Blender."),
     ("irradiance", "irradiance", "Map the irradiance of the ground at an hour or over a period."),
     ("sky", "sky", "Report the light of a place at an instant, and picture the sky dome."),
     ("terrain", "terrain", "Build a place's terrain and report its quality."),
@@ -74,6 +88,8 @@ COMMANDS = (
     ("inpaint", "inpaint", "Complete a painted texture where no camera saw the surface."),
     ("path", "path", "Make a camera path over a place, clear of the ground, with a map."),
     ("albedo", "albedo", "Recover the albedo of a place from its photographs."),
+    ("delight", "delight", "Take the light of its hour out of an image or a textured mesh."),
+    ("relight", "relight", "Light a textured mesh anew: pictures, lit textures or a film."),
     ("distill", "distill", "Distil a Gaussian model of a place."),
     ("splat", "splat", "Render distilled Gaussians at any hour, or bake them for other programs."),
     ("run", "run", "From photographs to pictures of any hour: all stages, resumable."),

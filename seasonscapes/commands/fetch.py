@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from seasonscapes.commands.arguments import parse_at
 from seasonscapes.commands.console import print_result, progress_bars
-from seasonscapes.commands.fetch_arguments import parse_extent, parse_interval
+from seasonscapes.open_data.requests_as_text import parse_extent, parse_interval
 
 
 def fetch_command(

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 
 _MOST_FRAMES = 200_000
 _SIZE = "1536x1024"
+# What a view keeps of each pixel at least, in single precision: radiance, surface radiance, albedo, position and normal of
+# three numbers each, uv of two, depth and alpha.
+_BYTES_PER_PIXEL = 4 * (5 * 3 + 2 + 2)
 
 
 @Parameter(name="*")
@@ -42,7 +45,15 @@ class ViewOptions:
     """WIDTHxHEIGHT in pixels; 1536x1024, or with a calibration record the shape of its picture."""
 
     def size_px(self) -> tuple[int, int]:
-        """Width and height."""
+        """Width and height; `InputError` where a picture of that size would not fit into memory."""
+        from seasonscapes.terrain.memory import require_bytes
+
+        width, height = self._shape()
+        needed, got = width * height * _BYTES_PER_PIXEL, f"{width}x{height}"
+        require_bytes(needed, where="--size", got=got, cure="choose a smaller one")
+        return width, height
+
+    def _shape(self) -> tuple[int, int]:
         record = self._record
         if record is None:
             return parse_size(self.size or _SIZE)

@@ -128,4 +128,6 @@ def egm96_m(latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> np.ndarray:
 
     latitude, longitude = np.broadcast_arrays(np.asarray(latitude_deg, float), np.asarray(longitude_deg, float))
     row, column = (90.0 - latitude) * _PER_DEG, longitude % 360.0 * _PER_DEG + _MARGIN
-    return map_coordinates(_egm96_cm(), [row, column], order=3, mode="nearest", output=np.float64) / 100.0
+    places = [row.ravel(), column.ravel()]
+    undulation_cm = map_coordinates(_egm96_cm(), places, order=3, mode="nearest", output=np.float64)
+    return undulation_cm.reshape(row.shape) / 100.0

@@ -195,7 +195,7 @@ def _glb(path: Path) -> np.ndarray:
     start = part.byteOffset or 0
     with tempfile.TemporaryDirectory() as folder:
         picture = Path(folder) / "texture.png"
-        picture.write_bytes(document.binary_blob()[start : start + part.byteLength])
+        picture.write_bytes((document.binary_blob() or b"")[start : start + part.byteLength])
         return _png(picture)
 
 

@@ -25,7 +25,7 @@ from seasonscapes.open_data.local_files import LocalRaster, local_colours, local
 from seasonscapes.open_data.remote import RemoteStore
 from seasonscapes.open_data.sources import Source, read_source, source_of
 from seasonscapes.progress import Progress, task_progress
-from seasonscapes.scene import Imagery, SceneFile
+from seasonscapes.scene import SceneFile
 from seasonscapes.sky.ephemeris import sun_position
 from seasonscapes.terrain.mosaic import MapGrid, grid_about
 from seasonscapes.terrain.raster import fill_nodata
@@ -551,7 +551,7 @@ def _scene_text(
             lines += ['encoding = "linear"', f"full_scale = {_FULL_SCALE}", "reflectance_scale = 1.0"]
         else:
             lines += ['encoding = "srgb"']
-        if image.time is not None and "time" in Imagery.model_fields:
+        if image.time is not None:
             lines += [f"time = {_toml(_iso(image.time))}"]
     for view in views:
         lines += ["", "[[camera]]"] + [f"{key} = {_toml(value)}" for key, value in asdict(view).items()]

@@ -1,4 +1,4 @@
-"""Extents and intervals as text on the command line."""
+"""Extents and intervals as people write them."""
 
 from __future__ import annotations
 
