@@ -15,6 +15,7 @@ from affine import Affine
 from pyproj import Transformer
 
 from seasonscapes.images import srgb_from_linear
+from seasonscapes.workspace import file_hash
 
 Field = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -261,8 +262,9 @@ def _swisstopo(
     nodata = -9999.0 if bands.dtype == np.float32 else None
     world.raster(world.folder / "files" / collection / file, bands, "EPSG:2056", transform, nodata=nodata)
     fine = f"{name}_{0.5 if 'alti' in name else 0.1}{ending}.tif"
-    assets = {
+    assets: dict[str, dict] = {
         key: {"href": f"{{base}}/files/{collection}/{key}", "type": "image/tiff; application=geotiff", "gsd": gsd}
         for key, gsd in ((fine, 0.5 if "alti" in name else 0.1), (file, 2.0))
     }
+    assets[file]["file:checksum"] = "1220" + file_hash(world.folder / "files" / collection / file)
     world.item(collection, name, bbox, {"datetime": f"{year}-01-01T00:00:00Z"}, assets)

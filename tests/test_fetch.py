@@ -272,6 +272,7 @@ def test_swiss_tiles_are_the_newest_of_the_spacing_that_is_needed(fetch):
     assert told["time"] is None
     assert told["report"]["years"] == [2023]
     assert len(sources(scene)["elevation"]["items"]) == 9
+    assert any(item["checksum_verified"] for item in sources(scene)["elevation"]["items"])
 
 
 def test_a_folder_of_tiles_is_a_place_too(world, tmp_path):
@@ -433,6 +434,17 @@ def test_a_truncated_file_is_told(fetch, world, tmp_path):
         path.write_bytes(whole)
     assert path.name in line
     assert "damaged, cut short or no GeoTIFF" in line
+
+
+def test_a_file_of_another_checksum_is_told(fetch, world, tmp_path):
+    stated = world.folder / "items" / "ch.swisstopo.swissalti3d" / "swissalti3d_2023_2600-1200.json"
+    right = stated.read_text()
+    stated.write_text(right.replace('"1220', '"1220ff'))
+    try:
+        line = failure(fetch, BERN, tmp_path, elevation="swissalti3d", imagery="none", size="1.6km", resolution=2)
+    finally:
+        stated.write_text(right)
+    assert "not the file whose checksum the catalogue states" in line
 
 
 def test_a_missing_file_is_told(fetch, world, tmp_path):

@@ -479,6 +479,7 @@ def _items(used: list[AssetUse], files: list[LocalRaster], store: RemoteStore) -
     items = []
     for use in {use.asset["href"]: use for use in used}.values():
         state = store.known_state(use.asset["href"])
+        checksum = use.asset.get("file:checksum") or use.asset.get("checksum:multihash")
         items.append(
             {
                 "source": use.source,
@@ -487,7 +488,8 @@ def _items(used: list[AssetUse], files: list[LocalRaster], store: RemoteStore) -
                 "time": None if use.item.time is None else _iso(use.item.time),
                 "etag": None if state is None else state.tag,
                 "bytes": None if state is None else state.size,
-                "stated_checksum": use.asset.get("file:checksum") or use.asset.get("checksum:multihash"),
+                "checksum": checksum,
+                "checksum_verified": store.verify(use.asset["href"], None if checksum is None else str(checksum)),
                 "processing_baseline": use.item.properties.get("s2:processing_baseline"),
             }
         )
