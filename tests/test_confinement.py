@@ -300,7 +300,7 @@ def test_run_copies_nothing_from_outside(tmp_path, capsys):
 
 
 def test_rasters_are_opened_and_arrays_unpickled_nowhere_else():
-    """Rasters are opened for reading in `raster_files` alone; nothing is ever unpickled."""
+    """Rasters are opened for reading in `raster_files` alone, and on servers in `open_data.remote`; nothing is unpickled."""
     import ast
 
     import seasonscapes
@@ -320,5 +320,5 @@ def test_rasters_are_opened_and_arrays_unpickled_nowhere_else():
                 unpickled.add(path.name)
             if name == "torch.load" and options.get("weights_only") != "True":
                 unpickled.add(path.name)
-    assert opened == {"raster_files.py"}
+    assert opened == {"raster_files.py", "remote.py"}
     assert unpickled == set()

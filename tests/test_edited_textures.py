@@ -89,6 +89,16 @@ def test_render_takes_an_edited_picture(scene, place, tmp_path):
     assert (land[..., 0] > 1.5 * land[..., 2]).mean() > 0.9
 
 
+def test_an_albedo_brings_its_atlas_along(scene, lit, tmp_path):
+    """Made with texels of 60 m, it is accepted without saying so again; other texels asked for are refused."""
+    out = tmp_path / "view.png"
+    common = {"camera": "aerial", "time": TIME, "sky": "hosek", "size": "24x16", "output": out}
+    command("render", scene, albedo=f"2024-07-20={lit['png']}", **common)
+    assert out.is_file()
+    with pytest.raises(AtlasMismatch):
+        command("render", scene, albedo=f"2024-07-20={lit['png']}", texel_m=90, **common)
+
+
 def _figure(place, folder: Path) -> Path:
     from seasonscapes.workflows.edited_textures import texture_facts
     from seasonscapes.workflows.pictures import png_metadata
