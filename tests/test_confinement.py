@@ -312,10 +312,10 @@ def test_rasters_are_opened_and_arrays_unpickled_nowhere_else():
                 continue
             name, options = ast.unparse(node.func), {word.arg: ast.unparse(word.value) for word in node.keywords}
             modes = [ast.unparse(value) for value in node.args[1:2]] + [options.get("mode")]
-            # A file of a server is read by `fetch`, as nothing but a GeoTIFF, and through this program's own bytes.
-            remote = path.name == "remote.py" and options.get("driver") == "'GTiff'" and "opener" in options
-            if name in ("rasterio.open", "rasterio.io.DatasetReader") and "'w'" not in modes and not remote:
+            if name in ("rasterio.open", "rasterio.io.DatasetReader") and "'w'" not in modes:
                 opened.add(path.name)
+                # A file of a server is nothing but a GeoTIFF, and read through bytes of this program's own.
+                assert path.name != "remote.py" or (options.get("driver") == "'GTiff'" and "opener" in options)
             if name in ("pickle.load", "pickle.loads") or options.get("allow_pickle") == "True":
                 unpickled.add(path.name)
             if name == "torch.load" and options.get("weights_only") != "True":
