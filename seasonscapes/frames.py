@@ -11,7 +11,7 @@ Conventions of the whole package:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -58,6 +58,20 @@ def normal_longitude(longitude_deg: float) -> float:
 # What declarations state of a place, WGS 84 [deg]: longitudes of 180…360° mean their equals of −180…0°.
 Latitude = Annotated[float, Field(ge=-90.0, le=90.0)]
 Longitude = Annotated[float, Field(ge=-180.0, le=360.0), AfterValidator(normal_longitude)]
+
+
+def frame_record(frame: LocalFrame) -> dict[str, Any]:
+    """Describe a local frame as plain values for files: its coordinate reference systems and its origin."""
+    return {
+        "crs": "local east-north-up [m] about the origin, through ECEF (EPSG:4978)",
+        "geographic_crs": "EPSG:4979",
+        "origin": {
+            "latitude_deg": frame.latitude_deg,
+            "longitude_deg": frame.longitude_deg,
+            "height_m": frame.height_m,
+            "refraction_k": frame.refraction_k,
+        },
+    }
 
 
 def ecef_from_geodetic(latitude_deg: ArrayLike, longitude_deg: ArrayLike, height_m: ArrayLike) -> np.ndarray:

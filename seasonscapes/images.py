@@ -6,6 +6,8 @@ sRGB encoding is used in files only. Exposure is EV100: ``luminance = 2**EV100 *
 
 from __future__ import annotations
 
+import errno
+import io
 import json
 import logging
 import os
@@ -55,8 +57,8 @@ def writes_noted(note: Callable[[Path], None]) -> Iterator[None]:
 def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     """Context manager for atomic writing: a temporary path that replaces ``path`` when the block succeeds.
 
-    After an exception in the block ``path`` is unchanged and the temporary file is removed. The temporary name keeps
-    the suffix, since many writers choose the format by it.
+    After an exception in the block ``path`` is unchanged and the temporary file is removed; an `OSError` about the
+    temporary file names ``path``. The temporary name keeps the suffix, since many writers choose the format by it.
 
     Parameters
     ----------
@@ -75,7 +77,10 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     for note in tuple(_notes):
         note(Path(name))
         note(path)
-    os.close(os.open(name, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
+    try:
+        os.close(os.open(name, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
     temporary = Path(name)
     try:
         yield temporary
@@ -84,8 +89,32 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
         os.umask(umask)
         temporary.chmod(0o666 & ~umask)
         os.replace(temporary, path)
+    except Exception as error:
+        trouble = _trouble_of_writing(error, name, path)
+        if trouble is None:
+            raise
+        raise trouble from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _trouble_of_writing(error: Exception, temporary: str, path: Path) -> OSError | None:
+    """The `OSError` about ``path`` that an exception stands for, or ``None`` if it is none or about another file.
+
+    A full disk is reported with the temporary name or with none; OpenEXR, safetensors and GDAL report it in exceptions of
+    their own, by the system's words.
+    """
+    if isinstance(error, OSError) and error.errno is not None:
+        if error.filename not in (None, temporary, Path(temporary)):
+            return None
+        return OSError(error.errno, error.strerror, str(path))
+    said = str(error).lower()
+    for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EIO):
+        if os.strerror(number).lower() in said:
+            return OSError(number, os.strerror(number), str(path))
+    if "failed to write" in said:
+        return OSError(errno.EIO, f"cannot be written ({error})", str(path))
+    return None
 
 
 def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
@@ -110,6 +139,11 @@ def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
     """
     linear = np.clip(linear, 0.0, 1.0)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.power(linear, 1.0 / 2.4) - 0.055)
+
+
+def srgb8_from_linear(linear: np.ndarray) -> np.ndarray:
+    """Encode linear values ``(...)``, clipped to [0, 1], as sRGB levels, uint8, without dithering."""
+    return np.rint(srgb_from_linear(linear) * 255.0).astype(np.uint8)
 
 
 def linear_from_srgb(encoded: ArrayLike) -> np.ndarray:
@@ -280,7 +314,7 @@ def write_png(path: str | os.PathLike, image: np.ndarray, *, metadata: Mapping[s
 
 
 def write_png8(path: str | os.PathLike, levels: np.ndarray, *, metadata: Mapping[str, str] | None = None) -> None:
-    """Write 8-bit levels as a PNG, atomically.
+    """Write 8-bit levels as a PNG, atomically; see `png8_bytes`.
 
     Parameters
     ----------
@@ -291,14 +325,39 @@ def write_png8(path: str | os.PathLike, levels: np.ndarray, *, metadata: Mapping
     metadata
         Key-value pairs for the PNG's international text chunks.
     """
+    encoded = png8_bytes(levels, metadata=metadata)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(encoded)
+
+
+def png8_bytes(levels: np.ndarray, *, metadata: Mapping[str, str] | None = None) -> bytes:
+    """Encode 8-bit levels as a PNG whose colours are declared to be sRGB.
+
+    Parameters
+    ----------
+    levels
+        sRGB-encoded levels ``(H, W, 3)``, or grey levels ``(H, W)`` (masks, counts), whose scale is not declared; uint8.
+    metadata
+        Key-value pairs for the PNG's international text chunks.
+
+    Returns
+    -------
+    bytes
+        The file's content.
+    """
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 
     info = PngInfo()
+    if levels.ndim == 3:
+        # Rendering intent 0 (perceptual); gAMA of 1 / 2.2 for readers that do not know the chunk (PNG 3rd ed., 11.3.2.5).
+        info.add(b"sRGB", b"\x00")
+        info.add(b"gAMA", (45455).to_bytes(4, "big"))
     for key, value in (metadata or {}).items():
         info.add_itxt(key, value)
-    with atomic_path(path) as temporary:
-        Image.fromarray(np.ascontiguousarray(levels)).save(temporary, format="PNG", pnginfo=info)
+    encoded = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(levels)).save(encoded, format="PNG", pnginfo=info)
+    return encoded.getvalue()
 
 
 # Formats of photographs. Pillow reads more, and some of them run other programs (EPS).

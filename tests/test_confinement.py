@@ -221,6 +221,15 @@ def test_a_camera_or_scene_of_such_a_name_is_refused(tmp_path, name):
         assert len(str(error.value)) < 600
 
 
+@pytest.mark.parametrize("text", [r"a\u001b[2Jb", r"a\u0000b", r"a\u0007b", "a" * 3000])
+def test_texts_that_could_steer_a_terminal_are_refused(tmp_path, text):
+    for key in ("title", "attribution"):
+        scene = "\n".join(line for line in places.SCENE.splitlines() if not line.startswith(key))
+        with pytest.raises(InputError, match=key) as error:
+            read_scene(places.write_place(tmp_path, f'{key} = "{text}"\n{scene}'))
+        assert str(error.value).isprintable()
+
+
 def test_names_that_differ_in_case_alone_are_one_file(tmp_path):
     with pytest.raises(InputError, match="two cameras are named"):
         read_scene(places.write_place(tmp_path, places.SCENE + CAMERA.replace('"south"', '"South"')))
@@ -269,3 +278,29 @@ def test_run_copies_nothing_from_outside(tmp_path, capsys):
         assert main(arguments) == 2
         assert len(capsys.readouterr().err.strip().splitlines()[-1]) < 500
     assert sorted(each.name for each in tmp_path.iterdir()) == ["scene", "secret.txt", "work"]
+
+
+# ------------------------------------------------------------------------------------------------- the code
+
+
+def test_rasters_are_opened_and_arrays_unpickled_nowhere_else():
+    """Rasters are opened for reading in `raster_files` alone; nothing is ever unpickled."""
+    import ast
+
+    import seasonscapes
+
+    package, opened, unpickled = Path(seasonscapes.__file__).parent, set(), set()
+    for path in package.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.Call):
+                continue
+            name, options = ast.unparse(node.func), {word.arg: ast.unparse(word.value) for word in node.keywords}
+            modes = [ast.unparse(value) for value in node.args[1:2]] + [options.get("mode")]
+            if name in ("rasterio.open", "rasterio.io.DatasetReader") and "'w'" not in modes:
+                opened.add(path.name)
+            if name in ("pickle.load", "pickle.loads") or options.get("allow_pickle") == "True":
+                unpickled.add(path.name)
+            if name == "torch.load" and options.get("weights_only") != "True":
+                unpickled.add(path.name)
+    assert opened == {"raster_files.py"}
+    assert unpickled == set()

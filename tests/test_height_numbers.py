@@ -195,7 +195,7 @@ def test_a_raster_that_declares_more_than_the_memory_holds_is_refused_before_it_
 
 def test_free_memory_is_asked_of_the_machine():
     check_memory((10, 10), "a.tif")
-    with pytest.raises(InputError, match="a.tif: too many samples"):
+    with pytest.raises(InputError, match=r"a\.tif: too many samples"):
         check_memory((10**8, 10**8), "a.tif")
 
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from seasonscapes.albedo.footprints import Footprints
 from seasonscapes.rendering.air_grid import AirGrid, SkyGrid, air_grid, interpolate_air, sky_grid, sky_pixel_radiance
-from seasonscapes.rendering.hemisphere_rays import RayScene, ray_scene, texture_at
+from seasonscapes.rendering.hemisphere_rays import RayScene, SurfacePoints, ray_scene, texture_at
 from seasonscapes.rendering.irradiance import DevicePoints, surface_at, upload_points
 from seasonscapes.rendering.receivers import DeviceClusters, incident_light, light_clusters, luminaries
 from seasonscapes.rendering.sun_visibility import visible_cosine
@@ -102,8 +102,41 @@ def trace_texel_transport(
     points, texel = surface_at(grey, position.reshape(-1, 3))
     if len(texel) == 0:
         raise ValueError("trace_texel_transport: no texel lies on the terrain")
-    coefficients = trace_points(grey, points, sampling, seed=seed, number=texel, progress=progress)
-    return TexelTransport(grey, shape, texel, points.origin, points.normal, upload_points(grey, coefficients))
+    return transport_of_points(grey, shape, points, texel, sampling=sampling, seed=seed, progress=progress)
+
+
+def transport_of_points(
+    surface: RayScene,
+    shape: tuple[int, int],
+    points: SurfacePoints,
+    texel: np.ndarray,
+    *,
+    sampling: SamplingOptions = TEXEL_SAMPLING,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> TexelTransport:
+    """Trace the daylight coefficients of texels whose surface points are known.
+
+    Parameters
+    ----------
+    surface
+        The surface, in a medium grey.
+    shape
+        Rows and columns R, S of the texture.
+    points
+        N surface points of texels.
+    texel
+        ``(N,)`` flat indices of these texels.
+    sampling, seed, progress
+        See `trace_texel_transport`.
+
+    Returns
+    -------
+    TexelTransport
+        Coefficients of these texels.
+    """
+    coefficients = trace_points(surface, points, sampling, seed=seed, number=texel, progress=progress)
+    return TexelTransport(surface, shape, texel, points.origin, points.normal, upload_points(surface, coefficients))
 
 
 def clusters_with_albedo(clusters: DeviceClusters, albedo: np.ndarray) -> DeviceClusters:

@@ -24,6 +24,7 @@ from seasonscapes.cameras.webcam import Webcam
 from seasonscapes.declaration import checked_name
 from seasonscapes.errors import InputError, UnreadableImage
 from seasonscapes.images import atomic_path, picture_size, read_image_linear, read_image_srgb
+from seasonscapes.text_files import read_text
 
 COLUMNS = ("webcam", "time_utc", "path", "bytes", "sha256")
 # Folder layout of the reference repository, with placeholders for parts of the path.
@@ -289,23 +290,20 @@ def read_manifest(path: Path, *, allow_outside: bool = False) -> list[ManifestRo
         The file is missing or not UTF-8, a column is missing, or a line is invalid: no time, a webcam that is no name
         (`declaration.checked_name`), or a path that leads out of the manifest's folder.
     """
+    reader = csv.reader(read_text(path).splitlines())
     try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file)
-            header = next(reader, None) or []
-            missing = [name for name in COLUMNS[:3] if name not in header]
-            if missing:
-                raise InputError(path, f"column {missing[0]!r} is missing", expected=",".join(COLUMNS))
-            columns = [header.index(name) if name in header else None for name in COLUMNS]
-            rows = [_row(path, number, cells, columns) for number, cells in enumerate(reader, 2) if cells]
-            if not allow_outside:
-                for number, row in enumerate(rows, 1):
-                    _require_below(row.path, f"{path}: row {number}")
-            return rows
-    except FileNotFoundError:
-        raise InputError(path, "no such file") from None
-    except UnicodeDecodeError as error:
-        raise InputError(path, f"not UTF-8 text: {error}") from None
+        header = next(reader, None) or []
+        missing = [name for name in COLUMNS[:3] if name not in header]
+        if missing:
+            raise InputError(path, f"column {missing[0]!r} is missing", expected=",".join(COLUMNS))
+        columns = [header.index(name) if name in header else None for name in COLUMNS]
+        rows = [_row(path, number, cells, columns) for number, cells in enumerate(reader, 2) if cells]
+    except csv.Error as error:
+        raise InputError(path, f"line {reader.line_num} is no row of a table: {error}") from None
+    if not allow_outside:
+        for number, row in enumerate(rows, 1):
+            _require_below(row.path, f"{path}: row {number}")
+    return rows
 
 
 def _row(path: Path, number: int, cells: list[str], columns: list[int | None]) -> ManifestRow:

@@ -33,7 +33,7 @@ class PlaceOptions:
     workspace: Path | None = None
     """Folder for built artefacts; default SEASONSCAPES_WORKSPACE or the user's cache."""
     allow_outside: bool = False
-    """Let the scene file name data outside its folder."""
+    """Trust the scene: data and pictures outside its folder, any raster format, servers."""
 
     def folder(self) -> Workspace:
         """The workspace asked for."""

@@ -10,6 +10,7 @@ from cyclopts import Parameter
 from seasonscapes.commands.arguments import parse_times
 from seasonscapes.commands.console import print_result, progress_bars
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
+from seasonscapes.commands.outputs import check_output_folder
 from seasonscapes.commands.run_options import RunEffort, RunPictureOptions
 from seasonscapes.commands.view_options import ViewOptions
 
@@ -54,6 +55,7 @@ def run_command(
     json
         Print one machine-readable record.
     """
+    check_output_folder(output)
     options, view, sky = place or PlaceOptions(), view or ViewOptions(size="768x512"), sky or SkyOptions()
     photographs, distil = pictures or RunPictureOptions(), (effort or RunEffort()).values()
     found, model, size_px = photographs.values(allow_outside=options.allow_outside), sky.model(), view.size_px()

@@ -121,6 +121,39 @@ def _surface_below(terrain: RayScene, start_m: np.ndarray, search_m: float) -> t
     return surface_points(terrain, interaction, found), np.array(found)
 
 
+def points_on_faces(terrain: RayScene, face: np.ndarray, weights: np.ndarray) -> SurfacePoints:
+    """Find surface points by face and barycentric coordinates, also on overhangs and vertical walls.
+
+    Parameters
+    ----------
+    terrain
+        The mesh.
+    face
+        ``(N,)`` face of each point.
+    weights
+        ``(N, 3)`` barycentric coordinates in the face.
+
+    Returns
+    -------
+    SurfacePoints
+        The front of the surface at N points.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    mi_face, mi_mesh = mi.UInt32(np.ascontiguousarray(face, np.uint32)), terrain.mi_terrain
+    corner = mi_mesh.face_indices(mi_face)
+    a, b, c = (mi_mesh.vertex_position(index) for index in (corner.x, corner.y, corner.z))
+    preliminary: Any = dr.zeros(mi.PreliminaryIntersection3f, len(face))
+    preliminary.t, preliminary.prim_index = 1.0, mi_face
+    preliminary.prim_uv = mi.Point2f(*(np.ascontiguousarray(weights[:, k], np.float32) for k in (1, 2)))
+    # Seen from the front.
+    ray = mi.Ray3f(a, -dr.normalize(dr.cross(b - a, c - a)))
+    active = mi.Bool(np.ones(len(face), bool))
+    interaction = mi_mesh.compute_surface_interaction(ray, preliminary, mi.RayFlags.All, active)
+    return surface_points(terrain, interaction, active)
+
+
 def upload_points(terrain: RayScene, coefficients: PointCoefficients) -> DevicePoints:
     """Copy coefficients to the device.
 

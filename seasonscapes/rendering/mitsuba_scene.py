@@ -99,7 +99,8 @@ def mi_mesh(terrain: Terrain, albedo: np.ndarray, *, smooth: bool = True) -> Any
     parameters.update()
     if smooth:
         # Mitsuba sums vertex normals in parallel; their last bits, and those of images, would vary between runs.
-        parameters["vertex_normals"] = vertex_normals(terrain).ravel()
+        normals = vertex_normals(terrain) if terrain.normals is None else terrain.normals
+        parameters["vertex_normals"] = np.ascontiguousarray(normals, np.float32).ravel()
         parameters.update()
     return mesh
 

@@ -52,6 +52,13 @@ def horizontal_crs(crs: str) -> CRS:
     return parsed
 
 
+def crs_name(crs: str) -> str:
+    """The short name of a CRS: ``EPSG:n`` where it is registered, else the name that it states."""
+    parsed = horizontal_crs(crs)
+    authority = parsed.to_authority(min_confidence=70)
+    return parsed.name if authority is None else ":".join(authority)
+
+
 @lru_cache(maxsize=64)
 def _transformer(crs: str) -> Transformer:
     from pyproj import Transformer

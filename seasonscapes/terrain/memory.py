@@ -44,6 +44,19 @@ def _address_space_left() -> int | None:
     return soft - used
 
 
+def require_bytes(needed: float, *, where: str, got: str, cure: str) -> None:
+    """Raise `InputError` where a piece of work would need more memory than this process may still take."""
+    free = available_bytes()
+    if needed > free:
+        raise InputError(
+            where,
+            "too large for this machine's memory",
+            got=f"{got}, at least {needed / 1e9:.1f} GB",
+            expected=f"at most {free / 1e9:.1f} GB",
+            cure=cure,
+        )
+
+
 def check_memory(shape: tuple[int, ...], where: str | os.PathLike[str]) -> None:
     """Raise `InputError` where a grid of heights, with all that is computed of it, would not fit into memory.
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from seasonscapes import bundled
 from seasonscapes.errors import InputError
-from seasonscapes.frames import LocalFrame, enu_from_geodetic
+from seasonscapes.frames import LocalFrame, enu_from_geodetic, frame_record
 from seasonscapes.progress import Progress, task_progress
 from seasonscapes.scene import SceneFile, read_scene
 from seasonscapes.source_hash import source_hash
@@ -101,6 +101,20 @@ class Place:
     def median_height_m(self) -> float:
         """Median height of the terrain [m]; sun, sky and interreflection are computed for this height."""
         return float(np.median(self.elevation.values))
+
+    @cached_property
+    def about(self) -> dict:
+        """Plain values for the metadata of files: scene, attribution, local frame with its origin, datum and CRS."""
+        from seasonscapes.terrain.crs import crs_name
+
+        record = frame_record(self.frame)
+        record["origin"] |= {"vertical_datum": self.scene.vertical_datum}
+        return {
+            "scene": self.scene.name,
+            "attribution": self.scene.attribution,
+            **record,
+            "source_crs": crs_name(self.elevation.crs),
+        }
 
     def require_texture(self, texture: Texture, *, what: str = "texture") -> Texture:
         """Return the texture, or raise `errors.AtlasMismatch` where it belongs to another atlas."""

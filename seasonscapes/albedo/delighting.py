@@ -1,0 +1,450 @@
+"""Albedo from one lit image of known hour: sun, sky and interreflection divided out texel by texel.
+
+image = scale · (transmittance · albedo / π · (visibility · sun + sky factor · sky + bounce(albedo)) + airlight)
+
+The image may lie a few texels off (`registration`), and its shadows are not quite where the heights put them
+(`shadow_borders`). Interreflection depends on the albedo and is iterated. The sky's share of the light is the least
+certain part of any sky model; it is corrected by what pairs of near texels under different light have in common.
+Texels in shade are recovered from skylight, clipped ones are completed from their neighbours' colour; every texel
+states its standard error and where it comes from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt, gaussian_filter
+
+from seasonscapes.albedo.closed_form import HIGHEST, LOWEST
+from seasonscapes.albedo.registration import shifted_back, texture_shift
+from seasonscapes.albedo.shadow_borders import BorderModel, refined_visibility
+from seasonscapes.errors import NoUsablePixels
+
+# Sources of a texel's albedo, in `DelitImage.source`.
+NOTHING, SUNLIT, SHADED, COMPLETED = 0, 1, 2, 3
+_GREY = 0.25
+# Standard deviation of the logarithm of the sky factor before an image is seen. Neighbouring pairs err alike, and land
+# that differs with its aspect (snow in the shade) misleads all of them: they never count as more than a few observations.
+_SKY_SIGMA, _PAIRS_PER_INDEPENDENT, _MOST_INDEPENDENT = 0.2, 50.0, 25.0
+# Distance of paired texels, across which land is about alike and shadow borders are past [texels].
+_PAIR_TEXELS = 4
+_LEAST_PAIRS = 500
+
+
+@dataclass(frozen=True)
+class TexelIrradiance:
+    """Light on the texels of a texture at one instant [lx]; textures of R rows and S columns.
+
+    Parameters
+    ----------
+    sun
+        ``(R, S, 3)`` illuminance of the inclined surface by the sun, as if nothing cast a shadow on it.
+    visibility
+        ``(R, S)`` predicted share of the sun's disc that is not hidden.
+    sky
+        ``(R, S, 3)`` illuminance by the visible sky.
+    bounce
+        Illuminance ``(R, S, 3)`` by light from other terrain, as a function of the albedo ``(R, S, 3)``.
+    level_lx
+        ``(3,)`` illuminance of level ground without surroundings; the reference of images of unknown exposure.
+    chart
+        ``(R, S)`` integers: neighbouring texels of equal number ≥ 0 adjoin on the surface; −1 off the surface.
+    """
+
+    sun: np.ndarray
+    visibility: np.ndarray
+    sky: np.ndarray
+    bounce: Callable[[np.ndarray], np.ndarray]
+    level_lx: np.ndarray
+    chart: np.ndarray
+
+
+@dataclass(frozen=True)
+class Air:
+    """Air between the surface and the sensor.
+
+    Parameters
+    ----------
+    transmittance, airlight
+        ``(3,)`` or ``(R, S, 3)`` share that passes, and radiance that is added [cd/m²].
+    """
+
+    transmittance: np.ndarray
+    airlight: np.ndarray
+
+
+@dataclass(frozen=True)
+class DelightOptions:
+    """How to remove the light of an image.
+
+    Parameters
+    ----------
+    radiance_per_unit
+        Radiance of the image's value 1 [cd/m²], one number or one for each channel. ``None``: unknown; then an image
+        value of 1 is what level ground of reflectance ``white_reflectance`` sends under the light of that hour.
+    white_reflectance
+        See ``radiance_per_unit``.
+    air
+        Air before the surface; ``None`` for none, as in images corrected for it.
+    register
+        Estimate and remove a shift of the image.
+    borders
+        Weights of the refinement of shadow borders; ``None`` keeps the predicted shadows.
+    fit_sky
+        Correct the sky's share of the light from the image.
+    rounds
+        Iterations of interreflection.
+    land_class
+        ``(R, S)`` integers, −1 for none: classes of land whose response to direct light is fitted one by one, so that
+        their albedo no longer depends on it. Canopies are no Lambertian surfaces, and their sunlight and shade mix
+        within a texel; see `class_response`. ``None`` treats all land as Lambertian.
+    light_error, slope_error
+        Relative error of the modelled light, and standard error of the cosine of incidence, for σ.
+    quantum
+        Standard error of the image's values, for σ: by default that of 8 bits in sRGB.
+    """
+
+    radiance_per_unit: float | np.ndarray | None = None
+    white_reflectance: float = 0.5
+    air: Air | None = None
+    register: bool = True
+    borders: BorderModel | None = field(default_factory=BorderModel)
+    fit_sky: bool = True
+    rounds: int = 3
+    land_class: np.ndarray | None = None
+    light_error: float = 0.05
+    slope_error: float = 0.06
+    quantum: float | None = None
+
+
+@dataclass(frozen=True)
+class DelitImage:
+    """An image without its light.
+
+    Parameters
+    ----------
+    albedo
+        ``(R, S, 3)`` float32; NaN where the image has no value.
+    sigma
+        ``(R, S)`` float32 standard error of the albedo; infinite where there is none.
+    visibility
+        ``(R, S)`` float32 share of the sun's disc that the image shows to be unhidden.
+    source
+        ``(R, S)`` uint8: 0 nothing, 1 sunlit, 2 in shade (from skylight), 3 completed (clipped in the image).
+    shift_texels
+        Rows and columns by which the image lay too far; ``None`` where it was not found or not asked for.
+    sky_factor
+        ``(3,)`` factor on the sky's illuminance that the image asks for.
+    radiance_per_unit
+        ``(3,)`` radiance of the image's value 1 that was used [cd/m²].
+    """
+
+    albedo: np.ndarray
+    sigma: np.ndarray
+    visibility: np.ndarray
+    source: np.ndarray
+    shift_texels: tuple[float, float] | None
+    sky_factor: np.ndarray
+    radiance_per_unit: np.ndarray
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Plain values for files and reports."""
+        surface = max(int((self.source > NOTHING).sum()), 1)
+        return {
+            "shift_texels": None if self.shift_texels is None else [round(float(x), 2) for x in self.shift_texels],
+            "sky_factor": [round(float(x), 3) for x in self.sky_factor],
+            "radiance_per_unit_cd_m2": [round(float(x), 1) for x in self.radiance_per_unit],
+            "sunlit_share": round(float((self.source == SUNLIT).sum() / surface), 4),
+            "shaded_share": round(float((self.source == SHADED).sum() / surface), 4),
+            "completed_share": round(float((self.source == COMPLETED).sum() / surface), 4),
+            "median_sigma": round(float(np.median(self.sigma[self.source > NOTHING])), 4) if surface > 1 else None,
+        }
+
+
+def delight_image(
+    image: np.ndarray,
+    clipped: np.ndarray,
+    light: TexelIrradiance,
+    *,
+    options: DelightOptions | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> DelitImage:
+    """Estimate the albedo of a lit image whose light is known.
+
+    Parameters
+    ----------
+    image
+        ``(R, S, 3)`` scene-linear values, proportional to radiance; NaN where there are none.
+    clipped
+        ``(R, S, 3)`` bool: values at the upper end of the sensor's or file's range.
+    light
+        Light of the image's hour on the texels.
+    options
+        Defaults if ``None``.
+    progress
+        Called with the finished fraction.
+
+    Returns
+    -------
+    DelitImage
+        Albedo, standard error, visibility of the sun, and what was fitted.
+
+    Raises
+    ------
+    NoUsablePixels
+        Where the image has no value on the surface.
+    """
+    options, report = options or DelightOptions(), progress or (lambda fraction: None)
+    chart = np.where(np.isfinite(image).all(axis=2), light.chart, -1)
+    if not (chart >= 0).any():
+        raise NoUsablePixels("delight: the image has no value anywhere on the surface")
+    scale = _radiance_per_unit(options, light)
+    grey = np.full(light.sun.shape, _GREY, np.float32)
+    bounce = light.bounce(grey)
+    shift = None
+    if options.register:
+        predicted = light.visibility[..., None] * light.sun + light.sky + bounce
+        shift = texture_shift(image.mean(axis=2), predicted.mean(axis=2), chart >= 0)
+        if shift is not None:
+            image = shifted_back(image, shift)
+            clipped = np.asarray(shifted_back(clipped.astype(np.float32), shift) > 0.01)
+            chart = np.where(np.isfinite(image).all(axis=2), light.chart, -1)
+    report(0.1)
+    radiance = _at_surface(np.nan_to_num(image) * scale, options.air)
+    visibility, deviation = light.visibility.astype(np.float32), np.zeros(chart.shape, np.float32)
+    factor, albedo = np.ones(3), grey
+    for number in range(options.rounds):
+        if options.borders is not None and number in (0, options.rounds - 1):
+            visibility, deviation = refined_visibility(
+                np.log(np.pi * np.maximum(radiance, 1e-3)),
+                light.sun,
+                np.maximum(factor * light.sky + bounce, 1e-3).astype(np.float32),
+                light.visibility,
+                chart,
+                # Borders are good enough for the sky factor after a rough first pass.
+                model=options.borders
+                if number == options.rounds - 1
+                else replace(options.borders, levels=3, iterations=8),
+            )
+        sunlight = visibility[..., None] * light.sun
+        if options.fit_sky:
+            usable = (chart >= 0) & ~clipped.any(axis=2) & (deviation < 0.1)
+            factor = fitted_sky_factor(radiance, sunlight, light.sky, bounce, np.where(usable, chart, -1))
+        illuminance = np.maximum(sunlight + factor * light.sky + bounce, 1e-3)
+        albedo = np.clip(np.pi * radiance / illuminance, LOWEST, HIGHEST).astype(np.float32)
+        albedo[chart < 0] = _GREY
+        bounce = light.bounce(albedo)
+        report(0.1 + 0.8 * (number + 1) / options.rounds)
+    known = chart >= 0
+    if options.land_class is not None:
+        kind = np.where(known & ~clipped.any(axis=2), options.land_class, -1)
+        illuminance = class_response(radiance, sunlight, illuminance - sunlight, kind)
+        albedo = np.clip(np.pi * radiance / illuminance, LOWEST, HIGHEST).astype(np.float32)
+    albedo = _completed(albedo, clipped & known[..., None], known)
+    sigma = _standard_error(albedo, image, light, sunlight, illuminance, deviation, options)
+    lost = clipped.any(axis=2) & known
+    sigma = np.where(lost, np.maximum(sigma, 0.3 * albedo.mean(axis=2)), sigma)
+    in_sun = sunlight.max(axis=2) > 0.25 * illuminance.max(axis=2)
+    source = np.select([~known, lost, in_sun], [NOTHING, COMPLETED, SUNLIT], SHADED).astype(np.uint8)
+    report(1.0)
+    return DelitImage(
+        np.where(known[..., None], albedo, np.float32(np.nan)),
+        np.where(known, sigma, np.inf).astype(np.float32),
+        visibility,
+        source,
+        shift,
+        factor,
+        scale,
+    )
+
+
+def _radiance_per_unit(options: DelightOptions, light: TexelIrradiance) -> np.ndarray:
+    if options.radiance_per_unit is not None:
+        return np.broadcast_to(np.asarray(options.radiance_per_unit, float), (3,))
+    white = options.white_reflectance * np.asarray(light.level_lx, float) / np.pi
+    if options.air is None:
+        return white
+    passed, added = (
+        np.asarray(values, float).reshape(-1, 3).mean(axis=0)
+        for values in (options.air.transmittance, options.air.airlight)
+    )
+    return white * passed + added
+
+
+def _at_surface(radiance: np.ndarray, air: Air | None) -> np.ndarray:
+    if air is None:
+        return radiance.astype(np.float32)
+    # What is left below the airlight is noise; a hundredth of the image stays.
+    return np.maximum((radiance - air.airlight) / air.transmittance, 0.01 * radiance).astype(np.float32)
+
+
+def fitted_sky_factor(
+    radiance: np.ndarray, sunlight: np.ndarray, sky: np.ndarray, bounce: np.ndarray, chart: np.ndarray
+) -> np.ndarray:
+    """Estimate the factor on skylight under which near texels in different light have most alike albedos.
+
+    Parameters
+    ----------
+    radiance
+        ``(R, S, 3)`` [cd/m²] that leaves the surface.
+    sunlight, sky, bounce
+        ``(R, S, 3)`` illuminance by sun, sky and other terrain [lx].
+    chart
+        ``(R, S)`` integers as in `TexelIrradiance`; −1 where a texel is not to be used.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(3,)``; 1 where the image has too few pairs to tell.
+    """
+    pairs = _pairs(sunlight.mean(axis=2), (sky + bounce).mean(axis=2), chart)
+    if len(pairs) < _LEAST_PAIRS:
+        return np.ones(3)
+    one, other = pairs.T
+    trials = np.linspace(-1.5, 1.5, 61)
+    result = np.ones(3)
+    for channel in range(3):
+        values, sun, from_sky, rest = (
+            array[..., channel].ravel().astype(np.float64) for array in (radiance, sunlight, sky, bounce)
+        )
+        contrast = np.log(np.maximum(values[one], 1e-3) / np.maximum(values[other], 1e-3))
+
+        def residual(
+            logarithm: float,
+            contrast: np.ndarray = contrast,
+            sun: np.ndarray = sun,
+            from_sky: np.ndarray = from_sky,
+            rest: np.ndarray = rest,
+        ) -> np.ndarray:
+            total = np.maximum(sun + np.exp(logarithm) * from_sky + rest, 1e-3)
+            return contrast - np.log(total[one] / total[other])
+
+        spread = max(1.4826 * float(np.median(np.abs(residual(0.0)))), 0.05)
+        independent = min(len(pairs) / _PAIRS_PER_INDEPENDENT, _MOST_INDEPENDENT)
+        cost = [
+            independent * float(np.mean(np.log1p((residual(trial) / (2.385 * spread)) ** 2))) * 0.5 * 2.385**2
+            + 0.5 * (trial / _SKY_SIGMA) ** 2
+            for trial in trials
+        ]
+        best = int(np.clip(np.argmin(cost), 1, len(trials) - 2))
+        curve = np.polyfit(trials[best - 1 : best + 2], cost[best - 1 : best + 2], 2)
+        result[channel] = np.exp(np.clip(-0.5 * curve[1] / curve[0], trials[0], trials[-1]))
+    return result
+
+
+def class_response(radiance: np.ndarray, sunlight: np.ndarray, ambient: np.ndarray, kind: np.ndarray) -> np.ndarray:
+    """Effective illuminance of classes of land: with as much diffuse light as makes their albedo independent of the sun.
+
+    The C correction of Teillet et al. 1982, within each class and channel, with exact cast shadows, sky and
+    interreflection in place of the cosine of incidence alone. The mean illuminance of a class does not change.
+
+    Parameters
+    ----------
+    radiance
+        ``(R, S, 3)`` [cd/m²] that leaves the surface.
+    sunlight, ambient
+        ``(R, S, 3)`` illuminance by the sun, and by sky and other terrain [lx].
+    kind
+        ``(R, S)`` class of each texel, −1 for none; small classes stay as they are.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(R, S, 3)`` effective illuminance [lx].
+    """
+    result = (sunlight + ambient).astype(np.float32)
+    for number in np.unique(kind[kind >= 0]):
+        member = kind == number
+        if member.sum() < _LEAST_PAIRS:
+            continue
+        for channel in range(3):
+            values, sun, diffuse = (
+                array[..., channel][member].astype(float) for array in (radiance, sunlight, ambient)
+            )
+
+            def dependence(
+                logarithm: float, values: np.ndarray = values, sun: np.ndarray = sun, diffuse: np.ndarray = diffuse
+            ) -> float:
+                albedo = values / np.maximum(sun + np.exp(logarithm) * diffuse, 1e-3)
+                low, high = np.percentile(albedo, [1.0, 99.0])
+                keep = (albedo >= low) & (albedo <= high)
+                return float(np.corrcoef(albedo[keep], sun[keep])[0, 1])
+
+            # More diffuse light makes the albedo of sunlit slopes larger: the dependence rises with the factor.
+            low, high = np.log(0.2), np.log(100.0)
+            for _ in range(18):
+                middle = 0.5 * (low + high)
+                low, high = (middle, high) if dependence(middle) < 0.0 else (low, middle)
+            effective = sun + np.exp(0.5 * (low + high)) * diffuse
+            result[..., channel][member] = effective * ((sun + diffuse).mean() / effective.mean())
+    return result
+
+
+def _pairs(sunlight: np.ndarray, ambient: np.ndarray, chart: np.ndarray, most: int = 40_000) -> np.ndarray:
+    """Flat indices ``(N, 2)`` of texels a few apart, in the same chart, whose total light differs."""
+    index = np.arange(chart.size).reshape(chart.shape)
+    total = np.log(np.maximum(sunlight + ambient, 1e-3)).ravel()
+    share = (sunlight / np.maximum(sunlight + ambient, 1e-3)).ravel()
+    found = []
+    for d_row, d_column in ((0, _PAIR_TEXELS), (_PAIR_TEXELS, 0)):
+        first = index[: chart.shape[0] - d_row, : chart.shape[1] - d_column].ravel()
+        second = index[d_row:, d_column:].ravel()
+        flat = chart.ravel()
+        keep = (flat[first] >= 0) & (flat[first] == flat[second])
+        keep &= (np.abs(total[first] - total[second]) > 0.3) & (np.abs(share[first] - share[second]) > 0.15)
+        found.append(np.stack([first[keep], second[keep]], axis=1))
+    pairs = np.concatenate(found)
+    if len(pairs) > most:
+        pairs = pairs[np.random.default_rng(0).choice(len(pairs), most, replace=False)]
+    return pairs
+
+
+def _completed(albedo: np.ndarray, clipped: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Albedo with its clipped channels completed: from the unclipped ones and the colour of unclipped neighbours."""
+    lost = np.asarray(clipped.any(axis=2), bool)
+    good = known & ~lost
+    if not lost.any() or not good.any():
+        return albedo
+    # Neighbours' colour: a normalised blur near by, the nearest texel where that reaches nothing.
+    share = gaussian_filter(good.astype(np.float32), 3.0)
+    blurred = (
+        np.stack([gaussian_filter(np.where(good, albedo[..., k], 0.0), 3.0) for k in range(3)], axis=2)
+        / np.maximum(share, 1e-6)[..., None]
+    )
+    nearest = np.asarray(distance_transform_edt(~good, return_distances=False, return_indices=True))
+    around = np.where((share > 1e-3)[..., None], blurred, albedo[nearest[0], nearest[1]])
+    whole = np.equal(clipped, np.zeros_like(clipped))
+    ratio = np.where(whole, albedo, 0.0).sum(axis=2) / np.maximum(np.where(whole, around, 0.0).sum(axis=2), 1e-6)
+    # A clipped value is a lower bound.
+    guess = np.where(whole.any(axis=2)[..., None], around * ratio[..., None], around)
+    filled = np.where(clipped, np.maximum(albedo, guess), albedo)
+    return np.clip(filled, LOWEST, HIGHEST).astype(np.float32)
+
+
+def _standard_error(
+    albedo: np.ndarray,
+    image: np.ndarray,
+    light: TexelIrradiance,
+    sunlight: np.ndarray,
+    illuminance: np.ndarray,
+    deviation: np.ndarray,
+    options: DelightOptions,
+) -> np.ndarray:
+    """Standard error ``(R, S)``: of the modelled light, the slope, the visibility and the image's levels."""
+    total = illuminance.mean(axis=2)
+    facing = np.asarray(light.level_lx, float).mean()
+    unhidden = (sunlight.mean(axis=2) > 0.0).astype(float)
+    value = np.maximum(np.nan_to_num(image).mean(axis=2), 1e-4)
+    # One level of 8-bit sRGB in linear light, about its derivative 2.2 v^(1 - 1/2.2).
+    quantum = 2.2 * value ** (1.0 - 1.0 / 2.2) / 255.0 / np.sqrt(12.0) if options.quantum is None else options.quantum
+    relative = (
+        options.light_error**2
+        + (options.slope_error * facing * unhidden / total) ** 2
+        + (deviation * light.sun.mean(axis=2) / total) ** 2
+        + (quantum / value) ** 2
+    )
+    return albedo.mean(axis=2) * np.sqrt(relative)
