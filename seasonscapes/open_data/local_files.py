@@ -5,7 +5,7 @@ from __future__ import annotations
 import glob
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,7 @@ from seasonscapes.open_data.imagery import colours
 from seasonscapes.open_data.sources import Source, source_of_file
 from seasonscapes.progress import TaskProgress
 from seasonscapes.terrain.crs import apply_affine, geodetic_from_map
+from seasonscapes.terrain.heights import check_height_band, declared_unit, to_metres
 from seasonscapes.terrain.mosaic import MapGrid, mosaic, read_tile
 from seasonscapes.terrain.raster_files import open_raster
 
@@ -85,7 +86,9 @@ def local_heights(rasters: list[LocalRaster], grid: MapGrid, *, progress: TaskPr
     def read(dataset: DatasetReader) -> Any:
         if dataset.count != 1:
             raise InputError(dataset.name, "more than one band", got=dataset.count, expected="one band of heights")
-        return read_tile(dataset, grid, bands=[1])
+        check_height_band(dataset, 1, dataset.name)
+        unit, tile = declared_unit(dataset, 1, dataset.name), read_tile(dataset, grid, bands=[1])
+        return None if tile is None else replace(tile, values=to_metres(tile.values, unit, dataset.name))
 
     return _mosaic(rasters, grid, read, progress)[..., 0]
 
