@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cyclopts import Parameter
+
+from seasonscapes.commands.outputs import check_output_folder
 
 if TYPE_CHECKING:
     from seasonscapes.progress import Progress
@@ -36,10 +39,13 @@ class PlaceOptions:
     """Trust the scene: data and pictures outside its folder, any raster format, servers."""
 
     def folder(self) -> Workspace:
-        """The workspace asked for."""
+        """The workspace asked for; `InputError` where there is none and none can be made."""
         from seasonscapes.workspace import Workspace, default_workspace
 
-        return default_workspace() if self.workspace is None else Workspace(self.workspace)
+        workspace = default_workspace() if self.workspace is None else Workspace(self.workspace)
+        if not os.access(workspace.folder, os.R_OK | os.X_OK) or not workspace.folder.is_dir():
+            check_output_folder(workspace.folder, flag="workspace" if self.workspace is None else "--workspace")
+        return workspace
 
     def mesh(self, *, texel_m: float | None = None) -> MeshOptions:
         """How to build the terrain; ``texel_m`` is a command's own default."""

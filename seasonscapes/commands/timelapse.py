@@ -90,6 +90,7 @@ def timelapse_command(
         check_output_folder(output)
     check_range("--fps", fps, 0.1, 240.0)
     check_range("--seed", seed, 0, 2**32)
+    work.check_cluster()
     part, path = work.part(), find_scene(scene)
     chosen = view.chosen(read_scene(path, allow_outside=place.allow_outside))
     times = when.instants(chosen.latitude_deg, chosen.longitude_deg)
