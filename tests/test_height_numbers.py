@@ -189,13 +189,13 @@ def test_a_raster_that_declares_more_than_the_memory_holds_is_refused_before_it_
         pass
     assert path.stat().st_size < 3_000_000
     monkeypatch.setattr("seasonscapes.terrain.memory.available_bytes", lambda: 16_000_000_000)
-    with pytest.raises(InputError, match=rf"too many samples.*got '{side} × {side}.*at most 16.0 GB.*\[area\]"):
+    with pytest.raises(InputError, match=rf"too large for this machine's memory.*got '{side} × {side}.*at most 16.0 GB.*\[area\]"):
         read_elevation(path)
 
 
 def test_free_memory_is_asked_of_the_machine():
     check_memory((10, 10), "a.tif")
-    with pytest.raises(InputError, match=r"a\.tif: too many samples"):
+    with pytest.raises(InputError, match=r"a\.tif: too large for"):
         check_memory((10**8, 10**8), "a.tif")
 
 

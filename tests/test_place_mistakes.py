@@ -210,7 +210,7 @@ def test_meshing_parameters_out_of_range_are_one_line_at_their_flag(flag, values
 
 def test_refining_beyond_the_memory_is_one_line(place, monkeypatch):
     monkeypatch.setattr("seasonscapes.terrain.memory.available_bytes", lambda: 500_000_000)
-    with pytest.raises(InputError, match="--refine: too many samples for this machine's memory; got '2560 × 2560"):
+    with pytest.raises(InputError, match="--refine: too large for this machine's memory; got '2560 × 2560"):
         place(options=MeshOptions(refine=64))
 
 
