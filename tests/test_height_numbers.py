@@ -189,7 +189,9 @@ def test_a_raster_that_declares_more_than_the_memory_holds_is_refused_before_it_
         pass
     assert path.stat().st_size < 3_000_000
     monkeypatch.setattr("seasonscapes.terrain.memory.available_bytes", lambda: 16_000_000_000)
-    with pytest.raises(InputError, match=rf"too large for this machine's memory.*got '{side} × {side}.*at most 16.0 GB.*\[area\]"):
+    with pytest.raises(
+        InputError, match=rf"too large for this machine's memory.*got '{side} × {side}.*at most 16.0 GB.*\[area\]"
+    ):
         read_elevation(path)
 
 
