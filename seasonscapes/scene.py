@@ -171,7 +171,7 @@ class Imagery(Declaration):
     bands: list[int] | None = Field(default=None, min_length=1, max_length=3)
     reflectance_scale: float = Field(default=0.5, gt=0.0, le=2.0)
     time: str | None = None
-    sun_deg: tuple[float, float] | None = None
+    sun_deg: list[float] | None = Field(default=None, min_length=2, max_length=2)
     delit: bool = False
 
     @model_validator(mode="after")
@@ -179,9 +179,7 @@ class Imagery(Declaration):
         if (self.time is not None) + (self.sun_deg is not None) + self.delit > 1:
             raise ValueError("give one of 'time' (when it was taken), 'sun_deg' and 'delit = true' (it holds no light)")
         if self.sun_deg is not None and not (-360.0 <= self.sun_deg[0] <= 360.0 and 0.0 < self.sun_deg[1] <= 90.0):
-            raise ValueError(
-                f"sun_deg: got {list(self.sun_deg)}, expected azimuth and elevation above the horizon [deg]"
-            )
+            raise ValueError(f"sun_deg: got {self.sun_deg}, expected azimuth and elevation above the horizon [deg]")
         return self
 
 

@@ -90,7 +90,7 @@ def local_heights(rasters: list[LocalRaster], grid: MapGrid, *, progress: TaskPr
         unit, tile = declared_unit(dataset, 1, dataset.name), read_tile(dataset, grid, bands=[1])
         return None if tile is None else replace(tile, values=to_metres(tile.values, unit, dataset.name))
 
-    return _mosaic(rasters, grid, read, progress)[..., 0]
+    return _mosaic(rasters, grid, read, progress, extend=False)[..., 0]
 
 
 def local_colours(rasters: list[LocalRaster], grid: MapGrid, *, progress: TaskProgress | None = None) -> np.ndarray:
@@ -111,7 +111,12 @@ def local_colours(rasters: list[LocalRaster], grid: MapGrid, *, progress: TaskPr
 
 
 def _mosaic(
-    rasters: list[LocalRaster], grid: MapGrid, read: Callable[[Any], Any], progress: TaskProgress | None
+    rasters: list[LocalRaster],
+    grid: MapGrid,
+    read: Callable[[Any], Any],
+    progress: TaskProgress | None,
+    *,
+    extend: bool = True,
 ) -> np.ndarray:
     tiles = []
     for number, raster in enumerate(rasters):
@@ -122,7 +127,7 @@ def _mosaic(
     tiles = [tile for tile in tiles if tile is not None]
     if not tiles:
         raise InputError(str(rasters[0].path), "none of the files shows the area", cure="check --at and --size")
-    return mosaic(tiles, grid)
+    return mosaic(tiles, grid, extend=extend)
 
 
 def _local_raster(path: Path, kind: str) -> LocalRaster:
