@@ -17,6 +17,7 @@ from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.errors import InputError
 from seasonscapes.frames import LocalFrame, geodetic_from_enu
 from seasonscapes.images import atomic_path
+from seasonscapes.text_files import MALFORMED
 
 
 @dataclass(frozen=True)
@@ -125,5 +126,5 @@ def read_calibration(path: Path) -> CalibratedWebcam:
         else:
             raise ValueError(f"projection {projection!r}")
         return CalibratedWebcam(str(record["webcam"]), view, float(record["k1"]), sigma, frame)
-    except (KeyError, TypeError, ValueError) as error:
+    except MALFORMED as error:
         raise InputError(path, f"not a calibration record: {error!r}") from None
