@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from seasonscapes.albedo.forward_model import TexelTransport, ambient_on_texels, sun_on_texels, trace_texel_transport
+from seasonscapes.albedo.sun_search import Relief
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.frames import LocalFrame, direction_from_angles
 from seasonscapes.images import linear_from_srgb, srgb_from_linear
@@ -14,7 +15,8 @@ from seasonscapes.rendering.transport import SamplingOptions
 from seasonscapes.sky.illumination import Illumination, global_horizontal_illuminance
 from seasonscapes.terrain.surface import Raster, Terrain
 
-FRAME = LocalFrame(46.55, 7.98)
+LATITUDE_DEG = 46.55
+FRAME = LocalFrame(LATITUDE_DEG, 7.98)
 DAY_OF_YEAR = 254
 # Share of the photograph that is exposed to white.
 CLIPPED_SHARE = 0.01
@@ -146,3 +148,34 @@ def lit_from_above(transport: TexelTransport, light: Illumination, albedo: np.nd
     """Radiance ``(R, S, 3)`` [cd/m²] of the texels under a light."""
     total = sun_on_texels(transport, light) + ambient_on_texels(transport, light, albedo)
     return total.reshape(albedo.shape) * albedo / np.float32(np.pi)
+
+
+def possible_sun(rng: np.random.Generator) -> tuple[float, float]:
+    """Azimuth and elevation [deg] of the sun on a random day and hour, 12 to 60° high."""
+    latitude = np.radians(LATITUDE_DEG)
+    while True:
+        declination, hour = np.radians(rng.uniform(-23.4, 23.4)), np.radians(rng.uniform(-80.0, 80.0))
+        sine = np.sin(latitude) * np.sin(declination) + np.cos(latitude) * np.cos(declination) * np.cos(hour)
+        elevation = float(np.degrees(np.arcsin(sine)))
+        if 12.0 < elevation < 60.0:
+            north = (np.sin(declination) - np.sin(latitude) * sine) / np.cos(latitude)
+            return float(np.degrees(np.arctan2(-np.cos(declination) * np.sin(hour), north)) % 360.0), elevation
+
+
+def relief_of(terrain: Terrain, shape: tuple[int, int], *, azimuths: int = 48) -> Relief:
+    """Normals and horizons under the texels."""
+    from seasonscapes.rendering.hemisphere_rays import ray_scene
+    from seasonscapes.rendering.horizon_angles import horizon_angles
+    from seasonscapes.rendering.irradiance import surface_at
+    from seasonscapes.rendering.mitsuba_scene import mi_mesh
+    from seasonscapes.terrain.texels import texel_positions
+
+    surface = ray_scene(mi_mesh(terrain, np.full(3, 0.3, np.float32)))
+    position, _ = texel_positions(terrain, shape[1], shape[0])
+    points, index = surface_at(surface, position.reshape(-1, 3))
+    normal = np.tile(np.array([0.0, 0.0, 1.0], np.float32), (shape[0] * shape[1], 1))
+    horizon = np.zeros((len(normal), azimuths), np.float32)
+    known = np.zeros(len(normal), bool)
+    normal[index], known[index] = points.normal, True
+    horizon[index] = horizon_angles(surface, points, azimuths=azimuths)
+    return Relief(normal.reshape(*shape, 3), horizon.reshape(*shape, azimuths), known.reshape(shape))

@@ -40,6 +40,8 @@ _MODULES = {
     "timelapse": "workflows.timelapse",
     "lit_texture": "workflows.received_light",
     "irradiance_map": "workflows.received_light",
+    "export_scene": "workflows.export_scene",
+    "ExportOptions": "workflows.export_scene",
     "textured_view": "workflows.view_rendering",
     "develop": "workflows.pictures",
     "srgb_from_linear": "images",
@@ -66,6 +68,14 @@ _MODULES = {
     "predict_radiance": "workflows.predicted_radiance",
     "delight": "workflows.delighting",
     "differentiable_scene": "workflows.differentiable",
+    # meshes
+    "load_mesh": "workflows.meshes",
+    "MeshPlacing": "terrain.mesh_placing",
+    "MeshSurroundings": "workflows.meshes",
+    "delight_mesh": "workflows.meshes",
+    "light_mesh": "workflows.meshes",
+    "render_mesh": "workflows.mesh_views",
+    "save_mesh": "terrain.mesh_writing",
     # Gaussians
     "distil": "workflows.distillation",
     "DistilOptions": "workflows.distillation",

@@ -14,6 +14,8 @@ from seasonscapes.scene import Viewpoint as Viewpoint
 from seasonscapes.sky.illumination import Illumination as Illumination
 from seasonscapes.sky.models import SkyModel as SkyModel
 from seasonscapes.sky.report import dome_picture as dome_picture
+from seasonscapes.terrain.mesh_placing import MeshPlacing as MeshPlacing
+from seasonscapes.terrain.mesh_writing import save_mesh as save_mesh
 from seasonscapes.terrain.surface import Texture as Texture
 from seasonscapes.texturing.completion import CompletionOptions as CompletionOptions
 from seasonscapes.workflows.albedo_recovery import RecoveryOptions as RecoveryOptions
@@ -26,10 +28,17 @@ from seasonscapes.workflows.delighting import delight as delight
 from seasonscapes.workflows.differentiable import differentiable_scene as differentiable_scene
 from seasonscapes.workflows.distillation import DistilOptions as DistilOptions
 from seasonscapes.workflows.distillation import distil as distil
+from seasonscapes.workflows.export_scene import ExportOptions as ExportOptions
+from seasonscapes.workflows.export_scene import export_scene as export_scene
 from seasonscapes.workflows.gaussian_views import render_gaussians as render_gaussians
 from seasonscapes.workflows.illumination import illumination as illumination
 from seasonscapes.workflows.illumination import sky_model as sky_model
 from seasonscapes.workflows.illumination import sun_moon_position as sun_moon_position
+from seasonscapes.workflows.mesh_views import render_mesh as render_mesh
+from seasonscapes.workflows.meshes import MeshSurroundings as MeshSurroundings
+from seasonscapes.workflows.meshes import delight_mesh as delight_mesh
+from seasonscapes.workflows.meshes import light_mesh as light_mesh
+from seasonscapes.workflows.meshes import load_mesh as load_mesh
 from seasonscapes.workflows.painting import paint as paint
 from seasonscapes.workflows.photograph_files import open_photographs as open_photographs
 from seasonscapes.workflows.pictures import develop as develop

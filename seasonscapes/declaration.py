@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import re
 import tomllib
+import unicodedata
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -17,6 +18,7 @@ from seasonscapes.text_files import read_text
 __all__ = ["Declaration", "InputError", "Name", "checked_name", "read_declaration", "read_toml", "validate"]
 
 MOST_NAME_CHARACTERS = 64
+MOST_TEXT_CHARACTERS = 2000
 # Letters and digits of any script; no separator of paths, no control character, nothing hidden, nothing like a flag.
 _NAME = re.compile(r"[^\W_](?:[\w .-]*[\w-])?")
 
@@ -45,8 +47,19 @@ def checked_name(value: str) -> str:
     return value
 
 
-# A name in a file that may become part of a file's name.
+def checked_text(value: str) -> str:
+    """Return a text for people; `ValueError` for one that is very long or could steer a terminal."""
+    if len(value) > MOST_TEXT_CHARACTERS:
+        raise ValueError(f"a text of {len(value)} characters; expected at most {MOST_TEXT_CHARACTERS}")
+    control = next((c for c in value if unicodedata.category(c) in ("Cc", "Cs") and c not in "\n\t"), None)
+    if control is not None:
+        raise ValueError(f"a control character in a text: {control!r}")
+    return value
+
+
+# A name in a file that may become part of a file's name, and a text that is shown and copied into files' metadata.
 Name = Annotated[str, AfterValidator(checked_name)]
+Text = Annotated[str, AfterValidator(checked_text)]
 
 
 class Declaration(BaseModel):

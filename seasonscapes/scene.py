@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import logging
 import math
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, PrivateAttr, model_validator
 
 from seasonscapes.cameras.pinhole import Camera, camera_at
 from seasonscapes.cameras.webcam import Webcam
-from seasonscapes.declaration import MOST_NAME_CHARACTERS, Declaration, InputError, Name, read_declaration
+from seasonscapes.declaration import MOST_NAME_CHARACTERS, Declaration, InputError, Name, Text, read_declaration
 from seasonscapes.frames import STANDARD_REFRACTION_K, Latitude, LocalFrame, Longitude
 from seasonscapes.terrain.raster_files import OWN_FOLDER, Confinement, confined_path, raster_hash
 
@@ -153,7 +154,15 @@ class Imagery(Declaration):
         Red, green and blue bands of the file, counted from 1; left out, those that the file marks.
     reflectance_scale
         Reflectance of a white pixel. Display images are contrast-stretched, so that their white is not a reflectance
-        of 1; 0.5 brings the meadows and rock of an Alpine mosaic to the reflectances of field spectra.
+        of 1; 0.5 brings the meadows and rock of an Alpine mosaic to the reflectances of field spectra. Of an image whose
+        light is taken out: the reflectance of level ground that is white in it.
+    time
+        When the image was taken, ISO 8601, without offset civil time at the place; or ``"unknown"``, then its sun is
+        estimated from shading and cast shadows. Its light is taken out before the image is used.
+    sun_deg
+        Azimuth and elevation of the sun in the image [deg], where they are known and the time is not.
+    delit
+        The image holds no light: a reflectance product, or one whose light was taken out before.
     """
 
     file: str
@@ -161,6 +170,21 @@ class Imagery(Declaration):
     full_scale: float | None = Field(default=None, gt=0.0)
     bands: list[int] | None = Field(default=None, min_length=1, max_length=3)
     reflectance_scale: float = Field(default=0.5, gt=0.0, le=2.0)
+    time: str | None = None
+    sun_deg: list[float] | None = Field(default=None, min_length=2, max_length=2)
+    delit: bool = False
+
+    @model_validator(mode="after")
+    def _one_light(self) -> Imagery:
+        if (self.time is not None) + (self.sun_deg is not None) + self.delit > 1:
+            raise ValueError("give one of 'time' (when it was taken), 'sun_deg' and 'delit = true' (it holds no light)")
+        if self.sun_deg is not None and not (-360.0 <= self.sun_deg[0] <= 360.0 and 0.0 < self.sun_deg[1] <= 90.0):
+            raise ValueError(f"sun_deg: got {self.sun_deg}, expected azimuth and elevation above the horizon [deg]")
+        return self
+
+
+# A cropped picture may not hold its principal point at all.
+Share = Annotated[float, Field(ge=-2.0, le=3.0)]
 
 
 class Viewpoint(Declaration):
@@ -181,7 +205,9 @@ class Viewpoint(Declaration):
     roll_deg
         Rotation about the viewing direction; positive lowers the right-hand side [deg].
     fov_deg
-        Horizontal field of view [deg].
+        Horizontal field of view of a picture with its principal point in the middle [deg]: the focal length.
+    principal_point
+        Where the optical axis meets the picture, as shares of its width (from the left) and height (from the top).
 
     Examples
     --------
@@ -198,6 +224,7 @@ class Viewpoint(Declaration):
     pitch_deg: float = Field(default=0.0, ge=-90.0, le=90.0)
     roll_deg: float = Field(default=0.0, ge=-180.0, le=180.0)
     fov_deg: float = Field(default=60.0, gt=0.0, lt=170.0)
+    principal_point: tuple[Share, Share] = (0.5, 0.5)
 
     @model_validator(mode="after")
     def _one_height(self) -> Viewpoint:
@@ -242,8 +269,8 @@ class SceneFile(Declaration):
     """
 
     name: str = Field(pattern=r"^[a-z0-9][a-z0-9_-]*$", max_length=MOST_NAME_CHARACTERS)
-    title: str = ""
-    attribution: str = ""
+    title: Text = ""
+    attribution: Text = ""
     vertical_datum: VerticalDatum = "unknown"
     refraction_k: float = Field(default=STANDARD_REFRACTION_K, ge=0.0, lt=0.9)
     origin: Origin | None = None
@@ -388,7 +415,7 @@ def camera_from_named_view(
     else:
         assert view.above_ground_m is not None  # validated by `Viewpoint`
         height_m = ground_height_m + float(view.above_ground_m)
-    return camera_at(
+    camera = camera_at(
         frame,
         view.latitude_deg,
         view.longitude_deg,
@@ -399,3 +426,5 @@ def camera_from_named_view(
         fov_deg=view.fov_deg,
         size_px=size_px,
     )
+    across, down = view.principal_point
+    return replace(camera, cx=across * camera.width_px, cy=down * camera.height_px)

@@ -44,10 +44,11 @@ def read_bounded(path: str | os.PathLike, *, where: str | Path | None = None, mo
         raise InputError(place, "no such file", got=got) from None
     except ValueError:
         raise InputError(place, "not a name of a file", got=os.fspath(path)) from None
+    if stat.S_ISDIR(os.fstat(handle).st_mode):
+        os.close(handle)
+        raise InputError(place, "this is a folder", got=got, expected="a file")
     with open(handle, "rb") as file:
         facts = os.fstat(handle)
-        if stat.S_ISDIR(facts.st_mode):
-            raise InputError(place, "this is a folder", got=got, expected="a file")
         if not stat.S_ISREG(facts.st_mode):
             raise InputError(place, "this is a pipe or a device", got=got, expected="a file")
         content = file.read(most_bytes + 1)

@@ -65,9 +65,7 @@ def default_workspace() -> Workspace:
 
 
 def file_hash(path: str | os.PathLike) -> str:
-    """SHA-256 of a file's content; of the name alone for GDAL's virtual files (``/vsi...``)."""
-    if os.fspath(path).startswith("/vsi"):
-        return hashlib.sha256(os.fspath(path).encode()).hexdigest()
+    """SHA-256 of a file's content; of rasters, which may consist of several files, `raster_files.raster_hash`."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

@@ -1,5 +1,6 @@
 """What was written is whole, and what is read is what was written: films, frames, built artefacts, files of others."""
 
+import json
 import resource
 import subprocess
 import sys
@@ -330,3 +331,91 @@ def test_a_model_of_gaussians_is_compared_with_what_was_written(tmp_path):
         flipped(path, at)
         with pytest.raises(InputError, match=r"damaged|not a safetensors|not a Gaussian model"):
             load_model(path)
+
+
+@pytest.mark.slow
+def test_a_workspace_whose_every_file_is_damaged_is_built_again(tmp_path, capsys, monkeypatch):
+    """The same picture from a workspace of which all files were changed or cut short."""
+    import places
+
+    from seasonscapes.cli import main
+    from seasonscapes.images import read_exr
+    from seasonscapes.rendering import transport
+
+    # Fewer rays: the same code, a fraction of the time.
+    few = (4, 16, 64, 4, 512, 32, 16, "reinhart")
+    monkeypatch.setattr(transport.SamplingOptions.__init__, "__defaults__", few)
+    monkeypatch.setattr(transport, "_PILOTS", 1 << 14)
+
+    scene = places.write_place(tmp_path / "scene")
+    arguments = ["render", str(scene), "--time", "2024-07-20T13:00", "--sky", "hosek", "--size", "32x24"]
+    arguments += ["--texel-m", "100", "--refine", "1", "--workspace", str(tmp_path / "work")]
+    pictures = []
+    for number, damage in enumerate((None, flipped, cut)):
+        files = [path for path in (tmp_path / "work").rglob("*") if path.is_file() and path.stat().st_size > 400]
+        for path in files if damage is not None else ():
+            damage(path)
+        assert main([*arguments, "-o", str(tmp_path / f"{number}.exr")]) == 0, capsys.readouterr().err
+        told = capsys.readouterr().err
+        assert (damage is None) == ("again" not in told)
+        pictures.append(read_exr(tmp_path / f"{number}.exr")[0][""])
+    for picture in pictures[1:]:
+        np.testing.assert_array_equal(picture, pictures[0])
+
+
+def test_photographs_of_the_workspace_are_compared_with_what_was_written(tmp_path, caplog):
+    from seasonscapes.workflows.synthetic_photographs import _SUMS, _remove_changed
+    from seasonscapes.workspace import file_hash
+
+    caplog.set_level("INFO")
+    names = ["a.png", "a_calibration.json", "later.png"]
+    for name in names:
+        (tmp_path / name).write_text(name)
+    (tmp_path / _SUMS).write_text(json.dumps({name: file_hash(tmp_path / name) for name in names[:2]}))
+    _remove_changed(tmp_path)
+    assert all((tmp_path / name).is_file() for name in names)
+    flipped(tmp_path / names[1])
+    _remove_changed(tmp_path)
+    assert [name for name in names if (tmp_path / name).is_file()] == ["a.png", "later.png"]
+    assert "is made again" in caplog.text
+    (tmp_path / _SUMS).write_text("{")
+    _remove_changed(tmp_path)
+    assert not any((tmp_path / name).is_file() for name in names)
+
+
+def test_keys_hold_the_sources_of_a_mosaic_the_world_file_the_sky_and_the_albedo(tmp_path):
+    """Terrain, image and the checkpoint of a distillation follow the content of every file that they are made of."""
+    from datetime import date
+
+    import places
+    from test_confinement import vrt
+
+    from seasonscapes.albedo.seasons import DatedAlbedo
+    from seasonscapes.sky.models import read_sky_model
+    from seasonscapes.workflows.albedo_sources import dated_albedos
+    from seasonscapes.workflows.distillation import DistilOptions, _data_key
+    from seasonscapes.workflows.place import MeshOptions, load_place
+
+    scene = places.write_place(tmp_path / "scene", places.SCENE.replace('file = "dem.tif"', 'file = "mosaic.vrt"'))
+    (scene.parent / "mosaic.vrt").write_text(vrt("dem.tif"))
+    options = MeshOptions(texel_m=100.0, refine=1, max_error_m=20.0)
+
+    def load():
+        return load_place(scene, Workspace(tmp_path / "work"), options=options)
+
+    def key(place, sky="hosek", albedo=(), **changed):
+        return _data_key(place, read_sky_model(sky), albedo, DistilOptions(**changed))
+
+    first = load()
+    own = DatedAlbedo(date(2024, 7, 1), "recovered", lambda: None)
+    keys = [key(first), key(first, sky="clear"), key(first, albedo=[own]), key(first, suns=9)]
+    image = dated_albedos(first)[0].content
+    places.write_raster(scene.parent / "dem.tif", places.hill_heights() + 300.0, spacing_m=50.0)
+    higher = load()
+    assert np.isclose(higher.elevation.values.max(), first.elevation.values.max() + 300.0)
+    assert higher.terrain.vertices[:, 2].max() > first.terrain.vertices[:, 2].max() + 200.0
+    keys.append(key(higher))
+    (scene.parent / "image.tif.aux.xml").write_text("<PAMDataset><Metadata/></PAMDataset>")
+    keys.append(key(load()))
+    assert dated_albedos(load())[0].content != image
+    assert len(set(keys)) == 6

@@ -481,8 +481,8 @@ def test_training_views_are_read_back(hill, tmp_path):
     np.testing.assert_array_equal(seeds["vertex"]["z"], baked(hill).means[:, 2])
     origin = next(line for line in seeds.comments if line.startswith("origin "))
     assert json.loads(origin.removeprefix("origin "))["latitude_deg"] == FRAME.latitude_deg
+    stray = TrainingView(NamedView("noon", camera, "noon.png", time), state)
     with pytest.raises(ValueError, match="subpath"):
-        stray = TrainingView(NamedView("noon", camera, "noon.png", time), state)
         write_training_views(tmp_path, [stray], baked(hill), FRAME)
     with pytest.raises(ValueError, match="no view"):
         write_training_views(tmp_path, [], baked(hill), FRAME)

@@ -12,11 +12,12 @@ states its standard error and where it comes from.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter
+from scipy.ndimage import shift as spline_shift
 
 from seasonscapes.albedo.closed_form import HIGHEST, LOWEST
 from seasonscapes.albedo.registration import shifted_back, texture_shift
@@ -97,6 +98,10 @@ class DelightOptions:
         Correct the sky's share of the light from the image.
     rounds
         Iterations of interreflection.
+    land_class
+        ``(R, S)`` integers, −1 for none: classes of land whose response to direct light is fitted one by one, so that
+        their albedo no longer depends on it. Canopies are no Lambertian surfaces, and their sunlight and shade mix
+        within a texel; see `class_response`. ``None`` treats all land as Lambertian.
     light_error, slope_error
         Relative error of the modelled light, and standard error of the cosine of incidence, for σ.
     quantum
@@ -110,6 +115,7 @@ class DelightOptions:
     borders: BorderModel | None = field(default_factory=BorderModel)
     fit_sky: bool = True
     rounds: int = 3
+    land_class: np.ndarray | None = None
     light_error: float = 0.05
     slope_error: float = 0.06
     quantum: float | None = None
@@ -194,44 +200,108 @@ def delight_image(
         Where the image has no value on the surface.
     """
     options, report = options or DelightOptions(), progress or (lambda fraction: None)
-    chart = np.where(np.isfinite(image).all(axis=2), light.chart, -1)
-    if not (chart >= 0).any():
+    known = np.isfinite(image).all(axis=2) & (light.chart >= 0)
+    if not known.any():
         raise NoUsablePixels("delight: the image has no value anywhere on the surface")
-    scale = _radiance_per_unit(options, light)
-    grey = np.full(light.sun.shape, _GREY, np.float32)
-    bounce = light.bounce(grey)
     shift = None
     if options.register:
-        predicted = light.visibility[..., None] * light.sun + light.sky + bounce
-        shift = texture_shift(image.mean(axis=2), predicted.mean(axis=2), chart >= 0)
-        if shift is not None:
-            image = shifted_back(image, shift)
-            clipped = shifted_back(clipped.astype(np.float32), shift) > 0.01
-            chart = np.where(np.isfinite(image).all(axis=2), light.chart, -1)
+        predicted = light.visibility[..., None] * light.sun + light.sky + light.bounce(_grey(light.sun.shape))
+        shift = texture_shift(image.mean(axis=2), predicted.mean(axis=2), known)
     report(0.1)
+    if shift is None:
+        return _delit(image, clipped, light, options, report)
+    # Splines through the sharp borders of shadows in the image would overshoot; the light is moved onto the image instead,
+    # and the albedo, which has none, back onto the surface.
+    moved = None if options.land_class is None else _moved(options.land_class, shift).astype(int)
+    result = _delit(image, clipped, _moved_light(light, shift), replace(options, land_class=moved), report)
+    return _placed_back(result, shift)
+
+
+def _grey(shape: tuple[int, ...]) -> np.ndarray:
+    return np.full(shape, _GREY, np.float32)
+
+
+def _moved(values: np.ndarray, shift: tuple[float, float], *, order: int = 0) -> np.ndarray:
+    """Values of texels ``(R, S)`` or ``(R, S, C)`` at the places where the image shows them; those of the rim beyond it."""
+    offsets = (*shift, *(0.0 for _ in values.shape[2:]))
+    return spline_shift(values.astype(np.float64), offsets, order=order, mode="nearest").astype(np.float32)
+
+
+def _moved_light(light: TexelIrradiance, shift: tuple[float, float]) -> TexelIrradiance:
+    back = (-shift[0], -shift[1])
+    return replace(
+        light,
+        sun=_moved(light.sun, shift, order=1),
+        visibility=_moved(light.visibility, shift, order=1),
+        sky=_moved(light.sky, shift, order=1),
+        bounce=lambda albedo: _moved(light.bounce(_moved(albedo, back)), shift, order=1),
+        chart=_moved(light.chart, shift).astype(np.int32),
+    )
+
+
+def _placed_back(delit: DelitImage, shift: tuple[float, float]) -> DelitImage:
+    """Results on the texels of the surface from those on the image's."""
+    logarithm = shifted_back(np.log(np.maximum(delit.albedo, LOWEST)), shift)
+    albedo = np.exp(logarithm)
+    known = np.asarray(np.isfinite(albedo).all(axis=2))
+    back = (-shift[0], -shift[1])
+    source = _moved(delit.source, back).astype(np.uint8)
+    # Beside an unknown texel no spline passes: the nearest value.
+    nearest = _moved(np.nan_to_num(delit.albedo), back)
+    albedo = np.where(known[..., None] | (source[..., None] == NOTHING), albedo, nearest)
+    there = source != NOTHING
+    sigma = np.where(there, _moved(np.where(np.isfinite(delit.sigma), delit.sigma, 1.0), back), np.inf)
+    return replace(
+        delit,
+        albedo=np.where(there[..., None], albedo, np.float32(np.nan)).astype(np.float32),
+        sigma=sigma.astype(np.float32),
+        visibility=np.clip(_moved(delit.visibility, back, order=1), 0.0, 1.0),
+        source=source,
+        shift_texels=shift,
+    )
+
+
+def _delit(
+    image: np.ndarray,
+    clipped: np.ndarray,
+    light: TexelIrradiance,
+    options: DelightOptions,
+    report: Callable[[float], None],
+) -> DelitImage:
+    """`delight_image` of an image that lies where the light does."""
+    known = np.isfinite(image).all(axis=2) & (light.chart >= 0)
+    chart = np.where(known, light.chart, -1)
+    scale = _radiance_per_unit(options, light)
     radiance = _at_surface(np.nan_to_num(image) * scale, options.air)
     visibility, deviation = light.visibility.astype(np.float32), np.zeros(chart.shape, np.float32)
-    factor, albedo = np.ones(3), grey
+    factor, bounce = np.ones(3), light.bounce(_grey(light.sun.shape))
+    sunlight = illuminance = visibility[..., None] * light.sun
+    albedo = _grey(light.sun.shape)
     for number in range(options.rounds):
-        if options.borders is not None and number in (0, options.rounds - 1):
+        final = number == options.rounds - 1
+        if options.borders is not None and (number == 0 or final):
             visibility, deviation = refined_visibility(
                 np.log(np.pi * np.maximum(radiance, 1e-3)),
                 light.sun,
                 np.maximum(factor * light.sky + bounce, 1e-3).astype(np.float32),
                 light.visibility,
                 chart,
-                model=options.borders,
+                # Borders are good enough for the sky factor after a rough first pass.
+                model=options.borders if final else replace(options.borders, levels=3, iterations=8),
             )
         sunlight = visibility[..., None] * light.sun
         if options.fit_sky:
-            usable = (chart >= 0) & ~clipped.any(axis=2) & (deviation < 0.1)
+            usable = known & ~clipped.any(axis=2) & (deviation < 0.1)
             factor = fitted_sky_factor(radiance, sunlight, light.sky, bounce, np.where(usable, chart, -1))
         illuminance = np.maximum(sunlight + factor * light.sky + bounce, 1e-3)
         albedo = np.clip(np.pi * radiance / illuminance, LOWEST, HIGHEST).astype(np.float32)
-        albedo[chart < 0] = _GREY
+        albedo[~known] = _GREY
         bounce = light.bounce(albedo)
         report(0.1 + 0.8 * (number + 1) / options.rounds)
-    known = chart >= 0
+    if options.land_class is not None:
+        kind = np.where(known & ~clipped.any(axis=2), options.land_class, -1)
+        illuminance = class_response(radiance, sunlight, illuminance - sunlight, kind)
+        albedo = np.clip(np.pi * radiance / illuminance, LOWEST, HIGHEST).astype(np.float32)
     albedo = _completed(albedo, clipped & known[..., None], known)
     sigma = _standard_error(albedo, image, light, sunlight, illuminance, deviation, options)
     lost = clipped.any(axis=2) & known
@@ -244,7 +314,7 @@ def delight_image(
         np.where(known, sigma, np.inf).astype(np.float32),
         visibility,
         source,
-        shift,
+        None,
         factor,
         scale,
     )
@@ -324,6 +394,54 @@ def fitted_sky_factor(
     return result
 
 
+def class_response(radiance: np.ndarray, sunlight: np.ndarray, ambient: np.ndarray, kind: np.ndarray) -> np.ndarray:
+    """Effective illuminance of classes of land: with as much diffuse light as makes their albedo independent of the sun.
+
+    The C correction of Teillet et al. 1982, within each class and channel, with exact cast shadows, sky and
+    interreflection in place of the cosine of incidence alone. The mean illuminance of a class does not change.
+
+    Parameters
+    ----------
+    radiance
+        ``(R, S, 3)`` [cd/m²] that leaves the surface.
+    sunlight, ambient
+        ``(R, S, 3)`` illuminance by the sun, and by sky and other terrain [lx].
+    kind
+        ``(R, S)`` class of each texel, −1 for none; small classes stay as they are.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(R, S, 3)`` effective illuminance [lx].
+    """
+    result = (sunlight + ambient).astype(np.float32)
+    for number in np.unique(kind[kind >= 0]):
+        member = kind == number
+        if member.sum() < _LEAST_PAIRS:
+            continue
+        for channel in range(3):
+            values, sun, diffuse = (
+                array[..., channel][member].astype(float) for array in (radiance, sunlight, ambient)
+            )
+
+            def dependence(
+                logarithm: float, values: np.ndarray = values, sun: np.ndarray = sun, diffuse: np.ndarray = diffuse
+            ) -> float:
+                albedo = values / np.maximum(sun + np.exp(logarithm) * diffuse, 1e-3)
+                low, high = np.percentile(albedo, [1.0, 99.0])
+                keep = (albedo >= low) & (albedo <= high)
+                return float(np.corrcoef(albedo[keep], sun[keep])[0, 1])
+
+            # More diffuse light makes the albedo of sunlit slopes larger: the dependence rises with the factor.
+            low, high = np.log(0.2), np.log(100.0)
+            for _ in range(18):
+                middle = 0.5 * (low + high)
+                low, high = (middle, high) if dependence(middle) < 0.0 else (low, middle)
+            effective = sun + np.exp(0.5 * (low + high)) * diffuse
+            result[..., channel][member] = effective * ((sun + diffuse).mean() / effective.mean())
+    return result
+
+
 def _pairs(sunlight: np.ndarray, ambient: np.ndarray, chart: np.ndarray, most: int = 40_000) -> np.ndarray:
     """Flat indices ``(N, 2)`` of texels a few apart, in the same chart, whose total light differs."""
     index = np.arange(chart.size).reshape(chart.shape)
@@ -345,11 +463,9 @@ def _pairs(sunlight: np.ndarray, ambient: np.ndarray, chart: np.ndarray, most: i
 
 def _completed(albedo: np.ndarray, clipped: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Albedo with its clipped channels completed: from the unclipped ones and the colour of unclipped neighbours."""
-    lost = clipped.any(axis=2)
-    if not lost.any():
-        return albedo
+    lost = np.asarray(clipped.any(axis=2), bool)
     good = known & ~lost
-    if not good.any():
+    if not lost.any() or not good.any():
         return albedo
     # Neighbours' colour: a normalised blur near by, the nearest texel where that reaches nothing.
     share = gaussian_filter(good.astype(np.float32), 3.0)
@@ -357,12 +473,12 @@ def _completed(albedo: np.ndarray, clipped: np.ndarray, known: np.ndarray) -> np
         np.stack([gaussian_filter(np.where(good, albedo[..., k], 0.0), 3.0) for k in range(3)], axis=2)
         / np.maximum(share, 1e-6)[..., None]
     )
-    nearest = distance_transform_edt(~good, return_distances=False, return_indices=True)
+    nearest = np.asarray(distance_transform_edt(~good, return_distances=False, return_indices=True))
     around = np.where((share > 1e-3)[..., None], blurred, albedo[nearest[0], nearest[1]])
-    whole = ~clipped
+    whole = np.equal(clipped, np.zeros_like(clipped))
     ratio = np.where(whole, albedo, 0.0).sum(axis=2) / np.maximum(np.where(whole, around, 0.0).sum(axis=2), 1e-6)
     # A clipped value is a lower bound.
-    guess = np.where(whole.any(axis=2)[..., None], around * ratio[..., None], around)
+    guess = np.where(np.asarray(whole.any(axis=2))[..., None], around * ratio[..., None], around)
     filled = np.where(clipped, np.maximum(albedo, guess), albedo)
     return np.clip(filled, LOWEST, HIGHEST).astype(np.float32)
 

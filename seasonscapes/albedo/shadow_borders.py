@@ -46,8 +46,8 @@ class BorderModel:
 
     levels: int = 5
     border_texels: float = 1.0
-    contrast: float = 0.2
-    truncation: float = 4.0
+    contrast: float = 0.3
+    truncation: float = 6.0
     smoothness: float = 0.3
     penumbra: float = 1.0
     iterations: int = 20
@@ -136,57 +136,83 @@ def _propagated(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean and standard deviation ``(h, w)`` of the visibility of one tile."""
     levels = np.linspace(0.0, 1.0, model.levels, dtype=np.float32)
-    light = levels[:, None] * sun[:, :, None, :] + ambient[:, :, None, :]
-    log_albedo = np.nan_to_num(log_radiance)[:, :, None, :] - np.log(np.maximum(light, 1e-3))
-    # Brightness, and two differences of colour.
-    features = np.concatenate(
+    known = chart >= 0
+    # Planes of levels come first: sums and minima over levels then run along contiguous memory.
+    features = np.stack([_features(log_radiance, level * sun + ambient) for level in levels])
+    unary = np.stack(
         [
-            log_albedo.mean(axis=3, keepdims=True),
-            log_albedo[..., :1] - log_albedo[..., 1:2],
-            log_albedo[..., 2:] - log_albedo[..., 1:2],
-        ],
-        axis=3,
-    ).astype(np.float32)
-    unary = -np.log(levels * prior[..., None] + (1.0 - levels) * (1.0 - prior[..., None]))
-    unary = unary + model.penumbra * 4.0 * levels * (1.0 - levels)
-    unary = np.where((chart >= 0)[..., None], unary, 0.0).astype(np.float32)
-    step = np.float32(model.smoothness) * np.abs(levels[:, None] - levels)
-    joined, cost = [], []
+            model.penumbra * 4.0 * level * (1.0 - level) - np.log(level * prior + (1.0 - level) * (1.0 - prior))
+            for level in levels
+        ]
+    )
+    unary = np.where(known, unary, 0.0).astype(np.float32)
+    costs, joined = [], []
     for axis in (0, 1):
-        first, second = _neighbours(features, axis)
-        difference = np.abs(first[:, :, :, None, :] - second[:, :, None, :, :]).sum(axis=4) / model.contrast
-        cost.append(np.minimum(difference, model.truncation) + step)
         one, other = _neighbours(chart, axis)
-        joined.append(((one == other) & (one >= 0))[..., None])
-    belief = _min_sum(unary, cost, joined, model.iterations)
-    weight = np.exp(-2.0 * belief)
-    weight /= weight.sum(axis=2, keepdims=True)
-    mean = (weight * levels).sum(axis=2)
-    return mean, np.sqrt(np.maximum((weight * levels**2).sum(axis=2) - mean**2, 0.0))
+        joined.append((one == other) & (one >= 0))
+        first, second = _neighbours(features, axis)
+        cost = np.empty((model.levels, model.levels, *joined[axis].shape), np.float32)
+        for k in range(model.levels):
+            for m in range(model.levels):
+                difference = np.abs(first[k] - second[m]).sum(axis=-1) / np.float32(model.contrast)
+                step = np.float32(model.smoothness * abs(levels[k] - levels[m]))
+                np.minimum(difference, np.float32(model.truncation), out=cost[k, m])
+                cost[k, m] += step
+        costs.append(cost)
+    belief = _min_sum(unary, costs, joined, model.iterations)
+    # Sharper than the beliefs: a share of a few hundredths of sun would darken the albedo of shade by a tenth.
+    weight = np.exp(-5.0 * belief)
+    weight /= weight.sum(axis=0)
+    mean = np.tensordot(levels, weight, axes=(0, 0))
+    return mean, np.sqrt(np.maximum(np.tensordot(levels**2, weight, axes=(0, 0)) - mean**2, 0.0))
+
+
+def _features(log_radiance: np.ndarray, light: np.ndarray) -> np.ndarray:
+    """Brightness of the log albedo under a light, and two differences of its colour ``(h, w, 3)``."""
+    log_albedo = np.nan_to_num(log_radiance) - np.log(np.maximum(light, 1e-3))
+    red, green, blue = np.moveaxis(log_albedo, 2, 0)
+    return np.stack([(red + green + blue) / 3.0, red - green, blue - green], axis=2).astype(np.float32)
 
 
 def _neighbours(values: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
-    """Views of all texels that have a next one along an axis, and of those next ones."""
-    return (values[:-1], values[1:]) if axis == 0 else (values[:, :-1], values[:, 1:])
+    """Views of all texels that have a next one along an axis, and of those next ones.
+
+    ``values`` is ``(h, w)``, planes ``(K, h, w)``, or planes of features ``(K, h, w, 3)``.
+    """
+    at = axis if values.ndim == 2 else axis + 1
+    ahead = [slice(None)] * values.ndim
+    behind = list(ahead)
+    ahead[at], behind[at] = slice(None, -1), slice(1, None)
+    return values[tuple(ahead)], values[tuple(behind)]
 
 
-def _min_sum(unary: np.ndarray, cost: list[np.ndarray], joined: list[np.ndarray], iterations: int) -> np.ndarray:
-    """Beliefs ``(h, w, K)``, 0 for the best level, after damped rounds of messages along both axes and both ways."""
-    # [axis][0]: messages to the next texel along the axis; [axis][1]: to the previous one; stored at the receiver.
+def _min_sum(unary: np.ndarray, costs: list[np.ndarray], joined: list[np.ndarray], iterations: int) -> np.ndarray:
+    """Beliefs ``(K, h, w)``, 0 for the best level, after damped rounds of messages along both axes and both ways."""
+    # [axis, 0]: messages to the next texel along the axis; [axis, 1]: to the previous one; stored at the receiver.
     messages = np.zeros((2, 2, *unary.shape), np.float32)
     for _ in range(iterations):
         total = unary + messages.sum(axis=(0, 1))
-        fresh = np.zeros_like(messages)
         for axis in (0, 1):
             ahead, _ = _neighbours(total - messages[axis, 1], axis)
             _, back = _neighbours(total - messages[axis, 0], axis)
-            _, to_next = _neighbours(fresh[axis, 0], axis)
-            to_previous, _ = _neighbours(fresh[axis, 1], axis)
-            for target, sent in (
-                (to_next, (ahead[..., :, None] + cost[axis]).min(axis=2)),
-                (to_previous, (back[..., None, :] + cost[axis]).min(axis=3)),
-            ):
-                target[...] = np.where(joined[axis], sent - sent.min(axis=2, keepdims=True), 0.0)
-        messages = 0.5 * (messages + fresh)
+            _, to_next = _neighbours(messages[axis, 0], axis)
+            to_previous, _ = _neighbours(messages[axis, 1], axis)
+            _send(ahead, costs[axis], joined[axis], to_next)
+            _send(back, costs[axis].swapaxes(0, 1), joined[axis], to_previous)
     belief = unary + messages.sum(axis=(0, 1))
-    return belief - belief.min(axis=2, keepdims=True)
+    return belief - belief.min(axis=0)
+
+
+def _send(source: np.ndarray, cost: np.ndarray, joined: np.ndarray, target: np.ndarray) -> None:
+    """Damped update of messages ``(K, h, w)``: the least of source and cost over the source's levels."""
+    sent = np.empty(source.shape, np.float32)
+    trial = np.empty(source.shape[1:], np.float32)
+    for m in range(len(sent)):
+        np.add(source[0], cost[0, m], out=sent[m])
+        for k in range(1, len(source)):
+            np.add(source[k], cost[k, m], out=trial)
+            np.minimum(sent[m], trial, out=sent[m])
+    sent -= sent.min(axis=0)
+    sent *= joined
+    target += sent
+    target *= np.float32(0.5)

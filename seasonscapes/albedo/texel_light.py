@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
+from scipy.ndimage import label
 
 from seasonscapes.albedo.delighting import TexelIrradiance
 from seasonscapes.albedo.forward_model import TexelTransport, ambient_on_texels
@@ -25,8 +28,7 @@ def texel_irradiance(
     light
         Sun and sky; the moon is left out.
     chart
-        ``(R, S)`` integers of the texture's charts, −1 for none; by default the whole surface is one chart, as in
-        top-down atlases.
+        ``(R, S)`` integers of the texture's charts, −1 for none; by default each connected part of the texture is one.
 
     Returns
     -------
@@ -46,8 +48,13 @@ def texel_irradiance(
     def bounce(albedo: np.ndarray) -> np.ndarray:
         return np.maximum(ambient_on_texels(transport, light, albedo) - sky, 0.0).reshape(rows, columns, 3)
 
+    if chart is None:
+        covered = np.zeros(rows * columns, bool)
+        covered[transport.texel] = True
+        numbered, _ = cast(tuple[np.ndarray, int], label(covered.reshape(rows, columns)))
+        chart = numbered.astype(np.int32) - 1
     surface = np.full(rows * columns, -1, np.int32)
-    surface[transport.texel] = 0 if chart is None else chart.ravel()[transport.texel]
+    surface[transport.texel] = chart.ravel()[transport.texel]
     return TexelIrradiance(
         sun.reshape(rows, columns, 3),
         visibility.reshape(rows, columns),

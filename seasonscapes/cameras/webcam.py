@@ -18,7 +18,7 @@ from pydantic import Field, field_validator, model_validator
 
 from seasonscapes.cameras.panorama import Panorama, panorama_from_angles
 from seasonscapes.cameras.pinhole import Camera, rotation_from_angles
-from seasonscapes.declaration import Declaration, InputError, Name, read_toml, validate
+from seasonscapes.declaration import Declaration, InputError, Name, Text, read_toml, validate
 from seasonscapes.frames import Latitude, LocalFrame, Longitude, enu_from_geodetic, local_axes
 
 
@@ -58,7 +58,7 @@ class Webcam(Declaration):
     """
 
     id: Name
-    name: str = ""
+    name: Text = ""
     latitude_deg: Latitude
     longitude_deg: Longitude
     height_m: float | None = Field(default=None, ge=-500.0, le=100_000.0)

@@ -75,9 +75,11 @@ app = App(
 
 # Name, module, and what the command does.
 COMMANDS = (
+    ("fetch", "fetch", "Make the scene of a place from open data, by its coordinates."),
     ("render", "render", "Render a view of a place at a date and hour."),
     ("timelapse", "timelapse", "Film a view through hours or seasons."),
     ("lit-texture", "lit_texture", "Export a place's texture as lit at an hour."),
+    ("export", "export", "Write a place for other programs: glTF, USD, 3D Tiles, Blender."),
     ("irradiance", "irradiance", "Map the irradiance of the ground at an hour or over a period."),
     ("sky", "sky", "Report the light of a place at an instant, and picture the sky dome."),
     ("terrain", "terrain", "Build a place's terrain and report its quality."),
@@ -88,6 +90,8 @@ COMMANDS = (
     ("inpaint", "inpaint", "Complete a painted texture where no camera saw the surface."),
     ("path", "path", "Make a camera path over a place, clear of the ground, with a map."),
     ("albedo", "albedo", "Recover the albedo of a place from its photographs."),
+    ("delight", "delight", "Take the light of its hour out of an image or a textured mesh."),
+    ("relight", "relight", "Light a textured mesh anew: pictures, lit textures or a film."),
     ("distill", "distill", "Distil a Gaussian model of a place."),
     ("splat", "splat", "Render distilled Gaussians at any hour, or bake them for other programs."),
     ("run", "run", "From photographs to pictures of any hour: all stages, resumable."),

@@ -67,6 +67,18 @@ def parse_at(text: str, *, flag: str = "--at") -> tuple[float, float, float | No
     return latitude, longitude, numbers[2], None
 
 
+def parse_sun(text: str, *, flag: str = "--sun") -> tuple[float, float]:
+    """``AZIMUTH,ELEVATION`` of the sun [deg]."""
+    expected = "AZIMUTH,ELEVATION in degrees, such as 172,38.5"
+    try:
+        azimuth_deg, elevation_deg = (float(part) for part in text.split(","))
+    except ValueError:
+        raise InputError(flag, "not a direction", got=text, expected=expected) from None
+    check_range(flag, azimuth_deg, -360.0, 360.0)
+    check_range(flag, elevation_deg, -18.0, 90.0)
+    return azimuth_deg, elevation_deg
+
+
 def parse_duration(flag: str, text: str) -> timedelta:
     """``90s``, ``10min``, ``1h``, ``1d`` as a length of time of at least a second."""
     match = re.fullmatch(r"([0-9]{1,12}(?:\.[0-9]{1,9})?)\s*(s|min|m|h|d)", text.strip())

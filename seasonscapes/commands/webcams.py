@@ -50,7 +50,7 @@ def webcams_command(
     output
         A .png map: positions, fields of view, headings.
     allow_outside
-        Let the scene file name data outside its folder.
+        Trust the scene: data and pictures outside its folder, any raster format, servers.
     json
         Print one machine-readable record.
     """

@@ -107,12 +107,18 @@ def _proj_undulation(
 
 
 @lru_cache(maxsize=1)
-def _egm96_cm() -> np.ndarray:
-    """Undulations [cm] at every half degree from the north pole, columns from Greenwich, with a margin on both sides."""
+def _egm96_coefficients() -> np.ndarray:
+    """Cubic B-spline coefficients of the undulations [cm] at every half degree.
+
+    Rows from the north pole, columns from Greenwich, with a margin on both sides.
+    """
+    from scipy.ndimage import spline_filter
+
     with np.load(str(files("seasonscapes.terrain") / "egm96_30min.npz"), allow_pickle=False) as stored:
         # Stored as differences along both axes, which deflate to half the size.
         grid = np.cumsum(np.cumsum(stored["differences_cm"], axis=0, dtype=np.int32), axis=1, dtype=np.int32)
-    return np.concatenate([grid[:, -_MARGIN:], grid, grid[:, :_MARGIN]], axis=1).astype(np.float32)
+    wrapped = np.concatenate([grid[:, -_MARGIN:], grid, grid[:, :_MARGIN]], axis=1)
+    return spline_filter(wrapped, order=3, output=np.float64, mode="nearest")
 
 
 def egm96_m(latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> np.ndarray:
@@ -128,4 +134,6 @@ def egm96_m(latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> np.ndarray:
 
     latitude, longitude = np.broadcast_arrays(np.asarray(latitude_deg, float), np.asarray(longitude_deg, float))
     row, column = (90.0 - latitude) * _PER_DEG, longitude % 360.0 * _PER_DEG + _MARGIN
-    return map_coordinates(_egm96_cm(), [row, column], order=3, mode="nearest", output=np.float64) / 100.0
+    places = [row.ravel(), column.ravel()]
+    undulation_cm = map_coordinates(_egm96_coefficients(), places, order=3, mode="nearest", prefilter=False)
+    return undulation_cm.reshape(row.shape) / 100.0

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from seasonscapes.errors import InputError
 
-if TYPE_CHECKING:
-    from seasonscapes.terrain.surface import Raster
-
 # Measured peak of reading, checking and meshing heights, per sample.
-_BYTES_PER_SAMPLE = 100
+_BYTES_PER_SAMPLE = 120
 
 
 def available_bytes() -> int:
@@ -61,25 +57,23 @@ def require_bytes(needed: float, *, where: str, got: str, cure: str) -> None:
         )
 
 
-def check_memory(grid: Raster, where: str | os.PathLike[str], *, factor: int = 1) -> None:
-    """Raise `InputError` where the heights of a grid, refined ``factor`` times, would not fit into memory.
+def check_memory(shape: tuple[int, ...], where: str | os.PathLike[str]) -> None:
+    """Raise `InputError` where a grid of heights, with all that is computed of it, would not fit into memory.
 
     Parameters
     ----------
-    grid
-        Supplies the size.
+    shape
+        Rows and columns, first of all.
     where
         File or argument, for the message.
-    factor
-        How many times finer the heights are to be interpolated.
     """
-    height, width = grid.values.shape[:2]
-    needed, free = height * width * factor**2 * _BYTES_PER_SAMPLE, available_bytes()
+    height, width = shape[:2]
+    needed, free = height * width * _BYTES_PER_SAMPLE, available_bytes()
     if needed > free:
         raise InputError(
             os.fspath(where),
             "too many samples for this machine's memory",
-            got=f"{width * factor} × {height * factor}, about {needed / 1e9:.1f} GB",
+            got=f"{width} × {height}, about {needed / 1e9:.1f} GB",
             expected=f"at most {free / 1e9:.1f} GB",
             cure="use a part with a table [area], or a coarser raster: gdal_translate -outsize 10% 10%",
         )

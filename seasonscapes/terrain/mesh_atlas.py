@@ -40,6 +40,24 @@ class Tile:
 
 
 @dataclass(frozen=True)
+class _Corners:
+    """Corners of F faces.
+
+    Position ``(F, 3, 3)``, column and row in the image ``(F, 3, 2)``, unit normal ``(F, 3, 3)``, tile of each face
+    ``(F,)``, and number ``(F, 3)`` of the vertex in the file.
+    """
+
+    position: np.ndarray
+    xy: np.ndarray
+    normal: np.ndarray
+    tile: np.ndarray
+    point: np.ndarray
+
+    def __getitem__(self, key: np.ndarray) -> _Corners:
+        return _Corners(*(getattr(self, name)[key] for name in self.__dataclass_fields__))
+
+
+@dataclass(frozen=True)
 class MeshAtlas:
     """A mesh with one image that holds all its textures.
 
@@ -64,8 +82,6 @@ class MeshAtlas:
         ``(R, S)`` int32 charts, −1 off the surface: neighbouring texels of one chart adjoin on the surface.
     fixed
         Tiles that are no texture: index among ``tiles`` and colour ``(3,)``.
-    factor
-        ``(T, 3)`` colour factor of each texture.
     notes
         What was found that may not be meant, one line each.
     """
@@ -79,7 +95,6 @@ class MeshAtlas:
     weights: np.ndarray
     chart: np.ndarray
     fixed: tuple[tuple[int, np.ndarray], ...]
-    factor: np.ndarray
     notes: tuple[str, ...] = ()
 
     def image(self, textures: list[np.ndarray]) -> np.ndarray:
@@ -163,24 +178,23 @@ def mesh_atlas(mesh: TexturedMesh, *, ground_albedo: float | None) -> MeshAtlas:
     sizes, blocks = _tile_sizes(mesh)
     tiles, shape = _shelves(sizes + [(2, 2)] * len(uniform))
     fixed = tuple((len(sizes) + index, colour) for index, colour in enumerate(uniform))
-    corners, uv, normals, tile_of, point, notes = _corners(mesh, tiles, len(sizes), blocks)
-    degenerate = (
-        face_normals(corners)[1] <= 1e-14 * max(float(np.ptp(corners.reshape(-1, 3), axis=0).max()), 1e-30) ** 2
-    )
+    corners, notes = _corners(mesh, tiles, len(sizes), blocks)
+    extent = max(float(np.ptp(corners.position.reshape(-1, 3), axis=0).max()), 1e-30)
+    degenerate = face_normals(corners.position)[1] <= 1e-14 * extent**2
     if degenerate.all():
         raise InputError(mesh.path, "all faces are degenerate")
     if degenerate.any():
         notes.append(f"{int(degenerate.sum())} of {len(degenerate)} faces are degenerate and cast no shadow")
-    keep = ~degenerate
-    corners, uv, normals, tile_of, point = (array[keep] for array in (corners, uv, normals, tile_of, point))
-    notes += _topology_notes(corners)
-    face, weights, chart, shared = _texels(shape, tiles, blocks, uv, tile_of, point)
+    corners = corners[~degenerate]
+    notes += _topology_notes(corners.position)
+    face, weights, chart, shared = _texels(shape, tiles, blocks, corners)
     if shared:
         notes.append(f"{shared} texels are used by several faces; their light is that of one of them")
+    vectors = [corners.position, corners.normal, corners.xy]
     if ground_albedo is not None:
-        more = _ground(corners, tiles[-1])
-        corners, uv, normals = (np.concatenate(pair) for pair in zip((corners, uv, normals), more, strict=True))
-    rows = np.concatenate([corners, normals, uv], axis=2).reshape(-1, 8).astype(np.float32)
+        ground = _ground(corners.position, tiles[-1])
+        vectors = [np.concatenate(pair) for pair in zip(vectors, ground, strict=True)]
+    rows = np.concatenate(vectors, axis=2).reshape(-1, 8).astype(np.float32)
     first, number = numbered_rows(rows)
     size = np.array([shape[1], shape[0]])
     coordinates = rows[first, 6:].astype(np.float64) / size
@@ -192,13 +206,7 @@ def mesh_atlas(mesh: TexturedMesh, *, ground_albedo: float | None) -> MeshAtlas:
         mesh.frame,
         normals=np.ascontiguousarray(rows[first, 3:6]),
     )
-    factor = np.ones((len(mesh.textures), 3), np.float32)
-    for part in mesh.parts:
-        if part.texture >= 0:
-            factor[part.texture] = part.colour
-    return MeshAtlas(
-        mesh, terrain, shape, tuple(tiles), tuple(blocks), face, weights, chart, fixed, factor, tuple(notes)
-    )
+    return MeshAtlas(mesh, terrain, shape, tuple(tiles), tuple(blocks), face, weights, chart, fixed, tuple(notes))
 
 
 def _tile_sizes(mesh: TexturedMesh) -> tuple[list[tuple[int, int]], list[np.ndarray | None]]:
@@ -257,8 +265,8 @@ def _blocks(values: np.ndarray, faces: np.ndarray, tile: Tile) -> np.ndarray:
 
 def _corners(
     mesh: TexturedMesh, tiles: list[Tile], textures: int, blocks: list[np.ndarray | None]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, list[str]]:
-    """Of the corners ``(F, 3, …)`` of all faces: position, column and row in the image, normal; tile; number of vertex."""
+) -> tuple[_Corners, list[str]]:
+    """Corners of all faces, and what was found about their normals."""
     positions, coordinates, normals, tile_of, point = [], [], [], [], []
     notes: list[str] = []
     plain, offset, done = textures, 0, dict.fromkeys(range(textures), 0)
@@ -293,7 +301,7 @@ def _corners(
         point.append(part.faces + offset)
         offset += len(position)
     stacked = (np.concatenate(arrays) for arrays in (positions, coordinates, normals, tile_of, point))
-    return *stacked, notes
+    return _Corners(*stacked), notes
 
 
 def _in_tile(mesh: TexturedMesh, name: str, uv: np.ndarray, tile: Tile) -> np.ndarray:
@@ -328,31 +336,26 @@ def _topology_notes(corners: np.ndarray) -> list[str]:
 
 
 def _texels(
-    shape: tuple[int, int],
-    tiles: list[Tile],
-    blocks: list[np.ndarray | None],
-    xy: np.ndarray,
-    tile_of: np.ndarray,
-    point: np.ndarray,
+    shape: tuple[int, int], tiles: list[Tile], blocks: list[np.ndarray | None], corners: _Corners
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
     """Face, barycentric coordinates and chart of the texels of all textures, and how many texels several faces share."""
     face, chart = (np.full(shape, -1, np.int32) for _ in range(2))
     weights = np.zeros((*shape, 3), np.float32)
-    charts, shared = _charts(xy, tile_of, point), 0
+    charts, shared = _charts(corners), 0
     for index, tile_blocks in enumerate(blocks):
-        tile, here = tiles[index], np.flatnonzero(tile_of == index)
+        tile, here = tiles[index], np.flatnonzero(corners.tile == index)
         if not len(here):
             continue
         inside = tile.window
         if tile_blocks is not None:
             # One texel of each vertex; every one is a chart of its own.
-            _, first = np.unique(point[here].ravel(), return_index=True)
-            column, row = np.floor(xy[here].reshape(-1, 2)[first]).astype(int).T
+            _, first = np.unique(corners.point[here].ravel(), return_index=True)
+            column, row = np.floor(corners.xy[here].reshape(-1, 2)[first]).astype(int).T
             face[row, column] = here[first // 3]
             weights[row, column] = np.eye(3, dtype=np.float32)[first % 3]
             chart[row, column] = charts.max(initial=0) + 1 + np.arange(len(first))
             continue
-        local = (xy[here] - np.array([tile.column, tile.row])).reshape(-1, 2)
+        local = (corners.xy[here] - np.array([tile.column, tile.row])).reshape(-1, 2)
         corner = np.arange(3 * len(here)).reshape(-1, 3)
         shared += int((coverage_count(local, corner, tile.columns, tile.rows) > 1).sum())
         found = covering_faces(local, corner, tile.columns, tile.rows)
@@ -365,13 +368,13 @@ def _texels(
     return face, weights, chart, shared
 
 
-def _charts(xy: np.ndarray, tile_of: np.ndarray, point: np.ndarray) -> np.ndarray:
+def _charts(corners: _Corners) -> np.ndarray:
     """Chart of each face: faces that share a vertex with equal texture coordinates belong together."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    rows = np.concatenate([xy.reshape(-1, 2).astype(np.float32).view(np.uint32), point.reshape(-1, 1)], axis=1)
-    rows = np.concatenate([rows, np.repeat(tile_of, 3)[:, None]], axis=1).astype(np.uint32)
+    xy = corners.xy.reshape(-1, 2).astype(np.float32).view(np.uint32)
+    rows = np.c_[xy, corners.point.reshape(-1), np.repeat(corners.tile, 3)].astype(np.uint32)
     corner = numbered_rows(rows)[1].reshape(-1, 3)
     one, other = np.r_[corner[:, 0], corner[:, 1]], np.r_[corner[:, 1], corner[:, 2]]
     count = int(corner.max()) + 1
@@ -380,7 +383,7 @@ def _charts(xy: np.ndarray, tile_of: np.ndarray, point: np.ndarray) -> np.ndarra
 
 
 def _ground(corners: np.ndarray, tile: Tile) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Corners, coordinates and normals of level ground just below a mesh, fine near it and coarse far away."""
+    """Corners, normals and coordinates of level ground just below a mesh, fine near it and coarse far away."""
     low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
     radius = 0.5 * float(np.linalg.norm(high - low))
     centre, level = 0.5 * (low + high), low[2] - 1e-3 * radius
@@ -398,4 +401,4 @@ def _ground(corners: np.ndarray, tile: Tile) -> tuple[np.ndarray, np.ndarray, np
         faces.append(np.stack([inner + sector, outer + following, inner + following], axis=1))
     triangles = points[np.concatenate(faces)]
     coordinates = np.tile(np.array([tile.column + 1.0, tile.row + 1.0]), (len(triangles), 3, 1))
-    return triangles, coordinates, np.tile(np.array([0.0, 0.0, 1.0]), (len(triangles), 3, 1))
+    return triangles, np.tile(np.array([0.0, 0.0, 1.0]), (len(triangles), 3, 1)), coordinates

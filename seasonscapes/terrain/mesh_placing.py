@@ -26,7 +26,7 @@ class MeshPlacing:
         ``"y"`` or ``"z"``: the file's axis that points upwards; ``None``: y of glTF, z of other files.
     at
         Latitude and longitude [deg] and height [m] of the middle of the mesh, if it has no map coordinates.
-    heading_deg
+    north_deg
         Azimuth of the file's own north (+y, or −z where y is up), clockwise from true north [deg].
     crs
         Coordinate system of the file's coordinates (``EPSG:n`` or WKT).
@@ -37,11 +37,17 @@ class MeshPlacing:
     ------
     InputError
         For values that contradict each other.
+
+    Examples
+    --------
+    >>> import seasonscapes as ss
+    >>> ss.MeshPlacing(crs="EPSG:2056", offset=(2_641_000.0, 1_158_000.0, 1_200.0)).crs
+    'EPSG:2056'
     """
 
     up: str | None = None
     at: tuple[float, float, float] | None = None
-    heading_deg: float = 0.0
+    north_deg: float = 0.0
     crs: str | None = None
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
@@ -52,8 +58,8 @@ class MeshPlacing:
             raise InputError("--at", "and --crs both say where the mesh lies", cure="drop one of them")
         if self.crs is None and any(self.offset):
             raise InputError("--offset", "wants the coordinate system it is in", cure="--crs EPSG:n")
-        if self.crs is not None and self.heading_deg:
-            raise InputError("--heading", "and --crs both say where north is", cure="drop one of them")
+        if self.crs is not None and self.north_deg:
+            raise InputError("--north", "and --crs both say where north is", cure="drop one of them")
 
 
 def placed(
@@ -94,7 +100,7 @@ def placed(
     if placing.crs is None:
         _require_metres(low, high, where)
         latitude, longitude, height = placing.at or (0.0, 0.0, 0.0)
-        turn, middle = turn_from_axes(up, placing.heading_deg), 0.5 * (low + high) @ axes
+        turn, middle = turn_from_axes(up, placing.north_deg), 0.5 * (low + high) @ axes
         frame = LocalFrame(latitude, longitude, height)
         return [(position - middle) @ turn.T for position in positions], turn, frame, up
     middle = 0.5 * (low + high)

@@ -221,13 +221,14 @@ def _read_gltf(path: Path, allow_outside: bool) -> MeshFile:
         )
     except Exception as error:  # trimesh lets errors of numpy and json through
         raise InputError(path, f"not a readable glTF file ({type(error).__name__}: {error})") from None
-    for node in scene.graph.nodes_geometry:
+    for node in sorted(scene.graph.nodes_geometry):
         transform, name = scene.graph[node]
         geometry = scene.geometry[name]
         if not hasattr(geometry, "faces"):
             continue
         label = getattr(getattr(geometry.visual, "material", None), "name", None)
-        image, factor, uv_transform = choice[int(label)] if label and label.isdigit() else (None, (1.0,) * 3, None)
+        plain = (None, (1.0, 1.0, 1.0), None)
+        image, factor, uv_transform = choice[int(label)] if label and label.isdigit() else plain
         uv = getattr(geometry.visual, "uv", None)
         if uv is not None and uv_transform is not None:
             uv = np.c_[uv[:, 0], 1.0 - uv[:, 1], np.ones(len(uv))] @ uv_transform.T

@@ -129,7 +129,7 @@ def read_elevation(
         check_height_band(source, reader.bands[0], where)
         declared = unit or declared_unit(source, reader.bands[0], where)
     check_cells(grid, where)
-    check_memory(grid, where)
+    check_memory(grid.values.shape, where)
     raster = read_raster(path, bounds_deg=bounds_deg, bands=reader.bands, confinement=confinement)
     if nodata is not None:
         raster = replace(raster, values=np.where(raster.values == nodata, np.float32(np.nan), raster.values))

@@ -148,7 +148,7 @@ def texel_positions(terrain: Terrain, width: int, height: int) -> tuple[np.ndarr
 
 
 def covered_share(terrain: Terrain, weight: np.ndarray) -> float:
-    """Share of a surface's plan area whose texels have a weight, by the middles of its faces.
+    """Share of a surface's texels that have a weight, counted on at most 512 × 512 of them.
 
     Parameters
     ----------
@@ -162,13 +162,12 @@ def covered_share(terrain: Terrain, weight: np.ndarray) -> float:
     float
         In [0, 1].
     """
-    height, width = weight.shape
-    middle = terrain.uv[terrain.faces].mean(axis=1)
-    column, row = np.floor(texel_coordinates(middle, width, height)).astype(int).T
-    covered = weight[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)] > 0.0
-    a, b, c = (terrain.vertices[terrain.faces[:, k], :2].astype(np.float64) for k in range(3))
-    area = np.abs(_cross(b - a, c - a))
-    return float(area[covered].sum() / max(area.sum(), 1e-12))
+    rows, columns = (min(side, 512) for side in weight.shape)
+    on_surface = covering_faces(texel_coordinates(terrain.uv, columns, rows), terrain.faces, columns, rows) >= 0
+    row = (np.arange(rows) + 0.5) * weight.shape[0] / rows
+    column = (np.arange(columns) + 0.5) * weight.shape[1] / columns
+    covered = weight[np.ix_(row.astype(int), column.astype(int))] > 0.0
+    return float(covered[on_surface].mean()) if on_surface.any() else 1.0
 
 
 def barycentric(corners: np.ndarray, point: np.ndarray) -> np.ndarray:

@@ -109,18 +109,18 @@ class TexturedMesh:
         return np.min([p.min(axis=0) for p in used], axis=0), np.max([p.max(axis=0) for p in used], axis=0)
 
 
-def turn_from_axes(up: str, heading_deg: float) -> np.ndarray:
+def turn_from_axes(up: str, north_deg: float) -> np.ndarray:
     """Rotation ``(3, 3)`` from a file's axes to east-north-up.
 
     Parameters
     ----------
     up
         ``"z"``: x east, y north; ``"y"``: x east, −z north, as in glTF.
-    heading_deg
+    north_deg
         Azimuth of the file's own north, clockwise from true north [deg].
     """
     axes = np.eye(3) if up == "z" else np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    sine, cosine = np.sin(np.radians(heading_deg)), np.cos(np.radians(heading_deg))
+    sine, cosine = np.sin(np.radians(north_deg)), np.cos(np.radians(north_deg))
     return np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]]) @ axes
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import date, datetime, timedelta
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +23,13 @@ from seasonscapes.albedo.seasons import (
     snowline_fraction,
 )
 from seasonscapes.errors import InputError
+from seasonscapes.scene import Imagery
 from seasonscapes.source_hash import source_hash
 from seasonscapes.terrain.surface import Raster, Texture, load_texture, save_texture
+from seasonscapes.workflows.delighting import UNKNOWN, delit_imagery, imagery_time
 from seasonscapes.workflows.edited_textures import albedo_date, read_albedo, require_albedo_file
-from seasonscapes.workflows.place import Place
+from seasonscapes.workflows.place import Place, utc_at
+from seasonscapes.workflows.scene_imagery import atlas_image
 from seasonscapes.workspace import build_once, file_hash
 
 # What workflows accept as ``albedo``: a texture of the place's atlas, an albedo of one date, albedos of several dates
@@ -35,7 +38,8 @@ AlbedoSource = Texture | DatedAlbedo | AlbedoSeries | None
 
 log = logging.getLogger(__name__)
 
-_IMAGE_CODE = ("terrain.imagery",)
+_IMAGE_CODE = ("terrain.imagery", "workflows.scene_imagery")
+_DELIT_CODE = ("workflows.delighting",)
 _SYNTHETIC_CODE = ("terrain.imagery", "terrain.synthetic")
 _EDITED_CODE = ("workflows.edited_textures",)
 _TRANSITION_CODE = ("albedo.seasons", "albedo.closed_form", "terrain.attributes")
@@ -107,7 +111,16 @@ def scene_albedo(place: Place, day: date | str) -> Texture:
         values = np.full((*place.texture_shape, 3), GREY_ALBEDO, np.float32)
         return Texture(values, np.zeros(place.texture_shape, np.float32), place.atlas_id)
     inputs.update(imagery=imagery.model_copy(update={"file": Path(imagery.file).name}), hash=place.scene.image_hash)
-    texture = texture_once(place, "albedo", inputs, code=_IMAGE_CODE, build=lambda: _baked_image(place))
+    time = imagery_time(imagery)
+    if time is None:
+        if not imagery.delit:
+            _tell_light_stays(imagery.file)
+        texture = texture_once(place, "albedo", inputs, code=_IMAGE_CODE, build=lambda: _baked_image(place, imagery))
+    else:
+        log.info("%s: its light is taken out", Path(imagery.file).name)
+        texture = texture_once(
+            place, "albedo-delit", inputs, code=_DELIT_CODE, build=lambda: delit_imagery(place, time).texture
+        )
     _tell_image(place, texture)
     return texture
 
@@ -183,14 +196,14 @@ def dated_albedos(place: Place, files: Sequence[AlbedoFile] = ()) -> list[DatedA
     if files:
         return sorted((_from_file(place, file) for file in files), key=lambda dated: dated.day)
     if place.synthetic is None:
-        midsummer = datetime(2024, 7, 1)
-        imagery = place.scene.imagery
-        content = (
-            "grey"
-            if imagery is None
-            else ":".join((imagery.model_dump_json(), str(place.scene.image_hash), source_hash(*_IMAGE_CODE)))
-        )
-        return [DatedAlbedo(midsummer.date(), content, lambda: scene_albedo(place, midsummer))]
+        day, imagery, content = date(2024, 7, 1), place.scene.imagery, "grey"
+        if imagery is not None:
+            time = imagery_time(imagery)
+            code = source_hash(*_IMAGE_CODE if time is None else _DELIT_CODE)
+            content = ":".join((imagery.model_dump_json(), str(place.scene.image_hash), code))
+            if isinstance(time, str) and time != UNKNOWN:
+                day = utc_at(place, time).date()
+        return [DatedAlbedo(day, content, lambda: scene_albedo(place, day))]
     days = [datetime(2024, month, day) for month in range(1, 13) for day in _FILM_DAYS]
     return [
         DatedAlbedo(
@@ -366,24 +379,20 @@ def _synthetic_image(place: Place, day_of_year: int) -> Raster:
     return Raster(values, elevation.transform * Affine.scale(1.0 / upsample), elevation.crs)
 
 
-def _baked_image(place: Place) -> Texture:
-    from seasonscapes.terrain.imagery import bake_imagery, read_imagery
-    from seasonscapes.terrain.raster import bounds_geographic
-
-    imagery = place.scene.imagery
-    assert imagery is not None
-    # Imagery far finer than the texels is averaged while it is read.
-    image = read_imagery(
-        imagery.file,
-        bounds_deg=bounds_geographic(place.elevation),
-        bands=tuple(imagery.bands) if imagery.bands else None,
-        finest_m=0.5 * place.atlas.texel_p50_m,
-        encoding=imagery.encoding,
-        full_scale=imagery.full_scale,
-        confinement=place.scene.confinement,
-    )
-    texture = bake_imagery(place.terrain, place.atlas, image)
-    values = np.clip(texture.values * imagery.reflectance_scale, 0.0, 0.95)
-    covered = texture.weight > 0.0
+def _baked_image(place: Place, imagery: Imagery) -> Texture:
+    """The scene's image as it is, taken for an albedo."""
+    image = atlas_image(place, imagery)
+    values = np.clip(image.values * imagery.reflectance_scale, 0.0, 0.95)
+    covered = image.weight > 0.0
     values[~covered] = np.median(values[covered], axis=0)
-    return replace(texture, values=values)
+    return Texture(values, image.weight, place.atlas_id)
+
+
+@lru_cache(maxsize=64)
+def _tell_light_stays(file: str) -> None:
+    """Log once for each file that its light is not taken out."""
+    log.info(
+        '%s: the light of its hour stays in the image; to take it out, state [imagery] time = "…" (or "unknown"), '
+        "or delit = true where it holds none",
+        Path(file).name,
+    )

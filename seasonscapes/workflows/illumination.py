@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from datetime import datetime
+from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import Path
 from threading import Lock
@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from seasonscapes.civil_time import resolve_time
+from seasonscapes.errors import InputError
+from seasonscapes.frames import LocalFrame
 from seasonscapes.progress import TaskProgress
 from seasonscapes.sky.atmosphere import Atmosphere
 from seasonscapes.sky.clear_sky import AtmosphereTables, atmosphere_tables, load_tables, save_tables
@@ -342,6 +344,28 @@ def illumination_on_terrain(place: Place, model: SkyModel, time: datetime) -> tu
 def position_at(place: Place, time: datetime) -> SunMoonPosition:
     """Sun and moon over the origin of a place at an aware instant."""
     return sun_moon_position(time, place.frame.latitude_deg, place.frame.longitude_deg, place.median_height_m)
+
+
+def given_sun_position(place: Place, azimuth_deg: float, elevation_deg: float) -> SunMoonPosition:
+    """A sun at stated angles over a place; see `given_sun_in_frame`."""
+    return given_sun_in_frame(place.frame, azimuth_deg, elevation_deg)
+
+
+def given_sun_in_frame(frame: LocalFrame, azimuth_deg: float, elevation_deg: float) -> SunMoonPosition:
+    """A sun at stated angles over the origin of a frame, without a moon; its instant stands for no date.
+
+    Raises
+    ------
+    InputError
+        For angles that are none.
+    """
+    if not (-360.0 <= azimuth_deg <= 360.0 and -18.0 <= elevation_deg <= 90.0):
+        expected = "azimuth -360 to 360, elevation -18 to 90"
+        raise InputError("--sun", "out of range", got=f"{azimuth_deg:g},{elevation_deg:g}", expected=expected)
+    instant = datetime(2024, 6, 1, 12, tzinfo=UTC)
+    position = sun_moon_position(instant, frame.latitude_deg, frame.longitude_deg, frame.height_m)
+    hidden = replace(position.moon, elevation_deg=-60.0, true_elevation_deg=-60.0)
+    return SunMoonPosition(instant, SolarPosition(azimuth_deg, elevation_deg, elevation_deg, 1.0), hidden)
 
 
 def tabulate_illumination(

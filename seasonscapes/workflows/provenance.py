@@ -7,6 +7,7 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
+from seasonscapes.array_files import read_arrays
 from seasonscapes.errors import InputError
 from seasonscapes.text_files import parse_json, read_json
 
@@ -84,10 +85,8 @@ def _tif(path: Path) -> dict:
 
 
 def _npz(path: Path) -> dict:
-    import numpy as np
-
-    with np.load(path, allow_pickle=False) as file:
-        arrays = {name: f"{file[name].dtype} {file[name].shape}" for name in file.files}
+    stored = read_arrays(path, what="an .npz file of this program")
+    arrays = {name: f"{values.dtype} {values.shape}" for name, values in stored.items()}
     return {"arrays": arrays, **_manifest(path)}
 
 

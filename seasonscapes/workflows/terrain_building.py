@@ -196,7 +196,8 @@ def build_terrain(
     report = progress or (lambda fraction: None)
     spacing_m = sample_spacing_m(elevation)
     if options.refine is not None:
-        check_memory(elevation, "--refine", factor=options.refine)
+        height, width = elevation.values.shape[:2]
+        check_memory((height * options.refine, width * options.refine), "--refine")
     factor = options.refine or refinement_factor(elevation.values[..., 0].size, spacing_m)
     bound = options.max_error_m or min(5.0, spacing_m / factor / 10.0)
     refined = refine_raster(elevation, factor)
@@ -237,7 +238,7 @@ def _texel_m(terrain: Terrain, elevation: Raster, scene: SceneFile, options: Mes
 
 def finest_texel_m(terrain: Terrain, options: MeshOptions) -> float:
     """Smallest side of a texel that the largest side of a texture allows [m]."""
-    return float(np.ptp(terrain.vertices[:, :2], axis=0).max()) / options.max_side_px * (1.0 + 1e-9)
+    return float(np.ptp(terrain.vertices[:, :2].astype(np.float64), axis=0).max()) / options.max_side_px * (1.0 + 1e-9)
 
 
 def tell_texel_wish(terrain: Terrain, scene: SceneFile, options: MeshOptions) -> None:

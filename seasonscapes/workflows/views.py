@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import logging
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from seasonscapes.declaration import validate
 from seasonscapes.errors import InputError
 from seasonscapes.frames import geodetic_from_enu
 from seasonscapes.scene import NamedCamera, Viewpoint, camera_from_named_view
@@ -15,6 +18,11 @@ if TYPE_CHECKING:
     from seasonscapes.cameras.panorama import Panorama
     from seasonscapes.cameras.pinhole import Camera
     from seasonscapes.terrain.surface import Terrain
+
+log = logging.getLogger(__name__)
+
+# Less distortion moves no pixel of a common camera by more than one.
+_VISIBLE_K1 = 1e-3
 
 __all__ = ["camera", "camera_for", "camera_geodetic", "scene_cameras"]
 
@@ -92,6 +100,43 @@ def camera_for(place: Place, view: Viewpoint, *, size_px: tuple[int, int], where
                 cure="give above_ground_m instead",
             )
     return camera_from_named_view(place.frame, view, ground, size_px=size_px)
+
+
+def calibrated_viewpoint(path: Path) -> tuple[NamedCamera, tuple[int, int]]:
+    """The viewpoint and the picture's size of a calibration record, as ``seasonscapes calibrate`` writes it.
+
+    Raises
+    ------
+    InputError
+        Where it is no such record, or that of a panorama.
+    """
+    from seasonscapes.calibration.calibration_file import read_calibration
+    from seasonscapes.calibration.pose_model import angles_from_rotation
+    from seasonscapes.cameras.pinhole import Camera
+    from seasonscapes.frames import local_axes
+
+    record = read_calibration(path)
+    camera = record.view
+    if not isinstance(camera, Camera):
+        cure = "`seasonscapes webcams` splits it into views"
+        raise InputError(path, "is the record of a panorama", expected="that of a perspective picture", cure=cure)
+    if abs(record.k1) > _VISIBLE_K1:
+        log.warning("%s: the picture is drawn without the lens distortion k1 = %.4g", path, record.k1)
+    latitude, longitude, height = (float(v) for v in geodetic_from_enu(record.frame, camera.position_m))
+    axes = local_axes(record.frame, latitude, longitude)
+    heading, pitch, roll = angles_from_rotation(axes @ camera.world_from_camera[:3, :3])
+    table = {
+        "name": record.webcam,
+        "latitude_deg": latitude,
+        "longitude_deg": longitude,
+        "height_m": height,
+        "heading_deg": float(heading),
+        "pitch_deg": float(pitch),
+        "roll_deg": float(roll),
+        "fov_deg": float(np.degrees(2.0 * np.arctan(0.5 * camera.width_px / camera.fx))),
+        "principal_point": (camera.cx / camera.width_px, camera.cy / camera.height_px),
+    }
+    return validate(table, NamedCamera, where=path), (camera.width_px, camera.height_px)
 
 
 def terrain_for_view(place: Place, view: Camera | Panorama) -> Terrain:

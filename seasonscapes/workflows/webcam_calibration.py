@@ -314,7 +314,8 @@ def calibrate(
         )
         if fit.calibration is None:
             raise NotEnoughEvidence("; ".join(fit.doubts))
-        return WebcamCalibration(station, fit.calibration, fit.horizon, points, fit.doubts)
+        doubts = (*fit.doubts, *_contradictions(station, fit.calibration, points))
+        return WebcamCalibration(station, fit.calibration, fit.horizon, points, doubts)
     if points is None:
         raise InputError("calibrate", "no evidence", cure="give --points FILE, --skyline, or both")
     sigma_m = webcam.position_sigma_m
@@ -322,7 +323,17 @@ def calibrate(
     solution = resect(station.view, points, priors=priors, k1=webcam.radial_k1, axes=station.axes)
     options = HorizonOptions(below_ground_m=40.0)
     horizon = horizon_from(station.rasters, station.frame, solution.view.position_m, options=options)
-    return WebcamCalibration(station, solution, horizon, points)
+    return WebcamCalibration(station, solution, horizon, points, _contradictions(station, solution, points))
+
+
+def _contradictions(station: WebcamStation, solution: Calibration, points: Correspondences | None) -> tuple[str, ...]:
+    """Doubts about a pose far from the stated one, and about points in another vertical datum."""
+    from seasonscapes.calibration.contradictions import datum_doubts, position_doubts
+
+    doubts = position_doubts(station.view, solution, station.axes, station.webcam.position_sigma_m)
+    if points is not None:
+        doubts += datum_doubts(points, station.frame, station.rasters)
+    return tuple(doubts)
 
 
 def calibrate_by_skylines(

@@ -93,7 +93,7 @@ def inspect_webcams(
             bad = {problem.path for problem in problems}
             write_manifest(manifest, [row for row in rows if row.path not in bad])
     elif manifest is not None:
-        rows = read_manifest(manifest)
+        rows = read_manifest(manifest, allow_outside=scene.confinement.allow_outside)
         problems = check_pictures(rows, manifest.parent, scene.webcams, decode=decode)
     return WebcamInspection(scene, heights, rows, problems)
 
