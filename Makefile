@@ -1,5 +1,6 @@
 # make demo   pictures of the bundled scene in out/demo/
 # make test   the tests
+# make check  the quick part of both: style, layers, and the tests that take milliseconds
 # make lint   style, types and layers: ruff, pyright, import-linter
 # Each makes the virtual environment .venv if it is missing, finds or installs libLLVM where it is needed, and can be
 # repeated at will. PYTHON=python3.12 chooses the interpreter, CONSTRAINTS=constraints.txt installs the tested versions.
@@ -11,9 +12,9 @@ BIN := $(VENV)/bin
 BASE := $(VENV)/.installed
 DEV := $(VENV)/.installed-dev
 
-.PHONY: demo test lint venv dev llvm clean help
+.PHONY: demo test check lint venv dev llvm clean help
 help:
-	@sed -n '1,5p' Makefile
+	@sed -n '1,6p' Makefile
 
 # A new pyproject.toml installs anew; otherwise the environment is left as it is.
 $(BASE): pyproject.toml tools/install.sh
@@ -37,6 +38,12 @@ demo: llvm $(BASE)
 
 test: llvm $(DEV)
 	$(BIN)/python -m pytest -q -n 2
+
+check: $(DEV)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+	$(BIN)/python -m pytest -q -n 2 -m fast
 
 lint: $(DEV)
 	$(BIN)/ruff check .

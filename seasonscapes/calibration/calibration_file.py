@@ -18,6 +18,7 @@ from seasonscapes.declaration import checked_name
 from seasonscapes.errors import InputError
 from seasonscapes.frames import LocalFrame, geodetic_from_enu
 from seasonscapes.images import atomic_path
+from seasonscapes.text_files import MALFORMED
 
 
 @dataclass(frozen=True)
@@ -126,5 +127,5 @@ def read_calibration(path: Path) -> CalibratedWebcam:
         else:
             raise ValueError(f"projection {projection!r}")
         return CalibratedWebcam(checked_name(str(record["webcam"])), view, float(record["k1"]), sigma, frame)
-    except (KeyError, TypeError, ValueError) as error:
+    except MALFORMED as error:
         raise InputError(path, f"not a calibration record: {error!r}") from None
