@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from albedo_landsat import CENTRE_UM, DATES, SOLAR, correlation, light_of, path_radiance, scene
+from albedo_landsat import CENTRE_UM, DATES, NAMES, SOLAR, correlation, light_of, path_radiance, scene
 
 # Land classes by k-means of band ratios of the July scene, which hardly depend on relief; those with fewer steep texels are
 # left out.
