@@ -23,11 +23,12 @@ from seasonscapes.calibration.evidence import Correspondences, Priors
 from seasonscapes.calibration.overlay import save_overlay
 from seasonscapes.calibration.pose_model import parameters_of_view
 from seasonscapes.calibration.resection import ResectionOptions, leave_one_out, resect
-from seasonscapes.calibration.skyline import SearchRange, align_to_skyline, read_image_srgb8
+from seasonscapes.calibration.skyline import SearchRange, align_to_skyline
 from seasonscapes.cameras.pinhole import camera_at
 from seasonscapes.evaluation.calibration_pictures import picture_trial
 from seasonscapes.evaluation.calibration_trials import point_trial, score_points
 from seasonscapes.frames import LocalFrame, enu_from_geodetic
+from seasonscapes.images import read_image_srgb8
 from seasonscapes.terrain.crs import geodetic_from_map
 from seasonscapes.terrain.raster import read_elevation
 

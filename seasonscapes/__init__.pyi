@@ -28,6 +28,8 @@ from seasonscapes.workflows.delighting import delight as delight
 from seasonscapes.workflows.differentiable import differentiable_scene as differentiable_scene
 from seasonscapes.workflows.distillation import DistilOptions as DistilOptions
 from seasonscapes.workflows.distillation import distil as distil
+from seasonscapes.workflows.export_scene import ExportOptions as ExportOptions
+from seasonscapes.workflows.export_scene import export_scene as export_scene
 from seasonscapes.workflows.gaussian_views import render_gaussians as render_gaussians
 from seasonscapes.workflows.illumination import illumination as illumination
 from seasonscapes.workflows.illumination import sky_model as sky_model

@@ -1,4 +1,4 @@
-"""Lookup of the scene and sky-model files that are distributed with the package."""
+"""Lookup of the scenes, sky models and data sources that are distributed with the package."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Literal
 
 from seasonscapes.declaration import InputError
 
-Kind = Literal["scenes", "sun_models"]
+Kind = Literal["scenes", "sun_models", "data_sources"]
 
 
 def bundled_folder(kind: Kind) -> Path:
@@ -18,7 +18,7 @@ def bundled_folder(kind: Kind) -> Path:
     Parameters
     ----------
     kind
-        ``scenes`` or ``sun_models``.
+        ``scenes``, ``sun_models`` or ``data_sources``.
 
     Returns
     -------
@@ -43,7 +43,7 @@ def bundled_names(kind: Kind) -> list[str]:
     Parameters
     ----------
     kind
-        ``scenes`` or ``sun_models``.
+        ``scenes``, ``sun_models`` or ``data_sources``.
 
     Returns
     -------
@@ -59,7 +59,7 @@ def bundled_path(kind: Kind, name: str) -> Path:
     Parameters
     ----------
     kind
-        ``scenes`` or ``sun_models``.
+        ``scenes``, ``sun_models`` or ``data_sources``.
     name
         File name without suffix.
 
@@ -75,7 +75,7 @@ def bundled_path(kind: Kind, name: str) -> Path:
     """
     names = bundled_names(kind)
     if name not in names:
-        noun = {"scenes": "scene", "sun_models": "sky model"}[kind]
+        noun = {"scenes": "scene", "sun_models": "sky model", "data_sources": "data source"}[kind]
         close = difflib.get_close_matches(name, names, n=1)
         raise InputError(
             name,

@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from seasonscapes.declaration import InputError
+
+# What is taken for a date and time, and the beginning of it after which a point or comma stands. Python's own parser drops
+# what follows such a point: half past six, written 18.30, would be six.
+_DATE = r"[0-9]{4}(?:-[0-9]{2}-[0-9]{2}|[0-9]{4}|-?W[0-9]{2}(?:-?[0-9])?)"
+_CLOCK = r"[0-9]{2}(?::?[0-9]{2}(?::?[0-9]{2}(?:[.,][0-9]+)?)?)?"
+_OFFSET = r"(?:[Zz]|[+-][0-9]{2}(?::?[0-9]{2}(?::?[0-9]{2})?)?)?"
+_ISO_8601 = re.compile(rf"{_DATE}(?:[Tt ]{_CLOCK}{_OFFSET})?")
+_FRACTION = re.compile(rf"{_DATE}[Tt ][0-9]{{2}}(?::?[0-9]{{2}})?[.,][0-9]")
 
 
 @dataclass(frozen=True)
@@ -78,8 +87,9 @@ def resolve_time(text: str, latitude_deg: float, longitude_deg: float) -> Resolv
     Raises
     ------
     InputError
-        If the text is not a date with a time, or if daylight saving skips or repeats the time there. A wrong guess of
-        the offset would displace the sun by 15°.
+        If the text is not a date with a time, if its hour or minute has a fraction (18.30 may be half past six or
+        18:18), or if daylight saving skips or repeats the time there. A wrong guess of the offset would displace the
+        sun by 15°.
 
     Examples
     --------
@@ -87,10 +97,15 @@ def resolve_time(text: str, latitude_deg: float, longitude_deg: float) -> Resolv
     '2024-09-01T12:00+02:00 = 2024-09-01T10:00:00Z'
     """
     text = text.strip()
+    if _FRACTION.match(text):
+        expected = "hours, minutes and seconds with colons between"
+        cure = "write half past six in the evening as T18:30"
+        raise InputError("time", "an hour or minute with a fraction", got=text, expected=expected, cure=cure)
     try:
-        parsed = datetime.fromisoformat(text)
-        has_time = any(separator in text[1:] for separator in ("T", "t", " "))
-        if not has_time:
+        if not _ISO_8601.fullmatch(text):
+            raise ValueError("another form than those above")
+        parsed = datetime.fromisoformat(text.upper())
+        if not any(separator in text for separator in "Tt "):
             raise InputError(
                 "time", "the hour is missing", got=text, expected="a date and time", cure=f"write {text}T12:00"
             )

@@ -1,84 +1,110 @@
-"""The command line. Commands live in `seasonscapes.commands` and are imported only when they are called."""
+"""The entry of the command line: one verb, one result, and every failure told in one line.
+
+Only the standard library is imported here, so that Ctrl-C is answered from the first moment; `seasonscapes.commands`
+holds the application.
+"""
 
 from __future__ import annotations
 
-import json
 import os
+import signal
 import sys
+from collections.abc import Sequence
 
-from cyclopts import App, Parameter
-
-from seasonscapes import __version__
-from seasonscapes.commands.console import show_messages
-from seasonscapes.commands.interruption import interruptible
-from seasonscapes.errors import SeasonscapesError
-
-app = App(
-    name="seasonscapes",
-    help="Physically-based relighting of mountain landscapes: any place, any date, any hour.",
-    version=__version__,
-    help_flags=["--help", "-h"],
-    help_format="plaintext",
-    # An empty list of albedos is never asked for.
-    default_parameter=Parameter(negative_iterable=()),
-)
-
-# Name, module, and what the command does.
-COMMANDS = (
-    ("render", "render", "Render a view of a place at a date and hour."),
-    ("timelapse", "timelapse", "Film a view through hours or seasons."),
-    ("lit-texture", "lit_texture", "Export a place's texture as lit at an hour."),
-    ("irradiance", "irradiance", "Map the irradiance of the ground at an hour or over a period."),
-    ("sky", "sky", "Report the light of a place at an instant, and picture the sky dome."),
-    ("terrain", "terrain", "Build a place's terrain and report its quality."),
-    ("webcams", "webcams", "List, check and map a scene's webcams and their pictures."),
-    ("calibrate", "calibrate", "Calibrate a webcam from matched points or the skyline."),
-    ("annotate", "annotate", "Match points of a photograph and the terrain on a local page."),
-    ("paint", "paint", "Paint calibrated pictures of one time into the place's texture."),
-    ("inpaint", "inpaint", "Complete a painted texture where no camera saw the surface."),
-    ("path", "path", "Make a camera path over a place, clear of the ground, with a map."),
-    ("albedo", "albedo", "Recover the albedo of a place from its photographs."),
-    ("delight", "delight", "Take the light of its hour out of an image or a textured mesh."),
-    ("relight", "relight", "Light a textured mesh anew: pictures, lit textures or a film."),
-    ("distill", "distill", "Distil a Gaussian model of a place."),
-    ("splat", "splat", "Render distilled Gaussians at any hour, or bake them for other programs."),
-    ("run", "run", "From photographs to pictures of any hour: all stages, resumable."),
-    ("evaluate", "evaluate", "Score pictures against the truth."),
-    ("info", "info", "Print the provenance of a file."),
-    ("demo", "demo", "Picture the embedded scene through a day, a night and a year."),
-    ("doctor", "doctor", "Report what this machine can do, and what is missing."),
-)
-for _name, _module, _help in COMMANDS:
-    app.command(f"seasonscapes.commands.{_module}:{_module}_command", name=_name, help=_help)
+from seasonscapes.commands.interruption import ignore_further_interruptions, interrupted, interruptible
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command.
+
+    Every failure is one line on stderr, and with ``--json`` one JSON object with the key ``error`` on stdout as well.
+    ``SEASONSCAPES_DEBUG=1`` shows the traceback of any failure too.
+
+    Parameters
+    ----------
+    arguments
+        The words after the program's name; those of this process if omitted.
 
     Returns
     -------
     int
-        Exit code: 0 for success, 2 for a mistake in the user's input, 130 for an interruption. Any other exception
-        is a bug and shows its traceback (exit code 1).
+        Exit code: 0 for success; 2 for a mistake in the input, or files and memory that do not allow the work; 130 for
+        an interruption; 1 for a fault of the program.
     """
-    tokens = sys.argv[1:] if arguments is None else arguments
+    tokens = list(sys.argv[1:] if arguments is None else arguments)
+    # After a process's command only the interpreter's own end is left: Ctrl-C there ends it without a traceback.
+    with interruptible(afterwards=signal.SIG_DFL if arguments is None else None):
+        try:
+            return _exit_code(tokens)
+        except KeyboardInterrupt:
+            return _told_interruption(tokens)
+
+
+def run(tokens: Sequence[str]) -> None:
+    """Run one command; exceptions pass through."""
+    from seasonscapes.commands.application import run_verb
+    from seasonscapes.commands.console import show_messages
+
     show_messages()
+    run_verb(tokens)
+
+
+def _exit_code(tokens: list[str]) -> int:
+    """Run one command and tell its failure."""
+    from seasonscapes.commands.console import ReaderGone
+    from seasonscapes.commands.refusals import told
+    from seasonscapes.errors import SeasonscapesError
+
     try:
-        with interruptible():
-            app(tokens, exit_on_error=True, print_error=True, result_action="return_value")
-    except SeasonscapesError as error:
-        if "--json" in tokens:
-            print(json.dumps({"error": str(error)}))
-        print(f"seasonscapes: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("seasonscapes: interrupted; finished files are whole, nothing half was left", file=sys.stderr)
-        return 130
-    except BrokenPipeError:
-        # The reader of our output went away (`| head`); that is not an error.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        run(tokens)
+    except ReaderGone:
+        return 0
+    except Exception as error:
+        if interrupted():
+            return _told_interruption(tokens)
+        if isinstance(error, SeasonscapesError):
+            return _refuse(tokens, str(error), error)
+        if isinstance(error, (OSError, MemoryError)):
+            return _refuse(tokens, told(error), error)
+        return _refuse(tokens, _fault(error), error, code=1)
     return 0
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def _told_interruption(tokens: list[str]) -> int:
+    ignore_further_interruptions()
+    return _refuse(tokens, "interrupted; finished files are whole, nothing half was left", None, code=130)
+
+
+def _fault(error: Exception) -> str:
+    """One line about an exception that nothing expected."""
+    import traceback
+
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [frame for frame in frames if f"{os.sep}seasonscapes{os.sep}" in frame.filename] or list(frames)
+    where = f"{os.path.basename(own[-1].filename)}:{own[-1].lineno}"
+    return (
+        f"{where}: {type(error).__name__}: {error}; this is a fault of seasonscapes: please report it with the traceback "
+        "that SEASONSCAPES_DEBUG=1 shows"
+    )
+
+
+def _refuse(tokens: list[str], problem: str, error: BaseException | None, *, code: int = 2) -> int:
+    """Tell a failure in one line, and return the exit code."""
+    from seasonscapes.commands.console import ReaderGone, message, plain_line, print_record
+
+    if error is not None and os.environ.get("SEASONSCAPES_DEBUG"):
+        import traceback
+
+        traceback.print_exception(error)
+    line = plain_line(problem)
+    try:
+        if _asks_for_json(tokens):
+            print_record({"error": line})
+        message(f"seasonscapes: {line}")
+    except (OSError, ReaderGone):
+        return code  # nobody is left who could be told
+    return code
+
+
+def _asks_for_json(tokens: list[str]) -> bool:
+    return any(token == "--json" or token.startswith("--json=") for token in tokens)

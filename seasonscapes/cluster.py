@@ -7,12 +7,13 @@ rescheduled on other workers, which keep the results that are already there.
 from __future__ import annotations
 
 import os
-import tomllib
+import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
+from seasonscapes.declaration import read_toml
 from seasonscapes.errors import InputError
 
 Item = TypeVar("Item")
@@ -87,7 +88,7 @@ def _own_cores(workers: int) -> Any:
 
 def _started(cluster: str) -> Any:
     kind, _, rest = cluster.partition(":")
-    if kind == "local" and rest.isdigit() and 1 <= int(rest) <= 1024:
+    if re.fullmatch(r"[0-9]{1,4}", rest) and kind == "local" and 1 <= int(rest) <= 1024:
         from distributed import LocalCluster
 
         return LocalCluster(
@@ -107,12 +108,7 @@ def _started(cluster: str) -> Any:
 
 def _slurm(path: Path) -> Any:
     """A cluster of SLURM jobs from a TOML file: ``jobs = N`` and a table ``[slurm]`` of the resources of each job."""
-    if not path.is_file():
-        raise InputError("--cluster", "no such file", got=str(path))
-    try:
-        table = tomllib.loads(path.read_text())
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(path, f"not TOML: {error}") from None
+    table = read_toml(path)
     jobs, resources = table.get("jobs"), table.get("slurm")
     if not isinstance(jobs, int) or jobs < 1 or not isinstance(resources, dict) or set(table) - {"jobs", "slurm"}:
         raise InputError(

@@ -3,16 +3,63 @@
 from __future__ import annotations
 
 import difflib
+import re
 import tomllib
+import unicodedata
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
 from pydantic_core import ErrorDetails
 
 from seasonscapes.errors import InputError
+from seasonscapes.text_files import read_text
 
-__all__ = ["Declaration", "InputError", "read_declaration", "read_toml", "validate"]
+__all__ = ["Declaration", "InputError", "Name", "checked_name", "read_declaration", "read_toml", "validate"]
+
+MOST_NAME_CHARACTERS = 64
+MOST_TEXT_CHARACTERS = 2000
+# Letters and digits of any script; no separator of paths, no control character, nothing hidden, nothing like a flag.
+_NAME = re.compile(r"[^\W_](?:[\w .-]*[\w-])?")
+
+
+def checked_name(value: str) -> str:
+    """Return a name that files may be called after; `ValueError` for any other.
+
+    A name begins with a letter or digit, holds letters, digits, ``-``, ``_``, ``.`` and blanks, does not end with a dot
+    or blank, and is at most 64 characters and 128 bytes of UTF-8 long.
+
+    Examples
+    --------
+    >>> from seasonscapes.declaration import checked_name
+    >>> checked_name("Jungfraujoch 2")
+    'Jungfraujoch 2'
+    """
+    fits = (
+        len(value) <= MOST_NAME_CHARACTERS and len(value.encode("utf-8", "surrogatepass")) <= 2 * MOST_NAME_CHARACTERS
+    )
+    if not fits or not _NAME.fullmatch(value):
+        shown = value if len(value) <= MOST_NAME_CHARACTERS else f"{value[:24]}… ({len(value)} characters)"
+        raise ValueError(
+            f"not a name: {shown!r}; expected letters, digits, '-', '_', '.' and blanks, "
+            f"at most {MOST_NAME_CHARACTERS} characters, beginning with a letter or digit"
+        )
+    return value
+
+
+def checked_text(value: str) -> str:
+    """Return a text for people; `ValueError` for one that is very long or could steer a terminal."""
+    if len(value) > MOST_TEXT_CHARACTERS:
+        raise ValueError(f"a text of {len(value)} characters; expected at most {MOST_TEXT_CHARACTERS}")
+    control = next((c for c in value if unicodedata.category(c) in ("Cc", "Cs") and c not in "\n\t"), None)
+    if control is not None:
+        raise ValueError(f"a control character in a text: {control!r}")
+    return value
+
+
+# A name in a file that may become part of a file's name, and a text that is shown and copied into files' metadata.
+Name = Annotated[str, AfterValidator(checked_name)]
+Text = Annotated[str, AfterValidator(checked_text)]
 
 
 class Declaration(BaseModel):
@@ -40,16 +87,14 @@ def read_toml(path: Path) -> dict[str, Any]:
     Raises
     ------
     InputError
-        If the file does not exist, is a folder, or is not valid TOML.
+        If the file does not exist, is a folder, a pipe or a device, is too large, or is not valid TOML.
     """
+    text = read_text(path)
     try:
-        with open(path, "rb") as file:
-            return tomllib.load(file)
-    except FileNotFoundError:
-        raise InputError(path, "no such file") from None
-    except IsADirectoryError:
-        raise InputError(path, "this is a folder", expected="a TOML file") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise InputError(path, "not valid TOML: nested too deeply") from None
+    except ValueError as error:  # TOMLDecodeError among them, and integers of too many digits
         raise InputError(path, f"not valid TOML: {error}") from None
 
 

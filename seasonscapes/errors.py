@@ -1,13 +1,24 @@
 """Exceptions of the package. This module imports nothing heavy, so that the command line starts quickly.
 
 Every exception here describes a mistake in the user's input that the program recognises. The command line prints its
-message as one line and exits with code 2. Any other exception is a bug and keeps its traceback.
+message as one line and exits with code 2, as it does for the system's own errors of files and memory (`OSError`,
+`MemoryError`). Any other exception is a fault of the program.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
+
+MOST_SHOWN_CHARACTERS = 300
+
+
+def shortened(text: str) -> str:
+    """A text of any length as a message can show it: the middle of a long one is left out."""
+    if len(text) <= MOST_SHOWN_CHARACTERS:
+        return text
+    half = MOST_SHOWN_CHARACTERS // 2
+    return f"{text[:half]} … {text[-half:]} ({len(text)} characters)"
 
 
 class SeasonscapesError(Exception):
@@ -41,7 +52,7 @@ class InputError(SeasonscapesError):
     ):
         parts = [f"{where}: {problem}"]
         if got is not None:
-            parts.append(f"got {got!r}" if isinstance(got, str) else f"got {got}")
+            parts.append(f"got {shortened(got)!r}" if isinstance(got, str) else f"got {got}")
         if expected:
             parts.append(f"expected {expected}")
         if cure:
@@ -68,6 +79,10 @@ class NotEnoughEvidence(SeasonscapesError, ValueError):
 
 class UnreadableImage(SeasonscapesError, ValueError):
     """A file is not an image that can be decoded."""
+
+
+class DamagedFile(SeasonscapesError, ValueError):
+    """A stored file is not what was written: cut short, changed, exchanged, or of another version."""
 
 
 class ImageSizeMismatch(SeasonscapesError, ValueError):

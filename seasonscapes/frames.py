@@ -11,9 +11,11 @@ Conventions of the whole package:
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import AfterValidator, Field
 
 # WGS 84 defining constants (NGA.STND.0036).
 SEMI_MAJOR_AXIS_M = 6378137.0
@@ -46,6 +48,30 @@ class LocalFrame:
     longitude_deg: float
     height_m: float = 0.0
     refraction_k: float = 0.0
+
+
+def normal_longitude(longitude_deg: float) -> float:
+    """A longitude of 0…360°, or past 180°, as its equal within ±180° [deg]."""
+    return longitude_deg if -180.0 <= longitude_deg <= 180.0 else (longitude_deg + 180.0) % 360.0 - 180.0
+
+
+# What declarations state of a place, WGS 84 [deg]: longitudes of 180…360° mean their equals of −180…0°.
+Latitude = Annotated[float, Field(ge=-90.0, le=90.0)]
+Longitude = Annotated[float, Field(ge=-180.0, le=360.0), AfterValidator(normal_longitude)]
+
+
+def frame_record(frame: LocalFrame) -> dict[str, Any]:
+    """Describe a local frame as plain values for files: its coordinate reference systems and its origin."""
+    return {
+        "crs": "local east-north-up [m] about the origin, through ECEF (EPSG:4978)",
+        "geographic_crs": "EPSG:4979",
+        "origin": {
+            "latitude_deg": frame.latitude_deg,
+            "longitude_deg": frame.longitude_deg,
+            "height_m": frame.height_m,
+            "refraction_k": frame.refraction_k,
+        },
+    }
 
 
 def ecef_from_geodetic(latitude_deg: ArrayLike, longitude_deg: ArrayLike, height_m: ArrayLike) -> np.ndarray:

@@ -6,10 +6,14 @@ sRGB encoding is used in files only. Exposure is EV100: ``luminance = 2**EV100 *
 
 from __future__ import annotations
 
+import errno
+import io
 import json
+import logging
 import os
-import tempfile
-from collections.abc import Iterator, Mapping
+import secrets
+import warnings
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -20,20 +24,41 @@ from numpy.typing import ArrayLike
 
 from seasonscapes.errors import NoUsablePixels, UnreadableImage
 
+log = logging.getLogger(__name__)
+
 # Reflected-light meter calibration constant (ISO 2720) at ISO 100.
 METER_CONSTANT = 12.5 / 100.0
 # Luminance that just saturates a sensor at EV100 = 0: 78 / (S q) with q = 0.65 (ISO 12232; Lagarde & de Rousiers 2014).
 SATURATION_LUMINANCE = 1.2
+# Of a file's name in that of its temporary file.
+_STEM_CHARACTERS = 24
+_notes: list[Callable[[Path], None]] = []
 # Luminance weights of linear Rec.709 (ITU-R BT.709): Y = w · rgb. In photometric RGB, Y is in lux or cd/m².
 REC709_LUMINANCE = np.array([0.2126390, 0.7151687, 0.0721923])
+
+
+@contextmanager
+def writes_noted(note: Callable[[Path], None]) -> Iterator[None]:
+    """Context manager: ``note`` is called with each file that `atomic_path` is about to create, temporary ones included.
+
+    Parameters
+    ----------
+    note
+        Called before the file exists, from any thread of this process.
+    """
+    _notes.append(note)
+    try:
+        yield
+    finally:
+        _notes.remove(note)
 
 
 @contextmanager
 def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     """Context manager for atomic writing: a temporary path that replaces ``path`` when the block succeeds.
 
-    After an exception in the block ``path`` is unchanged and the temporary file is removed. The temporary name keeps
-    the suffix, since many writers choose the format by it.
+    After an exception in the block ``path`` is unchanged and the temporary file is removed; an `OSError` about the
+    temporary file names ``path``. The temporary name keeps the suffix, since many writers choose the format by it.
 
     Parameters
     ----------
@@ -47,18 +72,49 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=f".part{path.suffix}", dir=path.parent)
-    os.close(handle)
+    # Of a long name only the beginning, so that the temporary one is not too long where the name itself is not.
+    name = str(path.with_name(f".{path.stem[:_STEM_CHARACTERS]}-{secrets.token_hex(4)}.part{path.suffix}"))
+    for note in tuple(_notes):
+        note(Path(name))
+        note(path)
+    try:
+        os.close(os.open(name, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
     temporary = Path(name)
     try:
         yield temporary
-        # mkstemp creates private files; set the mode that open() would have set.
+        # The temporary file is private; set the mode that open() would have set.
         umask = os.umask(0)
         os.umask(umask)
         temporary.chmod(0o666 & ~umask)
         os.replace(temporary, path)
+    except Exception as error:
+        trouble = _trouble_of_writing(error, name, path)
+        if trouble is None:
+            raise
+        raise trouble from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _trouble_of_writing(error: Exception, temporary: str, path: Path) -> OSError | None:
+    """The `OSError` about ``path`` that an exception stands for, or ``None`` if it is none or about another file.
+
+    A full disk is reported with the temporary name or with none; OpenEXR, safetensors and GDAL report it in exceptions of
+    their own, by the system's words.
+    """
+    if isinstance(error, OSError) and error.errno is not None:
+        if error.filename not in (None, temporary, Path(temporary)):
+            return None
+        return OSError(error.errno, error.strerror, str(path))
+    said = str(error).lower()
+    for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EIO):
+        if os.strerror(number).lower() in said:
+            return OSError(number, os.strerror(number), str(path))
+    if "failed to write" in said:
+        return OSError(errno.EIO, f"cannot be written ({error})", str(path))
+    return None
 
 
 def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
@@ -83,6 +139,11 @@ def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
     """
     linear = np.clip(linear, 0.0, 1.0)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.power(linear, 1.0 / 2.4) - 0.055)
+
+
+def srgb8_from_linear(linear: np.ndarray) -> np.ndarray:
+    """Encode linear values ``(...)``, clipped to [0, 1], as sRGB levels, uint8, without dithering."""
+    return np.rint(srgb_from_linear(linear) * 255.0).astype(np.uint8)
 
 
 def linear_from_srgb(encoded: ArrayLike) -> np.ndarray:
@@ -253,7 +314,7 @@ def write_png(path: str | os.PathLike, image: np.ndarray, *, metadata: Mapping[s
 
 
 def write_png8(path: str | os.PathLike, levels: np.ndarray, *, metadata: Mapping[str, str] | None = None) -> None:
-    """Write 8-bit levels as a PNG, atomically.
+    """Write 8-bit levels as a PNG, atomically; see `png8_bytes`.
 
     Parameters
     ----------
@@ -264,23 +325,187 @@ def write_png8(path: str | os.PathLike, levels: np.ndarray, *, metadata: Mapping
     metadata
         Key-value pairs for the PNG's international text chunks.
     """
+    encoded = png8_bytes(levels, metadata=metadata)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(encoded)
+
+
+def png8_bytes(levels: np.ndarray, *, metadata: Mapping[str, str] | None = None) -> bytes:
+    """Encode 8-bit levels as a PNG whose colours are declared to be sRGB.
+
+    Parameters
+    ----------
+    levels
+        sRGB-encoded levels ``(H, W, 3)``, or grey levels ``(H, W)`` (masks, counts), whose scale is not declared; uint8.
+    metadata
+        Key-value pairs for the PNG's international text chunks.
+
+    Returns
+    -------
+    bytes
+        The file's content.
+    """
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 
     info = PngInfo()
+    if levels.ndim == 3:
+        # Rendering intent 0 (perceptual); gAMA of 1 / 2.2 for readers that do not know the chunk (PNG 3rd ed., 11.3.2.5).
+        info.add(b"sRGB", b"\x00")
+        info.add(b"gAMA", (45455).to_bytes(4, "big"))
     for key, value in (metadata or {}).items():
         info.add_itxt(key, value)
-    with atomic_path(path) as temporary:
-        Image.fromarray(np.ascontiguousarray(levels)).save(temporary, format="PNG", pnginfo=info)
+    encoded = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(levels)).save(encoded, format="PNG", pnginfo=info)
+    return encoded.getvalue()
 
 
-def read_image_linear(path: str | os.PathLike) -> np.ndarray:
-    """Read an 8- or 16-bit sRGB image file as linear Rec.709.
+# Formats of photographs. Pillow reads more, and some of them run other programs (EPS).
+_PHOTO_FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "PPM", "GIF", "JPEG2000")
+_EXIF_ORIENTATION, _SIDEWAYS = 0x0112, (5, 6, 7, 8)
+# The largest webcam panoramas have some 100 megapixels; a few bytes of a file can declare any size.
+_MOST_PIXELS = 300_000_000
+
+
+@contextmanager
+def _opened(path: str | os.PathLike) -> Iterator[Any]:
+    """A photograph opened by Pillow; everything that is wrong with it in the block is one `UnreadableImage`."""
+    import struct
+    import zlib
+
+    from PIL import Image, UnidentifiedImageError
+
+    if not Path(path).is_file():
+        raise FileNotFoundError(path)
+    try:
+        with warnings.catch_warnings():
+            # Our own limit holds.
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(path, formats=_PHOTO_FORMATS) as picture:
+                if picture.width * picture.height > _MOST_PIXELS:
+                    raise UnreadableImage(
+                        f"{path}: the picture is too large; got {picture.width} x {picture.height}, expected at most "
+                        f"{_MOST_PIXELS // 1_000_000} megapixels"
+                    )
+                yield picture
+    except UnidentifiedImageError:
+        kinds = ", ".join(_PHOTO_FORMATS)
+        raise UnreadableImage(f"{path}: not a readable picture; expected {kinds} of 8 or 16 bits") from None
+    except Image.DecompressionBombError:
+        raise UnreadableImage(f"{path}: the picture is too large to be one") from None
+    except (OSError, SyntaxError, ValueError, TypeError, struct.error, zlib.error, EOFError) as error:
+        if isinstance(error, UnreadableImage):
+            raise
+        raise UnreadableImage(f"{path}: not a readable picture: {' '.join(str(error).split())}") from None
+
+
+def picture_size(path: str | os.PathLike) -> tuple[int, int, str]:
+    """Width and height [px] of a photograph as it is looked at, after its EXIF orientation, and its format.
+
+    Raises
+    ------
+    FileNotFoundError, UnreadableImage
+        As `read_image_srgb`; only the header is read.
+    """
+    with _opened(path) as picture:
+        width, height = picture.size
+        if picture.getexif().get(_EXIF_ORIENTATION) in _SIDEWAYS:
+            width, height = height, width
+        return width, height, str(picture.format)
+
+
+def read_image_srgb(path: str | os.PathLike) -> np.ndarray:
+    """Read a photograph as sRGB: turned by its EXIF orientation, with its colour profile converted.
+
+    This is the only reader of photographs, so that all commands see the same pixels at the same places.
 
     Parameters
     ----------
     path
-        Image file in a format that OpenCV decodes. EXIF orientation is ignored.
+        JPEG, PNG, TIFF, WebP, JPEG 2000, BMP, PPM or GIF of 8 or 16 bits: grey, RGB, CMYK or with a palette. Alpha is
+        ignored.
+
+    Returns
+    -------
+    ndarray
+        sRGB-encoded values ``(H, W, 3)``: uint8, or uint16 where the file has 16 bits.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the file does not exist.
+    UnreadableImage
+        If the file is no such picture, is truncated, or declares an absurd size.
+    """
+    from PIL import ImageOps
+
+    with _opened(path) as picture:
+        deep = picture.mode.startswith("I;16") or any("16" in str(tile[3]) for tile in picture.tile)
+        if picture.mode in ("F", "I") and not deep:
+            kind = "float" if picture.mode == "F" else "32-bit"
+            raise UnreadableImage(f"{path}: not a readable picture; got {kind} pixels, expected 8 or 16 bits")
+        picture.load()
+        foreign = _foreign_profile(path, picture)
+        if not deep or foreign is not None:
+            turned = ImageOps.exif_transpose(picture)
+            assert turned is not None, "a new picture where it is not asked to change in place"
+            if deep:
+                log.warning("%s: converted to sRGB with 8 of its 16 bits", path)
+            return np.ascontiguousarray(_to_srgb(path, turned, foreign))
+    # Pillow keeps 8 bits of each channel; OpenCV keeps 16, and turns by the orientation as well.
+    levels = cv2.imread(os.fspath(path), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    if levels is None or not np.issubdtype(levels.dtype, np.integer):
+        raise UnreadableImage(f"{path}: not a readable picture of 16 bits; save it without an orientation tag")
+    return np.ascontiguousarray(levels[..., ::-1])
+
+
+def _foreign_profile(path: str | os.PathLike, picture: Any) -> Any:
+    """The embedded colour profile of a picture where it is not sRGB, else ``None``."""
+    import io
+
+    from PIL import ImageCms
+
+    embedded = picture.info.get("icc_profile")
+    if not embedded:
+        return None
+    try:
+        profile = ImageCms.ImageCmsProfile(io.BytesIO(embedded))
+        name = ImageCms.getProfileDescription(profile)
+    except (ImageCms.PyCMSError, OSError):
+        log.warning("%s: its colour profile is damaged; the colours count as sRGB", path)
+        return None
+    return None if "srgb" in name.lower() else profile
+
+
+def _to_srgb(path: str | os.PathLike, picture: Any, profile: Any) -> np.ndarray:
+    """8-bit sRGB levels ``(H, W, 3)`` of a loaded picture, through its profile where there is one."""
+    from PIL import ImageCms
+
+    # Profiles are made for these modes; all others are ways of storing them.
+    if picture.mode not in ("L", "RGB", "CMYK", "LAB"):
+        picture = picture.convert("L" if picture.mode in ("1", "LA", "La", "I;16", "I;16B", "I;16L") else "RGB")
+    if profile is not None:
+        try:
+            srgb = ImageCms.createProfile("sRGB")
+            converted = ImageCms.profileToProfile(picture, profile, srgb, outputMode="RGB")
+        except ImageCms.PyCMSError as error:
+            raise UnreadableImage(f"{path}: its colour profile does not fit its pixels: {error}") from None
+        assert converted is not None, "a new picture where it is not asked to change in place"
+        log.info("%s: converted to sRGB from %s", path, ImageCms.getProfileDescription(profile).strip())
+        return np.asarray(converted)
+    if picture.mode == "CMYK":
+        log.warning("%s: made for print (CMYK) and without a colour profile; its colours are a guess", path)
+    return np.asarray(picture.convert("RGB"))
+
+
+def read_image_srgb8(path: str | os.PathLike) -> np.ndarray:
+    """`read_image_srgb` in 8 bits ``(H, W, 3)``, whatever the file has."""
+    levels = read_image_srgb(path)
+    return levels if levels.dtype == np.uint8 else np.round(levels / 257.0).astype(np.uint8)
+
+
+def read_image_linear(path: str | os.PathLike) -> np.ndarray:
+    """`read_image_srgb` decoded to linear Rec.709.
 
     Returns
     -------
@@ -289,20 +514,11 @@ def read_image_linear(path: str | os.PathLike) -> np.ndarray:
 
     Raises
     ------
-    FileNotFoundError
-        If the file does not exist.
-    UnreadableImage
-        If the file cannot be decoded, or holds no integer pixels.
+    FileNotFoundError, UnreadableImage
+        As `read_image_srgb`.
     """
-    if not Path(path).is_file():
-        raise FileNotFoundError(path)
-    encoded = cv2.imread(os.fspath(path), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
-    if encoded is None:
-        raise UnreadableImage(f"{path}: not a readable picture")
-    if not np.issubdtype(encoded.dtype, np.integer):
-        raise UnreadableImage(f"{path}: not a readable picture; got {encoded.dtype} pixels, expected 8 or 16 bits")
-    maximum = np.iinfo(encoded.dtype.name).max
-    return linear_from_srgb(encoded[..., ::-1].astype(np.float32) / maximum)
+    levels = read_image_srgb(path)
+    return linear_from_srgb(levels.astype(np.float32) / np.iinfo(levels.dtype.name).max)
 
 
 def write_exr(

@@ -6,21 +6,23 @@ A scene file holds facts about the place only; the settings of processing stages
 from __future__ import annotations
 
 import logging
+import math
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, PrivateAttr, model_validator
 
 from seasonscapes.cameras.pinhole import Camera, camera_at
 from seasonscapes.cameras.webcam import Webcam
-from seasonscapes.declaration import Declaration, InputError, read_declaration
-from seasonscapes.frames import STANDARD_REFRACTION_K, LocalFrame
+from seasonscapes.declaration import MOST_NAME_CHARACTERS, Declaration, InputError, Name, Text, read_declaration
+from seasonscapes.frames import STANDARD_REFRACTION_K, Latitude, LocalFrame, Longitude
+from seasonscapes.terrain.raster_files import OWN_FOLDER, Confinement, confined_path, raster_hash
 
 log = logging.getLogger(__name__)
 
 VerticalDatum = Literal["unknown", "ellipsoidal", "EGM96", "EGM2008", "LN02", "NN2000", "NAVD88", "EVRF", "local"]
-Latitude = Field(ge=-90.0, le=90.0)
-Longitude = Field(ge=-180.0, le=180.0)
+HeightUnit = Literal["metre", "foot", "US survey foot", "decimetre", "centimetre", "kilometre"]
 
 
 class Origin(Declaration):
@@ -34,8 +36,8 @@ class Origin(Declaration):
         Height in the scene's vertical datum [m].
     """
 
-    latitude_deg: float = Latitude
-    longitude_deg: float = Longitude
+    latitude_deg: Latitude
+    longitude_deg: Longitude
     height_m: float = Field(default=0.0, ge=-500.0, le=9000.0)
 
 
@@ -45,26 +47,31 @@ class Area(Declaration):
     Parameters
     ----------
     west_deg, south_deg, east_deg, north_deg
-        WGS 84 bounds [deg], at most 3° apart.
+        WGS 84 bounds [deg], at most 3° of a great circle apart. Across the antimeridian ``east_deg`` is the smaller one.
     """
 
-    west_deg: float = Longitude
-    south_deg: float = Latitude
-    east_deg: float = Longitude
-    north_deg: float = Latitude
+    west_deg: Longitude
+    south_deg: Latitude
+    east_deg: Longitude
+    north_deg: Latitude
 
     @model_validator(mode="after")
     def _ordered(self) -> Area:
-        if not (self.west_deg < self.east_deg and self.south_deg < self.north_deg):
+        if not self.south_deg < self.north_deg or self.west_deg == self.east_deg:
             raise ValueError("expected west_deg < east_deg and south_deg < north_deg")
-        if self.east_deg - self.west_deg > 3.0 or self.north_deg - self.south_deg > 3.0:
+        west, south, east, north = self.bounds_deg
+        if east - west > 180.0:
+            raise ValueError("expected west_deg < east_deg and south_deg < north_deg")
+        middle = min(89.0, abs(0.5 * (south + north)))
+        if max((east - west) * math.cos(math.radians(middle)), north - south) > 3.0 + 1e-9:
             raise ValueError("spans more than 3°, too far for a single sun position and sky; choose a smaller area")
         return self
 
     @property
     def bounds_deg(self) -> tuple[float, float, float, float]:
-        """West, south, east and north bounds [deg]."""
-        return self.west_deg, self.south_deg, self.east_deg, self.north_deg
+        """West, south, east and north bounds [deg]; east is beyond 180° where the area crosses the antimeridian."""
+        east = self.east_deg + (360.0 if self.east_deg < self.west_deg else 0.0)
+        return self.west_deg, self.south_deg, east, self.north_deg
 
 
 class SyntheticElevation(Declaration):
@@ -106,7 +113,11 @@ class Elevation(Declaration):
     file
         Raster file, relative to the scene file's folder.
     band
-        Band of the file, counted from 1; the first if omitted.
+        Band of the file, counted from 1; may be left out where there is one.
+    unit
+        Unit of the file's heights; left out, the one that the file declares, else metres.
+    nodata
+        Value of the file that means no data, besides what it declares.
     synthetic
         Synthetic terrain in place of a file.
     max_hole_share
@@ -115,6 +126,8 @@ class Elevation(Declaration):
 
     file: str | None = None
     band: int | None = Field(default=None, ge=1)
+    unit: HeightUnit | None = None
+    nodata: float | None = None
     synthetic: SyntheticElevation | None = None
     max_hole_share: float = Field(default=0.25, ge=0.0, le=1.0)
 
@@ -135,9 +148,10 @@ class Imagery(Declaration):
     encoding
         Transfer function of the pixel values.
     full_scale
-        Pixel value that corresponds to 1.
+        Value that corresponds to 1, after the file's own scale and offset. Left out, it is 1 for floating-point numbers
+        and where the file has a scale, else 255.
     bands
-        Bands of the file, counted from 1.
+        Red, green and blue bands of the file, counted from 1; left out, those that the file marks.
     reflectance_scale
         Reflectance of a white pixel. Display images are contrast-stretched, so that their white is not a reflectance
         of 1; 0.5 brings the meadows and rock of an Alpine mosaic to the reflectances of field spectra. Of an image whose
@@ -153,7 +167,7 @@ class Imagery(Declaration):
 
     file: str
     encoding: Literal["srgb", "linear"] = "srgb"
-    full_scale: float = Field(default=255.0, gt=0.0)
+    full_scale: float | None = Field(default=None, gt=0.0)
     bands: list[int] | None = Field(default=None, min_length=1, max_length=3)
     reflectance_scale: float = Field(default=0.5, gt=0.0, le=2.0)
     time: str | None = None
@@ -169,6 +183,10 @@ class Imagery(Declaration):
                 f"sun_deg: got {self.sun_deg}, expected azimuth and elevation above the horizon [deg]"
             )
         return self
+
+
+# A cropped picture may not hold its principal point at all.
+Share = Annotated[float, Field(ge=-2.0, le=3.0)]
 
 
 class Viewpoint(Declaration):
@@ -189,7 +207,9 @@ class Viewpoint(Declaration):
     roll_deg
         Rotation about the viewing direction; positive lowers the right-hand side [deg].
     fov_deg
-        Horizontal field of view [deg].
+        Horizontal field of view of a picture with its principal point in the middle [deg]: the focal length.
+    principal_point
+        Where the optical axis meets the picture, as shares of its width (from the left) and height (from the top).
 
     Examples
     --------
@@ -198,14 +218,15 @@ class Viewpoint(Declaration):
     60.0
     """
 
-    latitude_deg: float = Latitude
-    longitude_deg: float = Longitude
+    latitude_deg: Latitude
+    longitude_deg: Longitude
     height_m: float | None = Field(default=None, ge=-500.0, le=100_000.0)
     above_ground_m: float | None = Field(default=None, gt=0.0, le=100_000.0)
     heading_deg: float = Field(ge=-360.0, le=360.0)
     pitch_deg: float = Field(default=0.0, ge=-90.0, le=90.0)
     roll_deg: float = Field(default=0.0, ge=-180.0, le=180.0)
     fov_deg: float = Field(default=60.0, gt=0.0, lt=170.0)
+    principal_point: tuple[Share, Share] = (0.5, 0.5)
 
     @model_validator(mode="after")
     def _one_height(self) -> Viewpoint:
@@ -220,10 +241,10 @@ class NamedCamera(Viewpoint):
     Parameters
     ----------
     name
-        Unique name of the camera.
+        Unique name of the camera; see `declaration.checked_name`.
     """
 
-    name: str = Field(min_length=1)
+    name: Name
 
 
 class SceneFile(Declaration):
@@ -234,7 +255,7 @@ class SceneFile(Declaration):
     Parameters
     ----------
     name
-        Identifier of lower-case letters, digits, ``_`` and ``-``.
+        Identifier of lower-case letters, digits, ``_`` and ``-``, at most 64 characters.
     title
         Human-readable name.
     attribution
@@ -249,9 +270,9 @@ class SceneFile(Declaration):
         Arrays of tables ``[[camera]]`` and ``[[webcam]]`` in the file.
     """
 
-    name: str = Field(pattern=r"^[a-z0-9][a-z0-9_-]*$")
-    title: str = ""
-    attribution: str = ""
+    name: str = Field(pattern=r"^[a-z0-9][a-z0-9_-]*$", max_length=MOST_NAME_CHARACTERS)
+    title: Text = ""
+    attribution: Text = ""
     vertical_datum: VerticalDatum = "unknown"
     refraction_k: float = Field(default=STANDARD_REFRACTION_K, ge=0.0, lt=0.9)
     origin: Origin | None = None
@@ -260,11 +281,24 @@ class SceneFile(Declaration):
     imagery: Imagery | None = None
     cameras: list[NamedCamera] = Field(default_factory=list, alias="camera")
     webcams: list[Webcam] = Field(default_factory=list, alias="webcam")
+    _confinement: Confinement = PrivateAttr(default=OWN_FOLDER)
+
+    @property
+    def confinement(self) -> Confinement:
+        """Where the files of the scene's rasters may lie; set by `read_scene`."""
+        return self._confinement
+
+    @property
+    def image_hash(self) -> str | None:
+        """Hash of the content of the scene's image, see `terrain.raster_files.raster_hash`; ``None`` without one."""
+        return None if self.imagery is None else raster_hash(self.imagery.file, self.confinement)
 
     @model_validator(mode="after")
     def _unique(self) -> SceneFile:
         for kind, names in (("cameras", [c.name for c in self.cameras]), ("webcams", [w.id for w in self.webcams])):
-            duplicate = next((name for name in names if names.count(name) > 1), None)
+            # Files are called after them, also where a file system ignores case.
+            folded = [name.casefold() for name in names]
+            duplicate = next((name for name in names if folded.count(name.casefold()) > 1), None)
             if duplicate is not None:
                 raise ValueError(f"two {kind} are named '{duplicate}'")
         return self
@@ -334,21 +368,14 @@ def read_scene(path: str | Path, *, allow_outside: bool = False) -> SceneFile:
     if "vertical_datum" not in scene.model_fields_set:
         log.info("%s: no vertical_datum: heights count as metres above sea level", path.name)
     folder = path.resolve().parent
+    confinement = Confinement(folder, allow_outside)
 
     def absolute_path(key: str, name: str) -> str:
-        # GDAL's virtual file systems (/vsicurl/, /vsizip/ …) count as outside the folder; they may access the network.
-        virtual = name.startswith("/vsi")
-        target = Path(name) if virtual else (folder / name).resolve()
-        if not allow_outside and (virtual or not target.is_relative_to(folder)):
-            raise InputError(
-                f"{path}: {key}",
-                "leads outside the scene file's folder",
-                got=name,
-                cure="move the data beside the file, or pass --allow-outside",
-            )
-        if not virtual and not target.is_file():
+        target = confined_path(name, folder, confinement, where=f"{path}: {key}")
+        # GDAL's virtual files (/vsicurl/, /vsizip/ …) remain text; whether they exist is seen when they are opened.
+        if isinstance(target, Path) and not target.is_file():
             raise InputError(f"{path}: {key}", "no such file", got=str(target))
-        return name if virtual else str(target)
+        return str(target)
 
     updates: dict[str, Any] = {}
     if scene.elevation is not None and scene.elevation.file is not None:
@@ -359,7 +386,9 @@ def read_scene(path: str | Path, *, allow_outside: bool = False) -> SceneFile:
         updates["imagery"] = scene.imagery.model_copy(
             update={"file": absolute_path("imagery.file", scene.imagery.file)}
         )
-    return scene.model_copy(update=updates)
+    scene = scene.model_copy(update=updates)
+    scene._confinement = confinement
+    return scene
 
 
 def camera_from_named_view(
@@ -388,7 +417,7 @@ def camera_from_named_view(
     else:
         assert view.above_ground_m is not None  # validated by `Viewpoint`
         height_m = ground_height_m + float(view.above_ground_m)
-    return camera_at(
+    camera = camera_at(
         frame,
         view.latitude_deg,
         view.longitude_deg,
@@ -399,3 +428,5 @@ def camera_from_named_view(
         fov_deg=view.fov_deg,
         size_px=size_px,
     )
+    across, down = view.principal_point
+    return replace(camera, cx=across * camera.width_px, cy=down * camera.height_px)

@@ -2,13 +2,16 @@
 
 An artefact is one file with a manifest beside it (``NAME.json``), which is written last. An artefact without a manifest
 is ignored. The name hashes the input values, the content of input files and the source of the modules that build the
-artefact (`seasonscapes.source_hash`), so that other inputs or other code never reuse it.
+artefact (`seasonscapes.source_hash`), so that other inputs or other code never reuse it. The manifest states the
+artefact's own SHA-256, which is compared when it is loaded (about a second for each gigabyte): one that was cut short,
+changed or exchanged since is built again, and told.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import os
 import sys
 import time
@@ -19,10 +22,12 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from seasonscapes import __version__
+from seasonscapes.errors import InputError
 from seasonscapes.images import atomic_path
 from seasonscapes.source_hash import source_hash
 
 Value = TypeVar("Value")
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -60,9 +65,7 @@ def default_workspace() -> Workspace:
 
 
 def file_hash(path: str | os.PathLike) -> str:
-    """SHA-256 of a file's content; of the name alone for GDAL's virtual files (``/vsi...``)."""
-    if os.fspath(path).startswith("/vsi"):
-        return hashlib.sha256(os.fspath(path).encode()).hexdigest()
+    """SHA-256 of a file's content; of rasters, which may consist of several files, `raster_files.raster_hash`."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -141,20 +144,64 @@ def build_once(
     build, save, load
         Make the value; write it to a path; read it from a path.
 
+    Raises
+    ------
+    InputError
+        Where a folder stands in the artefact's place.
+
     Notes
     -----
     Two processes that build the same artefact at once both succeed: each renames a whole file onto the same name.
     """
-    path = workspace.folder / f"{name}-{artefact_key(inputs, code)}{suffix}"
+    key = artefact_key(inputs, code)
+    path = workspace.folder / f"{name}-{key}{suffix}"
     manifest = path.with_name(path.name + ".json")
+    for file in (path, manifest):
+        if file.is_dir():
+            cure = "remove it, or choose another --workspace"
+            raise InputError(file, "a folder stands where a built file belongs", cure=cure)
     if manifest.is_file() and path.is_file():
-        return load(path)
+        doubt = _doubt(path, manifest, key)
+        if doubt is None:
+            return load(path)
+        log.info("%s: %s; it is built again", path, doubt)
     start = time.perf_counter()
     value = build()
     with atomic_path(path) as temporary:
         save(value, temporary)
-    seconds = round(time.perf_counter() - start, 3)
-    record = {"inputs": inputs, "code": source_hash(*code), "modules": code, "version": __version__, "seconds": seconds}
+        digest = file_hash(temporary)
+    record = {
+        "key": key,
+        "sha256": digest,
+        "inputs": inputs,
+        "code": source_hash(*code),
+        "modules": code,
+        "version": __version__,
+        "seconds": round(time.perf_counter() - start, 3),
+    }
     with atomic_path(manifest) as temporary:
         temporary.write_text(json.dumps(record, indent=1, sort_keys=True, default=plain_value) + "\n")
     return value
+
+
+# Artefacts whose content this process has compared already: size, time of change [ns] and inode then.
+_compared: dict[Path, tuple[str, int, int, int]] = {}
+
+
+def _doubt(path: Path, manifest: Path, key: str) -> str | None:
+    """Why an artefact cannot be what its manifest says, or ``None``."""
+    try:
+        record = json.loads(manifest.read_text(encoding="utf-8"))
+        stated = record["key"], record["sha256"]
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return "its manifest is damaged, or of an older version"
+    if stated[0] != key:
+        return "its manifest is another artefact's"
+    about = path.stat()
+    state = (str(stated[1]), about.st_size, about.st_mtime_ns, about.st_ino)
+    if _compared.get(path) == state:
+        return None
+    if file_hash(path) != stated[1]:
+        return "its content is not what was written"
+    _compared[path] = state
+    return None

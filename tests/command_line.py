@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from seasonscapes.cli import app, show_messages
+from seasonscapes.cli import run
 
 
 def command(name: str, *positional: object, **flags: object) -> None:
     """Run ``seasonscapes name``; ``times_utc=3`` is ``--times-utc 3``, ``fast=True`` is ``--fast``, lists repeat a flag."""
-    show_messages()
     tokens = [name, *map(str, positional)]
     for flag, value in flags.items():
         option = "--" + flag.rstrip("_").replace("_", "-")
@@ -19,4 +18,4 @@ def command(name: str, *positional: object, **flags: object) -> None:
                 tokens.append("--no-" + option[2:])
             elif each is not None:
                 tokens += [option, str(each)]
-    app(tokens, exit_on_error=False, print_error=False, result_action="return_value")
+    run(tokens)

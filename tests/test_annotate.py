@@ -17,10 +17,10 @@ from seasonscapes.calibration.annotation import (
     project_to_photograph,
     remove_last_match,
     save_session,
-    serve_session,
     session_state,
     solve_session,
 )
+from seasonscapes.calibration.annotation_page import serve_session
 from seasonscapes.calibration.calibration_file import read_calibration
 from seasonscapes.calibration.evidence import Priors, read_points
 from seasonscapes.calibration.pose_model import parameters_of_view, project_with_parameters
@@ -151,7 +151,7 @@ def test_the_server_answers_only_here_and_only_with_its_token(session):
         for path, body, message in (
             ("solve", b"{}", "at least 3 are needed"),
             ("pick", b"{}", "not a request"),
-            ("pick", b"[", "Expecting value"),
+            ("pick", b"[", "not readable as JSON"),
         ):
             with pytest.raises(urllib.error.HTTPError) as error:
                 urllib.request.urlopen(urllib.request.Request(root + path, body, headers=token))

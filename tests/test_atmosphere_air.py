@@ -38,7 +38,7 @@ def test_solar_table_is_the_integral_of_its_sources():
     wavelength, density = _full_resolution()
     bins = ((wavelength - 360.0) // 10).astype(int)
     expected = np.stack([np.bincount(bins, density[:, k]) * 0.5 for k in range(3)], 1)
-    np.testing.assert_allclose(spectrum._SOLAR_XYZ_LX, expected, rtol=2e-5, atol=1e-4)
+    np.testing.assert_allclose(spectrum.SOLAR_XYZ_LX, expected, rtol=2e-5, atol=1e-4)
     assert expected[:, 1].sum() == pytest.approx(133_100.0, rel=1e-3)  # the solar illuminance constant
 
 

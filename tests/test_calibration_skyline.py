@@ -11,7 +11,7 @@ from seasonscapes.calibration.evidence import Correspondences, Priors
 from seasonscapes.calibration.overlay import draw_overlay, save_overlay
 from seasonscapes.calibration.pose_model import parameters_of_view, project_with_parameters, view_from_parameters
 from seasonscapes.calibration.resection import resect
-from seasonscapes.calibration.skyline import SearchRange, align_to_skyline, read_image_srgb8
+from seasonscapes.calibration.skyline import SearchRange, align_to_skyline
 from seasonscapes.calibration.terrain_horizon import (
     HorizonOptions,
     cell_size_m,
@@ -23,6 +23,7 @@ from seasonscapes.cameras.pinhole import camera_at
 from seasonscapes.errors import CameraBelowGround, ImageSizeMismatch
 from seasonscapes.evaluation.calibration_pictures import panorama_trial, picture_trial
 from seasonscapes.frames import MEAN_RADIUS_M, LocalFrame, enu_from_geodetic, geodetic_from_enu
+from seasonscapes.images import read_image_srgb8
 from seasonscapes.terrain.crs import geodetic_from_map, map_from_geodetic
 from seasonscapes.terrain.raster import read_elevation
 from seasonscapes.terrain.surface import Raster

@@ -103,7 +103,7 @@ def test_a_place_of_ones_own(hill, tmp_path, capsys):
         (["--time", "2024-09-01T12:00", "--at", "46.53;7.98", "--heading", "0"], "--at: not a place"),
         (
             ["--time", "2024-09-01T12:00", "--at", "7.98,146.53", "--heading", "0"],
-            "outside the elevation raster|no civil",
+            "stands 12721 km from the terrain; .* expected near latitude 46",
         ),
         (
             ["--time", "2024-09-01T12:00", "--at", "97.98,46.53", "--heading", "0"],

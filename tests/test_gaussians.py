@@ -56,7 +56,15 @@ from seasonscapes.gaussians.splat_view import (  # noqa: E402
 )
 from seasonscapes.gaussians.surfels import axes_from_quaternions, surfel_albedo, terrain_surfels  # noqa: E402
 from seasonscapes.gaussians.tile_tree import concatenate_tiles, select_tiles, tile_bounds, tile_discs, tile_tree  # noqa: E402
-from seasonscapes.gaussians.training import Schedule, SurfaceTargets, TrainingFrame, fit_code, surface_targets, train  # noqa: E402
+from seasonscapes.gaussians.training import (  # noqa: E402
+    Checkpoint,
+    Schedule,
+    SurfaceTargets,
+    TrainingFrame,
+    fit_code,
+    surface_targets,
+    train,
+)
 from seasonscapes.rendering.hemisphere_rays import ray_scene  # noqa: E402
 from seasonscapes.rendering.horizon_angles import horizon_angles  # noqa: E402
 from seasonscapes.rendering.irradiance import surface_at  # noqa: E402
@@ -276,15 +284,23 @@ def test_pictures_teach_and_an_interrupted_run_goes_on(hill, told, tmp_path):
             raise Stop
 
     path = tmp_path / "run.safetensors"
+    checkpoint = Checkpoint(path, "of this sky")
     with pytest.raises(Stop):
-        train(appearance(hill), told, frames, schedule, seed=5, checkpoint=path, progress=stop_after)
+        train(appearance(hill), told, frames, schedule, seed=5, checkpoint=checkpoint, progress=stop_after)
     again = appearance(hill, seed=9)
-    rest = train(again, told, frames, schedule, seed=5, checkpoint=path)
+    rest = train(again, told, frames, schedule, seed=5, checkpoint=checkpoint)
     assert len(rest) == 30 - 16
     for one, other in zip(whole.parameters(), again.parameters(), strict=True):
         assert torch.equal(one, other)
-    with pytest.raises(ValueError, match="another run"):
-        train(appearance(hill), told, frames, schedule, seed=6, checkpoint=path)
+    with pytest.raises(InputError, match="another run; got 'another seed'"):
+        train(appearance(hill), told, frames, schedule, seed=6, checkpoint=checkpoint)
+    with pytest.raises(InputError, match="another run; got 'another scene, sky or albedo'"):
+        train(appearance(hill), told, frames, schedule, seed=5, checkpoint=replace(checkpoint, key="of another sky"))
+    content = path.read_bytes()
+    for damaged in (content[:100], content[:-7], content[:-99] + b"x" + content[-98:], b"", b"{}"):
+        path.write_bytes(damaged)
+        with pytest.raises(InputError, match="damaged"):
+            train(appearance(hill), told, frames, schedule, seed=5, checkpoint=checkpoint)
     assert not [p for p in tmp_path.iterdir() if p != path]
 
 
@@ -441,6 +457,8 @@ def test_gltf_is_read_by_pygltflib(hill, tmp_path):
 
 def test_training_views_are_read_back(hill, tmp_path):
     """By the package's own readers of both formats, with time and sun beside each frame."""
+    from plyfile import PlyData
+
     camera = looking_down(size=32)
     time = datetime(2024, 6, 21, 10, 30, tzinfo=UTC)
     state = light_state(hill[4], LIGHTS[0], 173.0)
@@ -455,6 +473,17 @@ def test_training_views_are_read_back(hill, tmp_path):
     (colmap,) = read_colmap(tmp_path / "sparse" / "0")
     np.testing.assert_allclose(colmap.camera.world_from_camera, camera.world_from_camera, atol=1e-6)
     assert len((tmp_path / "sparse" / "0" / "points3D.txt").read_text().splitlines()) == 1 + 24 * 24
+    # COLMAP looks for images below a folder that it is given; nerfstudio beside transforms.json.
+    assert (again.file, colmap.name) == ("images/noon.png", "noon.png")
+    seeds = PlyData.read(tmp_path / "points.ply")
+    colours = np.stack([seeds["vertex"][name] for name in ("red", "green", "blue")], axis=1)
+    np.testing.assert_allclose(colours / 255.0, baked(hill).rgb, atol=0.51 / 255.0)
+    np.testing.assert_array_equal(seeds["vertex"]["z"], baked(hill).means[:, 2])
+    origin = next(line for line in seeds.comments if line.startswith("origin "))
+    assert json.loads(origin.removeprefix("origin "))["latitude_deg"] == FRAME.latitude_deg
+    stray = TrainingView(NamedView("noon", camera, "noon.png", time), state)
+    with pytest.raises(ValueError, match="subpath"):
+        write_training_views(tmp_path, [stray], baked(hill), FRAME)
     with pytest.raises(ValueError, match="no view"):
         write_training_views(tmp_path, [], baked(hill), FRAME)
 
@@ -496,7 +525,11 @@ def test_splat_writes_what_is_asked_for(distilled, suffix, capsys):
     assert main([*arguments, "--size", "64x48", "--json", *common]) == 0
     record = json.loads(capsys.readouterr().out)
     assert record["time_utc"] == "2024-09-01T10:00:00+00:00"
-    assert output.stat().st_size > 1000
+    content = output.read_bytes()
+    assert len(content) > 1000
+    assert str(model.parent).encode() not in content, "no path of the maker's disk"
+    if suffix in ("ply", "glb"):
+        assert b'"latitude_deg": 46.5' in content or b'"latitude_deg":46.5' in content, "the origin"
     if suffix == "png":
         pixels = np.asarray(Image.open(output), float)
         assert pixels[:4].mean(axis=(0, 1))[2] > pixels[:4].mean(axis=(0, 1))[0], "the sky is blue"

@@ -19,6 +19,7 @@ from seasonscapes.images import (
     tone_curve,
     write_exr,
     write_png,
+    write_png8,
 )
 
 
@@ -58,6 +59,19 @@ def test_png_round_trip_with_metadata(tmp_path):
     assert list(path.parent.iterdir()) == [path]
 
 
+def test_png_declares_its_colours_to_be_srgb(tmp_path):
+    """Read back by Pillow, chunk by chunk; a grey mask is declared nothing."""
+    from PIL import Image
+
+    write_png(tmp_path / "a.png", np.full((4, 6, 3), 0.2))
+    with Image.open(tmp_path / "a.png") as image:
+        assert image.info["srgb"] == 0
+        assert image.info["gamma"] == pytest.approx(1.0 / 2.2, abs=1e-4)
+    write_png8(tmp_path / "mask.png", np.zeros((4, 6), np.uint8))
+    with Image.open(tmp_path / "mask.png") as image:
+        assert "srgb" not in image.info
+
+
 def test_a_failed_write_leaves_nothing_and_keeps_the_old(tmp_path):
     path = tmp_path / "a.txt"
     path.write_text("old")
@@ -75,7 +89,7 @@ def test_missing_and_broken_pictures_are_named(tmp_path):
     with pytest.raises(UnreadableImage, match=r"bad\.png"):
         read_image_linear(tmp_path / "bad.png")
     cv2.imwrite(str(tmp_path / "float.tif"), np.ones((4, 4, 3), np.float32))
-    with pytest.raises(UnreadableImage, match=r"float\.tif.*got float32 pixels"):
+    with pytest.raises(UnreadableImage, match=r"float\.tif.*expected .* of 8 or 16 bits"):
         read_image_linear(tmp_path / "float.tif")
     (tmp_path / "bad.exr").write_bytes(b"not a picture")
     with pytest.raises(UnreadableImage, match=r"bad\.exr"):

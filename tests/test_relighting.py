@@ -483,7 +483,14 @@ def test_lit_texture(hill, tmp_path, capsys):
     model = pygltflib.GLTF2.load(str(tmp_path / "lit.glb"))
     assert "KHR_materials_unlit" in model.materials[0].extensions
     assert len(model.images) == 1
-    assert model.asset.extras["scene"] == str(hill.scene)
+    assert model.asset.extras["scene"] == "hill"
+    assert model.asset.extras["origin"]["latitude_deg"] == pytest.approx(46.551, abs=0.01)
+    assert model.asset.extras["origin"]["vertical_datum"] == "local"
+    assert model.asset.extras["source_crs"] == "EPSG:32632"
+    # No file tells where on the maker's disk it was made from or written to.
+    for suffix in ("exr", "png", "glb"):
+        assert str(tmp_path).encode() not in (tmp_path / f"lit.{suffix}").read_bytes()
+        assert str(hill.scene).encode() not in (tmp_path / f"lit.{suffix}").read_bytes()
     for suffix in ("exr", "png", "glb"):
         capsys.readouterr()
         assert main(["info", str(tmp_path / f"lit.{suffix}"), "--json"]) == 0

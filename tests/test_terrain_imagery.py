@@ -221,7 +221,7 @@ def test_images_that_are_no_colour_images_are_named(tmp_path):
     with pytest.raises(InputError, match=r"five.tif: not a colour image; got 5; expected one \(grey\) or three bands"):
         read_imagery(five, full_scale=10_000.0)
     with pytest.raises(
-        InputError, match=r"brighter than full scale; got '300'; expected at most 255; state the image's"
+        InputError, match=r"brighter than full scale; got '300'; expected at most 255; state \[imagery\] full_scale"
     ):
         read_imagery(five, bands=(3, 2, 1))
     reflectance = read_imagery(five, bands=(3, 2, 1), encoding="linear", full_scale=10_000.0)

@@ -9,11 +9,11 @@ import pytest
 from places import MASSIF
 
 from seasonscapes.calibration.calibration_file import read_calibration
-from seasonscapes.calibration.skyline import read_image_srgb8
 from seasonscapes.cameras.observation import read_manifest
 from seasonscapes.cameras.panorama import Panorama, level_panorama
 from seasonscapes.errors import InputError, NoTerrainInView
 from seasonscapes.evaluation import synthetic_webcams
+from seasonscapes.images import read_image_srgb8
 from seasonscapes.rendering.hemisphere_rays import ray_scene
 from seasonscapes.rendering.mitsuba_scene import mi_mesh
 from seasonscapes.rendering.transport import SamplingOptions

@@ -243,7 +243,7 @@ def _placed_back(delit: DelitImage, shift: tuple[float, float]) -> DelitImage:
     """Results on the texels of the surface from those on the image's."""
     logarithm = shifted_back(np.log(np.maximum(delit.albedo, LOWEST)), shift)
     albedo = np.exp(logarithm)
-    known = np.isfinite(albedo).all(axis=2)
+    known = np.asarray(np.isfinite(albedo).all(axis=2))
     back = (-shift[0], -shift[1])
     source = _moved(delit.source, back).astype(np.uint8)
     # Beside an unknown texel no spline passes: the nearest value.
@@ -275,6 +275,8 @@ def _delit(
     radiance = _at_surface(np.nan_to_num(image) * scale, options.air)
     visibility, deviation = light.visibility.astype(np.float32), np.zeros(chart.shape, np.float32)
     factor, bounce = np.ones(3), light.bounce(_grey(light.sun.shape))
+    sunlight = illuminance = visibility[..., None] * light.sun
+    albedo = _grey(light.sun.shape)
     for number in range(options.rounds):
         final = number == options.rounds - 1
         if options.borders is not None and (number == 0 or final):
@@ -476,7 +478,7 @@ def _completed(albedo: np.ndarray, clipped: np.ndarray, known: np.ndarray) -> np
     whole = np.equal(clipped, np.zeros_like(clipped))
     ratio = np.where(whole, albedo, 0.0).sum(axis=2) / np.maximum(np.where(whole, around, 0.0).sum(axis=2), 1e-6)
     # A clipped value is a lower bound.
-    guess = np.where(whole.any(axis=2)[..., None], around * ratio[..., None], around)
+    guess = np.where(np.asarray(whole.any(axis=2))[..., None], around * ratio[..., None], around)
     filled = np.where(clipped, np.maximum(albedo, guess), albedo)
     return np.clip(filled, LOWEST, HIGHEST).astype(np.float32)
 

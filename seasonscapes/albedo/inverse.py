@@ -20,7 +20,8 @@ from seasonscapes.albedo.closed_form import HIGHEST, LOWEST, AlbedoFit, pixel_we
 from seasonscapes.albedo.differentiable_views import DifferentiableViews, differentiable_views, mi_picture
 from seasonscapes.albedo.forward_model import TexelTransport
 from seasonscapes.albedo.photographs import AlbedoPhotograph
-from seasonscapes.errors import NotEnoughEvidence
+from seasonscapes.array_files import read_arrays
+from seasonscapes.errors import InputError, NotEnoughEvidence
 from seasonscapes.images import atomic_path
 from seasonscapes.terrain.surface import Terrain
 
@@ -473,9 +474,10 @@ def _save(state: IterationState, stage: _StageState, path: Path) -> None:
 
 def _load(problem: _Problem, path: Path) -> tuple[IterationState, _StageState | None]:
     """State of a checkpoint, and of its stage unless the file lacks it."""
-    with np.load(path, allow_pickle=False) as file:
-        note = json.loads(str(file["note"]))
-        arrays = {name: file[name] for name in file.files if name != "note"}
+    arrays = read_arrays(path, what="a checkpoint of the refinement", cure="remove it to start anew")
+    if "note" not in arrays:
+        raise InputError(path, "not a checkpoint of the refinement", cure="remove it to start anew")
+    note = json.loads(str(arrays.pop("note")))
     state = IterationState(_named(arrays, "value:"), note["stage"], note["iteration"], note["history"])
     if "rng" not in note:
         return state, None

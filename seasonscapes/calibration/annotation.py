@@ -1,22 +1,15 @@
-"""Manual annotation of correspondences on a local web page: photograph on the left, rendered terrain on the right.
+"""Manual annotation of correspondences: matches between a photograph and the terrain, a calibration from them.
 
-All computation is done by functions on an `AnnotationSession`; the page only displays its state. The server listens on
-127.0.0.1 and requires the token in the address that it returns, so that other pages in the same browser have no access.
+All computation is done by functions on an `AnnotationSession`; `annotation_page` serves them to a page in the browser.
 """
 
 from __future__ import annotations
 
-import json
-import secrets
-import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qs, urlparse
 
-import cv2
 import numpy as np
 
 from seasonscapes.calibration.calibration_file import write_calibration
@@ -26,10 +19,6 @@ from seasonscapes.calibration.resection import Calibration, report_lines, resect
 from seasonscapes.calibration.terrain_view import TerrainView, scaled_view, shaded_relief
 from seasonscapes.errors import ImageSizeMismatch
 from seasonscapes.frames import LocalFrame, geodetic_from_enu, local_axes
-
-_MAX_REQUEST_BYTES = 10_000
-
-_Json = dict[str, Any]
 
 
 @dataclass
@@ -324,107 +313,3 @@ def session_state(session: AnnotationSession) -> dict[str, Any]:
         "summary": summary,
         "report": [] if solution is None else list(report_lines(solution)),
     }
-
-
-def serve_session(session: AnnotationSession, *, port: int = 0) -> tuple[ThreadingHTTPServer, str]:
-    """Serve the page of a session on 127.0.0.1 in a background thread.
-
-    Parameters
-    ----------
-    session
-        Session.
-    port
-        TCP port; 0 selects a free one.
-
-    Returns
-    -------
-    server : ThreadingHTTPServer
-        The running server; call ``shutdown`` to stop it.
-    address : str
-        URL of the page with its access token.
-    """
-    token, lock = secrets.token_urlsafe(16), threading.Lock()
-    server = ThreadingHTTPServer(("127.0.0.1", port), _handler(session, token, lock))
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    return server, f"http://127.0.0.1:{server.server_address[1]}/?token={token}"
-
-
-def _actions(session: AnnotationSession) -> dict[str, Callable[[_Json], _Json]]:
-    def returning_state(action: Callable[[_Json], None]) -> Callable[[_Json], _Json]:
-        def run(body: _Json) -> _Json:
-            action(body)
-            return session_state(session)
-
-        return run
-
-    return {
-        "/state": lambda body: session_state(session),
-        "/where": lambda body: {"photo": project_to_photograph(session, body["terrain"])},
-        "/pick": returning_state(lambda body: add_match(session, body["photo"], body["terrain"])),
-        "/undo": returning_state(lambda body: remove_last_match(session)),
-        "/solve": returning_state(lambda body: solve_session(session)),
-        "/save": lambda body: {"files": [str(path) for path in save_session(session)]},
-    }
-
-
-def _handler(session: AnnotationSession, token: str, lock: threading.Lock) -> type[BaseHTTPRequestHandler]:
-    actions = _actions(session)
-
-    class Handler(BaseHTTPRequestHandler):
-        def log_message(self, format: str, *args: object) -> None:
-            pass
-
-        def _allowed(self, given: str | None) -> bool:
-            host = (self.headers.get("Host") or "").rsplit(":", 1)[0]
-            if host in ("127.0.0.1", "localhost") and secrets.compare_digest(given or "", token):
-                return True
-            self._send(403, "application/json", json.dumps({"error": "wrong or missing token"}).encode())
-            return False
-
-        def _send(self, code: int, kind: str, body: bytes) -> None:
-            self.send_response(code)
-            self.send_header("Content-Type", kind)
-            self.send_header("Content-Length", str(len(body)))
-            self.send_header("Cache-Control", "no-store")
-            self.end_headers()
-            self.wfile.write(body)
-
-        def do_GET(self) -> None:
-            address = urlparse(self.path)
-            if not self._allowed(parse_qs(address.query).get("token", [""])[0]):
-                return
-            if address.path == "/":
-                page = Path(__file__).with_name("annotation.html").read_text(encoding="utf-8")
-                self._send(200, "text/html; charset=utf-8", page.replace("@TOKEN@", token).encode())
-            elif address.path in ("/photo.jpg", "/terrain.png"):
-                with lock:
-                    image = session.image if address.path == "/photo.jpg" else session.relief
-                suffix = address.path[-4:]
-                self._send(
-                    200,
-                    f"image/{'jpeg' if suffix == '.jpg' else 'png'}",
-                    cv2.imencode(suffix, image[..., ::-1])[1].tobytes(),
-                )
-            else:
-                self._send(404, "application/json", b'{"error": "no such page"}')
-
-        def do_POST(self) -> None:
-            if not self._allowed(self.headers.get("X-Token")):
-                return
-            action = actions.get(urlparse(self.path).path)
-            length = int(self.headers.get("Content-Length") or 0)
-            if action is None or length > _MAX_REQUEST_BYTES:
-                self._send(404, "application/json", b'{"error": "no such action"}')
-                return
-            try:
-                body = json.loads(self.rfile.read(length) or b"{}")
-                with lock:
-                    answer = action(body)
-            except (ValueError, KeyError, TypeError) as error:
-                # The page displays the message; a KeyError or TypeError has none that is readable.
-                text = str(error) if isinstance(error, ValueError) else f"not a request of this page: {error!r}"
-                self._send(400, "application/json", json.dumps({"error": text}).encode())
-                return
-            self._send(200, "application/json", json.dumps(answer).encode())
-
-    return Handler

@@ -12,6 +12,7 @@ import numpy as np
 from seasonscapes.errors import InputError
 from seasonscapes.frames import LocalFrame, enu_from_geodetic, geodetic_from_enu
 from seasonscapes.images import atomic_path
+from seasonscapes.text_files import read_text
 
 POINT_COLUMNS = ("name", "x_px", "y_px", "latitude_deg", "longitude_deg", "height_m")
 
@@ -169,10 +170,9 @@ def read_points(path: Path, frame: LocalFrame) -> Correspondences:
         If the file or a column is missing, or a line (which the message names) holds no valid point.
     """
     try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.DictReader(file))
-    except FileNotFoundError:
-        raise InputError(path, "no such file") from None
+        rows = list(csv.DictReader(read_text(path).splitlines()))
+    except csv.Error as error:
+        raise InputError(path, f"not a table: {error}") from None
     pixel, geodetic, names = [], [], []
     for number, row in enumerate(rows, 2):
         try:

@@ -8,11 +8,9 @@ of the horizon coincides with edges, the heading is well determined, and it does
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-import cv2
 import numpy as np
 
 from seasonscapes.calibration.boundary_map import BoundaryMap, boundary_map, edge_near
@@ -21,7 +19,7 @@ from seasonscapes.calibration.pose_model import View, parameters_of_view, projec
 from seasonscapes.calibration.resection import Calibration, ResectionOptions, SkylineEvidence, resect
 from seasonscapes.calibration.terrain_horizon import Horizon, HorizonOptions, cell_size_m, horizon_from
 from seasonscapes.cameras.panorama import Panorama
-from seasonscapes.errors import ImageSizeMismatch, UnreadableImage
+from seasonscapes.errors import ImageSizeMismatch
 from seasonscapes.frames import LocalFrame, geodetic_from_enu, local_axes
 from seasonscapes.terrain.surface import Raster
 
@@ -512,27 +510,3 @@ def _assess(problem: _SkylineProblem, fits: list[tuple[Calibration, float]]) -> 
         tuple(doubts),
         problem.horizon,
     )
-
-
-def read_image_srgb8(path: str | os.PathLike[str]) -> np.ndarray:
-    """Read an image file as 8-bit sRGB.
-
-    Parameters
-    ----------
-    path
-        Image file of any format that OpenCV decodes.
-
-    Returns
-    -------
-    ndarray
-        Image ``(H, W, 3)`` uint8 sRGB.
-
-    Raises
-    ------
-    UnreadableImage
-        If the file cannot be decoded.
-    """
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image is None:
-        raise UnreadableImage(f"{path}: not a readable image")
-    return np.ascontiguousarray(image[..., ::-1])

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from seasonscapes.errors import CameraBelowGround, NoTerrainInView
 from seasonscapes.frames import LocalFrame, enu_from_geodetic, geodetic_from_enu, local_axes
-from seasonscapes.terrain.crs import horizontal_crs, map_from_geodetic, raster_pixels
+from seasonscapes.terrain.crs import horizontal_crs, map_position, raster_pixels
 from seasonscapes.terrain.raster import sample_raster
 from seasonscapes.terrain.surface import Raster
 
@@ -72,7 +72,7 @@ def terrain_height(rasters: Sequence[Raster], latitude_deg: ArrayLike, longitude
         missing = np.isnan(height)
         if not missing.any():
             break
-        x, y = map_from_geodetic(raster.crs, latitude[missing], longitude[missing])
+        x, y = map_position(raster, latitude[missing], longitude[missing])
         height[missing] = sample_raster(raster, x, y)[..., 0]
     return height
 

@@ -10,16 +10,17 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
+from seasonscapes import text_files
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.declaration import InputError
-from seasonscapes.frames import LocalFrame
+from seasonscapes.frames import LocalFrame, frame_record
 from seasonscapes.images import atomic_path
 
 # OpenCV (x right, y down, z forward) to OpenGL (x right, y up, z backward), and back.
@@ -48,7 +49,7 @@ class NamedView:
     time: datetime | None = None
 
 
-def write_colmap(folder: Path, views: Sequence[NamedView]) -> None:
+def write_colmap(folder: Path, views: Sequence[NamedView], *, image_folder: str = "") -> None:
     """Write a COLMAP text model: ``cameras.txt``, ``images.txt`` and an empty ``points3D.txt``.
 
     Each view gets its own PINHOLE camera. COLMAP stores ``camera_from_world`` as a quaternion (w first) and a
@@ -60,18 +61,22 @@ def write_colmap(folder: Path, views: Sequence[NamedView]) -> None:
         Folder of the model.
     views
         Views to write.
+    image_folder
+        The folder that readers are told to look for images in (``colmap --image_path``), as it begins the views' files;
+        the model names files relative to it.
 
     Raises
     ------
     ValueError
-        A file name contains white space, which the format does not support.
+        A file name contains white space, which the format does not support, or lies outside ``image_folder``.
     """
     from scipy.spatial.transform import Rotation
 
     cameras = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, FX, FY, CX, CY"]
     images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"]
     for number, view in enumerate(views, 1):
-        camera, name = view.camera, view.file or view.name
+        camera = view.camera
+        name = PurePosixPath(view.file or view.name).relative_to(image_folder).as_posix()
         if any(character.isspace() for character in name):
             raise ValueError(f"write_colmap: got file name {name!r}, expected one without white space")
         rotation = camera.world_from_camera[:3, :3].T
@@ -188,16 +193,7 @@ def write_transforms(path: Path, views: Sequence[NamedView], frame: LocalFrame) 
         if view.time is not None:
             record["time_utc"] = view.time.astimezone(UTC).isoformat().replace("+00:00", "Z")
         frames.append(record)
-    world = {
-        "crs": "local east-north-up [m] about the origin, through ECEF (EPSG:4978)",
-        "geographic_crs": "EPSG:4979",
-        "origin": {
-            "latitude_deg": frame.latitude_deg,
-            "longitude_deg": frame.longitude_deg,
-            "height_m": frame.height_m,
-            "refraction_k": frame.refraction_k,
-        },
-    }
+    world = frame_record(frame)
     _write_text(path, json.dumps({"camera_model": "PINHOLE", "world": world, "frames": frames}, indent=1) + "\n")
 
 
@@ -389,12 +385,7 @@ def read_json(path: Path) -> dict[str, Any]:
     InputError
         The file is missing, is not valid JSON, or does not contain an object.
     """
-    try:
-        table = json.loads(Path(path).read_text(encoding="utf-8-sig"))
-    except FileNotFoundError:
-        raise InputError(path, "no such file") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(path, f"not valid JSON: {error}") from None
+    table = text_files.read_json(path)
     if not isinstance(table, dict):
         raise InputError(path, "not a JSON object", got=type(table).__name__)
     return table
@@ -407,9 +398,7 @@ def _write_text(path: Path, text: str) -> None:
 
 def _lines(path: Path, *, keep_blank: bool = False) -> list[tuple[str, str]]:
     """Lines of a file that are no comments, each with file name and line number for messages."""
-    if not path.is_file():
-        raise InputError(path, "no such file")
-    rows = enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
+    rows = enumerate(text_files.read_text(path).splitlines(), 1)
     return [
         (f"{path}: line {number}", row)
         for number, row in rows

@@ -13,7 +13,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from pathlib import Path
+from pathlib import Path, PurePath
 from zoneinfo import ZoneInfo
 
 import numpy as np
@@ -21,8 +21,10 @@ import numpy as np
 from seasonscapes.cameras.panorama import Panorama
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.cameras.webcam import Webcam
+from seasonscapes.declaration import checked_name
 from seasonscapes.errors import InputError, UnreadableImage
-from seasonscapes.images import atomic_path, read_image_linear
+from seasonscapes.images import atomic_path, picture_size, read_image_linear, read_image_srgb
+from seasonscapes.text_files import read_text
 
 COLUMNS = ("webcam", "time_utc", "path", "bytes", "sha256")
 # Folder layout of the reference repository, with placeholders for parts of the path.
@@ -267,13 +269,15 @@ def write_manifest(path: Path, rows: Iterable[ManifestRow]) -> None:
             writer.writerow((row.webcam, stamp, row.path, "" if row.bytes is None else row.bytes, row.sha256))
 
 
-def read_manifest(path: Path) -> list[ManifestRow]:
+def read_manifest(path: Path, *, allow_outside: bool = False) -> list[ManifestRow]:
     """Read a manifest, without opening images.
 
     Parameters
     ----------
     path
         CSV file with the columns ``webcam``, ``time_utc``, ``path`` and optionally ``bytes``, ``sha256``.
+    allow_outside
+        Permit images outside the manifest's folder.
 
     Returns
     -------
@@ -283,21 +287,23 @@ def read_manifest(path: Path) -> list[ManifestRow]:
     Raises
     ------
     InputError
-        The file is missing or not UTF-8, a column is missing, or a line is invalid.
+        The file is missing or not UTF-8, a column is missing, or a line is invalid: no time, a webcam that is no name
+        (`declaration.checked_name`), or a path that leads out of the manifest's folder.
     """
+    reader = csv.reader(read_text(path).splitlines())
     try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file)
-            header = next(reader, None) or []
-            missing = [name for name in COLUMNS[:3] if name not in header]
-            if missing:
-                raise InputError(path, f"column {missing[0]!r} is missing", expected=",".join(COLUMNS))
-            columns = [header.index(name) if name in header else None for name in COLUMNS]
-            return [_row(path, number, cells, columns) for number, cells in enumerate(reader, 2) if cells]
-    except FileNotFoundError:
-        raise InputError(path, "no such file") from None
-    except UnicodeDecodeError as error:
-        raise InputError(path, f"not UTF-8 text: {error}") from None
+        header = next(reader, None) or []
+        missing = [name for name in COLUMNS[:3] if name not in header]
+        if missing:
+            raise InputError(path, f"column {missing[0]!r} is missing", expected=",".join(COLUMNS))
+        columns = [header.index(name) if name in header else None for name in COLUMNS]
+        rows = [_row(path, number, cells, columns) for number, cells in enumerate(reader, 2) if cells]
+    except csv.Error as error:
+        raise InputError(path, f"line {reader.line_num} is no row of a table: {error}") from None
+    if not allow_outside:
+        for number, row in enumerate(rows, 1):
+            _require_below(row.path, f"{path}: row {number}")
+    return rows
 
 
 def _row(path: Path, number: int, cells: list[str], columns: list[int | None]) -> ManifestRow:
@@ -308,9 +314,20 @@ def _row(path: Path, number: int, cells: list[str], columns: list[int | None]) -
             raise ValueError(f"time_utc {stamp!r} has no offset")
         if not webcam or not name:
             raise ValueError("webcam or path is empty")
-        return ManifestRow(webcam, time.astimezone(UTC), name, int(size) if size else None, digest)
+        return ManifestRow(checked_name(webcam), time.astimezone(UTC), name, int(size) if size else None, digest)
     except (ValueError, IndexError) as error:
         raise InputError(f"{path}: line {number}", str(error), cure="write e.g. 2024-09-01T10:00:00Z") from None
+
+
+def _require_below(name: str, where: str) -> None:
+    """`InputError` for a name that leads out of the folder that it is relative to."""
+    if PurePath(name).is_absolute() or ".." in PurePath(name).parts or not name.isprintable():
+        raise InputError(
+            where,
+            "leads outside the manifest's folder",
+            got=name,
+            cure="move the pictures below it, or pass --allow-outside",
+        )
 
 
 def check_pictures(
@@ -363,23 +380,20 @@ def _file_problem(
     file: Path, row: ManifestRow, length: int, size: tuple[int, int], decode: bool
 ) -> tuple[str, str] | None:
     """Kind and description of the first problem of a file."""
-    from PIL import Image
-
     if length == 0:
         return "empty", "0 bytes"
     try:
-        with Image.open(file) as picture:
-            found, kind = picture.size, picture.format
-            if decode:
-                picture.load()
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        *found, kind = picture_size(file)
+        if decode:
+            read_image_srgb(file)
+    except UnreadableImage as error:
         return ("truncated" if "truncated" in str(error) else "unreadable"), str(error)
     with open(file, "rb") as stream:
         stream.seek(max(0, length - 64))
         tail = stream.read()
     if (kind == "JPEG" and b"\xff\xd9" not in tail) or (kind == "PNG" and b"IEND" not in tail):
         return "truncated", f"{length} bytes without the {kind} end marker"
-    if found != size:
+    if tuple(found) != size:
         return "wrong size", f"{found[0]} x {found[1]} px; expected {size[0]} x {size[1]}"
     if row.bytes is not None and row.bytes != length:
         return "changed", f"{length} bytes; expected {row.bytes} from the manifest"
@@ -448,10 +462,8 @@ def open_observation(row: ManifestRow, folder: Path, camera: Camera | Panorama) 
         image = read_image_linear(path)
     except FileNotFoundError:
         raise InputError(path, "no such picture") from None
-    except ValueError:
-        raise UnreadableImage(
-            f"{path}: not a readable picture; download it again or remove it from the manifest"
-        ) from None
+    except UnreadableImage as error:
+        raise UnreadableImage(f"{error}; download it again or remove it from the manifest") from None
     if image.shape[:2] != (camera.height_px, camera.width_px):
         raise InputError(
             path,

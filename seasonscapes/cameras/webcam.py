@@ -18,8 +18,8 @@ from pydantic import Field, field_validator, model_validator
 
 from seasonscapes.cameras.panorama import Panorama, panorama_from_angles
 from seasonscapes.cameras.pinhole import Camera, rotation_from_angles
-from seasonscapes.declaration import Declaration, InputError, read_toml, validate
-from seasonscapes.frames import LocalFrame, enu_from_geodetic, local_axes
+from seasonscapes.declaration import Declaration, InputError, Name, Text, read_toml, validate
+from seasonscapes.frames import Latitude, LocalFrame, Longitude, enu_from_geodetic, local_axes
 
 
 class Webcam(Declaration):
@@ -30,7 +30,7 @@ class Webcam(Declaration):
     Parameters
     ----------
     id, name
-        Identifier, and name for human readers.
+        Identifier (see `declaration.checked_name`), and name for human readers.
     latitude_deg, longitude_deg
         WGS 84 position [deg].
     height_m, above_ground_m
@@ -57,12 +57,12 @@ class Webcam(Declaration):
         IANA name of the time zone of the camera's clock.
     """
 
-    id: str = Field(min_length=1, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
-    name: str = ""
-    latitude_deg: float = Field(ge=-90.0, le=90.0)
-    longitude_deg: float = Field(ge=-180.0, le=180.0)
-    height_m: float | None = None
-    above_ground_m: float | None = Field(default=None, ge=0.0)
+    id: Name
+    name: Text = ""
+    latitude_deg: Latitude
+    longitude_deg: Longitude
+    height_m: float | None = Field(default=None, ge=-500.0, le=100_000.0)
+    above_ground_m: float | None = Field(default=None, ge=0.0, le=100_000.0)
     vertical_datum: str = "unknown"
     position_sigma_m: float = Field(default=10.0, gt=0.0)
     projection: Literal["cylindrical", "equirectangular", "perspective"]
@@ -110,9 +110,9 @@ class WebcamFile(Declaration):
     def _unique(self) -> Self:
         ids: set[str] = set()
         for webcam in self.webcam:
-            if webcam.id in ids:
+            if webcam.id.casefold() in ids:
                 raise ValueError(f"two webcams have the id {webcam.id}")
-            ids.add(webcam.id)
+            ids.add(webcam.id.casefold())
         return self
 
 

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from seasonscapes.commands.arguments import check_range, check_suffix, parse_size, parse_times
+from seasonscapes.commands.arguments import check_range, parse_size, parse_times
 from seasonscapes.commands.console import print_result, progress_bars
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
+from seasonscapes.commands.outputs import check_output
 from seasonscapes.errors import InputError
 
 if TYPE_CHECKING:
@@ -72,7 +73,7 @@ def albedo_command(
     """
     sky, options = sky or SkyOptions(), place or PlaceOptions()
     start = clock.perf_counter()
-    check_suffix(output, (".npz",))
+    check_output(output, (".npz",))
     check_range("--within-min", within_min, 0.0, 1e6)
     check_range("--iterations", iterations, 0, 100_000)
     from seasonscapes.rendering.backend import use_backend
@@ -92,7 +93,7 @@ def albedo_command(
                 expected = "the .csv of seasonscapes webcams --manifest"
                 cure = "for a synthetic scene: --synthetic-webcams"
                 raise InputError("--manifest", "missing", expected=expected, cure=cure)
-            sources = PhotographSources(manifest, calibrations, masks)
+            sources = PhotographSources(manifest, calibrations, masks, options.allow_outside)
             photographs = photographs_at(loaded, sources, utc, within_min=within_min, progress=progress)
         how = recovery.RecoveryOptions(fit_haze, fit_curve, iterations)
         recovered = recovery.recover_albedo(loaded, photographs, sky=model, options=how, progress=progress)

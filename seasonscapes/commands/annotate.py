@@ -8,8 +8,10 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from seasonscapes.commands.arguments import check_range
 from seasonscapes.commands.calibrate import TerrainSource
 from seasonscapes.commands.console import message
+from seasonscapes.commands.outputs import check_output_folder
 
 
 def annotate_command(
@@ -38,10 +40,13 @@ def annotate_command(
     """
     from functools import partial
 
-    from seasonscapes.calibration.annotation import AnnotationSession, serve_session
+    from seasonscapes.calibration.annotation import AnnotationSession
+    from seasonscapes.calibration.annotation_page import serve_session
     from seasonscapes.calibration.terrain_view import march_terrain_view
     from seasonscapes.workflows.webcam_calibration import station_picture
 
+    check_output_folder(output)
+    check_range("--port", port, 0, 65535)
     station = (terrain or TerrainSource()).station(scene, webcam)
     image = station_picture(picture, station, "--picture")
     look = partial(march_terrain_view, rasters=station.rasters, frame=station.frame)

@@ -9,9 +9,13 @@ from typing import TYPE_CHECKING
 
 from seasonscapes.commands.console import message
 from seasonscapes.errors import InputError
+from seasonscapes.frames import normal_longitude
+from seasonscapes.text_files import read_text
 
 if TYPE_CHECKING:
     from seasonscapes.workflows.albedo_sources import AlbedoFile
+
+_LONGEST_SECONDS = 366 * 86400.0
 
 
 def check_range(flag: str, value: float, low: float, high: float) -> None:
@@ -27,16 +31,9 @@ def check_choice(flag: str, value: str, choices: tuple[str, ...]) -> None:
         raise InputError(flag, f"unknown {flag.lstrip('-')}", got=value, expected=expected)
 
 
-def check_suffix(output: Path, suffixes: tuple[str, ...], *, flag: str = "--output") -> None:
-    """`InputError` about a path whose name does not end in one of the suffixes."""
-    if output.suffix.lower() not in suffixes:
-        expected = "a name that ends in " + " or ".join(suffixes)
-        raise InputError(flag, "unknown kind of file", got=str(output), expected=expected)
-
-
 def parse_size(text: str, *, flag: str = "--size") -> tuple[int, int]:
     """``1536x1024`` as width and height [px]."""
-    match = re.fullmatch(r"(\d{1,5})[x×](\d{1,5})", text.strip())
+    match = re.fullmatch(r"([0-9]{1,5})[x×]([0-9]{1,5})", text.strip())
     if not match or not (1 <= int(match[1]) <= 32768 and 1 <= int(match[2]) <= 32768):
         raise InputError(flag, "not a picture size", got=text, expected="WIDTHxHEIGHT in pixels, such as 1536x1024")
     return int(match[1]), int(match[2])
@@ -55,16 +52,19 @@ def parse_at(text: str, *, flag: str = "--at") -> tuple[float, float, float | No
         numbers = []
     if len(numbers) not in (2, 3):
         raise InputError(flag, "not a place", got=text, expected=expected)
-    if not (-90.0 <= numbers[0] <= 90.0 and -180.0 <= numbers[1] <= 180.0):
+    if not (-90.0 <= numbers[0] <= 90.0 and -180.0 <= numbers[1] <= 360.0):
         cure = "is the order latitude, longitude, in degrees?"
         raise InputError(flag, "latitude or longitude out of range", got=text, expected=expected, cure=cure)
+    latitude, longitude = numbers[0], normal_longitude(numbers[1])
     if len(numbers) == 2:
-        return numbers[0], numbers[1], None, 2.0
+        return latitude, longitude, None, 2.0
+    if not -500.0 <= numbers[2] <= 100_000.0:
+        raise InputError(flag, "height out of range", got=text, expected="-500 to 100000 metres")
     if parts[2].startswith("+"):
         if numbers[2] <= 0.0:
             raise InputError(flag, "the height above ground must be positive", got=text)
-        return numbers[0], numbers[1], None, numbers[2]
-    return numbers[0], numbers[1], numbers[2], None
+        return latitude, longitude, None, numbers[2]
+    return latitude, longitude, numbers[2], None
 
 
 def parse_sun(text: str, *, flag: str = "--sun") -> tuple[float, float]:
@@ -81,12 +81,13 @@ def parse_sun(text: str, *, flag: str = "--sun") -> tuple[float, float]:
 
 def parse_duration(flag: str, text: str) -> timedelta:
     """``90s``, ``10min``, ``1h``, ``1d`` as a length of time of at least a second."""
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(s|min|m|h|d)", text.strip())
+    match = re.fullmatch(r"([0-9]{1,12}(?:\.[0-9]{1,9})?)\s*(s|min|m|h|d)", text.strip())
     unit = {"s": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
-    if not match or float(match[1]) * unit[match[2]] < 1.0:
-        expected = "a number and s, min, h or d, such as 10min"
+    seconds = float(match[1]) * unit[match[2]] if match else 0.0
+    if not 1.0 <= seconds <= _LONGEST_SECONDS:
+        expected = "a number and s, min, h or d, such as 10min, at most 366d"
         raise InputError(flag, "not a length of time of at least a second", got=text, expected=expected)
-    return timedelta(seconds=float(match[1]) * unit[match[2]])
+    return timedelta(seconds=seconds)
 
 
 def parse_time(text: str, latitude_deg: float, longitude_deg: float) -> datetime:
@@ -98,15 +99,14 @@ def parse_time(text: str, latitude_deg: float, longitude_deg: float) -> datetime
     return resolved.utc
 
 
-def listed(text: str) -> list[str]:
+def listed(flag: str, text: str) -> list[str]:
     """Items separated by commas, or the lines of a file (comments after ``#``)."""
-    path = Path(text)
     try:
-        is_file = path.is_file()
+        is_file = Path(text).is_file()
     except OSError:  # a list of times can be longer than a file name
         is_file = False
     if is_file:
-        lines = (line.split("#")[0].strip() for line in path.read_text(encoding="utf-8").splitlines())
+        lines = (line.split("#")[0].strip() for line in read_text(Path(text), where=flag).splitlines())
         return [line for line in lines if line]
     return [part.strip() for part in text.split(",") if part.strip()]
 
@@ -115,7 +115,7 @@ def parse_times(flag: str, text: str, latitude_deg: float, longitude_deg: float)
     """Instants in UTC, in order, without repetition; see `listed`."""
     from seasonscapes.civil_time import resolve_time
 
-    readings = [resolve_time(item, latitude_deg, longitude_deg) for item in listed(text)]
+    readings = [resolve_time(item, latitude_deg, longitude_deg) for item in listed(flag, text)]
     if not readings:
         raise InputError(flag, "no time in it", got=text)
     message(f"{len(readings)} times, the first one {readings[0].reading}")

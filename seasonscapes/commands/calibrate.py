@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from seasonscapes.commands.console import message, print_result
+from seasonscapes.commands.outputs import check_output_folder
 from seasonscapes.errors import InputError, NotEnoughEvidence
 
 if TYPE_CHECKING:
@@ -78,6 +79,7 @@ def calibrate_command(
     from seasonscapes.calibration.resection import report_lines
     from seasonscapes.workflows.webcam_calibration import calibrate, station_picture
 
+    check_output_folder(output)
     if points is None and not skyline:
         raise InputError("calibrate", "no evidence", cure="give --points FILE, --skyline, or both")
     station = (terrain or TerrainSource()).station(scene, webcam)

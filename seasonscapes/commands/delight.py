@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from seasonscapes.commands.arguments import check_suffix, parse_sun, parse_time
+from seasonscapes.commands.arguments import parse_sun, parse_time
 from seasonscapes.commands.console import message, print_result, progress_bars
 from seasonscapes.commands.delight_mesh import delight_mesh_file, require_no_scene_flags
 from seasonscapes.commands.mesh_options import MESH_SUFFIXES, MeshFileFlags, MeshFlags
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
+from seasonscapes.commands.outputs import check_output
 from seasonscapes.errors import InputError
 
 if TYPE_CHECKING:
@@ -69,17 +70,15 @@ def delight_command(
         return
     if mesh is not None or files is not None:
         raise InputError(source, "flags of meshes beside a scene", cure="leave out --at, --up, --crs, --bits and such")
-    check_suffix(output, (".npz", ".png", ".exr"))
+    check_output(output, (".npz", ".png", ".exr"))
     if (time is None) == (sun is None):
         raise InputError("--time", "give either --time (or --time unknown) or --sun AZIMUTH,ELEVATION")
     angles = None if sun is None else parse_sun(sun)
-    from seasonscapes.workflows.delighting import UNKNOWN, delit_imagery, with_image
+    from seasonscapes.workflows.delighting import UNKNOWN, delit_imagery
 
     model = sky.model()
     with progress_bars() as progress:
         loaded = options.load(source, progress)
-        if image is not None:
-            loaded = with_image(loaded, image)
         when: ImageTime
         if angles is not None:
             when = angles
@@ -87,7 +86,9 @@ def delight_command(
             assert time is not None  # one of them was given
             known = time != UNKNOWN
             when = parse_time(time, loaded.frame.latitude_deg, loaded.frame.longitude_deg) if known else UNKNOWN
-        result = delit_imagery(loaded, when, sky=model, sensor_height_m=sensor_height_m, progress=progress)
+        result = delit_imagery(
+            loaded, when, image_file=image, sky=model, sensor_height_m=sensor_height_m, progress=progress
+        )
     record: dict[str, Any] = {
         "output": str(output),
         "scene": loaded.scene.name,

@@ -7,8 +7,9 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from seasonscapes.commands.arguments import parse_size
+from seasonscapes.commands.arguments import check_range, parse_size
 from seasonscapes.commands.console import message, print_result, progress_bars
+from seasonscapes.commands.outputs import check_output_folder
 
 
 def demo_command(
@@ -48,6 +49,8 @@ def demo_command(
     from seasonscapes.workspace import Workspace
 
     width, height = parse_size(size)
+    check_range("--spp", spp, 1, 1 << 20)
+    check_output_folder(output)
     backend = use_backend(device)
     message(f"demo: rendering on {backend.variant} ({backend.reason})")
     message("demo: building the embedded scene (the first time takes a minute)")

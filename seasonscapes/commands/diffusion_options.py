@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 from cyclopts import Parameter
 
-from seasonscapes.commands.arguments import check_choice, check_range, check_suffix, parse_names
+from seasonscapes.commands.arguments import check_choice, check_range, parse_names
+from seasonscapes.commands.outputs import check_output
 from seasonscapes.errors import InputError
 
 if TYPE_CHECKING:
@@ -111,5 +112,5 @@ class DiffusionOptions:
         check_range("--least-hole", self.least_hole, 0.0, 1.0)
         check_range("--fps", self.fps, 1.0, 240.0)
         if self.film is not None:
-            check_suffix(self.film, (".mp4",), flag="--film")
+            check_output(self.film, (".mp4",), flag="--film")
         return options

@@ -8,9 +8,10 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from seasonscapes.commands.arguments import check_choice, check_range, check_suffix, parse_albedo
+from seasonscapes.commands.arguments import check_choice, check_range, parse_albedo
 from seasonscapes.commands.console import print_result, progress_bars
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
+from seasonscapes.commands.outputs import check_output, check_output_folder
 from seasonscapes.errors import InputError
 
 
@@ -68,7 +69,7 @@ def distill_command(
     """
     sky, options = sky or SkyOptions(), place or PlaceOptions()
     start = clock.perf_counter()
-    check_suffix(output, (".safetensors",))
+    check_output(output, (".safetensors",))
     for flag, value, low, high in (
         ("--discs", discs, 8, 4096),
         ("--suns", suns, 1, 512),
@@ -80,6 +81,8 @@ def distill_command(
         ("--seed", seed, 0, 2**32),
     ):
         check_range(flag, value, low, high)
+    if export_views is not None:
+        check_output_folder(export_views, flag="--export-views")
     if export_views is not None and views == 0:
         raise InputError("--export-views", "there are no views to export", cure="ask for some with --views")
     from seasonscapes.workflows import distillation

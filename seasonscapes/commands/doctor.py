@@ -6,6 +6,7 @@ import importlib.metadata
 import importlib.util
 import os
 import platform
+import subprocess
 import sys
 
 from seasonscapes import __version__
@@ -17,7 +18,7 @@ EXTRAS = {"gaussians": "torch", "diffusion": "diffusers", "poisson": "open3d", "
 
 
 def doctor_command(*, json: bool = False) -> None:
-    """Report what this machine can do: Python, renderer, libLLVM, extras, and a short test render.
+    """Report what this machine can do: Python, renderer, libLLVM, extras (imported), and a short test render.
 
     Never crashes: the test render runs in a process of its own, and a libLLVM that would abort is named instead.
 
@@ -29,7 +30,8 @@ def doctor_command(*, json: bool = False) -> None:
     backend = choose_backend("auto")
     library = find_llvm()
     works, line = probe_in_child("auto")
-    extras = {name: importlib.util.find_spec(module) is not None for name, module in EXTRAS.items()}
+    faults = {name: _import_fault(module) for name, module in EXTRAS.items()}
+    extras = {name: fault is None for name, fault in faults.items()}
     versions = {name: _version(name) for name in ("mitsuba", "drjit", "numpy", "rasterio", "torch")}
     record = {
         "seasonscapes": __version__,
@@ -44,6 +46,7 @@ def doctor_command(*, json: bool = False) -> None:
         "libllvm_usable": library is not None and library.usable,
         "versions": versions,
         "extras": extras,
+        "extras_faults": {name: fault for name, fault in faults.items() if fault is not None},
         "test_render": works,
         "test_render_note": line,
     }
@@ -57,7 +60,7 @@ def doctor_command(*, json: bool = False) -> None:
         f"renderer      {backend.variant}: {backend.reason}",
         f"libLLVM       {llvm}",
         "packages      " + ", ".join(f"{name} {version or 'absent'}" for name, version in versions.items()),
-        "extras        " + ", ".join(f"{name} {'yes' if there else 'no'}" for name, there in extras.items()),
+        "extras        " + ", ".join(f"{name} {fault or 'yes'}" for name, fault in faults.items()),
         f"test render   {'works' if works else 'FAILED'}: {line}",
     ]
     if backend.device == "scalar":
@@ -65,6 +68,22 @@ def doctor_command(*, json: bool = False) -> None:
     print_result(record, lines, as_json=json)
     if not works:
         sys.exit(1)
+
+
+def _import_fault(module: str) -> str | None:
+    """Why a module cannot be imported, by importing it in a process of its own; ``None`` where it can."""
+    if importlib.util.find_spec(module) is None:
+        return "no"
+    try:
+        result = subprocess.run(
+            [sys.executable, "-c", f"import {module}"], capture_output=True, text=True, timeout=120.0, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return "BROKEN (its import did not end within 120 s)"
+    if result.returncode == 0:
+        return None
+    lines = result.stderr.strip().splitlines() or [f"ended by {result.returncode}"]
+    return f"BROKEN ({lines[-1]})"
 
 
 def _version(name: str) -> str | None:

@@ -8,8 +8,9 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from seasonscapes.commands.arguments import check_choice, check_range, check_suffix
+from seasonscapes.commands.arguments import check_choice, check_range
 from seasonscapes.commands.console import message, print_result, progress_bars
+from seasonscapes.commands.outputs import check_output, check_output_folder
 from seasonscapes.errors import InputError
 
 
@@ -68,7 +69,9 @@ def evaluate_command(
     if not far_m > near_m:
         raise InputError("--far-m", "not beyond --near-m", got=far_m, expected=f"more than {near_m:g}")
     if table is not None:
-        check_suffix(table, (".csv", ".md"), flag="--table")
+        check_output(table, (".csv", ".md"), flag="--table")
+    if figures is not None:
+        check_output_folder(figures, flag="--figures")
     found = pairs.paired(truth, pictures)
     pairs.check_files_held_out([true_path for true_path, _ in found.values()], used)
     measure, why = _lpips(lpips)

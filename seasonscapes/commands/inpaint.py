@@ -8,10 +8,11 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from seasonscapes.commands.arguments import check_range, check_suffix, parse_time
+from seasonscapes.commands.arguments import check_range, parse_time
 from seasonscapes.commands.console import print_result, progress_bars
 from seasonscapes.commands.diffusion_options import DiffusionOptions
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
+from seasonscapes.commands.outputs import check_output, check_output_folder
 from seasonscapes.commands.view_options import ViewOptions
 
 
@@ -64,7 +65,9 @@ def inpaint_command(
     """
     view, options, sky = view or ViewOptions(), place or PlaceOptions(), sky or SkyOptions()
     start = clock.perf_counter()
-    check_suffix(output, (".npz",))
+    check_output(output, (".npz",))
+    if figures is not None:
+        check_output_folder(figures, flag="--figures")
     check_range("--detail", detail, 0.0, 1.0)
     check_range("--seed", seed, 0, 2**32 - 1)
     from seasonscapes.images import atomic_path

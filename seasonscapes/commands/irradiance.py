@@ -8,9 +8,10 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from seasonscapes.commands.arguments import check_suffix, parse_time
+from seasonscapes.commands.arguments import parse_time
 from seasonscapes.commands.console import print_result, progress_bars
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
+from seasonscapes.commands.outputs import check_output
 from seasonscapes.commands.view_options import WhenOptions
 from seasonscapes.errors import InputError
 
@@ -55,7 +56,7 @@ def irradiance_command(
     """
     start = clock.perf_counter()
     sky, options = sky or SkyOptions(), place or PlaceOptions()
-    check_suffix(output, (".tif", ".tiff"))
+    check_output(output, (".tif", ".tiff"))
     if (time is None) == (when is None):
         got, cure = "both" if when else "neither", "--time T, or --from T0 --to T1 --every 1h"
         raise InputError("--time", "give either an instant or a period", got=got, cure=cure)

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from seasonscapes.commands.arguments import check_suffix, parse_time
+from seasonscapes.commands.arguments import parse_time
 from seasonscapes.commands.console import print_result, progress_bars
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
+from seasonscapes.commands.outputs import check_output
 
 if TYPE_CHECKING:
     import numpy as np
@@ -58,7 +59,7 @@ def lit_texture_command(
     """
     start = clock.perf_counter()
     sky, options = sky or SkyOptions(), place or PlaceOptions()
-    check_suffix(output, (".png", ".glb", ".exr"))
+    check_output(output, (".png", ".glb", ".exr"))
     from seasonscapes.exposure import develop, exposure_ev100, parse_exposure
     from seasonscapes.images import write_exr
     from seasonscapes.rendering.backend import use_backend
@@ -79,12 +80,11 @@ def lit_texture_command(
         lit = lit_texture(loaded, utc, sky=model, albedo=given, rays=rays, seed=seed, progress=progress)
     light, position = illumination_on_terrain(loaded, model, utc)
     record: dict[str, Any] = {
-        "scene": scene,
+        "scene": loaded.scene.name,
         "time_utc": utc.astimezone(UTC).isoformat(),
         "sun": sun_angles(position),
         "sky": light.model,
         "attribution": loaded.scene.attribution,
-        "output": str(output),
         "rays": rays,
         "seed": seed,
         "texture": texture_facts(loaded, "lit", utc=utc, sky=model, rays=rays, seed=seed),
@@ -103,17 +103,12 @@ def lit_texture_command(
             _write_model(output, loaded, picture, record)
     record["seconds"] = round(clock.perf_counter() - start, 2)
     size = f"{loaded.atlas.width_px} × {loaded.atlas.height_px} texels"
-    print_result(record, [f"{output}  ({size}, {record['seconds']} s)"], as_json=json)
+    print_result({"output": str(output), **record}, [f"{output}  ({size}, {record['seconds']} s)"], as_json=json)
 
 
 def _write_model(output: Path, place: Place, picture: np.ndarray, record: dict) -> None:
-    import json
+    from seasonscapes.export.gltf import TexturedTerrain, write_gltf
+    from seasonscapes.images import srgb8_from_linear
 
-    import numpy as np
-
-    from seasonscapes.images import srgb_from_linear
-    from seasonscapes.terrain.gltf import write_glb
-
-    levels = np.rint(srgb_from_linear(picture) * 255.0).astype(np.uint8)
-    plain = json.loads(json.dumps(record, default=float))
-    write_glb(output, place.terrain, levels, unlit=True, extras=plain)
+    about = {**place.about, **record}
+    write_gltf(output, TexturedTerrain(place.terrain, srgb8_from_linear(picture), lit=True, about=about))

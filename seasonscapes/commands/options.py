@@ -33,7 +33,7 @@ class PlaceOptions:
     workspace: Path | None = None
     """Folder for built artefacts; default SEASONSCAPES_WORKSPACE or the user's cache."""
     allow_outside: bool = False
-    """Let the scene file name data outside its folder."""
+    """Trust the scene: data and pictures outside its folder, any raster format, servers."""
 
     def folder(self) -> Workspace:
         """The workspace asked for."""
@@ -45,7 +45,9 @@ class PlaceOptions:
         """How to build the terrain; ``texel_m`` is a command's own default."""
         from seasonscapes.workflows.place import MeshOptions
 
-        return MeshOptions(self.mesher, self.max_error_m, self.refine, self.atlas, self.texel_m or texel_m)
+        return MeshOptions(
+            self.mesher, self.max_error_m, self.refine, self.atlas, texel_m if self.texel_m is None else self.texel_m
+        )
 
     def load(self, scene: str, progress: Progress | None = None, *, texel_m: float | None = None) -> Place:
         """The place of a scene file or bundled scene."""

@@ -11,6 +11,7 @@ from cyclopts import Parameter
 from seasonscapes.commands.arguments import check_choice, check_range, parse_size, parse_time
 from seasonscapes.commands.console import message, print_result, progress_bars
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
+from seasonscapes.commands.outputs import check_output_folder
 from seasonscapes.commands.picture_options import PictureOptions
 
 
@@ -63,6 +64,7 @@ def paint_command(
     check_choice("--mode", mode, PAINT_MODES)
     check_range("--near-m", near_m, 0.0, 1e5)
     check_range("--within-min", pictures.within_min, 0.0, 1e6)
+    check_output_folder(output)
     model, _ = sky.model(), parse_size(pictures.size)
     with progress_bars() as progress:
         loaded = options.load(scene, progress)

@@ -7,9 +7,10 @@ from typing import Annotated, cast, get_args
 
 from cyclopts import Parameter
 
-from seasonscapes.commands.arguments import check_choice, check_range, check_suffix, parse_size
+from seasonscapes.commands.arguments import check_choice, check_range, parse_size
 from seasonscapes.commands.console import print_result, progress_bars
 from seasonscapes.commands.options import PlaceOptions
+from seasonscapes.commands.outputs import check_output
 from seasonscapes.commands.waypoint_arguments import EXPECTED_WAYPOINT, parse_position, parse_waypoint
 from seasonscapes.errors import InputError, InvalidPath
 
@@ -70,9 +71,9 @@ def path_command(
         Print one machine-readable record.
     """
     options = place or PlaceOptions()
-    check_suffix(output, (".json",))
+    check_output(output, (".json",))
     if map is not None:
-        check_suffix(map, (".png",), flag="--map")
+        check_output(map, (".png",), flag="--map")
     check_range("--clearance-m", clearance_m, 0.0, 10_000.0)
     check_range("--fov", fov, 1.0, 169.0)
     check_range("--views", 60 if views is None else views, 2, 100_000)

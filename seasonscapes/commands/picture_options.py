@@ -52,7 +52,9 @@ class PictureOptions:
                     "for a synthetic scene: --synthetic-webcams",
                 )
                 raise InputError("--manifest", "missing", expected=expected, cure=cure)
-            return PhotographSources(self.manifest, self.calibrations, self.masks)
+            return PhotographSources(
+                self.manifest, self.calibrations, self.masks, place.scene.confinement.allow_outside
+            )
         size_px = parse_size(self.size)
         return photographed_in_workspace(
             place, utc, model, leave_out=parse_names(self.leave_out), size_px=size_px, progress=progress

@@ -8,10 +8,11 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from seasonscapes.commands.arguments import check_range, check_suffix, parse_albedo, parse_time
+from seasonscapes.commands.arguments import check_range, parse_albedo, parse_time
 from seasonscapes.commands.console import print_result, progress_bars
 from seasonscapes.commands.look_options import LookOptions
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
+from seasonscapes.commands.outputs import check_output
 from seasonscapes.commands.view_options import ViewOptions
 
 
@@ -68,7 +69,7 @@ def render_command(
         look or LookOptions(),
         place or PlaceOptions(),
     )
-    check_suffix(output, (".png", ".exr"))
+    check_output(output, (".png", ".exr"))
     if spp is not None:
         check_range("--spp", spp, 1, 1 << 20)
     if max_depth is not None:
@@ -106,7 +107,6 @@ def render_command(
     record = picture.provenance
     ev100 = look.ev100(picture.radiance)
     record |= {
-        "output": str(output),
         "camera": chosen.name,
         "albedo": [
             {"date": each.day.isoformat(), "content": each.content} for each in (series.dated if series else ())
@@ -121,4 +121,4 @@ def render_command(
     record["seconds"] = round(clock.perf_counter() - start, 2)
     how = "light transport" if record["engine"] == "transport" else f"{record['spp']} samples per pixel"
     facts = f"{how}, EV {ev100:.1f}, {record['seconds']} s, {record['variant']}"
-    print_result(record, [f"{output}  ({size_px[0]} × {size_px[1]}, {facts})"], as_json=json)
+    print_result({"output": str(output), **record}, [f"{output}  ({size_px[0]} × {size_px[1]}, {facts})"], as_json=json)

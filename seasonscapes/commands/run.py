@@ -10,6 +10,7 @@ from cyclopts import Parameter
 from seasonscapes.commands.arguments import parse_times
 from seasonscapes.commands.console import print_result, progress_bars
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
+from seasonscapes.commands.outputs import check_output_folder
 from seasonscapes.commands.run_options import RunEffort, RunPictureOptions
 from seasonscapes.commands.view_options import ViewOptions
 
@@ -54,9 +55,10 @@ def run_command(
     json
         Print one machine-readable record.
     """
+    check_output_folder(output)
     options, view, sky = place or PlaceOptions(), view or ViewOptions(size="768x512"), sky or SkyOptions()
-    photographs, distil = (pictures or RunPictureOptions()).values(), (effort or RunEffort()).values()
-    model, size_px = sky.model(), view.size_px()
+    photographs, distil = pictures or RunPictureOptions(), (effort or RunEffort()).values()
+    found, model, size_px = photographs.values(allow_outside=options.allow_outside), sky.model(), view.size_px()
     from seasonscapes.workflows.albedo_recovery import TEXEL_M
     from seasonscapes.workflows.full_run import RunJob, run
 
@@ -70,7 +72,7 @@ def run_command(
             view.chosen(loaded.scene),
             size_px,
             model,
-            photographs,
+            found,
             distil,
             seed,
             options.allow_outside,

@@ -35,8 +35,8 @@ class RunPictureOptions:
     photo_size: str | None = None
     """Of a synthetic scene's webcams; default 2048x384, in perspective 720x480."""
 
-    def values(self) -> RunPhotographs:
-        """The flags as one value."""
+    def values(self, *, allow_outside: bool = False) -> RunPhotographs:
+        """The flags as one value; ``allow_outside`` lets the manifest name pictures outside its folder."""
         from seasonscapes.workflows.photograph_files import PhotographSources
         from seasonscapes.workflows.run_photographs import PHOTO_SIZES, RunPhotographs
 
@@ -45,7 +45,7 @@ class RunPictureOptions:
             size_px = parse_size(self.photo_size, flag="--photo-size")
         sources = None
         if self.manifest is not None:
-            sources = PhotographSources(self.manifest, self.calibrations, self.masks)
+            sources = PhotographSources(self.manifest, self.calibrations, self.masks, allow_outside)
         return RunPhotographs(
             sources, self.masks, self.within_min, frozenset(parse_names(self.leave_out)), self.photo_kind, size_px
         )

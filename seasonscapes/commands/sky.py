@@ -7,9 +7,10 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from seasonscapes.commands.arguments import check_suffix, parse_at
+from seasonscapes.commands.arguments import parse_at
 from seasonscapes.commands.console import message, print_result, progress_bars
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
+from seasonscapes.commands.outputs import check_output
 from seasonscapes.errors import InputError
 
 
@@ -47,7 +48,7 @@ def sky_command(
     if (scene is None) == (at is None):
         raise InputError("sky", "give either a scene or --at LAT,LON,HEIGHT", got="both" if at else "neither")
     if output is not None:
-        check_suffix(output, (".png", ".exr"))
+        check_output(output, (".png", ".exr"))
     model = (sky or SkyOptions()).model()
     latitude, longitude, height_m = _standpoint(scene, at, options)
     resolved = resolve_time(time, latitude, longitude)

@@ -10,10 +10,11 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from seasonscapes import __version__
-from seasonscapes.commands.arguments import check_choice, check_range, check_suffix, parse_time
+from seasonscapes.commands.arguments import check_choice, check_range, parse_time
 from seasonscapes.commands.console import print_result, progress_bars
 from seasonscapes.commands.look_options import LookOptions
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
+from seasonscapes.commands.outputs import check_output
 from seasonscapes.commands.view_options import ViewOptions
 from seasonscapes.errors import InputError, NoTerrainInView
 
@@ -58,7 +59,7 @@ def splat_command(
         place or PlaceOptions(),
     )
     start = clock.perf_counter()
-    check_suffix(output, (".png", ".exr", ".ply", ".glb"))
+    check_output(output, (".png", ".exr", ".ply", ".glb"))
     check_range("--subpixels", subpixels, 1, 4)
     check_choice("--device", device, ("cpu", "cuda"))
     from seasonscapes.workflows import gaussian_views as gaussians
@@ -84,7 +85,6 @@ def splat_command(
     light, position = illumination_for_camera(loaded, camera, declared, utc)
     day, suffix = gaussians.day_of_year(utc), output.suffix.lower()
     record: dict[str, Any] = {
-        "output": str(output),
         "scene": loaded.scene.name,
         "gaussians": len(splats.means),
         "time_utc": utc.astimezone(UTC).isoformat(),
@@ -95,7 +95,8 @@ def splat_command(
     if suffix in (".ply", ".glb"):
         baked, ev100 = gaussians.bake_gaussians(splats, light, day, exposure=metering)
         record["exposure_ev100"] = round(ev100, 3)
-        write_ply(output, baked) if suffix == ".ply" else write_gltf(output, baked, note=record)
+        note = {**loaded.about, **record}
+        write_ply(output, baked, note=note) if suffix == ".ply" else write_gltf(output, baked, note=note)
     else:
         try:
             picture, times_ms = gaussians.timed_view(splats, camera, light, day, subpixels=subpixels, device=device)
@@ -112,4 +113,4 @@ def splat_command(
     record["seconds"] = round(clock.perf_counter() - start, 2)
     sun = f"sun at {record['sun']['elevation_deg']:.1f}°"
     line = f"{output}  ({record['gaussians']:,} Gaussians, {sun}, {record['seconds']} s)"
-    print_result(record, [line], as_json=json)
+    print_result({"output": str(output), **record}, [line], as_json=json)

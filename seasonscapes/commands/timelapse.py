@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time as clock
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
@@ -12,6 +12,7 @@ from seasonscapes.commands.arguments import check_range, parse_albedo, parse_dur
 from seasonscapes.commands.console import print_result, progress_bars
 from seasonscapes.commands.look_options import LookOptions
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
+from seasonscapes.commands.outputs import check_output, check_output_folder
 from seasonscapes.commands.view_options import ViewOptions, WhenOptions
 from seasonscapes.commands.work_options import WorkOptions
 from seasonscapes.errors import InputError
@@ -83,6 +84,10 @@ def timelapse_command(
         raise InputError("--output", "unknown kind of film", got=str(output), expected=expected)
     if output.suffix and exr:
         raise InputError("--exr", "wants a folder to write to", cure="give a folder as --output")
+    if output.suffix:
+        check_output(output, (".mp4",))
+    else:
+        check_output_folder(output)
     check_range("--fps", fps, 0.1, 240.0)
     check_range("--seed", seed, 0, 2**32)
     part, path = work.part(), find_scene(scene)
@@ -103,15 +108,14 @@ def timelapse_command(
         allow_outside=place.allow_outside,
     )
     chosen_times = times if part is None else films.shard(times, *part)
+    how: dict[str, Any] = {"cluster": work.cluster, "exr_folder": output.resolve() if exr else None}
     with progress_bars() as progress:
-        exr_folder = output.resolve() if exr else None
-        rendered = films.render_frames(
-            job, chosen_times, cluster=work.cluster, exr_folder=exr_folder, progress=progress
-        )
-        if part is None:
-            films.develop_film(job, times, output, film_look, progress=progress)
-            if not keep_frames:
-                films.remove_frames(job, times)
+        if part is not None:
+            rendered = films.render_frames(job, chosen_times, **how, progress=progress)
+        else:
+            rendered = films.make_film(
+                job, times, output, film_look, **how, keep_frames=keep_frames, progress=progress
+            )[1]
     record = {"scene": scene, "camera": chosen.name, "frames": len(chosen_times), "rendered": rendered}
     record |= {"output": str(output)} if part is None else {}
     record["seconds"] = round(clock.perf_counter() - start, 2)

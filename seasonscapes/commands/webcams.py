@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from seasonscapes.commands.arguments import check_suffix
 from seasonscapes.commands.console import message, print_result
+from seasonscapes.commands.outputs import check_output
 
 if TYPE_CHECKING:
     from seasonscapes.workflows.webcam_inspection import WebcamInspection
@@ -50,7 +50,7 @@ def webcams_command(
     output
         A .png map: positions, fields of view, headings.
     allow_outside
-        Let the scene file name data outside its folder.
+        Trust the scene: data and pictures outside its folder, any raster format, servers.
     json
         Print one machine-readable record.
     """
@@ -59,7 +59,9 @@ def webcams_command(
     from seasonscapes.workflows.webcam_inspection import inspect_webcams, scene_with_webcams
 
     if output is not None:
-        check_suffix(output, (".png",))
+        check_output(output, (".png",))
+    if pictures is not None and manifest is not None:
+        check_output(manifest, (".csv",), flag="--manifest")
     read = scene_with_webcams(scene, allow_outside=allow_outside)
     found = inspect_webcams(
         read, pictures=pictures, layout=layout, manifest=manifest, decode=decode, elevation=elevation

@@ -24,7 +24,7 @@ class WorkOptions:
         """The part i/N as two numbers."""
         if self.shard is None:
             return None
-        match = re.fullmatch(r"(\d+)/(\d+)", self.shard)
+        match = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", self.shard)
         if match is None or not 1 <= int(match[1]) <= int(match[2]):
             expected = "i/N with 1 ≤ i ≤ N, such as 3/8"
             raise InputError("--shard", "not a part of the whole", got=self.shard, expected=expected)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -75,16 +75,30 @@ def load_lpips(folder: Path | None = None) -> Lpips:
     reason = missing_lpips(folder)
     if reason is not None:
         raise FileNotFoundError(f"LPIPS: {reason}")
-    import torch
-
     folder = folder or Path(os.environ[ENVIRONMENT])
-    network, linear = (torch.load(folder / name, map_location="cpu", weights_only=True) for name in WEIGHTS)
+    network, linear = (_weights(folder / name) for name in WEIGHTS)
     for name, weights, keys in zip(WEIGHTS, (network, linear), (_NETWORK_KEYS, _LINEAR_KEYS), strict=True):
         missing = [key for key in keys if not isinstance(weights, Mapping) or key not in weights]
         if missing:
             problem = f"not the weights of LPIPS: {len(missing)} of {len(keys)} keys are missing"
             raise InputError(folder / name, problem, expected=f"the key {missing[0]}")
     return lpips_of(network, linear)
+
+
+def _weights(path: Path) -> Any:
+    """The tensors of a weight file; `InputError` for a damaged one, and for one that would run code to be loaded."""
+    import pickle
+
+    import torch
+
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError:
+        problem = "not plain tensors: it holds objects, which are never unpickled"
+    # What torch raises for files that are cut short or no weights at all.
+    except (RuntimeError, EOFError, ValueError, KeyError, AttributeError, TypeError, IndexError, OSError) as error:
+        problem = f"not readable as weights: {str(error).partition(chr(10))[0] or type(error).__name__}"
+    raise InputError(path, problem, expected="a state dict of torch.save", cure="download the file again")
 
 
 def lpips_of(network: Mapping[str, torch.Tensor], linear: Mapping[str, torch.Tensor]) -> Lpips:

@@ -7,7 +7,6 @@ These formats have no light, so one instant is exported: display-referred sRGB c
 from __future__ import annotations
 
 import json
-import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC
@@ -18,10 +17,13 @@ import numpy as np
 
 from seasonscapes.cameras.exchange import NamedView, write_colmap, write_transforms
 from seasonscapes.errors import InputError
-from seasonscapes.frames import LocalFrame
+from seasonscapes.export.gltf_file import GltfFile
+from seasonscapes.frames import LocalFrame, frame_record
 from seasonscapes.gaussians.disc_transport import LightState
 from seasonscapes.images import atomic_path
 
+# Where training pictures lie below the folder of `write_training_views`.
+IMAGE_FOLDER = "images"
 # Y₀₀, the constant spherical harmonic.
 SH0 = 0.28209479177387814
 _COLUMNS = ("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",
@@ -66,7 +68,7 @@ class BakedSplats:
                 raise ValueError(f"BakedSplats: {name} differs in length from means, or has values that are not finite")
 
 
-def write_ply(path: Path, splats: BakedSplats) -> None:
+def write_ply(path: Path, splats: BakedSplats, *, note: dict[str, Any] | None = None) -> None:
     """Write a 3DGS ``.ply``, 68 bytes per splat: log scales, logit opacity, wxyz, f_dc = (rgb − ½) / Y₀₀.
 
     Parameters
@@ -75,21 +77,49 @@ def write_ply(path: Path, splats: BakedSplats) -> None:
         Output file, written atomically.
     splats
         Gaussians of one instant.
+    note
+        Plain values, each a comment ``NAME JSON`` of the header, such as the origin.
     """
     table = np.zeros((len(splats.means), len(_COLUMNS)), "<f4")
     table[:, 0:3], table[:, 6:9] = splats.means, (splats.rgb - 0.5) / SH0
     table[:, 9], table[:, 10:13], table[:, 13:17] = splats.opacity_logits, splats.log_scales, splats.quaternions
+    _write_vertices(path, table.tobytes(), len(table), [f"float {name}" for name in _COLUMNS], note)
+
+
+def write_points(path: Path, splats: BakedSplats, *, note: dict[str, Any] | None = None) -> None:
+    """Write the centres of Gaussians with their colours as a point cloud ``.ply``: x, y, z, red, green, blue.
+
+    Parameters
+    ----------
+    path
+        Output file, written atomically.
+    splats
+        The Gaussians.
+    note
+        As of `write_ply`.
+    """
+    columns = [*((axis, "<f4") for axis in "xyz"), *((name, "u1") for name in ("red", "green", "blue"))]
+    table = np.zeros(len(splats.means), columns)
+    levels = np.rint(255.0 * np.clip(splats.rgb, 0.0, 1.0))
+    for index, (name, _) in enumerate(columns):
+        table[name] = splats.means[:, index] if index < 3 else levels[:, index - 3]
+    properties = [f"{'float' if kind == '<f4' else 'uchar'} {name}" for name, kind in columns]
+    _write_vertices(path, table.tobytes(), len(table), properties, note)
+
+
+def _write_vertices(path: Path, body: bytes, count: int, properties: list[str], note: dict[str, Any] | None) -> None:
     header = [
         "ply",
         "format binary_little_endian 1.0",
         "comment east-north-up metres, sRGB",
-        f"element vertex {len(table)}",
-        *(f"property float {name}" for name in _COLUMNS),
+        *(f"comment {name} {json.dumps(value, default=float)}" for name, value in (note or {}).items()),
+        f"element vertex {count}",
+        *(f"property {text}" for text in properties),
         "end_header",
     ]
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write(("\n".join(header) + "\n").encode("ascii"))
-        file.write(table.tobytes())
+        file.write(body)
 
 
 def read_ply(path: Path) -> BakedSplats:
@@ -153,6 +183,7 @@ def write_gltf(path: Path, splats: BakedSplats, *, note: dict[str, Any] | None =
     note
         Plain values for the ``extras`` of the asset.
     """
+    file = GltfFile({"up_axis": "y", "colour_space": "sRGB, display-referred", **(note or {})})
     arrays = {
         "POSITION": splats.means,
         "COLOR_0": np.concatenate([_linear(splats.rgb), _sigmoid(splats.opacity_logits)[:, None]], axis=1),
@@ -161,43 +192,17 @@ def write_gltf(path: Path, splats: BakedSplats, *, note: dict[str, Any] | None =
         "KHR_gaussian_splatting:OPACITY": _sigmoid(splats.opacity_logits),
         "KHR_gaussian_splatting:SH_DEGREE_0_COEF_0": (splats.rgb - 0.5) / SH0,
     }
-    kinds = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
-    body, views, accessors = b"", [], []
-    for name, values in arrays.items():
-        values = np.ascontiguousarray(values, "<f4")
-        accessor = {
-            "bufferView": len(views),
-            "componentType": 5126,
-            "count": len(values),
-            "type": kinds[values.shape[1] if values.ndim == 2 else 1],
-        }
-        if name == "POSITION":
-            accessor |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
-        accessors.append(accessor)
-        views.append({"buffer": 0, "byteOffset": len(body), "byteLength": values.nbytes, "target": 34962})
-        body += values.tobytes()
     primitive = {
         "mode": 0,
-        "attributes": {name: index for index, name in enumerate(arrays)},
+        "attributes": {name: file.add_array(values, bounds=name == "POSITION") for name, values in arrays.items()},
         "extensions": {"KHR_gaussian_splatting": {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}},
     }
+    file.use("KHR_gaussian_splatting")
     root2 = float(np.sqrt(0.5))
-    document = {
-        "asset": {"version": "2.0", "generator": "seasonscapes", "extras": note or {}},
-        "extensionsUsed": ["KHR_gaussian_splatting"],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": "east-north-up", "mesh": 0, "rotation": [-root2, 0.0, 0.0, root2]}],
-        "meshes": [{"primitives": [primitive]}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": len(body)}],
-    }
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        file.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(body)))
-        file.write(struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(body), b"BIN\0") + body)
+    mesh = file.add("meshes", {"primitives": [primitive]})
+    node = file.add("nodes", {"name": "east-north-up", "mesh": mesh, "rotation": [-root2, 0.0, 0.0, root2]})
+    file.table |= {"scene": 0, "scenes": [{"nodes": [node]}]}
+    file.write_glb(path)
 
 
 def _sigmoid(values: np.ndarray) -> np.ndarray:
@@ -231,7 +236,8 @@ def write_training_views(folder: Path, views: Sequence[TrainingView], splats: Ba
 
     Every frame of ``transforms.json`` has ``timestamp_utc``, ``sun_enu`` (unit, towards the sun; absent by night),
     ``sun_lx``, ``sky_lx`` and ``exposure`` (1 over the luminance of the horizontal illuminance [lx]); readers ignore
-    unknown keys. COLMAP's ``points3D.txt`` contains the centres of the discs with their colours.
+    unknown keys. COLMAP's ``points3D.txt`` and ``points.ply`` contain the centres of the discs with their colours.
+    Pictures are named relative to the folder in the former, relative to its ``images/`` in COLMAP's model.
 
     Parameters
     ----------
@@ -266,7 +272,7 @@ def write_training_views(folder: Path, views: Sequence[TrainingView], splats: Ba
             record |= {"sun_enu": light.bodies[0][0].tolist(), "sun_lx": light.bodies[1][0].tolist()}
     with atomic_path(folder / "transforms.json") as temporary:
         temporary.write_text(json.dumps(table, indent=1) + "\n")
-    write_colmap(folder / "sparse" / "0", named)
+    write_colmap(folder / "sparse" / "0", named, image_folder=IMAGE_FOLDER)
     levels = np.rint(255.0 * np.clip(splats.rgb, 0.0, 1.0)).astype(int)
     lines = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]"]
     lines += [
@@ -275,4 +281,4 @@ def write_training_views(folder: Path, views: Sequence[TrainingView], splats: Ba
     ]
     with atomic_path(folder / "sparse" / "0" / "points3D.txt") as temporary:
         temporary.write_text("\n".join(lines) + "\n")
-    write_ply(folder / "points.ply", splats)
+    write_points(folder / "points.ply", splats, note=frame_record(frame))

@@ -7,9 +7,10 @@ possible.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
@@ -209,12 +210,23 @@ def save_model(model: GaussianModel, path: str | os.PathLike[str]) -> None:
     from safetensors.numpy import save_file
 
     tensors, header = pack_model(model)
+    facts = json.dumps(header)
     with atomic_path(path) as temporary:
         save_file(
             {name: np.ascontiguousarray(values) for name, values in tensors.items()},
             temporary,
-            metadata={"format": FORMAT, "facts": json.dumps(header)},
+            metadata={"format": FORMAT, "facts": facts, "sha256": content_digest(tensors, facts)},
         )
+
+
+def content_digest(tensors: Mapping[str, np.ndarray], facts: str) -> str:
+    """SHA-256 of named arrays and a text, whatever their order."""
+    digest = hashlib.sha256(facts.encode())
+    for name in sorted(tensors):
+        values = np.ascontiguousarray(tensors[name])
+        digest.update(f"\0{name}\0{values.dtype.str}\0{values.shape}\0".encode())
+        digest.update(values.tobytes())
+    return digest.hexdigest()
 
 
 def load_model(path: str | os.PathLike[str]) -> GaussianModel:
@@ -233,7 +245,7 @@ def load_model(path: str | os.PathLike[str]) -> GaussianModel:
     Raises
     ------
     InputError
-        If the file is missing, or is no Gaussian model.
+        If the file is missing, is no Gaussian model, or is not what was written.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -248,7 +260,13 @@ def load_model(path: str | os.PathLike[str]) -> GaussianModel:
         raise InputError(where, f"not a safetensors file: {error}") from None
     if metadata.get("format") != FORMAT:
         raise InputError(where, "not a Gaussian model", got=str(metadata.get("format")), expected=FORMAT)
-    return unpack_model(tensors, json.loads(metadata["facts"]))
+    cure = "copy it again, or make it with `seasonscapes distill`"
+    if metadata.get("sha256") != content_digest(tensors, metadata.get("facts", "")):
+        raise InputError(where, "damaged, or of an older version: its content is not what its checksum says", cure=cure)
+    try:
+        return unpack_model(tensors, json.loads(metadata["facts"]))
+    except (KeyError, TypeError, ValueError, IndexError, RecursionError) as error:
+        raise InputError(where, f"not a Gaussian model: {error!r}", cure=cure) from None
 
 
 def pack_model(model: GaussianModel) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -326,6 +344,10 @@ def unpack_model(tensors: dict[str, np.ndarray], header: dict[str, Any]) -> Gaus
         The model, up to quantisation.
     """
     grid, (low, step) = SurfelGrid(**header["plan"]), header["height"]
+    if not 0 < grid.columns * grid.rows <= 8 * len(tensors["taken"]):
+        raise ValueError(
+            f"a grid of {grid.columns} × {grid.rows} cells, {8 * len(tensors['taken'])} of which are stored"
+        )
     cell = np.flatnonzero(np.unpackbits(tensors["taken"])[: grid.columns * grid.rows]).astype(np.int32)
     row, column = np.divmod(cell, grid.columns)
     means = np.stack(

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from seasonscapes.errors import InputError
 from seasonscapes.gaussians.appearance import Appearance, LightTensors, light_tensors
 from seasonscapes.gaussians.disc_transport import LightState
 from seasonscapes.gaussians.losses import (
@@ -31,6 +32,7 @@ from seasonscapes.gaussians.losses import (
     surface_loss,
     training_picture,
 )
+from seasonscapes.gaussians.model import content_digest
 from seasonscapes.gaussians.rasterise import set_torch_threads
 from seasonscapes.images import atomic_path
 
@@ -81,6 +83,23 @@ class Schedule:
     def __post_init__(self) -> None:
         if min(self.surface_steps, self.picture_steps) < 0 or min(self.batch, self.checkpoint_every, self.threads) < 1:
             raise ValueError("Schedule: steps must not be negative, batch, checkpoint_every and threads at least 1")
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """File that an interrupted training continues from.
+
+    Parameters
+    ----------
+    path
+        ``.safetensors`` file.
+    key
+        Identifier of everything that the training data were made from: scene, sky, albedo and code. A checkpoint of
+        another key is refused.
+    """
+
+    path: Path
+    key: str = ""
 
 
 @dataclass(frozen=True)
@@ -153,7 +172,7 @@ def train(
     schedule: Schedule | None = None,
     *,
     seed: int = 0,
-    checkpoint: Path | None = None,
+    checkpoint: Checkpoint | None = None,
     progress: Progress | None = None,
 ) -> list[float]:
     """Train an appearance in place.
@@ -171,7 +190,7 @@ def train(
     seed
         Seed of the random draws.
     checkpoint
-        ``.safetensors`` file to save to; training continues from it if it exists.
+        File to save to; training continues from it if it exists.
     progress
         Called with the finished fraction after each step.
 
@@ -182,8 +201,8 @@ def train(
 
     Raises
     ------
-    ValueError
-        If the checkpoint belongs to another run: kind, seed, sizes or schedule differ.
+    InputError
+        If the checkpoint is damaged or belongs to another run: kind, seed, schedule or key differ.
     FloatingPointError
         If the loss is not finite.
     """
@@ -198,7 +217,11 @@ def train(
         "schedule": asdict(replace(schedule, threads=1)),
         "times": len(targets.states),
     }
-    start = load_checkpoint(checkpoint, appearance, optimiser, run) if checkpoint and Path(checkpoint).is_file() else 0
+    if checkpoint:
+        run["key"] = checkpoint.key
+    start = (
+        load_checkpoint(checkpoint.path, appearance, optimiser, run) if checkpoint and checkpoint.path.exists() else 0
+    )
     lights = light_tensors(targets.states, targets.seasons)
     colours = torch.as_tensor(targets.colours)
     pictures = [training_picture(frame) for frame in frames]
@@ -217,7 +240,7 @@ def train(
         optimiser.step()
         losses.append(float(loss.detach()))
         if checkpoint and ((step + 1) % schedule.checkpoint_every == 0 or step + 1 == total):
-            save_checkpoint(checkpoint, appearance, optimiser, run, step + 1)
+            save_checkpoint(checkpoint.path, appearance, optimiser, run, step + 1)
         if progress is not None:
             progress((step + 1) / total)
     return losses
@@ -316,15 +339,19 @@ def save_checkpoint(
     """
     from safetensors.torch import save_file
 
-    tensors = {f"value.{name}": parameter.detach() for name, parameter in appearance.named_parameters()}
+    tensors: dict[str, torch.Tensor] = {
+        f"value.{name}": parameter.detach() for name, parameter in appearance.named_parameters()
+    }
     names = {id(parameter): name for name, parameter in appearance.named_parameters()}
     for parameter, moments in optimiser.state.items():
         tensors |= {
             f"{key}.{names[id(parameter)]}": value.reshape(-1) if key == "step" else value
             for key, value in moments.items()
         }
+    facts = json.dumps({"run": run, "step": step}, sort_keys=True)
+    digest = content_digest({name: value.numpy() for name, value in tensors.items()}, facts)
     with atomic_path(path) as temporary:
-        save_file(tensors, temporary, metadata={"run": json.dumps(run, sort_keys=True), "step": str(step)})
+        save_file(tensors, temporary, metadata={"facts": facts, "sha256": digest})
 
 
 def load_checkpoint(path: Path, appearance: Appearance, optimiser: torch.optim.Adam, run: dict[str, Any]) -> int:
@@ -348,23 +375,33 @@ def load_checkpoint(path: Path, appearance: Appearance, optimiser: torch.optim.A
 
     Raises
     ------
-    ValueError
-        If the checkpoint belongs to another run, or a parameter has another shape.
+    InputError
+        If the file is damaged, or belongs to another run.
     """
-    from safetensors import safe_open
+    from safetensors import SafetensorError, safe_open
 
-    with safe_open(path, "pt") as file:
-        stored = file.metadata()
-        if json.loads(stored["run"]) != json.loads(json.dumps(run)):
-            raise ValueError(f"{path}: a checkpoint of another run ({stored['run']}); remove it or name another file")
-        for name, parameter in appearance.named_parameters():
-            value = file.get_tensor(f"value.{name}")
-            if value.shape != parameter.shape:
-                raise ValueError(f"{path}: {name} has shape {tuple(value.shape)}, expected {tuple(parameter.shape)}")
-            parameter.data.copy_(value)
-            optimiser.state[parameter] = {
-                "step": file.get_tensor(f"step.{name}").reshape(()),
-                "exp_avg": file.get_tensor(f"exp_avg.{name}"),
-                "exp_avg_sq": file.get_tensor(f"exp_avg_sq.{name}"),
-            }
-        return int(stored["step"])
+    cure = "remove it to start anew, or name another --output"
+    try:
+        with safe_open(path, "pt") as file:
+            stored = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+    except (SafetensorError, OSError, ValueError) as error:
+        raise InputError(path, f"not a checkpoint, or damaged: {error}", cure=cure) from None
+    facts = stored.get("facts", "")
+    if stored.get("sha256") != content_digest({name: value.numpy() for name, value in tensors.items()}, facts):
+        raise InputError(path, "a damaged checkpoint: its content is not what its checksum says", cure=cure)
+    known, wanted = json.loads(facts), json.loads(json.dumps(run))
+    if known["run"] != wanted:
+        differs = sorted(
+            name for name in wanted.keys() | known["run"].keys() if known["run"].get(name) != wanted.get(name)
+        )
+        told = ", ".join("scene, sky or albedo" if name == "key" else name for name in differs)
+        raise InputError(path, "a checkpoint of another run", got=f"another {told}", cure=cure)
+    for name, parameter in appearance.named_parameters():
+        parameter.data.copy_(tensors[f"value.{name}"])
+        optimiser.state[parameter] = {
+            "step": tensors[f"step.{name}"].reshape(()),
+            "exp_avg": tensors[f"exp_avg.{name}"],
+            "exp_avg_sq": tensors[f"exp_avg_sq.{name}"],
+        }
+    return int(known["step"])

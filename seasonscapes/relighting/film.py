@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import subprocess
+import tempfile
 from collections.abc import Iterable
+from contextlib import suppress
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 
+from seasonscapes.errors import InputError
 from seasonscapes.images import atomic_path, srgb_from_linear
 
 
@@ -18,7 +23,7 @@ def write_video(
     Parameters
     ----------
     path
-        Output file, written atomically.
+        Output file, written atomically: it appears when the encoder has finished and all of its images are in it.
     images
         Display-linear images ``(H, W, 3)`` in [0, 1], all of the same size. H.264 requires even sizes: an odd last row
         or column is dropped.
@@ -38,27 +43,21 @@ def write_video(
     ------
     ValueError
         If there is no image, or the sizes differ.
+    InputError
+        If the encoder fails, such as on a full disk; no file is left then.
     """
-    import imageio_ffmpeg
-
-    count, writer, size = 0, None, (0, 0)
-    with atomic_path(path) as temporary:
+    count, encoder, size = 0, None, (0, 0)
+    with atomic_path(path) as temporary, tempfile.TemporaryFile() as messages:
         try:
             for image in images:
                 height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
-                if writer is None:
+                if encoder is None:
                     size = (width, height)
-                    writer = imageio_ffmpeg.write_frames(
-                        str(temporary),
-                        size,
-                        fps=fps,  # pyright: ignore[reportArgumentType]  # FFmpeg accepts fractions
-                        quality=quality,
-                        macro_block_size=2,
-                        codec="libx264",
-                        pix_fmt_out="yuv420p",
-                        output_params=["-movflags", "+faststart", "-metadata", f"comment={comment}"],
+                    command = _command(temporary, size, fps, quality, comment)
+                    # In a session of its own: Ctrl-C reaches this program alone, which then ends the encoder.
+                    encoder = subprocess.Popen(
+                        command, stdin=subprocess.PIPE, stdout=messages, stderr=messages, start_new_session=True
                     )
-                    writer.send(None)
                 if (width, height) != size:
                     raise ValueError(
                         f"write_video: got an image of {width} × {height} pixels, expected {size[0]} × {size[1]}"
@@ -66,11 +65,54 @@ def write_video(
                 # Dithering against banding in smooth skies; enough of it remains after compression.
                 noise = np.random.default_rng(count).random((height, width, 1), np.float32)
                 encoded = srgb_from_linear(image[:height, :width]) * 255.0 + noise
-                writer.send(np.ascontiguousarray(np.clip(encoded, 0.0, 255.0).astype(np.uint8)))
+                assert encoder.stdin is not None
+                encoder.stdin.write(np.clip(encoded, 0.0, 255.0).astype(np.uint8).tobytes())
                 count += 1
+            if encoder is None:
+                raise ValueError("write_video: got no images, expected at least one")
+            # Closes its input, which ends the encoding, and waits for its end.
+            encoder.communicate()
+            code = encoder.returncode
+        except BrokenPipeError:
+            # The encoder ended before it had all images.
+            code = None if encoder is None else encoder.wait()
         finally:
-            if writer is not None:
-                writer.close()
-        if count == 0:
-            raise ValueError("write_video: got no images, expected at least one")
+            if encoder is not None:
+                encoder.kill()
+                encoder.wait()
+                assert encoder.stdin is not None
+                with suppress(OSError):
+                    encoder.stdin.close()
+        if code != 0 or _frame_count(temporary) != count:
+            messages.seek(0)
+            told = messages.read().decode(errors="replace").strip().splitlines()
+            raise InputError(
+                path,
+                f"the film could not be encoded: {told[-1] if told else f'the encoder ended with code {code}'}",
+                cure="see whether the disk is full, then start again",
+            )
     return count
+
+
+def _command(output: Path, size: tuple[int, int], fps: float, quality: int, comment: str) -> list[str]:
+    import imageio_ffmpeg
+
+    # Constant rate factor of x264: 0 is lossless, 51 the worst.
+    rate_factor = int((1.0 - quality / 10.0) * 51.0)
+    return [
+        *(imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error"),
+        *("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}"),
+        *("-r", str(Fraction(fps).limit_denominator()), "-i", "-"),
+        *("-an", "-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", str(rate_factor)),
+        *("-movflags", "+faststart", "-metadata", f"comment={comment}", str(output)),
+    ]
+
+
+def _frame_count(path: Path) -> int:
+    """Number of images in a film; 0 where it cannot be read."""
+    import imageio_ffmpeg
+
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", str(path), "-map", "0:v:0", "-c", "copy"]
+    done = subprocess.run([*command, "-f", "null", "-progress", "-", "-"], capture_output=True, text=True)
+    frames = [int(line[6:]) for line in done.stdout.splitlines() if line.startswith("frame=")]
+    return frames[-1] if done.returncode == 0 and frames else 0

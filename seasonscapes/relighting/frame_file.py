@@ -7,7 +7,9 @@ precision.
 
 from __future__ import annotations
 
+import hashlib
 import json
+import logging
 import os
 from datetime import datetime
 from pathlib import Path
@@ -16,6 +18,8 @@ from typing import Any
 import numpy as np
 
 from seasonscapes.images import SATURATION_LUMINANCE, read_exr, write_exr
+
+log = logging.getLogger(__name__)
 
 # Just below the largest finite half-precision number, 65504.
 _LARGEST = 60000.0
@@ -36,8 +40,13 @@ def save_frame(path: Path, radiance: np.ndarray, *, metered_ev100: float, proven
         Provenance: plain values, stored in the header of the file.
     """
     scale = SATURATION_LUMINANCE * 2.0**metered_ev100
-    header = {"seasonscapes:metered_ev100": float(metered_ev100), "seasonscapes:provenance": provenance}
-    write_exr(path, {"": np.minimum(radiance / scale, _LARGEST)}, header=header, half=True)
+    pixels = np.minimum(radiance / scale, _LARGEST).astype(np.float16)
+    header = {
+        "seasonscapes:metered_ev100": float(metered_ev100),
+        "seasonscapes:provenance": provenance,
+        "seasonscapes:sha256": _digest(pixels),
+    }
+    write_exr(path, {"": pixels}, header=header, half=True)
 
 
 def load_frame(path: Path) -> tuple[np.ndarray, float]:
@@ -58,6 +67,24 @@ def load_frame(path: Path) -> tuple[np.ndarray, float]:
     layers, header = read_exr(path)
     metered = float(header["seasonscapes:metered_ev100"])
     return layers[""].astype(np.float32) * np.float32(SATURATION_LUMINANCE * 2.0**metered), metered
+
+
+def is_whole_frame(path: Path) -> bool:
+    """Whether a file is a frame of `save_frame` whose pixels are those that were written."""
+    if not path.is_file():
+        return False
+    try:
+        layers, header = read_exr(path)
+        frame_header(path)
+        return header["seasonscapes:sha256"] == _digest(layers[""])
+    except (RuntimeError, OSError, ValueError, KeyError, TypeError):
+        # What OpenEXR and its readers raise for damaged files; the frame is rendered again.
+        log.info("%s: a damaged frame is rendered again", path.name)
+        return False
+
+
+def _digest(pixels: np.ndarray) -> str:
+    return hashlib.sha256(np.ascontiguousarray(pixels, np.float16).tobytes()).hexdigest()
 
 
 def frame_header(path: Path) -> tuple[float, dict[str, Any]]:

@@ -193,6 +193,8 @@ def integrate_irradiance(
 
 def _efficacies(light: Illumination) -> tuple[float, float]:
     """Luminous efficacy of sunlight and of skylight [lm/W]."""
+    if light.efficacy_lm_w is not None:
+        return light.efficacy_lm_w
     sky = float(luminance(diffuse_horizontal_illuminance(light.sky_radiance)))
     if light.sun is None:
         return efficacies_lm_w(0.0, sky, 1.0)

@@ -1,8 +1,9 @@
-"""Luminous efficacy of sunlight and skylight, for converting illuminance to irradiance.
+"""Luminous efficacy of sunlight and skylight under clouds, for converting illuminance to irradiance.
 
 Perez, Ineichen, Seals, Michalsky & Stewart 1990, "Modeling daylight availability and irradiance components from direct
 and global irradiance", doi:10.1016/0038-092X(90)90055-H, table 4 and eqs 6–8, solved for the irradiance that gives an
-illuminance. Accurate to about 5 % by day. For the sun below 1° elevation, and in twilight, the values at 1° are used.
+illuminance. Accurate to about 5 % by day; for cloudless atmospheres `sky.broadband` is closer. For the sun below 1°
+elevation, and in twilight, the values at 1° are used.
 """
 
 from __future__ import annotations

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import glob
+import logging
 import os
 import re
 import subprocess
@@ -19,6 +20,8 @@ from typing import Any
 import numpy as np
 
 from seasonscapes.declaration import InputError
+
+log = logging.getLogger(__name__)
 
 # LLVM 14 and 15 abort; LLVMGetVersion exists from LLVM 16 on, so that older libraries do not report a version.
 OLDEST_LLVM = 16
@@ -61,12 +64,15 @@ class Backend:
         Why this device was chosen, for display.
     library
         The libLLVM that was found; ``None`` for CUDA, on explicit request of ``scalar``, or if there is none.
+    library_problem
+        Why LLVM could not be used where it was wanted; empty otherwise.
     """
 
     device: str
     variant: str
     reason: str
     library: Library | None = None
+    library_problem: str = ""
 
 
 def library_version(path: str) -> tuple[int, int, int]:
@@ -193,7 +199,7 @@ def choose_backend(device: str = "auto") -> Backend:
     problem = "no libLLVM found" if library is None else f"libLLVM at {library.path} is older than {OLDEST_LLVM}"
     if device == "llvm":
         raise InputError("--device", problem, got="llvm", cure=LLVM_CURE)
-    return Backend("scalar", VARIANTS["scalar"], f"{problem}; slower, and without gradients", library)
+    return Backend("scalar", VARIANTS["scalar"], f"{problem}; slower, and without gradients", library, problem)
 
 
 def _check_name(device: str) -> None:
@@ -237,6 +243,8 @@ def use_backend(device: str | None = None, *, gradients: bool = False) -> Backen
         mi.set_variant(chosen.variant)
         mi.set_log_level(mi.LogLevel.Error)
         _active = chosen
+        if chosen.device == "scalar" and chosen.library_problem:
+            log.warning("renderer: the scalar variant, since %s: much slower; %s", chosen.library_problem, LLVM_CURE)
     elif device not in (None, "auto", _active.device):
         raise InputError("--device", f"the device of this process is already {_active.device}", got=device)
     if gradients and _active.device == "scalar":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
@@ -16,13 +17,14 @@ import numpy as np
 
 from seasonscapes.cameras.panorama import Panorama
 from seasonscapes.cameras.pinhole import Camera
+from seasonscapes.errors import DamagedFile
 from seasonscapes.frames import LocalFrame
 from seasonscapes.rendering.hemisphere_rays import SurfacePoints
 from seasonscapes.rendering.light_clusters import LightClusters, ReceiverCoefficients
 from seasonscapes.rendering.transport import PointCoefficients, SamplingOptions, ViewCoefficients
 
 # Format of the files: increment whenever a stored field is added, removed or renamed.
-REVISION = 3
+REVISION = 4
 _TYPES: dict[str, type] = {
     stored.__name__: stored
     for stored in (
@@ -88,7 +90,8 @@ def save_coefficients(path: str | os.PathLike[str], coefficients: Coefficients, 
     """
     with atomic_folder(path) as folder:
         record = _write(folder, "", coefficients)
-        text = json.dumps({"revision": REVISION, "key": key, "coefficients": record}, indent=1)
+        files = {path.name: _digest(path) for path in sorted(folder.iterdir())}
+        text = json.dumps({"revision": REVISION, "key": key, "files": files, "coefficients": record}, indent=1)
         (folder / "coefficients.json").write_text(text)
 
 
@@ -111,16 +114,28 @@ def load_coefficients(path: str | os.PathLike[str], *, key: str | None = None) -
     ------
     FileNotFoundError
         If the folder holds no coefficients.
-    ValueError
-        If the folder has another revision, or its key differs from ``key``.
+    DamagedFile
+        If the folder has another revision, its key differs from ``key``, or a file is not what was written.
     """
     folder = Path(path)
-    record = json.loads((folder / "coefficients.json").read_text())
-    if record["revision"] != REVISION:
-        raise ValueError(f"{folder}: coefficients of revision {record['revision']}, expected {REVISION}")
-    if key is not None and record["key"] != key:
-        raise ValueError(f"{folder}: coefficients of {record['key'] or 'unknown inputs'}, expected {key}")
+    try:
+        record = json.loads((folder / "coefficients.json").read_text(encoding="utf-8"))
+        revision, own_key, files = record["revision"], record["key"], dict(record["files"])
+    except (ValueError, KeyError, TypeError, RecursionError):
+        raise DamagedFile(f"{folder}: its record is damaged, or of an older version") from None
+    if revision != REVISION:
+        raise DamagedFile(f"{folder}: coefficients of revision {revision}, expected {REVISION}")
+    if key is not None and own_key != key:
+        raise DamagedFile(f"{folder}: coefficients of {own_key or 'unknown inputs'}, expected {key}")
+    for name, digest in files.items():
+        if not (folder / name).is_file() or _digest(folder / name) != digest:
+            raise DamagedFile(f"{folder}: {name} is not what was written")
     return _read(folder, "", record["coefficients"])
+
+
+def _digest(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _write(folder: Path, prefix: str, value: Any) -> Any:

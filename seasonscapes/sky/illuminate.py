@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from seasonscapes.sky.atmosphere import Atmosphere
+from seasonscapes.sky.broadband import clear_efficacies_lm_w
 from seasonscapes.sky.clear_sky import AtmosphereTables, LuminarySource, atmosphere_tables, illumination_from_atmosphere
 from seasonscapes.sky.clouds import with_clouds
 from seasonscapes.sky.eclipses import eclipse_record, eclipsed_sun, solar_eclipse
@@ -205,12 +206,12 @@ def _clear_illumination(
     tables_of: TablesOf,
 ) -> Illumination:
     """Illumination by the clear atmosphere and the night sky."""
-    source = None
+    atmosphere, source = atmosphere_from_model(model), None
     if moon is not None:
         ratio = moon_to_sun_ratio(moon, WAVELENGTHS_NM)
         source = LuminarySource(moon.direction, ratio, float(moon.angular_radius_deg))
     clear = illumination_from_atmosphere(
-        tables_of(atmosphere_from_model(model)),
+        tables_of(atmosphere),
         sun.direction,
         height_m,
         distance_au=float(sun.distance_au),
@@ -226,7 +227,8 @@ def _clear_illumination(
         ground_albedo=model.ground.albedo,
         optical_depth=haze + float(rayleigh_optical_depth(550.0)),
     )
-    return replace(clear, sky_radiance=(clear.sky_radiance + night).astype(np.float32))
+    efficacy = clear_efficacies_lm_w(atmosphere, float(sun.elevation_deg), height_m, water_cm=model.water_cm)
+    return replace(clear, sky_radiance=(clear.sky_radiance + night).astype(np.float32), efficacy_lm_w=efficacy)
 
 
 def _overcast_illumination(
@@ -270,4 +272,5 @@ def _add_clouds(model: SkyModel, clear: Illumination, sun: SolarPosition, moon: 
     weights = illuminances / illuminances.sum()
     transmission = float(sum(weight * source[1] for weight, source in zip(weights, sources, strict=True)))
     colour = np.asarray(sum(weight * source[2] for weight, source in zip(weights, sources, strict=True)))
-    return with_clouds(clear, model.cloudiness, dominant, transmission=transmission, colour=colour)
+    clouded = with_clouds(clear, model.cloudiness, dominant, transmission=transmission, colour=colour)
+    return replace(clouded, efficacy_lm_w=None)

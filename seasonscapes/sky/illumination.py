@@ -86,6 +86,8 @@ class Illumination:
     visible_sky
         Map of the sky behind the terrain as observed by the camera, where it differs from ``sky_radiance``: the sky
         observed from a summit differs from the sky that illuminates the valley.
+    efficacy_lm_w
+        Luminous efficacies of sunlight and of skylight [lm/W], where the sky model knows the infrared.
     model
         Name of the sky model and its parameters, for provenance.
     frame
@@ -107,6 +109,7 @@ class Illumination:
     moon: Luminary | None = None
     aerial_perspective: AerialPerspective | None = None
     visible_sky: np.ndarray | None = None
+    efficacy_lm_w: tuple[float, float] | None = None
     model: dict[str, Any] = field(default_factory=dict)
     frame: LocalFrame | None = None
     time: datetime | None = None

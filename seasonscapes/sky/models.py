@@ -128,11 +128,15 @@ class AtmosphereModel(SkyModel):
         ``atmosphere``.
     aerosol, ozone
         See `Aerosol` and `Ozone`.
+    water_cm
+        Precipitable water above the ground of the model [cm], which absorbs infrared: it determines watts, not light.
+        Default: the U.S. Standard Atmosphere 1976.
     """
 
     kind: Literal["atmosphere"] = "atmosphere"
     aerosol: Aerosol
     ozone: Ozone
+    water_cm: float = Field(default=1.42, ge=0.0, le=10.0)
 
 
 class OvercastModel(SkyModel):

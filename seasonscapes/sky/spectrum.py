@@ -21,12 +21,12 @@ RGB_FROM_XYZ = np.linalg.inv(
     [[0.4123908, 0.3575843, 0.1804808], [0.2126390, 0.7151687, 0.0721923], [0.0193308, 0.1191948, 0.9505322]]
 )
 
-_BIN_CENTRES_NM = np.arange(365.0, 830.0, 10.0)
+BIN_CENTRES_NM = np.arange(365.0, 830.0, 10.0)
 
 # 683 lm/W ∫ E(λ) (x̄ ȳ z̄)(λ) dλ over bins of 10 nm [lx]: the extraterrestrial spectrum of ASTM G173-03 at 1 au
 # weighted by the CIE 1931 2° observer. The sum is the extraterrestrial XYZ of the sun: Y = 133.1 klx.
 # fmt: off
-_SOLAR_XYZ_LX = np.array([
+SOLAR_XYZ_LX = np.array([
     (1.86958, 0.0560168, 8.75148),
     (6.13336, 0.179524, 28.8539),
     (16.5193, 0.470075, 77.9707),
@@ -120,7 +120,7 @@ def ozone_optical_depth_per_du(wavelength_nm: ArrayLike = WAVELENGTHS_NM) -> np.
     ndarray
         Optical depth ``(...)`` [1/DU].
     """
-    return np.interp(np.asarray(wavelength_nm, float), _BIN_CENTRES_NM, _OZONE_CROSS_SECTION) * _MOLECULES_PER_M2_AND_DU
+    return np.interp(np.asarray(wavelength_nm, float), BIN_CENTRES_NM, _OZONE_CROSS_SECTION) * _MOLECULES_PER_M2_AND_DU
 
 
 def angstrom_ratio(exponent: float, reference_nm: float, wavelength_nm: ArrayLike = WAVELENGTHS_NM) -> np.ndarray:
@@ -155,8 +155,8 @@ def rgb_from_transfer() -> np.ndarray:
     ndarray
         ``(3, 9)``. The product with a transfer is in [lx], with a transfer per steradian in [cd/m²].
     """
-    transfer, at_bands = _daylight_transfers(_BIN_CENTRES_NM), _daylight_transfers(WAVELENGTHS_NM)
-    xyz = transfer @ _SOLAR_XYZ_LX
+    transfer, at_bands = _daylight_transfers(BIN_CENTRES_NM), _daylight_transfers(WAVELENGTHS_NM)
+    xyz = transfer @ SOLAR_XYZ_LX
     total = xyz.sum(axis=1, keepdims=True)
     return RGB_FROM_XYZ @ np.linalg.lstsq(at_bands / total, xyz / total, rcond=None)[0].T
 

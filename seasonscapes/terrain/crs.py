@@ -52,6 +52,13 @@ def horizontal_crs(crs: str) -> CRS:
     return parsed
 
 
+def crs_name(crs: str) -> str:
+    """The short name of a CRS: ``EPSG:n`` where it is registered, else the name that it states."""
+    parsed = horizontal_crs(crs)
+    authority = parsed.to_authority(min_confidence=70)
+    return parsed.name if authority is None else ":".join(authority)
+
+
 @lru_cache(maxsize=64)
 def _transformer(crs: str) -> Transformer:
     from pyproj import Transformer
@@ -114,6 +121,51 @@ def map_from_geodetic(crs: str, latitude_deg: ArrayLike, longitude_deg: ArrayLik
     return np.asarray(x), np.asarray(y)
 
 
+def turn(crs: str) -> float | None:
+    """The full circle in a geographic CRS's own unit (360 for degrees); ``None`` for a projected CRS."""
+    horizontal = horizontal_crs(crs)
+    if not horizontal.is_geographic:
+        return None
+    return 2.0 * np.pi / horizontal.axis_info[0].unit_conversion_factor
+
+
+def wrapped(value: ArrayLike, centre: float, period: float) -> np.ndarray:
+    """Values shifted by whole periods to within half a period of a centre: longitudes are equal modulo 360°."""
+    value = np.asarray(value, float)
+    return value - period * np.round((value - centre) / period)
+
+
+def map_position(raster: Raster, latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Map coordinates of WGS 84 positions as a raster writes them: its longitudes may be 0…360° or run past 180°.
+
+    Parameters
+    ----------
+    raster
+        Supplies transform, size and CRS.
+    latitude_deg, longitude_deg
+        Positions ``(...)`` [deg].
+
+    Returns
+    -------
+    x, y
+        ``(...)`` float64 in the CRS's units; infinite outside the domain of the projection.
+    """
+    height, width = raster.values.shape[:2]
+    return grid_position(raster.crs, raster.transform, (width, height), latitude_deg, longitude_deg)
+
+
+def grid_position(
+    crs: str, transform: Affine, size: tuple[int, int], latitude_deg: ArrayLike, longitude_deg: ArrayLike
+) -> tuple[np.ndarray, np.ndarray]:
+    """`map_position` of a grid of ``size`` columns and rows."""
+    x, y = map_from_geodetic(crs, latitude_deg, longitude_deg)
+    full_turn = turn(crs)
+    if full_turn is not None:
+        centre = float(apply_affine(transform, size[0] / 2.0, size[1] / 2.0)[0])
+        x = np.where(np.isfinite(x), wrapped(np.nan_to_num(x), centre, full_turn), x)
+    return x, y
+
+
 def apply_affine(transform: Affine, x: ArrayLike, y: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Apply an affine map to coordinates.
 
@@ -148,6 +200,4 @@ def raster_pixels(raster: Raster, latitude_deg: ArrayLike, longitude_deg: ArrayL
     numpy.ndarray
         Column and row ``(..., 2)``; the first pixel's centre is (0.5, 0.5).
     """
-    return np.stack(
-        apply_affine(~raster.transform, *map_from_geodetic(raster.crs, latitude_deg, longitude_deg)), axis=-1
-    )
+    return np.stack(apply_affine(~raster.transform, *map_position(raster, latitude_deg, longitude_deg)), axis=-1)

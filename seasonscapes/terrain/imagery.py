@@ -11,10 +11,11 @@ import numpy as np
 
 from seasonscapes.declaration import InputError
 from seasonscapes.frames import LocalFrame, geodetic_from_enu
-from seasonscapes.images import linear_from_srgb
 from seasonscapes.terrain.atlas import Atlas
 from seasonscapes.terrain.crs import raster_pixels
+from seasonscapes.terrain.image_bands import Decoder, image_facts
 from seasonscapes.terrain.raster import read_raster
+from seasonscapes.terrain.raster_files import OWN_FOLDER, Confinement
 from seasonscapes.terrain.surface import Raster, Terrain, Texture, atlas_identity
 from seasonscapes.terrain.texels import texel_coordinates, texel_positions
 
@@ -36,20 +37,22 @@ def read_imagery(
     bands: tuple[int, ...] | None = None,
     finest_m: float | None = None,
     encoding: str = "srgb",
-    full_scale: float = 255.0,
+    full_scale: float | None = None,
+    confinement: Confinement = OWN_FOLDER,
 ) -> Raster:
     """Read a georeferenced colour image as scene-linear Rec.709.
 
     Parameters
     ----------
-    path, bounds_deg, finest_m
+    path, bounds_deg, finest_m, confinement
         As in `read_raster`; for baking, half the texel size is sufficient for ``finest_m``.
     bands
-        Red, green and blue band numbers from 1; ``None`` for the file's three colour bands, or its only band as grey.
+        Red, green and blue band numbers from 1; ``None`` for the bands that the file marks as such, or its three colour
+        bands, or its only band as grey (by its colour table where it has one).
     encoding
         ``srgb`` for display-referred images, ``linear`` for reflectance.
     full_scale
-        The file's value that corresponds to 1.
+        The value that corresponds to 1, after the file's own scale and offset; see `image_bands.image_facts`.
 
     Returns
     -------
@@ -59,41 +62,22 @@ def read_imagery(
     Raises
     ------
     InputError
-        As `read_raster`; neither one nor three colour bands; sRGB values that exceed ``full_scale``.
+        As `read_raster`; neither one nor three colour bands; numbers that cannot be what was stated: brighter than
+        ``full_scale``, negative, or black everywhere.
     ValueError
         Unknown ``encoding``.
     """
     if encoding not in ENCODINGS:
         raise ValueError(f"encoding: got {encoding!r}, expected one of {', '.join(ENCODINGS)}")
-
-    def decode(values: np.ndarray) -> np.ndarray:
-        if encoding == "linear":
-            return values / full_scale
-        brightest = np.max(values, initial=-np.inf, where=np.isfinite(values))
-        if brightest > full_scale:
-            raise InputError(
-                os.fspath(path),
-                "brighter than full scale",
-                got=f"{brightest:g}",
-                expected=f"at most {full_scale:g}",
-                cure="state the image's full scale",
-            )
-        with np.errstate(invalid="ignore"):
-            return linear_from_srgb(values / full_scale)
-
-    raster = read_raster(path, bounds_deg=bounds_deg, bands=bands, finest_m=finest_m, decode=decode)
-    count = raster.values.shape[2]
-    if count not in (1, 3):
-        raise InputError(
-            os.fspath(path),
-            "not a colour image",
-            got=count,
-            expected="one (grey) or three bands, and alpha",
-            cure="name its red, green and blue bands",
-        )
+    facts = image_facts(path, bands=bands, full_scale=full_scale, confinement=confinement)
+    decode = Decoder(path, encoding, facts.full_scale)
+    raster = read_raster(
+        path, bounds_deg=bounds_deg, bands=facts.bands, finest_m=finest_m, decode=decode, confinement=confinement
+    )
+    decode.check()
     # A pixel with one missing channel counts as missing.
     values = np.where(np.isfinite(raster.values).all(axis=2, keepdims=True), raster.values, np.float32(np.nan))
-    return replace(raster, values=np.repeat(values, 3 // count, axis=2))
+    return replace(raster, values=np.repeat(values, 3 // raster.values.shape[2], axis=2))
 
 
 def bake_imagery(terrain: Terrain, atlas: Atlas, image: Raster, *, gutter_px: int = 4) -> Texture:

@@ -5,11 +5,10 @@ Only horizontal positions are transformed. Heights stay in the raster's own vert
 
 from __future__ import annotations
 
+import logging
 import os
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -17,18 +16,22 @@ from affine import Affine
 from numpy.typing import ArrayLike
 
 from seasonscapes.declaration import InputError
-from seasonscapes.frames import LocalFrame, enu_from_geodetic
-from seasonscapes.terrain.crs import apply_affine, geodetic_from_map, horizontal_crs, map_from_geodetic
+from seasonscapes.frames import LocalFrame, normal_longitude
+from seasonscapes.terrain.crs import apply_affine, geodetic_from_map, grid_position, wrapped
+from seasonscapes.terrain.heights import UNITS_M, check_height_band, check_heights, declared_unit
 from seasonscapes.terrain.hole_filling import harmonic_fill, nan_mean
+from seasonscapes.terrain.memory import check_memory
+from seasonscapes.terrain.placement import cell_sides_m, centre_deg, check_cells, check_place, checked_crs, likely_cause
+from seasonscapes.terrain.raster_bands import BandReader, band_reader
+from seasonscapes.terrain.raster_files import OWN_FOLDER, Confinement, open_raster
 from seasonscapes.terrain.surface import Raster
 
 if TYPE_CHECKING:
     from rasterio.io import DatasetReader
     from rasterio.windows import Window
 
-# From the shore of the Dead Sea (-430 m) to above Mount Everest (8,849 m). Heights in feet or centimetres and
-# undeclared nodata values usually exceed this range somewhere.
-PLAUSIBLE_ELEVATION_M = (-500.0, 9000.0)
+log = logging.getLogger(__name__)
+
 DEFAULT_MAX_HOLE_SHARE = 0.25
 
 
@@ -57,20 +60,47 @@ class FillReport:
 # ---------------------------------------------------------------------------------------------- reading
 
 
+def raster_grid(path: str | os.PathLike[str], confinement: Confinement = OWN_FOLDER) -> Raster:
+    """The grid of a raster file without its values.
+
+    Returns
+    -------
+    Raster
+        ``values`` of shape ``(H, W, 0)``.
+    """
+    with open_raster(path, confinement) as source:
+        crs = checked_crs(source, os.fspath(path))
+        return _grid(source, crs, _window(source, crs, None, os.fspath(path)))
+
+
+def _grid(source: DatasetReader, crs: str, window: Window) -> Raster:
+    shape = (int(window.height), int(window.width), 0)
+    return Raster(np.empty(shape, np.float32), _window_transform(source.transform, window, 1), crs)
+
+
 def read_elevation(
     path: str | os.PathLike[str],
     *,
     bounds_deg: tuple[float, float, float, float] | None = None,
     band: int | None = None,
+    unit: str | None = None,
+    nodata: float | None = None,
+    confinement: Confinement = OWN_FOLDER,
 ) -> Raster:
-    """Read an elevation raster of one band and check that its values are plausible heights in metres.
+    """Read an elevation raster of one band as heights in metres, and check that land has such heights.
+
+    A unit that the file declares, by its band or its vertical CRS, is converted to metres, and this is told.
 
     Parameters
     ----------
-    path, bounds_deg
+    path, bounds_deg, confinement
         As in `read_raster`.
     band
         Number of the band that holds the heights, from 1; required if the file has several bands.
+    unit
+        Unit of the heights, a key of `heights.UNITS_M`; ``None`` for the one that the file declares, else metres.
+    nodata
+        Value that means no data, in the file's own unit, besides what the file declares.
 
     Returns
     -------
@@ -80,28 +110,33 @@ def read_elevation(
     Raises
     ------
     InputError
-        As `read_raster`; several bands and ``band`` is ``None``; heights outside −500 … 9000 m.
+        As `read_raster`; several bands and ``band`` is ``None``; more samples than fit into memory; an unknown unit; cells
+        or heights that no landscape has.
     """
-    raster = read_raster(path, bounds_deg=bounds_deg, bands=None if band is None else (band,))
-    count = raster.values.shape[2]
-    if count != 1:
-        raise InputError(
-            os.fspath(path),
-            "more than one band",
-            got=count,
-            expected="one band of heights",
-            cure="name the band that holds the heights",
-        )
-    if np.isfinite(raster.values).any():
-        low, high = float(np.nanmin(raster.values)), float(np.nanmax(raster.values))
-        if low < PLAUSIBLE_ELEVATION_M[0] or high > PLAUSIBLE_ELEVATION_M[1]:
+    where = os.fspath(path)
+    with open_raster(path, confinement) as source:
+        crs = checked_crs(source, where)
+        grid = _grid(source, crs, _window(source, crs, bounds_deg, where))
+        reader = band_reader(source, None if band is None else (band,), where)
+        if len(reader.bands) != 1:
             raise InputError(
-                os.fspath(path),
-                "heights outside the range of land elevations",
-                got=f"{low:g} … {high:g}",
-                expected=f"{PLAUSIBLE_ELEVATION_M[0]:g} … {PLAUSIBLE_ELEVATION_M[1]:g} m",
-                cure="check unit (metres), band, and that the file declares its nodata value",
+                where,
+                "more than one band",
+                got=len(reader.bands),
+                expected="one band of heights",
+                cure="name the band that holds the heights",
             )
+        check_height_band(source, reader.bands[0], where)
+        declared = unit or declared_unit(source, reader.bands[0], where)
+    check_cells(grid, where)
+    check_memory(grid.values.shape, where)
+    raster = read_raster(path, bounds_deg=bounds_deg, bands=reader.bands, confinement=confinement)
+    if nodata is not None:
+        raster = replace(raster, values=np.where(raster.values == nodata, np.float32(np.nan), raster.values))
+    if declared is not None and declared != "metre":
+        log.warning("%s: heights in the unit %s, converted to metres", where, declared)
+        raster = replace(raster, values=(raster.values * UNITS_M[declared]).astype(np.float32))
+    check_heights(raster, where, unit=declared, nodata=nodata)
     return raster
 
 
@@ -112,13 +147,14 @@ def read_raster(
     bands: tuple[int, ...] | None = None,
     finest_m: float | None = None,
     decode: Callable[[np.ndarray], np.ndarray] | None = None,
+    confinement: Confinement = OWN_FOLDER,
 ) -> Raster:
-    """Read a raster in any GDAL format (GeoTIFF, SRTM ``.hgt``, VRT mosaic …), or a window of it.
+    """Read a raster (GeoTIFF, SRTM ``.hgt``, VRT mosaic …), or a window of it; see `terrain.raster_files`.
 
     Parameters
     ----------
     path
-        File, or a GDAL ``/vsi…`` path.
+        File; where ``confinement`` trusts it, also a GDAL ``/vsi…`` path.
     bounds_deg
         West, south, east, north in WGS 84 [deg]. The smallest window of whole pixels that contains them, plus a border
         of one pixel for interpolation, is read in the raster's own grid (without resampling). ``None`` for the whole
@@ -130,6 +166,8 @@ def read_raster(
         full-resolution image is never held in memory.
     decode
         Function applied to values before averaging, such as sRGB decoding.
+    confinement
+        Where the raster's files may lie; by default in its own folder.
 
     Returns
     -------
@@ -145,88 +183,31 @@ def read_raster(
     ValueError
         ``finest_m`` is not positive, or ``bounds_deg`` is not an ordered box.
     """
-    import rasterio
-    from rasterio.errors import NotGeoreferencedWarning, RasterioError
-
-    if not os.fspath(path).startswith("/vsi") and not Path(path).is_file():
-        raise InputError(os.fspath(path), "no such file")
     if finest_m is not None and not finest_m > 0.0:
         raise ValueError(f"finest_m: got {finest_m}, expected a positive size")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(path) as source:
-                crs = _checked_crs(source, os.fspath(path))
-                bands = _checked_bands(source, bands, os.fspath(path))
-                window = _window(source, crs, bounds_deg, os.fspath(path))
-                shrink = 1 if finest_m is None else _shrink(source, crs, window, finest_m)
-                values = _read_blocks(source, bands, window, shrink, decode)
-                transform = _window_transform(source.transform, window, shrink)
-    except RasterioError as error:
-        raise InputError(os.fspath(path), f"not readable as a raster: {error}") from None
+    where = os.fspath(path)
+    with open_raster(path, confinement) as source:
+        crs = checked_crs(source, where)
+        reader = band_reader(source, bands, where)
+        window = _window(source, crs, bounds_deg, where)
+        shrink = 1 if finest_m is None else _shrink(_grid(source, crs, window), finest_m)
+        values = _read_blocks(reader, window, shrink, decode)
+        transform = _window_transform(source.transform, window, shrink)
     return Raster(values, transform, crs)
-
-
-def _checked_crs(source: DatasetReader, path: str) -> str:
-    if source.crs is None:
-        raise InputError(path, "the raster has no CRS", cure="assign one with: gdal_edit.py -a_srs EPSG:… FILE")
-    if source.transform == Affine.identity():
-        raise InputError(
-            path, "the raster has a CRS but no geotransform", cure="assign one with: gdal_edit.py -a_ullr … FILE"
-        )
-    text = source.crs.to_string()
-    width, height = source.width, source.height
-    corners = np.stack(apply_affine(source.transform, [0, width, 0, width], [0, 0, height, height]), axis=-1)
-    extent = f"x {corners[:, 0].min():g} … {corners[:, 0].max():g}, y {corners[:, 1].min():g} … {corners[:, 1].max():g}"
-    pixel = max(abs(source.transform.a), abs(source.transform.b), abs(source.transform.d), abs(source.transform.e))
-    crs = horizontal_crs(text)
-    if crs.is_geographic:
-        # Longitudes of 0…360° are in use; .hgt grids extend half a pixel beyond the pole.
-        low, high = corners.min(0), corners.max(0)
-        if low[1] < -90.0 - pixel or high[1] > 90.0 + pixel or low[0] < -180.0 - pixel or high[0] > 360.0 + pixel:
-            raise InputError(
-                path,
-                f"coordinates beyond ±180°/±90° in the geographic CRS {text}",
-                got=extent,
-                expected="degrees",
-                cure="the file's CRS is probably a projected one",
-            )
-    elif np.abs(corners).max() <= 360.0 and pixel < 1.0:
-        raise InputError(
-            path,
-            f"coordinates in degrees in the projected CRS {text}",
-            got=extent,
-            cure="the file's CRS is probably EPSG:4326",
-        )
-    return text
-
-
-def _checked_bands(source: DatasetReader, bands: tuple[int, ...] | None, path: str) -> tuple[int, ...]:
-    if bands is None:
-        return tuple(band for band in source.indexes if band != _alpha_band(source))
-    for band in bands:
-        if band not in source.indexes:
-            raise InputError(path, "no such band", got=band, expected=f"1 … {source.count}")
-    return tuple(bands)
-
-
-def _alpha_band(source: DatasetReader) -> int | None:
-    """Number of the alpha band, by its colour interpretation or description."""
-    from rasterio.enums import ColorInterp
-
-    for band, kind, text in zip(source.indexes, source.colorinterp, source.descriptions, strict=True):
-        if kind == ColorInterp.alpha or (text or "").lower().startswith("alpha"):
-            return band
-    return None
 
 
 def _window(source: DatasetReader, crs: str, bounds_deg: tuple[float, float, float, float] | None, path: str) -> Window:
     from rasterio.windows import Window
 
+    check_place(crs, source.transform, source.width, source.height, path)
+    if min(source.width, source.height) < 2:
+        raise InputError(path, "too few samples", got=f"{source.width} × {source.height}", expected="at least 2 × 2")
     if bounds_deg is None:
         return Window(0, 0, source.width, source.height)  # pyright: ignore[reportCallIssue]
     longitude, latitude = _boundary(*_checked_bounds(bounds_deg))
-    x, y = map_from_geodetic(crs, latitude, longitude)
+    x, y = grid_position(crs, source.transform, (source.width, source.height), latitude, longitude)
+    if not (np.isfinite(x).all() and np.isfinite(y).all()):
+        raise _no_overlap(source, crs, bounds_deg, path)
     column, row = apply_affine(~source.transform, x, y)
     # Round outwards to whole pixels and add one pixel, so that bilinear interpolation covers the bounds.
     left, right = int(np.floor(column.min())) - 1, int(np.ceil(column.max())) + 1
@@ -234,14 +215,22 @@ def _window(source: DatasetReader, crs: str, bounds_deg: tuple[float, float, flo
     left, top = max(left, 0), max(top, 0)
     right, bottom = min(right, source.width), min(bottom, source.height)
     if right - left < 2 or bottom - top < 2:
-        extent = _bounds_deg(crs, source.transform, source.width, source.height)
-        raise InputError(
-            path,
-            "the raster does not overlap the requested area",
-            got=_bounds_text(extent),
-            expected=_bounds_text(bounds_deg),
-        )
+        raise _no_overlap(source, crs, bounds_deg, path)
     return Window(left, top, right - left, bottom - top)  # pyright: ignore[reportCallIssue]
+
+
+def _no_overlap(
+    source: DatasetReader, crs: str, bounds_deg: tuple[float, float, float, float], path: str
+) -> InputError:
+    west, south, east, north = bounds_deg
+    grid = Raster(np.empty((source.height, source.width, 0), np.float32), source.transform, crs)
+    return InputError(
+        path,
+        "the raster does not overlap the requested area",
+        got=_bounds_text(_bounds_deg(crs, source.transform, source.width, source.height)),
+        expected=_bounds_text(bounds_deg),
+        cure=likely_cause(grid, 0.5 * (south + north), 0.5 * (west + east)),
+    )
 
 
 def _checked_bounds(bounds_deg: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
@@ -251,15 +240,11 @@ def _checked_bounds(bounds_deg: tuple[float, float, float, float]) -> tuple[floa
     return west, south, east, north
 
 
-def _shrink(source: DatasetReader, crs: str, window: Window, finest_m: float) -> int:
-    """Side [px] of the averaging blocks: pixels per ``finest_m`` at the window's centre, leaving at least 2 × 2 blocks."""
-    column, row = window.col_off + window.width / 2.0, window.row_off + window.height / 2.0
-    x, y = apply_affine(source.transform, column + np.array([0.0, 1.0, 0.0]), row + np.array([0.0, 0.0, 1.0]))
-    latitude, longitude = geodetic_from_map(crs, x, y)
-    position = enu_from_geodetic(LocalFrame(float(latitude[0]), float(longitude[0])), latitude, longitude, 0.0)
-    pixel_m = np.linalg.norm(position[1:], axis=1).max()
+def _shrink(grid: Raster, finest_m: float) -> int:
+    """Side [px] of the averaging blocks: pixels per ``finest_m`` at the grid's centre, leaving at least 2 × 2 blocks."""
     # The tolerance keeps rounding errors from reducing an exact multiple.
-    return int(np.clip(np.floor(finest_m / pixel_m + 1e-6), 1, max(1, min(window.width, window.height) // 2)))
+    wanted = np.floor(finest_m / max(cell_sides_m(grid)) + 1e-6)
+    return int(np.clip(wanted, 1, max(1, min(grid.values.shape[:2]) // 2)))
 
 
 def _window_transform(transform: Affine, window: Window, shrink: int) -> Affine:
@@ -269,34 +254,22 @@ def _window_transform(transform: Affine, window: Window, shrink: int) -> Affine:
 
 
 def _read_blocks(
-    source: DatasetReader,
-    bands: tuple[int, ...],
-    window: Window,
-    shrink: int,
-    decode: Callable[[np.ndarray], np.ndarray] | None,
+    reader: BandReader, window: Window, shrink: int, decode: Callable[[np.ndarray], np.ndarray] | None
 ) -> np.ndarray:
     """Read, decode and average a window in strips, so that only the averaged result is held in memory."""
     from rasterio.windows import Window
 
-    height, width = int(window.height) // shrink, int(window.width) // shrink
-    scale = np.array([source.scales[band - 1] for band in bands], np.float64)
-    offset = np.array([source.offsets[band - 1] for band in bands], np.float64)
-    values = np.empty((height, width, len(bands)), np.float32)
-    alpha = _alpha_band(source)
-    strip = max(1, 2**22 // max(1, width * shrink * len(bands)) // shrink)
+    height, width, channels = int(window.height) // shrink, int(window.width) // shrink, reader.channels
+    values = np.empty((height, width, channels), np.float32)
+    strip = max(1, 2**22 // max(1, width * shrink * channels) // shrink)
     for row in range(0, height, strip):
         rows = min(strip, height - row)
         top = window.row_off + row * shrink
-        part = Window(window.col_off, top, width * shrink, rows * shrink)  # pyright: ignore[reportCallIssue]
-        read = source.read(bands, window=part, masked=True)
-        block = np.where(np.ma.getmaskarray(read), np.nan, read.data.astype(np.float64))
-        if alpha is not None:
-            block[:, source.read(alpha, window=part) == 0] = np.nan
-        block = block.transpose(1, 2, 0) * scale + offset
+        block = reader.read(Window(window.col_off, top, width * shrink, rows * shrink))  # pyright: ignore[reportCallIssue]
         if decode is not None:
             block = decode(block)
         if shrink > 1:
-            block = nan_mean(block.reshape(rows, shrink, width, shrink, len(bands)), axes=(1, 3))
+            block = nan_mean(block.reshape(rows, shrink, width, shrink, channels), axes=(1, 3))
         values[row : row + rows] = block
     return values
 
@@ -318,6 +291,7 @@ def _bounds_deg(crs: str, transform: Affine, width: int, height: int) -> tuple[f
     latitude, longitude = geodetic_from_map(crs, *apply_affine(transform, *_boundary(0.0, 0.0, width, height)))
     if not (np.isfinite(latitude).all() and np.isfinite(longitude).all()):
         raise InputError(crs, "the raster's edge lies outside the area of its CRS", cure="the CRS is probably wrong")
+    longitude = wrapped(longitude, normal_longitude(centre_deg(crs, transform, width, height)[1]), 360.0)
     return float(longitude.min()), float(latitude.min()), float(longitude.max()), float(latitude.max())
 
 
@@ -332,7 +306,7 @@ def bounds_geographic(raster: Raster) -> tuple[float, float, float, float]:
     Returns
     -------
     tuple
-        West, south, east, north in WGS 84 [deg].
+        West, south, east, north in WGS 84 [deg]; west < east even across the antimeridian, where one is beyond ±180°.
 
     Raises
     ------
@@ -361,8 +335,8 @@ def centre_frame(raster: Raster, *, height_m: float = 0.0, refraction_k: float =
         The frame.
     """
     height, width = raster.values.shape[:2]
-    latitude, longitude = geodetic_from_map(raster.crs, *apply_affine(raster.transform, width / 2.0, height / 2.0))
-    return LocalFrame(float(latitude), float(longitude), height_m, refraction_k)
+    latitude, longitude = centre_deg(raster.crs, raster.transform, width, height)
+    return LocalFrame(latitude, normal_longitude(longitude), height_m, refraction_k)
 
 
 def _bounds_text(bounds_deg: tuple[float, float, float, float]) -> str:
@@ -389,13 +363,15 @@ def require_overlap(
         The bounding boxes are disjoint.
     """
     a, b = bounds_geographic(raster), bounds_geographic(other)
+    shift = float(wrapped(a[0], b[0], 360.0)) - a[0]
+    a = (a[0] + shift, a[1], a[2] + shift, a[3])
     if max(a[0], b[0]) >= min(a[2], b[2]) or max(a[1], b[1]) >= min(a[3], b[3]):
         raise InputError(
             os.fspath(where),
             f"does not overlap the {other_name} raster",
             got=_bounds_text(a),
             expected=_bounds_text(b),
-            cure="check the CRS of both files",
+            cure=likely_cause(raster, 0.5 * (b[1] + b[3]), 0.5 * (b[0] + b[2])) or "check the CRS of both files",
         )
 
 

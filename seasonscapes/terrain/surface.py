@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from affine import Affine
 
-from seasonscapes.errors import AtlasMismatch
+from seasonscapes.array_files import read_arrays
+from seasonscapes.errors import AtlasMismatch, InputError
 from seasonscapes.frames import MEAN_RADIUS_M, LocalFrame
 
 
@@ -341,10 +342,22 @@ def load_texture(path: str | os.PathLike[str]) -> Texture:
     -------
     Texture
         The texture; ``atlas_id`` is ``None`` if the file has none.
+
+    Raises
+    ------
+    InputError
+        Where the file is missing, damaged, or no texture.
     """
-    with np.load(path, allow_pickle=False) as stored:
-        atlas_id = str(stored["atlas_id"]) if "atlas_id" in stored else None
-        return Texture(stored["values"], stored["weight"], atlas_id)
+    stored = read_arrays(path, ["values", "weight"], optional=["atlas_id"], what="a texture")
+    values, weight = stored["values"], stored["weight"]
+    if values.dtype.kind != "f" or weight.dtype.kind != "f" or values.shape != (*weight.shape, 3) or weight.ndim != 2:
+        got = f"values {values.dtype} {values.shape}, weight {weight.dtype} {weight.shape}"
+        raise InputError(
+            os.fspath(path), "not a texture", got=got, expected="values (R, S, 3) and weight (R, S), floats"
+        )
+    if not np.isfinite(weight).all():
+        raise InputError(os.fspath(path), "not a texture: its weights are not finite")
+    return Texture(values, weight, str(stored["atlas_id"]) if "atlas_id" in stored else None)
 
 
 def sample_texture(values: np.ndarray, uv: np.ndarray) -> np.ndarray:

@@ -147,6 +147,29 @@ def texel_positions(terrain: Terrain, width: int, height: int) -> tuple[np.ndarr
     return positions, face_id
 
 
+def covered_share(terrain: Terrain, weight: np.ndarray) -> float:
+    """Share of a surface's texels that have a weight, counted on at most 512 × 512 of them.
+
+    Parameters
+    ----------
+    terrain
+        Surface with UV coordinates.
+    weight
+        ``(H, W)``; 0 where a texture does not reach.
+
+    Returns
+    -------
+    float
+        In [0, 1].
+    """
+    rows, columns = (min(side, 512) for side in weight.shape)
+    on_surface = covering_faces(texel_coordinates(terrain.uv, columns, rows), terrain.faces, columns, rows) >= 0
+    row = (np.arange(rows) + 0.5) * weight.shape[0] / rows
+    column = (np.arange(columns) + 0.5) * weight.shape[1] / columns
+    covered = weight[np.ix_(row.astype(int), column.astype(int))] > 0.0
+    return float(covered[on_surface].mean()) if on_surface.any() else 1.0
+
+
 def barycentric(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
     """Compute barycentric coordinates, clipped to the triangle.
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from seasonscapes.errors import NoUsablePixels
+from seasonscapes.array_files import read_arrays
+from seasonscapes.errors import InputError, NoUsablePixels
 from seasonscapes.images import atomic_path
 from seasonscapes.rendering.hemisphere_rays import RayScene
 from seasonscapes.terrain.atlas import Atlas
@@ -42,6 +44,8 @@ from seasonscapes.texturing.radiometric_fit import (
 )
 from seasonscapes.texturing.texel_weights import sharpened, texel_weight
 from seasonscapes.texturing.visibility import project_texels, visible_by_ray
+
+log = logging.getLogger(__name__)
 
 PAINT_MODES = ("weighted", "first")
 Progress = Callable[[float], None]
@@ -419,8 +423,11 @@ def _load_or_paint(folder: Path | None, tile: AtlasTile, paint: Callable[[], _Pa
         return paint()
     path = folder / f"{tile.name}.npz"
     if path.is_file():
-        with np.load(path, allow_pickle=False) as stored:
+        try:
+            stored = read_arrays(path, _PaintedTile.__dataclass_fields__, what="a painted tile")
             return _PaintedTile(*(stored[name] for name in _PaintedTile.__dataclass_fields__))
+        except InputError as error:
+            log.info("%s; it is painted again", error)
     painted_tile = paint()
     with atomic_path(path) as temporary:
         np.savez(temporary, **{name: getattr(painted_tile, name) for name in _PaintedTile.__dataclass_fields__})

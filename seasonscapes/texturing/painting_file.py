@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from seasonscapes.array_files import read_arrays
 from seasonscapes.exposure import develop, exposure_ev100
 from seasonscapes.images import srgb_from_linear, write_exr, write_png, write_png8
 from seasonscapes.terrain.surface import Texture
@@ -58,24 +59,30 @@ def load_painting(path: str | os.PathLike) -> Painting:
     -------
     Painting
         Arrays equal those that were saved, bit for bit.
+
+    Raises
+    ------
+    InputError
+        Where the file is missing, damaged, or no painting.
     """
-    with np.load(path, allow_pickle=False) as stored:
-        note = json.loads(str(stored["note"]))
-        # Files of earlier versions use the second key.
-        radiometry: dict[str, Any] = note["radiometry"] if "radiometry" in note else note["harmony"]
-        arrays: dict[str, Any] = {
-            name: np.array(value) if isinstance(value, list) else value for name, value in radiometry.items()
-        }
-        atlas_id = str(stored["atlas_id"]) if "atlas_id" in stored else None
-        return Painting(
-            Texture(stored["values"], stored["weight"], atlas_id),
-            stored["best"],
-            # Files of earlier versions have 8 bits.
-            stored["coverage"].astype(np.uint16),
-            tuple(note["webcams"]),
-            RadiometricFit(**arrays),
-            tuple(note["skipped"]),
-        )
+    stored = read_arrays(
+        path, ["note", "values", "weight", "best", "coverage"], optional=["atlas_id"], what="a painting"
+    )
+    note = json.loads(str(stored["note"]))
+    # Files of earlier versions use the second key.
+    radiometry: dict[str, Any] = note["radiometry"] if "radiometry" in note else note["harmony"]
+    arrays: dict[str, Any] = {
+        name: np.array(value) if isinstance(value, list) else value for name, value in radiometry.items()
+    }
+    return Painting(
+        Texture(stored["values"], stored["weight"], str(stored["atlas_id"]) if "atlas_id" in stored else None),
+        stored["best"],
+        # Files of earlier versions have 8 bits.
+        stored["coverage"].astype(np.uint16),
+        tuple(note["webcams"]),
+        RadiometricFit(**arrays),
+        tuple(note["skipped"]),
+    )
 
 
 def write_figures(painting: Painting, folder: Path) -> dict[str, str]:

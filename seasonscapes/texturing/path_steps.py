@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from seasonscapes.array_files import read_arrays
+from seasonscapes.errors import InputError
 from seasonscapes.images import atomic_path, write_png8
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -94,15 +99,20 @@ def load_step(folder: Path | None, index: int) -> PathStep | None:
     Returns
     -------
     PathStep or None
-        ``None`` where no complete step is stored.
+        ``None`` where no complete step is stored, or a damaged one, which is told.
     """
     if folder is None or not _record_path(folder, index).is_file():
         return None
     from PIL import Image
 
-    with Image.open(_picture_path(folder, index, "result")) as file:
-        frame = np.array(file)
-    with np.load(_record_path(folder, index), allow_pickle=False) as stored:
-        return PathStep(
-            index, float(stored["hole_share"]), stored["texels"], stored["values"], frame, bool(stored["skipped"])
-        )
+    names = ("hole_share", "texels", "values", "skipped")
+    try:
+        stored = read_arrays(_record_path(folder, index), names, what="a step of a path")
+        with Image.open(_picture_path(folder, index, "result")) as file:
+            frame = np.array(file)
+    except (InputError, OSError, SyntaxError) as error:
+        log.info("%s; the view is painted again", error)
+        return None
+    return PathStep(
+        index, float(stored["hole_share"]), stored["texels"], stored["values"], frame, bool(stored["skipped"])
+    )

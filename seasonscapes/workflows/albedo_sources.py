@@ -107,18 +107,44 @@ def scene_albedo(place: Place, day: date | str) -> Texture:
         )
     imagery = place.scene.imagery
     if imagery is None:
+        log.warning("%s: names no image: the land is grey, with an albedo of %g", place.path, GREY_ALBEDO)
         values = np.full((*place.texture_shape, 3), GREY_ALBEDO, np.float32)
         return Texture(values, np.zeros(place.texture_shape, np.float32), place.atlas_id)
-    inputs.update(imagery=imagery.model_copy(update={"file": Path(imagery.file).name}), hash=file_hash(imagery.file))
+    inputs.update(imagery=imagery.model_copy(update={"file": Path(imagery.file).name}), hash=place.scene.image_hash)
     time = imagery_time(imagery)
-    if time is not None:
+    if time is None:
+        if not imagery.delit:
+            _tell_light_stays(imagery.file)
+        texture = texture_once(place, "albedo", inputs, code=_IMAGE_CODE, build=lambda: _baked_image(place, imagery))
+    else:
         log.info("%s: its light is taken out", Path(imagery.file).name)
-        return texture_once(
+        texture = texture_once(
             place, "albedo-delit", inputs, code=_DELIT_CODE, build=lambda: delit_imagery(place, time).texture
         )
-    if not imagery.delit:
-        _tell_light_stays(imagery.file)
-    return texture_once(place, "albedo", inputs, code=_IMAGE_CODE, build=lambda: _baked_image(place, imagery))
+    _tell_image(place, texture)
+    return texture
+
+
+def _tell_image(place: Place, texture: Texture) -> None:
+    """Warn of what was understood of the scene's image, and of land that it does not cover."""
+    from seasonscapes.terrain.image_bands import image_facts
+    from seasonscapes.terrain.texels import covered_share
+
+    imagery = place.scene.imagery
+    assert imagery is not None
+    facts = image_facts(
+        imagery.file,
+        bands=tuple(imagery.bands) if imagery.bands else None,
+        full_scale=imagery.full_scale,
+        confinement=place.scene.confinement,
+    )
+    for line in facts.told:
+        log.warning("%s", line)
+    share = covered_share(place.terrain, texture.weight)
+    if share < 0.999:
+        log.warning(
+            "%s: the image covers %.3g %% of the land; the rest has its median colour", imagery.file, 100.0 * share
+        )
 
 
 def texture_once(
@@ -174,7 +200,7 @@ def dated_albedos(place: Place, files: Sequence[AlbedoFile] = ()) -> list[DatedA
         if imagery is not None:
             time = imagery_time(imagery)
             code = source_hash(*_IMAGE_CODE if time is None else _DELIT_CODE)
-            content = ":".join((imagery.model_dump_json(), file_hash(imagery.file), code))
+            content = ":".join((imagery.model_dump_json(), str(place.scene.image_hash), code))
             if isinstance(time, str) and time != UNKNOWN:
                 day = utc_at(place, time).date()
         return [DatedAlbedo(day, content, lambda: scene_albedo(place, day))]

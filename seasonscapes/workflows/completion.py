@@ -5,7 +5,6 @@ from __future__ import annotations
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
-from zipfile import BadZipFile
 
 import numpy as np
 
@@ -114,10 +113,7 @@ def read_painted(path: Path, place: Place) -> Texture:
 
     if not path.is_file():
         raise InputError("--texture", "no such file", got=str(path), cure="run `seasonscapes paint` first")
-    try:
-        texture = load_texture(path)
-    except (BadZipFile, KeyError, ValueError, EOFError) as error:
-        raise InputError("--texture", f"not a painted texture: {error}", got=str(path)) from None
+    texture = load_texture(path)
     rows, columns = place.texture_shape
     if texture.weight.shape != (rows, columns):
         raise InputError(

@@ -23,7 +23,7 @@ from seasonscapes.workflows.illumination import illumination_for_camera
 from seasonscapes.workflows.pictures import develop
 from seasonscapes.workflows.place import MeshOptions, Place
 from seasonscapes.workflows.relight_session import RenderJob
-from seasonscapes.workflows.timelapse import FilmLook, develop_film, render_frames
+from seasonscapes.workflows.timelapse import make_film
 from seasonscapes.workflows.views import camera_for, terrain_for_view
 from seasonscapes.workspace import content_key
 
@@ -140,8 +140,7 @@ def day_film(
     )
     start = resolve_time(f"{_FIRST_HOUR:%Y-%m-%dT%H:%M}", view.latitude_deg, view.longitude_deg).utc
     times = [start + index * timedelta(minutes=10) for index in range(145)]
-    render_frames(job, times, place=place, progress=progress)
-    develop_film(job, times, path, FilmLook(), progress=progress)
+    make_film(job, times, path, keep_frames=True, place=place, progress=progress)
     log.info("demo: %s", path)
     return path
 

@@ -20,6 +20,7 @@ from seasonscapes.sky.models import SkyModel
 from seasonscapes.workflows.albedo_sources import scene_albedo
 from seasonscapes.workflows.illumination import illumination_at, sky_model, sun_moon_position
 from seasonscapes.workflows.place import Place
+from seasonscapes.workspace import artefact_key
 
 if TYPE_CHECKING:
     from seasonscapes.cameras.pinhole import Camera
@@ -196,12 +197,13 @@ def distil_with_data(
     from seasonscapes.gaussians.model import model_from
     from seasonscapes.gaussians.rasterise import set_torch_threads
     from seasonscapes.gaussians.splat_view import learned_parameters
-    from seasonscapes.gaussians.training import Schedule, train
+    from seasonscapes.gaussians.training import Checkpoint, Schedule, train
 
     options = options or DistilOptions()
     set_torch_threads(1)
     dated = [albedo] if isinstance(albedo, DatedAlbedo) else list(albedo or ())
-    data = distillation_data(place, sky_model(sky), dated, options, seed=seed, progress=progress)
+    model = sky_model(sky)
+    data = distillation_data(place, model, dated, options, seed=seed, progress=progress)
     appearance = Appearance(
         options.kind,
         data.albedo,
@@ -217,11 +219,11 @@ def distil_with_data(
         data.frames,
         Schedule(options.steps, options.picture_steps),
         seed=seed,
-        checkpoint=checkpoint,
+        checkpoint=checkpoint and Checkpoint(checkpoint, _data_key(place, model, dated, options)),
         progress=task_progress(progress, "distilling"),
     )
     note = {"scene": place.scene.name, "seed": seed, "suns": options.suns, "attribution": place.scene.attribution}
-    model = model_from(
+    distilled = model_from(
         data.surfels,
         data.albedo,
         data.days,
@@ -230,7 +232,20 @@ def distil_with_data(
         frame=place.frame,
         note=note,
     )
-    return Distilled(model, data, losses)
+    return Distilled(distilled, data, losses)
+
+
+def _data_key(place: Place, model: SkyModel, dated: Sequence[DatedAlbedo], options: DistilOptions) -> str:
+    """Identifier of everything that the training data are made from, except the seed."""
+    imagery = place.scene.imagery
+    inputs = {
+        "place": place.key,
+        "sky": model,
+        "albedo": [[each.day, each.content] for each in dated],
+        "imagery": None if dated or imagery is None else [imagery.model_dump(exclude={"file"}), place.scene.image_hash],
+        "options": options,
+    }
+    return artefact_key(inputs, ("workflows.distillation",))
 
 
 def dated_textures(place: Place, dated: Sequence[DatedAlbedo], dates: int) -> list[tuple[float, np.ndarray]]:
@@ -344,12 +359,12 @@ def draw_lights(
 def export_training_views(folder: Path, place: Place, data: DistillationData) -> None:
     """Write the training images as PNG, with cameras, times and suns for other trainers (nerfstudio, COLMAP)."""
     from seasonscapes.cameras.exchange import NamedView
-    from seasonscapes.gaussians.interchange import BakedSplats, TrainingView, write_training_views
+    from seasonscapes.gaussians.interchange import IMAGE_FOLDER, BakedSplats, TrainingView, write_training_views
     from seasonscapes.images import srgb_from_linear, write_png
 
     per_camera, views = len(data.frames) // max(len(data.cameras), 1), []
     for number, frame in enumerate(data.frames):
-        name = f"images/{number:04d}.png"
+        name = f"{IMAGE_FOLDER}/{number:04d}.png"
         write_png(folder / name, np.clip(frame.image, 0.0, 1.0))
         view = NamedView(f"{number:04d}", data.cameras[number // per_camera], name, data.times[frame.time])
         views.append(TrainingView(view, _state(data, frame.time)))

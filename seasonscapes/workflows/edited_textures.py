@@ -13,10 +13,10 @@ from collections.abc import Callable
 from datetime import date, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from zipfile import BadZipFile
 
 import numpy as np
 
+from seasonscapes.array_files import read_arrays
 from seasonscapes.errors import AtlasMismatch, InputError, SeasonscapesError
 from seasonscapes.sky.models import SkyModel, sky_model_from_table
 from seasonscapes.terrain.surface import Texture, load_texture
@@ -67,24 +67,26 @@ def require_albedo_file(path: Path) -> None:
         raise InputError("--albedo", "not an albedo texture", got=str(path), expected=expected)
     if kind != ".npz":
         return
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            names = set(stored.files)
-    except (BadZipFile, ValueError, EOFError, AttributeError):
-        raise InputError(path, "not an albedo texture", expected="a .npz file of `seasonscapes albedo`") from None
-    if not {"values", "weight"} <= names:
-        raise InputError(path, "not an albedo texture", got=", ".join(sorted(names)), expected="values and weight")
+    cure = "give a .npz file of `seasonscapes albedo`"
+    read_arrays(path, ["values", "weight"], what="an albedo texture", cure=cure)
 
 
 def albedo_date(path: Path) -> date | None:
     """The date that an albedo file states, or ``None``; `InputError` where it is missing or no texture."""
     require_albedo_file(path)
     if path.suffix.lower() == ".npz":
-        with np.load(path, allow_pickle=False) as stored:
-            return date.fromisoformat(str(stored["date"])) if "date" in stored else None
+        stored = read_arrays(path, [], optional=["date"], what="an albedo texture")
+        return _stated_date(path, stored["date"]) if "date" in stored else None
     facts = _facts(path)
     stated = facts.get("date", facts.get("time_utc"))
-    return None if stated is None else datetime.fromisoformat(str(stated)).date()
+    return None if stated is None else _stated_date(path, stated)
+
+
+def _stated_date(path: Path, stated: object) -> date:
+    try:
+        return datetime.fromisoformat(str(stated)).date()
+    except ValueError:
+        raise InputError(path, "states no date", got=str(stated), expected="ISO 8601, such as 2024-07-20") from None
 
 
 def read_albedo(place: Place, path: Path) -> Texture:
@@ -193,7 +195,7 @@ def _glb(path: Path) -> np.ndarray:
     start = part.byteOffset or 0
     with tempfile.TemporaryDirectory() as folder:
         picture = Path(folder) / "texture.png"
-        picture.write_bytes(document.binary_blob()[start : start + part.byteLength])
+        picture.write_bytes((document.binary_blob() or b"")[start : start + part.byteLength])
         return _png(picture)
 
 

@@ -38,7 +38,6 @@ from seasonscapes.workflows.run_photographs import (
 )
 from seasonscapes.workflows.stage_runner import Stage, run_stages, stage_range
 from seasonscapes.workflows.views import camera_for
-from seasonscapes.workspace import file_hash
 
 STAGES = ("pictures", "calibrate", "albedo", "paint", "inpaint", "relight", "distil", "splat")
 
@@ -159,7 +158,7 @@ def _imagery(place: Place) -> dict | None:
     imagery = place.scene.imagery
     if imagery is None:
         return None
-    return {**imagery.model_dump(mode="json", exclude={"file"}), "hash": file_hash(imagery.file)}
+    return {**imagery.model_dump(mode="json", exclude={"file"}), "hash": place.scene.image_hash}
 
 
 def _sources(folder: Path) -> PhotographSources:
@@ -271,11 +270,8 @@ def _relight(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]
         seed=job.seed,
         allow_outside=job.allow_outside,
     )
-    timelapse.render_frames(render_job, hours, place=place, progress=progress)
     look = timelapse.FilmLook(smooth_s=0.0)
-    paths = timelapse.develop_film(render_job, hours, folder / "relight", look, progress=progress)
-    timelapse.remove_frames(render_job, hours)
-    return paths
+    return timelapse.make_film(render_job, hours, folder / "relight", look, place=place, progress=progress)[0]
 
 
 def _distil(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:

@@ -10,7 +10,7 @@ import numpy as np
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.cameras.trajectory import Ground
 from seasonscapes.frames import geodetic_from_enu
-from seasonscapes.terrain.raster import map_from_geodetic
+from seasonscapes.terrain.crs import map_position
 from seasonscapes.workflows.place import Place
 
 _MAP_PX, _PROFILE_PX = 1200, 220
@@ -59,7 +59,7 @@ def _relief(place: Place) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray
 
     def pixel(places_m: np.ndarray) -> np.ndarray:
         latitude, longitude, _ = geodetic_from_enu(place.frame, places_m)
-        x, y = map_from_geodetic(place.elevation.crs, latitude, longitude)
+        x, y = map_position(place.elevation, latitude, longitude)
         column, row = inverse.a * x + inverse.b * y + inverse.c, inverse.d * x + inverse.e * y + inverse.f
         return np.stack([np.asarray(column) * scale, np.asarray(row) * scale], axis=-1)
 

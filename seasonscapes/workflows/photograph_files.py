@@ -36,11 +36,22 @@ class PhotographSources:
         Folder of ``WEBCAM_calibration.json``, as ``seasonscapes calibrate`` writes them.
     masks
         Folder of ``WEBCAM.png``, black where something stands before the landscape; optional.
+    allow_outside
+        Let the manifest name pictures outside its folder.
     """
 
     manifest: Path
     calibrations: Path
     masks: Path | None = None
+    allow_outside: bool = False
+
+    def picture_of(self, row: ManifestRow) -> Path:
+        """The picture of a row of the manifest; `InputError` where a link leads out of the manifest's folder."""
+        path, folder = self.manifest.parent / row.path, self.manifest.parent.resolve()
+        if not self.allow_outside and not path.resolve().is_relative_to(folder):
+            cure = "copy the picture itself, or pass --allow-outside"
+            raise InputError(path, "leads outside the manifest's folder", got=str(path.resolve()), cure=cure)
+        return path
 
     def calibration_of(self, webcam: str) -> Path:
         """The calibration record of a webcam, whether it exists or not."""
@@ -139,12 +150,12 @@ def rows_at(
     Raises
     ------
     InputError
-        Where no photograph is near enough; it names the nearest one.
+        Where no photograph is near enough (it names the nearest one), or one leads out of the manifest's folder.
     """
     from seasonscapes.cameras.observation import read_manifest
 
     nearest: dict[str, ManifestRow] = {}
-    rows = read_manifest(sources.manifest)
+    rows = read_manifest(sources.manifest, allow_outside=sources.allow_outside)
     for row in sorted(rows, key=lambda row: (abs(row.time - time), row.path)):
         if abs(row.time - time) <= timedelta(minutes=within_min):
             nearest.setdefault(row.webcam, row)
@@ -154,6 +165,8 @@ def rows_at(
             closest = min(rows, key=lambda row: abs(row.time - time))
             expected = f"the nearest is {closest.webcam} at {closest.time.isoformat()}"
         raise InputError(where, f"no picture within {within_min:g} minutes", got=time.isoformat(), expected=expected)
+    for row in nearest.values():
+        sources.picture_of(row)
     return [nearest[name] for name in sorted(nearest)]
 
 
@@ -226,8 +239,8 @@ def _mask(sources: PhotographSources, webcam: str, shape: tuple[int, ...]) -> np
         return np.ones(shape, bool)
     try:
         mask = read_image_linear(path).max(axis=2) > 0.5
-    except UnreadableImage:
-        raise InputError(path, "not a readable picture") from None
+    except UnreadableImage as error:
+        raise InputError(path, str(error)) from None
     if mask.shape != shape:
         raise InputError(
             path,

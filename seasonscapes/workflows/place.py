@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
@@ -12,13 +13,14 @@ import numpy as np
 
 from seasonscapes import bundled
 from seasonscapes.errors import InputError
-from seasonscapes.frames import LocalFrame, enu_from_geodetic
+from seasonscapes.frames import LocalFrame, enu_from_geodetic, frame_record
 from seasonscapes.progress import Progress, task_progress
 from seasonscapes.scene import SceneFile, read_scene
 from seasonscapes.source_hash import source_hash
+from seasonscapes.terrain.raster_files import raster_hash
 from seasonscapes.terrain.surface import Raster, Terrain, Texture, atlas_identity, mesh_up_m, require_atlas
 from seasonscapes.workflows.terrain_building import MeshOptions
-from seasonscapes.workspace import Workspace, build_once, default_workspace, file_hash
+from seasonscapes.workspace import Workspace, build_once, default_workspace
 
 if TYPE_CHECKING:
     from seasonscapes.terrain.raster import FillReport
@@ -30,6 +32,10 @@ __all__ = ["MeshOptions", "Place", "find_scene", "ground_height_m", "load_place"
 # Includes the synthetic massif's own modules.
 _TERRAIN_CODE = ("workflows.terrain_building",)
 _MASSIF_CODE = ("terrain.synthetic",)
+# The farthest sight on record, by refraction over the Alps and the Pyrenees, is some 440 km; pictures end far before.
+FARTHEST_CAMERA_KM = 200.0
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -95,6 +101,20 @@ class Place:
     def median_height_m(self) -> float:
         """Median height of the terrain [m]; sun, sky and interreflection are computed for this height."""
         return float(np.median(self.elevation.values))
+
+    @cached_property
+    def about(self) -> dict:
+        """Plain values for the metadata of files: scene, attribution, local frame with its origin, datum and CRS."""
+        from seasonscapes.terrain.crs import crs_name
+
+        record = frame_record(self.frame)
+        record["origin"] |= {"vertical_datum": self.scene.vertical_datum}
+        return {
+            "scene": self.scene.name,
+            "attribution": self.scene.attribution,
+            **record,
+            "source_crs": crs_name(self.elevation.crs),
+        }
 
     def require_texture(self, texture: Texture, *, what: str = "texture") -> Texture:
         """Return the texture, or raise `errors.AtlasMismatch` where it belongs to another atlas."""
@@ -168,13 +188,14 @@ def load_place(
     massif = None if declared.elevation.synthetic is None else _massif(declared, workspace)
     elevation, fill = terrain_building.read_heights(declared, massif, where=f"{path}: elevation.file")
     report(0.3)
+    _check_cameras(path, declared, elevation)
     frame = terrain_building.local_frame(declared, elevation)
     source = declared.elevation.file
     key = {
         "code": source_hash(*_TERRAIN_CODE),
         "elevation": declared.elevation.model_copy(update={"file": source and Path(source).name}),
-        "elevation_hash": source and file_hash(source),
-        "imagery_hash": declared.imagery and file_hash(declared.imagery.file) if options.texel_m is None else None,
+        "elevation_hash": source and raster_hash(source, declared.confinement),
+        "imagery_hash": declared.image_hash if options.texel_m is None else None,
         "area": declared.area,
         "frame": frame,
         "options": options,
@@ -191,8 +212,52 @@ def load_place(
         save=terrain_building.save_built_terrain,
         load=terrain_building.load_built_terrain,
     )
+    terrain_building.tell_texel_wish(terrain, declared, options)
     report(1.0)
     return Place(path, declared, frame, elevation, fill, terrain, atlas, massif, key, workspace, options)
+
+
+def _check_cameras(path: Path, scene: SceneFile, elevation: Raster) -> None:
+    """`InputError` where all cameras of a scene stand far from its raster; a warning about single ones that do."""
+    from seasonscapes.terrain.placement import distance_km, likely_cause
+    from seasonscapes.terrain.raster import bounds_geographic
+
+    views = [(each.name, each) for each in scene.cameras] + [(each.id, each) for each in scene.webcams]
+    if not views:
+        return
+    bounds = bounds_geographic(elevation)
+    far = [(distance_km(view.latitude_deg, view.longitude_deg, bounds), name, view) for name, view in views]
+    nearest, name, view = min(far, key=lambda each: each[0])
+    if nearest > FARTHEST_CAMERA_KM:
+        raise InputError(
+            f"{path}: elevation.file",
+            f"lies {nearest:.0f} km from the nearest camera, '{name}'",
+            got=f"latitude {bounds[1]:.3f} … {bounds[3]:.3f}, longitude {bounds[0]:.3f} … {bounds[2]:.3f}",
+            expected=f"near {view.latitude_deg:.3f}, {view.longitude_deg:.3f}",
+            cure=likely_cause(elevation, view.latitude_deg, view.longitude_deg)
+            or "check the CRS of the raster, and latitude and longitude of the cameras",
+        )
+    for distance, name, view in far:
+        if distance > FARTHEST_CAMERA_KM:
+            cause = likely_cause(elevation, view.latitude_deg, view.longitude_deg) or "check latitude and longitude"
+            log.warning("%s: camera '%s' stands %.0f km from the terrain: %s", path, name, distance, cause)
+
+
+def require_near(place: Place, latitude_deg: float, longitude_deg: float, *, where: str) -> None:
+    """`InputError` about a position from which no terrain of the place can be seen, since it is too far away."""
+    from seasonscapes.terrain.placement import distance_km, likely_cause
+    from seasonscapes.terrain.raster import bounds_geographic
+
+    west, south, east, north = bounds_geographic(place.elevation)
+    distance = distance_km(latitude_deg, longitude_deg, (west, south, east, north))
+    if distance > FARTHEST_CAMERA_KM:
+        raise InputError(
+            where,
+            f"stands {distance:.0f} km from the terrain",
+            got=f"{latitude_deg}, {longitude_deg}",
+            expected=f"near latitude {south:.4f} … {north:.4f}, longitude {west:.4f} … {east:.4f}",
+            cure=likely_cause(place.elevation, latitude_deg, longitude_deg),
+        )
 
 
 def _massif(scene: SceneFile, workspace: Workspace) -> SyntheticMassif:
@@ -235,6 +300,7 @@ def ground_height_m(place: Place, latitude_deg: float, longitude_deg: float, *, 
     """
     from seasonscapes.terrain.raster import bounds_geographic
 
+    require_near(place, latitude_deg, longitude_deg, where=where)
     height = ground_or_nan(place, latitude_deg, longitude_deg)
     if not np.isfinite(height):
         west, south, east, north = bounds_geographic(place.elevation)
@@ -249,9 +315,10 @@ def ground_height_m(place: Place, latitude_deg: float, longitude_deg: float, *, 
 
 def ground_or_nan(place: Place, latitude_deg: float, longitude_deg: float) -> float:
     """`ground_height_m`, or NaN outside the elevation raster."""
-    from seasonscapes.terrain.raster import map_from_geodetic, sample_raster
+    from seasonscapes.terrain.crs import map_position
+    from seasonscapes.terrain.raster import sample_raster
 
-    x, y = map_from_geodetic(place.elevation.crs, latitude_deg, longitude_deg)
+    x, y = map_position(place.elevation, latitude_deg, longitude_deg)
     height = float(sample_raster(place.elevation, x, y)[..., 0])
     position = enu_from_geodetic(place.frame, latitude_deg, longitude_deg, np.nan_to_num(height))
     rendered = mesh_up_m(place.terrain, position)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from seasonscapes.array_files import read_arrays
 from seasonscapes.progress import Progress, task_progress
 from seasonscapes.sky.models import SkyModel
 from seasonscapes.terrain.surface import Texture
@@ -98,9 +99,9 @@ def albedo_relative_sigma(path: Path, shape: tuple[int, int]) -> np.ndarray:
     """Relative standard error ``(R, S)`` float32 of an albedo file; `RELATIVE_SIGMA` where it states none."""
     relative = np.full(shape, np.inf, np.float32)
     if path.suffix.lower() == ".npz":
-        with np.load(path, allow_pickle=False) as stored:
-            if "sigma" in stored:
-                relative = stored["sigma"] / np.maximum(stored["values"][..., 1], 1e-3)
+        stored = read_arrays(path, ["values"], optional=["sigma"], what="an albedo texture")
+        if "sigma" in stored:
+            relative = stored["sigma"] / np.maximum(stored["values"][..., 1], 1e-3)
     return np.where(np.isfinite(relative), relative, RELATIVE_SIGMA).astype(np.float32)
 
 

@@ -7,7 +7,9 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
+from seasonscapes.array_files import read_arrays
 from seasonscapes.errors import InputError
+from seasonscapes.text_files import parse_json, read_json
 
 
 def provenance(path: Path) -> dict:
@@ -71,9 +73,9 @@ def _png(path: Path) -> dict:
 
 
 def _tif(path: Path) -> dict:
-    import rasterio
+    from seasonscapes.terrain.raster_files import open_raster
 
-    with rasterio.open(path) as file:
+    with open_raster(path) as file:
         return {
             "size_px": [file.width, file.height],
             "crs": str(file.crs),
@@ -83,35 +85,31 @@ def _tif(path: Path) -> dict:
 
 
 def _npz(path: Path) -> dict:
-    import numpy as np
-
-    with np.load(path, allow_pickle=False) as file:
-        arrays = {name: f"{file[name].dtype} {file[name].shape}" for name in file.files}
+    stored = read_arrays(path, what="an .npz file of this program")
+    arrays = {name: f"{values.dtype} {values.shape}" for name, values in stored.items()}
     return {"arrays": arrays, **_manifest(path)}
 
 
 def _manifest(path: Path) -> dict:
     """The manifest that the workspace wrote beside an artefact."""
     beside = path.with_name(path.name + ".json")
-    return {"manifest": json.loads(beside.read_text())} if beside.is_file() else {"manifest": "none beside it"}
+    return {"manifest": read_json(beside)} if beside.is_file() else {"manifest": "none beside it"}
 
 
-def _glb(path: Path) -> dict:
-    import pygltflib
+def _gltf(path: Path) -> dict:
+    from seasonscapes.export.gltf_file import read_gltf_table
 
-    document = pygltflib.GLTF2.load(str(path))
-    if document is None:
-        raise ValueError("no glTF document")
-    faces = sum(
-        document.accessors[p.indices].count // 3
-        for mesh in document.meshes
-        for p in mesh.primitives
-        if p.indices is not None
+    table = read_gltf_table(path)
+    indexed = (
+        table["accessors"][primitive["indices"]]["count"] // 3
+        for mesh in table.get("meshes", [])
+        for primitive in mesh["primitives"]
+        if "indices" in primitive
     )
     return {
-        "faces": faces,
-        "extensions": ", ".join(document.extensionsUsed or []) or "none",
-        "extras": document.asset.extras,
+        "faces": sum(indexed),
+        "extensions": ", ".join(table.get("extensionsUsed", [])) or "none",
+        "extras": table["asset"].get("extras", {}),
     }
 
 
@@ -135,19 +133,19 @@ def _safetensors(path: Path) -> dict:
         size = int.from_bytes(file.read(8), "little")
         if size > 100_000_000:
             raise ValueError("not a safetensors header")
-        header = json.loads(file.read(size))
+        header = parse_json(file.read(size), where=path)
     about = {key: _loaded(value) for key, value in header.pop("__metadata__", {}).items()}
     return {"tensors": {name: f"{entry['dtype']} {tuple(entry['shape'])}" for name, entry in header.items()}, **about}
 
 
 def _json(path: Path) -> dict:
-    return {"content": json.loads(path.read_text())}
+    return {"content": read_json(path)}
 
 
 def _folder(path: Path) -> dict:
     for name in ("coefficients.json", "run.json"):
         if (path / name).is_file():
-            return {"record": json.loads((path / name).read_text())}
+            return {"record": read_json(path / name)}
     raise ValueError("neither daylight coefficients nor a run")
 
 
@@ -157,7 +155,8 @@ READERS = {
     ".tif": _tif,
     ".tiff": _tif,
     ".npz": _npz,
-    ".glb": _glb,
+    ".glb": _gltf,
+    ".gltf": _gltf,
     ".mp4": _mp4,
     ".safetensors": _safetensors,
     ".json": _json,

@@ -263,15 +263,19 @@ def _map_grid(place: Place, spacing_m: float | None) -> tuple[Raster, np.ndarray
     from affine import Affine
 
     from seasonscapes.frames import enu_from_geodetic
-    from seasonscapes.terrain.crs import apply_affine
-    from seasonscapes.terrain.raster import geodetic_from_map, sample_raster
+    from seasonscapes.terrain.crs import apply_affine, geodetic_from_map
+    from seasonscapes.terrain.memory import check_memory
+    from seasonscapes.terrain.raster import sample_raster
 
     raster = place.elevation
     height, width = raster.values.shape[:2]
+    if spacing_m is not None and not 0.0 < spacing_m < np.inf:
+        raise InputError("--spacing-m", "out of range", got=spacing_m, expected="a positive number of metres")
     factor = 1.0 if spacing_m is None else spacing_m / sample_spacing_m(raster)
     rows, columns = max(1, round(height / factor)), max(1, round(width / factor))
     if rows * columns > 400_000_000:
         raise InputError("--spacing-m", "too many cells", got=rows * columns, expected="at most 400,000,000")
+    check_memory((rows, columns), "--spacing-m")
     transform = raster.transform * Affine.scale(width / columns, height / rows)
     column, row = np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5)
     # The mesh ends at the outermost samples: cells on its edge or beyond are moved inside, by a thousandth at least.

@@ -6,6 +6,7 @@ opens the same session and renders the same frame to the digit. `open_session` t
 
 from __future__ import annotations
 
+import logging
 import operator
 from dataclasses import asdict, dataclass, field
 from datetime import date, datetime
@@ -24,6 +25,7 @@ from seasonscapes.albedo.seasons import (
     snowline_fraction,
 )
 from seasonscapes.cameras.pinhole import Camera, view_in_frame
+from seasonscapes.errors import DamagedFile, InputError
 from seasonscapes.progress import Progress, task_progress
 from seasonscapes.scene import NamedCamera
 from seasonscapes.sky.illumination import Illumination
@@ -46,6 +48,8 @@ if TYPE_CHECKING:
     from seasonscapes.rendering.radiance import RenderedView
     from seasonscapes.rendering.relit_view import RelightableView
     from seasonscapes.rendering.transport import SamplingOptions, ViewCoefficients
+
+log = logging.getLogger(__name__)
 
 _COEFFICIENTS_CODE = ("rendering.transport", "rendering.coefficients_file", "terrain.view_refinement")
 _VIEW_ALBEDO_CODE = ("rendering.transport", "rendering.relit_view")
@@ -290,10 +294,18 @@ def _coefficients(
     sampling = sampling or SamplingOptions()
     key = artefact_key(inputs | {"sampling": asdict(sampling)}, _COEFFICIENTS_CODE)
     folder = place.workspace.folder / f"{place.scene.name}/coefficients-{key}"
-    if not (folder / "coefficients.json").is_file():
+    if folder.exists() and not folder.is_dir():
+        raise InputError(folder, "a file stands where a built folder belongs", cure="remove it")
+    coefficients = None
+    if (folder / "coefficients.json").is_file():
+        try:
+            coefficients = load_coefficients(folder, key=key)
+        except DamagedFile as error:
+            log.info("%s; light transport is traced again", error)
+    if coefficients is None:
         report = task_progress(progress, "light transport", start=0.1)
         save_coefficients(folder, trace_view(scene, camera, sampling, seed=seed, progress=report), key=key)
-    coefficients = load_coefficients(folder, key=key)
+        coefficients = load_coefficients(folder, key=key)
     assert isinstance(coefficients, ViewCoefficients)
     return coefficients
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
@@ -11,14 +12,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from seasonscapes.errors import InputError, NoTerrainInView
+from seasonscapes.images import atomic_path
 from seasonscapes.progress import Progress, task_progress
 from seasonscapes.sky.models import SkyModel
+from seasonscapes.text_files import read_json
 from seasonscapes.workflows.albedo_sources import scene_albedo
 from seasonscapes.workflows.illumination import illumination_for_camera, sky_model
 from seasonscapes.workflows.photograph_files import PhotographSources
 from seasonscapes.workflows.place import Place, utc_at
 from seasonscapes.workflows.views import scene_cameras
-from seasonscapes.workspace import artefact_key
+from seasonscapes.workspace import artefact_key, file_hash
 
 if TYPE_CHECKING:
     from seasonscapes.cameras.observation import Observation
@@ -31,6 +34,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _SIZE_PX = (720, 480)
+_SUMS = "checksums.json"
 PHOTOGRAPHS_CODE = ("workflows.synthetic_photographs",)
 
 
@@ -222,7 +226,28 @@ def photographed_in_workspace(
     inputs = {"place": place.key, "time": utc, "sky": model, "size": size_px}
     key = artefact_key(inputs, PHOTOGRAPHS_CODE)
     folder = place.workspace.folder / place.scene.name / f"webcams-{key}"
-    return photograph_series(place, [utc], model, folder, cameras=cameras, progress=progress)
+    _remove_changed(folder)
+    sources = photograph_series(place, [utc], model, folder, cameras=cameras, progress=progress)
+    files = sorted(path for path in folder.iterdir() if path.suffix in (".png", ".json", ".csv") and path.name != _SUMS)
+    with atomic_path(folder / _SUMS) as temporary:
+        temporary.write_text(json.dumps({path.name: file_hash(path) for path in files}, indent=1), encoding="utf-8")
+    return sources
+
+
+def _remove_changed(folder: Path) -> None:
+    """Remove photographs and records of the workspace that are not what was written, which is told."""
+    if not (folder / _SUMS).is_file():
+        return
+    try:
+        sums = read_json(folder / _SUMS)
+    except InputError:
+        sums = None
+    for path in sorted(path for path in folder.iterdir() if path.is_file() and path.name != _SUMS):
+        known = sums.get(path.name) if isinstance(sums, dict) else "unknown"
+        # What is not listed was written after the list, by a process that was killed before it wrote another.
+        if known is not None and file_hash(path) != known:
+            log.info("%s: its content is not what was written; it is made again", path)
+            path.unlink()
 
 
 def synthetic_observations(

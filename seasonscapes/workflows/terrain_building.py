@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -10,10 +11,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from seasonscapes.errors import InputError
-from seasonscapes.frames import LocalFrame, enu_from_geodetic
-from seasonscapes.terrain.crs import geodetic_from_map
+from seasonscapes.frames import LocalFrame
+from seasonscapes.terrain.crs import wrapped
+from seasonscapes.terrain.memory import check_memory
 from seasonscapes.terrain.mesh import MESHERS, build_mesh
-from seasonscapes.terrain.raster import bounds_geographic, centre_frame, fill_nodata, read_elevation
+from seasonscapes.terrain.placement import cell_sides_m, check_area
+from seasonscapes.terrain.raster import bounds_geographic, centre_frame, fill_nodata, raster_grid, read_elevation
+from seasonscapes.terrain.raster_files import OWN_FOLDER
 from seasonscapes.terrain.refine import refine_raster, refinement_factor
 from seasonscapes.terrain.surface import Raster, Terrain, load_terrain, save_terrain
 from seasonscapes.terrain.surface_grid import surface_grid
@@ -29,14 +33,23 @@ __all__ = [
     "MeshOptions",
     "build_massif",
     "build_terrain",
+    "finest_texel_m",
     "load_built_terrain",
     "load_massif",
     "local_frame",
     "read_heights",
+    "read_scene_elevation",
     "sample_spacing_m",
     "save_built_terrain",
     "save_massif",
+    "tell_texel_wish",
 ]
+
+log = logging.getLogger(__name__)
+
+
+# Texels a little finer than the image's pixels lose none of it by resampling.
+_TEXELS_PER_PIXEL = 0.7
 
 
 @dataclass(frozen=True)
@@ -79,6 +92,13 @@ class MeshOptions:
             raise InputError("--mesher", "unknown mesher", got=self.mesher, expected=", ".join(MESHERS))
         if self.atlas not in ATLASES:
             raise InputError("--atlas", "unknown atlas", got=self.atlas, expected=", ".join(ATLASES))
+        for flag, size_m in (("--max-error-m", self.max_error_m), ("--texel-m", self.texel_m)):
+            if size_m is not None and not 0.001 <= size_m <= 100_000.0:
+                raise InputError(flag, "out of range", got=size_m, expected="0.001 to 100000 (metres)")
+        if self.refine is not None and not 1 <= self.refine <= 64:
+            raise InputError("--refine", "out of range", got=self.refine, expected="1 to 64")
+        if not 1 <= self.max_side_px <= 32_768:
+            raise InputError("max_side_px", "out of range", got=self.max_side_px, expected="1 to 32768")
 
 
 def build_massif(declared: SyntheticElevation) -> SyntheticMassif:
@@ -108,10 +128,32 @@ def read_heights(scene: SceneFile, massif: SyntheticMassif | None, *, where: str
     if massif is not None:
         raster = massif.elevation
     else:
-        assert elevation.file is not None, "a scene has either a synthetic elevation or a file"
         bounds = scene.area.bounds_deg if scene.area is not None else None
-        raster = read_elevation(elevation.file, bounds_deg=bounds, band=elevation.band)
+        raster = read_scene_elevation(scene, bounds_deg=bounds)
+        check_area(bounds_geographic(raster), where)
     return fill_nodata(raster, max_share=elevation.max_hole_share, where=where)
+
+
+def read_scene_elevation(
+    scene: SceneFile, file: str | Path | None = None, *, bounds_deg: tuple[float, float, float, float] | None = None
+) -> Raster:
+    """Read a scene's own raster of heights as its file declares it, or another ``file`` of the user's choice.
+
+    A raster that the user names may lie anywhere; what it names in turn may not.
+    """
+    elevation = scene.elevation
+    if file is not None:
+        return read_elevation(file, bounds_deg=bounds_deg, confinement=OWN_FOLDER)
+    assert elevation is not None, "callers refuse scenes without elevation"
+    assert elevation.file is not None, "a scene has either a synthetic elevation or a file"
+    return read_elevation(
+        elevation.file,
+        bounds_deg=bounds_deg,
+        band=elevation.band,
+        unit=elevation.unit,
+        nodata=elevation.nodata,
+        confinement=scene.confinement,
+    )
 
 
 def local_frame(scene: SceneFile, elevation: Raster) -> LocalFrame:
@@ -126,7 +168,8 @@ def local_frame(scene: SceneFile, elevation: Raster) -> LocalFrame:
         return centre_frame(elevation, refraction_k=scene.refraction_k)
     origin = scene.origin
     west, south, east, north = bounds_geographic(elevation)
-    if not (west - 1.0 <= origin.longitude_deg <= east + 1.0 and south - 1.0 <= origin.latitude_deg <= north + 1.0):
+    longitude = float(wrapped(origin.longitude_deg, 0.5 * (west + east), 360.0))
+    if not (west - 1.0 <= longitude <= east + 1.0 and south - 1.0 <= origin.latitude_deg <= north + 1.0):
         raise InputError(
             "origin",
             "lies more than 1° outside the elevation raster",
@@ -138,11 +181,7 @@ def local_frame(scene: SceneFile, elevation: Raster) -> LocalFrame:
 
 def sample_spacing_m(raster: Raster) -> float:
     """Mean distance between neighbouring samples of a raster on the ground [m]."""
-    height, width = raster.values.shape[:2]
-    column, row = np.array([0.0, 1.0, 0.0]) + width // 2, np.array([0.0, 0.0, 1.0]) + height // 2
-    latitude, longitude = geodetic_from_map(raster.crs, *(raster.transform * (column, row)))
-    positions = enu_from_geodetic(LocalFrame(float(latitude[0]), float(longitude[0])), latitude, longitude, 0.0)
-    return float(np.mean(np.linalg.norm(positions[1:], axis=1)))
+    return float(np.mean(cell_sides_m(raster)))
 
 
 def build_terrain(
@@ -156,6 +195,9 @@ def build_terrain(
     """Mesh an elevation raster in a local frame and unwrap it; see `terrain.mesh` and `terrain.unwrap`."""
     report = progress or (lambda fraction: None)
     spacing_m = sample_spacing_m(elevation)
+    if options.refine is not None:
+        height, width = elevation.values.shape[:2]
+        check_memory((height * options.refine, width * options.refine), "--refine")
     factor = options.refine or refinement_factor(elevation.values[..., 0].size, spacing_m)
     bound = options.max_error_m or min(5.0, spacing_m / factor / 10.0)
     refined = refine_raster(elevation, factor)
@@ -188,16 +230,33 @@ def _texel_m(terrain: Terrain, elevation: Raster, scene: SceneFile, options: Mes
     if wish is None and scene.elevation is not None and scene.elevation.synthetic is not None:
         wish = scene.elevation.synthetic.detail_m
     elif wish is None and scene.imagery is not None:
-        wish = 0.7 * sample_spacing_m(_image_grid(scene.imagery.file))
+        wish = _TEXELS_PER_PIXEL * sample_spacing_m(raster_grid(scene.imagery.file, scene.confinement))
     elif wish is None:
         wish = sample_spacing_m(elevation)
-    extent_m = float(np.ptp(terrain.vertices[:, :2], axis=0).max())
-    return max(wish, extent_m / options.max_side_px * (1.0 + 1e-9))
+    return max(wish, finest_texel_m(terrain, options))
 
 
-def _image_grid(path: str) -> Raster:
-    """The grid of a raster file without its values."""
-    import rasterio
+def finest_texel_m(terrain: Terrain, options: MeshOptions) -> float:
+    """Smallest side of a texel that the largest side of a texture allows [m]."""
+    return float(np.ptp(terrain.vertices[:, :2].astype(np.float64), axis=0).max()) / options.max_side_px * (1.0 + 1e-9)
 
-    with rasterio.open(path) as source:
-        return Raster(np.empty((source.height, source.width, 0), np.float32), source.transform, source.crs.to_string())
+
+def tell_texel_wish(terrain: Terrain, scene: SceneFile, options: MeshOptions) -> None:
+    """Warn where the texels that were asked for, or the pixels of the scene's image, are finer than a texture can be."""
+    finest = finest_texel_m(terrain, options)
+    limit = f"the {options.max_side_px} texels that a side may have here allow {finest:.3g} m"
+    if options.texel_m is not None:
+        if options.texel_m < finest:
+            log.warning(
+                "--texel-m: texels of %g m were asked for, but %s; choose a smaller [area]", options.texel_m, limit
+            )
+    elif (
+        scene.imagery is not None
+        and (pixel := sample_spacing_m(raster_grid(scene.imagery.file, scene.confinement))) < 0.9 * finest
+    ):
+        log.warning(
+            "%s: its pixels of %.3g m are finer than texels can be: %s; choose a smaller [area]",
+            scene.imagery.file,
+            pixel,
+            limit,
+        )

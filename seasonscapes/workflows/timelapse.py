@@ -16,7 +16,15 @@ from seasonscapes import __version__
 from seasonscapes.errors import InputError
 from seasonscapes.exposure import develop, exposure_ev100, photo_ev100
 from seasonscapes.progress import Progress, each_reported
-from seasonscapes.relighting.frame_file import frame_header, frame_name, load_frame, save_frame, time_stamp
+from seasonscapes.relighting.frame_file import (
+    frame_header,
+    frame_name,
+    is_whole_frame,
+    load_frame,
+    save_frame,
+    time_stamp,
+)
+from seasonscapes.workflows.frame_claims import frames_claimed
 from seasonscapes.workflows.pictures import balance_rgb
 from seasonscapes.workflows.place import Place, utc_at
 from seasonscapes.workflows.relight_session import (
@@ -126,7 +134,7 @@ def session_frame(
     """
     path = folder / frame_name(time)
     copy = None if exr_folder is None else exr_folder / frame_name(time)
-    if path.is_file() and (copy is None or copy.is_file()):
+    if is_whole_frame(path) and (copy is None or copy.is_file()):
         return {"time_utc": time.isoformat(), "metered_ev100": frame_header(path)[0], "rendered": False}
     view, light, position = view_at(session, time)
     metered = exposure_ev100(view.radiance, "auto")
@@ -199,6 +207,50 @@ def render_frames(
 
         results = run_on_cluster(cluster, task, times)
     return sum(record["rendered"] for record in each_reported(results, len(times), progress, "frames"))
+
+
+def make_film(
+    job: RenderJob,
+    times: Sequence[datetime],
+    output: Path,
+    look: FilmLook | None = None,
+    *,
+    cluster: str | None = None,
+    exr_folder: Path | None = None,
+    keep_frames: bool = False,
+    place: Place | None = None,
+    progress: Progress | None = None,
+) -> tuple[list[Path], int]:
+    """Render a job's missing frames, develop all, and remove them when the film is done; see `render_frames`.
+
+    Frames are kept where rendering or encoding fails, and those that another process's film needs are left to it.
+
+    Parameters
+    ----------
+    job, times, cluster, exr_folder, place, progress
+        As in `render_frames`.
+    output, look
+        As in `develop_frames`.
+    keep_frames
+        Leave the undeveloped frames in the workspace.
+
+    Returns
+    -------
+    paths, rendered
+        The files written, and how many frames were rendered now.
+
+    Raises
+    ------
+    NoTerrainInView, InputError
+        As in `render_frames`; a film that cannot be encoded.
+    """
+    folder = frames_folder(cached_session(job, place=place, progress=progress))
+    with frames_claimed(folder, [frame_name(time) for time in times]) as claim:
+        rendered = render_frames(job, times, cluster=cluster, exr_folder=exr_folder, place=place, progress=progress)
+        paths = develop_film(job, times, output, look, progress=progress)
+        if not keep_frames:
+            claim.sweep()
+    return paths, rendered
 
 
 def develop_film(
@@ -346,18 +398,10 @@ def timelapse(
     if not utc:
         raise InputError("times", "no time in it", got=str(times))
     folder = frames_folder(session)
-    for time in each_reported(utc, len(utc), progress, "frames"):
-        session_frame(session, folder, time)
-    return develop_frames(folder, utc, Path(output), look or FilmLook(), _about(session, ""), progress=progress)
-
-
-def remove_frames(job: RenderJob, times: Sequence[datetime]) -> None:
-    """Remove a job's undeveloped frames of these instants from the workspace."""
-    folder = frames_folder(cached_session(job))
-    for time in times:
-        (folder / frame_name(time)).unlink(missing_ok=True)
-    if folder.is_dir() and not any(folder.iterdir()):
-        folder.rmdir()
+    with frames_claimed(folder, [frame_name(time) for time in utc]):
+        for time in each_reported(utc, len(utc), progress, "frames"):
+            session_frame(session, folder, time)
+        return develop_frames(folder, utc, Path(output), look or FilmLook(), _about(session, ""), progress=progress)
 
 
 def shard(times: Sequence[datetime], part: int, parts: int) -> list[datetime]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,12 +11,17 @@ import numpy as np
 from seasonscapes.errors import InputError
 from seasonscapes.frames import geodetic_from_enu
 from seasonscapes.scene import NamedCamera, Viewpoint, camera_from_named_view
-from seasonscapes.workflows.place import Place, ground_height_m, ground_or_nan
+from seasonscapes.workflows.place import Place, ground_height_m, ground_or_nan, require_near
 
 if TYPE_CHECKING:
     from seasonscapes.cameras.panorama import Panorama
     from seasonscapes.cameras.pinhole import Camera
     from seasonscapes.terrain.surface import Terrain
+
+log = logging.getLogger(__name__)
+
+# Less distortion moves no pixel of a common camera by more than one.
+_VISIBLE_K1 = 1e-3
 
 __all__ = ["camera", "camera_for", "camera_geodetic", "scene_cameras"]
 
@@ -79,6 +86,7 @@ def camera_for(place: Place, view: Viewpoint, *, size_px: tuple[int, int], where
     if view.above_ground_m is not None:
         ground = ground_height_m(place, view.latitude_deg, view.longitude_deg, where=where)
     else:
+        require_near(place, view.latitude_deg, view.longitude_deg, where=where)
         ground = ground_or_nan(place, view.latitude_deg, view.longitude_deg)
         if view.height_m is not None and view.height_m < ground:
             raise InputError(
@@ -91,6 +99,43 @@ def camera_for(place: Place, view: Viewpoint, *, size_px: tuple[int, int], where
                 cure="give above_ground_m instead",
             )
     return camera_from_named_view(place.frame, view, ground, size_px=size_px)
+
+
+def calibrated_viewpoint(path: Path) -> tuple[NamedCamera, tuple[int, int]]:
+    """The viewpoint and the picture's size of a calibration record, as ``seasonscapes calibrate`` writes it.
+
+    Raises
+    ------
+    InputError
+        Where it is no such record, or that of a panorama.
+    """
+    from seasonscapes.calibration.calibration_file import read_calibration
+    from seasonscapes.calibration.pose_model import angles_from_rotation
+    from seasonscapes.cameras.pinhole import Camera
+    from seasonscapes.frames import local_axes
+
+    record = read_calibration(path)
+    camera = record.view
+    if not isinstance(camera, Camera):
+        cure = "`seasonscapes webcams` splits it into views"
+        raise InputError(path, "is the record of a panorama", expected="that of a perspective picture", cure=cure)
+    if abs(record.k1) > _VISIBLE_K1:
+        log.warning("%s: the picture is drawn without the lens distortion k1 = %.4g", path, record.k1)
+    latitude, longitude, height = (float(v) for v in geodetic_from_enu(record.frame, camera.position_m))
+    axes = local_axes(record.frame, latitude, longitude)
+    heading, pitch, roll = angles_from_rotation(axes @ camera.world_from_camera[:3, :3])
+    view = NamedCamera(
+        name=record.webcam,
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        height_m=height,
+        heading_deg=heading,
+        pitch_deg=pitch,
+        roll_deg=roll,
+        fov_deg=float(np.degrees(2.0 * np.arctan(0.5 * camera.width_px / camera.fx))),
+        principal_point=(camera.cx / camera.width_px, camera.cy / camera.height_px),
+    )
+    return view, (camera.width_px, camera.height_px)
 
 
 def terrain_for_view(place: Place, view: Camera | Panorama) -> Terrain:
@@ -131,16 +176,15 @@ def scene_cameras(place: Place, *, leave_out: set[str] | None = None, size_px: t
 def local_ground(place: Place):
     """Heights of the ground in the local frame as a function of positions ``(N, 2)`` east, north [m]; NaN outside."""
     from seasonscapes.frames import enu_from_geodetic
-    from seasonscapes.terrain.raster import map_from_geodetic, sample_raster
+    from seasonscapes.terrain.crs import map_position
+    from seasonscapes.terrain.raster import sample_raster
 
     def heights(positions: np.ndarray) -> np.ndarray:
         up = np.zeros(len(positions))
         # The local vertical differs from the frame's, so a point's height shifts it sideways; two rounds converge.
         for _ in range(2):
             latitude, longitude, _ = geodetic_from_enu(place.frame, np.column_stack([positions, up]))
-            height = sample_raster(place.elevation, *map_from_geodetic(place.elevation.crs, latitude, longitude))[
-                ..., 0
-            ]
+            height = sample_raster(place.elevation, *map_position(place.elevation, latitude, longitude))[..., 0]
             up = enu_from_geodetic(place.frame, latitude, longitude, np.nan_to_num(height))[..., 2]
         return np.where(np.isfinite(height), up, np.nan)
 

@@ -143,18 +143,20 @@ def webcam_station(
     960
     """
     from seasonscapes.cameras.webcam import find_webcam, webcam_model
-    from seasonscapes.terrain.raster import fill_nodata, map_from_geodetic, read_elevation, sample_raster
+    from seasonscapes.terrain.crs import map_position
+    from seasonscapes.terrain.raster import fill_nodata, sample_raster
+    from seasonscapes.workflows.terrain_building import read_scene_elevation
 
     read = scene_with_webcams(scene, allow_outside=allow_outside)
     if webcam is None and len(read.webcams) > 1:
         raise InputError("--webcam", "missing", expected="one of " + ", ".join(w.id for w in read.webcams))
     found = read.webcams[0] if webcam is None else find_webcam(read.webcams, webcam)
-    first = elevation or (read.elevation and read.elevation.file)
-    if first is None:
+    own = read.elevation.file if read.elevation is not None else None
+    if elevation is None and own is None:
         raise InputError(scene, "names no elevation raster", cure="give one with --elevation FILE")
-    files = [Path(file) for file in (first, context) if file is not None]
-    rasters = [fill_nodata(read_elevation(file), where=str(file))[0] for file in files]
-    x, y = map_from_geodetic(rasters[0].crs, found.latitude_deg, found.longitude_deg)
+    files = [elevation, *([] if context is None else [context])]
+    rasters = [fill_nodata(read_scene_elevation(read, file), where=str(file or own))[0] for file in files]
+    x, y = map_position(rasters[0], found.latitude_deg, found.longitude_deg)
     ground = float(sample_raster(rasters[0], x, y)[..., 0])
     if not np.isfinite(ground):
         raise InputError("--webcam", f"'{found.id}' stands outside the elevation raster")
@@ -220,14 +222,14 @@ def camera_station(place: Place, camera: Camera, *, name: str = "webcam") -> Web
 
 def read_picture(path: Path, where: str) -> np.ndarray:
     """A picture file as ``(H, W, 3)`` uint8 sRGB; `InputError` about ``where`` where it is none."""
-    from seasonscapes.calibration.skyline import read_image_srgb8
+    from seasonscapes.images import read_image_srgb8
 
     if not path.is_file():
         raise InputError(where, "no such file", got=str(path))
     try:
         return read_image_srgb8(path)
-    except UnreadableImage:
-        raise InputError(where, "not a readable picture", got=str(path)) from None
+    except UnreadableImage as error:
+        raise InputError(where, str(error)) from None
 
 
 def station_picture(path: Path, station: WebcamStation, where: str) -> np.ndarray:
@@ -312,7 +314,8 @@ def calibrate(
         )
         if fit.calibration is None:
             raise NotEnoughEvidence("; ".join(fit.doubts))
-        return WebcamCalibration(station, fit.calibration, fit.horizon, points, fit.doubts)
+        doubts = (*fit.doubts, *_contradictions(station, fit.calibration, points))
+        return WebcamCalibration(station, fit.calibration, fit.horizon, points, doubts)
     if points is None:
         raise InputError("calibrate", "no evidence", cure="give --points FILE, --skyline, or both")
     sigma_m = webcam.position_sigma_m
@@ -320,7 +323,17 @@ def calibrate(
     solution = resect(station.view, points, priors=priors, k1=webcam.radial_k1, axes=station.axes)
     options = HorizonOptions(below_ground_m=40.0)
     horizon = horizon_from(station.rasters, station.frame, solution.view.position_m, options=options)
-    return WebcamCalibration(station, solution, horizon, points)
+    return WebcamCalibration(station, solution, horizon, points, _contradictions(station, solution, points))
+
+
+def _contradictions(station: WebcamStation, solution: Calibration, points: Correspondences | None) -> tuple[str, ...]:
+    """Doubts about a pose far from the stated one, and about points in another vertical datum."""
+    from seasonscapes.calibration.contradictions import datum_doubts, position_doubts
+
+    doubts = position_doubts(station.view, solution, station.axes, station.webcam.position_sigma_m)
+    if points is not None:
+        doubts += datum_doubts(points, station.frame, station.rasters)
+    return tuple(doubts)
 
 
 def calibrate_by_skylines(
@@ -348,7 +361,8 @@ def calibrate_by_skylines(
     """
     from seasonscapes.calibration.calibration_file import read_calibration, write_calibration
     from seasonscapes.calibration.pose_model import parameters_of_view, view_from_parameters
-    from seasonscapes.calibration.skyline import align_to_skyline, read_image_srgb8
+    from seasonscapes.calibration.skyline import align_to_skyline
+    from seasonscapes.images import read_image_srgb8
 
     files, doubts = [], {}
     for record in sorted(records.glob("*_calibration.json")):

@@ -84,7 +84,7 @@ def inspect_webcams(
         write_manifest,
     )
 
-    heights = _heights(scene, elevation or (scene.elevation and scene.elevation.file))
+    heights = _heights(scene, elevation)
     rows, problems = [], []
     if pictures is not None:
         rows, problems = scan_folder(pictures, scene.webcams, layout=layout or REFERENCE_LAYOUT)
@@ -93,20 +93,22 @@ def inspect_webcams(
             bad = {problem.path for problem in problems}
             write_manifest(manifest, [row for row in rows if row.path not in bad])
     elif manifest is not None:
-        rows = read_manifest(manifest)
+        rows = read_manifest(manifest, allow_outside=scene.confinement.allow_outside)
         problems = check_pictures(rows, manifest.parent, scene.webcams, decode=decode)
     return WebcamInspection(scene, heights, rows, problems)
 
 
-def _heights(scene: SceneFile, source: Path | str | None) -> list[HeightCheck]:
-    """Each webcam's height against the terrain; nothing where there is no raster."""
+def _heights(scene: SceneFile, elevation: Path | str | None) -> list[HeightCheck]:
+    """Each webcam's height against the given or the scene's own raster; nothing where there is none."""
     from seasonscapes.cameras.webcam import check_heights
-    from seasonscapes.terrain.raster import map_from_geodetic, read_elevation, sample_raster
+    from seasonscapes.terrain.crs import map_position
+    from seasonscapes.terrain.raster import sample_raster
+    from seasonscapes.workflows.terrain_building import read_scene_elevation
 
-    if source is None:
+    if elevation is None and (scene.elevation is None or scene.elevation.file is None):
         return []
     bounds = scene.area.bounds_deg if scene.area is not None else None
-    raster = read_elevation(source, bounds_deg=bounds)
+    raster = read_scene_elevation(scene, elevation, bounds_deg=bounds)
     latitudes, longitudes = zip(*((webcam.latitude_deg, webcam.longitude_deg) for webcam in scene.webcams), strict=True)
-    x, y = map_from_geodetic(raster.crs, list(latitudes), list(longitudes))
+    x, y = map_position(raster, list(latitudes), list(longitudes))
     return check_heights(scene.webcams, sample_raster(raster, x, y)[..., 0].tolist())

@@ -1,0 +1,425 @@
+"""Places from open data: right heights and colours whatever the catalogue's traps, and one line where it fails.
+
+A catalogue and its files stand on loopback, in a process of their own, shaped as the real ones are (`open_data_world`).
+Several places on Earth hold one trap each. No test leaves the machine, but the one marked `network`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import rasterio
+from command_line import command
+from open_data_world import World, height_m, reflectance
+from pvlib.solarposition import get_solarposition
+
+from seasonscapes.errors import InputError
+from seasonscapes.open_data import remote
+from seasonscapes.open_data.requests_as_text import parse_extent, parse_interval
+from seasonscapes.terrain.crs import geodetic_from_map
+
+ALPS = (46.55, 7.999)  # the border between two tiles runs through it
+ZONES = (46.5, 5.999)  # on both sides of the border of two UTM zones
+DATE_LINE = (-16.8, 179.999)
+COAST = (10.0, 20.075)  # no tile east of 20.075° E
+WITHHELD = (40.1, 45.0)  # GLO-30 has no tile, GLO-90 has
+VOIDS = (30.0, 80.0)
+LIAR = (20.0, 100.0)  # an item states twice the land that its file shows
+SNOW = (46.0, 12.0)
+WRONG = (50.0, 20.0)  # items that state an offset which was applied before
+RANGE = "2024-07..2024-09"
+
+
+def sky(where):
+    """SCL of a day over SNOW: cloud where it is, a bright patch that is taken for cloud on every day, snow in the east."""
+
+    def classes(latitude, longitude):
+        north, east = latitude - SNOW[0], longitude - SNOW[1]
+        kind = np.where(east > 0.004, 11, 4)
+        kind = np.where((np.abs(north + 0.009) < 0.003) & (np.abs(east - 0.009) < 0.004), 8, kind)
+        return np.where(where(north, east), 9, kind)
+
+    return classes
+
+
+DAYS_OVER_SNOW = {
+    "2024-07-14T10:15:31Z": sky(lambda north, east: (np.abs(north) < 0.006) & (np.abs(east + 0.006) < 0.006)),
+    "2024-07-19T10:15:31Z": sky(lambda north, east: north > 0.0065),
+    "2024-07-24T10:15:31Z": sky(lambda north, east: north > 0.0075),
+}
+
+
+def snowy(latitude, longitude):
+    snow = (longitude > SNOW[1] + 0.004)[..., None]
+    return np.where(snow, 0.7, reflectance(latitude, longitude))
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    world = World(tmp_path_factory.mktemp("open_data") / "world")
+    for west in (7.85, 8.0):
+        world.dem_tile(west, 46.475)
+    for when, options in (
+        ("2024-07-14T10:25:31Z", {}),
+        ("2018-07-14T10:25:31Z", {"baseline": "02.08"}),
+        ("2022-07-14T10:25:31Z", {"baseline": "04.00", "declared": False}),
+        ("2019-07-14T10:25:31Z", {"baseline": "02.13", "declared": False}),
+    ):
+        world.sentinel_tile(when, "EPSG:32632", *ALPS, size_m=5000.0, **options)
+
+    world.dem_tile(5.925, 46.425)
+    world.sentinel_tile("2024-07-14T10:25:31Z", "EPSG:32631", ZONES[0], ZONES[1] - 0.02, size_m=4500.0)
+    world.sentinel_tile("2024-07-14T10:25:45Z", "EPSG:32632", ZONES[0], ZONES[1] + 0.02, size_m=4500.0)
+
+    world.dem_tile(179.85, -16.875)
+    world.dem_tile(-180.0, -16.875)
+    world.sentinel_tile("2024-07-14T22:19:36Z", "EPSG:32760", *DATE_LINE, size_m=5000.0)
+
+    world.dem_tile(19.925, 9.925)
+    world.dem_tile(44.85, 39.9, size_deg=0.3, samples_per_deg=1200, collection="cop-dem-glo-90")
+    world.dem_tile(79.925, 29.925, void=lambda lat, lon: np.hypot(lat - VOIDS[0], lon - VOIDS[1]) < 0.004)
+    world.dem_tile(79.85, 29.85, size_deg=0.3, samples_per_deg=1200, collection="cop-dem-glo-90")
+    liar = world.dem_tile(99.85, 19.925, size_deg=0.15)
+    stated = world.folder / "items" / "cop-dem-glo-30" / f"{liar.stem}.json"
+    item = json.loads(stated.read_text())
+    item["bbox"][2] += 0.15
+    stated.write_text(json.dumps(item))
+
+    world.dem_tile(11.925, 45.925)
+    for when, classes in DAYS_OVER_SNOW.items():
+        world.sentinel_tile(when, "EPSG:32633", *SNOW, size_m=4000.0, classes=classes, colours=snowy)
+
+    world.dem_tile(19.925, 49.925)
+    world.sentinel_tile("2024-07-14T09:50:31Z", "EPSG:32634", *WRONG, size_m=4000.0, stored_offset=False)
+    yield world
+    world.stop()
+
+
+@pytest.fixture(scope="module")
+def url(world):
+    return world.start()
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    """A cache that the tests share; those of the cache itself have their own."""
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture
+def fetch(url, cache, world, tmp_path, monkeypatch):
+    monkeypatch.setattr(remote, "FIRST_WAIT_S", 0.02)
+    world.faults()
+    world.requests()
+
+    def run(place, **flags) -> Path:
+        output = flags.pop("output", tmp_path / "place.toml")
+        flags = {"stac": url, "size": "3km", "date": RANGE, "workspace": cache} | flags
+        # A blank before a negative number is a blank like any other.
+        command("fetch", at=",".join(map(str, place)), output=output, **flags)
+        return output
+
+    return run
+
+
+def raster(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Values ``(H, W, C)`` with NaN, latitude and longitude of the pixels' centres."""
+    with rasterio.open(path) as file:
+        values = np.ma.filled(file.read(masked=True).astype(float), np.nan).transpose(1, 2, 0)
+        u, v = np.meshgrid(np.arange(file.width) + 0.5, np.arange(file.height) + 0.5)
+        latitude, longitude = geodetic_from_map(file.crs.to_string(), *(file.transform * (u, v)))
+    return values, latitude, longitude
+
+
+def height_error(scene: Path) -> np.ndarray:
+    values, latitude, longitude = raster(scene.with_name(f"{scene.stem}.dem.tif"))
+    return np.abs(values[..., 0] - height_m(latitude, longitude))
+
+
+def colour_error(scene: Path, colours=reflectance) -> np.ndarray:
+    values, latitude, longitude = raster(scene.with_name(f"{scene.stem}.ortho.tif"))
+    return np.abs(values / 1e4 - colours(latitude, longitude)).max(axis=2)
+
+
+def sources(scene: Path) -> dict:
+    return json.loads(scene.with_name(f"{scene.stem}.sources.json").read_text())
+
+
+# ---------------------------------------------------------------------------------------------- right by construction
+
+
+def test_a_place_appears_from_its_coordinates(fetch, url):
+    """Heights across the border of two tiles to 0.3 m: pixel is point, or slopes of 30° would be off by 8 m."""
+    scene = fetch(ALPS)
+    declared = tomllib.loads(scene.read_text())
+    assert declared["vertical_datum"] == "EGM2008"
+    assert "WorldDEM-30 © DLR" in declared["attribution"]
+    assert "Copernicus Sentinel data 2024" in declared["attribution"]
+    assert [camera["name"] for camera in declared["camera"]] == ["summit", "valley", "air"]
+    assert height_error(scene).max() < 0.3
+    assert colour_error(scene).max() < 2e-3
+    told = sources(scene)
+    assert told["imagery"]["time"] == "2024-07-14T10:25:31Z"
+    sun = get_solarposition(pd.DatetimeIndex(["2024-07-14T10:25:31Z"]), *ALPS)
+    assert told["imagery"]["sun"]["azimuth_deg"] == pytest.approx(float(sun["azimuth"].iloc[0]), abs=0.1)
+    assert told["imagery"]["sun"]["elevation_deg"] == pytest.approx(float(sun["apparent_elevation"].iloc[0]), abs=0.1)
+    assert told["imagery"]["sun"]["stated_azimuth_deg"] == 160.0
+    assert {item["address"].startswith(url) for item in told["elevation"]["items"]} == {True}
+    assert len(told["elevation"]["items"]) == 2
+    assert all(item["etag"] for item in told["imagery"]["items"])
+
+
+@pytest.mark.parametrize("year", [2018, 2019, 2022])
+def test_the_offset_is_that_of_the_baseline(fetch, year):
+    """Baselines before 04.00 have none, later ones have it whether the item says so or not."""
+    scene = fetch(ALPS, date=str(year), size="2km")
+    assert colour_error(scene).max() < 2e-3
+
+
+def test_two_utm_zones_join_without_a_seam(fetch):
+    scene = fetch(ZONES)
+    assert height_error(scene).max() < 0.3
+    assert colour_error(scene).max() < 3e-3
+    assert len({item["id"] for item in sources(scene)["imagery"]["items"]}) == 2
+
+
+def test_the_antimeridian_is_a_place_like_any_other(fetch):
+    scene = fetch(DATE_LINE)
+    assert height_error(scene).max() < 0.3
+    assert colour_error(scene).max() < 2e-3
+    assert len(sources(scene)["elevation"]["items"]) == 2
+
+
+def test_sea_without_tiles_is_at_zero(fetch):
+    scene = fetch(COAST, imagery="none")
+    values, _, longitude = raster(scene.with_name("place.dem.tif"))
+    east = longitude > COAST[1] + 0.001
+    assert east.mean() == pytest.approx(0.45, abs=0.1)
+    assert (values[..., 0][east] == 0.0).all()
+    assert height_error(scene)[longitude < COAST[1] - 0.001].max() < 0.3
+    assert sources(scene)["elevation"]["shares"]["sea"] == pytest.approx(east.mean(), abs=0.05)
+
+
+def test_withheld_tiles_come_from_the_coarser_product_and_it_is_told(fetch):
+    scene = fetch(WITHHELD, imagery="none")
+    assert height_error(scene).max() < 3.0
+    told = sources(scene)["elevation"]
+    assert told["shares"] == {"cop-dem-glo-90": 1.0}
+    assert "WorldDEM-90" in tomllib.loads(scene.read_text())["attribution"]
+
+
+def test_voids_are_filled_from_the_coarser_product(fetch):
+    scene = fetch(VOIDS, imagery="none")
+    assert height_error(scene).max() < 3.0
+    shares = sources(scene)["elevation"]["shares"]
+    assert 0.02 < shares["cop-dem-glo-90"] < 0.2
+    assert sum(shares.values()) == pytest.approx(1.0)
+
+
+def test_a_cloud_over_snow_is_filled_and_snow_taken_for_cloud_is_kept(fetch):
+    """The clearest day lights the image; what its cloud hides is of the next days, and told with its share."""
+    scene = fetch(SNOW)
+    assert colour_error(scene, snowy).max() < 0.01
+    told = sources(scene)["imagery"]
+    assert told["time"] == "2024-07-14T10:15:31Z"
+    assert told["report"]["known_share"] == 1.0
+    assert 0.13 < told["report"]["filled_from"][0]["share"] < 0.22
+    assert told["report"]["snow_share"] > 0.3
+
+
+def test_a_median_has_no_time(fetch):
+    scene = fetch(SNOW, composite="median")
+    told = sources(scene)["imagery"]
+    assert told["time"] is None
+    assert len(told["report"]["times"]) == 3
+    assert "time" not in tomllib.loads(scene.read_text())["imagery"]
+
+
+def test_an_offset_that_was_applied_before_is_noticed(fetch):
+    with pytest.raises(InputError, match="no image make sense as reflectance"):
+        fetch(WRONG)
+
+
+# ---------------------------------------------------------------------------------------------- networks
+
+
+def test_plan_loads_nothing(fetch, world, tmp_path, capsys):
+    fetch(ALPS, plan=True, json=True)
+    told = json.loads(capsys.readouterr().out)
+    assert len(told["elevation"]["items"]) == 2
+    assert told["imagery"]["days"][0]["time"] == "2024-07-14T10:25:31Z"
+    assert told["elevation"]["about_bytes"] > 1000
+    assert "WorldDEM-30" in told["elevation"]["licences"][0]["attribution"]
+    assert not [line for line in world.requests() if "/files/" in line]
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_is_cached_is_not_asked_again_and_serves_offline(fetch, world, tmp_path):
+    scene = fetch(ALPS, workspace=tmp_path / "cache")
+    first = {path.name: path.read_bytes() for path in tmp_path.glob("place.*.tif")}
+    assert world.requests()
+    fetch(ALPS, workspace=tmp_path / "cache")
+    fetch(ALPS, workspace=tmp_path / "cache", offline=True)
+    assert world.requests() == []
+    assert {path.name: path.read_bytes() for path in tmp_path.glob("place.*.tif")} == first
+    assert scene.is_file()
+    with pytest.raises(InputError, match="not asked about this area before; leave out --offline once"):
+        fetch((46.56, 7.99), workspace=tmp_path / "cache", offline=True)
+
+
+def test_bad_networks_are_survived(fetch, world, tmp_path):
+    """Busy servers, cut answers and cut files: asked again, same result."""
+    world.faults(
+        ("/search", 502, 2), ("/search", "cut", 1), ("DEM.tif", 503, 2), ("B04", "cut", 2), ("SCL", "whole", 1)
+    )
+    scene = fetch(ALPS, workspace=tmp_path / "cache")
+    assert height_error(scene).max() < 0.3
+    assert colour_error(scene).max() < 2e-3
+
+
+def test_an_interrupted_download_resumes(fetch, world, tmp_path):
+    world.faults(("B02", 503, 99))
+    with pytest.raises(InputError, match=r"503 .*, 5 times; run the same command again later: what is loaded is kept"):
+        fetch(ALPS, workspace=tmp_path / "cache")
+    assert [path.name for path in tmp_path.iterdir()] == ["cache"]
+    world.faults()
+    loaded = {line for line in world.requests() if "B02" not in line}
+    assert colour_error(fetch(ALPS, workspace=tmp_path / "cache")).max() < 2e-3
+    assert not loaded & set(world.requests())
+
+
+def test_an_expired_cache_asks_again_and_a_changed_file_is_loaded_anew(fetch, world, tmp_path, caplog):
+    cache = tmp_path / "cache"
+    scene = fetch(ALPS, imagery="none", workspace=cache)
+    for state in (cache / "open_data").rglob("state.json"):
+        state.write_text(state.read_text().replace('"asked": "20', '"asked": "19'))
+    for search in (cache / "open_data" / "searches").iterdir():
+        search.write_text(search.read_text().replace('"asked": "20', '"asked": "19'))
+    changed = next((world.folder / "files" / "cop-dem-glo-30").glob("*+46.48_+8.00*"))
+    before = changed.read_bytes()
+    world.requests()
+    try:
+        world.dem_tile(8.0, 46.475, heights=lambda lat, lon: height_m(lat, lon) + 100.0)
+        fetch(ALPS, imagery="none", workspace=cache)
+        values, latitude, longitude = raster(scene.with_name("place.dem.tif"))
+        east = longitude > 8.001
+        assert np.abs(values[..., 0] - height_m(latitude, longitude) - 100.0)[east].max() < 0.3
+    finally:
+        changed.write_bytes(before)
+    assert any("/search" in line for line in world.requests())
+
+
+def test_a_silent_catalogue_is_replaced_by_its_last_answer(fetch, world, tmp_path, caplog):
+    cache = tmp_path / "cache"
+    fetch(ALPS, imagery="none", workspace=cache)
+    for search in (cache / "open_data" / "searches").iterdir():
+        search.write_text(search.read_text().replace('"asked": "20', '"asked": "19'))
+    world.faults(("/search", 503, 99))
+    fetch(ALPS, imagery="none", workspace=cache)
+    assert "its answer of 19" in caplog.text
+
+
+def test_damage_in_the_cache_is_loaded_again(fetch, tmp_path):
+    cache = tmp_path / "cache"
+    fetch(ALPS, imagery="none", workspace=cache)
+    for blocks in (cache / "open_data").rglob("*.blocks"):
+        content = bytearray(blocks.read_bytes())
+        content[1000:1010] = b"x" * 10
+        blocks.write_bytes(bytes(content))
+    for index in list((cache / "open_data").rglob("*.index.npy"))[:1]:
+        index.write_bytes(b"no index")
+    assert height_error(fetch(ALPS, imagery="none", workspace=cache)).max() < 0.3
+
+
+# ---------------------------------------------------------------------------------------------- failures
+
+
+def failure(fetch, place, tmp_path: Path, **flags) -> str:
+    """The one line of a failure; nothing is left beside the cache."""
+    with pytest.raises(InputError) as caught:
+        fetch(place, workspace=tmp_path / "cache", **flags)
+    assert [path.name for path in tmp_path.iterdir() if path.name != "cache"] == []
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_a_catalogue_that_lies_about_its_extent_is_told(fetch, tmp_path):
+    line = failure(fetch, LIAR, tmp_path, imagery="none")
+    assert "a part of the area has no heights, though the catalogue states that it covers it; got '51 %'" in line
+
+
+def test_a_truncated_file_is_told(fetch, world, tmp_path):
+    path = next((world.folder / "files" / "cop-dem-glo-30").glob("*+45.92_+11.93*"))
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    try:
+        line = failure(fetch, SNOW, tmp_path, imagery="none")
+    finally:
+        path.write_bytes(whole)
+    assert path.name in line
+    assert "damaged, cut short or no GeoTIFF" in line
+
+
+def test_a_missing_file_is_told(fetch, world, tmp_path):
+    world.faults(("B03", 404, 99))
+    line = failure(fetch, ALPS, tmp_path)
+    assert "B03.tif: the server answers 404" in line
+    assert "choose another --date or source" in line
+
+
+def test_a_missing_tile_is_replaced_by_the_coarser_product(fetch, world, tmp_path):
+    world.faults(("cop-dem-glo-30/", 404, 99))
+    scene = fetch(VOIDS, imagery="none", workspace=tmp_path / "cache")
+    assert sources(scene)["elevation"]["shares"] == {"cop-dem-glo-90": 1.0}
+    assert len(sources(scene)["elevation"]["missing_items"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("place", "flags", "line"),
+    [
+        ((0.0, -150.0), {"imagery": "none"}, "is the place on land"),
+        (ALPS, {"date": "2011"}, "no image in this time with so few clouds"),
+        (ALPS, {"stac": "file:///etc"}, "--stac: not an address"),
+        (ALPS, {"stac": "http://127.0.0.1:9/"}, "the catalogue does not answer"),
+        (ALPS, {"elevation": "srtm"}, "--elevation: unknown source of elevation; got 'srtm'; expected one of"),
+        (ALPS, {"elevation": "sentinel-2"}, "unknown source of elevation"),
+        (ALPS, {"imagery": "nothing/*.tif"}, "--imagery: no such file"),
+        ((10.0, 10.0), {"elevation": "swissalti3d"}, "swissALTI3D has nothing here"),
+        (ALPS, {"size": "20"}, "--size: not an extent"),
+        (ALPS, {"size": "2000km"}, "--size: out of range"),
+        (ALPS, {"composite": "mean"}, "--composite: unknown composite"),
+        (ALPS, {"cloud": 120}, "--cloud: out of range"),
+        (ALPS, {"date": "2024-13"}, "--date: not a time"),
+    ],
+)
+def test_mistakes_are_one_line(fetch, tmp_path, place, flags, line):
+    assert line in failure(fetch, place, tmp_path, **flags)
+
+
+def test_an_edited_scene_is_not_overwritten(fetch):
+    scene = fetch(COAST, imagery="none")
+    fetch(COAST, imagery="none")
+    scene.write_text(scene.read_text() + "# mine\n")
+    with pytest.raises(InputError, match="exists, and is not as fetch wrote it"):
+        fetch(COAST, imagery="none")
+
+
+def test_intervals_and_extents():
+    assert parse_interval("2024-07..2024-09") == "2024-07-01T00:00:00Z/2024-09-30T23:59:59Z"
+    assert parse_interval("2024-02") == "2024-02-01T00:00:00Z/2024-02-29T23:59:59Z"
+    assert parse_interval("2024-02-03") == "2024-02-03T00:00:00Z/2024-02-03T23:59:59Z"
+    assert parse_extent("30x20km") == (30_000.0, 20_000.0)
+    assert parse_extent("800 m") == (800.0, 800.0)
+
+
+@pytest.mark.network
+@pytest.mark.skipif("SEASONSCAPES_NETWORK" not in os.environ, reason="asks real catalogues")
+def test_the_real_catalogues_answer(tmp_path):
+    command("fetch", at="46.62,8.03", size="3km", date="2024-07..2024-09", output=tmp_path / "grindelwald.toml")
+    assert sources(tmp_path / "grindelwald.toml")["imagery"]["report"]["known_share"] > 0.9
