@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -91,8 +91,6 @@ class TexturedMesh:
         Local frame, whose origin is in the middle of the mesh.
     up
         ``"y"`` or ``"z"``: the file's axis that points upwards.
-    notes
-        What was found that may not be meant, one line each.
     """
 
     path: Path
@@ -102,7 +100,6 @@ class TexturedMesh:
     turn: np.ndarray
     frame: LocalFrame
     up: str
-    notes: tuple[str, ...] = field(default=())
 
     @property
     def bounds_m(self) -> tuple[np.ndarray, np.ndarray]:
