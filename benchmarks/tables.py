@@ -123,7 +123,7 @@ TABLES = {
     "night": Table(
         "sky_night",
         (
-            Row("sun from +20° to −18°, factor from the nearer of two published fits, largest", "{twilight_factor_max:.2f}", "≤ 1.5", "twilight_factor_max <= 1.5"),
+            Row("sun from +20° to −18° and moon, factor from the nearer of two published fits, largest", "{twilight_factor_max:.2f}", "≤ 1.5", "twilight_factor_max <= 1.5"),
             Row("… factor outside the range between the two fits, largest", "{twilight_factor_outside_max:.2f}", "≤ 1.5", "twilight_factor_outside_max <= 1.5"),
             Row("full and half moon from 10° to 60°, factor from the nearer fit, largest", "{moon_factor_max:.2f}", "≤ 1.5", "moon_factor_max <= 1.5"),
         ),
