@@ -45,6 +45,8 @@ bibtex_reference_style = "author_year"
 bibtex_default_style = "plain"
 
 copybutton_prompt_text = "$ "
+# Two dashes of a flag are two dashes.
+smartquotes = False
 html_theme = "furo"
 html_title = "seasonscapes"
 html_static_path = ["_static"]

@@ -155,12 +155,13 @@ def key_table(model: type[Declaration], prefix: str = "", nested: bool = True) -
             if nested and get_origin(field.annotation) is not list:
                 rows += key_table(inner, f"{prefix}{key}.")
             continue
-        unit = next((unit for suffix, unit in UNITS.items() if name.endswith(suffix)), "")
-        default = "required" if field.is_required() else _default(field)
-        text = re.sub(r"``|`", "`", descriptions[name]).replace("|", "\\|")
-        rows.append(
-            f"| `{prefix}{key}` | {type_text(field.annotation)} | {unit} | {range_text(field)} | {default} | {text} |"
-        )
+        unit = next((f"[{unit}]" for suffix, unit in UNITS.items() if name.endswith(suffix)), "")
+        default = "**required**" if field.is_required() else _default(field)
+        # The unit has its place beside the type.
+        text = re.sub(r" \[(deg|m|km|px|DU)\](?=[.,;]|$)", "", descriptions[name])
+        text = re.sub(r"``|`", "`", text).replace("|", "\\|")
+        value = ", ".join(filter(None, (f"{type_text(field.annotation)} {unit}".strip(), range_text(field), default)))
+        rows.append(f"| `{prefix}{key}` | {value} | {text} |")
     return rows
 
 
@@ -173,10 +174,10 @@ def _models(annotation: Any) -> Iterator[type[Declaration]]:
 
 def _default(field: FieldInfo) -> str:
     value = field.default if field.default is not PydanticUndefined else field.default_factory()  # type: ignore[misc]
-    return "" if value is None or value == "" or value == [] else f"`{value}`"
+    return "optional" if value is None or value == "" or value == [] else f"default `{value}`"
 
 
-HEADER = ["| key | type | unit | range | default | meaning |", "|---|---|---|---|---|---|"]
+HEADER = ["| key | value | meaning |", "|---|---|---|"]
 
 
 def key_page() -> dict[str, str]:
