@@ -159,6 +159,13 @@ def test_doctor_never_crashes(capsys, monkeypatch):
     assert record["test_render"] is True
 
 
+def extras_at_hand(folder, **sources):
+    """Environment with modules of the extras that are quick to import: empty ones, or of the given sources."""
+    for module in ("torch", "diffusers", "open3d", "distributed", "pxr"):
+        (folder / f"{module}.py").write_text(sources.get(module, ""))
+    return {"PYTHONPATH": os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")])}
+
+
 @pytest.mark.parametrize("bad", ["missing", "text", "old"])
 def test_doctor_names_an_unusable_libllvm(tmp_path, bad):
     path = tmp_path / "libLLVM-14.so"
@@ -170,7 +177,7 @@ def test_doctor_names_an_unusable_libllvm(tmp_path, bad):
         source.write_text("int LLVMOld(void) { return 14; }")
         if subprocess.run(["cc", "-shared", "-fPIC", "-o", path, source], check=False).returncode:
             pytest.skip("no C compiler to make an old library with")
-    environment = {**os.environ, "DRJIT_LIBLLVM_PATH": str(path)}
+    environment = {**os.environ, **extras_at_hand(tmp_path), "DRJIT_LIBLLVM_PATH": str(path)}
     done = subprocess.run(
         [sys.executable, "-m", "seasonscapes", "doctor"], env=environment, capture_output=True, text=True
     )
@@ -178,6 +185,27 @@ def test_doctor_names_an_unusable_libllvm(tmp_path, bad):
     assert "libLLVM-14.so" in done.stdout
     assert "scalar_rgb" in done.stdout
     assert "libllvm19" in done.stdout
+
+
+def test_an_extra_that_is_there_but_broken_is_no_extra(tmp_path):
+    environment = {**os.environ, **extras_at_hand(tmp_path, torch="raise ImportError('libgomp.so.1: no such file')")}
+    command = [sys.executable, "-m", "seasonscapes", "doctor", "--json"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    record = json.loads(done.stdout)
+    assert [name for name, there in record["extras"].items() if not there] == ["gaussians"]
+    assert record["extras_faults"] == {"gaussians": "BROKEN (ImportError: libgomp.so.1: no such file)"}
+
+
+def test_a_fall_back_to_the_scalar_variant_says_why(tmp_path):
+    program = "from seasonscapes.rendering.backend import use_backend; print(use_backend().device)"
+    environment = {**os.environ, "DRJIT_LIBLLVM_PATH": str(tmp_path / "none.so")}
+    environment.pop("SEASONSCAPES_DEVICE", None)
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
+    if done.stdout.strip() == "cuda":
+        pytest.skip("a CUDA device needs no libLLVM")
+    assert done.stdout.strip() == "scalar"
+    assert "the scalar variant, since libLLVM at" in done.stderr
+    assert "none.so is older than 16" in done.stderr
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
