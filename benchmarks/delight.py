@@ -11,9 +11,9 @@
 * Suns: 30 such scenes of unknown season and hour; the share whose sun is found within 5° of azimuth and 4° of elevation,
   and how many wrong ones were trusted. Controls: mirrored images, and mosaics of two hours.
 * Landsat (where the data folder is present): |r| of reflectance with the cosine of incidence within land classes (by band
-  ratios), on slopes over 8°, two dates with known suns; and the agreement of the two dates. Canopies are not Lambertian:
-  the response of each class to direct light is fitted (`DelightOptions.land_class`); the row ``lambertian`` does without,
-  and ``c_by_class`` is the C correction fitted in the same classes.
+  ratios), on all slopes and on those over 8°, two dates with known suns; and the agreement of the two dates. Canopies are
+  not Lambertian: the response of each class to direct light is fitted (`DelightOptions.land_class`); the row
+  ``lambertian`` does without, and ``c_by_class`` is the C correction fitted in the same classes.
 * Mesh: rocks and a hut on a patch of ground with three textures, y up, shifted origin; textures path traced by Mitsuba's own
   integrator at one hour (8-bit sRGB), delit, written, read and relit at two others: PSNR over texels. Control: the clock an
   hour off.
@@ -356,20 +356,22 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=None)
     parser.add_argument("--json", type=Path, default=None)
     parser.add_argument("--pictures", type=Path, default=None, help="folder for pictures of the albedos")
+    parser.add_argument("--only", nargs="+", choices=("synthetic", "suns", "landsat", "mesh"), help="parts to run; all")
     parser.add_argument("--data", type=Path, default=HERE.parents[1] / "shared" / "data")
     args = parser.parse_args()
     seed = secrets.randbelow(100_000) if args.seed is None else args.seed
     size = QUICK if args.quick else FULL
     use_backend()
     numbers: dict[str, Any] = {"seed": seed}
-    for part in (
-        lambda: synthetic(seed, size, numbers, args.pictures),
-        lambda: suns(seed, size, numbers),
-        lambda: numbers.update(landsat_numbers(args.data, seed)),
-        lambda: meshes(seed, args.quick, numbers),
-    ):
+    parts = {
+        "synthetic": lambda: synthetic(seed, size, numbers, args.pictures),
+        "suns": lambda: suns(seed, size, numbers),
+        "landsat": lambda: numbers.update(landsat_numbers(args.data, seed)),
+        "mesh": lambda: meshes(seed, args.quick, numbers),
+    }
+    for name in args.only or parts:
         start = time.perf_counter()
-        part()
+        parts[name]()
         print(f"  ({time.perf_counter() - start:.0f} s)", flush=True)
     for name, (bar, sense) in BARS.items():
         value = numbers.get(name)

@@ -593,7 +593,7 @@ def test_export_on_the_command_line(hill, tmp_path, capsys):
         (["--to", "glb", "-o", "a.glb", "--day", "2024-06-31"], "not a date"),
         (["--to", "glb", "-o", "a.glb", "--day", "2024-06-21", "--time", NOON], "name two times"),
         (["--to", "usd", "-o", "a.usdc", "--day", "2024-06-21", "--every", "10s"], "instants of a day"),
-        (["--to", "3dtiles", "-o", "b", "--geoid-m", "nan"], "no place on Earth"),
+        (["--to", "3dtiles", "-o", "b", "--geoid-m", "4000"], "no place on Earth"),
     ],
 )
 def test_what_does_not_go_together_is_one_line(hill, tmp_path, monkeypatch, capsys, flags, said):

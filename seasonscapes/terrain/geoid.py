@@ -65,8 +65,7 @@ def geoid_of(vertical_datum: str, latitude_deg: float, longitude_deg: float, *, 
         For a stated height beyond ±120 m, which no place on Earth has.
     """
     if given_m is not None:
-        if not abs(given_m) <= 120.0:
-            raise InputError("--geoid-m", "no place on Earth has this", got=given_m, expected="-107 to 86")
+        require_undulation(given_m)
         return Geoid(f"{given_m:g} m everywhere, as given", _constant(given_m))
     if vertical_datum == "ellipsoidal":
         return Geoid("heights are above the ellipsoid already", _constant(0.0))
@@ -81,6 +80,12 @@ def geoid_of(vertical_datum: str, latitude_deg: float, longitude_deg: float, *, 
         return Geoid(doubt, egm96_m)
     doubt = f"EGM96 at 30 minutes; heights (datum: {vertical_datum}) are taken as above sea level, else give --geoid-m"
     return Geoid(doubt, egm96_m)
+
+
+def require_undulation(given_m: float) -> None:
+    """`InputError` for a height of a datum's zero above the ellipsoid beyond ±120 m, which no place on Earth has."""
+    if not abs(given_m) <= 120.0:
+        raise InputError("--geoid-m", "no place on Earth has this", got=given_m, expected="-107 to 86")
 
 
 def _constant(height_m: float) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:

@@ -157,6 +157,10 @@ def require_consistent(to: str, time: Any, options: ExportOptions, camera: Camer
         raise InputError("--camera", "goes with --to blender", got=to)
     if options.geoid_m is not None and to != "3dtiles":
         raise InputError("--geoid-m", "goes with --to 3dtiles", got=to)
+    if options.geoid_m is not None:
+        from seasonscapes.terrain.geoid import require_undulation
+
+        require_undulation(options.geoid_m)
 
 
 def day_instants(place: Place, day: date, every: timedelta) -> list[datetime]:
