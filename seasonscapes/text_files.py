@@ -88,9 +88,9 @@ def parse_json(text: str | bytes, *, where: str | Path) -> Any:
     try:
         return json.loads(text, parse_constant=refuse)
     except RecursionError:
-        raise InputError(where, "not readable as JSON: nested too deeply") from None
+        raise InputError(where, "not valid JSON: nested too deeply") from None
     except ValueError as error:  # JSONDecodeError and UnicodeDecodeError among them, and integers of too many digits
-        raise InputError(where, f"not readable as JSON: {error}") from None
+        raise InputError(where, f"not valid JSON: {error}") from None
 
 
 def read_json(path: str | os.PathLike, *, where: str | Path | None = None) -> Any:

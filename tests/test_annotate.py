@@ -151,7 +151,7 @@ def test_the_server_answers_only_here_and_only_with_its_token(session):
         for path, body, message in (
             ("solve", b"{}", "at least 3 are needed"),
             ("pick", b"{}", "not a request"),
-            ("pick", b"[", "not readable as JSON"),
+            ("pick", b"[", "not valid JSON"),
         ):
             with pytest.raises(urllib.error.HTTPError) as error:
                 urllib.request.urlopen(urllib.request.Request(root + path, body, headers=token))

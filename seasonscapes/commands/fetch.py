@@ -9,6 +9,7 @@ from cyclopts import Parameter
 
 from seasonscapes.commands.arguments import parse_at
 from seasonscapes.commands.console import print_result, progress_bars
+from seasonscapes.commands.outputs import check_output
 from seasonscapes.open_data.requests_as_text import parse_extent, parse_interval
 
 
@@ -65,6 +66,7 @@ def fetch_command(
     from seasonscapes.workflows.fetching import FetchRequest, described, fetch_place, open_data_store, plan_place
     from seasonscapes.workspace import Workspace
 
+    check_output(output, (".toml",))
     request = FetchRequest(
         output,
         None if at is None else parse_at(at)[:2],

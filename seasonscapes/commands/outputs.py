@@ -32,6 +32,14 @@ def check_output_folder(folder: Path, *, flag: str = "--output") -> None:
         pass
 
 
+def check_file_or_folder(output: Path, *, flag: str = "--output") -> None:
+    """`InputError` about an output that cannot be written: a file where its name has a suffix, else a folder."""
+    if output.suffix:
+        check_output(output, (output.suffix.lower(),), flag=flag)
+    else:
+        check_output_folder(output, flag=flag)
+
+
 @contextmanager
 def _writable_below(folder: Path, output: Path, flag: str) -> Iterator[None]:
     """`InputError` where no file can be made in a folder, or in the nearest one above it that exists."""

@@ -14,6 +14,7 @@ from seasonscapes.commands.look_options import LookOptions
 from seasonscapes.commands.mesh_options import MESH_SUFFIXES, MeshFileFlags, MeshFlags, hour_on
 from seasonscapes.commands.mesh_view_options import MeshViewFlags
 from seasonscapes.commands.options import SkyOptions
+from seasonscapes.commands.outputs import check_file_or_folder
 from seasonscapes.commands.view_options import WhenOptions
 from seasonscapes.errors import InputError
 
@@ -86,6 +87,7 @@ def relight_command(
     check_range("--turntable", turntable, 1, 3600)
     check_range("--fps", fps, 0.1, 240.0)
     film = FilmLook(look.metering(), fps=fps, look=look.look, white_balance=look.white_balance)
+    check_file_or_folder(output)
     pictures = _pictures_wanted(output, files, film=when is not None, turntable=turntable)
     by_hour = time is not None or when is not None or taken is not None
     loaded = flags.load(source, allow_outside=allow_outside, place_needed=by_hour)

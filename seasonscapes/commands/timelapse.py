@@ -12,7 +12,7 @@ from seasonscapes.commands.arguments import check_range, parse_albedo, parse_dur
 from seasonscapes.commands.console import print_result, progress_bars
 from seasonscapes.commands.look_options import LookOptions
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
-from seasonscapes.commands.outputs import check_output, check_output_folder
+from seasonscapes.commands.outputs import check_file_or_folder
 from seasonscapes.commands.view_options import ViewOptions, WhenOptions
 from seasonscapes.commands.work_options import WorkOptions
 from seasonscapes.errors import InputError
@@ -84,10 +84,7 @@ def timelapse_command(
         raise InputError("--output", "unknown kind of film", got=str(output), expected=expected)
     if output.suffix and exr:
         raise InputError("--exr", "wants a folder to write to", cure="give a folder as --output")
-    if output.suffix:
-        check_output(output, (".mp4",))
-    else:
-        check_output_folder(output)
+    check_file_or_folder(output)
     check_range("--fps", fps, 0.1, 240.0)
     check_range("--seed", seed, 0, 2**32)
     work.check_cluster()

@@ -13,6 +13,10 @@ from fault_harness import TIME, call
 BASE: dict[str, list[str]] = {
     "render": ["s.toml", "--time", TIME, "--size", "16x12", "--spp", "1", "--output", "out/a.png"],
     "timelapse": ["s.toml", "--times", TIME, "--size", "16x12", "--output", "out/film"],
+    "fetch": ["--at", "46.5,8.0", "--elevation", "dem.tif", "--imagery", "image.tif", "--output", "got/g.toml"],
+    "export": ["s.toml", "--to", "glb", "--output", "out/e.glb"],
+    "delight": ["s.toml", "--sun", "170,40", "--output", "out/d.npz"],
+    "relight": ["box.ply", "--at", "46.5,8,1500", "--time", TIME, "--output", "out/r.png"],
     "lit-texture": ["s.toml", "--time", TIME, "--output", "out/l.png"],
     "irradiance": ["s.toml", "--time", TIME, "--output", "out/i.tif"],
     "sky": ["--at", "46.5,8,1500", "--time", TIME, "--output", "out/d.png"],
