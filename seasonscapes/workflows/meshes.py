@@ -56,6 +56,17 @@ class MeshSurroundings:
         Where tables of the sky are kept.
     seed
         Equal seeds give equal results.
+
+    Raises
+    ------
+    InputError
+        For an albedo out of range.
+
+    Examples
+    --------
+    >>> import seasonscapes as ss
+    >>> ss.MeshSurroundings(sky="overcast").model.name
+    'overcast'
     """
 
     ground_albedo: float | None = 0.2
