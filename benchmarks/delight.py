@@ -11,9 +11,9 @@
 * Suns: 30 such scenes of unknown season and hour; the share whose sun is found within 5° of azimuth and 4° of elevation,
   and how many wrong ones were trusted. Controls: mirrored images, and mosaics of two hours.
 * Landsat (where the data folder is present): |r| of reflectance with the cosine of incidence within land classes (by band
-  ratios), on all slopes and on those over 8°, two dates with known suns; and the agreement of the two dates. Canopies are not Lambertian:
-  the response of each class to direct light is fitted (`DelightOptions.land_class`); the row ``lambertian`` does without,
-  and ``c_by_class`` is the C correction fitted in the same classes.
+  ratios), on all slopes and on those over 8°, two dates with known suns; and the agreement of the two dates. Canopies are
+  not Lambertian: the response of each class to direct light is fitted (`DelightOptions.land_class`); the row
+  ``lambertian`` does without, and ``c_by_class`` is the C correction fitted in the same classes.
 * Mesh: rocks and a hut on a patch of ground with three textures, y up, shifted origin; textures path traced by Mitsuba's own
   integrator at one hour (8-bit sRGB), delit, written, read and relit at two others: PSNR over texels. Control: the clock an
   hour off.

@@ -80,7 +80,7 @@ def test_the_bernese_cameras_travel_with_the_package(capsys):
         (["--picture", "good.png", "--points", "none.csv"], "none.csv: no such file"),
         (["--picture", "good.png", "--points", "few.csv"], "points"),
         (["--picture", "good.png", "--skyline", "--webcam", "north"], "north"),
-        (["--picture", "good.png", "--skyline", "--mask", "bad.jpg"], "--mask: not a readable picture"),
+        (["--picture", "good.png", "--skyline", "--mask", "bad.jpg"], "not a readable picture"),
     ],
 )
 def test_calibrate_says_what_is_wrong(tmp_path, capsys, monkeypatch, arguments, message):

@@ -342,6 +342,16 @@ def broken_file(kind: str, folder: Path) -> tuple[Path, ss.MeshPlacing | None]:
         path = write_gltf(folder)
         path.write_text(path.read_text().replace('"boxes.bin"', '"../boxes.bin"'))
         return path, None
+    if kind == "normal map outside":
+        path = write_gltf(folder)
+        document = json.loads(path.read_text())
+        document["images"].append({"uri": "../secret.png"})
+        path.write_text(json.dumps(document))
+        return path, None
+    if kind == "broken colour":
+        path = write_obj(folder)
+        (folder / "boxes.mtl").write_text("newmtl wall0\nKd red green blue\n")
+        return path, None
     if kind == "ply texture outside":
         return write_ply(folder, texture="../wall0.png"), None
     if kind == "cmyk":
@@ -405,6 +415,8 @@ BROKEN = {
     "absolute texture": "map_Kd: outside the mesh's folder; got '/etc/wall0.png'",
     "texture on the network": "map_Kd: a file on the network; got 'https://example.org/wall0.png'",
     "buffer outside": r"buffer 0: outside the mesh's folder; got '../boxes.bin'",
+    "normal map outside": r"texture 2: outside the mesh's folder; got '../secret.png'",
+    "broken colour": "a colour that is no three numbers; got 'red green blue'",
     "ply texture outside": "TextureFile: outside the mesh's folder; got '../wall0.png'",
     "cmyk": "texture wall0.jpg: a texture in CMYK; got 'CMYK'; expected RGB",
     "no image": "texture wall0.png: not a readable image",
@@ -428,7 +440,7 @@ class TestMistakes:
         with pytest.raises(InputError, match=BROKEN[kind]) as caught:
             ss.load_mesh(path, placing)
         assert "\n" not in str(caught.value)
-        assert path.name in str(caught.value)
+        assert path.stem in str(caught.value)
 
     def test_outside_files_are_read_when_allowed(self, tmp_path):
         folder = tmp_path / "mesh"

@@ -186,7 +186,7 @@ def read_tile(
 
 
 def mosaic(tiles: Sequence[Raster], grid: MapGrid, *, extend: bool = True) -> np.ndarray:
-    """Bring rasters onto a grid by bilinear interpolation; where several have a value, the first counts.
+    """Bring rasters onto a grid by cubic convolution, linear beside gaps; where several have a value, the first counts.
 
     Parameters
     ----------
@@ -211,7 +211,7 @@ def mosaic(tiles: Sequence[Raster], grid: MapGrid, *, extend: bool = True) -> np
         weak = np.full_like(strip, np.nan)
         for group in groups:
             column, row = _strip_pixels(grid, rows, group.crs, group.transform)
-            values, weight = _bilinear(group.values, column, row)
+            values, weight = _interpolated(group.values, column, row)
             sure = np.asarray(np.isnan(strip) & (weight[..., None] > 0.999))
             strip[sure] = values[sure]
             some = np.asarray(np.isnan(weak) & (weight[..., None] > _LEAST_WEIGHT))
@@ -304,22 +304,72 @@ def _between(nodes: np.ndarray, width: int, height: int) -> np.ndarray:
     return along[:, j] * (1.0 - t) + along[:, j + 1] * t
 
 
-def _bilinear(values: np.ndarray, column: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean of the known neighbours by bilinear weights ``(H, W, C)``, and the sum of these weights ``(H, W)``."""
+def _interpolated(values: np.ndarray, column: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Cubic convolution where all neighbours are known, the mean of the known ones by bilinear weights elsewhere.
+
+    Returns the values ``(H, W, C)`` and the sum of the bilinear weights of known neighbours ``(H, W)``.
+    """
+    outside = ~(np.isfinite(column) & np.isfinite(row))
+    column = np.clip(np.where(outside, -9.0, column), -2.0, values.shape[1] + 1.0)
+    row = np.clip(np.where(outside, -9.0, row), -2.0, values.shape[0] + 1.0)
+    # Pixels of the same grid are taken as they are.
+    column, row = _snapped(column), _snapped(row)
+    linear, weight, _ = _convolved(values, column, row, _linear_weights)
+    if not (column % 1.0).any() and not (row % 1.0).any():
+        return linear / np.maximum(weight, 1e-12)[..., None], weight
+    cubic, _, missing = _convolved(values, column, row, _cubic_weights)
+    smooth = ~missing
+    return np.where(smooth[..., None], cubic, linear / np.maximum(weight, 1e-12)[..., None]), weight
+
+
+def _snapped(position: np.ndarray) -> np.ndarray:
+    """Positions, those within a thousandth of a pixel's centre at it."""
+    near = np.rint(position)
+    return np.where(np.abs(position - near) < 1e-3, near, position)
+
+
+def _linear_weights(fraction: np.ndarray) -> list[tuple[int, np.ndarray]]:
+    return [(0, 1.0 - fraction), (1, fraction)]
+
+
+def _cubic_weights(fraction: np.ndarray) -> list[tuple[int, np.ndarray]]:
+    """Catmull-Rom: passes through the samples, exact for parabolas."""
+    t = fraction
+    return [
+        (-1, ((-0.5 * t + 1.0) * t - 0.5) * t),
+        (0, (1.5 * t - 2.5) * t * t + 1.0),
+        (1, ((-1.5 * t + 2.0) * t + 0.5) * t),
+        (2, (0.5 * t - 0.5) * t * t),
+    ]
+
+
+def _convolved(
+    values: np.ndarray,
+    column: np.ndarray,
+    row: np.ndarray,
+    weights: Callable[[np.ndarray], list[tuple[int, np.ndarray]]],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Weighted sum of the known neighbours, sum of their weights, and whether a neighbour of some weight is missing."""
     height, width = values.shape[:2]
     known = np.asarray(np.isfinite(values).all(axis=2))
     filled = np.where(known[..., None], values, 0.0).astype(np.float32)
-    outside = ~(np.isfinite(column) & np.isfinite(row))
-    column = np.clip(np.where(outside, -9.0, column), -2.0, width + 1.0)
-    row = np.clip(np.where(outside, -9.0, row), -2.0, height + 1.0)
     column0, row0 = np.floor(column).astype(int), np.floor(row).astype(int)
-    fx, fy = column - column0, row - row0
-    total, weight = np.zeros((*column.shape, values.shape[2])), np.zeros(column.shape)
-    for r, wy in ((row0, 1.0 - fy), (row0 + 1, fy)):
-        for c, wx in ((column0, 1.0 - fx), (column0 + 1, fx)):
+    total, sum_, missing = (
+        np.zeros((*column.shape, values.shape[2])),
+        np.zeros(column.shape),
+        np.zeros(column.shape, bool),
+    )
+    for d_row, wy in weights(row - row0):
+        for d_column, wx in weights(column - column0):
+            w = wy * wx
+            if not w.any():
+                continue
+            r, c = row0 + d_row, column0 + d_column
             inside = (r >= 0) & (r < height) & (c >= 0) & (c < width)
-            r_in, c_in = np.clip(r, 0, height - 1), np.clip(c, 0, width - 1)
-            w = np.where(inside & known[r_in, c_in], wy * wx, 0.0)
-            total += w[..., None] * filled[r_in, c_in]
-            weight += w
-    return total / np.maximum(weight, 1e-12)[..., None], weight
+            r, c = np.clip(r, 0, height - 1), np.clip(c, 0, width - 1)
+            here = inside & known[r, c]
+            missing |= ~here & (w != 0.0)
+            w = np.where(here, w, 0.0)
+            total += w[..., None] * filled[r, c]
+            sum_ += w
+    return total, sum_, missing

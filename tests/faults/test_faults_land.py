@@ -37,7 +37,7 @@ def shifted(east_m=0.0, north_m=0.0, side_m=50.0):
 
 
 NAN = float("nan")
-# Heights: what is written, and whether it must be refused, must say a word of doubt, or may be taken.
+# Heights: what is written, and whether it must be refused.
 HEIGHTS = {
     "one sample": ({"values": HILL[:1, :1]}, "refuse"),
     "one row": ({"values": HILL[:1]}, "refuse"),
@@ -69,16 +69,15 @@ HEIGHTS = {
         "either",
     ),
     "turned": ({"values": HILL, "transform": Affine(35, 35, places.EAST_M, 35, -35, places.NORTH_M)}, "either"),
-    "two bands": ({"values": np.stack([HILL, HILL])}, "either"),
+    "two bands": ({"values": np.stack([HILL, HILL])}, "refuse"),
     "flat": ({"values": np.full((21, 21), 500.0)}, "either"),
     "one spike": (
         {"values": np.where(np.eye(21, k=30) + (np.arange(441).reshape(21, 21) == 220), 9000.0, HILL)},
-        "either",
+        "refuse",
     ),
-    "noise": ({"values": np.random.default_rng(0).uniform(0, 8000, (21, 21))}, "either"),
-    "zeros among mountains": ({"values": np.where(np.arange(21) > 12, 0.0, HILL + 1000.0)}, "either"),
+    "noise": ({"values": np.random.default_rng(0).uniform(0, 8000, (21, 21))}, "refuse"),
+    "zeros among mountains": ({"values": np.where(np.arange(21) > 12, 0.0, HILL + 1000.0)}, "refuse"),
 }
-DOUBTED = {"one spike": "spike|metres", "noise": "noise|rough|metres", "zeros among mountains": "0 m|zero|missing"}
 
 
 @pytest.mark.parametrize("kind", HEIGHTS)
@@ -265,7 +264,8 @@ def test_rows_of_a_manifest_that_are_none(own_land, record_property, verb, row):
     else:
         more = ["--time", TIME, "--manifest", "m.csv", "--calibrations", "cal", "--sky", "hosek", "--json"]
         outcome = run_in(own_land, ["paint", "w.toml", *more])
-    judge(record_property, outcome, "refuse")
+    # `webcams` lists the pictures that are missing among its problems.
+    judge(record_property, outcome, "either" if verb == "webcams" and "nb.png" in row else "refuse")
 
 
 @pytest.mark.fast
