@@ -87,15 +87,18 @@ def test_the_albedo_of_a_lit_image_returns_without_its_shadow():
         options=DelightOptions(radiance_per_unit=20_000.0, register=False, borders=None),
     )
     moved = np.abs(light.visibility - true) > 0.5
-    assert np.abs(error)[moved].mean() < 0.25 * np.abs(ghost.albedo / albedo - 1.0)[moved].mean()
+    assert np.abs(error)[moved].mean() < 0.3 * np.abs(ghost.albedo / albedo - 1.0)[moved].mean()
 
 
 def test_a_sky_of_other_strength_is_found_from_the_shadow_itself():
     light, true = hill_light()
     radiance = lit(texture(), light, true)
-    assumed = light.sky / np.float32(1.3)
-    factor = fitted_sky_factor(radiance, true[..., None] * light.sun, assumed, light.bounce(texture()), light.chart)
-    assert factor == pytest.approx([1.3] * 3, rel=0.12)
+    # Bluer than assumed, too.
+    true_factor = np.array([1.2, 1.3, 1.5], np.float32)
+    assumed = light.sky / true_factor
+    factor = fitted_sky_factor(radiance, light.sun, true, assumed, light.bounce(texture()), light.chart)
+    assert factor == pytest.approx(true_factor, rel=0.15)
+    assert factor[2] / factor[0] > 1.12
 
 
 def test_clipped_texels_are_completed_in_the_colour_of_their_neighbours():

@@ -33,6 +33,10 @@ _SKY_SIGMA, _PAIRS_PER_INDEPENDENT, _MOST_INDEPENDENT = 0.2, 50.0, 25.0
 # Distance of paired texels, across which land is about alike and shadow borders are past [texels].
 _PAIR_TEXELS = 4
 _LEAST_PAIRS = 500
+# The same for its colour, which pairs across shadows tell well and the blue of a display image may exceed by far.
+_SKY_COLOUR_SIGMA = 0.5
+# A slope faces the sun with more than this share of the largest illuminance.
+_FACING_SHARE = 0.2
 
 
 @dataclass(frozen=True)
@@ -292,7 +296,7 @@ def _delit(
         sunlight = visibility[..., None] * light.sun
         if options.fit_sky:
             usable = known & ~clipped.any(axis=2) & (deviation < 0.1)
-            factor = fitted_sky_factor(radiance, sunlight, light.sky, bounce, np.where(usable, chart, -1))
+            factor = fitted_sky_factor(radiance, light.sun, visibility, light.sky, bounce, np.where(usable, chart, -1))
         illuminance = np.maximum(sunlight + factor * light.sky + bounce, 1e-3)
         albedo = np.clip(np.pi * radiance / illuminance, LOWEST, HIGHEST).astype(np.float32)
         albedo[~known] = _GREY
@@ -341,16 +345,26 @@ def _at_surface(radiance: np.ndarray, air: Air | None) -> np.ndarray:
 
 
 def fitted_sky_factor(
-    radiance: np.ndarray, sunlight: np.ndarray, sky: np.ndarray, bounce: np.ndarray, chart: np.ndarray
+    radiance: np.ndarray,
+    sun: np.ndarray,
+    visibility: np.ndarray,
+    sky: np.ndarray,
+    bounce: np.ndarray,
+    chart: np.ndarray,
 ) -> np.ndarray:
     """Estimate the factor on skylight under which near texels in different light have most alike albedos.
+
+    Its mean comes from all such pairs. Its colour comes from those across borders of cast shadows, where there are enough:
+    land on both sides of them has the same colours, while land on different slopes may differ with its aspect.
 
     Parameters
     ----------
     radiance
         ``(R, S, 3)`` [cd/m²] that leaves the surface.
-    sunlight, sky, bounce
-        ``(R, S, 3)`` illuminance by sun, sky and other terrain [lx].
+    sun, sky, bounce
+        ``(R, S, 3)`` illuminance by the sun without cast shadows, by sky and by other terrain [lx].
+    visibility
+        ``(R, S)`` visibility of the sun.
     chart
         ``(R, S)`` integers as in `TexelIrradiance`; −1 where a texel is not to be used.
 
@@ -359,34 +373,47 @@ def fitted_sky_factor(
     numpy.ndarray
         ``(3,)``; 1 where the image has too few pairs to tell.
     """
-    pairs = _pairs(sunlight.mean(axis=2), (sky + bounce).mean(axis=2), chart)
+    sunlight = visibility[..., None] * sun
+    ambient = (sky + bounce).mean(axis=2)
+    total = np.log(np.maximum(sunlight.mean(axis=2) + ambient, 1e-3))
+    share = sunlight.mean(axis=2) / np.exp(total)
+    pairs = _pairs(
+        chart, lambda one, other: (np.abs(total[one] - total[other]) > 0.3) & (np.abs(share[one] - share[other]) > 0.15)
+    )
     if len(pairs) < _LEAST_PAIRS:
         return np.ones(3)
+    factor = _sky_factor(pairs, (radiance, sunlight, sky, bounce), _SKY_SIGMA)
+    # A texel that the sun would light well, and that is hidden from it, stands in a cast shadow.
+    facing = sun.mean(axis=2) > _FACING_SHARE * sun.mean(axis=2).max()
+    side = np.where(facing & (visibility > 0.95), 1.0, np.where(facing & (visibility < 0.05), 0.0, np.nan))
+    pairs = _pairs(chart, lambda one, other: np.abs(side[one] - side[other]) == 1.0)
+    if len(pairs) < _LEAST_PAIRS:
+        return factor
+    across = _sky_factor(pairs, (radiance, sunlight, sky, bounce), _SKY_COLOUR_SIGMA)
+    return across * np.exp(np.mean(np.log(factor) - np.log(across)))
+
+
+def _sky_factor(pairs: np.ndarray, textures: tuple[np.ndarray, ...], sigma: float) -> np.ndarray:
+    """Factor ``(3,)`` of least robust cost over pairs of texels ``(N, 2)``, beside its prior of a standard deviation.
+
+    ``textures`` are radiance, sunlight, skylight and light from other terrain, ``(R, S, 3)`` each.
+    """
     one, other = pairs.T
     trials = np.linspace(-1.5, 1.5, 61)
+    independent = min(len(pairs) / _PAIRS_PER_INDEPENDENT, _MOST_INDEPENDENT)
     result = np.ones(3)
     for channel in range(3):
-        values, sun, from_sky, rest = (
-            array[..., channel].ravel().astype(np.float64) for array in (radiance, sunlight, sky, bounce)
-        )
+        values, direct, from_sky, rest = (texture[..., channel].ravel().astype(np.float64) for texture in textures)
         contrast = np.log(np.maximum(values[one], 1e-3) / np.maximum(values[other], 1e-3))
-
-        def residual(
-            logarithm: float,
-            contrast: np.ndarray = contrast,
-            sun: np.ndarray = sun,
-            from_sky: np.ndarray = from_sky,
-            rest: np.ndarray = rest,
-        ) -> np.ndarray:
-            total = np.maximum(sun + np.exp(logarithm) * from_sky + rest, 1e-3)
-            return contrast - np.log(total[one] / total[other])
-
-        spread = max(1.4826 * float(np.median(np.abs(residual(0.0)))), 0.05)
-        independent = min(len(pairs) / _PAIRS_PER_INDEPENDENT, _MOST_INDEPENDENT)
+        residuals = []
+        for trial in trials:
+            light = np.maximum(direct + np.exp(trial) * from_sky + rest, 1e-3)
+            residuals.append(contrast - np.log(light[one] / light[other]))
+        spread = max(1.4826 * float(np.median(np.abs(residuals[len(trials) // 2]))), 0.05)
         cost = [
-            independent * float(np.mean(np.log1p((residual(trial) / (2.385 * spread)) ** 2))) * 0.5 * 2.385**2
-            + 0.5 * (trial / _SKY_SIGMA) ** 2
-            for trial in trials
+            independent * float(np.mean(np.log1p((residual / (2.385 * spread)) ** 2))) * 0.5 * 2.385**2
+            + 0.5 * (trial / sigma) ** 2
+            for trial, residual in zip(trials, residuals, strict=True)
         ]
         best = int(np.clip(np.argmin(cost), 1, len(trials) - 2))
         curve = np.polyfit(trials[best - 1 : best + 2], cost[best - 1 : best + 2], 2)
@@ -442,19 +469,16 @@ def class_response(radiance: np.ndarray, sunlight: np.ndarray, ambient: np.ndarr
     return result
 
 
-def _pairs(sunlight: np.ndarray, ambient: np.ndarray, chart: np.ndarray, most: int = 40_000) -> np.ndarray:
-    """Flat indices ``(N, 2)`` of texels a few apart, in the same chart, whose total light differs."""
+def _pairs(
+    chart: np.ndarray, chosen: Callable[[tuple[slice, slice], tuple[slice, slice]], np.ndarray], most: int = 40_000
+) -> np.ndarray:
+    """Flat indices ``(N, 2)`` of texels a few apart in the same chart, of which ``chosen`` (by their slices) is true."""
     index = np.arange(chart.size).reshape(chart.shape)
-    total = np.log(np.maximum(sunlight + ambient, 1e-3)).ravel()
-    share = (sunlight / np.maximum(sunlight + ambient, 1e-3)).ravel()
     found = []
-    for d_row, d_column in ((0, _PAIR_TEXELS), (_PAIR_TEXELS, 0)):
-        first = index[: chart.shape[0] - d_row, : chart.shape[1] - d_column].ravel()
-        second = index[d_row:, d_column:].ravel()
-        flat = chart.ravel()
-        keep = (flat[first] >= 0) & (flat[first] == flat[second])
-        keep &= (np.abs(total[first] - total[second]) > 0.3) & (np.abs(share[first] - share[second]) > 0.15)
-        found.append(np.stack([first[keep], second[keep]], axis=1))
+    whole, ahead, behind = slice(None), slice(None, -_PAIR_TEXELS), slice(_PAIR_TEXELS, None)
+    for one, other in (((whole, ahead), (whole, behind)), ((ahead, whole), (behind, whole))):
+        keep = (chart[one] >= 0) & (chart[one] == chart[other]) & chosen(one, other)
+        found.append(np.stack([index[one][keep], index[other][keep]], axis=1))
     pairs = np.concatenate(found)
     if len(pairs) > most:
         pairs = pairs[np.random.default_rng(0).choice(len(pairs), most, replace=False)]
