@@ -87,12 +87,14 @@ def landsat_numbers(data: Path, seed: int) -> dict[str, Any]:
         means = [float(np.mean(list(values.values()))) for values in (r, on_steep)]
         print(f"  {name:38s}{worst:7.2f}{means[0]:7.2f}{worst_steep:11.2f}{means[1]:7.2f}{agreement:9.2f}")
         if name == "ours":
-            print(f"    worst: {max(r, key=r.__getitem__)}")
+            by_date = ", ".join(f"{date} {max(v for at, v in r.items() if at[0] == date):.2f}" for date in DATES)
+            print(f"    largest by date: {by_date}; worst: {max(r, key=r.__getitem__)}")
         key = "landsat" if name == "ours" else f"landsat_{name}"
         numbers |= {
             f"{key}_abs_r_max": worst,
             f"{key}_abs_r_mean": means[0],
             f"{key}_steep_abs_r_max": worst_steep,
+            **{f"{key}_abs_r_max_{date}": max(value for at, value in r.items() if at[0] == date) for date in DATES},
             f"{key}_agreement": agreement,
         }
     return numbers

@@ -14,6 +14,9 @@ import rasterio
 from affine import Affine
 from pyproj import Transformer
 
+from seasonscapes.images import srgb_from_linear
+from seasonscapes.workspace import file_hash
+
 Field = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
@@ -215,3 +218,53 @@ class World:
             if point:
                 file.update_tags(AREA_OR_POINT="Point")
             file.write(bands)
+
+
+def swisstopo_tiles(world: World, *, east_km: int, north_km: int) -> None:
+    """3 × 3 tiles of swissALTI3D and SWISSIMAGE about a kilometre of the Swiss grid, as data.geo.admin.ch states them.
+
+    One tile is also there from 2019, 50 m too high; only spacings of 2 m have files.
+    """
+    to_map = Transformer.from_crs("EPSG:2056", "EPSG:4326", always_xy=True)
+    for east in range(east_km - 1, east_km + 2):
+        for north in range(north_km - 1, north_km + 2):
+            transform = Affine(2.0, 0.0, east * 1000.0, 0.0, -2.0, (north + 1) * 1000.0)
+            axis = (np.arange(500) + 0.5) * 2.0
+            x, y = np.meshgrid(east * 1000.0 + axis, (north + 1) * 1000.0 - axis)
+            longitude, latitude = to_map.transform(x, y)
+            lon, lat = to_map.transform(
+                [east * 1000.0, east * 1000.0 + 1000.0], [north * 1000.0, north * 1000.0 + 1000.0]
+            )
+            bbox = [lon[0], lat[0], lon[1], lat[1]]
+            for year in (2019, 2023) if (east, north) == (east_km, north_km) else (2023,):
+                heights = height_m(latitude, longitude) + (50.0 if year == 2019 else 0.0)
+                name = f"swissalti3d_{year}_{east}-{north}"
+                _swisstopo(world, "ch.swisstopo.swissalti3d", name, "_2056_5728", year, bbox, transform, heights[None])
+            colours = srgb_from_linear(2.0 * reflectance(latitude, longitude))
+            stored = np.rint(255.0 * colours).astype(np.uint8).transpose(2, 0, 1)
+            name = f"swissimage-dop10_2023_{east}-{north}"
+            _swisstopo(world, "ch.swisstopo.swissimage-dop10", name, "_2056", 2023, bbox, transform, stored)
+
+
+def _swisstopo(
+    world: World,
+    collection: str,
+    name: str,
+    ending: str,
+    year: int,
+    bbox: list[float],
+    transform: Affine,
+    bands: np.ndarray,
+) -> None:
+    file = f"{name}_2{ending}.tif"
+    if bands.dtype != np.uint8:
+        bands = bands.astype(np.float32)
+    nodata = -9999.0 if bands.dtype == np.float32 else None
+    world.raster(world.folder / "files" / collection / file, bands, "EPSG:2056", transform, nodata=nodata)
+    fine = f"{name}_{0.5 if 'alti' in name else 0.1}{ending}.tif"
+    assets: dict[str, dict] = {
+        key: {"href": f"{{base}}/files/{collection}/{key}", "type": "image/tiff; application=geotiff", "gsd": gsd}
+        for key, gsd in ((fine, 0.5 if "alti" in name else 0.1), (file, 2.0))
+    }
+    assets[file]["file:checksum"] = "1220" + file_hash(world.folder / "files" / collection / file)
+    world.item(collection, name, bbox, {"datetime": f"{year}-01-01T00:00:00Z"}, assets)

@@ -110,6 +110,22 @@ def test_a_raster_that_leads_elsewhere_is_refused_before_it_is_opened(outside, t
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize(
+    "name", ["loop.tif", "x" * 300 + ".tif", "a\\u0000.tif", "sub", "dem.tif/x", "pipe", "/dev/zero"]
+)
+def test_names_that_are_no_file_have_their_line(outside, name, capsys):
+    import os
+
+    from seasonscapes.cli import main
+
+    (outside.parent / "loop.tif").symlink_to("loop.tif")
+    (outside.parent / "sub").mkdir()
+    os.mkfifo(outside.parent / "pipe")
+    outside.write_text(places.SCENE.replace('file = "dem.tif"', f'file = "{name}"'))
+    assert main(["terrain", str(outside), "--workspace", str(outside.parent / "work")]) == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
 def test_sidecars_are_confined_too(outside):
     folder, dem = outside.parent, outside.parent / "dem.tif"
     with server() as (url, asked):
@@ -284,7 +300,7 @@ def test_run_copies_nothing_from_outside(tmp_path, capsys):
 
 
 def test_rasters_are_opened_and_arrays_unpickled_nowhere_else():
-    """Rasters are opened for reading in `raster_files` alone; nothing is ever unpickled."""
+    """Rasters are opened for reading in `raster_files` alone, and on servers in `open_data.remote`; nothing is unpickled."""
     import ast
 
     import seasonscapes
@@ -302,5 +318,5 @@ def test_rasters_are_opened_and_arrays_unpickled_nowhere_else():
                 unpickled.add(path.name)
             if name == "torch.load" and options.get("weights_only") != "True":
                 unpickled.add(path.name)
-    assert opened == {"raster_files.py"}
+    assert opened == {"raster_files.py", "remote.py"}
     assert unpickled == set()

@@ -157,7 +157,7 @@ def test_a_mosaic_of_two_hours_has_no_single_sun(case, tmp_path):
 def test_a_scene_file_that_states_the_sun_is_used_without_its_light_once_built(case, caplog):
     place = ss.load_place(case.scene, options=ss.MeshOptions(texel_m=60.0))
     stated = case.folder / "stated.toml"
-    stated.write_text(SCENE + "sun_deg = [150.0, 38.0]\n")
+    stated.write_text(SCENE + 'sun_deg = [150.0, 38.0]\nsky = "hosek"\n')
     delit = ss.load_place(stated, options=ss.MeshOptions(texel_m=60.0))
     with caplog.at_level(logging.INFO, logger="seasonscapes"):
         values = ss.scene_albedo(delit, "2024-09-10").values
@@ -198,6 +198,9 @@ def test_mistakes_get_their_line(case, tmp_path):
     path = case.folder / "both.toml"
     path.write_text(SCENE + 'time = "unknown"\ndelit = true\n')
     with pytest.raises(ss.InputError, match="give one of 'time'"):
+        read_scene(path)
+    path.write_text(SCENE + 'sky = "hazy"\n')
+    with pytest.raises(ss.InputError, match="give 'time' or 'sun_deg'"):
         read_scene(path)
     path.write_text(SCENE + "sun_deg = [150.0, -3.0]\n")
     with pytest.raises(ss.InputError, match="above the horizon"):

@@ -15,14 +15,21 @@ import numpy as np
 import pandas as pd
 import pytest
 import rasterio
+from affine import Affine
 from command_line import command
-from open_data_world import World, height_m, reflectance
+from open_data_world import World, height_m, reflectance, swisstopo_tiles
+from places import hill_heights, write_raster
 from pvlib.solarposition import get_solarposition
 
+import seasonscapes as ss
 from seasonscapes.errors import InputError
+from seasonscapes.images import linear_from_srgb
 from seasonscapes.open_data import remote
 from seasonscapes.open_data.requests_as_text import parse_extent, parse_interval
-from seasonscapes.terrain.crs import geodetic_from_map
+from seasonscapes.terrain.crs import geodetic_from_map, map_from_geodetic
+from seasonscapes.terrain.raster import sample_raster
+from seasonscapes.terrain.surface import Raster
+from seasonscapes.terrain.synthetic import CRS, alpine_albedo, alpine_massif
 
 ALPS = (46.55, 7.999)  # the border between two tiles runs through it
 ZONES = (46.5, 5.999)  # on both sides of the border of two UTM zones
@@ -32,6 +39,7 @@ WITHHELD = (40.1, 45.0)  # GLO-30 has no tile, GLO-90 has
 VOIDS = (30.0, 80.0)
 LIAR = (20.0, 100.0)  # an item states twice the land that its file shows
 SNOW = (46.0, 12.0)
+BERN = (46.9555, 7.4452)  # the middle of kilometre 2600-1200 of the Swiss grid
 WRONG = (50.0, 20.0)  # items that state an offset which was applied before
 RANGE = "2024-07..2024-09"
 
@@ -94,6 +102,8 @@ def world(tmp_path_factory):
     world.dem_tile(11.925, 45.925)
     for when, classes in DAYS_OVER_SNOW.items():
         world.sentinel_tile(when, "EPSG:32633", *SNOW, size_m=4000.0, classes=classes, colours=snowy)
+
+    swisstopo_tiles(world, east_km=2600, north_km=1200)
 
     world.dem_tile(19.925, 49.925)
     world.sentinel_tile("2024-07-14T09:50:31Z", "EPSG:32634", *WRONG, size_m=4000.0, stored_offset=False)
@@ -165,7 +175,7 @@ def test_a_place_appears_from_its_coordinates(fetch, url):
     assert height_error(scene).max() < 0.3
     assert colour_error(scene).max() < 2e-3
     told = sources(scene)
-    assert told["imagery"]["time"] == "2024-07-14T10:25:31Z"
+    assert declared["imagery"]["time"] == told["imagery"]["time"] == "2024-07-14T10:25:31Z"
     sun = get_solarposition(pd.DatetimeIndex(["2024-07-14T10:25:31Z"]), *ALPS)
     assert told["imagery"]["sun"]["azimuth_deg"] == pytest.approx(float(sun["azimuth"].iloc[0]), abs=0.1)
     assert told["imagery"]["sun"]["elevation_deg"] == pytest.approx(float(sun["apparent_elevation"].iloc[0]), abs=0.1)
@@ -244,6 +254,66 @@ def test_a_median_has_no_time(fetch):
 def test_an_offset_that_was_applied_before_is_noticed(fetch):
     with pytest.raises(InputError, match="no image make sense as reflectance"):
         fetch(WRONG)
+
+
+def test_swiss_tiles_are_the_newest_of_the_spacing_that_is_needed(fetch):
+    """Only files of 2 m are there, and the tile of 2019 is 50 m too high."""
+    scene = fetch(BERN, elevation="swissalti3d", imagery="swissimage", size="1.6km", resolution=2)
+    assert height_error(scene).max() < 0.05
+    declared = tomllib.loads(scene.read_text())
+    assert declared["vertical_datum"] == "LN02"
+    assert declared["attribution"] == "© swisstopo"
+    assert declared["imagery"]["encoding"] == "srgb"
+    values, latitude, longitude = raster(scene.with_name("place.ortho.tif"))
+    assert (values[..., 3] == 255).all()
+    shown = linear_from_srgb(values[..., :3] / 255.0)
+    assert np.abs(shown - 2.0 * reflectance(latitude, longitude)).max() < 0.01
+    told = sources(scene)["imagery"]
+    assert told["time"] is None
+    assert told["report"]["years"] == [2023]
+    assert len(sources(scene)["elevation"]["items"]) == 9
+    assert any(item["checksum_verified"] for item in sources(scene)["elevation"]["items"])
+
+
+def test_a_folder_of_tiles_is_a_place_too(world, tmp_path):
+    """No network, no coordinates: extent, datum and credit come from the files."""
+    files = world.folder / "files"
+    scene = tmp_path / "bern.toml"
+    flags = {"elevation": files / "ch.swisstopo.swissalti3d" / "*_2023_*.tif", "resolution": 4}
+    command("fetch", imagery=files / "ch.swisstopo.swissimage-dop10" / "*.tif", output=scene, **flags)
+    values, _, _ = raster(scene.with_name("bern.dem.tif"))
+    assert 740 <= values.shape[0] <= 780
+    assert np.nanmax(height_error(scene)) < 0.2
+    assert np.isfinite(values).mean() > 0.97
+    declared = tomllib.loads(scene.read_text())
+    assert declared["vertical_datum"] == "LN02"
+    assert declared["attribution"] == "© swisstopo"
+    told = sources(scene)
+    assert "address" not in told["elevation"]["items"][0]
+    assert str(files) not in json.dumps(told)
+    assert told["imagery"]["report"]["years"] == [2023]
+
+
+def test_heights_in_feet_become_metres(tmp_path):
+    values = hill_heights() / 0.3048
+    path = write_raster(tmp_path / "feet.tif", values, spacing_m=50.0)
+    with rasterio.open(path, "r+") as file:
+        file.units = ["ft"]
+    command("fetch", elevation=path, imagery="none", output=tmp_path / "hill.toml")
+    shown, _, _ = raster(tmp_path / "hill.dem.tif")
+    assert np.nanmax(shown) == pytest.approx(1500.0, abs=10.0)
+
+
+def test_tokens_that_are_freely_given_are_added_to_addresses(world, url, tmp_path):
+    (world.folder / "files" / "token").write_text('{"token": "sig=abc"}')
+    path = next((world.folder / "files" / "cop-dem-glo-90").glob("*.tif"))
+    address = f"{url}files/cop-dem-glo-90/{path.name}"
+    world.requests()
+    store = remote.RemoteStore(tmp_path)
+    assert store.read(address, lambda dataset: dataset.count, token_url=f"{url}files/token") == 1
+    asked = world.requests()
+    assert asked[0].startswith("GET /files/token")
+    assert all("?sig=abc" in line for line in asked[1:])
 
 
 # ---------------------------------------------------------------------------------------------- networks
@@ -366,6 +436,17 @@ def test_a_truncated_file_is_told(fetch, world, tmp_path):
     assert "damaged, cut short or no GeoTIFF" in line
 
 
+def test_a_file_of_another_checksum_is_told(fetch, world, tmp_path):
+    stated = world.folder / "items" / "ch.swisstopo.swissalti3d" / "swissalti3d_2023_2600-1200.json"
+    right = stated.read_text()
+    stated.write_text(right.replace('"1220', '"1220ff'))
+    try:
+        line = failure(fetch, BERN, tmp_path, elevation="swissalti3d", imagery="none", size="1.6km", resolution=2)
+    finally:
+        stated.write_text(right)
+    assert "not the file whose checksum the catalogue states" in line
+
+
 def test_a_missing_file_is_told(fetch, world, tmp_path):
     world.faults(("B03", 404, 99))
     line = failure(fetch, ALPS, tmp_path)
@@ -423,3 +504,96 @@ def test_intervals_and_extents():
 def test_the_real_catalogues_answer(tmp_path):
     command("fetch", at="46.62,8.03", size="3km", date="2024-07..2024-09", output=tmp_path / "grindelwald.toml")
     assert sources(tmp_path / "grindelwald.toml")["imagery"]["report"]["known_share"] > 0.9
+
+
+# ---------------------------------------------------------------------------------------------- a picture
+
+
+def psnr_db(first: np.ndarray, second: np.ndarray) -> float:
+    return float(-10.0 * np.log10(np.mean((first - second) ** 2)))
+
+
+@pytest.mark.slow
+def test_the_fetched_scene_renders_as_one_made_by_hand(world, url, tmp_path):
+    """Massif → tiles of the catalogues → fetch → picture, against the massif's own rasters → picture: within 0.5 dB.
+
+    Both are compared to the synthetic scene itself, from the same camera.
+    """
+    massif = alpine_massif(size_m=6000.0, spacing_m=30.0)
+    colour = Raster(alpine_albedo(massif, 196.0, upsample=2), massif.elevation.transform * Affine.scale(0.5), CRS)
+
+    def of(raster: Raster):
+        def at(latitude, longitude):
+            x, y = map_from_geodetic(CRS, latitude, longitude)
+            height, width = raster.values.shape[:2]
+            column, row = ~raster.transform * (x, y)
+            inside = np.clip(column, 0.5, width - 0.5), np.clip(row, 0.5, height - 0.5)
+            return sample_raster(raster, *(raster.transform * inside))
+
+        return at
+
+    def heights(latitude, longitude):
+        return of(massif.elevation)(latitude, longitude)[..., 0]
+
+    local = World(tmp_path / "massif")
+    local.dem_tile(7.92, 46.51, size_deg=0.12, heights=heights)
+    local.sentinel_tile("2024-07-14T10:25:31Z", CRS, 46.55, 7.98, size_m=5600.0, colours=of(colour))
+    address = local.start()
+    try:
+        fetched = tmp_path / "fetched.toml"
+        flags = {"at": "46.55,7.98", "size": "5.2km", "date": "2024-07", "workspace": tmp_path / "cache"}
+        command("fetch", stac=address, output=fetched, **flags)
+    finally:
+        local.stop()
+    by_hand = tmp_path / "by_hand.toml"
+    write_tiff(tmp_path / "dem.tif", massif.elevation)
+    write_tiff(tmp_path / "ortho.tif", colour)
+    camera = CAMERA.format(height_m=float(massif.elevation.values.max()) + 300.0)
+    by_hand.write_text(BY_HAND + camera)
+    text = fetched.read_text()
+    # The light stays in for the comparison: the painted image has none.
+    text = "\n".join(line for line in text.splitlines() if not line.startswith("time ="))
+    fetched.write_text(text.split("[[camera]]")[0] + camera)
+    synthetic = tmp_path / "synthetic.toml"
+    synthetic.write_text(SYNTHETIC + camera)
+    pictures = []
+    for scene in (synthetic, by_hand, fetched):
+        place = ss.load_place(scene, ss.Workspace(tmp_path / "workspace"))
+        view = ss.render(place, ss.camera(place, "air", size_px=(96, 64)), "2024-07-14T10:25:31Z", spp=16)
+        pictures.append(np.clip(view.radiance / 20_000.0, 0.0, 1.0))
+    direct, through = psnr_db(pictures[1], pictures[0]), psnr_db(pictures[2], pictures[0])
+    print(f"by hand {direct:.2f} dB, fetched {through:.2f} dB, one against the other {psnr_db(*pictures[1:]):.2f} dB")
+    assert through > direct - 0.5
+
+
+def write_tiff(path: Path, values: Raster) -> None:
+    bands = values.values.transpose(2, 0, 1).astype(np.float32)
+    profile = {"driver": "GTiff", "count": len(bands), "height": bands.shape[1], "width": bands.shape[2]}
+    with rasterio.open(path, "w", **profile, dtype="float32", crs=values.crs, transform=values.transform) as file:
+        file.write(bands)
+
+
+SYNTHETIC = """name = "synthetic"
+[elevation.synthetic]
+size_m = 6000.0
+spacing_m = 30.0
+detail_m = 15.0
+"""
+BY_HAND = """name = "by_hand"
+[elevation]
+file = "dem.tif"
+[imagery]
+file = "ortho.tif"
+encoding = "linear"
+full_scale = 1.0
+reflectance_scale = 1.0
+"""
+CAMERA = """
+[[camera]]
+name = "air"
+latitude_deg = 46.565
+longitude_deg = 7.965
+height_m = {height_m}
+heading_deg = 145.0
+pitch_deg = -22.0
+"""

@@ -47,6 +47,7 @@ def copied_package(tmp_path) -> Path:
         ("terrain/surface.py", "import mitsuba", "Mitsuba and Dr.Jit"),
         ("workflows/paint.py", "import torch", "PyTorch"),
         ("workspace.py", "import distributed", "Dask"),
+        ("workflows/fetching.py", "import requests", "The network"),
     ],
 )
 def test_a_forbidden_import_breaks_a_contract(copied_package, module, line, contract):

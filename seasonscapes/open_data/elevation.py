@@ -13,8 +13,8 @@ from seasonscapes.open_data.catalogue import Item, asset_of, search
 from seasonscapes.open_data.remote import MissingFile, RemoteStore
 from seasonscapes.open_data.sources import Source, read_source
 from seasonscapes.progress import TaskProgress
+from seasonscapes.terrain.heights import PLAUSIBLE_ELEVATION_M
 from seasonscapes.terrain.mosaic import MapGrid, mosaic, read_tile
-from seasonscapes.terrain.raster import PLAUSIBLE_ELEVATION_M
 from seasonscapes.terrain.surface import Raster
 
 log = logging.getLogger(__name__)

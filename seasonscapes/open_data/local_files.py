@@ -5,7 +5,7 @@ from __future__ import annotations
 import glob
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,7 @@ from seasonscapes.open_data.imagery import colours
 from seasonscapes.open_data.sources import Source, source_of_file
 from seasonscapes.progress import TaskProgress
 from seasonscapes.terrain.crs import apply_affine, geodetic_from_map
+from seasonscapes.terrain.heights import UNITS_M, check_height_band, declared_unit
 from seasonscapes.terrain.mosaic import MapGrid, mosaic, read_tile
 from seasonscapes.terrain.raster_files import open_raster
 
@@ -85,9 +86,12 @@ def local_heights(rasters: list[LocalRaster], grid: MapGrid, *, progress: TaskPr
     def read(dataset: DatasetReader) -> Any:
         if dataset.count != 1:
             raise InputError(dataset.name, "more than one band", got=dataset.count, expected="one band of heights")
-        return read_tile(dataset, grid, bands=[1])
+        check_height_band(dataset, 1, dataset.name)
+        metres = UNITS_M[declared_unit(dataset, 1, dataset.name) or "metre"]
+        tile = read_tile(dataset, grid, bands=[1])
+        return tile if tile is None or metres == 1.0 else replace(tile, values=tile.values * np.float32(metres))
 
-    return _mosaic(rasters, grid, read, progress)[..., 0]
+    return _mosaic(rasters, grid, read, progress, extend=False)[..., 0]
 
 
 def local_colours(rasters: list[LocalRaster], grid: MapGrid, *, progress: TaskProgress | None = None) -> np.ndarray:
@@ -108,7 +112,12 @@ def local_colours(rasters: list[LocalRaster], grid: MapGrid, *, progress: TaskPr
 
 
 def _mosaic(
-    rasters: list[LocalRaster], grid: MapGrid, read: Callable[[Any], Any], progress: TaskProgress | None
+    rasters: list[LocalRaster],
+    grid: MapGrid,
+    read: Callable[[Any], Any],
+    progress: TaskProgress | None,
+    *,
+    extend: bool = True,
 ) -> np.ndarray:
     tiles = []
     for number, raster in enumerate(rasters):
@@ -119,7 +128,7 @@ def _mosaic(
     tiles = [tile for tile in tiles if tile is not None]
     if not tiles:
         raise InputError(str(rasters[0].path), "none of the files shows the area", cure="check --at and --size")
-    return mosaic(tiles, grid)
+    return mosaic(tiles, grid, extend=extend)
 
 
 def _local_raster(path: Path, kind: str) -> LocalRaster:

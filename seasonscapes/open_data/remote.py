@@ -43,6 +43,8 @@ _BUSY = (429, 500, 502, 503, 504)
 _LONGEST_WAIT_S = 20.0
 # A server without ranges sends a whole file; more than this is not loaded for a window of it.
 _LARGEST_WHOLE_BYTES = 256 * 2**20
+# Code and length of SHA-256 at the start of a multihash.
+_SHA256 = "1220"
 _GDAL: dict[str, Any] = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_PAM_ENABLED": "NO"}
 
 
@@ -184,6 +186,37 @@ class RemoteStore:
         except (OSError, ValueError, TypeError):
             log.info("%s: unreadable, loaded again", path)
             return None
+
+    def verify(self, url: str, multihash: str | None) -> bool:
+        """Compare a file that is wholly on disk with the checksum that its catalogue states.
+
+        Parameters
+        ----------
+        url
+            Its address.
+        multihash
+            Hexadecimal multihash; kinds other than SHA-256 are not compared.
+
+        Returns
+        -------
+        bool
+            Whether it was compared: only a part of most files is loaded.
+
+        Raises
+        ------
+        InputError
+            The file is another one.
+        """
+        state = self.known_state(url)
+        if state is None or multihash is None or not multihash.lower().startswith(_SHA256):
+            return False
+        blocks = self.blocks(state)
+        if blocks.share < 1.0:
+            return False
+        if hashlib.sha256(blocks.read(0, state.size)).hexdigest() != multihash.lower().removeprefix(_SHA256):
+            self.forget(url)
+            raise InputError(url, "not the file whose checksum the catalogue states", cure="report it to the catalogue")
+        return True
 
     def forget(self, url: str) -> None:
         """Ask the server again about a file."""

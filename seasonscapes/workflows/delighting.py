@@ -245,15 +245,13 @@ def image_light(
         utc = utc_at(place, time)
         position, day = position_at(place, utc), utc.date()
         record = {"time_utc": utc.isoformat()}
+    elevation_deg = float(position.sun.elevation_deg)
+    if elevation_deg <= 0.0:
+        got = f"the sun stands at {elevation_deg:.1f}°"
+        raise InputError("--time", "no daylight in the image", got=got, expected="a sun above the horizon")
     height_m = place.median_height_m
     light = illumination_at(model, position, height_m, workspace=place.workspace, with_aerial_perspective=False)
-    if light.sun is None and float(position.sun.elevation_deg) <= 0.0:
-        got = f"the sun stands at {float(position.sun.elevation_deg):.1f}°"
-        raise InputError("--time", "no daylight in the image", got=got, expected="a sun above the horizon")
-    record["sun"] = {
-        "azimuth_deg": round(float(position.sun.azimuth_deg), 3),
-        "elevation_deg": round(float(position.sun.elevation_deg), 3),
-    }
+    record["sun"] = {"azimuth_deg": round(float(position.sun.azimuth_deg), 3), "elevation_deg": round(elevation_deg, 3)}
     return replace(light, frame=place.frame), day, record | {"sky": light.model}
 
 

@@ -25,7 +25,7 @@ from seasonscapes.open_data.local_files import LocalRaster, local_colours, local
 from seasonscapes.open_data.remote import RemoteStore
 from seasonscapes.open_data.sources import Source, read_source, source_of
 from seasonscapes.progress import Progress, task_progress
-from seasonscapes.scene import Imagery, SceneFile
+from seasonscapes.scene import SceneFile
 from seasonscapes.sky.ephemeris import sun_position
 from seasonscapes.terrain.mosaic import MapGrid, grid_about
 from seasonscapes.terrain.raster import fill_nodata
@@ -479,6 +479,7 @@ def _items(used: list[AssetUse], files: list[LocalRaster], store: RemoteStore) -
     items = []
     for use in {use.asset["href"]: use for use in used}.values():
         state = store.known_state(use.asset["href"])
+        checksum = use.asset.get("file:checksum") or use.asset.get("checksum:multihash")
         items.append(
             {
                 "source": use.source,
@@ -487,7 +488,8 @@ def _items(used: list[AssetUse], files: list[LocalRaster], store: RemoteStore) -
                 "time": None if use.item.time is None else _iso(use.item.time),
                 "etag": None if state is None else state.tag,
                 "bytes": None if state is None else state.size,
-                "stated_checksum": use.asset.get("file:checksum") or use.asset.get("checksum:multihash"),
+                "checksum": checksum,
+                "checksum_verified": store.verify(use.asset["href"], None if checksum is None else str(checksum)),
                 "processing_baseline": use.item.properties.get("s2:processing_baseline"),
             }
         )
@@ -551,7 +553,7 @@ def _scene_text(
             lines += ['encoding = "linear"', f"full_scale = {_FULL_SCALE}", "reflectance_scale = 1.0"]
         else:
             lines += ['encoding = "srgb"']
-        if image.time is not None and "time" in Imagery.model_fields:
+        if image.time is not None:
             lines += [f"time = {_toml(_iso(image.time))}"]
     for view in views:
         lines += ["", "[[camera]]"] + [f"{key} = {_toml(value)}" for key, value in asdict(view).items()]
