@@ -179,6 +179,9 @@ def mesh_atlas(mesh: TexturedMesh, *, ground_albedo: float | None) -> MeshAtlas:
     tiles, shape = _shelves(sizes + [(2, 2)] * len(uniform))
     fixed = tuple((len(sizes) + index, colour) for index, colour in enumerate(uniform))
     corners, notes = _corners(mesh, tiles, len(sizes), blocks)
+    for index, texture in enumerate(mesh.textures):
+        if len({part.colour for part in mesh.parts if part.texture == index}) > 1:
+            notes.append(f"texture {texture.name} is tinted differently by several materials; the last tint is used")
     extent = max(float(np.ptp(corners.position.reshape(-1, 3), axis=0).max()), 1e-30)
     degenerate = face_normals(corners.position)[1] <= 1e-14 * extent**2
     if degenerate.all():

@@ -12,8 +12,9 @@ from seasonscapes.errors import InputError
 from seasonscapes.images import linear_from_srgb, srgb_from_linear
 from seasonscapes.terrain.textured_mesh import MeshTexture
 
-# Work on a texel takes about this much memory: coefficients of its light, and images in single precision [bytes].
-BYTES_PER_TEXEL = 550
+# Memory that a texel takes at the peak: coefficients of its light, and images in single precision [bytes]. Measured with
+# textures half of whose texels lie on the surface.
+BYTES_PER_TEXEL = 1000
 
 
 def decode_texture(data: bytes, name: str, where: str) -> MeshTexture:

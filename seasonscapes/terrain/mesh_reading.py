@@ -387,7 +387,7 @@ def _read_obj(path: Path, allow_outside: bool) -> MeshFile:
             normals=geometry.get("vertex_normals"),
             look=(
                 # Many programs write Kd 0 or 0.8 beside a texture and ignore it.
-                (1.0, 1.0, 1.0) if texture is not None or material is None else material.colour,
+                (1.0, 1.0, 1.0) if material is None or texture is not None or colours is not None else material.colour,
                 None if colours is None else linear_from_srgb(_unit(colours)),
             ),
         )

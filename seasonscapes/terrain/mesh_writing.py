@@ -137,11 +137,13 @@ def _write_document(
     import pygltflib
 
     order: dict[int, int] = {}
+    factors = {part.texture: part.colour for part in mesh.parts}
     for material in document.materials:
         index = base_image(document, material)
         if index is not None:
-            order.setdefault(index, len(order))
-            material.pbrMetallicRoughness.baseColorFactor = [1.0, 1.0, 1.0, _alpha(material)]
+            number = order.setdefault(index, len(order))
+            factor = factors.get(number, (1.0, 1.0, 1.0))
+            material.pbrMetallicRoughness.baseColorFactor = [*factor, _alpha(material)]
     beside: list[tuple[Path, bytes]] = []
     views: dict[int, bytes] = {}
     for index, number in order.items():

@@ -13,7 +13,7 @@ from seasonscapes.images import atomic_path, write_exr
 from seasonscapes.terrain.mesh_images import encode_texture
 from seasonscapes.terrain.mesh_writing import save_mesh
 from seasonscapes.terrain.textured_mesh import TexturedMesh
-from seasonscapes.workflows.meshes import DelitMesh, LitMesh
+from seasonscapes.workflows.meshes import DelitMesh, LitMesh, with_textures
 from seasonscapes.workflows.pictures import balance_rgb
 from seasonscapes.workflows.timelapse import FilmLook
 
@@ -65,7 +65,7 @@ def lit_pictures(
         develop(radiance, ev100, eye=look.exposure == "eye", look=look.look, white=white) for radiance in lit.radiance
     ]
     textures = [replace(t, values=np.clip(p, 0.0, 1.0)) for t, p in zip(lit.mesh.textures, pictures, strict=True)]
-    return replace(lit.mesh, textures=tuple(textures))
+    return with_textures(lit.mesh, textures)
 
 
 def save_lit_textures(folder: Path, lit: LitMesh, pictures: TexturedMesh, *, kind: str, bits: int) -> list[Path]:

@@ -21,7 +21,7 @@ from seasonscapes.sky.illumination import Illumination
 from seasonscapes.sky.models import SkyModel
 from seasonscapes.terrain.mesh_atlas import MeshAtlas, mesh_atlas
 from seasonscapes.terrain.mesh_placing import MeshPlacing, placed
-from seasonscapes.terrain.textured_mesh import TexturedMesh
+from seasonscapes.terrain.textured_mesh import MeshTexture, TexturedMesh
 from seasonscapes.workflows.illumination import (
     SunMoonPosition,
     given_sun_in_frame,
@@ -397,10 +397,15 @@ def delight_mesh(
     )
     values = atlas.textures(albedo.astype(np.float32))
     textures = tuple(replace(t, values=v) for t, v in zip(mesh.textures, values, strict=True))
-    parts = tuple(part if part.texture < 0 else replace(part, colour=(1.0, 1.0, 1.0)) for part in mesh.parts)
     sigma = tuple(sheet[..., 0] for sheet in atlas.textures(delit.sigma[..., None]))
     facts = record | {"ground_albedo": around.ground_albedo, "textures": "albedo", **delit.facts}
-    return DelitMesh(replace(mesh, textures=textures, parts=parts), sigma, facts)
+    return DelitMesh(with_textures(mesh, textures), sigma, facts)
+
+
+def with_textures(mesh: TexturedMesh, textures: Sequence[MeshTexture]) -> TexturedMesh:
+    """The mesh with other textures, which contain the colour factors of its materials."""
+    parts = tuple(part if part.texture < 0 else replace(part, colour=(1.0, 1.0, 1.0)) for part in mesh.parts)
+    return replace(mesh, textures=tuple(textures), parts=parts)
 
 
 def _reflecting(atlas: MeshAtlas, albedo: np.ndarray, known: np.ndarray) -> np.ndarray:
