@@ -1,6 +1,9 @@
 # make demo   pictures of the bundled scene in out/demo/
 # make test   the tests
+# make check  the quick part of both: style, layers, and the tests that take milliseconds
 # make lint   style, types and layers: ruff, pyright, import-linter
+# make docs   the site in docs/_build/html; a warning is an error. docs-notebooks executes its notebooks first
+# make tables the tables of README and site from benchmarks/results; `make results` measures those anew, in hours
 # Each makes the virtual environment .venv if it is missing, finds or installs libLLVM where it is needed, and can be
 # repeated at will. PYTHON=python3.12 chooses the interpreter, CONSTRAINTS=constraints.txt installs the tested versions.
 
@@ -11,9 +14,9 @@ BIN := $(VENV)/bin
 BASE := $(VENV)/.installed
 DEV := $(VENV)/.installed-dev
 
-.PHONY: demo test lint venv dev llvm clean help
+.PHONY: demo test check docs docs-notebooks tables results lint venv dev llvm clean help
 help:
-	@sed -n '1,5p' Makefile
+	@sed -n '1,8p' Makefile
 
 # A new pyproject.toml installs anew; otherwise the environment is left as it is.
 $(BASE): pyproject.toml tools/install.sh
@@ -36,7 +39,37 @@ demo: llvm $(BASE)
 	$(BIN)/seasonscapes demo -o out/demo
 
 test: llvm $(DEV)
-	$(BIN)/python -m pytest -q -n 2
+	$(BIN)/python -m pytest -q -n 2 --durations=25
+
+docs: $(DEV)
+	$(BIN)/sphinx-build -q -W --keep-going docs docs/_build/html
+
+docs-notebooks: $(DEV)
+	$(BIN)/python docs/run_notebooks.py
+
+tables: $(DEV)
+	$(BIN)/python benchmarks/tables.py
+
+# One after the other: they measure times.
+results: $(DEV)
+	$(BIN)/python benchmarks/terrain.py --quick --json benchmarks/results/terrain-quick.json
+	$(BIN)/python benchmarks/surface.py --quick --json benchmarks/results/surface-quick.json
+	$(BIN)/python benchmarks/render.py --json benchmarks/results/render.json
+	$(BIN)/python benchmarks/sky.py --json benchmarks/results/sky.json
+	$(BIN)/python benchmarks/sky_night.py --json benchmarks/results/sky_night.json
+	$(BIN)/python benchmarks/relight.py --json benchmarks/results/relight.json
+	$(BIN)/python benchmarks/texturing.py --quick --json benchmarks/results/texturing-quick.json
+	$(BIN)/python benchmarks/albedo.py --quick --json benchmarks/results/albedo-quick.json
+	$(BIN)/python benchmarks/gaussians.py --json benchmarks/results/gaussians.json
+	$(BIN)/python benchmarks/alpinebench.py --quick --json benchmarks/results/alpinebench-quick.json
+	$(BIN)/python benchmarks/calibration.py --quick --json benchmarks/results/calibration-quick.json
+	$(BIN)/python benchmarks/tables.py
+
+check: $(DEV)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+	$(BIN)/python -m pytest -q -n 2 -m fast
 
 lint: $(DEV)
 	$(BIN)/ruff check .

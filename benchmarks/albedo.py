@@ -19,7 +19,6 @@ The corrections get more than they could know: exposure, white balance and air a
 from __future__ import annotations
 
 import argparse
-import json
 import secrets
 import sys
 import time
@@ -33,6 +32,7 @@ HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
 
 from albedo_scene import Truth, hours, lights_for, make_truth, path_traced  # noqa: E402
+from record import write_record  # noqa: E402
 
 from seasonscapes.albedo.closed_form import AlbedoFit, SearchOptions, solve_albedo  # noqa: E402
 from seasonscapes.albedo.corrections import CORRECTIONS, slopes_under  # noqa: E402
@@ -411,8 +411,7 @@ def main() -> None:
         args.seed = secrets.randbelow(100_000)
     print(f"seed {args.seed}", file=sys.stderr)
     numbers = run(args)
-    if args.json is not None:
-        args.json.write_text(json.dumps({key: float(value) for key, value in numbers.items()}, indent=1) + "\n")
+    write_record(args.json, numbers, seed=args.seed)
 
 
 if __name__ == "__main__":

@@ -11,12 +11,12 @@ the infrared, whose darkest thousandth is shaded land.) ``--seed`` decides the r
 from __future__ import annotations
 
 import argparse
-import json
 import secrets
 import sys
 from pathlib import Path
 
 import numpy as np
+from record import write_record
 
 # Sun's elevation and azimuth [deg] of each date, from the scenes' headers.
 DATES = {"2002-07-20": (61.4, 125.8), "2002-11-25": (26.2, 159.5)}
@@ -39,9 +39,7 @@ def main() -> None:
     if not folder.is_dir():
         sys.exit(f"no such folder: {folder}; give --data")
     seed = secrets.randbelow(100_000) if args.seed is None else args.seed
-    numbers = {"seed": float(seed)} | measure(folder, seed)
-    if args.json is not None:
-        args.json.write_text(json.dumps(numbers, indent=1) + "\n")
+    write_record(args.json, measure(folder, seed), seed=seed)
 
 
 def measure(folder: Path, seed: int) -> dict[str, float]:

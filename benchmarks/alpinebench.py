@@ -26,7 +26,6 @@ each colour first, as one must for a real webcam.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import secrets
 import sys
@@ -45,6 +44,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from albedo_scene import hours, lights_for  # noqa: E402
 from alpinebench_scene import DATE, SIZES, pose_errors  # noqa: E402
 from alpinebench_stages import Bench, Splats  # noqa: E402
+from record import write_record  # noqa: E402
 
 from seasonscapes.evaluation.figures import comparison_figure, image_row, steepest_window  # noqa: E402
 from seasonscapes.evaluation.lpips import load_lpips, missing_lpips  # noqa: E402
@@ -381,8 +381,7 @@ def main() -> None:
         save_day(bench, whole, arguments.figures)
     ablated = {"ablation_painted": painted_rows, "ablation_held_out": held_rows, "ablation_painting": painting_rows}
     numbers = numbers_of(bench, rows, ablated, whole) | {"seconds": time.perf_counter() - bench.clock.start}
-    if arguments.json is not None:
-        arguments.json.write_text(json.dumps({key: float(value) for key, value in numbers.items()}, indent=1) + "\n")
+    write_record(arguments.json, numbers, seed=seed)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import json
 import os
 import secrets
 import sys
@@ -18,6 +17,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from record import write_record
 
 from seasonscapes.calibration.evidence import Correspondences, Priors
 from seasonscapes.calibration.overlay import save_overlay
@@ -206,8 +206,7 @@ def main() -> int:
     numbers = {key: float(value) for key, value in numbers.items()}
     for key, value in numbers.items():
         print(f"{key:44s} {value:10.4f}")
-    if arguments.json:
-        arguments.json.write_text(json.dumps(numbers | {"seed": seed}, indent=1) + "\n")
+    write_record(arguments.json, numbers, seed=seed)
     return 0
 
 

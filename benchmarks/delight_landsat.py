@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from albedo_landsat import CENTRE_UM, DATES, SOLAR, correlation, light_of, path_radiance, scene
+from albedo_landsat import CENTRE_UM, DATES, NAMES, SOLAR, correlation, light_of, path_radiance, scene
 
 # Land classes by k-means of band ratios of the July scene, which hardly depend on relief; those with fewer steep texels are
 # left out.
@@ -65,22 +65,38 @@ def landsat_numbers(data: Path, seed: int) -> dict[str, Any]:
         results[date]["c_by_class"] = by_class
     numbers: dict[str, Any] = {}
     names = list(results[next(iter(DATES))])
+    kinds = [number for number in range(CLASSES) if int((label == number).sum()) >= LEAST_TEXELS]
     print(
-        f"{'Landsat: largest and mean |r| with cos i within classes':56s}{'|r| max':>9s}{'|r| mean':>9s}{'dates r':>9s}"
+        f"{'Landsat: |r| with cos i within classes':40s}{'max':>7s}{'mean':>7s}{'steep max':>11s}{'mean':>7s}{'dates r':>9s}"
     )
     for name in names:
-        r = [
-            abs(correlation(results[date][name][:, band], cosines[date], steep & (label == kind)))
-            for date in DATES
-            for kind in range(CLASSES)
-            if int((steep & (label == kind)).sum()) >= LEAST_TEXELS
-            for band in range(6)
-        ]
+        r, on_steep = (
+            {
+                (date, kind, NAMES[band]): abs(
+                    correlation(results[date][name][:, band], cosines[date], part & (label == kind))
+                )
+                for date in DATES
+                for kind in kinds
+                for band in range(6)
+            }
+            for part in (np.ones(len(label), bool), steep)
+        )
         first, second = (results[date][name] for date in DATES)
         agreement = float(np.mean([correlation(first[:, band], second[:, band], steep) for band in range(6)]))
-        print(f"  {name:54s}{max(r):9.2f}{np.mean(r):9.2f}{agreement:9.2f}")
+        worst, worst_steep = max(r.values()), max(on_steep.values())
+        means = [float(np.mean(list(values.values()))) for values in (r, on_steep)]
+        print(f"  {name:38s}{worst:7.2f}{means[0]:7.2f}{worst_steep:11.2f}{means[1]:7.2f}{agreement:9.2f}")
+        if name == "ours":
+            by_date = ", ".join(f"{date} {max(v for at, v in r.items() if at[0] == date):.2f}" for date in DATES)
+            print(f"    largest by date: {by_date}; worst: {max(r, key=r.__getitem__)}")
         key = "landsat" if name == "ours" else f"landsat_{name}"
-        numbers |= {f"{key}_abs_r_max": max(r), f"{key}_abs_r_mean": float(np.mean(r)), f"{key}_agreement": agreement}
+        numbers |= {
+            f"{key}_abs_r_max": worst,
+            f"{key}_abs_r_mean": means[0],
+            f"{key}_steep_abs_r_max": worst_steep,
+            **{f"{key}_abs_r_max_{date}": max(value for at, value in r.items() if at[0] == date) for date in DATES},
+            f"{key}_agreement": agreement,
+        }
     return numbers
 
 

@@ -17,14 +17,15 @@ year seen by three cameras; they are judged on suns that they have not seen, on 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import secrets
 import time
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 import numpy as np
+from record import write_record
 
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
@@ -485,7 +486,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="a small scene, within five minutes on two cores")
     parser.add_argument("--seed", type=int, default=None)
-    parser.add_argument("--json", default=None)
+    parser.add_argument("--json", type=Path, default=None)
     parser.add_argument(
         "--only", default="", help="some alone, of full, sun, code, physical, and of speed and shadow (both untrained)"
     )
@@ -543,13 +544,11 @@ def main() -> None:
     write_result(result, arguments.json)
 
 
-def write_result(result: dict[str, float], path: str | None) -> None:
+def write_result(result: dict[str, float], path: Path | None) -> None:
     """A table, and the same numbers as JSON."""
     for name, value in result.items():
         print(f"{name:36s} {value:10.3f}")
-    if path:
-        with open(path, "w") as file:
-            json.dump(result, file, indent=1)
+    write_record(path, result, seed=int(result["seed"]))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Relighting from daylight coefficients against path tracing every frame anew: error, time, break-even, a year.
 
-    python benchmarks/relight.py [--quick] [--seed N] [--json FILE] [--bpy-python PATH] [--pictures FOLDER] [--skip-year]
+    python benchmarks/relight.py [--quick] [--seed N] [--json FILE] [--bpy-python PATH] [--pictures FOLDER] [--only PART]
 
 * Equal error: in blocks of pixels drawn all over a view of the synthetic massif, a converged path tracing of the same
   light and bounces is the reference (4,096 samples a pixel or more). The coefficients' error against it is their relRMSE
@@ -18,7 +18,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import resource
 import secrets
@@ -35,6 +34,7 @@ import numpy as np
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
 import render as arena  # noqa: E402  (the contest's scene and rivals)
+from record import write_record  # noqa: E402
 
 BLOCK = 16
 
@@ -376,13 +376,13 @@ sys.path.insert(0, {here!r})
 import numpy as np, tempfile
 from pathlib import Path
 import render as arena
-from seasonscapes.rendering.hemisphere_rays import occluder
-from seasonscapes.rendering.relit_view import ready_view, relight_view
-from seasonscapes.rendering.transport import Effort, trace_view
+from seasonscapes.rendering.hemisphere_rays import ray_scene
+from seasonscapes.rendering.relit_view import relight_view, relightable_view
+from seasonscapes.rendering.transport import SamplingOptions, trace_view
 scene, camera, facts = arena.make_scene({seed}, Path(tempfile.mkdtemp()), width_px=1536, threads=2)
 base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-terrain = occluder(scene.mi_terrain)
-ready = ready_view(terrain, trace_view(terrain, camera, Effort(patches="reinhart"), seed=1))
+terrain = ray_scene(scene.mi_terrain)
+ready = relightable_view(terrain, trace_view(terrain, camera, SamplingOptions(patches="reinhart"), seed=1))
 relight_view(ready, scene.illumination)
 print("PEAK", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9, base * 1024 / 1e9)
 """
@@ -435,8 +435,7 @@ def main() -> None:
     record["peak_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
     for key, value in record.items():
         print(f"{key:36s} {value:12.5g}")
-    if arguments.json:
-        arguments.json.write_text(json.dumps(record, indent=1, default=float))
+    write_record(arguments.json, record, seed=seed)
 
 
 if __name__ == "__main__":

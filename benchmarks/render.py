@@ -31,6 +31,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from record import write_record
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
@@ -355,7 +356,6 @@ def main() -> None:
         save_pictures(arguments.pictures, results)
     if arguments.json:
         record |= {
-            "seed": seed,
             "threads": arguments.threads,
             "triangles": facts["triangles"],
             "spp": spp,
@@ -363,7 +363,7 @@ def main() -> None:
             "rounds": rounds,
             "load_1min": os.getloadavg()[0],
         }
-        arguments.json.write_text(json.dumps(record, indent=1))
+        write_record(arguments.json, record, seed=seed)
 
 
 if __name__ == "__main__":

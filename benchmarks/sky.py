@@ -40,6 +40,7 @@ from atmosphere_cases import (
     steps_beyond_trend,
     tables_of,
 )
+from record import write_record
 
 from seasonscapes.frames import direction_from_angles
 from seasonscapes.sky.atmosphere import Atmosphere
@@ -308,8 +309,7 @@ def main() -> None:
         arguments.plots.mkdir(parents=True, exist_ok=True)
         plot_domes(arguments.plots)
     print(json.dumps(numbers, indent=2))
-    if arguments.json:
-        arguments.json.write_text(json.dumps(numbers, indent=2))
+    write_record(arguments.json, numbers, seed=seed)
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ from seasonscapes.sky.models import SkyModel, read_sky_model
 
 sys.path.append(str(Path(__file__).parents[1] / "tests"))
 import oracles_usno as usno
+from record import write_record
 
 # Circular 171 gives what its Fortran does: apparent altitude down to the sunset's -5/6°, true altitude below.
 _SUN_ALTITUDES_DEG = (*range(20, -1, -1), *range(-1, -19, -1))
@@ -132,8 +133,7 @@ def main() -> None:
     print_rows(rows)
     numbers = night_numbers(rows)
     print(json.dumps(numbers, indent=2))
-    if arguments.json:
-        arguments.json.write_text(json.dumps(numbers))
+    write_record(arguments.json, numbers, seed=None)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ plain before a wall is compared with the direct normal irradiance times the sine
 from __future__ import annotations
 
 import argparse
-import json
 import secrets
 import tempfile
 import time
@@ -21,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import rasterio
 from affine import Affine
+from record import write_record
 
 import seasonscapes as ss
 from seasonscapes.frames import geodetic_from_enu
@@ -282,8 +282,7 @@ def main() -> None:
         numbers["still_processor_s"] = numbers["still_second_processor_s"]
     for key, value in numbers.items():
         print(f"{key:<32} {value:.5g}", flush=True)
-    if arguments.json:
-        arguments.json.write_text(json.dumps(numbers, indent=1) + "\n")
+    write_record(arguments.json, numbers, seed=seed)
 
 
 if __name__ == "__main__":

@@ -20,6 +20,8 @@ import tempfile
 import time
 from pathlib import Path
 
+from record import write_record
+
 LV95_ORIGIN_M = (2_610_000.0, 1_180_000.0)
 
 
@@ -276,8 +278,7 @@ def main() -> None:
                 continue
             record |= run_part(name, seed, folder)
     print_table(record)
-    if options.json:
-        options.json.write_text(json.dumps(record, indent=1) + "\n")
+    write_record(options.json, record, seed=seed)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ out and said to be. Scores are of hidden texels only.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import secrets
 import sys
@@ -22,6 +21,7 @@ import cv2
 import numpy as np
 import texturing_places as places
 import texturing_rivals as rivals
+from record import write_record
 
 from seasonscapes.terrain.surface import Texture, sample_texture
 from seasonscapes.texturing.completion import CompletedTexture, CompletionOptions, complete
@@ -258,8 +258,7 @@ def main() -> int:
     print()
     for key, value in numbers.items():
         print(f"{key:52s} {value:10.4f}")
-    if arguments.json:
-        arguments.json.write_text(json.dumps(numbers | {"seed": seed}, indent=1) + "\n")
+    write_record(arguments.json, numbers, seed=seed)
     return 0
 
 

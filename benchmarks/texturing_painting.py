@@ -9,7 +9,6 @@ A massif whose albedo, light and poses are known, photographed by webcams with t
 from __future__ import annotations
 
 import argparse
-import json
 import secrets
 import sys
 import time
@@ -24,6 +23,7 @@ sys.path.append(str(HERE.parent / "tests"))
 
 from albedo_scene import Truth, hours, lights_for, make_truth, terrain_and_albedo  # noqa: E402
 from oracles_visibility import BinnedTriangles  # noqa: E402
+from record import write_record  # noqa: E402
 
 from seasonscapes.evaluation.synthetic_webcams import SyntheticPicture, WebcamInstant, WebcamOptions, webcam_series  # noqa: E402
 from seasonscapes.evaluation.webcam_faults import TYPICAL, PoseSigmas, add_foreground, degrade, perturb_pose  # noqa: E402
@@ -373,8 +373,7 @@ def main() -> None:
     numbers = measure(arguments.quick, seed) | {"seed": seed, "seconds": time.perf_counter() - start}
     for name, value in numbers.items():
         print(f"{name:<48} {value:12.4f}")
-    if arguments.json is not None:
-        arguments.json.write_text(json.dumps(numbers, indent=1) + "\n")
+    write_record(arguments.json, numbers, seed=seed)
 
 
 if __name__ == "__main__":

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
+from urllib.parse import urlsplit
 
 from seasonscapes.declaration import read_toml
 from seasonscapes.errors import InputError
@@ -44,6 +46,38 @@ def run_on_cluster(cluster: str, task: Callable[[Item], dict], items: Iterable[I
         yield from run_by(client, task, items)
 
 
+def check_cluster(cluster: str) -> None:
+    """Check the description of a cluster before work begins, without reaching it.
+
+    Raises
+    ------
+    InputError
+        If it is neither ``local:N`` of 1 to 1024 workers, nor ``tcp://HOST:PORT``, nor ``slurm:FILE`` where there is
+        SLURM and the file describes a cluster.
+    """
+    kind, _, rest = cluster.partition(":")
+    if kind == "local" and re.fullmatch(r"[0-9]{1,4}", rest) and 1 <= int(rest) <= 1024:
+        return
+    if kind in ("tcp", "tls") and _is_address(cluster):
+        return
+    if kind == "slurm" and rest:
+        _slurm_table(Path(rest))
+        if shutil.which("sbatch") is None:
+            raise InputError("--cluster", "there is no SLURM on this machine (sbatch is not found)", got=cluster)
+        return
+    raise InputError(
+        "--cluster", "unknown kind of cluster", got=cluster, expected="local:N, tcp://HOST:PORT or slurm:FILE"
+    )
+
+
+def _is_address(text: str) -> bool:
+    try:
+        parts = urlsplit(text)
+        return bool(parts.hostname) and parts.port is not None and not parts.path and not parts.query
+    except ValueError:
+        return False
+
+
 @contextmanager
 def connected(cluster: str) -> Iterator[Any]:
     """A Dask client of a cluster; a cluster that was started for it ends with the block."""
@@ -52,6 +86,7 @@ def connected(cluster: str) -> Iterator[Any]:
         from distributed import Client
     except ImportError:
         raise InputError("--cluster", "Dask is not installed", cure="pip install 'seasonscapes[cluster]'") from None
+    check_cluster(cluster)
     settings = {"distributed.scheduler.allowed-failures": _DEATHS, "distributed.worker.daemon": False}
     with dask.config.set(settings):
         if cluster.startswith(("tcp://", "tls://")):
@@ -88,7 +123,7 @@ def _own_cores(workers: int) -> Any:
 
 def _started(cluster: str) -> Any:
     kind, _, rest = cluster.partition(":")
-    if re.fullmatch(r"[0-9]{1,4}", rest) and kind == "local" and 1 <= int(rest) <= 1024:
+    if kind == "local":
         from distributed import LocalCluster
 
         return LocalCluster(
@@ -99,23 +134,24 @@ def _started(cluster: str) -> Any:
             dashboard_address=None,  # pyright: ignore[reportArgumentType]
             memory_limit=0,
         )
-    if kind == "slurm" and rest:
-        return _slurm(Path(rest))
-    raise InputError(
-        "--cluster", "unknown kind of cluster", got=cluster, expected="local:N, tcp://HOST:PORT or slurm:FILE"
-    )
+    return _slurm(Path(rest))
+
+
+def _slurm_table(path: Path) -> tuple[int, dict[str, Any]]:
+    """From a TOML file: ``jobs = N`` and a table ``[slurm]`` of the resources of each job."""
+    table = read_toml(path)
+    jobs, resources = table.get("jobs"), table.get("slurm")
+    if not isinstance(jobs, int) or not 1 <= jobs <= 10_000:
+        raise InputError(f"{path}: jobs", "not a number of jobs", got=jobs, expected="1 to 10000, such as jobs = 8")
+    if not isinstance(resources, dict) or set(table) - {"jobs", "slurm"}:
+        expected = "jobs = 8 and a table [slurm] with cores, memory, walltime, queue, account"
+        raise InputError(path, "does not describe a cluster", expected=expected)
+    return jobs, resources
 
 
 def _slurm(path: Path) -> Any:
-    """A cluster of SLURM jobs from a TOML file: ``jobs = N`` and a table ``[slurm]`` of the resources of each job."""
-    table = read_toml(path)
-    jobs, resources = table.get("jobs"), table.get("slurm")
-    if not isinstance(jobs, int) or jobs < 1 or not isinstance(resources, dict) or set(table) - {"jobs", "slurm"}:
-        raise InputError(
-            path,
-            "does not describe a cluster",
-            expected="jobs = 8 and a table [slurm] with cores, memory, walltime, queue, account",
-        )
+    """A cluster of SLURM jobs."""
+    jobs, resources = _slurm_table(path)
     from dask_jobqueue.slurm import SLURMCluster
 
     try:

@@ -49,6 +49,11 @@ class LocalFrame:
     height_m: float = 0.0
     refraction_k: float = 0.0
 
+    def __post_init__(self):
+        numbers = (self.latitude_deg, self.longitude_deg, self.height_m, self.refraction_k)
+        if not all(np.isfinite(number) for number in numbers) or abs(self.latitude_deg) > 90.0:
+            raise ValueError(f"LocalFrame: got origin {numbers}, expected finite numbers and a latitude within ±90°")
+
 
 def normal_longitude(longitude_deg: float) -> float:
     """A longitude of 0…360°, or past 180°, as its equal within ±180° [deg]."""

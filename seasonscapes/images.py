@@ -409,6 +409,9 @@ def picture_size(path: str | os.PathLike) -> tuple[int, int, str]:
     """
     with _opened(path) as picture:
         width, height = picture.size
+        if picture.format == "TIFF":
+            # Some versions of Pillow have turned the size already.
+            width, height = picture.tag_v2[256], picture.tag_v2[257]
         if picture.getexif().get(_EXIF_ORIENTATION) in _SIDEWAYS:
             width, height = height, width
         return width, height, str(picture.format)

@@ -161,6 +161,8 @@ class Imagery(Declaration):
         estimated from shading and cast shadows. Its light is taken out before the image is used.
     sun_deg
         Azimuth and elevation of the sun in the image [deg], where they are known and the time is not.
+    sky
+        Sky model of that hour: a bundled name (``clear``, ``hazy``, ``overcast``, ``hosek`` …).
     delit
         The image holds no light: a reflectance product, or one whose light was taken out before.
     """
@@ -171,17 +173,18 @@ class Imagery(Declaration):
     bands: list[int] | None = Field(default=None, min_length=1, max_length=3)
     reflectance_scale: float = Field(default=0.5, gt=0.0, le=2.0)
     time: str | None = None
-    sun_deg: tuple[float, float] | None = None
+    sun_deg: list[float] | None = Field(default=None, min_length=2, max_length=2)
+    sky: str = "clear"
     delit: bool = False
 
     @model_validator(mode="after")
     def _one_light(self) -> Imagery:
         if (self.time is not None) + (self.sun_deg is not None) + self.delit > 1:
             raise ValueError("give one of 'time' (when it was taken), 'sun_deg' and 'delit = true' (it holds no light)")
+        if "sky" in self.model_fields_set and self.time is None and self.sun_deg is None:
+            raise ValueError("'sky' is that of the image's hour: give 'time' or 'sun_deg' as well")
         if self.sun_deg is not None and not (-360.0 <= self.sun_deg[0] <= 360.0 and 0.0 < self.sun_deg[1] <= 90.0):
-            raise ValueError(
-                f"sun_deg: got {list(self.sun_deg)}, expected azimuth and elevation above the horizon [deg]"
-            )
+            raise ValueError(f"sun_deg: got {self.sun_deg}, expected azimuth and elevation above the horizon [deg]")
         return self
 
 

@@ -12,6 +12,8 @@ from typing import Any
 from seasonscapes.errors import InputError
 
 MOST_BYTES = 64 * 2**20
+# What a value of another kind or shape than expected raises where it is taken apart: the file's mistake, not a fault.
+MALFORMED = (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError)
 
 
 def read_bounded(path: str | os.PathLike, *, where: str | Path | None = None, most_bytes: int = MOST_BYTES) -> bytes:

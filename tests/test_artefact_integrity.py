@@ -381,3 +381,41 @@ def test_photographs_of_the_workspace_are_compared_with_what_was_written(tmp_pat
     (tmp_path / _SUMS).write_text("{")
     _remove_changed(tmp_path)
     assert not any((tmp_path / name).is_file() for name in names)
+
+
+def test_keys_hold_the_sources_of_a_mosaic_the_world_file_the_sky_and_the_albedo(tmp_path):
+    """Terrain, image and the checkpoint of a distillation follow the content of every file that they are made of."""
+    from datetime import date
+
+    import places
+    from test_confinement import vrt
+
+    from seasonscapes.albedo.seasons import DatedAlbedo
+    from seasonscapes.sky.models import read_sky_model
+    from seasonscapes.workflows.albedo_sources import dated_albedos
+    from seasonscapes.workflows.distillation import DistilOptions, _data_key
+    from seasonscapes.workflows.place import MeshOptions, load_place
+
+    scene = places.write_place(tmp_path / "scene", places.SCENE.replace('file = "dem.tif"', 'file = "mosaic.vrt"'))
+    (scene.parent / "mosaic.vrt").write_text(vrt("dem.tif"))
+    options = MeshOptions(texel_m=100.0, refine=1, max_error_m=20.0)
+
+    def load():
+        return load_place(scene, Workspace(tmp_path / "work"), options=options)
+
+    def key(place, sky="hosek", albedo=(), **changed):
+        return _data_key(place, read_sky_model(sky), albedo, DistilOptions(**changed))
+
+    first = load()
+    own = DatedAlbedo(date(2024, 7, 1), "recovered", lambda: None)
+    keys = [key(first), key(first, sky="clear"), key(first, albedo=[own]), key(first, suns=9)]
+    image = dated_albedos(first)[0].content
+    places.write_raster(scene.parent / "dem.tif", places.hill_heights() + 300.0, spacing_m=50.0)
+    higher = load()
+    assert np.isclose(higher.elevation.values.max(), first.elevation.values.max() + 300.0)
+    assert higher.terrain.vertices[:, 2].max() > first.terrain.vertices[:, 2].max() + 200.0
+    keys.append(key(higher))
+    (scene.parent / "image.tif.aux.xml").write_text("<PAMDataset><Metadata/></PAMDataset>")
+    keys.append(key(load()))
+    assert dated_albedos(load())[0].content != image
+    assert len(set(keys)) == 6

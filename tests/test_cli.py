@@ -43,6 +43,8 @@ def test_render_a_picture_and_its_record(hill, tmp_path, capsys):
     pixels = np.asarray(picture, float)
     assert pixels[:8].mean(axis=(0, 1))[2] > pixels[:8].mean(axis=(0, 1))[0], "the sky is blue"
     assert 40 < pixels.mean() < 220
+    assert record["output"] == str(output)
+    assert str(tmp_path).encode() not in output.read_bytes(), "no path of the maker's disk"
 
 
 def test_exr_layers_and_header_agree_with_the_picture(hill, tmp_path):
@@ -64,6 +66,8 @@ def test_exr_layers_and_header_agree_with_the_picture(hill, tmp_path):
     provenance = json.loads(header["seasonscapes:provenance"])
     assert provenance["spp"] == 4
     assert provenance["variant"]
+    for folder in (tmp_path, hill.parent):
+        assert str(folder).encode() not in output.read_bytes(), "no path of the maker's disk"
 
 
 def test_equal_calls_equal_files(hill, tmp_path):

@@ -74,13 +74,13 @@ def test_the_bernese_cameras_travel_with_the_package(capsys):
     ("arguments", "message"),
     [
         (["--picture", "none.jpg", "--skyline"], "--picture: no such file"),
-        (["--picture", "bad.jpg", "--skyline"], "--picture: not a readable picture"),
+        (["--picture", "bad.jpg", "--skyline"], "not a readable picture"),
         (["--picture", "small.png", "--skyline"], """got '10 x 10 px'; expected 320 x 200 px"""),
         (["--picture", "small.png"], "no evidence"),
         (["--picture", "good.png", "--points", "none.csv"], "none.csv: no such file"),
         (["--picture", "good.png", "--points", "few.csv"], "points"),
         (["--picture", "good.png", "--skyline", "--webcam", "north"], "north"),
-        (["--picture", "good.png", "--skyline", "--mask", "bad.jpg"], "--mask: not a readable picture"),
+        (["--picture", "good.png", "--skyline", "--mask", "bad.jpg"], "not a readable picture"),
     ],
 )
 def test_calibrate_says_what_is_wrong(tmp_path, capsys, monkeypatch, arguments, message):

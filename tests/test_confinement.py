@@ -110,6 +110,22 @@ def test_a_raster_that_leads_elsewhere_is_refused_before_it_is_opened(outside, t
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize(
+    "name", ["loop.tif", "x" * 300 + ".tif", "a\\u0000.tif", "sub", "dem.tif/x", "pipe", "/dev/zero"]
+)
+def test_names_that_are_no_file_have_their_line(outside, name, capsys):
+    import os
+
+    from seasonscapes.cli import main
+
+    (outside.parent / "loop.tif").symlink_to("loop.tif")
+    (outside.parent / "sub").mkdir()
+    os.mkfifo(outside.parent / "pipe")
+    outside.write_text(places.SCENE.replace('file = "dem.tif"', f'file = "{name}"'))
+    assert main(["terrain", str(outside), "--workspace", str(outside.parent / "work")]) == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
 def test_sidecars_are_confined_too(outside):
     folder, dem = outside.parent, outside.parent / "dem.tif"
     with server() as (url, asked):
@@ -230,6 +246,33 @@ def test_texts_that_could_steer_a_terminal_are_refused(tmp_path, text):
         assert str(error.value).isprintable()
 
 
+def test_a_calibration_record_becomes_a_camera_only_where_a_scene_could_name_it(tmp_path):
+    import json
+
+    from seasonscapes.calibration.calibration_file import read_calibration, write_calibration
+    from seasonscapes.calibration.pose_model import parameters_of_view
+    from seasonscapes.calibration.resection import Calibration
+    from seasonscapes.cameras.pinhole import Camera
+    from seasonscapes.frames import LocalFrame
+    from seasonscapes.workflows.views import calibrated_viewpoint
+
+    camera, path = Camera(12, 8, 10.0, 10.0, 6.0, 4.0, np.eye(4)), tmp_path / "w_calibration.json"
+    parameters, nothing = parameters_of_view(camera, np.eye(3)), (np.zeros((0, 2)), np.zeros(0, bool))
+    solved = Calibration(camera, 0.0, parameters, np.eye(9), (), *nothing, 0.0)
+    write_calibration(path, "w", solved, LocalFrame(46.55, 7.98))
+    assert calibrated_viewpoint(path)[0].name == "w"
+    record = json.loads(path.read_text())
+    path.write_text(json.dumps(record | {"webcam": "../evil"}))
+    with pytest.raises(InputError, match="not a name"):
+        read_calibration(path)
+    high = np.array(record["world_from_camera"])
+    high[2, 3] = 1e7
+    path.write_text(json.dumps(record | {"world_from_camera": high.tolist()}))
+    with pytest.raises(InputError, match="height_m") as error:
+        calibrated_viewpoint(path)
+    assert "\n" not in str(error.value)
+
+
 def test_names_that_differ_in_case_alone_are_one_file(tmp_path):
     with pytest.raises(InputError, match="two cameras are named"):
         read_scene(places.write_place(tmp_path, places.SCENE + CAMERA.replace('"south"', '"South"')))
@@ -284,7 +327,7 @@ def test_run_copies_nothing_from_outside(tmp_path, capsys):
 
 
 def test_rasters_are_opened_and_arrays_unpickled_nowhere_else():
-    """Rasters are opened for reading in `raster_files` alone; nothing is ever unpickled."""
+    """Rasters are opened for reading in `raster_files` alone, and on servers in `open_data.remote`; nothing is unpickled."""
     import ast
 
     import seasonscapes
@@ -298,9 +341,11 @@ def test_rasters_are_opened_and_arrays_unpickled_nowhere_else():
             modes = [ast.unparse(value) for value in node.args[1:2]] + [options.get("mode")]
             if name in ("rasterio.open", "rasterio.io.DatasetReader") and "'w'" not in modes:
                 opened.add(path.name)
+                # A file of a server is nothing but a GeoTIFF, and read through bytes of this program's own.
+                assert path.name != "remote.py" or (options.get("driver") == "'GTiff'" and "opener" in options)
             if name in ("pickle.load", "pickle.loads") or options.get("allow_pickle") == "True":
                 unpickled.add(path.name)
             if name == "torch.load" and options.get("weights_only") != "True":
                 unpickled.add(path.name)
-    assert opened == {"raster_files.py"}
+    assert opened == {"raster_files.py", "remote.py"}
     assert unpickled == set()

@@ -120,21 +120,23 @@ def test_the_command_takes_the_light_out_and_its_file_is_an_albedo(case, tmp_pat
         assert {"values", "weight", "sigma", "source", "visibility", "atlas_id"} <= set(stored.files)
 
 
-@pytest.mark.parametrize("kind", ["png", "exr"])
-def test_pictures_of_the_albedo_come_back_as_albedo(case, tmp_path, kind):
-    output = tmp_path / f"albedo.{kind}"
+def test_layers_of_the_albedo_come_back_as_albedo(case, tmp_path):
+    output = tmp_path / "albedo.exr"
     command("delight", case.scene, sun="150,38", sky="hosek", texel_m=60, output=output)
     place = ss.load_place(case.scene, options=ss.MeshOptions(texel_m=60.0))
     assert case.error(ss.load_albedo(place, output, "2024-09-10").load().values) < 0.08
 
 
 def test_a_sun_that_nobody_knows_is_found(case, tmp_path, capsys):
-    output = tmp_path / "albedo.npz"
+    output = tmp_path / "albedo.png"
     command("delight", case.scene, time="unknown", sky="hosek", texel_m=60, output=output, json=True)
     found = json.loads(capsys.readouterr().out.splitlines()[-1])["found_sun"]
     assert found["azimuth_deg"] == pytest.approx(SUN_DEG[0], abs=5.0)
     assert found["elevation_deg"] == pytest.approx(SUN_DEG[1], abs=4.0)
     assert found["azimuth_sigma_deg"] < 3.0
+    place = ss.load_place(case.scene, options=ss.MeshOptions(texel_m=60.0))
+    # The picture states what it holds: an albedo of this atlas.
+    assert case.error(ss.load_albedo(place, output, "2024-09-10").load().values) < 0.12
 
 
 def test_a_mosaic_of_two_hours_has_no_single_sun(case, tmp_path):
@@ -155,7 +157,7 @@ def test_a_mosaic_of_two_hours_has_no_single_sun(case, tmp_path):
 def test_a_scene_file_that_states_the_sun_is_used_without_its_light_once_built(case, caplog):
     place = ss.load_place(case.scene, options=ss.MeshOptions(texel_m=60.0))
     stated = case.folder / "stated.toml"
-    stated.write_text(SCENE + "sun_deg = [150.0, 38.0]\n")
+    stated.write_text(SCENE + 'sun_deg = [150.0, 38.0]\nsky = "hosek"\n')
     delit = ss.load_place(stated, options=ss.MeshOptions(texel_m=60.0))
     with caplog.at_level(logging.INFO, logger="seasonscapes"):
         values = ss.scene_albedo(delit, "2024-09-10").values
@@ -185,8 +187,10 @@ def test_mistakes_get_their_line(case, tmp_path):
         command("delight", case.scene, time="unknown", sun="150,38", output=output)
     with pytest.raises(ss.InputError, match="--sun: not a direction"):
         command("delight", case.scene, sun="south", output=output)
+    bare = case.folder / "bare.toml"
+    bare.write_text(SCENE.partition("[imagery]")[0])
     with pytest.raises(ss.InputError, match=r"no image; add a table \[imagery\]"):
-        command("delight", "alpine_small", sun="150,38", output=output)
+        command("delight", bare, sun="150,38", texel_m=60, output=output)
     with pytest.raises(ss.InputError, match="--image: no such file"):
         command("delight", case.scene, sun="150,38", image=tmp_path / "none.tif", texel_m=60, output=output)
     with pytest.raises(ss.InputError, match="--time: no daylight"):
@@ -194,6 +198,9 @@ def test_mistakes_get_their_line(case, tmp_path):
     path = case.folder / "both.toml"
     path.write_text(SCENE + 'time = "unknown"\ndelit = true\n')
     with pytest.raises(ss.InputError, match="give one of 'time'"):
+        read_scene(path)
+    path.write_text(SCENE + 'sky = "hazy"\n')
+    with pytest.raises(ss.InputError, match="give 'time' or 'sun_deg'"):
         read_scene(path)
     path.write_text(SCENE + "sun_deg = [150.0, -3.0]\n")
     with pytest.raises(ss.InputError, match="above the horizon"):

@@ -89,6 +89,16 @@ def test_render_takes_an_edited_picture(scene, place, tmp_path):
     assert (land[..., 0] > 1.5 * land[..., 2]).mean() > 0.9
 
 
+def test_an_albedo_brings_its_atlas_along(scene, lit, tmp_path):
+    """Made with texels of 60 m, it is accepted without saying so again; other texels asked for are refused."""
+    out = tmp_path / "view.png"
+    common = {"camera": "aerial", "time": TIME, "sky": "hosek", "size": "24x16", "output": out}
+    command("render", scene, albedo=f"2024-07-20={lit['png']}", **common)
+    assert out.is_file()
+    with pytest.raises(AtlasMismatch):
+        command("render", scene, albedo=f"2024-07-20={lit['png']}", texel_m=90, **common)
+
+
 def _figure(place, folder: Path) -> Path:
     from seasonscapes.workflows.edited_textures import texture_facts
     from seasonscapes.workflows.pictures import png_metadata
@@ -126,6 +136,20 @@ def _nan(place, folder: Path) -> Path:
     return path
 
 
+def _nan_texel(place, folder: Path) -> Path:
+    path = folder / "albedo.npz"
+    values = np.full((*place.texture_shape, 3), 0.2, np.float32)
+    values[3, 4, 1] = np.nan
+    save_texture(Texture(values, values[..., 0], place.atlas_id), path)
+    return path
+
+
+def _pickle(place, folder: Path) -> Path:
+    path = folder / "albedo.npz"
+    np.savez(path, values=np.array([{}], object), weight=np.zeros(1, np.float32))
+    return path
+
+
 def _no_picture(place, folder: Path) -> Path:
     path = folder / "notes.png"
     path.write_text("no picture")
@@ -140,6 +164,8 @@ def _no_picture(place, folder: Path) -> Path:
         (_size, "another atlas"),
         (_transparent, "transparent"),
         (_nan, "not finite"),
+        (_nan_texel, "not finite"),
+        (_pickle, "never loaded"),
         (_no_picture, "not a readable picture"),
     ],
 )

@@ -12,6 +12,7 @@ import places
 import pygltflib
 import pytest
 import trimesh
+from affine import Affine
 from PIL import Image
 
 import seasonscapes as ss
@@ -22,11 +23,19 @@ from seasonscapes.export.axes import lamp_quaternion, y_up
 from seasonscapes.export.blender import blender_scene, blender_script, exposure_scale
 from seasonscapes.export.gltf import TexturedTerrain
 from seasonscapes.export.sky_map import EAST_CENTRED, NORTH_EDGED, sky_in_layout
+from seasonscapes.export.tiles import TileSource, write_tileset
 from seasonscapes.export.usd import Instant, write_usd
-from seasonscapes.frames import axes_at, direction_from_angles, equirectangular_directions, sample_equirectangular
+from seasonscapes.frames import (
+    axes_at,
+    direction_from_angles,
+    ecef_from_geodetic,
+    equirectangular_directions,
+    sample_equirectangular,
+)
 from seasonscapes.images import read_exr
 from seasonscapes.sky.illumination import Luminary
 from seasonscapes.terrain.geoid import egm96_m, geoid_of
+from seasonscapes.terrain.surface import Raster
 from seasonscapes.workflows.export_scene import day_instants
 
 NOON = "2024-06-21T11:00Z"
@@ -303,6 +312,18 @@ def test_the_sun_of_a_usd_film_is_dark_by_night_and_turns_past_north_without_a_j
     np.testing.assert_allclose(world.TransformDir(Gf.Vec3d(0, 0, 1)), direction_from_angles(0.0, 4.0), atol=1e-5)
 
 
+def test_a_lit_usd_shines_by_itself(hill, tmp_path):
+    from pxr import Usd, UsdShade
+
+    write_usd(tmp_path / "lit.usda", TexturedTerrain(hill.terrain, np.full((2, 2, 3), 99, np.uint8), lit=True), [])
+    stage = Usd.Stage.Open(str(tmp_path / "lit.usda"))
+    surface = UsdShade.Shader(stage.GetPrimAtPath("/World/GroundMaterial/Surface"))
+    assert surface.GetInput("emissiveColor").HasConnectedSource()
+    assert tuple(surface.GetInput("diffuseColor").Get()) == (0.0, 0.0, 0.0)
+    assert not stage.GetPrimAtPath("/World/Sun")
+    assert not usd_errors(stage)
+
+
 def test_without_openusd_one_line_says_how_to_get_it(hill, tmp_path):
     code = "import sys; sys.modules['pxr'] = None\nfrom seasonscapes.cli import main; sys.exit(main(sys.argv[1:]))"
     arguments = ["export", str(hill.path), "--to", "usd", "-o", str(tmp_path / "a.usdc")]
@@ -422,6 +443,39 @@ def horizontal_area(tile: dict, place) -> float:
     return float(normal[upwards > 0.01, 2].sum())
 
 
+@pytest.mark.parametrize("flipped", [False, True], ids=["north-up", "south-up"])
+def test_tiles_wear_their_colours_the_right_way_round(hill, tmp_path, flipped):
+    """Colours that tell east and north come back at the vertices' own places, for rasters stored either way."""
+    raster = hill.elevation
+    if flipped:
+        height = raster.values.shape[0]
+        turned = raster.transform * Affine.translation(0, height) * Affine.scale(1, -1)
+        raster = Raster(raster.values[::-1].copy(), turned, raster.crs)
+
+    def colours_at(position_m):
+        share = np.clip(position_m[:, :2] / 3000.0 + 0.5, 0.0, 1.0)
+        return np.column_stack([255.0 * share, np.full(len(share), 90.0)]).astype(np.uint8)
+
+    geoid = geoid_of("ellipsoidal", 46.55, 7.98)
+    write_tileset(tmp_path, TileSource(raster, hill.frame, geoid, colours_at, 50.0, 5.0, lit=True))
+    axes = axes_at(hill.frame.latitude_deg, hill.frame.longitude_deg)
+    origin = ecef_from_geodetic(hill.frame.latitude_deg, hill.frame.longitude_deg, hill.frame.height_m)
+    for tile in read_tiles(tmp_path):
+        document, blob = tile["document"], tile["document"].binary_blob()
+        attributes = document.meshes[0].primitives[0].attributes
+        assert attributes.NORMAL is None
+        assert document.extensionsUsed == ["KHR_materials_unlit"]
+        view = document.bufferViews[document.images[0].bufferView]
+        (tmp_path / "tile.jpg").write_bytes(blob[view.byteOffset : view.byteOffset + view.byteLength])
+        picture = np.asarray(Image.open(tmp_path / "tile.jpg"), float)
+        uv = accessor(document, attributes.TEXCOORD_0, blob)
+        height, width = picture.shape[:2]
+        column, row = (np.clip((uv * [width, height]).astype(int), 0, [width - 1, height - 1])).T
+        expected = colours_at((tile["ecef"] - origin) @ axes.T).astype(float)
+        np.testing.assert_allclose(picture[row, column, :2], expected[:, :2], atol=6.0)
+        assert horizontal_area(tile, hill) == pytest.approx(3000.0**2, rel=2e-3)
+
+
 # ------------------------------------------------------------------------------------------------- geoid
 
 
@@ -539,7 +593,7 @@ def test_export_on_the_command_line(hill, tmp_path, capsys):
         (["--to", "glb", "-o", "a.glb", "--day", "2024-06-31"], "not a date"),
         (["--to", "glb", "-o", "a.glb", "--day", "2024-06-21", "--time", NOON], "name two times"),
         (["--to", "usd", "-o", "a.usdc", "--day", "2024-06-21", "--every", "10s"], "instants of a day"),
-        (["--to", "3dtiles", "-o", "b", "--geoid-m", "nan"], "no place on Earth"),
+        (["--to", "3dtiles", "-o", "b", "--geoid-m", "4000"], "no place on Earth"),
     ],
 )
 def test_what_does_not_go_together_is_one_line(hill, tmp_path, monkeypatch, capsys, flags, said):

@@ -189,13 +189,15 @@ def test_a_raster_that_declares_more_than_the_memory_holds_is_refused_before_it_
         pass
     assert path.stat().st_size < 3_000_000
     monkeypatch.setattr("seasonscapes.terrain.memory.available_bytes", lambda: 16_000_000_000)
-    with pytest.raises(InputError, match=rf"too many samples.*got '{side} × {side}.*at most 16.0 GB.*\[area\]"):
+    with pytest.raises(
+        InputError, match=rf"too large for this machine's memory.*got '{side} × {side}.*at most 16.0 GB.*\[area\]"
+    ):
         read_elevation(path)
 
 
 def test_free_memory_is_asked_of_the_machine():
     check_memory((10, 10), "a.tif")
-    with pytest.raises(InputError, match=r"a\.tif: too many samples"):
+    with pytest.raises(InputError, match=r"a\.tif: too large for"):
         check_memory((10**8, 10**8), "a.tif")
 
 
@@ -216,3 +218,22 @@ def test_what_is_doubted_stands_on_the_console_and_in_the_json(tmp_path, monkeyp
         warnings = json.loads(said.out.splitlines()[-1])["warnings"]
         assert [any(word in line for line in warnings) for word in ("US survey foot", "stand out")] == [True, True]
         assert all(line in said.err for line in warnings)
+
+
+def test_a_mosaic_of_ones_own_tiles_keeps_their_unit_and_band_order(tmp_path):
+    """What `fetch` joins of files that the user names."""
+    from rasterio.enums import ColorInterp
+
+    from seasonscapes.open_data.local_files import local_colours, local_heights, local_rasters
+    from seasonscapes.terrain.mosaic import MapGrid
+
+    grid = MapGrid("EPSG:32632", 420300.0, 5159700.0, 30.0, 20, 20)
+    written(tmp_path, hill() / FOOT, units="US survey foot")
+    heights = local_heights(local_rasters(str(tmp_path / "dem.tif"), "elevation", flag="--dem"), grid)
+    np.testing.assert_allclose(heights, hill()[10:30, 10:30], rtol=1e-5)
+    colours = np.stack([np.full((64, 64), value, np.uint8) for value in (10, 120, 240)])
+    path = write_tiff(tmp_path / "image.tif", colours, GRID, "EPSG:32632")
+    with rasterio.open(path, "r+") as file:
+        file.colorinterp = [ColorInterp.blue, ColorInterp.green, ColorInterp.red]
+    shown = local_colours(local_rasters(str(path), "imagery", flag="--imagery"), grid)
+    assert (np.diff(shown, axis=2) < 0.0).all()

@@ -59,6 +59,7 @@ COMMANDS = {
             "relight",
         ),
     ),
+    "export": ("export", *HILL, "--to", "glb", "-o", "out/hill.glb"),
     "distill": (
         *("distill", *HILL, "--sky", "hosek", "--discs", "16", "--suns", "2", "--views", "1", "--view-px", "32"),
         *("--steps", "600", "--picture-steps", "4", "-o", "out/model.safetensors"),

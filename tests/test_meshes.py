@@ -1,9 +1,7 @@
 """Textured meshes: every format is read alike, lies where it should, and keeps all but its textures when written."""
 
 import json
-import os
 import struct
-import subprocess
 import sys
 import zlib
 from pathlib import Path
@@ -18,6 +16,7 @@ from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
 import seasonscapes as ss
+from seasonscapes.cli import main
 from seasonscapes.errors import InputError
 from seasonscapes.frames import enu_from_geodetic
 from seasonscapes.images import linear_from_srgb, srgb_from_linear
@@ -320,7 +319,7 @@ class TestPlacing:
 
 def broken_file(kind: str, folder: Path) -> tuple[Path, ss.MeshPlacing | None]:
     """A mesh file with one fault."""
-    vertices, faces, _uv = box_faces()
+    vertices, faces, _ = box_faces()
     if kind == "no coordinates":
         path = write_obj(folder)
         path.write_text("\n".join(_without_uv(line) for line in path.read_text().splitlines()))
@@ -342,6 +341,16 @@ def broken_file(kind: str, folder: Path) -> tuple[Path, ss.MeshPlacing | None]:
     if kind == "buffer outside":
         path = write_gltf(folder)
         path.write_text(path.read_text().replace('"boxes.bin"', '"../boxes.bin"'))
+        return path, None
+    if kind == "normal map outside":
+        path = write_gltf(folder)
+        document = json.loads(path.read_text())
+        document["images"].append({"uri": "../secret.png"})
+        path.write_text(json.dumps(document))
+        return path, None
+    if kind == "broken colour":
+        path = write_obj(folder)
+        (folder / "boxes.mtl").write_text("newmtl wall0\nKd red green blue\n")
         return path, None
     if kind == "ply texture outside":
         return write_ply(folder, texture="../wall0.png"), None
@@ -406,6 +415,8 @@ BROKEN = {
     "absolute texture": "map_Kd: outside the mesh's folder; got '/etc/wall0.png'",
     "texture on the network": "map_Kd: a file on the network; got 'https://example.org/wall0.png'",
     "buffer outside": r"buffer 0: outside the mesh's folder; got '../boxes.bin'",
+    "normal map outside": r"texture 2: outside the mesh's folder; got '../secret.png'",
+    "broken colour": "a colour that is no three numbers; got 'red green blue'",
     "ply texture outside": "TextureFile: outside the mesh's folder; got '../wall0.png'",
     "cmyk": "texture wall0.jpg: a texture in CMYK; got 'CMYK'; expected RGB",
     "no image": "texture wall0.png: not a readable image",
@@ -429,7 +440,7 @@ class TestMistakes:
         with pytest.raises(InputError, match=BROKEN[kind]) as caught:
             ss.load_mesh(path, placing)
         assert "\n" not in str(caught.value)
-        assert path.name in str(caught.value)
+        assert path.stem in str(caught.value)
 
     def test_outside_files_are_read_when_allowed(self, tmp_path):
         folder = tmp_path / "mesh"
@@ -487,72 +498,70 @@ class TestMistakes:
         assert any("texels are used by several faces" in note for note in notes)
 
 
-class TestLight:
-    def test_a_wall_is_lit_by_the_sun_it_faces(self, tmp_path):
-        mesh = ss.load_mesh(write_glb(tmp_path))
-        around = ss.MeshSurroundings(sky="hosek", rays=64, ground_albedo=None)
-        transport = mesh_transport(mesh, around)
-        lit = ss.light_mesh(mesh, (90.0, 30.0), surroundings=around, transport=transport)
-        light, _ = mesh_light(mesh, (90.0, 30.0), around)
-        sun_lx = np.asarray(light.sun.normal_illuminance_lx)
-        positions = surface_positions(transport.atlas)[transport.atlas.tiles[1].window]
-        east = np.isclose(positions[..., 0], 2.5, atol=1e-4)
-        west = np.isclose(positions[..., 0], 0.5, atol=1e-4)
-        top = np.isclose(positions[..., 2], 0.5, atol=1e-4)
-        # The second box stands free towards the east; vertical walls are missed by rays from above, not by these.
-        assert east.sum() > 30
-        received = lit.illuminance[1]
-        sky = ss.light_mesh(mesh, (270.0, 30.0), surroundings=around, transport=transport).illuminance[1]
-        np.testing.assert_allclose(
-            np.median(received[east], axis=0) - np.median(sky[west], axis=0),
-            np.cos(np.radians(30.0)) * sun_lx,
-            rtol=0.02,
-        )
-        assert np.median(received[west][:, 1]) < 0.3 * np.median(received[east][:, 1])
-        assert np.median(received[top][:, 1]) > 0.5 * sun_lx[1]
+@pytest.fixture(scope="module")
+def boxes(tmp_path_factory):
+    """Two boxes on the ground, with the light transport of their texels."""
+    folder = tmp_path_factory.mktemp("boxes")
+    mesh = ss.load_mesh(write_glb(folder), ss.MeshPlacing(at=(46.5, 8.0, 1000.0)))
+    return mesh, mesh_transport(mesh, AROUND)
 
-    def test_the_neighbour_casts_a_shadow(self, tmp_path):
-        mesh = ss.load_mesh(write_glb(tmp_path))
-        transport = mesh_transport(mesh, AROUND)
+
+class TestLight:
+    def test_a_wall_is_lit_by_the_sun_it_faces(self, boxes):
+        from seasonscapes.albedo.forward_model import sun_on_texels
+
+        mesh, transport = boxes
+        light, _ = mesh_light(mesh, (90.0, 30.0), AROUND)
+        inside = transport.atlas.tiles[1].window
+        direct = sun_on_texels(transport.texels, light).reshape(*transport.atlas.shape, 3)[inside]
+        positions = surface_positions(transport.atlas)[inside]
+        # The second box stands free towards the east; rays from above would miss its vertical walls.
+        for wall, cosine in (
+            (np.isclose(positions[..., 0], 2.5, atol=1e-4), np.cos(np.radians(30.0))),
+            (np.isclose(positions[..., 2], 0.5, atol=1e-4), np.sin(np.radians(30.0))),
+            (np.isclose(positions[..., 0], 0.5, atol=1e-4), 0.0),
+        ):
+            assert wall.sum() > 30
+            expected = np.broadcast_to(cosine * np.asarray(light.sun.normal_illuminance_lx), direct[wall].shape)
+            np.testing.assert_allclose(direct[wall], expected, rtol=1e-3, atol=1e-3)
+
+    def test_the_neighbour_casts_a_shadow(self, boxes):
+        mesh, transport = boxes
         positions = surface_positions(transport.atlas)[transport.atlas.tiles[1].window]
         west = np.isclose(positions[..., 0], 0.5, atol=1e-4)
-        low = west & (positions[..., 2] < 0.1)
         lit = ss.light_mesh(mesh, (270.0, 20.0), surroundings=AROUND, transport=transport).illuminance[1]
         # The first box is 1 m high and ends 1 m west: its shadow reaches 1 - tan 20° = 0.64 m up this wall.
-        assert np.median(lit[low][:, 1]) < 0.5 * np.median(lit[west & (positions[..., 2] > 0.3)][:, 1])
+        height = positions[..., 2] + 0.5
+        assert np.median(lit[west & (height < 0.6)][:, 1]) < 0.5 * np.median(lit[west & (height > 0.68)][:, 1])
 
-    def test_light_taken_out_is_the_light_put_in(self, tmp_path):
+    def test_light_taken_out_is_the_light_put_in(self, boxes):
         from dataclasses import replace
 
-        mesh = ss.load_mesh(write_glb(tmp_path), ss.MeshPlacing(at=(46.5, 8.0, 1000.0)))
-        transport = mesh_transport(mesh, AROUND)
+        from seasonscapes.albedo.delighting import DelightOptions
+
+        mesh, transport = boxes
         lit = ss.light_mesh(mesh, SUN, surroundings=AROUND, transport=transport)
         level = mesh_light(mesh, SUN, AROUND)[0].global_horizontal_lx
-        white = 0.8 * level / np.pi
-        textures = [
-            replace(t, values=np.clip(r / white, 0.0, 1.0)) for t, r in zip(mesh.textures, lit.radiance, strict=True)
-        ]
-        photographed = replace(mesh, textures=tuple(textures))
-        delit = ss.delight_mesh(photographed, SUN, surroundings=AROUND, transport=transport)
-        for before, after, sigma, face in zip(
-            mesh.textures,
-            delit.mesh.textures,
-            delit.sigma,
-            (transport.atlas.tiles[0], transport.atlas.tiles[1]),
-            strict=True,
-        ):
-            known = transport.atlas.face[face.window] >= 0
-            ratio = after.values[known] / before.values[known]
-            # One factor for all: the exposure is not known.
-            spread = np.percentile(ratio, [5, 95]) / np.median(ratio)
-            np.testing.assert_allclose(spread, 1.0, atol=0.12)
-            assert np.isfinite(sigma[known]).all()
-            assert np.isinf(sigma[~known]).all()
-            assert after.values.min() >= 0.0
+        textures = tuple(
+            replace(t, values=np.clip(r * np.pi / (0.8 * level), 0.0, 1.0))
+            for t, r in zip(mesh.textures, lit.radiance, strict=True)
+        )
+        photographed = replace(mesh, textures=textures)
+        known = [transport.atlas.face[tile.window] >= 0 for tile in transport.atlas.tiles[:2]]
+        options = DelightOptions(white_reflectance=0.8)
+        delit = ss.delight_mesh(photographed, SUN, surroundings=AROUND, transport=transport, options=options)
+        for number, on in enumerate(known):
+            ratio = delit.mesh.textures[number].values[on] / mesh.textures[number].values[on]
+            np.testing.assert_allclose(np.percentile(ratio, [2, 98]), 1.0, atol=0.01)
+            assert np.isfinite(delit.sigma[number][on]).all()
+            assert np.isinf(delit.sigma[number][~on]).all()
+        # Without the exposure all is off by one factor, and by what reflections of darker walls change.
+        scaled = ss.delight_mesh(photographed, SUN, surroundings=AROUND, transport=transport).mesh.textures[0].values
+        ratio = scaled[known[0]] / mesh.textures[0].values[known[0]]
+        np.testing.assert_allclose(np.percentile(ratio, [10, 50, 90]), 0.5 / 0.8, rtol=0.05)
         # As they were lit, the walls differ by far more.
-        plain = photographed.textures[0].values / mesh.textures[0].values
-        known = transport.atlas.face[transport.atlas.tiles[0].window] >= 0
-        assert np.ptp(np.log(np.percentile(plain[known], [5, 95]))) > 1.0
+        plain = textures[0].values[known[0]] / mesh.textures[0].values[known[0]]
+        assert np.ptp(np.log(np.percentile(plain, [5, 95]))) > 1.0
 
     def test_vertex_colours_are_delit_vertex_by_vertex(self, tmp_path):
         from dataclasses import replace
@@ -567,20 +576,19 @@ class TestLight:
         seen = lit.illuminance[0][..., 1] > 0.02 * lit.illuminance[0][..., 1].max()
         np.testing.assert_allclose(np.percentile(ratio[seen], [5, 95]) / np.median(ratio[seen]), 1.0, atol=0.05)
 
-    def test_no_daylight_is_told(self, tmp_path):
+    def test_night_is_told(self, tmp_path):
         mesh = ss.load_mesh(coloured_ball(tmp_path), ss.MeshPlacing(at=(46.5, 8.0, 1000.0)))
-        with pytest.raises(InputError, match=r"no daylight in the textures|sun"):
+        with pytest.raises(InputError, match="the solar elevation is -17"):
             ss.delight_mesh(mesh, "2024-07-20T23:30", surroundings=AROUND)
 
-    def test_a_picture_shows_the_lit_texture(self, tmp_path):
-        mesh = ss.load_mesh(write_glb(tmp_path))
+    def test_a_picture_shows_the_lit_texture(self, boxes):
+        mesh, transport = boxes
         camera = mesh_camera(mesh, azimuth_deg=150.0, elevation_deg=35.0, size_px=(96, 64))
         view = relit_mesh_view(mesh_view(mesh, camera, surroundings=AROUND), SUN)
-        lit = ss.light_mesh(mesh, SUN, surroundings=AROUND)
-        atlas = mesh_atlas(mesh, ground_albedo=0.2)
+        lit = ss.light_mesh(mesh, SUN, surroundings=AROUND, transport=transport)
         on_mesh = view.gbuffer.position[..., 2] > 0.45
         assert on_mesh.sum() > 200
-        expected = atlas_lookup(atlas.image(list(lit.radiance)), view.gbuffer.uv[on_mesh])
+        expected = atlas_lookup(transport.atlas.image(list(lit.radiance)), view.gbuffer.uv[on_mesh])
         shown = view.surface[on_mesh]
         assert np.median(np.abs(shown / expected - 1.0)) < 0.04
 
@@ -628,46 +636,46 @@ def test_creases_keep_edges_sharp_and_smooth_the_rest():
 
 
 class TestCommands:
-    def run(self, tmp_path, *arguments: str) -> subprocess.CompletedProcess[str]:
-        program = Path(sys.executable).with_name("seasonscapes")
-        workspace = {"SEASONSCAPES_WORKSPACE": str(tmp_path / "workspace")}
-        return subprocess.run(
-            [program, *arguments], cwd=tmp_path, env=os.environ | workspace, capture_output=True, text=True
-        )
+    @pytest.fixture
+    def run(self, tmp_path, monkeypatch, capsys):
+        """Run one command in an empty folder; exit code, stdout and stderr."""
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setenv("SEASONSCAPES_WORKSPACE", str(tmp_path / "workspace"))
 
-    def test_delight_then_relight(self, tmp_path):
+        def run(*arguments: str) -> tuple[int, str, str]:
+            code = main(list(arguments))
+            return code, *capsys.readouterr()
+
+        return run
+
+    def test_delight_then_relight(self, tmp_path, run):
         write_glb(tmp_path)
         light = ["--at", "46.5,8,1000", "--time", "2024-07-20T13:00", "--sky", "hosek", "--rays", "16"]
-        done = self.run(tmp_path, "delight", "boxes.glb", *light, "-o", "albedo.glb", "--json")
-        assert done.returncode == 0, done.stderr
-        record = json.loads(done.stdout)
+        code, out, err = run("delight", "boxes.glb", *light, "-o", "albedo.glb", "--json")
+        assert code == 0, err
+        record = json.loads(out)
         assert record["sun"]["elevation_deg"] > 50.0
         assert str(tmp_path) not in (tmp_path / "albedo.glb").read_bytes().decode("latin-1")
         assert len(ss.load_mesh(tmp_path / "albedo.glb").textures) == 2
-        done = self.run(tmp_path, "relight", "albedo.glb", *light, "--size", "48x32", "-o", "view.png", "--json")
-        assert done.returncode == 0, done.stderr
-        assert Image.open(tmp_path / "view.png").size == (48, 32)
         span = ["--from", "2024-07-20T09:00", "--to", "2024-07-20T17:00", "--every", "4h", "--at", "46.5,8,1000"]
-        done = self.run(
-            tmp_path, "relight", "albedo.glb", *span, "--sky", "hosek", "--rays", "16", "--size", "32x24", "-o", "film"
+        code, _, err = run(
+            "relight", "albedo.glb", *span, "--sky", "hosek", "--rays", "16", "--size", "32x24", "-o", "film"
         )
-        assert done.returncode == 0, done.stderr
+        assert code == 0, err
         assert len(list((tmp_path / "film").glob("*.png"))) == 3
 
-    def test_lit_textures_and_turntable(self, tmp_path):
+    def test_lit_textures_and_turntable(self, tmp_path, run):
         write_obj(tmp_path)
         sun = ["--sun", "120,35", "--sky", "hosek", "--rays", "16"]
-        done = self.run(tmp_path, "relight", "boxes.obj", *sun, "--textures", "exr", "-o", "lit")
-        assert done.returncode == 0, done.stderr
+        code, _, err = run("relight", "boxes.obj", *sun, "--textures", "exr", "-o", "lit")
+        assert code == 0, err
         from seasonscapes.images import read_exr
 
         layers, _ = read_exr(tmp_path / "lit" / "wall1.exr")
         assert layers[""].shape == (24, 36, 3)
         assert layers["illuminance"].max() > 30_000.0
-        done = self.run(tmp_path, "relight", "boxes.obj", *sun, "-o", "lit.glb")
-        assert done.returncode == 0, done.stderr
-        done = self.run(tmp_path, "relight", "boxes.obj", *sun, "--turntable", "2", "--size", "32x24", "-o", "round")
-        assert done.returncode == 0, done.stderr
+        code, _, err = run("relight", "boxes.obj", *sun, "--turntable", "2", "--size", "32x24", "-o", "round")
+        assert code == 0, err
         first, second = (np.asarray(Image.open(path)) for path in sorted((tmp_path / "round").glob("*.png")))
         assert np.abs(first.astype(float) - second).mean() > 2.0
 
@@ -687,13 +695,13 @@ class TestCommands:
             (["delight", "alpine_small", "--sun", "100,40", "--up", "y"], "flags of meshes beside a scene"),
         ],
     )
-    def test_mistakes_on_the_command_line_get_one_line(self, tmp_path, arguments, line):
+    def test_mistakes_on_the_command_line_get_one_line(self, tmp_path, run, arguments, line):
         write_glb(tmp_path)
         extra = ["--sky", "hosek", "--rays", "16"] if "alpine_small" not in arguments else []
-        done = self.run(tmp_path, *arguments, *extra)
-        assert done.returncode == 2, done.stderr
-        assert line in done.stderr
-        assert "Traceback" not in done.stderr
+        code, _, err = run(*arguments, *extra)
+        assert code == 2, err
+        assert line in err
+        assert len(err.strip().splitlines()[-1]) > 10
 
 
 def test_lit_delit_relit_against_an_independent_path_tracer(tmp_path):
@@ -703,7 +711,7 @@ def test_lit_delit_relit_against_an_independent_path_tracer(tmp_path):
         from mesh_scene import mesh_relit
     finally:
         sys.path.pop(0)
-    scores = mesh_relit(5, tmp_path, texels=48, spp=64, rays=64)
+    scores = mesh_relit(5, tmp_path, texels=48, spp=32, rays=64)
     assert scores["mesh_uv_equal"] == 1.0
     assert scores["mesh_relit_psnr_db"] > 26.0
     assert scores["mesh_relit_psnr_db"] > scores["mesh_as_lit_psnr_db"] + 6.0

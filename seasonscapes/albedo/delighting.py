@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter
+from scipy.ndimage import shift as spline_shift
 
 from seasonscapes.albedo.closed_form import HIGHEST, LOWEST
 from seasonscapes.albedo.registration import shifted_back, texture_shift
@@ -199,26 +200,86 @@ def delight_image(
         Where the image has no value on the surface.
     """
     options, report = options or DelightOptions(), progress or (lambda fraction: None)
-    chart = np.where(np.isfinite(image).all(axis=2), light.chart, -1)
-    if not (chart >= 0).any():
+    known = np.isfinite(image).all(axis=2) & (light.chart >= 0)
+    if not known.any():
         raise NoUsablePixels("delight: the image has no value anywhere on the surface")
-    scale = _radiance_per_unit(options, light)
-    grey = np.full(light.sun.shape, _GREY, np.float32)
-    bounce = light.bounce(grey)
     shift = None
     if options.register:
-        predicted = light.visibility[..., None] * light.sun + light.sky + bounce
-        shift = texture_shift(image.mean(axis=2), predicted.mean(axis=2), chart >= 0)
-        if shift is not None:
-            image = shifted_back(image, shift)
-            clipped = np.asarray(shifted_back(clipped.astype(np.float32), shift) > 0.01)
-            chart = np.where(np.isfinite(image).all(axis=2), light.chart, -1)
+        predicted = light.visibility[..., None] * light.sun + light.sky + light.bounce(_grey(light.sun.shape))
+        shift = texture_shift(image.mean(axis=2), predicted.mean(axis=2), known)
     report(0.1)
+    if shift is None:
+        return _delit(image, clipped, light, options, report)
+    # Splines through the sharp borders of shadows in the image would overshoot; the light is moved onto the image instead,
+    # and the albedo, which has none, back onto the surface.
+    moved = None if options.land_class is None else _moved(options.land_class, shift).astype(int)
+    result = _delit(image, clipped, _moved_light(light, shift), replace(options, land_class=moved), report)
+    return _placed_back(result, shift)
+
+
+def _grey(shape: tuple[int, ...]) -> np.ndarray:
+    return np.full(shape, _GREY, np.float32)
+
+
+def _moved(values: np.ndarray, shift: tuple[float, float], *, order: int = 0) -> np.ndarray:
+    """Values of texels ``(R, S)`` or ``(R, S, C)`` at the places where the image shows them; those of the rim beyond it."""
+    offsets = (*shift, *(0.0 for _ in values.shape[2:]))
+    return spline_shift(values.astype(np.float64), offsets, order=order, mode="nearest").astype(np.float32)
+
+
+def _moved_light(light: TexelIrradiance, shift: tuple[float, float]) -> TexelIrradiance:
+    back = (-shift[0], -shift[1])
+    return replace(
+        light,
+        sun=_moved(light.sun, shift, order=1),
+        visibility=_moved(light.visibility, shift, order=1),
+        sky=_moved(light.sky, shift, order=1),
+        bounce=lambda albedo: _moved(light.bounce(_moved(albedo, back)), shift, order=1),
+        chart=_moved(light.chart, shift).astype(np.int32),
+    )
+
+
+def _placed_back(delit: DelitImage, shift: tuple[float, float]) -> DelitImage:
+    """Results on the texels of the surface from those on the image's."""
+    logarithm = shifted_back(np.log(np.maximum(delit.albedo, LOWEST)), shift)
+    albedo = np.exp(logarithm)
+    known = np.asarray(np.isfinite(albedo).all(axis=2))
+    back = (-shift[0], -shift[1])
+    source = _moved(delit.source, back).astype(np.uint8)
+    # Beside an unknown texel no spline passes: the nearest value.
+    nearest = _moved(np.nan_to_num(delit.albedo), back)
+    albedo = np.where(known[..., None] | (source[..., None] == NOTHING), albedo, nearest)
+    there = source != NOTHING
+    sigma = np.where(there, _moved(np.where(np.isfinite(delit.sigma), delit.sigma, 1.0), back), np.inf)
+    return replace(
+        delit,
+        albedo=np.where(there[..., None], albedo, np.float32(np.nan)).astype(np.float32),
+        sigma=sigma.astype(np.float32),
+        visibility=np.clip(_moved(delit.visibility, back, order=1), 0.0, 1.0),
+        source=source,
+        shift_texels=shift,
+    )
+
+
+def _delit(
+    image: np.ndarray,
+    clipped: np.ndarray,
+    light: TexelIrradiance,
+    options: DelightOptions,
+    report: Callable[[float], None],
+) -> DelitImage:
+    """`delight_image` of an image that lies where the light does."""
+    known = np.isfinite(image).all(axis=2) & (light.chart >= 0)
+    chart = np.where(known, light.chart, -1)
+    scale = _radiance_per_unit(options, light)
     radiance = _at_surface(np.nan_to_num(image) * scale, options.air)
     visibility, deviation = light.visibility.astype(np.float32), np.zeros(chart.shape, np.float32)
-    factor, albedo = np.ones(3), grey
+    factor, bounce = np.ones(3), light.bounce(_grey(light.sun.shape))
+    sunlight = illuminance = visibility[..., None] * light.sun
+    albedo = _grey(light.sun.shape)
     for number in range(options.rounds):
-        if options.borders is not None and number in (0, options.rounds - 1):
+        final = number == options.rounds - 1
+        if options.borders is not None and (number == 0 or final):
             visibility, deviation = refined_visibility(
                 np.log(np.pi * np.maximum(radiance, 1e-3)),
                 light.sun,
@@ -226,20 +287,17 @@ def delight_image(
                 light.visibility,
                 chart,
                 # Borders are good enough for the sky factor after a rough first pass.
-                model=options.borders
-                if number == options.rounds - 1
-                else replace(options.borders, levels=3, iterations=8),
+                model=options.borders if final else replace(options.borders, levels=3, iterations=8),
             )
         sunlight = visibility[..., None] * light.sun
         if options.fit_sky:
-            usable = (chart >= 0) & ~clipped.any(axis=2) & (deviation < 0.1)
+            usable = known & ~clipped.any(axis=2) & (deviation < 0.1)
             factor = fitted_sky_factor(radiance, sunlight, light.sky, bounce, np.where(usable, chart, -1))
         illuminance = np.maximum(sunlight + factor * light.sky + bounce, 1e-3)
         albedo = np.clip(np.pi * radiance / illuminance, LOWEST, HIGHEST).astype(np.float32)
-        albedo[chart < 0] = _GREY
+        albedo[~known] = _GREY
         bounce = light.bounce(albedo)
         report(0.1 + 0.8 * (number + 1) / options.rounds)
-    known = chart >= 0
     if options.land_class is not None:
         kind = np.where(known & ~clipped.any(axis=2), options.land_class, -1)
         illuminance = class_response(radiance, sunlight, illuminance - sunlight, kind)
@@ -256,7 +314,7 @@ def delight_image(
         np.where(known, sigma, np.inf).astype(np.float32),
         visibility,
         source,
-        shift,
+        None,
         factor,
         scale,
     )
@@ -420,7 +478,7 @@ def _completed(albedo: np.ndarray, clipped: np.ndarray, known: np.ndarray) -> np
     whole = np.equal(clipped, np.zeros_like(clipped))
     ratio = np.where(whole, albedo, 0.0).sum(axis=2) / np.maximum(np.where(whole, around, 0.0).sum(axis=2), 1e-6)
     # A clipped value is a lower bound.
-    guess = np.where(whole.any(axis=2)[..., None], around * ratio[..., None], around)
+    guess = np.where(np.asarray(whole.any(axis=2))[..., None], around * ratio[..., None], around)
     filled = np.where(clipped, np.maximum(albedo, guess), albedo)
     return np.clip(filled, LOWEST, HIGHEST).astype(np.float32)
 

@@ -8,7 +8,7 @@ energy, so that a few strong borders do not decide alone.
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, spline_filter1d
+from scipy.ndimage import gaussian_filter
 from scipy.ndimage import shift as spline_shift
 
 # Farther than this an image is not misregistered but wrongly georeferenced [texels].
@@ -65,8 +65,8 @@ def _gradients(values: np.ndarray, known: np.ndarray) -> list[np.ndarray]:
     return [gradient / (energy + np.median(energy) + 1e-9) for gradient in gradients]
 
 
-def shifted_back(values: np.ndarray, shift: tuple[float, float]) -> np.ndarray:
-    """Move an image back by a shift, with cubic splines.
+def shifted_back(values: np.ndarray, shift: tuple[float, float], *, order: int = 3) -> np.ndarray:
+    """Move an image back by a shift, by interpolation with splines.
 
     Parameters
     ----------
@@ -74,6 +74,8 @@ def shifted_back(values: np.ndarray, shift: tuple[float, float]) -> np.ndarray:
         ``(R, S, C)``; NaN where unknown.
     shift
         Rows and columns by which the image lies too far.
+    order
+        Of the splines: 3, or 1 for what must not overshoot, or 0 for the nearest value.
 
     Returns
     -------
@@ -81,14 +83,11 @@ def shifted_back(values: np.ndarray, shift: tuple[float, float]) -> np.ndarray:
         ``(R, S, C)`` float32, within the range of the values; NaN where a source texel is unknown.
     """
     known = np.isfinite(values).all(axis=2)
-    result = np.empty(values.shape, np.float32)
     back = (-shift[0], -shift[1])
+    result = np.empty(values.shape, np.float32)
     for channel in range(values.shape[2]):
-        plane = np.where(known, values[..., channel], 0.0)
-        moved = plane.astype(np.float64)
-        for axis in (0, 1):
-            moved = spline_filter1d(moved, order=3, axis=axis, mode="nearest")
-        moved = spline_shift(moved, back, order=3, mode="nearest", prefilter=False)
+        plane = np.where(known, values[..., channel], 0.0).astype(np.float64)
+        moved = spline_shift(plane, back, order=order, mode="nearest")
         result[..., channel] = np.clip(moved, plane.min(), plane.max())
-    valid = spline_shift(known.astype(np.float32), back, order=1, mode="constant", cval=0.0) > 0.99
+    valid = spline_shift(known.astype(np.float32), back, order=min(order, 1), mode="constant", cval=0.0) > 0.99
     return np.where(valid[..., None], result, np.float32(np.nan))

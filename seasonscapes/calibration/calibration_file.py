@@ -14,9 +14,11 @@ from seasonscapes.calibration.resection import Calibration
 from seasonscapes.cameras.exchange import read_json
 from seasonscapes.cameras.panorama import PROJECTIONS, Panorama
 from seasonscapes.cameras.pinhole import Camera
+from seasonscapes.declaration import checked_name
 from seasonscapes.errors import InputError
 from seasonscapes.frames import LocalFrame, geodetic_from_enu
 from seasonscapes.images import atomic_path
+from seasonscapes.text_files import MALFORMED
 
 
 @dataclass(frozen=True)
@@ -124,6 +126,6 @@ def read_calibration(path: Path) -> CalibratedWebcam:
             view = Panorama(projection, width, height, fx, fy, cx, cy, pose, frame)
         else:
             raise ValueError(f"projection {projection!r}")
-        return CalibratedWebcam(str(record["webcam"]), view, float(record["k1"]), sigma, frame)
-    except (KeyError, TypeError, ValueError) as error:
+        return CalibratedWebcam(checked_name(str(record["webcam"])), view, float(record["k1"]), sigma, frame)
+    except MALFORMED as error:
         raise InputError(path, f"not a calibration record: {error!r}") from None

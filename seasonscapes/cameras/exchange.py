@@ -129,10 +129,12 @@ def read_colmap(folder: Path) -> list[NamedView]:
         if number not in intrinsics:
             raise InputError(where, "no such camera in cameras.txt", got=number)
         pose = np.eye(4)
-        pose[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix().T
-        pose[:3, 3] = -pose[:3, :3] @ translation
-        width, height, fx, fy, cx, cy = intrinsics[number]
-        views.append(NamedView(name, Camera(width, height, fx, fy, cx, cy, pose), name))
+        try:
+            pose[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix().T
+            pose[:3, 3] = -pose[:3, :3] @ translation
+            views.append(NamedView(name, Camera(*intrinsics[number], pose), name))
+        except ValueError as error:
+            raise InputError(where, f"not a view: {error}") from None
     return views
 
 
@@ -159,9 +161,12 @@ def _colmap_intrinsics(fields: list[str], where: str) -> tuple[int, int, float, 
 
 def _floats(fields: list[str], where: str) -> list[float]:
     try:
-        return [float(field) for field in fields]
+        numbers = [float(field) for field in fields]
     except ValueError as error:
         raise InputError(where, f"not a number: {error}") from None
+    if not np.isfinite(numbers).all():
+        raise InputError(where, "a number that is not finite", got=" ".join(fields))
+    return numbers
 
 
 def write_transforms(path: Path, views: Sequence[NamedView], frame: LocalFrame) -> None:
@@ -218,31 +223,34 @@ def read_transforms(path: Path) -> tuple[list[NamedView], LocalFrame | None]:
         Invalid JSON, a missing key, or non-zero distortion.
     """
     table = read_json(path)
-    origin = table.get("world", {}).get("origin")
-    frame = LocalFrame(**origin) if origin else None
+    shared = {key: value for key, value in table.items() if key != "frames"}
+    try:
+        origin = (table.get("world") or {}).get("origin")
+        frame = LocalFrame(**origin) if origin else None
+        records = list(table["frames"])
+    except text_files.MALFORMED as error:
+        raise InputError(path, f"not a list of views: {error!r}") from None
     views = []
-    for index, record in enumerate(table.get("frames", [])):
-        values = {**{k: v for k, v in table.items() if k != "frames"}, **record}
+    for index, record in enumerate(records):
+        where = f"{path}: frames[{index}]"
         try:
-            fx, fy, cx, cy = values["fl_x"], values.get("fl_y", values["fl_x"]), values["cx"], values["cy"]
-            pose = np.array(record["transform_matrix"], float) @ _FLIP
-            width, height = int(values["w"]), int(values["h"])
-        except KeyError as error:
-            raise InputError(f"{path}: frames[{index}]", f"key {error} is missing") from None
-        distortion = [key for key in ("k1", "k2", "k3", "k4", "p1", "p2") if values.get(key)]
-        if distortion:
-            problem = f"distortion {distortion[0]} is not zero"
-            raise InputError(f"{path}: frames[{index}]", problem, cure="undistort the images first")
-        stamp = record.get("time_utc")
-        views.append(
-            NamedView(
-                record.get("name", record["file_path"]),
-                Camera(width, height, fx, fy, cx, cy, pose, frame),
-                record["file_path"],
-                datetime.fromisoformat(stamp) if stamp else None,
-            )
-        )
+            views.append(_view_of_record({**shared, **record}, record, frame, where))
+        except text_files.MALFORMED as error:
+            problem = f"key {error} is missing" if isinstance(error, KeyError) else f"not a view: {error}"
+            raise InputError(where, problem) from None
     return views, frame
+
+
+def _view_of_record(values: dict[str, Any], record: dict[str, Any], frame: LocalFrame | None, where: str) -> NamedView:
+    """The view of one record; its intrinsics may be shared by all and are among ``values``."""
+    fx, fy, cx, cy = (float(values[key]) for key in ("fl_x", "fl_y" if "fl_y" in values else "fl_x", "cx", "cy"))
+    distortion = [key for key in ("k1", "k2", "k3", "k4", "p1", "p2") if values.get(key)]
+    if distortion:
+        raise InputError(where, f"distortion {distortion[0]} is not zero", cure="undistort the images first")
+    pose = np.array(record["transform_matrix"], float) @ _FLIP
+    file, stamp = str(record["file_path"]), record.get("time_utc")
+    camera = Camera(int(values["w"]), int(values["h"]), fx, fy, cx, cy, pose, frame)
+    return NamedView(str(record.get("name", file)), camera, file, datetime.fromisoformat(stamp) if stamp else None)
 
 
 def opencv_from_camera(camera: Camera, k1: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -363,8 +371,9 @@ def read_opencv(path: Path) -> tuple[Camera, float]:
             record["rvec"],
             record["tvec"],
         )
-    except KeyError as error:
-        raise InputError(path, f"key {error} is missing") from None
+    except text_files.MALFORMED as error:
+        problem = f"key {error} is missing" if isinstance(error, KeyError) else f"not a camera: {error}"
+        raise InputError(path, problem) from None
 
 
 def read_json(path: Path) -> dict[str, Any]:

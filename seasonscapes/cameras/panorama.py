@@ -75,6 +75,8 @@ class Panorama:
             raise ValueError(f"world_from_camera: got shape {pose.shape}, expected a finite (4, 4) matrix")
         if not np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-6) or np.linalg.det(pose[:3, :3]) < 0:
             raise ValueError("world_from_camera: expected a right-handed rotation; the axes may be mirrored")
+        if not np.isfinite([self.fx, self.fy, self.cx, self.cy, self.width_px, self.height_px]).all():
+            raise ValueError("Panorama: image size, focal lengths and principal point must be finite")
         if min(self.width_px, self.height_px) < 1 or min(self.fx, self.fy) <= 0:
             raise ValueError("Panorama: image size and focal lengths must be positive")
         if self.span_deg > 360.0 + 360.0 * 2.0 / self.width_px:

@@ -20,6 +20,7 @@ from seasonscapes.cameras.trajectory import roll_of
 from seasonscapes.errors import InputError
 from seasonscapes.frames import LocalFrame, angles_from_direction, enu_from_geodetic, geodetic_from_enu, local_axes
 from seasonscapes.images import atomic_path
+from seasonscapes.text_files import MALFORMED
 
 KIND = "seasonscapes path"
 _INTRINSICS = ("fx", "fy", "cx", "cy")
@@ -142,7 +143,7 @@ def load_path(path: Path, frame: LocalFrame) -> list[Camera]:
     try:
         size = int(table["size_px"][0]), int(table["size_px"][1])
         cameras = [camera_from_record(record, frame, size) for record in table["views"]]
-    except (KeyError, TypeError, ValueError, IndexError) as error:
+    except MALFORMED as error:
         raise InputError(path, f"not a valid camera path: {error!r}") from None
     if not cameras:
         raise InputError(path, "the camera path has no views")
@@ -229,6 +230,6 @@ def read_reference_path(path: Path, frame: LocalFrame, *, kind: Kind = "refined"
         count = int(number) if isinstance(number, int) else sum(int(part) for part in number)
         curve = {"smooth": "spline", "linear": "linear"}[meta["interpolation"]]
         cameras = [views[name] for name in names]
-    except (KeyError, TypeError, ValueError) as error:
+    except MALFORMED as error:
         raise InputError(f"{path}: meta", f"not a list of waypoints: {error!r}") from None
     return ReferencePath(cameras, count, curve)

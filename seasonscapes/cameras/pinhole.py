@@ -67,6 +67,8 @@ class Camera:
         rotation = pose[:3, :3]
         if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0:
             raise ValueError("world_from_camera: expected a right-handed rotation; the axes may be mirrored")
+        if not np.isfinite([self.fx, self.fy, self.cx, self.cy, self.width_px, self.height_px]).all():
+            raise ValueError("Camera: image size, focal lengths and principal point must be finite")
         if min(self.width_px, self.height_px) < 1 or min(self.fx, self.fy) <= 0:
             raise ValueError("Camera: image size and focal lengths must be positive")
         object.__setattr__(self, "world_from_camera", pose)

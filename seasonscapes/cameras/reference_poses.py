@@ -26,6 +26,7 @@ from seasonscapes.frames import (
     geodetic_from_enu,
     local_axes,
 )
+from seasonscapes.text_files import MALFORMED
 
 # The grid: north-west corner, extent (latitude, longitude) [deg], rows and columns, height of one vertical step [m].
 _NORTH_DEG, _WEST_DEG, _EXTENT_DEG, _GRID, _STEP_UP_M = 46.85, 7.6, (0.45, 0.75), (836, 1393), 60.0
@@ -104,7 +105,7 @@ def read_reference_poses(path: Path, frame: LocalFrame, *, kind: Kind = "refined
             matrix = np.array(values["transform_matrix"], float)
             fx, fy, cx, cy = (float(values[key]) for key in ("fx", "fy", "cx", "cy"))
             size = int(values["wid"]), int(values["hei"])
-        except (KeyError, AttributeError, TypeError, ValueError) as error:
+        except MALFORMED as error:
             raise InputError(where, f"not a camera record: {error!r}") from None
         entry = _Record(name, matrix, (fx, fy, cx, cy), size, values.get("file_path", ""))
         views.append(_view(entry, frame, kind, where))

@@ -20,6 +20,8 @@ _SIGNED_VALUE = re.compile(r"-(\.?[0-9]|inf|nan)", re.IGNORECASE)
 _WHOLE_NUMBER = re.compile(r"[+-]?[0-9]{1,18}")
 # Flags for which "without limit" is an answer.
 _MAY_BE_INFINITE = ("--far-m",)
+# Flags for which "nothing" is an answer.
+_MAY_BE_EMPTY = ("--leave-out", "--prompt", "--without")
 _MOST_CHARACTERS = 100_000
 
 
@@ -36,15 +38,15 @@ def _value(type_: Any, tokens: Sequence[Token]) -> Any:
             raise InputError(name, "not a whole number", got=text, expected="digits, such as 12")
         if float in types and _not_finite(text) and name not in _MAY_BE_INFINITE:
             raise InputError(name, "not a finite number", got=text)
+        if not text and name not in _MAY_BE_EMPTY:
+            raise InputError(name, "nothing behind it", expected="a value")
         if Path in types:
-            check_no_device(Path(text) if text else None, name)
+            check_no_device(Path(text), name)
     return convert(type_, tokens)
 
 
-def check_no_device(path: Path | None, flag: str) -> None:
-    """`InputError` about an empty name, a pipe or a device: some would be waited for, others never end."""
-    if path is None:
-        raise InputError(flag, "an empty name", expected="the name of a file or folder")
+def check_no_device(path: Path, flag: str) -> None:
+    """`InputError` about a pipe or a device: one would be waited for, the other never ends."""
     try:
         mode = path.stat().st_mode
     except (OSError, ValueError):

@@ -74,13 +74,11 @@ def delight_command(
     if (time is None) == (sun is None):
         raise InputError("--time", "give either --time (or --time unknown) or --sun AZIMUTH,ELEVATION")
     angles = None if sun is None else parse_sun(sun)
-    from seasonscapes.workflows.delighting import UNKNOWN, delit_imagery, with_image
+    from seasonscapes.workflows.delighting import UNKNOWN, delit_imagery
 
     model = sky.model()
     with progress_bars() as progress:
         loaded = options.load(source, progress)
-        if image is not None:
-            loaded = with_image(loaded, image)
         when: ImageTime
         if angles is not None:
             when = angles
@@ -88,7 +86,9 @@ def delight_command(
             assert time is not None  # one of them was given
             known = time != UNKNOWN
             when = parse_time(time, loaded.frame.latitude_deg, loaded.frame.longitude_deg) if known else UNKNOWN
-        result = delit_imagery(loaded, when, sky=model, sensor_height_m=sensor_height_m, progress=progress)
+        result = delit_imagery(
+            loaded, when, image_file=image, sky=model, sensor_height_m=sensor_height_m, progress=progress
+        )
     record: dict[str, Any] = {
         "output": str(output),
         "scene": loaded.scene.name,

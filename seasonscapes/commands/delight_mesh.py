@@ -36,7 +36,7 @@ def delight_mesh_file(
     when = hour_on(loaded, *hour)
     with progress_bars() as progress:
         around = mesh.around(model, place.folder())
-        delit = delight_mesh(loaded, when, surroundings=around, progress=progress)
+        delit = delight_mesh(loaded, when, surroundings=around, options=mesh.delighting(), progress=progress)
     record = delit.facts | {"output": str(output), "rays": mesh.rays, "seed": mesh.seed}
     if files.textures is None:
         written = save_mesh(output, delit.mesh, bits=files.bits, facts=delit.facts)
@@ -45,7 +45,7 @@ def delight_mesh_file(
     record |= {"files": [str(path) for path in written], "seconds": round(clock.perf_counter() - start, 2)}
     factors = ", ".join(f"{value:.2f}" for value in record["sky_factor"])
     message(f"skylight of the textures over the sky model's: {factors}")
-    message("exposure unknown: white of the textures counts as level ground of reflectance 0.5 in that light")
+    message(f"white of the textures counts as level ground of reflectance {mesh.white_reflectance:g} in that light")
     sun = record["sun"]
     facts = (
         f"sun {sun['azimuth_deg']:.1f}°/{sun['elevation_deg']:.1f}°; {100 * record['sunlit_share']:.0f} % in sun, "

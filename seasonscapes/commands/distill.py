@@ -96,7 +96,7 @@ def distill_command(
     checkpoint = output.with_suffix(".checkpoint.safetensors")
     how = distillation.DistilOptions(discs, suns, dates, views, view_px, steps, picture_steps, kind)
     with progress_bars() as progress:
-        loaded = options.load(scene, progress)
+        loaded = options.load(scene, progress, albedo=[each.path for each in files])
         dated = dated_albedos(loaded, files) if files else ()
         distilled = distillation.distil_with_data(
             loaded, sky=model, albedo=dated, options=how, seed=seed, checkpoint=checkpoint, progress=progress

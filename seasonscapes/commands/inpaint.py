@@ -77,7 +77,7 @@ def inpaint_command(
     diffuse = (diffusion or DiffusionOptions()).values() if method == "diffusion" else None
     how, model = InpaintOptions(method, albedo, detail, fast, seed, diffuse), sky.model()
     with progress_bars() as progress:
-        loaded = options.load(scene, progress)
+        loaded = options.load(scene, progress, albedo=() if albedo is None else (albedo,))
         utc = parse_time(time, loaded.frame.latitude_deg, loaded.frame.longitude_deg)
         painted = completion.read_painted(texture, loaded)
         result = inpaint(loaded, painted, utc, model, how, progress=progress)

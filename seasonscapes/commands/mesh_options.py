@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 
 from cyclopts import Parameter
 
-from seasonscapes.commands.arguments import check_choice, parse_at, parse_sun, parse_time
+from seasonscapes.commands.arguments import check_choice, check_range, parse_at, parse_sun, parse_time
 from seasonscapes.commands.console import message
 from seasonscapes.errors import InputError
 
 if TYPE_CHECKING:
+    from seasonscapes.albedo.delighting import DelightOptions
     from seasonscapes.sky.models import SkyModel
     from seasonscapes.terrain.textured_mesh import TexturedMesh
     from seasonscapes.workflows.meshes import MeshSurroundings, Time
@@ -41,6 +42,8 @@ class MeshFlags:
     """Of the level ground at the mesh's lowest point."""
     ground: bool = True
     """Whether there is such ground, or the mesh hangs in the air."""
+    white_reflectance: float = 0.5
+    """Where light is taken out: reflectance of level ground that is white (value 1) in the textures."""
     rays: int = 256
     """Over the hemisphere of each texel or pixel, a power of two."""
     seed: int = 0
@@ -66,6 +69,13 @@ class MeshFlags:
         size = " × ".join(f"{side:.3g}" for side in high - low)
         message(f"{path.name}: {size} m (east × north × up), {mesh.up} up, {len(mesh.textures)} textures")
         return mesh
+
+    def delighting(self) -> DelightOptions:
+        """How light is taken out."""
+        from seasonscapes.albedo.delighting import DelightOptions
+
+        check_range("--white-reflectance", self.white_reflectance, 0.01, 2.0)
+        return DelightOptions(white_reflectance=self.white_reflectance)
 
     def around(self, sky: SkyModel, workspace: Workspace) -> MeshSurroundings:
         """Ground and sky."""

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cyclopts import Parameter
+
+from seasonscapes.commands.outputs import check_output_folder
 
 if TYPE_CHECKING:
     from seasonscapes.progress import Progress
@@ -36,27 +40,40 @@ class PlaceOptions:
     """Trust the scene: data and pictures outside its folder, any raster format, servers."""
 
     def folder(self) -> Workspace:
-        """The workspace asked for."""
+        """The workspace asked for; `InputError` where there is none and none can be made."""
         from seasonscapes.workspace import Workspace, default_workspace
 
-        return default_workspace() if self.workspace is None else Workspace(self.workspace)
+        workspace = default_workspace() if self.workspace is None else Workspace(self.workspace)
+        if not os.access(workspace.folder, os.R_OK | os.X_OK) or not workspace.folder.is_dir():
+            check_output_folder(workspace.folder, flag="workspace" if self.workspace is None else "--workspace")
+        return workspace
 
-    def mesh(self, *, texel_m: float | None = None) -> MeshOptions:
-        """How to build the terrain; ``texel_m`` is a command's own default."""
+    def mesh(self, *, texel_m: float | None = None, albedo: Sequence[Path] = ()) -> MeshOptions:
+        """How to build the terrain; ``texel_m`` is a command's own default.
+
+        Albedo files bring the terrain and the atlas that they were made with, unless flags ask for others.
+        """
+        from seasonscapes.workflows.edited_textures import stated_mesh
         from seasonscapes.workflows.place import MeshOptions
 
+        own = (self.mesher, self.max_error_m, self.refine, self.atlas, self.texel_m)
+        stated = stated_mesh(albedo) if own == ("adaptive", None, None, "planar", None) else None
+        if stated is not None:
+            return stated
         return MeshOptions(
             self.mesher, self.max_error_m, self.refine, self.atlas, texel_m if self.texel_m is None else self.texel_m
         )
 
-    def load(self, scene: str, progress: Progress | None = None, *, texel_m: float | None = None) -> Place:
-        """The place of a scene file or bundled scene."""
+    def load(
+        self, scene: str, progress: Progress | None = None, *, texel_m: float | None = None, albedo: Sequence[Path] = ()
+    ) -> Place:
+        """The place of a scene file or bundled scene; see `mesh`."""
         from seasonscapes.workflows.place import load_place
 
         return load_place(
             scene,
             self.folder(),
-            options=self.mesh(texel_m=texel_m),
+            options=self.mesh(texel_m=texel_m, albedo=albedo),
             allow_outside=self.allow_outside,
             progress=progress,
         )

@@ -67,7 +67,7 @@ def paint_command(
     check_output_folder(output)
     model, _ = sky.model(), parse_size(pictures.size)
     with progress_bars() as progress:
-        loaded = options.load(scene, progress)
+        loaded = options.load(scene, progress, albedo=() if albedo is None else (albedo,))
         utc = parse_time(time, loaded.frame.latitude_deg, loaded.frame.longitude_deg)
         # First of all: a wrong albedo file is refused before any picture is opened.
         predicted = None if albedo is None else measured_radiance(loaded, albedo, utc, model, progress=progress)

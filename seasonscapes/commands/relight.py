@@ -103,7 +103,8 @@ def relight_command(
         if before is None:
             message("the textures are taken for albedo; give --taken T if the light of an hour is in them")
         else:
-            loaded = delight_mesh(loaded, before, surroundings=around, progress=progress).mesh
+            options = flags.delighting()
+            loaded = delight_mesh(loaded, before, surroundings=around, options=options, progress=progress).mesh
         if pictures:
             written, record = relit_pictures(
                 loaded, hours, cameras, output, film, surroundings=around, progress=progress

@@ -87,7 +87,7 @@ def render_command(
     files = [parse_albedo(text) for text in albedo or ()]
     use_backend(device)
     with progress_bars() as progress:
-        loaded = options.load(scene, progress)
+        loaded = options.load(scene, progress, albedo=[each.path for each in files])
         chosen, camera = view.chosen(loaded.scene), view.pinhole(loaded)
         utc = parse_time(time, chosen.latitude_deg, chosen.longitude_deg)
         series = AlbedoSeries(tuple(dated_albedos(loaded, files)), season) if files else None

@@ -90,17 +90,19 @@ def timelapse_command(
         check_output_folder(output)
     check_range("--fps", fps, 0.1, 240.0)
     check_range("--seed", seed, 0, 2**32)
+    work.check_cluster()
     part, path = work.part(), find_scene(scene)
     chosen = view.chosen(read_scene(path, allow_outside=place.allow_outside))
     times = when.instants(chosen.latitude_deg, chosen.longitude_deg)
+    files = tuple(parse_albedo(text) for text in albedo or ())
     job = RenderJob(
         path.resolve(),
         place.folder().folder.resolve(),
-        place.mesh(),
+        place.mesh(albedo=[each.path for each in files]),
         chosen,
         view.size_px(),
         sky.model(),
-        albedo=tuple(parse_albedo(text) for text in albedo or ()),
+        albedo=files,
         season=season,
         base_day=films.base_day_of(times),
         seed=seed,

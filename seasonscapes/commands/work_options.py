@@ -20,6 +20,13 @@ class WorkOptions:
     shard: str | None = None
     """Only the part i/N of the frames, with no film made; any number of machines share a workspace."""
 
+    def check_cluster(self) -> None:
+        """`InputError` about a description of no cluster."""
+        if self.cluster is not None:
+            from seasonscapes.cluster import check_cluster
+
+            check_cluster(self.cluster)
+
     def part(self) -> tuple[int, int] | None:
         """The part i/N as two numbers."""
         if self.shard is None:

@@ -88,11 +88,15 @@ def load_lpips(folder: Path | None = None) -> Lpips:
 def _weights(path: Path) -> Any:
     """The tensors of a weight file; `InputError` for a damaged one, and for one that would run code to be loaded."""
     import pickle
+    import warnings
 
     import torch
 
     try:
-        return torch.load(path, map_location="cpu", weights_only=True)
+        with warnings.catch_warnings():
+            # About pickles of another kind, which are refused below.
+            warnings.simplefilter("ignore", UserWarning)
+            return torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError:
         problem = "not plain tensors: it holds objects, which are never unpickled"
     # What torch raises for files that are cut short or no weights at all.

@@ -55,7 +55,8 @@ def add_lamp(name, lamp):
 
 def add_sky():
     world = bpy.data.worlds.new("sky")
-    world.use_nodes = True
+    if world.node_tree is None:  # before Blender 5
+        world.use_nodes = True
     nodes = world.node_tree.nodes
     image = nodes.new("ShaderNodeTexEnvironment")
     image.image = bpy.data.images.load(str(FOLDER / SCENE["sky"]))
@@ -90,6 +91,7 @@ add_sky()
 if SCENE["camera"]:
     add_camera(SCENE["camera"])
 bpy.context.scene.render.engine = "CYCLES"
+bpy.context.scene.cycles.samples = 256
 if "--render" in sys.argv:
     bpy.context.scene.render.filepath = str(Path(sys.argv[sys.argv.index("--render") + 1]).resolve())
     bpy.ops.render.render(write_still=True)

@@ -268,6 +268,8 @@ class _Cutter:
         undulation = self.source.geoid.undulation_m(latitude, longitude)
         if not np.isfinite(undulation).all():
             raise InputError("--to 3dtiles", "PROJ's geoid grid does not cover the land", cure="give --geoid-m")
+        if np.ptp(longitude) > 180.0:
+            raise InputError("--to 3dtiles", "the land lies across the 180th meridian, where regions of tiles end")
         low, high = self.undulation_m
         self.undulation_m = [min(low, float(undulation.min())), max(high, float(undulation.max()))]
         height = raster.values[row, column, 0] + undulation

@@ -22,6 +22,7 @@ from seasonscapes.open_data.elevation import AssetUse, tiles_of
 from seasonscapes.open_data.remote import RemoteStore
 from seasonscapes.open_data.sources import Source, read_source
 from seasonscapes.progress import TaskProgress
+from seasonscapes.terrain.image_bands import marked_colours
 from seasonscapes.terrain.mosaic import MapGrid, mosaic, read_tile
 from seasonscapes.terrain.surface import Raster
 
@@ -240,7 +241,7 @@ def colours(dataset: Any, grid: MapGrid, encoding: str, *, full_scale: float = 2
             scaled = values / full_scale
             return linear_from_srgb(np.clip(scaled, 0.0, 1.0)) if encoding == "srgb" else scaled
 
-    return read_tile(dataset, grid, bands=[1, 2, 3], decode=decode)
+    return read_tile(dataset, grid, bands=marked_colours(dataset) or (1, 2, 3), decode=decode)
 
 
 def scale_and_offset(item: Item, asset: dict[str, Any], source: Source) -> tuple[float, float]:

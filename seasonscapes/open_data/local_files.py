@@ -17,7 +17,7 @@ from seasonscapes.open_data.imagery import colours
 from seasonscapes.open_data.sources import Source, source_of_file
 from seasonscapes.progress import TaskProgress
 from seasonscapes.terrain.crs import apply_affine, geodetic_from_map
-from seasonscapes.terrain.heights import UNITS_M, check_height_band, declared_unit
+from seasonscapes.terrain.heights import check_height_band, declared_unit, to_metres
 from seasonscapes.terrain.mosaic import MapGrid, mosaic, read_tile
 from seasonscapes.terrain.raster_files import open_raster
 
@@ -87,9 +87,8 @@ def local_heights(rasters: list[LocalRaster], grid: MapGrid, *, progress: TaskPr
         if dataset.count != 1:
             raise InputError(dataset.name, "more than one band", got=dataset.count, expected="one band of heights")
         check_height_band(dataset, 1, dataset.name)
-        metres = UNITS_M[declared_unit(dataset, 1, dataset.name) or "metre"]
-        tile = read_tile(dataset, grid, bands=[1])
-        return tile if tile is None or metres == 1.0 else replace(tile, values=tile.values * np.float32(metres))
+        unit, tile = declared_unit(dataset, 1, dataset.name), read_tile(dataset, grid, bands=[1])
+        return None if tile is None else replace(tile, values=to_metres(tile.values, unit, dataset.name))
 
     return _mosaic(rasters, grid, read, progress, extend=False)[..., 0]
 

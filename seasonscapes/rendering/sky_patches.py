@@ -2,7 +2,7 @@
 
 The upper half has the usual subdivision of the sky: 145 patches (Tregenza 1987, "Subdivision of the sky hemisphere for
 luminance measurements", doi:10.1177/096032718701900103) or 577 (Reinhart & Walkenhorst 2001, each divided by two both
-ways, doi:10.1016/S0378-7788(00)00119-2). On mountains rays also escape *below* the horizontal, so that the lower half
+ways, doi:10.1016/S0378-7788(01)00058-5). On mountains rays also escape *below* the horizontal, so that the lower half
 is subdivided too.
 """
 

@@ -304,8 +304,8 @@ def gas_phase(cosine: ArrayLike) -> np.ndarray:
 def aerosol_phase(cosine: ArrayLike, asymmetry: float) -> np.ndarray:
     """Evaluate the aerosol phase function, a sum of two Henyey-Greenstein lobes with a given mean cosine.
 
-    The backward lobe of g = -0.35 has a weight of 5 %, as for natural aerosols (Kattawar 1975,
-    doi:10.1016/0022-4073(75)90035-3); g of the forward lobe follows from the mean cosine.
+    The form is that of Kattawar 1975 (JQSRT 15, 839). The backward lobe (g = -0.35, weight 5 %) is chosen; g of the
+    forward lobe follows from the mean cosine.
 
     Parameters
     ----------

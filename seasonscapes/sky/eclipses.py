@@ -22,7 +22,7 @@ _RINGS = 400
 # a few lux (Sharp, Silverman & Lloyd 1971, doi:10.1364/AO.10.001207).
 _TOTALITY_SKY = 5e-4
 # Danjon's shadow: that of a sphere of the Earth's radius at 45° of latitude, enlarged by its atmosphere by 1 % of the
-# moon's parallax (Espenak & Meeus 2009, NASA/TP-2009-214174). Light refracted into the umbra makes the moon
+# moon's parallax (Espenak & Meeus 2009, NASA/TP-2009-214173). Light refracted into the umbra makes the moon
 # coppery, some ten thousand times dimmer than the full moon (Danjon's L = 2).
 _SHADOW_ENLARGEMENT = 1.01 * 0.99834
 _UMBRA_RGB = np.array([3.0e-4, 6.0e-5, 1.5e-5])

@@ -65,8 +65,7 @@ def geoid_of(vertical_datum: str, latitude_deg: float, longitude_deg: float, *, 
         For a stated height beyond ±120 m, which no place on Earth has.
     """
     if given_m is not None:
-        if not abs(given_m) <= 120.0:
-            raise InputError("--geoid-m", "no place on Earth has this", got=given_m, expected="-107 to 86")
+        require_undulation(given_m)
         return Geoid(f"{given_m:g} m everywhere, as given", _constant(given_m))
     if vertical_datum == "ellipsoidal":
         return Geoid("heights are above the ellipsoid already", _constant(0.0))
@@ -81,6 +80,12 @@ def geoid_of(vertical_datum: str, latitude_deg: float, longitude_deg: float, *, 
         return Geoid(doubt, egm96_m)
     doubt = f"EGM96 at 30 minutes; heights (datum: {vertical_datum}) are taken as above sea level, else give --geoid-m"
     return Geoid(doubt, egm96_m)
+
+
+def require_undulation(given_m: float) -> None:
+    """`InputError` for a height of a datum's zero above the ellipsoid beyond ±120 m, which no place on Earth has."""
+    if not abs(given_m) <= 120.0:
+        raise InputError("--geoid-m", "no place on Earth has this", got=given_m, expected="-107 to 86")
 
 
 def _constant(height_m: float) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
@@ -107,12 +112,18 @@ def _proj_undulation(
 
 
 @lru_cache(maxsize=1)
-def _egm96_cm() -> np.ndarray:
-    """Undulations [cm] at every half degree from the north pole, columns from Greenwich, with a margin on both sides."""
+def _egm96_coefficients() -> np.ndarray:
+    """Cubic B-spline coefficients of the undulations [cm] at every half degree.
+
+    Rows from the north pole, columns from Greenwich, with a margin on both sides.
+    """
+    from scipy.ndimage import spline_filter
+
     with np.load(str(files("seasonscapes.terrain") / "egm96_30min.npz"), allow_pickle=False) as stored:
         # Stored as differences along both axes, which deflate to half the size.
         grid = np.cumsum(np.cumsum(stored["differences_cm"], axis=0, dtype=np.int32), axis=1, dtype=np.int32)
-    return np.concatenate([grid[:, -_MARGIN:], grid, grid[:, :_MARGIN]], axis=1).astype(np.float32)
+    wrapped = np.concatenate([grid[:, -_MARGIN:], grid, grid[:, :_MARGIN]], axis=1)
+    return spline_filter(wrapped, order=3, output=np.float64, mode="nearest")
 
 
 def egm96_m(latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> np.ndarray:
@@ -129,5 +140,5 @@ def egm96_m(latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> np.ndarray:
     latitude, longitude = np.broadcast_arrays(np.asarray(latitude_deg, float), np.asarray(longitude_deg, float))
     row, column = (90.0 - latitude) * _PER_DEG, longitude % 360.0 * _PER_DEG + _MARGIN
     places = [row.ravel(), column.ravel()]
-    undulation_cm = map_coordinates(_egm96_cm(), places, order=3, mode="nearest", output=np.float64)
+    undulation_cm = map_coordinates(_egm96_coefficients(), places, order=3, mode="nearest", prefilter=False)
     return undulation_cm.reshape(row.shape) / 100.0

@@ -94,6 +94,14 @@ def declared_unit(source: DatasetReader, band: int, path: str) -> str | None:
     return by_band or by_crs
 
 
+def to_metres(values: np.ndarray, unit: str | None, where: str | os.PathLike[str]) -> np.ndarray:
+    """Heights in a unit of `UNITS_M` converted to metres, which is told; ``None`` counts as metres."""
+    if unit is None or unit == "metre":
+        return values
+    log.warning("%s: heights in the unit %s, converted to metres", os.fspath(where), unit)
+    return (values * UNITS_M[unit]).astype(np.float32)
+
+
 def _vertical_unit(source: DatasetReader, path: str) -> str | None:
     """Unit of the vertical axis of a compound or three-dimensional CRS."""
     from pyproj import CRS
@@ -150,6 +158,8 @@ def check_heights(raster: Raster, where: str | os.PathLike[str], *, unit: str | 
     if not known.any():
         return
     low, high = float(heights[known].min()), float(heights[known].max())
+    # A few spikes, which are told as such, do not make a land high.
+    summit = float(np.partition(heights[known], -6)[-6:].min()) if known.sum() > 64 else high
     if low < PLAUSIBLE_ELEVATION_M[0] or high > PLAUSIBLE_ELEVATION_M[1]:
         raise InputError(
             os.fspath(where),
@@ -164,7 +174,7 @@ def check_heights(raster: Raster, where: str | os.PathLike[str], *, unit: str | 
         _check_zeros(heights, known, spacing_m, where)
     _doubt_spikes(raster, spacing_m, where)
     if unit is None:
-        _doubt_feet(raster, high, spacing_m, where)
+        _doubt_feet(raster, summit, spacing_m, where)
 
 
 def _check_noise(heights: np.ndarray, spacing_m: float, where: str | os.PathLike[str]) -> None:

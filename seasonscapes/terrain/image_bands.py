@@ -100,6 +100,18 @@ def image_facts(
     return ImageFacts(tuple(bands), full_scale, tuple(told))
 
 
+def marked_colours(source: DatasetReader) -> tuple[int, int, int] | None:
+    """Numbers of the bands that a file marks as red, green and blue; ``None`` where it does not mark all three."""
+    from rasterio.enums import ColorInterp
+
+    kinds = dict(zip(source.colorinterp, source.indexes, strict=True))
+    colours = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
+    if not all(kind in kinds for kind in colours):
+        return None
+    red, green, blue = (kinds[kind] for kind in colours)
+    return red, green, blue
+
+
 def _colour_bands(source: DatasetReader, where: str) -> tuple[int, ...]:
     """Bands that a file marks as red, green and blue; else all its bands but alpha, one or three of them."""
     from rasterio.enums import ColorInterp
@@ -112,9 +124,9 @@ def _colour_bands(source: DatasetReader, where: str) -> tuple[int, ...]:
             expected="red, green and blue, or grey",
             cure="convert it to sRGB in a program that applies its colour profile",
         )
-    colours = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
-    if all(kind in kinds for kind in colours):
-        return tuple(kinds[kind] for kind in colours)
+    marked = marked_colours(source)
+    if marked is not None:
+        return marked
     bands = tuple(band for band in source.indexes if band != marked_alpha(source))
     if len(bands) not in (1, 3):
         raise InputError(

@@ -68,12 +68,9 @@ def check_memory(shape: tuple[int, ...], where: str | os.PathLike[str]) -> None:
         File or argument, for the message.
     """
     height, width = shape[:2]
-    needed, free = height * width * _BYTES_PER_SAMPLE, available_bytes()
-    if needed > free:
-        raise InputError(
-            os.fspath(where),
-            "too many samples for this machine's memory",
-            got=f"{width} × {height}, about {needed / 1e9:.1f} GB",
-            expected=f"at most {free / 1e9:.1f} GB",
-            cure="use a part with a table [area], or a coarser raster: gdal_translate -outsize 10% 10%",
-        )
+    require_bytes(
+        height * width * _BYTES_PER_SAMPLE,
+        where=os.fspath(where),
+        got=f"{width} × {height}",
+        cure="use a part with a table [area], or a coarser raster: gdal_translate -outsize 10% 10%",
+    )

@@ -37,6 +37,12 @@ class MeshPlacing:
     ------
     InputError
         For values that contradict each other.
+
+    Examples
+    --------
+    >>> import seasonscapes as ss
+    >>> ss.MeshPlacing(crs="EPSG:2056", offset=(2_641_000.0, 1_158_000.0, 1_200.0)).crs
+    'EPSG:2056'
     """
 
     up: str | None = None

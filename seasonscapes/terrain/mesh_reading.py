@@ -105,18 +105,24 @@ def _check(path: Path, file: MeshFile) -> None:
 
 def _referenced(path: Path, name: str, allow_outside: bool, what: str) -> bytes:
     """Contents of a file that a mesh refers to."""
+    target = _allowed(path, name, allow_outside, what)
+    if not target.is_file():
+        raise InputError(f"{path}: {what}", "no such file", got=name, expected=f"a file in {path.parent.resolve()}")
+    return target.read_bytes()
+
+
+def _allowed(path: Path, name: str, allow_outside: bool, what: str) -> Path:
+    """Path of a file that a mesh refers to; `InputError` where it is on the network or outside the mesh's folder."""
     where = f"{path}: {what}"
-    if re.match(r"[A-Za-z][A-Za-z0-9+.-]+://", name):
+    if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:", name):
         raise InputError(
             where, "a file on the network", got=name, cure="download it beside the mesh, and name it there"
         )
-    folder, plain = path.parent.resolve(), name.replace("\\", "/")
-    target = (folder / plain).resolve()
+    folder = path.parent.resolve()
+    target = (folder / name.replace("\\", "/")).resolve()
     if not allow_outside and not target.is_relative_to(folder):
         raise InputError(where, "outside the mesh's folder", got=name, cure="--allow-outside, if the file is trusted")
-    if not target.is_file():
-        raise InputError(where, "no such file", got=name, expected=f"a file in {folder}")
-    return target.read_bytes()
+    return target
 
 
 # --- glTF -------------------------------------------------------------------------------------------------------------
@@ -192,6 +198,10 @@ def _read_gltf(path: Path, allow_outside: bool) -> MeshFile:
     import trimesh
 
     document, blob = load_document(path, allow_outside)
+    for index, image in enumerate(document.images):
+        # Normal maps and such are not read here, but are copied when the mesh is written.
+        if image.uri is not None and not image.uri.startswith("data:"):
+            _allowed(path, unquote(image.uri), allow_outside, f"texture {index}")
     file, number = MeshFile(), {}
     materials = document.materials
     for material in materials:
@@ -315,11 +325,19 @@ def read_materials(path: Path, allow_outside: bool) -> dict[str, ObjMaterial]:
                 name = rest.strip()
                 found[name] = ObjMaterial(None, (0.8, 0.8, 0.8))
             elif name is not None and key == "Kd" and len(rest.split()) >= 3:
-                red, green, blue = (float(value) for value in rest.split()[:3])
+                red, green, blue = _colour(f"{path.parent / library}: {name}", rest)
                 found[name] = ObjMaterial(found[name].texture, (red, green, blue))
             elif name is not None and key == "map_Kd":
                 found[name] = ObjMaterial(texture_of_line(rest), found[name].colour)
     return found
+
+
+def _colour(where: str, text: str) -> tuple[float, float, float]:
+    try:
+        red, green, blue = (float(value) for value in text.split()[:3])
+    except ValueError:
+        raise InputError(where, "a colour that is no three numbers", got=text, expected="Kd R G B") from None
+    return red, green, blue
 
 
 def material_files(path: Path) -> list[str]:
@@ -433,6 +451,8 @@ def _unit(colours: np.ndarray) -> np.ndarray:
 
 
 def _unique(name: str, taken: dict[str, bytes]) -> str:
+    name = Path(name.replace("\\", "/")).name
+    name = "texture" if name in ("", ".", "..") else name
     stem, suffix, number, result = Path(name).stem, Path(name).suffix, 1, name
     while result in taken:
         number += 1

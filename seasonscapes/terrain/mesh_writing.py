@@ -101,8 +101,9 @@ def require_writable(path: Path, mesh: TexturedMesh) -> bool:
     Raises
     ------
     InputError
-        For a kind of file that this mesh cannot be written as.
+        For a kind of file that this mesh cannot be written as, or the file that it was read from.
     """
+    _require_new(path, mesh, [])
     suffix, source = path.suffix.lower(), mesh.path.suffix.lower()
     of_vertices = any(texture.of_vertices for texture in mesh.textures)
     same = suffix == source or (suffix in _GLTF and source in _GLTF)
@@ -163,7 +164,6 @@ def _write_document(
     data = _joined(document, blob, views)
     _mark_unlit(document, unlit)
     document.asset.extras = {**(document.asset.extras or {}), "seasonscapes": _plain(facts or {})}
-    _require_new(path, mesh, [])
     document.buffers = [pygltflib.Buffer(byteLength=len(data))]
     if path.suffix.lower() == ".gltf":
         binary = path.with_suffix(".bin")
@@ -331,7 +331,6 @@ def _write_obj(path: Path, mesh: TexturedMesh, textures: list[MeshTexture]) -> l
         _require_new(target, mesh, [*sources, *libraries])
         targets[name] = (target, texture)
     library = path.with_suffix(".mtl")
-    _require_new(path, mesh, sources)
     _require_new(library, mesh, [*sources, *libraries])
     lines = []
     for source in libraries:
@@ -361,7 +360,6 @@ def _write_obj(path: Path, mesh: TexturedMesh, textures: list[MeshTexture]) -> l
 def _write_ply(path: Path, mesh: TexturedMesh, textures: list[MeshTexture]) -> list[Path]:
     """Write a PLY with its texture beside it, or with other vertex colours."""
     names = ply_textures(mesh.path)
-    _require_new(path, mesh, [])
     if names:
         texture = textures[0]
         target = path.parent / Path(texture.name).with_suffix(file_suffix(texture.name, texture.bits))

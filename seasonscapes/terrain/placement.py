@@ -200,11 +200,12 @@ def likely_cause(raster: Raster, latitude_deg: float, longitude_deg: float, *, w
         return abs(place[0] - latitude_deg) < within_deg and abs(across) < within_deg
 
     here = centre_deg(raster.crs, raster.transform, width, height)
+    if near(here):
+        return None
     if near((here[1], here[0])):
         return "latitude and longitude are probably swapped"
     if near((-here[0], here[1])):
-        utm = " (UTM of the other hemisphere?)" if horizontal_crs(raster.crs).is_projected else ""
-        return f"north and south are probably exchanged{utm}"
+        return "north and south are probably exchanged"
     if near((here[0], -here[1])):
         return "the longitude probably has the wrong sign"
     if horizontal_crs(raster.crs).is_projected and near(
@@ -213,7 +214,8 @@ def likely_cause(raster: Raster, latitude_deg: float, longitude_deg: float, *, w
         return "easting and northing are probably swapped"
     for code, name in _other_utm(raster.crs, longitude_deg):
         if near(centre_deg(code, raster.transform, width, height)):
-            return f"the CRS is probably {name} ({code})"
+            other = ", of the other hemisphere" if here[0] * latitude_deg < 0.0 else ""
+            return f"the CRS is probably {name} ({code}){other}"
     return None
 
 

@@ -5,7 +5,6 @@ Only horizontal positions are transformed. Heights stay in the raster's own vert
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -18,7 +17,7 @@ from numpy.typing import ArrayLike
 from seasonscapes.declaration import InputError
 from seasonscapes.frames import LocalFrame, normal_longitude
 from seasonscapes.terrain.crs import apply_affine, geodetic_from_map, grid_position, wrapped
-from seasonscapes.terrain.heights import UNITS_M, check_height_band, check_heights, declared_unit
+from seasonscapes.terrain.heights import check_height_band, check_heights, declared_unit, to_metres
 from seasonscapes.terrain.hole_filling import harmonic_fill, nan_mean
 from seasonscapes.terrain.memory import check_memory
 from seasonscapes.terrain.placement import cell_sides_m, centre_deg, check_cells, check_place, checked_crs, likely_cause
@@ -29,8 +28,6 @@ from seasonscapes.terrain.surface import Raster
 if TYPE_CHECKING:
     from rasterio.io import DatasetReader
     from rasterio.windows import Window
-
-log = logging.getLogger(__name__)
 
 DEFAULT_MAX_HOLE_SHARE = 0.25
 
@@ -98,7 +95,7 @@ def read_elevation(
     band
         Number of the band that holds the heights, from 1; required if the file has several bands.
     unit
-        Unit of the heights, a key of `heights.UNITS_M`; ``None`` for the one that the file declares, else metres.
+        Unit of the heights, a key of `terrain.heights.UNITS_M`; ``None`` for the one that the file declares, else metres.
     nodata
         Value that means no data, in the file's own unit, besides what the file declares.
 
@@ -133,9 +130,7 @@ def read_elevation(
     raster = read_raster(path, bounds_deg=bounds_deg, bands=reader.bands, confinement=confinement)
     if nodata is not None:
         raster = replace(raster, values=np.where(raster.values == nodata, np.float32(np.nan), raster.values))
-    if declared is not None and declared != "metre":
-        log.warning("%s: heights in the unit %s, converted to metres", where, declared)
-        raster = replace(raster, values=(raster.values * UNITS_M[declared]).astype(np.float32))
+    raster = replace(raster, values=to_metres(raster.values, declared, where))
     check_heights(raster, where, unit=declared, nodata=nodata)
     return raster
 

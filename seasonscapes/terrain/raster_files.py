@@ -136,6 +136,11 @@ class Confinement:
 OWN_FOLDER = Confinement()
 
 
+def real_path(path: str | os.PathLike[str]) -> Path:
+    """Absolute and without links; unlike `pathlib.Path.resolve` also for links in a circle, which name no file."""
+    return Path(os.path.realpath(path))
+
+
 def confined_path(name: str, base: Path, confinement: Confinement, *, where: str | Path) -> Path | str:
     """Resolve the name of a file in a document that nobody vouches for.
 
@@ -166,8 +171,8 @@ def confined_path(name: str, base: Path, confinement: Confinement, *, where: str
         if confinement.allow_outside:
             return name
     else:
-        target = (base / name).resolve()
-        if confinement.allow_outside or target.is_relative_to((confinement.folder or base).resolve()):
+        target = real_path(base / name)
+        if confinement.allow_outside or target.is_relative_to(real_path(confinement.folder or base)):
             return target
     raise InputError(
         where,
@@ -246,7 +251,7 @@ def raster_hash(path: str | os.PathLike[str], confinement: Confinement = OWN_FOL
         with open_raster(name, confinement):
             digest.update(name.encode())
             return digest.hexdigest()
-    base = Path(name).resolve().parent
+    base = real_path(name).parent
     for file in sorted(raster_members(name, confinement)):
         with open(file, "rb") as stream:
             content = hashlib.file_digest(stream, "sha256").hexdigest()
@@ -257,14 +262,14 @@ def raster_hash(path: str | os.PathLike[str], confinement: Confinement = OWN_FOL
 def raster_members(path: str | os.PathLike[str], confinement: Confinement = OWN_FOLDER) -> set[Path]:
     """The files that a raster is made of, itself included; overviews are not, since they are never read."""
     found: set[Path] = set()
-    pending = [Path(path).resolve()]
+    pending = [real_path(path)]
     while pending:
         file = pending.pop()
         if file in found:
             continue
         found.add(file)
         with open_raster(file, _within(confinement, Path(path))) as source:
-            beside = {Path(each).resolve() for each in source.files if not each.startswith("/vsi")}
+            beside = {real_path(each) for each in source.files if not each.startswith("/vsi")}
         is_vrt = _starts_as_vrt(file)
         pending += [each for each in beside if is_vrt and each.suffix not in (".xml", ".ovr", ".msk")]
         found |= {each for each in beside if each.suffix != ".ovr" and (not is_vrt or each.suffix in (".xml", ".msk"))}
@@ -275,7 +280,7 @@ def _within(confinement: Confinement, path: Path) -> Confinement:
     """The confinement of files that a raster names: the raster's folder is theirs too."""
     if confinement.folder is not None or confinement.allow_outside:
         return confinement
-    return Confinement(path.resolve().parent)
+    return Confinement(real_path(path).parent)
 
 
 def _starts_as_vrt(path: Path) -> bool:
@@ -289,7 +294,7 @@ def _plain_driver(path: Path, confinement: Confinement, depth: int = 0) -> str:
         raise InputError(path, "a virtual path of GDAL", cure="pass --allow-outside if you trust it")
     if not path.is_file():
         raise InputError(path, "no such file")
-    target, folder = path.resolve(), (confinement.folder or path.parent).resolve()
+    target, folder = real_path(path), real_path(confinement.folder or path.parent)
     if not target.is_relative_to(folder):
         raise InputError(path, "leads outside its folder", got=str(target), expected=f"a file below {folder}")
     _require_plain_sidecars(path)
@@ -402,11 +407,11 @@ def _vrt_source(path: Path, name: str, attributes: dict[str, str], confinement: 
 
 def _require_inside(name: str, source: DatasetReader, confinement: Confinement) -> None:
     """Refuse a raster whose sidecars, parts or overviews lie elsewhere."""
-    folder = (confinement.folder or Path(name).parent).resolve()
+    folder = real_path(confinement.folder or Path(name).parent)
     if source.tags(ns="OVERVIEWS"):
         raise InputError(name, "names a file of overviews", cure="write it anew: gdal_translate FILE NEW.tif")
     for file in source.files:
-        if file.startswith("/vsi") or not Path(file).resolve().is_relative_to(folder):
+        if file.startswith("/vsi") or not real_path(file).is_relative_to(folder):
             raise InputError(
                 name,
                 "is made of a file outside its folder",

@@ -12,7 +12,7 @@ _FLUIDITY = 2.0 * 2.15e-5
 def mass_balance_m(surface: np.ndarray, equilibrium_m: np.ndarray | float) -> np.ndarray:
     """Compute the annual surface mass balance as a function of height above the equilibrium line.
 
-    The gradient of 0.85 m per 100 m is that of Alpine glaciers (Huss & Bauder 2009, doi:10.3189/172756409787769645).
+    The gradient of 0.85 m per 100 m is chosen so that the glaciers of the massif get the lengths of Alpine ones.
     Accumulation is limited to 1.6 m; ablation increases more steeply 1000 m below the equilibrium line.
 
     Parameters
@@ -35,7 +35,7 @@ def grow_ice(bed: np.ndarray, spacing_m: float, equilibrium_m: np.ndarray, *, ro
     """Compute the near-steady-state ice thickness on a bed in the shallow-ice approximation.
 
     Explicit diffusion with local time steps: intermediate states are not physical, the steady state balances ice flux
-    and mass balance (Huybrechts et al. 1996, EISMINT, doi:10.3189/S0260305500013197). Accumulation vanishes on slopes
+    and mass balance (Huybrechts & Payne 1996, EISMINT, doi:10.3189/S0260305500013197). Accumulation vanishes on slopes
     above about 45°.
 
     Parameters

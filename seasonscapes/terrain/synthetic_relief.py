@@ -108,7 +108,7 @@ def _soft_minimum(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
 def _carve_troughs(z: np.ndarray, area: np.ndarray, spacing_m: float) -> np.ndarray:
     """Widen valleys to the parabolic cross-section of glacial troughs.
 
-    Parabolas after Svensson 1959 (doi:10.1080/20014422.1959.11907928); the floor's half-width increases with catchment.
+    Parabolas after Svensson 1959 (Journal of Glaciology 3, 362); the floor's half-width increases with catchment.
     """
     for least, half_width, radius in ((0.35e6, 25.0, 90.0), (2e6, 70.0, 260.0), (10e6, 150.0, 420.0)):
         channel = area > least

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,8 @@ from seasonscapes.frames import LocalFrame
 
 # Faces whose normals differ by more than this do not share a smooth normal.
 _CREASE_DEG = 40.0
+# Pairs of corners in one step; bounds the memory.
+_CHUNK_PAIRS = 4_000_000
 
 
 @dataclass(frozen=True)
@@ -89,8 +91,6 @@ class TexturedMesh:
         Local frame, whose origin is in the middle of the mesh.
     up
         ``"y"`` or ``"z"``: the file's axis that points upwards.
-    notes
-        What was found that may not be meant, one line each.
     """
 
     path: Path
@@ -100,7 +100,6 @@ class TexturedMesh:
     turn: np.ndarray
     frame: LocalFrame
     up: str
-    notes: tuple[str, ...] = field(default=())
 
     @property
     def bounds_m(self) -> tuple[np.ndarray, np.ndarray]:
@@ -149,15 +148,25 @@ def creased_normals(corners: np.ndarray) -> np.ndarray:
     order = np.argsort(point, kind="stable")
     start = np.flatnonzero(np.r_[True, np.diff(point[order]) > 0])
     count = np.diff(np.r_[start, len(order)])
-    # All pairs of corners at one point.
-    size = np.repeat(count, count)
-    first = np.repeat(order, size)
-    offset = np.arange(size.sum()) - np.repeat(np.cumsum(size) - size, size)
-    second = order[np.repeat(np.repeat(start, count), size) + offset]
-    alike = (normal[first // 3] * normal[second // 3]).sum(axis=1) > np.cos(np.radians(_CREASE_DEG))
-    first, second = first[alike], second[alike]
-    weighted = normal * area[:, None]
-    total = np.stack([np.bincount(first, weighted[second // 3, k], minlength=len(point)) for k in range(3)], axis=1)
+    total = np.empty((len(point), 3))
+    pairs = np.cumsum(count.astype(np.int64) ** 2)
+    cuts = np.searchsorted(pairs, np.arange(_CHUNK_PAIRS, pairs[-1], _CHUNK_PAIRS))
+    for group in np.split(np.arange(len(start)), np.unique(cuts)):
+        if not len(group):
+            continue
+        # All pairs of corners at one point.
+        corner = order[start[group[0]] : start[group[-1]] + count[group[-1]]]
+        size = np.repeat(count[group], count[group])
+        first = np.repeat(np.arange(len(corner)), size)
+        offset = np.arange(size.sum()) - np.repeat(np.cumsum(size) - size, size)
+        second = np.repeat(np.repeat(start[group] - start[group[0]], count[group]), size) + offset
+        own = normal[corner // 3]
+        alike = (own[first] * own[second]).sum(axis=1) > np.cos(np.radians(_CREASE_DEG))
+        first, second = first[alike], second[alike]
+        weighted = own * area[corner // 3, None]
+        total[corner] = np.stack(
+            [np.bincount(first, weighted[second, k], minlength=len(corner)) for k in range(3)], axis=1
+        )
     length = np.linalg.norm(total, axis=1, keepdims=True)
     smooth = np.where(length > 0.0, total / np.maximum(length, 1e-300), np.repeat(normal, 3, axis=0))
     return smooth.reshape(corners.shape).astype(np.float32)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +19,7 @@ from seasonscapes.sky.models import SkyModel, with_overrides
 from seasonscapes.terrain.surface import Texture
 from seasonscapes.workflows.albedo_sources import orthoimage, scene_albedo
 from seasonscapes.workflows.illumination import illumination_for_camera, sky_model
-from seasonscapes.workflows.place import Place
+from seasonscapes.workflows.place import MeshOptions, Place
 
 if TYPE_CHECKING:
     from seasonscapes.albedo.closed_form import AlbedoFit
@@ -78,6 +79,8 @@ class RecoveredAlbedo:
         Identity of the UV atlas.
     facts
         Plain values: fitted visibility and tone curve.
+    mesh
+        How the terrain and its atlas were built.
     """
 
     day: date
@@ -86,6 +89,7 @@ class RecoveredAlbedo:
     photographs: list[AlbedoPhotograph] = field(repr=False)
     atlas_id: str
     facts: dict[str, Any] = field(default_factory=dict)
+    mesh: MeshOptions = field(default_factory=MeshOptions)
 
     @property
     def texture(self) -> Texture:
@@ -120,6 +124,7 @@ class RecoveredAlbedo:
                 residual=self.fit.residual,
                 atlas_id=self.atlas_id,
                 date=self.day.isoformat(),
+                mesh=json.dumps(asdict(self.mesh)),
             )
 
 
@@ -188,7 +193,7 @@ def recover_albedo(
     transport, prepared, facts = _prepared(place, in_frame, model, options, progress)
     fit, known = _solved(place, transport, prepared, options.iterations, progress)
     day = min(each.observation.time for each in prepared).date()
-    return RecoveredAlbedo(day, known, fit, prepared, place.atlas_id, facts)
+    return RecoveredAlbedo(day, known, fit, prepared, place.atlas_id, facts, place.options)
 
 
 def _illuminations(place: Place, photographs: Sequence[Observation], model: SkyModel) -> list[Illumination]:

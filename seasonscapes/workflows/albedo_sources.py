@@ -119,7 +119,11 @@ def scene_albedo(place: Place, day: date | str) -> Texture:
     else:
         log.info("%s: its light is taken out", Path(imagery.file).name)
         texture = texture_once(
-            place, "albedo-delit", inputs, code=_DELIT_CODE, build=lambda: delit_imagery(place, time).texture
+            place,
+            "albedo-delit",
+            inputs,
+            code=_DELIT_CODE,
+            build=lambda: delit_imagery(place, time, sky=imagery.sky).texture,
         )
     _tell_image(place, texture)
     return texture

@@ -61,6 +61,7 @@ def complete(
     ------
     AtlasMismatch
         For a texture of another atlas.
+
     Examples
     --------
     >>> import numpy as np

@@ -14,6 +14,7 @@ from seasonscapes.errors import InputError, NotEnoughEvidence
 from seasonscapes.progress import Progress, task_progress
 from seasonscapes.scene import Imagery
 from seasonscapes.sky.models import SkyModel
+from seasonscapes.terrain.raster_files import OWN_FOLDER, Confinement
 from seasonscapes.terrain.surface import Texture
 from seasonscapes.workflows.illumination import given_sun_position, illumination_at, position_at, sky_model
 from seasonscapes.workflows.place import Place, utc_at
@@ -140,15 +141,6 @@ def delight(
     return Texture(np.nan_to_num(delit.albedo), np.asarray(known, np.float32), place.atlas_id)
 
 
-def with_image(place: Place, path: Path) -> Place:
-    """The place with another georeferenced image instead of its own, read as the scene file's would be."""
-    if not path.is_file():
-        raise InputError("--image", "no such file", got=str(path))
-    own = place.scene.imagery or Imagery(file="")
-    imagery = own.model_copy(update={"file": str(path.resolve()), "time": None, "sun_deg": None, "delit": False})
-    return replace(place, scene=place.scene.model_copy(update={"imagery": imagery}))
-
-
 def imagery_time(imagery: Imagery) -> ImageTime | None:
     """When a scene file says that its image was taken; ``None`` where it does not."""
     return imagery.time if imagery.sun_deg is None else (float(imagery.sun_deg[0]), float(imagery.sun_deg[1]))
@@ -158,11 +150,12 @@ def delit_imagery(
     place: Place,
     time: ImageTime,
     *,
+    image_file: Path | None = None,
     sky: str | Path | SkyModel = "clear",
     sensor_height_m: float | None = None,
     progress: Progress | None = None,
 ) -> DelitScene:
-    """Remove the light from the image that a scene file names.
+    """Remove the light from the image that a scene file names, or from another image of the same land.
 
     Parameters
     ----------
@@ -170,6 +163,8 @@ def delit_imagery(
         The place.
     time
         When the image was taken; see `ImageTime`.
+    image_file
+        A georeferenced image to use instead of the scene's, encoded as the scene file says of its own.
     sky
         The sky model of that hour.
     sensor_height_m
@@ -193,12 +188,9 @@ def delit_imagery(
     from seasonscapes.albedo.delighting import DelightOptions, delight_image
     from seasonscapes.rendering.backend import use_backend
 
-    imagery = place.scene.imagery
-    if imagery is None:
-        where = f"{place.path}: imagery"
-        raise InputError(where, "the scene has no image", cure='add a table [imagery] with file = "image.tif"')
+    imagery, confinement = _chosen_image(place, image_file)
     use_backend()
-    image = atlas_image(place, imagery)
+    image = atlas_image(place, imagery, confinement)
     facts: dict[str, Any] = {}
     if time == UNKNOWN:
         found = image_sun(place, image, progress=progress)
@@ -225,6 +217,21 @@ def delit_imagery(
     return DelitScene(Texture(albedo.astype(np.float32), weight, place.atlas_id), delit, day, facts)
 
 
+def _chosen_image(place: Place, image_file: Path | None) -> tuple[Imagery, Confinement]:
+    """The scene's image, or another file of its encoding, and where its files may lie."""
+    own = place.scene.imagery
+    if image_file is not None:
+        if not image_file.is_file():
+            raise InputError("--image", "no such file", got=str(image_file))
+        given = str(image_file.resolve())
+        return Imagery(file=given) if own is None else own.model_copy(update={"file": given}), OWN_FOLDER
+    if own is None:
+        where = f"{place.path}: imagery"
+        cure = 'add a table [imagery] with file = "image.tif", or give --image'
+        raise InputError(where, "the scene has no image", cure=cure)
+    return own, place.scene.confinement
+
+
 def image_light(
     place: Place, time: ImageTime, sky: str | Path | SkyModel
 ) -> tuple[Illumination, date | None, dict[str, Any]]:
@@ -238,15 +245,13 @@ def image_light(
         utc = utc_at(place, time)
         position, day = position_at(place, utc), utc.date()
         record = {"time_utc": utc.isoformat()}
+    elevation_deg = float(position.sun.elevation_deg)
+    if elevation_deg <= 0.0:
+        got = f"the sun stands at {elevation_deg:.1f}°"
+        raise InputError("--time", "no daylight in the image", got=got, expected="a sun above the horizon")
     height_m = place.median_height_m
     light = illumination_at(model, position, height_m, workspace=place.workspace, with_aerial_perspective=False)
-    if light.sun is None and float(position.sun.elevation_deg) <= 0.0:
-        got = f"the sun stands at {float(position.sun.elevation_deg):.1f}°"
-        raise InputError("--time", "no daylight in the image", got=got, expected="a sun above the horizon")
-    record["sun"] = {
-        "azimuth_deg": round(float(position.sun.azimuth_deg), 3),
-        "elevation_deg": round(float(position.sun.elevation_deg), 3),
-    }
+    record["sun"] = {"azimuth_deg": round(float(position.sun.azimuth_deg), 3), "elevation_deg": round(elevation_deg, 3)}
     return replace(light, frame=place.frame), day, record | {"sky": light.model}
 
 

@@ -7,9 +7,11 @@ is checked and the picture is taken for an albedo.
 
 from __future__ import annotations
 
+import json
 import logging
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from datetime import date, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +22,7 @@ from seasonscapes.array_files import read_arrays
 from seasonscapes.errors import AtlasMismatch, InputError, SeasonscapesError
 from seasonscapes.sky.models import SkyModel, sky_model_from_table
 from seasonscapes.terrain.surface import Texture, load_texture
+from seasonscapes.workflows.terrain_building import MeshOptions
 
 if TYPE_CHECKING:
     from seasonscapes.relighting.lit_texture import LitTexture
@@ -49,7 +52,7 @@ def texture_facts(
     more
         Of lit textures: ``exposure_ev100`` of a developed picture, ``rays`` and ``seed`` of its light.
     """
-    facts: dict[str, Any] = {"holds": holds, "atlas_id": place.atlas_id, **more}
+    facts: dict[str, Any] = {"holds": holds, "atlas_id": place.atlas_id, "mesh": asdict(place.options), **more}
     if utc is not None:
         facts["time_utc"] = utc.isoformat()
     if sky is not None:
@@ -87,6 +90,30 @@ def _stated_date(path: Path, stated: object) -> date:
         return datetime.fromisoformat(str(stated)).date()
     except ValueError:
         raise InputError(path, "states no date", got=str(stated), expected="ISO 8601, such as 2024-07-20") from None
+
+
+def stated_mesh(paths: Sequence[Path]) -> MeshOptions | None:
+    """How the terrain and atlas of albedo files were built; ``None`` where a file does not say, or they differ.
+
+    Raises
+    ------
+    InputError
+        Where a file is missing or no texture, or states options that do not exist.
+    """
+    found = []
+    for path in paths:
+        require_albedo_file(path)
+        if path.suffix.lower() == ".npz":
+            stored = read_arrays(path, [], optional=["mesh"], what="an albedo texture")
+            found.append(json.loads(str(stored["mesh"])) if "mesh" in stored else None)
+        else:
+            found.append(_facts(path).get("mesh"))
+    if not found or any(each is None or each != found[0] for each in found):
+        return None
+    try:
+        return MeshOptions(**found[0])
+    except (TypeError, InputError) as error:
+        raise InputError(paths[0], f"states options of a mesh that do not exist ({error})") from None
 
 
 def read_albedo(place: Place, path: Path) -> Texture:

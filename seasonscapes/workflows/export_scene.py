@@ -157,6 +157,10 @@ def require_consistent(to: str, time: Any, options: ExportOptions, camera: Camer
         raise InputError("--camera", "goes with --to blender", got=to)
     if options.geoid_m is not None and to != "3dtiles":
         raise InputError("--geoid-m", "goes with --to 3dtiles", got=to)
+    if options.geoid_m is not None:
+        from seasonscapes.terrain.geoid import require_undulation
+
+        require_undulation(options.geoid_m)
 
 
 def day_instants(place: Place, day: date, every: timedelta) -> list[datetime]:
@@ -261,8 +265,8 @@ class _Job:
         albedo = chosen_albedo(place, self.day, self.albedo)
         lamps = {}
         if self.lights:
-            # Lights are absolute; this is how to expose for them.
-            about["exposure_ev100"] = _card_ev100(self.lights[0])
+            # Lights are absolute; this is how to expose for them, at the brightest instant of several.
+            about["exposure_ev100"] = max(_card_ev100(light) for light in self.lights)
             lamps = _lamps(self.lights[0])
         return TexturedTerrain(place.terrain, srgb8_from_linear(albedo.values), False, about, lamps), {}
 
@@ -355,8 +359,9 @@ def colours_from_above(place: Place, picture: np.ndarray) -> Callable[[np.ndarra
         found = np.empty((len(position_m), 3), np.float32)
         found[index] = sample_texture(picture, points.uv)
         # The mesh's rim is a chord of the raster's: what lies beyond it takes the nearest colour.
-        outside = np.setdiff1d(np.arange(len(position_m)), index)
-        if len(outside):
+        outside = np.ones(len(position_m), bool)
+        outside[index] = False
+        if outside.any():
             from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
             _, nearest = cKDTree(position_m[index, :2]).query(position_m[outside, :2])

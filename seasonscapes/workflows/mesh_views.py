@@ -16,9 +16,8 @@ from seasonscapes.cameras.pinhole import Camera, rotation_from_angles
 from seasonscapes.errors import InputError
 from seasonscapes.frames import angles_from_direction, direction_from_angles
 from seasonscapes.progress import Progress, each_reported, task_progress
-from seasonscapes.terrain.mesh_atlas import mesh_atlas
 from seasonscapes.terrain.textured_mesh import TexturedMesh
-from seasonscapes.workflows.meshes import MeshSurroundings, Time, albedo_image, mesh_light
+from seasonscapes.workflows.meshes import MeshSurroundings, Time, albedo_image, atlas_of, mesh_light
 from seasonscapes.workflows.timelapse import FilmLook, develop_frames
 
 if TYPE_CHECKING:
@@ -144,7 +143,7 @@ def mesh_view(
 
     around = surroundings or MeshSurroundings()
     use_backend()
-    atlas = mesh_atlas(mesh, ground_albedo=around.ground_albedo)
+    atlas = atlas_of(mesh, around)
     scene = ray_scene(mi_mesh(atlas.terrain, albedo_image(atlas, mesh)))
     sampling = SamplingOptions(albedo_samples=16, rays=around.rays, clusters=4096)
     report = task_progress(progress, "light transport")

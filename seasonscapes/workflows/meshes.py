@@ -56,6 +56,17 @@ class MeshSurroundings:
         Where tables of the sky are kept.
     seed
         Equal seeds give equal results.
+
+    Raises
+    ------
+    InputError
+        For an albedo out of range.
+
+    Examples
+    --------
+    >>> import seasonscapes as ss
+    >>> ss.MeshSurroundings(sky="overcast").model.name
+    'overcast'
     """
 
     ground_albedo: float | None = 0.2
@@ -128,7 +139,7 @@ def load_mesh(path: str | Path, placing: MeshPlacing | None = None, *, allow_out
     Returns
     -------
     TexturedMesh
-        Its parts, textures and positions; `mesh.notes` lists what may not be meant.
+        Its parts, textures and positions.
 
     Raises
     ------
@@ -283,9 +294,7 @@ def mesh_transport(
     around = surroundings or MeshSurroundings()
     require_rays(around.rays, where="--rays")
     use_backend()
-    atlas = mesh_atlas(mesh, ground_albedo=around.ground_albedo)
-    for note in atlas.notes:
-        log.info("%s: %s", mesh.path.name, note)
+    atlas = atlas_of(mesh, around)
     texel = np.flatnonzero(atlas.face >= 0)
     if len(texel) == 0:
         raise InputError(mesh.path, "no texel of any texture lies on the surface", cure="unwrap the mesh again")
@@ -297,6 +306,14 @@ def mesh_transport(
         surface, atlas.shape, points, texel, sampling=sampling, seed=around.seed, progress=report
     )
     return MeshTransport(atlas, transport)
+
+
+def atlas_of(mesh: TexturedMesh, surroundings: MeshSurroundings) -> MeshAtlas:
+    """All textures of a mesh in one image, on its ground; what may not be meant in the mesh is logged."""
+    atlas = mesh_atlas(mesh, ground_albedo=surroundings.ground_albedo)
+    for note in atlas.notes:
+        log.warning("%s: %s", mesh.path.name, note)
+    return atlas
 
 
 def delight_mesh(

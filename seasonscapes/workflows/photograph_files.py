@@ -14,6 +14,7 @@ import numpy as np
 from seasonscapes.cameras.pinhole import view_in_frame
 from seasonscapes.errors import InputError, UnreadableImage
 from seasonscapes.progress import Progress, each_reported
+from seasonscapes.terrain.raster_files import real_path
 from seasonscapes.workflows.place import Place, utc_at
 
 if TYPE_CHECKING:
@@ -47,10 +48,10 @@ class PhotographSources:
 
     def picture_of(self, row: ManifestRow) -> Path:
         """The picture of a row of the manifest; `InputError` where a link leads out of the manifest's folder."""
-        path, folder = self.manifest.parent / row.path, self.manifest.parent.resolve()
-        if not self.allow_outside and not path.resolve().is_relative_to(folder):
+        path, folder = self.manifest.parent / row.path, real_path(self.manifest.parent)
+        if not self.allow_outside and not real_path(path).is_relative_to(folder):
             cure = "copy the picture itself, or pass --allow-outside"
-            raise InputError(path, "leads outside the manifest's folder", got=str(path.resolve()), cure=cure)
+            raise InputError(path, "leads outside the manifest's folder", got=str(real_path(path)), cure=cure)
         return path
 
     def calibration_of(self, webcam: str) -> Path:

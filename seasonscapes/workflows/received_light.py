@@ -194,6 +194,8 @@ def irradiance_map(
     from seasonscapes.rendering.transport import SamplingOptions
 
     require_rays(rays)
+    if spacing_m is not None and not 0.0 < spacing_m < np.inf:
+        raise InputError("--spacing-m", "out of range", got=spacing_m, expected="a positive number of metres")
     use_backend()
     model = sky_model(sky)
     if isinstance(times, (str, datetime)):
@@ -269,8 +271,6 @@ def _map_grid(place: Place, spacing_m: float | None) -> tuple[Raster, np.ndarray
 
     raster = place.elevation
     height, width = raster.values.shape[:2]
-    if spacing_m is not None and not 0.0 < spacing_m < np.inf:
-        raise InputError("--spacing-m", "out of range", got=spacing_m, expected="a positive number of metres")
     factor = 1.0 if spacing_m is None else spacing_m / sample_spacing_m(raster)
     rows, columns = max(1, round(height / factor)), max(1, round(width / factor))
     if rows * columns > 400_000_000:

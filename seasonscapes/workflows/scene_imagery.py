@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from seasonscapes.scene import Imagery
+from seasonscapes.terrain.raster_files import Confinement
 from seasonscapes.workflows.place import Place
 
 # Values above these shares of the full scale are clipped: the last levels of 8-bit sRGB and linear files.
@@ -32,8 +33,17 @@ class AtlasImage:
     clipped: np.ndarray
 
 
-def atlas_image(place: Place, imagery: Imagery) -> AtlasImage:
-    """Read a scene's image and resample it into the place's atlas; see `terrain.imagery`.
+def atlas_image(place: Place, imagery: Imagery, confinement: Confinement | None = None) -> AtlasImage:
+    """Read an image and resample it into the place's atlas; see `terrain.imagery`.
+
+    Parameters
+    ----------
+    place
+        The place.
+    imagery
+        File and encoding: the scene's, or one of its kind.
+    confinement
+        Where the files of the raster may lie; by default where those of the scene may.
 
     Raises
     ------
@@ -51,7 +61,7 @@ def atlas_image(place: Place, imagery: Imagery) -> AtlasImage:
         finest_m=0.5 * place.atlas.texel_p50_m,
         encoding=imagery.encoding,
         full_scale=imagery.full_scale,
-        confinement=place.scene.confinement,
+        confinement=confinement or place.scene.confinement,
     )
     texture = bake_imagery(place.terrain, place.atlas, image)
     clipped = (texture.values >= _CLIPPED[imagery.encoding]) & (texture.weight[..., None] > 0.0)

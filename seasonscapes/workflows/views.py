@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from seasonscapes.declaration import validate
 from seasonscapes.errors import InputError
 from seasonscapes.frames import geodetic_from_enu
 from seasonscapes.scene import NamedCamera, Viewpoint, camera_from_named_view
@@ -124,18 +125,18 @@ def calibrated_viewpoint(path: Path) -> tuple[NamedCamera, tuple[int, int]]:
     latitude, longitude, height = (float(v) for v in geodetic_from_enu(record.frame, camera.position_m))
     axes = local_axes(record.frame, latitude, longitude)
     heading, pitch, roll = angles_from_rotation(axes @ camera.world_from_camera[:3, :3])
-    view = NamedCamera(
-        name=record.webcam,
-        latitude_deg=latitude,
-        longitude_deg=longitude,
-        height_m=height,
-        heading_deg=heading,
-        pitch_deg=pitch,
-        roll_deg=roll,
-        fov_deg=float(np.degrees(2.0 * np.arctan(0.5 * camera.width_px / camera.fx))),
-        principal_point=(camera.cx / camera.width_px, camera.cy / camera.height_px),
-    )
-    return view, (camera.width_px, camera.height_px)
+    table = {
+        "name": record.webcam,
+        "latitude_deg": latitude,
+        "longitude_deg": longitude,
+        "height_m": height,
+        "heading_deg": float(heading),
+        "pitch_deg": float(pitch),
+        "roll_deg": float(roll),
+        "fov_deg": float(np.degrees(2.0 * np.arctan(0.5 * camera.width_px / camera.fx))),
+        "principal_point": (camera.cx / camera.width_px, camera.cy / camera.height_px),
+    }
+    return validate(table, NamedCamera, where=path), (camera.width_px, camera.height_px)
 
 
 def terrain_for_view(place: Place, view: Camera | Panorama) -> Terrain:

@@ -1,0 +1,336 @@
+"""Tables of documents from the records of the benchmarks: ``make tables``, or ``python benchmarks/tables.py [--check]``.
+
+A document holds a table between ``<!-- table: NAME -->`` and ``<!-- end -->``. What stands there is made of
+``benchmarks/results/*.json`` (and the table of sky models of their files) and is overwritten; ``--check`` writes nothing
+and fails where a document differs. A figure without a record is not printed: its row says so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import operator
+import re
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "benchmarks" / "results"
+DOCUMENTS = ("README.md", "docs/measured.md", "sun_models/README.md")
+_COMPARISONS = {"<=": operator.le, ">=": operator.ge, "<": operator.lt, ">": operator.gt, "==": operator.eq}
+_REGION = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of a table.
+
+    Parameters
+    ----------
+    label
+        What was measured.
+    value
+        Format with the names of figures, such as ``{heading_median_deg:.3f}°``.
+    aim
+        What was aimed at, as a text; empty without an aim.
+    bounds
+        The aim as conditions on figures, such as ``seconds <= 60, peak_gb <= 4``; a row that misses one is marked.
+    record
+        Record of the row's figures, where it is not the table's.
+    """
+
+    label: str
+    value: str
+    aim: str = ""
+    bounds: str = ""
+    record: str = ""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of the figures of one record, or of several.
+
+    Parameters
+    ----------
+    record
+        Name of the record, the file without suffix.
+    rows
+        Its rows.
+    note
+        What flatters the figures, or what they mean; printed below the table.
+    """
+
+    record: str
+    rows: tuple[Row, ...]
+    note: str = ""
+
+
+_SAME_RENDERER = "Truth and estimate are made by the same renderer, which flatters every row."
+
+TABLES = {
+    "terrain": Table(
+        "terrain-quick",
+        (
+            Row("60 × 50 km at 30 m → adaptive mesh with a bound of 5 m: time", "{seconds_3000km2:.1f} s", "≤ 60 s", "seconds_3000km2 <= 60"),
+            Row("… memory", "{peak_gb:.2f} GB", "≤ 4 GB", "peak_gb <= 4"),
+            Row("… samples; triangles", "{samples_3000km2:,}; {triangles_3000km2:,}"),
+            Row("… vertical error: RMSE; largest", "{vertical_rmse_m:.2f} m; {vertical_max_m:.2f} m", "≤ 5 m", "vertical_max_m <= 5"),
+            Row("triangles saved against the full grid", "{triangles_saved_ratio:.0%}"),
+            Row("the full grid: time; memory", "{grid_seconds_3000km2:.1f} s; {grid_peak_gb:.2f} GB"),
+        ),
+    ),
+    "surface": Table(
+        "surface-quick",
+        (
+            Row("direct sunlight on a level plain before a wall of 300 m, largest error", "{plain_error_max:.2%}", "≤ 1 %", "plain_error_max <= 0.01"),
+            Row("triangles that the adaptive mesh saves against the full grid", "{triangles_saved_ratio:.0%}", "≥ 60 %", "triangles_saved_ratio >= 0.6"),
+            Row("direct irradiance of cells against the full grid: RMSE over DNI", "{irradiance_rmse_of_dni:.1%}", "≤ 2 %", "irradiance_rmse_of_dni <= 0.02"),
+            Row("… cells within 5 % of DNI", "{irradiance_within_5_percent:.1%}", "≥ 99 %", "irradiance_within_5_percent >= 0.99"),
+            Row("black terrain pixels over all cameras at four hours, morning to moonlight", "{black_pixels:.0f}", "0", "black_pixels == 0"),
+            Row("processor time of a still, after the first of a view", "{still_processor_s:.1f} s", "≤ 20 s", "still_processor_s <= 20"),
+        ),
+        "The truth of the views is the bilinear surface through the samples.",
+    ),
+    "render": Table(
+        "render",
+        (
+            Row("time of a bare Mitsuba script to equal noise, over ours", "{equal_noise_speedup_vs_bare_mitsuba:.1f} ×"),
+            Row("time of Blender Cycles to equal noise, over ours", "{equal_noise_speedup_vs_cycles:.1f} ×"),
+            Row("samples per second, over the bare script's", "{throughput_vs_bare_mitsuba:.2f} ×"),
+        ),
+        "One mesh, camera, texture, sun, sky and number of bounces; noise is the deviation between seeds.",
+    ),
+    "sky": Table(
+        "sky",
+        (
+            Row("direct normal illuminance against SPECTRL2 × V(λ), largest error", "{direct_error_max:.1%}", "≤ 5 %", "direct_error_max <= 0.05"),
+            Row("diffuse horizontal illuminance, the same", "{diffuse_error_max:.1%}", "≤ 15 %", "diffuse_error_max <= 0.15"),
+            Row("ratio of 3,500 m to 500 m, direct beam", "{altitude_direct_error_max:.1%}", "≤ 5 %", "altitude_direct_error_max <= 0.05"),
+            Row("sky radiance against a brute-force spectral path tracer, largest error", "{oracle_error_max:.1%}", "≤ 5 %", "oracle_error_max <= 0.05"),
+            Row("… whose own noise is", "{oracle_noise_max:.1%}"),
+            Row("energy balance of a conservative atmosphere", "{energy_error_max:.1%}"),
+            Row("aerial perspective against direct integration, largest error", "{aerial_error_max:.1%}", "≤ 2 %", "aerial_error_max <= 0.02"),
+            Row("horizontal ray to infinity against the horizon's sky", "{aerial_horizon_gap_max:.1%}", "≤ 2 %", "aerial_horizon_gap_max <= 0.02"),
+            Row("Koschmieder's law in homogeneous air", "{koschmieder_error_max:.1e}"),
+            Row("a new instant: sky map and aerial-perspective table", "{seconds_per_illumination:.2f} s", "≤ 0.5 s", "seconds_per_illumination <= 0.5"),
+            Row("jump beyond the trend between neighbouring 0.1° of sun elevation", "{step_max:.1%}", "≤ 5 %", "step_max <= 0.05"),
+        ),
+        "Light through sunset falls by more than 5 % per 0.1° in any true sky: what is bounded is that nothing jumps out of that course.",
+    ),
+    "night": Table(
+        "sky_night",
+        (
+            Row("sun from +20° to −18° and moon, factor from the nearer of two published fits, largest", "{twilight_factor_max:.2f}", "≤ 1.5", "twilight_factor_max <= 1.5"),
+            Row("… factor outside the range between the two fits, largest", "{twilight_factor_outside_max:.2f}", "≤ 1.5", "twilight_factor_outside_max <= 1.5"),
+            Row("full and half moon from 10° to 60°, factor from the nearer fit, largest", "{moon_factor_max:.2f}", "≤ 1.5", "moon_factor_max <= 1.5"),
+        ),
+        "The fits are those of the U.S. Naval Observatory {cite:p}`seidelmann1992,janiczek1987`; at −14° and −15° they are a factor of 3 apart.",
+    ),
+    "relight": Table(
+        "relight",
+        (
+            Row("error of a frame, RMS over mean: lit pixels", "{rel_rmse_lit:.1%}", "≤ 2 %", "rel_rmse_lit <= 0.02"),
+            Row("… shadowed pixels", "{rel_rmse_shadow:.1%}", "≤ 4 %", "rel_rmse_shadow <= 0.04"),
+            Row("noise of the reference itself", "{reference_noise:.1%}"),
+            Row("a frame", "{frame_s:.2f} s"),
+            Row("precomputation", "{precompute_s:.0f} s"),
+            Row("bare Mitsuba path tracing to the same error, over ours", "{speedup_vs_mitsuba:,.0f} ×", "≥ 100 ×", "speedup_vs_mitsuba >= 100"),
+            Row("Blender Cycles to the same error, over ours", "{speedup_vs_cycles:,.0f} ×", "≥ 100 ×", "speedup_vs_cycles >= 100"),
+            Row("this package's own path tracer to the same error, over ours", "{speedup_vs_ours:,.0f} ×"),
+            Row("all {year_frames:,} hours of a year with the sun above −12°, extrapolated from measured frames", "{year_minutes:.0f} min", "≤ 30 min", "year_minutes <= 30"),
+            Row("shadow rays over bare `ray_test` of the same rays", "{sun_ray_throughput_vs_bare:.0%}", "≥ 70 %", "sun_ray_throughput_vs_bare >= 0.7"),
+            Row("sun visibility against a march over the raster, away from shadow edges", "{visibility_agreement:.2%}", "≥ 99.5 %", "visibility_agreement >= 0.995"),
+            Row("memory of a view of 1536 × 1024: scene, precomputation and a frame", "{memory_peak_gb:.2f} GB", "< 4 GB", "memory_peak_gb <= 4"),
+        ),
+        "The reference is path tracing of the same light and bounces: what the light model lacks is in neither.",
+    ),
+    "texturing": Table(
+        "texturing-quick",
+        (
+            Row("painted view in its own camera, mean; worst", "{reprojection_db:.1f}; {reprojection_worst_db:.1f} dB", "> 35 dB", "reprojection_worst_db > 35"),
+            Row("two ridges: hidden texels that were painted", "{two_ridge_leaks:.0f} of {two_ridge_hidden:,.0f}", "0", "two_ridge_leaks == 0"),
+            Row("harmonised over raw pictures under one gain, painted texels", "+{harmonising_gain_db:.1f} dB", "≥ +1.2 dB", "harmonising_gain_db >= 1.2"),
+            Row("houses and masts: recall", "{foreground_recall:.2f}", "≥ 0.85", "foreground_recall >= 0.85"),
+            Row("… false rejects", "{foreground_false_rejects:.1%}", "≤ 5 %", "foreground_false_rejects <= 0.05"),
+            Row("hidden texels over Telea's inpainting", "+{hidden_gain_over_telea_db:.1f} dB", "≥ +6 dB", "hidden_gain_over_telea_db >= 6"),
+            Row("… SSIM over Telea's", "{hidden_ssim_over_telea:.1f} ×", "≥ 1.7 ×", "hidden_ssim_over_telea >= 1.7"),
+            Row("the real Landsat pair July → November, over Telea", "+{landsat_gain_over_telea_db:.1f} dB", "≥ +2 dB", "landsat_gain_over_telea_db >= 2"),
+            Row("a held-out camera's unseen pixels over Telea", "+{held_out_view_gain_over_telea_db:.1f} dB", "≥ +2.5 dB", "held_out_view_gain_over_telea_db >= 2.5"),
+            Row("processor seconds per hidden Mtexel: full; fast", "{cost_cpu_s_per_mtexel:.1f}; {cost_fast_cpu_s_per_mtexel:.1f}", "≤ 15; ≤ 5", "cost_cpu_s_per_mtexel <= 15, cost_fast_cpu_s_per_mtexel <= 5"),
+        ),
+        _SAME_RENDERER + " The Landsat row is of real pictures.",
+    ),
+    "albedo": Table(
+        "albedo-quick",
+        (
+            Row("clean linear pictures: albedo", "{clean_psnr_db:.1f} dB", "≥ 27 dB", "clean_psnr_db >= 27"),
+            Row("… relative error", "{clean_rel_error:.1%}", "≤ 4 %", "clean_rel_error <= 0.04"),
+            Row("… of texels that the sun never reached", "{clean_rel_error_shaded:.1%}", "≤ 4 %", "clean_rel_error_shaded <= 0.04"),
+            Row("… relit at held-out hours", "{clean_relit_psnr_db:.1f} dB"),
+            Row("8-bit JPEG, unknown exposure and white balance: albedo", "{webcam_psnr_db:.1f} dB", "≥ 24 dB", "webcam_psnr_db >= 24"),
+            Row("… relit at held-out hours", "{webcam_relit_psnr_db:.1f} dB", "≥ 27 dB", "webcam_relit_psnr_db >= 27"),
+            Row("… and unknown haze of 40 km: albedo", "{haze_psnr_db:.1f} dB", "≥ 21 dB", "haze_psnr_db >= 21"),
+            Row("… visibility found", "{haze_visibility_km:.1f} km"),
+            Row("over the best of cosine, Minnaert, C and SCS+C corrections", "+{margin_over_best_correction_db:.1f} dB"),
+            Row("ceiling: the true albedo through the same renderer, relit", "{relit_ceiling_db:.1f} dB"),
+        ),
+        _SAME_RENDERER,
+    ),
+    "gaussians": Table(
+        "gaussians",
+        (
+            Row("distilled, hours never seen: training cameras; unseen camera", "{full_psnr_db:.1f}; {full_unseen_camera_psnr_db:.1f} dB"),
+            Row("its physics alone, untrained", "{physical_untrained_psnr_db:.1f}; {physical_untrained_unseen_camera_psnr_db:.1f} dB"),
+            Row("blend of the three nearest training suns", "{blend_psnr_db:.1f} dB"),
+            Row("nearest training sun", "{nearest_sun_psnr_db:.1f} dB"),
+            Row("WildGaussians' conditioning, a free code for each picture", "{code_psnr_db:.1f}; {code_unseen_camera_psnr_db:.1f} dB"),
+            Row("a network fed with the sun's direction alone", "{sun_psnr_db:.1f}; {sun_unseen_camera_psnr_db:.1f} dB"),
+            Row("cast shadows, intersection over union", "{shadow_iou:.2f}"),
+            Row("bytes a Gaussian on disk", "{bytes_per_gaussian:.0f}"),
+            Row("a frame over path tracing to the same error: moving camera; still camera", "{speedup_vs_path:.1f} ×; {speedup_vs_path_still_camera:.0f} ×", "≥ 20 × still", "speedup_vs_path_still_camera >= 20"),
+        ),
+        "PSNR in sRGB on terrain. " + _SAME_RENDERER,
+    ),
+    "alpinebench": Table(
+        "alpinebench-quick",
+        (
+            Row("painted hours, views that no webcam saw", "{painted_view_psnr_db:.1f} dB, SSIM {painted_view_ssim:.3f}"),
+            Row("hours that nobody photographed, the same views", "{held_out_hour_psnr_db:.1f} dB, SSIM {held_out_hour_ssim:.3f}"),
+            Row("… distilled into Gaussians", "{distilled_psnr_db:.1f} dB"),
+            Row("ablation: no webcams (July's image, delit, relit), held-out hours", "{ablation_held_out_no_webcams_july_s_image_delit_relit_psnr_db:.1f} dB"),
+            Row("ablation: satellite only, best exposure, held-out hours", "{ablation_held_out_satellite_only_best_exposure_psnr_db:.1f} dB"),
+            Row("painted hours as the paper scores, masked pixels counted as perfect", "{painted_view_paper_mode_psnr_db:.1f} dB"),
+            Row("heading of calibrated webcams, largest error", "{heading_error_deg_max:.3f}°"),
+        ),
+        "PSNR over valid pixels with the truth's exposure. Light, air and terrain are the model's own in truth and estimate, which flatters every row but the satellite's.",
+    ),
+    "calibration": Table(
+        "calibration-quick",
+        (
+            Row("12 points, 1 px noise, 20 % wrong: heading error, median: panoramas", "{points_panorama_heading_median_deg:.3f}°", "< 0.02°", "points_panorama_heading_median_deg < 0.02"),
+            Row("… within two stated σ", "{points_panorama_two_sigma_coverage:.1%}", "95 %"),
+            Row("skyline alone, haze and masked foreground, start within ±10°: within 0.1°", "{skyline_success_rate:.0%}", "≥ 95 %", "skyline_success_rate >= 0.95"),
+            Row("… failures that were trusted", "{skyline_failures_not_flagged:.0f}", "0", "skyline_failures_not_flagged == 0"),
+            Row("thick fog: failures that were trusted", "{fog_failures_not_flagged:.0f} of {fog_trials:.0f}", "0", "fog_failures_not_flagged == 0"),
+            Row("Finse photograph, one radial term: RMS", "{finse_rms_px:.2f} px", "≤ 5.5 px", "finse_rms_px <= 5.5"),
+            Row("… leave-one-out", "{finse_leave_one_out_px:.2f} px", "≤ 7 px", "finse_leave_one_out_px <= 7"),
+            Row("… skyline against points", "{finse_skyline_minus_points_deg:.2f}°", "≤ 0.3°", "finse_skyline_minus_points_deg <= 0.3"),
+        ),
+        "The Finse rows are of a real photograph; all others are of rendered pictures.",
+    ),
+    "headline": Table(
+        "",
+        (
+            Row("Frame of a film; path tracing by bare Mitsuba to the same error takes", "{frame_s:.2f} s; {speedup_vs_mitsuba:,.0f} × as long", record="relight"),
+            Row("Path-traced picture; a bare Mitsuba script to the same noise takes", "{equal_noise_speedup_vs_bare_mitsuba:.1f} × as long", record="render"),
+            Row("Sky radiance against a brute-force path tracer, largest error", "{oracle_error_max:.1%}", record="sky"),
+            Row("Albedo from webcam pictures; over the best topographic correction", "{webcam_psnr_db:.1f} dB; +{margin_over_best_correction_db:.1f} dB", record="albedo-quick"),
+            Row("Hidden texels over Telea's inpainting; real Landsat pair", "+{hidden_gain_over_telea_db:.1f} dB; +{landsat_gain_over_telea_db:.1f} dB", record="texturing-quick"),
+            Row("Hours nobody photographed; satellite image alone", "{held_out_hour_psnr_db:.1f} dB; {ablation_held_out_satellite_only_best_exposure_psnr_db:.1f} dB", record="alpinebench-quick"),
+            Row("Twilight and moonlight against the U.S. Naval Observatory's fits, largest factor", "{twilight_factor_max:.2f}", "≤ 1.5", "twilight_factor_max <= 1.5", record="sky_night"),
+        ),
+    ),
+}  # fmt: skip
+
+
+def load_record(name: str) -> dict[str, Any] | None:
+    """Return a record, or ``None`` where it was not measured yet."""
+    path = RESULTS / f"{name}.json"
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+
+
+def record_table(name: str) -> str:
+    """Return a table in Markdown, and below it where its numbers come from."""
+    table = TABLES[name]
+    records = {each: load_record(each) for each in dict.fromkeys(row.record or table.record for row in table.rows)}
+    lines = ["| | measured | aim |", "|---|---|---|"]
+    for row in table.rows:
+        record = records[row.record or table.record]
+        if record is not None:
+            lines.append(_row_text(row, record["figures"]))
+    missing = [f"`benchmarks/results/{each}.json`" for each, record in records.items() if record is None]
+    if len(lines) == 2:
+        lines = []
+    if missing:
+        lines += ["", f"*Not measured by the present program: {', '.join(missing)}.*"]
+    sources = [f"<sub>{_source(record)}</sub>" for record in records.values() if record is not None]
+    if sources:
+        lines += ["", *([table.note, ""] if table.note else []), *sources]
+    return "\n".join(lines).strip() + "\n"
+
+
+def _row_text(row: Row, figures: dict[str, Any]) -> str:
+    try:
+        label, value = row.label.format(**figures), row.value.format(**figures)
+    except KeyError as absent:
+        return f"| {re.sub('{[^}]*}', '…', row.label)} | *not in this record: {absent.args[0]}* | {row.aim or '–'} |"
+    missed = any(not _holds(bound.strip(), figures) for bound in row.bounds.split(",") if bound.strip())
+    return f"| {label} | {_spaced(value)}{' **(missed)**' if missed else ''} | {row.aim or '–'} |"
+
+
+def _holds(bound: str, figures: dict[str, Any]) -> bool:
+    figure, comparison, limit = bound.split()
+    return _COMPARISONS[comparison](figures[figure], float(limit))
+
+
+def _source(record: dict[str, Any]) -> str:
+    machine, versions = record["machine"], record["versions"]
+    load = f", load {machine['load_5min']}" if "load_5min" in machine else ""
+    return (
+        f"`{record['command']}`, commit {record['commit']}, {record['date'][:10]}; {machine['cores']} cores of "
+        f"{machine['processor']}{load}; Python {versions['python']}, Mitsuba {versions['mitsuba']}."
+    )
+
+
+def _spaced(text: str) -> str:
+    return re.sub(r"(\d)%", r"\1 %", text)
+
+
+def sky_model_table() -> str:
+    """Return the table of the bundled sky models, from their files."""
+    from seasonscapes.sky.models import read_sky_model, visibility_km
+
+    lines = ["| model | kind | what it is | visibility at sea level |", "|---|---|---|---|"]
+    for path in sorted((ROOT / "sun_models").glob("*.toml")):
+        model = read_sky_model(path)
+        visibility = visibility_km(model)
+        below = " (below the cloud)" if model.kind == "overcast" else ""  # type: ignore[attr-defined]
+        shown = "unlimited" if visibility is None else f"{visibility:.0f} km{below}"
+        lines.append(f"| `{path.stem}` | {model.kind} | {model.description} | {shown} |")  # type: ignore[attr-defined]
+    return "\n".join(lines) + "\n"
+
+
+def table_text(name: str) -> str:
+    """Return what stands between the markers of a table."""
+    maker: Callable[[], str] = sky_model_table if name == "sky-models" else lambda: record_table(name)
+    return maker()
+
+
+def filled(document: str) -> str:
+    """Return a document with all its tables made anew."""
+    return _REGION.sub(lambda match: match[1] + table_text(match[2]) + match[3], document)
+
+
+def main() -> int:
+    """Write all documents, or name those that differ."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--check", action="store_true", help="write nothing; fail where a document differs")
+    check = parser.parse_args().check
+    differing = []
+    for name in DOCUMENTS:
+        path = ROOT / name
+        text = path.read_text(encoding="utf-8")
+        made = filled(text)
+        if made != text:
+            differing.append(name)
+            if not check:
+                path.write_text(made, encoding="utf-8")
+    print("\n".join(differing) if differing else "no difference")
+    return int(check and bool(differing))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,103 @@
+"""Tables equal their records, commands on the pages parse, stored notebooks are those of the tree, versions agree."""
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import seasonscapes
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = sorted([*DOCS.glob("*.md"), *DOCS.glob("start/*.md"), *DOCS.glob("howto/*.md"), ROOT / "README.md"])
+CONSOLE = re.compile(r"```(?:console|sh)\n(.*?)```", re.DOTALL)
+
+sys.path.insert(0, str(ROOT / "benchmarks"))
+import tables  # noqa: E402
+
+
+def commands_of(page: Path) -> list[str]:
+    """The seasonscapes commands of a page's console blocks, continued lines joined."""
+    lines: list[str] = []
+    for block in CONSOLE.findall(page.read_text(encoding="utf-8")):
+        lines += re.sub(r"\\\n\s*", "", block).splitlines()
+    stripped = [line.strip().removeprefix("$ ") for line in lines]
+    return [line for line in stripped if line.startswith("seasonscapes ")]
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if commands_of(page)], ids=lambda page: page.name)
+def test_commands_of_a_page_parse(page):
+    from seasonscapes.cli import app
+
+    for command in commands_of(page):
+        tokens = shlex.split(command, comments=True)[1:]
+        function, bound, _ = app.parse_args(tokens, exit_on_error=False, print_error=False)
+        assert function is not None, command
+        assert tokens[0].startswith("-") or bound is not None, command
+
+
+def test_pages_have_commands():
+    assert sum(len(commands_of(page)) for page in PAGES) > 25
+
+
+@pytest.mark.parametrize("name", tables.DOCUMENTS)
+def test_tables_equal_their_records(name):
+    text = (ROOT / name).read_text(encoding="utf-8")
+    assert tables.filled(text) == text, "run `make tables`"
+
+
+def test_a_wrong_number_in_a_table_is_found():
+    text = (ROOT / "docs" / "measured.md").read_text(encoding="utf-8")
+    table = re.search(r"<!-- table: night -->\n(.*?)<!-- end -->", text, re.DOTALL)
+    assert table is not None
+    number = re.search(r"\d\.\d\d", table[1])
+    assert number is not None
+    planted = text.replace(number[0], "1.01", 1)
+    assert planted != text
+    assert tables.filled(planted) == text
+
+
+def test_records_say_how_they_came_about():
+    records = sorted((ROOT / "benchmarks" / "results").glob("*.json"))
+    assert records
+    for path in records:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        assert set(record) == {"command", "seed", "commit", "date", "machine", "versions", "figures"}, path.name
+        assert record["figures"]
+        script = shlex.split(record["command"])[1]
+        assert (ROOT / script).is_file(), path.name
+
+
+def test_a_record_is_written_with_its_circumstances(tmp_path):
+    script = (
+        "from record import write_record; from pathlib import Path; write_record(Path('r.json'), {'a_m': 1.5}, seed=7)"
+    )
+    environment_path = {"PYTHONPATH": f"{ROOT / 'benchmarks'}", "PATH": "/usr/bin:/bin"}
+    subprocess.run([sys.executable, "-c", script], cwd=tmp_path, env=environment_path, check=True)
+    record = json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))
+    assert record["figures"] == {"a_m": 1.5}
+    assert record["seed"] == 7
+    assert record["command"].endswith("--seed 7")
+    assert record["versions"]["mitsuba"]
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda path: path.stem)
+def test_stored_notebooks_are_those_of_the_tree(path):
+    import nbformat
+
+    original = nbformat.read(path, as_version=4)
+    stored = nbformat.read(DOCS / "tutorials" / path.name, as_version=4)
+    assert [cell.source for cell in stored.cells] == [cell.source for cell in original.cells], "make docs-notebooks"
+    assert any(cell.get("outputs") for cell in stored.cells)
+
+
+def test_versions_agree():
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    cited = re.search(r"^version: (.+)$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE)
+    assert cited is not None
+    assert seasonscapes.__version__ == declared == cited[1]
