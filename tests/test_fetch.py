@@ -478,6 +478,7 @@ def test_a_missing_tile_is_replaced_by_the_coarser_product(fetch, world, tmp_pat
         ((10.0, 10.0), {"elevation": "swissalti3d"}, "swissALTI3D has nothing here"),
         (ALPS, {"size": "20"}, "--size: not an extent"),
         (ALPS, {"size": "2000km"}, "--size: out of range"),
+        ((*ALPS, 1200), {}, "--at: the centre of an area has no height"),
         (ALPS, {"composite": "mean"}, "--composite: unknown composite"),
         (ALPS, {"cloud": 120}, "--cloud: out of range"),
         (ALPS, {"date": "2024-13"}, "--date: not a time"),
