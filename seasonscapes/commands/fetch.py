@@ -10,6 +10,7 @@ from cyclopts import Parameter
 from seasonscapes.commands.arguments import parse_at
 from seasonscapes.commands.console import print_result, progress_bars
 from seasonscapes.commands.outputs import check_output
+from seasonscapes.errors import InputError
 from seasonscapes.open_data.requests_as_text import parse_extent, parse_interval
 
 
@@ -69,7 +70,7 @@ def fetch_command(
     check_output(output, (".toml",))
     request = FetchRequest(
         output,
-        None if at is None else parse_at(at)[:2],
+        None if at is None else _centre(at),
         None if size is None else parse_extent(size),
         elevation,
         imagery,
@@ -89,6 +90,13 @@ def fetch_command(
         fetched = fetch_place(request, store, progress=progress)
     record = fetched.record | {"scene": str(fetched.scene), "loaded_bytes": fetched.loaded_bytes}
     print_result(record, _lines(record), as_json=json)
+
+
+def _centre(text: str) -> tuple[float, float]:
+    latitude, longitude, height_m, _ = parse_at(text)
+    if height_m is not None or text.count(",") != 1:
+        raise InputError("--at", "the centre of an area has no height", got=text, expected="LAT,LON")
+    return latitude, longitude
 
 
 def _plan_lines(record: dict[str, Any]) -> list[str]:

@@ -6,6 +6,7 @@ the vertical datum, the text of attribution that the licence asks for, and where
 
 from __future__ import annotations
 
+import math
 from fnmatch import fnmatch
 from typing import Literal
 
@@ -72,6 +73,8 @@ class Source(Declaration):
         imagery.
     spacing_m
         Finest distance of samples [m].
+    in_degrees
+        Samples stand on a grid of degrees: they are nearer to each other from west to east, by the cosine of the latitude.
     bytes_per_sample
         Typical size of a compressed sample, for plans where a catalogue states no file size.
     licence, licence_url, attribution
@@ -112,6 +115,7 @@ class Source(Declaration):
     collection: str
     assets: list[str] = Field(min_length=1, max_length=3)
     spacing_m: float = Field(gt=0.0)
+    in_degrees: bool = False
     bytes_per_sample: float = Field(gt=0.0)
     licence: str
     licence_url: str
@@ -138,6 +142,10 @@ class Source(Declaration):
         if self.kind == "imagery" and len(self.assets) == 2:
             raise ValueError("imagery needs one asset with all colours, or red, green and blue")
         return self
+
+    def finest_m(self, latitude_deg: float) -> float:
+        """Distance of samples along the finer direction [m]; grids of degrees become sparser beyond 50°."""
+        return self.spacing_m * (math.cos(math.radians(min(abs(latitude_deg), 50.0))) if self.in_degrees else 1.0)
 
 
 def source_names(kind: str) -> list[str]:

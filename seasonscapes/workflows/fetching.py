@@ -171,7 +171,7 @@ def plan_place(request: FetchRequest, store: RemoteStore) -> FetchPlan:
     centre, size = _area(request, height_files or image_files)
     name = "files" if height_files else _AUTO_ELEVATION if request.elevation == "auto" else request.elevation
     source = None if height_files else source_of(name, "elevation", flag="--elevation")
-    finest = height_files[0].spacing_m if height_files else source.spacing_m if source is not None else 0.0
+    finest = min(each.spacing_m for each in height_files) if source is None else source.finest_m(centre[0])
     grid = grid_about(*centre, size, _spacing_m(finest, size, request.resolution_m))
     plan = FetchPlan(centre, size, name, "none", grid, None, height_files, image_files)
     if source is not None:
