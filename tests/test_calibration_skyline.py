@@ -188,6 +188,7 @@ def test_a_full_panorama_finds_its_heading_its_horizon_row_and_its_lean():
     assert heading_error(fit, trial) < 0.1
     truth = parameters_of_view(trial.truth, fit.horizon.axes)
     assert fit.calibration.parameters[1:3] == pytest.approx(truth[1:3], abs=0.1)
+    # A pixel is 0.15°: a row and a half is the 0.2° that the lean and the horizon's row share.
     assert fit.calibration.view.cy == pytest.approx(trial.truth.cy, abs=1.5)
 
 

@@ -17,8 +17,9 @@ DOCS = ROOT / "docs"
 PAGES = sorted([*DOCS.glob("*.md"), *DOCS.glob("start/*.md"), *DOCS.glob("howto/*.md"), ROOT / "README.md"])
 CONSOLE = re.compile(r"```(?:console|sh)\n(.*?)```", re.DOTALL)
 
-sys.path.insert(0, str(ROOT / "benchmarks"))
+sys.path[:0] = [str(ROOT / "benchmarks"), str(DOCS / "_ext")]
 import tables  # noqa: E402
+from generated_pages import command_line  # noqa: E402
 
 
 def commands_of(page: Path) -> list[str]:
@@ -32,8 +33,7 @@ def commands_of(page: Path) -> list[str]:
 
 @pytest.mark.parametrize("page", [page for page in PAGES if commands_of(page)], ids=lambda page: page.name)
 def test_commands_of_a_page_parse(page):
-    from seasonscapes.cli import app
-
+    app = command_line()
     for command in commands_of(page):
         tokens = shlex.split(command, comments=True)[1:]
         function, bound, _ = app.parse_args(tokens, exit_on_error=False, print_error=False)

@@ -243,7 +243,10 @@ def test_a_texel_larger_than_pixels_gets_their_mean(land, cameras):
     value, confidence = sample_input(ready, np.array([[column + 4.0, row + 4.0]]), np.array([8.0]))
     around = noise[row : row + 8, column : column + 8].mean(axis=(0, 1))
     np.testing.assert_allclose(value[0], around, atol=0.06)
-    assert confidence[0] >= 0.0
+    # Of 64 pixels those count that are neither too dark nor too bright to be trusted; the noise has both.
+    trusted = ready.levels[0][row : row + 8, column : column + 8, 4].mean()
+    assert 0.0 < trusted < 1.0
+    assert confidence[0] == pytest.approx(trusted, abs=1e-6)
 
 
 # --- agreement --------------------------------------------------------------------------------------------------------

@@ -117,7 +117,8 @@ def test_panoramas_to_gaussians(runs, capsys):
     relit, splat = (np.asarray(Image.open(next((whole / name).glob("*.png"))), float) for name in ("relight", "splat"))
     assert relit.shape == splat.shape == (64, 96, 3)
     assert relit.std() > 5.0
-    # Two ways to the same hour from the same albedo: not the same picture, but one of the same thing.
+    # Two ways to the same hour from the same albedo: not the same picture, but one of the same thing. A splat of so few
+    # discs is blurred, so that the bound is loose.
     assert np.corrcoef(relit.mean(axis=2).ravel(), splat.mean(axis=2).ravel())[0, 1] > 0.6
     assert main(["info", str(whole)]) == 0
     capsys.readouterr()

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
+from cyclopts import App
 from numpydoc.docscrape import NumpyDocString
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
@@ -78,11 +79,16 @@ def link_public_names(app: Sphinx, what: str, name: str, thing: Any, options: An
 # ------------------------------------------------------------------------------------------------ command line
 
 
-def command_page() -> str:
-    """Return the reference of all commands, as cyclopts describes them."""
+def command_line() -> App:
+    """Return the application of all commands."""
     from seasonscapes.cli import app
 
-    text = app.generate_docs(output_format="markdown", recursive=True, heading_level=1)
+    return app
+
+
+def command_page() -> str:
+    """Return the reference of all commands, as cyclopts describes them."""
+    text = command_line().generate_docs(output_format="markdown", recursive=True, heading_level=1)
     first = text.index("## seasonscapes ")
     return text[first:].replace("**Parameters**:", "")
 
