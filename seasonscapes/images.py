@@ -564,6 +564,15 @@ def write_exr(
         attributes[key] = value if isinstance(value, (str, float)) else json.dumps(value)
     with atomic_path(path) as temporary:
         OpenEXR.File(attributes, channels).write(os.fspath(temporary))
+        _require_whole_exr(temporary, path)
+
+
+def _require_whole_exr(temporary: Path, path: str | os.PathLike) -> None:
+    """`OSError` where a written file cannot be read: the library says nothing of a disk that is full when a file is closed."""
+    try:
+        read_exr(temporary)
+    except UnreadableImage as error:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), os.fspath(path)) from error
 
 
 def read_exr(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

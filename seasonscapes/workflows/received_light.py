@@ -302,7 +302,7 @@ def _bands(received: IntegratedIrradiance, shape: tuple[int, int], *, period: bo
 
 def write_geotiff(path: Path, grid: Raster, bands: dict[str, np.ndarray], record: dict) -> None:
     """Write bands ``(H, W)`` as a tiled float32 GeoTIFF with named bands and a record among its tags, atomically."""
-    import rasterio
+    from rasterio.io import MemoryFile
 
     from seasonscapes.images import atomic_path
 
@@ -322,8 +322,12 @@ def write_geotiff(path: Path, grid: Raster, bands: dict[str, np.ndarray], record
         "blockxsize": 256,
         "blockysize": 256,
     }
-    with atomic_path(path) as temporary, rasterio.open(temporary, "w", **profile) as file:
-        for index, (name, values) in enumerate(bands.items(), start=1):
-            file.write(values, index)
-            file.set_band_description(index, name)
-        file.update_tags(seasonscapes=json.dumps(record, default=float))
+    # Made in memory: GDAL says nothing of a disk that is full when it closes a file.
+    with MemoryFile() as memory:
+        with memory.open(**profile) as file:
+            for index, (name, values) in enumerate(bands.items(), start=1):
+                file.write(values, index)
+                file.set_band_description(index, name)
+            file.update_tags(seasonscapes=json.dumps(record, default=float))
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(memory.getbuffer())
