@@ -22,7 +22,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import secrets
 import sys
 import tempfile
@@ -51,6 +50,7 @@ from delight_scene import (  # noqa: E402
     unit_of,
 )
 from mesh_scene import mesh_relit  # noqa: E402
+from record import write_record  # noqa: E402
 
 from seasonscapes.albedo.corrections import CORRECTIONS, slopes_under  # noqa: E402
 from seasonscapes.albedo.delighting import DelightOptions, TexelIrradiance, delight_image  # noqa: E402
@@ -380,8 +380,7 @@ def main() -> None:
         else:
             verdict = "holds" if (value >= bar if sense == "at least" else value <= bar) else "MISSED"
         print(f"{name:34s}{'-' if value is None else f'{value:.3f}':>9s}  {sense} {bar:g}: {verdict}")
-    if args.json is not None:
-        args.json.write_text(json.dumps(numbers, indent=1, default=float) + "\n")
+    write_record(args.json, numbers, seed=seed)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import json
 import os
 import secrets
 import sys
@@ -26,6 +25,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pvlib
+from record import write_record
 from scipy.optimize import minimize_scalar
 
 from seasonscapes.sky.atmosphere import optics
@@ -274,8 +274,7 @@ def main() -> None:
         "\nworse of both days: "
         + ", ".join(f"{k} {100 * numbers[f'{k}_rms']:.2f} %" for k in ("direct", "diffuse", "global"))
     )
-    if args.json:
-        args.json.write_text(json.dumps(numbers, indent=1) + "\n")
+    write_record(args.json, numbers, seed=seed)
     if args.plot:
         draw(args.plot, plots)
 

@@ -81,7 +81,7 @@ def link_public_names(app: Sphinx, what: str, name: str, thing: Any, options: An
 
 def command_line() -> App:
     """Return the application of all commands."""
-    from seasonscapes.cli import app
+    from seasonscapes.commands.application import app
 
     return app
 
