@@ -12,6 +12,8 @@ import numpy as np
 
 from seasonscapes.errors import InputError
 
+# How an archive begins.
+_ARCHIVE = b"PK"
 # What numpy and zipfile raise for files that are cut short, changed, pickled, or no .npz file at all.
 _DAMAGE = (BadZipFile, ValueError, EOFError, KeyError, AttributeError, NotImplementedError, RuntimeError, zlib.error)
 
@@ -62,6 +64,10 @@ def read_arrays(
     path = Path(path)
     if not path.is_file():
         raise InputError(path, "no such file", expected=what, cure=cure)
+    with open(path, "rb") as file:
+        # numpy takes whatever is no archive for a pickle.
+        if file.read(len(_ARCHIVE)) != _ARCHIVE:
+            raise InputError(path, f"not {what}: no .npz file", cure=cure)
     try:
         with np.load(path, allow_pickle=False) as stored:
             if names is None:

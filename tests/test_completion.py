@@ -359,7 +359,7 @@ def test_inpaint_says_what_is_wrong(hill, tmp_path):
     save_texture(Texture(texture.values[:9, :9], texture.weight[:9, :9]), small)
     for options, text in (
         ({"texture": tmp_path / "none.npz"}, "no such file"),
-        ({"texture": path}, "not a painted texture"),
+        ({"texture": path}, r"not a texture: no \.npz file"),
         ({"texture": empty}, "no painted texel"),
         ({"texture": small}, "made for another atlas"),
         ({"texture": empty, "method": "magic"}, "unknown method"),

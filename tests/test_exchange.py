@@ -123,7 +123,7 @@ def test_opencv_projects_the_same_points_with_distortion(tmp_path):
             "distortion k1 is not zero",
         ),
         ("transforms.json", "[]", "not a JSON object"),
-        ("transforms.json", "{", "not readable as JSON"),
+        ("transforms.json", "{", "not valid JSON"),
         ("cameras.txt", "1 OPENCV 10 10 5 5 5 5 0 0 0 0\n", "camera model OPENCV has distortion"),
         ("cameras.txt", "# ids\n1 PINHOLE 10 10 5 5 5\n", r"cameras.txt: line 2: wrong number of PINHOLE .* got 3"),
         ("cameras.txt", "1 SIMPLE_PINHOLE 10 10\n", r"line 1: wrong number of SIMPLE_PINHOLE .* got 0; expected 3"),

@@ -267,7 +267,7 @@ def test_timelapse_says_what_is_wrong(hill, tmp_path, capsys, more, message):
 def test_an_interrupted_film_goes_on(hill, tmp_path, capsys, sign):
     output = tmp_path / "film.mp4"
     more = ("--from", "2024-06-20T08:00", "--to", "2024-06-20T18:00", "--every", "5min", "--seed", str(int(sign)))
-    command = [sys.executable, "-m", "seasonscapes.cli", *arguments(hill, output, *more)]
+    command = [sys.executable, "-m", "seasonscapes", *arguments(hill, output, *more)]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE)
     pattern, deadline = "hill/frames-*/20240620T*.exr", time.monotonic() + 120
     while len(done := list(Path(hill.workspace).glob(pattern))) < 5:
@@ -350,7 +350,7 @@ def test_slurm_jobs_render(hill, tmp_path, monkeypatch):
     assert "#SBATCH -p alpine" in script
     assert "#SBATCH -t 00:10:00" in script
     wishes.write_text("jobs = 0\n")
-    with pytest.raises(InputError, match="does not describe a cluster"):
+    with pytest.raises(InputError, match="not a number of jobs; got 0"):
         list(run_on_cluster(f"slurm:{wishes}", partial(render_frame, hill), times))
 
 

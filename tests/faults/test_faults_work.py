@@ -81,7 +81,9 @@ def test_a_full_disk_below_the_workspace(own_land, record_property):
 DRIVER = """
 import os, signal, sys, threading
 from seasonscapes.cli import main
-threading.Timer(float(sys.argv[1]), os.kill, (os.getpid(), signal.SIGINT)).start()
+timer = threading.Timer(float(sys.argv[1]), os.kill, (os.getpid(), signal.SIGINT))
+timer.daemon = True  # work that is done sooner ends the process
+timer.start()
 sys.argv[1:] = sys.argv[2:]
 sys.exit(main())
 """
