@@ -1,6 +1,7 @@
 """Shared fixtures. Threads are pinned before numpy loads, so that timings and results do not depend on the machine."""
 
 import os
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -17,3 +18,24 @@ def data_dir() -> Path:
     if not folder.is_dir():
         pytest.skip(f"real data set not found at {folder}; set SEASONSCAPES_DATA to its folder")
     return folder
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Sum the verdicts of the fault campaign. Here, since the process that gathers results of several loads no other."""
+    cases, wrong = 0, Counter()
+    for reports in terminalreporter.stats.values():
+        for report in reports:
+            for name, value in getattr(report, "user_properties", ()):
+                if name == "fault" and report.when == "call":
+                    cases += value["cases"]
+                    wrong.update(value["wrong"])
+    if cases:
+        told = {
+            "tracebacks": wrong["traceback"],
+            "half files": wrong["half file"],
+            "escapes": wrong["escape"],
+            "silent": wrong["silent"],
+            "not one line of text or JSON": wrong["not one line"] + wrong["no JSON"],
+            "refused in error": wrong["refused"],
+        }
+        terminalreporter.write_line(f"faults: {cases} cases, " + ", ".join(f"{n} {what}" for what, n in told.items()))
