@@ -1,8 +1,8 @@
 """The record of a benchmark: its figures, and everything that is needed to measure them again.
 
 A record is a JSON file ``benchmarks/results/NAME[-SIZE].json`` as written by ``--json``; ``make tables`` makes tables of
-it (`tables.py`). Its keys are ``command``, ``seed``, ``commit`` (with ``+changes`` where the tree differed from it),
-``date`` (UTC), ``machine``, ``versions`` and ``figures``.
+it (`tables.py`). Its keys are the figures, and ``record``: their ``command``, ``seed``, ``commit`` (with ``+changes`` where
+the tree differed from it), ``date`` (UTC), ``machine`` and ``versions``.
 """
 
 from __future__ import annotations
@@ -42,28 +42,29 @@ def write_record(path: Path | None, figures: dict[str, Any], *, seed: int | None
     command = ["python", f"benchmarks/{Path(sys.argv[0]).name}", *arguments]
     if seed is not None:
         command += ["--seed", str(seed)]
-    record = {
+    circumstances = {
         "command": shlex.join(command),
         "seed": seed,
         "commit": _commit(),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "machine": _machine(),
         "versions": {"python": platform.python_version()} | _versions(),
-        "figures": {
-            key: value if isinstance(value, int | str) else float(value)
-            for key, value in figures.items()
-            if key != "seed"
-        },
     }
+    record: dict[str, Any] = {
+        key: value if isinstance(value, int | str) else float(value) for key, value in figures.items() if key != "seed"
+    }
+    record["record"] = circumstances
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f"{path.name}.part")
     temporary.write_text(json.dumps(record, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     temporary.replace(path)
 
 
-def read_figures(path: Path) -> dict[str, Any]:
-    """Return the figures of a record."""
-    return json.loads(path.read_text(encoding="utf-8"))["figures"]
+def read_record(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the figures of a record, and their circumstances."""
+    figures = json.loads(path.read_text(encoding="utf-8"))
+    circumstances = figures.pop("record")
+    return figures, circumstances
 
 
 def _without_options(arguments: list[str], options: tuple[str, ...]) -> list[str]:

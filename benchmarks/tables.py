@@ -8,7 +8,6 @@ and fails where a document differs. A figure without a record is not printed: it
 from __future__ import annotations
 
 import argparse
-import json
 import operator
 import re
 import sys
@@ -16,6 +15,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from record import read_record
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
@@ -238,9 +239,12 @@ TABLES = {
 
 
 def load_record(name: str) -> dict[str, Any] | None:
-    """Return a record, or ``None`` where it was not measured yet."""
+    """Return the circumstances of a record with its ``figures``, or ``None`` where it was not measured yet."""
     path = RESULTS / f"{name}.json"
-    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+    if not path.is_file():
+        return None
+    figures, circumstances = read_record(path)
+    return {**circumstances, "figures": figures}
 
 
 def record_table(name: str) -> str:

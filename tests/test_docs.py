@@ -66,9 +66,10 @@ def test_records_say_how_they_came_about():
     records = sorted((ROOT / "benchmarks" / "results").glob("*.json"))
     assert records
     for path in records:
-        record = json.loads(path.read_text(encoding="utf-8"))
-        assert set(record) == {"command", "seed", "commit", "date", "machine", "versions", "figures"}, path.name
-        assert record["figures"]
+        figures = json.loads(path.read_text(encoding="utf-8"))
+        record = figures.pop("record")
+        assert set(record) == {"command", "seed", "commit", "date", "machine", "versions"}, path.name
+        assert figures
         script = shlex.split(record["command"])[1]
         assert (ROOT / script).is_file(), path.name
 
@@ -79,8 +80,9 @@ def test_a_record_is_written_with_its_circumstances(tmp_path):
     )
     environment_path = {"PYTHONPATH": f"{ROOT / 'benchmarks'}", "PATH": "/usr/bin:/bin"}
     subprocess.run([sys.executable, "-c", script], cwd=tmp_path, env=environment_path, check=True)
-    record = json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))
-    assert record["figures"] == {"a_m": 1.5}
+    figures = json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))
+    record = figures.pop("record")
+    assert figures == {"a_m": 1.5}
     assert record["seed"] == 7
     assert record["command"].endswith("--seed 7")
     assert record["versions"]["mitsuba"]

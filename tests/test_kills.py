@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import places
 import pytest
-from PIL import Image
+from file_contents import contents
 
 KILLS = int(os.environ.get("SEASONSCAPES_KILLS", "4"))
 SEED = int(os.environ.get("SEASONSCAPES_KILL_SEED", str(np.random.SeedSequence().entropy % 2**32)))
@@ -65,33 +65,6 @@ COMMANDS = {
         *("--steps", "600", "--picture-steps", "4", "-o", "out/model.safetensors"),
     ),
 }
-
-
-def contents(path: Path) -> dict:
-    """What a file holds, to the bit; without the seconds that it took."""
-    if path.suffix == ".safetensors":
-        from safetensors import safe_open
-
-        with safe_open(path, "np") as file:
-            return {"": file.metadata()} | {name: file.get_tensor(name).tobytes() for name in file.keys()}  # noqa: SIM118
-    if path.suffix == ".npz":
-        with np.load(path) as file:
-            return {name: file[name].tobytes() for name in file.files}
-    if path.suffix == ".png":
-        return {"pixels": np.asarray(Image.open(path)).tobytes()}
-    if path.suffix == ".exr":
-        from seasonscapes.images import read_exr
-
-        return {name: np.ascontiguousarray(layer).tobytes() for name, layer in read_exr(path)[0].items()}
-    if path.suffix == ".json":
-        return {"record": timeless(json.loads(path.read_text()))}
-    return {"bytes": path.read_bytes()}
-
-
-def timeless(value: object) -> object:
-    if isinstance(value, dict):
-        return {key: timeless(item) for key, item in value.items() if "seconds" not in key}
-    return [timeless(item) for item in value] if isinstance(value, list) else value
 
 
 def unfinished(name: str) -> bool:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from file_contents import contents
 from PIL import Image
 from places import MASSIF
 
@@ -143,22 +144,6 @@ def killed_in(runs: Runs, name: str, stage: str, delay_s: float) -> list[str]:
     code = process.wait()
     assert code == -signal.SIGKILL or stage == "splat", (stage, code, told)
     return told
-
-
-def contents(path: Path) -> dict:
-    """What a file holds, to the bit. Pictures tell how long they took beside their pixels; of safetensors' header the
-    order is by chance."""
-    if path.suffix == ".safetensors":
-        from safetensors import safe_open
-
-        with safe_open(path, "np") as file:
-            return {"": file.metadata()} | {name: file.get_tensor(name).tobytes() for name in file.keys()}  # noqa: SIM118
-    if path.suffix == ".npz":
-        with np.load(path) as file:
-            return {name: file[name].tobytes() for name in file.files}
-    if path.suffix == ".png":
-        return {"pixels": np.asarray(Image.open(path)).tobytes()}
-    return {"bytes": path.read_bytes()}
 
 
 @pytest.mark.slow
