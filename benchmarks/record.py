@@ -50,9 +50,7 @@ def write_record(path: Path | None, figures: dict[str, Any], *, seed: int | None
         "machine": _machine(),
         "versions": {"python": platform.python_version()} | _versions(),
     }
-    record: dict[str, Any] = {
-        key: value if isinstance(value, int | str) else float(value) for key, value in figures.items() if key != "seed"
-    }
+    record = {key: _plain(value) for key, value in figures.items() if key != "seed"}
     record["record"] = circumstances
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f"{path.name}.part")
@@ -65,6 +63,15 @@ def read_record(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     figures = json.loads(path.read_text(encoding="utf-8"))
     circumstances = figures.pop("record")
     return figures, circumstances
+
+
+def _plain(value: Any) -> Any:
+    """The value as JSON holds it: numpy's numbers as numbers, sequences as lists; ``None`` is not measured."""
+    if isinstance(value, dict):
+        return {key: _plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    return value if value is None or isinstance(value, int | str) else float(value)
 
 
 def _without_options(arguments: list[str], options: tuple[str, ...]) -> list[str]:
