@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from seasonscapes.sky.night import air_mass
+
 # Lower bounds of the sky clearness ε of each class.
 _CLEARNESS = np.array([1.0, 1.065, 1.23, 1.5, 1.95, 2.8, 4.5, 6.2])
 # fmt: off
@@ -51,15 +53,15 @@ def efficacies_lm_w(direct_normal_lx: float, diffuse_lx: float, sun_elevation_de
     >>> [round(value) for value in efficacies_lm_w(100_000.0, 12_000.0, 60.0)]
     [103, 134]
     """
-    zenith = np.radians(90.0 - np.clip(sun_elevation_deg, 1.0, 90.0))
-    cosine = np.cos(zenith)
-    air_mass = 1.0 / (cosine + 0.50572 * (96.07995 - np.degrees(zenith)) ** -1.6364)
+    elevation_deg = float(np.clip(sun_elevation_deg, 1.0, 90.0))
+    zenith = np.radians(90.0 - elevation_deg)
+    cosine, mass = np.cos(zenith), float(air_mass(elevation_deg))
     direct, diffuse = 100.0, 125.0
     for _ in range(_ITERATIONS):
         beam, sky = direct_normal_lx / direct, max(diffuse_lx / diffuse, 1e-6)
         cubed = 1.041 * zenith**3
         clearness = ((sky + beam) / sky + cubed) / (1.0 + cubed)
-        brightness = np.clip(sky * air_mass / _SOLAR_CONSTANT_W_M2, 0.01, 0.6)
+        brightness = np.clip(sky * mass / _SOLAR_CONSTANT_W_M2, 0.01, 0.6)
         row = int(np.searchsorted(_CLEARNESS, clearness, side="right")) - 1
         a, b, c, d = _DIRECT[row]
         direct = max(a + b * _WATER_CM + c * np.exp(5.73 * zenith - 5.0) + d * brightness, 20.0)

@@ -11,6 +11,7 @@ import io
 import json
 import os
 import re
+import resource
 import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -173,3 +174,14 @@ def with_flag(tokens: list[str], flag: str, value: str | None) -> list[str]:
         else:
             kept.append(token)
     return kept if value is None else [*kept, f"{flag}={value}"]
+
+
+@contextlib.contextmanager
+def disk_with(byte_count):
+    """No file may grow beyond a size, as on a full disk; programs that are started have the same limit."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (byte_count, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)

@@ -4,15 +4,14 @@ import http.client
 import json
 import os
 import random
-import resource
 import socket
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from functools import partial
 
 import numpy as np
 import pytest
+from fault_harness import disk_with
 from hypothesis import strategies as st
 
 from seasonscapes.calibration.annotation import AnnotationSession, save_session
@@ -196,17 +195,6 @@ def test_forty_at_once_are_answered(page, record_property):
         answers = list(many.map(one, range(40)))
     record_property("fault", {"cases": 40, "wrong": [] if set(answers) == {200} else ["not one line"]})
     assert answers == [200] * 40
-
-
-@contextmanager
-def disk_with(byte_count):
-    """No file may grow beyond a size, as on a full disk."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (byte_count, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def test_a_disk_without_space_is_told_to_the_page(page, session, record_property):

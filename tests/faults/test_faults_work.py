@@ -6,11 +6,10 @@ import resource
 import shutil
 import subprocess
 import sys
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from fault_harness import half_files, judge, run_in, snapshot, with_flag
+from fault_harness import disk_with, half_files, judge, run_in, snapshot, with_flag
 from fault_verbs import BASE, write_land
 
 WORK = {
@@ -28,17 +27,6 @@ WORK = {
     "evaluate figures": ["evaluate", *BASE["evaluate"], "--figures", "out/figures"],
     "evaluate table": ["evaluate", *BASE["evaluate"], "--table", "out/table.md"],
 }
-
-
-@contextmanager
-def disk_with(byte_count):
-    """No file may grow beyond a size, as on a full disk; programs that are started have the same limit."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (byte_count, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 @pytest.fixture(scope="module")
