@@ -20,7 +20,7 @@ from seasonscapes.sky.report import eclipse_text, moon_text
 from seasonscapes.workflows.albedo_sources import AlbedoSource, chosen_albedo
 from seasonscapes.workflows.illumination import SunMoonPosition, illumination_for_camera, position_at, sky_model
 from seasonscapes.workflows.place import Place, utc_at
-from seasonscapes.workflows.relight_session import relight_session, view_at
+from seasonscapes.workflows.relight_session import still_session, view_at
 from seasonscapes.workflows.views import camera_geodetic, terrain_for_view
 from seasonscapes.workspace import content_key
 
@@ -122,7 +122,7 @@ def render(
 
         # A third of the time of a film's coefficients; errors against four times their rays are 0.6 % (RMS).
         still = SamplingOptions(albedo_samples=16, rays=128)
-        session = relight_session(place, camera, sky=sky, albedo=texture, seed=seed, sampling=still, progress=progress)
+        session = still_session(place, camera, sky=sky, albedo=texture, seed=seed, sampling=still, progress=progress)
         view, light, position = view_at(session, utc)
         record = view_record(place, camera, light, position)
         return replace(view, provenance=record | {"engine": engine, "seed": seed, "variant": backend.variant})
