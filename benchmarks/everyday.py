@@ -1,0 +1,198 @@
+"""Everyday commands as a user types them: processor time and wall time of whole commands, cold and warm.
+
+Every command runs as a process of its own (``python -m seasonscapes``), in a workspace of this run. *Cold* is the first
+command of its kind in an empty workspace, *warm* the next one with another hour. Compiled kernels of Dr.Jit stay in the
+user's cache from run to run, as they do for a user. Keys that end in ``_s`` are processor seconds of all threads, those
+of ``demo_…`` wall seconds; ``…_wall_s`` stand beside them.
+
+    python benchmarks/everyday.py            # all, an hourly year of one view whole: an hour
+    python benchmarks/everyday.py --quick    # the year from 48 of its hours: some ten minutes
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from record import ROOT, write_record
+
+DAY = "2024-09-18"
+VIEW = ("alpine", "--size", "768x512")
+_TABLES = """
+from seasonscapes.sky.models import atmosphere_from_model, read_sky_model
+from seasonscapes.sky.scattering import atmosphere_tables
+atmosphere_tables(atmosphere_from_model(read_sky_model("clear")))
+"""
+_NOTHING = """
+from seasonscapes.sky.models import atmosphere_from_model, read_sky_model
+import seasonscapes.sky.scattering
+atmosphere_from_model(read_sky_model("clear"))
+"""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Time of a process and its children.
+
+    Parameters
+    ----------
+    processor_s, wall_s
+        Processor time of all threads, and time that passed [s].
+    first_file_s
+        When the first of the expected files stood there [s]; ``None`` if none was expected.
+    """
+
+    processor_s: float
+    wall_s: float
+    first_file_s: float | None = None
+
+
+class Bench:
+    """Commands in one temporary folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def seasonscapes(self, *arguments: str, workspace: str, awaited: Path | None = None) -> Cost:
+        """Cost of a command with a workspace of that name."""
+        environment = os.environ | {"SEASONSCAPES_WORKSPACE": str(self.folder / workspace)}
+        return self._cost([sys.executable, "-m", "seasonscapes", *arguments], environment, awaited)
+
+    def python(self, code: str) -> Cost:
+        """Cost of a piece of code."""
+        return self._cost([sys.executable, "-c", code], dict(os.environ), None)
+
+    def _cost(self, command: list[str], environment: dict[str, str], awaited: Path | None) -> Cost:
+        before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+        first = None
+        with open(self.folder / "log.txt", "wb") as log:
+            process = subprocess.Popen(command, cwd=ROOT, env=environment, stdout=log, stderr=log)
+            while process.poll() is None:
+                if awaited is not None and first is None and awaited.exists():
+                    first = time.perf_counter() - start
+                time.sleep(0.02)
+        wall, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
+        if process.returncode:
+            text = (self.folder / "log.txt").read_text(errors="replace")
+            raise SystemExit(f"{' '.join(command)} exited {process.returncode}:\n{text}")
+        used = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+        print(f"{used:8.1f} s processor {wall:8.1f} s wall   {' '.join(command[1:])[:110]}", flush=True)
+        return Cost(used, wall, first)
+
+
+def sky(bench: Bench) -> dict[str, float]:
+    """``sky`` for one instant, and the atmosphere tables that its first call builds."""
+    command = ("sky", "--at", "46.55,7.98,2000", "--time", f"{DAY}T12:00Z")
+    cold, warm = (bench.seasonscapes(*command, workspace="sky") for _ in range(2))
+    tables, imports = bench.python(_TABLES), bench.python(_NOTHING)
+    return {
+        "sky_cold_s": cold.processor_s,
+        "sky_warm_s": warm.processor_s,
+        "sky_warm_wall_s": warm.wall_s,
+        "tables_cold_s": tables.processor_s - imports.processor_s,
+    }
+
+
+def render(bench: Bench) -> dict[str, float]:
+    """``render`` of one view: first, with another hour, and by path tracing."""
+    output = str(bench.folder / "view.png")
+    hours = ("19:05", "18:05", "13:20")
+    engines: tuple[tuple[str, ...], ...] = ((), (), ("--engine", "path"))
+    cold, warm, path = (
+        bench.seasonscapes("render", *VIEW, "--time", f"{DAY}T{hour}", *more, "-o", output, workspace="render")
+        for hour, more in zip(hours, engines, strict=True)
+    )
+    return {
+        "render_cold_s": cold.processor_s,
+        "render_cold_wall_s": cold.wall_s,
+        "render_warm_s": warm.processor_s,
+        "render_warm_wall_s": warm.wall_s,
+        "render_path_warm_s": path.processor_s,
+    }
+
+
+def film(bench: Bench, hours: int | None) -> dict[str, float]:
+    """A first film of two frames in an empty workspace, and the hours of a year."""
+
+    def frames(first: str, last: str, every: str, name: str) -> Cost:
+        output = str(bench.folder / f"{name}.mp4")
+        period = ("--from", first, "--to", last, "--every", every)
+        return bench.seasonscapes("timelapse", *VIEW, *period, "-o", output, workspace="film")
+
+    ready = frames(f"{DAY}T10:00", f"{DAY}T11:00", "1h", "first")
+    total_hours = 366 * 24
+    if hours is None:
+        year = frames("2024-01-01T00:00", "2024-12-31T23:00", "1h", "year")
+        minutes, count = year.wall_s / 60.0, total_hours
+    else:
+        # One film of 2 h and one of ``hours`` h more, spread over the year: their difference is the cost of a frame.
+        base = frames("2024-01-01T00:00", "2024-12-31T00:00", "365d", "base")
+        year = frames("2024-01-02T01:00", "2024-12-30T00:00", f"{total_hours // hours}h", "sample")
+        count = hours
+        minutes = (base.wall_s + (year.wall_s - base.wall_s) / hours * total_hours) / 60.0
+    return {
+        "film_ready_s": ready.processor_s,
+        "film_ready_wall_s": ready.wall_s,
+        "year_minutes": minutes,
+        "year_frames_measured": count,
+        "year_frames": total_hours,
+    }
+
+
+def demo(bench: Bench) -> dict[str, float]:
+    """``demo`` in an empty workspace."""
+    folder = bench.folder / "demo"
+    cost = bench.seasonscapes("demo", "-o", str(folder), workspace="demo", awaited=folder / "day-and-year-00.png")
+    assert cost.first_file_s is not None
+    return {
+        "demo_first_picture_s": cost.first_file_s,
+        "demo_total_s": cost.wall_s,
+        "demo_processor_s": cost.processor_s,
+    }
+
+
+def irradiance(bench: Bench) -> dict[str, float]:
+    """The irradiance of 12 × 12 km at 30 m for one instant, with the terrain built before."""
+    bench.seasonscapes("terrain", "alpine", workspace="map")
+    output = str(bench.folder / "map.tif")
+    command = ("irradiance", "alpine", "--spacing-m", "30", "-o", output)
+    cold = bench.seasonscapes(*command, "--time", f"{DAY}T10:00", workspace="map")
+    warm = bench.seasonscapes(*command, "--time", f"{DAY}T11:00", workspace="map")
+    return {"irradiance_cold_s": cold.processor_s, "irradiance_s": warm.processor_s, "irradiance_wall_s": warm.wall_s}
+
+
+PARTS: dict[str, Callable[[Bench, bool], dict[str, float]]] = {
+    "sky": lambda bench, quick: sky(bench),
+    "render": lambda bench, quick: render(bench),
+    "film": lambda bench, quick: film(bench, 48 if quick else None),
+    "demo": lambda bench, quick: demo(bench),
+    "irradiance": lambda bench, quick: irradiance(bench),
+}
+
+
+def main() -> None:
+    """Run the parts and print their figures."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="estimate the year from 48 of its hours")
+    parser.add_argument("--only", choices=PARTS, action="append", help="a part alone; may be repeated")
+    parser.add_argument("--json", type=Path, help="write the numbers to a file")
+    arguments = parser.parse_args()
+    figures: dict[str, float] = {"load": os.getloadavg()[0]}
+    with tempfile.TemporaryDirectory(prefix="everyday-") as folder:
+        for name in arguments.only or PARTS:
+            figures |= PARTS[name](Bench(Path(folder)), arguments.quick)
+    print(json.dumps(figures, indent=2))
+    write_record(arguments.json, figures, seed=None)
+
+
+if __name__ == "__main__":
+    main()
