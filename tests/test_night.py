@@ -81,10 +81,10 @@ def test_moonlight_follows_both_distances():
 
 
 def test_moonlight_above_the_air():
-    # 0.25 to 0.36 lx from apogee to a "supermoon" in the literature (Kyba, Mohar & Posch 2017), at a few degrees phase.
+    # A high full moon lights the ground with up to 0.3 lx (Kyba, Mohar & Posch 2017); the air takes a tenth to a fifth.
     illuminance = SOLAR_LX * moon_to_sun_ratio(moon_at(phase_deg=5.0), 555.0)
     assert 0.27 < illuminance < 0.36
-    # Geometric albedo 0.12 (Allen): ratio = p (R / d)², before the surge.
+    # Geometric albedo 0.12 (Allen 1973): ratio = p (R / d)², before the surge.
     plain = 10.0 ** (-0.4 * (night.FULL_MOON_MAGNITUDE_V - night.SUN_MAGNITUDE_V))
     assert plain / (1737.4 / 384_400.0) ** 2 == pytest.approx(0.12, abs=0.005)
 
@@ -128,7 +128,7 @@ def test_night_sky_brightens_towards_the_horizon_then_fades_into_the_air():
     rows = luminance(night_sky_radiance(180, 4)[:90, 0])
     peak = 89.5 - np.argmax(rows)
     assert 5.0 < peak < 20.0
-    assert 1.3 < rows.max() / rows[0] < 2.5  # measured 0.3 to 1 mag (Duriscoe 2013)
+    assert 1.3 < rows.max() / rows[0] < 2.5  # 0.3 to 1 mag: the longer path through the layer, less extinction
     assert rows[-1] < rows[0]
     high = luminance(night_sky_radiance(180, 4, height_m=4000.0)[:90, 0])
     assert np.all(high > rows)

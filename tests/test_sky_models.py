@@ -129,7 +129,7 @@ def test_overrides_set_what_they_say():
     assert visibility_km(with_overrides(clear, visibility_km=20.0)) == pytest.approx(20.0, rel=1e-6)
     assert visibility_km(with_overrides(read_sky_model("overcast"), visibility_km=5.0)) == 5.0
     assert with_overrides(clear, turbidity=1.0).aerosol.optical_depth_500nm == 0.0
-    # Preetham et al. (1999), table 1 of its appendix: T = 3 is 0.20 at 550 nm, here by the definition of T.
+    # By the definition of T (Preetham et al. 1999), T = 3 is twice the optical depth of the gas, 0.0975 at 550 nm.
     hazier = with_overrides(clear, turbidity=3.0).aerosol.optical_depth_500nm
     assert hazier * (550.0 / 500.0) ** -1.3 == pytest.approx(0.195, abs=0.01)
     assert with_overrides(read_sky_model("hosek"), turbidity=5.0).turbidity == 5.0
