@@ -41,8 +41,14 @@ def test_commands_of_a_page_parse(page):
         assert tokens[0].startswith("-") or bound is not None, command
 
 
+def test_no_command_stands_outside_a_console_block():
+    for page in PAGES:
+        rest = CONSOLE.sub("", page.read_text(encoding="utf-8"))
+        assert re.findall(r"^[ $]*seasonscapes [a-z-]+ .*", rest, re.MULTILINE) == [], page.name
+
+
 def test_pages_have_commands():
-    assert sum(len(commands_of(page)) for page in PAGES) > 25
+    assert sum(len(commands_of(page)) for page in PAGES) > 50
 
 
 @pytest.mark.parametrize("name", tables.DOCUMENTS)

@@ -62,7 +62,7 @@ def moon_magnitude(moon: LunarPosition) -> float:
 
     ``V = -12.73 + 0.026 |α| + 4e-9 α⁴`` with the phase angle α [deg] (Allen 1973; Krisciunas & Schaefer 1991, eq. 9),
     corrected for the opposition surge and for the distances moon-observer and moon-sun. Between 2° and 90° the phase
-    curve is within 0.03 mag of the ROLO model's (Kieffer & Stone 2005), and the brightness within 7 %.
+    curve is within 0.08 mag of the ROLO model's (Kieffer & Stone 2005), and the brightness within 10 %.
 
     Parameters
     ----------

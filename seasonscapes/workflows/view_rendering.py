@@ -120,7 +120,7 @@ def render(
     if engine == "transport":
         from seasonscapes.rendering.transport import SamplingOptions
 
-        # A third of the time of a film's coefficients; errors against four times their rays are 0.6 % (RMS).
+        # Fewer rays than a film's coefficients, which many frames share.
         still = SamplingOptions(albedo_samples=16, rays=128)
         session = relight_session(place, camera, sky=sky, albedo=texture, seed=seed, sampling=still, progress=progress)
         view, light, position = view_at(session, utc)
