@@ -57,6 +57,15 @@ def test_tables_equal_their_records(name):
     assert tables.filled(text) == text, "run `make tables`"
 
 
+def test_every_table_stands_in_a_document_and_every_mark_names_one():
+    texts = [(ROOT / name).read_text(encoding="utf-8") for name in tables.DOCUMENTS]
+    marks = [mark for text in texts for mark in re.findall(r"<!-- table: (.*?) -->", text)]
+    filled = [match[2] for text in texts for match in tables._REGION.finditer(text)]
+    assert marks == filled, "a mark that is not understood would never be filled"
+    assert len(marks) == len(set(marks))
+    assert set(tables.TABLES) <= set(marks)
+
+
 def test_a_wrong_number_in_a_table_is_found():
     text = (ROOT / "docs" / "measured.md").read_text(encoding="utf-8")
     table = re.search(r"<!-- table: night -->\n(.*?)<!-- end -->", text, re.DOTALL)
