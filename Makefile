@@ -60,9 +60,11 @@ results: $(DEV)
 	$(BIN)/python benchmarks/render.py --json benchmarks/results/render.json
 	$(BIN)/python benchmarks/sky.py --json benchmarks/results/sky.json
 	$(BIN)/python benchmarks/sky_night.py --json benchmarks/results/sky_night.json
+	$(BIN)/python benchmarks/light_series.py --quick --json benchmarks/results/light_series-quick.json
 	$(BIN)/python benchmarks/relight.py --json benchmarks/results/relight.json
 	$(BIN)/python benchmarks/texturing.py --quick --json benchmarks/results/texturing-quick.json
 	$(BIN)/python benchmarks/albedo.py --quick --json benchmarks/results/albedo-quick.json
+	$(BIN)/python benchmarks/delight.py --quick --json benchmarks/results/delight-quick.json
 	$(BIN)/python benchmarks/gaussians.py --json benchmarks/results/gaussians.json
 	$(BIN)/python benchmarks/alpinebench.py --quick --json benchmarks/results/alpinebench-quick.json
 	$(BIN)/python benchmarks/calibration.py --quick --json benchmarks/results/calibration-quick.json

@@ -3,8 +3,8 @@
     python benchmarks/light_series.py [--quick] [--seed N] [--data FOLDER] [--json FILE] [--plot FILE]
 
 One number a day is fitted, the aerosol's optical depth, to direct sunlight at every tenth minute; all other minutes
-with the sun above 5° are judged. Precipitable water follows from the measured temperature and humidity (Gueymard 1994, by
-pvlib), the ground's albedo from the measured upward and downward light where a station has both. Beside ours in the same
+with the sun above 5° are judged. Precipitable water follows from the measured temperature and humidity (pvlib's
+`gueymard94_pw`), the ground's albedo from the measured upward and downward light where a station has both. Beside ours in the same
 run, fitted to the same minutes: the clear-sky model of Ineichen & Perez (by its Linke turbidity) and the broadband model
 of Bird & Hulstrom (by its optical depth), both as pvlib has them. ``--quick`` judges every fifth of those minutes.
 The measurements are SURFRAD (NOAA) and MIDC (NREL) days in ``light-series`` of the data folder; without it this ends

@@ -121,6 +121,18 @@ TABLES = {
         ),
         "Light through sunset falls by more than 5 % per 0.1° in any true sky: what is bounded is that nothing jumps out of that course.",
     ),
+    "light-series": Table(
+        "light_series-quick",
+        (
+            Row("direct sunlight of two measured clear days, minute by minute, RMS over mean, worse day", "{direct_rms:.1%}", "≤ 3 %", "direct_rms <= 0.03"),
+            Row("… diffuse light", "{diffuse_rms:.1%}", "≤ 12 %", "diffuse_rms <= 0.12"),
+            Row("… global light", "{global_rms:.1%}", "≤ 3 %", "global_rms <= 0.03"),
+            Row("diffuse light, Alamosa; Tucson: ours", "{alamosa_ours_diffuse_rms:.0%}; {tucson_ours_diffuse_rms:.0%}"),
+            Row("… Ineichen & Perez", "{alamosa_ineichen_diffuse_rms:.0%}; {tucson_ineichen_diffuse_rms:.0%}"),
+            Row("… Bird & Hulstrom", "{alamosa_bird_diffuse_rms:.0%}; {tucson_bird_diffuse_rms:.0%}"),
+        ),
+        "Real measurements (SURFRAD, MIDC). One number a day, the optical depth of aerosol, is fitted to direct light at every tenth minute, for each model; all other minutes are judged.",
+    ),
     "night": Table(
         "sky_night",
         (
@@ -179,6 +191,20 @@ TABLES = {
             Row("ceiling: the true albedo through the same renderer, relit", "{relit_ceiling_db:.1f} dB"),
         ),
         _SAME_RENDERER,
+    ),
+    "delight": Table(
+        "delight-quick",
+        (
+            Row("light taken out of one 8-bit image: albedo", "{albedo_psnr_db:.1f} dB", "≥ 27 dB", "albedo_psnr_db >= 27"),
+            Row("… relit at other hours", "{relit_psnr_db:.1f} dB", "≥ 29 dB", "relit_psnr_db >= 29"),
+            Row("… over the best of cosine, Minnaert, C and SCS+C corrections", "+{margin_over_best_correction_db:.1f} dB", "≥ +6 dB", "margin_over_best_correction_db >= 6"),
+            Row("… step that is left at shadow borders", "{shadow_border_step:.1%}", "≤ 5 %", "shadow_border_step <= 0.05"),
+            Row("suns of images without an hour, found within 5° and 4°", "{sun_found_rate:.0%}", "≥ 90 %", "sun_found_rate >= 0.9"),
+            Row("… wrong and yet trusted", "{sun_wrong_trusted:.0f}", "0", "sun_wrong_trusted <= 0"),
+            Row("the real Landsat image of July: largest correlation of albedo with the cosine of incidence", "{landsat_abs_r_max:.2f}", "≤ 0.1", "landsat_abs_r_max <= 0.1"),
+            Row("a textured mesh, delit and relit", "{mesh_relit_psnr_db:.1f} dB", "≥ 28 dB", "mesh_relit_psnr_db >= 28"),
+        ),
+        _SAME_RENDERER + " The Landsat row is of a real image, without truth.",
     ),
     "gaussians": Table(
         "gaussians",

@@ -20,8 +20,8 @@ _DIM_EV, _DIM_SLOPE, _MAX_UNDEREXPOSURE = 4.0, 0.25, 3.0
 _MESOPIC = (0.005, 5.0)
 # The same range for pictures by a camera [cd/m²]: below moonlight.
 _MOONLESS = (0.0004, 0.02)
-# Scotopic luminance from linear Rec.709, for the spectra of a typical display's primaries (Larson, Rushmeier & Piatko
-# 1997, doi:10.1109/2945.646233, eq. 9 through XYZ), and the bluish grey that rod vision is matched to in pictures.
+# Scotopic luminance from linear Rec.709, for the spectra of a typical display's primaries, close to the (0.062, 0.608,
+# 0.330) of Ward Larson, Rushmeier & Piatko 1997, doi:10.1109/2945.646233, and the bluish grey that rod vision is matched to in pictures.
 _SCOTOPIC = np.array([0.0627, 0.6072, 0.3301])
 _NIGHT_TINT = np.array([0.62, 0.80, 1.35])
 

@@ -23,7 +23,7 @@ FLATTENING = 1.0 / 298.257223563
 ECCENTRICITY_SQUARED = FLATTENING * (2.0 - FLATTENING)
 MEAN_RADIUS_M = 6371008.8
 
-# Mean terrestrial refraction of a line of sight as a fraction of Earth curvature (Gauss 1826; Bomford, Geodesy, 1980).
+# Mean terrestrial refraction of a line of sight as a fraction of Earth curvature (Bomford 1980, Geodesy).
 STANDARD_REFRACTION_K = 0.13
 
 

@@ -25,7 +25,8 @@ from seasonscapes.sky.scattering import AtmosphereTables
 from seasonscapes.sky.sh_moments import HARMONIC_ORDER, SUN_ELEVATION_KNOTS_DEG, diffuse_source, sun_geometry
 from seasonscapes.sky.spectrum import RGB_FROM_XYZ, WAVELENGTHS_NM, rgb_from_transfer
 
-# What SPECTRL2 takes its aerosol to be, at the eye's wavelengths (Bird & Riordan 1986, table 3: rural).
+# What SPECTRL2 takes its aerosol to be, at the eye's wavelengths (Bird & Riordan 1986; the defaults of
+# pvlib's `spectrl2`).
 SPECTRL2_AEROSOL = {"angstrom_exponent": 1.14, "single_scattering_albedo": 0.94, "asymmetry": 0.65}
 
 

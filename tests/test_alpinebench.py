@@ -6,7 +6,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
 BENCH = Path(__file__).parents[1] / "benchmarks" / "alpinebench.py"
 
@@ -93,5 +95,9 @@ def test_what_is_left_out_is_missed(measured):
 @pytest.mark.timeout(1200)
 def test_figures(measured):
     _, folder = measured
-    for name in ("alpinebench_painted.png", "alpinebench_held_out.png", "alpinebench_day.webp", "alpinebench_day.mp4"):
-        assert (folder / name).stat().st_size > 10_000
+    for name in ("alpinebench_painted.png", "alpinebench_held_out.png", "alpinebench_day.webp"):
+        with Image.open(folder / name) as picture:
+            levels = np.asarray(picture.convert("RGB"), float)
+        assert min(levels.shape[:2]) > 60, name
+        assert levels.std() > 10.0, f"{name} shows nothing"
+    assert (folder / "alpinebench_day.mp4").stat().st_size > 10_000

@@ -37,12 +37,12 @@ def test_base_is_corrected_by_what_was_seen(land):
     made = complete(painted(truth, seen), predictors, base=base)
     alone = complete(painted(truth, seen), predictors)
     hidden = ~seen
-    assert _error(made.values, truth, hidden) < 0.5 * _error(base, truth, hidden)
-    assert _error(made.values, truth, hidden) < 0.7 * _error(alone.values, truth, hidden)
+    assert _error(made.values, truth, hidden) < 0.3 * _error(base, truth, hidden)
+    assert _error(made.values, truth, hidden) < 0.4 * _error(alone.values, truth, hidden)
     # All texels of one weight: none is known to scatter more than another, and all stay.
     np.testing.assert_allclose(made.values[seen], truth[seen], rtol=1e-3)
     z = np.sqrt(np.mean((made.values - truth)[hidden] ** 2) / np.mean(made.sigma[hidden] ** 2))
-    assert 0.4 < z < 2.5
+    assert 0.7 < z < 1.4, "sigma is the root mean square error, within what one draw of the land scatters"
 
 
 def test_base_with_gaps(land):

@@ -65,11 +65,16 @@ def test_paint_writes_what_it_says(town, capsys):
     assert main(arguments(town, "--json")) == 0
     record = json.loads(capsys.readouterr().out)
     assert record["webcams"] == ["south"]
-    assert 0.05 < record["painted_share"] < 0.95
+    assert record["painted_share"] == pytest.approx(sum(record["shares"]))
+    assert record["painted_share"] > 0.05
     texture = load_texture(record["painted"])
     assert np.mean(texture.weight > 0.0) == pytest.approx(record["painted_share"])
     assert (texture.values[texture.weight > 0.0] > 0.0).all()
+    # "The first camera wins" is the same texture where there is one camera.
     assert main(arguments(town, "--json", "--mode", "first")) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["mode"] == "first"
+    np.testing.assert_array_equal(load_texture(record["painted"]).values, texture.values)
 
 
 @pytest.mark.parametrize(

@@ -41,14 +41,29 @@ def test_commands_of_a_page_parse(page):
         assert tokens[0].startswith("-") or bound is not None, command
 
 
+def test_no_command_stands_outside_a_console_block():
+    for page in PAGES:
+        rest = CONSOLE.sub("", page.read_text(encoding="utf-8"))
+        assert re.findall(r"^[ $]*seasonscapes [a-z-]+ .*", rest, re.MULTILINE) == [], page.name
+
+
 def test_pages_have_commands():
-    assert sum(len(commands_of(page)) for page in PAGES) > 25
+    assert sum(len(commands_of(page)) for page in PAGES) > 50
 
 
 @pytest.mark.parametrize("name", tables.DOCUMENTS)
 def test_tables_equal_their_records(name):
     text = (ROOT / name).read_text(encoding="utf-8")
     assert tables.filled(text) == text, "run `make tables`"
+
+
+def test_every_table_stands_in_a_document_and_every_mark_names_one():
+    texts = [(ROOT / name).read_text(encoding="utf-8") for name in tables.DOCUMENTS]
+    marks = [mark for text in texts for mark in re.findall(r"<!-- table: (.*?) -->", text)]
+    filled = [match[2] for text in texts for match in tables._REGION.finditer(text)]
+    assert marks == filled, "a mark that is not understood would never be filled"
+    assert len(marks) == len(set(marks))
+    assert set(tables.TABLES) <= set(marks)
 
 
 def test_a_wrong_number_in_a_table_is_found():

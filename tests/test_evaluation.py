@@ -412,5 +412,12 @@ def test_uses_must_be_plain():
         content_hash(np.zeros((2, 2, 3)))
 
 
-def test_ssim_map_has_the_frames_shape(pair):
-    assert ssim_map(*pair).shape == pair[0].shape[:2]
+def test_ssim_map_says_where_pictures_differ(pair):
+    truth = pair[0]
+    picture = truth.copy()
+    picture[8:12, 8:12] = 1.0 - picture[8:12, 8:12]
+    shown = ssim_map(truth, picture)
+    assert shown.shape == truth.shape[:2]
+    assert shown[8:12, 8:12].max() < 0.9
+    # Windows of 11 pixels that do not touch the square are of equal content.
+    np.testing.assert_allclose(shown[18:, 18:], 1.0, atol=1e-6)

@@ -311,7 +311,9 @@ def splats_of_surfels(surfels) -> Splats:
 def test_one_time_and_no_view_are_enough(hill, told):
     model = appearance(hill, times=1)
     once = SurfaceTargets(told.states[:1], [0], told.colours[:1])
-    assert len(train(model, once, (), Schedule(5, 50, batch=64))) == 5
+    losses = train(model, once, (), Schedule(5, 50, batch=64))
+    assert len(losses) == 5
+    assert losses[-1] < losses[0]
 
 
 def test_bad_lessons_and_frames_are_refused(hill, told):

@@ -36,7 +36,7 @@ def test_oracle_polynomials_meet_where_their_pieces_do():
 def test_oracles_agree_with_each_other_down_to_nautical_twilight():
     for altitude in range(-11, 21):
         ratio = usno.supplement_sun_lx(altitude) / (usno.circular_sun_lx(altitude) + usno.CIRCULAR_NIGHT_SKY_LX)
-        assert 0.85 < ratio < 1.30, altitude
+        assert 0.89 < ratio < 1.27, altitude  # how far the two published fits are apart
 
 
 def test_moon_magnitude_at_its_phases():
@@ -81,10 +81,10 @@ def test_moonlight_follows_both_distances():
 
 
 def test_moonlight_above_the_air():
-    # 0.25 to 0.36 lx from apogee to a "supermoon" in the literature (Kyba, Mohar & Posch 2017), at a few degrees phase.
+    # A high full moon lights the ground with up to 0.3 lx (Kyba, Mohar & Posch 2017); the air takes a tenth to a fifth.
     illuminance = SOLAR_LX * moon_to_sun_ratio(moon_at(phase_deg=5.0), 555.0)
     assert 0.27 < illuminance < 0.36
-    # Geometric albedo 0.12 (Allen): ratio = p (R / d)², before the surge.
+    # Geometric albedo 0.12 (Allen 1973): ratio = p (R / d)², before the surge.
     plain = 10.0 ** (-0.4 * (night.FULL_MOON_MAGNITUDE_V - night.SUN_MAGNITUDE_V))
     assert plain / (1737.4 / 384_400.0) ** 2 == pytest.approx(0.12, abs=0.005)
 
@@ -107,11 +107,13 @@ def test_full_to_half_moon_within_both_published_laws(phase_deg, altitude_deg):
     above = SOLAR_LX * moon_to_sun_ratio(moon_at(phase_deg=phase_deg), 555.0)
     ours = above * usno.circular_extinction(altitude_deg)
     parallax_deg = np.degrees(np.arcsin(6378.14 / 384_400.0))
-    for published in (
-        usno.circular_moon_lx(altitude_deg, 180.0 - phase_deg),
-        usno.supplement_moon_lx(altitude_deg, phase_deg, parallax_deg),
-    ):
-        assert 1 / 1.5 < ours / published < 1.5
+    # Ours lies 6 to 27 % above the one law; the other, whose phase law is steeper at full moon, is nearer at other phases.
+    assert 1.0 < ours / usno.circular_moon_lx(altitude_deg, 180.0 - phase_deg) < 1.3
+    assert (
+        0.85
+        < ours / usno.supplement_moon_lx(altitude_deg, phase_deg, parallax_deg)
+        < (1.5 if phase_deg < 5.0 else 1.35)
+    )
 
 
 def test_night_sky_brightness_and_illuminance():
@@ -119,16 +121,16 @@ def test_night_sky_brightness_and_illuminance():
     zenith = float(luminance(sky[0, 0]))
     assert 21.5 < -2.5 * np.log10(zenith / night.CANDELA_OF_ZERO_MAGNITUDE) < 21.8  # mag/arcsec², natural dark sites
     on_ground = float(luminance(diffuse_horizontal_illuminance(sky)))
-    # Between the Circular's 0.5 mlx and twice that; within 1.5 of the Supplement's fit at -18°.
+    # Between the Circular's 0.5 mlx and twice that; above the Supplement's fit at -18° by 43 %.
     assert 0.5e-3 < on_ground < 1.0e-3
-    assert 1 / 1.5 < on_ground / usno.supplement_sun_lx(-18.0) < 1.5
+    assert 1.0 < on_ground / usno.supplement_sun_lx(-18.0) < 1.5
 
 
 def test_night_sky_brightens_towards_the_horizon_then_fades_into_the_air():
     rows = luminance(night_sky_radiance(180, 4)[:90, 0])
     peak = 89.5 - np.argmax(rows)
     assert 5.0 < peak < 20.0
-    assert 1.3 < rows.max() / rows[0] < 2.5  # measured 0.3 to 1 mag (Duriscoe 2013)
+    assert 1.3 < rows.max() / rows[0] < 2.5  # 0.3 to 1 mag: the longer path through the layer, less extinction
     assert rows[-1] < rows[0]
     high = luminance(night_sky_radiance(180, 4, height_m=4000.0)[:90, 0])
     assert np.all(high > rows)

@@ -187,7 +187,9 @@ def test_a_projected_grid_near_the_antimeridian_needs_no_shift(tmp_path):
     to_map = Transformer.from_crs("EPSG:4326", "EPSG:32701", always_xy=True)
     x, y = to_map.transform(-179.9, -16.5)
     raster = Raster(slope()[..., None], Affine(30, 0, x - 600, 0, -30, y + 600), "EPSG:32701")
-    assert np.isfinite(sample_raster(raster, *to_map.transform(180.1, -16.5))).all()
+    found = sample_raster(raster, *to_map.transform(180.1, -16.5))
+    # 600 m from the corner are 20 cells of 30 m: between the samples of columns and rows 19 and 20.
+    assert float(np.squeeze(found)) == pytest.approx(500.0 + (4.0 + 9.0) * 19.5, rel=1e-6)
 
 
 # ---------------------------------------------------------------------------------------------- parameters of meshing

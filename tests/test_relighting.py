@@ -23,6 +23,7 @@ from seasonscapes.relighting.frame_file import frame_header, load_frame, save_fr
 from seasonscapes.relighting.luminous_efficacy import efficacies_lm_w
 from seasonscapes.scene import read_scene
 from seasonscapes.sky.models import read_sky_model
+from seasonscapes.sky.night import air_mass
 from seasonscapes.workflows.albedo_sources import AlbedoFile
 from seasonscapes.workflows.place import MeshOptions, load_place
 from seasonscapes.workflows.relight_session import RenderJob, open_session, view_at, view_of_day
@@ -355,11 +356,24 @@ def test_slurm_jobs_render(hill, tmp_path, monkeypatch):
 
 
 def test_efficacies_are_those_of_a_clear_day_and_of_an_overcast_one():
+    """Perez et al. 1990, table 4 with equations 7 and 8, at the irradiances that the answer means: it is a fixed point."""
+    water_cm, zenith = 1.4, np.radians(30.0)
     direct, diffuse = efficacies_lm_w(100_000.0, 12_000.0, 60.0)
-    assert 95.0 < direct < 110.0
-    assert 115.0 < diffuse < 145.0
+    beam, sky = 100_000.0 / direct, 12_000.0 / diffuse
+    clearness = ((sky + beam) / sky + 1.041 * zenith**3) / (1.0 + 1.041 * zenith**3)
+    assert clearness > 6.2, "the clearest of the eight classes"
+    brightness = sky * air_mass(60.0) / 1361.0
+    assert direct == pytest.approx(
+        101.18 + 1.58 * water_cm - 1.10 * np.exp(5.73 * zenith - 5.0) - 8.29 * brightness, rel=1e-4
+    )
+    assert diffuse == pytest.approx(
+        152.23 + 0.35 * water_cm - 45.27 * np.cos(zenith) - 7.98 * np.log(brightness), rel=1e-4
+    )
     _, overcast = efficacies_lm_w(0.0, 15_000.0, 40.0)
-    assert 105.0 < overcast < 125.0
+    brightness = 15_000.0 / overcast * air_mass(40.0) / 1361.0
+    assert overcast == pytest.approx(
+        97.24 - 0.46 * water_cm + 12.00 * np.cos(np.radians(50.0)) - 8.91 * np.log(brightness), rel=1e-4
+    )
 
 
 def test_watts_agree_with_pvlib():

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import places
 import pytest
+from scipy.stats import spearmanr
 
 from seasonscapes.albedo.seasons import (
     AlbedoSeries,
@@ -134,7 +135,13 @@ def test_where_dates_say_nothing_heights_decide():
     ground = slopes(3000)
     pair = (np.tile(WHITE, (3000, 1)), np.tile(BARE, (3000, 1)))
     half = snow_share(interpolate_albedo(pair, snow_transition(ground, *pair), 0.5, 0.5))
-    assert np.corrcoef(half, ground.height_m)[0, 1] > 0.8
+    tenth = len(half) // 10
+    order = np.argsort(ground.height_m)
+    assert half[order[:tenth]].max() < 0.01, "the lowest tenth is bare"
+    assert half[order[-tenth:]].min() > 0.99, "the highest tenth is white"
+    for sign in (-1.0, 1.0):
+        facing = sign * ground.normal[:, 1] > 0.2
+        assert spearmanr(half[facing], ground.height_m[facing])[0] > 0.9
     middle = np.abs(ground.height_m - 1500.0) < 200.0
     north, south = (middle & (sign * ground.normal[:, 1] > 0.2) for sign in (1.0, -1.0))
     assert half[north].mean() > half[south].mean() + 0.15

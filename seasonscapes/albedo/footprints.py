@@ -2,8 +2,8 @@
 
 The radiance of a pixel is linear in the texture: S rays are cast within the pixel, each hits the surface at a texture
 coordinate, and the texture is interpolated bilinearly there. Solving for texels against these sums, instead of
-resampling the photograph onto the texture first, gains 6 to 8 dB of albedo, because neither a pixel that covers many
-texels nor a texel that covers many pixels is blurred.
+resampling the photograph onto the texture first, blurs neither a pixel that covers many texels nor a texel that covers
+many pixels (`benchmarks/albedo.py` compares both).
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ is an unknown of a few levels. Its cost is the prior of the prediction, blurred 
 between neighbouring texels, the truncated difference of the logarithms of the albedos that follow from their
 visibilities, ``log(π L) − log(v · sun + ambient)``: a true border between sun and shade is where brightness and colour
 change as sunlight does, and land beyond it continues. The sum is minimised by loopy belief propagation (min-sum,
-Felzenszwalb & Huttenlocher 2006, doi:10.1007/s11263-006-7899-4).
+Felzenszwalb & Huttenlocher 2006, International Journal of Computer Vision 70, 41).
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from seasonscapes.gaussians.rasterise import ViewWeights
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-# Floor of the denominator of the relative squared error (Lehtinen et al. 2018, arXiv:1803.04189, § 3.2).
+# Floor of the denominator of the relative squared error (Lehtinen et al. 2018, arXiv:1803.04189); chosen.
 _RELATIVE_FLOOR = 0.02
 
 

@@ -436,7 +436,7 @@ def view_weights(
     camera
         The view.
     subpixels
-        Samples along a pixel's side: 2 gains about 1 dB at edges and on steep ground, at four times the cost.
+        Samples along a pixel's side: 2 is more exact at edges and on steep ground, at four times the samples.
     pixel_variance
         Variance added to each splat [px²].
 

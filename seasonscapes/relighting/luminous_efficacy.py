@@ -2,7 +2,7 @@
 
 Perez, Ineichen, Seals, Michalsky & Stewart 1990, "Modeling daylight availability and irradiance components from direct
 and global irradiance", doi:10.1016/0038-092X(90)90055-H, table 4 and eqs 6–8, solved for the irradiance that gives an
-illuminance. Accurate to about 5 % by day; for cloudless atmospheres `sky.broadband` is closer. For the sun below 1°
+illuminance. For cloudless atmospheres `sky.broadband` is closer. For the sun below 1°
 elevation, and in twilight, the values at 1° are used.
 """
 

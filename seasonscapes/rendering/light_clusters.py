@@ -4,7 +4,7 @@ The faces that bounced rays hit are grouped into M clusters of about equal impor
 reflected radiance of the clusters is computed first: from the sky through their own daylight coefficients, from the sun
 by shadow rays from points inside them, and from further bounces by exchange between clusters. Each receiver then sums
 the radiance of the clusters that its own hemisphere rays hit. This is direct-to-indirect transfer (Hašan, Pellacini &
-Bala 2006, doi:10.1145/1141911.1141998). The clusters are lit by the actual sun rather than by a sky patch around it, so
+Bala 2006, ACM Transactions on Graphics 25, 1089). The clusters are lit by the actual sun rather than by a sky patch around it, so
 that shadows on the opposite side of a valley contribute no light.
 """
 

@@ -2,8 +2,8 @@
 
 The irradiance of a diffuse surface varies as slowly as its normal; albedo varies faster and is not smoothed. The
 weights depend on geometry alone. They are therefore equal for all illuminations, and the result stays linear in the
-light. Increasing strides after Dammertz, Sewtz, Hanika & Lensch 2010, "Edge-avoiding À-Trous wavelet transform",
-doi:10.2312/EGGH/HPG10/067-075.
+light. Increasing strides after Dammertz, Sewtz, Hanika & Lensch 2010, "Edge-avoiding À-Trous wavelet transform
+for fast global illumination filtering", High Performance Graphics.
 """
 
 from __future__ import annotations

@@ -6,7 +6,8 @@ and pixels are independent. The generator has no state. A number depends on its 
 not depend on the division into blocks or on threads.
 
 Burley 2020, "Practical hash-based Owen scrambling", JCGT 9(4); second dimension after Ahmed 2024, "An implementation
-algorithm of 2D Sobol sequence fast, elegant, and compact", doi:10.2312/sr.20241147.
+algorithm of 2D Sobol sequence fast, elegant, and compact", doi:10.2312/sr.20241147; constants of the hash after Vegdahl
+2021, "Building a better LK hash".
 """
 
 from __future__ import annotations
@@ -87,7 +88,7 @@ def _fraction(bits: Any) -> Any:
 
 
 def _permuted(bits: Any, key: Any) -> Any:
-    """Permute by Laine & Karras' hash with Vegdahl's constants (Burley 2020, section 2.2)."""
+    """Permute by Laine & Karras' hash (Burley 2020) with the constants of Vegdahl 2021."""
     import mitsuba as mi
 
     bits = bits ^ (bits * mi.UInt32(0x3D20ADEA))

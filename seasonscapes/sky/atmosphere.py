@@ -245,7 +245,7 @@ def delta_scaled(optics_: Optics, order: int) -> Optics:
     """Apply delta-M scaling: truncate the aerosol phase function at a Legendre order.
 
     The forward peak, a fraction ``f = χ_{order+1}`` of the light scattered by aerosol, is treated as unscattered
-    (Wiscombe 1977, eqs. 15 to 20, doi:10.1175/1520-0469(1977)034<1408:TDMRYA>2.0.CO;2).
+    (Wiscombe 1977, doi:10.1175/1520-0469(1977)034<1408:TDMRYA>2.0.CO;2).
 
     Parameters
     ----------
@@ -285,7 +285,7 @@ def gas_moments(order: int) -> np.ndarray:
 
 
 def gas_phase(cosine: ArrayLike) -> np.ndarray:
-    """Evaluate the Rayleigh phase function with depolarisation (Chandrasekhar 1950, § 18; Bucholtz 1995, eq. 12).
+    """Evaluate the Rayleigh phase function with depolarisation (Chandrasekhar 1950; Bucholtz 1995).
 
     Parameters
     ----------

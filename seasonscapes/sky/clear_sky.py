@@ -4,7 +4,7 @@
 direction and its extraterrestrial spectral irradiance relative to the sun's (``irradiance``); the sky radiances of
 several luminaries are added.
 
-Polarisation is neglected (the error of a scalar theory is up to 5 % of a clear sky's radiance in single directions),
+Polarisation is neglected (a scalar theory errs by some per cent of a clear sky's radiance in single directions),
 and so is absorption by water vapour and oxygen, whose lines lie at wavelengths of low luminous efficiency.
 """
 

@@ -49,8 +49,8 @@ def with_clouds(
     """Compute the illumination under a cloud fraction from that of the clear sky.
 
     Global illuminance is multiplied by ``1 - (1 - t) c^3.4`` and the direct part in addition by ``1 - c²``, the forms
-    that Kasten & Czeplak (1980, Solar Energy 24, 177) fitted to ten years of hourly data, with their t = 0.25 at full
-    cover replaced by `cloud_transmission`. Direct light comes from a disc that grows with ``c`` to the 2.5° opening of
+    that Kasten & Czeplak (1980, doi:10.1016/0038-092X(80)90391-6) fitted to ten years of hourly data, with their
+    t = 0.25 at full cover replaced by `cloud_transmission`. Direct light comes from a disc that grows with ``c`` to the 2.5° opening of
     pyrheliometers, which softens shadows. Sky radiance is ``1 - c`` times the clear one; clouds contribute the
     remaining diffuse illuminance, as a blend with weight ``c`` from the CIE intermediate to the CIE overcast
     distribution.

@@ -1,4 +1,4 @@
-"""Correlated colour temperature by Ohno's method (2013, doi:10.1080/15502724.2014.839020).
+"""Correlated colour temperature by Ohno's method (Ohno 2014, doi:10.1080/15502724.2014.839020).
 
 The Planckian locus is tabulated once by colour-science (CIE 1931 2° observer) and shipped as a file, so that a report
 on the sky does not import that package, which takes a second. ``python -m seasonscapes.sky.colour_temperature``
@@ -84,7 +84,7 @@ def correlated_colour_temperature_k(rgb: np.ndarray) -> float | None:
 
 
 def _nearest(uv: np.ndarray) -> tuple[float, float]:
-    """Temperature [K] and signed distance D_uv of the nearest point of the locus (Ohno 2013, equations 3 to 13)."""
+    """Temperature [K] and signed distance D_uv of the nearest point of the locus (Ohno 2014)."""
     kelvin, locus = _table()
     distance = np.hypot(*(locus - uv).T)
     middle = int(np.clip(np.argmin(distance), 1, len(kelvin) - 2))

@@ -19,16 +19,17 @@ from seasonscapes.sky.ephemeris import LunarPosition
 from seasonscapes.sky.illumination import diffuse_horizontal_illuminance
 
 # Apparent V magnitudes: the sun at 1 au (Willmer 2018, Vega system), the full moon at its mean distance and 1 au from
-# the sun, extrapolated to zero phase without the opposition surge (Allen, Astrophysical Quantities, 3rd ed., § 66).
+# the sun, extrapolated to zero phase without the opposition surge (Allen 1973, Astrophysical Quantities, 3rd
+# ed., p. 144).
 SUN_MAGNITUDE_V, FULL_MOON_MAGNITUDE_V = -26.76, -12.73
 _MEAN_MOON_DISTANCE_KM = 384_400.0
 
 # Opposition surge: 35 % at full moon (Krisciunas & Schaefer 1991), decaying with the wavelength-independent width of
-# the ROLO model (Kieffer & Stone 2005, table 5: p1 = 4.06°).
+# the ROLO model (Kieffer & Stone 2005: p1 = 4.06°).
 _SURGE, _SURGE_WIDTH_DEG = 0.35, 4.06
 
 # Spectral slope of lunar reflectance: (B - V) = 0.92, compared with the sun's 0.65, gives a reflectance at 440 nm of
-# 0.78 of that at 550 nm (Allen § 66); highland and mare spectra are linear over the visible range.
+# 0.78 of that at 550 nm (Allen 1973); highland and mare spectra are linear over the visible range.
 _MOON_SLOPE = 1.1
 
 # Luminance of 1 S10, a tenth-magnitude (V) star spread over a square degree: 27.78 mag/arcsec². 10.8e4 cd/m² is the
@@ -36,31 +37,32 @@ _MOON_SLOPE = 1.1
 CANDELA_OF_ZERO_MAGNITUDE = 10.8e4
 S10_CD_M2 = CANDELA_OF_ZERO_MAGNITUDE * 10.0 ** (-0.4 * 27.78)
 
-# Zenith luminances above the lower atmosphere at a middle phase of the solar cycle (Roach & Gordon 1973; Benn & Ellison
-# 1998; Leinert et al. 1998): airglow 145 S10, zodiacal light 95 S10, stars and Milky Way 105 S10 as the mean over
-# the sky. After extinction this gives the 21.6 mag/arcsec² of a natural sky of Garstang (1989) and Cinzano et al.
+# Zenith luminances above the lower atmosphere at a middle phase of the solar cycle, chosen within what Roach & Gordon
+# 1973, Benn & Ellison 1998 and Leinert et al. 1998 give: airglow 145 S10, zodiacal light 95 S10, stars and Milky Way
+# 105 S10 as the mean over the sky. After extinction this gives the 21.6 mag/arcsec² of a natural sky of Garstang (1989) and Cinzano et al.
 # (2001).
 AIRGLOW_CD_M2, ZODIACAL_CD_M2, STARLIGHT_CD_M2 = 145.0 * S10_CD_M2, 95.0 * S10_CD_M2, 105.0 * S10_CD_M2
 
 # Linear Rec.709 at luminance 1. Airglow: O I 557.7 nm 250 R, Na 589.3 nm 60 R, O I 630 nm 100 R and a flat continuum
-# of 0.3 R/Å (Roach & Gordon 1973, ch. 3), whose sum agrees with the 145 S10 above. Zodiacal light: a Planckian of
-# 5600 K, a slightly reddened solar spectrum (Leinert et al. 1998, § 8.4). Starlight: 4900 K, that is B - V = 0.8.
+# of 0.3 R/Å (Roach & Gordon 1973), whose sum agrees with the 145 S10 above. Zodiacal light: a Planckian of
+# 5600 K, a slightly reddened solar spectrum (Leinert et al. 1998). Starlight: 4900 K, that is B - V = 0.8.
 AIRGLOW_RGB = np.array([1.05602, 1.03358, 0.50235])
 ZODIACAL_RGB = np.array([1.13231, 0.97270, 0.88077])
 STARLIGHT_RGB = np.array([1.22929, 0.95798, 0.74095])
 
 _AIRGLOW_HEIGHT_KM, _EARTH_RADIUS_KM = 90.0, 6371.0
 # Extinction of an extended source is less than that of a star, since light is scattered into the line of sight from
-# neighbouring directions. Leinert et al. (1998, § 5.2) find an effective optical depth of 0.5 to 0.75 of the true one.
+# neighbouring directions: 15 % or more of the zodiacal light (Leinert et al. 1998, § 5). The factor of the optical depth
+# is chosen.
 _EXTENDED_SOURCE_FACTOR = 0.6
 
 
 def moon_magnitude(moon: LunarPosition) -> float:
     """Compute the apparent V magnitude of the moon above the atmosphere.
 
-    ``V = -12.73 + 0.026 |α| + 4e-9 α⁴`` with the phase angle α [deg] (Allen; Krisciunas & Schaefer 1991, eq. 9),
+    ``V = -12.73 + 0.026 |α| + 4e-9 α⁴`` with the phase angle α [deg] (Allen 1973; Krisciunas & Schaefer 1991, eq. 9),
     corrected for the opposition surge and for the distances moon-observer and moon-sun. Between 2° and 90° the phase
-    curve is within 0.03 mag of the ROLO model's (Kieffer & Stone 2005), and the brightness within 7 %.
+    curve is within 0.08 mag of the ROLO model's (Kieffer & Stone 2005), and the brightness within 10 %.
 
     Parameters
     ----------

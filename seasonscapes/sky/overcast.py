@@ -26,7 +26,7 @@ _CLEAR_LX = (
 _LOW_SUN_TRANSMISSION = 0.4
 
 # Colour of the layer: near D65 by day, bluer in twilight owing to ozone absorption in the light from above (Lee &
-# Hernández-Andrés 2005, doi:10.1364/AO.44.005712).
+# Hernández-Andrés 2005, Applied Optics 44, 5712).
 DAY_CCT_K, TWILIGHT_CCT_K = 6500.0, 9500.0
 
 # CIE S 011 / ISO 15469 parameters (a, b, c, d, e). Type 8: partly cloudy, no gradation, distinct solar corona.

@@ -12,7 +12,7 @@ from seasonscapes.sky.atmosphere import TOP_HEIGHT_M, Atmosphere, Optics, gas_mo
 from seasonscapes.sky.ray_cells import CellSamples, local_sun_sine, scattering_per_m
 
 # Delta-M treats aerosol scattering within about 180°/L as unscattered. Along the horizon this is valid for narrow peaks
-# only: with L = 4 the sky beside a setting sun is 20 % too bright, with L = 10 it agrees with path tracing within
+# only: with L = 4 the sky beside a setting sun is too bright, with L = 10 it agrees with path tracing within
 # noise.
 HARMONIC_ORDER, LATER_ORDER = 10, 4
 _HEIGHTS = 14

@@ -10,7 +10,7 @@ from seasonscapes.declaration import InputError
 from seasonscapes.terrain.atlas import Atlas, measure_atlas, require_unfolded, singular_values, texel_grid
 from seasonscapes.terrain.surface import Terrain
 
-# The direct factorisation of a million unknowns takes about half a minute and 3 GB.
+# Beyond it the memory of the direct factorisation, one unknown a vertex, exceeds that of usual machines.
 MAX_FACES = 2_500_000
 
 

@@ -2,7 +2,7 @@
 
 Reflectances are linear Rec.709, rounded from published spectra: rock, soil and vegetation from the ECOSTRESS library
 (Meerdink et al. 2019, doi:10.1016/j.rse.2019.05.015), snow and ice from Warren 2019 (doi:10.1098/rsta.2018.0161)
-and Cuffey & Paterson 2010 (table 5.2), larch and pasture in autumn from the same library's senescent leaves and straw.
+and Cuffey & Paterson 2010, larch and pasture in autumn from the same library's senescent leaves and straw.
 """
 
 from __future__ import annotations
@@ -226,7 +226,7 @@ def _ground(massif: SyntheticMassif, day: float, rows: slice, upsample: int) -> 
     z = _upsampled(massif.elevation.values[..., 0], rows, upsample)
     cover = _upsampled_cover(massif, rows, upsample, grain)
     albedo = np.empty((*cover.shape, 3), np.float32)
-    # Spring is later and autumn earlier by about 3 days per 100 m of height (Hopkins 1918).
+    # Spring is later and autumn earlier by about 3 days per 100 m of height (Hopkins 1918: four days in 400 feet).
     delay_days = np.clip((z - 1500.0) * 0.030, -25.0, 30.0) + 4.0 * broad
     spring_weight = 0.5 + 0.5 * np.cos(2.0 * np.pi * (day - 120.0) / _YEAR)
     local_day = day + delay_days * (1.0 - 2.0 * spring_weight)

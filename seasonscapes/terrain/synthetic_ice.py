@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 # Glen's flow law for temperate ice in the shallow-ice approximation, 2 A (ρ g)³ / 5 with A = 2.4e-24 Pa⁻³ s⁻¹, ρ = 910 kg m⁻³,
-# per year (Cuffey & Paterson, The Physics of Glaciers, 4th ed., 2010, tables 3.4 and 8.1); doubled for sliding.
+# per year (Cuffey & Paterson, The Physics of Glaciers, 4th ed., 2010, table 3.4); doubled for sliding.
 _FLUIDITY = 2.0 * 2.15e-5
 
 
@@ -63,7 +63,7 @@ def grow_ice(bed: np.ndarray, spacing_m: float, equilibrium_m: np.ndarray, *, ro
         balance = np.where(balance > 0.0, balance * accumulation_factor, balance)
         down = (surface[1:] - surface[:-1]) / spacing_m
         right = (surface[:, 1:] - surface[:, :-1]) / spacing_m
-        # Mahaffy's scheme (1976, doi:10.1029/JC081i006p01059): diffusivity at cell corners, flux at cell faces.
+        # The scheme of Mahaffy 1976 (doi:10.1029/JC081i006p01059): diffusivity at cell corners, flux at cell faces.
         ice = 0.25 * (thickness[1:, 1:] + thickness[1:, :-1] + thickness[:-1, 1:] + thickness[:-1, :-1])
         squared_slope = (0.5 * (down[:, 1:] + down[:, :-1])) ** 2 + (0.5 * (right[1:] + right[:-1])) ** 2
         diffusivity = np.pad(np.float32(_FLUIDITY) * ice**5 * np.minimum(squared_slope, 0.3), 1)

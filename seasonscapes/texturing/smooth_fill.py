@@ -54,7 +54,7 @@ def telea_fill(
 def membrane_fill(values: np.ndarray, known: np.ndarray, *, sweeps: int = _SWEEPS) -> np.ndarray:
     """Fill holes with the solution of ∇²v = 0, known pixels fixed and the image border free (Neumann).
 
-    Cascadic multigrid (Bornemann & Deuflhard 1996, doi:10.1007/s002110050234): each level starts from the
+    Cascadic multigrid (Bornemann & Deuflhard 1996, Numerische Mathematik 75, 135): each level starts from the
     coarser one's solution and relaxes it by red–black Gauss–Seidel sweeps.
 
     Parameters
@@ -122,7 +122,7 @@ def _relax(values: np.ndarray, hole: np.ndarray, sweeps: int) -> np.ndarray:
 def push_pull(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Fill texels without weight from the next coarser level of a weighted mean pyramid.
 
-    After Gortler et al. 1996, "The Lumigraph", section 3.4.3 (doi:10.1145/237170.237200).
+    After Gortler et al. 1996, "The Lumigraph" (doi:10.1145/237170.237200).
 
     Parameters
     ----------

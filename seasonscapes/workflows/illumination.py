@@ -188,9 +188,8 @@ def atmosphere_tables_in(
     workspace
         Where tables are kept.
     by_elevation
-        Also tabulate diffuse light over the sun's elevation for each observer height: some seconds and 110 MB more,
-        after which the sky of an instant takes a third of the time. Radiances differ by less than 0.3 % while the
-        sun is above -12°.
+        Also tabulate diffuse light over the sun's elevation for each observer height, which costs time and space once
+        and makes the sky of an instant quicker. Radiances differ by less than 0.3 % while the sun is above -12°.
     """
     tables: dict[Atmosphere, AtmosphereTables] = {}
 

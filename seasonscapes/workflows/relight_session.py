@@ -54,7 +54,7 @@ log = logging.getLogger(__name__)
 _COEFFICIENTS_CODE = ("rendering.transport", "rendering.coefficients_file", "terrain.view_refinement")
 _VIEW_ALBEDO_CODE = ("rendering.transport", "rendering.relit_view")
 FRAME_CODE = ("workflows.relight_session", "relighting.frame_file")
-# Rows of the sky maps. Without clouds half as many as usual change an image by less than about 0.1 % in the mean: the
+# Rows of the sky maps. Without clouds half as many as usual hardly change an image: the
 # coefficients average over patches of 7°, and the sky behind the terrain is evaluated by the atmosphere model itself.
 _CLOUDY_ROWS, _CLEAR_ROWS = 128, 64
 _MIDSUMMER = date(2024, 7, 1)

@@ -141,7 +141,7 @@ def render(
 
 
 def still_sampling() -> SamplingOptions:
-    """Samples and rays of a still: a third of the time of a film's; errors against four times their rays are 0.6 % (RMS)."""
+    """Samples and rays of a still: fewer than a film's, whose frames share them."""
     from seasonscapes.rendering.transport import SamplingOptions
 
     return SamplingOptions(albedo_samples=16, rays=128)
