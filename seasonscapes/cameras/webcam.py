@@ -7,18 +7,18 @@ axis of rotation: it shifts the horizon from the middle row by the same angle in
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Self
+from typing import Any, Literal, Self
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, ModelWrapValidatorHandler, field_validator, model_validator
 
 from seasonscapes.cameras.panorama import Panorama, panorama_from_angles
 from seasonscapes.cameras.pinhole import Camera, rotation_from_angles
-from seasonscapes.declaration import Declaration, InputError, Name, Text, read_toml, validate
+from seasonscapes.declaration import Declaration, InputError, Name, Text, all_at_once, read_toml, validate
 from seasonscapes.frames import Latitude, LocalFrame, Longitude, enu_from_geodetic, local_axes
 
 
@@ -87,18 +87,29 @@ class Webcam(Declaration):
             raise ValueError(f"unknown time zone {value!r}; expected an IANA name such as 'Europe/Zurich'") from None
         return value
 
-    @model_validator(mode="after")
-    def _one_of_each(self) -> Self:
-        if (self.height_m is None) == (self.above_ground_m is None):
-            raise ValueError(f"webcam {self.id}: give exactly one of height_m and above_ground_m")
-        if (self.north_column_px is None) == (self.heading_deg is None):
-            raise ValueError(f"webcam {self.id}: give exactly one of north_column_px and heading_deg")
-        perspective = self.projection == "perspective"
-        if perspective and (self.horizontal_fov_deg >= 180.0 or self.north_column_px is not None):
-            raise ValueError(f"webcam {self.id}: a perspective camera needs heading_deg and a field of view below 180°")
-        if not perspective and self.vertical_fov_deg is None:
-            raise ValueError(f"webcam {self.id}: a panorama needs vertical_fov_deg")
-        return self
+    @model_validator(mode="wrap")
+    @classmethod
+    def _one_of_each(cls, data: Any, validated: ModelWrapValidatorHandler[Self]) -> Self:
+        return all_at_once(data, validated, cls._pairs)
+
+    @staticmethod
+    def _pairs(data: Mapping[str, Any]) -> list[str]:
+        """What is wrong with keys that exclude or need each other."""
+        webcam, given = data.get("id"), {key for key, value in data.items() if value is not None}
+        problems = []
+        if len(given & {"height_m", "above_ground_m"}) != 1:
+            problems.append(f"webcam {webcam}: give exactly one of height_m and above_ground_m")
+        if len(given & {"north_column_px", "heading_deg"}) != 1:
+            problems.append(f"webcam {webcam}: give exactly one of north_column_px and heading_deg")
+        fov = data.get("horizontal_fov_deg")
+        if data.get("projection") == "perspective":
+            if "north_column_px" in given or (isinstance(fov, (int, float)) and fov >= 180.0):
+                problems.append(
+                    f"webcam {webcam}: a perspective camera needs heading_deg and a field of view below 180°"
+                )
+        elif "projection" in given and "vertical_fov_deg" not in given:
+            problems.append(f"webcam {webcam}: a panorama needs vertical_fov_deg")
+        return problems
 
 
 class WebcamFile(Declaration):
