@@ -27,6 +27,7 @@ def albedo_command(
     calibrations: Path = Path("out/calibration"),
     masks: Path | None = None,
     within_min: float = 30.0,
+    doubtful_poses: bool = False,
     synthetic_webcams: bool = False,
     size: str = "384x256",
     fit_haze: bool = False,
@@ -56,6 +57,8 @@ def albedo_command(
         Folder of WEBCAM.png, black where something stands before the landscape.
     within_min
         Use each webcam's picture that is nearest to a time, within so many minutes.
+    doubtful_poses
+        Use poses that their calibration called not reliable.
     synthetic_webcams
         Photograph a synthetic scene from its own cameras instead of reading pictures; the error is then known and printed.
     size
@@ -93,7 +96,7 @@ def albedo_command(
                 expected = "the .csv of seasonscapes webcams --manifest"
                 cure = "for a synthetic scene: --synthetic-webcams"
                 raise InputError("--manifest", "missing", expected=expected, cure=cure)
-            sources = PhotographSources(manifest, calibrations, masks, options.allow_outside)
+            sources = PhotographSources(manifest, calibrations, masks, options.allow_outside, doubtful_poses)
             photographs = photographs_at(loaded, sources, utc, within_min=within_min, progress=progress)
         how = recovery.RecoveryOptions(fit_haze, fit_curve, iterations)
         recovered = recovery.recover_albedo(loaded, photographs, sky=model, options=how, progress=progress)

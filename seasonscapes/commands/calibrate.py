@@ -92,10 +92,12 @@ def calibrate_command(
         raise InputError(picture, str(error), cure="match points by hand: seasonscapes annotate") from None
     name, solution = station.webcam.id, found.solution
     record_file, figure = output / f"{name}_calibration.json", output / f"{name}_overlay.png"
-    write_calibration(record_file, name, solution, station.frame)
+    write_calibration(record_file, name, solution, station.frame, doubts=found.doubts)
     save_overlay(figure, image, solution, points=matched, horizon=found.horizon, title=name)
     for doubt in found.doubts:
         message(f"not reliable: {doubt}")
+    if found.doubts:
+        message("the record says so, and what uses poses leaves it out unless --doubtful-poses is given")
     record = {
         "webcam": name,
         "reliable": not found.doubts,

@@ -39,12 +39,15 @@ class PhotographSources:
         Folder of ``WEBCAM.png``, black where something stands before the landscape; optional.
     allow_outside
         Let the manifest name pictures outside its folder.
+    accept_doubtful
+        Use poses that their calibration called not reliable.
     """
 
     manifest: Path
     calibrations: Path
     masks: Path | None = None
     allow_outside: bool = False
+    accept_doubtful: bool = False
 
     def picture_of(self, row: ManifestRow) -> Path:
         """The picture of a row of the manifest; `InputError` where a link leads out of the manifest's folder."""
@@ -54,9 +57,12 @@ class PhotographSources:
             raise InputError(path, "leads outside the manifest's folder", got=str(real_path(path)), cure=cure)
         return path
 
-    def calibration_of(self, webcam: str) -> Path:
-        """The calibration record of a webcam, whether it exists or not."""
-        return self.calibrations / f"{webcam}_calibration.json"
+    def calibration_of(self, webcam: str, time: datetime | None = None) -> Path:
+        """The record of a webcam's picture of that time where there is one, else that of the webcam, which may be none."""
+        from seasonscapes.calibration.calibration_file import record_name
+
+        own = self.calibrations / record_name(webcam, time)
+        return own if own.is_file() else self.calibrations / record_name(webcam)
 
 
 def open_photographs(
@@ -173,27 +179,41 @@ def rows_at(
 
 def uncalibrated(rows: Sequence[ManifestRow], sources: PhotographSources) -> list[str]:
     """Webcams of photographs that have no calibration record."""
-    return sorted({row.webcam for row in rows if not sources.calibration_of(row.webcam).is_file()})
+    return sorted({row.webcam for row in rows if not sources.calibration_of(row.webcam, row.time).is_file()})
 
 
 def observations(
     rows: Sequence[ManifestRow], sources: PhotographSources, frame: LocalFrame, *, progress: Progress | None = None
 ) -> list[Observation]:
-    """Open photographs as pinhole observations in a frame; webcams without a calibration are left out and logged.
+    """Open photographs as pinhole observations in a frame.
+
+    Webcams without a calibration, and pictures whose pose is doubtful, are left out with a warning.
 
     Raises
     ------
     InputError
-        Where no webcam is calibrated.
+        Where no photograph is left.
     """
     from seasonscapes.calibration.calibration_file import read_calibration
 
     opened: list[Observation] = []
+    doubtful: list[str] = []
     for row in each_reported(rows, len(rows), progress, "opening photographs"):
-        record = sources.calibration_of(row.webcam)
-        if record.is_file():
-            opened += opened_views(row, sources, read_calibration(record), frame)
+        record = sources.calibration_of(row.webcam, row.time)
+        if not record.is_file():
+            continue
+        calibrated = read_calibration(record)
+        if calibrated.doubts and not sources.accept_doubtful:
+            doubtful.append(f"{record.name}: {'; '.join(calibrated.doubts)}")
+            continue
+        opened += opened_views(row, sources, calibrated, frame)
     without = uncalibrated(rows, sources)
+    if not opened and doubtful:
+        raise InputError(
+            sources.calibrations,
+            f"holds no reliable pose for these pictures: {' | '.join(doubtful)}",
+            cure="calibrate from points (seasonscapes annotate), or pass --doubtful-poses",
+        )
     if not opened:
         raise InputError(
             sources.calibrations,
@@ -202,7 +222,9 @@ def observations(
             cure="seasonscapes calibrate SCENE --webcam ... -o FOLDER",
         )
     for name in without:
-        log.info("left out: %s: no calibration", name)
+        log.warning("left out: %s: no calibration", name)
+    for name in doubtful:
+        log.warning("left out, the pose is not reliable: %s", name)
     return opened
 
 
@@ -213,16 +235,17 @@ def opened_views(
     from seasonscapes.cameras.lens import rectify
     from seasonscapes.cameras.observation import Observation, open_observation
     from seasonscapes.cameras.panorama import Panorama, cut_view, split_panorama
+    from seasonscapes.cameras.picture_content import picture_content
 
     view, sigma = view_in_frame(calibrated.view, frame), calibrated.sigma
     picture = open_observation(row, sources.manifest.parent, view)
-    mask = _mask(sources, row.webcam, picture.mask.shape)
+    mask = _mask(sources, row.webcam, picture.mask.shape) & picture_content(picture.image)
     mask_image = np.repeat(mask[..., None], 3, axis=2).astype(np.float32)
     if not isinstance(view, Panorama):
-        if not calibrated.k1:
+        if calibrated.lens.is_ideal:
             return [replace(picture, mask=mask, pose_sigma=sigma)]
-        image, inside = rectify(picture.image, view, calibrated.k1)
-        kept = rectify(mask_image, view, calibrated.k1)[0][..., 0] > 0.99
+        image, inside = rectify(picture.image, view, calibrated.lens)
+        kept = rectify(mask_image, view, calibrated.lens)[0][..., 0] > 0.99
         return [Observation(image.astype(np.float32), inside & kept, view, row.time, row.webcam, sigma)]
     views = []
     for number, camera in enumerate(split_panorama(view)):
