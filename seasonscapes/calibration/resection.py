@@ -9,7 +9,7 @@ least squares over the inliers gives the solution and its covariance (Hartley & 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -61,7 +61,7 @@ class Calibration:
     outlier: np.ndarray
     noise_px: float
     skyline_rms_px: float = float("nan")
-    lens: Lens = Lens()
+    lens: Lens = field(default_factory=Lens)
 
     @property
     def distortion(self) -> Lens:

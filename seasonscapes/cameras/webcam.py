@@ -53,6 +53,11 @@ class Webcam(Declaration):
         Pitch and roll of the axis of rotation, or of a perspective camera [deg].
     radial_k1
         Radial distortion coefficient of a perspective camera; see `seasonscapes.cameras.lens`.
+    principal_point_px
+        Column and row of the optical axis of a perspective camera [px]; the middle if omitted. ``heading_deg`` is then the
+        azimuth of that axis.
+    distortion
+        Coefficients ``k1`` … ``k6``, ``p1``, ``p2`` of a perspective camera instead of ``radial_k1``; they are taken as known.
     time_zone
         IANA name of the time zone of the camera's clock.
     """
@@ -76,6 +81,8 @@ class Webcam(Declaration):
     tilt_deg: float = Field(default=0.0, gt=-90.0, lt=90.0)
     roll_deg: float = Field(default=0.0, ge=-180.0, le=180.0)
     radial_k1: float = 0.0
+    principal_point_px: tuple[float, float] | None = Field(default=None, strict=False)
+    distortion: dict[Literal["k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"], float] = Field(default_factory=dict)
     time_zone: str
 
     @field_validator("time_zone")
@@ -109,6 +116,10 @@ class Webcam(Declaration):
                 )
         elif "projection" in given and "vertical_fov_deg" not in given:
             problems.append(f"webcam {webcam}: a panorama needs vertical_fov_deg")
+        if {"radial_k1", "distortion"} <= given:
+            problems.append(f"webcam {webcam}: radial_k1 and distortion state the same twice")
+        if data.get("projection") != "perspective" and given & {"distortion", "principal_point_px"}:
+            problems.append(f"webcam {webcam}: distortion and principal_point_px are a perspective camera's")
         return problems
 
 
@@ -244,7 +255,8 @@ def webcam_model(webcam: Webcam, frame: LocalFrame, *, ground_m: float | None = 
         fx = 0.5 * width / np.tan(np.radians(webcam.horizontal_fov_deg) / 2.0)
         fov = webcam.vertical_fov_deg
         fy = fx if fov is None else 0.5 * rows / np.tan(np.radians(fov) / 2.0)
-        return Camera(width, rows, fx, fy, 0.5 * width, 0.5 * rows, pose, frame)
+        cx, cy = webcam.principal_point_px or (0.5 * width, 0.5 * rows)
+        return Camera(width, rows, fx, fy, cx, cy, pose, frame)
     assert webcam.vertical_fov_deg is not None  # checked by the validator
     level = panorama_from_angles(
         webcam.projection,

@@ -55,11 +55,7 @@ class PictureOptions:
                 )
                 raise InputError("--manifest", "missing", expected=expected, cure=cure)
             return PhotographSources(
-                self.manifest,
-                self.calibrations,
-                self.masks,
-                place.scene.confinement.allow_outside,
-                self.doubtful_poses,
+                self.manifest, self.calibrations, self.masks, place.scene.confinement.allow_outside, self.doubtful_poses
             )
         size_px = parse_size(self.size)
         return photographed_in_workspace(
