@@ -18,8 +18,8 @@ from seasonscapes.cameras.observation import (
     write_manifest,
 )
 from seasonscapes.cameras.panorama import panorama_directions, project_panorama
-from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.cameras.picture_names import scan_folder, utc_from_camera_clock
+from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.cameras.webcam import (
     Webcam,
     check_heights,
