@@ -130,12 +130,35 @@ def photographs_at(
     *,
     within_min: float = 30.0,
     where: str = "--times",
+    most_pixels: int | None = None,
     progress: Progress | None = None,
 ) -> list[Observation]:
-    """`open_photographs` from given sources at UTC times; ``where`` is what an error message calls the times."""
+    """`open_photographs` from given sources at UTC times; ``where`` is what an error message calls the times.
+
+    Pictures of more than ``most_pixels`` are reduced to as many.
+    """
     near = [rows_at(sources, time, within_min=within_min, where=where) for time in times]
     rows = {row.path: row for group in near for row in group}
-    return observations(list(rows.values()), sources, place.frame, progress=progress)
+    opened = observations(list(rows.values()), sources, place.frame, progress=progress)
+    return opened if most_pixels is None else [reduced_observation(each, most_pixels) for each in opened]
+
+
+def reduced_observation(observation: Observation, most_pixels: int) -> Observation:
+    """A photograph averaged down to a number of pixels, in linear light; pixels that the mask touches stay masked."""
+    import cv2
+
+    from seasonscapes.cameras.pinhole import Camera
+    from seasonscapes.workflows.recovery_plan import reduced_camera
+
+    if not isinstance(observation.camera, Camera):
+        return observation
+    camera = reduced_camera(observation.camera, most_pixels)
+    if camera is observation.camera:
+        return observation
+    size = (camera.width_px, camera.height_px)
+    image = cv2.resize(observation.image, size, interpolation=cv2.INTER_AREA)
+    mask = cv2.resize(observation.mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.99
+    return replace(observation, image=image, mask=mask, camera=camera)
 
 
 def rows_at(
