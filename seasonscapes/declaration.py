@@ -6,16 +6,26 @@ import difflib
 import re
 import tomllib
 import unicodedata
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, LiteralString, TypeVar, cast, get_args, get_origin
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
-from pydantic_core import ErrorDetails
+from pydantic import AfterValidator, BaseModel, ConfigDict, ModelWrapValidatorHandler, ValidationError
+from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
 from seasonscapes.errors import InputError
 from seasonscapes.text_files import read_text
 
-__all__ = ["Declaration", "InputError", "Name", "checked_name", "read_declaration", "read_toml", "validate"]
+__all__ = [
+    "Declaration",
+    "InputError",
+    "Name",
+    "all_at_once",
+    "checked_name",
+    "read_declaration",
+    "read_toml",
+    "validate",
+]
 
 MOST_NAME_CHARACTERS = 64
 MOST_TEXT_CHARACTERS = 2000
@@ -69,6 +79,45 @@ class Declaration(BaseModel):
 
 
 Model = TypeVar("Model", bound=Declaration)
+
+
+def all_at_once(
+    data: Any, validated: ModelWrapValidatorHandler[Model], problems: Callable[[Mapping[str, Any]], list[str]]
+) -> Model:
+    """Validate a table and report what is wrong with its keys together beside what is wrong with each.
+
+    Parameters
+    ----------
+    data
+        The table, or an instance that is valid already.
+    validated
+        Of a ``wrap`` validator.
+    problems
+        Returns a message for each contradiction between keys of the table.
+
+    Raises
+    ------
+    ValidationError
+        With all problems.
+    """
+    found: list[InitErrorDetails] = []
+    if isinstance(data, Mapping):
+        found = [
+            InitErrorDetails(type=PydanticCustomError("value_error", "{error}", {"error": text}), input=None)
+            for text in problems(data)
+        ]
+    try:
+        model = validated(data)
+    except ValidationError as error:
+        for details in error.errors():
+            kind = PydanticCustomError(
+                cast(LiteralString, details["type"]), "{message}", {**details.get("ctx", {}), "message": details["msg"]}
+            )
+            found.append(InitErrorDetails(type=kind, loc=details["loc"], input=details["input"]))
+        raise ValidationError.from_exception_data(error.title, found) from None
+    if found:
+        raise ValidationError.from_exception_data(type(model).__name__, found)
+    return model
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -175,25 +224,40 @@ def _input_error(details: ErrorDetails, model: type[BaseModel], where: str | Pat
         cure = f"did you mean '{close[0]}'?" if close else None
         return InputError(at, "unknown key", expected="one of " + ", ".join(known) if known else None, cure=cure)
     if details["type"] == "missing":
-        return InputError(at, "missing key", cure="add it to the file")
+        return InputError(at, "missing key", expected=_expected_at(model, location), cure="add it to the file")
     if details["type"] == "value_error":
         return InputError(at, str(details.get("ctx", {})["error"]))
     got = details["input"]
     return InputError(at, details["msg"], got=got if isinstance(got, (str, int, float, bool)) else type(got).__name__)
 
 
+def _expected_at(model: type[BaseModel], location: list[int | str]) -> str | None:
+    """The values that a key may have, where they are few; ``None`` elsewhere."""
+    owner = _model_at(model, location[:-1])
+    field = None if owner is None else owner.model_fields.get(str(location[-1]))
+    if field is None or get_origin(field.annotation) is not Literal:
+        return None
+    return "one of " + ", ".join(str(value) for value in get_args(field.annotation))
+
+
 def _fields_at(model: type[BaseModel], location: list[int | str]) -> list[str]:
     """Field names of the nested model at a pydantic error location."""
-    current: Any = model
+    owner = _model_at(model, location)
+    return [] if owner is None else [field.alias or name for name, field in owner.model_fields.items()]
+
+
+def _model_at(model: type[BaseModel], location: list[int | str]) -> type[BaseModel] | None:
+    """The nested model at a pydantic error location; ``None`` where an unknown key leads to it."""
+    current = model
     for part in location:
         if isinstance(part, int):
             continue
-        field = getattr(current, "model_fields", {}).get(part)
-        field = field or next((f for f in getattr(current, "model_fields", {}).values() if f.alias == part), None)
+        field = current.model_fields.get(part)
+        field = field or next((f for f in current.model_fields.values() if f.alias == part), None)
         if field is None:
-            return []
+            return None
         current = _model_in(field.annotation) or current
-    return [field.alias or name for name, field in getattr(current, "model_fields", {}).items()]
+    return current
 
 
 def _model_in(annotation: Any) -> type[BaseModel] | None:

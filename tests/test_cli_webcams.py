@@ -134,3 +134,30 @@ def test_calibrate_from_points(tmp_path, capsys):
     assert record["values"][1] == pytest.approx(3.0, abs=0.05)
     assert (tmp_path / "out" / "south_overlay.png").is_file()
     assert (tmp_path / "out" / "south_calibration.json").is_file()
+
+
+def test_calibrate_takes_the_camera_of_another_program(tmp_path, capsys):
+    """The pose of a model is kept as it is, its distortion goes into the record, and later stages take it out."""
+    from seasonscapes.calibration.calibration_file import read_calibration
+    from seasonscapes.cameras.lens import Lens
+
+    scene = scene_with_webcam(tmp_path)
+    model = {
+        "size_px": [320, 200],
+        "focal_px": 300.0,
+        "heading_deg": 4.0,
+        "pitch_deg": 2.0,
+        "distortion": {"k1": -0.1, "p1": 0.001},
+    }
+    model |= {"latitude_deg": 46.5405, "longitude_deg": 7.98, "height_m": 1060.0, "principal_point_px": [150.0, 110.0]}
+    (tmp_path / "model.json").write_text(json.dumps(model))
+    cv2.imwrite(str(tmp_path / "photo.png"), np.full((200, 320, 3), 90, np.uint8))
+    arguments = ("--picture", tmp_path / "photo.png", "--camera-model", tmp_path / "model.json", "-o", tmp_path / "out")
+    assert run("calibrate", scene, *arguments, "--json") == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["values"][:2] == pytest.approx([4.0, 2.0], abs=1e-6)
+    found = read_calibration(tmp_path / "out" / "south_calibration.json")
+    assert found.lens == Lens(k1=-0.1, p1=0.001)
+    assert (found.view.cx, found.view.cy) == (150.0, 110.0)
+    assert run("calibrate", scene, "--picture", tmp_path / "photo.png", "--skyline", "--model-crs", "EPSG:32632") == 2
+    assert "--camera-model: missing" in capsys.readouterr().err

@@ -11,7 +11,7 @@ from seasonscapes.errors import InputError
 from seasonscapes.evaluation.figures import comparison_figure, error_colours, steepest_window
 from seasonscapes.evaluation.metrics import psnr_db
 from seasonscapes.evaluation.picture_pairs import matching_gain
-from seasonscapes.images import read_image_linear, write_exr, write_png8
+from seasonscapes.images import read_image_linear, srgb_from_linear, write_exr, write_png8
 
 HEIGHT, WIDTH = 48, 64
 
@@ -90,7 +90,23 @@ def test_radiance_is_developed_alike_and_masked_by_depth(tmp_path, capsys):
     matched = record_of(capsys)["pictures"][0]
     assert plain["mask_share"] == pytest.approx((HEIGHT - 16) / HEIGHT)
     assert plain["psnr_db"] < 25.0 < 40.0 < matched["psnr_db"]
-    assert matching_gain(truth, 0.25 * truth) == pytest.approx([4.0, 4.0, 4.0], rel=1e-4)
+    encoded = srgb_from_linear(np.clip(truth.reshape(-1, 3) / 8000.0, 0.0, 1.0))
+    assert matching_gain(encoded, 0.25 * truth.reshape(-1, 3) / 8000.0) == pytest.approx([4.0, 4.0, 4.0], rel=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_matched_picture_never_scores_worse(seed):
+    """Truths of snow and shadow have medians that say nothing about their squared errors."""
+    from seasonscapes.evaluation.metrics import psnr_db
+    from seasonscapes.evaluation.picture_pairs import PicturePair, matched
+
+    rng = np.random.default_rng(seed)
+    truth = np.where(rng.random((40, 50, 1)) < 0.3, 0.9, 0.05) * rng.uniform(0.5, 1.0, (40, 50, 3))
+    linear = rng.uniform(0.0, 1.5, (40, 50, 3)) * [1.0, 0.3, 3.0]
+    mask = rng.random((40, 50)) < 0.6
+    pair = PicturePair(srgb_from_linear(truth), srgb_from_linear(np.clip(linear, 0.0, 1.0)), None, linear)
+    after = matched(pair, mask)
+    assert psnr_db(after.truth, after.picture, mask) >= psnr_db(pair.truth, pair.picture, mask)
 
 
 def test_what_was_used_is_refused(folders):

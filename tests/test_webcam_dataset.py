@@ -15,11 +15,10 @@ from seasonscapes.cameras.observation import (
     file_sha256,
     open_observation,
     read_manifest,
-    scan_folder,
-    utc_from_camera_clock,
     write_manifest,
 )
 from seasonscapes.cameras.panorama import panorama_directions, project_panorama
+from seasonscapes.cameras.picture_names import scan_folder, utc_from_camera_clock
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.cameras.webcam import (
     Webcam,

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +14,10 @@ from seasonscapes.calibration.evidence import PARAMETERS
 from seasonscapes.calibration.pose_model import View
 from seasonscapes.calibration.resection import Calibration
 from seasonscapes.cameras.exchange import read_json
+from seasonscapes.cameras.lens import Lens
 from seasonscapes.cameras.panorama import PROJECTIONS, Panorama
 from seasonscapes.cameras.pinhole import Camera
-from seasonscapes.declaration import checked_name
+from seasonscapes.declaration import checked_name, checked_text
 from seasonscapes.errors import InputError
 from seasonscapes.frames import LocalFrame, geodetic_from_enu
 from seasonscapes.images import atomic_path
@@ -31,22 +34,39 @@ class CalibratedWebcam:
         Id of the webcam.
     view
         Camera or panorama with its pose in ``frame``.
-    k1
-        Radial distortion coefficient.
+    lens
+        Distortion of the pictures.
     sigma
         Standard deviation of each parameter, by the names `PARAMETERS`; 0 where it was fixed.
     frame
         Local frame of the pose.
+    doubts
+        Why the pose is not reliable; empty where it is.
     """
 
     webcam: str
     view: View
-    k1: float
+    lens: Lens
     sigma: dict[str, float]
     frame: LocalFrame
+    doubts: tuple[str, ...] = ()
 
 
-def write_calibration(path: Path, webcam: str, calibration: Calibration, frame: LocalFrame) -> None:
+def record_name(webcam: str, time: datetime | None = None) -> str:
+    """The file name of a webcam's record, or of that of its picture of one time."""
+    stamp = "" if time is None else f"_{time.astimezone(UTC):%Y%m%dT%H%M%SZ}"
+    return f"{webcam}{stamp}_calibration.json"
+
+
+def write_calibration(
+    path: Path,
+    webcam: str,
+    calibration: Calibration,
+    frame: LocalFrame,
+    *,
+    doubts: Sequence[str] = (),
+    time: datetime | None = None,
+) -> None:
     """Write a calibration record; the file appears atomically.
 
     Parameters
@@ -59,6 +79,10 @@ def write_calibration(path: Path, webcam: str, calibration: Calibration, frame: 
         Result of a resection.
     frame
         Local frame of the pose. The record holds the position in WGS 84 as well.
+    doubts
+        Why the pose is not reliable; a record with doubts is refused by what uses poses.
+    time
+        Of the picture that the pose belongs to, aware; ``None`` for all pictures of the webcam.
     """
     view = calibration.view
     latitude, longitude, height = (float(v) for v in geodetic_from_enu(frame, view.position_m))
@@ -70,13 +94,18 @@ def write_calibration(path: Path, webcam: str, calibration: Calibration, frame: 
         "fy": view.fy,
         "cx": view.cx,
         "cy": view.cy,
-        "k1": calibration.k1,
+        "k1": calibration.distortion.k1,
+        "distortion": asdict(calibration.distortion),
         "world_from_camera": view.world_from_camera.tolist(),
         "latitude_deg": latitude,
         "longitude_deg": longitude,
         "height_m": height,
         "angles_deg": dict(zip(("heading", "tilt", "roll"), calibration.parameters[:3].tolist(), strict=True)),
         "sigma": calibration.sigma,
+        "covariance": calibration.covariance.tolist(),
+        "reliable": not doubts,
+        "doubts": list(doubts),
+        "picture_time_utc": None if time is None else time.astimezone(UTC).isoformat(),
         "frame": {
             "latitude_deg": frame.latitude_deg,
             "longitude_deg": frame.longitude_deg,
@@ -105,7 +134,7 @@ def read_calibration(path: Path) -> CalibratedWebcam:
     Returns
     -------
     CalibratedWebcam
-        View, distortion, standard deviations and frame.
+        View, distortion, standard deviations, frame and doubts.
 
     Raises
     ------
@@ -126,6 +155,8 @@ def read_calibration(path: Path) -> CalibratedWebcam:
             view = Panorama(projection, width, height, fx, fy, cx, cy, pose, frame)
         else:
             raise ValueError(f"projection {projection!r}")
-        return CalibratedWebcam(checked_name(str(record["webcam"])), view, float(record["k1"]), sigma, frame)
+        lens = Lens(**record["distortion"]) if "distortion" in record else Lens(k1=float(record["k1"]))
+        doubts = tuple(checked_text(str(doubt)) for doubt in record.get("doubts", []))
+        return CalibratedWebcam(checked_name(str(record["webcam"])), view, lens, sigma, frame, doubts)
     except MALFORMED as error:
         raise InputError(path, f"not a calibration record: {error!r}") from None

@@ -121,13 +121,13 @@ def _best_rotation(camera_rays: np.ndarray, world_rays: np.ndarray) -> tuple[np.
     moment = np.einsum("pi,pj->pij", world_rays[first], camera_rays[first]) + np.einsum(
         "pi,pj->pij", world_rays[second], camera_rays[second]
     )
-    rotation = _nearest_rotation(moment)
+    rotation = nearest_rotations(moment)
     costs = _cost(np.einsum("pij,nj->pni", rotation, camera_rays), world_rays)
     best, cost = rotation[np.argmin(costs)], float(costs.min())
     for _ in range(20):
         angle = np.arccos(np.clip(np.sum(camera_rays @ best.T * world_rays, axis=1), -1.0, 1.0))
         weight = 1.0 / np.maximum(angle, 1e-4)
-        refined = _nearest_rotation(np.einsum("n,ni,nj->ij", weight, world_rays, camera_rays)[None])[0]
+        refined = nearest_rotations(np.einsum("n,ni,nj->ij", weight, world_rays, camera_rays)[None])[0]
         refined_cost = float(_cost(camera_rays @ refined.T, world_rays))
         if refined_cost >= cost - 1e-9:
             break
@@ -135,7 +135,7 @@ def _best_rotation(camera_rays: np.ndarray, world_rays: np.ndarray) -> tuple[np.
     return best, cost
 
 
-def _nearest_rotation(moment: np.ndarray) -> np.ndarray:
+def nearest_rotations(moment: np.ndarray) -> np.ndarray:
     """Rotations ``(P, 3, 3)`` that maximise the trace with moment matrices ``(P, 3, 3)`` (Kabsch 1976)."""
     u, _, vt = np.linalg.svd(moment)
     u[..., :, 2] *= np.sign(np.linalg.det(u @ vt))[..., None]

@@ -9,7 +9,7 @@ least squares over the inliers gives the solution and its covariance (Hartley & 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -17,6 +17,7 @@ import numpy as np
 from seasonscapes.calibration.evidence import PARAMETERS, Correspondences, Priors, select_points
 from seasonscapes.calibration.initial_rotation import check_orientation, rotation_among_pairs
 from seasonscapes.calibration.pose_model import View, parameters_of_view, pixel_error, view_from_parameters
+from seasonscapes.cameras.lens import Lens
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.errors import CameraBelowGround, NotEnoughEvidence
 
@@ -47,6 +48,8 @@ class Calibration:
         Standard deviation of a pixel coordinate [px], as given or as estimated.
     skyline_rms_px
         Root mean square of the skyline residuals within three standard deviations [px]; NaN without a skyline.
+    lens
+        Distortion that was known beforehand and taken out of the picture; ``k1`` is then 0.
     """
 
     view: View
@@ -58,6 +61,12 @@ class Calibration:
     outlier: np.ndarray
     noise_px: float
     skyline_rms_px: float = float("nan")
+    lens: Lens = field(default_factory=Lens)
+
+    @property
+    def distortion(self) -> Lens:
+        """The distortion of the pictures: the one known beforehand, or the solved ``k1``."""
+        return Lens(k1=self.k1) if self.lens.is_ideal else self.lens
 
     @property
     def sigma(self) -> dict[str, float]:

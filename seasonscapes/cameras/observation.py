@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import csv
 import hashlib
-import re
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path, PurePath
-from zoneinfo import ZoneInfo
 
 import numpy as np
 
@@ -27,9 +25,6 @@ from seasonscapes.images import atomic_path, picture_size, read_image_linear, re
 from seasonscapes.text_files import read_text
 
 COLUMNS = ("webcam", "time_utc", "path", "bytes", "sha256")
-# Folder layout of the reference repository, with placeholders for parts of the path.
-REFERENCE_LAYOUT = "{day}/{time}/360/{webcam}.jpg"
-_PARTS = {"day": r"\d{4}-\d{2}-\d{2}", "time": r"\d{2}[-:]\d{2}(?:[-:]\d{2})?", "webcam": r"[^/]+"}
 
 
 @dataclass(frozen=True)
@@ -122,111 +117,6 @@ class PictureProblem:
     kind: str
     path: str
     detail: str
-
-
-def utc_from_camera_clock(naive: datetime, time_zone: str) -> datetime:
-    """Convert the local time of a camera's clock to UTC.
-
-    Parameters
-    ----------
-    naive
-        Local time without offset.
-    time_zone
-        IANA name of the time zone.
-
-    Returns
-    -------
-    datetime.datetime
-        Aware UTC.
-
-    Raises
-    ------
-    ValueError
-        ``"ambiguous …"`` in the hour that is repeated at the end of daylight saving time, ``"skipped …"`` in the hour
-        that is skipped at its start. An error of one hour would displace the sun by 15°.
-    """
-    zone = ZoneInfo(time_zone)
-    early, late = (naive.replace(tzinfo=zone, fold=fold) for fold in (0, 1))
-    if early.utcoffset() != late.utcoffset():
-        exists = early.astimezone(UTC).astimezone(zone).replace(tzinfo=None) == naive
-        kind = "ambiguous" if exists else "skipped"
-        raise ValueError(
-            f"{kind}: {naive.isoformat()} {'happens twice' if exists else 'does not exist'} in {time_zone}"
-        )
-    return early.astimezone(UTC)
-
-
-def scan_folder(
-    folder: Path, webcams: Sequence[Webcam], *, layout: str = REFERENCE_LAYOUT
-) -> tuple[list[ManifestRow], list[PictureProblem]]:
-    """List the images below a folder by their file names, without opening them.
-
-    Parameters
-    ----------
-    folder
-        Folder to scan recursively.
-    webcams
-        Known webcams, with their time zones.
-    layout
-        Path pattern with ``{day}`` (2024-09-01), ``{time}`` (12-00-00, camera clock) and ``{webcam}``.
-
-    Returns
-    -------
-    rows
-        Images in order of webcam and time.
-    problems
-        File names that do not match the layout, unknown webcams, ambiguous or skipped local times, several images of
-        one webcam and instant.
-
-    Raises
-    ------
-    InputError
-        The folder does not exist.
-    ValueError
-        ``layout`` does not contain each placeholder once.
-    """
-    if not folder.is_dir():
-        raise InputError(folder, "no such folder")
-    zone_of = {webcam.id: webcam.time_zone for webcam in webcams}
-    parts = re.split(r"\{(day|time|webcam)\}", layout)
-    pattern = re.compile("".join(f"(?P<{p}>{_PARTS[p]})" if i % 2 else re.escape(p) for i, p in enumerate(parts)))
-    if set(parts[1::2]) != set(_PARTS):
-        raise ValueError(f"layout {layout!r} needs each of {{day}}, {{time}} and {{webcam}} once")
-    suffix = Path(layout).suffix.lower()
-    rows, problems = [], []
-    utc_of: dict[tuple[str, str, str], datetime | str] = {}
-    for file in sorted(folder.rglob("*")):
-        if file.suffix.lower() != suffix:
-            continue
-        name = file.relative_to(folder).as_posix()
-        match = pattern.fullmatch(name)
-        if not match:
-            problems.append(PictureProblem("unreadable name", name, f"expected {layout}"))
-            continue
-        if match["webcam"] not in zone_of:
-            problems.append(PictureProblem("unknown webcam", name, f"{match['webcam']} is not in the scene"))
-            continue
-        key = (match["day"], match["time"], zone_of[match["webcam"]])
-        if key not in utc_of:
-            utc_of[key] = _utc_or_problem(*key)
-        time = utc_of[key]
-        if isinstance(time, str):
-            kind = time.split(":")[0]
-            kind = {"ambiguous": "ambiguous time", "skipped": "skipped time"}.get(kind, kind)
-            problems.append(PictureProblem(kind, name, time))
-            continue
-        rows.append(ManifestRow(match["webcam"], time, name, file.stat().st_size))
-    rows.sort(key=lambda row: (row.webcam, row.time, row.path))
-    return rows, problems + duplicate_times(rows)
-
-
-def _utc_or_problem(day: str, time: str, zone: str) -> datetime | str:
-    """UTC of a local time in a file name, or a description of the problem."""
-    try:
-        return utc_from_camera_clock(datetime.fromisoformat(f"{day}T{time.replace('-', ':')}"), zone)
-    except ValueError as error:
-        text = str(error)
-        return text if text.startswith(("ambiguous", "skipped")) else f"unreadable name: {text}"
 
 
 def duplicate_times(rows: Iterable[ManifestRow]) -> list[PictureProblem]:

@@ -7,18 +7,18 @@ axis of rotation: it shifts the horizon from the middle row by the same angle in
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Self
+from typing import Any, Literal, Self
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, ModelWrapValidatorHandler, field_validator, model_validator
 
 from seasonscapes.cameras.panorama import Panorama, panorama_from_angles
 from seasonscapes.cameras.pinhole import Camera, rotation_from_angles
-from seasonscapes.declaration import Declaration, InputError, Name, Text, read_toml, validate
+from seasonscapes.declaration import Declaration, InputError, Name, Text, all_at_once, read_toml, validate
 from seasonscapes.frames import Latitude, LocalFrame, Longitude, enu_from_geodetic, local_axes
 
 
@@ -53,6 +53,11 @@ class Webcam(Declaration):
         Pitch and roll of the axis of rotation, or of a perspective camera [deg].
     radial_k1
         Radial distortion coefficient of a perspective camera; see `seasonscapes.cameras.lens`.
+    principal_point_px
+        Column and row of the optical axis of a perspective camera [px]; the middle if omitted. ``heading_deg`` is then the
+        azimuth of that axis.
+    distortion
+        Coefficients ``k1`` … ``k6``, ``p1``, ``p2`` of a perspective camera instead of ``radial_k1``; they are taken as known.
     time_zone
         IANA name of the time zone of the camera's clock.
     """
@@ -76,6 +81,8 @@ class Webcam(Declaration):
     tilt_deg: float = Field(default=0.0, gt=-90.0, lt=90.0)
     roll_deg: float = Field(default=0.0, ge=-180.0, le=180.0)
     radial_k1: float = 0.0
+    principal_point_px: tuple[float, float] | None = Field(default=None, strict=False)
+    distortion: dict[Literal["k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"], float] = Field(default_factory=dict)
     time_zone: str
 
     @field_validator("time_zone")
@@ -87,18 +94,33 @@ class Webcam(Declaration):
             raise ValueError(f"unknown time zone {value!r}; expected an IANA name such as 'Europe/Zurich'") from None
         return value
 
-    @model_validator(mode="after")
-    def _one_of_each(self) -> Self:
-        if (self.height_m is None) == (self.above_ground_m is None):
-            raise ValueError(f"webcam {self.id}: give exactly one of height_m and above_ground_m")
-        if (self.north_column_px is None) == (self.heading_deg is None):
-            raise ValueError(f"webcam {self.id}: give exactly one of north_column_px and heading_deg")
-        perspective = self.projection == "perspective"
-        if perspective and (self.horizontal_fov_deg >= 180.0 or self.north_column_px is not None):
-            raise ValueError(f"webcam {self.id}: a perspective camera needs heading_deg and a field of view below 180°")
-        if not perspective and self.vertical_fov_deg is None:
-            raise ValueError(f"webcam {self.id}: a panorama needs vertical_fov_deg")
-        return self
+    @model_validator(mode="wrap")
+    @classmethod
+    def _one_of_each(cls, data: Any, validated: ModelWrapValidatorHandler[Self]) -> Self:
+        return all_at_once(data, validated, cls._pairs)
+
+    @staticmethod
+    def _pairs(data: Mapping[str, Any]) -> list[str]:
+        """What is wrong with keys that exclude or need each other."""
+        webcam, given = data.get("id"), {key for key, value in data.items() if value is not None}
+        problems = []
+        if len(given & {"height_m", "above_ground_m"}) != 1:
+            problems.append(f"webcam {webcam}: give exactly one of height_m and above_ground_m")
+        if len(given & {"north_column_px", "heading_deg"}) != 1:
+            problems.append(f"webcam {webcam}: give exactly one of north_column_px and heading_deg")
+        fov = data.get("horizontal_fov_deg")
+        if data.get("projection") == "perspective":
+            if "north_column_px" in given or (isinstance(fov, (int, float)) and fov >= 180.0):
+                problems.append(
+                    f"webcam {webcam}: a perspective camera needs heading_deg and a field of view below 180°"
+                )
+        elif "projection" in given and "vertical_fov_deg" not in given:
+            problems.append(f"webcam {webcam}: a panorama needs vertical_fov_deg")
+        if {"radial_k1", "distortion"} <= given:
+            problems.append(f"webcam {webcam}: radial_k1 and distortion state the same twice")
+        if data.get("projection") != "perspective" and given & {"distortion", "principal_point_px"}:
+            problems.append(f"webcam {webcam}: distortion and principal_point_px are a perspective camera's")
+        return problems
 
 
 class WebcamFile(Declaration):
@@ -233,7 +255,8 @@ def webcam_model(webcam: Webcam, frame: LocalFrame, *, ground_m: float | None = 
         fx = 0.5 * width / np.tan(np.radians(webcam.horizontal_fov_deg) / 2.0)
         fov = webcam.vertical_fov_deg
         fy = fx if fov is None else 0.5 * rows / np.tan(np.radians(fov) / 2.0)
-        return Camera(width, rows, fx, fy, 0.5 * width, 0.5 * rows, pose, frame)
+        cx, cy = webcam.principal_point_px or (0.5 * width, 0.5 * rows)
+        return Camera(width, rows, fx, fy, cx, cy, pose, frame)
     assert webcam.vertical_fov_deg is not None  # checked by the validator
     level = panorama_from_angles(
         webcam.projection,

@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from seasonscapes.commands.arguments import check_range, parse_size, parse_times
-from seasonscapes.commands.console import print_result, progress_bars
+from seasonscapes.commands.console import message, print_result, progress_bars
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
 from seasonscapes.commands.outputs import check_output
 from seasonscapes.errors import InputError
 
 if TYPE_CHECKING:
     from seasonscapes.workflows.albedo_recovery import RecoveredAlbedo
+    from seasonscapes.workflows.photograph_files import PhotographSources
 
 
 def albedo_command(
@@ -27,6 +28,7 @@ def albedo_command(
     calibrations: Path = Path("out/calibration"),
     masks: Path | None = None,
     within_min: float = 30.0,
+    doubtful_poses: bool = False,
     synthetic_webcams: bool = False,
     size: str = "384x256",
     fit_haze: bool = False,
@@ -56,6 +58,8 @@ def albedo_command(
         Folder of WEBCAM.png, black where something stands before the landscape.
     within_min
         Use each webcam's picture that is nearest to a time, within so many minutes.
+    doubtful_poses
+        Use poses that their calibration called not reliable.
     synthetic_webcams
         Photograph a synthetic scene from its own cameras instead of reading pictures; the error is then known and printed.
     size
@@ -78,23 +82,27 @@ def albedo_command(
     check_range("--iterations", iterations, 0, 100_000)
     from seasonscapes.rendering.backend import use_backend
     from seasonscapes.workflows import albedo_recovery as recovery
-    from seasonscapes.workflows.photograph_files import PhotographSources, photographs_at
+    from seasonscapes.workflows.photograph_files import photographs_at
+    from seasonscapes.workflows.recovery_plan import MOST_PIXELS, plan_recovery
     from seasonscapes.workflows.synthetic_photographs import synthetic_observations
 
     model, size_px = sky.model(), parse_size(size)
     use_backend(gradients=iterations > 0)
     with progress_bars() as progress:
-        loaded = options.load(scene, progress, texel_m=recovery.TEXEL_M)
+        sources, texel_m = None, recovery.TEXEL_M
+        if not synthetic_webcams:
+            sources = _sources(manifest, calibrations, masks, options.allow_outside, doubtful_poses)
+            plan = plan_recovery(scene, sources, texel_m=options.texel_m, allow_outside=options.allow_outside)
+            message(f"plan: {plan}")
+            texel_m = plan.texel_m
+        loaded = options.load(scene, progress, texel_m=texel_m)
         utc = parse_times("--times", times, loaded.frame.latitude_deg, loaded.frame.longitude_deg)
-        if synthetic_webcams:
+        if sources is None:
             photographs = synthetic_observations(loaded, utc, model, size_px=size_px, progress=progress)
         else:
-            if manifest is None:
-                expected = "the .csv of seasonscapes webcams --manifest"
-                cure = "for a synthetic scene: --synthetic-webcams"
-                raise InputError("--manifest", "missing", expected=expected, cure=cure)
-            sources = PhotographSources(manifest, calibrations, masks, options.allow_outside)
-            photographs = photographs_at(loaded, sources, utc, within_min=within_min, progress=progress)
+            photographs = photographs_at(
+                loaded, sources, utc, within_min=within_min, most_pixels=MOST_PIXELS, progress=progress
+            )
         how = recovery.RecoveryOptions(fit_haze, fit_curve, iterations)
         recovered = recovery.recover_albedo(loaded, photographs, sky=model, options=how, progress=progress)
     recovered.save(output)
@@ -115,6 +123,17 @@ def albedo_command(
     if loaded.synthetic is not None:
         record |= recovery.error_against_truth(loaded, recovered)
     print_result(record, _lines(record, recovered), as_json=json)
+
+
+def _sources(
+    manifest: Path | None, calibrations: Path, masks: Path | None, allow_outside: bool, doubtful_poses: bool
+) -> PhotographSources:
+    from seasonscapes.workflows.photograph_files import PhotographSources
+
+    if manifest is None:
+        expected, cure = "the .csv of seasonscapes webcams --manifest", "for a synthetic scene: --synthetic-webcams"
+        raise InputError("--manifest", "missing", expected=expected, cure=cure)
+    return PhotographSources(manifest, calibrations, masks, allow_outside, doubtful_poses)
 
 
 def _lines(record: dict[str, Any], recovered: RecoveredAlbedo) -> list[str]:

@@ -33,6 +33,8 @@ class PictureOptions:
     """Folder of WEBCAM.png, black where something stands before the landscape."""
     within_min: float = 30.0
     """Use each webcam's picture that is nearest to --time, within so many minutes."""
+    doubtful_poses: bool = False
+    """Use poses that their calibration called not reliable."""
     synthetic_webcams: bool = False
     """Photograph a synthetic scene from its own cameras first (some seconds each) instead of reading pictures."""
     leave_out: str | None = None
@@ -53,7 +55,7 @@ class PictureOptions:
                 )
                 raise InputError("--manifest", "missing", expected=expected, cure=cure)
             return PhotographSources(
-                self.manifest, self.calibrations, self.masks, place.scene.confinement.allow_outside
+                self.manifest, self.calibrations, self.masks, place.scene.confinement.allow_outside, self.doubtful_poses
             )
         size_px = parse_size(self.size)
         return photographed_in_workspace(

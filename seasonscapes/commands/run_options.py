@@ -28,6 +28,8 @@ class RunPictureOptions:
     """Folder of WEBCAM.png, black where something stands before the landscape."""
     within_min: float = 30.0
     """Of a real scene: use each webcam's picture that is nearest to a time, within so many minutes."""
+    doubtful_poses: bool = False
+    """Use poses that their calibration called not reliable."""
     leave_out: str | None = None
     """Of a synthetic scene: cameras that take no picture, with commas between."""
     photo_kind: str = "panorama"
@@ -45,7 +47,9 @@ class RunPictureOptions:
             size_px = parse_size(self.photo_size, flag="--photo-size")
         sources = None
         if self.manifest is not None:
-            sources = PhotographSources(self.manifest, self.calibrations, self.masks, allow_outside)
+            sources = PhotographSources(
+                self.manifest, self.calibrations, self.masks, allow_outside, self.doubtful_poses
+            )
         return RunPhotographs(
             sources, self.masks, self.within_min, frozenset(parse_names(self.leave_out)), self.photo_kind, size_px
         )

@@ -39,10 +39,12 @@ def webcams_command(
     pictures
         A folder of pictures to list and check.
     layout
-        How paths below that folder are made of {day}, {time} (the camera's clock) and {webcam};
-        default {day}/{time}/360/{webcam}.jpg.
+        How paths below that folder are made of {day} (2024-09-01 or 20240901), {time} (12-00, 12-00-00 or 120000 by the
+        camera's clock; 120000Z is UTC), {webcam} (not needed where there is one) and {any}, such as
+        '{webcam}/{day}_{time}.jpg'; default what fits most files.
     manifest
-        Write the list of good pictures to this .csv; or, without --pictures, check the pictures it lists.
+        Write the list of good pictures to this .csv, in the pictures' folder or above it; or, without --pictures, check
+        the pictures it lists.
     decode
         Open every picture in full, which also finds damage in the middle.
     elevation

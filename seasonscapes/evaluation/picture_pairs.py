@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,9 @@ from seasonscapes.images import atomic_path, read_exr, read_image_linear, srgb_f
 
 _ENCODED, _LINEAR = (".png", ".jpg", ".jpeg"), (".exr",)
 MATCHES = ("none", "gain")
+# A common gain within a factor of 400, first in steps of a fifth; then each colour within a factor of 7.
+_MOST_LOG_GAIN, _GAIN_STEPS = 6.0, 30
+_COLOUR_LOG_GAIN = 2.0
 
 
 @dataclass(frozen=True)
@@ -73,11 +76,17 @@ class PicturePair:
         Images ``(H, W, 3)``, sRGB-encoded in [0, 1].
     depth_m
         Distance ``(H, W)`` of the truth [m], or ``None`` if its file contains no depth.
+    linear
+        The picture before it was developed: radiance, or linear values of an encoded picture.
+    ev100
+        Exposure of radiance; ``None`` for encoded pictures.
     """
 
     truth: np.ndarray
     picture: np.ndarray
     depth_m: np.ndarray | None
+    linear: np.ndarray
+    ev100: float | None = None
 
 
 def paired(truth: Path, pictures: Path) -> dict[str, tuple[Path, Path]]:
@@ -128,15 +137,13 @@ def _by_stem(flag: str, folder: Path) -> dict[str, Path]:
     return found
 
 
-def read_pair(true_path: Path, path: Path, *, match: str = "none") -> PicturePair:
+def read_pair(true_path: Path, path: Path) -> PicturePair:
     """Read a picture and its truth; radiance is developed with the exposure of the truth.
 
     Parameters
     ----------
     true_path, path
         Files of truth and picture: both ``.exr``, or both ``.png`` or ``.jpg``; of equal size.
-    match
-        ``"none"``, or ``"gain"`` to scale each colour of the picture by its `matching_gain` first.
 
     Returns
     -------
@@ -156,13 +163,14 @@ def read_pair(true_path: Path, path: Path, *, match: str = "none") -> PicturePai
     if truth.shape != picture.shape:
         got, expected = (f"{image.shape[1]}x{image.shape[0]}" for image in (picture, truth))
         raise InputError(path, "another size than the truth", got=got, expected=expected)
-    if match == "gain":
-        picture = picture * matching_gain(truth, picture)
-    if is_linear[0]:
-        ev100 = exposure_ev100(truth)
-        truth, picture = develop(truth, ev100), develop(picture, ev100)
-    truth, picture = (srgb_from_linear(np.clip(image, 0.0, 1.0)) for image in (truth, picture))
-    return PicturePair(truth, picture, depth)
+    ev100 = exposure_ev100(truth) if is_linear[0] else None
+    return PicturePair(encoded(truth, ev100), encoded(picture, ev100), depth, picture, ev100)
+
+
+def encoded(linear: np.ndarray, ev100: float | None = None) -> np.ndarray:
+    """Linear values ``(..., 3)`` as sRGB in [0, 1]; radiance is developed with an exposure first."""
+    shown = linear if ev100 is None else develop(linear, ev100)
+    return srgb_from_linear(np.clip(shown, 0.0, 1.0))
 
 
 def _read(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
@@ -177,27 +185,54 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     return layers[""], layers.get("depth")
 
 
-def matching_gain(truth: np.ndarray, picture: np.ndarray) -> np.ndarray:
-    """Compute the gains that scale a linear picture to the truth: median ratios over pixels neither black nor clipped.
+def matched(pair: PicturePair, mask: np.ndarray | None) -> PicturePair:
+    """Return the pair with each colour of the picture scaled by its `matching_gain`, fitted on the pixels scored."""
+    use = np.ones(pair.truth.shape[:2], bool) if mask is None else mask
+    gain = matching_gain(pair.truth[use], pair.linear[use], pair.ev100)
+    return replace(pair, picture=encoded(pair.linear * gain, pair.ev100))
+
+
+def matching_gain(truth: np.ndarray, picture: np.ndarray, ev100: float | None = None) -> np.ndarray:
+    """Compute the gains of a linear picture that bring its encoded values nearest to a truth, by least squares.
+
+    What is minimised is what PSNR measures, and 1 is among the candidates: a match never lowers a PSNR.
 
     Parameters
     ----------
-    truth, picture
-        Linear images ``(H, W, 3)``.
+    truth
+        Pixels ``(N, 3)``, sRGB-encoded in [0, 1].
+    picture
+        The same pixels ``(N, 3)``, linear.
+    ev100
+        Exposure that develops the picture where it is radiance.
 
     Returns
     -------
     ndarray
-        One gain per colour ``(3,)``; 1 if no pixel is usable.
+        One gain per colour ``(3,)``; 1 without pixels.
     """
+    from scipy.optimize import minimize_scalar
+
     gains = np.ones(3)
-    for channel in range(3):
-        a, b = truth[..., channel], picture[..., channel]
-        usable = np.isfinite(a) & np.isfinite(b) & (a > 1e-3 * np.nanmax(a)) & (b > 1e-3 * np.nanmax(b))
-        usable &= a < 0.98 * np.nanmax(a)
-        if usable.any():
-            gains[channel] = np.exp(np.median(np.log(a[usable] / b[usable])))
-    return gains
+    if not len(truth):
+        return gains
+
+    def error(trial: np.ndarray) -> float:
+        return float(np.mean((truth - encoded(picture * trial, ev100)) ** 2))
+
+    coarse = np.exp(np.linspace(-_MOST_LOG_GAIN, _MOST_LOG_GAIN, 2 * _GAIN_STEPS + 1))
+    gains = gains * min(coarse, key=lambda gain: error(np.full(3, gain)))
+    # The development mixes colours a little in highlights, so each colour is fitted again after the others.
+    for channel in (0, 1, 2, 0, 1, 2):
+        axis, start = np.eye(3)[channel], gains.copy()
+        found = minimize_scalar(
+            lambda change, start=start, axis=axis: error(start * np.exp(change * axis)),
+            bounds=(-_COLOUR_LOG_GAIN, _COLOUR_LOG_GAIN),
+            method="bounded",
+            options={"xatol": 1e-4},
+        )
+        gains = start * np.exp(float(found.x) * axis)
+    return gains if error(gains) <= error(np.ones(3)) else np.ones(3)
 
 
 def mask_of(name: str, pair: PicturePair, options: MaskOptions) -> np.ndarray | None:
@@ -295,8 +330,10 @@ def score_pair(
         If the pair cannot be compared, or no pixel is left to score.
     """
     options = options or ScoreOptions()
-    pair = read_pair(true_path, path, match=options.match)
+    pair = read_pair(true_path, path)
     mask = mask_of(name, pair, options.masks)
+    if options.match == "gain":
+        pair = matched(pair, mask)
     if mask is not None and not mask.any():
         raise InputError(path, "no pixel is left to score", cure="check --mask, --near-m and --far-m")
     result = score(pair.truth, pair.picture, mask, mode=options.mode, lpips=options.lpips)

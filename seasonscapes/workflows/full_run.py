@@ -164,7 +164,10 @@ def _imagery(place: Place) -> dict | None:
 def _sources(folder: Path) -> PhotographSources:
     masks = folder / "pictures" / "masks"
     return PhotographSources(
-        folder / "pictures" / "manifest.csv", folder / "calibration", masks if masks.is_dir() else None
+        folder / "pictures" / "manifest.csv",
+        folder / "calibration",
+        masks if masks.is_dir() else None,
+        accept_doubtful=True,  # decided where the records were brought
     )
 
 

@@ -188,7 +188,7 @@ def painting_of(
 def _hashes(sources: PhotographSources, rows: Sequence[ManifestRow]) -> list[list[str | None]]:
     found = []
     for row in rows:
-        files = [sources.manifest.parent / row.path, sources.calibration_of(row.webcam)]
+        files = [sources.manifest.parent / row.path, sources.calibration_of(row.webcam, row.time)]
         if sources.masks is not None:
             files.append(sources.masks / f"{row.webcam}.png")
         hashes = (file_hash(path) if path.is_file() else None for path in files)

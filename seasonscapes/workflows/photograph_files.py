@@ -39,12 +39,15 @@ class PhotographSources:
         Folder of ``WEBCAM.png``, black where something stands before the landscape; optional.
     allow_outside
         Let the manifest name pictures outside its folder.
+    accept_doubtful
+        Use poses that their calibration called not reliable.
     """
 
     manifest: Path
     calibrations: Path
     masks: Path | None = None
     allow_outside: bool = False
+    accept_doubtful: bool = False
 
     def picture_of(self, row: ManifestRow) -> Path:
         """The picture of a row of the manifest; `InputError` where a link leads out of the manifest's folder."""
@@ -54,9 +57,12 @@ class PhotographSources:
             raise InputError(path, "leads outside the manifest's folder", got=str(real_path(path)), cure=cure)
         return path
 
-    def calibration_of(self, webcam: str) -> Path:
-        """The calibration record of a webcam, whether it exists or not."""
-        return self.calibrations / f"{webcam}_calibration.json"
+    def calibration_of(self, webcam: str, time: datetime | None = None) -> Path:
+        """The record of a webcam's picture of that time where there is one, else that of the webcam, which may be none."""
+        from seasonscapes.calibration.calibration_file import record_name
+
+        own = self.calibrations / record_name(webcam, time)
+        return own if own.is_file() else self.calibrations / record_name(webcam)
 
 
 def open_photographs(
@@ -124,12 +130,35 @@ def photographs_at(
     *,
     within_min: float = 30.0,
     where: str = "--times",
+    most_pixels: int | None = None,
     progress: Progress | None = None,
 ) -> list[Observation]:
-    """`open_photographs` from given sources at UTC times; ``where`` is what an error message calls the times."""
+    """`open_photographs` from given sources at UTC times; ``where`` is what an error message calls the times.
+
+    Pictures of more than ``most_pixels`` are reduced to as many.
+    """
     near = [rows_at(sources, time, within_min=within_min, where=where) for time in times]
     rows = {row.path: row for group in near for row in group}
-    return observations(list(rows.values()), sources, place.frame, progress=progress)
+    opened = observations(list(rows.values()), sources, place.frame, progress=progress)
+    return opened if most_pixels is None else [reduced_observation(each, most_pixels) for each in opened]
+
+
+def reduced_observation(observation: Observation, most_pixels: int) -> Observation:
+    """A photograph averaged down to a number of pixels, in linear light; pixels that the mask touches stay masked."""
+    import cv2
+
+    from seasonscapes.cameras.pinhole import Camera
+    from seasonscapes.workflows.recovery_plan import reduced_camera
+
+    if not isinstance(observation.camera, Camera):
+        return observation
+    camera = reduced_camera(observation.camera, most_pixels)
+    if camera is observation.camera:
+        return observation
+    size = (camera.width_px, camera.height_px)
+    image = cv2.resize(observation.image, size, interpolation=cv2.INTER_AREA)
+    mask = cv2.resize(observation.mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.99
+    return replace(observation, image=image, mask=mask, camera=camera)
 
 
 def rows_at(
@@ -173,27 +202,41 @@ def rows_at(
 
 def uncalibrated(rows: Sequence[ManifestRow], sources: PhotographSources) -> list[str]:
     """Webcams of photographs that have no calibration record."""
-    return sorted({row.webcam for row in rows if not sources.calibration_of(row.webcam).is_file()})
+    return sorted({row.webcam for row in rows if not sources.calibration_of(row.webcam, row.time).is_file()})
 
 
 def observations(
     rows: Sequence[ManifestRow], sources: PhotographSources, frame: LocalFrame, *, progress: Progress | None = None
 ) -> list[Observation]:
-    """Open photographs as pinhole observations in a frame; webcams without a calibration are left out and logged.
+    """Open photographs as pinhole observations in a frame.
+
+    Webcams without a calibration, and pictures whose pose is doubtful, are left out with a warning.
 
     Raises
     ------
     InputError
-        Where no webcam is calibrated.
+        Where no photograph is left.
     """
     from seasonscapes.calibration.calibration_file import read_calibration
 
     opened: list[Observation] = []
+    doubtful: list[str] = []
     for row in each_reported(rows, len(rows), progress, "opening photographs"):
-        record = sources.calibration_of(row.webcam)
-        if record.is_file():
-            opened += opened_views(row, sources, read_calibration(record), frame)
+        record = sources.calibration_of(row.webcam, row.time)
+        if not record.is_file():
+            continue
+        calibrated = read_calibration(record)
+        if calibrated.doubts and not sources.accept_doubtful:
+            doubtful.append(f"{record.name}: {'; '.join(calibrated.doubts)}")
+            continue
+        opened += opened_views(row, sources, calibrated, frame)
     without = uncalibrated(rows, sources)
+    if not opened and doubtful:
+        raise InputError(
+            sources.calibrations,
+            f"holds no reliable pose for these pictures: {' | '.join(doubtful)}",
+            cure="calibrate from points (seasonscapes annotate), or pass --doubtful-poses",
+        )
     if not opened:
         raise InputError(
             sources.calibrations,
@@ -202,7 +245,9 @@ def observations(
             cure="seasonscapes calibrate SCENE --webcam ... -o FOLDER",
         )
     for name in without:
-        log.info("left out: %s: no calibration", name)
+        log.warning("left out: %s: no calibration", name)
+    for name in doubtful:
+        log.warning("left out, the pose is not reliable: %s", name)
     return opened
 
 
@@ -213,16 +258,17 @@ def opened_views(
     from seasonscapes.cameras.lens import rectify
     from seasonscapes.cameras.observation import Observation, open_observation
     from seasonscapes.cameras.panorama import Panorama, cut_view, split_panorama
+    from seasonscapes.cameras.picture_content import picture_content
 
     view, sigma = view_in_frame(calibrated.view, frame), calibrated.sigma
     picture = open_observation(row, sources.manifest.parent, view)
-    mask = _mask(sources, row.webcam, picture.mask.shape)
+    mask = _mask(sources, row.webcam, picture.mask.shape) & picture_content(picture.image)
     mask_image = np.repeat(mask[..., None], 3, axis=2).astype(np.float32)
     if not isinstance(view, Panorama):
-        if not calibrated.k1:
+        if calibrated.lens.is_ideal:
             return [replace(picture, mask=mask, pose_sigma=sigma)]
-        image, inside = rectify(picture.image, view, calibrated.k1)
-        kept = rectify(mask_image, view, calibrated.k1)[0][..., 0] > 0.99
+        image, inside = rectify(picture.image, view, calibrated.lens)
+        kept = rectify(mask_image, view, calibrated.lens)[0][..., 0] > 0.99
         return [Observation(image.astype(np.float32), inside & kept, view, row.time, row.webcam, sigma)]
     views = []
     for number, camera in enumerate(split_panorama(view)):

@@ -91,7 +91,8 @@ def record_facts(photographs: RunPhotographs, times: Sequence[datetime]) -> dict
     if photographs.sources is None:
         return {}
     rows = _chosen_rows(photographs, photographs.sources, times)
-    return {path.name: file_hash(path) for path in _chosen_records(photographs.sources, rows)}
+    records = {path.name: file_hash(path) for path in _chosen_records(photographs.sources, rows)}
+    return {"accept_doubtful": True, **records} if photographs.sources.accept_doubtful else records
 
 
 def bring_photographs(
@@ -175,7 +176,7 @@ def bring_poses(
 
     if photographs.sources is not None:
         rows = _chosen_rows(photographs, photographs.sources, times)
-        return [_copy(path, own / path.name) for path in _chosen_records(photographs.sources, rows)]
+        return [_copy(path, own / path.name) for path in _trusted_records(photographs.sources, rows)]
     time = times[len(times) // 2]
     pictures = {row.webcam: taken / row.path for row in read_manifest(taken / "manifest.csv") if row.time == time}
     files, doubts = calibrate_by_skylines(place, pictures, taken, own, seed=seed)
@@ -206,7 +207,7 @@ def _chosen_rows(
 
 
 def _chosen_records(sources: PhotographSources, rows: Sequence[ManifestRow]) -> list[Path]:
-    paths = [sources.calibration_of(webcam) for webcam in sorted({row.webcam for row in rows})]
+    paths = sorted({sources.calibration_of(row.webcam, row.time) for row in rows})
     found = [path for path in paths if path.is_file()]
     if not found:
         raise InputError(
@@ -216,6 +217,23 @@ def _chosen_records(sources: PhotographSources, rows: Sequence[ManifestRow]) -> 
             cure="seasonscapes calibrate SCENE --webcam ... -o FOLDER",
         )
     return found
+
+
+def _trusted_records(sources: PhotographSources, rows: Sequence[ManifestRow]) -> list[Path]:
+    """The records whose poses are reliable, or all where doubtful ones are accepted; `NotEnoughEvidence` for none."""
+    from seasonscapes.calibration.calibration_file import read_calibration
+
+    paths = _chosen_records(sources, rows)
+    doubts = {path: read_calibration(path).doubts for path in paths}
+    trusted = [path for path in paths if sources.accept_doubtful or not doubts[path]]
+    for path in paths:
+        if path not in trusted:
+            log.warning("run: left out, the pose is not reliable: %s: %s", path.name, "; ".join(doubts[path]))
+    if not trusted:
+        told = " | ".join(f"{path.name}: {'; '.join(doubts[path])}" for path in paths)
+        cure = "calibrate from points (seasonscapes annotate), or pass --doubtful-poses"
+        raise NotEnoughEvidence(f"run: no pose is reliable: {told}; {cure}")
+    return trusted
 
 
 def _mask_hashes(photographs: RunPhotographs, webcams: Sequence[str]) -> dict[str, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import astuple
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 # Less distortion moves no pixel of a common camera by more than one.
-_VISIBLE_K1 = 1e-3
+_VISIBLE_DISTORTION = 1e-3
 
 __all__ = ["camera", "camera_for", "camera_geodetic", "scene_cameras"]
 
@@ -120,8 +121,10 @@ def calibrated_viewpoint(path: Path) -> tuple[NamedCamera, tuple[int, int]]:
     if not isinstance(camera, Camera):
         cure = "`seasonscapes webcams` splits it into views"
         raise InputError(path, "is the record of a panorama", expected="that of a perspective picture", cure=cure)
-    if abs(record.k1) > _VISIBLE_K1:
-        log.warning("%s: the picture is drawn without the lens distortion k1 = %.4g", path, record.k1)
+    if max(abs(value) for value in astuple(record.lens)) > _VISIBLE_DISTORTION:
+        log.warning("%s: the picture is drawn without the lens distortion, k1 = %.4g", path, record.lens.k1)
+    for doubt in record.doubts:
+        log.warning("%s: the pose is not reliable: %s", path, doubt)
     latitude, longitude, height = (float(v) for v in geodetic_from_enu(record.frame, camera.position_m))
     axes = local_axes(record.frame, latitude, longitude)
     heading, pitch, roll = angles_from_rotation(axes @ camera.world_from_camera[:3, :3])

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from seasonscapes.cameras.lens import Lens, rectify, undistort
 from seasonscapes.cameras.pinhole import view_in_frame
 from seasonscapes.errors import CameraBelowGround, InputError, NotEnoughEvidence, NoUsablePixels, UnreadableImage
 from seasonscapes.frames import LocalFrame, local_axes
@@ -46,6 +47,12 @@ class WebcamStation:
         The webcam's east, north and up as rows ``(3, 3)``.
     rasters
         Elevation rasters, the finest first.
+    lens
+        Distortion that is known beforehand.
+    pose_is_known
+        Whether ``view`` is a finished calibration rather than a first guess.
+    vertical_datum
+        Of the heights.
     """
 
     webcam: Webcam
@@ -53,6 +60,9 @@ class WebcamStation:
     frame: LocalFrame
     axes: np.ndarray
     rasters: list[Raster]
+    lens: Lens = field(default_factory=Lens)
+    pose_is_known: bool = False
+    vertical_datum: str = "unknown"
 
 
 @dataclass(frozen=True)
@@ -69,6 +79,8 @@ class WebcamCalibration:
         The terrain's horizon at the solved position.
     points
         The matched points, where there were some.
+    picture
+        The picture ``(H, W, 3)`` uint8 sRGB, without a distortion that was known beforehand.
     doubts
         Why the result is not reliable; empty where it is.
     """
@@ -77,6 +89,7 @@ class WebcamCalibration:
     solution: Calibration
     horizon: Horizon | None
     points: Correspondences | None
+    picture: np.ndarray = field(repr=False)
     doubts: tuple[str, ...] = ()
 
 
@@ -163,7 +176,8 @@ def webcam_station(
     frame = LocalFrame(found.latitude_deg, found.longitude_deg, 0.0, read.refraction_k)
     view = webcam_model(found, frame, ground_m=ground)
     axes = local_axes(frame, found.latitude_deg, found.longitude_deg)
-    return WebcamStation(found, view, frame, axes, rasters)
+    lens = Lens(**found.distortion)
+    return WebcamStation(found, view, frame, axes, rasters, lens, vertical_datum=read.vertical_datum)
 
 
 def camera_station(place: Place, camera: Camera, *, name: str = "webcam") -> WebcamStation:
@@ -217,7 +231,9 @@ def camera_station(place: Place, camera: Camera, *, name: str = "webcam") -> Web
         roll_deg=float(roll),
         time_zone="UTC",
     )
-    return WebcamStation(webcam, camera, place.frame, axes, [place.elevation])
+    return WebcamStation(
+        webcam, camera, place.frame, axes, [place.elevation], vertical_datum=place.scene.vertical_datum
+    )
 
 
 def read_picture(path: Path, where: str) -> np.ndarray:
@@ -301,29 +317,81 @@ def calibrate(
     >>> bool(found.solution.rms_px < 0.1)
     True
     """
-    from seasonscapes.calibration.evidence import Priors
-    from seasonscapes.calibration.resection import resect
-    from seasonscapes.calibration.skyline import SearchRange, align_to_skyline
     from seasonscapes.calibration.terrain_horizon import HorizonOptions, horizon_from
 
-    webcam = station.webcam
-    if skyline:
-        search = SearchRange(k1=webcam.radial_k1)
-        fit = align_to_skyline(
-            picture, station.view, station.rasters, station.frame, mask=mask, search=search, points=points
-        )
-        if fit.calibration is None:
-            raise NotEnoughEvidence("; ".join(fit.doubts))
-        doubts = (*fit.doubts, *_contradictions(station, fit.calibration, points))
-        return WebcamCalibration(station, fit.calibration, fit.horizon, points, doubts)
-    if points is None:
+    if points is None and not skyline and not station.pose_is_known:
         raise InputError("calibrate", "no evidence", cure="give --points FILE, --skyline, or both")
-    sigma_m = webcam.position_sigma_m
+    if radial and not station.lens.is_ideal:
+        raise InputError("--radial", "and a distortion that is known beforehand contradict each other", cure="drop one")
+    if not station.lens.is_ideal:
+        picture, mask, points = _without_lens(station, picture, mask, points)
+    if skyline:
+        solution, horizon, doubts = _by_skyline(station, picture, points, mask)
+    else:
+        solution, doubts = _by_points(station, points, radial=radial), ()
+        options = HorizonOptions(below_ground_m=40.0)
+        horizon = horizon_from(station.rasters, station.frame, solution.view.position_m, options=options)
+    doubts = (*doubts, *_contradictions(station, solution, points))
+    solution = replace(solution, lens=station.lens)
+    return WebcamCalibration(station, solution, horizon, points, picture, doubts)
+
+
+def _by_skyline(
+    station: WebcamStation, picture: np.ndarray, points: Correspondences | None, mask: np.ndarray | None
+) -> tuple[Calibration, Horizon, tuple[str, ...]]:
+    from seasonscapes.calibration.skyline import SearchRange, align_to_skyline
+
+    search = SearchRange(k1=station.webcam.radial_k1)
+    if station.pose_is_known:
+        search = replace(search, heading_deg=3.0, tilt_deg=3.0)
+    fit = align_to_skyline(
+        picture, station.view, station.rasters, station.frame, mask=mask, search=search, points=points
+    )
+    if fit.calibration is None:
+        raise NotEnoughEvidence("; ".join(fit.doubts))
+    return fit.calibration, fit.horizon, fit.doubts
+
+
+def _by_points(station: WebcamStation, points: Correspondences | None, *, radial: bool) -> Calibration:
+    """The resection of points; without points, the pose that is known already."""
+    from seasonscapes.calibration.evidence import Priors
+    from seasonscapes.calibration.pose_model import parameters_of_view
+    from seasonscapes.calibration.resection import Calibration, resect
+
+    if points is None:
+        parameters = parameters_of_view(station.view, station.axes)
+        none = np.empty((0, 2)), np.empty(0, bool)
+        return Calibration(station.view, 0.0, parameters, np.zeros((9, 9)), (), *none, noise_px=0.0)
+    sigma_m = station.webcam.position_sigma_m
     priors = Priors(horizontal_m=sigma_m, vertical_m=sigma_m, k1=np.inf if radial else 0.0)
-    solution = resect(station.view, points, priors=priors, k1=webcam.radial_k1, axes=station.axes)
-    options = HorizonOptions(below_ground_m=40.0)
-    horizon = horizon_from(station.rasters, station.frame, solution.view.position_m, options=options)
-    return WebcamCalibration(station, solution, horizon, points, _contradictions(station, solution, points))
+    return resect(station.view, points, priors=priors, k1=station.webcam.radial_k1, axes=station.axes)
+
+
+def _without_lens(
+    station: WebcamStation, picture: np.ndarray, mask: np.ndarray | None, points: Correspondences | None
+) -> tuple[np.ndarray, np.ndarray, Correspondences | None]:
+    """Picture, mask and points as the ideal pinhole would show them."""
+    from seasonscapes.cameras.pinhole import Camera
+
+    view = station.view
+    assert isinstance(view, Camera)  # a panorama's distortion is refused where it is declared
+    straight, inside = straight_picture(picture, view, station.lens)
+    if mask is not None:
+        weight = rectify(np.repeat(mask[..., None], 3, axis=2).astype(np.float32), view, station.lens)[0]
+        inside = inside & (weight[..., 0] > 0.99)
+    if points is not None:
+        points = replace(points, pixel=undistort(points.pixel, view, station.lens))
+    return straight, inside, points
+
+
+def straight_picture(picture: np.ndarray, view: Camera | Panorama, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
+    """A picture ``(H, W, 3)`` uint8 without its lens's distortion, and ``(H, W)`` bool where it has pixels."""
+    from seasonscapes.cameras.pinhole import Camera
+
+    if lens.is_ideal or not isinstance(view, Camera):
+        return picture, np.ones(picture.shape[:2], bool)
+    image, inside = rectify(picture.astype(np.float32), view, lens)
+    return np.clip(np.rint(image), 0.0, 255.0).astype(np.uint8), inside
 
 
 def _contradictions(station: WebcamStation, solution: Calibration, points: Correspondences | None) -> tuple[str, ...]:

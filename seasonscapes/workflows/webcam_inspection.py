@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from pathlib import Path
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path, PurePath
 from typing import TYPE_CHECKING
 
 from seasonscapes.errors import InputError
@@ -13,6 +15,13 @@ from seasonscapes.workflows.place import find_scene
 if TYPE_CHECKING:
     from seasonscapes.cameras.observation import ManifestRow, PictureProblem
     from seasonscapes.cameras.webcam import HeightCheck
+
+
+# What a table needs at least, for people who have not written one yet.
+_NEEDED_KEYS = (
+    "id, latitude_deg, longitude_deg, height_m or above_ground_m, projection, width_px, height_px, horizontal_fov_deg, "
+    "heading_deg, time_zone"
+)
 
 
 @dataclass(frozen=True)
@@ -42,7 +51,7 @@ def scene_with_webcams(scene: str, *, allow_outside: bool = False) -> SceneFile:
     path = find_scene(scene)
     read = read_scene(path, allow_outside=allow_outside)
     if not read.webcams:
-        cure = "add [[webcam]] tables; scenes/bernese_highlands.toml shows how"
+        cure = f"add a [[webcam]] table with {_NEEDED_KEYS}; docs/howto/scene-file.md shows one"
         raise InputError(path, "names no webcam", cure=cure)
     return read
 
@@ -63,9 +72,9 @@ def inspect_webcams(
     scene
         With webcams.
     pictures, layout
-        A folder of pictures to list and check, and the pattern of paths below it.
+        A folder of pictures to list and check, and the pattern of paths below it (`picture_names.scan_folder`).
     manifest
-        Write the list of good pictures to this ``.csv``; or, without ``pictures``, check the pictures it lists.
+        Write the list of good pictures to this ``.csv``, with paths relative to its folder; or, without ``pictures``, check the pictures it lists.
     decode
         Open every picture in full.
     elevation
@@ -76,26 +85,34 @@ def inspect_webcams(
     WebcamInspection
         Heights, pictures and problems.
     """
-    from seasonscapes.cameras.observation import (
-        REFERENCE_LAYOUT,
-        check_pictures,
-        read_manifest,
-        scan_folder,
-        write_manifest,
-    )
+    from seasonscapes.cameras.observation import check_pictures, read_manifest, write_manifest
+    from seasonscapes.cameras.picture_names import scan_folder
 
     heights = _heights(scene, elevation)
     rows, problems = [], []
     if pictures is not None:
-        rows, problems = scan_folder(pictures, scene.webcams, layout=layout or REFERENCE_LAYOUT)
+        rows, problems = scan_folder(pictures, scene.webcams, layout=layout)
         problems += check_pictures(rows, pictures, scene.webcams, decode=decode)
         if manifest is not None:
             bad = {problem.path for problem in problems}
-            write_manifest(manifest, [row for row in rows if row.path not in bad])
+            good = [row for row in rows if row.path not in bad]
+            write_manifest(manifest, _relative_to_manifest(good, pictures, manifest, scene.confinement.allow_outside))
     elif manifest is not None:
         rows = read_manifest(manifest, allow_outside=scene.confinement.allow_outside)
         problems = check_pictures(rows, manifest.parent, scene.webcams, decode=decode)
     return WebcamInspection(scene, heights, rows, problems)
+
+
+def _relative_to_manifest(
+    rows: Sequence[ManifestRow], pictures: Path, manifest: Path, allow_outside: bool
+) -> list[ManifestRow]:
+    """Rows whose paths are relative to the manifest's folder, as readers of a manifest expect them."""
+    folder, base = Path(os.path.abspath(pictures)), Path(os.path.abspath(manifest.parent))
+    if not (allow_outside or folder.is_relative_to(base)):
+        cure = f"write it into {pictures} or a folder above, or pass --allow-outside"
+        raise InputError("--manifest", "lies beside its pictures, not above them", got=str(manifest), cure=cure)
+    prefix = PurePath(os.path.relpath(folder, base))
+    return [replace(row, path=(prefix / row.path).as_posix()) for row in rows]
 
 
 def _heights(scene: SceneFile, elevation: Path | str | None) -> list[HeightCheck]:
