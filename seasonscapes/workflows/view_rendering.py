@@ -116,7 +116,7 @@ def render(
     utc = utc_at(place, time)
     for line in sky_lines(position_at(place, utc)):
         log.info(line)
-    texture = chosen_albedo(place, utc.date(), albedo)
+    texture = chosen_albedo(place, utc.date(), albedo, progress=progress)
     if engine == "transport":
         from seasonscapes.rendering.transport import SamplingOptions
 
