@@ -1,4 +1,4 @@
-# make demo   pictures of the bundled scene in out/demo/
+# make demo   pictures of the bundled scene in out/demo/; `make gallery` adds a night and a film
 # make test   the tests
 # make check  the quick part of both: style, layers, and the tests that take milliseconds
 # make lint   style, types and layers: ruff, pyright, import-linter
@@ -14,7 +14,7 @@ BIN := $(VENV)/bin
 BASE := $(VENV)/.installed
 DEV := $(VENV)/.installed-dev
 
-.PHONY: demo test check docs docs-notebooks tables results lint venv dev llvm clean help
+.PHONY: demo gallery test check docs docs-notebooks tables results lint venv dev llvm clean help
 help:
 	@sed -n '1,8p' Makefile
 
@@ -37,6 +37,9 @@ llvm:
 
 demo: llvm $(BASE)
 	$(BIN)/seasonscapes demo -o out/demo
+
+gallery: llvm $(BASE)
+	$(BIN)/seasonscapes demo --gallery -o out/demo
 
 test: llvm $(DEV)
 	$(BIN)/python -m pytest -q -n 2 --durations=25

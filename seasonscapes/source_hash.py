@@ -98,7 +98,7 @@ def _imports(module: str) -> tuple[str, ...]:
     # In ``from package import module`` both names stand apart in the bytecode.
     dotted = packages | {f"{package}.{name}" for package in packages for name in names if "." not in name}
     inner = (name.removeprefix(_ROOT).removeprefix(".") for name in dotted)
-    return tuple(sorted(name for name in inner if name and _exists(name)))
+    return tuple(sorted(name for name in inner if name and name in _modules()))
 
 
 def _names(code: CodeType) -> Iterator[str]:
@@ -109,6 +109,8 @@ def _names(code: CodeType) -> Iterator[str]:
 
 
 @cache
-def _exists(module: str) -> bool:
-    path = _PACKAGE.joinpath(*module.split("."))
-    return path.with_suffix(".py").is_file() or (path / "__init__.py").is_file()
+def _modules() -> frozenset[str]:
+    """Names of all modules of the package, from one walk, since thousands of names are looked up."""
+    files = (path.relative_to(_PACKAGE).with_suffix("") for path in _PACKAGE.rglob("*.py"))
+    parts = (file.parts[:-1] if file.name == "__init__" else file.parts for file in files)
+    return frozenset(".".join(names) for names in parts)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from seasonscapes.commands.arguments import check_range, parse_size
+from seasonscapes.commands.arguments import parse_size
 from seasonscapes.commands.console import message, print_result, progress_bars
 from seasonscapes.commands.outputs import check_output_folder
 
@@ -17,12 +17,12 @@ def demo_command(
     *,
     camera: str | None = None,
     size: str = "720x480",
-    spp: int = 32,
+    gallery: bool = False,
     device: str = "auto",
     workspace: Path | None = None,
     json: bool = False,
 ) -> None:
-    """Render the embedded scene into contact sheets and a film: a day, four seasons, 24 hours under a full moon, four airs.
+    """Picture the embedded scene through a day, four seasons and four airs.
 
     Pictures that exist already, made with the same arguments, are kept: an interrupted demo continues.
 
@@ -33,9 +33,9 @@ def demo_command(
     camera
         A camera of the scene alpine; the first one when left out.
     size
-        Of the large panels; the hourly ones are half as wide.
-    spp
-        Samples per pixel of the large panels.
+        Of the panels; those of the gallery's night are half as wide.
+    gallery
+        Also 24 hours under a full moon, as a contact sheet and a film.
     device
         auto, cuda or llvm.
     workspace
@@ -44,21 +44,22 @@ def demo_command(
         Print one machine-readable record.
     """
     from seasonscapes.rendering.backend import use_backend
-    from seasonscapes.workflows.demo import contact_sheets, day_film
+    from seasonscapes.workflows.demo import day_and_year, night_and_film
     from seasonscapes.workflows.place import load_place
     from seasonscapes.workspace import Workspace
 
     width, height = parse_size(size)
-    check_range("--spp", spp, 1, 1 << 20)
     check_output_folder(output)
     backend = use_backend(device)
     message(f"demo: rendering on {backend.variant} ({backend.reason})")
-    message("demo: building the embedded scene (the first time takes a minute)")
+    message("demo: building the embedded scene")
+    made: list[Path] = []
     with progress_bars() as progress:
         place = load_place("alpine", None if workspace is None else Workspace(workspace), progress=progress)
         view = place.scene.camera(camera)
-        sheets = contact_sheets(place, view, output, size_px=(width, height), spp=spp, progress=progress)
-        film_size = (width // 4 * 2, height // 4 * 2)
-        film = day_film(place, view, output / "24-hours.mp4", size_px=film_size, device=device, progress=progress)
-    record = {"sheets": [str(sheet) for sheet in sheets], "film": str(film)}
-    print_result(record, [f"{len(sheets)} contact sheets and a film in {output}"], as_json=json)
+        made += day_and_year(place, view, output, size_px=(width, height), progress=progress)
+        if gallery:
+            half = (width // 4 * 2, height // 4 * 2)
+            made += night_and_film(place, view, output, size_px=half, device=device, progress=progress)
+    files = [str(path) for path in made]
+    print_result({"files": files}, [*files, f"and the panels of the sheets in {output}"], as_json=json)

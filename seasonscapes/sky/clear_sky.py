@@ -45,7 +45,7 @@ __all__ = [
 ]
 
 # Increment whenever the tables of an unchanged atmosphere change.
-TABLES_REVISION = 4
+TABLES_REVISION = 5
 # A luminary of less normal illuminance is omitted [lx].
 _MIN_NORMAL_LX = 1e-6
 

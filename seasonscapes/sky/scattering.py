@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from seasonscapes.sky.atmosphere import Atmosphere, Optics, delta_scaled, gas_moments, optics
 from seasonscapes.sky.curved_rays import (
@@ -50,7 +51,8 @@ from seasonscapes.sky.sh_moments import (
 )
 from seasonscapes.sky.spectrum import WAVELENGTHS_NM
 
-_AZIMUTHS, _CELLS, _THREADS = 11, 24, 4
+# Azimuths of the first two orders, and of the later ones, which have harmonics up to `LATER_ORDER` only.
+_AZIMUTHS, _LATER_AZIMUTHS, _CELLS, _THREADS = 11, 6, 24, 4
 
 
 @dataclass(frozen=True)
@@ -93,6 +95,7 @@ class _Level:
     """Rays from one table height for all solar elevations; shared by all orders of scattering."""
 
     samples: CellSamples
+    azimuths: np.ndarray  # between ray and sun (A,) [rad]
     sines: np.ndarray  # of the rays' elevations (K,)
     weights: np.ndarray  # solid angle (K, A) [sr]
     basis: np.ndarray  # spherical harmonics of the rays' directions (K, A, L, L)
@@ -102,20 +105,27 @@ class _Level:
     end_fraction: np.ndarray
 
 
-def _build_level(atmosphere: Atmosphere, scaled: Optics, height_m: float) -> _Level:
+def _build_levels(atmosphere: Atmosphere, scaled: Optics, height_m: float) -> tuple[_Level, _Level]:
+    """Rays from one table height with the azimuths of the first two orders, and with those of the later orders."""
     elevation, weight = _directions(float(horizon_elevation_rad(atmosphere, height_m)))
     rays = trace_curved_rays(atmosphere, height_m, elevation)
     samples = sample_cells(atmosphere, scaled, rays, cell_edges_m(atmosphere, rays, _CELLS))
-    azimuth = (np.arange(_AZIMUTHS) + 0.5) * np.pi / _AZIMUTHS
+    return (_level(samples, elevation, weight, _AZIMUTHS), _level(samples, elevation, weight, _LATER_AZIMUTHS))
+
+
+def _level(samples: CellSamples, elevation: np.ndarray, weight: np.ndarray, azimuth_count: int) -> _Level:
+    azimuth = (np.arange(azimuth_count) + 0.5) * np.pi / azimuth_count
     sun = np.radians(SUN_ELEVATION_KNOTS_DEG)
     suns, azimuths = (grid.ravel() for grid in np.meshgrid(sun, azimuth, indexing="ij"))
     geometry = sun_geometry(samples, elevation, suns, azimuths)
     x = np.cos(elevation)[:, None] * np.cos(azimuth)
     z = np.broadcast_to(np.sin(elevation)[:, None], x.shape)
     basis = zonal(z) * azimuthal(x, z)[..., None, :]
+    # Higher m would alias on this many azimuths.
+    basis[..., azimuth_count:] = 0.0
     end_sine = local_sun_sine(samples.edges.central_angle_rad[:, -1, None], suns, np.cos(azimuths))
-    weights = np.repeat(weight[:, None] * (2.0 * np.pi / _AZIMUTHS), _AZIMUTHS, axis=1)
-    return _Level(samples, np.sin(elevation), weights, basis, geometry, *sun_index(end_sine))
+    weights = np.repeat(weight[:, None] * (2.0 * np.pi / azimuth_count), azimuth_count, axis=1)
+    return _Level(samples, azimuth, np.sin(elevation), weights, basis, geometry, *sun_index(end_sine))
 
 
 def _first_radiance(atmosphere: Atmosphere, scaled: Optics, columns: SunColumns, level: _Level) -> np.ndarray:
@@ -125,10 +135,9 @@ def _first_radiance(atmosphere: Atmosphere, scaled: Optics, columns: SunColumns,
         atmosphere, columns, scaled, samples.height_m[..., None], np.arcsin(level.geometry.sun_sine)
     )
     sun = np.radians(SUN_ELEVATION_KNOTS_DEG)
-    azimuth = (np.arange(_AZIMUTHS) + 0.5) * np.pi / _AZIMUTHS
     nu = level.sines[:, None, None] * np.sin(sun)[:, None] + np.sqrt(1.0 - level.sines**2)[:, None, None] * np.cos(sun)[
         :, None
-    ] * np.cos(azimuth)
+    ] * np.cos(level.azimuths)
     nu = nu.reshape(len(level.sines), -1)
     degrees = np.arange(HARMONIC_ORDER + 1)
     phases = [
@@ -180,9 +189,11 @@ def atmosphere_tables(atmosphere: Atmosphere, *, tolerance: float = 0.1, max_ord
     albedo = np.broadcast_to(np.asarray(atmosphere.ground_albedo, float), WAVELENGTHS_NM.shape) / np.pi
     sun = np.radians(SUN_ELEVATION_KNOTS_DEG)
     direct = sun_transfer(atmosphere, columns, scaled, np.full(sun.shape, atmosphere.ground_height_m), sun)
-    # Levels are independent within an order, and numpy releases the interpreter lock, so threads run in parallel.
-    with ThreadPoolExecutor(_THREADS) as pool:
-        levels = list(pool.map(lambda height: _build_level(atmosphere, scaled, height), table_heights_m(atmosphere)))
+    # Levels are independent within an order, and numpy releases the interpreter lock, so threads run in parallel. Their
+    # matrices are small: threads of BLAS within each would wait for one another most of the time.
+    with threadpool_limits(1, "blas"), ThreadPoolExecutor(_THREADS) as pool:
+        pairs = pool.map(lambda height: _build_levels(atmosphere, scaled, height), table_heights_m(atmosphere))
+        levels, later_levels = zip(*pairs, strict=True)
         ground_radiance = direct * np.maximum(np.sin(sun), 0.0)[:, None] * albedo
         values, ground = _stack_levels(
             pool.map(
@@ -199,7 +210,7 @@ def atmosphere_tables(atmosphere: Atmosphere, *, tolerance: float = 0.1, max_ord
             source = values if order == 2 else values[:, :, : LATER_ORDER + 1, : LATER_ORDER + 1]
             previous, moments, ground_radiance = values[:, :, 0, 0], as_sh_moments(source, ground), ground * albedo
             next_order = partial(_next_order, atmosphere, scaled, moments, ground_radiance)
-            values, ground = _stack_levels(pool.map(next_order, levels))
+            values, ground = _stack_levels(pool.map(next_order, levels if order == 2 else later_levels))
             total, total_ground = total + values, total_ground + ground
             # Higher orders keep their angular shape and decay geometrically in each band.
             decay = np.clip(values[:, :, 0, 0] / np.maximum(previous, MIN_MEAN), 0.0, 0.98)

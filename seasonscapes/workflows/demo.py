@@ -3,34 +3,29 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import date, datetime, timedelta
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from seasonscapes.albedo.seasons import AlbedoSeries
 from seasonscapes.civil_time import resolve_time
-from seasonscapes.exposure import exposure_ev100
 from seasonscapes.images import write_png, write_png8
 from seasonscapes.progress import Progress, each_reported
 from seasonscapes.scene import NamedCamera
 from seasonscapes.sky.models import read_sky_model
 from seasonscapes.source_hash import source_hash
-from seasonscapes.workflows.albedo_sources import scene_albedo
-from seasonscapes.workflows.illumination import illumination_for_camera
+from seasonscapes.workflows.albedo_sources import dated_albedos
 from seasonscapes.workflows.pictures import develop
 from seasonscapes.workflows.place import MeshOptions, Place
-from seasonscapes.workflows.relight_session import RenderJob
-from seasonscapes.workflows.timelapse import make_film
-from seasonscapes.workflows.views import camera_for, terrain_for_view
+from seasonscapes.workflows.relight_session import RelightSession, RenderJob, still_session, view_at
+from seasonscapes.workflows.timelapse import cached_session, make_film
+from seasonscapes.workflows.view_rendering import still_sampling
+from seasonscapes.workflows.views import camera_for
 from seasonscapes.workspace import content_key
-
-if TYPE_CHECKING:
-    from seasonscapes.rendering.mitsuba_scene import RenderScene
-    from seasonscapes.rendering.radiance import RenderedView
-    from seasonscapes.terrain.surface import Terrain
 
 log = logging.getLogger(__name__)
 
@@ -68,16 +63,15 @@ AIR = [
 ]
 
 
-def contact_sheets(
+def day_and_year(
     place: Place,
     view: NamedCamera,
     output: Path,
     *,
     size_px: tuple[int, int] = (720, 480),
-    spp: int = 32,
     progress: Progress | None = None,
 ) -> list[Path]:
-    """Path trace the panels of three contact sheets (a day and a year, four airs, 24 hours) and assemble them.
+    """Relight one view through a day, four seasons and four airs, as two contact sheets.
 
     Panels that exist already, made from the same inputs by the same code, are kept.
 
@@ -88,9 +82,7 @@ def contact_sheets(
     output
         Folder for panels and sheets.
     size_px
-        Of the large panels; the hourly ones are half as wide.
-    spp
-        Samples per pixel.
+        Of the panels.
     progress
         Called with a task and its finished share.
 
@@ -99,34 +91,47 @@ def contact_sheets(
     list of pathlib.Path
         The sheets.
     """
-    renderer = _PanelRenderer(place, view, output, spp)
-    half = (size_px[0] // 2, size_px[1] // 2)
-    sheets = []
-    for name, panels, columns, size in (
-        ("day-and-year", DAY_AND_YEAR, 4, size_px),
-        ("air", AIR, 2, size_px),
-        ("24-hours", HOURS, 6, half),
-    ):
-        pictures = [
-            renderer.picture(f"{name}-{index:02d}", panel, size)
-            for index, panel in enumerate(each_reported(panels, len(panels), progress, name))
-        ]
-        sheets.append(output / f"{name}.png")
-        contact_sheet(sheets[-1], pictures, [panel.caption for panel in panels], columns=columns)
-        log.info("demo: %s", sheets[-1])
-    return sheets
+
+    def session() -> RelightSession:
+        series = AlbedoSeries(tuple(dated_albedos(place)), "nearest")
+        camera = camera_for(place, view, size_px=size_px)
+        base_day = date(YEAR, 9, 18)
+        return still_session(
+            place, camera, albedo=series, base_day=base_day, sampling=still_sampling(), progress=progress
+        )
+
+    panels = _Panels(place, view, output, size_px, session)
+    return [
+        panels.sheet("day-and-year", DAY_AND_YEAR, columns=4, progress=progress),
+        panels.sheet("air", AIR, columns=2, progress=progress),
+    ]
 
 
-def day_film(
+def night_and_film(
     place: Place,
     view: NamedCamera,
-    path: Path,
+    output: Path,
     *,
-    size_px: tuple[int, int],
+    size_px: tuple[int, int] = (360, 240),
     device: str = "auto",
     progress: Progress | None = None,
-) -> Path:
-    """Film a day and a night, every ten minutes; undeveloped frames stay in the workspace for the next time."""
+) -> tuple[Path, Path]:
+    """Show 24 hours under a full moon, as a contact sheet and as a film with a frame every ten minutes.
+
+    Parameters
+    ----------
+    place, view, output, progress
+        As in `day_and_year`.
+    size_px
+        Of panels and frames.
+    device
+        ``"auto"``, ``"cuda"`` or ``"llvm"``.
+
+    Returns
+    -------
+    sheet, film
+        The files. Undeveloped frames stay in the workspace for the next time.
+    """
     job = RenderJob(
         place.path.resolve(),
         place.workspace.folder.resolve(),
@@ -138,60 +143,63 @@ def day_film(
         base_day=_FIRST_HOUR.date(),
         device=device,
     )
+    panels = _Panels(place, view, output, size_px, lambda: cached_session(job, place=place, progress=progress))
+    sheet = panels.sheet("24-hours", HOURS, columns=6, progress=progress)
     start = resolve_time(f"{_FIRST_HOUR:%Y-%m-%dT%H:%M}", view.latitude_deg, view.longitude_deg).utc
     times = [start + index * timedelta(minutes=10) for index in range(145)]
-    make_film(job, times, path, keep_frames=True, place=place, progress=progress)
-    log.info("demo: %s", path)
-    return path
+    film = output / "24-hours.mp4"
+    make_film(job, times, film, keep_frames=True, place=place, progress=progress)
+    log.info("demo: %s", film)
+    return sheet, film
 
 
-class _PanelRenderer:
-    """Renders panels of one place; the mesh is kept while the albedo's day stays the same."""
+class _Panels:
+    """Relit panels of one view; its light transport is traced, or loaded, when the first panel is missing."""
 
-    def __init__(self, place: Place, view: NamedCamera, folder: Path, spp: int) -> None:
-        self.place, self.view, self.folder, self.spp = place, view, folder, spp
-        self.day: date | None = None
-        self.mi_mesh: Any = None
+    def __init__(
+        self,
+        place: Place,
+        view: NamedCamera,
+        folder: Path,
+        size_px: tuple[int, int],
+        make_session: Callable[[], RelightSession],
+    ) -> None:
+        self.place, self.view, self.folder, self.size_px = place, view, folder, size_px
+        self._make_session = make_session
 
     @cached_property
-    def terrain(self) -> Terrain:
-        """The terrain as the view needs it; made when the first panel is rendered."""
-        return terrain_for_view(self.place, camera_for(self.place, self.view, size_px=(768, 512)))
+    def session(self) -> RelightSession:
+        return self._make_session()
 
-    def picture(self, name: str, panel: Panel, size_px: tuple[int, int]) -> Path:
-        """Render one panel, or keep the file that was made from the same inputs."""
+    def sheet(self, name: str, panels: list[Panel], *, columns: int, progress: Progress | None) -> Path:
+        """Write the panels and their contact sheet."""
+        pictures = [
+            self.picture(f"{name}-{index:02d}", panel)
+            for index, panel in enumerate(each_reported(panels, len(panels), progress, name))
+        ]
+        path = self.folder / f"{name}.png"
+        contact_sheet(path, pictures, [panel.caption for panel in panels], columns=columns)
+        log.info("demo: %s", path)
+        return path
+
+    def picture(self, name: str, panel: Panel) -> Path:
+        """Relight one panel, or keep the file that was made from the same inputs."""
         from PIL import Image
 
         path = self.folder / f"{name}.png"
-        inputs = {"panel": panel, "size": size_px, "spp": self.spp, "view": self.view, "place": self.place.key}
+        inputs = {"panel": panel, "size": self.size_px, "view": self.view, "place": self.place.key}
         key = content_key(inputs | {"code": source_hash(*_CODE)})
         if path.is_file():
             with Image.open(path) as image:
                 if image.info.get("seasonscapes:panel") == key:
                     return path
-        view, ev100 = self._view(panel, size_px)
-        log.info("demo: %s  %s; EV %.1f", path.name, panel.caption, ev100)
-        write_png(path, develop(view, exposure=ev100), metadata={"seasonscapes:panel": key})
+        session = replace(self.session, sky=read_sky_model(panel.sky))
+        time = resolve_time(panel.time, self.view.latitude_deg, self.view.longitude_deg).utc
+        relit, light, _ = view_at(session, time)
+        relit = replace(relit, provenance={"white_rgb": light.white_rgb})
+        write_png(path, develop(relit), metadata={"seasonscapes:panel": key})
+        log.info("demo: %s  %s", path.name, panel.caption)
         return path
-
-    def _view(self, panel: Panel, size_px: tuple[int, int]) -> tuple[RenderedView, float]:
-        from seasonscapes.rendering.radiance import render_view
-
-        place, view = self.place, self.view
-        time = resolve_time(panel.time, view.latitude_deg, view.longitude_deg).utc
-        camera = camera_for(place, view, size_px=size_px)
-        light, _ = illumination_for_camera(place, camera, read_sky_model(panel.sky), time)
-        picture = render_view(self._scene(time.date(), light), camera, spp=self.spp)
-        return replace(picture, provenance={"white_rgb": light.white_rgb}), exposure_ev100(
-            picture.radiance, look="photo"
-        )
-
-    def _scene(self, day: date, light: Any) -> RenderScene:
-        from seasonscapes.rendering.mitsuba_scene import mi_mesh, relight
-
-        if self.day != day:
-            self.day, self.mi_mesh = day, mi_mesh(self.terrain, scene_albedo(self.place, day).values)
-        return relight(self.mi_mesh, light)
 
 
 def contact_sheet(path: Path, pictures: list[Path], captions: list[str], *, columns: int) -> None:

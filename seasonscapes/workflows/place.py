@@ -263,7 +263,8 @@ def require_near(place: Place, latitude_deg: float, longitude_deg: float, *, whe
 
 
 def _massif(scene: SceneFile, workspace: Workspace) -> SyntheticMassif:
-    from seasonscapes.workflows import terrain_building
+    # Imported here, since the generator loads a second of libraries that no other scene needs.
+    from seasonscapes.terrain.synthetic import alpine_massif, load_massif, save_massif
 
     assert scene.elevation is not None
     assert scene.elevation.synthetic is not None
@@ -274,9 +275,9 @@ def _massif(scene: SceneFile, workspace: Workspace) -> SyntheticMassif:
         {"synthetic": declared},
         code=_MASSIF_CODE,
         suffix=".npz",
-        build=lambda: terrain_building.build_massif(declared),
-        save=terrain_building.save_massif,
-        load=terrain_building.load_massif,
+        build=lambda: alpine_massif(seed=declared.seed, size_m=declared.size_m, spacing_m=declared.spacing_m),
+        save=save_massif,
+        load=load_massif,
     )
 
 

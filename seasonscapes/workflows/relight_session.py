@@ -121,6 +121,8 @@ class RelightSession:
         Of the coefficients.
     coefficients, ray_scene, relightable
         The traced transport and its copy on the device.
+    by_elevation
+        Whether diffuse light is interpolated between solar elevations, which pays for many instants.
     """
 
     place: Place
@@ -132,6 +134,7 @@ class RelightSession:
     coefficients: ViewCoefficients
     ray_scene: RayScene
     relightable: RelightableView
+    by_elevation: bool = False
     _albedos: dict[int, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, repr=False)
     _transitions: dict[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, repr=False)
     _current: tuple[list[tuple[int, float]], RelightableView] | None = field(default=None, repr=False)
@@ -193,6 +196,26 @@ def relight_session(
     >>> views[0].radiance.shape
     (32, 48, 3)
     """
+    session = still_session(
+        place, camera, sky=sky, albedo=albedo, base_day=base_day, seed=seed, sampling=sampling, progress=progress
+    )
+    tabulate_illumination(place, session.camera, session.sky, progress=task_progress(progress, "light of the sky"))
+    session.by_elevation = True
+    return session
+
+
+def still_session(
+    place: Place,
+    camera: Camera | Panorama,
+    *,
+    sky: str | Path | SkyModel = "clear",
+    albedo: AlbedoSource = None,
+    base_day: date = _MIDSUMMER,
+    seed: int = 0,
+    sampling: SamplingOptions | None = None,
+    progress: Progress | None = None,
+) -> RelightSession:
+    """`relight_session` for few instants: the light of each is computed, and no tables are built for it first."""
     from seasonscapes.rendering.hemisphere_rays import ray_scene
     from seasonscapes.rendering.mitsuba_scene import mi_mesh
     from seasonscapes.rendering.relit_view import relightable_view
@@ -206,7 +229,6 @@ def relight_session(
     camera, model = view_in_frame(camera, place.frame), sky_model(sky)
     base = nearest_albedo(albedo, base_day)
     scene = ray_scene(mi_mesh(terrain_for_view(place, camera), base.load().values))
-    tabulate_illumination(place, camera, model, progress=task_progress(progress, "light transport", end=0.1))
     inputs = {"place": place.key, **_camera_values(camera), "albedo": _identity(base), "seed": seed}
     coefficients = _coefficients(place, camera, scene, inputs, seed, sampling, progress)
     relightable = relightable_view(scene, coefficients)
@@ -303,7 +325,7 @@ def _coefficients(
         except DamagedFile as error:
             log.info("%s; light transport is traced again", error)
     if coefficients is None:
-        report = task_progress(progress, "light transport", start=0.1)
+        report = task_progress(progress, "light transport")
         save_coefficients(folder, trace_view(scene, camera, sampling, seed=seed, progress=report), key=key)
         coefficients = load_coefficients(folder, key=key)
     assert isinstance(coefficients, ViewCoefficients)
@@ -356,7 +378,7 @@ def view_at(session: RelightSession, time: datetime) -> tuple[RenderedView, Illu
 
     rows = _CLOUDY_ROWS if session.sky.cloudiness > 0.0 else _CLEAR_ROWS
     light, position = illumination_for_camera(
-        session.place, session.camera, session.sky, time, map_height=rows, by_elevation=True
+        session.place, session.camera, session.sky, time, map_height=rows, by_elevation=session.by_elevation
     )
     return relight_view(view_of_day(session, time.date()), light), light, position
 

@@ -21,28 +21,24 @@ from seasonscapes.terrain.raster_files import OWN_FOLDER
 from seasonscapes.terrain.refine import refine_raster, refinement_factor
 from seasonscapes.terrain.surface import Raster, Terrain, load_terrain, save_terrain
 from seasonscapes.terrain.surface_grid import surface_grid
-from seasonscapes.terrain.synthetic import alpine_massif, load_massif, save_massif
 from seasonscapes.terrain.tile_files import read_elevation_tiles, tile_spacing_m
 from seasonscapes.terrain.unwrap import ATLASES, Atlas, unwrap
 
 if TYPE_CHECKING:
-    from seasonscapes.scene import SceneFile, SyntheticElevation
+    from seasonscapes.scene import SceneFile
     from seasonscapes.terrain.raster import FillReport
     from seasonscapes.terrain.synthetic import SyntheticMassif
 
 __all__ = [
     "MeshOptions",
-    "build_massif",
     "build_terrain",
     "finest_texel_m",
     "load_built_terrain",
-    "load_massif",
     "local_frame",
     "read_heights",
     "read_scene_elevation",
     "sample_spacing_m",
     "save_built_terrain",
-    "save_massif",
     "tell_texel_wish",
 ]
 
@@ -100,11 +96,6 @@ class MeshOptions:
             raise InputError("--refine", "out of range", got=self.refine, expected="1 to 64")
         if not 1 <= self.max_side_px <= 32_768:
             raise InputError("max_side_px", "out of range", got=self.max_side_px, expected="1 to 32768")
-
-
-def build_massif(declared: SyntheticElevation) -> SyntheticMassif:
-    """Generate the synthetic massif that a scene file declares."""
-    return alpine_massif(seed=declared.seed, size_m=declared.size_m, spacing_m=declared.spacing_m)
 
 
 def read_heights(scene: SceneFile, massif: SyntheticMassif | None, *, where: str) -> tuple[Raster, FillReport]:

@@ -20,7 +20,7 @@ from seasonscapes.sky.report import eclipse_text, moon_text
 from seasonscapes.workflows.albedo_sources import AlbedoSource, chosen_albedo
 from seasonscapes.workflows.illumination import SunMoonPosition, illumination_for_camera, position_at, sky_model
 from seasonscapes.workflows.place import Place, utc_at
-from seasonscapes.workflows.relight_session import relight_session, view_at
+from seasonscapes.workflows.relight_session import still_session, view_at
 from seasonscapes.workflows.views import camera_geodetic, terrain_for_view
 from seasonscapes.workspace import content_key
 
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from seasonscapes.cameras.panorama import Panorama
     from seasonscapes.cameras.pinhole import Camera
     from seasonscapes.rendering.radiance import RenderedView
+    from seasonscapes.rendering.transport import SamplingOptions
     from seasonscapes.sky.illumination import Illumination
 
 log = logging.getLogger(__name__)
@@ -118,11 +119,9 @@ def render(
         log.info(line)
     texture = chosen_albedo(place, utc.date(), albedo, progress=progress)
     if engine == "transport":
-        from seasonscapes.rendering.transport import SamplingOptions
-
-        # A third of the time of a film's coefficients; errors against four times their rays are 0.6 % (RMS).
-        still = SamplingOptions(albedo_samples=16, rays=128)
-        session = relight_session(place, camera, sky=sky, albedo=texture, seed=seed, sampling=still, progress=progress)
+        session = still_session(
+            place, camera, sky=sky, albedo=texture, seed=seed, sampling=still_sampling(), progress=progress
+        )
         view, light, position = view_at(session, utc)
         record = view_record(place, camera, light, position)
         return replace(view, provenance=record | {"engine": engine, "seed": seed, "variant": backend.variant})
@@ -139,6 +138,13 @@ def render(
     record = view_record(place, camera, light, position)
     record |= {"engine": engine, "spp": spp, "max_depth": max_depth, "seed": seed, "variant": backend.variant}
     return replace(view, provenance=record)
+
+
+def still_sampling() -> SamplingOptions:
+    """Samples and rays of a still: a third of the time of a film's; errors against four times their rays are 0.6 % (RMS)."""
+    from seasonscapes.rendering.transport import SamplingOptions
+
+    return SamplingOptions(albedo_samples=16, rays=128)
 
 
 def chosen_engine(engine: str, *, path_options: bool, device: str) -> str:

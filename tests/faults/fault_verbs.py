@@ -36,7 +36,7 @@ BASE: dict[str, list[str]] = {
     "run": ["s.toml", "--times", TIME, "--at-hours", TIME, "--manifest", "m.csv", "--output", "out/run"],
     "evaluate": ["--truth", "p.png", "--pictures", "p.png"],
     "info": ["p.png"],
-    "demo": ["out/demo", "--spp", "1"],
+    "demo": ["out/demo", "--size", "48x32"],
     "doctor": [],
 }
 SCENE_VERBS = [verb for verb, tokens in BASE.items() if tokens[:1] in (["s.toml"], ["w.toml"])]
