@@ -69,6 +69,37 @@ def zone_at(latitude_deg: float, longitude_deg: float) -> str:
     return name
 
 
+def parse_time_text(text: str) -> datetime:
+    """Parse an ISO 8601 date and time as it is written, with or without UTC offset.
+
+    Raises
+    ------
+    InputError
+        If the text is not a date with a time, or its hour or minute has a fraction.
+    """
+    text = text.strip()
+    if _FRACTION.match(text):
+        expected = "hours, minutes and seconds with colons between"
+        cure = "write half past six in the evening as T18:30"
+        raise InputError("time", "an hour or minute with a fraction", got=text, expected=expected, cure=cure)
+    try:
+        if not _ISO_8601.fullmatch(text):
+            raise ValueError("another form than those above")
+        parsed = datetime.fromisoformat(text.upper())
+    except ValueError:
+        raise InputError(
+            "time",
+            "not an ISO 8601 date and time",
+            got=text,
+            expected="e.g. 2024-09-01T12:00, 2024-09-01T12:00+02:00 or 2024-09-01T10:00Z",
+        ) from None
+    if not any(separator in text for separator in "Tt "):
+        raise InputError(
+            "time", "the hour is missing", got=text, expected="a date and time", cure=f"write {text}T12:00"
+        )
+    return parsed
+
+
 def resolve_time(text: str, latitude_deg: float, longitude_deg: float) -> ResolvedTime:
     """Parse an ISO 8601 date and time; without UTC offset it is civil time at the place.
 
@@ -96,19 +127,9 @@ def resolve_time(text: str, latitude_deg: float, longitude_deg: float) -> Resolv
     >>> resolve_time("2024-09-01T12:00+02:00", 46.6, 8.0).reading
     '2024-09-01T12:00+02:00 = 2024-09-01T10:00:00Z'
     """
+    parsed = parse_time_text(text)
     text = text.strip()
-    if _FRACTION.match(text):
-        expected = "hours, minutes and seconds with colons between"
-        cure = "write half past six in the evening as T18:30"
-        raise InputError("time", "an hour or minute with a fraction", got=text, expected=expected, cure=cure)
     try:
-        if not _ISO_8601.fullmatch(text):
-            raise ValueError("another form than those above")
-        parsed = datetime.fromisoformat(text.upper())
-        if not any(separator in text for separator in "Tt "):
-            raise InputError(
-                "time", "the hour is missing", got=text, expected="a date and time", cure=f"write {text}T12:00"
-            )
         if parsed.utcoffset() is not None:
             utc = parsed.astimezone(UTC)
             return ResolvedTime(utc, None, f"{text} = {_utc_text(utc)}")
@@ -119,13 +140,6 @@ def resolve_time(text: str, latitude_deg: float, longitude_deg: float) -> Resolv
         utc = early.astimezone(UTC)
     except OverflowError:
         raise InputError("time", "out of range", got=text) from None
-    except ValueError:
-        raise InputError(
-            "time",
-            "not an ISO 8601 date and time",
-            got=text,
-            expected="e.g. 2024-09-01T12:00, 2024-09-01T12:00+02:00 or 2024-09-01T10:00Z",
-        ) from None
     reading = f"{parsed.isoformat(timespec='minutes')} civil time in {name} ({early:%Z}) = {_utc_text(utc)}"
     return ResolvedTime(utc, name, reading)
 

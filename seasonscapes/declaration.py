@@ -197,7 +197,7 @@ def validate(table: dict[str, Any], model: type[Model], *, where: str | Path) ->
         return model.model_validate(table)
     except ValidationError as error:
         found = sorted(error.errors(), key=lambda details: details["type"] != "extra_forbidden")
-        problems = [_input_error(details, model, where) for details in found if not _misspelt(details, found)]
+        problems = [_input_error(details, model, where, table) for details in found if not _misspelt(details, found)]
         if len(problems) == 1:
             raise problems[0] from None
         told = "; ".join(str(problem).removeprefix(f"{where}: ") for problem in problems)
@@ -214,8 +214,9 @@ def _misspelt(details: ErrorDetails, errors: list[ErrorDetails]) -> bool:
     return bool(difflib.get_close_matches(str(key), beside, n=1))
 
 
-def _input_error(details: ErrorDetails, model: type[BaseModel], where: str | Path) -> InputError:
+def _input_error(details: ErrorDetails, model: type[BaseModel], where: str | Path, table: dict[str, Any]) -> InputError:
     location = [part for part in details["loc"] if not (isinstance(part, str) and part.startswith("function-"))]
+    location = _as_written(location, table)
     key = ".".join(f"[{part}]" if isinstance(part, int) else str(part) for part in location).replace(".[", "[")
     at = f"{where}: {key}" if key else f"{where}"
     if details["type"] == "extra_forbidden":
@@ -238,6 +239,25 @@ def _expected_at(model: type[BaseModel], location: list[int | str]) -> str | Non
     if field is None or get_origin(field.annotation) is not Literal:
         return None
     return "one of " + ", ".join(str(value) for value in get_args(field.annotation))
+
+
+def _member(value: Any, part: Any) -> Any:
+    """What a dictionary or list of TOML holds under a key or number; ``None`` where there is nothing."""
+    if isinstance(value, dict):
+        return value.get(part)
+    return value[part] if isinstance(value, list) and isinstance(part, int) and part < len(value) else None
+
+
+def _as_written(location: list[int | str], table: dict[str, Any]) -> list[int | str]:
+    """A location without the numbers of arrays that the file has as a single table."""
+    written: list[int | str] = []
+    here: Any = table
+    for part in location:
+        if isinstance(part, int) and isinstance(here, dict):
+            continue
+        written.append(part)
+        here = _member(here, part)
+    return written
 
 
 def _fields_at(model: type[BaseModel], location: list[int | str]) -> list[str]:

@@ -8,16 +8,19 @@ from __future__ import annotations
 import logging
 import math
 from dataclasses import replace
+from datetime import date as date_type
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, PrivateAttr, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, PrivateAttr, field_validator, model_validator
 
 from seasonscapes.cameras.pinhole import Camera, camera_at
 from seasonscapes.cameras.webcam import Webcam
+from seasonscapes.civil_time import parse_time_text
 from seasonscapes.declaration import MOST_NAME_CHARACTERS, Declaration, InputError, Name, Text, read_declaration
 from seasonscapes.frames import STANDARD_REFRACTION_K, Latitude, LocalFrame, Longitude
-from seasonscapes.terrain.raster_files import OWN_FOLDER, Confinement, confined_path, raster_hash
+from seasonscapes.terrain.raster_files import OWN_FOLDER, Confinement, confined_path, rasters_hash
+from seasonscapes.terrain.tile_files import named_tiles
 
 log = logging.getLogger(__name__)
 
@@ -105,13 +108,44 @@ class SyntheticElevation(Declaration):
         return self
 
 
-class Elevation(Declaration):
-    """Elevation raster: either a file or synthetic terrain.
+class RasterFiles(Declaration):
+    """A raster in one file or in many tiles.
 
     Parameters
     ----------
     file
         Raster file, relative to the scene file's folder.
+    files
+        In place of ``file``: names and patterns of tiles, such as ``["tiles/*.tif"]``. They may overlap, and differ in CRS
+        and spacing; where several have a value, that of the newest counts (by a date or year in their names, then in the
+        order given). Where tiles are missing there is no data.
+    """
+
+    file: str | None = None
+    files: list[str] | None = Field(default=None, min_length=1, max_length=1000)
+
+    @property
+    def paths(self) -> tuple[str, ...]:
+        """The raster's files; after `read_scene` absolute, patterns resolved and the newest first."""
+        return tuple(self.files or ()) if self.file is None else (self.file,)
+
+    @property
+    def label(self) -> str:
+        """What messages call the raster: its file, or the first and the number of its tiles."""
+        first = Path(self.paths[0]).name
+        return first if len(self.paths) == 1 else f"{first} and {len(self.paths) - 1} more"
+
+    def without_folders(self) -> Any:
+        """A copy with the names of the files alone, for keys of artefacts, which move with their scene."""
+        names = [Path(path).name for path in self.paths]
+        return self.model_copy(update={"file": names[0]} if self.file is not None else {"files": names or None})
+
+
+class Elevation(RasterFiles):
+    """Elevation raster: a file, tiles, or synthetic terrain.
+
+    Parameters
+    ----------
     band
         Band of the file, counted from 1; may be left out where there is one.
     unit
@@ -119,12 +153,11 @@ class Elevation(Declaration):
     nodata
         Value of the file that means no data, besides what it declares.
     synthetic
-        Synthetic terrain in place of a file.
+        Synthetic terrain in place of files.
     max_hole_share
         Largest fraction of cells without data that is filled by interpolation.
     """
 
-    file: str | None = None
     band: int | None = Field(default=None, ge=1)
     unit: HeightUnit | None = None
     nodata: float | None = None
@@ -133,18 +166,37 @@ class Elevation(Declaration):
 
     @model_validator(mode="after")
     def _one_source(self) -> Elevation:
-        if (self.file is None) == (self.synthetic is None):
-            raise ValueError("give either 'file' or a table 'synthetic'")
+        if (self.file is not None) + (self.files is not None) + (self.synthetic is not None) != 1:
+            raise ValueError("give either 'file' or a table 'synthetic', or the tiles of a raster as 'files'")
         return self
 
 
-class Imagery(Declaration):
-    """Colour image of the ground that is used as its albedo.
+def _iso_text(value: Any) -> Any:
+    """Dates and times of TOML as ISO 8601 text."""
+    return value.isoformat() if isinstance(value, date_type) else value
+
+
+def _iso_date(value: str) -> str:
+    try:
+        return date_type.fromisoformat(value).isoformat()
+    except ValueError:
+        raise ValueError(f"not a date: {value!r}; expected YYYY-MM-DD") from None
+
+
+def _time_text(value: str) -> str:
+    if value != "unknown":
+        try:
+            parse_time_text(value)
+        except InputError as error:
+            raise ValueError(str(error).removeprefix("time: ")) from None
+    return value
+
+
+class Imagery(RasterFiles):
+    """Colour image of the ground that is used as its albedo; several ``[[imagery]]`` are images of several dates.
 
     Parameters
     ----------
-    file
-        Raster file, relative to the scene file's folder.
     encoding
         Transfer function of the pixel values.
     full_scale
@@ -161,21 +213,37 @@ class Imagery(Declaration):
         estimated from shading and cast shadows. Its light is taken out before the image is used.
     sun_deg
         Azimuth and elevation of the sun in the image [deg], where they are known and the time is not.
+    date
+        Day that the image shows, ``YYYY-MM-DD``, where ``time`` does not say it. Each of several images needs one; the albedo of
+        any day is interpolated between them.
     sky
         Sky model of that hour: a bundled name (``clear``, ``hazy``, ``overcast``, ``hosek`` …).
     delit
         The image holds no light: a reflectance product, or one whose light was taken out before.
     """
 
-    file: str
     encoding: Literal["srgb", "linear"] = "srgb"
     full_scale: float | None = Field(default=None, gt=0.0)
     bands: list[int] | None = Field(default=None, min_length=1, max_length=3)
     reflectance_scale: float = Field(default=0.5, gt=0.0, le=2.0)
-    time: str | None = None
+    time: Annotated[str, BeforeValidator(_iso_text), AfterValidator(_time_text)] | None = None
+    date: Annotated[str, BeforeValidator(_iso_text), AfterValidator(_iso_date)] | None = None
     sun_deg: list[float] | None = Field(default=None, min_length=2, max_length=2)
     sky: str = "clear"
     delit: bool = False
+
+    @model_validator(mode="after")
+    def _one_raster(self) -> Imagery:
+        if (self.file is None) == (self.files is None):
+            raise ValueError("give either 'file', or the tiles of an image as 'files'")
+        return self
+
+    @property
+    def day(self) -> date_type | None:
+        """The day that the image shows, as written; ``None`` where neither ``time`` nor ``date`` says it."""
+        if self.date is not None:
+            return date_type.fromisoformat(self.date)
+        return None if self.time in (None, "unknown") else parse_time_text(self.time).date()
 
     @model_validator(mode="after")
     def _one_light(self) -> Imagery:
@@ -185,6 +253,8 @@ class Imagery(Declaration):
             raise ValueError("'sky' is that of the image's hour: give 'time' or 'sun_deg' as well")
         if self.sun_deg is not None and not (-360.0 <= self.sun_deg[0] <= 360.0 and 0.0 < self.sun_deg[1] <= 90.0):
             raise ValueError(f"sun_deg: got {self.sun_deg}, expected azimuth and elevation above the horizon [deg]")
+        if self.date is not None and self.time not in (None, "unknown"):
+            raise ValueError("'time' says the date already: leave out 'date'")
         return self
 
 
@@ -267,8 +337,10 @@ class SceneFile(Declaration):
         Datum of all heights of the scene; left out, heights count as metres above sea level.
     refraction_k
         Terrestrial refraction coefficient, see `LocalFrame`.
-    origin, area, elevation, imagery
-        See `Origin`, `Area`, `Elevation` and `Imagery`.
+    origin, area, elevation
+        See `Origin`, `Area` and `Elevation`.
+    images
+        One table ``[imagery]``, or an array of tables ``[[imagery]]`` in the file; see `Imagery`.
     cameras, webcams
         Arrays of tables ``[[camera]]`` and ``[[webcam]]`` in the file.
     """
@@ -281,7 +353,7 @@ class SceneFile(Declaration):
     origin: Origin | None = None
     area: Area | None = None
     elevation: Elevation | None = None
-    imagery: Imagery | None = None
+    images: list[Imagery] = Field(default_factory=list, alias="imagery", max_length=100)
     cameras: list[NamedCamera] = Field(default_factory=list, alias="camera")
     webcams: list[Webcam] = Field(default_factory=list, alias="webcam")
     _confinement: Confinement = PrivateAttr(default=OWN_FOLDER)
@@ -292,9 +364,36 @@ class SceneFile(Declaration):
         return self._confinement
 
     @property
-    def image_hash(self) -> str | None:
-        """Hash of the content of the scene's image, see `terrain.raster_files.raster_hash`; ``None`` without one."""
-        return None if self.imagery is None else raster_hash(self.imagery.file, self.confinement)
+    def imagery(self) -> Imagery | None:
+        """The image of a scene with one, the first of several, or ``None``."""
+        return self.images[0] if self.images else None
+
+    @property
+    def image_keys(self) -> list[tuple[Imagery, str]]:
+        """Each image as declared, without folders, and the hash of its content: for keys of artefacts made of them."""
+        return [(image.without_folders(), rasters_hash(image.paths, self.confinement)) for image in self.images]
+
+    @field_validator("images", mode="before")
+    @classmethod
+    def _one_or_many(cls, value: Any) -> Any:
+        return value if isinstance(value, list) else [value]
+
+    @model_validator(mode="after")
+    def _dated(self) -> SceneFile:
+        if len(self.images) < 2:
+            return self
+        undated = [f"imagery[{number}]" for number, image in enumerate(self.images) if image.day is None]
+        if undated:
+            raise ValueError(f"{', '.join(undated)}: of several images each needs 'time', or 'date' = \"YYYY-MM-DD\"")
+        days = [image.day for image in self.images if image.day is not None]
+        seen: dict[tuple[int, int], int] = {}
+        for number, day in enumerate(days):
+            other = seen.setdefault((day.month, day.day), number)
+            if other != number:
+                raise ValueError(
+                    f"imagery[{other}] and imagery[{number}] show the same day of the year, {day:%m-%d}; keep one of them"
+                )
+        return self
 
     @model_validator(mode="after")
     def _unique(self) -> SceneFile:
@@ -308,7 +407,7 @@ class SceneFile(Declaration):
 
     @model_validator(mode="after")
     def _one_albedo_source(self) -> SceneFile:
-        if self.imagery is not None and self.elevation is not None and self.elevation.synthetic is not None:
+        if self.images and self.elevation is not None and self.elevation.synthetic is not None:
             raise ValueError("synthetic terrain includes an albedo: drop the table 'imagery'")
         return self
 
@@ -380,15 +479,20 @@ def read_scene(path: str | Path, *, allow_outside: bool = False) -> SceneFile:
             raise InputError(f"{path}: {key}", "no such file", got=str(target))
         return str(target)
 
+    def resolved(key: str, raster: RasterFiles) -> dict[str, Any]:
+        if raster.file is not None:
+            return {"file": absolute_path(f"{key}.file", raster.file)}
+        if raster.files is None:
+            return {}
+        return {"files": named_tiles(raster.files, folder, confinement, where=f"{path}: {key}.files")}
+
     updates: dict[str, Any] = {}
-    if scene.elevation is not None and scene.elevation.file is not None:
-        updates["elevation"] = scene.elevation.model_copy(
-            update={"file": absolute_path("elevation.file", scene.elevation.file)}
-        )
-    if scene.imagery is not None:
-        updates["imagery"] = scene.imagery.model_copy(
-            update={"file": absolute_path("imagery.file", scene.imagery.file)}
-        )
+    if scene.elevation is not None:
+        updates["elevation"] = scene.elevation.model_copy(update=resolved("elevation", scene.elevation))
+    keys = ["imagery"] if len(scene.images) == 1 else [f"imagery[{number}]" for number in range(len(scene.images))]
+    updates["images"] = [
+        image.model_copy(update=resolved(key, image)) for key, image in zip(keys, scene.images, strict=True)
+    ]
     scene = scene.model_copy(update=updates)
     scene._confinement = confinement
     return scene

@@ -403,12 +403,15 @@ def _sky_factor(pairs: np.ndarray, textures: tuple[np.ndarray, ...], sigma: floa
     independent = min(len(pairs) / _PAIRS_PER_INDEPENDENT, _MOST_INDEPENDENT)
     result = np.ones(3)
     for channel in range(3):
-        values, direct, from_sky, rest = (texture[..., channel].ravel().astype(np.float64) for texture in textures)
-        contrast = np.log(np.maximum(values[one], 1e-3) / np.maximum(values[other], 1e-3))
+        # At the texels of the pairs alone, which are far fewer than all.
+        ends = [[texture[..., channel].ravel()[end].astype(np.float64) for texture in textures] for end in (one, other)]
+        contrast = np.log(np.maximum(ends[0][0], 1e-3) / np.maximum(ends[1][0], 1e-3))
         residuals = []
         for trial in trials:
-            light = np.maximum(direct + np.exp(trial) * from_sky + rest, 1e-3)
-            residuals.append(contrast - np.log(light[one] / light[other]))
+            first, second = (
+                np.maximum(direct + np.exp(trial) * from_sky + rest, 1e-3) for _, direct, from_sky, rest in ends
+            )
+            residuals.append(contrast - np.log(first / second))
         spread = max(1.4826 * float(np.median(np.abs(residuals[len(trials) // 2]))), 0.05)
         cost = [
             independent * float(np.mean(np.log1p((residual / (2.385 * spread)) ** 2))) * 0.5 * 2.385**2

@@ -86,9 +86,7 @@ def delight_command(
             assert time is not None  # one of them was given
             known = time != UNKNOWN
             when = parse_time(time, loaded.frame.latitude_deg, loaded.frame.longitude_deg) if known else UNKNOWN
-        result = delit_imagery(
-            loaded, when, image_file=image, sky=model, sensor_height_m=sensor_height_m, progress=progress
-        )
+        result = delit_imagery(loaded, when, image=image, sky=model, sensor_height_m=sensor_height_m, progress=progress)
     record: dict[str, Any] = {
         "output": str(output),
         "scene": loaded.scene.name,

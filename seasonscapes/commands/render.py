@@ -75,9 +75,8 @@ def render_command(
     if max_depth is not None:
         check_range("--max-depth", max_depth, 2, 1000)
     check_range("--seed", seed, 0, 2**32)
-    from seasonscapes.albedo.seasons import AlbedoSeries
     from seasonscapes.rendering.backend import use_backend
-    from seasonscapes.workflows.albedo_sources import chosen_albedo, dated_albedos, require_season
+    from seasonscapes.workflows.albedo_sources import albedo_series, chosen_albedo, require_season
     from seasonscapes.workflows.pictures import png_metadata, save_exr, save_png
     from seasonscapes.workflows.view_rendering import render
 
@@ -90,8 +89,8 @@ def render_command(
         loaded = options.load(scene, progress, albedo=[each.path for each in files])
         chosen, camera = view.chosen(loaded.scene), view.pinhole(loaded)
         utc = parse_time(time, chosen.latitude_deg, chosen.longitude_deg)
-        series = AlbedoSeries(tuple(dated_albedos(loaded, files)), season) if files else None
-        texture = chosen_albedo(loaded, utc.date(), series)
+        series = albedo_series(loaded, files, season, progress=progress)
+        texture = chosen_albedo(loaded, utc.date(), series, progress=progress)
         picture = render(
             loaded,
             camera,

@@ -171,13 +171,14 @@ def upload_points(terrain: RayScene, coefficients: PointCoefficients) -> DeviceP
     """
     clusters = upload_clusters(terrain, coefficients.clusters)
     return DevicePoints(
-        _shadow_rays(terrain, coefficients.points, np.arange(len(coefficients.points.origin))),
+        shadow_rays(terrain, coefficients.points, np.arange(len(coefficients.points.origin))),
         upload_receivers(coefficients.receivers),
         clusters,
     )
 
 
-def _shadow_rays(terrain: RayScene, points: SurfacePoints, number: np.ndarray) -> SunRays:
+def shadow_rays(terrain: RayScene, points: SurfacePoints, number: np.ndarray) -> SunRays:
+    """Shadow rays from surface points, each of whose ``number`` decides where on the sun's disc its rays end."""
     samples = points.reshape(-1, 1)
     weight = np.ones(samples.origin.shape[:2], np.float32)
     return sun_rays(
@@ -277,7 +278,7 @@ def irradiance_blocks(
             index = block[found]
             coefficients = trace_points(terrain, points, sampling, shared=shared, seed=seed, number=index)
             device = DevicePoints(
-                _shadow_rays(terrain, points, index), upload_receivers(coefficients.receivers), clusters
+                shadow_rays(terrain, points, index), upload_receivers(coefficients.receivers), clusters
             )
             yield index, points, map(partial(irradiance, device), lights, cluster_lights)
         report(min(1.0, (start + BLOCK) / len(valid)))

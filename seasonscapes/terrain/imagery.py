@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import product
 
@@ -18,6 +18,7 @@ from seasonscapes.terrain.raster import read_raster
 from seasonscapes.terrain.raster_files import OWN_FOLDER, Confinement
 from seasonscapes.terrain.surface import Raster, Terrain, Texture, atlas_identity
 from seasonscapes.terrain.texels import texel_coordinates, texel_positions
+from seasonscapes.terrain.tile_files import path_list, read_tiles
 
 ENCODINGS = ("srgb", "linear")
 # Largest number of samples along a footprint; more elongated footprints use a coarser mip level.
@@ -31,7 +32,7 @@ _MAX_FIT_ERROR_PX = 0.01
 
 
 def read_imagery(
-    path: str | os.PathLike[str],
+    path: str | os.PathLike[str] | Sequence[str],
     *,
     bounds_deg: tuple[float, float, float, float] | None = None,
     bands: tuple[int, ...] | None = None,
@@ -45,7 +46,8 @@ def read_imagery(
     Parameters
     ----------
     path, bounds_deg, finest_m, confinement
-        As in `read_raster`; for baking, half the texel size is sufficient for ``finest_m``.
+        As in `read_raster`, or the tiles of one image (`tile_files.read_tiles`); for baking, half the texel size is
+        sufficient for ``finest_m``.
     bands
         Red, green and blue band numbers from 1; ``None`` for the bands that the file marks as such, or its three colour
         bands, or its only band as grey (by its colour table where it has one).
@@ -69,15 +71,25 @@ def read_imagery(
     """
     if encoding not in ENCODINGS:
         raise ValueError(f"encoding: got {encoding!r}, expected one of {', '.join(ENCODINGS)}")
-    facts = image_facts(path, bands=bands, full_scale=full_scale, confinement=confinement)
-    decode = Decoder(path, encoding, facts.full_scale)
-    raster = read_raster(
-        path, bounds_deg=bounds_deg, bands=facts.bands, finest_m=finest_m, decode=decode, confinement=confinement
-    )
-    decode.check()
-    # A pixel with one missing channel counts as missing.
-    values = np.where(np.isfinite(raster.values).all(axis=2, keepdims=True), raster.values, np.float32(np.nan))
-    return replace(raster, values=np.repeat(values, 3 // raster.values.shape[2], axis=2))
+    paths = path_list(path)
+    # Tiles are parts of one image, which is impossible or not as a whole: a tile may be all dark.
+    decoders: dict[float, Decoder] = {}
+
+    def read(tile: str, bounds: tuple[float, float, float, float] | None, finest: float | None) -> Raster:
+        facts = image_facts(tile, bands=bands, full_scale=full_scale, confinement=confinement)
+        decode = decoders.setdefault(facts.full_scale, Decoder(tile, encoding, facts.full_scale))
+        raster = read_raster(
+            tile, bounds_deg=bounds, bands=facts.bands, finest_m=finest, decode=decode, confinement=confinement
+        )
+        # A pixel with one missing channel counts as missing.
+        values = np.where(np.isfinite(raster.values).all(axis=2, keepdims=True), raster.values, np.float32(np.nan))
+        return replace(raster, values=np.repeat(values, 3 // raster.values.shape[2], axis=2))
+
+    image = read_tiles(paths, read, bounds_deg=bounds_deg, finest_m=finest_m, confinement=confinement)
+    for decode in decoders.values():
+        decode.check()
+    # Cubic interpolation between tiles of different grids overshoots at sharp borders.
+    return image if len(paths) == 1 else replace(image, values=np.maximum(image.values, 0.0))
 
 
 def bake_imagery(terrain: Terrain, atlas: Atlas, image: Raster, *, gutter_px: int = 4) -> Texture:

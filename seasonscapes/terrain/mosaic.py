@@ -14,6 +14,7 @@ import numpy as np
 from affine import Affine
 
 from seasonscapes.terrain.crs import apply_affine, geodetic_from_map, horizontal_crs, map_from_geodetic
+from seasonscapes.terrain.raster import bounds_geographic
 from seasonscapes.terrain.surface import Raster
 
 if TYPE_CHECKING:
@@ -203,14 +204,17 @@ def mosaic(tiles: Sequence[Raster], grid: MapGrid, *, extend: bool = True) -> np
         ``(height, width, C)`` float32, NaN where no raster has a value.
     """
     channels = tiles[0].values.shape[2] if tiles else 1
-    groups = [_joined(group) for group in _grouped(tiles)]
+    groups = [joined(group) for group in _grouped(tiles)]
     result = np.full((*grid.shape, channels), np.nan, np.float32)
     for start in range(0, grid.height, _STRIP_ROWS):
         rows = slice(start, min(start + _STRIP_ROWS, grid.height))
         strip = result[rows]
         weak = np.full_like(strip, np.nan)
         for group in groups:
-            column, row = _strip_pixels(grid, rows, group.crs, group.transform)
+            nodes = _strip_nodes(grid, rows, group.crs, group.transform)
+            if not _reaches(group, *nodes):
+                continue
+            column, row = (_between(each, grid.width, rows.stop - rows.start) - 0.5 for each in nodes)
             values, weight = _interpolated(group.values, column, row)
             sure = np.asarray(np.isnan(strip) & (weight[..., None] > 0.999))
             strip[sure] = values[sure]
@@ -253,20 +257,56 @@ def _factor(column: np.ndarray, row: np.ndarray, grid: MapGrid) -> int:
     return 2 ** max(0, int(np.floor(np.log2(max(min(across, down), 1.0)) + 0.01)))
 
 
+def same_grid(tiles: Sequence[Raster]) -> bool:
+    """Whether the pixels of all rasters stand on one grid."""
+    return len({_grid_key(tile) for tile in tiles}) == 1
+
+
+def _grid_key(tile: Raster) -> tuple:
+    t = tile.transform
+    # A phase just below 1 is one just above 0.
+    phases = (round((t.c / t.a) % 1.0, 2) % 1.0, round((t.f / t.e) % 1.0, 2) % 1.0)
+    return (tile.crs, f"{t.a:.9e}", f"{t.b:.6e}", f"{t.d:.6e}", f"{t.e:.9e}", *phases)
+
+
 def _grouped(tiles: Sequence[Raster]) -> list[list[Raster]]:
-    """Rasters whose pixels lie on the same grid, in order of their first."""
-    groups: dict[tuple, list[Raster]] = {}
-    for tile in tiles:
-        t = tile.transform
-        phase_x, phase_y = (t.c / t.a) % 1.0, (t.f / t.e) % 1.0
-        steps = (f"{t.a:.9e}", f"{t.b:.6e}", f"{t.d:.6e}", f"{t.e:.9e}")
-        # A phase just below 1 is one just above 0.
-        key = (tile.crs, *steps, round(phase_x, 2) % 1.0, round(phase_y, 2) % 1.0)
-        groups.setdefault(key, []).append(tile)
-    return list(groups.values())
+    """Rasters whose pixels lie on the same grid, in order of their first.
+
+    A raster does not join an earlier group past one that overlaps it: the order of the rasters decides there.
+    """
+    keys = [_grid_key(tile) for tile in tiles]
+    if len(set(keys)) == 1:
+        return [list(tiles)]
+    groups: list[tuple[tuple, list[int]]] = []
+    boxes = [bounds_geographic(tile) for tile in tiles]
+    for number, key in enumerate(keys):
+        for group_key, members in reversed(groups):
+            if group_key == key:
+                members.append(number)
+                break
+            if any(_boxes_overlap(boxes[number], boxes[member]) for member in members):
+                groups.append((key, [number]))
+                break
+        else:
+            groups.append((key, [number]))
+    return [[tiles[number] for number in members] for _, members in groups]
 
 
-def _joined(tiles: list[Raster]) -> Raster:
+def _boxes_overlap(a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> bool:
+    turn = 360.0 * round((b[0] - a[0]) / 360.0)
+    return a[0] + turn < b[2] and b[0] < a[2] + turn and a[1] < b[3] and b[1] < a[3]
+
+
+def joined(tiles: Sequence[Raster]) -> Raster:
+    """Rasters of one grid side by side; where several have a value, that of the first counts; NaN where none has.
+
+    Parameters
+    ----------
+    tiles
+        Rasters of which `same_grid` is true, of equal numbers of bands.
+    """
+    if len(tiles) == 1:
+        return tiles[0]
     first = tiles[0].transform
     places = []
     for tile in tiles:
@@ -285,14 +325,20 @@ def _joined(tiles: list[Raster]) -> Raster:
     return Raster(canvas, Affine(a, b, float(x), d, e, float(y)), tiles[0].crs)
 
 
-def _strip_pixels(grid: MapGrid, rows: slice, crs: str, transform: Affine) -> tuple[np.ndarray, np.ndarray]:
-    """Column and row in a raster of the cell centres of some rows, minus 0.5: whole numbers at pixel centres."""
+def _reaches(raster: Raster, column: np.ndarray, row: np.ndarray) -> bool:
+    """Whether a raster lies under any of the places between some of its pixel coordinates; NaN counts as anywhere."""
+    height, width = raster.values.shape[:2]
+    outside = (column.max() < -1.0) | (column.min() > width + 1.0) | (row.max() < -1.0) | (row.min() > height + 1.0)
+    return not bool(outside)
+
+
+def _strip_nodes(grid: MapGrid, rows: slice, crs: str, transform: Affine) -> tuple[np.ndarray, np.ndarray]:
+    """Column and row in a raster of every `_STEP`-th cell centre of some rows."""
     count = rows.stop - rows.start
     u = np.arange(0, grid.width + _STEP, _STEP) + 0.5
     v = np.arange(0, count + _STEP, _STEP) + rows.start + 0.5
     columns, rows_of = np.meshgrid(u, v)
-    nodes = _pixels_at(grid, columns, rows_of, crs, transform)
-    return _between(nodes[0], grid.width, count) - 0.5, _between(nodes[1], grid.width, count) - 0.5
+    return _pixels_at(grid, columns, rows_of, crs, transform)
 
 
 def _between(nodes: np.ndarray, width: int, height: int) -> np.ndarray:

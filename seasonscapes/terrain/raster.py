@@ -186,6 +186,7 @@ def read_raster(
         reader = band_reader(source, bands, where)
         window = _window(source, crs, bounds_deg, where)
         shrink = 1 if finest_m is None else _shrink(_grid(source, crs, window), finest_m)
+        window = _whole_blocks(window, shrink, source)
         values = _read_blocks(reader, window, shrink, decode)
         transform = _window_transform(source.transform, window, shrink)
     return Raster(values, transform, crs)
@@ -240,6 +241,24 @@ def _shrink(grid: Raster, finest_m: float) -> int:
     # The tolerance keeps rounding errors from reducing an exact multiple.
     wanted = np.floor(finest_m / max(cell_sides_m(grid)) + 1e-6)
     return int(np.clip(wanted, 1, max(1, min(grid.values.shape[:2]) // 2)))
+
+
+def _whole_blocks(window: Window, shrink: int, source: DatasetReader) -> Window:
+    """The window widened to whole blocks that are counted from the raster's corner, as far as the raster has them."""
+    from rasterio.windows import Window
+
+    left, top = (int(offset) // shrink * shrink for offset in (window.col_off, window.row_off))
+    right, bottom = (
+        max(start + 2 * shrink, min(-(-int(stop) // shrink), length // shrink) * shrink)
+        for start, stop, length in (
+            (left, window.col_off + window.width, source.width),
+            (top, window.row_off + window.height, source.height),
+        )
+    )
+    if right > source.width or bottom > source.height:
+        # A narrow strip at the rim of the raster.
+        return window
+    return Window(left, top, right - left, bottom - top)  # pyright: ignore[reportCallIssue]
 
 
 def _window_transform(transform: Affine, window: Window, shrink: int) -> Affine:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -257,6 +257,12 @@ def raster_hash(path: str | os.PathLike[str], confinement: Confinement = OWN_FOL
             content = hashlib.file_digest(stream, "sha256").hexdigest()
         digest.update(f"{os.path.relpath(file, base)}\0{content}\n".encode())
     return digest.hexdigest()
+
+
+def rasters_hash(paths: Sequence[str | os.PathLike[str]], confinement: Confinement = OWN_FOLDER) -> str:
+    """`raster_hash` of one file, or of the tiles of one raster in their order."""
+    hashes = [raster_hash(path, confinement) for path in paths]
+    return hashes[0] if len(hashes) == 1 else hashlib.sha256("\n".join(hashes).encode()).hexdigest()
 
 
 def raster_members(path: str | os.PathLike[str], confinement: Confinement = OWN_FOLDER) -> set[Path]:

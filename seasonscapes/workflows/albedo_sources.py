@@ -23,12 +23,13 @@ from seasonscapes.albedo.seasons import (
     snowline_fraction,
 )
 from seasonscapes.errors import InputError
+from seasonscapes.progress import Progress
 from seasonscapes.scene import Imagery
 from seasonscapes.source_hash import source_hash
 from seasonscapes.terrain.surface import Raster, Texture, load_texture, save_texture
-from seasonscapes.workflows.delighting import UNKNOWN, delit_imagery, imagery_time
+from seasonscapes.workflows.delighting import delit_imagery, imagery_time
 from seasonscapes.workflows.edited_textures import albedo_date, read_albedo, require_albedo_file
-from seasonscapes.workflows.place import Place, utc_at
+from seasonscapes.workflows.place import Place
 from seasonscapes.workflows.scene_imagery import atlas_image
 from seasonscapes.workspace import build_once, file_hash
 
@@ -45,6 +46,8 @@ _EDITED_CODE = ("workflows.edited_textures",)
 _TRANSITION_CODE = ("albedo.seasons", "albedo.closed_form", "terrain.attributes")
 # Where a scene has no image, the ground is uniformly grey: between rock and meadow.
 GREY_ALBEDO = 0.2
+# Day of an albedo that states none.
+_UNDATED = date(2024, 7, 1)
 # A synthetic place has no satellite; its albedo of this day of the year stands for a summer image.
 _IMAGE_DAY = 205
 # The albedo of a synthetic place is known for every day; films interpolate between these days of each month.
@@ -67,15 +70,18 @@ class AlbedoFile:
     path: Path
 
 
-def scene_albedo(place: Place, day: date | str) -> Texture:
-    """Return the albedo texture of a date: the synthetic truth of that day, or the scene's image.
+def scene_albedo(place: Place, day: date | str, *, progress: Progress | None = None) -> Texture:
+    """Return the albedo texture of a date: the synthetic truth of that day, or that of the scene's images.
 
     Parameters
     ----------
     place
         The place.
     day
-        A date, datetime or ISO 8601 text; it matters for synthetic places alone.
+        A date, datetime or ISO 8601 text; it matters for synthetic places and for scenes with several dated images, between
+        which the albedo is interpolated.
+    progress
+        Called with a task and its finished share.
 
     Returns
     -------
@@ -105,39 +111,45 @@ def scene_albedo(place: Place, day: date | str) -> Texture:
             code=_SYNTHETIC_CODE,
             build=lambda: bake_imagery(place.terrain, place.atlas, _synthetic_image(place, day_of_year)),
         )
-    imagery = place.scene.imagery
-    if imagery is None:
+    images = place.scene.images
+    if len(images) > 1:
+        return albedo_of_day(place, AlbedoSeries(tuple(dated_albedos(place, progress=progress))), day)
+    if not images:
         log.warning("%s: names no image: the land is grey, with an albedo of %g", place.path, GREY_ALBEDO)
         values = np.full((*place.texture_shape, 3), GREY_ALBEDO, np.float32)
         return Texture(values, np.zeros(place.texture_shape, np.float32), place.atlas_id)
-    inputs.update(imagery=imagery.model_copy(update={"file": Path(imagery.file).name}), hash=place.scene.image_hash)
+    return _image_albedo(place, 0, progress)
+
+
+def _image_albedo(place: Place, number: int, progress: Progress | None = None) -> Texture:
+    """The albedo of one of the scene's images; where its hour or sun is stated, without its light."""
+    imagery, (declared, content) = place.scene.images[number], place.scene.image_keys[number]
+    inputs: dict[str, Any] = {"terrain": place.key, "imagery": declared, "hash": content}
     time = imagery_time(imagery)
     if time is None:
         if not imagery.delit:
-            _tell_light_stays(imagery.file)
+            _tell_light_stays(imagery.label)
         texture = texture_once(place, "albedo", inputs, code=_IMAGE_CODE, build=lambda: _baked_image(place, imagery))
     else:
-        log.info("%s: its light is taken out", Path(imagery.file).name)
+        log.info("%s: its light is taken out", imagery.label)
         texture = texture_once(
             place,
             "albedo-delit",
             inputs,
             code=_DELIT_CODE,
-            build=lambda: delit_imagery(place, time, sky=imagery.sky).texture,
+            build=lambda: delit_imagery(place, time, image=imagery, sky=imagery.sky, progress=progress).texture,
         )
-    _tell_image(place, texture)
+    _tell_image(place, imagery, texture)
     return texture
 
 
-def _tell_image(place: Place, texture: Texture) -> None:
-    """Warn of what was understood of the scene's image, and of land that it does not cover."""
+def _tell_image(place: Place, imagery: Imagery, texture: Texture) -> None:
+    """Warn of what was understood of one of the scene's images, and of land that it does not cover."""
     from seasonscapes.terrain.image_bands import image_facts
     from seasonscapes.terrain.texels import covered_share
 
-    imagery = place.scene.imagery
-    assert imagery is not None
     facts = image_facts(
-        imagery.file,
+        imagery.paths[0],
         bands=tuple(imagery.bands) if imagery.bands else None,
         full_scale=imagery.full_scale,
         confinement=place.scene.confinement,
@@ -147,7 +159,7 @@ def _tell_image(place: Place, texture: Texture) -> None:
     share = covered_share(place.terrain, texture.weight)
     if share < 0.999:
         log.warning(
-            "%s: the image covers %.3g %% of the land; the rest has its median colour", imagery.file, 100.0 * share
+            "%s: the image covers %.3g %% of the land; the rest has its median colour", imagery.label, 100.0 * share
         )
 
 
@@ -168,16 +180,18 @@ def texture_once(
 
 
 def orthoimage(place: Place, day: date) -> Texture | None:
-    """Return the scene's image in the atlas (``weight`` 0 where it does not reach), or ``None`` without one.
+    """Return the scene's image of a day in the atlas (``weight`` 0 where it does not reach), or ``None`` without one.
 
     The image of a synthetic place is its albedo of a summer day; only the year of ``day`` matters.
     """
     if place.synthetic is not None:
         return scene_albedo(place, day.replace(month=1, day=1) + timedelta(days=_IMAGE_DAY - 1))
-    return None if place.scene.imagery is None else scene_albedo(place, day)
+    return scene_albedo(place, day) if place.scene.images else None
 
 
-def dated_albedos(place: Place, files: Sequence[AlbedoFile] = ()) -> list[DatedAlbedo]:
+def dated_albedos(
+    place: Place, files: Sequence[AlbedoFile] = (), *, progress: Progress | None = None
+) -> list[DatedAlbedo]:
     """Return the albedos of a place through the year, by date.
 
     Parameters
@@ -186,6 +200,8 @@ def dated_albedos(place: Place, files: Sequence[AlbedoFile] = ()) -> list[DatedA
         The place.
     files
         Recovered albedos to use instead of the scene's own.
+    progress
+        Called with a task and its finished share while light is taken out of an image.
 
     Returns
     -------
@@ -200,14 +216,12 @@ def dated_albedos(place: Place, files: Sequence[AlbedoFile] = ()) -> list[DatedA
     if files:
         return sorted((_from_file(place, file) for file in files), key=lambda dated: dated.day)
     if place.synthetic is None:
-        day, imagery, content = date(2024, 7, 1), place.scene.imagery, "grey"
-        if imagery is not None:
-            time = imagery_time(imagery)
-            code = source_hash(*_IMAGE_CODE if time is None else _DELIT_CODE)
-            content = ":".join((imagery.model_dump_json(), str(place.scene.image_hash), code))
-            if isinstance(time, str) and time != UNKNOWN:
-                day = utc_at(place, time).date()
-        return [DatedAlbedo(day, content, lambda: scene_albedo(place, day))]
+        if not place.scene.images:
+            return [DatedAlbedo(_UNDATED, "grey", lambda: scene_albedo(place, _UNDATED))]
+        return sorted(
+            (_dated_image(place, number, progress) for number in range(len(place.scene.images))),
+            key=lambda dated: dated.day,
+        )
     days = [datetime(2024, month, day) for month in range(1, 13) for day in _FILM_DAYS]
     return [
         DatedAlbedo(
@@ -217,6 +231,30 @@ def dated_albedos(place: Place, files: Sequence[AlbedoFile] = ()) -> list[DatedA
         )
         for day in days
     ]
+
+
+def _dated_image(place: Place, number: int, progress: Progress | None) -> DatedAlbedo:
+    declared, content = place.scene.image_keys[number]
+    code = source_hash(*_IMAGE_CODE if imagery_time(declared) is None else _DELIT_CODE)
+    identity = ":".join((declared.model_dump_json(), content, code))
+    return DatedAlbedo(declared.day or _UNDATED, identity, partial(_image_albedo, place, number, progress))
+
+
+def albedo_series(
+    place: Place, files: Sequence[AlbedoFile] = (), season: str = "blended", *, progress: Progress | None = None
+) -> AlbedoSeries | None:
+    """The dated albedos of given files, else of the scene's several images; ``None`` where there is nothing to choose from.
+
+    Parameters
+    ----------
+    place, files, progress
+        As in `dated_albedos`.
+    season
+        Interpolation between the dates; see `albedo.seasons.AlbedoSeries`.
+    """
+    if not files and len(place.scene.images) < 2:
+        return None
+    return AlbedoSeries(tuple(dated_albedos(place, files, progress=progress)), season)
 
 
 def load_albedo(place: Place, path: str | Path, day: date | str | None = None) -> DatedAlbedo:
@@ -343,7 +381,7 @@ def albedo_of_day(place: Place, series: AlbedoSeries, day: date) -> Texture:
     return Texture(values, weight, place.atlas_id)
 
 
-def chosen_albedo(place: Place, day: date, albedo: AlbedoSource = None) -> Texture:
+def chosen_albedo(place: Place, day: date, albedo: AlbedoSource = None, *, progress: Progress | None = None) -> Texture:
     """Resolve the ``albedo`` argument of a workflow to a texture of the place on a day.
 
     Parameters
@@ -352,6 +390,8 @@ def chosen_albedo(place: Place, day: date, albedo: AlbedoSource = None) -> Textu
         The place and the date.
     albedo
         A texture of the place's atlas, a dated albedo, a series of them, or ``None`` for the scene's own albedo.
+    progress
+        Called with a task and its finished share.
 
     Raises
     ------
@@ -359,7 +399,7 @@ def chosen_albedo(place: Place, day: date, albedo: AlbedoSource = None) -> Textu
         For a texture of another atlas.
     """
     if albedo is None:
-        return scene_albedo(place, day)
+        return scene_albedo(place, day, progress=progress)
     if isinstance(albedo, Texture):
         return place.require_texture(albedo, what="albedo")
     return albedo_of_day(place, AlbedoSeries((albedo,)) if isinstance(albedo, DatedAlbedo) else albedo, day)
@@ -393,10 +433,10 @@ def _baked_image(place: Place, imagery: Imagery) -> Texture:
 
 
 @lru_cache(maxsize=64)
-def _tell_light_stays(file: str) -> None:
-    """Log once for each file that its light is not taken out."""
+def _tell_light_stays(label: str) -> None:
+    """Log once for each image that its light is not taken out."""
     log.info(
         '%s: the light of its hour stays in the image; to take it out, state [imagery] time = "…" (or "unknown"), '
         "or delit = true where it holds none",
-        Path(file).name,
+        label,
     )

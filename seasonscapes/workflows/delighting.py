@@ -19,6 +19,7 @@ from seasonscapes.terrain.surface import Texture
 from seasonscapes.workflows.illumination import given_sun_position, illumination_at, position_at, sky_model
 from seasonscapes.workflows.place import Place, utc_at
 from seasonscapes.workflows.scene_imagery import AtlasImage, atlas_image
+from seasonscapes.workflows.terrain_building import sample_spacing_m
 
 if TYPE_CHECKING:
     from seasonscapes.albedo.delighting import Air, DelitImage, TexelIrradiance
@@ -34,6 +35,8 @@ ImageTime = str | datetime | tuple[float, float]
 
 # Azimuths of the horizons, and texels on a side, at which the sun of an image is searched.
 _AZIMUTHS, _SEARCH_SIDE = 72, 240
+# Skylight and interreflection are traced for about so many texels at most, and not more finely than the heights.
+_MOST_TRACED = 1_000_000
 # The air model ends here; beyond it there is none before a satellite [m].
 _HIGHEST_SENSOR_M = 60_000.0
 
@@ -150,12 +153,12 @@ def delit_imagery(
     place: Place,
     time: ImageTime,
     *,
-    image_file: Path | None = None,
+    image: Path | Imagery | None = None,
     sky: str | Path | SkyModel = "clear",
     sensor_height_m: float | None = None,
     progress: Progress | None = None,
 ) -> DelitScene:
-    """Remove the light from the image that a scene file names, or from another image of the same land.
+    """Remove the light from an image that a scene file names, or from another image of the same land.
 
     Parameters
     ----------
@@ -163,8 +166,9 @@ def delit_imagery(
         The place.
     time
         When the image was taken; see `ImageTime`.
-    image_file
-        A georeferenced image to use instead of the scene's, encoded as the scene file says of its own.
+    image
+        One of the scene's images, or a georeferenced file to use instead, encoded as the scene file says of its first one;
+        ``None`` for the only image of the scene.
     sky
         The sky model of that hour.
     sensor_height_m
@@ -181,23 +185,23 @@ def delit_imagery(
     Raises
     ------
     InputError
-        Where the scene has no image, for a time that is none, or a sensor below the ground.
+        Where the scene has no image, or several and none is given, for a time that is none, or a sensor below the ground.
     NotEnoughEvidence
         Where the sun of an image of unknown time cannot be told.
     """
     from seasonscapes.albedo.delighting import DelightOptions, delight_image
     from seasonscapes.rendering.backend import use_backend
 
-    imagery, confinement = _chosen_image(place, image_file)
+    imagery, confinement = _chosen_image(place, image)
     use_backend()
-    image = atlas_image(place, imagery, confinement)
+    pixels = atlas_image(place, imagery, confinement)
     facts: dict[str, Any] = {}
     if time == UNKNOWN:
-        found = image_sun(place, image, progress=progress)
+        found = image_sun(place, pixels, progress=progress)
         facts["found_sun"] = found_sun_record(found)
         if not found.trusted:
             cure = "state the image's time or sun"
-            raise NotEnoughEvidence(f"{Path(imagery.file).name}: its sun cannot be told: {found.reason}; {cure}")
+            raise NotEnoughEvidence(f"{imagery.label}: its sun cannot be told: {found.reason}; {cure}")
         time = (found.azimuth_deg, found.elevation_deg)
     light, day, record = image_light(place, time, sky)
     irradiance = _texel_light(place, light, progress)
@@ -207,29 +211,34 @@ def delit_imagery(
         # A texture of another layout than the plan has no single shift.
         register=place.atlas.kind == "planar",
     )
-    values = np.where(image.weight[..., None] > 0.0, image.values, np.float32(np.nan))
+    values = np.where(pixels.weight[..., None] > 0.0, pixels.values, np.float32(np.nan))
     report = task_progress(progress, "removing the light")
-    delit = delight_image(values, image.clipped, irradiance, options=options, progress=report)
+    delit = delight_image(values, pixels.clipped, irradiance, options=options, progress=report)
     known = delit.source > 0
     albedo = np.where(known[..., None], delit.albedo, np.median(delit.albedo[known], axis=0))
-    weight = np.where(known, image.weight, 0.0).astype(np.float32)
+    weight = np.where(known, pixels.weight, 0.0).astype(np.float32)
     facts |= record | {"sensor_height_m": sensor_height_m, **delit.facts}
     return DelitScene(Texture(albedo.astype(np.float32), weight, place.atlas_id), delit, day, facts)
 
 
-def _chosen_image(place: Place, image_file: Path | None) -> tuple[Imagery, Confinement]:
-    """The scene's image, or another file of its encoding, and where its files may lie."""
-    own = place.scene.imagery
-    if image_file is not None:
-        if not image_file.is_file():
-            raise InputError("--image", "no such file", got=str(image_file))
-        given = str(image_file.resolve())
-        return Imagery(file=given) if own is None else own.model_copy(update={"file": given}), OWN_FOLDER
-    if own is None:
-        where = f"{place.path}: imagery"
+def _chosen_image(place: Place, image: Path | Imagery | None) -> tuple[Imagery, Confinement]:
+    """An image of the scene, or another file of its encoding, and where its files may lie."""
+    own = place.scene.images
+    if isinstance(image, Imagery):
+        return image, place.scene.confinement
+    if image is not None:
+        if not image.is_file():
+            raise InputError("--image", "no such file", got=str(image))
+        given = {"file": str(image.resolve()), "files": None}
+        return own[0].model_copy(update=given) if own else Imagery(file=given["file"]), OWN_FOLDER
+    where = f"{place.path}: imagery"
+    if not own:
         cure = 'add a table [imagery] with file = "image.tif", or give --image'
         raise InputError(where, "the scene has no image", cure=cure)
-    return own, place.scene.confinement
+    if len(own) > 1:
+        labels = ", ".join(each.label for each in own)
+        raise InputError(where, "the scene has several images", got=labels, cure="name one with --image FILE")
+    return own[0], place.scene.confinement
 
 
 def image_light(
@@ -257,7 +266,7 @@ def image_light(
 
 def _texel_light(place: Place, light: Illumination, progress: Progress | None) -> TexelIrradiance:
     from seasonscapes.albedo.forward_model import trace_texel_transport
-    from seasonscapes.albedo.texel_light import texel_irradiance
+    from seasonscapes.albedo.texel_light import coarse_irradiance, texel_irradiance
     from seasonscapes.rendering.backend import use_backend
     from seasonscapes.rendering.transport import SamplingOptions
 
@@ -265,8 +274,23 @@ def _texel_light(place: Place, light: Illumination, progress: Progress | None) -
     # Skylight and interreflection vary slowly over an image whose texels are far finer than the relief.
     sampling = SamplingOptions(shadow_samples=1, rays=128, clusters_per_receiver=64, clusters=8192, rank=32)
     report = task_progress(progress, "light of the texels")
+    every = _traced_every(place)
+    if every > 1:
+        return coarse_irradiance(
+            place.terrain, place.texture_shape, light, every=every, sampling=sampling, progress=report
+        )
     transport = trace_texel_transport(place.terrain, place.texture_shape, sampling=sampling, progress=report)
     return texel_irradiance(transport, light)
+
+
+def _traced_every(place: Place) -> int:
+    """Of how many rows and columns of texels one is enough for skylight and interreflection, an odd number."""
+    if place.atlas.kind == "xatlas":
+        return 1
+    rows, columns = place.texture_shape
+    by_heights = sample_spacing_m(place.elevation) / place.atlas.texel_p50_m
+    every = max(by_heights, np.sqrt(rows * columns / _MOST_TRACED))
+    return 2 * round((every - 1.0) / 2.0) + 1
 
 
 def _air(place: Place, time: ImageTime, sky: str | Path | SkyModel, sensor_height_m: float) -> Air:

@@ -17,7 +17,7 @@ from seasonscapes.albedo.seasons import DatedAlbedo, day_number
 from seasonscapes.errors import InputError
 from seasonscapes.progress import Progress, each_reported, task_progress
 from seasonscapes.sky.models import SkyModel
-from seasonscapes.workflows.albedo_sources import scene_albedo
+from seasonscapes.workflows.albedo_sources import dated_albedos, scene_albedo
 from seasonscapes.workflows.illumination import illumination_at, sky_model, sun_moon_position
 from seasonscapes.workflows.place import Place
 from seasonscapes.workspace import artefact_key
@@ -237,12 +237,11 @@ def distil_with_data(
 
 def _data_key(place: Place, model: SkyModel, dated: Sequence[DatedAlbedo], options: DistilOptions) -> str:
     """Identifier of everything that the training data are made from, except the seed."""
-    imagery = place.scene.imagery
     inputs = {
         "place": place.key,
         "sky": model,
         "albedo": [[each.day, each.content] for each in dated],
-        "imagery": None if dated or imagery is None else [imagery.model_dump(exclude={"file"}), place.scene.image_hash],
+        "images": None if dated else place.scene.image_keys,
         "options": options,
     }
     return artefact_key(inputs, ("workflows.distillation",))
@@ -261,6 +260,10 @@ def dated_textures(place: Place, dated: Sequence[DatedAlbedo], dates: int) -> li
         if any(first[0] == second[0] for first, second in pairwise(found)):
             raise InputError("--albedo", "names a day of the year twice", cure="give one albedo for each")
         return found
+    if len(place.scene.images) > 1:
+        return sorted(
+            ((day_number(each.day), each.load().values) for each in dated_albedos(place)), key=lambda pair: pair[0]
+        )
     days = [_ONE_DAY]
     if place.synthetic is not None:
         days = np.linspace(15.0, 366.0 + 15.0, dates + 1)[:-1].round().tolist()

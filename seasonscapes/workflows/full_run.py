@@ -153,12 +153,9 @@ def stages_of(job: RunJob, progress: Progress | None = None) -> list[Stage]:
     ]
 
 
-def _imagery(place: Place) -> dict | None:
-    """What the scene file states about its image, and the hash of its content."""
-    imagery = place.scene.imagery
-    if imagery is None:
-        return None
-    return {**imagery.model_dump(mode="json", exclude={"file"}), "hash": place.scene.image_hash}
+def _imagery(place: Place) -> list[dict]:
+    """What the scene file states about its images, and the hashes of their contents."""
+    return [{**image.model_dump(mode="json"), "hash": content} for image, content in place.scene.image_keys]
 
 
 def _sources(folder: Path) -> PhotographSources:

@@ -17,7 +17,7 @@ from seasonscapes.frames import LocalFrame, enu_from_geodetic, frame_record
 from seasonscapes.progress import Progress, task_progress
 from seasonscapes.scene import SceneFile, read_scene
 from seasonscapes.source_hash import source_hash
-from seasonscapes.terrain.raster_files import raster_hash
+from seasonscapes.terrain.raster_files import rasters_hash
 from seasonscapes.terrain.surface import Raster, Terrain, Texture, atlas_identity, mesh_up_m, require_atlas
 from seasonscapes.workflows.terrain_building import MeshOptions
 from seasonscapes.workspace import Workspace, build_once, default_workspace
@@ -186,16 +186,18 @@ def load_place(
     report = task_progress(progress, "terrain")
     report(0.0)
     massif = None if declared.elevation.synthetic is None else _massif(declared, workspace)
-    elevation, fill = terrain_building.read_heights(declared, massif, where=f"{path}: elevation.file")
+    source = declared.elevation.paths
+    key_name = "files" if declared.elevation.files else "file"
+    elevation, fill = terrain_building.read_heights(declared, massif, where=f"{path}: elevation.{key_name}")
     report(0.3)
     _check_cameras(path, declared, elevation)
     frame = terrain_building.local_frame(declared, elevation)
-    source = declared.elevation.file
     key = {
         "code": source_hash(*_TERRAIN_CODE),
-        "elevation": declared.elevation.model_copy(update={"file": source and Path(source).name}),
-        "elevation_hash": source and raster_hash(source, declared.confinement),
-        "imagery_hash": declared.image_hash if options.texel_m is None else None,
+        "elevation": declared.elevation.without_folders(),
+        "elevation_hash": rasters_hash(source, declared.confinement) if source else None,
+        # The finest image decides how fine texels are.
+        "images": [content for _, content in declared.image_keys] if options.texel_m is None else None,
         "area": declared.area,
         "frame": frame,
         "options": options,

@@ -92,7 +92,7 @@ def lit_texture(
     use_backend()
     utc = utc_at(place, time)
     light, _ = illumination_on_terrain(place, sky_model(sky), utc)
-    texture = chosen_albedo(place, utc.date(), albedo)
+    texture = chosen_albedo(place, utc.date(), albedo, progress=progress)
     positions, _ = texel_positions(place.terrain, place.atlas.width_px, place.atlas.height_px)
     return bake_lit_texture(
         ray_scene(mi_mesh(place.terrain, texture.values)),

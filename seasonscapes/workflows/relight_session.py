@@ -223,7 +223,7 @@ def still_session(
     if isinstance(albedo, Texture):
         albedo = _undated(place, albedo)
     if albedo is None:
-        albedo = AlbedoSeries(tuple(dated_albedos(place)))
+        albedo = AlbedoSeries(tuple(dated_albedos(place, progress=progress)))
     elif isinstance(albedo, DatedAlbedo):
         albedo = AlbedoSeries((albedo,))
     camera, model = view_in_frame(camera, place.frame), sky_model(sky)
@@ -294,7 +294,7 @@ def session_of(job: RenderJob, place: Place, *, progress: Progress | None = None
         place,
         camera_for(place, job.view, size_px=job.size_px),
         sky=job.sky,
-        albedo=AlbedoSeries(tuple(dated_albedos(place, job.albedo)), job.season),
+        albedo=AlbedoSeries(tuple(dated_albedos(place, job.albedo, progress=progress)), job.season),
         base_day=job.base_day,
         seed=job.seed,
         progress=progress,

@@ -55,7 +55,7 @@ def atlas_image(place: Place, imagery: Imagery, confinement: Confinement | None 
 
     # Imagery far finer than the texels is averaged while it is read.
     image = read_imagery(
-        imagery.file,
+        imagery.paths,
         bounds_deg=bounds_geographic(place.elevation),
         bands=tuple(imagery.bands) if imagery.bands else None,
         finest_m=0.5 * place.atlas.texel_p50_m,

@@ -16,11 +16,12 @@ from seasonscapes.terrain.crs import wrapped
 from seasonscapes.terrain.memory import check_memory
 from seasonscapes.terrain.mesh import MESHERS, build_mesh
 from seasonscapes.terrain.placement import cell_sides_m, check_area
-from seasonscapes.terrain.raster import bounds_geographic, centre_frame, fill_nodata, raster_grid, read_elevation
+from seasonscapes.terrain.raster import bounds_geographic, centre_frame, fill_nodata, read_elevation
 from seasonscapes.terrain.raster_files import OWN_FOLDER
 from seasonscapes.terrain.refine import refine_raster, refinement_factor
 from seasonscapes.terrain.surface import Raster, Terrain, load_terrain, save_terrain
 from seasonscapes.terrain.surface_grid import surface_grid
+from seasonscapes.terrain.tile_files import read_elevation_tiles, tile_spacing_m
 from seasonscapes.terrain.unwrap import ATLASES, Atlas, unwrap
 
 if TYPE_CHECKING:
@@ -136,9 +137,9 @@ def read_scene_elevation(
     if file is not None:
         return read_elevation(file, bounds_deg=bounds_deg, confinement=OWN_FOLDER)
     assert elevation is not None, "callers refuse scenes without elevation"
-    assert elevation.file is not None, "a scene has either a synthetic elevation or a file"
-    return read_elevation(
-        elevation.file,
+    assert elevation.paths, "a scene has either a synthetic elevation or files"
+    return read_elevation_tiles(
+        elevation.paths,
         bounds_deg=bounds_deg,
         band=elevation.band,
         unit=elevation.unit,
@@ -220,11 +221,16 @@ def _texel_m(terrain: Terrain, elevation: Raster, scene: SceneFile, options: Mes
     wish = options.texel_m
     if wish is None and scene.elevation is not None and scene.elevation.synthetic is not None:
         wish = scene.elevation.synthetic.detail_m
-    elif wish is None and scene.imagery is not None:
-        wish = _TEXELS_PER_PIXEL * sample_spacing_m(raster_grid(scene.imagery.file, scene.confinement))
+    elif wish is None and scene.images:
+        wish = _TEXELS_PER_PIXEL * _image_pixel_m(scene)
     elif wish is None:
         wish = sample_spacing_m(elevation)
     return max(wish, finest_texel_m(terrain, options))
+
+
+def _image_pixel_m(scene: SceneFile) -> float:
+    """Side of a pixel of the finest image [m]."""
+    return min(tile_spacing_m(image.paths, scene.confinement) for image in scene.images)
 
 
 def finest_texel_m(terrain: Terrain, options: MeshOptions) -> float:
@@ -241,13 +247,10 @@ def tell_texel_wish(terrain: Terrain, scene: SceneFile, options: MeshOptions) ->
             log.warning(
                 "--texel-m: texels of %g m were asked for, but %s; choose a smaller [area]", options.texel_m, limit
             )
-    elif (
-        scene.imagery is not None
-        and (pixel := sample_spacing_m(raster_grid(scene.imagery.file, scene.confinement))) < 0.9 * finest
-    ):
+    elif scene.images and (pixel := _image_pixel_m(scene)) < 0.9 * finest:
         log.warning(
             "%s: its pixels of %.3g m are finer than texels can be: %s; choose a smaller [area]",
-            scene.imagery.file,
+            scene.images[0].label,
             pixel,
             limit,
         )

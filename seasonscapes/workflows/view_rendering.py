@@ -117,7 +117,7 @@ def render(
     utc = utc_at(place, time)
     for line in sky_lines(position_at(place, utc)):
         log.info(line)
-    texture = chosen_albedo(place, utc.date(), albedo)
+    texture = chosen_albedo(place, utc.date(), albedo, progress=progress)
     if engine == "transport":
         session = still_session(
             place, camera, sky=sky, albedo=texture, seed=seed, sampling=still_sampling(), progress=progress

@@ -164,7 +164,7 @@ def webcam_station(
     if webcam is None and len(read.webcams) > 1:
         raise InputError("--webcam", "missing", expected="one of " + ", ".join(w.id for w in read.webcams))
     found = read.webcams[0] if webcam is None else find_webcam(read.webcams, webcam)
-    own = read.elevation.file if read.elevation is not None else None
+    own = read.elevation.label if read.elevation is not None and read.elevation.paths else None
     if elevation is None and own is None:
         raise InputError(scene, "names no elevation raster", cure="give one with --elevation FILE")
     files = [elevation, *([] if context is None else [context])]

@@ -122,7 +122,7 @@ def _heights(scene: SceneFile, elevation: Path | str | None) -> list[HeightCheck
     from seasonscapes.terrain.raster import sample_raster
     from seasonscapes.workflows.terrain_building import read_scene_elevation
 
-    if elevation is None and (scene.elevation is None or scene.elevation.file is None):
+    if elevation is None and (scene.elevation is None or not scene.elevation.paths):
         return []
     bounds = scene.area.bounds_deg if scene.area is not None else None
     raster = read_scene_elevation(scene, elevation, bounds_deg=bounds)
