@@ -24,33 +24,9 @@ from seasonscapes.sky.sh_moments import HARMONIC_ORDER
 from seasonscapes.sky.spectrum import WAVELENGTHS_NM, angstrom_ratio, rayleigh_optical_depth
 
 # Apparent elevations of the luminary [deg]; dense where twilight and the reddening of the sun change fast.
-KNOTS_DEG = (
-    -18,
-    -15,
-    -12,
-    -10,
-    -8.5,
-    -7,
-    -6,
-    -5,
-    -4,
-    -3.2,
-    -2.5,
-    -1.8,
-    -1.2,
-    -0.6,
-    0,
-    0.6,
-    1.2,
-    2,
-    3,
-    4,
-    5.5,
-    7,
-    9,
-    12,
-)
-KNOTS_DEG = np.array([*KNOTS_DEG, 16, 21, 27, 34, 42, 51, 60, 70, 80, 90], float)
+_TWILIGHT_DEG = (-18, -15, -12, -10, -8.5, -7, -6, -5, -4, -3.2, -2.5, -1.8, -1.2, -0.6)
+_DAY_DEG = (0, 0.6, 1.2, 2, 3, 4, 5.5, 7, 9, 12, 16, 21, 27, 34, 42, 51, 60, 70, 80, 90)
+KNOTS_DEG = np.array([*_TWILIGHT_DEG, *_DAY_DEG], float)
 # Apparent elevations of the luminary for the direct light [deg].
 DIRECT_DEG = np.concatenate([np.linspace(-3.0, 5.0, 161), np.linspace(5.5, 20.0, 30), np.linspace(21.0, 90.0, 70)])
 # Rows of the air's table below and above the horizon, and distances of its columns as indices of `DISTANCE_EDGES_M`.

@@ -10,6 +10,7 @@ from seasonscapes.declaration import validate
 from seasonscapes.errors import InputError
 from seasonscapes.exposure import parse_exposure
 from seasonscapes.scene import NamedCamera
+from seasonscapes.sky.models import AtmosphereModel, SkyModel
 
 _EXPECTED = "…#v=1&t=2024-09-18T17:05Z&cam=LAT,LON,HEIGHT,HEADING,PITCH,FOV"
 _KEYS = ("latitude_deg", "longitude_deg", "height_m", "heading_deg", "pitch_deg", "fov_deg")
@@ -80,16 +81,17 @@ def read_address(text: str, *, where: str = "--at-url") -> ViewAddress:
     return ViewAddress(camera, time.astimezone(UTC), exposure, haze)
 
 
-def hazy_visibility_km(visibility_km: float, aerosol_share: float, haze: float) -> float:
-    """The meteorological range where the aerosol is ``haze`` times as dense.
+def hazy_sky(model: SkyModel, haze: float, *, where: str = "--at-url") -> SkyModel:
+    """A sky model with ``haze`` times its aerosol.
 
-    Parameters
-    ----------
-    visibility_km
-        At a haze of 1 [km].
-    aerosol_share
-        Share of the aerosol in the extinction there.
-    haze
-        Factor of the aerosol.
+    Raises
+    ------
+    InputError
+        For a model without aerosol.
     """
-    return visibility_km / (1.0 + (haze - 1.0) * aerosol_share)
+    if haze == 1.0:
+        return model
+    if not isinstance(model, AtmosphereModel):
+        raise InputError(where, "states a haze", got=haze, expected="a model of the atmosphere", cure="drop --sky")
+    depth = model.aerosol.optical_depth_500nm * haze
+    return model.model_copy(update={"aerosol": model.aerosol.model_copy(update={"optical_depth_500nm": depth})})

@@ -10,6 +10,7 @@ from typing import Any
 from urllib.parse import unquote, urlsplit
 
 from seasonscapes.albedo.seasons import AlbedoSeries
+from seasonscapes.bundled import is_bundled
 from seasonscapes.errors import InputError
 from seasonscapes.export.viewer_files import ViewerScene, single_file, viewer_files
 from seasonscapes.images import atomic_path
@@ -44,7 +45,8 @@ def first_view(place: Place, camera: str | None, time: str | datetime | None) ->
     InputError
         For a camera that the scene does not name, or a time that is none.
     """
-    view: dict[str, Any] = {}
+    # A published page names no folder of the machine that made it.
+    view: dict[str, Any] = {"scene": place.path.stem if is_bundled("scenes", place.path) else place.path.name}
     if camera is not None:
         view["camera"] = place.scene.camera(camera).name
     if time is not None:
@@ -129,6 +131,12 @@ class PlaceView:
         The page, one HTML file with all its data.
     height_px
         Height of the frame in the notebook [px].
+
+    Examples
+    --------
+    >>> import seasonscapes as ss
+    >>> ss.PlaceView("<!doctype html>", height_px=400).height_px
+    400
     """
 
     page: str

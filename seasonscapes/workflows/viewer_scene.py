@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, date, datetime
 from typing import TYPE_CHECKING, Any
 
@@ -173,6 +173,7 @@ def _build(
     from seasonscapes.export.viewer_files import ViewerScene
 
     grid, up, known = _heights(place, detail)
+    detail = _fitting(detail, max(grid.columns, grid.rows))
     low, high = float(up[known].min()), float(up[known].max())
     scale = max(high - low, 1.0) / 65534.0
     heights = np.where(known, 1 + np.rint((up - low) / scale), 0).astype(np.uint16)
@@ -208,6 +209,13 @@ def _build(
         "made_utc": datetime.now(UTC).replace(microsecond=0).isoformat(),
     }
     return ViewerScene(about, arrays, pictures)
+
+
+def _fitting(detail: ViewerDetail, nodes: int) -> ViewerDetail:
+    """A detail that is not finer than ``nodes`` heights along a side ask for."""
+    clusters = detail.clusters if nodes > 256 else min(detail.clusters, 1024)
+    sky_px, bounce_px = min(detail.sky_px, nodes), min(detail.bounce_px, max(nodes // 2, 8))
+    return replace(detail, sky_px=sky_px, bounce_px=bounce_px, clusters=clusters)
 
 
 def _haze(sky: AtmosphereModel) -> dict[str, Any]:
@@ -319,7 +327,8 @@ def _uv(place: Place, grid: _Grid, longest: int) -> tuple[np.ndarray, np.ndarray
     number = np.full(len(positions), -1)
     number[index] = np.arange(len(index))
     number = number.reshape(shape)
-    rows, columns = distance_transform_edt(number < 0, return_distances=False, return_indices=True)
+    indices = distance_transform_edt(number < 0, return_distances=False, return_indices=True)
+    rows, columns = np.asarray(indices)
     return found.uv, number[rows, columns], shape
 
 

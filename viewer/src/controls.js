@@ -1,6 +1,9 @@
 // The camera: orbit about a point of the ground, or walk on it; pointer, touch and keys.
 import { RAD, angles, cameraAxes } from "./frames.js";
 
+// Eyes above the ground [m]: the rendered mesh may stand a metre or two above the grid of heights.
+const CLEARANCE = 3;
+
 export function makeControls(canvas, frame, terrain, changed) {
   const camera = { latitude: 0, longitude: 0, height: 0, heading: 0, pitch: 0, fov: 50, position: [0, 0, 0] };
   const mode = { walk: false };
@@ -15,7 +18,7 @@ export function makeControls(canvas, frame, terrain, changed) {
 
   /** Take a position and a viewing direction of the frame. */
   function place(position, towards) {
-    const floor = terrain.inside(position[0], position[1]) ? terrain.heightAt(position[0], position[1]) + 2 : -Infinity;
+    const floor = terrain.inside(position[0], position[1]) ? terrain.heightAt(position[0], position[1]) + CLEARANCE : -Infinity;
     const p = [position[0], position[1], Math.max(position[2], floor)];
     const [latitude, longitude, height] = frame.toGeodetic(p);
     const { axes } = cameraAxes(frame, latitude, longitude, 0, 0);
@@ -34,7 +37,7 @@ export function makeControls(canvas, frame, terrain, changed) {
     const [s, c] = [Math.sin(camera.heading * RAD), Math.cos(camera.heading * RAD)];
     const p = camera.position;
     const next = [p[0] + forward * s + right * c, p[1] + forward * c - right * s, p[2] + up];
-    if (mode.walk && terrain.inside(next[0], next[1])) next[2] = terrain.heightAt(next[0], next[1]) + 2;
+    if (mode.walk && terrain.inside(next[0], next[1])) next[2] = terrain.heightAt(next[0], next[1]) + CLEARANCE;
     place(next, axes().forward);
   }
 
@@ -54,7 +57,7 @@ export function makeControls(canvas, frame, terrain, changed) {
     const heading = (camera.heading + turn + 360) % 360;
     const pitch = Math.min(Math.max(camera.pitch - rise, -89), 89);
     const [latitude, longitude, height] = frame.toGeodetic(position);
-    const floor = terrain.inside(position[0], position[1]) ? terrain.heightAt(position[0], position[1]) + 2 : -Infinity;
+    const floor = terrain.inside(position[0], position[1]) ? terrain.heightAt(position[0], position[1]) + CLEARANCE : -Infinity;
     if (position[2] < floor) return;
     Object.assign(camera, { latitude, longitude, height, heading, pitch, position });
     changed();

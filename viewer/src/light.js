@@ -255,11 +255,11 @@ export function makeLight(arrays, about) {
     return { coefficients: result, level };
   }
 
-  /** Extinction of the aerosol over that of all air near the ground, by colour. */
-  function hazeShare() {
+  /** Extinction of the aerosol over that of all air at a height, by colour. */
+  function hazeShare(height = about.surface_m) {
     const scale = about.sky.aerosol_scale_m;
-    const fade = Math.exp(-Math.max(about.surface_m - about.sky.ground_m, 0) / scale) / scale;
-    const gas = Math.exp(-about.surface_m / 8000) / 8000;
+    const fade = Math.exp(-Math.max(height - about.sky.ground_m, 0) / scale) / scale;
+    const gas = Math.exp(-height / 8000) / 8000;
     return about.sky.aerosol_extinction.map((depth, k) => {
       const haze = depth * fade;
       return haze / (haze + about.sky.gas_depth[k] * gas);

@@ -162,7 +162,7 @@ async function start() {
   let settle = 0;
   function loop() {
     requestAnimationFrame(loop);
-    step();
+    if (!state.paused) step();
   }
   function step() {
     if (state.playing) play();
@@ -181,6 +181,10 @@ async function start() {
     if (settle < enough) {
       settle += 1;
       renderer.draw(controls.camera.height);
+      if (!document.body.dataset.first) {
+        renderer.finish();
+        document.body.dataset.first = performance.now().toFixed(0);
+      }
       if (settle === 1 || settle === enough) {
         if (settle > 1) state.metered = false;
         expose();
@@ -307,10 +311,14 @@ async function start() {
     if (state.point) tellPoint();
   }
 
-  /** Times at which more than half of the sun's disc stands above the ground's horizon at a point, within a civil day. */
+  /** The same within the civil day of an instant. */
   function sunTimes(point, time) {
     const civil = clock.civil(time);
     const from = clock.instant(civil.year, civil.month, civil.day);
+    return sunTimesBetween(point, from, from + DAY);
+  }
+  /** Times at which more than half of the sun's disc comes above the ground's horizon at a point, or goes below it. */
+  function sunTimesBetween(point, from, to) {
     const margin = (instant) => {
       const sun = ephemeris.sun(instant);
       if (sun.elevation < -1) return -1;
@@ -322,7 +330,7 @@ async function start() {
       return d[2] - se * d[0] - sn * d[1];
     };
     const value = (instant) => Math.min(margin(instant), 100 * facing(instant));
-    return crossings(value, from, from + DAY, 3 * MINUTE);
+    return crossings(value, from, to, 2 * MINUTE);
   }
 
   function tellPoint() {
@@ -351,24 +359,19 @@ async function start() {
       `. Sun on ${clock.date(state.time)}: ${hours.toFixed(1)} h` + (times.length ? `; ${spoken}.` : ".");
   }
 
+  const address = () => writeAddress({ time: state.time, camera: controls.camera, ev: state.ev, haze: state.haze });
   function command() {
-    const c = controls.camera;
-    const { name } = about;
-    const at = `${c.latitude.toFixed(6)},${c.longitude.toFixed(6)},${c.height.toFixed(1)}`;
-    const stamp = new Date(state.time).toISOString().replace(/(:00)?\.000Z$/, "Z");
     const sky = about.sky.name === "clear" ? "" : ` --sky ${about.sky.name}`;
-    const haze = state.haze === 1 || !about.sky.visibility_km ? "" : ` --visibility-km ${visibility().toFixed(1)}`;
-    const ev = state.ev === "auto" ? "auto" : state.ev.toFixed(2);
-    return `seasonscapes render ${name} --at=${at} --heading ${c.heading.toFixed(2)} --pitch=${c.pitch.toFixed(2)} --fov ${c.fov.toFixed(2)} ` +
-      `--time ${stamp} --exposure=${ev} --size ${canvas.width}x${canvas.height} --engine path${sky}${haze}`;
+    return `seasonscapes render ${about.view.scene ?? about.name} --at-url "${address()}" --size ${canvas.width}x${canvas.height} --engine path${sky}`;
   }
-  const visibility = () => about.sky.visibility_km / (1 + (state.haze - 1) * light.hazeShare()[1]);
+  /** Meteorological range with the slider's haze [km]. */
+  const visibility = () => about.sky.visibility_km / (1 + (state.haze - 1) * light.hazeShare(about.sky.ground_m)[1]);
 
   let pending = 0;
   function remember() {
     clearTimeout(pending);
     pending = setTimeout(() => {
-      const hash = writeAddress({ time: state.time, camera: controls.camera, ev: state.ev, haze: state.haze });
+      const hash = address();
       element("command").textContent = command();
       if (location.hash === hash) return;
       try {
@@ -384,7 +387,7 @@ async function start() {
   function setTime(time, quality = fine) {
     state.time = Math.min(Math.max(time, Date.UTC(1900, 0, 2)), Date.UTC(2053, 9, 1));
     lightChanged(quality);
-    albedoChanged();
+    state.arriving = albedoChanged();
   }
   function stop() {
     state.playing = null;
@@ -516,7 +519,7 @@ async function start() {
     setHaze(given?.haze ?? 1);
     setEv(given?.ev ?? "auto");
     const first = about.view.time ? Date.parse(about.view.time) : noon();
-    setTime(given?.time ?? first);
+    setTime(given?.time ?? first, coarse);
   }
   function noon() {
     const civil = clock.civil(Date.now());
@@ -528,11 +531,10 @@ async function start() {
 
   fit();
   restore(readAddress(location.hash) ?? readAddress(about.view.hash ?? ""));
-  await albedoChanged();
-  await albedoTexture(0);
+  await state.arriving;
   element("status").textContent = "";
   // What measurements use; the page itself does not.
-  window.seasonscapes = { about, arrays, state, renderer, controls, ephemeris, terrain, light, frame, clock, setTime, setEv, setHaze, sunTimes, step, command, lightOf, now: () => now, fine };
+  window.seasonscapes = { about, arrays, state, renderer, controls, ephemeris, terrain, light, frame, clock, setTime, setEv, setHaze, sunTimes, sunTimesBetween, step, command, lightOf, now: () => now, fine, useCamera };
   loop();
   step();
   document.body.dataset.started = (performance.now() - began).toFixed(0);
