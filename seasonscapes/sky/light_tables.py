@@ -123,13 +123,14 @@ def light_tables(
     knots = KNOTS_DEG[: int(np.searchsorted(KNOTS_DEG, highest_deg)) + 1]
     distances = radiance.DISTANCE_EDGES_M
     columns = np.array([k for k in _COLUMNS if k == 0 or distances[k - 1] < farthest_m])
-    suns = np.array([np.radians(true_elevation_deg(tables.atmosphere, knot, surface_m)) for knot in knots])
     unit = np.ones(len(WAVELENGTHS_NM))
     sky, air, depth, horizon, night = [], [], [], [], []
     for index, height in enumerate(heights_m):
         view = radiance.observer_view(tables, float(height))
         horizon.append(view.horizon_rad)
         rows = air_rows_rad(view.horizon_rad)
+        # What an observer sees at the same apparent elevation: refraction depends on the height.
+        suns = np.radians(true_elevation_deg(tables.atmosphere, knots, float(height)))
         diffuse, diffuse_near = (_diffuse(tables, view, suns, near) for near in (False, True))
         parts = [[], [], []]
         for k, (knot, sun) in enumerate(zip(knots, suns, strict=True)):

@@ -34,24 +34,21 @@ export function makeLight(arrays, about) {
   function components(table, sizes, inner, elevation, height) {
     const [s, fs] = between(knots, elevation);
     const [h, fh] = between(heights, height);
+    const corners = [];
+    for (const [ds, ws] of [[0, 1 - fs], [1, fs]]) {
+      for (const [dh, wh] of [[0, 1 - fh], [1, fh]]) if (ws * wh > 0) corners.push([s + ds, h + dh, ws * wh]);
+    }
     const result = new Float32Array(inner);
-    for (const [dh, wh] of [[0, 1 - fh], [1, fh]]) {
-      if (wh === 0) continue;
-      const lists = sizes.shape.length === 2 ? 1 : sizes.shape[2];
-      const per = inner / lists;
-      for (let list = 0; list < lists; list++) {
-        const at = (ds) => ((s + ds) * H + h + dh) * lists + list;
-        const size = Math.exp((1 - fs) * Math.log(sizes.data[at(0)]) + fs * Math.log(sizes.data[at(1)]));
-        for (const [ds, ws] of [[0, 1 - fs], [1, fs]]) {
-          if (ws === 0) continue;
-          add(table, s + ds, h + dh, list, lists, per, inner, ws * wh, size, result);
-        }
-      }
+    const lists = sizes.shape.length === 2 ? 1 : sizes.shape[2];
+    for (let list = 0; list < lists; list++) {
+      // Sizes fall by powers of ten with the sun and rise with height: their geometric mean.
+      const size = Math.exp(corners.reduce((sum, [cs, ch, weight]) => sum + weight * Math.log(sizes.data[(cs * H + ch) * lists + list]), 0));
+      for (const [cs, ch, weight] of corners) add(table, cs, ch, list, lists, inner, weight, size, result);
     }
     return result;
   }
 
-  function add(table, s, h, list, lists, per, inner, weight, size, result) {
+  function add(table, s, h, list, lists, inner, weight, size, result) {
     const base = (s * H + h) * inner;
     if (lists === 1) {
       for (let k = 0; k < inner; k++) result[k] += weight * (k % CHANNELS === 9 ? 1 : size) * table[base + k];

@@ -38,7 +38,10 @@ async function start() {
 
   const state = { time: Date.now(), ev: "auto", haze: 1, shownEv: 15, dirty: true, coarse: false, metered: false, point: null, playing: null };
   const controls = makeControls(canvas, frame, terrain, () => cameraChanged());
-  if (still) document.body.classList.add("still");
+  if (still) {
+    document.body.classList.add("still");
+    renderer.state.cellPixels = 1;
+  }
 
   // ---- light -------------------------------------------------------------------------------------------------------
   let now = null;

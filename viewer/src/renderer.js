@@ -3,13 +3,13 @@
 import * as THREE from "three";
 import * as shaders from "./shaders.js";
 import { AIR_AZIMUTHS, SKY_AZIMUTHS } from "./light.js";
-import { chooseChunks, chunkGeometry } from "./terrain.js";
+import { CELLS, chooseChunks, chunkGeometry } from "./terrain.js";
 
 const SATURATION = 1.2;
 const GAIN = 1.6;
 const BRADFORD = [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]];
 const XYZ = [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.072175], [0.0193339, 0.119192, 0.9503041]];
-const MOST_CHUNKS = 4096;
+const MOST_CHUNKS = 8192;
 const METER = [96, 64];
 
 const half = (value) => THREE.DataUtils.toHalfFloat(Math.min(Math.max(value, -65000), 65000));
@@ -198,7 +198,7 @@ export function makeRenderer(canvas, { arrays, about }, terrain, light) {
   const meter = pass(shaders.METER, { uFrame: { value: null } });
   const meterTarget = target(...METER, THREE.FloatType, THREE.NearestFilter);
 
-  const state = { scale: 1, ev: 15, bodies: [], height: NaN, detail: 2.0, hfov: 52, seenSide: 0, passes: 0 };
+  const state = { scale: 1, ev: 15, bodies: [], height: NaN, cellPixels: software ? 2 : 1, hfov: 52, seenSide: 0, passes: 0 };
 
   function resize(width, height) {
     gl.setSize(width, height, false);
@@ -345,14 +345,16 @@ export function makeRenderer(canvas, { arrays, about }, terrain, light) {
     setObserver(height);
     const jitter = count === 0 ? [0, 0] : [halton(count, 2) - 0.5, halton(count, 3) - 0.5];
     project(jitter);
+    dome.uniforms.uPixel.value = (2 * Math.tan((state.hfov * Math.PI) / 360)) / frame.width;
     const frustum = new THREE.Frustum().setFromProjectionMatrix(new THREE.Matrix4().multiplyMatrices(camera.projectionMatrix, camera.matrixWorldInverse));
-    const chosen = chooseChunks(terrain, camera.position, state.detail, frustum).slice(0, MOST_CHUNKS);
+    // Cells of some pixels: a chunk is divided while its cells look larger.
+    const detail = 1 / (CELLS * state.cellPixels * dome.uniforms.uPixel.value);
+    const chosen = chooseChunks(terrain, camera.position, detail, frustum).slice(0, MOST_CHUNKS);
     chosen.forEach((chunk, k) => instances.setXYZ(k, ...chunk));
     geometry.instanceCount = chosen.length;
     instances.needsUpdate = true;
     ground.uniforms.uEye.value.copy(camera.position);
     dome.uniforms.uRays.value.copy(camera.matrixWorld).setPosition(0, 0, 0).multiply(camera.projectionMatrixInverse);
-    dome.uniforms.uPixel.value = (2 * Math.tan((state.hfov * Math.PI) / 360)) / frame.width;
     gl.setRenderTarget(frame);
     gl.clear(true, true, false);
     dome.depthTest = false;
