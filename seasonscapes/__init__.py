@@ -40,6 +40,8 @@ _MODULES = {
     "timelapse": "workflows.timelapse",
     "lit_texture": "workflows.received_light",
     "irradiance_map": "workflows.received_light",
+    "show": "workflows.viewer",
+    "PlaceView": "workflows.viewer",
     "export_scene": "workflows.export_scene",
     "ExportOptions": "workflows.export_scene",
     "textured_view": "workflows.view_rendering",

@@ -56,6 +56,8 @@ from seasonscapes.workflows.synthetic_photographs import synthetic_photographs a
 from seasonscapes.workflows.timelapse import timelapse as timelapse
 from seasonscapes.workflows.view_rendering import render as render
 from seasonscapes.workflows.view_rendering import textured_view as textured_view
+from seasonscapes.workflows.viewer import PlaceView as PlaceView
+from seasonscapes.workflows.viewer import show as show
 from seasonscapes.workflows.views import camera as camera
 from seasonscapes.workflows.webcam_calibration import calibrate as calibrate
 from seasonscapes.workflows.webcam_calibration import camera_station as camera_station

@@ -84,3 +84,8 @@ def bundled_path(kind: Kind, name: str) -> Path:
             cure=f"did you mean '{close[0]}'?" if close else None,
         )
     return bundled_folder(kind) / f"{name}.toml"
+
+
+def is_bundled(kind: Kind, path: Path) -> bool:
+    """Whether a path is that of a bundled file, which its name alone stands for."""
+    return path.stem in bundled_names(kind) and bundled_path(kind, path.stem) == path

@@ -171,7 +171,7 @@ def test_a_pose_that_is_not_reliable_is_left_out_or_refused(tmp_path, caplog):
     assert [each.time.hour for each in observations(rows, sources, FRAME)] == [8]
     assert "not reliable: hut_20240901T090000Z_calibration.json: fog" in caplog.text
     assert len(observations(rows, replace(sources, accept_doubtful=True), FRAME)) == 2
-    with pytest.raises(InputError, match="no reliable pose .*fog.*--doubtful-poses"):
+    with pytest.raises(InputError, match=r"no reliable pose .*fog.*--doubtful-poses"):
         observations(rows[1:], sources, FRAME)
 
 

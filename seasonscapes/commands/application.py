@@ -77,6 +77,7 @@ app = App(
 COMMANDS = (
     ("fetch", "fetch", "Make the scene of a place from open data, by its coordinates."),
     ("render", "render", "Render a view of a place at a date and hour."),
+    ("view", "view", "Show a place in a browser: drag the date and the hour."),
     ("timelapse", "timelapse", "Film a view through hours or seasons."),
     ("lit-texture", "lit_texture", "Export a place's texture as lit at an hour."),
     ("export", "export", "Write a place for other programs: glTF, USD, 3D Tiles, Blender."),

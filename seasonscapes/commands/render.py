@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time as clock
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -13,13 +14,15 @@ from seasonscapes.commands.console import print_result, progress_bars
 from seasonscapes.commands.look_options import LookOptions
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
 from seasonscapes.commands.outputs import check_output
+from seasonscapes.commands.url_options import at_address, given_address
 from seasonscapes.commands.view_options import ViewOptions
 
 
 def render_command(
     scene: str,
     *,
-    time: str,
+    time: str | None = None,
+    at_url: str | None = None,
     view: ViewOptions | None = None,
     sky: SkyOptions | None = None,
     look: LookOptions | None = None,
@@ -42,6 +45,9 @@ def render_command(
         A scene file, or the name of a bundled scene (alpine).
     time
         ISO 8601, such as 2024-09-01T12:00. Without an offset it is civil time at the camera.
+    at_url
+        Instead of --time, --camera and --at: the address of a view in the page of `seasonscapes view`, whose time, camera,
+        exposure and haze it states.
     albedo
         DATE=FILE, may be repeated: albedos of a date instead of the scene's own (.npz; or .png, .exr, .glb of this atlas).
     season
@@ -69,6 +75,9 @@ def render_command(
         look or LookOptions(),
         place or PlaceOptions(),
     )
+    address = given_address(at_url, time, view, look)
+    if address is not None:
+        view, look = replace(view, **at_address(address)), replace(look, exposure=address.exposure)
     check_output(output, (".png", ".exr"))
     if spp is not None:
         check_range("--spp", spp, 1, 1 << 20)
@@ -78,17 +87,18 @@ def render_command(
     from seasonscapes.rendering.backend import use_backend
     from seasonscapes.workflows.albedo_sources import albedo_series, chosen_albedo, require_season
     from seasonscapes.workflows.pictures import png_metadata, save_exr, save_png
+    from seasonscapes.workflows.view_address import hazy_sky
     from seasonscapes.workflows.view_rendering import render
 
     look.metering()
-    size_px, model = view.size_px(), sky.model()
+    size_px, model = view.size_px(), sky.model() if address is None else hazy_sky(sky.model(), address.haze)
     require_season(season, where="--season")
     files = [parse_albedo(text) for text in albedo or ()]
     use_backend(device)
     with progress_bars() as progress:
         loaded = options.load(scene, progress, albedo=[each.path for each in files])
         chosen, camera = view.chosen(loaded.scene), view.pinhole(loaded)
-        utc = parse_time(time, chosen.latitude_deg, chosen.longitude_deg)
+        utc = address.time if address else parse_time(str(time), chosen.latitude_deg, chosen.longitude_deg)
         series = albedo_series(loaded, files, season, progress=progress)
         texture = chosen_albedo(loaded, utc.date(), series, progress=progress)
         picture = render(

@@ -125,7 +125,11 @@ def tabulate_aerial_perspective(
 
 
 def airlight(
-    tables: AtmosphereTables, view: ObserverView, true_elevation_rad: float, irradiance: np.ndarray
+    tables: AtmosphereTables,
+    view: ObserverView,
+    true_elevation_rad: float,
+    irradiance: np.ndarray,
+    diffuse: np.ndarray | None = None,
 ) -> np.ndarray:
     """Integrate the components of a luminary's airlight up to each of `DISTANCE_EDGES_M`.
 
@@ -139,6 +143,8 @@ def airlight(
         True elevation of the luminary [rad].
     irradiance
         Extraterrestrial spectral irradiance over that of the sun at 1 au ``(B,)``.
+    diffuse
+        What `diffuse_at_observer` gives with ``near``, where it is known already.
 
     Returns
     -------
@@ -146,7 +152,8 @@ def airlight(
         Components ``(K, A, M, 10)`` as in `ScatteredRadiance`.
     """
     rgb_matrix = rgb_from_transfer() * irradiance
-    diffuse = diffuse_at_observer(tables, view, true_elevation_rad, near=True)
+    if diffuse is None:
+        diffuse = diffuse_at_observer(tables, view, true_elevation_rad, near=True)
     components = radiance_components(tables, view.near, true_elevation_rad, rgb_matrix, diffuse, cumulative=True)
     components = interpolate_azimuths(components)
     return np.concatenate([np.zeros_like(components[:, :, :1]), components], axis=2)

@@ -253,7 +253,7 @@ def illumination_from_atmosphere(
     if with_aerial_perspective:
         illuminant = np.asarray(
             sum(
-                irradiance * _surface_transfer(tables, direction, observer_height_m, true)
+                irradiance * surface_transfer(tables, direction, observer_height_m, true)
                 for direction, irradiance, true in zip(directions, irradiances, true_rad, strict=True)
             )
         )
@@ -362,8 +362,20 @@ def _direct_transfer(tables: AtmosphereTables, direction: np.ndarray, height_m: 
     )
 
 
-def _surface_transfer(tables: AtmosphereTables, direction: np.ndarray, height_m: float, true_rad: float) -> np.ndarray:
-    """Irradiance transfer of a steep surface near the observer: half of the direct and the whole diffuse one."""
+def surface_transfer(tables: AtmosphereTables, direction: np.ndarray, height_m: float, true_rad: float) -> np.ndarray:
+    """Irradiance transfer ``(B,)`` of a steep surface near the observer: half of the direct and the whole diffuse one.
+
+    Parameters
+    ----------
+    tables
+        Tables of the atmosphere.
+    direction
+        Apparent unit vector towards the luminary ``(3,)``.
+    height_m
+        Height of the observer [m].
+    true_rad
+        True elevation of the luminary [rad].
+    """
     index, fraction = sun_index(np.sin(true_rad))
     table = tables.moments.ground_irradiance
     diffuse = table[index] * (1.0 - fraction) + table[index + 1] * fraction

@@ -92,11 +92,7 @@ class ScatteredRadiance:
 @lru_cache(maxsize=8)
 def _view(atmosphere: Atmosphere, height_m: float) -> ObserverView:
     horizon = float(horizon_elevation_rad(atmosphere, height_m))
-    up = np.linspace(0.0, 1.0, _ROWS_ABOVE) ** _EXPONENT_ABOVE
-    down = np.linspace(1.0, 0.0, _ROWS_BELOW) ** _EXPONENT_BELOW
-    gap = 1e-5
-    below, above = horizon - gap - (np.pi / 2 + horizon - gap) * down, horizon + gap + (np.pi / 2 - horizon - gap) * up
-    elevation = np.concatenate([below, above])
+    elevation = row_elevations_rad(horizon, _ROWS_BELOW, _ROWS_ABOVE)
     rays = trace_curved_rays(atmosphere, height_m, elevation)
     unscaled = optics(atmosphere)
     scaled = delta_scaled(unscaled, HARMONIC_ORDER)
@@ -110,6 +106,23 @@ def _view(atmosphere: Atmosphere, height_m: float) -> ObserverView:
     depth = np.einsum("cks,cb->ksb", cell_columns(atmosphere, near.edges, midpoints), unscaled.extinction)
     depth = np.concatenate([np.zeros_like(depth[:, :1]), np.cumsum(depth, axis=1)], axis=1)
     return ObserverView(height_m, horizon, elevation, sky, near, depth)
+
+
+def row_elevations_rad(horizon_rad: float, below: int, above: int) -> np.ndarray:
+    """Elevations of the rows of a table [rad]: from the nadir to just below the horizon, then from just above it up.
+
+    Parameters
+    ----------
+    horizon_rad
+        Apparent elevation of the horizon [rad].
+    below, above
+        Number of rows below and above the horizon.
+    """
+    up = np.linspace(0.0, 1.0, above) ** _EXPONENT_ABOVE
+    down = np.linspace(1.0, 0.0, below) ** _EXPONENT_BELOW
+    gap = 1e-5
+    lower = horizon_rad - gap - (np.pi / 2 + horizon_rad - gap) * down
+    return np.concatenate([lower, horizon_rad + gap + (np.pi / 2 - horizon_rad - gap) * up])
 
 
 def observer_view(tables: AtmosphereTables, height_m: float) -> ObserverView:
@@ -143,6 +156,7 @@ def observed_sky(
     luminary_direction: np.ndarray,
     true_elevation_rad: float,
     irradiance: np.ndarray,
+    diffuse: np.ndarray | None = None,
 ) -> ScatteredRadiance:
     """Tabulate the sky radiance of one luminary for an observer.
 
@@ -158,6 +172,8 @@ def observed_sky(
         True (unrefracted) elevation of the luminary [rad].
     irradiance
         Extraterrestrial spectral irradiance over that of the sun at 1 au ``(B,)``.
+    diffuse
+        What `diffuse_at_observer` gives, where it is known already.
 
     Returns
     -------
@@ -165,7 +181,8 @@ def observed_sky(
         Table for `sky_radiance`.
     """
     rgb_matrix = rgb_from_transfer() * irradiance
-    diffuse = diffuse_at_observer(tables, view, true_elevation_rad)
+    if diffuse is None:
+        diffuse = diffuse_at_observer(tables, view, true_elevation_rad)
     components = radiance_components(tables, view.sky, true_elevation_rad, rgb_matrix, diffuse)[:, :, 0]
     components[:, :, 6:9] += (ground_along(tables, view.sky, true_elevation_rad) @ rgb_matrix.T).astype(np.float32)
     return ScatteredRadiance(

@@ -12,6 +12,7 @@ from fault_harness import TIME, call
 
 BASE: dict[str, list[str]] = {
     "render": ["s.toml", "--time", TIME, "--size", "16x12", "--spp", "1", "--output", "out/a.png"],
+    "view": ["s.toml", "--output", "out/page"],
     "timelapse": ["s.toml", "--times", TIME, "--size", "16x12", "--output", "out/film"],
     "fetch": ["--at", "46.5,8.0", "--elevation", "dem.tif", "--imagery", "image.tif", "--output", "got/g.toml"],
     "export": ["s.toml", "--to", "glb", "--output", "out/e.glb"],

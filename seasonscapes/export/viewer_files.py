@@ -1,0 +1,201 @@
+"""The page of a place in a browser as files: one binary of arrays, pictures of the albedo, a description, the program.
+
+The program (``seasonscapes/viewer_page/viewer.js``) is built from ``viewer/`` and needs neither a server of its own nor
+anything from elsewhere: addresses are relative, and the page's Content-Security-Policy permits its own files alone.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import io
+import json
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from seasonscapes.images import srgb8_from_linear
+
+PAGE = Path(__file__).parents[1] / "viewer_page"
+PROGRAM, STYLE, NOTICES = "viewer.js", "viewer.css", "NOTICES.txt"
+_FORMAT = 1
+_KINDS = {"uint8": "u8", "uint16": "u16", "float16": "f16", "float32": "f32"}
+_QUALITY = 82
+
+
+@dataclass(frozen=True)
+class AlbedoPicture:
+    """The albedo of a date, seen from above.
+
+    Parameters
+    ----------
+    day
+        The date.
+    content
+        A WebP picture of the sRGB-encoded albedo; row 0 is the northern edge of the grid.
+    size_px
+        Rows and columns.
+    """
+
+    day: date
+    content: bytes
+    size_px: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class ViewerScene:
+    """Everything that the page knows of a place.
+
+    Parameters
+    ----------
+    about
+        Plain values: names, frame, grid, cameras, sky.
+    arrays
+        Arrays by name; uint8, uint16, float16 or float32.
+    albedo
+        Pictures of the albedo by date.
+    """
+
+    about: dict[str, Any]
+    arrays: dict[str, np.ndarray]
+    albedo: Sequence[AlbedoPicture]
+
+
+def albedo_picture(day: date, values: np.ndarray, *, quality: int = _QUALITY) -> AlbedoPicture:
+    """Encode albedo ``(R, S, 3)``, row 0 in the north, as a picture."""
+    from PIL import Image
+
+    encoded = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(srgb8_from_linear(values))).save(
+        encoded, format="WEBP", quality=quality, method=4
+    )
+    return AlbedoPicture(day, encoded.getvalue(), (values.shape[0], values.shape[1]))
+
+
+def viewer_files(scene: ViewerScene, *, view: dict[str, Any] | None = None) -> dict[str, bytes]:
+    """The files of a static folder by name.
+
+    Parameters
+    ----------
+    scene
+        The place.
+    view
+        What the page shows at first: ``camera`` and ``time``.
+    """
+    description, binary, pictures = _packed(scene, view)
+    style, program = f'<link rel="stylesheet" href="{STYLE}">', f'<script defer src="{PROGRAM}"></script>'
+    policy = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data:; " + (
+        "base-uri 'none'; form-action 'none'"
+    )
+    return {
+        "index.html": _page(scene, policy, style, program, "").encode(),
+        PROGRAM: (PAGE / PROGRAM).read_bytes(),
+        STYLE: (PAGE / STYLE).read_bytes(),
+        NOTICES: (PAGE / NOTICES).read_bytes(),
+        "scene.json": description.encode(),
+        "scene.bin": binary,
+        **pictures,
+    }
+
+
+def single_file(scene: ViewerScene, *, view: dict[str, Any] | None = None) -> bytes:
+    """The page with all its data in one HTML file, which opens from the file system.
+
+    Parameters
+    ----------
+    scene
+        The place.
+    view
+        As in `viewer_files`.
+    """
+    description, binary, pictures = _packed(scene, view)
+    program = (PAGE / PROGRAM).read_text(encoding="utf-8").replace("</script", "<\\/script")
+    style = (PAGE / STYLE).read_text(encoding="utf-8")
+    policy = (
+        f"default-src 'none'; script-src '{_digest(program)}'; style-src '{_digest(style)}'; img-src data:; "
+        "base-uri 'none'; form-action 'none'"
+    )
+    escaped = description.replace("<", "\\u003c")
+    blocks = [f'<script type="application/json" id="scene.json">{escaped}</script>']
+    for name, content in {"scene.bin": binary, **pictures}.items():
+        text = base64.b64encode(content).decode()
+        blocks.append(f'<script type="application/octet-stream" id="{name}">{text}</script>')
+    notices = (PAGE / NOTICES).read_text(encoding="utf-8").replace("--", "- -")
+    blocks.append(f"<!--\n{notices}-->")
+    # The program is no module here: it runs where it stands, after all that it reads.
+    return _page(scene, policy, f"<style>{style}</style>", f"<script>{program}</script>", "\n".join(blocks)).encode()
+
+
+def _digest(text: str) -> str:
+    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+
+
+def _page(scene: ViewerScene, policy: str, style: str, program: str, data: str) -> str:
+    from html import escape
+
+    template = (PAGE / "index.html").read_text(encoding="utf-8")
+    parts = {
+        "@POLICY@": escape(policy, quote=True).replace("&#x27;", "'"),
+        "@TITLE@": escape(str(scene.about["title"])),
+        "@ATTRIBUTION@": escape(str(scene.about["attribution"])),
+        "@STYLE@": style,
+        "@DATA@": data,
+        "@PROGRAM@": program,
+    }
+    for name, text in parts.items():
+        template = template.replace(name, text)
+    return template
+
+
+def _packed(scene: ViewerScene, view: dict[str, Any] | None) -> tuple[str, bytes, dict[str, bytes]]:
+    """The description as JSON, the arrays one behind the other, and the pictures by name."""
+    binary, table = bytearray(), {}
+    for name, values in scene.arrays.items():
+        binary += b"\0" * (-len(binary) % 4)
+        kind = _KINDS[values.dtype.name]
+        table[name] = {"offset": len(binary), "shape": list(values.shape), "type": kind}
+        binary += np.ascontiguousarray(values).astype(values.dtype.newbyteorder("<"), copy=False).tobytes()
+    pictures, dated = {}, []
+    for picture in scene.albedo:
+        name = f"albedo-{picture.day.isoformat()}.webp"
+        pictures[name] = picture.content
+        dated.append({"date": picture.day.isoformat(), "file": name, "size_px": list(picture.size_px)})
+    description = {"format": _FORMAT, **scene.about, "arrays": table, "albedo": dated, "view": view or {}}
+    return json.dumps(description, separators=(",", ":"), allow_nan=False), bytes(binary), pictures
+
+
+def save_scene(scene: ViewerScene, path: Path) -> None:
+    """Write a scene to one file."""
+    description, binary, pictures = _packed(scene, None)
+    names = list(pictures)
+    head = json.dumps([description, len(binary), [[name, len(pictures[name])] for name in names]]).encode()
+    path.write_bytes(struct.pack("<Q", len(head)) + head + binary + b"".join(pictures[name] for name in names))
+
+
+def load_scene(path: Path) -> ViewerScene:
+    """Read a scene of `save_scene`."""
+    content = path.read_bytes()
+    (length,) = struct.unpack_from("<Q", content)
+    text, size, sizes = json.loads(content[8 : 8 + length])
+    about, start = json.loads(text), 8 + length
+    kinds = {short: name for name, short in _KINDS.items()}
+    arrays = {}
+    for name, entry in about.pop("arrays").items():
+        count = int(np.prod(entry["shape"]))
+        values = np.frombuffer(
+            content, np.dtype(kinds[entry["type"]]).newbyteorder("<"), count, start + entry["offset"]
+        )
+        arrays[name] = values.reshape(entry["shape"])
+    start += size
+    albedo = []
+    for dated, (_, bytes_) in zip(about.pop("albedo"), sizes, strict=True):
+        day, shape = date.fromisoformat(dated["date"]), dated["size_px"]
+        albedo.append(AlbedoPicture(day, content[start : start + bytes_], (shape[0], shape[1])))
+        start += bytes_
+    del about["format"], about["view"]
+    return ViewerScene(about, arrays, albedo)

@@ -1,0 +1,218 @@
+"""The page of a place in a browser: served here, as a static folder, as one file, or in a notebook."""
+
+from __future__ import annotations
+
+import html
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, urlsplit
+
+from seasonscapes.albedo.seasons import AlbedoSeries
+from seasonscapes.bundled import is_bundled
+from seasonscapes.errors import InputError
+from seasonscapes.export.viewer_files import ViewerScene, single_file, viewer_files
+from seasonscapes.images import atomic_path
+from seasonscapes.local_server import LocalHandler, LocalServer, Refused, Reply, serve_locally
+from seasonscapes.progress import Progress
+from seasonscapes.sky.models import SkyModel
+from seasonscapes.workflows.export_scene import new_folder
+from seasonscapes.workflows.illumination import sky_model
+from seasonscapes.workflows.place import Place, utc_at
+from seasonscapes.workflows.viewer_scene import SMALL, viewer_scene
+
+_KINDS = {
+    ".html": "text/html; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".txt": "text/plain; charset=utf-8",
+    ".json": "application/json",
+    ".bin": "application/octet-stream",
+    ".webp": "image/webp",
+}
+_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data:; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+
+
+def first_view(place: Place, camera: str | None, time: str | datetime | None) -> dict[str, Any]:
+    """What the page shows at first, as plain values.
+
+    Raises
+    ------
+    InputError
+        For a camera that the scene does not name, or a time that is none.
+    """
+    # A published page names no folder of the machine that made it.
+    view: dict[str, Any] = {"scene": place.path.stem if is_bundled("scenes", place.path) else place.path.name}
+    if camera is not None:
+        view["camera"] = place.scene.camera(camera).name
+    if time is not None:
+        view["time"] = utc_at(place, time).isoformat().replace("+00:00", "Z")
+    return view
+
+
+def write_folder(scene: ViewerScene, folder: Path, view: dict[str, Any]) -> dict[str, int]:
+    """Write the page as a static folder for any web host; the bytes of each file.
+
+    Raises
+    ------
+    InputError
+        Where there is a file, or a folder that is not empty.
+    """
+    files = viewer_files(scene, view=view)
+    with new_folder(folder) as temporary:
+        for name, content in files.items():
+            (temporary / name).write_bytes(content)
+    return {name: len(content) for name, content in files.items()}
+
+
+def write_single_file(scene: ViewerScene, path: Path, view: dict[str, Any]) -> int:
+    """Write the page as one HTML file, atomically; its bytes."""
+    content = single_file(scene, view=view)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
+    return len(content)
+
+
+def serve_scene(scene: ViewerScene, view: dict[str, Any], *, port: int = 0) -> tuple[LocalServer, str]:
+    """Serve the page on 127.0.0.1 in a background thread.
+
+    The token of access is the first part of the path, so that the page's relative addresses carry it.
+
+    Parameters
+    ----------
+    scene, view
+        The place, and what is shown at first.
+    port
+        TCP port; 0 selects a free one.
+
+    Returns
+    -------
+    server : LocalServer
+        Call ``shutdown`` to stop it.
+    address : str
+        URL of the page with its token.
+
+    Raises
+    ------
+    InputError
+        If the port is none, is taken, or may not be used.
+    """
+    files = viewer_files(scene, view=view)
+
+    class Handler(LocalHandler):
+        def do_GET(self) -> None:
+            self.answer(self._file)
+
+        do_HEAD = do_GET
+
+        def _file(self) -> Reply:
+            token, _, name = unquote(urlsplit(self.path).path).lstrip("/").partition("/")
+            self.require_access(token)
+            name = name or "index.html"
+            if name not in files:
+                raise Refused(404, "no such file")
+            return Reply(200, _KINDS[Path(name).suffix], files[name], _POLICY)
+
+    server, address = serve_locally(Handler, port=port)
+    return server, f"{address}/{Handler.token}/"
+
+
+@dataclass(frozen=True)
+class PlaceView:
+    """A place as a page in a notebook; made by `show`.
+
+    Parameters
+    ----------
+    page
+        The page, one HTML file with all its data.
+    height_px
+        Height of the frame in the notebook [px].
+
+    Examples
+    --------
+    >>> import seasonscapes as ss
+    >>> ss.PlaceView("<!doctype html>", height_px=400).height_px
+    400
+    """
+
+    page: str
+    height_px: int
+
+    def _repr_html_(self) -> str:
+        return (
+            f'<iframe srcdoc="{html.escape(self.page, quote=True)}" sandbox="allow-scripts allow-popups" '
+            f'style="width:100%;height:{self.height_px}px;border:0" title="A place in three dimensions"></iframe>'
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Write the page to an HTML file, atomically."""
+        with atomic_path(Path(path)) as temporary:
+            temporary.write_text(self.page, encoding="utf-8")
+
+
+def show(
+    place: Place,
+    time: str | datetime | None = None,
+    *,
+    camera: str | None = None,
+    sky: str | Path | SkyModel = "clear",
+    albedo: AlbedoSeries | None = None,
+    height_px: int = 640,
+    progress: Progress | None = None,
+) -> PlaceView:
+    """Show a place in a notebook: drag the date and the hour, walk, look at it from its cameras.
+
+    The page is the one that ``seasonscapes view`` serves, with fewer details, in one piece: it needs no running Python,
+    no widget extension and no network, and a notebook that was saved still shows it.
+
+    Parameters
+    ----------
+    place
+        The place.
+    time
+        The instant that is shown at first: an aware datetime, or ISO 8601 text.
+    camera
+        Name of the scene's camera that is shown at first.
+    sky
+        A cloudless model of the atmosphere, its name or its file.
+    albedo
+        Dated albedos; ``None``: the scene's own.
+    height_px
+        Height of the frame in the notebook [px].
+    progress
+        Called with a task and its finished share.
+
+    Returns
+    -------
+    PlaceView
+        Notebooks display it; ``save`` writes it to a file.
+
+    Raises
+    ------
+    InputError
+        For a camera or time that does not exist, and skies that the page cannot show.
+
+    Examples
+    --------
+    >>> import seasonscapes as ss
+    >>> place = ss.load_place("alpine_small")
+    >>> view = ss.show(place, "2024-07-20T18:30", camera="aerial")
+    >>> view.page.startswith("<!doctype html>")
+    True
+    """
+    require_vectorised()
+    view = first_view(place, camera, time)
+    scene = viewer_scene(place, albedo=albedo, sky=sky_model(sky), detail=SMALL, progress=progress)
+    return PlaceView(single_file(scene, view=view).decode(), height_px)
+
+
+def require_vectorised() -> None:
+    """`InputError` where the renderer has no vectorised backend, which light transport needs."""
+    from seasonscapes.rendering.backend import use_backend
+
+    if use_backend().device == "scalar":
+        raise InputError("view", "needs a vectorised renderer", cure="install a libLLVM; see seasonscapes doctor")

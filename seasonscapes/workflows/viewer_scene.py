@@ -1,0 +1,476 @@
+"""What the page in a browser needs of a place: heights on a grid, albedos by date, light transport, tables of the light."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, date, datetime
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from seasonscapes.albedo.seasons import AlbedoSeries, DatedAlbedo
+from seasonscapes.errors import InputError
+from seasonscapes.frames import geodetic_from_enu
+from seasonscapes.progress import Progress, task_progress
+from seasonscapes.scene import Viewpoint
+from seasonscapes.sky.models import AtmosphereModel, SkyModel, atmosphere_from_model, visibility_km
+from seasonscapes.workflows.albedo_sources import dated_albedos, snow_transition_between
+from seasonscapes.workflows.illumination import atmosphere_tables_in
+from seasonscapes.workflows.place import Place
+from seasonscapes.workflows.views import camera_for
+from seasonscapes.workspace import build_once
+
+if TYPE_CHECKING:
+    from seasonscapes.export.viewer_files import AlbedoPicture, ViewerScene
+    from seasonscapes.sky.light_tables import LightTables
+
+log = logging.getLogger(__name__)
+
+_CODE = ("workflows.viewer_scene", "export.viewer_files", "rendering.grid_transport", "sky.light_tables")
+_SEARCH_M = 1000.0
+# Heights above the highest ground up to which air and sky are tabulated [m].
+_ABOVE_M = 3000.0
+# Terms of the airlight's cosine series that are kept; the aerosol's phase function is not among what they describe.
+_AIR_TERMS = 8
+# Dates of a place whose albedo is known for every day: snow goes and comes fast in spring and autumn.
+_SHOWN = ((1, 16), (3, 1), (4, 1), (5, 1), (6, 1), (7, 16), (9, 16), (10, 16), (11, 16))
+
+
+@dataclass(frozen=True)
+class ViewerDetail:
+    """How finely a place is shown; the defaults keep a place of 12 km below 20 MB.
+
+    Parameters
+    ----------
+    most_nodes
+        Largest number of heights along a side; finer rasters are thinned.
+    albedo_px
+        Texels along the longer side of the sharpest albedo pictures, of which there are at most two.
+    other_albedo_px
+        The same of all other dates.
+    sky_px, bounce_px
+        Points along the longer side at which skylight and reflected light are computed.
+    rank
+        Daylight coefficients of a point, a multiple of 4.
+    clusters
+        Groups of faces that reflect light, a square of a power of two.
+    clusters_per_point
+        Groups that each point sees, a multiple of 4.
+    rays
+        Hemisphere rays of each point, a power of two.
+    """
+
+    most_nodes: int = 1280
+    albedo_px: int = 2048
+    other_albedo_px: int = 1024
+    sky_px: int = 384
+    bounce_px: int = 192
+    rank: int = 12
+    clusters: int = 4096
+    clusters_per_point: int = 32
+    rays: int = 256
+
+
+SMALL = ViewerDetail(640, 1024, 640, 224, 112, 8, 1024, 16, 128)
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """A regular east-north grid over a terrain: node (c, r) lies at west + c · step, south + r · step."""
+
+    west_m: float
+    south_m: float
+    step_m: float
+    columns: int
+    rows: int
+
+    def positions(self, longest: int | None = None) -> tuple[np.ndarray, tuple[int, int]]:
+        """East and north ``(N, 2)`` of texel centres that divide the grid's area, and their rows and columns."""
+        width, height = (self.columns - 1) * self.step_m, (self.rows - 1) * self.step_m
+        if longest is None:
+            rows, columns = self.rows, self.columns
+            east = self.west_m + np.arange(columns) * self.step_m
+            north = self.south_m + np.arange(rows) * self.step_m
+        else:
+            columns, rows = (max(2, round(longest * side / max(width, height))) for side in (width, height))
+            east = self.west_m + (np.arange(columns) + 0.5) / columns * width
+            north = self.south_m + (np.arange(rows) + 0.5) / rows * height
+        grid = np.stack(np.meshgrid(east, north), axis=-1)
+        return grid.reshape(-1, 2), (rows, columns)
+
+
+def viewer_scene(
+    place: Place,
+    *,
+    albedo: AlbedoSeries | None = None,
+    sky: SkyModel,
+    detail: ViewerDetail | None = None,
+    progress: Progress | None = None,
+) -> ViewerScene:
+    """Compute what the page shows, or load it from the workspace.
+
+    Parameters
+    ----------
+    place
+        The place.
+    albedo
+        Dated albedos; ``None``: the scene's own.
+    sky
+        A model of the atmosphere without clouds.
+    detail
+        How finely.
+    progress
+        Called with a task and its finished share.
+
+    Raises
+    ------
+    InputError
+        For skies that the page cannot show, and terrain without a grid of heights.
+    """
+    from seasonscapes.export.viewer_files import load_scene, save_scene
+
+    detail = detail or ViewerDetail()
+    if not isinstance(sky, AtmosphereModel) or sky.cloudiness > 0.0:
+        got = sky.name if not isinstance(sky, AtmosphereModel) else f"cloudiness {sky.cloudiness:g}"
+        expected = "a cloudless model of the atmosphere: clear, alpine_winter, hazy, saharan_dust or your own"
+        raise InputError("--sky", "the page shows cloudless skies", got=got, expected=expected)
+    if place.terrain.surface is None:
+        raise InputError(place.path, "has no grid of heights, which the page shows")
+    dated = list(albedo.dated) if albedo is not None else _own_albedos(place)
+    inputs = {
+        "terrain": place.key,
+        "cameras": [view.model_dump() for view in place.scene.cameras],
+        "about": place.about | {"title": place.scene.title},
+        "sky": sky,
+        "albedo": [[each.day.isoformat(), each.content] for each in dated],
+        "detail": asdict(detail),
+    }
+    return build_once(
+        place.workspace,
+        f"{place.scene.name}/viewer",
+        inputs,
+        code=_CODE,
+        suffix=".viewer",
+        build=lambda: _build(place, dated, sky, detail, progress),
+        save=save_scene,
+        load=load_scene,
+    )
+
+
+def _own_albedos(place: Place) -> list[DatedAlbedo]:
+    """The scene's own albedos: of places whose albedo is known for every day, those of `_SHOWN`."""
+    dated = dated_albedos(place)
+    if place.synthetic is None:
+        return dated
+    return [each for each in dated if (each.day.month, each.day.day) in _SHOWN]
+
+
+def _build(
+    place: Place, dated: Sequence[DatedAlbedo], sky: AtmosphereModel, detail: ViewerDetail, progress: Progress | None
+) -> ViewerScene:
+    from seasonscapes.export.viewer_files import ViewerScene
+
+    grid, up, known = _heights(place, detail)
+    detail = _fitting(detail, max(grid.columns, grid.rows))
+    low, high = float(up[known].min()), float(up[known].max())
+    scale = max(high - low, 1.0) / 65534.0
+    heights = np.where(known, 1 + np.rint((up - low) / scale), 0).astype(np.uint16)
+    light = _light(place, sky, task_progress(progress, "light", end=0.3))
+    arrays: dict[str, np.ndarray] = {"heights": heights}
+    pictures, order = _albedo(place, grid, dated, detail, progress)
+    if order is not None:
+        arrays["snow_order"] = order
+    arrays |= _transport(place, grid, dated, detail, task_progress(progress, "light", start=0.3))
+    arrays |= _light_arrays(light)
+    about = {
+        "name": place.scene.name,
+        "title": place.scene.title or place.scene.name,
+        "attribution": place.scene.attribution,
+        "datum": place.scene.vertical_datum,
+        "time_zone": _zone(place),
+        "frame": asdict(place.frame),
+        "grid": {
+            "west_m": grid.west_m,
+            "south_m": grid.south_m,
+            "step_m": grid.step_m,
+            "low_m": low,
+            "height_scale_m": scale,
+        },
+        "cameras": _cameras(place),
+        "surface_m": place.median_height_m,
+        "sky": {
+            "name": sky.name,
+            "visibility_km": visibility_km(sky),
+            "aerosol_depth": [float(value) for value in light.aerosol_depth],
+            **_haze(sky),
+        },
+        "made_utc": datetime.now(UTC).replace(microsecond=0).isoformat(),
+    }
+    return ViewerScene(about, arrays, pictures)
+
+
+def _fitting(detail: ViewerDetail, nodes: int) -> ViewerDetail:
+    """A detail that is not finer than ``nodes`` heights along a side ask for."""
+    clusters = detail.clusters if nodes > 256 else min(detail.clusters, 1024)
+    sky_px, bounce_px = min(detail.sky_px, nodes), min(detail.bounce_px, max(nodes // 2, 8))
+    return replace(detail, sky_px=sky_px, bounce_px=bounce_px, clusters=clusters)
+
+
+def _haze(sky: AtmosphereModel) -> dict[str, Any]:
+    """Vertical optical depths of aerosol and gas in red, green and blue, by which the page scales the haze."""
+    from seasonscapes.sky.spectrum import angstrom_ratio, rayleigh_optical_depth
+
+    middle = np.array([610.0, 550.0, 465.0])
+    aerosol = sky.aerosol.optical_depth_500nm * np.asarray(angstrom_ratio(sky.aerosol.angstrom_exponent, 500.0, middle))
+    return {
+        "aerosol_extinction": aerosol.tolist(),
+        "gas_depth": np.asarray(rayleigh_optical_depth(middle)).tolist(),
+        "aerosol_scale_m": sky.aerosol.scale_height_m,
+        "ground_m": sky.ground.height_m,
+    }
+
+
+def _zone(place: Place) -> str:
+    from seasonscapes.civil_time import zone_at
+
+    return str(zone_at(place.frame.latitude_deg, place.frame.longitude_deg))
+
+
+def _heights(place: Place, detail: ViewerDetail) -> tuple[_Grid, np.ndarray, np.ndarray]:
+    """The grid, up coordinates ``(R, C)`` of its nodes [m] with row 0 in the south, and which of them are known."""
+    from scipy.ndimage import map_coordinates
+
+    surface = place.terrain.surface
+    assert surface is not None
+    low, high = place.terrain.vertices[:, :2].min(axis=0), place.terrain.vertices[:, :2].max(axis=0)
+    finest = surface.spacing_m
+    step = max(finest, float((high - low).max()) / (detail.most_nodes - 1))
+    if step > 1.01 * finest:
+        log.warning(
+            "%s: the page shows heights every %.3g m of the raster's %.3g m: at most %d along a side",
+            place.path,
+            step,
+            finest,
+            detail.most_nodes,
+        )
+    columns, rows = (int(np.ceil(side / step - 1e-6)) + 1 for side in high - low)
+    grid = _Grid(float(low[0]), float(low[1]), step, columns, rows)
+    flat, shape = grid.positions()
+    # The polynomials take the height into account a little: two rounds converge.
+    position = np.column_stack([flat, np.full(len(flat), float(np.median(surface.nodes[..., 2])))])
+    nodes_up = surface.nodes[..., 2].astype(np.float64)
+    for _ in range(2):
+        column, row = surface.nodes_at(position).T
+        position[:, 2] = map_coordinates(nodes_up, [row, column], order=3, mode="nearest")
+    margin = 0.51
+    known = (column > -margin) & (column < nodes_up.shape[1] - 1 + margin)
+    known &= (row > -margin) & (row < nodes_up.shape[0] - 1 + margin)
+    return grid, position[:, 2].reshape(shape), known.reshape(shape)
+
+
+def _surface_positions(place: Place, grid: _Grid, longest: int) -> tuple[np.ndarray, tuple[int, int]]:
+    """Positions ``(N, 3)`` on the smooth surface at texel centres; NaN beyond the raster."""
+    surface = place.terrain.surface
+    assert surface is not None
+    flat, shape = grid.positions(longest)
+    position = np.column_stack([flat, np.full(len(flat), place.median_height_m)])
+    position[:, 2] = surface.up_at(position)
+    column, row = surface.nodes_at(position).T
+    height, width = surface.nodes.shape[:2]
+    inside = (column >= 0.01) & (column <= width - 1.01) & (row >= 0.01) & (row <= height - 1.01)
+    return np.where(inside[:, None], position, np.nan), shape
+
+
+def _albedo(
+    place: Place, grid: _Grid, dated: Sequence[DatedAlbedo], detail: ViewerDetail, progress: Progress | None
+) -> tuple[list[AlbedoPicture], np.ndarray | None]:
+    """Pictures of the albedos, and in which order places lose their snow, where there are several dates."""
+    from seasonscapes.export.viewer_files import albedo_picture
+
+    report = task_progress(progress, "albedo")
+    means = [float(each.load().values.mean()) for each in dated] if len(dated) > 2 else [0.0] * len(dated)
+    # The barest and the snowiest dates are looked at most.
+    sharp = {int(np.argmin(means)), int(np.argmax(means))} if len(dated) > 2 else set(range(len(dated)))
+    lookups: dict[int, tuple[np.ndarray, np.ndarray, tuple[int, int]]] = {}
+    pictures = []
+    for index, each in enumerate(dated):
+        longest = detail.albedo_px if index in sharp else detail.other_albedo_px
+        if longest not in lookups:
+            lookups[longest] = _uv(place, grid, longest)
+        uv, nearest, shape = lookups[longest]
+        pictures.append(albedo_picture(each.day, _seen(each.load().values, uv, nearest, shape)))
+        report((index + 1) / len(dated))
+    if len(dated) < 2:
+        return pictures, None
+    if len(dated) == 2:
+        first, last = dated
+    else:
+        first, last = dated[int(np.argmax(means))], dated[int(np.argmin(means))]
+    uv, nearest, shape = _uv(place, grid, detail.sky_px)
+    order = _seen(snow_transition_between(place, first, last).values, uv, nearest, shape)[::-1, :, 0]
+    return pictures, np.rint(np.clip(order, 0.0, 1.0) * 255.0).astype(np.uint8)
+
+
+def _uv(place: Place, grid: _Grid, longest: int) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
+    """Texture coordinates ``(K, 2)`` seen from above, which of them each of N texels shows, rows and columns."""
+    from scipy.ndimage import distance_transform_edt
+
+    from seasonscapes.rendering.hemisphere_rays import ray_scene
+    from seasonscapes.rendering.irradiance import surface_at
+    from seasonscapes.rendering.mitsuba_scene import mi_mesh
+
+    rays = ray_scene(mi_mesh(place.terrain, np.full((2, 2, 3), 0.5, np.float32)))
+    positions, shape = _surface_positions(place, grid, longest)
+    found, index = surface_at(rays, positions, search_m=_SEARCH_M)
+    number = np.full(len(positions), -1)
+    number[index] = np.arange(len(index))
+    number = number.reshape(shape)
+    indices = distance_transform_edt(number < 0, return_distances=False, return_indices=True)
+    rows, columns = np.asarray(indices)
+    return found.uv, number[rows, columns], shape
+
+
+def _seen(values: np.ndarray, uv: np.ndarray, nearest: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """A texture seen from above ``(R, C, 3)``, row 0 in the north."""
+    from seasonscapes.terrain.surface import sample_texture
+
+    # Pictures coarser than the texture show its mean over a texel.
+    factor = int(max(1, values.shape[0] // max(shape)))
+    if factor > 1:
+        height, width = (size // factor * factor for size in values.shape[:2])
+        blocks = values[:height, :width].reshape(height // factor, factor, width // factor, factor, -1)
+        if height == values.shape[0] and width == values.shape[1]:
+            values = blocks.mean(axis=(1, 3))
+    return sample_texture(values, uv)[nearest][::-1]
+
+
+def _transport(place: Place, grid: _Grid, dated: Sequence[DatedAlbedo], detail: ViewerDetail, report) -> dict[str, Any]:
+    from seasonscapes.rendering.grid_transport import grid_transport
+    from seasonscapes.rendering.hemisphere_rays import ray_scene
+    from seasonscapes.rendering.mitsuba_scene import mi_mesh
+    from seasonscapes.rendering.transport import SamplingOptions
+
+    sampling = SamplingOptions(
+        shadow_samples=1,
+        rays=detail.rays,
+        clusters=detail.clusters,
+        clusters_per_receiver=detail.clusters_per_point,
+        rank=detail.rank,
+    )
+    # Where reflected light matters does not depend much on the date: the brightest one decides.
+    base = max(dated, key=lambda each: float(each.load().values.mean()))
+    scene = ray_scene(mi_mesh(place.terrain, base.load().values))
+    sky_m, sky_shape = _surface_positions(place, grid, detail.sky_px)
+    bounce_m, bounce_shape = _surface_positions(place, grid, detail.bounce_px)
+    traced = grid_transport(scene, sky_m, bounce_m, sampling, search_m=_SEARCH_M, progress=report)
+    clusters = traced.clusters
+    width, height = (grid.columns - 1) * grid.step_m, (grid.rows - 1) * grid.step_m
+    origin = clusters.points.origin[..., :2]
+    uv = (origin - np.array([grid.west_m, grid.south_m])) / np.array([width, height])
+    both = np.concatenate([traced.sky, clusters.receivers.direct.astype(np.float32)])
+    low, high = both.min(axis=0), np.maximum(both.max(axis=0), both.min(axis=0) + 1e-6)
+
+    def levels(values: np.ndarray) -> np.ndarray:
+        return np.rint((values - low) / (high - low) * 255.0).astype(np.uint8)
+
+    return {
+        "sky_levels": levels(traced.sky).reshape(*sky_shape, detail.rank),
+        "sky_range": np.stack([low, high]).astype(np.float32),
+        "from_sky": clusters.from_sky.astype(np.float32),
+        "bounce_cluster": traced.cluster.reshape(*bounce_shape, -1),
+        "bounce_share": np.rint(traced.share * 255.0).astype(np.uint8).reshape(bounce_shape),
+        "cluster_uv": np.rint(np.clip(uv, 0.0, 1.0) * 65535.0).astype(np.uint16),
+        "cluster_levels": levels(clusters.receivers.direct.astype(np.float32)),
+        "cluster_cluster": clusters.receivers.cluster,
+        "cluster_share": np.rint(clusters.receivers.share.astype(np.float32) * 255.0).astype(np.uint8),
+    }
+
+
+def _light(place: Place, sky: AtmosphereModel, report) -> LightTables:
+    from seasonscapes.sky.light_tables import light_tables
+
+    heights = place.elevation.values
+    low, high = float(heights.min()), float(heights.max()) + _ABOVE_M
+    middle = place.median_height_m
+    knots = sorted({low + 2.0, middle, 0.5 * (middle + high - _ABOVE_M), high - _ABOVE_M, high})
+    highest = min(
+        90.0, 90.0 - abs(abs(place.frame.latitude_deg) - 28.7) if abs(place.frame.latitude_deg) > 28.7 else 90.0
+    )
+    extent = float(np.ptp(place.terrain.vertices[:, :2], axis=0).max())
+    tables = atmosphere_tables_in(place.workspace)(atmosphere_from_model(sky))
+    return light_tables(tables, np.array(knots), middle, highest_deg=highest, farthest_m=2.0 * extent, progress=report)
+
+
+def _light_arrays(light: LightTables) -> dict[str, np.ndarray]:
+    """The tables, components in half precision relative to their mean size at each elevation and height."""
+    sky, sky_size = _relative(light.sky, (2, 3))
+    air, air_size = _relative(light.air[..., :_AIR_TERMS, :], (2, 4))
+    return {
+        "light_elevation_deg": light.elevation_deg.astype(np.float32),
+        "light_height_m": light.height_m.astype(np.float32),
+        "light_horizon_rad": light.horizon_rad.astype(np.float32),
+        "light_sky": sky,
+        "light_sky_size": sky_size,
+        "light_air": air,
+        "light_air_size": air_size,
+        "light_depth": light.depth.astype(np.float16),
+        "light_distance_m": light.distance_m.astype(np.float32),
+        "direct_deg": light.direct_deg.astype(np.float32),
+        "direct_lx": light.direct_lx.astype(np.float32),
+        "phase": light.phase.astype(np.float32),
+        "night": light.night.astype(np.float32),
+    }
+
+
+def _relative(components: np.ndarray, axes: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Components over their mean size, float16; the size, float32. The last channel is a column and stays as it is."""
+    size = np.abs(components[..., :9]).mean(axis=(*axes, -1))
+    size = np.maximum(size, 1e-30).astype(np.float32)
+    relative = components.copy()
+    relative[..., :9] /= np.expand_dims(size, (*axes, components.ndim - 1))
+    return relative.astype(np.float16), size
+
+
+def _cameras(place: Place) -> list[dict[str, Any]]:
+    """The scene's cameras with their heights; without any, one that looks at the place from the south."""
+    rows = []
+    for view in place.scene.cameras or (_overview(place),):
+        camera = camera_for(place, view, size_px=(4, 3))
+        latitude, longitude, height = (float(value) for value in geodetic_from_enu(place.frame, camera.position_m))
+        rows.append(
+            {
+                "name": getattr(view, "name", "overview"),
+                "latitude_deg": latitude,
+                "longitude_deg": longitude,
+                "height_m": height,
+                "heading_deg": view.heading_deg,
+                "pitch_deg": view.pitch_deg,
+                "fov_deg": view.fov_deg,
+            }
+        )
+    return rows
+
+
+def _overview(place: Place) -> Viewpoint:
+    """A view over the whole place from beyond its southern rim."""
+    low, high = place.terrain.vertices.min(axis=0), place.terrain.vertices.max(axis=0)
+    size = float((high - low)[:2].max())
+    middle = 0.5 * (low + high)
+    position = np.array([middle[0], low[1] - 0.25 * size, high[2] + 0.35 * size])
+    latitude, longitude, height = (float(value) for value in geodetic_from_enu(place.frame, position))
+    return Viewpoint(
+        latitude_deg=latitude, longitude_deg=longitude, height_m=height, heading_deg=0.0, pitch_deg=-24.0, fov_deg=55.0
+    )
+
+
+def nearest_date(scene: ViewerScene, day: date) -> date:
+    """The date among a scene's albedos that is nearest in the year to a day."""
+    from seasonscapes.albedo.seasons import day_number
+
+    def distance(other: date) -> float:
+        gap = abs(day_number(other) - day_number(day)) % 365.25
+        return min(gap, 365.25 - gap)
+
+    return min((picture.day for picture in scene.albedo), key=distance)
