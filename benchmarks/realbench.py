@@ -26,11 +26,19 @@ from typing import Any
 import cv2
 import numpy as np
 from realbench_cameras import SKYLINE_PX, FixedCase, chamonix
-from realbench_rivals import rival_pictures, seeing_pictures
+from realbench_rivals import equally_exposed, rival_pictures, seeing_pictures
 from record import write_record
 
-from seasonscapes.albedo.fixed_camera import FitOptions, FixedCamera, conditions_of, fit_fixed_camera, picture_at
+from seasonscapes.albedo.fixed_camera import (
+    FitOptions,
+    FixedCamera,
+    conditions_of,
+    fit_fixed_camera,
+    picture_at,
+    relit_at,
+)
 from seasonscapes.albedo.picture_conditions import Conditions, Ground, ViewLight, picture_under
+from seasonscapes.albedo.residual_kriging import kriged
 from seasonscapes.evaluation.metrics import score
 from seasonscapes.images import linear_from_srgb, srgb_from_linear, write_png8
 from seasonscapes.rendering.backend import use_backend
@@ -154,6 +162,7 @@ def predictions(stack: Stack, k: int, options: FitOptions) -> tuple[dict[str, np
     results = {
         "ours": crossed(stack, *whole),
         "ours_without_kriging": crossed(stack, *model),
+        "ours_known": relit_blend(stack, camera, others, k),
         "ours_blind": picture_at(camera, light, camera.conditions[nearest]),
         "grey": crossed(
             stack, *[picture_under(grey.ground, light, each.values) for each in half_conditions(stack, grey, k)]
@@ -174,6 +183,14 @@ def predictions(stack: Stack, k: int, options: FitOptions) -> tuple[dict[str, np
         "sun_above_horizon": bool(light.sun.any()),
     }
     return results, facts
+
+
+def relit_blend(stack: Stack, camera: FixedCamera, others: list[int], k: int) -> np.ndarray:
+    """The other pictures, each relit to the asked hour under its own conditions, and blended as the rival `blend` is."""
+    relit = np.stack([relit_at(camera, stack.lights[k], j) for j in range(len(others))])
+    equal = equally_exposed(relit, stack.usable[others])
+    mean = equal.mean(axis=0)
+    return np.clip(mean + kriged(stack.known[others], stack.known[k], equal - mean), 0.0, 1.0)
 
 
 def grey_ground(camera: FixedCamera, view: FixedView) -> Ground:

@@ -122,7 +122,7 @@ def test_a_cloud_before_the_terrain_is_an_outlier_of_its_pixels_and_picture(pict
 
 
 def test_haze_has_the_right_order_and_its_sigma_covers_the_error(pictures, fitted):
-    ground, _, lights, truth, values = pictures
+    ground, _, lights, truth, _ = pictures
     rng = np.random.default_rng(0)
     for extinction in (0.02, 0.15):
         known = truth[6].values.copy()

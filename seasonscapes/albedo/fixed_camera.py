@@ -284,6 +284,12 @@ def picture_at(camera: FixedCamera, light: ViewLight, conditions: Conditions) ->
     return np.clip(picture_under(camera.ground, light, conditions.values) + left, 0.0, 1.0)
 
 
+def relit_at(camera: FixedCamera, light: ViewLight, number: int) -> np.ndarray:
+    """One of the camera's pictures ``(n, 3)`` in the light of another instant, under its own conditions and misfit."""
+    relit = picture_under(camera.ground, light, camera.conditions[number].values)
+    return np.clip(relit + camera.misfit[number], 0.0, 1.0)
+
+
 def _kinship(light: ViewLight, conditions: Conditions) -> np.ndarray:
     """What makes pictures alike: sun, season, weather, and the camera's contrast."""
     values = conditions.values
