@@ -51,6 +51,10 @@ _LARGEST_TURN = 0.3
 # Ground barely turned away from the sun may turn back.
 _BARELY_TURNED = -0.05
 _MEAN_REFLECTANCE = 0.15
+# Less direct light than this share of a clear sky's throws no shadow that a picture shows.
+_SUN_SHONE = 0.25
+# A picture is not explained where its residual is so many times the median of all pictures'.
+_UNEXPLAINED = 2.5
 
 
 @dataclass(frozen=True)
@@ -82,8 +86,8 @@ class FixedCamera:
         Of its n terrain pixels.
     conditions
         Of each of the K pictures.
-    lights
-        Of each of the K pictures.
+    kinship
+        ``(K, f)`` what makes the K pictures alike: sun, season, weather, the camera's contrast.
     misfit
         ``(K, n, 3)`` float32 picture - model, encoded values; 0 where something stood before the terrain.
     residual
@@ -94,7 +98,7 @@ class FixedCamera:
 
     ground: Ground
     conditions: list[Conditions]
-    lights: list[ViewLight]
+    kinship: np.ndarray
     misfit: np.ndarray
     residual: np.ndarray
     block: int
@@ -166,19 +170,22 @@ def fit_fixed_camera(
             each.values[GAIN] -= shift
         scale = scale + shift
         sample = replace(sample, reflectance=sample.reflectance * np.exp(shift))
-        sample = _refined(sample, slopes, part, conditions, STEPS, options.shading_sigma)
+        trust = _trust(_residuals(sample, part, conditions))
+        sample = _refined(sample, slopes, part, conditions, trust, STEPS, options.shading_sigma)
         report(0.8 * (done + 1) / ITERATIONS)
     ground = replace(ground, reflectance=ground.reflectance * np.exp(scale))
-    ground = _refined(ground, normal, whole, conditions, LAST_STEPS, options.shading_sigma)
+    trust = _trust(_residuals(sample, part, conditions))
+    ground = _refined(ground, normal, whole, conditions, trust, LAST_STEPS, options.shading_sigma)
     misfit = np.stack(
         [
             ((picture - picture_under(ground, light, each.values)) * mask[:, None]).astype(np.float32)
             for (picture, mask, light), each in zip(whole, conditions, strict=True)
         ]
     )
-    residual = [1.4826 * float(np.median(np.abs(part[mask]))) for part, mask in zip(misfit, usable, strict=True)]
+    residual = _residuals(ground, whole, conditions)
     report(1.0)
-    return FixedCamera(ground, conditions, list(lights), misfit, np.array(residual), options.block)
+    kinship = np.stack([_kinship(*each) for each in zip(lights, conditions, strict=True)])
+    return FixedCamera(ground, conditions, kinship, misfit, residual, options.block)
 
 
 def _first_ground(pictures: Sequence[np.ndarray], distance_km: np.ndarray, normal: np.ndarray) -> Ground:
@@ -209,6 +216,7 @@ def _refined(
     normal: np.ndarray,
     pictures: Sequence[tuple[np.ndarray, np.ndarray, ViewLight]],
     conditions: Sequence[Conditions],
+    trust: np.ndarray,
     steps: int,
     shading_sigma: float,
 ) -> Ground:
@@ -218,14 +226,14 @@ def _refined(
     for _ in range(steps):
         gradient, curvature = np.zeros_like(ground.reflectance), np.full_like(ground.reflectance, _DAMPING)
         turn, stiffness = (expected - ground.shading) @ precision, np.tile(precision, (len(normal), 1, 1))
-        for (picture, mask, light), each in zip(pictures, conditions, strict=True):
+        for (picture, mask, light), each, share in zip(pictures, conditions, trust, strict=True):
             factor, for_unit, addend = linear_parts(light, ground, each.values)
             linear, contrast = np.maximum(ground.reflectance * factor + addend, 1e-6), np.exp(each.values[CONTRAST])
             curved = linear**contrast
             slope = 1.055 / 2.4 * np.clip(curved, 1e-4, 1.0) ** (1.0 / 2.4 - 1.0) * contrast * curved / linear
             slope = np.where(curved < 1.0, slope, _CLIPPED_SLOPE) * ground.reflectance
             misfit = picture - encoded(linear, float(contrast))
-            weight = mask[:, None] / (1.0 + (misfit / RESIDUAL_SCALE) ** 2)
+            weight = share * mask[:, None] / (1.0 + (misfit / RESIDUAL_SCALE) ** 2)
             weight = weight * np.where(picture > _CLIPPED, _CLIPPED_WEIGHT, 1.0)
             gradient += weight * slope * factor * misfit
             curvature += weight * (slope * factor) ** 2
@@ -241,6 +249,35 @@ def _refined(
             ground.distance_km,
         )
     return ground
+
+
+def _residuals(
+    ground: Ground, pictures: Sequence[tuple[np.ndarray, np.ndarray, ViewLight]], conditions: Sequence[Conditions]
+) -> np.ndarray:
+    """Robust standard deviation of each picture's misfit ``(K,)``; infinite where none of its pixels is usable."""
+    return np.array(
+        [
+            1.4826 * np.median(np.abs(picture_under(ground, light, each.values) - picture)[mask])
+            if mask.any()
+            else np.inf
+            for (picture, mask, light), each in zip(pictures, conditions, strict=True)
+        ]
+    )
+
+
+def _trust(residual: np.ndarray) -> np.ndarray:
+    """Weight of each picture: pictures that the model leaves unexplained count little."""
+    return np.minimum(1.0, (np.median(residual) / np.maximum(residual, 1e-6)) ** 2)
+
+
+def unexplained(camera: FixedCamera) -> np.ndarray:
+    """Pictures ``(K,)`` bool that light, haze, exposure and response do not explain."""
+    return camera.residual > _UNEXPLAINED * np.median(camera.residual)
+
+
+def sun_shone(conditions: Conditions) -> bool:
+    """Whether sunlight fell on the terrain, by the share of direct light."""
+    return conditions.sun > _SUN_SHONE
 
 
 def conditions_of(
@@ -279,8 +316,7 @@ def picture_at(camera: FixedCamera, light: ViewLight, conditions: Conditions) ->
 
     The model's picture, and what the model leaves in pictures of like sun, season and weather (`residual_kriging`).
     """
-    known = np.stack([_kinship(*each) for each in zip(camera.lights, camera.conditions, strict=True)])
-    left = kriged(known, _kinship(light, conditions), camera.misfit)
+    left = kriged(camera.kinship, _kinship(light, conditions), camera.misfit)
     return np.clip(picture_under(camera.ground, light, conditions.values) + left, 0.0, 1.0)
 
 
@@ -291,7 +327,7 @@ def relit_at(camera: FixedCamera, light: ViewLight, number: int) -> np.ndarray:
 
 
 def _kinship(light: ViewLight, conditions: Conditions) -> np.ndarray:
-    """What makes pictures alike: sun, season, weather, and the camera's contrast."""
+    """See `FixedCamera.kinship`."""
     values = conditions.values
     return np.array(
         [*light.sun_direction, light.day / 60.0, values[SUN], values[OVERCAST], values[EXTINCTION], values[CONTRAST]]

@@ -113,6 +113,11 @@ class Conditions:
         return float(self.values[SUN])
 
     @property
+    def sun_sigma(self) -> float:
+        """Standard deviation of ``sun``."""
+        return float(self.sigma[SUN])
+
+    @property
     def overcast(self) -> float:
         """Share of the skylight that comes from clouds, 0 to 1."""
         return float(self.values[OVERCAST])
