@@ -1,0 +1,326 @@
+"""A fixed camera's pictures to the same view at hours that it never took."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from seasonscapes.albedo.picture_conditions import ViewLight
+from seasonscapes.cameras.pinhole import Camera, view_in_frame
+from seasonscapes.errors import InputError
+from seasonscapes.progress import Progress, task_progress
+from seasonscapes.workflows.illumination import illumination_for_camera, sky_model
+from seasonscapes.workflows.place import Place, utc_at
+from seasonscapes.workflows.relight_session import relight_session
+
+if TYPE_CHECKING:
+    from seasonscapes.albedo.fixed_camera import FixedCamera
+    from seasonscapes.cameras.observation import Observation
+    from seasonscapes.rendering.relit_view import RelightableView
+
+log = logging.getLogger(__name__)
+
+_MAP_ROWS = 64
+# The camera may have moved by this much between two pictures [px].
+_STANDS_STILL_PX = 0.5
+# Pictures of another time of the year show other snow and leaves [days].
+SEASON_DAYS = 45
+# Suns this far apart [deg] light slopes alike: the width of the weights of pictures.
+_ALIKE_DEG = 30.0
+Sky = Literal["any", "sun", "no sun"]
+
+
+@dataclass(frozen=True)
+class FixedView:
+    """The terrain in a fixed camera's pixels, ready for the light of any instant; from `fixed_view`.
+
+    Parameters
+    ----------
+    place, camera
+        The place and the camera, in the place's frame.
+    view
+        Daylight coefficients.
+    chosen
+        ``(n,)`` those of the view's pixels that terrain covers wholly.
+    pixel
+        ``(n,)`` their flat indices in the image.
+    distance_km, normal
+        ``(n,)`` [km] and ``(n, 3)`` of the terrain there.
+    """
+
+    place: Place
+    camera: Camera
+    view: RelightableView = field(repr=False)
+    chosen: np.ndarray = field(repr=False)
+    pixel: np.ndarray = field(repr=False)
+    distance_km: np.ndarray = field(repr=False)
+    normal: np.ndarray = field(repr=False)
+
+
+def fixed_view(place: Place, camera: Camera, *, progress: Progress | None = None) -> FixedView:
+    """Trace the light transport of a fixed camera's view; kept in the place's workspace.
+
+    Parameters
+    ----------
+    place
+        The place.
+    camera
+        The camera; one calibrated in another frame is converted to the place's.
+    progress
+        Called with a task and its finished share.
+
+    Raises
+    ------
+    NoTerrainInView
+        Where the camera sees no terrain.
+    """
+    from seasonscapes.albedo.view_light import view_distances_km, view_normals
+    from seasonscapes.rendering.transport import SamplingOptions
+
+    camera = view_in_frame(camera, place.frame)
+    # Light is compared with pictures of 8 bits: a quarter of a film's samples.
+    sampling = SamplingOptions(shadow_samples=4, albedo_samples=16, rays=256)
+    session = relight_session(place, camera, sampling=sampling, progress=progress)
+    chosen = np.flatnonzero(np.asarray(session.coefficients.coverage) > 0.99)
+    return FixedView(
+        place,
+        camera,
+        session.relightable,
+        chosen,
+        np.asarray(session.coefficients.pixel)[chosen],
+        view_distances_km(session.relightable)[chosen],
+        view_normals(session.relightable)[chosen],
+    )
+
+
+def light_on_view(view: FixedView, time: datetime) -> ViewLight:
+    """The light of an aware instant on the pixels of a view, under a clear and an overcast sky."""
+    from seasonscapes.albedo.view_light import view_light
+
+    clear, overcast = (
+        illumination_for_camera(view.place, view.camera, sky_model(name), time, map_height=_MAP_ROWS)[0]
+        for name in ("clear", "overcast")
+    )
+    return view_light(view.view, clear, overcast).at(view.chosen)
+
+
+@dataclass(frozen=True)
+class PictureWeather:
+    """Weather of one picture as it was found in it.
+
+    Parameters
+    ----------
+    time
+        Aware UTC.
+    sun_shone
+        Whether sunlight fell on the terrain; ``None`` where the sun stood below the horizon.
+    sun, sun_sigma
+        Direct light as a share of that of a clear sky, and its standard deviation.
+    overcast
+        Share of the skylight that came from clouds.
+    visibility_km
+        Meteorological range [km].
+    residual
+        Robust standard deviation of picture - model, in encoded values.
+    explained
+        False where the model leaves much more than in the other pictures.
+    """
+
+    time: datetime
+    sun_shone: bool | None
+    sun: float
+    sun_sigma: float
+    overcast: float
+    visibility_km: float
+    residual: float
+    explained: bool
+
+
+@dataclass(frozen=True)
+class CameraHours:
+    """What the pictures of a fixed camera tell of the view at any hour; made by `camera_hours`.
+
+    Parameters
+    ----------
+    view
+        The view and its light transport.
+    times
+        Of the pictures, aware UTC.
+    fitted
+        Ground of each pixel and conditions of each picture.
+    suns
+        ``(K, 3)`` directions of the sun in the pictures.
+    background
+        ``(H, W, 3)`` median of the pictures, sRGB-encoded: the sky and all that is no terrain.
+    """
+
+    view: FixedView
+    times: list[datetime]
+    fitted: FixedCamera = field(repr=False)
+    suns: np.ndarray = field(repr=False)
+    background: np.ndarray = field(repr=False)
+
+    @property
+    def weather(self) -> list[PictureWeather]:
+        """Weather of each picture, in the order of the photographs."""
+        from seasonscapes.albedo.fixed_camera import sun_shone, unexplained
+
+        odd = unexplained(self.fitted)
+        return [
+            PictureWeather(
+                time,
+                sun_shone(each) if sun[2] > 0.0 else None,
+                each.sun,
+                each.sun_sigma,
+                each.overcast,
+                each.visibility_km,
+                float(residual),
+                not strange,
+            )
+            for time, each, sun, residual, strange in zip(
+                self.times, self.fitted.conditions, self.suns, self.fitted.residual, odd, strict=True
+            )
+        ]
+
+    def at(self, time: str | datetime, *, sky: Sky = "any") -> np.ndarray:
+        """The view at another instant.
+
+        Each picture of the stated sky is relit to the instant, under its own haze and exposure; the result is their
+        mean, weighted by how near their sun stands to the instant's.
+
+        Parameters
+        ----------
+        time
+            An aware datetime, or ISO 8601 text; without offset it is civil time at the place.
+        sky
+            ``"sun"`` takes pictures in which the sun shone, ``"no sun"`` the others, ``"any"`` all.
+
+        Returns
+        -------
+        numpy.ndarray
+            ``(H, W, 3)`` sRGB-encoded, in [0, 1]; the sky is the median of the pictures'.
+
+        Raises
+        ------
+        InputError
+            Where no picture has the stated sky.
+        """
+        from seasonscapes.albedo.fixed_camera import relit_at
+
+        utc = utc_at(self.view.place, time)
+        self._warn_of_season(utc)
+        light = light_on_view(self.view, utc)
+        taken = [k for k, each in enumerate(self.weather) if sky == "any" or bool(each.sun_shone) == (sky == "sun")]
+        if not taken:
+            raise InputError("--sky", "no picture has this sky", got=sky, cure="give --sky any")
+        angle = np.degrees(np.arccos(np.clip(self.suns[taken] @ light.sun_direction, -1.0, 1.0)))
+        weight = np.exp(-0.5 * ((angle - angle.min()) / _ALIKE_DEG) ** 2)
+        values = sum(w * relit_at(self.fitted, light, k) for w, k in zip(weight / weight.sum(), taken, strict=True))
+        image = self.background.copy()
+        image.reshape(-1, 3)[self.view.pixel] = values
+        return image
+
+    def _warn_of_season(self, time: datetime) -> None:
+        day = time.timetuple().tm_yday
+        away = min(abs((each.timetuple().tm_yday - day + 182) % 365 - 182) for each in self.times)
+        if away > SEASON_DAYS:
+            log.warning(
+                "%s lies %d days of the year from every picture: snow and leaves of that season were never seen",
+                time.date().isoformat(),
+                away,
+            )
+
+
+def camera_hours(place: Place, photographs: Sequence[Observation], *, progress: Progress | None = None) -> CameraHours:
+    """Learn from a fixed camera's pictures what its view looks like at other hours.
+
+    Parameters
+    ----------
+    place
+        The place.
+    photographs
+        Of one camera that stands still; masks leave out what stands before the terrain.
+    progress
+        Called with a task and its finished share.
+
+    Returns
+    -------
+    CameraHours
+        Weather of each picture, and the view at any hour.
+
+    Raises
+    ------
+    InputError
+        Where the photographs are of several cameras, or of one that turned.
+    NoTerrainInView
+        Where the camera sees no terrain.
+    NoUsablePixels
+        For fewer than two photographs.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import seasonscapes as ss
+    >>> place = ss.load_place("alpine_small")
+    >>> times = ["2024-07-20T09:00", "2024-07-20T12:00", "2024-07-20T16:00"]
+    >>> camera = ss.camera(place, "aerial", size_px=(48, 32))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     sources = ss.synthetic_photographs(place, times, folder, sky="hosek", cameras={"aerial": camera})
+    ...     photographs = ss.open_photographs(place, sources.manifest, sources.calibrations, times)
+    >>> hours = ss.camera_hours(place, photographs)
+    >>> hours.at("2024-07-20T14:00").shape
+    (32, 48, 3)
+    """
+    from seasonscapes.albedo.fixed_camera import fit_fixed_camera
+    from seasonscapes.images import srgb_from_linear
+    from seasonscapes.rendering.backend import use_backend
+
+    if not photographs:
+        raise InputError("photographs", "none given", expected="two or more of one camera")
+    for each in photographs[1:]:
+        _require_same_view(photographs[0], each)
+    camera = photographs[0].camera
+    if not isinstance(camera, Camera):
+        raise InputError(photographs[0].webcam, "a panorama", expected="views cut out of it, as open_photographs gives")
+    use_backend()
+    view = fixed_view(place, camera, progress=progress)
+    encoded = [srgb_from_linear(each.image) for each in photographs]
+    lights = [light_on_view(view, each.time) for each in photographs]
+    fitted = fit_fixed_camera(
+        [image.reshape(-1, 3)[view.pixel] for image in encoded],
+        [each.mask.reshape(-1)[view.pixel] for each in photographs],
+        lights,
+        view.distance_km,
+        view.normal,
+        progress=task_progress(progress, "ground and weather"),
+    )
+    hours = CameraHours(
+        view,
+        [each.time for each in photographs],
+        fitted,
+        np.stack([each.sun_direction for each in lights]),
+        np.median(encoded, axis=0),
+    )
+    for each in hours.weather:
+        if not each.explained:
+            log.warning("%s UTC: not explained by light, haze and exposure; it counts little", each.time.isoformat())
+    return hours
+
+
+def _require_same_view(first: Observation, other: Observation) -> None:
+    """Raise `InputError` unless two observations are of one camera in one pose."""
+    a, b = first.camera, other.camera
+    size = (a.width_px, a.height_px) == (b.width_px, b.height_px)
+    turned = np.arccos(np.clip((np.trace(a.world_from_camera[:3, :3].T @ b.world_from_camera[:3, :3]) - 1) / 2, -1, 1))
+    if first.webcam != other.webcam or not size or turned * a.fx > _STANDS_STILL_PX:
+        raise InputError(
+            other.webcam,
+            "not the same view in all photographs",
+            got=f"{other.time.isoformat()} is turned by {np.degrees(turned):.2f}° from {first.webcam}'s first",
+            expected="one camera that stands still",
+        )
