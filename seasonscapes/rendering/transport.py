@@ -39,7 +39,13 @@ from seasonscapes.rendering.light_clusters import (
 )
 from seasonscapes.rendering.sky_patches import sky_patches
 from seasonscapes.rendering.smoothing import Neighbours, edge_aware_neighbours, smoothed
-from seasonscapes.rendering.view_samples import camera_points, pixel_moments, sample_weights, view_samples
+from seasonscapes.rendering.view_samples import (
+    camera_points,
+    pixel_moments,
+    sample_moments,
+    sample_weights,
+    view_samples,
+)
 
 # Hemisphere rays per block of receivers: their hits and weights take about 20 bytes each.
 BLOCK_RAYS = 1 << 23
@@ -455,14 +461,18 @@ def _view_rows(
     if len(pixel) == 0:
         return None
     weight = sample_weights(points.albedo, hit)
-    row_pixel = pixel - rows.start * camera.width_px
-    albedo, normal, coverage = pixel_moments(terrain, camera, rows, sampling.albedo_samples, seed)
+    if sampling.albedo_samples == sampling.shadow_samples:
+        albedo, normal, coverage = sample_moments(points, hit)
+    else:
+        row_pixel = pixel - rows.start * camera.width_px
+        moments = pixel_moments(terrain, camera, rows, sampling.albedo_samples, seed)
+        albedo, normal, coverage = (values[row_pixel] for values in moments)
     receivers = _trace_receivers(terrain, shared, points, weight, pixel.astype(np.uint32), sampling, seed)
     arrays = _PixelArrays(
         pixel,
-        coverage[row_pixel],
-        albedo[row_pixel],
-        normal[row_pixel],
+        coverage,
+        albedo,
+        normal,
         points.origin,
         points.normal.astype(np.float16),
         points.geometric_normal.astype(np.float16),
