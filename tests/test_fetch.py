@@ -11,6 +11,7 @@ import os
 import re
 import shutil
 import tomllib
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,10 @@ import seasonscapes as ss
 from seasonscapes.errors import InputError
 from seasonscapes.images import linear_from_srgb
 from seasonscapes.open_data import remote
+from seasonscapes.open_data.catalogue import Item
+from seasonscapes.open_data.elevation import tiles_of
 from seasonscapes.open_data.requests_as_text import parse_extent, parse_interval
+from seasonscapes.open_data.sources import read_source
 from seasonscapes.terrain.crs import geodetic_from_map, map_from_geodetic
 from seasonscapes.terrain.raster import sample_raster
 from seasonscapes.terrain.surface import Raster
@@ -226,6 +230,27 @@ def test_withheld_tiles_come_from_the_coarser_product_and_it_is_told(fetch):
     assert "WorldDEM-90" in tomllib.loads(scene.read_text())["attribution"]
 
 
+def test_the_finest_items_of_a_collection_count():
+    """3DEP has items of 10 m and, partly with a later date, of 30 m above each other in one collection."""
+    declared = read_source("3dep")
+    items = [
+        Item(
+            name,
+            (-106.0, 40.0, -105.0, 41.0),
+            datetime.fromisoformat(day),
+            {"gsd": gsd},
+            {"data": {"href": "https://a/b"}},
+        )
+        for name, day, gsd in (
+            ("n41w106-1", "2021-01-01T00:00:00+00:00", 30),
+            ("n41w106-13", "2019-01-01T00:00:00+00:00", 10),
+            ("n41w106-13b", "2020-01-01T00:00:00+00:00", 10),
+        )
+    ]
+    tiles = tiles_of(items, "3dep", declared, finest_m=10.0)
+    assert [tile.item.id for tile in tiles] == ["n41w106-13b", "n41w106-13", "n41w106-1"]
+
+
 def test_voids_are_filled_from_the_coarser_product(fetch):
     scene = fetch(VOIDS, imagery="none")
     assert height_error(scene).max() < 3.0
@@ -258,9 +283,10 @@ def test_an_offset_that_was_applied_before_is_noticed(fetch):
         fetch(WRONG)
 
 
-def test_swiss_tiles_are_the_newest_of_the_spacing_that_is_needed(fetch):
-    """Only files of 2 m are there, and the tile of 2019 is 50 m too high."""
-    scene = fetch(BERN, elevation="swissalti3d", imagery="swissimage", size="1.6km", resolution=2)
+def test_swiss_tiles_are_the_newest_of_the_spacing_that_is_needed(fetch, url):
+    """Only files of 2 m are there, and the tile of 2019 is 50 m too high; the catalogue does not say that it searches."""
+    flags = {"elevation": "swissalti3d", "imagery": "swissimage", "size": "1.6km", "resolution": 2}
+    scene = fetch(BERN, stac=url + "swisstopo/", **flags)
     assert height_error(scene).max() < 0.05
     declared = tomllib.loads(scene.read_text())
     assert declared["vertical_datum"] == "LN02"

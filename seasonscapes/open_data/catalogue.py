@@ -155,6 +155,8 @@ def _ask(store: RemoteStore, question: dict[str, Any]) -> list[dict[str, Any]]:
     for _ in range(2):  # the connection may break within an answer, which `Retry` does not see
         try:
             client = Client.open(url, stac_io=StacApiIO(max_retries=retry, timeout=TIMEOUT_S))
+            # data.geo.admin.ch searches, and does not say so; one that cannot answers the question with a status.
+            client.add_conforms_to("ITEM_SEARCH")
             found = client.search(
                 collections=[question["collection"]],
                 bbox=question["bbox"],
