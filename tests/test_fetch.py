@@ -136,7 +136,8 @@ def fetch(url, cache, world, tmp_path, monkeypatch):
 
     def run(place, **flags) -> Path:
         output = flags.pop("output", tmp_path / "place.toml")
-        flags = {"stac": url, "size": "3km", "date": RANGE, "workspace": cache} | flags
+        undated = flags.get("imagery") in ("none", "swissimage")
+        flags = {"stac": url, "size": "3km", "date": None if undated else RANGE, "workspace": cache} | flags
         # A blank before a negative number is a blank like any other.
         command("fetch", at=",".join(map(str, place)), output=output, **flags)
         return output
@@ -181,14 +182,16 @@ def test_a_place_appears_from_its_coordinates(fetch, url):
     assert height_error(scene).max() < 0.3
     assert colour_error(scene).max() < 2e-3
     told = sources(scene)
-    assert declared["imagery"]["time"] == told["imagery"]["time"] == "2024-07-14T10:25:31Z"
+    assert declared["imagery"]["time"] == told["imagery"][0]["time"] == "2024-07-14T10:25:31Z"
     sun = get_solarposition(pd.DatetimeIndex(["2024-07-14T10:25:31Z"]), *ALPS)
-    assert told["imagery"]["sun"]["azimuth_deg"] == pytest.approx(float(sun["azimuth"].iloc[0]), abs=0.1)
-    assert told["imagery"]["sun"]["elevation_deg"] == pytest.approx(float(sun["apparent_elevation"].iloc[0]), abs=0.1)
-    assert told["imagery"]["sun"]["stated_azimuth_deg"] == 160.0
+    assert told["imagery"][0]["sun"]["azimuth_deg"] == pytest.approx(float(sun["azimuth"].iloc[0]), abs=0.1)
+    assert told["imagery"][0]["sun"]["elevation_deg"] == pytest.approx(
+        float(sun["apparent_elevation"].iloc[0]), abs=0.1
+    )
+    assert told["imagery"][0]["sun"]["stated_azimuth_deg"] == 160.0
     assert {item["address"].startswith(url) for item in told["elevation"]["items"]} == {True}
     assert len(told["elevation"]["items"]) == 2
-    assert all(item["etag"] for item in told["imagery"]["items"])
+    assert all(item["etag"] for item in told["imagery"][0]["items"])
 
 
 @pytest.mark.parametrize("year", [2018, 2019, 2022])
@@ -202,7 +205,7 @@ def test_two_utm_zones_join_without_a_seam(fetch):
     scene = fetch(ZONES)
     assert height_error(scene).max() < 0.3
     assert colour_error(scene).max() < 3e-3
-    assert len({item["id"] for item in sources(scene)["imagery"]["items"]}) == 2
+    assert len({item["id"] for item in sources(scene)["imagery"][0]["items"]}) == 2
 
 
 def test_the_antimeridian_is_a_place_like_any_other(fetch):
@@ -263,7 +266,7 @@ def test_a_cloud_over_snow_is_filled_and_snow_taken_for_cloud_is_kept(fetch):
     """The clearest day lights the image; what its cloud hides is of the next days, and told with its share."""
     scene = fetch(SNOW)
     assert colour_error(scene, snowy).max() < 0.01
-    told = sources(scene)["imagery"]
+    told = sources(scene)["imagery"][0]
     assert told["time"] == "2024-07-14T10:15:31Z"
     assert told["report"]["known_share"] == 1.0
     assert 0.13 < told["report"]["filled_from"][0]["share"] < 0.22
@@ -272,7 +275,7 @@ def test_a_cloud_over_snow_is_filled_and_snow_taken_for_cloud_is_kept(fetch):
 
 def test_a_median_has_no_time(fetch):
     scene = fetch(SNOW, composite="median")
-    told = sources(scene)["imagery"]
+    told = sources(scene)["imagery"][0]
     assert told["time"] is None
     assert len(told["report"]["times"]) == 3
     assert "time" not in tomllib.loads(scene.read_text())["imagery"]
@@ -296,7 +299,7 @@ def test_swiss_tiles_are_the_newest_of_the_spacing_that_is_needed(fetch, url):
     assert (values[..., 3] == 255).all()
     shown = linear_from_srgb(values[..., :3] / 255.0)
     assert np.abs(shown - 2.0 * reflectance(latitude, longitude)).max() < 0.01
-    told = sources(scene)["imagery"]
+    told = sources(scene)["imagery"][0]
     assert told["time"] is None
     assert told["report"]["years"] == [2023]
     assert len(sources(scene)["elevation"]["items"]) == 9
@@ -319,7 +322,7 @@ def test_a_folder_of_tiles_is_a_place_too(world, tmp_path):
     told = sources(scene)
     assert "address" not in told["elevation"]["items"][0]
     assert str(files) not in json.dumps(told)
-    assert told["imagery"]["report"]["years"] == [2023]
+    assert told["imagery"][0]["report"]["years"] == [2023]
 
 
 def test_heights_in_feet_become_metres(tmp_path):
@@ -351,7 +354,7 @@ def test_plan_loads_nothing(fetch, world, tmp_path, capsys):
     fetch(ALPS, plan=True, json=True)
     told = json.loads(capsys.readouterr().out)
     assert len(told["elevation"]["items"]) == 2
-    assert told["imagery"]["days"][0]["time"] == "2024-07-14T10:25:31Z"
+    assert told["imagery"][0]["days"][0]["time"] == "2024-07-14T10:25:31Z"
     assert told["elevation"]["about_bytes"] > 1000
     assert "WorldDEM-30" in told["elevation"]["licences"][0]["attribution"]
     assert not [line for line in world.requests() if "/files/" in line]
@@ -500,7 +503,7 @@ def test_a_missing_tile_is_replaced_by_the_coarser_product(fetch, world, tmp_pat
         (ALPS, {"stac": "http://127.0.0.1:9/"}, "the catalogue does not answer"),
         (ALPS, {"elevation": "srtm"}, "--elevation: unknown source of elevation; got 'srtm'; expected one of"),
         (ALPS, {"elevation": "sentinel-2"}, "unknown source of elevation"),
-        (ALPS, {"imagery": "nothing/*.tif"}, "--imagery: no such file"),
+        (ALPS, {"imagery": "nothing/*.tif", "date": None}, "--imagery: no such file"),
         ((10.0, 10.0), {"elevation": "swissalti3d"}, "swissALTI3D has nothing here"),
         (ALPS, {"size": "20"}, "--size: not an extent"),
         (ALPS, {"size": "2000km"}, "--size: out of range"),
@@ -508,6 +511,12 @@ def test_a_missing_tile_is_replaced_by_the_coarser_product(fetch, world, tmp_pat
         (ALPS, {"composite": "mean"}, "--composite: unknown composite"),
         (ALPS, {"cloud": 120}, "--cloud: out of range"),
         (ALPS, {"date": "2024-13"}, "--date: not a time"),
+        (ALPS, {"imagery": "none", "date": "2024"}, "--date: with files of one's own, or without imagery"),
+        (ALPS, {"imagery": "none", "cloud": 5}, "--cloud: with files of one's own, or without imagery"),
+        (BERN, {"imagery": "swissimage", "composite": "median"}, "--composite: swissimage has one image"),
+        (BERN, {"imagery": "swissimage", "date": ["2023", "2019"]}, "--date: swissimage tells the year alone"),
+        (BERN, {"imagery": "swissimage", "date": "2011"}, "the catalogue has no image here; choose another --date"),
+        (ALPS, {"elevation": "lidar-hd"}, "--elevation: LiDAR HD has no catalogue that can be asked"),
     ],
 )
 def test_mistakes_are_one_line(fetch, tmp_path, place, flags, line):
@@ -534,7 +543,7 @@ def test_intervals_and_extents():
 @pytest.mark.skipif("SEASONSCAPES_NETWORK" not in os.environ, reason="asks real catalogues")
 def test_the_real_catalogues_answer(tmp_path):
     command("fetch", at="46.62,8.03", size="3km", date="2024-07..2024-09", output=tmp_path / "grindelwald.toml")
-    assert sources(tmp_path / "grindelwald.toml")["imagery"]["report"]["known_share"] > 0.9
+    assert sources(tmp_path / "grindelwald.toml")["imagery"][0]["report"]["known_share"] > 0.9
 
 
 # ---------------------------------------------------------------------------------------------- a picture

@@ -80,7 +80,7 @@ def height_tiles(
         Spacing that is needed [m].
     """
     source = read_source(name)
-    items = search(store, catalogue_url or source.catalogue, source.collection, grid.boxes_deg())
+    items = search(store, catalogue_url or source.catalogue_url, source.collection, grid.boxes_deg())
     return tiles_of(items, name, source, finest_m=finest_m)
 
 
