@@ -10,6 +10,7 @@ import json
 import os
 import re
 import shutil
+import socket
 import tomllib
 from datetime import datetime
 from pathlib import Path
@@ -384,6 +385,21 @@ def test_bad_networks_are_survived(fetch, world, tmp_path):
     assert colour_error(scene).max() < 2e-3
 
 
+def test_a_machine_without_network_is_told(fetch, tmp_path, monkeypatch):
+    def unknown(*_: object, **__: object) -> None:
+        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+
+    monkeypatch.setattr(socket, "getaddrinfo", unknown)
+    line = failure(fetch, ALPS, tmp_path, stac="http://catalogue.invalid/")
+    assert "the catalogue does not answer (its name is unknown here: is there a network?); try again later" in line
+
+
+def test_a_catalogue_that_stays_busy_is_told(fetch, world, tmp_path):
+    world.faults(("/search", 503, 99))
+    line = failure(fetch, ALPS, tmp_path)
+    assert "the catalogue does not answer (too many 503 error responses); try again later" in line
+
+
 def test_an_interrupted_download_resumes(fetch, world, tmp_path):
     world.faults(("B02", 503, 99))
     with pytest.raises(InputError, match=r"503 .*, 5 times; run the same command again later: what is loaded is kept"):
@@ -500,7 +516,12 @@ def test_a_missing_tile_is_replaced_by_the_coarser_product(fetch, world, tmp_pat
         ((0.0, -150.0), {"imagery": "none"}, "is the place on land"),
         (ALPS, {"date": "2011"}, "no image in this time with so few clouds"),
         (ALPS, {"stac": "file:///etc"}, "--stac: not an address"),
-        (ALPS, {"stac": "http://127.0.0.1:9/"}, "the catalogue does not answer"),
+        (ALPS, {"stac": "http://127.0.0.1:9/"}, "the catalogue does not answer (no connection)"),
+        (
+            ALPS,
+            {"stac": "http://catalogue.invalid/"},
+            "does not answer (its name is unknown here: is there a network?)",
+        ),
         (ALPS, {"elevation": "srtm"}, "--elevation: unknown source of elevation; got 'srtm'; expected one of"),
         (ALPS, {"elevation": "sentinel-2"}, "unknown source of elevation"),
         (ALPS, {"imagery": "nothing/*.tif", "date": None}, "--imagery: no such file"),
