@@ -83,6 +83,23 @@ def test_a_plan_lists_each_date(fetch, tmp_path, capsys):
     assert not (tmp_path / "p.toml").exists()
 
 
+def test_the_recorded_plan_of_grindelwald_is_what_the_local_catalogue_gives(tmp_path, capsys):
+    """The plan on the how-to page: items called as the real ones are, of a catalogue on this machine."""
+    world = World(tmp_path / "grindelwald")
+    for name, west in (("E007", 7.9), ("E008", 8.0)):
+        world.dem_tile(west, 46.54, size_deg=0.16, name=f"Copernicus_DSM_COG_10_N46_00_{name}_00_DEM")
+    for when, clouds in (("2024-07-19T10:25:31Z", 14.2), ("2024-08-08T10:25:32Z", 6.4), ("2024-09-17T10:25:30Z", 2.1)):
+        name = f"S2B_T32TMS_{when[:19].replace('-', '').replace(':', '')}_L2A"
+        world.sentinel_tile(when, "EPSG:32632", 46.62, 8.03, size_m=13_000.0, cloud_percent=clouds, name=name)
+    flags = {"at": "46.62,8.03", "size": "12km", "date": "2024-07..2024-09", "workspace": tmp_path / "cache"}
+    try:
+        command("fetch", stac=world.start(), plan=True, output=tmp_path / "grindelwald.toml", **flags)
+    finally:
+        world.stop()
+    page = (Path(__file__).parents[1] / "docs" / "howto" / "fetch.md").read_text(encoding="utf-8")
+    assert f"```text\n{capsys.readouterr().out.rstrip()}\n```" in page
+
+
 def test_a_median_of_several_dates_states_days_whose_light_stays_in(fetch, tmp_path):
     scene = fetch(tmp_path / "p.toml", date=["2024-07", "2024-02"], composite="median")
     images = declared(scene)["imagery"]
