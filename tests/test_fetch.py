@@ -385,6 +385,25 @@ def test_bad_networks_are_survived(fetch, world, tmp_path):
     assert colour_error(scene).max() < 2e-3
 
 
+@pytest.mark.parametrize(
+    ("part", "what", "line"),
+    [
+        ("/search", "cut", "the catalogue does not answer"),
+        (
+            "DEM.tif",
+            "cut",
+            "no connection, or it broke (ChunkedEncodingError), 5 times; run the same command again later",
+        ),
+        ("SCL", 502, "the server answers 502 Bad Gateway, 5 times; run the same command again later"),
+        ("B04", 500, "the server answers 500 Internal Server Error, 5 times"),
+        ("B04", 401, "the server answers 401 Unauthorized; choose another source"),
+    ],
+)
+def test_what_stays_broken_is_told(fetch, world, tmp_path, part, what, line):
+    world.faults((part, what, 99))
+    assert line in failure(fetch, ALPS, tmp_path)
+
+
 def test_a_machine_without_network_is_told(fetch, tmp_path, monkeypatch):
     def unknown(*_: object, **__: object) -> None:
         raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
@@ -564,6 +583,9 @@ def test_intervals_and_extents():
 @pytest.mark.skipif("SEASONSCAPES_NETWORK" not in os.environ, reason="asks real catalogues")
 def test_the_real_catalogues_answer(tmp_path):
     command("fetch", at="46.62,8.03", size="3km", date="2024-07..2024-09", output=tmp_path / "grindelwald.toml")
+    swiss = {"elevation": "swissalti3d", "imagery": "swissimage", "resolution": 2}
+    command("fetch", at="46.62,8.03", size="2km", output=tmp_path / "swiss.toml", **swiss)
+    assert sources(tmp_path / "swiss.toml")["elevation"]["shares"]["swissalti3d"] > 0.99
     assert sources(tmp_path / "grindelwald.toml")["imagery"][0]["report"]["known_share"] > 0.9
 
 
