@@ -2,7 +2,8 @@
 
 A document holds a table between ``<!-- table: NAME -->`` and ``<!-- end -->``. What stands there is made of
 ``benchmarks/results/*.json`` (and the table of sky models of their files) and is overwritten; ``--check`` writes nothing
-and fails where a document differs. A figure without a record is not printed: its row says so.
+and fails where a document differs. A figure without a record is not printed: its row says so. Times that were measured
+beside other work are marked as such.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import argparse
 import operator
 import re
+import string
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,6 +24,11 @@ ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 DOCUMENTS = ("README.md", "docs/measured.md", "sun_models/README.md")
 _COMPARISONS = {"<=": operator.le, ">=": operator.ge, "<": operator.lt, ">": operator.gt, "==": operator.eq}
+# Figures that a busy machine makes larger, by the ends of their names; processor time is among them, since processors
+# share caches and memory. Ratios of contestants that took turns are not.
+_TIME = re.compile(r"(^|_)(s|seconds|minutes)(_per_\w+|_3000km2)?$")
+# A benchmark with a thread for each core has a load of about their number by itself.
+_OWN_LOAD_SPARE = 0.5
 _REGION = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -281,7 +288,7 @@ def record_table(name: str) -> str:
     for row in table.rows:
         record = records[row.record or table.record]
         if record is not None:
-            lines.append(_row_text(row, record["figures"]))
+            lines.append(_row_text(row, record["figures"], busy=_busy(record)))
     missing = [f"`benchmarks/results/{each}.json`" for each, record in records.items() if record is None]
     if len(lines) == 2:
         lines = []
@@ -293,13 +300,20 @@ def record_table(name: str) -> str:
     return "\n".join(lines).strip() + "\n"
 
 
-def _row_text(row: Row, figures: dict[str, Any]) -> str:
+def _row_text(row: Row, figures: dict[str, Any], *, busy: bool) -> str:
     try:
         label, value = row.label.format(**figures), row.value.format(**figures)
     except KeyError as absent:
         return f"| {re.sub('{[^}]*}', '…', row.label)} | *not in this record: {absent.args[0]}* | {row.aim or '–'} |"
+    names = [name for _, name, _, _ in string.Formatter().parse(row.value) if name]
+    beside = " (beside other work)" if busy and any(_TIME.search(name) for name in names) else ""
     missed = any(not _holds(bound.strip(), figures) for bound in row.bounds.split(",") if bound.strip())
-    return f"| {label} | {_spaced(value)}{' **(missed)**' if missed else ''} | {row.aim or '–'} |"
+    return f"| {label} | {_spaced(value)}{beside}{' **(missed)**' if missed else ''} | {row.aim or '–'} |"
+
+
+def _busy(record: dict[str, Any]) -> bool:
+    machine = record["machine"]
+    return machine.get("load_5min", 0.0) > machine["cores"] + _OWN_LOAD_SPARE
 
 
 def _holds(bound: str, figures: dict[str, Any]) -> bool:
@@ -310,6 +324,7 @@ def _holds(bound: str, figures: dict[str, Any]) -> bool:
 def _source(record: dict[str, Any]) -> str:
     machine, versions = record["machine"], record["versions"]
     load = f", load {machine['load_5min']}" if "load_5min" in machine else ""
+    load += " (other work ran beside: times are too long)" if _busy(record) else ""
     return (
         f"`{record['command']}`, commit {record['commit']}, {record['date'][:10]}; {machine['cores']} cores of "
         f"{machine['processor']}{load}; Python {versions['python']}, Mitsuba {versions['mitsuba']}."

@@ -77,6 +77,16 @@ def test_a_wrong_number_in_a_table_is_found():
     assert tables.filled(planted) == text
 
 
+def test_times_measured_beside_other_work_are_marked():
+    row = tables.Row("a frame", "{frame_s:.1f} s", "≤ 1 s", "frame_s <= 1")
+    figures = {"frame_s": 1.25, "error": 0.5}
+    busy, quiet = {"machine": {"cores": 2, "load_5min": 3.0}}, {"machine": {"cores": 2, "load_5min": 2.1}}
+    assert (tables._busy(busy), tables._busy(quiet)) == (True, False)
+    assert tables._row_text(row, figures, busy=True) == "| a frame | 1.2 s (beside other work) **(missed)** | ≤ 1 s |"
+    assert tables._row_text(row, figures, busy=False) == "| a frame | 1.2 s **(missed)** | ≤ 1 s |"
+    assert "beside" not in tables._row_text(tables.Row("error", "{error:.0%}"), figures, busy=True)
+
+
 def test_records_say_how_they_came_about():
     records = sorted((ROOT / "benchmarks" / "results").glob("*.json"))
     assert records
