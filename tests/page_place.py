@@ -72,3 +72,23 @@ def write_page_place(folder: Path) -> Path:
     scene = folder / "my-valley.toml"
     scene.write_text(page_scene(), encoding="utf-8")
     return scene
+
+
+def write_photographs(folder: Path, scene: Path) -> None:
+    """Pictures of the webcam ``hut`` at the hours that the page of webcams names: rendered and developed, JPEG."""
+    import cv2
+
+    import seasonscapes as ss
+    from seasonscapes.cameras.webcam import read_webcams, webcam_model
+    from seasonscapes.workflows.place import ground_height_m
+
+    place = ss.load_place(str(scene))
+    (webcam,) = read_webcams(scene)
+    ground = ground_height_m(place, webcam.latitude_deg, webcam.longitude_deg, where=webcam.id)
+    view = webcam_model(webcam, place.frame, ground_m=ground)
+    pictures = folder / "webcams" / webcam.id
+    pictures.mkdir(parents=True)
+    for hour in ("09-00", "12-00", "16-00"):
+        seen = ss.render(place, view, f"2024-09-18T{hour.replace('-', ':')}")
+        encoded = np.round(255.0 * ss.srgb_from_linear(ss.develop(seen, look="neutral"))).astype(np.uint8)
+        cv2.imwrite(str(pictures / f"2024-09-18T{hour}.jpg"), encoded[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])

@@ -1,5 +1,6 @@
 """Tables equal their records, commands on the pages parse, stored notebooks are those of the tree, versions agree."""
 
+import ast
 import json
 import re
 import shlex
@@ -85,6 +86,13 @@ def test_times_measured_beside_other_work_are_marked():
     assert tables._row_text(row, figures, busy=True) == "| a frame | 1.2 s (beside other work) **(missed)** | ≤ 1 s |"
     assert tables._row_text(row, figures, busy=False) == "| a frame | 1.2 s **(missed)** | ≤ 1 s |"
     assert "beside" not in tables._row_text(tables.Row("error", "{error:.0%}"), figures, busy=True)
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "benchmarks").glob("*.py")), ids=lambda path: path.stem)
+def test_flags_that_a_benchmark_documents_exist(path):
+    source = path.read_text(encoding="utf-8")
+    documented = set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", ast.get_docstring(ast.parse(source)) or ""))
+    assert {flag for flag in documented if f'"{flag}"' not in source} == set()
 
 
 def test_records_say_how_they_came_about():
