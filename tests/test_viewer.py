@@ -229,7 +229,7 @@ class TestPlaces:
 
     def test_a_place_without_image_near_the_pole_has_a_page(self, place, tmp_path):
         text = SCENE.replace(
-            "latitude_deg = 46.5405\nlongitude_deg = 7.98", "latitude_deg = 89.97\nlongitude_deg = 20.0"
+            "latitude_deg = 46.5405\nlongitude_deg = 7.98", "latitude_deg = 89.987\nlongitude_deg = 135.0"
         )
         text = re.sub(r"\[imagery\].*?\n\n", "", text, flags=re.DOTALL)
         (tmp_path / "pole.toml").write_text(text)
@@ -342,15 +342,16 @@ def browser():
         yield running
 
 
+@pytest.fixture(scope="module")
+def page(browser, folder):
+    with served(folder) as address:
+        open_page(browser, address + "?still&size=96x72")
+        prepare(browser)
+        yield address
+
+
 @pytest.mark.browser
 class TestBrowser:
-    @pytest.fixture(scope="class")
-    def page(self, browser, folder):
-        with served(folder) as address:
-            open_page(browser, address + "?still&size=96x72")
-            prepare(browser)
-            yield address
-
     def test_it_opens_without_network_faults_or_messages(self, browser, page):
         assert [entry["message"] for entry in browser.get_log("browser")] == []
         answers = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]
