@@ -105,6 +105,8 @@ export function makeRenderer(canvas, { arrays, about }, terrain, light) {
     uSeen: { value: null },
     uAlbedoA: { value: null },
     uAlbedoB: { value: null },
+    uGainA: { value: new THREE.Vector3(1, 1, 1) },
+    uGainB: { value: new THREE.Vector3(1, 1, 1) },
     uOrder: { value: orderTexture },
     uOrderLow: { value: 0 },
     uOrderHigh: { value: 1 },
@@ -268,12 +270,15 @@ export function makeRenderer(canvas, { arrays, about }, terrain, light) {
   function setAlbedo(first, second, share) {
     shared.uAlbedoA.value = first;
     shared.uAlbedoB.value = second ?? first;
+    shared.uGainA.value.set(...first.userData.gain);
+    shared.uGainB.value.set(...(second ?? first).userData.gain);
     shared.uSeason.value = second ? share : 0;
     relight();
   }
 
-  function albedoTexture(bitmap) {
+  function albedoTexture(bitmap, gain) {
     const made = new THREE.Texture(bitmap);
+    made.userData.gain = gain;
     made.colorSpace = THREE.SRGBColorSpace;
     made.flipY = false;
     made.generateMipmaps = true;
