@@ -55,7 +55,7 @@ class ViewerDetail:
     rank
         Daylight coefficients of a point, a multiple of 4.
     clusters
-        Groups of faces that reflect light, a square of a power of two.
+        Groups of faces that reflect light, at most; a power of two.
     clusters_per_point
         Groups that each point sees, a multiple of 4.
     rays
