@@ -8,6 +8,7 @@ from test_rendering import PLANE, heightfield, looking_down, sun_at
 
 from seasonscapes.cameras.pinhole import Camera, rotation_from_angles
 from seasonscapes.frames import direction_from_angles, equirectangular_directions
+from seasonscapes.rendering.coefficients import SamplingOptions
 from seasonscapes.rendering.coefficients_file import load_coefficients, save_coefficients
 from seasonscapes.rendering.hemisphere_rays import ray_scene
 from seasonscapes.rendering.irradiance import irradiance, irradiance_blocks, surface_at, upload_points
@@ -23,7 +24,7 @@ from seasonscapes.rendering.sky_patches import (
     patch_radiance,
     sky_patches,
 )
-from seasonscapes.rendering.transport import SamplingOptions, trace_points, trace_view, view_albedo
+from seasonscapes.rendering.transport import trace_points, trace_view, view_albedo
 from seasonscapes.sky.illumination import Illumination, uniform_sky
 
 QUICK = SamplingOptions(rays=128, clusters=1024, clusters_per_receiver=32)

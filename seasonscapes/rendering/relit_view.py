@@ -11,8 +11,10 @@ import cv2
 import numpy as np
 
 from seasonscapes.rendering.air_grid import AirGrid, SkyGrid, air_grid, interpolate_air, sky_grid, sky_pixel_radiance
+from seasonscapes.rendering.coefficients import ViewCoefficients
 from seasonscapes.rendering.gbuffer import GBuffer, trace_gbuffer
-from seasonscapes.rendering.hemisphere_rays import RayScene, texture_at
+from seasonscapes.rendering.hemisphere_rays import RayScene, albedo_at
+from seasonscapes.rendering.mirrored_light import DeviceMirror, mirrored_radiance, upload_mirror
 from seasonscapes.rendering.mitsuba_scene import RenderScene
 from seasonscapes.rendering.radiance import RenderedView
 from seasonscapes.rendering.receivers import (
@@ -31,7 +33,7 @@ from seasonscapes.rendering.sun_visibility import (
     sum_incidence,
     sun_rays,
 )
-from seasonscapes.rendering.transport import ViewCoefficients, view_neighbours
+from seasonscapes.rendering.transport import view_neighbours
 from seasonscapes.sky.illumination import Illumination, Luminary
 
 # Ratio of distances within a pixel above which it contains more than one surface,
@@ -70,6 +72,8 @@ class RelightableView:
         Grid at which aerial perspective is evaluated.
     sky
         Grid at which sky radiance is evaluated.
+    mirror
+        What the water in the view mirrors; ``None`` without water.
     """
 
     coefficients: ViewCoefficients
@@ -81,6 +85,7 @@ class RelightableView:
     coverage: np.ndarray
     air: AirGrid
     sky: SkyGrid
+    mirror: DeviceMirror | None = None
 
 
 def relightable_view(terrain: RayScene, coefficients: ViewCoefficients) -> RelightableView:
@@ -128,6 +133,7 @@ def relightable_view(terrain: RayScene, coefficients: ViewCoefficients) -> Relig
         coverage,
         air,
         sky_grid(camera, np.flatnonzero(coverage.reshape(-1) < 1.0)),
+        upload_mirror(terrain, coefficients),
     )
 
 
@@ -144,7 +150,9 @@ def _distances(coefficients: ViewCoefficients) -> tuple[np.ndarray, np.ndarray, 
     return distance.min(axis=1), farthest, distance
 
 
-def with_albedo(view: RelightableView, albedo: np.ndarray, cluster_albedo: np.ndarray) -> RelightableView:
+def with_albedo(
+    view: RelightableView, albedo: np.ndarray, cluster_albedo: np.ndarray, mirrored_albedo: np.ndarray | None = None
+) -> RelightableView:
     """Return the view with another albedo of the same terrain (such as another season's).
 
     Parameters
@@ -155,6 +163,8 @@ def with_albedo(view: RelightableView, albedo: np.ndarray, cluster_albedo: np.nd
         ``(n, 3)`` mean albedo of the pixels, from `transport.view_albedo`.
     cluster_albedo
         ``(M, POINTS_PER_CLUSTER, 3)`` albedo of the points of the clusters, from the function `cluster_albedo`.
+    mirrored_albedo
+        ``(m, 3)`` of the ground that water mirrors, from the function `mirrored_albedo`; ``None`` leaves it.
 
     Returns
     -------
@@ -164,18 +174,22 @@ def with_albedo(view: RelightableView, albedo: np.ndarray, cluster_albedo: np.nd
     points = replace(view.clusters.clusters.points, albedo=np.asarray(cluster_albedo, np.float32))
     clusters = replace(view.clusters.clusters, points=points)
     coefficients = replace(view.coefficients, albedo=np.asarray(albedo, np.float32), clusters=clusters)
-    return replace(view, coefficients=coefficients, clusters=replace(view.clusters, clusters=clusters))
+    mirror = view.mirror
+    if mirror is not None and mirrored_albedo is not None:
+        mirror = replace(mirror, albedo=np.asarray(mirrored_albedo, np.float32))
+    clusters = replace(view.clusters, clusters=clusters)
+    return replace(view, coefficients=coefficients, clusters=clusters, mirror=mirror)
 
 
-def cluster_albedo(coefficients: ViewCoefficients, texture: np.ndarray) -> np.ndarray:
-    """Look up the albedo of the cluster points in a texture.
+def cluster_albedo(terrain: RayScene, coefficients: ViewCoefficients) -> np.ndarray:
+    """Look up the current albedo of the terrain at the points of a view's clusters.
 
     Parameters
     ----------
+    terrain
+        The terrain with the albedo, see `mitsuba_scene.set_albedo`.
     coefficients
         Coefficients of a view.
-    texture
-        ``(R, S, 3)`` albedo.
 
     Returns
     -------
@@ -185,8 +199,29 @@ def cluster_albedo(coefficients: ViewCoefficients, texture: np.ndarray) -> np.nd
     points = coefficients.clusters.points
     # An albedo of zero marks surfaces that were hit from their back, which stay black for every texture.
     front = np.asarray(points.albedo).max(axis=-1, keepdims=True) > 0.0
-    values = texture_at(texture, np.asarray(points.uv).reshape(-1, 2)).reshape(points.albedo.shape)
-    return np.where(front, values, 0.0).astype(np.float32)
+    return np.where(front, albedo_at(terrain, np.asarray(points.uv)), 0.0).astype(np.float32)
+
+
+def mirrored_albedo(terrain: RayScene, coefficients: ViewCoefficients) -> np.ndarray | None:
+    """Average the current albedo of the terrain over the ground that the water in a view mirrors.
+
+    Parameters
+    ----------
+    terrain
+        The terrain with the albedo, see `mitsuba_scene.set_albedo`.
+    coefficients
+        Coefficients of a view.
+
+    Returns
+    -------
+    numpy.ndarray or None
+        ``(m, 3)`` float32 as in `MirrorCoefficients`; ``None`` without water.
+    """
+    mirror = coefficients.mirror
+    if mirror is None:
+        return None
+    share = np.asarray(mirror.sample_share, np.float32)
+    return np.einsum("ms,msc->mc", share, albedo_at(terrain, np.asarray(mirror.sample_uv)))
 
 
 def relight_view(view: RelightableView, illumination: Illumination) -> RenderedView:
@@ -226,12 +261,15 @@ def relit_surface_radiance(view: RelightableView, illumination: Illumination) ->
     numpy.ndarray
         ``(n, 3)`` float32 [cd/m²], averaged over the pixel with the sky counted as black.
     """
-    direct, reflected = incident_light(view.receivers, light_clusters(view.clusters, illumination))
-    total = direct + reflected
+    clusters = light_clusters(view.clusters, illumination)
+    total = np.add(*incident_light(view.receivers, clusters))
     for body in luminaries(illumination):
         light = np.asarray(body.normal_illuminance_lx, np.float32) / np.float32(np.pi)
         total += sun_cosine(view, body)[:, None] * light
-    return total * view.coefficients.albedo
+    radiance = total * view.coefficients.albedo
+    if view.mirror is not None:
+        radiance[view.mirror.coefficients.pixel] += mirrored_radiance(view.mirror, illumination, clusters)
+    return radiance
 
 
 def sun_cosine(view: RelightableView, luminary: Luminary) -> np.ndarray:

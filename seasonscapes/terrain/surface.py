@@ -14,6 +14,7 @@ from affine import Affine
 from seasonscapes.array_files import read_arrays
 from seasonscapes.errors import AtlasMismatch, InputError
 from seasonscapes.frames import MEAN_RADIUS_M, LocalFrame
+from seasonscapes.terrain.surface_classes import Water
 
 
 @dataclass(frozen=True)
@@ -142,6 +143,8 @@ class Terrain:
         The smooth surface that the triangles approximate; ``None``: shading interpolates normals of the vertices.
     normals
         ``(V, 3)`` float32 unit normals of the vertices; ``None``: those of the triangles about them.
+    water
+        Its open water, which mirrors; ``None``: all ground is Lambertian. `save_terrain` leaves it out.
     """
 
     vertices: np.ndarray
@@ -150,6 +153,7 @@ class Terrain:
     frame: LocalFrame
     surface: SurfaceGrid | None = None
     normals: np.ndarray | None = None
+    water: Water | None = None
 
 
 def mesh_up_m(terrain: Terrain, position_m: np.ndarray) -> float:

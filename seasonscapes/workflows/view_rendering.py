@@ -27,8 +27,8 @@ from seasonscapes.workspace import content_key
 if TYPE_CHECKING:
     from seasonscapes.cameras.panorama import Panorama
     from seasonscapes.cameras.pinhole import Camera
+    from seasonscapes.rendering.coefficients import SamplingOptions
     from seasonscapes.rendering.radiance import RenderedView
-    from seasonscapes.rendering.transport import SamplingOptions
     from seasonscapes.sky.illumination import Illumination
 
 log = logging.getLogger(__name__)
@@ -142,7 +142,7 @@ def render(
 
 def still_sampling() -> SamplingOptions:
     """Samples and rays of a still: fewer than a film's, whose frames share them."""
-    from seasonscapes.rendering.transport import SamplingOptions
+    from seasonscapes.rendering.coefficients import SamplingOptions
 
     return SamplingOptions(albedo_samples=16, rays=128)
 

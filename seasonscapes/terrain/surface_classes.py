@@ -1,0 +1,23 @@
+"""Ground that is not Lambertian, as a terrain carries it: where it lies in the atlas, and what it is like."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Water:
+    """Open water of a terrain.
+
+    Parameters
+    ----------
+    mask
+        ``(R, S)`` float32 share of each texel that is water, row 0 at v = 1; its shore is the contour of one half.
+    wind_m_s
+        Speed of the wind over it [m/s]; 0 is a mirror.
+    """
+
+    mask: np.ndarray
+    wind_m_s: float
