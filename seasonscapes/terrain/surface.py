@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -144,7 +144,7 @@ class Terrain:
     normals
         ``(V, 3)`` float32 unit normals of the vertices; ``None``: those of the triangles about them.
     water
-        Its open water, which mirrors; ``None``: all ground is Lambertian. `save_terrain` leaves it out.
+        Its open water, which mirrors; ``None``: all ground is Lambertian.
     """
 
     vertices: np.ndarray
@@ -287,6 +287,9 @@ def save_terrain(terrain: Terrain, path: str | os.PathLike[str], *, note: dict[s
         surface = terrain.surface
         arrays |= {"surface": surface.nodes, "surface_to_node": surface.to_node, "surface_domain": surface.domain}
         arrays["surface_mesh_error_m"] = surface.mesh_error_m
+    if terrain.water is not None:
+        # Shares in steps of 1/255.
+        arrays |= {"water": np.round(terrain.water.mask * 255.0).astype(np.uint8), "water_wind": terrain.water.wind_m_s}
     np.savez(path, note=json.dumps(note or {}), **arrays)
 
 
@@ -317,6 +320,9 @@ def load_terrain(path: str | os.PathLike[str]) -> tuple[Terrain, dict[str, Any]]
                 float(stored["surface_mesh_error_m"]),
             )
         terrain = Terrain(stored["vertices"], stored["faces"], stored["uv"], frame, surface)
+        if "water" in stored:
+            water = Water(stored["water"].astype(np.float32) / np.float32(255.0), float(stored["water_wind"]))
+            terrain = replace(terrain, water=water)
         return terrain, json.loads(str(stored["note"]))
 
 

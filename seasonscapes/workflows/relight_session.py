@@ -213,9 +213,13 @@ def still_session(
     base_day: date = _MIDSUMMER,
     seed: int = 0,
     sampling: SamplingOptions | None = None,
+    lambertian: bool = False,
     progress: Progress | None = None,
 ) -> RelightSession:
-    """`relight_session` for few instants: the light of each is computed, and no tables are built for it first."""
+    """`relight_session` for few instants: the light of each is computed, and no tables are built for it first.
+
+    ``lambertian``: without surfaces that are not matt.
+    """
     from seasonscapes.rendering.hemisphere_rays import ray_scene
     from seasonscapes.rendering.mitsuba_scene import mi_mesh
     from seasonscapes.rendering.relit_view import relightable_view
@@ -228,8 +232,11 @@ def still_session(
         albedo = AlbedoSeries((albedo,))
     camera, model = view_in_frame(camera, place.frame), sky_model(sky)
     base = nearest_albedo(albedo, base_day)
-    scene = ray_scene(mi_mesh(terrain_for_view(place, camera), base.load().values))
+    terrain = terrain_for_view(place, camera, lambertian=lambertian)
+    scene = ray_scene(mi_mesh(terrain, base.load().values))
     inputs = {"place": place.key, **_camera_values(camera), "albedo": _identity(base), "seed": seed}
+    if lambertian:
+        inputs["lambertian"] = True
     coefficients = _coefficients(place, camera, scene, inputs, seed, sampling, progress)
     relightable = relightable_view(scene, coefficients)
     return RelightSession(place, camera, model, albedo, base, seed, coefficients, scene, relightable)
