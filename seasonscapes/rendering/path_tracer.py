@@ -3,7 +3,7 @@
 Mitsuba's general ``path`` integrator spends half of its emitter samples on the sun and the other half on directions of
 the sky. Here each vertex casts one shadow ray to the sun and one to the moon, and the cosine-sampled continuation ray
 samples the sky. The expectation and the number of rays are the same, with much less noise. Water that the viewer sees,
-directly or in other water, mirrors (`water_surface`).
+directly or in other water, mirrors (`water_surface`); snow that the viewer sees directly scatters (`snow_scattering`).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.rendering.gbuffer import mi_rays
 from seasonscapes.rendering.mitsuba_scene import LUMINARY_DISTANCE_M, RenderScene
 from seasonscapes.rendering.sobol import hashed, sobol_pair, uniform
-from seasonscapes.rendering.terrain_material import device_water, leaving_points, shadow_ray_start
+from seasonscapes.rendering.terrain_material import device_water, leaving_points, shadow_ray_start, snow_optics
 from seasonscapes.sky.illumination import Luminary
 
 # Farther hits are the polygons of sun and moon, which only Mitsuba's own integrators use.
@@ -137,7 +137,8 @@ def _trace(scene: RenderScene, ray: Any, sample_key: Any, index: Any, max_depth:
     import mitsuba as mi
 
     mi_terrain, mi_sky, luminaries = scene.mi_terrain, scene.mi_scene.environment(), _luminaries(scene)
-    material, water = mi_terrain.bsdf(), device_water(mi_terrain.bsdf())
+    material = mi_terrain.bsdf()
+    water, snow = device_water(material), snow_optics(material)
 
     def step(
         ray: Any, radiance: Any, throughput: Any, depth: Any, active: Any, on_terrain: Any, seen: Any, most: Any
@@ -160,7 +161,14 @@ def _trace(scene: RenderScene, ray: Any, sample_key: Any, index: Any, max_depth:
         reflectance = material.eval_diffuse_reflectance(surface, active)
         direction = mi.warp.square_to_cosine_hemisphere(sobol_pair(hashed(key, _BOUNCE), index))
         direction = mi.Frame3f(normal).to_world(direction)
-        mirrored, before, glitter = mi.Bool(False), throughput, None
+        mirrored, before, glitter, relative = mi.Bool(False), throughput, None, None
+        if snow is not None:
+
+            def relative(light: Any, normal: Any = normal, viewer: Any = -ray.d, albedo: Any = reflectance) -> Any:
+                """Of snow; the interpolated normal may face away from the viewer, who sees the facet all the same."""
+                cosines = (dr.dot(normal, viewer), dr.dot(normal, light), dr.dot(viewer, light))
+                return mi.Color3f(*snow.relative(albedo, cosines, dr))
+
         if water is not None:
             on_water = active & seen & water.covers(surface.uv, active)
             wave, share = water.mirrored(normal, -ray.d, sobol_pair(hashed(key, _WAVE), index))
@@ -176,11 +184,16 @@ def _trace(scene: RenderScene, ray: Any, sample_key: Any, index: Any, max_depth:
 
         throughput = dr.select(active, throughput * reflectance, throughput)
         diffuse = dr.select(mirrored, 0.0, throughput)
+        scatters = active & (depth == 0)
+        if water is not None:
+            scatters &= ~on_water
+        if relative is not None:
+            throughput = dr.select(scatters, throughput * relative(direction), throughput)
         light = _direct_light(
             scene,
             luminaries,
             (origin, outward, normal),
-            (diffuse, before, glitter),
+            (diffuse, scatters, relative, before, glitter),
             sample=(key, index),
             active=active,
             coherent=depth == 0,
@@ -234,7 +247,7 @@ def _direct_light(
     scene: RenderScene,
     luminaries: list[_DeviceLuminary],
     leaving: tuple[Any, Any, Any],
-    reflection: tuple[Any, Any, Any],
+    reflection: tuple[Any, Any, Any, Any, Any],
     *,
     sample: tuple[Any, Any],
     active: Any,
@@ -242,12 +255,13 @@ def _direct_light(
 ) -> Any:
     """Radiance that a surface reflects of the direct light of sun and moon, with one shadow ray for each.
 
-    ``reflection``: diffuse throughput; throughput and, as a function of the direction, reflection of glitter, or ``None``.
+    ``reflection``: diffuse throughput; snow, and its relative reflection; throughput before the surface, and the reflection
+    of glitter. Reflections are functions of the direction, or ``None``.
     """
     import mitsuba as mi
 
     origin, outward, normal = leaving
-    diffuse, before, glitter = reflection
+    diffuse, scatters, relative, before, glitter = reflection
     key, index = sample
     material = scene.mi_terrain.bsdf()
     total = mi.Color3f(0.0)
@@ -260,6 +274,8 @@ def _direct_light(
         ray.maxt = FAR_M
         shadowed = scene.mi_scene.ray_test(ray, coherent=coherent, active=facing)
         reflected = diffuse * cosine * dr.inv_pi
+        if relative is not None:
+            reflected = dr.select(scatters, reflected * relative(direction), reflected)
         if glitter is not None:
             reflected += before * glitter(direction)
         total += dr.select(facing & ~shadowed, reflected * luminary.mi_illuminance, 0.0)

@@ -26,6 +26,7 @@ from seasonscapes.rendering.receivers import (
     upload_clusters,
     upload_receivers,
 )
+from seasonscapes.rendering.snow_scattering import SnowOptics
 from seasonscapes.rendering.sun_visibility import (
     SunRays,
     bayer_disc_offset,
@@ -33,6 +34,7 @@ from seasonscapes.rendering.sun_visibility import (
     sum_incidence,
     sun_rays,
 )
+from seasonscapes.rendering.terrain_material import snow_optics
 from seasonscapes.rendering.transport import view_neighbours
 from seasonscapes.sky.illumination import Illumination, Luminary
 
@@ -74,6 +76,8 @@ class RelightableView:
         Grid at which sky radiance is evaluated.
     mirror
         What the water in the view mirrors; ``None`` without water.
+    snow
+        How snow scatters; ``None``: it is Lambertian.
     """
 
     coefficients: ViewCoefficients
@@ -86,6 +90,7 @@ class RelightableView:
     air: AirGrid
     sky: SkyGrid
     mirror: DeviceMirror | None = None
+    snow: SnowOptics | None = None
 
 
 def relightable_view(terrain: RayScene, coefficients: ViewCoefficients) -> RelightableView:
@@ -134,6 +139,7 @@ def relightable_view(terrain: RayScene, coefficients: ViewCoefficients) -> Relig
         air,
         sky_grid(camera, np.flatnonzero(coverage.reshape(-1) < 1.0)),
         upload_mirror(terrain, coefficients),
+        snow_optics(terrain.mi_terrain.bsdf()),
     )
 
 
@@ -263,13 +269,40 @@ def relit_surface_radiance(view: RelightableView, illumination: Illumination) ->
     """
     clusters = light_clusters(view.clusters, illumination)
     total = np.add(*incident_light(view.receivers, clusters))
+    snow = None if view.snow is None else _SnowPixels(view, view.snow)
+    if snow is not None:
+        total *= snow.of_diffuse_light()
     for body in luminaries(illumination):
         light = np.asarray(body.normal_illuminance_lx, np.float32) / np.float32(np.pi)
-        total += sun_cosine(view, body)[:, None] * light
+        lit = sun_cosine(view, body)[:, None] * light
+        total += lit if snow is None else lit * snow.of_luminary(body)
     radiance = total * view.coefficients.albedo
     if view.mirror is not None:
         radiance[view.mirror.coefficients.pixel] += mirrored_radiance(view.mirror, illumination, clusters)
     return radiance
+
+
+class _SnowPixels:
+    """Reflection of the n terrain pixels towards the camera relative to Lambertian ground, each ``(n, 3)``."""
+
+    def __init__(self, view: RelightableView, snow: SnowOptics) -> None:
+        coefficients = view.coefficients
+        self._snow = snow
+        self._albedo = list((coefficients.albedo / np.maximum(coefficients.coverage[:, None], 1e-3)).T)
+        normal = coefficients.normal
+        self._normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-6)
+        # Samples on terrain come first.
+        viewer = coefficients.camera.position_m.astype(np.float32) - coefficients.sample_origin[:, 0]
+        self._viewer = viewer / np.linalg.norm(viewer, axis=1, keepdims=True)
+        self._cosine = np.einsum("nk,nk->n", self._normal, self._viewer)
+
+    def of_diffuse_light(self) -> np.ndarray:
+        return np.stack(self._snow.relative_diffuse(self._albedo, self._cosine), axis=1).astype(np.float32)
+
+    def of_luminary(self, body: Luminary) -> np.ndarray:
+        light = np.asarray(body.direction, np.float32)
+        cosines = (self._cosine, self._normal @ light, self._viewer @ light)
+        return np.stack(self._snow.relative(self._albedo, cosines), axis=1).astype(np.float32)
 
 
 def sun_cosine(view: RelightableView, luminary: Luminary) -> np.ndarray:

@@ -10,7 +10,7 @@ slopes show no triangles. A facet is lit and seen as the surface that it approxi
   in Ray Tracing Gems II, doi:10.1007/978-1-4842-7185-8_4), and not from the facet, whose plane would cut them off.
 
 Water (`water_surface`) mirrors where the viewer sees it, directly or in other water; lit by it or seen in the diffuse light
-of other ground, it is Lambertian.
+of other ground, it is Lambertian. So is snow (`snow_scattering`) but for the light that it sends to the viewer directly.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ import numpy as np
 
 from seasonscapes.frames import MEAN_RADIUS_M
 from seasonscapes.rendering.backend import use_backend
+from seasonscapes.rendering.snow_scattering import SnowOptics
 from seasonscapes.rendering.water_surface import REFRACTIVE_INDEX, DeviceWater, slope_variance
 from seasonscapes.terrain.surface import SurfaceGrid, Terrain
 from seasonscapes.terrain.surface_classes import Water
@@ -157,6 +158,11 @@ def device_water(material: Any) -> DeviceWater | None:
     return getattr(material, "water", None)
 
 
+def snow_optics(material: Any) -> SnowOptics | None:
+    """The snow of a terrain's material; ``None`` where it has none, or where it is that of the scalar variant."""
+    return getattr(material, "snow", None)
+
+
 def device_surface(material: Any) -> DeviceSurface | None:
     """The surface of a terrain's material; ``None`` where its triangles shade themselves."""
     return getattr(material, "surface", None)
@@ -193,7 +199,7 @@ def terrain_material(reflectance: dict[str, Any], terrain: Terrain, *, smooth: b
     reflectance
         Mitsuba's dictionary of a texture.
     terrain
-        Its smooth surface and its water.
+        Its smooth surface, its water and its snow.
     smooth
         Shade with the normals of the smooth surface; else with those of the mesh. The scalar variant, which would call
         Python for every sample, has Mitsuba's own materials with the normals of the mesh.
@@ -213,6 +219,7 @@ def terrain_material(reflectance: dict[str, Any], terrain: Terrain, *, smooth: b
     _register(variant)
     material: Any = mi.load_dict({"type": _PLUGIN, "reflectance": reflectance})
     material.surface = DeviceSurface(terrain.surface) if smooth and terrain.surface is not None else None
+    material.snow = None if terrain.snow is None else SnowOptics(terrain.snow)
     material.water = None if terrain.water is None else DeviceWater(terrain.water, terrain.frame)
     return material
 
@@ -256,6 +263,7 @@ def _material_class() -> Any:
             self.reflectance = properties.get_texture("reflectance")
             self.surface: Any = None
             self.water: Any = None
+            self.snow: Any = None
             flags = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
             self.m_components, self.m_flags = [flags], flags
 
@@ -297,7 +305,11 @@ def _material_class() -> Any:
 
         def body(self, si: Any, active: Any) -> Any:
             """The albedo texture: reflectance of the ground, or of the body of water below its surface."""
-            return self.reflectance.eval(si, active)
+            albedo = self.reflectance.eval(si, active)
+            if self.snow is None or self.snow.clean is None:
+                return albedo
+            share = self.snow.share(*albedo, dr)
+            return albedo + share * (mi.Color3f(*self.snow.clean) - albedo)
 
         def traverse(self, callback: Any) -> None:
             callback.put("reflectance", self.reflectance, mi.ParamFlags.Differentiable)

@@ -21,3 +21,17 @@ class Water:
 
     mask: np.ndarray
     wind_m_s: float
+
+
+@dataclass(frozen=True)
+class Snow:
+    """Snow of a terrain, which lies where its albedo is bright and nearly white.
+
+    Parameters
+    ----------
+    grain_mm
+        Optical diameter of the grains of clean snow [mm], whose albedo then takes the place of the texture's; ``None``: the
+        texture's albedo says how much its grains and dirt absorb.
+    """
+
+    grain_mm: float | None = None

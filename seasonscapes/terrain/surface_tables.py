@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from seasonscapes.declaration import Declaration
 
@@ -29,3 +29,25 @@ class WaterTable(Declaration):
     def paths(self) -> tuple[str, ...]:
         """Its file, if it has one."""
         return () if self.file is None else (self.file,)
+
+
+class SnowTable(Declaration):
+    """Snow, which lies where the albedo is bright and nearly white. Without this table it is matt as all other ground.
+
+    Parameters
+    ----------
+    scattering
+        Whether it scatters light as grains of ice do: forwards, and brighter under a low sun.
+    grain_mm
+        Optical diameter of the grains [mm], of clean snow whose albedo then takes the place of the texture's: 0.1 when it
+        falls, 1 and more when it melts. Left out, the texture's albedo says how much it absorbs.
+    """
+
+    scattering: bool = True
+    grain_mm: float | None = Field(default=None, ge=0.02, le=10.0)
+
+    @model_validator(mode="after")
+    def _scatters(self) -> SnowTable:
+        if self.grain_mm is not None and not self.scattering:
+            raise ValueError("'grain_mm' is of snow that scatters: drop it, or scattering = false")
+        return self

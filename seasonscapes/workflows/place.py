@@ -207,6 +207,7 @@ def load_place(
         "frame": frame,
         "options": options,
         **water_key(declared),
+        **({} if declared.snow is None else {"snow": declared.snow}),
     }
     terrain, atlas = build_once(
         workspace,

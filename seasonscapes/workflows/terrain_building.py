@@ -20,6 +20,7 @@ from seasonscapes.terrain.raster import bounds_geographic, centre_frame, fill_no
 from seasonscapes.terrain.raster_files import OWN_FOLDER
 from seasonscapes.terrain.refine import refine_raster, refinement_factor
 from seasonscapes.terrain.surface import Raster, Terrain, load_terrain, save_terrain
+from seasonscapes.terrain.surface_classes import Snow
 from seasonscapes.terrain.surface_grid import surface_grid
 from seasonscapes.terrain.tile_files import read_elevation_tiles, tile_spacing_m
 from seasonscapes.terrain.unwrap import ATLASES, Atlas, unwrap
@@ -213,6 +214,8 @@ def build_terrain(
     terrain, atlas = unwrap(terrain, kind=options.atlas, texel_m=texel_m, max_side_px=options.max_side_px)
     if water is not None and scene.water is not None:
         terrain = with_water(terrain, atlas, water, scene.water.wind_m_s)
+    if scene.snow is not None and scene.snow.scattering:
+        terrain = replace(terrain, snow=Snow(scene.snow.grain_mm))
     return terrain, atlas
 
 

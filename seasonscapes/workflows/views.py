@@ -149,7 +149,7 @@ def terrain_for_view(place: Place, view: Camera | Panorama, *, lambertian: bool 
     """
     from seasonscapes.terrain.view_refinement import refined_for_view
 
-    terrain = replace(place.terrain, water=None) if lambertian else place.terrain
+    terrain = replace(place.terrain, water=None, snow=None) if lambertian else place.terrain
     return refined_for_view(terrain, view.position_m, 1.0 / float(view.fx))
 
 
