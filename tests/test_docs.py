@@ -105,6 +105,7 @@ def test_records_say_how_they_came_about():
         assert figures
         script = shlex.split(record["command"])[1]
         assert (ROOT / script).is_file(), path.name
+        assert " /" not in record["command"], "a folder of one machine"
 
 
 def test_a_record_is_written_with_its_circumstances(tmp_path):
