@@ -21,7 +21,7 @@ from seasonscapes.relighting.exposure_smoothing import smoothed_ev100
 from seasonscapes.relighting.film import write_video
 from seasonscapes.relighting.frame_file import frame_header, load_frame, save_frame
 from seasonscapes.relighting.luminous_efficacy import efficacies_lm_w
-from seasonscapes.rendering.transport import SamplingOptions
+from seasonscapes.rendering.coefficients import SamplingOptions
 from seasonscapes.scene import read_scene
 from seasonscapes.sky.models import read_sky_model
 from seasonscapes.sky.night import air_mass

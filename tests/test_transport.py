@@ -8,6 +8,7 @@ from test_rendering import PLANE, heightfield, looking_down, sun_at
 
 from seasonscapes.cameras.pinhole import Camera, rotation_from_angles
 from seasonscapes.frames import direction_from_angles, equirectangular_directions
+from seasonscapes.rendering.coefficients import SamplingOptions
 from seasonscapes.rendering.coefficients_file import load_coefficients, save_coefficients
 from seasonscapes.rendering.direction_basis import direction_basis
 from seasonscapes.rendering.hemisphere_rays import ray_scene
@@ -25,7 +26,7 @@ from seasonscapes.rendering.sky_patches import (
     sky_patches,
     sky_second_moments,
 )
-from seasonscapes.rendering.transport import SamplingOptions, trace_points, trace_view, view_albedo
+from seasonscapes.rendering.transport import trace_points, trace_view, view_albedo
 from seasonscapes.rendering.view_samples import pixel_moments, sample_moments, view_samples
 from seasonscapes.sky.illumination import Illumination, uniform_sky
 

@@ -71,6 +71,4 @@ def direction_basis(rows: np.ndarray, patches: SkyPatches, rank: int) -> Directi
     # Coefficients are scaled to a standard deviation of 1, where half precision is accurate.
     scale = 1.0 / np.maximum(np.asarray(rows @ projection).std(axis=0), 1e-12)
     error = float(np.sqrt(power[rank:].sum() / max(power.sum(), 1e-300)))
-    return DirectionBasis(
-        (projection * scale).astype(np.float32), (from_sky / scale).astype(np.float32), error
-    )
+    return DirectionBasis((projection * scale).astype(np.float32), (from_sky / scale).astype(np.float32), error)
