@@ -23,6 +23,7 @@ NOT_RUN = {
     r"^seasonscapes annotate|^seasonscapes view (alpine_small --camera|my-valley)": "serves a page until Ctrl-C",
     r"--points points.csv": "needs points that a person matched; tests/test_cli_webcams.py runs it",
     r"^seasonscapes (run|evaluate) ": "a run of all stages and its score; tests/test_run.py has both",
+    r"--turntable 36": "traces the light of 36 views; tests/test_meshes.py turns through fewer",
     r"--picture noon.jpg": "as on the page of webcams",
 }
 FOLDERS = [page for page in PAGES if page.name != "README.md" and page.parent.name != "docs" and commands_of(page)]
