@@ -68,6 +68,9 @@ results: $(DEV)
 	$(BIN)/python benchmarks/gaussians.py --json benchmarks/results/gaussians.json
 	$(BIN)/python benchmarks/alpinebench.py --quick --json benchmarks/results/alpinebench-quick.json
 	$(BIN)/python benchmarks/calibration.py --quick --json benchmarks/results/calibration-quick.json
+	$(BIN)/python benchmarks/realbench.py --json benchmarks/results/realbench.json
+	$(BIN)/python benchmarks/viewer.py --json benchmarks/results/viewer.json
+	$(BIN)/python benchmarks/everyday.py --quick --json benchmarks/results/everyday-quick.json
 	$(BIN)/python benchmarks/tables.py
 
 check: $(DEV)

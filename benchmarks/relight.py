@@ -85,9 +85,10 @@ def rel_rmse(image: np.ndarray, reference: np.ndarray, mask: np.ndarray) -> floa
 
 def coefficients_of(scene, camera, seed: int):
     """Our view, ready, and what making it took."""
+    from seasonscapes.rendering.coefficients import SamplingOptions
     from seasonscapes.rendering.hemisphere_rays import ray_scene
     from seasonscapes.rendering.relit_view import relightable_view
-    from seasonscapes.rendering.transport import SamplingOptions, trace_view
+    from seasonscapes.rendering.transport import trace_view
 
     start, start_cpu = time.perf_counter(), time.process_time()
     terrain = ray_scene(scene.mi_terrain)
@@ -378,7 +379,8 @@ from pathlib import Path
 import render as arena
 from seasonscapes.rendering.hemisphere_rays import ray_scene
 from seasonscapes.rendering.relit_view import relight_view, relightable_view
-from seasonscapes.rendering.transport import SamplingOptions, trace_view
+from seasonscapes.rendering.coefficients import SamplingOptions
+from seasonscapes.rendering.transport import trace_view
 scene, camera, facts = arena.make_scene({seed}, Path(tempfile.mkdtemp()), width_px=1536, threads=2)
 base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 terrain = ray_scene(scene.mi_terrain)

@@ -89,7 +89,8 @@ _MODULES = {
     "SeasonscapesError": "errors",
 }
 
-__all__ = ["__version__", *_MODULES]
+# One table of names; type checkers read the stub beside this file.
+__all__ = ["__version__", *_MODULES]  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:

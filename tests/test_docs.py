@@ -1,5 +1,6 @@
 """Tables equal their records, commands on the pages parse, stored notebooks are those of the tree, versions agree."""
 
+import ast
 import json
 import re
 import shlex
@@ -75,6 +76,23 @@ def test_a_wrong_number_in_a_table_is_found():
     planted = text.replace(number[0], "1.01", 1)
     assert planted != text
     assert tables.filled(planted) == text
+
+
+def test_times_measured_beside_other_work_are_marked():
+    row = tables.Row("a frame", "{frame_s:.1f} s", "≤ 1 s", "frame_s <= 1")
+    figures = {"frame_s": 1.25, "error": 0.5}
+    busy, quiet = {"machine": {"cores": 2, "load_5min": 3.0}}, {"machine": {"cores": 2, "load_5min": 2.1}}
+    assert (tables._busy(busy), tables._busy(quiet)) == (True, False)
+    assert tables._row_text(row, figures, busy=True) == "| a frame | 1.2 s (beside other work) **(missed)** | ≤ 1 s |"
+    assert tables._row_text(row, figures, busy=False) == "| a frame | 1.2 s **(missed)** | ≤ 1 s |"
+    assert "beside" not in tables._row_text(tables.Row("error", "{error:.0%}"), figures, busy=True)
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "benchmarks").glob("*.py")), ids=lambda path: path.stem)
+def test_flags_that_a_benchmark_documents_exist(path):
+    source = path.read_text(encoding="utf-8")
+    documented = set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", ast.get_docstring(ast.parse(source)) or ""))
+    assert {flag for flag in documented if f'"{flag}"' not in source} == set()
 
 
 def test_records_say_how_they_came_about():

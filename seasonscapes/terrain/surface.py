@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from affine import Affine
 from seasonscapes.array_files import read_arrays
 from seasonscapes.errors import AtlasMismatch, InputError
 from seasonscapes.frames import MEAN_RADIUS_M, LocalFrame
+from seasonscapes.terrain.surface_classes import Snow, Water
 
 
 @dataclass(frozen=True)
@@ -142,6 +143,10 @@ class Terrain:
         The smooth surface that the triangles approximate; ``None``: shading interpolates normals of the vertices.
     normals
         ``(V, 3)`` float32 unit normals of the vertices; ``None``: those of the triangles about them.
+    water
+        Its open water, which mirrors; ``None``: water is Lambertian.
+    snow
+        How its snow scatters; ``None``: snow is Lambertian.
     """
 
     vertices: np.ndarray
@@ -150,6 +155,8 @@ class Terrain:
     frame: LocalFrame
     surface: SurfaceGrid | None = None
     normals: np.ndarray | None = None
+    water: Water | None = None
+    snow: Snow | None = None
 
 
 def mesh_up_m(terrain: Terrain, position_m: np.ndarray) -> float:
@@ -283,6 +290,11 @@ def save_terrain(terrain: Terrain, path: str | os.PathLike[str], *, note: dict[s
         surface = terrain.surface
         arrays |= {"surface": surface.nodes, "surface_to_node": surface.to_node, "surface_domain": surface.domain}
         arrays["surface_mesh_error_m"] = surface.mesh_error_m
+    if terrain.water is not None:
+        # Shares in steps of 1/255.
+        arrays |= {"water": np.round(terrain.water.mask * 255.0).astype(np.uint8), "water_wind": terrain.water.wind_m_s}
+    if terrain.snow is not None:
+        arrays["snow_grain_mm"] = np.nan if terrain.snow.grain_mm is None else terrain.snow.grain_mm
     np.savez(path, note=json.dumps(note or {}), **arrays)
 
 
@@ -313,6 +325,12 @@ def load_terrain(path: str | os.PathLike[str]) -> tuple[Terrain, dict[str, Any]]
                 float(stored["surface_mesh_error_m"]),
             )
         terrain = Terrain(stored["vertices"], stored["faces"], stored["uv"], frame, surface)
+        if "water" in stored:
+            water = Water(stored["water"].astype(np.float32) / np.float32(255.0), float(stored["water_wind"]))
+            terrain = replace(terrain, water=water)
+        if "snow_grain_mm" in stored:
+            grain = float(stored["snow_grain_mm"])
+            terrain = replace(terrain, snow=Snow(None if np.isnan(grain) else grain))
         return terrain, json.loads(str(stored["note"]))
 
 

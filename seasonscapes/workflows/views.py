@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import astuple
+from dataclasses import astuple, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -142,11 +142,15 @@ def calibrated_viewpoint(path: Path) -> tuple[NamedCamera, tuple[int, int]]:
     return validate(table, NamedCamera, where=path), (camera.width_px, camera.height_px)
 
 
-def terrain_for_view(place: Place, view: Camera | Panorama) -> Terrain:
-    """The terrain of a place, refined near a camera until its error is a quarter of a pixel."""
+def terrain_for_view(place: Place, view: Camera | Panorama, *, lambertian: bool = False) -> Terrain:
+    """The terrain of a place, refined near a camera until its error is a quarter of a pixel.
+
+    ``lambertian``: without surfaces that are not matt.
+    """
     from seasonscapes.terrain.view_refinement import refined_for_view
 
-    return refined_for_view(place.terrain, view.position_m, 1.0 / float(view.fx))
+    terrain = replace(place.terrain, water=None, snow=None) if lambertian else place.terrain
+    return refined_for_view(terrain, view.position_m, 1.0 / float(view.fx))
 
 
 def camera_geodetic(place: Place, view: Camera | Panorama) -> tuple[float, float, float]:

@@ -106,7 +106,8 @@ async function start() {
   function albedoTexture(index) {
     if (!albedos.has(index)) {
       const options = { imageOrientation: "flipY", premultiplyAlpha: "none", colorSpaceConversion: "none" };
-      albedos.set(index, scene.picture(about.albedo[index].file).then((blob) => createImageBitmap(blob, options)).then(renderer.albedoTexture));
+      const { file, gain_rgb } = about.albedo[index];
+      albedos.set(index, scene.picture(file).then((blob) => createImageBitmap(blob, options)).then((bitmap) => renderer.albedoTexture(bitmap, gain_rgb)));
     }
     return albedos.get(index);
   }
