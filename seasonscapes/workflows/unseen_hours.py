@@ -49,8 +49,8 @@ class FixedView:
         ``(n,)`` those of the view's pixels that terrain covers wholly.
     pixel
         ``(n,)`` their flat indices in the image.
-    distance_km, normal
-        ``(n,)`` [km] and ``(n, 3)`` of the terrain there.
+    distance_km, height_m, normal
+        ``(n,)`` [km], ``(n,)`` above the frame's origin [m] and ``(n, 3)`` of the terrain there.
     """
 
     place: Place
@@ -59,6 +59,7 @@ class FixedView:
     chosen: np.ndarray = field(repr=False)
     pixel: np.ndarray = field(repr=False)
     distance_km: np.ndarray = field(repr=False)
+    height_m: np.ndarray = field(repr=False)
     normal: np.ndarray = field(repr=False)
 
 
@@ -79,7 +80,7 @@ def fixed_view(place: Place, camera: Camera, *, progress: Progress | None = None
     NoTerrainInView
         Where the camera sees no terrain.
     """
-    from seasonscapes.albedo.view_light import view_distances_km, view_normals
+    from seasonscapes.albedo.view_light import view_distances_km, view_heights_m, view_normals
     from seasonscapes.rendering.transport import SamplingOptions
 
     camera = view_in_frame(camera, place.frame)
@@ -94,6 +95,7 @@ def fixed_view(place: Place, camera: Camera, *, progress: Progress | None = None
         chosen,
         np.asarray(session.coefficients.pixel)[chosen],
         view_distances_km(session.relightable)[chosen],
+        view_heights_m(session.relightable)[chosen],
         view_normals(session.relightable)[chosen],
     )
 
@@ -168,13 +170,13 @@ class CameraHours:
     @property
     def weather(self) -> list[PictureWeather]:
         """Weather of each picture, in the order of the photographs."""
-        from seasonscapes.albedo.fixed_camera import sun_shone, unexplained
+        from seasonscapes.albedo.fixed_camera import SUN_SHONE, unexplained
 
         odd = unexplained(self.fitted)
         return [
             PictureWeather(
                 time,
-                sun_shone(each) if sun[2] > 0.0 else None,
+                bool(direct > SUN_SHONE) if sun[2] > 0.0 else None,
                 each.sun,
                 each.sun_sigma,
                 each.overcast,
@@ -182,8 +184,14 @@ class CameraHours:
                 float(residual),
                 not strange,
             )
-            for time, each, sun, residual, strange in zip(
-                self.times, self.fitted.conditions, self.suns, self.fitted.residual, odd, strict=True
+            for time, each, sun, direct, residual, strange in zip(
+                self.times,
+                self.fitted.conditions,
+                self.suns,
+                self.fitted.direct,
+                self.fitted.residual,
+                odd,
+                strict=True,
             )
         ]
 
