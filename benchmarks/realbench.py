@@ -1,6 +1,6 @@
 """Real photographs: leave one picture of a fixed camera out, recover the ground from the others, predict it, compare.
 
-    python benchmarks/realbench.py [--quick] [--seed N] [--data FOLDER] [--json FILE] [--sheets FOLDER] [--losses]
+    python benchmarks/realbench.py [--quick] [--seed N] [--data FOLDER] [--json FILE] [--sheets FOLDER] [--jobs N]
 
 Every picture of the webcam of Chamonix is left out once, and predicted with three amounts of knowledge:
 
@@ -16,8 +16,7 @@ time
 
 ``oracle_blend`` sees what is scored. ``mean_psnr_db``, ``margin_over_best_rival_db`` and ``share_better`` hold ``ours`` against
 the best of all rivals but ``half_layers``, which is printed beside. Scores are of terrain without near ground and clouds before
-it (polygons in ``realbench_masks.json``), raw and with one exposure for each colour. ``--losses`` exchanges one stage after
-another, and adds what each loses. ``--sheets`` writes photograph | predicted | best rival | difference; such pictures of
+it (polygons in ``realbench_masks.json``), raw and with one exposure for each colour. ``--sheets`` writes photograph | predicted | best rival | difference; such pictures of
 restricted photographs are not to be published.
 """
 
@@ -28,7 +27,10 @@ import os
 import secrets
 import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -227,35 +229,43 @@ def grey_ground(camera: FixedCamera, view: FixedView) -> Ground:
     return Ground(mean, np.column_stack([view.normal, np.zeros(len(view.normal))]), camera.ground.distance_km)
 
 
-def run_case(stack: Stack, options: FitOptions, sheets: Path | None) -> list[dict[str, Any]]:
-    rows = []
-    for k, picture in enumerate(stack.case.pictures):
-        start = time.process_time()
-        found, facts = predictions(stack, k, options)
-        scores = {name: scored(stack, k, values) for name, values in found.items()}
-        best = max(RIVALS, key=lambda name: scores[name]["psnr_db"])
-        shone = facts["direct_share"] > SUN_SHONE
-        row = {
-            "camera": stack.case.name,
-            "picture": picture.name,
-            "season": picture.season,
-            "best_rival": best,
-            **facts,
-        }
-        row |= {"sun_visible_seen": picture.sun_visible, "sun_visible_found": shone, "scores": scores}
-        rows.append(row | {"seconds": time.process_time() - start})
-        print(
-            f"{picture.name:26s} "
-            + " ".join(
-                f"{name} {scores[name]['psnr_db']:.2f}" for name in ("ours", "half_layers", "ours_known", "blend")
-            )
-            + f" | best rival {best} {scores[best]['psnr_db']:.2f} | ssim {scores['ours']['ssim']:.3f}"
-            + f" | sun {'shone' if shone else 'hidden'}, seen {picture.sun_visible}",
-            flush=True,
-        )
-        if sheets is not None:
-            write_sheet(sheets / f"{picture.name}.png", stack, k, found["ours"], found[best], best)
-    return rows
+def case_row(stack: Stack, options: FitOptions, sheets: Path | None, k: int) -> dict[str, Any]:
+    """Scores of all predictions of picture k, and what was found in it."""
+    start, picture = time.process_time(), stack.case.pictures[k]
+    found, facts = predictions(stack, k, options)
+    scores = {name: scored(stack, k, values) for name, values in found.items()}
+    best = max(RIVALS, key=lambda name: scores[name]["psnr_db"])
+    shone = facts["direct_share"] > SUN_SHONE
+    row = {"camera": stack.case.name, "picture": picture.name, "season": picture.season, "best_rival": best, **facts}
+    row |= {"sun_visible_seen": picture.sun_visible, "sun_visible_found": shone, "scores": scores}
+    print(
+        f"{picture.name:26s} "
+        + " ".join(f"{name} {scores[name]['psnr_db']:.2f}" for name in ("ours", "half_layers", "ours_known", "blend"))
+        + f" | best rival {best} {scores[best]['psnr_db']:.2f} | ssim {scores['ours']['ssim']:.3f}"
+        + f" | sun {'shone' if shone else 'hidden'}, seen {picture.sun_visible}",
+        flush=True,
+    )
+    if sheets is not None:
+        write_sheet(sheets / f"{picture.name}.png", stack, k, found["ours"], found[best], best)
+    return row | {"processor_seconds": time.process_time() - start}
+
+
+def run_cases(stack: Stack, options: FitOptions, sheets: Path | None, jobs: int) -> list[dict[str, Any]]:
+    """Rows of all pictures, in their order, by several processes; they need numpy alone and share the stack by forking."""
+    bare = replace(stack, view=replace(stack.view, view=None), case=replace(stack.case, place=None))
+    with ProcessPoolExecutor(jobs, mp_context=get_context("fork"), initializer=_remember, initargs=(bare,)) as pool:
+        return list(pool.map(partial(_remembered_row, options, sheets), range(len(stack.values))))
+
+
+_stacks: list[Stack] = []
+
+
+def _remember(stack: Stack) -> None:
+    _stacks[:] = [stack]
+
+
+def _remembered_row(options: FitOptions, sheets: Path | None, k: int) -> dict[str, Any]:
+    return case_row(_stacks[0], options, sheets, k)
 
 
 def write_sheet(path: Path, stack: Stack, k: int, ours: np.ndarray, rival: np.ndarray, name: str) -> None:
@@ -312,30 +322,38 @@ def figures_of(rows: list[dict[str, Any]]) -> dict[str, float]:
     return figures
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quick", action="store_true", help="pictures of half the width")
     parser.add_argument("--seed", type=int)
     parser.add_argument("--data", type=Path, default=os.environ.get("SEASONSCAPES_DATA"))
     parser.add_argument("--json", type=Path)
+
+
+def data_folder(given: str | Path | None) -> Path | None:
+    """The folder of real data; ``None``, and a line that says so, where the pictures are not there."""
+    data = Path(given) if given else Path(__file__).parents[2] / "shared" / "data"
+    if (data / "chamonix-2013").is_dir():
+        return data
+    print(f"realbench: skipped: no chamonix-2013 in {data}; give --data or SEASONSCAPES_DATA", file=sys.stderr)
+    return None
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add_arguments(parser)
     parser.add_argument("--sheets", type=Path)
-    parser.add_argument("--losses", action="store_true", help="exchange one stage after another (twice the time)")
+    parser.add_argument("--jobs", type=int, default=2, help="processes")
     arguments = parser.parse_args()
-    data = Path(arguments.data) if arguments.data else Path(__file__).parents[2] / "shared" / "data"
-    if not (data / "chamonix-2013").is_dir():
-        print(f"realbench: skipped: no chamonix-2013 in {data}; give --data or SEASONSCAPES_DATA", file=sys.stderr)
+    data = data_folder(arguments.data)
+    if data is None:
         return
     seed = secrets.randbelow(1 << 16) if arguments.seed is None else arguments.seed
     use_backend()
     width = QUICK_WIDTH_PX if arguments.quick else WIDTH_PX
     options = FitOptions(seed=seed)
     stack = stacked(chamonix(data, default_workspace(), width))
-    rows = run_case(stack, options, arguments.sheets)
+    rows = run_cases(stack, options, arguments.sheets, arguments.jobs)
     figures: dict[str, Any] = figures_of(rows) | shadow_figures(stack.case, stack.view, stack.lights)
-    if arguments.losses:
-        from realbench_losses import losses
-
-        figures |= losses(stack, chamonix(data, default_workspace(), width, refined_pose=False), options)
     figures["cases"] = rows
     for name, value in figures.items():
         if not isinstance(value, list):

@@ -20,6 +20,7 @@ from seasonscapes.errors import NoUsablePixels
 _KNOTS = (0.1, 0.4, 0.7, 0.95)
 # Strength of the ridge as a share of the pictures' mean energy in a layer.
 _RIDGE = 0.003
+_SMALLEST_RIDGE = 1e-9
 # Ground is far beyond the geometric middle of the range of distances; nearer than this it is never told apart [km].
 _NEAREST_KM = 1e-3
 
@@ -90,14 +91,17 @@ def completed_picture(camera: FixedCamera, pictures: np.ndarray, part: SeenPart,
     basis = np.concatenate(
         [model[None], camera.misfit, pictures - pictures.mean(axis=0), relit - relit.mean(axis=0)]
     ).astype(np.float32)
-    out = np.empty_like(model)
-    for c in range(3):
-        rows = (basis[:, None, :, c] * layers.T[None].astype(np.float32)).reshape(-1, len(model))
-        known = rows[:, part.seen]
-        # float64 for the products: the rows are nearly alike.
-        products = known.astype(np.float64) @ known.T.astype(np.float64)
-        ridge = _RIDGE * float(np.mean(np.diag(products)[layers.shape[1] :]))
-        aim = known.astype(np.float64) @ (part.picture - model)[part.seen, c]
-        weights = np.linalg.solve(products + max(ridge, 1e-9) * np.eye(len(products)), aim)
-        out[:, c] = model[:, c] + weights @ rows
+    out = model.copy()
+    # Layers of near and of far ground share no pixel.
+    for group in np.split(layers, layers.shape[1] // len(_KNOTS), axis=1):
+        inside = np.flatnonzero(group.any(axis=1))
+        seen = part.seen[inside]
+        for c in range(3):
+            rows = (basis[:, None, inside, c] * group[inside].T[None].astype(np.float32)).reshape(-1, len(inside))
+            # float64 for the products: the rows are nearly alike.
+            known = rows[:, seen].astype(np.float64)
+            products = known @ known.T
+            ridge = max(_RIDGE * float(np.mean(np.diag(products)[len(_KNOTS) :])), _SMALLEST_RIDGE)
+            aim = known @ (part.picture - model)[inside[seen], c]
+            out[inside, c] += np.linalg.solve(products + ridge * np.eye(len(products)), aim) @ rows
     return np.clip(out, 0.0, 1.0)
