@@ -62,6 +62,8 @@ results: $(DEV)
 	$(BIN)/python benchmarks/sky.py --json benchmarks/results/sky.json
 	$(BIN)/python benchmarks/sky_night.py --json benchmarks/results/sky_night.json
 	$(BIN)/python benchmarks/light_series.py --quick --json benchmarks/results/light_series-quick.json
+	$(BIN)/python benchmarks/realbench.py --quick --json benchmarks/results/realbench-quick.json
+	$(BIN)/python benchmarks/realbench_losses.py --quick --json benchmarks/results/realbench_losses-quick.json
 	$(BIN)/python benchmarks/relight.py --json benchmarks/results/relight.json
 	$(BIN)/python benchmarks/texturing.py --quick --json benchmarks/results/texturing-quick.json
 	$(BIN)/python benchmarks/albedo.py --quick --json benchmarks/results/albedo-quick.json

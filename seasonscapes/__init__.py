@@ -70,6 +70,8 @@ _MODULES = {
     "predict_radiance": "workflows.predicted_radiance",
     "delight": "workflows.delighting",
     "differentiable_scene": "workflows.differentiable",
+    "camera_hours": "workflows.unseen_hours",
+    "CameraHours": "workflows.unseen_hours",
     # meshes
     "load_mesh": "workflows.meshes",
     "MeshPlacing": "terrain.mesh_placing",
