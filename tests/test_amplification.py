@@ -54,15 +54,13 @@ def test_detail_follows_place_and_seed(mountain):
     )
     apart = amplified(part, 4, seed=5).values[40:200, 160:-40]
     whole = fine[40:200, 4 * 14 + 160 : 4 * 14 + 160 + apart.shape[1]]
-    assert np.abs(apart - whole).mean() < 0.03 * np.abs(fine - other).mean()
+    assert np.abs(apart - whole).mean() < 0.08 * np.abs(fine - other).mean()
 
 
 def test_plains_stay_smooth_and_slopes_have_gullies(mountain):
     level = replace(mountain, values=np.full_like(mountain.values, 700.0))
     assert np.abs(amplified(level, 4).values - 700.0).max() < 1e-3
     fine = amplified(mountain, 4, seed=1).values[..., 0].astype(float)
-    smooth = amplified(replace(mountain, values=mountain.values), 1).values
-    assert smooth is not None
     detail = fine - np.kron(mountain.values[..., 0], np.ones((4, 4)))
     down, across = np.gradient(mountain.values[..., 0].astype(float), SPACING_M)
     steep = np.hypot(down, across) > np.tan(np.radians(30.0))
@@ -70,24 +68,32 @@ def test_plains_stay_smooth_and_slopes_have_gullies(mountain):
     assert rough[steep].mean() > 2.0 * rough[np.hypot(down, across) < np.tan(np.radians(12.0))].mean()
 
 
-@pytest.mark.parametrize("elevation_deg", [35.0, 60.0])
+@pytest.mark.parametrize("elevation_deg", [20.0, 35.0, 60.0])
 def test_light_at_the_resolution_of_the_data_stays(mountain, elevation_deg):
-    """The sun's light on cells of the map, without cast shadows but with slopes that turn away: within 2 % in the mean."""
-    sun = np.array([0.5 * np.cos(np.radians(elevation_deg)), -np.sqrt(0.75) * np.cos(np.radians(elevation_deg))])
+    """The light of a sun in the south on cells of the map, with the shadows that slopes cast: within 2 % in the mean."""
+    rise = np.tan(np.radians(elevation_deg))
 
     def lit(heights, spacing_m):
-        down, across = np.gradient(heights.astype(float), spacing_m)
-        return np.maximum(np.sin(np.radians(elevation_deg)) - sun[0] * across + sun[1] * down, 0.0)
+        """Illuminance per area of the map, over the normal illuminance: rays come up the columns of the grid."""
+        above = heights.astype(float) - np.arange(len(heights))[:, None] * spacing_m * rise
+        horizon = np.maximum.accumulate(above[::-1], axis=0)[::-1]
+        # What rises above all that lies south of it catches the light between both.
+        caught = np.maximum(above[:-1] - horizon[1:], 0.0)
+        return caught / spacing_m * np.cos(np.radians(elevation_deg))
 
     fine = lit(amplified(mountain, 4, seed=2).values[..., 0], SPACING_M / 4)
-    coarse = lit(mountain.values[..., 0], SPACING_M)
-    inner = np.s_[4:-4, 4:-4]
-    averaged = fine.reshape(128, 4, 128, 4).mean(axis=(1, 3))[inner]
-    assert averaged.mean() == pytest.approx(coarse[inner].mean(), rel=0.02)
+    coarse = lit(amplified(mountain, 1).values[..., 0], SPACING_M)
+    assert fine.mean() == pytest.approx(coarse.mean(), rel=0.02)
+    # So it is in each ninth of the place.
+    thirds = [
+        np.array([[part.mean() for part in np.array_split(band, 3, axis=1)] for band in np.array_split(each, 3)])
+        for each in (fine, coarse)
+    ]
+    assert np.abs(thirds[0] - thirds[1]).max() < 0.03 * thirds[1].max()
 
 
 def test_noise_has_no_grid_and_no_bias():
-    assert len(set(lattice_hash(np.arange(1000), np.arange(1000)[:, None], 1).ravel().tolist())) > 999_000
+    assert len(np.unique(lattice_hash(np.arange(1000), np.arange(1000)[:, None], 1))) > 999_500
     x, y = np.random.default_rng(1).uniform(0.0, 500.0, (2, 100_000))
     assert abs(gradient_noise(x, y, 7).mean()) < 0.01
     step = gradient_noise(x + 1e-5, y, 7) - gradient_noise(x, y, 7)

@@ -72,6 +72,7 @@ def amplified(elevation: Raster, factor: int, *, seed: int = 0) -> Raster:
     spacing_m = float(np.mean(cell_sides_m(elevation)))
     heights, transform = elevation.values[..., 0].astype(np.float64), elevation.transform
     amplitude, fall = _measured_detail(heights)
+    amplitude = amplitude * _not_level(heights)
     step = 1
     while step < factor:
         step *= 2
@@ -100,6 +101,16 @@ def _measured_detail(heights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     ratio = gaussian_filter(finest, wide) / np.maximum(gaussian_filter(coarser, wide), 1e-9)
     size = heights.shape
     return finest[: size[0], : size[1]], np.clip(ratio, *_FALL)[: size[0], : size[1]]
+
+
+def _not_level(heights: np.ndarray) -> np.ndarray:
+    """0 on lakes, whose cells are equal, 1 from two cells off their shores on."""
+    from scipy.ndimage import distance_transform_edt, maximum_filter, minimum_filter
+
+    level = maximum_filter(heights, 3) - minimum_filter(heights, 3) == 0.0
+    if not level.any():
+        return np.ones_like(heights)
+    return np.clip((distance_transform_edt(~level) - 1.0) / 2.0, 0.0, 1.0)
 
 
 def _even(values: np.ndarray) -> np.ndarray:
