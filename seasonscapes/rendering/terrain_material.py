@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from seasonscapes.frames import MEAN_RADIUS_M
+from seasonscapes.rendering.albedo_detail import DeviceDetail
 from seasonscapes.rendering.backend import use_backend
 from seasonscapes.rendering.snow_scattering import SnowOptics
 from seasonscapes.rendering.water_surface import REFRACTIVE_INDEX, DeviceWater, slope_variance
@@ -240,6 +241,7 @@ def terrain_material(reflectance: dict[str, Any], terrain: Terrain, *, smooth: b
     _register(variant)
     material: Any = mi.load_dict({"type": _PLUGIN, "reflectance": reflectance})
     material.surface = DeviceSurface(terrain.surface) if smooth and terrain.surface is not None else None
+    material.detail = None if terrain.detail is None else DeviceDetail(terrain.detail)
     material.snow = None if terrain.snow is None else SnowOptics(terrain.snow)
     material.water = None if terrain.water is None else DeviceWater(terrain.water, terrain.frame)
     return material
@@ -285,6 +287,7 @@ def _material_class() -> Any:
             self.surface: Any = None
             self.water: Any = None
             self.snow: Any = None
+            self.detail: Any = None
             flags = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
             self.m_components, self.m_flags = [flags], flags
 
@@ -327,6 +330,8 @@ def _material_class() -> Any:
         def body(self, si: Any, active: Any) -> Any:
             """The albedo texture: reflectance of the ground, or of the body of water below its surface."""
             albedo = self.reflectance.eval(si, active)
+            if self.detail is not None:
+                albedo = self.detail.applied(albedo, si.p)
             if self.snow is None or self.snow.clean is None:
                 return albedo
             share = self.snow.share(*albedo, dr)

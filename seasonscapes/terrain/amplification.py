@@ -31,6 +31,8 @@ _STRENGTH = 0.85
 _ALIGNED = (0.10, 0.35)
 # Rounds after which means are kept to a thousandth of the detail; the rest is added cell by cell.
 _ROUNDS = 4
+# Cells around a part that are kept at each step, for interpolation.
+_MARGIN = 16
 _ORIENTATIONS = 8
 
 
@@ -67,21 +69,60 @@ def amplified(elevation: Raster, factor: int, *, seed: int = 0) -> Raster:
     >>> bool(np.abs(means - place.elevation.values[..., 0]).max() < 1e-3)
     True
     """
+    height, width = elevation.values.shape[:2]
+    return amplified_part(elevation, factor, rows=slice(0, height), columns=slice(0, width), seed=seed)
+
+
+def amplified_part(elevation: Raster, factor: int, *, rows: slice, columns: slice, seed: int = 0) -> Raster:
+    """Add relief to a part of a raster: what `amplified` gives there, without computing the rest.
+
+    Parameters
+    ----------
+    elevation, factor, seed
+        As in `amplified`.
+    rows, columns
+        Cells of ``elevation``, with start and stop.
+
+    Returns
+    -------
+    Raster
+        ``(rows factor, columns factor, 1)`` float32. Within some cells of the rim of the part, at each step, interpolation
+        lacks a trace of what lies beyond.
+
+    Raises
+    ------
+    ValueError
+        If the factor is no power of two.
+    """
     if factor < 1 or factor & (factor - 1):
         raise ValueError(f"factor: got {factor}, expected a power of two")
     spacing_m = float(np.mean(cell_sides_m(elevation)))
-    heights, transform = elevation.values[..., 0].astype(np.float64), elevation.transform
+    heights = elevation.values[..., 0].astype(np.float64)
     amplitude, fall = _measured_detail(heights)
     amplitude = amplitude * _not_level(heights)
+    # Cells beyond the part that each step keeps, and the part within the present arrays.
     step = 1
-    while step < factor:
+    first = [0, 0]
+    part = [rows, columns]
+    while True:
+        low = [max(each.start * step - _MARGIN, start) for each, start in zip(part, first, strict=True)]
+        high = [
+            min(each.stop * step + _MARGIN, start + count)
+            for each, start, count in zip(part, first, heights.shape, strict=True)
+        ]
+        if step == factor:
+            low, high = [each.start * step for each in part], [each.stop * step for each in part]
+        kept = tuple(slice(begin - start, end - start) for begin, end, start in zip(low, high, first, strict=True))
+        heights, amplitude, fall, first = heights[kept], amplitude[kept], fall[kept], low
+        if step == factor:
+            break
         step *= 2
-        transform = transform * Affine.scale(0.5)
-        heights, amplitude = (
-            _doubled(heights, amplitude * fall, spacing_m / step, transform, seed),
-            _spread(amplitude * fall),
-        )
-        fall = _spread(fall)
+        first = [2 * start for start in first]
+        transform = elevation.transform * Affine.scale(1.0 / step) * Affine.translation(first[1], first[0])
+        heights = _doubled(heights, amplitude * fall, spacing_m / step, transform, seed)
+        amplitude, fall = _spread(amplitude * fall), _spread(fall)
+    assert heights.shape == tuple((each.stop - each.start) * factor for each in part)
+    transform = elevation.transform * Affine.scale(1.0 / factor) * Affine.translation(first[1], first[0])
     return replace(elevation, values=heights[..., None].astype(np.float32), transform=transform)
 
 

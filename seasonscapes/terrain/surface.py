@@ -14,7 +14,7 @@ from affine import Affine
 from seasonscapes.array_files import read_arrays
 from seasonscapes.errors import AtlasMismatch, InputError
 from seasonscapes.frames import MEAN_RADIUS_M, LocalFrame
-from seasonscapes.terrain.surface_classes import Snow, Water
+from seasonscapes.terrain.surface_classes import AlbedoDetail, Snow, Water
 
 
 @dataclass(frozen=True)
@@ -176,6 +176,8 @@ class Terrain:
         Its open water, which mirrors; ``None``: water is Lambertian.
     snow
         How its snow scatters; ``None``: snow is Lambertian.
+    detail
+        Detail of the albedo below its texels, for one camera; ``None``: the texture alone. `save_terrain` leaves it out.
     """
 
     vertices: np.ndarray
@@ -186,6 +188,7 @@ class Terrain:
     normals: np.ndarray | None = None
     water: Water | None = None
     snow: Snow | None = None
+    detail: AlbedoDetail | None = None
 
 
 def mesh_up_m(terrain: Terrain, position_m: np.ndarray) -> float:
