@@ -61,6 +61,7 @@ _MODULES = {
     "complete": "workflows.completion",
     "CompletionOptions": "texturing.completion",
     "Texture": "terrain.surface",
+    "amplified": "terrain.amplification",
     # albedo
     "recover_albedo": "workflows.albedo_recovery",
     "RecoveryOptions": "workflows.albedo_recovery",
