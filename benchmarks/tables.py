@@ -306,32 +306,6 @@ TABLES = {
         ),
         "The Finse rows are of a real photograph; all others are of rendered pictures.",
     ),
-    "realbench": Table(
-        "realbench",
-        (
-            Row("pictures left out, each in turn: ours", "{psnr_db_ours:.1f} dB, SSIM {mean_ssim:.2f}", "≥ 25 dB, ≥ 0.75", "psnr_db_ours >= 25, mean_ssim >= 0.75"),
-            Row("… over the best rival on the mean", "{margin_over_best_rival_db:+.1f} dB", "≥ +2 dB", "margin_over_best_rival_db >= 2"),
-            Row("… cases in which ours beats the best rival of the case", "{share_better:.0%}", "≥ 75 %", "share_better >= 0.75"),
-            Row("ours, when nothing of the picture is known but its time", "{psnr_db_ours_blind:.1f} dB"),
-            Row("the other picture with the nearest sun", "{psnr_db_nearest:.1f} dB"),
-            Row("mean of the other pictures; their best blend", "{psnr_db_mean:.1f}; {psnr_db_blend:.1f} dB"),
-            Row("grey ground under our light", "{psnr_db_grey:.1f} dB"),
-        ),
-        "Real photographs of one fixed webcam (Chamonix, summer 2013), with one exposure for each colour. Conditions of a picture are found on one half of its pixels and scored on the other.",
-    ),
-    "viewer": Table(
-        "viewer",
-        (
-            Row("the page against path tracing, cameras × hours: mean; worst", "{mean_psnr_db:.1f}; {worst_psnr_db:.1f} dB", "≥ 34; ≥ 30 dB", "mean_psnr_db >= 34, worst_psnr_db >= 30"),
-            Row("cast shadows, intersection over union", "{shadow_iou:.3f}", "≥ 0.96", "shadow_iou >= 0.96"),
-            Row("sky radiance against the renderer's: median; 95 % of pixels", "{sky_error_median:.1%}; {sky_error_95:.1%}", "≤ 1 %", "sky_error_median <= 0.01"),
-            Row("times when the sun comes and goes at 20 places: median; largest error", "{sun_times_error_median_min:.1f}; {sun_times_error_min:.1f} min", "≤ 2 min", "sun_times_error_min <= 2"),
-            Row("a step of the hour; a frame of an orbit, software rendering", "{hour_step_s:.2f} s; {orbit_frame_s:.2f} s", "≤ 1 s", "hour_step_s <= 1"),
-            Row("the first picture of 512 × 512", "{first_picture_s:.1f} s", "≤ 3 s", "first_picture_s <= 3"),
-            Row("bytes of the place", "{scene_mb:.1f} MB", "≤ 20 MB", "scene_mb <= 20"),
-        ),
-        "Page and truth share heights, albedo and sky model, and no light transport but daylight coefficients.",
-    ),
     "everyday": Table(
         "everyday-quick",
         (
