@@ -33,6 +33,7 @@ def render_command(
     max_depth: int | None = None,
     seed: int = 0,
     lambertian: bool = False,
+    amplify: bool = False,
     output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("out/render.png"),
     place: PlaceOptions | None = None,
     device: str = "auto",
@@ -63,7 +64,9 @@ def render_command(
     seed
         Equal seeds give equal pictures.
     lambertian
-        All ground is matt, also water: for comparison.
+        All ground is matt, also water and snow: for comparison.
+    amplify
+        Add relief and albedo below the resolution of the data: for pictures, not for measurements.
     output
         A .png picture, or an .exr with all layers.
     device
@@ -115,6 +118,7 @@ def render_command(
             max_depth=max_depth,
             seed=seed,
             lambertian=lambertian,
+            amplify=amplify,
             progress=progress,
         )
     record = picture.provenance
