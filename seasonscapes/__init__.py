@@ -71,6 +71,8 @@ _MODULES = {
     "predict_radiance": "workflows.predicted_radiance",
     "delight": "workflows.delighting",
     "differentiable_scene": "workflows.differentiable",
+    "camera_hours": "workflows.unseen_hours",
+    "CameraHours": "workflows.unseen_hours",
     # meshes
     "load_mesh": "workflows.meshes",
     "MeshPlacing": "terrain.mesh_placing",
@@ -90,7 +92,8 @@ _MODULES = {
     "SeasonscapesError": "errors",
 }
 
-__all__ = ["__version__", *_MODULES]
+# One table of names; type checkers read the stub beside this file.
+__all__ = ["__version__", *_MODULES]  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:

@@ -25,7 +25,9 @@ from seasonscapes.terrain.tile_files import named_tiles
 
 log = logging.getLogger(__name__)
 
-VerticalDatum = Literal["unknown", "ellipsoidal", "EGM96", "EGM2008", "LN02", "NN2000", "NAVD88", "EVRF", "local"]
+VerticalDatum = Literal[
+    "unknown", "ellipsoidal", "EGM96", "EGM2008", "LN02", "IGN69", "NN2000", "NAVD88", "EVRF", "local"
+]
 HeightUnit = Literal["metre", "foot", "US survey foot", "decimetre", "centimetre", "kilometre"]
 
 

@@ -47,7 +47,13 @@ from seasonscapes.rendering.mirror_samples import (
 )
 from seasonscapes.rendering.sky_patches import sky_patches
 from seasonscapes.rendering.smoothing import Neighbours, edge_aware_neighbours, smoothed
-from seasonscapes.rendering.view_samples import camera_points, pixel_moments, sample_weights, view_samples
+from seasonscapes.rendering.view_samples import (
+    camera_points,
+    pixel_moments,
+    sample_moments,
+    sample_weights,
+    view_samples,
+)
 
 # Hemisphere rays per block of receivers: their hits and weights take about 20 bytes each.
 BLOCK_RAYS = 1 << 23
@@ -372,14 +378,18 @@ def _view_rows(
         # What the body of the water sends through the facets that are seen.
         points.albedo[samples.pixel] = body_albedo(terrain, points.albedo[samples.pixel], samples)
     weight = sample_weights(points.albedo, hit)
-    row_pixel = pixel - rows.start * camera.width_px
-    albedo, normal, coverage = pixel_moments(terrain, camera, rows, sampling.albedo_samples, seed)
+    if sampling.albedo_samples == sampling.shadow_samples:
+        albedo, normal, coverage = sample_moments(points, hit)
+    else:
+        row_pixel = pixel - rows.start * camera.width_px
+        moments = pixel_moments(terrain, camera, rows, sampling.albedo_samples, seed)
+        albedo, normal, coverage = (values[row_pixel] for values in moments)
     receivers = _trace_receivers(terrain, shared, points, weight, pixel.astype(np.uint32), sampling, seed)
     arrays = _PixelArrays(
         pixel,
-        coverage[row_pixel],
-        albedo[row_pixel],
-        normal[row_pixel],
+        coverage,
+        albedo,
+        normal,
         points.origin,
         points.normal.astype(np.float16),
         points.geometric_normal.astype(np.float16),

@@ -85,6 +85,25 @@ def sample_weights(albedo: np.ndarray, hit: np.ndarray) -> np.ndarray:
     return (luminous / luminous.sum(axis=1, keepdims=True)).astype(np.float32)
 
 
+def sample_moments(points: SurfacePoints, hit: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Average albedo, normal and terrain coverage over samples that are traced already; see `pixel_moments`.
+
+    Parameters
+    ----------
+    points, hit
+        ``(n, S)`` samples of n pixels, of `view_samples`.
+
+    Returns
+    -------
+    albedo, normal, coverage
+        Of the n pixels: ``(n, 3)``, ``(n, 3)`` and ``(n,)`` float32, as of `pixel_moments` with S samples.
+    """
+    # A small constant weight defines the normal of black pixels too.
+    weight = (points.albedo @ REC709_LUMINANCE.astype(np.float32) + np.float32(1e-6)) * hit
+    normal = np.einsum("ns,nsc->nc", weight, points.normal) / np.maximum(weight.sum(axis=1), 1e-20)[:, None]
+    return points.albedo.mean(axis=1), normal, hit.mean(axis=1, dtype=np.float32)
+
+
 def camera_points(
     terrain: RayScene, camera: Camera | Panorama, rows: range, count: int, seed: int
 ) -> tuple[SurfacePoints, np.ndarray]:

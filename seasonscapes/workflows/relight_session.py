@@ -457,6 +457,8 @@ def _view_albedo(session: RelightSession, dated: DatedAlbedo) -> tuple[np.ndarra
         "albedo": _identity(dated),
         "base": _identity(session.base),
         "seed": session.seed,
+        # Stills and films sample a pixel differently, and their pixels that show terrain differ.
+        "sampling": asdict(session.coefficients.sampling),
     }
     albedos = build_once(
         place.workspace,

@@ -161,7 +161,7 @@ def still_sampling() -> SamplingOptions:
     """Samples and rays of a still: fewer than a film's, whose frames share them."""
     from seasonscapes.rendering.coefficients import SamplingOptions
 
-    return SamplingOptions(albedo_samples=16, rays=128)
+    return SamplingOptions(albedo_samples=16, rays=64, clusters=8192)
 
 
 def chosen_engine(engine: str, *, path_options: bool, device: str) -> str:
