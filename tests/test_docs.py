@@ -86,7 +86,8 @@ def test_times_measured_beside_other_work_are_marked():
     assert (tables._busy(busy), tables._busy(quiet)) == (True, False)
     assert tables._row_text(row, figures, busy=True) == "| a frame | 1.2 s (beside other work) **(missed)** | ≤ 1 s |"
     assert tables._row_text(row, figures, busy=False) == "| a frame | 1.2 s **(missed)** | ≤ 1 s |"
-    assert "beside" not in tables._row_text(tables.Row("error", "{error:.0%}"), figures, busy=True)
+    assert tables._row_text(tables.Row("error", "{error:.0%}"), figures, busy=True) == "| error | 50 % | – |"
+    assert tables._row_text(tables.Row("noise", "{noise:.0%}"), figures, busy=False) is None
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "benchmarks").glob("*.py")), ids=lambda path: path.stem)

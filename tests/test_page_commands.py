@@ -25,7 +25,7 @@ NOT_RUN = {
     r"^seasonscapes (run|evaluate) ": "a run of all stages and its score; tests/test_run.py has both",
     r"^seasonscapes render alpine_lake|--engine path -o view.png": "a large picture, for minutes; tests/test_water.py renders small ones",
     r"--turntable 36": "traces the light of 36 views; tests/test_meshes.py turns through fewer",
-    r"^seasonscapes (albedo|paint|inpaint) my-valley": "needs panoramas large enough for a pose; tests/test_cli_paint.py runs all",
+    r"^seasonscapes (albedo|paint|inpaint) my-valley": "needs panoramas large enough for a pose; tests/test_run.py runs these stages",
     r"--picture noon.jpg": "as on the page of webcams",
 }
 FOLDERS = [page for page in PAGES if page.name != "README.md" and page.parent.name != "docs" and commands_of(page)]
@@ -73,4 +73,4 @@ def test_every_reason_not_to_run_is_of_a_command():
     every = [command for page in PAGES for command in commands_of(page)]
     assert [pattern for pattern in NOT_RUN if not any(re.search(pattern, command) for command in every)] == []
     run = [command for command in every if reason_not_to_run(command) is None]
-    assert len(run) > len(every) / 2
+    assert len(run) > 30
