@@ -166,6 +166,20 @@ class CameraHours:
         ``(K, 3)`` directions of the sun in the pictures.
     background
         ``(H, W, 3)`` median of the pictures, sRGB-encoded: the sky and all that is no terrain.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import seasonscapes as ss
+    >>> place = ss.load_place("alpine_small")
+    >>> times = ["2024-07-20T09:00", "2024-07-20T12:00", "2024-07-20T16:00"]
+    >>> camera = ss.camera(place, "aerial", size_px=(48, 32))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     sources = ss.synthetic_photographs(place, times, folder, sky="hosek", cameras={"aerial": camera})
+    ...     photographs = ss.open_photographs(place, sources.manifest, sources.calibrations, times)
+    >>> hours = ss.camera_hours(place, photographs)
+    >>> [each.sun_shone for each in hours.weather]
+    [True, True, True]
     """
 
     webcam: str
