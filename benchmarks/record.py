@@ -37,8 +37,8 @@ def write_record(path: Path | None, figures: dict[str, Any], *, seed: int | None
     """
     if path is None:
         return
-    # Each run of a command is told by its seed, whether it was given or drawn.
-    arguments = _without_options(sys.argv[1:], ("--json", "--seed"))
+    # Each run of a command is told by its seed, whether it was given or drawn; folders are those of one machine.
+    arguments = _without_options(sys.argv[1:], ("--json", "--seed", "--data", "--sheets", "--plot"))
     command = ["python", f"benchmarks/{Path(sys.argv[0]).name}", *arguments]
     if seed is not None:
         command += ["--seed", str(seed)]
