@@ -44,7 +44,8 @@ gallery: llvm $(BASE)
 test: llvm $(DEV)
 	$(BIN)/python -m pytest -q -n 2 --durations=25
 
-docs: $(DEV)
+# The page of a place in the site needs the renderer.
+docs: llvm $(DEV)
 	$(BIN)/sphinx-build -q -W --keep-going docs docs/_build/html
 
 docs-notebooks: $(DEV)
@@ -69,7 +70,12 @@ results: $(DEV)
 	$(BIN)/python benchmarks/delight.py --quick --json benchmarks/results/delight-quick.json
 	$(BIN)/python benchmarks/gaussians.py --json benchmarks/results/gaussians.json
 	$(BIN)/python benchmarks/alpinebench.py --quick --json benchmarks/results/alpinebench-quick.json
+	$(BIN)/python benchmarks/viewer.py --quick --json benchmarks/results/viewer-quick.json
 	$(BIN)/python benchmarks/calibration.py --quick --json benchmarks/results/calibration-quick.json
+	$(BIN)/python benchmarks/realbench.py --json benchmarks/results/realbench.json
+	$(BIN)/python benchmarks/viewer.py --json benchmarks/results/viewer.json
+	$(BIN)/python benchmarks/everyday.py --quick --json benchmarks/results/everyday-quick.json
+	$(BIN)/python benchmarks/scale.py --json benchmarks/results/scale.json
 	$(BIN)/python benchmarks/tables.py
 
 check: $(DEV)

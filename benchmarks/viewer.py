@@ -4,10 +4,10 @@
 
 The page (``seasonscapes view``) is written as a static folder, served by Python's own server and opened by a headless
 Chromium that reaches nothing else; without a WebGL context nothing is measured and the benchmark fails. The truth is
-``render`` with 64 paths a pixel and 6 edges a path: three cameras of the scene at six hours, from a sun 4° below the
-horizon to noon, with the same albedo date. Both radiances are developed by the same code, at the exposure and white of
-the truth, and compared as 8-bit sRGB where terrain covers at least half of a pixel. ``--quick`` takes 160 x 120 pixels
-instead of 384 x 288.
+``render`` with 6 edges a path, in rounds of 64 paths a pixel until its own noise is small: three cameras of the scene
+at six hours, from a sun 4° below the horizon to noon, with the same albedo date. Both radiances are developed by the
+same code, at the exposure and white of the truth, and compared as 8-bit sRGB where terrain covers at least half of a
+pixel. ``--quick`` takes 160 x 120 pixels instead of 384 x 288.
 
 Truth and page share the heights, the albedo, the sky model and its tables, and nothing of the light transport between
 them but the daylight coefficients that the page's are made of. Shadows are compared by sunlight alone: where a pixel
@@ -54,13 +54,15 @@ CONTROLS = {
     "no_bounce": {"change": {"bounce": 0}},
     "no_air": {"change": {"air": 0}},
 }
+# Paths a pixel of a round, the noise that the mean of rounds may keep, and most rounds.
+SPP, NOISE_DB, MOST_ROUNDS = 64, 41.0, 12
 # Frames of the page, each of OVERSAMPLED x OVERSAMPLED pixels for one of the truth.
 FRAMES, OVERSAMPLED = 6, 2
 
 
 @dataclass(frozen=True)
 class Truth:
-    """A path-traced view: radiance, coverage, radiance by sunlight alone without air (``None`` without a sun), look."""
+    """A path-traced view: radiance, coverage, radiance by sunlight alone without air (``None`` without a sun), look, noise."""
 
     camera: int
     time: datetime
@@ -69,6 +71,7 @@ class Truth:
     sunlight: np.ndarray | None
     ev100: float
     white: tuple[float, float, float]
+    noise_db: float
 
     def shown(self, image: np.ndarray) -> np.ndarray:
         """8-bit sRGB of an image at the exposure and white of this view."""
@@ -99,8 +102,30 @@ def _midnight(place: ss.Place, day: date) -> datetime:
     return noon - timedelta(hours=12)
 
 
+def path_traced(
+    scene, camera: Camera, white: tuple[float, float, float], seed: int
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Mean radiance and coverage of rounds of `SPP` paths a pixel, until its noise on terrain is `NOISE_DB`; the noise [dB].
+
+    One round leaves up to 30 dB on snow in skylight, which says nothing about the page.
+    """
+    images: list[np.ndarray] = []
+    noise_db = 0.0
+    while len(images) < MOST_ROUNDS and noise_db < NOISE_DB:
+        view = render_view(scene, camera, spp=SPP, seed=seed + 1000 * len(images), max_depth=6)
+        images.append(view.radiance)
+        if len(images) == 2:
+            ev100 = exposure_ev100(images[0], look="photo")
+            first, second = (srgb8_from_linear(develop(image, ev100, look="photo", white=white)) for image in images)
+            # Half the mean square of the difference of two is the variance of one.
+            variance = 0.5 * np.mean((first.astype(float) - second)[view.coverage >= 0.5] ** 2)
+        if len(images) >= 2:
+            noise_db = float(10.0 * np.log10(255.0**2 * len(images) / variance))
+    return np.mean(images, axis=0), view.coverage, noise_db
+
+
 def truth_of(
-    place: ss.Place, cameras: dict[int, Camera], times: list[datetime], albedo: np.ndarray, spp: int, seed: int
+    place: ss.Place, cameras: dict[int, Camera], times: list[datetime], albedo: np.ndarray, seed: int
 ) -> list[Truth]:
     """Path-traced views of all cameras and times."""
     found, sky = [], ss.sky_model("clear")
@@ -108,7 +133,7 @@ def truth_of(
         terrain = terrain_for_view(place, camera)
         for instant in times:
             light, _ = illumination_for_camera(place, camera, sky, instant)
-            view = render_view(build_scene(terrain, albedo, light), camera, spp=spp, seed=seed, max_depth=6)
+            image, coverage, noise = path_traced(build_scene(terrain, albedo, light), camera, light.white_rgb, seed)
             sunlight = None
             if light.sun is not None:
                 dark = np.zeros_like(light.sky_radiance)
@@ -116,8 +141,8 @@ def truth_of(
                 sunlight = render_view(
                     build_scene(terrain, albedo, alone), camera, spp=32, seed=seed, max_depth=2
                 ).surface
-            ev100 = exposure_ev100(view.radiance, look="photo")
-            found.append(Truth(number, instant, view.radiance, view.coverage, sunlight, ev100, light.white_rgb))
+            ev100 = exposure_ev100(image, look="photo")
+            found.append(Truth(number, instant, image, coverage, sunlight, ev100, light.white_rgb, noise))
     return found
 
 
@@ -235,6 +260,7 @@ def pictures(browser, truths: list[Truth], size: tuple[int, int]) -> dict[str, A
     figures: dict[str, Any] = {
         "mean_psnr_db": psnrs.mean(),
         "worst_psnr_db": psnrs.min(),
+        "truth_noise_worst_db": min(truth.noise_db for truth in truths),
         "shadow_iou": both / max(either, 1),
         "sky_error_median": np.median(errors),
         "sky_error_95": np.percentile(errors, 95.0),
@@ -303,7 +329,7 @@ def main() -> None:
         for k in numbers
     ]
     cameras = {k: ss.camera(place, view, size_px=size) for k, view in zip(numbers, views, strict=True)}
-    truths = truth_of(place, cameras, hours_of(place, shown), albedo, 64, seed)
+    truths = truth_of(place, cameras, hours_of(place, shown), albedo, seed)
     print(f"truth after {time.perf_counter() - start:.0f} s", flush=True)
     points = some_points(place, 20, seed)
     events, _ = sun_times_truth(place, points, shown)

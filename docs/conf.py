@@ -21,6 +21,7 @@ extensions = [
     "sphinxcontrib.bibtex",
     "mathml",
     "generated_pages",
+    "place_page",
 ]
 exclude_patterns = ["_build", "_generated", "_ext", "images"]
 
@@ -45,6 +46,7 @@ bibtex_reference_style = "author_year"
 bibtex_default_style = "plain"
 
 copybutton_prompt_text = "$ "
+copybutton_line_continuation_character = "\\"
 # Two dashes of a flag are two dashes.
 smartquotes = False
 html_theme = "furo"

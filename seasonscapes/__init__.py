@@ -61,6 +61,7 @@ _MODULES = {
     "complete": "workflows.completion",
     "CompletionOptions": "texturing.completion",
     "Texture": "terrain.surface",
+    "amplified": "terrain.amplification",
     # albedo
     "recover_albedo": "workflows.albedo_recovery",
     "RecoveryOptions": "workflows.albedo_recovery",
@@ -91,7 +92,8 @@ _MODULES = {
     "SeasonscapesError": "errors",
 }
 
-__all__ = ["__version__", *_MODULES]
+# One table of names; type checkers read the stub beside this file.
+__all__ = ["__version__", *_MODULES]  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:

@@ -1,7 +1,7 @@
 // The page's own light at instants and directions, for tests/test_viewer.py: node viewer_light.mjs FOLDER QUESTIONS.json
 import { readFile } from "node:fs/promises";
 import { makeLight } from "../viewer/src/light.js";
-import { makeFrame } from "../viewer/src/frames.js";
+import { angles, makeFrame } from "../viewer/src/frames.js";
 import { unpack } from "../viewer/src/arrays.js";
 
 const [folder, file] = process.argv.slice(2);
@@ -20,6 +20,7 @@ const answers = questions.suns.map(({ azimuth, elevation, direction, distance })
     direct: light.direct(elevation).map((value) => value * near),
     level: light.skyCoefficients(bodies).level,
     sky: questions.directions.map((d) => light.skyRadiance(sky, d, direction, questions.height_m)),
+    night: questions.directions.map((d) => light.nightRadiance(angles(d)[1], questions.height_m)),
   };
 });
 const positions = questions.geodetic.map((place) => frame.fromGeodetic(...place));

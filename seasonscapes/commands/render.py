@@ -32,6 +32,8 @@ def render_command(
     spp: int | None = None,
     max_depth: int | None = None,
     seed: int = 0,
+    lambertian: bool = False,
+    amplify: bool = False,
     output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("out/render.png"),
     place: PlaceOptions | None = None,
     device: str = "auto",
@@ -61,6 +63,10 @@ def render_command(
         Of path tracing: longest light path, default 6; 2 is direct light only.
     seed
         Equal seeds give equal pictures.
+    lambertian
+        All ground is matt, also water and snow: for comparison.
+    amplify
+        Add relief and albedo below the resolution of the data: for pictures, not for measurements.
     output
         A .png picture, or an .exr with all layers.
     device
@@ -111,6 +117,8 @@ def render_command(
             spp=spp,
             max_depth=max_depth,
             seed=seed,
+            lambertian=lambertian,
+            amplify=amplify,
             progress=progress,
         )
     record = picture.provenance

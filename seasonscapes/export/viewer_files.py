@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from seasonscapes.images import srgb8_from_linear
+from seasonscapes.images import linear_from_srgb, srgb8_from_linear
 
 PAGE = Path(__file__).parents[1] / "viewer_page"
 PROGRAM, STYLE, NOTICES = "viewer.js", "viewer.css", "NOTICES.txt"
@@ -40,11 +40,14 @@ class AlbedoPicture:
         A WebP picture of the sRGB-encoded albedo; row 0 is the northern edge of the grid.
     size_px
         Rows and columns.
+    gain_rgb
+        What the decoded linear values are multiplied with: the coder's levels of luma shift the mean by up to 2 %.
     """
 
     day: date
     content: bytes
     size_px: tuple[int, int]
+    gain_rgb: tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,11 @@ def albedo_picture(day: date, values: np.ndarray, *, quality: int = _QUALITY) ->
     Image.fromarray(np.ascontiguousarray(srgb8_from_linear(values))).save(
         encoded, format="WEBP", quality=quality, method=4
     )
-    return AlbedoPicture(day, encoded.getvalue(), (values.shape[0], values.shape[1]))
+    decoded = linear_from_srgb(np.asarray(Image.open(encoded).convert("RGB")) / 255.0)
+    red, green, blue = values.mean(axis=(0, 1)) / np.maximum(decoded.mean(axis=(0, 1)), 1e-6)
+    return AlbedoPicture(
+        day, encoded.getvalue(), (values.shape[0], values.shape[1]), (float(red), float(green), float(blue))
+    )
 
 
 def viewer_files(scene: ViewerScene, *, view: dict[str, Any] | None = None) -> dict[str, bytes]:
@@ -164,7 +171,8 @@ def _packed(scene: ViewerScene, view: dict[str, Any] | None) -> tuple[str, bytes
     for picture in scene.albedo:
         name = f"albedo-{picture.day.isoformat()}.webp"
         pictures[name] = picture.content
-        dated.append({"date": picture.day.isoformat(), "file": name, "size_px": list(picture.size_px)})
+        entry = {"date": picture.day.isoformat(), "file": name, "size_px": list(picture.size_px)}
+        dated.append(entry | {"gain_rgb": [round(gain, 5) for gain in picture.gain_rgb]})
     description = {"format": _FORMAT, **scene.about, "arrays": table, "albedo": dated, "view": view or {}}
     return json.dumps(description, separators=(",", ":"), allow_nan=False), bytes(binary), pictures
 
@@ -195,7 +203,8 @@ def load_scene(path: Path) -> ViewerScene:
     albedo = []
     for dated, (_, bytes_) in zip(about.pop("albedo"), sizes, strict=True):
         day, shape = date.fromisoformat(dated["date"]), dated["size_px"]
-        albedo.append(AlbedoPicture(day, content[start : start + bytes_], (shape[0], shape[1])))
+        picture = AlbedoPicture(day, content[start : start + bytes_], (shape[0], shape[1]), tuple(dated["gain_rgb"]))
+        albedo.append(picture)
         start += bytes_
     del about["format"], about["view"]
     return ViewerScene(about, arrays, albedo)

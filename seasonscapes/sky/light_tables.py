@@ -2,7 +2,7 @@
 
 A program without the atmosphere model (a page in a browser) evaluates sky, air, sun and moon from them at any instant.
 What the model tabulates for one luminary is smooth in azimuth: a cosine series (`along_rays.AZIMUTHS` terms) holds all of
-it. Over the luminary's elevation components are interpolated linearly about their geometric mean size, since twilight
+it. Over the luminary's elevation components are interpolated about their geometric mean size, by cubics, since twilight
 falls by a factor of a million within 18°.
 """
 
@@ -24,7 +24,7 @@ from seasonscapes.sky.sh_moments import HARMONIC_ORDER
 from seasonscapes.sky.spectrum import WAVELENGTHS_NM, angstrom_ratio, rayleigh_optical_depth
 
 # Apparent elevations of the luminary [deg]; dense where twilight and the reddening of the sun change fast.
-_TWILIGHT_DEG = (-18, -15, -12, -10, -8.5, -7, -6, -5, -4, -3.2, -2.5, -1.8, -1.2, -0.6)
+_TWILIGHT_DEG = (-18, -16.5, -15, -13.5, -12, -10, -8.5, -7, -6, -5, -4, -3.2, -2.5, -1.8, -1.2, -0.6)
 _DAY_DEG = (0, 0.6, 1.2, 2, 3, 4, 5.5, 7, 9, 12, 16, 21, 27, 34, 42, 51, 60, 70, 80, 90)
 KNOTS_DEG = np.array([*_TWILIGHT_DEG, *_DAY_DEG], float)
 # Apparent elevations of the luminary for the direct light [deg].

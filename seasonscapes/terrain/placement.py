@@ -155,7 +155,10 @@ def cell_sides_m(grid: Raster) -> tuple[float, float]:
 def check_area(bounds_deg: tuple[float, float, float, float], where: str | os.PathLike[str]) -> None:
     """Raise `InputError` for an area wider than `WIDEST_DEG` degrees of a great circle."""
     west, south, east, north = bounds_deg
-    across = (east - west) * float(np.cos(np.radians(np.clip(0.5 * (south + north), -89.0, 89.0))))
+    # Along the parallel nearest the equator; half of it at most, so that a box around a pole is as wide as its diameter.
+    nearest = float(np.clip(0.0, south, north))
+    turn = np.radians(min(east - west, 180.0))
+    across = float(np.degrees(2.0 * np.arcsin(np.cos(np.radians(nearest)) * np.sin(0.5 * turn))))
     if max(across, north - south) > WIDEST_DEG + 0.02:
         raise InputError(
             os.fspath(where),

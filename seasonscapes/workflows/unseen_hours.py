@@ -88,7 +88,7 @@ def fixed_view(place: Place, camera: Camera, *, progress: Progress | None = None
         Where the camera sees no terrain.
     """
     from seasonscapes.albedo.view_light import view_distances_km, view_heights_m, view_normals
-    from seasonscapes.rendering.transport import SamplingOptions
+    from seasonscapes.rendering.coefficients import SamplingOptions
 
     camera = view_in_frame(camera, place.frame)
     # Light is compared with pictures of 8 bits: a quarter of a film's samples.

@@ -7,7 +7,7 @@ import pytest
 from fault_harness import judge, run_in, with_flag
 from fault_verbs import BASE, JSON_VERBS, SCENE_VERBS
 
-FOLDER_OUTPUTS = ("hours", "annotate", "calibrate", "paint", "run", "timelapse")
+FOLDER_OUTPUTS = ("annotate", "calibrate", "hours", "paint", "run", "timelapse", "view")
 WITH_OUTPUT = [verb for verb, tokens in BASE.items() if "--output" in tokens]
 
 

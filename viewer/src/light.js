@@ -30,13 +30,39 @@ export function makeLight(arrays, about) {
     return [low, (x - list[low]) / (list[low + 1] - list[low])];
   }
 
+  /** Indices and weights of a cubic through the knots around a value, with the slopes of its neighbours. */
+  function cubic(list, value) {
+    const [k, f] = between(list, value);
+    const last = list.length - 1;
+    const width = list[k + 1] - list[k];
+    const [before, after] = [Math.max(k - 1, 0), Math.min(k + 2, last)];
+    const [first, second] = [f * (1 - f) ** 2 * width, f * f * (f - 1) * width];
+    const weights = new Map();
+    const give = (index, weight) => weights.set(index, (weights.get(index) ?? 0) + weight);
+    give(k, (1 + 2 * f) * (1 - f) ** 2);
+    give(k + 1, f * f * (3 - 2 * f));
+    for (const [slope, low, high] of [[first, before, k + 1], [second, k, after]]) {
+      // A parabola's slope at the middle of three knots; a straight one at an end.
+      const middle = slope === first ? k : k + 1;
+      if (low === middle || high === middle) {
+        give(high, slope / (list[high] - list[low]));
+        give(low, -slope / (list[high] - list[low]));
+        continue;
+      }
+      const [a, b] = [list[middle] - list[low], list[high] - list[middle]];
+      give(low, (-slope * b) / (a * (a + b)));
+      give(middle, (slope * (b - a)) / (a * b));
+      give(high, (slope * a) / (b * (a + b)));
+    }
+    return [...weights].filter(([, weight]) => weight !== 0);
+  }
+
   /** Components of a table at an elevation and a height: the last axis has CHANNELS values. */
   function components(table, sizes, inner, elevation, height) {
-    const [s, fs] = between(knots, elevation);
     const [h, fh] = between(heights, height);
     const corners = [];
-    for (const [ds, ws] of [[0, 1 - fs], [1, fs]]) {
-      for (const [dh, wh] of [[0, 1 - fh], [1, fh]]) if (ws * wh > 0) corners.push([s + ds, h + dh, ws * wh]);
+    for (const [s, ws] of cubic(knots, elevation)) {
+      for (const [dh, wh] of [[0, 1 - fh], [1, fh]]) if (wh > 0) corners.push([s, h + dh, ws * wh]);
     }
     const result = new Float32Array(inner);
     const lists = sizes.shape.length === 2 ? 1 : sizes.shape[2];

@@ -106,7 +106,8 @@ async function start() {
   function albedoTexture(index) {
     if (!albedos.has(index)) {
       const options = { imageOrientation: "flipY", premultiplyAlpha: "none", colorSpaceConversion: "none" };
-      albedos.set(index, scene.picture(about.albedo[index].file).then((blob) => createImageBitmap(blob, options)).then(renderer.albedoTexture));
+      const { file, gain_rgb } = about.albedo[index];
+      albedos.set(index, scene.picture(file).then((blob) => createImageBitmap(blob, options)).then((bitmap) => renderer.albedoTexture(bitmap, gain_rgb)));
     }
     return albedos.get(index);
   }
@@ -537,7 +538,7 @@ async function start() {
   await state.arriving;
   element("status").textContent = "";
   // What measurements use; the page itself does not.
-  window.seasonscapes = { about, arrays, state, renderer, controls, ephemeris, terrain, light, frame, clock, setTime, setEv, setHaze, sunTimes, sunTimesBetween, step, command, lightOf, now: () => now, fine, useCamera };
+  window.seasonscapes = { about, arrays, state, renderer, controls, ephemeris, terrain, light, frame, clock, setTime, setEv, setHaze, sunTimes, sunTimesBetween, step, expose, command, lightOf, now: () => now, fine, useCamera };
   loop();
   step();
   document.body.dataset.started = (performance.now() - began).toFixed(0);

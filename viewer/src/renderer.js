@@ -70,15 +70,18 @@ export function makeRenderer(canvas, { arrays, about }, terrain, light) {
   const bounceLists = layers(byLayers(arrays.bounce_cluster.data, bounceRows * bounceColumns, listed), bounceColumns, bounceRows, listed / 4, ...integers);
   const bounceShare = texture(arrays.bounce_share.data, bounceColumns, bounceRows, THREE.RedFormat, THREE.UnsignedByteType);
   bounceShare.unpackAlignment = 1;
+  // Any number of clusters, in a square whose last texels are of none.
   const clusters = arrays.cluster_share.shape[0];
-  const side = Math.round(Math.sqrt(clusters));
-  const clusterLevels = layers(byLayers(arrays.cluster_levels.data, clusters, rank), side, side, rank / 4, THREE.RGBAFormat, THREE.UnsignedByteType);
-  const clusterLists = layers(byLayers(arrays.cluster_cluster.data, clusters, listed), side, side, listed / 4, ...integers);
-  const clusterShare = texture(arrays.cluster_share.data, side, side, THREE.RedFormat, THREE.UnsignedByteType);
+  const side = Math.ceil(Math.sqrt(clusters));
+  const clusterLevels = layers(byLayers(arrays.cluster_levels.data, clusters, rank, side * side), side, side, rank / 4, THREE.RGBAFormat, THREE.UnsignedByteType);
+  const clusterLists = layers(byLayers(arrays.cluster_cluster.data, clusters, listed, side * side), side, side, listed / 4, ...integers);
+  const shares = new Uint8Array(side * side);
+  shares.set(arrays.cluster_share.data);
+  const clusterShare = texture(shares, side, side, THREE.RedFormat, THREE.UnsignedByteType);
   clusterShare.unpackAlignment = 1;
-  const points = new Uint16Array(clusters * 4 * 4);
+  const points = new Uint16Array(side * side * 4 * 4);
   for (let m = 0; m < clusters; m++) {
-    for (let k = 0; k < 4; k++) for (let c = 0; c < 2; c++) points[(k * clusters + m) * 4 + c] = arrays.cluster_uv.data[(m * 4 + k) * 2 + c];
+    for (let k = 0; k < 4; k++) for (let c = 0; c < 2; c++) points[(k * side * side + m) * 4 + c] = arrays.cluster_uv.data[(m * 4 + k) * 2 + c];
   }
   const clusterPoints = layers(points, side, side, 4, ...integers);
   const range = [];
@@ -102,6 +105,8 @@ export function makeRenderer(canvas, { arrays, about }, terrain, light) {
     uSeen: { value: null },
     uAlbedoA: { value: null },
     uAlbedoB: { value: null },
+    uGainA: { value: new THREE.Vector3(1, 1, 1) },
+    uGainB: { value: new THREE.Vector3(1, 1, 1) },
     uOrder: { value: orderTexture },
     uOrderLow: { value: 0 },
     uOrderHigh: { value: 1 },
@@ -265,12 +270,15 @@ export function makeRenderer(canvas, { arrays, about }, terrain, light) {
   function setAlbedo(first, second, share) {
     shared.uAlbedoA.value = first;
     shared.uAlbedoB.value = second ?? first;
+    shared.uGainA.value.set(...first.userData.gain);
+    shared.uGainB.value.set(...(second ?? first).userData.gain);
     shared.uSeason.value = second ? share : 0;
     relight();
   }
 
-  function albedoTexture(bitmap) {
+  function albedoTexture(bitmap, gain) {
     const made = new THREE.Texture(bitmap);
+    made.userData.gain = gain;
     made.colorSpace = THREE.SRGBColorSpace;
     made.flipY = false;
     made.generateMipmaps = true;
@@ -424,11 +432,11 @@ export function makeRenderer(canvas, { arrays, about }, terrain, light) {
   };
 }
 
-/** (N, L) values as layers of four: (L / 4, N, 4). */
-function byLayers(data, count, length) {
-  const result = new data.constructor(count * length);
+/** (N, L) values as layers of four: (L / 4, texels, 4); texels beyond N are zero. */
+function byLayers(data, count, length, texels = count) {
+  const result = new data.constructor(texels * length);
   for (let n = 0; n < count; n++) {
-    for (let l = 0; l < length; l++) result[((l >> 2) * count + n) * 4 + (l & 3)] = data[n * length + l];
+    for (let l = 0; l < length; l++) result[((l >> 2) * texels + n) * 4 + (l & 3)] = data[n * length + l];
   }
   return result;
 }

@@ -99,6 +99,7 @@ const SURFACE = /* glsl */ `
 uniform sampler2D uSlope, uSeen, uAlbedoA, uAlbedoB, uOrder;
 uniform ivec2 uNodes;
 uniform float uSeason, uOrderLow, uOrderHigh;
+uniform vec3 uGainA, uGainB;
 uniform vec3 uDirection[2];
 uniform vec3 uLight[2];
 
@@ -108,9 +109,9 @@ vec3 normalAt(vec2 uv) {
 }
 
 vec3 albedoAt(vec2 uv, float bias) {
-  vec3 a = texture(uAlbedoA, uv, bias).rgb;
+  vec3 a = uGainA * texture(uAlbedoA, uv, bias).rgb;
   if (uSeason <= 0.0) return a;
-  vec3 b = texture(uAlbedoB, uv, bias).rgb;
+  vec3 b = uGainB * texture(uAlbedoB, uv, bias).rgb;
   float change = abs(dot(b - a, vec3(0.2126, 0.7152, 0.0722)));
   float order = (texture(uOrder, uv).r - uOrderLow) / max(uOrderHigh - uOrderLow, 1e-3);
   float when = dot(b - a, vec3(1.0)) < 0.0 ? order : 1.0 - order;
