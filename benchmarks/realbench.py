@@ -216,11 +216,17 @@ def ours(stack: Stack, camera: FixedCamera, k: int, equal: np.ndarray, found: li
 
 
 def relit_blend(stack: Stack, camera: FixedCamera, others: list[int], k: int) -> np.ndarray:
-    """The other pictures, each relit to the asked hour under its own conditions, and blended as the rival `blend` is."""
+    """The other pictures blended as the rival `blend` is, half of each as it is and half relit to the asked hour.
+
+    Relit pictures are wrong where the model is, and those that are not where the light changed: errors of both average out.
+    """
     relit = np.stack([relit_at(camera, stack.lights[k], j) for j in range(len(others))])
-    equal = equally_exposed(relit, stack.usable[others])
-    mean = equal.mean(axis=0)
-    return np.clip(mean + kriged(stack.known[others], stack.known[k], equal - mean), 0.0, 1.0)
+    blends = []
+    for pictures in (relit, stack.values[others]):
+        equal = equally_exposed(pictures, stack.usable[others])
+        mean = equal.mean(axis=0)
+        blends.append(np.clip(mean + kriged(stack.known[others], stack.known[k], equal - mean), 0.0, 1.0))
+    return (blends[0] + blends[1]) / 2.0
 
 
 def grey_ground(camera: FixedCamera, view: FixedView) -> Ground:
