@@ -216,11 +216,17 @@ def ours(stack: Stack, camera: FixedCamera, k: int, equal: np.ndarray, found: li
 
 
 def relit_blend(stack: Stack, camera: FixedCamera, others: list[int], k: int) -> np.ndarray:
-    """The other pictures, each relit to the asked hour under its own conditions, and blended as the rival `blend` is."""
+    """The other pictures blended as the rival `blend` is, half of each as it is and half relit to the asked hour.
+
+    Relit pictures are wrong where the model is, and those that are not where the light changed: errors of both average out.
+    """
     relit = np.stack([relit_at(camera, stack.lights[k], j) for j in range(len(others))])
-    equal = equally_exposed(relit, stack.usable[others])
-    mean = equal.mean(axis=0)
-    return np.clip(mean + kriged(stack.known[others], stack.known[k], equal - mean), 0.0, 1.0)
+    blends = []
+    for pictures in (relit, stack.values[others]):
+        equal = equally_exposed(pictures, stack.usable[others])
+        mean = equal.mean(axis=0)
+        blends.append(np.clip(mean + kriged(stack.known[others], stack.known[k], equal - mean), 0.0, 1.0))
+    return (blends[0] + blends[1]) / 2.0
 
 
 def grey_ground(camera: FixedCamera, view: FixedView) -> Ground:
@@ -250,10 +256,15 @@ def case_row(stack: Stack, options: FitOptions, sheets: Path | None, k: int) -> 
     return row | {"processor_seconds": time.process_time() - start}
 
 
+def forkable(stack: Stack) -> Stack:
+    """The stack without what the renderer holds."""
+    return replace(stack, view=replace(stack.view, view=None), case=replace(stack.case, place=None))
+
+
 def run_cases(stack: Stack, options: FitOptions, sheets: Path | None, jobs: int) -> list[dict[str, Any]]:
     """Rows of all pictures, in their order, by several processes; they need numpy alone and share the stack by forking."""
-    bare = replace(stack, view=replace(stack.view, view=None), case=replace(stack.case, place=None))
-    with ProcessPoolExecutor(jobs, mp_context=get_context("fork"), initializer=_remember, initargs=(bare,)) as pool:
+    start = (_remember, (forkable(stack),))
+    with ProcessPoolExecutor(jobs, get_context("fork"), *start) as pool:
         return list(pool.map(partial(_remembered_row, options, sheets), range(len(stack.values))))
 
 
@@ -327,6 +338,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int)
     parser.add_argument("--data", type=Path, default=os.environ.get("SEASONSCAPES_DATA"))
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--jobs", type=int, default=2, help="processes")
 
 
 def data_folder(given: str | Path | None) -> Path | None:
@@ -342,7 +354,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_arguments(parser)
     parser.add_argument("--sheets", type=Path)
-    parser.add_argument("--jobs", type=int, default=2, help="processes")
     arguments = parser.parse_args()
     data = data_folder(arguments.data)
     if data is None:

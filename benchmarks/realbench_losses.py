@@ -1,6 +1,6 @@
 """What each stage of realbench loses: one after another is exchanged, and pictures are predicted again.
 
-    python benchmarks/realbench_losses.py [--quick] [--seed N] [--data FOLDER] [--json FILE]
+    python benchmarks/realbench_losses.py [--quick] [--seed N] [--data FOLDER] [--json FILE] [--jobs N]
 
 Every fourth picture (every second one without ``--quick``) is left out in turn. Figures are means over them [dB], with one
 exposure for each colour. ``whole_picture_seen``, ``slopes_of_heights`` and ``pose_of_data_folder`` are to be held against
@@ -11,7 +11,11 @@ from __future__ import annotations
 
 import argparse
 import secrets
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from functools import partial
+from multiprocessing import get_context
 
 import numpy as np
 from realbench import (
@@ -22,12 +26,13 @@ from realbench import (
     crossed,
     data_folder,
     fitted_camera,
+    forkable,
     half_conditions,
     one_exposure,
     ours,
     stacked,
 )
-from realbench_cameras import FixedCase, chamonix
+from realbench_cameras import chamonix
 from realbench_rivals import equally_exposed
 from record import write_record
 
@@ -38,30 +43,41 @@ from seasonscapes.rendering.backend import use_backend
 from seasonscapes.workspace import default_workspace
 
 
-def losses(stack: Stack, other_pose: FixedCase, options: FitOptions, every: int) -> dict[str, float]:
+def losses(stack: Stack, moved: Stack, options: FitOptions, numbers: Sequence[int], jobs: int) -> dict[str, float]:
     """Mean PSNR [dB] by exchanged stage.
 
     Parameters
     ----------
-    stack
-        The pictures.
-    other_pose
-        The same camera in the pose that the data folder states.
+    stack, moved
+        The pictures, in the fitted pose and in that of the data folder.
     options
         How the ground is solved.
-    every
-        Pictures 0, every, 2 every … are left out in turn.
+    numbers
+        Pictures that are left out in turn.
+    jobs
+        Processes.
     """
-    found: dict[str, list[float]] = {}
-    moved = stacked(other_pose)
-    for k in range(0, len(stack.values), every):
-        for name, values in _exchanged(stack, k, options).items():
-            found.setdefault(name, []).append(_psnr(stack, k, values))
-        camera, equal = _from_others(moved, k, options)
-        values = ours(moved, camera, k, equal, half_conditions(moved, camera, k))
-        found.setdefault("pose_of_data_folder", []).append(_psnr(moved, k, values))
-        print(k, {name: round(each[-1], 2) for name, each in found.items()}, flush=True)
-    return {f"{name}_db": float(np.mean(values)) for name, values in found.items()} | {"cases": len(found["program"])}
+    bare = [forkable(each) for each in (stack, moved)]
+    with ProcessPoolExecutor(jobs, mp_context=get_context("fork"), initializer=_remember, initargs=(bare,)) as pool:
+        rows = list(pool.map(partial(_row, options), numbers))
+    return {f"{name}_db": float(np.mean([row[name] for row in rows])) for name in rows[0]} | {"cases": len(rows)}
+
+
+_stacks: list[Stack] = []
+
+
+def _remember(stacks: list[Stack]) -> None:
+    _stacks[:] = stacks
+
+
+def _row(options: FitOptions, k: int) -> dict[str, float]:
+    """PSNR [dB] of picture k by exchanged stage."""
+    stack, moved = _stacks
+    row = {name: _psnr(stack, k, values) for name, values in _exchanged(stack, k, options).items()}
+    camera, equal = _from_others(moved, k, options)
+    row["pose_of_data_folder"] = _psnr(moved, k, ours(moved, camera, k, equal, half_conditions(moved, camera, k)))
+    print(k, {name: round(value, 2) for name, value in row.items()}, flush=True)
+    return row
 
 
 def _exchanged(stack: Stack, k: int, options: FitOptions) -> dict[str, np.ndarray]:
@@ -117,8 +133,9 @@ def main() -> None:
     use_backend()
     width, every = (QUICK_WIDTH_PX, 4) if arguments.quick else (WIDTH_PX, 2)
     stack = stacked(chamonix(data, default_workspace(), width))
-    other_pose = chamonix(data, default_workspace(), width, refined_pose=False)
-    figures = losses(stack, other_pose, FitOptions(seed=seed), every)
+    moved = stacked(chamonix(data, default_workspace(), width, refined_pose=False))
+    numbers = range(0, len(stack.values), every)
+    figures = losses(stack, moved, FitOptions(seed=seed), numbers, arguments.jobs)
     for name, value in figures.items():
         print(f"{name:34s} {value:.2f}")
     write_record(arguments.json, figures, seed=seed)

@@ -51,8 +51,8 @@ _LARGEST_TURN = 0.3
 # Ground barely turned away from the sun may turn back.
 _BARELY_TURNED = -0.05
 _MEAN_REFLECTANCE = 0.15
-# A smaller share of direct light on the best lit tenth of the ground throws no shadow that a picture shows.
-SUN_SHONE, _BEST_LIT = 0.25, 90.0
+# A smaller share of direct light on the best lit fiftieth of the ground throws no shadow that a picture shows.
+SUN_SHONE, _BEST_LIT = 0.25, 98.0
 # A picture is not explained where its residual is so many times the median of all pictures'.
 _UNEXPLAINED = 2.5
 
@@ -280,7 +280,7 @@ def unexplained(camera: FixedCamera) -> np.ndarray:
 
 
 def direct_share(ground: Ground, light: ViewLight, conditions: Conditions) -> float:
-    """Share of direct sunlight in the light on the best lit tenth of the ground, 0 to 1.
+    """Share of direct sunlight in the light on the best lit fiftieth of the ground, 0 to 1.
 
     Unlike `Conditions.sun` it is small where the sun grazes the slopes or haze and clouds outshine it; above `SUN_SHONE`
     the sun is taken to have shone.

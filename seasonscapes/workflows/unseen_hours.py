@@ -31,6 +31,8 @@ log = logging.getLogger(__name__)
 _MAP_ROWS = 64
 # The camera may have moved by this much between two pictures [px].
 _STANDS_STILL_PX = 0.5
+# A picture that shows less of the terrain than this share tells nothing.
+_LEAST_SHOWN = 0.02
 # A picture is meant by a time within so many seconds.
 _SAME_PICTURE_S = 60.0
 # Pictures of another time of the year show other snow and leaves [days].
@@ -164,8 +166,24 @@ class CameraHours:
         Ground of each pixel and conditions of each picture.
     suns
         ``(K, 3)`` directions of the sun in the pictures.
+    shown
+        ``(n,)`` terrain pixels that a picture shows: what stands before the landscape in all of them is no terrain.
     background
         ``(H, W, 3)`` median of the pictures, sRGB-encoded: the sky and all that is no terrain.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import seasonscapes as ss
+    >>> place = ss.load_place("alpine_small")
+    >>> times = ["2024-07-20T09:00", "2024-07-20T12:00", "2024-07-20T16:00"]
+    >>> camera = ss.camera(place, "aerial", size_px=(48, 32))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     sources = ss.synthetic_photographs(place, times, folder, sky="hosek", cameras={"aerial": camera})
+    ...     photographs = ss.open_photographs(place, sources.manifest, sources.calibrations, times)
+    >>> hours = ss.camera_hours(place, photographs)
+    >>> [each.sun_shone for each in hours.weather]
+    [True, True, True]
     """
 
     webcam: str
@@ -173,6 +191,7 @@ class CameraHours:
     times: list[datetime]
     fitted: FixedCamera = field(repr=False)
     suns: np.ndarray = field(repr=False)
+    shown: np.ndarray = field(repr=False)
     background: np.ndarray = field(repr=False)
 
     @property
@@ -238,7 +257,7 @@ class CameraHours:
         weight = np.exp(-0.5 * ((angle - angle.min()) / _ALIKE_DEG) ** 2)
         values = sum(w * relit_at(self.fitted, light, k) for w, k in zip(weight / weight.sum(), taken, strict=True))
         image = self.background.copy()
-        image.reshape(-1, 3)[self.view.pixel] = values
+        image.reshape(-1, 3)[self.view.pixel[self.shown]] = values[self.shown]
         return image
 
     def _warn_of_season(self, time: datetime) -> None:
@@ -293,7 +312,6 @@ def camera_hours(place: Place, photographs: Sequence[Observation], *, progress: 
     (32, 48, 3)
     """
     from seasonscapes.albedo.fixed_camera import fit_fixed_camera
-    from seasonscapes.images import srgb_from_linear
     from seasonscapes.rendering.backend import use_backend
 
     if not photographs:
@@ -305,11 +323,13 @@ def camera_hours(place: Place, photographs: Sequence[Observation], *, progress: 
         raise InputError(photographs[0].webcam, "a panorama", expected="views cut out of it, as open_photographs gives")
     use_backend()
     view = fixed_view(place, camera, progress=progress)
-    encoded = [srgb_from_linear(each.image) for each in photographs]
+    clear = _without_hidden(view, photographs)
+    photographs, encoded = [each for each, _, _ in clear], [image for _, image, _ in clear]
+    usable = [mask for _, _, mask in clear]
     lights = [light_on_view(view, each.time) for each in photographs]
     fitted = fit_fixed_camera(
         [image.reshape(-1, 3)[view.pixel] for image in encoded],
-        [each.mask.reshape(-1)[view.pixel] for each in photographs],
+        usable,
         lights,
         view.distance_km,
         view.normal,
@@ -321,12 +341,34 @@ def camera_hours(place: Place, photographs: Sequence[Observation], *, progress: 
         [each.time for each in photographs],
         fitted,
         np.stack([each.sun_direction for each in lights]),
+        np.any(usable, axis=0),
         np.median(encoded, axis=0),
     )
     for each in hours.weather:
         if not each.explained:
             log.warning("%s UTC: not explained by light, haze and exposure; it counts little", each.time.isoformat())
     return hours
+
+
+def _without_hidden(
+    view: FixedView, photographs: Sequence[Observation]
+) -> list[tuple[Observation, np.ndarray, np.ndarray]]:
+    """Photographs with their sRGB-encoded images ``(H, W, 3)`` and usable terrain pixels ``(n,)``: clouds before the
+    terrain are not, and pictures that show next to no terrain are left out with a warning."""
+    from seasonscapes.albedo.cloud_cover import clouds_before
+    from seasonscapes.images import srgb_from_linear
+
+    kept = []
+    for each in photographs:
+        image = srgb_from_linear(each.image)
+        terrain = np.zeros(image.shape[:2], bool)
+        terrain.reshape(-1)[view.pixel] = True
+        usable = (each.mask & ~clouds_before(image, terrain)).reshape(-1)[view.pixel]
+        if usable.mean() < _LEAST_SHOWN:
+            log.warning("%s UTC: left out: it shows next to no terrain", each.time.isoformat())
+            continue
+        kept.append((each, image, usable))
+    return kept
 
 
 def webcam_photographs(
