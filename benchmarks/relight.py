@@ -236,7 +236,8 @@ class SunMarch:
     def clearance_deg(self, position: np.ndarray, direction: np.ndarray, step_m: float, reach_m: float) -> np.ndarray:
         """Least angle ``(N,)`` between the ray and the land ahead, negative where land is in the way."""
         from seasonscapes.frames import geodetic_from_enu
-        from seasonscapes.terrain.raster import map_from_geodetic, sample_raster
+        from seasonscapes.terrain.crs import map_from_geodetic
+        from seasonscapes.terrain.raster import sample_raster
 
         raster = self.place.elevation
         least = np.full(len(position), 90.0)

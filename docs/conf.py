@@ -21,6 +21,7 @@ extensions = [
     "sphinxcontrib.bibtex",
     "mathml",
     "generated_pages",
+    "place_page",
 ]
 exclude_patterns = ["_build", "_generated", "_ext", "images"]
 

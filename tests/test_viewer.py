@@ -315,27 +315,27 @@ class TestLight:
             np.testing.assert_allclose(told["axes"][k], local_axes(place.frame, latitude, longitude), atol=1e-9)
 
 
+@pytest.fixture(scope="module")
+def sources(tmp_path_factory):
+    """The page's sources with what their lock file names, installed afresh."""
+    for tool in ("node", "npm"):
+        if shutil.which(tool) is None:
+            pytest.skip(f"{tool} is not installed")
+    source = tmp_path_factory.mktemp("sources") / "viewer"
+    shutil.copytree(ROOT / "viewer", source, ignore=shutil.ignore_patterns("node_modules"))
+    installed = subprocess.run(["npm", "ci", "--no-audit", "--no-fund"], cwd=source, capture_output=True, text=True)
+    if installed.returncode and re.search(r"ENOTFOUND|EAI_AGAIN|ECONNREFUSED|ETIMEDOUT|ENETUNREACH", installed.stderr):
+        pytest.skip("the registry of npm cannot be reached")
+    assert installed.returncode == 0, installed.stderr
+    return source
+
+
 class TestBuild:
-    def test_the_program_in_the_package_is_what_its_sources_build(self, tmp_path):
-        for tool in ("node", "npm"):
-            if shutil.which(tool) is None:
-                pytest.skip(f"{tool} is not installed")
-        source = tmp_path / "viewer"
-        shutil.copytree(ROOT / "viewer", source, ignore=shutil.ignore_patterns("node_modules"))
-        installed = subprocess.run(["npm", "ci", "--no-audit", "--no-fund"], cwd=source, capture_output=True, text=True)
-        if installed.returncode and re.search(
-            r"ENOTFOUND|EAI_AGAIN|ECONNREFUSED|ETIMEDOUT|ENETUNREACH", installed.stderr
-        ):
-            pytest.skip("the registry of npm cannot be reached")
-        assert installed.returncode == 0, installed.stderr
-        built = subprocess.run(
-            ["node", "build.mjs", str(tmp_path / "built")], cwd=source, capture_output=True, text=True
-        )
+    def test_the_program_in_the_package_is_what_its_sources_build(self, sources, tmp_path):
+        built = subprocess.run(["node", "build.mjs", str(tmp_path)], cwd=sources, capture_output=True, text=True)
         assert built.returncode == 0, built.stderr
         for name in ("viewer.js", "NOTICES.txt"):
-            assert (tmp_path / "built" / name).read_bytes() == (PAGE / name).read_bytes(), (
-                f"{name}: run viewer/build.mjs"
-            )
+            assert (tmp_path / name).read_bytes() == (PAGE / name).read_bytes(), f"{name}: run viewer/build.mjs"
 
 
 @pytest.fixture(scope="module")
@@ -403,8 +403,7 @@ class TestBrowser:
         again = "return seasonscapes.command()"
         assert said in browser.execute_script(again)
 
-    def test_every_control_has_a_name_and_axe_finds_no_serious_fault(self, browser, folder):
-        axe = ROOT / "viewer" / "node_modules" / "axe-core" / "axe.min.js"
+    def test_every_control_has_a_name_and_axe_finds_no_serious_fault(self, browser, folder, sources):
         with served(folder) as address:
             open_page(browser, address)
             browser.execute_script("seasonscapes.state.paused = true")
@@ -412,10 +411,8 @@ class TestBrowser:
                 assert browser.execute_script(
                     f"return document.getElementById('{name}').getAttribute('aria-valuetext')"
                 )
-            if not axe.is_file():
-                pytest.skip("axe-core is not installed in viewer/node_modules")
             # Through the debugger's protocol: the page's own policy lets no other script in.
-            browser.execute_script(axe.read_text())
+            browser.execute_script((sources / "node_modules" / "axe-core" / "axe.min.js").read_text())
             found = browser.execute_async_script("axe.run().then((r) => arguments[arguments.length - 1](r.violations))")
         serious = [each["id"] for each in found if each["impact"] in ("serious", "critical")]
         assert serious == [], [node["html"] for each in found for node in each["nodes"]]

@@ -95,7 +95,7 @@ def command_page() -> str:
 
 def verb_table() -> list[str]:
     """Return a table of all verbs with what they do, each linked to its section."""
-    application, rows = command_line(), ["| command | |", "|---|---|"]
+    application, rows = command_line(), ["| command | what it does |", "|---|---|"]
     for name in application:
         if not name.startswith("-"):
             rows.append(f"| [`{name}`](#seasonscapes-{name}) | {application[name].help.splitlines()[0]} |")

@@ -205,7 +205,7 @@ def cluster_albedo(terrain: RayScene, coefficients: ViewCoefficients) -> np.ndar
     points = coefficients.clusters.points
     # An albedo of zero marks surfaces that were hit from their back, which stay black for every texture.
     front = np.asarray(points.albedo).max(axis=-1, keepdims=True) > 0.0
-    return np.where(front, albedo_at(terrain, np.asarray(points.uv)), 0.0).astype(np.float32)
+    return np.where(front, albedo_at(terrain, np.asarray(points.uv), np.asarray(points.origin)), 0.0).astype(np.float32)
 
 
 def mirrored_albedo(terrain: RayScene, coefficients: ViewCoefficients) -> np.ndarray | None:
@@ -227,7 +227,9 @@ def mirrored_albedo(terrain: RayScene, coefficients: ViewCoefficients) -> np.nda
     if mirror is None:
         return None
     share = np.asarray(mirror.sample_share, np.float32)
-    return np.einsum("ms,msc->mc", share, albedo_at(terrain, np.asarray(mirror.sample_uv)))
+    return np.einsum(
+        "ms,msc->mc", share, albedo_at(terrain, np.asarray(mirror.sample_uv), np.asarray(mirror.sample_origin))
+    )
 
 
 def relight_view(view: RelightableView, illumination: Illumination) -> RenderedView:

@@ -21,10 +21,11 @@ from typing import Any
 import numpy as np
 
 from seasonscapes.frames import MEAN_RADIUS_M
+from seasonscapes.rendering.albedo_detail import DeviceDetail
 from seasonscapes.rendering.backend import use_backend
 from seasonscapes.rendering.snow_scattering import SnowOptics
 from seasonscapes.rendering.water_surface import REFRACTIVE_INDEX, DeviceWater, slope_variance
-from seasonscapes.terrain.surface import SurfaceGrid, Terrain
+from seasonscapes.terrain.surface import RIM_SHARE, SurfaceGrid, Terrain
 from seasonscapes.terrain.surface_classes import Water
 
 # Mitsuba's math::RayEpsilon in single precision.
@@ -58,9 +59,21 @@ class DeviceSurface:
         self.mi_error = dr.opaque(mi.Float, grid.mesh_error_m)
         self.mi_reach = dr.opaque(mi.Float, _REACH_NODES * grid.spacing_m)
         self._mi_domain = [dr.opaque(mi.Float, value) for value in (*grid.domain[:2], 1.0 / grid.domain[2])]
+        self.inner = None if grid.inner is None else DeviceSurface(grid.inner)
+        # Distances from the rim in texture coordinates, scaled to 1 where an inner surface counts fully.
+        rim = RIM_SHARE * min(rows, columns)
+        self._mi_rim = [dr.opaque(mi.Float, float(value)) for value in (columns / rim, rows / rim, 0.5 / rim)]
 
     def sample(self, mi_position: Any, active: Any = True) -> tuple[Any, Any]:
         """Return the unit normal ``mi.Normal3f`` and the up coordinate ``mi.Float`` [m] of the surface at positions."""
+        import drjit as dr
+        import mitsuba as mi
+
+        slope_east, slope_north, up, _ = self._slopes(mi_position, active)
+        return dr.normalize(mi.Normal3f(-slope_east, -slope_north, 1.0)), up
+
+    def _slopes(self, mi_position: Any, active: Any) -> tuple[Any, Any, Any, Any]:
+        """Slopes, up coordinate [m], and share in the surface around; see `SurfaceGrid.share_at`."""
         import drjit as dr
         import mitsuba as mi
 
@@ -69,7 +82,16 @@ class DeviceSurface:
         north = (mi_position.y * shrink - self._mi_domain[1]) * self._mi_domain[2]
         uv = mi.Point2f(*(self._polynomial(terms, east, north) for terms in self._mi_terms))
         slope_east, slope_north, up = self._mi_texture.eval(uv, active)
-        return dr.normalize(mi.Normal3f(-slope_east, -slope_north, 1.0)), up
+        across, down, half = self._mi_rim
+        inside = dr.minimum(dr.minimum(uv.x, 1.0 - uv.x) * across - half, dr.minimum(uv.y, 1.0 - uv.y) * down - half)
+        share = dr.clip(inside, 0.0, 1.0)
+        if self.inner is not None:
+            *finer, weight = self.inner._slopes(mi_position, active)
+            slope_east, slope_north, up = (
+                value + weight * (fine - value)
+                for value, fine in zip((slope_east, slope_north, up), finer, strict=True)
+            )
+        return slope_east, slope_north, up, share
 
     def _polynomial(self, terms: list[Any], east: Any, north: Any) -> Any:
         """Horner's scheme in north within one in east; terms in the order of `terrain.surface.exponents`."""
@@ -219,6 +241,7 @@ def terrain_material(reflectance: dict[str, Any], terrain: Terrain, *, smooth: b
     _register(variant)
     material: Any = mi.load_dict({"type": _PLUGIN, "reflectance": reflectance})
     material.surface = DeviceSurface(terrain.surface) if smooth and terrain.surface is not None else None
+    material.detail = None if terrain.detail is None else DeviceDetail(terrain.detail)
     material.snow = None if terrain.snow is None else SnowOptics(terrain.snow)
     material.water = None if terrain.water is None else DeviceWater(terrain.water, terrain.frame)
     return material
@@ -264,6 +287,7 @@ def _material_class() -> Any:
             self.surface: Any = None
             self.water: Any = None
             self.snow: Any = None
+            self.detail: Any = None
             flags = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
             self.m_components, self.m_flags = [flags], flags
 
@@ -306,6 +330,8 @@ def _material_class() -> Any:
         def body(self, si: Any, active: Any) -> Any:
             """The albedo texture: reflectance of the ground, or of the body of water below its surface."""
             albedo = self.reflectance.eval(si, active)
+            if self.detail is not None:
+                albedo = self.detail.applied(albedo, si.p)
             if self.snow is None or self.snow.clean is None:
                 return albedo
             share = self.snow.share(*albedo, dr)

@@ -61,7 +61,7 @@ def diffuse_reflectance(refractive_index: float = REFRACTIVE_INDEX) -> float:
 def slope_variance(wind_m_s: float) -> float:
     """Mean square slope of water under a wind, of both directions together.
 
-    Cox & Munk 1954: 0.003 + 0.00512 W for a wind W at 12.5 m height, measured from 1 to 14 m/s. Below 1 m/s its constant,
+    Cox & Munk 1954, doi:10.1364/JOSA.44.000838: 0.003 + 0.00512 W for a wind W at 12.5 m height, measured from 1 to 14 m/s. Below 1 m/s its constant,
     which is smaller than its own standard error, fades out: without wind a lake is a mirror.
 
     Parameters

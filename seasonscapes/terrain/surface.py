@@ -14,7 +14,7 @@ from affine import Affine
 from seasonscapes.array_files import read_arrays
 from seasonscapes.errors import AtlasMismatch, InputError
 from seasonscapes.frames import MEAN_RADIUS_M, LocalFrame
-from seasonscapes.terrain.surface_classes import Snow, Water
+from seasonscapes.terrain.surface_classes import AlbedoDetail, Snow, Water
 
 
 @dataclass(frozen=True)
@@ -53,6 +53,10 @@ def exponents(degree: int) -> list[tuple[int, int]]:
     return [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
 
 
+# Width of the rim along which an inner surface is blended with the one around it, as a share of its side.
+RIM_SHARE = 0.12
+
+
 @dataclass(frozen=True)
 class SurfaceGrid:
     """The smooth surface of a terrain at the samples of its raster, from which shading takes its normals.
@@ -67,12 +71,15 @@ class SurfaceGrid:
         East and north of the polynomials' centre, and their radius [m].
     mesh_error_m
         Vertical error bound of the mesh against the nodes [m].
+    inner
+        A finer surface of a part of it, which takes its place there; towards its rim the two are blended.
     """
 
     nodes: np.ndarray
     to_node: np.ndarray
     domain: tuple[float, float, float]
     mesh_error_m: float = 0.0
+    inner: SurfaceGrid | None = None
 
     @property
     def degree(self) -> int:
@@ -96,14 +103,36 @@ class SurfaceGrid:
         """Up coordinates ``(N,)`` float64 at positions ``(N, 3)`` [m]; see `sample`."""
         return self._interpolated(position_m, (2,))[0]
 
+    def spacing_at(self, position_m: np.ndarray) -> np.ndarray:
+        """Distance ``(N,)`` of neighbouring nodes at positions ``(N, 3)`` [m]."""
+        spacing = np.full(len(position_m), self.spacing_m)
+        if self.inner is not None:
+            spacing = np.where(self.inner.share_at(position_m) > 0.0, self.inner.spacing_m, spacing)
+        return spacing
+
+    def share_at(self, position_m: np.ndarray) -> np.ndarray:
+        """Share ``(N,)`` of this surface in one that it is the inner part of: 1 within, 0 at its rim and outside."""
+        column, row = self.nodes_at(np.asarray(position_m, np.float64)).T
+        rows, columns = self.nodes.shape[:2]
+        inside = np.minimum(np.minimum(column, columns - 1 - column), np.minimum(row, rows - 1 - row))
+        return np.clip(inside / (RIM_SHARE * min(rows, columns)), 0.0, 1.0)
+
     def _interpolated(self, position_m: np.ndarray, channels: tuple[int, ...]) -> list[np.ndarray]:
         from scipy.ndimage import map_coordinates
 
-        column, row = self.nodes_at(np.asarray(position_m, np.float64)).T
-        return [
+        position_m = np.asarray(position_m, np.float64)
+        column, row = self.nodes_at(position_m).T
+        values = [
             map_coordinates(self.nodes[..., k], [row, column], order=1, mode="nearest", output=np.float64)
             for k in channels
         ]
+        if self.inner is None:
+            return values
+        share = self.inner.share_at(position_m)
+        near = np.flatnonzero(share > 0.0)
+        for value, finer in zip(values, self.inner._interpolated(position_m[near], channels), strict=True):
+            value[near] += share[near] * (finer - value[near])
+        return values
 
     def sample(self, position_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Interpolate the surface bilinearly.
@@ -147,6 +176,8 @@ class Terrain:
         Its open water, which mirrors; ``None``: water is Lambertian.
     snow
         How its snow scatters; ``None``: snow is Lambertian.
+    detail
+        Detail of the albedo below its texels, for one camera; ``None``: the texture alone. `save_terrain` leaves it out.
     """
 
     vertices: np.ndarray
@@ -157,6 +188,7 @@ class Terrain:
     normals: np.ndarray | None = None
     water: Water | None = None
     snow: Snow | None = None
+    detail: AlbedoDetail | None = None
 
 
 def mesh_up_m(terrain: Terrain, position_m: np.ndarray) -> float:

@@ -35,3 +35,25 @@ class Snow:
     """
 
     grain_mm: float | None = None
+
+
+@dataclass(frozen=True)
+class AlbedoDetail:
+    """Detail of the albedo below its texels, as fine as a camera sees it; see `rendering.albedo_detail`.
+
+    Parameters
+    ----------
+    eye_m
+        ``(3,)`` position of the camera, east-north-up [m].
+    pixel_angle_rad
+        Angular size of its pixels [rad].
+    texel_m
+        Side of the texels [m].
+    seed
+        Another seed gives other detail.
+    """
+
+    eye_m: tuple[float, float, float]
+    pixel_angle_rad: float
+    texel_m: float
+    seed: int = 0

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_COEFFICIENTS_CODE = ("rendering.transport", "rendering.coefficients_file", "terrain.view_refinement")
+_COEFFICIENTS_CODE = ("rendering.transport", "rendering.coefficients_file", "workflows.amplified_terrain")
 _VIEW_ALBEDO_CODE = ("rendering.transport", "rendering.relit_view")
 FRAME_CODE = ("workflows.relight_session", "relighting.frame_file")
 # Rows of the sky maps. Without clouds half as many as usual hardly change an image: the
@@ -214,11 +214,12 @@ def still_session(
     seed: int = 0,
     sampling: SamplingOptions | None = None,
     lambertian: bool = False,
+    amplify: bool = False,
     progress: Progress | None = None,
 ) -> RelightSession:
     """`relight_session` for few instants: the light of each is computed, and no tables are built for it first.
 
-    ``lambertian``: without surfaces that are not matt.
+    ``lambertian``: without surfaces that are not matt. ``amplify``: with detail below the resolution of the data.
     """
     from seasonscapes.rendering.hemisphere_rays import ray_scene
     from seasonscapes.rendering.mitsuba_scene import mi_mesh
@@ -232,11 +233,11 @@ def still_session(
         albedo = AlbedoSeries((albedo,))
     camera, model = view_in_frame(camera, place.frame), sky_model(sky)
     base = nearest_albedo(albedo, base_day)
-    terrain = terrain_for_view(place, camera, lambertian=lambertian)
+    terrain = terrain_for_view(place, camera, lambertian=lambertian, amplify=amplify)
     scene = ray_scene(mi_mesh(terrain, base.load().values))
     inputs = {"place": place.key, **_camera_values(camera), "albedo": _identity(base), "seed": seed}
-    if lambertian:
-        inputs["lambertian"] = True
+    if lambertian or amplify:
+        inputs |= {"lambertian": lambertian, "amplified": amplify}
     coefficients = _coefficients(place, camera, scene, inputs, seed, sampling, progress)
     relightable = relightable_view(scene, coefficients)
     return RelightSession(place, camera, model, albedo, base, seed, coefficients, scene, relightable)

@@ -50,6 +50,7 @@ def render(
     max_depth: int | None = None,
     seed: int = 0,
     lambertian: bool = False,
+    amplify: bool = False,
     progress: Progress | None = None,
 ) -> RenderedView:
     """Render a view of a place at a date and hour.
@@ -77,7 +78,9 @@ def render(
     seed
         Equal seeds give equal pictures.
     lambertian
-        All ground is matt, also what the scene file declares as water: for comparison.
+        All ground is matt, also what the scene file declares as water and snow: for comparison.
+    amplify
+        Add relief and albedo below the resolution of the data: for pictures, not for measurements.
     progress
         Called with a task and its finished share.
 
@@ -130,16 +133,18 @@ def render(
             seed=seed,
             sampling=still_sampling(),
             lambertian=lambertian,
+            amplify=amplify,
             progress=progress,
         )
         view, light, position = view_at(session, utc)
         record = view_record(place, camera, light, position)
-        record |= {"engine": engine, "seed": seed, "lambertian": lambertian, "variant": backend.variant}
+        record |= {"engine": engine, "seed": seed, "lambertian": lambertian, "amplified": amplify}
+        record["variant"] = backend.variant
         return replace(view, provenance=record)
     spp, max_depth = 32 if spp is None else spp, 6 if max_depth is None else max_depth
     light, position = illumination_for_camera(place, camera, sky_model(sky), utc)
     view = render_view(
-        build_scene(terrain_for_view(place, camera, lambertian=lambertian), texture.values, light),
+        build_scene(terrain_for_view(place, camera, lambertian=lambertian, amplify=amplify), texture.values, light),
         camera,
         spp=spp,
         seed=seed,
@@ -148,7 +153,7 @@ def render(
     )
     record = view_record(place, camera, light, position)
     record |= {"engine": engine, "spp": spp, "max_depth": max_depth, "seed": seed, "variant": backend.variant}
-    record["lambertian"] = lambertian
+    record |= {"lambertian": lambertian, "amplified": amplify}
     return replace(view, provenance=record)
 
 

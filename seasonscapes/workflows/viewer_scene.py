@@ -74,6 +74,8 @@ class ViewerDetail:
 
 
 SMALL = ViewerDetail(640, 1024, 640, 224, 112, 8, 1024, 16, 128)
+# Of places with more heights along a side than the default shows: all files stay below 60 MB.
+LARGE = ViewerDetail(2560, 4096, 2048, 640, 320, 12, 16384, 32, 128)
 
 
 @dataclass(frozen=True)
@@ -120,7 +122,7 @@ def viewer_scene(
     sky
         A model of the atmosphere without clouds.
     detail
-        How finely.
+        How finely; ``None``: the defaults, or `LARGE` for a place that has more heights than these show.
     progress
         Called with a task and its finished share.
 
@@ -131,13 +133,15 @@ def viewer_scene(
     """
     from seasonscapes.export.viewer_files import load_scene, save_scene
 
-    detail = detail or ViewerDetail()
     if not isinstance(sky, AtmosphereModel) or sky.cloudiness > 0.0:
         got = sky.name if not isinstance(sky, AtmosphereModel) else f"cloudiness {sky.cloudiness:g}"
         expected = "a cloudless model of the atmosphere: clear, alpine_winter, hazy, saharan_dust or your own"
         raise InputError("--sky", "the page shows cloudless skies", got=got, expected=expected)
     if place.terrain.surface is None:
         raise InputError(place.path, "has no grid of heights, which the page shows")
+    if detail is None:
+        longest = float(np.ptp(place.terrain.vertices[:, :2], axis=0).max())
+        detail = LARGE if longest / place.terrain.surface.spacing_m > ViewerDetail.most_nodes else ViewerDetail()
     dated = list(albedo.dated) if albedo is not None else _own_albedos(place)
     inputs = {
         "terrain": place.key,

@@ -538,7 +538,7 @@ async function start() {
   await state.arriving;
   element("status").textContent = "";
   // What measurements use; the page itself does not.
-  window.seasonscapes = { about, arrays, state, renderer, controls, ephemeris, terrain, light, frame, clock, setTime, setEv, setHaze, sunTimes, sunTimesBetween, step, command, lightOf, now: () => now, fine, useCamera };
+  window.seasonscapes = { about, arrays, state, renderer, controls, ephemeris, terrain, light, frame, clock, setTime, setEv, setHaze, sunTimes, sunTimesBetween, step, expose, command, lightOf, now: () => now, fine, useCamera };
   loop();
   step();
   document.body.dataset.started = (performance.now() - began).toFixed(0);
