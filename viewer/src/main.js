@@ -15,6 +15,17 @@ const luminance = (rgb) => rgb[0] * LUMINANCE[0] + rgb[1] * LUMINANCE[1] + rgb[2
 const still = new URLSearchParams(location.search).has("still") || document.documentElement.dataset.still === "1";
 const reduced = matchMedia("(prefers-reduced-motion: reduce)").matches;
 
+/** Hold a request open, by which the program that serves this page knows that it is shown. */
+async function stayOpen() {
+  try {
+    const reader = (await fetch("open")).body.getReader();
+    while (!(await reader.read()).done);
+  } catch (error) {
+    if (!(error instanceof TypeError)) throw error;
+  }
+  element("status").textContent = "seasonscapes view has ended: dates that were not shown before cannot be loaded.";
+}
+
 start().catch((error) => {
   element("status").textContent = `The place cannot be shown: ${error.message}`;
   document.body.dataset.failed = error.message;
@@ -541,5 +552,6 @@ async function start() {
   window.seasonscapes = { about, arrays, state, renderer, controls, ephemeris, terrain, light, frame, clock, setTime, setEv, setHaze, sunTimes, sunTimesBetween, step, expose, command, lightOf, now: () => now, fine, useCamera };
   loop();
   step();
+  if (about.view.watched) stayOpen();
   document.body.dataset.started = (performance.now() - began).toFixed(0);
 }
