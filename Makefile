@@ -62,6 +62,8 @@ results: $(DEV)
 	$(BIN)/python benchmarks/sky.py --json benchmarks/results/sky.json
 	$(BIN)/python benchmarks/sky_night.py --json benchmarks/results/sky_night.json
 	$(BIN)/python benchmarks/light_series.py --quick --json benchmarks/results/light_series-quick.json
+	$(BIN)/python benchmarks/realbench.py --quick --json benchmarks/results/realbench-quick.json
+	$(BIN)/python benchmarks/realbench_losses.py --quick --json benchmarks/results/realbench_losses-quick.json
 	$(BIN)/python benchmarks/relight.py --json benchmarks/results/relight.json
 	$(BIN)/python benchmarks/texturing.py --quick --json benchmarks/results/texturing-quick.json
 	$(BIN)/python benchmarks/albedo.py --quick --json benchmarks/results/albedo-quick.json
@@ -70,6 +72,10 @@ results: $(DEV)
 	$(BIN)/python benchmarks/alpinebench.py --quick --json benchmarks/results/alpinebench-quick.json
 	$(BIN)/python benchmarks/viewer.py --quick --json benchmarks/results/viewer-quick.json
 	$(BIN)/python benchmarks/calibration.py --quick --json benchmarks/results/calibration-quick.json
+	$(BIN)/python benchmarks/realbench.py --json benchmarks/results/realbench.json
+	$(BIN)/python benchmarks/viewer.py --json benchmarks/results/viewer.json
+	$(BIN)/python benchmarks/everyday.py --quick --json benchmarks/results/everyday-quick.json
+	$(BIN)/python benchmarks/scale.py --json benchmarks/results/scale.json
 	$(BIN)/python benchmarks/tables.py
 
 check: $(DEV)

@@ -1,6 +1,6 @@
 """Albedo from a truth-known day of webcam pictures: our closed form beside the corrections of remote sensing, and controls.
 
-    python benchmarks/albedo.py [--quick] [--seed N] [--json FILE] [--pictures FOLDER] [--only CASE …]
+    python benchmarks/albedo.py [--quick] [--seed N] [--json FILE] [--pictures FOLDER] [--workspace FOLDER]
 
 A synthetic massif (seed drawn at run time) with its albedo of a September day, low cameras, hours of one day to fit; path
 traced, seen through air under the Bruneton sky. Cases: clean (linear, known exposure), webcam (8-bit sRGB, JPEG 88, noise,

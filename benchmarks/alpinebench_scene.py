@@ -24,10 +24,10 @@ from seasonscapes.evaluation.splits import check_no_leakage, held_out_times, pic
 from seasonscapes.evaluation.synthetic_webcams import SyntheticPicture, WebcamInstant, WebcamOptions, webcam_series
 from seasonscapes.evaluation.webcam_faults import TYPICAL, PoseSigmas, perturb_pose
 from seasonscapes.frames import LocalFrame
+from seasonscapes.rendering.coefficients import SamplingOptions
 from seasonscapes.rendering.gbuffer import trace_gbuffer
 from seasonscapes.rendering.hemisphere_rays import RayScene, ray_scene
 from seasonscapes.rendering.mitsuba_scene import RenderScene, mi_mesh
-from seasonscapes.rendering.transport import SamplingOptions
 from seasonscapes.sky.illumination import Illumination
 from seasonscapes.sky.models import SkyModel, read_sky_model, with_overrides
 from seasonscapes.terrain.atlas import Atlas, measure_atlas

@@ -38,6 +38,7 @@ from seasonscapes.evaluation.metrics import score
 from seasonscapes.evaluation.synthetic_webcams import SyntheticPicture
 from seasonscapes.exposure import develop, exposure_ev100
 from seasonscapes.images import srgb_from_linear
+from seasonscapes.rendering.coefficients import SamplingOptions
 from seasonscapes.rendering.gbuffer import trace_gbuffer
 from seasonscapes.rendering.mitsuba_scene import RenderScene, set_albedo
 from seasonscapes.rendering.radiance import apply_aerial_perspective
@@ -48,7 +49,7 @@ from seasonscapes.rendering.relit_view import (
     relightable_view,
     with_albedo,
 )
-from seasonscapes.rendering.transport import SamplingOptions, trace_view, view_albedo
+from seasonscapes.rendering.transport import trace_view, view_albedo
 from seasonscapes.sky.ephemeris import sun_position
 from seasonscapes.sky.illumination import Illumination, global_horizontal_illuminance
 from seasonscapes.terrain.surface import Texture, sample_texture
@@ -121,7 +122,7 @@ class Judge:
             n: with_albedo(
                 self.ready[n],
                 view_albedo(self.world.bare, self.ready[n].coefficients),
-                cluster_albedo(self.ready[n].coefficients, albedo),
+                cluster_albedo(self.world.bare, self.ready[n].coefficients),
             )
             for n in chosen
         }

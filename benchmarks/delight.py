@@ -22,6 +22,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import secrets
 import sys
 import tempfile
@@ -357,7 +358,8 @@ def main() -> None:
     parser.add_argument("--json", type=Path, default=None)
     parser.add_argument("--pictures", type=Path, default=None, help="folder for pictures of the albedos")
     parser.add_argument("--only", nargs="+", choices=("synthetic", "suns", "landsat", "mesh"), help="parts to run; all")
-    parser.add_argument("--data", type=Path, default=HERE.parents[1] / "shared" / "data")
+    data = Path(os.environ.get("SEASONSCAPES_DATA") or HERE.parents[1] / "shared" / "data")
+    parser.add_argument("--data", type=Path, default=data, help="default: $SEASONSCAPES_DATA or ../shared/data")
     args = parser.parse_args()
     seed = secrets.randbelow(100_000) if args.seed is None else args.seed
     size = QUICK if args.quick else FULL

@@ -27,7 +27,7 @@ def landsat_numbers(data: Path, seed: int) -> dict[str, Any]:
     from seasonscapes.albedo.forward_model import trace_texel_transport
     from seasonscapes.albedo.texel_light import texel_irradiance
     from seasonscapes.frames import direction_from_angles
-    from seasonscapes.rendering.transport import SamplingOptions
+    from seasonscapes.rendering.coefficients import SamplingOptions
 
     terrain, shape, bands = scene(folder)
     sampling = SamplingOptions(shadow_samples=1, rays=128, clusters_per_receiver=64, clusters=4096, rank=24)

@@ -11,7 +11,7 @@ from seasonscapes.albedo.sun_search import Relief
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.frames import LocalFrame, direction_from_angles
 from seasonscapes.images import linear_from_srgb, srgb_from_linear
-from seasonscapes.rendering.transport import SamplingOptions
+from seasonscapes.rendering.coefficients import SamplingOptions
 from seasonscapes.sky.illumination import Illumination, global_horizontal_illuminance
 from seasonscapes.terrain.surface import Raster, Terrain
 

@@ -143,8 +143,9 @@ class Truth:
 
 
 def truth_of(scene: Scene, terrain, camera, lights, states, *, seed: int = 3) -> Truth:
+    from seasonscapes.rendering.coefficients import SamplingOptions
     from seasonscapes.rendering.relit_view import relight_view, relightable_view
-    from seasonscapes.rendering.transport import SamplingOptions, trace_view
+    from seasonscapes.rendering.transport import trace_view
 
     view = trace_view(terrain, camera, SamplingOptions(rays=256), seed=seed)
     ready = relightable_view(terrain, view)

@@ -1,14 +1,22 @@
 """Real photographs: leave one picture of a fixed camera out, recover the ground from the others, predict it, compare.
 
-    python benchmarks/realbench.py [--quick] [--seed N] [--data FOLDER] [--json FILE] [--sheets FOLDER]
+    python benchmarks/realbench.py [--quick] [--seed N] [--data FOLDER] [--json FILE] [--sheets FOLDER] [--jobs N]
 
-Of each camera in the data folder every picture is left out once. What is known of it: its time, and the conditions of
-`albedo.picture_conditions` (direct light, clouds, haze, exposure, response), which are found on one half of its pixels (a
-chequerboard of blocks) and scored on the other half, both ways round. ``ours_blind`` knows nothing of its pixels: its
-conditions are those of the pictures with the nearest sun. Rivals see the other pictures, the time, and by eye whether the
-sun shone, and what its own sky looks like; those named ``half_`` see the same half as ours, and ``oracle_blend`` all of it.
-Scores are of terrain without near ground and clouds before it (polygons in ``realbench_masks.json``), raw and with one
-exposure for each colour. ``--sheets`` writes photograph | predicted | best rival | difference; such pictures of
+Every picture of the webcam of Chamonix is left out once, and predicted with three amounts of knowledge:
+
+half
+    One half of its terrain pixels (a chequerboard of blocks) is seen and the other one scored, both ways round. ``ours``
+    (`albedo.picture_completion`), ``ours_conditions`` (light, haze, exposure and response alone), ``grey`` (one albedo under
+    our light), ``half_blend`` (best linear blend of the other pictures), ``half_layers`` (a blend whose weights vary over
+    the ground as those of ``ours`` do), ``half_embedding`` (four numbers of appearance, as in WildGaussians).
+known
+    Its time, whether the sun shone, colour and brightness of its own sky: ``ours_known``, ``blend`` (by the same numbers).
+time
+    ``ours_blind`` (weather of the nearest sun), ``nearest`` (the picture of the nearest sun), ``mean`` of the others.
+
+``oracle_blend`` sees what is scored. ``mean_psnr_db``, ``margin_over_best_rival_db`` and ``share_better`` hold ``ours`` against
+the best of all rivals but ``half_layers``, which is printed beside. Scores are of terrain without near ground and clouds before
+it (polygons in ``realbench_masks.json``), raw and with one exposure for each colour. ``--sheets`` writes photograph | predicted | best rival | difference; such pictures of
 restricted photographs are not to be published.
 """
 
@@ -19,7 +27,10 @@ import os
 import secrets
 import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -27,16 +38,20 @@ import cv2
 import numpy as np
 from realbench_cameras import SKYLINE_PX, FixedCase, chamonix
 from realbench_rivals import equally_exposed, rival_pictures, seeing_pictures
+from realbench_shadows import shadow_figures
 from record import write_record
 
 from seasonscapes.albedo.fixed_camera import (
+    SUN_SHONE,
     FitOptions,
     FixedCamera,
     conditions_of,
+    direct_share,
     fit_fixed_camera,
     picture_at,
     relit_at,
 )
+from seasonscapes.albedo.picture_completion import SeenPart, completed_picture, ground_layers
 from seasonscapes.albedo.picture_conditions import Conditions, Ground, ViewLight, picture_under
 from seasonscapes.albedo.residual_kriging import kriged
 from seasonscapes.evaluation.metrics import score
@@ -48,7 +63,8 @@ from seasonscapes.workspace import default_workspace
 QUICK_WIDTH_PX, WIDTH_PX = 352, 704
 # Side of the blocks [of the full width] of which every other one tells the conditions.
 BLOCKS_ACROSS = 20
-BEST_RIVALS = ("nearest", "mean", "blend")
+RIVALS = ("nearest", "mean", "blend", "grey", "half_blend", "half_embedding")
+RIVALS_BY_KNOWLEDGE = ("nearest", "mean", "blend")
 
 
 @dataclass(frozen=True)
@@ -63,6 +79,7 @@ class Stack:
     half: np.ndarray
     known: np.ndarray
     sun: np.ndarray
+    layers: np.ndarray
 
 
 def stacked(case: FixedCase) -> Stack:
@@ -78,7 +95,17 @@ def stacked(case: FixedCase) -> Stack:
     lights = [light_on_view(view, each.time) for each in case.pictures]
     sun = np.stack([each.sun_direction for each in lights])
     known = np.stack([_known(case, k, covered, lights[k]) for k in range(len(lights))])
-    return Stack(case, view, lights, values, usable, (row // side + column // side) % 2 == 1, known, sun)
+    return Stack(
+        case,
+        view,
+        lights,
+        values,
+        usable,
+        (row // side + column // side) % 2 == 1,
+        known,
+        sun,
+        ground_layers(view.distance_km, view.height_m),
+    )
 
 
 def _known(case: FixedCase, k: int, covered: np.ndarray, light: ViewLight) -> np.ndarray:
@@ -155,42 +182,51 @@ def predictions(stack: Stack, k: int, options: FitOptions) -> tuple[dict[str, np
     others = [j for j in range(len(stack.values)) if j != k]
     camera = fitted_camera(stack, others, options)
     light, found = stack.lights[k], half_conditions(stack, camera, k)
-    model = [picture_under(camera.ground, light, each.values) for each in found]
-    whole = [picture_at(camera, light, each) for each in found]
-    nearest = int(np.argmax(stack.sun[others] @ stack.sun[k]))
     grey = replace(camera, ground=grey_ground(camera, stack.view))
+    pictures, usable = stack.values[others], stack.usable[others]
+    equal = equally_exposed(pictures, usable)
     results = {
-        "ours": crossed(stack, *whole),
-        "ours_without_kriging": crossed(stack, *model),
+        "ours": ours(stack, camera, k, equal, found),
+        "ours_conditions": crossed(stack, *[picture_under(camera.ground, light, each.values) for each in found]),
         "ours_known": relit_blend(stack, camera, others, k),
-        "ours_blind": picture_at(camera, light, camera.conditions[nearest]),
+        "ours_blind": picture_at(camera, light, camera.conditions[int(np.argmax(stack.sun[others] @ stack.sun[k]))]),
         "grey": crossed(
             stack, *[picture_under(grey.ground, light, each.values) for each in half_conditions(stack, grey, k)]
         ),
     }
-    results |= rival_pictures(
-        stack.values[others],
-        stack.usable[others],
-        stack.sun[others],
-        stack.known[others],
-        (stack.sun[k], stack.known[k]),
-    )
-    results |= seeing_pictures(stack.values[others], stack.usable[others], stack.values[k], stack.usable[k], stack.half)
+    asked = (stack.sun[k], stack.known[k])
+    results |= rival_pictures(pictures, usable, stack.sun[others], stack.known[others], asked)
+    results |= seeing_pictures(equal, stack.values[k], stack.usable[k], stack.half, stack.layers)
     facts = {
         "sun": float(np.mean([each.sun for each in found])),
         "overcast": float(np.mean([each.overcast for each in found])),
         "visibility_km": float(np.exp(np.mean([np.log(each.visibility_km) for each in found]))),
-        "sun_above_horizon": bool(light.sun.any()),
+        "direct_share": float(np.mean([direct_share(camera.ground, light, each) for each in found])),
     }
     return results, facts
 
 
+def ours(stack: Stack, camera: FixedCamera, k: int, equal: np.ndarray, found: list[Conditions]) -> np.ndarray:
+    """Either half of picture k by `completed_picture`, from what is seen of the other one."""
+    halves = []
+    for side, conditions in zip((False, True), found, strict=True):
+        part = SeenPart(stack.values[k], stack.usable[k] & (stack.half == side), stack.lights[k], conditions)
+        halves.append(completed_picture(camera, equal, part, stack.layers))
+    return crossed(stack, *halves)
+
+
 def relit_blend(stack: Stack, camera: FixedCamera, others: list[int], k: int) -> np.ndarray:
-    """The other pictures, each relit to the asked hour under its own conditions, and blended as the rival `blend` is."""
+    """The other pictures blended as the rival `blend` is, half of each as it is and half relit to the asked hour.
+
+    Relit pictures are wrong where the model is, and those that are not where the light changed: errors of both average out.
+    """
     relit = np.stack([relit_at(camera, stack.lights[k], j) for j in range(len(others))])
-    equal = equally_exposed(relit, stack.usable[others])
-    mean = equal.mean(axis=0)
-    return np.clip(mean + kriged(stack.known[others], stack.known[k], equal - mean), 0.0, 1.0)
+    blends = []
+    for pictures in (relit, stack.values[others]):
+        equal = equally_exposed(pictures, stack.usable[others])
+        mean = equal.mean(axis=0)
+        blends.append(np.clip(mean + kriged(stack.known[others], stack.known[k], equal - mean), 0.0, 1.0))
+    return (blends[0] + blends[1]) / 2.0
 
 
 def grey_ground(camera: FixedCamera, view: FixedView) -> Ground:
@@ -199,25 +235,48 @@ def grey_ground(camera: FixedCamera, view: FixedView) -> Ground:
     return Ground(mean, np.column_stack([view.normal, np.zeros(len(view.normal))]), camera.ground.distance_km)
 
 
-def run_case(case: FixedCase, options: FitOptions, sheets: Path | None) -> list[dict[str, Any]]:
-    stack, rows = stacked(case), []
-    for k, picture in enumerate(case.pictures):
-        start = time.process_time()
-        found, facts = predictions(stack, k, options)
-        scores = {name: scored(stack, k, values) for name, values in found.items()}
-        best = max(BEST_RIVALS, key=lambda name: scores[name]["psnr_db"])
-        row = {"camera": case.name, "picture": picture.name, "season": picture.season, "best_rival": best, **facts}
-        row |= {"sun_visible_seen": picture.sun_visible, "scores": scores, "seconds": time.process_time() - start}
-        rows.append(row)
-        print(
-            f"{picture.name:32s} "
-            + " ".join(f"{name} {values['psnr_db']:.2f}" for name, values in scores.items())
-            + f" | ssim {scores['ours']['ssim']:.3f} sun {facts['sun']:.2f}",
-            flush=True,
-        )
-        if sheets is not None:
-            write_sheet(sheets / f"{picture.name}.png", stack, k, found["ours"], found[best], best)
-    return rows
+def case_row(stack: Stack, options: FitOptions, sheets: Path | None, k: int) -> dict[str, Any]:
+    """Scores of all predictions of picture k, and what was found in it."""
+    start, picture = time.process_time(), stack.case.pictures[k]
+    found, facts = predictions(stack, k, options)
+    scores = {name: scored(stack, k, values) for name, values in found.items()}
+    best = max(RIVALS, key=lambda name: scores[name]["psnr_db"])
+    shone = facts["direct_share"] > SUN_SHONE
+    row = {"camera": stack.case.name, "picture": picture.name, "season": picture.season, "best_rival": best, **facts}
+    row |= {"sun_visible_seen": picture.sun_visible, "sun_visible_found": shone, "scores": scores}
+    print(
+        f"{picture.name:26s} "
+        + " ".join(f"{name} {scores[name]['psnr_db']:.2f}" for name in ("ours", "half_layers", "ours_known", "blend"))
+        + f" | best rival {best} {scores[best]['psnr_db']:.2f} | ssim {scores['ours']['ssim']:.3f}"
+        + f" | sun {'shone' if shone else 'hidden'}, seen {picture.sun_visible}",
+        flush=True,
+    )
+    if sheets is not None:
+        write_sheet(sheets / f"{picture.name}.png", stack, k, found["ours"], found[best], best)
+    return row | {"processor_seconds": time.process_time() - start}
+
+
+def forkable(stack: Stack) -> Stack:
+    """The stack without what the renderer holds."""
+    return replace(stack, view=replace(stack.view, view=None), case=replace(stack.case, place=None))
+
+
+def run_cases(stack: Stack, options: FitOptions, sheets: Path | None, jobs: int) -> list[dict[str, Any]]:
+    """Rows of all pictures, in their order, by several processes; they need numpy alone and share the stack by forking."""
+    start = (_remember, (forkable(stack),))
+    with ProcessPoolExecutor(jobs, get_context("fork"), *start) as pool:
+        return list(pool.map(partial(_remembered_row, options, sheets), range(len(stack.values))))
+
+
+_stacks: list[Stack] = []
+
+
+def _remember(stack: Stack) -> None:
+    _stacks[:] = [stack]
+
+
+def _remembered_row(options: FitOptions, sheets: Path | None, k: int) -> dict[str, Any]:
+    return case_row(_stacks[0], options, sheets, k)
 
 
 def write_sheet(path: Path, stack: Stack, k: int, ours: np.ndarray, rival: np.ndarray, name: str) -> None:
@@ -237,18 +296,36 @@ def write_sheet(path: Path, stack: Stack, k: int, ours: np.ndarray, rival: np.nd
     write_png8(path, np.round(255.0 * np.vstack([top, bottom])).astype(np.uint8))
 
 
-def figures_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
+def margin(rows: list[dict[str, Any]], ours: str, rivals: tuple[str, ...]) -> tuple[float, float]:
+    """Mean of ours less the best mean of the rivals [dB], and the share of cases better than the case's best rival."""
+
+    def mean(name: str) -> float:
+        return float(np.mean([row["scores"][name]["psnr_db"] for row in rows]))
+
+    better = [row["scores"][ours]["psnr_db"] > max(row["scores"][name]["psnr_db"] for name in rivals) for row in rows]
+    return mean(ours) - max(mean(name) for name in rivals), float(np.mean(better))
+
+
+def figures_of(rows: list[dict[str, Any]]) -> dict[str, float]:
     """The figures of all cases together; names of scores end in the method's name."""
     names = rows[0]["scores"]
-    mean = {name: float(np.mean([row["scores"][name]["psnr_db"] for row in rows])) for name in names}
-    best = max(mean[name] for name in BEST_RIVALS)
-    beaten = [row["scores"]["ours"]["psnr_db"] > row["scores"][row["best_rival"]]["psnr_db"] for row in rows]
-    figures: dict[str, Any] = {
-        "mean_psnr_db": mean["ours"],
-        "margin_over_best_rival_db": mean["ours"] - best,
-        "share_better": float(np.mean(beaten)),
+    known, better_known = margin(rows, "ours_known", RIVALS_BY_KNOWLEDGE)
+    gained, better = margin(rows, "ours", RIVALS)
+    figures = {
+        "mean_psnr_db": float(np.mean([row["scores"]["ours"]["psnr_db"] for row in rows])),
         "mean_ssim": float(np.mean([row["scores"]["ours"]["ssim"] for row in rows])),
+        "margin_over_best_rival_db": gained,
+        "share_better": better,
+        "margin_over_layered_blend_db": margin(rows, "ours", ("half_layers",))[0],
+        "known_margin_over_best_rival_db": known,
+        "known_share_better": better_known,
+        "sun_visible_accuracy": float(np.mean([row["sun_visible_seen"] == row["sun_visible_found"] for row in rows])),
     }
+    for season in sorted({row["season"] for row in rows}):
+        of = [row for row in rows if row["season"] == season]
+        figures[f"{season}_cases"] = len(of)
+        figures[f"{season}_psnr_db"] = float(np.mean([row["scores"]["ours"]["psnr_db"] for row in of]))
+        figures[f"{season}_margin_over_best_rival_db"] = margin(of, "ours", RIVALS)[0]
     for measure in ("psnr_db", "raw_psnr_db", "ssim", "flip", "colour_angle_deg"):
         figures |= {
             f"{measure}_{name}": float(np.mean([row["scores"][name][measure] for row in rows])) for name in names
@@ -256,24 +333,39 @@ def figures_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
     return figures
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quick", action="store_true", help="pictures of half the width")
     parser.add_argument("--seed", type=int)
     parser.add_argument("--data", type=Path, default=os.environ.get("SEASONSCAPES_DATA"))
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--jobs", type=int, default=2, help="processes")
+
+
+def data_folder(given: str | Path | None) -> Path | None:
+    """The folder of real data; ``None``, and a line that says so, where the pictures are not there."""
+    data = Path(given) if given else Path(__file__).parents[2] / "shared" / "data"
+    if (data / "chamonix-2013").is_dir():
+        return data
+    print(f"realbench: skipped: no chamonix-2013 in {data}; give --data or SEASONSCAPES_DATA", file=sys.stderr)
+    return None
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add_arguments(parser)
     parser.add_argument("--sheets", type=Path)
     arguments = parser.parse_args()
-    data = Path(arguments.data) if arguments.data else Path(__file__).parents[2] / "shared" / "data"
-    if not (data / "chamonix-2013").is_dir():
-        print(f"realbench: skipped: no chamonix-2013 in {data}; give --data or SEASONSCAPES_DATA", file=sys.stderr)
+    data = data_folder(arguments.data)
+    if data is None:
         return
     seed = secrets.randbelow(1 << 16) if arguments.seed is None else arguments.seed
     use_backend()
     width = QUICK_WIDTH_PX if arguments.quick else WIDTH_PX
     options = FitOptions(seed=seed)
-    rows = run_case(chamonix(data, default_workspace(), width), options, arguments.sheets)
-    figures = figures_of(rows) | {"cases": rows}
+    stack = stacked(chamonix(data, default_workspace(), width))
+    rows = run_cases(stack, options, arguments.sheets, arguments.jobs)
+    figures: dict[str, Any] = figures_of(rows) | shadow_figures(stack.case, stack.view, stack.lights)
+    figures["cases"] = rows
     for name, value in figures.items():
         if not isinstance(value, list):
             print(f"{name:40s} {value:.3f}")

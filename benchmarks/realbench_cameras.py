@@ -44,6 +44,7 @@ class FixedCase:
     camera: Camera
     pictures: list[Picture]
     shadows: dict[str, dict[str, list]]
+    full_width_px: int
 
 
 def polygons_mask(polygons: list, size: tuple[int, int], scale: float) -> np.ndarray:
@@ -130,4 +131,4 @@ def chamonix(
         time = datetime.fromisoformat(row["time_utc"].replace("Z", "+00:00"))
         season = "snow" if time.month < 6 else "summer"
         found.append(Picture(name, time, image, usable, masks["sun_visible"].get(name), season))
-    return FixedCase("chamonix-2013", place, camera, found, masks["shadows"])
+    return FixedCase("chamonix-2013", place, camera, found, masks["shadows"], width)

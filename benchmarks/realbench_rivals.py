@@ -51,21 +51,38 @@ def rival_pictures(
 
 
 def seeing_pictures(
-    pictures: np.ndarray, usable: np.ndarray, truth: np.ndarray, valid: np.ndarray, half: np.ndarray
+    equal: np.ndarray, truth: np.ndarray, valid: np.ndarray, half: np.ndarray, layers: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Predictions ``(n, 3)`` that see pixels of the truth: linear blends and free embeddings."""
-    equal = equally_exposed(pictures, usable)
+    """Predictions ``(n, 3)`` that see pixels of the truth: linear blends and free embeddings.
+
+    ``layers`` ``(n, L)`` are those of `ground_layers`, for the blend whose weights vary over the ground.
+    """
     flat = equal.reshape(len(equal), -1)
     centre = flat.mean(axis=0)
     components = np.linalg.svd(flat - centre, full_matrices=False)[2][: min(4, len(equal) - 1)]
-    found = {name: np.zeros_like(truth) for name in ("half_blend", "half_embedding")}
+    found = {name: np.zeros_like(truth) for name in ("half_blend", "half_embedding", "half_layers")}
     for side in (False, True):
         seen, asked = valid & (half == side), half != side
         found["half_blend"][asked] = _combination(equal, truth, seen, ridge=0.5)[asked]
         basis = np.concatenate([centre[None], components]).reshape(-1, *truth.shape)
         found["half_embedding"][asked] = _combination(basis, truth, seen, ridge=1e-6)[asked]
+        found["half_layers"][asked] = _layered(equal, truth, seen, layers)[asked]
     found["oracle_blend"] = _combination(equal, truth, valid, ridge=1e-6)
     return {name: np.clip(values, 0.0, 1.0) for name, values in found.items()}
+
+
+def _layered(equal: np.ndarray, truth: np.ndarray, seen: np.ndarray, layers: np.ndarray) -> np.ndarray:
+    """The blend of pictures ``(K, n, 3)`` with weights for each layer and colour, about their mean."""
+    mean, out = equal.mean(axis=0), np.empty_like(truth)
+    basis = np.concatenate([mean[None], equal - mean])
+    for c in range(3):
+        rows = (basis[:, None, :, c] * layers.T[None]).reshape(-1, len(truth))
+        known = rows[:, seen]
+        products = known @ known.T
+        ridge = 0.003 * float(np.mean(np.diag(products)[layers.shape[1] :]))
+        weights = np.linalg.solve(products + ridge * np.eye(len(products)), known @ (truth - mean)[seen, c])
+        out[:, c] = mean[:, c] + weights @ rows
+    return out
 
 
 def _combination(basis: np.ndarray, truth: np.ndarray, seen: np.ndarray, *, ridge: float) -> np.ndarray:

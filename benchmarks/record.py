@@ -37,8 +37,10 @@ def write_record(path: Path | None, figures: dict[str, Any], *, seed: int | None
     """
     if path is None:
         return
-    # Each run of a command is told by its seed, whether it was given or drawn.
-    arguments = _without_options(sys.argv[1:], ("--json", "--seed"))
+    # Each run of a command is told by its seed, whether it was given or drawn; where folders lie is the machine's own.
+    arguments = _without_options(
+        sys.argv[1:], ("--json", "--seed", "--data", "--sheets", "--plot", "--workspace", "--bpy-python")
+    )
     command = ["python", f"benchmarks/{Path(sys.argv[0]).name}", *arguments]
     if seed is not None:
         command += ["--seed", str(seed)]

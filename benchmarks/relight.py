@@ -85,9 +85,10 @@ def rel_rmse(image: np.ndarray, reference: np.ndarray, mask: np.ndarray) -> floa
 
 def coefficients_of(scene, camera, seed: int):
     """Our view, ready, and what making it took."""
+    from seasonscapes.rendering.coefficients import SamplingOptions
     from seasonscapes.rendering.hemisphere_rays import ray_scene
     from seasonscapes.rendering.relit_view import relightable_view
-    from seasonscapes.rendering.transport import SamplingOptions, trace_view
+    from seasonscapes.rendering.transport import trace_view
 
     start, start_cpu = time.perf_counter(), time.process_time()
     terrain = ray_scene(scene.mi_terrain)
@@ -235,7 +236,8 @@ class SunMarch:
     def clearance_deg(self, position: np.ndarray, direction: np.ndarray, step_m: float, reach_m: float) -> np.ndarray:
         """Least angle ``(N,)`` between the ray and the land ahead, negative where land is in the way."""
         from seasonscapes.frames import geodetic_from_enu
-        from seasonscapes.terrain.raster import map_from_geodetic, sample_raster
+        from seasonscapes.terrain.crs import map_from_geodetic
+        from seasonscapes.terrain.raster import sample_raster
 
         raster = self.place.elevation
         least = np.full(len(position), 90.0)
@@ -378,7 +380,8 @@ from pathlib import Path
 import render as arena
 from seasonscapes.rendering.hemisphere_rays import ray_scene
 from seasonscapes.rendering.relit_view import relight_view, relightable_view
-from seasonscapes.rendering.transport import SamplingOptions, trace_view
+from seasonscapes.rendering.coefficients import SamplingOptions
+from seasonscapes.rendering.transport import trace_view
 scene, camera, facts = arena.make_scene({seed}, Path(tempfile.mkdtemp()), width_px=1536, threads=2)
 base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 terrain = ray_scene(scene.mi_terrain)

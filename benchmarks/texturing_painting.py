@@ -28,11 +28,11 @@ from record import write_record  # noqa: E402
 from seasonscapes.evaluation.synthetic_webcams import SyntheticPicture, WebcamInstant, WebcamOptions, webcam_series  # noqa: E402
 from seasonscapes.evaluation.webcam_faults import TYPICAL, PoseSigmas, add_foreground, degrade, perturb_pose  # noqa: E402
 from seasonscapes.images import expose, linear_from_srgb, srgb_from_linear  # noqa: E402
+from seasonscapes.rendering.coefficients import SamplingOptions  # noqa: E402
 from seasonscapes.rendering.gbuffer import trace_gbuffer  # noqa: E402
 from seasonscapes.rendering.hemisphere_rays import RayScene, ray_scene  # noqa: E402
 from seasonscapes.rendering.irradiance import irradiance_blocks  # noqa: E402
 from seasonscapes.rendering.mitsuba_scene import RenderScene, mi_mesh  # noqa: E402
-from seasonscapes.rendering.transport import SamplingOptions  # noqa: E402
 from seasonscapes.sky.models import read_sky_model, with_overrides  # noqa: E402
 from seasonscapes.terrain.atlas import measure_atlas  # noqa: E402
 from seasonscapes.terrain.surface import Texture, sample_texture  # noqa: E402

@@ -46,6 +46,7 @@ bibtex_reference_style = "author_year"
 bibtex_default_style = "plain"
 
 copybutton_prompt_text = "$ "
+copybutton_line_continuation_character = "\\"
 # Two dashes of a flag are two dashes.
 smartquotes = False
 html_theme = "furo"

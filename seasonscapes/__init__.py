@@ -61,6 +61,7 @@ _MODULES = {
     "complete": "workflows.completion",
     "CompletionOptions": "texturing.completion",
     "Texture": "terrain.surface",
+    "amplified": "terrain.amplification",
     # albedo
     "recover_albedo": "workflows.albedo_recovery",
     "RecoveryOptions": "workflows.albedo_recovery",
@@ -70,6 +71,8 @@ _MODULES = {
     "predict_radiance": "workflows.predicted_radiance",
     "delight": "workflows.delighting",
     "differentiable_scene": "workflows.differentiable",
+    "camera_hours": "workflows.unseen_hours",
+    "CameraHours": "workflows.unseen_hours",
     # meshes
     "load_mesh": "workflows.meshes",
     "MeshPlacing": "terrain.mesh_placing",

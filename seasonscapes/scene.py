@@ -20,11 +20,14 @@ from seasonscapes.civil_time import parse_time_text
 from seasonscapes.declaration import MOST_NAME_CHARACTERS, Declaration, InputError, Name, Text, read_declaration
 from seasonscapes.frames import STANDARD_REFRACTION_K, Latitude, LocalFrame, Longitude
 from seasonscapes.terrain.raster_files import OWN_FOLDER, Confinement, confined_path, rasters_hash
+from seasonscapes.terrain.surface_tables import SnowTable, WaterTable
 from seasonscapes.terrain.tile_files import named_tiles
 
 log = logging.getLogger(__name__)
 
-VerticalDatum = Literal["unknown", "ellipsoidal", "EGM96", "EGM2008", "LN02", "NN2000", "NAVD88", "EVRF", "local"]
+VerticalDatum = Literal[
+    "unknown", "ellipsoidal", "EGM96", "EGM2008", "LN02", "IGN69", "NN2000", "NAVD88", "EVRF", "local"
+]
 HeightUnit = Literal["metre", "foot", "US survey foot", "decimetre", "centimetre", "kilometre"]
 
 
@@ -341,6 +344,8 @@ class SceneFile(Declaration):
         See `Origin`, `Area` and `Elevation`.
     images
         One table ``[imagery]``, or an array of tables ``[[imagery]]`` in the file; see `Imagery`.
+    water, snow
+        See `terrain.surface_tables`.
     cameras, webcams
         Arrays of tables ``[[camera]]`` and ``[[webcam]]`` in the file.
     """
@@ -354,6 +359,8 @@ class SceneFile(Declaration):
     area: Area | None = None
     elevation: Elevation | None = None
     images: list[Imagery] = Field(default_factory=list, alias="imagery", max_length=100)
+    water: WaterTable | None = None
+    snow: SnowTable | None = None
     cameras: list[NamedCamera] = Field(default_factory=list, alias="camera")
     webcams: list[Webcam] = Field(default_factory=list, alias="webcam")
     _confinement: Confinement = PrivateAttr(default=OWN_FOLDER)
@@ -362,6 +369,12 @@ class SceneFile(Declaration):
     def confinement(self) -> Confinement:
         """Where the files of the scene's rasters may lie; set by `read_scene`."""
         return self._confinement
+
+    @property
+    def input_paths(self) -> tuple[Path, ...]:
+        """All files of the scene's rasters; after `read_scene` absolute."""
+        tables = (self.elevation, self.water, *self.images)
+        return tuple(Path(path) for table in tables if table is not None for path in table.paths)
 
     @property
     def imagery(self) -> Imagery | None:
@@ -493,6 +506,8 @@ def read_scene(path: str | Path, *, allow_outside: bool = False) -> SceneFile:
     updates["images"] = [
         image.model_copy(update=resolved(key, image)) for key, image in zip(keys, scene.images, strict=True)
     ]
+    if scene.water is not None and scene.water.file is not None:
+        updates["water"] = scene.water.model_copy(update={"file": absolute_path("water.file", scene.water.file)})
     scene = scene.model_copy(update=updates)
     scene._confinement = confinement
     return scene

@@ -14,10 +14,10 @@ from seasonscapes.cameras.observation import Observation
 from seasonscapes.cameras.pinhole import Camera, rotation_from_angles
 from seasonscapes.frames import LocalFrame, direction_from_angles
 from seasonscapes.rendering.backend import use_backend
+from seasonscapes.rendering.coefficients import SamplingOptions
 from seasonscapes.rendering.hosek import hosek_illumination
 from seasonscapes.rendering.mitsuba_scene import mi_mesh, relight
 from seasonscapes.rendering.radiance import render_view
-from seasonscapes.rendering.transport import SamplingOptions
 from seasonscapes.sky.illumination import Illumination
 from seasonscapes.terrain.imagery import bake_imagery
 from seasonscapes.terrain.mesh import build_mesh

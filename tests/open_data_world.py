@@ -96,6 +96,7 @@ class World:
         heights: Field = height_m,
         collection: str = "cop-dem-glo-30",
         void: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
+        name: str | None = None,
     ) -> Path:
         """A tile as Copernicus DEM has them: pixel is point, so that its corner lies half a sample off."""
         count = round(size_deg * samples_per_deg)
@@ -106,7 +107,8 @@ class World:
         values = np.asarray(heights(y, x), np.float32)
         if void is not None:
             values[void(y, x)] = -9999.0
-        name = f"Copernicus_DSM_COG_{'10' if samples_per_deg > 2000 else '30'}_{south:+.2f}_{west:+.2f}_DEM"
+        arc_seconds = "10" if samples_per_deg > 2000 else "30"
+        name = name or f"Copernicus_DSM_COG_{arc_seconds}_{south:+.2f}_{west:+.2f}_DEM"
         transform = Affine(step, 0.0, west - step / 2.0, 0.0, -step, south + size_deg + step / 2.0)
         path = self.folder / "files" / collection / f"{name}.tif"
         self.raster(path, values[None], "EPSG:4326", transform, nodata=-9999.0, point=True)
@@ -131,6 +133,7 @@ class World:
         declared: bool = True,
         stored_offset: bool | None = None,
         cloud_percent: float = 3.0,
+        name: str | None = None,
     ) -> str:
         """An image as Sentinel-2 collection 1 has them; what ``classes`` calls 9 is painted as a cloud.
 
@@ -139,7 +142,8 @@ class World:
         """
         x, y = Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(longitude, latitude)
         west, north = round((x - size_m / 2.0) / 20.0) * 20.0, round((y + size_m / 2.0) / 20.0) * 20.0
-        name = f"S2B_T{crs[-2:]}XXX_{when.replace('-', '').replace(':', '').rstrip('Z')}_{len(list(self.items()))}_L2A"
+        stamp = when.replace("-", "").replace(":", "").rstrip("Z")
+        name = name or f"S2B_T{crs[-2:]}XXX_{stamp}_{len(list(self.items()))}_L2A"
         folder = self.folder / "files" / "s2" / name
         kind10, lat, lon = self._classes(crs, west, north, size_m, 10.0, classes)
         shifted = tuple(map(int, baseline.split("."))) >= (4, 0)

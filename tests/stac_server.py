@@ -4,6 +4,10 @@ FOLDER holds ``items/COLLECTION/*.json``, ``files/**`` and ``faults.json``. It a
 Range requests with entity tags, and fails as ``faults.json`` says: a list of [part of the path, what, how many times],
 what being a status, ``cut`` (half of the body) or ``whole`` (no Range). Each request is a line of ``requests.log``. The
 port is written to ``port``. Items' addresses begin with ``{base}``.
+
+``/`` is a catalogue like Earth Search. ``/swisstopo/`` is one like data.geo.admin.ch: its landing page does not say that it
+can be searched, pages hold at most 100 items, and a next page is named by what has to be added to the question (published
+code of geoadmin/service-stac: ``models/general.py``, ``pagination.py``).
 """
 
 from __future__ import annotations
@@ -18,6 +22,7 @@ from threading import Lock
 
 FOLDER = Path(sys.argv[1]) if len(sys.argv) > 1 else Path()
 PAGE = 2
+SWISS = "/swisstopo/"
 LOCK = Lock()
 
 
@@ -85,7 +90,7 @@ class Handler(BaseHTTPRequestHandler):
         failing = self.logged()
         if isinstance(failing, int):
             return self.reply(failing, b"busy")
-        if self.path == "/":
+        if self.path in ("/", SWISS):
             return self.reply(200, json.dumps(self.landing()).encode(), cut=failing == "cut")
         file = FOLDER / self.path.split("?")[0].lstrip("/")
         if not self.path.startswith("/files/") or not file.is_file():
@@ -101,21 +106,23 @@ class Handler(BaseHTTPRequestHandler):
         return self.reply(206, part, headers, cut=failing == "cut")
 
     def landing(self) -> dict:
+        base = self.base + self.path
+        conforms = ["https://api.stacspec.org/v1.0.0/core"]
+        if self.path == SWISS:
+            conforms += [
+                f"http://www.opengis.net/spec/ogcapi-features-1/1.0/conf/{part}"
+                for part in ("core", "oas30", "geojson")
+            ]
+        else:
+            conforms += [f"https://api.stacspec.org/v1.0.0/item-search{part}" for part in ("", "#query")]
+        search = {"rel": "search", "href": base + "search", "type": "application/geo+json", "method": "POST"}
         return {
             "type": "Catalog",
             "stac_version": "1.0.0",
             "id": "local",
             "description": "made by a test",
-            "conformsTo": [
-                "https://api.stacspec.org/v1.0.0/core",
-                "https://api.stacspec.org/v1.0.0/item-search",
-                "https://api.stacspec.org/v1.0.0/item-search#query",
-            ],
-            "links": [
-                {"rel": "self", "href": self.base + "/"},
-                {"rel": "root", "href": self.base + "/"},
-                {"rel": "search", "href": self.base + "/search", "type": "application/geo+json", "method": "POST"},
-            ],
+            "conformsTo": conforms,
+            "links": [{"rel": "self", "href": base}, {"rel": "root", "href": base}, search],
         }
 
     def do_POST(self) -> None:
@@ -129,11 +136,18 @@ class Handler(BaseHTTPRequestHandler):
                 item = json.loads(path.read_text().replace("{base}", self.base))
                 if matches(item, question):
                     found.append(item)
-        start = int(question.get("token") or 0)
+        swiss = self.path.startswith(SWISS)
+        if swiss and int(question["limit"]) > 100:
+            return self.reply(400, b'{"code": 400, "description": ["limit query parameter too big"]}')
+        start = int(question.get("token") or question.get("cursor") or 0)
         page = {"type": "FeatureCollection", "features": found[start : start + PAGE], "links": []}
         if start + PAGE < len(found):
-            body = question | {"token": str(start + PAGE)}
-            page["links"] = [{"rel": "next", "href": self.base + "/search", "method": "POST", "body": body}]
+            more = {"rel": "next", "href": self.base + self.path, "method": "POST"}
+            if swiss:
+                more |= {"merge": True, "body": {"limit": "100", "cursor": str(start + PAGE)}}
+            else:
+                more |= {"body": question | {"token": str(start + PAGE)}}
+            page["links"] = [more]
         return self.reply(200, json.dumps(page).encode(), cut=failing == "cut")
 
 

@@ -12,8 +12,8 @@ DOI = re.compile(r"doi[.:/ ](?:org/)?(10\.\d{4,5}/[^\s,\"`]+)", re.IGNORECASE)
 ENTRY = re.compile(r"^@(\w+)\{(\w+), (.*)\}$")
 SURNAME = r"[A-ZÀ-Þ][\wÀ-ž’'-]+"
 WORK = re.compile(rf"({SURNAME})(?:,? (?:&|and) (?:de )?{SURNAME}|, {SURNAME}| et al\.?)*,? \(?((?:1[89]|20)\d\d)\b")
-# Words before a year that are no authors: standards, months, companies, formats.
-NO_AUTHORS = {"Almanac", "Atmosphere", "Before", "CIE", "GREEN", "GeoTIFF", "GmbH", "IAU", "JPEG", "Neutral", "Perigee", "RGB", "WGCCRE"} | {
+# Words before a year that are no authors: standards, months, companies, formats, Python's None.
+NO_AUTHORS = {"Almanac", "Atmosphere", "Before", "CIE", "GREEN", "GeoTIFF", "GmbH", "IAU", "JPEG", "Neutral", "None", "Perigee", "RGB", "WGCCRE"} | {
     "January", "February", "March", "April", "May", "June", "July", "August", "September", "October", "November", "December",
 }  # fmt: skip
 

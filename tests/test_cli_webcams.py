@@ -65,6 +65,31 @@ def test_webcams_lists_checks_and_maps(tmp_path, capsys):
     assert (tmp_path / "map.png").stat().st_size > 1000
 
 
+def test_a_camera_below_the_ground_is_doubted(tmp_path, capsys):
+    text = places.SCENE + WEBCAM.replace("above_ground_m = 60.0", "height_m = 200.0")
+    assert run("webcams", places.write_place(tmp_path, text), "--json") == 0
+    record = json.loads(capsys.readouterr().out)
+    assert not record["heights"][0]["plausible"]
+    (warning,) = record["warnings"]
+    assert "m below ground; its position, its height or their datum is wrong" in warning
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["hut/2024-09-18T12-00.jpg", "hut/2024-09-18/12-00-00.jpg", "hut_20240918_120000.jpg", "2024-09-18_12-00.jpg"],
+)
+def test_the_names_of_pictures_that_the_how_to_shows_are_found(tmp_path, capsys, name):
+    scene = places.write_place(tmp_path, places.SCENE + WEBCAM.replace('"south"', '"hut"'))
+    picture = tmp_path / "pictures" / name
+    picture.parent.mkdir(parents=True)
+    cv2.imwrite(str(picture), np.random.default_rng(0).integers(0, 255, (200, 320, 3), np.uint8))
+    assert run("webcams", scene, "--pictures", tmp_path / "pictures", "--manifest", tmp_path / "m.csv") == 0
+    capsys.readouterr()
+    (row,) = csv.DictReader((tmp_path / "m.csv").read_text().splitlines())
+    assert row["time_utc"] == "2024-09-18T10:00:00Z"
+    assert row["path"] == f"pictures/{name}"
+
+
 def test_the_bernese_cameras_travel_with_the_package(capsys):
     assert run("webcams", "bernese_highlands", "--json") == 0
     assert len(json.loads(capsys.readouterr().out)["webcams"]) == 32
@@ -81,6 +106,10 @@ def test_the_bernese_cameras_travel_with_the_package(capsys):
         (["--picture", "good.png", "--points", "few.csv"], "points"),
         (["--picture", "good.png", "--skyline", "--webcam", "north"], "north"),
         (["--picture", "good.png", "--skyline", "--mask", "bad.jpg"], "not a readable picture"),
+        (
+            ["--picture", "good.png", "--skyline", "-o", "out/hut.json"],
+            "--output: several files are written, into a folder; got 'out/hut.json'; give the folder alone: out",
+        ),
     ],
 )
 def test_calibrate_says_what_is_wrong(tmp_path, capsys, monkeypatch, arguments, message):
@@ -90,7 +119,7 @@ def test_calibrate_says_what_is_wrong(tmp_path, capsys, monkeypatch, arguments, 
     cv2.imwrite("small.png", np.zeros((10, 10, 3), np.uint8))
     cv2.imwrite("good.png", np.zeros((200, 320, 3), np.uint8))
     (tmp_path / "few.csv").write_text("name,x_px,y_px,latitude_deg,longitude_deg,height_m\na,10,10,46.55,7.98,1200\n")
-    assert run("calibrate", scene, "-o", "out", *arguments) == 2
+    assert run("calibrate", scene, *arguments, *([] if "-o" in arguments else ["-o", "out"])) == 2
     complaint = [line for line in capsys.readouterr().err.splitlines() if line.startswith("seasonscapes: ")]
     assert len(complaint) == 1
     assert message in complaint[0]

@@ -18,8 +18,8 @@ from seasonscapes.albedo.forward_model import ambient_on_texels, sun_on_texels, 
 from seasonscapes.errors import NotEnoughEvidence
 from seasonscapes.frames import direction_from_angles, enu_from_geodetic
 from seasonscapes.images import srgb_from_linear
+from seasonscapes.rendering.coefficients import SamplingOptions
 from seasonscapes.rendering.hosek import hosek_illumination
-from seasonscapes.rendering.transport import SamplingOptions
 from seasonscapes.scene import read_scene
 from seasonscapes.sky.illumination import Illumination
 from seasonscapes.terrain.crs import apply_affine

@@ -1,5 +1,7 @@
 """Tables equal their records, commands on the pages parse, stored notebooks are those of the tree, versions agree."""
 
+import ast
+import importlib.util
 import json
 import re
 import shlex
@@ -77,6 +79,42 @@ def test_a_wrong_number_in_a_table_is_found():
     assert tables.filled(planted) == text
 
 
+def test_times_measured_beside_other_work_are_marked():
+    row = tables.Row("a frame", "{frame_s:.1f} s", "≤ 1 s", "frame_s <= 1")
+    figures = {"frame_s": 1.25, "error": 0.5}
+    busy, quiet = {"machine": {"cores": 2, "load_5min": 3.0}}, {"machine": {"cores": 2, "load_5min": 2.1}}
+    assert (tables._busy(busy), tables._busy(quiet)) == (True, False)
+    assert tables._row_text(row, figures, busy=True) == "| a frame | 1.2 s (beside other work) **(missed)** | ≤ 1 s |"
+    assert tables._row_text(row, figures, busy=False) == "| a frame | 1.2 s **(missed)** | ≤ 1 s |"
+    assert tables._row_text(tables.Row("error", "{error:.0%}"), figures, busy=True) == "| error | 50 % | – |"
+    assert tables._row_text(tables.Row("noise", "{noise:.0%}"), figures, busy=False) is None
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "benchmarks").glob("*.py")), ids=lambda path: path.stem)
+def test_flags_that_a_benchmark_documents_exist(path):
+    source = path.read_text(encoding="utf-8")
+    documented = set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", ast.get_docstring(ast.parse(source)) or ""))
+    # Benchmarks of one family share their flags.
+    shared = "".join(
+        (ROOT / "benchmarks" / f"{name}.py").read_text(encoding="utf-8")
+        for name in re.findall(r"^from (\w+) import", source, re.MULTILINE)
+        if (ROOT / "benchmarks" / f"{name}.py").is_file() and name != "record"
+    )
+    assert {flag for flag in documented if f'"{flag}"' not in source + shared} == set()
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "benchmarks").glob("*.py")), ids=lambda path: path.stem)
+def test_names_that_a_benchmark_imports_exist(path):
+    """Also those that are imported within functions, late in a run of an hour."""
+    imports = [
+        node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.ImportFrom)
+    ]
+    for node in (node for node in imports if node.module and node.module.split(".")[0] == "seasonscapes"):
+        module = importlib.import_module(node.module or "")
+        for name in (each.name for each in node.names if not hasattr(module, each.name)):
+            assert importlib.util.find_spec(f"{node.module}.{name}") is not None, f"{node.module} has no {name}"
+
+
 def test_records_say_how_they_came_about():
     records = sorted((ROOT / "benchmarks" / "results").glob("*.json"))
     assert records
@@ -87,6 +125,7 @@ def test_records_say_how_they_came_about():
         assert figures
         script = shlex.split(record["command"])[1]
         assert (ROOT / script).is_file(), path.name
+        assert " /" not in record["command"], "a folder of one machine"
 
 
 def test_a_record_is_written_with_its_circumstances(tmp_path):

@@ -10,7 +10,9 @@ import json
 import os
 import re
 import shutil
+import socket
 import tomllib
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +29,10 @@ import seasonscapes as ss
 from seasonscapes.errors import InputError
 from seasonscapes.images import linear_from_srgb
 from seasonscapes.open_data import remote
+from seasonscapes.open_data.catalogue import Item
+from seasonscapes.open_data.elevation import tiles_of
 from seasonscapes.open_data.requests_as_text import parse_extent, parse_interval
+from seasonscapes.open_data.sources import read_source
 from seasonscapes.terrain.crs import geodetic_from_map, map_from_geodetic
 from seasonscapes.terrain.raster import sample_raster
 from seasonscapes.terrain.surface import Raster
@@ -132,7 +137,8 @@ def fetch(url, cache, world, tmp_path, monkeypatch):
 
     def run(place, **flags) -> Path:
         output = flags.pop("output", tmp_path / "place.toml")
-        flags = {"stac": url, "size": "3km", "date": RANGE, "workspace": cache} | flags
+        undated = flags.get("imagery") in ("none", "swissimage")
+        flags = {"stac": url, "size": "3km", "date": None if undated else RANGE, "workspace": cache} | flags
         # A blank before a negative number is a blank like any other.
         command("fetch", at=",".join(map(str, place)), output=output, **flags)
         return output
@@ -177,14 +183,16 @@ def test_a_place_appears_from_its_coordinates(fetch, url):
     assert height_error(scene).max() < 0.3
     assert colour_error(scene).max() < 2e-3
     told = sources(scene)
-    assert declared["imagery"]["time"] == told["imagery"]["time"] == "2024-07-14T10:25:31Z"
+    assert declared["imagery"]["time"] == told["imagery"][0]["time"] == "2024-07-14T10:25:31Z"
     sun = get_solarposition(pd.DatetimeIndex(["2024-07-14T10:25:31Z"]), *ALPS)
-    assert told["imagery"]["sun"]["azimuth_deg"] == pytest.approx(float(sun["azimuth"].iloc[0]), abs=0.1)
-    assert told["imagery"]["sun"]["elevation_deg"] == pytest.approx(float(sun["apparent_elevation"].iloc[0]), abs=0.1)
-    assert told["imagery"]["sun"]["stated_azimuth_deg"] == 160.0
+    assert told["imagery"][0]["sun"]["azimuth_deg"] == pytest.approx(float(sun["azimuth"].iloc[0]), abs=0.1)
+    assert told["imagery"][0]["sun"]["elevation_deg"] == pytest.approx(
+        float(sun["apparent_elevation"].iloc[0]), abs=0.1
+    )
+    assert told["imagery"][0]["sun"]["stated_azimuth_deg"] == 160.0
     assert {item["address"].startswith(url) for item in told["elevation"]["items"]} == {True}
     assert len(told["elevation"]["items"]) == 2
-    assert all(item["etag"] for item in told["imagery"]["items"])
+    assert all(item["etag"] for item in told["imagery"][0]["items"])
 
 
 @pytest.mark.parametrize("year", [2018, 2019, 2022])
@@ -198,7 +206,7 @@ def test_two_utm_zones_join_without_a_seam(fetch):
     scene = fetch(ZONES)
     assert height_error(scene).max() < 0.3
     assert colour_error(scene).max() < 3e-3
-    assert len({item["id"] for item in sources(scene)["imagery"]["items"]}) == 2
+    assert len({item["id"] for item in sources(scene)["imagery"][0]["items"]}) == 2
 
 
 def test_the_antimeridian_is_a_place_like_any_other(fetch):
@@ -226,6 +234,27 @@ def test_withheld_tiles_come_from_the_coarser_product_and_it_is_told(fetch):
     assert "WorldDEM-90" in tomllib.loads(scene.read_text())["attribution"]
 
 
+def test_the_finest_items_of_a_collection_count():
+    """3DEP has items of 10 m and, partly with a later date, of 30 m above each other in one collection."""
+    declared = read_source("3dep")
+    items = [
+        Item(
+            name,
+            (-106.0, 40.0, -105.0, 41.0),
+            datetime.fromisoformat(day),
+            {"gsd": gsd},
+            {"data": {"href": "https://a/b"}},
+        )
+        for name, day, gsd in (
+            ("n41w106-1", "2021-01-01T00:00:00+00:00", 30),
+            ("n41w106-13", "2019-01-01T00:00:00+00:00", 10),
+            ("n41w106-13b", "2020-01-01T00:00:00+00:00", 10),
+        )
+    ]
+    tiles = tiles_of(items, "3dep", declared, finest_m=10.0)
+    assert [tile.item.id for tile in tiles] == ["n41w106-13b", "n41w106-13", "n41w106-1"]
+
+
 def test_voids_are_filled_from_the_coarser_product(fetch):
     scene = fetch(VOIDS, imagery="none")
     assert height_error(scene).max() < 3.0
@@ -238,7 +267,7 @@ def test_a_cloud_over_snow_is_filled_and_snow_taken_for_cloud_is_kept(fetch):
     """The clearest day lights the image; what its cloud hides is of the next days, and told with its share."""
     scene = fetch(SNOW)
     assert colour_error(scene, snowy).max() < 0.01
-    told = sources(scene)["imagery"]
+    told = sources(scene)["imagery"][0]
     assert told["time"] == "2024-07-14T10:15:31Z"
     assert told["report"]["known_share"] == 1.0
     assert 0.13 < told["report"]["filled_from"][0]["share"] < 0.22
@@ -247,7 +276,7 @@ def test_a_cloud_over_snow_is_filled_and_snow_taken_for_cloud_is_kept(fetch):
 
 def test_a_median_has_no_time(fetch):
     scene = fetch(SNOW, composite="median")
-    told = sources(scene)["imagery"]
+    told = sources(scene)["imagery"][0]
     assert told["time"] is None
     assert len(told["report"]["times"]) == 3
     assert "time" not in tomllib.loads(scene.read_text())["imagery"]
@@ -258,9 +287,10 @@ def test_an_offset_that_was_applied_before_is_noticed(fetch):
         fetch(WRONG)
 
 
-def test_swiss_tiles_are_the_newest_of_the_spacing_that_is_needed(fetch):
-    """Only files of 2 m are there, and the tile of 2019 is 50 m too high."""
-    scene = fetch(BERN, elevation="swissalti3d", imagery="swissimage", size="1.6km", resolution=2)
+def test_swiss_tiles_are_the_newest_of_the_spacing_that_is_needed(fetch, url):
+    """Only files of 2 m are there, and the tile of 2019 is 50 m too high; the catalogue does not say that it searches."""
+    flags = {"elevation": "swissalti3d", "imagery": "swissimage", "size": "1.6km", "resolution": 2}
+    scene = fetch(BERN, stac=url + "swisstopo/", **flags)
     assert height_error(scene).max() < 0.05
     declared = tomllib.loads(scene.read_text())
     assert declared["vertical_datum"] == "LN02"
@@ -270,7 +300,7 @@ def test_swiss_tiles_are_the_newest_of_the_spacing_that_is_needed(fetch):
     assert (values[..., 3] == 255).all()
     shown = linear_from_srgb(values[..., :3] / 255.0)
     assert np.abs(shown - 2.0 * reflectance(latitude, longitude)).max() < 0.01
-    told = sources(scene)["imagery"]
+    told = sources(scene)["imagery"][0]
     assert told["time"] is None
     assert told["report"]["years"] == [2023]
     assert len(sources(scene)["elevation"]["items"]) == 9
@@ -293,7 +323,7 @@ def test_a_folder_of_tiles_is_a_place_too(world, tmp_path):
     told = sources(scene)
     assert "address" not in told["elevation"]["items"][0]
     assert str(files) not in json.dumps(told)
-    assert told["imagery"]["report"]["years"] == [2023]
+    assert told["imagery"][0]["report"]["years"] == [2023]
 
 
 def test_heights_in_feet_become_metres(tmp_path):
@@ -325,7 +355,7 @@ def test_plan_loads_nothing(fetch, world, tmp_path, capsys):
     fetch(ALPS, plan=True, json=True)
     told = json.loads(capsys.readouterr().out)
     assert len(told["elevation"]["items"]) == 2
-    assert told["imagery"]["days"][0]["time"] == "2024-07-14T10:25:31Z"
+    assert told["imagery"][0]["days"][0]["time"] == "2024-07-14T10:25:31Z"
     assert told["elevation"]["about_bytes"] > 1000
     assert "WorldDEM-30" in told["elevation"]["licences"][0]["attribution"]
     assert not [line for line in world.requests() if "/files/" in line]
@@ -353,6 +383,40 @@ def test_bad_networks_are_survived(fetch, world, tmp_path):
     scene = fetch(ALPS, workspace=tmp_path / "cache")
     assert height_error(scene).max() < 0.3
     assert colour_error(scene).max() < 2e-3
+
+
+@pytest.mark.parametrize(
+    ("part", "what", "line"),
+    [
+        ("/search", "cut", "the catalogue does not answer"),
+        (
+            "DEM.tif",
+            "cut",
+            "no connection, or it broke (ChunkedEncodingError), 5 times; run the same command again later",
+        ),
+        ("SCL", 502, "the server answers 502 Bad Gateway, 5 times; run the same command again later"),
+        ("B04", 500, "the server answers 500 Internal Server Error, 5 times"),
+        ("B04", 401, "the server answers 401 Unauthorized; choose another source"),
+    ],
+)
+def test_what_stays_broken_is_told(fetch, world, tmp_path, part, what, line):
+    world.faults((part, what, 99))
+    assert line in failure(fetch, ALPS, tmp_path)
+
+
+def test_a_machine_without_network_is_told(fetch, tmp_path, monkeypatch):
+    def unknown(*_: object, **__: object) -> None:
+        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+
+    monkeypatch.setattr(socket, "getaddrinfo", unknown)
+    line = failure(fetch, ALPS, tmp_path, stac="http://catalogue.invalid/")
+    assert "the catalogue does not answer (its name is unknown here: is there a network?); try again later" in line
+
+
+def test_a_catalogue_that_stays_busy_is_told(fetch, world, tmp_path):
+    world.faults(("/search", 503, 99))
+    line = failure(fetch, ALPS, tmp_path)
+    assert "the catalogue does not answer (too many 503 error responses); try again later" in line
 
 
 def test_an_interrupted_download_resumes(fetch, world, tmp_path):
@@ -471,10 +535,15 @@ def test_a_missing_tile_is_replaced_by_the_coarser_product(fetch, world, tmp_pat
         ((0.0, -150.0), {"imagery": "none"}, "is the place on land"),
         (ALPS, {"date": "2011"}, "no image in this time with so few clouds"),
         (ALPS, {"stac": "file:///etc"}, "--stac: not an address"),
-        (ALPS, {"stac": "http://127.0.0.1:9/"}, "the catalogue does not answer"),
+        (ALPS, {"stac": "http://127.0.0.1:9/"}, "the catalogue does not answer (no connection)"),
+        (
+            ALPS,
+            {"stac": "http://catalogue.invalid/"},
+            "does not answer (its name is unknown here: is there a network?)",
+        ),
         (ALPS, {"elevation": "srtm"}, "--elevation: unknown source of elevation; got 'srtm'; expected one of"),
         (ALPS, {"elevation": "sentinel-2"}, "unknown source of elevation"),
-        (ALPS, {"imagery": "nothing/*.tif"}, "--imagery: no such file"),
+        (ALPS, {"imagery": "nothing/*.tif", "date": None}, "--imagery: no such file"),
         ((10.0, 10.0), {"elevation": "swissalti3d"}, "swissALTI3D has nothing here"),
         (ALPS, {"size": "20"}, "--size: not an extent"),
         (ALPS, {"size": "2000km"}, "--size: out of range"),
@@ -482,6 +551,12 @@ def test_a_missing_tile_is_replaced_by_the_coarser_product(fetch, world, tmp_pat
         (ALPS, {"composite": "mean"}, "--composite: unknown composite"),
         (ALPS, {"cloud": 120}, "--cloud: out of range"),
         (ALPS, {"date": "2024-13"}, "--date: not a time"),
+        (ALPS, {"imagery": "none", "date": "2024"}, "--date: with files of one's own, or without imagery"),
+        (ALPS, {"imagery": "none", "cloud": 5}, "--cloud: with files of one's own, or without imagery"),
+        (BERN, {"imagery": "swissimage", "composite": "median"}, "--composite: swissimage has one image"),
+        (BERN, {"imagery": "swissimage", "date": ["2023", "2019"]}, "--date: swissimage tells the year alone"),
+        (BERN, {"imagery": "swissimage", "date": "2011"}, "the catalogue has no image here; choose another --date"),
+        (ALPS, {"elevation": "lidar-hd"}, "--elevation: LiDAR HD has no catalogue that can be asked"),
     ],
 )
 def test_mistakes_are_one_line(fetch, tmp_path, place, flags, line):
@@ -508,7 +583,10 @@ def test_intervals_and_extents():
 @pytest.mark.skipif("SEASONSCAPES_NETWORK" not in os.environ, reason="asks real catalogues")
 def test_the_real_catalogues_answer(tmp_path):
     command("fetch", at="46.62,8.03", size="3km", date="2024-07..2024-09", output=tmp_path / "grindelwald.toml")
-    assert sources(tmp_path / "grindelwald.toml")["imagery"]["report"]["known_share"] > 0.9
+    swiss = {"elevation": "swissalti3d", "imagery": "swissimage", "resolution": 2}
+    command("fetch", at="46.62,8.03", size="2km", output=tmp_path / "swiss.toml", **swiss)
+    assert sources(tmp_path / "swiss.toml")["elevation"]["shares"]["swissalti3d"] > 0.99
+    assert sources(tmp_path / "grindelwald.toml")["imagery"][0]["report"]["known_share"] > 0.9
 
 
 # ---------------------------------------------------------------------------------------------- a picture

@@ -11,13 +11,14 @@ from seasonscapes.cameras.panorama import cut_view, panorama_from_angles, projec
 from seasonscapes.cameras.pinhole import rotation_from_angles
 from seasonscapes.evaluation.synthetic_webcams import WebcamInstant, WebcamOptions, webcam_series
 from seasonscapes.evaluation.webcam_faults import CLEAN, PoseSigmas, perturb_pose
+from seasonscapes.rendering.coefficients import SamplingOptions
 from seasonscapes.rendering.coefficients_file import load_coefficients, save_coefficients
 from seasonscapes.rendering.hemisphere_rays import ray_scene
 from seasonscapes.rendering.mitsuba_scene import mi_mesh, relight
 from seasonscapes.rendering.radiance import render_view
 from seasonscapes.rendering.relit_view import relight_view, relightable_view
 from seasonscapes.rendering.sightlines import visible_faces
-from seasonscapes.rendering.transport import SamplingOptions, trace_view
+from seasonscapes.rendering.transport import trace_view
 from seasonscapes.sky.illumination import Illumination
 
 EFFORT = SamplingOptions(shadow_samples=16, albedo_samples=64, rays=128, clusters=1024)

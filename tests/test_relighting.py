@@ -21,13 +21,16 @@ from seasonscapes.relighting.exposure_smoothing import smoothed_ev100
 from seasonscapes.relighting.film import write_video
 from seasonscapes.relighting.frame_file import frame_header, load_frame, save_frame
 from seasonscapes.relighting.luminous_efficacy import efficacies_lm_w
+from seasonscapes.rendering.coefficients import SamplingOptions
 from seasonscapes.scene import read_scene
 from seasonscapes.sky.models import read_sky_model
 from seasonscapes.sky.night import air_mass
-from seasonscapes.workflows.albedo_sources import AlbedoFile
+from seasonscapes.terrain.surface import Texture
+from seasonscapes.workflows.albedo_sources import AlbedoFile, AlbedoSeries, DatedAlbedo
 from seasonscapes.workflows.place import MeshOptions, load_place
-from seasonscapes.workflows.relight_session import RenderJob, open_session, view_at, view_of_day
+from seasonscapes.workflows.relight_session import RenderJob, open_session, still_session, view_at, view_of_day
 from seasonscapes.workflows.timelapse import cached_session, frames_folder, render_frame, shard
+from seasonscapes.workflows.views import camera_for
 from seasonscapes.workspace import Workspace
 
 NOON = datetime(2024, 6, 21, 11, tzinfo=UTC)
@@ -167,6 +170,24 @@ def test_dated_albedos_dress_the_view(hill, tmp_path):
     coarse = replace(hill, mesh=MeshOptions(texel_m=100.0), albedo=tuple(pairs))
     with pytest.raises(AtlasMismatch, match="another atlas"):
         open_session(coarse)
+
+
+def test_a_still_and_a_film_of_one_view_keep_their_albedos_apart(hill):
+    """Both keep the albedo of each date in the workspace; they sample a pixel differently."""
+    place = place_of(hill)
+    camera = camera_for(place, hill.view, size_px=(24, 16))
+    shape = (place.atlas.height_px, place.atlas.width_px, 3)
+    textures = [np.full(shape, level, np.float32) for level in (0.1, 0.3)]
+    series = AlbedoSeries(
+        tuple(
+            DatedAlbedo(date(2024, month, 21), f"level {level}", lambda texture=texture: Texture(texture))
+            for month, level, texture in zip((3, 9), (0.1, 0.3), textures, strict=True)
+        )
+    )
+    for samples in (16, 4):
+        sampling = SamplingOptions(shadow_samples=samples, albedo_samples=16, rays=16, clusters=64)
+        session = still_session(place, camera, albedo=series, sampling=sampling)
+        assert len(view_of_day(session, date(2024, 6, 21)).coefficients.albedo) == len(session.coefficients.pixel)
 
 
 def test_shards_are_a_partition():

@@ -8,7 +8,9 @@ from test_rendering import PLANE, heightfield, looking_down, sun_at
 
 from seasonscapes.cameras.pinhole import Camera, rotation_from_angles
 from seasonscapes.frames import direction_from_angles, equirectangular_directions
+from seasonscapes.rendering.coefficients import SamplingOptions
 from seasonscapes.rendering.coefficients_file import load_coefficients, save_coefficients
+from seasonscapes.rendering.direction_basis import direction_basis
 from seasonscapes.rendering.hemisphere_rays import ray_scene
 from seasonscapes.rendering.irradiance import irradiance, irradiance_blocks, surface_at, upload_points
 from seasonscapes.rendering.light_clusters import cluster_lists
@@ -22,8 +24,10 @@ from seasonscapes.rendering.sky_patches import (
     patch_of,
     patch_radiance,
     sky_patches,
+    sky_second_moments,
 )
-from seasonscapes.rendering.transport import SamplingOptions, trace_points, trace_view, view_albedo
+from seasonscapes.rendering.transport import trace_points, trace_view, view_albedo
+from seasonscapes.rendering.view_samples import pixel_moments, sample_moments, view_samples
 from seasonscapes.sky.illumination import Illumination, uniform_sky
 
 QUICK = SamplingOptions(rays=128, clusters=1024, clusters_per_receiver=32)
@@ -64,6 +68,32 @@ def test_relit_view_equals_path_tracing(valley, name):
     relit = relight_view(ready, LIGHTS[name]).surface
     assert relit.mean() / reference.mean() == pytest.approx(1.0, abs=0.01)
     assert np.sqrt(np.mean((relit - reference) ** 2)) < 0.04 * reference.mean()
+
+
+def test_moments_of_traced_samples_are_those_of_their_pixels(valley):
+    """A still takes albedo, normal and coverage from its shadow samples, in place of rays of their own."""
+    mesh, camera, _ = valley
+    points, hit, pixel = view_samples(ray_scene(mesh), camera, range(10, 40), 16, 3)
+    traced = pixel_moments(ray_scene(mesh), camera, range(10, 40), 16, 3)
+    for known, own in zip(sample_moments(points, hit), traced, strict=True):
+        np.testing.assert_allclose(known, own[pixel - 10 * camera.width_px], atol=1e-6)
+
+
+def test_directions_are_principal_components():
+    """Of coefficients that lie in few dimensions nothing is lost; of others, no more than any projection must lose."""
+    patches, random = sky_patches("reinhart"), np.random.default_rng(5)
+    flat = random.normal(size=(512, 8)) @ random.random((8, patches.size))
+    basis = direction_basis(flat, patches, rank=8)
+    skies = np.linalg.cholesky(sky_second_moments(patches)) @ random.normal(size=(patches.size, 64))
+    approximation = (flat @ basis.projection) @ (basis.from_sky.T @ skies)
+    np.testing.assert_allclose(approximation, flat @ skies, atol=1e-4 * np.abs(flat @ skies).max())
+    assert basis.error < 1e-6
+    rows = random.random((2048, patches.size)) ** 4
+    half = direction_basis(rows, patches, rank=32)
+    missed = (rows @ half.projection) @ (half.from_sky.T @ skies) - rows @ skies
+    measured = np.sqrt((missed**2).sum() / ((rows @ skies) ** 2).sum())
+    # 64 random skies tell the error of all within a tenth.
+    assert measured == pytest.approx(half.error, rel=0.1)
 
 
 @pytest.mark.parametrize(("bounces", "max_depth"), [(0, 2), (1, 3), (2, 4)])

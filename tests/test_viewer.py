@@ -69,6 +69,10 @@ class TestFiles:
         assert all((folder / each["file"]).is_file() for each in described["albedo"])
         assert described["attribution"] == "made by a test"
 
+    def test_the_credit_of_the_data_stands_on_the_page_and_in_its_description(self, folder):
+        assert '<p id="attribution">made by a test</p>' in (folder / "index.html").read_text()
+        assert "made by a test" in (folder / "scene.json").read_text()
+
     def test_the_only_scripts_that_run_in_a_single_file_are_those_of_its_policy(self, scene):
         page = single_file(scene, view={"camera": "south"}).decode()
         policy = re.search(r'Content-Security-Policy" content="([^"]*)"', page)[1]

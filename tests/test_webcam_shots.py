@@ -14,9 +14,9 @@ from seasonscapes.cameras.panorama import Panorama, level_panorama
 from seasonscapes.errors import InputError, NoTerrainInView
 from seasonscapes.evaluation import synthetic_webcams
 from seasonscapes.images import read_image_srgb8
+from seasonscapes.rendering.coefficients import SamplingOptions
 from seasonscapes.rendering.hemisphere_rays import ray_scene
 from seasonscapes.rendering.mitsuba_scene import mi_mesh
-from seasonscapes.rendering.transport import SamplingOptions
 from seasonscapes.sky.models import read_sky_model
 from seasonscapes.workflows.albedo_recovery import with_terrain
 from seasonscapes.workflows.painting import painting_inputs

@@ -90,7 +90,16 @@ def command_page() -> str:
     """Return the reference of all commands, as cyclopts describes them."""
     text = command_line().generate_docs(output_format="markdown", recursive=True, heading_level=1)
     first = text.index("## seasonscapes ")
-    return text[first:].replace("**Parameters**:", "")
+    return "\n".join(verb_table()) + "\n\n" + text[first:].replace("**Parameters**:", "")
+
+
+def verb_table() -> list[str]:
+    """Return a table of all verbs with what they do, each linked to its section."""
+    application, rows = command_line(), ["| command | what it does |", "|---|---|"]
+    for name in application:
+        if not name.startswith("-"):
+            rows.append(f"| [`{name}`](#seasonscapes-{name}) | {application[name].help.splitlines()[0]} |")
+    return rows
 
 
 # ------------------------------------------------------------------------------------------------ declarations

@@ -51,8 +51,8 @@ _LARGEST_TURN = 0.3
 # Ground barely turned away from the sun may turn back.
 _BARELY_TURNED = -0.05
 _MEAN_REFLECTANCE = 0.15
-# Less direct light than this share of a clear sky's throws no shadow that a picture shows.
-_SUN_SHONE = 0.25
+# A smaller share of direct light on the best lit fiftieth of the ground throws no shadow that a picture shows.
+SUN_SHONE, _BEST_LIT = 0.25, 98.0
 # A picture is not explained where its residual is so many times the median of all pictures'.
 _UNEXPLAINED = 2.5
 
@@ -92,6 +92,8 @@ class FixedCamera:
         ``(K, n, 3)`` float32 picture - model, encoded values; 0 where something stood before the terrain.
     residual
         ``(K,)`` robust standard deviation of the misfit.
+    direct
+        ``(K,)`` share of direct light in the pictures (`direct_share`).
     block
         Number of neighbouring pixels that err together.
     """
@@ -101,6 +103,7 @@ class FixedCamera:
     kinship: np.ndarray
     misfit: np.ndarray
     residual: np.ndarray
+    direct: np.ndarray
     block: int
 
 
@@ -185,7 +188,8 @@ def fit_fixed_camera(
     residual = _residuals(ground, whole, conditions)
     report(1.0)
     kinship = np.stack([_kinship(*each) for each in zip(lights, conditions, strict=True)])
-    return FixedCamera(ground, conditions, kinship, misfit, residual, options.block)
+    direct = np.array([direct_share(ground, *each) for each in zip(lights, conditions, strict=True)])
+    return FixedCamera(ground, conditions, kinship, misfit, residual, direct, options.block)
 
 
 def _first_ground(pictures: Sequence[np.ndarray], distance_km: np.ndarray, normal: np.ndarray) -> Ground:
@@ -275,9 +279,17 @@ def unexplained(camera: FixedCamera) -> np.ndarray:
     return camera.residual > _UNEXPLAINED * np.median(camera.residual)
 
 
-def sun_shone(conditions: Conditions) -> bool:
-    """Whether sunlight fell on the terrain, by the share of direct light."""
-    return conditions.sun > _SUN_SHONE
+def direct_share(ground: Ground, light: ViewLight, conditions: Conditions) -> float:
+    """Share of direct sunlight in the light on the best lit fiftieth of the ground, 0 to 1.
+
+    Unlike `Conditions.sun` it is small where the sun grazes the slopes or haze and clouds outshine it; above `SUN_SHONE`
+    the sun is taken to have shone.
+    """
+    if not light.sun.any():
+        return 0.0
+    direct = conditions.sun * light.sun.mean() * light.sun_visible * np.maximum(incidence(light, ground.shading), 0.0)
+    diffuse = ((1.0 - conditions.overcast) * light.sky + conditions.overcast * light.clouds).mean(axis=1)
+    return float(np.percentile(direct / np.maximum(direct + diffuse, 1e-9), _BEST_LIT))
 
 
 def conditions_of(

@@ -18,11 +18,12 @@ import numpy as np
 
 from seasonscapes.albedo.footprints import Footprints
 from seasonscapes.rendering.air_grid import AirGrid, SkyGrid, air_grid, interpolate_air, sky_grid, sky_pixel_radiance
+from seasonscapes.rendering.coefficients import SamplingOptions
 from seasonscapes.rendering.hemisphere_rays import RayScene, SurfacePoints, ray_scene, texture_at
 from seasonscapes.rendering.irradiance import DevicePoints, surface_at, upload_points
 from seasonscapes.rendering.receivers import DeviceClusters, incident_light, light_clusters, luminaries
 from seasonscapes.rendering.sun_visibility import visible_cosine
-from seasonscapes.rendering.transport import SamplingOptions, trace_points
+from seasonscapes.rendering.transport import trace_points
 from seasonscapes.sky.illumination import Illumination
 from seasonscapes.terrain.surface import Terrain
 from seasonscapes.terrain.texels import texel_positions

@@ -3,7 +3,7 @@
 Pictures taken under like conditions leave like residuals: shade of crowns and gullies below the raster, snow of the week,
 the camera's sharpening. Each picture is one point in a space of conditions; all pixels share a squared exponential
 covariance, whose range and noise are those with the smallest error when each picture in turn is left out. That error has
-a closed form (Rasmussen & Williams 2006, "Gaussian Processes for Machine Learning", eq. 5.12), and needs the products of
+a closed form (Rasmussen & Williams 2006, "Gaussian Processes for Machine Learning", § 5.4.2), and needs the products of
 the pictures with each other alone.
 """
 

@@ -16,10 +16,10 @@ from scipy.ndimage import distance_transform_edt, label
 
 from seasonscapes.albedo.delighting import TexelIrradiance
 from seasonscapes.albedo.forward_model import TexelTransport, ambient_on_texels, transport_of_points
+from seasonscapes.rendering.coefficients import SamplingOptions
 from seasonscapes.rendering.hemisphere_rays import ray_scene
 from seasonscapes.rendering.irradiance import shadow_rays, surface_at
 from seasonscapes.rendering.sun_visibility import SunRays, visible_cosine
-from seasonscapes.rendering.transport import SamplingOptions
 from seasonscapes.sky.illumination import Illumination, global_horizontal_illuminance
 from seasonscapes.terrain.surface import Terrain
 from seasonscapes.terrain.texels import texel_positions

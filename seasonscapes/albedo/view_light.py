@@ -65,3 +65,10 @@ def view_distances_km(view: RelightableView) -> np.ndarray:
     weight = np.asarray(view.coefficients.sample_weight, np.float32)
     away = np.linalg.norm(origin - view.coefficients.camera.position_m.astype(np.float32), axis=2)
     return (away * weight).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-6) / 1000.0
+
+
+def view_heights_m(view: RelightableView) -> np.ndarray:
+    """Height ``(n,)`` of the terrain in the pixels above the frame's origin [m]."""
+    height = np.asarray(view.coefficients.sample_origin, np.float32)[..., 2]
+    weight = np.asarray(view.coefficients.sample_weight, np.float32)
+    return (height * weight).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-6)

@@ -91,6 +91,7 @@ COMMANDS = (
     ("inpaint", "inpaint", "Complete a painted texture where no camera saw the surface."),
     ("path", "path", "Make a camera path over a place, clear of the ground, with a map."),
     ("albedo", "albedo", "Recover the albedo of a place from its photographs."),
+    ("hours", "hours", "Picture a fixed camera's view at hours that it never took."),
     ("delight", "delight", "Take the light of its hour out of an image or a textured mesh."),
     ("relight", "relight", "Light a textured mesh anew: pictures, lit textures or a film."),
     ("distill", "distill", "Distil a Gaussian model of a place."),

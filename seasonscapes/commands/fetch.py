@@ -21,9 +21,9 @@ def fetch_command(
     size: str | None = None,
     elevation: str = "auto",
     imagery: str = "sentinel-2",
-    date: str | None = None,
-    cloud: float = 20.0,
-    composite: str = "clearest",
+    date: list[str] | None = None,
+    cloud: float | None = None,
+    composite: str | None = None,
     stac: str | None = None,
     resolution: float | None = None,
     plan: bool = False,
@@ -31,7 +31,7 @@ def fetch_command(
     workspace: Path | None = None,
     json: bool = False,
 ) -> None:
-    """Make the scene of a place from open data: heights, an image, three cameras, and where all of it comes from.
+    """Make the scene of a place from open data: heights, images, three cameras, and where all of it comes from.
 
     Parameters
     ----------
@@ -46,11 +46,12 @@ def fetch_command(
     imagery
         sentinel-2, swissimage, none, or files of 8-bit colours.
     date
-        Of the image: 2024-07..2024-09, a month, a day or a year; default the last whole summer.
+        Of the image: 2024-07..2024-09, a month, a day or a year; default the last whole summer. Repeated, an image for each:
+        the ground at several dates.
     cloud
-        Largest cloud cover of an image in percent.
+        Largest cloud cover of an image in percent; default 20.
     composite
-        clearest (one day, whose time is kept) or median (of many days, without a time).
+        clearest (one day, whose time is kept; the default) or median (of many days, without a time).
     stac
         Another catalogue with the same collections.
     resolution
@@ -74,12 +75,11 @@ def fetch_command(
         None if size is None else parse_extent(size),
         elevation,
         imagery,
-        None if date is None else parse_interval(date),
+        [parse_interval(each) for each in date or []],
         cloud,
         composite,
         stac,
         resolution,
-        offline,
     )
     store = open_data_store(None if workspace is None else Workspace(workspace), offline=offline)
     if plan:
@@ -101,15 +101,13 @@ def _centre(text: str) -> tuple[float, float]:
 
 def _plan_lines(record: dict[str, Any]) -> list[str]:
     lines = []
-    for part in ("elevation", "imagery"):
-        found = record.get(part)
-        if found is None:
-            continue
+    for part, found in [("elevation", record["elevation"]), *(("imagery", each) for each in record["imagery"])]:
         days = found.get("days", [])
         count = f"{len(days)} days to choose from" if days else f"{len(found['items'])} items"
         megabytes = found["about_bytes"] / 1e6
         lines.append(f"{part:10} {found['source']}, {count}, about {megabytes:.1f} MB, every {found['spacing_m']:g} m")
-        lines += [f"{'':10} {item}" for item in found["items"]]
+        when = found.get("time") or found.get("day")
+        lines += [f"{'':10} {when}"] * bool(when) + [f"{'':10} {item}" for item in found["items"]]
         lines += [
             f"{'':10} {day['time']}  {day['cloud_percent']:g} % clouds  {', '.join(day['items'])}" for day in days
         ]
@@ -118,22 +116,22 @@ def _plan_lines(record: dict[str, Any]) -> list[str]:
 
 
 def _lines(record: dict[str, Any]) -> list[str]:
+    from seasonscapes.workflows.fetched_files import attributions
+
     heights = record["elevation"]
     shares = ", ".join(f"{100.0 * share:.4g} % {name}" for name, share in heights["shares"].items())
     lines = [
         f"scene      {record['scene']}",
         f"heights    {shares}; every {heights['grid']['spacing_m']:g} m, {heights['vertical_datum']}",
     ]
-    image = record.get("imagery")
-    if image is not None:
+    for image in record["imagery"]:
         known = 100.0 * image["report"]["known_share"]
-        when = image["time"] or "no single time: its light stays in"
+        when = image["time"] or f"{image['day'] or 'no single time'}: its light stays in"
         lines.append(f"image      {image['source']}, {when}; {known:.4g} % known")
         for other in image["report"].get("filled_from", []):
             lines.append(f"{'':10} {100.0 * other['share']:.2g} % hidden by clouds are of {other['time']}")
-    credits = {each["attribution"]: None for part in (heights, image or {}) for each in part.get("licences", [])}
     return [
         *lines,
-        *(f"credit     {credit}" for credit in credits),
+        *(f"credit     {credit}" for credit in attributions(record)),
         f"loaded     {record['loaded_bytes'] / 1e6:.1f} MB",
     ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -13,6 +13,8 @@ from seasonscapes.errors import InputError, shortened
 
 # Of one part of a path, on all common file systems.
 _MOST_NAME_BYTES = 255
+# A folder of such a name was meant to be a file.
+_FILE_SUFFIXES = (".json", ".csv", ".toml", ".npz", ".png", ".jpg", ".jpeg", ".exr", ".mp4", ".tif")
 
 
 def check_output(output: Path, suffixes: tuple[str, ...], *, flag: str = "--output") -> None:
@@ -27,7 +29,11 @@ def check_output(output: Path, suffixes: tuple[str, ...], *, flag: str = "--outp
 
 
 def check_output_folder(folder: Path, *, flag: str = "--output") -> None:
-    """`InputError` about a folder that cannot be made or written to; asked before long work begins."""
+    """`InputError` about a folder that cannot be made or written to, or has the name of a file; asked before long work
+    begins."""
+    if folder.suffix.lower() in _FILE_SUFFIXES and not folder.is_dir():
+        cure = f"give the folder alone: {folder.parent}"
+        raise InputError(flag, "several files are written, into a folder", got=str(folder), cure=cure)
     with _writable_below(folder, folder, flag):
         pass
 
@@ -38,6 +44,14 @@ def check_file_or_folder(output: Path, *, flag: str = "--output") -> None:
         check_output(output, (output.suffix.lower(),), flag=flag)
     else:
         check_output_folder(output, flag=flag)
+
+
+def refuse_own_input(output: Path, inputs: Iterable[Path], *, flag: str = "--output") -> None:
+    """`InputError` about an output that would replace one of the files that it is made of."""
+    for path in inputs:
+        if output.resolve() == path.resolve():
+            cure = "choose another name"
+            raise InputError(flag, "would replace a file that the scene is made of", got=str(output), cure=cure)
 
 
 @contextmanager

@@ -32,6 +32,8 @@ def render_command(
     spp: int | None = None,
     max_depth: int | None = None,
     seed: int = 0,
+    lambertian: bool = False,
+    amplify: bool = False,
     output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("out/render.png"),
     place: PlaceOptions | None = None,
     device: str = "auto",
@@ -61,6 +63,10 @@ def render_command(
         Of path tracing: longest light path, default 6; 2 is direct light only.
     seed
         Equal seeds give equal pictures.
+    lambertian
+        All ground is matt, also water and snow: for comparison.
+    amplify
+        Add relief and albedo below the resolution of the data: for pictures, not for measurements.
     output
         A .png picture, or an .exr with all layers.
     device
@@ -96,7 +102,7 @@ def render_command(
     files = [parse_albedo(text) for text in albedo or ()]
     use_backend(device)
     with progress_bars() as progress:
-        loaded = options.load(scene, progress, albedo=[each.path for each in files])
+        loaded = options.load(scene, progress, albedo=[each.path for each in files], output=output)
         chosen, camera = view.chosen(loaded.scene), view.pinhole(loaded)
         utc = address.time if address else parse_time(str(time), chosen.latitude_deg, chosen.longitude_deg)
         series = albedo_series(loaded, files, season, progress=progress)
@@ -111,6 +117,8 @@ def render_command(
             spp=spp,
             max_depth=max_depth,
             seed=seed,
+            lambertian=lambertian,
+            amplify=amplify,
             progress=progress,
         )
     record = picture.provenance

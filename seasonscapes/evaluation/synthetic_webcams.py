@@ -22,11 +22,12 @@ from seasonscapes.evaluation.webcam_faults import (
     perturb_pose,
 )
 from seasonscapes.images import linear_from_srgb
+from seasonscapes.rendering.coefficients import SamplingOptions
 from seasonscapes.rendering.gbuffer import GBuffer
 from seasonscapes.rendering.hemisphere_rays import ray_scene
 from seasonscapes.rendering.mitsuba_scene import mi_mesh, set_albedo
 from seasonscapes.rendering.relit_view import relight_view, relightable_view
-from seasonscapes.rendering.transport import SamplingOptions, trace_view, view_albedo
+from seasonscapes.rendering.transport import trace_view, view_albedo
 from seasonscapes.sky.illumination import Illumination
 from seasonscapes.terrain.surface import Terrain
 

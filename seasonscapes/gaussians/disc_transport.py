@@ -20,8 +20,8 @@ from seasonscapes.sky.illumination import Illumination, Luminary, global_horizon
 from seasonscapes.terrain.attributes import horizontal_gaussian_mean
 
 if TYPE_CHECKING:
+    from seasonscapes.rendering.coefficients import PointCoefficients
     from seasonscapes.rendering.hemisphere_rays import RayScene
-    from seasonscapes.rendering.transport import PointCoefficients
 
 AZIMUTHS = 64
 HORIZON_RANGE_RAD = (-0.02, 1.29)
@@ -223,8 +223,9 @@ def centre_coefficients(
     ValueError
         If a disc has no terrain below it.
     """
+    from seasonscapes.rendering.coefficients import SamplingOptions
     from seasonscapes.rendering.irradiance import surface_at
-    from seasonscapes.rendering.transport import SamplingOptions, trace_points
+    from seasonscapes.rendering.transport import trace_points
 
     points, found = surface_at(ray_scene, surfels.sample_points[:, surfels.sample_points.shape[1] // 2 - 3])
     if len(found) != len(surfels.means):

@@ -91,8 +91,9 @@ def relit_frames(
     NoTerrainInView
         If a camera's view contains no splat.
     """
+    from seasonscapes.rendering.coefficients import SamplingOptions
     from seasonscapes.rendering.relit_view import relight_view, relightable_view
-    from seasonscapes.rendering.transport import SamplingOptions, trace_view
+    from seasonscapes.rendering.transport import trace_view
 
     frames = []
     for number, camera in enumerate(cameras):

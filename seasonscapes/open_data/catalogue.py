@@ -24,6 +24,19 @@ Bounds = tuple[float, float, float, float]
 # More items than any area of a single sun needs; a catalogue whose pages never end stops here.
 _MOST_ITEMS = 4000
 _PAGE_ITEMS = 100
+# What errors of requests and urllib3 mean.
+_WHY = {
+    "NameResolutionError": "its name is unknown here: is there a network?",
+    "NewConnectionError": "no connection",
+    "ConnectionError": "no connection",
+    "ConnectTimeoutError": "no answer in time",
+    "ConnectTimeout": "no answer in time",
+    "ReadTimeoutError": "no answer in time",
+    "ReadTimeout": "no answer in time",
+    "SSLError": "its certificate is not trusted",
+    "ProtocolError": "the connection broke",
+    "ChunkedEncodingError": "the connection broke",
+}
 
 
 @dataclass(frozen=True)
@@ -155,6 +168,8 @@ def _ask(store: RemoteStore, question: dict[str, Any]) -> list[dict[str, Any]]:
     for _ in range(2):  # the connection may break within an answer, which `Retry` does not see
         try:
             client = Client.open(url, stac_io=StacApiIO(max_retries=retry, timeout=TIMEOUT_S))
+            # data.geo.admin.ch searches, and does not say so; one that cannot answers the question with a status.
+            client.add_conforms_to("ITEM_SEARCH")
             found = client.search(
                 collections=[question["collection"]],
                 bbox=question["bbox"],
@@ -169,16 +184,25 @@ def _ask(store: RemoteStore, question: dict[str, Any]) -> list[dict[str, Any]]:
             status = getattr(error, "status_code", None)  # absent where no answer came at all
             if status == 404:
                 raise InputError(url, f"has no collection {question['collection']}, or is no catalogue") from None
-            problem = f"the catalogue does not answer ({status or type(error.__cause__).__name__})"
+            problem = f"the catalogue does not answer ({status or _why(error)})"
         except (requests.exceptions.MissingSchema, requests.exceptions.InvalidURL):
             raise InputError("--stac", "not an address", got=url, expected="https://…") from None
         except requests.exceptions.RequestException as error:
-            problem = f"the catalogue does not answer ({type(error).__name__})"
+            problem = f"the catalogue does not answer ({_WHY.get(type(error).__name__, type(error).__name__)})"
         except (STACError, ValueError, KeyError, TypeError, AttributeError, NotImplementedError) as error:
             raise InputError(
                 url, f"no STAC catalogue that can be searched ({type(error).__name__})", cure=later
             ) from None
     raise InputError(url, problem, cure=later)
+
+
+def _why(error: Exception) -> str:
+    """In a few words why no answer came; pystac-client keeps the cause as the context of its own error alone."""
+    cause = error.__context__
+    first = cause.args[0] if cause is not None and cause.args else None
+    reason = getattr(first, "reason", first)
+    name = type(reason).__name__
+    return str(reason) if name == "ResponseError" else _WHY.get(name, type(cause or error).__name__)
 
 
 def _item(fields: Any) -> Item:

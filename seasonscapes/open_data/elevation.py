@@ -80,16 +80,22 @@ def height_tiles(
         Spacing that is needed [m].
     """
     source = read_source(name)
-    items = search(store, catalogue_url or source.catalogue, source.collection, grid.boxes_deg())
+    items = search(store, catalogue_url or source.catalogue_url, source.collection, grid.boxes_deg())
     return tiles_of(items, name, source, finest_m=finest_m)
 
 
 def tiles_of(items: Sequence[Item], name: str, source: Source, *, finest_m: float) -> list[AssetUse]:
-    """The one asset of each item, newest item first; of a tile in several years the newest alone where so declared."""
+    """The one asset of each item, the finest spacing first, then the newest; of a tile in several years the newest alone
+    where so declared."""
+
+    def worth(item: Item) -> tuple[float, float, str]:
+        # Items of 3DEP of 10 m and of 30 m lie above each other in one collection.
+        spacing = item.properties.get("gsd")
+        age = 0.0 if item.time is None else -item.time.timestamp()
+        return float(spacing) if isinstance(spacing, (int, float)) else 0.0, age, item.id
+
     newest: dict[tuple, Item] = {}
-    for item in sorted(
-        items, key=lambda item: (item.time is not None and item.time.timestamp(), item.id), reverse=True
-    ):
+    for item in sorted(items, key=worth):
         tile = tuple(round(bound, 4) for bound in item.bounds_deg) if source.newest_per_tile else (item.id,)
         newest.setdefault(tile, item)
     return [

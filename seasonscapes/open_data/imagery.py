@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import datetime, timedelta
+from datetime import date, datetime, timedelta
 from typing import Any
 
 import cv2
@@ -29,7 +29,7 @@ from seasonscapes.terrain.surface import Raster
 log = logging.getLogger(__name__)
 
 # Tiles of one pass of a satellite lie minutes apart, passes days.
-_SAME_PASS = timedelta(minutes=30)
+SAME_PASS = timedelta(minutes=30)
 # Days whose clouds are looked at, and days whose colours are loaded.
 _MOST_DAYS, _MOST_FILLING_DAYS = 8, 4
 # Clouds are looked at on a grid of about so many cells a side.
@@ -70,7 +70,9 @@ class Image:
         ``(H, W, 3)`` float32: reflectance, or linear display colours of `Source.encoding` ``srgb``; NaN where nothing is
         known.
     time
-        UTC at which the image was taken; ``None`` for a median and where only the year is known.
+        UTC at which the image was taken; ``None`` for a median and where only the day or the year is known.
+    day
+        The day that it shows; for a median that of the middle one of its images, ``None`` where only the year is known.
     used
         Assets that were read.
     report
@@ -79,6 +81,7 @@ class Image:
 
     values: np.ndarray
     time: datetime | None
+    day: date | None = None
     used: list[AssetUse] = field(default_factory=list)
     report: dict[str, Any] = field(default_factory=dict)
 
@@ -106,14 +109,19 @@ def image_days(
     source = read_source(name)
     query = None if source.cloud_property is None else {source.cloud_property: {"lte": cloud_percent}}
     items = search(
-        store, catalogue_url or source.catalogue, source.collection, grid.boxes_deg(), interval=interval, query=query
+        store,
+        catalogue_url or source.catalogue_url,
+        source.collection,
+        grid.boxes_deg(),
+        interval=interval,
+        query=query,
     )
     dated = sorted((item for item in items if item.time is not None), key=lambda item: (item.time, item.id))
     passes: list[list[Item]] = []
     for item in dated:
         assert item.time is not None
         last = passes[-1][-1].time if passes else None
-        if last is not None and item.time - last <= _SAME_PASS:
+        if last is not None and item.time - last <= SAME_PASS:
             passes[-1].append(item)
         else:
             passes.append([item])
@@ -183,19 +191,16 @@ def load_image(
 
 
 def load_undated(
-    store: RemoteStore,
-    name: str,
-    grid: MapGrid,
-    *,
-    catalogue_url: str | None = None,
-    progress: TaskProgress | None = None,
+    store: RemoteStore, name: str, grid: MapGrid, tiles: Sequence[AssetUse], *, progress: TaskProgress | None = None
 ) -> Image:
     """Load the image of a grid from a source of colour tiles without an hour, the newest of each tile.
 
     Parameters
     ----------
-    store, name, grid, catalogue_url
+    store, name, grid
         As in `image_days`.
+    tiles
+        From `undated_tiles`.
     progress
         Called with the finished share.
 
@@ -205,7 +210,6 @@ def load_undated(
         The source has no tile here.
     """
     source = read_source(name)
-    tiles = undated_tiles(store, name, grid, catalogue_url=catalogue_url)
     rasters, used = [], []
     for number, tile in enumerate(tiles):
         raster = store.read(tile.asset["href"], lambda dataset: colours(dataset, grid, source.encoding))
@@ -215,20 +219,27 @@ def load_undated(
         if progress is not None:
             progress((number + 1) / len(tiles))
     if not rasters:
-        latitude, longitude = grid.centre_deg
-        where = f"{name} at {latitude:.4f}, {longitude:.4f}"
-        raise InputError(where, "the catalogue has no image here", cure="choose --imagery sentinel-2 or none")
+        raise no_image_here(name, grid)
     years = sorted({tile.item.time.year for tile in used if tile.item.time is not None})
     values = mosaic(rasters, grid)
     known = float(np.isfinite(values).all(axis=2).mean())
-    return Image(values, None, used, {"known_share": known, "years": years, "time_known_to": "year"})
+    return Image(values, None, None, used, {"known_share": known, "years": years, "time_known_to": "year"})
 
 
-def undated_tiles(store: RemoteStore, name: str, grid: MapGrid, *, catalogue_url: str | None = None) -> list[AssetUse]:
-    """The tiles of a source of colour images that show a grid, newest first."""
+def undated_tiles(
+    store: RemoteStore, name: str, grid: MapGrid, *, interval: str | None = None, catalogue_url: str | None = None
+) -> list[AssetUse]:
+    """The tiles of a source of colour images that show a grid, newest first; of an ISO 8601 interval where one is given."""
     source = read_source(name)
-    items = search(store, catalogue_url or source.catalogue, source.collection, grid.boxes_deg())
+    items = search(store, catalogue_url or source.catalogue_url, source.collection, grid.boxes_deg(), interval=interval)
     return tiles_of(items, name, source, finest_m=grid.spacing_m)
+
+
+def no_image_here(name: str, grid: MapGrid) -> InputError:
+    """What is said of a place that a source of colour tiles does not show."""
+    latitude, longitude = grid.centre_deg
+    cure = "choose another --date, --imagery sentinel-2 or none"
+    return InputError(f"{name} at {latitude:.4f}, {longitude:.4f}", "the catalogue has no image here", cure=cure)
 
 
 def colours(dataset: Any, grid: MapGrid, encoding: str, *, full_scale: float = 255.0) -> Raster | None:
@@ -450,7 +461,7 @@ def _clearest(loaded: list[_LoadedDay]) -> Image:
         "snow_share": round(first.snow_share, 4),
         "water_share": round(first.water_share, 4),
     }
-    return Image(values.astype(np.float32), first.day.time, used, report)
+    return Image(values.astype(np.float32), first.day.time, first.day.time.date(), used, report)
 
 
 def _median(loaded: list[_LoadedDay]) -> Image:
@@ -465,7 +476,9 @@ def _median(loaded: list[_LoadedDay]) -> Image:
         "known_share": round(float(known.all(axis=2).mean()), 5),
         "note": "a median of several suns has no time; its light cannot be taken out",
     }
-    return Image(values, None, [use for each in loaded for use in each.used], report)
+    times = sorted(each.day.time for each in loaded)
+    used = [use for each in loaded for use in each.used]
+    return Image(values, None, times[len(times) // 2].date(), used, report)
 
 
 def _iso(time: datetime) -> str:

@@ -67,7 +67,7 @@ class Source(Declaration):
     kind
         ``elevation`` or ``imagery``.
     catalogue, collection
-        STAC API and collection.
+        STAC API and collection; left out where there is none, so that the source is only known by its downloaded files.
     assets
         Asset keys, or patterns with ``*``: one for elevation, one (with all colours) or three (red, green, blue) for
         imagery.
@@ -101,7 +101,7 @@ class Source(Declaration):
         Region of buckets in ``s3://`` addresses, which are read by HTTPS.
     token_url
         Address of a freely given token that is added to the files' addresses.
-    file_pattern
+    file_patterns
         Names of files that were downloaded from this source.
     covers_deg
         West, south, east and north bounds outside of which the source has nothing [deg].
@@ -111,9 +111,9 @@ class Source(Declaration):
 
     title: str
     kind: Literal["elevation", "imagery"]
-    catalogue: str = Field(pattern=r"^https?://")
-    collection: str
-    assets: list[str] = Field(min_length=1, max_length=3)
+    catalogue: str | None = Field(default=None, pattern=r"^https?://")
+    collection: str = ""
+    assets: list[str] = Field(default_factory=list, max_length=3)
     spacing_m: float = Field(gt=0.0)
     in_degrees: bool = False
     bytes_per_sample: float = Field(gt=0.0)
@@ -131,17 +131,29 @@ class Source(Declaration):
     cloud_property: str | None = None
     s3_region: str | None = None
     token_url: str | None = None
-    file_pattern: str | None = None
+    file_patterns: list[str] = Field(default_factory=list)
     covers_deg: list[float] | None = Field(default=None, min_length=4, max_length=4)
     notes: list[str] = Field(default_factory=list)
 
     @model_validator(mode="after")
     def _complete(self) -> Source:
-        if self.kind == "elevation" and (self.vertical_datum is None or len(self.assets) != 1):
+        if self.catalogue is None:
+            if not self.file_patterns or self.collection or self.assets:
+                raise ValueError("without a 'catalogue' a source has 'file_patterns', no 'collection' and no 'assets'")
+        elif not self.collection or not self.assets:
+            raise ValueError("a 'catalogue' needs 'collection' and 'assets'")
+        if self.kind == "elevation" and (self.vertical_datum is None or len(self.assets) > 1):
             raise ValueError("elevation needs 'vertical_datum' and one asset")
         if self.kind == "imagery" and len(self.assets) == 2:
             raise ValueError("imagery needs one asset with all colours, or red, green and blue")
         return self
+
+    @property
+    def catalogue_url(self) -> str:
+        """Address of the catalogue; `ValueError` for a source without one."""
+        if self.catalogue is None:
+            raise ValueError(f"{self.title}: has no catalogue")
+        return self.catalogue
 
     def finest_m(self, latitude_deg: float) -> float:
         """Distance of samples along the finer direction [m]; grids of degrees become sparser beyond 50°."""
@@ -177,6 +189,14 @@ def read_source(name: str) -> Source:
 def source_of(name: str, kind: str, *, flag: str) -> Source:
     """The bundled source of a kind that an argument names; `InputError` about the argument otherwise."""
     names = source_names(kind)
+    if name in names and read_source(name).catalogue is None:
+        source = read_source(name)
+        raise InputError(
+            flag,
+            f"{source.title} has no catalogue that can be asked",
+            got=name,
+            cure=f"download tiles ({source.licence_url}) and name them: {flag} 'tiles/{source.file_patterns[0]}'",
+        )
     if name not in names:
         raise InputError(
             flag,
@@ -191,6 +211,6 @@ def source_of_file(file_name: str, kind: str) -> tuple[str, Source] | None:
     """Name and declaration of the bundled source whose downloaded files are called like this one."""
     for name in source_names(kind):
         source = read_source(name)
-        if source.file_pattern is not None and fnmatch(file_name, source.file_pattern):
+        if any(fnmatch(file_name, pattern) for pattern in source.file_patterns):
             return name, source
     return None

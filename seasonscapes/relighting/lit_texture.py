@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from seasonscapes.relighting.luminous_efficacy import efficacies_lm_w
+from seasonscapes.rendering.coefficients import SamplingOptions
 from seasonscapes.rendering.hemisphere_rays import RayScene
 from seasonscapes.rendering.irradiance import irradiance_blocks
-from seasonscapes.rendering.transport import SamplingOptions
 from seasonscapes.sky.illumination import Illumination, diffuse_horizontal_illuminance, luminance
 
 Progress = Callable[[float], None]

@@ -19,12 +19,12 @@ from seasonscapes.cameras.panorama import Panorama
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.errors import DamagedFile
 from seasonscapes.frames import LocalFrame
+from seasonscapes.rendering.coefficients import MirrorCoefficients, PointCoefficients, SamplingOptions, ViewCoefficients
 from seasonscapes.rendering.hemisphere_rays import SurfacePoints
 from seasonscapes.rendering.light_clusters import LightClusters, ReceiverCoefficients
-from seasonscapes.rendering.transport import PointCoefficients, SamplingOptions, ViewCoefficients
 
 # Format of the files: increment whenever a stored field is added, removed or renamed.
-REVISION = 4
+REVISION = 5
 _TYPES: dict[str, type] = {
     stored.__name__: stored
     for stored in (
@@ -35,6 +35,7 @@ _TYPES: dict[str, type] = {
         ReceiverCoefficients,
         LightClusters,
         SamplingOptions,
+        MirrorCoefficients,
         PointCoefficients,
         ViewCoefficients,
     )

@@ -32,17 +32,15 @@ class DirectionBasis:
 
 
 @cache
-def _roots(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Symmetric square root of the covariance of skies, and the inverse of that root, ``(P, P)`` each."""
-    values, vectors = np.linalg.eigh(sky_second_moments(sky_patches(name)))
-    root = np.sqrt(np.maximum(values, 1e-9))
-    return (vectors * root) @ vectors.T, (vectors / root) @ vectors.T
+def _root(name: str) -> np.ndarray:
+    """A root L of the covariance of skies, C = L Lᵀ, lower triangular ``(P, P)``."""
+    return np.linalg.cholesky(sky_second_moments(sky_patches(name)))
 
 
 def direction_basis(rows: np.ndarray, patches: SkyPatches, rank: int) -> DirectionBasis:
     """Compute the principal components of daylight coefficients, weighted by the covariance of skies.
 
-    With C the covariance of sky patch radiances, the first singular vectors of ``rows C^½`` minimise the mean square
+    With C = L Lᵀ the covariance of sky patch radiances, the first singular vectors of ``rows L`` minimise the mean square
     error of ``rows · sky`` over these skies (Sloan, Hall, Hart & Snyder 2003, doi:10.1145/882262.882281, with one
     cluster).
 
@@ -60,14 +58,17 @@ def direction_basis(rows: np.ndarray, patches: SkyPatches, rank: int) -> Directi
     DirectionBasis
         Projection, reconstruction from the sky, and approximation error.
     """
-    half, inverse = _roots(patches.name)
-    weighted = np.asarray(rows, np.float64) @ half
-    power, components = np.linalg.eigh(weighted.T @ weighted)
-    power, components = np.maximum(power[::-1], 0.0), components[:, ::-1][:, :rank]
-    projection = half @ components
+    from threadpoolctl import threadpool_limits
+
+    # On some hundred patches, threads of BLAS wait for each other longer than they work.
+    with threadpool_limits(limits=1, user_api="blas"):
+        root = _root(patches.name)
+        weighted = np.asarray(rows, np.float64) @ root
+        power, components = np.linalg.eigh(weighted.T @ weighted)
+        power, components = np.maximum(power[::-1], 0.0), components[:, ::-1][:, :rank]
+        projection = root @ components
+        from_sky = np.linalg.solve(root.T, components)
     # Coefficients are scaled to a standard deviation of 1, where half precision is accurate.
     scale = 1.0 / np.maximum(np.asarray(rows @ projection).std(axis=0), 1e-12)
     error = float(np.sqrt(power[rank:].sum() / max(power.sum(), 1e-300)))
-    return DirectionBasis(
-        (projection * scale).astype(np.float32), (inverse @ components / scale).astype(np.float32), error
-    )
+    return DirectionBasis((projection * scale).astype(np.float32), (from_sky / scale).astype(np.float32), error)

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from seasonscapes.rendering.coefficients import SamplingOptions
 from seasonscapes.rendering.hemisphere_rays import RayScene
 from seasonscapes.rendering.irradiance import surface_at
 from seasonscapes.rendering.light_clusters import LightClusters
-from seasonscapes.rendering.transport import SamplingOptions, prepare_transport, trace_points
+from seasonscapes.rendering.transport import prepare_transport, trace_points
 
 _PILOTS = 1 << 17
 _BLOCK = 1 << 17

@@ -170,6 +170,36 @@ def surface_points(terrain: RayScene, interaction: Any, active: Any) -> SurfaceP
     return points
 
 
+def albedo_at(terrain: RayScene, uv: np.ndarray, position_m: np.ndarray | None = None) -> np.ndarray:
+    """Look up the terrain's current reflectance for diffuse light.
+
+    Parameters
+    ----------
+    terrain
+        The terrain.
+    uv
+        ``(..., 2)`` texture coordinates, v upwards.
+    position_m
+        ``(..., 3)`` positions [m], which detail of the albedo depends on.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(..., 3)`` float32.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    interaction = dr.zeros(mi.SurfaceInteraction3f)
+    u, v = (mi.Float(np.ascontiguousarray(uv[..., k].ravel(), np.float32)) for k in range(2))
+    interaction.uv = mi.Point2f(u, 1.0 - v)
+    if position_m is not None:
+        interaction.p = mi.Point3f(point3(np.asarray(position_m).reshape(-1, 3)))
+    values = np.array(terrain.mi_terrain.bsdf().eval_diffuse_reflectance(interaction, True))
+    # A uniform albedo is a single value.
+    return np.broadcast_to(values.T, (u.shape[0], 3)).reshape(*uv.shape[:-1], 3)
+
+
 def texture_at(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
     """Look up a texture bilinearly, with the filter of the renderer's own textures.
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from seasonscapes.rendering.backend import point3
+from seasonscapes.rendering.coefficients import PointCoefficients, SamplingOptions
 from seasonscapes.rendering.hemisphere_rays import RayScene, SurfacePoints, surface_points
 from seasonscapes.rendering.receivers import (
     ClusterLight,
@@ -22,7 +23,7 @@ from seasonscapes.rendering.receivers import (
     upload_receivers,
 )
 from seasonscapes.rendering.sun_visibility import SunRays, hashed_disc_offset, sun_rays, visible_cosine
-from seasonscapes.rendering.transport import PointCoefficients, SamplingOptions, prepare_transport, trace_points
+from seasonscapes.rendering.transport import prepare_transport, trace_points
 from seasonscapes.sky.illumination import Illumination
 
 # Points per block: their coefficients take about 300 bytes each.

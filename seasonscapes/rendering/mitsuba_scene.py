@@ -48,7 +48,7 @@ class RenderScene:
 
 
 def mi_mesh(terrain: Terrain, albedo: np.ndarray, *, smooth: bool = True) -> Any:
-    """Create a Mitsuba mesh with a Lambertian material.
+    """Create a Mitsuba mesh with its material; see `terrain_material`.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def mi_mesh(terrain: Terrain, albedo: np.ndarray, *, smooth: bool = True) -> Any
             "wrap_mode": "clamp",
         }
     properties = mi.Properties()
-    properties["bsdf"] = terrain_material(reflectance, terrain.surface if smooth else None)
+    properties["bsdf"] = terrain_material(reflectance, terrain, smooth=smooth)
     mesh = mi.Mesh(
         "terrain",
         len(terrain.vertices),

@@ -2,7 +2,8 @@
 
 Mitsuba's general ``path`` integrator spends half of its emitter samples on the sun and the other half on directions of
 the sky. Here each vertex casts one shadow ray to the sun and one to the moon, and the cosine-sampled continuation ray
-samples the sky. The expectation and the number of rays are the same, with much less noise.
+samples the sky. The expectation and the number of rays are the same, with much less noise. Water that the viewer sees,
+directly or in other water, mirrors (`water_surface`); snow that the viewer sees directly scatters (`snow_scattering`).
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.rendering.gbuffer import mi_rays
 from seasonscapes.rendering.mitsuba_scene import LUMINARY_DISTANCE_M, RenderScene
 from seasonscapes.rendering.sobol import hashed, sobol_pair, uniform
-from seasonscapes.rendering.terrain_material import leaving_points, shadow_ray_start
+from seasonscapes.rendering.terrain_material import device_water, leaving_points, shadow_ray_start, snow_optics
 from seasonscapes.sky.illumination import Luminary
 
 # Farther hits are the polygons of sun and moon, which only Mitsuba's own integrators use.
@@ -27,16 +28,19 @@ FAR_M = 0.1 * LUMINARY_DISTANCE_M
 # the least noise in equal time among 1 and 2 times √throughput and throughput, for albedos of 0.1 to 0.5.
 SURVIVAL = 2.0
 # Keys of the random decisions at a path vertex, mixed into their hashes.
-_PIXEL, _BOUNCE, _SURVIVAL, _LUMINARY = 0, 1, 3, 4
+_PIXEL, _BOUNCE, _SURVIVAL, _LUMINARY, _WAVE, _FRESNEL = 0, 1, 3, 4, 7, 8
 
 
 @dataclass(frozen=True)
 class _DeviceLuminary:
-    """Sun or moon on the device: frame towards its centre, cosine of its angular radius, and normal illuminance."""
+    """Sun or moon on the device: frame towards its centre, cosine and squared sine of its angular radius, normal illuminance
+    and radiance of its disc."""
 
     mi_frame: Any
     mi_cos_radius: Any
+    mi_sin2_radius: Any
     mi_illuminance: Any
+    mi_radiance: Any
 
 
 def trace_block(
@@ -105,8 +109,11 @@ def _upload_luminary(luminary: Luminary) -> _DeviceLuminary:
         return dr.opaque(mi.Float, float(value))
 
     frame = mi.Frame3f(mi.Vector3f(*map(opaque, luminary.direction)))
-    illuminance = mi.Color3f(*map(opaque, luminary.normal_illuminance_lx))
-    return _DeviceLuminary(frame, opaque(np.cos(np.radians(luminary.angular_radius_deg))), illuminance)
+    radius = np.radians(luminary.angular_radius_deg)
+    illuminance = np.asarray(luminary.normal_illuminance_lx, float)
+    radiance = illuminance / (4.0 * np.pi * np.sin(0.5 * radius) ** 2)
+    colours = (mi.Color3f(*map(opaque, colour)) for colour in (illuminance, radiance))
+    return _DeviceLuminary(frame, opaque(np.cos(radius)), opaque(np.sin(radius) ** 2), *colours)
 
 
 def _luminaries(scene: RenderScene) -> list[_DeviceLuminary]:
@@ -131,31 +138,98 @@ def _trace(scene: RenderScene, ray: Any, sample_key: Any, index: Any, max_depth:
 
     mi_terrain, mi_sky, luminaries = scene.mi_terrain, scene.mi_scene.environment(), _luminaries(scene)
     material = mi_terrain.bsdf()
+    water, snow = device_water(material), snow_optics(material)
 
-    def step(ray: Any, radiance: Any, throughput: Any, depth: Any, active: Any, on_terrain: Any) -> tuple[Any, ...]:
+    def step(
+        ray: Any, radiance: Any, throughput: Any, depth: Any, active: Any, on_terrain: Any, seen: Any, most: Any
+    ) -> tuple[Any, ...]:
+        # ``seen``: only mirrors lie between here and the viewer. ``most``: longest path; a mirror makes it one longer.
         preliminary = scene.mi_scene.ray_intersect_preliminary(ray, coherent=depth == 0, active=active)
         hit = active & preliminary.is_valid() & (preliminary.t < FAR_M)
         radiance += _sky_radiance(mi_sky, ray.d, throughput, active & ~hit & (depth > 0))
-        on_terrain |= hit
+        if water is not None and water.smooth:
+            radiance += _discs(luminaries, ray.d, throughput, active & ~hit & (depth > 0) & seen)
+        on_terrain |= hit & (depth == 0)
         key = hashed(sample_key, depth)
         survival = dr.select(depth > 0, dr.minimum(SURVIVAL * dr.sqrt(dr.max(throughput)), 1.0), 1.0)
-        active = hit & (depth + 1 < max_depth) & (uniform(hashed(key, _SURVIVAL)) < survival)
+        active = hit & (depth + 1 < most) & (uniform(hashed(key, _SURVIVAL)) < survival)
         throughput /= survival
         # Called on the mesh: the same call on the scene would first look up the shape of each lane.
         surface = mi_terrain.compute_surface_interaction(ray, preliminary, mi.RayFlags.All, active)
         active &= dr.dot(surface.n, ray.d) < 0.0
         origin, outward, normal = leaving_points(material, surface, active)
-        throughput = dr.select(active, throughput * material.eval_diffuse_reflectance(surface, active), throughput)
-        light = _direct_light(scene, luminaries, (origin, outward, normal), key, index, active, depth == 0)
-        radiance += dr.select(active, throughput * light, 0.0)
+        reflectance = material.eval_diffuse_reflectance(surface, active)
         direction = mi.warp.square_to_cosine_hemisphere(sobol_pair(hashed(key, _BOUNCE), index))
         direction = mi.Frame3f(normal).to_world(direction)
-        active &= (dr.max(throughput) > 0.0) & (dr.dot(direction, outward) > 0.0)
-        return mi.Ray3f(origin, direction), radiance, throughput, depth + 1, active, on_terrain
+        mirrored, before, glitter, relative = mi.Bool(False), throughput, None, None
+        if snow is not None:
 
-    start = (mi.Ray3f(ray), mi.Color3f(0.0), mi.Color3f(1.0), mi.UInt32(0), mi.Bool(True), mi.Bool(False))
-    _, radiance, _, _, _, on_terrain = dr.while_loop(start, lambda *state: state[4], step, label="path over terrain")
+            def relative(light: Any, normal: Any = normal, viewer: Any = -ray.d, albedo: Any = reflectance) -> Any:
+                """Of snow; the interpolated normal may face away from the viewer, who sees the facet all the same."""
+                cosines = (dr.dot(normal, viewer), dr.dot(normal, light), dr.dot(viewer, light))
+                return mi.Color3f(*snow.relative(albedo, cosines, dr))
+
+        if water is not None:
+            on_water = active & seen & water.covers(surface.uv, active)
+            wave, share = water.mirrored(normal, -ray.d, sobol_pair(hashed(key, _WAVE), index))
+            # A facet mirrors or lets in; the facet that is seen decides.
+            mirrored = on_water & (sobol_pair(hashed(key, _FRESNEL), index).x < share)
+            reflectance = dr.select(on_water, material.body(surface, on_water), reflectance)
+            reflectance = dr.select(mirrored, 1.0, reflectance)
+            direction = dr.select(mirrored, wave, direction)
+            if not water.smooth:
+
+                def glitter(light: Any, normal: Any = normal, viewer: Any = -ray.d, on_water: Any = on_water) -> Any:
+                    return dr.select(on_water, water.glitter(normal, viewer, light), 0.0)
+
+        throughput = dr.select(active, throughput * reflectance, throughput)
+        diffuse = dr.select(mirrored, 0.0, throughput)
+        scatters = active & (depth == 0)
+        if water is not None:
+            scatters &= ~on_water
+        if relative is not None:
+            throughput = dr.select(scatters, throughput * relative(direction), throughput)
+        light = _direct_light(
+            scene,
+            luminaries,
+            (origin, outward, normal),
+            (diffuse, scatters, relative, before, glitter),
+            sample=(key, index),
+            active=active,
+            coherent=depth == 0,
+        )
+        radiance += dr.select(active, light, 0.0)
+        seen &= mirrored
+        most = dr.select(mirrored & (most == max_depth), most + 1, most)
+        active &= (dr.max(throughput) > 0.0) & (dr.dot(direction, outward) > 0.0)
+        return mi.Ray3f(origin, direction), radiance, throughput, depth + 1, active, on_terrain, seen, most
+
+    start = (
+        mi.Ray3f(ray),
+        mi.Color3f(0.0),
+        mi.Color3f(1.0),
+        mi.UInt32(0),
+        mi.Bool(True),
+        mi.Bool(False),
+        mi.Bool(True),
+        mi.UInt32(max_depth),
+    )
+    _, radiance, _, _, _, on_terrain, *_ = dr.while_loop(
+        start, lambda *state: state[4], step, label="path over terrain"
+    )
     return radiance, on_terrain
+
+
+def _discs(luminaries: list[_DeviceLuminary], direction: Any, throughput: Any, escaped: Any) -> Any:
+    """Throughput × radiance of the discs of sun and moon along ``direction``, zero for lanes that have not escaped."""
+    import mitsuba as mi
+
+    total = mi.Color3f(0.0)
+    for luminary in luminaries:
+        local = luminary.mi_frame.to_local(direction)
+        inside = escaped & (local.z > 0.0) & (local.x * local.x + local.y * local.y < luminary.mi_sin2_radius)
+        total += dr.select(inside, throughput * luminary.mi_radiance, 0.0)
+    return total
 
 
 def _sky_radiance(mi_sky: Any, direction: Any, throughput: Any, escaped: Any) -> Any:
@@ -173,15 +247,22 @@ def _direct_light(
     scene: RenderScene,
     luminaries: list[_DeviceLuminary],
     leaving: tuple[Any, Any, Any],
-    key: Any,
-    index: Any,
+    reflection: tuple[Any, Any, Any, Any, Any],
+    *,
+    sample: tuple[Any, Any],
     active: Any,
     coherent: Any,
 ) -> Any:
-    """Radiance that a white surface reflects of the direct light of sun and moon, with one shadow ray for each."""
+    """Radiance that a surface reflects of the direct light of sun and moon, with one shadow ray for each.
+
+    ``reflection``: diffuse throughput; snow, and its relative reflection; throughput before the surface, and the reflection
+    of glitter. Reflections are functions of the direction, or ``None``.
+    """
     import mitsuba as mi
 
     origin, outward, normal = leaving
+    diffuse, scatters, relative, before, glitter = reflection
+    key, index = sample
     material = scene.mi_terrain.bsdf()
     total = mi.Color3f(0.0)
     for number, luminary in enumerate(luminaries):
@@ -192,5 +273,10 @@ def _direct_light(
         ray: Any = mi.Ray3f(origin + direction * shadow_ray_start(material, cosine), direction)
         ray.maxt = FAR_M
         shadowed = scene.mi_scene.ray_test(ray, coherent=coherent, active=facing)
-        total += dr.select(facing & ~shadowed, cosine * dr.inv_pi * luminary.mi_illuminance, 0.0)
+        reflected = diffuse * cosine * dr.inv_pi
+        if relative is not None:
+            reflected = dr.select(scatters, reflected * relative(direction), reflected)
+        if glitter is not None:
+            reflected += before * glitter(direction)
+        total += dr.select(facing & ~shadowed, reflected * luminary.mi_illuminance, 0.0)
     return total

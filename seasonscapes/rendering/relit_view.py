@@ -11,8 +11,10 @@ import cv2
 import numpy as np
 
 from seasonscapes.rendering.air_grid import AirGrid, SkyGrid, air_grid, interpolate_air, sky_grid, sky_pixel_radiance
+from seasonscapes.rendering.coefficients import ViewCoefficients
 from seasonscapes.rendering.gbuffer import GBuffer, trace_gbuffer
-from seasonscapes.rendering.hemisphere_rays import RayScene, texture_at
+from seasonscapes.rendering.hemisphere_rays import RayScene, albedo_at
+from seasonscapes.rendering.mirrored_light import DeviceMirror, mirrored_radiance, upload_mirror
 from seasonscapes.rendering.mitsuba_scene import RenderScene
 from seasonscapes.rendering.radiance import RenderedView
 from seasonscapes.rendering.receivers import (
@@ -24,6 +26,7 @@ from seasonscapes.rendering.receivers import (
     upload_clusters,
     upload_receivers,
 )
+from seasonscapes.rendering.snow_scattering import SnowOptics
 from seasonscapes.rendering.sun_visibility import (
     SunRays,
     bayer_disc_offset,
@@ -31,7 +34,8 @@ from seasonscapes.rendering.sun_visibility import (
     sum_incidence,
     sun_rays,
 )
-from seasonscapes.rendering.transport import ViewCoefficients, view_neighbours
+from seasonscapes.rendering.terrain_material import snow_optics
+from seasonscapes.rendering.transport import view_neighbours
 from seasonscapes.sky.illumination import Illumination, Luminary
 
 # Ratio of distances within a pixel above which it contains more than one surface,
@@ -70,6 +74,10 @@ class RelightableView:
         Grid at which aerial perspective is evaluated.
     sky
         Grid at which sky radiance is evaluated.
+    mirror
+        What the water in the view mirrors; ``None`` without water.
+    snow
+        How snow scatters; ``None``: it is Lambertian.
     """
 
     coefficients: ViewCoefficients
@@ -81,6 +89,8 @@ class RelightableView:
     coverage: np.ndarray
     air: AirGrid
     sky: SkyGrid
+    mirror: DeviceMirror | None = None
+    snow: SnowOptics | None = None
 
 
 def relightable_view(terrain: RayScene, coefficients: ViewCoefficients) -> RelightableView:
@@ -128,6 +138,8 @@ def relightable_view(terrain: RayScene, coefficients: ViewCoefficients) -> Relig
         coverage,
         air,
         sky_grid(camera, np.flatnonzero(coverage.reshape(-1) < 1.0)),
+        upload_mirror(terrain, coefficients),
+        snow_optics(terrain.mi_terrain.bsdf()),
     )
 
 
@@ -144,7 +156,9 @@ def _distances(coefficients: ViewCoefficients) -> tuple[np.ndarray, np.ndarray, 
     return distance.min(axis=1), farthest, distance
 
 
-def with_albedo(view: RelightableView, albedo: np.ndarray, cluster_albedo: np.ndarray) -> RelightableView:
+def with_albedo(
+    view: RelightableView, albedo: np.ndarray, cluster_albedo: np.ndarray, mirrored_albedo: np.ndarray | None = None
+) -> RelightableView:
     """Return the view with another albedo of the same terrain (such as another season's).
 
     Parameters
@@ -155,6 +169,8 @@ def with_albedo(view: RelightableView, albedo: np.ndarray, cluster_albedo: np.nd
         ``(n, 3)`` mean albedo of the pixels, from `transport.view_albedo`.
     cluster_albedo
         ``(M, POINTS_PER_CLUSTER, 3)`` albedo of the points of the clusters, from the function `cluster_albedo`.
+    mirrored_albedo
+        ``(m, 3)`` of the ground that water mirrors, from the function `mirrored_albedo`; ``None`` leaves it.
 
     Returns
     -------
@@ -164,18 +180,22 @@ def with_albedo(view: RelightableView, albedo: np.ndarray, cluster_albedo: np.nd
     points = replace(view.clusters.clusters.points, albedo=np.asarray(cluster_albedo, np.float32))
     clusters = replace(view.clusters.clusters, points=points)
     coefficients = replace(view.coefficients, albedo=np.asarray(albedo, np.float32), clusters=clusters)
-    return replace(view, coefficients=coefficients, clusters=replace(view.clusters, clusters=clusters))
+    mirror = view.mirror
+    if mirror is not None and mirrored_albedo is not None:
+        mirror = replace(mirror, albedo=np.asarray(mirrored_albedo, np.float32))
+    clusters = replace(view.clusters, clusters=clusters)
+    return replace(view, coefficients=coefficients, clusters=clusters, mirror=mirror)
 
 
-def cluster_albedo(coefficients: ViewCoefficients, texture: np.ndarray) -> np.ndarray:
-    """Look up the albedo of the cluster points in a texture.
+def cluster_albedo(terrain: RayScene, coefficients: ViewCoefficients) -> np.ndarray:
+    """Look up the current albedo of the terrain at the points of a view's clusters.
 
     Parameters
     ----------
+    terrain
+        The terrain with the albedo, see `mitsuba_scene.set_albedo`.
     coefficients
         Coefficients of a view.
-    texture
-        ``(R, S, 3)`` albedo.
 
     Returns
     -------
@@ -185,8 +205,31 @@ def cluster_albedo(coefficients: ViewCoefficients, texture: np.ndarray) -> np.nd
     points = coefficients.clusters.points
     # An albedo of zero marks surfaces that were hit from their back, which stay black for every texture.
     front = np.asarray(points.albedo).max(axis=-1, keepdims=True) > 0.0
-    values = texture_at(texture, np.asarray(points.uv).reshape(-1, 2)).reshape(points.albedo.shape)
-    return np.where(front, values, 0.0).astype(np.float32)
+    return np.where(front, albedo_at(terrain, np.asarray(points.uv), np.asarray(points.origin)), 0.0).astype(np.float32)
+
+
+def mirrored_albedo(terrain: RayScene, coefficients: ViewCoefficients) -> np.ndarray | None:
+    """Average the current albedo of the terrain over the ground that the water in a view mirrors.
+
+    Parameters
+    ----------
+    terrain
+        The terrain with the albedo, see `mitsuba_scene.set_albedo`.
+    coefficients
+        Coefficients of a view.
+
+    Returns
+    -------
+    numpy.ndarray or None
+        ``(m, 3)`` float32 as in `MirrorCoefficients`; ``None`` without water.
+    """
+    mirror = coefficients.mirror
+    if mirror is None:
+        return None
+    share = np.asarray(mirror.sample_share, np.float32)
+    return np.einsum(
+        "ms,msc->mc", share, albedo_at(terrain, np.asarray(mirror.sample_uv), np.asarray(mirror.sample_origin))
+    )
 
 
 def relight_view(view: RelightableView, illumination: Illumination) -> RenderedView:
@@ -226,12 +269,42 @@ def relit_surface_radiance(view: RelightableView, illumination: Illumination) ->
     numpy.ndarray
         ``(n, 3)`` float32 [cd/m²], averaged over the pixel with the sky counted as black.
     """
-    direct, reflected = incident_light(view.receivers, light_clusters(view.clusters, illumination))
-    total = direct + reflected
+    clusters = light_clusters(view.clusters, illumination)
+    total = np.add(*incident_light(view.receivers, clusters))
+    snow = None if view.snow is None else _SnowPixels(view, view.snow)
+    if snow is not None:
+        total *= snow.of_diffuse_light()
     for body in luminaries(illumination):
         light = np.asarray(body.normal_illuminance_lx, np.float32) / np.float32(np.pi)
-        total += sun_cosine(view, body)[:, None] * light
-    return total * view.coefficients.albedo
+        lit = sun_cosine(view, body)[:, None] * light
+        total += lit if snow is None else lit * snow.of_luminary(body)
+    radiance = total * view.coefficients.albedo
+    if view.mirror is not None:
+        radiance[view.mirror.coefficients.pixel] += mirrored_radiance(view.mirror, illumination, clusters)
+    return radiance
+
+
+class _SnowPixels:
+    """Reflection of the n terrain pixels towards the camera relative to Lambertian ground, each ``(n, 3)``."""
+
+    def __init__(self, view: RelightableView, snow: SnowOptics) -> None:
+        coefficients = view.coefficients
+        self._snow = snow
+        self._albedo = list((coefficients.albedo / np.maximum(coefficients.coverage[:, None], 1e-3)).T)
+        normal = coefficients.normal
+        self._normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-6)
+        # Samples on terrain come first.
+        viewer = coefficients.camera.position_m.astype(np.float32) - coefficients.sample_origin[:, 0]
+        self._viewer = viewer / np.linalg.norm(viewer, axis=1, keepdims=True)
+        self._cosine = np.einsum("nk,nk->n", self._normal, self._viewer)
+
+    def of_diffuse_light(self) -> np.ndarray:
+        return np.stack(self._snow.relative_diffuse(self._albedo, self._cosine), axis=1).astype(np.float32)
+
+    def of_luminary(self, body: Luminary) -> np.ndarray:
+        light = np.asarray(body.direction, np.float32)
+        cosines = (self._cosine, self._normal @ light, self._viewer @ light)
+        return np.stack(self._snow.relative(self._albedo, cosines), axis=1).astype(np.float32)
 
 
 def sun_cosine(view: RelightableView, luminary: Luminary) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Lambertian material of terrain whose normals come from a smooth surface instead of the triangles.
+"""Material of terrain: Lambertian ground whose normals come from a smooth surface, and water that mirrors.
 
 The triangles decide what is visible. Slopes for shading are those of the heights (`terrain.surface.SurfaceGrid`), so that
 large facets shade like the ground that they approximate: a plain stays level up to the foot of a cliff, and shaded
@@ -8,6 +8,9 @@ slopes show no triangles. A facet is lit and seen as the surface that it approxi
   that face away would otherwise make black slivers along crests.
 * Rays start from the smooth surface where this lies above the facet (cf. Hanika 2021, "Hacking the shadow terminator",
   in Ray Tracing Gems II, doi:10.1007/978-1-4842-7185-8_4), and not from the facet, whose plane would cut them off.
+
+Water (`water_surface`) mirrors where the viewer sees it, directly or in other water; lit by it or seen in the diffuse light
+of other ground, it is Lambertian. So is snow (`snow_scattering`) but for the light that it sends to the viewer directly.
 """
 
 from __future__ import annotations
@@ -18,8 +21,12 @@ from typing import Any
 import numpy as np
 
 from seasonscapes.frames import MEAN_RADIUS_M
+from seasonscapes.rendering.albedo_detail import DeviceDetail
 from seasonscapes.rendering.backend import use_backend
-from seasonscapes.terrain.surface import SurfaceGrid
+from seasonscapes.rendering.snow_scattering import SnowOptics
+from seasonscapes.rendering.water_surface import REFRACTIVE_INDEX, DeviceWater, slope_variance
+from seasonscapes.terrain.surface import RIM_SHARE, SurfaceGrid, Terrain
+from seasonscapes.terrain.surface_classes import Water
 
 # Mitsuba's math::RayEpsilon in single precision.
 RAY_EPSILON = float(np.finfo(np.float32).epsneg) * 1500.0
@@ -52,9 +59,21 @@ class DeviceSurface:
         self.mi_error = dr.opaque(mi.Float, grid.mesh_error_m)
         self.mi_reach = dr.opaque(mi.Float, _REACH_NODES * grid.spacing_m)
         self._mi_domain = [dr.opaque(mi.Float, value) for value in (*grid.domain[:2], 1.0 / grid.domain[2])]
+        self.inner = None if grid.inner is None else DeviceSurface(grid.inner)
+        # Distances from the rim in texture coordinates, scaled to 1 where an inner surface counts fully.
+        rim = RIM_SHARE * min(rows, columns)
+        self._mi_rim = [dr.opaque(mi.Float, float(value)) for value in (columns / rim, rows / rim, 0.5 / rim)]
 
     def sample(self, mi_position: Any, active: Any = True) -> tuple[Any, Any]:
         """Return the unit normal ``mi.Normal3f`` and the up coordinate ``mi.Float`` [m] of the surface at positions."""
+        import drjit as dr
+        import mitsuba as mi
+
+        slope_east, slope_north, up, _ = self._slopes(mi_position, active)
+        return dr.normalize(mi.Normal3f(-slope_east, -slope_north, 1.0)), up
+
+    def _slopes(self, mi_position: Any, active: Any) -> tuple[Any, Any, Any, Any]:
+        """Slopes, up coordinate [m], and share in the surface around; see `SurfaceGrid.share_at`."""
         import drjit as dr
         import mitsuba as mi
 
@@ -63,7 +82,16 @@ class DeviceSurface:
         north = (mi_position.y * shrink - self._mi_domain[1]) * self._mi_domain[2]
         uv = mi.Point2f(*(self._polynomial(terms, east, north) for terms in self._mi_terms))
         slope_east, slope_north, up = self._mi_texture.eval(uv, active)
-        return dr.normalize(mi.Normal3f(-slope_east, -slope_north, 1.0)), up
+        across, down, half = self._mi_rim
+        inside = dr.minimum(dr.minimum(uv.x, 1.0 - uv.x) * across - half, dr.minimum(uv.y, 1.0 - uv.y) * down - half)
+        share = dr.clip(inside, 0.0, 1.0)
+        if self.inner is not None:
+            *finer, weight = self.inner._slopes(mi_position, active)
+            slope_east, slope_north, up = (
+                value + weight * (fine - value)
+                for value, fine in zip((slope_east, slope_north, up), finer, strict=True)
+            )
+        return slope_east, slope_north, up, share
 
     def _polynomial(self, terms: list[Any], east: Any, north: Any) -> Any:
         """Horner's scheme in north within one in east; terms in the order of `terrain.surface.exponents`."""
@@ -97,7 +125,8 @@ def shading_normal(material: Any, interaction: Any, active: Any = True) -> Any:
         Of the smooth surface, or interpolated over the facet where the terrain has none.
     """
     surface = device_surface(material)
-    return interaction.sh_frame.n if surface is None else surface.sample(interaction.p, active)[0]
+    normal = interaction.sh_frame.n if surface is None else surface.sample(interaction.p, active)[0]
+    return _level_water(material, interaction, normal)
 
 
 def leaving_points(material: Any, interaction: Any, active: Any = True) -> tuple[Any, Any, Any]:
@@ -127,11 +156,33 @@ def leaving_points(material: Any, interaction: Any, active: Any = True) -> tuple
     offset = (1.0 + dr.max(dr.abs(interaction.p))) * RAY_EPSILON
     surface = device_surface(material)
     if surface is None:
-        return interaction.p + interaction.n * offset, interaction.n, interaction.sh_frame.n
+        outward, normal = (
+            _level_water(material, interaction, each) for each in (interaction.n, interaction.sh_frame.n)
+        )
+        return interaction.p + interaction.n * offset, outward, normal
     normal, up = surface.sample(interaction.p, active)
+    normal = _level_water(material, interaction, normal)
     # The distance to a slope is less than the vertical one.
     lift = dr.maximum(up - interaction.p.z, 0.0) * normal.z
     return interaction.p + interaction.n * offset + normal * lift, normal, normal
+
+
+def _level_water(material: Any, interaction: Any, normal: Any) -> Any:
+    """Normals of the ground, and of still water where there is water."""
+    import drjit as dr
+
+    water = device_water(material)
+    return normal if water is None else dr.select(water.covers(interaction.uv), water.vertical(interaction.p), normal)
+
+
+def device_water(material: Any) -> DeviceWater | None:
+    """The water of a terrain's material; ``None`` where it has none, or where it is that of the scalar variant."""
+    return getattr(material, "water", None)
+
+
+def snow_optics(material: Any) -> SnowOptics | None:
+    """The snow of a terrain's material; ``None`` where it has none, or where it is that of the scalar variant."""
+    return getattr(material, "snow", None)
 
 
 def device_surface(material: Any) -> DeviceSurface | None:
@@ -162,32 +213,56 @@ def shadow_ray_start(material: Any, cosine: Any) -> Any:
     return dr.minimum(surface.mi_error / dr.maximum(cosine, 1e-3), surface.mi_reach)
 
 
-def terrain_material(reflectance: dict[str, Any], surface: SurfaceGrid | None) -> Any:
+def terrain_material(reflectance: dict[str, Any], terrain: Terrain, *, smooth: bool = True) -> Any:
     """Create the material of a terrain.
 
     Parameters
     ----------
     reflectance
         Mitsuba's dictionary of a texture.
-    surface
-        The smooth surface; ``None``: normals are those of the mesh. The scalar variant, which would call Python for every
-        sample, has Mitsuba's own diffuse material with the normals of the mesh.
+    terrain
+        Its smooth surface, its water and its snow.
+    smooth
+        Shade with the normals of the smooth surface; else with those of the mesh. The scalar variant, which would call
+        Python for every sample, has Mitsuba's own materials with the normals of the mesh.
 
     Returns
     -------
     mi.BSDF
-        Lambertian, one-sided.
+        One-sided. To Mitsuba's own integrators, water is Lambertian except in the scalar variant.
     """
     import mitsuba as mi
 
     if use_backend().device == "scalar":
-        return mi.load_dict({"type": "diffuse", "reflectance": reflectance})
+        ground = {"type": "diffuse", "reflectance": reflectance}
+        return mi.load_dict(ground if terrain.water is None else _scalar_water(ground, terrain.water))
     variant = mi.variant()
     assert variant is not None
     _register(variant)
     material: Any = mi.load_dict({"type": _PLUGIN, "reflectance": reflectance})
-    material.surface = None if surface is None else DeviceSurface(surface)
+    material.surface = DeviceSurface(terrain.surface) if smooth and terrain.surface is not None else None
+    material.detail = None if terrain.detail is None else DeviceDetail(terrain.detail)
+    material.snow = None if terrain.snow is None else SnowOptics(terrain.snow)
+    material.water = None if terrain.water is None else DeviceWater(terrain.water, terrain.frame)
     return material
+
+
+def _scalar_water(ground: dict[str, Any], water: Water) -> dict[str, Any]:
+    """Mitsuba's own plastic, which is water over a diffuse body, where there is water; the ground elsewhere."""
+    import mitsuba as mi
+
+    mask = np.ascontiguousarray(water.mask[..., None] > 0.5, np.float32)
+    body = {
+        "type": "plastic",
+        "int_ior": REFRACTIVE_INDEX,
+        "nonlinear": False,
+        "diffuse_reflectance": ground["reflectance"],
+    }
+    if water.wind_m_s > 0.0:
+        roughness = float(np.sqrt(slope_variance(water.wind_m_s)))
+        body |= {"type": "roughplastic", "distribution": "beckmann", "alpha": roughness}
+    weight = {"type": "bitmap", "data": mi.TensorXf(mask), "raw": True, "filter_type": "nearest", "wrap_mode": "clamp"}
+    return {"type": "blendbsdf", "weight": weight, "ground": ground, "water": body}
 
 
 @cache
@@ -204,12 +279,15 @@ def _material_class() -> Any:
     import mitsuba as mi
 
     class TerrainMaterial(mi.BSDF):
-        """Lambertian reflection about the normals of ``surface``, whatever the normals of the mesh."""
+        """Lambertian reflection about the normals of ``surface``, whatever the normals of the mesh; see `body`."""
 
         def __init__(self, properties: Any) -> None:
             super().__init__(properties)
             self.reflectance = properties.get_texture("reflectance")
             self.surface: Any = None
+            self.water: Any = None
+            self.snow: Any = None
+            self.detail: Any = None
             flags = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
             self.m_components, self.m_flags = [flags], flags
 
@@ -228,7 +306,7 @@ def _material_class() -> Any:
             result.eta = 1.0
             result.sampled_type = mi.UInt32(int(self.m_flags))
             result.sampled_component = mi.UInt32(0)
-            return result, dr.select(active, self.reflectance.eval(si, active), 0.0)
+            return result, dr.select(active, self.eval_diffuse_reflectance(si, active), 0.0)
 
         def eval(self, ctx: Any, si: Any, wo: Any, active: Any) -> Any:
             return self.eval_pdf(ctx, si, wo, active)[0]
@@ -239,10 +317,25 @@ def _material_class() -> Any:
         def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any) -> Any:
             active = self._front(si, active)
             cosine = dr.maximum(dr.dot(self._normal(si, active), si.to_world(wo)), 0.0) * dr.inv_pi
-            return (dr.select(active, self.reflectance.eval(si, active) * cosine, 0.0), dr.select(active, cosine, 0.0))
+            reflectance = self.eval_diffuse_reflectance(si, active)
+            return (dr.select(active, reflectance * cosine, 0.0), dr.select(active, cosine, 0.0))
 
         def eval_diffuse_reflectance(self, si: Any, active: Any) -> Any:
-            return self.reflectance.eval(si, active)
+            """Of the ground, and of water for diffuse light."""
+            albedo = self.body(si, active)
+            if self.water is None:
+                return albedo
+            return dr.select(self.water.covers(si.uv, active), self.water.hemispherical(albedo), albedo)
+
+        def body(self, si: Any, active: Any) -> Any:
+            """The albedo texture: reflectance of the ground, or of the body of water below its surface."""
+            albedo = self.reflectance.eval(si, active)
+            if self.detail is not None:
+                albedo = self.detail.applied(albedo, si.p)
+            if self.snow is None or self.snow.clean is None:
+                return albedo
+            share = self.snow.share(*albedo, dr)
+            return albedo + share * (mi.Color3f(*self.snow.clean) - albedo)
 
         def traverse(self, callback: Any) -> None:
             callback.put("reflectance", self.reflectance, mi.ParamFlags.Differentiable)

@@ -20,6 +20,7 @@ import numpy as np
 from seasonscapes.cameras.panorama import Panorama
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.errors import NoTerrainInView
+from seasonscapes.rendering.coefficients import MirrorCoefficients, PointCoefficients, SamplingOptions, ViewCoefficients
 from seasonscapes.rendering.direction_basis import DirectionBasis, direction_basis
 from seasonscapes.rendering.hemisphere_rays import (
     ESCAPED,
@@ -37,9 +38,22 @@ from seasonscapes.rendering.light_clusters import (
     face_geometry,
     trace_path_hits,
 )
+from seasonscapes.rendering.mirror_samples import (
+    body_albedo,
+    mirror_coefficients,
+    mirror_samples,
+    mirror_weights,
+    water_samples,
+)
 from seasonscapes.rendering.sky_patches import sky_patches
 from seasonscapes.rendering.smoothing import Neighbours, edge_aware_neighbours, smoothed
-from seasonscapes.rendering.view_samples import camera_points, pixel_moments, sample_weights, view_samples
+from seasonscapes.rendering.view_samples import (
+    camera_points,
+    pixel_moments,
+    sample_moments,
+    sample_weights,
+    view_samples,
+)
 
 # Hemisphere rays per block of receivers: their hits and weights take about 20 bytes each.
 BLOCK_RAYS = 1 << 23
@@ -47,128 +61,11 @@ BLOCK_RAYS = 1 << 23
 _DIRECT_SHARPNESS = 64.0
 # Paths that are traced to place the clusters.
 _PILOTS = 1 << 18
+# Distinguishes the random numbers of what a pixel mirrors from its own.
+_MIRRORED = np.uint32(1 << 31)
 # Number of receivers, and rays of each, from which the directional basis is computed.
 _EXAMPLES, _EXAMPLE_RAYS = 4096, 512
 Progress = Callable[[float], None]
-
-
-@dataclass(frozen=True)
-class SamplingOptions:
-    """Sampling options of daylight coefficients.
-
-    Parameters
-    ----------
-    shadow_samples
-        Number S of samples per pixel from which shadow rays start, a square.
-    albedo_samples
-        Samples per pixel for its mean albedo and normal, a square.
-    rays
-        Hemisphere rays per receiver, a power of two.
-    bounces
-        Number of surfaces between light and receiver; 4 equals ``max_depth=6`` of the path tracer.
-    clusters
-        Number M of clusters of faces, a power of two up to 65,536.
-    clusters_per_receiver
-        Number K of clusters stored per receiver, even.
-    rank
-        Number r of daylight coefficients stored per receiver.
-    patches
-        Subdivision of the sky, a name in `sky_patches.SUBDIVISIONS`.
-
-    Raises
-    ------
-    ValueError
-        If a number violates these conditions.
-    """
-
-    shadow_samples: int = 16
-    albedo_samples: int = 64
-    rays: int = 512
-    bounces: int = 4
-    clusters: int = 16384
-    clusters_per_receiver: int = 64
-    rank: int = 32
-    patches: str = "reinhart"
-
-    def __post_init__(self):
-        if (
-            round(self.shadow_samples**0.5) ** 2 != self.shadow_samples
-            or self.rays & (self.rays - 1)
-            or self.bounces < 0
-        ):
-            raise ValueError(
-                "SamplingOptions: shadow_samples must be a square, rays a power of two, bounces not negative"
-            )
-        if self.rays % self.shadow_samples:
-            raise ValueError(
-                f"SamplingOptions: got {self.rays} rays, expected a multiple of the {self.shadow_samples} shadow_samples"
-            )
-        if self.clusters_per_receiver % 2 or not 0 < self.clusters <= 65536:
-            raise ValueError("SamplingOptions: clusters_per_receiver must be even and clusters at most 65536")
-
-
-@dataclass(frozen=True)
-class ViewCoefficients:
-    """Daylight coefficients of a view, for relighting it. n of its pixels show terrain, with S samples each.
-
-    Parameters
-    ----------
-    camera
-        The view.
-    pixel
-        ``(n,)`` int32 flat indices of the pixels that show terrain.
-    coverage
-        ``(n,)`` float32 fraction of the pixel that terrain covers.
-    albedo
-        ``(n, 3)`` float32 mean albedo over the pixel; the sky counts as black.
-    normal
-        ``(n, 3)`` float32 mean shading normal, weighted by luminous albedo.
-    sample_origin
-        ``(n, S, 3)`` float32 origins of shadow rays, ENU [m]; samples on terrain come first.
-    sample_normal, sample_outward
-        ``(n, S, 3)`` float16 shading and geometric normals.
-    sample_weight
-        ``(n, S)`` float16 weight of each sample in the pixel's reflected light, sum 1; 0 in the sky.
-    receivers
-        Coefficients of the pixels.
-    clusters
-        Clusters of faces that reflect light to the pixels.
-    seed, sampling
-        Seed and options they were computed with.
-    """
-
-    camera: Camera | Panorama
-    pixel: np.ndarray
-    coverage: np.ndarray
-    albedo: np.ndarray
-    normal: np.ndarray
-    sample_origin: np.ndarray
-    sample_normal: np.ndarray
-    sample_outward: np.ndarray
-    sample_weight: np.ndarray
-    receivers: ReceiverCoefficients
-    clusters: LightClusters
-    seed: int
-    sampling: SamplingOptions
-
-
-@dataclass(frozen=True)
-class PointCoefficients:
-    """Daylight coefficients of surface points (such as texels), for computing their irradiance.
-
-    Parameters
-    ----------
-    points
-        N surface points.
-    receivers
-        Coefficients of the points.
-    clusters
-        Clusters of faces that reflect light to the points.
-    """
-
-    points: SurfacePoints
-    receivers: ReceiverCoefficients
-    clusters: LightClusters
 
 
 @dataclass(frozen=True)
@@ -247,11 +144,14 @@ def trace_view(
     shared = prepare_transport(terrain, pilot[hit], sampling, seed=seed)
     report(0.1)
     rows = max(1, BLOCK_RAYS // (camera.width_px * sampling.rays))
-    blocks, receivers = [], []
+    blocks, receivers, mirrors = [], [], []
     for top in range(0, camera.height_px, rows):
         block_rows = range(top, min(top + rows, camera.height_px))
         block = _view_rows(terrain, shared, camera, block_rows, sampling, seed)
         if block is not None:
+            if block[2] is not None:
+                pixels = sum(len(before.pixel) for before in blocks)
+                mirrors.append(replace(block[2], pixel=block[2].pixel + np.int32(pixels)))
             blocks.append(block[0])
             receivers.append(block[1])
         report(0.1 + 0.9 * min(1.0, (top + rows) / camera.height_px))
@@ -264,6 +164,7 @@ def trace_view(
         clusters=shared.clusters,
         seed=seed,
         sampling=sampling,
+        mirror=_concatenate_mirrors(mirrors) if mirrors else None,
         **arrays,
     )
     direct = smoothed(view.receivers.direct, view_neighbours(view, stride=1, sharpness=_DIRECT_SHARPNESS))
@@ -434,6 +335,15 @@ def _zero_receivers(basis: DirectionBasis, sampling: SamplingOptions) -> Receive
     )
 
 
+def _concatenate_mirrors(blocks: Sequence[MirrorCoefficients]) -> MirrorCoefficients:
+    joined = {
+        field.name: np.concatenate([getattr(block, field.name) for block in blocks])
+        for field in fields(MirrorCoefficients)
+        if field.name != "receivers"
+    }
+    return MirrorCoefficients(receivers=_concatenate_receivers([block.receivers for block in blocks]), **joined)
+
+
 def _concatenate_receivers(blocks: Sequence[ReceiverCoefficients]) -> ReceiverCoefficients:
     return ReceiverCoefficients(
         np.concatenate([block.direct for block in blocks]),
@@ -449,26 +359,43 @@ def _view_rows(
     rows: range,
     sampling: SamplingOptions,
     seed: int,
-) -> tuple[_PixelArrays, ReceiverCoefficients] | None:
-    """Coefficients of the terrain pixels in some image rows; ``None`` if no pixel shows terrain."""
+) -> tuple[_PixelArrays, ReceiverCoefficients, MirrorCoefficients | None] | None:
+    """Coefficients of the terrain pixels in some image rows, and of what water mirrors in them.
+
+    ``None`` if no pixel shows terrain, and for the latter where none shows water.
+    """
     points, hit, pixel = view_samples(terrain, camera, rows, sampling.shadow_samples, seed)
     if len(pixel) == 0:
         return None
+    on_water, mirror = water_samples(terrain, points, hit), None
+    if on_water.any():
+        eye_m = np.asarray(camera.position_m)
+        samples = mirror_samples(terrain, eye_m, points, on_water, pixel, seed)
+        shares = mirror_weights(samples)
+        identity = pixel[samples.pixel].astype(np.uint32) ^ _MIRRORED
+        lit = _trace_receivers(terrain, shared, samples.points, shares, identity, sampling, seed)
+        mirror = mirror_coefficients(samples, shares, lit)
+        # What the body of the water sends through the facets that are seen.
+        points.albedo[samples.pixel] = body_albedo(terrain, points.albedo[samples.pixel], samples)
     weight = sample_weights(points.albedo, hit)
-    row_pixel = pixel - rows.start * camera.width_px
-    albedo, normal, coverage = pixel_moments(terrain, camera, rows, sampling.albedo_samples, seed)
+    if sampling.albedo_samples == sampling.shadow_samples:
+        albedo, normal, coverage = sample_moments(points, hit)
+    else:
+        row_pixel = pixel - rows.start * camera.width_px
+        moments = pixel_moments(terrain, camera, rows, sampling.albedo_samples, seed)
+        albedo, normal, coverage = (values[row_pixel] for values in moments)
     receivers = _trace_receivers(terrain, shared, points, weight, pixel.astype(np.uint32), sampling, seed)
     arrays = _PixelArrays(
         pixel,
-        coverage[row_pixel],
-        albedo[row_pixel],
-        normal[row_pixel],
+        coverage,
+        albedo,
+        normal,
         points.origin,
         points.normal.astype(np.float16),
         points.geometric_normal.astype(np.float16),
         weight.astype(np.float16),
     )
-    return arrays, receivers
+    return arrays, receivers, mirror
 
 
 def view_albedo(terrain: RayScene, coefficients: ViewCoefficients) -> np.ndarray:

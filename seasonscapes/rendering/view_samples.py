@@ -12,10 +12,10 @@ from seasonscapes.images import REC709_LUMINANCE
 from seasonscapes.rendering.gbuffer import mi_rays
 from seasonscapes.rendering.hemisphere_rays import LANES, RayScene, SurfacePoints, front_side, surface_points
 from seasonscapes.rendering.sobol import hashed, sobol_pair
-from seasonscapes.rendering.terrain_material import shading_normal
+from seasonscapes.rendering.terrain_material import device_water, shading_normal
 
 # Key of the random number stream, mixed into its hashes.
-_PIXEL = 103
+_PIXEL, _WAVE = 103, 105
 
 
 def view_samples(
@@ -85,6 +85,25 @@ def sample_weights(albedo: np.ndarray, hit: np.ndarray) -> np.ndarray:
     return (luminous / luminous.sum(axis=1, keepdims=True)).astype(np.float32)
 
 
+def sample_moments(points: SurfacePoints, hit: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Average albedo, normal and terrain coverage over samples that are traced already; see `pixel_moments`.
+
+    Parameters
+    ----------
+    points, hit
+        ``(n, S)`` samples of n pixels, of `view_samples`.
+
+    Returns
+    -------
+    albedo, normal, coverage
+        Of the n pixels: ``(n, 3)``, ``(n, 3)`` and ``(n,)`` float32, as of `pixel_moments` with S samples.
+    """
+    # A small constant weight defines the normal of black pixels too.
+    weight = (points.albedo @ REC709_LUMINANCE.astype(np.float32) + np.float32(1e-6)) * hit
+    normal = np.einsum("ns,nsc->nc", weight, points.normal) / np.maximum(weight.sum(axis=1), 1e-20)[:, None]
+    return points.albedo.mean(axis=1), normal, hit.mean(axis=1, dtype=np.float32)
+
+
 def camera_points(
     terrain: RayScene, camera: Camera | Panorama, rows: range, count: int, seed: int
 ) -> tuple[SurfacePoints, np.ndarray]:
@@ -110,13 +129,15 @@ def camera_points(
     hit
         ``(len(rows) W count,)`` bool: rays that hit terrain.
     """
-    interaction = _mi_camera_rays(terrain, camera, rows, count, seed)
+    interaction, _ = _mi_camera_rays(terrain, camera, rows, count, seed)
     valid = interaction.is_valid()
     return surface_points(terrain, interaction, valid), np.array(valid)
 
 
-def _mi_camera_rays(terrain: RayScene, camera: Camera | Panorama, rows: range, count: int, seed: int) -> Any:
-    """Surface interactions of ``count`` stratified rays per pixel, the rays of a pixel side by side."""
+def _mi_camera_rays(
+    terrain: RayScene, camera: Camera | Panorama, rows: range, count: int, seed: int
+) -> tuple[Any, Any]:
+    """Surface interactions of ``count`` stratified rays per pixel, side by side, and points that choose a facet of each."""
     import drjit as dr
     import mitsuba as mi
 
@@ -127,9 +148,10 @@ def _mi_camera_rays(terrain: RayScene, camera: Camera | Panorama, rows: range, c
     pixel = index + dr.opaque(mi.UInt32, rows.start) * width
     row = pixel // width
     key = hashed(hashed(pixel, dr.opaque(mi.UInt32, seed)), _PIXEL)
-    offset = sobol_pair(key, lane - index * dr.opaque(mi.UInt32, count))
+    sample = lane - index * dr.opaque(mi.UInt32, count)
+    offset = sobol_pair(key, sample)
     x, y = mi.Float(pixel - row * width) + offset.x, mi.Float(row) + offset.y
-    return terrain.mi_scene.ray_intersect(mi_rays(camera, x, y))
+    return terrain.mi_scene.ray_intersect(mi_rays(camera, x, y)), sobol_pair(hashed(key, _WAVE), sample)
 
 
 def pixel_moments(
@@ -155,7 +177,8 @@ def pixel_moments(
     Returns
     -------
     albedo
-        ``(N, 3)`` mean albedo of the N pixels of these rows, zero for the sky.
+        ``(N, 3)`` mean albedo of the N pixels of these rows, zero for the sky; of water that of its body, without what it
+        mirrors.
     normal
         ``(N, 3)`` mean shading normal, weighted by luminous albedo.
     coverage
@@ -168,11 +191,18 @@ def pixel_moments(
     parts = []
     for top in range(rows.start, rows.stop, step):
         block = range(top, min(top + step, rows.stop))
-        interaction = _mi_camera_rays(terrain, camera, block, count, seed)
+        interaction, facet = _mi_camera_rays(terrain, camera, block, count, seed)
         valid = interaction.is_valid()
         front = front_side(interaction, valid)
         material = terrain.mi_terrain.bsdf()
         albedo = material.eval_diffuse_reflectance(interaction, front)
+        water = device_water(material)
+        if water is not None:
+            # Of water, the body is seen through facets that do not mirror.
+            viewer = interaction.to_world(interaction.wi)
+            _, mirrored = water.mirrored(water.vertical(interaction.p), viewer, facet)
+            body = material.body(interaction, front) * (1.0 - mirrored)
+            albedo = dr.select(water.covers(interaction.uv, front), body, albedo)
         albedo = dr.select(front, albedo, mi.Color3f(0.0))
         # A small constant weight defines the normal of black pixels too.
         weight = dr.dot(albedo, mi.Color3f(*REC709_LUMINANCE.tolist())) + dr.select(valid, mi.Float(1e-6), 0.0)

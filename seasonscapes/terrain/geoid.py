@@ -23,6 +23,7 @@ _VERTICAL_CRS = {
     "EGM96": "EPSG:5773",
     "EGM2008": "EPSG:3855",
     "LN02": "EPSG:5728",
+    "IGN69": "EPSG:5720",
     "NN2000": "EPSG:5941",
     "NAVD88": "EPSG:5703",
     "EVRF": "EPSG:5621",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from affine import Affine
 from seasonscapes.array_files import read_arrays
 from seasonscapes.errors import AtlasMismatch, InputError
 from seasonscapes.frames import MEAN_RADIUS_M, LocalFrame
+from seasonscapes.terrain.surface_classes import AlbedoDetail, Snow, Water
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,10 @@ def exponents(degree: int) -> list[tuple[int, int]]:
     return [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
 
 
+# Width of the rim along which an inner surface is blended with the one around it, as a share of its side.
+RIM_SHARE = 0.12
+
+
 @dataclass(frozen=True)
 class SurfaceGrid:
     """The smooth surface of a terrain at the samples of its raster, from which shading takes its normals.
@@ -66,12 +71,15 @@ class SurfaceGrid:
         East and north of the polynomials' centre, and their radius [m].
     mesh_error_m
         Vertical error bound of the mesh against the nodes [m].
+    inner
+        A finer surface of a part of it, which takes its place there; towards its rim the two are blended.
     """
 
     nodes: np.ndarray
     to_node: np.ndarray
     domain: tuple[float, float, float]
     mesh_error_m: float = 0.0
+    inner: SurfaceGrid | None = None
 
     @property
     def degree(self) -> int:
@@ -95,14 +103,36 @@ class SurfaceGrid:
         """Up coordinates ``(N,)`` float64 at positions ``(N, 3)`` [m]; see `sample`."""
         return self._interpolated(position_m, (2,))[0]
 
+    def spacing_at(self, position_m: np.ndarray) -> np.ndarray:
+        """Distance ``(N,)`` of neighbouring nodes at positions ``(N, 3)`` [m]."""
+        spacing = np.full(len(position_m), self.spacing_m)
+        if self.inner is not None:
+            spacing = np.where(self.inner.share_at(position_m) > 0.0, self.inner.spacing_m, spacing)
+        return spacing
+
+    def share_at(self, position_m: np.ndarray) -> np.ndarray:
+        """Share ``(N,)`` of this surface in one that it is the inner part of: 1 within, 0 at its rim and outside."""
+        column, row = self.nodes_at(np.asarray(position_m, np.float64)).T
+        rows, columns = self.nodes.shape[:2]
+        inside = np.minimum(np.minimum(column, columns - 1 - column), np.minimum(row, rows - 1 - row))
+        return np.clip(inside / (RIM_SHARE * min(rows, columns)), 0.0, 1.0)
+
     def _interpolated(self, position_m: np.ndarray, channels: tuple[int, ...]) -> list[np.ndarray]:
         from scipy.ndimage import map_coordinates
 
-        column, row = self.nodes_at(np.asarray(position_m, np.float64)).T
-        return [
+        position_m = np.asarray(position_m, np.float64)
+        column, row = self.nodes_at(position_m).T
+        values = [
             map_coordinates(self.nodes[..., k], [row, column], order=1, mode="nearest", output=np.float64)
             for k in channels
         ]
+        if self.inner is None:
+            return values
+        share = self.inner.share_at(position_m)
+        near = np.flatnonzero(share > 0.0)
+        for value, finer in zip(values, self.inner._interpolated(position_m[near], channels), strict=True):
+            value[near] += share[near] * (finer - value[near])
+        return values
 
     def sample(self, position_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Interpolate the surface bilinearly.
@@ -142,6 +172,12 @@ class Terrain:
         The smooth surface that the triangles approximate; ``None``: shading interpolates normals of the vertices.
     normals
         ``(V, 3)`` float32 unit normals of the vertices; ``None``: those of the triangles about them.
+    water
+        Its open water, which mirrors; ``None``: water is Lambertian.
+    snow
+        How its snow scatters; ``None``: snow is Lambertian.
+    detail
+        Detail of the albedo below its texels, for one camera; ``None``: the texture alone. `save_terrain` leaves it out.
     """
 
     vertices: np.ndarray
@@ -150,6 +186,9 @@ class Terrain:
     frame: LocalFrame
     surface: SurfaceGrid | None = None
     normals: np.ndarray | None = None
+    water: Water | None = None
+    snow: Snow | None = None
+    detail: AlbedoDetail | None = None
 
 
 def mesh_up_m(terrain: Terrain, position_m: np.ndarray) -> float:
@@ -283,6 +322,11 @@ def save_terrain(terrain: Terrain, path: str | os.PathLike[str], *, note: dict[s
         surface = terrain.surface
         arrays |= {"surface": surface.nodes, "surface_to_node": surface.to_node, "surface_domain": surface.domain}
         arrays["surface_mesh_error_m"] = surface.mesh_error_m
+    if terrain.water is not None:
+        # Shares in steps of 1/255.
+        arrays |= {"water": np.round(terrain.water.mask * 255.0).astype(np.uint8), "water_wind": terrain.water.wind_m_s}
+    if terrain.snow is not None:
+        arrays["snow_grain_mm"] = np.nan if terrain.snow.grain_mm is None else terrain.snow.grain_mm
     np.savez(path, note=json.dumps(note or {}), **arrays)
 
 
@@ -313,6 +357,12 @@ def load_terrain(path: str | os.PathLike[str]) -> tuple[Terrain, dict[str, Any]]
                 float(stored["surface_mesh_error_m"]),
             )
         terrain = Terrain(stored["vertices"], stored["faces"], stored["uv"], frame, surface)
+        if "water" in stored:
+            water = Water(stored["water"].astype(np.float32) / np.float32(255.0), float(stored["water_wind"]))
+            terrain = replace(terrain, water=water)
+        if "snow_grain_mm" in stored:
+            grain = float(stored["snow_grain_mm"])
+            terrain = replace(terrain, snow=Snow(None if np.isnan(grain) else grain))
         return terrain, json.loads(str(stored["note"]))
 
 

@@ -17,7 +17,7 @@ from seasonscapes.terrain.surface import SurfaceGrid, Terrain
 _ALONG = (0.25, 0.5, 0.75)
 # Edges are not split below this length in spacings of the surface's nodes: between the nodes it is bilinear.
 _LEAST_NODES = 0.3
-_MOST_ROUNDS = 10
+_MOST_ROUNDS = 14
 # New faces at which refinement ends; each round at most doubles them.
 _MOST_FACES = 4_000_000
 
@@ -50,11 +50,10 @@ def refined_for_view(
     near = _near_faces(terrain, eye_m, reach_m)
     settled, faces = [terrain.faces[~near]], terrain.faces[near]
     vertices, uv = terrain.vertices, terrain.uv
-    spacing = terrain.surface.spacing_m
     visible_error = tolerance_px * pixel_angle_rad
     for _ in range(_MOST_ROUNDS):
         edges, of_face = _unique_edges(faces)
-        split = _visible(terrain.surface, vertices, edges, eye_m, visible_error, spacing)
+        split = _visible(terrain.surface, vertices, edges, eye_m, visible_error)
         # Faces whose middle deviates although no edge does.
         unsplit = ~split[of_face].any(axis=1)
         middle = vertices[faces[unsplit]].mean(axis=1, dtype=np.float64)
@@ -62,6 +61,7 @@ def refined_for_view(
         corners = vertices[faces[unsplit][deviating]].astype(np.float64)
         lengths = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
         longest = of_face[np.flatnonzero(unsplit)[deviating], lengths.argmax(axis=1)]
+        spacing = terrain.surface.spacing_at(middle[deviating])
         split[longest[lengths.max(axis=1) > _LEAST_NODES * spacing]] = True
         # An edge that only one near face has belongs to a far face too, or to the rim.
         split &= np.bincount(of_face.ravel(), minlength=len(edges)) == 2
@@ -103,16 +103,12 @@ def _deviation(surface: SurfaceGrid, position_m: np.ndarray) -> np.ndarray:
 
 
 def _visible(
-    surface: SurfaceGrid,
-    vertices: np.ndarray,
-    edges: np.ndarray,
-    eye_m: np.ndarray,
-    visible_error: float,
-    spacing_m: float,
+    surface: SurfaceGrid, vertices: np.ndarray, edges: np.ndarray, eye_m: np.ndarray, visible_error: float
 ) -> np.ndarray:
     """Edges ``(E,)`` from which the surface deviates visibly."""
     start, end = (vertices[edges[:, k]].astype(np.float64) for k in range(2))
-    long = np.flatnonzero(np.linalg.norm((end - start)[:, :2], axis=1) > _LEAST_NODES * spacing_m)
+    spacing = surface.spacing_at(0.5 * (start + end))
+    long = np.flatnonzero(np.linalg.norm((end - start)[:, :2], axis=1) > _LEAST_NODES * spacing)
     result = np.zeros(len(edges), bool)
     nearest = np.minimum(_distance(start[long], eye_m), _distance(end[long], eye_m))
     for share in _ALONG:

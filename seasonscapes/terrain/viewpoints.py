@@ -15,6 +15,8 @@ _MOST_CELLS = 240
 _EARTH_RADIUS_M = 6_371_000.0
 _REFRACTION_K = 0.13
 _VALLEY_CANDIDATES = 300
+# Ground that rises by more than 5° should stand at least so far before a camera in a valley, in shares of the land's side.
+_VALLEY_DISTANCE, _RISING = 0.15, float(np.tan(np.deg2rad(5.0)))
 
 
 @dataclass(frozen=True)
@@ -143,14 +145,18 @@ def _valley(land: _Land) -> View:
     if not len(fit):
         fit = np.argwhere(inner & (land.mean == land.mean[inner].min()))
     fit = fit[:: max(1, len(fit) // _VALLEY_CANDIDATES)]
+    far_m = _VALLEY_DISTANCE * min(land.mean.shape) * land.cell_m
     best = (-np.inf, 0, 0, 0, 0.0)
     for row, column in fit.tolist():
-        skyline = np.rad2deg(np.arctan(land.rays(row, column, float(land.mean[row, column]) + 20.0).max(axis=1)))
-        # A wall of more than 25° is too near to be seen as a mountain.
-        sectors = _sectors(np.clip(skyline, 0.0, 25.0), 25.0)
+        slopes = land.rays(row, column, float(land.mean[row, column]) + 20.0)
+        skyline = np.clip(np.rad2deg(np.arctan(slopes.max(axis=1))), 0.0, 25.0)
+        # A slope that rises right before the camera hides the mountains; what rises beyond the border is none.
+        rising = slopes > _RISING
+        wall_m = np.where(rising.any(axis=1), (rising.argmax(axis=1) + 1) * land.cell_m, far_m)
+        sectors = _sectors(skyline * np.minimum(wall_m / far_m, 1.0), 25.0)
         azimuth = int(np.argmax(sectors))
         if sectors[azimuth] > best[0]:
-            best = (float(sectors[azimuth]), int(row), int(column), azimuth, float(sectors[azimuth]))
+            best = (float(sectors[azimuth]), int(row), int(column), azimuth, float(_sectors(skyline, 25.0)[azimuth]))
     _, row, column, azimuth, skyline_deg = best
     heading = land.true_heading_deg(row, column, azimuth * 2.0 * np.pi / _AZIMUTHS)
     lift = max(15.0, land.grid.spacing_m / 2.0)

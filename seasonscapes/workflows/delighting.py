@@ -268,7 +268,7 @@ def _texel_light(place: Place, light: Illumination, progress: Progress | None) -
     from seasonscapes.albedo.forward_model import trace_texel_transport
     from seasonscapes.albedo.texel_light import coarse_irradiance, texel_irradiance
     from seasonscapes.rendering.backend import use_backend
-    from seasonscapes.rendering.transport import SamplingOptions
+    from seasonscapes.rendering.coefficients import SamplingOptions
 
     use_backend()
     # Skylight and interreflection vary slowly over an image whose texels are far finer than the relief.

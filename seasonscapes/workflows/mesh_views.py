@@ -136,10 +136,11 @@ def mesh_view(
         Where the camera sees neither mesh nor ground.
     """
     from seasonscapes.rendering.backend import use_backend
+    from seasonscapes.rendering.coefficients import SamplingOptions
     from seasonscapes.rendering.hemisphere_rays import ray_scene
     from seasonscapes.rendering.mitsuba_scene import mi_mesh
     from seasonscapes.rendering.relit_view import relightable_view
-    from seasonscapes.rendering.transport import SamplingOptions, trace_view
+    from seasonscapes.rendering.transport import trace_view
 
     around = surroundings or MeshSurroundings()
     use_backend()

@@ -285,10 +285,10 @@ def mesh_transport(
     """
     from seasonscapes.albedo.forward_model import transport_of_points
     from seasonscapes.rendering.backend import use_backend
+    from seasonscapes.rendering.coefficients import SamplingOptions
     from seasonscapes.rendering.hemisphere_rays import ray_scene
     from seasonscapes.rendering.irradiance import points_on_faces
     from seasonscapes.rendering.mitsuba_scene import mi_mesh
-    from seasonscapes.rendering.transport import SamplingOptions
     from seasonscapes.workflows.received_light import require_rays
 
     around = surroundings or MeshSurroundings()

@@ -19,6 +19,8 @@ from seasonscapes.scene import SceneFile, read_scene
 from seasonscapes.source_hash import source_hash
 from seasonscapes.terrain.raster_files import rasters_hash
 from seasonscapes.terrain.surface import Raster, Terrain, Texture, atlas_identity, mesh_up_m, require_atlas
+from seasonscapes.terrain.water import levelled
+from seasonscapes.workflows.scene_water import scene_water, water_key
 from seasonscapes.workflows.terrain_building import MeshOptions
 from seasonscapes.workspace import Workspace, build_once, default_workspace
 
@@ -149,7 +151,7 @@ def load_place(
     Parameters
     ----------
     scene
-        A scene file (``.toml``), or the name of a bundled scene: ``"alpine"`` or ``"alpine_small"``.
+        A scene file (``.toml``), or the name of a bundled scene: ``"alpine"``, ``"alpine_lake"`` or ``"alpine_small"``.
     workspace
         Where built artefacts are kept; default `workspace.default_workspace`.
     options
@@ -189,6 +191,9 @@ def load_place(
     source = declared.elevation.paths
     key_name = "files" if declared.elevation.files else "file"
     elevation, fill = terrain_building.read_heights(declared, massif, where=f"{path}: elevation.{key_name}")
+    water = scene_water(declared, elevation, massif)
+    if water is not None:
+        elevation = levelled(elevation, water)
     report(0.3)
     _check_cameras(path, declared, elevation)
     frame = terrain_building.local_frame(declared, elevation)
@@ -201,6 +206,8 @@ def load_place(
         "area": declared.area,
         "frame": frame,
         "options": options,
+        **water_key(declared),
+        **({} if declared.snow is None else {"snow": declared.snow}),
     }
     terrain, atlas = build_once(
         workspace,
@@ -209,7 +216,7 @@ def load_place(
         code=_TERRAIN_CODE,
         suffix=".npz",
         build=lambda: terrain_building.build_terrain(
-            elevation, frame, declared, options, progress=lambda share: report(0.3 + 0.7 * share)
+            elevation, frame, declared, options, water=water, progress=lambda share: report(0.3 + 0.7 * share)
         ),
         save=terrain_building.save_built_terrain,
         load=terrain_building.load_built_terrain,

@@ -107,9 +107,9 @@ def albedo_relative_sigma(path: Path, shape: tuple[int, int]) -> np.ndarray:
 
 def _relit(place: Place, albedo: Texture, utc: datetime, model: SkyModel, progress: Progress | None) -> Texture:
     from seasonscapes.relighting.lit_texture import bake_lit_texture
+    from seasonscapes.rendering.coefficients import SamplingOptions
     from seasonscapes.rendering.hemisphere_rays import ray_scene
     from seasonscapes.rendering.mitsuba_scene import mi_mesh
-    from seasonscapes.rendering.transport import SamplingOptions
     from seasonscapes.terrain.texels import texel_positions
 
     light, _ = illumination_on_terrain(place, model, utc)

@@ -83,9 +83,9 @@ def lit_texture(
     """
     from seasonscapes.relighting.lit_texture import bake_lit_texture
     from seasonscapes.rendering.backend import use_backend
+    from seasonscapes.rendering.coefficients import SamplingOptions
     from seasonscapes.rendering.hemisphere_rays import ray_scene
     from seasonscapes.rendering.mitsuba_scene import mi_mesh
-    from seasonscapes.rendering.transport import SamplingOptions
     from seasonscapes.terrain.texels import texel_positions
 
     require_rays(rays)
@@ -189,9 +189,9 @@ def irradiance_map(
     """
     from seasonscapes.relighting.lit_texture import IlluminationSeries, integrate_irradiance
     from seasonscapes.rendering.backend import use_backend
+    from seasonscapes.rendering.coefficients import SamplingOptions
     from seasonscapes.rendering.hemisphere_rays import ray_scene
     from seasonscapes.rendering.mitsuba_scene import mi_mesh
-    from seasonscapes.rendering.transport import SamplingOptions
 
     require_rays(rays)
     if spacing_m is not None and not 0.0 < spacing_m < np.inf:

@@ -44,14 +44,14 @@ from seasonscapes.workspace import Workspace, artefact_key, build_once
 
 if TYPE_CHECKING:
     from seasonscapes.cameras.panorama import Panorama
+    from seasonscapes.rendering.coefficients import SamplingOptions, ViewCoefficients
     from seasonscapes.rendering.hemisphere_rays import RayScene
     from seasonscapes.rendering.radiance import RenderedView
     from seasonscapes.rendering.relit_view import RelightableView
-    from seasonscapes.rendering.transport import SamplingOptions, ViewCoefficients
 
 log = logging.getLogger(__name__)
 
-_COEFFICIENTS_CODE = ("rendering.transport", "rendering.coefficients_file", "terrain.view_refinement")
+_COEFFICIENTS_CODE = ("rendering.transport", "rendering.coefficients_file", "workflows.amplified_terrain")
 _VIEW_ALBEDO_CODE = ("rendering.transport", "rendering.relit_view")
 FRAME_CODE = ("workflows.relight_session", "relighting.frame_file")
 # Rows of the sky maps. Without clouds half as many as usual hardly change an image: the
@@ -135,8 +135,8 @@ class RelightSession:
     ray_scene: RayScene
     relightable: RelightableView
     by_elevation: bool = False
-    _albedos: dict[int, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, repr=False)
-    _transitions: dict[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, repr=False)
+    _albedos: dict[int, tuple[np.ndarray, ...]] = field(default_factory=dict, repr=False)
+    _transitions: dict[str, tuple[np.ndarray, ...]] = field(default_factory=dict, repr=False)
     _current: tuple[list[tuple[int, float]], RelightableView] | None = field(default=None, repr=False)
 
 
@@ -213,9 +213,14 @@ def still_session(
     base_day: date = _MIDSUMMER,
     seed: int = 0,
     sampling: SamplingOptions | None = None,
+    lambertian: bool = False,
+    amplify: bool = False,
     progress: Progress | None = None,
 ) -> RelightSession:
-    """`relight_session` for few instants: the light of each is computed, and no tables are built for it first."""
+    """`relight_session` for few instants: the light of each is computed, and no tables are built for it first.
+
+    ``lambertian``: without surfaces that are not matt. ``amplify``: with detail below the resolution of the data.
+    """
     from seasonscapes.rendering.hemisphere_rays import ray_scene
     from seasonscapes.rendering.mitsuba_scene import mi_mesh
     from seasonscapes.rendering.relit_view import relightable_view
@@ -228,8 +233,11 @@ def still_session(
         albedo = AlbedoSeries((albedo,))
     camera, model = view_in_frame(camera, place.frame), sky_model(sky)
     base = nearest_albedo(albedo, base_day)
-    scene = ray_scene(mi_mesh(terrain_for_view(place, camera), base.load().values))
+    terrain = terrain_for_view(place, camera, lambertian=lambertian, amplify=amplify)
+    scene = ray_scene(mi_mesh(terrain, base.load().values))
     inputs = {"place": place.key, **_camera_values(camera), "albedo": _identity(base), "seed": seed}
+    if lambertian or amplify:
+        inputs |= {"lambertian": lambertian, "amplified": amplify}
     coefficients = _coefficients(place, camera, scene, inputs, seed, sampling, progress)
     relightable = relightable_view(scene, coefficients)
     return RelightSession(place, camera, model, albedo, base, seed, coefficients, scene, relightable)
@@ -310,8 +318,9 @@ def _coefficients(
     sampling: SamplingOptions | None,
     progress: Progress | None,
 ) -> ViewCoefficients:
+    from seasonscapes.rendering.coefficients import SamplingOptions, ViewCoefficients
     from seasonscapes.rendering.coefficients_file import load_coefficients, save_coefficients
-    from seasonscapes.rendering.transport import SamplingOptions, ViewCoefficients, trace_view
+    from seasonscapes.rendering.transport import trace_view
 
     sampling = sampling or SamplingOptions()
     key = artefact_key(inputs | {"sampling": asdict(sampling)}, _COEFFICIENTS_CODE)
@@ -400,19 +409,24 @@ def view_of_day(session: RelightSession, day: date) -> RelightableView:
 
 
 def _interpolated(session: RelightSession, weights: list[tuple[int, float]], day: date) -> list[np.ndarray]:
-    """Albedo of the view's pixels and of its light clusters, interpolated between the dated albedos nearest to a day."""
+    """Albedos as `_view_albedo` gives them, interpolated between the dated albedos nearest to a day."""
     parts = [session._albedos[index] for index, _ in weights]
     if len(parts) == 1 or session.albedo.season != "snow-line":
-        scaled = [[weight * part[k] for part, (_, weight) in zip(parts, weights, strict=True)] for k in range(2)]
+        scaled = [
+            [weight * part[k] for part, (_, weight) in zip(parts, weights, strict=True)] for k in range(len(parts[0]))
+        ]
         return [reduce(operator.add, terms) for terms in scaled]
     pair = [session.albedo.dated[index] for index, _ in weights]
     name = f"turning:{pair[0].content}:{pair[1].content}"
     if name not in session._transitions:
         # The time of transition is a texture like any other, and averaged over pixels like an albedo.
         transition = DatedAlbedo(pair[0].day, name, lambda: snow_transition_between(session.place, *pair))
-        pixels, clusters = _view_albedo(session, transition)
+        pixels, clusters, *mirrored = _view_albedo(session, transition)
         coverage = np.maximum(session.coefficients.coverage[:, None], 1e-3)
-        session._transitions = {name: (pixels / coverage, clusters)}
+        mirror = session.coefficients.mirror
+        if mirror is not None:
+            mirrored = [mirrored[0] / np.maximum(mirror.sample_share.sum(axis=1, dtype=np.float32)[:, None], 1e-3)]
+        session._transitions = {name: (pixels / coverage, clusters, *mirrored)}
     snowline = snowline_fraction(*(day_number(each) for each in (pair[0].day, pair[1].day, day)))
     return [
         interpolate_albedo((parts[0][k], parts[1][k]), transition, weights[1][1], snowline)
@@ -420,19 +434,22 @@ def _interpolated(session: RelightSession, weights: list[tuple[int, float]], day
     ]
 
 
-def _view_albedo(session: RelightSession, dated: DatedAlbedo) -> tuple[np.ndarray, np.ndarray]:
-    """Mean albedo of the view's pixels and of its light clusters for a dated texture; kept in the workspace."""
+def _view_albedo(session: RelightSession, dated: DatedAlbedo) -> tuple[np.ndarray, ...]:
+    """Mean albedo of the view's pixels, of its light clusters and, with water, of what it mirrors, for a dated texture.
+
+    Kept in the workspace.
+    """
     from seasonscapes.rendering.mitsuba_scene import set_albedo
-    from seasonscapes.rendering.relit_view import cluster_albedo
+    from seasonscapes.rendering.relit_view import cluster_albedo, mirrored_albedo
     from seasonscapes.rendering.transport import view_albedo
 
     place = session.place
 
-    def build() -> tuple[np.ndarray, np.ndarray]:
-        texture = dated.load().values
-        set_albedo(session.ray_scene, texture)
-        pixels = view_albedo(session.ray_scene, session.coefficients).astype(np.float16)
-        return pixels, cluster_albedo(session.coefficients, texture).astype(np.float16)
+    def build() -> tuple[np.ndarray, ...]:
+        set_albedo(session.ray_scene, dated.load().values)
+        of_view = (view_albedo, cluster_albedo, mirrored_albedo)
+        albedos = [albedo(session.ray_scene, session.coefficients) for albedo in of_view]
+        return tuple(albedo.astype(np.float16) for albedo in albedos if albedo is not None)
 
     inputs = {
         "place": place.key,
@@ -440,8 +457,10 @@ def _view_albedo(session: RelightSession, dated: DatedAlbedo) -> tuple[np.ndarra
         "albedo": _identity(dated),
         "base": _identity(session.base),
         "seed": session.seed,
+        # Stills and films sample a pixel differently, and their pixels that show terrain differ.
+        "sampling": asdict(session.coefficients.sampling),
     }
-    pixels, clusters = build_once(
+    albedos = build_once(
         place.workspace,
         f"{place.scene.name}/view-albedo",
         inputs,
@@ -451,13 +470,13 @@ def _view_albedo(session: RelightSession, dated: DatedAlbedo) -> tuple[np.ndarra
         save=_save_view_albedo,
         load=_load_view_albedo,
     )
-    return pixels.astype(np.float32), clusters.astype(np.float32)
+    return tuple(albedo.astype(np.float32) for albedo in albedos)
 
 
-def _save_view_albedo(albedo: tuple[np.ndarray, np.ndarray], path: Path) -> None:
-    np.savez(path, pixels=albedo[0], clusters=albedo[1])
+def _save_view_albedo(albedos: tuple[np.ndarray, ...], path: Path) -> None:
+    np.savez(path, *albedos)
 
 
-def _load_view_albedo(path: Path) -> tuple[np.ndarray, np.ndarray]:
+def _load_view_albedo(path: Path) -> tuple[np.ndarray, ...]:
     with np.load(path) as file:
-        return file["pixels"], file["clusters"]
+        return tuple(file[f"arr_{number}"] for number in range(len(file.files)))

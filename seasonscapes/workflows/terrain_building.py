@@ -20,9 +20,12 @@ from seasonscapes.terrain.raster import bounds_geographic, centre_frame, fill_no
 from seasonscapes.terrain.raster_files import OWN_FOLDER
 from seasonscapes.terrain.refine import refine_raster, refinement_factor
 from seasonscapes.terrain.surface import Raster, Terrain, load_terrain, save_terrain
+from seasonscapes.terrain.surface_classes import Snow
 from seasonscapes.terrain.surface_grid import surface_grid
 from seasonscapes.terrain.tile_files import read_elevation_tiles, tile_spacing_m
 from seasonscapes.terrain.unwrap import ATLASES, Atlas, unwrap
+from seasonscapes.terrain.water import levelled
+from seasonscapes.workflows.scene_water import with_water
 
 if TYPE_CHECKING:
     from seasonscapes.scene import SceneFile
@@ -182,9 +185,13 @@ def build_terrain(
     scene: SceneFile,
     options: MeshOptions,
     *,
+    water: Raster | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> tuple[Terrain, Atlas]:
-    """Mesh an elevation raster in a local frame and unwrap it; see `terrain.mesh` and `terrain.unwrap`."""
+    """Mesh an elevation raster in a local frame and unwrap it; see `terrain.mesh` and `terrain.unwrap`.
+
+    Where there is ``water``, its share ``(H, W, 1)`` at the raster's cells, lakes are level, and the terrain has a mask.
+    """
     report = progress or (lambda fraction: None)
     spacing_m = sample_spacing_m(elevation)
     if options.refine is not None:
@@ -193,6 +200,9 @@ def build_terrain(
     factor = options.refine or refinement_factor(elevation.values[..., 0].size, spacing_m)
     bound = options.max_error_m or min(5.0, spacing_m / factor / 10.0)
     refined = refine_raster(elevation, factor)
+    if water is not None and factor > 1:
+        # Interpolated heights rise towards the banks before the shore.
+        refined = levelled(refined, water)
     report(0.1)
     terrain = build_mesh(refined, frame, mesher=options.mesher, max_error_m=bound)
     report(0.6)
@@ -201,7 +211,12 @@ def build_terrain(
         terrain = replace(terrain, surface=surface_grid(refined, frame, mesh_error_m=error))
     report(0.8)
     texel_m = _texel_m(terrain, elevation, scene, options)
-    return unwrap(terrain, kind=options.atlas, texel_m=texel_m, max_side_px=options.max_side_px)
+    terrain, atlas = unwrap(terrain, kind=options.atlas, texel_m=texel_m, max_side_px=options.max_side_px)
+    if water is not None and scene.water is not None:
+        terrain = with_water(terrain, atlas, water, scene.water.wind_m_s)
+    if scene.snow is not None and scene.snow.scattering:
+        terrain = replace(terrain, snow=Snow(scene.snow.grain_mm))
+    return terrain, atlas
 
 
 def save_built_terrain(built: tuple[Terrain, Atlas], path: Path) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from datetime import datetime
-from typing import TYPE_CHECKING, Literal
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -22,12 +24,17 @@ if TYPE_CHECKING:
     from seasonscapes.albedo.fixed_camera import FixedCamera
     from seasonscapes.cameras.observation import Observation
     from seasonscapes.rendering.relit_view import RelightableView
+    from seasonscapes.workflows.photograph_files import PhotographSources
 
 log = logging.getLogger(__name__)
 
 _MAP_ROWS = 64
 # The camera may have moved by this much between two pictures [px].
 _STANDS_STILL_PX = 0.5
+# A picture that shows less of the terrain than this share tells nothing.
+_LEAST_SHOWN = 0.02
+# A picture is meant by a time within so many seconds.
+_SAME_PICTURE_S = 60.0
 # Pictures of another time of the year show other snow and leaves [days].
 SEASON_DAYS = 45
 # Suns this far apart [deg] light slopes alike: the width of the weights of pictures.
@@ -49,8 +56,8 @@ class FixedView:
         ``(n,)`` those of the view's pixels that terrain covers wholly.
     pixel
         ``(n,)`` their flat indices in the image.
-    distance_km, normal
-        ``(n,)`` [km] and ``(n, 3)`` of the terrain there.
+    distance_km, height_m, normal
+        ``(n,)`` [km], ``(n,)`` above the frame's origin [m] and ``(n, 3)`` of the terrain there.
     """
 
     place: Place
@@ -59,6 +66,7 @@ class FixedView:
     chosen: np.ndarray = field(repr=False)
     pixel: np.ndarray = field(repr=False)
     distance_km: np.ndarray = field(repr=False)
+    height_m: np.ndarray = field(repr=False)
     normal: np.ndarray = field(repr=False)
 
 
@@ -79,8 +87,8 @@ def fixed_view(place: Place, camera: Camera, *, progress: Progress | None = None
     NoTerrainInView
         Where the camera sees no terrain.
     """
-    from seasonscapes.albedo.view_light import view_distances_km, view_normals
-    from seasonscapes.rendering.transport import SamplingOptions
+    from seasonscapes.albedo.view_light import view_distances_km, view_heights_m, view_normals
+    from seasonscapes.rendering.coefficients import SamplingOptions
 
     camera = view_in_frame(camera, place.frame)
     # Light is compared with pictures of 8 bits: a quarter of a film's samples.
@@ -94,6 +102,7 @@ def fixed_view(place: Place, camera: Camera, *, progress: Progress | None = None
         chosen,
         np.asarray(session.coefficients.pixel)[chosen],
         view_distances_km(session.relightable)[chosen],
+        view_heights_m(session.relightable)[chosen],
         view_normals(session.relightable)[chosen],
     )
 
@@ -147,6 +156,8 @@ class CameraHours:
 
     Parameters
     ----------
+    webcam
+        Name of the camera.
     view
         The view and its light transport.
     times
@@ -155,26 +166,44 @@ class CameraHours:
         Ground of each pixel and conditions of each picture.
     suns
         ``(K, 3)`` directions of the sun in the pictures.
+    shown
+        ``(n,)`` terrain pixels that a picture shows: what stands before the landscape in all of them is no terrain.
     background
         ``(H, W, 3)`` median of the pictures, sRGB-encoded: the sky and all that is no terrain.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import seasonscapes as ss
+    >>> place = ss.load_place("alpine_small")
+    >>> times = ["2024-07-20T09:00", "2024-07-20T12:00", "2024-07-20T16:00"]
+    >>> camera = ss.camera(place, "aerial", size_px=(48, 32))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     sources = ss.synthetic_photographs(place, times, folder, sky="hosek", cameras={"aerial": camera})
+    ...     photographs = ss.open_photographs(place, sources.manifest, sources.calibrations, times)
+    >>> hours = ss.camera_hours(place, photographs)
+    >>> [each.sun_shone for each in hours.weather]
+    [True, True, True]
     """
 
+    webcam: str
     view: FixedView
     times: list[datetime]
     fitted: FixedCamera = field(repr=False)
     suns: np.ndarray = field(repr=False)
+    shown: np.ndarray = field(repr=False)
     background: np.ndarray = field(repr=False)
 
     @property
     def weather(self) -> list[PictureWeather]:
         """Weather of each picture, in the order of the photographs."""
-        from seasonscapes.albedo.fixed_camera import sun_shone, unexplained
+        from seasonscapes.albedo.fixed_camera import SUN_SHONE, unexplained
 
         odd = unexplained(self.fitted)
         return [
             PictureWeather(
                 time,
-                sun_shone(each) if sun[2] > 0.0 else None,
+                bool(direct > SUN_SHONE) if sun[2] > 0.0 else None,
                 each.sun,
                 each.sun_sigma,
                 each.overcast,
@@ -182,8 +211,14 @@ class CameraHours:
                 float(residual),
                 not strange,
             )
-            for time, each, sun, residual, strange in zip(
-                self.times, self.fitted.conditions, self.suns, self.fitted.residual, odd, strict=True
+            for time, each, sun, direct, residual, strange in zip(
+                self.times,
+                self.fitted.conditions,
+                self.suns,
+                self.fitted.direct,
+                self.fitted.residual,
+                odd,
+                strict=True,
             )
         ]
 
@@ -222,7 +257,7 @@ class CameraHours:
         weight = np.exp(-0.5 * ((angle - angle.min()) / _ALIKE_DEG) ** 2)
         values = sum(w * relit_at(self.fitted, light, k) for w, k in zip(weight / weight.sum(), taken, strict=True))
         image = self.background.copy()
-        image.reshape(-1, 3)[self.view.pixel] = values
+        image.reshape(-1, 3)[self.view.pixel[self.shown]] = values[self.shown]
         return image
 
     def _warn_of_season(self, time: datetime) -> None:
@@ -277,7 +312,6 @@ def camera_hours(place: Place, photographs: Sequence[Observation], *, progress: 
     (32, 48, 3)
     """
     from seasonscapes.albedo.fixed_camera import fit_fixed_camera
-    from seasonscapes.images import srgb_from_linear
     from seasonscapes.rendering.backend import use_backend
 
     if not photographs:
@@ -289,27 +323,150 @@ def camera_hours(place: Place, photographs: Sequence[Observation], *, progress: 
         raise InputError(photographs[0].webcam, "a panorama", expected="views cut out of it, as open_photographs gives")
     use_backend()
     view = fixed_view(place, camera, progress=progress)
-    encoded = [srgb_from_linear(each.image) for each in photographs]
+    clear = _without_hidden(view, photographs)
+    photographs, encoded = [each for each, _, _ in clear], [image for _, image, _ in clear]
+    usable = [mask for _, _, mask in clear]
     lights = [light_on_view(view, each.time) for each in photographs]
     fitted = fit_fixed_camera(
         [image.reshape(-1, 3)[view.pixel] for image in encoded],
-        [each.mask.reshape(-1)[view.pixel] for each in photographs],
+        usable,
         lights,
         view.distance_km,
         view.normal,
         progress=task_progress(progress, "ground and weather"),
     )
     hours = CameraHours(
+        photographs[0].webcam,
         view,
         [each.time for each in photographs],
         fitted,
         np.stack([each.sun_direction for each in lights]),
+        np.any(usable, axis=0),
         np.median(encoded, axis=0),
     )
     for each in hours.weather:
         if not each.explained:
             log.warning("%s UTC: not explained by light, haze and exposure; it counts little", each.time.isoformat())
     return hours
+
+
+def _without_hidden(
+    view: FixedView, photographs: Sequence[Observation]
+) -> list[tuple[Observation, np.ndarray, np.ndarray]]:
+    """Photographs with their sRGB-encoded images ``(H, W, 3)`` and usable terrain pixels ``(n,)``: clouds before the
+    terrain are not, and pictures that show next to no terrain are left out with a warning."""
+    from seasonscapes.albedo.cloud_cover import clouds_before
+    from seasonscapes.images import srgb_from_linear
+
+    kept = []
+    for each in photographs:
+        image = srgb_from_linear(each.image)
+        terrain = np.zeros(image.shape[:2], bool)
+        terrain.reshape(-1)[view.pixel] = True
+        usable = (each.mask & ~clouds_before(image, terrain)).reshape(-1)[view.pixel]
+        if usable.mean() < _LEAST_SHOWN:
+            log.warning("%s UTC: left out: it shows next to no terrain", each.time.isoformat())
+            continue
+        kept.append((each, image, usable))
+    return kept
+
+
+def webcam_photographs(
+    place: Place,
+    sources: PhotographSources,
+    webcam: str | None = None,
+    *,
+    hold_out: Sequence[datetime] = (),
+    most_pixels: int | None = None,
+    progress: Progress | None = None,
+) -> list[Observation]:
+    """All photographs of one webcam that a manifest lists, with their poses, in a place's frame.
+
+    Parameters
+    ----------
+    place
+        The place.
+    sources
+        Manifest, calibrations and masks.
+    webcam
+        Its name; may be left out where the manifest lists one webcam alone.
+    hold_out
+        Aware times of photographs to leave out, within a minute.
+    most_pixels
+        Larger photographs are reduced to as many.
+    progress
+        Called with a task and its finished share.
+
+    Raises
+    ------
+    InputError
+        Where the manifest lists several webcams or not this one, nothing was taken at a time of ``hold_out``, or fewer
+        than two photographs are left.
+    """
+    from seasonscapes.cameras.observation import read_manifest
+    from seasonscapes.workflows.photograph_files import observations, reduced_observation
+
+    rows = read_manifest(sources.manifest, allow_outside=sources.allow_outside)
+    names = sorted({row.webcam for row in rows})
+    if webcam is None and len(names) != 1:
+        raise InputError("--webcam", "missing", expected=", ".join(names) or "a manifest that is not empty")
+    wanted = webcam or names[0]
+    if wanted not in names:
+        raise InputError("--webcam", "has no picture in the manifest", got=wanted, expected=", ".join(names))
+    rows = [row for row in rows if row.webcam == wanted]
+    for time in hold_out:
+        kept = [row for row in rows if abs((row.time - time).total_seconds()) > _SAME_PICTURE_S]
+        if len(kept) == len(rows):
+            nearest = min(rows, key=lambda row: abs(row.time - time), default=None)
+            expected = "no picture is left" if nearest is None else f"the nearest is of {nearest.time.isoformat()}"
+            raise InputError("--hold-out", "no picture of that time", got=time.isoformat(), expected=expected)
+        rows = kept
+    if len(rows) < 2:
+        raise InputError(
+            sources.manifest, f"{len(rows)} pictures of {wanted}", expected="two or more of a fixed camera"
+        )
+    for row in rows:
+        sources.picture_of(row)
+    opened = observations(rows, sources, place.frame, progress=progress)
+    return opened if most_pixels is None else [reduced_observation(each, most_pixels) for each in opened]
+
+
+def save_hours(hours: CameraHours, times: Sequence[datetime], folder: Path, *, sky: Sky = "any") -> dict[str, Any]:
+    """Write the view at some instants, and the weather of the photographs, into a folder.
+
+    Parameters
+    ----------
+    hours
+        From `camera_hours`.
+    times
+        Aware.
+    folder
+        Gets ``WEBCAM_TIME.png`` for each and ``weather.json``; made where it is missing.
+    sky
+        See `CameraHours.at`.
+
+    Returns
+    -------
+    dict
+        ``files`` that were written, ``weather`` of each photograph, ``scene`` and ``attribution``.
+    """
+    from seasonscapes.images import atomic_path, linear_from_srgb
+    from seasonscapes.workflows.pictures import png_metadata, save_png
+
+    scene = hours.view.place.scene
+    weather = [asdict(each) for each in hours.weather]
+    for each in weather:
+        each["time_utc"] = each.pop("time").isoformat()
+    record: dict[str, Any] = {"scene": scene.name, "attribution": scene.attribution, "webcam": hours.webcam, "sky": sky}
+    files = []
+    for time in times:
+        path = folder / f"{hours.webcam}_{time.astimezone(UTC):%Y-%m-%dT%H%MZ}.png"
+        picture = linear_from_srgb(hours.at(time, sky=sky))
+        save_png(path, picture, metadata=png_metadata(record | {"time_utc": time.astimezone(UTC).isoformat()}))
+        files.append(str(path))
+    with atomic_path(folder / "weather.json") as path:
+        path.write_text(json.dumps(weather, indent=1) + "\n", encoding="utf-8")
+    return record | {"files": [*files, str(folder / "weather.json")], "weather": weather}
 
 
 def _require_same_view(first: Observation, other: Observation) -> None:

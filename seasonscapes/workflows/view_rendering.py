@@ -27,8 +27,8 @@ from seasonscapes.workspace import content_key
 if TYPE_CHECKING:
     from seasonscapes.cameras.panorama import Panorama
     from seasonscapes.cameras.pinhole import Camera
+    from seasonscapes.rendering.coefficients import SamplingOptions
     from seasonscapes.rendering.radiance import RenderedView
-    from seasonscapes.rendering.transport import SamplingOptions
     from seasonscapes.sky.illumination import Illumination
 
 log = logging.getLogger(__name__)
@@ -49,6 +49,8 @@ def render(
     spp: int | None = None,
     max_depth: int | None = None,
     seed: int = 0,
+    lambertian: bool = False,
+    amplify: bool = False,
     progress: Progress | None = None,
 ) -> RenderedView:
     """Render a view of a place at a date and hour.
@@ -75,6 +77,10 @@ def render(
         Of path tracing: largest number of edges of a light path; 2 is direct light only. Default 6.
     seed
         Equal seeds give equal pictures.
+    lambertian
+        All ground is matt, also what the scene file declares as water and snow: for comparison.
+    amplify
+        Add relief and albedo below the resolution of the data: for pictures, not for measurements.
     progress
         Called with a task and its finished share.
 
@@ -120,15 +126,25 @@ def render(
     texture = chosen_albedo(place, utc.date(), albedo, progress=progress)
     if engine == "transport":
         session = still_session(
-            place, camera, sky=sky, albedo=texture, seed=seed, sampling=still_sampling(), progress=progress
+            place,
+            camera,
+            sky=sky,
+            albedo=texture,
+            seed=seed,
+            sampling=still_sampling(),
+            lambertian=lambertian,
+            amplify=amplify,
+            progress=progress,
         )
         view, light, position = view_at(session, utc)
         record = view_record(place, camera, light, position)
-        return replace(view, provenance=record | {"engine": engine, "seed": seed, "variant": backend.variant})
+        record |= {"engine": engine, "seed": seed, "lambertian": lambertian, "amplified": amplify}
+        record["variant"] = backend.variant
+        return replace(view, provenance=record)
     spp, max_depth = 32 if spp is None else spp, 6 if max_depth is None else max_depth
     light, position = illumination_for_camera(place, camera, sky_model(sky), utc)
     view = render_view(
-        build_scene(terrain_for_view(place, camera), texture.values, light),
+        build_scene(terrain_for_view(place, camera, lambertian=lambertian, amplify=amplify), texture.values, light),
         camera,
         spp=spp,
         seed=seed,
@@ -137,14 +153,15 @@ def render(
     )
     record = view_record(place, camera, light, position)
     record |= {"engine": engine, "spp": spp, "max_depth": max_depth, "seed": seed, "variant": backend.variant}
+    record |= {"lambertian": lambertian, "amplified": amplify}
     return replace(view, provenance=record)
 
 
 def still_sampling() -> SamplingOptions:
     """Samples and rays of a still: fewer than a film's, whose frames share them."""
-    from seasonscapes.rendering.transport import SamplingOptions
+    from seasonscapes.rendering.coefficients import SamplingOptions
 
-    return SamplingOptions(albedo_samples=16, rays=128)
+    return SamplingOptions(albedo_samples=16, rays=64, clusters=8192)
 
 
 def chosen_engine(engine: str, *, path_options: bool, device: str) -> str:

@@ -351,10 +351,10 @@ def _seen(values: np.ndarray, uv: np.ndarray, nearest: np.ndarray, shape: tuple[
 
 
 def _transport(place: Place, grid: _Grid, dated: Sequence[DatedAlbedo], detail: ViewerDetail, report) -> dict[str, Any]:
+    from seasonscapes.rendering.coefficients import SamplingOptions
     from seasonscapes.rendering.grid_transport import grid_transport
     from seasonscapes.rendering.hemisphere_rays import ray_scene
     from seasonscapes.rendering.mitsuba_scene import mi_mesh
-    from seasonscapes.rendering.transport import SamplingOptions
 
     sampling = SamplingOptions(
         shadow_samples=1,

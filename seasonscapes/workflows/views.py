@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import astuple
+from dataclasses import astuple, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -142,11 +142,22 @@ def calibrated_viewpoint(path: Path) -> tuple[NamedCamera, tuple[int, int]]:
     return validate(table, NamedCamera, where=path), (camera.width_px, camera.height_px)
 
 
-def terrain_for_view(place: Place, view: Camera | Panorama) -> Terrain:
-    """The terrain of a place, refined near a camera until its error is a quarter of a pixel."""
-    from seasonscapes.terrain.view_refinement import refined_for_view
+def terrain_for_view(
+    place: Place, view: Camera | Panorama, *, lambertian: bool = False, amplify: bool = False
+) -> Terrain:
+    """The terrain of a place, refined near a camera until its error is a quarter of a pixel.
 
-    return refined_for_view(place.terrain, view.position_m, 1.0 / float(view.fx))
+    ``lambertian``: without surfaces that are not matt. ``amplify``: with detail below the resolution of the data; see
+    `workflows.amplified_terrain`.
+    """
+    from seasonscapes.terrain.view_refinement import refined_for_view
+    from seasonscapes.workflows.amplified_terrain import amplified_terrain
+
+    if amplify:
+        terrain = amplified_terrain(place, view)
+    else:
+        terrain = refined_for_view(place.terrain, view.position_m, 1.0 / float(view.fx))
+    return replace(terrain, water=None, snow=None) if lambertian else terrain
 
 
 def camera_geodetic(place: Place, view: Camera | Panorama) -> tuple[float, float, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from seasonscapes.cameras.observation import ManifestRow, PictureProblem
     from seasonscapes.cameras.webcam import HeightCheck
 
+log = logging.getLogger(__name__)
 
 # What a table needs at least, for people who have not written one yet.
 _NEEDED_KEYS = (
@@ -89,6 +91,13 @@ def inspect_webcams(
     from seasonscapes.cameras.picture_names import scan_folder
 
     heights = _heights(scene, elevation)
+    for check in heights:
+        if not check.plausible:
+            log.warning(
+                "webcam %s: %s; its position, its height or their datum is wrong, or the heights are too coarse",
+                check.webcam_id,
+                check.verdict,
+            )
     rows, problems = [], []
     if pictures is not None:
         rows, problems = scan_folder(pictures, scene.webcams, layout=layout)

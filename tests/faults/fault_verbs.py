@@ -32,6 +32,7 @@ BASE: dict[str, list[str]] = {
         *("--output", "out/p.json"),
     ],
     "albedo": ["s.toml", "--times", TIME, "--manifest", "m.csv", "--output", "out/a.npz"],
+    "hours": ["s.toml", "--at-hours", TIME, "--manifest", "m.csv", "--output", "out/hours"],
     "distill": ["s.toml", "--output", "out/m.safetensors"],
     "splat": ["s.toml", "--time", TIME, "--model", "m.safetensors", "--size", "16x12", "--output", "out/s.png"],
     "run": ["s.toml", "--times", TIME, "--at-hours", TIME, "--manifest", "m.csv", "--output", "out/run"],

@@ -1,0 +1,47 @@
+"""Clouds that hang before a mountain are found; the mountain, and snow under a blue sky, are not taken for them."""
+
+import numpy as np
+import pytest
+
+from seasonscapes.albedo.cloud_cover import clouds_before
+
+WIDTH, HEIGHT = 200, 120
+ROWS, COLUMNS = np.mgrid[:HEIGHT, :WIDTH]
+# A mountain whose top is at row 30.
+TERRAIN = (30 + np.abs(COLUMNS - 100) * 0.5) <= ROWS
+CLOUD = TERRAIN & (ROWS < 60)
+
+
+def _picture(sky: tuple[float, float, float]) -> np.ndarray:
+    rng = np.random.default_rng(1)
+    image = (
+        np.where(TERRAIN[..., None], (0.2, 0.25, 0.2), sky)
+        + 0.05 * np.sin(COLUMNS / 3.0)[..., None] * TERRAIN[..., None]
+    )
+    return np.clip(image + rng.normal(0.0, 0.01, image.shape), 0.0, 1.0)
+
+
+@pytest.mark.parametrize("sky", [(1.0, 1.0, 1.0), (0.8, 0.8, 0.78)])
+def test_a_cloud_of_the_sky_s_brightness_is_found_and_the_slope_below_it_kept(sky):
+    image = _picture(sky)
+    image[CLOUD] = np.clip(np.asarray(sky) + np.random.default_rng(2).normal(0.0, 0.01, (CLOUD.sum(), 3)), 0.0, 1.0)
+    found = clouds_before(image, TERRAIN)
+    assert (found & CLOUD).sum() > 0.98 * CLOUD.sum()
+    assert (found & ~CLOUD & (ROWS > 62)).sum() < 0.01 * TERRAIN.sum()
+    assert not (found & ~TERRAIN).any()
+
+
+def test_clear_pictures_lose_the_skyline_alone_and_snow_under_a_blue_sky_is_kept():
+    image = _picture((0.4, 0.6, 0.95))
+    image[CLOUD] = 0.97
+    assert clouds_before(image, TERRAIN).sum() < 0.05 * TERRAIN.sum()
+
+
+def test_bright_ground_that_does_not_touch_the_sky_is_kept():
+    image = _picture((0.8, 0.8, 0.8))
+    image[80:100, 60:140] = 0.8
+    assert not clouds_before(image, TERRAIN)[80:100, 60:140].any()
+
+
+def test_a_picture_without_sky_has_no_cloud_before_its_terrain():
+    assert not clouds_before(_picture((1.0, 1.0, 1.0)), np.ones_like(TERRAIN)).any()
