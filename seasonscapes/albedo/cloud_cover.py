@@ -33,7 +33,7 @@ def clouds_before(image: np.ndarray, terrain: np.ndarray) -> np.ndarray:
         ``(H, W)`` bool: terrain that clouds hide.
     """
     reach = max(1, round(_SKYLINE_PER_100_PX * image.shape[1] / 100.0))
-    sky = ~ndimage.binary_dilation(terrain, _NEIGHBOURS, iterations=reach)
+    sky = np.logical_not(ndimage.binary_dilation(terrain, _NEIGHBOURS, iterations=reach))
     if not sky.any():
         return np.zeros_like(terrain)
     nearest = np.zeros((2, *sky.shape), np.int32)
