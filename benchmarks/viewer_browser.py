@@ -79,8 +79,18 @@ def served(folder: Path) -> Iterator[str]:
         server.server_close()
 
 
-def open_page(browser, address: str, *, seconds: float = 120.0) -> float:
+def processor_s(browser) -> float:
+    """Processor seconds of the browser's processes so far."""
+    import psutil
+
+    processes = psutil.Process(browser.service.process.pid).children(recursive=True)
+    return sum(sum(process.cpu_times()[:4]) for process in processes)
+
+
+def open_page(browser, address: str, *, seconds: float = 120.0, until: str = "ready") -> float:
     """Open a page and wait until its picture is finished; the seconds from its address to its first picture.
+
+    ``until="first"`` waits for the first picture alone.
 
     Raises
     ------
@@ -93,7 +103,7 @@ def open_page(browser, address: str, *, seconds: float = 120.0) -> float:
         data = browser.execute_script("return {...document.body.dataset}")
         if "failed" in data:
             raise RuntimeError(f"the page cannot show the place: {data['failed']}")
-        if "ready" in data:
+        if until in data:
             device = browser.execute_script("return seasonscapes.renderer.device")
             if not device:
                 raise RuntimeError("the page has no WebGL context")

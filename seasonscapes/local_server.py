@@ -45,12 +45,13 @@ class Refused(Exception):
 
 
 class Reply(NamedTuple):
-    """What is sent: status, media type, body, Content-Security-Policy."""
+    """What is sent: status, media type, body, Content-Security-Policy; without ``ends`` more of the body follows."""
 
     status: int
     kind: str
     body: bytes
     policy: str = "default-src 'none'"
+    ends: bool = True
 
 
 class LocalServer(ThreadingHTTPServer):
@@ -117,7 +118,9 @@ class LocalHandler(BaseHTTPRequestHandler):
     def send(self, reply: Reply) -> None:
         """Send a reply with the headers of all replies."""
         self.send_response(reply.status)
-        headers = {"Content-Type": reply.kind, "Content-Length": str(len(reply.body)), **_NO_TRACE}
+        headers = {"Content-Type": reply.kind, **_NO_TRACE}
+        if reply.ends:
+            headers["Content-Length"] = str(len(reply.body))
         for name, value in (headers | {"Content-Security-Policy": reply.policy}).items():
             self.send_header(name, value)
         self.end_headers()

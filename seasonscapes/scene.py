@@ -371,6 +371,12 @@ class SceneFile(Declaration):
         return self._confinement
 
     @property
+    def input_paths(self) -> tuple[Path, ...]:
+        """All files of the scene's rasters; after `read_scene` absolute."""
+        tables = (self.elevation, self.water, *self.images)
+        return tuple(Path(path) for table in tables if table is not None for path in table.paths)
+
+    @property
     def imagery(self) -> Imagery | None:
         """The image of a scene with one, the first of several, or ``None``."""
         return self.images[0] if self.images else None

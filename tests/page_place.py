@@ -6,6 +6,7 @@ under the light of the hour that the scene file states, the mesh two boxes with 
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -69,6 +70,9 @@ def write_page_place(folder: Path) -> Path:
     _write(folder / "ortho.tif", colours, "uint8")
     _write(folder / "autumn.tif", colours * (0.95, 0.85, 0.7), "uint8")
     write_glb(folder).rename(folder / "castle.glb")
+    around = [[7.951, 46.601], [7.957, 46.601], [7.957, 46.605], [7.951, 46.605], [7.951, 46.601]]
+    lake = {"type": "Feature", "properties": {}, "geometry": {"type": "Polygon", "coordinates": [around]}}
+    (folder / "lakes.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [lake]}))
     scene = folder / "my-valley.toml"
     scene.write_text(page_scene(), encoding="utf-8")
     return scene

@@ -1,7 +1,7 @@
 """Albedo: linear parts against slow twins, recovery of a known truth, controls that must fail, and odd sets of pictures."""
 
 from dataclasses import replace
-from datetime import date
+from datetime import UTC, date, datetime
 
 import numpy as np
 import pytest
@@ -24,6 +24,7 @@ from seasonscapes.rendering.hosek import hosek_illumination
 from seasonscapes.rendering.receivers import luminaries
 from seasonscapes.terrain.atlas import measure_atlas
 from seasonscapes.texturing.predictors import predictors_for
+from seasonscapes.workflows.albedo_recovery import recovery_doubts
 
 QUICK = SolverOptions(rounds=4, iterations=10)
 
@@ -378,6 +379,13 @@ def test_gaps_are_completed_and_marked(place, photographs, clean):
     assert (bare.source[measured] == 1).all()
     assert np.isfinite(bare.sigma[predictors.surface]).all()
     assert error(bare.albedo) < flat
+    # Texels that were seen too badly to count keep no colours of their own.
+    bad = measured & (np.arange(height)[:, None] < height // 2)
+    fewer = replace(known, source=np.where(bad, 0, known.source).astype(np.uint8))
+    stray = replace(clean, albedo=np.where(bad[..., None], np.float32([0.9, 0.05, 0.9]), clean.albedo))
+    without = (completed_estimate(fewer, fit, None, predictors).albedo[bad] for fit in (clean, stray))
+    assert bad.sum() > 100
+    assert np.array_equal(*without)
     image = 0.6 * place.albedo * np.random.default_rng(1).normal(1.0, 0.1, place.albedo.shape)
     image = np.maximum(image, 0.01).astype(np.float32)
     corrected = completed_estimate(known, clean, image, predictors)
@@ -424,3 +432,21 @@ def test_cosine_correction_is_exact_without_sky():
     radiance = 0.3 * np.maximum(slopes.incidence, 0.0)[:, None] * np.ones(3)
     np.testing.assert_allclose(corrections.cosine(radiance, slopes)[lit], 0.3 * 0.8, rtol=1e-6)
     np.testing.assert_allclose(corrections.c_correction(radiance, slopes)[lit], 0.3 * 0.8, rtol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("days", "residual", "told"),
+    [
+        (["2024-07-01", "2024-08-20"], [0.03, 0.05], []),
+        (["2023-12-20", "2024-01-10"], [0.03, 0.05], []),
+        (["2018-05-12", "2018-09-08"], [0.03, 0.05], ["span 119 days of the year, and one albedo cannot hold"]),
+        (["2023-11-20", "2024-02-20", "2024-01-05"], [0.0, 0.0, 0.0], ["span 92 days of the year"]),
+        (["2024-07-01", "2024-07-01"], [0.03, 0.41], ["2024-07-01 12:00 UTC is not explained: its pixels differ from the fit by 41 %"]),
+    ],
+)  # fmt: skip
+def test_an_albedo_that_cannot_be_trusted_says_why(photographs, days, residual, told):
+    seen = photographs[0].observation
+    times = [datetime.fromisoformat(f"{day}T12:00").replace(tzinfo=UTC) for day in days]
+    doubts = recovery_doubts([replace(seen, time=time) for time in times], np.array(residual))
+    assert len(doubts) == len(told)
+    assert all(part in doubt for part, doubt in zip(told, doubts, strict=True))

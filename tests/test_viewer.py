@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import sys
+import time
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -115,7 +116,7 @@ class TestFiles:
 class TestServer:
     @pytest.fixture
     def page(self, scene):
-        server, address = serve_scene(scene, {})
+        server, address, _ = serve_scene(scene, {})
         yield re.fullmatch(r"http://127\.0\.0\.1:(\d+)/([\w-]+)/", address).groups()
         server.shutdown()
         server.server_close()
@@ -132,7 +133,7 @@ class TestServer:
 
     def test_the_page_and_its_files_are_served_under_the_token(self, page, scene):
         port, token = page
-        files = viewer_files(scene, view={})
+        files = viewer_files(scene, view={"watched": True})
         for name in ("", *files):
             status, body, headers = self.ask(port, f"/{token}/{name}")
             assert (status, body) == (200, files[name or "index.html"])
@@ -160,6 +161,30 @@ class TestServer:
     def test_there_are_no_other_files(self, page, name):
         port, token = page
         assert self.ask(port, f"/{token}/{name}")[0] == 404
+
+    def test_the_server_knows_when_its_last_page_is_closed(self, scene):
+        server, address, pages = serve_scene(scene, {})
+        try:
+            port, token = re.fullmatch(r"http://127\.0\.0\.1:(\d+)/([\w-]+)/", address).groups()
+            assert not pages.gone(0.0), "no page was opened yet"
+            held = []
+            for _ in range(2):
+                connection = http.client.HTTPConnection("127.0.0.1", int(port), timeout=10)
+                connection.request("GET", f"/{token}/open")
+                held.append(connection.getresponse())
+                assert held[-1].read(1) == b" "
+            held[0].close()
+            time.sleep(3.0)
+            assert not pages.gone(0.0), "another is open"
+            held[1].close()
+            deadline = time.monotonic() + 20.0
+            while not pages.gone(0.0) and time.monotonic() < deadline:
+                time.sleep(0.1)
+            assert pages.gone(0.0)
+            assert not pages.gone(60.0), "it may be loaded again"
+        finally:
+            server.shutdown()
+            server.server_close()
 
 
 class TestAddress:

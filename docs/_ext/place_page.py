@@ -5,6 +5,7 @@ It is made by the program at every build and comes from the workspace afterwards
 
 from __future__ import annotations
 
+import logging
 import shutil
 from pathlib import Path
 
@@ -23,6 +24,8 @@ def write(app: Sphinx, error: Exception | None) -> None:
     from seasonscapes.workflows.viewer import first_view, require_vectorised, write_folder
     from seasonscapes.workflows.viewer_scene import SMALL, viewer_scene
 
+    # That the page is coarser than the raster is meant here.
+    logging.getLogger("seasonscapes.workflows.viewer_scene").setLevel(logging.ERROR)
     use_backend()
     require_vectorised()
     place = ss.load_place(SCENE)

@@ -78,7 +78,7 @@ def delight_command(
 
     model = sky.model()
     with progress_bars() as progress:
-        loaded = options.load(source, progress)
+        loaded = options.load(source, progress, output=output)
         when: ImageTime
         if angles is not None:
             when = angles

@@ -94,7 +94,7 @@ def export_command(
         check_output_folder(output)
     model, options = (sky or SkyOptions()).model(), place or PlaceOptions()
     with progress_bars() as progress:
-        loaded = options.load(scene, progress, albedo=() if albedo is None else (albedo,))
+        loaded = options.load(scene, progress, albedo=() if albedo is None else (albedo,), output=output)
         when: Any = date_of_day
         if time is not None:
             when = parse_time(time, loaded.frame.latitude_deg, loaded.frame.longitude_deg)

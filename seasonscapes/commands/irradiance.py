@@ -69,7 +69,7 @@ def irradiance_command(
     model = sky.model()
     use_backend(device)
     with progress_bars() as progress:
-        loaded = options.load(scene, progress)
+        loaded = options.load(scene, progress, output=output)
         at = (loaded.frame.latitude_deg, loaded.frame.longitude_deg)
         times = parse_time(time, *at) if time is not None else (when or WhenOptions()).instants(*at)
         received = irradiance_map(

@@ -74,7 +74,7 @@ def lit_texture_command(
     metering, model = parse_exposure(exposure), sky.model()
     use_backend(device)
     with progress_bars() as progress:
-        loaded = options.load(scene, progress, albedo=() if albedo is None else (albedo,))
+        loaded = options.load(scene, progress, albedo=() if albedo is None else (albedo,), output=output)
         utc = parse_time(time, loaded.frame.latitude_deg, loaded.frame.longitude_deg)
         given = None if albedo is None else load_albedo(loaded, albedo, utc.date())
         lit = lit_texture(loaded, utc, sky=model, albedo=given, rays=rays, seed=seed, progress=progress)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from cyclopts import Parameter
 
-from seasonscapes.commands.outputs import check_output_folder
+from seasonscapes.commands.outputs import check_output_folder, refuse_own_input
 
 if TYPE_CHECKING:
     from seasonscapes.progress import Progress
@@ -65,18 +65,27 @@ class PlaceOptions:
         )
 
     def load(
-        self, scene: str, progress: Progress | None = None, *, texel_m: float | None = None, albedo: Sequence[Path] = ()
+        self,
+        scene: str,
+        progress: Progress | None = None,
+        *,
+        texel_m: float | None = None,
+        albedo: Sequence[Path] = (),
+        output: Path | None = None,
     ) -> Place:
-        """The place of a scene file or bundled scene; see `mesh`."""
+        """The place of a scene file or bundled scene (see `mesh`), of whose files ``output`` must be none."""
         from seasonscapes.workflows.place import load_place
 
-        return load_place(
+        place = load_place(
             scene,
             self.folder(),
             options=self.mesh(texel_m=texel_m, albedo=albedo),
             allow_outside=self.allow_outside,
             progress=progress,
         )
+        if output is not None:
+            refuse_own_input(output, (place.path, *place.scene.input_paths))
+        return place
 
 
 @Parameter(name="*")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -44,6 +44,14 @@ def check_file_or_folder(output: Path, *, flag: str = "--output") -> None:
         check_output(output, (output.suffix.lower(),), flag=flag)
     else:
         check_output_folder(output, flag=flag)
+
+
+def refuse_own_input(output: Path, inputs: Iterable[Path], *, flag: str = "--output") -> None:
+    """`InputError` about an output that would replace one of the files that it is made of."""
+    for path in inputs:
+        if output.resolve() == path.resolve():
+            cure = "choose another name"
+            raise InputError(flag, "would replace a file that the scene is made of", got=str(output), cure=cure)
 
 
 @contextmanager

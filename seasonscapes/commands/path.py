@@ -99,7 +99,7 @@ def path_command(
     check_choice("--turn", turn, tuple(TURNS))
     size_px = None if size is None else parse_size(size)
     with progress_bars() as progress:
-        loaded = options.load(scene, progress)
+        loaded = options.load(scene, progress, output=output)
     target = None if look_at is None else enu_from_geodetic(loaded.frame, *parse_position(loaded, look_at, "--look-at"))
     if reference is not None:
         path, meta = paths.reference_path(loaded, reference, kind=cast(Kind, kind), size_px=size_px)

@@ -102,7 +102,7 @@ def render_command(
     files = [parse_albedo(text) for text in albedo or ()]
     use_backend(device)
     with progress_bars() as progress:
-        loaded = options.load(scene, progress, albedo=[each.path for each in files])
+        loaded = options.load(scene, progress, albedo=[each.path for each in files], output=output)
         chosen, camera = view.chosen(loaded.scene), view.pinhole(loaded)
         utc = address.time if address else parse_time(str(time), chosen.latitude_deg, chosen.longitude_deg)
         series = albedo_series(loaded, files, season, progress=progress)

@@ -78,7 +78,7 @@ def splat_command(
     metering, size_px, declared = look.metering(), view.size_px(), sky.model()
     splats = load_model(model)
     with progress_bars() as progress:
-        loaded = options.load(scene, progress)
+        loaded = options.load(scene, progress, output=output)
     gaussians.require_scene(splats, loaded)
     chosen, camera = view.chosen(loaded.scene), view.pinhole(loaded)
     utc = parse_time(time, chosen.latitude_deg, chosen.longitude_deg)

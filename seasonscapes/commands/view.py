@@ -29,7 +29,7 @@ def view_command(
     place: PlaceOptions | None = None,
     json: bool = False,
 ) -> None:
-    """Show a place in a browser, where date and hour are dragged; serves on 127.0.0.1 until Ctrl-C.
+    """Show a place in a browser, where date and hour are dragged; serves on 127.0.0.1 until the page is closed.
 
     Parameters
     ----------
@@ -90,17 +90,17 @@ def view_command(
 
 
 def _serve(scene: Any, first: dict[str, Any], port: int, open_browser: bool) -> None:
-    """Serve until Ctrl-C."""
+    """Serve until the page is closed, or Ctrl-C."""
     import webbrowser
 
     from seasonscapes.workflows.viewer import serve_scene
 
-    server, address = serve_scene(scene, first, port=port)
-    message(f"view: open {address} in a browser; Ctrl-C ends")
+    server, address, pages = serve_scene(scene, first, port=port)
+    message(f"view: open {address} in a browser; closing the page or Ctrl-C ends")
     try:
         if open_browser:
             webbrowser.open(address)
-        while True:
+        while not pages.gone():
             clock.sleep(0.5)
     finally:
         server.shutdown()

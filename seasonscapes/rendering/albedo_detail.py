@@ -17,7 +17,7 @@ from seasonscapes.terrain.surface_classes import AlbedoDetail
 # Wavelengths of the octaves [m]: whole powers of two, from the coarsest that may be needed on.
 _COARSEST, _FINEST = 5, -8
 # Octaves fade out between these wavelengths in pixels.
-_FADE_PX = (1.5, 4.0)
+_FADE_PX = (0.5, 1.5)
 
 
 class DeviceDetail:
@@ -97,3 +97,29 @@ class DeviceDetail:
                 sine, cosine = dr.sincos(mi.Float(bits >> 8) * (2.0 * np.pi / 2.0**24))
                 corners.append(cosine * (fx - dx) + sine * (fy - dy))
         return dr.lerp(dr.lerp(corners[0], corners[1], u), dr.lerp(corners[2], corners[3], u), v)
+
+
+def finest_detail_m(detail: AlbedoDetail | None, texel_m: float, distance_m: np.ndarray) -> np.ndarray:
+    """Side of the smallest element of the albedo at distances from the camera: half the finest wavelength, or the texel.
+
+    Parameters
+    ----------
+    detail
+        Of the terrain; ``None``: its texels are the smallest elements.
+    texel_m
+        Side of a texel [m].
+    distance_m
+        ``(...)`` distances [m].
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(...)`` [m].
+    """
+    distance_m = np.asarray(distance_m, float)
+    if detail is None:
+        return np.full(distance_m.shape, texel_m)
+    pixel_m = np.maximum(distance_m, 0.5) * detail.pixel_angle_rad
+    # The finest octave that counts at least half.
+    power = np.ceil(np.log2(0.5 * sum(_FADE_PX) * pixel_m))
+    return np.minimum(0.5 * 2.0 ** np.maximum(power, _FINEST), texel_m)

@@ -33,7 +33,7 @@ def lattice_hash(column: np.ndarray, row: np.ndarray, seed: int) -> np.ndarray:
 
 
 def gradient_noise(x: np.ndarray, y: np.ndarray, seed: int) -> np.ndarray:
-    """Gradient noise after Perlin 2002: zero at the lattice points, smooth to the second derivative.
+    """Gradient noise after Perlin 2002 (doi:10.1145/566654.566636): zero at the lattice points, smooth to the second derivative.
 
     Parameters
     ----------

@@ -7,6 +7,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import date
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,6 +35,8 @@ log = logging.getLogger(__name__)
 
 # Webcams resolve no finer where they look farther than some kilometres; coefficients of finer atlases take long.
 TEXEL_M = 20.0
+# Photographs that model and fit explain leave a median of some percent; snow, leaves and grass change within two months.
+_DOUBTFUL_RESIDUAL, _SEASON_DAYS = 0.2, 60
 
 
 @dataclass(frozen=True)
@@ -192,8 +195,39 @@ def recover_albedo(
     in_frame = [replace(each, camera=view_in_frame(each.camera, place.frame)) for each in photographs]
     transport, prepared, facts = _prepared(place, in_frame, model, options, progress)
     fit, known = _solved(place, transport, prepared, options.iterations, progress)
+    for doubt in recovery_doubts([each.observation for each in prepared], fit.residual):
+        log.warning("%s", doubt)
     day = min(each.observation.time for each in prepared).date()
     return RecoveredAlbedo(day, known, fit, prepared, place.atlas_id, facts, place.options)
+
+
+def recovery_doubts(photographs: Sequence[Observation], residual: np.ndarray) -> list[str]:
+    """In words why an albedo that was recovered cannot be trusted; empty where nothing speaks against it.
+
+    Parameters
+    ----------
+    photographs
+        The K photographs.
+    residual
+        Median relative residual of each, ``(K,)``; see `albedo.closed_form.AlbedoFit`.
+    """
+    doubts = []
+    for each, value in zip(photographs, residual, strict=True):
+        if value > _DOUBTFUL_RESIDUAL:
+            doubts.append(
+                f"{each.webcam} {each.time:%Y-%m-%d %H:%M} UTC is not explained: its pixels differ from the fit by {100.0 * value:.0f} % "
+                "in the median; its sky (--sky, --cloudiness), pose or date is probably another one"
+            )
+    days = sorted({each.time.date().replace(year=2024) for each in photographs})
+    gaps = [(later - sooner).days for sooner, later in pairwise(days)]
+    # Through the turn of the year the days lie closer together.
+    apart = 366 - max([*gaps, 366 - (days[-1] - days[0]).days])
+    if apart > _SEASON_DAYS:
+        doubts.append(
+            f"the photographs span {apart} days of the year, and one albedo cannot hold several seasons: recover each season by "
+            "itself, and give them back as --albedo DATE=FILE"
+        )
+    return doubts
 
 
 def _illuminations(place: Place, photographs: Sequence[Observation], model: SkyModel) -> list[Illumination]:

@@ -151,7 +151,7 @@ def load_place(
     Parameters
     ----------
     scene
-        A scene file (``.toml``), or the name of a bundled scene: ``"alpine"`` or ``"alpine_small"``.
+        A scene file (``.toml``), or the name of a bundled scene: ``"alpine"``, ``"alpine_lake"`` or ``"alpine_small"``.
     workspace
         Where built artefacts are kept; default `workspace.default_workspace`.
     options

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import html
+import threading
+import time as time_module
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -31,6 +33,8 @@ _KINDS = {
     ".bin": "application/octet-stream",
     ".webp": "image/webp",
 }
+# What a page asks for as long as it is open.
+_WATCH = "open"
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data:; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -77,7 +81,29 @@ def write_single_file(scene: ViewerScene, path: Path, view: dict[str, Any]) -> i
     return len(content)
 
 
-def serve_scene(scene: ViewerScene, view: dict[str, Any], *, port: int = 0) -> tuple[LocalServer, str]:
+class OpenPages:
+    """How many browsers show a page: each holds a request open for as long as it does."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._count, self._closed_s = 0, float("inf")
+
+    def __enter__(self) -> None:
+        with self._lock:
+            self._count += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._count -= 1
+            self._closed_s = time_module.monotonic()
+
+    def gone(self, seconds: float = 5.0) -> bool:
+        """Whether the last page was closed so many seconds ago: a page that is loaded again comes back sooner."""
+        with self._lock:
+            return self._count == 0 and time_module.monotonic() - self._closed_s > seconds
+
+
+def serve_scene(scene: ViewerScene, view: dict[str, Any], *, port: int = 0) -> tuple[LocalServer, str, OpenPages]:
     """Serve the page on 127.0.0.1 in a background thread.
 
     The token of access is the first part of the path, so that the page's relative addresses carry it.
@@ -95,30 +121,48 @@ def serve_scene(scene: ViewerScene, view: dict[str, Any], *, port: int = 0) -> t
         Call ``shutdown`` to stop it.
     address : str
         URL of the page with its token.
+    pages : OpenPages
+        Tells when the last page was closed.
 
     Raises
     ------
     InputError
         If the port is none, is taken, or may not be used.
     """
-    files = viewer_files(scene, view=view)
+    files, pages = viewer_files(scene, view=view | {"watched": True}), OpenPages()
 
     class Handler(LocalHandler):
         def do_GET(self) -> None:
             self.answer(self._file)
+            if self.watching:
+                self._stay()
 
-        do_HEAD = do_GET
+        def do_HEAD(self) -> None:
+            self.answer(self._file)
+
+        watching = False
+
+        def _stay(self) -> None:
+            """Send a byte a second until the page is closed, which ends the connection."""
+            with pages:
+                while True:
+                    self.wfile.write(b" ")
+                    self.wfile.flush()
+                    time_module.sleep(1.0)
 
         def _file(self) -> Reply:
             token, _, name = unquote(urlsplit(self.path).path).lstrip("/").partition("/")
             self.require_access(token)
             name = name or "index.html"
+            self.watching = name == _WATCH
+            if self.watching:
+                return Reply(200, "text/plain", b"", _POLICY, ends=False)
             if name not in files:
                 raise Refused(404, "no such file")
             return Reply(200, _KINDS[Path(name).suffix], files[name], _POLICY)
 
     server, address = serve_locally(Handler, port=port)
-    return server, f"{address}/{Handler.token}/"
+    return server, f"{address}/{Handler.token}/", pages
 
 
 @dataclass(frozen=True)

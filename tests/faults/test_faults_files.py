@@ -4,7 +4,7 @@ import os
 import stat
 
 import pytest
-from fault_harness import judge, run_in, with_flag
+from fault_harness import TIME, judge, run_in, with_flag
 from fault_verbs import BASE, JSON_VERBS, SCENE_VERBS
 
 FOLDER_OUTPUTS = ("annotate", "calibrate", "hours", "paint", "run", "timelapse", "view")
@@ -50,6 +50,18 @@ def test_outputs_that_cannot_be_written(land, record_property, verb, kind):
 def test_outputs_of_no_kind(land, record_property, verb, name):
     tokens = with_flag(BASE[verb], "--output", name)
     judge(record_property, run_in(land, [verb, *tokens, *asking_json(verb)]), names="--output")
+
+
+@pytest.mark.fast
+@pytest.mark.parametrize("output", ["dem.tif", "../inside/dem.tif", "linked.tif"])
+def test_outputs_that_are_inputs(land, record_property, output):
+    """A map must not replace the heights that it is a map of."""
+    inside = land / "inside"
+    if not (inside / "linked.tif").exists():
+        (inside / "linked.tif").symlink_to("dem.tif")
+    before = (inside / "dem.tif").read_bytes()
+    judge(record_property, run_in(land, ["irradiance", "s.toml", "--time", TIME, "--output", output]), names="--output")
+    assert (inside / "dem.tif").read_bytes() == before
 
 
 # Scene files that are none, by the bytes that they hold.

@@ -1,19 +1,28 @@
 // The page: reads the scene, keeps the state of time, camera and exposure, and draws when something changed.
 import { makeControls } from "./controls.js";
 import { loadScene } from "./data.js";
+import { luminance, meteredEv, whiteOf } from "./exposure.js";
 import { makeEphemeris } from "./ephemeris.js";
 import { RAD, makeFrame } from "./frames.js";
 import { makeLight } from "./light.js";
 import { makeRenderer } from "./renderer.js";
 import { makeTerrain } from "./terrain.js";
-import { MINUTE, DAY, crossings, dayOfYear, fullMoons, makeClock, moonName, readAddress, writeAddress } from "./times.js";
+import { MINUTE, DAY, crossings, dayOfYear, fullMoons, highestMoon, makeClock, moonName, readAddress, seasonOf, sunAt, writeAddress } from "./times.js";
 
-const LUMINANCE = [0.212639, 0.7151687, 0.0721923];
-const METER_CONSTANT = 12.5 / 100;
 const element = (id) => document.getElementById(id);
-const luminance = (rgb) => rgb[0] * LUMINANCE[0] + rgb[1] * LUMINANCE[1] + rgb[2] * LUMINANCE[2];
 const still = new URLSearchParams(location.search).has("still") || document.documentElement.dataset.still === "1";
 const reduced = matchMedia("(prefers-reduced-motion: reduce)").matches;
+
+/** Hold a request open, by which the program that serves this page knows that it is shown. */
+async function stayOpen() {
+  try {
+    const reader = (await fetch("open")).body.getReader();
+    while (!(await reader.read()).done);
+  } catch (error) {
+    if (!(error instanceof TypeError)) throw error;
+  }
+  element("status").textContent = "seasonscapes view has ended: dates that were not shown before cannot be loaded.";
+}
 
 start().catch((error) => {
   element("status").textContent = `The place cannot be shown: ${error.message}`;
@@ -76,16 +85,7 @@ async function start() {
   }
 
   async function albedoChanged() {
-    const days = about.albedo.map((each) => dayOfYear({ year: 2024, month: Number(each.date.slice(5, 7)), day: Number(each.date.slice(8)) }));
-    const at = dayOfYear(clock.civil(state.time));
-    let [before, after, share] = [0, 0, 0];
-    if (days.length > 1) {
-      before = days.findLastIndex ? days.findLastIndex((day) => day <= at) : lastIndex(days, at);
-      if (before < 0) before = days.length - 1;
-      after = (before + 1) % days.length;
-      const gap = (days[after] - days[before] + 366) % 366 || 366;
-      share = ((at - days[before] + 366) % 366) / gap;
-    }
+    const { before, after, share } = seasonOf(about.albedo, dayOfYear(clock.civil(state.time)));
     const key = `${before}:${after}:${share.toFixed(3)}`;
     if (key === state.albedoKey) return;
     state.albedoKey = key;
@@ -101,7 +101,6 @@ async function start() {
     state.metered = false;
     state.dirty = true;
   }
-  const lastIndex = (list, at) => list.reduce((found, day, k) => (day <= at ? k : found), -1);
 
   function albedoTexture(index) {
     if (!albedos.has(index)) {
@@ -121,42 +120,16 @@ async function start() {
     remember();
   }
 
-  function white() {
-    const sun = now.bodies[0];
-    if (!(sun.normal[1] > 0)) return [1, 1, 1];
-    const w = [Math.min(sun.normal[0] / sun.normal[1], 1.14), 1, Math.max(sun.normal[2] / sun.normal[1], 0.86)];
-    const y = luminance(w);
-    return w.map((value) => value / y);
-  }
-
-  /** The EV100 of a camera's metering in the look `photo`, as seasonscapes/exposure.py. */
-  function meter() {
-    const values = renderer.luminances().filter((v) => v > 0 && Number.isFinite(v)).sort((a, b) => a - b);
-    if (!values.length) return 15;
-    const percentile = (p) => {
-      const x = (p / 100) * (values.length - 1);
-      const k = Math.floor(x);
-      return values[k] + (x - k) * ((values[k + 1] ?? values[k]) - values[k]);
-    };
-    const [low, high] = [percentile(2), percentile(98)];
-    const middle = values.filter((v) => v >= low && v <= high);
-    let ev = Math.log2(Math.exp(middle.reduce((sum, v) => sum + Math.log(v), 0) / middle.length) / METER_CONSTANT);
-    ev += Math.min(Math.max(0.25 * (4 - ev), 0), 3);
-    if (ev < 4) return ev - Math.min(Math.max((4 - ev) / 13, 0), 0.6);
-    const highlight = Math.max((percentile(97) * 1.6) / (1.2 * 2 ** ev), 1e-6);
-    return ev - Math.min(Math.max(Math.log2(0.8 / highlight), -0.3), 0.9);
-  }
-
   function expose() {
     if (state.ev === "auto") {
       if (!state.metered) {
-        const wanted = meter();
+        const wanted = meteredEv(renderer.luminances());
         const jump = reduced || still || !state.playing || Math.abs(wanted - state.shownEv) > 4;
         state.shownEv = jump ? wanted : state.shownEv + 0.3 * (wanted - state.shownEv);
         state.metered = true;
       }
     } else state.shownEv = state.ev;
-    renderer.setExposure(state.shownEv, white());
+    renderer.setExposure(state.shownEv, whiteOf(now.bodies[0].normal));
     element("ev-value").value = state.shownEv.toFixed(1);
     if (state.ev === "auto") element("ev").value = state.shownEv.toFixed(1);
     element("ev").setAttribute("aria-valuetext", `EV ${state.shownEv.toFixed(1)}${state.ev === "auto" ? ", automatic" : ""}`);
@@ -321,21 +294,7 @@ async function start() {
     const from = clock.instant(civil.year, civil.month, civil.day);
     return sunTimesBetween(point, from, from + DAY);
   }
-  /** Times at which more than half of the sun's disc comes above the ground's horizon at a point, or goes below it. */
-  function sunTimesBetween(point, from, to) {
-    const margin = (instant) => {
-      const sun = ephemeris.sun(instant);
-      if (sun.elevation < -1) return -1;
-      return sun.elevation - Math.max(terrain.horizonDeg(point[0], point[1], sun.azimuth), -90);
-    };
-    const [se, sn] = terrain.slopeAt(point[0], point[1]);
-    const facing = (instant) => {
-      const d = ephemeris.sun(instant).direction;
-      return d[2] - se * d[0] - sn * d[1];
-    };
-    const value = (instant) => Math.min(margin(instant), 100 * facing(instant));
-    return crossings(value, from, to, 2 * MINUTE);
-  }
+  const sunTimesBetween = (point, from, to) => sunAt(terrain, ephemeris, point, from, to);
 
   function tellPoint() {
     const [latitude, longitude, height] = frame.toGeodetic(state.point);
@@ -431,14 +390,8 @@ async function start() {
   });
   element("full-moon").addEventListener("click", () => {
     const next = fullMoons(state.time + DAY, state.time + 40 * DAY)[0];
-    if (next) setTime(highest(next));
+    if (next) setTime(highestMoon(ephemeris, next));
   });
-  /** The instant within half a day at which the moon stands highest. */
-  function highest(time) {
-    let best = time;
-    for (let t = time - DAY / 2; t < time + DAY / 2; t += 10 * MINUTE) if (ephemeris.moon(t).elevation > ephemeris.moon(best).elevation) best = t;
-    return best;
-  }
   for (const kind of ["day", "year"]) {
     element(`play-${kind}`).addEventListener("click", () => {
       const on = state.playing === kind;
@@ -541,5 +494,6 @@ async function start() {
   window.seasonscapes = { about, arrays, state, renderer, controls, ephemeris, terrain, light, frame, clock, setTime, setEv, setHaze, sunTimes, sunTimesBetween, step, expose, command, lightOf, now: () => now, fine, useCamera };
   loop();
   step();
+  if (about.view.watched) stayOpen();
   document.body.dataset.started = (performance.now() - began).toFixed(0);
 }

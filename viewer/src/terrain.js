@@ -86,9 +86,9 @@ export function makeTerrain(arrays, about) {
   /** Elevation [deg] of the ground's horizon from a point, towards an azimuth. */
   function horizonDeg(east, north, azimuthDeg) {
     const [de, dn] = [Math.sin(azimuthDeg * RAD), Math.cos(azimuthDeg * RAD)];
-    const start = heightAt(east, north) + 0.05 * step_m;
+    const start = heightAt(east, north) + 0.02 * step_m;
     let tangent = -0.2;
-    let t = 0.35 * step_m;
+    let t = 0.25 * step_m;
     const most = Math.hypot(columns, rows) * step_m;
     while (t < most) {
       const [e, n] = [east + de * t, north + dn * t];

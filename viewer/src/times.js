@@ -34,6 +34,17 @@ export function dayOfYear({ year, month, day }) {
   return Math.round((Date.UTC(year, month - 1, day) - Date.UTC(year, 0, 1)) / DAY) + 1;
 }
 
+/** Between which of dated pictures, in the order of the year, a day of the year lies, and how far. */
+export function seasonOf(dated, at) {
+  const days = dated.map(({ date }) => dayOfYear({ year: 2024, month: Number(date.slice(5, 7)), day: Number(date.slice(8)) }));
+  if (days.length < 2) return { before: 0, after: 0, share: 0 };
+  const last = days.reduce((found, day, k) => (day <= at ? k : found), -1);
+  const before = last < 0 ? days.length - 1 : last;
+  const after = (before + 1) % days.length;
+  const gap = (days[after] - days[before] + 366) % 366 || 366;
+  return { before, after, share: ((at - days[before] + 366) % 366) / gap };
+}
+
 /** Instants at which a function of time crosses a level, by halving. */
 export function crossings(value, from, to, step) {
   const found = [];
@@ -54,6 +65,20 @@ export function crossings(value, from, to, step) {
   return found;
 }
 
+/** Times at which more than half of the sun's disc comes above the ground's horizon at a point, or goes below it. */
+export function sunAt(terrain, ephemeris, point, from, to) {
+  const [se, sn] = terrain.slopeAt(point[0], point[1]);
+  const value = (instant) => {
+    const sun = ephemeris.sun(instant);
+    if (sun.elevation < -1) return -1;
+    const margin = sun.elevation - terrain.horizonDeg(point[0], point[1], sun.azimuth);
+    // The ground must face the sun, too.
+    const d = sun.direction;
+    return Math.min(margin, 100 * (d[2] - se * d[0] - sn * d[1]));
+  };
+  return crossings(value, from, to, 2 * MINUTE);
+}
+
 export function fullMoons(from, to) {
   const list = [];
   let time = SearchMoonPhase(180, new Date(from), 40);
@@ -62,6 +87,13 @@ export function fullMoons(from, to) {
     time = SearchMoonPhase(180, new Date(time.date.getTime() + 25 * DAY), 40);
   }
   return list;
+}
+
+/** The instant within half a day at which the moon stands highest. */
+export function highestMoon(ephemeris, time) {
+  let best = time;
+  for (let t = time - DAY / 2; t < time + DAY / 2; t += 10 * MINUTE) if (ephemeris.moon(t).elevation > ephemeris.moon(best).elevation) best = t;
+  return best;
 }
 
 export const moonName = (time) => {

@@ -1,0 +1,270 @@
+"""Detail near the eye: invented relief against withheld truth, near texels over 60 km, snow and water against theory.
+
+    python benchmarks/detail.py [--quick] [--seed N] [--data FOLDER] [--json FILE]
+
+Each elevation raster is averaged over 4 × 4 cells and amplified four times; slopes, the spectrum of the roughness and the
+lengths of shadows are compared with the withheld raster. A gain of 1 means as the truth, 0 no nearer than bicubic
+interpolation. The rasters are four of 2.5 to 10 m below ``--data`` (default: the environment's ``SEASONSCAPES_DATA``, or
+``../shared/data``); those that are not there are told and left out. The synthetic massif, whose own relief ends at its
+lattice of 60 m, is no truth about finer relief: its gains (``massif_…``) are printed beside, and stand for the others only
+where there are none.
+
+A place of 60 × 50 km is made on the spot, and a picture by a camera 2 m above its ground taken in a fresh process and
+workspace with ``--amplify``: ``first_picture_s`` is its wall time, ``peak_gb`` its largest memory, ``near_texel_px`` the
+largest size of an element of the albedo in the lowest rows of the picture. ``--quick`` renders it at 768 × 512 instead of
+1536 × 1024 pixels and takes the massif at 30 m.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import os
+import resource
+import secrets
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import rasterio
+from affine import Affine
+from record import ROOT, write_record
+
+from seasonscapes.rendering.albedo_detail import finest_detail_m
+from seasonscapes.rendering.snow_scattering import ICE_ABSORPTION, reflectance, snow_albedo
+from seasonscapes.rendering.water_surface import REFRACTIVE_INDEX, DeviceWater
+from seasonscapes.terrain.amplification import amplified
+from seasonscapes.terrain.surface import Raster
+from seasonscapes.terrain.surface_classes import AlbedoDetail, Water
+from seasonscapes.terrain.synthetic import alpine_massif
+
+sys.path.insert(0, str(ROOT / "tests"))
+from oracles_snow import wiscombe_warren_albedo
+
+# Spacings of 5, 10, 10 and 2.5 m.
+RASTERS = (
+    "sertig-10m/sertig_5m.tif",
+    "sertig-10m/sertig_valley.tif",
+    "davosdorf-10m/davosdorf.tif",
+    "bolternosa-timelapse/dem_2_5m.tif",
+)
+FACTOR = 4
+SUNS_DEG = (10.0, 20.0, 30.0)
+CAMERA_ABOVE_M = 2.0
+
+
+@dataclass(frozen=True)
+class Relief:
+    """A raster of heights ``(H, W)`` [m] whose sides are multiples of 8, and its spacing [m]."""
+
+    name: str
+    heights: np.ndarray
+    transform: Affine
+    crs: str
+    spacing_m: float
+
+
+def read_relief(path: Path) -> Relief:
+    with rasterio.open(path) as file:
+        heights, transform, crs = file.read(1).astype(float), file.transform, file.crs.to_wkt()
+    height, width = (size // 8 * 8 for size in heights.shape)
+    return Relief(path.stem, heights[:height, :width], transform, crs, abs(transform.a))
+
+
+def massif_relief(seed: int, spacing_m: float) -> Relief:
+    elevation = alpine_massif(seed=seed, size_m=12000.0, spacing_m=spacing_m).elevation
+    height, width = (size // 8 * 8 for size in elevation.values.shape[:2])
+    heights = elevation.values[:height, :width, 0].astype(float)
+    return Relief(f"massif {spacing_m:g} m", heights, elevation.transform, elevation.crs, spacing_m)
+
+
+def slopes_deg(heights: np.ndarray, spacing_m: float) -> np.ndarray:
+    down, across = np.gradient(heights, spacing_m)
+    return np.degrees(np.arctan(np.hypot(down, across)))
+
+
+def distribution_distance(first: np.ndarray, second: np.ndarray) -> float:
+    """Wasserstein distance of two samples, from their quantiles."""
+    share = np.linspace(0.0, 1.0, 501)
+    return float(np.abs(np.quantile(first, share) - np.quantile(second, share)).mean())
+
+
+def roughness_spectrum(heights: np.ndarray) -> np.ndarray:
+    """Logarithm of the power in eight bands between the Nyquist frequency of the coarse raster and that of the fine one."""
+    side = min(heights.shape)
+    square = heights[:side, :side]
+    row, column = np.mgrid[0:side, 0:side]
+    plane = np.stack([column.ravel(), row.ravel(), np.ones(side * side)], axis=1)
+    square = square - (plane @ np.linalg.lstsq(plane, square.ravel(), rcond=None)[0]).reshape(side, side)
+    window = np.hanning(side)
+    power = np.abs(np.fft.fft2(square * window[:, None] * window)) ** 2
+    frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(side), np.fft.fftfreq(side)))
+    edges = np.geomspace(0.5 / FACTOR, 0.5, 9)
+    return np.log10([power[(frequency >= a) & (frequency < b)].mean() for a, b in itertools.pairwise(edges)])
+
+
+def shadow_counts(heights: np.ndarray, spacing_m: float) -> np.ndarray:
+    """Numbers of shadows by length, for suns of three elevations in four directions."""
+    edges = np.geomspace(0.9 * spacing_m, 2000.0 * spacing_m, 20)
+    counts = []
+    for elevation_deg in SUNS_DEG:
+        lengths = []
+        for grid in (heights, heights[::-1], heights.T, heights.T[::-1]):
+            ray = grid + np.arange(len(grid))[:, None] * spacing_m * np.tan(np.radians(elevation_deg))
+            shadowed = np.pad(ray < np.maximum.accumulate(ray, axis=0) - 1e-6, ((1, 1), (0, 0))).T
+            change = np.diff(shadowed.astype(np.int8), axis=1)
+            lengths.append((np.nonzero(change == -1)[1] - np.nonzero(change == 1)[1]) * spacing_m)
+        counts.append(np.histogram(np.concatenate(lengths), edges)[0])
+    return np.concatenate(counts).astype(float)
+
+
+def relief_gains(relief: Relief, seed: int) -> dict[str, float]:
+    """How much nearer amplified heights are to the withheld ones than bicubic interpolation."""
+    truth, spacing_m = relief.heights, relief.spacing_m
+    height, width = (size // FACTOR for size in truth.shape)
+    coarse = truth.reshape(height, FACTOR, width, FACTOR).mean(axis=(1, 3))
+    raster = Raster(coarse[..., None].astype(np.float32), relief.transform * Affine.scale(FACTOR), relief.crs)
+    fine = amplified(raster, FACTOR, seed=seed).values[..., 0].astype(float)
+    bicubic = cv2.resize(coarse.astype(np.float32), truth.shape[::-1], interpolation=cv2.INTER_CUBIC).astype(float)
+    slope = [slopes_deg(each, spacing_m) for each in (truth, fine, bicubic)]
+    spectrum = [roughness_spectrum(each) for each in (truth, fine, bicubic)]
+    shadows = [shadow_counts(each, spacing_m) for each in (truth, fine, bicubic)]
+    return {
+        "slope_distance_gain": 1.0
+        - distribution_distance(slope[0], slope[1]) / distribution_distance(slope[0], slope[2]),
+        "spectrum_gain": 1.0
+        - float(np.linalg.norm(spectrum[1] - spectrum[0]) / np.linalg.norm(spectrum[2] - spectrum[0])),
+        "shadow_length_gain": 1.0
+        - float(np.abs(shadows[1] - shadows[0]).sum() / np.abs(shadows[2] - shadows[0]).sum()),
+    }
+
+
+def snow_error() -> float:
+    """Largest difference of our snow's albedo, integrated over viewers, from that of Wiscombe & Warren's model."""
+    node, weight = np.polynomial.legendre.leggauss(40)
+    cosine, weight = 0.5 * (node + 1.0), 0.25 * weight * (node + 1.0) * 2.0
+    azimuth = (np.arange(360) + 0.5) * np.pi / 360
+    worst = 0.0
+    for radius_um in (50.0, 100.0, 200.0, 500.0, 1000.0):
+        for wavelength, index in ICE_ABSORPTION.items():
+            spherical = snow_albedo(2e-3 * radius_um, None, (wavelength,))[0]
+            for sun in (0.3, 0.5, 0.8):
+                sines = np.sqrt(1.0 - cosine**2) * np.sqrt(1.0 - sun**2)
+                between = cosine[:, None] * sun + sines[:, None] * np.cos(azimuth)
+                plane = weight @ reflectance(cosine[:, None], sun, between, spherical).mean(axis=1)
+                worst = max(worst, abs(plane - wiscombe_warren_albedo(radius_um * 1e-6, wavelength, index, sun)))
+    return worst
+
+
+def fresnel_error() -> float:
+    """Largest difference of the renderer's reflectance of smooth water from Fresnel's sines and tangents."""
+    import mitsuba as mi
+
+    from seasonscapes.frames import LocalFrame
+
+    water = DeviceWater(Water(np.ones((2, 2), np.float32), 0.0), LocalFrame(46.5, 8.0))
+    angle = np.radians(np.linspace(0.5, 89.5, 179))
+    inside = np.arcsin(np.sin(angle) / REFRACTIVE_INDEX)
+    across = np.sin(angle - inside) / np.sin(angle + inside)
+    along = np.tan(angle - inside) / np.tan(angle + inside)
+    viewer = mi.Vector3f(mi.Float(np.sin(angle)), 0.0, mi.Float(np.cos(angle)))
+    _, found = water.mirrored(mi.Normal3f(0.0, 0.0, 1.0), viewer, mi.Point2f(0.5, 0.5))
+    return float(np.abs(np.array(found) - 0.5 * (across**2 + along**2)).max())
+
+
+def write_wide_place(folder: Path, seed: int) -> Path:
+    """Mountains of 60 × 50 km: heights and an image of 25 m, and a scene file with a camera 2 m above the ground."""
+    rng = np.random.default_rng(seed)
+    coarse = cv2.resize(rng.normal(0.0, 1.0, (13, 15)).astype(np.float32), (300, 250), interpolation=cv2.INTER_CUBIC)
+    coarse += 0.45 * cv2.resize(
+        rng.normal(0.0, 1.0, (50, 60)).astype(np.float32), (300, 250), interpolation=cv2.INTER_CUBIC
+    )
+    coarse += 0.2 * cv2.resize(
+        rng.normal(0.0, 1.0, (125, 150)).astype(np.float32), (300, 250), interpolation=cv2.INTER_CUBIC
+    )
+    transform = Affine(200.0, 0.0, 390_000.0, 0.0, -200.0, 5_180_000.0)
+    raster = amplified(Raster((1800.0 + 600.0 * coarse)[..., None], transform, "EPSG:32632"), 8, seed=seed)
+    heights = raster.values[..., 0]
+    slope = slopes_deg(heights.astype(float), 25.0)
+    meadow, rock, snow = np.array([60, 80, 45]), np.array([120, 115, 110]), np.array([235, 240, 245])
+    steep = np.clip((slope - 25.0) / 12.0, 0.0, 1.0)[..., None]
+    high = np.clip((heights - 2500.0) / 300.0, 0.0, 1.0)[..., None] * (1.0 - 0.7 * steep)
+    image = (meadow * (1.0 - steep) + rock * steep) * (1.0 - high) + snow * high
+    profile = {"driver": "GTiff", "height": 2000, "width": 2400, "crs": raster.crs, "transform": raster.transform}
+    with rasterio.open(folder / "heights.tif", "w", count=1, dtype="float32", **profile) as file:
+        file.write(heights, 1)
+    with rasterio.open(folder / "image.tif", "w", count=3, dtype="uint8", **profile) as file:
+        file.write(np.moveaxis(np.clip(image, 0, 255).astype(np.uint8), -1, 0))
+    (folder / "wide.toml").write_text(
+        'name = "wide"\nattribution = "made by a benchmark"\nvertical_datum = "local"\n\n[elevation]\nfile = "heights.tif"\n\n'
+        '[imagery]\nfile = "image.tif"\ndelit = true\n\n[snow]\n\n[[camera]]\nname = "eye"\nlatitude_deg = 46.54\n'
+        f"longitude_deg = 7.96\nabove_ground_m = {CAMERA_ABOVE_M}\nheading_deg = 150.0\npitch_deg = 0.0\nfov_deg = 60.0\n"
+    )
+    return folder / "wide.toml"
+
+
+def first_picture(folder: Path, seed: int, size_px: tuple[int, int]) -> dict[str, float]:
+    """Wall time and memory of the first picture of the wide place, and the size of its near texels."""
+    scene, start = write_wide_place(folder, seed), time.perf_counter()
+    command = [sys.executable, "-m", "seasonscapes", "render", str(scene), "--time", "2024-07-20T15:30", "--amplify"]
+    command += ["--size", f"{size_px[0]}x{size_px[1]}", "-o", str(folder / "wide.png")]
+    environment = {**os.environ, "SEASONSCAPES_WORKSPACE": str(folder / "workspace"), "PYTHONPATH": str(ROOT)}
+    start = time.perf_counter()
+    subprocess.run(command, check=True, env=environment, cwd=ROOT)
+    seconds = time.perf_counter() - start
+    peak_gb = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024 / 1e9
+    focal = 0.5 * size_px[0] / np.tan(np.radians(30.0))
+    # The lowest rows see level ground at these distances; farther ground has larger pixels.
+    below = np.arctan((np.arange(1, size_px[1] // 2) + 0.5) / focal)
+    distance = CAMERA_ABOVE_M / np.sin(below)
+    distance = distance[distance < 100.0]
+    texel_m = 60_000.0 / 4096
+    detail = AlbedoDetail((0.0, 0.0, 0.0), float(1.0 / focal), texel_m)
+    sizes = [finest_detail_m(each, texel_m, distance) / (distance / focal) for each in (detail, None)]
+    return {
+        "first_picture_s": seconds,
+        "peak_gb": peak_gb,
+        "near_texel_px": float(sizes[0].max()),
+        "near_texel_plain_px": float(sizes[1].max()),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--seed", type=int)
+    parser.add_argument(
+        "--data", type=Path, default=Path(os.environ.get("SEASONSCAPES_DATA") or ROOT.parent / "shared" / "data")
+    )
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    seed = secrets.randbelow(10_000) if options.seed is None else options.seed
+    reliefs = [massif_relief(1912, 30.0 if options.quick else 15.0)]
+    for path in (options.data / name for name in RASTERS):
+        if path.is_file():
+            reliefs.append(read_relief(path))
+        else:
+            print(f"{path}: not at hand, left out")
+    gains = {relief.name: relief_gains(relief, seed) for relief in reliefs}
+    for name, each in gains.items():
+        print(f"{name:24}" + "  ".join(f"{key} {value:.2f}" for key, value in each.items()))
+    massif, *real = gains.values()
+    judged = real or [massif]
+    figures = {key: float(np.mean([each[key] for each in judged])) for key in massif}
+    figures |= {f"worst_{key}": min(each[key] for each in judged) for key in massif}
+    figures |= {f"massif_{key}": value for key, value in massif.items()}
+    figures |= {"rasters": len(real), "snow_albedo_error": snow_error(), "fresnel_error": fresnel_error()}
+    with tempfile.TemporaryDirectory() as folder:
+        figures |= first_picture(Path(folder), seed, (768, 512) if options.quick else (1536, 1024))
+    for key, value in figures.items():
+        print(f"{key:28} {value:.4g}")
+    write_record(options.json, figures, seed=seed)
+
+
+if __name__ == "__main__":
+    main()
