@@ -3,8 +3,9 @@
     python benchmarks/realbench_losses.py
 
 It takes the flags of ``realbench.py``. Every fourth picture at half of the width, or every second one at the whole of it, is
-left out in turn. Figures are means over them [dB], with one exposure for each colour. ``whole_picture_seen``, ``slopes_of_heights`` and ``pose_of_data_folder`` are to be held against
-``program``; the others, which the completion would take over, against ``conditions_alone``.
+left out in turn. Figures are means over them [dB], with one exposure for each colour. ``whole_picture_seen``,
+``slopes_of_heights`` and ``pose_of_data_folder`` are to be held against ``program``; the others, which the completion would
+take over, against ``conditions_alone``.
 """
 
 from __future__ import annotations

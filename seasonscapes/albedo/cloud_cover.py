@@ -33,14 +33,16 @@ def clouds_before(image: np.ndarray, terrain: np.ndarray) -> np.ndarray:
         ``(H, W)`` bool: terrain that clouds hide.
     """
     reach = max(1, round(_SKYLINE_PER_100_PX * image.shape[1] / 100.0))
-    sky = ~ndimage.binary_dilation(terrain, _NEIGHBOURS, iterations=reach)
+    sky = np.logical_not(ndimage.binary_dilation(terrain, _NEIGHBOURS, iterations=reach))
     if not sky.any():
         return np.zeros_like(terrain)
-    nearest = ndimage.distance_transform_edt(~sky, return_distances=False, return_indices=True)
+    nearest = np.zeros((2, *sky.shape), np.int32)
+    ndimage.distance_transform_edt(~sky, return_distances=False, return_indices=True, indices=nearest)
     width = _SMOOTHING * image.shape[1]
     above = np.stack([ndimage.gaussian_filter(image[..., c][tuple(nearest)], width) for c in range(3)], axis=-1)
     like = np.abs(image - above).max(axis=-1) < _LIKE_SKY
-    labels, _ = ndimage.label(like | sky, _NEIGHBOURS)
+    labels = np.zeros(sky.shape, np.int32)
+    ndimage.label(like | sky, _NEIGHBOURS, output=labels)
     reached = np.isin(labels, np.unique(labels[sky]))
     # A cloud's fringe is neither sky nor ground.
     return ndimage.binary_dilation(reached & like, _NEIGHBOURS, iterations=reach) & terrain

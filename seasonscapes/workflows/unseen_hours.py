@@ -255,7 +255,8 @@ class CameraHours:
             raise InputError("--sky", "no picture has this sky", got=sky, cure="give --sky any")
         angle = np.degrees(np.arccos(np.clip(self.suns[taken] @ light.sun_direction, -1.0, 1.0)))
         weight = np.exp(-0.5 * ((angle - angle.min()) / _ALIKE_DEG) ** 2)
-        values = sum(w * relit_at(self.fitted, light, k) for w, k in zip(weight / weight.sum(), taken, strict=True))
+        relit = np.stack([relit_at(self.fitted, light, k) for k in taken])
+        values = np.tensordot(weight / weight.sum(), relit, 1)
         image = self.background.copy()
         image.reshape(-1, 3)[self.view.pixel[self.shown]] = values[self.shown]
         return image
