@@ -209,7 +209,8 @@ def levelled(elevation: Raster, water: Raster) -> Raster:
         inside = number[part] == index
         # Interpolated shores belong to the bank.
         inner = ndimage.binary_erosion(inside, np.ones((3, 3)))
-        values = heights[part][inner if inner.any() else inside]
+        chosen: Any = inner if inner.any() else inside
+        values = heights[part][chosen]
         level = float(np.median(values))
         low, high = np.percentile(values, [5.0, 95.0])
         if high - low > _LEVEL_M:
