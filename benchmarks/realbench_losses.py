@@ -1,9 +1,9 @@
 """What each stage of realbench loses: one after another is exchanged, and pictures are predicted again.
 
-    python benchmarks/realbench_losses.py [--quick] [--seed N] [--data FOLDER] [--json FILE] [--jobs N]
+    python benchmarks/realbench_losses.py
 
-Every fourth picture (every second one without ``--quick``) is left out in turn. Figures are means over them [dB], with one
-exposure for each colour. ``whole_picture_seen``, ``slopes_of_heights`` and ``pose_of_data_folder`` are to be held against
+It takes the flags of ``realbench.py``. Every fourth picture at half of the width, or every second one at the whole of it, is
+left out in turn. Figures are means over them [dB], with one exposure for each colour. ``whole_picture_seen``, ``slopes_of_heights`` and ``pose_of_data_folder`` are to be held against
 ``program``; the others, which the completion would take over, against ``conditions_alone``.
 """
 

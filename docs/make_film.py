@@ -25,7 +25,10 @@ def main() -> None:
     times = [(FIRST + number * STEP).isoformat() for number in range((LAST - FIRST) // STEP + 1)]
     with tempfile.TemporaryDirectory() as folder:
         frames = [Image.open(path).convert("RGB") for path in ss.timelapse(session, times, folder)]
-    frames[0].save(FILM, "WEBP", save_all=True, append_images=frames[1:], duration=120, loop=0, quality=70, method=6)
+    # Every frame whole: differences to the frame before leave lines in smooth skies.
+    frames[0].save(
+        FILM, "WEBP", save_all=True, append_images=frames[1:], duration=120, loop=0, quality=72, method=6, kmax=1
+    )
     print(f"{FILM}  ({len(frames)} frames, {FILM.stat().st_size / 1e6:.1f} MB)")
 
 

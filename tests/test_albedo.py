@@ -379,6 +379,13 @@ def test_gaps_are_completed_and_marked(place, photographs, clean):
     assert (bare.source[measured] == 1).all()
     assert np.isfinite(bare.sigma[predictors.surface]).all()
     assert error(bare.albedo) < flat
+    # Texels that were seen too badly to count keep no colours of their own.
+    bad = measured & (np.arange(height)[:, None] < height // 2)
+    fewer = replace(known, source=np.where(bad, 0, known.source).astype(np.uint8))
+    stray = replace(clean, albedo=np.where(bad[..., None], np.float32([0.9, 0.05, 0.9]), clean.albedo))
+    without = (completed_estimate(fewer, fit, None, predictors).albedo[bad] for fit in (clean, stray))
+    assert bad.sum() > 100
+    assert np.array_equal(*without)
     image = 0.6 * place.albedo * np.random.default_rng(1).normal(1.0, 0.1, place.albedo.shape)
     image = np.maximum(image, 0.01).astype(np.float32)
     corrected = completed_estimate(known, clean, image, predictors)

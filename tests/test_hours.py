@@ -10,10 +10,11 @@ import pytest
 
 import seasonscapes as ss
 from seasonscapes.cli import main
-from seasonscapes.images import read_image_srgb8
+from seasonscapes.images import read_image_srgb8, write_png8
 
 TAKEN = [f"2024-07-{day}T{hour}:00Z" for day, hour in ((18, "06"), (19, "08"), (20, "10"), (21, "13"), (22, "15"))]
 HELD_OUT = "2024-07-20T11:30Z"
+MASKED_ROWS = 6
 
 
 @pytest.fixture(scope="module")
@@ -23,6 +24,9 @@ def valley(tmp_path_factory) -> Path:
     place = ss.load_place("alpine_small")
     camera = ss.camera(place, "aerial", size_px=(96, 64))
     ss.synthetic_photographs(place, [*TAKEN, HELD_OUT], folder, cameras={"aerial": camera})
+    mask = np.full((64, 96, 3), 255, np.uint8)
+    mask[-MASKED_ROWS:] = 0
+    write_png8(folder / "masks" / "aerial.png", mask)
     return folder
 
 
@@ -45,7 +49,7 @@ def _error_db(picture: np.ndarray, truth: np.ndarray) -> float:
 def asked(valley, tmp_path_factory) -> tuple[Path, str, str]:
     """The folder, standard output and warnings of one run: the hour that was left out, and one of a season never seen."""
     folder = tmp_path_factory.mktemp("asked") / "out"
-    arguments = _arguments(valley, folder, "--hold-out", HELD_OUT, "--sky", "sun")
+    arguments = _arguments(valley, folder, "--hold-out", HELD_OUT, "--sky", "sun", "--masks", str(valley / "masks"))
     arguments[arguments.index("--at-hours") + 1] = f"{HELD_OUT},2024-12-20T12:00Z"
     out, error = StringIO(), StringIO()
     with redirect_stdout(out), redirect_stderr(error):
@@ -58,10 +62,17 @@ def test_the_hour_left_out_is_nearer_to_its_photograph_than_any_other_photograph
     photographs = {row[1]: _picture(valley / row[2]) for row in rows}
     (time,) = [time for time in photographs if "T11:30" in time]
     truth, found = photographs.pop(time), _picture(asked[0] / "aerial_2024-07-20T1130Z.png")
-    land = slice(24, None)
+    land = slice(24, -MASKED_ROWS)
     rivals = [*photographs.values(), np.mean(list(photographs.values()), axis=0)]
     assert len(rivals) == 6
     assert _error_db(found[land], truth[land]) > max(_error_db(each[land], truth[land]) for each in rivals) + 1.0
+
+
+def test_what_a_mask_hides_stays_as_in_the_median_of_the_pictures(valley, asked):
+    rows = [row.split(",") for row in (valley / "manifest.csv").read_text().splitlines()[1:]]
+    median = np.median([_picture(valley / row[2]) for row in rows if "T11:30" not in row[1]], axis=0)
+    found = _picture(asked[0] / "aerial_2024-07-20T1130Z.png")
+    np.testing.assert_allclose(found[-MASKED_ROWS:], median[-MASKED_ROWS:], atol=1.5 / 255.0)
 
 
 def test_weather_of_each_picture_is_written_and_the_sun_was_seen(asked):

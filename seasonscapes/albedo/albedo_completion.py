@@ -19,6 +19,7 @@ def complete_albedo(
     base: np.ndarray | None,
     predictors: Predictors,
     *,
+    measured: np.ndarray | None = None,
     seed: int = 0,
     progress: Callable[[float], None] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -33,6 +34,9 @@ def complete_albedo(
         relief alone, and measured texels do not change.
     predictors
         Relief predictors, without those of the sun's position, since albedo does not depend on it.
+    measured
+        ``(R, S)`` bool: texels that count without a ``base``, in which case nothing draws a poorly determined one to what is
+        likely; by default all that were observed.
     seed
         Seed of the regression.
     progress
@@ -46,6 +50,8 @@ def complete_albedo(
         Standard error ``(R, S)`` float32.
     """
     sigma = observed_sigma(fit)
+    if base is None and measured is not None:
+        sigma = np.where(measured, sigma, np.float32(np.inf))
     # Relative precision: the completion compares cube roots, in which equal relative errors are about equally large.
     weight = np.square(fit.albedo[..., 1] / np.maximum(sigma, 1e-4)).astype(np.float32)
     completed = complete(
@@ -84,7 +90,8 @@ def completed_estimate(
     AlbedoEstimate
         With a finite σ on the whole surface.
     """
-    albedo, sigma = complete_albedo(fit, base, predictors, progress=progress)
+    measured = estimate.source == 1
+    albedo, sigma = complete_albedo(fit, base, predictors, measured=measured, progress=progress)
     source = np.where(predictors.surface & (estimate.source != 1), np.uint8(2), estimate.source)
     return replace(
         estimate, albedo=albedo, sigma=np.where(predictors.surface, sigma, np.float32(np.inf)), source=source

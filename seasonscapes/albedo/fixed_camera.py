@@ -54,7 +54,7 @@ _MEAN_REFLECTANCE = 0.15
 # A smaller share of direct light on the best lit fiftieth of the ground throws no shadow that a picture shows.
 SUN_SHONE, _BEST_LIT = 0.25, 98.0
 # A picture is not explained where its residual is so many times the median of all pictures'.
-_UNEXPLAINED = 2.5
+_UNEXPLAINED = 3.0
 
 
 @dataclass(frozen=True)

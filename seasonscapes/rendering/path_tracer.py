@@ -18,8 +18,10 @@ from seasonscapes.cameras.panorama import Panorama
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.rendering.gbuffer import mi_rays
 from seasonscapes.rendering.mitsuba_scene import LUMINARY_DISTANCE_M, RenderScene
+from seasonscapes.rendering.snow_scattering import SnowOptics
 from seasonscapes.rendering.sobol import hashed, sobol_pair, uniform
 from seasonscapes.rendering.terrain_material import device_water, leaving_points, shadow_ray_start, snow_optics
+from seasonscapes.rendering.water_surface import DeviceWater
 from seasonscapes.sky.illumination import Luminary
 
 # Farther hits are the polygons of sun and moon, which only Mitsuba's own integrators use.
@@ -129,6 +131,45 @@ def _luminaries(scene: RenderScene) -> list[_DeviceLuminary]:
     return [_upload_luminary(body) for body in bright]
 
 
+@dataclass(frozen=True)
+class _Reflection:
+    """How lanes of paths reflect light from a direction.
+
+    ``diffuse`` and ``before``: throughput behind and before the surface; ``water`` with waves and ``snow`` with the lanes
+    that they concern.
+    """
+
+    normal: Any
+    viewer: Any
+    diffuse: Any
+    before: Any
+    albedo: Any
+    water: tuple[DeviceWater, Any] | None
+    snow: tuple[SnowOptics, Any] | None
+
+    def towards(self, direction: Any, cosine: Any) -> Any:
+        """Throughput × reflected radiance for unit normal irradiance [1/sr]."""
+        reflected = self.diffuse * cosine * dr.inv_pi * self.of_snow(direction)
+        if self.water is not None:
+            water, on_water = self.water
+            glitter = water.glitter(self.normal, self.viewer, direction)
+            reflected += dr.select(on_water, self.before * glitter, 0.0)
+        return reflected
+
+    def of_snow(self, direction: Any) -> Any:
+        """Reflection of snow relative to Lambertian ground.
+
+        The interpolated normal may face away from the viewer, who sees the facet all the same.
+        """
+        import mitsuba as mi
+
+        if self.snow is None:
+            return mi.Color3f(1.0)
+        optics, scatters = self.snow
+        cosines = (dr.dot(self.normal, self.viewer), dr.dot(self.normal, direction), dr.dot(self.viewer, direction))
+        return dr.select(scatters, mi.Color3f(*optics.relative(self.albedo, cosines, dr)), 1.0)
+
+
 def _trace(scene: RenderScene, ray: Any, sample_key: Any, index: Any, max_depth: Any) -> tuple[Any, Any]:
     """Radiance ``mi.Color3f`` along camera rays, and whether they hit terrain.
 
@@ -161,14 +202,8 @@ def _trace(scene: RenderScene, ray: Any, sample_key: Any, index: Any, max_depth:
         reflectance = material.eval_diffuse_reflectance(surface, active)
         direction = mi.warp.square_to_cosine_hemisphere(sobol_pair(hashed(key, _BOUNCE), index))
         direction = mi.Frame3f(normal).to_world(direction)
-        mirrored, before, glitter, relative = mi.Bool(False), throughput, None, None
-        if snow is not None:
-
-            def relative(light: Any, normal: Any = normal, viewer: Any = -ray.d, albedo: Any = reflectance) -> Any:
-                """Of snow; the interpolated normal may face away from the viewer, who sees the facet all the same."""
-                cosines = (dr.dot(normal, viewer), dr.dot(normal, light), dr.dot(viewer, light))
-                return mi.Color3f(*snow.relative(albedo, cosines, dr))
-
+        albedo, before = mi.Color3f(reflectance), mi.Color3f(throughput)
+        mirrored, on_water = mi.Bool(False), mi.Bool(False)
         if water is not None:
             on_water = active & seen & water.covers(surface.uv, active)
             wave, share = water.mirrored(normal, -ray.d, sobol_pair(hashed(key, _WAVE), index))
@@ -177,23 +212,22 @@ def _trace(scene: RenderScene, ray: Any, sample_key: Any, index: Any, max_depth:
             reflectance = dr.select(on_water, material.body(surface, on_water), reflectance)
             reflectance = dr.select(mirrored, 1.0, reflectance)
             direction = dr.select(mirrored, wave, direction)
-            if not water.smooth:
-
-                def glitter(light: Any, normal: Any = normal, viewer: Any = -ray.d, on_water: Any = on_water) -> Any:
-                    return dr.select(on_water, water.glitter(normal, viewer, light), 0.0)
-
         throughput = dr.select(active, throughput * reflectance, throughput)
-        diffuse = dr.select(mirrored, 0.0, throughput)
-        scatters = active & (depth == 0)
-        if water is not None:
-            scatters &= ~on_water
-        if relative is not None:
-            throughput = dr.select(scatters, throughput * relative(direction), throughput)
+        reflection = _Reflection(
+            normal,
+            -ray.d,
+            diffuse=dr.select(mirrored, 0.0, throughput),
+            before=before,
+            albedo=albedo,
+            water=None if water is None or water.smooth else (water, on_water),
+            snow=None if snow is None else (snow, active & (depth == 0) & ~on_water),
+        )
+        throughput *= reflection.of_snow(direction)
         light = _direct_light(
             scene,
             luminaries,
             (origin, outward, normal),
-            (diffuse, scatters, relative, before, glitter),
+            reflection,
             sample=(key, index),
             active=active,
             coherent=depth == 0,
@@ -247,21 +281,16 @@ def _direct_light(
     scene: RenderScene,
     luminaries: list[_DeviceLuminary],
     leaving: tuple[Any, Any, Any],
-    reflection: tuple[Any, Any, Any, Any, Any],
+    reflection: _Reflection,
     *,
     sample: tuple[Any, Any],
     active: Any,
     coherent: Any,
 ) -> Any:
-    """Radiance that a surface reflects of the direct light of sun and moon, with one shadow ray for each.
-
-    ``reflection``: diffuse throughput; snow, and its relative reflection; throughput before the surface, and the reflection
-    of glitter. Reflections are functions of the direction, or ``None``.
-    """
+    """Radiance that a surface reflects of the direct light of sun and moon, with one shadow ray for each."""
     import mitsuba as mi
 
     origin, outward, normal = leaving
-    diffuse, scatters, relative, before, glitter = reflection
     key, index = sample
     material = scene.mi_terrain.bsdf()
     total = mi.Color3f(0.0)
@@ -273,10 +302,6 @@ def _direct_light(
         ray: Any = mi.Ray3f(origin + direction * shadow_ray_start(material, cosine), direction)
         ray.maxt = FAR_M
         shadowed = scene.mi_scene.ray_test(ray, coherent=coherent, active=facing)
-        reflected = diffuse * cosine * dr.inv_pi
-        if relative is not None:
-            reflected = dr.select(scatters, reflected * relative(direction), reflected)
-        if glitter is not None:
-            reflected += before * glitter(direction)
-        total += dr.select(facing & ~shadowed, reflected * luminary.mi_illuminance, 0.0)
+        reflected = reflection.towards(direction, cosine) * luminary.mi_illuminance
+        total += dr.select(facing & ~shadowed, reflected, 0.0)
     return total

@@ -162,12 +162,13 @@ class SnowOptics:
         maths
             See `reflectance`.
         """
-        share = self.share(*albedo, maths)
+        share = self.share(albedo[0], albedo[1], albedo[2], maths)
+        out, into, between = cosines
         bounded = [maths.minimum(maths.maximum(channel, 0.05), 0.995) for channel in albedo]
-        return [1.0 + share * (reflectance(*cosines, each, maths) / each - 1.0) for each in bounded]
+        return [1.0 + share * (reflectance(out, into, between, each, maths) / each - 1.0) for each in bounded]
 
     def relative_diffuse(self, albedo: Any, cosine_out: Any) -> list[Any]:
         """Reflectance towards the viewer of diffuse light, divided by the albedo: a ^ (K(μ) − 1)."""
-        share = self.share(*albedo)
+        share = self.share(albedo[0], albedo[1], albedo[2])
         power = escape_function(np.maximum(cosine_out, _LEAST_COSINE)) - 1.0
         return [1.0 + share * (np.clip(each, 0.05, 0.995) ** power - 1.0) for each in albedo]

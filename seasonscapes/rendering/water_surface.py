@@ -145,7 +145,7 @@ class DeviceWater:
         cosine = dr.clip(dr.dot(local, facet), 0.0, 1.0)
         direction = 2.0 * cosine * facet - local
         direction.z = dr.abs(direction.z)
-        return frame.to_world(dr.normalize(direction)), mi.fresnel(cosine, REFRACTIVE_INDEX)[0]
+        return frame.to_world(dr.normalize(direction)), _fresnel(cosine)
 
     def glitter(self, mi_normal: Any, mi_viewer: Any, mi_light: Any) -> Any:
         """Radiance towards the viewer for unit normal irradiance from a small light [1/sr]; 0 for smooth water.
@@ -166,13 +166,14 @@ class DeviceWater:
             cosine = dr.dot(local, facet)
             density = waves.pdf(local, facet) / (4.0 * cosine)
             seen = (facet.z > 0.0) & (cosine > 1e-4) & (light.z > 0.0)
-            total += dr.select(seen, density * mi.fresnel(cosine, REFRACTIVE_INDEX)[0], 0.0)
+            total += dr.select(seen, density * _fresnel(cosine), 0.0)
         return total
 
     def _waves(self) -> Any:
         import mitsuba as mi
 
-        return mi.MicrofacetDistribution(mi.MicrofacetType.Beckmann, self._mi_roughness, True)
+        # The stubs name another float type.
+        return mi.MicrofacetDistribution(mi.MicrofacetType.Beckmann, self._mi_roughness, True)  # pyright: ignore[reportArgumentType, reportCallIssue]
 
     @staticmethod
     def _above(local: Any) -> Any:
@@ -181,3 +182,11 @@ class DeviceWater:
         import mitsuba as mi
 
         return dr.normalize(mi.Vector3f(local.x, local.y, dr.maximum(dr.abs(local.z), 1e-3)))
+
+
+def _fresnel(cosine: Any) -> Any:
+    """`fresnel_reflectance` on the device."""
+    import mitsuba as mi
+
+    # The stubs name another float type.
+    return mi.fresnel(cosine, REFRACTIVE_INDEX)[0]  # pyright: ignore[reportArgumentType]

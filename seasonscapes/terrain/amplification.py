@@ -13,6 +13,7 @@ are amplified as the whole is, but for their rims, whose surroundings are unknow
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from affine import Affine
@@ -151,7 +152,8 @@ def _not_level(heights: np.ndarray) -> np.ndarray:
     level = maximum_filter(heights, 3) - minimum_filter(heights, 3) == 0.0
     if not level.any():
         return np.ones_like(heights)
-    return np.clip((distance_transform_edt(~level) - 1.0) / 2.0, 0.0, 1.0)
+    distance: Any = distance_transform_edt(~level)
+    return np.clip((distance - 1.0) / 2.0, 0.0, 1.0)
 
 
 def _even(values: np.ndarray) -> np.ndarray:

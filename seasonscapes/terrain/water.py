@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 from affine import Affine
@@ -65,7 +66,7 @@ def polygon_water(path: str | Path, elevation: Raster) -> Raster:
     drawn = np.zeros((height, width), np.float32)
     if shapes:
         transform = elevation.transform * Affine.scale(1.0 / _FINER)
-        fine = rasterize(shapes, (height * _FINER, width * _FINER), transform=transform, dtype="uint8")
+        fine: Any = rasterize(shapes, (height * _FINER, width * _FINER), transform=transform, dtype="uint8")
         drawn = fine.reshape(height, _FINER, width, _FINER).mean(axis=(1, 3), dtype=np.float32)
     if not drawn.any():
         west, south, east, north = bounds_geographic(elevation)
@@ -77,10 +78,10 @@ def polygon_water(path: str | Path, elevation: Raster) -> Raster:
     return replace(elevation, values=drawn[..., None])
 
 
-def _polygons(document: object, path: str | Path) -> list[list]:
+def _polygons(document: Any, path: str | Path) -> list[list]:
     """Rings of all polygons of a GeoJSON document."""
 
-    def collect(node: object) -> list[list]:
+    def collect(node: Any) -> list[list]:
         kind = node.get("type") if isinstance(node, dict) else None
         if kind == "FeatureCollection" and isinstance(node["features"], list):
             return [rings for feature in node["features"] for rings in collect(feature)]
@@ -168,7 +169,7 @@ def find_water(elevation: Raster, image: Raster | None, *, least_area_m2: float)
         # Unknown colours (clouds, borders of the image) decide nothing.
         looks = ~(bright > _BRIGHTEST) & ~(blue < _LEAST_BLUE_OF_GREEN * green) & ~(blue < _LEAST_BLUE_OF_RED * red)
     found = np.zeros(heights.shape, np.float32)
-    number, count = ndimage.label(flat & looks)
+    number, count = cast(tuple[np.ndarray, int], ndimage.label(flat & looks))
     for index, part in enumerate(ndimage.find_objects(number, count), 1):
         inside = number[part] == index
         if inside.sum() * cell_m2 < least_area_m2:
@@ -203,17 +204,18 @@ def levelled(elevation: Raster, water: Raster) -> Raster:
     same = water.values.shape == elevation.values.shape and water.transform == elevation.transform
     shares = water.values if same else np.nan_to_num(sampled_on(water, elevation))
     heights = elevation.values[..., 0].copy()
-    number, count = ndimage.label(shares[..., 0] > 0.5, np.ones((3, 3)))
+    number, count = cast(tuple[np.ndarray, int], ndimage.label(shares[..., 0] > 0.5, np.ones((3, 3))))
     for index, part in enumerate(ndimage.find_objects(number, count), 1):
         inside = number[part] == index
         # Interpolated shores belong to the bank.
         inner = ndimage.binary_erosion(inside, np.ones((3, 3)))
         values = heights[part][inner if inner.any() else inside]
         level = float(np.median(values))
-        if np.ptp(np.percentile(values, [5.0, 95.0])) > _LEVEL_M:
+        low, high = np.percentile(values, [5.0, 95.0])
+        if high - low > _LEVEL_M:
             continue
         heights[part][inside] = level
-        grown = tuple(slice(max(axis.start - 1, 0), axis.stop + 1) for axis in part)
+        grown: Any = tuple(slice(max(axis.start - 1, 0), axis.stop + 1) for axis in part)
         rim = ndimage.binary_dilation(number[grown] == index, np.ones((3, 3))) & (number[grown] == 0)
         heights[grown][rim] = np.maximum(heights[grown][rim], level)
     return replace(elevation, values=heights[..., None])

@@ -55,7 +55,8 @@ def amplified_terrain(place: Place, view: Camera | Panorama, *, seed: int = 0) -
     terrain = place.terrain
     if terrain.surface is not None:
         terrain = replace(terrain, surface=_surface(place, eye_m, seed))
-    detail = AlbedoDetail(tuple(float(value) for value in eye_m), pixel_rad, place.atlas.texel_p50_m, seed)
+    east, north, up = (float(value) for value in eye_m)
+    detail = AlbedoDetail((east, north, up), pixel_rad, place.atlas.texel_p50_m, seed)
     terrain = refined_for_view(terrain, eye_m, pixel_rad, tolerance_px=_TOLERANCE_PX, reach_m=_REACH_M)
     return replace(terrain, detail=detail)
 

@@ -1,0 +1,87 @@
+"""Detail about a camera: a finer part of the surface, and noise of the albedo that keeps its means."""
+
+from dataclasses import replace
+
+import numpy as np
+import places
+import pytest
+
+from seasonscapes.rendering.albedo_detail import DeviceDetail, finest_detail_m
+from seasonscapes.rendering.backend import use_backend
+from seasonscapes.terrain.surface_classes import AlbedoDetail
+from seasonscapes.workflows import amplified_terrain
+from seasonscapes.workflows.place import load_place
+from seasonscapes.workflows.views import camera, terrain_for_view
+from seasonscapes.workspace import Workspace
+
+NEAR = AlbedoDetail((0.0, 0.0, 2.0), 1e-3, 4.0, seed=3)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("hill")
+    return load_place(places.write_place(folder), Workspace(folder / "workspace"))
+
+
+def test_the_surface_is_finest_about_the_camera(place, monkeypatch):
+    monkeypatch.setattr(amplified_terrain, "_MOST_NEAR_NODES", 300_000)
+    monkeypatch.setattr(amplified_terrain, "_MOST_NODES", 100_000)
+    view = camera(place, "south", size_px=(96, 64))
+    plain, fine = terrain_for_view(place, view), terrain_for_view(place, view, amplify=True)
+    assert place.terrain.surface is not None
+    assert fine.surface is not None
+    inner = fine.surface.inner
+    assert inner is not None
+    assert inner.spacing_m < 0.5 * fine.surface.spacing_m < place.terrain.surface.spacing_m
+    assert len(fine.faces) != len(plain.faces)
+    assert fine.detail is not None
+    # Within, the finer part counts alone; at its rim it has ended; in between nothing jumps.
+    eye = view.position_m
+    across = eye + np.stack([np.linspace(-700.0, 700.0, 2801), np.zeros(2801), np.zeros(2801)], axis=1)
+    share = inner.share_at(across)
+    assert share[1400] == 1.0
+    assert share[0] == share[-1] == 0.0
+    alone = replace(fine.surface, inner=None)
+    np.testing.assert_allclose(fine.surface.up_at(across)[1400], inner.up_at(across)[1400])
+    np.testing.assert_allclose(fine.surface.up_at(across)[0], alone.up_at(across)[0])
+    steps = np.abs(np.diff(fine.surface.up_at(across)))
+    assert steps.max() < 0.5 * 0.6, "0.5 m on, no more than a steep slope"
+    # Both are the same ground: they differ by less than the detail of the coarser one.
+    assert np.abs(inner.up_at(across)[1000:1800] - alone.up_at(across)[1000:1800]).max() < 2.0
+
+
+def detailed(albedo, x, y, z=0.0):
+    use_backend()
+    import mitsuba as mi
+
+    position = mi.Point3f(mi.Float(x.ravel().astype(np.float32)), mi.Float(y.ravel().astype(np.float32)), z)
+    values = np.array(DeviceDetail(NEAR).applied(mi.Color3f(*albedo), position)).T
+    return values.reshape(*x.shape, 3)
+
+
+@pytest.mark.parametrize(
+    ("albedo", "least", "most"),
+    [
+        ((0.10, 0.14, 0.05), 0.05, 0.5),
+        ((0.3, 0.29, 0.28), 0.05, 0.5),
+        ((0.9, 0.9, 0.9), 0.0, 0.03),
+        ((0.01, 0.03, 0.035), 0.0, 0.01),
+    ],
+)
+def test_noise_of_the_albedo_keeps_its_mean(albedo, least, most):
+    """Grass and rock vary, snow hardly, water not; the mean over an area of many texels stays within 1 %."""
+    x, y = np.meshgrid(np.arange(-200.0, 200.0, 0.5), np.arange(-200.0, 200.0, 0.5))
+    values = detailed(albedo, x, y)
+    np.testing.assert_allclose(values.mean(axis=(0, 1)), albedo, rtol=0.01)
+    assert least <= values[..., 1].std() / albedo[1] <= most
+    np.testing.assert_array_equal(values, detailed(albedo, x, y))
+
+
+def test_octaves_end_at_the_pixels():
+    """Near the camera neighbouring points of a few millimetres differ as they do not far away."""
+    x, y = np.meshgrid(np.arange(0.0, 1.0, 0.004), np.arange(0.0, 0.2, 0.004))
+    near, far = (detailed((0.3, 0.29, 0.28), x + offset, y)[..., 1] for offset in (1.0, 400.0))
+    assert np.abs(np.diff(near)).mean() > 5.0 * np.abs(np.diff(far)).mean()
+    distance = np.array([2.0, 6.0, 50.0, 300.0])
+    assert (finest_detail_m(NEAR, 4.0, distance) <= 1.0 * distance * NEAR.pixel_angle_rad + 2.0**-9).all()
+    assert (finest_detail_m(None, 4.0, distance) == 4.0).all()
