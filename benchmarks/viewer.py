@@ -292,7 +292,7 @@ STEPS = """
   const s = seasonscapes, r = s.renderer, start = s.state.time;
   s.state.paused = true;
   const began = performance.now();
-  for (let k = 1; k <= arguments[0]; k++) { s.setTime(start + k * 300000); r.luminances(); }
+  for (let k = 1; k <= arguments[0]; k++) { s.setTime(start + k * 300000, s.fine); r.luminances(); }
   return [(performance.now() - began) / 1000 / arguments[0], r.state.seenSide];
 """
 TURNS = """

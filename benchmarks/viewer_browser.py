@@ -123,7 +123,7 @@ window.measure = async ({camera, time, frames, size, change, sunOnly}) => {
   r.diffuse.uniforms.uBounceScale.value = sunOnly ? 0 : known.bounce;
   if (size && (r.gl.domElement.width !== size[0] || r.gl.domElement.height !== size[1])) r.resize(...size);
   if (camera !== undefined) s.useCamera(camera);
-  if (time !== undefined) s.setTime(time);
+  if (time !== undefined) s.setTime(time, s.sharp);
   await s.state.arriving;
   if (sunOnly) for (const v of r.shared.uSky.value) v.set(0, 0, 0);
   r.relight();

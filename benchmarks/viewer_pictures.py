@@ -40,7 +40,7 @@ const s = seasonscapes, r = s.renderer;
   s.state.paused = true;
   r.resize(...size);
   s.useCamera(camera);
-  s.setTime(time);
+  s.setTime(time, s.sharp);
   await s.state.arriving;
   for (let round = 0; round < 2; round++) {
     r.reset();

@@ -43,9 +43,10 @@ async function start() {
   const renderer = makeRenderer(canvas, scene, terrain, light);
   const fine = Math.min(1024, 2 * Math.max(terrain.columns, terrain.rows));
   const coarse = renderer.software ? 384 : fine;
+  const sharp = Math.min(2048, 2 * Math.max(terrain.columns, terrain.rows)); // At rest.
   const enough = still ? 16 : renderer.software ? 6 : 12;
 
-  const state = { time: Date.now(), ev: "auto", haze: 1, shownEv: 15, dirty: true, coarse: false, metered: false, point: null, playing: null };
+  const state = { time: Date.now(), ev: "auto", haze: 1, shownEv: 15, dirty: true, quality: 0, metered: false, point: null, playing: null };
   const controls = makeControls(canvas, frame, terrain, () => cameraChanged());
   if (still) {
     document.body.classList.add("still");
@@ -78,7 +79,7 @@ async function start() {
     // The frame holds radiance over what a grey card would send, so that half precision suffices day and night.
     const scale = 1 / Math.max((0.2 * luminance(now.level)) / Math.PI, 1e-7);
     renderer.setLight(now.bodies, now.sky, scale, quality);
-    state.coarse = quality < fine;
+    state.quality = quality;
     state.metered = false;
     state.dirty = true;
     tell();
@@ -149,10 +150,10 @@ async function start() {
       renderer.reset();
     }
     if (!renderer.shared.uAlbedoA.value) return;
-    if (state.coarse && settle === 1 && !state.playing) {
-      renderer.see(fine);
+    if (state.quality < sharp && settle === 1 && !state.playing) {
+      state.quality = state.quality < fine ? fine : sharp;
+      renderer.see(state.quality);
       renderer.relight();
-      state.coarse = false;
       settle = 0;
     }
     if (settle < enough) {
@@ -491,7 +492,7 @@ async function start() {
   await state.arriving;
   element("status").textContent = "";
   // What measurements use; the page itself does not.
-  window.seasonscapes = { about, arrays, state, renderer, controls, ephemeris, terrain, light, frame, clock, setTime, setEv, setHaze, sunTimes, sunTimesBetween, step, expose, command, lightOf, now: () => now, fine, useCamera };
+  window.seasonscapes = { about, arrays, state, renderer, controls, ephemeris, terrain, light, frame, clock, setTime, setEv, setHaze, sunTimes, sunTimesBetween, step, expose, command, lightOf, now: () => now, fine, sharp, useCamera };
   loop();
   step();
   if (about.view.watched) stayOpen();
