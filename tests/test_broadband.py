@@ -43,23 +43,16 @@ def test_water_vapour_raises_the_efficacy():
     assert wet / dry == pytest.approx(1.12, abs=0.04)
 
 
-def test_the_sun_by_the_minute(data_dir):
+def test_the_sun_by_the_minute(data_dir, monkeypatch):
     """A cloudless day in Arizona: direct sunlight within 3 % of the pyrheliometer, with one fitted optical depth."""
-    import importlib.util
+    import importlib
     from pathlib import Path
 
     folder = data_dir / "light-series"
     if not folder.is_dir():
         pytest.skip(f"no measurements of light at {folder}")
-    script = Path(__file__).parents[1] / "benchmarks" / "light_series.py"
-    spec = importlib.util.spec_from_file_location("light_series", script)
-    assert spec is not None
-    assert spec.loader is not None
-    bench = importlib.util.module_from_spec(spec)
-    import sys
-
-    sys.modules["light_series"] = bench
-    spec.loader.exec_module(bench)
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "benchmarks")
+    bench = importlib.import_module("light_series")
     day = bench.midc(folder / "midc_raw_20181018.txt")
     sun = bench.sun_position(day.times, day.latitude_deg, day.longitude_deg, day.height_m)
     chosen = np.flatnonzero(bench.chosen_minutes(day, np.asarray(sun.elevation_deg)))
