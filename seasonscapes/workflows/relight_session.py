@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, field
 from datetime import date, datetime
 from functools import reduce
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -115,10 +115,12 @@ class RelightSession:
         The place and the camera, whose pose is in the place's frame.
     sky
         The sky model.
-    albedo, base
-        Dated albedos with their interpolation, and the one that the coefficients were traced with.
+    albedo
+        Dated albedos with their interpolation.
     seed
         Of the coefficients.
+    traced_from
+        All that determines the coefficients, for keys of what is made of them.
     coefficients, ray_scene, relightable
         The traced transport and its copy on the device.
     by_elevation
@@ -129,8 +131,8 @@ class RelightSession:
     camera: Camera | Panorama
     sky: SkyModel
     albedo: AlbedoSeries
-    base: DatedAlbedo
     seed: int
+    traced_from: dict[str, Any]
     coefficients: ViewCoefficients
     ray_scene: RayScene
     relightable: RelightableView
@@ -221,6 +223,7 @@ def still_session(
 
     ``lambertian``: without surfaces that are not matt. ``amplify``: with detail below the resolution of the data.
     """
+    from seasonscapes.rendering.coefficients import SamplingOptions
     from seasonscapes.rendering.hemisphere_rays import ray_scene
     from seasonscapes.rendering.mitsuba_scene import mi_mesh
     from seasonscapes.rendering.relit_view import relightable_view
@@ -235,12 +238,19 @@ def still_session(
     base = nearest_albedo(albedo, base_day)
     terrain = terrain_for_view(place, camera, lambertian=lambertian, amplify=amplify)
     scene = ray_scene(mi_mesh(terrain, base.load().values))
-    inputs = {"place": place.key, **_camera_values(camera), "albedo": _identity(base), "seed": seed}
-    if lambertian or amplify:
-        inputs |= {"lambertian": lambertian, "amplified": amplify}
+    sampling = sampling or SamplingOptions()
+    inputs = {
+        "place": place.key,
+        **_camera_values(camera),
+        "base": _identity(base),
+        "seed": seed,
+        "sampling": asdict(sampling),
+        "lambertian": lambertian,
+        "amplified": amplify,
+    }
     coefficients = _coefficients(place, camera, scene, inputs, seed, sampling, progress)
     relightable = relightable_view(scene, coefficients)
-    return RelightSession(place, camera, model, albedo, base, seed, coefficients, scene, relightable)
+    return RelightSession(place, camera, model, albedo, seed, inputs, coefficients, scene, relightable)
 
 
 def relight(session: RelightSession, time: str | datetime) -> RenderedView:
@@ -315,15 +325,14 @@ def _coefficients(
     scene: RayScene,
     inputs: dict,
     seed: int,
-    sampling: SamplingOptions | None,
+    sampling: SamplingOptions,
     progress: Progress | None,
 ) -> ViewCoefficients:
-    from seasonscapes.rendering.coefficients import SamplingOptions, ViewCoefficients
+    from seasonscapes.rendering.coefficients import ViewCoefficients
     from seasonscapes.rendering.coefficients_file import load_coefficients, save_coefficients
     from seasonscapes.rendering.transport import trace_view
 
-    sampling = sampling or SamplingOptions()
-    key = artefact_key(inputs | {"sampling": asdict(sampling)}, _COEFFICIENTS_CODE)
+    key = artefact_key(inputs, _COEFFICIENTS_CODE)
     folder = place.workspace.folder / f"{place.scene.name}/coefficients-{key}"
     if folder.exists() and not folder.is_dir():
         raise InputError(folder, "a file stands where a built folder belongs", cure="remove it")
@@ -369,16 +378,12 @@ def nearest_albedo(albedo: AlbedoSeries, day: date) -> DatedAlbedo:
 
 def session_key(session: RelightSession) -> str:
     """Name of everything that determines a session's frames but their times."""
-    inputs = {
-        "place": session.place.key,
-        **_camera_values(session.camera),
+    shown = {
         "sky": session.sky,
         "albedo": [_identity(dated) for dated in session.albedo.dated],
-        "base": _identity(session.base),
         "season": session.albedo.season,
-        "seed": session.seed,
     }
-    return artefact_key(inputs, FRAME_CODE)
+    return artefact_key(session.traced_from | shown, FRAME_CODE)
 
 
 def view_at(session: RelightSession, time: datetime) -> tuple[RenderedView, Illumination, SunMoonPosition]:
@@ -451,19 +456,10 @@ def _view_albedo(session: RelightSession, dated: DatedAlbedo) -> tuple[np.ndarra
         albedos = [albedo(session.ray_scene, session.coefficients) for albedo in of_view]
         return tuple(albedo.astype(np.float16) for albedo in albedos if albedo is not None)
 
-    inputs = {
-        "place": place.key,
-        **_camera_values(session.camera),
-        "albedo": _identity(dated),
-        "base": _identity(session.base),
-        "seed": session.seed,
-        # Stills and films sample a pixel differently, and their pixels that show terrain differ.
-        "sampling": asdict(session.coefficients.sampling),
-    }
     albedos = build_once(
         place.workspace,
         f"{place.scene.name}/view-albedo",
-        inputs,
+        session.traced_from | {"albedo": _identity(dated)},
         code=_VIEW_ALBEDO_CODE,
         suffix=".npz",
         build=build,
