@@ -12,7 +12,7 @@ import io
 import json
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from seasonscapes.images import linear_from_srgb, srgb8_from_linear
 
 PAGE = Path(__file__).parents[1] / "viewer_page"
 PROGRAM, STYLE, NOTICES = "viewer.js", "viewer.css", "NOTICES.txt"
+GAUSSIANS = "gaussians.bin"
 _FORMAT = 1
 _KINDS = {"uint8": "u8", "uint16": "u16", "float16": "f16", "float32": "f32"}
 _QUALITY = 82
@@ -62,11 +63,14 @@ class ViewerScene:
         Arrays by name; uint8, uint16, float16 or float32.
     albedo
         Pictures of the albedo by date.
+    gaussians
+        Facts and arrays of a distilled model, which the page reads when it is asked for.
     """
 
     about: dict[str, Any]
     arrays: dict[str, np.ndarray]
     albedo: Sequence[AlbedoPicture]
+    gaussians: tuple[dict[str, Any], dict[str, np.ndarray]] | None = None
 
 
 def albedo_picture(day: date, values: np.ndarray, *, quality: int = _QUALITY) -> AlbedoPicture:
@@ -160,13 +164,8 @@ def _page(scene: ViewerScene, policy: str, style: str, program: str, data: str) 
 
 
 def _packed(scene: ViewerScene, view: dict[str, Any] | None) -> tuple[str, bytes, dict[str, bytes]]:
-    """The description as JSON, the arrays one behind the other, and the pictures by name."""
-    binary, table = bytearray(), {}
-    for name, values in scene.arrays.items():
-        binary += b"\0" * (-len(binary) % 4)
-        kind = _KINDS[values.dtype.name]
-        table[name] = {"offset": len(binary), "shape": list(values.shape), "type": kind}
-        binary += np.ascontiguousarray(values).astype(values.dtype.newbyteorder("<"), copy=False).tobytes()
+    """The description as JSON, the arrays one behind the other, and by name the pictures and the Gaussians."""
+    binary, table = _binary(scene.arrays)
     pictures, dated = {}, []
     for picture in scene.albedo:
         name = f"albedo-{picture.day.isoformat()}.webp"
@@ -174,12 +173,27 @@ def _packed(scene: ViewerScene, view: dict[str, Any] | None) -> tuple[str, bytes
         entry = {"date": picture.day.isoformat(), "file": name, "size_px": list(picture.size_px)}
         dated.append(entry | {"gain_rgb": [round(gain, 5) for gain in picture.gain_rgb]})
     description = {"format": _FORMAT, **scene.about, "arrays": table, "albedo": dated, "view": view or {}}
-    return json.dumps(description, separators=(",", ":"), allow_nan=False), bytes(binary), pictures
+    if scene.gaussians is not None:
+        facts, layer = scene.gaussians
+        pictures[GAUSSIANS], entries = _binary(layer)
+        description["gaussians"] = {**facts, "file": GAUSSIANS, "arrays": entries}
+    return json.dumps(description, separators=(",", ":"), allow_nan=False), binary, pictures
+
+
+def _binary(arrays: dict[str, np.ndarray]) -> tuple[bytes, dict[str, Any]]:
+    """Arrays one behind the other, and where each lies."""
+    binary, table = bytearray(), {}
+    for name, values in arrays.items():
+        binary += b"\0" * (-len(binary) % 4)
+        kind = _KINDS[values.dtype.name]
+        table[name] = {"offset": len(binary), "shape": list(values.shape), "type": kind}
+        binary += np.ascontiguousarray(values).astype(values.dtype.newbyteorder("<"), copy=False).tobytes()
+    return bytes(binary), table
 
 
 def save_scene(scene: ViewerScene, path: Path) -> None:
-    """Write a scene to one file."""
-    description, binary, pictures = _packed(scene, None)
+    """Write a scene without its Gaussians to one file."""
+    description, binary, pictures = _packed(replace(scene, gaussians=None), None)
     names = list(pictures)
     head = json.dumps([description, len(binary), [[name, len(pictures[name])] for name in names]]).encode()
     path.write_bytes(struct.pack("<Q", len(head)) + head + binary + b"".join(pictures[name] for name in names))
