@@ -22,7 +22,7 @@ from seasonscapes.workflows.viewer import first_view, with_gaussians, write_fold
 from seasonscapes.workflows.viewer_scene import ViewerDetail, viewer_scene
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-from viewer_browser import chromium, open_page, prepare, radiance, served, shrunk, why_no_browser  # noqa: E402
+from viewer_browser import chromium, open_page, prepare, radiance, served, shrunk, why_no_browser
 
 sys.path.pop(0)
 LOW_SUN, DUSK = "2024-07-20T05:00Z", "2024-07-20T19:30Z"

@@ -25,7 +25,8 @@ PAGE = Path(__file__).parents[1] / "viewer_page"
 PROGRAM, STYLE, NOTICES = "viewer.js", "viewer.css", "NOTICES.txt"
 GAUSSIANS = "gaussians.bin"
 _FORMAT = 1
-_KINDS = {"uint8": "u8", "uint16": "u16", "float16": "f16", "float32": "f32"}
+_KINDS = {"uint8": "u8", "uint16": "u16", "float16": "f16", "float32": "f32", "int32": "i32", "float64": "f64"}
+_TILE_ARRAYS = ("keys", "heights", "low_m", "scale_m")
 _QUALITY = 82
 
 
@@ -52,6 +53,39 @@ class AlbedoPicture:
 
 
 @dataclass(frozen=True)
+class HeightTiles:
+    """T tiles of heights that are finer than the page's grid.
+
+    Parameters
+    ----------
+    cells
+        Cells along a side of a tile.
+    keys
+        ``(T, 3)`` int32: level L (the grid's step over 2^L), column and row of tiles from the south-west.
+    heights
+        ``(T, cells + 3, cells + 3)`` uint16, row 0 in the south, one node more on each side than the tile.
+    low_m, scale_m
+        ``(T,)``: a height is low + stored · scale [m].
+    """
+
+    cells: int
+    keys: np.ndarray
+    heights: np.ndarray
+    low_m: np.ndarray
+    scale_m: np.ndarray
+
+    def files(self) -> dict[str, bytes]:
+        """The tiles as files by name."""
+        little = self.heights.astype("<u2", copy=False)
+        return {f"tile-{level}-{c}-{r}.bin": little[k].tobytes() for k, (level, c, r) in enumerate(self.keys.tolist())}
+
+    def about(self) -> dict[str, Any]:
+        """What the page knows of the tiles before it loads one."""
+        rows = zip(self.keys.tolist(), self.low_m.tolist(), self.scale_m.tolist(), strict=True)
+        return {"cells": self.cells, "list": [[*key, round(low, 4), float(f"{scale:.9g}")] for key, low, scale in rows]}
+
+
+@dataclass(frozen=True)
 class ViewerScene:
     """Everything that the page knows of a place.
 
@@ -60,17 +94,20 @@ class ViewerScene:
     about
         Plain values: names, frame, grid, cameras, sky.
     arrays
-        Arrays by name; uint8, uint16, float16 or float32.
+        Arrays by name; uint8, uint16, float16 or float32, which the page reads.
     albedo
         Pictures of the albedo by date.
     gaussians
         Facts and arrays of a distilled model, which the page reads when it is asked for.
+    tiles
+        Finer heights, which the page reads near its viewer; single files have none.
     """
 
     about: dict[str, Any]
     arrays: dict[str, np.ndarray]
     albedo: Sequence[AlbedoPicture]
     gaussians: tuple[dict[str, Any], dict[str, np.ndarray]] | None = None
+    tiles: HeightTiles | None = None
 
 
 def albedo_picture(day: date, values: np.ndarray, *, quality: int = _QUALITY) -> AlbedoPicture:
@@ -111,6 +148,7 @@ def viewer_files(scene: ViewerScene, *, view: dict[str, Any] | None = None) -> d
         "scene.json": description.encode(),
         "scene.bin": binary,
         **pictures,
+        **(scene.tiles.files() if scene.tiles is not None else {}),
     }
 
 
@@ -124,7 +162,7 @@ def single_file(scene: ViewerScene, *, view: dict[str, Any] | None = None) -> by
     view
         As in `viewer_files`.
     """
-    description, binary, pictures = _packed(scene, view)
+    description, binary, pictures = _packed(replace(scene, tiles=None), view)
     program = (PAGE / PROGRAM).read_text(encoding="utf-8").replace("</script", "<\\/script")
     style = (PAGE / STYLE).read_text(encoding="utf-8")
     policy = (
@@ -177,6 +215,8 @@ def _packed(scene: ViewerScene, view: dict[str, Any] | None) -> tuple[str, bytes
         facts, layer = scene.gaussians
         pictures[GAUSSIANS], entries = _binary(layer)
         description["gaussians"] = {**facts, "file": GAUSSIANS, "arrays": entries}
+    if scene.tiles is not None:
+        description["tiles"] = scene.tiles.about()
     return json.dumps(description, separators=(",", ":"), allow_nan=False), binary, pictures
 
 
@@ -193,7 +233,10 @@ def _binary(arrays: dict[str, np.ndarray]) -> tuple[bytes, dict[str, Any]]:
 
 def save_scene(scene: ViewerScene, path: Path) -> None:
     """Write a scene without its Gaussians to one file."""
-    description, binary, pictures = _packed(replace(scene, gaussians=None), None)
+    arrays = dict(scene.arrays)
+    if scene.tiles is not None:
+        arrays |= {f"tiles.{name}": getattr(scene.tiles, name) for name in _TILE_ARRAYS}
+    description, binary, pictures = _packed(replace(scene, arrays=arrays, gaussians=None, tiles=None), None)
     names = list(pictures)
     head = json.dumps([description, len(binary), [[name, len(pictures[name])] for name in names]]).encode()
     path.write_bytes(struct.pack("<Q", len(head)) + head + binary + b"".join(pictures[name] for name in names))
@@ -221,4 +264,6 @@ def load_scene(path: Path) -> ViewerScene:
         albedo.append(picture)
         start += bytes_
     del about["format"], about["view"]
-    return ViewerScene(about, arrays, albedo)
+    tiles = {name: arrays.pop(f"tiles.{name}") for name in _TILE_ARRAYS if f"tiles.{name}" in arrays}
+    kept = HeightTiles(tiles["heights"].shape[1] - 3, **tiles) if tiles else None
+    return ViewerScene(about, arrays, albedo, tiles=kept)

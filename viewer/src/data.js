@@ -14,7 +14,7 @@ export async function loadScene(report) {
     const { file, arrays: entries, ...facts } = about.gaussians;
     return { about: facts, arrays: unpackAll(await read(file, told), entries) };
   };
-  return { about, arrays, picture, layer };
+  return { about, arrays, picture, layer, file: read };
 }
 
 function unpackAll(binary, entries) {

@@ -8,6 +8,7 @@ import { makeGaussians } from "./gaussians.js";
 import { makeLight } from "./light.js";
 import { makeRenderer } from "./renderer.js";
 import { makeTerrain } from "./terrain.js";
+import { makeTiles } from "./tiles.js";
 import { MINUTE, DAY, crossings, dayOfYear, fullMoons, highestMoon, makeClock, moonName, readAddress, seasonOf, sunAt, writeAddress } from "./times.js";
 
 const element = (id) => document.getElementById(id);
@@ -39,6 +40,8 @@ async function start() {
   const clock = makeClock(about.time_zone);
   const ephemeris = makeEphemeris(about.frame.latitude_deg, about.frame.longitude_deg, about.surface_m);
   const terrain = makeTerrain(arrays, about);
+  const tiles = about.tiles ? makeTiles(terrain, about.tiles, scene.file, () => tileArrived()) : null;
+  if (tiles) terrain.setTiles(tiles);
   const light = makeLight(arrays, about);
   const canvas = element("picture");
   const renderer = makeRenderer(canvas, scene, terrain, light);
@@ -161,6 +164,7 @@ async function start() {
   // ---- camera and exposure -----------------------------------------------------------------------------------------
   function cameraChanged() {
     const { forward, up } = controls.axes();
+    tiles?.moved();
     renderer.setCamera(controls.camera.position, forward, up, controls.camera.fov);
     state.metered = false;
     state.dirty = true;
@@ -180,6 +184,11 @@ async function start() {
     element("ev-value").value = state.shownEv.toFixed(1);
     if (state.ev === "auto") element("ev").value = state.shownEv.toFixed(1);
     element("ev").setAttribute("aria-valuetext", `EV ${state.shownEv.toFixed(1)}${state.ev === "auto" ? ", automatic" : ""}`);
+  }
+
+  /** A finer piece of ground is there: draw again, with the same light. */
+  function tileArrived() {
+    state.dirty = true;
   }
 
   // ---- drawing -----------------------------------------------------------------------------------------------------
@@ -216,7 +225,7 @@ async function start() {
         expose();
       }
       renderer.show();
-      if (settle === enough) {
+      if (settle === enough && !tiles?.busy()) {
         renderer.finish();
         document.body.dataset.ready = String(Number(document.body.dataset.ready ?? 0) + 1);
       }
@@ -545,7 +554,7 @@ async function start() {
   await state.layered;
   element("status").textContent = "";
   // What measurements use; the page itself does not.
-  window.seasonscapes = { about, arrays, state, renderer, controls, ephemeris, terrain, light, frame, clock, setTime, setEv, setHaze, setDivider, sunTimes, sunTimesBetween, step, expose, command, lightOf, now: () => now, fine, sharp, useCamera };
+  window.seasonscapes = { about, arrays, state, renderer, controls, ephemeris, terrain, tiles, light, frame, clock, setTime, setEv, setHaze, setDivider, sunTimes, sunTimesBetween, step, expose, command, lightOf, now: () => now, fine, sharp, useCamera };
   loop();
   step();
   if (about.view.watched) stayOpen();

@@ -164,6 +164,8 @@ export function makeRenderer(canvas, { arrays, about }, terrain, light) {
     uDistances: { value: distances }, uColumns: { value: columns },
     uHorizon: { value: 0 }, uAirRows: { value: new THREE.Vector2(light.rows.airBelow, airRows - light.rows.airBelow) },
   };
+  const tiles = terrain.tiles();
+  const noTile = layers(new Uint8Array(1), 1, 1, 1, THREE.RedFormat, THREE.UnsignedByteType);
   const ground = new THREE.RawShaderMaterial({
     glslVersion: THREE.GLSL3,
     vertexShader: shaders.TERRAIN_VERTEX,
@@ -173,6 +175,8 @@ export function makeRenderer(canvas, { arrays, about }, terrain, light) {
       ...shared, ...air,
       uDiffuse: { value: diffuseTarget.texture },
       uWest: { value: new THREE.Vector2(terrain.west, terrain.south) },
+      uTileHeight: { value: tiles?.heights ?? noTile }, uTileSlope: { value: tiles?.slopes ?? noTile },
+      uTile: { value: tiles?.places ?? Array.from({ length: 48 }, () => new THREE.Vector3()) },
       uShadows: { value: 1 },
       uMark: { value: 0 }, uMarkAt: { value: new THREE.Vector2() },
     },
@@ -190,7 +194,7 @@ export function makeRenderer(canvas, { arrays, about }, terrain, light) {
   dome.depthFunc = THREE.LessEqualDepth;
 
   const geometry = chunkGeometry();
-  const instances = new THREE.InstancedBufferAttribute(new Float32Array(MOST_CHUNKS * 3), 3);
+  const instances = new THREE.InstancedBufferAttribute(new Float32Array(MOST_CHUNKS * 4), 4);
   instances.setUsage(THREE.DynamicDrawUsage);
   geometry.setAttribute("chunk", instances);
   const mesh = new THREE.Mesh(geometry, ground);
@@ -363,7 +367,7 @@ export function makeRenderer(canvas, { arrays, about }, terrain, light) {
     // Cells of some pixels: a chunk is divided while its cells look larger.
     const detail = 1 / (CELLS * state.cellPixels * dome.uniforms.uPixel.value);
     const chosen = chooseChunks(terrain, camera.position, detail, frustum).slice(0, MOST_CHUNKS);
-    chosen.forEach((chunk, k) => instances.setXYZ(k, ...chunk));
+    chosen.forEach((chunk, k) => instances.setXYZW(k, ...chunk));
     geometry.instanceCount = chosen.length;
     instances.needsUpdate = true;
     air.uEye.value.copy(camera.position);

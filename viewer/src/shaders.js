@@ -242,17 +242,25 @@ vec3 scattered(vec3 gas, vec4 aerosol, vec3 other, vec3 d) {
 
 export const TERRAIN_VERTEX = PRECISION + /* glsl */ `
 in vec3 position;
-in vec3 chunk;
+in vec4 chunk;
 uniform sampler2D uHeight;
+uniform sampler2DArray uTileHeight;
+uniform vec3 uTile[48];
 uniform ivec2 uNodes;
 uniform vec2 uWest;
 uniform float uStep;
 uniform mat4 projectionMatrix, viewMatrix;
 out vec2 vUvGround;
 out vec3 vWorld;
+flat out int vSlot;
 void main() {
   vec2 node = min(chunk.xy + position.xy * chunk.z, vec2(uNodes - 1));
-  float height = texelFetch(uHeight, ivec2(node), 0).r;
+  vSlot = int(chunk.w);
+  float height;
+  if (vSlot >= 0) {
+    vec3 tile = uTile[vSlot];
+    height = texelFetch(uTileHeight, ivec3(ivec2((node - tile.xy) * tile.z + 1.5), vSlot), 0).r;
+  } else height = texelFetch(uHeight, ivec2(node), 0).r;
   vUvGround = node / vec2(uNodes - 1);
   // Skirts hide the seams between chunks of different steps.
   vWorld = vec3(uWest + node * uStep, height - position.z * chunk.z * uStep * 1.5);
@@ -288,14 +296,21 @@ vec3 throughAir(vec3 radiance, vec3 ray, float distance) {
 
 export const TERRAIN = PRECISION + SURFACE + PHASES + AIR + /* glsl */ `
 uniform sampler2D uDiffuse, uMask;
+uniform sampler2DArray uTileSlope;
+uniform vec3 uTile[48];
 uniform float uShadows, uMark;
 uniform vec2 uMarkAt;
 in vec2 vUvGround;
 in vec3 vWorld;
+flat in int vSlot;
 layout(location = 0) out vec4 colour;
 void main() {
   if (texture(uMask, vUvGround).r < 0.5) discard;
   vec3 normal = normalAt(vUvGround);
+  if (vSlot >= 0) {
+    vec2 at = ((vUvGround * vec2(uNodes - 1) - uTile[vSlot].xy) * uTile[vSlot].z + 1.5) / vec2(textureSize(uTileSlope, 0).xy);
+    normal = normalize(vec3(-texture(uTileSlope, vec3(at, float(vSlot))).xy, 1.0));
+  }
   vec2 seen = mix(vec2(1.0), texture(uSeen, vUvGround).rg, uShadows);
   vec3 irradiance = directAt(vUvGround, normal, seen) + texture(uDiffuse, vUvGround).rgb;
   vec3 ray = vWorld - uEye;
