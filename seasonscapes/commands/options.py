@@ -25,7 +25,7 @@ class PlaceOptions:
     """How to read a scene and build its terrain."""
 
     mesher: str = "adaptive"
-    """adaptive (error-bounded), grid (every sample), poisson (an extra)."""
+    """adaptive (error-bounded), grid (every sample), poisson (the screened Poisson surface, error-bounded)."""
     max_error_m: float | None = None
     """Vertical bound of the adaptive mesh in metres; default a tenth of the samples' spacing, at most 5."""
     refine: int | None = None
