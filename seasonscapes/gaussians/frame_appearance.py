@@ -26,6 +26,7 @@ from seasonscapes.gaussians.appearance import fourier_embedding
 from seasonscapes.gaussians.losses import SparseProduct, TrainingFrame, image_loss, training_picture
 from seasonscapes.gaussians.model import content_digest
 from seasonscapes.gaussians.rasterise import splat_colours, view_weights
+from seasonscapes.gaussians.splat_view import FULL_COVERAGE
 from seasonscapes.gaussians.surfels import Surfels
 from seasonscapes.gaussians.training_views import front_facing_splats
 from seasonscapes.images import atomic_path
@@ -44,16 +45,20 @@ class FrameAppearance(nn.Module):
         ``(N, D)`` from `fourier_embedding`.
     times
         Number T of timestamps.
+    mean
+        Colour to start from.
     seed
         Of the network's initial weights.
     """
 
-    def __init__(self, embedding: np.ndarray, times: int, *, seed: int = 0) -> None:
+    def __init__(
+        self, embedding: np.ndarray, times: int, *, mean: Sequence[float] = (0.2, 0.2, 0.2), seed: int = 0
+    ) -> None:
         super().__init__()
         generator = torch.Generator().manual_seed(seed)
         count, size = embedding.shape
         colour = torch.zeros(count, _HARMONICS, 3)
-        colour[:, 0] = 0.4
+        colour[:, 0] = torch.as_tensor(mean)
         self.colour = nn.Parameter(colour)
         self.embedding = nn.Parameter(torch.tensor(embedding, dtype=torch.float32))
         self.codes = nn.Parameter(0.01 * torch.randn(times, _CODE, generator=generator))
@@ -177,7 +182,9 @@ def train_on_frames(
         directions.append(_directions(surfels, frame.camera)[pictures[-1].discs])
     if not pictures:
         raise NoTerrainInView("distil: no frame shows a Gaussian")
-    appearance = FrameAppearance(fourier_embedding(surfels.means, seed=seed), len(times), seed=seed)
+    mean = np.mean([frame.image[frame.mask].mean(axis=0) for frame in frames if frame.mask.any()], axis=0)
+    embedding = fourier_embedding(surfels.means, seed=seed)
+    appearance = FrameAppearance(embedding, len(times), mean=mean.tolist(), seed=seed)
     groups = [
         {"params": [p for n, p in appearance.named_parameters() if n.split(".")[0] == name], "lr": rate, "rate": rate}
         for name, rate in _RATES.items()
@@ -235,7 +242,7 @@ def render_frame(model: FrameGaussians, camera: Camera, time: datetime) -> tuple
     Returns
     -------
     picture, coverage
-        ``(H, W, 3)`` display-linear over black, and ``(H, W)`` in [0, 1].
+        ``(H, W, 3)`` display-linear over black, and ``(H, W)`` in [0, 1], both without the gaps between neighbours.
 
     Raises
     ------
@@ -247,7 +254,9 @@ def render_frame(model: FrameGaussians, camera: Camera, time: datetime) -> tuple
         raise NoTerrainInView("no Gaussian is in view")
     everyone = torch.arange(len(model.surfels.means))
     colours = model.appearance(everyone, _directions(model.surfels, camera), code_at(model, time)).numpy()
-    return splat_colours(weights, colours), weights.coverage
+    solid = np.clip(weights.coverage / FULL_COVERAGE, 0.0, 1.0)
+    scale = solid / np.maximum(weights.coverage, 1e-6)
+    return splat_colours(weights, colours) * scale[..., None].astype(np.float32), solid
 
 
 def save_frame_gaussians(model: FrameGaussians, path: Path) -> None:
