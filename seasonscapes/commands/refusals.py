@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import os
+from dataclasses import fields
+from typing import Any
 
 from seasonscapes.errors import InputError
 
@@ -54,3 +56,11 @@ def refuse_without(condition: str, holds: bool, **given: object) -> None:
     for name, value in given.items():
         if not holds and value is not None and value is not False:
             raise InputError(f"--{name.replace('_', '-')}", f"does nothing without {condition}", got=str(value))
+
+
+def refuse_given(condition: str, given: Any, untouched: Any) -> None:
+    """`InputError` about the first field of a dataclass of flags that differs from its default and does nothing."""
+    for field in fields(given):
+        value = getattr(given, field.name)
+        if value != getattr(untouched, field.name):
+            refuse_without(condition, False, **{field.name: value})

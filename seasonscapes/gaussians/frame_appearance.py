@@ -47,23 +47,32 @@ class FrameAppearance(nn.Module):
         Number T of timestamps.
     mean
         Colour to start from.
+    directional
+        Whether colours depend on the viewing direction, as in the paper; without, ĉ is one colour and r no input.
     seed
         Of the network's initial weights.
     """
 
     def __init__(
-        self, embedding: np.ndarray, times: int, *, mean: Sequence[float] = (0.2, 0.2, 0.2), seed: int = 0
+        self,
+        embedding: np.ndarray,
+        times: int,
+        *,
+        mean: Sequence[float] = (0.2, 0.2, 0.2),
+        directional: bool = True,
+        seed: int = 0,
     ) -> None:
         super().__init__()
         generator = torch.Generator().manual_seed(seed)
         count, size = embedding.shape
-        colour = torch.zeros(count, _HARMONICS, 3)
+        self.directional = directional
+        colour = torch.zeros(count, _HARMONICS if directional else 1, 3)
         colour[:, 0] = torch.as_tensor(mean)
         self.colour = nn.Parameter(colour)
         self.embedding = nn.Parameter(torch.tensor(embedding, dtype=torch.float32))
         self.codes = nn.Parameter(0.01 * torch.randn(times, _CODE, generator=generator))
         layers: list[nn.Module] = []
-        for inputs in (size + _CODE + 6, _HIDDEN):
+        for inputs in (size + _CODE + (6 if directional else 3), _HIDDEN):
             layer = nn.Linear(inputs, _HIDDEN)
             with torch.no_grad():
                 bound = (6.0 / inputs) ** 0.5
@@ -87,8 +96,13 @@ class FrameAppearance(nn.Module):
         code
             ``(32,)`` time embedding.
         """
-        base = torch.einsum("nk,nkc->nc", harmonics(direction), self.colour[index])
-        parts = [self.embedding[index], code.expand(len(index), -1), base, direction]
+        parts = [self.embedding[index], code.expand(len(index), -1)]
+        if self.directional:
+            base = torch.einsum("nk,nkc->nc", harmonics(direction), self.colour[index])
+            parts += [base, direction]
+        else:
+            base = self.colour[index, 0]
+            parts.append(base)
         gamma, beta = self.mlp(torch.cat(parts, dim=1)).split(3, dim=1)
         return ((1.0 + gamma) * base + beta).clamp(min=0.0)
 
@@ -137,6 +151,7 @@ def train_on_frames(
     times: Sequence[datetime],
     *,
     steps: int = 2000,
+    directional: bool = True,
     seed: int = 0,
     note: dict[str, Any] | None = None,
     progress: Callable[[float], None] | None = None,
@@ -153,6 +168,8 @@ def train_on_frames(
         Their timestamps, aware, in rising order.
     steps
         Of Adam, each on one picture.
+    directional
+        Whether colours depend on the viewing direction.
     seed
         Equal seeds give equal models.
     note
@@ -184,7 +201,7 @@ def train_on_frames(
         raise NoTerrainInView("distil: no frame shows a Gaussian")
     mean = np.mean([frame.image[frame.mask].mean(axis=0) for frame in frames if frame.mask.any()], axis=0)
     embedding = fourier_embedding(surfels.means, seed=seed)
-    appearance = FrameAppearance(embedding, len(times), mean=mean.tolist(), seed=seed)
+    appearance = FrameAppearance(embedding, len(times), mean=mean.tolist(), directional=directional, seed=seed)
     groups = [
         {"params": [p for n, p in appearance.named_parameters() if n.split(".")[0] == name], "lr": rate, "rate": rate}
         for name, rate in _RATES.items()
@@ -273,9 +290,28 @@ def save_frame_gaussians(model: FrameGaussians, path: Path) -> None:
 
     tensors = {name: value.detach().numpy() for name, value in model.appearance.state_dict().items()}
     tensors["means"] = model.surfels.means
-    facts = json.dumps({"format": _FORMAT, "times": [time.isoformat() for time in model.times], "note": model.note})
+    directional = model.appearance.directional
+    facts = json.dumps(
+        {
+            "format": _FORMAT,
+            "directional": directional,
+            "times": [time.isoformat() for time in model.times],
+            "note": model.note,
+        }
+    )
     with atomic_path(path) as temporary:
         save_file(tensors, temporary, metadata={"facts": facts, "sha256": content_digest(tensors, facts)})
+
+
+def is_frame_model(path: Path) -> bool:
+    """Whether a file is a model that `save_frame_gaussians` wrote, rather than a relightable one or none."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, "np") as file:
+            return _FORMAT in ((file.metadata() or {}).get("facts") or "")
+    except (SafetensorError, OSError, ValueError):
+        return False
 
 
 def load_frame_gaussians(path: Path, surfels_of: Callable[[float], Surfels]) -> FrameGaussians:
@@ -319,6 +355,6 @@ def load_frame_gaussians(path: Path, surfels_of: Callable[[float], Surfels]) -> 
             path, "was distilled from another terrain", cure="pass the --mesher, --atlas and --refine of then"
         )
     times = tuple(datetime.fromisoformat(text) for text in header["times"])
-    appearance = FrameAppearance(tensors["embedding"], len(times))
+    appearance = FrameAppearance(tensors["embedding"], len(times), directional=header["directional"])
     appearance.load_state_dict({name: torch.as_tensor(value) for name, value in tensors.items()})
     return FrameGaussians(surfels, appearance, times, header["note"])

@@ -25,7 +25,14 @@ from seasonscapes.workflows.edited_textures import albedo_date
 from seasonscapes.workflows.gaussian_views import render_gaussians
 from seasonscapes.workflows.inpainting import InpaintOptions, cloudiness_of, inpaint
 from seasonscapes.workflows.painting import painting_of, painting_record
-from seasonscapes.workflows.path_stages import distil_frames, film_path, make_path, path_completion, write_frame_views
+from seasonscapes.workflows.path_stages import (
+    distil_frames,
+    film_path,
+    frame_view,
+    load_frame_model,
+    make_path,
+    path_completion,
+)
 from seasonscapes.workflows.photograph_files import PhotographSources, photographs_at
 from seasonscapes.workflows.pictures import develop
 from seasonscapes.workflows.place import Place
@@ -445,10 +452,15 @@ def _distil_frames(job: RunJob, folder: Path, progress: Progress | None) -> list
 
 
 def _splat_frames(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
-    camera = camera_for(job.place, job.view, size_px=job.size_px)
-    model = folder / "gaussians" / "frames.safetensors"
-    own, cloudiness = folder / "splat", cloudiness_of(job.sky)
-    return write_frame_views(job.place, model, camera, job.hours, own, name=job.view.name, cloudiness=cloudiness)
+    model = load_frame_model(job.place, folder / "gaussians" / "frames.safetensors")
+    camera, paths = camera_for(job.place, job.view, size_px=job.size_px), []
+    for hour in _unique(job.hours):
+        picture = frame_view(job.place, model, camera, hour, cloudiness=cloudiness_of(job.sky))
+        record = {"scene": job.place.scene.name, "camera": job.view.name, "time_utc": hour.isoformat()}
+        record["attribution"] = job.place.scene.attribution
+        paths.append(folder / "splat" / f"{time_stamp(hour)}.png")
+        write_png(paths[-1], picture, metadata={"seasonscapes": json.dumps(record)})
+    return paths
 
 
 def _splat(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
@@ -180,7 +179,14 @@ def timed_views(place: Place, folder: Path) -> list[NamedView]:
 
 
 def distil_frames(
-    place: Place, folder: Path, *, discs: int, steps: int, seed: int = 0, progress: Progress | None = None
+    place: Place,
+    folder: Path,
+    *,
+    discs: int,
+    steps: int,
+    directional: bool = True,
+    seed: int = 0,
+    progress: Progress | None = None,
 ) -> tuple[FrameGaussians, list[float]]:
     """Train Gaussians with the paper's appearance on the timed frames of a folder.
 
@@ -194,6 +200,8 @@ def distil_frames(
         Gaussians along the longer side of the terrain.
     steps
         Training steps.
+    directional
+        Whether colours depend on the viewing direction, as in the paper.
     seed
         Equal seeds give equal models.
     progress
@@ -233,41 +241,42 @@ def distil_frames(
     note = {"scene": place.scene.name, "seed": seed, "spacing_m": surfels.grid.spacing_m}
     note |= {"attribution": place.scene.attribution, "frames": len(frames)}
     report = task_progress(progress, "distilling frames")
-    return train_on_frames(surfels, frames, times, steps=steps, seed=seed, note=note, progress=report)
+    return train_on_frames(
+        surfels, frames, times, steps=steps, directional=directional, seed=seed, note=note, progress=report
+    )
 
 
-def write_frame_views(
-    place: Place, model: Path, camera: Camera, hours: Sequence[datetime], own: Path, *, name: str, cloudiness: float
-) -> list[Path]:
-    """Picture a model of `distil_frames` at several hours, before a plain sky.
+def frame_view(place: Place, model: FrameGaussians, camera: Camera, time: datetime, *, cloudiness: float) -> np.ndarray:
+    """Picture ``(H, W, 3)``, display-linear, of a model of `distil_frames` at an hour, before a plain sky.
 
     Parameters
     ----------
     place, model
-        The place, and the model's file.
-    camera, name
-        The view and its name.
-    hours
-        Aware times.
-    own
-        Folder to write into.
+        The place, and a model of it.
+    camera
+        The view.
+    time
+        Aware.
     cloudiness
         Of the sky, in [0, 1].
     """
     from seasonscapes.cameras.pinhole import ray_directions
-    from seasonscapes.gaussians.frame_appearance import load_frame_gaussians, render_frame
-    from seasonscapes.gaussians.surfels import terrain_surfels
-    from seasonscapes.images import linear_from_srgb, write_png
+    from seasonscapes.gaussians.frame_appearance import render_frame
+    from seasonscapes.images import linear_from_srgb
     from seasonscapes.texturing.view_conditions import plain_sky
 
-    loaded = load_frame_gaussians(model, lambda spacing_m: terrain_surfels(place.terrain, spacing_m))
     sky = linear_from_srgb(plain_sky(ray_directions(camera), cloudiness=cloudiness))
-    files = []
-    for hour in sorted(set(hours)):
-        picture, coverage = render_frame(loaded, camera, hour)
-        facts = {"scene": place.scene.name, "camera": name, "time_utc": hour.isoformat()}
-        facts["attribution"] = place.scene.attribution
-        files.append(own / f"{time_stamp(hour)}.png")
-        shown = picture + (1.0 - coverage[..., None]) * sky
-        write_png(files[-1], np.clip(shown, 0.0, 1.0), metadata={"seasonscapes": json.dumps(facts)})
-    return files
+    picture, coverage = render_frame(model, camera, time)
+    return np.clip(picture + (1.0 - coverage[..., None]) * sky, 0.0, 1.0)
+
+
+def load_frame_model(place: Place, file: Path) -> FrameGaussians:
+    """Read a model of `distil_frames`; `InputError` where it is damaged or of another place."""
+    from seasonscapes.gaussians.frame_appearance import load_frame_gaussians
+    from seasonscapes.gaussians.surfels import terrain_surfels
+
+    model = load_frame_gaussians(file, lambda spacing_m: terrain_surfels(place.terrain, spacing_m))
+    if model.note.get("scene") != place.scene.name:
+        got = str(model.note.get("scene"))
+        raise InputError("--model", "was distilled from another scene", got=got, expected=place.scene.name)
+    return model
