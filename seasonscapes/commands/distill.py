@@ -46,7 +46,7 @@ def distill_command(
         physical (relit for any sun and date), paper (learned from --frames alone: viewing direction and a free embedding
         of each timestamp), or embedding (the same without viewing direction).
     frames
-        Of paper and embedding: folder with transforms.json, pictures and their times, as `run --method paper` films them.
+        Of paper and embedding: folder with transforms.json, pictures and their times, as a run films them.
     discs
         Gaussians along the longer side of the terrain.
     steps
