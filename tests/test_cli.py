@@ -165,7 +165,7 @@ def test_doctor_never_crashes(capsys, monkeypatch):
 
 def extras_at_hand(folder, **sources):
     """Environment with modules of the extras that are quick to import: empty ones, or of the given sources."""
-    for module in ("torch", "diffusers", "open3d", "distributed", "pxr"):
+    for module in ("torch", "diffusers", "distributed", "pxr"):
         (folder / f"{module}.py").write_text(sources.get(module, ""))
     return {"PYTHONPATH": os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")])}
 
