@@ -1,0 +1,103 @@
+"""Light of surrounding land that the air scatters into an image from above (adjacency effect).
+
+Over a dark forest between bright fields, much of what a satellite sees comes from the fields. Molecules and haze send it
+up from far and near; the share within a distance is that of the environment functions of 6S (Vermote et al. 1997,
+doi:10.1109/36.581987).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.signal import fftconvolve
+
+# Sums of a · exp(-b · distance): the share of light from beyond a distance [km], seen from space.
+_MOLECULES = ((0.930, 0.08), (0.070, 1.10))
+_HAZE = ((0.375, 0.2), (0.625, 1.83))
+# Land is averaged in so many cells on a side at most; beyond this distance nothing is added [km].
+_CELLS, _REACH_KM = 400, 15.0
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """Light from surrounding land in the air between surface and sensor.
+
+    Parameters
+    ----------
+    by_molecules, by_haze
+        ``(3,)`` diffuse transmittance: the share of the mean radiance of the surroundings that each adds.
+    texel_m
+        Size of a texel on the ground [m]; neighbouring texels adjoin.
+    """
+
+    by_molecules: np.ndarray
+    by_haze: np.ndarray
+    texel_m: float
+
+
+def without_surroundings(
+    radiance: np.ndarray, transmittance: np.ndarray, surroundings: Surroundings, known: np.ndarray
+) -> np.ndarray:
+    """Estimate the radiance at the surface, without what the air adds from the land around.
+
+    Parameters
+    ----------
+    radiance
+        ``(R, S, 3)`` at the sensor, without the air's own airlight.
+    transmittance
+        ``(3,)`` or ``(R, S, 3)`` share that passes the air straight.
+    surroundings
+        What the air adds.
+    known
+        ``(R, S)`` bool: texels with a value.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(R, S, 3)`` radiance that leaves the surface; nothing changes but for one factor where all land is alike.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> around = Surroundings(np.full(3, 0.05), np.full(3, 0.05), 30.0)
+    >>> level = without_surroundings(np.full((32, 32, 3), 0.9), np.full(3, 0.8), around, np.ones((32, 32), bool))
+    >>> bool(np.allclose(level, 1.0))
+    True
+    """
+    added = np.zeros_like(radiance, dtype=np.float32)
+    for share, parts in ((surroundings.by_molecules, _MOLECULES), (surroundings.by_haze, _HAZE)):
+        added += np.asarray(share, np.float32) * _mean_around(radiance, known, parts, surroundings.texel_m)
+    whole = transmittance + np.asarray(surroundings.by_molecules) + np.asarray(surroundings.by_haze)
+    return ((radiance - added / whole) / transmittance).astype(np.float32)
+
+
+def _mean_around(
+    radiance: np.ndarray, known: np.ndarray, parts: tuple[tuple[float, float], ...], texel_m: float
+) -> np.ndarray:
+    """Mean radiance of the known land around each texel ``(R, S, 3)``, by an environment function."""
+    rows, columns = known.shape
+    every = max(1, -(-max(rows, columns) // _CELLS))
+    size = (-(-columns // every), -(-rows // every))
+    weight = known.astype(np.float32)
+    values = np.where(known[..., None], radiance, 0.0).astype(np.float32)
+    if every > 1:
+        weight, values = (cv2.resize(array, size, interpolation=cv2.INTER_AREA) for array in (weight, values))
+    kernel = _kernel(parts, texel_m * every / 1000.0, max(size))
+    total = fftconvolve(weight, kernel, mode="same")
+    blurred = [fftconvolve(values[..., channel], kernel, mode="same") for channel in range(3)]
+    mean = np.stack(blurred, axis=2) / np.maximum(total, 1e-6)[..., None]
+    return cv2.resize(mean.astype(np.float32), (columns, rows), interpolation=cv2.INTER_LINEAR)
+
+
+def _kernel(parts: tuple[tuple[float, float], ...], cell_km: float, most: int) -> np.ndarray:
+    """Weights of cells around one ``(2N + 1, 2N + 1)``, from the derivative of an environment function by area."""
+    reach = max(1, min(most, int(_REACH_KM / cell_km)))
+    offset = np.arange(-reach, reach + 1) * cell_km
+    distance = np.hypot(offset[:, None], offset)
+    distance[reach, reach] = np.inf
+    kernel = sum(a * b * np.exp(-b * distance) for a, b in parts) / (2.0 * np.pi * distance) * cell_km**2
+    # The cell itself is a disc of equal area.
+    kernel[reach, reach] = sum(a * (1.0 - np.exp(-b * cell_km / np.sqrt(np.pi))) for a, b in parts)
+    return kernel / kernel.sum()
