@@ -16,6 +16,10 @@ from scipy.signal import fftconvolve
 # Sums of a · exp(-b · distance): the share of light from beyond a distance [km], seen from space.
 _MOLECULES = ((0.930, 0.08), (0.070, 1.10))
 _HAZE = ((0.375, 0.2), (0.625, 1.83))
+# Shares of scattered light that go on upwards.
+_UP_BY_MOLECULES, _UP_BY_HAZE = 0.5, 0.75
+# Each round leaves about the share of the scattered in the straight light of its error, a half in hazy blue.
+_ROUNDS = 4
 # Land is averaged in so many cells on a side at most; beyond this distance nothing is added [km].
 _CELLS, _REACH_KM = 400, 15.0
 
@@ -35,6 +39,32 @@ class Surroundings:
     by_molecules: np.ndarray
     by_haze: np.ndarray
     texel_m: float
+
+
+def scattered_upwards(molecules: np.ndarray, haze: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the diffuse transmittance of air straight up: half of what molecules scatter, three quarters of haze's.
+
+    Parameters
+    ----------
+    molecules, haze
+        Optical depths ``(3,)`` between surface and sensor.
+
+    Returns
+    -------
+    tuple of numpy.ndarray
+        Diffuse transmittances ``(3,)`` by molecules and by haze.
+
+    Examples
+    --------
+    >>> by_molecules, by_haze = scattered_upwards(np.array([0.06, 0.1, 0.2]), np.array([0.1, 0.12, 0.15]))
+    >>> by_haze.round(3)
+    array([0.067, 0.078, 0.088])
+    """
+    molecules, haze = np.asarray(molecules, float), np.asarray(haze, float)
+    up = _UP_BY_MOLECULES * molecules + _UP_BY_HAZE * haze
+    scattered = np.exp(-(molecules + haze)) * np.expm1(up)
+    share = _UP_BY_MOLECULES * molecules / np.maximum(up, 1e-9)
+    return scattered * share, scattered * (1.0 - share)
 
 
 def without_surroundings(
@@ -66,11 +96,15 @@ def without_surroundings(
     >>> bool(np.allclose(level, 1.0))
     True
     """
-    added = np.zeros_like(radiance, dtype=np.float32)
-    for share, parts in ((surroundings.by_molecules, _MOLECULES), (surroundings.by_haze, _HAZE)):
-        added += np.asarray(share, np.float32) * _mean_around(radiance, known, parts, surroundings.texel_m)
-    whole = transmittance + np.asarray(surroundings.by_molecules) + np.asarray(surroundings.by_haze)
-    return ((radiance - added / whole) / transmittance).astype(np.float32)
+    shares = [np.asarray(share, np.float32) for share in (surroundings.by_molecules, surroundings.by_haze)]
+    # The mean over surroundings is of the surface's radiance, which is what is sought.
+    surface = radiance / (transmittance + shares[0] + shares[1])
+    for _ in range(_ROUNDS):
+        added = np.zeros_like(surface, dtype=np.float32)
+        for share, parts in zip(shares, (_MOLECULES, _HAZE), strict=True):
+            added += share * _mean_around(surface, known, parts, surroundings.texel_m)
+        surface = (radiance - added) / transmittance
+    return surface.astype(np.float32)
 
 
 def _mean_around(

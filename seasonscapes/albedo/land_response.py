@@ -18,7 +18,7 @@ _LEAST_TEXELS = 500
 # Below this share of a class's mean direct light the exponent means nothing.
 _LEAST_RATIO = 0.05
 # Deviations of the logarithm of albedo beyond which a texel is something else than its class, such as a cloud.
-_OUTLIER_SIGMAS = 3.0
+_OUTLIER_SIGMAS = 5.0
 _SAMPLE = 20_000
 
 
