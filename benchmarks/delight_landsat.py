@@ -175,7 +175,7 @@ def vegetation_haze(view: Scene, date: str, sun: np.ndarray) -> float:
     doi:10.1109/36.628795). A date without such vegetation keeps thin haze.
     """
     level = view.clear & (view.land.normal[:, 2] > np.cos(np.radians(5.0)))
-    depth = np.arange(0.02, 0.8, 0.02)
+    depth = np.arange(0.05, 0.8, 0.05)
     excess = []
     for haze in depth:
         reflectance = np.pi * at_surface(view, view.bands[date] - path_radiance(sun, haze), haze) / (SOLAR * sun[2])
@@ -189,7 +189,9 @@ def vegetation_haze(view: Scene, date: str, sun: np.ndarray) -> float:
         excess.append([blue - 0.25 * shortwave, red - 0.5 * shortwave, 0.3 * 0.25 * shortwave, 0.3 * 0.5 * shortwave])
     table = np.array(excess)
     cost = (table[:, 0] / table[:, 2]) ** 2 + (table[:, 1] / table[:, 3]) ** 2
-    return float(depth[np.argmin(cost)])
+    best = int(np.clip(np.argmin(cost), 1, len(depth) - 2))
+    curve = np.polyfit(depth[best - 1 : best + 2], cost[best - 1 : best + 2], 2)
+    return float(-0.5 * curve[1] / curve[0])
 
 
 def air_of(haze: float, channels: list[int]) -> Air:

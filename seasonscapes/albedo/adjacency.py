@@ -7,6 +7,7 @@ doi:10.1109/36.581987).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -21,7 +22,7 @@ _UP_BY_MOLECULES, _UP_BY_HAZE = 0.5, 0.75
 # Each round leaves about the share of the scattered in the straight light of its error, a half in hazy blue.
 _ROUNDS = 4
 # Land is averaged in so many cells on a side at most; beyond this distance nothing is added [km].
-_CELLS, _REACH_KM = 400, 15.0
+_CELLS, _REACH_KM = 200, 15.0
 
 
 @dataclass(frozen=True)
@@ -96,33 +97,42 @@ def without_surroundings(
     >>> bool(np.allclose(level, 1.0))
     True
     """
-    shares = [np.asarray(share, np.float32) for share in (surroundings.by_molecules, surroundings.by_haze)]
+    molecules, haze = (np.asarray(share, float) for share in (surroundings.by_molecules, surroundings.by_haze))
+    added_share = (molecules + haze).astype(np.float32)
+    mean_around = _mean_around(known, molecules, haze, surroundings.texel_m)
     # The mean over surroundings is of the surface's radiance, which is what is sought.
-    surface = radiance / (transmittance + shares[0] + shares[1])
+    surface = radiance / (transmittance + added_share)
     for _ in range(_ROUNDS):
-        added = np.zeros_like(surface, dtype=np.float32)
-        for share, parts in zip(shares, (_MOLECULES, _HAZE), strict=True):
-            added += share * _mean_around(surface, known, parts, surroundings.texel_m)
-        surface = (radiance - added) / transmittance
+        surface = (radiance - added_share * mean_around(surface)) / transmittance
     return surface.astype(np.float32)
 
 
 def _mean_around(
-    radiance: np.ndarray, known: np.ndarray, parts: tuple[tuple[float, float], ...], texel_m: float
-) -> np.ndarray:
-    """Mean radiance of the known land around each texel ``(R, S, 3)``, by an environment function."""
+    known: np.ndarray, molecules: np.ndarray, haze: np.ndarray, texel_m: float
+) -> Callable[[np.ndarray], np.ndarray]:
+    """Mean of the known land's values ``(R, S, 3)`` around each texel, as molecules and haze of these shares weigh it."""
     rows, columns = known.shape
     every = max(1, -(-max(rows, columns) // _CELLS))
     size = (-(-columns // every), -(-rows // every))
-    weight = known.astype(np.float32)
-    values = np.where(known[..., None], radiance, 0.0).astype(np.float32)
-    if every > 1:
-        weight, values = (cv2.resize(array, size, interpolation=cv2.INTER_AREA) for array in (weight, values))
-    kernel = _kernel(parts, texel_m * every / 1000.0, max(size))
-    total = fftconvolve(weight, kernel, mode="same")
-    blurred = [fftconvolve(values[..., channel], kernel, mode="same") for channel in range(3)]
-    mean = np.stack(blurred, axis=2) / np.maximum(total, 1e-6)[..., None]
-    return cv2.resize(mean.astype(np.float32), (columns, rows), interpolation=cv2.INTER_LINEAR)
+
+    def coarse(values: np.ndarray) -> np.ndarray:
+        return values if every == 1 else cv2.resize(values, size, interpolation=cv2.INTER_AREA)
+
+    far, near = (_kernel(parts, texel_m * every / 1000.0, max(size)) for parts in (_MOLECULES, _HAZE))
+    kernels = [far * one + near * other for one, other in zip(molecules, haze, strict=True)]
+    weight = coarse(known.astype(np.float32))
+    totals = [np.maximum(fftconvolve(weight, kernel, mode="same"), 1e-9) for kernel in kernels]
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        land = coarse(np.where(known[..., None], values, 0.0).astype(np.float32))
+        blurred = [
+            fftconvolve(land[..., channel], kernel, mode="same") / total
+            for channel, (kernel, total) in enumerate(zip(kernels, totals, strict=True))
+        ]
+        around = np.stack(blurred, axis=2).astype(np.float32)
+        return cv2.resize(around, (columns, rows), interpolation=cv2.INTER_LINEAR)
+
+    return mean
 
 
 def _kernel(parts: tuple[tuple[float, float], ...], cell_km: float, most: int) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 A forest or a field sends back direct light as cos^κ of the angle of incidence: κ is 1 for a Lambertian surface; less
 under a high sun, as crowns stand upright on any slope; more under a low sun, as slopes that turn away from it show the
-shadows between their plants. It is the law of Minnaert (1941), applied to sunlight alone: shadows, skylight and light
+shadows between their plants. It is the law of Minnaert (1941, doi:10.1086/144279), applied to sunlight alone: shadows, skylight and light
 from other slopes, which the topographic corrections leave in it, are taken as modelled.
 """
 
