@@ -55,9 +55,11 @@ def delight_mesh_file(
     print_result(record, [f"{output}  ({facts})"], as_json=json)
 
 
-def require_no_scene_flags(place: PlaceOptions | None, *, image: Path | None, sensor_height_m: float | None) -> None:
+def require_no_scene_flags(
+    place: PlaceOptions | None, *, image: Path | None, sensor_height_m: float | None, land_classes: int
+) -> None:
     """`InputError` for flags of scenes beside a mesh."""
     about_files = PlaceOptions(workspace=place.workspace, allow_outside=place.allow_outside) if place else None
-    if image is not None or sensor_height_m is not None or place != about_files:
-        cure = "leave out --image, --sensor-height-m, --mesher, --atlas and such"
+    if image is not None or sensor_height_m is not None or land_classes or place != about_files:
+        cure = "leave out --image, --sensor-height-m, --land-classes, --mesher, --atlas and such"
         raise InputError("delight", "flags of scenes beside a mesh", cure=cure)
