@@ -234,7 +234,7 @@ def _solve(
         target = target + prior_weight * prior[0].reshape(start.shape)
 
     def normal(a: np.ndarray) -> np.ndarray:
-        total = smooth * _laplacian(a, shape) + (prior_weight + 1e-6 * typical) * a
+        total = smooth * grid_laplacian(a, shape) + (prior_weight + 1e-6 * typical) * a
         for equations, norm in zip(systems, gain_norms, strict=True):
             weight = equations.weight
             assert weight is not None
@@ -282,7 +282,7 @@ def _dots(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.einsum("nc,nc->c", a.astype(np.float64), b.astype(np.float64))
 
 
-def _laplacian(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+def grid_laplacian(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """Graph Laplacian of the texel grid: four neighbours."""
     grid = values.reshape(*shape, -1)
     result = np.zeros_like(grid)

@@ -66,6 +66,8 @@ class AlbedoPhotograph:
         Pixels of its camera at which aerial perspective and sky radiance are evaluated.
     gain
         ``(3,)`` known pixel value over radiance; ``None`` if exposure and white balance are unknown.
+    confidence
+        ``(n,)`` factors of the inverse variance of its terrain pixels; ``None`` for 1.
     """
 
     observation: Observation
@@ -74,6 +76,7 @@ class AlbedoPhotograph:
     number: int
     atmosphere: CameraAtmosphere
     gain: np.ndarray | None = None
+    confidence: np.ndarray | None = None
 
 
 def prepare_photographs(
@@ -167,12 +170,15 @@ def thinned_photographs(photographs: Sequence[AlbedoPhotograph], fraction: float
     if fraction >= 1.0:
         return list(photographs)
     rng = np.random.default_rng(seed)
-    thinned: dict[int, tuple[Footprints, CameraAtmosphere]] = {}
+    thinned: dict[int, tuple[Footprints, CameraAtmosphere, np.ndarray]] = {}
     result = []
     for photograph in photographs:
         if id(photograph.footprints) not in thinned:
-            part = thinned_footprints(photograph.footprints, rng.random(len(photograph.footprints.pixel)) < fraction)
-            thinned[id(photograph.footprints)] = (part, replace(camera_atmosphere(part), sky=photograph.atmosphere.sky))
-        footprints, atmosphere = thinned[id(photograph.footprints)]
-        result.append(replace(photograph, footprints=footprints, atmosphere=atmosphere))
+            keep = rng.random(len(photograph.footprints.pixel)) < fraction
+            part = thinned_footprints(photograph.footprints, keep)
+            atmosphere = replace(camera_atmosphere(part), sky=photograph.atmosphere.sky)
+            thinned[id(photograph.footprints)] = (part, atmosphere, keep)
+        footprints, atmosphere, keep = thinned[id(photograph.footprints)]
+        confidence = None if photograph.confidence is None else photograph.confidence[keep]
+        result.append(replace(photograph, footprints=footprints, atmosphere=atmosphere, confidence=confidence))
     return result
