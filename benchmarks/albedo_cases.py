@@ -7,7 +7,7 @@ cloud before the sun.
 * haze: the visibility is drawn from 18 to 45 km, where about 70 km is assumed;
 * curve: an S-curve of each camera's own strength, 0.25 to 0.6;
 * pose: each camera is turned by 0.1 to 0.3° about a random axis;
-* bounce: heights twice as steep, under fresh snow above saturated red and green slopes: interreflection is strong and coloured;
+* bounce: slopes 1.8 times as steep, under fresh snow above saturated red and green slopes: interreflection is strong and coloured;
 * clouds: at half of the hours the shadows of clouds cover about half of the land, and the skylight is that of a half-cloudy
   sky. The shadows have soft edges at no grid that the recovery knows.
 """
@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from scipy.ndimage import gaussian_filter
 from albedo_scene import Truth, lights_for, low_cameras, path_traced, terrain_and_albedo
 
 from seasonscapes.albedo.closed_form import AlbedoFit, solve_albedo
@@ -79,9 +80,7 @@ def cloud_shadows(truth: Truth, rng: np.random.Generator, share: float) -> list[
 
     reach = float(np.abs(truth.terrain.vertices[:, :2]).max())
     side = 256
-    noise = cv2.GaussianBlur(
-        rng.normal(size=(side, side)), (0, 0), side * 700.0 / (2.0 * reach), borderType=cv2.BORDER_WRAP
-    )
+    noise = gaussian_filter(rng.normal(size=(side, side)), side * 700.0 / (2.0 * reach), mode="wrap")
     edge = 0.25 * noise.std()
     field = 1.0 / (1.0 + np.exp(-(noise - np.quantile(noise, share)) / edge))
     bare = ray_scene(mi_mesh(truth.terrain, np.full(3, 0.3)))
@@ -95,7 +94,7 @@ def cloud_shadows(truth: Truth, rng: np.random.Generator, share: float) -> list[
 
 
 def gorge(truth: Truth, seed: int, cameras: int, texel_m: float) -> Truth:
-    """The massif twice as steep, with fresh snow and saturated colours."""
+    """The massif 1.8 times as steep, with fresh snow and saturated colours."""
     place = replace(
         truth.place, elevation=replace(truth.place.elevation, values=_steeper(truth.place.elevation.values))
     )
@@ -106,7 +105,7 @@ def gorge(truth: Truth, seed: int, cameras: int, texel_m: float) -> Truth:
 
 
 def _steeper(height_m: np.ndarray) -> np.ndarray:
-    return (height_m.mean() + 2.0 * (height_m - height_m.mean())).astype(height_m.dtype)
+    return (1000.0 + 1.8 * (height_m - height_m.min())).astype(height_m.dtype)
 
 
 def _saturated(albedo: np.ndarray) -> np.ndarray:
