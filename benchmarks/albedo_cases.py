@@ -18,8 +18,8 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from scipy.ndimage import gaussian_filter
 from albedo_scene import Truth, lights_for, low_cameras, path_traced, terrain_and_albedo
+from scipy.ndimage import gaussian_filter
 
 from seasonscapes.albedo.closed_form import AlbedoFit, solve_albedo
 from seasonscapes.albedo.forward_model import TexelTransport, trace_texel_transport
@@ -124,31 +124,42 @@ class CaseScene:
     observations: list[Observation]
 
 
-def case_scene(name: str, truth: Truth, land: TexelTransport, times, model, workspace, size, seed: int) -> CaseScene:
-    """Make the pictures of a case; draws are those of the seed and the case's own."""
+def case_scene(
+    name: str, truth: Truth, land: TexelTransport, times, clear, model, workspace, size, seed: int
+) -> CaseScene:
+    """Make the pictures of a case, from those of the clear day where they serve; the draws are the seed's and the case's."""
     rng = np.random.default_rng([seed, CASES.index(name)])
     if name == "bounce":
         truth = gorge(truth, seed, len(truth.cameras), size.texel_m)
         land = trace_texel_transport(truth.terrain, truth.shape)
     if name == "haze":
         model = with_overrides(model, visibility_km=float(np.exp(rng.uniform(np.log(18.0), np.log(45.0)))))
-    lights = lights_for(times, truth.cameras, model, workspace)
-    if name == "clouds":
-        cloudy = [_half_cloudy(row) if t % 2 else row for t, row in enumerate(lights)]
-        pictures = path_traced(truth, truth.albedo, cloudy, spp=size.spp, seed=seed + 1)
-        sunless = [[replace(light, sun=None) for light in row] for row in cloudy]
-        shaded = path_traced(truth, truth.albedo, sunless, spp=size.spp, seed=seed + 2)
-        for t in range(1, len(times), 2):
-            through = cloud_shadows(truth, rng, rng.uniform(0.35, 0.65))
-            for c, share in enumerate(through):
-                share = (0.08 + 0.92 * share)[..., None]
-                pictures[t][c] = share * pictures[t][c] + (1.0 - share) * shaded[t][c]
+    if name in ("haze", "bounce"):
+        lights = lights_for(times, truth.cameras, model, workspace)
+        pictures = path_traced(truth, truth.albedo, lights, spp=size.spp // 2, seed=seed + 1)
+    elif name == "clouds":
+        pictures = clouded(truth, times, clear, model, workspace, size, rng, seed)
     else:
-        pictures = path_traced(truth, truth.albedo, lights, spp=size.spp, seed=seed + 1)
+        pictures = clear
     curves = rng.uniform(0.25, 0.6, len(truth.cameras)) if name == "curve" else np.zeros(len(truth.cameras))
     faults = [WebcamFaults(tone_strength=float(strength)) for strength in curves]
     cameras = wrong_cameras(truth, rng) if name == "pose" else truth.cameras
     return CaseScene(truth, land, photographed(times, pictures, faults, cameras, rng))
+
+
+def clouded(truth: Truth, times, clear, model, workspace, size, rng: np.random.Generator, seed: int) -> list:
+    """The pictures of the day with cloud shadows at every second hour."""
+    hours = range(1, len(times), 2)
+    lights = [_half_cloudy(row) for row in lights_for([times[t] for t in hours], truth.cameras, model, workspace)]
+    sunless = [[replace(light, sun=None) for light in row] for row in lights]
+    lit = path_traced(truth, truth.albedo, lights, spp=size.spp // 2, seed=seed + 1)
+    shaded = path_traced(truth, truth.albedo, sunless, spp=size.spp // 2, seed=seed + 2)
+    pictures = [list(row) for row in clear]
+    for k, t in enumerate(hours):
+        for c, share in enumerate(cloud_shadows(truth, rng, rng.uniform(0.35, 0.65))):
+            through = (0.08 + 0.92 * share)[..., None]
+            pictures[t][c] = through * lit[k][c] + (1.0 - through) * shaded[k][c]
+    return pictures
 
 
 def _half_cloudy(row: list) -> list:

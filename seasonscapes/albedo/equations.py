@@ -8,7 +8,7 @@ import numpy as np
 
 from seasonscapes.albedo.footprints import whole_pixels
 from seasonscapes.albedo.forward_model import aerial_perspective_of, sky_radiance_of
-from seasonscapes.albedo.photographs import AlbedoPhotograph, NoiseModel
+from seasonscapes.albedo.photographs import AlbedoPhotograph, NoiseModel, TextureObservation
 from seasonscapes.cameras.observation import Observation
 from seasonscapes.rendering.receivers import luminaries
 
@@ -80,7 +80,7 @@ def equations_of(photograph: AlbedoPhotograph, noise_model: NoiseModel, size: in
     PhotographEquations
         Equations with zero ambient illuminance and without weights.
     """
-    footprints, observation = photograph.footprints, photograph.observation
+    footprints, observation, noise_model = photograph.footprints, photograph.observation, photograph.noise(noise_model)
     picture = observation.image.reshape(-1, 3)
     usable = usable_pixels(observation, noise_model).ravel()
     terrain = footprints.pixel
@@ -115,7 +115,7 @@ def equations_of(photograph: AlbedoPhotograph, noise_model: NoiseModel, size: in
     return equations
 
 
-def usable_pixels(observation: Observation, noise_model: NoiseModel) -> np.ndarray:
+def usable_pixels(observation: Observation | TextureObservation, noise_model: NoiseModel) -> np.ndarray:
     """Pixels ``(H, W)`` bool that are finite, not masked, and in encoded pictures neither clipped nor black."""
     usable = observation.mask & np.isfinite(observation.image).all(axis=2)
     if noise_model.levels is not None:
@@ -256,13 +256,13 @@ def reweight(systems: list[PhotographEquations], albedo: np.ndarray, noise_model
         radiance = model + equations.airlight
         if equations.projected:
             equations.inverse_gain = projected_gain(equations, radiance)
-        photograph = equations.photograph
+        photograph, own = equations.photograph, equations.photograph.noise(noise_model)
         lit = photograph.footprints.lit[photograph.number] if equations.luminary_lx else np.zeros(len(model))
         # Highest where a shadow's edge divides the pixel.
         penumbra = np.nan_to_num(4.0 * lit * (1.0 - lit)).astype(np.float32)[:, None]
         noise = equations.noise * equations.inverse_gain.astype(np.float32)
         floor = radiance_floor(radiance)
-        variance = (noise_model.model * radiance) ** 2 + (noise_model.edge * sun * penumbra) ** 2 + noise**2 + floor**2
+        variance = (own.model * radiance) ** 2 + (own.edge * sun * penumbra) ** 2 + noise**2 + floor**2
         equations.weight = np.where(equations.usable, 1.0 / variance, 0.0).astype(np.float32)
         if photograph.confidence is not None:
             equations.weight *= photograph.confidence[:, None]

@@ -36,13 +36,16 @@ from seasonscapes.albedo.recovery_rounds import (
     sun_weights,
 )
 from seasonscapes.albedo.recovery_unknowns import CURVE, GAIN, HAZE, SKY, SUN, TURN, straightened
+from seasonscapes.cameras.observation import Observation
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.errors import NotEnoughEvidence
 from seasonscapes.images import linear_from_srgb, srgb_from_linear
 
 Progress = Callable[[float], None]
-_TRAINING = SolverOptions(rounds=3, iterations=8)
-_LAST = SolverOptions(rounds=3, iterations=10)
+_TRAINING = SolverOptions(rounds=3, iterations=6)
+_LAST = SolverOptions(rounds=2, iterations=10)
+# Rounds end when one lowers the cost by a smaller share.
+_CONVERGED = 0.015
 # Footprints of cameras that turned by less stay as they are.
 _LEAST_TURN_PX = 0.1
 
@@ -91,7 +94,7 @@ class JointRecovery:
         Robust loss per value of the held-out photographs under the closed form and under the recovery, neither of which
         saw them.
     history
-        Robust cost per value of each round.
+        Robust cost per value at the beginning of each round.
     """
 
     fit: AlbedoFit
@@ -155,11 +158,13 @@ def recover_jointly(
     state = _started(problem, naive, training)
     before, _ = held_out_loss(problem, state, held_out)
     report(1 / steps)
-    history = []
+    history: list[float] = []
     for number in range(options.rounds):
         state, cost = advance(problem, state, training)
         history.append(cost)
         report((number + 2) / steps)
+        if number and cost > (1.0 - _CONVERGED) * history[-2]:
+            break
     after, state = held_out_loss(problem, state, held_out)
     for number in range(options.last_rounds):
         state, cost = advance(problem, state, range(len(photographs)))
@@ -220,12 +225,16 @@ def corrected_photographs(problem: RecoveryProblem, state: RecoveryState) -> lis
     """
     layout = problem.layout
     log_visibility = float(layout.view(state.values, HAZE)[0])
-    result = []
+    result, on_land = [], {}
     for picture in problem.pictures:
         photograph, observation = picture.photograph, picture.photograph.observation
         light = problem.frame.haze.at(picture.number, log_visibility)
-        scale = np.exp(layout.view(state.values, SKY)[picture.instant]).astype(np.float32)
-        light = replace(light, sky_radiance=(light.sky_radiance * scale).astype(np.float32))
+        # Photographs of one instant share sun and sky, so that the light on the land is computed once.
+        if picture.instant not in on_land:
+            scale = np.exp(layout.view(state.values, SKY)[picture.instant]).astype(np.float32)
+            on_land[picture.instant] = ((light.sky_radiance * scale).astype(np.float32), light.sun, light.moon)
+        sky, sun, moon = on_land[picture.instant]
+        light = replace(light, sky_radiance=sky, sun=sun, moon=moon)
         image = observation.image
         if picture.levels:
             curve = layout.view(state.values, CURVE)[picture.camera]
@@ -257,9 +266,10 @@ def _retraced(
             problem.pictures[members[0]].photograph.observation.camera,
         )
         if new is not old:
+            seen = [photographs[k].observation for k in members]
             traced = prepare_photographs(
                 transport,
-                [photographs[k].observation for k in members],
+                [each for each in seen if isinstance(each, Observation)],
                 [photographs[k].light for k in members],
                 gains=[photographs[k].gain for k in members],
             )

@@ -139,6 +139,7 @@ def recovery_picture(
     sun_weights
         Sparse ``(n, G²)`` weights of the nodes of the sun's grid in its pixels.
     """
+    noise_model = photograph.noise(noise_model)
     image = np.nan_to_num(photograph.observation.image).astype(np.float32)
     usable = usable_pixels(photograph.observation, noise_model)
     scale = 1.0 if noise_model.levels else 1.0 / max(float(np.percentile(image, 99.0)), 1e-12)
@@ -208,8 +209,9 @@ def resampled(picture: RecoveryPicture, turn: np.ndarray | None) -> tuple[np.nda
     if turn is None or not isinstance(camera, Camera):
         return picture.encoded.reshape(-1, 3)[pixel], picture.usable.ravel()[pixel], None
     position = turned_positions(camera, turn)
-    image = cv2.remap(picture.encoded, position, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    usable = cv2.remap(picture.usable.astype(np.float32), position, None, cv2.INTER_LINEAR, borderValue=0.0) > _WHOLE
+    x, y = (np.ascontiguousarray(position[..., k]) for k in (0, 1))
+    image = cv2.remap(picture.encoded, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    usable = cv2.remap(picture.usable.astype(np.float32), x, y, cv2.INTER_LINEAR, borderValue=0.0) > _WHOLE
     soft = cv2.GaussianBlur(image, (0, 0), _SLOPE_BLUR_PX)
     down, across = np.gradient(soft, axis=(0, 1))
     slopes = []

@@ -158,7 +158,7 @@ def predict(
     frame
         Their layout, the nodes of visibility and the noise.
     """
-    layout, noise_model = frame.layout, frame.noise_model
+    layout, noise_model = frame.layout, picture.photograph.noise(frame.noise_model)
     footprints, number = picture.photograph.footprints, picture.photograph.number
     of = {name: layout.view(state, name) for name in layout.shapes}
     gain = np.exp(of[GAIN][picture.number]).astype(np.float32) * np.float32(picture.scale)
@@ -178,7 +178,9 @@ def predict(
         through = geometric(picture.transmittance, low, weight) / np.float32(np.pi)
         lux = geometric(picture.luminary_lx, low, weight)
         sky = geometric(land.sky, low, weight) * scale
-        sun = sum((body * e for body, e in zip(bodies, lux, strict=True)), np.zeros_like(reflected))
+        sun = np.zeros_like(reflected)
+        for body, e in zip(bodies, lux, strict=True):
+            sun += body * e
         diffuse = share @ (sky * albedo)
         air = geometric(picture.airlight, low, weight)
         return through, sun, diffuse, air, lux, sky

@@ -39,7 +39,7 @@ class JointOptions:
     Parameters
     ----------
     rounds, last_rounds
-        Gauss-Newton rounds on the training photographs, and after them on all.
+        Most Gauss-Newton rounds on the training photographs, and rounds after them on all.
     iterations
         Conjugate-gradient iterations in each.
     sun_grid
@@ -55,7 +55,7 @@ class JointOptions:
     """
 
     rounds: int = 8
-    last_rounds: int = 3
+    last_rounds: int = 2
     iterations: int = 16
     sun_grid: int = 12
     held_out: float = 0.12
@@ -109,16 +109,17 @@ def make_problem(
     priors = options.priors
     start, sigma = np.zeros(layout.size), np.zeros(layout.size)
     layout.view(start, HAZE)[:], layout.view(start, SUN)[:] = np.log(haze.start_km), 1.0
-    layout.view(sigma, GAIN)[:] = priors.log_gain
     layout.view(sigma, CURVE)[:] = (priors.curve_strength, priors.log_exponent) if noise_model.levels else 0.0
-    layout.view(sigma, HAZE)[:] = priors.log_visibility if len(haze.visibility_km) > 1 else 0.0
     layout.view(sigma, SKY)[:] = priors.log_sky
+    layout.view(sigma, HAZE)[:] = priors.log_visibility if len(haze.visibility_km) > 1 else 0.0
     for photograph, camera in zip(photographs, cameras, strict=True):
         pose = photograph.observation.pose_sigma
         angles = [pose.get(name, 0.0) for name in ("pitch_deg", "heading_deg", "roll_deg")]
         layout.view(sigma, TURN)[camera] = np.radians(angles)
     layout.view(start, GAIN)[:] = np.log(gains)
-    layout.view(sigma, GAIN)[[photograph.gain is not None for photograph in photographs]] = 0.0
+    layout.view(sigma, GAIN)[:] = [
+        [priors.log_gain if photograph.gain is None else photograph.gain_sigma] * 3 for photograph in photographs
+    ]
     # An unknown that is exact keeps its start.
     precision = np.where(sigma > 0.0, priors.block / np.maximum(sigma, 1e-12) ** 2, 1e12)
     precision[layout.offset(SUN) :] = 0.0
@@ -136,7 +137,7 @@ def make_problem(
     ]
     first = [instants.index(t) for t in range(layout.instants)]
     sky = [sky_on_land(transport, [lights[k] for lights in haze.lights]) for k in first]
-    frame = RecoveryFrame(layout, haze, noise_model, layout.view(sigma, TURN).any(axis=1))
+    frame = RecoveryFrame(layout, haze, noise_model, np.asarray(layout.view(sigma, TURN).any(axis=1)))
     return RecoveryProblem(transport, pictures, frame, start, precision, sky, pixel_count, options)
 
 
@@ -266,13 +267,14 @@ def _add_sky(
 def _sun_prior(
     problem: RecoveryProblem, values: np.ndarray, precision: np.ndarray, pull: np.ndarray
 ) -> list[np.ndarray]:
-    """Add Cauchy's prior of the sun's visible share; the precision of its steps ``(G², G²)`` for each instant."""
+    """Add Cauchy's prior of the sun's visible share; the precision of its steps of the sun's share ``(G², G²)`` for each instant."""
     layout, priors, grid = problem.layout, problem.options.priors, problem.layout.grid
     first = layout.offset(SUN)
     share = layout.view(values, SUN)
-    weight = priors.block / priors.sun**2 / (1.0 + ((share - 1.0) / (_CAUCHY * priors.sun)) ** 2)
-    precision[first:] += weight.ravel()
-    pull[first:] += (weight * (1.0 - share)).ravel()
+    distance = layout.view(problem.start, SUN) - layout.view(values, SUN)
+    weight = priors.block / priors.sun**2 / (1.0 + (distance / (_CAUCHY * priors.sun)) ** 2)
+    layout.view(precision, SUN)[:] += weight
+    layout.view(pull, SUN)[:] += weight * distance
     node = np.arange(grid**2).reshape(grid, grid)
     pairs = [np.stack([node[:, :-1].ravel(), node[:, 1:].ravel()]), np.stack([node[:-1].ravel(), node[1:].ravel()])]
     low, high = np.concatenate(pairs, axis=1)
@@ -312,7 +314,7 @@ def held_out_loss(
                 worst = float(np.abs(predicted.sky_residual).max()) / priors.sky_picture
                 sky = priors.block / priors.sky_picture**2 / (1.0 + (worst / _CAUCHY) ** 2)
                 pulled, stiff = pulled + sky * predicted.sky_residual, stiff + sky
-            if problem.pictures[k].photograph.gain is None:
+            if problem.pictures[k].photograph.gain is None or problem.pictures[k].photograph.gain_sigma > 0.0:
                 gains[k] += np.clip(pulled / np.maximum(stiff, 1e-12), -_LARGEST_STEP, _LARGEST_STEP)
         predicted = predict(picture, lands[picture.instant], albedo, values, problem.frame)
         _, loss, number = _robust(predicted)

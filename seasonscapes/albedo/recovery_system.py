@@ -95,6 +95,7 @@ class RecoverySystem:
                 lumped[:, c] += matrix.T @ (matrix @ ones)
         typical = np.array([np.median(d[d > 0.0]) if (d > 0.0).any() else 1.0 for d in lumped.T], np.float32)
         self._smooth = self.smoothness * typical
+        self._shown = np.flatnonzero(lumped.any(axis=1))
         self._lumped = lumped + 4.0 * self._smooth + 1e-6 * typical
         self._tiny = 1e-6 * typical
 
@@ -163,14 +164,17 @@ class RecoverySystem:
         return albedo, other
 
     def _preconditioner(self):
-        count, size = self.dense_size, self.shape[0] * self.shape[1]
-        mixed = np.zeros((3, size, count), np.float32)
+        count = self.dense_size
+        # Texels that no pixel shows do not mix with anything.
+        shown = self._shown
+        lumped = self._lumped[shown]
+        mixed = np.zeros((3, len(shown), count), np.float32)
         schur = np.diag(self.precision[:count]) + self._evidence
         sun = [coupling + np.diag(self.precision[self._nodes(t)]) for t, coupling in enumerate(self.sun_coupling)]
         for block in self.blocks:
             for c, matrix in enumerate(block.albedo):
                 columns = block.columns[c]
-                mixed[c][:, columns] += matrix.T @ block.dense[c]
+                mixed[c][:, columns] += (matrix.T @ block.dense[c])[shown]
                 schur[np.ix_(columns, columns)] += block.dense[c].T.astype(float) @ block.dense[c]
             if block.sun_weights is not None:
                 instant = (block.sun_columns - count) // self.sun_size
@@ -178,21 +182,22 @@ class RecoverySystem:
                 sun[instant] += (block.sun_weights.T @ scaled).toarray()
         direct = schur.copy()
         for c in range(3):
-            schur -= mixed[c].T @ (mixed[c] / self._lumped[:, c, None])
+            schur -= mixed[c].T @ (mixed[c] / lumped[:, c, None])
         # Rounding of sums over thousands of texels must not make it indefinite.
         schur_factor = cho_factor(schur + 1e-5 * np.diag(np.diag(direct)))
         sun_factors = [cho_factor(matrix) for matrix in sun]
 
         def apply(r: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
             scaled = r[0] / self._lumped
-            reduced = r[1][:count] - sum(mixed[c].T @ scaled[:, c] for c in range(3))
+            reduced = r[1][:count] - sum(mixed[c].T @ scaled[shown, c] for c in range(3))
             other = np.empty_like(r[1])
             other[:count] = cho_solve(schur_factor, reduced)
             back = np.stack([mixed[c] @ other[:count].astype(np.float32) for c in range(3)], axis=1)
+            scaled[shown] -= back / lumped
             for instant, factor in enumerate(sun_factors):
                 nodes = self._nodes(instant)
                 other[nodes] = cho_solve(factor, r[1][nodes])
-            return scaled - back / self._lumped, other
+            return scaled, other
 
         return apply
 

@@ -43,7 +43,7 @@ class RecoveryPriors:
     log_sky
         Scale of skylight.
     sun, sun_step
-        Scale of Cauchy's distribution of the sun's visible share about 1, and of its step between neighbouring nodes.
+        Scales of Cauchy's distributions of the sun's visible share about 1, and of its step between neighbouring nodes.
     sky_picture
         Relative radiance of the sky in a photograph, one error for the whole sky (Cauchy): it fixes the exposure.
     block
