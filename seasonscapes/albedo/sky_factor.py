@@ -11,8 +11,10 @@ import numpy as np
 _SKY_SIGMA, _PAIRS_PER_INDEPENDENT, _MOST_INDEPENDENT = 0.2, 50.0, 25.0
 # Distance of paired texels, across which land is about alike and shadow borders are past [texels].
 _PAIR_TEXELS = 4
+# The same across borders of cast shadows: images blur them, which brightens the shade beside them.
+_ACROSS_TEXELS = 9
 _LEAST_PAIRS = 500
-# The same for its colour, which pairs across shadows tell well and the blue of a display image may exceed by far.
+# Standard deviation for the colour of the sky factor, which pairs across shadows tell well and the blue of a display image may exceed by far.
 _SKY_COLOUR_SIGMA = 0.5
 # A slope faces the sun with more than this share of the largest illuminance.
 _FACING_SHARE = 0.2
@@ -60,7 +62,7 @@ def fitted_sky_factor(
     # A texel that the sun would light well, and that is hidden from it, stands in a cast shadow.
     facing = sun.mean(axis=2) > _FACING_SHARE * sun.mean(axis=2).max()
     side = np.where(facing & (visibility > 0.95), 1.0, np.where(facing & (visibility < 0.05), 0.0, np.nan))
-    pairs = _pairs(chart, lambda one, other: np.abs(side[one] - side[other]) == 1.0)
+    pairs = _pairs(chart, lambda one, other: np.abs(side[one] - side[other]) == 1.0, apart=_ACROSS_TEXELS)
     if len(pairs) < _LEAST_PAIRS:
         return factor
     across = _sky_factor(pairs, (radiance, sunlight, sky, bounce), _SKY_COLOUR_SIGMA)
@@ -99,12 +101,16 @@ def _sky_factor(pairs: np.ndarray, textures: tuple[np.ndarray, ...], sigma: floa
 
 
 def _pairs(
-    chart: np.ndarray, chosen: Callable[[tuple[slice, slice], tuple[slice, slice]], np.ndarray], most: int = 40_000
+    chart: np.ndarray,
+    chosen: Callable[[tuple[slice, slice], tuple[slice, slice]], np.ndarray],
+    *,
+    apart: int = _PAIR_TEXELS,
+    most: int = 40_000,
 ) -> np.ndarray:
-    """Flat indices ``(N, 2)`` of texels a few apart in the same chart, of which ``chosen`` (by their slices) is true."""
+    """Flat indices ``(N, 2)`` of texels so many apart in the same chart, of which ``chosen`` (by their slices) is true."""
     index = np.arange(chart.size).reshape(chart.shape)
     found = []
-    whole, ahead, behind = slice(None), slice(None, -_PAIR_TEXELS), slice(_PAIR_TEXELS, None)
+    whole, ahead, behind = slice(None), slice(None, -apart), slice(apart, None)
     for one, other in (((whole, ahead), (whole, behind)), ((ahead, whole), (behind, whole))):
         keep = (chart[one] >= 0) & (chart[one] == chart[other]) & chosen(one, other)
         found.append(np.stack([index[one][keep], index[other][keep]], axis=1))

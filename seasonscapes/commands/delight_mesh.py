@@ -31,11 +31,12 @@ def delight_mesh_file(
     if hour[0] == "unknown":
         raise InputError("--time", "the sun of a mesh is not searched for", cure="give its time, or --sun AZ,EL")
     model = sky.model()
-    loaded = mesh.load(source, allow_outside=place.allow_outside, place_needed=hour[0] is not None)
+    standing = mesh.place(place.folder(), allow_outside=place.allow_outside)
+    loaded = mesh.load(source, allow_outside=place.allow_outside, place_needed=hour[0] is not None, on=standing)
     files.check(output, loaded)
     when = hour_on(loaded, *hour)
     with progress_bars() as progress:
-        around = mesh.around(model, place.folder())
+        around = mesh.around(model, place.folder(), loaded, standing)
         delit = delight_mesh(loaded, when, surroundings=around, options=mesh.delighting(), progress=progress)
     record = delit.facts | {"output": str(output), "rays": mesh.rays, "seed": mesh.seed}
     if files.textures is None:
