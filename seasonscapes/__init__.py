@@ -65,6 +65,7 @@ _MODULES = {
     # albedo
     "recover_albedo": "workflows.albedo_recovery",
     "RecoveryOptions": "workflows.albedo_recovery",
+    "PaintedTexture": "workflows.recovery_methods",
     "scene_albedo": "workflows.albedo_sources",
     "load_albedo": "workflows.albedo_sources",
     "AlbedoSeries": "albedo.seasons",

@@ -50,6 +50,7 @@ from seasonscapes.workflows.place import load_place as load_place
 from seasonscapes.workflows.predicted_radiance import predict_radiance as predict_radiance
 from seasonscapes.workflows.received_light import irradiance_map as irradiance_map
 from seasonscapes.workflows.received_light import lit_texture as lit_texture
+from seasonscapes.workflows.recovery_methods import PaintedTexture as PaintedTexture
 from seasonscapes.workflows.relight_session import relight as relight
 from seasonscapes.workflows.relight_session import relight_session as relight_session
 from seasonscapes.workflows.synthetic_photographs import synthetic_photographs as synthetic_photographs

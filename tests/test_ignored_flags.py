@@ -71,8 +71,8 @@ VERBS: dict[str, tuple[list[str], set[str], dict[str, list[str]]]] = {
     ),
     "albedo": (
         ["alpine_small", "--times", TIME],
-        {*_TERRAIN, *_SKY, "--times", "--synthetic-webcams", "--fit-haze", "--fit-curve", "--iterations", "--output"},
-        {**_NO_BOUND, **_REAL, "--size": []},
+        {*_TERRAIN, *_SKY, "--times", "--synthetic-webcams", "--method", "--painted", "--output"},
+        {**_NO_BOUND, **_REAL, "--size": []} | _each(("--fit-haze", "--fit-curve"), ["--method", "differentiable"]),
     ),
     "inpaint": (
         ["alpine_small", "--time", TIME],

@@ -89,9 +89,6 @@ def albedo_command(
     from seasonscapes.workflows.recovery_plan import plan_recovery
 
     check_choice("--method", method, METHODS)
-    if method != "closed" and (fit_haze or fit_curve):
-        cure = f"--method {method} finds haze and response itself"
-        raise InputError("--fit-haze" if fit_haze else "--fit-curve", "belongs to --method closed", cure=cure)
     model, size_px = sky.model(), parse_size(size)
     use_backend()
     with progress_bars() as progress:

@@ -69,6 +69,16 @@ CONDITIONS: dict[str, tuple[Condition, ...]] = {
     "albedo": (
         Condition(("--size",), "--synthetic-webcams", beside("--synthetic-webcams")),
         _SYNTHETIC[1],
+        Condition(
+            ("--fit-haze", "--fit-curve"),
+            "--method closed: differentiable finds haze and response itself",
+            named("--method", "closed", default="closed"),
+        ),
+        Condition(
+            ("--calibrations", "--masks", "--within-min", "--doubtful-poses"),
+            "photographs, of which --painted alone has none",
+            lambda given: "--manifest" in given or "--times" in given or "--painted" not in given,
+        ),
     ),
     "inpaint": (
         Condition(_DIFFUSION, "--method diffusion", named("--method", "diffusion", default="guided")),

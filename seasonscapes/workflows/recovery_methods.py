@@ -45,6 +45,15 @@ class PaintedTexture:
         Radiance [cd/m²] with weights, such as `paint` makes.
     name
         Where it came from, for messages.
+
+    Examples
+    --------
+    >>> from datetime import UTC, datetime
+    >>> import seasonscapes as ss
+    >>> place = ss.load_place("alpine_small")
+    >>> lit = ss.scene_albedo(place, "2024-07-20")
+    >>> ss.PaintedTexture(datetime(2024, 7, 20, 10, tzinfo=UTC), lit).name
+    'painted'
     """
 
     time: datetime

@@ -15,7 +15,7 @@ NUMBERS = [
     for value in NO_NUMBERS.get(kind, ())
     if not (flag == "--far-m" and value in ("inf", "1e999"))
 ]
-REPEATABLE = ("--via", "--albedo", "--used")
+REPEATABLE = ("--via", "--albedo", "--used", "--painted")
 # What every verb refuses, whatever it does; `{}` is a flag of its own that wants a value.
 WORDS = {
     "unknown flag": (["--bogus=1"], "Unknown option"),
