@@ -262,6 +262,8 @@ TABLES = {
             Row("… wrong and yet trusted", "{sun_wrong_trusted:.0f}", "0", "sun_wrong_trusted <= 0"),
             Row("real Landsat images of July and November, 4 classes, 6 bands: largest correlation of albedo with the cosine of incidence", "{landsat_abs_r_max:.2f}", "≤ 0.1", "landsat_abs_r_max <= 0.1"),
             Row("… of the C correction in the same classes; of the best other correction", "{landsat_c_by_class_abs_r_max:.2f}; {landsat_minnaert_abs_r_max:.2f}"),
+            Row("… of ours with classes found in three bands of each image by itself, as the command finds them", "{landsat_classes_by_three_bands_abs_r_max:.2f}"),
+            Row("… without classes; without the light of surrounding land taken out", "{landsat_lambertian_abs_r_max:.2f}; {landsat_without_air_abs_r_max:.2f}"),
             Row("… scatter of the ratio of the two dates, over that of the best correction", "{landsat_dates_spread_over_best_correction:.2f}", "≤ 1", "landsat_dates_spread_over_best_correction <= 1"),
             Row("… correlation of the two dates; by the cosine correction, which leaves relief in both", "{landsat_agreement:.2f}; {landsat_cosine_agreement:.2f}"),
             Row("Ararat in winter: step across shadow borders; as it is; best correction", "{ararat_border_step:.2f}; {ararat_as_it_is_border_step:.2f}; {ararat_cosine_border_step:.2f}"),
