@@ -112,7 +112,7 @@ def test_the_command_takes_the_light_out_and_its_file_is_an_albedo(case, tmp_pat
     place = ss.load_place(case.scene, options=ss.MeshOptions(texel_m=60.0))
     albedo = ss.load_albedo(place, output, "2024-09-10").load()
     lit = np.clip(ss.scene_albedo(place, "2024-09-10").values, 1e-3, None)
-    assert case.error(albedo.values) < 0.07
+    assert case.error(albedo.values) < 0.075
     assert case.error(lit) > 0.3
     assert record["sun"] == {"azimuth_deg": 150.0, "elevation_deg": 38.0}
     assert 0.0 < record["shaded_share"] < 1.0
