@@ -9,7 +9,6 @@ full grid at 20 m and the atlases of the large mesh.
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import json
 import os
 import resource
@@ -133,9 +132,7 @@ def jungfrau(seed: int, folder: str) -> dict:
         return {}
     raster, _ = fill_nodata(read_elevation(path))
     frame = centre_frame(raster)
-    meshers = [("adaptive", 5.0), ("adaptive", 20.0), ("grid", 5.0)]
-    if importlib.util.find_spec("open3d"):
-        meshers.append(("poisson", 5.0))
+    meshers = [("adaptive", 5.0), ("adaptive", 20.0), ("grid", 5.0), ("poisson", 5.0)]
     record = {}
     for mesher, bound_m in meshers:
         start = time.perf_counter()

@@ -119,7 +119,7 @@ def test_a_place_of_ones_own(hill, tmp_path, capsys):
         ),
         (["--time", "2024-09-01T12:00", "--at", "46.5405,7.98,500", "--heading", "0"], "below the ground"),
         (["--time", "2024-09-01T12:00", "--at", "46.5405,7.98"], "--heading: missing"),
-        (["--time", "2024-09-01T12:00", "--heading", "5"], "--heading: goes with --at"),
+        (["--time", "2024-09-01T12:00", "--heading", "5"], "--heading: does nothing without --at"),
         (["--time", "2024-09-01T12:00", "--size", "huge"], "--size: not a picture size"),
         (["--time", "2024-09-01T12:00", "--spp", "0"], "--spp: out of range"),
         (["--time", "2024-09-01T12:00", "--exposure", "bright"], "--exposure: not an exposure"),
@@ -165,7 +165,7 @@ def test_doctor_never_crashes(capsys, monkeypatch):
 
 def extras_at_hand(folder, **sources):
     """Environment with modules of the extras that are quick to import: empty ones, or of the given sources."""
-    for module in ("torch", "diffusers", "open3d", "distributed", "pxr"):
+    for module in ("torch", "diffusers", "distributed", "pxr"):
         (folder / f"{module}.py").write_text(sources.get(module, ""))
     return {"PYTHONPATH": os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")])}
 

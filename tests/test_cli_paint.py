@@ -82,7 +82,7 @@ def test_paint_writes_what_it_says(town, capsys):
     [
         (("--mode", "best"), "2024-09-01T10:00Z", "--mode: unknown mode"),
         ((), "2024-09-02T10:00Z", "--time: no picture within 30 minutes"),
-        (("--synthetic-webcams",), "2024-09-01T10:00Z", "is a real place"),
+        (("--synthetic-webcams",), "2024-09-01T10:00Z", "--manifest: does nothing without real photographs"),
         (("--near-m", "-5"), "2024-09-01T10:00Z", "--near-m: out of range"),
         (("--near-m", "50000"), "2024-09-01T10:00Z", "no usable pixel shows terrain"),
     ],

@@ -276,7 +276,8 @@ def test_all_painted_none_painted_and_nonsense():
         assert (lonely.sigma[~one] > 0.3 * truth[40, 40].mean()).all()
 
 
-def test_charts_that_lie_apart_are_neighbours_on_the_land():
+def test_charts_that_lie_apart_are_neighbours_on_the_land(monkeypatch):
+    monkeypatch.setattr("seasonscapes.terrain.charts._CHART_PX", 20)
     heights = places.hill_heights(count=41)
     raster = Raster(
         heights[..., None].astype(np.float32), places.Affine(50, 0, 421_000, 0, -50, 5_156_000), "EPSG:32632"

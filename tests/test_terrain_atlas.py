@@ -1,5 +1,7 @@
 """Atlases: no two places share a texel, and a texel is as large on the ground as its report says."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from affine import Affine
@@ -11,6 +13,7 @@ from seasonscapes.declaration import InputError
 from seasonscapes.frames import LocalFrame
 from seasonscapes.terrain import charts, relief
 from seasonscapes.terrain.atlas import measure_atlas, signed_uv_areas
+from seasonscapes.terrain.imagery import bake_imagery
 from seasonscapes.terrain.mesh import build_mesh
 from seasonscapes.terrain.surface import Raster, Terrain
 from seasonscapes.terrain.texels import coverage_count, covering_faces, texel_coordinates, texel_positions
@@ -220,6 +223,19 @@ def test_charts_are_split_copies_of_the_same_surface(monkeypatch):
     monkeypatch.setattr(charts, "MAX_FACES", 10)
     with pytest.raises(InputError, match="too many faces to cut into charts: "):
         unwrap(terrain, kind="xatlas")
+
+
+def test_charts_of_a_landscape_fill_the_texture_and_leave_no_black_texel():
+    raster = hill_lv95(300, 300)
+    terrain, atlas = unwrap(
+        build_mesh(raster, FRAME, mesher="poisson", max_error_m=2.0), kind="xatlas", texel_m=25.0, max_side_px=4096
+    )
+    assert atlas.utilization > 0.6
+    assert atlas.charts > 4
+    white = replace(raster, values=np.ones((300, 300, 3), np.float32))
+    baked = bake_imagery(terrain, atlas, white)
+    assert baked.values.min() > 0.999
+    assert baked.weight.min() > 0.0
 
 
 def test_charts_keep_their_distance():

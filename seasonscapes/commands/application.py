@@ -13,6 +13,7 @@ from cyclopts import App, Parameter, Token, convert
 from cyclopts.exceptions import CycloptsError
 
 from seasonscapes import __version__
+from seasonscapes.commands.flag_conditions import check_flags
 from seasonscapes.errors import InputError, SeasonscapesError
 
 # A value that would be taken for a flag unless it were joined to its own: a place south of the equator, a negative number.
@@ -119,6 +120,7 @@ def run_verb(tokens: Sequence[str]) -> None:
         If the tokens do not fit a verb and its flags.
     """
     joined = join_signed_values(tokens)
+    check_flags(joined)
     try:
         app(joined, exit_on_error=False, print_error=False, result_action="return_value")
     except CycloptsError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time as clock
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,8 +11,10 @@ from cyclopts import Parameter
 
 from seasonscapes.commands.arguments import check_choice, check_range, parse_albedo
 from seasonscapes.commands.console import print_result, progress_bars
+from seasonscapes.commands.distill_options import DistilOptionsOfLight, Frames, distil_frames
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
 from seasonscapes.commands.outputs import check_output, check_output_folder
+from seasonscapes.commands.refusals import refuse_given, refuse_without
 from seasonscapes.errors import InputError
 
 
@@ -19,14 +22,11 @@ def distill_command(
     scene: str,
     *,
     output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("out/gaussians.safetensors"),
+    appearance: str = "physical",
+    frames: Path | None = None,
     discs: int = 320,
-    suns: int = 32,
-    dates: int = 4,
-    views: int = 3,
-    view_px: int = 256,
     steps: int = 2500,
-    picture_steps: int = 240,
-    kind: str = "full",
+    light: DistilOptionsOfLight | None = None,
     export_views: Path | None = None,
     albedo: list[str] | None = None,
     seed: int = 0,
@@ -42,22 +42,15 @@ def distill_command(
         A scene file, or the name of a bundled scene (alpine).
     output
         The model, a .safetensors file. A checkpoint beside it lets an interrupted training continue.
+    appearance
+        physical (relit for any sun and date), paper (learned from --frames alone: viewing direction and a free embedding
+        of each timestamp), or embedding (the same without viewing direction).
+    frames
+        Of paper and embedding: folder with transforms.json, pictures and their times, as a run films them.
     discs
         Gaussians along the longer side of the terrain.
-    suns
-        Instants to train on, at random hours of the dates' days.
-    dates
-        Dates of the year whose albedo is stored; with --albedo, these. Between them the snow line moves.
-    views
-        Cameras around the terrain for training images; 0 trains on the surface alone.
-    view_px
-        Their size.
     steps
-        Training steps on the surface.
-    picture_steps
-        Training steps on images.
-    kind
-        full (physics and a network), physical (no network), or sun (a network alone, for comparison).
+        Training steps: on the surface, or on the frames.
     export_views
         Also write the training images for other trainers (nerfstudio, COLMAP) into this folder.
     albedo
@@ -67,36 +60,36 @@ def distill_command(
     json
         Print one machine-readable record.
     """
-    sky, options = sky or SkyOptions(), place or PlaceOptions()
     start = clock.perf_counter()
     check_output(output, (".safetensors",))
-    for flag, value, low, high in (
-        ("--discs", discs, 8, 4096),
-        ("--suns", suns, 1, 512),
-        ("--dates", dates, 1, 24),
-        ("--views", views, 0, 64),
-        ("--view-px", view_px, 16, 4096),
-        ("--steps", steps, 1, 1e6),
-        ("--picture-steps", picture_steps, 0, 1e6),
-        ("--seed", seed, 0, 2**32),
-    ):
-        check_range(flag, value, low, high)
+    check_choice("--appearance", appearance, ("physical", "paper", "embedding"))
+    for flag, value, high in (("--discs", discs, 4096), ("--steps", steps, 1e6), ("--seed", seed, 2**32)):
+        check_range(flag, value, {"--discs": 8, "--steps": 1, "--seed": 0}[flag], high)
+    own, options, physical = light or DistilOptionsOfLight(), place or PlaceOptions(), appearance == "physical"
+    refuse_without("--appearance paper or embedding", not physical, frames=frames)
+    refuse_without("--appearance physical", physical, export_views=export_views, albedo=albedo, **asdict(own))
+    if not physical:
+        refuse_given("--appearance physical", sky or SkyOptions(), SkyOptions())
+        distil_frames(scene, options, frames, output, Frames(appearance == "paper", discs, steps, seed), as_json=json)
+        return
+    sky, how = sky or SkyOptions(), own.values(discs, steps)
     if export_views is not None:
         check_output_folder(export_views, flag="--export-views")
-    if export_views is not None and views == 0:
+    if export_views is not None and how.views == 0:
         raise InputError("--export-views", "there are no views to export", cure="ask for some with --views")
     from seasonscapes.workflows import distillation
     from seasonscapes.workflows.albedo_sources import dated_albedos
 
-    check_choice("--kind", kind, distillation.KINDS)
     distillation.require_torch()
     from seasonscapes.gaussians.model import save_model
 
     model, files = sky.model(), [parse_albedo(text) for text in albedo or ()]
     checkpoint = output.with_suffix(".checkpoint.safetensors")
-    how = distillation.DistilOptions(discs, suns, dates, views, view_px, steps, picture_steps, kind)
     with progress_bars() as progress:
         loaded = options.load(scene, progress, albedo=[each.path for each in files])
+        if own.dates is not None and (files or loaded.synthetic is None):
+            whose = "--albedo names them" if files else "the scene's images have them"
+            raise InputError("--dates", f"does nothing here: {whose}", got=own.dates)
         dated = dated_albedos(loaded, files) if files else ()
         distilled = distillation.distil_with_data(
             loaded, sky=model, albedo=dated, options=how, seed=seed, checkpoint=checkpoint, progress=progress

@@ -24,14 +24,14 @@ if TYPE_CHECKING:
 class PlaceOptions:
     """How to read a scene and build its terrain."""
 
-    mesher: str = "adaptive"
-    """adaptive (error-bounded), grid (every sample), poisson (an extra)."""
+    mesher: str | None = None
+    """adaptive (error-bounded, default), grid (every sample), poisson (the screened Poisson surface, error-bounded)."""
     max_error_m: float | None = None
     """Vertical bound of the adaptive mesh in metres; default a tenth of the samples' spacing, at most 5."""
     refine: int | None = None
     """Interpolate the heights this many times finer first; default as far as it pays."""
-    atlas: str = "planar"
-    """planar (top-down), relief (more texels on cliffs), xatlas (charts)."""
+    atlas: str | None = None
+    """planar (top-down, default), relief (more texels on cliffs), xatlas (charts)."""
     texel_m: float | None = None
     """Side of a texel in metres; default as fine as the imagery."""
     workspace: Path | None = None
@@ -57,11 +57,15 @@ class PlaceOptions:
         from seasonscapes.workflows.place import MeshOptions
 
         own = (self.mesher, self.max_error_m, self.refine, self.atlas, self.texel_m)
-        stated = stated_mesh(albedo) if own == ("adaptive", None, None, "planar", None) else None
+        stated = stated_mesh(albedo) if own == (None,) * 5 else None
         if stated is not None:
             return stated
         return MeshOptions(
-            self.mesher, self.max_error_m, self.refine, self.atlas, texel_m if self.texel_m is None else self.texel_m
+            self.mesher or "adaptive",
+            self.max_error_m,
+            self.refine,
+            self.atlas or "planar",
+            texel_m if self.texel_m is None else self.texel_m,
         )
 
     def load(

@@ -1,9 +1,13 @@
-"""Trouble with files and memory, told in one line: what was touched, what the system said, and the cure."""
+"""Flags that would do nothing, and trouble with files and memory, told in one line each."""
 
 from __future__ import annotations
 
 import errno
 import os
+from dataclasses import fields
+from typing import Any
+
+from seasonscapes.errors import InputError
 
 _CURES = {
     errno.ENOSPC: "free some space, or choose another place",
@@ -39,3 +43,24 @@ def told(error: OSError | MemoryError) -> str:
     said = said if not where else said[:1].lower() + said[1:]
     cure = _CURES.get(error.errno or 0)
     return f"{where}{said}" + (f"; {cure}" if cure else "")
+
+
+def refuse_without(condition: str, holds: bool, **given: object) -> None:
+    """`InputError` about the first flag that was given although it does nothing without a condition.
+
+    Examples
+    --------
+    >>> from seasonscapes.commands.refusals import refuse_without
+    >>> refuse_without("--method diffusion", False, prompt=None, film=None)
+    """
+    for name, value in given.items():
+        if not holds and value is not None and value is not False:
+            raise InputError(f"--{name.replace('_', '-')}", f"does nothing without {condition}", got=str(value))
+
+
+def refuse_given(condition: str, given: Any, untouched: Any) -> None:
+    """`InputError` about the first field of a dataclass of flags that differs from its default and does nothing."""
+    for field in fields(given):
+        value = getattr(given, field.name)
+        if value != getattr(untouched, field.name):
+            refuse_without(condition, False, **{field.name: value})

@@ -16,6 +16,7 @@ from seasonscapes.commands.options import PlaceOptions, SkyOptions
 from seasonscapes.commands.outputs import check_output
 from seasonscapes.commands.url_options import at_address, given_address
 from seasonscapes.commands.view_options import ViewOptions
+from seasonscapes.errors import InputError
 
 
 def render_command(
@@ -27,7 +28,7 @@ def render_command(
     sky: SkyOptions | None = None,
     look: LookOptions | None = None,
     albedo: list[str] | None = None,
-    season: str = "blended",
+    season: str | None = None,
     engine: str = "auto",
     spp: int | None = None,
     max_depth: int | None = None,
@@ -53,7 +54,7 @@ def render_command(
     albedo
         DATE=FILE, may be repeated: albedos of a date instead of the scene's own (.npz; or .png, .exr, .glb of this atlas).
     season
-        How to interpolate between them: blended, nearest or snow-line, as of timelapse.
+        How to interpolate between dated albedos: blended (default), nearest or snow-line, as of timelapse.
     engine
         transport (light transport of the view, kept for its next picture, no grain), path (path tracing, the reference),
         or auto: path where --spp or --max-depth is given, else transport.
@@ -98,14 +99,16 @@ def render_command(
 
     look.metering()
     size_px, model = view.size_px(), sky.model() if address is None else hazy_sky(sky.model(), address.haze)
-    require_season(season, where="--season")
+    require_season(season or "blended", where="--season")
     files = [parse_albedo(text) for text in albedo or ()]
     use_backend(device)
     with progress_bars() as progress:
         loaded = options.load(scene, progress, albedo=[each.path for each in files], output=output)
         chosen, camera = view.chosen(loaded.scene), view.pinhole(loaded)
         utc = address.time if address else parse_time(str(time), chosen.latitude_deg, chosen.longitude_deg)
-        series = albedo_series(loaded, files, season, progress=progress)
+        series = albedo_series(loaded, files, season or "blended", progress=progress)
+        if season is not None and (series is None or len(series.dated) < 2):
+            raise InputError("--season", "does nothing without albedos of two dates", got=season, cure="add --albedo")
         texture = chosen_albedo(loaded, utc.date(), series, progress=progress)
         picture = render(
             loaded,
@@ -128,7 +131,7 @@ def render_command(
         "albedo": [
             {"date": each.day.isoformat(), "content": each.content} for each in (series.dated if series else ())
         ],
-        "season": season,
+        "season": season or "blended",
         "exposure_ev100": round(ev100, 3),
     }
     if output.suffix.lower() == ".png":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -11,6 +12,7 @@ from seasonscapes.commands.arguments import parse_times
 from seasonscapes.commands.console import print_result, progress_bars
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
 from seasonscapes.commands.outputs import check_output_folder
+from seasonscapes.commands.run_method_options import RunMethodOptions
 from seasonscapes.commands.run_options import RunEffort, RunPictureOptions
 from seasonscapes.commands.view_options import ViewOptions
 
@@ -20,6 +22,7 @@ def run_command(
     *,
     times: str,
     at_hours: str,
+    method: RunMethodOptions | None = None,
     pictures: RunPictureOptions | None = None,
     view: ViewOptions | None = None,
     sky: SkyOptions | None = None,
@@ -33,8 +36,9 @@ def run_command(
 ) -> None:
     """Take a scene from photographs to pictures of other hours and to Gaussians; an interrupted run continues.
 
-    Stages: pictures, calibrate, albedo, paint, inpaint, relight, distil, splat. Each is built again only where its
-    arguments, the content of what it reads or the program's code have changed; run.json in the folder records them.
+    Stages: pictures, calibrate, albedo, paint, inpaint, relight, distil, splat; with --method paper pictures, calibrate,
+    views, paint, path, inpaint, film, distil, splat. Each is built again only where its arguments, the content of what it
+    reads or the program's code have changed; run.json in the folder records them.
 
     Parameters
     ----------
@@ -45,7 +49,7 @@ def run_command(
     at_hours
         When to picture the place: ISO 8601, commas between.
     start
-        Build this stage (pictures, calibrate, albedo, paint, inpaint, relight, distil or splat) and all after it again.
+        Build this stage and all after it again.
     until
         Stop after this stage.
     seed
@@ -57,7 +61,14 @@ def run_command(
     """
     check_output_folder(output)
     options, view, sky = place or PlaceOptions(), view or ViewOptions(size="768x512"), sky or SkyOptions()
-    photographs, distil = pictures or RunPictureOptions(), (effort or RunEffort()).values()
+    stages_by, along = (method or RunMethodOptions()).values()
+    photographs, distil = (
+        pictures or RunPictureOptions(),
+        (effort or RunEffort()).values(appearance=stages_by.appearance),
+    )
+    if stages_by.name == "paper":
+        # The paper's mesh and atlas, where flags name no others.
+        options = replace(options, mesher=options.mesher or "poisson", atlas=options.atlas or "xatlas")
     found, model, size_px = photographs.values(allow_outside=options.allow_outside), sky.model(), view.size_px()
     from seasonscapes.workflows.albedo_recovery import TEXEL_M
     from seasonscapes.workflows.full_run import RunJob, run
@@ -76,6 +87,8 @@ def run_command(
             distil,
             seed,
             options.allow_outside,
+            stages_by,
+            along,
         )
         stages = run(job, output, first=start, last=until, progress=progress)
     record = {

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from cyclopts import Parameter
 
 from seasonscapes.commands.arguments import parse_names, parse_size
+from seasonscapes.commands.refusals import refuse_without
 
 if TYPE_CHECKING:
     from seasonscapes.workflows.distillation import DistilOptions
@@ -62,19 +63,21 @@ class RunEffort:
 
     discs: int = 160
     """Gaussians along the longer side of the terrain."""
-    steps: int = 1500
-    """Training steps on the surface."""
-    picture_steps: int = 120
-    """Training steps on images."""
-    suns: int = 24
-    """Instants to train on."""
-    views: int = 3
-    """Cameras around the terrain for training images; 0 trains on the surface alone."""
+    steps: int | None = None
+    """Training steps on the surface; default 1500."""
+    picture_steps: int | None = None
+    """Training steps on images; default 120."""
+    suns: int | None = None
+    """Instants to train on; default 24."""
+    views: int | None = None
+    """Cameras around the terrain for training images, default 3; 0 trains on the surface alone."""
 
-    def values(self) -> DistilOptions:
-        """The flags as one value."""
+    def values(self, *, appearance: str = "physical") -> DistilOptions:
+        """The flags as one value; `InputError` for those that the appearance does not use."""
         from seasonscapes.workflows.distillation import DistilOptions
 
-        return DistilOptions(
-            discs=self.discs, suns=self.suns, views=self.views, steps=self.steps, picture_steps=self.picture_steps
-        )
+        given = {"steps": self.steps, "picture_steps": self.picture_steps, "suns": self.suns, "views": self.views}
+        refuse_without("--appearance physical", appearance == "physical", **given)
+        effort = {"steps": 1500, "picture_steps": 120, "suns": 24, "views": 3}
+        effort |= {name: value for name, value in given.items() if value is not None}
+        return DistilOptions(discs=self.discs, **effort)

@@ -15,6 +15,7 @@ from seasonscapes.commands.console import print_result, progress_bars
 from seasonscapes.commands.look_options import LookOptions
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
 from seasonscapes.commands.outputs import check_output
+from seasonscapes.commands.refusals import refuse_given
 from seasonscapes.commands.view_options import ViewOptions
 from seasonscapes.errors import InputError, NoTerrainInView
 
@@ -66,6 +67,8 @@ def splat_command(
     from seasonscapes.workflows.distillation import require_torch
 
     require_torch()
+    from seasonscapes.commands.splat_frames import frame_picture
+    from seasonscapes.gaussians.frame_appearance import is_frame_model
     from seasonscapes.gaussians.interchange import write_gltf, write_ply
     from seasonscapes.gaussians.model import load_model
     from seasonscapes.gaussians.rasterise import set_torch_threads
@@ -75,6 +78,12 @@ def splat_command(
     from seasonscapes.workflows.view_rendering import sun_angles
 
     set_torch_threads(1)
+    if is_frame_model(model):
+        for given, untouched in ((sky, SkyOptions()), (look, LookOptions())):
+            refuse_given("a model that is relit (distill --appearance physical)", given, untouched)
+        check_output(output, (".png",))
+        frame_picture(scene, options, view, model, time, output, as_json=json)
+        return
     metering, size_px, declared = look.metering(), view.size_px(), sky.model()
     splats = load_model(model)
     with progress_bars() as progress:

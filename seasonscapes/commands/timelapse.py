@@ -24,7 +24,7 @@ def timelapse_command(
     when: WhenOptions | None = None,
     view: ViewOptions | None = None,
     sky: SkyOptions | None = None,
-    season: str = "blended",
+    season: str | None = None,
     albedo: list[str] | None = None,
     look: LookOptions | None = None,
     smooth: str = "15min",
@@ -47,7 +47,7 @@ def timelapse_command(
     scene
         A scene file, or the name of a bundled scene (alpine).
     season
-        Between dated albedos: blended (linear), nearest, or snow-line (the snow line moves place by place).
+        Between dated albedos: blended (linear, default), nearest, or snow-line (the snow line moves place by place).
     albedo
         DATE=FILE, may be repeated: albedos of a date instead of the scene's own (.npz; or .png, .exr, .glb of this atlas).
     smooth
@@ -78,7 +78,7 @@ def timelapse_command(
 
     smooth_s = 0.0 if smooth in ("0", "0s") else parse_duration("--smooth", smooth).total_seconds()
     film_look = films.FilmLook(look.metering(), smooth_s, fps, look.look, look.white_balance)
-    require_season(season, where="--season")
+    require_season(season or "blended", where="--season")
     if output.suffix.lower() not in (".mp4", ""):
         expected = "a name that ends in .mp4, or a folder"
         raise InputError("--output", "unknown kind of film", got=str(output), expected=expected)
@@ -89,7 +89,10 @@ def timelapse_command(
     check_range("--seed", seed, 0, 2**32)
     work.check_cluster()
     part, path = work.part(), find_scene(scene)
-    chosen = view.chosen(read_scene(path, allow_outside=place.allow_outside))
+    declared = read_scene(path, allow_outside=place.allow_outside)
+    if season is not None and len(albedo or declared.images) < 2:
+        raise InputError("--season", "does nothing without albedos of two dates", got=season, cure="add --albedo")
+    chosen = view.chosen(declared)
     times = when.instants(chosen.latitude_deg, chosen.longitude_deg)
     files = tuple(parse_albedo(text) for text in albedo or ())
     job = RenderJob(
@@ -100,7 +103,7 @@ def timelapse_command(
         view.size_px(),
         sky.model(),
         albedo=files,
-        season=season,
+        season=season or "blended",
         base_day=films.base_day_of(times),
         seed=seed,
         device=device,

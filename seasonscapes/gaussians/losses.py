@@ -204,7 +204,12 @@ def picture_loss(appearance: Appearance, lights: LightTensors, picture: Training
         Scalar loss.
     """
     values = appearance(picture.discs, picture.time, lights)
-    image = srgb_encoded(SparseProduct.apply(values, picture.forward, picture.backward)).reshape(picture.target.shape)
+    return image_loss(SparseProduct.apply(values, picture.forward, picture.backward), picture)
+
+
+def image_loss(pixels: torch.Tensor, picture: TrainingPicture) -> torch.Tensor:
+    """0.8 L1 + 0.2 D-SSIM of linear pixels ``(H W, 3)`` against a frame, in sRGB over its usable pixels."""
+    image = srgb_encoded(pixels).reshape(picture.target.shape)
     image = torch.where(picture.mask[..., None], image, 0.0)
     usable_fraction = picture.mask.float().mean()
     difference = (image - picture.target).abs().mean() / usable_fraction

@@ -135,7 +135,7 @@ def bake_imagery(terrain: Terrain, atlas: Atlas, image: Raster, *, gutter_px: in
     if not weight.any():
         raise InputError("imagery", "the image covers none of the terrain", cure="check the CRS of both files")
     atlas_id = atlas_identity(terrain, atlas.width_px, atlas.height_px)
-    return dilate(Texture(values, weight, atlas_id), face_id >= 0, gutter_px)
+    return filled_gutters(dilate(Texture(values, weight, atlas_id), face_id >= 0, gutter_px), face_id >= 0, gutter_px)
 
 
 def image_pixels(frame: LocalFrame, image: Raster, positions: np.ndarray) -> np.ndarray:
@@ -323,6 +323,35 @@ def dilate(texture: Texture, covered: np.ndarray, gutter_px: int) -> Texture:
         weight[rim_row, rim_column] = total_weight / count
         known[rim_row, rim_column] = True
     return replace(texture, values=values, weight=weight)
+
+
+def filled_gutters(texture: Texture, covered: np.ndarray, gutter_px: int) -> Texture:
+    """Give texels farther from every chart than its gutter the colour and weight of the nearest that has one.
+
+    Nothing on the surface reads them at full resolution; coarser copies of the texture, made by other programs, do.
+
+    Parameters
+    ----------
+    texture
+        What `dilate` returns.
+    covered
+        ``(H, W)`` bool, True where a chart lies.
+    gutter_px
+        Number of rings that `dilate` has added [texels].
+
+    Returns
+    -------
+    Texture
+        A texture of the same atlas without empty texels between charts.
+    """
+    from scipy.ndimage import binary_dilation, distance_transform_edt
+
+    ring = np.ones((3, 3), bool)
+    known = np.asarray(binary_dilation(covered, ring, iterations=gutter_px), bool) if gutter_px else covered
+    if known.all() or not known.any():
+        return texture
+    row, column = np.asarray(distance_transform_edt(~known, return_distances=False, return_indices=True))
+    return replace(texture, values=texture.values[row, column], weight=texture.weight[row, column])
 
 
 def _grown(mask: np.ndarray) -> np.ndarray:

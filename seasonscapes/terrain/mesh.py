@@ -15,15 +15,13 @@ from numpy.typing import ArrayLike
 from seasonscapes.frames import MEAN_RADIUS_M, LocalFrame, enu_from_geodetic, geodetic_from_enu
 from seasonscapes.terrain.atlas import planar_uv
 from seasonscapes.terrain.crs import apply_affine, geodetic_from_map, raster_pixels
-from seasonscapes.terrain.poisson import largest_piece, poisson_surface
+from seasonscapes.terrain.poisson import poisson_raster
 from seasonscapes.terrain.surface import Raster, Terrain
 from seasonscapes.terrain.texels import covering_faces
 
 DEFAULT_MAX_ERROR_M = 5.0
 # Samples per block: bounds the float64 temporaries of the geodetic transformation to 200 MB.
 _CHUNK = 500_000
-# Extrapolated samples around the raster for the Poisson reconstruction.
-_MARGIN = 4
 
 
 @dataclass(frozen=True)
@@ -67,9 +65,10 @@ def build_mesh(
         Local frame of the mesh.
     mesher
         A name in `MESHERS`: ``adaptive`` (greedy refinement to the error bound), ``grid`` (every sample a vertex),
-        ``poisson`` (screened Poisson surface, as in the SeasonScapes paper; needs the extra ``poisson``).
+        ``poisson`` (greedy refinement of the screened Poisson surface, as in the SeasonScapes paper).
     max_error_m
-        Bound of ``adaptive`` on the vertical distance between the mesh and every sample [m]; other meshers ignore it.
+        Bound of ``adaptive`` on the vertical distance between the mesh and every sample, of ``poisson`` on that between
+        the mesh and its surface [m]; ``grid`` is exact.
 
     Returns
     -------
@@ -189,25 +188,8 @@ def grid_faces(height: int, width: int, *, mirrored: bool = False) -> np.ndarray
 
 
 def _poisson(raster: Raster, frame: LocalFrame, max_error_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Screened Poisson surface of all samples, clipped to the raster's extent."""
-    height, width = raster.values.shape[:2]
-    # The reconstruction is inaccurate at its boundary: extrapolate the slope over a margin and clip it afterwards.
-    row, column = np.mgrid[-_MARGIN : height + _MARGIN, -_MARGIN : width + _MARGIN]
-    heights = np.pad(raster.values[..., 0].astype(np.float64), _MARGIN, mode="reflect", reflect_type="odd")
-    vertices, faces = poisson_surface(sample_positions(raster, frame, row, column, heights))
-    pixel = _pixel_coordinates(vertices, frame, raster) - 0.5
-    inside = np.all((pixel >= 0.0) & (pixel <= [width - 1, height - 1]), axis=1)
-    faces = largest_piece(faces[inside[faces].any(axis=1)], len(vertices))
-    if _projected_area(vertices, faces) < 0.0:
-        faces = faces[:, ::-1]
-    used, faces = np.unique(faces, return_inverse=True)
-    return vertices[used], faces.reshape(-1, 3).astype(np.uint32)
-
-
-def _projected_area(vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Signed horizontal area [m²]; positive for faces that are counter-clockwise from above."""
-    a, b, c = (vertices[faces[:, k], :2].astype(np.float64) for k in range(3))
-    return float(np.sum((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])) / 2.0
+    """Greedy insertion on the screened Poisson surface of all samples."""
+    return _adaptive(poisson_raster(raster), frame, max_error_m)
 
 
 MESHERS: dict[str, Callable[[Raster, LocalFrame, float], tuple[np.ndarray, np.ndarray]]] = {

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from seasonscapes.errors import InputError
 from seasonscapes.exposure import exposure_ev100
 from seasonscapes.images import atomic_path, write_png
 from seasonscapes.progress import Progress
@@ -22,13 +23,23 @@ from seasonscapes.workflows.albedo_sources import AlbedoFile, dated_albedos
 from seasonscapes.workflows.distillation import DistilOptions, distil_with_data, distillation_record
 from seasonscapes.workflows.edited_textures import albedo_date
 from seasonscapes.workflows.gaussian_views import render_gaussians
-from seasonscapes.workflows.inpainting import InpaintOptions, inpaint
+from seasonscapes.workflows.inpainting import InpaintOptions, cloudiness_of, inpaint
 from seasonscapes.workflows.painting import painting_of, painting_record
+from seasonscapes.workflows.path_stages import (
+    distil_frames,
+    film_path,
+    frame_view,
+    load_frame_model,
+    make_path,
+    path_completion,
+)
 from seasonscapes.workflows.photograph_files import PhotographSources, photographs_at
 from seasonscapes.workflows.pictures import develop
 from seasonscapes.workflows.place import Place
+from seasonscapes.workflows.plane_views import cut_plane_views, pose_plane_views
 from seasonscapes.workflows.predicted_radiance import RELATIVE_SIGMA, measured_radiance
 from seasonscapes.workflows.relight_session import RenderJob
+from seasonscapes.workflows.run_methods import METHODS, PathStages, RunMethod
 from seasonscapes.workflows.run_photographs import (
     RunPhotographs,
     bring_photographs,
@@ -38,8 +49,13 @@ from seasonscapes.workflows.run_photographs import (
 )
 from seasonscapes.workflows.stage_runner import Stage, run_stages, stage_range
 from seasonscapes.workflows.views import camera_for
+from seasonscapes.workspace import file_hash
 
-STAGES = ("pictures", "calibrate", "albedo", "paint", "inpaint", "relight", "distil", "splat")
+STAGES = ("pictures", "calibrate", "views", "albedo", "paint", "path", "inpaint", "film", "relight", "distil", "splat")
+
+
+# The first photograph in order wins, as it is: no fitted exposures, no haze, no doubt about silhouettes.
+AS_THE_PAPER = PaintOptions(mode="first", fit_gains=False, fit_haze=False, guard=False)
 
 
 @dataclass(frozen=True)
@@ -66,6 +82,10 @@ class RunJob:
         Equal seeds give equal results.
     allow_outside
         Let the scene file name rasters outside its folder.
+    method
+        How each stage is done; see `run_methods`.
+    along
+        What the stages along a camera path need.
     """
 
     place: Place
@@ -78,12 +98,14 @@ class RunJob:
     distil: DistilOptions = field(default_factory=DistilOptions)
     seed: int = 0
     allow_outside: bool = False
+    method: RunMethod = METHODS["physical"]
+    along: PathStages = field(default_factory=PathStages)
 
 
 def run(
     job: RunJob, folder: Path, *, first: str | None = None, last: str | None = None, progress: Progress | None = None
 ) -> dict:
-    """Run the stages that are not up to date: pictures, calibrate, albedo, paint, inpaint, relight, distil, splat.
+    """Run the stages of the job's method that are not up to date; see `STAGES` for their order.
 
     Parameters
     ----------
@@ -141,16 +163,79 @@ def stages_of(job: RunJob, progress: Progress | None = None) -> list[Stage]:
         modules = tuple(f"workflows.{module}" for module in code)
         return Stage(name, inputs, needs, lambda folder: build(job, folder, progress), own or name, modules)
 
-    return [
+    method, along = job.method, job.along
+    known = ("views",) if method.poses == "points" else ("pictures", "calibrate")
+    albedo = ("albedo",) if method.needs_albedo else ()
+    path = ("path",) if method.needs_path else ()
+    model = {**common, "discs": job.distil.discs, "steps": along.paper_steps}
+    painted = {**common, "painting": method.painting}
+    filled = {**common, "completion": method.completion, "model": _model_facts(along, method)}
+    stages = [
         stage("pictures", pictures, (), ("run_photographs",), _pictures),
-        stage("calibrate", records, ("pictures",), ("run_photographs",), _calibrate, "calibration"),
-        stage("albedo", common, ("pictures", "calibrate"), ("albedo_recovery", "photograph_files"), _albedo),
-        stage("paint", common, ("pictures", "calibrate", "albedo"), ("painting", "predicted_radiance"), _paint),
-        stage("inpaint", common, ("paint", "albedo"), ("inpainting", "completion"), _inpaint),
+        stage(
+            "calibrate",
+            {**records, "poses": method.poses, "points": _point_hashes(along)},
+            ("pictures",),
+            ("run_photographs", "plane_views"),
+            _calibrate,
+            "calibration",
+        ),
+        stage("views", {**common, "grade": method.grade}, ("pictures", "calibrate"), ("plane_views",), _views),
+        stage("albedo", common, known, ("albedo_recovery", "photograph_files"), _albedo),
+        stage("paint", painted, (*known, *albedo), ("painting", "predicted_radiance"), _paint),
+        stage(
+            "path",
+            {"place": place.key, "size": job.size_px, **_path_facts(along)},
+            (),
+            ("path_stages", "camera_paths"),
+            _path,
+        ),
+        stage("inpaint", filled, ("paint", *known[:1], *albedo, *path), ("inpainting", "completion"), _inpaint),
+        stage("film", {**common, "fps": along.fps}, ("inpaint", "path"), ("path_stages",), _film),
         stage("relight", looks, ("albedo",), ("timelapse",), _relight),
-        stage("distil", {**common, "distil": job.distil}, ("albedo",), ("distillation",), _distil, "gaussians"),
-        stage("splat", looks, ("distil",), ("gaussian_views",), _splat),
     ]
+    if method.appearance == "paper":
+        stages.append(stage("distil", model, ("film",), ("path_stages",), _distil_frames, "gaussians"))
+        stages.append(stage("splat", looks, ("distil",), ("path_stages",), _splat_frames))
+    else:
+        distil = {**common, "distil": job.distil}
+        stages.append(stage("distil", distil, ("albedo",), ("distillation",), _distil, "gaussians"))
+        stages.append(stage("splat", looks, ("distil",), ("gaussian_views",), _splat))
+    left_out = set() if method.poses == "points" else {"views"}
+    left_out |= set() if method.needs_albedo else {"albedo", "relight"}
+    left_out |= set() if method.needs_path else {"path", "film"}
+    return [each for each in stages if each.name not in left_out]
+
+
+def _point_hashes(along: PathStages) -> dict[str, str]:
+    """Contents of the files of points, where there are some."""
+    if along.points is None:
+        return {}
+    if not along.points.is_dir():
+        raise InputError("--points", "no such folder", got=str(along.points))
+    return {path.name: file_hash(path) for path in sorted(along.points.glob("*.csv"))}
+
+
+def _path_facts(along: PathStages) -> dict:
+    return {"path": None if along.path is None else file_hash(along.path), "views": along.views}
+
+
+def _model_facts(along: PathStages, method: RunMethod) -> dict | None:
+    """What the image model is told; its weights are identified in its own record."""
+    if method.completion != "diffusion" or along.diffusion is None:
+        return None
+    told = along.diffusion
+    guide = None if told.guide_image is None else file_hash(told.guide_image)
+    return {
+        "weights": None if told.weights is None else str(told.weights.resolve()),
+        "names": asdict(told.names),
+        "prompt": told.prompt,
+        "guide": guide,
+        "steps": told.steps,
+        "guidance": told.guidance,
+        "without": sorted(told.without),
+        "mask": told.mask,
+    }
 
 
 def _imagery(place: Place) -> list[dict]:
@@ -158,7 +243,10 @@ def _imagery(place: Place) -> list[dict]:
     return [{**image.model_dump(mode="json"), "hash": content} for image, content in place.scene.image_keys]
 
 
-def _sources(folder: Path) -> PhotographSources:
+def _sources(job: RunJob, folder: Path) -> PhotographSources:
+    if job.method.poses == "points":
+        own = folder / "views"
+        return PhotographSources(own / "manifest.csv", folder / "calibration", own / "masks")
     masks = folder / "pictures" / "masks"
     return PhotographSources(
         folder / "pictures" / "manifest.csv",
@@ -193,12 +281,30 @@ def _pictures(job: RunJob, folder: Path, progress: Progress | None) -> list[Path
 
 def _calibrate(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
     taken, own = folder / "pictures", folder / "calibration"
+    if job.method.poses == "points":
+        stated = _stated_records(job, folder)
+        kept = [] if job.photographs.sources is None else stated
+        return [*kept, *pose_plane_views(job.place, stated, own, points=job.along.points, seed=job.seed)[0]]
     return bring_poses(job.photographs, job.place, job.times, taken, own, seed=job.seed)
+
+
+def _stated_records(job: RunJob, folder: Path) -> list[Path]:
+    """Records of whole webcams from which plane views start: those of synthetic photographs, or copies of real ones."""
+    if job.photographs.sources is None:
+        return sorted((folder / "pictures").glob("*_calibration.json"))
+    own = folder / "calibration" / "whole"
+    copies = sorted(own.glob("*_calibration.json"))
+    return copies or bring_poses(job.photographs, job.place, job.times, folder / "pictures", own, seed=job.seed)
+
+
+def _views(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
+    stated = _stated_records(job, folder)
+    return cut_plane_views(folder / "pictures", stated, folder / "views", grade=job.method.grade)
 
 
 def _albedo(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
     within = job.photographs.within_min
-    photographs = photographs_at(job.place, _sources(folder), job.times, within_min=within, progress=progress)
+    photographs = photographs_at(job.place, _sources(job, folder), job.times, within_min=within, progress=progress)
     options = RecoveryOptions(fit_curve=True)
     recovered = recover_albedo(job.place, photographs, sky=job.sky, options=options, progress=progress)
     path = _albedo_path(folder)
@@ -221,15 +327,18 @@ def _paint(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
     files = []
     for time in job.times:
         own = folder / "paint" / time_stamp(time)
-        predicted = measured_radiance(job.place, _albedo_path(folder), time, job.sky, progress=progress)
+        reference = None
+        if job.method.needs_albedo and job.method.painting == "weighted":
+            predicted = measured_radiance(job.place, _albedo_path(folder), time, job.sky, progress=progress)
+            reference = RadiometricReference(predicted, RELATIVE_SIGMA)
         painting = painting_of(
             job.place,
-            _sources(folder),
+            _sources(job, folder),
             time,
             job.sky,
-            PaintOptions(),
+            PaintOptions() if job.method.painting == "weighted" else AS_THE_PAPER,
             within_min=job.photographs.within_min,
-            reference=RadiometricReference(predicted, RELATIVE_SIGMA),
+            reference=reference,
             progress=progress,
         )
         with atomic_path(own / "painted.npz") as temporary:
@@ -240,10 +349,25 @@ def _paint(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
     return files
 
 
+def _path(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
+    return make_path(job.place, job.along, folder / "path", size_px=job.size_px)
+
+
+def _inpaint_options(job: RunJob, folder: Path, time: datetime) -> InpaintOptions:
+    method = job.method.completion
+    albedo = _albedo_path(folder) if job.method.needs_albedo and method in ("guided", "diffusion") else None
+    if method != "diffusion":
+        return InpaintOptions(method, albedo, fast=method == "guided" and albedo is None, seed=job.seed)
+    along = path_completion(job.along, folder, time, _sources(job, folder).manifest)
+    # What no view of the path shows is filled from the rims, as the paper does after its loop.
+    rest = "guided" if albedo is not None else "telea"
+    return InpaintOptions(method, albedo, seed=job.seed, diffusion=along, rest=rest)
+
+
 def _inpaint(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
     files = []
-    options = InpaintOptions(albedo=_albedo_path(folder), fast=True, seed=job.seed)
     for time in job.times:
+        options = _inpaint_options(job, folder, time)
         own = folder / "inpaint" / time_stamp(time)
         painted = completion.read_painted(folder / "paint" / time_stamp(time) / "painted.npz", job.place)
         result = inpaint(job.place, painted, time, job.sky, options, progress=progress)
@@ -253,6 +377,20 @@ def _inpaint(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]
         _write_record(own / "completion.json", result.record)
         files.append(own / "completed.npz")
     return files
+
+
+def _film(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
+    from seasonscapes.terrain.surface import load_texture
+
+    textures = []
+    for time in sorted(set(job.times)):
+        painted = completion.read_painted(folder / "paint" / time_stamp(time) / "painted.npz", job.place)
+        completed = load_texture(folder / "inpaint" / time_stamp(time) / "completed.npz")
+        textures.append((time, completed.values, painted.weight > 0.0))
+    cloudiness = cloudiness_of(job.sky)
+    return film_path(
+        job.place, folder, textures, folder / "film", cloudiness=cloudiness, fps=job.along.fps, progress=progress
+    )
 
 
 def _relight(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
@@ -293,6 +431,36 @@ def _distil(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
     checkpoint.unlink(missing_ok=True)
     _write_record(own / "distillation.json", distillation_record(job.place, distilled))
     return [own / "model.safetensors"]
+
+
+def _distil_frames(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
+    from seasonscapes.gaussians.frame_appearance import save_frame_gaussians
+
+    file = folder / "gaussians" / "frames.safetensors"
+    model, losses = distil_frames(
+        job.place,
+        folder / "film",
+        discs=job.distil.discs,
+        steps=job.along.paper_steps,
+        seed=job.seed,
+        progress=progress,
+    )
+    save_frame_gaussians(model, file)
+    facts = {**model.note, "gaussians": len(model.surfels.means), "times": [time.isoformat() for time in model.times]}
+    record = _write_record(file.with_name("distillation.json"), facts | {"loss_first": losses[0], "loss": losses[-1]})
+    return [file, record]
+
+
+def _splat_frames(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
+    model = load_frame_model(job.place, folder / "gaussians" / "frames.safetensors")
+    camera, paths = camera_for(job.place, job.view, size_px=job.size_px), []
+    for hour in _unique(job.hours):
+        picture = frame_view(job.place, model, camera, hour, cloudiness=cloudiness_of(job.sky))
+        record = {"scene": job.place.scene.name, "camera": job.view.name, "time_utc": hour.isoformat()}
+        record["attribution"] = job.place.scene.attribution
+        paths.append(folder / "splat" / f"{time_stamp(hour)}.png")
+        write_png(paths[-1], picture, metadata={"seasonscapes": json.dumps(record)})
+    return paths
 
 
 def _splat(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:

@@ -42,6 +42,8 @@ class InpaintOptions:
         Equal seeds give equal textures.
     diffusion
         Of the method ``"diffusion"``.
+    rest
+        With ``"diffusion"``: how texels that no view of the path shows are completed, among `INPAINTERS`.
     """
 
     method: str = "guided"
@@ -50,6 +52,7 @@ class InpaintOptions:
     fast: bool = False
     seed: int = 0
     diffusion: PathCompletionOptions | None = None
+    rest: str = "guided"
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -123,7 +126,7 @@ def inpaint(
         if options.diffusion is not None:
             from seasonscapes.workflows.path_completion import SkyState, complete_along_path
 
-            completion = CompletionOptions(detail=options.detail, fast=options.fast, seed=options.seed)
+            completion = CompletionOptions(options.rest, options.detail, options.fast, options.seed)
             sky_state = SkyState(utc, cloudiness_of(sky))
             completed, facts = complete_along_path(
                 place, painted, predictors, sky_state, options.diffusion, completion, progress=progress

@@ -16,6 +16,7 @@ from seasonscapes.terrain.crs import wrapped
 from seasonscapes.terrain.memory import check_memory
 from seasonscapes.terrain.mesh import MESHERS, build_mesh
 from seasonscapes.terrain.placement import cell_sides_m, check_area
+from seasonscapes.terrain.poisson import poisson_raster
 from seasonscapes.terrain.raster import bounds_geographic, centre_frame, fill_nodata, read_elevation
 from seasonscapes.terrain.raster_files import OWN_FOLDER
 from seasonscapes.terrain.refine import refine_raster, refinement_factor
@@ -59,9 +60,10 @@ class MeshOptions:
     Parameters
     ----------
     mesher
-        ``"adaptive"`` (error-bounded triangulation), ``"grid"`` (every sample) or ``"poisson"`` (needs an extra).
+        ``"adaptive"`` (error-bounded triangulation), ``"grid"`` (every sample) or ``"poisson"`` (the same of the
+        screened Poisson surface, as in the paper).
     max_error_m
-        Vertical error bound of the adaptive mesh [m]. Default: a tenth of the sample spacing, at most 5 m.
+        Vertical error bound of the triangulation [m]. Default: a tenth of the sample spacing, at most 5 m.
     refine
         Interpolate the heights this many times finer before meshing; see `terrain.refine`. Default: as far as it pays.
     atlas
@@ -204,11 +206,14 @@ def build_terrain(
         # Interpolated heights rise towards the banks before the shore.
         refined = levelled(refined, water)
     report(0.1)
-    terrain = build_mesh(refined, frame, mesher=options.mesher, max_error_m=bound)
+    mesher = options.mesher
+    if mesher == "poisson":
+        # Mesh and shading share one surface.
+        refined, mesher = poisson_raster(refined), "adaptive"
+    terrain = build_mesh(refined, frame, mesher=mesher, max_error_m=bound)
     report(0.6)
-    if options.mesher != "poisson":
-        error = bound if options.mesher == "adaptive" else 0.0
-        terrain = replace(terrain, surface=surface_grid(refined, frame, mesh_error_m=error))
+    error = bound if mesher == "adaptive" else 0.0
+    terrain = replace(terrain, surface=surface_grid(refined, frame, mesh_error_m=error))
     report(0.8)
     texel_m = _texel_m(terrain, elevation, scene, options)
     terrain, atlas = unwrap(terrain, kind=options.atlas, texel_m=texel_m, max_side_px=options.max_side_px)

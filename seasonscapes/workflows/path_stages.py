@@ -1,0 +1,282 @@
+"""Stages of a run along a camera path: the path, completion by an image model, films, and Gaussians trained on frames."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from seasonscapes.errors import InputError
+from seasonscapes.images import atomic_path
+from seasonscapes.progress import Progress, each_reported, task_progress
+from seasonscapes.relighting.frame_file import time_stamp
+from seasonscapes.workflows.place import Place
+from seasonscapes.workflows.run_methods import PathStages
+
+if TYPE_CHECKING:
+    from seasonscapes.cameras.exchange import NamedView
+    from seasonscapes.cameras.pinhole import Camera
+    from seasonscapes.gaussians.frame_appearance import FrameGaussians
+    from seasonscapes.gaussians.surfels import Surfels
+    from seasonscapes.workflows.path_completion import PathCompletionOptions
+
+_FILE = "path.json"
+
+
+def make_path(place: Place, stages: PathStages, own: Path, *, size_px: tuple[int, int]) -> list[Path]:
+    """Copy the path that was asked for, or make one through the scene's cameras, or around the terrain.
+
+    Parameters
+    ----------
+    place
+        The place.
+    stages
+        The path's file, or its number of views.
+    own
+        Folder to write into.
+    size_px
+        Of its views, where it is made [px].
+    """
+    from seasonscapes.cameras.path_file import save_path
+    from seasonscapes.cameras.pinhole import Camera
+    from seasonscapes.gaussians.training_views import overview_cameras
+    from seasonscapes.workflows.camera_paths import camera_path
+    from seasonscapes.workflows.views import scene_cameras
+
+    file = own / _FILE
+    if stages.path is not None:
+        with atomic_path(file) as temporary:
+            shutil.copyfile(stages.path, temporary)
+        return [file]
+    known = list(scene_cameras(place, size_px=size_px).values()) if place.scene.cameras else []
+    if len(known) > 1:
+        views = camera_path(place, known, stages.views).cameras
+    else:
+        width, height = size_px
+        views = [
+            Camera(width, height, each.fx * width / each.width_px, each.fx * width / each.width_px, width / 2, height / 2,
+                   each.world_from_camera, place.frame)
+            for each in overview_cameras(place.terrain, stages.views)
+        ]  # fmt: skip
+    save_path(file, views, place.frame)
+    return [file]
+
+
+def path_completion(stages: PathStages, folder: Path, time: datetime, manifest: Path) -> PathCompletionOptions:
+    """How the image model completes the texture of a time: along the run's path, guided by a photograph of that time.
+
+    Raises
+    ------
+    InputError
+        Where no weights were named.
+    """
+    from seasonscapes.cameras.observation import read_manifest
+
+    if stages.diffusion is None:
+        raise InputError("--weights", "missing", expected="a folder with the weights of the image model")
+    nearest = min(read_manifest(manifest), key=lambda row: (abs((row.time - time).total_seconds()), row.webcam))
+    guide = manifest.parent / nearest.path
+    return replace(stages.diffusion, path=folder / "path" / _FILE, guide_image=stages.diffusion.guide_image or guide)
+
+
+def film_path(
+    place: Place,
+    folder: Path,
+    textures: Sequence[tuple[datetime, np.ndarray, np.ndarray]],
+    own: Path,
+    *,
+    cloudiness: float,
+    fps: float,
+    progress: Progress | None = None,
+) -> list[Path]:
+    """Film the completed textures along the path, and keep the frames with cameras and times (``transforms.json``).
+
+    Parameters
+    ----------
+    place, folder
+        The place and the run's folder, which holds the path.
+    textures
+        Of each time: the time, radiance ``(R, S, 3)`` [cd/m²] and which texels are painted ``(R, S)``.
+    own
+        Folder to write into.
+    cloudiness
+        Of the plain sky behind, in [0, 1].
+    fps
+        Of the films.
+    progress
+        Called with a task and its finished share.
+    """
+    from seasonscapes.cameras.exchange import NamedView, write_transforms
+    from seasonscapes.cameras.path_file import load_path
+    from seasonscapes.images import write_png
+    from seasonscapes.relighting.film import write_video
+    from seasonscapes.rendering.hemisphere_rays import ray_scene
+    from seasonscapes.rendering.mitsuba_scene import mi_mesh
+    from seasonscapes.texturing.path_inpainting import textured_frames
+    from seasonscapes.texturing.view_conditions import white_radiance
+
+    cameras = load_path(folder / "path" / _FILE, place.frame)
+    terrain = ray_scene(mi_mesh(place.terrain, np.full(3, 0.2)))
+    files, views = [], []
+    # One exposure for all times: how bright each hour is belongs to its look.
+    white = max(white_radiance(values, painted) for _, values, painted in textures)
+    for time, values, _ in textures:
+        stamp = time_stamp(time)
+        frames = []
+        drawn = textured_frames(values, cameras, terrain, white, cloudiness=cloudiness)
+        for number, frame in enumerate(each_reported(drawn, len(cameras), progress, f"filming {stamp}")):
+            name = f"{stamp}/{number:04d}.png"
+            write_png(own / name, frame)
+            frames.append(frame)
+            views.append(NamedView(f"{stamp}-{number:04d}", cameras[number], name, time))
+            files.append(own / name)
+        write_video(own / f"{stamp}.mp4", iter(frames), fps=fps)
+        files.append(own / f"{stamp}.mp4")
+    write_transforms(own / "transforms.json", views, place.frame)
+    return [*files, own / "transforms.json"]
+
+
+def disc_surfels(place: Place, discs: int) -> Surfels:
+    """Discs on the terrain of a place, so many along its longer side."""
+    from seasonscapes.gaussians.surfels import terrain_surfels
+
+    return terrain_surfels(place.terrain, float(np.ptp(place.terrain.vertices[:, :2], axis=0).max()) / discs)
+
+
+def timed_views(place: Place, folder: Path) -> list[NamedView]:
+    """Views with pictures and times of a folder's ``transforms.json``, in the frame of a place.
+
+    Raises
+    ------
+    InputError
+        Where the file is missing, states no time of a frame, or a picture is missing.
+    """
+    from seasonscapes.cameras.exchange import read_transforms
+    from seasonscapes.cameras.pinhole import view_in_frame
+
+    file = folder / "transforms.json"
+    if not file.is_file():
+        raise InputError("--frames", "holds no transforms.json", got=str(folder))
+    views, _ = read_transforms(file)
+    found = []
+    for view in views:
+        if view.time is None:
+            raise InputError(file, "states no time_utc", got=view.name)
+        if not (folder / view.file).resolve().is_relative_to(folder.resolve()):
+            raise InputError(file, "names a picture outside its folder", got=view.file)
+        if not (folder / view.file).is_file():
+            raise InputError(file, "no such picture", got=view.file)
+        camera: Camera = view.camera if view.camera.frame is None else view_in_frame(view.camera, place.frame)
+        found.append(replace(view, camera=camera))
+    if not found:
+        raise InputError(file, "names no frame")
+    return found
+
+
+def distil_frames(
+    place: Place,
+    folder: Path,
+    *,
+    discs: int,
+    steps: int,
+    directional: bool = True,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> tuple[FrameGaussians, list[float]]:
+    """Train Gaussians with the paper's appearance on the timed frames of a folder.
+
+    Parameters
+    ----------
+    place
+        The place, on whose terrain the Gaussians lie.
+    folder
+        With ``transforms.json``, as a run's ``film`` or ``distill --export-views`` writes it.
+    discs
+        Gaussians along the longer side of the terrain.
+    steps
+        Training steps.
+    directional
+        Whether colours depend on the viewing direction, as in the paper.
+    seed
+        Equal seeds give equal models.
+    progress
+        Called with a task and its finished share.
+
+    Raises
+    ------
+    InputError
+        Where PyTorch or the frames are missing.
+    """
+    from seasonscapes.workflows.distillation import require_torch
+
+    require_torch()
+    from seasonscapes.gaussians.frame_appearance import TimedFrame, train_on_frames
+    from seasonscapes.gaussians.rasterise import set_torch_threads
+    from seasonscapes.images import read_image_linear
+    from seasonscapes.rendering.gbuffer import trace_gbuffer
+    from seasonscapes.rendering.hemisphere_rays import ray_scene
+    from seasonscapes.rendering.mitsuba_scene import mi_mesh
+    from seasonscapes.texturing.inputs import unlit_scene
+
+    set_torch_threads(1)
+    surfels = disc_surfels(place, discs)
+    scene = unlit_scene(ray_scene(mi_mesh(place.terrain, np.full(3, 0.2))))
+    views = timed_views(place, folder)
+    times = sorted({view.time for view in views if view.time is not None})
+    frames = []
+    for view in views:
+        assert view.time is not None, "timed_views refuses views without time"
+        image = read_image_linear(folder / view.file)
+        if image.shape[:2] != (view.camera.height_px, view.camera.width_px):
+            got = f"{image.shape[1]} x {image.shape[0]}"
+            expected = f"{view.camera.width_px} x {view.camera.height_px}"
+            raise InputError(folder / view.file, "another size than its camera", got=got, expected=expected)
+        mask = np.isfinite(trace_gbuffer(scene, view.camera).depth)
+        frames.append(TimedFrame(view.camera, times.index(view.time), image, mask))
+    note = {"scene": place.scene.name, "seed": seed, "spacing_m": surfels.grid.spacing_m}
+    note |= {"attribution": place.scene.attribution, "frames": len(frames)}
+    report = task_progress(progress, "distilling frames")
+    return train_on_frames(
+        surfels, frames, times, steps=steps, directional=directional, seed=seed, note=note, progress=report
+    )
+
+
+def frame_view(place: Place, model: FrameGaussians, camera: Camera, time: datetime, *, cloudiness: float) -> np.ndarray:
+    """Picture ``(H, W, 3)``, display-linear, of a model of `distil_frames` at an hour, before a plain sky.
+
+    Parameters
+    ----------
+    place, model
+        The place, and a model of it.
+    camera
+        The view.
+    time
+        Aware.
+    cloudiness
+        Of the sky, in [0, 1].
+    """
+    from seasonscapes.cameras.pinhole import ray_directions
+    from seasonscapes.gaussians.frame_appearance import render_frame
+    from seasonscapes.images import linear_from_srgb
+    from seasonscapes.texturing.view_conditions import plain_sky
+
+    sky = linear_from_srgb(plain_sky(ray_directions(camera), cloudiness=cloudiness))
+    picture, coverage = render_frame(model, camera, time)
+    return np.clip(picture + (1.0 - coverage[..., None]) * sky, 0.0, 1.0)
+
+
+def load_frame_model(place: Place, file: Path) -> FrameGaussians:
+    """Read a model of `distil_frames`; `InputError` where it is damaged or of another place."""
+    from seasonscapes.gaussians.frame_appearance import load_frame_gaussians
+    from seasonscapes.gaussians.surfels import terrain_surfels
+
+    model = load_frame_gaussians(file, lambda spacing_m: terrain_surfels(place.terrain, spacing_m))
+    if model.note.get("scene") != place.scene.name:
+        got = str(model.note.get("scene"))
+        raise InputError("--model", "was distilled from another scene", got=got, expected=place.scene.name)
+    return model
