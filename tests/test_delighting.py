@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
@@ -159,3 +161,13 @@ def test_an_image_off_the_surface_is_refused():
     delit = delight_image(image, np.zeros(image.shape, bool), light)
     assert (delit.source[:, 60:] == NOTHING).all()
     assert np.isinf(delit.sigma[:, 60:]).all()
+
+
+def test_where_no_light_falls_the_standard_error_stays_that_of_an_unknown_albedo():
+    light, true = hill_light()
+    image = lit(texture(), light, true) / 20_000.0
+    dark = replace(light, sun=1e-6 * light.sun, sky=1e-4 * light.sky)
+    options = DelightOptions(radiance_per_unit=20_000.0, register=False, borders=None, fit_sky=False)
+    sigma = delight_image(image, np.zeros(image.shape, bool), dark, options=options).sigma
+    assert sigma.max() <= 1.0
+    assert np.median(sigma) > 0.5

@@ -4,6 +4,7 @@ import json
 import struct
 import sys
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -23,8 +24,10 @@ from seasonscapes.images import linear_from_srgb, srgb_from_linear
 from seasonscapes.terrain.crs import geodetic_from_map
 from seasonscapes.terrain.mesh_atlas import mesh_atlas
 from seasonscapes.terrain.textured_mesh import creased_normals
+from seasonscapes.workflows.mesh_ground import require_above, scene_ground
 from seasonscapes.workflows.mesh_views import camera_between, mesh_camera, mesh_view, relit_mesh_view
 from seasonscapes.workflows.meshes import mesh_light, mesh_transport
+from seasonscapes.workflows.place import ground_height_m
 
 SUN = (135.0, 40.0)
 AROUND = ss.MeshSurroundings(sky="hosek", rays=64)
@@ -200,8 +203,6 @@ def surface_positions(atlas) -> np.ndarray:
 
 class TestWriting:
     def repainted(self, mesh, value: float = 0.25):
-        from dataclasses import replace
-
         return replace(mesh, textures=tuple(replace(t, values=np.full_like(t.values, value)) for t in mesh.textures))
 
     @pytest.mark.parametrize("bits", [8, 16])
@@ -552,8 +553,6 @@ class TestLight:
         assert np.median(lit[west & (height < 0.6)][:, 1]) < 0.5 * np.median(lit[west & (height > 0.68)][:, 1])
 
     def test_light_taken_out_is_the_light_put_in(self, boxes):
-        from dataclasses import replace
-
         from seasonscapes.albedo.delighting import DelightOptions
 
         mesh, transport = boxes
@@ -581,8 +580,6 @@ class TestLight:
         assert np.ptp(np.log(np.percentile(plain, [5, 95]))) > 1.0
 
     def test_vertex_colours_are_delit_vertex_by_vertex(self, tmp_path):
-        from dataclasses import replace
-
         mesh = ss.load_mesh(coloured_ball(tmp_path), ss.MeshPlacing(at=(46.5, 8.0, 1000.0)))
         transport = mesh_transport(mesh, AROUND)
         lit = ss.light_mesh(mesh, SUN, surroundings=AROUND, transport=transport)
@@ -732,3 +729,85 @@ def test_lit_delit_relit_against_an_independent_path_tracer(tmp_path):
     assert scores["mesh_uv_equal"] == 1.0
     assert scores["mesh_relit_psnr_db"] > 26.0
     assert scores["mesh_relit_psnr_db"] > scores["mesh_as_lit_psnr_db"] + 6.0
+
+
+@pytest.fixture(scope="module")
+def place():
+    return ss.load_place("alpine_small")
+
+
+class TestOnTerrain:
+    """A block on the terrain of a scene, in a valley and on open ground."""
+
+    def block(self, folder, place, at, size_m=40.0):
+        box = trimesh.creation.box((size_m, size_m, size_m))
+        box.visual.vertex_colors = np.full((len(box.vertices), 4), (150, 150, 150, 255), np.uint8)
+        box.export(folder / "block.ply")
+        height = ground_height_m(place, *at, where="test")
+        return ss.load_mesh(folder / "block.ply", ss.MeshPlacing(at=(*at, height + 0.5 * size_m)))
+
+    def shaded_site(self, place, sun):
+        """Latitude and longitude of terrain that faces the sun and lies in another mountain's shadow."""
+        from seasonscapes.frames import direction_from_angles, geodetic_from_enu
+        from seasonscapes.rendering.hemisphere_rays import ray_scene
+        from seasonscapes.rendering.mitsuba_scene import mi_mesh
+
+        direction = direction_from_angles(*sun)
+        vertices = place.terrain.vertices[place.terrain.faces[::97]].mean(axis=1).astype(float)
+        inside = np.abs(vertices[:, :2]).max(axis=1) < 4000.0
+        start = vertices[inside] + np.array([0.0, 0.0, 5.0])
+        import mitsuba as mi
+
+        surface = ray_scene(mi_mesh(place.terrain, np.full(3, 0.3, np.float32)))
+        rays = mi.Ray3f(mi.Point3f(start.T.astype(np.float32)), mi.Vector3f([float(part) for part in direction]))
+        hidden = np.asarray(surface.mi_scene.ray_test(rays))
+        lit = np.flatnonzero(~hidden)
+        sites = [start[hidden][len(start[hidden]) // 2], start[lit[len(lit) // 2]]]
+        return [tuple(float(x) for x in geodetic_from_enu(place.frame, site)[:2]) for site in sites]
+
+    def test_a_mountain_shades_the_mesh(self, tmp_path, place):
+        sun = (240.0, 15.0)
+        hidden, open_ground = self.shaded_site(place, sun)
+        around = replace(AROUND, rays=16)
+        mesh = self.block(tmp_path, place, open_ground)
+        lit = ss.light_mesh(mesh, sun, surroundings=around)
+        assert "standing_on" not in lit.facts
+        level = float(lit.illuminance[0][..., 1].max())
+        brightest = []
+        for at in (hidden, open_ground):
+            mesh = self.block(tmp_path, place, at)
+            lit = ss.light_mesh(mesh, sun, surroundings=replace(around, terrain=scene_ground(place, mesh)))
+            assert lit.facts["standing_on"] == place.scene.name
+            brightest.append(float(lit.illuminance[0][..., 1].max()))
+        assert brightest[0] < 0.6 * brightest[1]
+        assert brightest[1] > 0.8 * level
+
+    def test_the_mesh_shades_the_terrain(self, tmp_path, place):
+        sun = (240.0, 30.0)
+        at = self.shaded_site(place, sun)[1]
+        pictures = []
+        for size_m in (120.0, 0.5):
+            mesh = self.block(tmp_path, place, at, size_m)
+            around = replace(AROUND, rays=16, terrain=scene_ground(place, mesh))
+            camera = camera_between(mesh, (0.0, 0.0, 900.0), (1.0, 0.0, 0.0), fov_deg=40.0, size_px=(48, 48))
+            pictures.append(ss.render_mesh(mesh, sun, camera, surroundings=around).radiance[..., 1])
+        ratio = pictures[0] / pictures[1]
+        # The shadow lies in the north-east of the block; the camera's up is north or so, its shadow is dark.
+        assert (ratio < 0.5).mean() > 0.01
+        assert np.median(ratio) == pytest.approx(1.0, abs=0.1)
+
+    def test_a_mesh_far_from_the_place_is_refused(self, tmp_path, place):
+        box = trimesh.creation.box()
+        box.visual.vertex_colors = np.full((len(box.vertices), 4), 150, np.uint8)
+        box.export(tmp_path / "far.ply")
+        mesh = ss.load_mesh(tmp_path / "far.ply", ss.MeshPlacing(at=(10.0, 8.0, 0.0)))
+        with pytest.raises(InputError, match="from the terrain"):
+            scene_ground(place, mesh)
+
+    def test_a_camera_inside_the_ground_is_refused(self, tmp_path, place):
+        mesh = self.block(tmp_path, place, (46.55, 7.98))
+        ground = scene_ground(place, mesh)
+        require_above(ground, camera_between(mesh, (0.0, 0.0, 60.0), (1.0, 0.0, 0.0), fov_deg=40.0, size_px=(8, 8)))
+        below = camera_between(mesh, (0.0, 0.0, -60.0), (1.0, 0.0, 0.0), fov_deg=40.0, size_px=(8, 8))
+        with pytest.raises(InputError, match="inside the ground"):
+            mesh_view(mesh, below, surroundings=replace(AROUND, terrain=ground))

@@ -411,4 +411,5 @@ def _standard_error(
         + (deviation * light.sun.mean(axis=2) / total) ** 2
         + (quantum / value) ** 2
     )
-    return albedo.mean(axis=2) * np.sqrt(relative)
+    # Where hardly any light falls nothing is known; no albedo is more than 1 off.
+    return np.minimum(albedo.mean(axis=2) * np.sqrt(relative), 1.0)

@@ -52,7 +52,7 @@ def delight_command(
         A georeferenced image to use instead of the scene's; with several dates this gives dated albedos.
     sensor_height_m
         Height of the aeroplane or satellite above sea level, if the air below it is still in the image. Orthophotos
-        and mosaics are mostly corrected for it.
+        and mosaics are mostly corrected for it. From 9 km up all count alike.
     land_classes
         Find so many classes of land (2 to 20) in the image by their colours, and fit the response of each to direct
         light: forests and crops are not Lambertian. Default 0: all land is.

@@ -38,12 +38,11 @@ ImageTime = str | datetime | tuple[float, float]
 _AZIMUTHS, _SEARCH_SIDE = 72, 240
 # Skylight and interreflection are traced for about so many texels at most, and not more finely than the heights.
 _MOST_TRACED = 1_000_000
-# The air model ends here; beyond it there is none before a satellite [m].
-_HIGHEST_SENSOR_M = 60_000.0
-# Of the air that scatters light of the land around into an image: wavelengths of red, green and blue, scale height of
-# the molecules, and ozone, which scatters nothing.
+# Sky models know observers up to here; nearly all haze and two thirds of the molecules are below [m].
+_HIGHEST_SENSOR_M = 9_000.0
+# Of the air that scatters light of the land around into an image: wavelengths of red, green and blue, and scale height
+# of the molecules.
 _PRIMARIES_NM, _MOLECULES_M = np.array([611.0, 549.0, 464.0]), 8000.0
-_OZONE_DU, _ABOVE_OZONE_M = 300.0, 30_000.0
 
 
 @dataclass(frozen=True)
@@ -179,7 +178,7 @@ def delit_imagery(
         The sky model of that hour.
     sensor_height_m
         Height of the aeroplane or satellite in the scene's vertical datum [m], if the air below it is still in the
-        image; ``None`` for images corrected for it.
+        image; ``None`` for images corrected for it. Above 9 km it counts as 9 km.
     land_classes
         Number of classes of land that are found in the image by their colours, and whose response to direct light is
         fitted one by one (forests are not Lambertian); 0 treats all land as Lambertian.
@@ -330,13 +329,12 @@ def _air(place: Place, time: ImageTime, sky: str | Path | SkyModel, sensor_heigh
 def _surroundings(place: Place, transmittance: np.ndarray, sensor_height_m: float) -> Surroundings:
     """Light of the land around that the air scatters into the image: what is not molecules counts as haze."""
     from seasonscapes.albedo.adjacency import Surroundings, scattered_upwards
-    from seasonscapes.sky.spectrum import ozone_optical_depth_per_du, rayleigh_optical_depth
+    from seasonscapes.sky.spectrum import rayleigh_optical_depth
 
     low, high = (np.exp(-height / _MOLECULES_M) for height in (place.median_height_m, sensor_height_m))
     molecules = rayleigh_optical_depth(_PRIMARIES_NM) * (low - high)
-    absorbed = ozone_optical_depth_per_du(_PRIMARIES_NM) * _OZONE_DU * (sensor_height_m > _ABOVE_OZONE_M)
     total = -np.log(np.clip(transmittance.reshape(-1, 3).mean(axis=0), 1e-3, 1.0))
-    by_molecules, by_haze = scattered_upwards(molecules, np.maximum(total - molecules - absorbed, 0.0))
+    by_molecules, by_haze = scattered_upwards(molecules, np.maximum(total - molecules, 0.0))
     return Surroundings(by_molecules, by_haze, place.atlas.texel_p50_m)
 
 

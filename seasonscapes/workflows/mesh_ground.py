@@ -7,6 +7,8 @@ from datetime import date
 import cv2
 import numpy as np
 
+from seasonscapes.cameras.pinhole import Camera
+from seasonscapes.errors import InputError
 from seasonscapes.frames import enu_from_geodetic, geodetic_from_enu
 from seasonscapes.progress import Progress
 from seasonscapes.terrain.mesh_atlas import MeshGround
@@ -76,3 +78,24 @@ def scene_ground(
         albedo = cv2.resize(albedo, size, interpolation=cv2.INTER_AREA)
     uv = terrain.uv[terrain.faces]
     return MeshGround(corners, normal[terrain.faces], uv, albedo.astype(np.float32), place.scene.name)
+
+
+def require_above(ground: MeshGround, camera: Camera) -> None:
+    """`InputError` for a camera below the ground."""
+    eye = camera.world_from_camera[:3, 3]
+    corners = ground.position
+    near = ((corners.min(axis=1)[:, :2] <= eye[:2]) & (corners.max(axis=1)[:, :2] >= eye[:2])).all(axis=1)
+    first, second, third = np.moveaxis(corners[near], 1, 0)
+    across, along = second - first, third - first
+    offset = eye[:2] - first[:, :2]
+    area = across[:, 0] * along[:, 1] - across[:, 1] * along[:, 0]
+    area = np.where(np.abs(area) < 1e-9, np.nan, area)
+    one = (offset[:, 0] * along[:, 1] - offset[:, 1] * along[:, 0]) / area
+    other = (across[:, 0] * offset[:, 1] - across[:, 1] * offset[:, 0]) / area
+    inside = (one >= 0.0) & (other >= 0.0) & (one + other <= 1.0)
+    height = (first[:, 2] + one * across[:, 2] + other * along[:, 2])[inside]
+    if height.size and float(height.max()) >= eye[2]:
+        cure = "choose another --azimuth, a higher --elevation, or --eye and --target"
+        raise InputError(
+            "--on", "the camera is inside the ground", got=f"{height.max() - eye[2]:.1f} m deep", cure=cure
+        )

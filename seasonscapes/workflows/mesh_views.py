@@ -17,6 +17,7 @@ from seasonscapes.errors import InputError
 from seasonscapes.frames import angles_from_direction, direction_from_angles
 from seasonscapes.progress import Progress, each_reported, task_progress
 from seasonscapes.terrain.textured_mesh import TexturedMesh
+from seasonscapes.workflows.mesh_ground import require_above
 from seasonscapes.workflows.meshes import MeshSurroundings, Time, albedo_image, atlas_of, mesh_light
 from seasonscapes.workflows.timelapse import FilmLook, develop_frames
 
@@ -132,6 +133,8 @@ def mesh_view(
 
     Raises
     ------
+    InputError
+        For a camera inside the terrain that the mesh stands on.
     NoTerrainInView
         Where the camera sees neither mesh nor ground.
     """
@@ -144,11 +147,14 @@ def mesh_view(
 
     around = surroundings or MeshSurroundings()
     use_backend()
+    camera = camera or mesh_camera(mesh)
+    if around.terrain is not None:
+        require_above(around.terrain, camera)
     atlas = atlas_of(mesh, around)
     scene = ray_scene(mi_mesh(atlas.terrain, albedo_image(atlas, mesh)))
     sampling = SamplingOptions(albedo_samples=16, rays=around.rays, clusters=4096)
     report = task_progress(progress, "light transport")
-    coefficients = trace_view(scene, camera or mesh_camera(mesh), sampling, seed=around.seed, progress=report)
+    coefficients = trace_view(scene, camera, sampling, seed=around.seed, progress=report)
     return MeshView(mesh, around, relightable_view(scene, coefficients))
 
 
