@@ -94,9 +94,9 @@ VERBS: dict[str, tuple[list[str], set[str], dict[str, list[str]]]] = {
     ),
     "splat": (
         ["alpine_small", "--time", TIME],
-        {*_TERRAIN, *_SKY, "--time", "--model", "--output", "--exposure"},
+        {*_TERRAIN, *_SKY, "--time", "--model", "--output", "--exposure", "--camera", "--at"},
         {**_OF_POSITION, **_NO_BOUND}
-        | _each((*_VIEW, "--subpixels", "--device", "--look", "--white-balance"), ["--output", "a.ply"]),
+        | _each(("--size", "--subpixels", "--device", "--look", "--white-balance"), ["--output", "a.ply"]),
     ),
     "run": (
         ["alpine_small", "--times", TIME, "--at-hours", TIME],

@@ -99,7 +99,7 @@ CONDITIONS: dict[str, tuple[Condition, ...]] = {
     "splat": (
         _POSITION,
         _BALANCE,
-        Condition((*_VIEW, "--subpixels", "--device"), "a picture", written_as(".png", ".exr", default="a.png")),
+        Condition(("--size", "--subpixels", "--device"), "a picture", lambda given: not written_as(".ply", ".glb", default="a.png")(given)),
         Condition(("--look", "--white-balance"), "a .png output", written_as(".png", default="a.png")),
     ),
     "run": (
