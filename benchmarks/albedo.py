@@ -4,8 +4,8 @@
 
 A synthetic massif (seed drawn at run time) with its albedo of a September day, low cameras, hours of one day to fit; path
 traced, seen through air under the Bruneton sky. Cases: clean (linear, known exposure), webcam (8-bit sRGB, JPEG 88, noise,
-unknown exposure and white balance), haze (the same in air of 40 km visibility, which is to be found), curve (an unknown
-S-curve as well). Scored over all texels that fill at least one pixel of some camera:
+unknown exposure and white balance), and those of `albedo_cases`, where the closed form's assumptions are wrong and the joint
+recovery stands beside it. Scored over all texels that fill at least one pixel of some camera:
 
 * PSNR of albedo (peak 1), relative error Σ|Δ| / Σ albedo, of all texels and of those never sunlit in any picture;
 * relit PSNR: pictures of held-out hours (two of the day, two of a December day's light), path traced at 32 samples with the
@@ -31,6 +31,7 @@ import numpy as np
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
 
+from albedo_cases import CASES, assumed_haze, case_scene, solve_case  # noqa: E402
 from albedo_scene import Truth, hours, lights_for, make_truth, path_traced  # noqa: E402
 from record import write_record  # noqa: E402
 
@@ -50,7 +51,6 @@ from seasonscapes.sky.models import read_sky_model, with_overrides  # noqa: E402
 from seasonscapes.workspace import Workspace, default_workspace  # noqa: E402
 
 FIT_DATE, WINTER_DATE = "2024-09-10", "2024-12-05"
-TRUE_HAZE_KM = 40.0
 
 
 @dataclass(frozen=True)
@@ -279,45 +279,60 @@ def run(args) -> dict[str, float]:
     margins.append(numbers["webcam_psnr_db"] - best)
     numbers["margin_over_best_correction_db"] = min(margins)
     clock.tell("webcam")
-    curve(args, truth, land, times, pictures, photographs, judge, table, numbers, clock)
-    haze(args, truth, land, times, model, workspace, judge, table, numbers, clock)
+    cases(args, truth, land, times, pictures, model, workspace, lights, numbers, clock)
     controls(truth, land, photographs, times, model, workspace, judge, table, numbers, clock)
     print_table(table, judge)
     return numbers
 
 
-def curve(args, truth, land, times, pictures, photographs, judge, table, numbers, clock) -> None:
-    """An unknown S-curve on top of all that webcams do."""
-    faults = WebcamFaults(tone_strength=0.4)
-    seen, _ = observations(truth, times, pictures, faults, args.seed + 3)
-    bent = [replace(photograph, observation=one, gain=None) for photograph, one in zip(photographs, seen, strict=True)]
-    found = fit_tone_curve(land, bent, search=SearchOptions(fraction=0.2 if args.quick else 0.1))
-    numbers["curve_strength_error"] = abs(found.strength - faults.tone_strength)
-    fit = solve_albedo(land, with_tone_curve(bent, found.strength), noise_model=EIGHT_BIT)
-    score(table, numbers, "curve", judge.scores(fit.albedo), judge)
-    clock.tell("tone curve")
+def cases(args, truth, land, times, pictures, model, workspace, lights, numbers, clock) -> None:
+    """Where the closed form's assumptions are wrong: both methods on the same pictures; see `albedo_cases`."""
+    gains = []
+    haze = assumed_haze(times, truth.cameras, model, workspace)
+    for name in CASES:
+        case = case_scene(name, truth, land, times, pictures, model, workspace, size_of(args), args.seed)
+        told, air = flat(lights), haze
+        if case.truth is not truth:
+            told = flat(lights_for(times, case.truth.cameras, model, workspace))
+            air = assumed_haze(times, case.truth.cameras, model, workspace)
+        found = solve_case(case, told, air)
+        gains.append(found.gain_db)
+        numbers[f"case_{name}_closed_psnr_db"], numbers[f"case_{name}_joint_psnr_db"] = found.closed_db, found.joint_db
+        numbers[f"case_{name}_gain_db"] = found.gain_db
+        numbers[f"case_{name}_held_out_start"] = found.joint.held_out_start
+        numbers[f"case_{name}_held_out_end"] = found.joint.held_out_end
+        print(
+            f"case {name:8s} closed {found.closed_db:6.2f} dB  joint {found.joint_db:6.2f} dB  {found.gain_db:+.2f} dB  "
+            f"held-out loss {found.joint.held_out_start:.3f} → {found.joint.held_out_end:.3f}"
+        )
+        if not args.quick and name in ("haze", "curve"):
+            numbers[f"case_{name}_searched_psnr_db"] = searched_db(name, case, told, times, model, workspace)
+        clock.tell(f"case {name}")
+    numbers["differentiable_gain_db"], numbers["differentiable_worst_db"] = float(np.mean(gains)), min(gains)
+    numbers["differentiable_held_out_ratio"] = max(
+        numbers[f"case_{name}_held_out_end"] / numbers[f"case_{name}_held_out_start"] for name in CASES
+    )
 
 
-def haze(args, truth, land, times, model, workspace, judge, table, numbers, clock) -> None:
-    """Unknown haze: the visibility is searched with the webcam's own pictures."""
+def searched_db(name: str, case, told, times, model, workspace) -> float:
+    """The closed form after its own search over one unknown, which is told which one is wrong."""
 
     def lights_of(visibility_km: float):
-        return flat(lights_for(times, truth.cameras, with_overrides(model, visibility_km=visibility_km), workspace))
+        return flat(
+            lights_for(times, case.truth.cameras, with_overrides(model, visibility_km=visibility_km), workspace)
+        )
 
-    true = lights_of(TRUE_HAZE_KM)
-    rows = [true[i : i + len(truth.cameras)] for i in range(0, len(true), len(truth.cameras))]
-    pictures = path_traced(truth, truth.albedo, rows, spp=size_of(args).spp, seed=args.seed + 5)
-    seen, _ = observations(truth, times, pictures, WebcamFaults(tone_strength=0.0), args.seed + 2)
-    photographs = prepare_photographs(land, seen, true)
-    found = fit_visibility(land, photographs, lights_of, noise_model=EIGHT_BIT)
-    numbers["haze_visibility_km"] = found.visibility_km
-    numbers["haze_visibility_error"] = abs(found.visibility_km / TRUE_HAZE_KM - 1.0)
-    photographs = [
-        replace(photograph, light=light)
-        for photograph, light in zip(photographs, lights_of(found.visibility_km), strict=True)
-    ]
-    score(table, numbers, "haze", judge.scores(solve_albedo(land, photographs, noise_model=EIGHT_BIT).albedo), judge)
-    clock.tell("haze")
+    photographs = prepare_photographs(case.land, case.observations, told)
+    if name == "curve":
+        found = fit_tone_curve(case.land, photographs, search=SearchOptions(fraction=0.1))
+        photographs = with_tone_curve(photographs, found.strength)
+    else:
+        found = fit_visibility(case.land, photographs, lights_of, noise_model=EIGHT_BIT)
+        lights = lights_of(found.visibility_km)
+        photographs = [replace(each, light=light) for each, light in zip(photographs, lights, strict=True)]
+    fit = solve_albedo(case.land, photographs, noise_model=EIGHT_BIT)
+    seen = fit.pixel_count >= 1.0
+    return psnr((fit.albedo - case.truth.albedo)[seen])
 
 
 def controls(truth, land, photographs, times, model, workspace, judge, table, numbers, clock) -> None:

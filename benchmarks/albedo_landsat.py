@@ -125,21 +125,24 @@ def scene(folder: Path):
     return terrain, (atlas.height_px, atlas.width_px), bands
 
 
-def depths(centre_um: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Optical depths of molecules and of thin haze."""
-    return 0.0088 * centre_um**-4.05, 0.12 * (centre_um / 0.55) ** -1.3
+THIN_HAZE = 0.12
 
 
-def path_radiance(sun: np.ndarray) -> np.ndarray:
+def depths(centre_um: np.ndarray, haze_depth: float = THIN_HAZE) -> tuple[np.ndarray, np.ndarray]:
+    """Optical depths of molecules and of haze, whose depth at 0.55 µm is given."""
+    return 0.0088 * centre_um**-4.05, haze_depth * (centre_um / 0.55) ** -1.3
+
+
+def path_radiance(sun: np.ndarray, haze_depth: float = THIN_HAZE) -> np.ndarray:
     """Radiance ``(6,)`` [W m⁻² sr⁻¹ µm⁻¹] that the air sends straight up under a sun, scattered once."""
-    rayleigh, haze = depths(CENTRE_UM)
+    rayleigh, haze = depths(CENTRE_UM, haze_depth)
     cosine, g = -float(sun[2]), 0.65
     molecules = 0.75 * (1.0 + cosine**2)
     particles = 0.93 * (1.0 - g * g) / (1.0 + g * g - 2.0 * g * cosine) ** 1.5
     return SOLAR / np.pi * (rayleigh * molecules + haze * particles) / 4.0
 
 
-def light_of(sun: np.ndarray, centre_um: np.ndarray):
+def light_of(sun: np.ndarray, centre_um: np.ndarray, haze_depth: float = THIN_HAZE):
     """Hosek's sun and sky at three bands: the sky's share falls with wavelength as that of thin air and haze does.
 
     The sun's normal irradiance outside the air is 1e5 in every band.
@@ -150,7 +153,7 @@ def light_of(sun: np.ndarray, centre_um: np.ndarray):
 
     light = hosek_illumination(sun, turbidity=3.0)
     airmass = 1.0 / sun[2]
-    rayleigh, haze = depths(centre_um)
+    rayleigh, haze = depths(centre_um, haze_depth)
     direct = 1.0e5 * np.exp(-(rayleigh + haze) * airmass)
     # Half of what molecules scatter and most of what haze does comes down; the map gives its shape alone.
     diffuse = 1.0e5 * sun[2] * (1.0 - np.exp(-(0.5 * rayleigh + 0.75 * haze) * airmass))

@@ -114,7 +114,7 @@ def open_page(browser, address: str, *, seconds: float = 120.0, until: str = "re
 
 PREPARE = """
 const done = arguments[arguments.length - 1];
-window.measure = async ({camera, time, frames, size, change, sunOnly}) => {
+window.measure = async ({camera, time, frames, size, change, sunOnly, divider}) => {
   const s = seasonscapes, r = s.renderer;
   s.state.paused = true;
   const known = {shadows: 1, bounce: 1, air: 1, ...(change || {})};
@@ -125,6 +125,7 @@ window.measure = async ({camera, time, frames, size, change, sunOnly}) => {
   if (camera !== undefined) s.useCamera(camera);
   if (time !== undefined) s.setTime(time, s.sharp);
   await s.state.arriving;
+  if (divider !== undefined) await s.setDivider(divider);
   if (sunOnly) for (const v of r.shared.uSky.value) v.set(0, 0, 0);
   r.relight();
   r.reset();

@@ -32,6 +32,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         an interruption; 1 for a fault of the program.
     """
     tokens = list(sys.argv[1:] if arguments is None else arguments)
+    if arguments is None:
+        # Before numpy is imported. No command has matrices that pay for BLAS's own threads: they wait busily for one
+        # another, which made half of the processor time of short commands.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # After a process's command only the interpreter's own end is left: Ctrl-C there ends it without a traceback.
     with interruptible(afterwards=signal.SIG_DFL if arguments is None else None):
         try:

@@ -10,9 +10,7 @@ from albedo_cases import Case, case, psnr
 from seasonscapes.albedo import corrections, equations, haze, season_grouping, tone_curve
 from seasonscapes.albedo.albedo_completion import completed_estimate
 from seasonscapes.albedo.closed_form import SearchOptions, SolverOptions, solve_albedo
-from seasonscapes.albedo.differentiable_views import SKY, differentiable_views, mi_picture
 from seasonscapes.albedo.forward_model import ambient_on_texels, predicted_surface_radiance
-from seasonscapes.albedo.inverse import ExtraUnknown, InverseOptions, refine_albedo
 from seasonscapes.albedo.photographs import EIGHT_BIT, AlbedoPhotograph, prepare_photographs
 from seasonscapes.albedo.resampled_radiance import resampled_radiance
 from seasonscapes.albedo.standard_error import AlbedoEstimate, albedo_estimate, observed_sigma
@@ -266,85 +264,6 @@ def test_contradicting_times_are_outvoted(place, photographs, clean):
     seen = clean.pixel_count >= 1.0
     assert psnr(fit.albedo, place.albedo, seen) > psnr(clean.albedo, place.albedo, seen) - 6.0
     assert np.argmax(fit.residual) == 0
-
-
-# ---------------------------------------------------------------------------------------------- differentiable
-
-
-@pytest.mark.parametrize("name", ["albedo", "sun", "sky", "haze", "log_gain"])
-def test_gradients_equal_finite_differences(place, photographs, name):
-    """Within 2 %, from independent random numbers."""
-    import drjit as dr
-    import mitsuba as mi
-
-    foggy = [replace(s, light=replace(s.light, aerial_perspective=Fog(8.0))) for s in photographs[3:5]]
-    views = differentiable_views(place.terrain, place.albedo, foggy)
-
-    def value(x, seed):
-        tensor = mi.TensorXf(x, shape=(1, 1, 1))
-        unknowns = {
-            "albedo": lambda: mi.TensorXf(place.albedo) * tensor,
-            "log_gain": lambda: mi.TensorXf(np.zeros((2, 3), np.float32)) + mi.TensorXf(x, shape=(1, 1)),
-        }.get(name, lambda: x)()
-        return dr.mean(mi_picture(views, 0, {name: unknowns}, spp=96, seed=seed), axis=None) / 1000.0
-
-    at, step = (0.0 if name == "log_gain" else 1.0), 0.02
-    slope = [float(value(mi.Float(at + sign * step), 5).array[0]) for sign in (1.0, -1.0)]
-    x = mi.Float(at)
-    dr.enable_grad(x)
-    dr.backward(value(x, 6))
-    assert float(dr.grad(x)[0]) == pytest.approx((slope[0] - slope[1]) / (2.0 * step), rel=0.02)
-
-
-def test_refinement_saves_resumes_and_takes_extras(place, photographs, clean, tmp_path):
-    poor = solve_albedo(place.transport, photographs, solver=SolverOptions(rounds=1))
-    poor = replace(poor, albedo=1.12 * poor.albedo)
-    seen = clean.pixel_count >= 1.0
-    told, file = [], tmp_path / "state.npz"
-    options = InverseOptions(unknowns=("albedo",), levels=(1,), iterations=24, check_every=8, spp=8)
-    done = refine_albedo(
-        place.terrain, place.transport, photographs, poor, options=options, callbacks=[told.append], resume=file
-    )
-    assert psnr(done.fit.albedo, place.albedo, seen) > psnr(poor.albedo, place.albedo, seen)
-    assert len(told) == len(done.history)
-    assert any("held_out" in record for record in done.history)
-    again = refine_albedo(place.terrain, place.transport, photographs, poor, options=options, resume=file)
-    assert len(again.history) == len(done.history), "a finished state has nothing left to do"
-    brighter = {SKY: ExtraUnknown(np.array([1.3]), low=0.1, high=3.0, step=0.02)}
-    options = InverseOptions(unknowns=(), extra=brighter, levels=(1,), iterations=20, check_every=5, spp=4)
-    found = refine_albedo(place.terrain, place.transport, photographs, clean, options=options)
-    assert abs(found.values[SKY][0] - 1.0) < 0.2, "the sky's own scale is found again"
-
-
-def test_an_interrupted_refinement_continues(place, photographs, tmp_path):
-    """Up to the rounding of gradients, which the renderer sums in no fixed order."""
-    poor = solve_albedo(place.transport, photographs, solver=SolverOptions(rounds=1))
-    options = InverseOptions(levels=(4, 1), iterations=9, check_every=3, spp=4)
-    problem = (place.terrain, place.transport, photographs, poor)
-    whole = refine_albedo(*problem, options=options)
-    for stage, iteration in ((0, 3), (0, 9), (1, 6)):
-        file = tmp_path / f"{stage}_{iteration}.npz"
-
-        def interrupt(state, at=(stage, iteration)):
-            state.stop = (state.stage, state.iteration) == at
-
-        part = refine_albedo(*problem, options=options, callbacks=[interrupt], resume=file)
-        assert len(part.history) == stage * 9 + iteration
-        again = refine_albedo(*problem, options=options, resume=file)
-        assert len(again.history) == len(whole.history)
-        for name in ("loss", "held_out"):
-            values = [[record.get(name, 0.0) for record in fit.history] for fit in (again, whole)]
-            np.testing.assert_allclose(*values, rtol=1e-3)
-        # Adam normalises gradients, so that single texels of tiny gradient may differ by more than rounding.
-        assert np.abs(again.values["albedo"] - whole.values["albedo"]).mean() < 1e-5
-        np.testing.assert_allclose(again.values["log_gain"], whole.values["log_gain"], atol=1e-4)
-
-
-def test_refinement_refuses(place, photographs, clean):
-    with pytest.raises(NotEnoughEvidence, match="two photographs"):
-        refine_albedo(place.terrain, place.transport, photographs[:1], clean)
-    with pytest.raises(ValueError, match="colour"):
-        refine_albedo(place.terrain, place.transport, photographs, clean, options=InverseOptions(unknowns=("colour",)))
 
 
 # ---------------------------------------------------------------------------------------------- uncertainty, seasons

@@ -15,10 +15,10 @@ from seasonscapes.albedo.delighting import (
     DelightOptions,
     TexelIrradiance,
     delight_image,
-    fitted_sky_factor,
 )
 from seasonscapes.albedo.registration import shifted_back, texture_shift
 from seasonscapes.albedo.shadow_borders import refined_visibility
+from seasonscapes.albedo.sky_factor import fitted_sky_factor
 from seasonscapes.errors import NoUsablePixels
 
 SUN_LX, SKY_LX = np.array([80_000.0, 76_000.0, 68_000.0]), np.array([11_000.0, 14_000.0, 20_000.0])

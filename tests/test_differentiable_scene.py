@@ -34,7 +34,9 @@ def test_haze_and_heading_are_fitted_to_a_photograph():
     assert optimizer["heading_deg"][0] == pytest.approx(0.8, abs=0.1)
 
 
-@pytest.mark.parametrize(("name", "at", "step"), [("sun", 1.0, 0.05), ("haze", 1.2, 0.05), ("log_gain", 0.1, 0.05)])
+@pytest.mark.parametrize(
+    ("name", "at", "step"), [("sun", 1.0, 0.05), ("sky", 1.0, 0.05), ("haze", 1.2, 0.05), ("log_gain", 0.1, 0.05)]
+)
 def test_gradients_equal_finite_differences(scene, name, at, step):
     def mean(value):
         return dr.mean(scene.render({name: value}, spp=8, seed=3).array)[0]

@@ -143,7 +143,7 @@ class TestReading:
             for number, texture in enumerate(mesh.textures):
                 np.testing.assert_array_equal(texture.values, linear_from_srgb(levels(number) / 255.0))
             # The texel at a point of the surface is the same one in every file.
-            atlas = mesh_atlas(mesh, ground_albedo=None)
+            atlas = mesh_atlas(mesh, ground=None)
             points = surface_positions(atlas)[atlas.tiles[1].window]
             np.testing.assert_allclose(points[20, 6], EXPECTED_POINT, atol=2e-6)
 
@@ -154,7 +154,7 @@ class TestReading:
         corners = uv[faces]
         sides = corners[:, 1:] - corners[:, :1]
         uv_area = 0.5 * np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]).sum()
-        texels = int((mesh_atlas(mesh, ground_albedo=None).face >= 0).sum())
+        texels = int((mesh_atlas(mesh, ground=None).face >= 0).sum())
         assert texels == pytest.approx(uv_area * levels(0).shape[0] * levels(0).shape[1], rel=0.1), (
             "borders count whole texels"
         )
@@ -482,36 +482,36 @@ class TestMistakes:
         path = write_obj(tmp_path)
         path.write_text(path.read_text().replace("vt 0.03333333 0.05000000", "vt 2.03333333 0.05000000"))
         with pytest.raises(InputError, match="its texture repeats over"):
-            mesh_atlas(ss.load_mesh(path), ground_albedo=None)
+            mesh_atlas(ss.load_mesh(path), ground=None)
 
     def test_whole_tiles_and_edges_are_taken_back(self, tmp_path):
         path = write_obj(tmp_path)
-        plain = mesh_atlas(ss.load_mesh(path), ground_albedo=None)
+        plain = mesh_atlas(ss.load_mesh(path), ground=None)
         text = path.read_text().splitlines()
         moved = [
             f"vt {float(w[1]) + 3:.8f} {float(w[2]) - 1:.8f}" if (w := line.split())[0] == "vt" else line
             for line in text
         ]
         path.write_text("\n".join(moved))
-        np.testing.assert_array_equal(mesh_atlas(ss.load_mesh(path), ground_albedo=None).face, plain.face)
+        np.testing.assert_array_equal(mesh_atlas(ss.load_mesh(path), ground=None).face, plain.face)
 
     def test_what_may_not_be_meant_is_told(self, tmp_path):
         vertices, faces, _ = box_faces()
         flat = np.concatenate([faces, [[0, 0, 1]]])
         (tmp_path / "odd.ply").write_bytes(_coloured(vertices, flat))
-        notes = mesh_atlas(ss.load_mesh(tmp_path / "odd.ply"), ground_albedo=None).notes
+        notes = mesh_atlas(ss.load_mesh(tmp_path / "odd.ply"), ground=None).notes
         assert any("1 of 11 faces are degenerate" in note for note in notes)
         fin = np.concatenate([vertices, [[0.0, 0.0, 3.0]]])
         extra = np.concatenate([faces, [[0, 2, 20], [2, 0, 20]]])
         (tmp_path / "fin.ply").write_bytes(_coloured(fin, extra))
-        notes = mesh_atlas(ss.load_mesh(tmp_path / "fin.ply"), ground_albedo=None).notes
+        notes = mesh_atlas(ss.load_mesh(tmp_path / "fin.ply"), ground=None).notes
         assert any("not manifold" in note for note in notes)
         (tmp_path / "under.ply").write_bytes(_coloured(vertices, faces[:, ::-1]))
-        notes = mesh_atlas(ss.load_mesh(tmp_path / "under.ply"), ground_albedo=None).notes
+        notes = mesh_atlas(ss.load_mesh(tmp_path / "under.ply"), ground=None).notes
         assert any("most faces look down" in note for note in notes)
         overlapping = write_obj(tmp_path)
         overlapping.write_text(overlapping.read_text().replace("usemtl wall1", "usemtl wall0"))
-        notes = mesh_atlas(ss.load_mesh(overlapping), ground_albedo=None).notes
+        notes = mesh_atlas(ss.load_mesh(overlapping), ground=None).notes
         assert any("texels are used by several faces" in note for note in notes)
 
 

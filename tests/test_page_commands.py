@@ -19,6 +19,7 @@ NOT_RUN = {
     r"^seasonscapes render alpine --time": "the scene at full detail, for minutes",
     r"^seasonscapes run alpine --times": "half an hour; tests/test_run.py runs all stages on a small place",
     r"^seasonscapes (distill|splat) ": "trains for minutes; tests/test_gaussians.py runs both",
+    r"--gaussians ": "a model that training makes; tests/test_viewer_gaussians.py shows one",
     r"--method diffusion": "needs weights; tests/test_diffusion.py runs it on tiny ones",
     r"^seasonscapes annotate|^seasonscapes view (alpine_small --camera|my-valley)": "serves a page until Ctrl-C",
     r"--points points.csv": "needs points that a person matched; tests/test_cli_webcams.py runs it",

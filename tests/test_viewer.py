@@ -256,7 +256,7 @@ class TestPlaces:
         detail = ViewerDetail(40, 64, 64, 24, 12, 4, 256, 4, 16)
         scene = viewer_scene(place, sky=ss.sky_model("clear"), detail=detail)
         assert max(scene.arrays["heights"].shape) <= 41
-        assert "at most 40 along a side" in caplog.text
+        assert "heights every 77.9 m of the raster's 12.5 m" in caplog.text
 
     def test_a_place_without_image_near_the_pole_has_a_page(self, place, tmp_path):
         text = SCENE.replace(

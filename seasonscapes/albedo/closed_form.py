@@ -14,7 +14,7 @@ buildings, cloud shadows and misregistered pixels lose their influence.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TypeVar
 
 import numpy as np
@@ -167,8 +167,7 @@ def solve_albedo(
     history = []
     for number in range(solver.rounds):
         filled = fill_nearest(albedo.reshape(*transport.shape, 3), pixel_count)
-        for equations in systems:
-            equations.ambient = ambient_on_texels(transport, equations.photograph.light, filled)
+        _update_ambient(systems, transport, filled)
         reweight(systems, albedo, noise_model, robust=number > 0)
         albedo, diagonal = _solve(systems, albedo, solver, transport.shape, prior)
         albedo = np.clip(albedo, LOWEST, HIGHEST)
@@ -183,6 +182,17 @@ def solve_albedo(
 
 def _unique(items: Sequence[_Item]) -> list[_Item]:
     return list({id(item): item for item in items}.values())
+
+
+def _update_ambient(systems: list[PhotographEquations], transport: TexelTransport, albedo: np.ndarray) -> None:
+    """Ambient illuminance under an albedo ``(R, S, 3)``, once for all photographs of one sky, sun and moon."""
+    known: dict[tuple[int, int, int], np.ndarray] = {}
+    for equations in systems:
+        light = equations.photograph.light
+        key = (id(light.sky_radiance), id(light.sun), id(light.moon))
+        if key not in known:
+            known[key] = ambient_on_texels(transport, light, albedo)
+        equations.ambient = known[key]
 
 
 def _require_usable(systems: list[PhotographEquations]) -> None:
@@ -234,7 +244,7 @@ def _solve(
         target = target + prior_weight * prior[0].reshape(start.shape)
 
     def normal(a: np.ndarray) -> np.ndarray:
-        total = smooth * _laplacian(a, shape) + (prior_weight + 1e-6 * typical) * a
+        total = smooth * grid_laplacian(a, shape) + (prior_weight + 1e-6 * typical) * a
         for equations, norm in zip(systems, gain_norms, strict=True):
             weight = equations.weight
             assert weight is not None
@@ -282,7 +292,7 @@ def _dots(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.einsum("nc,nc->c", a.astype(np.float64), b.astype(np.float64))
 
 
-def _laplacian(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+def grid_laplacian(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """Graph Laplacian of the texel grid: four neighbours."""
     grid = values.reshape(*shape, -1)
     result = np.zeros_like(grid)
@@ -306,7 +316,8 @@ def _assess(
         h = equations.inverse_gain.astype(np.float32)
         floor = radiance_floor(radiance)
         relative = (h * equations.picture - radiance) / (radiance + floor)
-        sigma = np.sqrt(noise_model.model**2 + (equations.noise * h / (radiance + floor)) ** 2)
+        own = equations.photograph.noise(noise_model)
+        sigma = np.sqrt(own.model**2 + (equations.noise * h / (radiance + floor)) ** 2)
         keep = equations.usable[:, 0]
         total += float(np.log1p((relative[keep] / (2.385 * sigma[keep])) ** 2).sum())
         count += int(keep.sum()) * 3
@@ -341,34 +352,3 @@ def fill_nearest(values: np.ndarray, pixel_count: np.ndarray) -> np.ndarray:
     assert nearest is not None
     row, column = nearest
     return values[row, column]
-
-
-def pixel_weights(
-    transport: TexelTransport, photographs: Sequence[AlbedoPhotograph], fit: AlbedoFit
-) -> list[np.ndarray]:
-    """Compute the robust weights of all terrain pixels under a finished fit and its noise model.
-
-    Parameters
-    ----------
-    transport
-        Daylight coefficients of the texels.
-    photographs
-        The K photographs of the fit.
-    fit
-        Result of `solve_albedo`.
-
-    Returns
-    -------
-    list of numpy.ndarray
-        For each photograph, weights ``(n, 3)`` [1 / (cd/m²)²] of its n terrain pixels.
-    """
-    size = transport.shape[0] * transport.shape[1]
-    albedo = fit.albedo.reshape(size, 3)
-    weights = []
-    for photograph, gain in zip(photographs, fit.gains, strict=True):
-        equations = equations_of(replace(photograph, gain=np.asarray(gain, float)), fit.noise_model, size)
-        equations.ambient = ambient_on_texels(transport, photograph.light, fit.albedo)
-        reweight([equations], albedo, fit.noise_model, robust=True)
-        assert equations.weight is not None
-        weights.append(equations.weight)
-    return weights

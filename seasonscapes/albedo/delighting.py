@@ -19,24 +19,17 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.ndimage import shift as spline_shift
 
+from seasonscapes.albedo.adjacency import Surroundings, without_surroundings
 from seasonscapes.albedo.closed_form import HIGHEST, LOWEST
+from seasonscapes.albedo.land_response import class_illuminance, land_classes
 from seasonscapes.albedo.registration import shifted_back, texture_shift
 from seasonscapes.albedo.shadow_borders import BorderModel, refined_visibility
+from seasonscapes.albedo.sky_factor import fitted_sky_factor
 from seasonscapes.errors import NoUsablePixels
 
 # Sources of a texel's albedo, in `DelitImage.source`.
 NOTHING, SUNLIT, SHADED, COMPLETED = 0, 1, 2, 3
 _GREY = 0.25
-# Standard deviation of the logarithm of the sky factor before an image is seen. Neighbouring pairs err alike, and land
-# that differs with its aspect (snow in the shade) misleads all of them: they never count as more than a few observations.
-_SKY_SIGMA, _PAIRS_PER_INDEPENDENT, _MOST_INDEPENDENT = 0.2, 50.0, 25.0
-# Distance of paired texels, across which land is about alike and shadow borders are past [texels].
-_PAIR_TEXELS = 4
-_LEAST_PAIRS = 500
-# The same for its colour, which pairs across shadows tell well and the blue of a display image may exceed by far.
-_SKY_COLOUR_SIGMA = 0.5
-# A slope faces the sun with more than this share of the largest illuminance.
-_FACING_SHARE = 0.2
 
 
 @dataclass(frozen=True)
@@ -75,10 +68,13 @@ class Air:
     ----------
     transmittance, airlight
         ``(3,)`` or ``(R, S, 3)`` share that passes, and radiance that is added [cd/m²].
+    surroundings
+        Light of the land around that it adds, in images from above; ``None`` to leave it out.
     """
 
     transmittance: np.ndarray
     airlight: np.ndarray
+    surroundings: Surroundings | None = None
 
 
 @dataclass(frozen=True)
@@ -105,7 +101,10 @@ class DelightOptions:
     land_class
         ``(R, S)`` integers, −1 for none: classes of land whose response to direct light is fitted one by one, so that
         their albedo no longer depends on it. Canopies are no Lambertian surfaces, and their sunlight and shade mix
-        within a texel; see `class_response`. ``None`` treats all land as Lambertian.
+        within a texel; see `albedo.land_response`. A number finds so many classes in the image by its colours;
+        ``None`` treats all land as Lambertian.
+    fit_where
+        ``(R, S)`` bool: texels at which those responses are fitted; all if ``None``.
     light_error, slope_error
         Relative error of the modelled light, and standard error of the cosine of incidence, for σ.
     quantum
@@ -119,7 +118,8 @@ class DelightOptions:
     borders: BorderModel | None = field(default_factory=BorderModel)
     fit_sky: bool = True
     rounds: int = 3
-    land_class: np.ndarray | None = None
+    land_class: np.ndarray | int | None = None
+    fit_where: np.ndarray | None = None
     light_error: float = 0.05
     slope_error: float = 0.06
     quantum: float | None = None
@@ -145,6 +145,9 @@ class DelitImage:
         ``(3,)`` factor on the sky's illuminance that the image asks for.
     radiance_per_unit
         ``(3,)`` radiance of the image's value 1 that was used [cd/m²].
+    exponents
+        ``(K, 3)`` exponents of the cosine of incidence of K classes of land, 1 for a Lambertian one; ``None`` without
+        classes.
     """
 
     albedo: np.ndarray
@@ -154,12 +157,14 @@ class DelitImage:
     shift_texels: tuple[float, float] | None
     sky_factor: np.ndarray
     radiance_per_unit: np.ndarray
+    exponents: np.ndarray | None = None
 
     @property
     def facts(self) -> dict[str, Any]:
         """Plain values for files and reports."""
         surface = max(int((self.source > NOTHING).sum()), 1)
-        return {
+        responses = {} if self.exponents is None else {"class_exponents": np.round(self.exponents, 3).tolist()}
+        return responses | {
             "shift_texels": None if self.shift_texels is None else [round(float(x), 2) for x in self.shift_texels],
             "sky_factor": [round(float(x), 3) for x in self.sky_factor],
             "radiance_per_unit_cd_m2": [round(float(x), 1) for x in self.radiance_per_unit],
@@ -216,8 +221,7 @@ def delight_image(
         return _delit(image, clipped, light, options, report)
     # Splines through the sharp borders of shadows in the image would overshoot; the light is moved onto the image instead,
     # and the albedo, which has none, back onto the surface.
-    moved = None if options.land_class is None else _moved(options.land_class, shift).astype(int)
-    result = _delit(image, clipped, _moved_light(light, shift), replace(options, land_class=moved), report)
+    result = _delit(image, clipped, _moved_light(light, shift), _moved_options(options, shift), report)
     return _placed_back(result, shift)
 
 
@@ -229,6 +233,15 @@ def _moved(values: np.ndarray, shift: tuple[float, float], *, order: int = 0) ->
     """Values of texels ``(R, S)`` or ``(R, S, C)`` at the places where the image shows them; those of the rim beyond it."""
     offsets = (*shift, *(0.0 for _ in values.shape[2:]))
     return spline_shift(values.astype(np.float64), offsets, order=order, mode="nearest").astype(np.float32)
+
+
+def _moved_options(options: DelightOptions, shift: tuple[float, float]) -> DelightOptions:
+    kind, where = options.land_class, options.fit_where
+    return replace(
+        options,
+        land_class=_moved(kind, shift).astype(int) if isinstance(kind, np.ndarray) else kind,
+        fit_where=None if where is None else _moved(where, shift) > 0.5,
+    )
 
 
 def _moved_light(light: TexelIrradiance, shift: tuple[float, float]) -> TexelIrradiance:
@@ -276,7 +289,7 @@ def _delit(
     known = np.isfinite(image).all(axis=2) & (light.chart >= 0)
     chart = np.where(known, light.chart, -1)
     scale = _radiance_per_unit(options, light)
-    radiance = _at_surface(np.nan_to_num(image) * scale, options.air)
+    radiance = _at_surface(np.nan_to_num(image) * scale, options.air, known)
     visibility, deviation = light.visibility.astype(np.float32), np.zeros(chart.shape, np.float32)
     factor, bounce = np.ones(3), light.bounce(_grey(light.sun.shape))
     sunlight = illuminance = visibility[..., None] * light.sun
@@ -302,9 +315,13 @@ def _delit(
         albedo[~known] = _GREY
         bounce = light.bounce(albedo)
         report(0.1 + 0.8 * (number + 1) / options.rounds)
+    exponents = None
     if options.land_class is not None:
-        kind = np.where(known & ~clipped.any(axis=2), options.land_class, -1)
-        illuminance = class_response(radiance, sunlight, illuminance - sunlight, kind)
+        whole = known & ~clipped.any(axis=2)
+        given = options.land_class
+        kind = land_classes(albedo, whole, given) if isinstance(given, int) else np.where(whole, given, -1)
+        ambient = illuminance - sunlight
+        illuminance, exponents = class_illuminance(radiance, light.sun, visibility, ambient, kind, options.fit_where)
         albedo = np.clip(np.pi * radiance / illuminance, LOWEST, HIGHEST).astype(np.float32)
     albedo = _completed(albedo, clipped & known[..., None], known)
     sigma = _standard_error(albedo, image, light, sunlight, illuminance, deviation, options)
@@ -321,6 +338,7 @@ def _delit(
         None,
         factor,
         scale,
+        exponents,
     )
 
 
@@ -337,155 +355,16 @@ def _radiance_per_unit(options: DelightOptions, light: TexelIrradiance) -> np.nd
     return white * passed + added
 
 
-def _at_surface(radiance: np.ndarray, air: Air | None) -> np.ndarray:
+def _at_surface(radiance: np.ndarray, air: Air | None, known: np.ndarray) -> np.ndarray:
     if air is None:
         return radiance.astype(np.float32)
+    left = radiance - air.airlight
+    if air.surroundings is None:
+        surface = left / air.transmittance
+    else:
+        surface = without_surroundings(left, air.transmittance, air.surroundings, known)
     # What is left below the airlight is noise; a hundredth of the image stays.
-    return np.maximum((radiance - air.airlight) / air.transmittance, 0.01 * radiance).astype(np.float32)
-
-
-def fitted_sky_factor(
-    radiance: np.ndarray,
-    sun: np.ndarray,
-    visibility: np.ndarray,
-    sky: np.ndarray,
-    bounce: np.ndarray,
-    chart: np.ndarray,
-) -> np.ndarray:
-    """Estimate the factor on skylight under which near texels in different light have most alike albedos.
-
-    Its mean comes from all such pairs. Its colour comes from those across borders of cast shadows, where there are enough:
-    land on both sides of them has the same colours, while land on different slopes may differ with its aspect.
-
-    Parameters
-    ----------
-    radiance
-        ``(R, S, 3)`` [cd/m²] that leaves the surface.
-    sun, sky, bounce
-        ``(R, S, 3)`` illuminance by the sun without cast shadows, by sky and by other terrain [lx].
-    visibility
-        ``(R, S)`` visibility of the sun.
-    chart
-        ``(R, S)`` integers as in `TexelIrradiance`; −1 where a texel is not to be used.
-
-    Returns
-    -------
-    numpy.ndarray
-        ``(3,)``; 1 where the image has too few pairs to tell.
-    """
-    sunlight = visibility[..., None] * sun
-    ambient = (sky + bounce).mean(axis=2)
-    total = np.log(np.maximum(sunlight.mean(axis=2) + ambient, 1e-3))
-    share = sunlight.mean(axis=2) / np.exp(total)
-    pairs = _pairs(
-        chart, lambda one, other: (np.abs(total[one] - total[other]) > 0.3) & (np.abs(share[one] - share[other]) > 0.15)
-    )
-    if len(pairs) < _LEAST_PAIRS:
-        return np.ones(3)
-    factor = _sky_factor(pairs, (radiance, sunlight, sky, bounce), _SKY_SIGMA)
-    # A texel that the sun would light well, and that is hidden from it, stands in a cast shadow.
-    facing = sun.mean(axis=2) > _FACING_SHARE * sun.mean(axis=2).max()
-    side = np.where(facing & (visibility > 0.95), 1.0, np.where(facing & (visibility < 0.05), 0.0, np.nan))
-    pairs = _pairs(chart, lambda one, other: np.abs(side[one] - side[other]) == 1.0)
-    if len(pairs) < _LEAST_PAIRS:
-        return factor
-    across = _sky_factor(pairs, (radiance, sunlight, sky, bounce), _SKY_COLOUR_SIGMA)
-    return across * np.exp(np.mean(np.log(factor) - np.log(across)))
-
-
-def _sky_factor(pairs: np.ndarray, textures: tuple[np.ndarray, ...], sigma: float) -> np.ndarray:
-    """Factor ``(3,)`` of least robust cost over pairs of texels ``(N, 2)``, beside its prior of a standard deviation.
-
-    ``textures`` are radiance, sunlight, skylight and light from other terrain, ``(R, S, 3)`` each.
-    """
-    one, other = pairs.T
-    trials = np.linspace(-1.5, 1.5, 61)
-    independent = min(len(pairs) / _PAIRS_PER_INDEPENDENT, _MOST_INDEPENDENT)
-    result = np.ones(3)
-    for channel in range(3):
-        # At the texels of the pairs alone, which are far fewer than all.
-        ends = [[texture[..., channel].ravel()[end].astype(np.float64) for texture in textures] for end in (one, other)]
-        contrast = np.log(np.maximum(ends[0][0], 1e-3) / np.maximum(ends[1][0], 1e-3))
-        residuals = []
-        for trial in trials:
-            first, second = (
-                np.maximum(direct + np.exp(trial) * from_sky + rest, 1e-3) for _, direct, from_sky, rest in ends
-            )
-            residuals.append(contrast - np.log(first / second))
-        spread = max(1.4826 * float(np.median(np.abs(residuals[len(trials) // 2]))), 0.05)
-        cost = [
-            independent * float(np.mean(np.log1p((residual / (2.385 * spread)) ** 2))) * 0.5 * 2.385**2
-            + 0.5 * (trial / sigma) ** 2
-            for trial, residual in zip(trials, residuals, strict=True)
-        ]
-        best = int(np.clip(np.argmin(cost), 1, len(trials) - 2))
-        curve = np.polyfit(trials[best - 1 : best + 2], cost[best - 1 : best + 2], 2)
-        result[channel] = np.exp(np.clip(-0.5 * curve[1] / curve[0], trials[0], trials[-1]))
-    return result
-
-
-def class_response(radiance: np.ndarray, sunlight: np.ndarray, ambient: np.ndarray, kind: np.ndarray) -> np.ndarray:
-    """Effective illuminance of classes of land: with as much diffuse light as makes their albedo independent of the sun.
-
-    The C correction of Teillet et al. 1982, within each class and channel, with exact cast shadows, sky and
-    interreflection in place of the cosine of incidence alone. The mean illuminance of a class does not change.
-
-    Parameters
-    ----------
-    radiance
-        ``(R, S, 3)`` [cd/m²] that leaves the surface.
-    sunlight, ambient
-        ``(R, S, 3)`` illuminance by the sun, and by sky and other terrain [lx].
-    kind
-        ``(R, S)`` class of each texel, −1 for none; small classes stay as they are.
-
-    Returns
-    -------
-    numpy.ndarray
-        ``(R, S, 3)`` effective illuminance [lx].
-    """
-    result = (sunlight + ambient).astype(np.float32)
-    for number in np.unique(kind[kind >= 0]):
-        member = kind == number
-        if member.sum() < _LEAST_PAIRS:
-            continue
-        for channel in range(3):
-            values, sun, diffuse = (
-                array[..., channel][member].astype(float) for array in (radiance, sunlight, ambient)
-            )
-
-            def dependence(
-                logarithm: float, values: np.ndarray = values, sun: np.ndarray = sun, diffuse: np.ndarray = diffuse
-            ) -> float:
-                albedo = values / np.maximum(sun + np.exp(logarithm) * diffuse, 1e-3)
-                low, high = np.percentile(albedo, [1.0, 99.0])
-                keep = (albedo >= low) & (albedo <= high)
-                return float(np.corrcoef(albedo[keep], sun[keep])[0, 1])
-
-            # More diffuse light makes the albedo of sunlit slopes larger: the dependence rises with the factor.
-            low, high = np.log(0.2), np.log(100.0)
-            for _ in range(18):
-                middle = 0.5 * (low + high)
-                low, high = (middle, high) if dependence(middle) < 0.0 else (low, middle)
-            effective = sun + np.exp(0.5 * (low + high)) * diffuse
-            result[..., channel][member] = effective * ((sun + diffuse).mean() / effective.mean())
-    return result
-
-
-def _pairs(
-    chart: np.ndarray, chosen: Callable[[tuple[slice, slice], tuple[slice, slice]], np.ndarray], most: int = 40_000
-) -> np.ndarray:
-    """Flat indices ``(N, 2)`` of texels a few apart in the same chart, of which ``chosen`` (by their slices) is true."""
-    index = np.arange(chart.size).reshape(chart.shape)
-    found = []
-    whole, ahead, behind = slice(None), slice(None, -_PAIR_TEXELS), slice(_PAIR_TEXELS, None)
-    for one, other in (((whole, ahead), (whole, behind)), ((ahead, whole), (behind, whole))):
-        keep = (chart[one] >= 0) & (chart[one] == chart[other]) & chosen(one, other)
-        found.append(np.stack([index[one][keep], index[other][keep]], axis=1))
-    pairs = np.concatenate(found)
-    if len(pairs) > most:
-        pairs = pairs[np.random.default_rng(0).choice(len(pairs), most, replace=False)]
-    return pairs
+    return np.maximum(surface, 0.01 * radiance).astype(np.float32)
 
 
 def _completed(albedo: np.ndarray, clipped: np.ndarray, known: np.ndarray) -> np.ndarray:

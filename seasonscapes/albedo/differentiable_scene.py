@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from seasonscapes.albedo.differentiable_views import ALBEDO, SKY, SUN, mi_sensor, mi_through_air
+from seasonscapes.cameras.panorama import Panorama
 from seasonscapes.cameras.pinhole import Camera, ray_directions
 from seasonscapes.frames import geodetic_from_enu, local_axes
 from seasonscapes.rendering.backend import use_backend
@@ -24,6 +24,8 @@ from seasonscapes.rendering.mitsuba_scene import mi_mesh, relight, sky_radiance_
 from seasonscapes.sky.illumination import Illumination
 from seasonscapes.terrain.surface import Terrain
 
+# Keys of Mitsuba's parameters.
+ALBEDO, SUN, SKY = "terrain.bsdf.reflectance.data", "sun.emitter.radiance.value", "sky.scale"
 UNKNOWNS = ("albedo", "sun", "sky", "haze", "log_gain", "heading_deg", "pitch_deg", "roll_deg")
 
 
@@ -282,3 +284,79 @@ def _bilinear(mi_image: Any, x: Any, y: Any) -> Any:
     top = at(0) * (1.0 - fx) + at(1) * fx
     bottom = at(width) * (1.0 - fx) + at(width + 1) * fx
     return top * (1.0 - fy) + bottom * fy
+
+
+def mi_sensor(camera: Camera | Panorama, *, pixel_format: str = "rgb") -> Any:
+    """Build Mitsuba's perspective sensor of a camera.
+
+    Parameters
+    ----------
+    camera
+        Perspective camera with square pixels.
+    pixel_format
+        ``"rgb"``, or ``"rgba"`` for the coverage too.
+
+    Returns
+    -------
+    mitsuba.Sensor
+        Sensor with a box filter and linear float32 pixels.
+
+    Raises
+    ------
+    ValueError
+        If the camera is a panorama or its pixels are not square.
+    """
+    import mitsuba as mi
+
+    if not isinstance(camera, Camera) or abs(camera.fx / camera.fy - 1.0) > 1e-6:
+        raise ValueError("mi_sensor: differentiable rendering needs a perspective camera with square pixels")
+    film = {
+        "type": "hdrfilm",
+        "width": camera.width_px,
+        "height": camera.height_px,
+        "pixel_format": pixel_format,
+        "component_format": "float32",
+        "rfilter": {"type": "box"},
+    }
+    return mi.load_dict(
+        {
+            "type": "perspective",
+            "fov_axis": "x",
+            "near_clip": 0.5,
+            "far_clip": 1.0e7,
+            "film": film,
+            "fov": float(np.degrees(2.0 * np.arctan(0.5 * camera.width_px / camera.fx))),
+            "principal_point_offset_x": 0.5 - camera.cx / camera.width_px,
+            "principal_point_offset_y": 0.5 - camera.cy / camera.height_px,
+            # Mitsuba's camera axes: z forward, x to the left.
+            "to_world": mi.ScalarTransform4f(camera.world_from_camera @ np.diag([-1.0, -1.0, 1.0, 1.0])),
+        }
+    )
+
+
+def mi_through_air(mi_image: Any, mi_depth: Any, mi_airlight: Any, haze: Any = None) -> Any:
+    """Apply aerial perspective to a rendered image, with a differentiable scale of its optical depth.
+
+    Parameters
+    ----------
+    mi_image
+        Radiance ``(H, W, 3)`` that leaves the terrain.
+    mi_depth, mi_airlight
+        Optical depth and airlight ``(H, W, 3)`` up to the terrain.
+    haze
+        Scale of the optical depth; ``None`` for 1.
+
+    Returns
+    -------
+    mitsuba.TensorXf
+        Radiance ``(H, W, 3)`` at the camera.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    if haze is None:
+        return mi_image * dr.exp(-mi_depth) + mi_airlight
+    scale = mi.TensorXf(mi.Float(haze), shape=(1, 1, 1))
+    # In a homogeneous medium airlight is proportional to 1 - exp(-optical depth).
+    growth = (1.0 - dr.exp(-mi_depth * scale)) / dr.fmax(1.0 - dr.exp(-mi_depth), 1e-6)
+    return mi_image * dr.exp(-mi_depth * scale) + mi_airlight * growth

@@ -8,11 +8,12 @@ import numpy as np
 
 from seasonscapes.albedo.footprints import whole_pixels
 from seasonscapes.albedo.forward_model import aerial_perspective_of, sky_radiance_of
-from seasonscapes.albedo.photographs import AlbedoPhotograph, NoiseModel
+from seasonscapes.albedo.photographs import AlbedoPhotograph, NoiseModel, TextureObservation
+from seasonscapes.cameras.observation import Observation
 from seasonscapes.rendering.receivers import luminaries
 
 # Sky pixels needed to fix a gain, and their least distance from sun and moon, whose disc and glare are not modelled.
-_FEWEST_SKY, _GLARE_DEG = 100, 8.0
+FEWEST_SKY, _GLARE_DEG = 100, 8.0
 
 
 @dataclass
@@ -59,7 +60,7 @@ class PhotographEquations:
     @property
     def projected(self) -> bool:
         """Whether the gain is eliminated: neither given nor fixed by the sky."""
-        return self.photograph.gain is None and len(self.sky_picture) < _FEWEST_SKY
+        return self.photograph.gain is None and len(self.sky_picture) < FEWEST_SKY
 
 
 def equations_of(photograph: AlbedoPhotograph, noise_model: NoiseModel, size: int) -> PhotographEquations:
@@ -79,19 +80,14 @@ def equations_of(photograph: AlbedoPhotograph, noise_model: NoiseModel, size: in
     PhotographEquations
         Equations with zero ambient illuminance and without weights.
     """
-    footprints, observation = photograph.footprints, photograph.observation
+    footprints, observation, noise_model = photograph.footprints, photograph.observation, photograph.noise(noise_model)
     picture = observation.image.reshape(-1, 3)
-    usable = observation.mask.ravel() & np.isfinite(picture).all(axis=1)
-    if noise_model.levels is not None:
-        # One clipped channel clips the pixel: demosaicing and JPEG mix the channels.
-        usable = usable & (picture.max(axis=1) < noise_model.white) & (picture.max(axis=1) > noise_model.black)
-    terrain, sky = footprints.pixel, photograph.atmosphere.sky.pixel
+    usable = usable_pixels(observation, noise_model).ravel()
+    terrain = footprints.pixel
     whole = whole_pixels(footprints) & usable[terrain]
     transmittance, airlight = aerial_perspective_of(photograph.atmosphere, photograph.light, len(terrain))
-    chosen = usable[sky]
-    for body in luminaries(photograph.light):
-        chosen &= photograph.atmosphere.sky.direction @ np.asarray(body.direction) < np.cos(np.radians(_GLARE_DEG))
-    sky = sky[chosen]
+    chosen = usable_sky(photograph, usable)
+    sky = photograph.atmosphere.sky.pixel[chosen]
     radiance = (
         sky_radiance_of(photograph.atmosphere, photograph.light)[chosen]
         if len(photograph.atmosphere.sky.pixel)
@@ -117,6 +113,25 @@ def equations_of(photograph: AlbedoPhotograph, noise_model: NoiseModel, size: in
     elif not equations.projected:
         equations.inverse_gain = _median_ratio(equations.sky_radiance, equations.sky_picture)
     return equations
+
+
+def usable_pixels(observation: Observation | TextureObservation, noise_model: NoiseModel) -> np.ndarray:
+    """Pixels ``(H, W)`` bool that are finite, not masked, and in encoded pictures neither clipped nor black."""
+    usable = observation.mask & np.isfinite(observation.image).all(axis=2)
+    if noise_model.levels is not None:
+        # One clipped channel clips the pixel: demosaicing and JPEG mix the channels.
+        brightest = observation.image.max(axis=2)
+        usable = usable & (brightest < noise_model.white) & (brightest > noise_model.black)
+    return usable
+
+
+def usable_sky(photograph: AlbedoPhotograph, usable: np.ndarray) -> np.ndarray:
+    """Which of the camera's sampled open pixels tell the exposure: usable ones away from sun and moon, bool."""
+    sky = photograph.atmosphere.sky
+    chosen = usable.ravel()[sky.pixel]
+    for body in luminaries(photograph.light):
+        chosen &= sky.direction @ np.asarray(body.direction) < np.cos(np.radians(_GLARE_DEG))
+    return chosen
 
 
 def picture_noise(linear: np.ndarray, noise_model: NoiseModel) -> np.ndarray:
@@ -241,14 +256,16 @@ def reweight(systems: list[PhotographEquations], albedo: np.ndarray, noise_model
         radiance = model + equations.airlight
         if equations.projected:
             equations.inverse_gain = projected_gain(equations, radiance)
-        photograph = equations.photograph
+        photograph, own = equations.photograph, equations.photograph.noise(noise_model)
         lit = photograph.footprints.lit[photograph.number] if equations.luminary_lx else np.zeros(len(model))
         # Highest where a shadow's edge divides the pixel.
         penumbra = np.nan_to_num(4.0 * lit * (1.0 - lit)).astype(np.float32)[:, None]
         noise = equations.noise * equations.inverse_gain.astype(np.float32)
         floor = radiance_floor(radiance)
-        variance = (noise_model.model * radiance) ** 2 + (noise_model.edge * sun * penumbra) ** 2 + noise**2 + floor**2
+        variance = (own.model * radiance) ** 2 + (own.edge * sun * penumbra) ** 2 + noise**2 + floor**2
         equations.weight = np.where(equations.usable, 1.0 / variance, 0.0).astype(np.float32)
+        if photograph.confidence is not None:
+            equations.weight *= photograph.confidence[:, None]
         if robust:
             h = equations.inverse_gain.astype(np.float32)
             residual = (h * equations.picture - radiance) * np.sqrt(equations.weight)

@@ -34,7 +34,7 @@ class Footprints:
     Parameters
     ----------
     camera
-        The view.
+        The view; ``None`` where the pixels are the texels of a painted texture.
     shape
         Rows and columns of the texture.
     pixel
@@ -59,7 +59,7 @@ class Footprints:
         ``(n,)`` float32 farthest over nearest distance within the pixel.
     """
 
-    camera: Camera | Panorama
+    camera: Camera | Panorama | None
     shape: tuple[int, int]
     pixel: np.ndarray
     coverage: np.ndarray

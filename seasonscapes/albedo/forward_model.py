@@ -219,14 +219,14 @@ class CameraAtmosphere:
     Parameters
     ----------
     air
-        Terrain pixels and their distances.
+        Terrain pixels and their distances; ``None`` for a painted texture, which has no air in front.
     sky
         A sample of the open pixels.
     pixel_angle_deg
         Angle of a pixel at the image centre [°].
     """
 
-    air: AirGrid
+    air: AirGrid | None
     sky: SkyGrid
     pixel_angle_deg: float
 
@@ -249,6 +249,7 @@ def camera_atmosphere(footprints: Footprints, *, sky_pixels: int = 4000, seed: i
         All terrain pixels, and the drawn open pixels.
     """
     camera = footprints.camera
+    assert camera is not None, "a painted texture has no open pixels"
     covered = np.zeros(camera.width_px * camera.height_px, bool)
     covered[footprints.pixel] = True
     # Lens and JPEG blur terrain into the open pixels next to the skyline.
@@ -283,7 +284,7 @@ def aerial_perspective_of(
     tuple of numpy.ndarray
         Transmittance ``(n, 3)`` and airlight ``(n, 3)`` [cd/m²], float32; 1 and 0 without aerial perspective.
     """
-    if light.aerial_perspective is None:
+    if light.aerial_perspective is None or atmosphere.air is None:
         return np.ones((count, 3), np.float32), np.zeros((count, 3), np.float32)
     transmittance, airlight = interpolate_air(atmosphere.air, light.aerial_perspective)
     return np.ascontiguousarray(transmittance, np.float32), np.ascontiguousarray(airlight, np.float32)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import datetime
 
 import numpy as np
 
@@ -51,8 +52,34 @@ EIGHT_BIT = NoiseModel(levels=255)
 
 
 @dataclass(frozen=True)
+class TextureObservation:
+    """A painted texture in the place of a photograph; see `cameras.observation.Observation`, whose names it has.
+
+    Parameters
+    ----------
+    image
+        ``(R, S, 3)`` float32 radiance [cd/m²].
+    mask
+        ``(R, S)`` bool, True where it is painted.
+    time
+        Aware time.
+    webcam
+        Where it came from.
+    camera, pose_sigma
+        None, and nothing.
+    """
+
+    image: np.ndarray
+    mask: np.ndarray
+    time: datetime
+    webcam: str
+    camera: None = None
+    pose_sigma: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class AlbedoPhotograph:
-    """One photograph, its light, and the footprints of its pixels.
+    """One photograph or painted texture, its light, and the footprints of its pixels.
 
     Parameters
     ----------
@@ -66,14 +93,27 @@ class AlbedoPhotograph:
         Pixels of its camera at which aerial perspective and sky radiance are evaluated.
     gain
         ``(3,)`` known pixel value over radiance; ``None`` if exposure and white balance are unknown.
+    gain_sigma
+        Relative standard deviation of a known gain; 0 if it is exact.
+    confidence
+        ``(n,)`` factors of the inverse variance of its terrain pixels; ``None`` for 1.
+    noise_model
+        Its own standard deviations; ``None`` for those that all photographs share.
     """
 
-    observation: Observation
+    observation: Observation | TextureObservation
     light: Illumination
     footprints: Footprints
     number: int
     atmosphere: CameraAtmosphere
     gain: np.ndarray | None = None
+    gain_sigma: float = 0.0
+    confidence: np.ndarray | None = None
+    noise_model: NoiseModel | None = None
+
+    def noise(self, shared: NoiseModel) -> NoiseModel:
+        """Its own noise model, or the one that all share."""
+        return self.noise_model or shared
 
 
 def prepare_photographs(
@@ -167,12 +207,15 @@ def thinned_photographs(photographs: Sequence[AlbedoPhotograph], fraction: float
     if fraction >= 1.0:
         return list(photographs)
     rng = np.random.default_rng(seed)
-    thinned: dict[int, tuple[Footprints, CameraAtmosphere]] = {}
+    thinned: dict[int, tuple[Footprints, CameraAtmosphere, np.ndarray]] = {}
     result = []
     for photograph in photographs:
         if id(photograph.footprints) not in thinned:
-            part = thinned_footprints(photograph.footprints, rng.random(len(photograph.footprints.pixel)) < fraction)
-            thinned[id(photograph.footprints)] = (part, replace(camera_atmosphere(part), sky=photograph.atmosphere.sky))
-        footprints, atmosphere = thinned[id(photograph.footprints)]
-        result.append(replace(photograph, footprints=footprints, atmosphere=atmosphere))
+            keep = rng.random(len(photograph.footprints.pixel)) < fraction
+            part = thinned_footprints(photograph.footprints, keep)
+            atmosphere = replace(camera_atmosphere(part), sky=photograph.atmosphere.sky)
+            thinned[id(photograph.footprints)] = (part, atmosphere, keep)
+        footprints, atmosphere, keep = thinned[id(photograph.footprints)]
+        confidence = None if photograph.confidence is None else photograph.confidence[keep]
+        result.append(replace(photograph, footprints=footprints, atmosphere=atmosphere, confidence=confidence))
     return result

@@ -3,27 +3,27 @@
 from __future__ import annotations
 
 import time as clock
-from datetime import UTC
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from seasonscapes.commands.arguments import check_range, parse_size, parse_times
+from seasonscapes.commands.albedo_record import albedo_lines, albedo_record
+from seasonscapes.commands.arguments import check_choice, check_range, parse_painted, parse_size, parse_times
 from seasonscapes.commands.console import message, print_result, progress_bars
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
 from seasonscapes.commands.outputs import check_output
 from seasonscapes.errors import InputError
 
 if TYPE_CHECKING:
-    from seasonscapes.workflows.albedo_recovery import RecoveredAlbedo
+    from seasonscapes.cameras.observation import Observation
     from seasonscapes.workflows.photograph_files import PhotographSources
 
 
 def albedo_command(
     scene: str,
     *,
-    times: str,
+    times: str | None = None,
     manifest: Path | None = None,
     calibrations: Path = Path("out/calibration"),
     masks: Path | None = None,
@@ -31,9 +31,10 @@ def albedo_command(
     doubtful_poses: bool = False,
     synthetic_webcams: bool = False,
     size: str = "384x256",
+    method: str = "closed",
+    painted: tuple[str, ...] = (),
     fit_haze: bool = False,
     fit_curve: bool = False,
-    iterations: int = 0,
     output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("out/albedo.npz"),
     sky: SkyOptions | None = None,
     place: PlaceOptions | None = None,
@@ -49,7 +50,7 @@ def albedo_command(
     scene
         A scene file, or the name of a bundled scene (alpine).
     times
-        Instants with commas between, or a file with one in each line; ISO 8601. One season at a time.
+        Of photographs: instants with commas between, or a file with one in each line; ISO 8601. One season at a time.
     manifest
         The .csv that `seasonscapes webcams --manifest` wrote.
     calibrations
@@ -64,12 +65,15 @@ def albedo_command(
         Photograph a synthetic scene from its own cameras instead of reading pictures; the error is then known and printed.
     size
         Of --synthetic-webcams: WIDTHxHEIGHT.
+    method
+        closed (light, air, response and poses are given), or differentiable (haze, exposures, response, clouds before
+        the sun and poses are unknowns too; takes minutes the first time).
+    painted
+        TIME=FILE, may be repeated: what `seasonscapes paint` wrote for a time, as a further observation.
     fit_haze
-        Search the visibility that explains the pictures best (takes minutes the first time).
+        With closed: search the visibility that explains the pictures best (takes minutes the first time).
     fit_curve
-        Search the webcams' tone curve.
-    iterations
-        Iterations of differentiable rendering after the closed form.
+        With closed: search the webcams' tone curve.
     output
         A .npz with albedo, standard error, times sunlit and source of each texel; pictures go beside it.
     json
@@ -79,50 +83,51 @@ def albedo_command(
     start = clock.perf_counter()
     check_output(output, (".npz",))
     check_range("--within-min", within_min, 0.0, 1e6)
-    check_range("--iterations", iterations, 0, 100_000)
     from seasonscapes.rendering.backend import use_backend
     from seasonscapes.workflows import albedo_recovery as recovery
-    from seasonscapes.workflows.photograph_files import photographs_at
-    from seasonscapes.workflows.recovery_plan import MOST_PIXELS, plan_recovery
-    from seasonscapes.workflows.synthetic_photographs import synthetic_observations
+    from seasonscapes.workflows.recovery_methods import METHODS
+    from seasonscapes.workflows.recovery_plan import plan_recovery
 
+    check_choice("--method", method, METHODS)
+    if method != "closed" and (fit_haze or fit_curve):
+        cure = f"--method {method} finds haze and response itself"
+        raise InputError("--fit-haze" if fit_haze else "--fit-curve", "belongs to --method closed", cure=cure)
     model, size_px = sky.model(), parse_size(size)
-    use_backend(gradients=iterations > 0)
+    use_backend()
     with progress_bars() as progress:
-        sources, texel_m = None, recovery.TEXEL_M
-        if not synthetic_webcams:
+        # Paintings have the atlas that `paint` chooses.
+        sources, texel_m = None, None if painted else recovery.TEXEL_M
+        if not synthetic_webcams and not (painted and manifest is None and times is None):
             sources = _sources(manifest, calibrations, masks, options.allow_outside, doubtful_poses)
             plan = plan_recovery(scene, sources, texel_m=options.texel_m, allow_outside=options.allow_outside)
             message(f"plan: {plan}")
-            texel_m = plan.texel_m
+            texel_m = None if painted else plan.texel_m
         loaded = options.load(scene, progress, texel_m=texel_m)
-        utc = parse_times("--times", times, loaded.frame.latitude_deg, loaded.frame.longitude_deg)
-        if sources is None:
-            photographs = synthetic_observations(loaded, utc, model, size_px=size_px, progress=progress)
-        else:
-            photographs = photographs_at(
-                loaded, sources, utc, within_min=within_min, most_pixels=MOST_PIXELS, progress=progress
-            )
-        how = recovery.RecoveryOptions(fit_haze, fit_curve, iterations)
-        recovered = recovery.recover_albedo(loaded, photographs, sky=model, options=how, progress=progress)
+        at = (loaded.frame.latitude_deg, loaded.frame.longitude_deg)
+        paintings = [parse_painted(text, *at) for text in painted]
+        photographs = []
+        if sources is not None or synthetic_webcams:
+            if times is None:
+                raise InputError("--times", "missing", expected="the instants of the photographs")
+            utc = parse_times("--times", times, *at)
+            photographs = _photographs(loaded, sources, utc, model, size_px, within_min, progress)
+        how = recovery.RecoveryOptions(fit_haze, fit_curve, method)
+        recovered = recovery.recover_albedo(
+            loaded, photographs, sky=model, options=how, painted=paintings, progress=progress
+        )
     recovered.save(output)
-    record: dict[str, Any] = {
-        "output": str(output),
-        "scene": loaded.scene.name,
-        "photographs": len(recovered.photographs),
-        "times_utc": [time.astimezone(UTC).isoformat() for time in utc],
-        "measured_share": float((recovered.estimate.source == 1).mean()),
-        "completed_share": float((recovered.estimate.source == 2).mean()),
-        "residual": [round(float(value), 4) for value in recovered.fit.residual],
-        "gains": recovered.fit.gains.tolist(),
-        **recovered.facts,
-        "figures": recovery.save_albedo_figures(loaded, recovered, output),
-        "attribution": loaded.scene.attribution,
-        "seconds": round(clock.perf_counter() - start, 1),
-    }
-    if loaded.synthetic is not None:
-        record |= recovery.error_against_truth(loaded, recovered)
-    print_result(record, _lines(record, recovered), as_json=json)
+    record = albedo_record(loaded, recovered, output) | {"seconds": round(clock.perf_counter() - start, 1)}
+    print_result(record, albedo_lines(record, recovered), as_json=json)
+
+
+def _photographs(loaded, sources, utc, model, size_px, within_min: float, progress) -> list[Observation]:
+    from seasonscapes.workflows.photograph_files import photographs_at
+    from seasonscapes.workflows.recovery_plan import MOST_PIXELS
+    from seasonscapes.workflows.synthetic_photographs import synthetic_observations
+
+    if sources is None:
+        return synthetic_observations(loaded, utc, model, size_px=size_px, progress=progress)
+    return photographs_at(loaded, sources, utc, within_min=within_min, most_pixels=MOST_PIXELS, progress=progress)
 
 
 def _sources(
@@ -134,16 +139,3 @@ def _sources(
         expected, cure = "the .csv of seasonscapes webcams --manifest", "for a synthetic scene: --synthetic-webcams"
         raise InputError("--manifest", "missing", expected=expected, cure=cure)
     return PhotographSources(manifest, calibrations, masks, allow_outside, doubtful_poses)
-
-
-def _lines(record: dict[str, Any], recovered: RecoveredAlbedo) -> list[str]:
-    observations = [photograph.observation for photograph in recovered.photographs]
-    lines = [
-        f"{each.webcam:<16} {each.time:%Y-%m-%d %H:%M} UTC  residual {residual:.1%}"
-        for each, residual in zip(observations, record["residual"], strict=True)
-    ]
-    lines.append(f"{record['measured_share']:.1%} of the texture measured, {record['completed_share']:.1%} completed")
-    if "true_psnr_db" in record:
-        error = f"{record['true_psnr_db']} dB, relative error {record['true_relative_error']:.1%}"
-        lines.append(f"against the truth, where measured: {error}")
-    return [*lines, record["output"], *record["figures"].values()]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from seasonscapes.commands.arguments import parse_sun, parse_time
+from seasonscapes.commands.arguments import check_range, parse_sun, parse_time
 from seasonscapes.commands.console import message, print_result, progress_bars
 from seasonscapes.commands.delight_mesh import delight_mesh_file, require_no_scene_flags
 from seasonscapes.commands.mesh_options import MESH_SUFFIXES, MeshFileFlags, MeshFlags
@@ -28,6 +28,7 @@ def delight_command(
     sun: str | None = None,
     image: Path | None = None,
     sensor_height_m: float | None = None,
+    land_classes: int = 0,
     output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("out/albedo.npz"),
     sky: SkyOptions | None = None,
     place: PlaceOptions | None = None,
@@ -52,6 +53,9 @@ def delight_command(
     sensor_height_m
         Height of the aeroplane or satellite above sea level, if the air below it is still in the image. Orthophotos
         and mosaics are mostly corrected for it.
+    land_classes
+        Find so many classes of land (2 to 20) in the image by their colours, and fit the response of each to direct
+        light: forests and crops are not Lambertian. Default 0: all land is.
     output
         .npz (albedo, σ, source and visibility of the sun of each texel), .png or .exr (albedo and σ); all of
         them can be given back with --albedo DATE=FILE. Of a mesh: .glb, or the same kind of file with the same
@@ -62,7 +66,7 @@ def delight_command(
     start = clock.perf_counter()
     sky, options = sky or SkyOptions(), place or PlaceOptions()
     if Path(source).suffix.lower() in MESH_SUFFIXES:
-        require_no_scene_flags(place, image=image, sensor_height_m=sensor_height_m)
+        require_no_scene_flags(place, image=image, sensor_height_m=sensor_height_m, land_classes=land_classes)
         flags, written = mesh or MeshFlags(), files or MeshFileFlags()
         delight_mesh_file(
             Path(source), output, (time, sun), mesh=flags, files=written, sky=sky, place=options, json=json
@@ -73,6 +77,8 @@ def delight_command(
     check_output(output, (".npz", ".png", ".exr"))
     if (time is None) == (sun is None):
         raise InputError("--time", "give either --time (or --time unknown) or --sun AZIMUTH,ELEVATION")
+    if land_classes != 0:
+        check_range("--land-classes", land_classes, 2, 20)
     angles = None if sun is None else parse_sun(sun)
     from seasonscapes.workflows.delighting import UNKNOWN, delit_imagery
 
@@ -86,7 +92,8 @@ def delight_command(
             assert time is not None  # one of them was given
             known = time != UNKNOWN
             when = parse_time(time, loaded.frame.latitude_deg, loaded.frame.longitude_deg) if known else UNKNOWN
-        result = delit_imagery(loaded, when, image=image, sky=model, sensor_height_m=sensor_height_m, progress=progress)
+        chosen: dict[str, Any] = {"sensor_height_m": sensor_height_m, "land_classes": land_classes}
+        result = delit_imagery(loaded, when, image=image, sky=model, progress=progress, **chosen)
     record: dict[str, Any] = {
         "output": str(output),
         "scene": loaded.scene.name,
@@ -137,4 +144,7 @@ def _tell(result: DelitScene) -> None:
         message(f"the image lay {facts['shift_texels'][0]:+.2f} rows, {facts['shift_texels'][1]:+.2f} columns off")
     factors = ", ".join(f"{value:.2f}" for value in facts["sky_factor"])
     message(f"skylight of the image over the sky model's: {factors}")
+    if "class_exponents" in facts:
+        classes = "; ".join("/".join(f"{value:.2f}" for value in row) for row in facts["class_exponents"])
+        message(f"direct light counts by cos^k of its incidence, k (red/green/blue) of the classes: {classes}")
     message("exposure unknown: the image's white counts as level ground of the scene's reflectance_scale in that light")

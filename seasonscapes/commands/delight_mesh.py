@@ -31,11 +31,12 @@ def delight_mesh_file(
     if hour[0] == "unknown":
         raise InputError("--time", "the sun of a mesh is not searched for", cure="give its time, or --sun AZ,EL")
     model = sky.model()
-    loaded = mesh.load(source, allow_outside=place.allow_outside, place_needed=hour[0] is not None)
+    standing = mesh.place(place.folder(), allow_outside=place.allow_outside)
+    loaded = mesh.load(source, allow_outside=place.allow_outside, place_needed=hour[0] is not None, on=standing)
     files.check(output, loaded)
     when = hour_on(loaded, *hour)
     with progress_bars() as progress:
-        around = mesh.around(model, place.folder())
+        around = mesh.around(model, place.folder(), loaded, standing)
         delit = delight_mesh(loaded, when, surroundings=around, options=mesh.delighting(), progress=progress)
     record = delit.facts | {"output": str(output), "rays": mesh.rays, "seed": mesh.seed}
     if files.textures is None:
@@ -55,9 +56,11 @@ def delight_mesh_file(
     print_result(record, [f"{output}  ({facts})"], as_json=json)
 
 
-def require_no_scene_flags(place: PlaceOptions | None, *, image: Path | None, sensor_height_m: float | None) -> None:
+def require_no_scene_flags(
+    place: PlaceOptions | None, *, image: Path | None, sensor_height_m: float | None, land_classes: int
+) -> None:
     """`InputError` for flags of scenes beside a mesh."""
     about_files = PlaceOptions(workspace=place.workspace, allow_outside=place.allow_outside) if place else None
-    if image is not None or sensor_height_m is not None or place != about_files:
-        cure = "leave out --image, --sensor-height-m, --mesher, --atlas and such"
+    if image is not None or sensor_height_m is not None or land_classes or place != about_files:
+        cure = "leave out --image, --sensor-height-m, --land-classes, --mesher, --atlas and such"
         raise InputError("delight", "flags of scenes beside a mesh", cure=cure)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from seasonscapes.sky.models import SkyModel
     from seasonscapes.terrain.textured_mesh import TexturedMesh
     from seasonscapes.workflows.meshes import MeshSurroundings, Time
+    from seasonscapes.workflows.place import Place
     from seasonscapes.workspace import Workspace
 
 
@@ -44,21 +45,34 @@ class MeshFlags:
     """Whether there is such ground, or the mesh hangs in the air."""
     white_reflectance: float = 0.5
     """Where light is taken out: reflectance of level ground that is white (value 1) in the textures."""
+    on: str | None = None
+    """Scene on whose terrain the mesh stands, instead of level ground; --at without a height is on its ground."""
     rays: int = 256
     """Over the hemisphere of each texel or pixel, a power of two."""
     seed: int = 0
     """Equal seeds give equal results."""
 
-    def load(self, path: Path, *, allow_outside: bool, place_needed: bool) -> TexturedMesh:
+    def place(self, workspace: Workspace, *, allow_outside: bool) -> Place | None:
+        """The place that the mesh stands on."""
+        from seasonscapes.workflows.place import load_place
+
+        if self.on is not None and not self.ground:
+            raise InputError("--on", "and --no-ground exclude each other", cure="drop one of them")
+        return None if self.on is None else load_place(self.on, workspace, allow_outside=allow_outside)
+
+    def load(self, path: Path, *, allow_outside: bool, place_needed: bool, on: Place | None = None) -> TexturedMesh:
         """The mesh, placed; what may not be meant is printed."""
         from seasonscapes.terrain.mesh_placing import MeshPlacing
         from seasonscapes.workflows.meshes import load_mesh
+        from seasonscapes.workflows.place import ground_height_m
 
         at = None
         if self.at is not None:
             latitude, longitude, height, _ = parse_at(self.at)
+            if height is None and on is not None:
+                height = ground_height_m(on, latitude, longitude, where="--at")
             at = (latitude, longitude, height or 0.0)
-        elif place_needed and self.crs is None:
+        elif (place_needed or on is not None) and self.crs is None:
             cure = "or --crs with --offset; or give the sun as --sun AZIMUTH,ELEVATION"
             raise InputError("--at", "missing: the sun of an hour depends on the place", expected="LAT,LON", cure=cure)
         placing = MeshPlacing(
@@ -77,12 +91,14 @@ class MeshFlags:
         check_range("--white-reflectance", self.white_reflectance, 0.01, 2.0)
         return DelightOptions(white_reflectance=self.white_reflectance)
 
-    def around(self, sky: SkyModel, workspace: Workspace) -> MeshSurroundings:
+    def around(self, sky: SkyModel, workspace: Workspace, mesh: TexturedMesh, on: Place | None) -> MeshSurroundings:
         """Ground and sky."""
+        from seasonscapes.workflows.mesh_ground import scene_ground
         from seasonscapes.workflows.meshes import MeshSurroundings
 
         ground = self.ground_albedo if self.ground else None
-        return MeshSurroundings(ground, sky, self.rays, workspace, self.seed)
+        terrain = None if on is None else scene_ground(on, mesh)
+        return MeshSurroundings(ground, sky, self.rays, workspace, self.seed, terrain)
 
 
 def three_numbers(flag: str, text: str | None) -> tuple[float, float, float] | None:

@@ -90,7 +90,10 @@ def relight_command(
     check_file_or_folder(output)
     pictures = _pictures_wanted(output, files, film=when is not None, turntable=turntable)
     by_hour = time is not None or when is not None or taken is not None
-    loaded = flags.load(source, allow_outside=allow_outside, place_needed=by_hour)
+    folder = default_workspace() if workspace is None else Workspace(workspace)
+    use_backend(device)
+    standing = flags.place(folder, allow_outside=allow_outside)
+    loaded = flags.load(source, allow_outside=allow_outside, place_needed=by_hour, on=standing)
     if not pictures:
         files.check(output, loaded)
     cameras = view.cameras(loaded, turntable)
@@ -99,8 +102,7 @@ def relight_command(
         raise InputError("--time", "and --from … --to name two sets of hours", cure="drop one of them")
     at = (loaded.frame.latitude_deg, loaded.frame.longitude_deg)
     hours: list[Time] = [hour_on(loaded, time, sun)] if when is None else [*when.instants(*at)]
-    use_backend(device)
-    around = flags.around(sky.model(), default_workspace() if workspace is None else Workspace(workspace))
+    around = flags.around(sky.model(), folder, loaded, standing)
     with progress_bars() as progress:
         if before is None:
             message("the textures are taken for albedo; give --taken T if the light of an hour is in them")

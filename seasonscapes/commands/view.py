@@ -21,6 +21,7 @@ def view_command(
     camera: str | None = None,
     time: str | None = None,
     albedo: list[str] | None = None,
+    gaussians: Path | None = None,
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
     single_file: Path | None = None,
     port: int = 0,
@@ -41,6 +42,8 @@ def view_command(
         The instant that is shown at first: ISO 8601; without an offset it is civil time at the place.
     albedo
         DATE=FILE, may be repeated: albedos of a date instead of the scene's own (.npz; or .png, .exr, .glb of this atlas).
+    gaussians
+        A model of `seasonscapes distill`: the page shows it beside the mesh, lit for the hour.
     output
         Write a static folder for any web host instead of serving.
     single_file
@@ -68,11 +71,14 @@ def view_command(
     model, options = (sky or SkyOptions()).model(), place or PlaceOptions()
     files = [parse_albedo(text) for text in albedo or ()]
     viewer.require_vectorised()
+    distilled = _read_gaussians(gaussians)
     with progress_bars() as progress:
         loaded = options.load(scene, progress, albedo=[each.path for each in files])
         first = viewer.first_view(loaded, camera, time)
         series = AlbedoSeries(tuple(dated_albedos(loaded, files))) if files else None
         shown = viewer_scene(loaded, albedo=series, sky=model, progress=progress)
+        if distilled is not None:
+            shown = viewer.with_gaussians(shown, distilled, loaded)
     record: dict[str, Any] = {"scene": loaded.scene.name, "attribution": loaded.scene.attribution, **first}
     lines = []
     if output is not None:
@@ -87,6 +93,18 @@ def view_command(
         print_result(record, lines, as_json=json)
         return
     _serve(shown, first, port, open)
+
+
+def _read_gaussians(path: Path | None) -> Any:
+    """A model of Gaussians; ``None`` without a path."""
+    if path is None:
+        return None
+    from seasonscapes.workflows.distillation import require_torch
+
+    require_torch()
+    from seasonscapes.gaussians.model import load_model
+
+    return load_model(path)
 
 
 def _serve(scene: Any, first: dict[str, Any], port: int, open_browser: bool) -> None:

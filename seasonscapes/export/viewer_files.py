@@ -12,7 +12,7 @@ import io
 import json
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -23,8 +23,10 @@ from seasonscapes.images import linear_from_srgb, srgb8_from_linear
 
 PAGE = Path(__file__).parents[1] / "viewer_page"
 PROGRAM, STYLE, NOTICES = "viewer.js", "viewer.css", "NOTICES.txt"
+GAUSSIANS = "gaussians.bin"
 _FORMAT = 1
-_KINDS = {"uint8": "u8", "uint16": "u16", "float16": "f16", "float32": "f32"}
+_KINDS = {"uint8": "u8", "uint16": "u16", "float16": "f16", "float32": "f32", "int32": "i32", "float64": "f64"}
+_TILE_ARRAYS = ("keys", "heights", "low_m", "scale_m")
 _QUALITY = 82
 
 
@@ -51,6 +53,39 @@ class AlbedoPicture:
 
 
 @dataclass(frozen=True)
+class HeightTiles:
+    """T tiles of heights that are finer than the page's grid.
+
+    Parameters
+    ----------
+    cells
+        Cells along a side of a tile.
+    keys
+        ``(T, 3)`` int32: level L (the grid's step over 2^L), column and row of tiles from the south-west.
+    heights
+        ``(T, cells + 3, cells + 3)`` uint16, row 0 in the south, one node more on each side than the tile.
+    low_m, scale_m
+        ``(T,)``: a height is low + stored · scale [m].
+    """
+
+    cells: int
+    keys: np.ndarray
+    heights: np.ndarray
+    low_m: np.ndarray
+    scale_m: np.ndarray
+
+    def files(self) -> dict[str, bytes]:
+        """The tiles as files by name."""
+        little = self.heights.astype("<u2", copy=False)
+        return {f"tile-{level}-{c}-{r}.bin": little[k].tobytes() for k, (level, c, r) in enumerate(self.keys.tolist())}
+
+    def about(self) -> dict[str, Any]:
+        """What the page knows of the tiles before it loads one."""
+        rows = zip(self.keys.tolist(), self.low_m.tolist(), self.scale_m.tolist(), strict=True)
+        return {"cells": self.cells, "list": [[*key, round(low, 4), float(f"{scale:.9g}")] for key, low, scale in rows]}
+
+
+@dataclass(frozen=True)
 class ViewerScene:
     """Everything that the page knows of a place.
 
@@ -59,14 +94,20 @@ class ViewerScene:
     about
         Plain values: names, frame, grid, cameras, sky.
     arrays
-        Arrays by name; uint8, uint16, float16 or float32.
+        Arrays by name; uint8, uint16, float16 or float32, which the page reads.
     albedo
         Pictures of the albedo by date.
+    gaussians
+        Facts and arrays of a distilled model, which the page reads when it is asked for.
+    tiles
+        Finer heights, which the page reads near its viewer; single files have none.
     """
 
     about: dict[str, Any]
     arrays: dict[str, np.ndarray]
     albedo: Sequence[AlbedoPicture]
+    gaussians: tuple[dict[str, Any], dict[str, np.ndarray]] | None = None
+    tiles: HeightTiles | None = None
 
 
 def albedo_picture(day: date, values: np.ndarray, *, quality: int = _QUALITY) -> AlbedoPicture:
@@ -107,6 +148,7 @@ def viewer_files(scene: ViewerScene, *, view: dict[str, Any] | None = None) -> d
         "scene.json": description.encode(),
         "scene.bin": binary,
         **pictures,
+        **(scene.tiles.files() if scene.tiles is not None else {}),
     }
 
 
@@ -120,7 +162,7 @@ def single_file(scene: ViewerScene, *, view: dict[str, Any] | None = None) -> by
     view
         As in `viewer_files`.
     """
-    description, binary, pictures = _packed(scene, view)
+    description, binary, pictures = _packed(replace(scene, tiles=None), view)
     program = (PAGE / PROGRAM).read_text(encoding="utf-8").replace("</script", "<\\/script")
     style = (PAGE / STYLE).read_text(encoding="utf-8")
     policy = (
@@ -160,13 +202,8 @@ def _page(scene: ViewerScene, policy: str, style: str, program: str, data: str) 
 
 
 def _packed(scene: ViewerScene, view: dict[str, Any] | None) -> tuple[str, bytes, dict[str, bytes]]:
-    """The description as JSON, the arrays one behind the other, and the pictures by name."""
-    binary, table = bytearray(), {}
-    for name, values in scene.arrays.items():
-        binary += b"\0" * (-len(binary) % 4)
-        kind = _KINDS[values.dtype.name]
-        table[name] = {"offset": len(binary), "shape": list(values.shape), "type": kind}
-        binary += np.ascontiguousarray(values).astype(values.dtype.newbyteorder("<"), copy=False).tobytes()
+    """The description as JSON, the arrays one behind the other, and by name the pictures and the Gaussians."""
+    binary, table = _binary(scene.arrays)
     pictures, dated = {}, []
     for picture in scene.albedo:
         name = f"albedo-{picture.day.isoformat()}.webp"
@@ -174,12 +211,32 @@ def _packed(scene: ViewerScene, view: dict[str, Any] | None) -> tuple[str, bytes
         entry = {"date": picture.day.isoformat(), "file": name, "size_px": list(picture.size_px)}
         dated.append(entry | {"gain_rgb": [round(gain, 5) for gain in picture.gain_rgb]})
     description = {"format": _FORMAT, **scene.about, "arrays": table, "albedo": dated, "view": view or {}}
-    return json.dumps(description, separators=(",", ":"), allow_nan=False), bytes(binary), pictures
+    if scene.gaussians is not None:
+        facts, layer = scene.gaussians
+        pictures[GAUSSIANS], entries = _binary(layer)
+        description["gaussians"] = {**facts, "file": GAUSSIANS, "arrays": entries}
+    if scene.tiles is not None:
+        description["tiles"] = scene.tiles.about()
+    return json.dumps(description, separators=(",", ":"), allow_nan=False), binary, pictures
+
+
+def _binary(arrays: dict[str, np.ndarray]) -> tuple[bytes, dict[str, Any]]:
+    """Arrays one behind the other, and where each lies."""
+    binary, table = bytearray(), {}
+    for name, values in arrays.items():
+        binary += b"\0" * (-len(binary) % 4)
+        kind = _KINDS[values.dtype.name]
+        table[name] = {"offset": len(binary), "shape": list(values.shape), "type": kind}
+        binary += np.ascontiguousarray(values).astype(values.dtype.newbyteorder("<"), copy=False).tobytes()
+    return bytes(binary), table
 
 
 def save_scene(scene: ViewerScene, path: Path) -> None:
-    """Write a scene to one file."""
-    description, binary, pictures = _packed(scene, None)
+    """Write a scene without its Gaussians to one file."""
+    arrays = dict(scene.arrays)
+    if scene.tiles is not None:
+        arrays |= {f"tiles.{name}": getattr(scene.tiles, name) for name in _TILE_ARRAYS}
+    description, binary, pictures = _packed(replace(scene, arrays=arrays, gaussians=None, tiles=None), None)
     names = list(pictures)
     head = json.dumps([description, len(binary), [[name, len(pictures[name])] for name in names]]).encode()
     path.write_bytes(struct.pack("<Q", len(head)) + head + binary + b"".join(pictures[name] for name in names))
@@ -207,4 +264,6 @@ def load_scene(path: Path) -> ViewerScene:
         albedo.append(picture)
         start += bytes_
     del about["format"], about["view"]
-    return ViewerScene(about, arrays, albedo)
+    tiles = {name: arrays.pop(f"tiles.{name}") for name in _TILE_ARRAYS if f"tiles.{name}" in arrays}
+    kept = HeightTiles(tiles["heights"].shape[1] - 3, **tiles) if tiles else None
+    return ViewerScene(about, arrays, albedo, tiles=kept)

@@ -40,6 +40,29 @@ class Tile:
 
 
 @dataclass(frozen=True)
+class MeshGround:
+    """Ground that a mesh stands on: G triangles with a texture.
+
+    Parameters
+    ----------
+    position, normal
+        ``(G, 3, 3)`` corners in the mesh's east-north-up frame [m], and unit normals there.
+    uv
+        ``(G, 3, 2)`` texture coordinates in [0, 1]; v points upwards.
+    albedo
+        ``(R, S, 3)`` texture.
+    name
+        What reports call it.
+    """
+
+    position: np.ndarray
+    normal: np.ndarray
+    uv: np.ndarray
+    albedo: np.ndarray
+    name: str
+
+
+@dataclass(frozen=True)
 class _Corners:
     """Corners of F faces.
 
@@ -81,7 +104,7 @@ class MeshAtlas:
     chart
         ``(R, S)`` int32 charts, −1 off the surface: neighbouring texels of one chart adjoin on the surface.
     fixed
-        Tiles that are no texture: index among ``tiles`` and colour ``(3,)``.
+        Tiles that are no texture of the mesh: index among ``tiles`` and colour ``(3,)``, or that of each texel.
     notes
         What was found that may not be meant, one line each.
     """
@@ -151,15 +174,15 @@ class MeshAtlas:
         return result
 
 
-def mesh_atlas(mesh: TexturedMesh, *, ground_albedo: float | None) -> MeshAtlas:
-    """Place all textures of a mesh in one image, and the mesh on level ground.
+def mesh_atlas(mesh: TexturedMesh, *, ground: float | MeshGround | None) -> MeshAtlas:
+    """Place all textures of a mesh in one image, and the mesh on ground.
 
     Parameters
     ----------
     mesh
         The mesh.
-    ground_albedo
-        Albedo of level ground at the mesh's lowest point; ``None`` for no ground.
+    ground
+        Albedo of level ground at the mesh's lowest point; or other ground; ``None`` for none.
 
     Returns
     -------
@@ -173,10 +196,15 @@ def mesh_atlas(mesh: TexturedMesh, *, ground_albedo: float | None) -> MeshAtlas:
     """
     colours = [np.asarray(part.colour, np.float32) for part in mesh.parts if part.texture < 0]
     uniform = [np.clip(colour, 0.0, 1.0) for colour in colours]
-    if ground_albedo is not None:
-        uniform.append(np.full(3, ground_albedo, np.float32))
     sizes, blocks = _tile_sizes(mesh)
-    tiles, shape = _shelves(sizes + [(2, 2)] * len(uniform))
+    plain = [(2, 2)] * len(uniform)
+    if isinstance(ground, MeshGround):
+        uniform.append(np.asarray(ground.albedo, np.float32))
+        plain.append((ground.albedo.shape[0], ground.albedo.shape[1]))
+    elif ground is not None:
+        uniform.append(np.full(3, ground, np.float32))
+        plain.append((2, 2))
+    tiles, shape = _shelves(sizes + plain)
     fixed = tuple((len(sizes) + index, colour) for index, colour in enumerate(uniform))
     corners, notes = _corners(mesh, tiles, len(sizes), blocks)
     for index, texture in enumerate(mesh.textures):
@@ -194,9 +222,10 @@ def mesh_atlas(mesh: TexturedMesh, *, ground_albedo: float | None) -> MeshAtlas:
     if shared:
         notes.append(f"{shared} texels are used by several faces; their light is that of one of them")
     vectors = [corners.position, corners.normal, corners.xy]
-    if ground_albedo is not None:
-        ground = _ground(corners.position, tiles[-1])
-        vectors = [np.concatenate(pair) for pair in zip(vectors, ground, strict=True)]
+    if ground is not None:
+        level = not isinstance(ground, MeshGround)
+        below = _ground(corners.position, tiles[-1]) if level else _given_ground(ground, tiles[-1])
+        vectors = [np.concatenate(pair) for pair in zip(vectors, below, strict=True)]
     rows = np.concatenate(vectors, axis=2).reshape(-1, 8).astype(np.float32)
     first, number = numbered_rows(rows)
     size = np.array([shape[1], shape[0]])
@@ -383,6 +412,14 @@ def _charts(corners: _Corners) -> np.ndarray:
     count = int(corner.max()) + 1
     _, label = connected_components(coo_matrix((np.ones(len(one)), (one, other)), (count, count)), directed=False)
     return label[corner[:, 0]].astype(np.int32)
+
+
+def _given_ground(ground: MeshGround, tile: Tile) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Corners, normals and coordinates of ground with a texture."""
+    xy = np.stack(
+        [tile.column + ground.uv[..., 0] * tile.columns, tile.row + (1.0 - ground.uv[..., 1]) * tile.rows], axis=2
+    )
+    return ground.position, ground.normal, xy
 
 
 def _ground(corners: np.ndarray, tile: Tile) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

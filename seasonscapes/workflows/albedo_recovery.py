@@ -19,13 +19,21 @@ from seasonscapes.progress import Progress, task_progress
 from seasonscapes.sky.models import SkyModel, with_overrides
 from seasonscapes.terrain.surface import Texture
 from seasonscapes.workflows.albedo_sources import orthoimage, scene_albedo
-from seasonscapes.workflows.illumination import illumination_for_camera, sky_model
+from seasonscapes.workflows.illumination import sky_model
 from seasonscapes.workflows.place import MeshOptions, Place
+from seasonscapes.workflows.recovery_methods import (
+    METHODS,
+    PaintedTexture,
+    closed_fit,
+    illuminations,
+    joint_fit,
+    painted_photographs,
+)
 
 if TYPE_CHECKING:
     from seasonscapes.albedo.closed_form import AlbedoFit
     from seasonscapes.albedo.forward_model import TexelTransport
-    from seasonscapes.albedo.photographs import AlbedoPhotograph
+    from seasonscapes.albedo.photographs import AlbedoPhotograph, TextureObservation
     from seasonscapes.albedo.seasons import DatedAlbedo
     from seasonscapes.albedo.standard_error import AlbedoEstimate
     from seasonscapes.cameras.observation import Observation
@@ -46,22 +54,35 @@ class RecoveryOptions:
     Parameters
     ----------
     fit_haze
-        Search the visibility that explains the photographs best.
+        Search the visibility that explains the photographs best, before the closed form.
     fit_curve
-        Search the strength of the cameras' tone curve.
-    iterations
-        Iterations of differentiable rendering after the closed form; 0 for none.
+        Search the strength of the cameras' tone curve, before the closed form.
+    method
+        ``closed``: light, air, response and poses are given (or searched, see above). ``differentiable``: haze, exposures,
+        each camera's response, clouds before the sun and poses within their standard deviations are unknowns beside the
+        albedo; the closed form is its start, and stays where it explains held-out photographs better.
+
+    Raises
+    ------
+    ValueError
+        For an unknown method, or a search beside the method that contains it.
 
     Examples
     --------
     >>> import seasonscapes as ss
-    >>> ss.RecoveryOptions(fit_haze=True).iterations
-    0
+    >>> ss.RecoveryOptions(fit_haze=True).method
+    'closed'
     """
 
     fit_haze: bool = False
     fit_curve: bool = False
-    iterations: int = 0
+    method: str = "closed"
+
+    def __post_init__(self):
+        if self.method not in METHODS:
+            raise ValueError(f"RecoveryOptions: method: got {self.method!r}, expected one of {', '.join(METHODS)}")
+        if self.method != "closed" and (self.fit_haze or self.fit_curve):
+            raise ValueError("RecoveryOptions: fit_haze and fit_curve belong to the closed form")
 
 
 @dataclass(frozen=True)
@@ -75,13 +96,13 @@ class RecoveredAlbedo:
     estimate
         Albedo ``(R, S, 3)``, standard error, times sunlit and source (1 measured, 2 completed) of each texel.
     fit
-        The closed-form (or refined) fit: gains, residuals.
+        The fit: gains, residuals.
     photographs
         The photographs used, with their light.
     atlas_id
         Identity of the UV atlas.
     facts
-        Plain values: fitted visibility and tone curve.
+        Plain values: what was fitted besides.
     mesh
         How the terrain and its atlas were built.
     """
@@ -137,6 +158,7 @@ def recover_albedo(
     *,
     sky: str | Path | SkyModel = "clear",
     options: RecoveryOptions | None = None,
+    painted: Sequence[PaintedTexture] = (),
     progress: Progress | None = None,
 ) -> RecoveredAlbedo:
     """Recover the albedo of a place from photographs of several hours of one season, whose light is known.
@@ -149,11 +171,14 @@ def recover_albedo(
     place
         The place.
     photographs
-        Such as `open_photographs` gives; their cameras are converted to the place's frame.
+        Such as `open_photographs` gives; their cameras are converted to the place's frame. May be none beside paintings.
     sky
         The sky model of all photographs.
     options
-        What to fit besides the albedo.
+        The method, and what to fit besides the albedo.
+    painted
+        Painted textures of some of the hours, as further observations. A painting of photographs that are given as well
+        counts them twice.
     progress
         Called with a task and its finished share.
 
@@ -172,7 +197,7 @@ def recover_albedo(
     Notes
     -----
     Robust (Cauchy) least squares in image space over all photographs with per-texel daylight coefficients; exposures
-    come from the sky in each photograph. See `albedo.closed_form`.
+    come from the sky in each photograph. See `albedo.closed_form` and `albedo.joint_recovery`.
 
     Examples
     --------
@@ -191,17 +216,23 @@ def recover_albedo(
     from seasonscapes.rendering.backend import use_backend
 
     options, model = options or RecoveryOptions(), sky_model(sky)
-    use_backend(gradients=options.iterations > 0)
+    use_backend()
     in_frame = [replace(each, camera=view_in_frame(each.camera, place.frame)) for each in photographs]
     transport, prepared, facts = _prepared(place, in_frame, model, options, progress)
-    fit, known = _solved(place, transport, prepared, options.iterations, progress)
+    prepared = [*prepared, *painted_photographs(place, transport, painted, model)]
+    if options.method == "closed":
+        fit = closed_fit(transport, prepared, progress)
+    else:
+        joint, found = joint_fit(place, transport, prepared, model, progress)
+        fit, prepared, facts = joint.fit, joint.photographs, facts | found
+    known = _completed(place, transport, prepared, fit, progress)
     for doubt in recovery_doubts([each.observation for each in prepared], fit.residual):
         log.warning("%s", doubt)
     day = min(each.observation.time for each in prepared).date()
     return RecoveredAlbedo(day, known, fit, prepared, place.atlas_id, facts, place.options)
 
 
-def recovery_doubts(photographs: Sequence[Observation], residual: np.ndarray) -> list[str]:
+def recovery_doubts(photographs: Sequence[Observation | TextureObservation], residual: np.ndarray) -> list[str]:
     """In words why an albedo that was recovered cannot be trusted; empty where nothing speaks against it.
 
     Parameters
@@ -228,16 +259,6 @@ def recovery_doubts(photographs: Sequence[Observation], residual: np.ndarray) ->
             "itself, and give them back as --albedo DATE=FILE"
         )
     return doubts
-
-
-def _illuminations(place: Place, photographs: Sequence[Observation], model: SkyModel) -> list[Illumination]:
-    """The light of each photograph as seen from its camera; cameras of one position and instant share it."""
-    lights: dict = {}
-    for photograph in photographs:
-        key = (photograph.time, photograph.camera.position_m.tobytes())
-        if key not in lights:
-            lights[key] = illumination_for_camera(place, photograph.camera, model, photograph.time)[0]
-    return [lights[each.time, each.camera.position_m.tobytes()] for each in photographs]
 
 
 def with_terrain(transport: TexelTransport, photographs: Sequence[Observation]) -> list[Observation]:
@@ -281,8 +302,10 @@ def _prepared(
     facts: dict[str, Any] = {}
     report = task_progress(progress, "daylight of the atlas")
     transport = trace_texel_transport(place.terrain, place.texture_shape, progress=report)
+    if not photographs:
+        return transport, [], facts
     photographs = with_terrain(transport, photographs)
-    lights = _illuminations(place, photographs, model)
+    lights = illuminations(place, photographs, model)
     report = task_progress(progress, "footprints of the photographs")
     prepared = prepare_photographs(transport, photographs, lights, progress=report)
     if options.fit_curve:
@@ -293,7 +316,7 @@ def _prepared(
     if options.fit_haze:
 
         def lights_of(visibility_km: float) -> list[Illumination]:
-            return _illuminations(place, photographs, with_overrides(model, visibility_km=visibility_km))
+            return illuminations(place, photographs, with_overrides(model, visibility_km=visibility_km))
 
         report = task_progress(progress, "visibility")
         found = fit_visibility(transport, prepared, lights_of, noise_model=EIGHT_BIT, progress=report)
@@ -304,38 +327,22 @@ def _prepared(
     return transport, prepared, facts
 
 
-def _solved(
+def _completed(
     place: Place,
     transport: TexelTransport,
     photographs: list[AlbedoPhotograph],
-    iterations: int,
+    fit: AlbedoFit,
     progress: Progress | None,
-) -> tuple[AlbedoFit, AlbedoEstimate]:
+) -> AlbedoEstimate:
     from seasonscapes.albedo.albedo_completion import completed_estimate
-    from seasonscapes.albedo.closed_form import solve_albedo
-    from seasonscapes.albedo.inverse import InverseOptions, refine_albedo
-    from seasonscapes.albedo.photographs import EIGHT_BIT
     from seasonscapes.albedo.standard_error import albedo_estimate
     from seasonscapes.texturing.predictors import predictors_for
 
-    report = task_progress(progress, "albedo")
-    fit = solve_albedo(transport, photographs, noise_model=EIGHT_BIT, progress=report)
-    if iterations:
-        options = InverseOptions(iterations=iterations, levels=(1,))
-        refine = task_progress(progress, "differentiable rendering")
-        fit = refine_albedo(
-            place.terrain,
-            transport,
-            photographs,
-            fit,
-            options=options,
-            callbacks=[lambda state: refine(state.iteration / iterations)],
-        ).fit
     known = albedo_estimate(transport, photographs, fit)
     image = orthoimage(place, photographs[0].observation.time)
     base = None if image is None else np.where(image.weight[..., None] > 0.0, image.values, np.float32(np.nan))
     report = task_progress(progress, "completing")
-    return fit, completed_estimate(known, fit, base, predictors_for(place.terrain, place.atlas), progress=report)
+    return completed_estimate(known, fit, base, predictors_for(place.terrain, place.atlas), progress=report)
 
 
 def save_albedo_figures(place: Place, recovered: RecoveredAlbedo, output: Path) -> dict[str, str]:

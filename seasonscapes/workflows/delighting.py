@@ -22,6 +22,7 @@ from seasonscapes.workflows.scene_imagery import AtlasImage, atlas_image
 from seasonscapes.workflows.terrain_building import sample_spacing_m
 
 if TYPE_CHECKING:
+    from seasonscapes.albedo.adjacency import Surroundings
     from seasonscapes.albedo.delighting import Air, DelitImage, TexelIrradiance
     from seasonscapes.albedo.sun_search import FoundSun
     from seasonscapes.sky.illumination import Illumination
@@ -39,6 +40,10 @@ _AZIMUTHS, _SEARCH_SIDE = 72, 240
 _MOST_TRACED = 1_000_000
 # The air model ends here; beyond it there is none before a satellite [m].
 _HIGHEST_SENSOR_M = 60_000.0
+# Of the air that scatters light of the land around into an image: wavelengths of red, green and blue, scale height of
+# the molecules, and ozone, which scatters nothing.
+_PRIMARIES_NM, _MOLECULES_M = np.array([611.0, 549.0, 464.0]), 8000.0
+_OZONE_DU, _ABOVE_OZONE_M = 300.0, 30_000.0
 
 
 @dataclass(frozen=True)
@@ -156,6 +161,7 @@ def delit_imagery(
     image: Path | Imagery | None = None,
     sky: str | Path | SkyModel = "clear",
     sensor_height_m: float | None = None,
+    land_classes: int = 0,
     progress: Progress | None = None,
 ) -> DelitScene:
     """Remove the light from an image that a scene file names, or from another image of the same land.
@@ -174,6 +180,9 @@ def delit_imagery(
     sensor_height_m
         Height of the aeroplane or satellite in the scene's vertical datum [m], if the air below it is still in the
         image; ``None`` for images corrected for it.
+    land_classes
+        Number of classes of land that are found in the image by their colours, and whose response to direct light is
+        fitted one by one (forests are not Lambertian); 0 treats all land as Lambertian.
     progress
         Called with a task and its finished share.
 
@@ -210,6 +219,7 @@ def delit_imagery(
         air=None if sensor_height_m is None else _air(place, time, sky, sensor_height_m),
         # A texture of another layout than the plan has no single shift.
         register=place.atlas.kind == "planar",
+        land_class=land_classes or None,
     )
     values = np.where(pixels.weight[..., None] > 0.0, pixels.values, np.float32(np.nan))
     report = task_progress(progress, "removing the light")
@@ -217,7 +227,7 @@ def delit_imagery(
     known = delit.source > 0
     albedo = np.where(known[..., None], delit.albedo, np.median(delit.albedo[known], axis=0))
     weight = np.where(known, pixels.weight, 0.0).astype(np.float32)
-    facts |= record | {"sensor_height_m": sensor_height_m, **delit.facts}
+    facts |= record | {"sensor_height_m": sensor_height_m, "land_classes": land_classes, **delit.facts}
     return DelitScene(Texture(albedo.astype(np.float32), weight, place.atlas_id), delit, day, facts)
 
 
@@ -312,7 +322,22 @@ def _air(place: Place, time: ImageTime, sky: str | Path | SkyModel, sensor_heigh
         raise InputError("--sensor-height-m", "this sky model has no air before the ground", cure=cure)
     down = np.broadcast_to(np.array([0.0, 0.0, -1.0]), (*ground_m.shape, 3))
     transmittance, airlight = seen.aerial_perspective(height_m - ground_m, down)
-    return Air(np.asarray(transmittance, np.float32), np.asarray(airlight, np.float32))
+    transmittance = np.asarray(transmittance, np.float32)
+    around = None if place.atlas.kind != "planar" else _surroundings(place, transmittance, height_m)
+    return Air(transmittance, np.asarray(airlight, np.float32), around)
+
+
+def _surroundings(place: Place, transmittance: np.ndarray, sensor_height_m: float) -> Surroundings:
+    """Light of the land around that the air scatters into the image: what is not molecules counts as haze."""
+    from seasonscapes.albedo.adjacency import Surroundings, scattered_upwards
+    from seasonscapes.sky.spectrum import ozone_optical_depth_per_du, rayleigh_optical_depth
+
+    low, high = (np.exp(-height / _MOLECULES_M) for height in (place.median_height_m, sensor_height_m))
+    molecules = rayleigh_optical_depth(_PRIMARIES_NM) * (low - high)
+    absorbed = ozone_optical_depth_per_du(_PRIMARIES_NM) * _OZONE_DU * (sensor_height_m > _ABOVE_OZONE_M)
+    total = -np.log(np.clip(transmittance.reshape(-1, 3).mean(axis=0), 1e-3, 1.0))
+    by_molecules, by_haze = scattered_upwards(molecules, np.maximum(total - molecules - absorbed, 0.0))
+    return Surroundings(by_molecules, by_haze, place.atlas.texel_p50_m)
 
 
 def image_sun(place: Place, image: AtlasImage, *, progress: Progress | None = None) -> FoundSun:

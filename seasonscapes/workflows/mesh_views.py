@@ -162,7 +162,7 @@ def relit_mesh_view(view: MeshView, time: Time) -> RenderedView:
         "size_px": [camera.width_px, camera.height_px],
         "world_from_camera": camera.world_from_camera.tolist(),
         "frame": dict(view.mesh.frame.__dict__),
-        "ground_albedo": view.surroundings.ground_albedo,
+        **view.surroundings.ground_facts,
     }
     return replace(relight_view(view.relightable, light), provenance=record)
 

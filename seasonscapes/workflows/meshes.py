@@ -19,7 +19,7 @@ from seasonscapes.errors import InputError
 from seasonscapes.progress import Progress, task_progress
 from seasonscapes.sky.illumination import Illumination
 from seasonscapes.sky.models import SkyModel
-from seasonscapes.terrain.mesh_atlas import MeshAtlas, mesh_atlas
+from seasonscapes.terrain.mesh_atlas import MeshAtlas, MeshGround, mesh_atlas
 from seasonscapes.terrain.mesh_placing import MeshPlacing, placed
 from seasonscapes.terrain.textured_mesh import MeshTexture, TexturedMesh
 from seasonscapes.workflows.illumination import (
@@ -56,6 +56,8 @@ class MeshSurroundings:
         Where tables of the sky are kept.
     seed
         Equal seeds give equal results.
+    terrain
+        A scene's terrain instead of level ground, of `scene_ground`.
 
     Raises
     ------
@@ -74,6 +76,7 @@ class MeshSurroundings:
     rays: int = 256
     workspace: Workspace = field(default_factory=default_workspace)
     seed: int = 0
+    terrain: MeshGround | None = None
 
     def __post_init__(self):
         if self.ground_albedo is not None and not 0.0 <= self.ground_albedo <= 1.0:
@@ -83,6 +86,11 @@ class MeshSurroundings:
     def model(self) -> SkyModel:
         """The sky model."""
         return sky_model(self.sky)
+
+    @property
+    def ground_facts(self) -> dict[str, Any]:
+        """Plain values about the ground."""
+        return {"ground_albedo": self.ground_albedo} if self.terrain is None else {"standing_on": self.terrain.name}
 
 
 @dataclass(frozen=True)
@@ -310,7 +318,7 @@ def mesh_transport(
 
 def atlas_of(mesh: TexturedMesh, surroundings: MeshSurroundings) -> MeshAtlas:
     """All textures of a mesh in one image, on its ground; what may not be meant in the mesh is logged."""
-    atlas = mesh_atlas(mesh, ground_albedo=surroundings.ground_albedo)
+    atlas = mesh_atlas(mesh, ground=surroundings.terrain or surroundings.ground_albedo)
     for note in atlas.notes:
         log.warning("%s: %s", mesh.path.name, note)
     return atlas
@@ -398,7 +406,7 @@ def delight_mesh(
     values = atlas.textures(albedo.astype(np.float32))
     textures = tuple(replace(t, values=v) for t, v in zip(mesh.textures, values, strict=True))
     sigma = tuple(sheet[..., 0] for sheet in atlas.textures(delit.sigma[..., None]))
-    facts = record | {"ground_albedo": around.ground_albedo, "textures": "albedo", **delit.facts}
+    facts = record | around.ground_facts | {"textures": "albedo", **delit.facts}
     return DelitMesh(with_textures(mesh, textures), sigma, facts)
 
 
@@ -468,7 +476,7 @@ def light_mesh(
     received = atlas.filled(total.reshape(*atlas.shape, 3), known)
     illuminance = atlas.textures(received)
     radiance = atlas.textures(received * albedo / np.float32(np.pi))
-    facts = record | {"ground_albedo": around.ground_albedo}
+    facts = record | around.ground_facts
     return LitMesh(mesh, tuple(radiance), tuple(illuminance), facts)
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import html
 import threading
 import time as time_module
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
 from seasonscapes.albedo.seasons import AlbedoSeries
@@ -20,9 +20,13 @@ from seasonscapes.local_server import LocalHandler, LocalServer, Refused, Reply,
 from seasonscapes.progress import Progress
 from seasonscapes.sky.models import SkyModel
 from seasonscapes.workflows.export_scene import new_folder
+from seasonscapes.workflows.gaussian_views import require_scene
 from seasonscapes.workflows.illumination import sky_model
 from seasonscapes.workflows.place import Place, utc_at
 from seasonscapes.workflows.viewer_scene import SMALL, viewer_scene
+
+if TYPE_CHECKING:
+    from seasonscapes.gaussians.model import GaussianModel
 
 _KINDS = {
     ".html": "text/html; charset=utf-8",
@@ -79,6 +83,24 @@ def write_single_file(scene: ViewerScene, path: Path, view: dict[str, Any]) -> i
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
     return len(content)
+
+
+def with_gaussians(scene: ViewerScene, model: GaussianModel, place: Place) -> ViewerScene:
+    """The page's data with a distilled model, which it lights and draws beside the mesh.
+
+    Raises
+    ------
+    InputError
+        For a model of another scene, of an appearance that the page does not evaluate, or with too many Gaussians.
+    """
+    from seasonscapes.gaussians.viewer_layer import viewer_layer
+
+    require_scene(model, place)
+    facts, arrays = viewer_layer(model)
+    if arrays["from_sky"].shape[0] != scene.arrays["from_sky"].shape[0]:
+        cure = "distil it again"
+        raise InputError("--gaussians", "was distilled for another subdivision of the sky than the page's", cure=cure)
+    return replace(scene, gaussians=(facts, arrays))
 
 
 class OpenPages:
@@ -205,6 +227,7 @@ def show(
     camera: str | None = None,
     sky: str | Path | SkyModel = "clear",
     albedo: AlbedoSeries | None = None,
+    gaussians: GaussianModel | None = None,
     height_px: int = 640,
     progress: Progress | None = None,
 ) -> PlaceView:
@@ -225,6 +248,8 @@ def show(
         A cloudless model of the atmosphere, its name or its file.
     albedo
         Dated albedos; ``None``: the scene's own.
+    gaussians
+        A model distilled from the place, which the page shows beside the mesh.
     height_px
         Height of the frame in the notebook [px].
     progress
@@ -251,6 +276,8 @@ def show(
     require_vectorised()
     view = first_view(place, camera, time)
     scene = viewer_scene(place, albedo=albedo, sky=sky_model(sky), detail=SMALL, progress=progress)
+    if gaussians is not None:
+        scene = with_gaussians(scene, gaussians, place)
     return PlaceView(single_file(scene, view=view).decode(), height_px)
 
 

@@ -19,6 +19,7 @@ from seasonscapes.sky.models import AtmosphereModel, SkyModel, atmosphere_from_m
 from seasonscapes.workflows.albedo_sources import dated_albedos, snow_transition_between
 from seasonscapes.workflows.illumination import atmosphere_tables_in
 from seasonscapes.workflows.place import Place
+from seasonscapes.workflows.viewer_grid import ViewerGrid, grid_heights, height_tiles, surface_positions
 from seasonscapes.workflows.views import camera_for
 from seasonscapes.workspace import build_once
 
@@ -28,7 +29,13 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_CODE = ("workflows.viewer_scene", "export.viewer_files", "rendering.grid_transport", "sky.light_tables")
+_CODE = (
+    "workflows.viewer_scene",
+    "workflows.viewer_grid",
+    "export.viewer_files",
+    "rendering.grid_transport",
+    "sky.light_tables",
+)
 _SEARCH_M = 1000.0
 # Heights above the highest ground up to which air and sky are tabulated [m].
 _ABOVE_M = 3000.0
@@ -60,6 +67,8 @@ class ViewerDetail:
         Groups that each point sees, a multiple of 4.
     rays
         Hemisphere rays of each point, a power of two.
+    tile_levels
+        Times that the grid of heights is halved into tiles at most, which the page loads near its viewer.
     """
 
     most_nodes: int = 1280
@@ -71,36 +80,12 @@ class ViewerDetail:
     clusters: int = 4096
     clusters_per_point: int = 32
     rays: int = 256
+    tile_levels: int = 0
 
 
 SMALL = ViewerDetail(640, 1024, 640, 224, 112, 8, 1024, 16, 128)
-# Of places with more heights along a side than the default shows: all files stay below 60 MB.
-LARGE = ViewerDetail(2560, 4096, 2048, 640, 320, 12, 16384, 32, 128)
-
-
-@dataclass(frozen=True)
-class _Grid:
-    """A regular east-north grid over a terrain: node (c, r) lies at west + c · step, south + r · step."""
-
-    west_m: float
-    south_m: float
-    step_m: float
-    columns: int
-    rows: int
-
-    def positions(self, longest: int | None = None) -> tuple[np.ndarray, tuple[int, int]]:
-        """East and north ``(N, 2)`` of texel centres that divide the grid's area, and their rows and columns."""
-        width, height = (self.columns - 1) * self.step_m, (self.rows - 1) * self.step_m
-        if longest is None:
-            rows, columns = self.rows, self.columns
-            east = self.west_m + np.arange(columns) * self.step_m
-            north = self.south_m + np.arange(rows) * self.step_m
-        else:
-            columns, rows = (max(2, round(longest * side / max(width, height))) for side in (width, height))
-            east = self.west_m + (np.arange(columns) + 0.5) / columns * width
-            north = self.south_m + (np.arange(rows) + 0.5) / rows * height
-        grid = np.stack(np.meshgrid(east, north), axis=-1)
-        return grid.reshape(-1, 2), (rows, columns)
+# Of places with more heights along a side than the default shows: what the first picture needs stays below 60 MB.
+LARGE = ViewerDetail(2560, 4096, 2048, 640, 320, 12, 16384, 32, 128, tile_levels=3)
 
 
 def viewer_scene(
@@ -178,7 +163,7 @@ def _build(
 ) -> ViewerScene:
     from seasonscapes.export.viewer_files import ViewerScene
 
-    grid, up, known = _heights(place, detail)
+    grid, up, known = grid_heights(place, detail.most_nodes)
     detail = _fitting(detail, max(grid.columns, grid.rows))
     low, high = float(up[known].min()), float(up[known].max())
     scale = max(high - low, 1.0) / 65534.0
@@ -214,7 +199,7 @@ def _build(
         },
         "made_utc": datetime.now(UTC).replace(microsecond=0).isoformat(),
     }
-    return ViewerScene(about, arrays, pictures)
+    return ViewerScene(about, arrays, pictures, tiles=height_tiles(place, grid, detail.tile_levels))
 
 
 def _fitting(detail: ViewerDetail, nodes: int) -> ViewerDetail:
@@ -244,53 +229,8 @@ def _zone(place: Place) -> str:
     return str(zone_at(place.frame.latitude_deg, place.frame.longitude_deg))
 
 
-def _heights(place: Place, detail: ViewerDetail) -> tuple[_Grid, np.ndarray, np.ndarray]:
-    """The grid, up coordinates ``(R, C)`` of its nodes [m] with row 0 in the south, and which of them are known."""
-    from scipy.ndimage import map_coordinates
-
-    surface = place.terrain.surface
-    assert surface is not None
-    low, high = place.terrain.vertices[:, :2].min(axis=0), place.terrain.vertices[:, :2].max(axis=0)
-    finest = surface.spacing_m
-    step = max(finest, float((high - low).max()) / (detail.most_nodes - 1))
-    if step > 1.01 * finest:
-        log.warning(
-            "%s: the page shows heights every %.3g m of the raster's %.3g m: at most %d along a side",
-            place.path,
-            step,
-            finest,
-            detail.most_nodes,
-        )
-    columns, rows = (int(np.ceil(side / step - 1e-6)) + 1 for side in high - low)
-    grid = _Grid(float(low[0]), float(low[1]), step, columns, rows)
-    flat, shape = grid.positions()
-    # The polynomials take the height into account a little: two rounds converge.
-    position = np.column_stack([flat, np.full(len(flat), float(np.median(surface.nodes[..., 2])))])
-    nodes_up = surface.nodes[..., 2].astype(np.float64)
-    for _ in range(2):
-        column, row = surface.nodes_at(position).T
-        position[:, 2] = map_coordinates(nodes_up, [row, column], order=3, mode="nearest")
-    margin = 0.51
-    known = (column > -margin) & (column < nodes_up.shape[1] - 1 + margin)
-    known &= (row > -margin) & (row < nodes_up.shape[0] - 1 + margin)
-    return grid, position[:, 2].reshape(shape), known.reshape(shape)
-
-
-def _surface_positions(place: Place, grid: _Grid, longest: int) -> tuple[np.ndarray, tuple[int, int]]:
-    """Positions ``(N, 3)`` on the smooth surface at texel centres; NaN beyond the raster."""
-    surface = place.terrain.surface
-    assert surface is not None
-    flat, shape = grid.positions(longest)
-    position = np.column_stack([flat, np.full(len(flat), place.median_height_m)])
-    position[:, 2] = surface.up_at(position)
-    column, row = surface.nodes_at(position).T
-    height, width = surface.nodes.shape[:2]
-    inside = (column >= 0.01) & (column <= width - 1.01) & (row >= 0.01) & (row <= height - 1.01)
-    return np.where(inside[:, None], position, np.nan), shape
-
-
 def _albedo(
-    place: Place, grid: _Grid, dated: Sequence[DatedAlbedo], detail: ViewerDetail, progress: Progress | None
+    place: Place, grid: ViewerGrid, dated: Sequence[DatedAlbedo], detail: ViewerDetail, progress: Progress | None
 ) -> tuple[list[AlbedoPicture], np.ndarray | None]:
     """Pictures of the albedos, and in which order places lose their snow, where there are several dates."""
     from seasonscapes.export.viewer_files import albedo_picture
@@ -319,7 +259,7 @@ def _albedo(
     return pictures, np.rint(np.clip(order, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
-def _uv(place: Place, grid: _Grid, longest: int) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
+def _uv(place: Place, grid: ViewerGrid, longest: int) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
     """Texture coordinates ``(K, 2)`` seen from above, which of them each of N texels shows, rows and columns."""
     from scipy.ndimage import distance_transform_edt
 
@@ -328,7 +268,7 @@ def _uv(place: Place, grid: _Grid, longest: int) -> tuple[np.ndarray, np.ndarray
     from seasonscapes.rendering.mitsuba_scene import mi_mesh
 
     rays = ray_scene(mi_mesh(place.terrain, np.full((2, 2, 3), 0.5, np.float32)))
-    positions, shape = _surface_positions(place, grid, longest)
+    positions, shape = surface_positions(place, grid, longest)
     found, index = surface_at(rays, positions, search_m=_SEARCH_M)
     number = np.full(len(positions), -1)
     number[index] = np.arange(len(index))
@@ -352,7 +292,9 @@ def _seen(values: np.ndarray, uv: np.ndarray, nearest: np.ndarray, shape: tuple[
     return sample_texture(values, uv)[nearest][::-1]
 
 
-def _transport(place: Place, grid: _Grid, dated: Sequence[DatedAlbedo], detail: ViewerDetail, report) -> dict[str, Any]:
+def _transport(
+    place: Place, grid: ViewerGrid, dated: Sequence[DatedAlbedo], detail: ViewerDetail, report
+) -> dict[str, Any]:
     from seasonscapes.rendering.coefficients import SamplingOptions
     from seasonscapes.rendering.grid_transport import grid_transport
     from seasonscapes.rendering.hemisphere_rays import ray_scene
@@ -368,8 +310,8 @@ def _transport(place: Place, grid: _Grid, dated: Sequence[DatedAlbedo], detail: 
     # Where reflected light matters does not depend much on the date: the brightest one decides.
     base = max(dated, key=lambda each: float(each.load().values.mean()))
     scene = ray_scene(mi_mesh(place.terrain, base.load().values))
-    sky_m, sky_shape = _surface_positions(place, grid, detail.sky_px)
-    bounce_m, bounce_shape = _surface_positions(place, grid, detail.bounce_px)
+    sky_m, sky_shape = surface_positions(place, grid, detail.sky_px)
+    bounce_m, bounce_shape = surface_positions(place, grid, detail.bounce_px)
     traced = grid_transport(scene, sky_m, bounce_m, sampling, search_m=_SEARCH_M, progress=report)
     clusters = traced.clusters
     width, height = (grid.columns - 1) * grid.step_m, (grid.rows - 1) * grid.step_m

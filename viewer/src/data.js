@@ -7,9 +7,18 @@ export async function loadScene(report) {
   const read = embedded ? readEmbedded : readFile;
   const about = embedded ? JSON.parse(embedded.textContent) : JSON.parse(new TextDecoder().decode(await readFile("scene.json")));
   const binary = await read("scene.bin", report);
-  const arrays = {};
-  for (const [name, entry] of Object.entries(about.arrays)) arrays[name] = unpack(binary, entry);
-  return { about, arrays, picture: async (file) => new Blob([await read(file)], { type: "image/webp" }) };
+  const arrays = unpackAll(binary, about.arrays);
+  const picture = async (file) => new Blob([await read(file)], { type: "image/webp" });
+  /** The distilled Gaussians, which are read when they are asked for. */
+  const layer = async (told) => {
+    const { file, arrays: entries, ...facts } = about.gaussians;
+    return { about: facts, arrays: unpackAll(await read(file, told), entries) };
+  };
+  return { about, arrays, picture, layer, file: read };
+}
+
+function unpackAll(binary, entries) {
+  return Object.fromEntries(Object.entries(entries).map(([name, entry]) => [name, unpack(binary, entry)]));
 }
 
 async function readFile(name, report) {

@@ -257,25 +257,35 @@ export function makeLight(arrays, about) {
     return [0, 1, 2].map((c) => arrays.direct_lx.data[3 * k + c] * (1 - f) + arrays.direct_lx.data[3 * k + 3 + c] * f);
   }
 
-  /** `from_sky.T @ patch radiances` for the lit surface: (rank, 3), and the sky's illuminance of level ground [lx]. */
-  function skyCoefficients(bodies) {
+  /** Mean radiances (patches, 3) of the sky over the lit surface, and its illuminance of level ground [lx]. */
+  function patchSky(bodies) {
     const whole = sky(bodies, about.surface_m);
-    const rank = arrays.from_sky.shape[1];
-    const result = new Float64Array(rank * 3);
+    const means = new Float64Array(patches.length * 3);
     const level = [0, 0, 0];
     patches.forEach(({ directions, solidAngle }, p) => {
-      const mean = [0, 0, 0];
       for (const d of directions) {
         const light = skyRadiance(whole, d, bodies[0].direction, about.surface_m);
-        for (let c = 0; c < 3; c++) mean[c] += light[c] / directions.length;
+        for (let c = 0; c < 3; c++) means[3 * p + c] += light[c] / directions.length;
       }
       const up = directions.reduce((sum, d) => sum + Math.max(d[2], 0), 0) / directions.length;
-      for (let c = 0; c < 3; c++) level[c] += mean[c] * solidAngle * up;
-      for (let r = 0; r < rank; r++) {
-        for (let c = 0; c < 3; c++) result[3 * r + c] += arrays.from_sky.data[p * rank + r] * mean[c];
-      }
+      for (let c = 0; c < 3; c++) level[c] += means[3 * p + c] * solidAngle * up;
     });
-    return { coefficients: result, level };
+    return { means, level };
+  }
+
+  /** `fromSky.T @ means`: (rank, 3). */
+  function project(fromSky, rank, means) {
+    const result = new Float64Array(rank * 3);
+    for (let p = 0; p < patches.length; p++) {
+      for (let r = 0; r < rank; r++) for (let c = 0; c < 3; c++) result[3 * r + c] += fromSky[p * rank + r] * means[3 * p + c];
+    }
+    return result;
+  }
+
+  /** Coefficients (rank, 3) of the lit surface's sky, its illuminance of level ground [lx], and its patches. */
+  function skyCoefficients(bodies) {
+    const { means, level } = patchSky(bodies);
+    return { coefficients: project(arrays.from_sky.data, arrays.from_sky.shape[1], means), level, means };
   }
 
   /** Extinction of the aerosol over that of all air at a height, by colour. */
@@ -290,7 +300,7 @@ export function makeLight(arrays, about) {
   }
 
   return {
-    sky, air, direct, skyCoefficients, skyRadiance, nightRadiance, hazeShare,
+    sky, air, direct, skyCoefficients, project, skyRadiance, nightRadiance, hazeShare,
     rows: { sky: K, skyBelow: SKY_BELOW, air: AK, airBelow: AIR_BELOW }, distances, gamma, aerosolDepth,
   };
 }

@@ -4,9 +4,11 @@ import { loadScene } from "./data.js";
 import { luminance, meteredEv, whiteOf } from "./exposure.js";
 import { makeEphemeris } from "./ephemeris.js";
 import { RAD, makeFrame } from "./frames.js";
+import { makeGaussians } from "./gaussians.js";
 import { makeLight } from "./light.js";
 import { makeRenderer } from "./renderer.js";
 import { makeTerrain } from "./terrain.js";
+import { makeTiles } from "./tiles.js";
 import { MINUTE, DAY, crossings, dayOfYear, fullMoons, highestMoon, makeClock, moonName, readAddress, seasonOf, sunAt, writeAddress } from "./times.js";
 
 const element = (id) => document.getElementById(id);
@@ -38,6 +40,8 @@ async function start() {
   const clock = makeClock(about.time_zone);
   const ephemeris = makeEphemeris(about.frame.latitude_deg, about.frame.longitude_deg, about.surface_m);
   const terrain = makeTerrain(arrays, about);
+  const tiles = about.tiles ? makeTiles(terrain, about.tiles, scene.file, () => tileArrived()) : null;
+  if (tiles) terrain.setTiles(tiles);
   const light = makeLight(arrays, about);
   const canvas = element("picture");
   const renderer = makeRenderer(canvas, scene, terrain, light);
@@ -46,7 +50,7 @@ async function start() {
   const sharp = Math.min(2048, 2 * Math.max(terrain.columns, terrain.rows)); // At rest.
   const enough = still ? 16 : renderer.software ? 6 : 12;
 
-  const state = { time: Date.now(), ev: "auto", haze: 1, shownEv: 15, dirty: true, quality: 0, metered: false, point: null, playing: null };
+  const state = { time: Date.now(), ev: "auto", haze: 1, shownEv: 15, dirty: true, quality: 0, metered: false, point: null, playing: null, divider: 1, learned: false };
   const controls = makeControls(canvas, frame, terrain, () => cameraChanged());
   if (still) {
     document.body.classList.add("still");
@@ -79,10 +83,55 @@ async function start() {
     // The frame holds radiance over what a grey card would send, so that half precision suffices day and night.
     const scale = 1 / Math.max((0.2 * luminance(now.level)) / Math.PI, 1e-7);
     renderer.setLight(now.bodies, now.sky, scale, quality);
+    lightGaussians(!state.playing && quality > coarse);
     state.quality = quality;
     state.metered = false;
     state.dirty = true;
     tell();
+  }
+
+  /** The Gaussians' colours; with `withNetwork` what they have learned beyond the physics, which takes a while. */
+  function lightGaussians(withNetwork) {
+    if (!gaussians || state.divider === 1) return;
+    const sky = light.project(gaussians.fromSky, gaussians.rank, now.sky.means);
+    const day = dayOfYear(clock.civil(state.time)) + clock.civil(state.time).minutes / 1440;
+    const told = { bodies: now.bodies.filter(({ lights }) => lights), sky, skyLx: now.sky.level, globalLx: luminance(now.level), day };
+    renderer.state.splats.light(gaussians.radiance(told, { withNetwork }));
+    state.learned = withNetwork;
+    state.dirty = true;
+  }
+
+  async function setDivider(value) {
+    state.divider = Math.min(Math.max(value, 0), 1);
+    element("divider").value = Math.round(100 * state.divider);
+    const said = state.divider === 1 ? "the mesh alone" : state.divider === 0 ? "the Gaussians alone" : `mesh left of ${Math.round(100 * state.divider)} %, Gaussians right of it`;
+    element("divider-value").value = said;
+    element("divider").setAttribute("aria-valuetext", said);
+    remember();
+    if (state.divider < 1 && !gaussians) {
+      loadingGaussians ??= scene.layer((share) => (element("status").textContent = `Loading the Gaussians ${Math.round(100 * share)} %`));
+      const layer = await loadingGaussians;
+      if (!gaussians) {
+        gaussians = makeGaussians(layer, orderAt);
+        renderer.setGaussians(gaussians);
+        element("status").textContent = "";
+      }
+    }
+    renderer.state.divider = state.divider;
+    if (now) lightGaussians(true);
+    state.metered = false;
+    state.dirty = true;
+  }
+  let gaussians = null;
+  let loadingGaussians = null;
+
+  /** When a place loses its snow among its neighbours, 0 to 1; null where the page knows one date alone. */
+  function orderAt(east, north) {
+    if (!arrays.snow_order) return null;
+    const [rows, columns] = arrays.snow_order.shape;
+    const c = Math.min(Math.max(Math.floor(((east - terrain.west) / ((terrain.columns - 1) * terrain.step)) * columns), 0), columns - 1);
+    const r = Math.min(Math.max(Math.floor(((north - terrain.south) / ((terrain.rows - 1) * terrain.step)) * rows), 0), rows - 1);
+    return arrays.snow_order.data[r * columns + c] / 255;
   }
 
   async function albedoChanged() {
@@ -115,6 +164,7 @@ async function start() {
   // ---- camera and exposure -----------------------------------------------------------------------------------------
   function cameraChanged() {
     const { forward, up } = controls.axes();
+    tiles?.moved();
     renderer.setCamera(controls.camera.position, forward, up, controls.camera.fov);
     state.metered = false;
     state.dirty = true;
@@ -136,6 +186,11 @@ async function start() {
     element("ev").setAttribute("aria-valuetext", `EV ${state.shownEv.toFixed(1)}${state.ev === "auto" ? ", automatic" : ""}`);
   }
 
+  /** A finer piece of ground is there: draw again, with the same light. */
+  function tileArrived() {
+    state.dirty = true;
+  }
+
   // ---- drawing -----------------------------------------------------------------------------------------------------
   let settle = 0;
   function loop() {
@@ -154,6 +209,8 @@ async function start() {
       state.quality = state.quality < fine ? fine : sharp;
       renderer.see(state.quality);
       renderer.relight();
+      if (!state.learned) lightGaussians(true);
+      state.dirty = false;
       settle = 0;
     }
     if (settle < enough) {
@@ -168,7 +225,7 @@ async function start() {
         expose();
       }
       renderer.show();
-      if (settle === enough) {
+      if (settle === enough && !tiles?.busy()) {
         renderer.finish();
         document.body.dataset.ready = String(Number(document.body.dataset.ready ?? 0) + 1);
       }
@@ -323,7 +380,7 @@ async function start() {
       `. Sun on ${clock.date(state.time)}: ${hours.toFixed(1)} h` + (times.length ? `; ${spoken}.` : ".");
   }
 
-  const address = () => writeAddress({ time: state.time, camera: controls.camera, ev: state.ev, haze: state.haze });
+  const address = () => writeAddress({ time: state.time, camera: controls.camera, ev: state.ev, haze: state.haze, divider: state.divider });
   function command() {
     const sky = about.sky.name === "clear" ? "" : ` --sky ${about.sky.name}`;
     return `seasonscapes render ${about.view.scene ?? about.name} --at-url "${address()}" --size ${canvas.width}x${canvas.height} --engine path${sky}`;
@@ -427,6 +484,9 @@ async function start() {
     state.dirty = true;
     remember();
   }
+  element("gaussians").hidden = !about.gaussians;
+  element("divider").addEventListener("input", (event) => (state.arriving = setDivider(Number(event.target.value) / 100).catch(failed)));
+  const failed = (error) => (element("status").textContent = `The Gaussians cannot be shown: ${error.message}`);
   function setEv(ev) {
     state.ev = ev;
     element("auto").checked = ev === "auto";
@@ -476,6 +536,7 @@ async function start() {
     }
     setHaze(given?.haze ?? 1);
     setEv(given?.ev ?? "auto");
+    if (about.gaussians) state.layered = setDivider(given?.divider ?? about.view.divider ?? 1).catch(failed);
     const first = about.view.time ? Date.parse(about.view.time) : noon();
     setTime(given?.time ?? first, coarse);
   }
@@ -490,9 +551,10 @@ async function start() {
   fit();
   restore(readAddress(location.hash) ?? readAddress(about.view.hash ?? ""));
   await state.arriving;
+  await state.layered;
   element("status").textContent = "";
   // What measurements use; the page itself does not.
-  window.seasonscapes = { about, arrays, state, renderer, controls, ephemeris, terrain, light, frame, clock, setTime, setEv, setHaze, sunTimes, sunTimesBetween, step, expose, command, lightOf, now: () => now, fine, sharp, useCamera };
+  window.seasonscapes = { about, arrays, state, renderer, controls, ephemeris, terrain, tiles, light, frame, clock, setTime, setEv, setHaze, setDivider, sunTimes, sunTimesBetween, step, expose, command, lightOf, now: () => now, fine, sharp, useCamera };
   loop();
   step();
   if (about.view.watched) stayOpen();

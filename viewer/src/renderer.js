@@ -3,6 +3,7 @@
 import * as THREE from "three";
 import * as shaders from "./shaders.js";
 import { AIR_AZIMUTHS, SKY_AZIMUTHS } from "./light.js";
+import { makeSplats } from "./splats.js";
 import { CELLS, chooseChunks, chunkGeometry } from "./terrain.js";
 
 const SATURATION = 1.2;
@@ -155,22 +156,29 @@ export function makeRenderer(canvas, { arrays, about }, terrain, light) {
   const nightTexture = texture(new Uint16Array(64 * 4), 1, 64, THREE.RGBAFormat, THREE.HalfFloatType, THREE.LinearFilter);
   const distances = new Float32Array(16);
   distances.set(light.distances);
+  const air = {
+    uPhase: shared.uPhase, uAerosol: shared.uAerosol, uGamma: shared.uGamma, uBody: shared.uBody,
+    uEye: { value: new THREE.Vector3() },
+    uAirGas: { value: airTextures[0] }, uAirAerosol: { value: airTextures[1] }, uAirOther: { value: airTextures[2] }, uAirDepth: { value: airTextures[3] },
+    uHaze: { value: 1 }, uHazeShare: { value: new THREE.Vector3(...light.hazeShare()) }, uAirOn: { value: 1 },
+    uDistances: { value: distances }, uColumns: { value: columns },
+    uHorizon: { value: 0 }, uAirRows: { value: new THREE.Vector2(light.rows.airBelow, airRows - light.rows.airBelow) },
+  };
+  const tiles = terrain.tiles();
+  const noTile = layers(new Uint8Array(1), 1, 1, 1, THREE.RedFormat, THREE.UnsignedByteType);
   const ground = new THREE.RawShaderMaterial({
     glslVersion: THREE.GLSL3,
     vertexShader: shaders.TERRAIN_VERTEX,
     fragmentShader: shaders.TERRAIN,
     side: THREE.DoubleSide,
     uniforms: {
-      ...shared,
+      ...shared, ...air,
       uDiffuse: { value: diffuseTarget.texture },
       uWest: { value: new THREE.Vector2(terrain.west, terrain.south) },
-      uEye: { value: new THREE.Vector3() },
-      uAirGas: { value: airTextures[0] }, uAirAerosol: { value: airTextures[1] }, uAirOther: { value: airTextures[2] }, uAirDepth: { value: airTextures[3] },
-      uHaze: { value: 1 }, uHazeShare: { value: new THREE.Vector3(...light.hazeShare()) },
-      uShadows: { value: 1 }, uAirOn: { value: 1 },
+      uTileHeight: { value: tiles?.heights ?? noTile }, uTileSlope: { value: tiles?.slopes ?? noTile },
+      uTile: { value: tiles?.places ?? Array.from({ length: 48 }, () => new THREE.Vector3()) },
+      uShadows: { value: 1 },
       uMark: { value: 0 }, uMarkAt: { value: new THREE.Vector2() },
-      uDistances: { value: distances }, uColumns: { value: columns },
-      uHorizon: { value: 0 }, uAirRows: { value: new THREE.Vector2(light.rows.airBelow, airRows - light.rows.airBelow) },
     },
   });
   const dome = pass(shaders.SKY, {
@@ -186,7 +194,7 @@ export function makeRenderer(canvas, { arrays, about }, terrain, light) {
   dome.depthFunc = THREE.LessEqualDepth;
 
   const geometry = chunkGeometry();
-  const instances = new THREE.InstancedBufferAttribute(new Float32Array(MOST_CHUNKS * 3), 3);
+  const instances = new THREE.InstancedBufferAttribute(new Float32Array(MOST_CHUNKS * 4), 4);
   instances.setUsage(THREE.DynamicDrawUsage);
   geometry.setAttribute("chunk", instances);
   const mesh = new THREE.Mesh(geometry, ground);
@@ -196,6 +204,7 @@ export function makeRenderer(canvas, { arrays, about }, terrain, light) {
   camera.up.set(0, 0, 1);
 
   let frame = null;
+  let splats = null;
   let means = null;
   let count = 0;
   const accumulate = pass(shaders.ACCUMULATE, { uFrame: { value: null }, uMean: { value: null }, uShare: { value: 1 } });
@@ -203,7 +212,7 @@ export function makeRenderer(canvas, { arrays, about }, terrain, light) {
   const meter = pass(shaders.METER, { uFrame: { value: null } });
   const meterTarget = target(...METER, THREE.FloatType, THREE.NearestFilter);
 
-  const state = { scale: 1, ev: 15, bodies: [], height: NaN, cellPixels: software ? 2 : 1, hfov: 52, seenSide: 0, passes: 0 };
+  const state = { scale: 1, ev: 15, bodies: [], height: NaN, cellPixels: software ? 2 : 1, hfov: 52, seenSide: 0, passes: 0, divider: 1, splats: null };
 
   function resize(width, height) {
     gl.setSize(width, height, false);
@@ -295,18 +304,18 @@ export function makeRenderer(canvas, { arrays, about }, terrain, light) {
     state.height = height;
     const bodies = state.bodies.filter((body) => body.counts);
     const k = state.scale;
-    const air = light.air(bodies, height);
-    fill(airTextures, air.grid, k, (n) => n);
+    const seenAir = light.air(bodies, height);
+    fill(airTextures, seenAir.grid, k);
     const depthData = airTextures[3].image.data;
     for (let row = 0; row < airRows; row++) {
       for (let m = 0; m < columns; m++) {
         for (let a = 0; a < AIR_AZIMUTHS; a++) {
-          for (let c = 0; c < 3; c++) depthData[((row * columns + m) * AIR_AZIMUTHS + a) * 4 + c] = half(air.depth[(row * columns + m) * 3 + c]);
+          for (let c = 0; c < 3; c++) depthData[((row * columns + m) * AIR_AZIMUTHS + a) * 4 + c] = half(seenAir.depth[(row * columns + m) * 3 + c]);
         }
       }
     }
     airTextures.forEach((each) => (each.needsUpdate = true));
-    ground.uniforms.uHorizon.value = air.horizon;
+    air.uHorizon.value = seenAir.horizon;
     const sky = light.sky(bodies, height);
     fill(skyTextures, sky.grid, k);
     skyTextures.forEach((each) => (each.needsUpdate = true));
@@ -358,17 +367,17 @@ export function makeRenderer(canvas, { arrays, about }, terrain, light) {
     // Cells of some pixels: a chunk is divided while its cells look larger.
     const detail = 1 / (CELLS * state.cellPixels * dome.uniforms.uPixel.value);
     const chosen = chooseChunks(terrain, camera.position, detail, frustum).slice(0, MOST_CHUNKS);
-    chosen.forEach((chunk, k) => instances.setXYZ(k, ...chunk));
+    chosen.forEach((chunk, k) => instances.setXYZW(k, ...chunk));
     geometry.instanceCount = chosen.length;
     instances.needsUpdate = true;
-    ground.uniforms.uEye.value.copy(camera.position);
+    air.uEye.value.copy(camera.position);
     dome.uniforms.uRays.value.copy(camera.matrixWorld).setPosition(0, 0, 0).multiply(camera.projectionMatrixInverse);
     gl.setRenderTarget(frame);
     gl.clear(true, true, false);
     dome.depthTest = false;
     quad.material = dome;
     gl.render(flat, still);
-    gl.render(world, camera);
+    drawGround();
     count += 1;
     accumulate.uniforms.uFrame.value = frame.texture;
     accumulate.uniforms.uMean.value = means[count % 2].texture;
@@ -377,6 +386,26 @@ export function makeRenderer(canvas, { arrays, about }, terrain, light) {
     state.mean = means[(count + 1) % 2];
     show();
     return count;
+  }
+
+  /** The mesh left of the divider, the Gaussians right of it. */
+  function drawGround() {
+    const [width, height] = [frame.width, frame.height];
+    const left = splats ? Math.round(state.divider * width) : width;
+    if (left === width) return gl.render(world, camera);
+    frame.scissorTest = true;
+    frame.scissor.set(0, 0, left, height);
+    gl.setRenderTarget(frame);
+    if (left > 0) gl.render(world, camera);
+    frame.scissor.set(left, 0, width - left, height);
+    splats.draw(camera, frame, state.scale);
+    frame.scissorTest = false;
+  }
+
+  /** Draw a model of `makeGaussians` right of the divider. */
+  function setGaussians(model) {
+    splats = makeSplats(gl, model, air, { texture, target, pass, run });
+    state.splats = splats;
   }
 
   function show() {
@@ -425,7 +454,7 @@ export function makeRenderer(canvas, { arrays, about }, terrain, light) {
   }
 
   return {
-    gl, state, software, device, resize, setLight, setAlbedo, albedoTexture, setCamera, draw, show, setExposure, luminances, readRadiance, mark, ray, see, relight,
+    gl, state, software, device, resize, setLight, setAlbedo, albedoTexture, setCamera, draw, show, setExposure, luminances, readRadiance, mark, ray, see, relight, setGaussians,
     ground, diffuse, shared,
     reset: () => (count = 0),
     finish: () => context.finish(),

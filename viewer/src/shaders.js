@@ -242,17 +242,25 @@ vec3 scattered(vec3 gas, vec4 aerosol, vec3 other, vec3 d) {
 
 export const TERRAIN_VERTEX = PRECISION + /* glsl */ `
 in vec3 position;
-in vec3 chunk;
+in vec4 chunk;
 uniform sampler2D uHeight;
+uniform sampler2DArray uTileHeight;
+uniform vec3 uTile[48];
 uniform ivec2 uNodes;
 uniform vec2 uWest;
 uniform float uStep;
 uniform mat4 projectionMatrix, viewMatrix;
 out vec2 vUvGround;
 out vec3 vWorld;
+flat out int vSlot;
 void main() {
   vec2 node = min(chunk.xy + position.xy * chunk.z, vec2(uNodes - 1));
-  float height = texelFetch(uHeight, ivec2(node), 0).r;
+  vSlot = int(chunk.w);
+  float height;
+  if (vSlot >= 0) {
+    vec3 tile = uTile[vSlot];
+    height = texelFetch(uTileHeight, ivec3(ivec2((node - tile.xy) * tile.z + 1.5), vSlot), 0).r;
+  } else height = texelFetch(uHeight, ivec2(node), 0).r;
   vUvGround = node / vec2(uNodes - 1);
   // Skirts hide the seams between chunks of different steps.
   vWorld = vec3(uWest + node * uStep, height - position.z * chunk.z * uStep * 1.5);
@@ -260,26 +268,15 @@ void main() {
 }
 `;
 
-export const TERRAIN = PRECISION + SURFACE + PHASES + /* glsl */ `
-uniform sampler2D uDiffuse, uMask;
+// What the air takes from a surface's radiance, and adds to it.
+const AIR = /* glsl */ `
 uniform sampler3D uAirGas, uAirAerosol, uAirOther, uAirDepth;
 uniform vec3 uEye, uHazeShare;
-uniform float uHaze, uShadows, uAirOn, uMark;
-uniform vec2 uMarkAt;
+uniform float uHaze, uAirOn;
 uniform float uDistances[16];
 uniform int uColumns;
 uniform vec2 uAirRows;
-in vec2 vUvGround;
-in vec3 vWorld;
-layout(location = 0) out vec4 colour;
-void main() {
-  if (texture(uMask, vUvGround).r < 0.5) discard;
-  vec3 normal = normalAt(vUvGround);
-  vec2 seen = mix(vec2(1.0), texture(uSeen, vUvGround).rg, uShadows);
-  vec3 irradiance = directAt(vUvGround, normal, seen) + texture(uDiffuse, vUvGround).rgb;
-  vec3 radiance = albedoAt(vUvGround, 0.0) * irradiance;
-  vec3 ray = vWorld - uEye;
-  float distance = length(ray);
+vec3 throughAir(vec3 radiance, vec3 ray, float distance) {
   vec3 d = ray / distance;
   float most = uDistances[uColumns - 1], reached = min(distance, most);
   int c = 0;
@@ -293,12 +290,102 @@ void main() {
   vec3 plain = exp(-depth);
   vec3 through = exp(-depth * (1.0 + (uHaze - 1.0) * uHazeShare));
   light *= (1.0 - through) / max(1.0 - plain, 1e-5);
-  radiance = mix(radiance, radiance * through + light, uAirOn);
+  return mix(radiance, radiance * through + light, uAirOn);
+}
+`;
+
+export const TERRAIN = PRECISION + SURFACE + PHASES + AIR + /* glsl */ `
+uniform sampler2D uDiffuse, uMask;
+uniform sampler2DArray uTileSlope;
+uniform vec3 uTile[48];
+uniform float uShadows, uMark;
+uniform vec2 uMarkAt;
+in vec2 vUvGround;
+in vec3 vWorld;
+flat in int vSlot;
+layout(location = 0) out vec4 colour;
+void main() {
+  if (texture(uMask, vUvGround).r < 0.5) discard;
+  vec3 normal = normalAt(vUvGround);
+  if (vSlot >= 0) {
+    vec2 at = ((vUvGround * vec2(uNodes - 1) - uTile[vSlot].xy) * uTile[vSlot].z + 1.5) / vec2(textureSize(uTileSlope, 0).xy);
+    normal = normalize(vec3(-texture(uTileSlope, vec3(at, float(vSlot))).xy, 1.0));
+  }
+  vec2 seen = mix(vec2(1.0), texture(uSeen, vUvGround).rg, uShadows);
+  vec3 irradiance = directAt(vUvGround, normal, seen) + texture(uDiffuse, vUvGround).rgb;
+  vec3 ray = vWorld - uEye;
+  float distance = length(ray);
+  vec3 radiance = throughAir(albedoAt(vUvGround, 0.0) * irradiance, ray, distance);
   if (uMark > 0.0) {
     float ring = length((vUvGround - uMarkAt) * vec2(uNodes - 1)) / (uMark * distance);
     if (abs(ring - 1.0) < 0.22) radiance = vec3(0.9, 0.25, 0.05);
   }
   colour = vec4(min(radiance, 60000.0), 1.0);
+}
+`;
+
+// Gaussians as seasonscapes/rendering/splatting.py: the ellipse of each in the picture, blended from the back.
+export const SPLAT_VERTEX = PRECISION + PHASES + AIR + /* glsl */ `
+in vec3 position;
+in float which;
+uniform sampler2D uCentre, uAxes, uColour;
+uniform int uAcross;
+uniform float uFocal, uVariance, uCut;
+uniform vec2 uPicture;
+uniform mat4 projectionMatrix, viewMatrix;
+out vec2 vOff;
+out vec4 vLight;
+flat out vec3 vConic;
+void main() {
+  int number = int(which);
+  ivec2 at = ivec2(number % uAcross, number / uAcross);
+  vec4 centre = texelFetch(uCentre, at, 0);
+  vec3 ray = centre.xyz - uEye;
+  vec3 p = (viewMatrix * vec4(centre.xyz, 1.0)).xyz;
+  float depth = -p.z;
+  gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
+  vec3 axis[3];
+  for (int k = 0; k < 3; k++) axis[k] = texelFetch(uAxes, ivec2(3 * at.x + k, at.y), 0).xyz;
+  if (depth <= 1.0 || centre.w < uCut || dot(ray, axis[2]) >= 0.0) return;
+  vec2 slope = clamp(p.xy / depth, -0.65 * uPicture / uFocal, 0.65 * uPicture / uFocal);
+  float xx = uVariance, xy = 0.0, yy = uVariance;
+  for (int k = 0; k < 3; k++) {
+    vec3 a = mat3(viewMatrix) * axis[k];
+    vec2 m = uFocal / depth * (a.xy + slope * a.z);
+    xx += m.x * m.x; xy += m.x * m.y; yy += m.y * m.y;
+  }
+  float determinant = max(xx * yy - xy * xy, 1e-12);
+  vConic = vec3(yy, -xy, xx) / determinant;
+  vOff = position.xy * sqrt(2.0 * log(centre.w / uCut)) * sqrt(vec2(xx, yy));
+  vLight = vec4(min(throughAir(texelFetch(uColour, at, 0).rgb, ray, length(ray)), 60000.0), centre.w);
+  vec4 clip = projectionMatrix * vec4(p, 1.0);
+  gl_Position = clip + vec4(2.0 * vOff / uPicture * clip.w, 0.0, 0.0);
+}
+`;
+
+export const SPLAT = PRECISION + /* glsl */ `
+uniform float uCut, uMost;
+in vec2 vOff;
+in vec4 vLight;
+flat in vec3 vConic;
+layout(location = 0) out vec4 colour;
+void main() {
+  float power = -0.5 * (vConic.x * vOff.x * vOff.x + vConic.z * vOff.y * vOff.y) - vConic.y * vOff.x * vOff.y;
+  float alpha = min(vLight.a * exp(power), uMost);
+  if (alpha < uCut) discard;
+  colour = vec4(vLight.rgb * alpha, alpha);
+}
+`;
+
+// Neighbouring discs leave gaps of a few per cent, through which the sky must not shine.
+export const SPLAT_OVER = PRECISION + /* glsl */ `
+uniform sampler2D uFrame;
+uniform float uFull;
+out vec4 colour;
+void main() {
+  vec4 drawn = texelFetch(uFrame, ivec2(gl_FragCoord.xy), 0);
+  float solid = clamp(drawn.a / uFull, 0.0, 1.0);
+  colour = vec4(drawn.rgb / max(drawn.a, 1e-6) * solid, solid);
 }
 `;
 

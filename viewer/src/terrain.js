@@ -61,9 +61,14 @@ export function makeTerrain(arrays, about) {
     return levels;
   }
 
+  // Finer heights, where the page has them.
+  let tiles = null;
+
   function heightAt(east, north) {
     const x = Math.min(Math.max((east - west_m) / step_m, 0), columns - 1.001);
     const y = Math.min(Math.max((north - south_m) / step_m, 0), rows - 1.001);
+    const fine = tiles?.heightAt(x, y);
+    if (fine != null) return fine;
     const [c, r] = [Math.floor(x), Math.floor(y)];
     const [fx, fy] = [x - c, y - r];
     return (at(c, r) * (1 - fx) + at(c + 1, r) * fx) * (1 - fy) + (at(c, r + 1) * (1 - fx) + at(c + 1, r + 1) * fx) * fy;
@@ -125,7 +130,7 @@ export function makeTerrain(arrays, about) {
     return null;
   }
 
-  return { up, known, rows, columns, low, high, step: step_m, west: west_m, south: south_m, slopes, pyramid, heightAt, slopeAt, inside, horizonDeg, hit };
+  return { up, known, rows, columns, low, high, step: step_m, west: west_m, south: south_m, slopes, pyramid, heightAt, slopeAt, inside, horizonDeg, hit, setTiles: (made) => (tiles = made), tiles: () => tiles };
 }
 
 /** One chunk of CELLS x CELLS cells with skirts; instances move and scale it. */
@@ -158,14 +163,16 @@ export function chunkGeometry() {
   return geometry;
 }
 
-/** The chunks (column, row, step) to draw from an eye: finer ones near it. */
+/** The chunks (column, row, step, slot of a tile or -1) to draw from an eye: finer ones near it. */
 export function chooseChunks(terrain, eye, detail, frustum) {
   const chosen = [];
+  const tiles = terrain.tiles();
+  tiles?.begin();
   const box = new THREE.Box3();
   const sideCells = Math.max(terrain.columns, terrain.rows) - 1;
   let step = 1;
   while (step * CELLS < sideCells) step *= 2;
-  const visit = (c, r, s) => {
+  const visit = (c, r, s, slot) => {
     if (c >= terrain.columns - 1 || r >= terrain.rows - 1) return;
     const [x0, y0] = [terrain.west + c * terrain.step, terrain.south + r * terrain.step];
     const size = s * CELLS * terrain.step;
@@ -173,11 +180,18 @@ export function chooseChunks(terrain, eye, detail, frustum) {
     box.max.set(x0 + size, y0 + size, terrain.high + 1);
     if (!frustum.intersectsBox(box)) return;
     const distance = box.distanceToPoint(eye);
-    if (s > 1 && distance < detail * size) {
-      const half = (s / 2) * CELLS;
-      for (const [dc, dr] of [[0, 0], [half, 0], [0, half], [half, half]]) visit(c + dc, r + dr, s / 2);
-    } else chosen.push([c, r, s]);
+    if (distance < detail * size) {
+      // Below the grid's own step the finer cells are a tile's, once it is loaded.
+      const finer = s > 1 ? null : tiles?.find(Math.round(Math.log2(2 / s)), c, r, distance);
+      if (s > 1 || finer) {
+        const half = (s / 2) * CELLS;
+        for (const [dc, dr] of [[0, 0], [half, 0], [0, half], [half, half]]) visit(c + dc, r + dr, s / 2, finer ? finer.slot : -1);
+        return;
+      }
+    }
+    chosen.push([c, r, s, slot]);
   };
-  visit(0, 0, step);
+  visit(0, 0, step, -1);
+  tiles?.load();
   return chosen;
 }

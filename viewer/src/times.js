@@ -101,7 +101,7 @@ export const moonName = (time) => {
   return names[Math.round(MoonPhase(new Date(time)) / 45) % 8];
 };
 
-/** `#v=1&t=…Z&cam=lat,lon,height,heading,pitch,fov&ev=auto&haze=1` as values; null for another format. */
+/** `#v=1&t=…Z&cam=lat,lon,height,heading,pitch,fov&ev=auto&haze=1&mesh=1` as values; null for another format. */
 export function readAddress(hash) {
   const given = new URLSearchParams(hash.replace(/^#/, ""));
   if (given.get("v") !== "1") return null;
@@ -117,12 +117,14 @@ export function readAddress(hash) {
   if (ev !== null) state.ev = ev === "auto" || !Number.isFinite(Number(ev)) ? "auto" : Number(ev);
   const haze = Number(given.get("haze") ?? "1");
   if (haze >= 0 && haze <= 20) state.haze = haze;
+  const divider = Number(given.get("mesh") ?? "1");
+  if (divider >= 0 && divider <= 1) state.divider = divider;
   return state;
 }
 
-export function writeAddress({ time, camera, ev, haze }) {
+export function writeAddress({ time, camera, ev, haze, divider }) {
   const stamp = new Date(time).toISOString().replace(/(:00)?\.000Z$/, "Z");
   const { latitude, longitude, height, heading, pitch, fov } = camera;
   const where = [latitude.toFixed(6), longitude.toFixed(6), height.toFixed(1), heading.toFixed(2), pitch.toFixed(2), fov.toFixed(2)];
-  return `#v=1&t=${stamp}&cam=${where.join(",")}&ev=${ev === "auto" ? "auto" : ev.toFixed(2)}` + (haze === 1 ? "" : `&haze=${haze.toFixed(2)}`);
+  return `#v=1&t=${stamp}&cam=${where.join(",")}&ev=${ev === "auto" ? "auto" : ev.toFixed(2)}` + (haze === 1 ? "" : `&haze=${haze.toFixed(2)}`) + (divider === 1 ? "" : `&mesh=${divider.toFixed(2)}`);
 }

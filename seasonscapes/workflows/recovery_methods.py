@@ -1,0 +1,182 @@
+"""Methods of albedo recovery at a place: the closed form, and the joint recovery with the unknowns that a place gives it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from seasonscapes.cameras.observation import Observation
+from seasonscapes.errors import AtlasMismatch
+from seasonscapes.progress import Progress, task_progress
+from seasonscapes.sky.models import SkyModel, visibility_km, with_overrides
+from seasonscapes.terrain.surface import Texture
+from seasonscapes.workflows.illumination import illumination_for_camera
+from seasonscapes.workflows.place import Place
+
+if TYPE_CHECKING:
+    from seasonscapes.albedo.closed_form import AlbedoFit
+    from seasonscapes.albedo.forward_model import TexelTransport
+    from seasonscapes.albedo.joint_recovery import JointRecovery
+    from seasonscapes.albedo.photographs import AlbedoPhotograph
+    from seasonscapes.albedo.recovery_pictures import HazeLights
+    from seasonscapes.sky.illumination import Illumination
+
+log = logging.getLogger(__name__)
+
+METHODS = ("closed", "differentiable")
+# Thick haze to polar air [km]; light in between is interpolated, linearly in extinction.
+_VISIBILITIES_KM = (12.0, 25.0, 50.0, 100.0)
+
+
+@dataclass(frozen=True)
+class PaintedTexture:
+    """A painting of a place as an observation of its albedo.
+
+    Parameters
+    ----------
+    time
+        The instant that it shows, aware UTC.
+    texture
+        Radiance [cd/m²] with weights, such as `paint` makes.
+    name
+        Where it came from, for messages.
+    """
+
+    time: datetime
+    texture: Texture
+    name: str = "painted"
+
+
+def illuminations(place: Place, photographs: Sequence[Observation], model: SkyModel) -> list[Illumination]:
+    """The light of each photograph as seen from its camera; cameras of one position and instant share it."""
+    lights: dict = {}
+    for photograph in photographs:
+        key = (photograph.time, photograph.camera.position_m.tobytes())
+        if key not in lights:
+            lights[key] = illumination_for_camera(place, photograph.camera, model, photograph.time)[0]
+    return [lights[each.time, each.camera.position_m.tobytes()] for each in photographs]
+
+
+def painted_photographs(
+    place: Place, transport: TexelTransport, painted: Sequence[PaintedTexture], model: SkyModel
+) -> list[AlbedoPhotograph]:
+    """Observations of painted textures under the light of their instants.
+
+    Raises
+    ------
+    AtlasMismatch
+        For a painting of another atlas.
+    """
+    from seasonscapes.albedo.painted_textures import painted_photograph
+    from seasonscapes.workflows.illumination import illumination
+
+    result = []
+    for each in painted:
+        if each.texture.values.shape[:2] != place.texture_shape or each.texture.atlas_id not in (None, place.atlas_id):
+            raise AtlasMismatch(
+                f"{each.name}: painted in another atlas than the scene has now; give the --texel-m, --atlas and mesh "
+                "options that it was painted with"
+            )
+        light = illumination(place, each.time, sky=model)
+        result.append(painted_photograph(transport, each.texture, light, each.time, each.name))
+    return result
+
+
+def closed_fit(
+    transport: TexelTransport, photographs: list[AlbedoPhotograph], progress: Progress | None = None
+) -> AlbedoFit:
+    """The closed form of 8-bit photographs."""
+    from seasonscapes.albedo.closed_form import solve_albedo
+    from seasonscapes.albedo.photographs import EIGHT_BIT
+
+    report = task_progress(progress, "albedo")
+    return solve_albedo(transport, photographs, noise_model=EIGHT_BIT, progress=report)
+
+
+def joint_fit(
+    place: Place,
+    transport: TexelTransport,
+    photographs: list[AlbedoPhotograph],
+    model: SkyModel,
+    progress: Progress | None = None,
+) -> tuple[JointRecovery, dict[str, Any]]:
+    """The joint recovery, started from the closed form, and what it found as plain values."""
+    from seasonscapes.albedo.joint_recovery import recover_jointly
+
+    start = closed_fit(transport, photographs, progress)
+    haze = _haze_lights(place, photographs, model, progress)
+    report = task_progress(progress, "haze, exposures, response, clouds, poses")
+    found = recover_jointly(transport, photographs, start, haze=haze, progress=report)
+    if not found.accepted:
+        log.warning(
+            "the closed form stays: photographs that were held out are explained no better by the joint recovery "
+            "(loss %.4f, before %.4f)",
+            found.held_out_end,
+            found.held_out_start,
+        )
+    return found, _facts(found, photographs, haze is not None)
+
+
+def _haze_lights(
+    place: Place, photographs: list[AlbedoPhotograph], model: SkyModel, progress: Progress | None
+) -> HazeLights | None:
+    """Lights of all photographs at several visibilities; ``None`` where the sky model has no haze to change."""
+    from seasonscapes.albedo.recovery_pictures import HazeLights
+
+    assumed, valid = visibility_km(model), model.valid.visibility_km
+    if assumed is None or valid is None:
+        log.info("haze stays as it is: the sky model has no visibility to change")
+        return None
+    report = task_progress(progress, "light at several visibilities")
+    nodes = tuple(km for km in _VISIBILITIES_KM if valid[0] <= km <= valid[1])
+    lights = []
+    for number, km in enumerate(nodes):
+        lights.append(_lights_in(place, photographs, with_overrides(model, visibility_km=km)))
+        report((number + 1) / len(nodes))
+    return HazeLights(nodes, lights, assumed)
+
+
+def _lights_in(place: Place, photographs: list[AlbedoPhotograph], model: SkyModel) -> list[Illumination]:
+    """The lights of photographs under another model; a painting has no air in front."""
+    from seasonscapes.workflows.illumination import illumination
+
+    seen = [each.observation for each in photographs if isinstance(each.observation, Observation)]
+    of_cameras, result = iter(illuminations(place, seen, model)), []
+    for photograph in photographs:
+        if isinstance(photograph.observation, Observation):
+            result.append(next(of_cameras))
+        else:
+            light = illumination(place, photograph.observation.time, sky=model)
+            result.append(replace(light, aerial_perspective=None))
+    return result
+
+
+def _facts(found: JointRecovery, photographs: list[AlbedoPhotograph], hazy: bool) -> dict[str, Any]:
+    conditions, names = found.conditions, list(dict.fromkeys(id(each.footprints) for each in photographs))
+    webcams = [next(p.observation.webcam for p in photographs if id(p.footprints) == name) for name in names]
+    facts: dict[str, Any] = {
+        "joint": {
+            "accepted": found.accepted,
+            "held_out_loss": [round(found.held_out_start, 4), round(found.held_out_end, 4)],
+            "sun_share": [round(float(value), 3) for value in conditions.sun_share],
+            "sky_scale": np.round(conditions.sky_scale.mean(axis=1), 3).tolist(),
+            "cameras": {
+                webcam: {
+                    "curve_strength": round(float(strength), 3),
+                    "curve_exponent": round(float(exponent), 3),
+                    "turn_deg": [round(float(angle), 3) for angle in turn],
+                }
+                for webcam, strength, exponent, turn in zip(
+                    webcams, conditions.curve_strength, conditions.curve_exponent, conditions.turn_deg, strict=True
+                )
+            },
+        }
+    }
+    if hazy:
+        facts["visibility_km"] = round(conditions.visibility_km, 1)
+    return facts
