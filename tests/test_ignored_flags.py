@@ -71,8 +71,9 @@ VERBS: dict[str, tuple[list[str], set[str], dict[str, list[str]]]] = {
     ),
     "albedo": (
         ["alpine_small", "--times", TIME],
-        {*_TERRAIN, *_SKY, "--times", "--synthetic-webcams", "--fit-haze", "--fit-curve", "--iterations", "--output"},
-        {**_NO_BOUND, **_REAL, "--size": []},
+        {*_TERRAIN, *_SKY, "--times", "--synthetic-webcams", "--method", "--painted", "--output"},
+        {**_NO_BOUND, **_REAL, "--size": []}
+        | _each(("--fit-haze", "--fit-curve"), ["--method", "differentiable"]),
     ),
     "inpaint": (
         ["alpine_small", "--time", TIME],
@@ -114,7 +115,7 @@ VERBS: dict[str, tuple[list[str], set[str], dict[str, list[str]]]] = {
     "relight": (
         ["box.ply", "--sun", "170,40"],
         {*_SKY, "--time", "--sun", "--from", "--to", "--times", "--taken", "--taken-sun", "--turntable", "--exposure"}
-        | {"--at", "--up", "--north", "--crs", "--offset", "--ground-albedo", "--ground", "--no-ground", "--rays"}
+        | {"--at", "--on", "--up", "--north", "--crs", "--offset", "--ground-albedo", "--ground", "--no-ground", "--rays"}
         | {"--white-reflectance", "--seed", "--bits", "--textures", "--look", "--output", "--workspace", "--size"}
         | {"--allow-outside", "--device", "--azimuth", "--elevation", "--eye", "--target", "--fov"},
         {**_NEUTRAL, "--every": [], "--fps": ["--output", "a.png"]},
@@ -127,16 +128,16 @@ VERBS: dict[str, tuple[list[str], set[str], dict[str, list[str]]]] = {
     ),
     "view": (
         ["alpine_small"],
-        {*_TERRAIN, *_SKY, "--time", "--albedo", "--output", "--single-file", "--camera", "--port", "--open", "--no-open"},
+        {*_TERRAIN, *_SKY, "--time", "--albedo", "--output", "--single-file", "--camera", "--gaussians", "--port", "--open", "--no-open"},
         _NO_BOUND,
     ),
     "delight": (
         ["alpine_small", "--sun", "170,40"],
-        {*_TERRAIN, *_SKY, "--time", "--sun", "--image", "--sensor-height-m", "--output"},
+        {*_TERRAIN, *_SKY, "--time", "--sun", "--image", "--sensor-height-m", "--land-classes", "--output"},
         {
             **_NO_BOUND,
             **_each(
-                ("--at", "--up", "--north", "--crs", "--offset", "--ground-albedo", "--no-ground", "--white-reflectance",
+                ("--at", "--on", "--up", "--north", "--crs", "--offset", "--ground-albedo", "--no-ground", "--white-reflectance",
                  "--rays", "--seed", "--bits", "--textures"),
                 [],
             ),
@@ -205,5 +206,5 @@ def test_a_flag_that_would_do_nothing_is_refused(verb, flag, capsys, tmp_path, m
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("seasonscapes: ")]
     assert len(lines) == 1
     told = lines[0]
-    assert re.search(r"does nothing|of no use|go with|goes with|flags of meshes", told), told
+    assert re.search(r"does nothing|of no use|go with|goes with|belongs to|flags of meshes", told), told
     assert flag in told or "flags of meshes" in told or "--spp" in told, told
