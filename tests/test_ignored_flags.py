@@ -40,9 +40,10 @@ VERBS: dict[str, tuple[list[str], set[str], dict[str, list[str]]]] = {
     ),
     "timelapse": (
         ["alpine_small", "--from", "2024-07-20T10:00", "--to", "2024-07-20T11:00"],
-        {*_TERRAIN, *_SKY, *_VIEW, "--from", "--to", "--times", "--every", "--albedo", "--exr", "--seed", "--output", "--cluster"}
+        {*_TERRAIN, *_SKY, "--path", "--from", "--to", "--times", "--albedo", "--seed", "--output", "--cluster"}
         | {"--shard", "--device"},
         {**_OF_POSITION, **_NO_BOUND}
+        | _each((*_VIEW, "--every", "--exr", "--cluster"), ["--path", "p.json"])
         | {"--season": [], "--fps": ["--output", "folder"]}
         | _each(("--smooth", "--exposure", "--look", "--white-balance", "--keep-frames"), ["--shard", "1/2"]),
     ),

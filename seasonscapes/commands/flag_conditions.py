@@ -48,6 +48,11 @@ CONDITIONS: dict[str, tuple[Condition, ...]] = {
         Condition(("--white-balance",), "a .png output", written_as(".png", default="a.png")),
     ),
     "timelapse": (
+        Condition(
+            (*_VIEW, "--every", "--smooth", "--exr", "--keep-frames", "--cluster", "--shard"),
+            "a fixed camera, which --path replaces",
+            no("--path"),
+        ),
         _POSITION,
         _BALANCE,
         _STEP,
