@@ -346,10 +346,11 @@ def filled_gutters(texture: Texture, covered: np.ndarray, gutter_px: int) -> Tex
     """
     from scipy.ndimage import binary_dilation, distance_transform_edt
 
-    known = binary_dilation(covered, np.ones((3, 3), bool), iterations=gutter_px) if gutter_px else covered
+    ring = np.ones((3, 3), bool)
+    known = np.asarray(binary_dilation(covered, ring, iterations=gutter_px), bool) if gutter_px else covered
     if known.all() or not known.any():
         return texture
-    row, column = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    row, column = np.asarray(distance_transform_edt(~known, return_distances=False, return_indices=True))
     return replace(texture, values=texture.values[row, column], weight=texture.weight[row, column])
 
 
