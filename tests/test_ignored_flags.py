@@ -40,9 +40,10 @@ VERBS: dict[str, tuple[list[str], set[str], dict[str, list[str]]]] = {
     ),
     "timelapse": (
         ["alpine_small", "--from", "2024-07-20T10:00", "--to", "2024-07-20T11:00"],
-        {*_TERRAIN, *_SKY, *_VIEW, "--from", "--to", "--times", "--every", "--albedo", "--exr", "--seed", "--output", "--cluster"}
+        {*_TERRAIN, *_SKY, "--path", "--from", "--to", "--times", "--albedo", "--seed", "--output", "--cluster"}
         | {"--shard", "--device"},
         {**_OF_POSITION, **_NO_BOUND}
+        | _each((*_VIEW, "--every", "--exr", "--cluster"), ["--path", "p.json"])
         | {"--season": [], "--fps": ["--output", "folder"]}
         | _each(("--smooth", "--exposure", "--look", "--white-balance", "--keep-frames"), ["--shard", "1/2"]),
     ),
@@ -94,9 +95,9 @@ VERBS: dict[str, tuple[list[str], set[str], dict[str, list[str]]]] = {
     ),
     "splat": (
         ["alpine_small", "--time", TIME],
-        {*_TERRAIN, *_SKY, "--time", "--model", "--output", "--exposure"},
+        {*_TERRAIN, *_SKY, "--time", "--model", "--output", "--exposure", "--camera", "--at"},
         {**_OF_POSITION, **_NO_BOUND}
-        | _each((*_VIEW, "--subpixels", "--device", "--look", "--white-balance"), ["--output", "a.ply"]),
+        | _each(("--size", "--subpixels", "--device", "--look", "--white-balance"), ["--output", "a.ply"]),
     ),
     "run": (
         ["alpine_small", "--times", TIME, "--at-hours", TIME],
@@ -114,7 +115,7 @@ VERBS: dict[str, tuple[list[str], set[str], dict[str, list[str]]]] = {
     "relight": (
         ["box.ply", "--sun", "170,40"],
         {*_SKY, "--time", "--sun", "--from", "--to", "--times", "--taken", "--taken-sun", "--turntable", "--exposure"}
-        | {"--at", "--up", "--north", "--crs", "--offset", "--ground-albedo", "--ground", "--no-ground", "--rays"}
+        | {"--at", "--on", "--up", "--north", "--crs", "--offset", "--ground-albedo", "--ground", "--no-ground", "--rays"}
         | {"--white-reflectance", "--seed", "--bits", "--textures", "--look", "--output", "--workspace", "--size"}
         | {"--allow-outside", "--device", "--azimuth", "--elevation", "--eye", "--target", "--fov"},
         {**_NEUTRAL, "--every": [], "--fps": ["--output", "a.png"]},
@@ -127,16 +128,16 @@ VERBS: dict[str, tuple[list[str], set[str], dict[str, list[str]]]] = {
     ),
     "view": (
         ["alpine_small"],
-        {*_TERRAIN, *_SKY, "--time", "--albedo", "--output", "--single-file", "--camera", "--port", "--open", "--no-open"},
+        {*_TERRAIN, *_SKY, "--time", "--albedo", "--output", "--single-file", "--camera", "--gaussians", "--port", "--open", "--no-open"},
         _NO_BOUND,
     ),
     "delight": (
         ["alpine_small", "--sun", "170,40"],
-        {*_TERRAIN, *_SKY, "--time", "--sun", "--image", "--sensor-height-m", "--output"},
+        {*_TERRAIN, *_SKY, "--time", "--sun", "--image", "--sensor-height-m", "--land-classes", "--output"},
         {
             **_NO_BOUND,
             **_each(
-                ("--at", "--up", "--north", "--crs", "--offset", "--ground-albedo", "--no-ground", "--white-reflectance",
+                ("--at", "--on", "--up", "--north", "--crs", "--offset", "--ground-albedo", "--no-ground", "--white-reflectance",
                  "--rays", "--seed", "--bits", "--textures"),
                 [],
             ),
@@ -205,5 +206,5 @@ def test_a_flag_that_would_do_nothing_is_refused(verb, flag, capsys, tmp_path, m
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("seasonscapes: ")]
     assert len(lines) == 1
     told = lines[0]
-    assert re.search(r"does nothing|of no use|go with|goes with|flags of meshes", told), told
+    assert re.search(r"does nothing|of no use|go with|goes with|belongs to|flags of meshes", told), told
     assert flag in told or "flags of meshes" in told or "--spp" in told, told

@@ -48,6 +48,11 @@ CONDITIONS: dict[str, tuple[Condition, ...]] = {
         Condition(("--white-balance",), "a .png output", written_as(".png", default="a.png")),
     ),
     "timelapse": (
+        Condition(
+            (*_VIEW, "--every", "--smooth", "--exr", "--keep-frames", "--cluster", "--shard"),
+            "a fixed camera, which --path replaces",
+            no("--path"),
+        ),
         _POSITION,
         _BALANCE,
         _STEP,
@@ -109,7 +114,7 @@ CONDITIONS: dict[str, tuple[Condition, ...]] = {
     "splat": (
         _POSITION,
         _BALANCE,
-        Condition((*_VIEW, "--subpixels", "--device"), "a picture", written_as(".png", ".exr", default="a.png")),
+        Condition(("--size", "--subpixels", "--device"), "a picture", lambda given: not written_as(".ply", ".glb", default="a.png")(given)),
         Condition(("--look", "--white-balance"), "a .png output", written_as(".png", default="a.png")),
     ),
     "run": (

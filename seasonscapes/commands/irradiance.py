@@ -12,7 +12,7 @@ from seasonscapes.commands.arguments import parse_time
 from seasonscapes.commands.console import print_result, progress_bars
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
 from seasonscapes.commands.outputs import check_output
-from seasonscapes.commands.view_options import WhenOptions
+from seasonscapes.commands.when_options import WhenOptions
 from seasonscapes.errors import InputError
 
 

@@ -15,7 +15,7 @@ from seasonscapes.commands.mesh_options import MESH_SUFFIXES, MeshFileFlags, Mes
 from seasonscapes.commands.mesh_view_options import MeshViewFlags
 from seasonscapes.commands.options import SkyOptions
 from seasonscapes.commands.outputs import check_file_or_folder
-from seasonscapes.commands.view_options import WhenOptions
+from seasonscapes.commands.when_options import WhenOptions
 from seasonscapes.errors import InputError
 
 if TYPE_CHECKING:

@@ -78,6 +78,11 @@ class RunEffort:
 
         given = {"steps": self.steps, "picture_steps": self.picture_steps, "suns": self.suns, "views": self.views}
         refuse_without("--appearance physical", appearance == "physical", **given)
-        effort = {"steps": 1500, "picture_steps": 120, "suns": 24, "views": 3}
-        effort |= {name: value for name, value in given.items() if value is not None}
-        return DistilOptions(discs=self.discs, **effort)
+        # A run's model is smaller than the one that `distill` makes.
+        return DistilOptions(
+            discs=self.discs,
+            suns=24 if self.suns is None else self.suns,
+            views=3 if self.views is None else self.views,
+            steps=1500 if self.steps is None else self.steps,
+            picture_steps=120 if self.picture_steps is None else self.picture_steps,
+        )

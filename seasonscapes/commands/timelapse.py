@@ -13,7 +13,9 @@ from seasonscapes.commands.console import print_result, progress_bars
 from seasonscapes.commands.look_options import LookOptions
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
 from seasonscapes.commands.outputs import check_file_or_folder
-from seasonscapes.commands.view_options import ViewOptions, WhenOptions
+from seasonscapes.commands.timelapse_path import film_path
+from seasonscapes.commands.view_options import ViewOptions
+from seasonscapes.commands.when_options import WhenOptions
 from seasonscapes.commands.work_options import WorkOptions
 from seasonscapes.errors import InputError
 
@@ -22,6 +24,7 @@ def timelapse_command(
     scene: str,
     *,
     when: WhenOptions | None = None,
+    path: Path | None = None,
     view: ViewOptions | None = None,
     sky: SkyOptions | None = None,
     season: str | None = None,
@@ -46,6 +49,9 @@ def timelapse_command(
     ----------
     scene
         A scene file, or the name of a bundled scene (alpine).
+    path
+        A path of `seasonscapes path`: its views are path-traced, at one hour of --times, at one for each view, or from
+        --from to --to.
     season
         Between dated albedos: blended (linear, default), nearest, or snow-line (the snow line moves place by place).
     albedo
@@ -88,15 +94,26 @@ def timelapse_command(
     check_range("--fps", fps, 0.1, 240.0)
     check_range("--seed", seed, 0, 2**32)
     work.check_cluster()
-    part, path = work.part(), find_scene(scene)
-    declared = read_scene(path, allow_outside=place.allow_outside)
+    part, file = work.part(), find_scene(scene)
+    declared = read_scene(file, allow_outside=place.allow_outside)
     if season is not None and len(albedo or declared.images) < 2:
         raise InputError("--season", "does nothing without albedos of two dates", got=season, cure="add --albedo")
+    if path is not None:
+        how: dict[str, Any] = {
+            "when": when,
+            "place": place,
+            "sky": sky.model(),
+            "albedo": albedo,
+            "season": season,
+            "seed": seed,
+        }
+        film_path(scene, path, output, film_look, **how, device=device, as_json=json)
+        return
     chosen = view.chosen(declared)
     times = when.instants(chosen.latitude_deg, chosen.longitude_deg)
     files = tuple(parse_albedo(text) for text in albedo or ())
     job = RenderJob(
-        path.resolve(),
+        file.resolve(),
         place.folder().folder.resolve(),
         place.mesh(albedo=[each.path for each in files]),
         chosen,
@@ -110,13 +127,13 @@ def timelapse_command(
         allow_outside=place.allow_outside,
     )
     chosen_times = times if part is None else films.shard(times, *part)
-    how: dict[str, Any] = {"cluster": work.cluster, "exr_folder": output.resolve() if exr else None}
+    where: dict[str, Any] = {"cluster": work.cluster, "exr_folder": output.resolve() if exr else None}
     with progress_bars() as progress:
         if part is not None:
-            rendered = films.render_frames(job, chosen_times, **how, progress=progress)
+            rendered = films.render_frames(job, chosen_times, **where, progress=progress)
         else:
             rendered = films.make_film(
-                job, times, output, film_look, **how, keep_frames=keep_frames, progress=progress
+                job, times, output, film_look, **where, keep_frames=keep_frames, progress=progress
             )[1]
     record = {"scene": scene, "camera": chosen.name, "frames": len(chosen_times), "rendered": rendered}
     record |= {"output": str(output)} if part is None else {}

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import datetime
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 from cyclopts import Parameter
 
-from seasonscapes.commands.arguments import check_range, parse_at, parse_duration, parse_size, parse_times
-from seasonscapes.commands.console import message
+from seasonscapes.commands.arguments import check_range, parse_at, parse_size
 from seasonscapes.errors import InputError
 
 if TYPE_CHECKING:
@@ -19,7 +17,6 @@ if TYPE_CHECKING:
     from seasonscapes.scene import NamedCamera, SceneFile
     from seasonscapes.workflows.place import Place
 
-_MOST_FRAMES = 200_000
 _SIZE = "1536x1024"
 # What a view keeps of each pixel at least, in single precision: radiance, surface radiance, albedo, position and normal of
 # three numbers each, uv of two, depth and alpha.
@@ -112,38 +109,3 @@ class ViewOptions:
 
         where = "--camera" if self.at is None else "--at"
         return camera_for(place, self.chosen(place.scene), size_px=self.size_px(), where=where)
-
-
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
-class WhenOptions:
-    """Which instants."""
-
-    start: Annotated[str | None, Parameter(name="--from")] = None
-    """First frame, ISO 8601; without an offset it is civil time at the camera."""
-    to: str | None = None
-    """Last frame."""
-    every: str = "10min"
-    """Time between frames: a number and s, min, h or d."""
-    times: str | None = None
-    """Instants instead: separated by commas, or a file with one in each line."""
-
-    def instants(self, latitude_deg: float, longitude_deg: float) -> list[datetime]:
-        """Aware UTC times, in order."""
-        from seasonscapes.civil_time import resolve_time
-
-        if self.times is not None:
-            if self.start is not None or self.to is not None:
-                raise InputError("--times", "and --from … --to name two sets of frames", cure="drop one of them")
-            return parse_times("--times", self.times, latitude_deg, longitude_deg)
-        if self.start is None or self.to is None:
-            raise InputError("--from", "and --to are needed", cure="give both, or --times")
-        first, last = (resolve_time(text, latitude_deg, longitude_deg) for text in (self.start, self.to))
-        message(f"from {first.reading}")
-        message(f"to {last.reading}")
-        if last.utc < first.utc:
-            raise InputError("--to", "lies before --from", got=self.to)
-        step = parse_duration("--every", self.every)
-        count = int((last.utc - first.utc) / step) + 1
-        check_range("--every", count, 1, _MOST_FRAMES)
-        return [first.utc + index * step for index in range(count)]
