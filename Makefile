@@ -58,7 +58,7 @@ tables: $(DEV)
 results: $(DEV)
 	$(BIN)/python benchmarks/terrain.py --quick --json benchmarks/results/terrain-quick.json
 	$(BIN)/python benchmarks/surface.py --quick --json benchmarks/results/surface-quick.json
-	$(BIN)/python benchmarks/render.py --json benchmarks/results/render.json
+	$(BIN)/python benchmarks/render.py --quick --json benchmarks/results/render-quick.json
 	$(BIN)/python benchmarks/sky.py --json benchmarks/results/sky.json
 	$(BIN)/python benchmarks/sky_night.py --json benchmarks/results/sky_night.json
 	$(BIN)/python benchmarks/light_series.py --quick --json benchmarks/results/light_series-quick.json
@@ -68,9 +68,10 @@ results: $(DEV)
 	$(BIN)/python benchmarks/texturing.py --quick --json benchmarks/results/texturing-quick.json
 	$(BIN)/python benchmarks/albedo.py --quick --json benchmarks/results/albedo-quick.json
 	$(BIN)/python benchmarks/delight.py --quick --json benchmarks/results/delight-quick.json
-	$(BIN)/python benchmarks/gaussians.py --json benchmarks/results/gaussians.json
+	$(BIN)/python benchmarks/gaussians.py --quick --json benchmarks/results/gaussians-quick.json
 	$(BIN)/python benchmarks/alpinebench.py --quick --json benchmarks/results/alpinebench-quick.json
 	$(BIN)/python benchmarks/viewer.py --quick --json benchmarks/results/viewer-quick.json
+	$(BIN)/python benchmarks/detail.py --quick --json benchmarks/results/detail-quick.json
 	$(BIN)/python benchmarks/calibration.py --quick --json benchmarks/results/calibration-quick.json
 	$(BIN)/python benchmarks/realbench.py --json benchmarks/results/realbench.json
 	$(BIN)/python benchmarks/viewer.py --json benchmarks/results/viewer.json

@@ -539,6 +539,11 @@ def main() -> None:
     result["held_out_hour_psnr_db"] = result["full_psnr_db"]
     result["unseen_camera_psnr_db"] = result["full_unseen_camera_psnr_db"]
     result["margin_over_wildgaussians_db"] = result["full_psnr_db"] - max(result["code_psnr_db"], result["sun_psnr_db"])
+    # What training brings on hours that it has not seen; a date between two dated albedos against the worse of these.
+    result["training_gain_db"] = result["full_psnr_db"] - result["physical_untrained_psnr_db"]
+    seen = min(result["season_seen_psnr_db"], result["season_seen2_psnr_db"])
+    result["between_dates_gap_db"] = seen - result["season_unseen_psnr_db"]
+    result["moving_camera_speedup"] = result["speedup_vs_path"]
     result["train_seconds"] = contest.seconds["full"]
     result["prepare_seconds"] = contest.seconds["transport"] + contest.seconds["lessons"] + contest.seconds["views"]
     result["total_seconds"] = time.perf_counter() - start
