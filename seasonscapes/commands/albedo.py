@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from seasonscapes.commands.albedo_record import albedo_lines, albedo_record
-from seasonscapes.commands.arguments import check_choice, check_range, parse_painted, parse_size, parse_times
+from seasonscapes.commands.arguments import check_choice, check_range, parse_size, parse_times
 from seasonscapes.commands.console import message, print_result, progress_bars
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
 from seasonscapes.commands.outputs import check_output
+from seasonscapes.commands.picture_options import parse_painted
 from seasonscapes.errors import InputError
 
 if TYPE_CHECKING:

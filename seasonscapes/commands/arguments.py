@@ -14,7 +14,6 @@ from seasonscapes.text_files import read_text
 
 if TYPE_CHECKING:
     from seasonscapes.workflows.albedo_sources import AlbedoFile
-    from seasonscapes.workflows.recovery_methods import PaintedTexture
 
 _LONGEST_SECONDS = 366 * 86400.0
 
@@ -126,19 +125,6 @@ def parse_times(flag: str, text: str, latitude_deg: float, longitude_deg: float)
 def parse_names(text: str | None) -> set[str]:
     """Names separated by commas."""
     return {name.strip() for name in (text or "").split(",")} - {""}
-
-
-def parse_painted(text: str, latitude_deg: float, longitude_deg: float) -> PaintedTexture:
-    """``TIME=FILE`` as a painted texture of an instant."""
-    from seasonscapes.terrain.surface import load_texture
-    from seasonscapes.workflows.recovery_methods import PaintedTexture
-
-    time, equals, name = text.partition("=")
-    if not equals or not name.strip():
-        expected = "TIME=FILE, such as 2024-07-20T12:00=out/paint/painted.npz"
-        raise InputError("--painted", "not a painting with its time", got=text, expected=expected)
-    instant = parse_time(time.strip(), latitude_deg, longitude_deg)
-    return PaintedTexture(instant, load_texture(name.strip()), name.strip())
 
 
 def parse_albedo(text: str) -> AlbedoFile:

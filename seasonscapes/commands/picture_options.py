@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from cyclopts import Parameter
 
-from seasonscapes.commands.arguments import parse_names, parse_size
+from seasonscapes.commands.arguments import parse_names, parse_size, parse_time
 from seasonscapes.errors import InputError
 
 if TYPE_CHECKING:
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from seasonscapes.sky.models import SkyModel
     from seasonscapes.workflows.photograph_files import PhotographSources
     from seasonscapes.workflows.place import Place
+    from seasonscapes.workflows.recovery_methods import PaintedTexture
 
 
 @Parameter(name="*")
@@ -61,3 +62,16 @@ class PictureOptions:
         return photographed_in_workspace(
             place, utc, model, leave_out=parse_names(self.leave_out), size_px=size_px, progress=progress
         )
+
+
+def parse_painted(text: str, latitude_deg: float, longitude_deg: float) -> PaintedTexture:
+    """``TIME=FILE`` as a painted texture of an instant."""
+    from seasonscapes.terrain.surface import load_texture
+    from seasonscapes.workflows.recovery_methods import PaintedTexture
+
+    time, equals, name = text.partition("=")
+    if not equals or not name.strip():
+        expected = "TIME=FILE, such as 2024-07-20T12:00=out/paint/painted.npz"
+        raise InputError("--painted", "not a painting with its time", got=text, expected=expected)
+    instant = parse_time(time.strip(), latitude_deg, longitude_deg)
+    return PaintedTexture(instant, load_texture(name.strip()), name.strip())
