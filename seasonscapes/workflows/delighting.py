@@ -208,7 +208,8 @@ def delit_imagery(
         found = image_sun(place, pixels, progress=progress)
         facts["found_sun"] = found_sun_record(found)
         if not found.trusted:
-            cure = "state the image's time or sun"
+            best = f"{found.azimuth_deg:.0f},{found.elevation_deg:.0f}"
+            cure = f"state the image's time or sun, or see what the best one gives, --sun {best}"
             raise NotEnoughEvidence(f"{imagery.label}: its sun cannot be told: {found.reason}; {cure}")
         time = (found.azimuth_deg, found.elevation_deg)
     light, day, record = image_light(place, time, sky)
