@@ -103,7 +103,7 @@ def test_panoramas_to_gaussians_and_film(paper_runs):
     assert len(frames) == 6
     assert len({frame["time_utc"] for frame in frames}) == 2
     learned = json.loads((whole / "gaussians" / "distillation.json").read_text())
-    assert learned["loss"] < 0.7 * learned["loss_first"]
+    assert learned["loss"] < 0.85 * learned["loss_first"]
     picture = np.asarray(Image.open(next((whole / "splat").glob("*.png"))), float)
     assert picture.shape == (64, 96, 3)
     assert picture.std() > 5.0
