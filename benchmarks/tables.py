@@ -414,11 +414,9 @@ def record_table(name: str) -> str:
     missing = [f"`benchmarks/results/{each}.json`" for each, record in records.items() if record is None]
     if missing:
         lines += ["", f"*Not measured by the present program: {', '.join(missing)}.*"]
-    sources = [
-        f"<sub>{_source(record)}</sub>" for each, record in records.items() if record is not None and each in used
-    ]
+    sources = [_source(record) for each, record in records.items() if record is not None and each in used]
     if sources:
-        lines += ["", *([table.note, ""] if table.note else []), *sources]
+        lines += ["", *([table.note, ""] if table.note else []), f"<sub>{'<br>'.join(sources)}</sub>"]
     return "\n".join(lines).strip() + "\n"
 
 
