@@ -6,8 +6,6 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from seasonscapes.declaration import InputError
 from seasonscapes.terrain.atlas import Atlas, measure_atlas, require_side, signed_uv_areas
@@ -133,6 +131,10 @@ def _laid_flat(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
 
 def _pieces(faces: np.ndarray, vertex_count: int) -> int:
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
+    # Taken in here: every command that knows a place would import it.
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     graph = coo_array((np.ones(len(edges), bool), edges.T), shape=(vertex_count, vertex_count))
     return int(connected_components(graph, directed=False)[0])
 

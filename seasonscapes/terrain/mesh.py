@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike
 from seasonscapes.frames import MEAN_RADIUS_M, LocalFrame, enu_from_geodetic, geodetic_from_enu
 from seasonscapes.terrain.atlas import planar_uv
 from seasonscapes.terrain.crs import apply_affine, geodetic_from_map, raster_pixels
-from seasonscapes.terrain.poisson import poisson_raster
 from seasonscapes.terrain.surface import Raster, Terrain
 from seasonscapes.terrain.texels import covering_faces
 
@@ -189,6 +188,9 @@ def grid_faces(height: int, width: int, *, mirrored: bool = False) -> np.ndarray
 
 def _poisson(raster: Raster, frame: LocalFrame, max_error_m: float) -> tuple[np.ndarray, np.ndarray]:
     """Greedy insertion on the screened Poisson surface of all samples."""
+    # Sparse solvers take long to import, and few places need them.
+    from seasonscapes.terrain.poisson import poisson_raster
+
     return _adaptive(poisson_raster(raster), frame, max_error_m)
 
 

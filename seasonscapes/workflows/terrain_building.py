@@ -16,7 +16,6 @@ from seasonscapes.terrain.crs import wrapped
 from seasonscapes.terrain.memory import check_memory
 from seasonscapes.terrain.mesh import MESHERS, build_mesh
 from seasonscapes.terrain.placement import cell_sides_m, check_area
-from seasonscapes.terrain.poisson import poisson_raster
 from seasonscapes.terrain.raster import bounds_geographic, centre_frame, fill_nodata, read_elevation
 from seasonscapes.terrain.raster_files import OWN_FOLDER
 from seasonscapes.terrain.refine import refine_raster, refinement_factor
@@ -208,6 +207,8 @@ def build_terrain(
     report(0.1)
     mesher = options.mesher
     if mesher == "poisson":
+        from seasonscapes.terrain.poisson import poisson_raster
+
         # Mesh and shading share one surface.
         refined, mesher = poisson_raster(refined), "adaptive"
     terrain = build_mesh(refined, frame, mesher=mesher, max_error_m=bound)
