@@ -232,7 +232,7 @@ class Appearance(nn.Module):
             self.embedding = nn.Parameter(torch.tensor(embedding, dtype=torch.float32))  # copied: modified by training
             if kind == "code":
                 self.codes = nn.Parameter(0.01 * torch.randn(times, CODE, generator=generator))
-            self.mlp = _network(self._inputs(embedding.shape[1]), HIDDEN[kind], generator)
+            self.mlp = correction_network(self._inputs(embedding.shape[1]), HIDDEN[kind], generator)
 
     def _inputs(self, embedding: int) -> int:
         """Number of network inputs."""
@@ -326,7 +326,8 @@ class Appearance(nn.Module):
         return torch.sigmoid((elevation - angle - self.shift[index]) / self.log_softness[index].exp())
 
 
-def _network(inputs: int, width: int, generator: torch.Generator) -> nn.Sequential:
+def correction_network(inputs: int, width: int, generator: torch.Generator) -> nn.Sequential:
+    """The network of the affine correction: two hidden layers, six outputs, and a last layer of zeros."""
     layers = [nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 6)]
     for layer in layers[:-1:2]:
         bound = (6.0 / layer.in_features) ** 0.5

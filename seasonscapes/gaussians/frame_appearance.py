@@ -22,7 +22,7 @@ from torch import nn
 
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.errors import InputError, NoTerrainInView
-from seasonscapes.gaussians.appearance import fourier_embedding
+from seasonscapes.gaussians.appearance import correction_network, fourier_embedding
 from seasonscapes.gaussians.losses import SparseProduct, TrainingFrame, image_loss, training_picture
 from seasonscapes.gaussians.model import content_digest
 from seasonscapes.gaussians.rasterise import splat_colours, view_weights
@@ -71,18 +71,7 @@ class FrameAppearance(nn.Module):
         self.colour = nn.Parameter(colour)
         self.embedding = nn.Parameter(torch.tensor(embedding, dtype=torch.float32))
         self.codes = nn.Parameter(0.01 * torch.randn(times, _CODE, generator=generator))
-        layers: list[nn.Module] = []
-        for inputs in (size + _CODE + (6 if directional else 3), _HIDDEN):
-            layer = nn.Linear(inputs, _HIDDEN)
-            with torch.no_grad():
-                bound = (6.0 / inputs) ** 0.5
-                layer.weight.copy_(bound * (2.0 * torch.rand(layer.weight.shape, generator=generator) - 1.0))
-                layer.bias.zero_()
-            layers += [layer, nn.ReLU()]
-        last = nn.Linear(_HIDDEN, 6)
-        nn.init.zeros_(last.weight)
-        nn.init.zeros_(last.bias)
-        self.mlp = nn.Sequential(*layers, last)
+        self.mlp = correction_network(size + _CODE + (6 if directional else 3), _HIDDEN, generator)
 
     def forward(self, index: torch.Tensor, direction: torch.Tensor, code: torch.Tensor) -> torch.Tensor:
         """Colours ``(n, 3)``, display-linear and not negative.

@@ -19,6 +19,7 @@ from seasonscapes.workflows.place import Place, utc_at
 
 if TYPE_CHECKING:
     from seasonscapes.cameras.pinhole import Camera
+    from seasonscapes.gaussians.frame_appearance import FrameGaussians
     from seasonscapes.gaussians.interchange import BakedSplats
     from seasonscapes.gaussians.model import GaussianModel
     from seasonscapes.gaussians.splat_view import SplatView
@@ -30,7 +31,7 @@ def day_of_year(time: datetime) -> float:
     return time.timetuple().tm_yday + time.hour / 24.0
 
 
-def require_scene(model: GaussianModel, place: Place) -> None:
+def require_scene(model: GaussianModel | FrameGaussians, place: Place) -> None:
     """`InputError` where a model was distilled from another scene."""
     if model.note.get("scene") != place.scene.name:
         got = str(model.note.get("scene"))

@@ -274,9 +274,8 @@ def load_frame_model(place: Place, file: Path) -> FrameGaussians:
     """Read a model of `distil_frames`; `InputError` where it is damaged or of another place."""
     from seasonscapes.gaussians.frame_appearance import load_frame_gaussians
     from seasonscapes.gaussians.surfels import terrain_surfels
+    from seasonscapes.workflows.gaussian_views import require_scene
 
     model = load_frame_gaussians(file, lambda spacing_m: terrain_surfels(place.terrain, spacing_m))
-    if model.note.get("scene") != place.scene.name:
-        got = str(model.note.get("scene"))
-        raise InputError("--model", "was distilled from another scene", got=got, expected=place.scene.name)
+    require_scene(model, place)
     return model
