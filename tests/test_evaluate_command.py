@@ -171,3 +171,33 @@ def test_steepest_window_finds_the_cliff():
     assert (width, height) == (30, 20)
     assert left <= 60 < 80 <= left + width
     assert top <= 35 < 50 <= top + height
+
+
+def test_lpips_from_its_two_published_parts(folders, capsys, monkeypatch):
+    """The verb `lpips` joins them, `evaluate` reads the file and says that these are not the published weights."""
+    pytest.importorskip("torch")
+    from test_evaluation import random_weights, write_lpips_parts
+
+    from seasonscapes.cli import main
+    from seasonscapes.evaluation.lpips import lpips_of
+
+    network, linear = random_weights()
+    alexnet, wheel, _ = write_lpips_parts(folders, network, linear)
+    file = folders / "l.safetensors"
+    assert main(["lpips", str(alexnet), str(wheel), "-o", str(file), "--json"]) == 0
+    told = capsys.readouterr()
+    assert not json.loads(told.out)["published"]
+    assert f"not the published weights: {alexnet} and {wheel}" in told.err
+    pictures = {"truth": folders / "truth", "pictures": folders / "made", "json": True}
+    command("evaluate", **pictures, lpips=file)
+    told = capsys.readouterr()
+    record = json.loads(told.out)
+    assert "by other weights than the published ones" in told.err
+    assert record["lpips_weights"]["published"] is False
+    images = levels(0) / 255.0, (levels(0) + 10) / 255.0
+    assert record["pictures"][0]["lpips"] == pytest.approx(lpips_of(network, linear)(*images, None), rel=1e-4)
+    monkeypatch.setenv("SEASONSCAPES_LPIPS", str(file))
+    command("evaluate", **pictures)
+    assert record_of(capsys)["pictures"] == record["pictures"]
+    assert main(["lpips", str(wheel), str(wheel), "-o", str(folders / "other.safetensors")]) == 2
+    assert "10 of 10 keys are missing" in capsys.readouterr().err

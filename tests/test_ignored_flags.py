@@ -152,7 +152,7 @@ VERBS: dict[str, tuple[list[str], set[str], dict[str, list[str]]]] = {
     ),
 }  # fmt: skip
 # Verbs without terrain or with checks of their own (tests of `fetch`, `webcams`, `calibrate` and `evaluate`).
-OTHERS = {"fetch", "webcams", "calibrate", "annotate", "evaluate", "info", "demo", "doctor"}
+OTHERS = {"fetch", "webcams", "calibrate", "annotate", "evaluate", "lpips", "info", "demo", "doctor"}
 _VALUES = {
     "--season": "nearest",
     "--within-min": "3",

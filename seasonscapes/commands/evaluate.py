@@ -51,7 +51,7 @@ def evaluate_command(
     used
         Folders or files that were used for painting, guidance or training: if a truth is among them, nothing is scored.
     lpips
-        Folder of LPIPS's weights; left out, what SEASONSCAPES_LPIPS names.
+        File of LPIPS's weights, made by `seasonscapes lpips`; left out, what SEASONSCAPES_LPIPS names.
     table
         Also write all scores to this .csv or .md.
     figures
@@ -74,7 +74,7 @@ def evaluate_command(
         check_output_folder(figures, flag="--figures")
     found = pairs.paired(truth, pictures)
     pairs.check_files_held_out([true_path for true_path, _ in found.values()], used)
-    measure, why = _lpips(lpips)
+    measure, why, sources = _lpips(lpips)
     options = pairs.ScoreOptions(pairs.MaskOptions(mask, near_m, far_m), mode, match, measure)
     rows = []
     with progress_bars() as progress:
@@ -88,18 +88,26 @@ def evaluate_command(
         pairs.write_table(table, rows)
     if why is not None:
         message(f"LPIPS is left out: {why}")
+    elif not sources["published"]:
+        message("LPIPS is by other weights than the published ones, and not comparable with that of other works")
     mean = {"picture": "mean"} | {name: value["mean"] for name, value in totals.items()}
     record = {"mode": mode, "match": match, "pictures": rows, "summary": totals, "lpips_skipped": why}
+    record["lpips_weights"] = sources
     print_result(record, [f"mode {mode}, {len(rows)} pictures", *table_lines([*rows, mean])], as_json=json)
 
 
-def _lpips(folder: Path | None) -> tuple[Callable | None, str | None]:
-    """The function that measures LPIPS, or why there is none; `InputError` where a named folder has no weights."""
-    from seasonscapes.evaluation.lpips import load_lpips, missing_lpips
+def _lpips(file: Path | None) -> tuple[Callable | None, str | None, dict]:
+    """The function that measures LPIPS and what it was made from, or why there is none; `InputError` where a named file
+    is missing, or PyTorch, which it needs."""
+    from importlib.util import find_spec
 
-    why = missing_lpips(folder)
+    from seasonscapes.evaluation.lpips import load_lpips, lpips_sources, missing_lpips
+
+    why = missing_lpips(file)
+    if why is None and (find_spec("torch") is None or find_spec("safetensors") is None):
+        why = "PyTorch and safetensors are missing (pip install 'seasonscapes[gaussians]')"
     if why is None:
-        return load_lpips(folder), None
-    if folder is not None:
+        return load_lpips(file), None, lpips_sources(file)
+    if file is not None:
         raise InputError("--lpips", why)
-    return None, why
+    return None, why, {}

@@ -2,8 +2,8 @@
 
 Mode ``valid`` evaluates only pixels within the mask. Mode ``paper`` multiplies both images by the mask and evaluates the
 whole image, as the reference evaluation does: masked pixels then count as perfect, which adds ``-10 log10(share)`` dB to
-PSNR, with ``share`` the fraction of pixels within the mask. That mode serves to compare with published values; every
-score reports the fraction. Images are display values (sRGB-encoded) in [0, 1].
+PSNR, with ``share`` the fraction of pixels within the mask. LPIPS sees the images in [0, 1] there, where its network was
+trained for [-1, 1]. That mode serves to compare with published values; every score reports the fraction. Images are display values (sRGB-encoded) in [0, 1].
 """
 
 from __future__ import annotations
@@ -99,15 +99,17 @@ def score(
     True
     """
     truth, picture, mask = _validated(truth, picture, mask, mode)
+    filled = _fill_masked(truth, picture, mask, mode)
+    if mode == "paper":
+        # `Lpips` maps [0, 1] to [-1, 1]; the reference evaluation gives [0, 1] to the network as it is.
+        filled = tuple(0.5 + 0.5 * image for image in filled)
     return Score(
         psnr_db(truth, picture, mask, mode=mode),
         ssim(truth, picture, mask, mode=mode),
         flip(truth, picture, mask, mode=mode),
         colour_angle_deg(truth, picture, mask),
         float(mask.mean()),
-        None
-        if lpips is None
-        else float(lpips(*_fill_masked(truth, picture, mask, mode), mask if mode == "valid" else None)),
+        None if lpips is None else float(lpips(filled[0], filled[1], mask if mode == "valid" else None)),
     )
 
 
