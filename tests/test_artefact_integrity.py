@@ -305,11 +305,11 @@ def test_lpips_weights_are_plain_tensors(tmp_path, kind):
 
 def test_lpips_weights_that_have_changed_are_refused(tmp_path):
     pytest.importorskip("torch")
-    from test_evaluation import random_weights, write_lpips_parts
+    from tiny_diffusion import random_lpips, write_lpips_parts
 
     from seasonscapes.evaluation.lpips import join_lpips, load_lpips
 
-    join_lpips(*write_lpips_parts(tmp_path, *random_weights())[:2], tmp_path / "l.safetensors")
+    join_lpips(*write_lpips_parts(tmp_path, *random_lpips())[:2], tmp_path / "l.safetensors")
     flipped(tmp_path / "l.safetensors")
     with pytest.raises(InputError, match=r"l\.safetensors: damaged"):
         load_lpips(tmp_path / "l.safetensors")

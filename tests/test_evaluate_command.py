@@ -176,12 +176,12 @@ def test_steepest_window_finds_the_cliff():
 def test_lpips_from_its_two_published_parts(folders, capsys, monkeypatch):
     """The verb `lpips` joins them, `evaluate` reads the file and says that these are not the published weights."""
     pytest.importorskip("torch")
-    from test_evaluation import random_weights, write_lpips_parts
+    from tiny_diffusion import random_lpips, write_lpips_parts
 
     from seasonscapes.cli import main
     from seasonscapes.evaluation.lpips import lpips_of
 
-    network, linear = random_weights()
+    network, linear = random_lpips()
     alexnet, wheel, _ = write_lpips_parts(folders, network, linear)
     file = folders / "l.safetensors"
     assert main(["lpips", str(alexnet), str(wheel), "-o", str(file), "--json"]) == 0

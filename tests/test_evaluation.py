@@ -5,6 +5,7 @@ from datetime import UTC, datetime, timedelta, timezone
 
 import numpy as np
 import pytest
+from tiny_diffusion import random_lpips, write_lpips_parts
 
 from seasonscapes.cameras.observation import Observation
 from seasonscapes.cameras.pinhole import Camera
@@ -180,23 +181,6 @@ def test_score_refuses_what_is_no_picture(pair, mask):
 # ---------------------------------------------------------------------------------------------- LPIPS
 
 
-def random_weights():
-    """Tensors in the names and shapes of the published files."""
-    import torch
-
-    generator = torch.Generator().manual_seed(7)
-    shapes = {0: (64, 3, 11, 11), 3: (192, 64, 5, 5), 6: (384, 192, 3, 3), 8: (256, 384, 3, 3), 10: (256, 256, 3, 3)}
-    network = {}
-    for n, shape in shapes.items():
-        network[f"features.{n}.weight"] = torch.randn(shape, generator=generator) * (2.0 / np.prod(shape[1:])) ** 0.5
-        network[f"features.{n}.bias"] = 0.1 * torch.randn(shape[0], generator=generator)
-    linear = {
-        f"lin{i}.model.1.weight": torch.rand((1, shape[0], 1, 1), generator=generator)
-        for i, shape in enumerate(shapes.values())
-    }
-    return network, linear
-
-
 def lpips_by_modules(network, linear):
     """LPIPS written independently with modules of torch: AlexNet's layers as published, taken after each ReLU."""
     import torch
@@ -241,7 +225,7 @@ def lpips_by_modules(network, linear):
 
 
 def test_lpips_equals_modules_of_torch(pair):
-    weights = random_weights()
+    weights = random_lpips()
     truth, picture = pair
     expected = lpips_by_modules(*weights)(truth, picture)
     assert expected > 0.01
@@ -250,7 +234,7 @@ def test_lpips_equals_modules_of_torch(pair):
 
 def test_lpips_in_mode_paper_sees_pictures_from_0_to_1(pair):
     """The reference evaluation does not map them to [-1, 1] first; masked pixels are black."""
-    measure = lpips_of(*random_weights())
+    measure = lpips_of(*random_lpips())
     truth, picture = pair
     mask = np.ones(truth.shape[:2], bool)
     mask[:10] = False
@@ -261,7 +245,7 @@ def test_lpips_in_mode_paper_sees_pictures_from_0_to_1(pair):
 
 def test_lpips_behaves_as_a_distance(pair):
     """With random weights: zero for equal pictures, symmetric, growing, and blind beyond the mask."""
-    measure = lpips_of(*random_weights())
+    measure = lpips_of(*random_lpips())
     truth, picture = pair
     assert measure(truth, truth) == 0.0
     assert measure(truth, picture) == pytest.approx(measure(picture, truth), rel=1e-5)
@@ -273,7 +257,7 @@ def test_lpips_behaves_as_a_distance(pair):
 
 def test_lpips_first_layer_by_hand():
     """With only the first layer's linear weights: the formula of the paper, eq. 1, on patches written out in numpy."""
-    network, linear = random_weights()
+    network, linear = random_lpips()
     for i in range(1, 5):
         linear[f"lin{i}.model.1.weight"] *= 0.0
     rng = np.random.default_rng(5)
@@ -303,25 +287,8 @@ def test_lpips_says_why_it_is_absent(tmp_path, monkeypatch):
         lpips_of({}, {})
 
 
-def write_lpips_parts(folder, network, linear):
-    """The two parts as they are published: a state dict of the whole network, and a wheel."""
-    import io
-    import zipfile
-
-    import torch
-
-    # What the published network holds besides.
-    torch.save(network | {"classifier.1.weight": torch.zeros(4, 4)}, folder / "alexnet-owt-7be5be79.pth")
-    content = io.BytesIO()
-    torch.save(linear, content, _use_new_zipfile_serialization=False)
-    with zipfile.ZipFile(folder / "lpips-0.1.4-py3-none-any.whl", "w") as wheel:
-        wheel.writestr("lpips/weights/v0.1/alex.pth", content.getvalue())
-        wheel.writestr("lpips/weights/v0.0/alex.pth", b"of an older version")
-    return folder / "alexnet-owt-7be5be79.pth", folder / "lpips-0.1.4-py3-none-any.whl", content.getvalue()
-
-
 def test_lpips_parts_are_joined_and_give_the_same(tmp_path, pair):
-    network, linear = random_weights()
+    network, linear = random_lpips()
     alexnet, wheel, content = write_lpips_parts(tmp_path, network, linear)
     found = join_lpips(alexnet, wheel, tmp_path / "a.safetensors")
     assert found["linear_sha256"] == hashlib.sha256(content).hexdigest()
@@ -343,7 +310,7 @@ def test_published_weights_are_known_by_their_checksums():
 def test_lpips_names_the_file_that_holds_other_weights(tmp_path):
     import torch
 
-    network, linear = random_weights()
+    network, linear = random_lpips()
     alexnet, wheel, _ = write_lpips_parts(tmp_path, network, linear)
     output = tmp_path / "l.safetensors"
     for other in ({}, [1.0]):
@@ -363,7 +330,7 @@ def test_lpips_names_the_file_that_holds_other_weights(tmp_path):
     with pytest.raises(InputError, match=r"1 of 10 keys are missing; expected the key features\.3\.bias"):
         join_lpips(alexnet, wheel, output)
     wheel.write_bytes(wheel.read_bytes()[:200])
-    torch.save(random_weights()[0], alexnet)
+    torch.save(random_lpips()[0], alexnet)
     with pytest.raises(InputError, match=r"\.whl: damaged"):
         join_lpips(alexnet, wheel, output)
     assert not output.exists()
