@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("diffusers")
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-import paper_table  # noqa: E402
+import paper_table
 
 LEAST = ["--quick", "--views", "2", "--held-out", "1"]
 
