@@ -23,6 +23,7 @@ from seasonscapes.evaluation.masks import reference_mask, terrain_mask
 from seasonscapes.evaluation.metrics import (
     angle_deg,
     colour_angle_deg,
+    delta_e2000,
     flip,
     flip_map,
     psnr_db,
@@ -176,6 +177,27 @@ def test_score_refuses_what_is_no_picture(pair, mask):
             score(*arguments)
     with pytest.raises(ValueError, match="mode"):
         psnr_db(truth, picture, mode="flattering")
+
+
+def test_colour_difference_of_greys_in_closed_form():
+    """Between neutral colours CIEDE2000 is the difference of lightness over its weight S_L."""
+    from seasonscapes.images import srgb_from_linear
+
+    def lightness(y):
+        return 116.0 * np.cbrt(y) - 16.0
+
+    for one, other in ((0.18, 0.30), (0.5, 0.55)):
+        pictures = [np.full((12, 12, 3), srgb_from_linear(np.array(y))) for y in (one, other)]
+        middle = (lightness(one) + lightness(other)) / 2.0 - 50.0
+        weight = 1.0 + 0.015 * middle**2 / np.sqrt(20.0 + middle**2)
+        expected = abs(lightness(one) - lightness(other)) / weight
+        assert delta_e2000(*pictures) == pytest.approx(expected, rel=1e-3)
+        assert score(*pictures, colour_difference=True).delta_e2000 == pytest.approx(expected, rel=1e-3)
+    black, white = np.zeros((12, 12, 3)), np.ones((12, 12, 3))
+    assert delta_e2000(black, white) == pytest.approx(100.0, abs=0.01)
+    half = np.arange(12)[:, None] < np.full(12, 6)
+    assert delta_e2000(black, np.where(half[..., None], white, black), ~half) == 0.0
+    assert score(black, white).delta_e2000 is None
 
 
 # ---------------------------------------------------------------------------------------------- LPIPS

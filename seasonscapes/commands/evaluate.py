@@ -29,7 +29,7 @@ def evaluate_command(
     figures: Path | None = None,
     json: bool = False,
 ) -> None:
-    """Score pictures against the truth: PSNR, SSIM, FLIP, colour angle and, where its weights are at hand, LPIPS.
+    """Score pictures against the truth: PSNR, SSIM, FLIP, colour angle, CIEDE2000 and, given its weights, LPIPS.
 
     Parameters
     ----------

@@ -336,7 +336,7 @@ def score_pair(
         pair = matched(pair, mask)
     if mask is not None and not mask.any():
         raise InputError(path, "no pixel is left to score", cure="check --mask, --near-m and --far-m")
-    result = score(pair.truth, pair.picture, mask, mode=options.mode, lpips=options.lpips)
+    result = score(pair.truth, pair.picture, mask, mode=options.mode, lpips=options.lpips, colour_difference=True)
     if figure is not None:
         sheet = comparison_figure({"truth": pair.truth, "picture": pair.picture}, mask=mask)
         write_png8(figure, np.round(255.0 * sheet).astype(np.uint8))
