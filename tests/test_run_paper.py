@@ -84,7 +84,7 @@ def test_panoramas_to_gaussians_and_film(paper_runs):
                 found = read_calibration(record).view.world_from_camera[:3, :3]
                 turn = found @ view.camera.world_from_camera[:3, :3].T
                 errors_deg[view.name] = float(np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))))
-    # From compasses up to 3° off to a pixel (half a degree here) or better; not copied from the truth.
+    # To a pixel (half a degree here) or better; not copied from the truth.
     assert len(errors_deg) >= 6
     assert 0.0 < max(errors_deg.values()) < 0.6
     for stamp in ("20240720T080000Z", "20240720T130000Z"):
