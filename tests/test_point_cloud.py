@@ -44,7 +44,7 @@ def test_points_lie_on_the_samples_and_face_along_the_slope():
     np.testing.assert_array_equal(cloud.colour, np.float32(0.25))
     # Far from the hill the land rises to the east by 2 m a cell, and faces west.
     normal = cloud.normal.reshape(40, 50, 3)[0, 48]
-    np.testing.assert_allclose(normal / normal[2], [-2.0 / CELL, 0.0, 1.0], atol=2e-3)
+    np.testing.assert_allclose(normal / normal[2], [-2.0 / CELL, 0.0, 1.0], atol=5e-3)
 
 
 def test_colours_are_the_image_s_at_the_points():

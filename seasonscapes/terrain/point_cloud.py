@@ -134,10 +134,14 @@ def _colours(frame: LocalFrame, image: Raster, position_m: np.ndarray) -> np.nda
     columns = min(len(pixel), 16_384)
     padded = np.full((-(-len(pixel) // columns) * columns, 2), -10.0, np.float32)
     padded[: len(pixel)] = np.nan_to_num(pixel, nan=-10.0)
-    at = padded.reshape(-1, columns, 2)
-    border = [float("nan")] * 4
+    column, row = (np.ascontiguousarray(padded[:, axis]).reshape(-1, columns) for axis in (0, 1))
     values = cv2.remap(
-        np.ascontiguousarray(image.values, np.float32), at, None, cv2.INTER_LINEAR, None, cv2.BORDER_CONSTANT, border
+        np.ascontiguousarray(image.values, np.float32),
+        column,
+        row,
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=[float("nan")] * 4,
     )
     return values.reshape(-1, 3)[: len(pixel)]
 
