@@ -7,9 +7,11 @@ import sys
 
 import numpy as np
 import pytest
+import trimesh
 from file_contents import contents
 from PIL import Image
 from places import MASSIF
+from plyfile import PlyData
 from test_run import LAUNCHER
 from tiny_diffusion import write_tiny_weights
 
@@ -22,7 +24,7 @@ from seasonscapes.workflows.run_methods import METHODS, run_method
 
 pytest.importorskip("diffusers")
 
-STAGES = ("pictures", "calibrate", "views", "paint", "path", "inpaint", "film", "distil", "splat")
+STAGES = ("cloud", "pictures", "calibrate", "views", "paint", "path", "inpaint", "film", "distil", "splat")
 
 
 class PaperRuns:
@@ -73,6 +75,19 @@ def paper_runs(tmp_path_factory):
 def test_panoramas_to_gaussians_and_film(paper_runs):
     whole = paper_runs.folder / "whole"
     assert tuple(json.loads((whole / "run.json").read_text())) == STAGES
+    about = json.loads((whole / "cloud" / "cloud.json").read_text())
+    points = PlyData.read(whole / "cloud" / "points.ply")["vertex"]
+    mesh = trimesh.load(whole / "cloud" / "mesh.ply", process=False)
+    assert len(points) == about["points"]
+    assert len({bytes(colour) for colour in zip(points["red"], points["green"], points["blue"], strict=True)}) > 1000
+    assert about["mesher"] == "poisson"
+    assert len(mesh.faces) == about["mesh"]["triangles"]
+    assert 0.0 < about["mesh"]["vertical_rmse_m"] < 6.0
+    # Both lie over the same ground.
+    for axis, name in enumerate("xy"):
+        assert (mesh.vertices[:, axis].min(), mesh.vertices[:, axis].max()) == pytest.approx(
+            (points[name].min(), points[name].max()), abs=0.01
+        )
     errors_deg = {}
     for webcam in ("aerial", "meadow"):
         true = read_calibration(whole / "pictures" / f"{webcam}_calibration.json").view
@@ -125,7 +140,7 @@ def test_killed_while_it_inpaints_it_goes_on_to_the_same_result(paper_runs):
     told = process.stderr.read()
     assert process.wait() == 0, told
     assert "run: paint: up to date" in told
-    for name in ("calibration", "views", "paint", "inpaint", "film", "gaussians", "splat"):
+    for name in ("cloud", "calibration", "views", "paint", "inpaint", "film", "gaussians", "splat"):
         files = [
             {path.relative_to(paper_runs.folder / run): path for path in (paper_runs.folder / run / name).rglob("*.*")}
             for run in ("killed", "whole")
