@@ -24,6 +24,8 @@ log = logging.getLogger(__name__)
 _FEWEST, _MOST_DEG = 4, 85.0
 # Of synthetic webcams: points clicked in each view, and how well a person hits a pixel.
 _POINTS, _CLICK_PX = 12, 1.0
+# A heading is not told that shifts the picture by more of its width than this (one standard deviation).
+_MOST_SIGMA = 0.01
 _NEAREST_M, _FARTHEST_M = 200.0, 40_000.0
 
 
@@ -102,6 +104,11 @@ def pose_plane_views(
                 solved = l1_pose(view.camera, seen)
             except NotEnoughEvidence as error:
                 doubts[view.name] = str(error)
+                continue
+            sigma_deg = solved.sigma["heading_deg"]
+            if np.radians(sigma_deg) * solved.view.fx > _MOST_SIGMA * solved.view.width_px:
+                # Points that lie close together leave a turn and a change of fx alike.
+                doubts[view.name] = f"its points leave the heading to ± {sigma_deg:.1f} deg"
                 continue
             files.append(own / record_name(view.name))
             write_calibration(files[-1], view.name, solved, known.frame)
