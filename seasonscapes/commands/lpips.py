@@ -22,7 +22,7 @@ def lpips_command(
     network
         torchvision's AlexNet, alexnet-owt-7be5be79.pth.
     linear
-        The authors' linear layers: lpips-*.whl of `pip download --no-deps lpips`, or its lpips/weights/v0.1/alex.pth.
+        The authors' linear layers: lpips-*.whl as pip downloads it, or the file lpips/weights/v0.1/alex.pth in it.
     output
         .safetensors file to write.
     json
