@@ -81,8 +81,8 @@ def test_panoramas_to_gaussians_and_film(paper_runs):
     assert len(points) == about["points"]
     assert len({bytes(colour) for colour in zip(points["red"], points["green"], points["blue"], strict=True)}) > 1000
     assert about["mesher"] == "poisson"
-    assert len(mesh.faces) == about["mesh"]["triangles"]
-    assert 0.0 < about["mesh"]["vertical_rmse_m"] < 6.0
+    assert len(mesh.faces) == about["triangles"]
+    assert 0.0 < about["vertical_rmse_m"] < 6.0
     # Both lie over the same ground.
     for axis, name in enumerate("xy"):
         assert (mesh.vertices[:, axis].min(), mesh.vertices[:, axis].max()) == pytest.approx(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import replace
 from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -62,13 +62,16 @@ def write_point_cloud(place: Place, day: date, own: Path) -> list[Path]:
     mesh = trimesh.Trimesh(place.terrain.vertices, place.terrain.faces, process=False)
     with atomic_path(files[1]) as temporary:
         mesh.export(str(temporary), file_type="ply")
+    report = mesh_report(place.terrain, place.elevation)
     facts = {
         "points": len(cloud.position_m),
         "spacing_m": sample_spacing_m(samples),
         "colours": label,
         "mesher": place.options.mesher,
+        "triangles": report.triangles,
         # Against the raster as it was read, before interpolation.
-        "mesh": asdict(mesh_report(place.terrain, place.elevation)),
+        "vertical_rmse_m": report.vertical_rmse_m,
+        "vertical_max_m": report.vertical_max_m,
     }
     with atomic_path(files[2]) as temporary:
         temporary.write_text(json.dumps(facts, indent=1, default=float) + "\n", encoding="utf-8")
@@ -77,8 +80,6 @@ def write_point_cloud(place: Place, day: date, own: Path) -> list[Path]:
 
 def _image(place: Place, day: date, spacing_m: float) -> tuple[str, Raster | None]:
     """Name and linear reflectance of the image nearest to a day; ``None`` without one."""
-    from dataclasses import replace
-
     from seasonscapes.terrain.imagery import read_imagery
     from seasonscapes.terrain.raster import bounds_geographic
 
