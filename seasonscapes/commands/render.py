@@ -131,7 +131,8 @@ def render_command(
         "albedo": [
             {"date": each.day.isoformat(), "content": each.content} for each in (series.dated if series else ())
         ],
-        "season": season or "blended",
+        # Between fewer than two dates nothing is blended.
+        "season": (season or "blended") if series is not None and len(series.dated) > 1 else None,
         "exposure_ev100": round(ev100, 3),
     }
     if output.suffix.lower() == ".png":
