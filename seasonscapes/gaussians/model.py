@@ -20,7 +20,15 @@ from seasonscapes.albedo.seasons import albedo_at
 from seasonscapes.errors import InputError
 from seasonscapes.frames import LocalFrame
 from seasonscapes.gaussians.disc_transport import DiscTransport
-from seasonscapes.gaussians.surfels import CHANGES, SurfelGrid, Surfels, changed_discs, disc_offsets_m, disc_shapes
+from seasonscapes.gaussians.surfels import (
+    CHANGES,
+    SurfelGrid,
+    Surfels,
+    axes_from_quaternions,
+    changed_discs,
+    disc_offsets_m,
+    disc_shapes,
+)
 from seasonscapes.images import atomic_path
 from seasonscapes.terrain.attributes import attributes_at
 
@@ -29,6 +37,8 @@ FORMAT = "seasonscapes gaussians 1"
 _RANGES = {"log_colour": (-1.0, 1.0), "log_gain": (-2.0, 2.0), "shift": (-0.1, 0.1), "log_softness": (-6.2, -1.0)} | {
     f"geometry.{name}": (-limit, limit) for name, (_, limit) in CHANGES.items()
 }
+# On level ground the axes of a disc turn with the last digit of its normal, and with them the stored angle.
+_RANGES["geometry.twist"] = (-0.5 * np.pi, 0.5 * np.pi)
 
 
 @dataclass(frozen=True)
@@ -328,7 +338,12 @@ def pack_model(model: GaussianModel) -> tuple[dict[str, np.ndarray], dict[str, A
     }
     feature_scale = np.maximum(np.abs(model.features).max(axis=0, initial=0.0), 1e-9) / 127.0
     tensors["features"] = np.rint(model.features / feature_scale).astype(np.int8)
-    for name, values in model.appearance.items():
+    learned = model.appearance
+    if changes:
+        rounded = from_octahedral(tensors["normal"]) * (tensors["roughness"][:, None] / np.float32(255.0))
+        changes = _relative_to(disc_shapes(rounded, spacing_m)[0], model, means)
+        learned = learned | {f"geometry.{name}": values for name, values in changes.items()}
+    for name, values in learned.items():
         tensors[f"appearance.{name}"] = _quantised(values, *_RANGES[name]) if name in _RANGES else values
     header = {
         "kind": model.kind,
@@ -341,6 +356,17 @@ def pack_model(model: GaussianModel) -> tuple[dict[str, np.ndarray], dict[str, A
         "feature_scale": feature_scale.tolist(),
     }
     return tensors, header
+
+
+def _relative_to(quaternions: np.ndarray, model: GaussianModel, means: np.ndarray) -> dict[str, np.ndarray]:
+    """The model's changes as seen from unchanged discs of other axes ``quaternions (N, 4)`` and centres ``means (N, 3)``."""
+    axes = axes_from_quaternions(quaternions)
+    offset = np.einsum("nij,ni->nj", axes, model.means - means) / model.grid.spacing_m
+    first = np.einsum("nij,ni->nj", axes, axes_from_quaternions(model.quaternions)[:, :, 0])
+    twist = np.arctan2(first[:, 1], first[:, 0])
+    # An ellipse is the same after half a turn.
+    twist = (twist + 0.5 * np.pi) % np.pi - 0.5 * np.pi
+    return model.changes | {"offset": offset, "twist": twist[:, None]}
 
 
 def unpack_model(tensors: dict[str, np.ndarray], header: dict[str, Any]) -> GaussianModel:

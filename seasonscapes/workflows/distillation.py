@@ -57,7 +57,7 @@ class DistilOptions:
         Training steps on the surface, and on images.
     kind
         ``"full"`` (physics and a network), ``"physical"`` (no network) or ``"sun"`` (a network alone, for comparison).
-    refine
+    refine_discs
         Whether the images also refine place, size, direction and opacity of the discs.
 
     Examples
@@ -75,7 +75,7 @@ class DistilOptions:
     steps: int = 2500
     picture_steps: int = 240
     kind: str = "full"
-    refine: bool = True
+    refine_discs: bool = True
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -217,7 +217,7 @@ def distil_with_data(
         times=options.suns,
         seed=seed,
     )
-    if options.refine and data.frames:
+    if options.refine_discs and data.frames:
         appearance.refine(DiscGeometry(data.surfels))
     losses = train(
         appearance,
