@@ -1,6 +1,6 @@
 """Relightable Gaussian model: known geometry, traced light transport, learned corrections; and its file format.
 
-A file takes about 100 bytes per Gaussian. Values that follow from the grid are not stored: the horizontal position of a
+A file takes about 107 bytes per Gaussian. Values that follow from the grid are not stored: the horizontal position of a
 disc is its cell, and its rotation and size follow from its normal, up to the changes that training made. All other values
 are quantised, to one byte where possible.
 """
