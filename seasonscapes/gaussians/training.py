@@ -42,7 +42,7 @@ Progress = Callable[[float], None]
 # Initial learning rates. They decay exponentially by `_DECAY` over each stage; the second stage starts at
 # `_SECOND_STAGE` times these.
 RATES = {
-    "log_colour": 2e-3,
+    "log_colour": 1e-2,
     "log_gain": 5e-3,
     "shift": 1e-3,
     "log_softness": 1e-2,
