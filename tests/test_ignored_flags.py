@@ -26,7 +26,18 @@ _DIFFUSION = (
     *("--hybrid", "--strength", "--steps", "--guidance", "--without", "--mask", "--dilate-px", "--least-hole"),
     *("--paint-sky", "--frames", "--film", "--fps", "--device", "--dtype", "--offload"),
 )
-_RELIT = ("--suns", "--dates", "--views", "--view-px", "--picture-steps", "--kind", "--export-views", "--albedo", *_SKY)
+_RELIT = (
+    "--suns",
+    "--dates",
+    "--views",
+    "--view-px",
+    "--picture-steps",
+    "--kind",
+    "--refine-discs",
+    "--export-views",
+    "--albedo",
+    *_SKY,
+)
 _LEARNED = ["--appearance", "paper", "--frames", "."]
 
 # Of each verb: arguments that would do; flags that always do something; and flags that are refused, beside which others.
