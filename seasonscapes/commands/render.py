@@ -65,7 +65,7 @@ def render_command(
     seed
         Equal seeds give equal pictures.
     lambertian
-        All ground is matt, also water and snow: for comparison.
+        All ground is matt, also water, snow and forest: for comparison.
     amplify
         Add relief and albedo below the resolution of the data: for pictures, not for measurements.
     output

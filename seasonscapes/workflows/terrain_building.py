@@ -226,6 +226,8 @@ def build_terrain(
         terrain = with_water(terrain, atlas, water, scene.water.wind_m_s)
     if scene.snow is not None and scene.snow.scattering:
         terrain = replace(terrain, snow=Snow(scene.snow.grain_mm))
+    if scene.forest is not None and scene.forest.hot_spot:
+        terrain = replace(terrain, forest=True)
     return terrain, atlas
 
 
