@@ -126,7 +126,7 @@ def bake_imagery(terrain: Terrain, atlas: Atlas, image: Raster, *, gutter_px: in
     weight = np.zeros((atlas.height_px, atlas.width_px), np.float32)
     pixels_of = pixel_map(terrain, image)
     footprint = _face_footprints(terrain, atlas, pixels_of)
-    pyramid = _pyramid(image.values, 2 + int(_mip_level(footprint).max()))
+    pyramid = _pyramid(image.values, 1 + int(np.ceil(_mip_level(footprint).max())))
     texel = np.flatnonzero(face_id >= 0)
     for start in range(0, len(texel), _CHUNK):
         part = texel[start : start + _CHUNK]
@@ -371,7 +371,10 @@ def filled_gutters(texture: Texture, covered: np.ndarray, gutter_px: int) -> Tex
     if known.all() or not known.any():
         return texture
     row, column = np.asarray(distance_transform_edt(~known, return_distances=False, return_indices=True))
-    return replace(texture, values=texture.values[row, column], weight=texture.weight[row, column])
+    empty = ~known
+    values, weight = texture.values.copy(), texture.weight.copy()
+    values[empty], weight[empty] = (kept[row[empty], column[empty]] for kept in (texture.values, texture.weight))
+    return replace(texture, values=values, weight=weight)
 
 
 def _grown(mask: np.ndarray) -> np.ndarray:
