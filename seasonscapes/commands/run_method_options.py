@@ -24,7 +24,7 @@ class RunMethodOptions:
     method: str = "physical"
     """physical (this package's) or paper (Algorithm 1 of the SeasonScapes paper)."""
     poses: str | None = None
-    """skyline (physical), or points (paper): plane views, each with heading and focal length by 2D-3D points, L1."""
+    """skyline (physical), or points (paper): plane views, each with heading, fx and fy by 2D-3D points, L1."""
     grade: str | None = None
     """Of plane views: paper (paper), none, warm or soft."""
     painting: str | None = None

@@ -209,6 +209,7 @@ def load_place(
         "options": options,
         **water_key(declared),
         **({} if declared.snow is None else {"snow": declared.snow}),
+        **({} if declared.forest is None else {"forest": declared.forest}),
     }
     terrain, atlas = build_once(
         workspace,

@@ -22,8 +22,10 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _FEWEST, _MOST_DEG = 4, 85.0
-# Of synthetic webcams: a compass's error, points clicked in each view, and how well a person hits a pixel.
-_COMPASS_DEG, _POINTS, _CLICK_PX = 3.0, 12, 1.0
+# Of synthetic webcams: points clicked in each view, and how well a person hits a pixel.
+_POINTS, _CLICK_PX = 12, 1.0
+# A heading is not told that shifts the picture by more of its width than this (one standard deviation).
+_MOST_SIGMA = 0.01
 _NEAREST_M, _FARTHEST_M = 200.0, 40_000.0
 
 
@@ -52,7 +54,7 @@ def plane_views(webcam: str, whole: Camera | Panorama) -> list[PlaneView]:
 def pose_plane_views(
     place: Place, stated: Sequence[Path], own: Path, *, points: Path | None, seed: int = 0
 ) -> tuple[list[Path], dict[str, str]]:
-    """Solve heading and focal length of each plane view from 2D–3D points under an L1 loss, as the paper does.
+    """Solve heading, ``fx`` and ``fy`` of each plane view from 2D–3D points under an L1 loss, as the paper does.
 
     Parameters
     ----------
@@ -64,7 +66,7 @@ def pose_plane_views(
         Folder for the records of the views and, of synthetic webcams, the points.
     points
         Folder of ``WEBCAM.csv`` with points in the pixels of the webcam's picture; ``None`` for a synthetic place, whose
-        points are terrain seen by the true camera, clicked with an error of a pixel, from a compass that is 3° off.
+        points are terrain seen by the true camera, clicked with an error of a pixel. Stated headings are not used.
     seed
         Of the synthetic clicks.
 
@@ -79,14 +81,12 @@ def pose_plane_views(
         Where no view could be posed.
     """
     from seasonscapes.calibration.calibration_file import read_calibration, record_name, write_calibration
-    from seasonscapes.calibration.evidence import Priors, read_points, write_points
-    from seasonscapes.calibration.pose_model import parameters_of_view, view_from_parameters
-    from seasonscapes.calibration.resection import ResectionOptions, resect
+    from seasonscapes.calibration.evidence import read_points, write_points
+    from seasonscapes.calibration.l1_pose import l1_pose
 
     if points is None and place.synthetic is None:
         raise InputError("--points", "missing", expected="a folder of WEBCAM.csv, of `seasonscapes annotate`")
     files, doubts = [], {}
-    priors = Priors(tilt_deg=0.0, roll_deg=0.0, horizontal_m=0.0, vertical_m=0.0, focal=np.inf)
     for record in stated:
         known = read_calibration(record)
         whole = known.view
@@ -100,16 +100,15 @@ def pose_plane_views(
         matches = read_points(table, known.frame)
         for view in plane_views(known.webcam, whole):
             seen = _points_in_view(matches, view)
-            start = view.camera
-            if points is None:
-                rng = np.random.default_rng([seed, zlib.crc32(view.name.encode())])
-                parameters = parameters_of_view(start, np.eye(3))
-                parameters[0] += rng.uniform(-_COMPASS_DEG, _COMPASS_DEG)
-                start = view_from_parameters(start, np.eye(3), parameters)
             try:
-                solved = resect(start, seen, priors=priors, options=ResectionOptions(loss="l1"))
+                solved = l1_pose(view.camera, seen)
             except NotEnoughEvidence as error:
                 doubts[view.name] = str(error)
+                continue
+            sigma_deg = solved.sigma["heading_deg"]
+            if np.radians(sigma_deg) * solved.view.fx > _MOST_SIGMA * solved.view.width_px:
+                # Points that lie close together leave a turn and a change of fx alike.
+                doubts[view.name] = f"its points leave the heading to ± {sigma_deg:.1f} deg"
                 continue
             files.append(own / record_name(view.name))
             write_calibration(files[-1], view.name, solved, known.frame)
