@@ -259,7 +259,7 @@ def _pyramid(values: np.ndarray, most: int) -> list[np.ndarray]:
     A level is the 2 × 2 box mean of the previous one.
     """
     known = np.isfinite(values).all(axis=2, keepdims=True)
-    levels = [np.concatenate([np.where(known, values, 0.0), known], axis=2).astype(np.float32)]
+    levels: list[np.ndarray] = [np.concatenate([np.where(known, values, 0.0), known], axis=2).astype(np.float32)]
     while max(levels[-1].shape[:2]) > 1 and len(levels) < most:
         level = levels[-1]
         level = np.pad(level, ((0, level.shape[0] % 2), (0, level.shape[1] % 2), (0, 0)))
