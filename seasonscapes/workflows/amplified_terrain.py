@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -31,6 +33,12 @@ _LEAST_M, _LEAST_NEAR_M, _NEAR_M = 1.0, 0.3, 500.0
 _MOST_FACTOR = 8
 # Invented relief need not be as exact as that of the data.
 _TOLERANCE_PX, _REACH_M = 1.0, 2000.0
+# Up to the first height above ground a camera stands on it, from the second one up it does not [m].
+_STANDING_M, _FREE_M = 20.0, 100.0
+# How far the surface is looked at to find the ground below a camera [m].
+_BELOW_M = 20.0
+
+log = logging.getLogger(__name__)
 
 
 def amplified_terrain(place: Place, view: Camera | Panorama, *, seed: int = 0) -> Terrain:
@@ -61,8 +69,36 @@ def amplified_terrain(place: Place, view: Camera | Panorama, *, seed: int = 0) -
     return replace(terrain, detail=detail)
 
 
-def _surface(place: Place, eye_m: np.ndarray, seed: int) -> SurfaceGrid:
-    """Amplified surface of the place with a finer part about a camera."""
+def on_amplified_ground(place: Place, view: Camera, *, seed: int = 0) -> Camera:
+    """Raise or lower a camera that stands on the ground by what detail adds below it, so that its height above ground stays.
+
+    Parameters
+    ----------
+    place, view, seed
+        See `amplified_terrain`.
+
+    Returns
+    -------
+    Camera
+        The same one where it is more than 100 m above the ground.
+    """
+    surface = place.terrain.surface
+    if surface is None:
+        return view
+    eye_m = np.asarray(view.position_m, float)
+    ground_m = float(surface.up_at(eye_m[None])[0])
+    share = np.clip((_FREE_M - (eye_m[2] - ground_m)) / (_FREE_M - _STANDING_M), 0.0, 1.0)
+    if share == 0.0:
+        return view
+    added_m = float(_surface(place, eye_m, seed, near_m=_BELOW_M).up_at(eye_m[None])[0]) - ground_m
+    pose = np.array(view.world_from_camera, float)
+    pose[2, 3] += share * added_m
+    log.info("the camera keeps its height above ground: detail changes the ground below it by %+.2f m", added_m)
+    return replace(view, world_from_camera=pose)
+
+
+def _surface(place: Place, eye_m: np.ndarray, seed: int, *, near_m: float = _NEAR_M) -> SurfaceGrid:
+    """Amplified surface of the place with a finer part about a camera, which reaches so far."""
     assert place.terrain.surface is not None
     spacing_m, error_m = sample_spacing_m(place.elevation), place.terrain.surface.mesh_error_m
     factor = 1
@@ -85,13 +121,17 @@ def _surface(place: Place, eye_m: np.ndarray, seed: int) -> SurfaceGrid:
     latitude, longitude, _ = geodetic_from_enu(place.frame, eye_m)
     column, row = (int(value) for value in raster_pixels(place.elevation, latitude, longitude).ravel())
     rows, columns = place.elevation.values.shape[:2]
-    reach = max(8, round(_NEAR_M / spacing_m))
+    usual, reach = (max(8, round(distance / spacing_m)) for distance in (_NEAR_M, near_m))
     if not (-reach < row < rows + reach and -reach < column < columns + reach):
         return whole
     part = tuple(slice(max(at - reach, 0), min(at + reach, size)) for at, size in ((row, rows), (column, columns)))
     if min(each.stop - each.start for each in part) < 8:
         return whole
-    near, cells = factor, (part[0].stop - part[0].start) * (part[1].stop - part[1].start)
+    # As fine as the part of the usual reach, whatever this one's.
+    near, cells = (
+        factor,
+        math.prod(min(at + usual, size) - max(at - usual, 0) for at, size in ((row, rows), (column, columns))),
+    )
     while cells * (2 * near) ** 2 <= _MOST_NEAR_NODES and spacing_m / (2 * near) >= _LEAST_NEAR_M:
         near *= 2
     if near == factor:
