@@ -36,8 +36,8 @@ def run_command(
 ) -> None:
     """Take a scene from photographs to pictures of other hours and to Gaussians; an interrupted run continues.
 
-    Stages: pictures, calibrate, albedo, paint, inpaint, relight, distil, splat; with --method paper pictures, calibrate,
-    views, paint, path, inpaint, film, distil, splat. Each is built again only where its arguments, the content of what it
+    Stages: pictures, calibrate, albedo, paint, inpaint, refine, relight, distil, splat; with --method paper pictures,
+    calibrate, views, paint, path, inpaint, film, distil, splat. Each is built again only where its arguments, the content of what it
     reads or the program's code have changed; run.json in the folder records them.
 
     Parameters
@@ -45,7 +45,8 @@ def run_command(
     scene
         A scene file, or the name of a bundled scene (alpine).
     times
-        When the photographs were taken: ISO 8601, commas between; of one season.
+        When the photographs were taken: ISO 8601, commas between. Days that show the same snow and colours give one albedo;
+        pictures of dates between two such seasons interpolate.
     at_hours
         When to picture the place: ISO 8601, commas between.
     start
@@ -61,7 +62,8 @@ def run_command(
     """
     check_output_folder(output)
     options, view, sky = place or PlaceOptions(), view or ViewOptions(size="768x512"), sky or SkyOptions()
-    stages_by, along = (method or RunMethodOptions()).values()
+    method = method or RunMethodOptions()
+    stages_by, along = method.values()
     photographs, distil = (
         pictures or RunPictureOptions(),
         (effort or RunEffort()).values(appearance=stages_by.appearance),
@@ -76,9 +78,10 @@ def run_command(
     with progress_bars() as progress:
         loaded = options.load(scene, progress, texel_m=TEXEL_M)
         at = (loaded.frame.latitude_deg, loaded.frame.longitude_deg)
+        utc = tuple(parse_times("--times", times, *at))
         job = RunJob(
             loaded,
-            tuple(parse_times("--times", times, *at)),
+            utc,
             tuple(parse_times("--at-hours", at_hours, *at)),
             view.chosen(loaded.scene),
             size_px,
@@ -89,6 +92,7 @@ def run_command(
             options.allow_outside,
             stages_by,
             along,
+            method.season_of(utc),
         )
         stages = run(job, output, first=start, last=until, progress=progress)
     record = {

@@ -17,7 +17,10 @@ _CHOICES = {
     "painting": ("weighted", "first"),
     "completion": ("guided", "telea", "membrane", "diffusion"),
     "appearance": ("physical", "paper"),
+    "recovery": ("closed", "differentiable"),
 }
+# What the stages of an albedo are asked for without one.
+_OF_ALBEDO = ("recovery", "painted", "inpainted")
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,12 @@ class RunMethod:
     appearance
         Of the Gaussians: ``"physical"`` is distilled from relit renders of the recovered albedo; ``"paper"`` is trained on
         the frames of the completed textures along the path.
+    recovery
+        Of albedo: ``"closed"``, or ``"differentiable"`` (see `albedo_recovery.RecoveryOptions`).
+    painted
+        Whether the painted textures enter the albedo once more, as observations beside the photographs.
+    inpainted
+        Whether the completed textures, their light taken out, enter the albedo of texels that no photograph measured.
 
     Examples
     --------
@@ -54,6 +63,9 @@ class RunMethod:
     painting: str
     completion: str
     appearance: str
+    recovery: str = "closed"
+    painted: bool = False
+    inpainted: bool = False
 
     def __post_init__(self) -> None:
         for name, choices in _CHOICES.items():
@@ -62,11 +74,21 @@ class RunMethod:
                 raise InputError(f"--{name}", "unknown", got=value, expected=", ".join(choices))
         if self.grade != "none" and self.poses != "points":
             raise InputError("--grade", "is for the plane views of --poses points", got=self.grade, expected="none")
+        if not self.needs_albedo:
+            for name in _OF_ALBEDO:
+                if getattr(self, name) not in (False, "closed"):
+                    flag = f"--{name}" if name == "recovery" else f"--use-{name}"
+                    raise InputError(flag, "does nothing: without relit pictures no albedo is recovered")
 
     @property
     def needs_albedo(self) -> bool:
         """Whether an albedo is recovered: from it come relit pictures, distilled light and fitted exposures."""
         return self.name == "physical" or self.appearance == "physical"
+
+    @property
+    def refines(self) -> bool:
+        """Whether paintings or completions go back into the albedo."""
+        return self.painted or self.inpainted
 
     @property
     def needs_path(self) -> bool:
@@ -80,7 +102,7 @@ METHODS = {
 }
 
 
-def run_method(name: str, **stages: str | None) -> RunMethod:
+def run_method(name: str, **stages: str | bool | None) -> RunMethod:
     """A method with some of its stages exchanged.
 
     Parameters
