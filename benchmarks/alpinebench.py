@@ -11,7 +11,8 @@ judged: pictures developed with the truth's exposure, land beyond 60 m, mode ``v
 each colour first, as one must for a real webcam.
 
 * Panoramas are calibrated, cut into views, and give the albedo, which corrects the satellite's image where no webcam
-  looked; relit, it ties the pictures of each hour together, and what they paint corrects it.
+  looked; relit, it ties the pictures of each hour together, and what they paint corrects it. The paintings then go back into
+  the albedo, as in ``run``; one table tells what they add, and what their completions and the joint recovery would.
 * Painted hours: the painted and completed texture, seen from the judged webcams through the air.
 * Held-out hours: the albedo recovered from the painted hours' pictures, relit.
 * Distilled: Gaussians that learned from that albedo under suns of other days, seen at the held-out hours.
@@ -46,6 +47,8 @@ from alpinebench_scene import DATE, SIZES, pose_errors  # noqa: E402
 from alpinebench_stages import Bench, Splats  # noqa: E402
 from record import write_record  # noqa: E402
 
+from seasonscapes.albedo.closed_form import solve_albedo  # noqa: E402
+from seasonscapes.albedo.photographs import EIGHT_BIT  # noqa: E402
 from seasonscapes.evaluation.figures import comparison_figure, image_row, steepest_window  # noqa: E402
 from seasonscapes.evaluation.lpips import load_lpips, missing_lpips  # noqa: E402
 from seasonscapes.evaluation.surfaces import albedo_error  # noqa: E402
@@ -101,17 +104,21 @@ def stages(bench: Bench) -> tuple[dict[str, dict], dict]:
     fit = bench.solved(clean=True, true_pose=True)
     rows["albedo alone, clean + relight"] = judge.scores(judge.of_albedo(bench.completed_albedo(fit)[0]), held)
     bench.clock.tell("albedo alone")
-    albedo_fit = bench.solved()
-    albedo, sigma = bench.completed_albedo(albedo_fit)
+    photographs = bench.photographs()
+    first_fit = solve_albedo(bench.land, photographs, noise_model=EIGHT_BIT)
+    first, sigma = bench.completed_albedo(first_fit)
+    told = {at: bench.true_texture(world.lights[at][0], first) for at in painted}
+    bench.clock.tell("albedo")
+    paintings = {at: bench.painted(at, relit=told[at]) for at in painted}
+    textures = {at: bench.fused(paintings[at].texture, at, told[at], sigma / first[..., 1]) for at in painted}
+    rows["all, painted hours"] = judge.scores(lambda c, at: judge.of_texture(textures[at], c, at), painted)
+    bench.clock.tell("calibrated, painted, completed")
+    albedo_fit = bench.solved_again(photographs, paintings)
+    albedo = bench.completed_albedo(albedo_fit)[0]
     relit = judge.of_albedo(albedo)
     rows["all, held-out hours"] = judge.scores(relit, held)
     rows["all, relit painted hours"] = judge.scores(relit, painted)
-    bench.clock.tell("albedo, relit")
-    told = {at: bench.true_texture(world.lights[at][0], albedo) for at in painted}
-    paintings = {at: bench.painted(at, relit=told[at]) for at in painted}
-    textures = {at: bench.fused(paintings[at].texture, at, told[at], sigma / albedo[..., 1]) for at in painted}
-    rows["all, painted hours"] = judge.scores(lambda c, at: judge.of_texture(textures[at], c, at), painted)
-    bench.clock.tell("calibrated, painted, completed")
+    bench.clock.tell("paintings back into the albedo, relit")
     splats = Splats(bench)
     rows["distil alone (true albedo)"] = judge.scores(splats.views(world.albedo), held)
     rows["all, distilled, held-out hours"] = judge.scores(splats.views(albedo), held)
@@ -121,9 +128,17 @@ def stages(bench: Bench) -> tuple[dict[str, dict], dict]:
         "told": told,
         "textures": textures,
         "albedo": albedo,
+        "albedos": {
+            "photographs alone": first,
+            "with painted": albedo,
+            "with inpainted": bench.inpainted(first, first_fit, textures),
+        },
+        "photographs": photographs,
+        "first_fit": first_fit,
         "fit": albedo_fit,
         "seen": seen,
         "relit": relit,
+        "held": rows["all, held-out hours"],
     }
 
 
@@ -141,6 +156,28 @@ def texture_scores(bench: Bench, textures: dict, *, air: bool = True) -> dict[st
         ablated_hours(bench),
         most=bench.world.size.ablated,
     )
+
+
+def contributions(bench: Bench, whole: dict) -> tuple[dict[str, dict], dict[str, float]]:
+    """What paintings, completions and the joint recovery each add to the albedo of photographs, at held-out hours.
+
+    Also the gains [dB] over the photographs alone, of pictures and of the albedo of all land.
+    """
+    judge, held, albedos = bench.judge, bench.world.held_hours, dict(whole["albedos"])
+    joint = bench.found_jointly(whole["photographs"], whole["first_fit"])
+    albedos["differentiable"] = bench.completed_albedo(joint)[0]
+    rows, numbers, land = Rows(), {}, bench.albedo_guides.surface
+    for name, albedo in albedos.items():
+        scores = whole["held"] if name == "with painted" else judge.scores(judge.of_albedo(albedo), held)
+        rows[name] = scores | {"albedo_psnr_db": albedo_error(bench.world.albedo, albedo, land).psnr_db}
+    alone = rows["photographs alone"]
+    for name, row in rows.items():
+        if row is not alone:
+            gain = row["psnr_db"] - alone["psnr_db"]
+            numbers[f"{key_of(name)}_gain_db"] = gain
+            numbers[f"{key_of(name)}_albedo_gain_db"] = row["albedo_psnr_db"] - alone["albedo_psnr_db"]
+    bench.clock.tell("contributions to the albedo")
+    return rows, numbers
 
 
 def painting_ablations(bench: Bench, whole: dict, without: dict[str, dict]) -> dict[str, dict]:
@@ -234,7 +271,7 @@ def one_colour(texture: Texture) -> np.ndarray:
     return np.where(seen[..., None], texture.values, texture.values[seen].mean(axis=0)).astype(np.float32)
 
 
-_SHOWN = ("psnr_db", "matched_psnr_db", "ssim", "flip", "lpips", "colour_angle_deg")
+_SHOWN = ("psnr_db", "matched_psnr_db", "ssim", "flip", "lpips", "colour_angle_deg", "albedo_psnr_db")
 
 
 def print_stages(rows: dict[str, dict]) -> None:
@@ -361,12 +398,15 @@ def main() -> None:
     rows, whole = stages(bench)
     print_stages(rows)
     painted_rows, held_rows = ablations(bench, whole)
+    albedo_rows, gains = contributions(bench, whole)
     painting_rows = painting_ablations(bench, whole, painted_rows)
     most = min(bench.world.size.ablated, len(bench.world.judged))
     print(f"\nthe whole, two painted hours, {most} views that no webcam saw")
     print_ablations(painted_rows)
     print("\nthe whole, held-out hours, the same views")
     print_ablations(held_rows)
+    print("\nwhat each adds to the albedo, held-out hours, all judged views")
+    print_stages(albedo_rows)
     print("\npainting and its completion alone, as the paper's, two painted hours, the same views")
     print_ablations(painting_rows)
     at = bench.world.painted_hours[0]
@@ -380,7 +420,8 @@ def main() -> None:
         save_figures(bench, whole, arguments.figures)
         save_day(bench, whole, arguments.figures)
     ablated = {"ablation_painted": painted_rows, "ablation_held_out": held_rows, "ablation_painting": painting_rows}
-    numbers = numbers_of(bench, rows, ablated, whole) | {"seconds": time.perf_counter() - bench.clock.start}
+    ablated["albedo"] = albedo_rows
+    numbers = numbers_of(bench, rows, ablated, whole) | gains | {"seconds": time.perf_counter() - bench.clock.start}
     write_record(arguments.json, numbers, seed=seed)
 
 

@@ -1,8 +1,9 @@
 """Completed textures as evidence about the albedo of texels that no photograph measured.
 
-A painting is completed from what its hour shows elsewhere: relief, the sun of the hour, an image. Its light taken out, that is
-another estimate of the albedo there, whose errors differ from those of the albedo's own completion; but in shade, where light
-is little and modelled worse, it is far off. It therefore moves the albedo by a small share, and by less the more they differ.
+With the light of their hour taken out, completed textures tell an albedo of every texel. Those that were fused with a relit
+albedo hold that albedo and, about the painted texels, what paintings show beyond it: they may replace it. Those that were
+completed by other means are another estimate; in shade, where light is little and modelled worse, it is far off, and it
+moves the albedo by a small share, and by less the more they differ.
 """
 
 from __future__ import annotations
@@ -16,8 +17,10 @@ from seasonscapes.albedo.forward_model import TexelTransport
 from seasonscapes.albedo.texture_delighting import delight_textures
 from seasonscapes.sky.illumination import Illumination
 
-# Share of the completed textures where both estimates agree, and the difference of logarithms at which it is half of that.
-SHARE, DIFFERENCE = 0.2, 0.6
+# Share of completed textures that were fused with the albedo, and of those that were completed without it.
+FUSED, ALONE = 1.0, 0.1
+# Difference of logarithms at which the share is half.
+DIFFERENCE = 0.6
 
 
 def corrected_by_inpainting(
@@ -27,7 +30,7 @@ def corrected_by_inpainting(
     completed: Sequence[np.ndarray],
     lights: Sequence[Illumination],
     *,
-    share: float = SHARE,
+    share: float,
 ) -> np.ndarray:
     """Move the albedo of texels that no photograph measured towards that of completed textures.
 
@@ -40,11 +43,11 @@ def corrected_by_inpainting(
     unmeasured
         ``(R, S)`` bool: texels that may change.
     completed
-        Radiance ``(R, S, 3)`` [cd/m²] of one or more hours, completed without the albedo's help.
+        Radiance ``(R, S, 3)`` [cd/m²] of one or more hours.
     lights
         Illumination of each.
     share
-        Weight of the completed textures where both agree, in [0, 1].
+        Weight of the completed textures where both agree, in [0, 1]: `FUSED` or `ALONE`.
 
     Returns
     -------
@@ -70,7 +73,7 @@ def corrected_by_inpainting(
     >>> light = ss.illumination(place, "2024-07-20T13:30", sky="hosek")
     >>> albedo = np.full((*place.texture_shape, 3), 0.2, np.float32)
     >>> nowhere = np.zeros(place.texture_shape, bool)
-    >>> bool((corrected_by_inpainting(transport, albedo, nowhere, [albedo * 1e4], [light]) == albedo).all())
+    >>> bool((corrected_by_inpainting(transport, albedo, nowhere, [albedo * 1e4], [light], share=1.0) == albedo).all())
     True
     """
     found, _ = delight_textures(transport, completed, lights)

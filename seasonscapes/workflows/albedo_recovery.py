@@ -56,7 +56,8 @@ class RecoveryOptions:
     fit_haze
         Search the visibility that explains the photographs best, before the closed form.
     fit_curve
-        Search the strength of the cameras' tone curve, before the closed form.
+        Search the strength of the cameras' tone curve, before either method; the differentiable one finds what is left of
+        each camera's response.
     method
         ``closed``: light, air, response and poses are given (or searched, see above). ``differentiable``: haze, exposures,
         each camera's response, clouds before the sun and poses within their standard deviations are unknowns beside the
@@ -81,8 +82,8 @@ class RecoveryOptions:
     def __post_init__(self):
         if self.method not in METHODS:
             raise ValueError(f"RecoveryOptions: method: got {self.method!r}, expected one of {', '.join(METHODS)}")
-        if self.method != "closed" and (self.fit_haze or self.fit_curve):
-            raise ValueError("RecoveryOptions: fit_haze and fit_curve belong to the closed form")
+        if self.method != "closed" and self.fit_haze:
+            raise ValueError("RecoveryOptions: fit_haze belongs to the closed form")
 
 
 @dataclass(frozen=True)

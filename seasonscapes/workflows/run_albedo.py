@@ -14,7 +14,7 @@ from seasonscapes.array_files import read_arrays
 from seasonscapes.images import atomic_path
 from seasonscapes.progress import Progress
 from seasonscapes.relighting.frame_file import time_stamp
-from seasonscapes.terrain.surface import Texture, load_texture
+from seasonscapes.terrain.surface import load_texture
 from seasonscapes.workflows import completion
 from seasonscapes.workflows.albedo_recovery import RecoveryOptions, save_albedo_figures, texel_transport
 from seasonscapes.workflows.albedo_sources import AlbedoFile
@@ -27,15 +27,12 @@ from seasonscapes.workflows.season_recovery import SeasonAlbedo, group_of, recov
 if TYPE_CHECKING:
     from seasonscapes.albedo.forward_model import TexelTransport
 
-# Confidence of paintings beside the photographs that they were painted from, whose errors they repeat.
-REPEATED = 0.1
 SEASONS_FILE = "seasons.json"
 
 
 def recovery_options(job: RunJob) -> RecoveryOptions:
-    """How a run recovers albedo: what its method does not find is searched for."""
-    closed = job.method.recovery == "closed"
-    return RecoveryOptions(fit_curve=closed, method=job.method.recovery)
+    """How a run recovers albedo: the webcams' tone curve is searched for before either method."""
+    return RecoveryOptions(fit_curve=True, method=job.method.recovery)
 
 
 def recover_albedos(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
@@ -85,32 +82,30 @@ def refine_albedos(job: RunJob, folder: Path, progress: Progress | None) -> list
     """The stage ``refine``: albedos with what the paintings and their completions tell, of the same seasons as before."""
     own = folder / "refined"
     records = season_records(folder)
-    painted = [
-        (time, completion.read_painted(folder / "paint" / time_stamp(time) / "painted.npz", job.place))
-        for time in sorted(set(job.times))
-    ]
     if job.method.painted:
-        seasons = _recovered_again(job, folder, records, painted, progress)
-        files = save_seasons(job, seasons, own)
+        files = save_seasons(job, _recovered_again(job, folder, records, progress), own)
     else:
         files = [_copied(folder / "albedo" / record["file"], own / record["file"]) for record in records]
         files.append(write_record(own / SEASONS_FILE, records))
     if job.method.inpainted:
         transport = texel_transport(job.place, progress)
         for number, record in enumerate(records):
-            theirs = [pair for pair in painted if group_of(records, pair[0]) == number]
-            _correct_unmeasured(job, folder, own / record["file"], transport, theirs, progress)
+            times = [time for time in sorted(set(job.times)) if group_of(records, time) == number]
+            _correct_unmeasured(job, folder, own / record["file"], transport, times)
     return files
 
 
 def _recovered_again(
-    job: RunJob, folder: Path, records: list[dict], painted: list[tuple[datetime, Texture]], progress: Progress | None
+    job: RunJob, folder: Path, records: list[dict[str, Any]], progress: Progress | None
 ) -> list[SeasonAlbedo]:
+    from seasonscapes.albedo.painted_textures import REPEATED
+
     within = job.photographs.within_min
     photographs = photographs_at(job.place, sources_of(job, folder), job.times, within_min=within, progress=progress)
-    paintings = [
-        PaintedTexture(time, texture, f"painted {time_stamp(time)}", confidence=REPEATED) for time, texture in painted
-    ]
+    paintings = []
+    for time in sorted(set(job.times)):
+        texture = completion.read_painted(folder / "paint" / time_stamp(time) / "painted.npz", job.place)
+        paintings.append(PaintedTexture(time, texture, f"painted {time_stamp(time)}", confidence=REPEATED))
     return recover_seasons(
         job.place,
         photographs,
@@ -123,35 +118,23 @@ def _recovered_again(
 
 
 def _correct_unmeasured(
-    job: RunJob,
-    folder: Path,
-    file: Path,
-    transport: TexelTransport,
-    painted: list[tuple[datetime, Texture]],
-    progress: Progress | None,
+    job: RunJob, folder: Path, file: Path, transport: TexelTransport, times: list[datetime]
 ) -> None:
     """Correct the texels of an albedo file that no photograph measured by completed textures of its season, in place."""
-    from seasonscapes.albedo.inpainted_albedo import corrected_by_inpainting
+    from seasonscapes.albedo.inpainted_albedo import ALONE, FUSED, corrected_by_inpainting
     from seasonscapes.albedo.standard_error import AlbedoEstimate
 
     stored = dict(read_arrays(file, what="an albedo texture"))
-    completed = [_completed_alone(job, folder, time, texture, progress) for time, texture in painted]
-    lights = [illumination(job.place, time, sky=job.sky) for time, _ in painted]
-    stored["values"] = corrected_by_inpainting(transport, stored["values"], stored["source"] != 1, completed, lights)
+    completed = [load_texture(folder / "inpaint" / time_stamp(time) / "completed.npz").values for time in times]
+    lights = [illumination(job.place, time, sky=job.sky) for time in times]
+    # The guided method fuses with the albedo itself, so that what differs is what the paintings tell.
+    share = FUSED if job.method.completion == "guided" else ALONE
+    unmeasured = stored["source"] != 1
+    stored["values"] = corrected_by_inpainting(transport, stored["values"], unmeasured, completed, lights, share=share)
     with atomic_path(file) as temporary, open(temporary, "wb") as output:
-        np.savez_compressed(output, **stored)
+        np.savez_compressed(output, **stored)  # pyright: ignore[reportArgumentType]  # numpy's stub takes **arrays for allow_pickle
     known = AlbedoEstimate(stored["values"], stored["sigma"], stored["sunlit"], stored["source"])
     save_albedo_figures(job.place, known, date.fromisoformat(str(stored["date"])), file)
-
-
-def _completed_alone(
-    job: RunJob, folder: Path, time: datetime, painted: Texture, progress: Progress | None
-) -> np.ndarray:
-    """A painting's completion without the albedo's help: the run's own, or, where that is a fusion, by relief and image."""
-    if job.method.completion != "guided":
-        return load_texture(folder / "inpaint" / time_stamp(time) / "completed.npz").values
-    options = completion.CompletionOptions(fast=True, seed=job.seed)
-    return completion.complete(job.place, painted, time, options=options, progress=progress).values
 
 
 def _copied(file: Path, copy: Path) -> Path:

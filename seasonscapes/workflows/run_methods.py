@@ -97,7 +97,7 @@ class RunMethod:
 
 
 METHODS = {
-    "physical": RunMethod("physical", "skyline", "none", "weighted", "guided", "physical"),
+    "physical": RunMethod("physical", "skyline", "none", "weighted", "guided", "physical", painted=True),
     "paper": RunMethod("paper", "points", "paper", "first", "diffusion", "paper"),
 }
 
