@@ -67,7 +67,7 @@ VERBS: dict[str, tuple[list[str], set[str], dict[str, list[str]]]] = {
     "paint": (
         ["alpine_small", "--time", TIME],
         {*_TERRAIN, *_SKY, "--time", "--synthetic-webcams", "--mode", "--near-m", "--harmonise", "--albedo", "--output"}
-        | {"--no-harmonise"},
+        | {"--no-harmonise", "--find-foreground"},
         {**_NO_BOUND, **_REAL, "--leave-out": [], "--size": []},
     ),
     "albedo": (
@@ -104,7 +104,7 @@ VERBS: dict[str, tuple[list[str], set[str], dict[str, list[str]]]] = {
         ["alpine_small", "--times", TIME, "--at-hours", TIME],
         {*_TERRAIN, *_SKY, *_VIEW, "--times", "--at-hours", "--manifest", "--masks", "--method", "--poses", "--grade"}
         | {"--painting", "--completion", "--appearance", "--discs", "--from", "--until", "--seed", "--output"}
-        | {"--recovery", "--use-painted", "--no-use-painted", "--use-inpainted", "--no-use-inpainted"},
+        | {"--recovery", "--use-painted", "--no-use-painted", "--use-inpainted", "--no-use-inpainted", "--find-foreground"},
         {**_OF_POSITION, **_NO_BOUND}
         | _each(("--calibrations", "--within-min", "--doubtful-poses"), [])
         | _each(("--photo-kind", "--photo-size", "--leave-out"), ["--manifest", "m.csv"])

@@ -24,7 +24,7 @@ from seasonscapes.terrain.surface import Texture
 # Resampling blurs, and a texel that several photographs show is a blend of them.
 PAINTED_NOISE = NoiseModel(model=0.05)
 # Confidence of a painting beside the photographs that it was painted from, whose errors it repeats.
-REPEATED = 0.3
+REPEATED = 0.1
 # Standard deviation of the common scale of a painting, whose exposure the skies of its photographs gave.
 _SCALE_SIGMA = 0.1
 _FEWEST_FACING = 1e-3

@@ -26,7 +26,7 @@ class RunMethodOptions:
     method: str = "physical"
     """physical (this package's) or paper (Algorithm 1 of the SeasonScapes paper)."""
     poses: str | None = None
-    """skyline (physical), or points (paper): plane views, each with heading and focal length by 2D-3D points, L1."""
+    """skyline (physical); joint: each panorama whole, by 2D-3D points; or points (paper): each of its plane views, L1."""
     grade: str | None = None
     """Of plane views: paper (paper), none, warm or soft."""
     painting: str | None = None
@@ -41,10 +41,12 @@ class RunMethodOptions:
     """Recover the albedo again with the painted textures as further observations."""
     use_inpainted: bool | None = None
     """Let the completed textures, their light taken out, correct the albedo where no photograph measured it."""
+    find_foreground: bool = False
+    """Look for houses and masts, which the terrain lacks, and paint none of them; what is known belongs into --masks."""
     season: str | None = None
     """Of photographs of several days: the albedo between two seasons is blended, nearest, or follows the snow-line."""
     points: Path | None = None
-    """Of --poses points with real photographs: folder of WEBCAM.csv, of `seasonscapes annotate`."""
+    """Of --poses joint or points with real photographs: folder of WEBCAM.csv, of `seasonscapes annotate`."""
     path: Path | None = None
     """Of completion by diffusion and of films: views of `seasonscapes path`; default through the scene's cameras."""
     path_views: int | None = None
@@ -75,8 +77,9 @@ class RunMethodOptions:
             recovery=self.recovery,
             painted=self.use_painted,
             inpainted=self.use_inpainted,
+            foreground=self.find_foreground,
         )
-        refuse_without("--poses points", method.poses == "points", points=self.points)
+        refuse_without("--poses joint or points", method.poses != "skyline", points=self.points)
         refuse_without("a path (--completion diffusion or --appearance paper)", method.needs_path, path=self.path)
         own = method.needs_path and self.path is None
         refuse_without("a path that this run makes", own, path_views=self.path_views)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from datetime import datetime
 from pathlib import Path
 
@@ -30,7 +30,7 @@ from seasonscapes.workflows.path_stages import (
 )
 from seasonscapes.workflows.pictures import develop
 from seasonscapes.workflows.place import Place
-from seasonscapes.workflows.plane_views import cut_plane_views, pose_plane_views
+from seasonscapes.workflows.plane_views import cut_plane_views, pose_panoramas, pose_plane_views
 from seasonscapes.workflows.predicted_radiance import RELATIVE_SIGMA, measured_radiance
 from seasonscapes.workflows.relight_session import RenderJob
 from seasonscapes.workflows.run_albedo import albedo_at, final_albedos, recover_albedos, refine_albedos
@@ -119,7 +119,7 @@ def stages_of(job: RunJob, progress: Progress | None = None) -> list[Stage]:
     path = ("path",) if method.needs_path else ()
     model = {**common, "discs": job.distil.discs, "steps": along.paper_steps}
     final = ("albedo", "refine") if method.refines else ("albedo",)
-    painted = {**common, "painting": method.painting}
+    painted = {**common, "painting": method.painting, "foreground": method.foreground}
     refined = {**common, "recovery": method.recovery, "painted": method.painted, "inpainted": method.inpainted}
     filled = {**common, "completion": method.completion, "model": _model_facts(along, method)}
     stages = [
@@ -217,6 +217,10 @@ def _calibrate(job: RunJob, folder: Path, progress: Progress | None) -> list[Pat
         stated = _stated_records(job, folder)
         kept = [] if job.photographs.sources is None else stated
         return [*kept, *pose_plane_views(job.place, stated, own, points=job.along.points, seed=job.seed)[0]]
+    if job.method.poses == "joint":
+        stated = _stated_records(job, folder)
+        kept = [] if job.photographs.sources is None else stated
+        return [*kept, *pose_panoramas(job.place, stated, own, points=job.along.points, seed=job.seed)[0]]
     return bring_poses(job.photographs, job.place, job.times, taken, own, seed=job.seed)
 
 
@@ -239,6 +243,8 @@ def _paint(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
     from seasonscapes.texturing.radiometric_fit import RadiometricReference
 
     files = []
+    options = PaintOptions() if job.method.painting == "weighted" else AS_THE_PAPER
+    options = replace(options, foreground=job.method.foreground)
     for time in job.times:
         own = folder / "paint" / time_stamp(time)
         reference = None
@@ -250,7 +256,7 @@ def _paint(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
             sources_of(job, folder),
             time,
             job.sky,
-            PaintOptions() if job.method.painting == "weighted" else AS_THE_PAPER,
+            options,
             within_min=job.photographs.within_min,
             reference=reference,
             progress=progress,

@@ -78,6 +78,22 @@ def pose_plane_views(
     NotEnoughEvidence
         Where no view could be posed.
     """
+    return _posed(place, stated, own, points, seed, whole=False)
+
+
+def pose_panoramas(
+    place: Place, stated: Sequence[Path], own: Path, *, points: Path | None, seed: int = 0
+) -> tuple[list[Path], dict[str, str]]:
+    """Solve one heading and scale of each whole panorama from the same points as `pose_plane_views`, all its views together.
+
+    Parameters, results and errors are those of `pose_plane_views`; a plane webcam is its own only view.
+    """
+    return _posed(place, stated, own, points, seed, whole=True)
+
+
+def _posed(
+    place: Place, stated: Sequence[Path], own: Path, points: Path | None, seed: int, *, whole: bool
+) -> tuple[list[Path], dict[str, str]]:
     from seasonscapes.calibration.calibration_file import read_calibration, record_name, write_calibration
     from seasonscapes.calibration.evidence import Priors, read_points, write_points
     from seasonscapes.calibration.pose_model import parameters_of_view, view_from_parameters
@@ -89,32 +105,33 @@ def pose_plane_views(
     priors = Priors(tilt_deg=0.0, roll_deg=0.0, horizontal_m=0.0, vertical_m=0.0, focal=np.inf)
     for record in stated:
         known = read_calibration(record)
-        whole = known.view
         table = own / f"{known.webcam}.csv" if points is None else points / f"{known.webcam}.csv"
         if points is None:
-            write_points(table, _clicked_points(place, whole, seed, known.webcam), known.frame)
+            write_points(table, _clicked_points(place, known.view, seed, known.webcam), known.frame)
             files.append(table)
         elif not table.is_file():
             doubts[known.webcam] = f"no such file: {table}"
             continue
         matches = read_points(table, known.frame)
-        for view in plane_views(known.webcam, whole):
-            seen = _points_in_view(matches, view)
-            start = view.camera
+        views = plane_views(known.webcam, known.view)
+        starts: list[tuple[str, Camera | Panorama, Correspondences]] = [(known.webcam, known.view, matches)]
+        if not whole:
+            starts = [(view.name, view.camera, _points_in_view(matches, view)) for view in views]
+        for name, start, seen in starts:
             if points is None:
-                rng = np.random.default_rng([seed, zlib.crc32(view.name.encode())])
+                rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
                 parameters = parameters_of_view(start, np.eye(3))
                 parameters[0] += rng.uniform(-_COMPASS_DEG, _COMPASS_DEG)
                 start = view_from_parameters(start, np.eye(3), parameters)
             try:
                 solved = resect(start, seen, priors=priors, options=ResectionOptions(loss="l1"))
             except NotEnoughEvidence as error:
-                doubts[view.name] = str(error)
+                doubts[name] = str(error)
                 continue
-            files.append(own / record_name(view.name))
-            write_calibration(files[-1], view.name, solved, known.frame)
-    for name, doubt in doubts.items():
-        log.info("run: calibrate: %s is left out: %s", name, doubt)
+            files.append(own / record_name(name))
+            write_calibration(files[-1], name, solved, known.frame)
+    for each, doubt in doubts.items():
+        log.info("run: calibrate: %s is left out: %s", each, doubt)
     if not any(path.suffix == ".json" for path in files):
         raise NotEnoughEvidence(f"run: no view could be posed by points: {'; '.join(sorted(set(doubts.values())))}")
     return files, doubts

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from seasonscapes.workflows.path_completion import PathCompletionOptions
 
 _CHOICES = {
-    "poses": ("skyline", "points"),
+    "poses": ("skyline", "joint", "points"),
     "grade": ("none", "paper", "warm", "soft"),
     "painting": ("weighted", "first"),
     "completion": ("guided", "telea", "membrane", "diffusion"),
@@ -32,7 +32,8 @@ class RunMethod:
     name
         Of the method that the stages were taken from.
     poses
-        ``"skyline"`` finds panoramas by the terrain's horizon; ``"points"`` cuts them to 4 to 6 plane views and solves each
+        ``"skyline"`` finds panoramas by the terrain's horizon; ``"joint"`` solves one pose of each whole panorama from
+        2D–3D points; ``"points"`` cuts them to 4 to 6 plane views and solves each
         one's heading and focal length from 2D–3D points under an L1 loss, as the paper does.
     grade
         Colour grade of the plane views (`cameras.colour_grade.GRADES`), or ``"none"``.
@@ -47,6 +48,8 @@ class RunMethod:
         Of albedo: ``"closed"``, or ``"differentiable"`` (see `albedo_recovery.RecoveryOptions`).
     painted
         Whether the painted textures enter the albedo once more, as observations beside the photographs.
+    foreground
+        Whether painting looks for houses and masts, and leaves them out.
     inpainted
         Whether the completed textures, their light taken out, enter the albedo of texels that no photograph measured.
 
@@ -66,6 +69,7 @@ class RunMethod:
     recovery: str = "closed"
     painted: bool = False
     inpainted: bool = False
+    foreground: bool = False
 
     def __post_init__(self) -> None:
         for name, choices in _CHOICES.items():
@@ -121,7 +125,7 @@ def run_method(name: str, **stages: str | bool | None) -> RunMethod:
         raise InputError("--method", "unknown method", got=name, expected=", ".join(METHODS))
     known = {each.name for each in fields(RunMethod)}
     chosen = {stage: value for stage, value in stages.items() if value is not None and stage in known}
-    if chosen.get("poses") == "skyline":
+    if chosen.get("poses") in ("skyline", "joint"):
         # A grade belongs to plane views; without them the method's own goes too.
         chosen.setdefault("grade", "none")
     return replace(METHODS[name], **chosen)
