@@ -11,8 +11,9 @@ judged: pictures developed with the truth's exposure, land beyond 60 m, mode ``v
 each colour first, as one must for a real webcam.
 
 * Panoramas are calibrated, cut into views, and give the albedo, which corrects the satellite's image where no webcam
-  looked; relit, it ties the pictures of each hour together, and what they paint corrects it. The paintings then go back into
-  the albedo, as in ``run``; one table tells what they add, and what their completions and the joint recovery would.
+  looked; relit, it ties the pictures of each hour together, and what they paint corrects it. One table tells what paintings,
+  their completions and the joint recovery would add to the albedo (``run --use-painted``, ``--use-inpainted``,
+  ``--recovery differentiable``); `alpinebench_contributions.py` tells it of many places.
 * Painted hours: the painted and completed texture, seen from the judged webcams through the air.
 * Held-out hours: the albedo recovered from the painted hours' pictures, relit.
 * Distilled: Gaussians that learned from that albedo under suns of other days, seen at the held-out hours.
@@ -105,20 +106,17 @@ def stages(bench: Bench) -> tuple[dict[str, dict], dict]:
     rows["albedo alone, clean + relight"] = judge.scores(judge.of_albedo(bench.completed_albedo(fit)[0]), held)
     bench.clock.tell("albedo alone")
     photographs = bench.photographs()
-    first_fit = solve_albedo(bench.land, photographs, noise_model=EIGHT_BIT)
-    first, sigma = bench.completed_albedo(first_fit)
-    told = {at: bench.true_texture(world.lights[at][0], first) for at in painted}
-    bench.clock.tell("albedo")
-    paintings = {at: bench.painted(at, relit=told[at]) for at in painted}
-    textures = {at: bench.fused(paintings[at].texture, at, told[at], sigma / first[..., 1]) for at in painted}
-    rows["all, painted hours"] = judge.scores(lambda c, at: judge.of_texture(textures[at], c, at), painted)
-    bench.clock.tell("calibrated, painted, completed")
-    albedo_fit = bench.solved_again(photographs, paintings)
-    albedo = bench.completed_albedo(albedo_fit)[0]
+    albedo_fit = solve_albedo(bench.land, photographs, noise_model=EIGHT_BIT)
+    albedo, sigma = bench.completed_albedo(albedo_fit)
     relit = judge.of_albedo(albedo)
     rows["all, held-out hours"] = judge.scores(relit, held)
     rows["all, relit painted hours"] = judge.scores(relit, painted)
-    bench.clock.tell("paintings back into the albedo, relit")
+    bench.clock.tell("albedo, relit")
+    told = {at: bench.true_texture(world.lights[at][0], albedo) for at in painted}
+    paintings = {at: bench.painted(at, relit=told[at]) for at in painted}
+    textures = {at: bench.fused(paintings[at].texture, at, told[at], sigma / albedo[..., 1]) for at in painted}
+    rows["all, painted hours"] = judge.scores(lambda c, at: judge.of_texture(textures[at], c, at), painted)
+    bench.clock.tell("calibrated, painted, completed")
     splats = Splats(bench)
     rows["distil alone (true albedo)"] = judge.scores(splats.views(world.albedo), held)
     rows["all, distilled, held-out hours"] = judge.scores(splats.views(albedo), held)
@@ -128,17 +126,10 @@ def stages(bench: Bench) -> tuple[dict[str, dict], dict]:
         "told": told,
         "textures": textures,
         "albedo": albedo,
-        "albedos": {
-            "photographs alone": first,
-            "with painted": albedo,
-            "with inpainted": bench.inpainted(first, first_fit, textures),
-        },
         "photographs": photographs,
-        "first_fit": first_fit,
         "fit": albedo_fit,
         "seen": seen,
         "relit": relit,
-        "held": rows["all, held-out hours"],
     }
 
 
@@ -159,22 +150,19 @@ def texture_scores(bench: Bench, textures: dict, *, air: bool = True) -> dict[st
 
 
 def contributions(bench: Bench, whole: dict) -> tuple[dict[str, dict], dict[str, float]]:
-    """What paintings, completions and the joint recovery each add to the albedo of photographs, at held-out hours.
+    """What each adds to the albedo of photographs, as rows of its relit held-out hours, and as gains [dB].
 
-    Also the gains [dB] over the photographs alone, of pictures and of the albedo of all land.
+    ``whole`` holds photographs, their fit and albedo, and painted and completed textures.
     """
-    judge, held, albedos = bench.judge, bench.world.held_hours, dict(whole["albedos"])
-    joint = bench.found_jointly(whole["photographs"], whole["first_fit"])
-    albedos["differentiable"] = bench.completed_albedo(joint)[0]
-    rows, numbers, land = Rows(), {}, bench.albedo_guides.surface
-    for name, albedo in albedos.items():
-        scores = whole["held"] if name == "with painted" else judge.scores(judge.of_albedo(albedo), held)
-        rows[name] = scores | {"albedo_psnr_db": albedo_error(bench.world.albedo, albedo, land).psnr_db}
+    judge, rows, numbers = bench.judge, Rows(), {}
+    for name, albedo in bench.albedos(whole).items():
+        scores = judge.scores(judge.of_albedo(albedo), bench.world.held_hours)
+        error = albedo_error(bench.world.albedo, albedo, bench.albedo_guides.surface)
+        rows[name] = scores | {"albedo_psnr_db": error.psnr_db}
     alone = rows["photographs alone"]
     for name, row in rows.items():
         if row is not alone:
-            gain = row["psnr_db"] - alone["psnr_db"]
-            numbers[f"{key_of(name)}_gain_db"] = gain
+            numbers[f"{key_of(name)}_gain_db"] = row["psnr_db"] - alone["psnr_db"]
             numbers[f"{key_of(name)}_albedo_gain_db"] = row["albedo_psnr_db"] - alone["albedo_psnr_db"]
     bench.clock.tell("contributions to the albedo")
     return rows, numbers

@@ -305,6 +305,19 @@ class Bench:
         """Albedo together with response, exposures, clouds and poses; haze stays the truth's, as for the closed form."""
         return recover_jointly(self.land, photographs, fit).fit
 
+    def albedos(self, whole: dict) -> dict[str, np.ndarray]:
+        """Albedos from photographs alone, with what else a run can use, and by the joint recovery.
+
+        ``whole`` holds ``photographs``, their closed ``fit`` and ``albedo``, and of each hour ``paintings`` and ``textures``.
+        """
+        photographs, fit, albedo = whole["photographs"], whole["fit"], whole["albedo"]
+        return {
+            "photographs alone": albedo,
+            "with painted": self.completed_albedo(self.solved_again(photographs, whole["paintings"]))[0],
+            "with inpainted": self.inpainted(albedo, fit, whole["textures"]),
+            "differentiable": self.completed_albedo(self.found_jointly(photographs, fit))[0],
+        }
+
     def completed_albedo(self, fit: AlbedoFit, base: Texture | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Another picture of the land (left out, the satellite's, its light taken out) corrected by the seen texels; and σ."""
         base = base or self.satellite

@@ -25,7 +25,7 @@ from seasonscapes.workflows.stage_runner import run_stages
 from seasonscapes.workspace import Workspace
 
 NOON = datetime(2024, 9, 1, 10, tzinfo=UTC)
-AFTER = ["albedo", "paint", "inpaint", "refine", "relight", "distil", "splat"]
+AFTER = ["albedo", "paint", "inpaint", "relight", "distil", "splat"]
 ALL = ["pictures", "calibrate", *AFTER]
 
 

@@ -101,7 +101,7 @@ class RunMethod:
 
 
 METHODS = {
-    "physical": RunMethod("physical", "skyline", "none", "weighted", "guided", "physical", painted=True),
+    "physical": RunMethod("physical", "skyline", "none", "weighted", "guided", "physical"),
     "paper": RunMethod("paper", "points", "paper", "first", "diffusion", "paper"),
 }
 
