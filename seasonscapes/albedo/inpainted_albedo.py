@@ -68,7 +68,7 @@ def corrected_by_inpainting(
     --------
     >>> import seasonscapes as ss
     >>> from seasonscapes.albedo.forward_model import trace_texel_transport
-    >>> place = ss.load_place("alpine_small", ss.MeshOptions(texel_m=120.0))
+    >>> place = ss.load_place("alpine_small", options=ss.MeshOptions(texel_m=120.0))
     >>> transport = trace_texel_transport(place.terrain, place.texture_shape)
     >>> light = ss.illumination(place, "2024-07-20T13:30", sky="hosek")
     >>> albedo = np.full((*place.texture_shape, 3), 0.2, np.float32)

@@ -65,7 +65,7 @@ def painted_photograph(
     --------
     >>> import seasonscapes as ss
     >>> from seasonscapes.albedo.forward_model import trace_texel_transport
-    >>> place = ss.load_place("alpine_small", ss.MeshOptions(texel_m=120.0))
+    >>> place = ss.load_place("alpine_small", options=ss.MeshOptions(texel_m=120.0))
     >>> transport = trace_texel_transport(place.terrain, place.texture_shape)
     >>> light = ss.illumination(place, "2024-07-20T13:30", sky="hosek")
     >>> lit = ss.Texture(np.full((*place.texture_shape, 3), 2e3, np.float32), np.ones(place.texture_shape, np.float32))
