@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from seasonscapes.cameras.pinhole import view_in_frame
+from seasonscapes.errors import NotEnoughEvidence, NoUsablePixels
 from seasonscapes.progress import Progress, each_reported
 from seasonscapes.sky.models import SkyModel
 from seasonscapes.workflows.albedo_recovery import (
@@ -96,11 +97,11 @@ def recover_seasons(
     NoTerrainInView
         Where no photograph shows any of the terrain.
     NotEnoughEvidence
-        Where the photographs of a day determine no texel.
+        Where the photographs of a season determine no texel.
 
     Notes
     -----
-    Each day's photographs alone give an albedo; days that are neighbours in the year and agree in it are one season
+    Each day's photographs alone give an albedo (a day for which they do not joins the nearest day); days that are neighbours in the year and agree in it are one season
     (`albedo.season_grouping.group_dates`), whose photographs together give the final one. Texels that did not change from
     season to season take their common mean (`share_unchanged`).
     """
@@ -140,13 +141,36 @@ def _grouped_days(
     # Prepared together, since photographs of one camera share their footprints.
     prepared = prepare_photographs(transport, seen, illuminations(place, seen, model))
     days = sorted({each.time.date() for each in seen})
+    known: list[date] = []
     estimates: list[AlbedoEstimate] = []
     for day in each_reported(days, len(days), progress, "albedo of each day"):
         own = [each for each in prepared if each.observation.time.date() == day]
-        estimates.append(albedo_estimate(transport, own, closed_fit(transport, own)))
-    groups = [[days[index] for index in group] for group in group_dates(days, estimates)]
-    log.info("seasons: %s", "; ".join(", ".join(map(str, group)) for group in groups))
+        try:
+            estimates.append(albedo_estimate(transport, own, closed_fit(transport, own)))
+        except (NotEnoughEvidence, NoUsablePixels) as error:
+            log.warning("%s alone gives no albedo (%s): it belongs to the season of the nearest day", day, error)
+        else:
+            known.append(day)
+    groups = [[known[index] for index in group] for group in group_dates(known, estimates)] or [[]]
+    for day in (day for day in days if day not in known):
+        min(groups, key=lambda group: min((days_apart(day, each) for each in group), default=0.0)).append(day)
+    log.info("seasons: %s", "; ".join(", ".join(map(str, sorted(group))) for group in groups))
     return groups
+
+
+def days_apart(first: date, second: date) -> float:
+    """Days between two dates within the year, which is a circle: 20 December and 10 January are three weeks apart.
+
+    Examples
+    --------
+    >>> from datetime import date
+    >>> round(days_apart(date(2023, 12, 20), date(2025, 1, 10)))
+    21
+    """
+    from seasonscapes.albedo.seasons import YEAR_DAYS, day_number
+
+    apart = abs(day_number(first) - day_number(second)) % YEAR_DAYS
+    return float(min(apart, YEAR_DAYS - apart))
 
 
 def group_of(seasons: Sequence[dict[str, Any]], time: datetime) -> int:
