@@ -77,3 +77,41 @@ def test_a_season_between_photographs_of_one_day_is_refused(tmp_path, capsys):
     where = ["-o", str(tmp_path / "run")]
     assert main(["run", str(tmp_path / "little.toml"), *times, *place, *where, "--season", "nearest"]) == 2
     assert "--times of two days" in capsys.readouterr().err
+
+
+def test_a_day_that_tells_nothing_alone_joins_the_nearest(monkeypatch):
+    """Of the recoveries of each day only the outcome counts here: one fails, the others are snow above two heights."""
+    from datetime import UTC, date, datetime
+    from types import SimpleNamespace
+
+    from test_albedo import _snow_above
+
+    from seasonscapes.albedo import photographs, standard_error
+    from seasonscapes.errors import NotEnoughEvidence
+    from seasonscapes.workflows import season_recovery
+
+    line_m = {date(2024, 9, 10): 2900.0, date(2024, 9, 20): 2890.0, date(2024, 11, 9): 2300.0, date(2023, 11, 20): None}
+    days = [SimpleNamespace(time=datetime(day.year, day.month, day.day, 11, tzinfo=UTC)) for day in line_m]
+
+    def solved(transport, own):
+        day = own[0].observation.time.date()
+        if line_m[day] is None:
+            raise NotEnoughEvidence("nothing fixes the exposure")
+        return line_m[day]
+
+    monkeypatch.setattr(season_recovery, "with_terrain", lambda transport, seen: seen)
+    monkeypatch.setattr(season_recovery, "illuminations", lambda place, seen, model: None)
+    monkeypatch.setattr(season_recovery, "closed_fit", solved)
+    monkeypatch.setattr(
+        photographs,
+        "prepare_photographs",
+        lambda transport, seen, lights: [SimpleNamespace(observation=each) for each in seen],
+    )
+    monkeypatch.setattr(standard_error, "albedo_estimate", lambda transport, own, fit: _snow_above(fit))
+    groups = season_recovery._grouped_days(None, None, days, None, None)
+    assert [sorted(group) for group in groups] == [
+        [date(2024, 9, 10), date(2024, 9, 20)],
+        [date(2023, 11, 20), date(2024, 11, 9)],
+    ]
+    line_m.update(dict.fromkeys(line_m))
+    assert [sorted(group) for group in season_recovery._grouped_days(None, None, days, None, None)] == [sorted(line_m)]

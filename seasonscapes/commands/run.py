@@ -74,6 +74,7 @@ def run_command(
     found, model, size_px = photographs.values(allow_outside=options.allow_outside), sky.model(), view.size_px()
     from seasonscapes.workflows.albedo_recovery import TEXEL_M
     from seasonscapes.workflows.full_run import RunJob, run
+    from seasonscapes.workflows.run_albedo import season_records
 
     with progress_bars() as progress:
         loaded = options.load(scene, progress, texel_m=TEXEL_M)
@@ -100,5 +101,13 @@ def run_command(
         "scene": loaded.scene.name,
         "stages": {name: {"seconds": entry["seconds"], "files": len(entry["files"])} for name, entry in stages.items()},
     }
+    seasons = season_records(output) if "albedo" in stages else []
+    if seasons:
+        record["seasons"] = seasons
     lines = [f"{name:<10} {entry['seconds']:8.1f} s  {len(entry['files'])} files" for name, entry in stages.items()]
+    if len(seasons) > 1:
+        lines += [
+            f"season     {each['day']}  {len(each['times_utc'])} instants on {', '.join(each['days'])}"
+            for each in seasons
+        ]
     print_result(record, [*lines, str(output)], as_json=json)
