@@ -3,6 +3,7 @@
 # make check  the quick part of both: style, layers, and the tests that take milliseconds
 # make lint   style, types and layers: ruff, pyright, import-linter
 # make docs   the site in docs/_build/html; a warning is an error. docs-notebooks executes its notebooks first
+# make sky-tables the atmosphere tables of the bundled sky models, after a change of their physics
 # make tables the tables of README and site from benchmarks/results; `make results` measures those anew, in hours
 # Each makes the virtual environment .venv if it is missing, finds or installs libLLVM where it is needed, and can be
 # repeated at will. PYTHON=python3.12 chooses the interpreter, CONSTRAINTS=constraints.txt installs the tested versions.
@@ -14,7 +15,7 @@ BIN := $(VENV)/bin
 BASE := $(VENV)/.installed
 DEV := $(VENV)/.installed-dev
 
-.PHONY: demo gallery test check docs docs-notebooks tables results lint venv dev llvm clean help
+.PHONY: demo gallery test check docs docs-notebooks sky-tables tables results lint venv dev llvm clean help
 help:
 	@sed -n '1,8p' Makefile
 
@@ -50,6 +51,9 @@ docs: llvm $(DEV)
 
 docs-notebooks: $(DEV)
 	$(BIN)/python docs/run_notebooks.py
+
+sky-tables: $(BASE)
+	$(BIN)/python -m seasonscapes.sky.shipped_tables
 
 tables: $(DEV)
 	$(BIN)/python benchmarks/tables.py

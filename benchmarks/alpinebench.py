@@ -51,7 +51,7 @@ from record import write_record  # noqa: E402
 from seasonscapes.albedo.closed_form import solve_albedo  # noqa: E402
 from seasonscapes.albedo.photographs import EIGHT_BIT  # noqa: E402
 from seasonscapes.evaluation.figures import comparison_figure, image_row, steepest_window  # noqa: E402
-from seasonscapes.evaluation.lpips import load_lpips, missing_lpips  # noqa: E402
+from seasonscapes.evaluation.lpips import load_lpips, lpips_sources, missing_lpips  # noqa: E402
 from seasonscapes.evaluation.surfaces import albedo_error  # noqa: E402
 from seasonscapes.evaluation.tables import by_distance, drop, table_lines  # noqa: E402
 from seasonscapes.exposure import develop, exposure_ev100  # noqa: E402
@@ -382,6 +382,8 @@ def main() -> None:
             raise SystemExit(f"alpinebench: no folder {data / 'jungfrau'}; name its parent in SEASONSCAPES_DATA")
     why = missing_lpips()
     print(f"seed {seed}" + (f"; LPIPS is left out: {why}" if why else ""), file=sys.stderr)
+    if why is None and not lpips_sources()["published"]:
+        print("LPIPS is by other weights than the published ones: not comparable", file=sys.stderr)
     bench = Bench(seed, "quick" if arguments.quick else arguments.size, None if why else load_lpips(), data)
     rows, whole = stages(bench)
     print_stages(rows)

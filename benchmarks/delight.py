@@ -54,7 +54,7 @@ from delight_scene import (  # noqa: E402
     transport_of,
     unit_of,
 )
-from mesh_scene import mesh_relit  # noqa: E402
+from mesh_scene import mesh_relit, mesh_suns  # noqa: E402
 from record import write_record  # noqa: E402
 
 from seasonscapes.albedo.corrections import CORRECTIONS, slopes_under  # noqa: E402
@@ -83,6 +83,9 @@ BARS = {
     "landsat_abs_r_max": (0.1, "at most"),
     "landsat_dates_spread_over_best_correction": (1.0, "at most"),
     "mesh_relit_psnr_db": (28.0, "at least"),
+    "mesh_sun_found_rate": (0.9, "at least"),
+    "mesh_sun_wrong_trusted": (0.0, "at most"),
+    "mesh_overcast_trusted": (0.0, "at most"),
 }
 
 
@@ -349,9 +352,10 @@ def _stored(truth: Truth, azimuth: float, elevation: float, turbidity: float, sh
 
 
 def meshes(seed: int, quick: bool, numbers: dict[str, Any]) -> None:
-    """A textured mesh with three textures, y up, shifted origin: lit at an hour, delit, relit at two others."""
+    """A textured mesh with three textures, y up, shifted origin: lit, delit, relit; and suns of meshes of unknown hour."""
     with tempfile.TemporaryDirectory() as folder:
         scores = mesh_relit(seed, Path(folder), texels=128 if quick else 256, spp=128 if quick else 256, rays=128)
+        scores |= mesh_suns(seed, Path(folder), scenes=9 if quick else 30)
     print("mesh: " + ", ".join(f"{name} {value:.2f}" for name, value in scores.items()), flush=True)
     numbers.update(scores)
 

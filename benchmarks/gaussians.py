@@ -3,13 +3,15 @@
     python benchmarks/gaussians.py [--quick] [--seed N] [--json FILE] [--picture FILE]
 
 The scene is a massif of our own making (another one for every seed) under a clear sky. Discs learn from suns of a whole
-year seen by three cameras; they are judged on suns that they have not seen, on those cameras and on a fourth one.
+year seen by six cameras around it; they are judged on suns that they have not seen, on three of those cameras and on
+another one, halfway between two of them.
 
 * Truth is the view relit from its daylight coefficients with the same bounces as path tracing, of which it has no noise;
   one view is path traced too, and the difference of both is printed.
 * PSNR is that of sRGB pictures over pixels that are all terrain, before the air (which would flatter); exposure is
   given by the horizontal illuminance, equal for all.
-* All contestants have the same discs, the same two stages, steps and pictures. ``code`` has a free vector for each
+* All contestants have the same discs, the same two stages, steps and pictures, and all refine their discs; the untrained
+  one has the discs as the terrain gives them. ``code`` has a free vector for each
   training time; for a held-out picture it is fitted to the left half and judged on the right one, as WildGaussians does
   (it has then seen half of the answer). ``sun`` is the same network told where the sun stands.
 """
@@ -20,17 +22,25 @@ import argparse
 import os
 import secrets
 import time
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from record import write_record
+
+if TYPE_CHECKING:
+    from seasonscapes.cameras.pinhole import Camera
+    from seasonscapes.gaussians.rasterise import Splats, ViewWeights
 
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 SUMMER_DAY, SPRING_DAYS = 245.0, (115.0, 130.0, 145.0)
+# Cameras of `Scene` that are learned from, and judged on.
+LEARNED, JUDGED = (0, 1, 2, 4, 5, 6), range(4)
 
 
 @dataclass(frozen=True)
@@ -69,7 +79,8 @@ class Scene:
         self.mesh = mi_mesh(self.terrain, self.albedo(SUMMER_DAY))
         self.ray_scene = ray_scene(self.mesh)
         first = float(self.rng.uniform(0.0, 360.0))
-        self.cameras = [self.camera(first + turn) for turn in (0.0, 120.0, 240.0, 55.0)]
+        # The first three are judged on, and with the last three learned from; the fourth is never learned from.
+        self.cameras = [self.camera(first + turn) for turn in (0.0, 120.0, 240.0, 30.0, 60.0, 180.0, 300.0)]
 
     def albedo(self, day: float) -> np.ndarray:
         from affine import Affine
@@ -179,6 +190,12 @@ def psnr(picture: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
     return float(-10.0 * np.log10(np.mean((srgb_from_linear(picture) - srgb_from_linear(truth))[mask] ** 2)))
 
 
+def picture(weights: ViewWeights, colours: np.ndarray) -> np.ndarray:
+    from seasonscapes.gaussians.rasterise import splat_colours
+
+    return splat_colours(weights, colours) / np.maximum(weights.coverage, 1e-3)[..., None]
+
+
 class Contest:
     """Discs, lessons, frames and truth, and what each contestant makes of them."""
 
@@ -189,7 +206,6 @@ class Contest:
             surfel_irradiance,
             trace_disc_transport,
         )
-        from seasonscapes.gaussians.rasterise import view_weights
         from seasonscapes.gaussians.surfels import surfel_albedo, terrain_surfels
         from seasonscapes.gaussians.training import TrainingFrame, surface_targets
         from seasonscapes.gaussians.training_views import front_facing_splats
@@ -205,9 +221,7 @@ class Contest:
         self.lights, days = scene.lights(sizes.suns + sizes.held_out)
         self.states = [light_state(self.transport, light, day) for light, day in zip(self.lights, days, strict=True)]
         self.suns, self.held_out = sizes.suns, range(sizes.suns, sizes.suns + sizes.held_out)
-        self.weights = []
-        for camera in scene.cameras:
-            self.weights.append(view_weights(front_facing_splats(self.surfels, camera), camera, subpixels=2))
+        self.weights = self.views(lambda camera: front_facing_splats(self.surfels, camera), range(len(scene.cameras)))
         if not learn:
             return
         start = time.perf_counter()
@@ -218,8 +232,8 @@ class Contest:
         self.truth = [truth_of(scene, scene.ray_scene, camera, self.lights, self.states) for camera in scene.cameras]
         self.seconds["views"] = time.perf_counter() - start
         self.frames = [
-            TrainingFrame(self.weights[v], t, self.truth[v].pictures[t], self.truth[v].solid)
-            for v in range(3)
+            TrainingFrame(self.weights[v], t, self.truth[v].pictures[t], self.truth[v].solid, scene.cameras[v])
+            for v in LEARNED
             for t in range(self.suns)
         ]
 
@@ -237,29 +251,42 @@ class Contest:
             seed=self.seed,
         )
 
+    def views(self, splats: Callable[[Camera], Splats], cameras: Iterable[int]) -> dict[int, ViewWeights]:
+        """Weights of discs in some of the cameras."""
+        from seasonscapes.gaussians.rasterise import view_weights
+
+        seen = {v: self.scene.cameras[v] for v in cameras}
+        return {v: view_weights(splats(camera), camera, subpixels=2) for v, camera in seen.items()}
+
+    def weights_of(self, appearance) -> dict[int, ViewWeights]:
+        """Weights of an appearance's discs in the cameras that are judged."""
+        import torch
+
+        if appearance.geometry is None:
+            return self.weights
+        with torch.no_grad():
+            return self.views(appearance.geometry.splats, JUDGED)
+
     def trained(self, kind: str):
+        from seasonscapes.gaussians.disc_geometry import DiscGeometry
         from seasonscapes.gaussians.training import Schedule, train
 
         sizes, appearance = self.scene.sizes, self.appearance(kind)
+        appearance.refine(DiscGeometry(self.surfels))
         start = time.perf_counter()
         train(appearance, self.targets, self.frames, Schedule(sizes.surface_steps, sizes.picture_steps), seed=self.seed)
         self.seconds[kind] = time.perf_counter() - start
         return appearance
 
-    def picture(self, view: int, colours: np.ndarray) -> np.ndarray:
-        from seasonscapes.gaussians.rasterise import splat_colours
-
-        return splat_colours(self.weights[view], colours) / np.maximum(self.weights[view].coverage, 1e-3)[..., None]
-
-    def score(self, appearance, times=None) -> tuple[float, float]:
+    def score(self, appearance, times=None, weights=None) -> tuple[float, float]:
         """Mean PSNR of held-out times on the training cameras and on the unseen one."""
         from seasonscapes.gaussians.appearance import colours_at
 
-        table = []
+        table, weights = [], weights or self.weights_of(appearance)
         for t in self.held_out if times is None else times:
             colours = colours_at(appearance, self.states[t])
             table.append(
-                [psnr(self.picture(v, colours), self.truth[v].pictures[t], self.truth[v].solid) for v in range(4)]
+                [psnr(picture(weights[v], colours), self.truth[v].pictures[t], self.truth[v].solid) for v in JUDGED]
             )
         mean = np.mean(table, axis=0)
         return float(mean[:3].mean()), float(mean[3])
@@ -269,7 +296,7 @@ class Contest:
         from seasonscapes.gaussians.appearance import light_tensors
         from seasonscapes.gaussians.training import TrainingFrame, fit_code
 
-        lights, table = light_tensors(self.states), []
+        lights, table, weights = light_tensors(self.states), [], self.weights_of(appearance)
         import torch
 
         for t in list(self.held_out)[: self.scene.sizes.code_fits]:
@@ -277,11 +304,11 @@ class Contest:
             for v in (0, 3):
                 truth = self.truth[v]
                 left = np.arange(truth.solid.shape[1])[None, :] < truth.solid.shape[1] // 2
-                frame = TrainingFrame(self.weights[v], t, truth.pictures[t], truth.solid & left)
+                frame = TrainingFrame(weights[v], t, truth.pictures[t], truth.solid & left)
                 code = fit_code(appearance, lights, frame, seed=self.seed)
                 with torch.no_grad():
                     colours = appearance(torch.arange(len(self.albedo)), torch.tensor(t), lights, code).numpy()
-                row.append(psnr(self.picture(v, colours), truth.pictures[t], truth.solid & ~left))
+                row.append(psnr(picture(weights[v], colours), truth.pictures[t], truth.solid & ~left))
             table.append(row)
         return tuple(np.mean(table, axis=0).tolist())
 
@@ -316,17 +343,17 @@ class Contest:
         from seasonscapes.rendering.gbuffer import trace_gbuffer
         from seasonscapes.rendering.mitsuba_scene import RenderScene
 
-        scene, both, either = self.scene, 0, 0
+        scene, both, either, weights = self.scene, 0, 0, self.weights_of(appearance)
         bare = RenderScene(scene.ray_scene.mi_scene, scene.mesh)
-        seen_by = [(trace_gbuffer(bare, camera), ~scene.underside(camera)) for camera in scene.cameras]
+        seen_by = [(trace_gbuffer(bare, camera), ~scene.underside(camera)) for camera in scene.cameras[:4]]
         for t in self.held_out:
             direction = torch.as_tensor(self.states[t].bodies[0][0])
             with torch.no_grad():
                 seen = appearance.visibility(torch.arange(len(self.albedo)), direction).numpy()
             for v, (gbuffer, above) in enumerate(seen_by):
                 sunny, facing = shadow_truth(scene, scene.ray_scene, gbuffer, self.states[t].bodies[0][0])
-                asked = facing & above & (self.weights[v].coverage > 0.5)
-                dark, true = (self.picture(v, seen[:, None])[..., 0] < 0.5)[asked], ~sunny[asked]
+                asked = facing & above & (weights[v].coverage > 0.5)
+                dark, true = (picture(weights[v], seen[:, None])[..., 0] < 0.5)[asked], ~sunny[asked]
                 both, either = both + int(np.sum(dark & true)), either + int(np.sum(dark | true))
         return both / max(either, 1)
 
@@ -347,6 +374,7 @@ def seasons(contest: Contest, appearance) -> dict[str, float]:
     true = {day: scene.albedo(day) for day in SPRING_DAYS}
     dated = np.stack([surfel_albedo(surfels, true[day]) for day in (SPRING_DAYS[0], SPRING_DAYS[2])])
     ground = attributes_at(surfels.means, surfels.normals, surfels.grid.spacing_m)
+    weights = contest.weights_of(appearance)
     result, held = {}, (appearance.albedo, appearance.neighbourhood_albedo)
     for number, day in enumerate(SPRING_DAYS):
         lights, _ = scene.lights(3, day=day)
@@ -362,8 +390,8 @@ def seasons(contest: Contest, appearance) -> dict[str, float]:
                 torch.as_tensor(around)[None],
             )
             values = [
-                psnr(contest.picture(0, colours_at(appearance, state)), picture, truth.solid)
-                for state, picture in zip(states, truth.pictures, strict=True)
+                psnr(picture(weights[0], colours_at(appearance, state)), seen, truth.solid)
+                for state, seen in zip(states, truth.pictures, strict=True)
             ]
             result[f"season_{('seen', 'unseen', 'seen2')[number]}{name}_psnr_db"] = float(np.mean(values))
     appearance.albedo, appearance.neighbourhood_albedo = held
@@ -378,6 +406,8 @@ def speed(contest: Contest, appearance) -> dict[str, float]:
     """
     from dataclasses import replace
 
+    import torch
+
     from seasonscapes.gaussians.appearance import colours_at
     from seasonscapes.gaussians.rasterise import rotations, splat_colours, view_weights
     from seasonscapes.gaussians.splat_view import SPLAT_LIMITS
@@ -389,9 +419,11 @@ def speed(contest: Contest, appearance) -> dict[str, float]:
     scene, surfels, t = contest.scene, contest.surfels, contest.held_out[0]
     camera = finer_camera(scene.cameras[0], scene.sizes.speed_px // scene.cameras[0].width_px)
     splats = front_facing_splats(surfels, camera)
+    if appearance.geometry is not None:
+        with torch.no_grad():
+            splats = appearance.geometry.splats(camera)
     axes = rotations(splats.quaternions) * splats.log_scales.exp()[:, None, :]
-    opacity = 1.0 / (1.0 + np.exp(-surfels.opacity_logits))
-    ready = upload_splats(surfels.means, axes.numpy(), opacity)
+    ready = upload_splats(splats.means.numpy(), axes.numpy(), torch.sigmoid(splats.opacity_logits).numpy())
     colours = colours_at(appearance, contest.states[t])
     moving = best(lambda: splat_layers(ready, colours, camera, SPLAT_LIMITS))
     in_torch = best(lambda: splat_colours(view_weights(splats, camera), colours))
@@ -449,7 +481,7 @@ def contact_sheet(contest: Contest, appearance, path: str) -> None:
     from seasonscapes.gaussians.appearance import colours_at
     from seasonscapes.images import srgb_from_linear
 
-    rows = []
+    rows, weights = [], contest.weights_of(appearance)
     order = sorted(contest.held_out, key=lambda t: contest.states[t].global_lx)[:: max(1, len(contest.held_out) // 4)][
         :4
     ]
@@ -457,8 +489,8 @@ def contact_sheet(contest: Contest, appearance, path: str) -> None:
         columns = []
         for t in order:
             truth = srgb_from_linear(contest.truth[v].pictures[t])
-            splats = srgb_from_linear(contest.picture(v, colours_at(appearance, contest.states[t])))
-            splats = splats * (contest.weights[v].coverage > 0.5)[..., None]
+            splats = srgb_from_linear(picture(weights[v], colours_at(appearance, contest.states[t])))
+            splats = splats * (weights[v].coverage > 0.5)[..., None]
             difference = np.clip(4.0 * np.abs(truth - splats), 0.0, 1.0)
             columns.append(np.concatenate([truth, splats, difference], axis=0))
         rows.append(np.concatenate(columns, axis=1))
@@ -469,7 +501,7 @@ def contact_sheet(contest: Contest, appearance, path: str) -> None:
 def packed_scores(contest: Contest, appearance) -> dict[str, float]:
     """Bytes for each Gaussian on disk, and what packing costs in PSNR."""
     from seasonscapes.gaussians.model import bytes_per_gaussian, model_from, pack_model, unpack_model
-    from seasonscapes.gaussians.splat_view import appearance_of, learned_parameters
+    from seasonscapes.gaussians.splat_view import appearance_of, learned_parameters, splats_of
 
     model = model_from(
         contest.surfels,
@@ -479,7 +511,9 @@ def packed_scores(contest: Contest, appearance) -> dict[str, float]:
         learned_parameters(appearance),
         frame=contest.scene.frame,
     )
-    again = contest.score(appearance_of(unpack_model(*pack_model(model))))
+    read = unpack_model(*pack_model(model))
+    weights = contest.views(lambda camera: splats_of(read, viewpoint_m=camera.position_m), JUDGED)
+    again = contest.score(appearance_of(read), weights=weights)
     return {"bytes_per_gaussian": bytes_per_gaussian(model), "packed_held_out_hour_psnr_db": again[0]}
 
 

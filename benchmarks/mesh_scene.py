@@ -6,7 +6,7 @@ by Mitsuba's own integrator over Mitsuba's own meshes and materials; the ground 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -202,7 +202,9 @@ def path_traced_textures(
 
     from seasonscapes.rendering.mitsuba_scene import mi_luminary, mi_sky
 
-    members: dict = {"type": "scene", "sky": mi_sky(light.sky_radiance), "sun": mi_luminary(light.sun)}
+    members: dict = {"type": "scene", "sky": mi_sky(light.sky_radiance)}
+    if light.sun is not None:
+        members["sun"] = mi_luminary(light.sun)
     for part in parts:
         members[part.name] = _own_mesh(part, turn)
     size = mi.ScalarTransform4f().scale([400.0, 400.0, 1.0])
@@ -270,6 +272,64 @@ def eight_bit(radiance: list[np.ndarray], unit: np.ndarray) -> list[np.ndarray]:
     return pictures
 
 
+def photographed(radiance: list[np.ndarray], light: Illumination) -> list[np.ndarray]:
+    """The textures of a camera that balances white for the hour, and exposes half a per cent to white."""
+    level = light.global_horizontal_lx / np.pi
+    unit = level * np.nanpercentile(np.concatenate([(values / level).ravel() for values in radiance]), 99.5)
+    return eight_bit(radiance, unit)
+
+
+def mesh_suns(seed: int, folder: Path, *, scenes: int, texels: int = 96, spp: int = 64) -> dict[str, float]:
+    """Suns of meshes of unknown hour: random rocks, days and hours; every third mesh stands under an even, overcast sky.
+
+    Returns
+    -------
+    dict
+        ``mesh_sun_found_rate`` (within 5° of azimuth and 4° of elevation), ``mesh_sun_wrong_trusted``, and
+        ``mesh_overcast_trusted`` of ``mesh_overcast`` meshes without a sun.
+    """
+    import seasonscapes as ss
+    from seasonscapes.rendering.backend import use_backend
+    from seasonscapes.workflows.mesh_sun import mesh_sun
+    from seasonscapes.workflows.meshes import mesh_light, mesh_transport
+
+    use_backend()
+    rng = np.random.default_rng(seed)
+    around = ss.MeshSurroundings(sky="hosek", rays=64)
+    placing = ss.MeshPlacing(up="y", crs=CRS, offset=OFFSET)
+    source = folder / "unknown_hour.glb"
+    found = wrong = overcast = overcast_trusted = 0
+    for number in range(scenes):
+        scene = int(rng.integers(1, 100_000))
+        parts = make_parts(scene, texels=texels)
+        write_parts(source, parts, [part.albedo for part in parts])
+        blank = ss.load_mesh(source, placing)
+        turn = blank.turn @ np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+        hour = f"2024-{rng.integers(3, 10):02d}-15T{rng.integers(6, 16):02d}:{rng.integers(0, 60):02d}Z"
+        light = mesh_light(blank, hour, around)[0]
+        sun = light.sun
+        assert sun is not None
+        if number % 3 == 2:
+            even = np.broadcast_to(light.sky_radiance.mean(axis=(0, 1)), light.sky_radiance.shape)
+            light = replace(light, sky_radiance=even.astype(np.float32), sun=None)
+        write_parts(source, parts, photographed(path_traced_textures(parts, light, turn, spp=spp, seed=scene), light))
+        mesh = ss.load_mesh(source, placing)
+        result = mesh_sun(mesh, mesh_transport(mesh, around), latitude_deg=mesh.frame.latitude_deg)
+        if light.sun is None:
+            overcast, overcast_trusted = overcast + 1, overcast_trusted + result.trusted
+            continue
+        off = abs((result.azimuth_deg - sun.azimuth_deg + 180.0) % 360.0 - 180.0)
+        good = off <= 5.0 and abs(result.elevation_deg - sun.elevation_deg) <= 4.0
+        found, wrong = found + good, wrong + (result.trusted and not good)
+    return {
+        "mesh_sun_scenes": scenes - overcast,
+        "mesh_sun_found_rate": found / (scenes - overcast),
+        "mesh_sun_wrong_trusted": float(wrong),
+        "mesh_overcast": overcast,
+        "mesh_overcast_trusted": float(overcast_trusted),
+    }
+
+
 def mesh_relit(seed: int, folder: Path, *, texels: int = 192, spp: int = 256, rays: int = 256) -> dict[str, float]:
     """Lit at one hour → delit → relit at two others: PSNR [dB] of sRGB textures against the truth, texels on the surface.
 
@@ -295,10 +355,7 @@ def mesh_relit(seed: int, folder: Path, *, texels: int = 192, spp: int = 256, ra
     taken, others = "2024-07-20T10:30Z", ("2024-07-20T06:30Z", "2024-07-20T15:30Z")
     lights = {time: mesh_light(blank, time, around)[0] for time in (taken, *others)}
     truth = {time: path_traced_textures(parts, light, turn, spp=spp, seed=seed) for time, light in lights.items()}
-    # A camera that balances white for the hour, and exposes half a per cent to white.
-    level = lights[taken].global_horizontal_lx / np.pi
-    unit = level * np.nanpercentile(np.concatenate([(t / level).ravel() for t in truth[taken]]), 99.5)
-    lit = eight_bit(truth[taken], unit)
+    lit = photographed(truth[taken], lights[taken])
     write_parts(source, parts, lit)
     mesh = ss.load_mesh(source, placing)
     transport = mesh_transport(mesh, around)

@@ -75,7 +75,7 @@ _MODULES = {
     "camera_hours": "workflows.unseen_hours",
     "CameraHours": "workflows.unseen_hours",
     # meshes
-    "load_mesh": "workflows.meshes",
+    "load_mesh": "workflows.mesh_loading",
     "MeshPlacing": "terrain.mesh_placing",
     "MeshSurroundings": "workflows.meshes",
     "delight_mesh": "workflows.meshes",

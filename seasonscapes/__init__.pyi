@@ -34,11 +34,11 @@ from seasonscapes.workflows.gaussian_views import render_gaussians as render_gau
 from seasonscapes.workflows.illumination import illumination as illumination
 from seasonscapes.workflows.illumination import sky_model as sky_model
 from seasonscapes.workflows.illumination import sun_moon_position as sun_moon_position
+from seasonscapes.workflows.mesh_loading import load_mesh as load_mesh
 from seasonscapes.workflows.mesh_views import render_mesh as render_mesh
 from seasonscapes.workflows.meshes import MeshSurroundings as MeshSurroundings
 from seasonscapes.workflows.meshes import delight_mesh as delight_mesh
 from seasonscapes.workflows.meshes import light_mesh as light_mesh
-from seasonscapes.workflows.meshes import load_mesh as load_mesh
 from seasonscapes.workflows.painting import paint as paint
 from seasonscapes.workflows.photograph_files import open_photographs as open_photographs
 from seasonscapes.workflows.pictures import develop as develop

@@ -34,7 +34,16 @@ SATURATION_LUMINANCE = 1.2
 _STEM_CHARACTERS = 24
 _notes: list[Callable[[Path], None]] = []
 # Luminance weights of linear Rec.709 (ITU-R BT.709): Y = w · rgb. In photometric RGB, Y is in lux or cd/m².
-REC709_LUMINANCE = np.array([0.2126390, 0.7151687, 0.0721923])
+# Linear Rec.709 with D65 white to CIE XYZ (ITU-R BT.709-6), as colour-science derives it from the primaries; that package
+# takes seconds to import.
+XYZ_FROM_REC709 = np.array(
+    [
+        [0.4123907992659595, 0.3575843393838780, 0.1804807884018343],
+        [0.2126390058715104, 0.7151686787677559, 0.0721923153607337],
+        [0.0193308187155918, 0.1191947797946259, 0.9505321522496608],
+    ]
+)
+REC709_LUMINANCE = XYZ_FROM_REC709[1]
 
 
 @contextmanager

@@ -9,18 +9,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from seasonscapes.images import REC709_LUMINANCE
+from seasonscapes.images import REC709_LUMINANCE, XYZ_FROM_REC709
 
 # CIE daylight of 5,500 K in linear Rec.709, the balance of daylight film.
-DAYLIGHT_RGB = (1.118, 0.982, 0.818)
+DAYLIGHT_RGB = (1.1038901, 0.9870861, 0.8219280)
 # The camera's balance follows the sun's colour this far only: a low sun stays warm in the picture.
 _MOST_RED, _LEAST_BLUE = 1.14, 0.86
 # Linear Rec.709 to the cone responses of Bradford's chromatic adaptation (Lindbloom; ICC.1:2022, annex E).
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
-_XYZ = np.array(
-    [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
-)
-_CONES = _BRADFORD @ _XYZ
+_CONES = _BRADFORD @ XYZ_FROM_REC709
 # Highlights: this percentile of the exposed luminance is moved towards this value, by at most these stops.
 _HIGHLIGHT_PERCENTILE, _HIGHLIGHT, _STOPS = 97.0, 0.8, (-0.3, 0.9)
 # Below this EV the picture is a night's, which stays dark.

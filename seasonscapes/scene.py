@@ -20,7 +20,7 @@ from seasonscapes.civil_time import parse_time_text
 from seasonscapes.declaration import MOST_NAME_CHARACTERS, Declaration, InputError, Name, Text, read_declaration
 from seasonscapes.frames import STANDARD_REFRACTION_K, Latitude, LocalFrame, Longitude
 from seasonscapes.terrain.raster_files import OWN_FOLDER, Confinement, confined_path, rasters_hash
-from seasonscapes.terrain.surface_tables import SnowTable, WaterTable
+from seasonscapes.terrain.surface_tables import ForestTable, SnowTable, WaterTable
 from seasonscapes.terrain.tile_files import named_tiles
 
 log = logging.getLogger(__name__)
@@ -361,6 +361,7 @@ class SceneFile(Declaration):
     images: list[Imagery] = Field(default_factory=list, alias="imagery", max_length=100)
     water: WaterTable | None = None
     snow: SnowTable | None = None
+    forest: ForestTable | None = None
     cameras: list[NamedCamera] = Field(default_factory=list, alias="camera")
     webcams: list[Webcam] = Field(default_factory=list, alias="webcam")
     _confinement: Confinement = PrivateAttr(default=OWN_FOLDER)

@@ -280,27 +280,39 @@ def test_lpips_weights_are_plain_tensors(tmp_path, kind):
     import pickle
 
     torch = pytest.importorskip("torch")
-    from seasonscapes.evaluation.lpips import WEIGHTS, load_lpips
+    from seasonscapes.evaluation.lpips import join_lpips, load_lpips
 
-    ran = tmp_path / "ran"
+    ran, path = tmp_path / "ran", tmp_path / "alexnet.pth"
 
     class Evil:
         def __reduce__(self):
             return (Path.touch, (ran,))
 
-    for name in WEIGHTS:
-        path = tmp_path / name
-        torch.save({"a": torch.zeros(64)}, path)
-        if kind == "pickle":
-            path.write_bytes(pickle.dumps(Evil()))
-        elif kind == "torch":
-            torch.save(Evil(), path)
-        elif kind != "other":
-            {"cut": cut, "text": text, "empty": empty}[kind](path)
-    with pytest.raises(InputError) as error:
-        load_lpips(tmp_path)
-    assert "\n" not in str(error.value)
+    torch.save({"a": torch.zeros(64)}, path)
+    if kind == "pickle":
+        path.write_bytes(pickle.dumps(Evil()))
+    elif kind == "torch":
+        torch.save(Evil(), path)
+    elif kind != "other":
+        {"cut": cut, "text": text, "empty": empty}[kind](path)
+    for read in (lambda: join_lpips(path, path, tmp_path / "l.safetensors"), lambda: load_lpips(path)):
+        with pytest.raises(InputError) as error:
+            read()
+        assert "\n" not in str(error.value)
     assert not ran.exists()
+    assert not (tmp_path / "l.safetensors").exists()
+
+
+def test_lpips_weights_that_have_changed_are_refused(tmp_path):
+    pytest.importorskip("torch")
+    from tiny_diffusion import random_lpips, write_lpips_parts
+
+    from seasonscapes.evaluation.lpips import join_lpips, load_lpips
+
+    join_lpips(*write_lpips_parts(tmp_path, *random_lpips())[:2], tmp_path / "l.safetensors")
+    flipped(tmp_path / "l.safetensors")
+    with pytest.raises(InputError, match=r"l\.safetensors: damaged"):
+        load_lpips(tmp_path / "l.safetensors")
 
 
 def test_a_model_of_gaussians_is_compared_with_what_was_written(tmp_path):

@@ -2,10 +2,13 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
+import tomllib
+from pathlib import Path
 
 import numpy as np
 import places
@@ -165,7 +168,7 @@ def test_doctor_never_crashes(capsys, monkeypatch):
 
 def extras_at_hand(folder, **sources):
     """Environment with modules of the extras that are quick to import: empty ones, or of the given sources."""
-    for module in ("torch", "diffusers", "distributed", "pxr"):
+    for module in ("torch", "gsplat", "diffusers", "distributed", "pystac_client", "pxr"):
         (folder / f"{module}.py").write_text(sources.get(module, ""))
     return {"PYTHONPATH": os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")])}
 
@@ -198,6 +201,17 @@ def test_an_extra_that_is_there_but_broken_is_no_extra(tmp_path):
     record = json.loads(done.stdout)
     assert [name for name, there in record["extras"].items() if not there] == ["gaussians"]
     assert record["extras_faults"] == {"gaussians": "BROKEN (ImportError: libgomp.so.1: no such file)"}
+
+
+def test_extras_are_those_of_the_page_and_of_doctor(tmp_path):
+    root = Path(__file__).parents[1]
+    extras = tomllib.loads((root / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    page = re.findall(r"^\| `([a-z]+)` \| ", (root / "docs" / "start" / "install.md").read_text(), re.MULTILINE)
+    assert sorted(set(page) - {"cuda", "llvm", "scalar"}) == sorted(extras)
+    environment = {**os.environ, **extras_at_hand(tmp_path)}
+    command = [sys.executable, "-m", "seasonscapes", "doctor", "--json"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert sorted([*json.loads(done.stdout)["extras"], "dev"]) == sorted(extras)
 
 
 def test_a_fall_back_to_the_scalar_variant_says_why(tmp_path):

@@ -341,6 +341,7 @@ def test_inpaint_writes_a_texture_and_figures(hill, tmp_path, capsys):
     np.testing.assert_array_equal(done.weight, texture.weight)
     assert record["filled_share"] == pytest.approx(np.mean(~seen), abs=0.02)
     assert {"satellite_1", "sun", "insolation"} <= set(record["guides"])
+    assert record["method"] == "guided"
     assert sorted(p.name for p in (tmp_path / "fig").iterdir()) == [
         "hill_south_after.png",
         "hill_south_before.png",
@@ -351,6 +352,15 @@ def test_inpaint_writes_a_texture_and_figures(hill, tmp_path, capsys):
     # West is reddish on the map, and stays so in the hole.
     assert done.values[40, 15, 0] > 1.5 * done.values[40, 15, 1]
     assert done.values[40, 65, 0] == pytest.approx(done.values[40, 65, 1], rel=0.1)
+
+
+@pytest.mark.parametrize("method", ["membrane", "telea"])
+def test_a_method_that_asks_no_guide_records_none(hill, tmp_path, capsys, method):
+    path, _ = hill
+    files = {"texture": tmp_path / "painted.npz", "output": tmp_path / "done.npz"}
+    command("inpaint", path, time="2024-09-01T10:00", method=method, json=True, **files)
+    record = json.loads(capsys.readouterr().out)
+    assert (record["method"], record["guides"]) == (method, [])
 
 
 def test_inpaint_says_what_is_wrong(hill, tmp_path):

@@ -690,6 +690,19 @@ def test_hybrid_and_ablations_end_to_end(run, hill, tmp_path, capsys):
     np.testing.assert_array_equal(done.values[seen], hill[1].values[seen])
 
 
+def test_without_paint_the_model_paints_everything_it_sees(run, hill, tmp_path, capsys):
+    run(tmp_path / "bare.npz", without="paint")
+    record = json.loads(capsys.readouterr().out)
+    assert record["without"] == ["paint"]
+    assert record["coverage"][0] == 0.0
+    assert record["coverage"][-1] > 0.1
+    done = load_texture(tmp_path / "bare.npz")
+    assert not done.weight.any()
+    assert np.isfinite(done.values).all()
+    seen = hill[1].weight > 0.0
+    assert np.abs(done.values[seen] - hill[1].values[seen]).mean() > 0.05 * hill[1].values[seen].mean()
+
+
 def test_the_verb_says_what_is_wrong(run, tmp_path):
     for flags, words in (
         ({"path": None}, "--path: missing"),
@@ -698,7 +711,8 @@ def test_the_verb_says_what_is_wrong(run, tmp_path):
         ({"weights": tmp_path}, "the base weights .* are missing"),
         ({"guide_image": tmp_path / "none.jpg"}, "--guide-image"),
         ({"mask": "xor"}, "coverage or hsv"),
-        ({"without": "prompt,sky"}, "of prompt, depth, mask, image"),
+        ({"without": "prompt,sky"}, "of prompt, depth, mask, image, paint"),
+        ({"without": "paint", "hybrid": True}, "--hybrid: of no use with --without paint"),
         ({"steps": 0}, "--steps"),
         ({"strength": 0.1}, "--strength"),
         ({"film": tmp_path / "a.gif"}, "mp4"),

@@ -9,6 +9,7 @@ from command_line import command
 
 from seasonscapes.errors import InputError
 from seasonscapes.evaluation.figures import comparison_figure, error_colours, steepest_window
+from seasonscapes.evaluation.masks import reference_mask
 from seasonscapes.evaluation.metrics import psnr_db
 from seasonscapes.evaluation.picture_pairs import matching_gain
 from seasonscapes.images import read_image_linear, srgb_from_linear, write_exr, write_png8
@@ -88,6 +89,10 @@ def test_radiance_is_developed_alike_and_masked_by_depth(tmp_path, capsys):
     plain = record_of(capsys)["pictures"][0]
     command("evaluate", truth=tmp_path / "truth.exr", pictures=tmp_path / "made.exr", match="gain", json=True)
     matched = record_of(capsys)["pictures"][0]
+    command("evaluate", truth=tmp_path / "truth.exr", pictures=tmp_path / "made.exr", mode="paper", json=True)
+    assert record_of(capsys)["pictures"][0]["mask_share"] == pytest.approx(reference_mask(depth).mean())
+    command("evaluate", truth=tmp_path / "truth.exr", pictures=tmp_path / "made.exr", near_m=10.0, json=True)
+    assert record_of(capsys)["pictures"][0]["mask_share"] == pytest.approx((HEIGHT - 8) / HEIGHT)
     assert plain["mask_share"] == pytest.approx((HEIGHT - 16) / HEIGHT)
     assert plain["psnr_db"] < 25.0 < 40.0 < matched["psnr_db"]
     encoded = srgb_from_linear(np.clip(truth.reshape(-1, 3) / 8000.0, 0.0, 1.0))
@@ -126,7 +131,15 @@ def test_errors_of_the_user(folders):
         ({"truth": truth, "pictures": made / "a.png"}, "a file and a folder"),
         ({"truth": truth, "pictures": made, "mode": "kind"}, "--mode"),
         ({"truth": truth, "pictures": made, "match": "all"}, "--match"),
-        ({"truth": truth, "pictures": made, "far_m": 10.0}, "--far-m"),
+        ({"truth": truth, "pictures": made, "far_m": 10.0}, "--far-m: not beyond"),
+        (
+            {"truth": truth / "a.png", "pictures": made / "a.png", "near_m": 10.0},
+            "--near-m: does nothing without a truth",
+        ),
+        (
+            {"truth": truth, "pictures": made, "mode": "paper", "far_m": 900.0},
+            "--far-m: does nothing without --mode valid",
+        ),
         ({"truth": truth, "pictures": made, "table": folders / "t.xls"}, "--table"),
         ({"truth": truth / "a.png", "pictures": made / "a.png", "lpips": folders}, "--lpips"),
         ({"truth": truth / "a.png", "pictures": made / "a.png", "mask": folders / "m.png"}, "--mask"),
@@ -171,3 +184,33 @@ def test_steepest_window_finds_the_cliff():
     assert (width, height) == (30, 20)
     assert left <= 60 < 80 <= left + width
     assert top <= 35 < 50 <= top + height
+
+
+def test_lpips_from_its_two_published_parts(folders, capsys, monkeypatch):
+    """The verb `lpips` joins them, `evaluate` reads the file and says that these are not the published weights."""
+    pytest.importorskip("torch")
+    from tiny_diffusion import random_lpips, write_lpips_parts
+
+    from seasonscapes.cli import main
+    from seasonscapes.evaluation.lpips import lpips_of
+
+    network, linear = random_lpips()
+    alexnet, wheel, _ = write_lpips_parts(folders, network, linear)
+    file = folders / "l.safetensors"
+    assert main(["lpips", str(alexnet), str(wheel), "-o", str(file), "--json"]) == 0
+    told = capsys.readouterr()
+    assert not json.loads(told.out)["published"]
+    assert f"not the published weights: {alexnet} and {wheel}" in told.err
+    pictures = {"truth": folders / "truth", "pictures": folders / "made", "json": True}
+    command("evaluate", **pictures, lpips=file)
+    told = capsys.readouterr()
+    record = json.loads(told.out)
+    assert "by other weights than the published ones" in told.err
+    assert record["lpips_weights"]["published"] is False
+    images = levels(0) / 255.0, (levels(0) + 10) / 255.0
+    assert record["pictures"][0]["lpips"] == pytest.approx(lpips_of(network, linear)(*images, None), rel=1e-4)
+    monkeypatch.setenv("SEASONSCAPES_LPIPS", str(file))
+    command("evaluate", **pictures)
+    assert record_of(capsys)["pictures"] == record["pictures"]
+    assert main(["lpips", str(wheel), str(wheel), "-o", str(folders / "other.safetensors")]) == 2
+    assert "10 of 10 keys are missing" in capsys.readouterr().err

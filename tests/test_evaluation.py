@@ -1,18 +1,29 @@
 """Metrics against closed forms, published values and scikit-image; splits that leak are refused."""
 
+import hashlib
 from datetime import UTC, datetime, timedelta, timezone
 
 import numpy as np
 import pytest
+from tiny_diffusion import random_lpips, write_lpips_parts
 
 from seasonscapes.cameras.observation import Observation
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.errors import InputError
-from seasonscapes.evaluation.lpips import load_lpips, lpips_of, missing_lpips
+from seasonscapes.evaluation.lpips import (
+    NETWORK_URL,
+    PUBLISHED,
+    join_lpips,
+    load_lpips,
+    lpips_of,
+    lpips_sources,
+    missing_lpips,
+)
 from seasonscapes.evaluation.masks import reference_mask, terrain_mask
 from seasonscapes.evaluation.metrics import (
     angle_deg,
     colour_angle_deg,
+    delta_e2000,
     flip,
     flip_map,
     psnr_db,
@@ -168,28 +179,95 @@ def test_score_refuses_what_is_no_picture(pair, mask):
         psnr_db(truth, picture, mode="flattering")
 
 
+def test_colour_difference_of_greys_in_closed_form():
+    """Between neutral colours CIEDE2000 is the difference of lightness over its weight S_L."""
+    from seasonscapes.images import srgb_from_linear
+
+    def lightness(y):
+        return 116.0 * np.cbrt(y) - 16.0
+
+    for one, other in ((0.18, 0.30), (0.5, 0.55)):
+        pictures = [np.full((12, 12, 3), srgb_from_linear(np.array(y))) for y in (one, other)]
+        middle = (lightness(one) + lightness(other)) / 2.0 - 50.0
+        weight = 1.0 + 0.015 * middle**2 / np.sqrt(20.0 + middle**2)
+        expected = abs(lightness(one) - lightness(other)) / weight
+        assert delta_e2000(*pictures) == pytest.approx(expected, rel=1e-3)
+        assert score(*pictures, colour_difference=True).delta_e2000 == pytest.approx(expected, rel=1e-3)
+    black, white = np.zeros((12, 12, 3)), np.ones((12, 12, 3))
+    assert delta_e2000(black, white) == pytest.approx(100.0, abs=0.01)
+    half = np.arange(12)[:, None] < np.full(12, 6)
+    assert delta_e2000(black, np.where(half[..., None], white, black), ~half) == 0.0
+    assert score(black, white).delta_e2000 is None
+
+
 # ---------------------------------------------------------------------------------------------- LPIPS
 
 
-def random_weights():
+def lpips_by_modules(network, linear):
+    """LPIPS written independently with modules of torch: AlexNet's layers as published, taken after each ReLU."""
     import torch
+    from torch import nn
 
-    generator = torch.Generator().manual_seed(7)
-    shapes = {0: (64, 3, 11, 11), 3: (192, 64, 5, 5), 6: (384, 192, 3, 3), 8: (256, 384, 3, 3), 10: (256, 256, 3, 3)}
-    network = {}
-    for n, shape in shapes.items():
-        network[f"features.{n}.weight"] = torch.randn(shape, generator=generator) * (2.0 / np.prod(shape[1:])) ** 0.5
-        network[f"features.{n}.bias"] = 0.1 * torch.randn(shape[0], generator=generator)
-    linear = {
-        f"lin{i}.model.1.weight": torch.rand((1, shape[0], 1, 1), generator=generator)
-        for i, shape in enumerate(shapes.values())
-    }
-    return network, linear
+    features = nn.Sequential(
+        nn.Conv2d(3, 64, kernel_size=11, stride=4, padding=2),
+        nn.ReLU(),
+        nn.MaxPool2d(kernel_size=3, stride=2),
+        nn.Conv2d(64, 192, kernel_size=5, padding=2),
+        nn.ReLU(),
+        nn.MaxPool2d(kernel_size=3, stride=2),
+        nn.Conv2d(192, 384, kernel_size=3, padding=1),
+        nn.ReLU(),
+        nn.Conv2d(384, 256, kernel_size=3, padding=1),
+        nn.ReLU(),
+        nn.Conv2d(256, 256, kernel_size=3, padding=1),
+        nn.ReLU(),
+    )
+    features.load_state_dict({key.removeprefix("features."): value for key, value in network.items()})
+    linears = [nn.Conv2d(value.shape[1], 1, 1, bias=False) for value in linear.values()]
+    for layer, value in zip(linears, linear.values(), strict=True):
+        layer.load_state_dict({"weight": value})
+
+    def outputs(image):
+        x = 2.0 * torch.tensor(image, dtype=torch.float32).permute(2, 0, 1)[None] - 1.0
+        shift, scale = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
+        x = (x - shift[None, :, None, None]) / scale[None, :, None, None]
+        found = []
+        for number, layer in enumerate(features):
+            x = layer(x)
+            if number in (1, 4, 7, 9, 11):
+                found.append(x / (torch.sqrt(torch.sum(x**2, dim=1, keepdim=True)) + 1e-10))
+        return found
+
+    def measure(truth, picture):
+        with torch.no_grad():
+            layers = zip(outputs(truth), outputs(picture), linears, strict=True)
+            return sum(float(linear((a - b) ** 2).mean()) for a, b, linear in layers)
+
+    return measure
+
+
+def test_lpips_equals_modules_of_torch(pair):
+    weights = random_lpips()
+    truth, picture = pair
+    expected = lpips_by_modules(*weights)(truth, picture)
+    assert expected > 0.01
+    assert lpips_of(*weights)(truth, picture) == pytest.approx(expected, rel=1e-5)
+
+
+def test_lpips_in_mode_paper_sees_pictures_from_0_to_1(pair):
+    """The reference evaluation does not map them to [-1, 1] first; masked pixels are black."""
+    measure = lpips_of(*random_lpips())
+    truth, picture = pair
+    mask = np.ones(truth.shape[:2], bool)
+    mask[:10] = False
+    by_hand = measure(*(0.5 + 0.5 * image * mask[..., None] for image in (truth, picture)))
+    assert score(truth, picture, mask, mode="paper", lpips=measure).lpips == pytest.approx(by_hand, rel=1e-6)
+    assert score(truth, picture, mask, lpips=measure).lpips != pytest.approx(by_hand, rel=1e-2)
 
 
 def test_lpips_behaves_as_a_distance(pair):
     """With random weights: zero for equal pictures, symmetric, growing, and blind beyond the mask."""
-    measure = lpips_of(*random_weights())
+    measure = lpips_of(*random_lpips())
     truth, picture = pair
     assert measure(truth, truth) == 0.0
     assert measure(truth, picture) == pytest.approx(measure(picture, truth), rel=1e-5)
@@ -201,7 +279,7 @@ def test_lpips_behaves_as_a_distance(pair):
 
 def test_lpips_first_layer_by_hand():
     """With only the first layer's linear weights: the formula of the paper, eq. 1, on patches written out in numpy."""
-    network, linear = random_weights()
+    network, linear = random_lpips()
     for i in range(1, 5):
         linear[f"lin{i}.model.1.weight"] *= 0.0
     rng = np.random.default_rng(5)
@@ -226,29 +304,58 @@ def test_lpips_first_layer_by_hand():
 def test_lpips_says_why_it_is_absent(tmp_path, monkeypatch):
     monkeypatch.delenv("SEASONSCAPES_LPIPS", raising=False)
     assert "SEASONSCAPES_LPIPS" in missing_lpips()
-    assert "alexnet.pth" in missing_lpips(tmp_path)
+    assert "no such file" in missing_lpips(tmp_path / "none.safetensors")
     with pytest.raises(ValueError, match=r"features\.0"):
         lpips_of({}, {})
+
+
+def test_lpips_parts_are_joined_and_give_the_same(tmp_path, pair):
+    network, linear = random_lpips()
+    alexnet, wheel, content = write_lpips_parts(tmp_path, network, linear)
+    found = join_lpips(alexnet, wheel, tmp_path / "a.safetensors")
+    assert found["linear_sha256"] == hashlib.sha256(content).hexdigest()
+    assert lpips_sources(tmp_path / "a.safetensors") == {**found, "published": False}
+    expected = lpips_of(network, linear)(*pair, None)
+    assert load_lpips(tmp_path / "a.safetensors")(*pair, None) == expected
+    (tmp_path / "alex.pth").write_bytes(content)
+    assert join_lpips(alexnet, tmp_path / "alex.pth", tmp_path / "b.safetensors") == found
+    assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
+    # A tenth of the whole network's size: only the convolutions are kept.
+    assert (tmp_path / "a.safetensors").stat().st_size == pytest.approx(4 * (2_469_696 + 1152), abs=3000)
+
+
+def test_published_weights_are_known_by_their_checksums():
+    assert PUBLISHED["alexnet_sha256"].startswith("7be5be79")
+    assert NETWORK_URL.endswith(f"-{PUBLISHED['alexnet_sha256'][:8]}.pth")
 
 
 def test_lpips_names_the_file_that_holds_other_weights(tmp_path):
     import torch
 
-    network, linear = random_weights()
+    network, linear = random_lpips()
+    alexnet, wheel, _ = write_lpips_parts(tmp_path, network, linear)
+    output = tmp_path / "l.safetensors"
     for other in ({}, [1.0]):
-        torch.save(network, tmp_path / "alexnet.pth")
-        torch.save(other, tmp_path / "lpips_alex.pth")
-        with pytest.raises(InputError, match=r"lpips_alex\.pth: .* 5 of 5 keys are missing; expected the key lin0"):
-            load_lpips(tmp_path)
-    torch.save(linear, tmp_path / "lpips_alex.pth")
-    picture = np.random.default_rng(0).random((40, 40, 3))
-    assert load_lpips(tmp_path)(picture, 0.5 * picture) == lpips_of(network, linear)(picture, 0.5 * picture)
+        torch.save(other, tmp_path / "other.pth")
+        with pytest.raises(InputError, match=r"other\.pth: .* 5 of 5 keys are missing; expected the key lin0"):
+            join_lpips(alexnet, tmp_path / "other.pth", output)
+    # The weights for VGG have the same names.
+    torch.save(linear | {"lin0.model.1.weight": torch.zeros(1, 128, 1, 1)}, tmp_path / "vgg.pth")
+    with pytest.raises(InputError, match=r"vgg\.pth: .*lin0.* has another shape; got \(1, 128, 1, 1\)"):
+        join_lpips(alexnet, tmp_path / "vgg.pth", output)
+    with pytest.raises(InputError, match=r"7be5be79\.pth: .* 5 of 5 keys are missing"):
+        join_lpips(alexnet, alexnet, output)
+    with pytest.raises(InputError, match=r"none\.pth: no such file"):
+        join_lpips(tmp_path / "none.pth", wheel, output)
     del network["features.3.bias"]
-    torch.save(network, tmp_path / "alexnet.pth")
-    with pytest.raises(
-        InputError, match=r"alexnet\.pth: .* 1 of 10 keys are missing; expected the key features\.3\.bias"
-    ):
-        load_lpips(tmp_path)
+    torch.save(network, alexnet)
+    with pytest.raises(InputError, match=r"1 of 10 keys are missing; expected the key features\.3\.bias"):
+        join_lpips(alexnet, wheel, output)
+    wheel.write_bytes(wheel.read_bytes()[:200])
+    torch.save(random_lpips()[0], alexnet)
+    with pytest.raises(InputError, match=r"\.whl: damaged"):
+        join_lpips(alexnet, wheel, output)
+    assert not output.exists()
 
 
 # ---------------------------------------------------------------------------------------------- masks

@@ -26,7 +26,18 @@ _DIFFUSION = (
     *("--hybrid", "--strength", "--steps", "--guidance", "--without", "--mask", "--dilate-px", "--least-hole"),
     *("--paint-sky", "--frames", "--film", "--fps", "--device", "--dtype", "--offload"),
 )
-_RELIT = ("--suns", "--dates", "--views", "--view-px", "--picture-steps", "--kind", "--export-views", "--albedo", *_SKY)
+_RELIT = (
+    "--suns",
+    "--dates",
+    "--views",
+    "--view-px",
+    "--picture-steps",
+    "--kind",
+    "--refine-discs",
+    "--export-views",
+    "--albedo",
+    *_SKY,
+)
 _LEARNED = ["--appearance", "paper", "--frames", "."]
 
 # Of each verb: arguments that would do; flags that always do something; and flags that are refused, beside which others.
@@ -153,9 +164,19 @@ VERBS: dict[str, tuple[list[str], set[str], dict[str, list[str]]]] = {
         | {"--most-pixels", "--doubtful-poses", "--output"},
         _NO_BOUND,
     ),
+    "evaluate": (
+        ["--truth", "t.png", "--pictures", "p.png"],
+        {"--truth", "--pictures", "--mask", "--mode", "--match", "--used", "--lpips", "--table", "--figures"},
+        # Beside truths without depth too, for which `evaluate`'s own tests have files.
+        _each(("--near-m", "--far-m"), ["--mode", "paper"]),
+    ),
+    "demo": ([], {"--output", "--camera", "--size", "--gallery", "--device", "--workspace"}, {}),
+    "lpips": (["a.pth", "l.whl"], {"--output"}, {}),
+    "info": (["a.png"], {"--artefact"}, {}),
+    "doctor": ([], set(), {}),
 }  # fmt: skip
-# Verbs without terrain or with checks of their own (tests of `fetch`, `webcams`, `calibrate` and `evaluate`).
-OTHERS = {"fetch", "webcams", "calibrate", "annotate", "evaluate", "info", "demo", "doctor"}
+# Verbs with checks of their own (tests of `fetch`, `webcams` and `calibrate`).
+OTHERS = {"fetch", "webcams", "calibrate", "annotate"}
 _VALUES = {
     "--season": "nearest",
     "--within-min": "3",

@@ -18,7 +18,7 @@ from trimesh.visual.texture import TextureVisuals
 
 import seasonscapes as ss
 from seasonscapes.cli import main
-from seasonscapes.errors import InputError
+from seasonscapes.errors import InputError, NotEnoughEvidence
 from seasonscapes.frames import enu_from_geodetic
 from seasonscapes.images import linear_from_srgb, srgb_from_linear
 from seasonscapes.terrain.crs import geodetic_from_map
@@ -701,7 +701,7 @@ class TestCommands:
             (["relight", "boxes.glb", "--sun", "100,40", "--turntable", "3"], "--output: unknown kind of file"),
             (["relight", "boxes.glb", "--sun", "100,40", "-o", "x.obj"], "x.obj: this mesh cannot be written so"),
             (["delight", "boxes.glb", "--sun", "100,40", "-o", "boxes.glb"], "would replace a file of the mesh itself"),
-            (["delight", "boxes.glb", "--time", "unknown", "-o", "x.glb"], "the sun of a mesh is not searched for"),
+            (["delight", "boxes.glb", "--time", "unknown", "-o", "x.glb"], "boxes.glb: its sun cannot be told"),
             (
                 ["delight", "boxes.glb", "--sun", "1,40", "--image", "x.tif", "-o", "x.glb"],
                 "flags of scenes beside a mesh",
@@ -729,6 +729,22 @@ def test_lit_delit_relit_against_an_independent_path_tracer(tmp_path):
     assert scores["mesh_uv_equal"] == 1.0
     assert scores["mesh_relit_psnr_db"] > 26.0
     assert scores["mesh_relit_psnr_db"] > scores["mesh_as_lit_psnr_db"] + 6.0
+
+
+def test_suns_of_unknown_hours_are_found_and_overcast_ones_refused(tmp_path):
+    """A small version of the benchmark's row: two meshes in the sun, one below an even sky."""
+    sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+    try:
+        from mesh_scene import mesh_suns
+    finally:
+        sys.path.pop(0)
+    scores = mesh_suns(6, tmp_path, scenes=3, texels=72, spp=32)
+    assert scores["mesh_sun_found_rate"] == 1.0
+    assert scores["mesh_sun_wrong_trusted"] == scores["mesh_overcast_trusted"] == 0.0
+    # The last mesh stands below the even sky: the command says so, and writes nothing.
+    mesh = ss.load_mesh(tmp_path / "unknown_hour.glb", ss.MeshPlacing(up="y"))
+    with pytest.raises(NotEnoughEvidence, match=r"its sun cannot be told: .*; state the time or the sun"):
+        ss.delight_mesh(mesh, "unknown", surroundings=AROUND)
 
 
 @pytest.fixture(scope="module")

@@ -70,6 +70,7 @@ def test_hidden_texels_follow_the_albedo(place, capsys):
     for name, extra in (("relief", ["--fast"]), ("relit", ["--albedo", str(folder / "albedo.npz"), "--sky", "hosek"])):
         record = _run(folder, capsys, "inpaint", "--texture", texture, *extra, "-o", str(folder / f"{name}.npz"))
         assert ("albedo, relit" in record["guides"]) == (name == "relit")
+        assert record["method"] == ("fused" if name == "relit" else "guided")
         completed, painted = load_texture(folder / f"{name}.npz"), load_texture(texture)
         hole = (painted.weight == 0.0) & (true > 0.0).all(axis=2)
         error[name] = float(np.median(np.abs(np.log(np.maximum(completed.values[hole], 1e-3) / true[hole]))))

@@ -121,6 +121,30 @@ def test_bundled_files_are_found_in_a_wheel_too(tmp_path, monkeypatch):
         bundled.bundled_folder("scenes")
 
 
+@pytest.mark.parametrize("name", ["alpine_winter", "clear", "hazy", "saharan_dust"])
+def test_shipped_tables_are_those_of_the_present_physics(name):
+    from seasonscapes.sky.scattering import atmosphere_tables
+    from seasonscapes.sky.shipped_tables import shipped_tables
+
+    atmosphere = atmosphere_from_model(read_sky_model(name))
+    shipped, fresh = shipped_tables(atmosphere), atmosphere_tables(atmosphere)
+    assert shipped is not None, "run make sky-tables"
+    # Logarithms of columns and of radiances, and ratios to the mean radiance.
+    np.testing.assert_allclose(shipped.sun_columns.log_columns, fresh.sun_columns.log_columns, atol=1e-9)
+    np.testing.assert_allclose(shipped.moments.log_mean, fresh.moments.log_mean, atol=1e-4)
+    np.testing.assert_allclose(shipped.moments.ratio, fresh.moments.ratio, atol=1e-4)
+    np.testing.assert_allclose(
+        shipped.moments.ground_irradiance, fresh.moments.ground_irradiance, rtol=1e-4, atol=1e-12
+    )
+
+
+def test_an_atmosphere_of_ones_own_has_no_shipped_tables():
+    from seasonscapes.sky.shipped_tables import shipped_tables
+
+    hazier = with_overrides(read_sky_model("clear"), visibility_km=20.0)
+    assert shipped_tables(atmosphere_from_model(hazier)) is None
+
+
 # ---- overrides and ranges
 
 

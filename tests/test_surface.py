@@ -242,3 +242,29 @@ def test_the_engine_is_chosen_by_what_is_asked_for(alpine):
         ss.render(alpine, camera, "2024-07-20T13:30", sky="hosek", engine="transport", spp=4)
     with pytest.raises(ss.InputError, match="unknown engine"):
         ss.render(alpine, camera, "2024-07-20T13:30", sky="hosek", engine="guess")
+
+
+def test_another_hour_of_a_map_uses_the_coefficients_that_the_first_one_kept(monkeypatch, tmp_path):
+    """And a map that is too large for keeping them has the same values."""
+    from seasonscapes.rendering import irradiance as rendering
+
+    place = ss.load_place("alpine_small", ss.Workspace(tmp_path))
+
+    def mapped(hour):
+        return ss.irradiance_map(place, f"2024-06-21T{hour}:00", sky="hosek", rays=16, spacing_m=300.0).bands
+
+    morning = mapped("09")
+    traced = rendering.trace_points
+
+    def refused(*arguments, **options):
+        raise AssertionError("light transport is traced again")
+
+    monkeypatch.setattr(rendering, "trace_points", refused)
+    again, noon = mapped("09"), mapped("12")
+    monkeypatch.setattr(rendering, "trace_points", traced)
+    monkeypatch.setattr(rendering, "BLOCK", 100)
+    in_blocks = mapped("12")
+    for name in morning:
+        np.testing.assert_array_equal(again[name], morning[name])
+        np.testing.assert_allclose(noon[name], in_blocks[name], rtol=2e-3, atol=2e-3)
+    assert np.nanmean(noon["total W/m2"]) > np.nanmean(morning["total W/m2"])

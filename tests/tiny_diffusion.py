@@ -6,7 +6,10 @@ the right classes and names, and every part has something to say: zero-convoluti
 
 from __future__ import annotations
 
+import io
 import json
+import math
+import zipfile
 from pathlib import Path
 
 BASE = "stable-diffusion-v1-5/stable-diffusion-v1-5"
@@ -176,3 +179,45 @@ def write_tiny_weights(folder: Path) -> Path:
     vision.save_pretrained(models / "image_encoder")
     save_file(adapter_state(unet, 3), models / "ip-adapter_sd15.safetensors")
     return folder
+
+
+def random_lpips(seed: int = 7) -> tuple[dict, dict]:
+    """Tensors in the names and shapes of the two published files of LPIPS: AlexNet's convolutions, the linear layers."""
+    import torch
+
+    generator = torch.Generator().manual_seed(seed)
+    shapes = {0: (64, 3, 11, 11), 3: (192, 64, 5, 5), 6: (384, 192, 3, 3), 8: (256, 384, 3, 3), 10: (256, 256, 3, 3)}
+    network = {}
+    for n, shape in shapes.items():
+        spread = (2.0 / math.prod(shape[1:])) ** 0.5
+        network[f"features.{n}.weight"] = torch.randn(shape, generator=generator) * spread
+        network[f"features.{n}.bias"] = 0.1 * torch.randn(shape[0], generator=generator)
+    linear = {
+        f"lin{i}.model.1.weight": torch.rand((1, shape[0], 1, 1), generator=generator)
+        for i, shape in enumerate(shapes.values())
+    }
+    return network, linear
+
+
+def write_lpips_parts(folder: Path, network: dict, linear: dict) -> tuple[Path, Path, bytes]:
+    """The two files as they are published, a state dict of the whole network and a wheel; and what the wheel holds."""
+    import torch
+
+    alexnet, wheel = folder / "alexnet-owt-7be5be79.pth", folder / "lpips-0.1.4-py3-none-any.whl"
+    # The published network holds more.
+    torch.save(network | {"classifier.1.weight": torch.zeros(4, 4)}, alexnet)
+    content = io.BytesIO()
+    torch.save(linear, content, _use_new_zipfile_serialization=False)
+    with zipfile.ZipFile(wheel, "w") as archive:
+        archive.writestr("lpips/weights/v0.1/alex.pth", content.getvalue())
+        archive.writestr("lpips/weights/v0.0/alex.pth", b"of an older version")
+    return alexnet, wheel, content.getvalue()
+
+
+def write_tiny_lpips(folder: Path) -> Path:
+    """Random weights of LPIPS as `seasonscapes lpips` joins them; returns the file."""
+    from seasonscapes.evaluation.lpips import join_lpips
+
+    alexnet, wheel, _ = write_lpips_parts(folder, *random_lpips())
+    join_lpips(alexnet, wheel, folder / "lpips.safetensors")
+    return folder / "lpips.safetensors"

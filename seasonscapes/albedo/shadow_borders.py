@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
@@ -20,6 +21,12 @@ from scipy.ndimage import gaussian_filter
 _TILE, _MARGIN = 384, 24
 # A texel far from every predicted border may still be in a shadow that the heights do not contain, at these odds.
 _SURPRISE = 0.002
+# Samples across the standard deviation of what counts as around.
+_SAMPLES_PER_SIGMA = 6.0
+# Squared deviations of three features, in their spreads, that are nothing unusual.
+_USUAL = 9.0
+# Texels of which the prediction is sure tell what land is around; rounds of weights; least spreads of its features.
+_SURE, _LAND_ROUNDS, _LEAST_SPREAD = 0.95, 3, np.array([0.3, 0.1, 0.1], np.float32)
 
 
 @dataclass(frozen=True)
@@ -42,6 +49,10 @@ class BorderModel:
         Cost of a half-lit texel.
     iterations
         Rounds of messages.
+    land
+        Largest cost of an albedo that is unlike that of the land around, in brightness or colour.
+    land_texels
+        Standard deviation of what counts as around [texels].
     """
 
     levels: int = 5
@@ -51,6 +62,8 @@ class BorderModel:
     smoothness: float = 0.3
     penumbra: float = 1.0
     iterations: int = 20
+    land: float = 4.0
+    land_texels: float = 24.0
 
 
 def refined_visibility(
@@ -97,13 +110,14 @@ def refined_visibility(
     prior = np.clip(prior / np.maximum(share, 1e-3), _SURPRISE, 1.0 - _SURPRISE)
     mean = np.where(known, prior, predicted).astype(np.float32)
     deviation = np.sqrt(mean * (1.0 - mean))
+    land = _land_around(log_radiance, sun, ambient, prior, known, model)
     tiles = list(_tiles(chart.shape))
     for number, (outer, inner, within) in enumerate(tiles):
         lit = known[outer] & (sun[outer].max(axis=2) > 0.0)
         # A tile all in sun, or all in shade, has no border to refine.
         if lit.any() and np.ptp(prior[outer][lit]) > 0.0:
             mean_here, deviation_here = _propagated(
-                log_radiance[outer], sun[outer], ambient[outer], prior[outer], chart[outer], model
+                log_radiance[outer], sun[outer], ambient[outer], prior[outer], chart[outer], land[outer], model
             )
             change = known[inner]
             mean[inner] = np.where(change, mean_here[within], mean[inner])
@@ -132,6 +146,7 @@ def _propagated(
     ambient: np.ndarray,
     prior: np.ndarray,
     chart: np.ndarray,
+    land: np.ndarray,
     model: BorderModel,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean and standard deviation ``(h, w)`` of the visibility of one tile."""
@@ -145,6 +160,9 @@ def _propagated(
             for level in levels
         ]
     )
+    # Land varies: only what lies beyond its usual spread counts.
+    unlike = np.maximum((((features - land[..., :3]) / land[..., 3:]) ** 2).sum(axis=-1) - _USUAL, 0.0)
+    unary += model.land * unlike / (unlike + 2.0 * model.land)
     unary = np.where(known, unary, 0.0).astype(np.float32)
     costs, joined = [], []
     for axis in (0, 1):
@@ -165,6 +183,39 @@ def _propagated(
     weight /= weight.sum(axis=0)
     mean = np.tensordot(levels, weight, axes=(0, 0))
     return mean, np.sqrt(np.maximum(np.tensordot(levels**2, weight, axes=(0, 0)) - mean**2, 0.0))
+
+
+def _land_around(
+    log_radiance: np.ndarray,
+    sun: np.ndarray,
+    ambient: np.ndarray,
+    prior: np.ndarray,
+    known: np.ndarray,
+    model: BorderModel,
+) -> np.ndarray:
+    """Mean and spread ``(R, S, 6)`` of the features of the land around each texel, from texels surely in sun or shade."""
+    rows, columns = known.shape
+    # It varies slowly: a texel of each small square stands for it.
+    step = max(1, min(round(model.land_texels / _SAMPLES_PER_SIGMA), rows, columns))
+    every, width = (slice(None, None, step), slice(None, None, step)), model.land_texels / step
+    chosen = prior[every]
+    sure = known[every] & ((chosen > _SURE) | (chosen < 1.0 - _SURE))
+    features = _features(log_radiance[every], chosen[..., None] * sun[every] + ambient[every])
+    typical = np.median(features[sure], axis=0) if sure.any() else np.zeros(3, np.float32)
+    left = np.where(sure[..., None], features - typical, 0.0)
+    weight = sure.astype(np.float32)
+    mean = spread = np.zeros_like(left)
+    for _ in range(_LAND_ROUNDS):
+        # A little of the whole image's, where nothing sure is around.
+        total = (gaussian_filter(weight, width) + np.float32(1e-3))[..., None]
+        mean = gaussian_filter(weight[..., None] * left, (width, width, 0)) / total
+        off = (left - mean) ** 2
+        spread = np.sqrt(gaussian_filter(weight[..., None] * off, (width, width, 0)) / total)
+        spread = np.maximum(spread, _LEAST_SPREAD)
+        weight = sure / (1.0 + (off / spread**2).sum(axis=2) / 3.0)
+    land = np.concatenate([mean + typical, spread], axis=2).astype(np.float32)
+    size = (land.shape[1] * step, land.shape[0] * step)
+    return np.stack([cv2.resize(land[..., k], size)[:rows, :columns] for k in range(6)], axis=2)
 
 
 def _features(log_radiance: np.ndarray, light: np.ndarray) -> np.ndarray:

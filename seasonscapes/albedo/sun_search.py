@@ -18,7 +18,7 @@ from scipy.ndimage import gaussian_filter
 from seasonscapes.frames import direction_from_angles
 
 # Blocks on a side, and the blocks on a side of each region that is asked on its own.
-_BLOCKS, _REGION = 6, 3
+BLOCKS, _REGION = 6, 3
 _AZIMUTH_STEP_DEG, _ELEVATIONS_DEG = 12.0, (7.0, 12.0, 18.0, 25.0, 33.0, 42.0, 52.0, 64.0)
 # Illuminance from an open sky over the sun's normal illuminance: hazy and low sun to clear and high sun.
 _SKY_SHARES = (0.12, 0.25, 0.5)
@@ -110,8 +110,65 @@ def find_sun(
     FoundSun
         With standard errors, and whether it can be trusted.
     """
+    return search_sun(_relief_search(image, relief), latitude_deg=latitude_deg, progress=progress)
+
+
+@dataclass(frozen=True)
+class SunSearch:
+    """What trial suns are compared with: D places of a surface, each with K differences to neighbours.
+
+    Parameters
+    ----------
+    measured
+        ``(K, D)`` differences of the logarithm of brightness.
+    block
+        ``(D,)`` integers: block of each place, of `BLOCKS` × `BLOCKS`, row by row.
+    predicted
+        The like ``(K, D)`` of the light of a sun with azimuth and elevation [deg]: a function of the illuminance from an
+        open sky over the sun's normal illuminance.
+    """
+
+    measured: np.ndarray
+    block: np.ndarray
+    predicted: Callable[[float, float], Callable[[float], np.ndarray]]
+
+    def costs(
+        self, trials: list[tuple[float, float, float]], progress: Callable[[float], None] | None = None
+    ) -> np.ndarray:
+        """Cost ``(N, B)`` of trials (azimuth, elevation [deg], share of the sky) in each block."""
+        size = np.median(np.abs(self.measured)) if self.measured.size else 1.0
+        scale = max(float(size), 1e-3)
+        result = np.empty((len(trials), BLOCKS * BLOCKS))
+        previous, differences = None, None
+        for number, (azimuth, elevation, share) in enumerate(trials):
+            if differences is None or (azimuth, elevation) != previous:
+                differences, previous = self.predicted(azimuth, elevation), (azimuth, elevation)
+            left = ((self.measured - differences(share)) ** 2).sum(axis=0)
+            cost = np.log1p(left / np.float32(scale**2))
+            result[number] = np.bincount(self.block, weights=cost, minlength=BLOCKS * BLOCKS)
+            if progress is not None:
+                progress((number + 1) / len(trials))
+        return result
+
+
+def search_sun(
+    search: SunSearch, *, latitude_deg: float | None = None, progress: Callable[[float], None] | None = None
+) -> FoundSun:
+    """Estimate azimuth and elevation of the sun whose light explains the measured differences best.
+
+    Parameters
+    ----------
+    search
+        What trial suns are compared with.
+    latitude_deg, progress
+        See `find_sun`.
+
+    Returns
+    -------
+    FoundSun
+        With standard errors, and whether it can be trusted.
+    """
     report = progress or (lambda fraction: None)
-    search = _Search(image, relief)
     coarse = [
         (float(azimuth), elevation, share)
         for azimuth in np.arange(0.0, 360.0, _AZIMUTH_STEP_DEG)
@@ -141,59 +198,40 @@ def _possible(azimuth_deg: float, elevation_deg: float, latitude_deg: float) -> 
     return bool(abs(np.degrees(np.arcsin(sine))) <= _HIGHEST_DECLINATION_DEG + 5.0)
 
 
-class _Search:
-    """Cost of trial suns in blocks of the image."""
+def _relief_search(image: np.ndarray, relief: Relief) -> SunSearch:
+    """Trial suns over relief under an image: gradients down and to the right of smoothed logarithms."""
+    known = relief.known & (image > 0.0)
+    covered = np.maximum(gaussian_filter(known.astype(np.float32), _SMOOTHING_TEXELS), 1e-3)
+    reach = gaussian_filter((~known).astype(np.float32), _SMOOTHING_TEXELS) < 1e-3
+    inside = reach[:-1, :-1] & reach[1:, :-1] & reach[:-1, 1:]
+    # The open part of the sky over a tilted surface, from the mean of its horizons.
+    upward = 0.5 * (1.0 + relief.normal[..., 2])
+    open_sky = (upward * np.mean(np.cos(np.maximum(relief.horizon_rad, 0.0)) ** 2, axis=2)).astype(np.float32)
 
-    def __init__(self, image: np.ndarray, relief: Relief):
-        self.relief = relief
-        self.azimuths = relief.horizon_rad.shape[2]
-        known = relief.known & (image > 0.0)
-        self.share = np.maximum(gaussian_filter(known.astype(np.float32), _SMOOTHING_TEXELS), 1e-3)
-        self.known = known
-        reach = gaussian_filter((~known).astype(np.float32), _SMOOTHING_TEXELS) < 1e-3
-        self.inside = reach[:-1, :-1] & reach[1:, :-1] & reach[:-1, 1:]
-        # The open part of the sky over a tilted surface, from the mean of its horizons.
-        upward = 0.5 * (1.0 + relief.normal[..., 2])
-        self.open_sky = (upward * np.mean(np.cos(np.maximum(relief.horizon_rad, 0.0)) ** 2, axis=2)).astype(np.float32)
-        self.gradients = self._gradients(np.log(np.where(known, image, 1.0)).astype(np.float32))
-        size = np.median(np.abs(np.stack(self.gradients))[:, self.inside]) if self.inside.any() else 1.0
-        self.scale = max(float(size), 1e-3)
-        rows, columns = (np.minimum(np.arange(n) * _BLOCKS // n, _BLOCKS - 1) for n in self.inside.shape)
-        self.block = (rows[:, None] * _BLOCKS + columns)[self.inside]
-
-    def _gradients(self, logarithm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        smooth = gaussian_filter(np.where(self.known, logarithm, 0.0), _SMOOTHING_TEXELS) / self.share
+    def gradients(logarithm: np.ndarray) -> np.ndarray:
+        smooth = gaussian_filter(np.where(known, logarithm, 0.0), _SMOOTHING_TEXELS) / covered
         corner = smooth[:-1, :-1]
-        return smooth[1:, :-1] - corner, smooth[:-1, 1:] - corner
+        return np.stack([(smooth[1:, :-1] - corner)[inside], (smooth[:-1, 1:] - corner)[inside]])
 
-    def _sunlight(self, azimuth_deg: float, elevation_deg: float) -> np.ndarray:
-        """Cosine of incidence × visibility ``(h, w)``."""
-        at = azimuth_deg / 360.0 * self.azimuths
-        lower, part = int(np.floor(at)), np.float32(at - np.floor(at))
-        horizon = self.relief.horizon_rad
-        height = (1.0 - part) * horizon[..., lower % self.azimuths] + part * horizon[..., (lower + 1) % self.azimuths]
-        above = np.degrees(np.radians(elevation_deg) - height) / _HORIZON_SOFTNESS_DEG
-        visible = np.clip(0.5 + 0.5 * above, 0.0, 1.0)
-        direction = direction_from_angles(azimuth_deg, elevation_deg).astype(np.float32)
-        return visible * np.maximum(self.relief.normal @ direction, 0.0)
+    def predicted(azimuth_deg: float, elevation_deg: float) -> Callable[[float], np.ndarray]:
+        sunlight = _sunlight(relief, azimuth_deg, elevation_deg)
+        return lambda share: gradients(np.log(sunlight + np.float32(share) * open_sky + np.float32(1e-3)))
 
-    def costs(
-        self, trials: list[tuple[float, float, float]], progress: Callable[[float], None] | None = None
-    ) -> np.ndarray:
-        """Cost ``(N, B)`` of trials (azimuth, elevation [deg], share of the sky) in each block."""
-        result = np.empty((len(trials), _BLOCKS * _BLOCKS))
-        sunlight, previous = np.zeros(0, np.float32), None
-        for number, (azimuth, elevation, share) in enumerate(trials):
-            if (azimuth, elevation) != previous:
-                sunlight, previous = self._sunlight(azimuth, elevation), (azimuth, elevation)
-            light = np.log(sunlight + np.float32(share) * self.open_sky + np.float32(1e-3))
-            down, right = self._gradients(light)
-            left = (self.gradients[0] - down) ** 2 + (self.gradients[1] - right) ** 2
-            cost = np.log1p(left[self.inside] / np.float32(self.scale**2))
-            result[number] = np.bincount(self.block, weights=cost, minlength=_BLOCKS * _BLOCKS)
-            if progress is not None:
-                progress((number + 1) / len(trials))
-        return result
+    rows, columns = (np.minimum(np.arange(n) * BLOCKS // n, BLOCKS - 1) for n in inside.shape)
+    block = (rows[:, None] * BLOCKS + columns)[inside]
+    return SunSearch(gradients(np.log(np.where(known, image, 1.0)).astype(np.float32)), block, predicted)
+
+
+def _sunlight(relief: Relief, azimuth_deg: float, elevation_deg: float) -> np.ndarray:
+    """Cosine of incidence × visibility ``(h, w)``."""
+    horizon, azimuths = relief.horizon_rad, relief.horizon_rad.shape[2]
+    at = azimuth_deg / 360.0 * azimuths
+    lower, part = int(np.floor(at)), np.float32(at - np.floor(at))
+    height = (1.0 - part) * horizon[..., lower % azimuths] + part * horizon[..., (lower + 1) % azimuths]
+    above = np.degrees(np.radians(elevation_deg) - height) / _HORIZON_SOFTNESS_DEG
+    visible = np.clip(0.5 + 0.5 * above, 0.0, 1.0)
+    direction = direction_from_angles(azimuth_deg, elevation_deg).astype(np.float32)
+    return visible * np.maximum(relief.normal @ direction, 0.0)
 
 
 def _around(
@@ -258,10 +296,10 @@ def _preference(first: np.ndarray, second: np.ndarray) -> float:
 def _regions(
     trials: list[tuple[float, float, float]], costs: np.ndarray, at_best: np.ndarray
 ) -> tuple[tuple[float, float, float], ...]:
-    block = np.arange(_BLOCKS * _BLOCKS).reshape(_BLOCKS, _BLOCKS)
+    block = np.arange(BLOCKS * BLOCKS).reshape(BLOCKS, BLOCKS)
     found = []
-    for top in range(0, _BLOCKS, _REGION):
-        for left in range(0, _BLOCKS, _REGION):
+    for top in range(0, BLOCKS, _REGION):
+        for left in range(0, BLOCKS, _REGION):
             part = block[top : top + _REGION, left : left + _REGION].ravel()
             best = int(np.argmin(costs[:, part].sum(axis=1)))
             found.append((*trials[best][:2], _preference(costs[best, part], at_best[part])))

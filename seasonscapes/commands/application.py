@@ -99,6 +99,7 @@ COMMANDS = (
     ("splat", "splat", "Render distilled Gaussians at any hour, or bake them for other programs."),
     ("run", "run", "From photographs to pictures of any hour: all stages, resumable."),
     ("evaluate", "evaluate", "Score pictures against the truth."),
+    ("lpips", "lpips", "Join the published weights of LPIPS to one file for evaluate."),
     ("info", "info", "Print the provenance of a file."),
     ("demo", "demo", "Picture the embedded scene through a day, a night and a year."),
     ("doctor", "doctor", "Report what this machine can do, and what is missing."),

@@ -132,3 +132,11 @@ def progress_bars() -> Iterator[Progress]:
             bars.update(tasks[task], completed=fraction)
 
         yield report
+
+
+def found_sun_text(found: dict[str, Any]) -> str:
+    """A sun that was found in an image, in words."""
+    return (
+        f"sun found: azimuth {found['azimuth_deg']:.1f}° ± {found['azimuth_sigma_deg']:.1f}°, elevation "
+        f"{found['elevation_deg']:.1f}° ± {found['elevation_sigma_deg']:.1f}° ({found['reason']})"
+    )

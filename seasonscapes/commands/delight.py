@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from seasonscapes.commands.arguments import check_range, parse_sun, parse_time
-from seasonscapes.commands.console import message, print_result, progress_bars
+from seasonscapes.commands.console import found_sun_text, message, print_result, progress_bars
 from seasonscapes.commands.delight_mesh import delight_mesh_file, require_no_scene_flags
 from seasonscapes.commands.mesh_options import MESH_SUFFIXES, MeshFileFlags, MeshFlags
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
@@ -135,11 +135,7 @@ def _write(output: Path, place: Place, result: DelitScene, record: dict[str, Any
 def _tell(result: DelitScene) -> None:
     facts = result.facts
     if "found_sun" in facts:
-        found = facts["found_sun"]
-        message(
-            f"sun found: azimuth {found['azimuth_deg']:.1f}° ± {found['azimuth_sigma_deg']:.1f}°, elevation "
-            f"{found['elevation_deg']:.1f}° ± {found['elevation_sigma_deg']:.1f}° ({found['reason']})"
-        )
+        message(found_sun_text(facts["found_sun"]))
     if facts["shift_texels"] is not None:
         message(f"the image lay {facts['shift_texels'][0]:+.2f} rows, {facts['shift_texels'][1]:+.2f} columns off")
     factors = ", ".join(f"{value:.2f}" for value in facts["sky_factor"])

@@ -5,8 +5,8 @@ from __future__ import annotations
 import time as clock
 from pathlib import Path
 
-from seasonscapes.commands.console import message, print_result, progress_bars
-from seasonscapes.commands.mesh_options import MeshFileFlags, MeshFlags, hour_on
+from seasonscapes.commands.console import found_sun_text, message, print_result, progress_bars
+from seasonscapes.commands.mesh_options import UNKNOWN, MeshFileFlags, MeshFlags, hour_on
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
 from seasonscapes.errors import InputError
 
@@ -28,13 +28,13 @@ def delight_mesh_file(
     from seasonscapes.workflows.meshes import delight_mesh
 
     start = clock.perf_counter()
-    if hour[0] == "unknown":
-        raise InputError("--time", "the sun of a mesh is not searched for", cure="give its time, or --sun AZ,EL")
     model = sky.model()
     standing = mesh.place(place.folder(), allow_outside=place.allow_outside)
-    loaded = mesh.load(source, allow_outside=place.allow_outside, place_needed=hour[0] is not None, on=standing)
+    loaded = mesh.load(
+        source, allow_outside=place.allow_outside, place_needed=hour[0] not in (None, UNKNOWN), on=standing
+    )
     files.check(output, loaded)
-    when = hour_on(loaded, *hour)
+    when = hour_on(loaded, *hour, may_be_unknown=True)
     with progress_bars() as progress:
         around = mesh.around(model, place.folder(), loaded, standing)
         delit = delight_mesh(loaded, when, surroundings=around, options=mesh.delighting(), progress=progress)
@@ -44,6 +44,8 @@ def delight_mesh_file(
     else:
         written = save_delit_textures(output, delit, kind=files.textures, bits=files.bits or 16)
     record |= {"files": [str(path) for path in written], "seconds": round(clock.perf_counter() - start, 2)}
+    if "found_sun" in record:
+        message(found_sun_text(record["found_sun"]))
     factors = ", ".join(f"{value:.2f}" for value in record["sky_factor"])
     message(f"skylight of the textures over the sky model's: {factors}")
     message(f"white of the textures counts as level ground of reflectance {mesh.white_reflectance:g} in that light")

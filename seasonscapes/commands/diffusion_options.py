@@ -46,7 +46,7 @@ class DiffusionOptions:
     guidance: float = 2.9
     """Classifier-free guidance: how much the prompt counts."""
     without: str | None = None
-    """Leave out conditions, with commas between: prompt, depth, mask, image."""
+    """Leave out conditions, with commas between: prompt, depth, mask, image, paint (the painted texels)."""
     mask: str = "coverage"
     """How holes are found: coverage, or hsv (red pixels, as in the reference implementation)."""
     dilate_px: int = 8

@@ -28,7 +28,7 @@ class DistilOptionsOfLight:
     dates: int | None = None
     """Of a synthetic scene: dates of the year whose albedo is stored, default 4. Between them the snow line moves."""
     views: int | None = None
-    """Cameras around the terrain for training images, default 3; 0 trains on the surface alone."""
+    """Cameras around the terrain for training images, default 6; 0 trains on the surface alone."""
     view_px: int | None = None
     """Their size; default 256."""
     picture_steps: int | None = None
@@ -36,11 +36,22 @@ class DistilOptionsOfLight:
     kind: str | None = None
     """full (physics and a network, default), physical (no network), or sun (a network alone, for comparison)."""
 
+    refine_discs: bool | None = None
+    """Whether the images also refine the discs: place, size, direction and opacity; default yes."""
+
     def values(self, discs: int, steps: int) -> DistilOptions:
         """The flags as one value."""
         from seasonscapes.workflows.distillation import KINDS, DistilOptions
 
-        how = {"suns": 32, "dates": 4, "views": 3, "view_px": 256, "picture_steps": 240, "kind": "full"}
+        how = {
+            "suns": 32,
+            "dates": 4,
+            "views": 6,
+            "view_px": 256,
+            "picture_steps": 240,
+            "kind": "full",
+            "refine_discs": True,
+        }
         how |= {name: getattr(self, name) for name in how if getattr(self, name) is not None}
         check_choice("--kind", how["kind"], KINDS)
         limits = {
@@ -52,6 +63,10 @@ class DistilOptionsOfLight:
         }
         for name, (low, high) in limits.items():
             check_range(f"--{name.replace('_', '-')}", how[name], low, high)
+        if self.refine_discs and not (how["views"] and how["picture_steps"]):
+            raise InputError(
+                "--refine-discs", "there are no images to refine from", cure="ask for --views and --picture-steps"
+            )
         return DistilOptions(discs=discs, steps=steps, **how)
 
 

@@ -14,7 +14,14 @@ from seasonscapes.commands.console import print_result
 from seasonscapes.rendering.backend import LLVM_CURE, choose_backend, cuda_devices, find_llvm, probe_in_child
 
 # What each extra of the package brings, by the module that shows it is there.
-EXTRAS = {"gaussians": "torch", "diffusion": "diffusers", "cluster": "distributed", "usd": "pxr"}
+EXTRAS = {
+    "gaussians": "torch",
+    "gsplat": "gsplat",
+    "diffusion": "diffusers",
+    "cluster": "distributed",
+    "data": "pystac_client",
+    "usd": "pxr",
+}
 
 
 def doctor_command(*, json: bool = False) -> None:

@@ -11,6 +11,7 @@ from cyclopts import Parameter
 from seasonscapes.commands.arguments import check_choice, check_range
 from seasonscapes.commands.console import message, print_result, progress_bars
 from seasonscapes.commands.outputs import check_output, check_output_folder
+from seasonscapes.commands.refusals import refuse_without
 from seasonscapes.errors import InputError
 
 
@@ -20,8 +21,8 @@ def evaluate_command(
     pictures: Path,
     mask: Path | None = None,
     mode: str = "valid",
-    near_m: float = 60.0,
-    far_m: float = float("inf"),
+    near_m: float | None = None,
+    far_m: float | None = None,
     match: str = "none",
     used: Annotated[tuple[Path, ...], Parameter(consume_multiple=True)] = (),
     lpips: Path | None = None,
@@ -29,7 +30,7 @@ def evaluate_command(
     figures: Path | None = None,
     json: bool = False,
 ) -> None:
-    """Score pictures against the truth: PSNR, SSIM, FLIP, colour angle and, where its weights are at hand, LPIPS.
+    """Score pictures against the truth: PSNR, SSIM, FLIP, colour angle, CIEDE2000 and, given its weights, LPIPS.
 
     Parameters
     ----------
@@ -41,17 +42,18 @@ def evaluate_command(
         A .png that is white where pixels count, or a folder of them. Truths in .exr that hold depth need none: sky and
         what is nearer than --near-m are left out.
     mode
-        valid (pixels of the mask alone) or paper (multiplied by the mask and scored over the frame, which flatters).
+        valid (pixels of the mask alone) or paper (multiplied by the mask and scored over the frame, which flatters; of
+        truths that hold depth by the paper's own mask: no sky, not the nearer 45 % of the land).
     near_m
-        Least distance in metres, where the truth holds depth.
+        Least distance in metres, of truths that hold depth; default 60.
     far_m
-        Greatest distance in metres, where the truth holds depth.
+        Greatest distance in metres, of truths that hold depth; default without end.
     match
         none, or gain: fit one factor for each colour first, for pictures of unknown exposure and white balance.
     used
         Folders or files that were used for painting, guidance or training: if a truth is among them, nothing is scored.
     lpips
-        Folder of LPIPS's weights; left out, what SEASONSCAPES_LPIPS names.
+        File of LPIPS's weights, made by `seasonscapes lpips`; left out, what SEASONSCAPES_LPIPS names.
     table
         Also write all scores to this .csv or .md.
     figures
@@ -60,22 +62,27 @@ def evaluate_command(
         Print one machine-readable record.
     """
     from seasonscapes.evaluation import picture_pairs as pairs
+    from seasonscapes.evaluation.masks import NEAR_M
     from seasonscapes.evaluation.metrics import MODES
     from seasonscapes.evaluation.tables import summary, table_lines
 
     check_choice("--mode", mode, tuple(MODES))
     check_choice("--match", match, pairs.MATCHES)
-    check_range("--near-m", near_m, 0.0, 1e6)
-    if not far_m > near_m:
-        raise InputError("--far-m", "not beyond --near-m", got=far_m, expected=f"more than {near_m:g}")
+    refuse_without("--mode valid", mode == "valid", near_m=near_m, far_m=far_m)
+    near, far = NEAR_M if near_m is None else near_m, float("inf") if far_m is None else far_m
+    check_range("--near-m", near, 0.0, 1e6)
+    if not far > near:
+        raise InputError("--far-m", "not beyond --near-m", got=far, expected=f"more than {near:g}")
     if table is not None:
         check_output(table, (".csv", ".md"), flag="--table")
     if figures is not None:
         check_output_folder(figures, flag="--figures")
     found = pairs.paired(truth, pictures)
+    depths = any(true_path.suffix.lower() == ".exr" for true_path, _ in found.values())
+    refuse_without("a truth in .exr, which may hold depth", depths, near_m=near_m, far_m=far_m)
     pairs.check_files_held_out([true_path for true_path, _ in found.values()], used)
-    measure, why = _lpips(lpips)
-    options = pairs.ScoreOptions(pairs.MaskOptions(mask, near_m, far_m), mode, match, measure)
+    measure, why, sources = _lpips(lpips)
+    options = pairs.ScoreOptions(pairs.MaskOptions(mask, near, far), mode, match, measure)
     rows = []
     with progress_bars() as progress:
         for number, (name, (true_path, path)) in enumerate(found.items()):
@@ -88,18 +95,26 @@ def evaluate_command(
         pairs.write_table(table, rows)
     if why is not None:
         message(f"LPIPS is left out: {why}")
+    elif not sources["published"]:
+        message("LPIPS is by other weights than the published ones, and not comparable with that of other works")
     mean = {"picture": "mean"} | {name: value["mean"] for name, value in totals.items()}
     record = {"mode": mode, "match": match, "pictures": rows, "summary": totals, "lpips_skipped": why}
+    record["lpips_weights"] = sources
     print_result(record, [f"mode {mode}, {len(rows)} pictures", *table_lines([*rows, mean])], as_json=json)
 
 
-def _lpips(folder: Path | None) -> tuple[Callable | None, str | None]:
-    """The function that measures LPIPS, or why there is none; `InputError` where a named folder has no weights."""
-    from seasonscapes.evaluation.lpips import load_lpips, missing_lpips
+def _lpips(file: Path | None) -> tuple[Callable | None, str | None, dict]:
+    """The function that measures LPIPS and what it was made from, or why there is none; `InputError` where a named file
+    is missing, or PyTorch, which it needs."""
+    from importlib.util import find_spec
 
-    why = missing_lpips(folder)
+    from seasonscapes.evaluation.lpips import load_lpips, lpips_sources, missing_lpips
+
+    why = missing_lpips(file)
+    if why is None and (find_spec("torch") is None or find_spec("safetensors") is None):
+        why = "PyTorch and safetensors are missing (pip install 'seasonscapes[gaussians]')"
     if why is None:
-        return load_lpips(folder), None
-    if folder is not None:
+        return load_lpips(file), None, lpips_sources(file)
+    if file is not None:
         raise InputError("--lpips", why)
-    return None, why
+    return None, why, {}

@@ -97,7 +97,7 @@ def inpaint_command(
         "figures": [str(path) for path in pictures],
         "seconds": round(clock.perf_counter() - start, 2),
     }
-    filled = f"{100 * record['filled_share']:.1f} % of {record['texels']:,} texels filled by {method}"
+    filled = f"{100 * record['filled_share']:.1f} % of {record['texels']:,} texels filled by {record['method']}"
     error = f"median σ {record['sigma_median']:.3g} on {record['value_median']:.3g}"
     line = f"{output}  ({filled}, {error}, {record['seconds']} s)"
     print_result(record, [line, *record["figures"]], as_json=json)

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 
 MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply")
+# The hour of textures whose sun is to be found.
+UNKNOWN = "unknown"
 
 
 @Parameter(name="*")
@@ -63,7 +65,7 @@ class MeshFlags:
     def load(self, path: Path, *, allow_outside: bool, place_needed: bool, on: Place | None = None) -> TexturedMesh:
         """The mesh, placed; what may not be meant is printed."""
         from seasonscapes.terrain.mesh_placing import MeshPlacing
-        from seasonscapes.workflows.meshes import load_mesh
+        from seasonscapes.workflows.mesh_loading import load_mesh
         from seasonscapes.workflows.place import ground_height_m
 
         at = None
@@ -113,15 +115,22 @@ def three_numbers(flag: str, text: str | None) -> tuple[float, float, float] | N
 
 
 def hour_on(
-    mesh: TexturedMesh, time: str | None, sun: str | None, *, flags: tuple[str, str] = ("--time", "--sun")
+    mesh: TexturedMesh,
+    time: str | None,
+    sun: str | None,
+    *,
+    flags: tuple[str, str] = ("--time", "--sun"),
+    may_be_unknown: bool = False,
 ) -> Time:
-    """The hour that two flags name: an instant, whose reading is printed, or the sun's angles."""
+    """The hour that two flags name: an instant, whose reading is printed, the sun's angles, or "unknown"."""
     if (time is None) == (sun is None):
         got, expected = "neither" if time is None else "both", f"{flags[0]} T, or {flags[1]} AZIMUTH,ELEVATION"
         raise InputError(flags[0], "give an hour or the sun's angles", got=got, expected=expected)
     if sun is not None:
         return parse_sun(sun, flag=flags[1])
     assert time is not None  # one of them was given
+    if may_be_unknown and time == UNKNOWN:
+        return time
     return parse_time(time, mesh.frame.latitude_deg, mesh.frame.longitude_deg)
 
 

@@ -11,7 +11,7 @@ from cyclopts import Parameter
 from seasonscapes.commands.arguments import check_range
 from seasonscapes.commands.console import message, print_result, progress_bars
 from seasonscapes.commands.look_options import LookOptions
-from seasonscapes.commands.mesh_options import MESH_SUFFIXES, MeshFileFlags, MeshFlags, hour_on
+from seasonscapes.commands.mesh_options import MESH_SUFFIXES, UNKNOWN, MeshFileFlags, MeshFlags, hour_on
 from seasonscapes.commands.mesh_view_options import MeshViewFlags
 from seasonscapes.commands.options import SkyOptions
 from seasonscapes.commands.outputs import check_file_or_folder
@@ -55,7 +55,7 @@ def relight_command(
     sun
         AZIMUTH,ELEVATION of the sun in degrees, instead of an hour.
     taken
-        When the textures were photographed: the light of that hour is taken out first.
+        When the textures were photographed: the light of that hour is taken out first. unknown: its sun is found.
     taken_sun
         AZIMUTH,ELEVATION of the sun when the textures were photographed, instead of --taken.
     turntable
@@ -89,7 +89,7 @@ def relight_command(
     film = FilmLook(look.metering(), fps=fps, look=look.look, white_balance=look.white_balance)
     check_file_or_folder(output)
     pictures = _pictures_wanted(output, files, film=when is not None, turntable=turntable)
-    by_hour = time is not None or when is not None or taken is not None
+    by_hour = time is not None or when is not None or taken not in (None, UNKNOWN)
     folder = default_workspace() if workspace is None else Workspace(workspace)
     use_backend(device)
     standing = flags.place(folder, allow_outside=allow_outside)
@@ -97,7 +97,9 @@ def relight_command(
     if not pictures:
         files.check(output, loaded)
     cameras = view.cameras(loaded, turntable)
-    before = None if taken is taken_sun is None else hour_on(loaded, taken, taken_sun, flags=("--taken", "--taken-sun"))
+    before = None
+    if taken is not None or taken_sun is not None:
+        before = hour_on(loaded, taken, taken_sun, flags=("--taken", "--taken-sun"), may_be_unknown=True)
     if when is not None and (time is not None or sun is not None):
         raise InputError("--time", "and --from … --to name two sets of hours", cure="drop one of them")
     at = (loaded.frame.latitude_deg, loaded.frame.longitude_deg)

@@ -65,7 +65,7 @@ def render_command(
     seed
         Equal seeds give equal pictures.
     lambertian
-        All ground is matt, also water and snow: for comparison.
+        All ground is matt, also water, snow and forest: for comparison.
     amplify
         Add relief and albedo below the resolution of the data: for pictures, not for measurements.
     output
@@ -131,7 +131,8 @@ def render_command(
         "albedo": [
             {"date": each.day.isoformat(), "content": each.content} for each in (series.dated if series else ())
         ],
-        "season": season or "blended",
+        # Between fewer than two dates nothing is blended.
+        "season": (season or "blended") if series is not None and len(series.dated) > 1 else None,
         "exposure_ev100": round(ev100, 3),
     }
     if output.suffix.lower() == ".png":

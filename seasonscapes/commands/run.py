@@ -36,7 +36,7 @@ def run_command(
 ) -> None:
     """Take a scene from photographs to pictures of other hours and to Gaussians; an interrupted run continues.
 
-    Stages: pictures, calibrate, albedo, paint, inpaint, refine, relight, distil, splat; with --method paper pictures,
+    Stages: pictures, calibrate, albedo, paint, inpaint, refine, relight, distil, splat; with --method paper cloud, pictures,
     calibrate, views, paint, path, inpaint, film, distil, splat. Each is built again only where its arguments, the content of what it
     reads or the program's code have changed; run.json in the folder records them.
 

@@ -26,7 +26,7 @@ class RunMethodOptions:
     method: str = "physical"
     """physical (this package's) or paper (Algorithm 1 of the SeasonScapes paper)."""
     poses: str | None = None
-    """skyline (physical); joint: each panorama whole, by 2D-3D points; or points (paper): each of its plane views, L1."""
+    """skyline (physical); joint: each panorama whole, by 2D-3D points; or points (paper): heading, fx, fy of plane views, L1."""
     grade: str | None = None
     """Of plane views: paper (paper), none, warm or soft."""
     painting: str | None = None

@@ -49,7 +49,7 @@ def splat_command(
     output
         A .png or .exr picture; or all Gaussians of that instant as .ply (3DGS) or .glb (KHR_gaussian_splatting).
     device
-        cpu, or cuda (needs gsplat).
+        cpu, or cuda (needs the extra gsplat).
     json
         Print one machine-readable record.
     """

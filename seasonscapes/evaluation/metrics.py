@@ -2,8 +2,8 @@
 
 Mode ``valid`` evaluates only pixels within the mask. Mode ``paper`` multiplies both images by the mask and evaluates the
 whole image, as the reference evaluation does: masked pixels then count as perfect, which adds ``-10 log10(share)`` dB to
-PSNR, with ``share`` the fraction of pixels within the mask. That mode serves to compare with published values; every
-score reports the fraction. Images are display values (sRGB-encoded) in [0, 1].
+PSNR, with ``share`` the fraction of pixels within the mask. LPIPS sees the images in [0, 1] there, where its network was
+trained for [-1, 1]. That mode serves to compare with published values; every score reports the fraction. Images are display values (sRGB-encoded) in [0, 1].
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 from seasonscapes.errors import NoUsablePixels
 from seasonscapes.evaluation.lpips import Lpips
-from seasonscapes.images import linear_from_srgb
+from seasonscapes.images import XYZ_FROM_REC709, linear_from_srgb
 
 MODES = ("valid", "paper")
 # Wang, Bovik, Sheikh & Simoncelli 2004 (doi:10.1109/TIP.2003.819861): Gaussian window of 11 pixels, sigma 1.5.
@@ -42,6 +42,9 @@ class Score:
         Fraction of the image within the mask, 0 to 1.
     lpips
         LPIPS, or ``None`` if it was not computed.
+    delta_e2000
+        Mean colour difference CIEDE2000 (ISO/CIE 11664-6); 1 is about what an eye can tell. ``None`` if it was not
+        computed.
     """
 
     psnr_db: float
@@ -50,9 +53,10 @@ class Score:
     colour_angle_deg: float
     mask_share: float
     lpips: float | None = None
+    delta_e2000: float | None = None
 
     def record(self) -> dict[str, float]:
-        """Return the metrics by name, without LPIPS if it was not computed."""
+        """Return the metrics by name, without those that were not computed."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 
@@ -63,6 +67,7 @@ def score(
     *,
     mode: str = "valid",
     lpips: Lpips | None = None,
+    colour_difference: bool = False,
 ) -> Score:
     """Compute all metrics of an image against the ground truth.
 
@@ -76,6 +81,8 @@ def score(
         Masking, ``valid`` or ``paper`` (see the module).
     lpips
         LPIPS function (`lpips.load_lpips`), or ``None`` to omit that metric.
+    colour_difference
+        Compute CIEDE2000 too, with colour-science, whose import takes a second.
 
     Returns
     -------
@@ -99,15 +106,18 @@ def score(
     True
     """
     truth, picture, mask = _validated(truth, picture, mask, mode)
+    filled = _fill_masked(truth, picture, mask, mode)
+    if mode == "paper":
+        # `Lpips` maps [0, 1] to [-1, 1]; the reference evaluation gives [0, 1] to the network as it is.
+        filled = tuple(0.5 + 0.5 * image for image in filled)
     return Score(
         psnr_db(truth, picture, mask, mode=mode),
         ssim(truth, picture, mask, mode=mode),
         flip(truth, picture, mask, mode=mode),
         colour_angle_deg(truth, picture, mask),
         float(mask.mean()),
-        None
-        if lpips is None
-        else float(lpips(*_fill_masked(truth, picture, mask, mode), mask if mode == "valid" else None)),
+        None if lpips is None else float(lpips(filled[0], filled[1], mask if mode == "valid" else None)),
+        delta_e2000(truth, picture, mask) if colour_difference else None,
     )
 
 
@@ -256,6 +266,27 @@ def colour_angle_deg(truth: np.ndarray, picture: np.ndarray, mask: np.ndarray | 
     """
     truth, picture, mask = _validated(truth, picture, mask, "valid")
     return angle_deg(linear_from_srgb(truth[mask]), linear_from_srgb(picture[mask]))
+
+
+def delta_e2000(truth: np.ndarray, picture: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """Compute the mean colour difference CIEDE2000 of two images, as colour-science defines it.
+
+    Parameters
+    ----------
+    truth, picture, mask
+        As in `score`.
+
+    Returns
+    -------
+    float
+        Difference; 0 for equal images, 100 between black and white.
+    """
+    import colour
+
+    truth, picture, mask = _validated(truth, picture, mask, "valid")
+    white = colour.CCS_ILLUMINANTS["CIE 1931 2 Degree Standard Observer"]["D65"]
+    lab = [colour.XYZ_to_Lab(linear_from_srgb(image[mask]) @ XYZ_FROM_REC709.T, white) for image in (truth, picture)]
+    return float(np.mean(colour.delta_E(*lab, method="CIE 2000")))
 
 
 def angle_deg(truth: np.ndarray, other: np.ndarray) -> float:

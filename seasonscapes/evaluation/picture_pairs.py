@@ -13,7 +13,7 @@ import numpy as np
 from seasonscapes.errors import InputError, UnreadableImage
 from seasonscapes.evaluation.figures import comparison_figure
 from seasonscapes.evaluation.lpips import Lpips
-from seasonscapes.evaluation.masks import terrain_mask
+from seasonscapes.evaluation.masks import NEAR_M, reference_mask, terrain_mask
 from seasonscapes.evaluation.metrics import Score, score
 from seasonscapes.evaluation.splits import file_content_hash
 from seasonscapes.evaluation.tables import table_lines
@@ -40,7 +40,7 @@ class MaskOptions:
     """
 
     mask: Path | None = None
-    near_m: float = 60.0
+    near_m: float = NEAR_M
     far_m: float = float("inf")
 
 
@@ -235,8 +235,10 @@ def matching_gain(truth: np.ndarray, picture: np.ndarray, ev100: float | None = 
     return gains if error(gains) <= error(np.ones(3)) else np.ones(3)
 
 
-def mask_of(name: str, pair: PicturePair, options: MaskOptions) -> np.ndarray | None:
+def mask_of(name: str, pair: PicturePair, options: MaskOptions, mode: str = "valid") -> np.ndarray | None:
     """Return the mask of scored pixels: white in the mask file and, with depth, terrain within the distances.
+
+    In mode ``paper`` depth gives the mask of the reference evaluation (`masks.reference_mask`) instead.
 
     Parameters
     ----------
@@ -246,6 +248,8 @@ def mask_of(name: str, pair: PicturePair, options: MaskOptions) -> np.ndarray | 
         Picture and truth.
     options
         Mask files and range of distances.
+    mode
+        Mode of `metrics.score`.
 
     Returns
     -------
@@ -260,7 +264,8 @@ def mask_of(name: str, pair: PicturePair, options: MaskOptions) -> np.ndarray | 
     terrain = None
     if pair.depth_m is not None:
         depth = np.where(np.isnan(pair.depth_m), np.inf, pair.depth_m)
-        terrain = terrain_mask(depth, near_m=options.near_m, far_m=options.far_m)
+        within = {"near_m": options.near_m, "far_m": options.far_m}
+        terrain = reference_mask(depth) if mode == "paper" else terrain_mask(depth, **within)
     if options.mask is None:
         return terrain
     path = options.mask / f"{name}.png" if options.mask.is_dir() else options.mask
@@ -331,12 +336,12 @@ def score_pair(
     """
     options = options or ScoreOptions()
     pair = read_pair(true_path, path)
-    mask = mask_of(name, pair, options.masks)
+    mask = mask_of(name, pair, options.masks, options.mode)
     if options.match == "gain":
         pair = matched(pair, mask)
     if mask is not None and not mask.any():
         raise InputError(path, "no pixel is left to score", cure="check --mask, --near-m and --far-m")
-    result = score(pair.truth, pair.picture, mask, mode=options.mode, lpips=options.lpips)
+    result = score(pair.truth, pair.picture, mask, mode=options.mode, lpips=options.lpips, colour_difference=True)
     if figure is not None:
         sheet = comparison_figure({"truth": pair.truth, "picture": pair.picture}, mask=mask)
         write_png8(figure, np.round(255.0 * sheet).astype(np.uint8))

@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from seasonscapes.gaussians.disc_geometry import DiscGeometry
 from seasonscapes.gaussians.disc_transport import (
     AZIMUTHS,
     HORIZON_RANGE_RAD,
@@ -196,6 +197,7 @@ class Appearance(nn.Module):
     sky: torch.Tensor
     bounce: torch.Tensor
     open_sky: torch.Tensor
+    geometry: DiscGeometry | None
 
     def __init__(
         self,
@@ -213,6 +215,7 @@ class Appearance(nn.Module):
             raise ValueError(f"kind: got {kind!r}, expected one of {', '.join(KINDS)}")
         count = albedo.shape[1]
         self.kind = kind
+        self.geometry = None  # the discs stay as they are, unless `refine` is called
         for name, values in (("albedo", albedo), ("neighbourhood_albedo", neighbourhood_albedo)):
             self.register_buffer(name, torch.as_tensor(np.asarray(values, np.float32)))
         low, high = HORIZON_RANGE_RAD
@@ -233,6 +236,10 @@ class Appearance(nn.Module):
             if kind == "code":
                 self.codes = nn.Parameter(0.01 * torch.randn(times, CODE, generator=generator))
             self.mlp = correction_network(self._inputs(embedding.shape[1]), HIDDEN[kind], generator)
+
+    def refine(self, geometry: DiscGeometry) -> None:
+        """Let training change the discs too, from pictures; `training.train` then needs frames with cameras."""
+        self.geometry = geometry
 
     def _inputs(self, embedding: int) -> int:
         """Number of network inputs."""

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
+from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.errors import NoTerrainInView
 from seasonscapes.gaussians.appearance import Appearance, LightTensors
-from seasonscapes.gaussians.rasterise import ViewWeights
+from seasonscapes.gaussians.disc_geometry import normalised_picture, uncovered_loss
+from seasonscapes.gaussians.rasterise import Splats, ViewWeights
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -33,6 +36,8 @@ class TrainingFrame:
         ``(H, W, 3)`` colours of the surface as in `SurfaceTargets`, before aerial perspective.
     mask
         ``(H, W)`` bool, True = usable.
+    camera
+        The view that the weights belong to; needed where the discs are refined.
 
     Raises
     ------
@@ -46,6 +51,7 @@ class TrainingFrame:
     time: int
     image: np.ndarray
     mask: np.ndarray
+    camera: Camera | None = None
 
     def __post_init__(self) -> None:
         if self.image.shape != (*self.mask.shape, 3) or self.mask.shape != (
@@ -110,6 +116,8 @@ class TrainingPicture:
         ``(H, W, 3)`` sRGB.
     mask
         ``(H, W)`` bool, True = usable and covered by splats.
+    camera
+        The view, where the frame names it.
     """
 
     discs: torch.Tensor
@@ -118,6 +126,7 @@ class TrainingPicture:
     time: torch.Tensor
     target: torch.Tensor
     mask: torch.Tensor
+    camera: Camera | None
 
 
 def training_picture(frame: TrainingFrame) -> TrainingPicture:
@@ -150,7 +159,13 @@ def training_picture(frame: TrainingFrame) -> TrainingPicture:
         mask[..., None], srgb_encoded(torch.as_tensor(np.nan_to_num(frame.image).astype(np.float32))), 0.0
     )
     return TrainingPicture(
-        torch.as_tensor(discs.astype(np.int64)), forward, forward.T.tocsr(), torch.tensor(frame.time), target, mask
+        torch.as_tensor(discs.astype(np.int64)),
+        forward,
+        forward.T.tocsr(),
+        torch.tensor(frame.time),
+        target,
+        mask,
+        frame.camera,
     )
 
 
@@ -205,6 +220,36 @@ def picture_loss(appearance: Appearance, lights: LightTensors, picture: Training
     """
     values = appearance(picture.discs, picture.time, lights)
     return image_loss(SparseProduct.apply(values, picture.forward, picture.backward), picture)
+
+
+def refining_loss(appearance: Appearance, lights: LightTensors, pictures: Sequence[TrainingPicture]) -> torch.Tensor:
+    """`picture_loss` of frames of one camera through its discs as they are now, differentiable in their geometry too.
+
+    Parameters
+    ----------
+    appearance
+        Appearance of N discs, with `Appearance.geometry`.
+    lights
+        T light states.
+    pictures
+        Pictures of one camera, from `training_picture`; their frozen weights only tell which discs are in view.
+
+    Returns
+    -------
+    torch.Tensor
+        Scalar loss: the mean of the pictures', and what pixels of terrain lack of coverage.
+    """
+    geometry, camera, seen = appearance.geometry, pictures[0].camera, pictures[0].discs
+    assert geometry is not None, "train refines only where there is one"
+    assert camera is not None, "train has asked for it"
+    colours = torch.cat([appearance(seen, picture.time, lights) for picture in pictures], dim=1)
+    splats = Splats(*(values.index_select(0, seen) for values in geometry.splats(camera)))
+    drawn, coverage = normalised_picture(splats, colours, camera)
+    losses = [
+        image_loss(pixels.reshape(-1, 3), picture)
+        for pixels, picture in zip(drawn.split(3, dim=2), pictures, strict=True)
+    ]
+    return torch.stack(losses).mean() + uncovered_loss(coverage, pictures[0].mask)
 
 
 def image_loss(pixels: torch.Tensor, picture: TrainingPicture) -> torch.Tensor:

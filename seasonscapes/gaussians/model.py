@@ -1,8 +1,8 @@
 """Relightable Gaussian model: known geometry, traced light transport, learned corrections; and its file format.
 
-A file takes about 100 bytes per Gaussian. Values that follow from the grid are not stored: the horizontal position of a
-disc is its cell, and its rotation and size follow from its normal. All other values are quantised, to one byte where
-possible.
+A file takes about 107 bytes per Gaussian. Values that follow from the grid are not stored: the horizontal position of a
+disc is its cell, and its rotation and size follow from its normal, up to the changes that training made. All other values
+are quantised, to one byte where possible.
 """
 
 from __future__ import annotations
@@ -20,13 +20,25 @@ from seasonscapes.albedo.seasons import albedo_at
 from seasonscapes.errors import InputError
 from seasonscapes.frames import LocalFrame
 from seasonscapes.gaussians.disc_transport import DiscTransport
-from seasonscapes.gaussians.surfels import SurfelGrid, Surfels, disc_shapes
+from seasonscapes.gaussians.surfels import (
+    CHANGES,
+    SurfelGrid,
+    Surfels,
+    axes_from_quaternions,
+    changed_discs,
+    disc_offsets_m,
+    disc_shapes,
+)
 from seasonscapes.images import atomic_path
 from seasonscapes.terrain.attributes import attributes_at
 
 FORMAT = "seasonscapes gaussians 1"
 # Learned parameters of each disc and the range of their quantisation; values beyond it are clipped.
-_RANGES = {"log_colour": (-1.0, 1.0), "log_gain": (-2.0, 2.0), "shift": (-0.1, 0.1), "log_softness": (-6.2, -1.0)}
+_RANGES = {"log_colour": (-1.0, 1.0), "log_gain": (-2.0, 2.0), "shift": (-0.1, 0.1), "log_softness": (-6.2, -1.0)} | {
+    f"geometry.{name}": (-limit, limit) for name, (_, limit) in CHANGES.items()
+}
+# On level ground the axes of a disc turn with the last digit of its normal, and with them the stored angle.
+_RANGES["geometry.twist"] = (-0.5 * np.pi, 0.5 * np.pi)
 
 
 @dataclass(frozen=True)
@@ -53,7 +65,8 @@ class GaussianModel:
         Light transport of the discs.
     appearance
         Learned parameters: ``log_colour (N, 3)``, ``log_gain (N, 2)``, ``shift (N,)``, ``log_softness (N,)``, and the
-        network's ``mlp.*``.
+        network's ``mlp.*``; ``geometry.*``, see `surfels.CHANGES`, if training changed the discs, which have these
+        changes already.
     kind
         Kind of appearance, a name in `appearance.KINDS`.
     grid, cell
@@ -102,6 +115,11 @@ class GaussianModel:
                 raise ValueError(f"GaussianModel: {int(np.sum(~np.isfinite(values)))} values of {name} are not finite")
         if np.any(np.diff(self.days) <= 0.0):
             raise ValueError(f"GaussianModel: days {self.days.tolist()} do not rise")
+
+    @property
+    def changes(self) -> dict[str, np.ndarray]:
+        """Changes of the discs that training made, by the names of `surfels.CHANGES`; empty if it made none."""
+        return _changes(self.appearance)
 
     def albedo_on(self, day: float) -> np.ndarray:
         """Interpolate the dated albedos to a day of the year; see `albedo.seasons.albedo_at`.
@@ -153,7 +171,7 @@ def model_from(
     Parameters
     ----------
     surfels
-        N discs.
+        N discs as the terrain gives them; changes that training made are applied here.
     albedo
         ``(M, N, 3)`` on M dates.
     days
@@ -174,11 +192,10 @@ def model_from(
     """
     parameters = dict(learned.arrays)
     features = parameters.pop("embedding", np.zeros((len(surfels.means), 0), np.float32))
+    changes = _changes(parameters)
+    discs = (surfels.means, surfels.quaternions, surfels.log_scales, surfels.opacity_logits)
     return GaussianModel(
-        surfels.means,
-        surfels.quaternions,
-        surfels.log_scales,
-        surfels.opacity_logits,
+        *(changed_discs(surfels.means, surfels.normals, surfels.grid.spacing_m, changes) if changes else discs),
         features,
         np.asarray(albedo, np.float32),
         np.asarray(days, np.float64),
@@ -192,20 +209,24 @@ def model_from(
     )
 
 
+def _changes(learned: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    return {name: learned[f"geometry.{name}"] for name in CHANGES if f"geometry.{name}" in learned}
+
+
 def save_model(model: GaussianModel, path: str | os.PathLike[str]) -> None:
     """Write a model to one packed ``.safetensors`` file, atomically.
 
     Parameters
     ----------
     model
-        Model whose geometry follows from grid and normals.
+        Model whose geometry follows from grid, normals and learned changes.
     path
         Output file.
 
     Raises
     ------
     ValueError
-        If the geometry does not follow from grid and normals, so that it would be lost.
+        If the geometry does not follow from grid, normals and learned changes, so that it would be lost.
     """
     from safetensors.numpy import save_file
 
@@ -275,7 +296,7 @@ def pack_model(model: GaussianModel) -> tuple[dict[str, np.ndarray], dict[str, A
     Parameters
     ----------
     model
-        Model whose geometry follows from grid and normals.
+        Model whose geometry follows from grid, normals and learned changes.
 
     Returns
     -------
@@ -287,9 +308,13 @@ def pack_model(model: GaussianModel) -> tuple[dict[str, np.ndarray], dict[str, A
     Raises
     ------
     ValueError
-        If the geometry does not follow from grid and normals, so that it would be lost.
+        If the geometry does not follow from grid, normals and learned changes, so that it would be lost.
     """
-    shape = disc_shapes(model.transport.normals, model.grid.spacing_m)
+    normals, spacing_m, changes = model.transport.normals, model.grid.spacing_m, model.changes
+    means = model.means
+    if changes:
+        means = means - disc_offsets_m(disc_shapes(normals, spacing_m)[0], spacing_m, changes)
+    shape = changed_discs(means, normals, spacing_m, changes)[1:]
     for name, expected in zip(("quaternions", "log_scales", "opacity_logits"), shape, strict=True):
         if not np.allclose(getattr(model, name), expected, atol=1e-3):
             raise ValueError(
@@ -297,12 +322,12 @@ def pack_model(model: GaussianModel) -> tuple[dict[str, np.ndarray], dict[str, A
             )
     occupied = np.zeros(model.grid.columns * model.grid.rows, bool)
     occupied[model.cell] = True
-    low, high = float(model.means[:, 2].min()), float(model.means[:, 2].max())
+    low, high = float(means[:, 2].min()), float(means[:, 2].max())
     step = max(high - low, 1e-3) / 65535.0
     transport = model.transport
     tensors = {
         "taken": np.packbits(occupied),
-        "height": np.rint((model.means[:, 2] - low) / step).astype(np.uint16),
+        "height": np.rint((means[:, 2] - low) / step).astype(np.uint16),
         "normal": octahedral(transport.normals),
         "roughness": np.rint(255.0 * np.clip(np.linalg.norm(transport.normals, axis=1), 0.0, 1.0)).astype(np.uint8),
         "albedo": np.rint(255.0 * np.sqrt(np.clip(model.albedo, 0.0, 1.0))).astype(np.uint8),
@@ -313,7 +338,12 @@ def pack_model(model: GaussianModel) -> tuple[dict[str, np.ndarray], dict[str, A
     }
     feature_scale = np.maximum(np.abs(model.features).max(axis=0, initial=0.0), 1e-9) / 127.0
     tensors["features"] = np.rint(model.features / feature_scale).astype(np.int8)
-    for name, values in model.appearance.items():
+    learned = model.appearance
+    if changes:
+        rounded = from_octahedral(tensors["normal"]) * (tensors["roughness"][:, None] / np.float32(255.0))
+        changes = _relative_to(disc_shapes(rounded, spacing_m)[0], model, means)
+        learned = learned | {f"geometry.{name}": values for name, values in changes.items()}
+    for name, values in learned.items():
         tensors[f"appearance.{name}"] = _quantised(values, *_RANGES[name]) if name in _RANGES else values
     header = {
         "kind": model.kind,
@@ -326,6 +356,17 @@ def pack_model(model: GaussianModel) -> tuple[dict[str, np.ndarray], dict[str, A
         "feature_scale": feature_scale.tolist(),
     }
     return tensors, header
+
+
+def _relative_to(quaternions: np.ndarray, model: GaussianModel, means: np.ndarray) -> dict[str, np.ndarray]:
+    """The model's changes as seen from unchanged discs of other axes ``quaternions (N, 4)`` and centres ``means (N, 3)``."""
+    axes = axes_from_quaternions(quaternions)
+    offset = np.einsum("nij,ni->nj", axes, model.means - means) / model.grid.spacing_m
+    first = np.einsum("nij,ni->nj", axes, axes_from_quaternions(model.quaternions)[:, :, 0])
+    twist = np.arctan2(first[:, 1], first[:, 0])
+    # An ellipse is the same after half a turn.
+    twist = (twist + 0.5 * np.pi) % np.pi - 0.5 * np.pi
+    return model.changes | {"offset": offset, "twist": twist[:, None]}
 
 
 def unpack_model(tensors: dict[str, np.ndarray], header: dict[str, Any]) -> GaussianModel:
@@ -373,8 +414,7 @@ def unpack_model(tensors: dict[str, np.ndarray], header: dict[str, Any]) -> Gaus
     features = tensors["features"] * np.array(header["feature_scale"], np.float32)
     albedo = ((tensors["albedo"] / np.float32(255.0)) ** 2).astype(np.float32)
     return GaussianModel(
-        means,
-        *disc_shapes(normals, grid.spacing_m),
+        *changed_discs(means, normals, grid.spacing_m, _changes(appearance)),
         features,
         albedo,
         np.array(header["days"]),
@@ -394,7 +434,7 @@ def bytes_per_gaussian(model: GaussianModel) -> float:
     Parameters
     ----------
     model
-        Model whose geometry follows from grid and normals.
+        Model whose geometry follows from grid, normals and learned changes.
 
     Returns
     -------

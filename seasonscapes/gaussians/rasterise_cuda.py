@@ -40,9 +40,8 @@ def rasterise_cuda(
     try:
         from gsplat import rasterization  # pyright: ignore[reportMissingImports]
     except ImportError:
-        raise InputError(
-            "--device", "the CUDA rasteriser needs gsplat", got="cuda", cure="pip install gsplat, or use --device cpu"
-        ) from None
+        cure = "pip install 'seasonscapes[gsplat]', or use --device cpu"
+        raise InputError("--device", "the CUDA rasteriser needs gsplat", got="cuda", cure=cure) from None
     device = torch.device("cuda")
     pose = torch.as_tensor(camera.world_from_camera, dtype=torch.float64)
     # Relative to the camera, because float32 loses centimetres some kilometres from the origin.

@@ -1,11 +1,12 @@
 """Surfels (discs) on the terrain: positions, rotations and sizes of the Gaussians, and the albedo of their cells.
 
-The geometry is known and therefore not learned: one disc per cell of a horizontal grid, tangent to the surface and
-elongated along the slope so that steep faces have no holes.
+The geometry is known: one disc per cell of a horizontal grid, tangent to the surface and elongated along the slope so that steep
+faces have no holes. Training may change it a little (`disc_geometry`, `CHANGES`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,6 +24,9 @@ THICKNESS = 0.03
 OPACITY = 0.995
 # Limit of the elongation, reached on cliffs steeper than about 80°.
 _MAX_STRETCH = 5.0
+# Changes that training may make to a disc: number of columns, and limit. Place along the disc's axes [spacing of the discs],
+# logarithm of the two standard deviations in its plane, angle about its normal [rad], logit of its opacity.
+CHANGES = {"offset": (3, 0.5), "stretch": (2, 1.0), "twist": (1, 1.0), "opacity": (1, 6.0)}
 # Sample points along a cell's side, over which albedo, normal and light are averaged.
 SUBCELLS = 4
 
@@ -178,6 +182,45 @@ def disc_shapes(normals: np.ndarray, spacing_m: float) -> tuple[np.ndarray, np.n
         np.log(scales * spacing_m).astype(np.float32),
         np.full(len(stretch), logit, np.float32),
     )
+
+
+def changed_discs(
+    means: np.ndarray, normals: np.ndarray, spacing_m: float, changes: Mapping[str, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Apply learned changes to the discs of a surface.
+
+    Parameters
+    ----------
+    means
+        ``(N, 3)`` centres of the cells on the surface, ENU [m].
+    normals
+        ``(N, 3)`` of any length, ENU.
+    spacing_m
+        Mean distance of neighbouring discs [m].
+    changes
+        By the names of `CHANGES`: ``offset (N, 3)``, ``stretch (N, 2)``, ``twist (N, 1)``, ``opacity (N, 1)``; or empty.
+
+    Returns
+    -------
+    tuple of numpy.ndarray
+        Means ``(N, 3)``, quaternions ``(N, 4)`` wxyz, log scales ``(N, 3)`` and opacity logits ``(N,)``, float32.
+    """
+    quaternions, log_scales, logits = disc_shapes(normals, spacing_m)
+    if not changes:
+        return means, quaternions, log_scales, logits
+    moved = means + disc_offsets_m(quaternions, spacing_m, changes)
+    half = 0.5 * changes["twist"]
+    w, x, y, z = np.split(quaternions, 4, axis=1)
+    c, s = np.cos(half), np.sin(half)
+    turned = np.concatenate([w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s], axis=1)
+    log_scales[:, :2] += changes["stretch"]
+    columns = (moved, turned, log_scales, logits + changes["opacity"][:, 0])
+    return tuple(values.astype(np.float32) for values in columns)  # pyright: ignore[reportReturnType]
+
+
+def disc_offsets_m(quaternions: np.ndarray, spacing_m: float, changes: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Shift of discs from the centres of their cells, of unturned ``quaternions (N, 4)``: ``(N, 3)`` ENU [m]."""
+    return spacing_m * np.einsum("nij,nj->ni", axes_from_quaternions(quaternions), changes["offset"])
 
 
 def _cells(terrain: Terrain, grid: SurfelGrid, at_vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -2,11 +2,12 @@
 
 1. Surface stage: radiance of (disc, time) pairs, from irradiance traced at the discs. No rasterisation, occlusion or
    blur is involved; most of the training happens here.
-2. Picture stage: a few steps over cameras and times, 0.8 L1 + 0.2 D-SSIM in sRGB, through frozen sparse weights, so
-   that the colours compensate for the extent of the splats. The surface loss is kept, because discs outside all
-   pictures would drift otherwise.
+2. Picture stage: a few steps over cameras and times, 0.8 L1 + 0.2 D-SSIM in sRGB. Where the appearance has a
+   `DiscGeometry`, place, size, direction and opacity of the discs are learned together with their colours through the
+   differentiable rasteriser; otherwise colours alone, through frozen sparse weights. The surface loss is kept, because
+   discs outside all pictures would drift otherwise.
 
-The geometry is known and not trained. Every step has its own random generator, seeded by (seed, step), so that an
+Every step has its own random generator, seeded by (seed, step), so that an
 interrupted run continues from its checkpoint with identical results.
 """
 
@@ -28,6 +29,7 @@ from seasonscapes.gaussians.losses import (
     SparseProduct,
     TrainingFrame,
     picture_loss,
+    refining_loss,
     srgb_encoded,
     surface_loss,
     training_picture,
@@ -40,15 +42,21 @@ Progress = Callable[[float], None]
 # Initial learning rates. They decay exponentially by `_DECAY` over each stage; the second stage starts at
 # `_SECOND_STAGE` times these.
 RATES = {
-    "log_colour": 2e-3,
+    "log_colour": 1e-2,
     "log_gain": 5e-3,
     "shift": 1e-3,
     "log_softness": 1e-2,
     "embedding": 5e-3,
     "codes": 5e-3,
     "mlp": 2e-3,
+    "geometry.offset": 2e-2,
+    "geometry.stretch": 4e-2,
+    "geometry.twist": 4e-2,
+    "geometry.opacity": 2e-1,
 }
 _SECOND_STAGE, _DECAY = 0.5, 0.1
+# Times of one camera in a step that refines the discs: rasterising costs more than more colours do.
+_TIMES_PER_STEP = 3
 # Weight of the surface loss in the second stage.
 _SURFACE_WEIGHT = 0.5
 
@@ -205,6 +213,8 @@ def train(
         If the checkpoint is damaged or belongs to another run: kind, seed, schedule or key differ.
     FloatingPointError
         If the loss is not finite.
+    ValueError
+        If the discs are to be refined and a frame names no camera.
     """
     schedule = schedule or Schedule()
     set_torch_threads(schedule.threads)
@@ -216,6 +226,7 @@ def train(
         "seed": seed,
         "schedule": asdict(replace(schedule, threads=1)),
         "times": len(targets.states),
+        "refined": appearance.geometry is not None,
     }
     if checkpoint:
         run["key"] = checkpoint.key
@@ -225,19 +236,31 @@ def train(
     lights = light_tensors(targets.states, targets.seasons)
     colours = torch.as_tensor(targets.colours)
     pictures = [training_picture(frame) for frame in frames]
+    geometry = appearance.geometry
+    if geometry is not None and any(picture.camera is None for picture in pictures):
+        raise ValueError("train: a frame names no camera, through which the discs could be refined")
+    cameras = _by_camera(frames)
     total, losses = schedule.surface_steps + schedule.picture_steps, []
     for step in range(start, total):
         _set_rates(optimiser, step, schedule)
         rng = np.random.default_rng([seed, step])
         loss = surface_loss(appearance, lights, colours, schedule.batch, rng)
         if step >= schedule.surface_steps:
-            picture = pictures[_picture_index(step - schedule.surface_steps, len(pictures), seed)]
-            loss = _SURFACE_WEIGHT * loss + picture_loss(appearance, lights, picture)
+            number = step - schedule.surface_steps
+            if geometry is None:
+                told = picture_loss(appearance, lights, pictures[_picture_index(number, len(pictures), seed)])
+            else:
+                own = cameras[_picture_index(number, len(cameras), seed)]
+                drawn = rng.choice(own, min(_TIMES_PER_STEP, len(own)), replace=False)
+                told = refining_loss(appearance, lights, [pictures[each] for each in drawn])
+            loss = _SURFACE_WEIGHT * loss + told
         if not bool(torch.isfinite(loss)):
             raise FloatingPointError(f"train: the loss of step {step} is {float(loss)}, expected a finite number")
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         optimiser.step()
+        if geometry is not None:
+            geometry.keep_within_limits()
         losses.append(float(loss.detach()))
         if checkpoint and ((step + 1) % schedule.checkpoint_every == 0 or step + 1 == total):
             save_checkpoint(checkpoint.path, appearance, optimiser, run, step + 1)
@@ -246,8 +269,16 @@ def train(
     return losses
 
 
+def _by_camera(frames: Sequence[TrainingFrame]) -> list[list[int]]:
+    """Indices of the frames of each camera; frames of one camera share their weights."""
+    groups: dict[int, list[int]] = {}
+    for number, frame in enumerate(frames):
+        groups.setdefault(id(frame.weights), []).append(number)
+    return list(groups.values())
+
+
 def _picture_index(step: int, count: int, seed: int) -> int:
-    """Picture of a step of the second stage: all pictures in random order, reshuffled every epoch."""
+    """Picture (or camera) of a step of the second stage: all of them in random order, reshuffled every epoch."""
     return int(np.random.default_rng([seed, 7, step // count]).permutation(count)[step % count])
 
 
@@ -255,7 +286,7 @@ def _optimiser(appearance: Appearance) -> torch.optim.Adam:
     """Adam with one parameter group per entry of `RATES`."""
     groups: dict[str, list[torch.nn.Parameter]] = {}
     for name, parameter in appearance.named_parameters():
-        groups.setdefault(name.split(".")[0], []).append(parameter)
+        groups.setdefault(name if name in RATES else name.split(".")[0], []).append(parameter)
     return torch.optim.Adam(
         [{"params": group, "lr": RATES[name], "name": name} for name, group in groups.items()], eps=1e-15, fused=True
     )
@@ -399,6 +430,8 @@ def load_checkpoint(path: Path, appearance: Appearance, optimiser: torch.optim.A
         raise InputError(path, "a checkpoint of another run", got=f"another {told}", cure=cure)
     for name, parameter in appearance.named_parameters():
         parameter.data.copy_(tensors[f"value.{name}"])
+        if f"step.{name}" not in tensors:  # has had no gradient yet
+            continue
         optimiser.state[parameter] = {
             "step": tensors[f"step.{name}"].reshape(()),
             "exp_avg": tensors[f"exp_avg.{name}"],

@@ -103,7 +103,7 @@ def relit_frames(
         weights = view_weights(front_facing_splats(surfels, camera), camera, subpixels=2)
         for time, light, state in lights:
             image = relight_view(view, light).surface * np.float32(np.pi / state.global_lx)
-            frames.append(TrainingFrame(weights, time, image, view.coverage > 0.999))
+            frames.append(TrainingFrame(weights, time, image, view.coverage > 0.999, camera))
         if progress is not None:
             progress((number + 1) / len(cameras))
     return frames

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from seasonscapes.relighting.luminous_efficacy import efficacies_lm_w
 from seasonscapes.rendering.coefficients import SamplingOptions
-from seasonscapes.rendering.hemisphere_rays import RayScene
-from seasonscapes.rendering.irradiance import irradiance_blocks
+from seasonscapes.rendering.hemisphere_rays import RayScene, SurfacePoints
+from seasonscapes.rendering.irradiance import Irradiance, irradiance_blocks
 from seasonscapes.sky.illumination import Illumination, diffuse_horizontal_illuminance, luminance
 
 Progress = Callable[[float], None]
@@ -132,49 +132,26 @@ class IlluminationSeries:
 
 
 def integrate_irradiance(
-    terrain: RayScene,
-    positions: np.ndarray,
-    series: IlluminationSeries,
-    *,
-    sampling: SamplingOptions | None = None,
-    search_m: float = 2.0,
-    seed: int = 0,
-    progress: Progress | None = None,
+    blocks: Iterable[tuple[np.ndarray, SurfacePoints, Iterator[Irradiance]]], count: int, series: IlluminationSeries
 ) -> IntegratedIrradiance:
-    """Sum the irradiance of surface points over several instants.
+    """Sum the irradiance of N surface points over several instants.
 
     Parameters
     ----------
-    terrain
-        From `rendering.hemisphere_rays.ray_scene`.
-    positions
-        ``(N, 3)`` positions on the terrain, ENU [m]; NaN for none.
+    blocks
+        From `rendering.irradiance.irradiance_blocks` or `kept_irradiance`, for the illuminations of ``series``.
+    count
+        Number N of the points.
     series
         Illuminations at the instants and their weights.
-    sampling
-        Sampling options; defaults if ``None``.
-    search_m
-        See `rendering.irradiance.surface_at`.
-    seed
-        Of the sampling.
-    progress
-        Called with the completed fraction.
 
     Returns
     -------
     IntegratedIrradiance
         Weighted sums of irradiance, illuminance and sunshine.
-
-    Raises
-    ------
-    ValueError
-        If none of the positions lies on the terrain.
     """
     efficacies = [_efficacies(light) for light in series.lights]
-    sums = np.full((len(positions), 5), np.nan, np.float32)
-    blocks = irradiance_blocks(
-        terrain, positions, series.lights, sampling, seed=seed, search_m=search_m, progress=progress
-    )
+    sums = np.full((count, 5), np.nan, np.float32)
     for index, points, results in blocks:
         total = np.zeros((len(index), 5), np.float64)
         for light, weight, (direct, diffuse), received in zip(

@@ -23,7 +23,7 @@ from seasonscapes.rendering.receivers import (
     upload_receivers,
 )
 from seasonscapes.rendering.sun_visibility import SunRays, hashed_disc_offset, sun_rays, visible_cosine
-from seasonscapes.rendering.transport import prepare_transport, trace_points
+from seasonscapes.rendering.transport import SharedTransport, prepare_transport, trace_points
 from seasonscapes.sky.illumination import Illumination
 
 # Points per block: their coefficients take about 300 bytes each.
@@ -217,6 +217,71 @@ def irradiance(
     return Irradiance(sun, np.float32(np.pi) * sky, np.float32(np.pi) * bounce)
 
 
+def point_coefficients(
+    terrain: RayScene,
+    position_m: np.ndarray,
+    sampling: SamplingOptions | None = None,
+    *,
+    seed: int = 0,
+    search_m: float = 2.0,
+    progress: Progress | None = None,
+) -> PointCoefficients:
+    """Trace the daylight coefficients of at most `BLOCK` surface points, for keeping; see `irradiance_blocks`.
+
+    Parameters
+    ----------
+    terrain, position_m, sampling, seed, search_m, progress
+        As in `irradiance_blocks`, with which the result agrees to the digit.
+
+    Returns
+    -------
+    PointCoefficients
+        Of the positions with a surface, for `kept_irradiance`.
+
+    Raises
+    ------
+    ValueError
+        If none of the positions lies on the terrain.
+    """
+    sampling = sampling or SamplingOptions()
+    shared = _shared(terrain, position_m, sampling, seed=seed, search_m=search_m)
+    points, index = surface_at(terrain, position_m, search_m=search_m)
+    return trace_points(terrain, points, sampling, shared=shared, seed=seed, number=index, progress=progress)
+
+
+def kept_irradiance(
+    terrain: RayScene,
+    position_m: np.ndarray,
+    coefficients: PointCoefficients,
+    lights: Sequence[Illumination],
+    *,
+    search_m: float = 2.0,
+) -> tuple[np.ndarray, SurfacePoints, Iterator[Irradiance]]:
+    """Compute the irradiance of surface points whose coefficients are known, as one block of `irradiance_blocks`.
+
+    Parameters
+    ----------
+    terrain, position_m, search_m
+        As `point_coefficients` was given them.
+    coefficients
+        What it returned.
+    lights
+        The illuminations.
+
+    Returns
+    -------
+    index, points, irradiances
+        As `irradiance_blocks` yields them.
+    """
+    _, index = surface_at(terrain, position_m, search_m=search_m)
+    device = DevicePoints(
+        shadow_rays(terrain, coefficients.points, index),
+        upload_receivers(coefficients.receivers),
+        upload_clusters(terrain, coefficients.clusters),
+    )
+    return index, coefficients.points, map(partial(irradiance, device), lights)
+
+
 def irradiance_blocks(
     terrain: RayScene,
     position_m: np.ndarray,
@@ -263,13 +328,7 @@ def irradiance_blocks(
     sampling = sampling or SamplingOptions()
     report = progress or (lambda fraction: None)
     valid = np.flatnonzero(np.isfinite(position_m).all(axis=1))
-    chosen = np.random.default_rng(seed).permutation(valid)[: 1 << 18]
-    pilot, found = surface_at(terrain, position_m[chosen], search_m=search_m)
-    if len(found) == 0:
-        raise ValueError(
-            "irradiance_blocks: no position lies on the terrain; check that positions and terrain share a frame"
-        )
-    shared = prepare_transport(terrain, pilot, sampling, seed=seed)
+    shared = _shared(terrain, position_m, sampling, seed=seed, search_m=search_m)
     clusters = upload_clusters(terrain, shared.clusters)
     cluster_lights = [light_clusters(clusters, light) for light in lights]
     for start in range(0, len(valid), BLOCK):
@@ -283,3 +342,15 @@ def irradiance_blocks(
             )
             yield index, points, map(partial(irradiance, device), lights, cluster_lights)
         report(min(1.0, (start + BLOCK) / len(valid)))
+
+
+def _shared(
+    terrain: RayScene, position_m: np.ndarray, sampling: SamplingOptions, *, seed: int, search_m: float
+) -> SharedTransport:
+    """What all points share, from a sample of them."""
+    valid = np.flatnonzero(np.isfinite(position_m).all(axis=1))
+    chosen = np.random.default_rng(seed).permutation(valid)[: 1 << 18]
+    pilot, found = surface_at(terrain, position_m[chosen], search_m=search_m)
+    if len(found) == 0:
+        raise ValueError("irradiance: no position lies on the terrain; check that positions and terrain share a frame")
+    return prepare_transport(terrain, pilot, sampling, seed=seed)

@@ -3,7 +3,7 @@
 Mitsuba's general ``path`` integrator spends half of its emitter samples on the sun and the other half on directions of
 the sky. Here each vertex casts one shadow ray to the sun and one to the moon, and the cosine-sampled continuation ray
 samples the sky. The expectation and the number of rays are the same, with much less noise. Water that the viewer sees,
-directly or in other water, mirrors (`water_surface`); snow that the viewer sees directly scatters (`snow_scattering`).
+directly or in other water, mirrors (`water_surface`); snow and forest that the viewer sees directly scatter (`ground_optics`).
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ import numpy as np
 from seasonscapes.cameras.panorama import Panorama
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.rendering.gbuffer import mi_rays
+from seasonscapes.rendering.ground_optics import GroundOptics
 from seasonscapes.rendering.mitsuba_scene import LUMINARY_DISTANCE_M, RenderScene
-from seasonscapes.rendering.snow_scattering import SnowOptics
 from seasonscapes.rendering.sobol import hashed, sobol_pair, uniform
-from seasonscapes.rendering.terrain_material import device_water, leaving_points, shadow_ray_start, snow_optics
+from seasonscapes.rendering.terrain_material import device_water, ground_optics, leaving_points, shadow_ray_start
 from seasonscapes.rendering.water_surface import DeviceWater
 from seasonscapes.sky.illumination import Luminary
 
@@ -135,7 +135,7 @@ def _luminaries(scene: RenderScene) -> list[_DeviceLuminary]:
 class _Reflection:
     """How lanes of paths reflect light from a direction.
 
-    ``diffuse`` and ``before``: throughput behind and before the surface; ``water`` with waves and ``snow`` with the lanes
+    ``diffuse`` and ``before``: throughput behind and before the surface; ``water`` with waves and ``optics`` with the lanes
     that they concern.
     """
 
@@ -145,27 +145,27 @@ class _Reflection:
     before: Any
     albedo: Any
     water: tuple[DeviceWater, Any] | None
-    snow: tuple[SnowOptics, Any] | None
+    optics: tuple[GroundOptics, Any] | None
 
     def towards(self, direction: Any, cosine: Any) -> Any:
         """Throughput × reflected radiance for unit normal irradiance [1/sr]."""
-        reflected = self.diffuse * cosine * dr.inv_pi * self.of_snow(direction)
+        reflected = self.diffuse * cosine * dr.inv_pi * self.of_ground(direction)
         if self.water is not None:
             water, on_water = self.water
             glitter = water.glitter(self.normal, self.viewer, direction)
             reflected += dr.select(on_water, self.before * glitter, 0.0)
         return reflected
 
-    def of_snow(self, direction: Any) -> Any:
-        """Reflection of snow relative to Lambertian ground.
+    def of_ground(self, direction: Any) -> Any:
+        """Reflection of snow and forest relative to Lambertian ground.
 
         The interpolated normal may face away from the viewer, who sees the facet all the same.
         """
         import mitsuba as mi
 
-        if self.snow is None:
+        if self.optics is None:
             return mi.Color3f(1.0)
-        optics, scatters = self.snow
+        optics, scatters = self.optics
         cosines = (dr.dot(self.normal, self.viewer), dr.dot(self.normal, direction), dr.dot(self.viewer, direction))
         return dr.select(scatters, mi.Color3f(*optics.relative(self.albedo, cosines, dr)), 1.0)
 
@@ -179,7 +179,7 @@ def _trace(scene: RenderScene, ray: Any, sample_key: Any, index: Any, max_depth:
 
     mi_terrain, mi_sky, luminaries = scene.mi_terrain, scene.mi_scene.environment(), _luminaries(scene)
     material = mi_terrain.bsdf()
-    water, snow = device_water(material), snow_optics(material)
+    water, optics = device_water(material), ground_optics(material)
 
     def step(
         ray: Any, radiance: Any, throughput: Any, depth: Any, active: Any, on_terrain: Any, seen: Any, most: Any
@@ -220,9 +220,9 @@ def _trace(scene: RenderScene, ray: Any, sample_key: Any, index: Any, max_depth:
             before=before,
             albedo=albedo,
             water=None if water is None or water.smooth else (water, on_water),
-            snow=None if snow is None else (snow, active & (depth == 0) & ~on_water),
+            optics=None if optics is None else (optics, active & (depth == 0) & ~on_water),
         )
-        throughput *= reflection.of_snow(direction)
+        throughput *= reflection.of_ground(direction)
         light = _direct_light(
             scene,
             luminaries,

@@ -13,6 +13,7 @@ import numpy as np
 from seasonscapes.rendering.air_grid import AirGrid, SkyGrid, air_grid, interpolate_air, sky_grid, sky_pixel_radiance
 from seasonscapes.rendering.coefficients import ViewCoefficients
 from seasonscapes.rendering.gbuffer import GBuffer, trace_gbuffer
+from seasonscapes.rendering.ground_optics import NUMPY, GroundOptics
 from seasonscapes.rendering.hemisphere_rays import RayScene, albedo_at
 from seasonscapes.rendering.mirrored_light import DeviceMirror, mirrored_radiance, upload_mirror
 from seasonscapes.rendering.mitsuba_scene import RenderScene
@@ -26,7 +27,6 @@ from seasonscapes.rendering.receivers import (
     upload_clusters,
     upload_receivers,
 )
-from seasonscapes.rendering.snow_scattering import SnowOptics
 from seasonscapes.rendering.sun_visibility import (
     SunRays,
     bayer_disc_offset,
@@ -34,7 +34,7 @@ from seasonscapes.rendering.sun_visibility import (
     sum_incidence,
     sun_rays,
 )
-from seasonscapes.rendering.terrain_material import snow_optics
+from seasonscapes.rendering.terrain_material import ground_optics
 from seasonscapes.rendering.transport import view_neighbours
 from seasonscapes.sky.illumination import Illumination, Luminary
 
@@ -76,8 +76,8 @@ class RelightableView:
         Grid at which sky radiance is evaluated.
     mirror
         What the water in the view mirrors; ``None`` without water.
-    snow
-        How snow scatters; ``None``: it is Lambertian.
+    optics
+        How snow and forest scatter; ``None``: they are Lambertian.
     """
 
     coefficients: ViewCoefficients
@@ -90,7 +90,7 @@ class RelightableView:
     air: AirGrid
     sky: SkyGrid
     mirror: DeviceMirror | None = None
-    snow: SnowOptics | None = None
+    optics: GroundOptics | None = None
 
 
 def relightable_view(terrain: RayScene, coefficients: ViewCoefficients) -> RelightableView:
@@ -139,7 +139,7 @@ def relightable_view(terrain: RayScene, coefficients: ViewCoefficients) -> Relig
         air,
         sky_grid(camera, np.flatnonzero(coverage.reshape(-1) < 1.0)),
         upload_mirror(terrain, coefficients),
-        snow_optics(terrain.mi_terrain.bsdf()),
+        ground_optics(terrain.mi_terrain.bsdf()),
     )
 
 
@@ -271,25 +271,25 @@ def relit_surface_radiance(view: RelightableView, illumination: Illumination) ->
     """
     clusters = light_clusters(view.clusters, illumination)
     total = np.add(*incident_light(view.receivers, clusters))
-    snow = None if view.snow is None else _SnowPixels(view, view.snow)
-    if snow is not None:
-        total *= snow.of_diffuse_light()
+    ground = None if view.optics is None else _GroundPixels(view, view.optics)
+    if ground is not None:
+        total *= ground.of_diffuse_light()
     for body in luminaries(illumination):
         light = np.asarray(body.normal_illuminance_lx, np.float32) / np.float32(np.pi)
         lit = sun_cosine(view, body)[:, None] * light
-        total += lit if snow is None else lit * snow.of_luminary(body)
+        total += lit if ground is None else lit * ground.of_luminary(body)
     radiance = total * view.coefficients.albedo
     if view.mirror is not None:
         radiance[view.mirror.coefficients.pixel] += mirrored_radiance(view.mirror, illumination, clusters)
     return radiance
 
 
-class _SnowPixels:
+class _GroundPixels:
     """Reflection of the n terrain pixels towards the camera relative to Lambertian ground, each ``(n, 3)``."""
 
-    def __init__(self, view: RelightableView, snow: SnowOptics) -> None:
+    def __init__(self, view: RelightableView, optics: GroundOptics) -> None:
         coefficients = view.coefficients
-        self._snow = snow
+        self._optics = optics
         self._albedo = list((coefficients.albedo / np.maximum(coefficients.coverage[:, None], 1e-3)).T)
         normal = coefficients.normal
         self._normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-6)
@@ -299,12 +299,12 @@ class _SnowPixels:
         self._cosine = np.einsum("nk,nk->n", self._normal, self._viewer)
 
     def of_diffuse_light(self) -> np.ndarray:
-        return np.stack(self._snow.relative_diffuse(self._albedo, self._cosine), axis=1).astype(np.float32)
+        return np.stack(self._optics.relative_diffuse(self._albedo, self._cosine), axis=1).astype(np.float32)
 
     def of_luminary(self, body: Luminary) -> np.ndarray:
         light = np.asarray(body.direction, np.float32)
         cosines = (self._cosine, self._normal @ light, self._viewer @ light)
-        return np.stack(self._snow.relative(self._albedo, cosines), axis=1).astype(np.float32)
+        return np.stack(self._optics.relative(self._albedo, cosines, NUMPY), axis=1).astype(np.float32)
 
 
 def sun_cosine(view: RelightableView, luminary: Luminary) -> np.ndarray:

@@ -64,12 +64,14 @@ def escape_function(cosine: Any) -> Any:
     return 3.0 / 7.0 * (1.0 + 2.0 * cosine)
 
 
-class _NumpyMaths:
+class NumpyMaths:
+    """Functions of NumPy under the names that the module ``drjit`` has."""
+
     exp, sqrt, minimum, maximum, acos = np.exp, np.sqrt, np.minimum, np.maximum, np.arccos
 
 
 def reflectance(
-    cosine_out: Any, cosine_in: Any, between: Any, albedo: Any, maths: Any = _NumpyMaths, factor: Any = None
+    cosine_out: Any, cosine_in: Any, between: Any, albedo: Any, maths: Any = NumpyMaths, factor: Any = None
 ) -> Any:
     """Reflectance of snow for one direction of light, as a multiple of that of a white Lambertian surface.
 
@@ -141,7 +143,7 @@ class SnowOptics:
         self.clean = None if snow.grain_mm is None else tuple(float(value) for value in snow_albedo(snow.grain_mm))
 
     @staticmethod
-    def share(red: Any, green: Any, blue: Any, maths: Any = _NumpyMaths) -> Any:
+    def share(red: Any, green: Any, blue: Any, maths: Any = NumpyMaths) -> Any:
         """How much of the ground is snow, 0 to 1, by its colour: bright, and nearly white."""
         most = maths.maximum(maths.maximum(red, green), maths.maximum(blue, 1e-4))
         least = maths.minimum(red, maths.minimum(green, blue))
@@ -150,7 +152,7 @@ class SnowOptics:
         pale = (_COLOURLESS[1] - (most - least) / most) / (_COLOURLESS[1] - _COLOURLESS[0])
         return maths.minimum(maths.maximum(maths.minimum(ramp, pale), 0.0), 1.0)
 
-    def relative(self, albedo: Any, cosines: tuple[Any, Any, Any], maths: Any = _NumpyMaths) -> list[Any]:
+    def relative(self, albedo: Any, cosines: tuple[Any, Any, Any], maths: Any = NumpyMaths) -> list[Any]:
         """Reflectance towards the viewer from one direction, divided by the albedo, in three channels.
 
         Parameters

@@ -6,6 +6,7 @@ The loop of a pixel ends when its remaining transmittance is negligible.
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -16,6 +17,8 @@ from seasonscapes.rendering.backend import point3, use_backend
 
 # Side of a tile [px]; the lanes of a tile run together.
 TILE = 4
+# Low and high 16 bits of a float32.
+_HALVES = (0, 1) if sys.byteorder == "little" else (1, 0)
 # Transmittance at which blending ends.
 _LEAST_TRANSMITTANCE = 1e-4
 
@@ -258,6 +261,13 @@ def _project(splats: DeviceSplats, camera: Camera, limits: SplatLimits) -> _Proj
     return _ProjectedSplats(*columns)
 
 
+def _ascending(values: np.ndarray) -> np.ndarray:
+    """Stable order of positive float32 numbers; by halves of their bits, for which NumPy has a radix sort."""
+    low, high = (np.ascontiguousarray(values.view(np.uint16)[half::2]) for half in _HALVES)
+    order = np.argsort(low, kind="stable")
+    return order[np.argsort(high[order], kind="stable")]
+
+
 def _tile_lists(projected: _ProjectedSplats, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Splats of all tiles, nearest first ``(K,)``, and the start of each tile's list ``(tiles + 1,)``, both uint32."""
     from scipy import sparse
@@ -274,7 +284,7 @@ def _tile_lists(projected: _ProjectedSplats, camera: Camera) -> tuple[np.ndarray
         & (cy + extent_y > 0.0)
         & (cy - extent_y < camera.height_px)
     )
-    inside = inside[np.argsort(depth[inside], kind="stable")]
+    inside = inside[_ascending(depth[inside])]
 
     def tiles(centre: np.ndarray, extent: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
         # Pixel centres lie half a pixel inside: a box that only touches the edge of a tile contains none of them.

@@ -10,7 +10,8 @@ slopes show no triangles. A facet is lit and seen as the surface that it approxi
   in Ray Tracing Gems II, doi:10.1007/978-1-4842-7185-8_4), and not from the facet, whose plane would cut them off.
 
 Water (`water_surface`) mirrors where the viewer sees it, directly or in other water; lit by it or seen in the diffuse light
-of other ground, it is Lambertian. So is snow (`snow_scattering`) but for the light that it sends to the viewer directly.
+of other ground, it is Lambertian. So are snow (`snow_scattering`) and forest (`forest_scattering`) but for the light that
+they send to the viewer directly.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import numpy as np
 from seasonscapes.frames import MEAN_RADIUS_M
 from seasonscapes.rendering.albedo_detail import DeviceDetail
 from seasonscapes.rendering.backend import use_backend
+from seasonscapes.rendering.ground_optics import GroundOptics, optics_of
 from seasonscapes.rendering.snow_scattering import SnowOptics
 from seasonscapes.rendering.water_surface import REFRACTIVE_INDEX, DeviceWater, slope_variance
 from seasonscapes.terrain.surface import RIM_SHARE, SurfaceGrid, Terrain
@@ -180,9 +182,9 @@ def device_water(material: Any) -> DeviceWater | None:
     return getattr(material, "water", None)
 
 
-def snow_optics(material: Any) -> SnowOptics | None:
-    """The snow of a terrain's material; ``None`` where it has none, or where it is that of the scalar variant."""
-    return getattr(material, "snow", None)
+def ground_optics(material: Any) -> GroundOptics | None:
+    """Snow and forest of a terrain's material; ``None`` where it has none, or where it is that of the scalar variant."""
+    return getattr(material, "optics", None)
 
 
 def device_surface(material: Any) -> DeviceSurface | None:
@@ -221,7 +223,7 @@ def terrain_material(reflectance: dict[str, Any], terrain: Terrain, *, smooth: b
     reflectance
         Mitsuba's dictionary of a texture.
     terrain
-        Its smooth surface, its water and its snow.
+        Its smooth surface, its water, its snow and its forest.
     smooth
         Shade with the normals of the smooth surface; else with those of the mesh. The scalar variant, which would call
         Python for every sample, has Mitsuba's own materials with the normals of the mesh.
@@ -243,6 +245,7 @@ def terrain_material(reflectance: dict[str, Any], terrain: Terrain, *, smooth: b
     material.surface = DeviceSurface(terrain.surface) if smooth and terrain.surface is not None else None
     material.detail = None if terrain.detail is None else DeviceDetail(terrain.detail)
     material.snow = None if terrain.snow is None else SnowOptics(terrain.snow)
+    material.optics = optics_of(terrain)
     material.water = None if terrain.water is None else DeviceWater(terrain.water, terrain.frame)
     return material
 
@@ -287,6 +290,7 @@ def _material_class() -> Any:
             self.surface: Any = None
             self.water: Any = None
             self.snow: Any = None
+            self.optics: Any = None
             self.detail: Any = None
             flags = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
             self.m_components, self.m_flags = [flags], flags

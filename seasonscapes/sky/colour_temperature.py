@@ -12,16 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
+from seasonscapes.images import XYZ_FROM_REC709
+
 _FILE = Path(__file__).with_name("planckian_locus.npz")
 _LOWEST_K, _HIGHEST_K, _STEP = 1000.0, 100_000.0, 1.0025
-# Linear Rec.709 to CIE XYZ (ITU-R BT.709-6), as colour-science derives it.
-_XYZ_FROM_RGB = np.array(
-    [
-        [0.4123907992659595, 0.3575843393838780, 0.1804807884018343],
-        [0.2126390058715104, 0.7151686787677559, 0.0721923153607337],
-        [0.0193308187155918, 0.1191947797946259, 0.9505321522496608],
-    ]
-)
 # Beyond this distance from the locus in (u, v) the triangular solution is less accurate than the parabolic one.
 _TRIANGULAR_DUV = 0.002
 _MAX_DUV = 0.05
@@ -73,7 +67,7 @@ def correlated_colour_temperature_k(rgb: np.ndarray) -> float | None:
     >>> round(correlated_colour_temperature_k([1.0, 1.0, 1.0]))
     6503
     """
-    xyz = _XYZ_FROM_RGB @ np.asarray(rgb, float)
+    xyz = XYZ_FROM_REC709 @ np.asarray(rgb, float)
     if not np.all(np.isfinite(xyz)) or xyz.sum() <= 0.0 or np.any(xyz < 0.0):
         return None
     denominator = xyz[0] + 15.0 * xyz[1] + 3.0 * xyz[2]

@@ -33,6 +33,7 @@ from seasonscapes.sky.overcast import (
     overcast,
     overcast_rgb,
 )
+from seasonscapes.sky.shipped_tables import shipped_tables
 from seasonscapes.sky.spectrum import WAVELENGTHS_NM, angstrom_ratio, rayleigh_optical_depth
 
 TablesOf = Callable[[Atmosphere], AtmosphereTables]
@@ -55,7 +56,7 @@ _MAX_SUN_FOR_MOONLIGHT_DEG, _MIN_MOON_DEG = 0.0, -9.0
 
 @lru_cache(maxsize=4)
 def tables_in_memory(atmosphere: Atmosphere) -> AtmosphereTables:
-    """Compute `atmosphere_tables` with a cache in memory.
+    """The tables of an atmosphere, shipped or computed, with a cache in memory.
 
     Parameters
     ----------
@@ -67,7 +68,7 @@ def tables_in_memory(atmosphere: Atmosphere) -> AtmosphereTables:
     AtmosphereTables
         Tables of the atmosphere.
     """
-    return atmosphere_tables(atmosphere)
+    return shipped_tables(atmosphere) or atmosphere_tables(atmosphere)
 
 
 @dataclass(frozen=True)
@@ -77,8 +78,8 @@ class SkyEvaluators:
     Parameters
     ----------
     tables_of
-        Function that returns the tables of an atmosphere, for example from a cache on disk. The default computes them
-        once per process, in tens of seconds.
+        Function that returns the tables of an atmosphere, for example from a cache on disk. The default loads those of
+        the bundled models and computes others once per process, in seconds.
     hosek
         Function that evaluates models of kind ``hosek``: `seasonscapes.rendering.hosek.hosek_illumination`.
     """

@@ -11,6 +11,7 @@ from seasonscapes.frames import equirectangular_directions
 from seasonscapes.sky.ephemeris import LunarPosition, SolarPosition
 from seasonscapes.sky.illumination import Illumination, diffuse_horizontal_illuminance, luminance
 from seasonscapes.sky.night import moon_to_sun_ratio, night_sky_radiance
+from seasonscapes.sky.spectrum import RGB_FROM_XYZ
 
 # Clear horizontal illuminance [lx] by solar elevation [deg]: the fits of Seidelmann (ed.), Explanatory Supplement to
 # the Astronomical Almanac (1992), § 9.3, less the night sky of 6.2e-4 lx that is included in measurements below -12°.
@@ -108,13 +109,8 @@ def daylight_rgb(cct_k: float) -> np.ndarray:
     else:
         x = -2.0064e9 / t**3 + 1.9018e6 / t**2 + 0.24748e3 / t + 0.237040
     y = -3.0 * x**2 + 2.870 * x - 0.275
-    rgb = _REC709_FROM_XYZ @ np.array([x / y, 1.0, (1.0 - x - y) / y])
+    rgb = RGB_FROM_XYZ @ np.array([x / y, 1.0, (1.0 - x - y) / y])
     return rgb / luminance(rgb)
-
-
-_REC709_FROM_XYZ = np.array(
-    [[3.2409699, -1.5373832, -0.4986108], [-0.9692436, 1.8759675, 0.0415551], [0.0556301, -0.2039770, 1.0569715]]
-)
 
 
 def overcast_rgb(sun_elevation_deg: float) -> np.ndarray:

@@ -12,14 +12,13 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike
 
+from seasonscapes.images import XYZ_FROM_REC709
+
 # Chosen by Nelder-Mead search so that nine samples of a transfer give the CIE XYZ of daylight, twilight and of the sun
 # through any air mass; `rgb_from_transfer` fits their weights and tests/test_atmosphere_air.py bounds the error.
 WAVELENGTHS_NM = np.array([421.0, 454.0, 481.0, 516.0, 540.0, 579.0, 612.0, 646.0, 701.0])
 
-# XYZ → linear Rec.709 with D65 white (ITU-R BT.709-6); the second row of its inverse gives luminance Y in lux or cd/m².
-RGB_FROM_XYZ = np.linalg.inv(
-    [[0.4123908, 0.3575843, 0.1804808], [0.2126390, 0.7151687, 0.0721923], [0.0193308, 0.1191948, 0.9505322]]
-)
+RGB_FROM_XYZ = np.linalg.inv(XYZ_FROM_REC709)
 
 BIN_CENTRES_NM = np.arange(365.0, 830.0, 10.0)
 

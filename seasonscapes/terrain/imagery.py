@@ -124,8 +124,9 @@ def bake_imagery(terrain: Terrain, atlas: Atlas, image: Raster, *, gutter_px: in
     positions, face_id = texel_positions(terrain, atlas.width_px, atlas.height_px)
     values = np.zeros((atlas.height_px, atlas.width_px, 3), np.float32)
     weight = np.zeros((atlas.height_px, atlas.width_px), np.float32)
-    pyramid, pixels_of = _pyramid(image.values), pixel_map(terrain, image)
+    pixels_of = pixel_map(terrain, image)
     footprint = _face_footprints(terrain, atlas, pixels_of)
+    pyramid = _pyramid(image.values, 2 + int(_mip_level(footprint).max()))
     texel = np.flatnonzero(face_id >= 0)
     for start in range(0, len(texel), _CHUNK):
         part = texel[start : start + _CHUNK]
@@ -238,23 +239,40 @@ def _face_footprints(terrain: Terrain, atlas: Atlas, pixels_of: Callable[[np.nda
     return footprint
 
 
-def _pyramid(values: np.ndarray) -> list[np.ndarray]:
-    """Mip levels ``(H, W, C + 1)`` of premultiplied colour and coverage, each the 2 × 2 box mean of the previous one."""
+# Zeros around the levels of a pyramid, so that interpolation outside the image needs no test [pixels].
+_RIM_PX = 3
+
+
+def _footprint_side(footprint: np.ndarray) -> np.ndarray:
+    """Side ``(N,)`` of the samples along footprints ``(N, 4)`` [image pixels], at least 1."""
+    return np.maximum(np.maximum(footprint[:, 3], footprint[:, 2] / _MAX_ANISOTROPY), 1.0)
+
+
+def _mip_level(footprint: np.ndarray) -> np.ndarray:
+    """Level ``(N,)`` of the pyramid for footprints ``(N, 4)``, with fractions."""
+    return np.log2(_footprint_side(footprint))
+
+
+def _pyramid(values: np.ndarray, most: int) -> list[np.ndarray]:
+    """At most ``most`` mip levels ``(H, W, C + 1)`` of premultiplied colour and coverage, each within a rim of zeros.
+
+    A level is the 2 × 2 box mean of the previous one.
+    """
     known = np.isfinite(values).all(axis=2, keepdims=True)
     levels = [np.concatenate([np.where(known, values, 0.0), known], axis=2).astype(np.float32)]
-    while max(levels[-1].shape[:2]) > 1:
+    while max(levels[-1].shape[:2]) > 1 and len(levels) < most:
         level = levels[-1]
         level = np.pad(level, ((0, level.shape[0] % 2), (0, level.shape[1] % 2), (0, 0)))
-        levels.append(level.reshape(level.shape[0] // 2, 2, level.shape[1] // 2, 2, -1).mean(axis=(1, 3)))
-    return levels
+        rows = level[0::2] + level[1::2]
+        levels.append((rows[:, 0::2] + rows[:, 1::2]) * np.float32(0.25))
+    return [np.pad(level, ((_RIM_PX, _RIM_PX), (_RIM_PX, _RIM_PX), (0, 0))) for level in levels]
 
 
 def _filtered(pyramid: list[np.ndarray], pixel: np.ndarray, footprint: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean colour ``(N, 3)`` and coverage ``(N,)`` over the footprints ``(N, 4)`` at pixels ``(N, 2)``."""
-    major, longer, shorter = footprint[:, :2], footprint[:, 2], footprint[:, 3]
-    side = np.maximum(np.maximum(shorter, longer / _MAX_ANISOTROPY), 1.0)
-    taps = np.ceil(np.maximum(longer, 1.0) / side - 1e-3).astype(int)
-    level = np.clip(np.log2(side), 0.0, len(pyramid) - 1.0)
+    major, longer = footprint[:, :2], footprint[:, 2]
+    taps = np.ceil(np.maximum(longer, 1.0) / _footprint_side(footprint) - 1e-3).astype(int)
+    level = np.clip(_mip_level(footprint), 0.0, len(pyramid) - 1.0)
     result = np.zeros((len(pixel), pyramid[0].shape[2]), np.float32)
     base = np.floor(level).astype(int)
     for count, lower in product(range(1, taps.max() + 1), range(base.min(), base.max() + 1)):
@@ -263,10 +281,13 @@ def _filtered(pyramid: list[np.ndarray], pixel: np.ndarray, footprint: np.ndarra
             continue
         blend = (level[chosen] - lower)[:, None].astype(np.float32)
         for tap in range(count):
-            at = pixel[chosen] + ((tap + 0.5) / count - 0.5) * major[chosen]
-            sample = _bilinear(pyramid[lower], at / 2.0**lower) * (1.0 - blend)
+            at = pixel[chosen]
+            if count > 1:
+                at = at + ((tap + 0.5) / count - 0.5) * major[chosen]
+            sample = _bilinear(pyramid[lower], at / 2.0**lower)
             if blend.any():
-                sample += _bilinear(pyramid[lower + 1], at / 2.0 ** (lower + 1)) * blend
+                coarser = _bilinear(pyramid[lower + 1], at / 2.0 ** (lower + 1))
+                sample = sample * (1.0 - blend) + coarser * blend
             result[chosen] += sample / count
     coverage = result[:, -1]
     rgb = np.where(coverage[:, None] > 1e-6, result[:, :-1] / np.maximum(coverage, 1e-6)[:, None], 0.0)
@@ -274,18 +295,17 @@ def _filtered(pyramid: list[np.ndarray], pixel: np.ndarray, footprint: np.ndarra
 
 
 def _bilinear(level: np.ndarray, pixel: np.ndarray) -> np.ndarray:
-    """Bilinear interpolation ``(N, C)`` at pixels ``(N, 2)``, with zeros outside the image."""
+    """Bilinear interpolation ``(N, C)`` at pixels ``(N, 2)`` of a level within its rim, with zeros outside the image."""
     height, width = level.shape[:2]
-    column, row = np.clip(np.nan_to_num(pixel, posinf=-9.0, neginf=-9.0) - 0.5, -2.0, [width + 1.0, height + 1.0]).T
-    column0, row0 = np.floor(column).astype(int), np.floor(row).astype(int)
-    fx, fy = (column - column0).astype(np.float32), (row - row0).astype(np.float32)
-    total = np.zeros((len(pixel), level.shape[2]), np.float32)
-    for r, wy in ((row0, 1.0 - fy), (row0 + 1, fy)):
-        for c, wx in ((column0, 1.0 - fx), (column0 + 1, fx)):
-            inside = (r >= 0) & (r < height) & (c >= 0) & (c < width)
-            weight = np.where(inside, wy * wx, np.float32(0.0))
-            total += weight[:, None] * level[np.clip(r, 0, height - 1), np.clip(c, 0, width - 1)]
-    return total
+    # Columns and rows of the level with its rim; what lies outside reads two zeros.
+    last = np.array([width - 2.0, height - 2.0])
+    place = np.clip(np.nan_to_num(pixel, nan=-9.0, posinf=-9.0, neginf=-9.0) + (_RIM_PX - 0.5), 0.0, last)
+    first = place.astype(np.int64)
+    fx, fy = (place - first).astype(np.float32).T[..., None]
+    flat, index = level.reshape(-1, level.shape[2]), first[:, 1] * width + first[:, 0]
+    upper = flat[index] * (1.0 - fx) + flat[index + 1] * fx
+    lower = flat[index + width] * (1.0 - fx) + flat[index + width + 1] * fx
+    return upper * (1.0 - fy) + lower * fy
 
 
 def dilate(texture: Texture, covered: np.ndarray, gutter_px: int) -> Texture:

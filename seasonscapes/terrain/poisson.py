@@ -1,6 +1,6 @@
 """Screened Poisson reconstruction of the surface through an elevation raster, as in the SeasonScapes paper.
 
-The samples and their normals are oriented points. The indicator χ of the ground (½ below, −½ above) minimises
+The samples and their normals are oriented points (`terrain.point_cloud`). The indicator χ of the ground (½ below, −½ above) minimises
 
     ∫ |∇χ − V|² dx  +  α / h ∫ χ² dA,
 
@@ -24,6 +24,7 @@ from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import cg
 
 from seasonscapes.terrain.placement import cell_sides_m
+from seasonscapes.terrain.point_cloud import OrientedPoints, oriented_points
 from seasonscapes.terrain.surface import Raster
 
 # Weight α of the samples, the one of the authors' program and of Open3D.
@@ -36,13 +37,13 @@ _TILE, _OVERLAP = 192, 22
 _TOLERANCE = 1e-5
 
 
-def poisson_raster(raster: Raster, *, screening: float = SCREENING) -> Raster:
-    """Replace the heights of a raster by those of its screened Poisson surface.
+def poisson_raster(points: OrientedPoints | Raster, *, screening: float = SCREENING) -> Raster:
+    """Reconstruct the screened Poisson surface of a point cloud on a raster.
 
     Parameters
     ----------
-    raster
-        ``values`` ``(H, W, 1)`` heights [m] without holes, at least 2 × 2.
+    points
+        Samples with normals, at least 2 × 2; of a raster without them, those of `oriented_points`.
     screening
         Weight of the samples against that of their normals; larger values follow the samples more closely.
 
@@ -67,17 +68,20 @@ def poisson_raster(raster: Raster, *, screening: float = SCREENING) -> Raster:
     """
     if not screening > 0.0:
         raise ValueError(f"screening: got {screening}, expected a positive weight")
+    if isinstance(points, Raster):
+        points = oriented_points(points)
+    raster = points.raster
     heights = raster.values[..., 0].astype(np.float64)
     # The slope continues beyond the border; a raster of few samples is reflected more than once.
     padded = np.pad(heights, _OVERLAP, mode="reflect", reflect_type="odd")
+    slopes = _padded_slopes(points.normals)
     sides_m = cell_sides_m(raster)
     result = np.empty_like(heights)
     for rows, columns in _tiles(heights.shape):
-        around = padded[
-            rows.start : rows.stop + 2 * _OVERLAP, columns.start : columns.stop + 2 * _OVERLAP
-        ]  # with its overlap, since the padding shifts by as much
+        # With its overlap, since the padding shifts by as much.
+        around = slice(rows.start, rows.stop + 2 * _OVERLAP), slice(columns.start, columns.stop + 2 * _OVERLAP)
         inner = slice(_OVERLAP, -_OVERLAP)
-        result[rows, columns] = _surface(around, sides_m, screening)[inner, inner]
+        result[rows, columns] = _surface(padded[around], slopes[around], sides_m, screening)[inner, inner]
     return replace(raster, values=result[..., None].astype(np.float32))
 
 
@@ -120,15 +124,36 @@ def _band(level: np.ndarray) -> _Band:
     return _Band(low, count, start, column, np.arange(len(column)) - start[column] + low.ravel()[column])
 
 
-def _surface(heights: np.ndarray, sides_m: tuple[float, float], screening: float) -> np.ndarray:
-    """Heights ``(H, W)`` [m] of the surface χ = 0 through samples ``(H, W)`` [m] of cells ``(dx, dy)`` [m]."""
+def _padded_slopes(normals: np.ndarray) -> np.ndarray:
+    """Slopes ``(…, …, 2)`` along columns and rows of normals, continued as the padded heights are."""
+    slopes = -normals[..., :2].astype(np.float64) / normals[..., 2:]
+    padded = []
+    for component, own in enumerate((1, 0)):
+        # Heights are reflected oddly: the slope across a border evenly, that along it oddly.
+        values = slopes[..., component]
+        for axis in (0, 1):
+            margin = [(0, 0), (0, 0)]
+            margin[axis] = (_OVERLAP, _OVERLAP)
+            values = np.pad(values, margin, mode="reflect", reflect_type="even" if axis == own else "odd")
+        padded.append(values)
+    return np.stack(padded, axis=-1)
+
+
+def _surface(heights: np.ndarray, slopes: np.ndarray, sides_m: tuple[float, float], screening: float) -> np.ndarray:
+    """Heights ``(H, W)`` [m] of the surface χ = 0 through samples ``(H, W)`` [m] with slopes ``(H, W, 2)``.
+
+    Cells have sides ``(dx, dy)`` [m].
+    """
     dx, dy = sides_m
     dz = float(np.sqrt(dx * dy))
     # Levels begin at zero height in every tile, so that tiles share one grid.
     level = heights / dz
     band = _band(level)
     size = len(band.column)
-    normals, extent = _slopes(level, dx, dy, dz)
+    normals = np.concatenate([-slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    # Of a cell's ground along up [levels].
+    extent = (np.abs(slopes[..., 0]) * dx + np.abs(slopes[..., 1]) * dy) / dz
     field = _splatted_normals(band, level, normals, extent) / dz
 
     diagonal, right = np.zeros(size), np.zeros(size)
@@ -181,14 +206,6 @@ def _surface(heights: np.ndarray, sides_m: tuple[float, float], screening: float
     if failed:
         raise RuntimeError("screened Poisson: conjugate gradients did not converge")
     return dz * _topmost_root(band, chi)
-
-
-def _slopes(level: np.ndarray, dx: float, dy: float, dz: float) -> tuple[np.ndarray, np.ndarray]:
-    """Unit normals ``(H, W, 3)`` along columns, rows and up, and the extent of a cell's ground along up [levels]."""
-    along_rows, along_columns = np.gradient(level)
-    normals = np.stack([-along_columns * dz / dx, -along_rows * dz / dy, np.ones_like(level)], axis=-1)
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    return normals, np.abs(along_rows) + np.abs(along_columns)
 
 
 def _splatted_normals(band: _Band, level: np.ndarray, normals: np.ndarray, extent: np.ndarray) -> np.ndarray:

@@ -176,6 +176,8 @@ class Terrain:
         Its open water, which mirrors; ``None``: water is Lambertian.
     snow
         How its snow scatters; ``None``: snow is Lambertian.
+    forest
+        Whether its forests have a hot spot, or are Lambertian.
     detail
         Detail of the albedo below its texels, for one camera; ``None``: the texture alone. `save_terrain` leaves it out.
     """
@@ -188,6 +190,7 @@ class Terrain:
     normals: np.ndarray | None = None
     water: Water | None = None
     snow: Snow | None = None
+    forest: bool = False
     detail: AlbedoDetail | None = None
 
 
@@ -327,6 +330,8 @@ def save_terrain(terrain: Terrain, path: str | os.PathLike[str], *, note: dict[s
         arrays |= {"water": np.round(terrain.water.mask * 255.0).astype(np.uint8), "water_wind": terrain.water.wind_m_s}
     if terrain.snow is not None:
         arrays["snow_grain_mm"] = np.nan if terrain.snow.grain_mm is None else terrain.snow.grain_mm
+    if terrain.forest:
+        arrays["forest"] = True
     np.savez(path, note=json.dumps(note or {}), **arrays)
 
 
@@ -363,6 +368,7 @@ def load_terrain(path: str | os.PathLike[str]) -> tuple[Terrain, dict[str, Any]]
         if "snow_grain_mm" in stored:
             grain = float(stored["snow_grain_mm"])
             terrain = replace(terrain, snow=Snow(None if np.isnan(grain) else grain))
+        terrain = replace(terrain, forest="forest" in stored)
         return terrain, json.loads(str(stored["note"]))
 
 

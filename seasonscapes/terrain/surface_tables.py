@@ -51,3 +51,15 @@ class SnowTable(Declaration):
         if self.grain_mm is not None and not self.scattering:
             raise ValueError("'grain_mm' is of snow that scatters: drop it, or scattering = false")
         return self
+
+
+class ForestTable(Declaration):
+    """Forest, which lies where the albedo is dark and green. Without this table it is matt as all other ground.
+
+    Parameters
+    ----------
+    hot_spot
+        Whether it is brighter with the sun behind the viewer, where no shadow of a crown is seen, than towards the sun.
+    """
+
+    hot_spot: bool = True

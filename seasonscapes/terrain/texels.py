@@ -136,14 +136,22 @@ def texel_positions(terrain: Terrain, width: int, height: int) -> tuple[np.ndarr
     """
     xy = texel_coordinates(terrain.uv, width, height)
     face_id = covering_faces(xy, terrain.faces, width, height)
+    # Over a face the position is linear in the texel: its gradients are computed once for each face.
+    corner, vertices = xy[terrain.faces[:, 0]], terrain.vertices.astype(np.float64)
+    (t1, t2), (p1, p2) = (
+        [values[terrain.faces[:, k]] - values[terrain.faces[:, 0]] for k in (1, 2)] for values in (xy, vertices)
+    )
+    determinant = _cross(t1, t2)[:, None]
+    # Faces of zero UV area cover no texel.
+    determinant = np.where(determinant == 0.0, np.inf, determinant)
+    across, down = (p1 * t2[:, 1:] - p2 * t1[:, 1:]) / determinant, (p2 * t1[:, :1] - p1 * t2[:, :1]) / determinant
+    start_m = vertices[terrain.faces[:, 0]] - across * corner[:, :1] - down * corner[:, 1:]
     positions = np.full((height, width, 3), np.nan, np.float32)
     flat, texel = positions.reshape(-1, 3), np.flatnonzero(face_id >= 0)
     for start in range(0, len(texel), _CHUNK_TEXELS):
         part = texel[start : start + _CHUNK_TEXELS]
-        corners = terrain.faces[face_id.ravel()[part]]
-        centre = np.stack([part % width, part // width], axis=-1) + 0.5
-        weights = barycentric(xy[corners], centre)
-        flat[part] = np.einsum("nk,nkc->nc", weights, terrain.vertices[corners])
+        face, (row, column) = face_id.ravel()[part], np.divmod(part, width)
+        flat[part] = start_m[face] + across[face] * (column + 0.5)[:, None] + down[face] * (row + 0.5)[:, None]
     return positions, face_id
 
 

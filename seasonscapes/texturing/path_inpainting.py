@@ -67,6 +67,8 @@ class PathInpaintingInputs:
     base
         ``(R, S, 3)`` completed radiance [cd/m²] as the initial estimate in holes (*hybrid*: the model only adds
         detail), or ``None``.
+    white
+        Radiance that pictures show as white [cd/m²]; ``None`` takes it from the painted texels.
     """
 
     texture: Texture
@@ -74,6 +76,7 @@ class PathInpaintingInputs:
     tiling: AtlasTiling
     terrain: RayScene
     base: np.ndarray | None = None
+    white: float | None = None
 
 
 @dataclass(frozen=True)
@@ -204,14 +207,14 @@ def inpaint_along_path(
     Raises
     ------
     NotEnoughEvidence
-        The texture has no painted texel.
+        The texture has no painted texel, and no radiance of white is given.
     ValueError
         The model returns a picture of another size or values that are not finite.
     """
-    if not state.painted.any():
+    if inputs.white is None and not state.painted.any():
         raise NotEnoughEvidence("inpaint_along_path: no painted texel: there is nothing to continue from")
     report = progress or (lambda fraction: None)
-    white = white_radiance(state.values, state.painted)
+    white = white_radiance(state.values, state.painted) if inputs.white is None else inputs.white
     count = len(inputs.cameras)
     for index in range(count):
         step = load_step(folder, index)

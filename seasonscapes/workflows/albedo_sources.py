@@ -49,7 +49,7 @@ GREY_ALBEDO = 0.2
 # Day of an albedo that states none.
 _UNDATED = date(2024, 7, 1)
 # A synthetic place has no satellite; its albedo of this day of the year stands for a summer image.
-_IMAGE_DAY = 205
+IMAGE_DAY = 205
 # The albedo of a synthetic place is known for every day; films interpolate between these days of each month.
 _FILM_DAYS = (1, 16)
 
@@ -109,7 +109,7 @@ def scene_albedo(place: Place, day: date | str, *, progress: Progress | None = N
             f"albedo-day{day_of_year:03d}",
             inputs | {"day_of_year": day_of_year},
             code=_SYNTHETIC_CODE,
-            build=lambda: bake_imagery(place.terrain, place.atlas, _synthetic_image(place, day_of_year)),
+            build=lambda: bake_imagery(place.terrain, place.atlas, synthetic_image(place, day_of_year)),
         )
     images = place.scene.images
     if len(images) > 1:
@@ -185,7 +185,7 @@ def orthoimage(place: Place, day: date) -> Texture | None:
     The image of a synthetic place is its albedo of a summer day; only the year of ``day`` matters.
     """
     if place.synthetic is not None:
-        return scene_albedo(place, day.replace(month=1, day=1) + timedelta(days=_IMAGE_DAY - 1))
+        return scene_albedo(place, day.replace(month=1, day=1) + timedelta(days=IMAGE_DAY - 1))
     return scene_albedo(place, day) if place.scene.images else None
 
 
@@ -405,7 +405,7 @@ def chosen_albedo(place: Place, day: date, albedo: AlbedoSource = None, *, progr
     return albedo_of_day(place, AlbedoSeries((albedo,)) if isinstance(albedo, DatedAlbedo) else albedo, day)
 
 
-def _synthetic_image(place: Place, day_of_year: int) -> Raster:
+def synthetic_image(place: Place, day_of_year: int) -> Raster:
     """The true albedo of a synthetic place on its own finer grid."""
     from affine import Affine
 

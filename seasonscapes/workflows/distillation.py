@@ -57,6 +57,8 @@ class DistilOptions:
         Training steps on the surface, and on images.
     kind
         ``"full"`` (physics and a network), ``"physical"`` (no network) or ``"sun"`` (a network alone, for comparison).
+    refine_discs
+        Whether the images also refine place, size, direction and opacity of the discs.
 
     Examples
     --------
@@ -68,11 +70,12 @@ class DistilOptions:
     discs: int = 320
     suns: int = 32
     dates: int = 4
-    views: int = 3
+    views: int = 6
     view_px: int = 256
     steps: int = 2500
     picture_steps: int = 240
     kind: str = "full"
+    refine_discs: bool = True
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -194,6 +197,7 @@ def distil_with_data(
     """`distil`, with the training data and losses."""
     require_torch()
     from seasonscapes.gaussians.appearance import Appearance, fourier_embedding
+    from seasonscapes.gaussians.disc_geometry import DiscGeometry
     from seasonscapes.gaussians.model import model_from
     from seasonscapes.gaussians.rasterise import set_torch_threads
     from seasonscapes.gaussians.splat_view import learned_parameters
@@ -213,6 +217,8 @@ def distil_with_data(
         times=options.suns,
         seed=seed,
     )
+    if options.refine_discs and data.frames:
+        appearance.refine(DiscGeometry(data.surfels))
     losses = train(
         appearance,
         data.targets,
@@ -329,7 +335,7 @@ def distillation_data(
             received[own] = surfel_irradiance(
                 scene, surfels, [lights[number] for number in own], rays=128, seed=seed, progress=report
             )
-        # Images of one date suffice: they determine the splats' width, not the season.
+        # Images of one date suffice: they determine the splats' shapes, not the season.
         if season == len(days) // 2 and options.views and own:
             wanted = [(number, lights[number], states[number]) for number in own]
             report = task_progress(progress, "pictures")
@@ -393,5 +399,6 @@ def distillation_record(place: Place, distilled: Distilled) -> dict[str, Any]:
         "bytes_per_gaussian": round(bytes_per_gaussian(distilled.model), 1),
         "suns": len(distilled.data.times),
         "dates": distilled.data.days,
+        "refined": bool(distilled.model.changes),
         "loss": losses[-1] if losses else None,
     }

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
-from seasonscapes.errors import InputError
 from seasonscapes.exposure import exposure_ev100
 from seasonscapes.images import atomic_path, write_png
 from seasonscapes.progress import Progress
@@ -26,25 +25,40 @@ from seasonscapes.workflows.path_stages import (
     frame_view,
     load_frame_model,
     make_path,
+    model_facts,
     path_completion,
+    path_facts,
+    point_hashes,
 )
 from seasonscapes.workflows.pictures import develop
 from seasonscapes.workflows.place import Place
 from seasonscapes.workflows.plane_views import cut_plane_views, pose_panoramas, pose_plane_views
+from seasonscapes.workflows.point_cloud import write_point_cloud
 from seasonscapes.workflows.predicted_radiance import RELATIVE_SIGMA, measured_radiance
 from seasonscapes.workflows.relight_session import RenderJob
 from seasonscapes.workflows.run_albedo import albedo_at, final_albedos, recover_albedos, refine_albedos
 from seasonscapes.workflows.run_job import RunJob, sources_of, write_record
-from seasonscapes.workflows.run_methods import PathStages, RunMethod
 from seasonscapes.workflows.run_photographs import bring_photographs, bring_poses, photograph_facts, record_facts
 from seasonscapes.workflows.stage_runner import Stage, run_stages, stage_range
 from seasonscapes.workflows.views import camera_for
-from seasonscapes.workspace import file_hash
 
 __all__ = ["AS_THE_PAPER", "STAGES", "RunJob", "run", "stages_of"]
 
 STAGES = (
-    *("pictures", "calibrate", "views", "albedo", "paint", "path", "inpaint", "refine", "film", "relight", "distil"),
+    *(
+        "cloud",
+        "pictures",
+        "calibrate",
+        "views",
+        "albedo",
+        "paint",
+        "path",
+        "inpaint",
+        "refine",
+        "film",
+        "relight",
+        "distil",
+    ),
     "splat",
 )
 
@@ -121,12 +135,14 @@ def stages_of(job: RunJob, progress: Progress | None = None) -> list[Stage]:
     final = ("albedo", "refine") if method.refines else ("albedo",)
     painted = {**common, "painting": method.painting, "foreground": method.foreground}
     refined = {**common, "recovery": method.recovery, "painted": method.painted, "inpainted": method.inpainted}
-    filled = {**common, "completion": method.completion, "model": _model_facts(along, method)}
+    filled = {**common, "completion": method.completion, "model": model_facts(along, method)}
+    surface = {"place": place.key, "imagery": common["imagery"], "day": job.times[0].date().isoformat()}
     stages = [
+        stage("cloud", surface, (), ("point_cloud",), _cloud),
         stage("pictures", pictures, (), ("run_photographs",), _pictures),
         stage(
             "calibrate",
-            {**records, "poses": method.poses, "points": _point_hashes(along)},
+            {**records, "poses": method.poses, "points": point_hashes(along)},
             ("pictures",),
             ("run_photographs", "plane_views"),
             _calibrate,
@@ -143,7 +159,7 @@ def stages_of(job: RunJob, progress: Progress | None = None) -> list[Stage]:
         stage("paint", painted, (*known, *albedo), ("painting", "predicted_radiance"), _paint),
         stage(
             "path",
-            {"place": place.key, "size": job.size_px, **_path_facts(along)},
+            {"place": place.key, "size": job.size_px, **path_facts(along)},
             (),
             ("path_stages", "camera_paths"),
             _path,
@@ -163,46 +179,20 @@ def stages_of(job: RunJob, progress: Progress | None = None) -> list[Stage]:
         stages.append(stage("distil", distil, final, ("distillation",), _distil, "gaussians"))
         stages.append(stage("splat", looks, ("distil",), ("gaussian_views",), _splat))
     left_out = set() if method.poses == "points" else {"views"}
+    left_out |= set() if place.options.mesher == "poisson" else {"cloud"}
     left_out |= set() if method.needs_albedo else {"albedo", "relight"}
     left_out |= set() if method.refines else {"refine"}
     left_out |= set() if method.needs_path else {"path", "film"}
     return [each for each in stages if each.name not in left_out]
 
 
-def _point_hashes(along: PathStages) -> dict[str, str]:
-    """Contents of the files of points, where there are some."""
-    if along.points is None:
-        return {}
-    if not along.points.is_dir():
-        raise InputError("--points", "no such folder", got=str(along.points))
-    return {path.name: file_hash(path) for path in sorted(along.points.glob("*.csv"))}
-
-
-def _path_facts(along: PathStages) -> dict:
-    return {"path": None if along.path is None else file_hash(along.path), "views": along.views}
-
-
-def _model_facts(along: PathStages, method: RunMethod) -> dict | None:
-    """What the image model is told; its weights are identified in its own record."""
-    if method.completion != "diffusion" or along.diffusion is None:
-        return None
-    told = along.diffusion
-    guide = None if told.guide_image is None else file_hash(told.guide_image)
-    return {
-        "weights": None if told.weights is None else str(told.weights.resolve()),
-        "names": asdict(told.names),
-        "prompt": told.prompt,
-        "guide": guide,
-        "steps": told.steps,
-        "guidance": told.guidance,
-        "without": sorted(told.without),
-        "mask": told.mask,
-    }
-
-
 def _imagery(place: Place) -> list[dict]:
     """What the scene file states about its images, and the hashes of their contents."""
     return [{**image.model_dump(mode="json"), "hash": content} for image, content in place.scene.image_keys]
+
+
+def _cloud(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
+    return write_point_cloud(job.place, job.times[0].date(), folder / "cloud")
 
 
 def _pictures(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:

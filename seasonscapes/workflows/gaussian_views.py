@@ -65,7 +65,7 @@ def render_gaussians(
     subpixels
         Samples along a pixel's side.
     device
-        ``"cpu"``, or ``"cuda"`` (needs gsplat).
+        ``"cpu"``, or ``"cuda"`` (needs the extra ``gsplat``).
 
     Returns
     -------

@@ -28,6 +28,7 @@ from seasonscapes.sky.illuminate import SkyEvaluators, illuminate
 from seasonscapes.sky.illumination import Illumination
 from seasonscapes.sky.models import AtmosphereModel, SkyModel, atmosphere_from_model, read_sky_model, with_overrides
 from seasonscapes.sky.observer_radiance import diffuse_by_elevation, observer_view
+from seasonscapes.sky.shipped_tables import shipped_tables
 from seasonscapes.workflows.place import Place, utc_at
 from seasonscapes.workflows.views import camera_geodetic
 from seasonscapes.workspace import Workspace, build_once
@@ -181,7 +182,8 @@ def illumination(
 def atmosphere_tables_in(
     workspace: Workspace, *, by_elevation: bool = False
 ) -> Callable[[Atmosphere], AtmosphereTables]:
-    """Return a function that gives an atmosphere's tables, computed once and kept in the workspace.
+    """Return a function that gives an atmosphere's tables: those of the bundled sky models are shipped, others computed once
+    and kept in the workspace.
 
     Parameters
     ----------
@@ -195,7 +197,7 @@ def atmosphere_tables_in(
 
     def tables_of(atmosphere: Atmosphere) -> AtmosphereTables:
         if atmosphere not in tables:
-            built = build_once(
+            built = shipped_tables(atmosphere) or build_once(
                 workspace,
                 "sky/tables",
                 {"atmosphere": atmosphere},

@@ -100,7 +100,8 @@ def inpaint(
     Returns
     -------
     Inpainted
-        The completed texture, and its method, predictors and shares.
+        The completed texture; method (``"fused"`` where a painting was fused with the radiance of an albedo), guides that
+        were asked, and shares.
     """
     from seasonscapes.texturing.bayesian_fusion import fuse_with_albedo
     from seasonscapes.texturing.completion import complete as complete_texture
@@ -114,6 +115,7 @@ def inpaint(
         predicted = predict_radiance(place, albedo, utc, sky=sky, progress=progress)
     record: dict[str, Any] = {"method": options.method}
     if predicted is not None and options.method == "guided":
+        record["method"] = "fused"
         assert options.albedo is not None
         # Of the predictors only the surface and the charts matter: neither sun nor image is used.
         predictors = predictors_for(place.terrain, place.atlas)
@@ -122,7 +124,9 @@ def inpaint(
         record["guides"] = ["albedo, relit"]
     else:
         predictors = predictors_at(place, utc, predicted)
-        record["guides"] = list(predictors.names)
+        # Only regression asks them.
+        regression = options.rest if options.method == "diffusion" else options.method
+        record["guides"] = list(predictors.names) if regression == "guided" else []
         if options.diffusion is not None:
             from seasonscapes.workflows.path_completion import SkyState, complete_along_path
 
@@ -131,7 +135,7 @@ def inpaint(
             completed, facts = complete_along_path(
                 place, painted, predictors, sky_state, options.diffusion, completion, progress=progress
             )
-            record |= facts
+            record |= facts | {"rest": options.rest}
         else:
             completed = complete_texture(
                 painted,

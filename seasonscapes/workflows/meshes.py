@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -20,7 +19,6 @@ from seasonscapes.progress import Progress, task_progress
 from seasonscapes.sky.illumination import Illumination
 from seasonscapes.sky.models import SkyModel
 from seasonscapes.terrain.mesh_atlas import MeshAtlas, MeshGround, mesh_atlas
-from seasonscapes.terrain.mesh_placing import MeshPlacing, placed
 from seasonscapes.terrain.textured_mesh import MeshTexture, TexturedMesh
 from seasonscapes.workflows.illumination import (
     SunMoonPosition,
@@ -130,72 +128,6 @@ class LitMesh:
     radiance: tuple[np.ndarray, ...]
     illuminance: tuple[np.ndarray, ...]
     facts: dict[str, Any]
-
-
-def load_mesh(path: str | Path, placing: MeshPlacing | None = None, *, allow_outside: bool = False) -> TexturedMesh:
-    """Read a textured mesh and place it on Earth.
-
-    Parameters
-    ----------
-    path
-        ``.glb``, ``.gltf``, ``.obj`` with MTL, or ``.ply``, with textures or vertex colours.
-    placing
-        Which axis is up, and where the mesh lies; in metres about latitude 0, longitude 0 if left out.
-    allow_outside
-        Let the file refer to files outside its folder.
-
-    Returns
-    -------
-    TexturedMesh
-        Its parts, textures and positions.
-
-    Raises
-    ------
-    InputError
-        For files that are missing or broken, that refer to files that are missing or outside the folder, without
-        texture coordinates and colours, in degrees, or with textures larger than the memory.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> import numpy as np, trimesh
-    >>> import seasonscapes as ss
-    >>> ball = trimesh.creation.icosphere(subdivisions=2)
-    >>> ball.visual.vertex_colors = np.full((len(ball.vertices), 4), (120, 110, 90, 255), np.uint8)
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     _ = ball.export(f"{folder}/ball.ply")
-    ...     mesh = ss.load_mesh(f"{folder}/ball.ply")
-    >>> len(mesh.textures), mesh.bounds_m[1].round(1).tolist()
-    (1, [1.0, 1.0, 1.0])
-    """
-    from seasonscapes.terrain.mesh_reading import read_mesh_file
-
-    path = Path(path)
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    file = read_mesh_file(path, allow_outside=allow_outside, memory_bytes=memory)
-    parts = []
-    for part in file.parts:
-        if len(part.faces):
-            used, faces = np.unique(part.faces, return_inverse=True)
-            kept = (None if values is None else values[used] for values in (part.vertices, part.uv, part.normals))
-            # Vertices that no face uses must not move or stretch the mesh; those of vertex colours stay numbered.
-            if part.texture >= 0 and file.textures[part.texture].of_vertices:
-                parts.append(replace(part, vertices=_without_unused(part.vertices, used)))
-                continue
-            vertices, uv, normals = kept
-            assert vertices is not None
-            parts.append(replace(part, vertices=vertices, faces=faces.reshape(-1, 3), uv=uv, normals=normals))
-    positions, turn, frame, up = placed(
-        [part.vertices for part in parts], placing or MeshPlacing(), suffix=path.suffix.lower(), where=str(path)
-    )
-    return TexturedMesh(path, tuple(parts), tuple(file.textures), tuple(positions), turn, frame, up)
-
-
-def _without_unused(vertices: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Vertices whose unused ones lie at the first used one."""
-    result = np.broadcast_to(vertices[used[0]], vertices.shape).copy()
-    result[used] = vertices[used]
-    return result
 
 
 def mesh_light(
@@ -333,15 +265,15 @@ def delight_mesh(
     transport: MeshTransport | None = None,
     progress: Progress | None = None,
 ) -> DelitMesh:
-    """Remove the light of a known hour from a mesh's textures: sun, cast shadows, skylight and interreflection.
+    """Remove the light of an hour from a mesh's textures: sun, cast shadows, skylight and interreflection.
 
     Parameters
     ----------
     mesh
         The mesh, whose textures were photographed at that hour.
     time
-        An aware datetime; ISO 8601 text, which without offset is civil time at the mesh; or azimuth and elevation of
-        the sun [deg].
+        An aware datetime; ISO 8601 text, which without offset is civil time at the mesh; azimuth and elevation of
+        the sun [deg]; or "unknown", to find the sun from shading and cast shadows.
     surroundings
         Ground, sky and number of rays.
     options
@@ -360,6 +292,8 @@ def delight_mesh(
     ------
     InputError
         For a time that is none, or a texture that repeats over the surface.
+    NotEnoughEvidence
+        Where the sun of textures of unknown hour cannot be told.
 
     Examples
     --------
@@ -380,6 +314,12 @@ def delight_mesh(
     from seasonscapes.albedo.texel_light import texel_irradiance
 
     around = surroundings or MeshSurroundings()
+    found = {}
+    if time == "unknown":
+        from seasonscapes.workflows.mesh_sun import require_mesh_sun
+
+        transport = transport or mesh_transport(mesh, around, progress=progress)
+        time, found = require_mesh_sun(mesh, transport, around, progress=progress)
     light, record = mesh_light(mesh, time, around)
     if light.sun is None and record["sun"]["elevation_deg"] <= 0.0:
         got = f"the sun stands at {record['sun']['elevation_deg']:.1f}°"
@@ -406,7 +346,7 @@ def delight_mesh(
     values = atlas.textures(albedo.astype(np.float32))
     textures = tuple(replace(t, values=v) for t, v in zip(mesh.textures, values, strict=True))
     sigma = tuple(sheet[..., 0] for sheet in atlas.textures(delit.sigma[..., None]))
-    facts = record | around.ground_facts | {"textures": "albedo", **delit.facts}
+    facts = record | found | around.ground_facts | {"textures": "albedo", **delit.facts}
     return DelitMesh(with_textures(mesh, textures), sigma, facts)
 
 

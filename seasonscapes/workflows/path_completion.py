@@ -30,7 +30,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _CODE = ("texturing.path_inpainting", "texturing.diffusion", "texturing.completion")
-CONDITIONS = ("prompt", "depth", "mask", "image")
+# What the model is told; `paint`: what it continues from.
+CONDITIONS = ("prompt", "depth", "mask", "image", "paint")
 _HYBRID_STRENGTH = 0.4
 
 
@@ -57,7 +58,8 @@ class PathCompletionOptions:
     steps, guidance
         Of the sampler; classifier-free guidance scale.
     without
-        Conditions that are switched off, among `CONDITIONS`.
+        Conditions that are switched off, among `CONDITIONS`. Without ``"paint"`` the model paints all that it sees, and
+        of the painting only the brightness is used.
     mask
         How holes are found: ``"coverage"`` or ``"hsv"``.
     dilate_px
@@ -92,6 +94,10 @@ class PathCompletionOptions:
     film: Path | None = None
     fps: float = 24.0
     device_settings: DeviceSettings = field(default_factory=DeviceSettings)
+
+    def __post_init__(self) -> None:
+        if self.hybrid and "paint" in self.without:
+            raise InputError("--hybrid", "of no use with --without paint: it completes what is painted")
 
     @property
     def effective_strength(self) -> float:
@@ -169,6 +175,7 @@ def complete_along_path(
     from seasonscapes.texturing.atlas_tiles import tiling
     from seasonscapes.texturing.completion import complete
     from seasonscapes.texturing.path_inpainting import InpaintingState, PathInpaintingInputs, PathInpaintingOptions
+    from seasonscapes.texturing.view_conditions import white_radiance
 
     cameras = load_path(options.path, place.frame)
     prompt = options.prompt if options.prompt is not None else prompt_of(place, sky.utc, sky.cloudiness)
@@ -185,26 +192,35 @@ def complete_along_path(
         return complete(texture, predictors, options=replace(completion, detail=detail), progress=report)
 
     alone = regression(painted, 0.0, f"completing ({method})") if options.hybrid else None
+    given = InpaintingState(painted)
+    start = replace(painted, weight=np.zeros_like(painted.weight)) if "paint" in options.without else painted
     inputs = PathInpaintingInputs(
-        painted,
+        start,
         cameras,
         tiling(place.terrain, place.atlas),
         ray_scene(mi_mesh(place.terrain, np.full(3, 0.2))),
         None if alone is None else alone.values,
+        white_radiance(given.values, given.painted),
     )
-    state = InpaintingState(painted)
+    state = InpaintingState(start)
     view_options = PathInpaintingOptions(
         options.mask, options.dilate_px, options.least_hole, options.paint_sky, sky.cloudiness, completion.seed
     )
-    folder = _views_folder(place, painted, options, completion, {"cloudiness": sky.cloudiness, **identity})
+    folder = _views_folder(place, start, options, completion, {"cloudiness": sky.cloudiness, **identity})
     facts = _painted_views(inputs, state, inpainter, view_options, folder, predictors.surface, progress)
     rest = regression(state.texture(), completion.detail, f"completing the rest ({method})")
     completed = join_completions(
         rest, alone or regression(painted, 0.0, f"error of the generated texels ({method})"), state
     )
-    facts |= {"prompt": prompt, "views_folder": str(folder), "weights": identity["weights"], "film": None}
+    facts |= {
+        "prompt": prompt,
+        "without": sorted(options.without),
+        "views_folder": str(folder),
+        "weights": identity["weights"],
+        "film": None,
+    }
     if options.film is not None:
-        facts["film"] = _film(inputs, state, completed.values, options, sky.cloudiness, progress)
+        facts["film"] = _film(inputs, completed.values, options, sky.cloudiness, progress)
     return completed, facts
 
 
@@ -316,7 +332,6 @@ def _painted_views(
 
 def _film(
     inputs: PathInpaintingInputs,
-    state: InpaintingState,
     values: np.ndarray,
     options: PathCompletionOptions,
     cloudiness: float,
@@ -324,10 +339,11 @@ def _film(
 ) -> str:
     from seasonscapes.relighting.film import write_video
     from seasonscapes.texturing.path_inpainting import textured_frames
-    from seasonscapes.texturing.view_conditions import white_radiance
 
     assert options.film is not None
-    white = white_radiance(state.values, state.painted)
-    frames: Iterator[np.ndarray] = textured_frames(values, inputs.cameras, inputs.terrain, white, cloudiness=cloudiness)
+    assert inputs.white is not None
+    frames: Iterator[np.ndarray] = textured_frames(
+        values, inputs.cameras, inputs.terrain, inputs.white, cloudiness=cloudiness
+    )
     write_video(options.film, each_reported(frames, len(inputs.cameras), progress, "filming"), fps=options.fps)
     return str(options.film)

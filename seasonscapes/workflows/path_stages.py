@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,7 +16,8 @@ from seasonscapes.images import atomic_path
 from seasonscapes.progress import Progress, each_reported, task_progress
 from seasonscapes.relighting.frame_file import time_stamp
 from seasonscapes.workflows.place import Place
-from seasonscapes.workflows.run_methods import PathStages
+from seasonscapes.workflows.run_methods import PathStages, RunMethod
+from seasonscapes.workspace import file_hash
 
 if TYPE_CHECKING:
     from seasonscapes.cameras.exchange import NamedView
@@ -26,6 +27,37 @@ if TYPE_CHECKING:
     from seasonscapes.workflows.path_completion import PathCompletionOptions
 
 _FILE = "path.json"
+
+
+def point_hashes(along: PathStages) -> dict[str, str]:
+    """Contents of the files of points, where there are some."""
+    if along.points is None:
+        return {}
+    if not along.points.is_dir():
+        raise InputError("--points", "no such folder", got=str(along.points))
+    return {path.name: file_hash(path) for path in sorted(along.points.glob("*.csv"))}
+
+
+def path_facts(along: PathStages) -> dict:
+    return {"path": None if along.path is None else file_hash(along.path), "views": along.views}
+
+
+def model_facts(along: PathStages, method: RunMethod) -> dict | None:
+    """What the image model is told; its weights are identified in its own record."""
+    if method.completion != "diffusion" or along.diffusion is None:
+        return None
+    told = along.diffusion
+    guide = None if told.guide_image is None else file_hash(told.guide_image)
+    return {
+        "weights": None if told.weights is None else str(told.weights.resolve()),
+        "names": asdict(told.names),
+        "prompt": told.prompt,
+        "guide": guide,
+        "steps": told.steps,
+        "guidance": told.guidance,
+        "without": sorted(told.without),
+        "mask": told.mask,
+    }
 
 
 def make_path(place: Place, stages: PathStages, own: Path, *, size_px: tuple[int, int]) -> list[Path]:

@@ -25,8 +25,9 @@ from seasonscapes.workflows.terrain_building import MeshOptions
 from seasonscapes.workspace import Workspace, build_once, default_workspace
 
 if TYPE_CHECKING:
+    from seasonscapes.scene import SyntheticElevation
     from seasonscapes.terrain.raster import FillReport
-    from seasonscapes.terrain.synthetic import SyntheticMassif
+    from seasonscapes.terrain.synthetic_massif import SyntheticMassif
     from seasonscapes.terrain.unwrap import Atlas
 
 __all__ = ["MeshOptions", "Place", "find_scene", "ground_height_m", "load_place", "utc_at"]
@@ -208,6 +209,7 @@ def load_place(
         "options": options,
         **water_key(declared),
         **({} if declared.snow is None else {"snow": declared.snow}),
+        **({} if declared.forest is None else {"forest": declared.forest}),
     }
     terrain, atlas = build_once(
         workspace,
@@ -270,8 +272,7 @@ def require_near(place: Place, latitude_deg: float, longitude_deg: float, *, whe
 
 
 def _massif(scene: SceneFile, workspace: Workspace) -> SyntheticMassif:
-    # Imported here, since the generator loads a second of libraries that no other scene needs.
-    from seasonscapes.terrain.synthetic import alpine_massif, load_massif, save_massif
+    from seasonscapes.terrain.synthetic_massif import load_massif, save_massif
 
     assert scene.elevation is not None
     assert scene.elevation.synthetic is not None
@@ -282,10 +283,17 @@ def _massif(scene: SceneFile, workspace: Workspace) -> SyntheticMassif:
         {"synthetic": declared},
         code=_MASSIF_CODE,
         suffix=".npz",
-        build=lambda: alpine_massif(seed=declared.seed, size_m=declared.size_m, spacing_m=declared.spacing_m),
+        build=lambda: _generated_massif(declared),
         save=save_massif,
         load=load_massif,
     )
+
+
+def _generated_massif(declared: SyntheticElevation) -> SyntheticMassif:
+    # Imported here, since the generator loads libraries that nothing else needs.
+    from seasonscapes.terrain.synthetic import alpine_massif
+
+    return alpine_massif(seed=declared.seed, size_m=declared.size_m, spacing_m=declared.spacing_m)
 
 
 def ground_height_m(place: Place, latitude_deg: float, longitude_deg: float, *, where: str) -> float:

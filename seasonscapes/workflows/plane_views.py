@@ -16,14 +16,19 @@ from seasonscapes.workflows.place import Place
 
 if TYPE_CHECKING:
     from seasonscapes.calibration.evidence import Correspondences
+    from seasonscapes.calibration.resection import Calibration
     from seasonscapes.cameras.panorama import Panorama
     from seasonscapes.cameras.pinhole import Camera
 
 log = logging.getLogger(__name__)
 
 _FEWEST, _MOST_DEG = 4, 85.0
-# Of synthetic webcams: a compass's error, points clicked in each view, and how well a person hits a pixel.
-_COMPASS_DEG, _POINTS, _CLICK_PX = 3.0, 12, 1.0
+# Of synthetic webcams: points clicked in each view, and how well a person hits a pixel.
+_POINTS, _CLICK_PX = 12, 1.0
+# A heading is not told that shifts the picture by more of its width than this (one standard deviation).
+_MOST_SIGMA = 0.01
+# A whole panorama is searched about its stated heading, which a synthetic webcam's compass has off by as much.
+_COMPASS_DEG = 3.0
 _NEAREST_M, _FARTHEST_M = 200.0, 40_000.0
 
 
@@ -52,7 +57,7 @@ def plane_views(webcam: str, whole: Camera | Panorama) -> list[PlaneView]:
 def pose_plane_views(
     place: Place, stated: Sequence[Path], own: Path, *, points: Path | None, seed: int = 0
 ) -> tuple[list[Path], dict[str, str]]:
-    """Solve heading and focal length of each plane view from 2D–3D points under an L1 loss, as the paper does.
+    """Solve heading, ``fx`` and ``fy`` of each plane view from 2D–3D points under an L1 loss, as the paper does.
 
     Parameters
     ----------
@@ -64,7 +69,7 @@ def pose_plane_views(
         Folder for the records of the views and, of synthetic webcams, the points.
     points
         Folder of ``WEBCAM.csv`` with points in the pixels of the webcam's picture; ``None`` for a synthetic place, whose
-        points are terrain seen by the true camera, clicked with an error of a pixel, from a compass that is 3° off.
+        points are terrain seen by the true camera, clicked with an error of a pixel. Stated headings are not used.
     seed
         Of the synthetic clicks.
 
@@ -95,14 +100,13 @@ def _posed(
     place: Place, stated: Sequence[Path], own: Path, points: Path | None, seed: int, *, whole: bool
 ) -> tuple[list[Path], dict[str, str]]:
     from seasonscapes.calibration.calibration_file import read_calibration, record_name, write_calibration
-    from seasonscapes.calibration.evidence import Priors, read_points, write_points
-    from seasonscapes.calibration.pose_model import parameters_of_view, view_from_parameters
-    from seasonscapes.calibration.resection import ResectionOptions, resect
+    from seasonscapes.calibration.evidence import read_points, write_points
+    from seasonscapes.calibration.l1_pose import l1_pose
+    from seasonscapes.cameras.panorama import Panorama
 
     if points is None and place.synthetic is None:
         raise InputError("--points", "missing", expected="a folder of WEBCAM.csv, of `seasonscapes annotate`")
     files, doubts = [], {}
-    priors = Priors(tilt_deg=0.0, roll_deg=0.0, horizontal_m=0.0, vertical_m=0.0, focal=np.inf)
     for record in stated:
         known = read_calibration(record)
         table = own / f"{known.webcam}.csv" if points is None else points / f"{known.webcam}.csv"
@@ -114,19 +118,20 @@ def _posed(
             continue
         matches = read_points(table, known.frame)
         views = plane_views(known.webcam, known.view)
-        starts: list[tuple[str, Camera | Panorama, Correspondences]] = [(known.webcam, known.view, matches)]
+        stated_view = _turned(known.view, seed, known.webcam) if points is None else known.view
+        starts: list[tuple[str, Camera | Panorama, Correspondences]] = [(known.webcam, stated_view, matches)]
         if not whole:
             starts = [(view.name, view.camera, _points_in_view(matches, view)) for view in views]
         for name, start, seen in starts:
-            if points is None:
-                rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
-                parameters = parameters_of_view(start, np.eye(3))
-                parameters[0] += rng.uniform(-_COMPASS_DEG, _COMPASS_DEG)
-                start = view_from_parameters(start, np.eye(3), parameters)
             try:
-                solved = resect(start, seen, priors=priors, options=ResectionOptions(loss="l1"))
+                solved = _whole_pose(start, seen) if isinstance(start, Panorama) else l1_pose(start, seen)
             except NotEnoughEvidence as error:
                 doubts[name] = str(error)
+                continue
+            sigma_deg = solved.sigma["heading_deg"]
+            if np.radians(sigma_deg) * solved.view.fx > _MOST_SIGMA * solved.view.width_px:
+                # Points that lie close together leave a turn and a change of fx alike.
+                doubts[name] = f"its points leave the heading to ± {sigma_deg:.1f} deg"
                 continue
             files.append(own / record_name(name))
             write_calibration(files[-1], name, solved, known.frame)
@@ -135,6 +140,24 @@ def _posed(
     if not any(path.suffix == ".json" for path in files):
         raise NotEnoughEvidence(f"run: no view could be posed by points: {'; '.join(sorted(set(doubts.values())))}")
     return files, doubts
+
+
+def _turned(view: Camera | Panorama, seed: int, webcam: str) -> Camera | Panorama:
+    """A synthetic webcam's view as a compass states it."""
+    from seasonscapes.calibration.pose_model import parameters_of_view, view_from_parameters
+
+    parameters = parameters_of_view(view, np.eye(3))
+    parameters[0] += np.random.default_rng([seed, zlib.crc32(webcam.encode())]).uniform(-_COMPASS_DEG, _COMPASS_DEG)
+    return view_from_parameters(view, np.eye(3), parameters)
+
+
+def _whole_pose(start: Panorama, points: Correspondences) -> Calibration:
+    """Heading and scale of a whole panorama under an L1 loss; position, tilt and roll are kept."""
+    from seasonscapes.calibration.evidence import Priors
+    from seasonscapes.calibration.resection import ResectionOptions, resect
+
+    priors = Priors(tilt_deg=0.0, roll_deg=0.0, horizontal_m=0.0, vertical_m=0.0, focal=np.inf)
+    return resect(start, points, priors=priors, options=ResectionOptions(loss="l1"))
 
 
 def cut_plane_views(pictures: Path, stated: Sequence[Path], own: Path, *, grade: str) -> list[Path]:

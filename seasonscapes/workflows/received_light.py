@@ -2,29 +2,37 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Sequence
+import logging
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from seasonscapes.errors import InputError
+from seasonscapes.errors import DamagedFile, InputError
 from seasonscapes.progress import Progress, each_reported, task_progress
 from seasonscapes.sky.models import SkyModel
-from seasonscapes.terrain.surface import Raster
+from seasonscapes.terrain.surface import Raster, Texture
 from seasonscapes.workflows.albedo_sources import AlbedoSource, chosen_albedo
 from seasonscapes.workflows.illumination import illumination_at, illumination_on_terrain, sky_model, sun_moon_position
 from seasonscapes.workflows.place import Place, utc_at
 from seasonscapes.workflows.terrain_building import sample_spacing_m
 from seasonscapes.workflows.view_rendering import sun_angles
+from seasonscapes.workspace import artefact_key
 
 if TYPE_CHECKING:
     from seasonscapes.relighting.lit_texture import IntegratedIrradiance, LitTexture
+    from seasonscapes.rendering.coefficients import PointCoefficients
     from seasonscapes.sky.illumination import Illumination
 
+log = logging.getLogger(__name__)
+
+_CELLS_CODE = ("rendering.irradiance", "rendering.coefficients_file")
 # All illuminations of a period are kept in memory, 100 kB each.
 _MOST_INSTANTS = 9000
 # The mesh lies within some metres of the raster; on a cliff a cell's height may be far from it.
@@ -191,6 +199,7 @@ def irradiance_map(
     from seasonscapes.rendering.backend import use_backend
     from seasonscapes.rendering.coefficients import SamplingOptions
     from seasonscapes.rendering.hemisphere_rays import ray_scene
+    from seasonscapes.rendering.irradiance import BLOCK, irradiance_blocks, kept_irradiance, point_coefficients
     from seasonscapes.rendering.mitsuba_scene import mi_mesh
 
     require_rays(rays)
@@ -210,17 +219,46 @@ def irradiance_map(
     record = {"scene": place.scene.name, **record, "attribution": place.scene.attribution}
     grid, positions = _map_grid(place, spacing_m)
     texture = chosen_albedo(place, instants[len(instants) // 2].date(), albedo)
-    received = integrate_irradiance(
-        ray_scene(mi_mesh(place.terrain, texture.values)),
-        positions,
-        IlluminationSeries(lights, hours),
-        sampling=SamplingOptions(shadow_samples=1, rays=rays),
-        search_m=_SEARCH_M,
-        seed=seed,
-        progress=task_progress(progress, "irradiance"),
-    )
+    scene = ray_scene(mi_mesh(place.terrain, texture.values))
+    sampling = SamplingOptions(shadow_samples=1, rays=rays)
+    report = task_progress(progress, "irradiance")
+    if len(positions) <= BLOCK:
+        inputs = {"place": place.key, "albedo": _content(texture), "spacing_m": spacing_m, "rays": rays, "seed": seed}
+        trace = partial(point_coefficients, scene, positions, sampling, seed=seed, search_m=_SEARCH_M, progress=report)
+        coefficients = _kept_coefficients(place, inputs, trace)
+        blocks = iter([kept_irradiance(scene, positions, coefficients, lights, search_m=_SEARCH_M)])
+    else:
+        blocks = irradiance_blocks(scene, positions, lights, sampling, seed=seed, search_m=_SEARCH_M, progress=report)
+    received = integrate_irradiance(blocks, len(positions), IlluminationSeries(lights, hours))
     period = not isinstance(times, (str, datetime))
     return IrradianceMap(grid, _bands(received, grid.values.shape[:2], period=period), record)
+
+
+def _content(texture: Texture) -> str:
+    return hashlib.sha256(texture.values.tobytes()).hexdigest()
+
+
+def _kept_coefficients(
+    place: Place, inputs: dict[str, Any], trace: Callable[[], PointCoefficients]
+) -> PointCoefficients:
+    """Coefficients of a map's cells from the workspace, where another instant has left them, or traced and kept there."""
+    from seasonscapes.rendering.coefficients import PointCoefficients
+    from seasonscapes.rendering.coefficients_file import load_coefficients, save_coefficients
+
+    key = artefact_key(inputs, _CELLS_CODE)
+    folder = place.workspace.folder / f"{place.scene.name}/coefficients-{key}"
+    if folder.exists() and not folder.is_dir():
+        raise InputError(folder, "a file stands where a built folder belongs", cure="remove it")
+    if (folder / "coefficients.json").is_file():
+        try:
+            kept = load_coefficients(folder, key=key)
+            assert isinstance(kept, PointCoefficients)
+            return kept
+        except DamagedFile as error:
+            log.info("%s; light transport is traced again", error)
+    traced = trace()
+    save_coefficients(folder, traced, key=key)
+    return traced
 
 
 def require_rays(rays: int, *, where: str = "rays") -> None:

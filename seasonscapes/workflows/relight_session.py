@@ -442,13 +442,16 @@ def _interpolated(session: RelightSession, weights: list[tuple[int, float]], day
 def _view_albedo(session: RelightSession, dated: DatedAlbedo) -> tuple[np.ndarray, ...]:
     """Mean albedo of the view's pixels, of its light clusters and, with water, of what it mirrors, for a dated texture.
 
-    Kept in the workspace.
+    Kept in the workspace. The coefficients hold those of the texture that they were traced with.
     """
     from seasonscapes.rendering.mitsuba_scene import set_albedo
     from seasonscapes.rendering.relit_view import cluster_albedo, mirrored_albedo
     from seasonscapes.rendering.transport import view_albedo
 
-    place = session.place
+    place, traced = session.place, session.coefficients
+    if _identity(dated) == session.traced_from["base"]:
+        mirrored = [] if traced.mirror is None else [traced.mirror.albedo]
+        return (traced.albedo, traced.clusters.points.albedo, *mirrored)
 
     def build() -> tuple[np.ndarray, ...]:
         set_albedo(session.ray_scene, dated.load().values)

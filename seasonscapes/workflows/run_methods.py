@@ -33,8 +33,8 @@ class RunMethod:
         Of the method that the stages were taken from.
     poses
         ``"skyline"`` finds panoramas by the terrain's horizon; ``"joint"`` solves one pose of each whole panorama from
-        2D–3D points; ``"points"`` cuts them to 4 to 6 plane views and solves each
-        one's heading and focal length from 2D–3D points under an L1 loss, as the paper does.
+        2D–3D points; ``"points"`` cuts them to 4 to 6 plane views and solves each one's heading, ``fx`` and ``fy`` from
+        2D–3D points under an L1 loss, as the paper does.
     grade
         Colour grade of the plane views (`cameras.colour_grade.GRADES`), or ``"none"``.
     painting

@@ -180,6 +180,17 @@ def sample_spacing_m(raster: Raster) -> float:
     return float(np.mean(cell_sides_m(raster)))
 
 
+def samples_to_mesh(elevation: Raster, options: MeshOptions, water: Raster | None = None) -> Raster:
+    """The samples that are meshed: a place's heights, interpolated where that pays; lakes stay level."""
+    if options.refine is not None:
+        height, width = elevation.values.shape[:2]
+        check_memory((height * options.refine, width * options.refine), "--refine")
+    factor = options.refine or refinement_factor(elevation.values[..., 0].size, sample_spacing_m(elevation))
+    refined = refine_raster(elevation, factor)
+    # Interpolated heights rise towards the banks before the shore.
+    return levelled(refined, water) if water is not None and factor > 1 else refined
+
+
 def build_terrain(
     elevation: Raster,
     frame: LocalFrame,
@@ -194,16 +205,9 @@ def build_terrain(
     Where there is ``water``, its share ``(H, W, 1)`` at the raster's cells, lakes are level, and the terrain has a mask.
     """
     report = progress or (lambda fraction: None)
-    spacing_m = sample_spacing_m(elevation)
-    if options.refine is not None:
-        height, width = elevation.values.shape[:2]
-        check_memory((height * options.refine, width * options.refine), "--refine")
-    factor = options.refine or refinement_factor(elevation.values[..., 0].size, spacing_m)
-    bound = options.max_error_m or min(5.0, spacing_m / factor / 10.0)
-    refined = refine_raster(elevation, factor)
-    if water is not None and factor > 1:
-        # Interpolated heights rise towards the banks before the shore.
-        refined = levelled(refined, water)
+    refined = samples_to_mesh(elevation, options, water)
+    factor = (refined.values.shape[1] - 1) // (elevation.values.shape[1] - 1)
+    bound = options.max_error_m or min(5.0, sample_spacing_m(elevation) / factor / 10.0)
     report(0.1)
     mesher = options.mesher
     if mesher == "poisson":
@@ -222,6 +226,8 @@ def build_terrain(
         terrain = with_water(terrain, atlas, water, scene.water.wind_m_s)
     if scene.snow is not None and scene.snow.scattering:
         terrain = replace(terrain, snow=Snow(scene.snow.grain_mm))
+    if scene.forest is not None and scene.forest.hot_spot:
+        terrain = replace(terrain, forest=True)
     return terrain, atlas
 
 

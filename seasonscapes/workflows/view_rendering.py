@@ -78,7 +78,7 @@ def render(
     seed
         Equal seeds give equal pictures.
     lambertian
-        All ground is matt, also what the scene file declares as water and snow: for comparison.
+        All ground is matt, also what the scene file declares as water, snow and forest: for comparison.
     amplify
         Add relief and albedo below the resolution of the data: for pictures, not for measurements.
     progress

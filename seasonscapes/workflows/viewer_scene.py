@@ -124,8 +124,8 @@ def viewer_scene(
         raise InputError("--sky", "the page shows cloudless skies", got=got, expected=expected)
     if place.terrain.surface is None:
         raise InputError(place.path, "has no grid of heights, which the page shows")
-    if place.terrain.water is not None or place.terrain.snow is not None:
-        log.warning("%s: the page shows water and snow as matt as other ground", place.path)
+    if place.terrain.water is not None or place.terrain.snow is not None or place.terrain.forest:
+        log.warning("%s: the page shows water, snow and forest as matt as other ground", place.path)
     if detail is None:
         longest = float(np.ptp(place.terrain.vertices[:, :2], axis=0).max())
         detail = LARGE if longest / place.terrain.surface.spacing_m > ViewerDetail.most_nodes else ViewerDetail()

@@ -157,7 +157,7 @@ def terrain_for_view(
         terrain = amplified_terrain(place, view)
     else:
         terrain = refined_for_view(place.terrain, view.position_m, 1.0 / float(view.fx))
-    return replace(terrain, water=None, snow=None) if lambertian else terrain
+    return replace(terrain, water=None, snow=None, forest=False) if lambertian else terrain
 
 
 def camera_geodetic(place: Place, view: Camera | Panorama) -> tuple[float, float, float]:

@@ -37,6 +37,7 @@ BASE: dict[str, list[str]] = {
     "splat": ["s.toml", "--time", TIME, "--model", "m.safetensors", "--size", "16x12", "--output", "out/s.png"],
     "run": ["s.toml", "--times", TIME, "--at-hours", TIME, "--manifest", "m.csv", "--output", "out/run"],
     "evaluate": ["--truth", "p.png", "--pictures", "p.png"],
+    "lpips": ["p.png", "p.png", "--output", "out/l.safetensors"],
     "info": ["p.png"],
     "demo": ["out/demo", "--size", "48x32"],
     "doctor": [],
