@@ -4,9 +4,10 @@
         [--adapter NAME] [--lpips FILE] [--scene SCENE] [--views N] [--steps N] [--size WxH] [--held-out N] [--times LIST]
         [--quick] [--seed N] [--json FILE] [--figures FOLDER]
 
-Photographs of a synthetic place are painted as the paper does (the first that sees a texel wins), an image model completes
-the texture along a path, and the finished texture is pictured from cameras whose photographs nothing was made of. Scores
-are the paper's: PSNR, SSIM and LPIPS in the mode ``paper`` with the reference's mask; ``valid_psnr_db`` counts masked pixels
+Photographs of every second camera of a synthetic place are painted as the paper does (the first that sees a texel wins), an
+image model completes the texture along a path, and the finished texture is pictured from the other cameras and from some
+along the path, whose photographs nothing was made of; ``unpainted`` is the share of the scored pixels that no photograph
+painted. Scores are the paper's: PSNR, SSIM and LPIPS in the mode ``paper`` with the reference's mask; ``valid_psnr_db`` counts masked pixels
 out. Exposure and white balance of each picture are fitted to the photograph first, for all rows alike. ``drop`` is the
 relative rise of LPIPS over the whole method.
 
@@ -48,7 +49,7 @@ from seasonscapes.sky.models import SkyModel
 from seasonscapes.texturing.inputs import unlit_scene
 from seasonscapes.texturing.model_weights import WeightNames
 from seasonscapes.texturing.path_inpainting import textured_frames
-from seasonscapes.texturing.view_conditions import white_radiance
+from seasonscapes.texturing.view_conditions import sample_covered, white_radiance
 from seasonscapes.workflows.camera_paths import camera_path
 from seasonscapes.workflows.full_run import AS_THE_PAPER
 from seasonscapes.workflows.illumination import sky_model
@@ -88,7 +89,7 @@ class Study:
 
 
 def prepared(arguments: argparse.Namespace, folder: Path) -> Study:
-    """Photograph the place from its own cameras, and from others between them that are held out."""
+    """Photograph the place from its own cameras and between them; every second own one is painted, the others are held out."""
     quick = arguments.quick
     options = ss.MeshOptions(texel_m=120.0, max_error_m=6.0, refine=1) if quick else None
     place = ss.load_place(arguments.scene, ss.Workspace(folder / "work"), options=options)
@@ -98,10 +99,12 @@ def prepared(arguments: argparse.Namespace, folder: Path) -> Study:
     own = scene_cameras(place, size_px=size_px)
     # Between the place's own cameras: the path passes by, as the paper's does.
     between = camera_path(place, list(own.values()), arguments.held_out + 2).cameras[1:-1]
-    others = {f"held-{number}": camera for number, camera in enumerate(between)}
+    others = {name: own[name] for name in list(own)[1::2]}
+    others |= {f"between-{number}": camera for number, camera in enumerate(between)}
+    chosen = {name: own[name] for name in list(own)[::2]}
     painted, held_out = (
         photograph_series(place, times, sky, folder / name, cameras=cameras, seed=arguments.seed)
-        for name, cameras in (("painted", own), ("held-out", others))
+        for name, cameras in (("painted", chosen), ("held-out", others))
     )
     path = make_path(place, PathStages(views=arguments.views), folder, size_px=size_px)[0]
     names = WeightNames(arguments.base, arguments.depth_net, arguments.inpaint_net, arguments.adapter)
@@ -114,7 +117,7 @@ def prepared(arguments: argparse.Namespace, folder: Path) -> Study:
 def rows_of(study: Study, said: dict[str, str], figures: Path | None) -> Iterator[dict]:
     """One row for each ablation: means over the held-out photographs of all times."""
     terrain = ray_scene(mi_mesh(study.place.terrain, np.full(3, 0.2)))
-    depths = {name: trace_gbuffer(unlit_scene(terrain), camera).depth for name, camera in study.cameras.items()}
+    views = {name: trace_gbuffer(unlit_scene(terrain), camera) for name, camera in study.cameras.items()}
     paintings = {
         time: painting_of(study.place, study.painted, time, study.sky, AS_THE_PAPER).texture for time in study.times
     }
@@ -133,16 +136,18 @@ def rows_of(study: Study, said: dict[str, str], figures: Path | None) -> Iterato
             frames = textured_frames(
                 done.completed.values, list(study.cameras.values()), terrain, white, cloudiness=cloudiness_of(study.sky)
             )
-            for (name, depth), frame in zip(depths.items(), frames, strict=True):
+            for (name, view), frame in zip(views.items(), frames, strict=True):
                 truth = np.clip(srgb_from_linear(read_image_linear(truths[name])), 0.0, 1.0)
-                mask = reference_mask(depth)
+                mask = reference_mask(view.depth)
                 gain = matching_gain(truth[mask], frame[mask])
                 picture = np.clip(srgb_from_linear(np.clip(frame * gain, 0.0, 1.0)), 0.0, 1.0)
                 paper = score(truth, picture, mask, mode="paper", lpips=study.measure)
-                scores.append([paper.psnr_db, paper.ssim, paper.lpips, score(truth, picture, mask).psnr_db])
+                seen = sample_covered(done.completed.values, done.completed.painted, view.uv)[1]
+                valid_db = score(truth, picture, mask).psnr_db
+                scores.append([paper.psnr_db, paper.ssim, paper.lpips, valid_db, (mask & ~seen).sum() / mask.sum()])
                 if figures is not None:
                     write_png(figures / f"{row.replace(' ', '_')}_{name}_{time:%Y%m%dT%H%M}.png", frame * gain)
-        psnr_db, ssim, lpips, valid_psnr_db = np.mean(scores, axis=0)
+        psnr_db, ssim, lpips, valid_psnr_db, unpainted = np.mean(scores, axis=0)
         whole = lpips if whole is None else whole
         yield {
             "row": row,
@@ -151,6 +156,7 @@ def rows_of(study: Study, said: dict[str, str], figures: Path | None) -> Iterato
             "lpips": lpips,
             "drop": drop(whole, lpips),
             "valid_psnr_db": valid_psnr_db,
+            "unpainted": unpainted,
             "covered": float(np.mean(covered)),
             "pictures": len(scores),
             **said,
@@ -194,7 +200,9 @@ def parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--views", type=int, help="of the path")
     parser.add_argument("--steps", type=int, help="of the sampler")
     parser.add_argument("--size", type=size_of, help="of photographs and views [px]")
-    parser.add_argument("--held-out", type=int, help="cameras between the place's own that are only scored")
+    parser.add_argument(
+        "--held-out", type=int, help="cameras between the place's own, scored beside every second own one"
+    )
     parser.add_argument("--times", help="UTC, with commas between")
     parser.add_argument("--quick", action="store_true", help="3 views of 96 × 64 px, 2 steps, one time")
     parser.add_argument("--seed", type=int, default=0)

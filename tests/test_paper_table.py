@@ -29,7 +29,10 @@ def test_the_table_runs_whole_and_says_what_its_weights_are(tmp_path, monkeypatc
     assert rows[-1]["valid_psnr_db"] < full["valid_psnr_db"] - 3.0
     assert rows[-1]["drop"] > 0.5
     assert all(row["valid_psnr_db"] < row["psnr_db"] for row in rows)
-    assert len(list((tmp_path / "figures").glob("*.png"))) == len(rows)
+    assert {row["unpainted"] for row in ablated[:-1]} == {full["unpainted"]}
+    assert 0.05 < full["unpainted"] < 0.95
+    assert rows[-1]["unpainted"] == 1.0
+    assert len(list((tmp_path / "figures").glob("*.png"))) == sum(row["pictures"] for row in rows)
     kept = json.loads((tmp_path / "table.json").read_text())
     assert kept["rows"] == rows
     assert kept["record"]["seed"] == 0
