@@ -113,5 +113,10 @@ def test_a_day_that_tells_nothing_alone_joins_the_nearest(monkeypatch):
         [date(2024, 9, 10), date(2024, 9, 20)],
         [date(2023, 11, 20), date(2024, 11, 9)],
     ]
+    # Far from every other day, it is left out rather than mixed into a season that it may not show.
+    line_m[date(2024, 11, 9)] = None
+    assert [sorted(group) for group in season_recovery._grouped_days(None, None, days, None, None)] == [
+        [date(2024, 9, 10), date(2024, 9, 20)]
+    ]
     line_m.update(dict.fromkeys(line_m))
     assert [sorted(group) for group in season_recovery._grouped_days(None, None, days, None, None)] == [sorted(line_m)]

@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+# Within the year; snow and leaves change little in between.
+_NEAR_DAYS = 21.0
+
 
 @dataclass(frozen=True)
 class SeasonAlbedo:
@@ -101,7 +104,8 @@ def recover_seasons(
 
     Notes
     -----
-    Each day's photographs alone give an albedo (a day for which they do not joins the nearest day); days that are neighbours in the year and agree in it are one season
+    Each day's photographs alone give an albedo (a day for which they do not joins one within three weeks, or is left out);
+    days that are neighbours in the year and agree in it are one season
     (`albedo.season_grouping.group_dates`), whose photographs together give the final one. Texels that did not change from
     season to season take their common mean (`share_unchanged`).
     """
@@ -143,17 +147,24 @@ def _grouped_days(
     days = sorted({each.time.date() for each in seen})
     known: list[date] = []
     estimates: list[AlbedoEstimate] = []
+    doubts: dict[date, str] = {}
     for day in each_reported(days, len(days), progress, "albedo of each day"):
         own = [each for each in prepared if each.observation.time.date() == day]
         try:
             estimates.append(albedo_estimate(transport, own, closed_fit(transport, own)))
         except (NotEnoughEvidence, NoUsablePixels) as error:
-            log.warning("%s alone gives no albedo (%s): it belongs to the season of the nearest day", day, error)
+            doubts[day] = str(error)
         else:
             known.append(day)
-    groups = [[known[index] for index in group] for group in group_dates(known, estimates)] or [[]]
-    for day in (day for day in days if day not in known):
-        min(groups, key=lambda group: min((days_apart(day, each) for each in group), default=0.0)).append(day)
+    # Where no day stands alone, all may stand together.
+    groups = [[known[index] for index in group] for group in group_dates(known, estimates)] or [days]
+    for day in doubts if known else ():
+        nearest = min(known, key=lambda each: days_apart(day, each))
+        if days_apart(day, nearest) <= _NEAR_DAYS:
+            next(group for group in groups if nearest in group).append(day)
+            log.warning("%s alone gives no albedo (%s): it joins the season of %s", day, doubts[day], nearest)
+        else:
+            log.warning("%s is left out of the albedo: alone it gives none (%s), and no day is near", day, doubts[day])
     log.info("seasons: %s", "; ".join(", ".join(map(str, sorted(group))) for group in groups))
     return groups
 
