@@ -106,11 +106,8 @@ def recover_seasons(
     -----
     Each day's photographs alone give an albedo (a day for which they do not joins one within three weeks, or is left out);
     days that are neighbours in the year and agree in it are one season
-    (`albedo.season_grouping.group_dates`), whose photographs together give the final one. Texels that did not change from
-    season to season take their common mean (`share_unchanged`).
+    (`albedo.season_grouping.group_dates`), whose photographs together give the final one.
     """
-    from seasonscapes.albedo.season_grouping import share_unchanged
-
     options, model = options or RecoveryOptions(), sky_model(sky)
     in_frame = [replace(each, camera=view_in_frame(each.camera, place.frame)) for each in photographs]
     transport = texel_transport(place, progress)
@@ -122,12 +119,7 @@ def recover_seasons(
         own = [each for each in painted if each.time.date() in days]
         recovered = recovered_over(place, transport, chosen, model, options, own, progress)
         found.append(SeasonAlbedo(recovered, tuple(sorted(days))))
-    shared = share_unchanged([each.recovered.estimate for each in found])
-    seasons = [
-        replace(each, recovered=replace(each.recovered, estimate=estimate))
-        for each, estimate in zip(found, shared, strict=True)
-    ]
-    return sorted(seasons, key=lambda each: each.recovered.day)
+    return sorted(found, key=lambda each: each.recovered.day)
 
 
 def _grouped_days(
