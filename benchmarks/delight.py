@@ -58,7 +58,7 @@ from mesh_scene import mesh_relit, mesh_suns  # noqa: E402
 from record import write_record  # noqa: E402
 
 from seasonscapes.albedo.corrections import CORRECTIONS, slopes_under  # noqa: E402
-from seasonscapes.albedo.delighting import DelightOptions, TexelIrradiance, delight_image  # noqa: E402
+from seasonscapes.albedo.delighting import SLOPE_ERROR, DelightOptions, TexelIrradiance, delight_image  # noqa: E402
 from seasonscapes.albedo.forward_model import TexelTransport, sun_on_texels  # noqa: E402
 from seasonscapes.albedo.registration import shifted_back  # noqa: E402
 from seasonscapes.albedo.sun_search import find_sun  # noqa: E402
@@ -251,7 +251,7 @@ def synthetic(seed: int, size: Size, numbers: dict[str, Any], pictures: Path | N
     photograph = photographed(seed, size)
     judge = Judge(photograph)
     known_scale = DelightOptions(radiance_per_unit=photograph.unit)
-    ours = texel_irradiance(photograph.coarse, photograph.light)
+    ours = texel_irradiance(photograph.coarse, photograph.light, slope_error=SLOPE_ERROR)
     image, clipped = photograph.image, photograph.clipped
 
     def run(light: TexelIrradiance, options: DelightOptions = known_scale) -> np.ndarray:

@@ -29,6 +29,8 @@ from seasonscapes.errors import NoUsablePixels
 
 # Sources of a texel's albedo, in `DelitImage.source`.
 NOTHING, SUNLIT, SHADED, COMPLETED = 0, 1, 2, 3
+# Standard error of the cosine of incidence on ground that heights smooth and trees cover.
+SLOPE_ERROR = 0.06
 _GREY = 0.25
 
 
@@ -121,7 +123,7 @@ class DelightOptions:
     land_class: np.ndarray | int | None = None
     fit_where: np.ndarray | None = None
     light_error: float = 0.05
-    slope_error: float = 0.06
+    slope_error: float = SLOPE_ERROR
     quantum: float | None = None
 
 

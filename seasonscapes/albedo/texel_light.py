@@ -8,11 +8,13 @@ light itself, so that every texel keeps what its own slope receives.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import cast
 
 import cv2
 import numpy as np
 from scipy.ndimage import distance_transform_edt, label
+from scipy.stats import norm
 
 from seasonscapes.albedo.delighting import TexelIrradiance
 from seasonscapes.albedo.forward_model import TexelTransport, ambient_on_texels, transport_of_points
@@ -26,12 +28,14 @@ from seasonscapes.terrain.texels import texel_positions
 
 # Shadow rays per texel, to different points of the sun's disc.
 _RAYS = 4
+# From so many standard errors of the cosine of incidence up, ground surely faces the sun.
+_SURELY_SUNLIT = 2.5
 # Less than this share of a level surface's skylight reaches no slope of a terrain.
 _LEAST_OPEN = 0.05
 
 
 def texel_irradiance(
-    transport: TexelTransport, light: Illumination, chart: np.ndarray | None = None
+    transport: TexelTransport, light: Illumination, chart: np.ndarray | None = None, *, slope_error: float = 0.0
 ) -> TexelIrradiance:
     """Compute the light on the texels of a terrain's texture, split into its parts.
 
@@ -43,6 +47,8 @@ def texel_irradiance(
         Sun and sky; the moon is left out.
     chart
         ``(R, S)`` integers of the texture's charts, −1 for none; by default each connected part of the texture is one.
+    slope_error
+        Standard error of the cosine of incidence, where heights are coarser than the image; see `_sunlight`.
 
     Returns
     -------
@@ -50,7 +56,8 @@ def texel_irradiance(
         Zero, and chart −1, for texels off the surface.
     """
     rows, columns = transport.shape
-    sun, visibility = _sunlight(transport.device_points.rays, transport.normal, transport.texel, transport.shape, light)
+    on = _SunTexels(transport.device_points.rays, transport.normal, transport.texel, transport.shape)
+    sun, visibility = _sunlight(on, light, slope_error)
     sky = ambient_on_texels(transport, light, None)
 
     def bounce(albedo: np.ndarray) -> np.ndarray:
@@ -68,6 +75,7 @@ def coarse_irradiance(
     *,
     every: int,
     sampling: SamplingOptions,
+    slope_error: float = 0.0,
     progress: Callable[[float], None] | None = None,
 ) -> TexelIrradiance:
     """`texel_irradiance` of a texture whose neighbouring texels adjoin, with coarser skylight and interreflection.
@@ -84,6 +92,8 @@ def coarse_irradiance(
         Trace skylight and interreflection for every so many-th row and column, an odd number.
     sampling
         Numbers of rays, light clusters and basis directions.
+    slope_error
+        See `texel_irradiance`.
     progress
         Called with the finished fraction.
 
@@ -115,7 +125,8 @@ def coarse_irradiance(
     coarse_texel = (row // every * coarse_shape[1] + column // every)[middle]
     chosen = points[np.flatnonzero(middle)]
     transport = transport_of_points(surface, coarse_shape, chosen, coarse_texel, sampling=sampling, progress=progress)
-    sun, visibility = _sunlight(shadow_rays(surface, points, texel), points.normal, texel, shape, light)
+    on = _SunTexels(shadow_rays(surface, points, texel), points.normal, texel, shape)
+    sun, visibility = _sunlight(on, light, slope_error)
     open_sky = _open_sky_illuminance(light)
     coarse_sky = ambient_on_texels(transport, light, None)
     share = np.zeros_like(coarse_sky)
@@ -133,18 +144,42 @@ def coarse_irradiance(
     return TexelIrradiance(sun, visibility, sky.reshape(*shape, 3), bounce, level, _charts(texel, shape, None))
 
 
-def _sunlight(
-    rays: SunRays, normal: np.ndarray, texel: np.ndarray, shape: tuple[int, int], light: Illumination
-) -> tuple[np.ndarray, np.ndarray]:
-    """Illuminance by the sun without shadows ``(R, S, 3)``, and the visible share of its disc ``(R, S)``."""
-    sun = np.zeros((shape[0] * shape[1], 3), np.float32)
-    visibility = np.zeros(shape[0] * shape[1], np.float32)
+@dataclass(frozen=True)
+class _SunTexels:
+    """N texels that the sun may light: shadow rays, normals ``(N, 3)``, flat index ``(N,)``, and shape of the texture."""
+
+    rays: SunRays
+    normal: np.ndarray
+    texel: np.ndarray
+    shape: tuple[int, int]
+
+
+def _sunlight(on: _SunTexels, light: Illumination, slope_error: float) -> tuple[np.ndarray, np.ndarray]:
+    """Illuminance by the sun without shadows ``(R, S, 3)``, and the visible share of its disc ``(R, S)``.
+
+    With a standard error of the cosine of incidence, ground that turns away from the sun may yet face it: crowns of trees
+    stand out of a steep slope, and heights smooth it. Where the cosine is small, the illuminance is that of the least
+    cosine that is surely sunlit, and the visibility is such that their product has the mean over the error. It is a
+    prediction that the image may overrule.
+    """
+    rows, columns = on.shape
+    sun = np.zeros((rows * columns, 3), np.float32)
+    visibility = np.zeros(rows * columns, np.float32)
     if light.sun is not None:
-        cosine = np.maximum(normal @ np.asarray(light.sun.direction, np.float32), 0.0)
-        seen = visible_cosine(rays, light.sun, rays_per_sample=_RAYS)[:, 0]
-        sun[texel] = cosine[:, None] * np.asarray(light.sun.normal_illuminance_lx, np.float32)
-        visibility[texel] = np.clip(seen / np.maximum(cosine, 1e-6), 0.0, 1.0)
-    return sun.reshape(*shape, 3), visibility.reshape(shape)
+        signed = on.normal @ np.asarray(light.sun.direction, np.float32)
+        cosine = np.maximum(signed, 0.0)
+        seen = visible_cosine(on.rays, light.sun, rays_per_sample=_RAYS)[:, 0]
+        share = np.clip(seen / np.maximum(cosine, 1e-6), 0.0, 1.0)
+        if slope_error > 0.0:
+            ratio = signed / slope_error
+            mean = signed * norm.cdf(ratio) + slope_error * norm.pdf(ratio)
+            cosine = np.maximum(signed, _SURELY_SUNLIT * slope_error)
+            # No shadow ray leaves ground that turns away: what hides the sun from it is not known.
+            hidden = np.where(signed > 0.2 * slope_error, share, 1.0)
+            share = np.clip(hidden * mean / cosine, 0.0, 1.0)
+        sun[on.texel] = cosine[:, None] * np.asarray(light.sun.normal_illuminance_lx, np.float32)
+        visibility[on.texel] = share
+    return sun.reshape(rows, columns, 3), visibility.reshape(rows, columns)
 
 
 def _charts(texel: np.ndarray, shape: tuple[int, int], chart: np.ndarray | None) -> np.ndarray:

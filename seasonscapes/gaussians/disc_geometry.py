@@ -35,7 +35,7 @@ class DiscGeometry(nn.Module):
     >>> import seasonscapes as ss
     >>> place = ss.load_place("alpine_small")
     >>> geometry = DiscGeometry(terrain_surfels(place.terrain, 400.0))
-    >>> geometry.offset.shape[1], float(geometry.twist.abs().sum())
+    >>> geometry.offset.shape[1], float(geometry.twist.detach().abs().sum())
     (3, 0.0)
     """
 

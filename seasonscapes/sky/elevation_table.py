@@ -17,14 +17,14 @@ from seasonscapes.images import atomic_path
 from seasonscapes.sky.sh_moments import SUN_ELEVATION_KNOTS_DEG
 
 # Increment whenever the tables of an unchanged atmosphere and observer change.
-TABLE_REVISION = 2
+TABLE_REVISION = 3
 _BATCH = 4
 
 
 def _knots_deg() -> np.ndarray:
-    """Knots [deg]: four per interval, and eight in astronomical twilight, where radiance decreases most steeply."""
+    """Knots [deg]: three per interval, and six in astronomical twilight, where radiance decreases most steeply."""
     low, high = SUN_ELEVATION_KNOTS_DEG[:-1], SUN_ELEVATION_KNOTS_DEG[1:]
-    counts = np.where((low >= -18.0) & (low < -12.0), 8, 4)
+    counts = np.where((low >= -18.0) & (low < -12.0), 6, 3)
     intervals = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(low, high, counts, strict=True)]
     return np.concatenate([*intervals, high[-1:]])
 

@@ -126,7 +126,7 @@ def bake_imagery(terrain: Terrain, atlas: Atlas, image: Raster, *, gutter_px: in
     weight = np.zeros((atlas.height_px, atlas.width_px), np.float32)
     pixels_of = pixel_map(terrain, image)
     footprint = _face_footprints(terrain, atlas, pixels_of)
-    pyramid = _pyramid(image.values, 2 + int(_mip_level(footprint).max()))
+    pyramid = _pyramid(image.values, 1 + int(np.ceil(_mip_level(footprint).max())))
     texel = np.flatnonzero(face_id >= 0)
     for start in range(0, len(texel), _CHUNK):
         part = texel[start : start + _CHUNK]
@@ -259,7 +259,7 @@ def _pyramid(values: np.ndarray, most: int) -> list[np.ndarray]:
     A level is the 2 × 2 box mean of the previous one.
     """
     known = np.isfinite(values).all(axis=2, keepdims=True)
-    levels = [np.concatenate([np.where(known, values, 0.0), known], axis=2).astype(np.float32)]
+    levels: list[np.ndarray] = [np.concatenate([np.where(known, values, 0.0), known], axis=2).astype(np.float32)]
     while max(levels[-1].shape[:2]) > 1 and len(levels) < most:
         level = levels[-1]
         level = np.pad(level, ((0, level.shape[0] % 2), (0, level.shape[1] % 2), (0, 0)))
@@ -371,7 +371,10 @@ def filled_gutters(texture: Texture, covered: np.ndarray, gutter_px: int) -> Tex
     if known.all() or not known.any():
         return texture
     row, column = np.asarray(distance_transform_edt(~known, return_distances=False, return_indices=True))
-    return replace(texture, values=texture.values[row, column], weight=texture.weight[row, column])
+    empty = ~known
+    values, weight = texture.values.copy(), texture.weight.copy()
+    values[empty], weight[empty] = (kept[row[empty], column[empty]] for kept in (texture.values, texture.weight))
+    return replace(texture, values=values, weight=weight)
 
 
 def _grown(mask: np.ndarray) -> np.ndarray:

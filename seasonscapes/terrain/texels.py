@@ -136,7 +136,18 @@ def texel_positions(terrain: Terrain, width: int, height: int) -> tuple[np.ndarr
     """
     xy = texel_coordinates(terrain.uv, width, height)
     face_id = covering_faces(xy, terrain.faces, width, height)
-    # Over a face the position is linear in the texel: its gradients are computed once for each face.
+    start_m, across, down = _face_gradients(terrain, xy)
+    positions = np.full((height, width, 3), np.nan, np.float32)
+    flat, texel = positions.reshape(-1, 3), np.flatnonzero(face_id >= 0)
+    for start in range(0, len(texel), _CHUNK_TEXELS):
+        part = texel[start : start + _CHUNK_TEXELS]
+        face, (row, column) = face_id.ravel()[part], np.divmod(part, width)
+        flat[part] = start_m[face] + across[face] * (column + 0.5)[:, None] + down[face] * (row + 0.5)[:, None]
+    return positions, face_id
+
+
+def _face_gradients(terrain: Terrain, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Over a face the position is linear in the texel: at texel coordinates 0, by column and by row, ``(F, 3)`` each [m]."""
     corner, vertices = xy[terrain.faces[:, 0]], terrain.vertices.astype(np.float64)
     (t1, t2), (p1, p2) = (
         [values[terrain.faces[:, k]] - values[terrain.faces[:, 0]] for k in (1, 2)] for values in (xy, vertices)
@@ -146,13 +157,7 @@ def texel_positions(terrain: Terrain, width: int, height: int) -> tuple[np.ndarr
     determinant = np.where(determinant == 0.0, np.inf, determinant)
     across, down = (p1 * t2[:, 1:] - p2 * t1[:, 1:]) / determinant, (p2 * t1[:, :1] - p1 * t2[:, :1]) / determinant
     start_m = vertices[terrain.faces[:, 0]] - across * corner[:, :1] - down * corner[:, 1:]
-    positions = np.full((height, width, 3), np.nan, np.float32)
-    flat, texel = positions.reshape(-1, 3), np.flatnonzero(face_id >= 0)
-    for start in range(0, len(texel), _CHUNK_TEXELS):
-        part = texel[start : start + _CHUNK_TEXELS]
-        face, (row, column) = face_id.ravel()[part], np.divmod(part, width)
-        flat[part] = start_m[face] + across[face] * (column + 0.5)[:, None] + down[face] * (row + 0.5)[:, None]
-    return positions, face_id
+    return start_m, across, down
 
 
 def covered_share(terrain: Terrain, weight: np.ndarray) -> float:

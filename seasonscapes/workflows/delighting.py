@@ -197,7 +197,7 @@ def delit_imagery(
     NotEnoughEvidence
         Where the sun of an image of unknown time cannot be told.
     """
-    from seasonscapes.albedo.delighting import DelightOptions, delight_image
+    from seasonscapes.albedo.delighting import SLOPE_ERROR, DelightOptions, delight_image
     from seasonscapes.rendering.backend import use_backend
 
     imagery, confinement = _chosen_image(place, image)
@@ -213,7 +213,7 @@ def delit_imagery(
             raise NotEnoughEvidence(f"{imagery.label}: its sun cannot be told: {found.reason}; {cure}")
         time = (found.azimuth_deg, found.elevation_deg)
     light, day, record = image_light(place, time, sky)
-    irradiance = _texel_light(place, light, progress)
+    irradiance = _texel_light(place, light, progress, slope_error=SLOPE_ERROR)
     options = DelightOptions(
         white_reflectance=imagery.reflectance_scale,
         air=None if sensor_height_m is None else _air(place, time, sky, sensor_height_m),
@@ -274,7 +274,9 @@ def image_light(
     return replace(light, frame=place.frame), day, record | {"sky": light.model}
 
 
-def _texel_light(place: Place, light: Illumination, progress: Progress | None) -> TexelIrradiance:
+def _texel_light(
+    place: Place, light: Illumination, progress: Progress | None, *, slope_error: float = 0.0
+) -> TexelIrradiance:
     from seasonscapes.albedo.forward_model import trace_texel_transport
     from seasonscapes.albedo.texel_light import coarse_irradiance, texel_irradiance
     from seasonscapes.rendering.backend import use_backend
@@ -287,10 +289,16 @@ def _texel_light(place: Place, light: Illumination, progress: Progress | None) -
     every = _traced_every(place)
     if every > 1:
         return coarse_irradiance(
-            place.terrain, place.texture_shape, light, every=every, sampling=sampling, progress=report
+            place.terrain,
+            place.texture_shape,
+            light,
+            every=every,
+            sampling=sampling,
+            slope_error=slope_error,
+            progress=report,
         )
     transport = trace_texel_transport(place.terrain, place.texture_shape, sampling=sampling, progress=report)
-    return texel_irradiance(transport, light)
+    return texel_irradiance(transport, light, slope_error=slope_error)
 
 
 def _traced_every(place: Place) -> int:
