@@ -74,6 +74,7 @@ results: $(DEV)
 	$(BIN)/python benchmarks/delight.py --quick --json benchmarks/results/delight-quick.json
 	$(BIN)/python benchmarks/gaussians.py --quick --json benchmarks/results/gaussians-quick.json
 	$(BIN)/python benchmarks/alpinebench.py --quick --json benchmarks/results/alpinebench-quick.json
+	$(BIN)/python benchmarks/alpinebench_contributions.py --json benchmarks/results/alpinebench-contributions.json
 	$(BIN)/python benchmarks/viewer.py --quick --json benchmarks/results/viewer-quick.json
 	$(BIN)/python benchmarks/detail.py --quick --json benchmarks/results/detail-quick.json
 	$(BIN)/python benchmarks/calibration.py --quick --json benchmarks/results/calibration-quick.json

@@ -11,7 +11,9 @@ judged: pictures developed with the truth's exposure, land beyond 60 m, mode ``v
 each colour first, as one must for a real webcam.
 
 * Panoramas are calibrated, cut into views, and give the albedo, which corrects the satellite's image where no webcam
-  looked; relit, it ties the pictures of each hour together, and what they paint corrects it.
+  looked; relit, it ties the pictures of each hour together, and what they paint corrects it. One table tells what paintings,
+  their completions and the joint recovery would add to the albedo (``run --use-painted``, ``--use-inpainted``,
+  ``--recovery differentiable``); `alpinebench_contributions.py` tells it of many places.
 * Painted hours: the painted and completed texture, seen from the judged webcams through the air.
 * Held-out hours: the albedo recovered from the painted hours' pictures, relit.
 * Distilled: Gaussians that learned from that albedo under suns of other days, seen at the held-out hours.
@@ -46,6 +48,8 @@ from alpinebench_scene import DATE, SIZES, pose_errors  # noqa: E402
 from alpinebench_stages import Bench, Splats  # noqa: E402
 from record import write_record  # noqa: E402
 
+from seasonscapes.albedo.closed_form import solve_albedo  # noqa: E402
+from seasonscapes.albedo.photographs import EIGHT_BIT  # noqa: E402
 from seasonscapes.evaluation.figures import comparison_figure, image_row, steepest_window  # noqa: E402
 from seasonscapes.evaluation.lpips import load_lpips, lpips_sources, missing_lpips  # noqa: E402
 from seasonscapes.evaluation.surfaces import albedo_error  # noqa: E402
@@ -101,7 +105,8 @@ def stages(bench: Bench) -> tuple[dict[str, dict], dict]:
     fit = bench.solved(clean=True, true_pose=True)
     rows["albedo alone, clean + relight"] = judge.scores(judge.of_albedo(bench.completed_albedo(fit)[0]), held)
     bench.clock.tell("albedo alone")
-    albedo_fit = bench.solved()
+    photographs = bench.photographs()
+    albedo_fit = solve_albedo(bench.land, photographs, noise_model=EIGHT_BIT)
     albedo, sigma = bench.completed_albedo(albedo_fit)
     relit = judge.of_albedo(albedo)
     rows["all, held-out hours"] = judge.scores(relit, held)
@@ -121,6 +126,7 @@ def stages(bench: Bench) -> tuple[dict[str, dict], dict]:
         "told": told,
         "textures": textures,
         "albedo": albedo,
+        "photographs": photographs,
         "fit": albedo_fit,
         "seen": seen,
         "relit": relit,
@@ -141,6 +147,25 @@ def texture_scores(bench: Bench, textures: dict, *, air: bool = True) -> dict[st
         ablated_hours(bench),
         most=bench.world.size.ablated,
     )
+
+
+def contributions(bench: Bench, whole: dict) -> tuple[dict[str, dict], dict[str, float]]:
+    """What each adds to the albedo of photographs, as rows of its relit held-out hours, and as gains [dB].
+
+    ``whole`` holds photographs, their fit and albedo, and painted and completed textures.
+    """
+    judge, rows, numbers = bench.judge, Rows(), {}
+    for name, albedo in bench.albedos(whole).items():
+        scores = judge.scores(judge.of_albedo(albedo), bench.world.held_hours)
+        error = albedo_error(bench.world.albedo, albedo, bench.albedo_guides.surface)
+        rows[name] = scores | {"albedo_psnr_db": error.psnr_db}
+    alone = rows["photographs alone"]
+    for name, row in rows.items():
+        if row is not alone:
+            numbers[f"{key_of(name)}_gain_db"] = row["psnr_db"] - alone["psnr_db"]
+            numbers[f"{key_of(name)}_albedo_gain_db"] = row["albedo_psnr_db"] - alone["albedo_psnr_db"]
+    bench.clock.tell("contributions to the albedo")
+    return rows, numbers
 
 
 def painting_ablations(bench: Bench, whole: dict, without: dict[str, dict]) -> dict[str, dict]:
@@ -234,7 +259,7 @@ def one_colour(texture: Texture) -> np.ndarray:
     return np.where(seen[..., None], texture.values, texture.values[seen].mean(axis=0)).astype(np.float32)
 
 
-_SHOWN = ("psnr_db", "matched_psnr_db", "ssim", "flip", "lpips", "colour_angle_deg")
+_SHOWN = ("psnr_db", "matched_psnr_db", "ssim", "flip", "lpips", "colour_angle_deg", "albedo_psnr_db")
 
 
 def print_stages(rows: dict[str, dict]) -> None:
@@ -363,12 +388,15 @@ def main() -> None:
     rows, whole = stages(bench)
     print_stages(rows)
     painted_rows, held_rows = ablations(bench, whole)
+    albedo_rows, gains = contributions(bench, whole)
     painting_rows = painting_ablations(bench, whole, painted_rows)
     most = min(bench.world.size.ablated, len(bench.world.judged))
     print(f"\nthe whole, two painted hours, {most} views that no webcam saw")
     print_ablations(painted_rows)
     print("\nthe whole, held-out hours, the same views")
     print_ablations(held_rows)
+    print("\nwhat each adds to the albedo, held-out hours, all judged views")
+    print_stages(albedo_rows)
     print("\npainting and its completion alone, as the paper's, two painted hours, the same views")
     print_ablations(painting_rows)
     at = bench.world.painted_hours[0]
@@ -382,7 +410,8 @@ def main() -> None:
         save_figures(bench, whole, arguments.figures)
         save_day(bench, whole, arguments.figures)
     ablated = {"ablation_painted": painted_rows, "ablation_held_out": held_rows, "ablation_painting": painting_rows}
-    numbers = numbers_of(bench, rows, ablated, whole) | {"seconds": time.perf_counter() - bench.clock.start}
+    ablated["albedo"] = albedo_rows
+    numbers = numbers_of(bench, rows, ablated, whole) | gains | {"seconds": time.perf_counter() - bench.clock.start}
     write_record(arguments.json, numbers, seed=seed)
 
 

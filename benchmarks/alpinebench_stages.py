@@ -30,7 +30,10 @@ from alpinebench_scene import (
 from seasonscapes.albedo.albedo_completion import complete_albedo
 from seasonscapes.albedo.closed_form import AlbedoFit, SearchOptions, solve_albedo
 from seasonscapes.albedo.forward_model import TexelTransport, ambient_on_texels, sun_on_texels, trace_texel_transport
-from seasonscapes.albedo.photographs import EIGHT_BIT, LINEAR, prepare_photographs
+from seasonscapes.albedo.inpainted_albedo import FUSED, corrected_by_inpainting
+from seasonscapes.albedo.joint_recovery import recover_jointly
+from seasonscapes.albedo.painted_textures import REPEATED, painted_photograph
+from seasonscapes.albedo.photographs import EIGHT_BIT, LINEAR, AlbedoPhotograph, prepare_photographs
 from seasonscapes.albedo.texture_delighting import delight_textures
 from seasonscapes.albedo.tone_curve import fit_tone_curve, with_tone_curve
 from seasonscapes.evaluation.masks import terrain_mask
@@ -262,20 +265,58 @@ class Bench:
         """A painting and what an albedo of relative error ``sigma``, relit, says of the hour."""
         return fuse_with_albedo(texture, told, sigma, self.predictors[at]).values
 
-    def solved(self, *, clean: bool = False, true_pose: bool = False, response: bool = True) -> AlbedoFit:
-        """Albedo from all painted hours' pictures; unless these are clean, their tone curve is searched for."""
+    def photographs(
+        self, *, clean: bool = False, true_pose: bool = False, response: bool = True
+    ) -> list[AlbedoPhotograph]:
+        """All painted hours' pictures with their light; unless these are clean, their tone curve is searched for."""
         seen, lights, gains = [], [], []
         for at in self.world.painted_hours:
             views = observed(self.pictures, self.world, at, gain=1.0 if clean else None, true_pose=true_pose)
-            for one, _, number in views:
-                seen.append(one)
+            for one, deviations, number in views:
+                seen.append(replace(one, pose_sigma=deviations))
                 lights.append(self.world.lights[at][number])
                 gains.append(np.ones(3) if clean else None)
         inputs = prepare_photographs(self.land, seen, lights, gains=gains, seed=self.world.seed)
         if response and not clean:
             curve = fit_tone_curve(self.land, inputs, search=SearchOptions(seed=self.world.seed))
             inputs = with_tone_curve(inputs, curve.strength)
+        return inputs
+
+    def solved(self, *, clean: bool = False, **how: bool) -> AlbedoFit:
+        """Albedo from `photographs`, by the closed form."""
+        inputs = self.photographs(clean=clean, **how)
         return solve_albedo(self.land, inputs, noise_model=LINEAR if clean else EIGHT_BIT)
+
+    def solved_again(self, photographs: list[AlbedoPhotograph], paintings: dict[datetime, Painting]) -> AlbedoFit:
+        """Albedo from photographs and, with the confidence that a run gives them, what was painted from them."""
+        repeated = []
+        for at, painting in paintings.items():
+            made = painted_photograph(self.land, painting.texture, self.world.lights[at][0], at)
+            repeated.append(replace(made, confidence=made.confidence * np.float32(REPEATED)))
+        return solve_albedo(self.land, [*photographs, *repeated], noise_model=EIGHT_BIT)
+
+    def inpainted(self, albedo: np.ndarray, fit: AlbedoFit, textures: dict[datetime, np.ndarray]) -> np.ndarray:
+        """An albedo that completed textures correct where no photograph measured it."""
+        lights = [self.world.lights[at][0] for at in textures]
+        unmeasured = fit.pixel_count < 0.5
+        return corrected_by_inpainting(self.land, albedo, unmeasured, list(textures.values()), lights, share=FUSED)
+
+    def found_jointly(self, photographs: list[AlbedoPhotograph], fit: AlbedoFit) -> AlbedoFit:
+        """Albedo together with response, exposures, clouds and poses; haze stays the truth's, as for the closed form."""
+        return recover_jointly(self.land, photographs, fit).fit
+
+    def albedos(self, whole: dict) -> dict[str, np.ndarray]:
+        """Albedos from photographs alone, with what else a run can use, and by the joint recovery.
+
+        ``whole`` holds ``photographs``, their closed ``fit`` and ``albedo``, and of each hour ``paintings`` and ``textures``.
+        """
+        photographs, fit, albedo = whole["photographs"], whole["fit"], whole["albedo"]
+        return {
+            "photographs alone": albedo,
+            "with painted": self.completed_albedo(self.solved_again(photographs, whole["paintings"]))[0],
+            "with inpainted": self.inpainted(albedo, fit, whole["textures"]),
+            "differentiable": self.completed_albedo(self.found_jointly(photographs, fit))[0],
+        }
 
     def completed_albedo(self, fit: AlbedoFit, base: Texture | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Another picture of the land (left out, the satellite's, its light taken out) corrected by the seen texels; and σ."""

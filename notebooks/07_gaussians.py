@@ -65,3 +65,8 @@ for axis, hour in zip(axes, ("06:00", "09:00", "13:00", "17:00"), strict=True):
     axis.imshow(ss.srgb_from_linear(ss.develop(view)))
     axis.set_title(f"{hour} UTC")
     axis.axis("off")
+
+# %% [markdown]
+# The command line knows two more models: `distill --appearance paper` learns its colours from frames of any hour by a network
+# that sees viewing direction and a free embedding, as the SeasonScapes paper does, and `--appearance embedding` without the
+# direction. Neither knows the sun: they show the hours of their frames, and blend between these.

@@ -70,3 +70,8 @@ for axis, name, picture in zip(axes, ("photograph", "fitted"), pair, strict=True
     axis.imshow(picture)
     axis.set_title(name)
     axis.axis("off")
+
+# %% [markdown]
+# Albedo is not recovered this way: gradients of path tracing are noisy, and Adam, which knows no curvature, was measured to
+# return the closed form's albedo or a worse one. `ss.recover_albedo(..., options=ss.RecoveryOptions(method="differentiable"))`
+# differentiates the daylight coefficients instead, exactly and without new rays; this scene is for what those do not hold.

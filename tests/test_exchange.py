@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-from seasonscapes.calibration.joint_panorama import joint_panoramas
 from seasonscapes.cameras.exchange import (
     NamedView,
     camera_from_opencv,
@@ -31,7 +30,6 @@ from seasonscapes.cameras.reference_poses import (
     reference_records,
     steps_per_metre,
 )
-from seasonscapes.cameras.webcam import read_webcams
 from seasonscapes.declaration import InputError
 from seasonscapes.frames import LocalFrame, geodetic_from_enu
 
@@ -213,23 +211,6 @@ def test_the_reference_files_come_in_and_go_back(data_dir, name, count, kind):
         latitude, longitude, _ = geodetic_from_enu(FRAME, view.camera.position_m)
         assert 46.3 < latitude < 46.9
         assert 7.5 < longitude < 8.4
-
-
-@pytest.mark.data
-def test_the_138_views_spread_as_measured_and_share_a_pose_when_solved_together(data_dir):
-    refined = read_reference_poses(poses(data_dir, "Rshot/transformation_final_v4_flat.json"), FRAME)
-    table = read_reference_poses(poses(data_dir, "Rshot/transformation_Roundshot_flat.json"), FRAME, kind="unrefined")
-    joint = joint_panoramas(read_webcams(BERNESE), refined, table, FRAME)
-    assert len(joint) == 32
-    ratio = np.concatenate([j.focal_ratio for j in joint])
-    assert np.median(ratio, axis=0) == pytest.approx([0.957, 0.939], abs=0.004)
-    errors = np.abs(np.concatenate([j.heading_error_deg for j in joint]))
-    assert len(errors) == 138
-    assert np.median(errors) == pytest.approx(1.7, abs=0.3)
-    assert 13.0 < np.max(errors) < 19.0
-    birg = next(j for j in joint if j.webcam == "28-SCHILTBIR")
-    assert birg.heading_offset_deg == pytest.approx([38.0] * 4, abs=0.6)
-    assert birg.solution is not None
 
 
 @pytest.mark.parametrize(

@@ -55,7 +55,6 @@ from seasonscapes.gaussians.splat_view import (  # noqa: E402
     render_model,
 )
 from seasonscapes.gaussians.surfels import axes_from_quaternions, surfel_albedo, terrain_surfels  # noqa: E402
-from seasonscapes.gaussians.tile_tree import concatenate_tiles, select_tiles, tile_bounds, tile_discs, tile_tree  # noqa: E402
 from seasonscapes.gaussians.training import (  # noqa: E402
     Checkpoint,
     Schedule,
@@ -72,7 +71,6 @@ from seasonscapes.rendering.mitsuba_scene import mi_mesh, relight  # noqa: E402
 from seasonscapes.rendering.radiance import path_trace  # noqa: E402
 from seasonscapes.rendering.splatting import splat_layers, upload_splats  # noqa: E402
 from seasonscapes.sky.illumination import Illumination, global_horizontal_illuminance  # noqa: E402
-from seasonscapes.terrain.attributes import vertex_normals  # noqa: E402
 
 set_torch_threads(1)
 CAMERA = Camera(24, 20, 26.0, 24.0, 12.5, 9.5, np.eye(4))
@@ -568,59 +566,6 @@ def test_distill_says_what_is_wrong(tmp_path, capsys):
     ):
         assert main(["distill", str(scene), *arguments]) == 2
         assert said in capsys.readouterr().err
-
-
-def test_tiles_cover_the_land_once_and_are_fine_where_near():
-    terrain = heightfield(lambda e, n: 30.0 * np.sin(e / 60.0), side_m=1600.0, count=161)
-    tree = tile_tree(terrain, finest_m=6.3, discs=16)
-    assert tree.levels == 5
-    assert tree.spacing_m(4) == pytest.approx(1600.0 / 16 / 16)
-    camera = looking_down(900.0, size=64, view_m=2400.0)
-    tiles = select_tiles(tree, camera)
-    seen = np.zeros((16, 16), int)
-    for tile in tiles:
-        span = 16 >> tile.level
-        seen[tile.row * span : (tile.row + 1) * span, tile.column * span : (tile.column + 1) * span] += 1
-    assert np.all(seen == 1), "from above all of it is in view"
-    pose = np.eye(4)
-    pose[:3, :3] = rotation_from_angles(0.0, -15.0)
-    pose[:3, 3] = [0.0, -790.0, 80.0]
-    low = Camera(96, 72, 80.0, 80.0, 48.0, 36.0, pose)
-    tiles = select_tiles(tree, low)
-    near, far = (
-        [t.level for t in tiles if side(tile_bounds(tree, t)[1])] for side in (lambda n: n < -700, lambda n: n > 500)
-    )
-    assert min(near) == 4
-    assert max(far) < 4
-    normals = vertex_normals(terrain)
-    made = [tile_discs(terrain, tree, tile, normals=normals) for tile in tiles]
-    shapes = concatenate_tiles(made, low)
-    assert len(shapes[0]) == sum(16 * 16 for _ in tiles)
-    pose[:3, 3] = 0.0
-    coverage = view_weights(splats_from(*shapes), replace(low, world_from_camera=pose), subpixels=2).coverage
-    assert coverage[30:68].min() > 0.75, "no crack between levels"
-    behind = replace(low, world_from_camera=looking_north(900.0, 50.0))
-    assert select_tiles(tree, behind) == []
-
-
-def test_a_tile_far_from_the_origin_keeps_its_millimetres():
-    far = heightfield(lambda e, n: 0.0 * e, side_m=100.0, count=3)
-    terrain = replace(far, vertices=far.vertices + np.float32([60_000.0, 0.0, 0.0]))
-    tree = tile_tree(terrain, finest_m=10.0, discs=10)
-    (made,) = [
-        tile_discs(terrain, tree, tile)
-        for tile in select_tiles(tree, replace(looking_down(), world_from_camera=above(60_000.0)))
-    ]
-    spacing = np.diff(np.sort(np.unique(made.surfels.means[:, 0].round(4))))
-    np.testing.assert_allclose(spacing, 10.0, atol=2e-3)
-    assert np.abs(made.surfels.means).max() < 60.0
-
-
-def above(east_m: float) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:3, :3] = rotation_from_angles(0.0, -90.0)
-    pose[:3, 3] = [east_m, 0.0, 1000.0]
-    return pose
 
 
 def test_a_free_code_is_found_for_a_new_picture(hill, told):

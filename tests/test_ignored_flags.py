@@ -78,13 +78,14 @@ VERBS: dict[str, tuple[list[str], set[str], dict[str, list[str]]]] = {
     "paint": (
         ["alpine_small", "--time", TIME],
         {*_TERRAIN, *_SKY, "--time", "--synthetic-webcams", "--mode", "--near-m", "--harmonise", "--albedo", "--output"}
-        | {"--no-harmonise"},
+        | {"--no-harmonise", "--find-foreground"},
         {**_NO_BOUND, **_REAL, "--leave-out": [], "--size": []},
     ),
     "albedo": (
         ["alpine_small", "--times", TIME],
-        {*_TERRAIN, *_SKY, "--times", "--synthetic-webcams", "--method", "--painted", "--output"},
-        {**_NO_BOUND, **_REAL, "--size": []} | _each(("--fit-haze", "--fit-curve"), ["--method", "differentiable"]),
+        {*_TERRAIN, *_SKY, "--times", "--synthetic-webcams", "--method", "--painted", "--output"}
+        | {"--fit-curve"},
+        {**_NO_BOUND, **_REAL, "--size": [], "--fit-haze": ["--method", "differentiable"]},
     ),
     "inpaint": (
         ["alpine_small", "--time", TIME],
@@ -113,10 +114,12 @@ VERBS: dict[str, tuple[list[str], set[str], dict[str, list[str]]]] = {
     "run": (
         ["alpine_small", "--times", TIME, "--at-hours", TIME],
         {*_TERRAIN, *_SKY, *_VIEW, "--times", "--at-hours", "--manifest", "--masks", "--method", "--poses", "--grade"}
-        | {"--painting", "--completion", "--appearance", "--discs", "--from", "--until", "--seed", "--output"},
+        | {"--painting", "--completion", "--appearance", "--discs", "--from", "--until", "--seed", "--output"}
+        | {"--recovery", "--use-painted", "--no-use-painted", "--use-inpainted", "--no-use-inpainted", "--find-foreground"},
         {**_OF_POSITION, **_NO_BOUND}
         | _each(("--calibrations", "--within-min", "--doubtful-poses"), [])
         | _each(("--photo-kind", "--photo-size", "--leave-out"), ["--manifest", "m.csv"])
+        | {"--season": []}
         | _each(("--points", "--path", "--path-views", "--weights", "--prompt", "--guide-image"), [])
         | _each(("--diffusion-steps", "--paper-steps"), [])
         | _each(

@@ -23,6 +23,8 @@ from seasonscapes.terrain.surface import Texture
 
 # Resampling blurs, and a texel that several photographs show is a blend of them.
 PAINTED_NOISE = NoiseModel(model=0.05)
+# Confidence of a painting beside the photographs that it was painted from, whose errors it repeats.
+REPEATED = 0.1
 # Standard deviation of the common scale of a painting, whose exposure the skies of its photographs gave.
 _SCALE_SIGMA = 0.1
 _FEWEST_FACING = 1e-3
@@ -63,7 +65,7 @@ def painted_photograph(
     --------
     >>> import seasonscapes as ss
     >>> from seasonscapes.albedo.forward_model import trace_texel_transport
-    >>> place = ss.load_place("alpine_small", ss.MeshOptions(texel_m=120.0))
+    >>> place = ss.load_place("alpine_small", options=ss.MeshOptions(texel_m=120.0))
     >>> transport = trace_texel_transport(place.terrain, place.texture_shape)
     >>> light = ss.illumination(place, "2024-07-20T13:30", sky="hosek")
     >>> lit = ss.Texture(np.full((*place.texture_shape, 3), 2e3, np.float32), np.ones(place.texture_shape, np.float32))

@@ -1,9 +1,8 @@
-"""Grouping of dated albedos by season, and averaging of texels that do not change between the dates."""
+"""Grouping of dated albedos by season."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from datetime import date
 
 import numpy as np
@@ -56,46 +55,3 @@ def _same_season(a: AlbedoEstimate, b: AlbedoEstimate) -> bool:
     tolerance = 3.0 * np.hypot(a.sigma[both], b.sigma[both]) + 0.10 * a.albedo[both][:, 1]
     colour = np.abs(a.albedo[both][:, 1] - b.albedo[both][:, 1]) > tolerance
     return bool(snow.mean() < _SNOW_CHANGED and colour.mean() < _COLOUR_CHANGED)
-
-
-def share_unchanged(estimates: Sequence[AlbedoEstimate]) -> list[AlbedoEstimate]:
-    """Replace texels that did not change between dates by their inverse-variance weighted mean.
-
-    A texel is unchanged if it is measured on at least two dates and agrees with the mean within two standard deviations
-    on all of them. Dates on which it was not measured receive the mean too, if the snow cover of their completed value
-    equals that of the mean.
-
-    Parameters
-    ----------
-    estimates
-        Albedos of several dates.
-
-    Returns
-    -------
-    list of AlbedoEstimate
-        Albedos in the same order, with joint means and standard deviations.
-    """
-    if len(estimates) < 2:
-        return list(estimates)
-    values = np.stack([estimate.albedo for estimate in estimates])
-    sigma = np.stack([estimate.sigma for estimate in estimates])
-    measured = np.stack([estimate.source == 1 for estimate in estimates])
-    weight = np.where(measured, 1.0 / np.maximum(sigma, 1e-4) ** 2, 0.0)
-    total = weight.sum(axis=0)
-    mean = (weight[..., None] * values).sum(axis=0) / np.maximum(total, 1e-12)[..., None]
-    deviation = np.where(measured, np.abs(values[..., 1] - mean[..., 1]) / np.maximum(sigma, 1e-4), 0.0).max(axis=0)
-    unchanged = (measured.sum(axis=0) >= 2) & (deviation < 2.0)
-    joint_sigma = 1.0 / np.sqrt(np.maximum(total, 1e-12))
-    result = []
-    for estimate, was_measured in zip(estimates, measured, strict=True):
-        same_snow = np.abs(snow_share(estimate.albedo) - snow_share(mean)) < 0.5
-        use = unchanged & (was_measured | same_snow)
-        result.append(
-            replace(
-                estimate,
-                albedo=np.where(use[..., None], mean, estimate.albedo).astype(np.float32),
-                sigma=np.where(use, joint_sigma, estimate.sigma).astype(np.float32),
-                source=np.where(use, 1, estimate.source).astype(np.uint8),
-            )
-        )
-    return result

@@ -74,7 +74,7 @@ def albedo_command(
     fit_haze
         With closed: search the visibility that explains the pictures best (takes minutes the first time).
     fit_curve
-        With closed: search the webcams' tone curve.
+        Search the webcams' tone curve first.
     output
         A .npz with albedo, standard error, times sunlit and source of each texel; pictures go beside it.
     json

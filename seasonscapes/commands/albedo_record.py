@@ -26,7 +26,7 @@ def albedo_record(loaded: Place, recovered: RecoveredAlbedo, output: Path) -> di
         "residual": [round(float(value), 4) for value in recovered.fit.residual],
         "gains": recovered.fit.gains.tolist(),
         **recovered.facts,
-        "figures": recovery.save_albedo_figures(loaded, recovered, output),
+        "figures": recovery.save_albedo_figures(loaded, recovered.estimate, recovered.day, output),
         "attribution": loaded.scene.attribution,
     }
     if loaded.synthetic is not None:

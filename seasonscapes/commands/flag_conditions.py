@@ -75,8 +75,8 @@ CONDITIONS: dict[str, tuple[Condition, ...]] = {
         Condition(("--size",), "--synthetic-webcams", beside("--synthetic-webcams")),
         _SYNTHETIC[1],
         Condition(
-            ("--fit-haze", "--fit-curve"),
-            "--method closed: differentiable finds haze and response itself",
+            ("--fit-haze",),
+            "--method closed: differentiable finds the haze itself",
             named("--method", "closed", default="closed"),
         ),
         Condition(

@@ -23,6 +23,7 @@ def paint_command(
     mode: str = "weighted",
     near_m: float = 60.0,
     harmonise: bool = True,
+    find_foreground: bool = False,
     albedo: Path | None = None,
     output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("out/paint"),
     sky: SkyOptions | None = None,
@@ -43,6 +44,8 @@ def paint_command(
         Leave out what is nearer than this in metres: roofs and trees rather than terrain.
     harmonise
         Fit exposure, white balance, contrast and haze of all cameras together.
+    find_foreground
+        Look for houses and masts, which the terrain lacks, and leave them out; what is known already belongs into --masks.
     albedo
         What `seasonscapes albedo` wrote for this scene: relit at this hour it determines exposures and haze better than
         the skies do.
@@ -73,7 +76,7 @@ def paint_command(
         predicted = None if albedo is None else measured_radiance(loaded, albedo, utc, model, progress=progress)
         sources = pictures.sources(loaded, utc, model, progress)
         reference = None if predicted is None else RadiometricReference(predicted, RELATIVE_SIGMA)
-        how = PaintOptions(mode=mode, fit_gains=harmonise, fit_haze=harmonise, near_m=near_m)
+        how = PaintOptions(mode, harmonise, harmonise, near_m=near_m, foreground=find_foreground)
         within = pictures.within_min
         painting = painting_of(
             loaded, sources, utc, model, how, within_min=within, reference=reference, progress=progress
@@ -87,6 +90,7 @@ def paint_command(
         "time_utc": utc.isoformat(),
         "scene": loaded.scene.name,
         "mode": mode,
+        "foreground": find_foreground,
         "uncalibrated": uncalibrated(rows_at(sources, utc, within_min=within), sources),
         "painted": str(output / "painted.npz"),
         "figures": figures,

@@ -36,7 +36,7 @@ def run_command(
 ) -> None:
     """Take a scene from photographs to pictures of other hours and to Gaussians; an interrupted run continues.
 
-    Stages: pictures, calibrate, albedo, paint, inpaint, relight, distil, splat; with --method paper cloud, pictures,
+    Stages: pictures, calibrate, albedo, paint, inpaint, refine, relight, distil, splat; with --method paper cloud, pictures,
     calibrate, views, paint, path, inpaint, film, distil, splat. Each is built again only where its arguments, the content of what it
     reads or the program's code have changed; run.json in the folder records them.
 
@@ -45,7 +45,8 @@ def run_command(
     scene
         A scene file, or the name of a bundled scene (alpine).
     times
-        When the photographs were taken: ISO 8601, commas between; of one season.
+        When the photographs were taken: ISO 8601, commas between. Days that show the same snow and colours give one albedo;
+        pictures of dates between two such seasons interpolate.
     at_hours
         When to picture the place: ISO 8601, commas between.
     start
@@ -61,7 +62,8 @@ def run_command(
     """
     check_output_folder(output)
     options, view, sky = place or PlaceOptions(), view or ViewOptions(size="768x512"), sky or SkyOptions()
-    stages_by, along = (method or RunMethodOptions()).values()
+    method = method or RunMethodOptions()
+    stages_by, along = method.values()
     photographs, distil = (
         pictures or RunPictureOptions(),
         (effort or RunEffort()).values(appearance=stages_by.appearance),
@@ -72,13 +74,15 @@ def run_command(
     found, model, size_px = photographs.values(allow_outside=options.allow_outside), sky.model(), view.size_px()
     from seasonscapes.workflows.albedo_recovery import TEXEL_M
     from seasonscapes.workflows.full_run import RunJob, run
+    from seasonscapes.workflows.run_albedo import season_records
 
     with progress_bars() as progress:
         loaded = options.load(scene, progress, texel_m=TEXEL_M)
         at = (loaded.frame.latitude_deg, loaded.frame.longitude_deg)
+        utc = tuple(parse_times("--times", times, *at))
         job = RunJob(
             loaded,
-            tuple(parse_times("--times", times, *at)),
+            utc,
             tuple(parse_times("--at-hours", at_hours, *at)),
             view.chosen(loaded.scene),
             size_px,
@@ -89,6 +93,7 @@ def run_command(
             options.allow_outside,
             stages_by,
             along,
+            method.season_of(utc),
         )
         stages = run(job, output, first=start, last=until, progress=progress)
     record = {
@@ -96,5 +101,13 @@ def run_command(
         "scene": loaded.scene.name,
         "stages": {name: {"seconds": entry["seconds"], "files": len(entry["files"])} for name, entry in stages.items()},
     }
+    seasons = season_records(output) if "albedo" in stages else []
+    if seasons:
+        record["seasons"] = seasons
     lines = [f"{name:<10} {entry['seconds']:8.1f} s  {len(entry['files'])} files" for name, entry in stages.items()]
+    if len(seasons) > 1:
+        lines += [
+            f"season     {each['day']}  {len(each['times_utc'])} instants on {', '.join(each['days'])}"
+            for each in seasons
+        ]
     print_result(record, [*lines, str(output)], as_json=json)

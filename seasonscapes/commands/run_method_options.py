@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,7 +26,7 @@ class RunMethodOptions:
     method: str = "physical"
     """physical (this package's) or paper (Algorithm 1 of the SeasonScapes paper)."""
     poses: str | None = None
-    """skyline (physical), or points (paper): plane views, each with heading, fx and fy by 2D-3D points, L1."""
+    """skyline (physical); joint: each panorama whole, by 2D-3D points; or points (paper): heading, fx, fy of plane views, L1."""
     grade: str | None = None
     """Of plane views: paper (paper), none, warm or soft."""
     painting: str | None = None
@@ -33,8 +35,18 @@ class RunMethodOptions:
     """guided (physical), telea, membrane, or diffusion (paper): an image model along the path."""
     appearance: str | None = None
     """Of the Gaussians: physical (relit renders), or paper (frames along the path, embeddings, viewing direction)."""
+    recovery: str | None = None
+    """Of albedo: closed (light, air and poses are given), or differentiable (haze, response, clouds, poses are found)."""
+    use_painted: bool | None = None
+    """Recover the albedo again with the painted textures as further observations."""
+    use_inpainted: bool | None = None
+    """Let the completed textures, their light taken out, correct the albedo where no photograph measured it."""
+    find_foreground: bool = False
+    """Look for houses and masts, which the terrain lacks, and paint none of them; what is known belongs into --masks."""
+    season: str | None = None
+    """Of photographs of several days: the albedo between two seasons is blended, nearest, or follows the snow-line."""
     points: Path | None = None
-    """Of --poses points with real photographs: folder of WEBCAM.csv, of `seasonscapes annotate`."""
+    """Of --poses joint or points with real photographs: folder of WEBCAM.csv, of `seasonscapes annotate`."""
     path: Path | None = None
     """Of completion by diffusion and of films: views of `seasonscapes path`; default through the scene's cameras."""
     path_views: int | None = None
@@ -62,8 +74,12 @@ class RunMethodOptions:
             painting=self.painting,
             completion=self.completion,
             appearance=self.appearance,
+            recovery=self.recovery,
+            painted=self.use_painted,
+            inpainted=self.use_inpainted,
+            foreground=self.find_foreground,
         )
-        refuse_without("--poses points", method.poses == "points", points=self.points)
+        refuse_without("--poses joint or points", method.poses != "skyline", points=self.points)
         refuse_without("a path (--completion diffusion or --appearance paper)", method.needs_path, path=self.path)
         own = method.needs_path and self.path is None
         refuse_without("a path that this run makes", own, path_views=self.path_views)
@@ -86,3 +102,13 @@ class RunMethodOptions:
                 Path(), self.weights, prompt=self.prompt, guide_image=self.guide_image, steps=self.diffusion_steps or 50
             )
         return method, PathStages(self.path, views, self.points, model, steps)
+
+    def season_of(self, times: Sequence[datetime]) -> str:
+        """How to interpolate between seasons; `InputError` where the flag does nothing, since all photographs are of one day."""
+        from seasonscapes.workflows.albedo_sources import require_season
+
+        season = self.season or "blended"
+        require_season(season, where="--season")
+        if self.season is not None and len({time.date() for time in times}) < 2:
+            raise InputError("--season", "does nothing without --times of two days", got=self.season)
+        return season

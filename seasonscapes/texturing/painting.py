@@ -100,6 +100,9 @@ class PaintOptions:
         Exclude pixels that show terrain nearer than this [m].
     tile_px
         Side of the tiles that are processed one after the other [texels].
+    foreground
+        Look for houses and masts, which the terrain lacks, and leave them out. `seasonscapes.paint` does; here the masks
+        are given as ``rejects``.
 
     Raises
     ------
@@ -113,6 +116,7 @@ class PaintOptions:
     guard: bool = True
     near_m: float = NEAR_M
     tile_px: int = TILE_PX
+    foreground: bool = False
 
     def __post_init__(self):
         if self.mode not in PAINT_MODES:
@@ -178,9 +182,11 @@ def paint_atlas(
     NoUsablePixels
         No input, or none with a usable pixel of terrain; the message gives the reason for each.
     ValueError
-        ``rejects`` and ``inputs`` differ in number.
+        ``rejects`` and ``inputs`` differ in number, or ``options.foreground`` without them.
     """
     options, report = options or PaintOptions(), progress or (lambda fraction: None)
+    if options.foreground and rejects is None:
+        raise ValueError("paint_atlas: options.foreground: give the masks as rejects, or use seasonscapes.paint")
     reference, ray_scene = reference or RadiometricReference(), target.ray_scene
     atlas_tiling = tiling(target.terrain, target.atlas, tile_px=options.tile_px)
     prepared, skipped = prepare_inputs(

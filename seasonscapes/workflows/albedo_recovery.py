@@ -56,7 +56,8 @@ class RecoveryOptions:
     fit_haze
         Search the visibility that explains the photographs best, before the closed form.
     fit_curve
-        Search the strength of the cameras' tone curve, before the closed form.
+        Search the strength of the cameras' tone curve, before either method; the differentiable one finds what is left of
+        each camera's response.
     method
         ``closed``: light, air, response and poses are given (or searched, see above). ``differentiable``: haze, exposures,
         each camera's response, clouds before the sun and poses within their standard deviations are unknowns beside the
@@ -81,8 +82,8 @@ class RecoveryOptions:
     def __post_init__(self):
         if self.method not in METHODS:
             raise ValueError(f"RecoveryOptions: method: got {self.method!r}, expected one of {', '.join(METHODS)}")
-        if self.method != "closed" and (self.fit_haze or self.fit_curve):
-            raise ValueError("RecoveryOptions: fit_haze and fit_curve belong to the closed form")
+        if self.method != "closed" and self.fit_haze:
+            raise ValueError("RecoveryOptions: fit_haze belongs to the closed form")
 
 
 @dataclass(frozen=True)
@@ -213,12 +214,32 @@ def recover_albedo(
     >>> recovered.estimate.albedo.shape == (*place.texture_shape, 3)
     True
     """
+    options, model = options or RecoveryOptions(), sky_model(sky)
+    in_frame = [replace(each, camera=view_in_frame(each.camera, place.frame)) for each in photographs]
+    return recovered_over(place, texel_transport(place, progress), in_frame, model, options, painted, progress)
+
+
+def texel_transport(place: Place, progress: Progress | None = None) -> TexelTransport:
+    """Daylight coefficients of a place's texels."""
+    from seasonscapes.albedo.forward_model import trace_texel_transport
     from seasonscapes.rendering.backend import use_backend
 
-    options, model = options or RecoveryOptions(), sky_model(sky)
     use_backend()
-    in_frame = [replace(each, camera=view_in_frame(each.camera, place.frame)) for each in photographs]
-    transport, prepared, facts = _prepared(place, in_frame, model, options, progress)
+    report = task_progress(progress, "daylight of the atlas")
+    return trace_texel_transport(place.terrain, place.texture_shape, progress=report)
+
+
+def recovered_over(
+    place: Place,
+    transport: TexelTransport,
+    photographs: list[Observation],
+    model: SkyModel,
+    options: RecoveryOptions,
+    painted: Sequence[PaintedTexture] = (),
+    progress: Progress | None = None,
+) -> RecoveredAlbedo:
+    """`recover_albedo` from photographs in the place's frame and daylight coefficients that were traced before."""
+    prepared, facts = _prepared(place, transport, photographs, model, options, progress)
     prepared = [*prepared, *painted_photographs(place, transport, painted, model)]
     if options.method == "closed":
         fit = closed_fit(transport, prepared, progress)
@@ -291,19 +312,21 @@ def with_terrain(transport: TexelTransport, photographs: Sequence[Observation]) 
 
 
 def _prepared(
-    place: Place, photographs: list[Observation], model: SkyModel, options: RecoveryOptions, progress: Progress | None
-) -> tuple[TexelTransport, list[AlbedoPhotograph], dict[str, Any]]:
-    """Texel transport and photographs with their light; tone curve and visibility fitted where asked for."""
-    from seasonscapes.albedo.forward_model import trace_texel_transport
+    place: Place,
+    transport: TexelTransport,
+    photographs: list[Observation],
+    model: SkyModel,
+    options: RecoveryOptions,
+    progress: Progress | None,
+) -> tuple[list[AlbedoPhotograph], dict[str, Any]]:
+    """Photographs with their light; tone curve and visibility fitted where asked for."""
     from seasonscapes.albedo.haze import fit_visibility
     from seasonscapes.albedo.photographs import EIGHT_BIT, prepare_photographs
     from seasonscapes.albedo.tone_curve import fit_tone_curve, with_tone_curve
 
     facts: dict[str, Any] = {}
-    report = task_progress(progress, "daylight of the atlas")
-    transport = trace_texel_transport(place.terrain, place.texture_shape, progress=report)
     if not photographs:
-        return transport, [], facts
+        return [], facts
     photographs = with_terrain(transport, photographs)
     lights = illuminations(place, photographs, model)
     report = task_progress(progress, "footprints of the photographs")
@@ -324,7 +347,7 @@ def _prepared(
         log.info("visibility %.0f km", found.visibility_km)
         hazy = lights_of(found.visibility_km)
         prepared = [replace(each, light=light) for each, light in zip(prepared, hazy, strict=True)]
-    return transport, prepared, facts
+    return prepared, facts
 
 
 def _completed(
@@ -345,7 +368,7 @@ def _completed(
     return completed_estimate(known, fit, base, predictors_for(place.terrain, place.atlas), progress=report)
 
 
-def save_albedo_figures(place: Place, recovered: RecoveredAlbedo, output: Path) -> dict[str, str]:
+def save_albedo_figures(place: Place, known: AlbedoEstimate, day: date, output: Path) -> dict[str, str]:
     """Write pictures beside an albedo file: the albedo, what was measured, and σ (white is 0.1); their paths.
 
     The picture of the albedo may be edited and given back as an albedo.
@@ -354,7 +377,6 @@ def save_albedo_figures(place: Place, recovered: RecoveredAlbedo, output: Path) 
     from seasonscapes.workflows.edited_textures import texture_facts
     from seasonscapes.workflows.pictures import png_metadata
 
-    known = recovered.estimate
     sigma = np.clip(np.nan_to_num(known.sigma, posinf=1.0) / 0.1, 0.0, 1.0)
     pictures: dict[str, np.ndarray] = {
         "albedo": known.albedo,
@@ -364,7 +386,7 @@ def save_albedo_figures(place: Place, recovered: RecoveredAlbedo, output: Path) 
     paths = {}
     for name, image in pictures.items():
         path = output.with_name(f"{output.stem}_{name}.png")
-        facts = texture_facts(place, "albedo" if name == "albedo" else "figure", date=recovered.day.isoformat())
+        facts = texture_facts(place, "albedo" if name == "albedo" else "figure", date=day.isoformat())
         record = {"texture": facts, "attribution": place.scene.attribution}
         write_png(path, np.clip(image, 0.0, 1.0), metadata=png_metadata(record))
         paths[name] = str(path)

@@ -4,23 +4,18 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 from seasonscapes.exposure import exposure_ev100
 from seasonscapes.images import atomic_path, write_png
 from seasonscapes.progress import Progress
 from seasonscapes.relighting.frame_file import time_stamp
-from seasonscapes.scene import NamedCamera
-from seasonscapes.sky.models import SkyModel
 from seasonscapes.texturing.painting import PaintOptions
 from seasonscapes.workflows import completion, timelapse
-from seasonscapes.workflows.albedo_recovery import RecoveryOptions, recover_albedo, save_albedo_figures
-from seasonscapes.workflows.albedo_sources import AlbedoFile, dated_albedos
-from seasonscapes.workflows.distillation import DistilOptions, distil_with_data, distillation_record
-from seasonscapes.workflows.edited_textures import albedo_date
+from seasonscapes.workflows.albedo_sources import dated_albedos
+from seasonscapes.workflows.distillation import distil_with_data, distillation_record
 from seasonscapes.workflows.gaussian_views import render_gaussians
 from seasonscapes.workflows.inpainting import InpaintOptions, cloudiness_of, inpaint
 from seasonscapes.workflows.painting import painting_of, painting_record
@@ -35,86 +30,40 @@ from seasonscapes.workflows.path_stages import (
     path_facts,
     point_hashes,
 )
-from seasonscapes.workflows.photograph_files import PhotographSources, photographs_at
 from seasonscapes.workflows.pictures import develop
 from seasonscapes.workflows.place import Place
-from seasonscapes.workflows.plane_views import cut_plane_views, pose_plane_views
+from seasonscapes.workflows.plane_views import cut_plane_views, pose_panoramas, pose_plane_views
 from seasonscapes.workflows.point_cloud import write_point_cloud
 from seasonscapes.workflows.predicted_radiance import RELATIVE_SIGMA, measured_radiance
 from seasonscapes.workflows.relight_session import RenderJob
-from seasonscapes.workflows.run_methods import METHODS, PathStages, RunMethod
-from seasonscapes.workflows.run_photographs import (
-    RunPhotographs,
-    bring_photographs,
-    bring_poses,
-    photograph_facts,
-    record_facts,
-)
+from seasonscapes.workflows.run_albedo import albedo_at, final_albedos, recover_albedos, refine_albedos
+from seasonscapes.workflows.run_job import RunJob, sources_of, write_record
+from seasonscapes.workflows.run_photographs import bring_photographs, bring_poses, photograph_facts, record_facts
 from seasonscapes.workflows.stage_runner import Stage, run_stages, stage_range
 from seasonscapes.workflows.views import camera_for
 
+__all__ = ["AS_THE_PAPER", "STAGES", "RunJob", "run", "stages_of"]
+
 STAGES = (
-    "cloud",
-    "pictures",
-    "calibrate",
-    "views",
-    "albedo",
-    "paint",
-    "path",
-    "inpaint",
-    "film",
-    "relight",
-    "distil",
+    *(
+        "cloud",
+        "pictures",
+        "calibrate",
+        "views",
+        "albedo",
+        "paint",
+        "path",
+        "inpaint",
+        "refine",
+        "film",
+        "relight",
+        "distil",
+    ),
     "splat",
 )
 
-
 # The first photograph in order wins, as it is: no fitted exposures, no haze, no doubt about silhouettes.
 AS_THE_PAPER = PaintOptions(mode="first", fit_gains=False, fit_haze=False, guard=False)
-
-
-@dataclass(frozen=True)
-class RunJob:
-    """What a run is to make.
-
-    Parameters
-    ----------
-    place
-        The place.
-    times
-        Of the photographs, aware UTC, of one season.
-    hours
-        Of the pictures, aware UTC.
-    view, size_px
-        Camera of the pictures, and their size [px].
-    sky
-        The sky model.
-    photographs
-        Where photographs and poses come from.
-    distil
-        Size and effort of the Gaussian model.
-    seed
-        Equal seeds give equal results.
-    allow_outside
-        Let the scene file name rasters outside its folder.
-    method
-        How each stage is done; see `run_methods`.
-    along
-        What the stages along a camera path need.
-    """
-
-    place: Place
-    times: tuple[datetime, ...]
-    hours: tuple[datetime, ...]
-    view: NamedCamera
-    size_px: tuple[int, int]
-    sky: SkyModel
-    photographs: RunPhotographs = field(default_factory=RunPhotographs)
-    distil: DistilOptions = field(default_factory=DistilOptions)
-    seed: int = 0
-    allow_outside: bool = False
-    method: RunMethod = METHODS["physical"]
-    along: PathStages = field(default_factory=PathStages)
 
 
 def run(
@@ -183,7 +132,9 @@ def stages_of(job: RunJob, progress: Progress | None = None) -> list[Stage]:
     albedo = ("albedo",) if method.needs_albedo else ()
     path = ("path",) if method.needs_path else ()
     model = {**common, "discs": job.distil.discs, "steps": along.paper_steps}
-    painted = {**common, "painting": method.painting}
+    final = ("albedo", "refine") if method.refines else ("albedo",)
+    painted = {**common, "painting": method.painting, "foreground": method.foreground}
+    refined = {**common, "recovery": method.recovery, "painted": method.painted, "inpainted": method.inpainted}
     filled = {**common, "completion": method.completion, "model": model_facts(along, method)}
     surface = {"place": place.key, "imagery": common["imagery"], "day": job.times[0].date().isoformat()}
     stages = [
@@ -198,7 +149,13 @@ def stages_of(job: RunJob, progress: Progress | None = None) -> list[Stage]:
             "calibration",
         ),
         stage("views", {**common, "grade": method.grade}, ("pictures", "calibrate"), ("plane_views",), _views),
-        stage("albedo", common, known, ("albedo_recovery", "photograph_files"), _albedo),
+        stage(
+            "albedo",
+            {**common, "recovery": method.recovery},
+            known,
+            ("season_recovery", "photograph_files"),
+            recover_albedos,
+        ),
         stage("paint", painted, (*known, *albedo), ("painting", "predicted_radiance"), _paint),
         stage(
             "path",
@@ -208,19 +165,23 @@ def stages_of(job: RunJob, progress: Progress | None = None) -> list[Stage]:
             _path,
         ),
         stage("inpaint", filled, ("paint", *known[:1], *albedo, *path), ("inpainting", "completion"), _inpaint),
+        stage(
+            "refine", refined, (*known, "albedo", "paint", "inpaint"), ("season_recovery",), refine_albedos, "refined"
+        ),
         stage("film", {**common, "fps": along.fps}, ("inpaint", "path"), ("path_stages",), _film),
-        stage("relight", looks, ("albedo",), ("timelapse",), _relight),
+        stage("relight", {**looks, "season": job.season}, final, ("timelapse",), _relight),
     ]
     if method.appearance == "paper":
         stages.append(stage("distil", model, ("film",), ("path_stages",), _distil_frames, "gaussians"))
         stages.append(stage("splat", looks, ("distil",), ("path_stages",), _splat_frames))
     else:
         distil = {**common, "distil": job.distil}
-        stages.append(stage("distil", distil, ("albedo",), ("distillation",), _distil, "gaussians"))
+        stages.append(stage("distil", distil, final, ("distillation",), _distil, "gaussians"))
         stages.append(stage("splat", looks, ("distil",), ("gaussian_views",), _splat))
     left_out = set() if method.poses == "points" else {"views"}
     left_out |= set() if place.options.mesher == "poisson" else {"cloud"}
     left_out |= set() if method.needs_albedo else {"albedo", "relight"}
+    left_out |= set() if method.refines else {"refine"}
     left_out |= set() if method.needs_path else {"path", "film"}
     return [each for each in stages if each.name not in left_out]
 
@@ -228,36 +189,6 @@ def stages_of(job: RunJob, progress: Progress | None = None) -> list[Stage]:
 def _imagery(place: Place) -> list[dict]:
     """What the scene file states about its images, and the hashes of their contents."""
     return [{**image.model_dump(mode="json"), "hash": content} for image, content in place.scene.image_keys]
-
-
-def _sources(job: RunJob, folder: Path) -> PhotographSources:
-    if job.method.poses == "points":
-        own = folder / "views"
-        return PhotographSources(own / "manifest.csv", folder / "calibration", own / "masks")
-    masks = folder / "pictures" / "masks"
-    return PhotographSources(
-        folder / "pictures" / "manifest.csv",
-        folder / "calibration",
-        masks if masks.is_dir() else None,
-        accept_doubtful=True,  # decided where the records were brought
-    )
-
-
-def _albedo_path(folder: Path) -> Path:
-    return folder / "albedo" / "albedo.npz"
-
-
-def _albedo_files(folder: Path) -> tuple[AlbedoFile, ...]:
-    path = _albedo_path(folder).resolve()
-    day = albedo_date(path)
-    assert day is not None, "the albedo stage states the date"
-    return (AlbedoFile(day, path),)
-
-
-def _write_record(path: Path, record: dict[str, Any]) -> Path:
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(record, indent=1, default=float) + "\n", encoding="utf-8")
-    return path
 
 
 def _cloud(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
@@ -276,6 +207,10 @@ def _calibrate(job: RunJob, folder: Path, progress: Progress | None) -> list[Pat
         stated = _stated_records(job, folder)
         kept = [] if job.photographs.sources is None else stated
         return [*kept, *pose_plane_views(job.place, stated, own, points=job.along.points, seed=job.seed)[0]]
+    if job.method.poses == "joint":
+        stated = _stated_records(job, folder)
+        kept = [] if job.photographs.sources is None else stated
+        return [*kept, *pose_panoramas(job.place, stated, own, points=job.along.points, seed=job.seed)[0]]
     return bring_poses(job.photographs, job.place, job.times, taken, own, seed=job.seed)
 
 
@@ -293,41 +228,25 @@ def _views(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
     return cut_plane_views(folder / "pictures", stated, folder / "views", grade=job.method.grade)
 
 
-def _albedo(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
-    within = job.photographs.within_min
-    photographs = photographs_at(job.place, _sources(job, folder), job.times, within_min=within, progress=progress)
-    options = RecoveryOptions(fit_curve=True)
-    recovered = recover_albedo(job.place, photographs, sky=job.sky, options=options, progress=progress)
-    path = _albedo_path(folder)
-    recovered.save(path)
-    save_albedo_figures(job.place, recovered, path)
-    observations = [photograph.observation for photograph in recovered.photographs]
-    residuals = [
-        {"webcam": each.webcam, "time_utc": each.time.isoformat(), "residual": round(float(residual), 4)}
-        for each, residual in zip(observations, recovered.fit.residual, strict=True)
-    ]
-    facts = {"measured_share": float((recovered.estimate.source == 1).mean()), **recovered.facts}
-    _write_record(path.with_suffix(".json"), facts | {"photographs": residuals})
-    return [path]
-
-
 def _paint(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
     from seasonscapes.texturing.painting_file import save_painting, write_figures
     from seasonscapes.texturing.radiometric_fit import RadiometricReference
 
     files = []
+    options = PaintOptions() if job.method.painting == "weighted" else AS_THE_PAPER
+    options = replace(options, foreground=job.method.foreground)
     for time in job.times:
         own = folder / "paint" / time_stamp(time)
         reference = None
         if job.method.needs_albedo and job.method.painting == "weighted":
-            predicted = measured_radiance(job.place, _albedo_path(folder), time, job.sky, progress=progress)
+            predicted = measured_radiance(job.place, albedo_at(folder, time), time, job.sky, progress=progress)
             reference = RadiometricReference(predicted, RELATIVE_SIGMA)
         painting = painting_of(
             job.place,
-            _sources(job, folder),
+            sources_of(job, folder),
             time,
             job.sky,
-            PaintOptions() if job.method.painting == "weighted" else AS_THE_PAPER,
+            options,
             within_min=job.photographs.within_min,
             reference=reference,
             progress=progress,
@@ -335,7 +254,7 @@ def _paint(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
         with atomic_path(own / "painted.npz") as temporary:
             save_painting(painting, temporary)
         write_figures(painting, own)
-        _write_record(own / "painting.json", painting_record(painting))
+        write_record(own / "painting.json", painting_record(painting))
         files.append(own / "painted.npz")
     return files
 
@@ -346,10 +265,10 @@ def _path(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
 
 def _inpaint_options(job: RunJob, folder: Path, time: datetime) -> InpaintOptions:
     method = job.method.completion
-    albedo = _albedo_path(folder) if job.method.needs_albedo and method in ("guided", "diffusion") else None
+    albedo = albedo_at(folder, time) if job.method.needs_albedo and method in ("guided", "diffusion") else None
     if method != "diffusion":
         return InpaintOptions(method, albedo, fast=method == "guided" and albedo is None, seed=job.seed)
-    along = path_completion(job.along, folder, time, _sources(job, folder).manifest)
+    along = path_completion(job.along, folder, time, sources_of(job, folder).manifest)
     # What no view of the path shows is filled from the rims, as the paper does after its loop.
     rest = "guided" if albedo is not None else "telea"
     return InpaintOptions(method, albedo, seed=job.seed, diffusion=along, rest=rest)
@@ -365,7 +284,7 @@ def _inpaint(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]
         with atomic_path(own / "completed.npz") as temporary:
             completion.save_completed(result.completed, painted, temporary)
         completion.save_texture_figures(own, job.place, result.completed, time, job.sky)
-        _write_record(own / "completion.json", result.record)
+        write_record(own / "completion.json", result.record)
         files.append(own / "completed.npz")
     return files
 
@@ -394,7 +313,8 @@ def _relight(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]
         job.view,
         job.size_px,
         job.sky,
-        albedo=_albedo_files(folder),
+        albedo=final_albedos(job, folder),
+        season=job.season,
         base_day=timelapse.base_day_of(hours),
         seed=job.seed,
         allow_outside=job.allow_outside,
@@ -412,7 +332,7 @@ def _distil(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
     distilled = distil_with_data(
         job.place,
         sky=job.sky,
-        albedo=dated_albedos(job.place, _albedo_files(folder)),
+        albedo=dated_albedos(job.place, final_albedos(job, folder)),
         options=job.distil,
         seed=job.seed,
         checkpoint=checkpoint,
@@ -420,7 +340,7 @@ def _distil(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
     )
     save_model(distilled.model, own / "model.safetensors")
     checkpoint.unlink(missing_ok=True)
-    _write_record(own / "distillation.json", distillation_record(job.place, distilled))
+    write_record(own / "distillation.json", distillation_record(job.place, distilled))
     return [own / "model.safetensors"]
 
 
@@ -441,7 +361,7 @@ def _distil_frames(job: RunJob, folder: Path, progress: Progress | None) -> list
     # Each step sees one frame, and frames differ: means of the first and of the last tenth of the steps.
     tenth = max(len(losses) // 10, 1)
     first, last = (sum(part) / tenth for part in (losses[:tenth], losses[-tenth:]))
-    record = _write_record(file.with_name("distillation.json"), facts | {"loss_first": first, "loss": last})
+    record = write_record(file.with_name("distillation.json"), facts | {"loss_first": first, "loss": last})
     return [file, record]
 
 

@@ -17,6 +17,7 @@ from seasonscapes.cameras.pinhole import view_in_frame
 from seasonscapes.progress import Progress, task_progress
 from seasonscapes.sky.models import SkyModel
 from seasonscapes.texturing.painting import Painting, PaintOptions
+from seasonscapes.workflows.foreground import foreground_masks
 from seasonscapes.workflows.illumination import illumination_for_camera, sky_model
 from seasonscapes.workflows.photograph_files import PhotographSources, observations, rows_at
 from seasonscapes.workflows.place import Place
@@ -91,12 +92,28 @@ def paint(
     from seasonscapes.rendering.mitsuba_scene import mi_mesh
     from seasonscapes.texturing.painting import PaintTarget, paint_atlas
 
-    inputs = painting_inputs(place, photographs, sky_model(sky))
+    inputs, options = painting_inputs(place, photographs, sky_model(sky)), options or PaintOptions()
+    target = PaintTarget(place.terrain, place.atlas, ray_scene(mi_mesh(place.terrain, np.full(3, 0.2))))
+    rejects = None
+    if options.foreground:
+        plain = replace(options, foreground=False)
+        rejects = foreground_masks(
+            place,
+            inputs,
+            target,
+            plain,
+            lambda masks: paint_atlas(inputs, target, options=plain, reference=reference, rejects=masks),
+            progress=progress,
+        )
+        for item, mask in zip(inputs, rejects, strict=True):
+            share = 0.0 if mask is None else float(mask.mean())
+            log.info("%s: %.1f %% of the picture is foreground", item.observation.webcam, 100.0 * share)
     painting = paint_atlas(
         inputs,
-        PaintTarget(place.terrain, place.atlas, ray_scene(mi_mesh(place.terrain, np.full(3, 0.2)))),
+        target,
         options=options,
         reference=reference,
+        rejects=rejects,
         resume=resume,
         progress=task_progress(progress, "painting"),
     )

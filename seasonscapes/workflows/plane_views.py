@@ -16,6 +16,7 @@ from seasonscapes.workflows.place import Place
 
 if TYPE_CHECKING:
     from seasonscapes.calibration.evidence import Correspondences
+    from seasonscapes.calibration.resection import Calibration
     from seasonscapes.cameras.panorama import Panorama
     from seasonscapes.cameras.pinhole import Camera
 
@@ -26,6 +27,8 @@ _FEWEST, _MOST_DEG = 4, 85.0
 _POINTS, _CLICK_PX = 12, 1.0
 # A heading is not told that shifts the picture by more of its width than this (one standard deviation).
 _MOST_SIGMA = 0.01
+# A whole panorama is searched about its stated heading, which a synthetic webcam's compass has off by as much.
+_COMPASS_DEG = 3.0
 _NEAREST_M, _FARTHEST_M = 200.0, 40_000.0
 
 
@@ -80,43 +83,81 @@ def pose_plane_views(
     NotEnoughEvidence
         Where no view could be posed.
     """
+    return _posed(place, stated, own, points, seed, whole=False)
+
+
+def pose_panoramas(
+    place: Place, stated: Sequence[Path], own: Path, *, points: Path | None, seed: int = 0
+) -> tuple[list[Path], dict[str, str]]:
+    """Solve one heading and scale of each whole panorama from the same points as `pose_plane_views`, all its views together.
+
+    Parameters, results and errors are those of `pose_plane_views`; a plane webcam is its own only view.
+    """
+    return _posed(place, stated, own, points, seed, whole=True)
+
+
+def _posed(
+    place: Place, stated: Sequence[Path], own: Path, points: Path | None, seed: int, *, whole: bool
+) -> tuple[list[Path], dict[str, str]]:
     from seasonscapes.calibration.calibration_file import read_calibration, record_name, write_calibration
     from seasonscapes.calibration.evidence import read_points, write_points
     from seasonscapes.calibration.l1_pose import l1_pose
+    from seasonscapes.cameras.panorama import Panorama
 
     if points is None and place.synthetic is None:
         raise InputError("--points", "missing", expected="a folder of WEBCAM.csv, of `seasonscapes annotate`")
     files, doubts = [], {}
     for record in stated:
         known = read_calibration(record)
-        whole = known.view
         table = own / f"{known.webcam}.csv" if points is None else points / f"{known.webcam}.csv"
         if points is None:
-            write_points(table, _clicked_points(place, whole, seed, known.webcam), known.frame)
+            write_points(table, _clicked_points(place, known.view, seed, known.webcam), known.frame)
             files.append(table)
         elif not table.is_file():
             doubts[known.webcam] = f"no such file: {table}"
             continue
         matches = read_points(table, known.frame)
-        for view in plane_views(known.webcam, whole):
-            seen = _points_in_view(matches, view)
+        views = plane_views(known.webcam, known.view)
+        stated_view = _turned(known.view, seed, known.webcam) if points is None else known.view
+        starts: list[tuple[str, Camera | Panorama, Correspondences]] = [(known.webcam, stated_view, matches)]
+        if not whole:
+            starts = [(view.name, view.camera, _points_in_view(matches, view)) for view in views]
+        for name, start, seen in starts:
             try:
-                solved = l1_pose(view.camera, seen)
+                solved = _whole_pose(start, seen) if isinstance(start, Panorama) else l1_pose(start, seen)
             except NotEnoughEvidence as error:
-                doubts[view.name] = str(error)
+                doubts[name] = str(error)
                 continue
             sigma_deg = solved.sigma["heading_deg"]
             if np.radians(sigma_deg) * solved.view.fx > _MOST_SIGMA * solved.view.width_px:
                 # Points that lie close together leave a turn and a change of fx alike.
-                doubts[view.name] = f"its points leave the heading to ± {sigma_deg:.1f} deg"
+                doubts[name] = f"its points leave the heading to ± {sigma_deg:.1f} deg"
                 continue
-            files.append(own / record_name(view.name))
-            write_calibration(files[-1], view.name, solved, known.frame)
-    for name, doubt in doubts.items():
-        log.info("run: calibrate: %s is left out: %s", name, doubt)
+            files.append(own / record_name(name))
+            write_calibration(files[-1], name, solved, known.frame)
+    for each, doubt in doubts.items():
+        log.info("run: calibrate: %s is left out: %s", each, doubt)
     if not any(path.suffix == ".json" for path in files):
         raise NotEnoughEvidence(f"run: no view could be posed by points: {'; '.join(sorted(set(doubts.values())))}")
     return files, doubts
+
+
+def _turned(view: Camera | Panorama, seed: int, webcam: str) -> Camera | Panorama:
+    """A synthetic webcam's view as a compass states it."""
+    from seasonscapes.calibration.pose_model import parameters_of_view, view_from_parameters
+
+    parameters = parameters_of_view(view, np.eye(3))
+    parameters[0] += np.random.default_rng([seed, zlib.crc32(webcam.encode())]).uniform(-_COMPASS_DEG, _COMPASS_DEG)
+    return view_from_parameters(view, np.eye(3), parameters)
+
+
+def _whole_pose(start: Panorama, points: Correspondences) -> Calibration:
+    """Heading and scale of a whole panorama under an L1 loss; position, tilt and roll are kept."""
+    from seasonscapes.calibration.evidence import Priors
+    from seasonscapes.calibration.resection import ResectionOptions, resect
+
+    priors = Priors(tilt_deg=0.0, roll_deg=0.0, horizontal_m=0.0, vertical_m=0.0, focal=np.inf)
+    return resect(start, points, priors=priors, options=ResectionOptions(loss="l1"))
 
 
 def cut_plane_views(pictures: Path, stated: Sequence[Path], own: Path, *, grade: str) -> list[Path]:

@@ -45,6 +45,8 @@ class PaintedTexture:
         Radiance [cd/m²] with weights, such as `paint` makes.
     name
         Where it came from, for messages.
+    confidence
+        Factor on the weights, in (0, 1]: a painting of photographs that are given as well repeats their errors.
 
     Examples
     --------
@@ -59,6 +61,7 @@ class PaintedTexture:
     time: datetime
     texture: Texture
     name: str = "painted"
+    confidence: float = 1.0
 
 
 def illuminations(place: Place, photographs: Sequence[Observation], model: SkyModel) -> list[Illumination]:
@@ -92,7 +95,9 @@ def painted_photographs(
                 "options that it was painted with"
             )
         light = illumination(place, each.time, sky=model)
-        result.append(painted_photograph(transport, each.texture, light, each.time, each.name))
+        made = painted_photograph(transport, each.texture, light, each.time, each.name)
+        assert made.confidence is not None, "a painting has weights"
+        result.append(replace(made, confidence=made.confidence * np.float32(each.confidence)))
     return result
 
 

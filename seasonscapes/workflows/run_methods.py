@@ -12,12 +12,15 @@ if TYPE_CHECKING:
     from seasonscapes.workflows.path_completion import PathCompletionOptions
 
 _CHOICES = {
-    "poses": ("skyline", "points"),
+    "poses": ("skyline", "joint", "points"),
     "grade": ("none", "paper", "warm", "soft"),
     "painting": ("weighted", "first"),
     "completion": ("guided", "telea", "membrane", "diffusion"),
     "appearance": ("physical", "paper"),
+    "recovery": ("closed", "differentiable"),
 }
+# What the stages of an albedo are asked for without one.
+_OF_ALBEDO = ("recovery", "painted", "inpainted")
 
 
 @dataclass(frozen=True)
@@ -29,8 +32,9 @@ class RunMethod:
     name
         Of the method that the stages were taken from.
     poses
-        ``"skyline"`` finds panoramas by the terrain's horizon; ``"points"`` cuts them to 4 to 6 plane views and solves each
-        one's heading, ``fx`` and ``fy`` from 2D–3D points under an L1 loss, as the paper does.
+        ``"skyline"`` finds panoramas by the terrain's horizon; ``"joint"`` solves one pose of each whole panorama from
+        2D–3D points; ``"points"`` cuts them to 4 to 6 plane views and solves each one's heading, ``fx`` and ``fy`` from
+        2D–3D points under an L1 loss, as the paper does.
     grade
         Colour grade of the plane views (`cameras.colour_grade.GRADES`), or ``"none"``.
     painting
@@ -40,6 +44,14 @@ class RunMethod:
     appearance
         Of the Gaussians: ``"physical"`` is distilled from relit renders of the recovered albedo; ``"paper"`` is trained on
         the frames of the completed textures along the path.
+    recovery
+        Of albedo: ``"closed"``, or ``"differentiable"`` (see `albedo_recovery.RecoveryOptions`).
+    painted
+        Whether the painted textures enter the albedo once more, as observations beside the photographs.
+    foreground
+        Whether painting looks for houses and masts, and leaves them out.
+    inpainted
+        Whether the completed textures, their light taken out, enter the albedo of texels that no photograph measured.
 
     Examples
     --------
@@ -54,6 +66,10 @@ class RunMethod:
     painting: str
     completion: str
     appearance: str
+    recovery: str = "closed"
+    painted: bool = False
+    inpainted: bool = False
+    foreground: bool = False
 
     def __post_init__(self) -> None:
         for name, choices in _CHOICES.items():
@@ -62,11 +78,21 @@ class RunMethod:
                 raise InputError(f"--{name}", "unknown", got=value, expected=", ".join(choices))
         if self.grade != "none" and self.poses != "points":
             raise InputError("--grade", "is for the plane views of --poses points", got=self.grade, expected="none")
+        if not self.needs_albedo:
+            for name in _OF_ALBEDO:
+                if getattr(self, name) not in (False, "closed"):
+                    flag = f"--{name}" if name == "recovery" else f"--use-{name}"
+                    raise InputError(flag, "does nothing: without relit pictures no albedo is recovered")
 
     @property
     def needs_albedo(self) -> bool:
         """Whether an albedo is recovered: from it come relit pictures, distilled light and fitted exposures."""
         return self.name == "physical" or self.appearance == "physical"
+
+    @property
+    def refines(self) -> bool:
+        """Whether paintings or completions go back into the albedo."""
+        return self.painted or self.inpainted
 
     @property
     def needs_path(self) -> bool:
@@ -80,7 +106,7 @@ METHODS = {
 }
 
 
-def run_method(name: str, **stages: str | None) -> RunMethod:
+def run_method(name: str, **stages: str | bool | None) -> RunMethod:
     """A method with some of its stages exchanged.
 
     Parameters
@@ -99,7 +125,7 @@ def run_method(name: str, **stages: str | None) -> RunMethod:
         raise InputError("--method", "unknown method", got=name, expected=", ".join(METHODS))
     known = {each.name for each in fields(RunMethod)}
     chosen = {stage: value for stage, value in stages.items() if value is not None and stage in known}
-    if chosen.get("poses") == "skyline":
+    if chosen.get("poses") in ("skyline", "joint"):
         # A grade belongs to plane views; without them the method's own goes too.
         chosen.setdefault("grade", "none")
     return replace(METHODS[name], **chosen)

@@ -1,0 +1,185 @@
+"""Albedos of several seasons from the photographs of many days: days are grouped by what they show, each group gives one."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import date, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from seasonscapes.cameras.pinhole import view_in_frame
+from seasonscapes.errors import NotEnoughEvidence, NoUsablePixels
+from seasonscapes.progress import Progress, each_reported
+from seasonscapes.sky.models import SkyModel
+from seasonscapes.workflows.albedo_recovery import (
+    RecoveredAlbedo,
+    RecoveryOptions,
+    recovered_over,
+    texel_transport,
+    with_terrain,
+)
+from seasonscapes.workflows.illumination import sky_model
+from seasonscapes.workflows.place import Place
+from seasonscapes.workflows.recovery_methods import PaintedTexture, closed_fit, illuminations
+
+if TYPE_CHECKING:
+    from seasonscapes.albedo.forward_model import TexelTransport
+    from seasonscapes.albedo.standard_error import AlbedoEstimate
+    from seasonscapes.cameras.observation import Observation
+
+log = logging.getLogger(__name__)
+
+# Within the year; snow and leaves change little in between.
+_NEAR_DAYS = 21.0
+
+
+@dataclass(frozen=True)
+class SeasonAlbedo:
+    """The albedo of one season.
+
+    Parameters
+    ----------
+    recovered
+        The albedo, dated by the first of its days.
+    days
+        UTC dates whose photographs it comes from.
+    """
+
+    recovered: RecoveredAlbedo
+    days: tuple[date, ...]
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """Plain values: its date, its days, and the instants of its photographs."""
+        times = sorted({each.observation.time for each in self.recovered.photographs})
+        return {
+            "day": self.recovered.day.isoformat(),
+            "days": [day.isoformat() for day in self.days],
+            "times_utc": [time.isoformat() for time in times],
+        }
+
+
+def recover_seasons(
+    place: Place,
+    photographs: Sequence[Observation],
+    *,
+    sky: str | Path | SkyModel = "clear",
+    options: RecoveryOptions | None = None,
+    painted: Sequence[PaintedTexture] = (),
+    groups: Sequence[Sequence[date]] | None = None,
+    progress: Progress | None = None,
+) -> list[SeasonAlbedo]:
+    """Recover one albedo for each season that photographs of many days show.
+
+    Parameters
+    ----------
+    place
+        The place.
+    photographs
+        Of any days; see `recover_albedo`.
+    sky
+        The sky model of all photographs.
+    options
+        The method, and what to fit besides the albedo, of each group.
+    painted
+        Painted textures of some of the hours, as further observations of their days.
+    groups
+        UTC dates of each season, where they are known; by default days are grouped by the snow and colours that they show.
+    progress
+        Called with a task and its finished share.
+
+    Returns
+    -------
+    list of SeasonAlbedo
+        In the order of their dates.
+
+    Raises
+    ------
+    NoTerrainInView
+        Where no photograph shows any of the terrain.
+    NotEnoughEvidence
+        Where the photographs of a season determine no texel.
+
+    Notes
+    -----
+    Each day's photographs alone give an albedo (a day for which they do not joins one within three weeks, or is left out);
+    days that are neighbours in the year and agree in it are one season
+    (`albedo.season_grouping.group_dates`), whose photographs together give the final one.
+    """
+    options, model = options or RecoveryOptions(), sky_model(sky)
+    in_frame = [replace(each, camera=view_in_frame(each.camera, place.frame)) for each in photographs]
+    transport = texel_transport(place, progress)
+    if groups is None:
+        groups = _grouped_days(place, transport, in_frame, model, progress)
+    found = []
+    for days in groups:
+        chosen = [each for each in in_frame if each.time.date() in days]
+        own = [each for each in painted if each.time.date() in days]
+        recovered = recovered_over(place, transport, chosen, model, options, own, progress)
+        found.append(SeasonAlbedo(recovered, tuple(sorted(days))))
+    return sorted(found, key=lambda each: each.recovered.day)
+
+
+def _grouped_days(
+    place: Place, transport: TexelTransport, photographs: list[Observation], model: SkyModel, progress: Progress | None
+) -> list[list[date]]:
+    """UTC dates of the photographs by season; days that lie within one season by the albedo that each gives alone."""
+    from seasonscapes.albedo.photographs import prepare_photographs
+    from seasonscapes.albedo.season_grouping import group_dates
+    from seasonscapes.albedo.standard_error import albedo_estimate
+
+    days = sorted({each.time.date() for each in photographs})
+    if len(days) < 2:
+        return [days]
+    seen = with_terrain(transport, photographs)
+    # Prepared together, since photographs of one camera share their footprints.
+    prepared = prepare_photographs(transport, seen, illuminations(place, seen, model))
+    days = sorted({each.time.date() for each in seen})
+    known: list[date] = []
+    estimates: list[AlbedoEstimate] = []
+    doubts: dict[date, str] = {}
+    for day in each_reported(days, len(days), progress, "albedo of each day"):
+        own = [each for each in prepared if each.observation.time.date() == day]
+        try:
+            estimates.append(albedo_estimate(transport, own, closed_fit(transport, own)))
+        except (NotEnoughEvidence, NoUsablePixels) as error:
+            doubts[day] = str(error)
+        else:
+            known.append(day)
+    # Where no day stands alone, all may stand together.
+    groups = [[known[index] for index in group] for group in group_dates(known, estimates)] or [days]
+    for day in doubts if known else ():
+        nearest = min(known, key=lambda each: days_apart(day, each))
+        if days_apart(day, nearest) <= _NEAR_DAYS:
+            next(group for group in groups if nearest in group).append(day)
+            log.warning("%s alone gives no albedo (%s): it joins the season of %s", day, doubts[day], nearest)
+        else:
+            log.warning("%s is left out of the albedo: alone it gives none (%s), and no day is near", day, doubts[day])
+    log.info("seasons: %s", "; ".join(", ".join(map(str, sorted(group))) for group in groups))
+    return groups
+
+
+def days_apart(first: date, second: date) -> float:
+    """Days between two dates within the year, which is a circle: 20 December and 10 January are three weeks apart.
+
+    Examples
+    --------
+    >>> from datetime import date
+    >>> round(days_apart(date(2023, 12, 20), date(2025, 1, 10)))
+    21
+    """
+    from seasonscapes.albedo.seasons import YEAR_DAYS, day_number
+
+    apart = abs(day_number(first) - day_number(second)) % YEAR_DAYS
+    return float(min(apart, YEAR_DAYS - apart))
+
+
+def group_of(seasons: Sequence[dict[str, Any]], time: datetime) -> int:
+    """Which of the recorded seasons an instant belongs to: the one that has a photograph nearest to it in time."""
+
+    def apart(season: dict[str, Any]) -> float:
+        return min(abs((datetime.fromisoformat(each) - time).total_seconds()) for each in season["times_utc"])
+
+    return min(range(len(seasons)), key=lambda number: apart(seasons[number]))
