@@ -87,25 +87,26 @@ def test_octaves_end_at_the_pixels():
     assert (finest_detail_m(None, 4.0, distance) == 4.0).all()
 
 
-def test_a_camera_near_the_ground_keeps_its_height_above_it(place, monkeypatch):
+def test_a_camera_near_the_ground_keeps_its_height_above_it(monkeypatch):
     """Detail may raise the ground by more than a camera stands above it: it would look at the ground from below."""
     from seasonscapes.workflows.amplified_terrain import on_amplified_ground
 
     monkeypatch.setattr(amplified_terrain, "_MOST_NEAR_NODES", 300_000)
     monkeypatch.setattr(amplified_terrain, "_MOST_NODES", 100_000)
-    south = camera(place, "south", size_px=(96, 64))
+    place = load_place("alpine_small")
+    south = camera(place, "meadow", size_px=(96, 64))
     assert place.terrain.surface is not None
     changes = []
     for step in range(6):
         pose = south.world_from_camera.copy()
-        pose[0, 3] += 90.0 * step
+        pose[0, 3] += 160.0 * step
         ground = float(place.terrain.surface.up_at(pose[None, :3, 3])[0])
         pose[2, 3] = ground + 2.0
         moved = on_amplified_ground(place, replace(south, world_from_camera=pose))
         below = terrain_for_view(place, moved, amplify=True).surface
         assert below is not None
         height = moved.position_m[2] - float(below.up_at(moved.position_m[None])[0])
-        assert height == pytest.approx(2.0, abs=0.15)
+        assert height == pytest.approx(2.0, abs=0.4)
         changes.append(moved.position_m[2] - pose[2, 3])
         pose[2, 3] = ground + 150.0
         free = replace(south, world_from_camera=pose)
