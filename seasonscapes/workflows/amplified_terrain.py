@@ -69,7 +69,7 @@ def amplified_terrain(place: Place, view: Camera | Panorama, *, seed: int = 0) -
     return replace(terrain, detail=detail)
 
 
-def on_amplified_ground(place: Place, view: Camera, *, seed: int = 0) -> Camera:
+def on_amplified_ground(place: Place, view: Camera | Panorama, *, seed: int = 0) -> Camera | Panorama:
     """Raise or lower a camera that stands on the ground by what detail adds below it, so that its height above ground stays.
 
     Parameters
@@ -79,7 +79,7 @@ def on_amplified_ground(place: Place, view: Camera, *, seed: int = 0) -> Camera:
 
     Returns
     -------
-    Camera
+    Camera or Panorama
         The same one where it is more than 100 m above the ground.
     """
     surface = place.terrain.surface
