@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import KDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from seasonscapes.albedo.sun_search import BLOCKS, FoundSun, SunSearch, search_sun
 
@@ -49,7 +49,7 @@ def neighbouring_pairs(position_m: np.ndarray) -> np.ndarray:
     """Pairs ``(P, 2)`` of samples ``(N, 3)`` that lie side by side."""
     if len(position_m) <= _NEIGHBOURS:
         return np.zeros((0, 2), int)
-    distance, other = KDTree(position_m).query(position_m, k=_NEIGHBOURS + 1)
+    distance, other = cKDTree(position_m).query(position_m, k=_NEIGHBOURS + 1)
     distance, other = distance[:, 1:], other[:, 1:]
     first = np.broadcast_to(np.arange(len(position_m))[:, None], other.shape)
     near = (distance < _FARTHEST * np.median(distance)) & (first != other)
