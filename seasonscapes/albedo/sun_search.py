@@ -27,7 +27,8 @@ _HORIZON_SOFTNESS_DEG = 1.0
 _SMOOTHING_TEXELS = 1.0
 # A trusted sun is this many standard errors better than any sun farther away than this angle [deg].
 _LEAST_LEAD, _APART_DEG = 3.5, 25.0
-_LARGEST_AZIMUTH_SIGMA_DEG, _LARGEST_ELEVATION_SIGMA_DEG = 2.2, 2.0
+# Three standard errors of azimuth are 5°.
+_LARGEST_AZIMUTH_SIGMA_DEG, _LARGEST_ELEVATION_SIGMA_DEG = 1.67, 2.0
 # Errors that all blocks share, such as heights coarser than the image, whose shadows are too short [deg].
 _COMMON_SIGMA_DEG = (0.8, 1.2)
 _HIGHEST_DECLINATION_DEG = 23.5
