@@ -181,33 +181,15 @@ def disc_surfels(place: Place, discs: int) -> Surfels:
 
 
 def timed_views(place: Place, folder: Path) -> list[NamedView]:
-    """Views with pictures and times of a folder's ``transforms.json``, in the frame of a place.
-
-    Raises
-    ------
-    InputError
-        Where the file is missing, states no time of a frame, or a picture is missing.
-    """
-    from seasonscapes.cameras.exchange import read_transforms
+    """Views with pictures and times of a folder, in the frame of a place; see `read_timed_views`, whose errors it raises."""
     from seasonscapes.cameras.pinhole import view_in_frame
+    from seasonscapes.cameras.timed_views import read_timed_views
+    from seasonscapes.civil_time import zone_at
 
-    file = folder / "transforms.json"
-    if not file.is_file():
-        raise InputError("--frames", "holds no transforms.json", got=str(folder))
-    views, _ = read_transforms(file)
-    found = []
-    for view in views:
-        if view.time is None:
-            raise InputError(file, "states no time_utc", got=view.name)
-        if not (folder / view.file).resolve().is_relative_to(folder.resolve()):
-            raise InputError(file, "names a picture outside its folder", got=view.file)
-        if not (folder / view.file).is_file():
-            raise InputError(file, "no such picture", got=view.file)
-        camera: Camera = view.camera if view.camera.frame is None else view_in_frame(view.camera, place.frame)
-        found.append(replace(view, camera=camera))
-    if not found:
-        raise InputError(file, "names no frame")
-    return found
+    origin = place.frame
+    zone = zone_at(origin.latitude_deg, origin.longitude_deg)
+    views = read_timed_views(folder, webcams=place.scene.webcams, time_zone=zone)
+    return [replace(view, camera=view_in_frame(view.camera, origin)) for view in views]
 
 
 def distil_frames(
@@ -227,7 +209,8 @@ def distil_frames(
     place
         The place, on whose terrain the Gaussians lie.
     folder
-        With ``transforms.json``, as a run's ``film`` or ``distill --export-views`` writes it.
+        With ``transforms.json``, as a run's ``film`` or ``distill --export-views`` writes it, or a COLMAP model; see
+        `seasonscapes.cameras.timed_views.read_timed_views`.
     discs
         Gaussians along the longer side of the terrain.
     steps
