@@ -29,6 +29,7 @@ file = "davosdorf.tif"
 [imagery]
 file = "davosdorf_color.tif"
 sun_deg = [{SUN_DEG[0]}, {SUN_DEG[1]}]
+land_classes = 8
 
 [[camera]]
 name = "weissfluh"

@@ -221,6 +221,12 @@ class Imagery(RasterFiles):
         any day is interpolated between them.
     sky
         Sky model of that hour: a bundled name (``clear``, ``hazy``, ``overcast``, ``hosek`` …).
+    land_classes
+        With ``time`` or ``sun_deg``: classes of land (2 to 20) whose response to direct light is fitted one by one; 0 treats
+        all land as Lambertian. Forests are not.
+    sensor_height_m
+        With ``time`` or ``sun_deg``: height of the sensor in the scene's vertical datum [m], where the air below it is
+        still in the image, as in satellite images that were not corrected for it.
     delit
         The image holds no light: a reflectance product, or one whose light was taken out before.
     """
@@ -233,6 +239,8 @@ class Imagery(RasterFiles):
     date: Annotated[str, BeforeValidator(_iso_text), AfterValidator(_iso_date)] | None = None
     sun_deg: list[float] | None = Field(default=None, min_length=2, max_length=2)
     sky: str = "clear"
+    land_classes: int = Field(default=0, ge=0, le=20)
+    sensor_height_m: float | None = Field(default=None, gt=0.0, le=1e9)
     delit: bool = False
 
     @model_validator(mode="after")
@@ -252,8 +260,13 @@ class Imagery(RasterFiles):
     def _one_light(self) -> Imagery:
         if (self.time is not None) + (self.sun_deg is not None) + self.delit > 1:
             raise ValueError("give one of 'time' (when it was taken), 'sun_deg' and 'delit = true' (it holds no light)")
-        if "sky" in self.model_fields_set and self.time is None and self.sun_deg is None:
-            raise ValueError("'sky' is that of the image's hour: give 'time' or 'sun_deg' as well")
+        about_light = [key for key in ("sky", "land_classes", "sensor_height_m") if key in self.model_fields_set]
+        if about_light and self.time is None and self.sun_deg is None:
+            raise ValueError(
+                f"'{about_light[0]}' is about the light of the image's hour: give 'time' or 'sun_deg' as well"
+            )
+        if self.land_classes == 1:
+            raise ValueError("land_classes: got 1, expected 2 to 20, or 0 for Lambertian land")
         if self.sun_deg is not None and not (-360.0 <= self.sun_deg[0] <= 360.0 and 0.0 < self.sun_deg[1] <= 90.0):
             raise ValueError(f"sun_deg: got {self.sun_deg}, expected azimuth and elevation above the horizon [deg]")
         if self.date is not None and self.time not in (None, "unknown"):

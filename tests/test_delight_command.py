@@ -194,6 +194,27 @@ def test_a_scene_file_that_states_the_sun_is_used_without_its_light_once_built(c
     assert case.error(values) < 0.5 * case.error(np.clip(ss.scene_albedo(place, "2024-09-10").values, 1e-3, None))
 
 
+def test_a_scene_file_may_ask_for_classes_of_land(case):
+    """The same albedo as by the flag; and keys about an hour that is not stated are refused."""
+    from seasonscapes.workflows.delighting import delit_imagery
+
+    options = ss.MeshOptions(texel_m=60.0)
+    stated = case.folder / "classes.toml"
+    stated.write_text(SCENE + 'sun_deg = [150.0, 38.0]\nsky = "hosek"\nland_classes = 3\n')
+    in_file = ss.load_place(stated, options=options)
+    by_flag = delit_imagery(ss.load_place(case.scene, options=options), (150.0, 38.0), sky="hosek", land_classes=3)
+    assert by_flag.facts["land_classes"] == 3
+    np.testing.assert_allclose(ss.scene_albedo(in_file, "2024-09-10").values, by_flag.texture.values, atol=1e-6)
+    for line, said in {
+        "land_classes = 3": "'land_classes' is about the light of the image's hour",
+        "sun_deg = [150.0, 38.0]\nland_classes = 1": "land_classes: got 1, expected 2 to 20",
+        "sun_deg = [150.0, 38.0]\nland_classes = 40": "land_classes",
+    }.items():
+        stated.write_text(SCENE + line + "\n")
+        with pytest.raises(ss.InputError, match=said):
+            ss.load_place(stated, options=options)
+
+
 def test_that_the_light_stays_in_is_told_once(case, caplog):
     copy = case.folder / "copy.tif"
     copy.write_bytes((case.folder / "photograph.tif").read_bytes())

@@ -178,10 +178,10 @@ def delit_imagery(
         The sky model of that hour.
     sensor_height_m
         Height of the aeroplane or satellite in the scene's vertical datum [m], if the air below it is still in the
-        image; ``None`` for images corrected for it. Above 9 km it counts as 9 km.
+        image. Above 9 km it counts as 9 km. ``None``: what the scene file says of the image, else it was corrected for.
     land_classes
         Number of classes of land that are found in the image by their colours, and whose response to direct light is
-        fitted one by one (forests are not Lambertian); 0 treats all land as Lambertian.
+        fitted one by one (forests are not Lambertian). 0: what the scene file says, else all land is Lambertian.
     progress
         Called with a task and its finished share.
 
@@ -201,6 +201,8 @@ def delit_imagery(
     from seasonscapes.rendering.backend import use_backend
 
     imagery, confinement = _chosen_image(place, image)
+    sensor_height_m = imagery.sensor_height_m if sensor_height_m is None else sensor_height_m
+    land_classes = land_classes or imagery.land_classes
     use_backend()
     pixels = atlas_image(place, imagery, confinement)
     facts: dict[str, Any] = {}
