@@ -84,6 +84,8 @@ def test_splat_like_a_photograph(held_out, capsys):
         ([], "name an hour, or a photograph with --like"),
         (["--like", str(photograph), "--size", "64x64"], "another shape than the view; got '96 x 64'"),
         (["--like", "none.png"], "no such file"),
+        (["--like", str(photograph), "--subpixels", "1"], "--subpixels: does nothing without a model that is relit"),
+        (["--like", str(photograph), "--device", "cuda"], "--device: does nothing without a model that is relit"),
     ):
         assert main([*common, *arguments, "-o", str(again)]) == 2
         assert said in capsys.readouterr().err

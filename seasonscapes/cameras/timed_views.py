@@ -104,9 +104,14 @@ def read_timed_views(folder: Path, *, webcams: Sequence[Webcam] = (), time_zone:
                 else f"name them, or add times to {GEOREFERENCE}"
             )
             raise InputError(file, "states no time of a picture", got=view.file, cure=cure)
-        if not (folder / view.file).resolve().is_relative_to(folder.resolve()):
+        try:
+            inside = (folder / view.file).resolve().is_relative_to(folder.resolve())
+            is_file = (folder / view.file).is_file()
+        except (ValueError, OSError) as error:  # a zero byte, or too long
+            raise InputError(file, f"not a name of a picture: {error}", got=view.file) from None
+        if not inside:
             raise InputError(file, "names a picture outside its folder", got=view.file)
-        if not (folder / view.file).is_file():
+        if not is_file:
             raise InputError(file, "no such picture", got=view.file)
     if not views:
         raise InputError(file, "names no frame")

@@ -83,8 +83,11 @@ def splat_command(
 
     set_torch_threads(1)
     if is_frame_model(model):
+        relit = "a model that is relit (distill --appearance physical)"
         for given, untouched in ((sky, SkyOptions()), (look, LookOptions())):
-            refuse_given("a model that is relit (distill --appearance physical)", given, untouched)
+            refuse_given(relit, given, untouched)
+        refuse_without(relit, subpixels == 2, subpixels=subpixels)
+        refuse_without(relit, device == "cpu", device=device)
         check_output(output, (".png",))
         if (time is None) == (like is None):
             raise InputError("--time", "name an hour, or a photograph with --like, and not both")
