@@ -41,13 +41,13 @@ def held_out(tmp_path_factory):
     return place, model, [(view.camera, views / view.file) for view in every if view.time == hidden], folder
 
 
-def test_a_fitted_code_shows_the_other_half_better_than_any_learned_one(held_out):
+def test_a_fitted_code_shows_the_other_half_better_than_the_nearest_learned_one(held_out):
     place, model, pictures, _ = held_out
     before = {name: value.clone() for name, value in model.appearance.state_dict().items()}
     assert len(pictures) == 2
     for camera, file in pictures:
         code, facts = look_of_photograph(place, model, camera, file)
-        assert facts["psnr_fitted_db"] > facts["psnr_nearest_db"] + 0.3
+        assert facts["psnr_fitted_db"] > facts["psnr_nearest_db"] + 2.0
         again, _ = look_of_photograph(place, model, camera, file)
         assert torch.equal(code, again)
     for name, value in model.appearance.state_dict().items():
@@ -76,7 +76,7 @@ def test_splat_like_a_photograph(held_out, capsys):
     assert main([*common, "--like", str(photograph), "--size", "72x48", "-o", str(again)]) == 0
     record = json.loads(capsys.readouterr().out)
     assert (record["like"], record["nearest_time_utc"]) == ("photo.png", time.isoformat())
-    assert record["psnr_fitted_db"] > 35.0
+    assert record["psnr_fitted_db"] > 40.0
     shown, truth = Image.open(again), Image.open(photograph).resize((72, 48), Image.Resampling.BOX)
     assert np.abs(np.asarray(shown, float) - np.asarray(truth, float)).mean() < 4.0
     for arguments, said in (

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from seasonscapes.workflows.path_completion import PathCompletionOptions
 
 _FILE = "path.json"
-# Of `look_of_photograph`: pixels count that Gaussians cover, and so many in each half are enough for 32 unknowns.
-_COVERED, _FEWEST_PIXELS = 0.5, 100
+# Of `look_of_photograph`: pixels count that Gaussians cover whole, and so many in each half are enough for 32 unknowns.
+_COVERED, _FEWEST_PIXELS = 0.99, 100
 
 
 def point_hashes(along: PathStages) -> dict[str, str]:
