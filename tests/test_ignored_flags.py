@@ -108,7 +108,7 @@ VERBS: dict[str, tuple[list[str], set[str], dict[str, list[str]]]] = {
     "splat": (
         ["alpine_small", "--time", TIME],
         {*_TERRAIN, *_SKY, "--time", "--model", "--output", "--exposure", "--camera", "--at"},
-        {**_OF_POSITION, **_NO_BOUND}
+        {**_OF_POSITION, **_NO_BOUND, "--like": []}
         | _each(("--size", "--subpixels", "--device", "--look", "--white-balance"), ["--output", "a.ply"]),
     ),
     "run": (

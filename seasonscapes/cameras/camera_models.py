@@ -112,18 +112,23 @@ def read_camera_model(path: Path, kind: ModelFormat | None = None, *, view: str 
         The file is missing, of an unknown or ambiguous format, has a lens that is not Brown's, holds several views and none
         is named, or states numbers that are no camera.
     """
-    kind = _recognised(path) if kind is None else kind
-    try:
-        models = _READERS[kind](path)
-    except text_files.MALFORMED as error:
-        problem = f"key {error} is missing" if isinstance(error, KeyError) else f"not a camera of {kind}: {error}"
-        raise InputError(path, problem) from None
+    models = read_camera_models(path, kind)
     chosen = models if view is None else [model for model in models if model.name == view]
     if len(chosen) == 1:
-        return _checked(chosen[0], path)
+        return chosen[0]
     names = ", ".join(sorted(model.name for model in models)[:20])
     problem = "holds no view of that name" if not chosen else f"holds {len(chosen)} views"
     raise InputError(path, problem, got=view, expected=f"one of {names}", cure="name one with --model-view")
+
+
+def read_camera_models(path: Path, kind: ModelFormat | None = None) -> list[CameraModel]:
+    """Read all cameras of a file of another program, in its order; arguments and errors as `read_camera_model`."""
+    kind = _recognised(path) if kind is None else kind
+    try:
+        return [_checked(model, path) for model in _READERS[kind](path)]
+    except text_files.MALFORMED as error:
+        problem = f"key {error} is missing" if isinstance(error, KeyError) else f"not a camera of {kind}: {error}"
+        raise InputError(path, problem) from None
 
 
 def _checked(model: CameraModel, path: Path) -> CameraModel:

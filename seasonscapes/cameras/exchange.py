@@ -25,6 +25,7 @@ from seasonscapes.images import atomic_path
 
 # OpenCV (x right, y down, z forward) to OpenGL (x right, y up, z backward), and back.
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+_UNMOVED = np.eye(4)[:3].tolist()
 
 
 @dataclass(frozen=True)
@@ -220,9 +221,13 @@ def read_transforms(path: Path) -> tuple[list[NamedView], LocalFrame | None]:
     Raises
     ------
     InputError
-        Invalid JSON, a missing key, or non-zero distortion.
+        Invalid JSON, a missing key, non-zero distortion, poses that nerfstudio moved (``applied_transform``), or a time
+        (``time_utc``, or ``time`` with an offset) that is not ISO 8601.
     """
     table = read_json(path)
+    if table.get("applied_transform", _UNMOVED) != _UNMOVED or table.get("applied_scale", 1.0) != 1.0:
+        cure = "export them as they were (ns-process-data moves them; COLMAP's own model has them)"
+        raise InputError(path, "its poses were moved (applied_transform, applied_scale)", cure=cure)
     shared = {key: value for key, value in table.items() if key != "frames"}
     try:
         origin = (table.get("world") or {}).get("origin")
@@ -248,9 +253,45 @@ def _view_of_record(values: dict[str, Any], record: dict[str, Any], frame: Local
     if distortion:
         raise InputError(where, f"distortion {distortion[0]} is not zero", cure="undistort the images first")
     pose = np.array(record["transform_matrix"], float) @ _FLIP
-    file, stamp = str(record["file_path"]), record.get("time_utc")
+    file = str(record["file_path"])
     camera = Camera(int(values["w"]), int(values["h"]), fx, fy, cx, cy, pose, frame)
-    return NamedView(str(record.get("name", file)), camera, file, datetime.fromisoformat(stamp) if stamp else None)
+    key = "time_utc" if record.get("time_utc") is not None else "time"
+    stamp = record.get(key)
+    time = None if stamp is None else parse_stamp(stamp, f"{where}: {key}", utc=key == "time_utc")
+    return NamedView(str(record.get("name", file)), camera, file, time)
+
+
+def parse_stamp(stamp: object, where: str, *, utc: bool = False) -> datetime:
+    """Time in UTC of an ISO 8601 text in a file.
+
+    Parameters
+    ----------
+    stamp
+        The text.
+    where
+        What a message begins with.
+    utc
+        Whether a text without offset is in UTC; else it is refused.
+
+    Raises
+    ------
+    InputError
+        For anything else, such as the numbers between 0 and 1 of films without clock.
+
+    Examples
+    --------
+    >>> from seasonscapes.cameras.exchange import parse_stamp
+    >>> parse_stamp("2024-09-01T12:00+02:00", "a file").isoformat()
+    '2024-09-01T10:00:00+00:00'
+    """
+    expected = "ISO 8601 with an offset, such as 2024-09-01T10:00Z"
+    try:
+        time = datetime.fromisoformat(stamp)  # pyright: ignore[reportArgumentType]
+        if time.tzinfo is None and not utc:
+            raise ValueError("it has no offset from UTC")
+        return time.replace(tzinfo=time.tzinfo or UTC).astimezone(UTC)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(where, f"not an instant: {error}", got=stamp, expected=expected) from None
 
 
 def opencv_from_camera(camera: Camera, k1: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

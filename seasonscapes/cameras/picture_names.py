@@ -133,6 +133,48 @@ def scan_folder(
     return rows, problems + duplicate_times(rows)
 
 
+def times_of_names(names: Sequence[str], webcams: Sequence[Webcam], time_zone: str) -> dict[str, datetime]:
+    """Times of pictures by their names, in that layout of `KNOWN_LAYOUTS` which most of them have.
+
+    Parameters
+    ----------
+    names
+        Paths of the pictures, with ``/``.
+    webcams
+        Known webcams, in whose time zones their pictures' names are.
+    time_zone
+        IANA name of the zone of other pictures' names; names with ``Z`` are in UTC.
+
+    Returns
+    -------
+    dict
+        Time, aware UTC, of each name that states one.
+
+    Raises
+    ------
+    InputError
+        For a date that is none, or a local time that the change of clocks repeats or skips.
+
+    Examples
+    --------
+    >>> from seasonscapes.cameras.picture_names import times_of_names
+    >>> times_of_names(["2024-09-01T1200.jpg"], [], "Europe/Zurich")["2024-09-01T1200.jpg"].isoformat()
+    '2024-09-01T10:00:00+00:00'
+    """
+    pattern = layout_pattern(_fitting_layout(names, single=True), webcam_may_be_missing=True)
+    zone_of = {webcam.id: webcam.time_zone for webcam in webcams}
+    other = webcams[0].time_zone if len(webcams) == 1 else time_zone
+    found = {}
+    for name in names:
+        if (match := pattern.fullmatch(name)) is not None:
+            zone = zone_of.get(match.groupdict().get("webcam", ""), other)
+            time = _utc_or_problem(match["day"], match["time"], zone)
+            if isinstance(time, str):
+                raise InputError(name, time, cure="name it in UTC, with Z behind the time")
+            found[name] = time
+    return found
+
+
 def layout_pattern(layout: str, *, webcam_may_be_missing: bool = False) -> re.Pattern[str]:
     """The regular expression of a layout of paths (see `scan_folder`).
 

@@ -46,7 +46,8 @@ def distill_command(
         physical (relit for any sun and date), paper (learned from --frames alone: viewing direction and a free embedding
         of each timestamp), or embedding (the same without viewing direction).
     frames
-        Of paper and embedding: folder with transforms.json, pictures and their times, as a run films them.
+        Of paper and embedding: folder of pictures with transforms.json and times, as a run films them; or with a COLMAP
+        model and georeference.json (origin on Earth, times; else the pictures' names tell times).
     discs
         Gaussians along the longer side of the terrain.
     steps

@@ -87,7 +87,7 @@ def distil_frames(
     from seasonscapes.workflows import path_stages
 
     if folder is None:
-        raise InputError("--frames", "missing", expected="a folder with transforms.json, pictures and times")
+        raise InputError("--frames", "missing", expected="a folder of pictures with transforms.json or a COLMAP model")
     start = clock.perf_counter()
     with progress_bars() as progress:
         loaded = place.load(scene, progress, output=output)

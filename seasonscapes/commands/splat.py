@@ -15,7 +15,7 @@ from seasonscapes.commands.console import print_result, progress_bars
 from seasonscapes.commands.look_options import LookOptions
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
 from seasonscapes.commands.outputs import check_output
-from seasonscapes.commands.refusals import refuse_given
+from seasonscapes.commands.refusals import refuse_given, refuse_without
 from seasonscapes.commands.view_options import ViewOptions
 from seasonscapes.errors import InputError, NoTerrainInView
 
@@ -23,7 +23,8 @@ from seasonscapes.errors import InputError, NoTerrainInView
 def splat_command(
     scene: str,
     *,
-    time: str,
+    time: str | None = None,
+    like: Path | None = None,
     model: Path = Path("out/gaussians.safetensors"),
     view: ViewOptions | None = None,
     sky: SkyOptions | None = None,
@@ -42,6 +43,9 @@ def splat_command(
         The scene that the model was distilled from.
     time
         ISO 8601, such as 2024-09-01T12:00. Without an offset it is civil time at the camera.
+    like
+        Of models learned from frames, in place of --time: the look of this photograph from the camera. It is fitted to the
+        left half of its terrain; the score is that of the right half.
     model
         From `seasonscapes distill`.
     subpixels
@@ -79,11 +83,19 @@ def splat_command(
 
     set_torch_threads(1)
     if is_frame_model(model):
+        relit = "a model that is relit (distill --appearance physical)"
         for given, untouched in ((sky, SkyOptions()), (look, LookOptions())):
-            refuse_given("a model that is relit (distill --appearance physical)", given, untouched)
+            refuse_given(relit, given, untouched)
+        refuse_without(relit, subpixels == 2, subpixels=subpixels)
+        refuse_without(relit, device == "cpu", device=device)
         check_output(output, (".png",))
-        frame_picture(scene, options, view, model, time, output, as_json=json)
+        if (time is None) == (like is None):
+            raise InputError("--time", "name an hour, or a photograph with --like, and not both")
+        frame_picture(scene, options, view, model, like or str(time), output, as_json=json)
         return
+    refuse_without("a model learned from frames (distill --frames)", False, like=like)
+    if time is None:
+        raise InputError("--time", "missing", expected="an hour, such as 2024-09-01T12:00")
     metering, size_px, declared = look.metering(), view.size_px(), sky.model()
     splats = load_model(model)
     with progress_bars() as progress:

@@ -18,26 +18,30 @@ if TYPE_CHECKING:
 
 
 def frame_picture(
-    scene: str, place: PlaceOptions, view: ViewOptions, model: Path, time: str, output: Path, *, as_json: bool
+    scene: str, place: PlaceOptions, view: ViewOptions, model: Path, look: str | Path, output: Path, *, as_json: bool
 ) -> None:
-    """Picture the model at an hour: between the timestamps of its frames, embeddings are interpolated."""
+    """Picture the model at an hour (text: embeddings of its frames' times are interpolated), or like a photograph (path)."""
     from seasonscapes.images import write_png
-    from seasonscapes.workflows.path_stages import frame_view, load_frame_model
+    from seasonscapes.workflows.path_stages import frame_view, load_frame_model, look_of_photograph
 
     start = clock.perf_counter()
     with progress_bars() as progress:
         loaded = place.load(scene, progress, output=output)
     splats, camera, chosen = load_frame_model(loaded, model), view.pinhole(loaded), view.chosen(loaded.scene)
-    utc = parse_time(time, chosen.latitude_deg, chosen.longitude_deg)
+    if isinstance(look, Path):
+        looks, about = look_of_photograph(loaded, splats, camera, look)
+    else:
+        looks = parse_time(look, chosen.latitude_deg, chosen.longitude_deg)
+        about = {"time_utc": looks.astimezone(UTC).isoformat()}
     try:
-        picture = frame_view(loaded, splats, camera, utc, cloudiness=0.0)
+        picture = frame_view(loaded, splats, camera, looks, cloudiness=0.0)
     except NoTerrainInView as error:
         raise InputError("--camera", str(error)) from None
     record = {
         "scene": loaded.scene.name,
         "gaussians": len(splats.surfels.means),
         "camera": chosen.name,
-        "time_utc": utc.astimezone(UTC).isoformat(),
+        **about,
         "learned_times_utc": [each.isoformat() for each in splats.times],
         "attribution": loaded.scene.attribution,
     }

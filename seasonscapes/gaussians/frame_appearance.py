@@ -23,13 +23,18 @@ from torch import nn
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.errors import InputError, NoTerrainInView
 from seasonscapes.gaussians.appearance import correction_network, fourier_embedding
-from seasonscapes.gaussians.losses import SparseProduct, TrainingFrame, image_loss, training_picture
+from seasonscapes.gaussians.losses import SparseProduct, TrainingFrame, image_loss, sampled_loss, training_picture
 from seasonscapes.gaussians.model import content_digest
 from seasonscapes.gaussians.rasterise import splat_colours, view_weights
 from seasonscapes.gaussians.splat_view import FULL_COVERAGE
 from seasonscapes.gaussians.surfels import Surfels
 from seasonscapes.gaussians.training_views import front_facing_splats
 from seasonscapes.images import atomic_path
+
+# Of `fit_frame_code`: cost of a squared distance from the start, beside a mean difference in sRGB; chosen by measurement.
+_STAY = 0.1
+# An instant, or a time embedding ``(32,)``.
+Look = datetime | torch.Tensor
 
 _HARMONICS, _CODE, _HIDDEN = 9, 32, 128
 _RATES = {"colour": 1e-2, "embedding": 5e-3, "codes": 5e-3, "mlp": 2e-3}
@@ -232,8 +237,64 @@ def code_at(model: FrameGaussians, time: datetime) -> torch.Tensor:
     return codes[lower] + (position - lower) * (codes[upper] - codes[lower])
 
 
+def fit_frame_code(
+    model: FrameGaussians, frame: TimedFrame, *, steps: int = 256, rate: float = 5e-3, seed: int = 0
+) -> tuple[torch.Tensor, int]:
+    """Fit a time embedding to a picture that the model was not trained on, with all else as it is.
+
+    This is the test-time optimisation of WildGaussians (Kulhanek et al. 2024, arXiv:2407.08447). It starts from the timestamp
+    whose embedding explains the picture best, and leaving it costs: without, what is not seen can become worse.
+
+    Parameters
+    ----------
+    model
+        Trained; it is not changed.
+    frame
+        The picture and its usable pixels, such as one half of them; its time is not used.
+    steps
+        Of Adam, each on 1024 pixels.
+    rate
+        Learning rate; it falls linearly to 0.
+    seed
+        Of the pixels.
+
+    Returns
+    -------
+    code, nearest
+        The embedding ``(32,)``, and the number of the timestamp from whose embedding it started.
+
+    Raises
+    ------
+    NoTerrainInView
+        Where no usable pixel shows a Gaussian.
+    """
+    weights = view_weights(front_facing_splats(model.surfels, frame.camera), frame.camera, subpixels=2)
+    picture = training_picture(TrainingFrame(weights, 0, frame.image, frame.mask))
+    if not picture.mask.any():
+        raise NoTerrainInView("fit_frame_code: no usable pixel shows a Gaussian")
+    directions = _directions(model.surfels, frame.camera)[picture.discs]
+
+    def loss(code: torch.Tensor, step: int) -> torch.Tensor:
+        def colours(visible: torch.Tensor) -> torch.Tensor:
+            return model.appearance(picture.discs[visible], directions[visible], code)
+
+        return sampled_loss(picture, colours, np.random.default_rng([seed, step]))
+
+    with torch.no_grad():
+        nearest = int(np.argmin([float(loss(code, 0)) for code in model.appearance.codes]))
+    start = model.appearance.codes[nearest].detach()
+    code = start.clone().requires_grad_()
+    optimiser = torch.optim.Adam([code], lr=rate)
+    for step in range(steps):
+        optimiser.param_groups[0]["lr"] = rate * (1.0 - step / steps)
+        total = loss(code, step) + _STAY * (code - start).square().sum()
+        (code.grad,) = torch.autograd.grad(total, [code])
+        optimiser.step()
+    return code.detach(), nearest
+
+
 @torch.no_grad()
-def render_frame(model: FrameGaussians, camera: Camera, time: datetime) -> tuple[np.ndarray, np.ndarray]:
+def render_frame(model: FrameGaussians, camera: Camera, time: Look) -> tuple[np.ndarray, np.ndarray]:
     """Render a model at an instant.
 
     Parameters
@@ -243,7 +304,7 @@ def render_frame(model: FrameGaussians, camera: Camera, time: datetime) -> tuple
     camera
         The view.
     time
-        Aware; see `code_at`.
+        Aware; see `code_at`. Or an embedding ``(32,)``, such as that of `fit_frame_code`.
 
     Returns
     -------
@@ -259,7 +320,8 @@ def render_frame(model: FrameGaussians, camera: Camera, time: datetime) -> tuple
     if weights.matrix.nnz == 0:
         raise NoTerrainInView("no Gaussian is in view")
     everyone = torch.arange(len(model.surfels.means))
-    colours = model.appearance(everyone, _directions(model.surfels, camera), code_at(model, time)).numpy()
+    code = time if isinstance(time, torch.Tensor) else code_at(model, time)
+    colours = model.appearance(everyone, _directions(model.surfels, camera), code).numpy()
     solid = np.clip(weights.coverage / FULL_COVERAGE, 0.0, 1.0)
     scale = solid / np.maximum(weights.coverage, 1e-6)
     return splat_colours(weights, colours) * scale[..., None].astype(np.float32), solid

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from seasonscapes.cameras.exchange import NamedView, write_colmap, write_transforms
+from seasonscapes.cameras.timed_views import GEOREFERENCE, write_georeference
 from seasonscapes.errors import InputError
 from seasonscapes.export.gltf_file import GltfFile
 from seasonscapes.frames import LocalFrame, frame_record
@@ -237,7 +238,8 @@ def write_training_views(folder: Path, views: Sequence[TrainingView], splats: Ba
     Every frame of ``transforms.json`` has ``timestamp_utc``, ``sun_enu`` (unit, towards the sun; absent by night),
     ``sun_lx``, ``sky_lx`` and ``exposure`` (1 over the luminance of the horizontal illuminance [lx]); readers ignore
     unknown keys. COLMAP's ``points3D.txt`` and ``points.ply`` contain the centres of the discs with their colours.
-    Pictures are named relative to the folder in the former, relative to its ``images/`` in COLMAP's model.
+    Pictures are named relative to the folder in the former, relative to its ``images/`` in COLMAP's model, beside which
+    ``georeference.json`` states origin and times.
 
     Parameters
     ----------
@@ -273,6 +275,7 @@ def write_training_views(folder: Path, views: Sequence[TrainingView], splats: Ba
     with atomic_path(folder / "transforms.json") as temporary:
         temporary.write_text(json.dumps(table, indent=1) + "\n")
     write_colmap(folder / "sparse" / "0", named, image_folder=IMAGE_FOLDER)
+    write_georeference(folder / "sparse" / "0" / GEOREFERENCE, named, frame, image_folder=IMAGE_FOLDER)
     levels = np.rint(255.0 * np.clip(splats.rgb, 0.0, 1.0)).astype(int)
     lines = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]"]
     lines += [

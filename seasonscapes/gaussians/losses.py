@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -259,6 +259,29 @@ def image_loss(pixels: torch.Tensor, picture: TrainingPicture) -> torch.Tensor:
     usable_fraction = picture.mask.float().mean()
     difference = (image - picture.target).abs().mean() / usable_fraction
     return 0.8 * difference + 0.2 * (1.0 - torch_ssim_map(image, picture.target)).mean() / usable_fraction
+
+
+def sampled_loss(
+    picture: TrainingPicture, colours: Callable[[torch.Tensor], torch.Tensor], rng: np.random.Generator
+) -> torch.Tensor:
+    """Mean absolute difference in sRGB of 1024 random usable pixels, which suffice for the few unknowns of a code.
+
+    Parameters
+    ----------
+    picture
+        The picture.
+    colours
+        Gives the linear colours ``(n, 3)`` of the picture's discs of numbers ``(n,)``.
+    rng
+        Draws the pixels.
+    """
+    rows = np.flatnonzero(picture.mask.numpy().ravel())
+    chosen = rng.choice(rows, min(1024, len(rows)), replace=False)
+    weights = picture.forward[chosen]
+    visible = np.unique(weights.indices)
+    weights = weights[:, visible]
+    pixels = SparseProduct.apply(colours(torch.from_numpy(visible).long()), weights, weights.T.tocsr())
+    return (srgb_encoded(pixels) - picture.target.reshape(-1, 3)[chosen]).abs().mean()
 
 
 def torch_ssim_map(image: torch.Tensor, other: torch.Tensor) -> torch.Tensor:

@@ -26,11 +26,10 @@ from seasonscapes.errors import InputError
 from seasonscapes.gaussians.appearance import Appearance, LightTensors, light_tensors
 from seasonscapes.gaussians.disc_transport import LightState
 from seasonscapes.gaussians.losses import (
-    SparseProduct,
     TrainingFrame,
     picture_loss,
     refining_loss,
-    srgb_encoded,
+    sampled_loss,
     surface_loss,
     training_picture,
 )
@@ -334,16 +333,12 @@ def fit_code(
     # Start from the mean of the learned codes, within the network's training range.
     code = appearance.codes.detach().mean(dim=0).requires_grad_()
     optimiser = torch.optim.Adam([code], lr=rate)
-    rows = np.flatnonzero(picture.mask.numpy().ravel())
+
+    def colours(visible: torch.Tensor) -> torch.Tensor:
+        return appearance(picture.discs[visible], picture.time, lights, code)
+
     for step in range(steps):
-        # A random batch of pixels suffices for 32 unknowns.
-        chosen = np.random.default_rng([seed, step]).choice(rows, min(1024, len(rows)), replace=False)
-        weights = picture.forward[chosen]
-        visible = np.unique(weights.indices)
-        weights = weights[:, visible]
-        values = appearance(picture.discs[torch.from_numpy(visible).long()], picture.time, lights, code)
-        pixels = SparseProduct.apply(values, weights, weights.T.tocsr())
-        loss = (srgb_encoded(pixels) - picture.target.reshape(-1, 3)[chosen]).abs().mean()
+        loss = sampled_loss(picture, colours, np.random.default_rng([seed, step]))
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()

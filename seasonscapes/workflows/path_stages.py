@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from seasonscapes.errors import InputError
+from seasonscapes.errors import InputError, NoTerrainInView
 from seasonscapes.images import atomic_path
 from seasonscapes.progress import Progress, each_reported, task_progress
 from seasonscapes.relighting.frame_file import time_stamp
@@ -22,11 +22,13 @@ from seasonscapes.workspace import file_hash
 if TYPE_CHECKING:
     from seasonscapes.cameras.exchange import NamedView
     from seasonscapes.cameras.pinhole import Camera
-    from seasonscapes.gaussians.frame_appearance import FrameGaussians
+    from seasonscapes.gaussians.frame_appearance import FrameGaussians, Look
     from seasonscapes.gaussians.surfels import Surfels
     from seasonscapes.workflows.path_completion import PathCompletionOptions
 
 _FILE = "path.json"
+# Of `look_of_photograph`: pixels count that Gaussians cover whole, and so many in each half are enough for 32 unknowns.
+_COVERED, _FEWEST_PIXELS = 0.99, 100
 
 
 def point_hashes(along: PathStages) -> dict[str, str]:
@@ -181,33 +183,15 @@ def disc_surfels(place: Place, discs: int) -> Surfels:
 
 
 def timed_views(place: Place, folder: Path) -> list[NamedView]:
-    """Views with pictures and times of a folder's ``transforms.json``, in the frame of a place.
-
-    Raises
-    ------
-    InputError
-        Where the file is missing, states no time of a frame, or a picture is missing.
-    """
-    from seasonscapes.cameras.exchange import read_transforms
+    """Views with pictures and times of a folder, in the frame of a place; see `read_timed_views`, whose errors it raises."""
     from seasonscapes.cameras.pinhole import view_in_frame
+    from seasonscapes.cameras.timed_views import read_timed_views
+    from seasonscapes.civil_time import zone_at
 
-    file = folder / "transforms.json"
-    if not file.is_file():
-        raise InputError("--frames", "holds no transforms.json", got=str(folder))
-    views, _ = read_transforms(file)
-    found = []
-    for view in views:
-        if view.time is None:
-            raise InputError(file, "states no time_utc", got=view.name)
-        if not (folder / view.file).resolve().is_relative_to(folder.resolve()):
-            raise InputError(file, "names a picture outside its folder", got=view.file)
-        if not (folder / view.file).is_file():
-            raise InputError(file, "no such picture", got=view.file)
-        camera: Camera = view.camera if view.camera.frame is None else view_in_frame(view.camera, place.frame)
-        found.append(replace(view, camera=camera))
-    if not found:
-        raise InputError(file, "names no frame")
-    return found
+    origin = place.frame
+    zone = zone_at(origin.latitude_deg, origin.longitude_deg)
+    views = read_timed_views(folder, webcams=place.scene.webcams, time_zone=zone)
+    return [replace(view, camera=view_in_frame(view.camera, origin)) for view in views]
 
 
 def distil_frames(
@@ -227,7 +211,8 @@ def distil_frames(
     place
         The place, on whose terrain the Gaussians lie.
     folder
-        With ``transforms.json``, as a run's ``film`` or ``distill --export-views`` writes it.
+        With ``transforms.json``, as a run's ``film`` or ``distill --export-views`` writes it, or a COLMAP model; see
+        `seasonscapes.cameras.timed_views.read_timed_views`.
     discs
         Gaussians along the longer side of the terrain.
     steps
@@ -250,14 +235,10 @@ def distil_frames(
     from seasonscapes.gaussians.frame_appearance import TimedFrame, train_on_frames
     from seasonscapes.gaussians.rasterise import set_torch_threads
     from seasonscapes.images import read_image_linear
-    from seasonscapes.rendering.gbuffer import trace_gbuffer
-    from seasonscapes.rendering.hemisphere_rays import ray_scene
-    from seasonscapes.rendering.mitsuba_scene import mi_mesh
-    from seasonscapes.texturing.inputs import unlit_scene
 
     set_torch_threads(1)
     surfels = disc_surfels(place, discs)
-    scene = unlit_scene(ray_scene(mi_mesh(place.terrain, np.full(3, 0.2))))
+    shows_terrain = _shows_terrain(place)
     views = timed_views(place, folder)
     times = sorted({view.time for view in views if view.time is not None})
     frames = []
@@ -268,8 +249,7 @@ def distil_frames(
             got = f"{image.shape[1]} x {image.shape[0]}"
             expected = f"{view.camera.width_px} x {view.camera.height_px}"
             raise InputError(folder / view.file, "another size than its camera", got=got, expected=expected)
-        mask = np.isfinite(trace_gbuffer(scene, view.camera).depth)
-        frames.append(TimedFrame(view.camera, times.index(view.time), image, mask))
+        frames.append(TimedFrame(view.camera, times.index(view.time), image, shows_terrain(view.camera)))
     note = {"scene": place.scene.name, "seed": seed, "spacing_m": surfels.grid.spacing_m}
     note |= {"attribution": place.scene.attribution, "frames": len(frames)}
     report = task_progress(progress, "distilling frames")
@@ -278,7 +258,78 @@ def distil_frames(
     )
 
 
-def frame_view(place: Place, model: FrameGaussians, camera: Camera, time: datetime, *, cloudiness: float) -> np.ndarray:
+def look_of_photograph(
+    place: Place, model: FrameGaussians, camera: Camera, photograph: Path
+) -> tuple[Look, dict[str, Any]]:
+    """Fit a time embedding to a photograph that a model has not seen: on the left half of its terrain, scored on the right.
+
+    Parameters
+    ----------
+    place, model
+        The place, and a model of it.
+    camera
+        From where the photograph was taken.
+    photograph
+        A picture of the camera's shape; a larger one is reduced.
+
+    Returns
+    -------
+    code, facts
+        The embedding for `frame_view`; and, as plain values, the learned time that is nearest in look, and the PSNR [dB, sRGB] of
+        the right half with that time's embedding and with the fitted one.
+
+    Raises
+    ------
+    InputError
+        Where the photograph is missing, has another shape, or shows too little terrain.
+    """
+    import cv2
+
+    from seasonscapes.evaluation.metrics import psnr_db
+    from seasonscapes.gaussians.frame_appearance import TimedFrame, fit_frame_code, render_frame
+    from seasonscapes.images import read_image_linear, srgb_from_linear
+
+    if not photograph.is_file():
+        raise InputError(photograph, "no such file")
+    image = read_image_linear(photograph)
+    (height, width), size = image.shape[:2], (camera.width_px, camera.height_px)
+    if abs(height * size[0] / width - size[1]) > 1.0:
+        raise InputError(
+            photograph, "another shape than the view", got=f"{width} x {height}", expected="{} x {}".format(*size)
+        )
+    image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    try:
+        _, coverage = render_frame(model, camera, model.times[0])
+        usable = _shows_terrain(place)(camera) & (coverage > _COVERED)
+        # Halves of the terrain rather than of the picture: a slope may fill one side alone.
+        sums = np.cumsum(usable.sum(axis=0))
+        left = usable & (np.arange(size[0]) <= np.searchsorted(sums, sums[-1] / 2.0))
+        right = usable & ~left
+        if min(left.sum(), right.sum()) < _FEWEST_PIXELS:
+            raise NoTerrainInView(f"shows less than {_FEWEST_PIXELS} pixels of terrain in one half")
+        code, nearest = fit_frame_code(model, TimedFrame(camera, 0, image, left))
+    except NoTerrainInView as error:
+        raise InputError(photograph, str(error)) from None
+    scores = [
+        psnr_db(srgb_from_linear(image), srgb_from_linear(render_frame(model, camera, look)[0]), right)
+        for look in (model.appearance.codes[nearest].detach(), code)
+    ]
+    facts = {"like": photograph.name, "nearest_time_utc": model.times[nearest].isoformat()}
+    return code, facts | {"psnr_nearest_db": round(scores[0], 2), "psnr_fitted_db": round(scores[1], 2)}
+
+
+def _shows_terrain(place: Place) -> Callable[[Camera], np.ndarray]:
+    """Gives the mask ``(H, W)`` of a view's pixels that show terrain."""
+    from seasonscapes.rendering.gbuffer import trace_gbuffer
+    from seasonscapes.rendering.hemisphere_rays import ray_scene
+    from seasonscapes.rendering.mitsuba_scene import mi_mesh
+    from seasonscapes.texturing.inputs import unlit_scene
+
+    scene = unlit_scene(ray_scene(mi_mesh(place.terrain, np.full(3, 0.2))))
+    return lambda camera: np.isfinite(trace_gbuffer(scene, camera).depth)
+
+
+def frame_view(place: Place, model: FrameGaussians, camera: Camera, time: Look, *, cloudiness: float) -> np.ndarray:
     """Picture ``(H, W, 3)``, display-linear, of a model of `distil_frames` at an hour, before a plain sky.
 
     Parameters
@@ -288,7 +339,7 @@ def frame_view(place: Place, model: FrameGaussians, camera: Camera, time: dateti
     camera
         The view.
     time
-        Aware.
+        Aware; or the embedding of `look_of_photograph`.
     cloudiness
         Of the sky, in [0, 1].
     """

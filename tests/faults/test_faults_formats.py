@@ -18,6 +18,7 @@ from seasonscapes.calibration.evidence import PARAMETERS, read_points
 from seasonscapes.cameras.exchange import read_colmap, read_opencv, read_transforms
 from seasonscapes.cameras.observation import read_manifest
 from seasonscapes.cameras.path_file import load_path, read_reference_path
+from seasonscapes.cameras.timed_views import read_timed_views
 from seasonscapes.errors import SeasonscapesError
 from seasonscapes.frames import LocalFrame
 from seasonscapes.scene import read_scene
@@ -106,6 +107,10 @@ OPENCV = {
 }
 MANIFEST = "webcam,time_utc,path\nhut,2024-09-18T10:00:00Z,p.png\nhut,2024-09-18T11:00:00Z,q.png\n"
 POINTS = "name,x_px,y_px,latitude_deg,longitude_deg,height_m\n1,5.0,6.0,46.5,8.0,1500\n2,50.0,60.0,46.6,8.0,1500\n"
+GEOREFERENCE = {
+    "world": TRANSFORMS["world"],
+    "times": {"a.png": "2024-09-18T10:00Z", "b.png": "2024-09-18T12:00+02:00"},
+}
 CAMERAS_TXT = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, FX, FY, CX, CY\n1 PINHOLE 160 120 140.0 140.0 80.0 60.0\n"
 IMAGES_TXT = "# IMAGE_ID\n1 1.0 0.0 0.0 0.0 5.0 6.0 7.0 1 a.png\n\n2 1.0 0.0 0.0 0.0 5.0 6.0 7.0 1 b.png\n\n"
 
@@ -222,7 +227,32 @@ def check_scene(scene):
     assert all(name and "/" not in name and name.isprintable() for name in names)
 
 
+def timed_views_of(name):
+    """Reads a file as the one of that name among the pictures of a folder."""
+
+    def read(path):
+        folder = path.parent / "pictures"
+        folder.mkdir(exist_ok=True)
+        for other, text in {"cameras.txt": CAMERAS_TXT, "images.txt": IMAGES_TXT, "a.png": "", "b.png": ""}.items():
+            (folder / other).write_text(text)
+        (folder / name).write_bytes(path.read_bytes())
+        return read_timed_views(folder)
+
+    return read
+
+
+def check_timed(views):
+    assert views
+    for view in views:
+        finite_camera(view.camera)
+        assert view.camera.frame is not None
+        assert view.time.utcoffset() is not None
+        assert view.file in ("a.png", "b.png")
+
+
 JSON_FORMATS = {
+    "georeference": (GEOREFERENCE, timed_views_of("georeference.json"), check_timed),
+    "timed transforms": (TRANSFORMS, timed_views_of("transforms.json"), check_timed),
     "calibration": (CALIBRATION, read_calibration, lambda found: finite_camera(found.view)),
     "path": (PATH, lambda path: load_path(path, FRAME), lambda found: [finite_camera(c) for c in found]),
     "transforms": (TRANSFORMS, read_transforms, lambda found: [finite_camera(view.camera) for view in found[0]]),
