@@ -12,8 +12,8 @@ each colour first, as one must for a real webcam.
 
 * Panoramas are calibrated, cut into views, and give the albedo, which corrects the satellite's image where no webcam
   looked; relit, it ties the pictures of each hour together, and what they paint corrects it. One table tells what paintings,
-  their completions and the joint recovery would add to the albedo (``run --use-painted``, ``--use-inpainted``,
-  ``--recovery differentiable``); `alpinebench_contributions.py` tells it of many places.
+  their completions and the joint recovery would add to the albedo (what flags of ``run`` switch
+  on); `alpinebench_contributions.py` tells it of many places.
 * Painted hours: the painted and completed texture, seen from the judged webcams through the air.
 * Held-out hours: the albedo recovered from the painted hours' pictures, relit.
 * Distilled: Gaussians that learned from that albedo under suns of other days, seen at the held-out hours.

@@ -176,7 +176,7 @@ def test_methods_exchange_their_stages():
         (["--weights", "."], "--weights: does nothing without --completion diffusion"),
         (["--paper-steps", "3"], "--paper-steps: does nothing without --appearance paper"),
         (["--path-views", "3"], "--path-views: does nothing without a path"),
-        (["--points", "."], "--points: does nothing without --poses points"),
+        (["--points", "."], "--points: does nothing without --poses joint or points"),
         (["--method", "paper"], "--weights: no folder of weights"),
         (["--appearance", "paper", "--suns", "3"], "--suns: does nothing without --appearance physical"),
     ],
