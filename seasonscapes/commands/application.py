@@ -19,9 +19,8 @@ from seasonscapes.errors import InputError, SeasonscapesError
 # A value that would be taken for a flag unless it were joined to its own: a place south of the equator, a negative number.
 _SIGNED_VALUE = re.compile(r"-(\.?[0-9]|inf|nan)", re.IGNORECASE)
 _WHOLE_NUMBER = re.compile(r"[+-]?[0-9]{1,18}")
-# Flags for which "without limit" is an answer.
+# Flags for which "without limit", and for which "nothing" is an answer.
 _MAY_BE_INFINITE = ("--far-m",)
-# Flags for which "nothing" is an answer.
 _MAY_BE_EMPTY = ("--leave-out", "--prompt", "--without")
 _MOST_CHARACTERS = 100_000
 

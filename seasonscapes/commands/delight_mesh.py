@@ -6,7 +6,8 @@ import time as clock
 from pathlib import Path
 
 from seasonscapes.commands.console import found_sun_text, message, print_result, progress_bars
-from seasonscapes.commands.mesh_options import UNKNOWN, MeshFileFlags, MeshFlags, hour_on
+from seasonscapes.commands.mesh_hours import UNKNOWN, hour_on
+from seasonscapes.commands.mesh_options import MeshFileFlags, MeshFlags
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
 from seasonscapes.errors import InputError
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from cyclopts import Parameter
 
-from seasonscapes.commands.arguments import check_choice, check_range, parse_at, parse_sun, parse_time
+from seasonscapes.commands.arguments import check_choice, check_range, parse_at
 from seasonscapes.commands.console import message
 from seasonscapes.errors import InputError
 
@@ -16,14 +16,12 @@ if TYPE_CHECKING:
     from seasonscapes.albedo.delighting import DelightOptions
     from seasonscapes.sky.models import SkyModel
     from seasonscapes.terrain.textured_mesh import TexturedMesh
-    from seasonscapes.workflows.meshes import MeshSurroundings, Time
+    from seasonscapes.workflows.meshes import MeshSurroundings
     from seasonscapes.workflows.place import Place
     from seasonscapes.workspace import Workspace
 
 
 MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply")
-# The hour of textures whose sun is to be found.
-UNKNOWN = "unknown"
 
 
 @Parameter(name="*")
@@ -112,26 +110,6 @@ def three_numbers(flag: str, text: str | None) -> tuple[float, float, float] | N
     except ValueError:
         raise InputError(flag, "not three numbers", got=text, expected="X,Y,Z") from None
     return x, y, z
-
-
-def hour_on(
-    mesh: TexturedMesh,
-    time: str | None,
-    sun: str | None,
-    *,
-    flags: tuple[str, str] = ("--time", "--sun"),
-    may_be_unknown: bool = False,
-) -> Time:
-    """The hour that two flags name: an instant, whose reading is printed, the sun's angles, or "unknown"."""
-    if (time is None) == (sun is None):
-        got, expected = "neither" if time is None else "both", f"{flags[0]} T, or {flags[1]} AZIMUTH,ELEVATION"
-        raise InputError(flags[0], "give an hour or the sun's angles", got=got, expected=expected)
-    if sun is not None:
-        return parse_sun(sun, flag=flags[1])
-    assert time is not None  # one of them was given
-    if may_be_unknown and time == UNKNOWN:
-        return time
-    return parse_time(time, mesh.frame.latitude_deg, mesh.frame.longitude_deg)
 
 
 @Parameter(name="*")

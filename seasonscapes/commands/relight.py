@@ -11,7 +11,8 @@ from cyclopts import Parameter
 from seasonscapes.commands.arguments import check_range
 from seasonscapes.commands.console import message, print_result, progress_bars
 from seasonscapes.commands.look_options import LookOptions
-from seasonscapes.commands.mesh_options import MESH_SUFFIXES, UNKNOWN, MeshFileFlags, MeshFlags, hour_on
+from seasonscapes.commands.mesh_hours import UNKNOWN, hour_on
+from seasonscapes.commands.mesh_options import MESH_SUFFIXES, MeshFileFlags, MeshFlags
 from seasonscapes.commands.mesh_view_options import MeshViewFlags
 from seasonscapes.commands.options import SkyOptions
 from seasonscapes.commands.outputs import check_file_or_folder
