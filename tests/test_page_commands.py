@@ -23,6 +23,7 @@ NOT_RUN = {
     r"--method diffusion": "needs weights; tests/test_diffusion.py runs it on tiny ones",
     r"^seasonscapes annotate|^seasonscapes view (alpine_small --camera|my-valley)": "serves a page until Ctrl-C",
     r"--points points.csv": "needs points that a person matched; tests/test_cli_webcams.py runs it",
+    r"^seasonscapes lpips ": "needs the two published files; tests/test_evaluate_command.py joins files of their layout",
     r"^seasonscapes (run|evaluate) ": "a run of all stages and its score; tests/test_run.py has both",
     r"^seasonscapes render alpine_lake|--engine path -o view.png": "a large picture, for minutes; tests/test_water.py renders small ones",
     r"--turntable 36": "traces the light of 36 views; tests/test_meshes.py turns through fewer",
