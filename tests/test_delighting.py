@@ -19,7 +19,7 @@ from seasonscapes.albedo.delighting import (
     delight_image,
 )
 from seasonscapes.albedo.registration import shifted_back, texture_shift
-from seasonscapes.albedo.shadow_borders import refined_visibility
+from seasonscapes.albedo.shadow_borders import BorderModel, refined_visibility
 from seasonscapes.albedo.sky_factor import fitted_sky_factor
 from seasonscapes.errors import NoUsablePixels
 
@@ -68,6 +68,17 @@ def test_shadow_borders_follow_the_image_where_the_prediction_is_three_texels_of
     assert before > 250
     assert after < 0.25 * before
     assert deviation[48, 56] < 0.05
+
+
+def test_the_land_around_may_be_left_out_of_the_cost():
+    light, true = hill_light()
+    image = lit(texture(), light, true)
+    ambient = np.maximum(light.sky, 1e-3).astype(np.float32)
+    known = (np.log(np.maximum(np.pi * image, 1e-3)), light.sun, ambient, light.visibility, light.chart)
+    for land in (0.0, 4.0):
+        visibility, _ = refined_visibility(*known, model=BorderModel(land=land))
+        assert np.isfinite(visibility).all()
+        assert np.abs(visibility - true).mean() < np.abs(light.visibility - true).mean()
 
 
 def test_the_albedo_of_a_lit_image_returns_without_its_shadow():

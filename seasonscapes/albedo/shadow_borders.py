@@ -50,7 +50,7 @@ class BorderModel:
     iterations
         Rounds of messages.
     land
-        Largest cost of an albedo that is unlike that of the land around, in brightness or colour.
+        Largest cost of an albedo that is unlike that of the land around, in brightness or colour; 0 leaves it out.
     land_texels
         Standard deviation of what counts as around [texels].
     """
@@ -160,9 +160,10 @@ def _propagated(
             for level in levels
         ]
     )
-    # Land varies: only what lies beyond its usual spread counts.
-    unlike = np.maximum((((features - land[..., :3]) / land[..., 3:]) ** 2).sum(axis=-1) - _USUAL, 0.0)
-    unary += model.land * unlike / (unlike + 2.0 * model.land)
+    if model.land > 0.0:
+        # Land varies: only what lies beyond its usual spread counts.
+        unlike = np.maximum((((features - land[..., :3]) / land[..., 3:]) ** 2).sum(axis=-1) - _USUAL, 0.0)
+        unary += model.land * unlike / (unlike + 2.0 * model.land)
     unary = np.where(known, unary, 0.0).astype(np.float32)
     costs, joined = [], []
     for axis in (0, 1):

@@ -14,7 +14,7 @@ from typing import cast
 import cv2
 import numpy as np
 from scipy.ndimage import distance_transform_edt, label
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from seasonscapes.albedo.delighting import TexelIrradiance
 from seasonscapes.albedo.forward_model import TexelTransport, ambient_on_texels, transport_of_points
@@ -172,7 +172,8 @@ def _sunlight(on: _SunTexels, light: Illumination, slope_error: float) -> tuple[
         share = np.clip(seen / np.maximum(cosine, 1e-6), 0.0, 1.0)
         if slope_error > 0.0:
             ratio = signed / slope_error
-            mean = signed * norm.cdf(ratio) + slope_error * norm.pdf(ratio)
+            density = np.exp(-0.5 * ratio**2) / np.sqrt(2.0 * np.pi)
+            mean = signed * ndtr(ratio) + slope_error * density
             cosine = np.maximum(signed, _SURELY_SUNLIT * slope_error)
             # No shadow ray leaves ground that turns away: what hides the sun from it is not known.
             hidden = np.where(signed > 0.2 * slope_error, share, 1.0)
