@@ -208,12 +208,8 @@ def delit_imagery(
     facts: dict[str, Any] = {}
     if time == UNKNOWN:
         found = image_sun(place, pixels, progress=progress)
+        time = trusted_sun(found, imagery.label, cure="state the image's time or sun")
         facts["found_sun"] = found_sun_record(found)
-        if not found.trusted:
-            best = f"{found.azimuth_deg:.0f},{found.elevation_deg:.0f}"
-            cure = f"state the image's time or sun, or see what the best one gives, --sun {best}"
-            raise NotEnoughEvidence(f"{imagery.label}: its sun cannot be told: {found.reason}; {cure}")
-        time = (found.azimuth_deg, found.elevation_deg)
     light, day, record = image_light(place, time, sky)
     irradiance = _texel_light(place, light, progress, slope_error=SLOPE_ERROR)
     options = DelightOptions(
@@ -398,6 +394,15 @@ def image_sun(place: Place, image: AtlasImage, *, progress: Progress | None = No
     return find_sun(
         brightness, relief, latitude_deg=place.frame.latitude_deg, progress=task_progress(progress, "sun of the image")
     )
+
+
+def trusted_sun(found: FoundSun, where: str, *, cure: str) -> tuple[float, float]:
+    """Azimuth and elevation [deg] of a sun that was found; `NotEnoughEvidence` with the cure where it is not to be trusted."""
+    if not found.trusted:
+        best = f"{found.azimuth_deg:.0f},{found.elevation_deg:.0f}"
+        cure = f"{cure}, or see what the best one gives, --sun {best}"
+        raise NotEnoughEvidence(f"{where}: its sun cannot be told: {found.reason}; {cure}")
+    return found.azimuth_deg, found.elevation_deg
 
 
 def found_sun_record(found: FoundSun) -> dict[str, Any]:

@@ -97,7 +97,7 @@ def require_mesh_sun(
     NotEnoughEvidence
         Where it cannot be told.
     """
-    from seasonscapes.workflows.delighting import found_sun_record
+    from seasonscapes.workflows.delighting import found_sun_record, trusted_sun
 
     ground = _GROUND if around.terrain is not None else around.ground_albedo
     # A mesh without a place lies at latitude and longitude zero.
@@ -105,11 +105,8 @@ def require_mesh_sun(
         mesh.frame.latitude_deg if (mesh.frame.latitude_deg, mesh.frame.longitude_deg) != (0.0, 0.0) else None
     )
     found = mesh_sun(mesh, transport, ground_albedo=ground, latitude_deg=latitude_deg, progress=progress)
-    if not found.trusted:
-        best = f"{found.azimuth_deg:.0f},{found.elevation_deg:.0f}"
-        cure = f"state the time or the sun, or see what the best one gives, --sun {best}"
-        raise NotEnoughEvidence(f"{mesh.path.name}: its sun cannot be told: {found.reason}; {cure}")
-    return (found.azimuth_deg, found.elevation_deg), {"found_sun": found_sun_record(found)}
+    sun = trusted_sun(found, mesh.path.name, cure="state the time or the sun")
+    return sun, {"found_sun": found_sun_record(found)}
 
 
 def _samples(atlas: MeshAtlas, mesh: TexturedMesh) -> tuple[np.ndarray, np.ndarray]:
