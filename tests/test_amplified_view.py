@@ -110,3 +110,33 @@ def test_a_camera_near_the_ground_keeps_its_height_above_it(monkeypatch):
         free = replace(south, world_from_camera=pose)
         assert view_with_terrain(place, free, amplify=True)[0] is free
     assert max(np.abs(changes)) > 0.3
+
+
+def test_the_ground_of_the_next_frame_of_a_film_is_the_same(place, monkeypatch):
+    """The finer part moves along with the camera, cell by cell: within what its pixels can tell, nothing pops up."""
+    monkeypatch.setattr(amplified_terrain, "_MOST_NEAR_NODES", 300_000)
+    monkeypatch.setattr(amplified_terrain, "_MOST_NODES", 100_000)
+    view = camera(place, "south", size_px=(96, 64))
+    grid = np.stack(np.meshgrid(np.linspace(-800.0, 800.0, 161), np.linspace(-800.0, 800.0, 161)), axis=-1).reshape(
+        -1, 2
+    )
+    points = np.c_[view.position_m[:2] + grid, np.zeros(len(grid))]
+
+    def ground(forward_m: float) -> tuple[np.ndarray, np.ndarray]:
+        pose = view.world_from_camera.copy()
+        pose[:3, 3] += forward_m * pose[:3, 2]
+        surface = view_with_terrain(place, replace(view, world_from_camera=pose), amplify=True)[1].surface
+        assert surface is not None
+        return surface.sample(points)
+
+    heights, normals = ground(0.0)
+    changed = 0
+    for step_m in (5.0, 20.0, 50.0):
+        other, turned = ground(step_m)
+        distance = np.linalg.norm(grid, axis=1)
+        pixels = np.abs(other - heights) / np.maximum(distance, 2.0) * view.fx
+        assert np.quantile(pixels, 0.999) < 0.5
+        assert pixels.max() < 2.0
+        assert np.degrees(np.arccos(np.clip((turned * normals).sum(axis=1), -1.0, 1.0))).mean() < 0.5
+        changed += int((other != heights).any())
+    assert changed, "the finer part was never moved"
