@@ -105,6 +105,16 @@ def test_both_engines_agree_on_snow(sun):
     assert np.abs(plain - reference).mean() > 0.02 * reference.mean()
 
 
+def test_rims_of_snow_have_no_sparks():
+    """A pixel on a rim whose mean normal faces away from a low sun is no brighter than its sunlit part can be."""
+    ridges = heightfield(lambda e, n: 40.0 * np.abs(np.sin(e / 90.0 + n / 140.0)), side_m=2000.0, count=161)
+    mesh, camera = mi_mesh(replace(ridges, snow=Snow()), np.array([0.80, 0.82, 0.85])), over_a_slope()
+    light = Illumination(uniform_sky(300.0).sky_radiance, sun_at(250.0, 6.0).sun)
+    relit = relight_view(relightable_view(ray_scene(mesh), trace(mesh, camera)), light).surface
+    reference, _ = path_trace(relight(mesh, light), camera, spp=256)
+    assert relit.max() < 1.3 * reference.max()
+
+
 def trace(mesh, camera):
     from seasonscapes.rendering.transport import trace_view
 

@@ -276,8 +276,9 @@ def relit_surface_radiance(view: RelightableView, illumination: Illumination) ->
         total *= ground.of_diffuse_light()
     for body in luminaries(illumination):
         light = np.asarray(body.normal_illuminance_lx, np.float32) / np.float32(np.pi)
-        lit = sun_cosine(view, body)[:, None] * light
-        total += lit if ground is None else lit * ground.of_luminary(body)
+        cosine = sun_cosine(view, body)
+        lit = cosine[:, None] * light
+        total += lit if ground is None else lit * ground.of_luminary(body, cosine)
     radiance = total * view.coefficients.albedo
     if view.mirror is not None:
         radiance[view.mirror.coefficients.pixel] += mirrored_radiance(view.mirror, illumination, clusters)
@@ -301,9 +302,11 @@ class _GroundPixels:
     def of_diffuse_light(self) -> np.ndarray:
         return np.stack(self._optics.relative_diffuse(self._albedo, self._cosine), axis=1).astype(np.float32)
 
-    def of_luminary(self, body: Luminary) -> np.ndarray:
+    def of_luminary(self, body: Luminary, lit_cosine: np.ndarray) -> np.ndarray:
         light = np.asarray(body.direction, np.float32)
-        cosines = (self._cosine, self._normal @ light, self._viewer @ light)
+        # On rims the mean normal may face away from a light that some samples face: it would be as bright as grazing snow.
+        incident = np.maximum(self._normal @ light, lit_cosine)
+        cosines = (self._cosine, incident, self._viewer @ light)
         return np.stack(self._optics.relative(self._albedo, cosines, NUMPY), axis=1).astype(np.float32)
 
 
