@@ -1,4 +1,4 @@
-"""Clouds before the terrain of a picture: where the terrain should be and the sky goes on."""
+"""Clouds in a picture: before the terrain, where the sky goes on below the skyline, and in the sky itself."""
 
 from __future__ import annotations
 
@@ -12,6 +12,10 @@ _SKYLINE_PER_100_PX = 0.6
 # Width of the smoothing of the sky's colour, as a share of the picture's.
 _SMOOTHING = 0.01
 _NEIGHBOURS = np.ones((3, 3), bool)
+# Excess of blue over red, over their sum, of encoded values: clouds of six cameras have -0.08 to 0.04, their clear skies 0.07 to 0.7.
+_GREYER = 0.05
+# A sky is judged where it covers so much of the picture, and so much of it is not clipped.
+_LEAST_SKY, _LEAST_TOLD, _CLIPPED_SKY = 0.02, 0.25, 0.96
 
 
 def clouds_before(image: np.ndarray, terrain: np.ndarray) -> np.ndarray:
@@ -46,3 +50,36 @@ def clouds_before(image: np.ndarray, terrain: np.ndarray) -> np.ndarray:
     reached = np.isin(labels, np.unique(labels[sky]))
     # A cloud's fringe is neither sky nor ground.
     return ndimage.binary_dilation(reached & like, _NEIGHBOURS, iterations=reach) & terrain
+
+
+def grey_share(image: np.ndarray, sky: np.ndarray) -> float | None:
+    """Share of a picture's sky that is as grey as clouds.
+
+    A clear sky is bluer than what it lights, clouds are not: their red is nearly as bright as their blue, by which cameras of the
+    whole sky tell them apart (Long et al. 2006, doi:10.1175/JTECH1875.1).
+
+    Parameters
+    ----------
+    image
+        ``(H, W, 3)`` sRGB-encoded, in [0, 1].
+    sky
+        ``(H, W)`` bool: pixels of the sky.
+
+    Returns
+    -------
+    float or None
+        0 to 1; ``None`` where too little of the sky is seen, or nearly all of it is clipped and tells nothing.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> half = np.where(np.arange(8)[:, None, None] < 4, [0.4, 0.5, 0.8], [0.7, 0.7, 0.71]) * np.ones((8, 8, 1))
+    >>> grey_share(half, np.ones((8, 8), bool))
+    0.5
+    """
+    values = image[sky]
+    told = values[values.min(axis=1) < _CLIPPED_SKY]
+    if sky.mean() < _LEAST_SKY or len(told) < _LEAST_TOLD * len(values):
+        return None
+    red, blue = told[:, 0], told[:, 2]
+    return float(np.mean((blue - red) / np.maximum(blue + red, 1e-6) < _GREYER))
