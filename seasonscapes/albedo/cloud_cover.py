@@ -16,6 +16,8 @@ _NEIGHBOURS = np.ones((3, 3), bool)
 _GREYER = 0.05
 # A sky is judged where it covers so much of the picture, and so much of it is not clipped.
 _LEAST_SKY, _LEAST_TOLD, _CLIPPED_SKY = 0.02, 0.25, 0.96
+# A closed cloud layer: nearly all of the sky is grey, and nearly none so bright as about a sun behind thin cloud.
+_CLOSED_GREY, _CLOSED_TOLD = 0.95, 0.9
 
 
 def clouds_before(image: np.ndarray, terrain: np.ndarray) -> np.ndarray:
@@ -36,8 +38,7 @@ def clouds_before(image: np.ndarray, terrain: np.ndarray) -> np.ndarray:
     numpy.ndarray
         ``(H, W)`` bool: terrain that clouds hide.
     """
-    reach = max(1, round(_SKYLINE_PER_100_PX * image.shape[1] / 100.0))
-    sky = np.logical_not(ndimage.binary_dilation(terrain, _NEIGHBOURS, iterations=reach))
+    reach, sky = _skyline_reach(terrain), sky_above(terrain)
     if not sky.any():
         return np.zeros_like(terrain)
     nearest = np.zeros((2, *sky.shape), np.int32)
@@ -83,3 +84,31 @@ def grey_share(image: np.ndarray, sky: np.ndarray) -> float | None:
         return None
     red, blue = told[:, 0], told[:, 2]
     return float(np.mean((blue - red) / np.maximum(blue + red, 1e-6) < _GREYER))
+
+
+def closed_clouds(image: np.ndarray, sky: np.ndarray) -> bool:
+    """Whether a picture's sky is a closed layer of clouds, through which the sun throws no shadows.
+
+    Parameters
+    ----------
+    image, sky
+        As in `grey_share`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> closed_clouds(np.full((8, 8, 3), 0.7), np.ones((8, 8), bool))
+    True
+    """
+    grey = grey_share(image, sky)
+    told = float(np.mean(image[sky].min(axis=1) < _CLIPPED_SKY)) if sky.any() else 0.0
+    return grey is not None and grey >= _CLOSED_GREY and told >= _CLOSED_TOLD
+
+
+def sky_above(terrain: np.ndarray) -> np.ndarray:
+    """Pixels ``(H, W)`` bool of a picture that are surely sky, for the pixels that terrain covers ``(H, W)`` bool."""
+    return np.logical_not(ndimage.binary_dilation(terrain, _NEIGHBOURS, iterations=_skyline_reach(terrain)))
+
+
+def _skyline_reach(terrain: np.ndarray) -> int:
+    return max(1, round(_SKYLINE_PER_100_PX * terrain.shape[1] / 100.0))
