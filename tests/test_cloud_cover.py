@@ -64,7 +64,8 @@ def test_only_a_sky_seen_whole_and_grey_is_closed():
     terrain = np.zeros((60, 80), bool)
     terrain[30:] = True
     sky = sky_above(terrain)
-    assert sky[:29].all() and not sky[30:].any()
+    assert sky[:29].all()
+    assert not sky[30:].any()
     cloud = np.full((60, 80, 3), 0.75)
     glare, gap = cloud.copy(), cloud.copy()
     glare[:15, :30] = 1.0

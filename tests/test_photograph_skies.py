@@ -8,7 +8,7 @@ import pytest
 import seasonscapes as ss
 from seasonscapes.rendering.sightlines import visible_faces
 from seasonscapes.sky.models import with_overrides
-from seasonscapes.workflows.albedo_recovery import texel_transport
+from seasonscapes.workflows.albedo_recovery import RecoveryOptions, _prepared, texel_transport
 from seasonscapes.workflows.illumination import sky_model
 from seasonscapes.workflows.photograph_skies import photograph_skies
 
@@ -17,7 +17,7 @@ from seasonscapes.workflows.photograph_skies import photograph_skies
 def taken(tmp_path_factory):
     """A small place, its texels' transport, and one photograph of it under a clear sky and one under clouds."""
     place = ss.load_place("alpine_small")
-    times = ["2024-07-20T11:00"]
+    times = ["2024-07-20T16:00"]
     camera = ss.camera(place, "aerial", size_px=(96, 64))
     observations = []
     for name, sky in (("clear", "clear"), ("clouds", "overcast")):
@@ -55,9 +55,13 @@ def test_a_low_sun_and_a_synthetic_clear_sky_stay_clear(taken):
     ]
 
 
-def test_clouds_that_the_sky_shows_keep_white_land_white(taken):
-    """Land photographed under clouds: its albedo is as neutral as it was, where a clear sky's blue is not taken out of it."""
-    place, _, observations = taken
-    found = ss.recover_albedo(place, [observations[1]])
-    blind = ss.recover_albedo(place, [replace(observations[1], time=observations[1].time)], sky="clear")
-    assert found.photographs[0].light.model["cloudiness"] == blind.photographs[0].light.model["cloudiness"] >= 0.5
+def test_albedo_is_recovered_under_the_clouds_that_a_photograph_shows(taken):
+    """The light of the recovery is dimmer and less blue where the photograph's sky is grey."""
+    place, transport, _ = taken
+    blue, grey = _with_sky(taken, 0, (0.12, 0.25, 0.6)), _with_sky(taken, 1, (0.5, 0.5, 0.52))
+    prepared, _ = _prepared(place, transport, [blue, grey], sky_model("clear"), RecoveryOptions(), None)
+    suns = [each.light.sun for each in prepared]
+    direct = [0.0 if sun is None else float(np.sum(sun.normal_illuminance_lx)) for sun in suns]
+    assert direct[1] < 0.3 * direct[0]
+    colour = [each.light.sky_radiance[: each.light.sky_radiance.shape[0] // 2].mean((0, 1)) for each in prepared]
+    assert colour[1][2] / colour[1][0] < 0.7 * colour[0][2] / colour[0][0]

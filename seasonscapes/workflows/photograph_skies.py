@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from seasonscapes.albedo.cloud_cover import grey_share
+from seasonscapes.cameras.pinhole import Camera, ray_directions
 from seasonscapes.images import srgb_from_linear
 from seasonscapes.sky.ephemeris import sun_position
 from seasonscapes.sky.models import AtmosphereModel, SkyModel
@@ -20,8 +21,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-# Near the horizon the sun's own sky is as grey as clouds [deg].
-_LOWEST_SUN_DEG = 10.0
+# A clear sky is as grey as clouds where the sun is low, and about the sun [deg].
+_LOWEST_SUN_DEG, _AROUND_SUN_DEG = 10.0, 60.0
 # Below this share of grey sky a picture counts as clear: haze and clouds on the horizon are grey too.
 _CLOUDY = 0.5
 
@@ -63,11 +64,14 @@ def photograph_skies(
 
 
 def _grey_share(place: Place, transport: TexelTransport, photograph: Observation) -> float | None:
-    """See `grey_share`; ``None`` for a low sun."""
+    """See `grey_share`, away from the sun; ``None`` for a low one."""
     from seasonscapes.rendering.sightlines import visible_faces
 
     sun = sun_position(photograph.time, place.frame.latitude_deg, place.frame.longitude_deg)
     if float(np.asarray(sun.elevation_deg)) < _LOWEST_SUN_DEG:
         return None
-    sky = (visible_faces(transport.ray_scene, photograph.camera) < 0) & photograph.mask
+    camera = photograph.camera
+    assert isinstance(camera, Camera)  # panoramas were cut into views
+    away = ray_directions(camera) @ sun.direction < np.cos(np.radians(_AROUND_SUN_DEG))
+    sky = (visible_faces(transport.ray_scene, camera) < 0) & photograph.mask & away
     return grey_share(srgb_from_linear(np.clip(photograph.image, 0.0, 1.0)), sky)
