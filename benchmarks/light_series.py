@@ -2,11 +2,12 @@
 
     python benchmarks/light_series.py [--quick] [--seed N] [--data FOLDER] [--json FILE] [--plot FILE]
 
-One number a day is fitted, the aerosol's optical depth, to direct sunlight at every tenth minute; all other minutes
-with the sun above 5° are judged. Precipitable water follows from the measured temperature and humidity (pvlib's
-`gueymard94_pw`), the ground's albedo from the measured upward and downward light where a station has both. Beside ours in the same
-run, fitted to the same minutes: the clear-sky model of Ineichen & Perez (by its Linke turbidity) and the broadband model
-of Bird & Hulstrom (by its optical depth), both as pvlib has them. ``--quick`` judges every fifth of those minutes.
+The air of a day is fitted to direct sunlight at every tenth minute: aerosol's optical depth, and the water above the station. All
+other minutes with the sun above 5° are judged; diffuse and global light are never fitted. Water that follows from
+temperature and humidity at the ground (pvlib's `gueymard94_pw`) is too much where moist air lies under an inversion: what
+it gives, with the depth alone fitted, is printed beside (``humidity``). The ground's albedo follows from the measured upward
+and downward light where a station has both. Beside ours in the same run, fitted to the same minutes: the clear-sky model of
+Ineichen & Perez (by its Linke turbidity) and the broadband model of Bird & Hulstrom (by depth and water), both as pvlib has them. ``--quick`` judges every fifth of those minutes.
 The measurements are SURFRAD (NOAA) and MIDC (NREL) days in ``light-series`` of the data folder; without it this ends
 with a reason. ``--seed`` chooses which tenth of the minutes is fitted.
 """
@@ -18,7 +19,8 @@ import csv
 import os
 import secrets
 import sys
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -26,7 +28,7 @@ import numpy as np
 import pandas as pd
 import pvlib
 from record import write_record
-from scipy.optimize import minimize_scalar
+from scipy.optimize import least_squares, minimize_scalar
 
 from seasonscapes.sky.atmosphere import optics
 from seasonscapes.sky.broadband import clear_efficacies_lm_w
@@ -156,8 +158,22 @@ def fitted(error, low: float, high: float) -> float:
     return float(minimize_scalar(error, bounds=(low, high), method="bounded", options={"xatol": 1e-4}).x)
 
 
+def fitted_air(
+    direct: Callable[[float, float], np.ndarray], measured: np.ndarray, water_cm: float
+) -> tuple[float, float]:
+    """Optical depth and water [cm] under which direct light ``direct(depth, water_cm)`` comes nearest to the measured."""
+
+    def error(logs: np.ndarray) -> np.ndarray:
+        return direct(*np.exp(logs)) / measured.mean() - measured / measured.mean()
+
+    start = np.log([0.03, water_cm])
+    low, high = np.log([0.001, 0.01]), np.log([0.6, 8.0])
+    depth, water = np.exp(least_squares(error, start, bounds=(low, high), xtol=1e-4, diff_step=0.01).x)
+    return float(depth), float(water)
+
+
 def rivals(day: Day, sun: SolarPosition, fit: np.ndarray, judged: np.ndarray) -> dict[str, tuple[np.ndarray, ...]]:
-    """Direct, diffuse and global of pvlib's clear-sky models at the judged minutes, each fitted by one number."""
+    """Direct, diffuse and global of pvlib's clear-sky models at the judged minutes, fitted to the same minutes as ours."""
     zenith = 90.0 - np.asarray(sun.elevation_deg)
     mass = pvlib.atmosphere.get_relative_airmass(zenith)
     pressure = pvlib.atmosphere.alt2pres(day.height_m)
@@ -167,21 +183,16 @@ def rivals(day: Day, sun: SolarPosition, fit: np.ndarray, judged: np.ndarray) ->
         absolute = pvlib.atmosphere.get_absolute_airmass(mass[at], pressure)
         return pvlib.clearsky.ineichen(zenith[at], absolute, turbidity, altitude=day.height_m, dni_extra=extra)
 
-    def bird(depth: float, at: np.ndarray):
+    def bird(depth: float, water_cm: float, at: np.ndarray):
         return pvlib.clearsky.bird(
-            zenith[at], mass[at], 1.3 * depth, depth, day.water_cm, pressure=pressure, dni_extra=extra,
+            zenith[at], mass[at], 1.3 * depth, depth, water_cm, pressure=pressure, dni_extra=extra,
             albedo=day.ground_albedo,
         )  # fmt: skip
 
-    found = {}
-    for name, model, low, high in (("ineichen", ineichen, 1.0, 6.0), ("bird", bird, 0.001, 0.5)):
-
-        def error(value: float, model=model) -> float:
-            return rms(np.asarray(model(value, fit)["dni"]), day.direct[fit])
-
-        answer = model(fitted(error, low, high), judged)
-        found[name] = tuple(np.asarray(answer[key]) for key in ("dni", "dhi", "ghi"))
-    return found
+    turbidity = fitted(lambda value: rms(np.asarray(ineichen(value, fit)["dni"]), day.direct[fit]), 1.0, 6.0)
+    air = fitted_air(lambda *each: np.asarray(bird(*each, fit)["dni"]), day.direct[fit], day.water_cm)
+    answers = {"ineichen": ineichen(turbidity, judged), "bird": bird(*air, judged)}
+    return {name: tuple(np.asarray(each[key]) for key in ("dni", "dhi", "ghi")) for name, each in answers.items()}
 
 
 def clock_error_min(day: Day, model: AtmosphereModel, fit: np.ndarray) -> float:
@@ -202,20 +213,32 @@ def run(day: Day, *, quick: bool, seed: int) -> tuple[dict[str, float], dict[str
     offset = seed % FIT_EVERY
     fit = chosen[offset::FIT_EVERY]
     judged = np.setdiff1d(chosen, fit)[:: 5 if quick else 1]
-    base = station_model(day)
-    depth = fitted(lambda value: rms(our_direct(with_depth(base, value), day, sun, fit), day.direct[fit]), 0.002, 0.6)
-    model = with_depth(base, depth)
+
+    def of_air(depth: float, water_cm: float, at: np.ndarray) -> np.ndarray:
+        moist = replace(day, water_cm=water_cm)
+        return our_direct(with_depth(station_model(moist), depth), moist, sun, at)
+
+    depth, water = fitted_air(lambda *air: of_air(*air, fit), day.direct[fit], day.water_cm)
+    humid_depth = fitted(lambda value: rms(of_air(value, day.water_cm, fit), day.direct[fit]), 0.002, 0.6)
     sine = np.sin(np.radians(elevation[judged]))
-    direct, diffuse = our_direct(model, day, sun, judged), our_diffuse(model, day, sun, judged)
     measured = {"direct": day.direct[judged], "diffuse": day.diffuse[judged], "global": day.total[judged]}
-    models = {"ours": (direct, diffuse, direct * sine + diffuse), **rivals(day, sun, fit, judged)}
+    models = {}
+    for name, air in (("ours", (depth, water)), ("humidity", (humid_depth, day.water_cm))):
+        moist = replace(day, water_cm=air[1])
+        direct = of_air(*air, judged)
+        diffuse = our_diffuse(with_depth(station_model(moist), air[0]), moist, sun, judged)
+        models[name] = (direct, diffuse, direct * sine + diffuse)
+    models |= rivals(day, sun, fit, judged)
+    moist = replace(day, water_cm=water)
     figures = {
         "optical_depth_500nm": depth,
-        "water_cm": day.water_cm,
+        "water_cm": water,
+        "humidity_optical_depth_500nm": humid_depth,
+        "humidity_water_cm": day.water_cm,
         "ground_albedo": day.ground_albedo,
         "minutes_fitted": len(fit),
         "minutes_judged": len(judged),
-        "clock_error_min": clock_error_min(day, model, fit),
+        "clock_error_min": clock_error_min(moist, with_depth(station_model(moist), depth), fit),
         "instruments_closure_rms": rms(measured["direct"] * sine + measured["diffuse"], measured["global"]),
     }
     for name, values in models.items():
@@ -239,7 +262,7 @@ def print_table(name: str, figures: dict[str, float]) -> None:
         f"{100 * figures['instruments_closure_rms']:.1f} %"
     )
     print(f"  {'':10} {'direct':>16} {'diffuse':>16} {'global':>16}   rms (bias)")
-    for model in ("ours", "ineichen", "bird"):
+    for model in ("ours", "humidity", "ineichen", "bird"):
         cells = [
             f"{100 * figures[f'{model}_{kind}_rms']:6.2f} % ({100 * figures[f'{model}_{kind}_bias']:+5.1f})"
             for kind in ("direct", "diffuse", "global")

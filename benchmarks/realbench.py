@@ -41,6 +41,7 @@ from realbench_rivals import equally_exposed, rival_pictures, seeing_pictures
 from realbench_shadows import shadow_figures
 from record import write_record
 
+from seasonscapes.albedo.cloud_cover import closed_clouds, sky_above
 from seasonscapes.albedo.fixed_camera import (
     SUN_SHONE,
     FitOptions,
@@ -78,6 +79,7 @@ class Stack:
     usable: np.ndarray
     half: np.ndarray
     known: np.ndarray
+    closed: np.ndarray
     sun: np.ndarray
     layers: np.ndarray
 
@@ -103,6 +105,7 @@ def stacked(case: FixedCase) -> Stack:
         usable,
         (row // side + column // side) % 2 == 1,
         known,
+        np.array([closed_clouds(each.image, sky_above(covered > 0)) for each in case.pictures]),
         sun,
         ground_layers(view.distance_km, view.height_m),
     )
@@ -182,6 +185,7 @@ def predictions(stack: Stack, k: int, options: FitOptions) -> tuple[dict[str, np
     others = [j for j in range(len(stack.values)) if j != k]
     camera = fitted_camera(stack, others, options)
     light, found = stack.lights[k], half_conditions(stack, camera, k)
+    whole = conditions_of(camera, stack.values[k], stack.usable[k], light)
     grey = replace(camera, ground=grey_ground(camera, stack.view))
     pictures, usable = stack.values[others], stack.usable[others]
     equal = equally_exposed(pictures, usable)
@@ -201,7 +205,8 @@ def predictions(stack: Stack, k: int, options: FitOptions) -> tuple[dict[str, np
         "sun": float(np.mean([each.sun for each in found])),
         "overcast": float(np.mean([each.overcast for each in found])),
         "visibility_km": float(np.exp(np.mean([np.log(each.visibility_km) for each in found]))),
-        "direct_share": float(np.mean([direct_share(camera.ground, light, each) for each in found])),
+        # Weather is no prediction: it is found in the whole picture, as `camera_hours` does.
+        "direct_share": direct_share(camera.ground, light, whole),
     }
     return results, facts
 
@@ -241,7 +246,7 @@ def case_row(stack: Stack, options: FitOptions, sheets: Path | None, k: int) -> 
     found, facts = predictions(stack, k, options)
     scores = {name: scored(stack, k, values) for name, values in found.items()}
     best = max(RIVALS, key=lambda name: scores[name]["psnr_db"])
-    shone = facts["direct_share"] > SUN_SHONE
+    shone = bool(facts["direct_share"] > SUN_SHONE and not stack.closed[k])
     row = {"camera": stack.case.name, "picture": picture.name, "season": picture.season, "best_rival": best, **facts}
     row |= {"sun_visible_seen": picture.sun_visible, "sun_visible_found": shone, "scores": scores}
     print(

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from seasonscapes.albedo.cloud_cover import clouds_before
+from seasonscapes.albedo.cloud_cover import closed_clouds, clouds_before, grey_share, sky_above
 
 WIDTH, HEIGHT = 200, 120
 ROWS, COLUMNS = np.mgrid[:HEIGHT, :WIDTH]
@@ -45,3 +45,29 @@ def test_bright_ground_that_does_not_touch_the_sky_is_kept():
 
 def test_a_picture_without_sky_has_no_cloud_before_its_terrain():
     assert not clouds_before(_picture((1.0, 1.0, 1.0)), np.ones_like(TERRAIN)).any()
+
+
+def test_a_sky_is_grey_as_far_as_clouds_cover_it_and_clipped_sky_tells_nothing():
+    rng = np.random.default_rng(3)
+    sky = np.ones((40, 50), bool)
+    for share in (0.0, 0.3, 1.0):
+        cloud = rng.random((40, 50, 1)) < share
+        image = np.where(cloud, [0.78, 0.79, 0.81], [0.42, 0.58, 0.86])
+        assert grey_share(image, sky) == pytest.approx(cloud.mean())
+    assert grey_share(np.ones((40, 50, 3)), sky) is None
+    few = np.zeros((40, 50), bool)
+    few[0, :5] = True
+    assert grey_share(np.full((40, 50, 3), 0.7), few) is None
+
+
+def test_only_a_sky_seen_whole_and_grey_is_closed():
+    terrain = np.zeros((60, 80), bool)
+    terrain[30:] = True
+    sky = sky_above(terrain)
+    assert sky[:29].all()
+    assert not sky[30:].any()
+    cloud = np.full((60, 80, 3), 0.75)
+    glare, gap = cloud.copy(), cloud.copy()
+    glare[:15, :30] = 1.0
+    gap[:10, :30] = 0.42, 0.58, 0.86
+    assert [closed_clouds(each, sky) for each in (cloud, glare, gap)] == [True, False, False]

@@ -9,7 +9,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from seasonscapes.commands.arguments import parse_times
-from seasonscapes.commands.console import print_result, progress_bars
+from seasonscapes.commands.console import message, print_result, progress_bars
 from seasonscapes.commands.options import PlaceOptions, SkyOptions
 from seasonscapes.commands.outputs import check_output_folder
 from seasonscapes.commands.run_method_options import RunMethodOptions
@@ -74,10 +74,16 @@ def run_command(
     found, model, size_px = photographs.values(allow_outside=options.allow_outside), sky.model(), view.size_px()
     from seasonscapes.workflows.albedo_recovery import TEXEL_M
     from seasonscapes.workflows.full_run import RunJob, run
+    from seasonscapes.workflows.recovery_plan import plan_recovery
     from seasonscapes.workflows.run_albedo import season_records
 
     with progress_bars() as progress:
-        loaded = options.load(scene, progress, texel_m=TEXEL_M)
+        texel_m = TEXEL_M
+        if found.sources is not None and stages_by.needs_albedo:
+            plan = plan_recovery(scene, found.sources, texel_m=options.texel_m, allow_outside=options.allow_outside)
+            message(f"plan: {plan}")
+            texel_m = plan.texel_m
+        loaded = options.load(scene, progress, texel_m=texel_m)
         at = (loaded.frame.latitude_deg, loaded.frame.longitude_deg)
         utc = tuple(parse_times("--times", times, *at))
         job = RunJob(

@@ -20,6 +20,7 @@ from seasonscapes.sky.models import SkyModel, with_overrides
 from seasonscapes.terrain.surface import Texture
 from seasonscapes.workflows.albedo_sources import orthoimage, scene_albedo
 from seasonscapes.workflows.illumination import sky_model
+from seasonscapes.workflows.photograph_skies import photograph_skies
 from seasonscapes.workflows.place import MeshOptions, Place
 from seasonscapes.workflows.recovery_methods import (
     METHODS,
@@ -174,7 +175,7 @@ def recover_albedo(
     photographs
         Such as `open_photographs` gives; their cameras are converted to the place's frame. May be none beside paintings.
     sky
-        The sky model of all photographs.
+        The sky model of all photographs; clouds are added where a photograph's own sky shows them.
     options
         The method, and what to fit besides the albedo.
     painted
@@ -328,7 +329,8 @@ def _prepared(
     if not photographs:
         return [], facts
     photographs = with_terrain(transport, photographs)
-    lights = illuminations(place, photographs, model)
+    skies = photograph_skies(place, transport, photographs, model)
+    lights = illuminations(place, photographs, skies)
     report = task_progress(progress, "footprints of the photographs")
     prepared = prepare_photographs(transport, photographs, lights, progress=report)
     if options.fit_curve:
@@ -339,7 +341,8 @@ def _prepared(
     if options.fit_haze:
 
         def lights_of(visibility_km: float) -> list[Illumination]:
-            return illuminations(place, photographs, with_overrides(model, visibility_km=visibility_km))
+            hazy = [with_overrides(each, visibility_km=visibility_km) for each in skies]
+            return illuminations(place, photographs, hazy)
 
         report = task_progress(progress, "visibility")
         found = fit_visibility(transport, prepared, lights_of, noise_model=EIGHT_BIT, progress=report)

@@ -36,7 +36,7 @@ from seasonscapes.workflows.plane_views import cut_plane_views, pose_panoramas, 
 from seasonscapes.workflows.point_cloud import write_point_cloud
 from seasonscapes.workflows.predicted_radiance import RELATIVE_SIGMA, measured_radiance
 from seasonscapes.workflows.relight_session import RenderJob
-from seasonscapes.workflows.run_albedo import albedo_at, final_albedos, recover_albedos, refine_albedos
+from seasonscapes.workflows.run_albedo import albedo_at, final_albedos, recover_albedos, refine_albedos, sky_at
 from seasonscapes.workflows.run_job import RunJob, sources_of, write_record
 from seasonscapes.workflows.run_photographs import bring_photographs, bring_poses, photograph_facts, record_facts
 from seasonscapes.workflows.stage_runner import Stage, run_stages, stage_range
@@ -238,14 +238,15 @@ def _paint(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
     for time in job.times:
         own = folder / "paint" / time_stamp(time)
         reference = None
+        sky = sky_at(job, folder, time) if job.method.needs_albedo else job.sky
         if job.method.needs_albedo and job.method.painting == "weighted":
-            predicted = measured_radiance(job.place, albedo_at(folder, time), time, job.sky, progress=progress)
+            predicted = measured_radiance(job.place, albedo_at(folder, time), time, sky, progress=progress)
             reference = RadiometricReference(predicted, RELATIVE_SIGMA)
         painting = painting_of(
             job.place,
             sources_of(job, folder),
             time,
-            job.sky,
+            sky,
             options,
             within_min=job.photographs.within_min,
             reference=reference,
@@ -280,10 +281,11 @@ def _inpaint(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]
         options = _inpaint_options(job, folder, time)
         own = folder / "inpaint" / time_stamp(time)
         painted = completion.read_painted(folder / "paint" / time_stamp(time) / "painted.npz", job.place)
-        result = inpaint(job.place, painted, time, job.sky, options, progress=progress)
+        sky = sky_at(job, folder, time) if job.method.needs_albedo else job.sky
+        result = inpaint(job.place, painted, time, sky, options, progress=progress)
         with atomic_path(own / "completed.npz") as temporary:
             completion.save_completed(result.completed, painted, temporary)
-        completion.save_texture_figures(own, job.place, result.completed, time, job.sky)
+        completion.save_texture_figures(own, job.place, result.completed, time, sky)
         write_record(own / "completion.json", result.record)
         files.append(own / "completed.npz")
     return files

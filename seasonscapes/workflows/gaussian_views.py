@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time as clock
 from dataclasses import replace
 from datetime import datetime
@@ -24,6 +25,12 @@ if TYPE_CHECKING:
     from seasonscapes.gaussians.model import GaussianModel
     from seasonscapes.gaussians.splat_view import SplatView
     from seasonscapes.sky.illumination import Illumination
+
+
+log = logging.getLogger(__name__)
+
+# Discs so far apart in a picture are seen as blots.
+_COARSE_PX = 12.0
 
 
 def day_of_year(time: datetime) -> float:
@@ -100,7 +107,22 @@ def render_gaussians(
     utc = utc_at(place, time)
     light, _ = illumination_for_camera(place, camera, sky_model(sky), utc)
     view = render_model(model, camera, light, day_of_year(utc), raster=RasterOptions(subpixels, device))
+    _warn_of_coarse_discs(model, camera, view)
     return replace(view, provenance={"white_rgb": light.white_rgb})
+
+
+def _warn_of_coarse_discs(model: GaussianModel, camera: Camera, view: SplatView) -> None:
+    seen = (view.coverage > 0.5) & np.isfinite(view.depth)
+    if not seen.any():
+        return
+    across_px = float(model.grid.spacing_m * np.median(camera.fx / view.depth[seen]))
+    if across_px > _COARSE_PX:
+        log.warning(
+            "Gaussians %.3g m apart lie %.0f pixels from each other in half of this view or more: it shows no detail; distil "
+            "more of them (--discs) or stand farther away",
+            model.grid.spacing_m,
+            across_px,
+        )
 
 
 def timed_view(

@@ -64,14 +64,16 @@ class PaintedTexture:
     confidence: float = 1.0
 
 
-def illuminations(place: Place, photographs: Sequence[Observation], model: SkyModel) -> list[Illumination]:
-    """The light of each photograph as seen from its camera; cameras of one position and instant share it."""
+def illuminations(place: Place, photographs: Sequence[Observation], models: Sequence[SkyModel]) -> list[Illumination]:
+    """The light of each photograph under its sky, as seen from its camera; those of one position, instant and sky share it."""
     lights: dict = {}
-    for photograph in photographs:
-        key = (photograph.time, photograph.camera.position_m.tobytes())
+    found = []
+    for photograph, model in zip(photographs, models, strict=True):
+        key = (photograph.time, photograph.camera.position_m.tobytes(), model.model_dump_json())
         if key not in lights:
             lights[key] = illumination_for_camera(place, photograph.camera, model, photograph.time)[0]
-    return [lights[each.time, each.camera.position_m.tobytes()] for each in photographs]
+        found.append(lights[key])
+    return found
 
 
 def painted_photographs(
@@ -160,7 +162,7 @@ def _lights_in(place: Place, photographs: list[AlbedoPhotograph], model: SkyMode
     from seasonscapes.workflows.illumination import illumination
 
     seen = [each.observation for each in photographs if isinstance(each.observation, Observation)]
-    of_cameras, result = iter(illuminations(place, seen, model)), []
+    of_cameras, result = iter(illuminations(place, seen, [model] * len(seen))), []
     for photograph in photographs:
         if isinstance(photograph.observation, Observation):
             result.append(next(of_cameras))

@@ -14,6 +14,7 @@ from seasonscapes.array_files import read_arrays
 from seasonscapes.images import atomic_path
 from seasonscapes.progress import Progress
 from seasonscapes.relighting.frame_file import time_stamp
+from seasonscapes.sky.models import SkyModel
 from seasonscapes.terrain.surface import load_texture
 from seasonscapes.workflows import completion
 from seasonscapes.workflows.albedo_recovery import RecoveryOptions, save_albedo_figures, texel_transport
@@ -21,6 +22,7 @@ from seasonscapes.workflows.albedo_sources import AlbedoFile
 from seasonscapes.workflows.illumination import illumination
 from seasonscapes.workflows.photograph_files import photographs_at
 from seasonscapes.workflows.recovery_methods import PaintedTexture
+from seasonscapes.workflows.recovery_plan import MOST_PIXELS
 from seasonscapes.workflows.run_job import RunJob, sources_of, write_record
 from seasonscapes.workflows.season_recovery import SeasonAlbedo, group_of, recover_seasons
 
@@ -38,7 +40,9 @@ def recovery_options(job: RunJob) -> RecoveryOptions:
 def recover_albedos(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
     """The stage ``albedo``: photographs grouped by season, an albedo of each group, and the record of the groups."""
     within = job.photographs.within_min
-    photographs = photographs_at(job.place, sources_of(job, folder), job.times, within_min=within, progress=progress)
+    photographs = photographs_at(
+        job.place, sources_of(job, folder), job.times, within_min=within, most_pixels=MOST_PIXELS, progress=progress
+    )
     seasons = recover_seasons(job.place, photographs, sky=job.sky, options=recovery_options(job), progress=progress)
     return save_seasons(job, seasons, folder / "albedo")
 
@@ -54,10 +58,14 @@ def save_seasons(job: RunJob, seasons: list[SeasonAlbedo], own: Path) -> list[Pa
         name = "albedo.npz" if len(seasons) == 1 else f"albedo_{recovered.day.isoformat()}.npz"
         recovered.save(own / name)
         save_albedo_figures(job.place, recovered.estimate, recovered.day, own / name)
-        observations = [photograph.observation for photograph in recovered.photographs]
         residuals = [
-            {"webcam": each.webcam, "time_utc": each.time.isoformat(), "residual": round(float(residual), 4)}
-            for each, residual in zip(observations, recovered.fit.residual, strict=True)
+            {
+                "webcam": each.observation.webcam,
+                "time_utc": each.observation.time.isoformat(),
+                "residual": round(float(residual), 4),
+                "cloudiness": (each.light.model or {}).get("cloudiness", 0.0),
+            }
+            for each, residual in zip(recovered.photographs, recovered.fit.residual, strict=True)
         ]
         share = round(float((recovered.estimate.source == 1).mean()), 4)
         facts = {"measured_share": share, **recovered.facts, "photographs": residuals}
@@ -76,6 +84,21 @@ def albedo_at(folder: Path, time: datetime) -> Path:
     """The albedo of the season that the photographs of an instant belong to."""
     records = season_records(folder)
     return folder / "albedo" / records[group_of(records, time)]["file"]
+
+
+def sky_at(job: RunJob, folder: Path, time: datetime) -> SkyModel:
+    """The sky of an instant's photographs: the one asked for, with the clouds that the albedo stage found in them."""
+    file = albedo_at(folder, time).with_suffix(".json")
+    photographs = json.loads(file.read_text(encoding="utf-8"))["photographs"]
+
+    def apart(photograph: dict[str, Any]) -> float:
+        return abs((datetime.fromisoformat(photograph["time_utc"]) - time).total_seconds())
+
+    within_s = 60.0 * job.photographs.within_min
+    found = [each["cloudiness"] for each in photographs if apart(each) <= within_s]
+    if not found or max(found) == 0.0 or job.sky.cloudiness > 0.0:
+        return job.sky
+    return job.sky.model_copy(update={"cloudiness": float(np.median(found))})
 
 
 def refine_albedos(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
@@ -101,7 +124,9 @@ def _recovered_again(
     from seasonscapes.albedo.painted_textures import REPEATED
 
     within = job.photographs.within_min
-    photographs = photographs_at(job.place, sources_of(job, folder), job.times, within_min=within, progress=progress)
+    photographs = photographs_at(
+        job.place, sources_of(job, folder), job.times, within_min=within, most_pixels=MOST_PIXELS, progress=progress
+    )
     paintings = []
     for time in sorted(set(job.times)):
         texture = completion.read_painted(folder / "paint" / time_stamp(time) / "painted.npz", job.place)
@@ -126,7 +151,7 @@ def _correct_unmeasured(
 
     stored = dict(read_arrays(file, what="an albedo texture"))
     completed = [load_texture(folder / "inpaint" / time_stamp(time) / "completed.npz").values for time in times]
-    lights = [illumination(job.place, time, sky=job.sky) for time in times]
+    lights = [illumination(job.place, time, sky=sky_at(job, folder, time)) for time in times]
     # The guided method fuses with the albedo itself, so that what differs is what the paintings tell.
     share = FUSED if job.method.completion == "guided" else ALONE
     unmeasured = stored["source"] != 1

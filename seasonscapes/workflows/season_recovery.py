@@ -21,6 +21,7 @@ from seasonscapes.workflows.albedo_recovery import (
     with_terrain,
 )
 from seasonscapes.workflows.illumination import sky_model
+from seasonscapes.workflows.photograph_skies import photograph_skies
 from seasonscapes.workflows.place import Place
 from seasonscapes.workflows.recovery_methods import PaintedTexture, closed_fit, illuminations
 
@@ -80,7 +81,7 @@ def recover_seasons(
     photographs
         Of any days; see `recover_albedo`.
     sky
-        The sky model of all photographs.
+        The sky model of all photographs; clouds are added where a photograph's own sky shows them.
     options
         The method, and what to fit besides the albedo, of each group.
     painted
@@ -135,7 +136,9 @@ def _grouped_days(
         return [days]
     seen = with_terrain(transport, photographs)
     # Prepared together, since photographs of one camera share their footprints.
-    prepared = prepare_photographs(transport, seen, illuminations(place, seen, model))
+    prepared = prepare_photographs(
+        transport, seen, illuminations(place, seen, photograph_skies(place, transport, seen, model))
+    )
     days = sorted({each.time.date() for each in seen})
     known: list[date] = []
     estimates: list[AlbedoEstimate] = []

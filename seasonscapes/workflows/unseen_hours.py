@@ -170,6 +170,8 @@ class CameraHours:
         ``(n,)`` terrain pixels that a picture shows: what stands before the landscape in all of them is no terrain.
     background
         ``(H, W, 3)`` median of the pictures, sRGB-encoded: the sky and all that is no terrain.
+    closed
+        ``(K,)`` bool: pictures whose sky is a closed layer of clouds.
 
     Examples
     --------
@@ -193,6 +195,7 @@ class CameraHours:
     suns: np.ndarray = field(repr=False)
     shown: np.ndarray = field(repr=False)
     background: np.ndarray = field(repr=False)
+    closed: np.ndarray = field(repr=False)
 
     @property
     def weather(self) -> list[PictureWeather]:
@@ -203,7 +206,7 @@ class CameraHours:
         return [
             PictureWeather(
                 time,
-                bool(direct > SUN_SHONE) if sun[2] > 0.0 else None,
+                bool(direct > SUN_SHONE and not closed) if sun[2] > 0.0 else None,
                 each.sun,
                 each.sun_sigma,
                 each.overcast,
@@ -211,11 +214,12 @@ class CameraHours:
                 float(residual),
                 not strange,
             )
-            for time, each, sun, direct, residual, strange in zip(
+            for time, each, sun, direct, closed, residual, strange in zip(
                 self.times,
                 self.fitted.conditions,
                 self.suns,
                 self.fitted.direct,
+                self.closed,
                 self.fitted.residual,
                 odd,
                 strict=True,
@@ -312,6 +316,7 @@ def camera_hours(place: Place, photographs: Sequence[Observation], *, progress: 
     >>> hours.at("2024-07-20T14:00").shape
     (32, 48, 3)
     """
+    from seasonscapes.albedo.cloud_cover import closed_clouds, sky_above
     from seasonscapes.albedo.fixed_camera import fit_fixed_camera
     from seasonscapes.rendering.backend import use_backend
 
@@ -336,6 +341,9 @@ def camera_hours(place: Place, photographs: Sequence[Observation], *, progress: 
         view.normal,
         progress=task_progress(progress, "ground and weather"),
     )
+    terrain = np.zeros((camera.height_px, camera.width_px), bool)
+    terrain.reshape(-1)[view.pixel] = True
+    sky = sky_above(terrain)
     hours = CameraHours(
         photographs[0].webcam,
         view,
@@ -344,6 +352,7 @@ def camera_hours(place: Place, photographs: Sequence[Observation], *, progress: 
         np.stack([each.sun_direction for each in lights]),
         np.any(usable, axis=0),
         np.median(encoded, axis=0),
+        np.array([closed_clouds(image, sky & each.mask) for each, image in zip(photographs, encoded, strict=True)]),
     )
     for each in hours.weather:
         if not each.explained:

@@ -1,0 +1,77 @@
+"""Which sky each photograph was taken under: the one asked for, with the clouds that the photograph's own sky shows."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from seasonscapes.albedo.cloud_cover import grey_share
+from seasonscapes.cameras.pinhole import Camera, ray_directions
+from seasonscapes.images import srgb_from_linear
+from seasonscapes.sky.ephemeris import sun_position
+from seasonscapes.sky.models import AtmosphereModel, SkyModel
+
+if TYPE_CHECKING:
+    from seasonscapes.albedo.forward_model import TexelTransport
+    from seasonscapes.cameras.observation import Observation
+    from seasonscapes.workflows.place import Place
+
+log = logging.getLogger(__name__)
+
+# A clear sky is as grey as clouds where the sun is low, and about the sun [deg].
+_LOWEST_SUN_DEG, _AROUND_SUN_DEG = 10.0, 60.0
+# Below this share of grey sky a picture counts as clear: haze and clouds on the horizon are grey too.
+_CLOUDY = 0.5
+
+
+def photograph_skies(
+    place: Place, transport: TexelTransport, photographs: Sequence[Observation], model: SkyModel
+) -> list[SkyModel]:
+    """The sky model of each photograph: clouds are added to a clear one where half of the photograph's sky or more is grey.
+
+    Without them, the blue light of a clear sky would be taken out of land that clouds lit: snow turns blue, or pink.
+
+    Parameters
+    ----------
+    place
+        The place.
+    transport
+        Of its texels; what terrain covers in a photograph is no sky.
+    photographs
+        In the place's frame.
+    model
+        The sky asked for; one that states clouds stays as it is.
+    """
+    if not isinstance(model, AtmosphereModel) or model.cloudiness > 0.0:
+        return [model] * len(photographs)
+    skies: dict = {}
+    for each in photographs:
+        skies.setdefault((each.webcam, each.time), []).append(_grey_share(place, transport, each))
+    models = {}
+    for (webcam, time), shares in skies.items():
+        told = [share for share in shares if share is not None]
+        grey = round(float(np.median(told)), 1) if told else 0.0
+        models[webcam, time] = model
+        if grey >= _CLOUDY:
+            log.info(
+                "%s %s UTC: %.0f %% of its sky is grey: taken as clouds", webcam, f"{time:%Y-%m-%d %H:%M}", 100.0 * grey
+            )
+            models[webcam, time] = model.model_copy(update={"cloudiness": grey})
+    return [models[each.webcam, each.time] for each in photographs]
+
+
+def _grey_share(place: Place, transport: TexelTransport, photograph: Observation) -> float | None:
+    """See `grey_share`, away from the sun; ``None`` for a low one."""
+    from seasonscapes.rendering.sightlines import visible_faces
+
+    sun = sun_position(photograph.time, place.frame.latitude_deg, place.frame.longitude_deg)
+    if float(np.asarray(sun.elevation_deg)) < _LOWEST_SUN_DEG:
+        return None
+    camera = photograph.camera
+    assert isinstance(camera, Camera)  # panoramas were cut into views
+    away = ray_directions(camera) @ sun.direction < np.cos(np.radians(_AROUND_SUN_DEG))
+    sky = (visible_faces(transport.ray_scene, camera) < 0) & photograph.mask & away
+    return grey_share(srgb_from_linear(np.clip(photograph.image, 0.0, 1.0)), sky)

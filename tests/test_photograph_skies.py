@@ -1,0 +1,67 @@
+"""Clouds that photographs show in their own skies, in the recovery of albedo."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import seasonscapes as ss
+from seasonscapes.rendering.sightlines import visible_faces
+from seasonscapes.sky.models import with_overrides
+from seasonscapes.workflows.albedo_recovery import RecoveryOptions, _prepared, texel_transport
+from seasonscapes.workflows.illumination import sky_model
+from seasonscapes.workflows.photograph_skies import photograph_skies
+
+
+@pytest.fixture(scope="module")
+def taken(tmp_path_factory):
+    """A small place, its texels' transport, and one photograph of it under a clear sky and one under clouds."""
+    place = ss.load_place("alpine_small")
+    times = ["2024-07-20T16:00"]
+    camera = ss.camera(place, "aerial", size_px=(96, 64))
+    observations = []
+    for name, sky in (("clear", "clear"), ("clouds", "overcast")):
+        folder = tmp_path_factory.mktemp(name)
+        sources = ss.synthetic_photographs(place, times, folder, sky=sky, cameras={"aerial": camera})
+        observations += ss.open_photographs(place, sources.manifest, sources.calibrations, times)
+    return place, texel_transport(place), observations
+
+
+def _with_sky(taken, number: int, colour) -> "ss.Observation":
+    _, transport, observations = taken
+    each = observations[number]
+    sky = visible_faces(transport.ray_scene, each.camera) < 0
+    return replace(each, image=np.where(sky[..., None], np.float32(colour), each.image), webcam=f"cam{number}")
+
+
+def test_a_grey_sky_is_taken_as_clouds_and_a_blue_one_is_not(taken):
+    place, transport, _ = taken
+    clear = sky_model("clear")
+    blue, grey = _with_sky(taken, 0, (0.12, 0.25, 0.6)), _with_sky(taken, 1, (0.5, 0.5, 0.52))
+    found = photograph_skies(place, transport, [blue, grey], clear)
+    assert [each.cloudiness for each in found] == [0.0, 1.0]
+    stated = with_overrides(clear, cloudiness=0.3)
+    assert photograph_skies(place, transport, [grey], stated) == [stated]
+
+
+def test_a_low_sun_and_a_synthetic_clear_sky_stay_clear(taken):
+    place, transport, observations = taken
+    clear = sky_model("clear")
+    grey = _with_sky(taken, 1, (0.5, 0.5, 0.52))
+    evening = replace(grey, time=grey.time.replace(hour=18, minute=45))
+    assert [each.cloudiness for each in photograph_skies(place, transport, [observations[0], evening], clear)] == [
+        0.0,
+        0.0,
+    ]
+
+
+def test_albedo_is_recovered_under_the_clouds_that_a_photograph_shows(taken):
+    """The light of the recovery is dimmer and less blue where the photograph's sky is grey."""
+    place, transport, _ = taken
+    blue, grey = _with_sky(taken, 0, (0.12, 0.25, 0.6)), _with_sky(taken, 1, (0.5, 0.5, 0.52))
+    prepared, _ = _prepared(place, transport, [blue, grey], sky_model("clear"), RecoveryOptions(), None)
+    suns = [each.light.sun for each in prepared]
+    direct = [0.0 if sun is None else float(np.sum(sun.normal_illuminance_lx)) for sun in suns]
+    assert direct[1] < 0.3 * direct[0]
+    colour = [each.light.sky_radiance[: each.light.sky_radiance.shape[0] // 2].mean((0, 1)) for each in prepared]
+    assert colour[1][2] / colour[1][0] < 0.7 * colour[0][2] / colour[0][0]
