@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -251,6 +252,11 @@ def _ground(massif: SyntheticMassif, day: float, rows: slice, upsample: int) -> 
     return albedo, cover
 
 
+def _by_class(cover: np.ndarray, values: dict[Cover, float], *, otherwise: float = 0.0) -> np.ndarray:
+    """A value of each cell's class, ``(h, w)`` float32."""
+    return np.array([values.get(kind, otherwise) for kind in Cover], np.float32)[cover]
+
+
 def _add_texture(albedo: np.ndarray, strip: _Strip, seed: int) -> None:
     """Multiply an albedo ``(h, w, 3)`` by within-class variation (crowns, tufts, strata, field plots), in massif."""
     cover, grain, broad = strip.cover, strip.grain, strip.broad
@@ -266,16 +272,15 @@ def _add_texture(albedo: np.ndarray, strip: _Strip, seed: int) -> None:
         Cover.FIRN: 0.03,
         Cover.FIELD: 0.10,
     }
-    gain = np.zeros(cover.shape, np.float32)
-    for kind, amount in contrast.items():
-        gain[cover == kind] = amount
-    factor = np.exp(gain * grain + np.where(np.isin(cover, (Cover.FIRN, Cover.ICE)), 0.02, 0.10) * broad)
-    level = strata_level_m(strip.height_m, strip.east_m, strip.north_m, seed) + 8.0 * grain
-    bands = sum(np.sin(level * (2.0 * np.pi / period) + 0.8) for period in LEDGES_M)
-    factor *= np.where(cover == Cover.ROCK, np.exp(0.13 * bands), 1.0)
-    albedo *= factor[..., None]
-    rusty = np.where(np.isin(cover, (Cover.ROCK, Cover.SCREE)), 0.06 * broad, 0.0)[..., None]
-    albedo *= np.exp(rusty * np.array([1.0, 0.0, -1.0], np.float32))
+    of_class = partial(_by_class, cover)
+    exponent = of_class(contrast) * grain + of_class({Cover.FIRN: 0.02, Cover.ICE: 0.02}, otherwise=0.10) * broad
+    rock = cover == Cover.ROCK
+    level = (strata_level_m(strip.height_m, strip.east_m, strip.north_m, seed) + 8.0 * grain)[rock]
+    exponent[rock] += 0.13 * sum(np.sin(level * np.float32(2.0 * np.pi / period) + 0.8) for period in LEDGES_M)
+    albedo *= np.exp(exponent)[..., None]
+    rusty = np.exp(of_class({Cover.ROCK: 0.06, Cover.SCREE: 0.06}) * broad)
+    albedo[..., 0] *= rusty
+    albedo[..., 2] /= rusty
     field = cover == Cover.FIELD
     if field.any():
         plots = np.sign(spline_noise(seed + 421, 260.0, strip.east_m, strip.north_m)) + np.sign(
@@ -314,14 +319,14 @@ def alpine_albedo(massif: SyntheticMassif, day_of_year: float, *, upsample: int 
     for rows in _strips(height):
         albedo, cover = _ground(massif, day_of_year, rows, upsample)
         snow = _snow(massif, day_of_year, rows, upsample)
-        visible = np.ones(cover.shape, np.float32)
-        for kind, fraction in _VISIBLE_SNOW.items():
-            visible[cover == kind] = fraction
+        visible = _by_class(cover, _VISIBLE_SNOW, otherwise=1.0)
         east, north = _axes(massif, rows, upsample)
-        ageing = 0.04 * fractal_noise(massif.seed + 501, 200.0, east, north, octaves=3)
-        snow_albedo = _snow_albedo(day_of_year) + ageing[..., None] * 0.35
+        ageing = 0.014 * fractal_noise(massif.seed + 501, 200.0, east, north, octaves=3)
+        snow_albedo = _snow_albedo(day_of_year) + ageing[..., None]
         weight = (snow * visible)[..., None]
-        result[rows.start * upsample : rows.stop * upsample] = albedo + weight * (snow_albedo - albedo)
+        snow_albedo -= albedo
+        snow_albedo *= weight
+        np.add(albedo, snow_albedo, out=result[rows.start * upsample : rows.stop * upsample])
     return np.clip(result, 0.01, 0.93, out=result)
 
 
