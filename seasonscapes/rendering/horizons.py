@@ -18,8 +18,9 @@ from seasonscapes.rendering.sky_patches import SkyPatches
 from seasonscapes.rendering.sobol import hash_to_unit, hashed, uniform
 from seasonscapes.rendering.terrain_material import device_surface
 
-# Spacings of the table. All borders of patches lie between two of its azimuths.
-_AZIMUTH_DEG, _ELEVATION_DEG = 0.5, 1.0
+# Spacings of the table, which a processor's cache holds: its azimuths are means of three, between which all borders of
+# patches lie.
+_AZIMUTH_DEG, _ELEVATION_DEG = 1.5, 2.0
 # Bisections of the range between the surface's own plane and the zenith: cells of some 3°, shifted at random.
 _STEPS = 5
 # Key of the random number stream, mixed into its hashes.
@@ -68,9 +69,10 @@ def sky_above(patches: SkyPatches, functions: np.ndarray) -> SkyAbove:
 
     # Of each row of patches, what lies above each elevation.
     above = antiderivatives(np.broadcast_to(upper, start.shape)) - antiderivatives(start)
-    azimuth_deg = (np.arange(round(360.0 / _AZIMUTH_DEG)) + 0.5) * _AZIMUTH_DEG
+    azimuth_deg = (np.arange(3 * round(360.0 / _AZIMUTH_DEG)) + 0.5) * _AZIMUTH_DEG / 3.0
     patch = patches.offsets + (azimuth_deg[:, None] * patches.counts / 360.0).astype(int)
     values = np.concatenate([functions, np.ones((len(functions), 1))], axis=1)[patch]
+    values = values.reshape(-1, 3, *values.shape[1:]).mean(axis=1)
     return SkyAbove(np.einsum("ker,arf->aekf", above, values, optimize=True).astype(np.float32))
 
 
@@ -118,7 +120,8 @@ def sky_coefficients(
     for start in range(0, count, step):
         part = slice(start, start + step)
         chosen = _drawn(weight[part], azimuths, key[part])
-        flat = points[part].reshape(-1)[(np.arange(len(chosen))[:, None] * samples + chosen).ravel()]
+        # All receivers at one azimuth after those at another: neighbouring rays are almost parallel.
+        flat = points[part].reshape(-1)[(np.arange(len(chosen)) * samples + chosen.T).ravel()]
         result[part] = _integrals(table, azimuths, *_horizons(terrain, flat, azimuths, turn[part], key[part]))
     result *= weight.sum(axis=1, keepdims=True) * np.float32(2.0 / azimuths)
     return result[:, :-1], result[:, -1]
@@ -145,17 +148,18 @@ def _horizons(
     """Horizons of receivers at their azimuths, from a point for each.
 
     Returns the azimuth [rad], the elevation of the horizon or of the point's own plane where that is higher [rad], and the
-    components of the normal along the azimuth and upwards, each ``(N · azimuths,)`` float32.
+    components of the normal along the azimuth and upwards, each ``(N · azimuths,)`` float32, of one receiver side by side.
     """
     import drjit as dr
     import mitsuba as mi
 
     lane = dr.arange(mi.UInt32, len(points.origin))
-    per_receiver = dr.opaque(mi.UInt32, azimuths)
-    receiver = lane // per_receiver
+    receivers = dr.opaque(mi.UInt32, len(turn))
+    number = lane // receivers
+    receiver = lane - number * receivers
     mi_key = hashed(dr.gather(mi.UInt32, mi.UInt32(key), receiver), _HORIZON)
-    place = mi.Float(lane - receiver * per_receiver) + dr.gather(mi.Float, mi.Float(turn % 1.0), receiver)
-    azimuth = place * (2.0 * np.pi / mi.Float(per_receiver))
+    place = mi.Float(number) + dr.gather(mi.Float, mi.Float(turn % 1.0), receiver)
+    azimuth = place * dr.opaque(mi.Float, 2.0 * np.pi / azimuths)
     east, north = dr.sincos(azimuth)
     normal = point3(points.normal)
     along, upward = normal.x * east + normal.y * north, dr.maximum(normal.z, 1e-3)
@@ -163,7 +167,7 @@ def _horizons(
     # Cells of equal height from the plane to the zenith, shifted by a random part of a cell: without it, all horizons
     # of a slope would be rounded to the same ones.
     cell = (0.5 * np.pi - plane) / (2**_STEPS - 1)
-    shift = uniform(hashed(mi_key, lane))
+    shift = uniform(hashed(mi_key, number))
     below, origin = mi.Float(0.0), point3(points.origin)
     for bit in reversed(range(_STEPS)):
         border = below + float(2**bit)
@@ -176,7 +180,9 @@ def _horizons(
     horizon = dr.clip(plane + (below + 0.5 - shift) * cell, plane, 0.5 * np.pi)
     lanes = (azimuth, horizon, along, upward)
     dr.eval(lanes)
-    azimuth_rad, horizon_rad, normal_along, normal_up = (np.array(values) for values in lanes)
+    azimuth_rad, horizon_rad, normal_along, normal_up = (
+        np.ascontiguousarray(np.array(values).reshape(azimuths, -1).T).ravel() for values in lanes
+    )
     return azimuth_rad, horizon_rad, normal_along, normal_up
 
 
