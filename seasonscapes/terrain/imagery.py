@@ -266,14 +266,19 @@ def _pyramid(values: np.ndarray, most: int) -> list[np.ndarray]:
 
     A level is the 2 × 2 box mean of the previous one.
     """
-    known = np.isfinite(values).all(axis=2, keepdims=True)
-    levels: list[np.ndarray] = [np.concatenate([np.where(known, values, 0.0), known], axis=2).astype(np.float32)]
-    while max(levels[-1].shape[:2]) > 1 and len(levels) < most:
-        level = levels[-1]
+    height, width, channels = values.shape
+    known = np.isfinite(values).all(axis=2)
+    finest = np.zeros((height + 2 * _RIM_PX, width + 2 * _RIM_PX, channels + 1), np.float32)
+    inside = np.s_[_RIM_PX : _RIM_PX + height, _RIM_PX : _RIM_PX + width]
+    finest[inside][..., :-1] = values if known.all() else np.where(known[..., None], values, 0.0)
+    finest[inside][..., -1] = known
+    levels, level = [finest], finest[inside]
+    while max(level.shape[:2]) > 1 and len(levels) < most:
         level = np.pad(level, ((0, level.shape[0] % 2), (0, level.shape[1] % 2), (0, 0)))
         rows = level[0::2] + level[1::2]
-        levels.append((rows[:, 0::2] + rows[:, 1::2]) * np.float32(0.25))
-    return [np.pad(level, ((_RIM_PX, _RIM_PX), (_RIM_PX, _RIM_PX), (0, 0))) for level in levels]
+        level = (rows[:, 0::2] + rows[:, 1::2]) * np.float32(0.25)
+        levels.append(np.pad(level, ((_RIM_PX, _RIM_PX), (_RIM_PX, _RIM_PX), (0, 0))))
+    return levels
 
 
 def _filtered(pyramid: list[np.ndarray], pixel: np.ndarray, footprint: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
