@@ -23,8 +23,8 @@ class SamplingOptions:
     albedo_samples
         Samples per pixel for its mean albedo and normal, a square.
     rays
-        Hemisphere rays per receiver, a power of two. On height fields `horizon_azimuths` and `bounce_rays` replace them, with
-        less noise for fewer rays.
+        Hemisphere rays per receiver, a power of two. On height fields horizons and rays below them replace these, with as
+        little noise; see `horizon_azimuths`.
     bounces
         Number of surfaces between light and receiver; 4 equals ``max_depth=6`` of the path tracer.
     clusters
@@ -55,11 +55,6 @@ class SamplingOptions:
     def horizon_azimuths(self) -> int:
         """Azimuths at which the horizon of a receiver on a height field is searched, a power of two."""
         return max(self.rays // 16, 8)
-
-    @property
-    def bounce_rays(self) -> int:
-        """Hemisphere rays of a receiver on a height field that tell which ground it sees, a power of two."""
-        return max(self.rays // 8, 16)
 
     def __post_init__(self):
         if (

@@ -1,19 +1,21 @@
-"""Skylight on land that is a height field, from its horizon: above it the sky is seen in every direction, below it nowhere.
+"""Light that land receives which is a height field, from its horizon: above it there is sky in every direction, below it land.
 
-From a point on a height field a direction that is free stays free when it is raised. What the point receives of the sky
-follows from its horizon at some azimuths, which bisection with few rays finds, and from integrals over elevation that are
-tabulated (cf. Dozier & Frew 1990, doi:10.1109/36.58986). Of as many rays distributed over the hemisphere most would tell
-nothing: only those near the horizon do.
+From a point on a height field a direction that is free stays free when it is raised (Max 1988, doi:10.1007/BF01905562).
+What the point receives of the sky follows from its horizon at some azimuths, which bisection with few rays finds, and from
+integrals over elevation that are tabulated (cf. Dozier & Frew 1990, doi:10.1109/36.58986). What land it sees is told by
+rays below the horizon. Of as many rays distributed over the hemisphere most would tell nothing: they reach the sky far
+above the horizon.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from seasonscapes.rendering.backend import point3
-from seasonscapes.rendering.hemisphere_rays import LANES, RayScene, SurfacePoints
+from seasonscapes.rendering.hemisphere_rays import ABSORBED, ESCAPED, LANES, RayScene, SurfacePoints
 from seasonscapes.rendering.sky_patches import SkyPatches
 from seasonscapes.rendering.sobol import hash_to_unit, hashed, uniform
 from seasonscapes.rendering.terrain_material import device_surface
@@ -23,6 +25,7 @@ from seasonscapes.rendering.terrain_material import device_surface
 _AZIMUTH_DEG, _ELEVATION_DEG = 1.5, 2.0
 # Bisections of the range between the surface's own plane and the zenith: cells of some 3°, shifted at random.
 _STEPS = 5
+_GOLDEN = 0.618034
 # Key of the random number stream, mixed into its hashes.
 _HORIZON = 107
 
@@ -58,7 +61,7 @@ def sky_above(patches: SkyPatches, functions: np.ndarray) -> SkyAbove:
     Returns
     -------
     SkyAbove
-        For `sky_coefficients`.
+        For `trace_horizons`.
     """
     elevation = np.radians(np.arange(-90.0, 90.0 + 0.5 * _ELEVATION_DEG, _ELEVATION_DEG))
     upper, lower = np.radians(patches.edges_deg[:-1]), np.radians(patches.edges_deg[1:])
@@ -76,17 +79,41 @@ def sky_above(patches: SkyPatches, functions: np.ndarray) -> SkyAbove:
     return SkyAbove(np.einsum("ker,arf->aekf", above, values, optimize=True).astype(np.float32))
 
 
-def sky_coefficients(
+@dataclass(frozen=True)
+class HorizonTransport:
+    """What N receivers on a height field see.
+
+    Parameters
+    ----------
+    coefficients
+        ``(N, r)`` float32: integrals over the visible sky of function × cosine of incidence / π.
+    sky_share
+        ``(N,)`` float32 share of the cosine-weighted hemisphere that is sky.
+    hit
+        ``(N, K)`` int32 cluster of faces that each of K rays below the horizon hits, negative for none.
+    ray_weight
+        ``(N, K)`` float32 share of the cosine-weighted hemisphere that each of these rays stands for.
+    """
+
+    coefficients: np.ndarray
+    sky_share: np.ndarray
+    hit: np.ndarray
+    ray_weight: np.ndarray
+
+
+def trace_horizons(
     terrain: RayScene,
     above: SkyAbove,
     points: SurfacePoints,
     weight: np.ndarray,
     *,
     azimuths: int,
+    land_rays: int,
     turn: np.ndarray,
     key: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients of the light that receivers on a height field get from the sky.
+    mi_face_cluster: Any,
+) -> HorizonTransport:
+    """Find the horizons of receivers on a height field, what they get from the sky, and the land that they see.
 
     Parameters
     ----------
@@ -101,30 +128,43 @@ def sky_coefficients(
     azimuths
         Number of azimuths at which the horizon is searched, a power of two: evenly spaced, each from a point that is drawn in
         proportion to its weight.
+    land_rays
+        Rays below the horizon at each azimuth.
     turn
         ``(N,)`` float32 offset of each receiver's azimuths, in spaces between them.
     key
         ``(N,)`` uint32 keys of the receivers' random numbers.
+    mi_face_cluster
+        ``mi.UInt32`` cluster of each face.
 
     Returns
     -------
-    coefficients
-        ``(N, r)`` float32: integrals over the visible sky of function × cosine of incidence / π.
-    sky_share
-        ``(N,)`` float32 share of the cosine-weighted hemisphere that is sky.
+    HorizonTransport
+        Light from the sky, and rays to land.
     """
     count, samples = weight.shape
     table = above.table.reshape(-1, above.table.shape[3])
-    result = np.empty((count, table.shape[1]), np.float32)
+    sums = np.empty((count, table.shape[1]), np.float32)
+    hit = np.empty((count, azimuths * land_rays), np.int32)
+    ray_weight = np.empty(hit.shape, np.float32)
     step = max(1, LANES // azimuths)
     for start in range(0, count, step):
         part = slice(start, start + step)
         chosen = _drawn(weight[part], azimuths, key[part])
         # All receivers at one azimuth after those at another: neighbouring rays are almost parallel.
         flat = points[part].reshape(-1)[(np.arange(len(chosen)) * samples + chosen.T).ravel()]
-        result[part] = _integrals(table, azimuths, *_horizons(terrain, flat, azimuths, turn[part], key[part]))
-    result *= weight.sum(axis=1, keepdims=True) * np.float32(2.0 / azimuths)
-    return result[:, :-1], result[:, -1]
+        lanes = _HorizonLanes(flat, azimuths, turn[part], key[part])
+        horizon, bound = lanes.horizon(terrain)
+        elevations, measure = lanes.towards_land(bound, land_rays)
+        rows = lanes.by_receiver([lanes.azimuth, horizon, lanes.along, lanes.upward, measure])
+        sums[part] = _integrals(table, azimuths, *(values.ravel() for values in rows[:4]))
+        land = [lanes.clusters(terrain, elevation, mi_face_cluster, measure > 0.0) for elevation in elevations]
+        hit[part] = np.stack(lanes.by_receiver(land), axis=-1).reshape(len(chosen), -1)
+        ray_weight[part] = np.repeat(rows[4] / np.float32(land_rays), land_rays, axis=1)
+    scale = weight.sum(axis=1, keepdims=True) * np.float32(2.0 / azimuths)
+    sums *= scale
+    ray_weight *= scale
+    return HorizonTransport(sums[:, :-1], sums[:, -1], hit, ray_weight)
 
 
 def _drawn(weight: np.ndarray, azimuths: int, key: np.ndarray) -> np.ndarray:
@@ -142,48 +182,105 @@ def _drawn(weight: np.ndarray, azimuths: int, key: np.ndarray) -> np.ndarray:
     return index
 
 
-def _horizons(
-    terrain: RayScene, points: SurfacePoints, azimuths: int, turn: np.ndarray, key: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Horizons of receivers at their azimuths, from a point for each.
+class _HorizonLanes:
+    """Lanes on the device, one for each azimuth of each receiver, with a surface point ``points`` for each."""
 
-    Returns the azimuth [rad], the elevation of the horizon or of the point's own plane where that is higher [rad], and the
-    components of the normal along the azimuth and upwards, each ``(N · azimuths,)`` float32, of one receiver side by side.
-    """
-    import drjit as dr
-    import mitsuba as mi
+    def __init__(self, points: SurfacePoints, azimuths: int, turn: np.ndarray, key: np.ndarray) -> None:
+        import drjit as dr
+        import mitsuba as mi
 
-    lane = dr.arange(mi.UInt32, len(points.origin))
-    receivers = dr.opaque(mi.UInt32, len(turn))
-    number = lane // receivers
-    receiver = lane - number * receivers
-    mi_key = hashed(dr.gather(mi.UInt32, mi.UInt32(key), receiver), _HORIZON)
-    place = mi.Float(number) + dr.gather(mi.Float, mi.Float(turn % 1.0), receiver)
-    azimuth = place * dr.opaque(mi.Float, 2.0 * np.pi / azimuths)
-    east, north = dr.sincos(azimuth)
-    normal = point3(points.normal)
-    along, upward = normal.x * east + normal.y * north, dr.maximum(normal.z, 1e-3)
-    plane = dr.atan2(-along, upward)
-    # Cells of equal height from the plane to the zenith, shifted by a random part of a cell: without it, all horizons
-    # of a slope would be rounded to the same ones.
-    cell = (0.5 * np.pi - plane) / (2**_STEPS - 1)
-    shift = uniform(hashed(mi_key, number))
-    below, origin = mi.Float(0.0), point3(points.origin)
-    for bit in reversed(range(_STEPS)):
-        border = below + float(2**bit)
-        elevation = plane + (border - shift) * cell
+        self._azimuths = azimuths
+        receivers = dr.opaque(mi.UInt32, len(turn))
+        lane = dr.arange(mi.UInt32, len(points.origin))
+        number = lane // receivers
+        receiver = lane - number * receivers
+        turned = dr.gather(mi.Float, mi.Float((turn % 1.0).astype(np.float32)), receiver)
+        mi_key = hashed(hashed(dr.gather(mi.UInt32, mi.UInt32(key), receiver), _HORIZON), number)
+        self.azimuth = (mi.Float(number) + turned) * dr.opaque(mi.Float, 2.0 * np.pi / azimuths)
+        self._north_east = dr.sincos(self.azimuth)[::-1]
+        self._origin, normal = point3(points.origin), point3(points.normal)
+        north, east = self._north_east
+        self.along, self.upward = normal.x * east + normal.y * north, dr.maximum(normal.z, 1e-3)
+        self._plane = dr.atan2(-self.along, self.upward)
+        self._shift = uniform(mi_key)
+        # A lattice of place in the interval by azimuth (steps of the golden ratio) and by receiver: those whose azimuths are
+        # turned against each other have different elevations at them, too.
+        place = dr.gather(mi.Float, mi.Float((5.0 * turn % 1.0).astype(np.float32)), receiver)
+        place += mi.Float(number) * _GOLDEN
+        self._place = place - dr.floor(place)
+
+    def by_receiver(self, lanes: list[Any]) -> list[np.ndarray]:
+        """Values of lanes as arrays ``(N, azimuths)``."""
+        import drjit as dr
+
+        dr.eval(lanes)
+        return [np.ascontiguousarray(np.array(values).reshape(self._azimuths, -1).T) for values in lanes]
+
+    def horizon(self, terrain: RayScene) -> tuple[Any, Any]:
+        """Elevation of the horizon [rad], or of the point's own plane where that is higher, and what no land rises above."""
+        import drjit as dr
+        import mitsuba as mi
+
+        # Cells of equal height from the plane to the zenith, shifted by a random part of a cell: without it, all horizons
+        # of a slope would be rounded to the same ones.
+        cell = (0.5 * np.pi - self._plane) / (2**_STEPS - 1)
+        below = mi.Float(0.0)
+        for bit in reversed(range(_STEPS)):
+            border = below + float(2**bit)
+            elevation = self._plane + (border - self._shift) * cell
+            inside = (elevation > self._plane) & (elevation < 0.5 * np.pi)
+            hidden = terrain.mi_scene.ray_test(self._ray(elevation), active=inside) | (elevation <= self._plane)
+            below = dr.select(hidden, border, below)
+        horizon, bound = (
+            dr.clip(self._plane + (below + place - self._shift) * cell, self._plane, 0.5 * np.pi)
+            for place in (0.5, 1.0)
+        )
+        dr.eval(horizon, bound)
+        return horizon, bound
+
+    def towards_land(self, bound: Any, count: int) -> tuple[list[Any], Any]:
+        """Elevations of rays between plane and bound, distributed by the cosine of incidence, and the integral of that."""
+        import drjit as dr
+
+        start = self._integral(self._plane)
+        measure = dr.maximum(self._integral(bound) - start, 0.0)
+        elevations = []
+        for number in range(count):
+            wanted = start + measure * ((number + self._place) / count)
+            low, high = self._plane, bound
+            for _ in range(8):
+                middle = 0.5 * (low + high)
+                beyond = self._integral(middle) > wanted
+                low, high = dr.select(beyond, low, middle), dr.select(beyond, middle, high)
+            elevations.append(0.5 * (low + high))
+        return elevations, measure
+
+    def clusters(self, terrain: RayScene, elevation: Any, mi_face_cluster: Any, active: Any) -> Any:
+        """Cluster ``mi.Int32`` that rays at elevations hit; `ESCAPED` or `ABSORBED` for none."""
+        import drjit as dr
+        import mitsuba as mi
+
+        ray = self._ray(elevation)
+        found = terrain.mi_scene.ray_intersect_preliminary(ray, active=active)
+        interaction = found.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
+        cluster = mi.Int32(dr.gather(mi.UInt32, mi_face_cluster, found.prim_index, found.is_valid()))
+        front = dr.dot(interaction.n, ray.d) < 0.0
+        return dr.select(found.is_valid(), dr.select(front, cluster, ABSORBED), ESCAPED)
+
+    def _ray(self, elevation: Any) -> Any:
+        import drjit as dr
+        import mitsuba as mi
+
         sine, cosine = dr.sincos(elevation)
-        inside = (elevation > plane) & (elevation < 0.5 * np.pi)
-        ray = mi.Ray3f(origin, mi.Vector3f(east * cosine, north * cosine, sine))
-        hidden = terrain.mi_scene.ray_test(ray, active=inside) | (elevation <= plane)
-        below = dr.select(hidden, border, below)
-    horizon = dr.clip(plane + (below + 0.5 - shift) * cell, plane, 0.5 * np.pi)
-    lanes = (azimuth, horizon, along, upward)
-    dr.eval(lanes)
-    azimuth_rad, horizon_rad, normal_along, normal_up = (
-        np.ascontiguousarray(np.array(values).reshape(azimuths, -1).T).ravel() for values in lanes
-    )
-    return azimuth_rad, horizon_rad, normal_along, normal_up
+        north, east = self._north_east
+        return mi.Ray3f(self._origin, mi.Vector3f(east * cosine, north * cosine, sine))
+
+    def _integral(self, elevation: Any) -> Any:
+        """Antiderivative over elevation of cosine of incidence × cosine of elevation."""
+        import drjit as dr
+
+        sine, cosine = dr.sincos(elevation)
+        return self.along * 0.5 * (elevation + sine * cosine) + self.upward * 0.5 * sine * sine
 
 
 def _integrals(

@@ -29,7 +29,7 @@ from seasonscapes.rendering.hemisphere_rays import (
     concatenate_points,
     gather_hemisphere,
 )
-from seasonscapes.rendering.horizons import SkyAbove, is_height_field, sky_above, sky_coefficients
+from seasonscapes.rendering.horizons import SkyAbove, is_height_field, sky_above, trace_horizons
 from seasonscapes.rendering.light_clusters import (
     POINTS_PER_CLUSTER,
     LightClusters,
@@ -46,7 +46,7 @@ from seasonscapes.rendering.mirror_samples import (
     mirror_weights,
     water_samples,
 )
-from seasonscapes.rendering.sky_patches import sky_patches
+from seasonscapes.rendering.sky_patches import patch_sums, sky_patches
 from seasonscapes.rendering.smoothing import Neighbours, edge_aware_neighbours, smoothed
 from seasonscapes.rendering.sobol import hash_to_unit
 from seasonscapes.rendering.view_samples import (
@@ -65,6 +65,8 @@ BLOCK_RAYS = 1 << 23
 _DIRECT_SHARPNESS = 64.0
 # Paths that are traced to place the clusters.
 _PILOTS = 1 << 18
+# Rays below the horizon at each azimuth of a receiver on a height field.
+_LAND_RAYS = 2
 # Distinguishes the random numbers of what a pixel mirrors from its own.
 _MIRRORED = np.uint32(1 << 31)
 # Number of receivers, and rays of each, from which the directional basis is computed.
@@ -392,9 +394,9 @@ def _view_rows(
         row_pixel = pixel - rows.start * camera.width_px
         moments = pixel_moments(terrain, camera, rows, sampling.albedo_samples, seed)
         albedo, normal, coverage = (values[row_pixel] for values in moments)
-    receivers = _trace_receivers(
-        terrain, shared, points, weight, pixel.astype(np.uint32), sampling, seed, pixel_tiles(pixel, camera.width_px)
-    )
+    # Without horizons each pixel has random numbers of its own: neighbours would share their noise.
+    tile = None if shared.above is None else pixel_tiles(pixel, camera.width_px)
+    receivers = _trace_receivers(terrain, shared, points, weight, pixel.astype(np.uint32), sampling, seed, tile)
     arrays = _PixelArrays(
         pixel,
         coverage,
@@ -445,55 +447,38 @@ def _trace_receivers(
     ``tile`` the key that up to 16 neighbours share and the number of each among them.
     """
     count, samples = weight.shape
-    rays = sampling.rays if shared.above is None else sampling.bounce_rays
-    sample_rays = max(rays // samples, 1)
     shared_key, number = (identity, np.zeros(count, np.uint32)) if tile is None else tile
     key = shared_key + np.uint32((seed * 747796405 + 1) % 2**32)
-    # Receiver k of a tile uses the Sobol points from k · rays on, and its sample i those from i · rays / S on, so that each
-    # sample, each receiver and the tile have an aligned run of the sequence.
-    first = (number[:, None] * samples + np.arange(samples)).astype(np.uint32) * np.uint32(sample_rays)
+    start = hash_to_unit(identity, seed)
+    if shared.above is not None:
+        seen = trace_horizons(
+            terrain,
+            shared.above,
+            points,
+            weight,
+            azimuths=sampling.horizon_azimuths,
+            land_rays=_LAND_RAYS,
+            turn=number * np.float32(1.0 / TILE) + hash_to_unit(key, seed),
+            key=identity ^ key,
+            mi_face_cluster=shared.mi_face_cluster,
+        )
+        cluster, hits = cluster_lists(seen.hit, seen.ray_weight, sampling.clusters_per_receiver, start=start)
+        # The horizon tells better than the rays how much of the hemisphere is land.
+        share = np.where(hits > 0.0, np.maximum(weight.sum(axis=1) - seen.sky_share, 0.0), 0.0)
+        return ReceiverCoefficients(seen.coefficients.astype(np.float16), cluster, share.astype(np.float16))
+    sample_rays = sampling.rays // samples
     patch, hit = gather_hemisphere(
         terrain,
         sky_patches(sampling.patches),
         points.reshape(-1),
         rays=sample_rays,
-        first=first.ravel(),
+        # Sample i uses the Sobol points from i · rays / S on, so that each sample has an aligned run of the sequence.
+        first=np.tile(np.arange(samples, dtype=np.uint32) * np.uint32(sample_rays), count),
         scramble=np.repeat(key, samples),
         mi_face_cluster=shared.mi_face_cluster,
     )
     patch, hit = patch.reshape(count, -1), hit.reshape(count, -1)
     ray_weight = np.repeat(weight / np.float32(sample_rays), sample_rays, axis=1)
-    cluster, share = cluster_lists(hit, ray_weight, sampling.clusters_per_receiver, start=hash_to_unit(identity, seed))
-    if shared.above is None:
-        direct = patch_sums(patch, np.where(hit == ESCAPED, ray_weight, 0.0), shared.basis.projection)
-    else:
-        turn = number * np.float32(1.0 / TILE) + hash_to_unit(key, seed)
-        direct, sky = sky_coefficients(
-            terrain, shared.above, points, weight, azimuths=sampling.horizon_azimuths, turn=turn, key=identity ^ key
-        )
-        # Where a ray hit land, the horizon tells better than the rays how much of the hemisphere is land.
-        share = np.where(share > 0.0, np.maximum(weight.sum(axis=1) - sky, 0.0), 0.0)
+    direct = patch_sums(patch, np.where(hit == ESCAPED, ray_weight, 0.0), shared.basis.projection)
+    cluster, share = cluster_lists(hit, ray_weight, sampling.clusters_per_receiver, start=start)
     return ReceiverCoefficients(direct.astype(np.float16), cluster, share.astype(np.float16))
-
-
-def patch_sums(index: np.ndarray, weight: np.ndarray, table: np.ndarray) -> np.ndarray:
-    """Compute weighted sums of selected rows of a table.
-
-    Parameters
-    ----------
-    index, weight
-        ``(N, K)`` row indices and their weights.
-    table
-        ``(P, r)``.
-
-    Returns
-    -------
-    numpy.ndarray
-        ``(N, r)`` sums over K of weight × row.
-    """
-    from scipy import sparse
-
-    count, terms = index.shape
-    start = np.arange(0, count * terms + 1, terms, dtype=np.int32)
-    matrix = sparse.csr_array((weight.ravel(), index.ravel(), start), shape=(count, len(table)))
-    return matrix @ table
