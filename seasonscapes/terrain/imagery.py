@@ -267,12 +267,13 @@ def _pyramid(values: np.ndarray, most: int) -> list[np.ndarray]:
     A level is the 2 × 2 box mean of the previous one.
     """
     height, width, channels = values.shape
-    known = np.isfinite(values).all(axis=2)
+    known = np.asarray(np.isfinite(values).all(axis=2))
     finest = np.zeros((height + 2 * _RIM_PX, width + 2 * _RIM_PX, channels + 1), np.float32)
     inside = np.s_[_RIM_PX : _RIM_PX + height, _RIM_PX : _RIM_PX + width]
     finest[inside][..., :-1] = values if known.all() else np.where(known[..., None], values, 0.0)
     finest[inside][..., -1] = known
-    levels, level = [finest], finest[inside]
+    level: np.ndarray = finest[inside]
+    levels: list[np.ndarray] = [finest]
     while max(level.shape[:2]) > 1 and len(levels) < most:
         level = np.pad(level, ((0, level.shape[0] % 2), (0, level.shape[1] % 2), (0, 0)))
         rows = level[0::2] + level[1::2]

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -54,7 +55,7 @@ def write_shipped_massif() -> Path:
     maps = {"elevation": massif.elevation.values[..., 0], "debris": massif.debris, "shore_m": massif.shore_m}
     _path().parent.mkdir(exist_ok=True)
     with atomic_path(_path()) as temporary, open(temporary, "wb") as file:
-        packed = {name: _packed(values) for name, values in maps.items()}
+        packed: dict[str, Any] = {name: _packed(values) for name, values in maps.items()}
         np.savez_compressed(file, revision=_REVISION, cover=massif.cover, **packed)
     return _path()
 
