@@ -4,6 +4,7 @@
 # make lint   style, types and layers: ruff, pyright, import-linter
 # make docs   the site in docs/_build/html; a warning is an error. docs-notebooks executes its notebooks first
 # make sky-tables the atmosphere tables of the bundled sky models, after a change of their physics
+# make massif the heights of the bundled scene, after a change of their generator
 # make tables the tables of README and site from benchmarks/results; `make results` measures those anew, in hours
 # Each makes the virtual environment .venv if it is missing, finds or installs libLLVM where it is needed, and can be
 # repeated at will. PYTHON=python3.12 chooses the interpreter, CONSTRAINTS=constraints.txt installs the tested versions.
@@ -15,7 +16,7 @@ BIN := $(VENV)/bin
 BASE := $(VENV)/.installed
 DEV := $(VENV)/.installed-dev
 
-.PHONY: demo gallery test check docs docs-notebooks sky-tables tables results lint venv dev llvm clean help
+.PHONY: demo gallery test check docs docs-notebooks sky-tables massif tables results lint venv dev llvm clean help
 help:
 	@sed -n '1,8p' Makefile
 
@@ -54,6 +55,9 @@ docs-notebooks: $(DEV)
 
 sky-tables: $(BASE)
 	$(BIN)/python -m seasonscapes.sky.shipped_tables
+
+massif: $(BASE)
+	$(BIN)/python -m seasonscapes.terrain.shipped_massif
 
 tables: $(DEV)
 	$(BIN)/python benchmarks/tables.py

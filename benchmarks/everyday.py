@@ -139,15 +139,18 @@ def film(bench: Bench, hours: int | None) -> dict[str, float]:
     if hours is None:
         year = frames("2024-01-01T00:00", "2024-12-31T23:00", "1h", "year")
         minutes, count = year.wall_s / 60.0, total_hours
+        frame_s = year.processor_s / total_hours
     else:
         # One film of 2 h and one of ``hours`` h more, spread over the year: their difference is the cost of a frame.
         base = frames("2024-01-01T00:00", "2024-12-31T00:00", "365d", "base")
         year = frames("2024-01-02T01:00", "2024-12-30T00:00", f"{total_hours // hours}h", "sample")
         count = hours
         minutes = (base.wall_s + (year.wall_s - base.wall_s) / hours * total_hours) / 60.0
+        frame_s = (year.processor_s - base.processor_s) / hours
     return {
         "film_ready_s": ready.processor_s,
         "film_ready_wall_s": ready.wall_s,
+        "frame_s": frame_s,
         "year_minutes": minutes,
         "year_frames_measured": count,
         "year_frames": total_hours,

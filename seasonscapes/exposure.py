@@ -148,10 +148,10 @@ def develop(
     if look not in LOOKS:
         raise InputError("--look", "unknown look", got=look, expected=", ".join(LOOKS))
     if eye:
-        image = _blend_rod_vision(np.asarray(image, np.float64))
+        image = _blend_rod_vision(np.asarray(image))
     if look == "photo":
         # A moonless sky is green of airglow; cameras' night modes, like the eye, show it grey-blue.
-        image = image if eye else _blend_rod_vision(np.asarray(image, np.float64), _MOONLESS)
+        image = image if eye else _blend_rod_vision(np.asarray(image), _MOONLESS)
         image = image if white is None else balanced(image, white)
         return photo_curve(expose(image, ev100) * EXPOSURE_GAIN)
     return tone_curve(expose(image, ev100))
@@ -159,9 +159,17 @@ def develop(
 
 def _blend_rod_vision(image: np.ndarray, mesopic: tuple[float, float] = _MESOPIC) -> np.ndarray:
     """Blend an image with its scotopic grey by the position of each pixel's luminance in the mesopic range."""
-    luminance = np.maximum(image @ REC709_LUMINANCE, 1e-9)
+    luminance = np.maximum(image @ REC709_LUMINANCE.astype(image.dtype), 1e-9)
     low, high = np.log10(mesopic)
-    rod_weight = np.clip((high - np.log10(luminance)) / (high - low), 0.0, 1.0)[..., None]
+    # By day no pixel is so dim that rods see it; by night most are, and all are as quickly done.
+    dim = luminance < mesopic[1]
+    if not dim.any():
+        return image
+    chosen = dim if dim.mean() < 0.2 else np.s_[:]
+    cones = image[chosen].astype(np.float64)
+    rod_weight = np.clip((high - np.log10(luminance[chosen])) / (high - low), 0.0, 1.0)[..., None]
     tint = _NIGHT_TINT / (_NIGHT_TINT @ REC709_LUMINANCE)
-    grey = np.maximum(image @ _SCOTOPIC, 0.0)[..., None] * tint
-    return (1.0 - rod_weight) * image + rod_weight * grey
+    grey = np.maximum(cones @ _SCOTOPIC, 0.0)[..., None] * tint
+    result = image.copy()
+    result[chosen] = (1.0 - rod_weight) * cones + rod_weight * grey
+    return result

@@ -12,6 +12,9 @@ from seasonscapes.sky.atmosphere import delta_scaled, gas_moments, optics
 from seasonscapes.sky.clear_sky import LuminarySource, illumination_from_atmosphere
 from seasonscapes.sky.elevation_table import (
     KNOTS_DEG,
+    PART_KNOTS,
+    PARTS,
+    PartedTable,
     interpolate_at_elevation,
     load_table,
     save_table,
@@ -173,25 +176,45 @@ def test_a_grid_of_directions_is_the_same_sky():
 def test_film_tables_are_built_once_and_whole(tmp_path, monkeypatch):
     """A table that has no manifest, as an interrupted run leaves it, is built anew; a finished one is read."""
     workspace, built = Workspace(tmp_path), []
+    sun_rad = np.radians(KNOTS_DEG[PART_KNOTS + 4])  # whose neighbours are of the same part
 
-    def build(tables, height_m, near):
+    def build(tables, height_m, near, *, part):
         built.append((height_m, near))
-        return tabulate_by_elevation(lambda suns: np.full((len(suns), 2), 1.0 + near))
+        return tabulate_by_elevation(lambda suns: np.full((len(suns), 2), 1.0 + near), part=part)
 
     monkeypatch.setattr(illumination_module, "diffuse_by_elevation", build)
     tables = tables_of()
     for _ in range(2):
         diffuse_of = illumination_module._diffuse_in(workspace, tables)
         for _ in range(2):
-            assert interpolate_at_elevation(diffuse_of(900.0, True), 0.3) == pytest.approx(2.0, rel=1e-3)
+            assert interpolate_at_elevation(diffuse_of(900.0, True), sun_rad) == pytest.approx(2.0, rel=1e-3)
     assert built == [(900.0, True)]
     (manifest,) = tmp_path.rglob("*.npy.json")
     manifest.unlink()
     assert interpolate_at_elevation(
-        illumination_module._diffuse_in(workspace, tables)(900.0, True), 0.3
+        illumination_module._diffuse_in(workspace, tables)(900.0, True), sun_rad
     ) == pytest.approx(2.0, rel=1e-3)
-    illumination_module._diffuse_in(workspace, tables)(901.0, True)
+    other = illumination_module._diffuse_in(workspace, tables)(901.0, True)
+    assert len(built) == 2, "a table is built where it is needed"
+    assert interpolate_at_elevation(other, sun_rad) == pytest.approx(2.0, rel=1e-3)
     assert built == [(900.0, True), (900.0, True), (901.0, True)]
+
+
+def test_parts_of_a_table_are_the_whole_table():
+    def values_of(suns_rad: np.ndarray) -> np.ndarray:
+        return np.exp(np.degrees(suns_rad) / 30.0)[:, None]
+
+    whole, asked = tabulate_by_elevation(values_of), []
+
+    def part_of(number: int) -> np.ndarray:
+        asked.append(number)
+        return tabulate_by_elevation(values_of, part=number)
+
+    table = PartedTable(part_of)
+    for elevation_deg in (-40.0, -17.9, 0.01, 4.4, 33.0, 90.0):
+        rad = np.radians(elevation_deg)
+        np.testing.assert_array_equal(interpolate_at_elevation(table, rad), interpolate_at_elevation(whole, rad))
+    assert len(asked) == len(set(asked)) < PARTS
 
 
 def test_light_for_a_film_takes_its_tables_from_the_workspace(tmp_path, looked_up, monkeypatch):
@@ -203,10 +226,11 @@ def test_light_for_a_film_takes_its_tables_from_the_workspace(tmp_path, looked_u
 
     asked = []
 
-    def build(tables, height_m, near):
-        asked.append((height_m, near))
+    def build(tables, height_m, near, *, part):
+        if part == 0:
+            asked.append((height_m, near))
         # The land's own sky is not compared here, so the camera's table will do for its height too.
-        return looked_up.diffuse_of(HEIGHT_M, near)
+        return looked_up.diffuse_of(HEIGHT_M, near)[part * PART_KNOTS : (part + 1) * PART_KNOTS]
 
     assert atmosphere_from_model(read_sky_model("clear")) == tables_of().atmosphere
     monkeypatch.setattr(illumination_module, "atmosphere_tables", lambda _: tables_of())

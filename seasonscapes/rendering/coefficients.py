@@ -23,7 +23,8 @@ class SamplingOptions:
     albedo_samples
         Samples per pixel for its mean albedo and normal, a square.
     rays
-        Hemisphere rays per receiver, a power of two.
+        Hemisphere rays per receiver, a power of two. On height fields horizons and rays below them replace these, with as
+        little noise; see `horizon_azimuths`.
     bounces
         Number of surfaces between light and receiver; 4 equals ``max_depth=6`` of the path tracer.
     clusters
@@ -49,6 +50,11 @@ class SamplingOptions:
     clusters_per_receiver: int = 64
     rank: int = 32
     patches: str = "reinhart"
+
+    @property
+    def horizon_azimuths(self) -> int:
+        """Azimuths at which the horizon of a receiver on a height field is searched, a power of two."""
+        return max(self.rays // 16, 8)
 
     def __post_init__(self):
         if (

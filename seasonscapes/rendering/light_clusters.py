@@ -10,7 +10,6 @@ that shadows on the opposite side of a valley contribute no light.
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -153,63 +152,79 @@ def cluster_faces(hits: PathHits, faces: FaceGeometry, count: int, *, seed: int)
         ``(F,)`` uint32 cluster of each face.
     """
     face_key = np.concatenate((faces.centroid, faces.normal), axis=1)
-    # Faces are divided, not hits, so that the face alone determines the cluster that a ray hits.
-    key = face_key[hits.face]
     hit_count = len(hits.face)
+    # Faces are divided, not hits, so that the face alone determines the cluster that a ray hits.
+    rows = _Rows(np.arange(hit_count), np.ascontiguousarray(face_key[hits.face].T), hits.throughput)
     levels = max(0, int(np.log2(max(min(count, hit_count / POINTS_PER_CLUSTER), 1))))
-    order, bounds = np.arange(hit_count), [0, hit_count]
+    bounds = np.array([0, hit_count])
     face_cluster, all_faces = np.zeros(len(face_key), np.uint32), np.arange(len(face_key))
     for _ in range(levels):
-        axes, values, split_bounds = [], [], [0]
-        for start, end in itertools.pairwise(bounds):
-            axis, value, middle = _split(key, hits.throughput, order[start:end])
-            axes.append(axis)
-            values.append(value)
-            split_bounds += [start + middle, end]
-        side = face_key[all_faces, np.array(axes)[face_cluster]] >= np.array(values, np.float32)[face_cluster]
+        rows, axes, values, middles = _split(rows, bounds)
+        side = face_key[all_faces, axes[face_cluster]] >= values[face_cluster]
         face_cluster = face_cluster * np.uint32(2) + side.astype(np.uint32)
-        bounds = split_bounds
-    return hits.points[_choose_points(order, np.array(bounds), hits.throughput, seed)], face_cluster
+        bounds = np.append(0, np.stack([middles, bounds[1:]], axis=1).ravel())
+    return hits.points[_choose_points(rows.order, bounds, hits.throughput, seed)], face_cluster
 
 
-def _split(key: np.ndarray, weight: np.ndarray, rows: np.ndarray) -> tuple[int, float, int]:
-    """Sort ``rows`` in place along the axis of largest spread and split them at the weighted median.
+@dataclass(frozen=True)
+class _Rows:
+    """Hits in groups: their numbers ``(K,)``, centroid and normal of their faces ``(6, K)``, and their throughput ``(K,)``."""
 
-    Returns the axis, the value of the split, and the number of rows below it.
+    order: np.ndarray
+    key: np.ndarray
+    weight: np.ndarray
+
+
+def _split(rows: _Rows, bounds: np.ndarray) -> tuple[_Rows, np.ndarray, np.ndarray, np.ndarray]:
+    """Sort each group of hits, delimited by ``bounds``, along its axis of largest spread, and split it at the median.
+
+    Returns the sorted hits, and of each group the axis, the value of the split (infinite for empty groups) and the place
+    where the hits above it begin.
     """
-    if len(rows) == 0:
-        return 0, np.inf, 0
-    values = key[rows]
-    spread = values.std(axis=0)
-    normal = 3 + int(np.argmax(spread[3:]))
-    axis = normal if spread[normal] > _NORMAL_SPREAD else int(np.argmax(spread[:3]))
-    rows[:] = rows[np.argsort(values[:, axis], kind="stable")]
-    values, total = key[rows, axis], np.cumsum(weight[rows])
-    value = values[min(int(np.searchsorted(total, 0.5 * total[-1])), len(rows) - 1)]
-    if value == values[0]:
-        # With many hits on the first face the split is moved behind it, so that neither side is empty if possible.
-        value = values[min(int(np.searchsorted(values, value, side="right")), len(rows) - 1)]
-    return axis, float(value), int(np.searchsorted(values, value, side="left"))
+    groups, count = len(bounds) - 1, np.diff(bounds)
+    filled = np.flatnonzero(count)
+    start, last, number = bounds[filled], bounds[filled + 1] - 1, count[filled]
+    group = np.repeat(np.arange(groups), count)
+    spread = np.zeros((len(rows.key), groups))
+    for column, result in zip(rows.key, spread, strict=True):
+        mean = np.add.reduceat(column, start, dtype=np.float64) / number
+        centred = column - np.repeat(mean.astype(np.float32), number)
+        result[filled] = np.sqrt(np.add.reduceat(centred * centred, start, dtype=np.float64) / number)
+    normal = 3 + np.argmax(spread[3:], axis=0)
+    axis = np.where(spread[normal, np.arange(groups)] > _NORMAL_SPREAD, normal, np.argmax(spread[:3], axis=0))
+    along = rows.key[axis[group], np.arange(len(group))]
+    # Groups and the ordered bits of floats in one integer, which sorts several times faster than two keys.
+    bits = along.view(np.int32)
+    ordered = np.where(bits < 0, ~bits, bits | np.int32(-(2**31))).view(np.uint32)
+    sort = np.argsort((group.astype(np.uint64) << np.uint64(32)) | ordered, kind="stable")
+    along, rows = along[sort], _Rows(rows.order[sort], np.take(rows.key, sort, axis=1), rows.weight[sort])
+    # The weighted median of each group, by one search in the sums over all groups.
+    total = np.cumsum(rows.weight, dtype=np.float64)
+    before = np.where(start > 0, total[start - 1], 0.0)
+    value = np.full(groups, np.inf, np.float32)
+    value[filled] = along[np.clip(np.searchsorted(total, 0.5 * (before + total[last])), start, last)]
+    # With many hits on the first face the split is moved behind it, so that neither side is empty if possible.
+    for each in filled[value[filled] == along[start]]:
+        within = along[bounds[each] : bounds[each + 1]]
+        value[each] = within[min(int(np.searchsorted(within, within[0], side="right")), len(within) - 1)]
+    middle = bounds[:-1].copy()
+    middle[filled] += np.add.reduceat((along < value[group]).astype(np.intp), start)
+    return rows, axis, value, middle
 
 
 def _choose_points(order: np.ndarray, bounds: np.ndarray, weight: np.ndarray, seed: int) -> np.ndarray:
     """Indices ``(M, POINTS_PER_CLUSTER)`` of hits; ``bounds`` ``(M + 1,)`` delimit the clusters in ``order``."""
-    rng = np.random.default_rng(seed)
     occupied = np.flatnonzero(np.diff(bounds) > 0)
+    start, last = bounds[occupied], bounds[occupied + 1] - 1
+    total = np.cumsum(weight[order], dtype=np.float64)
+    before = np.where(start > 0, total[start - 1], 0.0)
+    # Systematic samples, whose expected frequency is proportional to the weight.
+    place = np.arange(POINTS_PER_CLUSTER) + np.random.default_rng(seed).random(len(occupied))[:, None]
+    target = before[:, None] + place / POINTS_PER_CLUSTER * (total[last] - before)[:, None]
     chosen = np.empty((len(bounds) - 1, POINTS_PER_CLUSTER), np.intp)
-    for cluster in occupied:
-        rows = order[bounds[cluster] : bounds[cluster + 1]]
-        chosen[cluster] = rows[_systematic_sample(weight[rows], POINTS_PER_CLUSTER, rng.random())]
+    chosen[occupied] = order[np.clip(np.searchsorted(total, target, side="right"), start[:, None], last[:, None])]
     nearest = occupied[np.clip(np.searchsorted(occupied, np.arange(len(chosen))), 0, len(occupied) - 1)]
     return chosen[nearest]
-
-
-def _systematic_sample(weight: np.ndarray, count: int, start: float) -> np.ndarray:
-    """Systematic sample of ``count`` indices with expected frequency proportional to ``weight``."""
-    total = np.cumsum(weight, dtype=np.float64)
-    return np.minimum(
-        np.searchsorted(total, (np.arange(count) + start) / count * total[-1], side="right"), len(weight) - 1
-    )
 
 
 def cluster_lists(

@@ -193,6 +193,29 @@ def patch_radiance(patches: SkyPatches, sky_radiance: np.ndarray) -> np.ndarray:
     return _averaging(patches.name, height, width) @ np.asarray(sky_radiance, np.float64).reshape(height * width, -1)
 
 
+def patch_sums(index: np.ndarray, weight: np.ndarray, table: np.ndarray) -> np.ndarray:
+    """Compute weighted sums of selected rows of a table.
+
+    Parameters
+    ----------
+    index, weight
+        ``(N, K)`` row indices and their weights.
+    table
+        ``(P, r)``.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(N, r)`` sums over K of weight × row.
+    """
+    from scipy import sparse
+
+    count, terms = index.shape
+    start = np.arange(0, count * terms + 1, terms, dtype=np.int32)
+    matrix = sparse.csr_array((weight.ravel(), index.ravel(), start), shape=(count, len(table)))
+    return matrix @ table
+
+
 def direction_weights(patches: SkyPatches, direction: np.ndarray) -> np.ndarray:
     """Compute the weights for interpolating a quantity per patch at one direction.
 

@@ -14,6 +14,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 
 def hashed(key: Any, word: Any) -> Any:
     """Hash a key and a word to a new key (Wellons' *lowbias32*), bijective in ``key``.
@@ -52,6 +54,27 @@ def uniform(key: Any) -> Any:
         In [0, 1).
     """
     return _fraction(hashed(key, 0))
+
+
+def hash_to_unit(identity: np.ndarray, seed: int) -> np.ndarray:
+    """Hash receiver indices to numbers in [0, 1), independently of the division into blocks (Wellons' *lowbias32*).
+
+    Parameters
+    ----------
+    identity
+        ``(N,)`` unsigned integers.
+    seed
+        Any integer.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(N,)`` float32.
+    """
+    bits = identity.astype(np.uint32) ^ np.uint32((seed * 2891336453 + 0x9E3779B9) % 2**32)
+    for shift, factor in ((16, 0x7FEB352D), (15, 0x846CA68B)):
+        bits = (bits ^ (bits >> np.uint32(shift))) * np.uint32(factor)
+    return ((bits ^ (bits >> np.uint32(16))) >> np.uint32(8)).astype(np.float32) * np.float32(2.0**-24)
 
 
 def sobol_pair(key: Any, index: Any) -> Any:

@@ -229,7 +229,7 @@ def sum_incidence(rays: SunRays, luminary: Luminary, receiver: np.ndarray) -> tu
         index = dr.arange(mi.UInt32, dr.width(chosen) * rays.samples)
         samples = dr.opaque(mi.UInt32, rays.samples)
         lane = dr.gather(mi.UInt32, chosen, index // samples) * samples + index % samples
-        visible, cosine, weight = _visible(rays, disc, lane)
+        visible, cosine, weight = _visible(rays, disc, lane, coherent=True)
         weighted = dr.fmax(cosine, 0.0) * weight
         lanes = [dr.select(visible, weighted, 0.0), weighted]
         dr.eval(lanes)
@@ -283,10 +283,11 @@ def _mi_disc(luminary: Luminary, points: int) -> _Disc:
     return _Disc(mi.Vector3f(point3(disc_directions(luminary, count))), dr.opaque(mi.UInt32, count), centre)
 
 
-def _visible(rays: SunRays, disc: _Disc, lane: Any, shift: Any = 0) -> tuple[Any, Any, Any]:
+def _visible(rays: SunRays, disc: _Disc, lane: Any, shift: Any = 0, *, coherent: bool = False) -> tuple[Any, Any, Any]:
     """Visibility of the luminary from samples (``lane`` of `SunRays`), cosine of incidence of its centre, and weight.
 
-    ``shift`` selects other points of the disc. Samples whose facet faces away from the luminary are dark, as in a path
+    ``shift`` selects other points of the disc; ``coherent`` traces packets, which pays where all samples of a receiver lie side
+    by side. Samples whose facet faces away from the luminary are dark, as in a path
     tracer, whose shadow ray would start inside the terrain.
     """
     import drjit as dr
@@ -308,4 +309,4 @@ def _visible(rays: SunRays, disc: _Disc, lane: Any, shift: Any = 0) -> tuple[Any
     origin = dr.gather(mi.Point3f, rays.mi_origin, lane, active)
     material = rays.terrain.mi_terrain.bsdf()
     ray = mi.Ray3f(origin + direction * shadow_ray_start(material, cosine), direction)
-    return active & ~rays.terrain.mi_scene.ray_test(ray, active), cosine, weight
+    return active & ~rays.terrain.mi_scene.ray_test(ray, coherent=coherent, active=active), cosine, weight

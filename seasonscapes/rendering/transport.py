@@ -29,6 +29,7 @@ from seasonscapes.rendering.hemisphere_rays import (
     concatenate_points,
     gather_hemisphere,
 )
+from seasonscapes.rendering.horizons import SkyAbove, is_height_field, sky_above, trace_horizons
 from seasonscapes.rendering.light_clusters import (
     POINTS_PER_CLUSTER,
     LightClusters,
@@ -46,11 +47,14 @@ from seasonscapes.rendering.mirror_samples import (
     morton_order,
     water_samples,
 )
-from seasonscapes.rendering.sky_patches import sky_patches
+from seasonscapes.rendering.sky_patches import patch_sums, sky_patches
 from seasonscapes.rendering.smoothing import Neighbours, edge_aware_neighbours, smoothed
+from seasonscapes.rendering.sobol import hash_to_unit
 from seasonscapes.rendering.view_samples import (
+    TILE,
     camera_points,
     pixel_moments,
+    pixel_tiles,
     sample_moments,
     sample_weights,
     view_samples,
@@ -62,6 +66,8 @@ BLOCK_RAYS = 1 << 23
 _DIRECT_SHARPNESS = 64.0
 # Paths that are traced to place the clusters.
 _PILOTS = 1 << 18
+# Rays below the horizon at each azimuth of a receiver on a height field.
+_LAND_RAYS = 2
 # Distinguishes the random numbers of what a pixel mirrors from its own.
 _MIRRORED = np.uint32(1 << 31)
 # Number of receivers, and rays of each, from which the directional basis is computed.
@@ -81,11 +87,14 @@ class SharedTransport:
         Directional basis of the sky.
     clusters
         The clusters and their own coefficients.
+    above
+        Integrals of the basis above horizons, for terrains that are height fields; ``None`` for others.
     """
 
     mi_face_cluster: Any
     basis: DirectionBasis
     clusters: LightClusters
+    above: SkyAbove | None
 
 
 @dataclass(frozen=True)
@@ -299,17 +308,18 @@ def prepare_transport(
     )
     rows = patch_sums(patch, np.where(hit == ESCAPED, np.float32(1.0 / _EXAMPLE_RAYS), 0.0), np.eye(patches.size))
     basis = direction_basis(rows, patches, sampling.rank)
+    above = sky_above(patches, basis.projection) if is_height_field(terrain) else None
     if sampling.bounces == 0 or hit_count == 0:
         unlit = LightClusters(
             pilot[:1].reshape(1, 1), _zero_receivers(basis, sampling), basis.from_sky, sampling.patches, 0
         )
-        return SharedTransport(unclustered, basis, unlit)
+        return SharedTransport(unclustered, basis, unlit, above)
     points, face_cluster = cluster_faces(hits, faces, sampling.clusters, seed=seed)
     size = len(points.origin)
     clusters = LightClusters(
         points, _zero_receivers(basis, sampling), basis.from_sky, sampling.patches, sampling.bounces
     )
-    shared = SharedTransport(mi.UInt32(face_cluster), basis, clusters)
+    shared = SharedTransport(mi.UInt32(face_cluster), basis, clusters, above)
     step = max(1, BLOCK_RAYS // sampling.rays)
     uniform = np.full((size, POINTS_PER_CLUSTER), 1.0 / POINTS_PER_CLUSTER, np.float32)
     blocks = [
@@ -386,7 +396,9 @@ def _view_rows(
         row_pixel = pixel - rows.start * camera.width_px
         moments = pixel_moments(terrain, camera, rows, sampling.albedo_samples, seed)
         albedo, normal, coverage = (values[row_pixel] for values in moments)
-    receivers = _trace_receivers(terrain, shared, points, weight, pixel.astype(np.uint32), sampling, seed)
+    # Without horizons each pixel has random numbers of its own: neighbours would share their noise.
+    tile = None if shared.above is None else pixel_tiles(pixel, camera.width_px)
+    receivers = _trace_receivers(terrain, shared, points, weight, pixel.astype(np.uint32), sampling, seed, tile)
     arrays = _PixelArrays(
         pixel,
         coverage,
@@ -429,71 +441,46 @@ def _trace_receivers(
     identity: np.ndarray,
     sampling: SamplingOptions,
     seed: int,
+    tile: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> ReceiverCoefficients:
     """Coefficients of N receivers with S surface points ``(N, S)`` each.
 
-    ``weight`` ``(N, S)`` are the weights of the points, ``identity`` ``(N,)`` the random number keys of the receivers.
+    ``weight`` ``(N, S)`` are the weights of the points, ``identity`` ``(N,)`` the random number keys of the receivers,
+    ``tile`` the key that up to 16 neighbours share and the number of each among them.
     """
     count, samples = weight.shape
+    shared_key, number = (identity, np.zeros(count, np.uint32)) if tile is None else tile
+    key = shared_key + np.uint32((seed * 747796405 + 1) % 2**32)
+    start = hash_to_unit(identity, seed)
+    if shared.above is not None:
+        seen = trace_horizons(
+            terrain,
+            shared.above,
+            points,
+            weight,
+            azimuths=sampling.horizon_azimuths,
+            land_rays=_LAND_RAYS,
+            turn=number * np.float32(1.0 / TILE) + hash_to_unit(key, seed),
+            key=identity ^ key,
+            mi_face_cluster=shared.mi_face_cluster,
+        )
+        cluster, hits = cluster_lists(seen.hit, seen.ray_weight, sampling.clusters_per_receiver, start=start)
+        # The horizon tells better than the rays how much of the hemisphere is land.
+        share = np.where(hits > 0.0, np.maximum(weight.sum(axis=1) - seen.sky_share, 0.0), 0.0)
+        return ReceiverCoefficients(seen.coefficients.astype(np.float16), cluster, share.astype(np.float16))
     sample_rays = sampling.rays // samples
-    # Sample i uses the Sobol points from i · rays / S on, so that each sample has an aligned run of the sequence.
-    first = np.tile(np.arange(samples, dtype=np.uint32) * np.uint32(sample_rays), count)
-    scramble = np.repeat(identity + np.uint32((seed * 747796405 + 1) % 2**32), samples)
     patch, hit = gather_hemisphere(
         terrain,
         sky_patches(sampling.patches),
         points.reshape(-1),
         rays=sample_rays,
-        first=first,
-        scramble=scramble,
+        # Sample i uses the Sobol points from i · rays / S on, so that each sample has an aligned run of the sequence.
+        first=np.tile(np.arange(samples, dtype=np.uint32) * np.uint32(sample_rays), count),
+        scramble=np.repeat(key, samples),
         mi_face_cluster=shared.mi_face_cluster,
     )
     patch, hit = patch.reshape(count, -1), hit.reshape(count, -1)
     ray_weight = np.repeat(weight / np.float32(sample_rays), sample_rays, axis=1)
     direct = patch_sums(patch, np.where(hit == ESCAPED, ray_weight, 0.0), shared.basis.projection)
-    cluster, share = cluster_lists(hit, ray_weight, sampling.clusters_per_receiver, start=hash_to_unit(identity, seed))
+    cluster, share = cluster_lists(hit, ray_weight, sampling.clusters_per_receiver, start=start)
     return ReceiverCoefficients(direct.astype(np.float16), cluster, share.astype(np.float16))
-
-
-def hash_to_unit(identity: np.ndarray, seed: int) -> np.ndarray:
-    """Hash receiver indices to numbers in [0, 1), independently of the division into blocks (Wellons' *lowbias32*).
-
-    Parameters
-    ----------
-    identity
-        ``(N,)`` unsigned integers.
-    seed
-        Any integer.
-
-    Returns
-    -------
-    numpy.ndarray
-        ``(N,)`` float32.
-    """
-    bits = identity.astype(np.uint32) ^ np.uint32((seed * 2891336453 + 0x9E3779B9) % 2**32)
-    for shift, factor in ((16, 0x7FEB352D), (15, 0x846CA68B)):
-        bits = (bits ^ (bits >> np.uint32(shift))) * np.uint32(factor)
-    return ((bits ^ (bits >> np.uint32(16))) >> np.uint32(8)).astype(np.float32) * np.float32(2.0**-24)
-
-
-def patch_sums(index: np.ndarray, weight: np.ndarray, table: np.ndarray) -> np.ndarray:
-    """Compute weighted sums of selected rows of a table.
-
-    Parameters
-    ----------
-    index, weight
-        ``(N, K)`` row indices and their weights.
-    table
-        ``(P, r)``.
-
-    Returns
-    -------
-    numpy.ndarray
-        ``(N, r)`` sums over K of weight × row.
-    """
-    from scipy import sparse
-
-    count, terms = index.shape
-    start = np.arange(0, count * terms + 1, terms, dtype=np.int32)
-    matrix = sparse.csr_array((weight.ravel(), index.ravel(), start), shape=(count, len(table)))
-    return matrix @ table

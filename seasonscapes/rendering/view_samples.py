@@ -16,6 +16,30 @@ from seasonscapes.rendering.terrain_material import device_water, shading_normal
 
 # Key of the random number stream, mixed into its hashes.
 _PIXEL, _WAVE = 103, 105
+# Pixels of a square tile, which share stratified random numbers.
+TILE = 16
+_BAYER = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]], np.uint32)
+
+
+def pixel_tiles(pixel: np.ndarray, width_px: int) -> tuple[np.ndarray, np.ndarray]:
+    """Divide pixels into tiles of 4 × 4, whose pixels have complementary random numbers: any 3 × 3 of them have nine.
+
+    Parameters
+    ----------
+    pixel
+        ``(n,)`` flat pixel indices.
+    width_px
+        Width of the image [px].
+
+    Returns
+    -------
+    key
+        ``(n,)`` uint32 key of each pixel's tile.
+    number
+        ``(n,)`` uint32 number of the pixel in its tile, by Bayer's matrix.
+    """
+    row, column = np.divmod(pixel, width_px)
+    return ((row // 4) * width_px + column // 4).astype(np.uint32), _BAYER[row % 4, column % 4]
 
 
 def view_samples(

@@ -36,8 +36,42 @@ _MAX_STORED = 32768.0
 Progress = Callable[[float], None]
 
 
+# Knots of one part of a table that is built as it is needed.
+PART_KNOTS = 8
+PARTS = -(-len(KNOTS_DEG) // PART_KNOTS)
+
+
+class PartedTable:
+    """A table of `tabulate_by_elevation` whose parts are made when they are first needed: a day needs few of them.
+
+    Parameters
+    ----------
+    part_of
+        Function from the number of a part, below `PARTS`, to its `PART_KNOTS` records (the last has fewer).
+    """
+
+    def __init__(self, part_of: Callable[[int], np.ndarray]) -> None:
+        self._part_of = part_of
+        self._parts: dict[int, np.ndarray] = {}
+
+    def part(self, number: int) -> np.ndarray:
+        """The records of a part."""
+        if number not in self._parts:
+            self._parts[number] = self._part_of(number)
+        return self._parts[number]
+
+    def __getitem__(self, knots: slice) -> np.ndarray:
+        """Records of consecutive knots."""
+        first, last, _ = knots.indices(len(KNOTS_DEG))
+        records = []
+        for number in range(first // PART_KNOTS, (last - 1) // PART_KNOTS + 1):
+            start = number * PART_KNOTS
+            records.append(self.part(number)[max(first - start, 0) : last - start])
+        return np.concatenate(records)
+
+
 def tabulate_by_elevation(
-    values_of: Callable[[np.ndarray], np.ndarray], *, progress: Progress | None = None
+    values_of: Callable[[np.ndarray], np.ndarray], *, part: int | None = None, progress: Progress | None = None
 ) -> np.ndarray:
     """Tabulate a positive array-valued function of solar elevation.
 
@@ -45,6 +79,8 @@ def tabulate_by_elevation(
     ----------
     values_of
         Function from true elevations ``(N,)`` [rad] to positive values ``(N, ...)``.
+    part
+        Only the knots of this part, see `PartedTable`.
     progress
         Called with the completed fraction.
 
@@ -54,22 +90,23 @@ def tabulate_by_elevation(
         Structured array ``(J,)`` with one record per knot: ``scale`` and ``values`` ``(...)``.
     """
     table = None
-    for start in range(0, len(KNOTS_DEG), _BATCH):
-        values = values_of(np.radians(KNOTS_DEG[start : start + _BATCH]))
+    knots_deg = KNOTS_DEG if part is None else KNOTS_DEG[part * PART_KNOTS : (part + 1) * PART_KNOTS]
+    for start in range(0, len(knots_deg), _BATCH):
+        values = values_of(np.radians(knots_deg[start : start + _BATCH]))
         shape = values.shape[1:]
         if table is None:
-            table = np.empty(len(KNOTS_DEG), [("scale", np.float32), ("values", np.float16, shape)])
+            table = np.empty(len(knots_deg), [("scale", np.float32), ("values", np.float16, shape)])
         scale = np.maximum(values.reshape(len(values), -1).max(axis=1), 1e-30) / _MAX_STORED
         records = table[start : start + len(values)]
         records["scale"] = scale
         records["values"] = values / scale.reshape(-1, *(1,) * len(shape))
         if progress is not None:
-            progress((start + len(values)) / len(KNOTS_DEG))
-    assert table is not None  # KNOTS_DEG is not empty
+            progress((start + len(values)) / len(knots_deg))
+    assert table is not None  # no part is empty
     return table
 
 
-def interpolate_at_elevation(table: np.ndarray, elevation_rad: float) -> np.ndarray:
+def interpolate_at_elevation(table: np.ndarray | PartedTable, elevation_rad: float) -> np.ndarray:
     """Interpolate a table at a solar elevation.
 
     Parameters
@@ -85,8 +122,9 @@ def interpolate_at_elevation(table: np.ndarray, elevation_rad: float) -> np.ndar
         Values ``(...)``, float32.
     """
     first, weights = _lagrange_weights(float(np.degrees(elevation_rad)))
-    values = np.zeros(table.dtype["values"].shape, np.float32)
-    for record, weight in zip(table[first : first + len(weights)], weights, strict=True):
+    records = table[first : first + len(weights)]
+    values = np.zeros(records.dtype["values"].shape, np.float32)
+    for record, weight in zip(records, weights, strict=True):
         if weight != 0.0:
             values += record["values"].astype(np.float32) * np.float32(weight * record["scale"])
     # The cubic undershoots zero beside steep onsets.

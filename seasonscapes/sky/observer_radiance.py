@@ -222,9 +222,14 @@ def diffuse_at_observer(
 
 
 def diffuse_by_elevation(
-    tables: AtmosphereTables, height_m: float, near: bool, *, progress: Callable[[float], None] | None = None
+    tables: AtmosphereTables,
+    height_m: float,
+    near: bool,
+    *,
+    part: int | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> np.ndarray:
-    """Tabulate `diffuse_at_observer` by solar elevation; takes some seconds.
+    """Tabulate `diffuse_at_observer` by solar elevation; takes some seconds, a part a fraction of one.
 
     Parameters
     ----------
@@ -234,6 +239,8 @@ def diffuse_by_elevation(
         Height of the observer [m].
     near
         As in `diffuse_at_observer`.
+    part
+        A part of the table, see `elevation_table.PartedTable`.
     progress
         Called with the completed fraction.
 
@@ -245,7 +252,9 @@ def diffuse_by_elevation(
     view = observer_view(tables, height_m)
     samples = view.near if near else view.sky
     return tabulate_by_elevation(
-        lambda suns: diffuse_along(tables, samples, view.elevation_rad, suns, cumulative=near), progress=progress
+        lambda suns: diffuse_along(tables, samples, view.elevation_rad, suns, cumulative=near),
+        part=part,
+        progress=progress,
     )
 
 

@@ -33,6 +33,7 @@ from seasonscapes.sky.curved_rays import (
     sun_transfer,
     trace_curved_rays,
 )
+from seasonscapes.sky.elevation_table import PartedTable
 from seasonscapes.sky.ray_cells import CellSamples, local_sun_sine, sample_cells, scattering_per_m
 from seasonscapes.sky.sh_moments import (
     HARMONIC_ORDER,
@@ -75,7 +76,7 @@ class AtmosphereTables:
     atmosphere: Atmosphere
     sun_columns: SunColumns
     moments: ShMoments
-    diffuse_of: Callable[[float, bool], np.ndarray] | None = None
+    diffuse_of: Callable[[float, bool], np.ndarray | PartedTable] | None = None
 
 
 def _directions(horizon_rad: float) -> tuple[np.ndarray, np.ndarray]:

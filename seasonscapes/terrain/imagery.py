@@ -17,7 +17,7 @@ from seasonscapes.terrain.image_bands import Decoder, image_facts
 from seasonscapes.terrain.raster import read_raster
 from seasonscapes.terrain.raster_files import OWN_FOLDER, Confinement
 from seasonscapes.terrain.surface import Raster, Terrain, Texture, atlas_identity
-from seasonscapes.terrain.texels import texel_coordinates, texel_positions
+from seasonscapes.terrain.texels import covering_faces, face_gradients, texel_coordinates
 from seasonscapes.terrain.tile_files import path_list, read_tiles
 
 ENCODINGS = ("srgb", "linear")
@@ -121,17 +121,25 @@ def bake_imagery(terrain: Terrain, atlas: Atlas, image: Raster, *, gutter_px: in
     InputError
         The image covers none of the terrain.
     """
-    positions, face_id = texel_positions(terrain, atlas.width_px, atlas.height_px)
+    xy = texel_coordinates(terrain.uv, atlas.width_px, atlas.height_px)
+    face_id = covering_faces(xy, terrain.faces, atlas.width_px, atlas.height_px)
     values = np.zeros((atlas.height_px, atlas.width_px, 3), np.float32)
     weight = np.zeros((atlas.height_px, atlas.width_px), np.float32)
     pixels_of = pixel_map(terrain, image)
-    footprint = _face_footprints(terrain, atlas, pixels_of)
+    vertex_px = pixels_of(terrain.vertices)
+    gradients = face_gradients(vertex_px, terrain.faces, xy)
+    footprint = _footprints(*gradients[1:])
+    linear = _linear_on_faces(terrain, vertex_px, pixels_of)
+    if not linear:
+        gradients = face_gradients(terrain.vertices, terrain.faces, xy)
     pyramid = _pyramid(image.values, 1 + int(np.ceil(_mip_level(footprint).max())))
     texel = np.flatnonzero(face_id >= 0)
     for start in range(0, len(texel), _CHUNK):
         part = texel[start : start + _CHUNK]
-        pixel = pixels_of(positions.reshape(-1, 3)[part])
-        rgb, coverage = _filtered(pyramid, pixel, footprint[face_id.ravel()[part]])
+        face, (row, column) = face_id.ravel()[part], np.divmod(part, atlas.width_px)
+        origin, across, down = (each[face] for each in gradients)
+        place = origin + across * (column + 0.5)[:, None] + down * (row + 0.5)[:, None]
+        rgb, coverage = _filtered(pyramid, place if linear else pixels_of(place), footprint[face])
         values.reshape(-1, 3)[part], weight.ravel()[part] = rgb, coverage
     if not weight.any():
         raise InputError("imagery", "the image covers none of the terrain", cure="check the CRS of both files")
@@ -212,30 +220,30 @@ def _polynomial(coefficients: np.ndarray, e: np.ndarray, n: np.ndarray, u: np.nd
     return total
 
 
-def _face_footprints(terrain: Terrain, atlas: Atlas, pixels_of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Footprint ellipse of a texel of each face in the image, ``(F, 4)`` float32: major axis (x, y), its length, minor.
+def _linear_on_faces(terrain: Terrain, vertex_px: np.ndarray, pixels_of: Callable[[np.ndarray], np.ndarray]) -> bool:
+    """Whether image pixels are linear over the faces: they are, unless faces are many kilometres wide."""
+    corners = terrain.vertices[terrain.faces]
+    widest = np.argsort(np.ptp(corners[..., :2], axis=1).max(axis=1))[-1000:]
+    exact = pixels_of(corners[widest].mean(axis=1, dtype=np.float64))
+    error_px = np.abs(exact - vertex_px[terrain.faces[widest]].mean(axis=1))
+    return bool(error_px.max(initial=0.0) <= _MAX_FIT_ERROR_PX)
 
-    The lengths are the singular values of the map from texels to pixels.
+
+def _footprints(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Footprint ellipses of texels in the image, ``(F, 4)`` float32: major axis (x, y), its length, minor.
+
+    ``x`` and ``y`` ``(F, 2)`` are the changes of the pixel by column and row. The lengths are the singular values of the
+    map from texels to pixels.
     """
-    footprint = np.empty((len(terrain.faces), 4), np.float32)
-    texel_of = texel_coordinates(terrain.uv, atlas.width_px, atlas.height_px)
-    for start in range(0, len(terrain.faces), _CHUNK):
-        faces = terrain.faces[start : start + _CHUNK]
-        p = np.moveaxis(pixels_of(terrain.vertices[faces].reshape(-1, 3)).reshape(-1, 3, 2), 1, 0)
-        t = np.moveaxis(texel_of[faces], 1, 0)
-        p1, p2, t1, t2 = p[1] - p[0], p[2] - p[0], t[1] - t[0], t[2] - t[0]
-        determinant = (t1[:, 0] * t2[:, 1] - t1[:, 1] * t2[:, 0])[:, None]
-        # Faces of zero UV area cover no texel; their footprint only has to be finite.
-        determinant = np.where(determinant == 0.0, np.inf, determinant)
-        x, y = (p1 * t2[:, 1:] - p2 * t1[:, 1:]) / determinant, (p2 * t1[:, :1] - p1 * t2[:, :1]) / determinant
-        a, b, c = (np.sum(x * x, 1), np.sum(x * y, 1), np.sum(y * y, 1))
-        largest = (a + c + np.sqrt((a - c) ** 2 + 4.0 * b * b)) / 2.0
-        # Eigenvector of the 2 × 2 Gram matrix, from a row that does not vanish, mapped to the image.
-        vector = np.where((a >= c)[:, None], np.stack([largest - c, b], 1), np.stack([b, largest - a], 1))
-        vector = vector / np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-300)
-        footprint[start : start + len(faces), :2] = x * vector[:, :1] + y * vector[:, 1:]
-        footprint[start : start + len(faces), 2] = np.sqrt(largest)
-        footprint[start : start + len(faces), 3] = np.sqrt(np.maximum(a + c - largest, 0.0))
+    a, b, c = (np.sum(x * x, 1), np.sum(x * y, 1), np.sum(y * y, 1))
+    largest = (a + c + np.sqrt((a - c) ** 2 + 4.0 * b * b)) / 2.0
+    # Eigenvector of the 2 × 2 Gram matrix, from a row that does not vanish, mapped to the image.
+    vector = np.where((a >= c)[:, None], np.stack([largest - c, b], 1), np.stack([b, largest - a], 1))
+    vector = vector / np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-300)
+    footprint = np.empty((len(x), 4), np.float32)
+    footprint[:, :2] = x * vector[:, :1] + y * vector[:, 1:]
+    footprint[:, 2] = np.sqrt(largest)
+    footprint[:, 3] = np.sqrt(np.maximum(a + c - largest, 0.0))
     return footprint
 
 
@@ -258,14 +266,20 @@ def _pyramid(values: np.ndarray, most: int) -> list[np.ndarray]:
 
     A level is the 2 × 2 box mean of the previous one.
     """
-    known = np.isfinite(values).all(axis=2, keepdims=True)
-    levels: list[np.ndarray] = [np.concatenate([np.where(known, values, 0.0), known], axis=2).astype(np.float32)]
-    while max(levels[-1].shape[:2]) > 1 and len(levels) < most:
-        level = levels[-1]
+    height, width, channels = values.shape
+    known = np.asarray(np.isfinite(values).all(axis=2))
+    finest = np.zeros((height + 2 * _RIM_PX, width + 2 * _RIM_PX, channels + 1), np.float32)
+    inside = np.s_[_RIM_PX : _RIM_PX + height, _RIM_PX : _RIM_PX + width]
+    finest[inside][..., :-1] = values if known.all() else np.where(known[..., None], values, 0.0)
+    finest[inside][..., -1] = known
+    level: np.ndarray = finest[inside]
+    levels: list[np.ndarray] = [finest]
+    while max(level.shape[:2]) > 1 and len(levels) < most:
         level = np.pad(level, ((0, level.shape[0] % 2), (0, level.shape[1] % 2), (0, 0)))
         rows = level[0::2] + level[1::2]
-        levels.append((rows[:, 0::2] + rows[:, 1::2]) * np.float32(0.25))
-    return [np.pad(level, ((_RIM_PX, _RIM_PX), (_RIM_PX, _RIM_PX), (0, 0))) for level in levels]
+        level = (rows[:, 0::2] + rows[:, 1::2]) * np.float32(0.25)
+        levels.append(np.pad(level, ((_RIM_PX, _RIM_PX), (_RIM_PX, _RIM_PX), (0, 0))))
+    return levels
 
 
 def _filtered(pyramid: list[np.ndarray], pixel: np.ndarray, footprint: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -303,9 +317,17 @@ def _bilinear(level: np.ndarray, pixel: np.ndarray) -> np.ndarray:
     first = place.astype(np.int64)
     fx, fy = (place - first).astype(np.float32).T[..., None]
     flat, index = level.reshape(-1, level.shape[2]), first[:, 1] * width + first[:, 0]
-    upper = flat[index] * (1.0 - fx) + flat[index + 1] * fx
-    lower = flat[index + width] * (1.0 - fx) + flat[index + width + 1] * fx
-    return upper * (1.0 - fy) + lower * fy
+    rows = []
+    for corner in (index, index + width):
+        left, right = np.take(flat, corner, axis=0), np.take(flat, corner + 1, axis=0)
+        right -= left
+        right *= fx
+        right += left
+        rows.append(right)
+    rows[1] -= rows[0]
+    rows[1] *= fy
+    rows[1] += rows[0]
+    return rows[1]
 
 
 def dilate(texture: Texture, covered: np.ndarray, gutter_px: int) -> Texture:

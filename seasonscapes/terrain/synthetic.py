@@ -41,9 +41,6 @@ def alpine_massif(*, seed: int = 1912, size_m: float = 12000.0, spacing_m: float
     ValueError
         Another spacing, or a size outside 2000 to 12000 m or not an even multiple of the spacing.
     """
-    from affine import Affine
-    from pyproj import Transformer
-
     if spacing_m not in (15.0, 30.0, 60.0):
         raise ValueError(f"spacing_m: got {spacing_m}, expected 15, 30 or 60")
     if not 2000.0 <= size_m <= 12000.0 or size_m % (2.0 * spacing_m):
@@ -51,23 +48,47 @@ def alpine_massif(*, seed: int = 1912, size_m: float = 12000.0, spacing_m: float
     landform = relief(size_m / 2.0, spacing_m, seed)
     axis = (np.arange(landform.elevation.shape[0]) - (landform.elevation.shape[0] - 1) / 2.0) * spacing_m
     cover = ground_cover(landform, spacing_m, seed, axis, -axis)
-    to_map = Transformer.from_crs("EPSG:4326", CRS, always_xy=True, allow_ballpark=False)
-    east, north = to_map.transform(CENTRE_LONGITUDE_DEG, CENTRE_LATITUDE_DEG)
-    edge = axis[-1] + spacing_m / 2.0
-    transform = Affine(spacing_m, 0.0, east - edge, 0.0, -spacing_m, north + edge)
-    z = landform.elevation.astype(np.float32)
-    mean_height = cv2.GaussianBlur(z, (0, 0), 90.0 / spacing_m)
-    slope, northness = slope_and_northness(z, spacing_m)
-    return SyntheticMassif(
-        Raster(z[..., None], transform, CRS),
+    return massif_of(
+        landform.elevation.astype(np.float32),
         cover,
-        slope,
-        northness,
-        mean_height - z,
         landform.debris.astype(np.float32),
         landform.floor.shore_m.astype(np.float32),
-        seed,
-        spacing_m,
+        seed=seed,
+        spacing_m=spacing_m,
+    )
+
+
+def massif_of(
+    z: np.ndarray, cover: np.ndarray, debris: np.ndarray, shore_m: np.ndarray, *, seed: int, spacing_m: float
+) -> SyntheticMassif:
+    """Place maps of a massif on the Earth and derive the attributes of its surface.
+
+    Parameters
+    ----------
+    z
+        Heights ``(H, W)`` float32 [m].
+    cover, debris, shore_m
+        Maps ``(H, W)`` as in `SyntheticMassif`.
+    seed, spacing_m
+        Of the generator.
+
+    Returns
+    -------
+    SyntheticMassif
+        Centred at 46.55° N, 7.98° E.
+    """
+    from affine import Affine
+    from pyproj import Transformer
+
+    to_map = Transformer.from_crs("EPSG:4326", CRS, always_xy=True, allow_ballpark=False)
+    east, north = to_map.transform(CENTRE_LONGITUDE_DEG, CENTRE_LATITUDE_DEG)
+    edge = 0.5 * z.shape[0] * spacing_m
+    transform = Affine(spacing_m, 0.0, east - edge, 0.0, -spacing_m, north + edge)
+    mean_height = cv2.GaussianBlur(z, (0, 0), 90.0 / spacing_m)
+    slope, northness = slope_and_northness(z, spacing_m)
+    elevation = Raster(z[..., None], transform, CRS)
+    return SyntheticMassif(
+        elevation, cover, slope, northness, mean_height - z, debris, shore_m, seed=seed, spacing_m=spacing_m
     )
 
 
@@ -81,6 +102,7 @@ __all__ = [
     "alpine_albedo",
     "alpine_massif",
     "load_massif",
+    "massif_of",
     "save_massif",
     "snow_fraction",
     "snow_line_m",

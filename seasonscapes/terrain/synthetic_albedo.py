@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
+from math import cos, pi, sin
 
 import cv2
 import numpy as np
@@ -132,12 +134,13 @@ def _upsampled(field: np.ndarray, rows: slice, upsample: int, interpolation: int
 
 
 def _axes(massif: SyntheticMassif, rows: slice, upsample: int) -> tuple[np.ndarray, np.ndarray]:
-    """East of the columns ``(w,)`` and north of the rows ``(h,)`` [m] about the massif's centre."""
+    """East of the columns ``(w,)`` and north of the rows ``(h,)`` [m] about the massif's centre, float32 as all maps."""
     height, width = massif.cover.shape
     step = massif.spacing_m / upsample
     column = np.arange(width * upsample) + 0.5
     row = np.arange(rows.start * upsample, rows.stop * upsample) + 0.5
-    return column * step - 0.5 * width * massif.spacing_m, 0.5 * height * massif.spacing_m - row * step
+    east, north = column * step - 0.5 * width * massif.spacing_m, 0.5 * height * massif.spacing_m - row * step
+    return east.astype(np.float32), north.astype(np.float32)
 
 
 def _snow(massif: SyntheticMassif, day: float, rows: slice, upsample: int) -> np.ndarray:
@@ -148,12 +151,12 @@ def _snow(massif: SyntheticMassif, day: float, rows: slice, upsample: int) -> np
     patches = fractal_noise(massif.seed + 301, 420.0, east, north, octaves=7, gain=0.7)
     concavity = _upsampled(massif.concavity_m, rows, upsample, cv2.INTER_LINEAR)
     # The dependence of the snow line on aspect is largest in early summer and smallest in early winter.
-    contrast = 330.0 + 130.0 * np.sin(2.0 * np.pi * (day - 60.0) / _YEAR)
+    contrast = 330.0 + 130.0 * sin(2.0 * pi * (day - 60.0) / _YEAR)
     line = snow_line_m(day) - contrast * northness - 10.0 * np.clip(concavity, -12.0, 12.0) + 95.0 * patches
     accumulated = _smoothstep(-90.0, 130.0, z - line)
     # Slopes above about 55° shed snow, except on ledges; unresolved ledges retain 6 %.
     level = strata_level_m(z, east, north, massif.seed)
-    ledge = np.cos(level * (2.0 * np.pi / LEDGES_M[1]))
+    ledge = np.cos(level * np.float32(2.0 * pi / LEDGES_M[1]))
     retained = 1.0 - _smoothstep(
         44.0,
         60.0,
@@ -228,27 +231,31 @@ def _ground(massif: SyntheticMassif, day: float, rows: slice, upsample: int) -> 
     albedo = np.empty((*cover.shape, 3), np.float32)
     # Spring is later and autumn earlier by about 3 days per 100 m of height (Hopkins 1918: four days in 400 feet).
     delay_days = np.clip((z - 1500.0) * 0.030, -25.0, 30.0) + 4.0 * broad
-    spring_weight = 0.5 + 0.5 * np.cos(2.0 * np.pi * (day - 120.0) / _YEAR)
+    spring_weight = 0.5 + 0.5 * cos(2.0 * pi * (day - 120.0) / _YEAR)
     local_day = day + delay_days * (1.0 - 2.0 * spring_weight)
-    for kind in Cover:
+    constant = np.array([_CONSTANT_ALBEDO.get(kind, (0.0, 0.0, 0.0)) for kind in Cover], np.float32)
+    np.take(constant, cover, axis=0, out=albedo)
+    for kind, knots in _SEASONAL_ALBEDO.items():
         cells = cover == kind
-        if not cells.any():
-            continue
-        if kind in _SEASONAL_ALBEDO:
-            albedo[cells] = _periodic(local_day[cells], _SEASONAL_ALBEDO[kind])
-        else:
-            albedo[cells] = np.array(_CONSTANT_ALBEDO[kind], np.float32)
+        if cells.any():
+            albedo[cells] = _periodic(local_day[cells], knots)
     ice = cover == Cover.ICE
     if ice.any():
-        debris = _upsampled(massif.debris, rows, upsample, cv2.INTER_LINEAR)
-        dirt = np.clip(debris + 0.30 * grain + 0.45 * broad - 0.65, 0.0, 0.75) + 0.30 * _smoothstep(2700.0, 1500.0, z)
-        dirt = np.clip(dirt, 0.0, 0.92)[ice, None]
+        debris = _upsampled(massif.debris, rows, upsample, cv2.INTER_LINEAR)[ice]
+        height_m, fine, coarse = z[ice], grain[ice], broad[ice]
+        dirt = np.clip(debris + 0.30 * fine + 0.45 * coarse - 0.65, 0.0, 0.75)
+        dirt = np.clip(dirt + 0.30 * _smoothstep(2700.0, 1500.0, height_m), 0.0, 0.92)[:, None]
         # Crevasses and ogives are transverse to the flow, along contour lines.
-        crevasse = np.sin(z * (2.0 * np.pi / 11.0) + 2.5 * grain + 3.0 * broad)[ice, None]
+        crevasse = np.sin(height_m * (2.0 * pi / 11.0) + 2.5 * fine + 3.0 * coarse)[:, None]
         scree = np.array(_CONSTANT_ALBEDO[Cover.SCREE], np.float32)
         albedo[ice] = (albedo[ice] + dirt * (0.8 * scree - albedo[ice])) * (1.0 + 0.07 * crevasse)
     _add_texture(albedo, _Strip(cover, z, grain, broad, east, north), seed)
     return albedo, cover
+
+
+def _by_class(cover: np.ndarray, values: dict[Cover, float], *, otherwise: float = 0.0) -> np.ndarray:
+    """A value of each cell's class, ``(h, w)`` float32."""
+    return np.array([values.get(kind, otherwise) for kind in Cover], np.float32)[cover]
 
 
 def _add_texture(albedo: np.ndarray, strip: _Strip, seed: int) -> None:
@@ -266,16 +273,15 @@ def _add_texture(albedo: np.ndarray, strip: _Strip, seed: int) -> None:
         Cover.FIRN: 0.03,
         Cover.FIELD: 0.10,
     }
-    gain = np.zeros(cover.shape, np.float32)
-    for kind, amount in contrast.items():
-        gain[cover == kind] = amount
-    factor = np.exp(gain * grain + np.where(np.isin(cover, (Cover.FIRN, Cover.ICE)), 0.02, 0.10) * broad)
-    level = strata_level_m(strip.height_m, strip.east_m, strip.north_m, seed) + 8.0 * grain
-    bands = sum(np.sin(level * (2.0 * np.pi / period) + 0.8) for period in LEDGES_M)
-    factor *= np.where(cover == Cover.ROCK, np.exp(0.13 * bands), 1.0)
-    albedo *= factor[..., None]
-    rusty = np.where(np.isin(cover, (Cover.ROCK, Cover.SCREE)), 0.06 * broad, 0.0)[..., None]
-    albedo *= np.exp(rusty * np.array([1.0, 0.0, -1.0], np.float32))
+    of_class = partial(_by_class, cover)
+    exponent = of_class(contrast) * grain + of_class({Cover.FIRN: 0.02, Cover.ICE: 0.02}, otherwise=0.10) * broad
+    rock = cover == Cover.ROCK
+    level = (strata_level_m(strip.height_m, strip.east_m, strip.north_m, seed) + 8.0 * grain)[rock]
+    exponent[rock] += 0.13 * sum(np.sin(level * np.float32(2.0 * pi / period) + np.float32(0.8)) for period in LEDGES_M)
+    albedo *= np.exp(exponent)[..., None]
+    rusty = np.exp(of_class({Cover.ROCK: 0.06, Cover.SCREE: 0.06}) * broad)
+    albedo[..., 0] *= rusty
+    albedo[..., 2] /= rusty
     field = cover == Cover.FIELD
     if field.any():
         plots = np.sign(spline_noise(seed + 421, 260.0, strip.east_m, strip.north_m)) + np.sign(
@@ -314,14 +320,14 @@ def alpine_albedo(massif: SyntheticMassif, day_of_year: float, *, upsample: int 
     for rows in _strips(height):
         albedo, cover = _ground(massif, day_of_year, rows, upsample)
         snow = _snow(massif, day_of_year, rows, upsample)
-        visible = np.ones(cover.shape, np.float32)
-        for kind, fraction in _VISIBLE_SNOW.items():
-            visible[cover == kind] = fraction
+        visible = _by_class(cover, _VISIBLE_SNOW, otherwise=1.0)
         east, north = _axes(massif, rows, upsample)
-        ageing = 0.04 * fractal_noise(massif.seed + 501, 200.0, east, north, octaves=3)
-        snow_albedo = _snow_albedo(day_of_year) + ageing[..., None] * 0.35
+        ageing = 0.014 * fractal_noise(massif.seed + 501, 200.0, east, north, octaves=3)
+        snow_albedo = _snow_albedo(day_of_year) + ageing[..., None]
         weight = (snow * visible)[..., None]
-        result[rows.start * upsample : rows.stop * upsample] = albedo + weight * (snow_albedo - albedo)
+        snow_albedo -= albedo
+        snow_albedo *= weight
+        np.add(albedo, snow_albedo, out=result[rows.start * upsample : rows.stop * upsample])
     return np.clip(result, 0.01, 0.93, out=result)
 
 

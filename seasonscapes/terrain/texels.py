@@ -136,7 +136,7 @@ def texel_positions(terrain: Terrain, width: int, height: int) -> tuple[np.ndarr
     """
     xy = texel_coordinates(terrain.uv, width, height)
     face_id = covering_faces(xy, terrain.faces, width, height)
-    start_m, across, down = _face_gradients(terrain, xy)
+    start_m, across, down = face_gradients(terrain.vertices, terrain.faces, xy)
     positions = np.full((height, width, 3), np.nan, np.float32)
     flat, texel = positions.reshape(-1, 3), np.flatnonzero(face_id >= 0)
     for start in range(0, len(texel), _CHUNK_TEXELS):
@@ -146,18 +146,34 @@ def texel_positions(terrain: Terrain, width: int, height: int) -> tuple[np.ndarr
     return positions, face_id
 
 
-def _face_gradients(terrain: Terrain, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Over a face the position is linear in the texel: at texel coordinates 0, by column and by row, ``(F, 3)`` each [m]."""
-    corner, vertices = xy[terrain.faces[:, 0]], terrain.vertices.astype(np.float64)
+def face_gradients(values: np.ndarray, faces: np.ndarray, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Express a quantity that is linear over each face as a function of the texel.
+
+    Parameters
+    ----------
+    values
+        ``(V, C)`` at the vertices.
+    faces
+        ``(F, 3)`` vertex indices.
+    xy
+        ``(V, 2)`` column and row of the vertices [texels].
+
+    Returns
+    -------
+    start, across, down
+        ``(F, C)`` float64 each: the value at texel coordinates 0, and its change by column and by row.
+    """
+    values = np.asarray(values, np.float64)
     (t1, t2), (p1, p2) = (
-        [values[terrain.faces[:, k]] - values[terrain.faces[:, 0]] for k in (1, 2)] for values in (xy, vertices)
+        [array[faces[:, k]] - array[faces[:, 0]] for k in (1, 2)] for array in (np.asarray(xy, np.float64), values)
     )
     determinant = _cross(t1, t2)[:, None]
     # Faces of zero UV area cover no texel.
     determinant = np.where(determinant == 0.0, np.inf, determinant)
     across, down = (p1 * t2[:, 1:] - p2 * t1[:, 1:]) / determinant, (p2 * t1[:, :1] - p1 * t2[:, :1]) / determinant
-    start_m = vertices[terrain.faces[:, 0]] - across * corner[:, :1] - down * corner[:, 1:]
-    return start_m, across, down
+    corner = xy[faces[:, 0]]
+    start = values[faces[:, 0]] - across * corner[:, :1] - down * corner[:, 1:]
+    return start, across, down
 
 
 def covered_share(terrain: Terrain, weight: np.ndarray) -> float:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING
@@ -22,7 +22,7 @@ from seasonscapes.frames import LocalFrame
 from seasonscapes.progress import TaskProgress
 from seasonscapes.sky.atmosphere import Atmosphere
 from seasonscapes.sky.clear_sky import AtmosphereTables, atmosphere_tables, load_tables, save_tables
-from seasonscapes.sky.elevation_table import load_table, save_table
+from seasonscapes.sky.elevation_table import PARTS, PartedTable, load_table, save_table
 from seasonscapes.sky.ephemeris import LunarPosition, SolarPosition, moon_position, sun_position
 from seasonscapes.sky.illuminate import SkyEvaluators, illuminate
 from seasonscapes.sky.illumination import Illumination
@@ -190,8 +190,8 @@ def atmosphere_tables_in(
     workspace
         Where tables are kept.
     by_elevation
-        Also tabulate diffuse light over the sun's elevation for each observer height, which costs time and space once
-        and makes the sky of an instant quicker. Radiances differ by less than 0.3 % while the sun is above -12°.
+        Also tabulate diffuse light over the sun's elevation for each observer height, by parts as they are needed, which costs
+        time and space once and makes the sky of an instant quicker. Radiances differ by less than 0.3 % while the sun is above -12°.
     """
     tables: dict[Atmosphere, AtmosphereTables] = {}
 
@@ -213,25 +213,25 @@ def atmosphere_tables_in(
     return tables_of
 
 
-def _diffuse_in(workspace: Workspace, tables: AtmosphereTables) -> Callable[[float, bool], np.ndarray]:
-    cached: dict[tuple[float, bool], np.ndarray] = {}
+def _diffuse_in(workspace: Workspace, tables: AtmosphereTables) -> Callable[[float, bool], PartedTable]:
+    cached: dict[tuple[float, bool], PartedTable] = {}
     lock = Lock()  # the skies of sun and moon are computed in two threads
 
-    def diffuse_of(height_m: float, near: bool) -> np.ndarray:
-        key = (height_m, near)
+    def part_of(height_m: float, near: bool, part: int) -> np.ndarray:
         with lock:
-            if key not in cached:
-                cached[key] = build_once(
-                    workspace,
-                    "sky/diffuse",
-                    {"atmosphere": tables.atmosphere, "height_m": height_m, "near": near},
-                    code=_DIFFUSE_CODE,
-                    suffix=".npy",
-                    build=lambda: diffuse_by_elevation(tables, height_m, near),
-                    save=save_table,
-                    load=load_table,
-                )
-            return cached[key]
+            return build_once(
+                workspace,
+                "sky/diffuse",
+                {"atmosphere": tables.atmosphere, "height_m": height_m, "near": near, "part": part},
+                code=_DIFFUSE_CODE,
+                suffix=".npy",
+                build=lambda: diffuse_by_elevation(tables, height_m, near, part=part),
+                save=save_table,
+                load=load_table,
+            )
+
+    def diffuse_of(height_m: float, near: bool) -> PartedTable:
+        return cached.setdefault((height_m, near), PartedTable(partial(part_of, height_m, near)))
 
     return diffuse_of
 
@@ -372,14 +372,16 @@ def given_sun_in_frame(frame: LocalFrame, azimuth_deg: float, elevation_deg: flo
 def tabulate_illumination(
     place: Place, camera: Camera | Panorama, model: SkyModel, *, progress: TaskProgress | None = None
 ) -> None:
-    """Build the tables that `illumination_for_camera` uses with ``by_elevation``, before other processes need them."""
+    """Build all tables that `illumination_for_camera` uses with ``by_elevation``, before other processes need them."""
     if not isinstance(model, AtmosphereModel):
         return
     tables = atmosphere_tables_in(place.workspace, by_elevation=True)(atmosphere_from_model(model))
-    assert tables.diffuse_of is not None
+    diffuse_of = _diffuse_in(place.workspace, tables)
     camera_m = camera_geodetic(place, camera)[2]
     wanted = [(place.median_height_m, False), (camera_m, False), (camera_m, True)]
     for index, (height_m, near) in enumerate(wanted):
-        tables.diffuse_of(observer_view(tables, height_m).height_m, near)
-        if progress is not None:
-            progress((index + 1) / len(wanted))
+        table = diffuse_of(observer_view(tables, height_m).height_m, near)
+        for part in range(PARTS):
+            table.part(part)
+            if progress is not None:
+                progress((index + (part + 1) / PARTS) / len(wanted))

@@ -34,7 +34,7 @@ __all__ = ["MeshOptions", "Place", "find_scene", "ground_height_m", "load_place"
 
 # Includes the synthetic massif's own modules.
 _TERRAIN_CODE = ("workflows.terrain_building",)
-_MASSIF_CODE = ("terrain.synthetic",)
+_MASSIF_CODE = ("terrain.shipped_massif",)
 # The farthest sight on record, by refraction over the Alps and the Pyrenees, is some 440 km; pictures end far before.
 FARTHEST_CAMERA_KM = 200.0
 
@@ -291,9 +291,11 @@ def _massif(scene: SceneFile, workspace: Workspace) -> SyntheticMassif:
 
 def _generated_massif(declared: SyntheticElevation) -> SyntheticMassif:
     # Imported here, since the generator loads libraries that nothing else needs.
+    from seasonscapes.terrain.shipped_massif import shipped_massif
     from seasonscapes.terrain.synthetic import alpine_massif
 
-    return alpine_massif(seed=declared.seed, size_m=declared.size_m, spacing_m=declared.spacing_m)
+    wanted = {"seed": declared.seed, "size_m": declared.size_m, "spacing_m": declared.spacing_m}
+    return shipped_massif(**wanted) or alpine_massif(**wanted)
 
 
 def ground_height_m(place: Place, latitude_deg: float, longitude_deg: float, *, where: str) -> float:

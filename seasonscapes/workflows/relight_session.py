@@ -32,12 +32,7 @@ from seasonscapes.sky.illumination import Illumination
 from seasonscapes.sky.models import SkyModel
 from seasonscapes.terrain.surface import Texture
 from seasonscapes.workflows.albedo_sources import AlbedoFile, AlbedoSource, dated_albedos, snow_transition_between
-from seasonscapes.workflows.illumination import (
-    SunMoonPosition,
-    illumination_for_camera,
-    sky_model,
-    tabulate_illumination,
-)
+from seasonscapes.workflows.illumination import SunMoonPosition, illumination_for_camera, sky_model
 from seasonscapes.workflows.place import MeshOptions, Place, load_place, utc_at
 from seasonscapes.workflows.views import camera_for, view_with_terrain
 from seasonscapes.workspace import Workspace, artefact_key, build_once
@@ -216,7 +211,6 @@ def relight_session(
         amplify=amplify,
         progress=progress,
     )
-    tabulate_illumination(place, session.camera, session.sky, progress=task_progress(progress, "light of the sky"))
     session.by_elevation = True
     return session
 

@@ -15,7 +15,7 @@ import numpy as np
 from seasonscapes import __version__
 from seasonscapes.errors import InputError
 from seasonscapes.exposure import develop, exposure_ev100, photo_ev100
-from seasonscapes.progress import Progress, each_reported
+from seasonscapes.progress import Progress, each_reported, task_progress
 from seasonscapes.relighting.frame_file import (
     frame_header,
     frame_name,
@@ -204,7 +204,11 @@ def render_frames(
         results = map(task, times)
     else:
         from seasonscapes.cluster import run_on_cluster
+        from seasonscapes.workflows.illumination import tabulate_illumination
 
+        # Once, before every worker needs them.
+        told = task_progress(progress, "light of the sky")
+        tabulate_illumination(session.place, session.camera, session.sky, progress=told)
         results = run_on_cluster(cluster, task, times)
     return sum(record["rendered"] for record in each_reported(results, len(times), progress, "frames"))
 

@@ -1,0 +1,300 @@
+"""Light that land receives which is a height field, from its horizon: above it there is sky in every direction, below it land.
+
+From a point on a height field a direction that is free stays free when it is raised (Max 1988, doi:10.1007/BF01905562).
+What the point receives of the sky follows from its horizon at some azimuths, which bisection with few rays finds, and from
+integrals over elevation that are tabulated (cf. Dozier & Frew 1990, doi:10.1109/36.58986). What land it sees is told by
+rays below the horizon. Of as many rays distributed over the hemisphere most would tell nothing: they reach the sky far
+above the horizon.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from seasonscapes.rendering.backend import point3
+from seasonscapes.rendering.hemisphere_rays import ABSORBED, ESCAPED, LANES, RayScene, SurfacePoints
+from seasonscapes.rendering.sky_patches import SkyPatches
+from seasonscapes.rendering.sobol import hash_to_unit, hashed, uniform
+from seasonscapes.rendering.terrain_material import device_surface
+
+# Spacings of the table, which a processor's cache holds: its azimuths are means of three, between which all borders of
+# patches lie.
+_AZIMUTH_DEG, _ELEVATION_DEG = 1.5, 2.0
+# Bisections of the range between the surface's own plane and the zenith: cells of some 3°, shifted at random.
+_STEPS = 5
+_GOLDEN = 0.618034
+# Key of the random number stream, mixed into its hashes.
+_HORIZON = 107
+
+
+@dataclass(frozen=True)
+class SkyAbove:
+    """Integrals of a directional basis over the sky above an elevation, at tabulated azimuths.
+
+    Parameters
+    ----------
+    table
+        ``(azimuths, elevations, 2, r + 1)`` float32: of cos² and of sin · cos of the elevation, times r functions and 1.
+    """
+
+    table: np.ndarray
+
+
+def is_height_field(terrain: RayScene) -> bool:
+    """Whether a terrain is the surface of heights, without walls or overhangs."""
+    return device_surface(terrain.mi_terrain.bsdf()) is not None
+
+
+def sky_above(patches: SkyPatches, functions: np.ndarray) -> SkyAbove:
+    """Tabulate the integrals of functions of direction that are constant over patches.
+
+    Parameters
+    ----------
+    patches
+        The P patches.
+    functions
+        ``(P, r)`` values.
+
+    Returns
+    -------
+    SkyAbove
+        For `trace_horizons`.
+    """
+    elevation = np.radians(np.arange(-90.0, 90.0 + 0.5 * _ELEVATION_DEG, _ELEVATION_DEG))
+    upper, lower = np.radians(patches.edges_deg[:-1]), np.radians(patches.edges_deg[1:])
+    start = np.clip(elevation[:, None], lower, upper)
+
+    def antiderivatives(angle: np.ndarray) -> np.ndarray:
+        return np.stack([0.5 * angle + 0.25 * np.sin(2.0 * angle), 0.5 * np.sin(angle) ** 2])
+
+    # Of each row of patches, what lies above each elevation.
+    above = antiderivatives(np.broadcast_to(upper, start.shape)) - antiderivatives(start)
+    azimuth_deg = (np.arange(3 * round(360.0 / _AZIMUTH_DEG)) + 0.5) * _AZIMUTH_DEG / 3.0
+    patch = patches.offsets + (azimuth_deg[:, None] * patches.counts / 360.0).astype(int)
+    values = np.concatenate([functions, np.ones((len(functions), 1))], axis=1)[patch]
+    values = values.reshape(-1, 3, *values.shape[1:]).mean(axis=1)
+    return SkyAbove(np.einsum("ker,arf->aekf", above, values, optimize=True).astype(np.float32))
+
+
+@dataclass(frozen=True)
+class HorizonTransport:
+    """What N receivers on a height field see.
+
+    Parameters
+    ----------
+    coefficients
+        ``(N, r)`` float32: integrals over the visible sky of function × cosine of incidence / π.
+    sky_share
+        ``(N,)`` float32 share of the cosine-weighted hemisphere that is sky.
+    hit
+        ``(N, K)`` int32 cluster of faces that each of K rays below the horizon hits, negative for none.
+    ray_weight
+        ``(N, K)`` float32 share of the cosine-weighted hemisphere that each of these rays stands for.
+    """
+
+    coefficients: np.ndarray
+    sky_share: np.ndarray
+    hit: np.ndarray
+    ray_weight: np.ndarray
+
+
+def trace_horizons(
+    terrain: RayScene,
+    above: SkyAbove,
+    points: SurfacePoints,
+    weight: np.ndarray,
+    *,
+    azimuths: int,
+    land_rays: int,
+    turn: np.ndarray,
+    key: np.ndarray,
+    mi_face_cluster: Any,
+) -> HorizonTransport:
+    """Find the horizons of receivers on a height field, what they get from the sky, and the land that they see.
+
+    Parameters
+    ----------
+    terrain
+        The terrain; see `is_height_field`.
+    above
+        From `sky_above`, of r functions.
+    points
+        ``(N, S)`` surface points of N receivers.
+    weight
+        ``(N, S)`` their weights.
+    azimuths
+        Number of azimuths at which the horizon is searched, a power of two: evenly spaced, each from a point that is drawn in
+        proportion to its weight.
+    land_rays
+        Rays below the horizon at each azimuth.
+    turn
+        ``(N,)`` float32 offset of each receiver's azimuths, in spaces between them.
+    key
+        ``(N,)`` uint32 keys of the receivers' random numbers.
+    mi_face_cluster
+        ``mi.UInt32`` cluster of each face.
+
+    Returns
+    -------
+    HorizonTransport
+        Light from the sky, and rays to land.
+    """
+    count, samples = weight.shape
+    table = above.table.reshape(-1, above.table.shape[3])
+    sums = np.empty((count, table.shape[1]), np.float32)
+    hit = np.empty((count, azimuths * land_rays), np.int32)
+    ray_weight = np.empty(hit.shape, np.float32)
+    step = max(1, LANES // azimuths)
+    for start in range(0, count, step):
+        part = slice(start, start + step)
+        chosen = _drawn(weight[part], azimuths, key[part])
+        # All receivers at one azimuth after those at another: neighbouring rays are almost parallel.
+        flat = points[part].reshape(-1)[(np.arange(len(chosen)) * samples + chosen.T).ravel()]
+        lanes = _HorizonLanes(flat, azimuths, turn[part], key[part])
+        horizon, bound = lanes.horizon(terrain)
+        elevations, measure = lanes.towards_land(bound, land_rays)
+        rows = lanes.by_receiver([lanes.azimuth, horizon, lanes.along, lanes.upward, measure])
+        sums[part] = _integrals(table, azimuths, *(values.ravel() for values in rows[:4]))
+        land = [lanes.clusters(terrain, elevation, mi_face_cluster, measure > 0.0) for elevation in elevations]
+        hit[part] = np.stack(lanes.by_receiver(land), axis=-1).reshape(len(chosen), -1)
+        ray_weight[part] = np.repeat(rows[4] / np.float32(land_rays), land_rays, axis=1)
+    scale = weight.sum(axis=1, keepdims=True) * np.float32(2.0 / azimuths)
+    sums *= scale
+    ray_weight *= scale
+    return HorizonTransport(sums[:, :-1], sums[:, -1], hit, ray_weight)
+
+
+def _drawn(weight: np.ndarray, azimuths: int, key: np.ndarray) -> np.ndarray:
+    """Systematic sample ``(N, azimuths)`` of indices in proportion to weights ``(N, S)``."""
+    index = np.zeros((len(weight), azimuths), np.intp)
+    if weight.shape[1] == 1:
+        return index
+    total = np.cumsum(weight, axis=1, dtype=np.float32)
+    # Neighbouring azimuths use points that are far apart in the list (van der Corput's order).
+    bits = azimuths.bit_length() - 1
+    order = [int(f"{number:0{bits}b}"[::-1], 2) for number in range(azimuths)]
+    place = (np.array(order, np.float32) + hash_to_unit(key, _HORIZON)[:, None]) / azimuths * total[:, -1:]
+    for column in total[:, :-1].T:
+        index += place >= column[:, None]
+    return index
+
+
+class _HorizonLanes:
+    """Lanes on the device, one for each azimuth of each receiver, with a surface point ``points`` for each."""
+
+    def __init__(self, points: SurfacePoints, azimuths: int, turn: np.ndarray, key: np.ndarray) -> None:
+        import drjit as dr
+        import mitsuba as mi
+
+        self._azimuths = azimuths
+        receivers = dr.opaque(mi.UInt32, len(turn))
+        lane = dr.arange(mi.UInt32, len(points.origin))
+        number = lane // receivers
+        receiver = lane - number * receivers
+        turned = dr.gather(mi.Float, mi.Float((turn % 1.0).astype(np.float32)), receiver)
+        mi_key = hashed(hashed(dr.gather(mi.UInt32, mi.UInt32(key), receiver), _HORIZON), number)
+        self.azimuth = (mi.Float(number) + turned) * dr.opaque(mi.Float, 2.0 * np.pi / azimuths)
+        self._north_east = dr.sincos(self.azimuth)[::-1]
+        self._origin, normal = point3(points.origin), point3(points.normal)
+        north, east = self._north_east
+        self.along, self.upward = normal.x * east + normal.y * north, dr.maximum(normal.z, 1e-3)
+        self._plane = dr.atan2(-self.along, self.upward)
+        self._shift = uniform(mi_key)
+        # A lattice of place in the interval by azimuth (steps of the golden ratio) and by receiver: those whose azimuths are
+        # turned against each other have different elevations at them, too.
+        place = dr.gather(mi.Float, mi.Float((5.0 * turn % 1.0).astype(np.float32)), receiver)
+        place += mi.Float(number) * _GOLDEN
+        self._place = place - dr.floor(place)
+
+    def by_receiver(self, lanes: list[Any]) -> list[np.ndarray]:
+        """Values of lanes as arrays ``(N, azimuths)``."""
+        import drjit as dr
+
+        dr.eval(lanes)
+        return [np.ascontiguousarray(np.array(values).reshape(self._azimuths, -1).T) for values in lanes]
+
+    def horizon(self, terrain: RayScene) -> tuple[Any, Any]:
+        """Elevation of the horizon [rad], or of the point's own plane where that is higher, and what no land rises above."""
+        import drjit as dr
+        import mitsuba as mi
+
+        # Cells of equal height from the plane to the zenith, shifted by a random part of a cell: without it, all horizons
+        # of a slope would be rounded to the same ones.
+        cell = (0.5 * np.pi - self._plane) / (2**_STEPS - 1)
+        below = mi.Float(0.0)
+        for bit in reversed(range(_STEPS)):
+            border = below + float(2**bit)
+            elevation = self._plane + (border - self._shift) * cell
+            inside = (elevation > self._plane) & (elevation < 0.5 * np.pi)
+            hidden = terrain.mi_scene.ray_test(self._ray(elevation), active=inside) | (elevation <= self._plane)
+            below = dr.select(hidden, border, below)
+        horizon, bound = (
+            dr.clip(self._plane + (below + place - self._shift) * cell, self._plane, 0.5 * np.pi)
+            for place in (0.5, 1.0)
+        )
+        dr.eval(horizon, bound)
+        return horizon, bound
+
+    def towards_land(self, bound: Any, count: int) -> tuple[list[Any], Any]:
+        """Elevations of rays between plane and bound, distributed by the cosine of incidence, and the integral of that."""
+        import drjit as dr
+
+        start = self._integral(self._plane)
+        measure = dr.maximum(self._integral(bound) - start, 0.0)
+        elevations = []
+        for number in range(count):
+            wanted = start + measure * ((number + self._place) / count)
+            low, high = self._plane, bound
+            for _ in range(8):
+                middle = 0.5 * (low + high)
+                beyond = self._integral(middle) > wanted
+                low, high = dr.select(beyond, low, middle), dr.select(beyond, middle, high)
+            elevations.append(0.5 * (low + high))
+        return elevations, measure
+
+    def clusters(self, terrain: RayScene, elevation: Any, mi_face_cluster: Any, active: Any) -> Any:
+        """Cluster ``mi.Int32`` that rays at elevations hit; `ESCAPED` or `ABSORBED` for none."""
+        import drjit as dr
+        import mitsuba as mi
+
+        ray = self._ray(elevation)
+        found = terrain.mi_scene.ray_intersect_preliminary(ray, active=active)
+        interaction = found.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
+        cluster = mi.Int32(dr.gather(mi.UInt32, mi_face_cluster, found.prim_index, found.is_valid()))
+        front = dr.dot(interaction.n, ray.d) < 0.0
+        return dr.select(found.is_valid(), dr.select(front, cluster, ABSORBED), ESCAPED)
+
+    def _ray(self, elevation: Any) -> Any:
+        import drjit as dr
+        import mitsuba as mi
+
+        sine, cosine = dr.sincos(elevation)
+        north, east = self._north_east
+        return mi.Ray3f(self._origin, mi.Vector3f(east * cosine, north * cosine, sine))
+
+    def _integral(self, elevation: Any) -> Any:
+        """Antiderivative over elevation of cosine of incidence × cosine of elevation."""
+        import drjit as dr
+
+        sine, cosine = dr.sincos(elevation)
+        return self.along * 0.5 * (elevation + sine * cosine) + self.upward * 0.5 * sine * sine
+
+
+def _integrals(
+    table: np.ndarray, azimuths: int, azimuth: np.ndarray, horizon: np.ndarray, along: np.ndarray, upward: np.ndarray
+) -> np.ndarray:
+    """Sums ``(N, r + 1)`` over the azimuths of tabulated integrals above horizons, linear between tabulated elevations."""
+    from scipy import sparse
+
+    columns, elevations = round(360.0 / _AZIMUTH_DEG), round(180.0 / _ELEVATION_DEG) + 1
+    column = np.minimum((azimuth * np.float32(np.degrees(1.0) / _AZIMUTH_DEG)).astype(np.int32), columns - 1)
+    place = (horizon * np.float32(np.degrees(1.0)) + np.float32(90.0)) / np.float32(_ELEVATION_DEG)
+    lower = np.clip(place.astype(np.int32), 0, elevations - 2)
+    share = place - lower
+    index = ((column * elevations + lower) * 2)[:, None] + np.arange(4, dtype=np.int32)
+    weight = np.stack([along * (1.0 - share), upward * (1.0 - share), along * share, upward * share], axis=1)
+    start = np.arange(0, weight.size + 1, 4 * azimuths, dtype=np.int32)
+    return sparse.csr_array((weight.ravel(), index.ravel(), start), shape=(len(start) - 1, len(table))) @ table
