@@ -369,7 +369,7 @@ class Splats:
         world, seed = self.bench.world, self.bench.world.seed
         set_albedo(self.bench.judge.scene, albedo)
         own = surfel_albedo(self.surfels, albedo)
-        around = neighbourhood_mean(self.surfels.means, own, self.surfels.grid.spacing_m)
+        around = neighbourhood_mean(self.surfels.means, own, self.surfels.spacing_m)
         received = surfel_irradiance(world.bare, self.surfels, self.lights, rays=64, seed=seed)
         targets = surface_targets(self.states, [0] * len(self.states), own[None], received)
         appearance = Appearance(

@@ -189,7 +189,7 @@ LIGHTS = [light(100.0, 12.0), light(180.0, 40.0), light(250.0, 25.0)]
 
 def appearance(hill, kind: str = "full", *, seed: int = 0, times: int = 3) -> Appearance:
     _, surfels, _, albedo, transport = hill
-    around = neighbourhood_mean(surfels.means, albedo, surfels.grid.spacing_m)
+    around = neighbourhood_mean(surfels.means, albedo, surfels.spacing_m)
     return Appearance(
         kind, albedo[None], around[None], transport, fourier_embedding(surfels.means), times=times, seed=seed
     )

@@ -178,7 +178,7 @@ def trace_disc_transport(
         progress=lambda fraction: report(0.4 + 0.4 * fraction),
     )
     device_points = upload_points(ray_scene, traced)
-    surroundings = neighbourhood_mean(surfels.means, albedo, surfels.grid.spacing_m).mean(axis=1)
+    surroundings = neighbourhood_mean(surfels.means, albedo, surfels.spacing_m).mean(axis=1)
 
     def reflected(light: Illumination) -> np.ndarray:
         return irradiance(device_points, light, sun_rays_per_point=1).bounce.mean(axis=1)
@@ -249,7 +249,7 @@ def _bounce_coefficients(reflected: Callable[[Illumination], np.ndarray]) -> np.
     return np.concatenate([coefficients, reflected(uniform_sky(1.0 / np.pi))[None]])
 
 
-def neighbourhood_mean(means: np.ndarray, albedo: np.ndarray, spacing_m: float) -> np.ndarray:
+def neighbourhood_mean(means: np.ndarray, albedo: np.ndarray, spacing_m: float | np.ndarray) -> np.ndarray:
     """Average the albedo of discs over their surroundings, with a Gaussian of `NEIGHBOURHOOD_SIGMA_M`.
 
     Parameters
@@ -259,7 +259,7 @@ def neighbourhood_mean(means: np.ndarray, albedo: np.ndarray, spacing_m: float) 
     albedo
         ``(N, 3)``.
     spacing_m
-        Distance of the discs [m].
+        Distance of neighbouring discs [m], ``(N,)`` or one for all.
 
     Returns
     -------

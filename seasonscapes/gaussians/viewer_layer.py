@@ -55,7 +55,7 @@ def viewer_layer(model: GaussianModel) -> tuple[dict[str, Any], dict[str, np.nda
         )
     learned = model.appearance
     # The learned gains of colour belong to all that the albedo is multiplied with, but not to the surroundings' mean.
-    surroundings = [neighbourhood_mean(model.means, values, model.grid.spacing_m) for values in model.albedo]
+    surroundings = [neighbourhood_mean(model.means, values, model.spacing_m) for values in model.albedo]
     transport = model.transport
     arrays: dict[str, np.ndarray] = {
         "means": model.means.astype(np.float32),

@@ -314,7 +314,7 @@ def distillation_data(
     extent_m = float(np.ptp(place.terrain.vertices[:, :2], axis=0).max())
     surfels = terrain_surfels(place.terrain, extent_m / options.discs)
     albedo = np.stack([surfel_albedo(surfels, texture) for texture in textures])
-    around = np.stack([neighbourhood_mean(surfels.means, each, surfels.grid.spacing_m) for each in albedo])
+    around = np.stack([neighbourhood_mean(surfels.means, each, surfels.spacing_m) for each in albedo])
     seasons = [number % len(days) for number in range(options.suns)]
     lights, times = draw_lights(place, model, [days[season] for season in seasons], seed=seed, progress=progress)
     received = np.empty((options.suns, len(surfels.means), 3), np.float32)
