@@ -116,7 +116,7 @@ def test_changes_are_the_same_in_torch_in_numpy_and_on_disk(hill, refined, tmp_p
     for one, other in zip(_covariances(again), _covariances(model), strict=True):
         assert np.abs(one - other).max() < 0.03 * np.abs(other).max()
     np.testing.assert_allclose(again.opacity_logits, model.opacity_logits, atol=0.05)
-    assert bytes_per_gaussian(model) < 108.0
+    assert bytes_per_gaussian(model) < 176.0
     with pytest.raises(ValueError, match="log_scales do not follow"):
         save_model(replace(model, log_scales=model.log_scales + 0.1), tmp_path / "other.safetensors")
 

@@ -213,8 +213,9 @@ def test_discs_lie_on_the_terrain_and_close_it(hill):
     height = 160.0 * np.exp(-(surfels.means[:, 0] ** 2 + (surfels.means[:, 1] - 80.0) ** 2) / 180.0**2)
     assert np.abs(surfels.means[:, 2] - height).max() < 4.0
     turned = axes_from_quaternions(surfels.quaternions.astype(np.float64))
-    unit = surfels.normals / np.linalg.norm(surfels.normals, axis=1, keepdims=True)
-    np.testing.assert_allclose(turned[..., 2], unit, atol=1e-5)
+    np.testing.assert_allclose(turned[..., 2], surfels.facing, atol=1e-5)
+    # The plane of the mesh, which the smooth normals follow to some hundredths.
+    np.testing.assert_allclose(surfels.facing, surfels.normals, atol=0.05)
     splats = splats_from(surfels.means, surfels.quaternions, surfels.log_scales, surfels.opacity_logits)
     coverage = view_weights(splats, looking_down(size=96, view_m=700.0), subpixels=2).coverage
     assert coverage.min() > 0.8
@@ -345,7 +346,7 @@ def model(hill, told) -> GaussianModel:
 
 
 def test_model_survives_its_file(model, tmp_path):
-    """Packed into bytes and read back: the same colours within a hundredth, at 100 bytes for each Gaussian."""
+    """Packed into bytes and read back: the same colours within a hundredth, at 168 bytes for each Gaussian."""
     save_model(model, tmp_path / "hill.safetensors")
     again = load_model(tmp_path / "hill.safetensors")
     np.testing.assert_allclose(again.means, model.means, atol=0.01)
@@ -357,7 +358,7 @@ def test_model_survives_its_file(model, tmp_path):
     for each in LIGHTS:
         before, after = model_colours(model, each, 100.0)[0], model_colours(again, each, 100.0)[0]
         assert np.sqrt(np.mean((after - before) ** 2)) < 0.01 * before.mean()
-    assert bytes_per_gaussian(model) <= 100.5
+    assert bytes_per_gaussian(model) <= 168.5
     (tmp_path / "other.safetensors").write_bytes(b"no")
     with pytest.raises(InputError, match="not a safetensors file"):
         load_model(tmp_path / "other.safetensors")
@@ -513,7 +514,9 @@ def test_distill_leaves_a_model_and_views(distilled):
     assert made.note["scene"] == "hill"
     assert not model.with_suffix(".checkpoint.safetensors").exists()
     views, _ = read_transforms(model.parent / "views" / "transforms.json")
-    assert len(views) == 4
+    # Four hours from the scene's camera and from the one around the terrain.
+    assert len(views) == 8
+    assert made.level.max() > 0
     assert all((model.parent / "views" / view.file).is_file() for view in views)
 
 

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 class DistilOptionsOfLight:
     """Of --appearance physical."""
 
+    disc_px: float | None = None
+    """Largest side of a disc in pictures of --view-px from the scene's cameras [px], default 2; 0: all of one size."""
     suns: int | None = None
     """Instants to train on, at random hours of the dates' days; default 32."""
     dates: int | None = None
@@ -44,6 +46,7 @@ class DistilOptionsOfLight:
         from seasonscapes.workflows.distillation import KINDS, DistilOptions
 
         how = {
+            "disc_px": 2.0,
             "suns": 32,
             "dates": 4,
             "views": 6,
@@ -55,6 +58,7 @@ class DistilOptionsOfLight:
         how |= {name: getattr(self, name) for name in how if getattr(self, name) is not None}
         check_choice("--kind", how["kind"], KINDS)
         limits = {
+            "disc_px": (0, 64),
             "suns": (1, 512),
             "dates": (1, 24),
             "views": (0, 64),

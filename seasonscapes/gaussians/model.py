@@ -1,6 +1,6 @@
 """Relightable Gaussian model: known geometry, traced light transport, learned corrections; and its file format.
 
-A file takes about 111 bytes per Gaussian. Values that follow from the grid are not stored: the horizontal position of a
+A file takes about 175 bytes per Gaussian. Values that follow from the grid are not stored: the horizontal position of a
 disc is its cell, and its rotation and size follow from its plane, up to the changes that training made. All other values
 are quantised, to one byte where possible.
 """
@@ -33,7 +33,7 @@ from seasonscapes.gaussians.surfels import (
 from seasonscapes.images import atomic_path
 from seasonscapes.terrain.attributes import attributes_at
 
-FORMAT = "seasonscapes gaussians 1"
+FORMAT = "seasonscapes gaussians 2"
 # Learned parameters of each disc and the range of their quantisation; values beyond it are clipped.
 _RANGES = {"log_colour": (-1.0, 1.0), "log_gain": (-2.0, 2.0), "shift": (-0.1, 0.1), "log_softness": (-6.2, -1.0)} | {
     f"geometry.{name}": (-limit, limit) for name, (_, limit) in CHANGES.items()
