@@ -322,7 +322,10 @@ def distillation_data(
     near = _near_cameras(place, options)
     if near:
         first = mi_mesh(place.terrain, textures[0])
-        place_m, side_m = footprints(RenderScene(ray_scene(first).mi_scene, first), near)
+        stage = RenderScene(ray_scene(first).mi_scene, first)
+        seen = [footprints(stage, [camera]) for camera in near]
+        near = [camera for camera, (places, _) in zip(near, seen, strict=True) if len(places)]
+        place_m, side_m = (np.concatenate(column) for column in zip(*seen, strict=True))
         surfels = refined_surfels(place.terrain, surfels, place_m, options.disc_px * side_m)
     albedo = np.stack([surfel_albedo(surfels, texture) for texture in textures])
     around = np.stack([neighbourhood_mean(surfels.means, each, surfels.spacing_m) for each in albedo])
