@@ -5,13 +5,13 @@ import pytest
 
 pytest.importorskip("torch")
 
-from test_rendering import heightfield, looking_down  # noqa: E402
+from test_rendering import heightfield, looking_down
 
-from seasonscapes.gaussians.disc_cells import cell_centres_m, packed_cells, unpacked_cells  # noqa: E402
-from seasonscapes.gaussians.disc_density import footprints, refined_surfels  # noqa: E402
-from seasonscapes.gaussians.surfels import plane_normals, terrain_surfels  # noqa: E402
-from seasonscapes.rendering.hemisphere_rays import ray_scene  # noqa: E402
-from seasonscapes.rendering.mitsuba_scene import RenderScene, mi_mesh  # noqa: E402
+from seasonscapes.gaussians.disc_cells import cell_centres_m, packed_cells, unpacked_cells
+from seasonscapes.gaussians.disc_density import footprints, refined_surfels
+from seasonscapes.gaussians.surfels import plane_normals, terrain_surfels
+from seasonscapes.rendering.hemisphere_rays import ray_scene
+from seasonscapes.rendering.mitsuba_scene import RenderScene, mi_mesh
 
 
 @pytest.fixture(scope="module")
