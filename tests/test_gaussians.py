@@ -13,7 +13,8 @@ import places  # noqa: E402
 from PIL import Image  # noqa: E402
 from test_rendering import FRAME, heightfield, looking_down, sun_at  # noqa: E402
 
-from seasonscapes.cameras.exchange import NamedView, read_colmap, read_transforms  # noqa: E402
+from seasonscapes.cameras.camera_models import read_camera_models  # noqa: E402
+from seasonscapes.cameras.exchange import NamedView, read_transforms  # noqa: E402
 from seasonscapes.cameras.pinhole import Camera, rotation_from_angles  # noqa: E402
 from seasonscapes.cli import main  # noqa: E402
 from seasonscapes.errors import InputError, NoTerrainInView  # noqa: E402
@@ -471,8 +472,9 @@ def test_training_views_are_read_back(hill, tmp_path):
     record = json.loads((tmp_path / "transforms.json").read_text())["frames"][0]
     assert record["timestamp_utc"] == "2024-06-21T10:30:00Z"
     np.testing.assert_allclose(record["sun_enu"], LIGHTS[0].sun.direction, atol=1e-6)
-    (colmap,) = read_colmap(tmp_path / "sparse" / "0")
-    np.testing.assert_allclose(colmap.camera.world_from_camera, camera.world_from_camera, atol=1e-6)
+    (colmap,) = read_camera_models(tmp_path / "sparse" / "0", "colmap")
+    np.testing.assert_allclose(colmap.rotation, camera.world_from_camera[:3, :3], atol=1e-6)
+    np.testing.assert_allclose(colmap.position, camera.position_m, atol=1e-6)
     assert len((tmp_path / "sparse" / "0" / "points3D.txt").read_text().splitlines()) == 1 + 24 * 24
     # COLMAP looks for images below a folder that it is given; nerfstudio beside transforms.json.
     assert (again.file, colmap.name) == ("images/noon.png", "noon.png")
