@@ -67,6 +67,8 @@ class DistilOptionsOfLight:
         }
         for name, (low, high) in limits.items():
             check_range(f"--{name.replace('_', '-')}", how[name], low, high)
+        if self.disc_px and not how["views"]:
+            raise InputError("--disc-px", "there are no images whose pixels discs could follow", cure="ask for --views")
         if self.refine_discs and not (how["views"] and how["picture_steps"]):
             raise InputError(
                 "--refine-discs", "there are no images to refine from", cure="ask for --views and --picture-steps"
