@@ -36,7 +36,7 @@ def viewer_layer(model: GaussianModel) -> tuple[dict[str, Any], dict[str, np.nda
     about : dict
         Plain values: kind, days of the year of the dated albedos, ranges of the quantised values, limits of rasterisation.
     arrays : dict of numpy.ndarray
-        uint8, float16 and float32 arrays, some 170 bytes for each Gaussian.
+        uint8, float16 and float32 arrays, some 230 bytes for each Gaussian.
 
     Raises
     ------
@@ -49,7 +49,7 @@ def viewer_layer(model: GaussianModel) -> tuple[dict[str, Any], dict[str, np.nda
             "--gaussians", "the page cannot light it", got=f"kind {model.kind}", expected=", ".join(_SHIFTS)
         )
     if count > MOST_DISCS:
-        cure = "distil with fewer --discs"
+        cure = "distil with fewer --discs, or larger ones: --disc-px"
         raise InputError(
             "--gaussians", "more than a page draws", got=count, expected=f"at most {MOST_DISCS}", cure=cure
         )
