@@ -131,12 +131,14 @@ def stages(bench: Bench) -> tuple[dict[str, dict], dict]:
 
 
 def distilled(bench: Bench, albedo: np.ndarray, rows: dict[str, dict]) -> None:
-    """Rows of Gaussians that learned from the true albedo, and from the found one."""
+    """Rows of Gaussians that learned from the true albedo, from the found one, and from pictures too."""
     splats, held = Splats(bench), bench.world.held_hours
     print(f"    {len(splats.surfels.means)} Gaussians", file=sys.stderr)
     rows["distil alone (true albedo)"] = bench.judge.scores(splats.views(bench.world.albedo), held)
     rows["all, distilled, held-out hours"] = bench.judge.scores(splats.views(albedo), held)
-    bench.clock.tell("distilled twice")
+    pictured = splats.views(bench.world.albedo, refined=True)
+    rows["distil alone, refined from pictures"] = bench.judge.scores(pictured, held)
+    bench.clock.tell("distilled three times")
 
 
 def distilling_alone(bench: Bench) -> dict[str, dict]:

@@ -342,10 +342,10 @@ class Bench:
 
 
 class Splats:
-    """Gaussians distilled from an albedo under suns of other days, as `seasonscapes distill` makes them.
+    """Gaussians distilled from an albedo under suns of other days; discs and their light transport are made once.
 
-    Their discs are as fine as the judged webcams' pixels are on the ground; pictures to learn from are those of the painting
-    webcams' views and of cameras around the land. No picture of a judged webcam or of the judged day is used.
+    Discs are as fine as the judged webcams' pixels are on the ground. ``refined`` ones learn from pictures too, those of the
+    painting webcams' views and of cameras around the land. No picture of a judged webcam or of the judged day is used.
     """
 
     def __init__(self, bench: Bench):
@@ -371,7 +371,7 @@ class Splats:
         seen = [camera for panorama in world.painting for camera in split_panorama(panorama)]
         self.cameras = seen + overview_cameras(world.terrain, 6, size_px=world.size.judged_px[1])
 
-    def views(self, albedo: np.ndarray, *, refined: bool = True) -> Callable[[int, datetime], np.ndarray]:
+    def views(self, albedo: np.ndarray, *, refined: bool = False) -> Callable[[int, datetime], np.ndarray]:
         """Views of the Gaussians that an albedo was distilled into."""
         from seasonscapes.gaussians.appearance import Appearance, fourier_embedding
         from seasonscapes.gaussians.disc_geometry import DiscGeometry
