@@ -9,6 +9,9 @@ interpolation. The rasters are four of 2.5 to 10 m below ``--data`` (default: th
 lattice of 60 m, is no truth about finer relief: its gains (``massif_…``) are printed beside, and stand for the others only
 where there are none.
 
+Beside sunny photographs of a webcam, plain and amplified pictures of the same instants are compared by how their detail falls off
+towards the pixel (`detail_photograph`): ``photograph_gain`` is 1 where the amplified ones are like photographs.
+
 A place of 60 × 50 km is made on the spot, and a picture by a camera 2 m above its ground taken in a fresh process and
 workspace with ``--amplify``: ``first_picture_s`` is its wall time, ``peak_gb`` its largest memory, ``near_texel_px`` the
 largest size of an element of the albedo in the lowest rows of the picture. ``--quick`` renders it at 768 × 512 instead of
@@ -33,6 +36,7 @@ import cv2
 import numpy as np
 import rasterio
 from affine import Affine
+from detail_photograph import photograph_gains
 from record import ROOT, write_record
 
 from seasonscapes.rendering.albedo_detail import finest_detail_m
@@ -260,6 +264,7 @@ def main() -> None:
     figures |= {f"massif_{key}": value for key, value in massif.items()}
     figures |= {"rasters": len(real), "snow_albedo_error": snow_error(), "fresnel_error": fresnel_error()}
     with tempfile.TemporaryDirectory() as folder:
+        figures |= photograph_gains(options.data, Path(folder), 352 if options.quick else 704)
         figures |= first_picture(Path(folder), seed, (768, 512) if options.quick else (1536, 1024))
     for key, value in figures.items():
         print(f"{key:28} {value:.4g}")

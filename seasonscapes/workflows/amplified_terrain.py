@@ -35,14 +35,12 @@ _MOST_FACTOR = 8
 _TOLERANCE_PX, _REACH_M = 1.0, 2000.0
 # Up to the first height above ground a camera stands on it, from the second one up it does not [m].
 _STANDING_M, _FREE_M = 20.0, 100.0
-# How far the surface is looked at to find the ground below a camera [m].
-_BELOW_M = 20.0
 
 log = logging.getLogger(__name__)
 
 
-def amplified_terrain(place: Place, view: Camera | Panorama, *, seed: int = 0) -> Terrain:
-    """Add detail below the resolution of the data to the terrain of a view.
+def amplified_view(place: Place, view: Camera | Panorama, *, seed: int = 0) -> tuple[Camera | Panorama, Terrain]:
+    """Add detail below the resolution of the data to the ground of a view.
 
     Parameters
     ----------
@@ -55,50 +53,40 @@ def amplified_terrain(place: Place, view: Camera | Panorama, *, seed: int = 0) -
 
     Returns
     -------
-    Terrain
+    view
+        Raised or lowered by what detail adds to the ground below it, so that its height above ground stays; the same one
+        where that is more than 100 m.
+    terrain
         With the atlas of the place: its surface is finer everywhere, and finest about the camera, where the mesh follows it;
         its albedo has detail down to the pixels. Means over the data's cells stay.
     """
-    eye_m, pixel_rad = view.position_m, 1.0 / float(view.fx)
     terrain = place.terrain
     if terrain.surface is not None:
-        terrain = replace(terrain, surface=_surface(place, eye_m, seed))
+        fine = _surface(place, np.asarray(view.position_m, float), seed)
+        view, terrain = _at_its_height(view, terrain.surface, fine), replace(terrain, surface=fine)
+    eye_m, pixel_rad = view.position_m, 1.0 / float(view.fx)
     east, north, up = (float(value) for value in eye_m)
     detail = AlbedoDetail((east, north, up), pixel_rad, place.atlas.texel_p50_m, seed)
     terrain = refined_for_view(terrain, eye_m, pixel_rad, tolerance_px=_TOLERANCE_PX, reach_m=_REACH_M)
-    return replace(terrain, detail=detail)
+    return view, replace(terrain, detail=detail)
 
 
-def on_amplified_ground(place: Place, view: Camera | Panorama, *, seed: int = 0) -> Camera | Panorama:
-    """Raise or lower a camera that stands on the ground by what detail adds below it, so that its height above ground stays.
-
-    Parameters
-    ----------
-    place, view, seed
-        See `amplified_terrain`.
-
-    Returns
-    -------
-    Camera or Panorama
-        The same one where it is more than 100 m above the ground.
-    """
-    surface = place.terrain.surface
-    if surface is None:
-        return view
+def _at_its_height(view: Camera | Panorama, plain: SurfaceGrid, fine: SurfaceGrid) -> Camera | Panorama:
     eye_m = np.asarray(view.position_m, float)
-    ground_m = float(surface.up_at(eye_m[None])[0])
+    ground_m, finer_m = (float(surface.up_at(eye_m[None])[0]) for surface in (plain, fine))
     share = np.clip((_FREE_M - (eye_m[2] - ground_m)) / (_FREE_M - _STANDING_M), 0.0, 1.0)
     if share == 0.0:
         return view
-    added_m = float(_surface(place, eye_m, seed, near_m=_BELOW_M).up_at(eye_m[None])[0]) - ground_m
     pose = np.array(view.world_from_camera, float)
-    pose[2, 3] += share * added_m
-    log.info("the camera keeps its height above ground: detail changes the ground below it by %+.2f m", added_m)
+    pose[2, 3] += share * (finer_m - ground_m)
+    log.info(
+        "the camera keeps its height above ground: detail changes the ground below it by %+.2f m", finer_m - ground_m
+    )
     return replace(view, world_from_camera=pose)
 
 
-def _surface(place: Place, eye_m: np.ndarray, seed: int, *, near_m: float = _NEAR_M) -> SurfaceGrid:
-    """Amplified surface of the place with a finer part about a camera, which reaches so far."""
+def _surface(place: Place, eye_m: np.ndarray, seed: int) -> SurfaceGrid:
+    """Amplified surface of the place with a finer part about a camera."""
     assert place.terrain.surface is not None
     spacing_m, error_m = sample_spacing_m(place.elevation), place.terrain.surface.mesh_error_m
     factor = 1
@@ -121,17 +109,13 @@ def _surface(place: Place, eye_m: np.ndarray, seed: int, *, near_m: float = _NEA
     latitude, longitude, _ = geodetic_from_enu(place.frame, eye_m)
     column, row = (int(value) for value in raster_pixels(place.elevation, latitude, longitude).ravel())
     rows, columns = place.elevation.values.shape[:2]
-    usual, reach = (max(8, round(distance / spacing_m)) for distance in (_NEAR_M, near_m))
+    reach = max(8, round(_NEAR_M / spacing_m))
     if not (-reach < row < rows + reach and -reach < column < columns + reach):
         return whole
     part = tuple(slice(max(at - reach, 0), min(at + reach, size)) for at, size in ((row, rows), (column, columns)))
     if min(each.stop - each.start for each in part) < 8:
         return whole
-    # As fine as the part of the usual reach, whatever this one's.
-    near, cells = (
-        factor,
-        math.prod(min(at + usual, size) - max(at - usual, 0) for at, size in ((row, rows), (column, columns))),
-    )
+    near, cells = factor, math.prod(each.stop - each.start for each in part)
     while cells * (2 * near) ** 2 <= _MOST_NEAR_NODES and spacing_m / (2 * near) >= _LEAST_NEAR_M:
         near *= 2
     if near == factor:

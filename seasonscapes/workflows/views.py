@@ -142,22 +142,25 @@ def calibrated_viewpoint(path: Path) -> tuple[NamedCamera, tuple[int, int]]:
     return validate(table, NamedCamera, where=path), (camera.width_px, camera.height_px)
 
 
-def terrain_for_view(
-    place: Place, view: Camera | Panorama, *, lambertian: bool = False, amplify: bool = False
-) -> Terrain:
-    """The terrain of a place, refined near a camera until its error is a quarter of a pixel.
-
-    ``lambertian``: without surfaces that are not matt. ``amplify``: with detail below the resolution of the data; see
-    `workflows.amplified_terrain`.
-    """
+def terrain_for_view(place: Place, view: Camera | Panorama) -> Terrain:
+    """The terrain of a place, refined near a camera until its error is a quarter of a pixel."""
     from seasonscapes.terrain.view_refinement import refined_for_view
-    from seasonscapes.workflows.amplified_terrain import amplified_terrain
 
-    if amplify:
-        terrain = amplified_terrain(place, view)
-    else:
-        terrain = refined_for_view(place.terrain, view.position_m, 1.0 / float(view.fx))
-    return replace(terrain, water=None, snow=None, forest=False) if lambertian else terrain
+    return refined_for_view(place.terrain, view.position_m, 1.0 / float(view.fx))
+
+
+def view_with_terrain(
+    place: Place, view: Camera | Panorama, *, lambertian: bool = False, amplify: bool = False
+) -> tuple[Camera | Panorama, Terrain]:
+    """A camera and the terrain that it is to render.
+
+    ``lambertian``: without surfaces that are not matt. ``amplify``: with detail below the resolution of the data, on
+    which the camera keeps its height above ground; see `workflows.amplified_terrain`.
+    """
+    from seasonscapes.workflows.amplified_terrain import amplified_view
+
+    view, terrain = amplified_view(place, view) if amplify else (view, terrain_for_view(place, view))
+    return view, replace(terrain, water=None, snow=None, forest=False) if lambertian else terrain
 
 
 def camera_geodetic(place: Place, view: Camera | Panorama) -> tuple[float, float, float]:
