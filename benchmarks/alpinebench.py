@@ -1,7 +1,7 @@
 """From webcams to relit pictures, against the truth: what each stage loses, what all lose together, what each idea earns.
 
     python benchmarks/alpinebench.py [--quick] [--size tiny|quick|small|medium|large] [--place massif|jungfrau]
-                                     [--seed N] [--json FILE] [--figures FOLDER]
+                                     [--seed N] [--only distil] [--json FILE] [--figures FOLDER]
 
 A place whose albedo, light and poses are known is photographed by panoramic webcams at full physics, and degraded as
 webcams do (auto exposure, white balance, tone curve, noise, JPEG, haze; poses of GPS and compass, calibrated from clicked
@@ -117,10 +117,7 @@ def stages(bench: Bench) -> tuple[dict[str, dict], dict]:
     textures = {at: bench.fused(paintings[at].texture, at, told[at], sigma / albedo[..., 1]) for at in painted}
     rows["all, painted hours"] = judge.scores(lambda c, at: judge.of_texture(textures[at], c, at), painted)
     bench.clock.tell("calibrated, painted, completed")
-    splats = Splats(bench)
-    rows["distil alone (true albedo)"] = judge.scores(splats.views(world.albedo), held)
-    rows["all, distilled, held-out hours"] = judge.scores(splats.views(albedo), held)
-    bench.clock.tell("distilled twice")
+    distilled(bench, albedo, rows)
     return rows, {
         "paintings": paintings,
         "told": told,
@@ -131,6 +128,28 @@ def stages(bench: Bench) -> tuple[dict[str, dict], dict]:
         "seen": seen,
         "relit": relit,
     }
+
+
+def distilled(bench: Bench, albedo: np.ndarray, rows: dict[str, dict]) -> None:
+    """Rows of Gaussians that learned from the true albedo, from the found one, and from pictures too."""
+    splats, held = Splats(bench), bench.world.held_hours
+    print(f"    {len(splats.surfels.means)} Gaussians", file=sys.stderr)
+    rows["distil alone (true albedo)"] = bench.judge.scores(splats.views(bench.world.albedo), held)
+    rows["all, distilled, held-out hours"] = bench.judge.scores(splats.views(albedo), held)
+    pictured = splats.views(bench.world.albedo, refined=True)
+    rows["distil alone, refined from pictures"] = bench.judge.scores(pictured, held)
+    bench.clock.tell("distilled three times")
+
+
+def distilling_alone(bench: Bench) -> dict[str, dict]:
+    """What `stages` says of Gaussians, and of the relit albedos that they are compared with."""
+    world, judge, rows = bench.world, bench.judge, Rows()
+    rows["relight (true albedo)"] = judge.scores(judge.of_albedo(world.albedo), world.held_hours)
+    albedo, _ = bench.completed_albedo(bench.solved())
+    rows["all, held-out hours"] = judge.scores(judge.of_albedo(albedo), world.held_hours)
+    bench.clock.tell("albedo, relit")
+    distilled(bench, albedo, rows)
+    return rows
 
 
 def satellite_view(bench: Bench) -> Callable:
@@ -371,6 +390,7 @@ def main() -> None:
     parser.add_argument("--size", choices=tuple(SIZES), default="small")
     parser.add_argument("--place", choices=("massif", "jungfrau"), default="massif")
     parser.add_argument("--seed", type=int, default=None)
+    parser.add_argument("--only", choices=("distil",), help="this stage alone, with the albedo that it needs")
     parser.add_argument("--json", type=Path, default=None)
     parser.add_argument("--figures", type=Path, default=None)
     arguments = parser.parse_args()
@@ -385,6 +405,12 @@ def main() -> None:
     if why is None and not lpips_sources()["published"]:
         print("LPIPS is by other weights than the published ones: not comparable", file=sys.stderr)
     bench = Bench(seed, "quick" if arguments.quick else arguments.size, None if why else load_lpips(), data)
+    if arguments.only:
+        rows = distilling_alone(bench)
+        print_stages(rows)
+        numbers = {f"stage_{key_of(name)}_{key}": value for name, row in rows.items() for key, value in row.items()}
+        write_record(arguments.json, numbers, seed=seed)
+        return
     rows, whole = stages(bench)
     print_stages(rows)
     painted_rows, held_rows = ablations(bench, whole)

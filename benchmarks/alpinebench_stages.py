@@ -36,6 +36,7 @@ from seasonscapes.albedo.painted_textures import REPEATED, painted_photograph
 from seasonscapes.albedo.photographs import EIGHT_BIT, LINEAR, AlbedoPhotograph, prepare_photographs
 from seasonscapes.albedo.texture_delighting import delight_textures
 from seasonscapes.albedo.tone_curve import fit_tone_curve, with_tone_curve
+from seasonscapes.cameras.panorama import split_panorama
 from seasonscapes.evaluation.masks import terrain_mask
 from seasonscapes.evaluation.metrics import score
 from seasonscapes.evaluation.synthetic_webcams import SyntheticPicture
@@ -79,6 +80,8 @@ LESSONS = (
     ("2024-10-08", 13.5),
 )
 NEAR_M = 60.0
+# Largest side of a disc, in pixels of the judged webcams.
+DISC_PX = 2.0
 
 
 class Judge:
@@ -339,16 +342,25 @@ class Bench:
 
 
 class Splats:
-    """Gaussians distilled from an albedo under suns of other days; discs and their light transport are made once."""
+    """Gaussians distilled from an albedo under suns of other days; discs and their light transport are made once.
+
+    Discs are as fine as the judged webcams' pixels are on the ground. ``refined`` ones learn from pictures too, those of the
+    painting webcams' views and of cameras around the land. No picture of a judged webcam or of the judged day is used.
+    """
 
     def __init__(self, bench: Bench):
+        from seasonscapes.gaussians.disc_density import footprints, refined_surfels
         from seasonscapes.gaussians.disc_transport import light_state, trace_disc_transport
         from seasonscapes.gaussians.rasterise import set_torch_threads
         from seasonscapes.gaussians.surfels import surfel_albedo, terrain_surfels
+        from seasonscapes.gaussians.training_views import overview_cameras
 
         set_torch_threads(1)
         self.bench, world = bench, bench.world
-        self.surfels = terrain_surfels(world.terrain, world.size.disc_m)
+        stage = RenderScene(world.bare.mi_scene, world.bare.mi_terrain)
+        place_m, side_m = footprints(stage, world.judged)
+        coarse = terrain_surfels(world.terrain, world.size.disc_m)
+        self.surfels = refined_surfels(world.terrain, coarse, place_m, DISC_PX * side_m)
         set_albedo(bench.judge.scene, world.albedo)
         self.transport = trace_disc_transport(
             world.bare, self.surfels, surfel_albedo(self.surfels, world.albedo), rays=64, seed=world.seed
@@ -356,20 +368,24 @@ class Splats:
         times = [hours(day, hour)[0] for day, hour in LESSONS]
         self.lights = [row[0] for row in lights_for(times, world.painting[:1], world.sky, default_workspace())]
         self.states = [light_state(self.transport, light, DAY_OF_YEAR) for light in self.lights]
+        seen = [camera for panorama in world.painting for camera in split_panorama(panorama)]
+        self.cameras = seen + overview_cameras(world.terrain, 6, size_px=world.size.judged_px[1])
 
-    def views(self, albedo: np.ndarray) -> Callable[[int, datetime], np.ndarray]:
+    def views(self, albedo: np.ndarray, *, refined: bool = False) -> Callable[[int, datetime], np.ndarray]:
         """Views of the Gaussians that an albedo was distilled into."""
         from seasonscapes.gaussians.appearance import Appearance, fourier_embedding
+        from seasonscapes.gaussians.disc_geometry import DiscGeometry
         from seasonscapes.gaussians.disc_transport import neighbourhood_mean, surfel_irradiance
         from seasonscapes.gaussians.model import model_from
         from seasonscapes.gaussians.splat_view import learned_parameters, model_weights, render_model
         from seasonscapes.gaussians.surfels import surfel_albedo
         from seasonscapes.gaussians.training import Schedule, surface_targets, train
+        from seasonscapes.gaussians.training_views import relit_frames
 
         world, seed = self.bench.world, self.bench.world.seed
         set_albedo(self.bench.judge.scene, albedo)
         own = surfel_albedo(self.surfels, albedo)
-        around = neighbourhood_mean(self.surfels.means, own, self.surfels.grid.spacing_m)
+        around = neighbourhood_mean(self.surfels.means, own, self.surfels.spacing_m)
         received = surfel_irradiance(world.bare, self.surfels, self.lights, rays=64, seed=seed)
         targets = surface_targets(self.states, [0] * len(self.states), own[None], received)
         appearance = Appearance(
@@ -381,7 +397,12 @@ class Splats:
             times=len(self.states),
             seed=seed,
         )
-        train(appearance, targets, schedule=Schedule(surface_steps=600), seed=seed)
+        frames = []
+        if refined:
+            instants = [(n, *pair) for n, pair in enumerate(zip(self.lights, self.states, strict=True))]
+            frames = relit_frames(world.bare, self.surfels, self.cameras, instants, seed=seed)
+            appearance.refine(DiscGeometry(self.surfels))
+        train(appearance, targets, frames, Schedule(surface_steps=600, picture_steps=96), seed=seed)
         model = model_from(
             self.surfels, own[None], [DAY_OF_YEAR], self.transport, learned_parameters(appearance), frame=world.frame
         )

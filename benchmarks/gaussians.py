@@ -215,7 +215,7 @@ class Contest:
         start = time.perf_counter()
         self.surfels = terrain_surfels(scene.terrain, scene.spacing_m)
         self.albedo = surfel_albedo(self.surfels, scene.albedo(SUMMER_DAY))
-        self.around = neighbourhood_mean(self.surfels.means, self.albedo, self.surfels.grid.spacing_m)
+        self.around = neighbourhood_mean(self.surfels.means, self.albedo, self.surfels.spacing_m)
         self.transport = trace_disc_transport(scene.ray_scene, self.surfels, self.albedo, rays=64, seed=seed)
         self.seconds["transport"] = time.perf_counter() - start
         self.lights, days = scene.lights(sizes.suns + sizes.held_out)
@@ -373,7 +373,7 @@ def seasons(contest: Contest, appearance) -> dict[str, float]:
     scene, surfels = contest.scene, contest.surfels
     true = {day: scene.albedo(day) for day in SPRING_DAYS}
     dated = np.stack([surfel_albedo(surfels, true[day]) for day in (SPRING_DAYS[0], SPRING_DAYS[2])])
-    ground = attributes_at(surfels.means, surfels.normals, surfels.grid.spacing_m)
+    ground = attributes_at(surfels.means, surfels.normals, surfels.spacing_m)
     weights = contest.weights_of(appearance)
     result, held = {}, (appearance.albedo, appearance.neighbourhood_albedo)
     for number, day in enumerate(SPRING_DAYS):
@@ -384,7 +384,7 @@ def seasons(contest: Contest, appearance) -> dict[str, float]:
         if number == 1:
             guesses["_mean"] = dated.mean(axis=0)
         for name, albedo in guesses.items():
-            around = neighbourhood_mean(surfels.means, albedo, surfels.grid.spacing_m)
+            around = neighbourhood_mean(surfels.means, albedo, surfels.spacing_m)
             appearance.albedo, appearance.neighbourhood_albedo = (
                 torch.as_tensor(albedo)[None],
                 torch.as_tensor(around)[None],

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
+from seasonscapes.cameras.camera_models import read_camera_models
 from seasonscapes.cameras.exchange import (
     NamedView,
     camera_from_opencv,
     opencv_from_camera,
-    read_colmap,
     read_opencv,
     read_transforms,
     write_colmap,
@@ -62,8 +62,10 @@ def test_colmap_and_nerfstudio_come_back(tmp_path):
     write_transforms(tmp_path / "transforms.json", views, FRAME)
     back, frame = read_transforms(tmp_path / "transforms.json")
     assert frame == FRAME
-    for view, colmap, nerf in zip(views, read_colmap(tmp_path / "sparse"), back, strict=True):
-        same(view.camera, colmap.camera)
+    for view, colmap, nerf in zip(views, read_camera_models(tmp_path / "sparse", "colmap"), back, strict=True):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = colmap.rotation, colmap.position
+        same(view.camera, Camera(*colmap.size_px, colmap.fx, colmap.fy, colmap.cx, colmap.cy, pose))
         same(view.camera, nerf.camera)
         assert colmap.name == view.file
         assert (nerf.name, nerf.file, nerf.time) == (view.name, view.file, view.time)
@@ -122,32 +124,12 @@ def test_opencv_projects_the_same_points_with_distortion(tmp_path):
         ),
         ("transforms.json", "[]", "not a JSON object"),
         ("transforms.json", "{", "not valid JSON"),
-        ("cameras.txt", "1 OPENCV 10 10 5 5 5 5 0 0 0 0\n", "camera model OPENCV has distortion"),
-        ("cameras.txt", "# ids\n1 PINHOLE 10 10 5 5 5\n", r"cameras.txt: line 2: wrong number of PINHOLE .* got 3"),
-        ("cameras.txt", "1 SIMPLE_PINHOLE 10 10\n", r"line 1: wrong number of SIMPLE_PINHOLE .* got 0; expected 3"),
-        ("cameras.txt", "1 PINHOLE\n", r"cameras.txt: line 1: too few values"),
-        ("cameras.txt", "1 PINHOLE 10 10 5 5 5 wide\n", r"cameras.txt: line 1: not a number: .*wide"),
     ],
 )
 def test_foreign_files_that_do_not_fit_say_so(tmp_path, name, text, message):
     (tmp_path / name).write_text(text)
     with pytest.raises(InputError, match=message):
-        read_transforms(tmp_path / name) if name.endswith("json") else read_colmap(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ("1 1 0 0 0 0 0 0 2 a.jpg", r"images.txt: line 3: no such camera in cameras.txt; got '2'"),
-        ("1 1 0 0 0 0 0 0 1", r"images.txt: line 3: too few values for an image; got 9"),
-        ("1 1 0 0 east 0 0 0 1 a.jpg", r"images.txt: line 3: not a number"),
-    ],
-)
-def test_images_that_do_not_fit_are_named_by_file_and_line(tmp_path, line, message):
-    (tmp_path / "cameras.txt").write_text("1 PINHOLE 10 10 5 5 5 5\n")
-    (tmp_path / "images.txt").write_text(f"1 1 0 0 0 0 0 0 1 first.jpg\n\n{line}\n\n")
-    with pytest.raises(InputError, match=message):
-        read_colmap(tmp_path)
+        read_transforms(tmp_path / name)
 
 
 def test_stretching_and_back_is_the_identity_and_the_steps_are_those_measured():

@@ -23,7 +23,22 @@ def held_out(tmp_path_factory):
     """A place, a model of relit pictures of all suns but one, and the views and pictures of that one."""
     folder = tmp_path_factory.mktemp("codes")
     scene, views = places.write_place(folder / "scene"), folder / "views"
-    flags = ["--discs", "48", "--sky", "hosek", "--suns", "9", "--views", "2", "--view-px", "64", "--steps", "1"]
+    flags = [
+        "--discs",
+        "48",
+        "--sky",
+        "hosek",
+        "--suns",
+        "9",
+        "--disc-px",
+        "0",
+        "--views",
+        "2",
+        "--view-px",
+        "64",
+        "--steps",
+        "1",
+    ]
     flags += ["--picture-steps", "0", "--no-refine-discs", "--seed", "3", "--export-views", str(views)]
     flags += ["-o", str(folder / "relit.safetensors"), "--workspace", str(folder / "work")]
     assert main(["distill", str(scene), *flags]) == 0

@@ -31,6 +31,7 @@ _RELIT = (
     "--dates",
     "--views",
     "--view-px",
+    "--disc-px",
     "--picture-steps",
     "--kind",
     "--refine-discs",

@@ -23,7 +23,22 @@ def exported(tmp_path_factory):
     folder = tmp_path_factory.mktemp("views")
     scene, views = places.write_place(folder / "scene"), folder / "views"
     common = ["--workspace", str(folder / "work"), "--discs", "24"]
-    small = ["--sky", "hosek", "--suns", "2", "--views", "2", "--view-px", "32", "--steps", "4", "--picture-steps", "0"]
+    small = [
+        "--sky",
+        "hosek",
+        "--suns",
+        "2",
+        "--disc-px",
+        "0",
+        "--views",
+        "2",
+        "--view-px",
+        "32",
+        "--steps",
+        "4",
+        "--picture-steps",
+        "0",
+    ]
     model = str(folder / "m.safetensors")
     small += ["--no-refine-discs", "--export-views", str(views)]
     assert main(["distill", str(scene), "-o", model, *small, *common]) == 0

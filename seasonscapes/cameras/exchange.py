@@ -1,4 +1,4 @@
-"""Import and export of cameras: COLMAP text models, nerfstudio's ``transforms.json``, OpenCV.
+"""Import and export of cameras: nerfstudio's ``transforms.json``, OpenCV; COLMAP text models, which `camera_models` reads.
 
 Poses are written in the scene's local east-north-up frame [m]; ``transforms.json`` also stores the frame's origin and
 refraction coefficient and the time of each image, so that views remain georeferenced.
@@ -90,84 +90,6 @@ def write_colmap(folder: Path, views: Sequence[NamedView], *, image_folder: str 
         images += [f"{number} {' '.join(repr(float(v)) for v in pose)} {number} {name}", ""]
     for name, lines in (("cameras.txt", cameras), ("images.txt", images), ("points3D.txt", ["# empty"])):
         _write_text(folder / name, "\n".join(lines) + "\n")
-
-
-def read_colmap(folder: Path) -> list[NamedView]:
-    """Read the views of a COLMAP text model.
-
-    Parameters
-    ----------
-    folder
-        Folder of ``cameras.txt`` and ``images.txt``.
-
-    Returns
-    -------
-    list of NamedView
-        Views in the order of ``images.txt``, without local frame.
-
-    Raises
-    ------
-    InputError
-        A file is missing, a camera model is neither PINHOLE nor SIMPLE_PINHOLE, a line is not in the format, or an
-        image has an unknown camera; the message names file and line.
-    """
-    from scipy.spatial.transform import Rotation
-
-    intrinsics: dict[str, tuple[int, int, float, float, float, float]] = {}
-    for where, line in _lines(folder / "cameras.txt"):
-        number, *fields = line.split()
-        intrinsics[number] = _colmap_intrinsics(fields, where)
-    views = []
-    # Every second line lists 2-D points and may be blank: blank lines must be kept until lines are paired.
-    for where, line in _lines(folder / "images.txt", keep_blank=True)[::2]:
-        if not line.strip():
-            continue
-        fields = line.split(maxsplit=9)
-        if len(fields) < 10:
-            raise InputError(where, "too few values for an image", got=len(fields), expected="10")
-        _, *values, number, name = fields
-        w, x, y, z, *translation = _floats(values, where)
-        if number not in intrinsics:
-            raise InputError(where, "no such camera in cameras.txt", got=number)
-        pose = np.eye(4)
-        try:
-            pose[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix().T
-            pose[:3, 3] = -pose[:3, :3] @ translation
-            views.append(NamedView(name, Camera(*intrinsics[number], pose), name))
-        except ValueError as error:
-            raise InputError(where, f"not a view: {error}") from None
-    return views
-
-
-def _colmap_intrinsics(fields: list[str], where: str) -> tuple[int, int, float, float, float, float]:
-    """Width, height, fx, fy, cx and cy from the fields of a line of ``cameras.txt`` after the camera's number."""
-    if len(fields) < 3:
-        raise InputError(where, "too few values for a camera")
-    model = fields[0]
-    parameters = {"PINHOLE": 4, "SIMPLE_PINHOLE": 3}
-    if model not in parameters:
-        raise InputError(
-            where,
-            f"camera model {model} has distortion",
-            expected="PINHOLE",
-            cure="undistort the images first (colmap image_undistorter)",
-        )
-    count = len(fields) - 3
-    if count != parameters[model]:
-        raise InputError(where, f"wrong number of {model} parameters", got=count, expected=str(parameters[model]))
-    width, height, *numbers = _floats(fields[1:], where)
-    fx, fy, cx, cy = numbers if model == "PINHOLE" else (numbers[0], *numbers)
-    return int(width), int(height), fx, fy, cx, cy
-
-
-def _floats(fields: list[str], where: str) -> list[float]:
-    try:
-        numbers = [float(field) for field in fields]
-    except ValueError as error:
-        raise InputError(where, f"not a number: {error}") from None
-    if not np.isfinite(numbers).all():
-        raise InputError(where, "a number that is not finite", got=" ".join(fields))
-    return numbers
 
 
 def write_transforms(path: Path, views: Sequence[NamedView], frame: LocalFrame) -> None:
@@ -444,13 +366,3 @@ def read_json(path: Path) -> dict[str, Any]:
 def _write_text(path: Path, text: str) -> None:
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
-
-
-def _lines(path: Path, *, keep_blank: bool = False) -> list[tuple[str, str]]:
-    """Lines of a file that are no comments, each with file name and line number for messages."""
-    rows = enumerate(text_files.read_text(path).splitlines(), 1)
-    return [
-        (f"{path}: line {number}", row)
-        for number, row in rows
-        if not row.startswith("#") and (keep_blank or row.strip())
-    ]

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 class DistilOptionsOfLight:
     """Of --appearance physical."""
 
+    disc_px: float | None = None
+    """Largest side of a disc in pictures of --view-px from the scene's cameras [px], default 2; 0: all of one size."""
     suns: int | None = None
     """Instants to train on, at random hours of the dates' days; default 32."""
     dates: int | None = None
@@ -44,6 +46,7 @@ class DistilOptionsOfLight:
         from seasonscapes.workflows.distillation import KINDS, DistilOptions
 
         how = {
+            "disc_px": 2.0,
             "suns": 32,
             "dates": 4,
             "views": 6,
@@ -55,6 +58,7 @@ class DistilOptionsOfLight:
         how |= {name: getattr(self, name) for name in how if getattr(self, name) is not None}
         check_choice("--kind", how["kind"], KINDS)
         limits = {
+            "disc_px": (0, 64),
             "suns": (1, 512),
             "dates": (1, 24),
             "views": (0, 64),
@@ -63,6 +67,8 @@ class DistilOptionsOfLight:
         }
         for name, (low, high) in limits.items():
             check_range(f"--{name.replace('_', '-')}", how[name], low, high)
+        if self.disc_px and not how["views"]:
+            raise InputError("--disc-px", "there are no images whose pixels discs could follow", cure="ask for --views")
         if self.refine_discs and not (how["views"] and how["picture_steps"]):
             raise InputError(
                 "--refine-discs", "there are no images to refine from", cure="ask for --views and --picture-steps"

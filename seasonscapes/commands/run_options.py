@@ -81,6 +81,7 @@ class RunEffort:
         # A run's model is smaller than the one that `distill` makes.
         return DistilOptions(
             discs=self.discs,
+            disc_px=0.0,
             suns=24 if self.suns is None else self.suns,
             views=3 if self.views is None else self.views,
             steps=1500 if self.steps is None else self.steps,

@@ -41,14 +41,14 @@ class DiscGeometry(nn.Module):
 
     def __init__(self, surfels: Surfels) -> None:
         super().__init__()
-        self.spacing_m = surfels.grid.spacing_m
+        self.spacing_m = torch.as_tensor(surfels.spacing_m)[:, None]
         self.base = Splats(
             *(
                 torch.as_tensor(values)
                 for values in (surfels.means, surfels.quaternions, surfels.log_scales, surfels.opacity_logits)
             )
         )
-        self.axes, self.normals = rotations(self.base.quaternions), torch.as_tensor(surfels.normals)
+        self.axes, self.facing = rotations(self.base.quaternions), torch.as_tensor(surfels.facing)
         self.offset, self.stretch, self.twist, self.opacity = (
             nn.Parameter(torch.zeros(len(surfels.means), columns)) for columns, _ in CHANGES.values()
         )
@@ -58,7 +58,7 @@ class DiscGeometry(nn.Module):
         base = self.base
         means = base.means + self.spacing_m * torch.einsum("nij,nj->ni", self.axes, self.offset)
         log_scales = base.log_scales + nn.functional.pad(self.stretch, (0, 1))
-        away = ((means.detach() - torch.as_tensor(camera.position_m.astype(np.float32))) * self.normals).sum(1) > 0.0
+        away = ((means.detach() - torch.as_tensor(camera.position_m.astype(np.float32))) * self.facing).sum(1) > 0.0
         logits = torch.where(away, -20.0, base.opacity_logits + self.opacity[:, 0])
         return Splats(means, turned(base.quaternions, self.twist[:, 0]), log_scales, logits)
 

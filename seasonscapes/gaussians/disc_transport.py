@@ -1,6 +1,6 @@
 """Light transport of discs on the terrain: horizon, sky coefficients and interreflection, traced once for any light.
 
-* sun and moon: elevation of the horizon in 64 azimuths, one byte each; a soft edge accounts for the disc's extent;
+* sun and moon: elevation of the horizon in 128 azimuths, one byte each; a soft edge accounts for the disc's extent;
 * sky: coefficients in a small basis of directions (`rendering.direction_basis`), one byte each;
 * bounce: light reflected by terrain of unit albedo, as a linear polynomial in the sun's direction and for a grey sky;
   it is multiplied by the mean albedo of the surroundings.
@@ -23,14 +23,14 @@ if TYPE_CHECKING:
     from seasonscapes.rendering.coefficients import PointCoefficients
     from seasonscapes.rendering.hemisphere_rays import RayScene
 
-AZIMUTHS = 64
+AZIMUTHS = 128
 HORIZON_RANGE_RAD = (-0.02, 1.29)
 # Number of sky coefficients per disc.
 SKY_RANK = 8
 # Standard deviation of the Gaussian that averages albedo around a disc, for the colour of interreflection [m].
 NEIGHBOURHOOD_SIGMA_M = 300.0
-# Initial softness of the horizon [rad]: the sun's radius and half a step of the table.
-SOFTNESS_RAD = 0.012
+# Initial softness of the horizon [rad]: the sun's radius. Softer edges blur the shadows of fine discs.
+SOFTNESS_RAD = 0.004
 # Light clusters of the terrain; few suffice, because interreflection is smooth.
 LIGHT_CLUSTERS = 4096
 Progress = Callable[[float], None]
@@ -45,7 +45,7 @@ class DiscTransport:
     normals
         ``(N, 3)`` float32 mean shading normals; their length is below 1 where the surface is rough.
     horizon
-        ``(N, 64)`` uint8 over `HORIZON_RANGE_RAD`, column 0 north, clockwise.
+        ``(N, 128)`` uint8 over `HORIZON_RANGE_RAD`, column 0 north, clockwise.
     sky, sky_scale
         ``(N, r)`` int8 sky coefficients and their scale ``(r,)`` float32.
     from_sky
@@ -178,7 +178,7 @@ def trace_disc_transport(
         progress=lambda fraction: report(0.4 + 0.4 * fraction),
     )
     device_points = upload_points(ray_scene, traced)
-    surroundings = neighbourhood_mean(surfels.means, albedo, surfels.grid.spacing_m).mean(axis=1)
+    surroundings = neighbourhood_mean(surfels.means, albedo, surfels.spacing_m).mean(axis=1)
 
     def reflected(light: Illumination) -> np.ndarray:
         return irradiance(device_points, light, sun_rays_per_point=1).bounce.mean(axis=1)
@@ -249,7 +249,7 @@ def _bounce_coefficients(reflected: Callable[[Illumination], np.ndarray]) -> np.
     return np.concatenate([coefficients, reflected(uniform_sky(1.0 / np.pi))[None]])
 
 
-def neighbourhood_mean(means: np.ndarray, albedo: np.ndarray, spacing_m: float) -> np.ndarray:
+def neighbourhood_mean(means: np.ndarray, albedo: np.ndarray, spacing_m: float | np.ndarray) -> np.ndarray:
     """Average the albedo of discs over their surroundings, with a Gaussian of `NEIGHBOURHOOD_SIGMA_M`.
 
     Parameters
@@ -259,7 +259,7 @@ def neighbourhood_mean(means: np.ndarray, albedo: np.ndarray, spacing_m: float) 
     albedo
         ``(N, 3)``.
     spacing_m
-        Distance of the discs [m].
+        Distance of neighbouring discs [m], ``(N,)`` or one for all.
 
     Returns
     -------

@@ -1,7 +1,7 @@
 """Relightable Gaussian model: known geometry, traced light transport, learned corrections; and its file format.
 
-A file takes about 107 bytes per Gaussian. Values that follow from the grid are not stored: the horizontal position of a
-disc is its cell, and its rotation and size follow from its normal, up to the changes that training made. All other values
+A file takes about 175 bytes per Gaussian. Values that follow from the grid are not stored: the horizontal position of a
+disc is its cell, and its rotation and size follow from its plane, up to the changes that training made. All other values
 are quantised, to one byte where possible.
 """
 
@@ -19,6 +19,7 @@ import numpy as np
 from seasonscapes.albedo.seasons import albedo_at
 from seasonscapes.errors import InputError
 from seasonscapes.frames import LocalFrame
+from seasonscapes.gaussians.disc_cells import cell_centres_m, packed_cells, unpacked_cells
 from seasonscapes.gaussians.disc_transport import DiscTransport
 from seasonscapes.gaussians.surfels import (
     CHANGES,
@@ -32,7 +33,7 @@ from seasonscapes.gaussians.surfels import (
 from seasonscapes.images import atomic_path
 from seasonscapes.terrain.attributes import attributes_at
 
-FORMAT = "seasonscapes gaussians 1"
+FORMAT = "seasonscapes gaussians 2"
 # Learned parameters of each disc and the range of their quantisation; values beyond it are clipped.
 _RANGES = {"log_colour": (-1.0, 1.0), "log_gain": (-2.0, 2.0), "shift": (-0.1, 0.1), "log_softness": (-6.2, -1.0)} | {
     f"geometry.{name}": (-limit, limit) for name, (_, limit) in CHANGES.items()
@@ -69,8 +70,8 @@ class GaussianModel:
         changes already.
     kind
         Kind of appearance, a name in `appearance.KINDS`.
-    grid, cell
-        Grid of the discs, see `surfels.Surfels`.
+    grid, level, cell, facing
+        Grid and planes of the discs, see `surfels.Surfels`.
     frame
         Local frame of the positions.
     note
@@ -93,7 +94,9 @@ class GaussianModel:
     appearance: dict[str, np.ndarray]
     kind: str
     grid: SurfelGrid
+    level: np.ndarray
     cell: np.ndarray
+    facing: np.ndarray
     frame: LocalFrame
     note: dict[str, Any] = field(default_factory=dict)
 
@@ -105,7 +108,9 @@ class GaussianModel:
             "log_scales": (count, 3),
             "opacity_logits": (count,),
             "albedo": (len(self.days), count, 3),
+            "level": (count,),
             "cell": (count,),
+            "facing": (count, 3),
         }
         for name, shape in expected.items():
             values = getattr(self, name)
@@ -115,6 +120,11 @@ class GaussianModel:
                 raise ValueError(f"GaussianModel: {int(np.sum(~np.isfinite(values)))} values of {name} are not finite")
         if np.any(np.diff(self.days) <= 0.0):
             raise ValueError(f"GaussianModel: days {self.days.tolist()} do not rise")
+
+    @property
+    def spacing_m(self) -> np.ndarray:
+        """Distance ``(N,)`` of each disc from its neighbours [m]."""
+        return self.grid.spacings_m(self.level)
 
     @property
     def changes(self) -> dict[str, np.ndarray]:
@@ -136,7 +146,7 @@ class GaussianModel:
         """
         if len(self.days) == 1:
             return self.albedo[0]
-        attributes = attributes_at(self.means, self.transport.normals, self.grid.spacing_m)
+        attributes = attributes_at(self.means, self.transport.normals, self.spacing_m)
         return albedo_at(self.albedo, self.days, day, attributes)
 
 
@@ -195,7 +205,7 @@ def model_from(
     changes = _changes(parameters)
     discs = (surfels.means, surfels.quaternions, surfels.log_scales, surfels.opacity_logits)
     return GaussianModel(
-        *(changed_discs(surfels.means, surfels.normals, surfels.grid.spacing_m, changes) if changes else discs),
+        *(changed_discs(surfels.means, surfels.facing, surfels.spacing_m, changes) if changes else discs),
         features,
         np.asarray(albedo, np.float32),
         np.asarray(days, np.float64),
@@ -203,7 +213,9 @@ def model_from(
         parameters,
         learned.kind,
         surfels.grid,
+        surfels.level,
         surfels.cell,
+        surfels.facing,
         frame,
         note or {},
     )
@@ -219,14 +231,14 @@ def save_model(model: GaussianModel, path: str | os.PathLike[str]) -> None:
     Parameters
     ----------
     model
-        Model whose geometry follows from grid, normals and learned changes.
+        Model whose geometry follows from grid, planes and learned changes.
     path
         Output file.
 
     Raises
     ------
     ValueError
-        If the geometry does not follow from grid, normals and learned changes, so that it would be lost.
+        If the geometry does not follow from grid, planes and learned changes, so that it would be lost.
     """
     from safetensors.numpy import save_file
 
@@ -296,7 +308,7 @@ def pack_model(model: GaussianModel) -> tuple[dict[str, np.ndarray], dict[str, A
     Parameters
     ----------
     model
-        Model whose geometry follows from grid, normals and learned changes.
+        Model whose geometry follows from grid, planes and learned changes.
 
     Returns
     -------
@@ -308,26 +320,22 @@ def pack_model(model: GaussianModel) -> tuple[dict[str, np.ndarray], dict[str, A
     Raises
     ------
     ValueError
-        If the geometry does not follow from grid, normals and learned changes, so that it would be lost.
+        If the geometry does not follow from grid, planes and learned changes, so that it would be lost.
     """
-    normals, spacing_m, changes = model.transport.normals, model.grid.spacing_m, model.changes
-    means = model.means
+    spacing_m, changes, means = model.spacing_m, model.changes, model.means
     if changes:
-        means = means - disc_offsets_m(disc_shapes(normals, spacing_m)[0], spacing_m, changes)
-    shape = changed_discs(means, normals, spacing_m, changes)[1:]
+        means = means - disc_offsets_m(disc_shapes(model.facing, spacing_m)[0], spacing_m, changes)
+    shape = changed_discs(means, model.facing, spacing_m, changes)[1:]
     for name, expected in zip(("quaternions", "log_scales", "opacity_logits"), shape, strict=True):
         if not np.allclose(getattr(model, name), expected, atol=1e-3):
-            raise ValueError(
-                f"save_model: {name} do not follow from the discs' grid and normals; export a .ply instead"
-            )
-    occupied = np.zeros(model.grid.columns * model.grid.rows, bool)
-    occupied[model.cell] = True
+            raise ValueError(f"save_model: {name} do not follow from the discs' grid and planes; export a .ply instead")
     low, high = float(means[:, 2].min()), float(means[:, 2].max())
     step = max(high - low, 1e-3) / 65535.0
     transport = model.transport
     tensors = {
-        "taken": np.packbits(occupied),
+        **packed_cells(model.grid, model.level, model.cell),
         "height": np.rint((means[:, 2] - low) / step).astype(np.uint16),
+        "facing": octahedral(model.facing),
         "normal": octahedral(transport.normals),
         "roughness": np.rint(255.0 * np.clip(np.linalg.norm(transport.normals, axis=1), 0.0, 1.0)).astype(np.uint8),
         "albedo": np.rint(255.0 * np.sqrt(np.clip(model.albedo, 0.0, 1.0))).astype(np.uint8),
@@ -340,8 +348,7 @@ def pack_model(model: GaussianModel) -> tuple[dict[str, np.ndarray], dict[str, A
     tensors["features"] = np.rint(model.features / feature_scale).astype(np.int8)
     learned = model.appearance
     if changes:
-        rounded = from_octahedral(tensors["normal"]) * (tensors["roughness"][:, None] / np.float32(255.0))
-        changes = _relative_to(disc_shapes(rounded, spacing_m)[0], model, means)
+        changes = _relative_to(disc_shapes(from_octahedral(tensors["facing"]), spacing_m)[0], model, means)
         learned = learned | {f"geometry.{name}": values for name, values in changes.items()}
     for name, values in learned.items():
         tensors[f"appearance.{name}"] = _quantised(values, *_RANGES[name]) if name in _RANGES else values
@@ -350,6 +357,7 @@ def pack_model(model: GaussianModel) -> tuple[dict[str, np.ndarray], dict[str, A
         "days": model.days.tolist(),
         "height": [low, step],
         "plan": asdict(model.grid),
+        "levels": int(model.level.max(initial=0)),
         "frame": asdict(model.frame),
         "note": model.note,
         "patches": transport.patches,
@@ -361,7 +369,7 @@ def pack_model(model: GaussianModel) -> tuple[dict[str, np.ndarray], dict[str, A
 def _relative_to(quaternions: np.ndarray, model: GaussianModel, means: np.ndarray) -> dict[str, np.ndarray]:
     """The model's changes as seen from unchanged discs of other axes ``quaternions (N, 4)`` and centres ``means (N, 3)``."""
     axes = axes_from_quaternions(quaternions)
-    offset = np.einsum("nij,ni->nj", axes, model.means - means) / model.grid.spacing_m
+    offset = np.einsum("nij,ni->nj", axes, model.means - means) / model.spacing_m[:, None]
     first = np.einsum("nij,ni->nj", axes, axes_from_quaternions(model.quaternions)[:, :, 0])
     twist = np.arctan2(first[:, 1], first[:, 0])
     # An ellipse is the same after half a turn.
@@ -385,20 +393,10 @@ def unpack_model(tensors: dict[str, np.ndarray], header: dict[str, Any]) -> Gaus
         The model, up to quantisation.
     """
     grid, (low, step) = SurfelGrid(**header["plan"]), header["height"]
-    if not 0 < grid.columns * grid.rows <= 8 * len(tensors["taken"]):
-        raise ValueError(
-            f"a grid of {grid.columns} × {grid.rows} cells, {8 * len(tensors['taken'])} of which are stored"
-        )
-    cell = np.flatnonzero(np.unpackbits(tensors["taken"])[: grid.columns * grid.rows]).astype(np.int32)
-    row, column = np.divmod(cell, grid.columns)
-    means = np.stack(
-        [
-            grid.west_m + (column + 0.5) * grid.east_step_m,
-            grid.north_m - (row + 0.5) * grid.north_step_m,
-            low + tensors["height"] * step,
-        ],
-        axis=1,
-    ).astype(np.float32)
+    level, cell = unpacked_cells(grid, tensors, int(header["levels"]))
+    east_m, north_m = cell_centres_m(grid, level, cell)
+    means = np.stack([east_m, north_m, low + tensors["height"] * step], axis=1).astype(np.float32)
+    facing = from_octahedral(tensors["facing"])
     normals = from_octahedral(tensors["normal"]) * (tensors["roughness"][:, None] / np.float32(255.0))
     stored = {
         item.name: tensors[f"transport.{item.name}"]
@@ -414,7 +412,7 @@ def unpack_model(tensors: dict[str, np.ndarray], header: dict[str, Any]) -> Gaus
     features = tensors["features"] * np.array(header["feature_scale"], np.float32)
     albedo = ((tensors["albedo"] / np.float32(255.0)) ** 2).astype(np.float32)
     return GaussianModel(
-        *changed_discs(means, normals, grid.spacing_m, _changes(appearance)),
+        *changed_discs(means, facing, grid.spacings_m(level), _changes(appearance)),
         features,
         albedo,
         np.array(header["days"]),
@@ -422,7 +420,9 @@ def unpack_model(tensors: dict[str, np.ndarray], header: dict[str, Any]) -> Gaus
         appearance,
         header["kind"],
         grid,
+        level,
         cell,
+        facing,
         LocalFrame(**header["frame"]),
         header["note"],
     )
@@ -434,7 +434,7 @@ def bytes_per_gaussian(model: GaussianModel) -> float:
     Parameters
     ----------
     model
-        Model whose geometry follows from grid, normals and learned changes.
+        Model whose geometry follows from grid, planes and learned changes.
 
     Returns
     -------
@@ -446,7 +446,7 @@ def bytes_per_gaussian(model: GaussianModel) -> float:
     own = {
         name: values.nbytes
         for name, values in tensors.items()
-        if values.shape[:1] == (count,) or name in ("taken", "albedo")
+        if values.shape[:1] == (count,) or name in ("split", "albedo")
     }
     own["albedo"] //= len(model.days)
     return sum(own.values()) / count

@@ -94,7 +94,7 @@ def appearance_of(model: GaussianModel, *, albedo: np.ndarray | None = None, see
         Module with the model's learned parameters.
     """
     dated = model.albedo if albedo is None else albedo[None]
-    surroundings = np.stack([neighbourhood_mean(model.means, values, model.grid.spacing_m) for values in dated])
+    surroundings = np.stack([neighbourhood_mean(model.means, values, model.spacing_m) for values in dated])
     embedding = model.features if model.features.shape[1] else fourier_embedding(model.means)
     codes = model.appearance.get("codes")
     times = 1 if codes is None else len(codes)
@@ -168,7 +168,7 @@ def splats_of(model: GaussianModel, *, viewpoint_m: np.ndarray | None = None) ->
     """
     logits = model.opacity_logits
     if viewpoint_m is not None:
-        facing_away = np.einsum("nc,nc->n", model.means - viewpoint_m.astype(np.float32), model.transport.normals) > 0.0
+        facing_away = np.einsum("nc,nc->n", model.means - viewpoint_m.astype(np.float32), model.facing) > 0.0
         logits = np.where(facing_away, np.float32(-20.0), logits)
     return splats_from(model.means, model.quaternions, model.log_scales, logits)
 

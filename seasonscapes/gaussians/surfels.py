@@ -1,7 +1,8 @@
 """Surfels (discs) on the terrain: positions, rotations and sizes of the Gaussians, and the albedo of their cells.
 
-The geometry is known: one disc per cell of a horizontal grid, tangent to the surface and elongated along the slope so that steep
-faces have no holes. Training may change it a little (`disc_geometry`, `CHANGES`).
+The geometry is known: one disc per cell of a horizontal grid, in the plane of the mesh within the cell and elongated along the
+slope so that steep faces have no holes. Cells may be quartered where a camera sees them near (`disc_density`). Training may
+change the discs a little (`disc_geometry`, `CHANGES`).
 """
 
 from __future__ import annotations
@@ -57,6 +58,16 @@ class SurfelGrid:
         """Mean distance of neighbouring discs [m]."""
         return 0.5 * (self.east_step_m + self.north_step_m)
 
+    def quartered(self, level: int) -> SurfelGrid:
+        """The grid whose cells were quartered so many times."""
+        parts = 2**level
+        steps = (self.east_step_m / parts, self.north_step_m / parts)
+        return SurfelGrid(self.west_m, self.north_m, *steps, self.columns * parts, self.rows * parts)
+
+    def spacings_m(self, level: np.ndarray) -> np.ndarray:
+        """Mean distance ``(N,)`` of discs from their neighbours of the same level ``(N,)`` [m]."""
+        return np.ldexp(np.float32(self.spacing_m), -level.astype(np.int32)).astype(np.float32)
+
 
 @dataclass(frozen=True)
 class Surfels:
@@ -64,8 +75,9 @@ class Surfels:
 
     Parameters
     ----------
-    grid, cell
-        The grid, and each disc's flat index in it ``(N,)`` int32, rows from the north.
+    grid, level, cell
+        The grid, how often each disc's cell was quartered ``(N,)`` uint8, and its flat index in the grid of that level
+        (`SurfelGrid.quartered`) ``(N,)`` int64, rows from the north.
     means
         ``(N, 3)`` float32 ENU [m].
     quaternions
@@ -74,6 +86,8 @@ class Surfels:
         ``(N, 3)`` float32, natural logarithms of standard deviations [m] along these axes.
     opacity_logits
         ``(N,)`` float32.
+    facing
+        ``(N, 3)`` float32 unit normal of the plane through the mesh in the cell, in which the disc lies.
     normals
         ``(N, 3)`` float32 mean shading normal over the cell; its length is below 1 where the surface is rough.
     sample_points
@@ -83,14 +97,21 @@ class Surfels:
     """
 
     grid: SurfelGrid
+    level: np.ndarray
     cell: np.ndarray
     means: np.ndarray
     quaternions: np.ndarray
     log_scales: np.ndarray
     opacity_logits: np.ndarray
+    facing: np.ndarray
     normals: np.ndarray
     sample_points: np.ndarray
     uv: np.ndarray
+
+    @property
+    def spacing_m(self) -> np.ndarray:
+        """Distance ``(N,)`` of each disc from its neighbours [m]."""
+        return self.grid.spacings_m(self.level)
 
 
 def terrain_surfels(
@@ -136,19 +157,64 @@ def terrain_surfels(
         float(west), float(north), float(east - west) / columns, float(north - south) / rows, columns, rows
     )
     normals = vertex_normals(terrain) if normals is None else normals
-    positions, normals, uv = _cells(_within(terrain, (west, south, east, north)), grid, normals)
-    whole = np.isfinite(positions).all(axis=(1, 2))
+    samples = cell_samples(terrain, grid, normals)
+    whole = np.isfinite(samples[0]).all(axis=(1, 2))
     if not whole.any():
         raise ValueError(
             "terrain_surfels: the terrain covers no cell completely; use a smaller spacing or other bounds"
         )
-    positions, normals, uv = positions[whole], normals[whole], uv[whole]
+    level = np.zeros(int(whole.sum()), np.uint8)
+    return surfels_from_cells(grid, level, np.flatnonzero(whole), *(values[whole] for values in samples))
+
+
+def surfels_from_cells(
+    grid: SurfelGrid, level: np.ndarray, cell: np.ndarray, positions: np.ndarray, normals: np.ndarray, uv: np.ndarray
+) -> Surfels:
+    """Make the discs of cells.
+
+    Parameters
+    ----------
+    grid, level, cell
+        As of `Surfels`.
+    positions, normals, uv
+        ``(N, S, 3)``, ``(N, S, 3)`` and ``(N, S, 2)`` of the cells' sample points, from `cell_samples`.
+
+    Returns
+    -------
+    Surfels
+        N discs.
+    """
     means = positions.mean(axis=1, dtype=np.float64).astype(np.float32)
-    mean_normal = normals.mean(axis=1)
-    shape = disc_shapes(mean_normal, grid.spacing_m)
+    facing, mean_normal = plane_normals(positions), normals.mean(axis=1)
+    shape = disc_shapes(facing, grid.spacings_m(level))
     return Surfels(
-        grid, np.flatnonzero(whole).astype(np.int32), means, *shape, mean_normal.astype(np.float32), positions, uv
+        grid, level, cell.astype(np.int64), means, *shape, facing, mean_normal.astype(np.float32), positions, uv
     )
+
+
+def plane_normals(positions: np.ndarray) -> np.ndarray:
+    """Upward unit normals of the planes that fit heights best.
+
+    Discs in these planes leave no holes. Shading normals, which are smooth from face to face, lean away from the mesh by some
+    degrees: seen at grazing angles, discs that follow them turn their backs, or let the land behind shine through.
+
+    Parameters
+    ----------
+    positions
+        ``(N, S, 3)`` points, not all in one vertical plane, ENU [m].
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(N, 3)`` float32.
+    """
+    x, y, z = np.moveaxis(positions - positions.mean(axis=1, keepdims=True, dtype=np.float64), 2, 0)
+    xx, xy, yy = (x * x).sum(1), (x * y).sum(1), (y * y).sum(1)
+    xz, yz = (x * z).sum(1), (y * z).sum(1)
+    determinant = xx * yy - xy * xy
+    east, north = (xz * yy - yz * xy) / determinant, (yz * xx - xz * xy) / determinant
+    normal = np.stack([-east, -north, np.ones(len(east))], axis=1)
+    return (normal / np.linalg.norm(normal, axis=1, keepdims=True)).astype(np.float32)
 
 
 def _within(terrain: Terrain, bounds_m: tuple[float, float, float, float]) -> Terrain:
@@ -159,7 +225,7 @@ def _within(terrain: Terrain, bounds_m: tuple[float, float, float, float]) -> Te
     return terrain if inside.all() else replace(terrain, faces=terrain.faces[inside])
 
 
-def disc_shapes(normals: np.ndarray, spacing_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def disc_shapes(normals: np.ndarray, spacing_m: float | np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compute the shapes of discs tangent to a surface.
 
     Parameters
@@ -167,7 +233,7 @@ def disc_shapes(normals: np.ndarray, spacing_m: float) -> tuple[np.ndarray, np.n
     normals
         ``(N, 3)`` of any length, ENU.
     spacing_m
-        Mean distance of neighbouring discs [m].
+        Mean distance of neighbouring discs [m], ``(N,)`` or one for all.
 
     Returns
     -------
@@ -179,13 +245,13 @@ def disc_shapes(normals: np.ndarray, spacing_m: float) -> tuple[np.ndarray, np.n
     logit = np.log(OPACITY / (1.0 - OPACITY))
     return (
         quaternions_from_axes(axes).astype(np.float32),
-        np.log(scales * spacing_m).astype(np.float32),
+        np.log(scales * np.reshape(spacing_m, (-1, 1))).astype(np.float32),
         np.full(len(stretch), logit, np.float32),
     )
 
 
 def changed_discs(
-    means: np.ndarray, normals: np.ndarray, spacing_m: float, changes: Mapping[str, np.ndarray]
+    means: np.ndarray, normals: np.ndarray, spacing_m: float | np.ndarray, changes: Mapping[str, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Apply learned changes to the discs of a surface.
 
@@ -194,9 +260,9 @@ def changed_discs(
     means
         ``(N, 3)`` centres of the cells on the surface, ENU [m].
     normals
-        ``(N, 3)`` of any length, ENU.
+        ``(N, 3)`` of the discs' planes, of any length, ENU.
     spacing_m
-        Mean distance of neighbouring discs [m].
+        Mean distance of neighbouring discs [m], ``(N,)`` or one for all.
     changes
         By the names of `CHANGES`: ``offset (N, 3)``, ``stretch (N, 2)``, ``twist (N, 1)``, ``opacity (N, 1)``; or empty.
 
@@ -218,14 +284,38 @@ def changed_discs(
     return tuple(values.astype(np.float32) for values in columns)  # pyright: ignore[reportReturnType]
 
 
-def disc_offsets_m(quaternions: np.ndarray, spacing_m: float, changes: Mapping[str, np.ndarray]) -> np.ndarray:
+def disc_offsets_m(
+    quaternions: np.ndarray, spacing_m: float | np.ndarray, changes: Mapping[str, np.ndarray]
+) -> np.ndarray:
     """Shift of discs from the centres of their cells, of unturned ``quaternions (N, 4)``: ``(N, 3)`` ENU [m]."""
-    return spacing_m * np.einsum("nij,nj->ni", axes_from_quaternions(quaternions), changes["offset"])
+    return np.reshape(spacing_m, (-1, 1)) * np.einsum(
+        "nij,nj->ni", axes_from_quaternions(quaternions), changes["offset"]
+    )
 
 
-def _cells(terrain: Terrain, grid: SurfelGrid, at_vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Positions, normals and atlas coordinates ``(cells, S, ...)`` of the cells' sample points; NaN off the terrain."""
+def cell_samples(
+    terrain: Terrain, grid: SurfelGrid, at_vertices: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Sample a terrain within all cells of a grid.
+
+    Parameters
+    ----------
+    terrain
+        Mesh with texture coordinates.
+    grid
+        The cells, K of them.
+    at_vertices
+        ``(V, 3)`` from `vertex_normals`.
+
+    Returns
+    -------
+    tuple of numpy.ndarray
+        Positions ``(K, S, 3)`` ENU [m], shading normals ``(K, S, 3)`` and atlas coordinates ``(K, S, 2)`` of sample points;
+        NaN off the terrain.
+    """
     width, height = grid.columns, grid.rows
+    east_m, south_m = grid.west_m + width * grid.east_step_m, grid.north_m - height * grid.north_step_m
+    terrain = _within(terrain, (grid.west_m, south_m, east_m, grid.north_m))
     low = np.array([grid.west_m, grid.north_m - height * grid.north_step_m])
     flat = (terrain.vertices[:, :2] - low) / [width * grid.east_step_m, height * grid.north_step_m]
     top_down = replace(terrain, uv=flat)

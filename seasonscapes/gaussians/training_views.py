@@ -124,6 +124,6 @@ def front_facing_splats(surfels: Surfels, camera: Camera) -> Splats:
     Splats
         N splats; those that face away from the camera are transparent.
     """
-    facing_away = np.einsum("nc,nc->n", surfels.means - camera.position_m.astype(np.float32), surfels.normals) > 0.0
+    facing_away = np.einsum("nc,nc->n", surfels.means - camera.position_m.astype(np.float32), surfels.facing) > 0.0
     logits = np.where(facing_away, np.float32(-20.0), surfels.opacity_logits)
     return splats_from(surfels.means, surfels.quaternions, surfels.log_scales, logits)

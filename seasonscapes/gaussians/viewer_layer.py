@@ -36,7 +36,7 @@ def viewer_layer(model: GaussianModel) -> tuple[dict[str, Any], dict[str, np.nda
     about : dict
         Plain values: kind, days of the year of the dated albedos, ranges of the quantised values, limits of rasterisation.
     arrays : dict of numpy.ndarray
-        uint8, float16 and float32 arrays, some 170 bytes for each Gaussian.
+        uint8, float16 and float32 arrays, some 230 bytes for each Gaussian.
 
     Raises
     ------
@@ -49,13 +49,13 @@ def viewer_layer(model: GaussianModel) -> tuple[dict[str, Any], dict[str, np.nda
             "--gaussians", "the page cannot light it", got=f"kind {model.kind}", expected=", ".join(_SHIFTS)
         )
     if count > MOST_DISCS:
-        cure = "distil with fewer --discs"
+        cure = "distil with fewer --discs, or larger ones: --disc-px"
         raise InputError(
             "--gaussians", "more than a page draws", got=count, expected=f"at most {MOST_DISCS}", cure=cure
         )
     learned = model.appearance
     # The learned gains of colour belong to all that the albedo is multiplied with, but not to the surroundings' mean.
-    surroundings = [neighbourhood_mean(model.means, values, model.grid.spacing_m) for values in model.albedo]
+    surroundings = [neighbourhood_mean(model.means, values, model.spacing_m) for values in model.albedo]
     transport = model.transport
     arrays: dict[str, np.ndarray] = {
         "means": model.means.astype(np.float32),

@@ -32,7 +32,7 @@ class TerrainAttributes:
     concavity_m: np.ndarray
 
 
-def attributes_at(position_m: np.ndarray, normal: np.ndarray, spacing_m: float) -> TerrainAttributes:
+def attributes_at(position_m: np.ndarray, normal: np.ndarray, spacing_m: float | np.ndarray) -> TerrainAttributes:
     """Compute terrain attributes at given surface points.
 
     Parameters
@@ -42,7 +42,7 @@ def attributes_at(position_m: np.ndarray, normal: np.ndarray, spacing_m: float) 
     normal
         ``(N, 3)`` surface normals of any length.
     spacing_m
-        Typical distance between neighbouring points [m].
+        Typical distance between neighbouring points [m], ``(N,)`` or one for all.
 
     Returns
     -------
@@ -51,7 +51,8 @@ def attributes_at(position_m: np.ndarray, normal: np.ndarray, spacing_m: float) 
     """
     unit = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
     height = position_m[:, 2:].astype(np.float32)
-    mean_height = horizontal_gaussian_mean(position_m, height, max(spacing_m, _MIN_SPACING_M), _CONCAVITY_SIGMA_M)
+    spacing_m = spacing_m * max(1.0, _MIN_SPACING_M / float(np.max(spacing_m)))
+    mean_height = horizontal_gaussian_mean(position_m, height, spacing_m, _CONCAVITY_SIGMA_M)
     return TerrainAttributes(height[:, 0], unit.astype(np.float32), (mean_height - height)[:, 0])
 
 
@@ -113,11 +114,12 @@ def vertex_normals(terrain: Terrain) -> np.ndarray:
 
 
 def horizontal_gaussian_mean(
-    position_m: np.ndarray, values: np.ndarray, spacing_m: float, sigma_m: float
+    position_m: np.ndarray, values: np.ndarray, spacing_m: float | np.ndarray, sigma_m: float
 ) -> np.ndarray:
     """Smooth scattered values with a horizontal Gaussian kernel (normalised convolution on a grid).
 
-    Values are binned into square cells; the Gaussian of the sums is divided by the Gaussian of the counts.
+    Values are binned into square cells; the Gaussian of the sums is divided by the Gaussian of the counts. Points weigh as the
+    areas that they stand for.
 
     Parameters
     ----------
@@ -126,7 +128,7 @@ def horizontal_gaussian_mean(
     values
         ``(N, C)`` values at the points.
     spacing_m
-        Cell size of the grid [m].
+        Distance between neighbouring points [m], ``(N,)`` or one for all; the largest is the cell size of the grid.
     sigma_m
         Standard deviation of the Gaussian [m].
 
@@ -137,12 +139,14 @@ def horizontal_gaussian_mean(
     """
     import cv2
 
-    cell = np.floor((position_m[:, :2] - position_m[:, :2].min(axis=0)) / spacing_m + 0.5).astype(int)
+    cell_m = float(np.max(spacing_m))
+    cell = np.floor((position_m[:, :2] - position_m[:, :2].min(axis=0)) / cell_m + 0.5).astype(int)
     shape = cell.max(axis=0)[::-1] + 1
     grid, count = np.zeros((*shape, values.shape[1]), np.float32), np.zeros(shape, np.float32)
-    np.add.at(grid, (cell[:, 1], cell[:, 0]), values)
-    np.add.at(count, (cell[:, 1], cell[:, 0]), 1.0)
-    sigma = sigma_m / spacing_m
+    share = np.broadcast_to(np.square(spacing_m / cell_m), (len(values),))
+    np.add.at(grid, (cell[:, 1], cell[:, 0]), share[:, None] * values)
+    np.add.at(count, (cell[:, 1], cell[:, 0]), share)
+    sigma = sigma_m / cell_m
     blurred = cv2.GaussianBlur(grid, (0, 0), sigma).reshape(grid.shape)
     mean = blurred / np.maximum(cv2.GaussianBlur(count, (0, 0), sigma), 1e-6)[..., None]
     return mean[cell[:, 1], cell[:, 0]]

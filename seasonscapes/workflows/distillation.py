@@ -47,12 +47,16 @@ class DistilOptions:
     ----------
     discs
         Gaussians along the longer side of the terrain.
+    disc_px
+        Largest side of a disc in pictures of ``view_px`` from the scene's cameras [px]: where they look, cells of discs are
+        quartered until it holds. 0, or no ``views``, leaves all discs of one size.
     suns
         Instants to train on, at random hours of the dates' days.
     dates
         Dates of the year whose albedo is stored separately, for scenes that know their albedo of every day.
     views, view_px
-        Cameras around the terrain for training images, and the size of these [px]; 0 trains on the surface alone.
+        Cameras around the terrain for training images, and the size of these [px]; 0 trains on the surface alone. Where discs
+        follow the scene's cameras, these are learned from too.
     steps, picture_steps
         Training steps on the surface, and on images.
     kind
@@ -68,6 +72,7 @@ class DistilOptions:
     """
 
     discs: int = 320
+    disc_px: float = 2.0
     suns: int = 32
     dates: int = 4
     views: int = 6
@@ -297,6 +302,7 @@ def distillation_data(
     progress
         Called with a task and its finished share.
     """
+    from seasonscapes.gaussians.disc_density import footprints, refined_surfels
     from seasonscapes.gaussians.disc_transport import (
         light_state,
         neighbourhood_mean,
@@ -307,19 +313,27 @@ def distillation_data(
     from seasonscapes.gaussians.training import surface_targets
     from seasonscapes.gaussians.training_views import overview_cameras, relit_frames
     from seasonscapes.rendering.hemisphere_rays import ray_scene
-    from seasonscapes.rendering.mitsuba_scene import mi_mesh
+    from seasonscapes.rendering.mitsuba_scene import RenderScene, mi_mesh
 
     pairs = dated_textures(place, dated, options.dates)
     days, textures = [day for day, _ in pairs], [texture for _, texture in pairs]
     extent_m = float(np.ptp(place.terrain.vertices[:, :2], axis=0).max())
     surfels = terrain_surfels(place.terrain, extent_m / options.discs)
+    near = _near_cameras(place, options)
+    if near:
+        first = mi_mesh(place.terrain, textures[0])
+        stage = RenderScene(ray_scene(first).mi_scene, first)
+        seen = [footprints(stage, [camera]) for camera in near]
+        near = [camera for camera, (places, _) in zip(near, seen, strict=True) if len(places)]
+        place_m, side_m = (np.concatenate(column) for column in zip(*seen, strict=True))
+        surfels = refined_surfels(place.terrain, surfels, place_m, options.disc_px * side_m)
     albedo = np.stack([surfel_albedo(surfels, texture) for texture in textures])
-    around = np.stack([neighbourhood_mean(surfels.means, each, surfels.grid.spacing_m) for each in albedo])
+    around = np.stack([neighbourhood_mean(surfels.means, each, surfels.spacing_m) for each in albedo])
     seasons = [number % len(days) for number in range(options.suns)]
     lights, times = draw_lights(place, model, [days[season] for season in seasons], seed=seed, progress=progress)
     received = np.empty((options.suns, len(surfels.means), 3), np.float32)
     transport, states, frames = None, [], []
-    cameras = overview_cameras(place.terrain, options.views, size_px=options.view_px, first_deg=30.0)
+    cameras = near + overview_cameras(place.terrain, options.views, size_px=options.view_px, first_deg=30.0)
     for season, texture in enumerate(textures):
         own = [number for number in range(options.suns) if seasons[number] == season]
         scene = ray_scene(mi_mesh(place.terrain, texture))
@@ -343,6 +357,15 @@ def distillation_data(
     assert transport is not None, "there is at least one date"
     targets = surface_targets(states, seasons, albedo, received)
     return DistillationData(surfels, albedo, around, days, transport, targets, times, frames, cameras)
+
+
+def _near_cameras(place: Place, options: DistilOptions) -> list[Camera]:
+    """The scene's cameras, in pictures of the training's size, where the discs are to follow them."""
+    from seasonscapes.workflows.views import scene_cameras
+
+    if options.disc_px <= 0.0 or options.views == 0 or not place.scene.cameras:
+        return []
+    return list(scene_cameras(place, size_px=(options.view_px, options.view_px)).values())
 
 
 def draw_lights(
@@ -396,6 +419,7 @@ def distillation_record(place: Place, distilled: Distilled) -> dict[str, Any]:
         "scene": place.scene.name,
         "gaussians": len(surfels.means),
         "spacing_m": round(surfels.grid.spacing_m, 2),
+        "least_spacing_m": round(float(surfels.spacing_m.min()), 2),
         "bytes_per_gaussian": round(bytes_per_gaussian(distilled.model), 1),
         "suns": len(distilled.data.times),
         "dates": distilled.data.days,

@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 
 from seasonscapes.calibration.calibration_file import read_calibration
 from seasonscapes.calibration.evidence import PARAMETERS, read_points
-from seasonscapes.cameras.exchange import read_colmap, read_opencv, read_transforms
+from seasonscapes.cameras.camera_models import read_camera_models
+from seasonscapes.cameras.exchange import read_opencv, read_transforms
 from seasonscapes.cameras.observation import read_manifest
 from seasonscapes.cameras.path_file import load_path, read_reference_path
 from seasonscapes.cameras.timed_views import read_timed_views
@@ -339,16 +340,17 @@ def test_colmap(tmp_path, record_property, fuzz, part):
     for name, text in texts.items():
         (tmp_path / name).write_text(text)
 
-    def check(views):
-        for view in views:
-            finite_camera(view.camera)
+    def check(models):
+        for model in models:
+            assert np.isfinite([model.fx, model.fy, model.cx, model.cy, *model.rotation.ravel(), *model.position]).all()
+            assert min(model.size_px) > 0
 
     def holds(changes):
         text = changed_lines(texts[part], changes, " ")
         (tmp_path / part).write_text(text, encoding="utf-8", errors="replace", newline="")
-        read_or_refused(lambda: read_colmap(tmp_path), check)
+        read_or_refused(lambda: read_camera_models(tmp_path, "colmap"), check)
 
-    assert len(read_colmap(tmp_path)) == 2
+    assert len(read_camera_models(tmp_path, "colmap")) == 2
     record_property("fault", {"cases": fuzz(LINES, holds), "wrong": []})
 
 
