@@ -30,8 +30,7 @@ def test_the_surface_is_finest_about_the_camera(place, monkeypatch):
     plain, fine = terrain_for_view(place, view), terrain_for_view(place, view, amplify=True)
     assert place.terrain.surface is not None
     assert fine.surface is not None
-    inner = fine.surface.inner
-    assert inner is not None
+    (inner,) = fine.surface.parts
     assert inner.spacing_m < 0.5 * fine.surface.spacing_m < place.terrain.surface.spacing_m
     assert len(fine.faces) != len(plain.faces)
     assert fine.detail is not None
@@ -41,7 +40,7 @@ def test_the_surface_is_finest_about_the_camera(place, monkeypatch):
     share = inner.share_at(across)
     assert share[1400] == 1.0
     assert share[0] == share[-1] == 0.0
-    alone = replace(fine.surface, inner=None)
+    alone = replace(fine.surface, parts=())
     np.testing.assert_allclose(fine.surface.up_at(across)[1400], inner.up_at(across)[1400])
     np.testing.assert_allclose(fine.surface.up_at(across)[0], alone.up_at(across)[0])
     steps = np.abs(np.diff(fine.surface.up_at(across)))
@@ -89,7 +88,7 @@ def test_octaves_end_at_the_pixels():
 
 def test_a_camera_near_the_ground_keeps_its_height_above_it(monkeypatch):
     """Detail may raise the ground by more than a camera stands above it: it would look at the ground from below."""
-    from seasonscapes.workflows.amplified_terrain import on_amplified_ground
+    from seasonscapes.workflows.amplified_terrain import on_detailed_ground
 
     monkeypatch.setattr(amplified_terrain, "_MOST_NEAR_NODES", 300_000)
     monkeypatch.setattr(amplified_terrain, "_MOST_NODES", 100_000)
@@ -102,7 +101,7 @@ def test_a_camera_near_the_ground_keeps_its_height_above_it(monkeypatch):
         pose[0, 3] += 160.0 * step
         ground = float(place.terrain.surface.up_at(pose[None, :3, 3])[0])
         pose[2, 3] = ground + 2.0
-        moved = on_amplified_ground(place, replace(south, world_from_camera=pose))
+        moved = on_detailed_ground(place, replace(south, world_from_camera=pose), amplify=True)
         below = terrain_for_view(place, moved, amplify=True).surface
         assert below is not None
         height = moved.position_m[2] - float(below.up_at(moved.position_m[None])[0])
@@ -110,5 +109,5 @@ def test_a_camera_near_the_ground_keeps_its_height_above_it(monkeypatch):
         changes.append(moved.position_m[2] - pose[2, 3])
         pose[2, 3] = ground + 150.0
         free = replace(south, world_from_camera=pose)
-        assert on_amplified_ground(place, free) is free
+        assert on_detailed_ground(place, free, amplify=True) is free
     assert max(np.abs(changes)) > 0.3

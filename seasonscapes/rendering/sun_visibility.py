@@ -307,5 +307,5 @@ def _visible(rays: SunRays, disc: _Disc, lane: Any, shift: Any = 0) -> tuple[Any
     direction = dr.gather(mi.Vector3f, disc.mi_directions, disc_point % disc.mi_count)
     origin = dr.gather(mi.Point3f, rays.mi_origin, lane, active)
     material = rays.terrain.mi_terrain.bsdf()
-    ray = mi.Ray3f(origin + direction * shadow_ray_start(material, cosine), direction)
+    ray = mi.Ray3f(origin + direction * shadow_ray_start(material, cosine, origin), direction)
     return active & ~rays.terrain.mi_scene.ray_test(ray, active), cosine, weight

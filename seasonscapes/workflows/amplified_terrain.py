@@ -1,4 +1,4 @@
-"""The terrain of a place with relief and albedo below the resolution of its data, as fine as a camera sees them."""
+"""The terrain of a place as fine as a camera sees it: its finest data, and relief and albedo below their resolution."""
 
 from __future__ import annotations
 
@@ -13,10 +13,12 @@ import numpy as np
 from seasonscapes.frames import geodetic_from_enu
 from seasonscapes.terrain.amplification import amplified, amplified_part
 from seasonscapes.terrain.crs import raster_pixels
-from seasonscapes.terrain.surface import SurfaceGrid, Terrain
+from seasonscapes.terrain.surface import Raster, SurfaceGrid, Terrain, surface_arrays, surface_from_arrays
 from seasonscapes.terrain.surface_classes import AlbedoDetail
 from seasonscapes.terrain.surface_grid import surface_grid
-from seasonscapes.terrain.view_refinement import refined_for_view
+from seasonscapes.terrain.view_refinement import moved_to, refined_for_view
+from seasonscapes.workflows.nested_heights import finest_near
+from seasonscapes.workflows.nested_images import image_details
 from seasonscapes.workflows.terrain_building import sample_spacing_m
 from seasonscapes.workspace import build_once
 
@@ -31,6 +33,8 @@ _MOST_NODES, _MOST_NEAR_NODES = 12_000_000, 5_000_000
 # Finest spacing [m] of the whole and about a camera, and how far the finer part reaches [m].
 _LEAST_M, _LEAST_NEAR_M, _NEAR_M = 1.0, 0.3, 500.0
 _MOST_FACTOR = 8
+# Width of the rim along which that part is blended with what is around it, as a share of its side.
+_RIM_SHARE = 0.12
 # Invented relief need not be as exact as that of the data.
 _TOLERANCE_PX, _REACH_M = 1.0, 2000.0
 # Up to the first height above ground a camera stands on it, from the second one up it does not [m].
@@ -41,8 +45,8 @@ _BELOW_M = 20.0
 log = logging.getLogger(__name__)
 
 
-def amplified_terrain(place: Place, view: Camera | Panorama, *, seed: int = 0) -> Terrain:
-    """Add detail below the resolution of the data to the terrain of a view.
+def detailed_terrain(place: Place, view: Camera | Panorama, *, amplify: bool = False, seed: int = 0) -> Terrain:
+    """The terrain of a view, as fine about its camera as the data are, or finer.
 
     Parameters
     ----------
@@ -50,32 +54,41 @@ def amplified_terrain(place: Place, view: Camera | Panorama, *, seed: int = 0) -
         The place.
     view
         The camera, in the place's frame.
+    amplify
+        Add detail below the resolution of the data.
     seed
         Another seed gives other detail.
 
     Returns
     -------
     Terrain
-        With the atlas of the place: its surface is finer everywhere, and finest about the camera, where the mesh follows it;
-        its albedo has detail down to the pixels. Means over the data's cells stay.
+        With the atlas of the place. Its surface has a part about the camera as fine as the files there, and its mesh follows
+        it; images finer than the atlas lie over its albedo. With ``amplify`` it is finer everywhere and finest about the camera, and its albedo has detail down to the pixels;
+        means over the data's cells stay.
     """
     eye_m, pixel_rad = view.position_m, 1.0 / float(view.fx)
     terrain = place.terrain
     if terrain.surface is not None:
-        terrain = replace(terrain, surface=_surface(place, eye_m, seed))
+        surface = _surface(place, eye_m, seed, amplify=amplify)
+        terrain = terrain if surface is terrain.surface else moved_to(terrain, surface)
+    terrain = replace(terrain, images=image_details(place, np.asarray(eye_m)))
+    if not amplify:
+        return refined_for_view(terrain, eye_m, pixel_rad)
     east, north, up = (float(value) for value in eye_m)
     detail = AlbedoDetail((east, north, up), pixel_rad, place.atlas.texel_p50_m, seed)
     terrain = refined_for_view(terrain, eye_m, pixel_rad, tolerance_px=_TOLERANCE_PX, reach_m=_REACH_M)
     return replace(terrain, detail=detail)
 
 
-def on_amplified_ground(place: Place, view: Camera | Panorama, *, seed: int = 0) -> Camera | Panorama:
+def on_detailed_ground(
+    place: Place, view: Camera | Panorama, *, amplify: bool = False, seed: int = 0
+) -> Camera | Panorama:
     """Raise or lower a camera that stands on the ground by what detail adds below it, so that its height above ground stays.
 
     Parameters
     ----------
-    place, view, seed
-        See `amplified_terrain`.
+    place, view, amplify, seed
+        See `detailed_terrain`.
 
     Returns
     -------
@@ -83,22 +96,49 @@ def on_amplified_ground(place: Place, view: Camera | Panorama, *, seed: int = 0)
         The same one where it is more than 100 m above the ground.
     """
     surface = place.terrain.surface
-    if surface is None:
+    if surface is None or not (amplify or place.finer_heights):
         return view
     eye_m = np.asarray(view.position_m, float)
     ground_m = float(surface.up_at(eye_m[None])[0])
     share = np.clip((_FREE_M - (eye_m[2] - ground_m)) / (_FREE_M - _STANDING_M), 0.0, 1.0)
     if share == 0.0:
         return view
-    added_m = float(_surface(place, eye_m, seed, near_m=_BELOW_M).up_at(eye_m[None])[0]) - ground_m
+    detailed = _surface(place, eye_m, seed, near_m=_BELOW_M, amplify=amplify)
+    added_m = float(detailed.up_at(eye_m[None])[0]) - ground_m
+    if added_m == 0.0:
+        return view
     pose = np.array(view.world_from_camera, float)
     pose[2, 3] += share * added_m
     log.info("the camera keeps its height above ground: detail changes the ground below it by %+.2f m", added_m)
     return replace(view, world_from_camera=pose)
 
 
-def _surface(place: Place, eye_m: np.ndarray, seed: int, *, near_m: float = _NEAR_M) -> SurfaceGrid:
-    """Amplified surface of the place with a finer part about a camera, which reaches so far."""
+def _surface(
+    place: Place, eye_m: np.ndarray, seed: int, *, near_m: float = _NEAR_M, amplify: bool = True
+) -> SurfaceGrid:
+    """Surface of the place, amplified or not, with a finer part about a camera, which reaches so far."""
+    surface = place.terrain.surface
+    assert surface is not None
+    whole, factor = _amplified_whole(place, seed) if amplify else (surface, 1)
+    found = finest_near(place, eye_m, near_m) if surface.parts else None
+    if found is None and not amplify:
+        return surface
+    if found is None:
+        # Parts of finer data that do not hold the camera take the place of what is invented.
+        near = _near_part(place, place.elevation, eye_m, near_m, seed, least_factor=factor)
+        parts = surface.parts if near is None else (near, *surface.parts)
+        return replace(whole, parts=parts)
+    number, heights = found
+    kept = heights is place.finer_heights[number]
+    if kept and not amplify:
+        return surface
+    near = _near_part(place, heights, eye_m, near_m, seed, least_factor=1 if kept else 0, amplify=amplify)
+    before, after = surface.parts[: number + 1], surface.parts[number + 1 :]
+    return replace(whole, parts=(*before, *(() if near is None else (near,)), *after))
+
+
+def _amplified_whole(place: Place, seed: int) -> tuple[SurfaceGrid, int]:
+    """The amplified surface of the elevation raster, and how many times finer than it."""
     assert place.terrain.surface is not None
     spacing_m, error_m = sample_spacing_m(place.elevation), place.terrain.surface.mesh_error_m
     factor = 1
@@ -118,35 +158,54 @@ def _surface(place: Place, eye_m: np.ndarray, seed: int, *, near_m: float = _NEA
         save=_save_surface,
         load=_load_surface,
     )
+    return whole, factor
+
+
+def _near_part(
+    place: Place,
+    elevation: Raster,
+    eye_m: np.ndarray,
+    near_m: float,
+    seed: int,
+    *,
+    least_factor: int,
+    amplify: bool = True,
+) -> SurfaceGrid | None:
+    """A finer surface about a camera, of a raster that lies there.
+
+    ``None`` where the raster does not reach it, and where it would be no more than ``least_factor`` times finer.
+    """
+    assert place.terrain.surface is not None
+    spacing_m = sample_spacing_m(elevation)
     latitude, longitude, _ = geodetic_from_enu(place.frame, eye_m)
-    column, row = (int(value) for value in raster_pixels(place.elevation, latitude, longitude).ravel())
-    rows, columns = place.elevation.values.shape[:2]
-    usual, reach = (max(8, round(distance / spacing_m)) for distance in (_NEAR_M, near_m))
+    column, row = (int(value) for value in raster_pixels(elevation, latitude, longitude).ravel())
+    rows, columns = elevation.values.shape[:2]
+    most = math.isqrt(_MOST_NEAR_NODES) // 2
+    usual, reach = (min(max(8, round(distance / spacing_m)), most) for distance in (_NEAR_M, near_m))
     if not (-reach < row < rows + reach and -reach < column < columns + reach):
-        return whole
+        return None
     part = tuple(slice(max(at - reach, 0), min(at + reach, size)) for at, size in ((row, rows), (column, columns)))
     if min(each.stop - each.start for each in part) < 8:
-        return whole
+        return None
     # As fine as the part of the usual reach, whatever this one's.
-    near, cells = (
-        factor,
+    factor, cells = (
+        1,
         math.prod(min(at + usual, size) - max(at - usual, 0) for at, size in ((row, rows), (column, columns))),
     )
-    while cells * (2 * near) ** 2 <= _MOST_NEAR_NODES and spacing_m / (2 * near) >= _LEAST_NEAR_M:
-        near *= 2
-    if near == factor:
-        return whole
-    fine = amplified_part(place.elevation, near, rows=part[0], columns=part[1], seed=seed)
-    return replace(whole, inner=surface_grid(fine, place.frame, mesh_error_m=error_m))
+    while amplify and cells * (2 * factor) ** 2 <= _MOST_NEAR_NODES and spacing_m / (2 * factor) >= _LEAST_NEAR_M:
+        factor *= 2
+    if factor <= least_factor:
+        return None
+    fine = amplified_part(elevation, factor, rows=part[0], columns=part[1], seed=seed)
+    error_m = float(place.terrain.surface.error_at(eye_m[None])[0])
+    rim_nodes = _RIM_SHARE * min(fine.values.shape[:2])
+    return surface_grid(fine, place.frame, mesh_error_m=error_m, rim_nodes=rim_nodes)
 
 
 def _save_surface(surface: SurfaceGrid, path: Path) -> None:
-    np.savez(
-        path, nodes=surface.nodes, to_node=surface.to_node, domain=surface.domain, mesh_error_m=surface.mesh_error_m
-    )
+    np.savez(path, **surface_arrays(surface))
 
 
 def _load_surface(path: Path) -> SurfaceGrid:
     with np.load(path, allow_pickle=False) as stored:
-        east, north, radius = (float(value) for value in stored["domain"])
-        return SurfaceGrid(stored["nodes"], stored["to_node"], (east, north, radius), float(stored["mesh_error_m"]))
+        return surface_from_arrays(stored)

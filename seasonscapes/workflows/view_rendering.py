@@ -18,7 +18,7 @@ from seasonscapes.sky.eclipses import eclipse_record
 from seasonscapes.sky.models import SkyModel
 from seasonscapes.sky.report import eclipse_text, moon_text
 from seasonscapes.workflows.albedo_sources import AlbedoSource, chosen_albedo
-from seasonscapes.workflows.amplified_terrain import on_amplified_ground
+from seasonscapes.workflows.amplified_terrain import on_detailed_ground
 from seasonscapes.workflows.illumination import SunMoonPosition, illumination_for_camera, position_at, sky_model
 from seasonscapes.workflows.place import Place, utc_at
 from seasonscapes.workflows.relight_session import still_session, view_at
@@ -121,8 +121,7 @@ def render(
     backend = use_backend()
     engine = chosen_engine(engine, path_options=spp is not None or max_depth is not None, device=backend.device)
     camera = view_in_frame(camera, place.frame)
-    if amplify:
-        camera = on_amplified_ground(place, camera)
+    camera = on_detailed_ground(place, camera, amplify=amplify)
     utc = utc_at(place, time)
     for line in sky_lines(position_at(place, utc)):
         log.info(line)

@@ -145,18 +145,14 @@ def calibrated_viewpoint(path: Path) -> tuple[NamedCamera, tuple[int, int]]:
 def terrain_for_view(
     place: Place, view: Camera | Panorama, *, lambertian: bool = False, amplify: bool = False
 ) -> Terrain:
-    """The terrain of a place, refined near a camera until its error is a quarter of a pixel.
+    """The terrain of a place, with the finest data about a camera, and refined there until its error is a quarter of a pixel.
 
     ``lambertian``: without surfaces that are not matt. ``amplify``: with detail below the resolution of the data; see
     `workflows.amplified_terrain`.
     """
-    from seasonscapes.terrain.view_refinement import refined_for_view
-    from seasonscapes.workflows.amplified_terrain import amplified_terrain
+    from seasonscapes.workflows.amplified_terrain import detailed_terrain
 
-    if amplify:
-        terrain = amplified_terrain(place, view)
-    else:
-        terrain = refined_for_view(place.terrain, view.position_m, 1.0 / float(view.fx))
+    terrain = detailed_terrain(place, view, amplify=amplify)
     return replace(terrain, water=None, snow=None, forest=False) if lambertian else terrain
 
 
