@@ -102,7 +102,15 @@ def refined_in_parts(terrain: Terrain) -> Terrain:
         # A face of a plain may hold a whole part within its corners.
         (east, north), reach = part.domain[:2], part.domain[2]
         near |= (low < (east + reach, north + reach)).all(axis=1) & (high > (east - reach, north - reach)).all(axis=1)
-    return _refined(terrain, surface, near, surface.error_at)
+
+    def tolerance_m(position_m: np.ndarray) -> np.ndarray:
+        # Elsewhere the mesh stays as it is.
+        result = np.full(len(position_m), np.inf)
+        for part in surface.parts:
+            result[part.share_at(position_m) > 0.0] = part.mesh_error_m
+        return result
+
+    return _refined(terrain, surface, near, tolerance_m)
 
 
 def _refined(

@@ -227,11 +227,13 @@ def build_terrain(
     terrain = replace(terrain, surface=surface_grid(refined, frame, mesh_error_m=error))
     if finer:
         assert terrain.surface is not None
-        parts = tuple(_finer_part(part, elevation, frame, options) for part in finer)
-        terrain = refined_in_parts(moved_to(terrain, replace(terrain.surface, parts=parts)))
+        parts = tuple(_finer_part(part, elevation, frame, bound) for part in finer)
+        terrain = moved_to(terrain, replace(terrain.surface, parts=parts))
     report(0.8)
     texel_m = _texel_m(terrain, elevation, scene, options)
     terrain, atlas = unwrap(terrain, kind=options.atlas, texel_m=texel_m, max_side_px=options.max_side_px)
+    # Refined last: texture coordinates are interpolated, so that slivers among the new faces cannot fold over.
+    terrain = refined_in_parts(terrain)
     if water is not None and scene.water is not None:
         terrain = with_water(terrain, atlas, water, scene.water.wind_m_s)
     if scene.snow is not None and scene.snow.scattering:
@@ -241,11 +243,11 @@ def build_terrain(
     return terrain, atlas
 
 
-def _finer_part(part: Raster, elevation: Raster, frame: LocalFrame, options: MeshOptions) -> SurfaceGrid:
+def _finer_part(part: Raster, elevation: Raster, frame: LocalFrame, bound_m: float) -> SurfaceGrid:
     """The surface of finer heights, which the mesh follows as closely as their spacing deserves."""
     spacing_m = sample_spacing_m(part)
-    bound = options.max_error_m or min(5.0, spacing_m * _PART_ERROR)
-    return surface_grid(part, frame, mesh_error_m=bound, rim_nodes=RIM_CELLS * sample_spacing_m(elevation) / spacing_m)
+    error_m = min(bound_m, spacing_m * _PART_ERROR)
+    return surface_grid(part, frame, mesh_error_m=error_m, rim_nodes=RIM_CELLS * sample_spacing_m(elevation) / spacing_m)
 
 
 def save_built_terrain(built: tuple[Terrain, Atlas], path: Path) -> None:
