@@ -386,7 +386,9 @@ class SceneFile(Declaration):
             return self
         for number, image in enumerate(self.images):
             if image.finer:
-                raise ValueError(f"imagery[{number}].finer: of several dated images none can have finer ones; keep one image")
+                raise ValueError(
+                    f"imagery[{number}].finer: of several dated images none can have finer ones; keep one image"
+                )
         undated = [f"imagery[{number}]" for number, image in enumerate(self.images) if image.day is None]
         if undated:
             raise ValueError(f"{', '.join(undated)}: of several images each needs 'time', or 'date' = \"YYYY-MM-DD\"")

@@ -71,7 +71,8 @@ class DeviceSurface:
             weight = part._placement.share(uv)
             finer = part._mi_texture.eval(uv, active & (weight > 0.0))
             slope_east, slope_north, up = (
-                value + weight * (fine - value) for value, fine in zip((slope_east, slope_north, up), finer, strict=True)
+                value + weight * (fine - value)
+                for value, fine in zip((slope_east, slope_north, up), finer, strict=True)
             )
         return dr.normalize(mi.Normal3f(-slope_east, -slope_north, 1.0)), up
 
@@ -80,10 +81,7 @@ class DeviceSurface:
         error, reach = self._mi_error, self._mi_reach
         for part in self._parts:
             weight = part._placement.share(part._placement.uv(mi_position))
-            error, reach = (
-                error + weight * (part._mi_error - error),
-                reach + weight * (part._mi_reach - reach),
-            )
+            error, reach = (error + weight * (part._mi_error - error), reach + weight * (part._mi_reach - reach))
         return error, reach
 
 

@@ -337,11 +337,7 @@ def surface_from_arrays(stored: Any, prefix: str = "") -> SurfaceGrid:
     east, north, radius = (float(value) for value in stored[f"{prefix}domain"])
     error_m, rim_nodes = (float(value) for value in stored[f"{prefix}measures"])
     return SurfaceGrid(
-        stored[f"{prefix}nodes"],
-        stored[f"{prefix}to_node"],
-        (east, north, radius),
-        error_m,
-        rim_nodes=rim_nodes,
+        stored[f"{prefix}nodes"], stored[f"{prefix}to_node"], (east, north, radius), error_m, rim_nodes=rim_nodes
     )
 
 

@@ -188,10 +188,7 @@ def read_tiles(
     spacing_m = max(min(sides), finest_m or 0.0)
     west, south, east, north = bounds_deg
     latitude, longitude = 0.5 * (south + north), 0.5 * (west + east)
-    size_m = (
-        (east - west) * METRES_PER_DEGREE * math.cos(math.radians(latitude)),
-        (north - south) * METRES_PER_DEGREE,
-    )
+    size_m = ((east - west) * METRES_PER_DEGREE * math.cos(math.radians(latitude)), (north - south) * METRES_PER_DEGREE)
     width, height = (round(side / spacing_m) for side in size_m)
     require_bytes(
         width * height * _BYTES_PER_PIXEL,

@@ -225,7 +225,13 @@ def load_place(
         code=_TERRAIN_CODE,
         suffix=".npz",
         build=lambda: terrain_building.build_terrain(
-            elevation, frame, declared, options, finer=finer, water=water, progress=lambda share: report(0.3 + 0.7 * share)
+            elevation,
+            frame,
+            declared,
+            options,
+            finer=finer,
+            water=water,
+            progress=lambda share: report(0.3 + 0.7 * share),
         ),
         save=terrain_building.save_built_terrain,
         load=terrain_building.load_built_terrain,

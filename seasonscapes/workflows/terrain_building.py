@@ -247,7 +247,9 @@ def _finer_part(part: Raster, elevation: Raster, frame: LocalFrame, bound_m: flo
     """The surface of finer heights, which the mesh follows as closely as their spacing deserves."""
     spacing_m = sample_spacing_m(part)
     error_m = min(bound_m, spacing_m * _PART_ERROR)
-    return surface_grid(part, frame, mesh_error_m=error_m, rim_nodes=RIM_CELLS * sample_spacing_m(elevation) / spacing_m)
+    return surface_grid(
+        part, frame, mesh_error_m=error_m, rim_nodes=RIM_CELLS * sample_spacing_m(elevation) / spacing_m
+    )
 
 
 def save_built_terrain(built: tuple[Terrain, Atlas], path: Path) -> None:
