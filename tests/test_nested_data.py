@@ -198,9 +198,9 @@ def test_another_vertical_datum_is_doubted_refused_and_stated(tmp_path, caplog):
     with caplog.at_level("WARNING"):
         load_place(path, Workspace(tmp_path / "workspace"))
         load_place(path, Workspace(tmp_path / "workspace"))
-    assert sum("+9.0 m in the median" in each.message for each in caplog.records) == 2
+    assert sum("+9.1 m in the median" in each.message for each in caplog.records) == 2
     write_nested(tmp_path, above_m=49.0)
-    with pytest.raises(InputError, match=r"offset_m = -49\.0"):
+    with pytest.raises(InputError, match=r"offset_m = -49\.1"):
         load_place(path, Workspace(tmp_path / "workspace"))
     caplog.clear()
     stated = load_place(
