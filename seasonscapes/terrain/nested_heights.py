@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from seasonscapes.errors import InputError
-from seasonscapes.terrain.crs import grid_position
+from seasonscapes.terrain.crs import apply_affine, grid_position
 from seasonscapes.terrain.mosaic import RasterGrid, mosaic
 from seasonscapes.terrain.placement import cell_sides_m
 from seasonscapes.terrain.raster import require_overlap
@@ -154,7 +154,7 @@ def _covering(under: Sequence[Raster], fine: Raster) -> Raster:
     for each in under[:-1]:
         height, width = each.values.shape[:2]
         x, y = grid_position(each.crs, each.transform, (width, height), latitude, longitude)
-        column, row = ~each.transform * (float(x), float(y))
+        column, row = (float(value) for value in apply_affine(~each.transform, x, y))
         if 0.0 <= column <= width and 0.0 <= row <= height:
             return each
     return under[-1]
@@ -173,7 +173,7 @@ def _closed_sides(fine: Raster, bounds_deg: Bounds) -> list[tuple[int, int]]:
     ]
     latitude, longitude = (np.concatenate(each) for each in zip(*around, strict=True))
     x, y = grid_position(fine.crs, fine.transform, (width, height), latitude, longitude)
-    column, row = ~fine.transform * (x, y)
+    column, row = apply_affine(~fine.transform, x, y)
 
     # A window ends within two pixels of the bounds, unless the raster ends before.
     def closed(low: float, high: float, count: int) -> tuple[int, int]:

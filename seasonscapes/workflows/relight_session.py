@@ -32,6 +32,7 @@ from seasonscapes.sky.illumination import Illumination
 from seasonscapes.sky.models import SkyModel
 from seasonscapes.terrain.surface import Texture
 from seasonscapes.workflows.albedo_sources import AlbedoFile, AlbedoSource, dated_albedos, snow_transition_between
+from seasonscapes.workflows.amplified_terrain import on_detailed_ground
 from seasonscapes.workflows.illumination import (
     SunMoonPosition,
     illumination_for_camera,
@@ -310,7 +311,7 @@ def session_of(job: RenderJob, place: Place, *, progress: Progress | None = None
     use_backend(job.device)
     return relight_session(
         place,
-        camera_for(place, job.view, size_px=job.size_px),
+        on_detailed_ground(place, camera_for(place, job.view, size_px=job.size_px)),
         sky=job.sky,
         albedo=AlbedoSeries(tuple(dated_albedos(place, job.albedo, progress=progress)), job.season),
         base_day=job.base_day,
