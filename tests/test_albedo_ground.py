@@ -1,0 +1,111 @@
+"""Albedo from photographs of ground that is not Lambertian: water tells none, snow's is found by how snow scatters."""
+
+from dataclasses import replace
+
+import albedo_cases
+import numpy as np
+import pytest
+
+from seasonscapes.albedo import equations
+from seasonscapes.albedo.closed_form import solve_albedo
+from seasonscapes.albedo.forward_model import trace_texel_transport
+from seasonscapes.albedo.ground_pixels import ground_pixels, without_water
+from seasonscapes.albedo.photographs import LINEAR, prepare_photographs
+from seasonscapes.cameras.observation import Observation
+from seasonscapes.errors import NoUsablePixels
+from seasonscapes.rendering.coefficients import SamplingOptions
+from seasonscapes.rendering.mitsuba_scene import mi_mesh, relight
+from seasonscapes.rendering.radiance import render_view
+from seasonscapes.terrain.surface_classes import Snow
+
+SAMPLING = SamplingOptions(shadow_samples=1, rays=128, clusters_per_receiver=64, clusters=1024, rank=24)
+
+
+@pytest.fixture(scope="module")
+def case():
+    return albedo_cases.case()
+
+
+@pytest.fixture(scope="module")
+def photographs(case):
+    return prepare_photographs(case.transport, *case.observations())
+
+
+@pytest.fixture(scope="module")
+def snowy(case):
+    """The place under snow of albedo 0.8 that scatters as snow does, its transport, and photographs of it."""
+    terrain = replace(case.terrain, snow=Snow())
+    albedo = np.full_like(case.albedo, 0.8)
+    mesh = mi_mesh(terrain, albedo)
+    observations, lights = [], []
+    for number, light in ((0, case.lights[0]), (3, case.lights[3])):
+        for camera in case.cameras[:2]:
+            image = render_view(relight(mesh, light), camera, spp=64, seed=number).radiance
+            moment = case.observations([number])[0][0].time
+            observations.append(Observation(image, np.ones(image.shape[:2], bool), camera, moment, "snow"))
+            lights.append(light)
+    transport = trace_texel_transport(terrain, albedo.shape[:2], sampling=SAMPLING)
+    gains = [np.ones(3)] * len(observations)
+    return transport, prepare_photographs(transport, observations, lights, gains=gains), albedo
+
+
+def test_the_albedo_of_snow_is_found_by_how_it_scatters(case, snowy):
+    """Taken for matt, snow towards the sun seems brighter and snow away from it darker than it is."""
+    transport, photographs, albedo = snowy
+    found = solve_albedo(transport, photographs, noise_model=LINEAR)
+    matt = solve_albedo(case.transport, photographs, noise_model=LINEAR)
+    seen = found.pixel_count > 4.0
+    errors = [np.sqrt(np.mean((fit.albedo[seen] - albedo[seen]) ** 2)) for fit in (found, matt)]
+    assert errors[0] < 0.5 * errors[1]
+    assert errors[0] < 0.05
+    assert np.median(found.residual) < 0.5 * np.median(matt.residual)
+
+
+def test_the_adjoint_of_snow_is_the_transpose(snowy):
+    transport, photographs, albedo = snowy
+    row = equations.equations_of(photographs[1], LINEAR, albedo.size // 3)
+    ground = ground_pixels(transport, photographs[1])
+    assert ground is not None
+    row.ground = ground.factors(albedo.reshape(-1, 3))
+    assert np.ptp(row.ground.luminaries[0]) > 0.2
+    rng = np.random.default_rng(4)
+    row.ambient = rng.uniform(1e3, 1e4, row.ambient.shape).astype(np.float32)
+    a, r = rng.random(row.ambient.shape, np.float32), rng.random(row.picture.shape, np.float32)
+    left = (equations.forward_product(row, a)[0].astype(float) * r).sum()
+    assert left == pytest.approx((a.astype(float) * equations.adjoint(row, r)).sum(), rel=1e-4)
+    # The diagonal against the response to single texels.
+    row.weight = np.ones_like(row.picture)
+    diagonal = equations.squared_adjoint(row)
+    for texel in rng.choice(np.flatnonzero(diagonal[:, 1] > 0.0), 3):
+        one = np.zeros_like(a)
+        one[texel] = 1.0
+        response = equations.forward_product(row, one)[0].astype(float)
+        np.testing.assert_allclose((response**2).sum(axis=0), diagonal[texel], rtol=1e-3)
+
+
+def test_water_tells_no_albedo(case, photographs):
+    row, column = np.mgrid[0 : case.albedo.shape[0], 0 : case.albedo.shape[1]]
+    counts = pixel_counts(photographs)
+    at = np.unravel_index(np.argmax(counts), counts.shape)
+    water = (np.hypot(row - at[0], column - at[1]) < 5.0).astype(np.float32)
+    dry, share = without_water(photographs, water)
+    assert 0.0 < share < 0.5
+    assert len(dry) == len(photographs)
+    assert len({id(each.footprints) for each in dry}) == len(case.cameras)
+    for before, after in zip(photographs, dry, strict=True):
+        wet = before.footprints.matrix(before.footprints.share) @ water.ravel()
+        np.testing.assert_array_equal(after.footprints.pixel, before.footprints.pixel[wet <= 0.02])
+    fit = solve_albedo(case.transport, dry, noise_model=LINEAR)
+    inside = np.hypot(row - at[0], column - at[1]) < 3.0
+    assert fit.information[inside].max() == 0.0
+    # Elsewhere nothing is lost.
+    away = (np.hypot(row - at[0], column - at[1]) > 9.0) & (fit.pixel_count > 2.0)
+    assert albedo_cases.psnr(fit.albedo, case.albedo, away) > 30.0
+    with pytest.raises(NoUsablePixels, match="water"):
+        without_water(photographs, np.ones_like(water))
+
+
+def pixel_counts(photographs):
+    from seasonscapes.albedo.footprints import texel_pixel_count
+
+    return texel_pixel_count([each.footprints for each in photographs[:3]])
