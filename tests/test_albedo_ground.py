@@ -1,9 +1,11 @@
 """Albedo from photographs of ground that is not Lambertian: water tells none, snow's is found by how snow scatters."""
 
+import json
 from dataclasses import replace
 
 import albedo_cases
 import numpy as np
+import places
 import pytest
 
 from seasonscapes.albedo import equations
@@ -19,6 +21,11 @@ from seasonscapes.rendering.hosek import hosek_illumination
 from seasonscapes.rendering.mitsuba_scene import mi_mesh, relight
 from seasonscapes.rendering.radiance import render_view
 from seasonscapes.terrain.surface_classes import Snow
+from seasonscapes.workflows.albedo_recovery import recover_albedo
+from seasonscapes.workflows.place import load_place, utc_at
+from seasonscapes.workflows.view_rendering import render
+from seasonscapes.workflows.views import camera
+from seasonscapes.workspace import Workspace
 
 SAMPLING = SamplingOptions(shadow_samples=1, rays=128, clusters_per_receiver=64, clusters=1024, rank=24)
 
@@ -43,10 +50,10 @@ def snowy(case):
     # Each camera looks towards a low sun.
     for number, azimuth_deg in ((0, 240.0), (2, 110.0)):
         light = hosek_illumination(direction_from_angles(azimuth_deg, 10.0), shape=(64, 128))
-        for camera in (case.cameras[0], case.cameras[2]):
-            image = render_view(relight(mesh, light), camera, spp=64, seed=number).radiance
+        for view in (case.cameras[0], case.cameras[2]):
+            image = render_view(relight(mesh, light), view, spp=64, seed=number).radiance
             moment = case.observations([number])[0][0].time
-            observations.append(Observation(image, np.ones(image.shape[:2], bool), camera, moment, "snow"))
+            observations.append(Observation(image, np.ones(image.shape[:2], bool), view, moment, "snow"))
             lights.append(light)
     transport = trace_texel_transport(terrain, albedo.shape[:2], sampling=SAMPLING)
     gains = [np.ones(3)] * len(observations)
@@ -132,3 +139,27 @@ def pixel_counts(photographs):
     from seasonscapes.albedo.footprints import texel_pixel_count
 
     return texel_pixel_count([each.footprints for each in photographs[:3]])
+
+
+def test_recovery_completes_the_texels_of_water(tmp_path, caplog):
+    path = places.write_place(tmp_path, places.SCENE + '\n[water]\nfile = "lakes.geojson"\n\n[snow]\n')
+    ring = [[7.977, 46.5440], [7.983, 46.5440], [7.983, 46.5462], [7.977, 46.5462], [7.977, 46.5440]]
+    (tmp_path / "lakes.geojson").write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
+    place = load_place(path, Workspace(tmp_path / "workspace"))
+    view = camera(place, "south", size_px=(72, 48))
+    seen = []
+    for hour in ("09", "15"):
+        picture = render(place, view, f"2024-07-01T{hour}:00", sky="hosek", spp=16)
+        mask = np.ones(picture.radiance.shape[:2], bool)
+        image = (picture.radiance / np.percentile(picture.radiance, 99.9)).clip(0.0, 1.0)
+        seen.append(Observation(image.astype(np.float32), mask, view, utc_at(place, f"2024-07-01T{hour}:00"), "south"))
+    with caplog.at_level("INFO"):
+        recovered = recover_albedo(place, seen, sky="hosek")
+    assert 0.05 < recovered.facts["water_share"] < 0.6
+    assert any("water:" in each.message for each in caplog.records)
+    lake = place.terrain.water.mask == 1.0
+    assert lake.sum() > 20
+    assert set(np.unique(recovered.estimate.source[lake])) == {2}
+    assert (recovered.estimate.source == 1).sum() > 100
+    np.testing.assert_array_equal(recovered.texture.weight[lake], 0.0)
+    assert np.isfinite(recovered.estimate.sigma[lake]).all()
