@@ -212,10 +212,10 @@ def adjoint(equations: PhotographEquations, residual: np.ndarray) -> np.ndarray:
     return total
 
 
-def _light_factors(equations: PhotographEquations) -> tuple[list[np.ndarray], np.ndarray | np.float32]:
+def _light_factors(equations: PhotographEquations) -> tuple[list[np.ndarray], np.ndarray]:
     """What the pixels reflect of each luminary [lx] and of diffuse light, relative to Lambertian ground."""
     if equations.ground is None:
-        return equations.luminary_lx, np.float32(1.0)
+        return equations.luminary_lx, np.ones(3, np.float32)
     direct = zip(equations.luminary_lx, equations.ground.luminaries, strict=True)
     return [illuminance * factor for illuminance, factor in direct], equations.ground.diffuse
 
@@ -241,11 +241,9 @@ def squared_adjoint(equations: PhotographEquations) -> np.ndarray:
     direct, diffuse = _light_factors(equations)
     entries = np.diff(footprints.start)
 
-    def of_entries(factor: np.ndarray | np.float32, channel: int) -> np.ndarray | np.float32:
-        """A channel of factors that are the same in all pixels, or of each pixel, for each entry."""
-        if factor.ndim < 2:
-            return factor[channel] if factor.ndim else factor
-        return np.repeat(factor[:, channel], entries)
+    def of_entries(factor: np.ndarray, channel: int) -> np.ndarray:
+        """A channel of factors ``(3,)`` of all pixels, or ``(n, 3)`` of each, for the entries."""
+        return factor[channel] if factor.ndim == 1 else np.repeat(factor[:, channel], entries)
 
     for channel in range(3):
         values = share * equations.ambient[texel, channel] * of_entries(diffuse, channel)

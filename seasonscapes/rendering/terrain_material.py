@@ -16,6 +16,7 @@ they send to the viewer directly.
 
 from __future__ import annotations
 
+import logging
 from functools import cache
 from typing import Any
 
@@ -30,6 +31,8 @@ from seasonscapes.rendering.snow_scattering import SnowOptics
 from seasonscapes.rendering.water_surface import REFRACTIVE_INDEX, DeviceWater, slope_variance
 from seasonscapes.terrain.surface import SurfaceGrid, Terrain
 from seasonscapes.terrain.surface_classes import Water
+
+log = logging.getLogger(__name__)
 
 # Mitsuba's math::RayEpsilon in single precision.
 RAY_EPSILON = float(np.finfo(np.float32).epsneg) * 1500.0
@@ -215,6 +218,8 @@ def terrain_material(reflectance: dict[str, Any], terrain: Terrain, *, smooth: b
     import mitsuba as mi
 
     if use_backend().device == "scalar":
+        if terrain.images:
+            log.warning("finer images are left out in the scalar variant; it needs the device llvm or cuda")
         ground = {"type": "diffuse", "reflectance": reflectance}
         return mi.load_dict(ground if terrain.water is None else _scalar_water(ground, terrain.water))
     variant = mi.variant()
