@@ -9,6 +9,9 @@ interpolation. The rasters are four of 2.5 to 10 m below ``--data`` (default: th
 lattice of 60 m, is no truth about finer relief: its gains (``massif_…``) are printed beside, and stand for the others only
 where there are none.
 
+Beside sunny photographs of a webcam, plain and amplified pictures of the same instants are compared by how their detail falls off
+towards the pixel (`detail_photograph`): ``photograph_gain`` is 1 where the amplified ones are like photographs.
+
 A place of 60 × 50 km is made on the spot, and a picture by a camera 2 m above its ground taken in a fresh process and
 workspace with ``--amplify``: ``first_picture_s`` is its wall time, ``peak_gb`` its largest memory, ``near_texel_px`` the
 largest size of an element of the albedo in the lowest rows of the picture. ``--quick`` renders it at 768 × 512 instead of
@@ -38,6 +41,7 @@ import cv2
 import numpy as np
 import rasterio
 from affine import Affine
+from detail_photograph import photograph_gains
 from record import ROOT, write_record
 
 from seasonscapes.rendering.albedo_detail import finest_detail_m
@@ -49,7 +53,7 @@ from seasonscapes.terrain.crs import raster_pixels
 from seasonscapes.terrain.surface import Raster
 from seasonscapes.terrain.surface_classes import AlbedoDetail, Water
 from seasonscapes.terrain.synthetic import alpine_massif
-from seasonscapes.workflows.amplified_terrain import detailed_terrain
+from seasonscapes.workflows.amplified_terrain import detailed_view
 from seasonscapes.workflows.place import load_place
 from seasonscapes.workflows.views import camera
 from seasonscapes.workspace import Workspace
@@ -273,7 +277,7 @@ def nested_figures(scene: Path, folder: Path, size_px: tuple[int, int]) -> dict[
     place = load_place(scene, Workspace(folder / "workspace"))
     view = camera(place, "eye", size_px=size_px)
     focal, distance = float(view.fx), lowest_rows_m(size_px)
-    terrain = detailed_terrain(place, view)
+    view, terrain = detailed_view(place, view)
     assert terrain.surface is not None
     texel_m = terrain.images[-1].levels[-1].texel_m
     eye_m = np.asarray(view.position_m, float)
@@ -360,6 +364,7 @@ def main() -> None:
     figures |= {"rasters": len(real), "snow_albedo_error": snow_error(), "fresnel_error": fresnel_error()}
     size_px, factor = ((768, 512), 8) if options.quick else ((1536, 1024), 16)
     with tempfile.TemporaryDirectory() as folder:
+        figures |= photograph_gains(options.data, Path(folder), 352 if options.quick else 704)
         figures |= wide_figures(Path(folder), seed, size_px)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -157,7 +157,7 @@ def film(bench: Bench, hours: int | None) -> dict[str, float]:
 def demo(bench: Bench) -> dict[str, float]:
     """``demo`` in an empty workspace."""
     folder = bench.folder / "demo"
-    cost = bench.seasonscapes("demo", "-o", str(folder), workspace="demo", awaited=folder / "day-and-year-00.png")
+    cost = bench.seasonscapes("demo", "-o", str(folder), workspace="demo", awaited=folder / "lake.png")
     assert cost.first_file_s is not None
     return {
         "demo_first_picture_s": cost.first_file_s,

@@ -11,7 +11,7 @@ from seasonscapes.rendering.backend import use_backend
 from seasonscapes.terrain.surface_classes import AlbedoDetail
 from seasonscapes.workflows import amplified_terrain
 from seasonscapes.workflows.place import load_place
-from seasonscapes.workflows.views import camera, terrain_for_view
+from seasonscapes.workflows.views import camera, terrain_for_view, view_with_terrain
 from seasonscapes.workspace import Workspace
 
 NEAR = AlbedoDetail((0.0, 0.0, 2.0), 1e-3, 4.0, seed=3)
@@ -27,7 +27,7 @@ def test_the_surface_is_finest_about_the_camera(place, monkeypatch):
     monkeypatch.setattr(amplified_terrain, "_MOST_NEAR_NODES", 300_000)
     monkeypatch.setattr(amplified_terrain, "_MOST_NODES", 100_000)
     view = camera(place, "south", size_px=(96, 64))
-    plain, fine = terrain_for_view(place, view), terrain_for_view(place, view, amplify=True)
+    plain, fine = terrain_for_view(place, view), view_with_terrain(place, view, amplify=True)[1]
     assert place.terrain.surface is not None
     assert fine.surface is not None
     (inner,) = fine.surface.parts
@@ -88,8 +88,6 @@ def test_octaves_end_at_the_pixels():
 
 def test_a_camera_near_the_ground_keeps_its_height_above_it(monkeypatch):
     """Detail may raise the ground by more than a camera stands above it: it would look at the ground from below."""
-    from seasonscapes.workflows.amplified_terrain import on_detailed_ground
-
     monkeypatch.setattr(amplified_terrain, "_MOST_NEAR_NODES", 300_000)
     monkeypatch.setattr(amplified_terrain, "_MOST_NODES", 100_000)
     place = load_place("alpine_small")
@@ -101,13 +99,43 @@ def test_a_camera_near_the_ground_keeps_its_height_above_it(monkeypatch):
         pose[0, 3] += 160.0 * step
         ground = float(place.terrain.surface.up_at(pose[None, :3, 3])[0])
         pose[2, 3] = ground + 2.0
-        moved = on_detailed_ground(place, replace(south, world_from_camera=pose), amplify=True)
-        below = terrain_for_view(place, moved, amplify=True).surface
+        moved, terrain = view_with_terrain(place, replace(south, world_from_camera=pose), amplify=True)
+        below = terrain.surface
         assert below is not None
         height = moved.position_m[2] - float(below.up_at(moved.position_m[None])[0])
         assert height == pytest.approx(2.0, abs=0.4)
         changes.append(moved.position_m[2] - pose[2, 3])
         pose[2, 3] = ground + 150.0
         free = replace(south, world_from_camera=pose)
-        assert on_detailed_ground(place, free, amplify=True) is free
+        assert view_with_terrain(place, free, amplify=True)[0] is free
     assert max(np.abs(changes)) > 0.3
+
+
+def test_the_ground_of_the_next_frame_of_a_film_is_the_same(place, monkeypatch):
+    """The finer part moves along with the camera, cell by cell: within what its pixels can tell, nothing pops up."""
+    monkeypatch.setattr(amplified_terrain, "_MOST_NEAR_NODES", 300_000)
+    monkeypatch.setattr(amplified_terrain, "_MOST_NODES", 100_000)
+    view = camera(place, "south", size_px=(96, 64))
+    grid = np.stack(np.meshgrid(np.linspace(-800.0, 800.0, 161), np.linspace(-800.0, 800.0, 161)), axis=-1).reshape(
+        -1, 2
+    )
+    points = np.c_[view.position_m[:2] + grid, np.zeros(len(grid))]
+
+    def ground(forward_m: float) -> tuple[np.ndarray, np.ndarray]:
+        pose = view.world_from_camera.copy()
+        pose[:3, 3] += forward_m * pose[:3, 2]
+        surface = view_with_terrain(place, replace(view, world_from_camera=pose), amplify=True)[1].surface
+        assert surface is not None
+        return surface.sample(points)
+
+    heights, normals = ground(0.0)
+    changed = 0
+    for step_m in (5.0, 20.0, 50.0):
+        other, turned = ground(step_m)
+        distance = np.linalg.norm(grid, axis=1)
+        pixels = np.abs(other - heights) / np.maximum(distance, 2.0) * view.fx
+        assert np.quantile(pixels, 0.999) < 0.5
+        assert pixels.max() < 2.0
+        assert np.degrees(np.arccos(np.clip((turned * normals).sum(axis=1), -1.0, 1.0))).mean() < 0.5
+        changed += int((other != heights).any())
+    assert changed, "the finer part was never moved"

@@ -52,7 +52,7 @@ VERBS: dict[str, tuple[list[str], set[str], dict[str, list[str]]]] = {
     "timelapse": (
         ["alpine_small", "--from", "2024-07-20T10:00", "--to", "2024-07-20T11:00"],
         {*_TERRAIN, *_SKY, "--path", "--from", "--to", "--times", "--albedo", "--seed", "--output", "--cluster"}
-        | {"--shard", "--device"},
+        | {"--shard", "--device", "--amplify"},
         {**_OF_POSITION, **_NO_BOUND}
         | _each((*_VIEW, "--every", "--exr", "--cluster"), ["--path", "p.json"])
         | {"--season": [], "--fps": ["--output", "folder"]}

@@ -47,5 +47,9 @@ def test_a_path_is_filmed_once_and_the_sun_moves(tmp_path, capsys):
     assert main([*film, "--times", "2024-07-20T13:00"]) == 0
     assert np.abs(np.asarray(Image.open(frames[0]), float) - morning).mean() > 3.0, "another hour, another light"
     capsys.readouterr()
+    capsys.readouterr()
+    assert main([*film, *hours, "--amplify"]) == 0
+    assert json.loads(capsys.readouterr().out)["rendered"] == 3, "other frames than the plain ones"
+    assert np.abs(np.asarray(Image.open(frames[0]), float) - morning).mean() > 0.5, "detail is seen"
     assert main([*film, *hours, "--every", "1h"]) == 2
     assert "--every: does nothing" in capsys.readouterr().err

@@ -12,6 +12,8 @@ from seasonscapes.rendering.backend import use_backend
 from seasonscapes.rendering.coefficients import SamplingOptions
 from seasonscapes.rendering.coefficients_file import load_coefficients, save_coefficients
 from seasonscapes.rendering.hemisphere_rays import ray_scene
+from seasonscapes.rendering.mirror_samples import morton_order
+from seasonscapes.rendering.mirrored_light import WaveBlur
 from seasonscapes.rendering.mitsuba_scene import mi_mesh, relight, set_albedo
 from seasonscapes.rendering.radiance import path_trace
 from seasonscapes.rendering.relit_view import (
@@ -241,3 +243,26 @@ def test_views_without_water_are_as_before():
     view = trace_view(ray_scene(mesh), looking_down(size=8), SamplingOptions(rays=64, clusters=16))
     assert view.mirror is None
     assert relightable_view(ray_scene(mesh), view).mirror is None
+
+
+def test_the_filter_of_rough_water_keeps_the_light_and_takes_the_grain():
+    """On an L of water pixels, some of which hold a bit of shore: light only goes from one to the other."""
+    row, column = np.nonzero(np.tri(40, 30) > 0.0)
+    generator = np.random.default_rng(5)
+    whole = (generator.random(len(row)) < 0.9).astype(np.float32)
+    blur = WaveBlur(row, column, 2.0, whole, 0.5 * whole)
+    grain = (1.0 + 0.3 * generator.standard_normal((len(row), 3))).astype(np.float32)
+    filtered = blur.applied(grain)
+    np.testing.assert_allclose(filtered.sum(axis=0), grain.sum(axis=0), rtol=1e-5)
+    np.testing.assert_allclose(blur.applied(np.full_like(grain, 2.5)), 2.5, rtol=1e-5)
+    np.testing.assert_array_equal(filtered[whole == 0.0], grain[whole == 0.0])
+    assert filtered[whole > 0.0].std() < 0.5 * 0.3
+
+
+def test_pixels_along_a_morton_curve_fill_aligned_squares():
+    row, column = np.mgrid[0:8, 0:8]
+    order = morton_order(column, row)
+    assert sorted(order.ravel()) == list(range(64))
+    for side in (2, 4):
+        blocks = (order // side**2).reshape(8 // side, side, 8 // side, side)
+        assert (blocks == blocks[:, :1, :, :1]).all()

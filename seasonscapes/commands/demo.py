@@ -22,7 +22,7 @@ def demo_command(
     workspace: Path | None = None,
     json: bool = False,
 ) -> None:
-    """Picture the embedded scene through a day, four seasons and four airs.
+    """Picture the embedded massif above its lake: on a June evening, through a day, four seasons and four airs.
 
     Pictures that exist already, made with the same arguments, are kept: an interrupted demo continues.
 
@@ -31,7 +31,7 @@ def demo_command(
     output
         Folder for the pictures.
     camera
-        A camera of the scene alpine; the first one when left out.
+        A camera of the scene alpine_lake; the first one when left out.
     size
         Of the panels; those of the gallery's night are half as wide.
     gallery
@@ -44,7 +44,7 @@ def demo_command(
         Print one machine-readable record.
     """
     from seasonscapes.rendering.backend import use_backend
-    from seasonscapes.workflows.demo import day_and_year, night_and_film
+    from seasonscapes.workflows.demo import SCENE, day_and_year, night_and_film
     from seasonscapes.workflows.place import load_place
     from seasonscapes.workspace import Workspace
 
@@ -55,7 +55,7 @@ def demo_command(
     message("demo: building the embedded scene")
     made: list[Path] = []
     with progress_bars() as progress:
-        place = load_place("alpine", None if workspace is None else Workspace(workspace), progress=progress)
+        place = load_place(SCENE, None if workspace is None else Workspace(workspace), progress=progress)
         view = place.scene.camera(camera)
         made += day_and_year(place, view, output, size_px=(width, height), progress=progress)
         if gallery:

@@ -35,6 +35,7 @@ def timelapse_command(
     exr: bool = False,
     keep_frames: bool = False,
     seed: int = 0,
+    amplify: bool = False,
     output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("out/timelapse.mp4"),
     work: WorkOptions | None = None,
     place: PlaceOptions | None = None,
@@ -66,6 +67,8 @@ def timelapse_command(
         Leave the undeveloped frames in the workspace when the film is done.
     seed
         Equal seeds give equal pictures.
+    amplify
+        Add relief and albedo below the resolution of the data, as of render.
     output
         A .mp4 film, or a folder for .png frames.
     device
@@ -106,6 +109,7 @@ def timelapse_command(
             "albedo": albedo,
             "season": season,
             "seed": seed,
+            "amplify": amplify,
         }
         film_path(scene, path, output, film_look, **how, device=device, as_json=json)
         return
@@ -125,6 +129,7 @@ def timelapse_command(
         seed=seed,
         device=device,
         allow_outside=place.allow_outside,
+        amplify=amplify,
     )
     chosen_times = times if part is None else films.shard(times, *part)
     where: dict[str, Any] = {"cluster": work.cluster, "exr_folder": output.resolve() if exr else None}

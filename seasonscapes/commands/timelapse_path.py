@@ -5,7 +5,7 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from seasonscapes.commands.arguments import parse_albedo
 from seasonscapes.commands.console import print_result, progress_bars
@@ -30,6 +30,7 @@ def film_path(
     albedo: Sequence[str] | None,
     season: str | None,
     seed: int,
+    amplify: bool,
     device: str,
     as_json: bool,
 ) -> None:
@@ -49,9 +50,8 @@ def film_path(
         times = when.ends(*at)
         series = albedo_series(loaded, files, season or "blended", progress=progress)
         keys = [season or "blended", *(each.content for each in (series.dated if series else ()))]
-        frames, rendered = film_along(
-            loaded, path, times, output, look, sky=sky, albedo=series, albedo_key=keys, seed=seed, progress=progress
-        )
+        how: dict[str, Any] = {"sky": sky, "albedo": series, "albedo_key": keys, "seed": seed, "amplify": amplify}
+        frames, rendered = film_along(loaded, path, times, output, look, **how, progress=progress)
     record = {"scene": scene, "path": str(path), "frames": frames, "rendered": rendered, "output": str(output)}
     record["seconds"] = round(clock.perf_counter() - start, 2)
     print_result(

@@ -74,7 +74,7 @@ def water_samples(terrain: RayScene, points: SurfacePoints, hit: np.ndarray) -> 
 
 
 def mirror_samples(
-    terrain: RayScene, eye_m: np.ndarray, points: SurfacePoints, on_water: np.ndarray, identity: np.ndarray, seed: int
+    terrain: RayScene, eye_m: np.ndarray, points: SurfacePoints, on_water: np.ndarray, order: np.ndarray, seed: int
 ) -> MirrorSamples:
     """Follow the rays that the water in the samples of pixels mirrors.
 
@@ -86,8 +86,9 @@ def mirror_samples(
         ``(3,)`` position of the camera [m].
     points, on_water
         ``(n, S)`` surface points of the samples, and whether they are on water.
-    identity
-        ``(n,)`` number of each pixel in the image, which chooses its facets.
+    order
+        ``(n,)`` number of each pixel along a Morton curve, see `morton_order`. All pixels share one sequence of facets, whose
+        aligned runs are stratified: the means over 2 × 2, 4 × 4 … pixels too, so that little grain is seen.
     seed
         Of the facets.
 
@@ -107,10 +108,10 @@ def mirror_samples(
     viewer = (viewer / np.linalg.norm(viewer, axis=1, keepdims=True)).astype(np.float32)
     water = device_water(terrain.mi_terrain.bsdf())
     assert water is not None
-    key = hashed(hashed(mi.UInt32(identity[pixel][row].astype(np.uint32)), dr.opaque(mi.UInt32, seed)), _WAVE)
+    key, number = hashed(dr.opaque(mi.UInt32, seed), _WAVE), order[pixel][row] * on_water.shape[1] + sample
     # The stubs reject normals as vectors.
     normal, mi_viewer = cast(Any, mi.Normal3f(point3(from_water.normal))), mi.Vector3f(point3(viewer))
-    direction, reflectance = water.mirrored(normal, mi_viewer, sobol_pair(key, mi.UInt32(sample.astype(np.uint32))))
+    direction, reflectance = water.mirrored(normal, mi_viewer, sobol_pair(key, mi.UInt32(number.astype(np.uint32))))
     interaction = terrain.mi_scene.ray_intersect(mi.Ray3f(point3(from_water.origin), direction))
     valid = interaction.is_valid()
     found = surface_points(terrain, interaction, valid)
@@ -128,6 +129,23 @@ def mirror_samples(
     shares, directions = np.zeros(on_water.shape, np.float32), np.zeros((*on_water.shape, 3), np.float32)
     shares[on_water], directions[on_water] = np.array(reflectance), np.array(direction).T
     return MirrorSamples(pixel, on_water, shares, directions, repeated, hit)
+
+
+def morton_order(column: np.ndarray, row: np.ndarray) -> np.ndarray:
+    """Number ``(n,)`` int64 of pixels along a Morton curve, which goes through aligned squares one after the other."""
+
+    def spread(bits: np.ndarray) -> np.ndarray:
+        bits = np.asarray(bits, np.int64)
+        for shift, mask in (
+            (16, 0x0000FFFF0000FFFF),
+            (8, 0x00FF00FF00FF00FF),
+            (4, 0x0F0F0F0F0F0F0F0F),
+            (2, 0x3333333333333333),
+        ):
+            bits = (bits | bits << shift) & mask
+        return (bits | bits << 1) & 0x5555555555555555
+
+    return spread(column) | spread(row) << 1
 
 
 def mirror_weights(samples: MirrorSamples) -> np.ndarray:

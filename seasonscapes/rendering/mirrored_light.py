@@ -26,6 +26,56 @@ from seasonscapes.sky.illumination import Illumination, Luminary
 _LANES = 1 << 22
 
 
+# The filter against grain is at most so many pixels wide (standard deviation), and so small a part of what waves spread over.
+_BLUR_PX, _BLUR_SHARE = 2.0, 0.125
+# Share of a pixel from which on it is all water.
+_WHOLE = 0.99
+
+
+@dataclass(frozen=True)
+class WaveBlur:
+    """A filter of what neighbouring pixels of rough water mirror.
+
+    Waves spread each mirrored point over many pixels, mostly upwards and downwards; a few facets per pixel leave grain of it.
+    The filter is much narrower than that spread. What one pixel gives another it gets back in the same measure: the sum of the
+    light stays, and so does even light.
+
+    Parameters
+    ----------
+    row, column
+        ``(m,)`` of the pixels in a part of the image that holds them.
+    vertical_px
+        Standard deviation of the filter along columns [px].
+    down, across
+        ``(m,)`` float32 0 to 1: how much pixels take part along columns, and along rows, where the filter is a binomial one
+        of three pixels. Pixels that hold something else than water do not.
+    """
+
+    row: np.ndarray
+    column: np.ndarray
+    vertical_px: float
+    down: np.ndarray
+    across: np.ndarray
+
+    def applied(self, radiance: np.ndarray) -> np.ndarray:
+        """Filter radiance ``(m, 3)``."""
+        import cv2
+
+        reach = int(np.ceil(3.0 * self.vertical_px))
+        along_columns = cv2.getGaussianKernel(2 * reach + 1, self.vertical_px, cv2.CV_32F)
+        radiance = self._exchanged(radiance, self.down, along_columns)
+        return self._exchanged(radiance, self.across, np.array([[0.25, 0.5, 0.25]], np.float32))
+
+    def _exchanged(self, radiance: np.ndarray, part: np.ndarray, kernel: np.ndarray) -> np.ndarray:
+        """Exchange light between pixels i and j by the symmetric weights part i × part j × kernel (i - j)."""
+        import cv2
+
+        image = np.zeros((self.row.max() + 1, self.column.max() + 1, 4), np.float32)
+        image[self.row, self.column] = np.c_[radiance * part[:, None], part]
+        near = cv2.filter2D(image, -1, kernel, borderType=cv2.BORDER_CONSTANT)[self.row, self.column]
+        return radiance + part[:, None] * (near[:, :3] - radiance * near[:, 3:])
+
+
 @dataclass(frozen=True)
 class DeviceMirror:
     """What the water in a view mirrors, on the Dr.Jit device: m pixels show water, with S samples each.
@@ -46,6 +96,8 @@ class DeviceMirror:
         ``(m, 3)`` float32 unit normals of the water in the pixels, and unit directions towards the camera.
     pixel_angle_rad
         Angular size of a pixel [rad].
+    blur
+        Over which pixels waves spread what they mirror; ``None`` for smooth water.
     """
 
     coefficients: MirrorCoefficients
@@ -57,6 +109,7 @@ class DeviceMirror:
     normal: np.ndarray
     viewer: np.ndarray
     pixel_angle_rad: float
+    blur: WaveBlur | None
 
 
 def upload_mirror(terrain: RayScene, view: ViewCoefficients) -> DeviceMirror | None:
@@ -96,7 +149,22 @@ def upload_mirror(terrain: RayScene, view: ViewCoefficients) -> DeviceMirror | N
         normal,
         viewer,
         1.0 / float(view.camera.fx),
+        None if water.smooth else _wave_blur(view, mirror, normal, viewer, water),
     )
+
+
+def _wave_blur(
+    view: ViewCoefficients, mirror: MirrorCoefficients, normal: np.ndarray, viewer: np.ndarray, water: DeviceWater
+) -> WaveBlur:
+    row, column = np.divmod(view.pixel[mirror.pixel].astype(np.int64), view.camera.width_px)
+    # Slopes turn mirrored rays by twice their angle; sideways by the sine of the grazing angle less.
+    spread_px = 2.0 * water.roughness / np.sqrt(2.0) * float(view.camera.fx)
+    grazing = np.abs((normal * viewer).sum(axis=1))
+    across = np.clip(_BLUR_SHARE * spread_px * grazing / 0.7, 0.0, 1.0)
+    whole = (np.asarray(mirror.water_weight, np.float32).sum(axis=1) > _WHOLE).astype(np.float32)
+    vertical_px = max(min(_BLUR_PX, _BLUR_SHARE * spread_px), 0.1)
+    across = whole * np.sqrt(across).astype(np.float32)
+    return WaveBlur(row - row.min(), column - column.min(), vertical_px, whole, across)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
@@ -130,7 +198,8 @@ def mirrored_radiance(mirror: DeviceMirror, illumination: Illumination, light: C
         )
         if not mirror.water.smooth:
             glitter += (_visible_share(mirror, body) * _glitter(mirror, body))[:, None] * normal_illuminance
-    return irradiance * mirror.albedo + glitter + _mirrored_sky(mirror, illumination)
+    mirrored = irradiance * mirror.albedo + _mirrored_sky(mirror, illumination)
+    return (mirrored if mirror.blur is None else mirror.blur.applied(mirrored)) + glitter
 
 
 def _visible_share(mirror: DeviceMirror, body: Luminary) -> np.ndarray:

@@ -43,6 +43,7 @@ from seasonscapes.rendering.mirror_samples import (
     mirror_coefficients,
     mirror_samples,
     mirror_weights,
+    morton_order,
     water_samples,
 )
 from seasonscapes.rendering.sky_patches import sky_patches
@@ -370,7 +371,8 @@ def _view_rows(
     on_water, mirror = water_samples(terrain, points, hit), None
     if on_water.any():
         eye_m = np.asarray(camera.position_m)
-        samples = mirror_samples(terrain, eye_m, points, on_water, pixel, seed)
+        order = morton_order(pixel % camera.width_px, pixel // camera.width_px)
+        samples = mirror_samples(terrain, eye_m, points, on_water, order, seed)
         shares = mirror_weights(samples)
         identity = pixel[samples.pixel].astype(np.uint32) ^ _MIRRORED
         lit = _trace_receivers(terrain, shared, samples.points, shares, identity, sampling, seed)

@@ -100,9 +100,10 @@ class DeviceWater:
             wrap_mode=dr.WrapMode.Clamp,
         )
         self._mi_curvature = dr.opaque(mi.Float, (1.0 - frame.refraction_k) / MEAN_RADIUS_M)
-        self.smooth = slope_variance(water.wind_m_s) == 0.0
+        self.roughness = float(np.sqrt(slope_variance(water.wind_m_s)))
+        self.smooth = self.roughness == 0.0
         # Beckmann's distribution of slopes is a Gaussian of this width.
-        self._mi_roughness = dr.opaque(mi.Float, float(np.sqrt(slope_variance(water.wind_m_s))))
+        self._mi_roughness = dr.opaque(mi.Float, self.roughness)
         self.diffuse_reflectance = diffuse_reflectance()
 
     def covers(self, mi_uv: Any, active: Any = True) -> Any:

@@ -12,6 +12,7 @@ are amplified as the whole is, but for their rims, whose surroundings are unknow
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -35,6 +36,8 @@ _ROUNDS = 4
 # Cells around a part that are kept at each step, for interpolation.
 _MARGIN = 16
 _ORIENTATIONS = 8
+# Rows of a strip of noise, and how many strips are made at a time.
+_STRIP, _THREADS = 256, 4
 
 
 def amplified(elevation: Raster, factor: int, *, seed: int = 0) -> Raster:
@@ -210,14 +213,15 @@ def _doubled(heights: np.ndarray, amplitude: np.ndarray, spacing_m: float, trans
     row, column = np.mgrid[0 : base.shape[0], 0 : base.shape[1]]
     # Detail is fixed to the grid of the map: its origin is a whole number of cells.
     first_column, first_row = (round(offset) for offset in (transform.c / transform.a, transform.f / transform.e))
-    detail = oriented_noise(
-        (column + first_column).astype(np.float64),
-        (row + first_row).astype(np.float64),
-        angle=np.arctan2(down, across),
-        aligned=aligned,
-        seed=seed,
-        orientations=_ORIENTATIONS,
-    )
+    x, y, angle = (column + first_column).astype(float), (row + first_row).astype(float), np.arctan2(down, across)
+
+    def strip(rows: slice) -> np.ndarray:
+        return oriented_noise(
+            x[rows], y[rows], angle=angle[rows], aligned=aligned[rows], seed=seed, orientations=_ORIENTATIONS
+        )
+
+    with ThreadPoolExecutor(_THREADS) as pool:
+        detail = np.concatenate(list(pool.map(strip, (slice(at, at + _STRIP) for at in range(0, len(base), _STRIP)))))
     detail = detail - _interpolated(_block_means(detail))
     fine = base + _STRENGTH * detail * np.maximum(_cubic(amplitude), 0.0)
     return fine + _interpolated(heights - _block_means(fine))

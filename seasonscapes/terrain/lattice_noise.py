@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 # Of what grids of unit spacing hold, and those of twice the spacing do not, before they are scaled to 1.
@@ -50,12 +52,37 @@ def gradient_noise(x: np.ndarray, y: np.ndarray, seed: int) -> np.ndarray:
     column, row = np.floor(x), np.floor(y)
     fx, fy = x - column, y - row
     u, v = (f * f * f * (f * (6.0 * f - 15.0) + 10.0) for f in (fx, fy))
-    corners = []
-    for dy in (0, 1):
-        for dx in (0, 1):
-            angle = lattice_hash(column + dx, row + dy, seed) * (2.0 * np.pi / 2.0**32)
-            corners.append(np.cos(angle) * (fx - dx) + np.sin(angle) * (fy - dy))
+    gradient, corners = _gradients(column, row, seed), []
+    for k in range(4):
+        east, north = gradient(k)
+        corners.append(east * (fx - k % 2) + north * (fy - k // 2))
     return (corners[0] * (1 - u) + corners[1] * u) * (1 - v) + (corners[2] * (1 - u) + corners[3] * u) * v
+
+
+def _gradients(column: np.ndarray, row: np.ndarray, seed: int) -> Callable[[int], tuple[np.ndarray, np.ndarray]]:
+    """East and north components of the gradients at a corner, 0 to 3, of lattice cells ``(...)``.
+
+    Where there are fewer cells than points they are looked up in a table: drawing them is what noise costs.
+    """
+
+    def drawn(column: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        angle = lattice_hash(column, row, seed) * (2.0 * np.pi / 2.0**32)
+        return np.cos(angle), np.sin(angle)
+
+    if column.size:
+        first = int(column.min()), int(row.min())
+        width, height = int(column.max()) - first[0] + 2, int(row.max()) - first[1] + 2
+        if width * height < column.size:
+            rows, columns = np.mgrid[first[1] : first[1] + height, first[0] : first[0] + width]
+            east, north = (each.ravel() for each in drawn(columns, rows))
+            cell = (row - first[1]).astype(np.int64) * width + (column - first[0]).astype(np.int64)
+
+            def looked_up(corner: int) -> tuple[np.ndarray, np.ndarray]:
+                at = cell + (corner // 2 * width + corner % 2)
+                return east[at], north[at]
+
+            return looked_up
+    return lambda corner: drawn(column + corner % 2, row + corner // 2)
 
 
 def oriented_noise(

@@ -39,14 +39,14 @@ _RIM_SHARE = 0.12
 _TOLERANCE_PX, _REACH_M = 1.0, 2000.0
 # Up to the first height above ground a camera stands on it, from the second one up it does not [m].
 _STANDING_M, _FREE_M = 20.0, 100.0
-# How far the surface is looked at to find the ground below a camera [m].
-_BELOW_M = 20.0
 
 log = logging.getLogger(__name__)
 
 
-def detailed_terrain(place: Place, view: Camera | Panorama, *, amplify: bool = False, seed: int = 0) -> Terrain:
-    """The terrain of a view, as fine about its camera as the data are, or finer.
+def detailed_view(
+    place: Place, view: Camera | Panorama, *, amplify: bool = False, seed: int = 0
+) -> tuple[Camera | Panorama, Terrain]:
+    """The ground of a view as fine about its camera as the data are, or finer.
 
     Parameters
     ----------
@@ -61,78 +61,61 @@ def detailed_terrain(place: Place, view: Camera | Panorama, *, amplify: bool = F
 
     Returns
     -------
-    Terrain
+    view
+        Raised or lowered by what finer ground adds below it, so that its height above ground stays; the same one where that is
+        more than 100 m.
+    terrain
         With the atlas of the place. Its surface has a part about the camera as fine as the files there, and its mesh follows
-        it; images finer than the atlas lie over its albedo. With ``amplify`` it is finer everywhere and finest about the camera, and its albedo has detail down to the pixels;
-        means over the data's cells stay.
+        it; images finer than the atlas lie over its albedo. With ``amplify`` it is finer everywhere and finest about the camera,
+        and its albedo has detail down to the pixels; means over the data's cells stay.
     """
-    eye_m, pixel_rad = view.position_m, 1.0 / float(view.fx)
     terrain = place.terrain
     if terrain.surface is not None:
-        surface = _surface(place, eye_m, seed, amplify=amplify)
-        terrain = terrain if surface is terrain.surface else moved_to(terrain, surface)
-    terrain = replace(terrain, images=image_details(place, np.asarray(eye_m)))
+        fine = _surface(place, np.asarray(view.position_m, float), seed, amplify=amplify)
+        if fine is not terrain.surface:
+            view, terrain = _at_its_height(view, terrain.surface, fine), moved_to(terrain, fine)
+    eye_m, pixel_rad = np.asarray(view.position_m, float), 1.0 / float(view.fx)
+    terrain = replace(terrain, images=image_details(place, eye_m))
     if not amplify:
-        return refined_for_view(terrain, eye_m, pixel_rad)
+        return view, refined_for_view(terrain, eye_m, pixel_rad)
     east, north, up = (float(value) for value in eye_m)
     detail = AlbedoDetail((east, north, up), pixel_rad, place.atlas.texel_p50_m, seed)
     terrain = refined_for_view(terrain, eye_m, pixel_rad, tolerance_px=_TOLERANCE_PX, reach_m=_REACH_M)
-    return replace(terrain, detail=detail)
+    return view, replace(terrain, detail=detail)
 
 
-def on_detailed_ground(
-    place: Place, view: Camera | Panorama, *, amplify: bool = False, seed: int = 0
-) -> Camera | Panorama:
-    """Raise or lower a camera that stands on the ground by what detail adds below it, so that its height above ground stays.
-
-    Parameters
-    ----------
-    place, view, amplify, seed
-        See `detailed_terrain`.
-
-    Returns
-    -------
-    Camera or Panorama
-        The same one where it is more than 100 m above the ground.
-    """
-    surface = place.terrain.surface
-    if surface is None or not (amplify or place.finer_heights):
-        return view
+def _at_its_height(view: Camera | Panorama, plain: SurfaceGrid, fine: SurfaceGrid) -> Camera | Panorama:
     eye_m = np.asarray(view.position_m, float)
-    ground_m = float(surface.up_at(eye_m[None])[0])
+    ground_m, finer_m = (float(surface.up_at(eye_m[None])[0]) for surface in (plain, fine))
     share = np.clip((_FREE_M - (eye_m[2] - ground_m)) / (_FREE_M - _STANDING_M), 0.0, 1.0)
     if share == 0.0:
         return view
-    detailed = _surface(place, eye_m, seed, near_m=_BELOW_M, amplify=amplify)
-    added_m = float(detailed.up_at(eye_m[None])[0]) - ground_m
-    if added_m == 0.0:
-        return view
     pose = np.array(view.world_from_camera, float)
-    pose[2, 3] += share * added_m
-    log.info("the camera keeps its height above ground: detail changes the ground below it by %+.2f m", added_m)
+    pose[2, 3] += share * (finer_m - ground_m)
+    log.info(
+        "the camera keeps its height above ground: detail changes the ground below it by %+.2f m", finer_m - ground_m
+    )
     return replace(view, world_from_camera=pose)
 
 
-def _surface(
-    place: Place, eye_m: np.ndarray, seed: int, *, near_m: float = _NEAR_M, amplify: bool = True
-) -> SurfaceGrid:
-    """Surface of the place, amplified or not, with a finer part about a camera, which reaches so far."""
+def _surface(place: Place, eye_m: np.ndarray, seed: int, *, amplify: bool) -> SurfaceGrid:
+    """Surface of the place, amplified or not, with a finer part about a camera."""
     surface = place.terrain.surface
     assert surface is not None
     whole, factor = _amplified_whole(place, seed) if amplify else (surface, 1)
-    found = finest_near(place, eye_m, near_m) if surface.parts else None
+    found = finest_near(place, eye_m, _NEAR_M) if surface.parts else None
     if found is None and not amplify:
         return surface
     if found is None:
         # Parts of finer data that do not hold the camera take the place of what is invented.
-        near = _near_part(place, place.elevation, eye_m, near_m, seed, least_factor=factor)
+        near = _near_part(place, place.elevation, eye_m, seed, least_factor=factor)
         parts = surface.parts if near is None else (near, *surface.parts)
         return replace(whole, parts=parts)
     number, heights = found
     kept = heights is place.finer_heights[number]
     if kept and not amplify:
         return surface
-    near = _near_part(place, heights, eye_m, near_m, seed, least_factor=1 if kept else 0, amplify=amplify)
+    near = _near_part(place, heights, eye_m, seed, least_factor=1 if kept else 0, amplify=amplify)
     before, after = surface.parts[: number + 1], surface.parts[number + 1 :]
     return replace(whole, parts=(*before, *(() if near is None else (near,)), *after))
 
@@ -162,14 +145,7 @@ def _amplified_whole(place: Place, seed: int) -> tuple[SurfaceGrid, int]:
 
 
 def _near_part(
-    place: Place,
-    elevation: Raster,
-    eye_m: np.ndarray,
-    near_m: float,
-    seed: int,
-    *,
-    least_factor: int,
-    amplify: bool = True,
+    place: Place, elevation: Raster, eye_m: np.ndarray, seed: int, *, least_factor: int, amplify: bool = True
 ) -> SurfaceGrid | None:
     """A finer surface about a camera, of a raster that lies there.
 
@@ -180,18 +156,13 @@ def _near_part(
     latitude, longitude, _ = geodetic_from_enu(place.frame, eye_m)
     column, row = (int(value) for value in raster_pixels(elevation, latitude, longitude).ravel())
     rows, columns = elevation.values.shape[:2]
-    most = math.isqrt(_MOST_NEAR_NODES) // 2
-    usual, reach = (min(max(8, round(distance / spacing_m)), most) for distance in (_NEAR_M, near_m))
+    reach = min(max(8, round(_NEAR_M / spacing_m)), math.isqrt(_MOST_NEAR_NODES) // 2)
     if not (-reach < row < rows + reach and -reach < column < columns + reach):
         return None
     part = tuple(slice(max(at - reach, 0), min(at + reach, size)) for at, size in ((row, rows), (column, columns)))
     if min(each.stop - each.start for each in part) < 8:
         return None
-    # As fine as the part of the usual reach, whatever this one's.
-    factor, cells = (
-        1,
-        math.prod(min(at + usual, size) - max(at - usual, 0) for at, size in ((row, rows), (column, columns))),
-    )
+    factor, cells = 1, math.prod(each.stop - each.start for each in part)
     while amplify and cells * (2 * factor) ** 2 <= _MOST_NEAR_NODES and spacing_m / (2 * factor) >= _LEAST_NEAR_M:
         factor *= 2
     if factor <= least_factor:

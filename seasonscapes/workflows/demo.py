@@ -42,15 +42,18 @@ class Panel:
     sky: str = "clear"
 
 
+# The massif from its sunlit side, above the lake that mirrors it.
+SCENE = "alpine_lake"
+FIRST = Panel("June evening", f"{YEAR}-06-21T17:30")
 DAY_AND_YEAR = [
     Panel("dawn, 18 September 07:00", f"{YEAR}-09-18T07:00"),
-    Panel("morning, 09:00", f"{YEAR}-09-18T09:00"),
     Panel("noon, 13:20", f"{YEAR}-09-18T13:20"),
+    Panel("afternoon, 17:00", f"{YEAR}-09-18T17:00"),
     Panel("evening, 19:05", f"{YEAR}-09-18T19:05"),
-    Panel("winter noon, 20 January", f"{YEAR}-01-20T12:40", "alpine_winter"),
-    Panel("spring noon, 5 May", f"{YEAR}-05-05T13:25"),
-    Panel("summer noon, 20 July", f"{YEAR}-07-20T13:35"),
-    Panel("autumn noon, 20 October", f"{YEAR}-10-20T13:10"),
+    Panel("winter afternoon, 20 January", f"{YEAR}-01-20T15:00", "alpine_winter"),
+    Panel("spring afternoon, 5 May", f"{YEAR}-05-05T17:00"),
+    Panel("summer afternoon, 20 July", f"{YEAR}-07-20T17:00"),
+    Panel("autumn afternoon, 20 October", f"{YEAR}-10-20T16:00"),
 ]
 _FIRST_HOUR = datetime(YEAR, 9, 17, 12)
 HOURS = [
@@ -58,7 +61,7 @@ HOURS = [
     for time in (_FIRST_HOUR + timedelta(hours=hour) for hour in range(24))
 ]
 AIR = [
-    Panel(f"{sky.replace('_', ' ')} noon, 20 July", f"{YEAR}-07-20T13:35", sky)
+    Panel(f"{sky.replace('_', ' ')} afternoon, 20 July", f"{YEAR}-07-20T17:00", sky)
     for sky in ("clear", "hazy", "saharan_dust", "overcast")
 ]
 
@@ -71,14 +74,14 @@ def day_and_year(
     size_px: tuple[int, int] = (720, 480),
     progress: Progress | None = None,
 ) -> list[Path]:
-    """Relight one view through a day, four seasons and four airs, as two contact sheets.
+    """Relight one view on a June evening, and through a day, four seasons and four airs as two contact sheets.
 
-    Panels that exist already, made from the same inputs by the same code, are kept.
+    The ground has detail below the resolution of the data. Panels that exist already, made from the same inputs by the same code, are kept.
 
     Parameters
     ----------
     place, view
-        The embedded scene and one of its cameras.
+        The scene `SCENE` and one of its cameras.
     output
         Folder for panels and sheets.
     size_px
@@ -89,19 +92,18 @@ def day_and_year(
     Returns
     -------
     list of pathlib.Path
-        The sheets.
+        The picture and the sheets.
     """
 
     def session() -> RelightSession:
         series = AlbedoSeries(tuple(dated_albedos(place)), "nearest")
         camera = camera_for(place, view, size_px=size_px)
-        base_day = date(YEAR, 9, 18)
-        return still_session(
-            place, camera, albedo=series, base_day=base_day, sampling=still_sampling(), progress=progress
-        )
+        how = {"base_day": date(YEAR, 6, 21), "sampling": still_sampling(), "amplify": True}
+        return still_session(place, camera, albedo=series, **how, progress=progress)
 
     panels = _Panels(place, view, output, size_px, session)
     return [
+        panels.picture(view.name, FIRST),
         panels.sheet("day-and-year", DAY_AND_YEAR, columns=4, progress=progress),
         panels.sheet("air", AIR, columns=2, progress=progress),
     ]
@@ -140,6 +142,7 @@ def night_and_film(
         size_px,
         read_sky_model("clear"),
         season="nearest",
+        amplify=True,
         base_day=_FIRST_HOUR.date(),
         device=device,
     )

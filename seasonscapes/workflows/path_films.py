@@ -23,7 +23,7 @@ from seasonscapes.workflows.view_rendering import render
 from seasonscapes.workspace import artefact_key, file_hash
 
 if TYPE_CHECKING:
-    from seasonscapes.cameras.pinhole import Camera
+    from seasonscapes.rendering.radiance import RenderedView
 
 # Over so many seconds of the film the exposure follows, as a cameraman's would.
 _FOLLOWS_S = 1.0
@@ -59,6 +59,7 @@ def film_along(
     albedo_key: Sequence[str] = (),
     spp: int = 32,
     seed: int = 0,
+    amplify: bool = False,
     progress: Progress | None = None,
 ) -> tuple[int, int]:
     """Film a path of cameras; an interrupted film continues.
@@ -83,6 +84,8 @@ def film_along(
         Samples per pixel.
     seed
         Equal seeds give equal pictures.
+    amplify
+        As of `render`.
     progress
         Called with a task and its finished share.
 
@@ -104,6 +107,7 @@ def film_along(
         "albedo": list(albedo_key),
         "spp": spp,
         "seed": seed,
+        "amplified": amplify,
     }
     inputs |= {"images": place.scene.image_keys}
     folder = place.workspace.folder / place.scene.name / f"path-{artefact_key(inputs, ('workflows.path_films',))}"
@@ -112,7 +116,10 @@ def film_along(
     for number, (camera, hour) in enumerate(each_reported(views, len(views), progress, "frames")):
         files.append(folder / f"{number:05d}-{hour.timestamp():.0f}.exr")
         if not is_whole_frame(files[-1]):
-            _render(place, camera, hour, files[-1], sky=sky, albedo=albedo, spp=spp, seed=seed)
+            view = render(
+                place, camera, hour, sky=sky, albedo=albedo, engine="path", spp=spp, seed=seed, amplify=amplify
+            )
+            _keep(view, files[-1])
             rendered += 1
     pictures = each_reported(_developed(files, look), len(files), progress, "developing")
     about = {"scene": place.scene.name, "attribution": place.scene.attribution, "sky": sky.name}
@@ -126,18 +133,7 @@ def film_along(
     return len(files), rendered
 
 
-def _render(
-    place: Place,
-    camera: Camera,
-    hour: datetime,
-    file: Path,
-    *,
-    sky: SkyModel,
-    albedo: AlbedoSource,
-    spp: int,
-    seed: int,
-) -> None:
-    view = render(place, camera, hour, sky=sky, albedo=albedo, engine="path", spp=spp, seed=seed)
+def _keep(view: RenderedView, file: Path) -> None:
     metered = exposure_ev100(view.radiance, "auto")
     record = {"white_rgb": view.provenance["white_rgb"], "photo_ev100": photo_ev100(view.radiance, metered)}
     save_frame(file, view.radiance, metered_ev100=metered, provenance=record)

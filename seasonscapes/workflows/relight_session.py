@@ -32,7 +32,6 @@ from seasonscapes.sky.illumination import Illumination
 from seasonscapes.sky.models import SkyModel
 from seasonscapes.terrain.surface import Texture
 from seasonscapes.workflows.albedo_sources import AlbedoFile, AlbedoSource, dated_albedos, snow_transition_between
-from seasonscapes.workflows.amplified_terrain import on_detailed_ground
 from seasonscapes.workflows.illumination import (
     SunMoonPosition,
     illumination_for_camera,
@@ -40,7 +39,7 @@ from seasonscapes.workflows.illumination import (
     tabulate_illumination,
 )
 from seasonscapes.workflows.place import MeshOptions, Place, load_place, utc_at
-from seasonscapes.workflows.views import camera_for, terrain_for_view
+from seasonscapes.workflows.views import camera_for, view_with_terrain
 from seasonscapes.workspace import Workspace, artefact_key, build_once
 
 if TYPE_CHECKING:
@@ -90,6 +89,8 @@ class RenderJob:
         ``"auto"``, ``"cuda"`` or ``"llvm"``.
     allow_outside
         Let the scene file name rasters outside its folder.
+    amplify
+        Add relief and albedo below the resolution of the data.
     """
 
     scene: Path
@@ -104,6 +105,7 @@ class RenderJob:
     seed: int = 0
     device: str = "auto"
     allow_outside: bool = False
+    amplify: bool = False
 
 
 @dataclass
@@ -152,6 +154,7 @@ def relight_session(
     base_day: date = _MIDSUMMER,
     seed: int = 0,
     sampling: SamplingOptions | None = None,
+    amplify: bool = False,
     progress: Progress | None = None,
 ) -> RelightSession:
     """Trace the light transport of a view once, so that every instant costs a fraction of a second.
@@ -174,6 +177,9 @@ def relight_session(
         Equal seeds give equal results.
     sampling
         Number of samples and rays; the default suits films, whose frames share the coefficients.
+    amplify
+        Add relief and albedo below the resolution of the data: for pictures, not for measurements. A camera near the
+        ground keeps its height above it.
     progress
         Called with a task and its finished share.
 
@@ -200,7 +206,15 @@ def relight_session(
     (32, 48, 3)
     """
     session = still_session(
-        place, camera, sky=sky, albedo=albedo, base_day=base_day, seed=seed, sampling=sampling, progress=progress
+        place,
+        camera,
+        sky=sky,
+        albedo=albedo,
+        base_day=base_day,
+        seed=seed,
+        sampling=sampling,
+        amplify=amplify,
+        progress=progress,
     )
     tabulate_illumination(place, session.camera, session.sky, progress=task_progress(progress, "light of the sky"))
     session.by_elevation = True
@@ -237,7 +251,7 @@ def still_session(
         albedo = AlbedoSeries((albedo,))
     camera, model = view_in_frame(camera, place.frame), sky_model(sky)
     base = nearest_albedo(albedo, base_day)
-    terrain = terrain_for_view(place, camera, lambertian=lambertian, amplify=amplify)
+    camera, terrain = view_with_terrain(place, camera, lambertian=lambertian, amplify=amplify)
     scene = ray_scene(mi_mesh(terrain, base.load().values))
     sampling = sampling or SamplingOptions()
     inputs = {
@@ -311,11 +325,12 @@ def session_of(job: RenderJob, place: Place, *, progress: Progress | None = None
     use_backend(job.device)
     return relight_session(
         place,
-        on_detailed_ground(place, camera_for(place, job.view, size_px=job.size_px)),
+        camera_for(place, job.view, size_px=job.size_px),
         sky=job.sky,
         albedo=AlbedoSeries(tuple(dated_albedos(place, job.albedo, progress=progress)), job.season),
         base_day=job.base_day,
         seed=job.seed,
+        amplify=job.amplify,
         progress=progress,
     )
 

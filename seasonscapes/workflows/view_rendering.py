@@ -18,11 +18,10 @@ from seasonscapes.sky.eclipses import eclipse_record
 from seasonscapes.sky.models import SkyModel
 from seasonscapes.sky.report import eclipse_text, moon_text
 from seasonscapes.workflows.albedo_sources import AlbedoSource, chosen_albedo
-from seasonscapes.workflows.amplified_terrain import on_detailed_ground
 from seasonscapes.workflows.illumination import SunMoonPosition, illumination_for_camera, position_at, sky_model
 from seasonscapes.workflows.place import Place, utc_at
 from seasonscapes.workflows.relight_session import still_session, view_at
-from seasonscapes.workflows.views import camera_geodetic, terrain_for_view
+from seasonscapes.workflows.views import camera_geodetic, terrain_for_view, view_with_terrain
 from seasonscapes.workspace import content_key
 
 if TYPE_CHECKING:
@@ -121,7 +120,6 @@ def render(
     backend = use_backend()
     engine = chosen_engine(engine, path_options=spp is not None or max_depth is not None, device=backend.device)
     camera = view_in_frame(camera, place.frame)
-    camera = on_detailed_ground(place, camera, amplify=amplify)
     utc = utc_at(place, time)
     for line in sky_lines(position_at(place, utc)):
         log.info(line)
@@ -139,14 +137,15 @@ def render(
             progress=progress,
         )
         view, light, position = view_at(session, utc)
-        record = view_record(place, camera, light, position)
+        record = view_record(place, session.camera, light, position)
         record |= {"engine": engine, "seed": seed, "lambertian": lambertian, "amplified": amplify}
         record["variant"] = backend.variant
         return replace(view, provenance=record)
     spp, max_depth = 32 if spp is None else spp, 6 if max_depth is None else max_depth
+    camera, terrain = view_with_terrain(place, camera, lambertian=lambertian, amplify=amplify)
     light, position = illumination_for_camera(place, camera, sky_model(sky), utc)
     view = render_view(
-        build_scene(terrain_for_view(place, camera, lambertian=lambertian, amplify=amplify), texture.values, light),
+        build_scene(terrain, texture.values, light),
         camera,
         spp=spp,
         seed=seed,

@@ -142,18 +142,25 @@ def calibrated_viewpoint(path: Path) -> tuple[NamedCamera, tuple[int, int]]:
     return validate(table, NamedCamera, where=path), (camera.width_px, camera.height_px)
 
 
-def terrain_for_view(
+def terrain_for_view(place: Place, view: Camera | Panorama) -> Terrain:
+    """The terrain of a place with its finest data about a camera, refined there until its error is a quarter of a pixel."""
+    from seasonscapes.workflows.amplified_terrain import detailed_view
+
+    return detailed_view(place, view)[1]
+
+
+def view_with_terrain(
     place: Place, view: Camera | Panorama, *, lambertian: bool = False, amplify: bool = False
-) -> Terrain:
-    """The terrain of a place, with the finest data about a camera, and refined there until its error is a quarter of a pixel.
+) -> tuple[Camera | Panorama, Terrain]:
+    """A camera and the terrain that it is to render, with the finest data about it.
 
-    ``lambertian``: without surfaces that are not matt. ``amplify``: with detail below the resolution of the data; see
-    `workflows.amplified_terrain`.
+    ``lambertian``: without surfaces that are not matt. ``amplify``: with detail below the resolution of the data. On either the
+    camera keeps its height above ground; see `workflows.amplified_terrain`.
     """
-    from seasonscapes.workflows.amplified_terrain import detailed_terrain
+    from seasonscapes.workflows.amplified_terrain import detailed_view
 
-    terrain = detailed_terrain(place, view, amplify=amplify)
-    return replace(terrain, water=None, snow=None, forest=False) if lambertian else terrain
+    view, terrain = detailed_view(place, view, amplify=amplify)
+    return view, replace(terrain, water=None, snow=None, forest=False) if lambertian else terrain
 
 
 def camera_geodetic(place: Place, view: Camera | Panorama) -> tuple[float, float, float]:
