@@ -16,6 +16,12 @@ A place of 60 × 50 km is made on the spot, and a picture by a camera 2 m above 
 workspace with ``--amplify``: ``first_picture_s`` is its wall time, ``peak_gb`` its largest memory, ``near_texel_px`` the
 largest size of an element of the albedo in the lowest rows of the picture. ``--quick`` renders it at 768 × 512 instead of
 1536 × 1024 pixels and takes the massif at 30 m.
+
+The same place with finer data of a square of 6 km about the camera (heights of 1.6 m, 1.5 m above the coarse ones, an image of
+0.8 m; ``--quick``: 3.1 and 1.6 m) gives ``nested_first_picture_s``, ``nested_peak_gb`` and ``nested_near_texel_px``, and
+``nested_near_texel_plain_px`` without ``--amplify``; ``nested_node_m`` is the spacing of the surface below the camera, and
+``nested_border_step_m`` the largest step of the surface between points 0.25 m apart across the border of the data, less that
+of the slopes there.
 """
 
 from __future__ import annotations
@@ -23,7 +29,6 @@ from __future__ import annotations
 import argparse
 import itertools
 import os
-import resource
 import secrets
 import subprocess
 import sys
@@ -42,10 +47,16 @@ from record import ROOT, write_record
 from seasonscapes.rendering.albedo_detail import finest_detail_m
 from seasonscapes.rendering.snow_scattering import ICE_ABSORPTION, reflectance, snow_albedo
 from seasonscapes.rendering.water_surface import REFRACTIVE_INDEX, DeviceWater
-from seasonscapes.terrain.amplification import amplified
+from seasonscapes.scene import read_scene
+from seasonscapes.terrain.amplification import amplified, amplified_part
+from seasonscapes.terrain.crs import raster_pixels
 from seasonscapes.terrain.surface import Raster
 from seasonscapes.terrain.surface_classes import AlbedoDetail, Water
 from seasonscapes.terrain.synthetic import alpine_massif
+from seasonscapes.workflows.amplified_terrain import detailed_view
+from seasonscapes.workflows.place import load_place
+from seasonscapes.workflows.views import camera
+from seasonscapes.workspace import Workspace
 
 sys.path.insert(0, str(ROOT / "tests"))
 from oracles_snow import wiscombe_warren_albedo
@@ -60,6 +71,8 @@ RASTERS = (
 FACTOR = 4
 SUNS_DEG = (10.0, 20.0, 30.0)
 CAMERA_ABOVE_M = 2.0
+# Of the finer data of a wide place: side in cells of 25 m, and how much higher they lie.
+NESTED_CELLS, NESTED_OFFSET_M = 240, 1.5
 
 
 @dataclass(frozen=True)
@@ -212,21 +225,107 @@ def write_wide_place(folder: Path, seed: int) -> Path:
     return folder / "wide.toml"
 
 
-def first_picture(folder: Path, seed: int, size_px: tuple[int, int]) -> dict[str, float]:
-    """Wall time and memory of the first picture of the wide place, and the size of its near texels."""
-    scene, start = write_wide_place(folder, seed), time.perf_counter()
-    command = [sys.executable, "-m", "seasonscapes", "render", str(scene), "--time", "2024-07-20T15:30", "--amplify"]
-    command += ["--size", f"{size_px[0]}x{size_px[1]}", "-o", str(folder / "wide.png")]
-    environment = {**os.environ, "SEASONSCAPES_WORKSPACE": str(folder / "workspace"), "PYTHONPATH": str(ROOT)}
-    start = time.perf_counter()
-    subprocess.run(command, check=True, env=environment, cwd=ROOT)
-    seconds = time.perf_counter() - start
-    peak_gb = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024 / 1e9
+def write_nested_place(folder: Path, seed: int, factor: int) -> Path:
+    """The wide place, and data of a square of 6 km about its camera that are ``factor`` times finer."""
+    scene = write_wide_place(folder, seed)
+    with rasterio.open(folder / "heights.tif") as file:
+        wide = Raster(file.read(1)[..., None], file.transform, file.crs.to_string())
+    camera = read_scene(scene).cameras[0]
+    column, row = (int(each) for each in raster_pixels(wide, camera.latitude_deg, camera.longitude_deg).ravel())
+    rows, columns = (slice(at - NESTED_CELLS // 2, at + NESTED_CELLS // 2) for at in (row, column))
+    fine = amplified_part(wide, factor, rows=rows, columns=columns, seed=seed + 1)
+    heights = fine.values[..., 0]
+    rng = np.random.default_rng(seed)
+    height, width = heights.shape
+    profile = {"driver": "GTiff", "crs": wide.crs, "tiled": True, "compress": "deflate", "zlevel": 1}
+    with rasterio.open(
+        folder / "fine.tif",
+        "w",
+        count=1,
+        dtype="float32",
+        height=height,
+        width=width,
+        transform=fine.transform,
+        **profile,
+    ) as file:
+        file.write(heights + np.float32(NESTED_OFFSET_M), 1)
+    # Bare ground where it is steep, meadow elsewhere, each with grain of the size of a pixel.
+    steep = np.clip((slopes_deg(heights, 25.0 / factor) - 30.0) / 10.0, 0.0, 1.0).astype(np.float32)
+    steep = cv2.resize(steep, (2 * width, 2 * height))
+    with rasterio.open(
+        folder / "fine_image.tif",
+        "w",
+        count=3,
+        dtype="uint8",
+        height=2 * height,
+        width=2 * width,
+        transform=fine.transform * Affine.scale(0.5),
+        **profile,
+    ) as file:
+        grain = rng.normal(1.0, 0.12, steep.shape).astype(np.float32)
+        for band, (meadow, rock) in enumerate(((60, 120), (80, 115), (45, 110)), 1):
+            file.write(np.clip((meadow + (rock - meadow) * steep) * grain, 1, 255).astype(np.uint8), band)
+    text = scene.read_text()
+    text = text.replace('file = "heights.tif"\n', 'file = "heights.tif"\n\n[[elevation.finer]]\nfile = "fine.tif"\n')
+    text = text.replace("delit = true\n", 'delit = true\n\n[[imagery.finer]]\nfile = "fine_image.tif"\n')
+    scene.write_text(text)
+    return scene
+
+
+def nested_figures(scene: Path, folder: Path, size_px: tuple[int, int]) -> dict[str, float]:
+    """What the renderer gets of the nested data about the camera: texels, nodes, and the surface across the border."""
+    place = load_place(scene, Workspace(folder / "workspace"))
+    view = camera(place, "eye", size_px=size_px)
+    focal, distance = float(view.fx), lowest_rows_m(size_px)
+    view, terrain = detailed_view(place, view)
+    assert terrain.surface is not None
+    texel_m = terrain.images[-1].levels[-1].texel_m
+    eye_m = np.asarray(view.position_m, float)
+    detail = AlbedoDetail((0.0, 0.0, 0.0), 1.0 / focal, texel_m)
+    sizes = [finest_detail_m(each, texel_m, distance) / (distance / focal) for each in (detail, None)]
+    # From the camera across the eastern border of the fine data, at ten northings.
+    east = np.arange(0.0, 0.6 * NESTED_CELLS * 25.0, 0.25)
+    steps = []
+    for north in np.linspace(-2000.0, 2000.0, 10):
+        line = eye_m + np.stack([east, np.full_like(east, north), np.zeros_like(east)], axis=1)
+        up, normal = terrain.surface.sample(line)
+        rise = -normal[:, 0] / normal[:, 2]
+        steps.append(np.abs(np.diff(up) - 0.25 * 0.5 * (rise[1:] + rise[:-1]))[east[1:] > 0.46 * NESTED_CELLS * 25.0])
+    return {
+        "nested_near_texel_px": float(sizes[0].max()),
+        "nested_near_texel_plain_px": float(sizes[1].max()),
+        "nested_node_m": float(terrain.surface.spacing_at(eye_m[None])[0]),
+        "nested_border_step_m": float(np.max(steps)),
+        "nested_faces": len(terrain.faces),
+    }
+
+
+def lowest_rows_m(size_px: tuple[int, int]) -> np.ndarray:
+    """Distances [m] at which the rows of a level picture of 60° see level ground, up to 100 m; farther ground has larger pixels."""
     focal = 0.5 * size_px[0] / np.tan(np.radians(30.0))
-    # The lowest rows see level ground at these distances; farther ground has larger pixels.
     below = np.arctan((np.arange(1, size_px[1] // 2) + 0.5) / focal)
     distance = CAMERA_ABOVE_M / np.sin(below)
-    distance = distance[distance < 100.0]
+    return distance[distance < 100.0]
+
+
+def first_picture(scene: Path, folder: Path, size_px: tuple[int, int]) -> tuple[float, float]:
+    """Wall time [s] and memory [GB] of the first picture of a place."""
+    command = [sys.executable, "-m", "seasonscapes", "render", str(scene), "--time", "2024-07-20T15:30", "--amplify"]
+    command += ["--size", f"{size_px[0]}x{size_px[1]}", "-o", str(folder / "picture.png")]
+    environment = {**os.environ, "SEASONSCAPES_WORKSPACE": str(folder / "workspace"), "PYTHONPATH": str(ROOT)}
+    start = time.perf_counter()
+    with subprocess.Popen(command, env=environment, cwd=ROOT) as process:
+        _, status, used = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise SystemExit(f"{scene}: seasonscapes render failed")
+    return time.perf_counter() - start, used.ru_maxrss * 1024 / 1e9
+
+
+def wide_figures(folder: Path, seed: int, size_px: tuple[int, int]) -> dict[str, float]:
+    """Wall time and memory of the first picture of the wide place, and the size of its near texels."""
+    seconds, peak_gb = first_picture(write_wide_place(folder, seed), folder, size_px)
+    focal, distance = 0.5 * size_px[0] / np.tan(np.radians(30.0)), lowest_rows_m(size_px)
     texel_m = 60_000.0 / 4096
     detail = AlbedoDetail((0.0, 0.0, 0.0), float(1.0 / focal), texel_m)
     sizes = [finest_detail_m(each, texel_m, distance) / (distance / focal) for each in (detail, None)]
@@ -263,9 +362,16 @@ def main() -> None:
     figures |= {f"worst_{key}": min(each[key] for each in judged) for key in massif}
     figures |= {f"massif_{key}": value for key, value in massif.items()}
     figures |= {"rasters": len(real), "snow_albedo_error": snow_error(), "fresnel_error": fresnel_error()}
+    size_px, factor = ((768, 512), 8) if options.quick else ((1536, 1024), 16)
     with tempfile.TemporaryDirectory() as folder:
         figures |= photograph_gains(options.data, Path(folder), 352 if options.quick else 704)
-        figures |= first_picture(Path(folder), seed, (768, 512) if options.quick else (1536, 1024))
+        figures |= wide_figures(Path(folder), seed, size_px)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        scene = write_nested_place(folder, seed, factor)
+        seconds, peak_gb = first_picture(scene, folder, size_px)
+        figures |= {"nested_first_picture_s": seconds, "nested_peak_gb": peak_gb}
+        figures |= nested_figures(scene, folder, size_px)
     for key, value in figures.items():
         print(f"{key:28} {value:.4g}")
     write_record(options.json, figures, seed=seed)

@@ -20,6 +20,7 @@ from seasonscapes.civil_time import parse_time_text
 from seasonscapes.declaration import MOST_NAME_CHARACTERS, Declaration, InputError, Name, Text, read_declaration
 from seasonscapes.frames import STANDARD_REFRACTION_K, Latitude, LocalFrame, Longitude
 from seasonscapes.terrain.raster_files import OWN_FOLDER, Confinement, confined_path, rasters_hash
+from seasonscapes.terrain.raster_tables import Encoding, FinerHeights, FinerImage, HeightUnit, RasterFiles
 from seasonscapes.terrain.surface_tables import ForestTable, SnowTable, WaterTable
 from seasonscapes.terrain.tile_files import named_tiles
 
@@ -28,7 +29,6 @@ log = logging.getLogger(__name__)
 VerticalDatum = Literal[
     "unknown", "ellipsoidal", "EGM96", "EGM2008", "LN02", "IGN69", "NN2000", "NAVD88", "EVRF", "local"
 ]
-HeightUnit = Literal["metre", "foot", "US survey foot", "decimetre", "centimetre", "kilometre"]
 
 
 class Origin(Declaration):
@@ -111,39 +111,6 @@ class SyntheticElevation(Declaration):
         return self
 
 
-class RasterFiles(Declaration):
-    """A raster in one file or in many tiles.
-
-    Parameters
-    ----------
-    file
-        Raster file, relative to the scene file's folder.
-    files
-        In place of ``file``: names and patterns of tiles, such as ``["tiles/*.tif"]``. They may overlap, and differ in CRS
-        and spacing; where several have a value, that of the newest counts (by a date or year in their names, then in the
-        order given). Where tiles are missing there is no data.
-    """
-
-    file: str | None = None
-    files: list[str] | None = Field(default=None, min_length=1, max_length=1000)
-
-    @property
-    def paths(self) -> tuple[str, ...]:
-        """The raster's files; after `read_scene` absolute, patterns resolved and the newest first."""
-        return tuple(self.files or ()) if self.file is None else (self.file,)
-
-    @property
-    def label(self) -> str:
-        """What messages call the raster: its file, or the first and the number of its tiles."""
-        first = Path(self.paths[0]).name
-        return first if len(self.paths) == 1 else f"{first} and {len(self.paths) - 1} more"
-
-    def without_folders(self) -> Any:
-        """A copy with the names of the files alone, for keys of artefacts, which move with their scene."""
-        names = [Path(path).name for path in self.paths]
-        return self.model_copy(update={"file": names[0]} if self.file is not None else {"files": names or None})
-
-
 class Elevation(RasterFiles):
     """Elevation raster: a file, tiles, or synthetic terrain.
 
@@ -159,6 +126,8 @@ class Elevation(RasterFiles):
         Synthetic terrain in place of files.
     max_hole_share
         Largest fraction of cells without data that is filled by interpolation.
+    finer
+        Array of tables ``[[elevation.finer]]``: finer heights of parts of it.
     """
 
     band: int | None = Field(default=None, ge=1)
@@ -166,11 +135,14 @@ class Elevation(RasterFiles):
     nodata: float | None = None
     synthetic: SyntheticElevation | None = None
     max_hole_share: float = Field(default=0.25, ge=0.0, le=1.0)
+    finer: list[FinerHeights] = Field(default_factory=list, max_length=20)
 
     @model_validator(mode="after")
     def _one_source(self) -> Elevation:
         if (self.file is not None) + (self.files is not None) + (self.synthetic is not None) != 1:
             raise ValueError("give either 'file' or a table 'synthetic', or the tiles of a raster as 'files'")
+        if self.synthetic is not None and self.finer:
+            raise ValueError("finer heights are parts of a raster in files: drop 'finer' or 'synthetic'")
         return self
 
 
@@ -229,9 +201,11 @@ class Imagery(RasterFiles):
         still in the image, as in satellite images that were not corrected for it.
     delit
         The image holds no light: a reflectance product, or one whose light was taken out before.
+    finer
+        Array of tables ``[[imagery.finer]]``: finer images of parts of it.
     """
 
-    encoding: Literal["srgb", "linear"] = "srgb"
+    encoding: Encoding = "srgb"
     full_scale: float | None = Field(default=None, gt=0.0)
     bands: list[int] | None = Field(default=None, min_length=1, max_length=3)
     reflectance_scale: float = Field(default=0.5, gt=0.0, le=2.0)
@@ -242,6 +216,7 @@ class Imagery(RasterFiles):
     land_classes: int = Field(default=0, ge=0, le=20)
     sensor_height_m: float | None = Field(default=None, gt=0.0, le=1e9)
     delit: bool = False
+    finer: list[FinerImage] = Field(default_factory=list, max_length=20)
 
     @model_validator(mode="after")
     def _one_raster(self) -> Imagery:
@@ -388,7 +363,7 @@ class SceneFile(Declaration):
     def input_paths(self) -> tuple[Path, ...]:
         """All files of the scene's rasters; after `read_scene` absolute."""
         tables = (self.elevation, self.water, *self.images)
-        return tuple(Path(path) for table in tables if table is not None for path in table.paths)
+        return tuple(Path(path) for table in tables if table is not None for path in _all_paths(table))
 
     @property
     def imagery(self) -> Imagery | None:
@@ -398,7 +373,7 @@ class SceneFile(Declaration):
     @property
     def image_keys(self) -> list[tuple[Imagery, str]]:
         """Each image as declared, without folders, and the hash of its content: for keys of artefacts made of them."""
-        return [(image.without_folders(), rasters_hash(image.paths, self.confinement)) for image in self.images]
+        return [(image.without_folders(), rasters_hash(image.all_paths, self.confinement)) for image in self.images]
 
     @field_validator("images", mode="before")
     @classmethod
@@ -409,6 +384,11 @@ class SceneFile(Declaration):
     def _dated(self) -> SceneFile:
         if len(self.images) < 2:
             return self
+        for number, image in enumerate(self.images):
+            if image.finer:
+                raise ValueError(
+                    f"imagery[{number}].finer: of several dated images none can have finer ones; keep one image"
+                )
         undated = [f"imagery[{number}]" for number, image in enumerate(self.images) if image.day is None]
         if undated:
             raise ValueError(f"{', '.join(undated)}: of several images each needs 'time', or 'date' = \"YYYY-MM-DD\"")
@@ -472,6 +452,10 @@ class SceneFile(Declaration):
         )
 
 
+def _all_paths(table: RasterFiles | WaterTable) -> tuple[str, ...]:
+    return table.all_paths if isinstance(table, RasterFiles) else table.paths
+
+
 def read_scene(path: str | Path, *, allow_outside: bool = False) -> SceneFile:
     """Read a scene file and make its file paths absolute.
 
@@ -507,11 +491,17 @@ def read_scene(path: str | Path, *, allow_outside: bool = False) -> SceneFile:
         return str(target)
 
     def resolved(key: str, raster: RasterFiles) -> dict[str, Any]:
+        found: dict[str, Any] = {}
         if raster.file is not None:
-            return {"file": absolute_path(f"{key}.file", raster.file)}
-        if raster.files is None:
-            return {}
-        return {"files": named_tiles(raster.files, folder, confinement, where=f"{path}: {key}.files")}
+            found = {"file": absolute_path(f"{key}.file", raster.file)}
+        elif raster.files is not None:
+            found = {"files": named_tiles(raster.files, folder, confinement, where=f"{path}: {key}.files")}
+        if raster.finer_tables:
+            found["finer"] = [
+                part.model_copy(update=resolved(f"{key}.finer[{number}]", part))
+                for number, part in enumerate(raster.finer_tables)
+            ]
+        return found
 
     updates: dict[str, Any] = {}
     if scene.elevation is not None:

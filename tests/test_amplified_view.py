@@ -30,8 +30,7 @@ def test_the_surface_is_finest_about_the_camera(place, monkeypatch):
     plain, fine = terrain_for_view(place, view), view_with_terrain(place, view, amplify=True)[1]
     assert place.terrain.surface is not None
     assert fine.surface is not None
-    inner = fine.surface.inner
-    assert inner is not None
+    (inner,) = fine.surface.parts
     assert inner.spacing_m < 0.5 * fine.surface.spacing_m < place.terrain.surface.spacing_m
     assert len(fine.faces) != len(plain.faces)
     assert fine.detail is not None
@@ -41,7 +40,7 @@ def test_the_surface_is_finest_about_the_camera(place, monkeypatch):
     share = inner.share_at(across)
     assert share[1400] == 1.0
     assert share[0] == share[-1] == 0.0
-    alone = replace(fine.surface, inner=None)
+    alone = replace(fine.surface, parts=())
     np.testing.assert_allclose(fine.surface.up_at(across)[1400], inner.up_at(across)[1400])
     np.testing.assert_allclose(fine.surface.up_at(across)[0], alone.up_at(across)[0])
     steps = np.abs(np.diff(fine.surface.up_at(across)))

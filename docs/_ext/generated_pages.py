@@ -198,11 +198,15 @@ HEADER = ["| key | value | meaning |", "|---|---|---|"]
 def key_page() -> dict[str, str]:
     """Return the tables of keys of scene files and sky models, by file name."""
     from seasonscapes.cameras.webcam import Webcam
-    from seasonscapes.scene import NamedCamera, SceneFile
+    from seasonscapes.scene import Imagery, NamedCamera, SceneFile
     from seasonscapes.sky.models import KINDS, SkyModel
+    from seasonscapes.terrain.raster_tables import FinerHeights, FinerImage
 
     pages = {
         "scene_keys.md": "\n".join(HEADER + key_table(SceneFile)) + "\n",
+        "imagery_keys.md": "\n".join(HEADER + key_table(Imagery)) + "\n",
+        "finer_heights_keys.md": "\n".join(HEADER + key_table(FinerHeights)) + "\n",
+        "finer_image_keys.md": "\n".join(HEADER + key_table(FinerImage)) + "\n",
         "camera_keys.md": "\n".join(HEADER + key_table(NamedCamera)) + "\n",
         "webcam_keys.md": "\n".join(HEADER + key_table(Webcam)) + "\n",
         "sky_keys.md": "\n".join(HEADER + key_table(SkyModel)) + "\n",

@@ -8,7 +8,8 @@ in ``a`` remains, which preconditioned conjugate gradients solve.
 Projecting the gains of all photographs, with sky pixels among the equations, would let the common scale shrink: terrain
 pixels outnumber sky pixels, and any misfit of theirs is smallest where all radiance is small.
 Residuals are weighted by the variances of camera and model, and iteratively reweighted with Cauchy's function, so that
-buildings, cloud shadows and misregistered pixels lose their influence.
+buildings, cloud shadows and misregistered pixels lose their influence. Snow and forest reflect as in the renderer, under the
+albedo of the round before (`ground_pixels`).
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from seasonscapes.albedo.equations import (
 )
 from seasonscapes.albedo.footprints import texel_pixel_count
 from seasonscapes.albedo.forward_model import TexelTransport, ambient_on_texels
+from seasonscapes.albedo.ground_pixels import ground_pixels
 from seasonscapes.albedo.photographs import LINEAR, AlbedoPhotograph, NoiseModel
 from seasonscapes.errors import NotEnoughEvidence, NoUsablePixels
 
@@ -164,10 +166,13 @@ def solve_albedo(
     pixel_count = texel_pixel_count(_unique([photograph.footprints for photograph in photographs]))
     albedo = np.full((size, 3), 0.25, np.float32) if start is None else start.reshape(size, 3).astype(np.float32)
     observed = pixel_count.ravel() > 0.0
+    grounds = [ground_pixels(transport, photograph) for photograph in photographs]
     history = []
     for number in range(solver.rounds):
         filled = fill_nearest(albedo.reshape(*transport.shape, 3), pixel_count)
         _update_ambient(systems, transport, filled)
+        for equations, ground in zip(systems, grounds, strict=True):
+            equations.ground = None if ground is None else ground.factors(albedo)
         reweight(systems, albedo, noise_model, robust=number > 0)
         albedo, diagonal = _solve(systems, albedo, solver, transport.shape, prior)
         albedo = np.clip(albedo, LOWEST, HIGHEST)

@@ -8,6 +8,7 @@ import numpy as np
 
 from seasonscapes.albedo.footprints import whole_pixels
 from seasonscapes.albedo.forward_model import aerial_perspective_of, sky_radiance_of
+from seasonscapes.albedo.ground_pixels import GroundFactors
 from seasonscapes.albedo.photographs import AlbedoPhotograph, NoiseModel, TextureObservation
 from seasonscapes.cameras.observation import Observation
 from seasonscapes.rendering.receivers import luminaries
@@ -42,6 +43,8 @@ class PhotographEquations:
         Normal illuminance ``(3,)`` [lx] of each luminary.
     weight
         ``(n, 3)`` inverse variances [1 / (cd/m²)²]; ``None`` before the first `reweight`.
+    ground
+        How its pixels reflect relative to Lambertian ground; ``None`` where they are.
     """
 
     photograph: AlbedoPhotograph
@@ -56,6 +59,7 @@ class PhotographEquations:
     inverse_gain: np.ndarray
     luminary_lx: list[np.ndarray]
     weight: np.ndarray | None = None
+    ground: GroundFactors | None = None
 
     @property
     def projected(self) -> bool:
@@ -176,9 +180,10 @@ def forward_product(equations: PhotographEquations, albedo: np.ndarray) -> tuple
     """
     footprints = equations.photograph.footprints
     sun = np.zeros((len(footprints.pixel), 3), np.float32)
-    for illuminance, values in zip(equations.luminary_lx, footprints.sunlit[equations.photograph.number], strict=True):
-        sun += (footprints.matrix(values) @ albedo) * illuminance
-    total = sun + footprints.matrix(footprints.share) @ (equations.ambient * albedo)
+    direct, diffuse = _light_factors(equations)
+    for factor, values in zip(direct, footprints.sunlit[equations.photograph.number], strict=True):
+        sun += (footprints.matrix(values) @ albedo) * factor
+    total = sun + footprints.matrix(footprints.share) @ (equations.ambient * albedo) * diffuse
     scale = equations.transmittance / np.float32(np.pi)
     return total * scale, sun * scale
 
@@ -200,10 +205,19 @@ def adjoint(equations: PhotographEquations, residual: np.ndarray) -> np.ndarray:
     """
     footprints = equations.photograph.footprints
     scaled = residual * equations.transmittance / np.float32(np.pi)
-    total = (footprints.matrix(footprints.share).T @ scaled) * equations.ambient
-    for illuminance, values in zip(equations.luminary_lx, footprints.sunlit[equations.photograph.number], strict=True):
-        total += footprints.matrix(values).T @ (scaled * illuminance)
+    direct, diffuse = _light_factors(equations)
+    total = (footprints.matrix(footprints.share).T @ (scaled * diffuse)) * equations.ambient
+    for factor, values in zip(direct, footprints.sunlit[equations.photograph.number], strict=True):
+        total += footprints.matrix(values).T @ (scaled * factor)
     return total
+
+
+def _light_factors(equations: PhotographEquations) -> tuple[list[np.ndarray], np.ndarray]:
+    """What the pixels reflect of each luminary [lx] and of diffuse light, relative to Lambertian ground."""
+    if equations.ground is None:
+        return equations.luminary_lx, np.ones(3, np.float32)
+    direct = zip(equations.luminary_lx, equations.ground.luminaries, strict=True)
+    return [illuminance * factor for illuminance, factor in direct], equations.ground.diffuse
 
 
 def squared_adjoint(equations: PhotographEquations) -> np.ndarray:
@@ -224,12 +238,17 @@ def squared_adjoint(equations: PhotographEquations) -> np.ndarray:
     scaled = equations.weight * (equations.transmittance / np.float32(np.pi)) ** 2
     share, texel = footprints.share, footprints.texel
     total = np.empty_like(equations.ambient)
+    direct, diffuse = _light_factors(equations)
+    entries = np.diff(footprints.start)
+
+    def of_entries(factor: np.ndarray, channel: int) -> np.ndarray:
+        """A channel of factors ``(3,)`` of all pixels, or ``(n, 3)`` of each, for the entries."""
+        return factor[channel] if factor.ndim == 1 else np.repeat(factor[:, channel], entries)
+
     for channel in range(3):
-        values = share * equations.ambient[texel, channel]
-        for illuminance, sunlit in zip(
-            equations.luminary_lx, footprints.sunlit[equations.photograph.number], strict=True
-        ):
-            values = values + sunlit * illuminance[channel]
+        values = share * equations.ambient[texel, channel] * of_entries(diffuse, channel)
+        for factor, sunlit in zip(direct, footprints.sunlit[equations.photograph.number], strict=True):
+            values = values + sunlit * of_entries(factor, channel)
         total[:, channel] = footprints.matrix(values * values).T @ scaled[:, channel]
     return total
 

@@ -207,11 +207,26 @@ def thinned_photographs(photographs: Sequence[AlbedoPhotograph], fraction: float
     if fraction >= 1.0:
         return list(photographs)
     rng = np.random.default_rng(seed)
+    return kept_pixels(photographs, lambda footprints: rng.random(len(footprints.pixel)) < fraction)
+
+
+def kept_pixels(
+    photographs: Sequence[AlbedoPhotograph], chosen: Callable[[Footprints], np.ndarray]
+) -> list[AlbedoPhotograph]:
+    """Photographs with some of their terrain pixels.
+
+    Parameters
+    ----------
+    photographs
+        Photographs of one camera share their footprints, and keep the same pixels.
+    chosen
+        Which terrain pixels to keep, ``(n,)`` bool, of the footprints of a camera.
+    """
     thinned: dict[int, tuple[Footprints, CameraAtmosphere, np.ndarray]] = {}
     result = []
     for photograph in photographs:
         if id(photograph.footprints) not in thinned:
-            keep = rng.random(len(photograph.footprints.pixel)) < fraction
+            keep = chosen(photograph.footprints)
             part = thinned_footprints(photograph.footprints, keep)
             atmosphere = replace(camera_atmosphere(part), sky=photograph.atmosphere.sky)
             thinned[id(photograph.footprints)] = (part, atmosphere, keep)

@@ -34,14 +34,19 @@ class DeviceDetail:
         import mitsuba as mi
 
         self._mi_eye = mi.Point3f(*(dr.opaque(mi.Float, float(value)) for value in detail.eye_m))
+        self.texel_m = detail.texel_m
         self._mi_pixel = dr.opaque(mi.Float, detail.pixel_angle_rad)
         self._octaves = [
             2.0**power for power in range(_COARSEST, _FINEST - 1, -1) if 2.0**power <= 2.0 * detail.texel_m
         ]
         self._mi_seed = dr.opaque(mi.UInt32, detail.seed % 2**32)
 
-    def applied(self, albedo: Any, position: Any) -> Any:
-        """Albedo ``mi.Color3f`` with its detail at positions ``mi.Point3f``."""
+    def applied(self, albedo: Any, position: Any, texel_m: Any = None) -> Any:
+        """Albedo ``mi.Color3f`` with its detail at positions ``mi.Point3f``.
+
+        ``texel_m`` ``mi.Float`` [m] is the side of the texels there, where an image finer than the atlas lies over it:
+        octaves that the image holds itself are left out.
+        """
         import drjit as dr
         import mitsuba as mi
 
@@ -49,6 +54,8 @@ class DeviceDetail:
         total, energy = mi.Float(0.0), 0.0
         for number, length in enumerate(self._octaves):
             seen = dr.clip((length / pixel_m - _FADE_PX[0]) / (_FADE_PX[1] - _FADE_PX[0]), 0.0, 1.0)
+            if texel_m is not None:
+                seen *= dr.clip(4.0 * texel_m / length - 1.0, 0.0, 1.0)
             # Turned from octave to octave, so that their lattices do not coincide.
             angle = 0.7 * number
             cosine, sine = float(np.cos(angle) / length), float(np.sin(angle) / length)

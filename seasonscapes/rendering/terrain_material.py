@@ -16,19 +16,23 @@ they send to the viewer directly.
 
 from __future__ import annotations
 
+import logging
 from functools import cache
 from typing import Any
 
 import numpy as np
 
-from seasonscapes.frames import MEAN_RADIUS_M
 from seasonscapes.rendering.albedo_detail import DeviceDetail
 from seasonscapes.rendering.backend import use_backend
+from seasonscapes.rendering.grid_placement import GridPlacement
 from seasonscapes.rendering.ground_optics import GroundOptics, optics_of
+from seasonscapes.rendering.image_detail import DeviceImages
 from seasonscapes.rendering.snow_scattering import SnowOptics
 from seasonscapes.rendering.water_surface import REFRACTIVE_INDEX, DeviceWater, slope_variance
-from seasonscapes.terrain.surface import RIM_SHARE, SurfaceGrid, Terrain
+from seasonscapes.terrain.surface import SurfaceGrid, Terrain
 from seasonscapes.terrain.surface_classes import Water
+
+log = logging.getLogger(__name__)
 
 # Mitsuba's math::RayEpsilon in single precision.
 RAY_EPSILON = float(np.finfo(np.float32).epsneg) * 1500.0
@@ -50,63 +54,38 @@ class DeviceSurface:
         import drjit as dr
         import mitsuba as mi
 
-        rows, columns = grid.nodes.shape[:2]
         # Without the texture units of a GPU, whose interpolation weights have 8 bits.
         self._mi_texture: Any = mi.Texture2f(  # pyright: ignore[reportCallIssue]
             mi.TensorXf(grid.nodes), use_accel=False, wrap_mode=dr.WrapMode.Clamp
         )
-        scaled = (grid.to_node + np.eye(1, grid.to_node.shape[1]) * 0.5) / np.array([[columns], [rows]])
-        self._degree = grid.degree
-        self._mi_terms = [[dr.opaque(mi.Float, float(value)) for value in terms] for terms in scaled]
-        self.mi_error = dr.opaque(mi.Float, grid.mesh_error_m)
-        self.mi_reach = dr.opaque(mi.Float, _REACH_NODES * grid.spacing_m)
-        self._mi_domain = [dr.opaque(mi.Float, value) for value in (*grid.domain[:2], 1.0 / grid.domain[2])]
-        self.inner = None if grid.inner is None else DeviceSurface(grid.inner)
-        # Distances from the rim in texture coordinates, scaled to 1 where an inner surface counts fully.
-        rim = RIM_SHARE * min(rows, columns)
-        self._mi_rim = [dr.opaque(mi.Float, float(value)) for value in (columns / rim, rows / rim, 0.5 / rim)]
+        self._placement = GridPlacement(grid.to_node, grid.domain, grid.nodes.shape[:2], grid.rim_nodes)
+        self._mi_error = dr.opaque(mi.Float, grid.mesh_error_m)
+        self._mi_reach = dr.opaque(mi.Float, _REACH_NODES * grid.spacing_m)
+        self._parts = [DeviceSurface(part) for part in grid.parts]
 
     def sample(self, mi_position: Any, active: Any = True) -> tuple[Any, Any]:
         """Return the unit normal ``mi.Normal3f`` and the up coordinate ``mi.Float`` [m] of the surface at positions."""
         import drjit as dr
         import mitsuba as mi
 
-        slope_east, slope_north, up, _ = self._slopes(mi_position, active)
-        return dr.normalize(mi.Normal3f(-slope_east, -slope_north, 1.0)), up
-
-    def _slopes(self, mi_position: Any, active: Any) -> tuple[Any, Any, Any, Any]:
-        """Slopes, up coordinate [m], and share in the surface around; see `SurfaceGrid.share_at`."""
-        import drjit as dr
-        import mitsuba as mi
-
-        shrink = MEAN_RADIUS_M / (MEAN_RADIUS_M + mi_position.z)
-        east = (mi_position.x * shrink - self._mi_domain[0]) * self._mi_domain[2]
-        north = (mi_position.y * shrink - self._mi_domain[1]) * self._mi_domain[2]
-        uv = mi.Point2f(*(self._polynomial(terms, east, north) for terms in self._mi_terms))
-        slope_east, slope_north, up = self._mi_texture.eval(uv, active)
-        across, down, half = self._mi_rim
-        inside = dr.minimum(dr.minimum(uv.x, 1.0 - uv.x) * across - half, dr.minimum(uv.y, 1.0 - uv.y) * down - half)
-        share = dr.clip(inside, 0.0, 1.0)
-        if self.inner is not None:
-            *finer, weight = self.inner._slopes(mi_position, active)
+        slope_east, slope_north, up = self._mi_texture.eval(self._placement.uv(mi_position), active)
+        for part in self._parts:
+            uv = part._placement.uv(mi_position)
+            weight = part._placement.share(uv)
+            finer = part._mi_texture.eval(uv, active & (weight > 0.0))
             slope_east, slope_north, up = (
                 value + weight * (fine - value)
                 for value, fine in zip((slope_east, slope_north, up), finer, strict=True)
             )
-        return slope_east, slope_north, up, share
+        return dr.normalize(mi.Normal3f(-slope_east, -slope_north, 1.0)), up
 
-    def _polynomial(self, terms: list[Any], east: Any, north: Any) -> Any:
-        """Horner's scheme in north within one in east; terms in the order of `terrain.surface.exponents`."""
-        import drjit as dr
-
-        rest, total = list(terms), 0.0
-        for count in range(1, self._degree + 2):
-            inner = 0.0
-            for term in reversed(rest[-count:]):
-                inner = dr.fma(inner, north, term)
-            del rest[-count:]
-            total = dr.fma(total, east, inner)
-        return total
+    def error_and_reach(self, mi_position: Any) -> tuple[Any, Any]:
+        """Vertical error bound of the mesh, and the farthest start of shadow rays, ``mi.Float`` [m] at positions."""
+        error, reach = self._mi_error, self._mi_reach
+        for part in self._parts:
+            weight = part._placement.share(part._placement.uv(mi_position))
+            error, reach = (error + weight * (part._mi_error - error), reach + weight * (part._mi_reach - reach))
+        return error, reach
 
 
 def shading_normal(material: Any, interaction: Any, active: Any = True) -> Any:
@@ -192,7 +171,7 @@ def device_surface(material: Any) -> DeviceSurface | None:
     return getattr(material, "surface", None)
 
 
-def shadow_ray_start(material: Any, cosine: Any) -> Any:
+def shadow_ray_start(material: Any, cosine: Any, position: Any) -> Any:
     """Return how far from the surface a shadow ray begins [m].
 
     Facets may stand above the smooth surface by the error of the mesh. Under a low sun they would cast streaks of shadow
@@ -206,13 +185,16 @@ def shadow_ray_start(material: Any, cosine: Any) -> Any:
         Of the terrain's mesh.
     cosine
         ``mi.Float``: cosine of the angle between ray and surface normal.
+    position
+        ``mi.Point3f``: where the ray leaves the surface.
     """
     import drjit as dr
 
     surface = device_surface(material)
     if surface is None:
         return 0.0
-    return dr.minimum(surface.mi_error / dr.maximum(cosine, 1e-3), surface.mi_reach)
+    error, reach = surface.error_and_reach(position)
+    return dr.minimum(error / dr.maximum(cosine, 1e-3), reach)
 
 
 def terrain_material(reflectance: dict[str, Any], terrain: Terrain, *, smooth: bool = True) -> Any:
@@ -236,6 +218,8 @@ def terrain_material(reflectance: dict[str, Any], terrain: Terrain, *, smooth: b
     import mitsuba as mi
 
     if use_backend().device == "scalar":
+        if terrain.images:
+            log.warning("finer images are left out in the scalar variant; it needs the device llvm or cuda")
         ground = {"type": "diffuse", "reflectance": reflectance}
         return mi.load_dict(ground if terrain.water is None else _scalar_water(ground, terrain.water))
     variant = mi.variant()
@@ -244,6 +228,7 @@ def terrain_material(reflectance: dict[str, Any], terrain: Terrain, *, smooth: b
     material: Any = mi.load_dict({"type": _PLUGIN, "reflectance": reflectance})
     material.surface = DeviceSurface(terrain.surface) if smooth and terrain.surface is not None else None
     material.detail = None if terrain.detail is None else DeviceDetail(terrain.detail)
+    material.images = DeviceImages(terrain.images) if terrain.images else None
     material.snow = None if terrain.snow is None else SnowOptics(terrain.snow)
     material.optics = optics_of(terrain)
     material.water = None if terrain.water is None else DeviceWater(terrain.water, terrain.frame)
@@ -292,6 +277,7 @@ def _material_class() -> Any:
             self.snow: Any = None
             self.optics: Any = None
             self.detail: Any = None
+            self.images: Any = None
             flags = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
             self.m_components, self.m_flags = [flags], flags
 
@@ -333,9 +319,12 @@ def _material_class() -> Any:
 
         def body(self, si: Any, active: Any) -> Any:
             """The albedo texture: reflectance of the ground, or of the body of water below its surface."""
-            albedo = self.reflectance.eval(si, active)
+            albedo, texel_m = self.reflectance.eval(si, active), None
+            if self.images is not None:
+                texel_m = 0.0 if self.detail is None else self.detail.texel_m
+                albedo, texel_m = self.images.applied(albedo, si.uv, si.p, texel_m, active)
             if self.detail is not None:
-                albedo = self.detail.applied(albedo, si.p)
+                albedo = self.detail.applied(albedo, si.p, texel_m)
             if self.snow is None or self.snow.clean is None:
                 return albedo
             share = self.snow.share(*albedo, dr)

@@ -89,6 +89,44 @@ class MapGrid:
         return [(west, south, east, north)]
 
 
+@dataclass(frozen=True)
+class RasterGrid:
+    """The grid of a raster in any CRS, as a target of `mosaic`.
+
+    Parameters
+    ----------
+    raster
+        Supplies size, transform and CRS.
+    """
+
+    raster: Raster
+
+    @property
+    def height(self) -> int:
+        """Rows."""
+        return self.raster.values.shape[0]
+
+    @property
+    def width(self) -> int:
+        """Columns."""
+        return self.raster.values.shape[1]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.height, self.width
+
+    def geodetic(self, column: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Latitude and longitude [deg] of cell coordinates; (0.5, 0.5) is the centre of the first cell."""
+        return geodetic_from_map(self.raster.crs, *apply_affine(self.raster.transform, column, row))
+
+    @property
+    def centre_deg(self) -> tuple[float, float]:
+        """Latitude and longitude of the centre [deg]."""
+        latitude, longitude = self.geodetic(np.array(self.width / 2.0), np.array(self.height / 2.0))
+        return float(latitude), float(longitude)
+
+
 def grid_about(latitude_deg: float, longitude_deg: float, size_m: tuple[float, float], spacing_m: float) -> MapGrid:
     """The grid of a rectangle about a place, in the UTM zone of the place, polar stereographic beyond ±84°.
 
@@ -186,7 +224,7 @@ def read_tile(
     return Raster(values.astype(np.float32), blocks, crs)
 
 
-def mosaic(tiles: Sequence[Raster], grid: MapGrid, *, extend: bool = True) -> np.ndarray:
+def mosaic(tiles: Sequence[Raster], grid: MapGrid | RasterGrid, *, extend: bool = True) -> np.ndarray:
     """Bring rasters onto a grid by cubic convolution, linear beside gaps; where several have a value, the first counts.
 
     Parameters
@@ -240,7 +278,7 @@ def _unwrapped(transform: Affine, crs: str, width: int, grid: MapGrid) -> Affine
 
 
 def _pixels_at(
-    grid: MapGrid, u: np.ndarray, v: np.ndarray, crs: str, transform: Affine
+    grid: MapGrid | RasterGrid, u: np.ndarray, v: np.ndarray, crs: str, transform: Affine
 ) -> tuple[np.ndarray, np.ndarray]:
     """Column and row in a raster of cell coordinates of a grid."""
     latitude, longitude = grid.geodetic(u, v)
@@ -332,7 +370,7 @@ def _reaches(raster: Raster, column: np.ndarray, row: np.ndarray) -> bool:
     return not bool(outside)
 
 
-def _strip_nodes(grid: MapGrid, rows: slice, crs: str, transform: Affine) -> tuple[np.ndarray, np.ndarray]:
+def _strip_nodes(grid: MapGrid | RasterGrid, rows: slice, crs: str, transform: Affine) -> tuple[np.ndarray, np.ndarray]:
     """Column and row in a raster of every `_STEP`-th cell centre of some rows."""
     count = rows.stop - rows.start
     u = np.arange(0, grid.width + _STEP, _STEP) + 0.5

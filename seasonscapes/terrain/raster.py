@@ -82,6 +82,7 @@ def read_elevation(
     band: int | None = None,
     unit: str | None = None,
     nodata: float | None = None,
+    finest_m: float | None = None,
     confinement: Confinement = OWN_FOLDER,
 ) -> Raster:
     """Read an elevation raster of one band as heights in metres, and check that land has such heights.
@@ -90,7 +91,7 @@ def read_elevation(
 
     Parameters
     ----------
-    path, bounds_deg, confinement
+    path, bounds_deg, finest_m, confinement
         As in `read_raster`.
     band
         Number of the band that holds the heights, from 1; required if the file has several bands.
@@ -126,10 +127,15 @@ def read_elevation(
         check_height_band(source, reader.bands[0], where)
         declared = unit or declared_unit(source, reader.bands[0], where)
     check_cells(grid, where)
-    check_memory(grid.values.shape, where)
-    raster = read_raster(path, bounds_deg=bounds_deg, bands=reader.bands, confinement=confinement)
-    if nodata is not None:
-        raster = replace(raster, values=np.where(raster.values == nodata, np.float32(np.nan), raster.values))
+    shrink = 1 if finest_m is None else _shrink(grid, finest_m)
+    check_memory((grid.values.shape[0] // shrink, grid.values.shape[1] // shrink), where)
+
+    def known(values: np.ndarray) -> np.ndarray:
+        return values if nodata is None else np.where(values == nodata, np.float32(np.nan), values)
+
+    raster = read_raster(
+        path, bounds_deg=bounds_deg, bands=reader.bands, finest_m=finest_m, decode=known, confinement=confinement
+    )
     raster = replace(raster, values=to_metres(raster.values, declared, where))
     check_heights(raster, where, unit=declared, nodata=nodata)
     return raster

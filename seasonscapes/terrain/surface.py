@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -14,7 +15,7 @@ from affine import Affine
 from seasonscapes.array_files import read_arrays
 from seasonscapes.errors import AtlasMismatch, InputError
 from seasonscapes.frames import MEAN_RADIUS_M, LocalFrame
-from seasonscapes.terrain.surface_classes import AlbedoDetail, Snow, Water
+from seasonscapes.terrain.surface_classes import AlbedoDetail, ImageDetail, Snow, Water
 
 
 @dataclass(frozen=True)
@@ -53,8 +54,9 @@ def exponents(degree: int) -> list[tuple[int, int]]:
     return [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
 
 
-# Width of the rim along which an inner surface is blended with the one around it, as a share of its side.
-RIM_SHARE = 0.12
+def polynomial_degree(to_node: np.ndarray) -> int:
+    """Degree of polynomials ``(2, T)`` of `monomials`."""
+    return round((8 * to_node.shape[1] + 1) ** 0.5 - 3) // 2
 
 
 @dataclass(frozen=True)
@@ -71,20 +73,24 @@ class SurfaceGrid:
         East and north of the polynomials' centre, and their radius [m].
     mesh_error_m
         Vertical error bound of the mesh against the nodes [m].
-    inner
-        A finer surface of a part of it, which takes its place there; towards its rim the two are blended.
+    parts
+        Finer surfaces of parts of it, coarse ones first, each of which takes the place of those before it; towards its rim
+        they are blended.
+    rim_nodes
+        Of a part: width of that rim, in its own nodes.
     """
 
     nodes: np.ndarray
     to_node: np.ndarray
     domain: tuple[float, float, float]
     mesh_error_m: float = 0.0
-    inner: SurfaceGrid | None = None
+    parts: tuple[SurfaceGrid, ...] = ()
+    rim_nodes: float = 1.0
 
     @property
     def degree(self) -> int:
         """Degree of the polynomials."""
-        return round((8 * self.to_node.shape[1] + 1) ** 0.5 - 3) // 2
+        return polynomial_degree(self.to_node)
 
     @property
     def spacing_m(self) -> float:
@@ -105,17 +111,24 @@ class SurfaceGrid:
 
     def spacing_at(self, position_m: np.ndarray) -> np.ndarray:
         """Distance ``(N,)`` of neighbouring nodes at positions ``(N, 3)`` [m]."""
-        spacing = np.full(len(position_m), self.spacing_m)
-        if self.inner is not None:
-            spacing = np.where(self.inner.share_at(position_m) > 0.0, self.inner.spacing_m, spacing)
-        return spacing
+        return self._of_finest(position_m, lambda surface: surface.spacing_m)
+
+    def error_at(self, position_m: np.ndarray) -> np.ndarray:
+        """Vertical error bound ``(N,)`` of the mesh at positions ``(N, 3)`` [m]."""
+        return self._of_finest(position_m, lambda surface: surface.mesh_error_m)
+
+    def _of_finest(self, position_m: np.ndarray, value: Callable[[SurfaceGrid], float]) -> np.ndarray:
+        result = np.full(len(position_m), value(self))
+        for part in self.parts:
+            result[part.share_at(position_m) > 0.0] = value(part)
+        return result
 
     def share_at(self, position_m: np.ndarray) -> np.ndarray:
-        """Share ``(N,)`` of this surface in one that it is the inner part of: 1 within, 0 at its rim and outside."""
+        """Share ``(N,)`` of this surface in one that it is a part of: 1 within, 0 at its rim and outside."""
         column, row = self.nodes_at(np.asarray(position_m, np.float64)).T
         rows, columns = self.nodes.shape[:2]
         inside = np.minimum(np.minimum(column, columns - 1 - column), np.minimum(row, rows - 1 - row))
-        return np.clip(inside / (RIM_SHARE * min(rows, columns)), 0.0, 1.0)
+        return np.clip(inside / self.rim_nodes, 0.0, 1.0)
 
     def _interpolated(self, position_m: np.ndarray, channels: tuple[int, ...]) -> list[np.ndarray]:
         from scipy.ndimage import map_coordinates
@@ -126,12 +139,11 @@ class SurfaceGrid:
             map_coordinates(self.nodes[..., k], [row, column], order=1, mode="nearest", output=np.float64)
             for k in channels
         ]
-        if self.inner is None:
-            return values
-        share = self.inner.share_at(position_m)
-        near = np.flatnonzero(share > 0.0)
-        for value, finer in zip(values, self.inner._interpolated(position_m[near], channels), strict=True):
-            value[near] += share[near] * (finer - value[near])
+        for part in self.parts:
+            share = part.share_at(position_m)
+            near = np.flatnonzero(share > 0.0)
+            for value, finer in zip(values, part._interpolated(position_m[near], channels), strict=True):
+                value[near] += share[near] * (finer - value[near])
         return values
 
     def sample(self, position_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -180,6 +192,8 @@ class Terrain:
         Whether its forests have a hot spot, or are Lambertian.
     detail
         Detail of the albedo below its texels, for one camera; ``None``: the texture alone. `save_terrain` leaves it out.
+    images
+        Images finer than the texels, for one camera, whose detail lies over the albedo. `save_terrain` leaves them out.
     """
 
     vertices: np.ndarray
@@ -192,6 +206,7 @@ class Terrain:
     snow: Snow | None = None
     forest: bool = False
     detail: AlbedoDetail | None = None
+    images: tuple[ImageDetail, ...] = ()
 
 
 def mesh_up_m(terrain: Terrain, position_m: np.ndarray) -> float:
@@ -307,6 +322,25 @@ def require_atlas(texture: Texture, atlas_id: str, shape: tuple[int, int], *, wh
         )
 
 
+def surface_arrays(surface: SurfaceGrid, prefix: str = "") -> dict[str, Any]:
+    """A surface without its parts as arrays to store."""
+    return {
+        f"{prefix}nodes": surface.nodes,
+        f"{prefix}to_node": surface.to_node,
+        f"{prefix}domain": surface.domain,
+        f"{prefix}measures": np.array([surface.mesh_error_m, surface.rim_nodes], np.float64),
+    }
+
+
+def surface_from_arrays(stored: Any, prefix: str = "") -> SurfaceGrid:
+    """The surface of `surface_arrays`."""
+    east, north, radius = (float(value) for value in stored[f"{prefix}domain"])
+    error_m, rim_nodes = (float(value) for value in stored[f"{prefix}measures"])
+    return SurfaceGrid(
+        stored[f"{prefix}nodes"], stored[f"{prefix}to_node"], (east, north, radius), error_m, rim_nodes=rim_nodes
+    )
+
+
 def save_terrain(terrain: Terrain, path: str | os.PathLike[str], *, note: dict[str, Any] | None = None) -> None:
     """Write a terrain and its metadata to one ``.npz`` file.
 
@@ -322,9 +356,8 @@ def save_terrain(terrain: Terrain, path: str | os.PathLike[str], *, note: dict[s
     frame = np.array([getattr(terrain.frame, name) for name in LocalFrame.__dataclass_fields__], np.float64)
     arrays: dict[str, Any] = {"vertices": terrain.vertices, "faces": terrain.faces, "uv": terrain.uv, "frame": frame}
     if terrain.surface is not None:
-        surface = terrain.surface
-        arrays |= {"surface": surface.nodes, "surface_to_node": surface.to_node, "surface_domain": surface.domain}
-        arrays["surface_mesh_error_m"] = surface.mesh_error_m
+        for number, surface in enumerate((terrain.surface, *terrain.surface.parts)):
+            arrays |= surface_arrays(surface, f"surface{number}_")
     if terrain.water is not None:
         # Shares in steps of 1/255.
         arrays |= {"water": np.round(terrain.water.mask * 255.0).astype(np.uint8), "water_wind": terrain.water.wind_m_s}
@@ -352,15 +385,10 @@ def load_terrain(path: str | os.PathLike[str]) -> tuple[Terrain, dict[str, Any]]
     """
     with np.load(path, allow_pickle=False) as stored:
         frame = LocalFrame(*map(float, stored["frame"]))
-        surface = None
-        if "surface" in stored:
-            east, north, radius = map(float, stored["surface_domain"])
-            surface = SurfaceGrid(
-                stored["surface"],
-                stored["surface_to_node"],
-                (east, north, radius),
-                float(stored["surface_mesh_error_m"]),
-            )
+        surfaces = []
+        while f"surface{len(surfaces)}_nodes" in stored:
+            surfaces.append(surface_from_arrays(stored, f"surface{len(surfaces)}_"))
+        surface = replace(surfaces[0], parts=tuple(surfaces[1:])) if surfaces else None
         terrain = Terrain(stored["vertices"], stored["faces"], stored["uv"], frame, surface)
         if "water" in stored:
             water = Water(stored["water"].astype(np.float32) / np.float32(255.0), float(stored["water_wind"]))

@@ -57,3 +57,42 @@ class AlbedoDetail:
     pixel_angle_rad: float
     texel_m: float
     seed: int = 0
+
+
+@dataclass(frozen=True)
+class ImageLevel:
+    """An image of a part of the ground on its own map grid.
+
+    Parameters
+    ----------
+    values
+        ``(R, S, 4)`` float16: linear colour, and its share in what the coarser levels show; row 0 first.
+    to_node, domain
+        From positions in the local frame to column and row; see `terrain.surface.monomials`.
+    texel_m
+        Side of its pixels [m].
+    rim_nodes
+        Width of the rim along which it fades into the coarser levels [pixels].
+    """
+
+    values: np.ndarray
+    to_node: np.ndarray
+    domain: tuple[float, float, float]
+    texel_m: float
+    rim_nodes: float
+
+
+@dataclass(frozen=True)
+class ImageDetail:
+    """Detail of an image finer than the texels of the atlas, relative to its mean over them; see `rendering.image_detail`.
+
+    Parameters
+    ----------
+    mean
+        ``(R, S, 3)`` float16 mean of the image over the atlas's texels, row 0 at v = 1; 1 where it does not reach.
+    levels
+        The image, coarse and wide first; the shares of the first one are those of the whole image in what lies below it.
+    """
+
+    mean: np.ndarray
+    levels: tuple[ImageLevel, ...]

@@ -21,7 +21,9 @@ _DEGREES = (3, 5, 7)
 _STRIP = 500_000
 
 
-def surface_grid(raster: Raster, frame: LocalFrame, *, mesh_error_m: float = 0.0) -> SurfaceGrid:
+def surface_grid(
+    raster: Raster, frame: LocalFrame, *, mesh_error_m: float = 0.0, rim_nodes: float = 1.0
+) -> SurfaceGrid:
     """Compute slopes and up coordinates of a raster's samples in the local frame.
 
     Parameters
@@ -32,6 +34,8 @@ def surface_grid(raster: Raster, frame: LocalFrame, *, mesh_error_m: float = 0.0
         Local frame of the result.
     mesh_error_m
         Vertical error bound of the mesh that approximates the surface [m].
+    rim_nodes
+        Of a part of another surface: width of the rim along which the two are blended, in samples.
 
     Returns
     -------
@@ -59,18 +63,23 @@ def surface_grid(raster: Raster, frame: LocalFrame, *, mesh_error_m: float = 0.0
         kept = slice(first - low, min(first + strip, rows) - low)
         nodes[first : first + strip, :, :2] = (-normal[..., :2] / np.maximum(normal[..., 2:], 1e-6))[kept]
         nodes[first : first + strip, :, 2] = position[kept, :, 2]
-    return SurfaceGrid(nodes, *_to_nodes(raster, frame, stride, heights), mesh_error_m)
+    levels_m = (float(heights.min()), float(heights.max()))
+    to_node, domain = grid_polynomials(raster, frame, levels_m, stride=stride)
+    return SurfaceGrid(nodes, to_node, domain, mesh_error_m, rim_nodes=rim_nodes)
 
 
-def _to_nodes(
-    raster: Raster, frame: LocalFrame, stride: int, heights: np.ndarray
+def grid_polynomials(
+    raster: Raster, frame: LocalFrame, levels_m: tuple[float, float], *, stride: int = 1
 ) -> tuple[np.ndarray, tuple[float, float, float]]:
-    """Polynomials from the local frame to column and row of the nodes, and the centre and radius of their domain."""
+    """Polynomials from the local frame to column and row of a raster's samples, and centre and radius of their domain.
+
+    ``levels_m`` are the lowest and highest heights of the ground there; ``stride`` counts every so many samples as one.
+    """
     height, width = raster.values.shape[:2]
     row, column = np.meshgrid(np.linspace(0, height - 1, 24), np.linspace(0, width - 1, 24), indexing="ij")
     x, y = apply_affine(raster.transform, column + 0.5, row + 0.5)
     latitude, longitude = geodetic_from_map(raster.crs, x, y)
-    levels = np.linspace(float(heights.min()), float(heights.max()) + 1.0, 3)
+    levels = np.linspace(levels_m[0], levels_m[1] + 1.0, 3)
     position = np.concatenate([enu_from_geodetic(frame, latitude, longitude, level).reshape(-1, 3) for level in levels])
     low, high = position[:, :2].min(axis=0), position[:, :2].max(axis=0)
     centre, radius = 0.5 * (low + high), 0.5 * float((high - low).max())

@@ -35,7 +35,7 @@ _MOST_TILES = 5000
 # Three bands in float32: the tiles, their join, and the grid.
 _BYTES_PER_PIXEL = 40
 # Degrees along a meridian, on a sphere of the Earth's mean radius.
-_METRES_PER_DEGREE = 111_195.0
+METRES_PER_DEGREE = 111_195.0
 
 
 # ---------------------------------------------------------------------------------------------- which files
@@ -188,10 +188,7 @@ def read_tiles(
     spacing_m = max(min(sides), finest_m or 0.0)
     west, south, east, north = bounds_deg
     latitude, longitude = 0.5 * (south + north), 0.5 * (west + east)
-    size_m = (
-        (east - west) * _METRES_PER_DEGREE * math.cos(math.radians(latitude)),
-        (north - south) * _METRES_PER_DEGREE,
-    )
+    size_m = ((east - west) * METRES_PER_DEGREE * math.cos(math.radians(latitude)), (north - south) * METRES_PER_DEGREE)
     width, height = (round(side / spacing_m) for side in size_m)
     require_bytes(
         width * height * _BYTES_PER_PIXEL,
@@ -199,7 +196,7 @@ def read_tiles(
         got=f"{width} × {height}",
         cure="use a part with a table [area]",
     )
-    tiles = [_unwrapped(read(path, bounds, finest_m), longitude) for path, bounds in wanted.items()]
+    tiles = [in_turn_of(read(path, bounds, finest_m), longitude) for path, bounds in wanted.items()]
     if same_grid(tiles):
         return joined(tiles)
     grid = grid_about(latitude, longitude, size_m, spacing_m)
@@ -213,14 +210,17 @@ def read_elevation_tiles(
     band: int | None = None,
     unit: str | None = None,
     nodata: float | None = None,
+    finest_m: float | None = None,
     confinement: Confinement = OWN_FOLDER,
 ) -> Raster:
     """`raster.read_elevation` of one file, or of tiles as one raster; each file's own unit counts."""
 
-    def read(path: str, bounds: Bounds | None, _: float | None) -> Raster:
-        return read_elevation(path, bounds_deg=bounds, band=band, unit=unit, nodata=nodata, confinement=confinement)
+    def read(path: str, bounds: Bounds | None, finest: float | None) -> Raster:
+        return read_elevation(
+            path, bounds_deg=bounds, band=band, unit=unit, nodata=nodata, finest_m=finest, confinement=confinement
+        )
 
-    heights = read_tiles(paths, read, bounds_deg=bounds_deg, confinement=confinement)
+    heights = read_tiles(paths, read, bounds_deg=bounds_deg, finest_m=finest_m, confinement=confinement)
     check_memory(heights.values.shape, f"{paths[0]} and {len(paths) - 1} more")
     return heights
 
@@ -240,8 +240,8 @@ def _overlap(box: Bounds, bounds_deg: Bounds, sides_m: tuple[float, float]) -> b
     """Whether a tile reaches into bounds by two pixels or more."""
     west, south, east, north = box
     turn = float(wrapped(west, 0.5 * (bounds_deg[0] + bounds_deg[2]) - 0.5 * (east - west), 360.0)) - west
-    down = 2.0 * sides_m[1] / _METRES_PER_DEGREE
-    across = 2.0 * sides_m[0] / (_METRES_PER_DEGREE * max(math.cos(math.radians(0.5 * (south + north))), 0.01))
+    down = 2.0 * sides_m[1] / METRES_PER_DEGREE
+    across = 2.0 * sides_m[0] / (METRES_PER_DEGREE * max(math.cos(math.radians(0.5 * (south + north))), 0.01))
     return (
         west + turn < bounds_deg[2] - across
         and east + turn > bounds_deg[0] + across
@@ -261,8 +261,8 @@ def _union(boxes: list[Bounds]) -> Bounds:
     return min(wests), min(box[1] for box in boxes), max(easts), max(box[3] for box in boxes)
 
 
-def _unwrapped(raster: Raster, longitude_deg: float) -> Raster:
-    """A raster of a geographic CRS in the turn of a longitude."""
+def in_turn_of(raster: Raster, longitude_deg: float) -> Raster:
+    """A raster, of a geographic CRS in the turn of a longitude."""
     if not horizontal_crs(raster.crs).is_geographic:
         return raster
     a, b, c, d, e, f = tuple(raster.transform)[:6]

@@ -7,6 +7,7 @@ depends on the edge alone, so that both of its faces agree and the mesh stays wi
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -20,6 +21,7 @@ _LEAST_NODES = 0.3
 _MOST_ROUNDS = 14
 # New faces at which refinement ends; each round at most doubles them.
 _MOST_FACES = 4_000_000
+_CHUNK = 500_000
 
 
 def refined_for_view(
@@ -47,21 +49,87 @@ def refined_for_view(
     """
     if terrain.surface is None:
         return terrain
-    near = _near_faces(terrain, eye_m, reach_m)
+    visible_error = tolerance_px * pixel_angle_rad
+
+    def tolerance_m(position_m: np.ndarray) -> np.ndarray:
+        return visible_error * np.linalg.norm(position_m - eye_m, axis=-1)
+
+    return _refined(terrain, terrain.surface, _near_faces(terrain, eye_m, reach_m), tolerance_m)
+
+
+def moved_to(terrain: Terrain, surface: SurfaceGrid) -> Terrain:
+    """Move the vertices of a mesh up or down by what another surface of its ground differs from its own.
+
+    Parameters
+    ----------
+    terrain
+        The mesh, with a surface.
+    surface
+        Takes its place.
+
+    Returns
+    -------
+    Terrain
+        As near to its new surface as it was to its old one, between whose nodes alone it may be coarse: see `refined_for_view`.
+    """
+    assert terrain.surface is not None
+    vertices = terrain.vertices.copy()
+    for start in range(0, len(vertices), _CHUNK):
+        part = vertices[start : start + _CHUNK]
+        part[:, 2] += surface.up_at(part) - terrain.surface.up_at(part)
+    return replace(terrain, vertices=vertices, surface=surface)
+
+
+def refined_in_parts(terrain: Terrain) -> Terrain:
+    """Refine a mesh where its surface has finer parts, until it is as near to each as its ``mesh_error_m`` says.
+
+    Parameters
+    ----------
+    terrain
+        The mesh; without parts it is returned unchanged.
+
+    Returns
+    -------
+    Terrain
+        Texture coordinates of new vertices are interpolated.
+    """
+    surface = terrain.surface
+    if surface is None or not surface.parts:
+        return terrain
+    low, high = (side(terrain.vertices[terrain.faces, :2], axis=1) for side in (np.min, np.max))
+    near = np.zeros(len(terrain.faces), bool)
+    for part in surface.parts:
+        # A face of a plain may hold a whole part within its corners.
+        (east, north), reach = part.domain[:2], part.domain[2]
+        near |= (low < (east + reach, north + reach)).all(axis=1) & (high > (east - reach, north - reach)).all(axis=1)
+
+    def tolerance_m(position_m: np.ndarray) -> np.ndarray:
+        # Elsewhere the mesh stays as it is.
+        result = np.full(len(position_m), np.inf)
+        for part in surface.parts:
+            result[part.share_at(position_m) > 0.0] = part.mesh_error_m
+        return result
+
+    return _refined(terrain, surface, near, tolerance_m)
+
+
+def _refined(
+    terrain: Terrain, surface: SurfaceGrid, near: np.ndarray, tolerance_m: Callable[[np.ndarray], np.ndarray]
+) -> Terrain:
+    """Split edges of the ``near`` faces until the surface deviates from them by no more than is tolerated there."""
     settled, faces = [terrain.faces[~near]], terrain.faces[near]
     vertices, uv = terrain.vertices, terrain.uv
-    visible_error = tolerance_px * pixel_angle_rad
     for _ in range(_MOST_ROUNDS):
         edges, of_face = _unique_edges(faces)
-        split = _visible(terrain.surface, vertices, edges, eye_m, visible_error)
+        split = _visible(surface, vertices, edges, tolerance_m)
         # Faces whose middle deviates although no edge does.
         unsplit = ~split[of_face].any(axis=1)
         middle = vertices[faces[unsplit]].mean(axis=1, dtype=np.float64)
-        deviating = _deviation(terrain.surface, middle) > visible_error * _distance(middle, eye_m)
+        deviating = _deviation(surface, middle) > tolerance_m(middle)
         corners = vertices[faces[unsplit][deviating]].astype(np.float64)
         lengths = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
         longest = of_face[np.flatnonzero(unsplit)[deviating], lengths.argmax(axis=1)]
-        spacing = terrain.surface.spacing_at(middle[deviating])
+        spacing = surface.spacing_at(middle[deviating])
         split[longest[lengths.max(axis=1) > _LEAST_NODES * spacing]] = True
         # An edge that only one near face has belongs to a far face too, or to the rim.
         split &= np.bincount(of_face.ravel(), minlength=len(edges)) == 2
@@ -73,7 +141,7 @@ def refined_for_view(
             break
         ends = edges[split]
         middle = vertices[ends].mean(axis=1, dtype=np.float64)
-        middle[:, 2] = terrain.surface.up_at(middle)
+        middle[:, 2] = surface.up_at(middle)
         number = np.full(len(edges), -1, np.int64)
         number[split] = len(vertices) + np.arange(len(ends))
         vertices = np.concatenate([vertices, middle.astype(np.float32)])
@@ -94,27 +162,23 @@ def _unique_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.stack([keys >> 32, keys & 0xFFFFFFFF], axis=1), inverse.reshape(-1, 3)
 
 
-def _distance(position_m: np.ndarray, eye_m: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(position_m - eye_m, axis=-1)
-
-
 def _deviation(surface: SurfaceGrid, position_m: np.ndarray) -> np.ndarray:
     return np.abs(surface.up_at(position_m) - position_m[:, 2])
 
 
 def _visible(
-    surface: SurfaceGrid, vertices: np.ndarray, edges: np.ndarray, eye_m: np.ndarray, visible_error: float
+    surface: SurfaceGrid, vertices: np.ndarray, edges: np.ndarray, tolerance_m: Callable[[np.ndarray], np.ndarray]
 ) -> np.ndarray:
     """Edges ``(E,)`` from which the surface deviates visibly."""
     start, end = (vertices[edges[:, k]].astype(np.float64) for k in range(2))
     spacing = surface.spacing_at(0.5 * (start + end))
     long = np.flatnonzero(np.linalg.norm((end - start)[:, :2], axis=1) > _LEAST_NODES * spacing)
     result = np.zeros(len(edges), bool)
-    nearest = np.minimum(_distance(start[long], eye_m), _distance(end[long], eye_m))
+    least = np.minimum(tolerance_m(start[long]), tolerance_m(end[long]))
     for share in _ALONG:
         point = start[long] + share * (end - start)[long]
-        nearest = np.minimum(nearest, _distance(point, eye_m))
-        result[long] |= _deviation(surface, point) > visible_error * nearest
+        least = np.minimum(least, tolerance_m(point))
+        result[long] |= _deviation(surface, point) > least
     return result
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from seasonscapes.cameras.observation import Observation
 from seasonscapes.cameras.pinhole import view_in_frame
 from seasonscapes.errors import NoTerrainInView
 from seasonscapes.progress import Progress, task_progress
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
     from seasonscapes.albedo.photographs import AlbedoPhotograph, TextureObservation
     from seasonscapes.albedo.seasons import DatedAlbedo
     from seasonscapes.albedo.standard_error import AlbedoEstimate
-    from seasonscapes.cameras.observation import Observation
     from seasonscapes.sky.illumination import Illumination
 
 log = logging.getLogger(__name__)
@@ -321,6 +321,7 @@ def _prepared(
     progress: Progress | None,
 ) -> tuple[list[AlbedoPhotograph], dict[str, Any]]:
     """Photographs with their light; tone curve and visibility fitted where asked for."""
+    from seasonscapes.albedo.ground_pixels import without_water
     from seasonscapes.albedo.haze import fit_visibility
     from seasonscapes.albedo.photographs import EIGHT_BIT, prepare_photographs
     from seasonscapes.albedo.tone_curve import fit_tone_curve, with_tone_curve
@@ -333,6 +334,14 @@ def _prepared(
     lights = illuminations(place, photographs, skies)
     report = task_progress(progress, "footprints of the photographs")
     prepared = prepare_photographs(transport, photographs, lights, progress=report)
+    if place.terrain.water is not None:
+        prepared, share = without_water(prepared, place.terrain.water.mask)
+        photographs = [each.observation for each in prepared if isinstance(each.observation, Observation)]
+        facts["water_share"] = round(share, 4)
+        log.info(
+            "water: %.3g %% of the pixels on terrain show it and tell no albedo; its texels are completed",
+            100.0 * share,
+        )
     if options.fit_curve:
         curve = fit_tone_curve(transport, prepared, progress=task_progress(progress, "tone curve"))
         prepared = with_tone_curve(prepared, curve.strength)

@@ -20,6 +20,7 @@ from seasonscapes.source_hash import source_hash
 from seasonscapes.terrain.raster_files import rasters_hash
 from seasonscapes.terrain.surface import Raster, Terrain, Texture, atlas_identity, mesh_up_m, require_atlas
 from seasonscapes.terrain.water import levelled
+from seasonscapes.workflows.nested_heights import finer_heights
 from seasonscapes.workflows.scene_water import scene_water, water_key
 from seasonscapes.workflows.terrain_building import MeshOptions
 from seasonscapes.workspace import Workspace, build_once, default_workspace
@@ -69,6 +70,8 @@ class Place:
         Where built artefacts are kept.
     options
         How the terrain was meshed and unwrapped.
+    finer_heights
+        Heights of the parts of the terrain that have finer data, the coarsest first; see `workflows.nested_heights`.
 
     Examples
     --------
@@ -89,6 +92,7 @@ class Place:
     key: dict
     workspace: Workspace
     options: MeshOptions
+    finer_heights: tuple[Raster, ...] = ()
 
     @property
     def texture_shape(self) -> tuple[int, int]:
@@ -189,12 +193,15 @@ def load_place(
     report = task_progress(progress, "terrain")
     report(0.0)
     massif = None if declared.elevation.synthetic is None else _massif(declared, workspace)
-    source = declared.elevation.paths
+    source = declared.elevation.all_paths
+    images_matter = options.texel_m is None or any(image.finer for image in declared.images)
     key_name = "files" if declared.elevation.files else "file"
     elevation, fill = terrain_building.read_heights(declared, massif, where=f"{path}: elevation.{key_name}")
     water = scene_water(declared, elevation, massif)
     if water is not None:
         elevation = levelled(elevation, water)
+    of_water = water_key(declared)
+    finer = finer_heights(declared, elevation, water, workspace, of_water)
     report(0.3)
     _check_cameras(path, declared, elevation)
     frame = terrain_building.local_frame(declared, elevation)
@@ -202,12 +209,12 @@ def load_place(
         "code": source_hash(*_TERRAIN_CODE),
         "elevation": declared.elevation.without_folders(),
         "elevation_hash": rasters_hash(source, declared.confinement) if source else None,
-        # The finest image decides how fine texels are.
-        "images": [content for _, content in declared.image_keys] if options.texel_m is None else None,
+        # The finest image decides how fine texels are, and finer images of parts lie over the albedo.
+        "images": [content for _, content in declared.image_keys] if images_matter else None,
         "area": declared.area,
         "frame": frame,
         "options": options,
-        **water_key(declared),
+        **of_water,
         **({} if declared.snow is None else {"snow": declared.snow}),
         **({} if declared.forest is None else {"forest": declared.forest}),
     }
@@ -218,14 +225,20 @@ def load_place(
         code=_TERRAIN_CODE,
         suffix=".npz",
         build=lambda: terrain_building.build_terrain(
-            elevation, frame, declared, options, water=water, progress=lambda share: report(0.3 + 0.7 * share)
+            elevation,
+            frame,
+            declared,
+            options,
+            finer=finer,
+            water=water,
+            progress=lambda share: report(0.3 + 0.7 * share),
         ),
         save=terrain_building.save_built_terrain,
         load=terrain_building.load_built_terrain,
     )
     terrain_building.tell_texel_wish(terrain, declared, options)
     report(1.0)
-    return Place(path, declared, frame, elevation, fill, terrain, atlas, massif, key, workspace, options)
+    return Place(path, declared, frame, elevation, fill, terrain, atlas, massif, key, workspace, options, finer)
 
 
 def _check_cameras(path: Path, scene: SceneFile, elevation: Raster) -> None:

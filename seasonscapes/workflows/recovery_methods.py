@@ -124,6 +124,8 @@ def joint_fit(
     """The joint recovery, started from the closed form, and what it found as plain values."""
     from seasonscapes.albedo.joint_recovery import recover_jointly
 
+    if place.terrain.snow is not None or place.terrain.forest:
+        log.warning("the differentiable method treats snow and forest as matt; the closed form does not")
     start = closed_fit(transport, photographs, progress)
     haze = _haze_lights(place, photographs, model, progress)
     report = task_progress(progress, "haze, exposures, response, clouds, poses")

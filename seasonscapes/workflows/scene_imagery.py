@@ -8,6 +8,7 @@ import numpy as np
 
 from seasonscapes.scene import Imagery
 from seasonscapes.terrain.raster_files import Confinement
+from seasonscapes.workflows.nested_images import finer_images, whole_image
 from seasonscapes.workflows.place import Place
 
 # Values above these shares of the full scale are clipped: the last levels of 8-bit sRGB and linear files.
@@ -35,6 +36,8 @@ class AtlasImage:
 
 def atlas_image(place: Place, imagery: Imagery, confinement: Confinement | None = None) -> AtlasImage:
     """Read an image and resample it into the place's atlas; see `terrain.imagery`.
+
+    Texels that it does not reach at all take the mean of its finer parts, where these do.
 
     Parameters
     ----------
@@ -64,5 +67,9 @@ def atlas_image(place: Place, imagery: Imagery, confinement: Confinement | None 
         confinement=confinement or place.scene.confinement,
     )
     texture = bake_imagery(place.terrain, place.atlas, image)
+    for part in finer_images(place) if imagery.finer else []:
+        mean = whole_image(place, part).mean
+        empty = (texture.weight == 0.0) & (mean.weight > 0.0)
+        texture.values[empty], texture.weight[empty] = mean.values[empty], mean.weight[empty]
     clipped = (texture.values >= _CLIPPED[imagery.encoding]) & (texture.weight[..., None] > 0.0)
     return AtlasImage(texture.values, texture.weight, clipped)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,15 +15,17 @@ from seasonscapes.frames import LocalFrame
 from seasonscapes.terrain.crs import wrapped
 from seasonscapes.terrain.memory import check_memory
 from seasonscapes.terrain.mesh import MESHERS, build_mesh
+from seasonscapes.terrain.nested_heights import RIM_CELLS
 from seasonscapes.terrain.placement import cell_sides_m, check_area
 from seasonscapes.terrain.raster import bounds_geographic, centre_frame, fill_nodata, read_elevation
 from seasonscapes.terrain.raster_files import OWN_FOLDER
 from seasonscapes.terrain.refine import refine_raster, refinement_factor
-from seasonscapes.terrain.surface import Raster, Terrain, load_terrain, save_terrain
+from seasonscapes.terrain.surface import Raster, SurfaceGrid, Terrain, load_terrain, save_terrain
 from seasonscapes.terrain.surface_classes import Snow
 from seasonscapes.terrain.surface_grid import surface_grid
 from seasonscapes.terrain.tile_files import read_elevation_tiles, tile_spacing_m
 from seasonscapes.terrain.unwrap import ATLASES, Atlas, unwrap
+from seasonscapes.terrain.view_refinement import moved_to, refined_in_parts
 from seasonscapes.terrain.water import levelled
 from seasonscapes.workflows.scene_water import with_water
 
@@ -48,6 +50,8 @@ __all__ = [
 log = logging.getLogger(__name__)
 
 
+# Error of the mesh in finer parts, in their spacings: near a camera it is refined further.
+_PART_ERROR = 0.25
 # Texels a little finer than the image's pixels lose none of it by resampling.
 _TEXELS_PER_PIXEL = 0.7
 
@@ -197,11 +201,13 @@ def build_terrain(
     scene: SceneFile,
     options: MeshOptions,
     *,
+    finer: Sequence[Raster] = (),
     water: Raster | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> tuple[Terrain, Atlas]:
     """Mesh an elevation raster in a local frame and unwrap it; see `terrain.mesh` and `terrain.unwrap`.
 
+    Where there are ``finer`` heights of parts (`workflows.nested_heights`), mesh and surface follow them.
     Where there is ``water``, its share ``(H, W, 1)`` at the raster's cells, lakes are level, and the terrain has a mask.
     """
     report = progress or (lambda fraction: None)
@@ -219,9 +225,15 @@ def build_terrain(
     report(0.6)
     error = bound if mesher == "adaptive" else 0.0
     terrain = replace(terrain, surface=surface_grid(refined, frame, mesh_error_m=error))
+    if finer:
+        assert terrain.surface is not None
+        parts = tuple(_finer_part(part, elevation, frame, bound) for part in finer)
+        terrain = moved_to(terrain, replace(terrain.surface, parts=parts))
     report(0.8)
     texel_m = _texel_m(terrain, elevation, scene, options)
     terrain, atlas = unwrap(terrain, kind=options.atlas, texel_m=texel_m, max_side_px=options.max_side_px)
+    # Refined last: texture coordinates are interpolated, so that slivers among the new faces cannot fold over.
+    terrain = refined_in_parts(terrain)
     if water is not None and scene.water is not None:
         terrain = with_water(terrain, atlas, water, scene.water.wind_m_s)
     if scene.snow is not None and scene.snow.scattering:
@@ -229,6 +241,15 @@ def build_terrain(
     if scene.forest is not None and scene.forest.hot_spot:
         terrain = replace(terrain, forest=True)
     return terrain, atlas
+
+
+def _finer_part(part: Raster, elevation: Raster, frame: LocalFrame, bound_m: float) -> SurfaceGrid:
+    """The surface of finer heights, which the mesh follows as closely as their spacing deserves."""
+    spacing_m = sample_spacing_m(part)
+    error_m = min(bound_m, spacing_m * _PART_ERROR)
+    return surface_grid(
+        part, frame, mesh_error_m=error_m, rim_nodes=RIM_CELLS * sample_spacing_m(elevation) / spacing_m
+    )
 
 
 def save_built_terrain(built: tuple[Terrain, Atlas], path: Path) -> None:

@@ -143,23 +143,23 @@ def calibrated_viewpoint(path: Path) -> tuple[NamedCamera, tuple[int, int]]:
 
 
 def terrain_for_view(place: Place, view: Camera | Panorama) -> Terrain:
-    """The terrain of a place, refined near a camera until its error is a quarter of a pixel."""
-    from seasonscapes.terrain.view_refinement import refined_for_view
+    """The terrain of a place with its finest data about a camera, refined there until its error is a quarter of a pixel."""
+    from seasonscapes.workflows.amplified_terrain import detailed_view
 
-    return refined_for_view(place.terrain, view.position_m, 1.0 / float(view.fx))
+    return detailed_view(place, view)[1]
 
 
 def view_with_terrain(
     place: Place, view: Camera | Panorama, *, lambertian: bool = False, amplify: bool = False
 ) -> tuple[Camera | Panorama, Terrain]:
-    """A camera and the terrain that it is to render.
+    """A camera and the terrain that it is to render, with the finest data about it.
 
-    ``lambertian``: without surfaces that are not matt. ``amplify``: with detail below the resolution of the data, on
-    which the camera keeps its height above ground; see `workflows.amplified_terrain`.
+    ``lambertian``: without surfaces that are not matt. ``amplify``: with detail below the resolution of the data. On either the
+    camera keeps its height above ground; see `workflows.amplified_terrain`.
     """
-    from seasonscapes.workflows.amplified_terrain import amplified_view
+    from seasonscapes.workflows.amplified_terrain import detailed_view
 
-    view, terrain = amplified_view(place, view) if amplify else (view, terrain_for_view(place, view))
+    view, terrain = detailed_view(place, view, amplify=amplify)
     return view, replace(terrain, water=None, snow=None, forest=False) if lambertian else terrain
 
 
