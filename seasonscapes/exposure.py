@@ -125,7 +125,7 @@ def develop(
     Parameters
     ----------
     image
-        Scene-linear image ``(H, W, 3)`` [cd/m²].
+        Scene-linear image ``(..., 3)`` [cd/m²].
     ev100
         Exposure, from `exposure_ev100`.
     eye
@@ -138,7 +138,7 @@ def develop(
     Returns
     -------
     ndarray
-        Display-linear picture ``(H, W, 3)`` in [0, 1].
+        Display-linear picture ``(..., 3)`` in [0, 1].
 
     Raises
     ------
@@ -159,13 +159,15 @@ def develop(
 
 def _blend_rod_vision(image: np.ndarray, mesopic: tuple[float, float] = _MESOPIC) -> np.ndarray:
     """Blend an image with its scotopic grey by the position of each pixel's luminance in the mesopic range."""
+    if not np.issubdtype(image.dtype, np.floating):
+        image = image.astype(np.float64)
     luminance = np.maximum(image @ REC709_LUMINANCE.astype(image.dtype), 1e-9)
     low, high = np.log10(mesopic)
     # By day no pixel is so dim that rods see it; by night most are, and all are as quickly done.
     dim = luminance < mesopic[1]
     if not dim.any():
         return image
-    chosen = dim if dim.mean() < 0.2 else np.s_[:]
+    chosen = dim if dim.mean() < 0.2 else np.s_[...]
     cones = image[chosen].astype(np.float64)
     rod_weight = np.clip((high - np.log10(luminance[chosen])) / (high - low), 0.0, 1.0)[..., None]
     tint = _NIGHT_TINT / (_NIGHT_TINT @ REC709_LUMINANCE)

@@ -36,6 +36,16 @@ def test_rods_drain_colour_and_turn_it_blue():
     assert dim[0, 0, 2] > dim[0, 0, 0]
 
 
+@pytest.mark.parametrize("how", [{"look": "photo"}, {"eye": True}])
+def test_whole_numbers_and_single_pixels_develop_like_images(how):
+    for luminance, ev100 in ((4000, 15.0), (1, 3.0)):
+        expected = develop(card(float(luminance)), ev100, **how)
+        np.testing.assert_array_equal(develop(np.full((4, 4, 3), luminance), ev100, **how), expected)
+        np.testing.assert_allclose(develop(np.full(3, float(luminance)), ev100, **how), expected[0, 0], rtol=1e-12)
+    dim = np.array([3e-4, 2e-4, 1e-4])
+    np.testing.assert_allclose(develop(dim, -6.0, **how), develop(dim[None, None], -6.0, **how)[0, 0], rtol=1e-12)
+
+
 def test_fixed_values_and_mistakes():
     assert parse_exposure("12.5") == 12.5
     assert exposure_ev100(card(1.0), 12.5) == 12.5
