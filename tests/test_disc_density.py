@@ -51,6 +51,10 @@ def test_cells_survive_packing(refined):
     assert packed["split"].nbytes < 0.5 * len(found.cell)
     with pytest.raises(ValueError, match="bits of quartered cells"):
         unpacked_cells(found.grid, packed | {"split": packed["split"][:5]}, int(found.level.max()))
+    # No cell is left to quarter: without a bound this loops on nothing.
+    for levels in (10**6, -1, float("inf"), 1.5):
+        with pytest.raises(ValueError, match="expected 0 to 6"):
+            unpacked_cells(found.grid, {name: np.zeros_like(bits) for name, bits in packed.items()}, levels)
 
 
 def test_planes_are_those_of_the_points():

@@ -1,6 +1,7 @@
 """Gaussians: the rasteriser against its twin, the discs against the path tracer, exports through their readers."""
 
 import json
+import re
 from dataclasses import replace
 from datetime import UTC, datetime
 
@@ -34,7 +35,7 @@ from seasonscapes.gaussians.interchange import (  # noqa: E402
     write_ply,
     write_training_views,
 )
-from seasonscapes.gaussians.model import GaussianModel, bytes_per_gaussian, load_model, model_from, save_model  # noqa: E402
+from seasonscapes.gaussians.model import GaussianModel, bytes_per_gaussian, load_model, model_from, pack_model, save_model  # noqa: E402
 from seasonscapes.gaussians.rasterise import (  # noqa: E402
     Splats,
     rasterise,
@@ -359,6 +360,11 @@ def test_model_survives_its_file(model, tmp_path):
     for each in LIGHTS:
         before, after = model_colours(model, each, 100.0)[0], model_colours(again, each, 100.0)[0]
         assert np.sqrt(np.mean((after - before) ** 2)) < 0.01 * before.mean()
+    tensors, _ = pack_model(model)
+    shared = re.compile(r"appearance\.mlp\.|transport\.(from_sky|\w+_scale)")
+    own = sum(values.nbytes for name, values in tensors.items() if not shared.match(name))
+    own -= tensors["albedo"].nbytes // 2  # of two dates
+    assert bytes_per_gaussian(model) == pytest.approx(own / len(model.means))
     assert bytes_per_gaussian(model) <= 168.5
     (tmp_path / "other.safetensors").write_bytes(b"no")
     with pytest.raises(InputError, match="not a safetensors file"):

@@ -8,6 +8,9 @@ import numpy as np
 
 from seasonscapes.gaussians.surfels import SurfelGrid
 
+# Cells are quartered so often at most: 1/64 of the grid's spacing.
+MOST_LEVELS = 6
+
 
 def cell_centres_m(grid: SurfelGrid, level: np.ndarray, cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Compute the centres of cells.
@@ -82,7 +85,7 @@ def unpacked_cells(grid: SurfelGrid, tensors: Mapping[str, np.ndarray], levels: 
     tensors
         ``taken`` and ``split``.
     levels
-        The finest level.
+        The finest level, at most `MOST_LEVELS`.
 
     Returns
     -------
@@ -92,8 +95,10 @@ def unpacked_cells(grid: SurfelGrid, tensors: Mapping[str, np.ndarray], levels: 
     Raises
     ------
     ValueError
-        If there are fewer bits than cells.
+        If there are fewer bits than cells, or there cannot be so many levels.
     """
+    if levels not in range(MOST_LEVELS + 1):
+        raise ValueError(f"cells quartered {levels} times, expected 0 to {MOST_LEVELS}")
     count = grid.columns * grid.rows
     if not 0 < count <= 8 * len(tensors["taken"]):
         raise ValueError(

@@ -12,7 +12,7 @@ from dataclasses import fields
 import numpy as np
 
 from seasonscapes.cameras.pinhole import Camera
-from seasonscapes.gaussians.disc_cells import quarters
+from seasonscapes.gaussians.disc_cells import MOST_LEVELS, quarters
 from seasonscapes.gaussians.surfels import SurfelGrid, Surfels, cell_samples, surfels_from_cells
 from seasonscapes.rendering.gbuffer import trace_gbuffer
 from seasonscapes.rendering.mitsuba_scene import RenderScene
@@ -21,8 +21,6 @@ from seasonscapes.terrain.surface import Terrain
 
 # Rays along a pixel's side that find what a camera sees.
 _SUBPIXELS = 2
-# Cells are quartered so often at most: 1/64 of the grid's spacing.
-MOST_LEVELS = 6
 # Side of the blocks of cells that are sampled together.
 _BLOCK = 48
 
@@ -55,10 +53,8 @@ def footprints(scene: RenderScene, cameras: Sequence[Camera]) -> tuple[np.ndarra
     return np.concatenate(places), np.concatenate(sides)
 
 
-def refined_surfels(
-    terrain: Terrain, surfels: Surfels, place_m: np.ndarray, wanted_m: np.ndarray, *, most_levels: int = MOST_LEVELS
-) -> Surfels:
-    """Quarter the cells of discs until none at given places is larger than wanted there.
+def refined_surfels(terrain: Terrain, surfels: Surfels, place_m: np.ndarray, wanted_m: np.ndarray) -> Surfels:
+    """Quarter the cells of discs, `MOST_LEVELS` times at most, until none at given places is larger than wanted there.
 
     Parameters
     ----------
@@ -70,8 +66,6 @@ def refined_surfels(
         ``(K, 2)`` horizontal positions, ENU [m].
     wanted_m
         ``(K,)`` largest spacing of discs around them [m].
-    most_levels
-        How often a cell is quartered at most.
 
     Returns
     -------
@@ -81,7 +75,7 @@ def refined_surfels(
     normals, grid, current, finished = vertex_normals(terrain), surfels.grid, surfels, []
     with np.errstate(divide="ignore"):
         levels = np.ceil(np.log2(grid.spacing_m / np.maximum(wanted_m, 0.0)) - 1e-6)
-    for number in range(most_levels):
+    for number in range(MOST_LEVELS):
         near = _with_neighbours(grid.quartered(number), place_m[levels > number])
         split = np.isin(current.cell, near)
         if not split.any():

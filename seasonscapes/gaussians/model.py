@@ -393,7 +393,7 @@ def unpack_model(tensors: dict[str, np.ndarray], header: dict[str, Any]) -> Gaus
         The model, up to quantisation.
     """
     grid, (low, step) = SurfelGrid(**header["plan"]), header["height"]
-    level, cell = unpacked_cells(grid, tensors, int(header["levels"]))
+    level, cell = unpacked_cells(grid, tensors, header["levels"])
     east_m, north_m = cell_centres_m(grid, level, cell)
     means = np.stack([east_m, north_m, low + tensors["height"] * step], axis=1).astype(np.float32)
     facing = from_octahedral(tensors["facing"])
@@ -446,7 +446,7 @@ def bytes_per_gaussian(model: GaussianModel) -> float:
     own = {
         name: values.nbytes
         for name, values in tensors.items()
-        if values.shape[:1] == (count,) or name in ("split", "albedo")
+        if values.shape[:1] == (count,) or name in ("taken", "split", "albedo")
     }
     own["albedo"] //= len(model.days)
     return sum(own.values()) / count
