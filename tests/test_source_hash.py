@@ -60,3 +60,10 @@ def test_imports_inside_functions_count():
 def test_a_module_that_does_not_exist():
     with pytest.raises(ValueError, match=r"terrain\.nowhere"):
         source_hash("terrain.nowhere")
+
+
+def test_albedo_of_a_view_is_rebuilt_with_the_ground_that_it_was_traced_on():
+    from seasonscapes.workflows.relight_session import _COEFFICIENTS_CODE, _VIEW_ALBEDO_CODE
+
+    for code in (_COEFFICIENTS_CODE, _VIEW_ALBEDO_CODE):
+        assert {"terrain.amplification", "workflows.nested_images"} <= imported_modules(*code)

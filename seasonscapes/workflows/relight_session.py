@@ -46,8 +46,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_COEFFICIENTS_CODE = ("rendering.transport", "rendering.coefficients_file", "workflows.amplified_terrain")
-_VIEW_ALBEDO_CODE = ("rendering.transport", "rendering.relit_view")
+_TRACED_CODE = ("rendering.transport", "workflows.amplified_terrain")
+_COEFFICIENTS_CODE = (*_TRACED_CODE, "rendering.coefficients_file")
+_VIEW_ALBEDO_CODE = (*_TRACED_CODE, "rendering.relit_view")
 FRAME_CODE = ("workflows.relight_session", "relighting.frame_file")
 # Rows of the sky maps. Without clouds half as many as usual hardly change an image: the
 # coefficients average over patches of 7°, and the sky behind the terrain is evaluated by the atmosphere model itself.
