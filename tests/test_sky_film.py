@@ -227,8 +227,7 @@ def test_light_for_a_film_takes_its_tables_from_the_workspace(tmp_path, looked_u
     asked = []
 
     def build(tables, height_m, near, *, part):
-        if part == 0:
-            asked.append((height_m, near))
+        asked.append((height_m, near, part))
         # The land's own sky is not compared here, so the camera's table will do for its height too.
         return looked_up.diffuse_of(HEIGHT_M, near)[part * PART_KNOTS : (part + 1) * PART_KNOTS]
 
@@ -239,17 +238,26 @@ def test_light_for_a_film_takes_its_tables_from_the_workspace(tmp_path, looked_u
     view = place.scene.camera(None).model_copy(update={"above_ground_m": None, "height_m": HEIGHT_M})
     camera, model = camera_for(place, view, size_px=(32, 24)), read_sky_model("clear")
     when, told = datetime(2024, 9, 1, 17, 50, tzinfo=UTC), []
-    illumination_module.tabulate_illumination(place, camera, model, progress=told.append)
+    illumination_module.tabulate_illumination(place, camera, model, [])
+    assert not asked
+    illumination_module.tabulate_illumination(place, camera, model, [when], progress=told.append)
     assert told[-1] == 1.0
+    tables = list(dict.fromkeys((height_m, near) for height_m, near, _ in asked))
+    assert [near for _, near in tables] == [False, False, True]
     heights = [place.median_height_m, HEIGHT_M, HEIGHT_M]
-    assert [near for _, near in asked] == [False, False, True]
-    np.testing.assert_allclose([height for height, _ in asked], heights, atol=1e-3)
+    np.testing.assert_allclose([height_m for height_m, _ in tables], heights, atol=1e-3)
+    assert len(asked) <= 2 * len(tables), "the sun's neighbourhood alone; the moon has set"
+    moonlit = datetime(2024, 9, 18, 23, tzinfo=UTC)
+    illumination_module.tabulate_illumination(place, camera, model, [moonlit])
+    built = len(asked)
+    illumination_module.illumination_for_camera(place, camera, model, moonlit, map_height=4, by_elevation=True)
+    assert len(asked) == built, "those of the sun and of the moon"
     exact, moment = illumination_module.illumination_for_camera(place, camera, model, when, map_height=16)
     assert -3.0 < moment.sun.elevation_deg < 3.0
     quick, _ = illumination_module.illumination_for_camera(place, camera, model, when, map_height=16, by_elevation=True)
     illumination_module.atmosphere_tables_in.cache_clear()
     again, _ = illumination_module.illumination_for_camera(place, camera, model, when, map_height=16, by_elevation=True)
-    assert len(asked) == 3
+    assert len(asked) == built
     assert 0.0 < worst(quick.visible_sky, exact.visible_sky) < 3e-3
     np.testing.assert_array_equal(again.visible_sky, quick.visible_sky)
     np.testing.assert_array_equal(again.sky_radiance, quick.sky_radiance)

@@ -64,10 +64,20 @@ class PartedTable:
         """Records of consecutive knots."""
         first, last, _ = knots.indices(len(KNOTS_DEG))
         records = []
-        for number in range(first // PART_KNOTS, (last - 1) // PART_KNOTS + 1):
+        for number in _parts_between(first, last):
             start = number * PART_KNOTS
             records.append(self.part(number)[max(first - start, 0) : last - start])
         return np.concatenate(records)
+
+
+def parts_at(elevation_rad: float) -> range:
+    """Numbers of the parts of a `PartedTable` that interpolation at a true solar elevation [rad] reads."""
+    first, weights = _lagrange_weights(float(np.degrees(elevation_rad)))
+    return _parts_between(first, first + len(weights))
+
+
+def _parts_between(first: int, last: int) -> range:
+    return range(first // PART_KNOTS, (last - 1) // PART_KNOTS + 1)
 
 
 def tabulate_by_elevation(

@@ -170,7 +170,7 @@ def _uneclipsed(
         )
         return _with_provenance(model, _add_clouds(model, clear, sun, None))
     if isinstance(model, AtmosphereModel):
-        moon = _significant_moon(sun, moon)
+        moon = significant_moon(sun, moon)
         clear = _clear_illumination(
             model,
             sun,
@@ -189,7 +189,7 @@ def _with_provenance(model: SkyModel, illumination: Illumination) -> Illuminatio
     return replace(illumination, model={**record, "cloudiness": model.cloudiness})
 
 
-def _significant_moon(sun: SolarPosition, moon: LunarPosition | None) -> LunarPosition | None:
+def significant_moon(sun: SolarPosition, moon: LunarPosition | None) -> LunarPosition | None:
     """The moon, or ``None`` if its light is negligible."""
     if moon is None or sun.elevation_deg > _MAX_SUN_FOR_MOONLIGHT_DEG or moon.elevation_deg < _MIN_MOON_DEG:
         return None
@@ -237,7 +237,7 @@ def _overcast_illumination(
 ) -> Illumination:
     return overcast(
         sun,
-        _significant_moon(sun, moon),
+        significant_moon(sun, moon),
         height_m=height_m,
         map_height=map_height,
         visibility_km=model.visibility_km,

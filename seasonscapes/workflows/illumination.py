@@ -6,7 +6,7 @@ frame's axes hold everywhere (a sun computed for each position's own horizon wou
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import lru_cache, partial
@@ -21,10 +21,10 @@ from seasonscapes.errors import InputError
 from seasonscapes.frames import LocalFrame
 from seasonscapes.progress import TaskProgress
 from seasonscapes.sky.atmosphere import Atmosphere
-from seasonscapes.sky.clear_sky import AtmosphereTables, atmosphere_tables, load_tables, save_tables
-from seasonscapes.sky.elevation_table import PARTS, PartedTable, load_table, save_table
+from seasonscapes.sky.clear_sky import AtmosphereTables, atmosphere_tables, load_tables, save_tables, true_elevation_deg
+from seasonscapes.sky.elevation_table import PartedTable, load_table, parts_at, save_table
 from seasonscapes.sky.ephemeris import LunarPosition, SolarPosition, moon_position, sun_position
-from seasonscapes.sky.illuminate import SkyEvaluators, illuminate
+from seasonscapes.sky.illuminate import SkyEvaluators, illuminate, significant_moon
 from seasonscapes.sky.illumination import Illumination
 from seasonscapes.sky.models import AtmosphereModel, SkyModel, atmosphere_from_model, read_sky_model, with_overrides
 from seasonscapes.sky.observer_radiance import diffuse_by_elevation, observer_view
@@ -370,18 +370,28 @@ def given_sun_in_frame(frame: LocalFrame, azimuth_deg: float, elevation_deg: flo
 
 
 def tabulate_illumination(
-    place: Place, camera: Camera | Panorama, model: SkyModel, *, progress: TaskProgress | None = None
+    place: Place,
+    camera: Camera | Panorama,
+    model: SkyModel,
+    times: Sequence[datetime],
+    *,
+    progress: TaskProgress | None = None,
 ) -> None:
-    """Build all tables that `illumination_for_camera` uses with ``by_elevation``, before other processes need them."""
-    if not isinstance(model, AtmosphereModel):
+    """Build the tables that `illumination_for_camera` reads at these times with ``by_elevation``, before other processes need them."""
+    if not times or not isinstance(model, AtmosphereModel):
         return
     tables = atmosphere_tables_in(place.workspace, by_elevation=True)(atmosphere_from_model(model))
     diffuse_of = _diffuse_in(place.workspace, tables)
-    camera_m = camera_geodetic(place, camera)[2]
-    wanted = [(place.median_height_m, False), (camera_m, False), (camera_m, True)]
-    for index, (height_m, near) in enumerate(wanted):
+    apparent_deg = []
+    for position in (position_at(place, time) for time in times):
+        moon = significant_moon(position.sun, position.moon)
+        apparent_deg += [body.elevation_deg for body in (position.sun, moon) if body is not None]
+    camera_m, wanted = camera_geodetic(place, camera)[2], []
+    for height_m, near in ((place.median_height_m, False), (camera_m, False), (camera_m, True)):
+        true_rad = np.radians(true_elevation_deg(tables.atmosphere, np.array(apparent_deg), height_m))
         table = diffuse_of(observer_view(tables, height_m).height_m, near)
-        for part in range(PARTS):
-            table.part(part)
-            if progress is not None:
-                progress((index + (part + 1) / PARTS) / len(wanted))
+        wanted += [(table, part) for part in sorted({part for each in true_rad for part in parts_at(each)})]
+    for number, (table, part) in enumerate(wanted):
+        table.part(part)
+        if progress is not None:
+            progress((number + 1) / len(wanted))

@@ -206,9 +206,11 @@ def render_frames(
         from seasonscapes.cluster import run_on_cluster
         from seasonscapes.workflows.illumination import tabulate_illumination
 
-        # Once, before every worker needs them.
+        # Once, before every worker needs them; what a damaged frame needs beside, its worker makes.
+        folders = [frames_folder(session), *([] if exr_folder is None else [exr_folder])]
+        missing = [time for time in times if not all((folder / frame_name(time)).is_file() for folder in folders)]
         told = task_progress(progress, "light of the sky")
-        tabulate_illumination(session.place, session.camera, session.sky, progress=told)
+        tabulate_illumination(session.place, session.camera, session.sky, missing, progress=told)
         results = run_on_cluster(cluster, task, times)
     return sum(record["rendered"] for record in each_reported(results, len(times), progress, "frames"))
 
