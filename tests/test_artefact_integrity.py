@@ -395,7 +395,7 @@ def test_photographs_of_the_workspace_are_compared_with_what_was_written(tmp_pat
     assert not any((tmp_path / name).is_file() for name in names)
 
 
-def test_keys_hold_the_sources_of_a_mosaic_the_world_file_the_sky_and_the_albedo(tmp_path):
+def test_keys_hold_the_sources_of_a_mosaic_the_world_file_the_sky_the_albedo_and_the_cameras(tmp_path):
     """Terrain, image and the checkpoint of a distillation follow the content of every file that they are made of."""
     from datetime import date
 
@@ -422,6 +422,12 @@ def test_keys_hold_the_sources_of_a_mosaic_the_world_file_the_sky_and_the_albedo
     own = DatedAlbedo(date(2024, 7, 1), "recovered", lambda: None)
     keys = [key(first), key(first, sky="clear"), key(first, albedo=[own]), key(first, suns=9)]
     image = dated_albedos(first)[0].content
+    unmoved, unseen = scene.read_text(), key(first, disc_px=0.0)
+    scene.write_text(unmoved.replace("heading_deg = 0.0", "heading_deg = 9.0"))
+    turned = load()
+    keys.append(key(turned))
+    assert key(turned, disc_px=0.0) == unseen, "discs of one size follow no camera"
+    scene.write_text(unmoved)
     places.write_raster(scene.parent / "dem.tif", places.hill_heights() + 300.0, spacing_m=50.0)
     higher = load()
     assert np.isclose(higher.elevation.values.max(), first.elevation.values.max() + 300.0)
@@ -430,4 +436,4 @@ def test_keys_hold_the_sources_of_a_mosaic_the_world_file_the_sky_and_the_albedo
     (scene.parent / "image.tif.aux.xml").write_text("<PAMDataset><Metadata/></PAMDataset>")
     keys.append(key(load()))
     assert dated_albedos(load())[0].content != image
-    assert len(set(keys)) == 6
+    assert len(set(keys)) == 7

@@ -248,12 +248,15 @@ def distil_with_data(
 
 def _data_key(place: Place, model: SkyModel, dated: Sequence[DatedAlbedo], options: DistilOptions) -> str:
     """Identifier of everything that the training data are made from, except the seed."""
+    from seasonscapes.workflows.views import camera_values
+
     inputs = {
         "place": place.key,
         "sky": model,
         "albedo": [[each.day, each.content] for each in dated],
         "images": None if dated else place.scene.image_keys,
         "options": options,
+        "near": [camera_values(camera) for camera in _near_cameras(place, options)],
     }
     return artefact_key(inputs, ("workflows.distillation",))
 

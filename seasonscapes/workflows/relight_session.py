@@ -34,7 +34,7 @@ from seasonscapes.terrain.surface import Texture
 from seasonscapes.workflows.albedo_sources import AlbedoFile, AlbedoSource, dated_albedos, snow_transition_between
 from seasonscapes.workflows.illumination import SunMoonPosition, illumination_for_camera, sky_model
 from seasonscapes.workflows.place import MeshOptions, Place, load_place, utc_at
-from seasonscapes.workflows.views import camera_for, view_with_terrain
+from seasonscapes.workflows.views import camera_for, camera_values, view_with_terrain
 from seasonscapes.workspace import Workspace, artefact_key, build_once
 
 if TYPE_CHECKING:
@@ -251,7 +251,7 @@ def still_session(
     sampling = sampling or SamplingOptions()
     inputs = {
         "place": place.key,
-        **_camera_values(camera),
+        "camera": camera_values(camera),
         "base": _identity(base),
         "seed": seed,
         "sampling": asdict(sampling),
@@ -359,15 +359,6 @@ def _coefficients(
         coefficients = load_coefficients(folder, key=key)
     assert isinstance(coefficients, ViewCoefficients)
     return coefficients
-
-
-def _camera_values(camera: Camera | Panorama) -> dict:
-    names = ("width_px", "height_px", "fx", "fy", "cx", "cy")
-    numbers = {name: float(getattr(camera, name)) for name in names}
-    kind = getattr(camera, "projection", "pinhole")
-    # Another machine may compute the same pose with another last digit.
-    pose = np.round(camera.world_from_camera, 9).tolist()
-    return {"camera": {"kind": kind, "pose": pose, **numbers}}
 
 
 def _undated(place: Place, texture: Texture) -> DatedAlbedo:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from dataclasses import astuple, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -189,6 +189,15 @@ def scene_cameras(place: Place, *, leave_out: set[str] | None = None, size_px: t
     if not chosen:
         raise InputError("--leave-out", "leaves no camera", got=", ".join(sorted(leave_out)))
     return chosen
+
+
+def camera_values(camera: Camera | Panorama) -> dict[str, Any]:
+    """Plain values of a camera, for keys of what is made with it."""
+    names = ("width_px", "height_px", "fx", "fy", "cx", "cy")
+    numbers = {name: float(getattr(camera, name)) for name in names}
+    kind = getattr(camera, "projection", "pinhole")
+    # Another machine may compute the same pose with another last digit.
+    return {"kind": kind, "pose": np.round(camera.world_from_camera, 9).tolist(), **numbers}
 
 
 def local_ground(place: Place):
