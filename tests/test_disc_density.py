@@ -5,6 +5,7 @@ import pytest
 
 pytest.importorskip("torch")
 
+import places
 from test_rendering import heightfield, looking_down
 
 from seasonscapes.gaussians.disc_cells import cell_centres_m, packed_cells, unpacked_cells
@@ -12,6 +13,11 @@ from seasonscapes.gaussians.disc_density import footprints, refined_surfels
 from seasonscapes.gaussians.surfels import plane_normals, terrain_surfels
 from seasonscapes.rendering.hemisphere_rays import ray_scene
 from seasonscapes.rendering.mitsuba_scene import RenderScene, mi_mesh
+from seasonscapes.sky.models import read_sky_model
+from seasonscapes.workflows.distillation import DistilOptions, distillation_data
+from seasonscapes.workflows.place import load_place
+from seasonscapes.workflows.views import scene_cameras
+from seasonscapes.workspace import Workspace
 
 
 @pytest.fixture(scope="module")
@@ -77,3 +83,16 @@ def test_footprints_are_the_pixels_of_the_camera(slope):
     row = place_m[:80]
     gaps = np.linalg.norm(np.diff(row, axis=0), axis=1)
     np.testing.assert_allclose(np.median(gaps / side_m[:79]), 0.5, rtol=0.1)
+
+
+def test_a_camera_that_sees_hardly_any_ground_is_told_and_left_out(tmp_path, caplog):
+    """Its picture has a few rays that meet the ground, and no pixel that they fill."""
+    scene = places.SCENE.replace("pitch_deg = -8.0", "pitch_deg = 45.5")
+    place = load_place(places.write_place(tmp_path / "scene", scene), Workspace(tmp_path / "work"))
+    (camera,) = scene_cameras(place, size_px=(32, 32)).values()
+    mesh = mi_mesh(place.terrain, np.full((8, 8, 3), 0.4, np.float32))
+    assert len(footprints(RenderScene(ray_scene(mesh).mi_scene, mesh), [camera])[0])
+    options = DistilOptions(discs=8, suns=1, dates=1, views=1, view_px=32)
+    data = distillation_data(place, read_sky_model("hosek"), [], options)
+    assert len(data.cameras) == len(data.frames) == 1
+    assert "nothing is learned from camera south: TrainingFrame: no splat or no usable pixel" in caplog.text

@@ -35,7 +35,14 @@ from seasonscapes.gaussians.interchange import (  # noqa: E402
     write_ply,
     write_training_views,
 )
-from seasonscapes.gaussians.model import GaussianModel, bytes_per_gaussian, load_model, model_from, pack_model, save_model  # noqa: E402
+from seasonscapes.gaussians.model import (
+    GaussianModel,
+    bytes_per_gaussian,
+    load_model,
+    model_from,
+    pack_model,
+    save_model,
+)
 from seasonscapes.gaussians.rasterise import (  # noqa: E402
     Splats,
     rasterise,

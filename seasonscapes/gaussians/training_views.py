@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -62,7 +62,6 @@ def relit_frames(
     lights: Sequence[tuple[int, Illumination, LightState]],
     *,
     seed: int = 0,
-    progress: Callable[[float], None] | None = None,
 ) -> list[TrainingFrame]:
     """Render the training frames of every camera at every time from daylight coefficients.
 
@@ -78,8 +77,6 @@ def relit_frames(
         Index among the training targets' times, light and light state of each time.
     seed
         Seed of the random numbers.
-    progress
-        Called with the finished fraction after each camera.
 
     Returns
     -------
@@ -89,14 +86,14 @@ def relit_frames(
     Raises
     ------
     NoTerrainInView
-        If a camera's view contains no splat.
+        If a camera's view contains no terrain, no splat or no usable pixel.
     """
     from seasonscapes.rendering.coefficients import SamplingOptions
     from seasonscapes.rendering.relit_view import relight_view, relightable_view
     from seasonscapes.rendering.transport import trace_view
 
     frames = []
-    for number, camera in enumerate(cameras):
+    for camera in cameras:
         view = relightable_view(
             ray_scene, trace_view(ray_scene, camera, SamplingOptions(rays=256, clusters=LIGHT_CLUSTERS), seed=seed)
         )
@@ -104,8 +101,6 @@ def relit_frames(
         for time, light, state in lights:
             image = relight_view(view, light).surface * np.float32(np.pi / state.global_lx)
             frames.append(TrainingFrame(weights, time, image, view.coverage > 0.999, camera))
-        if progress is not None:
-            progress((number + 1) / len(cameras))
     return frames
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from seasonscapes.albedo.seasons import DatedAlbedo, day_number
-from seasonscapes.errors import InputError
+from seasonscapes.errors import InputError, NoTerrainInView
 from seasonscapes.progress import Progress, each_reported, task_progress
 from seasonscapes.sky.models import SkyModel
 from seasonscapes.workflows.albedo_sources import dated_albedos, scene_albedo
@@ -106,7 +106,7 @@ class DistillationData:
     times
         Instants, aware UTC.
     frames, cameras
-        Training images, camera by camera, and the cameras.
+        Training images, camera by camera, and the cameras; none of those of the scene that see no disc.
     """
 
     surfels: Surfels
@@ -256,7 +256,7 @@ def _data_key(place: Place, model: SkyModel, dated: Sequence[DatedAlbedo], optio
         "albedo": [[each.day, each.content] for each in dated],
         "images": None if dated else place.scene.image_keys,
         "options": options,
-        "near": [camera_values(camera) for camera in _near_cameras(place, options)],
+        "near": [camera_values(camera) for camera in _near_cameras(place, options).values()],
     }
     return artefact_key(inputs, ("workflows.distillation",))
 
@@ -326,9 +326,7 @@ def distillation_data(
     if near:
         first = mi_mesh(place.terrain, textures[0])
         stage = RenderScene(ray_scene(first).mi_scene, first)
-        seen = [footprints(stage, [camera]) for camera in near]
-        near = [camera for camera, (places, _) in zip(near, seen, strict=True) if len(places)]
-        place_m, side_m = (np.concatenate(column) for column in zip(*seen, strict=True))
+        place_m, side_m = footprints(stage, list(near.values()))
         surfels = refined_surfels(place.terrain, surfels, place_m, options.disc_px * side_m)
     albedo = np.stack([surfel_albedo(surfels, texture) for texture in textures])
     around = np.stack([neighbourhood_mean(surfels.means, each, surfels.spacing_m) for each in albedo])
@@ -336,7 +334,8 @@ def distillation_data(
     lights, times = draw_lights(place, model, [days[season] for season in seasons], seed=seed, progress=progress)
     received = np.empty((options.suns, len(surfels.means), 3), np.float32)
     transport, states, frames = None, [], []
-    cameras = near + overview_cameras(place.terrain, options.views, size_px=options.view_px, first_deg=30.0)
+    around_all = overview_cameras(place.terrain, options.views, size_px=options.view_px, first_deg=30.0)
+    cameras: list[Camera] = []
     for season, texture in enumerate(textures):
         own = [number for number in range(options.suns) if seasons[number] == season]
         scene = ray_scene(mi_mesh(place.terrain, texture))
@@ -355,20 +354,28 @@ def distillation_data(
         # Images of one date suffice: they determine the splats' shapes, not the season.
         if season == len(days) // 2 and options.views and own:
             wanted = [(number, lights[number], states[number]) for number in own]
-            report = task_progress(progress, "pictures")
-            frames = relit_frames(scene, surfels, cameras, wanted, seed=seed, progress=report)
+            views = [*near.items(), *((None, camera) for camera in around_all)]
+            for name, camera in each_reported(views, len(views), progress, "pictures"):
+                try:
+                    frames += relit_frames(scene, surfels, [camera], wanted, seed=seed)
+                except NoTerrainInView as error:
+                    if name is None:
+                        raise
+                    log.warning("nothing is learned from camera %s: %s", name, error)
+                else:
+                    cameras.append(camera)
     assert transport is not None, "there is at least one date"
     targets = surface_targets(states, seasons, albedo, received)
     return DistillationData(surfels, albedo, around, days, transport, targets, times, frames, cameras)
 
 
-def _near_cameras(place: Place, options: DistilOptions) -> list[Camera]:
+def _near_cameras(place: Place, options: DistilOptions) -> dict[str, Camera]:
     """The scene's cameras, in pictures of the training's size, where the discs are to follow them."""
     from seasonscapes.workflows.views import scene_cameras
 
     if options.disc_px <= 0.0 or options.views == 0 or not place.scene.cameras:
-        return []
-    return list(scene_cameras(place, size_px=(options.view_px, options.view_px)).values())
+        return {}
+    return scene_cameras(place, size_px=(options.view_px, options.view_px))
 
 
 def draw_lights(
