@@ -35,7 +35,7 @@ from seasonscapes.gaussians.interchange import (  # noqa: E402
     write_ply,
     write_training_views,
 )
-from seasonscapes.gaussians.model import (
+from seasonscapes.gaussians.model import (  # noqa: E402
     GaussianModel,
     bytes_per_gaussian,
     load_model,
