@@ -104,6 +104,7 @@ def distill_command(
         distillation.export_training_views(export_views, loaded, distilled.data)
         record["views"] = str(export_views)
     record["seconds"] = round(clock.perf_counter() - start, 1)
-    size = f"{record['gaussians']:,} Gaussians {record['spacing_m']} m apart"
+    apart = " to ".join(f"{each}" for each in sorted({record["least_spacing_m"], record["spacing_m"]}))
+    size = f"{record['gaussians']:,} Gaussians {apart} m apart"
     line = f"{output}  ({size}, {record['bytes_per_gaussian']} bytes each, {record['seconds']} s)"
     print_result(record, [line], as_json=json)

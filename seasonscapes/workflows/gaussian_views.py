@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from seasonscapes.cameras.pinhole import view_in_frame
+from seasonscapes.cameras.pinhole import ray_directions, view_in_frame
 from seasonscapes.errors import InputError
 from seasonscapes.sky.models import SkyModel
 from seasonscapes.workflows.distillation import require_torch
@@ -31,6 +31,8 @@ log = logging.getLogger(__name__)
 
 # Discs so far apart in a picture are seen as blots.
 _COARSE_PX = 12.0
+# Pixels that are asked about it.
+_SAMPLES = 5000
 
 
 def day_of_year(time: datetime) -> float:
@@ -112,15 +114,23 @@ def render_gaussians(
 
 
 def _warn_of_coarse_discs(model: GaussianModel, camera: Camera, view: SplatView) -> None:
+    from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
+
     seen = (view.coverage > 0.5) & np.isfinite(view.depth)
-    if not seen.any():
+    if not seen.any() or model.grid.spacing_m * np.median(camera.fx / view.depth[seen]) <= _COARSE_PX:
         return
-    across_px = float(model.grid.spacing_m * np.median(camera.fx / view.depth[seen]))
+    # Discs may be smaller than the grid's cells: those count that stand where pixels look.
+    row, column = (index[:: 1 + len(index) // _SAMPLES] for index in np.nonzero(seen))
+    depth_m = view.depth[row, column].astype(np.float64)
+    rays = ray_directions(camera, np.stack([column, row], axis=-1) + 0.5)
+    nearest = cKDTree(model.means).query(camera.position_m + depth_m[:, None] * rays)[1]
+    spacing_m = model.spacing_m[nearest]
+    across_px = float(np.median(camera.fx * spacing_m / depth_m))
     if across_px > _COARSE_PX:
         log.warning(
             "Gaussians %.3g m apart lie %.0f pixels from each other in half of this view or more: it shows no detail; distil "
             "more of them (--discs) or stand farther away",
-            model.grid.spacing_m,
+            float(np.median(spacing_m)),
             across_px,
         )
 
