@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from datetime import UTC, datetime
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -273,3 +274,22 @@ def test_median_height_is_computed_once(tmp_path, monkeypatch):
     assert place.median_height_m == median
     monkeypatch.setattr(np, "median", lambda values: pytest.fail("computed again"))
     assert place.median_height_m == median
+
+
+def test_a_cluster_waits_for_the_light_of_missing_frames_alone(tmp_path, monkeypatch):
+    from seasonscapes import cluster
+    from seasonscapes.workflows import timelapse
+
+    asked, times = [], [datetime(2024, 9, 1, hour, tzinfo=UTC) for hour in (9, 12, 15)]
+    session = SimpleNamespace(place=None, camera=None, sky=None, coefficients=SimpleNamespace(pixel=[]))
+    monkeypatch.setattr(timelapse, "cached_session", lambda *_, **__: session)
+    monkeypatch.setattr(timelapse, "frames_folder", lambda _: tmp_path)
+    monkeypatch.setattr(cluster, "run_on_cluster", lambda _, task, items: [{"rendered": True} for _ in items])
+    monkeypatch.setattr(
+        illumination_module, "tabulate_illumination", lambda *of, progress: asked.append([time.hour for time in of[3]])
+    )
+    for kept, exr_folder in ((times[:2], None), (times[2:], None), ([], tmp_path / "exr")):
+        for time in kept:
+            (tmp_path / timelapse.frame_name(time)).touch()
+        timelapse.render_frames(None, times, cluster="local:2", exr_folder=exr_folder)
+    assert asked == [[15], [], [9, 12, 15]]
