@@ -40,8 +40,9 @@ def test_a_grey_sky_is_taken_as_clouds_and_a_blue_one_is_not(taken):
     blue, grey = _with_sky(taken, 0, (0.12, 0.25, 0.6)), _with_sky(taken, 1, (0.5, 0.5, 0.52))
     found = photograph_skies(place, transport, [blue, grey], clear)
     assert [each.cloudiness for each in found] == [0.0, 1.0]
-    stated = with_overrides(clear, cloudiness=0.3)
-    assert photograph_skies(place, transport, [grey], stated) == [stated]
+    for cloudiness in (0.3, 0.0):
+        stated = with_overrides(clear, cloudiness=cloudiness)
+        assert [each.cloudiness for each in photograph_skies(place, transport, [grey], stated)] == [cloudiness]
 
 
 def test_a_low_sun_and_a_synthetic_clear_sky_stay_clear(taken):

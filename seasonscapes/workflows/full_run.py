@@ -103,7 +103,8 @@ def stages_of(job: RunJob, progress: Progress | None = None) -> list[Stage]:
     common = {
         "place": place.key,
         "imagery": _imagery(place),
-        "sky": job.sky.model_dump(mode="json"),
+        # A stated clear sky (0) and one whose clouds the photographs tell have equal values.
+        "sky": {**job.sky.model_dump(mode="json"), "states_clouds": job.sky.states_clouds},
         "seed": job.seed,
         "times": [time.isoformat() for time in job.times],
     }
