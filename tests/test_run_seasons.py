@@ -86,7 +86,7 @@ def test_a_day_that_tells_nothing_alone_joins_the_nearest(monkeypatch):
 
     from test_albedo import _snow_above
 
-    from seasonscapes.albedo import photographs, standard_error
+    from seasonscapes.albedo import standard_error
     from seasonscapes.errors import NotEnoughEvidence
     from seasonscapes.workflows import season_recovery
 
@@ -99,13 +99,11 @@ def test_a_day_that_tells_nothing_alone_joins_the_nearest(monkeypatch):
             raise NotEnoughEvidence("nothing fixes the exposure")
         return line_m[day]
 
-    monkeypatch.setattr(season_recovery, "with_terrain", lambda transport, seen: seen)
-    monkeypatch.setattr(season_recovery, "illuminations", lambda place, seen, model: None)
     monkeypatch.setattr(season_recovery, "closed_fit", solved)
     monkeypatch.setattr(
-        photographs,
-        "prepare_photographs",
-        lambda transport, seen, lights: [SimpleNamespace(observation=each) for each in seen],
+        season_recovery,
+        "photographs_of_ground",
+        lambda place, transport, seen, model: ([SimpleNamespace(observation=each) for each in seen], [], 0.0),
     )
     monkeypatch.setattr(standard_error, "albedo_estimate", lambda transport, own, fit: _snow_above(fit))
     groups = season_recovery._grouped_days(None, None, days, None, None)
