@@ -240,12 +240,13 @@ def recovered_over(
     progress: Progress | None = None,
 ) -> RecoveredAlbedo:
     """`recover_albedo` from photographs in the place's frame and daylight coefficients that were traced before."""
-    prepared, facts = _prepared(place, transport, photographs, model, options, progress)
-    prepared = [*prepared, *painted_photographs(place, transport, painted, model)]
+    prepared, skies, facts = _prepared(place, transport, photographs, model, options, progress)
+    painted_skies = [model if each.sky is None else each.sky for each in painted]
+    prepared = [*prepared, *painted_photographs(place, transport, painted, painted_skies)]
     if options.method == "closed":
         fit = closed_fit(transport, prepared, progress)
     else:
-        joint, found = joint_fit(place, transport, prepared, model, progress)
+        joint, found = joint_fit(place, transport, prepared, [*skies, *painted_skies], progress)
         fit, prepared, facts = joint.fit, joint.photographs, facts | found
     known = _completed(place, transport, prepared, fit, progress)
     for doubt in recovery_doubts([each.observation for each in prepared], fit.residual):
@@ -367,15 +368,15 @@ def _prepared(
     model: SkyModel,
     options: RecoveryOptions,
     progress: Progress | None,
-) -> tuple[list[AlbedoPhotograph], dict[str, Any]]:
-    """Photographs with their light; tone curve and visibility fitted where asked for."""
+) -> tuple[list[AlbedoPhotograph], list[SkyModel], dict[str, Any]]:
+    """Photographs with their light, and their skies; tone curve and visibility fitted where asked for."""
     from seasonscapes.albedo.haze import fit_visibility
     from seasonscapes.albedo.photographs import EIGHT_BIT
     from seasonscapes.albedo.tone_curve import fit_tone_curve, with_tone_curve
 
     facts: dict[str, Any] = {}
     if not photographs:
-        return [], facts
+        return [], [], facts
     prepared, skies, share = photographs_of_ground(place, transport, photographs, model, progress)
     photographs = [each.observation for each in prepared if isinstance(each.observation, Observation)]
     if place.terrain.water is not None:
@@ -401,7 +402,7 @@ def _prepared(
         log.info("visibility %.0f km", found.visibility_km)
         hazy = lights_of(found.visibility_km)
         prepared = [replace(each, light=light) for each, light in zip(prepared, hazy, strict=True)]
-    return prepared, facts
+    return prepared, skies, facts
 
 
 def _completed(

@@ -63,7 +63,7 @@ def save_seasons(job: RunJob, seasons: list[SeasonAlbedo], own: Path) -> list[Pa
                 "webcam": each.observation.webcam,
                 "time_utc": each.observation.time.isoformat(),
                 "residual": round(float(residual), 4),
-                "cloudiness": (each.light.model or {}).get("cloudiness", 0.0),
+                "cloudiness": each.light.cloudiness,
             }
             for each, residual in zip(recovered.photographs, recovered.fit.residual, strict=True)
         ]
@@ -130,7 +130,8 @@ def _recovered_again(
     paintings = []
     for time in sorted(set(job.times)):
         texture = completion.read_painted(folder / "paint" / time_stamp(time) / "painted.npz", job.place)
-        paintings.append(PaintedTexture(time, texture, f"painted {time_stamp(time)}", confidence=REPEATED))
+        name, sky = f"painted {time_stamp(time)}", sky_at(job, folder, time)
+        paintings.append(PaintedTexture(time, texture, name, confidence=REPEATED, sky=sky))
     return recover_seasons(
         job.place,
         photographs,
