@@ -36,7 +36,7 @@ from seasonscapes.terrain.mesh import sample_positions
 from seasonscapes.terrain.surface import mesh_up_m
 from seasonscapes.terrain.synthetic import alpine_massif
 from seasonscapes.terrain.view_refinement import refined_for_view
-from seasonscapes.workflows.views import terrain_for_view
+from seasonscapes.workflows.views import view_with_terrain
 
 SUNS_DEG = ((135.0, 10.0), (180.0, 20.0), (150.0, 60.0))
 HOURS = {
@@ -163,7 +163,7 @@ def cameras(pair: Pair, count: int, rng: np.random.Generator) -> list[tuple[ss.C
 
 def rays_of_view(place: ss.Place, camera: ss.Camera) -> RayScene:
     """The adaptive mesh as it is rendered: refined near the camera."""
-    return ray_scene(mi_mesh(terrain_for_view(place, camera), GREY))
+    return ray_scene(mi_mesh(view_with_terrain(place, camera)[1], GREY))
 
 
 def rays_of_truth(place: ss.Place, camera: ss.Camera) -> RayScene:

@@ -48,7 +48,7 @@ from seasonscapes.sky.illumination import Luminary
 from seasonscapes.workflows.illumination import illumination_for_camera, position_at
 from seasonscapes.workflows.viewer import write_folder
 from seasonscapes.workflows.viewer_scene import viewer_scene
-from seasonscapes.workflows.views import terrain_for_view
+from seasonscapes.workflows.views import view_with_terrain
 
 DAY = date(2024, 7, 16)
 SUN_DEG = (-4.0, 1.5, 6.0, 15.0, 35.0, 90.0)
@@ -133,7 +133,7 @@ def truth_of(
     """Path-traced views of all cameras and times."""
     found, sky = [], ss.sky_model("clear")
     for number, camera in cameras.items():
-        terrain = terrain_for_view(place, camera)
+        terrain = view_with_terrain(place, camera)[1]
         for instant in times:
             light, _ = illumination_for_camera(place, camera, sky, instant)
             image, coverage, noise = path_traced(build_scene(terrain, albedo, light), camera, light.white_rgb, seed)

@@ -11,7 +11,7 @@ from seasonscapes.rendering.backend import use_backend
 from seasonscapes.terrain.surface_classes import AlbedoDetail
 from seasonscapes.workflows import amplified_terrain
 from seasonscapes.workflows.place import load_place
-from seasonscapes.workflows.views import camera, terrain_for_view, view_with_terrain
+from seasonscapes.workflows.views import camera, view_with_terrain
 from seasonscapes.workspace import Workspace
 
 NEAR = AlbedoDetail((0.0, 0.0, 2.0), 1e-3, 4.0, seed=3)
@@ -27,7 +27,7 @@ def test_the_surface_is_finest_about_the_camera(place, monkeypatch):
     monkeypatch.setattr(amplified_terrain, "_MOST_NEAR_NODES", 300_000)
     monkeypatch.setattr(amplified_terrain, "_MOST_NODES", 100_000)
     view = camera(place, "south", size_px=(96, 64))
-    plain, fine = terrain_for_view(place, view), view_with_terrain(place, view, amplify=True)[1]
+    plain, fine = view_with_terrain(place, view)[1], view_with_terrain(place, view, amplify=True)[1]
     assert place.terrain.surface is not None
     assert fine.surface is not None
     (inner,) = fine.surface.parts

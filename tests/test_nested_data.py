@@ -16,7 +16,7 @@ from seasonscapes.workflows import nested_heights as heights_workflow
 from seasonscapes.workflows import nested_images
 from seasonscapes.workflows.albedo_sources import scene_albedo
 from seasonscapes.workflows.place import load_place
-from seasonscapes.workflows.views import camera, terrain_for_view
+from seasonscapes.workflows.views import camera, view_with_terrain
 from seasonscapes.workspace import Workspace
 
 CRS = "EPSG:32632"
@@ -177,13 +177,15 @@ def test_data_finer_than_what_is_kept_are_read_about_the_camera(tmp_path, monkey
     (kept,) = place.finer_heights
     assert kept.values.size <= 20_000
     eye = np.array([40.0, -60.0, 1500.0])
-    number, near = heights_workflow.finest_near(place, eye, 150.0)
+    number, near = heights_workflow.finest_near(place, eye, 150.0, most_samples=5_000_000)
     assert number == 0
     assert near.transform.a == 2.5
+    less = heights_workflow.finest_near(place, eye, 150.0, most_samples=3_000)[1]
+    assert less.values.size < 2.0 * 3_000 < near.values.size
     view = replace(
         camera(place, "south", size_px=(48, 32)), world_from_camera=np.block([[np.eye(3), eye[:, None]], [0, 0, 0, 1]])
     )
-    terrain = terrain_for_view(place, view)
+    terrain = view_with_terrain(place, view)[1]
     assert terrain.surface.spacing_at(eye[None])[0] == pytest.approx(2.5, rel=0.01)
     points = eye + np.stack([np.linspace(-60.0, 60.0, 50), np.zeros(50), np.zeros(50)], axis=1)
     for _ in range(3):
@@ -191,6 +193,26 @@ def test_data_finer_than_what_is_kept_are_read_about_the_camera(tmp_path, monkey
     x, y, height = map_of(place, points)
     assert np.abs(height - fine_m(x, y)).max() < 0.15
     assert np.abs(place.terrain.surface.up_at(points) - points[:, 2]).max() > 0.3, "what is kept is coarser"
+
+
+def test_a_camera_may_stand_in_a_hole_of_the_finer_data_and_where_the_ground_has_changed(tmp_path, monkeypatch):
+    """What is read about a camera was judged as a whole: a window without data, or 40 m lower, is no mistake."""
+    monkeypatch.setattr(heights_workflow, "_MOST_SAMPLES", 20_000)
+    path = write_nested(tmp_path)
+    raster = square(fine_m, 2.5)
+    raster.values[270:330, 270:330] = np.nan
+    raster.values[380:, 380:] -= 40.0
+    write(tmp_path / "fine.tif", raster)
+    place = load_place(path, Workspace(tmp_path / "workspace"))
+    for east, north, below_m in ((0.0, 0.0, 0.0), (430.0, -430.0, 40.0)):
+        eye = np.array([east, north, 1500.0])
+        _, near = heights_workflow.finest_near(place, eye, 60.0, most_samples=5_000_000)
+        assert np.isfinite(near.values).all()
+        count = near.values.shape[0] // 2
+        row, column = np.mgrid[0 : near.values.shape[0], 0 : near.values.shape[1]] + 0.5
+        truth = coarse_m(*apply_affine(near.transform, column, row)) - below_m
+        middle = (slice(count - 4, count + 4),) * 2
+        assert np.abs(near.values[..., 0] - truth)[middle].max() < 3.0
 
 
 def test_another_vertical_datum_is_doubted_refused_and_stated(tmp_path, caplog):
@@ -241,7 +263,7 @@ def albedo_along(place, terrain, positions):
 
 def test_the_albedo_shows_the_finer_image_and_keeps_its_mean(place):
     """The coarse image, two colours, says how bright each texel is; the fine one how this is spread over stripes of 10 m."""
-    terrain = terrain_for_view(place, camera(place, "south", size_px=(48, 32)))
+    terrain = view_with_terrain(place, camera(place, "south", size_px=(48, 32)))[1]
     east = np.arange(-395.0, 395.0, 0.5)
     points = np.stack([east, np.full_like(east, 12.0), np.zeros_like(east)], axis=1)
     for _ in range(3):
@@ -273,6 +295,34 @@ def test_images_finer_than_what_is_kept_are_read_about_the_camera(tmp_path, monk
     assert max(max(level.values.shape[:2]) for level in detail.levels) < 230
     (elsewhere,) = nested_images.image_details(place, np.array([1450.0, 0.0, 1500.0]))
     assert len(elsewhere.levels) < len(detail.levels)
+
+
+def test_paths_keep_clear_of_finer_heights(tmp_path):
+    from seasonscapes.workflows.views import local_ground
+
+    place = load_place(write_nested(tmp_path, above_m=4.0), Workspace(tmp_path / "workspace"))
+    points = np.array([[20.0, 40.0], [1300.0, 0.0]])
+    ground = local_ground(place)(points)
+    surface = place.terrain.surface
+    assert surface is not None
+    assert ground[0] == pytest.approx(surface.up_at(np.array([[20.0, 40.0, ground[0]]]))[0], abs=0.1)
+    assert np.isnan(local_ground(place)(np.array([[5000.0, 0.0]]))).all()
+
+
+def test_the_days_of_melting_are_no_colours(place):
+    """Detail and finer images multiply colours; a texture of times is seen as it is."""
+    from seasonscapes.rendering.hemisphere_rays import ray_scene
+    from seasonscapes.rendering.mitsuba_scene import mi_mesh
+    from seasonscapes.rendering.terrain_material import bare_texture
+
+    terrain = view_with_terrain(place, camera(place, "south", size_px=(48, 32)), amplify=True)[1]
+    material = ray_scene(mi_mesh(terrain, np.full(3, 0.3))).mi_terrain.bsdf()
+    assert material.detail is not None
+    assert material.images is not None
+    with bare_texture(material):
+        assert material.detail is material.images is None
+    assert material.detail is not None
+    assert material.images is not None
 
 
 def test_both_engines_show_the_same(place):

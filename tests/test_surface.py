@@ -15,7 +15,7 @@ from seasonscapes.rendering.mitsuba_scene import RenderScene, mi_mesh
 from seasonscapes.terrain.mesh import sample_positions
 from seasonscapes.terrain.surface import mesh_up_m
 from seasonscapes.terrain.view_refinement import _unique_edges, refined_for_view
-from seasonscapes.workflows.views import terrain_for_view
+from seasonscapes.workflows.views import view_with_terrain
 
 NOON = "2024-12-21T11:22:17Z"
 
@@ -180,7 +180,7 @@ def test_above_ground_is_above_what_is_rendered(summit):
         latitude_deg=latitude + 0.00013, longitude_deg=longitude, above_ground_m=1.7, heading_deg=90.0, pitch_deg=-89.0
     )
     camera = ss.camera(summit, eye, size_px=(9, 9))
-    scene = ray_scene(mi_mesh(terrain_for_view(summit, camera), np.full(3, 0.3)))
+    scene = ray_scene(mi_mesh(view_with_terrain(summit, camera)[1], np.full(3, 0.3)))
     depth = trace_gbuffer(RenderScene(scene.mi_scene, scene.mi_terrain), camera).depth[4, 4]
     assert depth == pytest.approx(1.7, abs=0.3)
     ground = mesh_up_m(summit.terrain, camera.position_m)
@@ -197,7 +197,7 @@ def test_a_camera_below_the_rendered_surface_is_refused(summit):
 
 def test_refinement_near_the_camera_has_no_cracks_and_keeps_the_atlas(alpine):
     camera = ss.camera(alpine, "meadow", size_px=(768, 512))
-    plain, fine = alpine.terrain, terrain_for_view(alpine, camera)
+    plain, fine = alpine.terrain, view_with_terrain(alpine, camera)[1]
     assert len(plain.faces) < len(fine.faces) < 3 * len(plain.faces)
 
     def rims(terrain):

@@ -17,6 +17,8 @@ they send to the viewer directly.
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
@@ -233,6 +235,22 @@ def terrain_material(reflectance: dict[str, Any], terrain: Terrain, *, smooth: b
     material.optics = optics_of(terrain)
     material.water = None if terrain.water is None else DeviceWater(terrain.water, terrain.frame)
     return material
+
+
+@contextmanager
+def bare_texture(material: Any) -> Iterator[None]:
+    """Within, the body of the ground is its texture alone, without detail, finer images and clean snow.
+
+    For textures that hold something else than colours, such as the days on which snow goes.
+    """
+    kept = {name: getattr(material, name) for name in ("detail", "images", "snow") if hasattr(material, name)}
+    for name in kept:
+        setattr(material, name, None)
+    try:
+        yield
+    finally:
+        for name, value in kept.items():
+            setattr(material, name, value)
 
 
 def _scalar_water(ground: dict[str, Any], water: Water) -> dict[str, Any]:

@@ -40,6 +40,7 @@ def read_imagery(
     encoding: str = "srgb",
     full_scale: float | None = None,
     confinement: Confinement = OWN_FOLDER,
+    window: bool = False,
 ) -> Raster:
     """Read a georeferenced colour image as scene-linear Rec.709.
 
@@ -55,6 +56,8 @@ def read_imagery(
         ``srgb`` for display-referred images, ``linear`` for reflectance.
     full_scale
         The value that corresponds to 1, after the file's own scale and offset; see `image_bands.image_facts`.
+    window
+        It is a window of an image that was read before as a whole: its numbers are not judged.
 
     Returns
     -------
@@ -86,7 +89,7 @@ def read_imagery(
         return replace(raster, values=np.repeat(values, 3 // raster.values.shape[2], axis=2))
 
     image = read_tiles(paths, read, bounds_deg=bounds_deg, finest_m=finest_m, confinement=confinement)
-    for decode in decoders.values():
+    for decode in () if window else decoders.values():
         decode.check()
     # Cubic interpolation between tiles of different grids overshoots at sharp borders.
     return image if len(paths) == 1 else replace(image, values=np.maximum(image.values, 0.0))

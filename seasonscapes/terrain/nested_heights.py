@@ -82,36 +82,66 @@ def nested_heights(
         Where the two do not overlap; where so little data is there that all of it is border; where they differ by more
         than 25 m in the median.
     """
-    from scipy.ndimage import distance_transform_edt
-
     require_overlap(fine, under[-1], where=where)
-    grid = RasterGrid(fine)
-    coarse = mosaic([in_turn_of(each, grid.centre_deg[1]) for each in under], grid)[..., 0]
-    heights = fine.values[..., 0]
-    known = np.isfinite(heights) & np.isfinite(coarse)
-    sides_m = cell_sides_m(fine)
-    cell_m = _spacing_m(_covering(under, fine))
-    border = [(1, 1), (1, 1)] if bounds_deg is None else _closed_sides(fine, bounds_deg)
-    padded = np.pad(known, border)
-    if padded.all():
-        distance_m = np.full(padded.shape, np.inf, np.float32)
-    else:
-        distance_m = np.asarray(distance_transform_edt(padded, sampling=sides_m[::-1]), np.float32)
-    kept = tuple(slice(before, before + count) for (before, _), count in zip(border, known.shape, strict=True))
-    share = np.clip((distance_m[kept] / np.float32(cell_m) - RIM_CELLS) / _BLEND_CELLS, 0.0, 1.0)
-    if not (share == 1.0).any():
+    blend = _Blend(fine, under, bounds_deg)
+    if not (blend.share == 1.0).any():
         raise InputError(
             where,
             "too small for a finer part, or nearly without data",
-            got=f"{known.sum()} known cells of {sides_m[0]:.3g} m, none farther than {distance_m.max():.0f} m from the border",
-            expected=f"more than {(RIM_CELLS + _BLEND_CELLS) * cell_m:.0f} m, {RIM_CELLS + _BLEND_CELLS:g} cells of the raster below",
+            got=f"{blend.known.sum()} known cells of {cell_sides_m(fine)[0]:.3g} m, none farther than "
+            f"{blend.inside_m:.0f} m from the border",
+            expected=f"more than {(RIM_CELLS + _BLEND_CELLS) * blend.cell_m:.0f} m, {RIM_CELLS + _BLEND_CELLS:g} cells of "
+            "the raster below",
         )
-    offset = _offset(heights[share == 1.0] - coarse[share == 1.0])
+    alone = blend.share == 1.0
+    offset = _offset(fine.values[..., 0][alone] - blend.coarse[alone])
     _require_near(offset, where)
-    share = share * share * (3.0 - 2.0 * share)
-    coarse = _without_gaps(coarse)
-    blended = np.where(share > 0.0, coarse + share * (np.where(known, heights, 0.0) - coarse), coarse)
-    return replace(fine, values=blended[..., None].astype(np.float32)), offset
+    return blend.heights(fine), offset
+
+
+def nested_window(fine: Raster, under: Sequence[Raster], *, bounds_deg: Bounds) -> Raster:
+    """Blend a window of finer heights that `nested_heights` has accepted as a whole: it may hold no data at all.
+
+    Parameters
+    ----------
+    fine, under, bounds_deg
+        As in `nested_heights`.
+
+    Returns
+    -------
+    Raster
+        As `nested_heights` returns it.
+    """
+    return _Blend(fine, under, bounds_deg).heights(fine)
+
+
+class _Blend:
+    """Shares of a fine raster, and the heights of the rasters below on its grid."""
+
+    def __init__(self, fine: Raster, under: Sequence[Raster], bounds_deg: Bounds | None) -> None:
+        from scipy.ndimage import distance_transform_edt
+
+        grid = RasterGrid(fine)
+        self.coarse = mosaic([in_turn_of(each, grid.centre_deg[1]) for each in under], grid)[..., 0]
+        self.known = np.isfinite(fine.values[..., 0]) & np.isfinite(self.coarse)
+        self.cell_m = _spacing_m(_covering(under, fine))
+        border = [(1, 1), (1, 1)] if bounds_deg is None else _closed_sides(fine, bounds_deg)
+        padded = np.pad(self.known, border)
+        if padded.all():
+            distance_m = np.full(padded.shape, np.inf, np.float32)
+        else:
+            distance_m = np.asarray(distance_transform_edt(padded, sampling=cell_sides_m(fine)[::-1]), np.float32)
+        self.inside_m = float(distance_m.max())
+        kept = tuple(slice(before, before + count) for (before, _), count in zip(border, self.known.shape, strict=True))
+        self.share = np.clip((distance_m[kept] / np.float32(self.cell_m) - RIM_CELLS) / _BLEND_CELLS, 0.0, 1.0)
+
+    def heights(self, fine: Raster) -> Raster:
+        """The blended raster."""
+        share = self.share * self.share * (3.0 - 2.0 * self.share)
+        coarse = _without_gaps(self.coarse)
+        own = np.where(self.known, fine.values[..., 0], 0.0)
+        blended = np.where(share > 0.0, coarse + share * (own - coarse), coarse)
+        return replace(fine, values=blended[..., None].astype(np.float32))
 
 
 def _offset(difference: np.ndarray) -> HeightOffset:
@@ -142,6 +172,11 @@ def _require_near(offset: HeightOffset, where: str) -> None:
 def reach_of_border_m(fine: Raster, under: Sequence[Raster]) -> float:
     """How far into a fine raster its border is felt [m]."""
     return (RIM_CELLS + _BLEND_CELLS) * _spacing_m(_covering(under, fine))
+
+
+def rim_m(fine: Raster, under: Sequence[Raster]) -> float:
+    """How far from the border of a fine raster its heights do not count yet [m]."""
+    return RIM_CELLS * _spacing_m(_covering(under, fine))
 
 
 def _spacing_m(raster: Raster) -> float:

@@ -138,6 +138,12 @@ def tile_spacing_m(paths: Sequence[str], confinement: Confinement = OWN_FOLDER) 
     return min(float(np.mean(cell_sides_m(raster_grid(path, confinement)))) for path in paths)
 
 
+def tiles_reach_into(paths: Sequence[str], bounds_deg: Bounds, confinement: Confinement = OWN_FOLDER) -> bool:
+    """Whether any of the tiles reaches into bounds by two pixels or more."""
+    grids = [raster_grid(path, confinement) for path in paths]
+    return any(_overlap(bounds_geographic(grid), bounds_deg, cell_sides_m(grid)) for grid in grids)
+
+
 def read_tiles(
     paths: Sequence[str],
     read: Callable[[str, Bounds | None, float | None], Raster],

@@ -7,12 +7,15 @@ depends on the edge alone, so that both of its faces agree and the mesh stays wi
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
 from seasonscapes.terrain.surface import SurfaceGrid, Terrain
+
+log = logging.getLogger(__name__)
 
 # Points along an edge at which its distance from the surface is measured.
 _ALONG = (0.25, 0.5, 0.75)
@@ -137,6 +140,10 @@ def _refined(
         divided = split[of_face].any(axis=1)
         settled.append(faces[~divided])
         faces, of_face = faces[divided], of_face[divided]
+        if len(faces) > _MOST_FACES:
+            log.warning(
+                "the mesh stays coarser than its surface there: more than %d faces would be needed", _MOST_FACES
+            )
         if not len(faces) or len(faces) > _MOST_FACES:
             break
         ends = edges[split]

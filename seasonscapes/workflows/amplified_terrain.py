@@ -103,7 +103,7 @@ def _surface(place: Place, eye_m: np.ndarray, seed: int, *, amplify: bool) -> Su
     surface = place.terrain.surface
     assert surface is not None
     whole, factor = _amplified_whole(place, seed) if amplify else (surface, 1)
-    found = finest_near(place, eye_m, _NEAR_M) if surface.parts else None
+    found = finest_near(place, eye_m, _NEAR_M, most_samples=_MOST_NEAR_NODES) if surface.parts else None
     if found is None and not amplify:
         return surface
     if found is None:

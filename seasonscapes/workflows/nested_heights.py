@@ -11,12 +11,24 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from seasonscapes.frames import geodetic_from_enu
-from seasonscapes.terrain.nested_heights import HeightOffset, nested_heights, reach_of_border_m, tell_offset
+from seasonscapes.terrain.nested_heights import (
+    HeightOffset,
+    nested_heights,
+    nested_window,
+    reach_of_border_m,
+    tell_offset,
+)
 from seasonscapes.terrain.placement import cell_sides_m
 from seasonscapes.terrain.raster import bounds_geographic, raster_grid
 from seasonscapes.terrain.raster_files import rasters_hash
 from seasonscapes.terrain.surface import Raster
-from seasonscapes.terrain.tile_files import METRES_PER_DEGREE, Bounds, read_elevation_tiles, tile_spacing_m
+from seasonscapes.terrain.tile_files import (
+    METRES_PER_DEGREE,
+    Bounds,
+    read_elevation_tiles,
+    tile_spacing_m,
+    tiles_reach_into,
+)
 from seasonscapes.terrain.water import levelled
 from seasonscapes.workspace import Workspace, build_once
 
@@ -25,7 +37,7 @@ if TYPE_CHECKING:
     from seasonscapes.terrain.raster_tables import FinerHeights
     from seasonscapes.workflows.place import Place
 
-_CODE = ("workflows.nested_heights",)
+_CODE = ("workflows.nested_heights", "workflows.scene_water")
 # Samples of a part that are kept for the whole place; finer data are averaged to these, and read anew about a camera.
 _MOST_SAMPLES = 12_000_000
 
@@ -90,7 +102,7 @@ def finer_heights(
     return tuple(parts)
 
 
-def finest_near(place: Place, eye_m: np.ndarray, reach_m: float) -> tuple[int, Raster] | None:
+def finest_near(place: Place, eye_m: np.ndarray, reach_m: float, *, most_samples: int) -> tuple[int, Raster] | None:
     """The finest heights about a position, as fine as their files are.
 
     Parameters
@@ -101,6 +113,8 @@ def finest_near(place: Place, eye_m: np.ndarray, reach_m: float) -> tuple[int, R
         ``(3,)`` position [m].
     reach_m
         Distance to which they are wanted, to all sides [m].
+    most_samples
+        What is read of them at most; very fine heights then reach less far.
 
     Returns
     -------
@@ -115,15 +129,19 @@ def finest_near(place: Place, eye_m: np.ndarray, reach_m: float) -> tuple[int, R
         return None
     number, kept = within[-1], place.finer_heights[within[-1]]
     declared = _coarse_first(place.scene)[number]
-    if tile_spacing_m(declared.paths, place.scene.confinement) > 0.8 * float(np.mean(cell_sides_m(kept))):
+    spacing_m = tile_spacing_m(declared.paths, place.scene.confinement)
+    if spacing_m > 0.8 * float(np.mean(cell_sides_m(kept))):
         return number, kept
     under = (*reversed(place.finer_heights[:number]), place.elevation)
     latitude, longitude, _ = (float(value) for value in geodetic_from_enu(place.frame, eye_m))
-    down = (reach_m + reach_of_border_m(kept, under)) / METRES_PER_DEGREE
+    reach_m = min(reach_m + reach_of_border_m(kept, under), 0.5 * math.sqrt(most_samples) * spacing_m)
+    down = reach_m / METRES_PER_DEGREE
     across = down / max(math.cos(math.radians(latitude)), 0.01)
     bounds_deg = longitude - across, latitude - down, longitude + across, latitude + down
-    fine = _read(place.scene, declared, bounds_deg, None)
-    heights, _ = nested_heights(fine, under, bounds_deg=bounds_deg, where=declared.label)
+    if not tiles_reach_into(declared.paths, bounds_deg, place.scene.confinement):
+        return number, kept
+    # The whole part was accepted: a window of it may hold a hole, or ground that has changed.
+    heights = nested_window(_read(place.scene, declared, bounds_deg, None), under, bounds_deg=bounds_deg)
     if place.scene.water is not None:
         heights = _with_level_ground(heights, kept)
     return number, heights

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,7 +17,7 @@ from seasonscapes.terrain.raster_files import rasters_hash
 from seasonscapes.terrain.surface import Raster, Texture
 from seasonscapes.terrain.surface_classes import ImageDetail, ImageLevel
 from seasonscapes.terrain.surface_grid import grid_polynomials
-from seasonscapes.terrain.tile_files import METRES_PER_DEGREE, Bounds, tile_spacing_m
+from seasonscapes.terrain.tile_files import METRES_PER_DEGREE, Bounds, tile_spacing_m, tiles_reach_into
 from seasonscapes.workspace import build_once
 
 if TYPE_CHECKING:
@@ -86,6 +86,8 @@ def whole_image(place: Place, declared: FinerImage) -> WholeImage:
         bounds_deg = bounds_geographic(place.elevation)
         spacing_m = tile_spacing_m(declared.paths, place.scene.confinement)
         raster = _read(place, declared, bounds_deg, spacing_m * _whole_step(place, declared))
+        # As it is kept: the first run and later ones see the same.
+        raster = replace(raster, values=raster.values.astype(np.float16).astype(np.float32))
         return WholeImage(raster, bake_imagery(place.terrain, place.atlas, raster))
 
     return build_once(
@@ -113,8 +115,9 @@ def _detail(place: Place, declared: FinerImage, eye_m: np.ndarray) -> ImageDetai
     while step > 1:
         step = -(-step // 2)
         bounds_deg = _window(place, eye_m, 0.5 * _MOST_SIDE * step * spacing_m)
-        if _overlaps(bounds_geographic(whole.raster), bounds_deg):
-            window = _read(place, declared, bounds_deg, step * spacing_m)
+        reached = tiles_reach_into(declared.paths, bounds_deg, place.scene.confinement)
+        if reached and _overlaps(bounds_geographic(whole.raster), bounds_deg):
+            window = _read(place, declared, bounds_deg, step * spacing_m, window=True)
             levels.append(_level(place, window, _sure(np.isfinite(window.values[..., 0])), rim_nodes=_LEVEL_RIM_PX))
     mean = np.where(whole.mean.weight[..., None] > 0.0, whole.mean.values, 1.0)
     return ImageDetail(mean.astype(np.float16), tuple(levels))
@@ -131,7 +134,7 @@ def _whole_step(place: Place, declared: FinerImage) -> int:
     return max(1, math.ceil(side_m / (_MOST_SIDE * tile_spacing_m(declared.paths, place.scene.confinement)) - 1e-2))
 
 
-def _read(place: Place, declared: FinerImage, bounds_deg: Bounds, finest_m: float) -> Raster:
+def _read(place: Place, declared: FinerImage, bounds_deg: Bounds, finest_m: float, *, window: bool = False) -> Raster:
     return read_imagery(
         declared.paths,
         bounds_deg=bounds_deg,
@@ -140,6 +143,7 @@ def _read(place: Place, declared: FinerImage, bounds_deg: Bounds, finest_m: floa
         encoding=declared.encoding,
         full_scale=declared.full_scale,
         confinement=place.scene.confinement,
+        window=window,
     )
 
 

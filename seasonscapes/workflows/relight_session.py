@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import operator
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
 from datetime import date, datetime
 from functools import reduce
@@ -53,6 +54,8 @@ FRAME_CODE = ("workflows.relight_session", "relighting.frame_file")
 # coefficients average over patches of 7°, and the sky behind the terrain is evaluated by the atmosphere model itself.
 _CLOUDY_ROWS, _CLEAR_ROWS = 128, 64
 _MIDSUMMER = date(2024, 7, 1)
+# What the content of textures begins with that hold times of transition.
+_TURNING = "turning:"
 
 
 @dataclass(frozen=True)
@@ -257,6 +260,9 @@ def still_session(
         "lambertian": lambertian,
         "amplified": amplify,
     }
+    if terrain.images:
+        # How finer images are read is in their tables alone.
+        inputs["images"] = place.scene.image_keys
     coefficients = _coefficients(place, camera, scene, inputs, seed, sampling, progress)
     relightable = relightable_view(scene, coefficients)
     return RelightSession(place, camera, model, albedo, seed, inputs, coefficients, scene, relightable)
@@ -432,7 +438,7 @@ def _interpolated(session: RelightSession, weights: list[tuple[int, float]], day
         ]
         return [reduce(operator.add, terms) for terms in scaled]
     pair = [session.albedo.dated[index] for index, _ in weights]
-    name = f"turning:{pair[0].content}:{pair[1].content}"
+    name = f"{_TURNING}{pair[0].content}:{pair[1].content}"
     if name not in session._transitions:
         # The time of transition is a texture like any other, and averaged over pixels like an albedo.
         transition = DatedAlbedo(pair[0].day, name, lambda: snow_transition_between(session.place, *pair))
@@ -456,6 +462,7 @@ def _view_albedo(session: RelightSession, dated: DatedAlbedo) -> tuple[np.ndarra
     """
     from seasonscapes.rendering.mitsuba_scene import set_albedo
     from seasonscapes.rendering.relit_view import cluster_albedo, mirrored_albedo
+    from seasonscapes.rendering.terrain_material import bare_texture
     from seasonscapes.rendering.transport import view_albedo
 
     place, traced = session.place, session.coefficients
@@ -466,7 +473,9 @@ def _view_albedo(session: RelightSession, dated: DatedAlbedo) -> tuple[np.ndarra
     def build() -> tuple[np.ndarray, ...]:
         set_albedo(session.ray_scene, dated.load().values)
         of_view = (view_albedo, cluster_albedo, mirrored_albedo)
-        albedos = [albedo(session.ray_scene, session.coefficients) for albedo in of_view]
+        material = session.ray_scene.mi_terrain.bsdf()
+        with bare_texture(material) if dated.content.startswith(_TURNING) else nullcontext():
+            albedos = [albedo(session.ray_scene, session.coefficients) for albedo in of_view]
         return tuple(albedo.astype(np.float16) for albedo in albedos if albedo is not None)
 
     albedos = build_once(

@@ -15,7 +15,7 @@ from seasonscapes.frames import LocalFrame
 from seasonscapes.terrain.crs import wrapped
 from seasonscapes.terrain.memory import check_memory
 from seasonscapes.terrain.mesh import MESHERS, build_mesh
-from seasonscapes.terrain.nested_heights import RIM_CELLS
+from seasonscapes.terrain.nested_heights import rim_m
 from seasonscapes.terrain.placement import cell_sides_m, check_area
 from seasonscapes.terrain.raster import bounds_geographic, centre_frame, fill_nodata, read_elevation
 from seasonscapes.terrain.raster_files import OWN_FOLDER
@@ -227,7 +227,9 @@ def build_terrain(
     terrain = replace(terrain, surface=surface_grid(refined, frame, mesh_error_m=error))
     if finer:
         assert terrain.surface is not None
-        parts = tuple(_finer_part(part, elevation, frame, bound) for part in finer)
+        parts = tuple(
+            _finer_part(part, (*reversed(finer[:number]), elevation), frame, bound) for number, part in enumerate(finer)
+        )
         terrain = moved_to(terrain, replace(terrain.surface, parts=parts))
     report(0.8)
     texel_m = _texel_m(terrain, elevation, scene, options)
@@ -243,13 +245,11 @@ def build_terrain(
     return terrain, atlas
 
 
-def _finer_part(part: Raster, elevation: Raster, frame: LocalFrame, bound_m: float) -> SurfaceGrid:
-    """The surface of finer heights, which the mesh follows as closely as their spacing deserves."""
+def _finer_part(part: Raster, under: Sequence[Raster], frame: LocalFrame, bound_m: float) -> SurfaceGrid:
+    """The surface of finer heights above the rasters ``under`` them, which the mesh follows as closely as their spacing deserves."""
     spacing_m = sample_spacing_m(part)
     error_m = min(bound_m, spacing_m * _PART_ERROR)
-    return surface_grid(
-        part, frame, mesh_error_m=error_m, rim_nodes=RIM_CELLS * sample_spacing_m(elevation) / spacing_m
-    )
+    return surface_grid(part, frame, mesh_error_m=error_m, rim_nodes=rim_m(part, under) / spacing_m)
 
 
 def save_built_terrain(built: tuple[Terrain, Atlas], path: Path) -> None:

@@ -21,7 +21,7 @@ from seasonscapes.workflows.albedo_sources import AlbedoSource, chosen_albedo
 from seasonscapes.workflows.illumination import SunMoonPosition, illumination_for_camera, position_at, sky_model
 from seasonscapes.workflows.place import Place, utc_at
 from seasonscapes.workflows.relight_session import still_session, view_at
-from seasonscapes.workflows.views import camera_geodetic, terrain_for_view, view_with_terrain
+from seasonscapes.workflows.views import camera_geodetic, view_with_terrain
 from seasonscapes.workspace import content_key
 
 if TYPE_CHECKING:
@@ -240,8 +240,9 @@ def textured_view(
     from seasonscapes.terrain.surface import sample_texture
 
     camera = view_in_frame(camera, place.frame)
+    camera, terrain = view_with_terrain(place, camera)
     light, position = illumination_for_camera(place, camera, sky_model(sky), utc_at(place, time))
-    scene = build_scene(terrain_for_view(place, camera), np.full(3, 0.2, np.float32), light)
+    scene = build_scene(terrain, np.full(3, 0.2, np.float32), light)
     gbuffer = trace_gbuffer(scene, camera)
     coverage = np.isfinite(gbuffer.depth).astype(np.float32)
     surface = np.nan_to_num(sample_texture(radiance, gbuffer.uv))

@@ -142,13 +142,6 @@ def calibrated_viewpoint(path: Path) -> tuple[NamedCamera, tuple[int, int]]:
     return validate(table, NamedCamera, where=path), (camera.width_px, camera.height_px)
 
 
-def terrain_for_view(place: Place, view: Camera | Panorama) -> Terrain:
-    """The terrain of a place with its finest data about a camera, refined there until its error is a quarter of a pixel."""
-    from seasonscapes.workflows.amplified_terrain import detailed_view
-
-    return detailed_view(place, view)[1]
-
-
 def view_with_terrain(
     place: Place, view: Camera | Panorama, *, lambertian: bool = False, amplify: bool = False
 ) -> tuple[Camera | Panorama, Terrain]:
@@ -204,6 +197,10 @@ def local_ground(place: Place):
             latitude, longitude, _ = geodetic_from_enu(place.frame, np.column_stack([positions, up]))
             height = sample_raster(place.elevation, *map_position(place.elevation, latitude, longitude))[..., 0]
             up = enu_from_geodetic(place.frame, latitude, longitude, np.nan_to_num(height))[..., 2]
+        surface = place.terrain.surface
+        if surface is not None and surface.parts:
+            # Finer heights of a part may rise above the raster's.
+            up = surface.up_at(np.column_stack([positions, up]))
         return np.where(np.isfinite(height), up, np.nan)
 
     return heights
