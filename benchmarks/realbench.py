@@ -97,6 +97,7 @@ def stacked(case: FixedCase) -> Stack:
     lights = [light_on_view(view, each.time) for each in case.pictures]
     sun = np.stack([each.sun_direction for each in lights])
     known = np.stack([_known(case, k, covered, lights[k]) for k in range(len(lights))])
+    # Polygons of land that clouds hide cover the sky above as well, and are no mask of it.
     return Stack(
         case,
         view,

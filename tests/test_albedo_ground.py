@@ -8,10 +8,11 @@ import numpy as np
 import places
 import pytest
 
-from seasonscapes.albedo import equations
+from seasonscapes.albedo import equations, haze
 from seasonscapes.albedo.closed_form import solve_albedo
 from seasonscapes.albedo.forward_model import ambient_on_texels, trace_texel_transport
 from seasonscapes.albedo.ground_pixels import ground_pixels, without_water
+from seasonscapes.albedo.haze import HazeFit
 from seasonscapes.albedo.photographs import LINEAR, prepare_photographs
 from seasonscapes.cameras.observation import Observation
 from seasonscapes.errors import NoUsablePixels
@@ -21,8 +22,10 @@ from seasonscapes.rendering.hosek import hosek_illumination
 from seasonscapes.rendering.mitsuba_scene import mi_mesh, relight
 from seasonscapes.rendering.radiance import render_view
 from seasonscapes.terrain.surface_classes import Snow
-from seasonscapes.workflows.albedo_recovery import recover_albedo
+from seasonscapes.workflows.albedo_recovery import RecoveryOptions, _prepared, recover_albedo, texel_transport
+from seasonscapes.workflows.illumination import sky_model
 from seasonscapes.workflows.place import load_place, utc_at
+from seasonscapes.workflows.season_recovery import _grouped_days
 from seasonscapes.workflows.view_rendering import render
 from seasonscapes.workflows.views import camera
 from seasonscapes.workspace import Workspace
@@ -141,11 +144,51 @@ def pixel_counts(photographs):
     return texel_pixel_count([each.footprints for each in photographs[:3]])
 
 
-def test_recovery_completes_the_texels_of_water(tmp_path, caplog):
-    path = places.write_place(tmp_path, places.SCENE + '\n[water]\nfile = "lakes.geojson"\n\n[snow]\n')
+# A camera above the lake that sees nothing else.
+ABOVE_LAKE = """
+[[camera]]
+name = "lake"
+latitude_deg = 46.5451
+longitude_deg = 7.98
+above_ground_m = 400.0
+heading_deg = 0.0
+pitch_deg = -88.0
+fov_deg = 8.0
+"""
+
+
+def lake_place(folder, text=""):
+    path = places.write_place(folder, places.SCENE + text + '\n[water]\nfile = "lakes.geojson"\n\n[snow]\n')
     ring = [[7.977, 46.5440], [7.983, 46.5440], [7.983, 46.5462], [7.977, 46.5462], [7.977, 46.5440]]
-    (tmp_path / "lakes.geojson").write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
-    place = load_place(path, Workspace(tmp_path / "workspace"))
+    (folder / "lakes.geojson").write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
+    return load_place(path, Workspace(folder / "workspace"))
+
+
+def test_a_photograph_of_water_alone_drops_out_with_its_sky_and_joins_a_season(tmp_path, monkeypatch, caplog):
+    place = lake_place(tmp_path, ABOVE_LAKE)
+    seen = []
+    for name, day in (("lake", 2), ("south", 1), ("south", 3)):
+        view, image = camera(place, name, size_px=(48, 32)), np.full((32, 48, 3), 0.3, np.float32)
+        seen.append(Observation(image, np.ones((32, 48), bool), view, utc_at(place, f"2024-07-0{day}T12:00"), name))
+    tried = []
+
+    def fitted(transport, photographs, lights_of, **rest):
+        tried.append([len(photographs), len(lights_of(30.0))])
+        return HazeFit(30.0, {30.0: 0.0})
+
+    monkeypatch.setattr(haze, "fit_visibility", fitted)
+    transport, sky = texel_transport(place), sky_model("clear", cloudiness=0.0)
+    prepared = _prepared(place, transport, seen, sky, RecoveryOptions(fit_haze=True), None)[0]
+    assert [each.observation.webcam for each in prepared] == ["south", "south"]
+    assert tried == [[2, 2]]
+    with caplog.at_level("WARNING"):
+        groups = _grouped_days(place, transport, seen, sky, None)
+    assert sorted(day.day for group in groups for day in group) == [1, 2, 3]
+    assert "2024-07-02 alone gives no albedo (it shows no ground)" in caplog.text
+
+
+def test_recovery_completes_the_texels_of_water(tmp_path, caplog):
+    place = lake_place(tmp_path)
     view = camera(place, "south", size_px=(72, 48))
     seen = []
     for hour in ("09", "15"):

@@ -6,11 +6,15 @@ import numpy as np
 import pytest
 
 import seasonscapes as ss
+from seasonscapes.albedo import joint_recovery
+from seasonscapes.albedo.recovery_rounds import JointOptions, make_problem
+from seasonscapes.errors import NotEnoughEvidence
 from seasonscapes.rendering.sightlines import visible_faces
 from seasonscapes.sky.models import with_overrides
-from seasonscapes.workflows.albedo_recovery import RecoveryOptions, _prepared, texel_transport
+from seasonscapes.workflows.albedo_recovery import RecoveryOptions, _prepared, recovered_over, texel_transport
 from seasonscapes.workflows.illumination import sky_model
 from seasonscapes.workflows.photograph_skies import photograph_skies
+from seasonscapes.workflows.recovery_methods import PaintedTexture
 
 
 @pytest.fixture(scope="module")
@@ -40,8 +44,9 @@ def test_a_grey_sky_is_taken_as_clouds_and_a_blue_one_is_not(taken):
     blue, grey = _with_sky(taken, 0, (0.12, 0.25, 0.6)), _with_sky(taken, 1, (0.5, 0.5, 0.52))
     found = photograph_skies(place, transport, [blue, grey], clear)
     assert [each.cloudiness for each in found] == [0.0, 1.0]
-    stated = with_overrides(clear, cloudiness=0.3)
-    assert photograph_skies(place, transport, [grey], stated) == [stated]
+    for cloudiness in (0.3, 0.0):
+        stated = with_overrides(clear, cloudiness=cloudiness)
+        assert [each.cloudiness for each in photograph_skies(place, transport, [grey], stated)] == [cloudiness]
 
 
 def test_a_low_sun_and_a_synthetic_clear_sky_stay_clear(taken):
@@ -59,9 +64,41 @@ def test_albedo_is_recovered_under_the_clouds_that_a_photograph_shows(taken):
     """The light of the recovery is dimmer and less blue where the photograph's sky is grey."""
     place, transport, _ = taken
     blue, grey = _with_sky(taken, 0, (0.12, 0.25, 0.6)), _with_sky(taken, 1, (0.5, 0.5, 0.52))
-    prepared, _ = _prepared(place, transport, [blue, grey], sky_model("clear"), RecoveryOptions(), None)
+    prepared, _, _ = _prepared(place, transport, [blue, grey], sky_model("clear"), RecoveryOptions(), None)
     suns = [each.light.sun for each in prepared]
     direct = [0.0 if sun is None else float(np.sum(sun.normal_illuminance_lx)) for sun in suns]
     assert direct[1] < 0.3 * direct[0]
     colour = [each.light.sky_radiance[: each.light.sky_radiance.shape[0] // 2].mean((0, 1)) for each in prepared]
     assert colour[1][2] / colour[1][0] < 0.7 * colour[0][2] / colour[0][0]
+
+
+def test_the_joint_recovery_starts_from_the_sky_of_each_photograph(taken, monkeypatch):
+    """At every visibility, and two photographs of one moment do not share their light."""
+    place, transport, _ = taken
+    blue, grey = _with_sky(taken, 0, (0.12, 0.25, 0.6)), _with_sky(taken, 1, (0.5, 0.5, 0.52))
+    tried = []
+
+    def recovered(transport, photographs, start, *, haze, progress):
+        problem = make_problem(transport, photographs, haze, start.noise_model, start.gains, JointOptions())
+        tried.append([picture.instant for picture in problem.pictures])
+        tried.extend([light.cloudiness for light in lights] for lights in haze.lights)
+        raise NotEnoughEvidence("far enough for this test")
+
+    monkeypatch.setattr(joint_recovery, "recover_jointly", recovered)
+    options = RecoveryOptions(method="differentiable")
+    with pytest.raises(NotEnoughEvidence):
+        recovered_over(place, transport, [blue, grey], sky_model("clear"), options)
+    assert tried[0] == [0, 1]
+    assert len(tried) > 3
+    assert all(each == [0.0, 1.0] for each in tried[1:])
+
+
+def test_a_painting_is_taken_under_the_sky_that_it_was_painted_under(taken):
+    place, transport, _ = taken
+    clear, shape = sky_model("clear"), (*place.texture_shape, 3)
+    lit = ss.Texture(np.full(shape, 2e3, np.float32), np.ones(shape[:2], np.float32))
+    blue = _with_sky(taken, 0, (0.12, 0.25, 0.6))
+    cloudy = with_overrides(clear, cloudiness=0.7)
+    painted = [PaintedTexture(blue.time, lit), PaintedTexture(blue.time, lit, sky=cloudy)]
+    found = recovered_over(place, transport, [blue], clear, RecoveryOptions(), painted)
+    assert [each.light.cloudiness for each in found.photographs] == [0.0, 0.0, 0.7]

@@ -3,7 +3,9 @@
 import json
 import subprocess
 import sys
+from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +14,10 @@ from places import MASSIF
 from test_run import LAUNCHER
 
 from seasonscapes.cli import main
+from seasonscapes.sky.models import read_sky_model, with_overrides
+from seasonscapes.terrain import surface
+from seasonscapes.workflows import full_run, run_albedo
+from seasonscapes.workflows.run_job import RunJob
 
 DAYS = {"summer": ("2024-07-10", "2024-07-20"), "winter": ("2024-01-20",)}
 
@@ -81,12 +87,9 @@ def test_a_season_between_photographs_of_one_day_is_refused(tmp_path, capsys):
 
 def test_a_day_that_tells_nothing_alone_joins_the_nearest(monkeypatch):
     """Of the recoveries of each day only the outcome counts here: one fails, the others are snow above two heights."""
-    from datetime import UTC, date, datetime
-    from types import SimpleNamespace
-
     from test_albedo import _snow_above
 
-    from seasonscapes.albedo import photographs, standard_error
+    from seasonscapes.albedo import standard_error
     from seasonscapes.errors import NotEnoughEvidence
     from seasonscapes.workflows import season_recovery
 
@@ -99,13 +102,11 @@ def test_a_day_that_tells_nothing_alone_joins_the_nearest(monkeypatch):
             raise NotEnoughEvidence("nothing fixes the exposure")
         return line_m[day]
 
-    monkeypatch.setattr(season_recovery, "with_terrain", lambda transport, seen: seen)
-    monkeypatch.setattr(season_recovery, "illuminations", lambda place, seen, model: None)
     monkeypatch.setattr(season_recovery, "closed_fit", solved)
     monkeypatch.setattr(
-        photographs,
-        "prepare_photographs",
-        lambda transport, seen, lights: [SimpleNamespace(observation=each) for each in seen],
+        season_recovery,
+        "photographs_of_ground",
+        lambda place, transport, seen, model: ([SimpleNamespace(observation=each) for each in seen], [], 0.0),
     )
     monkeypatch.setattr(standard_error, "albedo_estimate", lambda transport, own, fit: _snow_above(fit))
     groups = season_recovery._grouped_days(None, None, days, None, None)
@@ -120,3 +121,67 @@ def test_a_day_that_tells_nothing_alone_joins_the_nearest(monkeypatch):
     ]
     line_m.update(dict.fromkeys(line_m))
     assert [sorted(group) for group in season_recovery._grouped_days(None, None, days, None, None)] == [sorted(line_m)]
+
+
+NOON = datetime(2024, 7, 20, 12, tzinfo=UTC)
+
+
+def cloudy_job(folder, sky) -> RunJob:
+    """A run whose albedo stage found clouds: webcam a at noon clear and twenty minutes later overcast, b near noon overcast."""
+    found = [("a", 0, 0.0), ("a", 20, 1.0), ("b", 5, 0.8), ("b", 150, 0.2)]
+    photographs = [
+        {"webcam": webcam, "time_utc": (NOON + timedelta(minutes=minutes)).isoformat(), "cloudiness": cloudiness}
+        for webcam, minutes, cloudiness in found
+    ]
+    (folder / "albedo").mkdir(parents=True)
+    (folder / "albedo" / "albedo.json").write_text(json.dumps({"photographs": photographs}))
+    record = {"file": "albedo.npz", "days": ["2024-07-20"], "times_utc": [each["time_utc"] for each in photographs]}
+    (folder / "albedo" / "seasons.json").write_text(json.dumps([record]))
+    place = SimpleNamespace(scene=None)
+    times = (NOON, NOON + timedelta(minutes=20), NOON + timedelta(hours=5))
+    return RunJob(place, times, (), None, (96, 64), sky)  # pyright: ignore[reportArgumentType]
+
+
+def test_an_instant_has_the_clouds_of_each_webcams_nearest_photograph(tmp_path, monkeypatch):
+    clear = read_sky_model("clear")
+    job = cloudy_job(tmp_path, clear)
+    expected = [0.4, 0.9, 0.0]
+    found = [run_albedo.sky_at(job, tmp_path, time).cloudiness for time in job.times]
+    assert found == pytest.approx(expected)
+    stated = with_overrides(clear, cloudiness=0.0)
+    assert run_albedo.sky_at(cloudy_job(tmp_path / "stated", stated), tmp_path / "stated", NOON) is stated
+    # The film of a time has its sky behind.
+    filmed = []
+
+    def film_path(place, folder, textures, own, *, cloudiness, **rest):
+        assert [time for time, _, _ in textures] == list(job.times)
+        filmed.extend(cloudiness)
+        return []
+
+    texture = SimpleNamespace(values=None, weight=np.ones((2, 2)))
+    monkeypatch.setattr(full_run, "film_path", film_path)
+    monkeypatch.setattr(full_run.completion, "read_painted", lambda path, place: texture)
+    monkeypatch.setattr(surface, "load_texture", lambda path: texture)
+    full_run._film(job, tmp_path, None)
+    assert filmed == pytest.approx(expected)
+
+
+def test_what_later_stages_read_belongs_to_the_files_of_the_albedo_stage(tmp_path, monkeypatch):
+    monkeypatch.setattr(run_albedo, "save_albedo_figures", lambda *arguments: {})
+    photograph = SimpleNamespace(
+        observation=SimpleNamespace(webcam="a", time=NOON), light=SimpleNamespace(cloudiness=0.6)
+    )
+    recovered = SimpleNamespace(
+        day=NOON.date(),
+        estimate=SimpleNamespace(source=np.ones((2, 2))),
+        photographs=[photograph],
+        fit=SimpleNamespace(residual=np.array([0.1])),
+        facts={},
+        save=lambda path: path.write_bytes(b"albedo"),
+    )
+    (tmp_path / "albedo").mkdir()
+    season = SimpleNamespace(recovered=recovered, record={"times_utc": [NOON.isoformat()]})
+    job = cloudy_job(tmp_path / "other", read_sky_model("clear"))
+    files = run_albedo.save_seasons(job, [season], tmp_path / "albedo")
+    assert [file.name for file in files] == ["albedo.npz", "albedo.json", "seasons.json"]
+    assert run_albedo.sky_at(job, tmp_path, NOON).cloudiness == 0.6

@@ -102,9 +102,12 @@ def make_problem(
     gains: np.ndarray,
     options: JointOptions,
 ) -> RecoveryProblem:
-    """Group photographs by camera and instant, and lay out the unknowns with their priors."""
+    """Group photographs by camera and instant, and lay out the unknowns with their priors.
+
+    Photographs of one moment under different clouds count as two instants, since those of one instant share their light.
+    """
     cameras = _numbers([id(photograph.footprints) for photograph in photographs])
-    instants = _numbers([photograph.observation.time for photograph in photographs])
+    instants = _numbers([(each.observation.time, each.light.cloudiness) for each in photographs])
     layout = UnknownLayout(len(photographs), max(cameras) + 1, max(instants) + 1, options.sun_grid)
     priors = options.priors
     start, sigma = np.zeros(layout.size), np.zeros(layout.size)

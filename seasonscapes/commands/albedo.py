@@ -87,7 +87,6 @@ def albedo_command(
     from seasonscapes.rendering.backend import use_backend
     from seasonscapes.workflows import albedo_recovery as recovery
     from seasonscapes.workflows.recovery_methods import METHODS
-    from seasonscapes.workflows.recovery_plan import plan_recovery
 
     check_choice("--method", method, METHODS)
     model, size_px = sky.model(), parse_size(size)
@@ -97,7 +96,7 @@ def albedo_command(
         sources, texel_m = None, None if painted else recovery.TEXEL_M
         if not synthetic_webcams and not (painted and manifest is None and times is None):
             sources = _sources(manifest, calibrations, masks, options.allow_outside, doubtful_poses)
-            plan = plan_recovery(scene, sources, texel_m=options.texel_m, allow_outside=options.allow_outside)
+            plan = options.plan(scene, sources)
             message(f"plan: {plan}")
             texel_m = None if painted else plan.texel_m
         loaded = options.load(scene, progress, texel_m=texel_m)

@@ -24,6 +24,7 @@ def albedo_record(loaded: Place, recovered: RecoveredAlbedo, output: Path) -> di
         "measured_share": float((recovered.estimate.source == 1).mean()),
         "completed_share": float((recovered.estimate.source == 2).mean()),
         "residual": [round(float(value), 4) for value in recovered.fit.residual],
+        "cloudiness": [each.light.cloudiness for each in recovered.photographs],
         "gains": recovered.fit.gains.tolist(),
         **recovered.facts,
         "figures": recovery.save_albedo_figures(loaded, recovered.estimate, recovered.day, output),

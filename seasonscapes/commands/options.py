@@ -15,7 +15,9 @@ from seasonscapes.commands.outputs import check_output_folder, refuse_own_input
 if TYPE_CHECKING:
     from seasonscapes.progress import Progress
     from seasonscapes.sky.models import SkyModel
+    from seasonscapes.workflows.photograph_files import PhotographSources
     from seasonscapes.workflows.place import MeshOptions, Place
+    from seasonscapes.workflows.recovery_plan import RecoveryPlan
     from seasonscapes.workspace import Workspace
 
 
@@ -47,6 +49,14 @@ class PlaceOptions:
         if not os.access(workspace.folder, os.R_OK | os.X_OK) or not workspace.folder.is_dir():
             check_output_folder(workspace.folder, flag="workspace" if self.workspace is None else "--workspace")
         return workspace
+
+    def plan(self, scene: str, sources: PhotographSources) -> RecoveryPlan:
+        """How finely to recover an albedo of a scene from photographs; see `plan_recovery`."""
+        from seasonscapes.workflows.recovery_plan import plan_recovery
+
+        return plan_recovery(
+            scene, sources, texel_m=self.texel_m, workspace=self.folder(), allow_outside=self.allow_outside
+        )
 
     def mesh(self, *, texel_m: float | None = None, albedo: Sequence[Path] = ()) -> MeshOptions:
         """How to build the terrain; ``texel_m`` is a command's own default.

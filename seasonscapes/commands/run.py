@@ -74,13 +74,12 @@ def run_command(
     found, model, size_px = photographs.values(allow_outside=options.allow_outside), sky.model(), view.size_px()
     from seasonscapes.workflows.albedo_recovery import TEXEL_M
     from seasonscapes.workflows.full_run import RunJob, run
-    from seasonscapes.workflows.recovery_plan import plan_recovery
     from seasonscapes.workflows.run_albedo import season_records
 
     with progress_bars() as progress:
         texel_m = TEXEL_M
         if found.sources is not None and stages_by.needs_albedo:
-            plan = plan_recovery(scene, found.sources, texel_m=options.texel_m, allow_outside=options.allow_outside)
+            plan = options.plan(scene, found.sources)
             message(f"plan: {plan}")
             texel_m = plan.texel_m
         loaded = options.load(scene, progress, texel_m=texel_m)

@@ -120,6 +120,11 @@ class Illumination:
         return global_horizontal_illuminance(self)
 
     @property
+    def cloudiness(self) -> float:
+        """Cloud fraction of its sky model, 0 to 1."""
+        return float(self.model.get("cloudiness", 0.0))
+
+    @property
     def white_rgb(self) -> tuple[float, float, float]:
         """The colour that a camera takes for white under this light, linear Rec.709; see `photo_look.white_point`."""
         return white_point(None if self.sun is None else np.asarray(self.sun.normal_illuminance_lx))

@@ -118,6 +118,11 @@ class SkyModel(Declaration):
     valid: ValidRange
     cloudiness: UnitInterval = 0.0
 
+    @property
+    def states_clouds(self) -> bool:
+        """Whether the cloudiness was given, by the file or an override; 0 then says that the sky is clear."""
+        return "cloudiness" in self.model_fields_set
+
 
 class AtmosphereModel(SkyModel):
     """Clear or hazy atmosphere at any solar elevation, spectral with multiple scattering (`sky.clear_sky`).

@@ -240,12 +240,13 @@ def recovered_over(
     progress: Progress | None = None,
 ) -> RecoveredAlbedo:
     """`recover_albedo` from photographs in the place's frame and daylight coefficients that were traced before."""
-    prepared, facts = _prepared(place, transport, photographs, model, options, progress)
-    prepared = [*prepared, *painted_photographs(place, transport, painted, model)]
+    prepared, skies, facts = _prepared(place, transport, photographs, model, options, progress)
+    painted_skies = [model if each.sky is None else each.sky for each in painted]
+    prepared = [*prepared, *painted_photographs(place, transport, painted, painted_skies)]
     if options.method == "closed":
         fit = closed_fit(transport, prepared, progress)
     else:
-        joint, found = joint_fit(place, transport, prepared, model, progress)
+        joint, found = joint_fit(place, transport, prepared, [*skies, *painted_skies], progress)
         fit, prepared, facts = joint.fit, joint.photographs, facts | found
     known = _completed(place, transport, prepared, fit, progress)
     for doubt in recovery_doubts([each.observation for each in prepared], fit.residual):
@@ -312,6 +313,54 @@ def with_terrain(transport: TexelTransport, photographs: Sequence[Observation]) 
     return kept
 
 
+def photographs_of_ground(
+    place: Place,
+    transport: TexelTransport,
+    photographs: Sequence[Observation],
+    model: SkyModel,
+    progress: Progress | None = None,
+) -> tuple[list[AlbedoPhotograph], list[SkyModel], float]:
+    """The photographs that show ground, under the light of their skies: clouds as they show them, and pixels of water left out.
+
+    Parameters
+    ----------
+    place, transport
+        The place, and the daylight coefficients of its texels.
+    photographs
+        In the place's frame.
+    model
+        The sky asked for; see `photograph_skies`.
+    progress
+        Called with a task and its finished share.
+
+    Returns
+    -------
+    photographs, skies
+        In the same order, without those that show none of the ground, and the sky of each.
+    water_share
+        Of all pixels on terrain, how many show water, 0 to 1.
+
+    Raises
+    ------
+    NoTerrainInView
+        Where no photograph shows any of the terrain.
+    NoUsablePixels
+        Where all that they show is water.
+    """
+    from seasonscapes.albedo.ground_pixels import without_water
+    from seasonscapes.albedo.photographs import prepare_photographs
+
+    seen = with_terrain(transport, photographs)
+    skies = photograph_skies(place, transport, seen, model)
+    report = task_progress(progress, "footprints of the photographs")
+    prepared = prepare_photographs(transport, seen, illuminations(place, seen, skies), progress=report)
+    if place.terrain.water is None:
+        return prepared, skies, 0.0
+    sky_of = {id(each): sky for each, sky in zip(seen, skies, strict=True)}
+    dry, share = without_water(prepared, place.terrain.water.mask)
+    return dry, [sky_of[id(each.observation)] for each in dry], share
+
+
 def _prepared(
     place: Place,
     transport: TexelTransport,
@@ -319,24 +368,18 @@ def _prepared(
     model: SkyModel,
     options: RecoveryOptions,
     progress: Progress | None,
-) -> tuple[list[AlbedoPhotograph], dict[str, Any]]:
-    """Photographs with their light; tone curve and visibility fitted where asked for."""
-    from seasonscapes.albedo.ground_pixels import without_water
+) -> tuple[list[AlbedoPhotograph], list[SkyModel], dict[str, Any]]:
+    """Photographs with their light, and their skies; tone curve and visibility fitted where asked for."""
     from seasonscapes.albedo.haze import fit_visibility
-    from seasonscapes.albedo.photographs import EIGHT_BIT, prepare_photographs
+    from seasonscapes.albedo.photographs import EIGHT_BIT
     from seasonscapes.albedo.tone_curve import fit_tone_curve, with_tone_curve
 
     facts: dict[str, Any] = {}
     if not photographs:
-        return [], facts
-    photographs = with_terrain(transport, photographs)
-    skies = photograph_skies(place, transport, photographs, model)
-    lights = illuminations(place, photographs, skies)
-    report = task_progress(progress, "footprints of the photographs")
-    prepared = prepare_photographs(transport, photographs, lights, progress=report)
+        return [], [], facts
+    prepared, skies, share = photographs_of_ground(place, transport, photographs, model, progress)
+    photographs = [each.observation for each in prepared if isinstance(each.observation, Observation)]
     if place.terrain.water is not None:
-        prepared, share = without_water(prepared, place.terrain.water.mask)
-        photographs = [each.observation for each in prepared if isinstance(each.observation, Observation)]
         facts["water_share"] = round(share, 4)
         log.info(
             "water: %.3g %% of the pixels on terrain show it and tell no albedo; its texels are completed",
@@ -359,7 +402,7 @@ def _prepared(
         log.info("visibility %.0f km", found.visibility_km)
         hazy = lights_of(found.visibility_km)
         prepared = [replace(each, light=light) for each, light in zip(prepared, hazy, strict=True)]
-    return prepared, facts
+    return prepared, skies, facts
 
 
 def _completed(

@@ -103,7 +103,8 @@ def stages_of(job: RunJob, progress: Progress | None = None) -> list[Stage]:
     common = {
         "place": place.key,
         "imagery": _imagery(place),
-        "sky": job.sky.model_dump(mode="json"),
+        # A stated clear sky (0) and one whose clouds the photographs tell have equal values.
+        "sky": {**job.sky.model_dump(mode="json"), "states_clouds": job.sky.states_clouds},
         "seed": job.seed,
         "times": [time.isoformat() for time in job.times],
     }
@@ -153,10 +154,10 @@ def stages_of(job: RunJob, progress: Progress | None = None) -> list[Stage]:
             "albedo",
             {**common, "recovery": method.recovery},
             known,
-            ("season_recovery", "photograph_files"),
+            ("season_recovery", "photograph_files", "run_albedo"),
             recover_albedos,
         ),
-        stage("paint", painted, (*known, *albedo), ("painting", "predicted_radiance"), _paint),
+        stage("paint", painted, (*known, *albedo), ("painting", "predicted_radiance", "run_albedo"), _paint),
         stage(
             "path",
             {"place": place.key, "size": job.size_px, **path_facts(along)},
@@ -164,11 +165,22 @@ def stages_of(job: RunJob, progress: Progress | None = None) -> list[Stage]:
             ("path_stages", "camera_paths"),
             _path,
         ),
-        stage("inpaint", filled, ("paint", *known[:1], *albedo, *path), ("inpainting", "completion"), _inpaint),
         stage(
-            "refine", refined, (*known, "albedo", "paint", "inpaint"), ("season_recovery",), refine_albedos, "refined"
+            "inpaint",
+            filled,
+            ("paint", *known[:1], *albedo, *path),
+            ("inpainting", "completion", "run_albedo"),
+            _inpaint,
         ),
-        stage("film", {**common, "fps": along.fps}, ("inpaint", "path"), ("path_stages",), _film),
+        stage(
+            "refine",
+            refined,
+            (*known, "albedo", "paint", "inpaint"),
+            ("season_recovery", "run_albedo"),
+            refine_albedos,
+            "refined",
+        ),
+        stage("film", {**common, "fps": along.fps}, ("inpaint", *albedo, "path"), ("path_stages", "run_albedo"), _film),
         stage("relight", {**looks, "season": job.season}, final, ("timelapse",), _relight),
     ]
     if method.appearance == "paper":
@@ -238,7 +250,7 @@ def _paint(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
     for time in job.times:
         own = folder / "paint" / time_stamp(time)
         reference = None
-        sky = sky_at(job, folder, time) if job.method.needs_albedo else job.sky
+        sky = sky_at(job, folder, time)
         if job.method.needs_albedo and job.method.painting == "weighted":
             predicted = measured_radiance(job.place, albedo_at(folder, time), time, sky, progress=progress)
             reference = RadiometricReference(predicted, RELATIVE_SIGMA)
@@ -281,7 +293,7 @@ def _inpaint(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]
         options = _inpaint_options(job, folder, time)
         own = folder / "inpaint" / time_stamp(time)
         painted = completion.read_painted(folder / "paint" / time_stamp(time) / "painted.npz", job.place)
-        sky = sky_at(job, folder, time) if job.method.needs_albedo else job.sky
+        sky = sky_at(job, folder, time)
         result = inpaint(job.place, painted, time, sky, options, progress=progress)
         with atomic_path(own / "completed.npz") as temporary:
             completion.save_completed(result.completed, painted, temporary)
@@ -294,12 +306,12 @@ def _inpaint(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]
 def _film(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
     from seasonscapes.terrain.surface import load_texture
 
-    textures = []
+    textures, cloudiness = [], []
     for time in sorted(set(job.times)):
         painted = completion.read_painted(folder / "paint" / time_stamp(time) / "painted.npz", job.place)
         completed = load_texture(folder / "inpaint" / time_stamp(time) / "completed.npz")
         textures.append((time, completed.values, painted.weight > 0.0))
-    cloudiness = cloudiness_of(job.sky)
+        cloudiness.append(cloudiness_of(sky_at(job, folder, time)))
     return film_path(
         job.place, folder, textures, folder / "film", cloudiness=cloudiness, fps=job.along.fps, progress=progress
     )

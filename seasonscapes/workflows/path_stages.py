@@ -124,7 +124,7 @@ def film_path(
     textures: Sequence[tuple[datetime, np.ndarray, np.ndarray]],
     own: Path,
     *,
-    cloudiness: float,
+    cloudiness: Sequence[float],
     fps: float,
     progress: Progress | None = None,
 ) -> list[Path]:
@@ -139,7 +139,7 @@ def film_path(
     own
         Folder to write into.
     cloudiness
-        Of the plain sky behind, in [0, 1].
+        Of the plain sky behind at each time, in [0, 1].
     fps
         Of the films.
     progress
@@ -159,10 +159,10 @@ def film_path(
     files, views = [], []
     # One exposure for all times: how bright each hour is belongs to its look.
     white = max(white_radiance(values, painted) for _, values, painted in textures)
-    for time, values, _ in textures:
+    for (time, values, _), clouds in zip(textures, cloudiness, strict=True):
         stamp = time_stamp(time)
         frames = []
-        drawn = textured_frames(values, cameras, terrain, white, cloudiness=cloudiness)
+        drawn = textured_frames(values, cameras, terrain, white, cloudiness=clouds)
         for number, frame in enumerate(each_reported(drawn, len(cameras), progress, f"filming {stamp}")):
             name = f"{stamp}/{number:04d}.png"
             write_png(own / name, frame)

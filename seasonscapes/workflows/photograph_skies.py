@@ -43,9 +43,9 @@ def photograph_skies(
     photographs
         In the place's frame.
     model
-        The sky asked for; one that states clouds stays as it is.
+        The sky asked for; one that states its cloudiness stays as it is, a clear one (0) too.
     """
-    if not isinstance(model, AtmosphereModel) or model.cloudiness > 0.0:
+    if not isinstance(model, AtmosphereModel) or model.states_clouds:
         return [model] * len(photographs)
     skies: dict = {}
     for each in photographs:

@@ -183,16 +183,15 @@ def load_place(
     >>> place.terrain.vertices.shape[1], place.scene.cameras[0].name
     (3, 'aerial')
     """
-    path, options = find_scene(scene), options or MeshOptions()
-    declared = read_scene(path, allow_outside=allow_outside)
-    if declared.elevation is None:
-        raise InputError(path, "names no elevation raster", cure='add a table [elevation] with file = "dem.tif"')
+    options = options or MeshOptions()
+    path, declared = scene_with_elevation(scene, allow_outside=allow_outside)
+    assert declared.elevation is not None
     workspace = workspace or default_workspace()
     from seasonscapes.workflows import terrain_building
 
     report = task_progress(progress, "terrain")
     report(0.0)
-    massif = None if declared.elevation.synthetic is None else _massif(declared, workspace)
+    massif = scene_massif(declared, workspace)
     source = declared.elevation.all_paths
     images_matter = options.texel_m is None or any(image.finer for image in declared.images)
     key_name = "files" if declared.elevation.files else "file"
@@ -241,6 +240,15 @@ def load_place(
     return Place(path, declared, frame, elevation, fill, terrain, atlas, massif, key, workspace, options, finer)
 
 
+def scene_with_elevation(scene: str | Path, *, allow_outside: bool = False) -> tuple[Path, SceneFile]:
+    """Find and read a scene file; `InputError` where it names no elevation."""
+    path = find_scene(scene)
+    declared = read_scene(path, allow_outside=allow_outside)
+    if declared.elevation is None:
+        raise InputError(path, "names no elevation raster", cure='add a table [elevation] with file = "dem.tif"')
+    return path, declared
+
+
 def _check_cameras(path: Path, scene: SceneFile, elevation: Raster) -> None:
     """`InputError` where all cameras of a scene stand far from its raster; a warning about single ones that do."""
     from seasonscapes.terrain.placement import distance_km, likely_cause
@@ -284,12 +292,13 @@ def require_near(place: Place, latitude_deg: float, longitude_deg: float, *, whe
         )
 
 
-def _massif(scene: SceneFile, workspace: Workspace) -> SyntheticMassif:
+def scene_massif(scene: SceneFile, workspace: Workspace) -> SyntheticMassif | None:
+    """The synthetic massif that a scene declares, generated once for a workspace; ``None`` where it names files."""
     from seasonscapes.terrain.synthetic_massif import load_massif, save_massif
 
-    assert scene.elevation is not None
-    assert scene.elevation.synthetic is not None
-    declared = scene.elevation.synthetic
+    declared = None if scene.elevation is None else scene.elevation.synthetic
+    if declared is None:
+        return None
     return build_once(
         workspace,
         f"{scene.name}/massif",

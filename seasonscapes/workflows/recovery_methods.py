@@ -47,6 +47,8 @@ class PaintedTexture:
         Where it came from, for messages.
     confidence
         Factor on the weights, in (0, 1]: a painting of photographs that are given as well repeats their errors.
+    sky
+        What it was painted under; ``None`` for the sky that is asked for.
 
     Examples
     --------
@@ -62,6 +64,7 @@ class PaintedTexture:
     texture: Texture
     name: str = "painted"
     confidence: float = 1.0
+    sky: SkyModel | None = None
 
 
 def illuminations(place: Place, photographs: Sequence[Observation], models: Sequence[SkyModel]) -> list[Illumination]:
@@ -77,9 +80,9 @@ def illuminations(place: Place, photographs: Sequence[Observation], models: Sequ
 
 
 def painted_photographs(
-    place: Place, transport: TexelTransport, painted: Sequence[PaintedTexture], model: SkyModel
+    place: Place, transport: TexelTransport, painted: Sequence[PaintedTexture], models: Sequence[SkyModel]
 ) -> list[AlbedoPhotograph]:
-    """Observations of painted textures under the light of their instants.
+    """Observations of painted textures under the light of their instants and skies.
 
     Raises
     ------
@@ -90,7 +93,7 @@ def painted_photographs(
     from seasonscapes.workflows.illumination import illumination
 
     result = []
-    for each in painted:
+    for each, model in zip(painted, models, strict=True):
         if each.texture.values.shape[:2] != place.texture_shape or each.texture.atlas_id not in (None, place.atlas_id):
             raise AtlasMismatch(
                 f"{each.name}: painted in another atlas than the scene has now; give the --texel-m, --atlas and mesh "
@@ -118,16 +121,16 @@ def joint_fit(
     place: Place,
     transport: TexelTransport,
     photographs: list[AlbedoPhotograph],
-    model: SkyModel,
+    models: Sequence[SkyModel],
     progress: Progress | None = None,
 ) -> tuple[JointRecovery, dict[str, Any]]:
-    """The joint recovery, started from the closed form, and what it found as plain values."""
+    """The joint recovery under the sky of each photograph, started from the closed form, and what it found as plain values."""
     from seasonscapes.albedo.joint_recovery import recover_jointly
 
     if place.terrain.snow is not None or place.terrain.forest:
         log.warning("the differentiable method treats snow and forest as matt; the closed form does not")
     start = closed_fit(transport, photographs, progress)
-    haze = _haze_lights(place, photographs, model, progress)
+    haze = _haze_lights(place, photographs, models, progress)
     report = task_progress(progress, "haze, exposures, response, clouds, poses")
     found = recover_jointly(transport, photographs, start, haze=haze, progress=report)
     if not found.accepted:
@@ -141,31 +144,37 @@ def joint_fit(
 
 
 def _haze_lights(
-    place: Place, photographs: list[AlbedoPhotograph], model: SkyModel, progress: Progress | None
+    place: Place, photographs: list[AlbedoPhotograph], models: Sequence[SkyModel], progress: Progress | None
 ) -> HazeLights | None:
-    """Lights of all photographs at several visibilities; ``None`` where the sky model has no haze to change."""
+    """Lights of all photographs at several visibilities; ``None`` where a sky model has no haze to change."""
     from seasonscapes.albedo.recovery_pictures import HazeLights
 
-    assumed, valid = visibility_km(model), model.valid.visibility_km
-    if assumed is None or valid is None:
+    # Skies differ in their clouds; the haze is that of all photographs.
+    assumed, ranges = visibility_km(models[0]), [model.valid.visibility_km for model in models]
+    valid = [each for each in ranges if each is not None]
+    if assumed is None or len(valid) < len(models):
         log.info("haze stays as it is: the sky model has no visibility to change")
         return None
     report = task_progress(progress, "light at several visibilities")
-    nodes = tuple(km for km in _VISIBILITIES_KM if valid[0] <= km <= valid[1])
+    nodes = tuple(km for km in _VISIBILITIES_KM if all(low <= km <= high for low, high in valid))
     lights = []
     for number, km in enumerate(nodes):
-        lights.append(_lights_in(place, photographs, with_overrides(model, visibility_km=km)))
+        lights.append(_lights_in(place, photographs, [with_overrides(model, visibility_km=km) for model in models]))
         report((number + 1) / len(nodes))
     return HazeLights(nodes, lights, assumed)
 
 
-def _lights_in(place: Place, photographs: list[AlbedoPhotograph], model: SkyModel) -> list[Illumination]:
-    """The lights of photographs under another model; a painting has no air in front."""
+def _lights_in(place: Place, photographs: list[AlbedoPhotograph], models: Sequence[SkyModel]) -> list[Illumination]:
+    """The lights of photographs under other models; a painting has no air in front."""
     from seasonscapes.workflows.illumination import illumination
 
-    seen = [each.observation for each in photographs if isinstance(each.observation, Observation)]
-    of_cameras, result = iter(illuminations(place, seen, [model] * len(seen))), []
-    for photograph in photographs:
+    seen, skies = [], []
+    for photograph, model in zip(photographs, models, strict=True):
+        if isinstance(photograph.observation, Observation):
+            seen.append(photograph.observation)
+            skies.append(model)
+    of_cameras, result = iter(illuminations(place, seen, skies)), []
+    for photograph, model in zip(photographs, models, strict=True):
         if isinstance(photograph.observation, Observation):
             result.append(next(of_cameras))
         else:

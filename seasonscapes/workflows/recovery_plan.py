@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from seasonscapes.cameras.pinhole import Camera
     from seasonscapes.terrain.surface import Raster
     from seasonscapes.workflows.photograph_files import PhotographSources
+    from seasonscapes.workspace import Workspace
 
 log = logging.getLogger(__name__)
 
@@ -68,7 +69,12 @@ class RecoveryPlan:
 
 
 def plan_recovery(
-    scene: str, sources: PhotographSources, *, texel_m: float | None = None, allow_outside: bool = False
+    scene: str,
+    sources: PhotographSources,
+    *,
+    texel_m: float | None = None,
+    workspace: Workspace | None = None,
+    allow_outside: bool = False,
 ) -> RecoveryPlan:
     """Plan the recovery of an albedo from the photographs of a manifest.
 
@@ -80,6 +86,8 @@ def plan_recovery(
         Manifest and calibration records.
     texel_m
         Side of a texel that is asked for [m]; ``None`` chooses it.
+    workspace
+        Where the heights of a synthetic scene are kept; default `workspace.default_workspace`.
     allow_outside
         Let the scene file name rasters outside its folder.
 
@@ -87,15 +95,22 @@ def plan_recovery(
     -------
     RecoveryPlan
         Texels and pixels.
+
+    Raises
+    ------
+    InputError
+        Where the scene names no elevation, or a file is damaged.
     """
     from seasonscapes.cameras.observation import read_manifest
-    from seasonscapes.scene import read_scene
     from seasonscapes.terrain.placement import cell_sides_m
-    from seasonscapes.workflows.place import find_scene
+    from seasonscapes.workflows.place import scene_massif, scene_with_elevation
     from seasonscapes.workflows.terrain_building import read_scene_elevation
+    from seasonscapes.workspace import default_workspace
 
-    read = read_scene(find_scene(scene), allow_outside=allow_outside)
-    raster = read_scene_elevation(read, None, bounds_deg=None if read.area is None else read.area.bounds_deg)
+    _, read = scene_with_elevation(scene, allow_outside=allow_outside)
+    massif = scene_massif(read, workspace or default_workspace())
+    bounds_deg = None if read.area is None else read.area.bounds_deg
+    raster = read_scene_elevation(read, bounds_deg=bounds_deg) if massif is None else massif.elevation
     rows = read_manifest(sources.manifest, allow_outside=sources.allow_outside)
     records = _records([sources.calibration_of(row.webcam, row.time) for row in rows])
     views = [view for record in records.values() for view in _views_of(record)]

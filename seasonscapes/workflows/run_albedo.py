@@ -63,15 +63,14 @@ def save_seasons(job: RunJob, seasons: list[SeasonAlbedo], own: Path) -> list[Pa
                 "webcam": each.observation.webcam,
                 "time_utc": each.observation.time.isoformat(),
                 "residual": round(float(residual), 4),
-                "cloudiness": (each.light.model or {}).get("cloudiness", 0.0),
+                "cloudiness": each.light.cloudiness,
             }
             for each, residual in zip(recovered.photographs, recovered.fit.residual, strict=True)
         ]
         share = round(float((recovered.estimate.source == 1).mean()), 4)
         facts = {"measured_share": share, **recovered.facts, "photographs": residuals}
-        write_record((own / name).with_suffix(".json"), facts)
         records.append({"file": name, **season.record, "measured_share": share})
-        files.append(own / name)
+        files += [own / name, write_record((own / name).with_suffix(".json"), facts)]
     return [*files, write_record(own / SEASONS_FILE, records)]
 
 
@@ -87,7 +86,9 @@ def albedo_at(folder: Path, time: datetime) -> Path:
 
 
 def sky_at(job: RunJob, folder: Path, time: datetime) -> SkyModel:
-    """The sky of an instant's photographs: the one asked for, with the clouds that the albedo stage found in them."""
+    """The sky of an instant: the one asked for, with the clouds that the albedo stage found in each webcam's nearest photograph."""
+    if job.sky.states_clouds or not job.method.needs_albedo:
+        return job.sky
     file = albedo_at(folder, time).with_suffix(".json")
     photographs = json.loads(file.read_text(encoding="utf-8"))["photographs"]
 
@@ -95,10 +96,12 @@ def sky_at(job: RunJob, folder: Path, time: datetime) -> SkyModel:
         return abs((datetime.fromisoformat(photograph["time_utc"]) - time).total_seconds())
 
     within_s = 60.0 * job.photographs.within_min
-    found = [each["cloudiness"] for each in photographs if apart(each) <= within_s]
-    if not found or max(found) == 0.0 or job.sky.cloudiness > 0.0:
-        return job.sky
-    return job.sky.model_copy(update={"cloudiness": float(np.median(found))})
+    nearest: dict[str, float] = {}
+    for each in sorted(photographs, key=apart):
+        if apart(each) <= within_s:
+            nearest.setdefault(each["webcam"], each["cloudiness"])
+    cloudiness = float(np.median(list(nearest.values()))) if nearest else 0.0
+    return job.sky.model_copy(update={"cloudiness": cloudiness}) if cloudiness > 0.0 else job.sky
 
 
 def refine_albedos(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
@@ -130,7 +133,8 @@ def _recovered_again(
     paintings = []
     for time in sorted(set(job.times)):
         texture = completion.read_painted(folder / "paint" / time_stamp(time) / "painted.npz", job.place)
-        paintings.append(PaintedTexture(time, texture, f"painted {time_stamp(time)}", confidence=REPEATED))
+        name, sky = f"painted {time_stamp(time)}", sky_at(job, folder, time)
+        paintings.append(PaintedTexture(time, texture, name, confidence=REPEATED, sky=sky))
     return recover_seasons(
         job.place,
         photographs,

@@ -16,14 +16,13 @@ from seasonscapes.sky.models import SkyModel
 from seasonscapes.workflows.albedo_recovery import (
     RecoveredAlbedo,
     RecoveryOptions,
+    photographs_of_ground,
     recovered_over,
     texel_transport,
-    with_terrain,
 )
 from seasonscapes.workflows.illumination import sky_model
-from seasonscapes.workflows.photograph_skies import photograph_skies
 from seasonscapes.workflows.place import Place
-from seasonscapes.workflows.recovery_methods import PaintedTexture, closed_fit, illuminations
+from seasonscapes.workflows.recovery_methods import PaintedTexture, closed_fit
 
 if TYPE_CHECKING:
     from seasonscapes.albedo.forward_model import TexelTransport
@@ -127,24 +126,22 @@ def _grouped_days(
     place: Place, transport: TexelTransport, photographs: list[Observation], model: SkyModel, progress: Progress | None
 ) -> list[list[date]]:
     """UTC dates of the photographs by season; days that lie within one season by the albedo that each gives alone."""
-    from seasonscapes.albedo.photographs import prepare_photographs
     from seasonscapes.albedo.season_grouping import group_dates
     from seasonscapes.albedo.standard_error import albedo_estimate
 
     days = sorted({each.time.date() for each in photographs})
     if len(days) < 2:
         return [days]
-    seen = with_terrain(transport, photographs)
     # Prepared together, since photographs of one camera share their footprints.
-    prepared = prepare_photographs(
-        transport, seen, illuminations(place, seen, photograph_skies(place, transport, seen, model))
-    )
-    days = sorted({each.time.date() for each in seen})
+    prepared = photographs_of_ground(place, transport, photographs, model)[0]
     known: list[date] = []
     estimates: list[AlbedoEstimate] = []
     doubts: dict[date, str] = {}
     for day in each_reported(days, len(days), progress, "albedo of each day"):
         own = [each for each in prepared if each.observation.time.date() == day]
+        if not own:
+            doubts[day] = "it shows no ground"
+            continue
         try:
             estimates.append(albedo_estimate(transport, own, closed_fit(transport, own)))
         except (NotEnoughEvidence, NoUsablePixels) as error:
