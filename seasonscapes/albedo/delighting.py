@@ -21,6 +21,7 @@ from scipy.ndimage import shift as spline_shift
 
 from seasonscapes.albedo.adjacency import Surroundings, without_surroundings
 from seasonscapes.albedo.closed_form import HIGHEST, LOWEST
+from seasonscapes.albedo.ground_above import GroundAbove
 from seasonscapes.albedo.land_response import class_illuminance, land_classes
 from seasonscapes.albedo.registration import shifted_back, texture_shift
 from seasonscapes.albedo.shadow_borders import BorderModel, refined_visibility
@@ -107,6 +108,9 @@ class DelightOptions:
         ``None`` treats all land as Lambertian.
     fit_where
         ``(R, S)`` bool: texels at which those responses are fitted; all if ``None``.
+    ground
+        Snow, forest and water as an image from straight above sees them; ``None`` treats them as Lambertian. The response
+        of classes of land, where they are given, takes the place of that of snow and forest.
     light_error, slope_error
         Relative error of the modelled light, and standard error of the cosine of incidence, for σ.
     quantum
@@ -122,6 +126,7 @@ class DelightOptions:
     rounds: int = 3
     land_class: np.ndarray | int | None = None
     fit_where: np.ndarray | None = None
+    ground: GroundAbove | None = None
     light_error: float = 0.05
     slope_error: float = SLOPE_ERROR
     quantum: float | None = None
@@ -243,7 +248,13 @@ def _moved_options(options: DelightOptions, shift: tuple[float, float]) -> Delig
         options,
         land_class=_moved(kind, shift).astype(int) if isinstance(kind, np.ndarray) else kind,
         fit_where=None if where is None else _moved(where, shift) > 0.5,
+        ground=None if options.ground is None else _moved_ground(options.ground, shift),
     )
+
+
+def _moved_ground(ground: GroundAbove, shift: tuple[float, float]) -> GroundAbove:
+    water = None if ground.water is None else _moved(ground.water, shift, order=1)
+    return replace(ground, normal=_moved(ground.normal, shift), water=water)
 
 
 def _moved_light(light: TexelIrradiance, shift: tuple[float, float]) -> TexelIrradiance:
@@ -292,6 +303,8 @@ def _delit(
     chart = np.where(known, light.chart, -1)
     scale = _radiance_per_unit(options, light)
     radiance = _at_surface(np.nan_to_num(image) * scale, options.air, known)
+    if options.ground is not None:
+        radiance = options.ground.lambertian_radiance(radiance)
     visibility, deviation = light.visibility.astype(np.float32), np.zeros(chart.shape, np.float32)
     factor, bounce = np.ones(3), light.bounce(_grey(light.sun.shape))
     sunlight = illuminance = visibility[..., None] * light.sun
@@ -325,6 +338,10 @@ def _delit(
         ambient = illuminance - sunlight
         illuminance, exponents = class_illuminance(radiance, light.sun, visibility, ambient, kind, options.fit_where)
         albedo = np.clip(np.pi * radiance / illuminance, LOWEST, HIGHEST).astype(np.float32)
+    elif options.ground is not None:
+        illuminance = options.ground.illuminance(radiance, sunlight, illuminance - sunlight)
+        albedo = np.clip(np.pi * radiance / np.maximum(illuminance, 1e-3), LOWEST, HIGHEST).astype(np.float32)
+        albedo[~known] = _GREY
     albedo = _completed(albedo, clipped & known[..., None], known)
     sigma = _standard_error(albedo, image, light, sunlight, illuminance, deviation, options)
     lost = clipped.any(axis=2) & known

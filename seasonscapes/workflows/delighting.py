@@ -24,6 +24,7 @@ from seasonscapes.workflows.terrain_building import sample_spacing_m
 if TYPE_CHECKING:
     from seasonscapes.albedo.adjacency import Surroundings
     from seasonscapes.albedo.delighting import Air, DelitImage, TexelIrradiance
+    from seasonscapes.albedo.ground_above import GroundAbove
     from seasonscapes.albedo.sun_search import FoundSun
     from seasonscapes.sky.illumination import Illumination
 
@@ -218,6 +219,7 @@ def delit_imagery(
         # A texture of another layout than the plan has no single shift.
         register=place.atlas.kind == "planar",
         land_class=land_classes or None,
+        ground=_ground_above(place, light),
     )
     values = np.where(pixels.weight[..., None] > 0.0, pixels.values, np.float32(np.nan))
     report = task_progress(progress, "removing the light")
@@ -297,6 +299,33 @@ def _texel_light(
         )
     transport = trace_texel_transport(place.terrain, place.texture_shape, sampling=sampling, progress=report)
     return texel_irradiance(transport, light, slope_error=slope_error)
+
+
+def _ground_above(place: Place, light: Illumination) -> GroundAbove | None:
+    """Snow, forest and water that the scene file declares, as an image from above sees them."""
+    from seasonscapes.albedo.ground_above import GroundAbove
+    from seasonscapes.rendering.ground_optics import optics_of
+    from seasonscapes.terrain.texels import texel_positions
+
+    terrain = place.terrain
+    optics = optics_of(terrain)
+    if optics is None and terrain.water is None:
+        return None
+    positions, face = texel_positions(terrain, place.atlas.width_px, place.atlas.height_px)
+    normal, on_surface = np.full(positions.shape, np.nan, np.float32), face >= 0
+    if terrain.surface is not None:
+        normal[on_surface] = terrain.surface.sample(positions[on_surface])[1]
+    else:
+        corners = terrain.vertices[terrain.faces[face[on_surface]]].astype(np.float64)
+        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normal[on_surface] = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
+    return GroundAbove(
+        optics,
+        normal,
+        np.array([0.0, 0.0, 1.0]) if light.sun is None else np.asarray(light.sun.direction, float),
+        None if terrain.water is None else terrain.water.mask,
+        light.sky_radiance[0].mean(axis=0),
+    )
 
 
 def _traced_every(place: Place) -> int:
