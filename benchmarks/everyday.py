@@ -141,12 +141,15 @@ def film(bench: Bench, hours: int | None) -> dict[str, float]:
         minutes, count = year.wall_s / 60.0, total_hours
         frame_s = year.processor_s / total_hours
     else:
-        # One film of 2 h and one of ``hours`` h more, spread over the year: their difference is the cost of a frame.
-        base = frames("2024-01-01T00:00", "2024-12-31T00:00", "365d", "base")
-        year = frames("2024-01-02T01:00", "2024-12-30T00:00", f"{total_hours // hours}h", "sample")
+        # Hours spread over the year make what a year needs: albedos of all dates, light of all solar elevations. As many
+        # other hours then cost frames alone, but for what two frames cost.
+        every = f"{total_hours // hours}h"
+        first = frames("2024-01-02T01:00", "2024-12-30T00:00", every, "sample")
+        two = frames("2024-01-01T00:00", "2024-12-31T00:00", "365d", "two")
+        other = frames("2024-01-03T02:00", "2024-12-31T01:00", every, "other")
         count = hours
-        minutes = (base.wall_s + (year.wall_s - base.wall_s) / hours * total_hours) / 60.0
-        frame_s = (year.processor_s - base.processor_s) / hours
+        frame_s = (other.processor_s - two.processor_s) / (hours - 2)
+        minutes = (first.wall_s + (other.wall_s - two.wall_s) / (hours - 2) * (total_hours - hours)) / 60.0
     return {
         "film_ready_s": ready.processor_s,
         "film_ready_wall_s": ready.wall_s,
