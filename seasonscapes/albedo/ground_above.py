@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from seasonscapes.rendering.ground_optics import NUMPY, GroundOptics
+from seasonscapes.rendering.ground_optics import GroundOptics
 from seasonscapes.rendering.water_surface import fresnel_reflectance
 
 # The factor of snow depends on its albedo; each round is ten times nearer.
@@ -67,9 +67,8 @@ class GroundAbove:
         up, into = np.nan_to_num(self.normal @ _UP, nan=1.0), np.nan_to_num(self.normal @ self.to_sun, nan=1.0)
         cosines = (up.ravel(), into.ravel(), np.full(up.size, float(_UP @ self.to_sun)))
         for _ in range(_ROUNDS):
-            albedo = np.clip(np.pi * radiance / np.maximum(total, 1e-3), 1e-3, 1.0)
-            channels = list(albedo.reshape(-1, 3).T)
-            direct = np.stack(self.optics.relative(channels, cosines, NUMPY), axis=1).reshape(*shape, 3)
-            diffuse = np.stack(self.optics.relative_diffuse(channels, cosines[0]), axis=1).reshape(*shape, 3)
+            albedo = np.clip(np.pi * radiance / np.maximum(total, 1e-3), 1e-3, 1.0).reshape(-1, 3)
+            direct = self.optics.relative_rows(albedo, cosines).reshape(*shape, 3)
+            diffuse = self.optics.relative_diffuse_rows(albedo, cosines[0]).reshape(*shape, 3)
             total = (sunlight * direct + ambient * diffuse).astype(np.float32)
         return total

@@ -15,7 +15,7 @@ import numpy as np
 from seasonscapes.albedo.forward_model import TexelTransport
 from seasonscapes.albedo.photographs import AlbedoPhotograph, kept_pixels
 from seasonscapes.errors import NoUsablePixels
-from seasonscapes.rendering.ground_optics import NUMPY, GroundOptics
+from seasonscapes.rendering.ground_optics import GroundOptics
 from seasonscapes.rendering.receivers import luminaries
 from seasonscapes.rendering.terrain_material import ground_optics
 
@@ -62,14 +62,13 @@ class GroundPixels:
         """Factors under an albedo ``(R·S, 3)``."""
         footprints = self.photograph.footprints
         mean = footprints.matrix(footprints.share) @ albedo / np.maximum(footprints.coverage, 1e-3)[:, None]
-        channels, out = list(mean.T), np.einsum("nk,nk->n", self.normal, self.viewer)
+        out = np.einsum("nk,nk->n", self.normal, self.viewer)
         direct = []
         for body in luminaries(self.photograph.light):
             light = np.asarray(body.direction, np.float32)
             cosines = (out, self.normal @ light, self.viewer @ light)
-            direct.append(np.stack(self.optics.relative(channels, cosines, NUMPY), axis=1).astype(np.float32))
-        diffuse = np.stack(self.optics.relative_diffuse(channels, out), axis=1).astype(np.float32)
-        return GroundFactors(diffuse, direct)
+            direct.append(self.optics.relative_rows(mean, cosines))
+        return GroundFactors(self.optics.relative_diffuse_rows(mean, out), direct)
 
 
 def ground_pixels(transport: TexelTransport, photograph: AlbedoPhotograph) -> GroundPixels | None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from seasonscapes.rendering.forest_scattering import ForestOptics
 from seasonscapes.rendering.snow_scattering import NumpyMaths, SnowOptics
 from seasonscapes.terrain.surface import Terrain
@@ -31,6 +33,14 @@ class GroundOptics:
     def relative_diffuse(self, albedo: Any, cosine_out: Any) -> list[Any]:
         """Reflectance towards the viewer of diffuse light, divided by the albedo."""
         return self._total([part.relative_diffuse(albedo, cosine_out) for part in self._parts])
+
+    def relative_rows(self, albedo: np.ndarray, cosines: tuple[Any, Any, Any]) -> np.ndarray:
+        """`relative` of albedos ``(n, 3)`` in NumPy, ``(n, 3)`` float32."""
+        return np.stack(self.relative(list(albedo.T), cosines, NUMPY), axis=1).astype(np.float32)
+
+    def relative_diffuse_rows(self, albedo: np.ndarray, cosine_out: np.ndarray) -> np.ndarray:
+        """`relative_diffuse` of albedos ``(n, 3)`` in NumPy, ``(n, 3)`` float32."""
+        return np.stack(self.relative_diffuse(list(albedo.T), cosine_out), axis=1).astype(np.float32)
 
     @staticmethod
     def _total(parts: list[list[Any]]) -> list[Any]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from seasonscapes.rendering.backend import point3
 from seasonscapes.rendering.hemisphere_rays import ABSORBED, ESCAPED, LANES, RayScene, SurfacePoints
-from seasonscapes.rendering.sky_patches import SkyPatches
+from seasonscapes.rendering.sky_patches import SkyPatches, patch_sums
 from seasonscapes.rendering.sobol import hash_to_unit, hashed, uniform
 from seasonscapes.rendering.terrain_material import device_surface
 
@@ -287,8 +287,6 @@ def _integrals(
     table: np.ndarray, azimuths: int, azimuth: np.ndarray, horizon: np.ndarray, along: np.ndarray, upward: np.ndarray
 ) -> np.ndarray:
     """Sums ``(N, r + 1)`` over the azimuths of tabulated integrals above horizons, linear between tabulated elevations."""
-    from scipy import sparse
-
     columns, elevations = round(360.0 / _AZIMUTH_DEG), round(180.0 / _ELEVATION_DEG) + 1
     column = np.minimum((azimuth * np.float32(np.degrees(1.0) / _AZIMUTH_DEG)).astype(np.int32), columns - 1)
     place = (horizon * np.float32(np.degrees(1.0)) + np.float32(90.0)) / np.float32(_ELEVATION_DEG)
@@ -296,5 +294,4 @@ def _integrals(
     share = place - lower
     index = ((column * elevations + lower) * 2)[:, None] + np.arange(4, dtype=np.int32)
     weight = np.stack([along * (1.0 - share), upward * (1.0 - share), along * share, upward * share], axis=1)
-    start = np.arange(0, weight.size + 1, 4 * azimuths, dtype=np.int32)
-    return sparse.csr_array((weight.ravel(), index.ravel(), start), shape=(len(start) - 1, len(table))) @ table
+    return patch_sums(index.reshape(-1, 4 * azimuths), weight.reshape(-1, 4 * azimuths), table)

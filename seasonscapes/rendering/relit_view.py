@@ -13,7 +13,7 @@ import numpy as np
 from seasonscapes.rendering.air_grid import AirGrid, SkyGrid, air_grid, interpolate_air, sky_grid, sky_pixel_radiance
 from seasonscapes.rendering.coefficients import ViewCoefficients
 from seasonscapes.rendering.gbuffer import GBuffer, trace_gbuffer
-from seasonscapes.rendering.ground_optics import NUMPY, GroundOptics
+from seasonscapes.rendering.ground_optics import GroundOptics
 from seasonscapes.rendering.hemisphere_rays import RayScene, albedo_at
 from seasonscapes.rendering.mirrored_light import DeviceMirror, mirrored_radiance, upload_mirror
 from seasonscapes.rendering.mitsuba_scene import RenderScene
@@ -291,7 +291,7 @@ class _GroundPixels:
     def __init__(self, view: RelightableView, optics: GroundOptics) -> None:
         coefficients = view.coefficients
         self._optics = optics
-        self._albedo = list((coefficients.albedo / np.maximum(coefficients.coverage[:, None], 1e-3)).T)
+        self._albedo = coefficients.albedo / np.maximum(coefficients.coverage[:, None], 1e-3)
         normal = coefficients.normal
         self._normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-6)
         # Samples on terrain come first.
@@ -300,14 +300,13 @@ class _GroundPixels:
         self._cosine = np.einsum("nk,nk->n", self._normal, self._viewer)
 
     def of_diffuse_light(self) -> np.ndarray:
-        return np.stack(self._optics.relative_diffuse(self._albedo, self._cosine), axis=1).astype(np.float32)
+        return self._optics.relative_diffuse_rows(self._albedo, self._cosine)
 
     def of_luminary(self, body: Luminary, lit_cosine: np.ndarray) -> np.ndarray:
         light = np.asarray(body.direction, np.float32)
         # On rims the mean normal may face away from a light that some samples face: it would be as bright as grazing snow.
         incident = np.maximum(self._normal @ light, lit_cosine)
-        cosines = (self._cosine, incident, self._viewer @ light)
-        return np.stack(self._optics.relative(self._albedo, cosines, NUMPY), axis=1).astype(np.float32)
+        return self._optics.relative_rows(self._albedo, (self._cosine, incident, self._viewer @ light))
 
 
 def sun_cosine(view: RelightableView, luminary: Luminary) -> np.ndarray:

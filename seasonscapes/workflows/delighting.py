@@ -306,6 +306,7 @@ def _ground_above(place: Place, light: Illumination) -> GroundAbove | None:
     from seasonscapes.albedo.ground_above import GroundAbove
     from seasonscapes.rendering.ground_optics import optics_of
     from seasonscapes.terrain.texels import texel_positions
+    from seasonscapes.terrain.textured_mesh import face_normals
 
     terrain = place.terrain
     optics = optics_of(terrain)
@@ -317,8 +318,7 @@ def _ground_above(place: Place, light: Illumination) -> GroundAbove | None:
         normal[on_surface] = terrain.surface.sample(positions[on_surface])[1]
     else:
         corners = terrain.vertices[terrain.faces[face[on_surface]]].astype(np.float64)
-        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normal[on_surface] = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
+        normal[on_surface] = face_normals(corners)[0]
     return GroundAbove(
         optics,
         normal,
