@@ -20,7 +20,7 @@ from seasonscapes.civil_time import parse_time_text
 from seasonscapes.declaration import MOST_NAME_CHARACTERS, Declaration, InputError, Name, Text, read_declaration
 from seasonscapes.frames import STANDARD_REFRACTION_K, Latitude, LocalFrame, Longitude
 from seasonscapes.terrain.raster_files import OWN_FOLDER, Confinement, confined_path, rasters_hash
-from seasonscapes.terrain.raster_tables import Encoding, FinerHeights, FinerImage, HeightUnit, RasterFiles
+from seasonscapes.terrain.raster_tables import FinerHeights, FinerImage, HeightFiles, ImageFiles, RasterFiles
 from seasonscapes.terrain.surface_tables import ForestTable, SnowTable, WaterTable
 from seasonscapes.terrain.tile_files import named_tiles
 
@@ -111,17 +111,11 @@ class SyntheticElevation(Declaration):
         return self
 
 
-class Elevation(RasterFiles):
+class Elevation(HeightFiles):
     """Elevation raster: a file, tiles, or synthetic terrain.
 
     Parameters
     ----------
-    band
-        Band of the file, counted from 1; may be left out where there is one.
-    unit
-        Unit of the file's heights; left out, the one that the file declares, else metres.
-    nodata
-        Value of the file that means no data, besides what it declares.
     synthetic
         Synthetic terrain in place of files.
     max_hole_share
@@ -130,9 +124,6 @@ class Elevation(RasterFiles):
         Array of tables ``[[elevation.finer]]``: finer heights of parts of it.
     """
 
-    band: int | None = Field(default=None, ge=1)
-    unit: HeightUnit | None = None
-    nodata: float | None = None
     synthetic: SyntheticElevation | None = None
     max_hole_share: float = Field(default=0.25, ge=0.0, le=1.0)
     finer: list[FinerHeights] = Field(default_factory=list, max_length=20)
@@ -167,18 +158,11 @@ def _time_text(value: str) -> str:
     return value
 
 
-class Imagery(RasterFiles):
+class Imagery(ImageFiles):
     """Colour image of the ground that is used as its albedo; several ``[[imagery]]`` are images of several dates.
 
     Parameters
     ----------
-    encoding
-        Transfer function of the pixel values.
-    full_scale
-        Value that corresponds to 1, after the file's own scale and offset. Left out, it is 1 for floating-point numbers
-        and where the file has a scale, else 255.
-    bands
-        Red, green and blue bands of the file, counted from 1; left out, those that the file marks.
     reflectance_scale
         Reflectance of a white pixel. Display images are contrast-stretched, so that their white is not a reflectance
         of 1; 0.5 brings the meadows and rock of an Alpine mosaic to the reflectances of field spectra. Of an image whose
@@ -205,9 +189,6 @@ class Imagery(RasterFiles):
         Array of tables ``[[imagery.finer]]``: finer images of parts of it.
     """
 
-    encoding: Encoding = "srgb"
-    full_scale: float | None = Field(default=None, gt=0.0)
-    bands: list[int] | None = Field(default=None, min_length=1, max_length=3)
     reflectance_scale: float = Field(default=0.5, gt=0.0, le=2.0)
     time: Annotated[str, BeforeValidator(_iso_text), AfterValidator(_time_text)] | None = None
     date: Annotated[str, BeforeValidator(_iso_text), AfterValidator(_iso_date)] | None = None

@@ -59,18 +59,8 @@ class RasterFiles(Declaration):
         return self.model_copy(update=update)
 
 
-class _Part(RasterFiles):
-    """A finer raster of a part of another one."""
-
-    @model_validator(mode="after")
-    def _one_raster(self) -> _Part:
-        if (self.file is None) == (self.files is None):
-            raise ValueError("give either 'file', or the tiles of a raster as 'files'")
-        return self
-
-
-class FinerHeights(_Part):
-    """Finer heights of a part of the elevation raster, blended into it along their border.
+class HeightFiles(RasterFiles):
+    """Heights in files.
 
     Parameters
     ----------
@@ -80,18 +70,15 @@ class FinerHeights(_Part):
         Unit of the file's heights; left out, the one that the file declares, else metres.
     nodata
         Value of the file that means no data, besides what it declares.
-    offset_m
-        What is added to these heights to bring them to the datum of the elevation raster [m].
     """
 
     band: int | None = Field(default=None, ge=1)
     unit: HeightUnit | None = None
     nodata: float | None = None
-    offset_m: float = Field(default=0.0, ge=-200.0, le=200.0)
 
 
-class FinerImage(_Part):
-    """Finer image of a part of the ground, whose detail is laid over the albedo in the pictures of cameras near it.
+class ImageFiles(RasterFiles):
+    """A colour image in files.
 
     Parameters
     ----------
@@ -107,3 +94,29 @@ class FinerImage(_Part):
     encoding: Encoding = "srgb"
     full_scale: float | None = Field(default=None, gt=0.0)
     bands: list[int] | None = Field(default=None, min_length=1, max_length=3)
+
+
+class _Part(RasterFiles):
+    """A finer raster of a part of another one."""
+
+    @model_validator(mode="after")
+    def _one_raster(self) -> _Part:
+        if (self.file is None) == (self.files is None):
+            raise ValueError("give either 'file', or the tiles of a raster as 'files'")
+        return self
+
+
+class FinerHeights(HeightFiles, _Part):
+    """Finer heights of a part of the elevation raster, blended into it along their border.
+
+    Parameters
+    ----------
+    offset_m
+        What is added to these heights to bring them to the datum of the elevation raster [m].
+    """
+
+    offset_m: float = Field(default=0.0, ge=-200.0, le=200.0)
+
+
+class FinerImage(ImageFiles, _Part):
+    """Finer image of a part of the ground, whose detail is laid over the albedo in the pictures of cameras near it."""

@@ -322,6 +322,17 @@ def require_atlas(texture: Texture, atlas_id: str, shape: tuple[int, int], *, wh
         )
 
 
+def raster_arrays(raster: Raster) -> dict[str, Any]:
+    """A raster as arrays to store."""
+    return {"values": raster.values, "transform": np.array(tuple(raster.transform)[:6]), "crs": raster.crs}
+
+
+def raster_from_arrays(stored: Any) -> Raster:
+    """The raster of `raster_arrays`."""
+    transform = Affine(*(float(value) for value in stored["transform"]))
+    return Raster(stored["values"], transform, str(stored["crs"]))
+
+
 def surface_arrays(surface: SurfaceGrid, prefix: str = "") -> dict[str, Any]:
     """A surface without its parts as arrays to store."""
     return {

@@ -138,6 +138,22 @@ def tile_spacing_m(paths: Sequence[str], confinement: Confinement = OWN_FOLDER) 
     return min(float(np.mean(cell_sides_m(raster_grid(path, confinement)))) for path in paths)
 
 
+def bounds_about(latitude_deg: float, longitude_deg: float, reach_m: float) -> Bounds:
+    """Bounds [deg] that reach so far to all sides of a place [m]."""
+    down = reach_m / METRES_PER_DEGREE
+    across = down / max(math.cos(math.radians(latitude_deg)), 0.01)
+    return longitude_deg - across, latitude_deg - down, longitude_deg + across, latitude_deg + down
+
+
+def covered_size_m(paths: Sequence[str], bounds_deg: Bounds, confinement: Confinement = OWN_FOLDER) -> np.ndarray:
+    """Extent ``(2,)`` from west to east and from south to north of what tiles cover of bounds [m]."""
+    boxes = np.array([bounds_geographic(raster_grid(path, confinement)) for path in paths])
+    west, south = np.maximum(boxes[:, :2].min(axis=0), bounds_deg[:2])
+    east, north = np.minimum(boxes[:, 2:].max(axis=0), bounds_deg[2:])
+    metres = METRES_PER_DEGREE * np.array([math.cos(math.radians(0.5 * (south + north))), 1.0])
+    return np.array([east - west, north - south]) * metres
+
+
 def tiles_reach_into(paths: Sequence[str], bounds_deg: Bounds, confinement: Confinement = OWN_FOLDER) -> bool:
     """Whether any of the tiles reaches into bounds by two pixels or more."""
     grids = [raster_grid(path, confinement) for path in paths]

@@ -19,12 +19,13 @@ from seasonscapes.terrain.nested_heights import (
     tell_offset,
 )
 from seasonscapes.terrain.placement import cell_sides_m
-from seasonscapes.terrain.raster import bounds_geographic, raster_grid
+from seasonscapes.terrain.raster import bounds_geographic
 from seasonscapes.terrain.raster_files import rasters_hash
-from seasonscapes.terrain.surface import Raster
+from seasonscapes.terrain.surface import Raster, raster_arrays, raster_from_arrays
 from seasonscapes.terrain.tile_files import (
-    METRES_PER_DEGREE,
     Bounds,
+    bounds_about,
+    covered_size_m,
     read_elevation_tiles,
     tile_spacing_m,
     tiles_reach_into,
@@ -135,9 +136,7 @@ def finest_near(place: Place, eye_m: np.ndarray, reach_m: float, *, most_samples
     under = (*reversed(place.finer_heights[:number]), place.elevation)
     latitude, longitude, _ = (float(value) for value in geodetic_from_enu(place.frame, eye_m))
     reach_m = min(reach_m + reach_of_border_m(kept, under), 0.5 * math.sqrt(most_samples) * spacing_m)
-    down = reach_m / METRES_PER_DEGREE
-    across = down / max(math.cos(math.radians(latitude)), 0.01)
-    bounds_deg = longitude - across, latitude - down, longitude + across, latitude + down
+    bounds_deg = bounds_about(latitude, longitude, reach_m)
     if not tiles_reach_into(declared.paths, bounds_deg, place.scene.confinement):
         return number, kept
     # The whole part was accepted: a window of it may hold a hole, or ground that has changed.
@@ -171,11 +170,8 @@ def _read(scene: SceneFile, declared: FinerHeights, bounds_deg: Bounds, finest_m
 def _finest_m(scene: SceneFile, declared: FinerHeights, bounds_deg: Bounds) -> float:
     """Whole number of samples whose mean is kept, as a length [m]."""
     spacing_m = tile_spacing_m(declared.paths, scene.confinement)
-    boxes = np.array([bounds_geographic(raster_grid(path, scene.confinement)) for path in declared.paths])
-    west, south = np.maximum(boxes[:, :2].min(axis=0), bounds_deg[:2])
-    east, north = np.minimum(boxes[:, 2:].max(axis=0), bounds_deg[2:])
-    metres = METRES_PER_DEGREE * np.array([math.cos(math.radians(0.5 * (south + north))), 1.0])
-    area_m2 = float(np.prod(np.maximum(np.array([east - west, north - south]) * metres, spacing_m)))
+    sides_m = covered_size_m(declared.paths, bounds_deg, scene.confinement)
+    area_m2 = float(np.prod(np.maximum(sides_m, spacing_m)))
     return spacing_m * math.ceil(math.sqrt(area_m2 / _MOST_SAMPLES) / spacing_m - 1e-6)
 
 
@@ -209,19 +205,9 @@ def _with_level_ground(heights: Raster, kept: Raster) -> Raster:
 
 def _save(built: _Built, path: Path) -> None:
     raster, offset = built
-    np.savez(
-        path,
-        values=raster.values,
-        transform=np.array(tuple(raster.transform)[:6]),
-        crs=raster.crs,
-        offset=[offset.median_m, offset.spread_m],
-    )
+    np.savez(path, **raster_arrays(raster), offset=[offset.median_m, offset.spread_m])
 
 
 def _load(path: Path) -> _Built:
-    from affine import Affine
-
     with np.load(path, allow_pickle=False) as stored:
-        transform = Affine(*(float(value) for value in stored["transform"]))
-        raster = Raster(stored["values"], transform, str(stored["crs"]))
-        return raster, HeightOffset(*(float(value) for value in stored["offset"]))
+        return raster_from_arrays(stored), HeightOffset(*(float(value) for value in stored["offset"]))

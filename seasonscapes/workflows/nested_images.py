@@ -12,12 +12,12 @@ import numpy as np
 from seasonscapes.frames import geodetic_from_enu
 from seasonscapes.terrain.imagery import bake_imagery, read_imagery
 from seasonscapes.terrain.placement import cell_sides_m
-from seasonscapes.terrain.raster import bounds_geographic, raster_grid
+from seasonscapes.terrain.raster import bounds_geographic
 from seasonscapes.terrain.raster_files import rasters_hash
-from seasonscapes.terrain.surface import Raster, Texture
+from seasonscapes.terrain.surface import Raster, Texture, raster_arrays, raster_from_arrays
 from seasonscapes.terrain.surface_classes import ImageDetail, ImageLevel
 from seasonscapes.terrain.surface_grid import grid_polynomials
-from seasonscapes.terrain.tile_files import METRES_PER_DEGREE, Bounds, tile_spacing_m, tiles_reach_into
+from seasonscapes.terrain.tile_files import Bounds, bounds_about, covered_size_m, tile_spacing_m, tiles_reach_into
 from seasonscapes.workspace import build_once
 
 if TYPE_CHECKING:
@@ -112,9 +112,10 @@ def _detail(place: Place, declared: FinerImage, eye_m: np.ndarray) -> ImageDetai
     levels = [_level(place, whole.raster, _border_share(place, whole.raster, known), rim_nodes=1.0)]
     spacing_m = tile_spacing_m(declared.paths, place.scene.confinement)
     step = _whole_step(place, declared)
+    latitude, longitude, _ = (float(value) for value in geodetic_from_enu(place.frame, eye_m))
     while step > 1:
         step = -(-step // 2)
-        bounds_deg = _window(place, eye_m, 0.5 * _MOST_SIDE * step * spacing_m)
+        bounds_deg = bounds_about(latitude, longitude, 0.5 * _MOST_SIDE * step * spacing_m)
         reached = tiles_reach_into(declared.paths, bounds_deg, place.scene.confinement)
         if reached and _overlaps(bounds_geographic(whole.raster), bounds_deg):
             window = _read(place, declared, bounds_deg, step * spacing_m, window=True)
@@ -126,11 +127,7 @@ def _detail(place: Place, declared: FinerImage, eye_m: np.ndarray) -> ImageDetai
 def _whole_step(place: Place, declared: FinerImage) -> int:
     """Pixels of the image along a pixel of its widest level."""
     bounds_deg = bounds_geographic(place.elevation)
-    boxes = np.array([bounds_geographic(raster_grid(path, place.scene.confinement)) for path in declared.paths])
-    west, south = np.maximum(boxes[:, :2].min(axis=0), bounds_deg[:2])
-    east, north = np.minimum(boxes[:, 2:].max(axis=0), bounds_deg[2:])
-    width_m = (east - west) * METRES_PER_DEGREE * math.cos(math.radians(0.5 * (south + north)))
-    side_m = max(width_m, (north - south) * METRES_PER_DEGREE)
+    side_m = float(covered_size_m(declared.paths, bounds_deg, place.scene.confinement).max())
     return max(1, math.ceil(side_m / (_MOST_SIDE * tile_spacing_m(declared.paths, place.scene.confinement)) - 1e-2))
 
 
@@ -145,13 +142,6 @@ def _read(place: Place, declared: FinerImage, bounds_deg: Bounds, finest_m: floa
         confinement=place.scene.confinement,
         window=window,
     )
-
-
-def _window(place: Place, eye_m: np.ndarray, reach_m: float) -> Bounds:
-    latitude, longitude, _ = (float(value) for value in geodetic_from_enu(place.frame, eye_m))
-    down = reach_m / METRES_PER_DEGREE
-    across = down / max(math.cos(math.radians(latitude)), 0.01)
-    return longitude - across, latitude - down, longitude + across, latitude + down
 
 
 def _overlaps(image_deg: Bounds, window_deg: Bounds) -> bool:
@@ -192,22 +182,13 @@ def _level(place: Place, raster: Raster, share: np.ndarray, *, rim_nodes: float)
 
 
 def _save(image: WholeImage, path: Path) -> None:
-    raster = image.raster
-    np.savez(
-        path,
-        values=raster.values.astype(np.float16),
-        transform=np.array(tuple(raster.transform)[:6]),
-        crs=raster.crs,
-        mean=image.mean.values,
-        weight=image.mean.weight,
-        atlas_id=str(image.mean.atlas_id),
-    )
+    raster = replace(image.raster, values=image.raster.values.astype(np.float16))
+    mean = {"mean": image.mean.values, "weight": image.mean.weight, "atlas_id": str(image.mean.atlas_id)}
+    np.savez(path, **raster_arrays(raster), **mean)
 
 
 def _load(path: Path) -> WholeImage:
-    from affine import Affine
-
     with np.load(path, allow_pickle=False) as stored:
-        transform = Affine(*(float(value) for value in stored["transform"]))
-        raster = Raster(stored["values"], transform, str(stored["crs"]))
-        return WholeImage(raster, Texture(stored["mean"], stored["weight"], str(stored["atlas_id"])))
+        return WholeImage(
+            raster_from_arrays(stored), Texture(stored["mean"], stored["weight"], str(stored["atlas_id"]))
+        )
