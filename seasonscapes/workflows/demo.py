@@ -76,7 +76,8 @@ def day_and_year(
 ) -> list[Path]:
     """Relight one view on a June evening, and through a day, four seasons and four airs as two contact sheets.
 
-    The ground has detail below the resolution of the data. Panels that exist already, made from the same inputs by the same code, are kept.
+    The ground has detail below the resolution of the data. Panels that exist already, made from the same inputs by the same
+    code, are kept.
 
     Parameters
     ----------

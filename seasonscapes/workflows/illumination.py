@@ -381,7 +381,7 @@ def tabulate_illumination(
     if not times or not isinstance(model, AtmosphereModel):
         return
     tables = atmosphere_tables_in(place.workspace, by_elevation=True)(atmosphere_from_model(model))
-    diffuse_of = _diffuse_in(place.workspace, tables)
+    assert tables.diffuse_of is not None
     apparent_deg = []
     for position in (position_at(place, time) for time in times):
         moon = significant_moon(position.sun, position.moon)
@@ -389,7 +389,8 @@ def tabulate_illumination(
     camera_m, wanted = camera_geodetic(place, camera)[2], []
     for height_m, near in ((place.median_height_m, False), (camera_m, False), (camera_m, True)):
         true_rad = np.radians(true_elevation_deg(tables.atmosphere, np.array(apparent_deg), height_m))
-        table = diffuse_of(observer_view(tables, height_m).height_m, near)
+        table = tables.diffuse_of(observer_view(tables, height_m).height_m, near)
+        assert isinstance(table, PartedTable)
         wanted += [(table, part) for part in sorted({part for each in true_rad for part in parts_at(each)})]
     for number, (table, part) in enumerate(wanted):
         table.part(part)

@@ -55,8 +55,6 @@ FRAME_CODE = ("workflows.relight_session", "relighting.frame_file")
 # coefficients average over patches of 7°, and the sky behind the terrain is evaluated by the atmosphere model itself.
 _CLOUDY_ROWS, _CLEAR_ROWS = 128, 64
 _MIDSUMMER = date(2024, 7, 1)
-# What the content of textures begins with that hold times of transition.
-_TURNING = "turning:"
 
 
 @dataclass(frozen=True)
@@ -430,11 +428,11 @@ def _interpolated(session: RelightSession, weights: list[tuple[int, float]], day
         ]
         return [reduce(operator.add, terms) for terms in scaled]
     pair = [session.albedo.dated[index] for index, _ in weights]
-    name = f"{_TURNING}{pair[0].content}:{pair[1].content}"
+    name = f"turning:{pair[0].content}:{pair[1].content}"
     if name not in session._transitions:
         # The time of transition is a texture like any other, and averaged over pixels like an albedo.
         transition = DatedAlbedo(pair[0].day, name, lambda: snow_transition_between(session.place, *pair))
-        pixels, clusters, *mirrored = _view_albedo(session, transition)
+        pixels, clusters, *mirrored = _view_albedo(session, transition, colours=False)
         coverage = np.maximum(session.coefficients.coverage[:, None], 1e-3)
         mirror = session.coefficients.mirror
         if mirror is not None:
@@ -447,10 +445,10 @@ def _interpolated(session: RelightSession, weights: list[tuple[int, float]], day
     ]
 
 
-def _view_albedo(session: RelightSession, dated: DatedAlbedo) -> tuple[np.ndarray, ...]:
+def _view_albedo(session: RelightSession, dated: DatedAlbedo, *, colours: bool = True) -> tuple[np.ndarray, ...]:
     """Mean albedo of the view's pixels, of its light clusters and, with water, of what it mirrors, for a dated texture.
 
-    Kept in the workspace. The coefficients hold those of the texture that they were traced with.
+    Without ``colours`` the texture holds something else, which is averaged as it is: detail belongs to colours. Kept in the workspace. The coefficients hold those of the texture that they were traced with.
     """
     from seasonscapes.rendering.mitsuba_scene import set_albedo
     from seasonscapes.rendering.relit_view import cluster_albedo, mirrored_albedo
@@ -466,7 +464,7 @@ def _view_albedo(session: RelightSession, dated: DatedAlbedo) -> tuple[np.ndarra
         set_albedo(session.ray_scene, dated.load().values)
         of_view = (view_albedo, cluster_albedo, mirrored_albedo)
         material = session.ray_scene.mi_terrain.bsdf()
-        with bare_texture(material) if dated.content.startswith(_TURNING) else nullcontext():
+        with nullcontext() if colours else bare_texture(material):
             albedos = [albedo(session.ray_scene, session.coefficients) for albedo in of_view]
         return tuple(albedo.astype(np.float16) for albedo in albedos if albedo is not None)
 
