@@ -74,6 +74,8 @@ _MODULES = {
     "differentiable_scene": "workflows.differentiable",
     "camera_hours": "workflows.unseen_hours",
     "CameraHours": "workflows.unseen_hours",
+    "picture_clocks": "workflows.picture_clocks",
+    "PictureClock": "workflows.picture_clocks",
     # meshes
     "load_mesh": "workflows.mesh_loading",
     "MeshPlacing": "terrain.mesh_placing",

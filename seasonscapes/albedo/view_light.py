@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from seasonscapes.albedo.picture_conditions import ViewLight
 from seasonscapes.rendering.receivers import incident_light, light_clusters
 from seasonscapes.rendering.relit_view import RelightableView, sun_cosine
-from seasonscapes.sky.illumination import Illumination
+from seasonscapes.rendering.sun_visibility import raised_rays
+from seasonscapes.sky.illumination import Illumination, Luminary
 
 # Below this cosine of incidence, visibility is that of ground rougher than the heights: this share of it sees the sun.
 _GRAZING, _TURNED_AWAY, _TURNED_AWAY_VISIBLE = 0.15, 0.02, 0.3
@@ -45,12 +48,29 @@ def view_light(view: RelightableView, clear: Illumination, overcast: Illuminatio
         direction = np.asarray(clear.sun.direction, float)
         direct = np.maximum(np.asarray(clear.sun.normal_illuminance_lx, float), 0.0) / np.pi
         lit = sun_cosine(view, clear.sun)
-        cosine = view_normals(view) @ direction
-        visible = np.clip(lit / np.maximum(cosine, _GRAZING), 0.0, 1.0)
-        visible = np.where(cosine > _TURNED_AWAY, visible, _TURNED_AWAY_VISIBLE).astype(np.float32)
+        visible = _visible_share(view, lit, direction)
     mean = float((lit[:, None] * direct + sky + bounce).mean())
     day = clear.time.timetuple().tm_yday
     return ViewLight(direct / mean, visible, direction, (sky + bounce) / mean, clouds / float(clouds.mean()), day)
+
+
+def sun_visible(view: RelightableView, sun: Luminary) -> np.ndarray:
+    """Share ``(n,)`` of the ground in each pixel of a view that sees the sun, as in `view_light`; 0 below the horizon."""
+    if sun.direction[2] <= 0.0:
+        return np.zeros(len(view.coefficients.pixel), np.float32)
+    return _visible_share(view, sun_cosine(view, sun), np.asarray(sun.direction, float))
+
+
+def _visible_share(view: RelightableView, lit: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """The share that sees the sun, of its mean cosine × visibility and its direction."""
+    cosine = view_normals(view) @ direction
+    visible = np.clip(lit / np.maximum(cosine, _GRAZING), 0.0, 1.0)
+    return np.where(cosine > _TURNED_AWAY, visible, _TURNED_AWAY_VISIBLE).astype(np.float32)
+
+
+def view_raised(view: RelightableView, height_m: float) -> RelightableView:
+    """A view whose ground receives sunlight as if it lay higher by ``height_m`` [m] below the same ridges."""
+    return replace(view, rays=raised_rays(view.rays, height_m))
 
 
 def view_normals(view: RelightableView) -> np.ndarray:

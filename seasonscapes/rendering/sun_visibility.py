@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -103,6 +103,17 @@ def sun_rays(
     mi_disc_offset = mi.UInt32((np.asarray(disc_offset, np.int64) % 256).astype(np.uint32))
     dr.eval(mi_origin, mi_normal, mi_geometric_normal, mi_weight, mi_disc_offset)
     return SunRays(terrain, mi_origin, mi_normal, mi_geometric_normal, mi_weight, mi_disc_offset, weight.shape[1])
+
+
+def raised_rays(rays: SunRays, height_m: float) -> SunRays:
+    """Shadow rays that start higher by a height [m]: what an error of the heights does to shadows."""
+    import drjit as dr
+    import mitsuba as mi
+
+    origin = rays.mi_origin
+    raised = mi.Point3f(origin.x, origin.y, origin.z + height_m)
+    dr.eval(raised)
+    return replace(rays, mi_origin=raised)
 
 
 def bayer_disc_offset(pixel: np.ndarray, width_px: int, samples: int) -> np.ndarray:

@@ -323,13 +323,13 @@ def camera_hours(place: Place, photographs: Sequence[Observation], *, progress: 
     if not photographs:
         raise InputError("photographs", "none given", expected="two or more of one camera")
     for each in photographs[1:]:
-        _require_same_view(photographs[0], each)
+        require_same_view(photographs[0], each)
     camera = photographs[0].camera
     if not isinstance(camera, Camera):
         raise InputError(photographs[0].webcam, "a panorama", expected="views cut out of it, as open_photographs gives")
     use_backend()
     view = fixed_view(place, camera, progress=progress)
-    clear = _without_hidden(view, photographs)
+    clear = without_hidden(view, photographs)
     photographs, encoded = [each for each, _, _ in clear], [image for _, image, _ in clear]
     usable = [mask for _, _, mask in clear]
     lights = [light_on_view(view, each.time) for each in photographs]
@@ -360,7 +360,7 @@ def camera_hours(place: Place, photographs: Sequence[Observation], *, progress: 
     return hours
 
 
-def _without_hidden(
+def without_hidden(
     view: FixedView, photographs: Sequence[Observation]
 ) -> list[tuple[Observation, np.ndarray, np.ndarray]]:
     """Photographs with their sRGB-encoded images ``(H, W, 3)`` and usable terrain pixels ``(n,)``: clouds before the
@@ -479,7 +479,7 @@ def save_hours(hours: CameraHours, times: Sequence[datetime], folder: Path, *, s
     return record | {"files": [*files, str(folder / "weather.json")], "weather": weather}
 
 
-def _require_same_view(first: Observation, other: Observation) -> None:
+def require_same_view(first: Observation, other: Observation) -> None:
     """Raise `InputError` unless two observations are of one camera in one pose."""
     a, b = first.camera, other.camera
     size = (a.width_px, a.height_px) == (b.width_px, b.height_px)
