@@ -44,6 +44,8 @@ from seasonscapes.workflows.photograph_files import open_photographs as open_pho
 from seasonscapes.workflows.pictures import develop as develop
 from seasonscapes.workflows.pictures import save_exr as save_exr
 from seasonscapes.workflows.pictures import save_png as save_png
+from seasonscapes.workflows.picture_clocks import PictureClock as PictureClock
+from seasonscapes.workflows.picture_clocks import picture_clocks as picture_clocks
 from seasonscapes.workflows.place import MeshOptions as MeshOptions
 from seasonscapes.workflows.place import Place as Place
 from seasonscapes.workflows.place import load_place as load_place

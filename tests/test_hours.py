@@ -51,6 +51,7 @@ def asked(valley, tmp_path_factory) -> tuple[Path, str, str]:
     folder = tmp_path_factory.mktemp("asked") / "out"
     arguments = _arguments(valley, folder, "--hold-out", HELD_OUT, "--sky", "sun", "--masks", str(valley / "masks"))
     arguments[arguments.index("--at-hours") + 1] = f"{HELD_OUT},2024-12-20T12:00Z"
+    arguments += ["--check-clocks", "20"]
     out, error = StringIO(), StringIO()
     with redirect_stdout(out), redirect_stderr(error):
         assert main(arguments) == 0
@@ -83,6 +84,19 @@ def test_weather_of_each_picture_is_written_and_the_sun_was_seen(asked):
     assert out.count("direct light") == len(TAKEN)
 
 
+def test_clocks_are_told_for_each_picture_and_right_ones_are_not_doubted(asked):
+    folder, out, error = asked
+    clocks = json.loads((folder / "clocks.json").read_text())
+    assert [each["time_utc"][:16] + "Z" for each in clocks] == TAKEN
+    told = [each for each in clocks if each["trusted"]]
+    assert told
+    assert all(abs(each["offset_min"]) <= 2.0 for each in told)
+    assert out.count("10 m of error of the heights") == len(told)
+    assert out.count("clock not told: ") == len(clocks) - len(told)
+    assert not any(each["doubted"] for each in clocks)
+    assert "check the camera's clock" not in error
+
+
 def test_a_season_never_seen_is_said(asked):
     assert "2024-12-20 lies" in asked[2]
     assert "never seen" in asked[2]
@@ -95,6 +109,7 @@ def test_a_season_never_seen_is_said(asked):
         (("--hold-out", "2024-01-01T12:00Z"), "--hold-out: no picture of that time"),
         (("--hold-out", ",".join(TAKEN)), "1 pictures of aerial"),
         (("--sky", "rain"), "--sky"),
+        (("--check-clocks", "5"), "--check-clocks: out of range; got 5.0; expected 10 to 180"),
     ],
 )
 def test_mistakes_are_told_in_one_line(valley, tmp_path, capsys, more, told):

@@ -162,7 +162,7 @@ VERBS: dict[str, tuple[list[str], set[str], dict[str, list[str]]]] = {
     "hours": (
         ["alpine_small", "--at-hours", TIME, "--manifest", "m.csv"],
         {*_TERRAIN, "--at-hours", "--manifest", "--webcam", "--calibrations", "--masks", "--hold-out", "--sky"}
-        | {"--most-pixels", "--doubtful-poses", "--output"},
+        | {"--most-pixels", "--doubtful-poses", "--check-clocks", "--output"},
         _NO_BOUND,
     ),
     "evaluate": (

@@ -28,6 +28,7 @@ def hours_command(
     sky: str = "any",
     most_pixels: int = 250_000,
     doubtful_poses: bool = False,
+    check_clocks: float | None = None,
     output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("out/hours"),
     place: PlaceOptions | None = None,
     json: bool = False,
@@ -59,8 +60,10 @@ def hours_command(
         Reduce larger pictures to so many pixels.
     doubtful_poses
         Use poses that their calibration called not reliable.
+    check_clocks
+        Tell by how many minutes each picture's clock is off, from its cast shadows; within so many minutes, 10 to 180.
     output
-        A folder for WEBCAM_TIME.png of each hour, and weather.json of each picture.
+        A folder for WEBCAM_TIME.png of each hour, and weather.json (and clocks.json) of each picture.
     json
         Print one machine-readable record.
     """
@@ -70,8 +73,11 @@ def hours_command(
     check_choice("--sky", sky, tuple(_SKIES))
     check_range("--most-pixels", most_pixels, 1_000, 10_000_000)
     from seasonscapes.workflows.photograph_files import PhotographSources
+    from seasonscapes.workflows.picture_clocks import WINDOW_MIN, picture_clocks, save_clocks
     from seasonscapes.workflows.unseen_hours import Sky, camera_hours, save_hours, webcam_photographs
 
+    if check_clocks is not None:
+        check_range("--check-clocks", check_clocks, *WINDOW_MIN)
     with progress_bars() as progress:
         loaded = options.load(scene, progress)
         position = (loaded.frame.latitude_deg, loaded.frame.longitude_deg)
@@ -83,13 +89,18 @@ def hours_command(
         )
         hours = camera_hours(loaded, photographs, progress=progress)
         record: dict[str, Any] = save_hours(hours, times, output, sky=cast(Sky, _SKIES[sky]))
+        clocks = []
+        if check_clocks is not None:
+            clocks = picture_clocks(loaded, photographs, window_min=check_clocks, progress=progress)
+            record["clocks"] = save_clocks(clocks, output / "clocks.json")
+            record["files"].append(str(output / "clocks.json"))
     record["seconds"] = round(clock.perf_counter() - start, 1)
     lines = [
         f"{each['time_utc']}  {_sun(each['sun_shone'])}  direct light {each['sun']:.2f} ± {each['sun_sigma']:.2f} of a "
         f"clear sky's, visibility {each['visibility_km']:.0f} km{'' if each['explained'] else '  NOT EXPLAINED'}"
         for each in record["weather"]
     ]
-    print_result(record, [*lines, *record["files"]], as_json=json)
+    print_result(record, [*lines, *(each.told() for each in clocks), *record["files"]], as_json=json)
 
 
 def _sun(shone: bool | None) -> str:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import datetime, timedelta
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,6 +27,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+# How far a clock may be taken to be off [min].
+WINDOW_MIN = (10.0, 180.0)
 # Offsets are tried this far apart [min], in which the sun moves by its diameter.
 STEP_MIN = 2.0
 # So many pixels of either kind tell weather and shadows; blocks of the picture across its width that err together.
@@ -68,6 +72,17 @@ class PictureClock:
     def doubted(self) -> bool:
         """Whether the shadows contradict the stated time."""
         return self.trusted and abs(self.offset_min) > max(_DOUBTED_SIGMAS * self.sigma_min, STEP_MIN)
+
+    def told(self) -> str:
+        """One line for people."""
+        at = self.time.isoformat()
+        if not self.trusted:
+            return f"{at}  clock not told: {self.reason}"
+        return (
+            f"{at}  clock {self.offset_min:+.1f} ± {self.sigma_min:.1f} min; shadows run {self.edge_speed_m_per_min:.0f} m/min, "
+            f"and 10 m of error of the heights is {10.0 * self.heights_min_per_m:.1f} min at an edge"
+            f"{'  CHECK THE CLOCK' if self.doubted else ''}"
+        )
 
 
 def picture_clocks(
@@ -116,8 +131,9 @@ def picture_clocks(
     """
     from seasonscapes.rendering.backend import use_backend
 
-    if not 10.0 <= window_min <= 180.0:
-        raise InputError("window_min", "out of range", got=f"{window_min:g}", expected="10 to 180")
+    if not WINDOW_MIN[0] <= window_min <= WINDOW_MIN[1]:
+        expected = f"{WINDOW_MIN[0]:g} to {WINDOW_MIN[1]:g}"
+        raise InputError("window_min", "out of range", got=f"{window_min:g}", expected=expected)
     for each in photographs[1:]:
         require_same_view(photographs[0], each)
     camera = photographs[0].camera if photographs else None
@@ -144,6 +160,33 @@ def picture_clocks(
             )
         report((k + 1) / len(shown))
     return clocks
+
+
+def save_clocks(clocks: Sequence[PictureClock], path: Path) -> list[dict[str, Any]]:
+    """Write the clocks of pictures as JSON; numbers that were not found are null.
+
+    Parameters
+    ----------
+    clocks
+        From `picture_clocks`.
+    path
+        The file.
+
+    Returns
+    -------
+    list of dict
+        What was written.
+    """
+    from seasonscapes.images import atomic_path
+
+    rows = []
+    for each in clocks:
+        row = {"time_utc": each.time.isoformat(), **asdict(each), "doubted": each.doubted}
+        del row["time"]
+        rows.append({k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in row.items()})
+    with atomic_path(path) as written:
+        written.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    return rows
 
 
 def _clock(
