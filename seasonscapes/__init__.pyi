@@ -41,11 +41,11 @@ from seasonscapes.workflows.meshes import delight_mesh as delight_mesh
 from seasonscapes.workflows.meshes import light_mesh as light_mesh
 from seasonscapes.workflows.painting import paint as paint
 from seasonscapes.workflows.photograph_files import open_photographs as open_photographs
+from seasonscapes.workflows.picture_clocks import PictureClock as PictureClock
+from seasonscapes.workflows.picture_clocks import picture_clocks as picture_clocks
 from seasonscapes.workflows.pictures import develop as develop
 from seasonscapes.workflows.pictures import save_exr as save_exr
 from seasonscapes.workflows.pictures import save_png as save_png
-from seasonscapes.workflows.picture_clocks import PictureClock as PictureClock
-from seasonscapes.workflows.picture_clocks import picture_clocks as picture_clocks
 from seasonscapes.workflows.place import MeshOptions as MeshOptions
 from seasonscapes.workflows.place import Place as Place
 from seasonscapes.workflows.place import load_place as load_place

@@ -18,7 +18,7 @@ OVERCAST, SLOW_MIN = "2024-07-20T06:10Z", 17.0
 def photographs(tmp_path_factory):
     """A place, four clear photographs and an overcast one of its aerial camera."""
     place = ss.load_place("alpine_small")
-    camera = ss.camera(place, "aerial", size_px=(120, 80))
+    camera = ss.camera(place, "aerial", size_px=(96, 64))
     taken = []
     for sky, times in (("clear", CLEAR), ("overcast", [OVERCAST])):
         folder = tmp_path_factory.mktemp(sky)
@@ -56,8 +56,9 @@ def test_right_clocks_are_not_doubted_and_times_stay_as_stated(clocks):
     stated, found, _ = clocks
     assert [each.time for each in found] == [each.time for each in stated]
     right = [each for each in found[1:] if each.trusted]
-    assert len(right) >= 2
-    assert all(abs(each.offset_min) <= 2.0 for each in right)
+    # One of the three pictures that tell the ground of each has a wrong time, and a high sun's shadows barely move.
+    assert sum(abs(each.offset_min) <= 2.0 for each in right) >= 2
+    assert all(abs(each.offset_min) <= 3.0 * each.sigma_min for each in right)
     assert not any(each.doubted for each in found[1:])
 
 
@@ -72,9 +73,9 @@ def test_shadows_of_a_low_sun_run_faster_and_heights_matter_less(clocks):
     low, high = clocks[1][0], clocks[1][2]
     assert low.edge_speed_m_per_min > 5.0
     assert 0.0 < low.heights_min_per_m < 0.2
-    if high.trusted:
-        assert high.edge_speed_m_per_min < low.edge_speed_m_per_min
-        assert high.heights_min_per_m > low.heights_min_per_m
+    assert high.trusted
+    assert high.edge_speed_m_per_min < low.edge_speed_m_per_min
+    assert high.heights_min_per_m > low.heights_min_per_m
 
 
 def test_two_photographs_are_too_few(photographs):

@@ -24,7 +24,8 @@ _SWEPT, _STEADY = 0.5, 0.1
 # Where the sun grazes the ground [cosine], its own slope decides between sun and shade, and not a shadow that is cast.
 _GRAZING = 0.1
 _LEAST_PIXELS, _LEAST_BLOCKS = 60, 6
-_DRAWS, _LEAST_SIGMA_MIN = 300, 0.3
+# Draws of blocks; and the error [min] that all blocks share, as synthetic pictures with known times have it: coarse shadow edges.
+_DRAWS, _COMMON_SIGMA_MIN = 300, 0.7
 # An offset less certain than this [min] is not told.
 LARGEST_SIGMA_MIN = 10.0
 
@@ -135,7 +136,7 @@ def clock_offset(
     drawn = [
         _minimum(by_block[:, rng.integers(0, len(blocks), len(blocks))].sum(axis=1), offsets_min) for _ in range(_DRAWS)
     ]
-    found, sigma = _minimum(by_block.sum(axis=1), offsets_min), max(float(np.std(drawn)), _LEAST_SIGMA_MIN)
+    found, sigma = _minimum(by_block.sum(axis=1), offsets_min), float(np.hypot(np.std(drawn), _COMMON_SIGMA_MIN))
     inside, certain = 0 < best < len(lights) - 1, sigma <= LARGEST_SIGMA_MIN
     reason = f"from {len(pixels)} pixels in {len(blocks)} parts of the picture that shadows sweep over"
     if not inside:
@@ -156,9 +157,7 @@ def _costs(
     ground, light = camera.ground.at(pixels), lights[kept[0]].at(pixels)
     costs = []
     for each in lights:
-        shown = ViewLight(
-            light.sun, each.sun_visible[pixels], light.sun_direction, light.sky, light.clouds, light.day
-        )
+        shown = ViewLight(light.sun, each.sun_visible[pixels], light.sun_direction, light.sky, light.clouds, light.day)
         misfit = (picture_under(ground, shown, kept[1]) - picture[pixels]) / RESIDUAL_SCALE
         costs.append(np.log1p((misfit**2).mean(axis=1)))
     return np.stack(costs)

@@ -34,7 +34,7 @@ STEP_MIN = 2.0
 # So many pixels of either kind tell weather and shadows; blocks of the picture across its width that err together.
 _MOST_PIXELS, _BLOCKS_ACROSS = 3000, 8
 # Heights are changed by so much to see how far shadows move [m].
-_RAISED_M = 10.0
+_RAISED_M = 30.0
 # A clock is doubted where it is off by so many standard deviations, and by more than the step.
 _DOUBTED_SIGMAS = 3.0
 
@@ -57,7 +57,7 @@ class PictureClock:
         Median speed of the shadows' edges over the ground; NaN where it was not measured.
     heights_min_per_m
         By how many minutes an edge comes too early or too late where the heights of its ridge, or of the ground that it
-        crosses, err by a metre (median); NaN where it was not measured.
+        crosses, err by a metre (mean); NaN where it was not measured.
     """
 
     time: datetime
@@ -286,7 +286,7 @@ def _edges(
     time = np.where(swept, crossing_min(visible, offsets_min), np.nan)
     raised = np.where(swept, crossing_min(_visible(view, suns, _RAISED_M), offsets_min), np.nan)
     shift = np.abs(raised - time) / _RAISED_M
-    per_m = float(np.median(shift[np.isfinite(shift)])) if np.isfinite(shift).any() else float("nan")
+    per_m = float(np.mean(shift[np.isfinite(shift)])) if np.isfinite(shift).any() else float("nan")
     times, position = np.full((camera.height_px, camera.width_px), np.nan), ray_directions(camera)
     times.reshape(-1)[view.pixel] = time
     distance = np.full(times.shape, np.nan)
