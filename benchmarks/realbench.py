@@ -2,7 +2,7 @@
 
     python benchmarks/realbench.py [--quick] [--seed N] [--data FOLDER] [--json FILE] [--sheets FOLDER] [--jobs N]
 
-Every picture of the webcam of Chamonix is left out once, and predicted with three amounts of knowledge:
+Every picture of the webcam of Chamonix (and, scored apart under ``cameras``, of camera KR1 at Kronebreen under clouds) is left out once, and predicted with three amounts of knowledge:
 
 half
     One half of its terrain pixels (a chequerboard of blocks) is seen and the other one scored, both ways round. ``ours``
@@ -36,7 +36,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from realbench_cameras import SKYLINE_PX, FixedCase, chamonix
+from realbench_cameras import SKYLINE_PX, FixedCase, cameras_not_scored, chamonix, kronebreen
 from realbench_rivals import equally_exposed, rival_pictures, seeing_pictures
 from realbench_shadows import shadow_figures
 from record import write_record
@@ -339,6 +339,11 @@ def figures_of(rows: list[dict[str, Any]]) -> dict[str, float]:
     return figures
 
 
+def camera_row(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """The figures of one camera."""
+    return {"camera": rows[0]["camera"], "pictures": len(rows), **figures_of(rows)}
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quick", action="store_true", help="pictures of half the width")
     parser.add_argument("--seed", type=int)
@@ -372,6 +377,17 @@ def main() -> None:
     rows = run_cases(stack, options, arguments.sheets, arguments.jobs)
     figures: dict[str, Any] = figures_of(rows) | shadow_figures(stack.case, stack.view, stack.lights)
     figures["cases"] = rows
+    figures["cameras"] = [camera_row(rows)]
+    if (data / "kronebreen-kr1").is_dir():
+        stack = stacked(kronebreen(data, default_workspace(), width))
+        figures["cameras"].append(camera_row(run_cases(stack, options, arguments.sheets, arguments.jobs)))
+    figures["cameras"] += cameras_not_scored(data)
+    for row in figures["cameras"]:
+        told = (
+            row.get("reason")
+            or f"{row['mean_psnr_db']:.2f} dB, {row['margin_over_best_rival_db']:+.2f} dB over the best rival"
+        )
+        print(f"{row['camera']:28s} {row['pictures']:3d} pictures: {told}")
     for name, value in figures.items():
         if not isinstance(value, list):
             print(f"{name:40s} {value:.3f}")

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import tempfile
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,6 +17,8 @@ import numpy as np
 from seasonscapes.cameras.pinhole import Camera, rotation_from_angles
 from seasonscapes.frames import enu_from_geodetic, local_axes
 from seasonscapes.images import read_image_srgb8
+from seasonscapes.terrain.crs import geodetic_from_map
+from seasonscapes.workflows.camera_import import map_axes
 from seasonscapes.workflows.place import Place, load_place
 from seasonscapes.workspace import Workspace
 
@@ -132,3 +136,74 @@ def chamonix(
         season = "snow" if time.month < 6 else "summer"
         found.append(Picture(name, time, image, usable, masks["sun_visible"].get(name), season))
     return FixedCase("chamonix-2013", place, camera, found, masks["shadows"], width)
+
+
+def kronebreen(data: Path, workspace: Workspace, width_px: int) -> FixedCase:
+    """Camera KR1 above the front of Kronebreen: four overcast hours of one day; fjord and near slope are masked."""
+    folder = data / "kronebreen-kr1"
+    known = json.loads((folder / "camera.json").read_text())
+    masks = json.loads(MASKS.read_text())["kronebreen-kr1"]
+    crs, position = f"EPSG:{known['epsg']}", known["camera_position_utm33n_m"]
+    latitude, longitude = (float(each) for each in geodetic_from_map(crs, *position[:2]))
+    place = scene_of("kronebreen", latitude, longitude, folder / "dem_kongsfjorden_20m_utm33n.tif", workspace)
+    world = np.eye(4)
+    axes = local_axes(place.frame, latitude, longitude)
+    world[:3, :3] = map_axes(crs, tuple(position), place.frame, axes) @ np.array(known["R_world_to_camera"]).T
+    world[:3, 3] = enu_from_geodetic(place.frame, latitude, longitude, position[2])
+    width, height = known["size"]
+    scale = width_px / width
+    size = (width_px, round(height * scale))
+    (fx, _, cx), (_, fy, cy), _ = np.array(known["K_px"]) * scale
+    camera = Camera(*size, fx, fy, cx, cy, world, place.frame)
+    usable = ~polygons_mask(masks["near_ground"], size[::-1], scale)
+    found = []
+    for path in sorted((folder / "pictures").glob("*.jpg")):
+        image = scaled(read_image_srgb8(path).astype(np.float32) / 255.0, size)
+        found.append(Picture(path.stem, _time_in(path.stem), image, usable, masks["sun_visible"][path.stem], "summer"))
+    return FixedCase("kronebreen-kr1", place, camera, found, {}, width)
+
+
+# Leaving one picture out, the ground is fitted to at least two others.
+LEAST_PICTURES, _SEASON_DAYS = 3, 45
+
+
+def _time_in(name: str) -> datetime:
+    """The instant in a picture's name, taken as UTC: year, month, day, hour and minute from the first year on."""
+    start = re.search(r"(?:19|20)\d\d", name)
+    assert start is not None, name
+    digits = re.sub(r"\D", "", name[start.start() :])
+    return datetime.strptime(digits[:12], "%Y%m%d%H%M").replace(tzinfo=UTC)
+
+
+def most_of_one_season(times: list[datetime]) -> int:
+    """The most pictures that lie within 45 days."""
+    days = np.sort([each.timestamp() / 86_400.0 for each in times])
+    return int(max((np.searchsorted(days, day + _SEASON_DAYS, "right") - k for k, day in enumerate(days)), default=0))
+
+
+def cameras_not_scored(data: Path) -> list[dict[str, Any]]:
+    """Fixed cameras of the data folder that leaving one picture out cannot score, and why."""
+    cameras: dict[str, list[datetime]] = {}
+    glacier = data / "columbia-glacier" / "pictures.json"
+    for picture in json.loads(glacier.read_text()) if glacier.is_file() else []:
+        time = datetime.fromisoformat(picture["time_utc"].replace("Z", "+00:00"))
+        cameras.setdefault(f"columbia-glacier {picture['station']}", []).append(time)
+    for name, pattern in (
+        ("finse-webcam", "*.jpg"),
+        ("bolternosa-timelapse", "*.jpg"),
+        ("pineta-2024-06-13", "pictures/*.jpg"),
+    ):
+        times = [_time_in(path.stem) for path in sorted((data / name).glob(pattern))]
+        if times:
+            cameras[name] = times
+    rows = []
+    for name, times in sorted(cameras.items()):
+        most = most_of_one_season(times)
+        if not list((data / name.split()[0]).glob("*.tif")):
+            reason = "no heights of the place in the data folder"
+        elif most < LEAST_PICTURES:
+            reason = f"at most {most} of its pictures within {_SEASON_DAYS} days; leaving one out needs {LEAST_PICTURES}"
+        else:
+            reason = "no reader of this camera"
+        rows.append({"camera": name, "pictures": len(times), "reason": reason})
+    return rows

@@ -124,7 +124,7 @@ def _placed(model: CameraModel, source: ModelSource, station: WebcamStation) -> 
     if model.rotation is None:
         pose[:3, :3] = station.view.world_from_camera[:3, :3]
         return pose, axes
-    from_map = axes.T if model.geographic else _map_axes(str(source.crs), (x, y, height), frame, axes)
+    from_map = axes.T if model.geographic else map_axes(str(source.crs), (x, y, height), frame, axes)
     pose[:3, :3] = from_map @ model.rotation
     return pose, axes
 
@@ -138,7 +138,7 @@ def _geodetic(crs: str, x: float, y: float, path: Path) -> tuple[float, float]:
     return latitude, longitude
 
 
-def _map_axes(crs: str, position: tuple[float, float, float], frame: LocalFrame, axes: np.ndarray) -> np.ndarray:
+def map_axes(crs: str, position: tuple[float, float, float], frame: LocalFrame, axes: np.ndarray) -> np.ndarray:
     """Rotation ``(3, 3)`` from a map's axes (grid east, grid north, up) to the frame: grid north is not true north."""
     from seasonscapes.terrain.crs import geodetic_from_map, horizontal_crs
 
