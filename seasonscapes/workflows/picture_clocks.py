@@ -126,7 +126,7 @@ def picture_clocks(
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     sources = ss.synthetic_photographs(place, times, folder, sky="hosek", cameras={"aerial": camera})
     ...     photographs = ss.open_photographs(place, sources.manifest, sources.calibrations, times)
-    >>> [each.trusted for each in ss.picture_clocks(place, photographs, window_min=30)]
+    >>> [each.doubted for each in ss.picture_clocks(place, photographs, window_min=30)]
     [False, False, False]
     """
     from seasonscapes.rendering.backend import use_backend
