@@ -202,7 +202,9 @@ def cameras_not_scored(data: Path) -> list[dict[str, Any]]:
         if not list((data / name.split()[0]).glob("*.tif")):
             reason = "no heights of the place in the data folder"
         elif most < LEAST_PICTURES:
-            reason = f"at most {most} of its pictures within {_SEASON_DAYS} days; leaving one out needs {LEAST_PICTURES}"
+            reason = (
+                f"at most {most} of its pictures within {_SEASON_DAYS} days; leaving one out needs {LEAST_PICTURES}"
+            )
         else:
             reason = "no reader of this camera"
         rows.append({"camera": name, "pictures": len(times), "reason": reason})

@@ -17,17 +17,18 @@ import numpy as np
 
 from seasonscapes.albedo.fixed_camera import SUN_SHONE, FixedCamera, conditions_of, direct_share
 from seasonscapes.albedo.picture_conditions import RESIDUAL_SCALE, ViewLight, picture_under
-from seasonscapes.errors import NoUsablePixels
 
 # Share of the sun that must come or go within the window; ground that loses less is steady.
 _SWEPT, _STEADY = 0.5, 0.1
 # Where the sun grazes the ground [cosine], its own slope decides between sun and shade, and not a shadow that is cast.
 _GRAZING = 0.1
 _LEAST_PIXELS, _LEAST_BLOCKS = 60, 6
+# Both sun and shade must have this share of the steady ground: with one of them alone, what the other looks like is a guess.
+_LEAST_SHARE = 0.02
 # Draws of blocks; and the error [min] that all blocks share, as synthetic pictures with known times have it: coarse shadow edges.
 _DRAWS, _COMMON_SIGMA_MIN = 300, 0.7
 # An offset less certain than this [min] is not told.
-LARGEST_SIGMA_MIN = 10.0
+LARGEST_SIGMA_MIN = 5.0
 
 
 @dataclass(frozen=True)
@@ -120,13 +121,13 @@ def clock_offset(
     if len(pixels) < _LEAST_PIXELS or len(blocks) < _LEAST_BLOCKS:
         reason = f"shadows sweep over {len(pixels)} pixels in {len(blocks)} parts of the picture: too few"
         return ClockOffset(np.nan, np.inf, False, reason, len(pixels))
+    in_sun = float((lights[stated].sun_visible[steady] > _SWEPT).mean()) if steady.any() else 0.0
+    if not _LEAST_SHARE <= in_sun <= 1.0 - _LEAST_SHARE:
+        reason = f"{in_sun:.0%} of the ground that no shadow sweeps over sees the sun: sun and shade cannot be compared"
+        return ClockOffset(np.nan, np.inf, False, reason, len(pixels))
     best, curve = stated, np.empty((len(lights), 0))
     for _ in range(2):
-        try:
-            conditions = conditions_of(camera, picture, steady, lights[best], seed=seed)
-        except NoUsablePixels:
-            reason = "shadows sweep over all of the ground: make the window narrower"
-            return ClockOffset(np.nan, np.inf, False, reason, len(pixels))
+        conditions = conditions_of(camera, picture, steady, lights[best], seed=seed)
         if direct_share(camera.ground, lights[best], conditions) < SUN_SHONE:
             return ClockOffset(np.nan, np.inf, False, "no sunlight throws shadows in it", len(pixels))
         curve = _costs(camera, picture, lights, pixels, (best, conditions.values))
