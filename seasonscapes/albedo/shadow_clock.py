@@ -23,7 +23,7 @@ _SWEPT, _STEADY = 0.5, 0.1
 # Where the sun grazes the ground [cosine], its own slope decides between sun and shade, and not a shadow that is cast.
 _GRAZING = 0.1
 _LEAST_PIXELS, _LEAST_BLOCKS = 60, 6
-# Both sun and shade must have this share of the steady ground: with one of them alone, what the other looks like is a guess.
+# Shade must have this share of the steady ground: where all of it is lit, sunlight and skylight are told apart by guess.
 _LEAST_SHARE = 0.02
 # Draws of blocks; and the error [min] that all blocks share, as synthetic pictures with known times have it: coarse shadow edges.
 _DRAWS, _COMMON_SIGMA_MIN = 300, 0.7
@@ -122,8 +122,8 @@ def clock_offset(
         reason = f"shadows sweep over {len(pixels)} pixels in {len(blocks)} parts of the picture: too few"
         return ClockOffset(np.nan, np.inf, False, reason, len(pixels))
     in_sun = float((lights[stated].sun_visible[steady] > _SWEPT).mean()) if steady.any() else 0.0
-    if not _LEAST_SHARE <= in_sun <= 1.0 - _LEAST_SHARE:
-        reason = f"{in_sun:.0%} of the ground that no shadow sweeps over sees the sun: sun and shade cannot be compared"
+    if not steady.any() or in_sun > 1.0 - _LEAST_SHARE:
+        reason = "no ground stays in the shade: how dark shade is in this picture cannot be told"
         return ClockOffset(np.nan, np.inf, False, reason, len(pixels))
     best, curve = stated, np.empty((len(lights), 0))
     for _ in range(2):
