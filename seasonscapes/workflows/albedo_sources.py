@@ -409,7 +409,7 @@ def synthetic_image(place: Place, day_of_year: int) -> Raster:
     """The true albedo of a synthetic place on its own finer grid."""
     from affine import Affine
 
-    from seasonscapes.terrain.synthetic import alpine_albedo
+    from seasonscapes.terrain.synthetic_albedo import alpine_albedo
 
     assert place.synthetic is not None
     assert place.scene.elevation is not None
