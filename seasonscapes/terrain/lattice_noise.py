@@ -47,10 +47,11 @@ def gradient_noise(x: np.ndarray, y: np.ndarray, seed: int) -> np.ndarray:
     Returns
     -------
     numpy.ndarray
-        ``(...)``, of mean 0 and standard deviation about 0.25.
+        ``(...)`` float32, of mean 0 and standard deviation about 0.25.
     """
     column, row = np.floor(x), np.floor(y)
-    fx, fy = x - column, y - row
+    # Coordinates on a map need double precision, places within a cell do not.
+    fx, fy = (x - column).astype(np.float32), (y - row).astype(np.float32)
     u, v = (f * f * f * (f * (6.0 * f - 15.0) + 10.0) for f in (fx, fy))
     gradient, corners = _gradients(column, row, seed), []
     for k in range(4):
@@ -67,7 +68,7 @@ def _gradients(column: np.ndarray, row: np.ndarray, seed: int) -> Callable[[int]
 
     def drawn(column: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         angle = lattice_hash(column, row, seed) * (2.0 * np.pi / 2.0**32)
-        return np.cos(angle), np.sin(angle)
+        return np.cos(angle).astype(np.float32), np.sin(angle).astype(np.float32)
 
     if column.size:
         first = int(column.min()), int(row.min())
@@ -115,7 +116,7 @@ def oriented_noise(
     some = aligned > 0.0
     x, y, twice = x[some], y[some], 2.0 * angle[some]
     cosine, sine = np.cos(twice), np.sin(twice)
-    total, weights = np.zeros_like(x), np.zeros_like(x)
+    total, weights = np.zeros_like(cosine), np.zeros_like(cosine)
     for k in range(orientations):
         direction = np.pi * k / orientations
         weight = np.cos(2.0 * direction) * cosine + np.sin(2.0 * direction) * sine
