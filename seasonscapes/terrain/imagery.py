@@ -419,9 +419,10 @@ def filled_gutters(texture: Texture, covered: np.ndarray, gutter_px: int) -> Tex
         return texture
     empty = ~known
     # Distances are those of steps on the grid of texels, a few percent off.
-    _, label = cv2.distanceTransformWithLabels(
+    _, labelled = cv2.distanceTransformWithLabels(
         empty.view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
+    label = labelled.astype(np.int32, copy=False)
     source = np.empty(int(label.max()) + 1, np.intp)
     source[label[known]] = np.flatnonzero(known)
     nearest = source[label[empty]]
