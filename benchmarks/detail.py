@@ -71,6 +71,8 @@ RASTERS = (
 FACTOR = 4
 SUNS_DEG = (10.0, 20.0, 30.0)
 CAMERA_ABOVE_M = 2.0
+# Of a wide place: its lowest and highest ground.
+LOWEST_M, HIGHEST_M = 0.0, 4200.0
 # Of the finer data of a wide place: side in cells of 25 m, and how much higher they lie.
 NESTED_CELLS, NESTED_OFFSET_M = 240, 1.5
 
@@ -194,18 +196,21 @@ def fresnel_error() -> float:
     return float(np.abs(np.array(found) - 0.5 * (across**2 + along**2)).max())
 
 
+def wide_relief(seed: int) -> Raster:
+    """Heights of 60 × 50 km at 200 m, from 0 to 4,200 m for every seed: noise that is not scaled ends below any land for some."""
+    rng = np.random.default_rng(seed)
+    relief = np.zeros((250, 300))
+    for weight, nodes in ((1.0, (13, 15)), (0.45, (50, 60)), (0.2, (125, 150))):
+        noise = rng.normal(0.0, 1.0, nodes).astype(np.float32)
+        relief += weight * cv2.resize(noise, (300, 250), interpolation=cv2.INTER_CUBIC)
+    heights = LOWEST_M + (HIGHEST_M - LOWEST_M) * (relief - relief.min()) / np.ptp(relief)
+    transform = Affine(200.0, 0.0, 390_000.0, 0.0, -200.0, 5_180_000.0)
+    return Raster(heights.astype(np.float32)[..., None], transform, "EPSG:32632")
+
+
 def write_wide_place(folder: Path, seed: int) -> Path:
     """Mountains of 60 × 50 km: heights and an image of 25 m, and a scene file with a camera 2 m above the ground."""
-    rng = np.random.default_rng(seed)
-    coarse = cv2.resize(rng.normal(0.0, 1.0, (13, 15)).astype(np.float32), (300, 250), interpolation=cv2.INTER_CUBIC)
-    coarse += 0.45 * cv2.resize(
-        rng.normal(0.0, 1.0, (50, 60)).astype(np.float32), (300, 250), interpolation=cv2.INTER_CUBIC
-    )
-    coarse += 0.2 * cv2.resize(
-        rng.normal(0.0, 1.0, (125, 150)).astype(np.float32), (300, 250), interpolation=cv2.INTER_CUBIC
-    )
-    transform = Affine(200.0, 0.0, 390_000.0, 0.0, -200.0, 5_180_000.0)
-    raster = amplified(Raster((1800.0 + 600.0 * coarse)[..., None], transform, "EPSG:32632"), 8, seed=seed)
+    raster = amplified(wide_relief(seed), 8, seed=seed)
     heights = raster.values[..., 0]
     slope = slopes_deg(heights.astype(float), 25.0)
     meadow, rock, snow = np.array([60, 80, 45]), np.array([120, 115, 110]), np.array([235, 240, 245])
@@ -314,11 +319,16 @@ def first_picture(scene: Path, folder: Path, size_px: tuple[int, int]) -> tuple[
     command += ["--size", f"{size_px[0]}x{size_px[1]}", "-o", str(folder / "picture.png")]
     environment = {**os.environ, "SEASONSCAPES_WORKSPACE": str(folder / "workspace"), "PYTHONPATH": str(ROOT)}
     start = time.perf_counter()
-    with subprocess.Popen(command, env=environment, cwd=ROOT) as process:
+    said = ""
+    with subprocess.Popen(command, env=environment, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        for line in process.stderr:
+            print(line, end="", file=sys.stderr, flush=True)
+            said = line.strip() or said
         _, status, used = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
-        raise SystemExit(f"{scene}: seasonscapes render failed")
+        raise SystemExit(f"{scene}: seasonscapes render exited with {process.returncode}; it said: {said}")
     return time.perf_counter() - start, used.ru_maxrss * 1024 / 1e9
 
 
