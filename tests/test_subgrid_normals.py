@@ -28,7 +28,7 @@ from seasonscapes.workflows.albedo_recovery import RecoveryOptions, recover_albe
 from seasonscapes.workflows.edited_textures import read_albedo
 from seasonscapes.workflows.illumination import sky_model
 from seasonscapes.workflows.place import load_place, utc_at
-from seasonscapes.workflows.synthetic_photographs import synthetic_observations
+from seasonscapes.workflows.synthetic_photographs import photograph_each
 from seasonscapes.workflows.view_rendering import render
 from seasonscapes.workflows.views import camera
 
@@ -208,7 +208,8 @@ def test_a_recovery_keeps_its_tilts_where_they_are_asked_for(tmp_path):
     place = load_place("alpine_small")
     times = [utc_at(place, f"2024-07-20T{hour}:00") for hour in ("10", "13", "16")]
     view = {"aerial": camera(place, "aerial", size_px=(96, 64))}
-    photographs = synthetic_observations(place, times, sky_model("hosek"), cameras=view)
+    each = photograph_each(place, times, sky_model("hosek"), view)
+    photographs = [picture.observation for _, pictures in each for picture in pictures]
     recovered = recover_albedo(place, photographs, sky="hosek", options=RecoveryOptions(normals=True))
     assert recovered.facts["tilted_share"] > 0.02
     assert recovered.facts["tilt_prior_sigma"] > 0.02

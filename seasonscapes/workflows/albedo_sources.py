@@ -385,7 +385,7 @@ def _mixed_tilt(textures: Sequence[Texture], fraction: float) -> np.ndarray | No
     """Tilts between two dates; a texture without any has the normals of the heights."""
     shares = zip(textures, (1.0 - fraction, fraction), strict=True)
     parts = [np.float32(share) * each.tilt for each, share in shares if each.tilt is not None]
-    return np.sum(parts, axis=0, dtype=np.float32) if parts else None
+    return np.asarray(np.sum(parts, axis=0), np.float32) if parts else None
 
 
 def chosen_albedo(place: Place, day: date, albedo: AlbedoSource = None, *, progress: Progress | None = None) -> Texture:
