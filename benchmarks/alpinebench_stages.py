@@ -351,6 +351,7 @@ class Splats:
     def __init__(self, bench: Bench):
         from seasonscapes.gaussians.disc_density import footprints, refined_surfels
         from seasonscapes.gaussians.disc_transport import light_state, trace_disc_transport
+        from seasonscapes.gaussians.land_shadows import disc_shadows
         from seasonscapes.gaussians.rasterise import set_torch_threads
         from seasonscapes.gaussians.surfels import surfel_albedo, terrain_surfels
         from seasonscapes.gaussians.training_views import overview_cameras
@@ -365,6 +366,7 @@ class Splats:
         self.transport = trace_disc_transport(
             world.bare, self.surfels, surfel_albedo(self.surfels, world.albedo), rays=64, seed=world.seed
         )
+        self.shadows = disc_shadows(world.bare, self.surfels.grid, self.surfels.level, self.surfels.cell)
         times = [hours(day, hour)[0] for day, hour in LESSONS]
         self.lights = [row[0] for row in lights_for(times, world.painting[:1], world.sky, default_workspace())]
         self.states = [light_state(self.transport, light, DAY_OF_YEAR) for light in self.lights]
@@ -377,7 +379,7 @@ class Splats:
         from seasonscapes.gaussians.disc_geometry import DiscGeometry
         from seasonscapes.gaussians.disc_transport import neighbourhood_mean, surfel_irradiance
         from seasonscapes.gaussians.model import model_from
-        from seasonscapes.gaussians.splat_view import learned_parameters, model_weights, render_model
+        from seasonscapes.gaussians.splat_view import learned_parameters, model_colours, model_weights, render_model
         from seasonscapes.gaussians.surfels import surfel_albedo
         from seasonscapes.gaussians.training import Schedule, surface_targets, train
         from seasonscapes.gaussians.training_views import relit_frames
@@ -387,7 +389,7 @@ class Splats:
         own = surfel_albedo(self.surfels, albedo)
         around = neighbourhood_mean(self.surfels.means, own, self.surfels.spacing_m)
         received = surfel_irradiance(world.bare, self.surfels, self.lights, rays=64, seed=seed)
-        targets = surface_targets(self.states, [0] * len(self.states), own[None], received)
+        targets = surface_targets(self.states, [0] * len(self.states), own[None], received, self.shadows)
         appearance = Appearance(
             "full",
             own[None],
@@ -410,7 +412,9 @@ class Splats:
 
         def view(camera: int, at: datetime) -> np.ndarray:
             light = self.bench.judge.light(camera, at)
-            return render_model(model, world.judged[camera], light, DAY_OF_YEAR, weights=weights[camera]).radiance
+            colours = model_colours(model, light, DAY_OF_YEAR, shadows=self.shadows)
+            judged = world.judged[camera]
+            return render_model(model, judged, light, DAY_OF_YEAR, weights=weights[camera], colours=colours).radiance
 
         return view
 

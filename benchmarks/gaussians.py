@@ -206,6 +206,7 @@ class Contest:
             surfel_irradiance,
             trace_disc_transport,
         )
+        from seasonscapes.gaussians.land_shadows import disc_shadows
         from seasonscapes.gaussians.surfels import surfel_albedo, terrain_surfels
         from seasonscapes.gaussians.training import TrainingFrame, surface_targets
         from seasonscapes.gaussians.training_views import front_facing_splats
@@ -220,13 +221,16 @@ class Contest:
         self.seconds["transport"] = time.perf_counter() - start
         self.lights, days = scene.lights(sizes.suns + sizes.held_out)
         self.states = [light_state(self.transport, light, day) for light, day in zip(self.lights, days, strict=True)]
+        self.shadows = disc_shadows(scene.ray_scene, self.surfels.grid, self.surfels.level, self.surfels.cell)
         self.suns, self.held_out = sizes.suns, range(sizes.suns, sizes.suns + sizes.held_out)
         self.weights = self.views(lambda camera: front_facing_splats(self.surfels, camera), range(len(scene.cameras)))
         if not learn:
             return
         start = time.perf_counter()
         received = surfel_irradiance(scene.ray_scene, self.surfels, self.lights[: self.suns], rays=128, seed=seed)
-        self.targets = surface_targets(self.states[: self.suns], [0] * self.suns, self.albedo[None], received)
+        self.targets = surface_targets(
+            self.states[: self.suns], [0] * self.suns, self.albedo[None], received, self.shadows
+        )
         self.seconds["lessons"] = time.perf_counter() - start
         start = time.perf_counter()
         self.truth = [truth_of(scene, scene.ray_scene, camera, self.lights, self.states) for camera in scene.cameras]
@@ -278,13 +282,17 @@ class Contest:
         self.seconds[kind] = time.perf_counter() - start
         return appearance
 
-    def score(self, appearance, times=None, weights=None) -> tuple[float, float]:
-        """Mean PSNR of held-out times on the training cameras and on the unseen one."""
+    def colours(self, appearance, state) -> np.ndarray:
+        """Colours of the discs under a light, in the land's shadows."""
         from seasonscapes.gaussians.appearance import colours_at
 
+        return colours_at(appearance, state, visible=self.shadows.visible_share(state))
+
+    def score(self, appearance, times=None, weights=None) -> tuple[float, float]:
+        """Mean PSNR of held-out times on the training cameras and on the unseen one."""
         table, weights = [], weights or self.weights_of(appearance)
         for t in self.held_out if times is None else times:
-            colours = colours_at(appearance, self.states[t])
+            colours = self.colours(appearance, self.states[t])
             table.append(
                 [psnr(picture(weights[v], colours), self.truth[v].pictures[t], self.truth[v].solid) for v in JUDGED]
             )
@@ -337,7 +345,10 @@ class Contest:
         return share
 
     def shadow_iou(self, appearance) -> float:
-        """Intersection over union of cast shadows, of pixels that face the sun, over held-out times and all cameras."""
+        """Intersection over union of cast shadows, of pixels that face the sun, over held-out times and all cameras.
+
+        Those that a browser shows, by the horizons of the discs; elsewhere shadows are traced.
+        """
         import torch
 
         from seasonscapes.rendering.gbuffer import trace_gbuffer
@@ -363,7 +374,6 @@ def seasons(contest: Contest, appearance) -> dict[str, float]:
     import torch
 
     from seasonscapes.albedo.seasons import albedo_at
-    from seasonscapes.gaussians.appearance import colours_at
     from seasonscapes.gaussians.disc_transport import light_state, neighbourhood_mean
     from seasonscapes.gaussians.surfels import surfel_albedo
     from seasonscapes.rendering.hemisphere_rays import ray_scene
@@ -390,7 +400,7 @@ def seasons(contest: Contest, appearance) -> dict[str, float]:
                 torch.as_tensor(around)[None],
             )
             values = [
-                psnr(picture(weights[0], colours_at(appearance, state)), seen, truth.solid)
+                psnr(picture(weights[0], contest.colours(appearance, state)), seen, truth.solid)
                 for state, seen in zip(states, truth.pictures, strict=True)
             ]
             result[f"season_{('seen', 'unseen', 'seen2')[number]}{name}_psnr_db"] = float(np.mean(values))
@@ -408,7 +418,6 @@ def speed(contest: Contest, appearance) -> dict[str, float]:
 
     import torch
 
-    from seasonscapes.gaussians.appearance import colours_at
     from seasonscapes.gaussians.rasterise import rotations, splat_colours, view_weights
     from seasonscapes.gaussians.splat_view import SPLAT_LIMITS
     from seasonscapes.gaussians.training_views import front_facing_splats
@@ -424,10 +433,10 @@ def speed(contest: Contest, appearance) -> dict[str, float]:
             splats = appearance.geometry.splats(camera)
     axes = rotations(splats.quaternions) * splats.log_scales.exp()[:, None, :]
     ready = upload_splats(splats.means.numpy(), axes.numpy(), torch.sigmoid(splats.opacity_logits).numpy())
-    colours = colours_at(appearance, contest.states[t])
+    colours = contest.colours(appearance, contest.states[t])
     moving = best(lambda: splat_layers(ready, colours, camera, SPLAT_LIMITS))
     in_torch = best(lambda: splat_colours(view_weights(splats, camera), colours))
-    relit = best(lambda: colours_at(appearance, contest.states[t]))
+    relit = best(lambda: contest.colours(appearance, contest.states[t]))
     weights = view_weights(splats, camera)
     still = best(lambda: splat_colours(weights, colours))
     drawn, covered = splat_layers(ready, colours, camera, SPLAT_LIMITS)
@@ -478,7 +487,6 @@ def contact_sheet(contest: Contest, appearance, path: str) -> None:
     """Held-out hours in columns; path traced, splats, difference × 4 in rows; the unseen camera in the lower half."""
     from PIL import Image
 
-    from seasonscapes.gaussians.appearance import colours_at
     from seasonscapes.images import srgb_from_linear
 
     rows, weights = [], contest.weights_of(appearance)
@@ -489,7 +497,7 @@ def contact_sheet(contest: Contest, appearance, path: str) -> None:
         columns = []
         for t in order:
             truth = srgb_from_linear(contest.truth[v].pictures[t])
-            splats = srgb_from_linear(picture(weights[v], colours_at(appearance, contest.states[t])))
+            splats = srgb_from_linear(picture(weights[v], contest.colours(appearance, contest.states[t])))
             splats = splats * (weights[v].coverage > 0.5)[..., None]
             difference = np.clip(4.0 * np.abs(truth - splats), 0.0, 1.0)
             columns.append(np.concatenate([truth, splats, difference], axis=0))

@@ -290,7 +290,7 @@ TABLES = {
             Row("nearest training sun", "{nearest_sun_psnr_db:.1f} dB"),
             Row("WildGaussians' conditioning, a free code for each picture", "{code_psnr_db:.1f}; {code_unseen_camera_psnr_db:.1f} dB"),
             Row("a network fed with the sun's direction alone", "{sun_psnr_db:.1f}; {sun_unseen_camera_psnr_db:.1f} dB"),
-            Row("cast shadows, intersection over union", "{shadow_iou:.2f}"),
+            Row("cast shadows by horizons, as in a browser: intersection over union", "{shadow_iou:.2f}"),
             Row("bytes a Gaussian on disk", "{bytes_per_gaussian:.0f}"),
             Row("samples a pixel with which path tracing has the error of a frame", "{path_spp_of_equal_error:.1f}"),
             Row("a frame over path tracing to the same error: moving camera; still camera", "{moving_camera_speedup:.1f} ×; {speedup_vs_path_still_camera:.0f} ×", "≥ 20 ×", "moving_camera_speedup >= 20"),

@@ -16,8 +16,11 @@ pytest.importorskip("torch")
 import seasonscapes as ss
 from seasonscapes.export.viewer_files import GAUSSIANS, load_scene, save_scene, single_file, viewer_files
 from seasonscapes.gaussians.model import save_model
+from seasonscapes.gaussians.splat_view import RasterOptions, render_model
 from seasonscapes.gaussians.viewer_layer import MOST_DISCS, viewer_layer
 from seasonscapes.sky.illumination import luminance
+from seasonscapes.workflows.gaussian_views import day_of_year
+from seasonscapes.workflows.illumination import illumination_for_camera
 from seasonscapes.workflows.viewer import first_view, with_gaussians, write_folder
 from seasonscapes.workflows.viewer_scene import ViewerDetail, viewer_scene
 
@@ -105,12 +108,18 @@ def test_the_command_writes_them(place, model, tmp_path):
     assert (tmp_path / "page" / GAUSSIANS).stat().st_size > 100 * len(model.means)
 
 
+def by_horizons(model, place, time):
+    """The renderer's picture with shadows by the discs' horizons, as browsers have them."""
+    camera, utc = ss.camera(place, "south", size_px=(48, 36)), datetime.fromisoformat(time)
+    light, _ = illumination_for_camera(place, camera, ss.sky_model("clear"), utc)
+    return render_model(model, camera, light, day_of_year(utc), raster=RasterOptions(4))
+
+
 @pytest.mark.browser
 class TestBrowser:
     @pytest.mark.parametrize("time", [LOW_SUN, DUSK])
     def test_its_gaussians_are_those_of_the_renderer(self, page, place, model, time):
-        camera = ss.camera(place, "south", size_px=(48, 36))
-        truth = ss.render_gaussians(model, place, camera, time, subpixels=4)
+        truth = by_horizons(model, place, time)
         when = datetime.fromisoformat(time).timestamp() * 1000.0
         image = shrunk(radiance(page, camera=0, time=when, frames=8, size=[96, 72], divider=0), 2)
         ground = truth.coverage > 0.99
@@ -124,11 +133,10 @@ class TestBrowser:
 
     def test_the_network_and_the_physics_both_count(self, page, place, model):
         """The same comparison fails without what was learned: it proves something."""
-        camera = ss.camera(place, "south", size_px=(48, 36))
-        truth = ss.render_gaussians(model, place, camera, LOW_SUN, subpixels=4)
+        truth = by_horizons(model, place, LOW_SUN)
         when = datetime.fromisoformat(LOW_SUN).timestamp() * 1000.0
         radiance(page, camera=0, time=when, frames=1, size=[96, 72], divider=0)
-        plain = ss.render_gaussians(replace(model, kind="physical"), place, camera, LOW_SUN, subpixels=4)
+        plain = by_horizons(replace(model, kind="physical"), place, LOW_SUN)
         ground = truth.coverage > 0.99
         assert np.mean(np.abs(luminance(plain.radiance[ground]) / luminance(truth.radiance[ground]) - 1.0) > 0.05) > 0.3
 

@@ -105,6 +105,7 @@ def splat_command(
     utc = parse_time(time, chosen.latitude_deg, chosen.longitude_deg)
     light, position = illumination_for_camera(loaded, camera, declared, utc)
     day, suffix = gaussians.day_of_year(utc), output.suffix.lower()
+    shadows = gaussians.cast_shadows(splats, loaded)
     record: dict[str, Any] = {
         "scene": loaded.scene.name,
         "gaussians": len(splats.means),
@@ -114,13 +115,15 @@ def splat_command(
         "seasonscapes": __version__,
     }
     if suffix in (".ply", ".glb"):
-        baked, ev100 = gaussians.bake_gaussians(splats, light, day, exposure=metering)
+        baked, ev100 = gaussians.bake_gaussians(splats, light, day, shadows=shadows, exposure=metering)
         record["exposure_ev100"] = round(ev100, 3)
         note = {**loaded.about, **record}
         write_ply(output, baked, note=note) if suffix == ".ply" else write_gltf(output, baked, note=note)
     else:
         try:
-            picture, times_ms = gaussians.timed_view(splats, camera, light, day, subpixels=subpixels, device=device)
+            picture, times_ms = gaussians.timed_view(
+                splats, camera, light, day, shadows=shadows, subpixels=subpixels, device=device
+            )
         except NoTerrainInView as error:
             raise InputError("--camera", str(error)) from None
         ev100 = look.ev100(picture.radiance)

@@ -9,7 +9,7 @@ model equals physical shading.
 
     ĉ = a · (Σ V(ω) (n·ω)⁺ E_ω + s E_sky + b E_bounce)
 
-with V the soft visibility above the horizon. Colours are radiance × π over the luminance of the horizontal illuminance,
+with V the soft visibility above the horizon, or for sun and moon the traced one (`land_shadows`). Colours are radiance × π over the luminance of the horizontal illuminance,
 so that noon and dusk have the same magnitude. `KINDS` lists ablations.
 """
 
@@ -25,6 +25,7 @@ from torch import nn
 from seasonscapes.gaussians.disc_geometry import DiscGeometry
 from seasonscapes.gaussians.disc_transport import (
     AZIMUTHS,
+    BODIES,
     HORIZON_RANGE_RAD,
     SOFTNESS_RAD,
     DiscTransport,
@@ -40,7 +41,6 @@ EMBEDDING, CODE = 6, 32
 # Width of the hidden layers; without physical shading those of WildGaussians.
 HIDDEN = {"code": 128, "sun": 128, "full": 64}
 TIME_FEATURES, PHYSICAL_FEATURES = 14, 8
-BODIES = 2
 
 
 @dataclass(frozen=True)
@@ -61,6 +61,9 @@ class LightTensors:
         ``(T, 14)`` time embedding from `time_features`.
     season
         ``(T,)`` index of the dated albedo of each time.
+    visible
+        ``(T, 2, N)`` uint8: traced share of the light of sun and moon that reaches N discs past the land, 255 all of it; ``None``:
+        the discs' horizons tell.
     """
 
     direction: torch.Tensor
@@ -69,9 +72,12 @@ class LightTensors:
     bounce: torch.Tensor
     features: torch.Tensor
     season: torch.Tensor
+    visible: torch.Tensor | None = None
 
 
-def light_tensors(states: Sequence[LightState], seasons: Sequence[int] | None = None) -> LightTensors:
+def light_tensors(
+    states: Sequence[LightState], seasons: Sequence[int] | None = None, visible: np.ndarray | None = None
+) -> LightTensors:
     """Stack light states into tensors.
 
     Parameters
@@ -80,6 +86,8 @@ def light_tensors(states: Sequence[LightState], seasons: Sequence[int] | None = 
         T light states; bodies beyond two are dropped.
     seasons
         Index of the dated albedo of each time; 0 if omitted.
+    visible
+        ``(T, 2, N)`` in [0, 1], from `land_shadows.DiscShadows.visible_share`; by the discs' horizons if omitted.
 
     Returns
     -------
@@ -91,7 +99,8 @@ def light_tensors(states: Sequence[LightState], seasons: Sequence[int] | None = 
         torch.as_tensor(np.stack(column), dtype=torch.float32) for column in zip(*rows, strict=True)
     )
     season = torch.as_tensor([0] * len(states) if seasons is None else list(seasons))
-    return LightTensors(direction, illuminance, sky, bounce, features, season)
+    shares = None if visible is None else torch.as_tensor(np.rint(255.0 * visible).astype(np.uint8))
+    return LightTensors(direction, illuminance, sky, bounce, features, season, shares)
 
 
 def _light_rows(state: LightState) -> tuple[np.ndarray, ...]:
@@ -293,7 +302,11 @@ class Appearance(nn.Module):
             if body and not bool(illuminance.any()):
                 continue
             cosine = (normals * direction).sum(1)
-            visible_cosine = self.visibility(index, direction) * cosine.clamp(min=0.0)
+            if lights.visible is None:
+                visible = self.visibility(index, direction)
+            else:
+                visible = lights.visible[time, body, index].float() / 255.0
+            visible_cosine = visible * cosine.clamp(min=0.0)
             total = total + visible_cosine[:, None] * illuminance
             if body == 0:
                 features = [visible_cosine[:, None], cosine[:, None]]
@@ -348,7 +361,12 @@ def correction_network(inputs: int, width: int, generator: torch.Generator) -> n
 
 @torch.no_grad()
 def colours_at(
-    appearance: Appearance, state: LightState, season: int = 0, *, code: torch.Tensor | None = None
+    appearance: Appearance,
+    state: LightState,
+    season: int = 0,
+    *,
+    code: torch.Tensor | None = None,
+    visible: np.ndarray | None = None,
 ) -> np.ndarray:
     """Compute the colours of all Gaussians under a light.
 
@@ -362,13 +380,16 @@ def colours_at(
         Index of the dated albedo.
     code
         ``(32,)``, replaces the codes of ``kind="code"``.
+    visible
+        ``(2, N)`` in [0, 1], from `land_shadows.DiscShadows.visible_share`; by the discs' horizons if omitted.
 
     Returns
     -------
     numpy.ndarray
         ``(N, 3)`` float32; radiance is colour × ``state.global_lx`` / π.
     """
-    lights, time = light_tensors([state], [season]), torch.zeros((), dtype=torch.long)
+    lights = light_tensors([state], [season], None if visible is None else visible[None])
+    time = torch.zeros((), dtype=torch.long)
     count = appearance.albedo.shape[1]
     parts = [
         appearance(torch.arange(start, min(start + 32768, count)), time, lights, code)

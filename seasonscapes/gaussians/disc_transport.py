@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from seasonscapes.rendering.hemisphere_rays import RayScene
 
 AZIMUTHS = 128
+# Sun and moon; other bodies of a light are dropped.
+BODIES = 2
 HORIZON_RANGE_RAD = (-0.02, 1.29)
 # Number of sky coefficients per disc.
 SKY_RANK = 8

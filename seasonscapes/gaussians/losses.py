@@ -97,7 +97,22 @@ def surface_loss(
     index = torch.as_tensor(rng.integers(0, count, batch))
     time = torch.as_tensor(rng.integers(0, times, batch))
     value = appearance(index, time, lights)
-    return ((value - targets[time, index]) ** 2 / (value.detach() ** 2 + _RELATIVE_FLOOR)).mean()
+    loss = ((value - targets[time, index]) ** 2 / (value.detach() ** 2 + _RELATIVE_FLOOR)).mean()
+    if lights.visible is None:
+        return loss
+    # Colours no longer say anything about the horizons, which browsers relight with: they learn from the traced shadows.
+    return loss + _horizon_loss(appearance, lights, index, time)
+
+
+def _horizon_loss(
+    appearance: Appearance, lights: LightTensors, index: torch.Tensor, time: torch.Tensor
+) -> torch.Tensor:
+    """Squared error of the sun's visibility by horizons, of discs that face it."""
+    assert lights.visible is not None
+    direction = lights.direction[time, 0]
+    facing = (appearance.normals[index] * direction).sum(1) > 0.0
+    traced = lights.visible[time, 0, index].float() / 255.0
+    return (((appearance.visibility(index, direction) - traced) * facing) ** 2).mean()
 
 
 @dataclass(frozen=True)

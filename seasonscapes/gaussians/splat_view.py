@@ -12,6 +12,7 @@ from seasonscapes.cameras.pinhole import Camera, ray_directions
 from seasonscapes.errors import NoTerrainInView
 from seasonscapes.gaussians.appearance import Appearance, colours_at, fourier_embedding
 from seasonscapes.gaussians.disc_transport import LightState, light_state, neighbourhood_mean
+from seasonscapes.gaussians.land_shadows import DiscShadows, disc_shadows
 from seasonscapes.gaussians.model import GaussianModel, LearnedParameters
 from seasonscapes.gaussians.rasterise import (
     ALPHA_CUT,
@@ -26,6 +27,7 @@ from seasonscapes.gaussians.rasterise import (
     view_weights,
 )
 from seasonscapes.rendering.backend import use_backend
+from seasonscapes.rendering.hemisphere_rays import RayScene
 from seasonscapes.rendering.splatting import DeviceSplats, SplatLimits, finer_camera, splat_layers, upload_splats
 from seasonscapes.sky.illumination import AerialPerspective, Illumination
 
@@ -122,7 +124,32 @@ def learned_parameters(appearance: Appearance) -> LearnedParameters:
     return LearnedParameters(appearance.kind, arrays)
 
 
-def model_colours(model: GaussianModel, illumination: Illumination, day: float) -> tuple[np.ndarray, LightState]:
+def model_shadows(model: GaussianModel, land: RayScene) -> DiscShadows:
+    """Prepare the shadow rays of a model, for any instant.
+
+    Parameters
+    ----------
+    model
+        N Gaussians.
+    land
+        The mesh that they were made on.
+
+    Returns
+    -------
+    land_shadows.DiscShadows
+        Shadow rays of the discs.
+
+    Raises
+    ------
+    ValueError
+        If the Gaussians were made on another mesh.
+    """
+    return disc_shadows(land, model.grid, model.level, model.cell)
+
+
+def model_colours(
+    model: GaussianModel, illumination: Illumination, day: float, *, shadows: DiscShadows | None = None
+) -> tuple[np.ndarray, LightState]:
     """Compute the colours of all Gaussians under a light.
 
     Parameters
@@ -133,6 +160,8 @@ def model_colours(model: GaussianModel, illumination: Illumination, day: float) 
         Sun, moon and sky.
     day
         Day of the year, for the albedo.
+    shadows
+        From `model_shadows`: cast shadows are traced; by the discs' horizons if omitted.
 
     Returns
     -------
@@ -147,7 +176,8 @@ def model_colours(model: GaussianModel, illumination: Illumination, day: float) 
     if model.kind == "code":
         raise ValueError("model_colours: a model with free codes cannot be relit for another instant")
     state = light_state(model.transport, illumination, day)
-    return colours_at(appearance_of(model, albedo=model.albedo_on(day)), state), state
+    visible = shadows.visible_share(state) if shadows else None
+    return colours_at(appearance_of(model, albedo=model.albedo_on(day)), state, visible=visible), state
 
 
 def splats_of(model: GaussianModel, *, viewpoint_m: np.ndarray | None = None) -> Splats:

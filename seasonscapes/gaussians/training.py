@@ -25,6 +25,7 @@ import torch
 from seasonscapes.errors import InputError
 from seasonscapes.gaussians.appearance import Appearance, LightTensors, light_tensors
 from seasonscapes.gaussians.disc_transport import LightState
+from seasonscapes.gaussians.land_shadows import DiscShadows
 from seasonscapes.gaussians.losses import (
     TrainingFrame,
     picture_loss,
@@ -121,6 +122,9 @@ class SurfaceTargets:
         T indices of dated albedos.
     colours
         ``(T, N, 3)`` float32: radiance × π over the luminance of the horizontal illuminance.
+    visible
+        ``(T, 2, N)`` traced share of the light of sun and moon, from `land_shadows`, if models are to be relit with it. The
+        horizons of the discs then learn from it instead of from colours.
 
     Raises
     ------
@@ -131,6 +135,7 @@ class SurfaceTargets:
     states: Sequence[LightState]
     seasons: Sequence[int]
     colours: np.ndarray
+    visible: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         if not len(self.states) == len(self.seasons) == len(self.colours) > 0:
@@ -143,7 +148,11 @@ class SurfaceTargets:
 
 
 def surface_targets(
-    states: Sequence[LightState], seasons: Sequence[int], albedo: np.ndarray, irradiance: np.ndarray
+    states: Sequence[LightState],
+    seasons: Sequence[int],
+    albedo: np.ndarray,
+    irradiance: np.ndarray,
+    shadows: DiscShadows | None = None,
 ) -> SurfaceTargets:
     """Compute training targets from traced irradiance and dated albedos.
 
@@ -157,6 +166,8 @@ def surface_targets(
         ``(M, N, 3)`` of N discs on M dates.
     irradiance
         ``(T, N, 3)`` of the discs [lx], from `disc_transport.surfel_irradiance`.
+    shadows
+        Shadow rays of the discs: the model is to be relit with traced shadows; by the discs' horizons if omitted.
 
     Returns
     -------
@@ -169,7 +180,8 @@ def surface_targets(
             for state, season, received in zip(states, seasons, irradiance, strict=True)
         ]
     )
-    return SurfaceTargets(list(states), list(seasons), colours.astype(np.float32))
+    visible = np.stack([shadows.visible_share(state).astype(np.float16) for state in states]) if shadows else None
+    return SurfaceTargets(list(states), list(seasons), colours.astype(np.float32), visible)
 
 
 def train(
@@ -226,13 +238,14 @@ def train(
         "schedule": asdict(replace(schedule, threads=1)),
         "times": len(targets.states),
         "refined": appearance.geometry is not None,
+        "traced": targets.visible is not None,
     }
     if checkpoint:
         run["key"] = checkpoint.key
     start = (
         load_checkpoint(checkpoint.path, appearance, optimiser, run) if checkpoint and checkpoint.path.exists() else 0
     )
-    lights = light_tensors(targets.states, targets.seasons)
+    lights = light_tensors(targets.states, targets.seasons, targets.visible)
     colours = torch.as_tensor(targets.colours)
     pictures = [training_picture(frame) for frame in frames]
     geometry = appearance.geometry

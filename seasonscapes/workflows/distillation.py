@@ -312,6 +312,7 @@ def distillation_data(
         surfel_irradiance,
         trace_disc_transport,
     )
+    from seasonscapes.gaussians.land_shadows import disc_shadows
     from seasonscapes.gaussians.surfels import surfel_albedo, terrain_surfels
     from seasonscapes.gaussians.training import surface_targets
     from seasonscapes.gaussians.training_views import overview_cameras, relit_frames
@@ -365,7 +366,9 @@ def distillation_data(
                 else:
                     cameras.append(camera)
     assert transport is not None, "there is at least one date"
-    targets = surface_targets(states, seasons, albedo, received)
+    bare = ray_scene(mi_mesh(place.terrain, np.full(3, 0.3)))
+    shadows = disc_shadows(bare, surfels.grid, surfels.level, surfels.cell)
+    targets = surface_targets(states, seasons, albedo, received, shadows)
     return DistillationData(surfels, albedo, around, days, transport, targets, times, frames, cameras)
 
 

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from seasonscapes.cameras.pinhole import Camera
     from seasonscapes.gaussians.frame_appearance import FrameGaussians
     from seasonscapes.gaussians.interchange import BakedSplats
+    from seasonscapes.gaussians.land_shadows import DiscShadows
     from seasonscapes.gaussians.model import GaussianModel
     from seasonscapes.gaussians.splat_view import SplatView
     from seasonscapes.sky.illumination import Illumination
@@ -45,6 +46,24 @@ def require_scene(model: GaussianModel | FrameGaussians, place: Place) -> None:
     if model.note.get("scene") != place.scene.name:
         got = str(model.note.get("scene"))
         raise InputError("--model", "was distilled from another scene", got=got, expected=place.scene.name)
+
+
+def cast_shadows(model: GaussianModel, place: Place) -> DiscShadows | None:
+    """Shadow rays of a model's discs on its place's land; ``None`` without a vectorised variant: their horizons tell shadows."""
+    from seasonscapes.gaussians.splat_view import model_shadows
+    from seasonscapes.rendering.backend import use_backend
+    from seasonscapes.rendering.hemisphere_rays import ray_scene
+    from seasonscapes.rendering.mitsuba_scene import mi_mesh
+
+    if use_backend().device == "scalar":
+        log.warning(
+            "cast shadows come from the Gaussians' horizons, which are coarser: tracing them needs libLLVM or CUDA"
+        )
+        return None
+    try:
+        return model_shadows(model, ray_scene(mi_mesh(place.terrain, np.full(3, 0.3))))
+    except ValueError as error:
+        raise InputError("--model", f"does not lie on the scene's land: {error}") from None
 
 
 def render_gaussians(
@@ -101,14 +120,16 @@ def render_gaussians(
     """
     require_torch()
     from seasonscapes.gaussians.rasterise import set_torch_threads
-    from seasonscapes.gaussians.splat_view import RasterOptions, render_model
+    from seasonscapes.gaussians.splat_view import RasterOptions, model_colours, render_model
 
     set_torch_threads(1)
     require_scene(model, place)
     camera = view_in_frame(camera, place.frame)
     utc = utc_at(place, time)
     light, _ = illumination_for_camera(place, camera, sky_model(sky), utc)
-    view = render_model(model, camera, light, day_of_year(utc), raster=RasterOptions(subpixels, device))
+    day = day_of_year(utc)
+    colours = model_colours(model, light, day, shadows=cast_shadows(model, place))
+    view = render_model(model, camera, light, day, colours=colours, raster=RasterOptions(subpixels, device))
     _warn_of_coarse_discs(model, camera, view)
     return replace(view, provenance={"white_rgb": light.white_rgb})
 
@@ -136,13 +157,20 @@ def _warn_of_coarse_discs(model: GaussianModel, camera: Camera, view: SplatView)
 
 
 def timed_view(
-    model: GaussianModel, camera: Camera, light: Illumination, day: float, *, subpixels: int, device: str
+    model: GaussianModel,
+    camera: Camera,
+    light: Illumination,
+    day: float,
+    *,
+    shadows: DiscShadows | None,
+    subpixels: int,
+    device: str,
 ) -> tuple[SplatView, dict[str, float]]:
     """`render_gaussians` for a known light, and the milliseconds of colouring and rasterisation."""
     from seasonscapes.gaussians.splat_view import RasterOptions, model_colours, render_model
 
     start = clock.perf_counter()
-    colours = model_colours(model, light, day)
+    colours = model_colours(model, light, day, shadows=shadows)
     middle = clock.perf_counter()
     view = render_model(model, camera, light, day, colours=colours, raster=RasterOptions(subpixels, device))
     end = clock.perf_counter()
@@ -150,7 +178,12 @@ def timed_view(
 
 
 def bake_gaussians(
-    model: GaussianModel, light: Illumination, day: float, *, exposure: str | float = "auto"
+    model: GaussianModel,
+    light: Illumination,
+    day: float,
+    *,
+    shadows: DiscShadows | None,
+    exposure: str | float = "auto",
 ) -> tuple[BakedSplats, float]:
     """All Gaussians of one instant in display colours, and the EV100 of their exposure.
 
@@ -160,6 +193,8 @@ def bake_gaussians(
         The model.
     light, day
         Illumination, and day of the year.
+    shadows
+        From `cast_shadows`.
     exposure
         ``"auto"`` or ``"eye"`` expose for a grey card in the open; or EV100.
     """
@@ -168,7 +203,7 @@ def bake_gaussians(
     from seasonscapes.gaussians.splat_view import model_colours
     from seasonscapes.images import srgb_from_linear
 
-    colours, state = model_colours(model, light, day)
+    colours, state = model_colours(model, light, day, shadows=shadows)
     radiance = colours * np.float32(state.global_lx / np.pi)
     card = np.full((1, 1, 3), 0.18 * state.global_lx / np.pi)
     ev100 = exposure_ev100(card, exposure)
