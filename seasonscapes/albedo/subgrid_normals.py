@@ -109,7 +109,9 @@ def tilt_sigma(height_m: np.ndarray, spacing_m: float, texel_m: float) -> float:
     fine, coarse = (each / np.linalg.norm(each, axis=-1, keepdims=True) for each in normals)
     cosine = np.maximum((fine * coarse).sum(axis=-1), _LEAST_COSINE)
     lost = np.clip(1.0 / cosine**2 - 1.0, 0.0, _LARGEST_TILT**2)
-    return float(np.sqrt(0.5 * lost.mean()))
+    # At the rim the means are extrapolated.
+    inner = lost[factor:-factor, factor:-factor]
+    return float(np.sqrt(0.5 * (inner if inner.size else lost).mean()))
 
 
 def tangents(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
