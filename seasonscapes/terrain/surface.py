@@ -195,7 +195,7 @@ class Terrain:
     images
         Images finer than the texels, for one camera, whose detail lies over the albedo. `save_terrain` leaves them out.
     tilt
-        ``(R, S, 3)`` added to its unit normals where it is shaded, see `Texture`; ``None``: nothing. `save_terrain` leaves it out.
+        ``(R, S, 3)`` added to its unit normals where it is shaded, see `Texture`. `save_terrain` leaves it out.
     """
 
     vertices: np.ndarray
@@ -253,8 +253,7 @@ class Texture:
     atlas_id
         Identifier of the UV atlas that the texture belongs to, see `atlas_identity`; ``None`` if unknown.
     tilt
-        Of an albedo: ``(R, S, 3)`` float32 to be added to the terrain's unit normals, east-north-up, by which the ground below
-        the resolution of the heights is shaded; ``None``: the heights' normals.
+        Of an albedo: ``(R, S, 3)`` float32 added to the terrain's unit normals (east-north-up) where it is shaded; or ``None``.
 
     Examples
     --------
@@ -282,10 +281,8 @@ class Texture:
     @property
     def content(self) -> str:
         """Hash of values and tilt."""
-        digest = hashlib.sha256(self.values.tobytes())
-        if self.tilt is not None:
-            digest.update(self.tilt.tobytes())
-        return digest.hexdigest()
+        tilt = b"" if self.tilt is None else self.tilt.tobytes()
+        return hashlib.sha256(self.values.tobytes() + tilt).hexdigest()
 
 
 def atlas_identity(terrain: Terrain, width_px: int, height_px: int) -> str:
@@ -438,8 +435,7 @@ def save_texture(texture: Texture, path: str | os.PathLike[str]) -> None:
     path
         File to write.
     """
-    known = {"atlas_id": texture.atlas_id, "tilt": texture.tilt}
-    more: dict[str, Any] = {name: value for name, value in known.items() if value is not None}
+    more: dict[str, Any] = {key: each for key in ("atlas_id", "tilt") if (each := getattr(texture, key)) is not None}
     np.savez(path, values=texture.values, weight=texture.weight, **more)
 
 
@@ -472,8 +468,7 @@ def load_texture(path: str | os.PathLike[str]) -> Texture:
         raise InputError(os.fspath(path), "not a texture: its weights are not finite")
     tilt = stored.get("tilt")
     if tilt is not None and (tilt.dtype.kind != "f" or tilt.shape != values.shape or not np.isfinite(tilt).all()):
-        expected = f"finite floats {values.shape}"
-        raise InputError(os.fspath(path), "not a texture: tilt", got=f"{tilt.dtype} {tilt.shape}", expected=expected)
+        raise InputError(os.fspath(path), "not a texture: tilt", got=tilt.shape, expected=f"finite, {values.shape}")
     return Texture(values, weight, str(stored["atlas_id"]) if "atlas_id" in stored else None, tilt)
 
 
