@@ -86,7 +86,7 @@ VERBS: dict[str, tuple[list[str], set[str], dict[str, list[str]]]] = {
         ["alpine_small", "--times", TIME],
         {*_TERRAIN, *_SKY, "--times", "--synthetic-webcams", "--method", "--painted", "--output"}
         | {"--fit-curve"},
-        {**_NO_BOUND, **_REAL, "--size": [], "--fit-haze": ["--method", "differentiable"]},
+        {**_NO_BOUND, **_REAL, "--size": [], **_each(("--fit-haze", "--normals"), ["--method", "differentiable"])},
     ),
     "inpaint": (
         ["alpine_small", "--time", TIME],

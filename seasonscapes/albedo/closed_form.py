@@ -170,7 +170,7 @@ def solve_albedo(
     history = []
     for number in range(solver.rounds):
         filled = fill_nearest(albedo.reshape(*transport.shape, 3), pixel_count)
-        _update_ambient(systems, transport, filled)
+        update_ambient(systems, transport, filled)
         for equations, ground in zip(systems, grounds, strict=True):
             equations.ground = None if ground is None else ground.factors(albedo)
         reweight(systems, albedo, noise_model, robust=number > 0)
@@ -189,7 +189,7 @@ def _unique(items: Sequence[_Item]) -> list[_Item]:
     return list({id(item): item for item in items}.values())
 
 
-def _update_ambient(systems: list[PhotographEquations], transport: TexelTransport, albedo: np.ndarray) -> None:
+def update_ambient(systems: list[PhotographEquations], transport: TexelTransport, albedo: np.ndarray) -> None:
     """Ambient illuminance under an albedo ``(R, S, 3)``, once for all photographs of one sky, sun and moon."""
     known: dict[tuple[int, int, int], np.ndarray] = {}
     for equations in systems:

@@ -180,7 +180,7 @@ def forward_product(equations: PhotographEquations, albedo: np.ndarray) -> tuple
     """
     footprints = equations.photograph.footprints
     sun = np.zeros((len(footprints.pixel), 3), np.float32)
-    direct, diffuse = _light_factors(equations)
+    direct, diffuse = light_factors(equations)
     for factor, values in zip(direct, footprints.sunlit[equations.photograph.number], strict=True):
         sun += (footprints.matrix(values) @ albedo) * factor
     total = sun + footprints.matrix(footprints.share) @ (equations.ambient * albedo) * diffuse
@@ -205,14 +205,14 @@ def adjoint(equations: PhotographEquations, residual: np.ndarray) -> np.ndarray:
     """
     footprints = equations.photograph.footprints
     scaled = residual * equations.transmittance / np.float32(np.pi)
-    direct, diffuse = _light_factors(equations)
+    direct, diffuse = light_factors(equations)
     total = (footprints.matrix(footprints.share).T @ (scaled * diffuse)) * equations.ambient
     for factor, values in zip(direct, footprints.sunlit[equations.photograph.number], strict=True):
         total += footprints.matrix(values).T @ (scaled * factor)
     return total
 
 
-def _light_factors(equations: PhotographEquations) -> tuple[list[np.ndarray], np.ndarray]:
+def light_factors(equations: PhotographEquations) -> tuple[list[np.ndarray], np.ndarray]:
     """What the pixels reflect of each luminary [lx] and of diffuse light, relative to Lambertian ground."""
     if equations.ground is None:
         return equations.luminary_lx, np.ones(3, np.float32)
@@ -238,7 +238,7 @@ def squared_adjoint(equations: PhotographEquations) -> np.ndarray:
     scaled = equations.weight * (equations.transmittance / np.float32(np.pi)) ** 2
     share, texel = footprints.share, footprints.texel
     total = np.empty_like(equations.ambient)
-    direct, diffuse = _light_factors(equations)
+    direct, diffuse = light_factors(equations)
     entries = np.diff(footprints.start)
 
     def of_entries(factor: np.ndarray, channel: int) -> np.ndarray:

@@ -36,6 +36,7 @@ def albedo_command(
     painted: tuple[str, ...] = (),
     fit_haze: bool = False,
     fit_curve: bool = False,
+    normals: bool = False,
     output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("out/albedo.npz"),
     sky: SkyOptions | None = None,
     place: PlaceOptions | None = None,
@@ -75,6 +76,8 @@ def albedo_command(
         With closed: search the visibility that explains the pictures best (takes minutes the first time).
     fit_curve
         Search the webcams' tone curve first.
+    normals
+        With closed: find normals finer than the heights from the shading of three or more suns; `render` shades with them.
     output
         A .npz with albedo, standard error, times sunlit and source of each texel; pictures go beside it.
     json
@@ -108,7 +111,7 @@ def albedo_command(
                 raise InputError("--times", "missing", expected="the instants of the photographs")
             utc = parse_times("--times", times, *at)
             photographs = _photographs(loaded, sources, utc, model, size_px, within_min, progress)
-        how = recovery.RecoveryOptions(fit_haze, fit_curve, method)
+        how = recovery.RecoveryOptions(fit_haze, fit_curve, method, normals)
         recovered = recovery.recover_albedo(
             loaded, photographs, sky=model, options=how, painted=paintings, progress=progress
         )

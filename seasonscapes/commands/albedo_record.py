@@ -43,6 +43,10 @@ def albedo_lines(record: dict[str, Any], recovered: RecoveredAlbedo) -> list[str
         for each, residual in zip(observations, record["residual"], strict=True)
     ]
     lines.append(f"{record['measured_share']:.1%} of the texture measured, {record['completed_share']:.1%} completed")
+    if "tilted_share" in record:
+        lines.append(
+            f"{record['tilted_share']:.1%} have normals from the pictures, tilted by {record['tilt_rms']:.2f} (rms)"
+        )
     if "true_psnr_db" in record:
         error = f"{record['true_psnr_db']} dB, relative error {record['true_relative_error']:.1%}"
         lines.append(f"against the truth, where measured: {error}")

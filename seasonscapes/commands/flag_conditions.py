@@ -79,6 +79,7 @@ CONDITIONS: dict[str, tuple[Condition, ...]] = {
             "--method closed: differentiable finds the haze itself",
             named("--method", "closed", default="closed"),
         ),
+        Condition(("--normals",), "--method closed", named("--method", "closed", default="closed")),
         Condition(
             ("--calibrations", "--masks", "--within-min", "--doubtful-poses"),
             "photographs, of which --painted alone has none",

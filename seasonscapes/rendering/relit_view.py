@@ -44,8 +44,10 @@ _DEPTH_RATIO = 1.05
 _AIR_RATIO = 1.1
 # Below this cosine of incidence the samples of a pixel may face the sun or not, or shadow each other.
 _GRAZING = 0.25
-# Interreflected light varies slowly; its noise is averaged over neighbouring pixels of one surface.
+# Interreflected light varies slowly; its noise is averaged over neighbouring pixels of one surface, at these strides,
 _BOUNCE_STRIDES, _BOUNCE_SHARPNESS = (1,), 64.0
+# and over wider surroundings in pictures with fewer rays than these, where noise is what errs most.
+_MANY_RAYS, _WIDE_STRIDES = 256, (1, 2)
 # Pixels per block of the distance computation; bounds the memory.
 _BLOCK = 1 << 17
 
@@ -119,7 +121,8 @@ def relightable_view(terrain: RayScene, coefficients: ViewCoefficients) -> Relig
     centre_m = gbuffer.depth.reshape(-1)[pixel]
     mixed = np.flatnonzero((farthest > nearest * _AIR_RATIO) | ~np.isfinite(centre_m))
     air = air_grid(camera, pixel, np.where(np.isfinite(centre_m), centre_m, nearest), mixed, distance[mixed])
-    passes = [view_neighbours(coefficients, stride=stride, sharpness=_BOUNCE_SHARPNESS) for stride in _BOUNCE_STRIDES]
+    strides = _BOUNCE_STRIDES if coefficients.sampling.rays >= _MANY_RAYS else _WIDE_STRIDES
+    passes = [view_neighbours(coefficients, stride=stride, sharpness=_BOUNCE_SHARPNESS) for stride in strides]
     rays = sun_rays(
         terrain,
         coefficients.sample_origin,

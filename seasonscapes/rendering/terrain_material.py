@@ -105,11 +105,11 @@ def shading_normal(material: Any, interaction: Any, active: Any = True) -> Any:
     Returns
     -------
     mi.Normal3f
-        Of the smooth surface, or interpolated over the facet where the terrain has none.
+        Of the smooth surface, or interpolated over the facet where the terrain has none; tilted where the ground is known better.
     """
     surface = device_surface(material)
     normal = interaction.sh_frame.n if surface is None else surface.sample(interaction.p, active)[0]
-    return _level_water(material, interaction, normal)
+    return _level_water(material, interaction, _tilted(material, interaction, normal))
 
 
 def leaving_points(material: Any, interaction: Any, active: Any = True) -> tuple[Any, Any, Any]:
@@ -139,15 +139,25 @@ def leaving_points(material: Any, interaction: Any, active: Any = True) -> tuple
     offset = (1.0 + dr.max(dr.abs(interaction.p))) * RAY_EPSILON
     surface = device_surface(material)
     if surface is None:
-        outward, normal = (
-            _level_water(material, interaction, each) for each in (interaction.n, interaction.sh_frame.n)
-        )
+        shading = _tilted(material, interaction, interaction.sh_frame.n)
+        outward, normal = (_level_water(material, interaction, each) for each in (interaction.n, shading))
         return interaction.p + interaction.n * offset, outward, normal
-    normal, up = surface.sample(interaction.p, active)
-    normal = _level_water(material, interaction, normal)
+    smooth, up = surface.sample(interaction.p, active)
+    outward, normal = (
+        _level_water(material, interaction, each) for each in (smooth, _tilted(material, interaction, smooth))
+    )
     # The distance to a slope is less than the vertical one.
-    lift = dr.maximum(up - interaction.p.z, 0.0) * normal.z
-    return interaction.p + interaction.n * offset + normal * lift, normal, normal
+    lift = dr.maximum(up - interaction.p.z, 0.0) * outward.z
+    return interaction.p + interaction.n * offset + outward * lift, outward, normal
+
+
+def _tilted(material: Any, interaction: Any, normal: Any) -> Any:
+    """Normals of the heights, tilted by what photographs tell of the ground below their resolution."""
+    import drjit as dr
+    import mitsuba as mi
+
+    tilt = getattr(material, "tilt", None)
+    return normal if tilt is None else dr.normalize(normal + mi.Normal3f(*tilt.eval(interaction.uv)))
 
 
 def _level_water(material: Any, interaction: Any, normal: Any) -> Any:
@@ -222,6 +232,8 @@ def terrain_material(reflectance: dict[str, Any], terrain: Terrain, *, smooth: b
     if use_backend().device == "scalar":
         if terrain.images:
             log.warning("finer images are left out in the scalar variant; it needs the device llvm or cuda")
+        if terrain.tilt is not None:
+            log.warning("normals from photographs are left out in the scalar variant; it needs the device llvm or cuda")
         ground = {"type": "diffuse", "reflectance": reflectance}
         return mi.load_dict(ground if terrain.water is None else _scalar_water(ground, terrain.water))
     variant = mi.variant()
@@ -229,12 +241,22 @@ def terrain_material(reflectance: dict[str, Any], terrain: Terrain, *, smooth: b
     _register(variant)
     material: Any = mi.load_dict({"type": _PLUGIN, "reflectance": reflectance})
     material.surface = DeviceSurface(terrain.surface) if smooth and terrain.surface is not None else None
+    material.tilt = None if terrain.tilt is None or not smooth else _device_texture(terrain.tilt)
     material.detail = None if terrain.detail is None else DeviceDetail(terrain.detail)
     material.images = DeviceImages(terrain.images) if terrain.images else None
     material.snow = None if terrain.snow is None else SnowOptics(terrain.snow)
     material.optics = optics_of(terrain)
     material.water = None if terrain.water is None else DeviceWater(terrain.water, terrain.frame)
     return material
+
+
+def _device_texture(values: np.ndarray) -> Any:
+    """Values ``(R, S, C)`` over the texture coordinates of the mesh, on the Dr.Jit device."""
+    import drjit as dr
+    import mitsuba as mi
+
+    tensor = mi.TensorXf(np.ascontiguousarray(values, np.float32))
+    return mi.Texture2f(tensor, use_accel=False, wrap_mode=dr.WrapMode.Clamp)  # pyright: ignore[reportCallIssue]
 
 
 @contextmanager
@@ -291,6 +313,7 @@ def _material_class() -> Any:
             super().__init__(properties)
             self.reflectance = properties.get_texture("reflectance")
             self.surface: Any = None
+            self.tilt: Any = None
             self.water: Any = None
             self.snow: Any = None
             self.optics: Any = None

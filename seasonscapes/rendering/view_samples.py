@@ -81,11 +81,11 @@ def view_samples(
     sort_key = np.random.default_rng((seed, rows.start)).random(hit.shape, np.float32)
     order = np.argsort(np.where(hit, sort_key, 2.0), axis=1)
     hit = np.take_along_axis(hit, order, axis=1)
-    columns = {}
-    for name in SurfacePoints.__dataclass_fields__:
-        values = getattr(flat, name).reshape(*on_terrain.shape, count, -1)[on_terrain]
-        values = np.take_along_axis(values, order[..., None], axis=1)
-        columns[name] = np.where(hit[..., None], values, 0.0 if name == "albedo" else values[:, :1])
+    # Samples of the sky repeat the first one.
+    sample = np.flatnonzero(on_terrain)[:, None] * count + order
+    sample = np.where(hit, sample, sample[:, :1])
+    columns = {name: np.take(getattr(flat, name), sample, axis=0) for name in SurfacePoints.__dataclass_fields__}
+    columns["albedo"][~hit] = 0.0
     return SurfacePoints(**columns), hit, pixel
 
 

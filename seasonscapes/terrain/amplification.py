@@ -178,12 +178,10 @@ def _cubic(values: np.ndarray) -> np.ndarray:
         count = values.shape[axis]
         padded = np.pad(values, [(2, 2) if k == axis else (0, 0) for k in (0, 1)], mode="reflect", reflect_type="odd")
 
-        def taken(first: int, padded: np.ndarray = padded, count: int = count, axis: int = axis) -> np.ndarray:
-            return np.take(padded, np.arange(first, first + count), axis=axis)
-
+        zero, one, two, three, four = (padded[(slice(None),) * axis + (slice(at, at + count),)] for at in range(5))
         # Weights of Catmull-Rom's spline at a quarter before and behind a sample.
-        left = -0.0234375 * taken(0) + 0.2265625 * taken(1) + 0.8671875 * taken(2) - 0.0703125 * taken(3)
-        right = -0.0703125 * taken(1) + 0.8671875 * taken(2) + 0.2265625 * taken(3) - 0.0234375 * taken(4)
+        left = -0.0234375 * zero + 0.2265625 * one + 0.8671875 * two - 0.0703125 * three
+        right = -0.0703125 * one + 0.8671875 * two + 0.2265625 * three - 0.0234375 * four
         values = np.stack([left, right], axis=axis + 1).reshape(
             [2 * size if k == axis else size for k, size in enumerate(values.shape)]
         )
@@ -192,10 +190,23 @@ def _cubic(values: np.ndarray) -> np.ndarray:
 
 def _interpolated(values: np.ndarray) -> np.ndarray:
     """Cubic interpolation whose means over 2 × 2 cells are the values."""
-    fine = _cubic(values)
+    # What is interpolated again and again is the coarse values' own error, and interpolation is linear: the rounds need the
+    # coarse grid alone.
+    total = values
     for _ in range(_ROUNDS):
-        fine = fine + _cubic(values - _block_means(fine))
+        total = total + (values - _means_of_cubic(total))
+    fine = _cubic(total)
     return fine + _spread(values - _block_means(fine))
+
+
+def _means_of_cubic(values: np.ndarray) -> np.ndarray:
+    """Means over 2 × 2 cells of `_cubic`, without it."""
+    for axis in (0, 1):
+        count = values.shape[axis]
+        padded = np.pad(values, [(2, 2) if k == axis else (0, 0) for k in (0, 1)], mode="reflect", reflect_type="odd")
+        before, last, own, coming, after = (padded[(slice(None),) * axis + (slice(at, at + count),)] for at in range(5))
+        values = -0.01171875 * (before + after) + 0.078125 * (last + coming) + 0.8671875 * own
+    return values
 
 
 def _doubled(heights: np.ndarray, amplitude: np.ndarray, spacing_m: float, transform: Affine, seed: int) -> np.ndarray:
@@ -210,14 +221,14 @@ def _doubled(heights: np.ndarray, amplitude: np.ndarray, spacing_m: float, trans
     down, across = np.gradient(smooth, spacing_m)
     slope = np.hypot(across, down)
     aligned = np.clip((slope - _ALIGNED[0]) / (_ALIGNED[1] - _ALIGNED[0]), 0.0, 1.0)
-    row, column = np.mgrid[0 : base.shape[0], 0 : base.shape[1]]
     # Detail is fixed to the grid of the map: its origin is a whole number of cells.
     first_column, first_row = (round(offset) for offset in (transform.c / transform.a, transform.f / transform.e))
-    x, y, angle = (column + first_column).astype(float), (row + first_row).astype(float), np.arctan2(down, across)
+    x, y = np.arange(base.shape[1]) + float(first_column), np.arange(base.shape[0])[:, None] + float(first_row)
+    angle = np.arctan2(down, across)
 
     def strip(rows: slice) -> np.ndarray:
         return oriented_noise(
-            x[rows], y[rows], angle=angle[rows], aligned=aligned[rows], seed=seed, orientations=_ORIENTATIONS
+            x, y[rows], angle=angle[rows], aligned=aligned[rows], seed=seed, orientations=_ORIENTATIONS
         )
 
     with ThreadPoolExecutor(_THREADS) as pool:

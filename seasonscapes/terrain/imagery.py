@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import product
 
+import cv2
 import numpy as np
 
 from seasonscapes.declaration import InputError
@@ -135,14 +136,21 @@ def bake_imagery(terrain: Terrain, atlas: Atlas, image: Raster, *, gutter_px: in
     linear = _linear_on_faces(terrain, vertex_px, pixels_of)
     if not linear:
         gradients = face_gradients(terrain.vertices, terrain.faces, xy)
-    pyramid = _pyramid(image.values, 1 + int(np.ceil(_mip_level(footprint).max())))
+    side = _footprint_side(footprint)
+    pyramid = _pyramid(image.values, 1 + int(np.ceil(np.log2(side).max())))
+    # How to filter follows from the face, of which there are far fewer than texels.
+    major = footprint[:, :2]
+    taps = np.ceil(np.maximum(footprint[:, 2], 1.0) / side - 1e-3).astype(np.int16)
+    level = np.clip(np.log2(side), 0.0, len(pyramid) - 1.0)
+    of_face = np.concatenate(gradients, axis=1)
     texel = np.flatnonzero(face_id >= 0)
     for start in range(0, len(texel), _CHUNK):
         part = texel[start : start + _CHUNK]
         face, (row, column) = face_id.ravel()[part], np.divmod(part, atlas.width_px)
-        origin, across, down = (each[face] for each in gradients)
+        origin, across, down = np.split(np.take(of_face, face, axis=0), 3, axis=1)
         place = origin + across * (column + 0.5)[:, None] + down * (row + 0.5)[:, None]
-        rgb, coverage = _filtered(pyramid, place if linear else pixels_of(place), footprint[face])
+        where = place if linear else pixels_of(place)
+        rgb, coverage = _filtered(pyramid, where, face, major, taps, level)
         values.reshape(-1, 3)[part], weight.ravel()[part] = rgb, coverage
     if not weight.any():
         raise InputError("imagery", "the image covers none of the terrain", cure="check the CRS of both files")
@@ -259,11 +267,6 @@ def _footprint_side(footprint: np.ndarray) -> np.ndarray:
     return np.maximum(np.maximum(footprint[:, 3], footprint[:, 2] / _MAX_ANISOTROPY), 1.0)
 
 
-def _mip_level(footprint: np.ndarray) -> np.ndarray:
-    """Level ``(N,)`` of the pyramid for footprints ``(N, 4)``, with fractions."""
-    return np.log2(_footprint_side(footprint))
-
-
 def _pyramid(values: np.ndarray, most: int) -> list[np.ndarray]:
     """At most ``most`` mip levels ``(H, W, C + 1)`` of premultiplied colour and coverage, each within a rim of zeros.
 
@@ -285,22 +288,32 @@ def _pyramid(values: np.ndarray, most: int) -> list[np.ndarray]:
     return levels
 
 
-def _filtered(pyramid: list[np.ndarray], pixel: np.ndarray, footprint: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean colour ``(N, 3)`` and coverage ``(N,)`` over the footprints ``(N, 4)`` at pixels ``(N, 2)``."""
-    major, longer = footprint[:, :2], footprint[:, 2]
-    taps = np.ceil(np.maximum(longer, 1.0) / _footprint_side(footprint) - 1e-3).astype(int)
-    level = np.clip(_mip_level(footprint), 0.0, len(pyramid) - 1.0)
+def _filtered(
+    pyramid: list[np.ndarray],
+    pixel: np.ndarray,
+    face: np.ndarray,
+    major: np.ndarray,
+    taps: np.ndarray,
+    level: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean colour ``(N, 3)`` and coverage ``(N,)`` over the footprints of N texels at pixels ``(N, 2)``.
+
+    ``face`` ``(N,)`` are their faces, ``major`` ``(F, 2)``, ``taps`` and ``level`` ``(F,)`` those of the faces: the major axis
+    of the footprint, the samples along it, and their level of the pyramid.
+    """
     result = np.zeros((len(pixel), pyramid[0].shape[2]), np.float32)
-    base = np.floor(level).astype(int)
-    for count, lower in product(range(1, taps.max() + 1), range(base.min(), base.max() + 1)):
-        chosen = np.flatnonzero((taps == count) & (base == lower))
+    count_of, level_of = taps[face], level[face]
+    base = level_of.astype(np.int16)
+    for count, lower in product(range(1, count_of.max() + 1), range(base.min(), base.max() + 1)):
+        chosen = np.flatnonzero((count_of == count) & (base == lower))
         if not len(chosen):
             continue
-        blend = (level[chosen] - lower)[:, None].astype(np.float32)
+        blend = (level_of[chosen] - lower)[:, None].astype(np.float32)
+        centre = pixel[chosen]
         for tap in range(count):
-            at = pixel[chosen]
+            at = centre
             if count > 1:
-                at = at + ((tap + 0.5) / count - 0.5) * major[chosen]
+                at = at + ((tap + 0.5) / count - 0.5) * major[face[chosen]]
             sample = _bilinear(pyramid[lower], at / 2.0**lower)
             if blend.any():
                 coarser = _bilinear(pyramid[lower + 1], at / 2.0 ** (lower + 1))
@@ -351,8 +364,8 @@ def dilate(texture: Texture, covered: np.ndarray, gutter_px: int) -> Texture:
         The extended texture of the same atlas.
     """
     values, weight, known = texture.values.copy(), texture.weight.copy(), covered.copy()
+    rim_row, rim_column = np.nonzero(_widened(known, 1) & ~known)
     for _ in range(gutter_px):
-        rim_row, rim_column = np.nonzero(_grown(known) & ~known)
         if not len(rim_row):
             break
         total, total_weight, count = np.zeros((len(rim_row), 3)), np.zeros(len(rim_row)), np.zeros(len(rim_row))
@@ -367,7 +380,19 @@ def dilate(texture: Texture, covered: np.ndarray, gutter_px: int) -> Texture:
         values[rim_row, rim_column] = total / np.maximum(total_weight, 1e-12)[:, None]
         weight[rim_row, rim_column] = total_weight / count
         known[rim_row, rim_column] = True
+        # The next ring lies beside this one.
+        rim_row, rim_column = _unknown_beside(known, rim_row, rim_column)
     return replace(texture, values=values, weight=weight)
+
+
+def _unknown_beside(known: np.ndarray, row: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns, in order, of cells outside a mask ``(H, W)`` in the 8-neighbourhoods of given cells."""
+    height, width = known.shape
+    around = [(row + down, column + across) for down, across in product((-1, 0, 1), repeat=2)]
+    r, c = (np.concatenate(each) for each in zip(*around, strict=True))
+    inside = (r >= 0) & (r < height) & (c >= 0) & (c < width)
+    cell = np.unique(r[inside] * width + c[inside])
+    return np.divmod(cell[~known.ravel()[cell]], width)
 
 
 def filled_gutters(texture: Texture, covered: np.ndarray, gutter_px: int) -> Texture:
@@ -389,21 +414,23 @@ def filled_gutters(texture: Texture, covered: np.ndarray, gutter_px: int) -> Tex
     Texture
         A texture of the same atlas without empty texels between charts.
     """
-    from scipy.ndimage import binary_dilation, distance_transform_edt
-
-    ring = np.ones((3, 3), bool)
-    known = np.asarray(binary_dilation(covered, ring, iterations=gutter_px), bool) if gutter_px else covered
+    known = _widened(covered, gutter_px) if gutter_px else covered
     if known.all() or not known.any():
         return texture
-    row, column = np.asarray(distance_transform_edt(~known, return_distances=False, return_indices=True))
     empty = ~known
+    # Distances are those of steps on the grid of texels, a few percent off.
+    _, labelled = cv2.distanceTransformWithLabels(
+        empty.view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    label = labelled.astype(np.int32, copy=False)
+    source = np.empty(int(label.max()) + 1, np.intp)
+    source[label[known]] = np.flatnonzero(known)
+    nearest = source[label[empty]]
     values, weight = texture.values.copy(), texture.weight.copy()
-    values[empty], weight[empty] = (kept[row[empty], column[empty]] for kept in (texture.values, texture.weight))
+    values[empty], weight[empty] = texture.values.reshape(-1, 3)[nearest], texture.weight.ravel()[nearest]
     return replace(texture, values=values, weight=weight)
 
 
-def _grown(mask: np.ndarray) -> np.ndarray:
-    """Binary dilation of a mask by its 8-neighbourhood."""
-    grown = np.pad(mask, 1)
-    grown = grown[:-2] | grown[1:-1] | grown[2:]
-    return grown[:, :-2] | grown[:, 1:-1] | grown[:, 2:]
+def _widened(mask: np.ndarray, rings: int) -> np.ndarray:
+    """A mask with rings of its 8-neighbourhood added."""
+    return cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=rings).astype(bool)

@@ -47,10 +47,11 @@ def gradient_noise(x: np.ndarray, y: np.ndarray, seed: int) -> np.ndarray:
     Returns
     -------
     numpy.ndarray
-        ``(...)``, of mean 0 and standard deviation about 0.25.
+        ``(...)`` float32, of mean 0 and standard deviation about 0.25.
     """
     column, row = np.floor(x), np.floor(y)
-    fx, fy = x - column, y - row
+    # Coordinates on a map need double precision, places within a cell do not.
+    fx, fy = (x - column).astype(np.float32), (y - row).astype(np.float32)
     u, v = (f * f * f * (f * (6.0 * f - 15.0) + 10.0) for f in (fx, fy))
     gradient, corners = _gradients(column, row, seed), []
     for k in range(4):
@@ -67,7 +68,7 @@ def _gradients(column: np.ndarray, row: np.ndarray, seed: int) -> Callable[[int]
 
     def drawn(column: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         angle = lattice_hash(column, row, seed) * (2.0 * np.pi / 2.0**32)
-        return np.cos(angle), np.sin(angle)
+        return np.cos(angle).astype(np.float32), np.sin(angle).astype(np.float32)
 
     if column.size:
         first = int(column.min()), int(row.min())
@@ -93,7 +94,7 @@ def oriented_noise(
     Parameters
     ----------
     x, y
-        ``(...)`` coordinates.
+        Coordinates that broadcast to ``(...)``, such as ``(W,)`` and ``(H, 1)``.
     angle
         ``(...)`` direction along which it is drawn out [rad], where ``aligned`` is 1.
     aligned
@@ -109,17 +110,27 @@ def oriented_noise(
         ``(...)``, of mean about 0. What a grid of unit spacing holds of it, and one of twice the spacing does not, has a
         root mean square of about 1.
     """
+    x, y = np.broadcast_arrays(x, y)
     isotropic = gradient_noise(x * 0.37, y * 0.37, seed) * 4.0
-    total, weights = np.zeros_like(isotropic), np.zeros_like(isotropic)
+    # What is aligned, in rows of its own.
+    some = aligned > 0.0
+    x, y, twice = x[some], y[some], 2.0 * angle[some]
+    cosine, sine = np.cos(twice), np.sin(twice)
+    total, weights = np.zeros_like(cosine), np.zeros_like(cosine)
     for k in range(orientations):
         direction = np.pi * k / orientations
-        weight = np.maximum(np.cos(2.0 * (angle - direction)), 0.0) ** 4
-        chosen = (weight > 0.0) & (aligned > 0.0)
-        along = (np.cos(direction) * x + np.sin(direction) * y)[chosen] * 0.16
-        across = (-np.sin(direction) * x + np.cos(direction) * y)[chosen] * 0.40
+        weight = np.cos(2.0 * direction) * cosine + np.sin(2.0 * direction) * sine
+        chosen = np.flatnonzero(weight > 0.0)
+        weight = weight[chosen]
+        weight *= weight
+        weight *= weight
+        here_x, here_y = x[chosen], y[chosen]
+        along = (np.cos(direction) * here_x + np.sin(direction) * here_y) * 0.16
+        across = (-np.sin(direction) * here_x + np.cos(direction) * here_y) * 0.40
         noise = gradient_noise(along, across, seed + 101 + k)
         # Ridges: crests where the noise changes its sign.
-        total[chosen] += weight[chosen] * (4.0 * noise + 3.0 * (0.2 - np.abs(noise)) * 2.0)
-        weights[chosen] += weight[chosen] ** 2
-    drawn = total / np.sqrt(np.maximum(weights, 1e-6))
-    return np.sqrt(1.0 - aligned) * isotropic / _ISOTROPIC_RMS + np.sqrt(aligned) * drawn / _DRAWN_RMS
+        total[chosen] += weight * (4.0 * noise + 3.0 * (0.2 - np.abs(noise)) * 2.0)
+        weights[chosen] += weight * weight
+    result = np.sqrt(1.0 - aligned) * isotropic / _ISOTROPIC_RMS
+    result[some] += np.sqrt(aligned[some]) * total / np.sqrt(np.maximum(weights, 1e-6)) / _DRAWN_RMS
+    return result

@@ -12,8 +12,7 @@ import numpy as np
 
 from seasonscapes.bundled import bundled_folder
 from seasonscapes.images import atomic_path
-from seasonscapes.terrain.synthetic import alpine_massif, massif_of
-from seasonscapes.terrain.synthetic_massif import SyntheticMassif
+from seasonscapes.terrain.synthetic_massif import SyntheticMassif, massif_of
 
 # Increment whenever the generator makes another massif of the same parameters.
 _REVISION = 1
@@ -51,6 +50,9 @@ def shipped_massif(*, seed: int, size_m: float, spacing_m: float) -> SyntheticMa
 
 def write_shipped_massif() -> Path:
     """Generate the bundled scene's massif and write it beside the scenes."""
+    # The generator loads libraries that a shipped massif does not need.
+    from seasonscapes.terrain.synthetic import alpine_massif
+
     massif = alpine_massif(**_PARAMETERS)
     maps = {"elevation": massif.elevation.values[..., 0], "debris": massif.debris, "shore_m": massif.shore_m}
     _path().parent.mkdir(exist_ok=True)

@@ -194,6 +194,8 @@ class Terrain:
         Detail of the albedo below its texels, for one camera; ``None``: the texture alone. `save_terrain` leaves it out.
     images
         Images finer than the texels, for one camera, whose detail lies over the albedo. `save_terrain` leaves them out.
+    tilt
+        ``(R, S, 3)`` added to its unit normals where it is shaded, see `Texture`. `save_terrain` leaves it out.
     """
 
     vertices: np.ndarray
@@ -207,6 +209,7 @@ class Terrain:
     forest: bool = False
     detail: AlbedoDetail | None = None
     images: tuple[ImageDetail, ...] = ()
+    tilt: np.ndarray | None = None
 
 
 def mesh_up_m(terrain: Terrain, position_m: np.ndarray) -> float:
@@ -249,6 +252,8 @@ class Texture:
         ``(R, S)`` float32 weight of the observations, 0 for unobserved texels; ones if left out.
     atlas_id
         Identifier of the UV atlas that the texture belongs to, see `atlas_identity`; ``None`` if unknown.
+    tilt
+        Of an albedo: ``(R, S, 3)`` float32 added to the terrain's unit normals (east-north-up) where it is shaded; or ``None``.
 
     Examples
     --------
@@ -263,12 +268,21 @@ class Texture:
     values: np.ndarray
     weight: np.ndarray = field(default=None)  # type: ignore[assignment]  # set in __post_init__
     atlas_id: str | None = None
+    tilt: np.ndarray | None = None
 
     def __post_init__(self):
         if self.weight is None:
             object.__setattr__(self, "weight", np.ones(self.values.shape[:2], np.float32))
         if self.values.shape[:2] != self.weight.shape:
             raise ValueError(f"Texture: values {self.values.shape} and weight {self.weight.shape} differ in size")
+        if self.tilt is not None and self.tilt.shape != self.values.shape:
+            raise ValueError(f"Texture: values {self.values.shape} and tilt {self.tilt.shape} differ in size")
+
+    @property
+    def content(self) -> str:
+        """Hash of values and tilt."""
+        tilt = b"" if self.tilt is None else self.tilt.tobytes()
+        return hashlib.sha256(self.values.tobytes() + tilt).hexdigest()
 
 
 def atlas_identity(terrain: Terrain, width_px: int, height_px: int) -> str:
@@ -421,8 +435,8 @@ def save_texture(texture: Texture, path: str | os.PathLike[str]) -> None:
     path
         File to write.
     """
-    identity: dict[str, Any] = {} if texture.atlas_id is None else {"atlas_id": texture.atlas_id}
-    np.savez(path, values=texture.values, weight=texture.weight, **identity)
+    more: dict[str, Any] = {key: each for key in ("atlas_id", "tilt") if (each := getattr(texture, key)) is not None}
+    np.savez(path, values=texture.values, weight=texture.weight, **more)
 
 
 def load_texture(path: str | os.PathLike[str]) -> Texture:
@@ -443,7 +457,7 @@ def load_texture(path: str | os.PathLike[str]) -> Texture:
     InputError
         Where the file is missing, damaged, or no texture.
     """
-    stored = read_arrays(path, ["values", "weight"], optional=["atlas_id"], what="a texture")
+    stored = read_arrays(path, ["values", "weight"], optional=["atlas_id", "tilt"], what="a texture")
     values, weight = stored["values"], stored["weight"]
     if values.dtype.kind != "f" or weight.dtype.kind != "f" or values.shape != (*weight.shape, 3) or weight.ndim != 2:
         got = f"values {values.dtype} {values.shape}, weight {weight.dtype} {weight.shape}"
@@ -452,7 +466,10 @@ def load_texture(path: str | os.PathLike[str]) -> Texture:
         )
     if not np.isfinite(weight).all():
         raise InputError(os.fspath(path), "not a texture: its weights are not finite")
-    return Texture(values, weight, str(stored["atlas_id"]) if "atlas_id" in stored else None)
+    tilt = stored.get("tilt")
+    if tilt is not None and (tilt.dtype.kind != "f" or tilt.shape != values.shape or not np.isfinite(tilt).all()):
+        raise InputError(os.fspath(path), "not a texture: tilt", got=tilt.shape, expected=f"finite, {values.shape}")
+    return Texture(values, weight, str(stored["atlas_id"]) if "atlas_id" in stored else None, tilt)
 
 
 def sample_texture(values: np.ndarray, uv: np.ndarray) -> np.ndarray:

@@ -6,17 +6,20 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
-from seasonscapes.terrain.surface import Raster
 from seasonscapes.terrain.synthetic_albedo import SEASONS, alpine_albedo, snow_fraction, snow_line_m
-from seasonscapes.terrain.synthetic_cover import Cover, ground_cover, slope_and_northness
-from seasonscapes.terrain.synthetic_massif import SyntheticMassif, load_massif, save_massif
+from seasonscapes.terrain.synthetic_cover import Cover, ground_cover
+from seasonscapes.terrain.synthetic_massif import (
+    CENTRE_LATITUDE_DEG,
+    CENTRE_LONGITUDE_DEG,
+    CRS,
+    SyntheticMassif,
+    load_massif,
+    massif_of,
+    save_massif,
+)
 from seasonscapes.terrain.synthetic_relief import relief
-
-CENTRE_LATITUDE_DEG, CENTRE_LONGITUDE_DEG = 46.55, 7.98
-CRS = "EPSG:32632"
 
 
 def alpine_massif(*, seed: int = 1912, size_m: float = 12000.0, spacing_m: float = 15.0) -> SyntheticMassif:
@@ -55,40 +58,6 @@ def alpine_massif(*, seed: int = 1912, size_m: float = 12000.0, spacing_m: float
         landform.floor.shore_m.astype(np.float32),
         seed=seed,
         spacing_m=spacing_m,
-    )
-
-
-def massif_of(
-    z: np.ndarray, cover: np.ndarray, debris: np.ndarray, shore_m: np.ndarray, *, seed: int, spacing_m: float
-) -> SyntheticMassif:
-    """Place maps of a massif on the Earth and derive the attributes of its surface.
-
-    Parameters
-    ----------
-    z
-        Heights ``(H, W)`` float32 [m].
-    cover, debris, shore_m
-        Maps ``(H, W)`` as in `SyntheticMassif`.
-    seed, spacing_m
-        Of the generator.
-
-    Returns
-    -------
-    SyntheticMassif
-        Centred at 46.55° N, 7.98° E.
-    """
-    from affine import Affine
-    from pyproj import Transformer
-
-    to_map = Transformer.from_crs("EPSG:4326", CRS, always_xy=True, allow_ballpark=False)
-    east, north = to_map.transform(CENTRE_LONGITUDE_DEG, CENTRE_LATITUDE_DEG)
-    edge = 0.5 * z.shape[0] * spacing_m
-    transform = Affine(spacing_m, 0.0, east - edge, 0.0, -spacing_m, north + edge)
-    mean_height = cv2.GaussianBlur(z, (0, 0), 90.0 / spacing_m)
-    slope, northness = slope_and_northness(z, spacing_m)
-    elevation = Raster(z[..., None], transform, CRS)
-    return SyntheticMassif(
-        elevation, cover, slope, northness, mean_height - z, debris, shore_m, seed=seed, spacing_m=spacing_m
     )
 
 

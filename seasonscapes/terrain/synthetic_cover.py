@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from seasonscapes.terrain.noise import fractal_noise
+from seasonscapes.terrain.synthetic_massif import slope_and_northness
 from seasonscapes.terrain.synthetic_relief import Relief
 
 
@@ -28,28 +29,6 @@ class Cover(IntEnum):
 
 
 FOREST = (Cover.CONIFER, Cover.LARCH, Cover.BROADLEAF)
-
-
-def slope_and_northness(elevation: np.ndarray, spacing_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Compute slope and aspect of an elevation grid.
-
-    Parameters
-    ----------
-    elevation
-        Heights ``(H, W)`` [m], row 0 in the north.
-    spacing_m
-        Cell size [m].
-
-    Returns
-    -------
-    slope_deg
-        ``(H, W)`` float32 [deg].
-    northness
-        ``(H, W)`` float32 northward component of the unit normal.
-    """
-    down, right = np.gradient(elevation.astype(np.float64), spacing_m)
-    up = 1.0 / np.sqrt(1.0 + down**2 + right**2)
-    return np.degrees(np.arccos(up)).astype(np.float32), (down * up).astype(np.float32)
 
 
 def ground_cover(relief: Relief, spacing_m: float, seed: int, east_m: np.ndarray, north_m: np.ndarray) -> np.ndarray:

@@ -5,11 +5,14 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from seasonscapes.images import atomic_path
 from seasonscapes.terrain.surface import Raster
 
+CENTRE_LATITUDE_DEG, CENTRE_LONGITUDE_DEG = 46.55, 7.98
+CRS = "EPSG:32632"
 _MAPS = ("cover", "slope_deg", "northness", "concavity_m", "debris", "shore_m")
 
 
@@ -44,6 +47,62 @@ class SyntheticMassif:
     shore_m: np.ndarray
     seed: int
     spacing_m: float
+
+
+def massif_of(
+    z: np.ndarray, cover: np.ndarray, debris: np.ndarray, shore_m: np.ndarray, *, seed: int, spacing_m: float
+) -> SyntheticMassif:
+    """Place maps of a massif on the Earth and derive the attributes of its surface.
+
+    Parameters
+    ----------
+    z
+        Heights ``(H, W)`` float32 [m].
+    cover, debris, shore_m
+        Maps ``(H, W)`` as in `SyntheticMassif`.
+    seed, spacing_m
+        Of the generator.
+
+    Returns
+    -------
+    SyntheticMassif
+        Centred at 46.55° N, 7.98° E.
+    """
+    from affine import Affine
+    from pyproj import Transformer
+
+    to_map = Transformer.from_crs("EPSG:4326", CRS, always_xy=True, allow_ballpark=False)
+    east, north = to_map.transform(CENTRE_LONGITUDE_DEG, CENTRE_LATITUDE_DEG)
+    edge = 0.5 * z.shape[0] * spacing_m
+    transform = Affine(spacing_m, 0.0, east - edge, 0.0, -spacing_m, north + edge)
+    mean_height = cv2.GaussianBlur(z, (0, 0), 90.0 / spacing_m)
+    slope, northness = slope_and_northness(z, spacing_m)
+    elevation = Raster(z[..., None], transform, CRS)
+    return SyntheticMassif(
+        elevation, cover, slope, northness, mean_height - z, debris, shore_m, seed=seed, spacing_m=spacing_m
+    )
+
+
+def slope_and_northness(elevation: np.ndarray, spacing_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Compute slope and aspect of an elevation grid.
+
+    Parameters
+    ----------
+    elevation
+        Heights ``(H, W)`` [m], row 0 in the north.
+    spacing_m
+        Cell size [m].
+
+    Returns
+    -------
+    slope_deg
+        ``(H, W)`` float32 [deg].
+    northness
+        ``(H, W)`` float32 northward component of the unit normal.
+    """
+    down, right = np.gradient(elevation.astype(np.float64), spacing_m)
+    up = 1.0 / np.sqrt(1.0 + down**2 + right**2)
+    return np.degrees(np.arccos(up)).astype(np.float32), (down * up).astype(np.float32)
 
 
 def save_massif(massif: SyntheticMassif, path: str | os.PathLike[str]) -> None:

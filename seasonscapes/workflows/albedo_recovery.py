@@ -30,6 +30,7 @@ from seasonscapes.workflows.recovery_methods import (
     illuminations,
     joint_fit,
     painted_photographs,
+    tilted_fit,
 )
 
 if TYPE_CHECKING:
@@ -63,6 +64,9 @@ class RecoveryOptions:
         ``closed``: light, air, response and poses are given (or searched, see above). ``differentiable``: haze, exposures,
         each camera's response, clouds before the sun and poses within their standard deviations are unknowns beside the
         albedo; the closed form is its start, and stays where it explains held-out photographs better.
+    normals
+        With the closed form: find normals below the resolution of the heights from the shading of three or more suns, beside
+        the albedo; see `albedo.subgrid_normals`.
 
     Raises
     ------
@@ -79,12 +83,15 @@ class RecoveryOptions:
     fit_haze: bool = False
     fit_curve: bool = False
     method: str = "closed"
+    normals: bool = False
 
     def __post_init__(self):
         if self.method not in METHODS:
             raise ValueError(f"RecoveryOptions: method: got {self.method!r}, expected one of {', '.join(METHODS)}")
         if self.method != "closed" and self.fit_haze:
             raise ValueError("RecoveryOptions: fit_haze belongs to the closed form")
+        if self.method != "closed" and self.normals:
+            raise ValueError("RecoveryOptions: normals belong to the closed form")
 
 
 @dataclass(frozen=True)
@@ -107,6 +114,8 @@ class RecoveredAlbedo:
         Plain values: what was fitted besides.
     mesh
         How the terrain and its atlas were built.
+    tilt
+        ``(R, S, 3)`` to be added to the terrain's normals, where they were asked for; see `terrain.surface.Texture`.
     """
 
     day: date
@@ -116,28 +125,27 @@ class RecoveredAlbedo:
     atlas_id: str
     facts: dict[str, Any] = field(default_factory=dict)
     mesh: MeshOptions = field(default_factory=MeshOptions)
+    tilt: np.ndarray | None = field(default=None, repr=False)
 
     @property
     def texture(self) -> Texture:
         """The albedo as a texture; ``weight`` is ``1 / σ²`` where photographs measured it and 0 elsewhere."""
         known = self.estimate
         weight = np.where(known.source == 1, 1.0 / np.maximum(known.sigma, 1e-4) ** 2, 0.0).astype(np.float32)
-        return Texture(known.albedo, weight, self.atlas_id)
+        return Texture(known.albedo, weight, self.atlas_id, self.tilt)
 
     def dated(self) -> DatedAlbedo:
         """The albedo with its date, for `render`, `relight_session` and others."""
-        import hashlib
-
         from seasonscapes.albedo.seasons import DatedAlbedo
 
-        content = hashlib.sha256(self.estimate.albedo.tobytes()).hexdigest()
-        return DatedAlbedo(self.day, content, lambda: self.texture)
+        return DatedAlbedo(self.day, self.texture.content, lambda: self.texture)
 
     def save(self, path: str | Path) -> None:
         """Write a ``.npz`` file, atomically; `load_albedo` and ``--albedo`` read it."""
         from seasonscapes.images import atomic_path
 
         known, texture = self.estimate, self.texture
+        more: dict[str, Any] = {} if self.tilt is None else {"tilt": self.tilt}
         with atomic_path(Path(path)) as temporary, open(temporary, "wb") as file:
             np.savez_compressed(
                 file,
@@ -151,6 +159,7 @@ class RecoveredAlbedo:
                 atlas_id=self.atlas_id,
                 date=self.day.isoformat(),
                 mesh=json.dumps(asdict(self.mesh)),
+                **more,
             )
 
 
@@ -243,8 +252,12 @@ def recovered_over(
     prepared, skies, facts = _prepared(place, transport, photographs, model, options, progress)
     painted_skies = [model if each.sky is None else each.sky for each in painted]
     prepared = [*prepared, *painted_photographs(place, transport, painted, painted_skies)]
+    tilt = None
     if options.method == "closed":
         fit = closed_fit(transport, prepared, progress)
+        if options.normals:
+            tilt, fit, found = tilted_fit(place, transport, prepared, fit, progress)
+            facts = facts | found
     else:
         joint, found = joint_fit(place, transport, prepared, [*skies, *painted_skies], progress)
         fit, prepared, facts = joint.fit, joint.photographs, facts | found
@@ -252,7 +265,7 @@ def recovered_over(
     for doubt in recovery_doubts([each.observation for each in prepared], fit.residual):
         log.warning("%s", doubt)
     day = min(each.observation.time for each in prepared).date()
-    return RecoveredAlbedo(day, known, fit, prepared, place.atlas_id, facts, place.options)
+    return RecoveredAlbedo(day, known, fit, prepared, place.atlas_id, facts, place.options, tilt)
 
 
 def recovery_doubts(photographs: Sequence[Observation | TextureObservation], residual: np.ndarray) -> list[str]:

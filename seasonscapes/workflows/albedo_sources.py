@@ -378,7 +378,14 @@ def albedo_of_day(place: Place, series: AlbedoSeries, day: date) -> Texture:
     else:
         transition, snowline = np.zeros_like(textures[0].values), fraction
     values = interpolate_albedo((textures[0].values, textures[1].values), transition, fraction, snowline)
-    return Texture(values, weight, place.atlas_id)
+    return Texture(values, weight, place.atlas_id, _mixed_tilt(textures, fraction))
+
+
+def _mixed_tilt(textures: Sequence[Texture], fraction: float) -> np.ndarray | None:
+    """Tilts between two dates; a texture without any has the normals of the heights."""
+    shares = zip(textures, (1.0 - fraction, fraction), strict=True)
+    parts = [np.float32(share) * each.tilt for each, share in shares if each.tilt is not None]
+    return np.asarray(np.sum(parts, axis=0), np.float32) if parts else None
 
 
 def chosen_albedo(place: Place, day: date, albedo: AlbedoSource = None, *, progress: Progress | None = None) -> Texture:
@@ -409,7 +416,7 @@ def synthetic_image(place: Place, day_of_year: int) -> Raster:
     """The true albedo of a synthetic place on its own finer grid."""
     from affine import Affine
 
-    from seasonscapes.terrain.synthetic import alpine_albedo
+    from seasonscapes.terrain.synthetic_albedo import alpine_albedo
 
     assert place.synthetic is not None
     assert place.scene.elevation is not None

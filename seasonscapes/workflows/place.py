@@ -35,7 +35,7 @@ __all__ = ["MeshOptions", "Place", "find_scene", "ground_height_m", "load_place"
 
 # Includes the synthetic massif's own modules.
 _TERRAIN_CODE = ("workflows.terrain_building",)
-_MASSIF_CODE = ("terrain.shipped_massif",)
+_MASSIF_CODE = ("terrain.synthetic",)
 # The farthest sight on record, by refraction over the Alps and the Pyrenees, is some 440 km; pictures end far before.
 FARTHEST_CAMERA_KM = 200.0
 
@@ -293,13 +293,15 @@ def require_near(place: Place, latitude_deg: float, longitude_deg: float, *, whe
 
 
 def scene_massif(scene: SceneFile, workspace: Workspace) -> SyntheticMassif | None:
-    """The synthetic massif that a scene declares, generated once for a workspace; ``None`` where it names files."""
+    """The synthetic massif that a scene declares, shipped or generated once for a workspace; ``None`` where it names files."""
+    from seasonscapes.terrain.shipped_massif import shipped_massif
     from seasonscapes.terrain.synthetic_massif import load_massif, save_massif
 
     declared = None if scene.elevation is None else scene.elevation.synthetic
     if declared is None:
         return None
-    return build_once(
+    shipped = shipped_massif(seed=declared.seed, size_m=declared.size_m, spacing_m=declared.spacing_m)
+    return shipped or build_once(
         workspace,
         f"{scene.name}/massif",
         {"synthetic": declared},
@@ -313,11 +315,9 @@ def scene_massif(scene: SceneFile, workspace: Workspace) -> SyntheticMassif | No
 
 def _generated_massif(declared: SyntheticElevation) -> SyntheticMassif:
     # Imported here, since the generator loads libraries that nothing else needs.
-    from seasonscapes.terrain.shipped_massif import shipped_massif
     from seasonscapes.terrain.synthetic import alpine_massif
 
-    wanted = {"seed": declared.seed, "size_m": declared.size_m, "spacing_m": declared.spacing_m}
-    return shipped_massif(**wanted) or alpine_massif(**wanted)
+    return alpine_massif(seed=declared.seed, size_m=declared.size_m, spacing_m=declared.spacing_m)
 
 
 def ground_height_m(place: Place, latitude_deg: float, longitude_deg: float, *, where: str) -> float:

@@ -5,6 +5,7 @@ A prior for the radiometric calibration of photographs, and for the completion o
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -115,7 +116,7 @@ def _relit(place: Place, albedo: Texture, utc: datetime, model: SkyModel, progre
     light, _ = illumination_on_terrain(place, model, utc)
     positions, _ = texel_positions(place.terrain, place.atlas.width_px, place.atlas.height_px)
     lit = bake_lit_texture(
-        ray_scene(mi_mesh(place.terrain, albedo.values)),
+        ray_scene(mi_mesh(replace(place.terrain, tilt=albedo.tilt), albedo.values)),
         positions,
         albedo.values,
         light,

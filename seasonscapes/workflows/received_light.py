@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -17,7 +16,7 @@ import numpy as np
 from seasonscapes.errors import DamagedFile, InputError
 from seasonscapes.progress import Progress, each_reported, task_progress
 from seasonscapes.sky.models import SkyModel
-from seasonscapes.terrain.surface import Raster, Texture
+from seasonscapes.terrain.surface import Raster
 from seasonscapes.workflows.albedo_sources import AlbedoSource, chosen_albedo
 from seasonscapes.workflows.illumination import illumination_at, illumination_on_terrain, sky_model, sun_moon_position
 from seasonscapes.workflows.place import Place, utc_at
@@ -103,7 +102,7 @@ def lit_texture(
     texture = chosen_albedo(place, utc.date(), albedo, progress=progress)
     positions, _ = texel_positions(place.terrain, place.atlas.width_px, place.atlas.height_px)
     return bake_lit_texture(
-        ray_scene(mi_mesh(place.terrain, texture.values)),
+        ray_scene(mi_mesh(replace(place.terrain, tilt=texture.tilt), texture.values)),
         positions,
         texture.values,
         light,
@@ -219,11 +218,11 @@ def irradiance_map(
     record = {"scene": place.scene.name, **record, "attribution": place.scene.attribution}
     grid, positions = _map_grid(place, spacing_m)
     texture = chosen_albedo(place, instants[len(instants) // 2].date(), albedo)
-    scene = ray_scene(mi_mesh(place.terrain, texture.values))
+    scene = ray_scene(mi_mesh(replace(place.terrain, tilt=texture.tilt), texture.values))
     sampling = SamplingOptions(shadow_samples=1, rays=rays)
     report = task_progress(progress, "irradiance")
     if len(positions) <= BLOCK:
-        inputs = {"place": place.key, "albedo": _content(texture), "spacing_m": spacing_m, "rays": rays, "seed": seed}
+        inputs = {"place": place.key, "albedo": texture.content, "spacing_m": spacing_m, "rays": rays, "seed": seed}
         trace = partial(point_coefficients, scene, positions, sampling, seed=seed, search_m=_SEARCH_M, progress=report)
         coefficients = _kept_coefficients(place, inputs, trace)
         blocks = iter([kept_irradiance(scene, positions, coefficients, lights, search_m=_SEARCH_M)])
@@ -232,10 +231,6 @@ def irradiance_map(
     received = integrate_irradiance(blocks, len(positions), IlluminationSeries(lights, hours))
     period = not isinstance(times, (str, datetime))
     return IrradianceMap(grid, _bands(received, grid.values.shape[:2], period=period), record)
-
-
-def _content(texture: Texture) -> str:
-    return hashlib.sha256(texture.values.tobytes()).hexdigest()
 
 
 def _kept_coefficients(

@@ -17,6 +17,7 @@ from seasonscapes.sky.models import SkyModel, visibility_km, with_overrides
 from seasonscapes.terrain.surface import Texture
 from seasonscapes.workflows.illumination import illumination_for_camera
 from seasonscapes.workflows.place import Place
+from seasonscapes.workflows.terrain_building import sample_spacing_m
 
 if TYPE_CHECKING:
     from seasonscapes.albedo.closed_form import AlbedoFit
@@ -115,6 +116,29 @@ def closed_fit(
 
     report = task_progress(progress, "albedo")
     return solve_albedo(transport, photographs, noise_model=EIGHT_BIT, progress=report)
+
+
+def tilted_fit(
+    place: Place,
+    transport: TexelTransport,
+    photographs: list[AlbedoPhotograph],
+    start: AlbedoFit,
+    progress: Progress | None = None,
+) -> tuple[np.ndarray, AlbedoFit, dict[str, Any]]:
+    """Tilts ``(R, S, 3)`` of the texels' normals, the closed form under them, and what was found as plain values."""
+    from seasonscapes.albedo.photographs import EIGHT_BIT
+    from seasonscapes.albedo.subgrid_normals import FEWEST_SUNS, solve_tilts, tilt_sigma
+
+    spacing_m = sample_spacing_m(place.elevation)
+    sigma = tilt_sigma(place.elevation.values[..., 0], spacing_m, place.atlas.texel_p50_m)
+    report = task_progress(progress, "normals below the heights")
+    tilt, fit = solve_tilts(transport, photographs, start, sigma, noise_model=EIGHT_BIT, progress=report)
+    tilted = np.linalg.norm(tilt, axis=-1)
+    found = tilted > 0.0
+    if not found.any():
+        log.warning("no normals were found: no texel is seen in sunlight from %d directions of the sun", FEWEST_SUNS)
+    size = float(np.sqrt(np.mean(tilted[found] ** 2))) if found.any() else 0.0
+    return tilt, fit, {"tilt_prior_sigma": sigma, "tilted_share": float(found.mean()), "tilt_rms": size}
 
 
 def joint_fit(

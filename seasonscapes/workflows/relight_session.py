@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import operator
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import date, datetime
 from functools import reduce
 from pathlib import Path
@@ -248,7 +248,9 @@ def still_session(
     camera, model = view_in_frame(camera, place.frame), sky_model(sky)
     base = nearest_albedo(albedo, base_day)
     camera, terrain = view_with_terrain(place, camera, lambertian=lambertian, amplify=amplify)
-    scene = ray_scene(mi_mesh(terrain, base.load().values))
+    texture = base.load()
+    # Normals are traced with, and belong to the ground: those of the base serve all dates.
+    scene = ray_scene(mi_mesh(replace(terrain, tilt=texture.tilt), texture.values))
     sampling = sampling or SamplingOptions()
     inputs = {
         "place": place.key,
@@ -366,11 +368,8 @@ def _coefficients(
 
 
 def _undated(place: Place, texture: Texture) -> DatedAlbedo:
-    import hashlib
-
     place.require_texture(texture, what="albedo")
-    content = hashlib.sha256(texture.values.tobytes()).hexdigest()
-    return DatedAlbedo(_MIDSUMMER, content, lambda: texture)
+    return DatedAlbedo(_MIDSUMMER, texture.content, lambda: texture)
 
 
 def _identity(dated: DatedAlbedo) -> dict:

@@ -16,7 +16,7 @@ from seasonscapes.workspace import file_hash
 
 if TYPE_CHECKING:
     from seasonscapes.scene import SceneFile
-    from seasonscapes.terrain.synthetic import SyntheticMassif
+    from seasonscapes.terrain.synthetic_massif import SyntheticMassif
     from seasonscapes.terrain.unwrap import Atlas
 
 log = logging.getLogger(__name__)

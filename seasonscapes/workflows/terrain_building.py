@@ -32,7 +32,7 @@ from seasonscapes.workflows.scene_water import with_water
 if TYPE_CHECKING:
     from seasonscapes.scene import SceneFile
     from seasonscapes.terrain.raster import FillReport
-    from seasonscapes.terrain.synthetic import SyntheticMassif
+    from seasonscapes.terrain.synthetic_massif import SyntheticMassif
 
 __all__ = [
     "MeshOptions",

@@ -145,7 +145,7 @@ def render(
     camera, terrain = view_with_terrain(place, camera, lambertian=lambertian, amplify=amplify)
     light, position = illumination_for_camera(place, camera, sky_model(sky), utc)
     view = render_view(
-        build_scene(terrain, texture.values, light),
+        build_scene(replace(terrain, tilt=texture.tilt), texture.values, light),
         camera,
         spp=spp,
         seed=seed,

@@ -1,0 +1,230 @@
+"""Normals below the resolution of heights: known tilts path-traced, found again, and shaded with by both engines."""
+
+from dataclasses import replace
+
+import albedo_cases
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+from scipy.sparse import eye_array
+
+from seasonscapes.albedo.closed_form import SolverOptions, solve_albedo
+from seasonscapes.albedo.photographs import LINEAR, prepare_photographs
+from seasonscapes.albedo.subgrid_normals import (
+    FEWEST_SUNS,
+    TiltEquations,
+    solve_tilts,
+    suns_seen,
+    tangents,
+    tilt_sigma,
+    tilt_step,
+    tilted_photographs,
+)
+from seasonscapes.errors import InputError
+from seasonscapes.rendering.mitsuba_scene import mi_mesh, relight
+from seasonscapes.rendering.radiance import render_view
+from seasonscapes.terrain.surface import Texture, load_texture, save_texture
+from seasonscapes.workflows.albedo_recovery import RecoveryOptions, recover_albedo
+from seasonscapes.workflows.edited_textures import read_albedo
+from seasonscapes.workflows.illumination import sky_model
+from seasonscapes.workflows.place import load_place, utc_at
+from seasonscapes.workflows.synthetic_photographs import photograph_each
+from seasonscapes.workflows.view_rendering import render
+from seasonscapes.workflows.views import camera
+
+SUNS = np.array([[0.6, 0.0, 0.8], [0.0, 0.6, 0.8], [-0.6, 0.0, 0.8], [0.0, -0.8, 0.6], [0.5, 0.5, 0.7071]])
+COUNT = 200
+
+
+def _truth(seed):
+    rng = np.random.default_rng(seed)
+    normal = np.column_stack([rng.normal(0.0, 0.2, (COUNT, 2)), np.ones(COUNT)])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    return rng, normal, rng.normal(0.0, 0.15, (COUNT, 2)), rng.uniform(0.1, 0.5, (COUNT, 3))
+
+
+def _pixels(normal, tilts, albedo, sun, visible, sky=0.3):
+    """Radiance of pixels that show one texel each."""
+    first, second = tangents(normal)
+    tilted = normal + tilts[:, :1] * first + tilts[:, 1:] * second
+    cosine = np.maximum(tilted @ sun, 0.0) / np.linalg.norm(tilted, axis=1) * visible
+    return albedo * (cosine[:, None] + sky), cosine
+
+
+def _found(normal, albedo, pictures, visible, sigma, weight=1e4, rounds=6):
+    """Tilts and albedo of pixels of one texel each, in alternation."""
+    tilts, guess = np.zeros((COUNT, 2)), np.full((COUNT, 3), 0.3)
+    basis = tangents(normal)
+    for _ in range(rounds):
+        cosines = [
+            _pixels(normal, tilts, guess, sun, seen)[1][:, None] + 0.3 for sun, seen in zip(SUNS, visible, strict=True)
+        ]
+        guess = np.sum([c * p for c, p in zip(cosines, pictures, strict=True)], 0) / np.sum([c * c for c in cosines], 0)
+        parts = []
+        for sun, picture, seen in zip(SUNS, pictures, visible, strict=True):
+            before = np.maximum(normal @ sun, 0.1)
+            slope = np.stack([(each @ sun) / before for each in basis], axis=1)
+            residual = picture - _pixels(normal, tilts, guess, sun, seen)[0]
+            lit = eye_array(COUNT).tocsr() * (before * seen)[:, None]
+            parts.append(TiltEquations(lit.tocsr(), np.ones((COUNT, 3)), np.full((COUNT, 3), weight), residual, slope))
+        tilts = tilt_step(parts, guess, tilts, sigma)
+    return tilts, guess
+
+
+def test_tilts_and_albedo_are_found_from_several_suns():
+    _, normal, truth, albedo = _truth(1)
+    visible = np.ones((len(SUNS), COUNT))
+    pictures = [_pixels(normal, truth, albedo, sun, seen)[0] for sun, seen in zip(SUNS, visible, strict=True)]
+    tilts, found = _found(normal, albedo, pictures, visible, 0.3, rounds=40)
+    error = np.sqrt(np.mean((tilts - truth) ** 2))
+    assert error < 0.2 * np.sqrt(np.mean(truth**2))
+    assert np.median(np.abs(found / albedo - 1.0)) < 0.02
+
+
+def test_noise_gives_the_prior_and_shadow_tells_nothing():
+    rng, normal, _, albedo = _truth(2)
+    visible = np.ones((len(SUNS), COUNT))
+    visible[:, : COUNT // 2] = 0.0
+    flat = np.zeros((COUNT, 2))
+    pictures = [
+        _pixels(normal, flat, albedo, sun, seen)[0] + rng.normal(0.0, 0.05, (COUNT, 3))
+        for sun, seen in zip(SUNS, visible, strict=True)
+    ]
+    tilts, _ = _found(normal, albedo, pictures, visible, 0.3, weight=1.0 / 0.05**2)
+    assert np.abs(tilts[: COUNT // 2]).max() == 0.0
+    # A narrow prior holds what a wide one lets follow the noise.
+    wide, narrow = (
+        np.sqrt(np.mean(_found(normal, albedo, pictures, visible, sigma, weight=400.0)[0] ** 2))
+        for sigma in (1.0, 0.02)
+    )
+    assert narrow < 0.02 < wide
+
+
+@pytest.fixture(scope="module")
+def rough():
+    """The place of the albedo tests with ground that is tilted from its heights, path-traced; and what its heights alone tell."""
+    case = albedo_cases.case()
+    rng = np.random.default_rng(3)
+    size = case.albedo.shape[0] * case.albedo.shape[1]
+    normal = np.tile([0.0, 0.0, 1.0], (size, 1))
+    normal[case.transport.texel] = case.transport.normal
+    along = [gaussian_filter(rng.normal(size=case.albedo.shape[:2]), 1.0).ravel() for _ in range(2)]
+    tilt = sum(
+        0.2 / part.std() * part[:, None] * tangent for part, tangent in zip(along, tangents(normal), strict=True)
+    )
+    mesh = mi_mesh(replace(case.terrain, tilt=tilt.reshape(case.albedo.shape).astype(np.float32)), case.albedo)
+    pictures = [
+        [
+            render_view(relight(mesh, light), view, spp=64, seed=10 * t + c).radiance
+            for c, view in enumerate(case.cameras)
+        ]
+        for t, light in enumerate(case.lights)
+    ]
+    seen, lights = replace(case, pictures=pictures).observations()
+    photographs = prepare_photographs(case.transport, seen, lights, gains=[np.ones(3)] * len(seen))
+    start = solve_albedo(case.transport, photographs, noise_model=LINEAR)
+    return case, normal, tilt, photographs, start
+
+
+def test_known_tilts_are_found_in_path_traced_pictures(rough):
+    case, normal, truth, photographs, start = rough
+    found, fit = solve_tilts(case.transport, photographs, start, 0.2)
+    tilt = found.reshape(-1, 3)
+    assert np.abs((tilt * normal).sum(axis=1)).max() < 1e-5
+    few = suns_seen(photographs) < FEWEST_SUNS
+    assert few.any()
+    assert not tilt[few].any()
+    good = ~few & (start.pixel_count.ravel() > 2.0)
+    assert good.sum() > 100
+    left = np.sqrt(np.mean((tilt - truth)[good] ** 2) / np.mean(truth[good] ** 2))
+    assert left < 0.75
+    assert np.median(fit.residual) < 0.95 * np.median(start.residual)
+    # Albedo is rid of the shading.
+    error = [np.abs(each.albedo - case.albedo).reshape(-1, 3)[good].mean() for each in (start, fit)]
+    assert error[1] < 0.9 * error[0]
+
+
+def test_a_light_that_was_held_out_is_predicted_better(rough):
+    case, normal, truth_tilt, photographs, _ = rough
+    held, kept = photographs[3:6], [*photographs[:3], *photographs[6:]]
+    solver = SolverOptions(rounds=9)
+    flat = solve_albedo(case.transport, kept, noise_model=LINEAR, solver=solver)
+    tilt, fit = solve_tilts(case.transport, kept, solve_albedo(case.transport, kept, noise_model=LINEAR), 0.2)
+    known = tilt.reshape(-1, 3).any(axis=1)
+
+    # What the picture shows is the sunlight of the true tilts.
+    true = tilted_photographs(held, normal, truth_tilt)
+
+    def against_truth(model_photographs, albedo):
+        total = []
+        for model, exact in zip(model_photographs, true, strict=True):
+            prints, other = model.footprints, exact.footprints
+            inside = prints.matrix(prints.share) @ known.astype(np.float32) > 0.95
+            predicted = prints.matrix(prints.sunlit[model.number][0]) @ albedo.reshape(-1, 3)
+            shown = other.matrix(other.sunlit[exact.number][0]) @ case.albedo.reshape(-1, 3)
+            total.append((predicted - shown)[inside])
+        return np.sqrt(np.mean(np.concatenate(total) ** 2))
+
+    assert against_truth(tilted_photographs(held, normal, tilt.reshape(-1, 3)), fit.albedo) < 0.9 * against_truth(
+        held, flat.albedo
+    )
+
+
+def test_both_engines_shade_with_the_tilts_of_an_albedo():
+    place = load_place("alpine_small")
+    view = camera(place, "aerial", size_px=(48, 32))
+    values = np.full((*place.texture_shape, 3), 0.3, np.float32)
+    towards_west = np.zeros_like(values)
+    towards_west[..., 0] = -0.6
+    plain = Texture(values, atlas_id=place.atlas_id)
+    tilted = replace(plain, tilt=towards_west)
+    assert tilted.content != plain.content
+    evening = {"time": "2024-07-20T17:00", "sky": "hosek"}
+    pictures = {
+        (name, engine): render(place, view, albedo=albedo, engine=engine, **evening, **more).radiance
+        for name, albedo in (("plain", plain), ("tilted", tilted))
+        for engine, more in (("transport", {}), ("path", {"spp": 64}))
+    }
+    land = np.isfinite(render(place, view, albedo=plain, **evening).gbuffer.depth)
+    gain = {
+        engine: pictures["tilted", engine][land].mean() / pictures["plain", engine][land].mean()
+        for engine in ("transport", "path")
+    }
+    assert gain["path"] > 1.05
+    assert gain["transport"] == pytest.approx(gain["path"], abs=0.03)
+
+
+def test_textures_keep_their_tilts_in_files(tmp_path):
+    values = np.full((4, 5, 3), 0.2, np.float32)
+    tilt = np.random.default_rng(0).normal(0.0, 0.1, values.shape).astype(np.float32)
+    save_texture(Texture(values, tilt=tilt), tmp_path / "t.npz")
+    assert np.array_equal(load_texture(tmp_path / "t.npz").tilt, tilt)
+    np.savez(tmp_path / "bad.npz", values=values, weight=values[..., 0], tilt=np.full((4, 5, 3), np.nan, np.float32))
+    with pytest.raises(InputError, match="tilt"):
+        load_texture(tmp_path / "bad.npz")
+
+
+def test_a_recovery_keeps_its_tilts_where_they_are_asked_for(tmp_path):
+    place = load_place("alpine_small")
+    times = [utc_at(place, f"2024-07-20T{hour}:00") for hour in ("10", "13", "16")]
+    view = {"aerial": camera(place, "aerial", size_px=(96, 64))}
+    each = photograph_each(place, times, sky_model("clear"), view)
+    photographs = [picture.observation for _, pictures in each for picture in pictures]
+    recovered = recover_albedo(place, photographs, options=RecoveryOptions(normals=True))
+    assert recovered.facts["tilted_share"] > 0.02
+    assert recovered.facts["tilt_prior_sigma"] > 0.02
+    recovered.save(tmp_path / "a.npz")
+    texture = read_albedo(place, tmp_path / "a.npz")
+    assert np.array_equal(texture.tilt, recovered.tilt)
+    assert 0.0 < recovered.facts["tilt_rms"] < 1.0
+    with pytest.raises(ValueError, match="normals belong to the closed form"):
+        RecoveryOptions(method="differentiable", normals=True)
+
+
+def test_sigma_of_tilts_follows_the_roughness_that_heights_lose():
+    rng = np.random.default_rng(4)
+    noise = gaussian_filter(rng.normal(size=(256, 256)), 1.5)
+    rough, smooth = (tilt_sigma(100.0 * each, 30.0, 10.0) for each in (noise, gaussian_filter(noise, 8.0)))
+    assert 0.03 < rough < 0.6
+    assert smooth < 0.2 * rough
+    assert tilt_sigma(np.fromfunction(lambda r, c: 9.0 * r + 4.0 * c, (90, 80)), 30.0, 10.0) < 0.02
