@@ -90,8 +90,8 @@ def picture_clocks(
 ) -> list[PictureClock]:
     """Compare the cast shadows in a fixed camera's pictures with those of the sun before and after the stated times.
 
-    Nothing is corrected. Each picture's ground is known from the other ones, whose clocks are taken to be right: an error
-    that all pictures share is found too, less sharply. High suns, whose shadows barely move, tell nothing.
+    Nothing is corrected. Each picture's ground is known from the other ones, whose clocks are taken to be right. High suns,
+    whose shadows barely move, tell nothing.
 
     Parameters
     ----------
