@@ -75,6 +75,7 @@ results: $(DEV)
 	$(BIN)/python benchmarks/relight.py --json benchmarks/results/relight.json
 	$(BIN)/python benchmarks/texturing.py --quick --json benchmarks/results/texturing-quick.json
 	$(BIN)/python benchmarks/albedo.py --quick --json benchmarks/results/albedo-quick.json
+	$(BIN)/python benchmarks/subgrid_normals.py --json benchmarks/results/subgrid_normals.json
 	$(BIN)/python benchmarks/delight.py --quick --json benchmarks/results/delight-quick.json
 	$(BIN)/python benchmarks/gaussians.py --quick --json benchmarks/results/gaussians-quick.json
 	$(BIN)/python benchmarks/alpinebench.py --quick --json benchmarks/results/alpinebench-quick.json
