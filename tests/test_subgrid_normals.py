@@ -14,6 +14,7 @@ from seasonscapes.albedo.subgrid_normals import (
     FEWEST_SUNS,
     TiltEquations,
     solve_tilts,
+    sunlight_factors,
     suns_seen,
     tangents,
     tilt_sigma,
@@ -79,6 +80,26 @@ def test_tilts_and_albedo_are_found_from_several_suns():
     error = np.sqrt(np.mean((tilts - truth) ** 2))
     assert error < 0.2 * np.sqrt(np.mean(truth**2))
     assert np.median(np.abs(found / albedo - 1.0)) < 0.02
+
+
+def test_ground_without_tilt_keeps_its_sunlight_however_low_the_sun():
+    normal = np.tile([0.0, 0.0, 1.0], (6, 1))
+    tilt = np.zeros((6, 3))
+    tilt[3:, 0] = 0.05, -0.05, -0.4
+    for elevation_deg in (0.5, 2.0, 5.0, 30.0, 80.0):
+        elevation = np.radians(elevation_deg)
+        sun = np.array([np.cos(elevation), 0.0, np.sin(elevation)])
+        factor = sunlight_factors(normal, tilt, sun)
+        assert np.allclose(factor[:3], 1.0, atol=1e-12)
+        assert factor[3] > 1.0 > factor[4] >= factor[5] >= 0.0
+        # The slope that the equations of the tilts have.
+        slope = sun[0] / max(sun[2], 0.1)
+        step = sunlight_factors(normal[:1], np.array([[1e-4, 0.0, 0.0]]), sun)[0] - 1.0
+        assert step == pytest.approx(1e-4 * slope, rel=1e-3)
+        if elevation_deg > 10.0:
+            tilted = (normal + tilt) / np.linalg.norm(normal + tilt, axis=1, keepdims=True)
+            assert np.allclose(factor, np.maximum(tilted @ sun, 0.0) / sun[2])
+    assert sunlight_factors(normal, tilt, np.array([0.8, 0.0, -0.6])).tolist() == [1.0] * 6
 
 
 def test_noise_gives_the_prior_and_shadow_tells_nothing():

@@ -136,12 +136,21 @@ def sunlight_factors(normal: np.ndarray, tilt: np.ndarray, direction: np.ndarray
     Returns
     -------
     numpy.ndarray
-        ``(N,)``; 1 where the sun stands behind the normal.
+        ``(N,)``; 1 without tilt, and where the sun stands behind the normal. Below a cosine of incidence of 0.1 the change is
+        relative to that cosine, so that grazing light on rough ground stays bounded.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from seasonscapes.albedo.subgrid_normals import sunlight_factors
+    >>> up, towards_sun, low_sun = np.array([[0.0, 0.0, 1.0]]), np.array([[0.1, 0.0, 0.0]]), np.array([0.96, 0.0, 0.28])
+    >>> sunlight_factors(up, 0.0 * up, low_sun).tolist(), sunlight_factors(up, towards_sun, low_sun).round(2).tolist()
+    ([1.0], [1.34])
     """
     tilted = normal + tilt
-    cosine = np.maximum(tilted @ direction, 0.0) / np.linalg.norm(tilted, axis=1)
-    before = normal @ direction
-    return np.where(before > 0.0, cosine / np.maximum(before, _LEAST_COSINE), 1.0)
+    cosine, before = tilted @ direction / np.linalg.norm(tilted, axis=1), normal @ direction
+    factor = np.maximum(1.0 + (cosine - before) / np.maximum(before, _LEAST_COSINE), 0.0)
+    return np.where(before > 0.0, factor, 1.0)
 
 
 def tilted_photographs(
