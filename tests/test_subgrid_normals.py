@@ -191,6 +191,28 @@ def test_a_light_that_was_held_out_is_predicted_better(rough):
     )
 
 
+def test_a_sun_too_faint_beside_the_sky_tells_no_tilts(rough):
+    case, _, _, photographs, _ = rough
+    few = photographs[: 2 * len(case.cameras) : len(case.cameras)]
+    light = few[0].light
+    dim = replace(light.sun, normal_illuminance_lx=np.full(3, 1e-6))
+    moon = replace(light.sun, direction=np.array([0.0, 0.6, 0.8]))
+    # A moon that is kept is the first body, and no sun.
+    for bodies in ([], [few[0].footprints.sunlit[few[0].number][0]]):
+        dawn = replace(
+            few[0],
+            light=replace(light, sun=dim, moon=moon if bodies else None),
+            footprints=replace(few[0].footprints, sunlit=[bodies]),
+            number=0,
+        )
+        assert np.array_equal(suns_seen([*few, dawn]), suns_seen(few))
+        assert not suns_seen([dawn]).any()
+        start = solve_albedo(case.transport, [*few, dawn], noise_model=LINEAR, solver=SolverOptions(rounds=1))
+        tilt, fit = solve_tilts(case.transport, [*few, dawn], start, 0.2)
+        assert not tilt.any()
+        assert np.isfinite(fit.albedo).all()
+
+
 def test_both_engines_shade_with_the_tilts_of_an_albedo():
     place = load_place("alpine_small")
     view = camera(place, "aerial", size_px=(48, 32))
@@ -248,4 +270,8 @@ def test_sigma_of_tilts_follows_the_roughness_that_heights_lose():
     rough, smooth = (tilt_sigma(100.0 * each, 30.0, 10.0) for each in (noise, gaussian_filter(noise, 8.0)))
     assert 0.03 < rough < 0.6
     assert smooth < 0.2 * rough
+    # Of large heights the middle counts.
+    wide = np.zeros((2304, 2304), np.float32)
+    wide[128:-128, 128:-128] = np.tile(100.0 * noise, (8, 8))
+    assert tilt_sigma(wide, 30.0, 10.0) == tilt_sigma(wide[128:-128, 128:-128], 30.0, 10.0)
     assert tilt_sigma(np.fromfunction(lambda r, c: 9.0 * r + 4.0 * c, (90, 80)), 30.0, 10.0) < 0.02

@@ -28,6 +28,7 @@ from seasonscapes.albedo.forward_model import TexelTransport
 from seasonscapes.albedo.ground_pixels import ground_pixels
 from seasonscapes.albedo.photographs import LINEAR, AlbedoPhotograph, NoiseModel
 from seasonscapes.rendering.receivers import luminaries
+from seasonscapes.sky.illumination import Illumination
 
 FEWEST_SUNS = 3
 # Suns nearer to each other are one [°].
@@ -40,6 +41,8 @@ _BLOCK = 32.0
 _LEAST_COSINE = 0.1
 # Slopes beyond 45° from the heights' are no relief that one texel may stand for.
 _LARGEST_TILT = 1.0
+# The central samples of the heights, to a side, tell the roughness of all: in bounded memory.
+_WINDOW = 2048
 # A texel is lit where this share of what is seen of it, times the cosine, is in sunlight; and seen from so many pixels on.
 _LIT, _FEWEST_PIXELS = 0.05, 0.5
 
@@ -59,7 +62,8 @@ class TiltEquations:
     residual
         ``(n, 3)`` picture - model [cd/m²].
     slope
-        ``(N, 2)`` relative change of a texel's sunlight by its tilts; 0 where they are not free.
+        ``(N, 2)`` relative change of a texel's sunlight by its tilts, the same array for all cameras of an hour; 0 where they
+        are not free.
     """
 
     sunlit: Any
@@ -78,7 +82,7 @@ def tilt_sigma(height_m: np.ndarray, spacing_m: float, texel_m: float) -> float:
     Parameters
     ----------
     height_m
-        ``(H, W)`` heights without holes [m].
+        ``(H, W)`` heights without holes [m]; of larger ones the central 2048 × 2048 count.
     spacing_m
         Distance of neighbouring samples [m].
     texel_m
@@ -99,6 +103,8 @@ def tilt_sigma(height_m: np.ndarray, spacing_m: float, texel_m: float) -> float:
     """
     import cv2
 
+    top, left = (max((side - _WINDOW) // 2, 0) for side in height_m.shape)
+    height_m = height_m[top : top + _WINDOW, left : left + _WINDOW]
     factor = int(np.clip(round(spacing_m / texel_m), 2, 8))
     rows, columns = (max(each // factor, 2) for each in height_m.shape)
     height_m = np.ascontiguousarray(height_m[: rows * factor, : columns * factor], np.float32)
@@ -181,11 +187,12 @@ def suns_seen(photographs: Sequence[AlbedoPhotograph]) -> np.ndarray:
     directions: list[np.ndarray] = []
     lit: list[np.ndarray] = []
     for each in photographs:
-        if each.light.sun is None:
+        sun = _sun_of(each.light)
+        if sun is None:
             continue
-        footprints, direction = each.footprints, np.asarray(each.light.sun.direction)
+        footprints, (number, direction) = each.footprints, sun
         share = np.bincount(footprints.texel, footprints.share, size)
-        sunlit = np.bincount(footprints.texel, footprints.sunlit[each.number][0], size) > _LIT * share
+        sunlit = np.bincount(footprints.texel, footprints.sunlit[each.number][number], size) > _LIT * share
         same = [k for k, other in enumerate(directions) if other @ direction > np.cos(np.radians(_SAME_SUN_DEG))]
         if same:
             lit[same[0]] |= sunlit
@@ -193,6 +200,15 @@ def suns_seen(photographs: Sequence[AlbedoPhotograph]) -> np.ndarray:
             directions.append(direction)
             lit.append(sunlit)
     return np.sum(lit, axis=0) if lit else np.zeros(size, np.int64)
+
+
+def _sun_of(light: Illumination) -> tuple[int, np.ndarray] | None:
+    """Which of the bodies that footprints know is the sun, and the unit vector ``(3,)`` towards it.
+
+    ``None`` where it is below the horizon, or so faint beside the sky that `luminaries` leaves it out.
+    """
+    bodies = enumerate(luminaries(light))
+    return next(((number, np.asarray(body.direction)) for number, body in bodies if body is light.sun), None)
 
 
 def solve_tilts(
@@ -233,12 +249,13 @@ def solve_tilts(
     normal[transport.texel] = transport.normal
     basis = tangents(normal)
     free = (suns_seen(photographs) >= FEWEST_SUNS) & (start.pixel_count.ravel() >= _FEWEST_PIXELS)
-    fit, tilts, tilt = start, np.zeros((size, 2)), np.zeros((size, 3))
+    fit, tilts, tilt, current = start, np.zeros((size, 2)), np.zeros((size, 3)), list(photographs)
     for done in range(_ROUNDS):
-        current = tilted_photographs(photographs, normal, tilt)
         parts = _equations(transport, photographs, current, fit, (normal, basis, free), noise_model)
         tilts = tilt_step(parts, fit.albedo.reshape(size, 3), tilts, sigma)
         tilt = tilts[:, :1] * basis[0] + tilts[:, 1:] * basis[1]
+        # Before the next ones are made: together they would be the most memory that a recovery takes.
+        del parts, current
         current = tilted_photographs(photographs, normal, tilt)
         solver = SolverOptions(rounds=_CLOSED_ROUNDS)
         fit = solve_albedo(transport, current, noise_model=noise_model, solver=solver, start=fit.albedo)
@@ -263,23 +280,25 @@ def _equations(
         equations.ground = None if ground is None else ground.factors(albedo)
         equations.inverse_gain = 1.0 / gain
     reweight(systems, albedo, noise_model, robust=True)
-    parts = []
+    parts, slopes = [], {}
     for equations, before in zip(systems, plain, strict=True):
-        if before.light.sun is None:
+        sun = _sun_of(before.light)
+        if sun is None:
             continue
-        weight = equations.weight
+        (number, direction), weight = sun, equations.weight
         assert weight is not None, "reweight sets it"
         radiance = forward_product(equations, albedo)[0] + equations.airlight
         residual = equations.picture * equations.inverse_gain.astype(np.float32) - radiance
         spread = np.abs(residual * np.sqrt(weight))[equations.usable[:, 0]]
         # The empirical spread replaces variances that were underestimated.
         scale = max(1.0, float(np.median(spread)) / 0.6745) if len(spread) else 1.0
-        direction = np.asarray(before.light.sun.direction)
-        cosine = np.maximum(normal @ direction, _LEAST_COSINE)
-        slope = np.stack([(tangent @ direction) / cosine for tangent in basis], axis=1) * free[:, None]
-        sunlit = before.footprints.matrix(before.footprints.sunlit[before.number][0])
-        unit = equations.transmittance / np.float32(np.pi) * light_factors(equations)[0][0]
-        parts.append(TiltEquations(sunlit, unit, weight / np.float32(scale**2 * _BLOCK), residual, slope))
+        hour = tuple(direction)
+        if hour not in slopes:
+            change = np.stack([tangent @ direction for tangent in basis], axis=1) * free[:, None]
+            slopes[hour] = (change / np.maximum(normal @ direction, _LEAST_COSINE)[:, None]).astype(np.float32)
+        sunlit = before.footprints.matrix(before.footprints.sunlit[before.number][number])
+        unit = equations.transmittance / np.float32(np.pi) * light_factors(equations)[0][number]
+        parts.append(TiltEquations(sunlit, unit, weight / np.float32(scale**2 * _BLOCK), residual, slopes[hour]))
     return parts
 
 
