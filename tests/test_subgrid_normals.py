@@ -22,8 +22,13 @@ from seasonscapes.albedo.subgrid_normals import (
     tilted_photographs,
 )
 from seasonscapes.errors import InputError
-from seasonscapes.rendering.mitsuba_scene import mi_mesh, relight
+from seasonscapes.frames import direction_from_angles
+from seasonscapes.rendering.hemisphere_rays import ray_scene
+from seasonscapes.rendering.hosek import hosek_illumination
+from seasonscapes.rendering.irradiance import surface_at
+from seasonscapes.rendering.mitsuba_scene import build_scene, mi_mesh, relight
 from seasonscapes.rendering.radiance import render_view
+from seasonscapes.rendering.sun_visibility import sun_rays, visible_cosine
 from seasonscapes.terrain.surface import Texture, load_texture, save_texture
 from seasonscapes.workflows.albedo_recovery import RecoveryOptions, recover_albedo
 from seasonscapes.workflows.edited_textures import read_albedo
@@ -235,6 +240,41 @@ def test_both_engines_shade_with_the_tilts_of_an_albedo():
     }
     assert gain["path"] > 1.05
     assert gain["transport"] == pytest.approx(gain["path"], abs=0.03)
+
+
+def test_tilts_cast_no_shadows_on_their_own_ground():
+    place = load_place("alpine_small")
+    light = hosek_illumination(direction_from_angles(285.0, 4.0), shape=(16, 32))
+    values = np.full((*place.texture_shape, 3), 0.3, np.float32)
+    tilt = np.zeros_like(values)
+    # Towards the sun: the cosine to the tilted normal is large where that to the surface is small.
+    tilt[..., :2] = 0.6 * light.sun.direction[:2] / np.linalg.norm(light.sun.direction[:2])
+    terrains = [place.terrain, replace(place.terrain, tilt=tilt)]
+
+    low, high = place.terrain.vertices.min(axis=0), place.terrain.vertices.max(axis=0)
+    position_m = np.random.default_rng(0).uniform(low, high, (20_000, 3))
+    position_m[:, 2] = 0.5 * (low[2] + high[2])
+    visible = []
+    for terrain in terrains:
+        scene = ray_scene(mi_mesh(terrain, values))
+        points, _ = surface_at(scene, position_m, search_m=float(high[2] - low[2]))
+        normals = (each[:, None] for each in (points.normal, points.geometric_normal))
+        rays = sun_rays(scene, points.origin[:, None], *normals, np.ones((len(points.uv), 1)), np.zeros(len(points.uv)))
+        visible.append(visible_cosine(rays, light.sun)[:, 0] > 0.0)
+        towards = (points.geometric_normal @ light.sun.direction).astype(np.float32)
+    grazing = (towards > 0.01) & (towards < 0.06)
+    assert visible[0][grazing].sum() > 50
+    assert np.array_equal(visible[0][grazing], visible[1][grazing])
+
+    # The path tracer: the sun alone, and paths without bounces.
+    dark = replace(light, sky_radiance=np.zeros_like(light.sky_radiance))
+    view = camera(place, "aerial", size_px=(96, 64))
+    lit = [
+        render_view(build_scene(each, values, dark), view, spp=1, seed=0, max_depth=2).radiance[..., 1] > 0.0
+        for each in terrains
+    ]
+    assert lit[0].sum() > 200
+    assert not (lit[0] & ~lit[1]).any()
 
 
 def test_textures_keep_their_tilts_in_files(tmp_path):

@@ -298,8 +298,9 @@ def _direct_light(
         point = sobol_pair(hashed(key, _LUMINARY + number), index)
         direction = luminary.mi_frame.to_world(mi.warp.square_to_uniform_cone(point, luminary.mi_cos_radius))
         cosine = dr.dot(normal, direction)
-        facing = active & (cosine > 0.0) & (dr.dot(outward, direction) > 0.0)
-        ray: Any = mi.Ray3f(origin + direction * shadow_ray_start(material, cosine, origin), direction)
+        rise = dr.dot(outward, direction)
+        facing = active & (cosine > 0.0) & (rise > 0.0)
+        ray: Any = mi.Ray3f(origin + direction * shadow_ray_start(material, rise, origin), direction)
         ray.maxt = FAR_M
         shadowed = scene.mi_scene.ray_test(ray, coherent=coherent, active=facing)
         reflected = reflection.towards(direction, cosine) * luminary.mi_illuminance

@@ -319,5 +319,5 @@ def _visible(rays: SunRays, disc: _Disc, lane: Any, shift: Any = 0, *, coherent:
     direction = dr.gather(mi.Vector3f, disc.mi_directions, disc_point % disc.mi_count)
     origin = dr.gather(mi.Point3f, rays.mi_origin, lane, active)
     material = rays.terrain.mi_terrain.bsdf()
-    ray = mi.Ray3f(origin + direction * shadow_ray_start(material, cosine, origin), direction)
+    ray = mi.Ray3f(origin + direction * shadow_ray_start(material, geometric_cosine, origin), direction)
     return active & ~rays.terrain.mi_scene.ray_test(ray, coherent=coherent, active=active), cosine, weight

@@ -196,7 +196,8 @@ def shadow_ray_start(material: Any, cosine: Any, position: Any) -> Any:
     material
         Of the terrain's mesh.
     cosine
-        ``mi.Float``: cosine of the angle between ray and surface normal.
+        ``mi.Float``: cosine of the angle between ray and the smooth surface's own normal, not a tilted one: the error is
+        that of the geometry.
     position
         ``mi.Point3f``: where the ray leaves the surface.
     """
