@@ -1,6 +1,7 @@
 """Textures that this program writes, edited elsewhere, come back as albedo; those of another atlas do not."""
 
 import json
+from datetime import date
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,11 @@ from PIL import Image
 from places import MASSIF
 
 import seasonscapes as ss
+from seasonscapes.albedo.standard_error import AlbedoEstimate
 from seasonscapes.errors import AtlasMismatch
 from seasonscapes.images import linear_from_display, linear_from_srgb, read_exr, tone_curve, write_exr, write_png
 from seasonscapes.terrain.surface import Texture, save_texture
+from seasonscapes.workflows.albedo_recovery import save_albedo_figures
 from seasonscapes.workflows.edited_textures import albedo_date, read_albedo
 
 TIME = "2024-07-20T13:30"
@@ -182,6 +185,33 @@ def test_a_picture_of_another_atlas_is_refused(lit, scene):
     other = ss.load_place(scene, options=ss.MeshOptions(texel_m=60.0, max_error_m=25.0))
     with pytest.raises(AtlasMismatch, match=r"lit\.png: belongs to another atlas of the same size"):
         read_albedo(other, lit["png"])
+
+
+def test_light_on_normals_that_a_picture_does_not_hold_is_no_albedo(scene, place, tmp_path, caplog):
+    """The light on tilted normals is not that which reading computes; nor does an albedo's picture hold tilts."""
+    values = np.full((*place.texture_shape, 3), 0.3, np.float32)
+    tilted = Texture(values, values[..., 0], place.atlas_id, np.full_like(values, 0.1))
+    save_texture(tilted, tmp_path / "tilted.npz")
+    command(
+        "lit-texture",
+        scene,
+        time=TIME,
+        sky="hosek",
+        rays=16,
+        texel_m=60,
+        albedo=tmp_path / "tilted.npz",
+        output=tmp_path / "lit.exr",
+    )
+    with pytest.raises(ss.InputError, match=r"lit\.exr: is lit on normals .* --normals") as caught:
+        read_albedo(place, tmp_path / "lit.exr")
+    assert "\n" not in str(caught.value)
+    known = AlbedoEstimate(values, values[..., 0], values[..., 0], np.ones(place.texture_shape, np.uint8))
+    for each in (False, True):
+        caplog.clear()
+        paths = save_albedo_figures(place, known, date(2024, 7, 20), tmp_path / "a.npz", tilted=each)
+        texture = read_albedo(place, Path(paths["albedo"]))
+        assert texture.tilt is None
+        assert ("normals" in caplog.text) == each
 
 
 def test_developed_values_are_inverted():

@@ -27,7 +27,9 @@ def albedo_record(loaded: Place, recovered: RecoveredAlbedo, output: Path) -> di
         "cloudiness": [each.light.cloudiness for each in recovered.photographs],
         "gains": recovered.fit.gains.tolist(),
         **recovered.facts,
-        "figures": recovery.save_albedo_figures(loaded, recovered.estimate, recovered.day, output),
+        "figures": recovery.save_albedo_figures(
+            loaded, recovered.estimate, recovered.day, output, tilted=recovered.tilt is not None
+        ),
         "attribution": loaded.scene.attribution,
     }
     if loaded.synthetic is not None:

@@ -87,7 +87,7 @@ def lit_texture_command(
         "attribution": loaded.scene.attribution,
         "rays": rays,
         "seed": seed,
-        "texture": texture_facts(loaded, "lit", utc=utc, sky=model, rays=rays, seed=seed),
+        "texture": texture_facts(loaded, "lit", utc=utc, sky=model, rays=rays, seed=seed, tilted=lit.tilted),
     }
     if output.suffix.lower() == ".exr":
         layers = {"": lit.radiance, "sun": lit.sun, "sky": lit.sky, "bounce": lit.bounce, "albedo": lit.albedo}

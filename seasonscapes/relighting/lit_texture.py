@@ -27,12 +27,15 @@ class LitTexture:
         reflects [lx]; NaN for texels without a surface.
     albedo
         ``(R, S, 3)`` albedo of the texels.
+    tilted
+        Whether sun, sky and bounce are those of normals from photographs, and not of the heights' own.
     """
 
     sun: np.ndarray
     sky: np.ndarray
     bounce: np.ndarray
     albedo: np.ndarray
+    tilted: bool = False
 
     @property
     def radiance(self) -> np.ndarray:

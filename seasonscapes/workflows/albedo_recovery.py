@@ -436,10 +436,12 @@ def _completed(
     return completed_estimate(known, fit, base, predictors_for(place.terrain, place.atlas), progress=report)
 
 
-def save_albedo_figures(place: Place, known: AlbedoEstimate, day: date, output: Path) -> dict[str, str]:
+def save_albedo_figures(
+    place: Place, known: AlbedoEstimate, day: date, output: Path, *, tilted: bool = False
+) -> dict[str, str]:
     """Write pictures beside an albedo file: the albedo, what was measured, and σ (white is 0.1); their paths.
 
-    The picture of the albedo may be edited and given back as an albedo.
+    The picture of the albedo may be edited and given back as an albedo; ``tilted``: which has normals of its own.
     """
     from seasonscapes.images import write_png
     from seasonscapes.workflows.edited_textures import texture_facts
@@ -454,7 +456,8 @@ def save_albedo_figures(place: Place, known: AlbedoEstimate, day: date, output: 
     paths = {}
     for name, image in pictures.items():
         path = output.with_name(f"{output.stem}_{name}.png")
-        facts = texture_facts(place, "albedo" if name == "albedo" else "figure", date=day.isoformat())
+        holds = "albedo" if name == "albedo" else "figure"
+        facts = texture_facts(place, holds, date=day.isoformat(), tilted=tilted)
         record = {"texture": facts, "attribution": place.scene.attribution}
         write_png(path, np.clip(image, 0.0, 1.0), metadata=png_metadata(record))
         paths[name] = str(path)

@@ -50,7 +50,8 @@ def texture_facts(
     utc, sky
         Of lit textures: the hour and its sky.
     more
-        Of lit textures: ``exposure_ev100`` of a developed picture, ``rays`` and ``seed`` of its light.
+        Of lit textures: ``exposure_ev100`` of a developed picture, ``rays`` and ``seed`` of its light. ``tilted``: true where
+        the albedo has normals of its own (``albedo --normals``), which a picture does not hold.
     """
     facts: dict[str, Any] = {"holds": holds, "atlas_id": place.atlas_id, "mesh": asdict(place.options), **more}
     if utc is not None:
@@ -136,7 +137,8 @@ def read_albedo(place: Place, path: Path) -> Texture:
     Raises
     ------
     InputError
-        Where it is no albedo: a figure, radiance, transparent texels, values that are not finite or beyond 1.5.
+        Where it is no albedo: a figure, radiance, transparent texels, values that are not finite or beyond 1.5; or lit on
+        normals of its own, whose light cannot be computed again from a picture.
     AtlasMismatch
         Where it is of another atlas or size.
     """
@@ -153,6 +155,10 @@ def read_albedo(place: Place, path: Path) -> Texture:
             raise InputError(path, "is a figure, not an albedo", cure=cure)
         if facts.get("holds") == "lit":
             texture = _without_light(place, path, texture, facts)
+        elif facts.get("tilted"):
+            log.warning(
+                "%s: the normals that photographs told stay behind in the .npz; this one has those of the heights", path
+            )
         elif not facts:
             log.info("%s: states nothing about itself; taken for an albedo of this place's atlas", path)
     _require_albedo_values(path, texture)
@@ -236,6 +242,9 @@ def _without_light(place: Place, path: Path, texture: Texture, facts: dict[str, 
     """
     from seasonscapes.images import linear_from_display
 
+    if facts.get("tilted"):
+        cure = "render from the .npz that it was made of, or recover that without --normals"
+        raise InputError(path, "is lit on normals from photographs, which a picture does not hold", cure=cure)
     radiance, weight = texture.values, texture.weight
     if "exposure_ev100" in facts:
         if facts.get("eye"):

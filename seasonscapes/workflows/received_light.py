@@ -101,7 +101,7 @@ def lit_texture(
     light, _ = illumination_on_terrain(place, sky_model(sky), utc)
     texture = chosen_albedo(place, utc.date(), albedo, progress=progress)
     positions, _ = texel_positions(place.terrain, place.atlas.width_px, place.atlas.height_px)
-    return bake_lit_texture(
+    lit = bake_lit_texture(
         ray_scene(mi_mesh(replace(place.terrain, tilt=texture.tilt), texture.values)),
         positions,
         texture.values,
@@ -110,6 +110,7 @@ def lit_texture(
         seed=seed,
         progress=task_progress(progress, "baking"),
     )
+    return replace(lit, tilted=texture.tilt is not None)
 
 
 @dataclass(frozen=True)
