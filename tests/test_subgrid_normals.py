@@ -36,7 +36,7 @@ from seasonscapes.workflows.illumination import sky_model
 from seasonscapes.workflows.place import load_place, utc_at
 from seasonscapes.workflows.synthetic_photographs import photograph_each
 from seasonscapes.workflows.view_rendering import render
-from seasonscapes.workflows.views import camera
+from seasonscapes.workflows.views import camera, tilted_terrain
 
 SUNS = np.array([[0.6, 0.0, 0.8], [0.0, 0.6, 0.8], [-0.6, 0.0, 0.8], [0.0, -0.8, 0.6], [0.5, 0.5, 0.7071]])
 COUNT = 200
@@ -275,6 +275,18 @@ def test_tilts_cast_no_shadows_on_their_own_ground():
     ]
     assert lit[0].sum() > 200
     assert not (lit[0] & ~lit[1]).any()
+
+
+def test_invented_relief_stands_in_place_of_tilts(caplog):
+    terrain = load_place("alpine_small").terrain
+    plain = Texture(np.full((4, 5, 3), 0.2, np.float32))
+    tilted = replace(plain, tilt=np.full((4, 5, 3), 0.1, np.float32))
+    caplog.set_level("INFO")
+    assert tilted_terrain(terrain, tilted, amplify=False).tilt is tilted.tilt
+    assert tilted_terrain(terrain, plain, amplify=True).tilt is None
+    assert "left out" not in caplog.text
+    assert tilted_terrain(terrain, tilted, amplify=True).tilt is None
+    assert "left out" in caplog.text
 
 
 def test_textures_keep_their_tilts_in_files(tmp_path):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import operator
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from datetime import date, datetime
 from functools import reduce
 from pathlib import Path
@@ -35,7 +35,7 @@ from seasonscapes.terrain.surface import Texture
 from seasonscapes.workflows.albedo_sources import AlbedoFile, AlbedoSource, dated_albedos, snow_transition_between
 from seasonscapes.workflows.illumination import SunMoonPosition, illumination_for_camera, sky_model
 from seasonscapes.workflows.place import MeshOptions, Place, load_place, utc_at
-from seasonscapes.workflows.views import camera_for, camera_values, view_with_terrain
+from seasonscapes.workflows.views import camera_for, camera_values, tilted_terrain, view_with_terrain
 from seasonscapes.workspace import Workspace, artefact_key, build_once
 
 if TYPE_CHECKING:
@@ -250,7 +250,7 @@ def still_session(
     camera, terrain = view_with_terrain(place, camera, lambertian=lambertian, amplify=amplify)
     texture = base.load()
     # Normals are traced with, and belong to the ground: those of the base serve all dates.
-    scene = ray_scene(mi_mesh(replace(terrain, tilt=texture.tilt), texture.values))
+    scene = ray_scene(mi_mesh(tilted_terrain(terrain, texture, amplify=amplify), texture.values))
     sampling = sampling or SamplingOptions()
     inputs = {
         "place": place.key,

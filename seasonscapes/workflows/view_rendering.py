@@ -21,7 +21,7 @@ from seasonscapes.workflows.albedo_sources import AlbedoSource, chosen_albedo
 from seasonscapes.workflows.illumination import SunMoonPosition, illumination_for_camera, position_at, sky_model
 from seasonscapes.workflows.place import Place, utc_at
 from seasonscapes.workflows.relight_session import still_session, view_at
-from seasonscapes.workflows.views import camera_geodetic, view_with_terrain
+from seasonscapes.workflows.views import camera_geodetic, tilted_terrain, view_with_terrain
 from seasonscapes.workspace import content_key
 
 if TYPE_CHECKING:
@@ -80,7 +80,8 @@ def render(
     lambertian
         All ground is matt, also what the scene file declares as water, snow and forest: for comparison.
     amplify
-        Add relief and albedo below the resolution of the data: for pictures, not for measurements.
+        Add relief and albedo below the resolution of the data: for pictures, not for measurements. Normals that the albedo has
+        from photographs (``albedo --normals``) are left out then: both are of the same scale.
     progress
         Called with a task and its finished share.
 
@@ -145,7 +146,7 @@ def render(
     camera, terrain = view_with_terrain(place, camera, lambertian=lambertian, amplify=amplify)
     light, position = illumination_for_camera(place, camera, sky_model(sky), utc)
     view = render_view(
-        build_scene(replace(terrain, tilt=texture.tilt), texture.values, light),
+        build_scene(tilted_terrain(terrain, texture, amplify=amplify), texture.values, light),
         camera,
         spp=spp,
         seed=seed,

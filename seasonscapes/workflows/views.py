@@ -18,7 +18,7 @@ from seasonscapes.workflows.place import Place, ground_height_m, ground_or_nan, 
 if TYPE_CHECKING:
     from seasonscapes.cameras.panorama import Panorama
     from seasonscapes.cameras.pinhole import Camera
-    from seasonscapes.terrain.surface import Terrain
+    from seasonscapes.terrain.surface import Terrain, Texture
 
 log = logging.getLogger(__name__)
 
@@ -154,6 +154,16 @@ def view_with_terrain(
 
     view, terrain = detailed_view(place, view, amplify=amplify)
     return view, replace(terrain, water=None, snow=None, forest=False) if lambertian else terrain
+
+
+def tilted_terrain(terrain: Terrain, albedo: Texture, *, amplify: bool) -> Terrain:
+    """A terrain with the normals that its albedo has below the resolution of the heights, if any.
+
+    Not with ``amplify``: relief is invented for the same octaves, and would count twice.
+    """
+    if albedo.tilt is not None and amplify:
+        log.info("detail is invented where the albedo has normals from photographs: these are left out")
+    return terrain if amplify else replace(terrain, tilt=albedo.tilt)
 
 
 def camera_geodetic(place: Place, view: Camera | Panorama) -> tuple[float, float, float]:
