@@ -23,6 +23,8 @@ from seasonscapes.albedo.subgrid_normals import (
 )
 from seasonscapes.errors import InputError
 from seasonscapes.frames import direction_from_angles
+from seasonscapes.relighting.lit_texture import bake_lit_texture
+from seasonscapes.rendering.coefficients import SamplingOptions
 from seasonscapes.rendering.hemisphere_rays import ray_scene
 from seasonscapes.rendering.hosek import hosek_illumination
 from seasonscapes.rendering.irradiance import surface_at
@@ -30,6 +32,7 @@ from seasonscapes.rendering.mitsuba_scene import build_scene, mi_mesh, relight
 from seasonscapes.rendering.radiance import render_view
 from seasonscapes.rendering.sun_visibility import sun_rays, visible_cosine
 from seasonscapes.terrain.surface import Texture, load_texture, save_texture
+from seasonscapes.terrain.surface_grid import surface_grid
 from seasonscapes.workflows.albedo_recovery import RecoveryOptions, recover_albedo
 from seasonscapes.workflows.edited_textures import read_albedo
 from seasonscapes.workflows.illumination import sky_model
@@ -220,7 +223,7 @@ def test_a_sun_too_faint_beside_the_sky_tells_no_tilts(rough):
 
 def test_both_engines_shade_with_the_tilts_of_an_albedo():
     place = load_place("alpine_small")
-    view = camera(place, "aerial", size_px=(48, 32))
+    view = camera(place, "aerial", size_px=(36, 24))
     values = np.full((*place.texture_shape, 3), 0.3, np.float32)
     towards_west = np.zeros_like(values)
     towards_west[..., 0] = -0.6
@@ -228,18 +231,41 @@ def test_both_engines_shade_with_the_tilts_of_an_albedo():
     tilted = replace(plain, tilt=towards_west)
     assert tilted.content != plain.content
     evening = {"time": "2024-07-20T17:00", "sky": "hosek"}
-    pictures = {
-        (name, engine): render(place, view, albedo=albedo, engine=engine, **evening, **more).radiance
+    views = {
+        (name, engine): render(place, view, albedo=albedo, engine=engine, **evening, **more)
         for name, albedo in (("plain", plain), ("tilted", tilted))
-        for engine, more in (("transport", {}), ("path", {"spp": 64}))
+        for engine, more in (("transport", {}), ("path", {"spp": 32}))
     }
-    land = np.isfinite(render(place, view, albedo=plain, **evening).gbuffer.depth)
+    land = np.isfinite(views["plain", "path"].gbuffer.depth)
     gain = {
-        engine: pictures["tilted", engine][land].mean() / pictures["plain", engine][land].mean()
+        engine: views["tilted", engine].radiance[land].mean() / views["plain", engine].radiance[land].mean()
         for engine in ("transport", "path")
     }
     assert gain["path"] > 1.05
     assert gain["transport"] == pytest.approx(gain["path"], abs=0.03)
+
+
+def test_skylight_and_bounces_are_those_of_the_heights(rough):
+    """As the recovery has them: tilts change the light of sun and moon alone."""
+    case, _, tilt, _, _ = rough
+    smooth = replace(case.terrain, surface=surface_grid(case.place.elevation, case.terrain.frame))
+    tilted = replace(smooth, tilt=tilt.reshape(case.albedo.shape).astype(np.float32))
+    dull = replace(case.lights[0], sun=None)
+    view = case.cameras[0]
+    cloudy = [
+        render_view(build_scene(each, case.albedo, dull), view, spp=4, seed=0).radiance for each in (smooth, tilted)
+    ]
+    assert cloudy[0].max() > 0.0
+    assert np.array_equal(*cloudy)
+    positions = case.transport.position_m[None, ::4]
+    colours = np.full_like(positions, 0.3, np.float32)
+    sampling = SamplingOptions(shadow_samples=1, rays=64, clusters=256, clusters_per_receiver=16)
+    lit = [
+        bake_lit_texture(ray_scene(mi_mesh(each, case.albedo)), positions, colours, case.lights[0], sampling=sampling)
+        for each in (smooth, tilted)
+    ]
+    assert np.array_equal(lit[0].sky, lit[1].sky, equal_nan=True)
+    assert np.nanmean(np.abs(lit[0].sun - lit[1].sun)) > 0.02 * np.nanmean(lit[0].sun)
 
 
 def test_tilts_cast_no_shadows_on_their_own_ground():

@@ -5,7 +5,7 @@ Points, normals and directions are lanes; one compiled kernel serves all blocks,
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
@@ -13,7 +13,7 @@ import numpy as np
 from seasonscapes.rendering.backend import point3, use_backend
 from seasonscapes.rendering.sky_patches import SkyPatches, mi_patch_of
 from seasonscapes.rendering.sobol import hashed, sobol_pair, uniform
-from seasonscapes.rendering.terrain_material import leaving_points
+from seasonscapes.rendering.terrain_material import diffuse_normal, leaving_points
 
 # Rays in one kernel launch; bounds the memory.
 LANES = 1 << 22
@@ -170,6 +170,12 @@ def surface_points(terrain: RayScene, interaction: Any, active: Any) -> SurfaceP
     return points
 
 
+def diffuse_points(terrain: RayScene, points: SurfacePoints) -> SurfacePoints:
+    """Points with the normals that diffuse light has in place of those for shading; see `diffuse_normal`."""
+    material = terrain.mi_terrain.bsdf()
+    return replace(points, normal=diffuse_normal(material, points.geometric_normal, points.normal))
+
+
 def albedo_at(terrain: RayScene, uv: np.ndarray, position_m: np.ndarray | None = None) -> np.ndarray:
     """Look up the terrain's current reflectance for diffuse light.
 
@@ -265,6 +271,7 @@ def gather_hemisphere(
         ``(N, K)`` int32 cluster that each ray hits; `ESCAPED` if it reaches the sky; `ABSORBED` if it enters its own
         surface or hits the back of a face (from below the terrain's border).
     """
+    points = diffuse_points(terrain, points)
     patch, hit = (np.empty((len(points.origin), rays), np.int32) for _ in range(2))
     step = max(1, LANES // rays)
     for start in range(0, len(patch), step):
@@ -336,6 +343,7 @@ def trace_bounce(terrain: RayScene, points: SurfacePoints, seed: int) -> tuple[S
     import drjit as dr
     import mitsuba as mi
 
+    points = diffuse_points(terrain, points)
     key = hashed(hashed(dr.arange(mi.UInt32, len(points.origin)), dr.opaque(mi.UInt32, seed)), _BOUNCE)
     square = mi.Point2f(uniform(hashed(key, 0)), uniform(hashed(key, 1)))
     # The stubs reject normals as vectors.

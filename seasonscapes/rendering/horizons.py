@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from seasonscapes.rendering.backend import point3
-from seasonscapes.rendering.hemisphere_rays import ABSORBED, ESCAPED, LANES, RayScene, SurfacePoints
+from seasonscapes.rendering.hemisphere_rays import ABSORBED, ESCAPED, LANES, RayScene, SurfacePoints, diffuse_points
 from seasonscapes.rendering.sky_patches import SkyPatches, patch_sums
 from seasonscapes.rendering.sobol import hash_to_unit, hashed, uniform
 from seasonscapes.rendering.terrain_material import device_surface
@@ -142,6 +142,7 @@ def trace_horizons(
     HorizonTransport
         Light from the sky, and rays to land.
     """
+    points = diffuse_points(terrain, points)
     count, samples = weight.shape
     table = above.table.reshape(-1, above.table.shape[3])
     sums = np.empty((count, table.shape[1]), np.float32)

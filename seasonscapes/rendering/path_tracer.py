@@ -8,7 +8,7 @@ directly or in other water, mirrors (`water_surface`); snow and forest that the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -20,7 +20,13 @@ from seasonscapes.rendering.gbuffer import mi_rays
 from seasonscapes.rendering.ground_optics import GroundOptics
 from seasonscapes.rendering.mitsuba_scene import LUMINARY_DISTANCE_M, RenderScene
 from seasonscapes.rendering.sobol import hashed, sobol_pair, uniform
-from seasonscapes.rendering.terrain_material import device_water, ground_optics, leaving_points, shadow_ray_start
+from seasonscapes.rendering.terrain_material import (
+    device_water,
+    diffuse_normal,
+    ground_optics,
+    leaving_points,
+    shadow_ray_start,
+)
 from seasonscapes.rendering.water_surface import DeviceWater
 from seasonscapes.sky.illumination import Luminary
 
@@ -201,7 +207,8 @@ def _trace(scene: RenderScene, ray: Any, sample_key: Any, index: Any, max_depth:
         origin, outward, normal = leaving_points(material, surface, active)
         reflectance = material.eval_diffuse_reflectance(surface, active)
         direction = mi.warp.square_to_cosine_hemisphere(sobol_pair(hashed(key, _BOUNCE), index))
-        direction = mi.Frame3f(normal).to_world(direction)
+        diffuse = diffuse_normal(material, outward, normal)
+        direction = mi.Frame3f(diffuse).to_world(direction)
         albedo, before = mi.Color3f(reflectance), mi.Color3f(throughput)
         mirrored, on_water = mi.Bool(False), mi.Bool(False)
         if water is not None:
@@ -222,7 +229,7 @@ def _trace(scene: RenderScene, ray: Any, sample_key: Any, index: Any, max_depth:
             water=None if water is None or water.smooth else (water, on_water),
             optics=None if optics is None else (optics, active & (depth == 0) & ~on_water),
         )
-        throughput *= reflection.of_ground(direction)
+        throughput *= replace(reflection, normal=diffuse).of_ground(direction)
         light = _direct_light(
             scene,
             luminaries,

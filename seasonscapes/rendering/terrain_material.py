@@ -151,6 +151,26 @@ def leaving_points(material: Any, interaction: Any, active: Any = True) -> tuple
     return interaction.p + interaction.n * offset + outward * lift, outward, normal
 
 
+def diffuse_normal(material: Any, outward: Any, normal: Any) -> Any:
+    """The normal about which light from the sky and from other ground arrives.
+
+    Parameters
+    ----------
+    material
+        Of the terrain's mesh.
+    outward, normal
+        As `leaving_points` returns them, on the device or as arrays.
+
+    Returns
+    -------
+    mi.Normal3f or numpy.ndarray
+        Without tilts the shading normal. Ground below the resolution of the heights is turned towards other ground as often as
+        towards the sky, and tilts were found under the skylight of the heights: with them the smooth surface's own.
+    """
+    tilted = getattr(material, "tilt", None) is not None and device_surface(material) is not None
+    return outward if tilted else normal
+
+
 def _tilted(material: Any, interaction: Any, normal: Any) -> Any:
     """Normals of the heights, tilted by what photographs tell of the ground below their resolution."""
     import drjit as dr
