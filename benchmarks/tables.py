@@ -253,7 +253,7 @@ TABLES = {
             Row("… and half of the hours half cloudy", "{case_clouds_closed_psnr_db:.1f} dB; {case_clouds_joint_psnr_db:.1f} dB"),
             Row("joint recovery over closed form: mean of these five; least", "{differentiable_gain_db:+.1f} dB; {differentiable_worst_db:+.1f} dB", "≥ +2 dB; ≥ −0.1 dB", "differentiable_gain_db >= 2, differentiable_worst_db >= -0.1"),
             Row("… loss of held-out photographs, after over before, largest", "{differentiable_held_out_ratio:.2f}", "< 1", "differentiable_held_out_ratio < 1"),
-            Row("heights averaged to 120 m, hours never photographed: with normals below the heights; without", "{held_out_psnr_db:.1f} dB; {without_normals_psnr_db:.1f} dB", record="subgrid_normals"),
+            Row("heights averaged to 120 m, hours never photographed, by the recovery's own model (not rendered): with normals below the heights; without", "{held_out_psnr_db:.1f} dB; {without_normals_psnr_db:.1f} dB", record="subgrid_normals"),
             Row("over the best of cosine, Minnaert, C and SCS+C corrections", "+{margin_over_best_correction_db:.1f} dB"),
             Row("ceiling: the true albedo through the same renderer, relit", "{relit_ceiling_db:.1f} dB"),
         ),
