@@ -221,7 +221,8 @@ class Contest:
         self.seconds["transport"] = time.perf_counter() - start
         self.lights, days = scene.lights(sizes.suns + sizes.held_out)
         self.states = [light_state(self.transport, light, day) for light, day in zip(self.lights, days, strict=True)]
-        self.shadows = disc_shadows(scene.ray_scene, self.surfels.grid, self.surfels.level, self.surfels.cell)
+        discs = self.surfels
+        self.shadows = disc_shadows(scene.ray_scene, discs.grid, discs.level, discs.cell, discs.means[:, 2])
         self.suns, self.held_out = sizes.suns, range(sizes.suns, sizes.suns + sizes.held_out)
         self.weights = self.views(lambda camera: front_facing_splats(self.surfels, camera), range(len(scene.cameras)))
         if not learn:

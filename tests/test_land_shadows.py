@@ -1,5 +1,7 @@
 """Cast shadows at discs against closed form: a ridge's shadow on a plain, its penumbra, and what models do with them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ torch = pytest.importorskip("torch")
 
 from test_rendering import heightfield, sun_at  # noqa: E402
 
+import seasonscapes as ss  # noqa: E402
 from seasonscapes.gaussians.appearance import Appearance, colours_at, fourier_embedding, light_tensors  # noqa: E402
 from seasonscapes.gaussians.disc_transport import light_state, surfel_irradiance, trace_disc_transport  # noqa: E402
 from seasonscapes.gaussians.land_shadows import disc_shadows  # noqa: E402
@@ -16,6 +19,7 @@ from seasonscapes.gaussians.surfels import terrain_surfels  # noqa: E402
 from seasonscapes.gaussians.training import Schedule, surface_targets, train  # noqa: E402
 from seasonscapes.rendering.hemisphere_rays import ray_scene  # noqa: E402
 from seasonscapes.rendering.mitsuba_scene import mi_mesh  # noqa: E402
+from seasonscapes.workflows.gaussian_views import cast_shadows  # noqa: E402
 
 set_torch_threads(1)
 WALL_M, SIDE_M = 100.0, 1000.0
@@ -31,7 +35,13 @@ def plain():
     land = ray_scene(mi_mesh(terrain, np.full(3, 0.3)))
     albedo = np.full((len(surfels.means), 3), 0.3, np.float32)
     transport = trace_disc_transport(land, surfels, albedo, rays=16)
-    return surfels, land, albedo, transport, disc_shadows(land, surfels.grid, surfels.level, surfels.cell)
+    return (
+        surfels,
+        land,
+        albedo,
+        transport,
+        disc_shadows(land, surfels.grid, surfels.level, surfels.cell, surfels.means[:, 2]),
+    )
 
 
 def states_of(plain):
@@ -63,17 +73,19 @@ def test_quartered_cells_are_sampled_in_their_quarter(plain):
     quarters = np.full(4 * len(cell), 1, level.dtype)
     row, column = np.divmod(cell, grid.columns)
     fine = [(2 * row + i) * 2 * grid.columns + 2 * column + j for i in range(2) for j in range(2)]
-    finer = disc_shadows(land, grid, quarters, np.concatenate(fine))
+    finer = disc_shadows(land, grid, quarters, np.concatenate(fine), np.tile(surfels.means[:, 2], 4))
     state = states_of(plain)[0]
     mean = finer.visible_share(state)[0].reshape(4, -1).mean(axis=0)
     np.testing.assert_allclose(mean, shadows.visible_share(state)[0], atol=0.2)
 
 
 def test_discs_that_have_no_land_are_refused(plain):
-    surfels = plain[0]
+    surfels, land = plain[:2]
     small = ray_scene(mi_mesh(heightfield(lambda e, n: 0.0 * e, side_m=300.0, count=3), np.full(3, 0.3)))
     with pytest.raises(ValueError, match="discs have no land below them; use the terrain"):
-        disc_shadows(small, surfels.grid, surfels.level, surfels.cell)
+        disc_shadows(small, surfels.grid, surfels.level, surfels.cell, surfels.means[:, 2])
+    with pytest.raises(ValueError, match="300 m or more above or below the land"):
+        disc_shadows(land, surfels.grid, surfels.level, surfels.cell, surfels.means[:, 2] + 300.0)
 
 
 def appearance(plain, kind="physical"):
@@ -125,3 +137,28 @@ def test_the_loss_counts_traced_shadows(plain):
         for visible in (targets.visible, 1.0 - targets.visible)
     ]
     assert losses[0] < 0.2 * losses[1]
+
+
+@pytest.fixture(scope="module")
+def distilled():
+    place = ss.load_place("alpine_small")
+    quick = ss.DistilOptions(discs=12, suns=2, dates=1, views=0, steps=2, picture_steps=0)
+    return ss.distil(place, sky="hosek", options=quick), place
+
+
+def test_rays_are_placed_once_for_a_loop_over_hours(distilled):
+    model, place = distilled
+    first = cast_shadows(model, place)
+    assert first is cast_shadows(model, place)
+    assert first is not cast_shadows(replace(model), place)
+    assert cast_shadows(replace(model, kind="sun"), place) is None
+
+
+def test_models_of_other_land_are_refused(distilled):
+    model, place = distilled
+    higher = replace(model, means=model.means + np.float32([0.0, 0.0, 3.0 * model.grid.spacing_m]))
+    elsewhere = replace(model, frame=replace(model.frame, latitude_deg=model.frame.latitude_deg + 0.1))
+    for wrong, match in ((higher, "does not lie on the scene's land"), (elsewhere, "about another origin")):
+        with pytest.raises(ss.InputError, match=match) as told:
+            cast_shadows(wrong, place)
+        assert "\n" not in str(told.value)

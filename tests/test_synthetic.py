@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+import seasonscapes as ss
 from seasonscapes.terrain import flow
 from seasonscapes.terrain.noise import fractal_noise, spline_noise
 from seasonscapes.terrain.synthetic import (
@@ -357,3 +358,19 @@ def test_the_shipped_massif_is_that_of_the_present_generator():
     assert shipped_massif(seed=1912, size_m=12000.0, spacing_m=30.0) is None
     values = np.random.default_rng(2).normal(size=(7, 5)).astype(np.float32)
     np.testing.assert_array_equal(_unpacked(_packed(values)), values)
+
+
+def test_a_changed_massif_is_another_place(monkeypatch, tmp_path):
+    """Its maps are in the key of the terrain: a mesh of former heights would lie below new ones."""
+    workspace = ss.Workspace(tmp_path)
+    place = ss.load_place("alpine_small", workspace)
+    assert place.synthetic is not None
+    elevation = place.synthetic.elevation
+    raised = dataclasses.replace(
+        place.synthetic, elevation=dataclasses.replace(elevation, values=elevation.values + np.float32(500.0))
+    )
+    monkeypatch.setattr("seasonscapes.workflows.place.scene_massif", lambda *_: raised)
+    again = ss.load_place("alpine_small", workspace)
+    assert again.key != place.key
+    higher_m = np.median(again.terrain.vertices[:, 2]) - np.median(place.terrain.vertices[:, 2])
+    assert higher_m == pytest.approx(500.0, abs=20.0)

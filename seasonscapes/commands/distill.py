@@ -34,7 +34,7 @@ def distill_command(
     place: PlaceOptions | None = None,
     json: bool = False,
 ) -> None:
-    """Distil a Gaussian model of a place, which renders any date and hour in milliseconds.
+    """Distil a Gaussian model of a place, which renders any date and hour in a fraction of a second.
 
     Parameters
     ----------

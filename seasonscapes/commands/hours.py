@@ -73,7 +73,7 @@ def hours_command(
     check_choice("--sky", sky, tuple(_SKIES))
     check_range("--most-pixels", most_pixels, 1_000, 10_000_000)
     from seasonscapes.workflows.photograph_files import PhotographSources
-    from seasonscapes.workflows.picture_clocks import WINDOW_MIN, picture_clocks, save_clocks
+    from seasonscapes.workflows.picture_clocks import WINDOW_MIN, checkable_camera, picture_clocks, save_clocks
     from seasonscapes.workflows.unseen_hours import Sky, camera_hours, save_hours, webcam_photographs
 
     if check_clocks is not None:
@@ -87,6 +87,8 @@ def hours_command(
         photographs = webcam_photographs(
             loaded, sources, webcam, hold_out=left_out, most_pixels=most_pixels, progress=progress
         )
+        if check_clocks is not None:
+            checkable_camera(photographs)  # before the long work
         hours = camera_hours(loaded, photographs, progress=progress)
         record: dict[str, Any] = save_hours(hours, times, output, sky=cast(Sky, _SKIES[sky]))
         clocks = []

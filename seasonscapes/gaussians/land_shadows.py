@@ -20,7 +20,7 @@ from seasonscapes.sky.illumination import Luminary
 
 # Mean angular radius of the sun; that of the moon, 0.259°, blurs shadows as much.
 _RADIUS_DEG = 0.2666
-# Cells of one search for points on the mesh; bounds the memory.
+# Cells of one search for points on the mesh; bounds its memory.
 _CELLS = 1 << 17
 _MARGIN_M = 10.0
 
@@ -59,7 +59,9 @@ class DiscShadows:
         return np.clip(share, 0.0, 1.0)
 
 
-def disc_shadows(land: RayScene, grid: SurfelGrid, level: np.ndarray, cell: np.ndarray) -> DiscShadows:
+def disc_shadows(
+    land: RayScene, grid: SurfelGrid, level: np.ndarray, cell: np.ndarray, height_m: np.ndarray
+) -> DiscShadows:
     """Place sample points in the cells of discs, for shadow rays.
 
     Parameters
@@ -68,6 +70,8 @@ def disc_shadows(land: RayScene, grid: SurfelGrid, level: np.ndarray, cell: np.n
         Mesh that casts the shadows and that the discs were made on.
     grid, level, cell
         Cells of N discs, see `surfels.Surfels`.
+    height_m
+        ``(N,)`` up coordinates of the discs [m].
 
     Returns
     -------
@@ -77,12 +81,13 @@ def disc_shadows(land: RayScene, grid: SurfelGrid, level: np.ndarray, cell: np.n
     Raises
     ------
     ValueError
-        If a cell has no land: the discs were made on another mesh.
+        If a cell has no land, or half of the discs lie farther from it than from their neighbours: they were made on another
+        mesh.
     """
     count, samples = len(cell), SUBCELLS**2
     low_m, high_m = (float(z) for z in (land.mi_terrain.bbox().min.z, land.mi_terrain.bbox().max.z))
-    origin, normal = np.zeros((2, count, samples, 3), np.float32)
-    weight = np.zeros((count, samples), np.float32)
+    origin = np.zeros((count, samples, 3), np.float32)
+    normal, weight = np.zeros((count, samples, 3), np.float16), np.zeros((count, samples), np.float16)
     for start in range(0, count, _CELLS):
         block = slice(start, min(start + _CELLS, count))
         across_m = _sample_places_m(grid, level[block], cell[block])
@@ -91,9 +96,14 @@ def disc_shadows(land: RayScene, grid: SurfelGrid, level: np.ndarray, cell: np.n
         for values, seen in ((origin, points.origin), (normal, points.geometric_normal)):
             values[block].reshape(-1, 3)[found] = seen
         weight[block].reshape(-1)[found] = 1.0
-    if not (weight.sum(axis=1) > 0.0).all():
+    if not weight.any(axis=1).all():
         raise ValueError(
-            f"{int((weight.sum(axis=1) == 0.0).sum())} discs have no land below them; use the terrain that they were made from"
+            f"{int((~weight.any(axis=1)).sum())} discs have no land below them; use the terrain that they were made from"
+        )
+    apart_m = np.abs((origin[..., 2] * weight).sum(axis=1) / weight.sum(axis=1, dtype=np.float32) - height_m)
+    if np.median(apart_m / grid.spacings_m(level)) > 1.0:
+        raise ValueError(
+            f"half of the discs lie {np.median(apart_m):.3g} m or more above or below the land; use the terrain that they were made from"
         )
     # The cosine is that of the mesh: it weighs the samples, and shading normals need not agree with what is in shadow.
     return DiscShadows(sun_rays(land, origin, normal, normal, weight, hashed_disc_offset(np.arange(count))))

@@ -144,7 +144,7 @@ def model_shadows(model: GaussianModel, land: RayScene) -> DiscShadows:
     ValueError
         If the Gaussians were made on another mesh.
     """
-    return disc_shadows(land, model.grid, model.level, model.cell)
+    return disc_shadows(land, model.grid, model.level, model.cell, model.means[:, 2])
 
 
 def model_colours(

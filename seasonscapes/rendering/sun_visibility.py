@@ -95,10 +95,12 @@ def sun_rays(
     import mitsuba as mi
 
     mi_origin = point3(np.asarray(origin_m).reshape(-1, 3))
-    mi_normal, mi_geometric_normal = (
-        [mi.Float16(np.ascontiguousarray(column, np.float16)) for column in np.asarray(values).reshape(-1, 3).T]
-        for values in (normal, geometric_normal)
-    )
+
+    def columns(values: np.ndarray) -> list[Any]:
+        return [mi.Float16(np.ascontiguousarray(column, np.float16)) for column in np.asarray(values).reshape(-1, 3).T]
+
+    mi_normal = columns(normal)
+    mi_geometric_normal = mi_normal if geometric_normal is normal else columns(geometric_normal)
     mi_weight = mi.Float16(np.ascontiguousarray(weight, np.float16).ravel())
     mi_disc_offset = mi.UInt32((np.asarray(disc_offset, np.int64) % 256).astype(np.uint32))
     dr.eval(mi_origin, mi_normal, mi_geometric_normal, mi_weight, mi_disc_offset)

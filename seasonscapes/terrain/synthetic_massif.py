@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from dataclasses import dataclass
 
@@ -47,6 +48,14 @@ class SyntheticMassif:
     shore_m: np.ndarray
     seed: int
     spacing_m: float
+
+    @property
+    def content(self) -> str:
+        """Hash of the maps that terrain, water and albedo are made of."""
+        digest = hashlib.sha256()
+        for values in (self.elevation.values, self.cover, self.debris, self.shore_m):
+            digest.update(np.ascontiguousarray(values).tobytes())
+        return digest.hexdigest()
 
 
 def massif_of(

@@ -145,7 +145,7 @@ def distil(
     checkpoint: Path | None = None,
     progress: Progress | None = None,
 ) -> GaussianModel:
-    """Distil a Gaussian model of a place, which is then lit for any date and hour in milliseconds.
+    """Distil a Gaussian model of a place, which is then lit for any date and hour in a fraction of a second.
 
     Parameters
     ----------
@@ -367,7 +367,7 @@ def distillation_data(
                     cameras.append(camera)
     assert transport is not None, "there is at least one date"
     bare = ray_scene(mi_mesh(place.terrain, np.full(3, 0.3)))
-    shadows = disc_shadows(bare, surfels.grid, surfels.level, surfels.cell)
+    shadows = disc_shadows(bare, surfels.grid, surfels.level, surfels.cell, surfels.means[:, 2])
     targets = surface_targets(states, seasons, albedo, received, shadows)
     return DistillationData(surfels, albedo, around, days, transport, targets, times, frames, cameras)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time as clock
+import weakref
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -32,6 +33,8 @@ log = logging.getLogger(__name__)
 
 # Discs so far apart in a picture are seen as blots.
 _COARSE_PX = 12.0
+# The shadow rays of the last model and place.
+_LAST: dict[str, tuple[weakref.ref[GaussianModel], weakref.ref[Place], DiscShadows | None]] = {}
 # Pixels that are asked about it.
 _SAMPLES = 5000
 
@@ -49,12 +52,40 @@ def require_scene(model: GaussianModel | FrameGaussians, place: Place) -> None:
 
 
 def cast_shadows(model: GaussianModel, place: Place) -> DiscShadows | None:
-    """Shadow rays of a model's discs on its place's land; ``None`` without a vectorised variant: their horizons tell shadows."""
+    """Shadow rays of a model's discs on its place's land, for any hour.
+
+    ``None`` for models that know no physics, and without a vectorised variant, where the discs' horizons tell shadows. Those of
+    the last model and place are kept, so that a loop over hours makes them once.
+
+    Parameters
+    ----------
+    model, place
+        The model, and the place that it was distilled from.
+
+    Raises
+    ------
+    InputError
+        If the model lies on another terrain than the place's.
+    """
+    known = _LAST.get("shadows")
+    if known is not None and known[0]() is model and known[1]() is place:
+        return known[2]
+    shadows = _cast_shadows(model, place)
+    _LAST["shadows"] = (weakref.ref(model), weakref.ref(place), shadows)
+    return shadows
+
+
+def _cast_shadows(model: GaussianModel, place: Place) -> DiscShadows | None:
     from seasonscapes.gaussians.splat_view import model_shadows
     from seasonscapes.rendering.backend import use_backend
     from seasonscapes.rendering.hemisphere_rays import ray_scene
     from seasonscapes.rendering.mitsuba_scene import mi_mesh
 
+    if model.kind not in ("physical", "full"):
+        return None
+    cure = "load the scene with the terrain's options of `distill`, or distil again"
+    if model.frame != place.frame:
+        raise InputError("--model", "was distilled about another origin", cure=cure)
     if use_backend().device == "scalar":
         log.warning(
             "cast shadows come from the Gaussians' horizons, which are coarser: tracing them needs libLLVM or CUDA"
@@ -63,7 +94,7 @@ def cast_shadows(model: GaussianModel, place: Place) -> DiscShadows | None:
     try:
         return model_shadows(model, ray_scene(mi_mesh(place.terrain, np.full(3, 0.3))))
     except ValueError as error:
-        raise InputError("--model", f"does not lie on the scene's land: {error}") from None
+        raise InputError("--model", f"does not lie on the scene's land: {error}", cure=cure) from None
 
 
 def render_gaussians(

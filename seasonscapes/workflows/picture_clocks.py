@@ -33,8 +33,8 @@ WINDOW_MIN = (10.0, 180.0)
 STEP_MIN = 2.0
 # So many pixels of either kind tell weather and shadows; blocks of the picture across its width that err together.
 _MOST_PIXELS, _BLOCKS_ACROSS = 3000, 8
-# Heights are changed by so much to see how far shadows move [m].
-_RAISED_M = 30.0
+# Heights are changed by so much to see how far shadows move [m]; by more, edges that move most would leave the window.
+_RAISED_M = 3.0
 # A clock is doubted where it is off by so many standard deviations, and by more than the step.
 _DOUBTED_SIGMAS = 3.0
 
@@ -78,11 +78,12 @@ class PictureClock:
         at = self.time.isoformat()
         if not self.trusted:
             return f"{at}  clock not told: {self.reason}"
-        return (
-            f"{at}  clock {self.offset_min:+.1f} ± {self.sigma_min:.1f} min; shadows run {self.edge_speed_m_per_min:.0f} m/min, "
-            f"and 10 m of error of the heights is {10.0 * self.heights_min_per_m:.1f} min at an edge"
-            f"{'  CHECK THE CLOCK' if self.doubted else ''}"
-        )
+        told = f"{at}  clock {self.offset_min:+.1f} ± {self.sigma_min:.1f} min"
+        if np.isfinite(self.edge_speed_m_per_min):
+            told += f"; shadows run {self.edge_speed_m_per_min:.0f} m/min"
+        if np.isfinite(self.heights_min_per_m):
+            told += f"; 10 m of error of the heights is {10.0 * self.heights_min_per_m:.1f} min at an edge"
+        return told + ("  CHECK THE CLOCK" if self.doubted else "")
 
 
 def picture_clocks(
@@ -136,11 +137,7 @@ def picture_clocks(
         raise InputError("window_min", "out of range", got=f"{window_min:g}", expected=expected)
     for each in photographs[1:]:
         require_same_view(photographs[0], each)
-    camera = photographs[0].camera if photographs else None
-    if len(photographs) < 3 or not isinstance(camera, Camera):
-        raise InputError(
-            "photographs", f"{len(photographs)} given", expected="three or more views of one camera to check its clock"
-        )
+    camera = checkable_camera(photographs)
     use_backend()
     view = fixed_view(place, camera, progress=progress)
     shown = without_hidden(view, photographs)
@@ -160,6 +157,16 @@ def picture_clocks(
             )
         report((k + 1) / len(shown))
     return clocks
+
+
+def checkable_camera(photographs: Sequence[Observation]) -> Camera:
+    """The camera of photographs whose clocks can be compared; `InputError` for fewer than three, or panoramas."""
+    camera = photographs[0].camera if photographs else None
+    if len(photographs) < 3 or not isinstance(camera, Camera):
+        raise InputError(
+            "photographs", f"{len(photographs)} given", expected="three or more views of one camera to check its clock"
+        )
+    return camera
 
 
 def save_clocks(clocks: Sequence[PictureClock], path: Path) -> list[dict[str, Any]]:

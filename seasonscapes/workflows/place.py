@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 
 __all__ = ["MeshOptions", "Place", "find_scene", "ground_height_m", "load_place", "utc_at"]
 
-# Includes the synthetic massif's own modules.
 _TERRAIN_CODE = ("workflows.terrain_building",)
 _MASSIF_CODE = ("terrain.synthetic",)
 # The farthest sight on record, by refraction over the Alps and the Pyrenees, is some 440 km; pictures end far before.
@@ -214,6 +213,8 @@ def load_place(
         "frame": frame,
         "options": options,
         **of_water,
+        # Generated or shipped: its maps count, not the code that makes them.
+        **({} if massif is None else {"massif": massif.content}),
         **({} if declared.snow is None else {"snow": declared.snow}),
         **({} if declared.forest is None else {"forest": declared.forest}),
     }
