@@ -405,7 +405,7 @@ class Splats:
             instants = [(n, *pair) for n, pair in enumerate(zip(self.lights, self.states, strict=True))]
             frames = relit_frames(world.bare, self.surfels, self.cameras, instants, seed=seed)
             appearance.refine(DiscGeometry(self.surfels))
-        train(appearance, targets, frames, Schedule(surface_steps=600, picture_steps=96), seed=seed)
+        train(appearance, targets, frames, Schedule(*world.size.steps), seed=seed)
         model = model_from(
             self.surfels, own[None], [DAY_OF_YEAR], self.transport, learned_parameters(appearance), frame=world.frame
         )

@@ -58,6 +58,14 @@ class PictureClock:
     heights_min_per_m
         By how many minutes an edge comes too early or too late where the heights of its ridge, or of the ground that it
         crosses, err by a metre (mean); NaN where it was not measured.
+
+    Examples
+    --------
+    >>> from datetime import datetime, timezone
+    >>> import seasonscapes as ss
+    >>> noon = datetime(2024, 9, 18, 12, tzinfo=timezone.utc)
+    >>> ss.PictureClock(noon, 17.2, 1.1, True, "from 900 pixels in 12 parts of the picture", 20.0, 0.1).doubted
+    True
     """
 
     time: datetime
