@@ -366,8 +366,7 @@ class Splats:
         self.transport = trace_disc_transport(
             world.bare, self.surfels, surfel_albedo(self.surfels, world.albedo), rays=64, seed=world.seed
         )
-        discs = self.surfels
-        self.shadows = disc_shadows(world.bare, discs.grid, discs.level, discs.cell, discs.means[:, 2])
+        self.shadows = disc_shadows(world.bare, self.surfels)
         times = [hours(day, hour)[0] for day, hour in LESSONS]
         self.lights = [row[0] for row in lights_for(times, world.painting[:1], world.sky, default_workspace())]
         self.states = [light_state(self.transport, light, DAY_OF_YEAR) for light in self.lights]

@@ -221,8 +221,7 @@ class Contest:
         self.seconds["transport"] = time.perf_counter() - start
         self.lights, days = scene.lights(sizes.suns + sizes.held_out)
         self.states = [light_state(self.transport, light, day) for light, day in zip(self.lights, days, strict=True)]
-        discs = self.surfels
-        self.shadows = disc_shadows(scene.ray_scene, discs.grid, discs.level, discs.cell, discs.means[:, 2])
+        self.shadows = disc_shadows(scene.ray_scene, self.surfels)
         self.suns, self.held_out = sizes.suns, range(sizes.suns, sizes.suns + sizes.held_out)
         self.weights = self.views(lambda camera: front_facing_splats(self.surfels, camera), range(len(scene.cameras)))
         if not learn:

@@ -35,13 +35,7 @@ def plain():
     land = ray_scene(mi_mesh(terrain, np.full(3, 0.3)))
     albedo = np.full((len(surfels.means), 3), 0.3, np.float32)
     transport = trace_disc_transport(land, surfels, albedo, rays=16)
-    return (
-        surfels,
-        land,
-        albedo,
-        transport,
-        disc_shadows(land, surfels.grid, surfels.level, surfels.cell, surfels.means[:, 2]),
-    )
+    return (surfels, land, albedo, transport, disc_shadows(land, surfels))
 
 
 def states_of(plain):
@@ -73,7 +67,9 @@ def test_quartered_cells_are_sampled_in_their_quarter(plain):
     quarters = np.full(4 * len(cell), 1, level.dtype)
     row, column = np.divmod(cell, grid.columns)
     fine = [(2 * row + i) * 2 * grid.columns + 2 * column + j for i in range(2) for j in range(2)]
-    finer = disc_shadows(land, grid, quarters, np.concatenate(fine), np.tile(surfels.means[:, 2], 4))
+    finer = disc_shadows(
+        land, replace(surfels, level=quarters, cell=np.concatenate(fine), means=np.tile(surfels.means, (4, 1)))
+    )
     state = states_of(plain)[0]
     mean = finer.visible_share(state)[0].reshape(4, -1).mean(axis=0)
     np.testing.assert_allclose(mean, shadows.visible_share(state)[0], atol=0.2)
@@ -83,9 +79,9 @@ def test_discs_that_have_no_land_are_refused(plain):
     surfels, land = plain[:2]
     small = ray_scene(mi_mesh(heightfield(lambda e, n: 0.0 * e, side_m=300.0, count=3), np.full(3, 0.3)))
     with pytest.raises(ValueError, match="discs have no land below them; use the terrain"):
-        disc_shadows(small, surfels.grid, surfels.level, surfels.cell, surfels.means[:, 2])
+        disc_shadows(small, surfels)
     with pytest.raises(ValueError, match="300 m or more above or below the land"):
-        disc_shadows(land, surfels.grid, surfels.level, surfels.cell, surfels.means[:, 2] + 300.0)
+        disc_shadows(land, replace(surfels, means=surfels.means + np.float32([0.0, 0.0, 300.0])))
 
 
 def appearance(plain, kind="physical"):

@@ -12,7 +12,8 @@ import numpy as np
 
 from seasonscapes.gaussians.disc_cells import cell_centres_m
 from seasonscapes.gaussians.disc_transport import BODIES, LightState
-from seasonscapes.gaussians.surfels import SUBCELLS, SurfelGrid
+from seasonscapes.gaussians.model import GaussianModel
+from seasonscapes.gaussians.surfels import SUBCELLS, SurfelGrid, Surfels
 from seasonscapes.rendering.hemisphere_rays import RayScene
 from seasonscapes.rendering.irradiance import surface_at
 from seasonscapes.rendering.sun_visibility import SunRays, hashed_disc_offset, sum_incidence, sun_rays
@@ -59,19 +60,15 @@ class DiscShadows:
         return np.clip(share, 0.0, 1.0)
 
 
-def disc_shadows(
-    land: RayScene, grid: SurfelGrid, level: np.ndarray, cell: np.ndarray, height_m: np.ndarray
-) -> DiscShadows:
+def disc_shadows(land: RayScene, discs: Surfels | GaussianModel) -> DiscShadows:
     """Place sample points in the cells of discs, for shadow rays.
 
     Parameters
     ----------
     land
         Mesh that casts the shadows and that the discs were made on.
-    grid, level, cell
-        Cells of N discs, see `surfels.Surfels`.
-    height_m
-        ``(N,)`` up coordinates of the discs [m].
+    discs
+        N discs, or a model of them.
 
     Returns
     -------
@@ -84,6 +81,7 @@ def disc_shadows(
         If a cell has no land, or half of the discs lie farther from it than from their neighbours: they were made on another
         mesh.
     """
+    grid, level, cell = discs.grid, discs.level, discs.cell
     count, samples = len(cell), SUBCELLS**2
     low_m, high_m = (float(z) for z in (land.mi_terrain.bbox().min.z, land.mi_terrain.bbox().max.z))
     origin = np.zeros((count, samples, 3), np.float32)
@@ -100,7 +98,7 @@ def disc_shadows(
         raise ValueError(
             f"{int((~weight.any(axis=1)).sum())} discs have no land below them; use the terrain that they were made from"
         )
-    apart_m = np.abs((origin[..., 2] * weight).sum(axis=1) / weight.sum(axis=1, dtype=np.float32) - height_m)
+    apart_m = np.abs((origin[..., 2] * weight).sum(axis=1) / weight.sum(axis=1, dtype=np.float32) - discs.means[:, 2])
     if np.median(apart_m / grid.spacings_m(level)) > 1.0:
         raise ValueError(
             f"half of the discs lie {np.median(apart_m):.3g} m or more above or below the land; use the terrain that they were made from"

@@ -12,7 +12,7 @@ from seasonscapes.cameras.pinhole import Camera, ray_directions
 from seasonscapes.errors import NoTerrainInView
 from seasonscapes.gaussians.appearance import Appearance, colours_at, fourier_embedding
 from seasonscapes.gaussians.disc_transport import LightState, light_state, neighbourhood_mean
-from seasonscapes.gaussians.land_shadows import DiscShadows, disc_shadows
+from seasonscapes.gaussians.land_shadows import DiscShadows
 from seasonscapes.gaussians.model import GaussianModel, LearnedParameters
 from seasonscapes.gaussians.rasterise import (
     ALPHA_CUT,
@@ -27,7 +27,6 @@ from seasonscapes.gaussians.rasterise import (
     view_weights,
 )
 from seasonscapes.rendering.backend import use_backend
-from seasonscapes.rendering.hemisphere_rays import RayScene
 from seasonscapes.rendering.splatting import DeviceSplats, SplatLimits, finer_camera, splat_layers, upload_splats
 from seasonscapes.sky.illumination import AerialPerspective, Illumination
 
@@ -124,29 +123,6 @@ def learned_parameters(appearance: Appearance) -> LearnedParameters:
     return LearnedParameters(appearance.kind, arrays)
 
 
-def model_shadows(model: GaussianModel, land: RayScene) -> DiscShadows:
-    """Prepare the shadow rays of a model, for any instant.
-
-    Parameters
-    ----------
-    model
-        N Gaussians.
-    land
-        The mesh that they were made on.
-
-    Returns
-    -------
-    land_shadows.DiscShadows
-        Shadow rays of the discs.
-
-    Raises
-    ------
-    ValueError
-        If the Gaussians were made on another mesh.
-    """
-    return disc_shadows(land, model.grid, model.level, model.cell, model.means[:, 2])
-
-
 def model_colours(
     model: GaussianModel, illumination: Illumination, day: float, *, shadows: DiscShadows | None = None
 ) -> tuple[np.ndarray, LightState]:
@@ -161,7 +137,7 @@ def model_colours(
     day
         Day of the year, for the albedo.
     shadows
-        From `model_shadows`: cast shadows are traced; by the discs' horizons if omitted.
+        From `land_shadows.disc_shadows`: cast shadows are traced; by the discs' horizons if omitted.
 
     Returns
     -------

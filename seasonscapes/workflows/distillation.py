@@ -334,7 +334,7 @@ def distillation_data(
     seasons = [number % len(days) for number in range(options.suns)]
     lights, times = draw_lights(place, model, [days[season] for season in seasons], seed=seed, progress=progress)
     received = np.empty((options.suns, len(surfels.means), 3), np.float32)
-    transport, states, frames = None, [], []
+    transport, shadows, states, frames = None, None, [], []
     around_all = overview_cameras(place.terrain, options.views, size_px=options.view_px, first_deg=30.0)
     cameras: list[Camera] = []
     for season, texture in enumerate(textures):
@@ -342,6 +342,7 @@ def distillation_data(
         scene = ray_scene(mi_mesh(place.terrain, texture))
         if transport is None:
             report = task_progress(progress, "transport")
+            shadows = disc_shadows(scene, surfels)
             transport = trace_disc_transport(scene, surfels, albedo[season], rays=64, seed=seed, progress=report)
             states = [
                 light_state(transport, light, float(at.timetuple().tm_yday))
@@ -366,8 +367,6 @@ def distillation_data(
                 else:
                     cameras.append(camera)
     assert transport is not None, "there is at least one date"
-    bare = ray_scene(mi_mesh(place.terrain, np.full(3, 0.3)))
-    shadows = disc_shadows(bare, surfels.grid, surfels.level, surfels.cell, surfels.means[:, 2])
     targets = surface_targets(states, seasons, albedo, received, shadows)
     return DistillationData(surfels, albedo, around, days, transport, targets, times, frames, cameras)
 

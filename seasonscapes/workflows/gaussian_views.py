@@ -76,7 +76,7 @@ def cast_shadows(model: GaussianModel, place: Place) -> DiscShadows | None:
 
 
 def _cast_shadows(model: GaussianModel, place: Place) -> DiscShadows | None:
-    from seasonscapes.gaussians.splat_view import model_shadows
+    from seasonscapes.gaussians.land_shadows import disc_shadows
     from seasonscapes.rendering.backend import use_backend
     from seasonscapes.rendering.hemisphere_rays import ray_scene
     from seasonscapes.rendering.mitsuba_scene import mi_mesh
@@ -92,7 +92,7 @@ def _cast_shadows(model: GaussianModel, place: Place) -> DiscShadows | None:
         )
         return None
     try:
-        return model_shadows(model, ray_scene(mi_mesh(place.terrain, np.full(3, 0.3))))
+        return disc_shadows(ray_scene(mi_mesh(place.terrain, np.full(3, 0.3))), model)
     except ValueError as error:
         raise InputError("--model", f"does not lie on the scene's land: {error}", cure=cure) from None
 
