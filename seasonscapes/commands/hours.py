@@ -93,7 +93,7 @@ def hours_command(
         record: dict[str, Any] = save_hours(hours, times, output, sky=cast(Sky, _SKIES[sky]))
         clocks = []
         if check_clocks is not None:
-            clocks = picture_clocks(loaded, photographs, window_min=check_clocks, progress=progress)
+            clocks = picture_clocks(loaded, photographs, window_min=check_clocks, view=hours.view, progress=progress)
             record["clocks"] = save_clocks(clocks, output / "clocks.json")
             record["files"].append(str(output / "clocks.json"))
     record["seconds"] = round(clock.perf_counter() - start, 1)

@@ -95,7 +95,12 @@ class PictureClock:
 
 
 def picture_clocks(
-    place: Place, photographs: Sequence[Observation], *, window_min: float = 60.0, progress: Progress | None = None
+    place: Place,
+    photographs: Sequence[Observation],
+    *,
+    window_min: float = 60.0,
+    view: FixedView | None = None,
+    progress: Progress | None = None,
 ) -> list[PictureClock]:
     """Compare the cast shadows in a fixed camera's pictures with those of the sun before and after the stated times.
 
@@ -110,6 +115,8 @@ def picture_clocks(
         Three or more of one camera that stands still; masks leave out what stands before the terrain.
     window_min
         How far a clock may be off, 10 to 180 [min].
+    view
+        Of these photographs' camera, where it was traced before (`CameraHours.view`).
     progress
         Called with a task and its finished share.
 
@@ -147,7 +154,7 @@ def picture_clocks(
         require_same_view(photographs[0], each)
     camera = checkable_camera(photographs)
     use_backend()
-    view = fixed_view(place, camera, progress=progress)
+    view = view or fixed_view(place, camera, progress=progress)
     shown = without_hidden(view, photographs)
     report = task_progress(progress, "clocks")
     pictures = [image.reshape(-1, 3)[view.pixel] for _, image, _ in shown]
