@@ -25,6 +25,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from record import write_record
@@ -40,6 +41,8 @@ ARC_KM2, MAP_SPACING_M = 200_000.0, 30.0
 DAYLIGHT_HOURS = 4400.0
 _NOON = datetime(2024, 6, 21, 11, tzinfo=UTC)
 _VIEW = (768, 512)
+# How long workers stand by while their idle cost is measured.
+_WAIT_S = 5.0
 
 
 @dataclass(frozen=True)
@@ -73,36 +76,56 @@ def write_tiny_frame(frame: TinyFrame) -> dict:
 
 
 def scheduling(count: int, killed: int, seed: int) -> dict[str, float]:
-    """Frames that arrive and their cost, first on workers that live and then on workers that are killed."""
+    """Frames that arrive and their cost, first on workers that live and then on workers that are killed.
+
+    Overhead is what a frame costs beside its writing: processor time of scheduler, client and workers together, less that
+    of writing the same frames without Dask and that of as long a wait: workers cost something while they stand by, which is
+    told apart, as their start is.
+    """
     chosen = set(np.random.default_rng(seed).choice(count, killed, replace=False).tolist())
-    lost = 0
-    walls = {}
+    lost, walls, used, idle_share = 0, {}, {}, 0.0
     for name, deadly in (("calm", set()), ("killed", chosen)):
         with tempfile.TemporaryDirectory(prefix="scale-") as text, connected(f"local:{WORKERS}") as client:
             folder = Path(text)
-            start = time.perf_counter()
+            # Libraries are imported, and each worker's first frame written, before anything is measured.
+            client.run(write_tiny_frame, TinyFrame(count, folder, deadly=False))
+            worker_start_s = sum(client.run(time.process_time).values()) / WORKERS
+            before, start = _processor_of_all(client), time.perf_counter()
+            time.sleep(_WAIT_S)
+            waited, idle_s = time.perf_counter() - start, sum(_processor_of_all(client).values()) - sum(before.values())
+            before, start = _processor_of_all(client), time.perf_counter()
             frames = (TinyFrame(number, folder, number in deadly) for number in range(count))
             told = [record["number"] for record in run_by(client, write_tiny_frame, frames)]
             walls[name] = time.perf_counter() - start
+            if not deadly:  # workers that are killed take their times with them
+                used = {key: value - before[key] for key, value in _processor_of_all(client).items()}
+                idle_share = idle_s / waited
             whole = sum(_is_whole(folder / f"{number:05d}.exr", number) for number in range(count))
             lost = max(lost, count - min(whole, len(set(told))))
             marks = len(list(folder.glob("killed-*")))
             print(f"{name}: {count} frames, {whole} whole, {marks} workers killed, {walls[name]:.1f} s", flush=True)
-    start = time.perf_counter()
+    started = time.process_time()
     with tempfile.TemporaryDirectory(prefix="scale-") as text:
         for number in range(count // 10):
             write_tiny_frame(TinyFrame(number, Path(text), deadly=False))
-    alone_s = (time.perf_counter() - start) / (count // 10)
-    # Without Dask the frames are written one after the other; its workers share the machine's cores.
-    overhead_s = walls["calm"] / count - alone_s / min(WORKERS, os.cpu_count() or 1)
+    alone_s = (time.process_time() - started) / (count // 10)
     return {
         "frames": count,
         "frames_lost": lost,
         "workers_killed": killed,
-        "scheduled_ms_per_frame": 1e3 * walls["calm"] / count,
-        "overhead_ms_per_frame": 1e3 * overhead_s,
+        "worker_start_processor_s": worker_start_s,
+        "tiny_frame_ms": 1e3 * alone_s,
+        "scheduler_ms_per_frame": 1e3 * used["scheduler"] / count,
+        "overhead_ms_per_frame": 1e3 * ((sum(used.values()) - idle_share * walls["calm"]) / count - alone_s),
+        "idle_share_of_core_per_worker": idle_share / WORKERS,
+        "wall_ms_per_frame": 1e3 * walls["calm"] / count,
         "s_per_killed_worker": max(walls["killed"] - walls["calm"], 0.0) / killed,
     }
+
+
+def _processor_of_all(client: Any) -> dict[str, float]:
+    """Processor time of this process, which holds scheduler and client, and of all workers [s]."""
+    return {"scheduler": time.process_time(), "workers": sum(client.run(time.process_time).values())}
 
 
 def _is_whole(path: Path, number: int) -> bool:

@@ -9,8 +9,10 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterable, Iterator
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
@@ -23,6 +25,9 @@ Item = TypeVar("Item")
 _DEATHS = 10
 # Tasks submitted ahead for each worker.
 _AHEAD = 4
+# Items travel together while they take no longer than this [s], and no more than so many: much longer than a call of Dask
+# costs, much shorter than what is worth sharing among workers. Both chosen.
+_BATCH_S, _MOST_TOGETHER = 0.25, 64
 
 
 def run_on_cluster(cluster: str, task: Callable[[Item], dict], items: Iterable[Item]) -> Iterator[dict]:
@@ -87,7 +92,12 @@ def connected(cluster: str) -> Iterator[Any]:
     except ImportError:
         raise InputError("--cluster", "Dask is not installed", cure="pip install 'seasonscapes[cluster]'") from None
     check_cluster(cluster)
-    settings = {"distributed.scheduler.allowed-failures": _DEATHS, "distributed.worker.daemon": False}
+    settings = {
+        "distributed.scheduler.allowed-failures": _DEATHS,
+        "distributed.worker.daemon": False,
+        # Statistics that only Dask's dashboard shows; they cost a worker some percent of a core.
+        "distributed.worker.profile.enabled": False,
+    }
     with dask.config.set(settings):
         if cluster.startswith(("tcp://", "tls://")):
             try:
@@ -163,21 +173,47 @@ def _slurm(path: Path) -> Any:
 
 
 def run_by(client: Any, task: Callable[[Item], dict], items: Iterable[Item]) -> Iterator[dict]:
-    """Run a task for every item on a Dask client's workers and give the records as they are done."""
+    """Run a task for every item on a Dask client's workers and give the records as they are done.
+
+    Short tasks travel together: a call of Dask costs milliseconds by itself. How many follows from how long the latest took.
+    An item's exception ends the iteration; of the items that travelled with it, some may have been run.
+
+    Parameters
+    ----------
+    client
+        Of `connected`.
+    task
+        A function that can be pickled. It may be called again for an item whose worker died, and knows which results exist.
+    items
+        Its arguments, one for each call; they are taken as workers need them.
+    """
     from distributed import as_completed
 
     pending = iter(items)
     workers = max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
+    together = 1
 
-    def submit(item: Item) -> Any:
+    def submit() -> Any | None:
+        batch = list(islice(pending, together))
         # Impure, so that a second run calls the task again: the task itself knows which results exist.
-        return client.submit(task, item, pure=False)
+        return client.submit(_run_batch, task, batch, pure=False) if batch else None
 
-    first = [submit(item) for _, item in zip(range(_AHEAD * workers), pending, strict=False)]
-    running = as_completed(first)
+    first = [submit() for _ in range(_AHEAD * workers)]
+    running = as_completed([future for future in first if future is not None])
     for future in running:
-        yield future.result()
+        records, seconds = future.result()
         future.release()
-        following = next(pending, None)
+        # A worker's first item may be slow (it opens files, compiles kernels): the number may grow again afterwards.
+        fitting = int(len(records) * _BATCH_S / max(seconds, 1e-6))
+        together = max(1, min(fitting, 2 * together, _MOST_TOGETHER))
+        following = submit()
         if following is not None:
-            running.add(submit(following))
+            running.add(following)
+        yield from records
+
+
+def _run_batch(task: Callable[[Item], dict], items: Sequence[Item]) -> tuple[list[dict], float]:
+    """The records of some items, and how long they took [s]."""
+    start = time.perf_counter()
+    records = [task(item) for item in items]
+    return records, time.perf_counter() - start

@@ -1,0 +1,71 @@
+"""Independent tasks on Dask's workers: nothing lost, short tasks travel together, long ones alone."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+pytest.importorskip("distributed")
+
+
+@pytest.fixture(scope="module")
+def client():
+    from distributed import Client, LocalCluster
+
+    # Threads of this process: the scheduler is Dask's own, and no process has to start.
+    with (
+        LocalCluster(n_workers=3, threads_per_worker=1, processes=False, dashboard_address=None) as cluster,
+        Client(cluster) as connected,
+    ):
+        yield connected
+
+
+def record(item: tuple[int, float]) -> dict:
+    from distributed import get_worker
+
+    number, seconds = item
+    time.sleep(seconds)
+    return {"number": number, "call": get_worker().get_current_task()}
+
+
+def test_short_tasks_travel_together_and_none_is_lost_or_done_twice(client):
+    from seasonscapes.cluster import run_by
+
+    records = list(run_by(client, record, ((number, 0.0) for number in range(2000))))
+    assert sorted(each["number"] for each in records) == list(range(2000))
+    assert len({each["call"] for each in records}) < 2000 / 8
+
+
+def test_long_tasks_travel_alone(client):
+    from seasonscapes.cluster import run_by
+
+    records = list(run_by(client, record, ((number, 0.3) for number in range(15))))
+    assert len({each["call"] for each in records}) == 15
+
+
+def test_items_are_taken_as_workers_need_them(client):
+    from seasonscapes.cluster import run_by
+
+    taken = []
+
+    def items():
+        for number in range(500):
+            taken.append(number)
+            yield number, 0.2
+
+    running = run_by(client, record, items())
+    next(running)
+    assert len(taken) < 40
+    running.close()
+
+
+def test_a_task_that_fails_ends_the_iteration_with_its_own_exception(client):
+    from seasonscapes.cluster import run_by
+
+    with pytest.raises(ZeroDivisionError):
+        list(run_by(client, divided, range(-300, 300)))
+
+
+def divided(number: int) -> dict:
+    return {"quotient": 1 / number}
