@@ -86,7 +86,16 @@ def albedo(folder: Path, data: Path) -> dict[str, float]:
     calibrate = ["calibrate", scene, "--picture", first, "--points", str(folder / "points.csv"), "--series", manifest]
     run([*calibrate, "-o", str(folder / "calibration")], folder)
     times = "2018-05-12T12:25Z,2018-09-08T09:25Z"
-    arguments = ["albedo", scene, "--manifest", manifest, "--calibrations", str(folder / "calibration"), "--times", times]
+    arguments = [
+        "albedo",
+        scene,
+        "--manifest",
+        manifest,
+        "--calibrations",
+        str(folder / "calibration"),
+        "--times",
+        times,
+    ]
     cost = run([*arguments, "--doubtful-poses", "-o", str(folder / "albedo.npz")], folder)
     return {"albedo_s": cost[0], "albedo_peak_gb": cost[1]}
 

@@ -306,7 +306,7 @@ def guard(stage: Stage, *, seed: int, texels: int = 12_000) -> dict:
 
 def rejection(stage: Stage, *, seed: int, texels: int = 12_000) -> dict:
     """Houses and a mast before every webcam: how much of them is found, and what painting gains by it."""
-    from seasonscapes.texturing.regression_fill import fit_regression, predict
+    from seasonscapes.texturing.colour_regression import fit_regression, predict
 
     terrain, inputs = stage.truth.terrain, shots_of(stage)
     first = paint_atlas(inputs, target_of(stage))

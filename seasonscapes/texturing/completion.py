@@ -17,6 +17,8 @@ from seasonscapes.texturing.predictors import Predictors
 from seasonscapes.texturing.regression_fill import regression_fill
 from seasonscapes.texturing.residual_correction import corrected_fill
 from seasonscapes.texturing.smooth_fill import membrane_fill, push_pull, telea_fill
+from seasonscapes.texturing.tiled_completion import complete_tiles
+from seasonscapes.texturing.tiled_predictors import TiledPredictors
 from seasonscapes.texturing.top_down_grid import from_grid, to_grid
 
 Progress = Callable[[float], None]
@@ -187,7 +189,7 @@ class CompletionOptions:
 
 def complete(
     texture: Texture,
-    predictors: Predictors,
+    predictors: Predictors | TiledPredictors,
     *,
     base: np.ndarray | None = None,
     options: CompletionOptions | None = None,
@@ -201,7 +203,8 @@ def complete(
         Radiance or albedo; painted where ``weight`` is positive and the values are finite.
     predictors
         From `predictors.predictors_for`, of the same size. The methods ``membrane`` and ``telea`` use only its surface
-        and top-down grid.
+        and top-down grid. With those of `tiled_predictors.tiled_predictors`, the method ``guided`` without base and grain
+        works tile by tile, in memory for little more than the texture.
     base
         ``(R, S, 3)`` estimate of every texel from another source, in the texture's unit (for an albedo: an orthophoto
         without its illumination), NaN where unknown. It is corrected by the painted texels, which in turn are shrunk
@@ -235,6 +238,11 @@ def complete(
         )
     report = progress or (lambda fraction: None)
     painted = painted_texels(texture)
+    if isinstance(predictors, TiledPredictors):
+        if method == "guided" and base is None and options.detail == 0.0:
+            tiled = complete_tiles(texture, painted, predictors, fast=fast, seed=seed, progress=progress)
+            return CompletedTexture(*tiled, painted)
+        predictors = predictors.whole()
     known = painted & predictors.surface
     if not known.any():
         raise NotEnoughEvidence("complete: no painted texel on the surface: there is nothing to learn from")

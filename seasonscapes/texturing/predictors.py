@@ -57,6 +57,7 @@ def stack_predictors(
     *,
     grid: TopDownGrid | None = None,
     surface: np.ndarray | None = None,
+    empty_images: bool = False,
 ) -> Predictors:
     """Stack layers and a satellite image in the same atlas.
 
@@ -70,6 +71,8 @@ def stack_predictors(
         As in `Predictors`.
     surface
         As in `Predictors`; ``None`` for the texels where every layer is finite.
+    empty_images
+        Keep a satellite image of which no texel has a value.
 
     Returns
     -------
@@ -89,7 +92,7 @@ def stack_predictors(
         surface = np.asarray(np.isfinite(columns).all(axis=0))
     if satellite is not None:
         imaged = (satellite.weight > 0.0) & np.isfinite(satellite.values).all(axis=2)
-        if imaged.any():
+        if empty_images or imaged.any():
             for channel in range(satellite.values.shape[2]):
                 columns.append(np.where(imaged, satellite.values[..., channel], np.nan).astype(np.float32))
                 names.append(f"satellite_{channel + 1}")

@@ -9,292 +9,26 @@ removes the seam.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from seasonscapes.texturing.colour_regression import Regression, fit_extrapolation, fit_forest, fit_regression, predict
 from seasonscapes.texturing.completion_error import ErrorModel, Predict, fit_error_model, spatial_folds
 from seasonscapes.texturing.predictors import Predictors
 from seasonscapes.texturing.smooth_fill import propagate
 from seasonscapes.texturing.top_down_grid import from_grid, to_grid
-
-if TYPE_CHECKING:
-    from sklearn.ensemble import ExtraTreesRegressor, HistGradientBoostingRegressor
 
 Progress = Callable[[float], None]
 
 SAMPLES, FAST_SAMPLES = 40_000, 20_000
 # Decay length of propagated residuals [texels].
 REACH_PX = 12.0
-# Weight of the boosted trees in their mean with the randomised trees. Boosting is more accurate, the randomised trees
-# have less variance; the mean is better than either where the predictors explain little.
-MIX = 0.65
 # Texels predicted at once.
 BLOCK = 200_000
 # Prefixes of the names of predictors that are images of the terrain, to which its colour is nearly proportional.
 IMAGES = ("satellite", "relit")
-# Stands for NaN: not every version of the randomised trees accepts missing values. No predictor has this value.
-_MISSING = np.float32(-1.0e5)
-# Ridge penalty of the linear term in variances of its inputs, and the limit of the training range beyond which it
-# applies [standard deviations]. Chosen on synthetic massifs of seeds 5 to 7 with two cameras, and such that textures
-# with large painted areas do not become worse (seed 99, Landsat).
-_RIDGE, _RANGE = 0.1, 1.0
-
-
-@dataclass(frozen=True)
-class LinearExtrapolation:
-    """Linear map from image predictors to encoded colour, applied to the excess over the training range only.
-
-    Parameters
-    ----------
-    columns
-        Indices of the predictors that are images; their cube roots are used.
-    mean, scale
-        ``(C,)`` mean and standard deviation of the cube roots over the training texels.
-    slope
-        ``(C, 3)`` encoded colour per standard deviation.
-    """
-
-    columns: np.ndarray
-    mean: np.ndarray
-    scale: np.ndarray
-    slope: np.ndarray
-
-    def __call__(self, predictor: np.ndarray) -> np.ndarray:
-        """Return the term to add to encoded colours ``(n, 3)``; 0 within the training range or without an image.
-
-        Parameters
-        ----------
-        predictor
-            ``(n, G)``.
-        """
-        image = (np.cbrt(predictor[:, self.columns]) - self.mean) / self.scale
-        return np.nan_to_num(image - np.clip(image, -_RANGE, _RANGE)) @ self.slope
-
-
-def fit_extrapolation(predictor: np.ndarray, encoded: np.ndarray, images: np.ndarray) -> LinearExtrapolation:
-    """Fit encoded colours to the image predictors by ridge regression.
-
-    Parameters
-    ----------
-    predictor
-        ``(n, G)``.
-    encoded
-        ``(n, 3)`` colours, cube roots.
-    images
-        ``(G,)`` bool: predictors that are images.
-
-    Returns
-    -------
-    LinearExtrapolation
-        Zero without images or where none has a value.
-    """
-    columns = np.flatnonzero(images)
-    image = np.cbrt(predictor[:, columns].astype(np.float64))
-    known = np.isfinite(image).all(axis=1)
-    if len(columns) == 0 or not known.any():
-        return LinearExtrapolation(columns, np.zeros(len(columns)), np.ones(len(columns)), np.zeros((len(columns), 3)))
-    mean, scale = image[known].mean(axis=0), image[known].std(axis=0) + 1e-6
-    image, colour = (image[known] - mean) / scale, encoded[known] - encoded[known].mean(axis=0)
-    normal = image.T @ image + _RIDGE * len(image) * np.eye(len(columns))
-    return LinearExtrapolation(columns, mean, scale, np.linalg.solve(normal, image.T @ colour))
-
-
-@dataclass(frozen=True)
-class Regression:
-    """A fitted regression from predictors to encoded colour.
-
-    Parameters
-    ----------
-    extrapolation
-        Linear term outside the training range of the images; the trees are fitted to the remainder.
-    boosted
-        Gradient-boosted trees of lightness and two colour differences, or ``None`` in the fast variant.
-    forest
-        Extremely randomised trees of all channels; the spread between them enters the error model.
-    """
-
-    extrapolation: LinearExtrapolation
-    boosted: tuple[HistGradientBoostingRegressor, ...] | None
-    forest: ExtraTreesRegressor
-
-
-def to_opponent_colour(encoded: np.ndarray) -> np.ndarray:
-    """Convert RGB to lightness and two colour differences, which are nearly uncorrelated.
-
-    Parameters
-    ----------
-    encoded
-        ``(..., 3)`` colours R, G, B.
-
-    Returns
-    -------
-    ndarray
-        ``(..., 3)``: (R + G + B) / 3, R − G, B − G.
-    """
-    r, g, b = np.moveaxis(encoded, -1, 0)
-    return np.stack([(r + g + b) / 3.0, r - g, b - g], -1)
-
-
-def from_opponent_colour(opponent: np.ndarray) -> np.ndarray:
-    """Invert `to_opponent_colour`.
-
-    Parameters
-    ----------
-    opponent
-        ``(..., 3)``: lightness and colour differences.
-
-    Returns
-    -------
-    ndarray
-        ``(..., 3)`` colours R, G, B.
-    """
-    lightness, rg, bg = np.moveaxis(opponent, -1, 0)
-    g = lightness - (rg + bg) / 3.0
-    return np.stack([rg + g, g, bg + g], -1)
-
-
-def fit_regression(
-    predictor: np.ndarray, encoded: np.ndarray, images: np.ndarray | None = None, *, fast: bool = False, seed: int = 0
-) -> Regression:
-    """Fit a regression from predictors to encoded colours.
-
-    Parameters
-    ----------
-    predictor
-        ``(n, G)``, NaN where unknown.
-    encoded
-        ``(n, 3)`` colours, cube roots.
-    images
-        ``(G,)`` bool: predictors that are images; ``None`` for none.
-    fast
-        Fit randomised trees only.
-    seed
-        Of the trees.
-
-    Returns
-    -------
-    Regression
-        For `predict`.
-    """
-    from sklearn.ensemble import HistGradientBoostingRegressor
-
-    extrapolation = fit_extrapolation(
-        predictor, encoded, np.zeros(predictor.shape[1], bool) if images is None else images
-    )
-    remainder = encoded - extrapolation(predictor)
-    forest = fit_forest(predictor, remainder, seed, trees=20 if fast else 12)
-    if fast:
-        return Regression(extrapolation, None, forest)
-    boosted = []
-    for channel, (target, rounds) in enumerate(zip(to_opponent_colour(remainder).T, (100, 40, 40), strict=True)):
-        model = HistGradientBoostingRegressor(
-            max_iter=rounds,
-            learning_rate=0.1,
-            max_leaf_nodes=31,
-            max_features=0.5,
-            min_samples_leaf=20,
-            l2_regularization=1.0,
-            early_stopping=False,  # pyright: ignore[reportArgumentType]
-            random_state=seed + channel,
-        )
-        boosted.append(model.fit(predictor, target))
-    return Regression(extrapolation, tuple(boosted), forest)
-
-
-def fit_forest(
-    predictor: np.ndarray,
-    encoded: np.ndarray,
-    seed: int,
-    *,
-    trees: int,
-    leaf: int = 5,
-    weight: np.ndarray | None = None,
-) -> ExtraTreesRegressor:
-    """Fit extremely randomised trees from predictors to colours.
-
-    Parameters
-    ----------
-    predictor
-        ``(n, G)``, NaN where unknown.
-    encoded
-        ``(n, 3)`` colours.
-    seed
-        Of the trees.
-    trees
-        Number of trees.
-    leaf
-        Least number of samples in a leaf.
-    weight
-        ``(n,)`` sample weights; ``None`` for equal ones.
-
-    Returns
-    -------
-    ExtraTreesRegressor
-        For `forest_mean_spread`.
-    """
-    from sklearn.ensemble import ExtraTreesRegressor
-
-    forest = ExtraTreesRegressor(trees, min_samples_leaf=leaf, max_features=0.5, n_jobs=1, random_state=seed)
-    return forest.fit(_replace_missing(predictor), encoded, sample_weight=weight)
-
-
-def _replace_missing(predictor: np.ndarray) -> np.ndarray:
-    return np.ascontiguousarray(np.where(np.isfinite(predictor), predictor, _MISSING), np.float32)
-
-
-def forest_mean_spread(forest: ExtraTreesRegressor, predictor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute mean and standard deviation of the predictions of the single trees.
-
-    Parameters
-    ----------
-    forest
-        From `fit_forest`.
-    predictor
-        ``(n, G)``, NaN where unknown.
-
-    Returns
-    -------
-    mean
-        ``(n, 3)`` over the trees.
-    spread
-        ``(n,)`` standard deviation between the trees, RMS over the channels.
-    """
-    finite = _replace_missing(predictor)
-    total, square = np.zeros((len(finite), 3)), np.zeros((len(finite), 3))
-    for tree in forest.estimators_:
-        value = tree.tree_.predict(finite).reshape(len(finite), 3)
-        total += value
-        square += value**2
-    mean = total / len(forest.estimators_)
-    variance = np.maximum(square / len(forest.estimators_) - mean**2, 0.0)
-    return mean, np.sqrt(variance.mean(axis=1))
-
-
-def predict(regression: Regression, predictor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Predict encoded colours.
-
-    Parameters
-    ----------
-    regression
-        From `fit_regression`.
-    predictor
-        ``(n, G)``, NaN where unknown.
-
-    Returns
-    -------
-    encoded
-        ``(n, 3)`` colours, cube roots.
-    spread
-        ``(n,)`` standard deviation between the randomised trees.
-    """
-    mean, spread = forest_mean_spread(regression.forest, predictor)
-    if regression.boosted is not None:
-        boosted = from_opponent_colour(np.stack([model.predict(predictor) for model in regression.boosted], -1))
-        mean = MIX * boosted + (1.0 - MIX) * mean
-    return regression.extrapolation(predictor) + mean, spread
 
 
 def regression_fill(
@@ -336,24 +70,95 @@ def regression_fill(
     table, flat = predictors.values.reshape(-1, predictors.values.shape[2]), values.reshape(-1, 3)
     sample = rng.choice(known, min(FAST_SAMPLES if fast else SAMPLES, len(known)), replace=False)
     predictor, encoded = mask_imagery(table[sample], predictors, painted, rng), flat[sample].astype(np.float64)
-    images = np.array([name.startswith(IMAGES) for name in predictors.names])
-    regression = fit_regression(predictor, encoded, images, fast=fast, seed=seed)
-    report(0.2)
     fold = texel_folds(sample, painted, predictors, seed)
+    fitted = fit_completion(
+        predictor, encoded, predictors.names, fold, fast=fast, seed=seed, progress=lambda done: report(0.35 * done)
+    )
+    return completion_of(fitted, values, painted, predictors, progress=lambda done: report(0.35 + 0.6 * done))
+
+
+@dataclass(frozen=True)
+class FittedCompletion:
+    """A regression with the model of its error, fitted to painted texels."""
+
+    regression: Regression
+    error_model: ErrorModel
+
+
+def fit_completion(
+    predictor: np.ndarray,
+    encoded: np.ndarray,
+    names: Sequence[str],
+    fold: np.ndarray,
+    *,
+    fast: bool = False,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> FittedCompletion:
+    """Fit a regression and the model of its error to a sample of painted texels.
+
+    Parameters
+    ----------
+    predictor
+        ``(n, G)``, NaN where unknown.
+    encoded
+        ``(n, 3)`` float64 colours, cube roots.
+    names
+        Of the G predictors.
+    fold
+        ``(n,)`` from `texel_folds`.
+    fast, seed, progress
+        As in `regression_fill`.
+    """
+    report = progress or (lambda fraction: None)
+    images = np.array([name.startswith(IMAGES) for name in names])
+    regression = fit_regression(predictor, encoded, images, fast=fast, seed=seed)
+    report(0.6)
     error_model = _fit_error(predictor, encoded, images, fold, seed)
-    report(0.35)
+    report(1.0)
+    return FittedCompletion(regression, error_model)
+
+
+def completion_of(
+    fitted: FittedCompletion,
+    values: np.ndarray,
+    painted: np.ndarray,
+    predictors: Predictors,
+    *,
+    inside: np.ndarray | None = None,
+    progress: Progress | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Fill unpainted texels by a fitted regression, and propagate its residual at painted texels into them.
+
+    Parameters
+    ----------
+    fitted
+        From `fit_completion`.
+    values, painted, predictors, progress
+        As in `regression_fill`.
+    inside
+        ``(R, S)`` bool: texels whose filling is wanted; ``None`` for all. Painted texels outside of it give residuals.
+
+    Returns
+    -------
+    filled, sigma
+        As `regression_fill`; where not wanted, without meaning.
+    """
+    report = progress or (lambda fraction: None)
+    table = predictors.values.reshape(-1, predictors.values.shape[2])
     hole = predictors.surface & ~painted
     rim = _rim(hole, painted & predictors.surface, int(REACH_PX), predictors)
+    hole = hole if inside is None else hole & inside
     predicted = np.zeros_like(values, dtype=np.float32)
     sigma = np.zeros(painted.shape, np.float32)
     target = np.flatnonzero(hole | rim)
     for start in range(0, len(target), BLOCK):
         part = target[start : start + BLOCK]
-        colour, spread = predict(regression, table[part])
+        colour, spread = predict(fitted.regression, table[part])
         predicted.reshape(-1, 3)[part] = colour
-        inside = hole.ravel()[part]
-        sigma.ravel()[part[inside]] = error_model.sigma(table[part[inside]], colour[inside], spread[inside])
-        report(0.35 + 0.6 * min(1.0, (start + BLOCK) / len(target)))
+        wanted = hole.ravel()[part]
+        sigma.ravel()[part[wanted]] = fitted.error_model.sigma(table[part[wanted]], colour[wanted], spread[wanted])
+        report(min(1.0, (start + BLOCK) / len(target)))
     residual = np.where(rim[..., None], values - predicted, 0.0)
     filled = np.where(hole[..., None], predicted + propagate_residual(residual, rim, predictors), values)
     return filled.astype(np.float32), sigma
@@ -387,7 +192,25 @@ def mask_imagery(
         return predictor
     finite = np.isfinite(predictors.values[..., image][predictors.surface & ~painted])
     missing = np.asarray(~finite.all(axis=1))
-    missing_share = float(missing.mean()) if len(missing) else 0.0
+    return without_images(predictor, image, float(missing.mean()) if len(missing) else 0.0, rng)
+
+
+def without_images(
+    predictor: np.ndarray, image: np.ndarray, missing_share: float, rng: np.random.Generator
+) -> np.ndarray:
+    """Remove images from training texels at random, until a share of them (at most half) has none; see `mask_imagery`.
+
+    Parameters
+    ----------
+    predictor
+        ``(n, G)`` of the training texels.
+    image
+        ``(G,)`` bool: predictors that are images which may be missing.
+    missing_share
+        Share of the unpainted texels without an image.
+    rng
+        Random generator.
+    """
     training_missing = ~np.isfinite(predictor[:, image]).all(axis=1)
     # The border of the image is not random: texels without it are rare among painted texels and frequent in the holes.
     extra = min(0.5, missing_share) - float(training_missing.mean())

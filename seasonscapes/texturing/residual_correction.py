@@ -16,14 +16,13 @@ from collections.abc import Callable
 
 import numpy as np
 
+from seasonscapes.texturing.colour_regression import fit_forest, forest_mean_spread
 from seasonscapes.texturing.completion_error import Predict, fit_error_model
 from seasonscapes.texturing.predictors import Predictors
 from seasonscapes.texturing.regression_fill import (
     BLOCK,
     FAST_SAMPLES,
     SAMPLES,
-    fit_forest,
-    forest_mean_spread,
     propagate_residual,
     regression_fill,
     texel_folds,

@@ -20,7 +20,10 @@ if TYPE_CHECKING:
     from seasonscapes.cameras.pinhole import Camera
     from seasonscapes.sky.models import SkyModel
     from seasonscapes.texturing.predictors import Predictors
+    from seasonscapes.texturing.tiled_predictors import TiledPredictors
 
+# Texels whose predictors are held at once: some 100 bytes each, and as much again while they are made.
+MOST_WHOLE_TEXELS = 16_000_000
 _FIGURE_PX = 1024
 # Over the sky of each texel, where the light of a completed picture is computed again.
 _RAYS = 128
@@ -79,7 +82,7 @@ def complete(
     place.require_texture(texture)
     return complete_texture(
         texture,
-        predictors_at(place, utc_at(place, time), predicted),
+        completion_predictors(place, utc_at(place, time), predicted),
         options=options,
         progress=task_progress(progress, f"completing ({options.method})"),
     )
@@ -87,19 +90,39 @@ def complete(
 
 def predictors_at(place: Place, utc: datetime, predicted: Texture | None = None) -> Predictors:
     """Predictors of every texel: relief, the sun of the hour and of the day, the orthoimage, predicted radiance."""
-    from seasonscapes.sky.ephemeris import sun_position
     from seasonscapes.texturing.predictors import predictors_for
+
+    relit = None if predicted is None else predicted.values
+    return predictors_for(
+        place.terrain, place.atlas, satellite=orthoimage(place, utc), relit=relit, **_suns(place, utc)
+    )
+
+
+def completion_predictors(
+    place: Place, utc: datetime, predicted: Texture | None = None
+) -> Predictors | TiledPredictors:
+    """`predictors_at`, for `texturing.completion.complete`: in tiles for a planar atlas whose predictors would take gigabytes."""
+    from seasonscapes.texturing.tiled_predictors import tiled_predictors
+
+    rows, columns = place.texture_shape
+    if place.atlas.kind != "planar" or rows * columns <= MOST_WHOLE_TEXELS:
+        return predictors_at(place, utc, predicted)
+    layers = {} if predicted is None else {f"relit_{n + 1}": predicted.values[..., n] for n in range(3)}
+    return tiled_predictors(
+        place.terrain, place.atlas, satellite=orthoimage(place, utc), layers=layers, **_suns(place, utc)
+    )
+
+
+def _suns(place: Place, utc: datetime) -> dict[str, np.ndarray]:
+    """Directions to the sun at a time and through its day, as predictors take them."""
+    from seasonscapes.sky.ephemeris import sun_position
 
     at = (place.frame.latitude_deg, place.frame.longitude_deg)
     hours = [utc + timedelta(hours=hour) for hour in range(-12, 12)]
-    return predictors_for(
-        place.terrain,
-        place.atlas,
-        satellite=orthoimage(place, utc),
-        relit=None if predicted is None else predicted.values,
-        sun_direction=sun_position(utc, *at).direction,
-        day_suns=np.asarray(sun_position(hours, *at).direction, float),
-    )
+    return {
+        "sun_direction": sun_position(utc, *at).direction,
+        "day_suns": np.asarray(sun_position(hours, *at).direction, float),
+    }
 
 
 def read_painted(path: Path, place: Place) -> Texture:

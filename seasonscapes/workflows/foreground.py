@@ -58,9 +58,9 @@ def foreground_masks(
     """
     from seasonscapes.rendering.gbuffer import trace_gbuffer
     from seasonscapes.texturing.atlas_tiles import tiling
+    from seasonscapes.texturing.colour_regression import fit_regression, predict
     from seasonscapes.texturing.foreground import cross_validated_prediction, foreground_mask
     from seasonscapes.texturing.inputs import prepare_input, unlit_scene
-    from seasonscapes.texturing.regression_fill import fit_regression, predict
 
     def fit(predictors: np.ndarray, values: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
         regression = fit_regression(predictors, values, fast=True, seed=seed)

@@ -13,7 +13,7 @@ from seasonscapes.sky.models import SkyModel
 from seasonscapes.terrain.surface import Texture
 from seasonscapes.texturing.completion import INPAINTERS, CompletedTexture, CompletionOptions
 from seasonscapes.workflows.albedo_sources import load_albedo
-from seasonscapes.workflows.completion import completion_record, predictors_at
+from seasonscapes.workflows.completion import completion_predictors, completion_record, predictors_at
 from seasonscapes.workflows.place import Place
 from seasonscapes.workflows.predicted_radiance import albedo_relative_sigma, predict_radiance
 
@@ -123,7 +123,8 @@ def inpaint(
         completed = fuse_with_albedo(painted, predicted.values, sigma, predictors)
         record["guides"] = ["albedo, relit"]
     else:
-        predictors = predictors_at(place, utc, predicted)
+        found = predictors_at if options.diffusion is not None else completion_predictors
+        predictors = found(place, utc, predicted)
         # Only regression asks them.
         regression = options.rest if options.method == "diffusion" else options.method
         record["guides"] = list(predictors.names) if regression == "guided" else []

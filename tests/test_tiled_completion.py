@@ -1,0 +1,115 @@
+"""Completion by tiles: as the whole texture's where both can be had, whatever the tiles, and in bounded memory."""
+
+import numpy as np
+import places
+import pytest
+
+from seasonscapes.errors import NotEnoughEvidence
+from seasonscapes.frames import LocalFrame
+from seasonscapes.terrain.mesh import build_mesh
+from seasonscapes.terrain.surface import Raster, Texture
+from seasonscapes.terrain.unwrap import unwrap
+from seasonscapes.texturing.completion import CompletionOptions, complete
+from seasonscapes.texturing.predictors import predictors_for
+from seasonscapes.texturing.tiled_completion import complete_tiles
+from seasonscapes.texturing.tiled_predictors import tiled_predictors
+
+SUN = np.array([0.5, -0.6, 0.624])
+
+
+@pytest.fixture(scope="module")
+def hill():
+    """A planar atlas of some 400 × 400 texels with its predictors, a truth that follows from them, and a mask with holes."""
+    heights = places.hill_heights(count=61)
+    raster = Raster(
+        heights[..., None].astype(np.float32), places.Affine(50, 0, 421_000, 0, -50, 5_156_000), "EPSG:32632"
+    )
+    terrain = build_mesh(raster, LocalFrame(46.55, 7.98, 0.0, 0.13), mesher="grid")
+    terrain, atlas = unwrap(terrain, kind="planar", texel_m=7.5, max_side_px=1024)
+    rng = np.random.default_rng(4)
+    rows, columns = atlas.height_px, atlas.width_px
+    image = rng.uniform(0.05, 0.6, (rows // 8 + 1, columns // 8 + 1, 3)).repeat(8, 0).repeat(8, 1)[:rows, :columns]
+    satellite = Texture(image.astype(np.float32), np.ones((rows, columns), np.float32))
+    satellite.weight[:, : columns // 4] = 0.0
+    whole = predictors_for(terrain, atlas, satellite=satellite, sun_direction=SUN)
+    sun = np.nan_to_num(whole.values[..., whole.names.index("sun")])
+    truth = (1000.0 + image * (8_000.0 + 30_000.0 * sun[..., None])).astype(np.float32)
+    row, column = np.mgrid[0:rows, 0:columns]
+    seen = (np.hypot(row % 100 - 50, column % 90 - 45) > 25.0) & (row < 0.8 * rows)
+    return terrain, atlas, satellite, whole, Texture(truth, (seen & whole.surface).astype(np.float32))
+
+
+def test_windows_of_predictors_are_those_of_the_whole_atlas(hill):
+    terrain, atlas, satellite, whole, _ = hill
+    tiled = tiled_predictors(terrain, atlas, satellite=satellite, sun_direction=SUN)
+    assert tiled.names == whole.names
+    np.testing.assert_array_equal(tiled.surface, whole.surface)
+    window = np.s_[130:260, 70:300]
+    part = tiled.window(window)
+    np.testing.assert_array_equal(part.surface, whole.surface[window])
+    inner = whole.surface[window]
+    spread = np.nanstd(whole.values, axis=(0, 1))
+    error = (part.values - whole.values[window])[inner] / spread
+    # Positions of texels are float32 metres there and exact here.
+    assert np.nanmax(np.abs(error)) < 1e-4
+    np.testing.assert_array_equal(np.isnan(part.values), np.isnan(whole.values[window]) | ~inner[..., None])
+
+
+def test_coarser_attributes_stay_close_to_the_fine_ones(hill):
+    terrain, atlas, _, whole, _ = hill
+    tiled = tiled_predictors(terrain, atlas, sun_direction=SUN, most_cells=whole.surface.size // 9)
+    inner = np.zeros(whole.surface.shape, bool)
+    inner[20:-20, 20:-20] = True
+    inner &= whole.surface
+    names = [name for name in whole.names if not name.startswith("satellite")]
+    for name in ("elevation", "slope", "sky_view"):
+        fine = whole.values[..., whole.names.index(name)][inner]
+        coarse = tiled.whole().values[..., names.index(name)][inner]
+        assert np.corrcoef(fine, coarse)[0, 1] > 0.99, name
+
+
+def test_tiles_fill_as_the_whole_texture_does(hill):
+    terrain, atlas, satellite, whole, texture = hill
+    tiled = tiled_predictors(terrain, atlas, satellite=satellite, sun_direction=SUN)
+    painted, hole = texture.weight > 0.0, whole.surface & (texture.weight == 0.0)
+    reference = complete(texture, whole, options=CompletionOptions(fast=True))
+    flat = np.broadcast_to(np.median(texture.values[painted], axis=0), texture.values.shape)
+
+    def error(values):
+        return float(np.sqrt(np.mean((np.cbrt(values) - np.cbrt(texture.values))[hole] ** 2)))
+
+    results = {}
+    for tile_px in (4096, 150):
+        values, sigma = complete_tiles(texture, painted, tiled, fast=True, tile_px=tile_px)
+        np.testing.assert_array_equal(values[painted], texture.values[painted])
+        assert np.isfinite(values).all()
+        assert (sigma[hole] > 0.0).all()
+        assert not sigma[painted].any()
+        assert error(values) < 1.05 * error(reference.values)
+        results[tile_px] = values
+    assert error(reference.values) < 0.5 * error(flat)
+    # The regression is the same; residuals of painted texels beyond a tile's border have decayed.
+    difference = np.cbrt(results[150]) - np.cbrt(results[4096])
+    assert np.sqrt(np.mean(difference[hole] ** 2)) < 0.1 * error(results[4096])
+
+
+def test_complete_takes_tiles_where_they_do(hill):
+    terrain, atlas, satellite, _, texture = hill
+    tiled = tiled_predictors(terrain, atlas, satellite=satellite, sun_direction=SUN)
+    options = CompletionOptions(fast=True, seed=3)
+    done = complete(texture, tiled, options=options)
+    values, _ = complete_tiles(texture, texture.weight > 0.0, tiled, fast=True, seed=3)
+    np.testing.assert_array_equal(done.values, values)
+    smooth = complete(texture, tiled, options=CompletionOptions("membrane"))
+    assert np.isfinite(smooth.values).all()
+    assert not np.array_equal(smooth.values, values)
+
+
+def test_nothing_painted_and_negative_values_are_refused(hill):
+    terrain, atlas, _, whole, texture = hill
+    tiled = tiled_predictors(terrain, atlas)
+    with pytest.raises(NotEnoughEvidence, match="no painted texel"):
+        complete(Texture(texture.values, np.zeros_like(texture.weight)), tiled)
+    negative = np.where(whole.surface[..., None], -1.0, texture.values).astype(np.float32)
+    with pytest.raises(ValueError, match="negative"):
+        complete(Texture(negative, texture.weight), tiled)
