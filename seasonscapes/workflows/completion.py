@@ -93,8 +93,9 @@ def predictors_at(place: Place, utc: datetime, predicted: Texture | None = None)
     from seasonscapes.texturing.predictors import predictors_for
 
     relit = None if predicted is None else predicted.values
+    sun, day = _suns(place, utc)
     return predictors_for(
-        place.terrain, place.atlas, satellite=orthoimage(place, utc), relit=relit, **_suns(place, utc)
+        place.terrain, place.atlas, satellite=orthoimage(place, utc), relit=relit, sun_direction=sun, day_suns=day
     )
 
 
@@ -108,21 +109,19 @@ def completion_predictors(
     if place.atlas.kind != "planar" or rows * columns <= MOST_WHOLE_TEXELS:
         return predictors_at(place, utc, predicted)
     layers = {} if predicted is None else {f"relit_{n + 1}": predicted.values[..., n] for n in range(3)}
+    sun, day = _suns(place, utc)
     return tiled_predictors(
-        place.terrain, place.atlas, satellite=orthoimage(place, utc), layers=layers, **_suns(place, utc)
+        place.terrain, place.atlas, satellite=orthoimage(place, utc), layers=layers, sun_direction=sun, day_suns=day
     )
 
 
-def _suns(place: Place, utc: datetime) -> dict[str, np.ndarray]:
-    """Directions to the sun at a time and through its day, as predictors take them."""
+def _suns(place: Place, utc: datetime) -> tuple[np.ndarray, np.ndarray]:
+    """Directions to the sun at a time ``(3,)``, and through its day ``(24, 3)``."""
     from seasonscapes.sky.ephemeris import sun_position
 
     at = (place.frame.latitude_deg, place.frame.longitude_deg)
     hours = [utc + timedelta(hours=hour) for hour in range(-12, 12)]
-    return {
-        "sun_direction": sun_position(utc, *at).direction,
-        "day_suns": np.asarray(sun_position(hours, *at).direction, float),
-    }
+    return sun_position(utc, *at).direction, np.asarray(sun_position(hours, *at).direction, float)
 
 
 def read_painted(path: Path, place: Place) -> Texture:

@@ -123,14 +123,12 @@ def inpaint(
         completed = fuse_with_albedo(painted, predicted.values, sigma, predictors)
         record["guides"] = ["albedo, relit"]
     else:
-        found = predictors_at if options.diffusion is not None else completion_predictors
-        predictors = found(place, utc, predicted)
-        # Only regression asks them.
+        # Only regression asks what they tell.
         regression = options.rest if options.method == "diffusion" else options.method
-        record["guides"] = list(predictors.names) if regression == "guided" else []
         if options.diffusion is not None:
             from seasonscapes.workflows.path_completion import SkyState, complete_along_path
 
+            predictors = predictors_at(place, utc, predicted)
             completion = CompletionOptions(options.rest, options.detail, options.fast, options.seed)
             sky_state = SkyState(utc, cloudiness_of(sky))
             completed, facts = complete_along_path(
@@ -138,12 +136,14 @@ def inpaint(
             )
             record |= facts | {"rest": options.rest}
         else:
+            predictors = completion_predictors(place, utc, predicted)
             completed = complete_texture(
                 painted,
                 predictors,
                 options=CompletionOptions(options.method, options.detail, options.fast, options.seed),
                 progress=task_progress(progress, f"completing ({options.method})"),
             )
+        record["guides"] = list(predictors.names) if regression == "guided" else []
     return Inpainted(completed, completion_record(completed, predictors.surface) | record)
 
 
