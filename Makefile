@@ -87,6 +87,7 @@ results: $(DEV)
 	$(BIN)/python benchmarks/viewer.py --json benchmarks/results/viewer.json
 	$(BIN)/python benchmarks/everyday.py --quick --json benchmarks/results/everyday-quick.json
 	$(BIN)/python benchmarks/scale.py --json benchmarks/results/scale.json
+	$(BIN)/python benchmarks/large.py --quick --json benchmarks/results/large-quick.json
 	$(BIN)/python benchmarks/tables.py
 
 check: $(DEV)
