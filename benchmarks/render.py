@@ -9,6 +9,8 @@ warm-up that compiles kernels and builds trees; what is compared is the call tha
 * Throughput is camera samples per second: the median over the rounds of the ratio between neighbours.
 * Noise is what differs between pictures of different seeds. Efficiency is 1 / (variance × seconds): how much sooner a
   picture of equal noise is there, since samples of different renderers are not worth the same.
+* Shadow rays to points of the sun's disc, from sixteen samples in each pixel, are counted as `visible_cosine` casts them (it makes
+  them, and multiplies by the cosine of incidence) and as a bare `ray_test` of the same rays, which lie ready on the device.
 * Agreement compares mean pictures where terrain covers the pixel: the contest is fair only if they are the same. Blocks
   of 16 × 16 pixels are compared, so that the noise that is left counts little.
 
@@ -207,6 +209,53 @@ def contest(renders: dict[str, Render], *, spp: int, rounds: int, seed: int) -> 
     return results
 
 
+def shadow_rays(scene, camera, *, rounds: int, seed: int) -> dict[str, float]:
+    """Shadow rays per processor second, over a bare `ray_test` of the same rays; the median of neighbours in time."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from seasonscapes.rendering.backend import point3
+    from seasonscapes.rendering.hemisphere_rays import ray_scene
+    from seasonscapes.rendering.sun_visibility import bayer_disc_offset, disc_directions, sun_rays, visible_cosine
+    from seasonscapes.rendering.terrain_material import shadow_ray_start
+    from seasonscapes.rendering.view_samples import view_samples
+
+    land, sun = ray_scene(scene.mi_terrain), scene.illumination.sun
+    points, hit, pixel = view_samples(land, camera, range(camera.height_px), 16, seed)
+    offset = bayer_disc_offset(pixel, camera.width_px, 16)
+    rays = sun_rays(land, points.origin, points.normal, points.geometric_normal, hit.astype(np.float32), offset)
+    disc = (np.arange(16) + offset[:, None] % 256) % 16
+    direction = disc_directions(sun, 16).astype(np.float32)[disc].reshape(-1, 3)
+    # As float16, which is how the rays hold them.
+    half = [
+        each.reshape(-1, 3).astype(np.float16).astype(np.float32) for each in (points.normal, points.geometric_normal)
+    ]
+    cosine, facet = (normal @ np.asarray(sun.direction, np.float32) for normal in half)
+    active = mi.Bool((cosine > 0.0) & (facet > 0.0) & hit.ravel())
+    towards = mi.Vector3f(point3(direction))
+    origin = point3(points.origin.reshape(-1, 3))
+    origin += towards * shadow_ray_start(land.mi_terrain.bsdf(), mi.Float(facet), origin)
+    dr.eval(origin, towards, active)
+
+    def ours() -> np.ndarray:
+        return visible_cosine(rays, sun).ravel() > 0.0
+
+    def bare() -> np.ndarray:
+        return np.array(active & ~land.mi_scene.ray_test(mi.Ray3f(origin, towards), active=active))
+
+    differ = float((ours() != bare()).mean())
+    ratios, rates = [], []
+    for _ in range(rounds):
+        mine, plain = timed(ours)[1]["cpu_seconds"], timed(bare)[1]["cpu_seconds"]
+        ratios.append(plain / mine)
+        rates.append(len(direction) / mine / 1e6)
+    return {
+        "shadow_rays_vs_ray_test": float(np.median(ratios)),
+        "shadow_mrays_per_cpu_s": float(np.median(rates)),
+        "shadow_rays_differ": differ,
+    }
+
+
 def noise_variance(images: list[np.ndarray], mask: np.ndarray) -> float:
     """Variance of a pixel between seeds, mean over pixels and channels, relative to the squared mean."""
     stack = np.array([image[mask] for image in images], np.float64)
@@ -284,7 +333,7 @@ def show(table: dict[str, dict], record: dict[str, float]) -> None:
         )
     print()
     for key, value in record.items():
-        if "_vs_" in key:
+        if "_vs_" in key or key.startswith("shadow_"):
             print(f"{key:45s} {value:8.2f}")
 
 
@@ -350,7 +399,7 @@ def main() -> None:
 
     mask = path_trace(scene, camera, spp=4, max_depth=2)[1] == 1.0
     table = measure(results, spp, mask)
-    record = record_of(table, results)
+    record = record_of(table, results) | shadow_rays(scene, camera, rounds=4 * rounds, seed=seed % 2**30)
     show(table, record)
     if arguments.pictures:
         save_pictures(arguments.pictures, results)

@@ -280,7 +280,7 @@ def visible_cosine(rays: SunRays, luminary: Luminary, *, rays_per_sample: int = 
         index = dr.arange(mi.UInt32, count * rays_per_sample)
         sample = index // dr.opaque(mi.UInt32, rays_per_sample)
         shift = (index - sample * dr.opaque(mi.UInt32, rays_per_sample)) * dr.opaque(mi.UInt32, rays.samples)
-        visible, cosine, _ = _visible(rays, disc, sample + dr.opaque(mi.UInt32, start), shift)
+        visible, cosine, _ = _visible(rays, disc, sample + dr.opaque(mi.UInt32, start), shift, coherent=True)
         lanes = dr.select(visible, cosine, 0.0)
         dr.eval(lanes)
         result[start : start + count] = np.array(dr.block_sum(lanes, rays_per_sample)) / rays_per_sample
