@@ -49,7 +49,7 @@ _ALBEDO = """
 import seasonscapes as ss
 from seasonscapes.terrain.surface import save_texture
 from seasonscapes.workflows.albedo_sources import scene_albedo
-save_texture({path!r}, scene_albedo(ss.load_place("alpine"), "{day}"))
+save_texture(scene_albedo(ss.load_place("alpine"), "{day}"), {path!r})
 """
 _WORKERS = 2
 
@@ -88,6 +88,8 @@ class Bench:
         return self._cost([sys.executable, "-c", code], environment, None)
 
     def _cost(self, command: list[str], environment: dict[str, str], awaited: Path | None) -> Cost:
+        # As for a user, whose interpreter keeps compiled modules.
+        environment.pop("PYTHONDONTWRITEBYTECODE", None)
         before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
         first = None
         with open(self.folder / "log.txt", "wb") as log:
