@@ -79,8 +79,8 @@ def scheduling(count: int, killed: int, seed: int) -> dict[str, float]:
     """Frames that arrive and their cost, first on workers that live and then on workers that are killed.
 
     Overhead is what a frame costs beside its writing: processor time of scheduler, client and workers together, less that
-    of writing the same frames without Dask and that of as long a wait: workers cost something while they stand by, which is
-    told apart, as their start is.
+    of writing the same frames without Dask. What workers cost while they stand by is in it, and told apart too, as is
+    their start.
     """
     chosen = set(np.random.default_rng(seed).choice(count, killed, replace=False).tolist())
     lost, walls, used, idle_share = 0, {}, {}, 0.0
@@ -116,7 +116,7 @@ def scheduling(count: int, killed: int, seed: int) -> dict[str, float]:
         "worker_start_processor_s": worker_start_s,
         "tiny_frame_ms": 1e3 * alone_s,
         "scheduler_ms_per_frame": 1e3 * used["scheduler"] / count,
-        "overhead_ms_per_frame": 1e3 * ((sum(used.values()) - idle_share * walls["calm"]) / count - alone_s),
+        "overhead_ms_per_frame": 1e3 * (sum(used.values()) / count - alone_s),
         "idle_share_of_core_per_worker": idle_share / WORKERS,
         "wall_ms_per_frame": 1e3 * walls["calm"] / count,
         "s_per_killed_worker": max(walls["killed"] - walls["calm"], 0.0) / killed,
