@@ -15,7 +15,7 @@ import numpy as np
 
 from seasonscapes.cameras.panorama import Panorama, view_directions
 from seasonscapes.cameras.pinhole import Camera
-from seasonscapes.rendering.backend import aligned
+from seasonscapes.rendering.backend import aligned, to_numpy
 from seasonscapes.rendering.mitsuba_scene import sky_radiance_towards
 from seasonscapes.sky.illumination import AerialPerspective, Illumination
 
@@ -147,9 +147,9 @@ def interpolate_air(grid: AirGrid, air: AerialPerspective) -> tuple[np.ndarray, 
     texture: Any = mi.Texture3f(  # pyright: ignore[reportCallIssue]
         mi.TensorXf(aligned(nodes)), wrap_mode=dr.WrapMode.Clamp
     )
-    values = np.array(texture.eval(grid.mi_coordinate)).T.copy()
+    values = to_numpy(texture.eval(grid.mi_coordinate))
     if len(grid.mixed):
-        samples = np.array(texture.eval(grid.mi_sample_coordinate)).T.reshape(*grid.sample_weight.shape, 6)
+        samples = to_numpy(texture.eval(grid.mi_sample_coordinate)).reshape(*grid.sample_weight.shape, 6)
         values[grid.mixed] = np.einsum("ks,ksc->kc", grid.sample_weight, samples)
     return values[:, :3], values[:, 3:]
 

@@ -267,8 +267,14 @@ def to_numpy(values: Any) -> np.ndarray:
     numpy.ndarray
         ``(N,)`` or ``(N, C)``, float32 for Mitsuba's floats.
     """
-    array = np.array(values)
-    return array.T.copy() if array.ndim == 2 else array
+    import drjit as dr
+
+    if dr.depth_v(values) < 2:
+        return np.array(values)
+    # Component by component: Dr.Jit would compile a kernel that joins them for each number of lanes.
+    components = list(values)
+    dr.eval(components)
+    return np.stack(np.broadcast_arrays(*map(np.array, components)), axis=-1)
 
 
 def aligned(values: np.ndarray, dtype: Any = np.float32) -> np.ndarray:

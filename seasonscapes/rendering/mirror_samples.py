@@ -8,7 +8,7 @@ from typing import Any, cast
 import numpy as np
 
 from seasonscapes.images import REC709_LUMINANCE
-from seasonscapes.rendering.backend import aligned, point3
+from seasonscapes.rendering.backend import aligned, point3, to_numpy
 from seasonscapes.rendering.coefficients import MirrorCoefficients
 from seasonscapes.rendering.hemisphere_rays import RayScene, SurfacePoints, concatenate_points, surface_points
 from seasonscapes.rendering.light_clusters import ReceiverCoefficients
@@ -127,7 +127,7 @@ def mirror_samples(
     repeated = concatenate_points([found, from_water])[number]
     repeated.albedo[~hit] = 0.0
     shares, directions = np.zeros(on_water.shape, np.float32), np.zeros((*on_water.shape, 3), np.float32)
-    shares[on_water], directions[on_water] = np.array(reflectance), np.array(direction).T
+    shares[on_water], directions[on_water] = np.array(reflectance), to_numpy(direction)
     return MirrorSamples(pixel, on_water, shares, directions, repeated, hit)
 
 
