@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -356,7 +356,7 @@ def _by_points(station: WebcamStation, points: Correspondences | None, *, radial
     """The resection of points; without points, the pose that is known already."""
     from seasonscapes.calibration.evidence import Priors
     from seasonscapes.calibration.pose_model import parameters_of_view
-    from seasonscapes.calibration.resection import Calibration, resect
+    from seasonscapes.calibration.resection import Calibration, ResectionOptions, resect
 
     if points is None:
         parameters = parameters_of_view(station.view, station.axes)
@@ -364,7 +364,29 @@ def _by_points(station: WebcamStation, points: Correspondences | None, *, radial
         return Calibration(station.view, 0.0, parameters, np.zeros((9, 9)), (), *none, noise_px=0.0)
     sigma_m = station.webcam.position_sigma_m
     priors = Priors(horizontal_m=sigma_m, vertical_m=sigma_m, k1=np.inf if radial else 0.0)
-    return resect(station.view, points, priors=priors, k1=station.webcam.radial_k1, axes=station.axes)
+    options = ResectionOptions(ground_m=_ground_of(station), ground_sigma_m=ground_sigma_m(station.rasters[0]))
+    return resect(station.view, points, priors=priors, k1=station.webcam.radial_k1, axes=station.axes, options=options)
+
+
+def ground_sigma_m(raster: Raster) -> float:
+    """Standard deviation of interpolated heights of mountains [m]: a tenth of a cell's side, at least 1 m."""
+    from seasonscapes.calibration.terrain_horizon import cell_size_m
+
+    return max(0.1 * cell_size_m(raster), 1.0)
+
+
+def _ground_of(station: WebcamStation) -> Callable[[float, float], float]:
+    """Height of the ground in the station's frame [m] at (east, north) [m]; NaN outside the rasters."""
+    from seasonscapes.calibration.terrain_horizon import terrain_height
+    from seasonscapes.frames import enu_from_geodetic, geodetic_from_enu
+
+    def ground_m(east_m: float, north_m: float) -> float:
+        plan = np.array([[east_m, north_m, station.view.position_m[2]]])
+        latitude, longitude, _ = geodetic_from_enu(station.frame, plan)
+        height = terrain_height(station.rasters, latitude, longitude)
+        return float(enu_from_geodetic(station.frame, latitude, longitude, height)[0, 2])
+
+    return ground_m
 
 
 def _without_lens(
