@@ -335,6 +335,8 @@ def photographs_of_ground(
 ) -> tuple[list[AlbedoPhotograph], list[SkyModel], float]:
     """The photographs that show ground, under the light of their skies: clouds as they show them, and pixels of water left out.
 
+    Where none shows sky, some have an assumed gain; see `albedo.assumed_exposure`.
+
     Parameters
     ----------
     place, transport
@@ -360,6 +362,7 @@ def photographs_of_ground(
     NoUsablePixels
         Where all that they show is water.
     """
+    from seasonscapes.albedo.assumed_exposure import with_assumed_exposure
     from seasonscapes.albedo.ground_pixels import without_water
     from seasonscapes.albedo.photographs import prepare_photographs
 
@@ -367,6 +370,7 @@ def photographs_of_ground(
     skies = photograph_skies(place, transport, seen, model)
     report = task_progress(progress, "footprints of the photographs")
     prepared = prepare_photographs(transport, seen, illuminations(place, seen, skies), progress=report)
+    prepared = with_assumed_exposure(prepared)
     if place.terrain.water is None:
         return prepared, skies, 0.0
     sky_of = {id(each): sky for each, sky in zip(seen, skies, strict=True)}

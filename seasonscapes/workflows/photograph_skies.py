@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from datetime import datetime
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -60,7 +61,23 @@ def photograph_skies(
                 "%s %s UTC: %.0f %% of its sky is grey: taken as clouds", webcam, f"{time:%Y-%m-%d %H:%M}", 100.0 * grey
             )
             models[webcam, time] = model.model_copy(update={"cloudiness": grey})
+    _warn_of_untold(skies)
     return [models[each.webcam, each.time] for each in photographs]
+
+
+def _warn_of_untold(skies: dict[tuple[str, datetime], list[float | None]]) -> None:
+    """Say which pictures tell nothing of their weather; a panorama tells it in any of its views."""
+    told: dict[tuple[str, datetime], bool] = {}
+    for (view, time), shares in skies.items():
+        webcam = view.split("/")[0]
+        told[webcam, time] = told.get((webcam, time), False) or any(share is not None for share in shares)
+    untold = [f"{webcam} {time:%Y-%m-%d %H:%M} UTC" for (webcam, time), known in told.items() if not known]
+    if untold:
+        log.warning(
+            "%s: the weather is not told, since no unclipped sky away from the sun is seen: taken as clear; where clouds hid the sun, "
+            "state --sky overcast or --cloudiness",
+            ", ".join(untold),
+        )
 
 
 def _grey_share(place: Place, transport: TexelTransport, photograph: Observation) -> float | None:
