@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 import seasonscapes as ss
+from seasonscapes.albedo import tone_curve
 from seasonscapes.albedo.assumed_exposure import with_assumed_exposure
 from seasonscapes.albedo.closed_form import solve_albedo
 from seasonscapes.albedo.photographs import EIGHT_BIT, prepare_photographs
 from seasonscapes.cameras.observation import Observation
 from seasonscapes.images import linear_from_srgb, srgb_from_linear
-from seasonscapes.workflows.albedo_recovery import photographs_of_ground, texel_transport
+from seasonscapes.workflows.albedo_recovery import RecoveryOptions, _prepared, photographs_of_ground, texel_transport
 from seasonscapes.workflows.albedo_sources import scene_albedo
 from seasonscapes.workflows.illumination import illumination_for_camera, sky_model
 from seasonscapes.workflows.place import utc_at
@@ -69,3 +70,13 @@ def test_one_photograph_of_a_day_is_assumed_and_the_sky_comes_first(taken):
     assert gains[1] == pytest.approx(np.pi / lights[1].global_horizontal_lx)
     seen = prepare_photographs(transport, [without[0], with_sky[1]], lights)
     assert [each.gain for each in with_assumed_exposure(seen)] == [None, None]
+
+
+def test_the_tone_curve_of_one_such_photograph_is_not_guessed(taken, monkeypatch):
+    place, transport, _, without = taken
+    monkeypatch.setattr(tone_curve, "fit_tone_curve", lambda *given, **named: tone_curve.ToneCurveFit(0.4, {}))
+    options = RecoveryOptions(fit_curve=True)
+    one = _prepared(place, transport, without[:1], sky_model("clear"), options, None)[2]
+    two = _prepared(place, transport, without, sky_model("clear"), options, None)[2]
+    assert "curve_strength" not in one
+    assert two["curve_strength"] == 0.4

@@ -402,7 +402,11 @@ def _prepared(
             "water: %.3g %% of the pixels on terrain show it and tell no albedo; its texels are completed",
             100.0 * share,
         )
-    if options.fit_curve:
+    # Contrast of one picture whose exposure is assumed is its land's as well as its camera's.
+    alone = len({each.observation.time for each in prepared}) == 1 and prepared[0].gain is not None
+    if options.fit_curve and alone:
+        log.info("tone curve: taken as sRGB's; one photograph without sky does not tell another")
+    elif options.fit_curve:
         curve = fit_tone_curve(transport, prepared, progress=task_progress(progress, "tone curve"))
         prepared = with_tone_curve(prepared, curve.strength)
         facts["curve_strength"] = round(curve.strength, 3)
