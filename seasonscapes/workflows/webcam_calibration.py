@@ -155,10 +155,12 @@ def webcam_station(
     >>> station.view.width_px
     960
     """
+    from seasonscapes.calibration.terrain_horizon import terrain_height
     from seasonscapes.cameras.webcam import find_webcam, webcam_model
-    from seasonscapes.terrain.crs import map_position
-    from seasonscapes.terrain.raster import fill_nodata, sample_raster
+    from seasonscapes.terrain.raster import fill_nodata
+    from seasonscapes.workflows.nested_heights import finer_heights
     from seasonscapes.workflows.terrain_building import read_scene_elevation
+    from seasonscapes.workspace import default_workspace
 
     read = scene_with_webcams(scene, allow_outside=allow_outside)
     if webcam is None and len(read.webcams) > 1:
@@ -169,8 +171,9 @@ def webcam_station(
         raise InputError(scene, "names no elevation raster", cure="give one with --elevation FILE")
     files = [elevation, *([] if context is None else [context])]
     rasters = [fill_nodata(read_scene_elevation(read, file), where=str(file or own))[0] for file in files]
-    x, y = map_position(rasters[0], found.latitude_deg, found.longitude_deg)
-    ground = float(sample_raster(rasters[0], x, y)[..., 0])
+    if elevation is None and read.elevation is not None and read.elevation.finer:
+        rasters = [*reversed(finer_heights(read, rasters[0], None, default_workspace(), {})), *rasters]
+    ground = float(terrain_height(rasters, [found.latitude_deg], [found.longitude_deg])[0])
     if not np.isfinite(ground):
         raise InputError("--webcam", f"'{found.id}' stands outside the elevation raster")
     frame = LocalFrame(found.latitude_deg, found.longitude_deg, 0.0, read.refraction_k)
@@ -364,15 +367,17 @@ def _by_points(station: WebcamStation, points: Correspondences | None, *, radial
         return Calibration(station.view, 0.0, parameters, np.zeros((9, 9)), (), *none, noise_px=0.0)
     sigma_m = station.webcam.position_sigma_m
     priors = Priors(horizontal_m=sigma_m, vertical_m=sigma_m, k1=np.inf if radial else 0.0)
-    options = ResectionOptions(ground_m=_ground_of(station), ground_sigma_m=ground_sigma_m(station.rasters[0]))
+    options = ResectionOptions(ground_m=_ground_of(station), ground_sigma_m=_ground_sigma_m(station))
     return resect(station.view, points, priors=priors, k1=station.webcam.radial_k1, axes=station.axes, options=options)
 
 
-def ground_sigma_m(raster: Raster) -> float:
+def _ground_sigma_m(station: WebcamStation) -> float:
     """Standard deviation of interpolated heights of mountains [m]: a tenth of a cell's side, at least 1 m."""
-    from seasonscapes.calibration.terrain_horizon import cell_size_m
+    from seasonscapes.calibration.terrain_horizon import cell_size_m, terrain_height
 
-    return max(0.1 * cell_size_m(raster), 1.0)
+    at = [station.webcam.latitude_deg], [station.webcam.longitude_deg]
+    about = [each for each in station.rasters if np.isfinite(terrain_height([each], *at)[0])]
+    return max(0.1 * cell_size_m(about[0] if about else station.rasters[0]), 1.0)
 
 
 def _ground_of(station: WebcamStation) -> Callable[[float, float], float]:
