@@ -21,7 +21,7 @@ from seasonscapes.sky.models import SkyModel, with_overrides
 from seasonscapes.terrain.surface import Texture
 from seasonscapes.workflows.albedo_sources import orthoimage, scene_albedo
 from seasonscapes.workflows.illumination import sky_model
-from seasonscapes.workflows.photograph_skies import photograph_skies
+from seasonscapes.workflows.photograph_skies import photograph_skies, without_land_beyond
 from seasonscapes.workflows.place import MeshOptions, Place
 from seasonscapes.workflows.recovery_methods import (
     METHODS,
@@ -366,7 +366,7 @@ def photographs_of_ground(
     from seasonscapes.albedo.ground_pixels import without_water
     from seasonscapes.albedo.photographs import prepare_photographs
 
-    seen = with_terrain(transport, photographs)
+    seen = without_land_beyond(place, with_terrain(transport, photographs))
     skies = photograph_skies(place, transport, seen, model)
     report = task_progress(progress, "footprints of the photographs")
     prepared = prepare_photographs(transport, seen, illuminations(place, seen, skies), progress=report)
