@@ -88,6 +88,37 @@ def observed_sigma(fit: AlbedoFit) -> np.ndarray:
     return np.where(fit.pixel_count >= _FEWEST_PIXELS, texel_sigma(fit), np.inf).astype(np.float32)
 
 
+def rim_of_seen(seen: np.ndarray) -> np.ndarray:
+    """Outermost texels of what photographs see: seen in part, they take up what their last pixels lack.
+
+    Parameters
+    ----------
+    seen
+        ``(R, S)`` bool.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(R, S)`` bool: seen texels beside unseen ones, where others farther inside stand next to them to complete them from. Gaps one texel wide, as pixels
+        leave them on land seen flatly, have no rim.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> seen = np.zeros((7, 9), bool)
+    >>> seen[1:6, 1:6], seen[3, 3], seen[3, 8] = True, False, True
+    >>> rim_of_seen(seen).astype(int).sum(axis=0).tolist()
+    [0, 5, 2, 2, 2, 5, 0, 0, 0]
+    """
+    from scipy import ndimage
+
+    around = np.ones((3, 3), bool)
+    # Beyond the atlas nothing is unseen: padding keeps the closing from eating its border.
+    closed = ndimage.binary_closing(np.pad(seen, 2, mode="edge"), around)[2:-2, 2:-2] | seen
+    inner = ndimage.binary_erosion(closed, around, border_value=1)
+    return seen & ~inner & ndimage.binary_dilation(inner, around)
+
+
 def times_sunlit(photographs: Sequence[AlbedoPhotograph]) -> np.ndarray:
     """Count the photographs in which each texel is visible in direct sunlight.
 
@@ -141,6 +172,7 @@ def albedo_estimate(
     measured = np.zeros(transport.shape[0] * transport.shape[1], bool)
     measured[transport.texel] = True
     measured = measured.reshape(transport.shape) & (sigma < _POOR * fit.albedo[..., 1] + 0.02)
+    measured &= ~rim_of_seen(fit.pixel_count >= _FEWEST_PIXELS)
     if not measured.any():
         raise NotEnoughEvidence("albedo_estimate: no texel is measured: too few pixels or too large a standard error")
     albedo = np.where(measured[..., None], fit.albedo, np.median(fit.albedo[measured], axis=0)).astype(np.float32)
