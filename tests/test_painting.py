@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import pairwise
@@ -48,6 +49,7 @@ from seasonscapes.texturing.radiometric_fit import (
 from seasonscapes.texturing.silhouette import depth_jumps, pose_sigma_px, silhouette_guard
 from seasonscapes.texturing.texel_weights import sharpened, texel_weight
 from seasonscapes.texturing.visibility import project_texels, visible_by_depth, visible_by_faces, visible_by_ray
+from seasonscapes.workflows.painting import painting_record
 
 NOON = datetime(2024, 9, 1, 12, tzinfo=UTC)
 SKY = np.array([3000.0, 4000.0, 6000.0])
@@ -290,6 +292,13 @@ def test_without_sky_the_airlight_has_the_gain_of_the_surface(land, overlapping)
     found = fit_radiometry(ready, land.ray_scene, reference=reference, fit_contrast=False)
     np.testing.assert_allclose(found.log_gain, [np.log(gains)], atol=0.06)
     assert found.haze == pytest.approx(1.0, abs=0.15)
+
+
+def test_the_record_of_a_single_camera_is_json(land, cameras):
+    record = json.loads(json.dumps(painting_record(land.paint([land.item(cameras[0], "alone")])), allow_nan=False))
+    assert record["overlaps"] == 0
+    assert record["scatter_before"] is None
+    assert 0.0 < record["painted_share"] < 1.0
 
 
 def test_air_is_subtracted_exactly_when_all_is_known():
