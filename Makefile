@@ -4,7 +4,7 @@
 # make lint   style, types and layers: ruff, pyright, import-linter
 # make docs   the site in docs/_build/html; a warning is an error. docs-notebooks executes its notebooks first
 # make sky-tables the atmosphere tables of the bundled sky models, after a change of their physics
-# make massif the heights of the bundled scene, after a change of their generator
+# make massif the heights of the bundled scenes, after a change of their generator
 # make tables the tables of README and site from benchmarks/results; `make results` measures those anew, in hours
 # Each makes the virtual environment .venv if it is missing, finds or installs libLLVM where it is needed, and can be
 # repeated at will. PYTHON=python3.12 chooses the interpreter, CONSTRAINTS=constraints.txt installs the tested versions.

@@ -36,6 +36,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Before numpy is imported. No command has matrices that pay for BLAS's own threads: they wait busily for one
         # another, which made half of the processor time of short commands.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+        # No model here has plugins of Pydantic: it would read the metadata of every installed package in search of some.
+        os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     # After a process's command only the interpreter's own end is left: Ctrl-C there ends it without a traceback.
     with interruptible(afterwards=signal.SIG_DFL if arguments is None else None):
         try:

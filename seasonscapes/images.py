@@ -18,7 +18,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -465,6 +464,8 @@ def read_image_srgb(path: str | os.PathLike) -> np.ndarray:
                 log.warning("%s: converted to sRGB with 8 of its 16 bits", path)
             return np.ascontiguousarray(_to_srgb(path, turned, foreign))
     # Pillow keeps 8 bits of each channel; OpenCV keeps 16, and turns by the orientation as well.
+    import cv2  # slow to load, and few commands read pictures
+
     levels = cv2.imread(os.fspath(path), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     if levels is None or not np.issubdtype(levels.dtype, np.integer):
         raise UnreadableImage(f"{path}: not a readable picture of 16 bits; save it without an orientation tag")

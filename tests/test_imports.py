@@ -37,7 +37,7 @@ PARSING = {
 _LAND = {"rasterio", "pyproj", "cv2", "scipy"}
 # Verb, flags besides those of `fault_verbs.BASE`, and the heavy packages of a whole call.
 WORK = [
-    ("sky", ["--at", "46.5,8,1500", "--time", "2024-07-20T12:00Z"], {"cv2", "skyfield"}),
+    ("sky", ["--at", "46.5,8,1500", "--time", "2024-07-20T12:00Z"], {"skyfield"}),
     ("render", [*BASE["render"], "--sky", "hosek"], {*_LAND, "PIL", "skyfield", "mitsuba"}),
     ("irradiance", [*BASE["irradiance"], "--sky", "hosek"], {*_LAND, "skyfield", "mitsuba"}),
     ("webcams", BASE["webcams"], {*_LAND, "PIL"}),

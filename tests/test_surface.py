@@ -13,7 +13,9 @@ from seasonscapes.rendering.hemisphere_rays import ray_scene
 from seasonscapes.rendering.irradiance import surface_at
 from seasonscapes.rendering.mitsuba_scene import RenderScene, mi_mesh
 from seasonscapes.terrain.mesh import sample_positions
-from seasonscapes.terrain.surface import mesh_up_m
+from seasonscapes.terrain.raster import centre_frame
+from seasonscapes.terrain.surface import Raster, mesh_up_m
+from seasonscapes.terrain.surface_grid import grid_positions, surface_grid
 from seasonscapes.terrain.view_refinement import _unique_edges, refined_for_view
 from seasonscapes.workflows.views import view_with_terrain
 
@@ -115,14 +117,30 @@ def test_the_surface_passes_through_the_samples(tmp_path, crs):
 
 
 @pytest.mark.parametrize(
+    ("crs", "corner", "step", "shape"),
+    [
+        ("EPSG:32632", (4e5, 5.18e6), 30.0, (2000, 1667)),
+        ("EPSG:4326", (7.5, 47.0), 1 / 3600, (900, 1100)),
+        ("EPSG:3413", (-9e5, 7e5), 2000.0, (700, 900)),
+    ],
+    ids=["projected", "geographic", "polar and wide"],
+)
+def test_positions_of_samples_are_those_of_the_transformation_within_a_millimetre(crs, corner, step, shape):
+    """They are interpolated for any valley, and transformed sample by sample where a raster is too wide for that."""
+    rng = np.random.default_rng(4)
+    raster = Raster(np.zeros((*shape, 1), np.float32), Affine(step, 0, corner[0], 0, -step, corner[1]), crs)
+    frame = replace(centre_frame(raster), refraction_k=0.13)
+    rows, columns = (np.sort(rng.integers(0, extent, 17)) for extent in shape)
+    heights = rng.uniform(-400.0, 8800.0, (17, 17))
+    exact = sample_positions(raster, frame, *np.meshgrid(rows, columns, indexing="ij"), heights)
+    np.testing.assert_allclose(grid_positions(raster, frame)(rows, columns, heights), exact, atol=1e-3)
+
+
+@pytest.mark.parametrize(
     ("crs", "corner", "step"),
     [("EPSG:4326", (5.0, 50.0), 5.0 / 300), ("EPSG:4326", (15.0, 80.0), 2.0 / 300), ("EPSG:3857", (9e5, 6e6), 200.0)],
 )
 def test_the_surface_of_wide_and_polar_rasters(crs, corner, step):
-    from seasonscapes.terrain.raster import centre_frame
-    from seasonscapes.terrain.surface import Raster
-    from seasonscapes.terrain.surface_grid import surface_grid
-
     heights = np.random.default_rng(2).uniform(0.0, 4000.0, (300, 300, 1)).astype(np.float32)
     raster = Raster(heights, Affine(step, 0, corner[0], 0, -step, corner[1]), crs)
     frame = centre_frame(raster)

@@ -40,8 +40,7 @@ def sky_command(
         Print one machine-readable record.
     """
     from seasonscapes.civil_time import resolve_time
-    from seasonscapes.images import write_exr, write_png
-    from seasonscapes.sky.report import dome_picture, record_lines, sky_record
+    from seasonscapes.sky.report import record_lines, sky_record
     from seasonscapes.workflows.illumination import illumination_at, sun_moon_position
 
     options = place or PlaceOptions()
@@ -58,6 +57,9 @@ def sky_command(
     record = sky_record(light, resolved.utc, position.sun, position.moon, latitude, longitude, zone=resolved.zone)
     record["place"] = {"latitude_deg": latitude, "longitude_deg": longitude, "height_m": height_m}
     if output is not None:
+        from seasonscapes.images import write_exr, write_png
+        from seasonscapes.sky.report import dome_picture
+
         if output.suffix.lower() == ".png":
             write_png(output, dome_picture(light))
         else:

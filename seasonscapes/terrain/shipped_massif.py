@@ -1,6 +1,6 @@
-"""The massif of the bundled scene, which is distributed with the package, so that nobody waits for its erosion.
+"""The massifs of the bundled scenes, which are distributed with the package, so that nobody waits for their erosion.
 
-``make massif`` writes it; a test compares it with one that is generated anew. Any other massif is generated.
+``make massif`` writes them; a test compares them with those that are generated anew. Any other massif is generated.
 """
 
 from __future__ import annotations
@@ -16,7 +16,11 @@ from seasonscapes.terrain.synthetic_massif import SyntheticMassif, massif_of
 
 # Increment whenever the generator makes another massif of the same parameters.
 _REVISION = 1
-_PARAMETERS = {"seed": 1912, "size_m": 12000.0, "spacing_m": 15.0}
+_SHIPPED = {
+    "alpine": {"seed": 1912, "size_m": 12000.0, "spacing_m": 15.0},
+    "alpine_lake": {"seed": 1912, "size_m": 12000.0, "spacing_m": 30.0},
+    "alpine_small": {"seed": 1912, "size_m": 12000.0, "spacing_m": 60.0},
+}
 
 
 def shipped_massif(*, seed: int, size_m: float, spacing_m: float) -> SyntheticMassif | None:
@@ -30,7 +34,7 @@ def shipped_massif(*, seed: int, size_m: float, spacing_m: float) -> SyntheticMa
     Returns
     -------
     SyntheticMassif or None
-        ``None`` for all massifs but the bundled scene's.
+        ``None`` for all massifs but those of the bundled scenes.
 
     Examples
     --------
@@ -39,27 +43,30 @@ def shipped_massif(*, seed: int, size_m: float, spacing_m: float) -> SyntheticMa
     >>> shipped_massif(seed=7, size_m=12000.0, spacing_m=15.0) is None
     True
     """
-    if {"seed": seed, "size_m": size_m, "spacing_m": spacing_m} != _PARAMETERS or not _path().is_file():
+    wanted = {"seed": seed, "size_m": size_m, "spacing_m": spacing_m}
+    name = next((name for name, parameters in _SHIPPED.items() if parameters == wanted), None)
+    if name is None or not _path(name).is_file():
         return None
-    with np.load(_path(), allow_pickle=False) as file:
+    with np.load(_path(name), allow_pickle=False) as file:
         if int(file["revision"]) != _REVISION:
             return None
         z, debris, shore_m = (_unpacked(file[name]) for name in ("elevation", "debris", "shore_m"))
         return massif_of(z, file["cover"], debris, shore_m, seed=seed, spacing_m=spacing_m)
 
 
-def write_shipped_massif() -> Path:
-    """Generate the bundled scene's massif and write it beside the scenes."""
+def write_shipped_massifs() -> list[Path]:
+    """Generate the bundled scenes' massifs and write them beside the scenes."""
     # The generator loads libraries that a shipped massif does not need.
     from seasonscapes.terrain.synthetic import alpine_massif
 
-    massif = alpine_massif(**_PARAMETERS)
-    maps = {"elevation": massif.elevation.values[..., 0], "debris": massif.debris, "shore_m": massif.shore_m}
-    _path().parent.mkdir(exist_ok=True)
-    with atomic_path(_path()) as temporary, open(temporary, "wb") as file:
-        packed: dict[str, Any] = {name: _packed(values) for name, values in maps.items()}
-        np.savez_compressed(file, revision=_REVISION, cover=massif.cover, **packed)
-    return _path()
+    for name, parameters in _SHIPPED.items():
+        massif = alpine_massif(**parameters)
+        maps = {"elevation": massif.elevation.values[..., 0], "debris": massif.debris, "shore_m": massif.shore_m}
+        _path(name).parent.mkdir(exist_ok=True)
+        with atomic_path(_path(name)) as temporary, open(temporary, "wb") as file:
+            packed: dict[str, Any] = {each: _packed(values) for each, values in maps.items()}
+            np.savez_compressed(file, revision=_REVISION, cover=massif.cover, **packed)
+    return [_path(name) for name in _SHIPPED]
 
 
 def _packed(values: np.ndarray) -> np.ndarray:
@@ -74,9 +81,9 @@ def _unpacked(planes: np.ndarray) -> np.ndarray:
     return np.cumsum(steps, axis=1, dtype=np.uint32).view(np.float32)
 
 
-def _path() -> Path:
-    return bundled_folder("scenes") / "massif" / "alpine.npz"
+def _path(name: str) -> Path:
+    return bundled_folder("scenes") / "massif" / f"{name}.npz"
 
 
 if __name__ == "__main__":
-    print(write_shipped_massif())
+    print(*write_shipped_massifs(), sep="\n")

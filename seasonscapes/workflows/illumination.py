@@ -18,7 +18,7 @@ import numpy as np
 
 from seasonscapes.civil_time import resolve_time
 from seasonscapes.errors import InputError
-from seasonscapes.frames import LocalFrame
+from seasonscapes.frames import LocalFrame, geodetic_from_enu
 from seasonscapes.progress import TaskProgress
 from seasonscapes.sky.atmosphere import Atmosphere
 from seasonscapes.sky.clear_sky import AtmosphereTables, atmosphere_tables, load_tables, save_tables, true_elevation_deg
@@ -29,13 +29,12 @@ from seasonscapes.sky.illumination import Illumination
 from seasonscapes.sky.models import AtmosphereModel, SkyModel, atmosphere_from_model, read_sky_model, with_overrides
 from seasonscapes.sky.observer_radiance import diffuse_by_elevation, observer_view
 from seasonscapes.sky.shipped_tables import shipped_tables
-from seasonscapes.workflows.place import Place, utc_at
-from seasonscapes.workflows.views import camera_geodetic
 from seasonscapes.workspace import Workspace, build_once
 
 if TYPE_CHECKING:
     from seasonscapes.cameras.panorama import Panorama
     from seasonscapes.cameras.pinhole import Camera
+    from seasonscapes.workflows.place import Place
 
 _TABLES_CODE = ("sky.clear_sky",)
 _DIFFUSE_CODE = ("sky.observer_radiance", "sky.elevation_table")
@@ -172,6 +171,9 @@ def illumination(
     >>> light.sky_radiance.shape[2], bool(light.sun.normal_illuminance_lx[1] > 80_000)
     (3, True)
     """
+    # Here, since the sky of a position alone needs no place.
+    from seasonscapes.workflows.place import utc_at
+
     model, utc = sky_model(sky), utc_at(place, time)
     if camera is None:
         return illumination_on_terrain(place, model, utc)[0]
@@ -319,7 +321,7 @@ def illumination_for_camera(
     at_camera = illumination_at(
         model,
         position,
-        camera_geodetic(place, camera)[2],
+        _height_m(place, camera),
         workspace=place.workspace,
         map_height=map_height,
         by_elevation=by_elevation,
@@ -340,6 +342,10 @@ def illumination_on_terrain(place: Place, model: SkyModel, time: datetime) -> tu
         model, position, place.median_height_m, workspace=place.workspace, with_aerial_perspective=False
     )
     return replace(light, frame=place.frame), position
+
+
+def _height_m(place: Place, camera: Camera | Panorama) -> float:
+    return float(geodetic_from_enu(place.frame, camera.position_m)[2])
 
 
 def position_at(place: Place, time: datetime) -> SunMoonPosition:
@@ -386,7 +392,7 @@ def tabulate_illumination(
     for position in (position_at(place, time) for time in times):
         moon = significant_moon(position.sun, position.moon)
         apparent_deg += [body.elevation_deg for body in (position.sun, moon) if body is not None]
-    camera_m, wanted = camera_geodetic(place, camera)[2], []
+    camera_m, wanted = _height_m(place, camera), []
     for height_m, near in ((place.median_height_m, False), (camera_m, False), (camera_m, True)):
         true_rad = np.radians(true_elevation_deg(tables.atmosphere, np.array(apparent_deg), height_m))
         table = tables.diffuse_of(observer_view(tables, height_m).height_m, near)
