@@ -115,7 +115,7 @@ def rim_of_seen(seen: np.ndarray) -> np.ndarray:
     around = np.ones((3, 3), bool)
     # Beyond the atlas nothing is unseen: padding keeps the closing from eating its border.
     closed = ndimage.binary_closing(np.pad(seen, 2, mode="edge"), around)[2:-2, 2:-2] | seen
-    inner = ndimage.binary_erosion(closed, around, border_value=1)
+    inner = np.asarray(ndimage.binary_erosion(closed, around, border_value=1))
     return seen & ~inner & ndimage.binary_dilation(inner, around)
 
 

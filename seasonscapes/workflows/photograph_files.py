@@ -20,6 +20,7 @@ from seasonscapes.workflows.place import HEIGHT_TOLERANCE_M, LEAST_ABOVE_GROUND_
 if TYPE_CHECKING:
     from seasonscapes.calibration.calibration_file import CalibratedWebcam
     from seasonscapes.cameras.observation import ManifestRow, Observation
+    from seasonscapes.cameras.panorama import Panorama
     from seasonscapes.cameras.pinhole import Camera
     from seasonscapes.frames import LocalFrame
     from seasonscapes.terrain.surface import Terrain
@@ -267,7 +268,7 @@ def observations(
     return opened
 
 
-def _depth_m(terrain: Terrain, camera: Camera) -> float:
+def _depth_m(terrain: Terrain, camera: Camera | Panorama) -> float:
     """How far below the mesh a camera stands [m]; negative above it, and minus infinity beside it."""
     from seasonscapes.terrain.surface import mesh_up_m
 
