@@ -83,9 +83,11 @@ def observed_sigma(fit: AlbedoFit) -> np.ndarray:
     Returns
     -------
     numpy.ndarray
-        ``(R, S)`` float32 (green); infinite for texels that cover less than half a pixel.
+        ``(R, S)`` float32 (green); infinite for texels that cover less than half a pixel, and for the outermost ones; see
+        `rim_of_seen`.
     """
-    return np.where(fit.pixel_count >= _FEWEST_PIXELS, texel_sigma(fit), np.inf).astype(np.float32)
+    seen = (fit.pixel_count >= _FEWEST_PIXELS) & (fit.information > 0.0)
+    return np.where(seen & ~rim_of_seen(seen), texel_sigma(fit), np.inf).astype(np.float32)
 
 
 def rim_of_seen(seen: np.ndarray) -> np.ndarray:
@@ -114,9 +116,9 @@ def rim_of_seen(seen: np.ndarray) -> np.ndarray:
 
     around = np.ones((3, 3), bool)
     # Beyond the atlas nothing is unseen: padding keeps the closing from eating its border.
-    closed = ndimage.binary_closing(np.pad(seen, 2, mode="edge"), around)[2:-2, 2:-2] | seen
+    closed = np.asarray(ndimage.binary_closing(np.pad(seen, 2, mode="edge"), around))[2:-2, 2:-2] | seen
     inner = np.asarray(ndimage.binary_erosion(closed, around, border_value=1))
-    return seen & ~inner & ndimage.binary_dilation(inner, around)
+    return np.logical_and.reduce([seen, np.logical_not(inner), ndimage.binary_dilation(inner, around)])
 
 
 def times_sunlit(photographs: Sequence[AlbedoPhotograph]) -> np.ndarray:
@@ -172,7 +174,6 @@ def albedo_estimate(
     measured = np.zeros(transport.shape[0] * transport.shape[1], bool)
     measured[transport.texel] = True
     measured = measured.reshape(transport.shape) & (sigma < _POOR * fit.albedo[..., 1] + 0.02)
-    measured &= ~rim_of_seen(fit.pixel_count >= _FEWEST_PIXELS)
     if not measured.any():
         raise NotEnoughEvidence("albedo_estimate: no texel is measured: too few pixels or too large a standard error")
     albedo = np.where(measured[..., None], fit.albedo, np.median(fit.albedo[measured], axis=0)).astype(np.float32)
