@@ -83,42 +83,9 @@ def observed_sigma(fit: AlbedoFit) -> np.ndarray:
     Returns
     -------
     numpy.ndarray
-        ``(R, S)`` float32 (green); infinite for texels that cover less than half a pixel, and for the outermost ones; see
-        `rim_of_seen`.
+        ``(R, S)`` float32 (green); infinite for texels that cover less than half a pixel.
     """
-    seen = (fit.pixel_count >= _FEWEST_PIXELS) & (fit.information > 0.0)
-    return np.where(seen & ~rim_of_seen(seen), texel_sigma(fit), np.inf).astype(np.float32)
-
-
-def rim_of_seen(seen: np.ndarray) -> np.ndarray:
-    """Outermost texels of what photographs see: seen in part, they take up what their last pixels lack.
-
-    Parameters
-    ----------
-    seen
-        ``(R, S)`` bool.
-
-    Returns
-    -------
-    numpy.ndarray
-        ``(R, S)`` bool: seen texels beside unseen ones, where others farther inside stand next to them to complete them from. Gaps one texel wide, as pixels
-        leave them on land seen flatly, have no rim.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> seen = np.zeros((7, 9), bool)
-    >>> seen[1:6, 1:6], seen[3, 3], seen[3, 8] = True, False, True
-    >>> rim_of_seen(seen).astype(int).sum(axis=0).tolist()
-    [0, 5, 2, 2, 2, 5, 0, 0, 0]
-    """
-    from scipy import ndimage
-
-    around = np.ones((3, 3), bool)
-    # Beyond the atlas nothing is unseen: padding keeps the closing from eating its border.
-    closed = np.asarray(ndimage.binary_closing(np.pad(seen, 2, mode="edge"), around))[2:-2, 2:-2] | seen
-    inner = np.asarray(ndimage.binary_erosion(closed, around, border_value=1))
-    return np.logical_and.reduce([seen, np.logical_not(inner), ndimage.binary_dilation(inner, around)])
+    return np.where(fit.pixel_count >= _FEWEST_PIXELS, texel_sigma(fit), np.inf).astype(np.float32)
 
 
 def times_sunlit(photographs: Sequence[AlbedoPhotograph]) -> np.ndarray:
