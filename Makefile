@@ -43,8 +43,9 @@ demo: llvm $(BASE)
 gallery: llvm $(BASE)
 	$(BIN)/seasonscapes demo --gallery -o out/demo
 
+# A file's tests share what its fixtures make: each file is of one worker, in the order of `tests/conftest.py`.
 test: llvm $(DEV)
-	$(BIN)/python -m pytest -q -n 2 --durations=25
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder --durations=25
 
 # The page of a place in the site needs the renderer.
 docs: llvm $(DEV)

@@ -365,11 +365,11 @@ def save_figures(bench: Bench, whole: dict, folder: Path) -> None:
 
 
 def save_day(bench: Bench, whole: dict, folder: Path) -> None:
-    """The judged day every 20 minutes: truth, ours and satellite only, as MP4 and animated WebP."""
+    """The judged day (every 20 minutes, but at the tiny size): truth, ours and satellite only, as MP4 and animated WebP."""
     from PIL import Image
 
     judge, camera = bench.judge, bench.world.judged[0]
-    times = hours(DATE, *np.arange(4.5, 18.6, 1.0 / 3.0).tolist())
+    times = hours(DATE, *np.arange(4.5, 18.6, bench.world.size.day_step_h).tolist())
     lights = [row[0] for row in lights_for(times, [camera], bench.world.sky, default_workspace())]
     views = {"truth": judge.clothed(bench.world.albedo, [0])[0], "ours": judge.clothed(whole["albedo"], [0])[0]}
     sheets = []

@@ -63,6 +63,10 @@ class Size:
         How many judged views ablations are scored on.
     steps
         Of the distillation: on the surface, and with pictures.
+    overviews
+        Cameras around the land whose pictures Gaussians learn from too.
+    day_step_h
+        Between the pictures of the day that is filmed.
     """
 
     extent_m: tuple[float, float]
@@ -78,6 +82,8 @@ class Size:
     disc_m: float
     ablated: int = 8
     steps: tuple[int, int] = (600, 96)
+    overviews: int = 6
+    day_step_h: float = 1.0 / 3.0
 
 
 _WEB = SamplingOptions(shadow_samples=4, albedo_samples=16, rays=64, clusters=1024, clusters_per_receiver=32, rank=24)
@@ -85,7 +91,20 @@ _FINE = SamplingOptions(shadow_samples=4, albedo_samples=16, rays=128, clusters=
 _QUICK_HOURS = (7.0, 8.5, 10.0, 12.0, 14.0, 15.5)
 SIZES = {
     "tiny": Size(
-        (3000.0, 3000.0), 60.0, 30.0, 2, 75.0, 96, 1, (144, 96), (8.5, 10.0, 14.0), _WEB, 60.0, steps=(150, 16)
+        (3000.0, 3000.0),
+        60.0,
+        30.0,
+        2,
+        75.0,
+        96,
+        1,
+        (144, 96),
+        (8.5, 10.0, 14.0),
+        _WEB,
+        60.0,
+        steps=(150, 16),
+        overviews=1,
+        day_step_h=1.0,
     ),
     "quick": Size((5400.0, 5400.0), 30.0, 18.0, 2, 75.0, 200, 1, (300, 200), _QUICK_HOURS, _WEB, 36.0),
     "small": Size(

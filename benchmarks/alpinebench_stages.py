@@ -371,7 +371,7 @@ class Splats:
         self.lights = [row[0] for row in lights_for(times, world.painting[:1], world.sky, default_workspace())]
         self.states = [light_state(self.transport, light, DAY_OF_YEAR) for light in self.lights]
         seen = [camera for panorama in world.painting for camera in split_panorama(panorama)]
-        self.cameras = seen + overview_cameras(world.terrain, 6, size_px=world.size.judged_px[1])
+        self.cameras = seen + overview_cameras(world.terrain, world.size.overviews, size_px=world.size.judged_px[1])
 
     def views(self, albedo: np.ndarray, *, refined: bool = False) -> Callable[[int, datetime], np.ndarray]:
         """Views of the Gaussians that an albedo was distilled into."""

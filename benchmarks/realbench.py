@@ -43,7 +43,6 @@ from record import write_record
 
 from seasonscapes.albedo.cloud_cover import closed_clouds, sky_above
 from seasonscapes.albedo.fixed_camera import (
-    SUN_SHONE,
     FitOptions,
     FixedCamera,
     conditions_of,
@@ -55,6 +54,7 @@ from seasonscapes.albedo.fixed_camera import (
 from seasonscapes.albedo.picture_completion import SeenPart, completed_picture, ground_layers
 from seasonscapes.albedo.picture_conditions import Conditions, Ground, ViewLight, picture_under
 from seasonscapes.albedo.residual_kriging import kriged
+from seasonscapes.albedo.sunlit_patches import sun_shone
 from seasonscapes.evaluation.metrics import score
 from seasonscapes.images import linear_from_srgb, srgb_from_linear, write_png8
 from seasonscapes.rendering.backend import use_backend
@@ -207,7 +207,17 @@ def predictions(stack: Stack, k: int, options: FitOptions) -> tuple[dict[str, np
         "overcast": float(np.mean([each.overcast for each in found])),
         "visibility_km": float(np.exp(np.mean([np.log(each.visibility_km) for each in found]))),
         # Weather is no prediction: it is found in the whole picture, as `camera_hours` does.
-        "direct_share": direct_share(camera.ground, light, whole),
+        "direct_share": (direct := direct_share(camera.ground, light, whole)),
+        "sun_visible_found": sun_shone(
+            camera,
+            direct,
+            stack.values[k],
+            stack.usable[k],
+            light,
+            stack.view.pixel,
+            (stack.case.camera.width_px, stack.case.camera.height_px),
+            closed=bool(stack.closed[k]),
+        ),
     }
     return results, facts
 
@@ -247,14 +257,13 @@ def case_row(stack: Stack, options: FitOptions, sheets: Path | None, k: int) -> 
     found, facts = predictions(stack, k, options)
     scores = {name: scored(stack, k, values) for name, values in found.items()}
     best = max(RIVALS, key=lambda name: scores[name]["psnr_db"])
-    shone = bool(facts["direct_share"] > SUN_SHONE and not stack.closed[k])
     row = {"camera": stack.case.name, "picture": picture.name, "season": picture.season, "best_rival": best, **facts}
-    row |= {"sun_visible_seen": picture.sun_visible, "sun_visible_found": shone, "scores": scores}
+    row |= {"sun_visible_seen": picture.sun_visible, "scores": scores}
     print(
         f"{picture.name:26s} "
         + " ".join(f"{name} {scores[name]['psnr_db']:.2f}" for name in ("ours", "half_layers", "ours_known", "blend"))
         + f" | best rival {best} {scores[best]['psnr_db']:.2f} | ssim {scores['ours']['ssim']:.3f}"
-        + f" | sun {'shone' if shone else 'hidden'}, seen {picture.sun_visible}",
+        + f" | sun {'shone' if facts['sun_visible_found'] else 'hidden'}, seen {picture.sun_visible}",
         flush=True,
     )
     if sheets is not None:

@@ -20,6 +20,19 @@ def data_dir() -> Path:
     return folder
 
 
+def pytest_ignore_collect(collection_path, config):
+    """`make check` imports the files that hold fast tests alone: importing all takes longer than most of its tests."""
+    if config.option.markexpr == "fast" and collection_path.name.startswith("test_") and collection_path.is_file():
+        return "mark.fast" not in collection_path.read_text(encoding="utf-8") or None
+    return None
+
+
+def pytest_collection_modifyitems(items):
+    """Files with slow tests first: begun last, one of them alone would keep a worker busy while the other has ended."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)
+
+
 def pytest_terminal_summary(terminalreporter):
     """Sum the verdicts of the fault campaign. Here, since the process that gathers results of several loads no other."""
     cases, wrong = 0, Counter()

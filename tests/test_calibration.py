@@ -152,6 +152,43 @@ def test_nan_and_a_camera_below_ground_and_no_evidence_are_refused():
         Priors(focal=-1.0)
 
 
+def test_a_camera_on_a_slope_is_not_solved_into_it():
+    # A hillside that falls northwards to a plain with the matched points: seen so flatly, they hardly tell how far back and
+    # up the camera stands.
+    def ground_m(east: float, north: float) -> float:
+        return max(300.0 - 0.4 * north, 10.0)
+
+    def solved(seed: int, options: ResectionOptions) -> np.ndarray:
+        rng = np.random.default_rng(seed)
+        camera = camera_at(
+            LocalFrame(78.17, 15.91, 0.0, 0.13),
+            78.17,
+            15.91,
+            302.0,
+            heading_deg=8.0,
+            pitch_deg=-13.0,
+            fov_deg=46.0,
+            size_px=(1438, 898),
+        )
+        ground = np.column_stack([rng.uniform(-250.0, 350.0, 9), rng.uniform(760.0, 2200.0, 9), np.full(9, 10.0)])
+        pixel = project(camera, ground)[0] + rng.normal(scale=5.0, size=(9, 2))
+        priors = Priors(horizontal_m=50.0, vertical_m=50.0, k1=0.0)
+        return resect(camera, Correspondences(pixel, ground), priors=priors, options=options).view.position_m
+
+    above = ResectionOptions(ground_m=ground_m, ground_sigma_m=1.0)
+    free = np.array([solved(seed, ResectionOptions()) for seed in range(12)])
+    kept = np.array([solved(seed, above) for seed in range(12)])
+    depth_free, depth_kept = (np.array([ground_m(*each[:2]) - each[2] for each in found]) for found in (free, kept))
+    assert depth_free.max() > 5.0
+    assert depth_kept.max() < 2.0
+    truth = [0.0, 0.0, 302.0]
+    assert np.linalg.norm(kept - truth, axis=1).mean() < 0.9 * np.linalg.norm(free - truth, axis=1).mean()
+    # Where the ground leaves the camera free, nothing changes.
+    clear = depth_free < -5.0
+    assert clear.any()
+    assert np.allclose(kept[clear], free[clear], atol=0.1)
+
+
 def test_undetermined_unknowns_are_named():
     trial = point_trial(np.random.default_rng(3), panoramic=False, count=12, outlier_share=0.0, noise_px=0.0)
     one = select_points(trial.points, np.zeros(8, int))

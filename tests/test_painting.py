@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import pairwise
@@ -38,10 +39,17 @@ from seasonscapes.texturing.foreground import cross_validated_prediction, foregr
 from seasonscapes.texturing.inputs import PaintingInput, prepare_input, sample_input
 from seasonscapes.texturing.painting import PaintOptions, PaintTarget, paint_atlas, paint_tile, prepare_inputs
 from seasonscapes.texturing.painting_file import load_painting, save_painting, write_figures
-from seasonscapes.texturing.radiometric_fit import RadiometricFit, fit_radiometry, invert_contrast, radiance_at_surface
+from seasonscapes.texturing.radiometric_fit import (
+    RadiometricFit,
+    RadiometricReference,
+    fit_radiometry,
+    invert_contrast,
+    radiance_at_surface,
+)
 from seasonscapes.texturing.silhouette import depth_jumps, pose_sigma_px, silhouette_guard
 from seasonscapes.texturing.texel_weights import sharpened, texel_weight
 from seasonscapes.texturing.visibility import project_texels, visible_by_depth, visible_by_faces, visible_by_ray
+from seasonscapes.workflows.painting import painting_record
 
 NOON = datetime(2024, 9, 1, 12, tzinfo=UTC)
 SKY = np.array([3000.0, 4000.0, 6000.0])
@@ -271,6 +279,26 @@ def test_gains_and_haze_are_recovered(land, overlapping):
         [replace(item, air=more) for item in inputs], land.ray_scene, land.cut, PaintOptions(near_m=1.0)
     )
     assert fit_radiometry(ready, land.ray_scene, fit_contrast=False).haze == pytest.approx(1.0 / 1.4, abs=0.1)
+
+
+def test_without_sky_the_airlight_has_the_gain_of_the_surface(land, overlapping):
+    gains = np.array([1.3, 1.0, 0.6]) * 5e-5
+    item = land.item(overlapping[2], "valley", gains=gains, air=thick_air)
+    ground = np.isfinite(land.look(overlapping[2]).depth)
+    item = replace(item, observation=replace(item.observation, mask=ground))
+    ready, _ = prepare_inputs([item], land.ray_scene, land.cut, PaintOptions(near_m=1.0))
+    assert np.isnan(ready[0].sky_value).all()
+    reference = RadiometricReference(land.radiance, 0.2)
+    found = fit_radiometry(ready, land.ray_scene, reference=reference, fit_contrast=False)
+    np.testing.assert_allclose(found.log_gain, [np.log(gains)], atol=0.06)
+    assert found.haze == pytest.approx(1.0, abs=0.15)
+
+
+def test_the_record_of_a_single_camera_is_json(land, cameras):
+    record = json.loads(json.dumps(painting_record(land.paint([land.item(cameras[0], "alone")])), allow_nan=False))
+    assert record["overlaps"] == 0
+    assert record["scatter_before"] is None
+    assert 0.0 < record["painted_share"] < 1.0
 
 
 def test_air_is_subtracted_exactly_when_all_is_known():

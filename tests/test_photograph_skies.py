@@ -1,5 +1,6 @@
 """Clouds that photographs show in their own skies, in the recovery of albedo."""
 
+import logging
 from dataclasses import replace
 
 import numpy as np
@@ -59,6 +60,23 @@ def test_a_low_sun_and_a_synthetic_clear_sky_stay_clear(taken):
         0.0,
         0.0,
     ]
+
+
+def test_a_picture_whose_weather_is_not_told_is_named(taken, caplog):
+    place, transport, _ = taken
+    seen = _with_sky(taken, 0, (0.12, 0.25, 0.6))
+    ground = visible_faces(transport.ray_scene, seen.camera) >= 0
+    views = [replace(seen, webcam="hut/0", mask=ground), replace(seen, webcam="hut/1")]
+    alone = replace(seen, webcam="mast", mask=ground)
+    with caplog.at_level(logging.WARNING):
+        found = photograph_skies(place, transport, [*views, alone], sky_model("clear"))
+    assert [each.cloudiness for each in found] == [0.0, 0.0, 0.0]
+    told = [each.message for each in caplog.records if "weather is not told" in each.message]
+    assert len(told) == 1
+    assert told[0].startswith("mast 2024-07-20 14:00 UTC: ")
+    caplog.clear()
+    photograph_skies(place, transport, [alone], with_overrides(sky_model("clear"), cloudiness=0.3))
+    assert not caplog.records
 
 
 def test_albedo_is_recovered_under_the_clouds_that_a_photograph_shows(taken):

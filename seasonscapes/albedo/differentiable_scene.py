@@ -18,7 +18,7 @@ import numpy as np
 from seasonscapes.cameras.panorama import Panorama
 from seasonscapes.cameras.pinhole import Camera, ray_directions
 from seasonscapes.frames import geodetic_from_enu, local_axes
-from seasonscapes.rendering.backend import use_backend
+from seasonscapes.rendering.backend import aligned, use_backend
 from seasonscapes.rendering.gbuffer import trace_gbuffer
 from seasonscapes.rendering.mitsuba_scene import mi_mesh, relight, sky_radiance_towards
 from seasonscapes.sky.illumination import Illumination
@@ -237,9 +237,9 @@ def build_differentiable_scene(
         mi_params,
         mi_sensor(wide, pixel_format="rgba"),
         mi.load_dict({"type": "prb", "max_depth": max_depth, "rr_depth": 64, "hide_emitters": True}),
-        mi.TensorXf(depth),
-        mi.TensorXf(airlight),
-        mi.TensorXf(sky),
+        mi.TensorXf(aligned(depth)),
+        mi.TensorXf(aligned(airlight)),
+        mi.TensorXf(aligned(sky)),
         np.array(mi_params[SUN]).ravel() if SUN in mi_params else None,
         margin_px,
         camera.world_from_camera[:3, :3].T @ zenith,

@@ -293,7 +293,13 @@ def direct_share(ground: Ground, light: ViewLight, conditions: Conditions) -> fl
 
 
 def conditions_of(
-    camera: FixedCamera, picture: np.ndarray, usable: np.ndarray, light: ViewLight, *, seed: int = 0
+    camera: FixedCamera,
+    picture: np.ndarray,
+    usable: np.ndarray,
+    light: ViewLight,
+    *,
+    sun: float | None = None,
+    seed: int = 0,
 ) -> Conditions:
     """Conditions of another picture of the camera, from its own usable pixels.
 
@@ -303,6 +309,8 @@ def conditions_of(
         From pictures that do not include this one.
     picture, usable, light
         As in `fit_fixed_camera`.
+    sun
+        Direct light as a share of that of a clear sky, where it is known.
     seed
         Of the sample of pixels.
 
@@ -316,10 +324,12 @@ def conditions_of(
         raise NoUsablePixels("conditions_of: the picture has no usable pixel")
     chosen = chosen[sampled_pixels(camera.ground.distance_km[chosen], 2 * SAMPLE, seed)]
     found = Conditions(_first_values(light), np.full(COUNT, np.inf))
+    free = np.ones(COUNT, bool)
+    if sun is not None:
+        free[SUN], found.values[SUN] = False, sun
+    part = picture[chosen], camera.ground.at(chosen), light.at(chosen)
     for _ in range(2):
-        found = fit_conditions(
-            picture[chosen], camera.ground.at(chosen), light.at(chosen), start=found.values, block=camera.block
-        )
+        found = fit_conditions(*part, start=found.values, free=free, block=camera.block)
     return found
 
 

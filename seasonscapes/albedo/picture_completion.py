@@ -1,9 +1,11 @@
 """The rest of a picture of which part is seen, from the other pictures of a fixed camera.
 
 What the seen part tells is more than weather, haze and exposure (`fixed_camera.conditions_of`): how much of which other
-day's snow, crowns and valley haze is in this one. The picture is the model's, and a sum of what the model left in the other
-pictures, of those pictures, and of them relit to the asked instant. The weights of the sum are found where the picture is
-seen, by ridge regression; they vary with distance and height, as air, snow and leaves do.
+day's snow, crowns and valley haze is in this one. The picture is the mean of the other ones, and a sum of what the model
+says of it beyond that mean, of what the model left in the others, of them as they are, and of them relit to the asked
+instant. The weights of the sum are found where the picture is seen, by ridge regression; they vary with distance and
+height, as air, snow and leaves do. The ridge draws towards the mean, and not towards the model: the mean has the detail
+that the model leaves in every picture.
 """
 
 from __future__ import annotations
@@ -86,12 +88,13 @@ def completed_picture(camera: FixedCamera, pictures: np.ndarray, part: SeenPart,
     """
     if not part.seen.any():
         raise NoUsablePixels("completed_picture: no pixel of the picture is seen")
+    mean = pictures.mean(axis=0)
     model = picture_under(camera.ground, part.light, part.conditions.values)
     relit = np.stack([relit_at(camera, part.light, j) for j in range(len(pictures))])
     basis = np.concatenate(
-        [model[None], camera.misfit, pictures - pictures.mean(axis=0), relit - relit.mean(axis=0)]
+        [mean[None], (model - mean)[None], camera.misfit, pictures - mean, relit - relit.mean(axis=0)]
     ).astype(np.float32)
-    out = model.copy()
+    out = mean.copy()
     # Layers of near and of far ground share no pixel.
     for group in np.split(layers, layers.shape[1] // len(_KNOTS), axis=1):
         inside = np.flatnonzero(group.any(axis=1))
@@ -102,6 +105,6 @@ def completed_picture(camera: FixedCamera, pictures: np.ndarray, part: SeenPart,
             known = rows[:, seen].astype(np.float64)
             products = known @ known.T
             ridge = max(_RIDGE * float(np.mean(np.diag(products)[len(_KNOTS) :])), _SMALLEST_RIDGE)
-            aim = known @ (part.picture - model)[inside[seen], c]
+            aim = known @ (part.picture - mean)[inside[seen], c]
             out[inside, c] += np.linalg.solve(products + ridge * np.eye(len(products)), aim) @ rows
     return np.clip(out, 0.0, 1.0)

@@ -24,6 +24,8 @@ from seasonscapes.errors import CameraBelowGround, NotEnoughEvidence
 Loss = Literal["cauchy", "l1", "squares"]
 # Threshold on the residual of an inlier [standard deviations]: probability 0.999 of two pixel coordinates (χ², 2 dof).
 OUTLIER_SIGMAS = 3.717
+# No camera lies on the ground: the lowest ones stand on posts and sills.
+_LEAST_ABOVE_GROUND_M = 1.0
 
 # Maps whitened residual vectors (N, D) to vectors whose squared length is the robust loss.
 _RobustLoss = Callable[[np.ndarray], np.ndarray]
@@ -122,6 +124,8 @@ class ResectionProblem:
         Correspondences; may be empty.
     skyline
         Skyline residuals, or ``None``.
+    ground_m, ground_sigma_m
+        See `ResectionOptions`.
     """
 
     start: View
@@ -130,6 +134,8 @@ class ResectionProblem:
     sigmas: np.ndarray
     points: Correspondences
     skyline: SkylineEvidence | None
+    ground_m: Callable[[float, float], float] | None = None
+    ground_sigma_m: float = 1.0
 
     @property
     def free(self) -> np.ndarray:
@@ -152,14 +158,18 @@ class ResectionOptions:
     guess
         Initial parameters ``(9,)`` where a better estimate than the mean of the priors exists.
     ground_m
-        Function that returns the terrain height in the frame [m] at (east, north) [m]; enables a check that the camera
-        is above the ground.
+        Function that returns the terrain height in the frame [m] at (east, north) [m], NaN where it is unknown. The camera is
+        then kept above the ground: a camera on a slope is far less free than its position and height are singly, since
+        what moves it into the slope has to lift it.
+    ground_sigma_m
+        Standard deviation of those heights [m].
     """
 
     loss: Loss = "cauchy"
     noise_px: float | None = None
     guess: np.ndarray | None = None
     ground_m: Callable[[float, float], float] | None = None
+    ground_sigma_m: float = 1.0
 
 
 def resect(
@@ -200,7 +210,7 @@ def resect(
         If there are fewer points than unknowns without a prior require, the points are mirrored, flipped, in reverse
         order, behind the camera or have no common pose, or a parameter remains undetermined.
     CameraBelowGround
-        If the start or the solution lies more than 5 m below the ground.
+        If the start or the solution lies more than five standard deviations of the heights below the ground.
     ValueError
         If neither points nor a skyline are given.
     """
@@ -210,8 +220,7 @@ def resect(
     # A panorama has no radial distortion; the horizon row of a perspective camera is not separable from its tilt.
     sigmas[8 if isinstance(start, Camera) else 7] = 0.0
     origin = parameters_of_view(start, axes, k1)
-    if options.ground_m is not None:
-        _check_above_ground(origin, options.ground_m, "the start")
+    _check_above_ground(origin, options, "the start")
     if points is None and skyline is None:
         raise ValueError("resect: neither points nor a skyline given")
     parameters = origin.copy() if options.guess is None else np.array(options.guess, float)
@@ -225,11 +234,10 @@ def resect(
                 parameters[angle] = origin[angle]
     if points is None:
         points = Correspondences(np.empty((0, 2)), np.empty((0, 3)))
-    problem = ResectionProblem(start, axes, origin, sigmas, points, skyline)
+    problem = ResectionProblem(start, axes, origin, sigmas, points, skyline, options.ground_m, options.ground_sigma_m)
     parameters, outlier, noise = _solve(problem, parameters, options.loss, options.noise_px)
     calibration = _calibration(problem, parameters, outlier, noise, widen=options.noise_px is None)
-    if options.ground_m is not None:
-        _check_above_ground(parameters, options.ground_m, "the solution")
+    _check_above_ground(parameters, options, "the solution")
     return calibration
 
 
@@ -286,14 +294,20 @@ def _check_point_count(count: int, sigmas: np.ndarray, has_skyline: bool) -> Non
         raise NotEnoughEvidence(f"{count} points for {unknowns} unknowns without a prior: at least {needed} are needed")
 
 
-def _check_above_ground(
-    parameters: np.ndarray, ground_m: Callable[[float, float], float], what: str, *, tolerance_m: float = 5.0
-) -> None:
-    below = float(ground_m(parameters[3], parameters[4])) - parameters[5]
-    if below > tolerance_m:
+def _check_above_ground(parameters: np.ndarray, options: ResectionOptions, what: str) -> None:
+    below = _depth_m(options, parameters)
+    if below > 5.0 * options.ground_sigma_m:
         raise CameraBelowGround(
             f"{what} puts the camera {below:.0f} m below ground; check its height and vertical datum"
         )
+
+
+def _depth_m(known: ResectionOptions | ResectionProblem, parameters: np.ndarray, clearance_m: float = 0.0) -> float:
+    """How far below the ground, or below a clearance above it, the camera stands [m]; 0 where the ground is unknown."""
+    if known.ground_m is None:
+        return 0.0
+    below = float(known.ground_m(parameters[3], parameters[4])) + clearance_m - parameters[5]
+    return max(below, 0.0) if np.isfinite(below) else 0.0
 
 
 def _residual_rows(
@@ -312,6 +326,8 @@ def _residual_rows(
     offset = parameters - problem.origin
     offset[0] = (offset[0] + 180.0) % 360.0 - 180.0
     rows.append(offset[has_prior] / problem.sigmas[has_prior])
+    if problem.ground_m is not None:
+        rows.append(np.array([_depth_m(problem, parameters, _LEAST_ABOVE_GROUND_M) / problem.ground_sigma_m]))
     return np.concatenate(rows)
 
 

@@ -40,6 +40,9 @@ class Horizon:
         Points ``(E, 3)`` where a nearer ridge occludes the terrain behind it, without the skyline [m].
     edge_gap
         ``(E,)`` distance from the ridge to the next visible terrain behind it, relative to the distance of the ridge.
+    edge_of_heights_deg
+        ``(A,)`` elevation angle of the highest terrain where that is the border of the heights, so that the skyline lies beyond
+        it [deg]; NaN where the skyline is known, and where there is no terrain at that azimuth.
     """
 
     position_m: np.ndarray
@@ -49,6 +52,7 @@ class Horizon:
     skyline_elevation_deg: np.ndarray
     edges_m: np.ndarray
     edge_gap: np.ndarray
+    edge_of_heights_deg: np.ndarray
 
 
 def terrain_height(rasters: Sequence[Raster], latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> np.ndarray:
@@ -240,7 +244,7 @@ def horizon_from(
         raise CameraBelowGround(f"the camera is {depth:.0f} m below ground; check its height and vertical datum")
     distance = _distances(options.nearest_m, options.reach_m, 0.7 * cell_size_m(rasters[0]))
     azimuth_deg = np.arange(3600) * 0.1 if azimuth_deg is None else np.asarray(azimuth_deg, float)
-    skyline, elevation, edges, gaps = [], [], [], []
+    skyline, elevation, edges, gaps, borders = [], [], [], [], []
     # Blocks of azimuths bound the memory to some hundred megabytes.
     for part in np.array_split(azimuth_deg, max(1, len(azimuth_deg) * len(distance) // 1_000_000)):
         points = terrain_profile(rasters, frame, position, part, distance)
@@ -250,13 +254,22 @@ def horizon_from(
         rows = np.arange(len(part))
         skyline.append(np.where(has_skyline[:, None], points[rows, top], np.nan))
         elevation.append(np.where(has_skyline, np.degrees(np.arctan(slope[rows, top])), np.nan))
+        highest_deg = np.degrees(np.arctan(slope[rows, top]))
+        borders.append(np.where(has_skyline | ~np.isfinite(slope[rows, top]), np.nan, highest_deg))
         edges.append(points[ridge])
         gaps.append(gap)
     elevation = np.concatenate(elevation)
     if not np.isfinite(elevation).any():
         raise NoTerrainInView("no terrain within reach of the camera")
     return Horizon(
-        position, axes, azimuth_deg, np.concatenate(skyline), elevation, np.concatenate(edges), np.concatenate(gaps)
+        position,
+        axes,
+        azimuth_deg,
+        np.concatenate(skyline),
+        elevation,
+        np.concatenate(edges),
+        np.concatenate(gaps),
+        np.concatenate(borders),
     )
 
 

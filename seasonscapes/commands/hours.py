@@ -55,7 +55,7 @@ def hours_command(
     hold_out
         Times of pictures to leave out, within a minute: to compare the result with what the camera saw.
     sky
-        sun, no-sun or any: which pictures are relit, by whether the sun shone in them.
+        sun, no-sun or any: which pictures are relit; those with sun on patches of the ground alone belong to any.
     most_pixels
         Reduce larger pictures to so many pixels.
     doubtful_poses

@@ -15,6 +15,7 @@ import numpy as np
 
 from seasonscapes.cameras.panorama import Panorama, view_directions
 from seasonscapes.cameras.pinhole import Camera
+from seasonscapes.rendering.backend import aligned, to_numpy
 from seasonscapes.rendering.mitsuba_scene import sky_radiance_towards
 from seasonscapes.sky.illumination import AerialPerspective, Illumination
 
@@ -105,7 +106,7 @@ def air_grid(
             (row / step + 0.5) / nodes.shape[0],
             (relative * (_SLICES - 1) + 0.5) / _SLICES,
         )
-        return mi.Point3f(*(mi.Float(np.ascontiguousarray(values, np.float32)) for values in columns))
+        return mi.Point3f(*(mi.Float(aligned(values)) for values in columns))
 
     samples = np.repeat(pixel[mixed], mixed_distance_m.shape[1])
     return AirGrid(
@@ -144,11 +145,11 @@ def interpolate_air(grid: AirGrid, air: AerialPerspective) -> tuple[np.ndarray, 
     nodes = np.concatenate([np.broadcast_to(part, (*shape, 3)) for part in parts], axis=-1).astype(np.float32)
     # The stub of Dr.Jit gives the texture types as `object`.
     texture: Any = mi.Texture3f(  # pyright: ignore[reportCallIssue]
-        mi.TensorXf(np.ascontiguousarray(nodes)), wrap_mode=dr.WrapMode.Clamp
+        mi.TensorXf(aligned(nodes)), wrap_mode=dr.WrapMode.Clamp
     )
-    values = np.array(texture.eval(grid.mi_coordinate)).T.copy()
+    values = to_numpy(texture.eval(grid.mi_coordinate))
     if len(grid.mixed):
-        samples = np.array(texture.eval(grid.mi_sample_coordinate)).T.reshape(*grid.sample_weight.shape, 6)
+        samples = to_numpy(texture.eval(grid.mi_sample_coordinate)).reshape(*grid.sample_weight.shape, 6)
         values[grid.mixed] = np.einsum("ks,ksc->kc", grid.sample_weight, samples)
     return values[:, :3], values[:, 3:]
 

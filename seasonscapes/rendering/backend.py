@@ -26,6 +26,8 @@ log = logging.getLogger(__name__)
 # LLVM 14 and 15 abort; LLVMGetVersion exists from LLVM 16 on, so that older libraries do not report a version.
 OLDEST_LLVM = 16
 LLVM_CURE = "install one: 'apt-get install libllvm19' (Debian 12, Ubuntu 24.04), 'brew install llvm@19' (macOS)"
+# Of an AVX-512 register, the widest that LLVM vectorises for [bytes].
+_ALIGNMENT = 64
 VARIANTS = {"cuda": "cuda_ad_rgb", "llvm": "llvm_ad_rgb", "scalar": "scalar_rgb"}
 
 
@@ -265,8 +267,50 @@ def to_numpy(values: Any) -> np.ndarray:
     numpy.ndarray
         ``(N,)`` or ``(N, C)``, float32 for Mitsuba's floats.
     """
-    array = np.array(values)
-    return array.T.copy() if array.ndim == 2 else array
+    import drjit as dr
+
+    if dr.depth_v(values) < 2:
+        return np.array(values)
+    # Component by component: Dr.Jit would compile a kernel that joins them for each number of lanes.
+    components = list(values)
+    dr.eval(components)
+    return np.stack(np.broadcast_arrays(*map(np.array, components)), axis=-1)
+
+
+def aligned(values: np.ndarray, dtype: Any = np.float32) -> np.ndarray:
+    """Return values as memory that Dr.Jit can take over, its beginning aligned.
+
+    Dr.Jit reads numpy's memory where it lies, and compiles a kernel of its own for each pattern of aligned and unaligned
+    inputs; where numpy's arrays begin is chance. All kernels would be compiled anew time and again, for most of the
+    time of a small picture.
+
+    Parameters
+    ----------
+    values
+        Any shape.
+    dtype
+        Of the result.
+
+    Returns
+    -------
+    numpy.ndarray
+        Contiguous, of the same shape, beginning at a multiple of 64 bytes; a copy where the values do not.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from seasonscapes.rendering.backend import aligned
+    >>> aligned(np.arange(9)[1:]).ctypes.data % 64
+    0
+    """
+    values = np.ascontiguousarray(values, dtype)
+    if values.ctypes.data % _ALIGNMENT == 0:
+        return values
+    memory = np.empty(values.nbytes + _ALIGNMENT, np.uint8)
+    first = -memory.ctypes.data % _ALIGNMENT
+    result = memory[first : first + values.nbytes].view(values.dtype).reshape(values.shape)
+    result[...] = values
+    return result
 
 
 def point3(values: np.ndarray) -> Any:
@@ -284,7 +328,7 @@ def point3(values: np.ndarray) -> Any:
     """
     import mitsuba as mi
 
-    return mi.Point3f(*(mi.Float(np.ascontiguousarray(values[:, axis], np.float32)) for axis in range(3)))
+    return mi.Point3f(*(mi.Float(aligned(values[:, axis])) for axis in range(3)))
 
 
 def probe_in_child(device: str = "auto", *, timeout_s: float = 120.0) -> tuple[bool, str]:

@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from seasonscapes.rendering.backend import point3, use_backend
+from seasonscapes.rendering.backend import aligned, point3, to_numpy, use_backend
 from seasonscapes.rendering.sky_patches import SkyPatches, mi_patch_of
 from seasonscapes.rendering.sobol import hashed, sobol_pair, uniform
 from seasonscapes.rendering.terrain_material import diffuse_normal, leaving_points
@@ -165,7 +165,7 @@ def surface_points(terrain: RayScene, interaction: Any, active: Any) -> SurfaceP
     origin, outward, normal = leaving_points(material, interaction, active)
     lanes = (origin, normal, outward, albedo, interaction.uv)
     dr.eval(lanes)
-    points = SurfacePoints(*(np.ascontiguousarray(np.array(values).T) for values in lanes))
+    points = SurfacePoints(*map(to_numpy, lanes))
     points.uv[:, 1] = 1.0 - points.uv[:, 1]
     return points
 
@@ -197,13 +197,13 @@ def albedo_at(terrain: RayScene, uv: np.ndarray, position_m: np.ndarray | None =
     import mitsuba as mi
 
     interaction = dr.zeros(mi.SurfaceInteraction3f)
-    u, v = (mi.Float(np.ascontiguousarray(uv[..., k].ravel(), np.float32)) for k in range(2))
+    u, v = (mi.Float(aligned(uv[..., k].ravel())) for k in range(2))
     interaction.uv = mi.Point2f(u, 1.0 - v)
     if position_m is not None:
         interaction.p = mi.Point3f(point3(np.asarray(position_m).reshape(-1, 3)))
-    values = np.array(terrain.mi_terrain.bsdf().eval_diffuse_reflectance(interaction, True))
+    values = to_numpy(terrain.mi_terrain.bsdf().eval_diffuse_reflectance(interaction, True))
     # A uniform albedo is a single value.
-    return np.broadcast_to(values.T, (u.shape[0], 3)).reshape(*uv.shape[:-1], 3)
+    return np.broadcast_to(values, (u.shape[0], 3)).reshape(*uv.shape[:-1], 3)
 
 
 def texture_at(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
@@ -228,9 +228,9 @@ def texture_at(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
 
     # The stub of Dr.Jit gives the texture types as `object`.
     bitmap: Any = mi.Texture2f(  # pyright: ignore[reportCallIssue]
-        mi.TensorXf(np.ascontiguousarray(texture, np.float32)), wrap_mode=dr.WrapMode.Clamp
+        mi.TensorXf(aligned(texture)), wrap_mode=dr.WrapMode.Clamp
     )
-    return np.array(bitmap.eval(mi.Point2f(uv[:, 0], 1.0 - uv[:, 1]))).T
+    return to_numpy(bitmap.eval(mi.Point2f(aligned(uv[:, 0]), aligned(1.0 - uv[:, 1]))))
 
 
 def gather_hemisphere(
@@ -298,8 +298,8 @@ def _gather_block(
     per_point = dr.opaque(mi.UInt32, rays)
     lane = dr.arange(mi.UInt32, count * rays)
     point = lane // per_point
-    index = lane - point * per_point + dr.gather(mi.UInt32, mi.UInt32(first), point)
-    key = hashed(dr.gather(mi.UInt32, mi.UInt32(scramble), point), _HEMISPHERE)
+    index = lane - point * per_point + dr.gather(mi.UInt32, mi.UInt32(aligned(first, np.uint32)), point)
+    key = hashed(dr.gather(mi.UInt32, mi.UInt32(aligned(scramble, np.uint32)), point), _HEMISPHERE)
     mi_normal, mi_geometric_normal = (
         cast(Any, dr.gather(mi.Normal3f, mi.Normal3f(point3(normals)), point))  # the stubs reject normals as vectors
         for normals in (points.normal, points.geometric_normal)

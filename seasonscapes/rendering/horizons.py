@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from seasonscapes.rendering.backend import point3
+from seasonscapes.rendering.backend import aligned, point3
 from seasonscapes.rendering.hemisphere_rays import ABSORBED, ESCAPED, LANES, RayScene, SurfacePoints, diffuse_points
 from seasonscapes.rendering.sky_patches import SkyPatches, patch_sums
 from seasonscapes.rendering.sobol import hash_to_unit, hashed, uniform
@@ -195,8 +195,8 @@ class _HorizonLanes:
         lane = dr.arange(mi.UInt32, len(points.origin))
         number = lane // receivers
         receiver = lane - number * receivers
-        turned = dr.gather(mi.Float, mi.Float((turn % 1.0).astype(np.float32)), receiver)
-        mi_key = hashed(hashed(dr.gather(mi.UInt32, mi.UInt32(key), receiver), _HORIZON), number)
+        turned = dr.gather(mi.Float, mi.Float(aligned(turn % 1.0)), receiver)
+        mi_key = hashed(hashed(dr.gather(mi.UInt32, mi.UInt32(aligned(key, np.uint32)), receiver), _HORIZON), number)
         self.azimuth = (mi.Float(number) + turned) * dr.opaque(mi.Float, 2.0 * np.pi / azimuths)
         self._north_east = dr.sincos(self.azimuth)[::-1]
         self._origin, normal = point3(points.origin), point3(points.normal)
@@ -206,7 +206,7 @@ class _HorizonLanes:
         self._shift = uniform(mi_key)
         # A lattice of place in the interval by azimuth (steps of the golden ratio) and by receiver: those whose azimuths are
         # turned against each other have different elevations at them, too.
-        place = dr.gather(mi.Float, mi.Float((5.0 * turn % 1.0).astype(np.float32)), receiver)
+        place = dr.gather(mi.Float, mi.Float(aligned(5.0 * turn % 1.0)), receiver)
         place += mi.Float(number) * _GOLDEN
         self._place = place - dr.floor(place)
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from seasonscapes.rendering.backend import aligned
 from seasonscapes.rendering.grid_placement import GridPlacement
 from seasonscapes.terrain.surface_classes import ImageDetail, ImageLevel
 
@@ -92,5 +93,5 @@ def _texture(values: np.ndarray) -> Any:
     import mitsuba as mi
 
     return mi.Texture2f16(  # pyright: ignore[reportCallIssue]
-        mi.TensorXf16(np.ascontiguousarray(values, np.float16)), use_accel=False, wrap_mode=dr.WrapMode.Clamp
+        mi.TensorXf16(aligned(values, np.float16)), use_accel=False, wrap_mode=dr.WrapMode.Clamp
     )

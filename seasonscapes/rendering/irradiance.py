@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from seasonscapes.rendering.backend import point3
+from seasonscapes.rendering.backend import aligned, point3
 from seasonscapes.rendering.coefficients import PointCoefficients, SamplingOptions
 from seasonscapes.rendering.hemisphere_rays import RayScene, SurfacePoints, surface_points
 from seasonscapes.rendering.receivers import (
@@ -142,15 +142,15 @@ def points_on_faces(terrain: RayScene, face: np.ndarray, weights: np.ndarray) ->
     import drjit as dr
     import mitsuba as mi
 
-    mi_face, mi_mesh = mi.UInt32(np.ascontiguousarray(face, np.uint32)), terrain.mi_terrain
+    mi_face, mi_mesh = mi.UInt32(aligned(face, np.uint32)), terrain.mi_terrain
     corner = mi_mesh.face_indices(mi_face)
     a, b, c = (mi_mesh.vertex_position(index) for index in (corner.x, corner.y, corner.z))
     preliminary: Any = dr.zeros(mi.PreliminaryIntersection3f, len(face))
     preliminary.t, preliminary.prim_index = 1.0, mi_face
-    preliminary.prim_uv = mi.Point2f(*(np.ascontiguousarray(weights[:, k], np.float32) for k in (1, 2)))
+    preliminary.prim_uv = mi.Point2f(*(aligned(weights[:, k]) for k in (1, 2)))
     # Seen from the front.
     ray = mi.Ray3f(a, -dr.normalize(dr.cross(b - a, c - a)))
-    active = mi.Bool(np.ones(len(face), bool))
+    active = mi.Bool(aligned(np.ones(len(face)), bool))
     interaction = mi_mesh.compute_surface_interaction(ray, preliminary, mi.RayFlags.All, active)
     return surface_points(terrain, interaction, active)
 

@@ -8,7 +8,7 @@ from typing import Any, cast
 import numpy as np
 
 from seasonscapes.images import REC709_LUMINANCE
-from seasonscapes.rendering.backend import point3
+from seasonscapes.rendering.backend import aligned, point3, to_numpy
 from seasonscapes.rendering.coefficients import MirrorCoefficients
 from seasonscapes.rendering.hemisphere_rays import RayScene, SurfacePoints, concatenate_points, surface_points
 from seasonscapes.rendering.light_clusters import ReceiverCoefficients
@@ -68,7 +68,7 @@ def water_samples(terrain: RayScene, points: SurfacePoints, hit: np.ndarray) -> 
     if water is None:
         return np.zeros(hit.shape, bool)
     u, v = (np.ascontiguousarray(points.uv[..., k].ravel(), np.float32) for k in range(2))
-    covered = np.array(water.covers(mi.Point2f(mi.Float(u), mi.Float(1.0 - v)))).reshape(hit.shape)
+    covered = np.array(water.covers(mi.Point2f(mi.Float(aligned(u)), mi.Float(aligned(1.0 - v))))).reshape(hit.shape)
     # The back of a facet, seen from below the terrain's border, is black.
     return covered & hit & (points.albedo.max(axis=-1) > 0.0)
 
@@ -111,7 +111,7 @@ def mirror_samples(
     key, number = hashed(dr.opaque(mi.UInt32, seed), _WAVE), order[pixel][row] * on_water.shape[1] + sample
     # The stubs reject normals as vectors.
     normal, mi_viewer = cast(Any, mi.Normal3f(point3(from_water.normal))), mi.Vector3f(point3(viewer))
-    direction, reflectance = water.mirrored(normal, mi_viewer, sobol_pair(key, mi.UInt32(number.astype(np.uint32))))
+    direction, reflectance = water.mirrored(normal, mi_viewer, sobol_pair(key, mi.UInt32(aligned(number, np.uint32))))
     interaction = terrain.mi_scene.ray_intersect(mi.Ray3f(point3(from_water.origin), direction))
     valid = interaction.is_valid()
     found = surface_points(terrain, interaction, valid)
@@ -127,7 +127,7 @@ def mirror_samples(
     repeated = concatenate_points([found, from_water])[number]
     repeated.albedo[~hit] = 0.0
     shares, directions = np.zeros(on_water.shape, np.float32), np.zeros((*on_water.shape, 3), np.float32)
-    shares[on_water], directions[on_water] = np.array(reflectance), np.array(direction).T
+    shares[on_water], directions[on_water] = np.array(reflectance), to_numpy(direction)
     return MirrorSamples(pixel, on_water, shares, directions, repeated, hit)
 
 

@@ -12,7 +12,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from seasonscapes.rendering.backend import point3
+from seasonscapes.rendering.backend import point3, to_numpy
 from seasonscapes.rendering.coefficients import MirrorCoefficients, ViewCoefficients
 from seasonscapes.rendering.hemisphere_rays import RayScene
 from seasonscapes.rendering.mitsuba_scene import mi_sky
@@ -211,11 +211,12 @@ def _visible_share(mirror: DeviceMirror, body: Luminary) -> np.ndarray:
 
 def _glitter(mirror: DeviceMirror, body: Luminary) -> np.ndarray:
     """Radiance ``(m,)`` of water for unit normal irradiance from a luminary [1/sr]."""
+    import drjit as dr
     import mitsuba as mi
 
     # The stubs reject normals as vectors.
     normal = cast(Any, mi.Normal3f(point3(mirror.normal)))
-    light = mi.Vector3f(*(float(axis) for axis in body.direction))
+    light = mi.Vector3f(*(dr.opaque(mi.Float, float(axis)) for axis in body.direction))  # no kernel for each hour
     return np.array(mirror.water.glitter(normal, mi.Vector3f(point3(mirror.viewer)), light))
 
 
@@ -248,5 +249,5 @@ def _sky(illumination: Illumination, direction: np.ndarray) -> np.ndarray:
     for start in range(0, len(direction), _LANES):
         interaction = dr.zeros(mi.SurfaceInteraction3f)
         interaction.wi = -mi.Vector3f(point3(direction[start : start + _LANES]))
-        result[start : start + _LANES] = np.array(emitter.eval(interaction)).T
+        result[start : start + _LANES] = to_numpy(emitter.eval(interaction))
     return result

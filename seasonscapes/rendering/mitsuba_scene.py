@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from seasonscapes.frames import equirectangular_directions, sample_equirectangular
-from seasonscapes.rendering.backend import use_backend
+from seasonscapes.rendering.backend import aligned, use_backend
 from seasonscapes.rendering.terrain_material import terrain_material
 from seasonscapes.sky.illumination import Illumination, Luminary
 from seasonscapes.terrain.attributes import vertex_normals
@@ -74,7 +74,7 @@ def mi_mesh(terrain: Terrain, albedo: np.ndarray, *, smooth: bool = True) -> Any
     else:
         reflectance = {
             "type": "bitmap",
-            "data": mi.TensorXf(np.ascontiguousarray(albedo)),
+            "data": mi.TensorXf(aligned(albedo)),
             "raw": True,  # linear floats: no sRGB decoding, and differentiable
             "filter_type": "bilinear",
             "wrap_mode": "clamp",
@@ -93,14 +93,14 @@ def mi_mesh(terrain: Terrain, albedo: np.ndarray, *, smooth: bool = True) -> Any
     # Mitsuba's bitmaps have row 0 at v = 0; here row 0 is at v = 1 (v runs upwards).
     uv[:, 1] = 1.0 - uv[:, 1]
     parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = np.ascontiguousarray(terrain.vertices, np.float32).ravel()
-    parameters["faces"] = np.ascontiguousarray(terrain.faces, np.uint32).ravel()
-    parameters["vertex_texcoords"] = uv.ravel()
+    parameters["vertex_positions"] = aligned(terrain.vertices).ravel()
+    parameters["faces"] = aligned(terrain.faces, np.uint32).ravel()
+    parameters["vertex_texcoords"] = aligned(uv).ravel()
     parameters.update()
     if smooth:
         # Mitsuba sums vertex normals in parallel; their last bits, and those of images, would vary between runs.
         normals = vertex_normals(terrain) if terrain.normals is None else terrain.normals
-        parameters["vertex_normals"] = np.ascontiguousarray(normals, np.float32).ravel()
+        parameters["vertex_normals"] = aligned(normals).ravel()
         parameters.update()
     return mesh
 
@@ -264,7 +264,7 @@ def set_albedo(scene: _HasTerrain, albedo: np.ndarray) -> None:
 
     parameters = mi.traverse(scene.mi_terrain)
     key = next(key for key in parameters.keys() if key.endswith("reflectance.data"))  # noqa: SIM118 (not a dict)
-    parameters[key] = mi.TensorXf(np.ascontiguousarray(albedo, np.float32))
+    parameters[key] = mi.TensorXf(aligned(albedo))
     parameters.update()
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from seasonscapes.rendering.backend import aligned
 from seasonscapes.rendering.hemisphere_rays import RayScene
 from seasonscapes.rendering.light_clusters import LightClusters, ReceiverCoefficients
 from seasonscapes.rendering.sky_patches import patch_radiance, sky_patches
@@ -98,9 +99,12 @@ def upload_receivers(receivers: ReceiverCoefficients, smoothing: list[Neighbours
     import mitsuba as mi
 
     cluster = np.asarray(receivers.cluster).astype(np.uint32)
-    direct = [mi.Float16(np.ascontiguousarray(column)) for column in np.asarray(receivers.direct).T]
-    pairs = [mi.UInt32(cluster[:, k] | (cluster[:, k + 1] << np.uint32(16))) for k in range(0, cluster.shape[1], 2)]
-    share = mi.Float(np.asarray(receivers.share, np.float32) / cluster.shape[1])
+    direct = [mi.Float16(aligned(column, np.float16)) for column in np.asarray(receivers.direct).T]
+    pairs = [
+        mi.UInt32(aligned(cluster[:, k] | (cluster[:, k + 1] << np.uint32(16)), np.uint32))
+        for k in range(0, cluster.shape[1], 2)
+    ]
+    share = mi.Float(aligned(np.asarray(receivers.share, np.float32) / cluster.shape[1]))
     dr.eval(direct, pairs, share)
     return DeviceReceivers(direct, pairs, share, [upload_neighbours(neighbours) for neighbours in smoothing or []])
 
@@ -227,16 +231,16 @@ def light_clusters(device: DeviceClusters, illumination: Illumination) -> Cluste
 
     clusters = device.clusters
     sky = patch_radiance(sky_patches(clusters.patches), illumination.sky_radiance)
-    mi_sky = mi.Float((clusters.from_sky.T @ sky).astype(np.float32).ravel())
+    mi_sky = mi.Float(aligned((clusters.from_sky.T @ sky).ravel()))
     if clusters.bounces == 0:
-        return ClusterLight(mi_sky, mi.Float(np.zeros(4, np.float32)))
+        return ClusterLight(mi_sky, mi.Float(aligned(np.zeros(4))))
     albedo = clusters.points.albedo
     sunlit = np.zeros((len(albedo), 3), np.float32)
     for body in luminaries(illumination):
         cosine = visible_cosine(device.rays, body)[..., None]
         sunlit += (cosine * albedo).mean(axis=1) * (np.asarray(body.normal_illuminance_lx, np.float32) / np.pi)
-    mean_albedo = [mi.Float(np.ascontiguousarray(column)) for column in albedo.mean(axis=1).T]
-    from_sun = [mi.Float(np.ascontiguousarray(column)) for column in sunlit.T]
+    mean_albedo = [mi.Float(aligned(column)) for column in albedo.mean(axis=1).T]
+    from_sun = [mi.Float(aligned(column)) for column in sunlit.T]
     first_bounce = [
         sun + reflectance * incident
         for sun, reflectance, incident in zip(

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from seasonscapes.frames import angles_from_direction, direction_from_angles
+from seasonscapes.rendering.backend import aligned
 
 _TREGENZA_ROWS = (30, 30, 24, 24, 18, 12, 6)
 # Rows below the horizon, finer near it, where radiance varies most: (lower edge [deg], patches).
@@ -146,8 +147,8 @@ def mi_patch_of(patches: SkyPatches, direction: Any) -> Any:
     row = mi.UInt32(0)
     for sine in np.sin(np.radians(patches.edges_deg[1:-1])):
         row += dr.select(direction.z < float(sine), mi.UInt32(1), mi.UInt32(0))
-    count = dr.gather(mi.UInt32, mi.UInt32(patches.counts.astype(np.uint32)), row)
-    first = dr.gather(mi.UInt32, mi.UInt32(patches.offsets.astype(np.uint32)), row)
+    count = dr.gather(mi.UInt32, mi.UInt32(aligned(patches.counts, np.uint32)), row)
+    first = dr.gather(mi.UInt32, mi.UInt32(aligned(patches.offsets, np.uint32)), row)
     revolution = dr.atan2(direction.x, direction.y) * (0.5 / np.pi)
     revolution = dr.select(revolution < 0.0, revolution + 1.0, revolution)
     return first + dr.minimum(mi.UInt32(revolution * mi.Float(count)), count - 1)

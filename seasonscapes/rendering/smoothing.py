@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from seasonscapes.rendering.backend import aligned
+
 _TAPS = [(row, column) for row in (-1, 0, 1) for column in (-1, 0, 1) if (row, column) != (0, 0)]
 # Distance from the tangent plane at which the weight of a neighbour falls to 1/e, in pixel widths per pixel of stride.
 _PLANE_PX = 0.7
@@ -166,7 +168,7 @@ def upload_neighbours(neighbours: Neighbours) -> DeviceNeighbours:
     import drjit as dr
     import mitsuba as mi
 
-    index = [mi.UInt32(row.astype(np.uint32)) for row in neighbours.index]
-    weight = [mi.Float16(row.astype(np.float16)) for row in neighbours.weight]
+    index = [mi.UInt32(aligned(row, np.uint32)) for row in neighbours.index]
+    weight = [mi.Float16(aligned(row, np.float16)) for row in neighbours.weight]
     dr.eval(index, weight)
     return DeviceNeighbours(index, weight)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from seasonscapes.cameras.pinhole import Camera
-from seasonscapes.rendering.backend import point3, use_backend
+from seasonscapes.rendering.backend import aligned, point3, use_backend
 
 # Side of a tile [px]; the lanes of a tile run together.
 TILE = 4
@@ -116,9 +116,7 @@ def upload_splats(means: np.ndarray, axes: np.ndarray, opacity: np.ndarray) -> D
     import mitsuba as mi
 
     columns = [mi.Vector3f(point3(axes[:, :, k])) for k in range(3)]
-    splats = DeviceSplats(
-        mi.Point3f(point3(means)), columns, mi.Float(np.ascontiguousarray(opacity, np.float32)), len(means)
-    )
+    splats = DeviceSplats(mi.Point3f(point3(means)), columns, mi.Float(aligned(opacity)), len(means))
     dr.eval(splats.mi_centre, splats.mi_axes, splats.mi_opacity)
     return splats
 
@@ -160,9 +158,9 @@ def splat_layers(
     tile_columns = dr.opaque(mi.UInt32, across)
     column, row = (tile % tile_columns) * TILE + inner % TILE, (tile // tile_columns) * TILE + inner // TILE
     x, y = mi.Float(column) + 0.5, mi.Float(row) + 0.5
-    mi_start = mi.UInt32(start)
-    channels = [mi.Float(np.ascontiguousarray(channel, np.float32)) for channel in layers.T]
-    order = mi.UInt32(index)
+    mi_start = mi.UInt32(aligned(start, np.uint32))
+    channels = [mi.Float(aligned(channel)) for channel in layers.T]
+    order = mi.UInt32(aligned(index, np.uint32))
     most, least = dr.opaque(mi.Float, limits.max_alpha), dr.opaque(mi.Float, limits.min_alpha)
 
     parameters = (

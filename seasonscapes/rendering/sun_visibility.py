@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from seasonscapes.rendering.backend import point3
+from seasonscapes.rendering.backend import aligned, point3
 from seasonscapes.rendering.hemisphere_rays import RayScene
 from seasonscapes.rendering.terrain_material import shadow_ray_start
 from seasonscapes.sky.illumination import Luminary
@@ -97,12 +97,12 @@ def sun_rays(
     mi_origin = point3(np.asarray(origin_m).reshape(-1, 3))
 
     def columns(values: np.ndarray) -> list[Any]:
-        return [mi.Float16(np.ascontiguousarray(column, np.float16)) for column in np.asarray(values).reshape(-1, 3).T]
+        return [mi.Float16(aligned(column, np.float16)) for column in np.asarray(values).reshape(-1, 3).T]
 
     mi_normal = columns(normal)
     mi_geometric_normal = mi_normal if geometric_normal is normal else columns(geometric_normal)
-    mi_weight = mi.Float16(np.ascontiguousarray(weight, np.float16).ravel())
-    mi_disc_offset = mi.UInt32((np.asarray(disc_offset, np.int64) % 256).astype(np.uint32))
+    mi_weight = mi.Float16(aligned(weight, np.float16).ravel())
+    mi_disc_offset = mi.UInt32(aligned(np.asarray(disc_offset, np.int64) % 256, np.uint32))
     dr.eval(mi_origin, mi_normal, mi_geometric_normal, mi_weight, mi_disc_offset)
     return SunRays(terrain, mi_origin, mi_normal, mi_geometric_normal, mi_weight, mi_disc_offset, weight.shape[1])
 
@@ -238,7 +238,7 @@ def sum_incidence(rays: SunRays, luminary: Luminary, receiver: np.ndarray) -> tu
     disc = _mi_disc(luminary, rays.samples)
     step = max(1, LANES // rays.samples)
     for start in range(0, len(receiver), step):
-        chosen = mi.UInt32(receiver[start : start + step].astype(np.uint32))
+        chosen = mi.UInt32(aligned(receiver[start : start + step], np.uint32))
         index = dr.arange(mi.UInt32, dr.width(chosen) * rays.samples)
         samples = dr.opaque(mi.UInt32, rays.samples)
         lane = dr.gather(mi.UInt32, chosen, index // samples) * samples + index % samples

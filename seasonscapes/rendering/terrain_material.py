@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from seasonscapes.rendering.albedo_detail import DeviceDetail
-from seasonscapes.rendering.backend import use_backend
+from seasonscapes.rendering.backend import aligned, use_backend
 from seasonscapes.rendering.grid_placement import GridPlacement
 from seasonscapes.rendering.ground_optics import GroundOptics, optics_of
 from seasonscapes.rendering.image_detail import DeviceImages
@@ -58,7 +58,7 @@ class DeviceSurface:
 
         # Without the texture units of a GPU, whose interpolation weights have 8 bits.
         self._mi_texture: Any = mi.Texture2f(  # pyright: ignore[reportCallIssue]
-            mi.TensorXf(grid.nodes), use_accel=False, wrap_mode=dr.WrapMode.Clamp
+            mi.TensorXf(aligned(grid.nodes)), use_accel=False, wrap_mode=dr.WrapMode.Clamp
         )
         self._placement = GridPlacement(grid.to_node, grid.domain, grid.nodes.shape[:2], grid.rim_nodes)
         self._mi_error = dr.opaque(mi.Float, grid.mesh_error_m)
@@ -276,7 +276,7 @@ def _device_texture(values: np.ndarray) -> Any:
     import drjit as dr
     import mitsuba as mi
 
-    tensor = mi.TensorXf(np.ascontiguousarray(values, np.float32))
+    tensor = mi.TensorXf(aligned(values))
     return mi.Texture2f(tensor, use_accel=False, wrap_mode=dr.WrapMode.Clamp)  # pyright: ignore[reportCallIssue]
 
 
@@ -310,7 +310,13 @@ def _scalar_water(ground: dict[str, Any], water: Water) -> dict[str, Any]:
     if water.wind_m_s > 0.0:
         roughness = float(np.sqrt(slope_variance(water.wind_m_s)))
         body |= {"type": "roughplastic", "distribution": "beckmann", "alpha": roughness}
-    weight = {"type": "bitmap", "data": mi.TensorXf(mask), "raw": True, "filter_type": "nearest", "wrap_mode": "clamp"}
+    weight = {
+        "type": "bitmap",
+        "data": mi.TensorXf(aligned(mask)),
+        "raw": True,
+        "filter_type": "nearest",
+        "wrap_mode": "clamp",
+    }
     return {"type": "blendbsdf", "weight": weight, "ground": ground, "water": body}
 
 

@@ -20,6 +20,7 @@ import numpy as np
 from seasonscapes.cameras.panorama import Panorama
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.errors import NoTerrainInView
+from seasonscapes.rendering.backend import aligned
 from seasonscapes.rendering.coefficients import MirrorCoefficients, PointCoefficients, SamplingOptions, ViewCoefficients
 from seasonscapes.rendering.direction_basis import DirectionBasis, direction_basis
 from seasonscapes.rendering.hemisphere_rays import (
@@ -289,7 +290,7 @@ def prepare_transport(
     faces = face_geometry(terrain.mi_terrain)
     permutation = np.random.default_rng(seed).permutation(len(pilot.origin))
     pilot = pilot[np.resize(permutation, _PILOTS)]
-    unclustered = mi.UInt32(np.zeros(len(faces.centroid), np.uint32))
+    unclustered = mi.UInt32(aligned(np.zeros(len(faces.centroid)), np.uint32))
     hits = trace_path_hits(terrain, pilot, max(sampling.bounces, 1), seed)
     hit_count = len(hits.face)
     # Receivers and clusters share one basis, so that both serve as examples.
@@ -319,7 +320,7 @@ def prepare_transport(
     clusters = LightClusters(
         points, _zero_receivers(basis, sampling), basis.from_sky, sampling.patches, sampling.bounces
     )
-    shared = SharedTransport(mi.UInt32(face_cluster), basis, clusters, above)
+    shared = SharedTransport(mi.UInt32(aligned(face_cluster, np.uint32)), basis, clusters, above)
     step = max(1, BLOCK_RAYS // sampling.rays)
     uniform = np.full((size, POINTS_PER_CLUSTER), 1.0 / POINTS_PER_CLUSTER, np.float32)
     blocks = [

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from seasonscapes.frames import MEAN_RADIUS_M, LocalFrame
-from seasonscapes.rendering.backend import use_backend
+from seasonscapes.rendering.backend import aligned, use_backend
 from seasonscapes.terrain.surface_classes import Water
 
 # Of fresh water at 20 °C in the middle of the visible spectrum.
@@ -95,9 +95,7 @@ class DeviceWater:
 
         # The stub of Dr.Jit gives the texture types as `object`.
         self._mi_mask: Any = mi.Texture2f(  # pyright: ignore[reportCallIssue]
-            mi.TensorXf(np.ascontiguousarray(water.mask[..., None], np.float32)),
-            use_accel=False,
-            wrap_mode=dr.WrapMode.Clamp,
+            mi.TensorXf(aligned(water.mask[..., None])), use_accel=False, wrap_mode=dr.WrapMode.Clamp
         )
         self._mi_curvature = dr.opaque(mi.Float, (1.0 - frame.refraction_k) / MEAN_RADIUS_M)
         self.roughness = float(np.sqrt(slope_variance(water.wind_m_s)))

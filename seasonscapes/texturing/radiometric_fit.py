@@ -3,7 +3,7 @@
 The image value is ``v = R_a(g (T^h L + s A_h))``: radiance L of the surface through the transmittance T of the sky
 model, plus its airlight A, scaled by ``(1 - T^h) / (1 - T)`` to A_h, times the camera's gain g per channel, on a tone
 curve R of contrast a. The scale of the airlight, s g, is measured on the sky above the horizon in the same image, which
-needs no gain. Gains, contrasts and one haze exponent h (1 is the sky model's own haze) are fitted jointly by robust
+needs no gain; in an image without sky s is 1. Gains, contrasts and one haze exponent h (1 is the sky model's own haze) are fitted jointly by robust
 least squares over all surface points visible from two cameras, and against predicted radiance where it is given.
 """
 
@@ -270,8 +270,9 @@ def _apply_step(radiometry: RadiometricFit, step: np.ndarray) -> RadiometricFit:
 def _with_sky_gain(
     inputs: Sequence[PreparedInput], radiometry: RadiometricFit, radiance: float | None
 ) -> RadiometricFit:
-    """The same with gains of the airlight measured on the sky under the present contrasts."""
-    return replace(radiometry, log_sky_gain=_gain_prior(inputs, radiometry, radiance).mean)
+    """The same with gains of the airlight measured on the sky under the present contrasts, or those of the surface without sky."""
+    prior = _gain_prior(inputs, radiometry, radiance)
+    return replace(radiometry, log_sky_gain=np.where(prior.sees_sky[:, None], prior.mean, radiometry.log_gain))
 
 
 @dataclass(frozen=True)
@@ -284,10 +285,13 @@ class _GainPrior:
         ``(K, 3)``.
     sigma
         ``(K, 1)`` its standard deviation.
+    sees_sky
+        ``(K,)`` bool: by the sky, and not by the image's median.
     """
 
     mean: np.ndarray
     sigma: np.ndarray
+    sees_sky: np.ndarray
 
 
 def _gain_prior(inputs: Sequence[PreparedInput], radiometry: RadiometricFit, radiance: float | None) -> _GainPrior:
@@ -311,7 +315,7 @@ def _gain_prior(inputs: Sequence[PreparedInput], radiometry: RadiometricFit, rad
         horizon = float(np.mean([horizon_radiance(prepared.painting_input) for prepared in inputs]))
         offset = -np.log(radiance or _SURFACE_TO_SKY * horizon or 1.0)
     return _GainPrior(
-        np.where(known[:, None], sky, median + offset), np.where(known, _SKY_SIGMA, _MEDIAN_SIGMA)[:, None]
+        np.where(known[:, None], sky, median + offset), np.where(known, _SKY_SIGMA, _MEDIAN_SIGMA)[:, None], known
     )
 
 
@@ -434,9 +438,9 @@ def _gauss_newton_step(
     Residuals are divided by the local slope of the tone curves; otherwise the flattest curves would fit best.
     """
     count = len(radiometry.contrast)
-    residuals = [_overlap_residuals(overlaps, radiometry)]
+    residuals = [_overlap_residuals(overlaps, radiometry, prior.sees_sky)]
     if expected is not None:
-        residuals.append(_predicted_residuals(overlaps.single, expected, predicted_sigma, radiometry))
+        residuals.append(_predicted_residuals(overlaps.single, expected, predicted_sigma, radiometry, prior.sees_sky))
     matrix, gradient = _prior_equations(radiometry, prior, count)
     for block in residuals:
         for channel in range(3):
@@ -452,7 +456,15 @@ def _gauss_newton_step(
     return step
 
 
-def _overlap_residuals(overlaps: OverlapPairs, radiometry: RadiometricFit) -> _Residuals:
+def _slope_of_gain(sees_sky: np.ndarray, camera: np.ndarray, samples: _Linearisation) -> np.ndarray:
+    """How much faster than log gain the log radiance of samples falls ``(N, 3)``.
+
+    Airlight that the sky tells stays as it is; airlight under the same gain as the surface changes as the image value would.
+    """
+    return np.where(sees_sky[camera][:, None], 1.0, np.exp(samples.log_slope))
+
+
+def _overlap_residuals(overlaps: OverlapPairs, radiometry: RadiometricFit, sees_sky: np.ndarray) -> _Residuals:
     """Differences of log radiance between the two cameras of each pair."""
     own, other = overlaps.own, overlaps.other
     left, right = _linearise(own, radiometry), _linearise(other, radiometry)
@@ -460,13 +472,14 @@ def _overlap_residuals(overlaps: OverlapPairs, radiometry: RadiometricFit) -> _R
     slope = np.exp(0.5 * (left.log_slope + right.log_slope))
     noise = left.noise**2 * np.exp(2.0 * left.log_slope) + right.noise**2 * np.exp(2.0 * right.log_slope)
     half = 0.5 * error
+    by_own, by_other = _slope_of_gain(sees_sky, own.camera, left), _slope_of_gain(sees_sky, other.camera, right)
     return _Residuals(
         error / slope,
         noise / slope**2 + _SURFACE_SIGMA**2,
         (
-            _CameraDerivatives(own.camera, -1.0 / slope, (left.by_contrast - half * left.slope_by_contrast) / slope),
+            _CameraDerivatives(own.camera, -by_own / slope, (left.by_contrast - half * left.slope_by_contrast) / slope),
             _CameraDerivatives(
-                other.camera, 1.0 / slope, (-right.by_contrast - half * right.slope_by_contrast) / slope
+                other.camera, by_other / slope, (-right.by_contrast - half * right.slope_by_contrast) / slope
             ),
         ),
         (left.by_haze - right.by_haze - half * (left.slope_by_haze + right.slope_by_haze)) / slope,
@@ -475,17 +488,26 @@ def _overlap_residuals(overlaps: OverlapPairs, radiometry: RadiometricFit) -> _R
 
 
 def _predicted_residuals(
-    single: CameraSamples, expected: np.ndarray, predicted_sigma: float, radiometry: RadiometricFit
+    single: CameraSamples,
+    expected: np.ndarray,
+    predicted_sigma: float,
+    radiometry: RadiometricFit,
+    sees_sky: np.ndarray,
 ) -> _Residuals:
     """Differences of log radiance between each camera and the prediction."""
     known = np.asarray(np.isfinite(expected).all(axis=1))
     samples = _linearise(single[known], radiometry)
     camera, slope = single.camera[known], np.exp(samples.log_slope)
     error = samples.log_surface - expected[known] - radiometry.log_gain[camera]
+    by_gain = _slope_of_gain(sees_sky, camera, samples)
     return _Residuals(
         error / slope,
         samples.noise**2 + predicted_sigma**2,
-        (_CameraDerivatives(camera, -1.0 / slope, (samples.by_contrast - error * samples.slope_by_contrast) / slope),),
+        (
+            _CameraDerivatives(
+                camera, -by_gain / slope, (samples.by_contrast - error * samples.slope_by_contrast) / slope
+            ),
+        ),
         (samples.by_haze - error * samples.slope_by_haze) / slope,
         _independent_count(camera),
     )

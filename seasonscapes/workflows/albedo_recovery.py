@@ -21,7 +21,7 @@ from seasonscapes.sky.models import SkyModel, with_overrides
 from seasonscapes.terrain.surface import Texture
 from seasonscapes.workflows.albedo_sources import orthoimage, scene_albedo
 from seasonscapes.workflows.illumination import sky_model
-from seasonscapes.workflows.photograph_skies import photograph_skies
+from seasonscapes.workflows.photograph_skies import photograph_skies, without_land_beyond
 from seasonscapes.workflows.place import MeshOptions, Place
 from seasonscapes.workflows.recovery_methods import (
     METHODS,
@@ -335,6 +335,8 @@ def photographs_of_ground(
 ) -> tuple[list[AlbedoPhotograph], list[SkyModel], float]:
     """The photographs that show ground, under the light of their skies: clouds as they show them, and pixels of water left out.
 
+    Where none shows sky, some have an assumed gain; see `albedo.assumed_exposure`.
+
     Parameters
     ----------
     place, transport
@@ -360,13 +362,15 @@ def photographs_of_ground(
     NoUsablePixels
         Where all that they show is water.
     """
+    from seasonscapes.albedo.assumed_exposure import with_assumed_exposure
     from seasonscapes.albedo.ground_pixels import without_water
     from seasonscapes.albedo.photographs import prepare_photographs
 
-    seen = with_terrain(transport, photographs)
+    seen = without_land_beyond(place, with_terrain(transport, photographs))
     skies = photograph_skies(place, transport, seen, model)
     report = task_progress(progress, "footprints of the photographs")
     prepared = prepare_photographs(transport, seen, illuminations(place, seen, skies), progress=report)
+    prepared = with_assumed_exposure(prepared)
     if place.terrain.water is None:
         return prepared, skies, 0.0
     sky_of = {id(each): sky for each, sky in zip(seen, skies, strict=True)}
@@ -398,7 +402,11 @@ def _prepared(
             "water: %.3g %% of the pixels on terrain show it and tell no albedo; its texels are completed",
             100.0 * share,
         )
-    if options.fit_curve:
+    # Contrast of one picture whose exposure is assumed is its land's as well as its camera's.
+    alone = len({each.observation.time for each in prepared}) == 1 and prepared[0].gain is not None
+    if options.fit_curve and alone:
+        log.info("tone curve: taken as sRGB's; one photograph without sky does not tell another")
+    elif options.fit_curve:
         curve = fit_tone_curve(transport, prepared, progress=task_progress(progress, "tone curve"))
         prepared = with_tone_curve(prepared, curve.strength)
         facts["curve_strength"] = round(curve.strength, 3)

@@ -185,7 +185,7 @@ def painting_of(
     tiles = place.workspace.folder / place.scene.name / f"tiles-{artefact_key(inputs, _CODE)}"
 
     def build() -> Painting:
-        opened = observations(rows, sources, place.frame, progress=progress)
+        opened = observations(rows, sources, place.frame, terrain=place.terrain, progress=progress)
         return paint(place, opened, sky=model, options=options, reference=reference, resume=tiles, progress=progress)
 
     painting = build_once(
@@ -214,7 +214,10 @@ def _hashes(sources: PhotographSources, rows: Sequence[ManifestRow]) -> list[lis
 
 
 def painting_record(painting: Painting) -> dict:
-    """Plain numbers about a painting: gains [1 / (cd/m²)], haze, and the share of the texture each webcam paints best."""
+    """Plain numbers about a painting: gains [1 / (cd/m²)], haze, and the share of the texture each webcam paints best.
+
+    Differences between cameras are ``None`` where no two see the same land: JSON has no NaN.
+    """
     radiometry, size = painting.radiometry, painting.best.size
     shares = np.bincount(painting.best[painting.best >= 0].ravel(), minlength=len(painting.webcams)) / size
     return {
@@ -224,8 +227,8 @@ def painting_record(painting: Painting) -> dict:
         "contrasts": radiometry.contrast.tolist(),
         "haze": radiometry.haze,
         "overlaps": radiometry.overlaps,
-        "scatter_before": radiometry.scatter_before,
-        "scatter_after": radiometry.scatter_after,
+        "scatter_before": radiometry.scatter_before if radiometry.overlaps else None,
+        "scatter_after": radiometry.scatter_after if radiometry.overlaps else None,
         "shares": shares.tolist(),
         "painted_share": float(np.mean(painting.texture.weight > 0.0)),
     }

@@ -15,12 +15,15 @@ from seasonscapes.cameras.pinhole import view_in_frame
 from seasonscapes.errors import InputError, UnreadableImage
 from seasonscapes.progress import Progress, each_reported
 from seasonscapes.terrain.raster_files import real_path
-from seasonscapes.workflows.place import Place, utc_at
+from seasonscapes.workflows.place import HEIGHT_TOLERANCE_M, LEAST_ABOVE_GROUND_M, Place, utc_at
 
 if TYPE_CHECKING:
     from seasonscapes.calibration.calibration_file import CalibratedWebcam
     from seasonscapes.cameras.observation import ManifestRow, Observation
+    from seasonscapes.cameras.panorama import Panorama
+    from seasonscapes.cameras.pinhole import Camera
     from seasonscapes.frames import LocalFrame
+    from seasonscapes.terrain.surface import Terrain
 
 log = logging.getLogger(__name__)
 
@@ -139,7 +142,7 @@ def photographs_at(
     """
     near = [rows_at(sources, time, within_min=within_min, where=where) for time in times]
     rows = {row.path: row for group in near for row in group}
-    opened = observations(list(rows.values()), sources, place.frame, progress=progress)
+    opened = observations(list(rows.values()), sources, place.frame, terrain=place.terrain, progress=progress)
     return opened if most_pixels is None else [reduced_observation(each, most_pixels) for each in opened]
 
 
@@ -206,11 +209,17 @@ def uncalibrated(rows: Sequence[ManifestRow], sources: PhotographSources) -> lis
 
 
 def observations(
-    rows: Sequence[ManifestRow], sources: PhotographSources, frame: LocalFrame, *, progress: Progress | None = None
+    rows: Sequence[ManifestRow],
+    sources: PhotographSources,
+    frame: LocalFrame,
+    *,
+    terrain: Terrain | None = None,
+    progress: Progress | None = None,
 ) -> list[Observation]:
     """Open photographs as pinhole observations in a frame.
 
-    Webcams without a calibration, and pictures whose pose is doubtful, are left out with a warning.
+    Webcams without a calibration, and pictures whose pose is doubtful, are left out with a warning; so are cameras far below the
+    ground of ``terrain``, while those that lie in it by no more than heights are known to are lifted out.
 
     Raises
     ------
@@ -229,7 +238,15 @@ def observations(
         if calibrated.doubts and not sources.accept_doubtful:
             doubtful.append(f"{record.name}: {'; '.join(calibrated.doubts)}")
             continue
-        opened += opened_views(row, sources, calibrated, frame)
+        views = opened_views(row, sources, calibrated, frame)
+        depth_m = -np.inf if terrain is None else _depth_m(terrain, views[0].camera)
+        if depth_m > HEIGHT_TOLERANCE_M and not sources.accept_doubtful:
+            doubtful.append(f"{record.name}: the camera stands {depth_m:.1f} m below the ground of the terrain")
+            continue
+        if depth_m > 0.0:
+            log.warning("%s: the camera stands %.1f m below the ground of the terrain: lifted", record.name, depth_m)
+            views = [_lifted(view, depth_m + LEAST_ABOVE_GROUND_M) for view in views]
+        opened += views
     without = uncalibrated(rows, sources)
     if not opened and doubtful:
         raise InputError(
@@ -249,6 +266,20 @@ def observations(
     for name in doubtful:
         log.warning("left out, the pose is not reliable: %s", name)
     return opened
+
+
+def _depth_m(terrain: Terrain, camera: Camera | Panorama) -> float:
+    """How far below the mesh a camera stands [m]; negative above it, and minus infinity beside it."""
+    from seasonscapes.terrain.surface import mesh_up_m
+
+    up = mesh_up_m(terrain, camera.position_m)
+    return up - float(camera.position_m[2]) if np.isfinite(up) else -np.inf
+
+
+def _lifted(view: Observation, by_m: float) -> Observation:
+    pose = view.camera.world_from_camera.copy()
+    pose[2, 3] += by_m
+    return replace(view, camera=replace(view.camera, world_from_camera=pose))
 
 
 def opened_views(

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
+from datetime import datetime
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from seasonscapes.albedo.cloud_cover import grey_share
 from seasonscapes.cameras.pinhole import Camera, ray_directions
+from seasonscapes.errors import NoTerrainInView
 from seasonscapes.images import srgb_from_linear
 from seasonscapes.sky.ephemeris import sun_position
 from seasonscapes.sky.models import AtmosphereModel, SkyModel
@@ -25,6 +28,8 @@ log = logging.getLogger(__name__)
 _LOWEST_SUN_DEG, _AROUND_SUN_DEG = 10.0, 60.0
 # Below this share of grey sky a picture counts as clear: haze and clouds on the horizon are grey too.
 _CLOUDY = 0.5
+# Land beyond the raster seldom rises higher above the horizontal; azimuths are looked at in steps [deg].
+_BEYOND_DEG, _AZIMUTH_STEP_DEG = 15.0, 0.25
 
 
 def photograph_skies(
@@ -60,7 +65,85 @@ def photograph_skies(
                 "%s %s UTC: %.0f %% of its sky is grey: taken as clouds", webcam, f"{time:%Y-%m-%d %H:%M}", 100.0 * grey
             )
             models[webcam, time] = model.model_copy(update={"cloudiness": grey})
+    _warn_of_untold(skies)
     return [models[each.webcam, each.time] for each in photographs]
+
+
+def without_land_beyond(place: Place, photographs: Sequence[Observation]) -> list[Observation]:
+    """Mask what looks like sky only because the heights end before it: where the land still rises at their border.
+
+    Mountains beyond the raster, taken for a grey and dim sky, would make clouds of a clear day and falsify exposure and colours.
+
+    Parameters
+    ----------
+    place
+        The place; a synthetic one has nothing beyond its heights.
+    photographs
+        In the place's frame.
+
+    Returns
+    -------
+    list of Observation
+        In the same order; pixels less than 15° above the horizontal are masked in the azimuths without a known skyline.
+    """
+    from seasonscapes.scene import SyntheticElevation
+
+    if isinstance(place.scene.elevation, SyntheticElevation):
+        return list(photographs)
+    open_to: dict[tuple, np.ndarray] = {}
+    result, told = [], set()
+    for each in photographs:
+        camera = each.camera
+        assert isinstance(camera, Camera)  # panoramas were cut into views
+        key = (camera.width_px, camera.height_px, camera.fx, camera.world_from_camera.tobytes())
+        if key not in open_to:
+            open_to[key] = _under_unknown_skyline(place, camera)
+        beyond = open_to[key] & each.mask
+        webcam = each.webcam.split("/")[0]
+        if beyond.any() and webcam not in told:
+            told.add(webcam)
+            log.warning(
+                "%s: the heights end before the skyline in %.0f %% of its columns: nothing there is taken for sky; heights that reach "
+                "farther would tell",
+                webcam,
+                100.0 * float(open_to[key].any(axis=0).mean()),
+            )
+        result.append(replace(each, mask=each.mask & ~open_to[key]) if beyond.any() else each)
+    return result
+
+
+def _under_unknown_skyline(place: Place, camera: Camera) -> np.ndarray:
+    """Pixels ``(H, W)`` bool without ground in them that land beyond the raster may fill."""
+    from seasonscapes.calibration.terrain_horizon import HorizonOptions, horizon_from
+
+    directions = ray_directions(camera)
+    unknown = np.zeros(directions.shape[:2], bool)
+    options = HorizonOptions(below_ground_m=np.inf)
+    try:
+        azimuths = np.arange(0.0, 360.0, _AZIMUTH_STEP_DEG)
+        horizon = horizon_from([place.elevation], place.frame, camera.position_m, azimuth_deg=azimuths, options=options)
+    except NoTerrainInView:
+        return unknown
+    east, north, up = np.moveaxis(directions @ horizon.axes.T, -1, 0)
+    column = np.rint(np.degrees(np.arctan2(east, north)) % 360.0 / _AZIMUTH_STEP_DEG).astype(int) % len(azimuths)
+    highest = horizon.edge_of_heights_deg[column]
+    elevation_deg = np.degrees(np.arcsin(np.clip(up, -1.0, 1.0)))
+    return np.isfinite(highest) & (elevation_deg > highest) & (elevation_deg < _BEYOND_DEG)
+
+
+def _warn_of_untold(skies: dict[tuple[str, datetime], list[float | None]]) -> None:
+    """Say which pictures tell nothing of their weather; a panorama tells it in any of its views."""
+    told: dict[tuple[str, datetime], bool] = {}
+    for (view, time), shares in skies.items():
+        webcam = view.split("/")[0]
+        told[webcam, time] = told.get((webcam, time), False) or any(share is not None for share in shares)
+    untold = [f"{webcam} {time:%Y-%m-%d %H:%M} UTC" for (webcam, time), known in told.items() if not known]
+    if untold:
+        log.warning(
+            "%s: the weather is not told, since no unclipped sky away from the sun is seen: taken as clear; where clouds hid the sun, "
+            "state --sky overcast or --cloudiness",
+            ", ".join(untold),
+        )
 
 
 def _grey_share(place: Place, transport: TexelTransport, photograph: Observation) -> float | None:

@@ -31,6 +31,9 @@ if TYPE_CHECKING:
     from seasonscapes.terrain.synthetic_massif import SyntheticMassif
     from seasonscapes.terrain.unwrap import Atlas
 
+# So far a solved camera may lie in the ground, where heights are known no better, and is then lifted to the second [m].
+HEIGHT_TOLERANCE_M, LEAST_ABOVE_GROUND_M = 5.0, 1.0
+
 __all__ = ["MeshOptions", "Place", "find_scene", "ground_height_m", "load_place", "utc_at"]
 
 _TERRAIN_CODE = ("workflows.terrain_building",)

@@ -62,10 +62,9 @@ class RecoveryPlan:
         return (_BYTES + _BYTES_PER_TEXEL * self.texels + _BYTES_PER_PIXEL * self.pixels) / 1e9
 
     def __str__(self) -> str:
-        return (
-            f"{self.texels / 1e3:.0f} thousand texels of {self.texel_m:.3g} m (a pixel covers {self.footprint_m:.3g} m in "
-            f"the median), {self.pixels / 1e6:.2g} million pixels, about {self.memory_gb:.1f} GB"
-        )
+        known = f"a pixel covers {self.footprint_m:.3g} m in the median"
+        covers = known if np.isfinite(self.footprint_m) else "the cameras see no ground of these heights near them"
+        return f"{self.texels / 1e3:.0f} thousand texels of {self.texel_m:.3g} m ({covers}), {self.pixels / 1e6:.2g} million pixels, about {self.memory_gb:.1f} GB"
 
 
 def plan_recovery(

@@ -133,7 +133,7 @@ def _grouped_days(
     if len(days) < 2:
         return [days]
     # Prepared together, since photographs of one camera share their footprints.
-    prepared = photographs_of_ground(place, transport, photographs, model)[0]
+    prepared = photographs_of_ground(place, transport, photographs, model, progress)[0]
     known: list[date] = []
     estimates: list[AlbedoEstimate] = []
     doubts: dict[date, str] = {}

@@ -172,6 +172,8 @@ class CameraHours:
         ``(H, W, 3)`` median of the pictures, sRGB-encoded: the sky and all that is no terrain.
     closed
         ``(K,)`` bool: pictures whose sky is a closed layer of clouds.
+    shone
+        ``(K,)`` bool: pictures in which sunlight fell on ground (`sunlit_patches.sun_shone`).
 
     Examples
     --------
@@ -196,17 +198,18 @@ class CameraHours:
     shown: np.ndarray = field(repr=False)
     background: np.ndarray = field(repr=False)
     closed: np.ndarray = field(repr=False)
+    shone: np.ndarray = field(repr=False)
 
     @property
     def weather(self) -> list[PictureWeather]:
         """Weather of each picture, in the order of the photographs."""
-        from seasonscapes.albedo.fixed_camera import SUN_SHONE, unexplained
+        from seasonscapes.albedo.fixed_camera import unexplained
 
         odd = unexplained(self.fitted)
         return [
             PictureWeather(
                 time,
-                bool(direct > SUN_SHONE and not closed) if sun[2] > 0.0 else None,
+                bool(shone) if sun[2] > 0.0 else None,
                 each.sun,
                 each.sun_sigma,
                 each.overcast,
@@ -214,15 +217,8 @@ class CameraHours:
                 float(residual),
                 not strange,
             )
-            for time, each, sun, direct, closed, residual, strange in zip(
-                self.times,
-                self.fitted.conditions,
-                self.suns,
-                self.fitted.direct,
-                self.closed,
-                self.fitted.residual,
-                odd,
-                strict=True,
+            for time, each, sun, shone, residual, strange in zip(
+                self.times, self.fitted.conditions, self.suns, self.shone, self.fitted.residual, odd, strict=True
             )
         ]
 
@@ -237,7 +233,8 @@ class CameraHours:
         time
             An aware datetime, or ISO 8601 text; without offset it is civil time at the place.
         sky
-            ``"sun"`` takes pictures in which the sun shone, ``"no sun"`` the others, ``"any"`` all.
+            ``"sun"`` takes pictures in which all ground that faces the sun was lit, ``"no sun"`` those in which none was,
+            ``"any"`` all, those with patches of sunlight included.
 
         Returns
         -------
@@ -249,12 +246,14 @@ class CameraHours:
         InputError
             Where no picture has the stated sky.
         """
-        from seasonscapes.albedo.fixed_camera import relit_at
+        from seasonscapes.albedo.fixed_camera import SUN_SHONE, relit_at
 
         utc = utc_at(self.view.place, time)
         self._warn_of_season(utc)
         light = light_on_view(self.view, utc)
-        taken = [k for k, each in enumerate(self.weather) if sky == "any" or bool(each.sun_shone) == (sky == "sun")]
+        lit = (self.fitted.direct > SUN_SHONE) & ~self.closed
+        alike = {"any": np.ones_like(lit), "sun": lit, "no sun": ~self.shone}[sky]
+        taken = [k for k, each in enumerate(alike) if each]
         if not taken:
             raise InputError("--sky", "no picture has this sky", got=sky, cure="give --sky any")
         angle = np.degrees(np.arccos(np.clip(self.suns[taken] @ light.sun_direction, -1.0, 1.0)))
@@ -318,6 +317,7 @@ def camera_hours(place: Place, photographs: Sequence[Observation], *, progress: 
     """
     from seasonscapes.albedo.cloud_cover import closed_clouds, sky_above
     from seasonscapes.albedo.fixed_camera import fit_fixed_camera
+    from seasonscapes.albedo.sunlit_patches import sun_shone
     from seasonscapes.rendering.backend import use_backend
 
     if not photographs:
@@ -333,17 +333,18 @@ def camera_hours(place: Place, photographs: Sequence[Observation], *, progress: 
     photographs, encoded = [each for each, _, _ in clear], [image for _, image, _ in clear]
     usable = [mask for _, _, mask in clear]
     lights = [light_on_view(view, each.time) for each in photographs]
+    values = [image.reshape(-1, 3)[view.pixel] for image in encoded]
     fitted = fit_fixed_camera(
-        [image.reshape(-1, 3)[view.pixel] for image in encoded],
-        usable,
-        lights,
-        view.distance_km,
-        view.normal,
-        progress=task_progress(progress, "ground and weather"),
+        values, usable, lights, view.distance_km, view.normal, progress=task_progress(progress, "ground and weather")
     )
     terrain = np.zeros((camera.height_px, camera.width_px), bool)
     terrain.reshape(-1)[view.pixel] = True
-    sky = sky_above(terrain)
+    sky, size = sky_above(terrain), (camera.width_px, camera.height_px)
+    closed = [closed_clouds(image, sky & each.mask) for each, image in zip(photographs, encoded, strict=True)]
+    shone = [
+        sun_shone(fitted, direct, picture, mask, light, view.pixel, size, closed=cloud)
+        for direct, picture, mask, light, cloud in zip(fitted.direct, values, usable, lights, closed, strict=True)
+    ]
     hours = CameraHours(
         photographs[0].webcam,
         view,
@@ -352,7 +353,8 @@ def camera_hours(place: Place, photographs: Sequence[Observation], *, progress: 
         np.stack([each.sun_direction for each in lights]),
         np.any(usable, axis=0),
         np.median(encoded, axis=0),
-        np.array([closed_clouds(image, sky & each.mask) for each, image in zip(photographs, encoded, strict=True)]),
+        np.array(closed),
+        np.array(shone),
     )
     for each in hours.weather:
         if not each.explained:
@@ -437,7 +439,7 @@ def webcam_photographs(
         )
     for row in rows:
         sources.picture_of(row)
-    opened = observations(rows, sources, place.frame, progress=progress)
+    opened = observations(rows, sources, place.frame, terrain=place.terrain, progress=progress)
     return opened if most_pixels is None else [reduced_observation(each, most_pixels) for each in opened]
 
 

@@ -13,7 +13,14 @@ from seasonscapes.declaration import validate
 from seasonscapes.errors import InputError
 from seasonscapes.frames import geodetic_from_enu
 from seasonscapes.scene import NamedCamera, Viewpoint, camera_from_named_view
-from seasonscapes.workflows.place import Place, ground_height_m, ground_or_nan, require_near
+from seasonscapes.workflows.place import (
+    HEIGHT_TOLERANCE_M,
+    LEAST_ABOVE_GROUND_M,
+    Place,
+    ground_height_m,
+    ground_or_nan,
+    require_near,
+)
 
 if TYPE_CHECKING:
     from seasonscapes.cameras.panorama import Panorama
@@ -90,6 +97,14 @@ def camera_for(place: Place, view: Viewpoint, *, size_px: tuple[int, int], where
     else:
         require_near(place, view.latitude_deg, view.longitude_deg, where=where)
         ground = ground_or_nan(place, view.latitude_deg, view.longitude_deg)
+        if view.height_m is not None and ground - HEIGHT_TOLERANCE_M <= view.height_m < ground:
+            log.warning(
+                "%s stands %.1f m below the ground, within what its heights are known to: it is lifted to %g m above",
+                view.name if isinstance(view, NamedCamera) else where,
+                ground - view.height_m,
+                LEAST_ABOVE_GROUND_M,
+            )
+            view = view.model_copy(update={"height_m": ground + LEAST_ABOVE_GROUND_M})
         if view.height_m is not None and view.height_m < ground:
             raise InputError(
                 where,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -155,10 +155,12 @@ def webcam_station(
     >>> station.view.width_px
     960
     """
+    from seasonscapes.calibration.terrain_horizon import terrain_height
     from seasonscapes.cameras.webcam import find_webcam, webcam_model
-    from seasonscapes.terrain.crs import map_position
-    from seasonscapes.terrain.raster import fill_nodata, sample_raster
+    from seasonscapes.terrain.raster import fill_nodata
+    from seasonscapes.workflows.nested_heights import finer_heights
     from seasonscapes.workflows.terrain_building import read_scene_elevation
+    from seasonscapes.workspace import default_workspace
 
     read = scene_with_webcams(scene, allow_outside=allow_outside)
     if webcam is None and len(read.webcams) > 1:
@@ -169,8 +171,9 @@ def webcam_station(
         raise InputError(scene, "names no elevation raster", cure="give one with --elevation FILE")
     files = [elevation, *([] if context is None else [context])]
     rasters = [fill_nodata(read_scene_elevation(read, file), where=str(file or own))[0] for file in files]
-    x, y = map_position(rasters[0], found.latitude_deg, found.longitude_deg)
-    ground = float(sample_raster(rasters[0], x, y)[..., 0])
+    if elevation is None and read.elevation is not None and read.elevation.finer:
+        rasters = [*reversed(finer_heights(read, rasters[0], None, default_workspace(), {})), *rasters]
+    ground = float(terrain_height(rasters, [found.latitude_deg], [found.longitude_deg])[0])
     if not np.isfinite(ground):
         raise InputError("--webcam", f"'{found.id}' stands outside the elevation raster")
     frame = LocalFrame(found.latitude_deg, found.longitude_deg, 0.0, read.refraction_k)
@@ -356,7 +359,7 @@ def _by_points(station: WebcamStation, points: Correspondences | None, *, radial
     """The resection of points; without points, the pose that is known already."""
     from seasonscapes.calibration.evidence import Priors
     from seasonscapes.calibration.pose_model import parameters_of_view
-    from seasonscapes.calibration.resection import Calibration, resect
+    from seasonscapes.calibration.resection import Calibration, ResectionOptions, resect
 
     if points is None:
         parameters = parameters_of_view(station.view, station.axes)
@@ -364,7 +367,31 @@ def _by_points(station: WebcamStation, points: Correspondences | None, *, radial
         return Calibration(station.view, 0.0, parameters, np.zeros((9, 9)), (), *none, noise_px=0.0)
     sigma_m = station.webcam.position_sigma_m
     priors = Priors(horizontal_m=sigma_m, vertical_m=sigma_m, k1=np.inf if radial else 0.0)
-    return resect(station.view, points, priors=priors, k1=station.webcam.radial_k1, axes=station.axes)
+    options = ResectionOptions(ground_m=_ground_of(station), ground_sigma_m=_ground_sigma_m(station))
+    return resect(station.view, points, priors=priors, k1=station.webcam.radial_k1, axes=station.axes, options=options)
+
+
+def _ground_sigma_m(station: WebcamStation) -> float:
+    """Standard deviation of interpolated heights of mountains [m]: a tenth of a cell's side, at least 1 m."""
+    from seasonscapes.calibration.terrain_horizon import cell_size_m, terrain_height
+
+    at = [station.webcam.latitude_deg], [station.webcam.longitude_deg]
+    about = [each for each in station.rasters if np.isfinite(terrain_height([each], *at)[0])]
+    return max(0.1 * cell_size_m(about[0] if about else station.rasters[0]), 1.0)
+
+
+def _ground_of(station: WebcamStation) -> Callable[[float, float], float]:
+    """Height of the ground in the station's frame [m] at (east, north) [m]; NaN outside the rasters."""
+    from seasonscapes.calibration.terrain_horizon import terrain_height
+    from seasonscapes.frames import enu_from_geodetic, geodetic_from_enu
+
+    def ground_m(east_m: float, north_m: float) -> float:
+        plan = np.array([[east_m, north_m, station.view.position_m[2]]])
+        latitude, longitude, _ = geodetic_from_enu(station.frame, plan)
+        height = terrain_height(station.rasters, latitude, longitude)
+        return float(enu_from_geodetic(station.frame, latitude, longitude, height)[0, 2])
+
+    return ground_m
 
 
 def _without_lens(

@@ -1,0 +1,82 @@
+"""Photographs without sky: what stands for their exposure and white balance, and that it is said."""
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import seasonscapes as ss
+from seasonscapes.albedo import tone_curve
+from seasonscapes.albedo.assumed_exposure import with_assumed_exposure
+from seasonscapes.albedo.closed_form import solve_albedo
+from seasonscapes.albedo.photographs import EIGHT_BIT, prepare_photographs
+from seasonscapes.cameras.observation import Observation
+from seasonscapes.images import linear_from_srgb, srgb_from_linear
+from seasonscapes.workflows.albedo_recovery import RecoveryOptions, _prepared, photographs_of_ground, texel_transport
+from seasonscapes.workflows.albedo_sources import scene_albedo
+from seasonscapes.workflows.illumination import illumination_for_camera, sky_model
+from seasonscapes.workflows.place import utc_at
+from seasonscapes.workflows.recovery_methods import closed_fit
+
+MORNING, NOON = "2024-07-20T09:00", "2024-07-20T13:30"
+
+
+@pytest.fixture(scope="module")
+def taken():
+    """A small place, its transport, and photographs of two hours, exposed and balanced for level ground, with and without sky."""
+    place = ss.load_place("alpine_small")
+    camera = ss.camera(place, "aerial", size_px=(96, 64))
+    with_sky, without = [], []
+    for time in (MORNING, NOON):
+        view = ss.render(place, camera, time, sky="clear", spp=16)
+        utc = utc_at(place, time)
+        light = illumination_for_camera(place, camera, sky_model("clear"), utc)[0]
+        linear = np.clip(view.radiance * np.pi / light.global_horizontal_lx, 0.0, 1.0)
+        picture = linear_from_srgb(np.round(255.0 * srgb_from_linear(linear)) / 255.0).astype(np.float32)
+        ground = np.isfinite(view.gbuffer.depth)
+        with_sky.append(Observation(picture, np.ones_like(ground), camera, utc, "hut"))
+        without.append(Observation(picture, ground, camera, utc, "hut"))
+    return place, texel_transport(place), with_sky, without
+
+
+def _error(place, fit) -> tuple[float, float]:
+    """Errors of the mean albedo over measured texels: of its brightness, and of its colour, relative."""
+    seen = fit.pixel_count > 0.5
+    ratio = fit.albedo[seen].mean(axis=0) / scene_albedo(place, "2024-07-20").values[seen].mean(axis=0)
+    return abs(float(np.log(ratio.mean()))), float(np.ptp(ratio) / ratio.mean())
+
+
+def test_without_sky_albedo_has_the_cameras_own_brightness_and_colour(taken, caplog):
+    place, transport, _, without = taken
+    with caplog.at_level(logging.WARNING):
+        prepared, _, _ = photographs_of_ground(place, transport, without, sky_model("clear"))
+    assert sum("exposure and white balance" in each.message for each in caplog.records) == 1
+    brightness, colour = _error(place, closed_fit(transport, prepared))
+    assert brightness < 0.1
+    assert colour < 0.06
+    # The airlight before the terrain is all that told them otherwise.
+    unknown = [replace(each, gain=None) for each in prepared]
+    worse = _error(place, solve_albedo(transport, unknown, noise_model=EIGHT_BIT))
+    assert worse[0] > 2.0 * brightness or worse[1] > 2.0 * colour
+
+
+def test_one_photograph_of_a_day_is_assumed_and_the_sky_comes_first(taken):
+    place, transport, with_sky, without = taken
+    lights = [illumination_for_camera(place, each.camera, sky_model("clear"), each.time)[0] for each in without]
+    dark = prepare_photographs(transport, without, lights)
+    gains = [each.gain for each in with_assumed_exposure(dark)]
+    assert gains[0] is None
+    assert gains[1] == pytest.approx(np.pi / lights[1].global_horizontal_lx)
+    seen = prepare_photographs(transport, [without[0], with_sky[1]], lights)
+    assert [each.gain for each in with_assumed_exposure(seen)] == [None, None]
+
+
+def test_the_tone_curve_of_one_such_photograph_is_not_guessed(taken, monkeypatch):
+    place, transport, _, without = taken
+    monkeypatch.setattr(tone_curve, "fit_tone_curve", lambda *given, **named: tone_curve.ToneCurveFit(0.4, {}))
+    options = RecoveryOptions(fit_curve=True)
+    one = _prepared(place, transport, without[:1], sky_model("clear"), options, None)[2]
+    two = _prepared(place, transport, without, sky_model("clear"), options, None)[2]
+    assert "curve_strength" not in one
+    assert two["curve_strength"] == 0.4
