@@ -114,7 +114,7 @@ def _fitted(
     image = np.array([name.startswith("satellite") for name in predictors.names])
     if image.any():
         hidden = _rows_of(predictors, _drawn(predictors.surface & ~painted, count, rng), tile_px)
-        missing = ~np.isfinite(hidden[:, image]).all(axis=1)
+        missing = np.asarray(~np.isfinite(hidden[:, image]).all(axis=1))
         predictor = without_images(predictor, image, float(missing.mean()) if len(missing) else 0.0, rng)
     row, column = np.divmod(texel, painted.shape[1])
     fold = spatial_folds(np.stack([column, row], -1), painted, predictors.surface & ~painted, seed)
