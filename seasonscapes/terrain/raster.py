@@ -462,12 +462,12 @@ def fill_nodata(
     InputError
         All cells are missing, or more than ``max_share`` of them.
     """
-    from scipy import ndimage
-
     hole = ~np.all(np.isfinite(raster.values), axis=2)
     cells = int(hole.sum())
     if cells == 0:
         return raster, FillReport(0, 0.0, 0, 0)
+    from scipy import ndimage
+
     if cells == hole.size:
         raise InputError(os.fspath(where), "no data at all in the requested area", cure="check area and nodata value")
     share = cells / hole.size
