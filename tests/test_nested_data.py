@@ -353,3 +353,49 @@ def test_ground_without_a_coarse_image_takes_the_finer_one(tmp_path):
     middle = tuple(size // 2 for size in place.texture_shape)
     np.testing.assert_allclose(texture.values[middle], 0.4, rtol=0.25)
     assert texture.weight[middle] > 0.9
+
+
+AREA = "[area]\nwest_deg = 7.974\neast_deg = 7.987\nsouth_deg = 46.547\nnorth_deg = 46.556\n"
+WEBCAM = """
+[[webcam]]
+id = "hill"
+latitude_deg = 46.5505
+longitude_deg = 7.981
+above_ground_m = 20.0
+projection = "perspective"
+width_px = 320
+height_px = 200
+horizontal_fov_deg = 60.0
+heading_deg = 2.0
+time_zone = "Europe/Zurich"
+"""
+
+
+@pytest.mark.parametrize("first", ["place", "calibration"])
+def test_a_calibration_and_the_place_keep_the_same_finer_heights_in_either_order(first, tmp_path, monkeypatch):
+    from seasonscapes.workflows.webcam_calibration import webcam_station
+
+    path = write_nested(tmp_path)
+    path.write_text(path.read_text().replace("[elevation]", AREA + "[elevation]", 1) + WEBCAM)
+    monkeypatch.setenv("SEASONSCAPES_WORKSPACE", str(tmp_path / "workspace"))
+    loaded = load_place(path) if first == "place" else None
+    finer, whole = webcam_station(str(path)).rasters
+    loaded = loaded or load_place(path)
+    (kept,) = loaded.finer_heights
+    np.testing.assert_array_equal(finer.values, kept.values)
+    assert kept.transform == finer.transform
+    # Cut to the area, 1.0 km by 1.0 km and a margin, out of 1.5 km by 1.5 km; what lies beyond it may still be on the skyline.
+    assert kept.values.shape[1] * 2.5 < 1400.0
+    assert whole.values.shape == base().values.shape
+    assert loaded.elevation.values.shape < whole.values.shape
+
+
+def test_finer_heights_of_other_bounds_are_other_ones(tmp_path):
+    from seasonscapes.scene import read_scene
+
+    path, workspace = write_nested(tmp_path), Workspace(tmp_path / "workspace")
+    scene, elevation = read_scene(path), base()
+    (whole,) = heights_workflow.finer_heights(scene, elevation, None, workspace, {})
+    cut = replace(elevation, values=elevation.values[20:41], transform=elevation.transform @ Affine.translation(0, 20))
+    (part,) = heights_workflow.finer_heights(scene, cut, None, workspace, {})
+    assert part.values.shape[0] < 0.8 * whole.values.shape[0]

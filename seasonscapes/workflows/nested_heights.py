@@ -73,11 +73,11 @@ def finer_heights(
     """
     parts: list[Raster] = []
     assert scene.elevation is not None, "callers refuse scenes without elevation"
+    bounds_deg = bounds_geographic(elevation)
     for declared in _coarse_first(scene):
         under = (*reversed(parts), elevation)
 
         def build(declared: FinerHeights = declared, under: tuple[Raster, ...] = under) -> _Built:
-            bounds_deg = bounds_geographic(elevation)
             fine = _read(scene, declared, bounds_deg, _finest_m(scene, declared, bounds_deg))
             heights, offset = nested_heights(fine, under, bounds_deg=bounds_deg, where=declared.label)
             return (heights if water is None else _with_lakes(heights, under, water)), offset
@@ -89,7 +89,8 @@ def finer_heights(
                 "elevation": scene.elevation.without_folders(),
                 "hash": rasters_hash(scene.elevation.all_paths, scene.confinement),
                 "part": declared.without_folders(),
-                "area": scene.area,
+                # A caller may have read more or less than the scene's area; another machine, another last digit.
+                "bounds": [round(each, 9) for each in bounds_deg],
                 **water_key,
             },
             code=_CODE,

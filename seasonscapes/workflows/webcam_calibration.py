@@ -159,7 +159,7 @@ def webcam_station(
     from seasonscapes.cameras.webcam import find_webcam, webcam_model
     from seasonscapes.terrain.raster import fill_nodata
     from seasonscapes.workflows.nested_heights import finer_heights
-    from seasonscapes.workflows.terrain_building import read_scene_elevation
+    from seasonscapes.workflows.terrain_building import read_heights, read_scene_elevation
     from seasonscapes.workspace import default_workspace
 
     read = scene_with_webcams(scene, allow_outside=allow_outside)
@@ -171,8 +171,10 @@ def webcam_station(
         raise InputError(scene, "names no elevation raster", cure="give one with --elevation FILE")
     files = [elevation, *([] if context is None else [context])]
     rasters = [fill_nodata(read_scene_elevation(read, file), where=str(file or own))[0] for file in files]
-    if elevation is None and read.elevation is not None and read.elevation.finer:
-        rasters = [*reversed(finer_heights(read, rasters[0], None, default_workspace(), {})), *rasters]
+    if elevation is None and own is not None and read.elevation is not None and read.elevation.finer:
+        # Blended into the heights of the scene's area, as `load_place` blends them; the skyline is that of all the heights.
+        within, _ = read_heights(read, None, where=own)
+        rasters = [*reversed(finer_heights(read, within, None, default_workspace(), {})), *rasters]
     ground = float(terrain_height(rasters, [found.latitude_deg], [found.longitude_deg])[0])
     if not np.isfinite(ground):
         raise InputError("--webcam", f"'{found.id}' stands outside the elevation raster")
