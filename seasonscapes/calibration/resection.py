@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 
 from seasonscapes.calibration.evidence import PARAMETERS, Correspondences, Priors, select_points
+from seasonscapes.calibration.ground_clearance import LEAST_ABOVE_GROUND_M, TOLERANCE_SIGMAS
 from seasonscapes.calibration.initial_rotation import check_orientation, rotation_among_pairs
 from seasonscapes.calibration.pose_model import View, parameters_of_view, pixel_error, view_from_parameters
 from seasonscapes.cameras.lens import Lens
@@ -24,8 +25,6 @@ from seasonscapes.errors import CameraBelowGround, NotEnoughEvidence
 Loss = Literal["cauchy", "l1", "squares"]
 # Threshold on the residual of an inlier [standard deviations]: probability 0.999 of two pixel coordinates (χ², 2 dof).
 OUTLIER_SIGMAS = 3.717
-# No camera lies on the ground: the lowest ones stand on posts and sills.
-_LEAST_ABOVE_GROUND_M = 1.0
 
 # Maps whitened residual vectors (N, D) to vectors whose squared length is the robust loss.
 _RobustLoss = Callable[[np.ndarray], np.ndarray]
@@ -210,7 +209,8 @@ def resect(
         If there are fewer points than unknowns without a prior require, the points are mirrored, flipped, in reverse
         order, behind the camera or have no common pose, or a parameter remains undetermined.
     CameraBelowGround
-        If the start or the solution lies more than five standard deviations of the heights below the ground.
+        If the solution lies more than five standard deviations of the heights below the ground, or the start more than five of
+        its heights and of its own prior together.
     ValueError
         If neither points nor a skyline are given.
     """
@@ -220,7 +220,8 @@ def resect(
     # A panorama has no radial distortion; the horizon row of a perspective camera is not separable from its tilt.
     sigmas[8 if isinstance(start, Camera) else 7] = 0.0
     origin = parameters_of_view(start, axes, k1)
-    _check_above_ground(origin, options, "the start")
+    # A start is known as badly as its prior says: the evidence may lift it out of the ground.
+    _check_above_ground(origin, options, "the start", sigma_m=float(np.hypot(options.ground_sigma_m, sigmas[5])))
     if points is None and skyline is None:
         raise ValueError("resect: neither points nor a skyline given")
     parameters = origin.copy() if options.guess is None else np.array(options.guess, float)
@@ -237,7 +238,7 @@ def resect(
     problem = ResectionProblem(start, axes, origin, sigmas, points, skyline, options.ground_m, options.ground_sigma_m)
     parameters, outlier, noise = _solve(problem, parameters, options.loss, options.noise_px)
     calibration = _calibration(problem, parameters, outlier, noise, widen=options.noise_px is None)
-    _check_above_ground(parameters, options, "the solution")
+    _check_above_ground(parameters, options, "the solution", sigma_m=options.ground_sigma_m)
     return calibration
 
 
@@ -294,9 +295,9 @@ def _check_point_count(count: int, sigmas: np.ndarray, has_skyline: bool) -> Non
         raise NotEnoughEvidence(f"{count} points for {unknowns} unknowns without a prior: at least {needed} are needed")
 
 
-def _check_above_ground(parameters: np.ndarray, options: ResectionOptions, what: str) -> None:
+def _check_above_ground(parameters: np.ndarray, options: ResectionOptions, what: str, *, sigma_m: float) -> None:
     below = _depth_m(options, parameters)
-    if below > 5.0 * options.ground_sigma_m:
+    if below > TOLERANCE_SIGMAS * sigma_m:
         raise CameraBelowGround(
             f"{what} puts the camera {below:.0f} m below ground; check its height and vertical datum"
         )
@@ -327,7 +328,7 @@ def _residual_rows(
     offset[0] = (offset[0] + 180.0) % 360.0 - 180.0
     rows.append(offset[has_prior] / problem.sigmas[has_prior])
     if problem.ground_m is not None:
-        rows.append(np.array([_depth_m(problem, parameters, _LEAST_ABOVE_GROUND_M) / problem.ground_sigma_m]))
+        rows.append(np.array([_depth_m(problem, parameters, LEAST_ABOVE_GROUND_M) / problem.ground_sigma_m]))
     return np.concatenate(rows)
 
 

@@ -185,7 +185,7 @@ def painting_of(
     tiles = place.workspace.folder / place.scene.name / f"tiles-{artefact_key(inputs, _CODE)}"
 
     def build() -> Painting:
-        opened = observations(rows, sources, place.frame, terrain=place.terrain, progress=progress)
+        opened = observations(rows, sources, place.frame, place=place, progress=progress)
         return paint(place, opened, sky=model, options=options, reference=reference, resume=tiles, progress=progress)
 
     painting = build_once(

@@ -11,19 +11,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from seasonscapes.calibration.ground_clearance import LEAST_ABOVE_GROUND_M, clear_of_ground
 from seasonscapes.cameras.pinhole import view_in_frame
 from seasonscapes.errors import InputError, UnreadableImage
 from seasonscapes.progress import Progress, each_reported
 from seasonscapes.terrain.raster_files import real_path
-from seasonscapes.workflows.place import HEIGHT_TOLERANCE_M, LEAST_ABOVE_GROUND_M, Place, utc_at
+from seasonscapes.workflows.camera_ground import GroundBelow, ground_below
+from seasonscapes.workflows.place import Place, utc_at
 
 if TYPE_CHECKING:
     from seasonscapes.calibration.calibration_file import CalibratedWebcam
     from seasonscapes.cameras.observation import ManifestRow, Observation
-    from seasonscapes.cameras.panorama import Panorama
-    from seasonscapes.cameras.pinhole import Camera
     from seasonscapes.frames import LocalFrame
-    from seasonscapes.terrain.surface import Terrain
 
 log = logging.getLogger(__name__)
 
@@ -142,7 +141,7 @@ def photographs_at(
     """
     near = [rows_at(sources, time, within_min=within_min, where=where) for time in times]
     rows = {row.path: row for group in near for row in group}
-    opened = observations(list(rows.values()), sources, place.frame, terrain=place.terrain, progress=progress)
+    opened = observations(list(rows.values()), sources, place.frame, place=place, progress=progress)
     return opened if most_pixels is None else [reduced_observation(each, most_pixels) for each in opened]
 
 
@@ -213,13 +212,14 @@ def observations(
     sources: PhotographSources,
     frame: LocalFrame,
     *,
-    terrain: Terrain | None = None,
+    place: Place | None = None,
     progress: Progress | None = None,
 ) -> list[Observation]:
     """Open photographs as pinhole observations in a frame.
 
-    Webcams without a calibration, and pictures whose pose is doubtful, are left out with a warning; so are cameras far below the
-    ground of ``terrain``, while those that lie in it by no more than heights are known to are lifted out.
+    Webcams without a calibration, and pictures whose pose is doubtful, are left out with a warning. With a ``place``, so are cameras
+    deeper in its ground than heights are known to (`calibration.ground_clearance.ground_tolerance_m`), while others that stand
+    less than a metre above it are lifted to that.
 
     Raises
     ------
@@ -230,6 +230,7 @@ def observations(
 
     opened: list[Observation] = []
     doubtful: list[str] = []
+    lifter = None if place is None else _Lifter(place, accept_doubtful=sources.accept_doubtful)
     for row in each_reported(rows, len(rows), progress, "opening photographs"):
         record = sources.calibration_of(row.webcam, row.time)
         if not record.is_file():
@@ -239,15 +240,16 @@ def observations(
             doubtful.append(f"{record.name}: {'; '.join(calibrated.doubts)}")
             continue
         views = opened_views(row, sources, calibrated, frame)
-        depth_m = -np.inf if terrain is None else _depth_m(terrain, views[0].camera)
-        if depth_m > HEIGHT_TOLERANCE_M and not sources.accept_doubtful:
-            doubtful.append(f"{record.name}: the camera stands {depth_m:.1f} m below the ground of the terrain")
-            continue
-        if depth_m > 0.0:
-            log.warning("%s: the camera stands %.1f m below the ground of the terrain: lifted", record.name, depth_m)
-            views = [_lifted(view, depth_m + LEAST_ABOVE_GROUND_M) for view in views]
+        if lifter is not None:
+            below = lifter.below(views, record.name)
+            if below.too_deep_m and not sources.accept_doubtful:
+                known = f"whose heights are known to {below.tolerance_m:.0f} m"
+                deep = f"the camera stands {below.too_deep_m:.1f} m below the ground of the terrain, {known}"
+                doubtful.append(f"{record.name}: {deep}")
+                continue
+            views = [replace(view, camera=clear_of_ground(view.camera, below.up_m)) for view in views]
         opened += views
-    without = uncalibrated(rows, sources)
+    without, doubtful = uncalibrated(rows, sources), list(dict.fromkeys(doubtful))
     if not opened and doubtful:
         raise InputError(
             sources.calibrations,
@@ -268,18 +270,22 @@ def observations(
     return opened
 
 
-def _depth_m(terrain: Terrain, camera: Camera | Panorama) -> float:
-    """How far below the mesh a camera stands [m]; negative above it, and minus infinity beside it."""
-    from seasonscapes.terrain.surface import mesh_up_m
+class _Lifter:
+    """Lifts cameras that lie in the ground; looks, and tells, once for each position that photographs were taken from."""
 
-    up = mesh_up_m(terrain, camera.position_m)
-    return up - float(camera.position_m[2]) if np.isfinite(up) else -np.inf
+    def __init__(self, place: Place, *, accept_doubtful: bool) -> None:
+        self._place, self._accept_doubtful = place, accept_doubtful
+        self._known: dict[tuple[float, ...], GroundBelow] = {}
 
-
-def _lifted(view: Observation, by_m: float) -> Observation:
-    pose = view.camera.world_from_camera.copy()
-    pose[2, 3] += by_m
-    return replace(view, camera=replace(view.camera, world_from_camera=pose))
+    def below(self, views: list[Observation], name: str) -> GroundBelow:
+        """The ground below one photograph's views, told of where these are to be lifted."""
+        position_m = views[0].camera.position_m
+        key = tuple(np.round(position_m, 3).tolist())
+        if key not in self._known:
+            self._known[key] = found = ground_below(self._place, position_m)
+            if found.lifts and (self._accept_doubtful or not found.too_deep_m):
+                log.warning("%s: the camera stands %s: lifted to %g m above", name, found, LEAST_ABOVE_GROUND_M)
+        return self._known[key]
 
 
 def opened_views(

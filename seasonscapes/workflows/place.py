@@ -18,8 +18,9 @@ from seasonscapes.progress import Progress, task_progress
 from seasonscapes.scene import SceneFile, read_scene
 from seasonscapes.source_hash import source_hash
 from seasonscapes.terrain.raster_files import rasters_hash
-from seasonscapes.terrain.surface import Raster, Terrain, Texture, atlas_identity, mesh_up_m, require_atlas
+from seasonscapes.terrain.surface import Raster, Terrain, Texture, atlas_identity, require_atlas
 from seasonscapes.terrain.water import levelled
+from seasonscapes.workflows.camera_ground import rendered_up_m
 from seasonscapes.workflows.nested_heights import finer_heights
 from seasonscapes.workflows.scene_water import scene_water, water_key
 from seasonscapes.workflows.terrain_building import MeshOptions
@@ -30,9 +31,6 @@ if TYPE_CHECKING:
     from seasonscapes.terrain.raster import FillReport
     from seasonscapes.terrain.synthetic_massif import SyntheticMassif
     from seasonscapes.terrain.unwrap import Atlas
-
-# So far a solved camera may lie in the ground, where heights are known no better, and is then lifted to the second [m].
-HEIGHT_TOLERANCE_M, LEAST_ABOVE_GROUND_M = 5.0, 1.0
 
 __all__ = ["MeshOptions", "Place", "find_scene", "ground_height_m", "load_place", "utc_at"]
 
@@ -367,10 +365,7 @@ def ground_or_nan(place: Place, latitude_deg: float, longitude_deg: float) -> fl
     x, y = map_position(place.elevation, latitude_deg, longitude_deg)
     height = float(sample_raster(place.elevation, x, y)[..., 0])
     position = enu_from_geodetic(place.frame, latitude_deg, longitude_deg, np.nan_to_num(height))
-    rendered = mesh_up_m(place.terrain, position)
-    if place.terrain.surface is not None and np.isfinite(rendered):
-        # Near a camera the mesh is refined towards this surface.
-        rendered = max(rendered, float(place.terrain.surface.up_at(position[None])[0]))
+    rendered = rendered_up_m(place.terrain, position)
     return height + (rendered - float(position[2])) if np.isfinite(rendered) else height
 
 

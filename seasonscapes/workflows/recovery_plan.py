@@ -21,6 +21,7 @@ from seasonscapes.cameras.pinhole import project
 if TYPE_CHECKING:
     from seasonscapes.calibration.calibration_file import CalibratedWebcam
     from seasonscapes.cameras.pinhole import Camera
+    from seasonscapes.frames import LocalFrame
     from seasonscapes.terrain.surface import Raster
     from seasonscapes.workflows.photograph_files import PhotographSources
     from seasonscapes.workspace import Workspace
@@ -115,7 +116,9 @@ def plan_recovery(
     views = [view for record in records.values() for view in _views_of(record)]
     width_m, height_m = cell_sides_m(raster)
     area_m2 = width_m * height_m * raster.values.shape[0] * raster.values.shape[1]
-    footprints = [footprint_m(view, raster, record.frame) for record in records.values() for view in _views_of(record)]
+    footprints = [
+        _clear_footprint_m(view, raster, record.frame) for record in records.values() for view in _views_of(record)
+    ]
     footprint = float(np.nanmedian(footprints)) if np.isfinite(footprints).any() else float("nan")
     if texel_m is None:
         least = float(np.sqrt(area_m2 / MOST_TEXELS))
@@ -134,6 +137,21 @@ def _views_of(record: CalibratedWebcam) -> list[Camera]:
     """The pinhole views of a webcam's pictures, at the size at which they are used."""
     whole = split_panorama(record.view) if isinstance(record.view, Panorama) else [record.view]
     return [reduced_camera(view, MOST_PIXELS) for view in whole]
+
+
+def _clear_footprint_m(camera: Camera, raster: Raster, frame: LocalFrame) -> float:
+    """`footprint_m` of a camera that is lifted where it lies in these heights, as it is when its photographs are opened.
+
+    However deep it lies: these are the scene's coarse heights, and where finer ones lie lower the camera may stand on them.
+    """
+    from seasonscapes.calibration.ground_clearance import clear_of_ground
+    from seasonscapes.calibration.terrain_horizon import terrain_height
+    from seasonscapes.frames import enu_from_geodetic, geodetic_from_enu
+
+    latitude, longitude, _ = (float(each) for each in geodetic_from_enu(frame, camera.position_m))
+    height_m = float(terrain_height([raster], [latitude], [longitude])[0])
+    up_m = float(enu_from_geodetic(frame, latitude, longitude, height_m)[2])
+    return footprint_m(clear_of_ground(camera, up_m), raster, frame)
 
 
 def reduced_camera(camera: Camera, most_pixels: int) -> Camera:

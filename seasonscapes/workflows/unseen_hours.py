@@ -439,7 +439,7 @@ def webcam_photographs(
         )
     for row in rows:
         sources.picture_of(row)
-    opened = observations(rows, sources, place.frame, terrain=place.terrain, progress=progress)
+    opened = observations(rows, sources, place.frame, place=place, progress=progress)
     return opened if most_pixels is None else [reduced_observation(each, most_pixels) for each in opened]
 
 

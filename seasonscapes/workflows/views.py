@@ -9,18 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from seasonscapes.calibration.ground_clearance import LEAST_ABOVE_GROUND_M
 from seasonscapes.declaration import validate
 from seasonscapes.errors import InputError
-from seasonscapes.frames import geodetic_from_enu
+from seasonscapes.frames import enu_from_geodetic, geodetic_from_enu
 from seasonscapes.scene import NamedCamera, Viewpoint, camera_from_named_view
-from seasonscapes.workflows.place import (
-    HEIGHT_TOLERANCE_M,
-    LEAST_ABOVE_GROUND_M,
-    Place,
-    ground_height_m,
-    ground_or_nan,
-    require_near,
-)
+from seasonscapes.workflows.camera_ground import ground_below
+from seasonscapes.workflows.place import Place, ground_height_m, ground_or_nan, require_near
 
 if TYPE_CHECKING:
     from seasonscapes.cameras.panorama import Panorama
@@ -76,6 +71,9 @@ def camera(place: Place, view: str | Viewpoint | None = None, *, size_px: tuple[
 def camera_for(place: Place, view: Viewpoint, *, size_px: tuple[int, int], where: str = "--camera") -> Camera:
     """Return the pinhole camera of a viewpoint.
 
+    A stated height less than a metre above ground, or in it by no more than heights are known to (half a cell, at least 5 m), is
+    lifted to a metre above, with a warning.
+
     Parameters
     ----------
     place
@@ -90,21 +88,20 @@ def camera_for(place: Place, view: Viewpoint, *, size_px: tuple[int, int], where
     Raises
     ------
     InputError
-        Where it stands below the ground or, given above ground, outside the raster.
+        Where it stands deeper in the ground or, given above ground, outside the raster.
     """
     if view.above_ground_m is not None:
         ground = ground_height_m(place, view.latitude_deg, view.longitude_deg, where=where)
     else:
         require_near(place, view.latitude_deg, view.longitude_deg, where=where)
         ground = ground_or_nan(place, view.latitude_deg, view.longitude_deg)
-        if view.height_m is not None and ground - HEIGHT_TOLERANCE_M <= view.height_m < ground:
-            log.warning(
-                "%s stands %.1f m below the ground, within what its heights are known to: it is lifted to %g m above",
-                view.name if isinstance(view, NamedCamera) else where,
-                ground - view.height_m,
-                LEAST_ABOVE_GROUND_M,
-            )
-            view = view.model_copy(update={"height_m": ground + LEAST_ABOVE_GROUND_M})
+        if view.height_m is not None and np.isfinite(ground):
+            at = enu_from_geodetic(place.frame, view.latitude_deg, view.longitude_deg, view.height_m)
+            below = ground_below(place, at)
+            if below.lifts and not below.too_deep_m:
+                name = view.name if isinstance(view, NamedCamera) else where
+                log.warning("%s stands %s: it is lifted to %g m above", name, below, LEAST_ABOVE_GROUND_M)
+                view = view.model_copy(update={"height_m": ground + LEAST_ABOVE_GROUND_M})
         if view.height_m is not None and view.height_m < ground:
             raise InputError(
                 where,
@@ -220,7 +217,6 @@ def camera_values(camera: Camera | Panorama) -> dict[str, Any]:
 
 def local_ground(place: Place):
     """Heights of the ground in the local frame as a function of positions ``(N, 2)`` east, north [m]; NaN outside."""
-    from seasonscapes.frames import enu_from_geodetic
     from seasonscapes.terrain.crs import map_position
     from seasonscapes.terrain.raster import sample_raster
 

@@ -334,7 +334,8 @@ def calibrate(
         solution, horizon, doubts = _by_skyline(station, picture, points, mask)
     else:
         solution, doubts = _by_points(station, points, radial=radial), ()
-        options = HorizonOptions(below_ground_m=40.0)
+        # The resection has refused what lies too deep in the ground.
+        options = HorizonOptions(below_ground_m=40.0 if points is None else np.inf)
         horizon = horizon_from(station.rasters, station.frame, solution.view.position_m, options=options)
     doubts = (*doubts, *_contradictions(station, solution, points))
     solution = replace(solution, lens=station.lens)
@@ -360,6 +361,7 @@ def _by_skyline(
 def _by_points(station: WebcamStation, points: Correspondences | None, *, radial: bool) -> Calibration:
     """The resection of points; without points, the pose that is known already."""
     from seasonscapes.calibration.evidence import Priors
+    from seasonscapes.calibration.ground_clearance import height_sigma_m
     from seasonscapes.calibration.pose_model import parameters_of_view
     from seasonscapes.calibration.resection import Calibration, ResectionOptions, resect
 
@@ -369,17 +371,10 @@ def _by_points(station: WebcamStation, points: Correspondences | None, *, radial
         return Calibration(station.view, 0.0, parameters, np.zeros((9, 9)), (), *none, noise_px=0.0)
     sigma_m = station.webcam.position_sigma_m
     priors = Priors(horizontal_m=sigma_m, vertical_m=sigma_m, k1=np.inf if radial else 0.0)
-    options = ResectionOptions(ground_m=_ground_of(station), ground_sigma_m=_ground_sigma_m(station))
+    webcam = station.webcam
+    ground_sigma_m = height_sigma_m(station.rasters, webcam.latitude_deg, webcam.longitude_deg)
+    options = ResectionOptions(ground_m=_ground_of(station), ground_sigma_m=ground_sigma_m)
     return resect(station.view, points, priors=priors, k1=station.webcam.radial_k1, axes=station.axes, options=options)
-
-
-def _ground_sigma_m(station: WebcamStation) -> float:
-    """Standard deviation of interpolated heights of mountains [m]: a tenth of a cell's side, at least 1 m."""
-    from seasonscapes.calibration.terrain_horizon import cell_size_m, terrain_height
-
-    at = [station.webcam.latitude_deg], [station.webcam.longitude_deg]
-    about = [each for each in station.rasters if np.isfinite(terrain_height([each], *at)[0])]
-    return max(0.1 * cell_size_m(about[0] if about else station.rasters[0]), 1.0)
 
 
 def _ground_of(station: WebcamStation) -> Callable[[float, float], float]:
