@@ -1,5 +1,7 @@
 """What a recovery states before it starts: texels as fine as pixels see the ground."""
 
+import json
+
 import numpy as np
 import pytest
 from places import MASSIF, SCENE, write_place
@@ -43,3 +45,29 @@ def test_a_scene_without_elevation_is_one_line(tmp_path):
     scene.write_text(SCENE.split("[elevation]")[0])
     with pytest.raises(InputError, match="names no elevation raster"):
         plan_recovery(str(scene), PhotographSources(tmp_path / "manifest.csv", tmp_path))
+
+
+def lowered(sources: PhotographSources, by_m: float) -> PhotographSources:
+    """The same photograph with a record whose camera lies so much lower."""
+    for path in sources.calibrations.glob("*_calibration.json"):
+        record = json.loads(path.read_text(encoding="utf-8"))
+        record["world_from_camera"][2][3] -= by_m
+        path.write_text(json.dumps(record), encoding="utf-8")
+    return sources
+
+
+@pytest.mark.parametrize("depth_m", [3.0, 20.0])
+def test_a_camera_in_the_ground_is_planned_from_above_it_as_it_is_used(depth_m, tmp_path):
+    text = SCENE.replace("above_ground_m = 120.0", "above_ground_m = 1.0").replace(
+        "pitch_deg = -8.0", "pitch_deg = 5.0"
+    )
+    path, workspace = write_place(tmp_path), Workspace(tmp_path / "work")
+    path.write_text(text)
+    place = load_place(path, workspace, options=MeshOptions(texel_m=240.0, refine=1))
+    sources = sources_of(place, "south", tmp_path)
+    above = plan_recovery(str(path), sources, workspace=workspace)
+    inside = plan_recovery(str(path), lowered(sources, 1.0 + depth_m), workspace=workspace)
+    assert np.isfinite(above.footprint_m)
+    assert inside.footprint_m == pytest.approx(above.footprint_m, rel=0.05)
+    assert inside.texel_m == pytest.approx(above.texel_m, rel=0.05)
+    assert "see no ground" not in str(inside)
