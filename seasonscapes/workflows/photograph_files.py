@@ -254,7 +254,7 @@ def observations(
         raise InputError(
             sources.calibrations,
             f"holds no reliable pose for these pictures: {' | '.join(doubtful)}",
-            cure="calibrate from points (seasonscapes annotate), or pass --doubtful-poses",
+            cure="calibrate from points (seasonscapes annotate, then calibrate --points), or pass --doubtful-poses",
         )
     if not opened:
         raise InputError(

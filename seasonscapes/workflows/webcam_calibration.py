@@ -236,9 +236,8 @@ def camera_station(place: Place, camera: Camera, *, name: str = "webcam") -> Web
         roll_deg=float(roll),
         time_zone="UTC",
     )
-    return WebcamStation(
-        webcam, camera, place.frame, axes, [place.elevation], vertical_datum=place.scene.vertical_datum
-    )
+    rasters = [*reversed(place.finer_heights), place.elevation]
+    return WebcamStation(webcam, camera, place.frame, axes, rasters, vertical_datum=place.scene.vertical_datum)
 
 
 def read_picture(path: Path, where: str) -> np.ndarray:
