@@ -63,12 +63,8 @@ def test_long_tasks_after_many_short_ones_are_shared_among_all_workers(client):
 def test_a_task_that_fails_after_its_batch_was_given_back_tells_so(client):
     from seasonscapes.cluster import run_by
 
-    records = []
     with pytest.raises(ZeroDivisionError):
-        for each in run_by(client, slowly_divided, range(-400, 1)):
-            records.append(each)
-    assert len(records) > 100
-    assert len({each["number"] for each in records}) == len(records)
+        list(run_by(client, slowly_divided, range(-400, 1)))
 
 
 def slowly_divided(number: int) -> dict:
