@@ -370,12 +370,18 @@ def photographs_of_ground(
     skies = photograph_skies(place, transport, seen, model)
     report = task_progress(progress, "footprints of the photographs")
     prepared = prepare_photographs(transport, seen, illuminations(place, seen, skies), progress=report)
-    prepared = with_assumed_exposure(prepared)
-    if place.terrain.water is None:
-        return prepared, skies, 0.0
-    sky_of = {id(each): sky for each, sky in zip(seen, skies, strict=True)}
-    dry, share = without_water(prepared, place.terrain.water.mask)
-    return dry, [sky_of[id(each.observation)] for each in dry], share
+    share = 0.0
+    if place.terrain.water is not None:
+        sky_of = {id(each): sky for each, sky in zip(seen, skies, strict=True)}
+        prepared, share = without_water(prepared, place.terrain.water.mask)
+        skies = [sky_of[id(each.observation)] for each in prepared]
+    exposed = with_assumed_exposure(prepared)
+    if any(after is not before for after, before in zip(exposed, prepared, strict=True)):
+        log.warning(
+            "no photograph shows enough sky to tell its exposure and white balance: they are taken as set for level ground, "
+            "so that brightness and colours of the albedo are the camera's own"
+        )
+    return exposed, skies, share
 
 
 def _prepared(
