@@ -94,4 +94,5 @@ def test_the_tone_curve_of_one_such_photograph_is_not_guessed(taken, monkeypatch
     one = _prepared(place, transport, without[:1], sky_model("clear"), options, None)[2]
     two = _prepared(place, transport, without, sky_model("clear"), options, None)[2]
     assert "curve_strength" not in one
+    assert one["exposure"].startswith("assumed")
     assert two["curve_strength"] == 0.4

@@ -393,6 +393,7 @@ def _prepared(
     progress: Progress | None,
 ) -> tuple[list[AlbedoPhotograph], list[SkyModel], dict[str, Any]]:
     """Photographs with their light, and their skies; tone curve and visibility fitted where asked for."""
+    from seasonscapes.albedo.assumed_exposure import with_assumed_exposure
     from seasonscapes.albedo.haze import fit_visibility
     from seasonscapes.albedo.photographs import EIGHT_BIT
     from seasonscapes.albedo.tone_curve import fit_tone_curve, with_tone_curve
@@ -428,7 +429,11 @@ def _prepared(
         facts["visibility_km"] = round(found.visibility_km, 1)
         log.info("visibility %.0f km", found.visibility_km)
         hazy = lights_of(found.visibility_km)
-        prepared = [replace(each, light=light) for each, light in zip(prepared, hazy, strict=True)]
+        # An assumed exposure is that under the light: here no other gain is known.
+        lit = [replace(each, light=light, gain=None) for each, light in zip(prepared, hazy, strict=True)]
+        prepared = with_assumed_exposure(lit)
+    if any(each.gain is not None for each in prepared):
+        facts["exposure"] = "assumed: no photograph shows enough sky"
     return prepared, skies, facts
 
 
