@@ -154,16 +154,16 @@ def film(bench: Bench, *, whole: bool) -> dict[str, float]:
     workers = ("--cluster", f"local:{_WORKERS}")
     # A day is a day of every season: nights, and elevations of the sun that the sky has no tables for yet.
     days = [time for time in year if time.timetuple().tm_yday % 92 == 20]
-    # What two frames of a film cost is there with or without the others.
     first = frames([year[0], year[-1]], "prepared", *albedos)
-    some = frames([time + timedelta(minutes=30) for time in days], "some", *albedos)
-    pair = frames([year[1], year[-2]], "pair", *albedos)
     counted = year if whole else days
     film = frames(counted, "year", *albedos, *workers)
     minutes = film.wall_s / 60.0
     if not whole:
+        # What the hours of other days cost beside what two frames of a film do; the sky's tables are there already.
         again = frames([year[2], year[-3]], "again", *albedos, *workers)
         minutes = (film.wall_s + (film.wall_s - again.wall_s) / (len(days) - 2) * (len(year) - len(days))) / 60.0
+    some = frames([time + timedelta(minutes=30) for time in days], "some", *albedos)
+    pair = frames([year[1], year[-2]], "pair", *albedos)
     return {
         "film_ready_s": ready.processor_s,
         "film_ready_wall_s": ready.wall_s,

@@ -241,7 +241,9 @@ def shadow_rays(scene, camera, *, rounds: int, seed: int) -> dict[str, float]:
         return visible_cosine(rays, sun).ravel() > 0.0
 
     def bare() -> np.ndarray:
-        return np.array(active & ~land.mi_scene.ray_test(mi.Ray3f(origin, towards), active=active))
+        # In packets, as ours, which is faster for neighbouring rays.
+        hidden = land.mi_scene.ray_test(mi.Ray3f(origin, towards), coherent=True, active=active)
+        return np.array(active & ~hidden)
 
     differ = float((ours() != bare()).mean())
     ratios, rates = [], []

@@ -79,11 +79,11 @@ def scheduling(count: int, killed: int, seed: int) -> dict[str, float]:
     """Frames that arrive and their cost, first on workers that live and then on workers that are killed.
 
     Overhead is what a frame costs beside its writing: processor time of scheduler, client and workers together, less that
-    of writing the same frames without Dask. What workers cost while they stand by is in it, and told apart too, as is
+    of writing frames in a loop in one of the workers. What workers cost while they stand by is in it, and told apart too, as is
     their start.
     """
     chosen = set(np.random.default_rng(seed).choice(count, killed, replace=False).tolist())
-    lost, walls, used, idle_share = 0, {}, {}, 0.0
+    lost, walls, used, idle_share, alone_s = 0, {}, {}, 0.0, 0.0
     for name, deadly in (("calm", set()), ("killed", chosen)):
         with tempfile.TemporaryDirectory(prefix="scale-") as text, connected(f"local:{WORKERS}") as client:
             folder = Path(text)
@@ -102,13 +102,10 @@ def scheduling(count: int, killed: int, seed: int) -> dict[str, float]:
                 idle_share = idle_s / waited
             whole = sum(_is_whole(folder / f"{number:05d}.exr", number) for number in range(count))
             lost = max(lost, count - min(whole, len(set(told))))
+            if not deadly:
+                alone_s = client.submit(_alone_s, folder, count // 10).result()
             marks = len(list(folder.glob("killed-*")))
             print(f"{name}: {count} frames, {whole} whole, {marks} workers killed, {walls[name]:.1f} s", flush=True)
-    started = time.process_time()
-    with tempfile.TemporaryDirectory(prefix="scale-") as text:
-        for number in range(count // 10):
-            write_tiny_frame(TinyFrame(number, Path(text), deadly=False))
-    alone_s = (time.process_time() - started) / (count // 10)
     return {
         "frames": count,
         "frames_lost": lost,
@@ -121,6 +118,14 @@ def scheduling(count: int, killed: int, seed: int) -> dict[str, float]:
         "wall_ms_per_frame": 1e3 * walls["calm"] / count,
         "s_per_killed_worker": max(walls["killed"] - walls["calm"], 0.0) / killed,
     }
+
+
+def _alone_s(folder: Path, count: int) -> float:
+    """Processor time per frame [s] of writing frames one after another, in a process that has written some before."""
+    started = time.process_time()
+    for number in range(count):
+        write_tiny_frame(TinyFrame(number, folder, deadly=False))
+    return (time.process_time() - started) / count
 
 
 def _processor_of_all(client: Any) -> dict[str, float]:

@@ -10,6 +10,7 @@ import os
 import re
 import shutil
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import islice
@@ -26,7 +27,7 @@ _DEATHS = 10
 # Tasks submitted ahead for each worker.
 _AHEAD = 4
 # Items travel together while they take no longer than this [s], and no more than so many: much longer than a call of Dask
-# costs, much shorter than what is worth sharing among workers. Both chosen.
+# costs, much shorter than what is worth sharing among workers. A batch that takes longer gives back the rest. Both chosen.
 _BATCH_S, _MOST_TOGETHER = 0.25, 64
 
 
@@ -176,6 +177,7 @@ def run_by(client: Any, task: Callable[[Item], dict], items: Iterable[Item]) -> 
     """Run a task for every item on a Dask client's workers and give the records as they are done.
 
     Short tasks travel together: a call of Dask costs milliseconds by itself. How many follows from how long the latest took.
+    Where they turn out to be long, those that a worker has not begun are shared among all workers again.
     An item's exception ends the iteration; of the items that travelled with it, some may have been run.
 
     Parameters
@@ -189,31 +191,41 @@ def run_by(client: Any, task: Callable[[Item], dict], items: Iterable[Item]) -> 
     """
     from distributed import as_completed
 
-    pending = iter(items)
+    pending, given_back = iter(items), deque()
     workers = max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
     together = 1
+    running, batches = as_completed(), {}
 
-    def submit() -> Any | None:
-        batch = list(islice(pending, together))
-        # Impure, so that a second run calls the task again: the task itself knows which results exist.
-        return client.submit(_run_batch, task, batch, pure=False) if batch else None
+    def submit() -> None:
+        """Submit batches until enough wait for the workers or no item is left."""
+        while len(batches) < _AHEAD * workers:
+            batch = [given_back.popleft() for _ in range(min(together, len(given_back)))]
+            batch += islice(pending, together - len(batch))
+            if not batch:
+                return
+            # Impure, so that a second run calls the task again: the task itself knows which results exist.
+            future = client.submit(_run_batch, task, batch, pure=False)
+            batches[future.key] = batch
+            running.add(future)
 
-    first = [submit() for _ in range(_AHEAD * workers)]
-    running = as_completed([future for future in first if future is not None])
+    submit()
     for future in running:
         records, seconds = future.result()
         future.release()
+        given_back.extend(batches.pop(future.key)[len(records) :])
         # A worker's first item may be slow (it opens files, compiles kernels): the number may grow again afterwards.
         fitting = int(len(records) * _BATCH_S / max(seconds, 1e-6))
         together = max(1, min(fitting, 2 * together, _MOST_TOGETHER))
-        following = submit()
-        if following is not None:
-            running.add(following)
+        submit()
         yield from records
 
 
 def _run_batch(task: Callable[[Item], dict], items: Sequence[Item]) -> tuple[list[dict], float]:
-    """The records of some items, and how long they took [s]."""
+    """The records of some items, at least of the first, until they took too long; and how long they took [s]."""
     start = time.perf_counter()
-    records = [task(item) for item in items]
+    records: list[dict] = []
+    for item in items:
+        records.append(task(item))
+        if time.perf_counter() - start >= _BATCH_S:
+            break
     return records, time.perf_counter() - start

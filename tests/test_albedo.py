@@ -334,6 +334,10 @@ def test_dates_are_grouped_by_their_snow():
     first, second, same = _snow_above(2900.0), _snow_above(2300.0), _snow_above(2890.0)
     days = [date(2024, 9, 10), date(2024, 11, 9), date(2024, 9, 20)]
     assert season_grouping.group_dates(days, [first, second, same]) == [[0, 2], [1]]
+    # Two thirds of a stop between exposures that were assumed makes no season; other snow does.
+    brighter = replace(same, albedo=np.float32(1.6) * same.albedo)
+    assert season_grouping.group_dates(days, [first, second, brighter]) == [[0], [2], [1]]
+    assert season_grouping.group_dates(days, [first, second, brighter], [0.3, 0.3, 0.3]) == [[0, 2], [1]]
 
 
 def test_cosine_correction_is_exact_without_sky():

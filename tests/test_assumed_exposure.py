@@ -72,6 +72,21 @@ def test_one_photograph_of_a_day_is_assumed_and_the_sky_comes_first(taken):
     assert [each.gain for each in with_assumed_exposure(seen)] == [None, None]
 
 
+def test_every_camera_has_its_own_exposure_whatever_the_order(taken):
+    place, transport, _, without = taken
+    noon = without[1]
+    views = [replace(noon, webcam=name) for name in ("hut", "mast", "mast/0", "mast/1")]
+    lights = [illumination_for_camera(place, each.camera, sky_model("clear"), each.time)[0] for each in views]
+    for order in ([0, 1], [1, 0], [2, 3], [0, 2, 3]):
+        prepared = prepare_photographs(transport, [views[k] for k in order], [lights[k] for k in order])
+        assert all(each.gain is not None for each in with_assumed_exposure(prepared))
+    night = [
+        replace(each, light=replace(each.light, sky_radiance=0.0 * each.light.sky_radiance, sun=None))
+        for each in prepared
+    ]
+    assert all(each.gain is None for each in with_assumed_exposure(night))
+
+
 def test_the_tone_curve_of_one_such_photograph_is_not_guessed(taken, monkeypatch):
     place, transport, _, without = taken
     monkeypatch.setattr(tone_curve, "fit_tone_curve", lambda *given, **named: tone_curve.ToneCurveFit(0.4, {}))
@@ -79,4 +94,5 @@ def test_the_tone_curve_of_one_such_photograph_is_not_guessed(taken, monkeypatch
     one = _prepared(place, transport, without[:1], sky_model("clear"), options, None)[2]
     two = _prepared(place, transport, without, sky_model("clear"), options, None)[2]
     assert "curve_strength" not in one
+    assert one["exposure"].startswith("assumed")
     assert two["curve_strength"] == 0.4

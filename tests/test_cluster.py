@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 
 import pytest
 
@@ -26,7 +27,7 @@ def record(item: tuple[int, float]) -> dict:
 
     number, seconds = item
     time.sleep(seconds)
-    return {"number": number, "call": get_worker().get_current_task()}
+    return {"number": number, "call": get_worker().get_current_task(), "worker": get_worker().name}
 
 
 def test_short_tasks_travel_together_and_none_is_lost_or_done_twice(client):
@@ -42,6 +43,33 @@ def test_long_tasks_travel_alone(client):
 
     records = list(run_by(client, record, ((number, 0.3) for number in range(15))))
     assert len({each["call"] for each in records}) == 15
+
+
+def test_long_tasks_after_many_short_ones_are_shared_among_all_workers(client):
+    from seasonscapes.cluster import run_by
+
+    items = [(number, 0.0 if number < 1000 else 0.05) for number in range(1090)]
+    records = list(run_by(client, record, items))
+    assert sorted(each["number"] for each in records) == list(range(1090))
+    slow = [each for each in records if each["number"] >= 1000]
+    # Some 5 fill a batch's 0.25 s; short ones before them, none.
+    assert max(Counter(each["call"] for each in slow).values()) <= 6
+    # 30 would be an even share of the 90.
+    shares = Counter(each["worker"] for each in slow)
+    assert len(shares) == 3
+    assert max(shares.values()) < 45, shares
+
+
+def test_a_task_that_fails_after_its_batch_was_given_back_tells_so(client):
+    from seasonscapes.cluster import run_by
+
+    with pytest.raises(ZeroDivisionError):
+        list(run_by(client, slowly_divided, range(-400, 1)))
+
+
+def slowly_divided(number: int) -> dict:
+    time.sleep(0.02 if number > -40 else 0.0)
+    return {"number": number, "quotient": 1 / number}
 
 
 def test_items_are_taken_as_workers_need_them(client):

@@ -35,6 +35,7 @@ from seasonscapes.terrain.surface import load_texture, sample_texture
 from seasonscapes.terrain.texels import texel_positions
 from seasonscapes.terrain.unwrap import unwrap
 from seasonscapes.texturing.atlas_tiles import tile_surface, tiles_of, tiling
+from seasonscapes.texturing.camera_overlaps import CameraSamples
 from seasonscapes.texturing.foreground import cross_validated_prediction, foreground_mask
 from seasonscapes.texturing.inputs import PaintingInput, prepare_input, sample_input
 from seasonscapes.texturing.painting import PaintOptions, PaintTarget, paint_atlas, paint_tile, prepare_inputs
@@ -42,6 +43,9 @@ from seasonscapes.texturing.painting_file import load_painting, save_painting, w
 from seasonscapes.texturing.radiometric_fit import (
     RadiometricFit,
     RadiometricReference,
+    _by_gain,
+    _linearise,
+    _log_surface,
     fit_radiometry,
     invert_contrast,
     radiance_at_surface,
@@ -292,6 +296,27 @@ def test_without_sky_the_airlight_has_the_gain_of_the_surface(land, overlapping)
     found = fit_radiometry(ready, land.ray_scene, reference=reference, fit_contrast=False)
     np.testing.assert_allclose(found.log_gain, [np.log(gains)], atol=0.06)
     assert found.haze == pytest.approx(1.0, abs=0.15)
+
+
+@pytest.mark.parametrize("contrast", [1.0, 1.5])
+@pytest.mark.parametrize("sees_sky", [True, False])
+def test_log_radiance_changes_with_the_gain_as_its_derivative_says(sees_sky, contrast):
+    rng = np.random.default_rng(3)
+    count = 40
+    air = rng.uniform(0.3, 0.9, (count, 3)), rng.uniform(200.0, 900.0, (count, 3))
+    samples = CameraSamples(np.zeros(count, int), rng.uniform(0.2, 0.8, (count, 3)), *air)
+    fit = RadiometricFit(np.full((1, 3), np.log(2e-4)), np.full((1, 3), np.log(1.5e-4)), np.array([contrast]))
+
+    def log_radiance(log_gain):
+        airlight = fit.log_sky_gain + (0.0 if sees_sky else log_gain)
+        return _log_surface(samples, replace(fit, log_sky_gain=airlight))[0] - log_gain
+
+    measured = (log_radiance(5e-3) - log_radiance(-5e-3)) / 1e-2
+    told = _by_gain(np.array([sees_sky]), samples.camera, _linearise(samples, fit))
+    # Where hardly any surface is left in the value, its share is clipped.
+    clear = np.abs(measured) < 5.0
+    assert clear.mean() > 0.7
+    np.testing.assert_allclose(told[clear], measured[clear], rtol=0.05)
 
 
 def test_the_record_of_a_single_camera_is_json(land, cameras):

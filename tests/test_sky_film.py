@@ -280,11 +280,16 @@ def test_a_cluster_waits_for_the_light_of_missing_frames_alone(tmp_path, monkeyp
     from seasonscapes import cluster
     from seasonscapes.workflows import timelapse
 
-    asked, times = [], [datetime(2024, 9, 1, hour, tzinfo=UTC) for hour in (9, 12, 15)]
+    asked, handed, times = [], [], [datetime(2024, 9, 1, hour, tzinfo=UTC) for hour in (9, 12, 15)]
     session = SimpleNamespace(place=None, camera=None, sky=None, coefficients=SimpleNamespace(pixel=[]))
     monkeypatch.setattr(timelapse, "cached_session", lambda *_, **__: session)
     monkeypatch.setattr(timelapse, "frames_folder", lambda _: tmp_path)
-    monkeypatch.setattr(cluster, "run_on_cluster", lambda _, task, items: [{"rendered": True} for _ in items])
+
+    def run(_, task, items):
+        handed.append([time.hour for time in items])
+        return [{"rendered": True} for _ in items]
+
+    monkeypatch.setattr(cluster, "run_on_cluster", run)
     monkeypatch.setattr(
         illumination_module, "tabulate_illumination", lambda *of, progress: asked.append([time.hour for time in of[3]])
     )
@@ -293,3 +298,5 @@ def test_a_cluster_waits_for_the_light_of_missing_frames_alone(tmp_path, monkeyp
             (tmp_path / timelapse.frame_name(time)).touch()
         timelapse.render_frames(None, times, cluster="local:2", exr_folder=exr_folder)
     assert asked == [[15], [], [9, 12, 15]]
+    # Missing frames first: what is there is only checked.
+    assert handed == [[15, 9, 12], [9, 12, 15], [9, 12, 15]]

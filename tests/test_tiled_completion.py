@@ -4,15 +4,17 @@ import numpy as np
 import places
 import pytest
 
-from seasonscapes.errors import NotEnoughEvidence
+from seasonscapes.errors import AtlasMismatch, NotEnoughEvidence
 from seasonscapes.frames import LocalFrame
 from seasonscapes.terrain.mesh import build_mesh
 from seasonscapes.terrain.surface import Raster, Texture
 from seasonscapes.terrain.unwrap import unwrap
+from seasonscapes.texturing import tiled_completion
+from seasonscapes.texturing import tiled_predictors as tiled_predictors_module
 from seasonscapes.texturing.completion import CompletionOptions, complete
 from seasonscapes.texturing.predictors import predictors_for
 from seasonscapes.texturing.tiled_completion import complete_tiles
-from seasonscapes.texturing.tiled_predictors import tiled_predictors
+from seasonscapes.texturing.tiled_predictors import TiledPredictors, tiled_predictors
 
 SUN = np.array([0.5, -0.6, 0.624])
 
@@ -68,7 +70,7 @@ def test_coarser_attributes_stay_close_to_the_fine_ones(hill):
         assert np.corrcoef(fine, coarse)[0, 1] > 0.99, name
 
 
-def test_tiles_fill_as_the_whole_texture_does(hill):
+def test_tiles_fill_as_the_whole_texture_does(hill, monkeypatch):
     terrain, atlas, satellite, whole, texture = hill
     tiled = tiled_predictors(terrain, atlas, satellite=satellite, sun_direction=SUN)
     painted, hole = texture.weight > 0.0, whole.surface & (texture.weight == 0.0)
@@ -87,10 +89,14 @@ def test_tiles_fill_as_the_whole_texture_does(hill):
         assert not sigma[painted].any()
         assert error(values) < 1.05 * error(reference.values)
         results[tile_px] = values
+    monkeypatch.setattr(tiled_completion, "HALO_PX", 0)
+    monkeypatch.setattr(tiled_completion, "_PHASE_PX", 1)
+    results[0], _ = complete_tiles(texture, painted, tiled, fast=True, tile_px=150)
     assert error(reference.values) < 0.5 * error(flat)
     # The regression is the same; residuals of painted texels beyond a tile's border have decayed.
-    difference = np.cbrt(results[150]) - np.cbrt(results[4096])
-    assert np.sqrt(np.mean(difference[hole] ** 2)) < 0.1 * error(results[4096])
+    apart = {px: np.sqrt(np.mean((np.cbrt(results[px]) - np.cbrt(results[4096]))[hole] ** 2)) for px in (150, 0)}
+    assert apart[150] < 0.01 * error(results[4096])
+    assert apart[0] > 0.01 * error(results[4096])  # without a border
 
 
 def test_complete_takes_tiles_where_they_do(hill):
@@ -103,6 +109,43 @@ def test_complete_takes_tiles_where_they_do(hill):
     smooth = complete(texture, tiled, options=CompletionOptions("membrane"))
     assert np.isfinite(smooth.values).all()
     assert not np.array_equal(smooth.values, values)
+
+
+def test_a_texture_without_holes_is_not_fitted(hill, monkeypatch):
+    terrain, atlas, _, whole, texture = hill
+    monkeypatch.setattr(tiled_completion, "fit_completion", lambda *_, **__: pytest.fail("fitted"))
+    full = Texture(texture.values, whole.surface.astype(np.float32))
+    done = complete(full, tiled_predictors(terrain, atlas))
+    np.testing.assert_array_equal(done.values[whole.surface], full.values[whole.surface])
+    assert not done.sigma[whole.surface].any()
+    assert np.isfinite(done.values).all()
+
+
+def test_smooth_fills_take_the_surface_alone_and_grain_tells_its_memory(hill, monkeypatch, caplog):
+    terrain, atlas, satellite, whole, texture = hill
+    tiled = tiled_predictors(terrain, atlas, satellite=satellite, sun_direction=SUN)
+    with monkeypatch.context() as patch:
+        patch.setattr(TiledPredictors, "window", lambda *_: pytest.fail("predictors computed"))
+        for method in ("membrane", "telea"):
+            options = CompletionOptions(method)
+            done = complete(texture, tiled, options=options)
+            np.testing.assert_array_equal(done.values, complete(texture, whole, options=options).values)
+    assert not caplog.records
+    monkeypatch.setattr(tiled_predictors_module, "_BLOCK_PX", 150)
+    values = tiled.whole().values
+    rows, columns = tiled.surface.shape
+    np.testing.assert_allclose(values, tiled.window((slice(0, rows), slice(0, columns))).values, rtol=1e-4, atol=1e-4)
+    complete(texture, tiled, options=CompletionOptions("membrane", detail=0.5))
+    assert "held in memory" in caplog.text
+
+
+def test_images_and_layers_of_another_size_are_refused(hill):
+    terrain, atlas, satellite, _, _ = hill
+    larger = Texture(np.pad(satellite.values, ((0, 50), (0, 50), (0, 0))), np.pad(satellite.weight, ((0, 50), (0, 50))))
+    with pytest.raises(AtlasMismatch, match="satellite is"):
+        tiled_predictors(terrain, atlas, satellite=larger)
+    with pytest.raises(AtlasMismatch, match="relit_1 is"):
+        tiled_predictors(terrain, atlas, layers={"relit_1": larger.weight})
 
 
 def test_nothing_painted_and_negative_values_are_refused(hill):

@@ -9,25 +9,25 @@ number.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import replace
+from datetime import date
 
 import numpy as np
 
 from seasonscapes.albedo.equations import FEWEST_SKY, usable_pixels, usable_sky
 from seasonscapes.albedo.photographs import EIGHT_BIT, AlbedoPhotograph, NoiseModel
 
-log = logging.getLogger(__name__)
-
 # Automatic exposures lie within a stop of a grey card's, white balances nearer to it.
-_GAIN_SIGMA = 0.3
+ASSUMED_SIGMA = 0.3
+# In less light cameras do not expose for level ground any more: at the end of civil twilight.
+_DIMMEST_LX = 3.0
 
 
 def with_assumed_exposure(
     photographs: Sequence[AlbedoPhotograph], noise_model: NoiseModel = EIGHT_BIT
 ) -> list[AlbedoPhotograph]:
-    """Give a gain to one photograph of each day, where no photograph shows the sky that would tell one.
+    """Give a gain to one hour of each camera and day, where no photograph shows the sky that would tell one.
 
     Parameters
     ----------
@@ -40,8 +40,8 @@ def with_assumed_exposure(
     -------
     list of AlbedoPhotograph
         In the same order; the same photographs where one of them shows sky or has a known gain. Otherwise the photograph of each
-        UTC day under the strongest light has the gain of a camera that exposes and balances for level ground, by which
-        those of the same ground find their own.
+        camera and UTC day under the strongest light, or all views of a panorama then, has the gain of a camera that exposes and
+        balances for level ground, by which those of the same ground find their own.
 
     Examples
     --------
@@ -50,24 +50,26 @@ def with_assumed_exposure(
     """
     if not photographs or any(_tells_gain(each, noise_model) for each in photographs):
         return list(photographs)
-    log.warning(
-        "no photograph shows enough sky to tell its exposure and white balance: they are taken as set for level ground, so that "
-        "brightness and colours of the albedo are the camera's own"
-    )
 
-    def level_lx(photograph: AlbedoPhotograph) -> float:
-        return float(photograph.light.global_horizontal_lx[1])
+    def hour(photograph: AlbedoPhotograph) -> tuple[str, date]:
+        # The views of a panorama share its name, and one exposure.
+        return photograph.observation.webcam.split("/")[0], photograph.observation.time.date()
 
-    strongest: dict = {}
-    for number, each in enumerate(photographs):
-        day = each.observation.time.date()
-        if day not in strongest or level_lx(each) > level_lx(photographs[strongest[day]]):
-            strongest[day] = number
-    result = list(photographs)
-    for number in strongest.values():
-        level = np.maximum(photographs[number].light.global_horizontal_lx, 1e-6)
-        result[number] = replace(photographs[number], gain=np.pi / level, gain_sigma=_GAIN_SIGMA)
-    return result
+    strongest: dict[tuple[str, date], AlbedoPhotograph] = {}
+    for each in sorted(photographs, key=lambda each: each.observation.time):
+        before = strongest.get(hour(each))
+        if before is None or _level_lx(each) > _level_lx(before):
+            strongest[hour(each)] = each
+    return [
+        replace(each, gain=np.pi / each.light.global_horizontal_lx, gain_sigma=ASSUMED_SIGMA)
+        if each.observation.time == strongest[hour(each)].observation.time and _level_lx(each) >= _DIMMEST_LX
+        else each
+        for each in photographs
+    ]
+
+
+def _level_lx(photograph: AlbedoPhotograph) -> float:
+    return float(photograph.light.global_horizontal_lx[1])
 
 
 def _tells_gain(photograph: AlbedoPhotograph, noise_model: NoiseModel) -> bool:

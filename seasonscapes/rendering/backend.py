@@ -295,6 +295,7 @@ def aligned(values: np.ndarray, dtype: Any = np.float32) -> np.ndarray:
     -------
     numpy.ndarray
         Contiguous, of the same shape, beginning at a multiple of 64 bytes; a copy where the values do not.
+        Otherwise it may share the caller's memory, which must not be written to while Dr.Jit may still read it.
 
     Examples
     --------

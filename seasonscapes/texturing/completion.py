@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -21,6 +22,7 @@ from seasonscapes.texturing.tiled_completion import complete_tiles
 from seasonscapes.texturing.tiled_predictors import TiledPredictors
 from seasonscapes.texturing.top_down_grid import from_grid, to_grid
 
+log = logging.getLogger(__name__)
 Progress = Callable[[float], None]
 
 
@@ -204,7 +206,8 @@ def complete(
     predictors
         From `predictors.predictors_for`, of the same size. The methods ``membrane`` and ``telea`` use only its surface
         and top-down grid. With those of `tiled_predictors.tiled_predictors`, the method ``guided`` without base and grain
-        works tile by tile, in memory for little more than the texture.
+        works tile by tile, without the predictors of all texels in memory; ``membrane`` and ``telea`` without grain compute
+        none. Grain or a base take them all, and a warning tells how much memory that is.
     base
         ``(R, S, 3)`` estimate of every texel from another source, in the texture's unit (for an albedo: an orthophoto
         without its illumination), NaN where unknown. It is corrected by the painted texels, which in turn are shrunk
@@ -242,7 +245,16 @@ def complete(
         if method == "guided" and base is None and options.detail == 0.0:
             tiled = complete_tiles(texture, painted, predictors, fast=fast, seed=seed, progress=progress)
             return CompletedTexture(*tiled, painted)
-        predictors = predictors.whole()
+        if method != "guided" and options.detail == 0.0:
+            # These look at the surface alone.
+            predictors = Predictors(np.empty((*painted.shape, 0), np.float32), (), predictors.surface)
+        else:
+            log.warning(
+                "complete: with grain or a base, the predictors of all %.1f million texels are held in memory: %.2f GB",
+                painted.size / 1e6,
+                painted.size * len(predictors.names) * 4 / 1e9,
+            )
+            predictors = predictors.whole()
     known = painted & predictors.surface
     if not known.any():
         raise NotEnoughEvidence("complete: no painted texel on the surface: there is nothing to learn from")

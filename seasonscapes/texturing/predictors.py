@@ -99,6 +99,29 @@ def stack_predictors(
     return Predictors(np.stack(columns, -1), tuple(names), surface, grid)
 
 
+def require_atlas_size(shape: tuple[int, int], satellite: Texture | None, layers: Mapping[str, np.ndarray]) -> None:
+    """Check that a satellite image and layers are as large as an atlas.
+
+    Parameters
+    ----------
+    shape
+        Rows and columns of the atlas.
+    satellite, layers
+        As in `stack_predictors`.
+
+    Raises
+    ------
+    AtlasMismatch
+        One of another size.
+    """
+    sizes = {name: layer.shape for name, layer in layers.items()}
+    if satellite is not None:
+        sizes["satellite"] = satellite.values.shape[:2]
+    for name, size in sizes.items():
+        if size != shape:
+            raise AtlasMismatch(f"predictors: {name} is {size}, the atlas {shape}")
+
+
 def predictors_for(
     terrain: Terrain,
     atlas: Atlas,
@@ -140,12 +163,7 @@ def predictors_for(
     extra = dict(extra or {})
     if relit is not None:
         extra |= {f"relit_{n + 1}": relit[..., n] for n in range(3)}
-    for name, size in [
-        ("satellite", satellite.values.shape[:2] if satellite is not None else shape),
-        *((name, layer.shape) for name, layer in extra.items()),
-    ]:
-        if size != shape:
-            raise AtlasMismatch(f"predictors_for: {name} is {size}, the atlas {shape}")
+    require_atlas_size(shape, satellite, extra)
     positions, face_id = texel_positions(terrain, atlas.width_px, atlas.height_px)
     # A planar atlas is a top-down grid itself: with its own cell size the two coincide.
     planar_m = float((np.ptp(terrain.vertices[:, :2], axis=0) / [atlas.width_px, atlas.height_px]).max())

@@ -348,8 +348,8 @@ class _Linearisation:
         Standard deviation of the logarithm of the image value.
     log_slope
         Logarithm of the derivative of ``log_surface`` with respect to the logarithm of the image value.
-    by_contrast, by_haze
-        Derivatives of ``log_surface`` with respect to log contrast and log haze.
+    by_contrast, by_haze, by_sky_gain
+        Derivatives of ``log_surface`` with respect to log contrast, log haze and the log gain of the airlight.
     slope_by_contrast, slope_by_haze
         Derivatives of ``log_slope`` with respect to the same.
     """
@@ -359,6 +359,7 @@ class _Linearisation:
     log_slope: np.ndarray
     by_contrast: np.ndarray
     by_haze: np.ndarray
+    by_sky_gain: np.ndarray
     slope_by_contrast: np.ndarray
     slope_by_haze: np.ndarray
 
@@ -368,10 +369,11 @@ def _linearise(samples: CameraSamples, radiometry: RadiometricFit) -> _Linearisa
     log_slope = _log_slope(samples, radiometry)
     more_contrast = replace(radiometry, contrast=radiometry.contrast * np.exp(_DIFFERENCE))
     more_haze = replace(radiometry, haze=radiometry.haze * np.exp(_DIFFERENCE))
+    more_gain = replace(radiometry, log_sky_gain=radiometry.log_sky_gain + _DIFFERENCE)
     # Noise and rounding have a constant standard deviation in encoded values.
     noise = _IMAGE_SIGMA * 2.4 / np.maximum(srgb_from_linear(samples.value) + 0.055, 0.02)
     value_derivatives = (
-        (_log_surface(samples, other)[0] - log_surface) / _DIFFERENCE for other in (more_contrast, more_haze)
+        (_log_surface(samples, other)[0] - log_surface) / _DIFFERENCE for other in (more_contrast, more_haze, more_gain)
     )
     slope_derivatives = ((_log_slope(samples, other) - log_slope) / _DIFFERENCE for other in (more_contrast, more_haze))
     return _Linearisation(log_surface, noise, log_slope, *value_derivatives, *slope_derivatives)
@@ -456,12 +458,13 @@ def _gauss_newton_step(
     return step
 
 
-def _slope_of_gain(sees_sky: np.ndarray, camera: np.ndarray, samples: _Linearisation) -> np.ndarray:
-    """How much faster than log gain the log radiance of samples falls ``(N, 3)``.
+def _by_gain(sees_sky: np.ndarray, camera: np.ndarray, samples: _Linearisation) -> np.ndarray:
+    """Derivative ``(N, 3)`` of the log radiance of samples with respect to the log gain of their cameras.
 
-    Airlight that the sky tells stays as it is; airlight under the same gain as the surface changes as the image value would.
+    Airlight whose gain the sky tells stays as it is; without sky it has the gain of the surface. The slope that a residual
+    is divided by counts as a weight here: else a gain that leaves nothing but airlight would fit best.
     """
-    return np.where(sees_sky[camera][:, None], 1.0, np.exp(samples.log_slope))
+    return np.where(sees_sky[camera][:, None], 0.0, samples.by_sky_gain) - 1.0
 
 
 def _overlap_residuals(overlaps: OverlapPairs, radiometry: RadiometricFit, sees_sky: np.ndarray) -> _Residuals:
@@ -472,14 +475,14 @@ def _overlap_residuals(overlaps: OverlapPairs, radiometry: RadiometricFit, sees_
     slope = np.exp(0.5 * (left.log_slope + right.log_slope))
     noise = left.noise**2 * np.exp(2.0 * left.log_slope) + right.noise**2 * np.exp(2.0 * right.log_slope)
     half = 0.5 * error
-    by_own, by_other = _slope_of_gain(sees_sky, own.camera, left), _slope_of_gain(sees_sky, other.camera, right)
+    by_own, by_other = _by_gain(sees_sky, own.camera, left), _by_gain(sees_sky, other.camera, right)
     return _Residuals(
         error / slope,
         noise / slope**2 + _SURFACE_SIGMA**2,
         (
-            _CameraDerivatives(own.camera, -by_own / slope, (left.by_contrast - half * left.slope_by_contrast) / slope),
+            _CameraDerivatives(own.camera, by_own / slope, (left.by_contrast - half * left.slope_by_contrast) / slope),
             _CameraDerivatives(
-                other.camera, by_other / slope, (-right.by_contrast - half * right.slope_by_contrast) / slope
+                other.camera, -by_other / slope, (-right.by_contrast - half * right.slope_by_contrast) / slope
             ),
         ),
         (left.by_haze - right.by_haze - half * (left.slope_by_haze + right.slope_by_haze)) / slope,
@@ -499,13 +502,13 @@ def _predicted_residuals(
     samples = _linearise(single[known], radiometry)
     camera, slope = single.camera[known], np.exp(samples.log_slope)
     error = samples.log_surface - expected[known] - radiometry.log_gain[camera]
-    by_gain = _slope_of_gain(sees_sky, camera, samples)
+    by_gain = _by_gain(sees_sky, camera, samples)
     return _Residuals(
         error / slope,
         samples.noise**2 + predicted_sigma**2,
         (
             _CameraDerivatives(
-                camera, -by_gain / slope, (samples.by_contrast - error * samples.slope_by_contrast) / slope
+                camera, by_gain / slope, (samples.by_contrast - error * samples.slope_by_contrast) / slope
             ),
         ),
         (samples.by_haze - error * samples.slope_by_haze) / slope,

@@ -1,4 +1,4 @@
-"""Completion of a large texture tile by tile: one regression for all, and memory for little more than the texture itself.
+"""Completion of a large texture tile by tile: one regression for all, without the predictors of all texels in memory.
 
 The regression is fitted to a sample of painted texels of the whole texture, as `regression_fill` does. Each tile is then
 filled with a border of `HALO_PX` texels around it. Residuals of painted texels that lie farther away are left out:
@@ -28,6 +28,9 @@ from seasonscapes.texturing.tiled_predictors import TiledPredictors, Window
 
 Progress = Callable[[float], None]
 TILE_PX, HALO_PX = 2048, 96
+# Windows begin at multiples of this many texels, so that the cells of a pyramid over them are those over the whole texture
+# as far as residuals reach; as many levels as the border is wide.
+_PHASE_PX = 32
 
 
 @dataclass(frozen=True)
@@ -68,7 +71,8 @@ def complete_tiles(
     values
         ``(R, S, 3)`` float32, finite everywhere; painted texels equal the given ones bit for bit.
     sigma
-        ``(R, S)`` float32 standard error of the filled texels in the unit of ``values``; 0 where painted.
+        ``(R, S)`` float32 standard error of the filled texels in the unit of ``values``; 0 where painted, and like
+        ``values`` in windows without any texel of the surface.
 
     Raises
     ------
@@ -78,7 +82,16 @@ def complete_tiles(
         A negative painted value.
     """
     report = progress or (lambda fraction: None)
-    scale, fitted = _fitted(texture, painted, predictors, fast=fast, seed=seed, tile_px=tile_px, progress=report)
+    known = painted & predictors.surface
+    if not known.any():
+        raise NotEnoughEvidence("complete: no painted texel on the surface: there is nothing to learn from")
+    brightest = _brightest(texture, painted, known, tile_px)
+    if np.array_equal(known, predictors.surface):
+        scale, fitted = _Scale(1.0, 1.0), None  # no hole: only what lies off the surface is extended
+    else:
+        scale, fitted = _fitted(
+            texture, painted, predictors, known, brightest, fast=fast, seed=seed, tile_px=tile_px, progress=report
+        )
     values, sigma = np.empty_like(texture.values, np.float32), np.zeros(painted.shape, np.float32)
     tiles = list(_windows(painted.shape, tile_px))
     for done, tile in enumerate(tiles):
@@ -91,6 +104,8 @@ def _fitted(
     texture: Texture,
     painted: np.ndarray,
     predictors: TiledPredictors,
+    known: np.ndarray,
+    brightest: float,
     *,
     fast: bool,
     seed: int,
@@ -99,14 +114,6 @@ def _fitted(
 ) -> tuple[_Scale, FittedCompletion]:
     rng = np.random.default_rng(seed)
     count = FAST_SAMPLES if fast else SAMPLES
-    known = painted & predictors.surface
-    if not known.any():
-        raise NotEnoughEvidence("complete: no painted texel on the surface: there is nothing to learn from")
-    brightest = 0.0
-    for tile in _windows(painted.shape, tile_px):
-        if texture.values[tile][painted[tile]].min(initial=0.0) < 0.0:
-            raise ValueError("complete: negative values among the painted texels")
-        brightest = max(brightest, float(texture.values[tile][known[tile]].max(initial=0.0)))
     texel = _drawn(known, count, rng)
     predictor, colour = _rows_of(predictors, texel, tile_px), texture.values.reshape(-1, 3)[texel]
     unit = max(float(np.median(colour)), 1e-6 * brightest, 1e-12)
@@ -129,6 +136,16 @@ def _fitted(
         progress=lambda done: progress(0.1 + 0.2 * done),
     )
     return _Scale(unit, float(np.cbrt(brightest / unit))), fitted
+
+
+def _brightest(texture: Texture, painted: np.ndarray, known: np.ndarray, tile_px: int) -> float:
+    """The greatest value of a known texel; refuses negative painted ones."""
+    brightest = 0.0
+    for tile in _windows(painted.shape, tile_px):
+        if texture.values[tile][painted[tile]].min(initial=0.0) < 0.0:
+            raise ValueError("complete: negative values among the painted texels")
+        brightest = max(brightest, float(texture.values[tile][known[tile]].max(initial=0.0)))
+    return brightest
 
 
 def _drawn(mask: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
@@ -162,13 +179,13 @@ def _filled(
     predictors: TiledPredictors,
     tile: Window,
     scale: _Scale,
-    fitted: FittedCompletion,
+    fitted: FittedCompletion | None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Values and σ of a tile."""
     height, width = painted.shape
     outer = (
-        slice(max(0, tile[0].start - HALO_PX), min(height, tile[0].stop + HALO_PX)),
-        slice(max(0, tile[1].start - HALO_PX), min(width, tile[1].stop + HALO_PX)),
+        slice(_aligned_start(tile[0].start), min(height, tile[0].stop + HALO_PX)),
+        slice(_aligned_start(tile[1].start), min(width, tile[1].stop + HALO_PX)),
     )
     core = tuple(slice(t.start - o.start, t.stop - o.start) for t, o in zip(tile, outer, strict=True))
     surface, known = predictors.surface[outer], painted[outer]
@@ -181,7 +198,7 @@ def _filled(
         # What lies between charts is filled from the surface about it, which has to be complete first.
         inside[:] = True
     hole = surface & ~known & inside
-    if hole.any():
+    if fitted is not None and hole.any():
         encoded = np.cbrt(values / np.float32(scale.unit))
         filled, error = completion_of(fitted, encoded, known & surface, predictors.window(outer), inside=inside)
         # Cubing amplifies small errors of bright texels; no filled texel may be brighter than all known ones.
@@ -191,6 +208,10 @@ def _filled(
         extended = push_pull(np.concatenate([values, sigma[..., None]], -1), (~off_surface).astype(np.float32))
         values[off_surface], sigma[off_surface] = extended[off_surface][:, :3], extended[off_surface][:, 3]
     return values[core], sigma[core]
+
+
+def _aligned_start(start: int) -> int:
+    return max(0, start - HALO_PX) // _PHASE_PX * _PHASE_PX
 
 
 def _windows(shape: tuple[int, int], tile_px: int) -> Iterator[Window]:

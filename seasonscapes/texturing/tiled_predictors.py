@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 
 import cv2
 import numpy as np
@@ -13,12 +14,13 @@ from numpy.typing import ArrayLike
 from seasonscapes.terrain.atlas import Atlas
 from seasonscapes.terrain.surface import Terrain, Texture
 from seasonscapes.terrain.texels import covering_faces, texel_coordinates
-from seasonscapes.texturing.predictors import Predictors, stack_predictors
+from seasonscapes.texturing.predictors import Predictors, require_atlas_size, stack_predictors
 from seasonscapes.texturing.terrain_features import terrain_features
 from seasonscapes.texturing.top_down_grid import grid_heights
 
 # Terrain attributes are computed on at most this many cells; finer texels interpolate between them.
 MOST_CELLS = 12_000_000
+_BLOCK_PX = 2048
 Window = tuple[slice, slice]
 
 
@@ -57,7 +59,12 @@ class TiledPredictors:
     def whole(self) -> Predictors:
         """Predictors of all texels at once, in as much memory as they take."""
         rows, columns = self.surface.shape
-        return self.window((slice(0, rows), slice(0, columns)))
+        values = np.empty((rows, columns, len(self.names)), np.float32)
+        # remap gives no more than 32,767 texels along a side.
+        for top, left in product(range(0, rows, _BLOCK_PX), range(0, columns, _BLOCK_PX)):
+            part = slice(top, min(top + _BLOCK_PX, rows)), slice(left, min(left + _BLOCK_PX, columns))
+            values[part] = self.window(part).values
+        return Predictors(values, self.names, self.surface)
 
     def window(self, window: Window) -> Predictors:
         """Predictors of a rectangle of texels.
@@ -128,7 +135,10 @@ def tiled_predictors(
     ------
     ValueError
         An atlas that is not planar.
+    AtlasMismatch
+        A satellite image or a layer of another size than the atlas.
     """
+    require_atlas_size((atlas.height_px, atlas.width_px), satellite, layers or {})
     if atlas.kind != "planar":
         raise ValueError(f"tiled_predictors: got an atlas {atlas.kind!r}, expected planar")
     cell_m = float((np.ptp(terrain.vertices[:, :2], axis=0) / [atlas.width_px, atlas.height_px]).max())

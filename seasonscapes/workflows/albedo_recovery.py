@@ -370,12 +370,18 @@ def photographs_of_ground(
     skies = photograph_skies(place, transport, seen, model)
     report = task_progress(progress, "footprints of the photographs")
     prepared = prepare_photographs(transport, seen, illuminations(place, seen, skies), progress=report)
-    prepared = with_assumed_exposure(prepared)
-    if place.terrain.water is None:
-        return prepared, skies, 0.0
-    sky_of = {id(each): sky for each, sky in zip(seen, skies, strict=True)}
-    dry, share = without_water(prepared, place.terrain.water.mask)
-    return dry, [sky_of[id(each.observation)] for each in dry], share
+    share = 0.0
+    if place.terrain.water is not None:
+        sky_of = {id(each): sky for each, sky in zip(seen, skies, strict=True)}
+        prepared, share = without_water(prepared, place.terrain.water.mask)
+        skies = [sky_of[id(each.observation)] for each in prepared]
+    exposed = with_assumed_exposure(prepared)
+    if any(after is not before for after, before in zip(exposed, prepared, strict=True)):
+        log.warning(
+            "no photograph shows enough sky to tell its exposure and white balance: they are taken as set for level ground, "
+            "so that brightness and colours of the albedo are the camera's own"
+        )
+    return exposed, skies, share
 
 
 def _prepared(
@@ -387,6 +393,7 @@ def _prepared(
     progress: Progress | None,
 ) -> tuple[list[AlbedoPhotograph], list[SkyModel], dict[str, Any]]:
     """Photographs with their light, and their skies; tone curve and visibility fitted where asked for."""
+    from seasonscapes.albedo.assumed_exposure import with_assumed_exposure
     from seasonscapes.albedo.haze import fit_visibility
     from seasonscapes.albedo.photographs import EIGHT_BIT
     from seasonscapes.albedo.tone_curve import fit_tone_curve, with_tone_curve
@@ -422,7 +429,11 @@ def _prepared(
         facts["visibility_km"] = round(found.visibility_km, 1)
         log.info("visibility %.0f km", found.visibility_km)
         hazy = lights_of(found.visibility_km)
-        prepared = [replace(each, light=light) for each, light in zip(prepared, hazy, strict=True)]
+        # An assumed exposure is that under the light: here no other gain is known.
+        lit = [replace(each, light=light, gain=None) for each, light in zip(prepared, hazy, strict=True)]
+        prepared = with_assumed_exposure(lit)
+    if any(each.gain is not None for each in prepared):
+        facts["exposure"] = "assumed: no photograph shows enough sky"
     return prepared, skies, facts
 
 

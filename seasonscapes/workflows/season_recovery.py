@@ -126,6 +126,7 @@ def _grouped_days(
     place: Place, transport: TexelTransport, photographs: list[Observation], model: SkyModel, progress: Progress | None
 ) -> list[list[date]]:
     """UTC dates of the photographs by season; days that lie within one season by the albedo that each gives alone."""
+    from seasonscapes.albedo.assumed_exposure import with_assumed_exposure
     from seasonscapes.albedo.season_grouping import group_dates
     from seasonscapes.albedo.standard_error import albedo_estimate
 
@@ -136,9 +137,11 @@ def _grouped_days(
     prepared = photographs_of_ground(place, transport, photographs, model, progress)[0]
     known: list[date] = []
     estimates: list[AlbedoEstimate] = []
+    scale_sigma: list[float] = []
     doubts: dict[date, str] = {}
     for day in each_reported(days, len(days), progress, "albedo of each day"):
-        own = [each for each in prepared if each.observation.time.date() == day]
+        # Alone a day without sky has nothing but its cameras' own exposure, whatever the others show.
+        own = with_assumed_exposure([each for each in prepared if each.observation.time.date() == day])
         if not own:
             doubts[day] = "it shows no ground"
             continue
@@ -148,8 +151,9 @@ def _grouped_days(
             doubts[day] = str(error)
         else:
             known.append(day)
+            scale_sigma.append(max(each.gain_sigma for each in own))
     # Where no day stands alone, all may stand together.
-    groups = [[known[index] for index in group] for group in group_dates(known, estimates)] or [days]
+    groups = [[known[index] for index in group] for group in group_dates(known, estimates, scale_sigma)] or [days]
     for day in doubts if known else ():
         nearest = min(known, key=lambda each: days_apart(day, each))
         if days_apart(day, nearest) <= _NEAR_DAYS:

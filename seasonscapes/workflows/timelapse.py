@@ -211,7 +211,9 @@ def render_frames(
         missing = [time for time in times if not all((folder / frame_name(time)).is_file() for folder in folders)]
         told = task_progress(progress, "light of the sky")
         tabulate_illumination(session.place, session.camera, session.sky, missing, progress=told)
-        results = run_on_cluster(cluster, task, times)
+        to_render = set(missing)
+        # Those that are there are checked last: every worker renders first, and no long task follows many short ones.
+        results = run_on_cluster(cluster, task, [*missing, *(time for time in times if time not in to_render)])
     return sum(record["rendered"] for record in each_reported(results, len(times), progress, "frames"))
 
 
