@@ -72,6 +72,25 @@ def test_one_photograph_of_a_day_is_assumed_and_the_sky_comes_first(taken):
     assert [each.gain for each in with_assumed_exposure(seen)] == [None, None]
 
 
+def test_exposures_of_the_night_are_not_assumed(taken, caplog):
+    place, transport, _, without = taken
+    night = replace(without[0], time=utc_at(place, "2024-07-22T01:00"))
+    pictures = [without[1], night]
+    lights = [illumination_for_camera(place, each.camera, sky_model("clear"), each.time)[0] for each in pictures]
+    dark = prepare_photographs(transport, pictures, lights)
+    with caplog.at_level(logging.WARNING):
+        gains = [each.gain for each in with_assumed_exposure(dark)]
+    assert gains[0] is not None
+    assert gains[1] is None
+    assert [each.message for each in caplog.records if each.message.startswith("2024-07-21: ")]
+    caplog.clear()
+    with caplog.at_level(logging.WARNING):
+        alone = with_assumed_exposure(dark[1:])
+    assert alone[0].gain is None
+    assert not any("set for level ground" in each.message for each in caplog.records)
+    assert sum("at night" in each.message for each in caplog.records) == 1
+
+
 def test_the_tone_curve_of_one_such_photograph_is_not_guessed(taken, monkeypatch):
     place, transport, _, without = taken
     monkeypatch.setattr(tone_curve, "fit_tone_curve", lambda *given, **named: tone_curve.ToneCurveFit(0.4, {}))

@@ -22,6 +22,8 @@ log = logging.getLogger(__name__)
 
 # Automatic exposures lie within a stop of a grey card's, white balances nearer to it.
 _GAIN_SIGMA = 0.3
+# Level ground has some 3 lx where civil twilight ends; in the night below, exposures end at the longest that a camera has.
+_DARKEST_LX = 3.0
 
 
 def with_assumed_exposure(
@@ -41,7 +43,8 @@ def with_assumed_exposure(
     list of AlbedoPhotograph
         In the same order; the same photographs where one of them shows sky or has a known gain. Otherwise the photograph of each
         UTC day under the strongest light has the gain of a camera that exposes and balances for level ground, by which
-        those of the same ground find their own.
+        those of the same ground find their own; days that have none but photographs of the night (level ground below 3 lx) are
+        named and stay without.
 
     Examples
     --------
@@ -50,22 +53,30 @@ def with_assumed_exposure(
     """
     if not photographs or any(_tells_gain(each, noise_model) for each in photographs):
         return list(photographs)
-    log.warning(
-        "no photograph shows enough sky to tell its exposure and white balance: they are taken as set for level ground, so that "
-        "brightness and colours of the albedo are the camera's own"
-    )
 
     def level_lx(photograph: AlbedoPhotograph) -> float:
-        return float(photograph.light.global_horizontal_lx[1])
+        return float(np.min(photograph.light.global_horizontal_lx))
 
     strongest: dict = {}
     for number, each in enumerate(photographs):
         day = each.observation.time.date()
         if day not in strongest or level_lx(each) > level_lx(photographs[strongest[day]]):
             strongest[day] = number
+    lit = [number for number in strongest.values() if level_lx(photographs[number]) >= _DARKEST_LX]
+    dark = sorted(str(day) for day, number in strongest.items() if number not in lit)
+    if lit:
+        log.warning(
+            "no photograph shows enough sky to tell its exposure and white balance: they are taken as set for level ground, so that "
+            "brightness and colours of the albedo are the camera's own"
+        )
+    if dark:
+        log.warning(
+            "%s: no photograph shows enough sky to tell its exposure, and all were taken at night, where a camera's own is not known",
+            ", ".join(dark),
+        )
     result = list(photographs)
-    for number in strongest.values():
-        level = np.maximum(photographs[number].light.global_horizontal_lx, 1e-6)
+    for number in lit:
+        level = photographs[number].light.global_horizontal_lx
         result[number] = replace(photographs[number], gain=np.pi / level, gain_sigma=_GAIN_SIGMA)
     return result
 
