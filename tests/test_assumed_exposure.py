@@ -80,11 +80,23 @@ def test_every_camera_has_its_own_exposure_whatever_the_order(taken):
     for order in ([0, 1], [1, 0], [2, 3], [0, 2, 3]):
         prepared = prepare_photographs(transport, [views[k] for k in order], [lights[k] for k in order])
         assert all(each.gain is not None for each in with_assumed_exposure(prepared))
-    night = [
-        replace(each, light=replace(each.light, sky_radiance=0.0 * each.light.sky_radiance, sun=None))
-        for each in prepared
-    ]
-    assert all(each.gain is None for each in with_assumed_exposure(night))
+
+
+def test_exposures_of_the_night_are_not_assumed(taken, caplog):
+    place, transport, _, without = taken
+    night = replace(without[0], time=utc_at(place, "2024-07-22T01:00"))
+    pictures = [without[1], night]
+    with caplog.at_level(logging.WARNING):
+        gains = [each.gain for each in photographs_of_ground(place, transport, pictures, sky_model("clear"))[0]]
+    assert gains[0] is not None
+    assert gains[1] is None
+    assert [each.message for each in caplog.records if each.message.startswith("2024-07-21: ")]
+    caplog.clear()
+    with caplog.at_level(logging.WARNING):
+        alone = photographs_of_ground(place, transport, pictures[1:], sky_model("clear"))[0]
+    assert alone[0].gain is None
+    assert not any("set for level ground" in each.message for each in caplog.records)
+    assert sum("at night" in each.message for each in caplog.records) == 1
 
 
 def test_the_tone_curve_of_one_such_photograph_is_not_guessed(taken, monkeypatch):

@@ -1,6 +1,7 @@
 """Alignment without a hand: the terrain's horizon by closed forms, then pictures whose truth is known, then real ones."""
 
 import csv
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from seasonscapes.calibration.terrain_horizon import (
     terrain_profile,
 )
 from seasonscapes.cameras.pinhole import camera_at
-from seasonscapes.errors import CameraBelowGround, ImageSizeMismatch
+from seasonscapes.errors import CameraBelowGround, ImageSizeMismatch, NoTerrainInView
 from seasonscapes.evaluation.calibration_pictures import panorama_trial, picture_trial
 from seasonscapes.frames import MEAN_RADIUS_M, LocalFrame, enu_from_geodetic, geodetic_from_enu
 from seasonscapes.images import read_image_srgb8
@@ -124,6 +125,21 @@ def test_terrain_that_ends_rising_gives_no_horizon_and_a_finer_raster_goes_first
     assert terrain_height([fine, coarse], latitude, longitude) == pytest.approx([99.0, 10.0])
     with pytest.raises(CameraBelowGround, match="94 m below ground"):
         horizon_from([fine, coarse], frame_at_middle(), [0.0, 0.0, 5.0])
+
+
+def test_a_bowl_has_a_border_in_place_of_a_skyline():
+    bowl = raster_of(lambda e, n: 0.15 * np.hypot(e, n) + (e**2 + n**2) / (2.0 * MEAN_RADIUS_M))
+    azimuth = np.arange(0.0, 360.0, 30.0)
+    horizon = horizon_from([bowl], frame_at_middle(), [0.0, 0.0, 30.0], azimuth_deg=azimuth)
+    assert np.isnan(horizon.skyline_elevation_deg).all()
+    assert np.isnan(horizon.skyline_m).all()
+    assert horizon.edge_of_heights_deg == pytest.approx(np.degrees(np.arctan(0.15)), abs=0.3)
+    half = 0.5 * bowl.values.shape[0] * abs(bowl.transform.a)
+    assert np.abs(horizon.edge_of_heights_m[:, :2]).max(axis=1) == pytest.approx(half, rel=0.03)
+    away = horizon_from([bowl], frame_at_middle(), [2.0 * half, 0.0, 9000.0], azimuth_deg=np.array([90.0, 270.0]))
+    assert np.isnan(away.edge_of_heights_m[0]).all()
+    with pytest.raises(NoTerrainInView):
+        horizon_from([bowl], frame_at_middle(), [2.0 * half, 0.0, 9000.0], azimuth_deg=np.array([80.0, 90.0]))
 
 
 @pytest.mark.parametrize("turned_deg", [0.0, 30.0])
@@ -246,6 +262,14 @@ def test_a_picture_of_another_size_is_refused(trial, fit):
         boundary_map(trial.image.astype(float), None, 10.0)
     with pytest.raises(ValueError, match="leaves 0 %"):
         boundary_map(trial.image, np.zeros(trial.image.shape[:2], bool), 10.0)
+
+
+def test_heights_that_end_before_the_skyline_everywhere_are_named(trial):
+    (raster,) = trial.rasters
+    side = (np.arange(len(raster.values)) - 0.5 * len(raster.values)) * cell_size_m(raster)
+    bowl = (0.15 * np.hypot(side[:, None], side) - 5000.0).astype(np.float32)
+    with pytest.raises(NoTerrainInView, match="end before the skyline in every direction"):
+        align_to_skyline(trial.image, trial.start, (replace(raster, values=bowl[..., None]),), trial.frame)
 
 
 def test_a_uniform_frame_is_recognised():

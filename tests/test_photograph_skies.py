@@ -51,6 +51,43 @@ def test_a_grey_sky_is_taken_as_clouds_and_a_blue_one_is_not(taken):
         assert [each.cloudiness for each in photograph_skies(place, transport, [grey], stated)] == [cloudiness]
 
 
+def test_views_of_a_panorama_have_the_sky_that_any_of_them_tells(taken):
+    place, transport, _ = taken
+    clear = sky_model("clear")
+    grey, blue = _with_sky(taken, 1, (0.5, 0.5, 0.52)), _with_sky(taken, 0, (0.12, 0.25, 0.6))
+    ground = visible_faces(transport.ray_scene, grey.camera) >= 0
+    views = [replace(grey, webcam="hut/0"), replace(grey, webcam="hut/1", mask=ground)]
+    assert [each.cloudiness for each in photograph_skies(place, transport, views, clear)] == [1.0, 1.0]
+    assert [each.cloudiness for each in photograph_skies(place, transport, views[::-1], clear)] == [1.0, 1.0]
+    # Of the sky, one view shows about a tenth.
+    rows = np.cumsum((~ground).sum(axis=1))
+    few = (np.arange(len(rows)) <= np.searchsorted(rows, rows[-1] / 10))[:, None] & ~ground
+    views = [replace(blue, webcam="hut/0"), replace(grey, webcam="hut/1", mask=few | ground)]
+    assert [each.cloudiness for each in photograph_skies(place, transport, views, clear)] == [0.0, 0.0]
+    views = [replace(grey, webcam="hut/0"), replace(blue, webcam="hut/1", mask=few | ground)]
+    first, second = (each.cloudiness for each in photograph_skies(place, transport, views, clear))
+    assert first == second
+    assert 0.7 < first < 0.95
+    # Other webcams and other instants have their own.
+    mixed = [replace(grey, webcam="hut/0"), replace(blue, webcam="mast/0")]
+    assert [each.cloudiness for each in photograph_skies(place, transport, mixed, clear)] == [1.0, 0.0]
+
+
+def test_a_low_sun_is_named_as_the_reason_that_the_weather_is_not_told(taken, caplog):
+    place, transport, _ = taken
+    grey = _with_sky(taken, 1, (0.5, 0.5, 0.52))
+    evening = replace(grey, time=grey.time.replace(hour=18, minute=45))
+    covered = replace(grey, webcam="mast", mask=visible_faces(transport.ray_scene, grey.camera) >= 0)
+    with caplog.at_level(logging.WARNING):
+        photograph_skies(place, transport, [evening, covered], sky_model("clear"))
+    low, unseen = sorted(each.message for each in caplog.records if "weather is not told" in each.message)
+    assert low.startswith("cam1 2024-07-20 18:45 UTC: ")
+    assert "the sun stands lower than 10°" in low
+    assert "no unclipped sky" not in low
+    assert unseen.startswith("mast 2024-07-20 14:00 UTC: ")
+    assert "no unclipped sky away from the sun is seen" in unseen
+
+
 def test_a_low_sun_and_a_synthetic_clear_sky_stay_clear(taken):
     place, transport, observations = taken
     clear = sky_model("clear")

@@ -20,7 +20,7 @@ from seasonscapes.albedo.photographs import EIGHT_BIT, AlbedoPhotograph, NoiseMo
 
 # Automatic exposures lie within a stop of a grey card's, white balances nearer to it.
 ASSUMED_SIGMA = 0.3
-# In less light cameras do not expose for level ground any more: at the end of civil twilight.
+# Level ground has some 3 lx where civil twilight ends; in the night below, exposures end at the longest that a camera has.
 _DIMMEST_LX = 3.0
 
 
@@ -41,14 +41,15 @@ def with_assumed_exposure(
     list of AlbedoPhotograph
         In the same order; the same photographs where one of them shows sky or has a known gain. Otherwise the photograph of each
         camera and UTC day under the strongest light, or all views of a panorama then, has the gain of a camera that exposes and
-        balances for level ground, by which those of the same ground find their own.
+        balances for level ground, by which those of the same ground find their own; photographs of the night (`too_dark`) stay
+        without.
 
     Examples
     --------
     >>> with_assumed_exposure([])
     []
     """
-    if not photographs or any(_tells_gain(each, noise_model) for each in photographs):
+    if not photographs or any(tells_gain(each, noise_model) for each in photographs):
         return list(photographs)
 
     def hour(photograph: AlbedoPhotograph) -> tuple[str, date]:
@@ -62,17 +63,23 @@ def with_assumed_exposure(
             strongest[hour(each)] = each
     return [
         replace(each, gain=np.pi / each.light.global_horizontal_lx, gain_sigma=ASSUMED_SIGMA)
-        if each.observation.time == strongest[hour(each)].observation.time and _level_lx(each) >= _DIMMEST_LX
+        if each.observation.time == strongest[hour(each)].observation.time and not too_dark(each)
         else each
         for each in photographs
     ]
 
 
+def too_dark(photograph: AlbedoPhotograph) -> bool:
+    """Whether level ground has less light than at the end of civil twilight, where cameras cannot expose for it."""
+    return _level_lx(photograph) < _DIMMEST_LX
+
+
 def _level_lx(photograph: AlbedoPhotograph) -> float:
-    return float(photograph.light.global_horizontal_lx[1])
+    return float(np.min(photograph.light.global_horizontal_lx))
 
 
-def _tells_gain(photograph: AlbedoPhotograph, noise_model: NoiseModel) -> bool:
+def tells_gain(photograph: AlbedoPhotograph, noise_model: NoiseModel = EIGHT_BIT) -> bool:
+    """Whether a photograph's gain is known, or told by the sky that it shows."""
     if photograph.gain is not None:
         return True
     usable = usable_pixels(photograph.observation, photograph.noise(noise_model))

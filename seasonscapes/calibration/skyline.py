@@ -19,7 +19,7 @@ from seasonscapes.calibration.pose_model import View, parameters_of_view, projec
 from seasonscapes.calibration.resection import Calibration, ResectionOptions, SkylineEvidence, resect
 from seasonscapes.calibration.terrain_horizon import Horizon, HorizonOptions, cell_size_m, horizon_from
 from seasonscapes.cameras.panorama import Panorama
-from seasonscapes.errors import ImageSizeMismatch
+from seasonscapes.errors import ImageSizeMismatch, NoTerrainInView
 from seasonscapes.frames import LocalFrame, geodetic_from_enu, local_axes
 from seasonscapes.terrain.surface import Raster
 
@@ -174,7 +174,7 @@ def align_to_skyline(
     Raises
     ------
     NoTerrainInView
-        If no terrain is visible from the start position.
+        If no terrain is visible from the start position, or the heights end before the skyline in every direction.
     CameraBelowGround
         If the start position lies more than 40 m below the ground.
     NoUsablePixels
@@ -197,6 +197,10 @@ def align_to_skyline(
     cell_m = cell_size_m(rasters[0])
     options = HorizonOptions(nearest_m=max(60.0, 3.0 * cell_m), below_ground_m=40.0)
     horizon = horizon_from(rasters, frame, start.position_m, azimuth_deg=azimuth, options=options)
+    if not np.isfinite(horizon.skyline_elevation_deg).any():
+        raise NoTerrainInView(
+            "align_to_skyline: the heights end before the skyline in every direction of the camera; it takes heights that reach farther"
+        )
     boundary = boundary_map(image, mask, start.fy * np.pi / 180.0)
     terrain_sigma_m = search.terrain_sigma_m or cell_m / 3.0
     problem = _SkylineProblem(start, axes, origin, horizon, terrain_sigma_m, boundary, search, points)

@@ -43,6 +43,8 @@ class Horizon:
     edge_of_heights_deg
         ``(A,)`` elevation angle of the highest terrain where that is the border of the heights, so that the skyline lies beyond
         it [deg]; NaN where the skyline is known, and where there is no terrain at that azimuth.
+    edge_of_heights_m
+        ``(A, 3)`` the terrain at that border [m]; NaN as above.
     """
 
     position_m: np.ndarray
@@ -53,6 +55,7 @@ class Horizon:
     edges_m: np.ndarray
     edge_gap: np.ndarray
     edge_of_heights_deg: np.ndarray
+    edge_of_heights_m: np.ndarray
 
 
 def terrain_height(rasters: Sequence[Raster], latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> np.ndarray:
@@ -226,7 +229,7 @@ def horizon_from(
     Returns
     -------
     Horizon
-        Skyline and ridge edges.
+        Skyline and ridge edges. Where the skyline lies beyond the heights at every azimuth, all of it is NaN.
 
     Raises
     ------
@@ -244,7 +247,7 @@ def horizon_from(
         raise CameraBelowGround(f"the camera is {depth:.0f} m below ground; check its height and vertical datum")
     distance = _distances(options.nearest_m, options.reach_m, 0.7 * cell_size_m(rasters[0]))
     azimuth_deg = np.arange(3600) * 0.1 if azimuth_deg is None else np.asarray(azimuth_deg, float)
-    skyline, elevation, edges, gaps, borders = [], [], [], [], []
+    skyline, elevation, edges, gaps, borders_deg, borders = [], [], [], [], [], []
     # Blocks of azimuths bound the memory to some hundred megabytes.
     for part in np.array_split(azimuth_deg, max(1, len(azimuth_deg) * len(distance) // 1_000_000)):
         points = terrain_profile(rasters, frame, position, part, distance)
@@ -254,12 +257,13 @@ def horizon_from(
         rows = np.arange(len(part))
         skyline.append(np.where(has_skyline[:, None], points[rows, top], np.nan))
         elevation.append(np.where(has_skyline, np.degrees(np.arctan(slope[rows, top])), np.nan))
-        highest_deg = np.degrees(np.arctan(slope[rows, top]))
-        borders.append(np.where(has_skyline | ~np.isfinite(slope[rows, top]), np.nan, highest_deg))
+        at_border = ~has_skyline & np.isfinite(slope[rows, top])
+        borders_deg.append(np.where(at_border, np.degrees(np.arctan(slope[rows, top])), np.nan))
+        borders.append(np.where(at_border[:, None], points[rows, top], np.nan))
         edges.append(points[ridge])
         gaps.append(gap)
-    elevation = np.concatenate(elevation)
-    if not np.isfinite(elevation).any():
+    elevation, border_deg = np.concatenate(elevation), np.concatenate(borders_deg)
+    if not (np.isfinite(elevation) | np.isfinite(border_deg)).any():
         raise NoTerrainInView("no terrain within reach of the camera")
     return Horizon(
         position,
@@ -269,6 +273,7 @@ def horizon_from(
         elevation,
         np.concatenate(edges),
         np.concatenate(gaps),
+        border_deg,
         np.concatenate(borders),
     )
 

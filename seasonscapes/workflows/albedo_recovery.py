@@ -362,7 +362,7 @@ def photographs_of_ground(
     NoUsablePixels
         Where all that they show is water.
     """
-    from seasonscapes.albedo.assumed_exposure import with_assumed_exposure
+    from seasonscapes.albedo.assumed_exposure import tells_gain, with_assumed_exposure
     from seasonscapes.albedo.ground_pixels import without_water
     from seasonscapes.albedo.photographs import prepare_photographs
 
@@ -381,7 +381,21 @@ def photographs_of_ground(
             "no photograph shows enough sky to tell its exposure and white balance: they are taken as set for level ground, "
             "so that brightness and colours of the albedo are the camera's own"
         )
+    if not any(tells_gain(each) for each in prepared):
+        _tell_nights(exposed)
     return exposed, skies, share
+
+
+def _tell_nights(photographs: list[AlbedoPhotograph]) -> None:
+    from seasonscapes.albedo.assumed_exposure import too_dark
+
+    days = {each.observation.time.date() for each in photographs}
+    nights = days - {each.observation.time.date() for each in photographs if not too_dark(each)}
+    if nights:
+        log.warning(
+            "%s: no photograph shows enough sky to tell its exposure, and all were taken at night, where a camera's own is not known",
+            ", ".join(sorted(map(str, nights))),
+        )
 
 
 def _prepared(
