@@ -359,6 +359,7 @@ def _by_skyline(
 
 def _by_points(station: WebcamStation, points: Correspondences | None, *, radial: bool) -> Calibration:
     """The resection of points; without points, the pose that is known already."""
+    from seasonscapes.calibration.contradictions import datum_doubts
     from seasonscapes.calibration.evidence import Priors
     from seasonscapes.calibration.ground_clearance import height_sigma_m
     from seasonscapes.calibration.pose_model import parameters_of_view
@@ -372,7 +373,9 @@ def _by_points(station: WebcamStation, points: Correspondences | None, *, radial
     priors = Priors(horizontal_m=sigma_m, vertical_m=sigma_m, k1=np.inf if radial else 0.0)
     webcam = station.webcam
     ground_sigma_m = height_sigma_m(station.rasters, webcam.latitude_deg, webcam.longitude_deg)
-    options = ResectionOptions(ground_m=_ground_of(station), ground_sigma_m=ground_sigma_m)
+    # Points in another vertical datum put the camera as far off the ground, which tells nothing then: they are doubted.
+    ground_m = None if datum_doubts(points, station.frame, station.rasters) else _ground_of(station)
+    options = ResectionOptions(ground_m=ground_m, ground_sigma_m=ground_sigma_m)
     return resect(station.view, points, priors=priors, k1=station.webcam.radial_k1, axes=station.axes, options=options)
 
 
