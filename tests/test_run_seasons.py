@@ -106,7 +106,11 @@ def test_a_day_that_tells_nothing_alone_joins_the_nearest(monkeypatch):
     monkeypatch.setattr(
         season_recovery,
         "photographs_of_ground",
-        lambda place, transport, seen, model, progress: ([SimpleNamespace(observation=each) for each in seen], [], 0.0),
+        lambda place, transport, seen, model, progress: (
+            [SimpleNamespace(observation=each, gain=np.ones(3), gain_sigma=0.0) for each in seen],
+            [],
+            0.0,
+        ),
     )
     monkeypatch.setattr(standard_error, "albedo_estimate", lambda transport, own, fit: _snow_above(fit))
     groups = season_recovery._grouped_days(None, None, days, None, None)
