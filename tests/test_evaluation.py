@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from tiny_diffusion import random_lpips, write_lpips_parts
 
-from seasonscapes.cameras.observation import Observation
+from seasonscapes.cameras.observation import Observation, webcam_of
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.errors import InputError
 from seasonscapes.evaluation.lpips import (
@@ -42,7 +42,6 @@ from seasonscapes.evaluation.splits import (
     held_out_views,
     observation_hash,
     picture_use,
-    webcam_of,
 )
 from seasonscapes.evaluation.surfaces import albedo_error, shadow_iou
 from seasonscapes.evaluation.tables import by_class, by_distance, drop, summary, table_lines

@@ -17,6 +17,7 @@ import numpy as np
 
 from seasonscapes.albedo.equations import FEWEST_SKY, usable_pixels, usable_sky
 from seasonscapes.albedo.photographs import EIGHT_BIT, AlbedoPhotograph, NoiseModel
+from seasonscapes.cameras.observation import webcam_of
 
 # Automatic exposures lie within a stop of a grey card's, white balances nearer to it.
 ASSUMED_SIGMA = 0.3
@@ -54,7 +55,7 @@ def with_assumed_exposure(
 
     def hour(photograph: AlbedoPhotograph) -> tuple[str, date]:
         # The views of a panorama share its name, and one exposure.
-        return photograph.observation.webcam.split("/")[0], photograph.observation.time.date()
+        return webcam_of(photograph.observation.webcam), photograph.observation.time.date()
 
     strongest: dict[tuple[str, date], AlbedoPhotograph] = {}
     for each in sorted(photographs, key=lambda each: each.observation.time):

@@ -362,3 +362,25 @@ def open_observation(row: ManifestRow, folder: Path, camera: Camera | Panorama) 
             expected=f"{camera.width_px} x {camera.height_px}",
         )
     return Observation(image, np.ones(image.shape[:2], bool), camera, row.time, row.webcam)
+
+
+def webcam_of(name: str) -> str:
+    """Return the webcam of a view.
+
+    Parameters
+    ----------
+    name
+        Name of a webcam, or of a view of its panorama (``webcam/view``).
+
+    Returns
+    -------
+    str
+        Id of the webcam.
+
+    Examples
+    --------
+    >>> from seasonscapes.cameras.observation import webcam_of
+    >>> webcam_of("mountain/3")
+    'mountain'
+    """
+    return name.split("/", 1)[0]

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from seasonscapes.cameras.observation import Observation
+from seasonscapes.cameras.observation import Observation, webcam_of
 from seasonscapes.errors import SeasonscapesError
 from seasonscapes.images import srgb_from_linear
 
@@ -202,27 +202,6 @@ def held_out_times(
             f"held_out_times: got every = {every} and {len(ordered)} times, expected distinct times and every ≥ 2"
         )
     return tuple(time for time in ordered if time not in held_out), tuple(held_out)
-
-
-def webcam_of(name: str) -> str:
-    """Return the webcam of a view.
-
-    Parameters
-    ----------
-    name
-        Name of a webcam, or of a view of its panorama (``webcam/view``).
-
-    Returns
-    -------
-    str
-        Id of the webcam.
-
-    Examples
-    --------
-    >>> webcam_of("mountain/3")
-    'mountain'
-    """
-    return name.split("/", 1)[0]
 
 
 def check_no_leakage(evaluated: Sequence[PictureUse], used: Sequence[PictureUse], *, kind: str = "picture") -> None:

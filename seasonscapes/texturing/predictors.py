@@ -99,6 +99,11 @@ def stack_predictors(
     return Predictors(np.stack(columns, -1), tuple(names), surface, grid)
 
 
+def relit_layers(relit: np.ndarray | None) -> dict[str, np.ndarray]:
+    """The channels of predicted radiance ``(R, S, 3)`` as layers by name; none where there is no prediction."""
+    return {} if relit is None else {f"relit_{n + 1}": relit[..., n] for n in range(3)}
+
+
 def require_atlas_size(shape: tuple[int, int], satellite: Texture | None, layers: Mapping[str, np.ndarray]) -> None:
     """Check that a satellite image and layers are as large as an atlas.
 
@@ -160,9 +165,7 @@ def predictors_for(
         A satellite image or a layer of another size than the atlas.
     """
     shape = (atlas.height_px, atlas.width_px)
-    extra = dict(extra or {})
-    if relit is not None:
-        extra |= {f"relit_{n + 1}": relit[..., n] for n in range(3)}
+    extra = {**(extra or {}), **relit_layers(relit)}
     require_atlas_size(shape, satellite, extra)
     positions, face_id = texel_positions(terrain, atlas.width_px, atlas.height_px)
     # A planar atlas is a top-down grid itself: with its own cell size the two coincide.

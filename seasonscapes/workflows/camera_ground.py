@@ -66,10 +66,9 @@ def ground_below(place: Place, position_m: np.ndarray) -> GroundBelow:
     """
     from seasonscapes.calibration.terrain_horizon import terrain_height
 
-    rasters = [*reversed(place.finer_heights), place.elevation]
     latitude, longitude, height = (float(each) for each in geodetic_from_enu(place.frame, position_m))
-    in_heights_m = float(terrain_height(rasters, [latitude], [longitude])[0]) - height
-    tolerance_m = ground_tolerance_m(rasters, latitude, longitude)
+    in_heights_m = float(terrain_height(place.height_rasters, [latitude], [longitude])[0]) - height
+    tolerance_m = ground_tolerance_m(place.height_rasters, latitude, longitude)
     up_m = rendered_up_m(place.terrain, position_m)
     too_deep_m = in_heights_m if in_heights_m > tolerance_m else 0.0
     return GroundBelow(up_m, up_m - float(position_m[2]), too_deep_m, tolerance_m)

@@ -103,12 +103,13 @@ def completion_predictors(
     place: Place, utc: datetime, predicted: Texture | None = None
 ) -> Predictors | TiledPredictors:
     """`predictors_at`, for `texturing.completion.complete`: in tiles for a planar atlas whose predictors would take gigabytes."""
+    from seasonscapes.texturing.predictors import relit_layers
     from seasonscapes.texturing.tiled_predictors import tiled_predictors
 
     rows, columns = place.texture_shape
     if place.atlas.kind != "planar" or rows * columns <= MOST_WHOLE_TEXELS:
         return predictors_at(place, utc, predicted)
-    layers = {} if predicted is None else {f"relit_{n + 1}": predicted.values[..., n] for n in range(3)}
+    layers = relit_layers(None if predicted is None else predicted.values)
     sun, day = _suns(place, utc)
     return tiled_predictors(
         place.terrain, place.atlas, satellite=orthoimage(place, utc), layers=layers, sun_direction=sun, day_suns=day

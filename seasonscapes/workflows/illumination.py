@@ -18,7 +18,7 @@ import numpy as np
 
 from seasonscapes.civil_time import resolve_time
 from seasonscapes.errors import InputError
-from seasonscapes.frames import LocalFrame, geodetic_from_enu
+from seasonscapes.frames import LocalFrame
 from seasonscapes.progress import TaskProgress
 from seasonscapes.sky.atmosphere import Atmosphere
 from seasonscapes.sky.clear_sky import AtmosphereTables, atmosphere_tables, load_tables, save_tables, true_elevation_deg
@@ -308,6 +308,8 @@ def illumination_for_camera(
     by_elevation
         For many instants of one camera; see `atmosphere_tables_in`.
     """
+    from seasonscapes.workflows.views import camera_geodetic
+
     position = position_at(place, time)
     on_terrain = illumination_at(
         model,
@@ -321,7 +323,7 @@ def illumination_for_camera(
     at_camera = illumination_at(
         model,
         position,
-        _height_m(place, camera),
+        camera_geodetic(place, camera)[2],
         workspace=place.workspace,
         map_height=map_height,
         by_elevation=by_elevation,
@@ -342,10 +344,6 @@ def illumination_on_terrain(place: Place, model: SkyModel, time: datetime) -> tu
         model, position, place.median_height_m, workspace=place.workspace, with_aerial_perspective=False
     )
     return replace(light, frame=place.frame), position
-
-
-def _height_m(place: Place, camera: Camera | Panorama) -> float:
-    return float(geodetic_from_enu(place.frame, camera.position_m)[2])
 
 
 def position_at(place: Place, time: datetime) -> SunMoonPosition:
@@ -384,6 +382,8 @@ def tabulate_illumination(
     progress: TaskProgress | None = None,
 ) -> None:
     """Build the tables that `illumination_for_camera` reads at these times with ``by_elevation``, before other processes need them."""
+    from seasonscapes.workflows.views import camera_geodetic
+
     if not times or not isinstance(model, AtmosphereModel):
         return
     tables = atmosphere_tables_in(place.workspace, by_elevation=True)(atmosphere_from_model(model))
@@ -392,7 +392,7 @@ def tabulate_illumination(
     for position in (position_at(place, time) for time in times):
         moon = significant_moon(position.sun, position.moon)
         apparent_deg += [body.elevation_deg for body in (position.sun, moon) if body is not None]
-    camera_m, wanted = _height_m(place, camera), []
+    camera_m, wanted = camera_geodetic(place, camera)[2], []
     for height_m, near in ((place.median_height_m, False), (camera_m, False), (camera_m, True)):
         true_rad = np.radians(true_elevation_deg(tables.atmosphere, np.array(apparent_deg), height_m))
         table = tables.diffuse_of(observer_view(tables, height_m).height_m, near)

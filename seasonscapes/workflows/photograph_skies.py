@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from seasonscapes.albedo.cloud_cover import grey_share
+from seasonscapes.cameras.observation import webcam_of
 from seasonscapes.cameras.pinhole import Camera, ray_directions
-from seasonscapes.evaluation.splits import webcam_of
 from seasonscapes.frames import MEAN_RADIUS_M, geodetic_from_enu
 from seasonscapes.images import srgb_from_linear
 from seasonscapes.sky.ephemeris import sun_position
@@ -148,7 +148,7 @@ def _under_unknown_skyline(place: Place, camera: Camera) -> np.ndarray:
     away_m = np.hypot(*(place.terrain.vertices[:, :2] - camera.position_m[:2]).T)
     options = HorizonOptions(below_ground_m=np.inf, reach_m=1.1 * float(away_m.max()))
     azimuths = np.arange(0.0, 360.0, _AZIMUTH_STEP_DEG)
-    rasters = (*reversed(place.finer_heights), place.elevation)
+    rasters = place.height_rasters
     horizon = horizon_from(rasters, place.frame, camera.position_m, azimuth_deg=azimuths, options=options)
     highest_deg = _highest_beyond_deg(place, rasters, horizon)
     directions = ray_directions(camera)

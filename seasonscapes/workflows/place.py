@@ -99,6 +99,11 @@ class Place:
         """Rows and columns of the place's textures [texels]."""
         return self.atlas.height_px, self.atlas.width_px
 
+    @property
+    def height_rasters(self) -> tuple[Raster, ...]:
+        """All of the place's heights in order of precedence, the finest first."""
+        return (*reversed(self.finer_heights), self.elevation)
+
     @cached_property
     def atlas_id(self) -> str:
         """Identity of the UV atlas, which textures of this place carry; see `terrain.surface.atlas_identity`."""

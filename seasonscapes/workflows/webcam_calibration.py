@@ -236,7 +236,7 @@ def camera_station(place: Place, camera: Camera, *, name: str = "webcam") -> Web
         roll_deg=float(roll),
         time_zone="UTC",
     )
-    rasters = [*reversed(place.finer_heights), place.elevation]
+    rasters = list(place.height_rasters)
     return WebcamStation(webcam, camera, place.frame, axes, rasters, vertical_datum=place.scene.vertical_datum)
 
 
