@@ -84,6 +84,26 @@ def test_a_film_s_sky_is_the_picture_s(looked_up, low_deg, high_deg, bound):
             np.testing.assert_array_equal(quick.sun.normal_illuminance_lx, exact.sun.normal_illuminance_lx)
 
 
+@pytest.mark.parametrize("sun_deg", [-8.0, 0.2, 35.0])
+def test_distances_along_the_same_rays_are_the_same_air(looked_up, sun_deg):
+    """Aerial perspective on a grid of distances × directions, and at one distance for all, against one ray after another."""
+    rng = np.random.default_rng(3)
+    direction = rng.normal(size=(9, 11, 3)) * [1.0, 1.0, 0.3]
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    moon = LuminarySource(direction_from_angles(120.0, 17.3), 1e-6, 0.26)
+    sun = direction_from_angles(210.0, sun_deg)
+    air = illumination_from_atmosphere(looked_up, sun, HEIGHT_M, moon=moon, shape=(8, 16)).aerial_perspective
+    distances_m = np.array([0.0, 35.0, 1.7e4, 2.9e5, 1.3e6, 5e6, np.inf])
+    grid = air(distances_m[:, None, None], direction)
+    for number, distance_m in enumerate(distances_m):
+        each = air(np.full((9, 11), distance_m), direction)
+        alone = air(float(distance_m), direction)
+        for on_grid, single, expected in zip(grid, alone, each, strict=True):
+            assert on_grid.shape == (7, 9, 11, 3)
+            np.testing.assert_allclose(on_grid[number], expected, rtol=2e-6, atol=1e-9 * expected.max())
+            np.testing.assert_array_equal(single, on_grid[number])
+
+
 def test_the_moon_s_colour_is_kept(looked_up):
     """Moonlight has another spectrum than sunlight: each channel within 0.3 % of the brightest, not luminance alone."""
     sun, spectrum = direction_from_angles(300.0, -25.0), 2e-6 * np.linspace(0.7, 1.3, 9)

@@ -55,16 +55,17 @@ class AerialPerspective(Protocol):
         Parameters
         ----------
         depth_m
-            Distance from the viewer along the ray ``(...)`` [m]; infinite for a ray without surface.
+            Distance from the viewer along the ray ``(...)`` [m], infinite for a ray without surface; or D distances
+            ``(D, 1, ..., 1)`` along each of the rays.
         direction
             Unit viewing directions, away from the viewer, ``(..., 3)`` east-north-up.
 
         Returns
         -------
         transmittance
-            ``(..., 3)`` in [0, 1].
+            In [0, 1], of a shape that broadcasts to ``(..., 3)``, or to ``(D, ..., 3)``.
         airlight
-            Radiance scattered into the ray ``(..., 3)`` [cd/m²].
+            Radiance scattered into the ray [cd/m²], likewise.
         """
         ...
 
