@@ -10,7 +10,7 @@ from atmosphere_cases import tables_of
 
 from seasonscapes.frames import direction_from_angles
 from seasonscapes.sky.atmosphere import delta_scaled, gas_moments, optics
-from seasonscapes.sky.clear_sky import LuminarySource, illumination_from_atmosphere
+from seasonscapes.sky.clear_sky import LuminarySource, illumination_from_atmosphere, sky_radiance_map
 from seasonscapes.sky.elevation_table import (
     KNOTS_DEG,
     PART_KNOTS,
@@ -23,6 +23,7 @@ from seasonscapes.sky.elevation_table import (
 )
 from seasonscapes.sky.illumination import luminance
 from seasonscapes.sky.models import atmosphere_from_model, read_sky_model
+from seasonscapes.sky.night import night_sky_radiance
 from seasonscapes.sky.observer_radiance import (
     diffuse_by_elevation,
     observed_sky,
@@ -102,6 +103,22 @@ def test_distances_along_the_same_rays_are_the_same_air(looked_up, sun_deg):
             assert on_grid.shape == (7, 9, 11, 3)
             np.testing.assert_allclose(on_grid[number], expected, rtol=2e-6, atol=1e-9 * expected.max())
             np.testing.assert_array_equal(single, on_grid[number])
+
+
+def test_a_sun_deep_below_the_horizon_lights_no_air(looked_up):
+    """What is left out is less than 0.1 % of the natural night sky's radiance in every direction."""
+    shape = (16, 32)
+    for azimuth_deg in (0.0, 130.0):
+        direction = direction_from_angles(azimuth_deg, -25.0)
+        left_out = sky_radiance_map(looked_up, direction, HEIGHT_M, shape=shape)[:8]
+        night = night_sky_radiance(*shape, height_m=HEIGHT_M)[:8]
+        assert 0.0 < luminance(left_out).max() and (luminance(left_out) < 1e-3 * luminance(night)).all()
+    dark, dim = (
+        illumination_from_atmosphere(looked_up, direction_from_angles(130.0, deg), HEIGHT_M, shape=shape)
+        for deg in (-25.1, -24.9)
+    )
+    assert dark.sky_radiance.max() == 0.0 < dim.sky_radiance.max()
+    np.testing.assert_array_equal(dark.aerial_perspective(5e3, direction_from_angles(0.0, 1.0))[1], 0.0)
 
 
 def test_the_moon_s_colour_is_kept(looked_up):

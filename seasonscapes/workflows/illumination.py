@@ -217,7 +217,7 @@ def atmosphere_tables_in(
 
 def _diffuse_in(workspace: Workspace, tables: AtmosphereTables) -> Callable[[float, bool], PartedTable]:
     cached: dict[tuple[float, bool], PartedTable] = {}
-    lock = Lock()  # the skies of sun and moon are computed in two threads
+    lock = Lock()
 
     def part_of(height_m: float, near: bool, part: int) -> np.ndarray:
         with lock:
