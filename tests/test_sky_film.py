@@ -289,7 +289,10 @@ def test_light_for_a_film_takes_its_tables_from_the_workspace(tmp_path, looked_u
     moonlit = datetime(2024, 9, 18, 23, tzinfo=UTC)
     illumination_module.tabulate_illumination(place, camera, model, [moonlit])
     built = len(asked)
-    illumination_module.illumination_for_camera(place, camera, model, moonlit, map_height=4, by_elevation=True)
+    _, in_film = illumination_module.illumination_for_camera(
+        place, camera, model, moonlit, map_height=4, by_elevation=True
+    )
+    assert in_film == illumination_module.position_at(place, moonlit)
     assert len(asked) == built, "those of the sun and of the moon"
     exact, moment = illumination_module.illumination_for_camera(place, camera, model, when, map_height=16)
     assert -3.0 < moment.sun.elevation_deg < 3.0

@@ -49,7 +49,7 @@ TABLES_REVISION = 5
 _MIN_NORMAL_LX = 1e-6
 # Nor does it light the air from below this true elevation [deg]: the sun's light is then less than 6e-4 of the night sky's
 # in any direction, and 2e-5 of its mean.
-_LOWEST_DEG = -25.0
+LOWEST_SHINING_DEG = -25.0
 
 
 @dataclass(frozen=True)
@@ -231,7 +231,7 @@ def illumination_from_atmosphere(
     shining = [
         (direction, true, irradiance)
         for direction, true, irradiance in zip(directions, true_rad, irradiances, strict=True)
-        if true > np.radians(_LOWEST_DEG)
+        if true > np.radians(LOWEST_SHINING_DEG)
     ]
     lights = tuple(observed_sky(tables, view, *each) for each in shining)
     radiance = _radiance_map(lights, shape)
