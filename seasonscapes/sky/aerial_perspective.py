@@ -44,7 +44,7 @@ class TabulatedAerialPerspective:
     depth_rgb: np.ndarray
     lights: tuple[tuple[ScatteredRadiance, np.ndarray], ...]
 
-    def __call__(self, depth_m: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def __call__(self, depth_m: np.ndarray | float, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Evaluate transmittance and airlight up to a distance along directions.
 
         The transmittance of an RGB channel is the mean over the bands, weighted by the radiance of a grey surface near
