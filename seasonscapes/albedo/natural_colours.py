@@ -6,10 +6,10 @@ mountains are recovered in deep blue, and whatever is completed in their likenes
 neutral. Soil, rock and plants reflect less blue than red (Bowker et al. 1985, NASA RP-1139), snow, gravel and water about as
 much; nor is land black. Therefore
 
-- the bluest of the near ground, where it is bluer than neutral, is made neutral by the white balance;
-- the airlight is increased in blue until the bluest of the far ground is neutral as well, and decreased in each channel as far as
-  some far ground would otherwise reflect less than the darkest land (dark-object subtraction, Chavez 1988,
-  doi:10.1016/0034-4257(88)90019-3).
+- the bluest of the near ground, where it is bluer than the uncertainty of a white balance allows, is made neutral by it;
+- the airlight is increased in blue until the bluest of the far ground is neutral as well, or like the bluest near by, and
+  decreased in each channel as far as some far ground would otherwise reflect less than the darkest land (dark-object
+  subtraction, Chavez 1988, doi:10.1016/0034-4257(88)90019-3).
 
 What already has possible colours stays as it is.
 """
@@ -23,6 +23,7 @@ from datetime import date, datetime
 
 import numpy as np
 
+from seasonscapes.albedo.assumed_exposure import ASSUMED_SIGMA
 from seasonscapes.albedo.equations import usable_pixels
 from seasonscapes.albedo.forward_model import (
     TexelTransport,
@@ -40,7 +41,7 @@ log = logging.getLogger(__name__)
 _NEAR = 0.85
 # Of the brighter half, this share is the bluest ground. Of all, this share may be darker than the darkest land.
 _BLUEST, _DARKER = 0.1, 0.05
-_DARKEST_LAND = 0.03
+_DARKEST_LAND = 0.01
 # Far ground is looked at in so many layers of the air before it, of equally many pixels.
 _LAYERS = 4
 # White balances lie within a factor of two, also of blue against red in the shade; airlight within four of the model's.
@@ -150,21 +151,24 @@ def _correction(
     fields = ("radiance", "white", "transmittance", "airlight")
     ground = _Ground(*(np.concatenate([getattr(each, name) for each in pieces]) for name in fields))
     is_near = ground.transmittance[:, 2] >= _NEAR
-    gain, airlight = np.ones(3), np.ones(3)
+    gain, airlight, allowed = np.ones(3), np.ones(3), 0.0
     if is_near.sum() >= _FEWEST_PX:
         near = ground.part(is_near).albedo()
         bright, excess = _blue_excess(near)
         bluest = np.median(bright[excess >= np.quantile(excess, 1.0 - _BLUEST)], axis=0)
-        if bluest[2] > bluest[0] > 0.0:
+        by = float(np.log(np.maximum(bluest[2], _TINY) / np.maximum(bluest[0], _TINY)))
+        if by > ASSUMED_SIGMA:
             gain = np.clip(bluest / luminance(bluest), 1.0 / _BALANCE, _BALANCE)
+        else:
+            allowed = max(0.0, by)
     if (~is_near).sum() >= _FEWEST_PX:
         far = ground.part(~is_near)
-        airlight = _airlight_factor(replace(far, radiance=far.radiance / gain))
+        airlight = _airlight_factor(replace(far, radiance=far.radiance / gain), allowed)
     return gain, airlight
 
 
-def _airlight_factor(far: _Ground) -> np.ndarray:
-    """Factors of the airlight, nearest to 1, with which far ground is not bluer than neutral, nor, which comes first, black."""
+def _airlight_factor(far: _Ground, allowed: float) -> np.ndarray:
+    """Factors of the airlight, nearest to 1, with which far ground is not bluer than ``allowed``, nor, which comes first, black."""
     # What holds on the whole need not hold for the farthest: each layer of air has its own distribution.
     edges = np.quantile(far.transmittance[:, 2], np.linspace(0.0, 1.0, _LAYERS + 1)[1:-1])
     layer = np.searchsorted(edges, far.transmittance[:, 2])
@@ -178,7 +182,7 @@ def _airlight_factor(far: _Ground) -> np.ndarray:
 
     def too_blue(value: float) -> float:
         tried = np.array([factor[0], factor[1], value])
-        return max(float(np.quantile(_blue_excess(each.albedo(tried))[1], 1.0 - _BLUEST)) for each in layers)
+        return max(float(np.quantile(_blue_excess(each.albedo(tried))[1], 1.0 - _BLUEST)) for each in layers) - allowed
 
     if not layers:
         return factor
