@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from affine import Affine
 
-from seasonscapes.terrain.monotone_cubic import monotone_cubic
+from seasonscapes.terrain.interpolation import monotone_cubic
 from seasonscapes.terrain.surface import Raster
 
 

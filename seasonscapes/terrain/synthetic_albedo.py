@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from seasonscapes.terrain.monotone_cubic import monotone_cubic
+from seasonscapes.terrain.interpolation import monotone_cubic
 from seasonscapes.terrain.noise import fractal_noise, spline_noise
 from seasonscapes.terrain.synthetic_cover import FOREST, Cover
 from seasonscapes.terrain.synthetic_layout import LEDGES_M, strata_level_m

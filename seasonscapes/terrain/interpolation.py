@@ -1,4 +1,4 @@
-"""Monotone cubic interpolation, without scipy's module for it, whose import takes longer than all that is interpolated here."""
+"""Interpolation of samples, without the modules of scipy for it: their imports take longer than what is interpolated here."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def monotone_cubic(knots: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.
     Examples
     --------
     >>> import numpy as np
-    >>> from seasonscapes.terrain.monotone_cubic import monotone_cubic
+    >>> from seasonscapes.terrain.interpolation import monotone_cubic
     >>> monotone_cubic(np.arange(4.0), np.array([0.0, 0.0, 1.0, 1.0]), np.array([0.5, 1.5, 2.5]))
     array([0. , 0.5, 1. ])
     """
@@ -75,3 +75,35 @@ def _end_slope(near: np.ndarray, far: np.ndarray, chord: np.ndarray, next_chord:
     slope = ((2.0 * near + far) * chord - near * next_chord) / (near + far)
     turned = (np.sign(chord) != np.sign(next_chord)) & (np.abs(slope) > 3.0 * np.abs(chord))
     return np.where(np.sign(slope) != np.sign(chord), 0.0, np.where(turned, 3.0 * chord, slope))
+
+
+def bilinear(nodes: np.ndarray, column: np.ndarray, row: np.ndarray) -> np.ndarray:
+    """Interpolate bilinearly between the nodes of a grid.
+
+    Parameters
+    ----------
+    nodes
+        ``(R, S, C)``, R and S ≥ 2.
+    column, row
+        ``(N,)`` places, whole numbers at the nodes; outside of the grid those of its border.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(N, C)`` float64.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from seasonscapes.terrain.interpolation import bilinear
+    >>> bilinear(np.arange(4.0).reshape(2, 2, 1), np.array([0.5, 9.0]), np.array([0.0, 0.5]))
+    array([[0.5],
+           [2. ]])
+    """
+    rows, columns = nodes.shape[:2]
+    column, row = np.clip(column, 0.0, columns - 1.0), np.clip(row, 0.0, rows - 1.0)
+    left, above = np.minimum(column.astype(np.intp), columns - 2), np.minimum(row.astype(np.intp), rows - 2)
+    across, down = (column - left)[:, None], (row - above)[:, None]
+    flat, corner = nodes.reshape(rows * columns, -1), above * columns + left
+    upper, lower = (flat[first] * (1.0 - across) + flat[first + 1] * across for first in (corner, corner + columns))
+    return upper * (1.0 - down) + lower * down

@@ -1,10 +1,11 @@
-"""Monotone cubic interpolation is that of scipy."""
+"""Interpolation is that of scipy."""
 
 import numpy as np
 import pytest
 from scipy.interpolate import PchipInterpolator
+from scipy.ndimage import map_coordinates
 
-from seasonscapes.terrain.monotone_cubic import monotone_cubic
+from seasonscapes.terrain.interpolation import bilinear, monotone_cubic
 
 
 @pytest.mark.parametrize("count", [2, 3, 4, 40])
@@ -22,3 +23,14 @@ def test_equals_scipys(count):
 def test_refuses_what_is_no_table(knots, count):
     with pytest.raises(ValueError, match="increasing knots"):
         monotone_cubic(np.array(knots), np.zeros(count), np.zeros(1))
+
+
+def test_bilinear_equals_scipys_and_keeps_the_border_outside():
+    rng = np.random.default_rng(5)
+    nodes = rng.normal(size=(30, 40, 2)).astype(np.float32)
+    row = np.concatenate([rng.uniform(-5.0, 35.0, 3000), [0.0, 29.0, 7.0]])
+    column = np.concatenate([rng.uniform(-5.0, 45.0, 3000), [0.0, 39.0, 9.0]])
+    expected = [
+        map_coordinates(nodes[..., k], [row, column], order=1, mode="nearest", output=np.float64) for k in (0, 1)
+    ]
+    np.testing.assert_allclose(bilinear(nodes, column, row), np.transpose(expected), atol=1e-12)
