@@ -10,6 +10,16 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 
+@pytest.fixture(scope="module")
+def few_rays():
+    """Light transport with few rays for a module's tests; see `few_rays.py`."""
+    from few_rays import trace_few_rays
+
+    take_back = trace_few_rays()
+    yield
+    take_back()
+
+
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """The optional folder of real rasters and photographs; tests that ask for it skip where it is absent."""

@@ -1,10 +1,11 @@
-"""Notebooks: short, paired with a script, of the public interface alone, and they execute on the small place."""
+"""Notebooks: short, paired with a script, of the public interface alone, and they execute on a place like theirs, coarser."""
 
 import ast
+import json
 import os
+import shutil
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -59,18 +60,19 @@ def test_the_public_interface_alone(name):
 
 
 @pytest.fixture(scope="module")
-def executed():
-    """Each notebook as its script, in a process of its own, two at a time: exit code and error."""
-
-    def execute(name: str) -> tuple[int, str]:
-        environment = os.environ | {"MPLBACKEND": "Agg", "OMP_NUM_THREADS": "1"}
-        done = subprocess.run(
-            [sys.executable, f"{name}.py"], cwd=FOLDER, env=environment, capture_output=True, text=True, check=False
-        )
-        return done.returncode, done.stderr
-
-    with ThreadPoolExecutor(2) as pool:
-        return dict(zip(NAMES, pool.map(execute, NAMES), strict=True))
+def executed(tmp_path_factory):
+    """Each notebook as its script on a coarser copy of the place, all in one workspace: exit code and error by name."""
+    folder = tmp_path_factory.mktemp("notebooks")
+    for name in NAMES:
+        shutil.copy(FOLDER / f"{name}.py", folder)
+    scene = (FOLDER / "small.toml").read_text()
+    assert "detail_m = 15.0" in scene
+    (folder / "small.toml").write_text(scene.replace("detail_m = 15.0", "detail_m = 30.0"))
+    own = {"MPLBACKEND": "Agg", "SEASONSCAPES_WORKSPACE": str(folder / "workspace")}
+    runner = [sys.executable, str(Path(__file__).with_name("notebook_runner.py")), *NAMES]
+    done = subprocess.run(runner, cwd=folder, env=os.environ | own, stdout=subprocess.PIPE, text=True, check=True)
+    records = [json.loads(line) for line in done.stdout.splitlines()]
+    return {record["name"]: (record["code"], record["stderr"]) for record in records}
 
 
 @pytest.mark.slow
