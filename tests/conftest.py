@@ -20,6 +20,19 @@ def few_rays():
     take_back()
 
 
+@pytest.fixture(scope="module")
+def coarse_viewer():
+    """Coarse pages of `view`, which has no flag for it, for a module's tests."""
+    from dataclasses import astuple
+
+    from seasonscapes.workflows.viewer_scene import ViewerDetail
+
+    coarse = ViewerDetail(160, 256, 160, 48, 24, 8, 256, 16, 64)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ViewerDetail.__init__, "__defaults__", astuple(coarse))
+        yield
+
+
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """The optional folder of real rasters and photographs; tests that ask for it skip where it is absent."""

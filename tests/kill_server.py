@@ -46,7 +46,6 @@ if __name__ == "__main__":
     import scipy.ndimage
     import scipy.sparse.linalg  # noqa: F401
     import skyfield.api  # noqa: F401
-
     from few_rays import trace_few_rays
 
     from seasonscapes.cli import main

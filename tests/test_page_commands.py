@@ -13,7 +13,6 @@ from page_place import write_page_place, write_photographs
 from test_docs import PAGES, commands_of
 
 from seasonscapes.cli import main
-from seasonscapes.workflows.viewer_scene import ViewerDetail
 
 # Commands that are only parsed (`test_docs.py`), and why; a pattern that matches none is stale and fails.
 NOT_RUN = {
@@ -38,10 +37,6 @@ NOT_RUN = {
     r"^seasonscapes irradiance my-valley.toml --from": "48 half-hours; that of the small scene runs",
     r"^seasonscapes hours|pictures/hut_|--layout": "needs the photographs of a fixed camera; tests/test_hours.py runs it",
 }
-
-
-# What the browser's page shows by default, in the order of `ViewerDetail`; its own sizes are those of `test_viewer.py`.
-COARSE = (160, 256, 160, 48, 24, 8, 256, 16, 64, 0)
 
 
 def reason_not_to_run(command: str) -> str | None:
@@ -72,13 +67,12 @@ def with_a_small_picture(tokens: list[str]) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def valley(tmp_path_factory, few_rays):
+def valley(tmp_path_factory, few_rays, coarse_viewer):
     """The folder of the place, with a workspace that all pages share."""
     folder = tmp_path_factory.mktemp("valley")
     scene = write_page_place(folder)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SEASONSCAPES_WORKSPACE", str(folder / "workspace"))
-        patch.setattr(ViewerDetail.__init__, "__defaults__", COARSE)
         write_photographs(folder, scene)
         yield folder
 
