@@ -72,7 +72,7 @@ def test_the_public_interface_alone(name):
 
 @pytest.fixture(scope="module")
 def executed(tmp_path_factory):
-    """Each notebook as its script, with `LESS`, all in one workspace: exit code and error by name."""
+    """Each notebook as its script, with `LESS`: exit code and error by name."""
     folder = tmp_path_factory.mktemp("notebooks")
     for name in ("small.toml", *(f"{name}.py" for name in NAMES)):
         text = (FOLDER / name).read_text()
@@ -80,7 +80,7 @@ def executed(tmp_path_factory):
             assert printed in text, f"{name} has no {printed}"
             text = text.replace(printed, less)
         (folder / name).write_text(text)
-    own = {"MPLBACKEND": "Agg", "SEASONSCAPES_WORKSPACE": str(folder / "workspace")}
+    own = {"MPLBACKEND": "Agg"}
     runner = [sys.executable, str(Path(__file__).with_name("notebook_runner.py")), *NAMES]
     done = subprocess.run(runner, cwd=folder, env=os.environ | own, stdout=subprocess.PIPE, text=True, check=True)
     records = [json.loads(line) for line in done.stdout.splitlines()]
