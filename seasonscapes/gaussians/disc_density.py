@@ -150,10 +150,11 @@ def refined_surfels(terrain: Terrain, surfels: Surfels, place_m: np.ndarray, wan
     for number in range(MOST_LEVELS):
         near = _with_neighbours(grid.quartered(number), place_m[levels > number])
         split = np.isin(current.cell, near)
-        if not split.any():
+        if not len(near):
             break
         finished.append(_chosen(current, ~split))
-        kids = np.sort(quarters(current.cell[split], grid.columns << number).ravel())
+        # Cells that terrain covers in part have no disc, but some of their quarters may: skylines often lie at its border.
+        kids = np.sort(quarters(near, grid.columns << number).ravel())
         current = _sampled(terrain, normals, grid, number + 1, kids)
     return _joined([*finished, current])
 
@@ -171,7 +172,7 @@ def coarsening(surfels: Surfels, place_m: np.ndarray, wanted_m: np.ndarray, most
     Returns
     -------
     float
-        The smallest of 1, 2^¼, 2^½ … with which `refined_surfels` makes no more discs.
+        The smallest of 1, 2^¼, 2^½ … with which `refined_surfels` makes no more discs even if terrain covers all cells.
     """
     if not len(wanted_m):
         return 1.0
@@ -195,12 +196,12 @@ def _levels(grid: SurfelGrid, wanted_m: np.ndarray) -> np.ndarray:
 
 
 def _count(surfels: Surfels, place_m: np.ndarray, wanted_m: np.ndarray) -> int:
-    """Number of discs that `refined_surfels` makes where terrain covers all quarters."""
+    """Number of discs that `refined_surfels` makes at most: where terrain covers all quarters."""
     grid, levels, current, count = surfels.grid, _levels(surfels.grid, wanted_m), surfels.cell, len(surfels.cell)
     for number in range(MOST_LEVELS):
-        split = current[np.isin(current, _with_neighbours(grid.quartered(number), place_m[levels > number]))]
-        count += 3 * len(split)
-        current = quarters(split, grid.columns << number).ravel()
+        near = _with_neighbours(grid.quartered(number), place_m[levels > number])
+        count += 4 * len(near) - int(np.isin(near, current).sum())
+        current = quarters(near, grid.columns << number).ravel()
     return count
 
 
