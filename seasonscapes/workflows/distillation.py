@@ -61,7 +61,8 @@ class DistilOptions:
     views, view_px
         Cameras around the terrain for training images, and the size of these [px]; 0 trains on the surface alone.
     learn_near
-        Whether the cameras that discs follow are learned from too, where there are ``views``.
+        Whether the cameras that discs follow are learned from too, where there are ``views``. Otherwise discs that are fine
+        because of them keep place, size, direction and opacity.
     steps, picture_steps
         Training steps on the surface, and on images.
     kind
@@ -232,7 +233,9 @@ def distil_with_data(
         seed=seed,
     )
     if options.refine_discs and data.frames:
-        appearance.refine(DiscGeometry(data.surfels))
+        # Pictures from elsewhere show many discs at once that were made fine for a camera, and cannot tell their changes apart.
+        fixed = None if options.learn_near else data.surfels.level > 0
+        appearance.refine(DiscGeometry(data.surfels, fixed))
     losses = train(
         appearance,
         data.targets,
