@@ -401,7 +401,7 @@ def test_keys_hold_the_sources_of_a_mosaic_the_world_file_the_sky_the_albedo_and
     from seasonscapes.albedo.seasons import DatedAlbedo
     from seasonscapes.sky.models import read_sky_model
     from seasonscapes.workflows.albedo_sources import dated_albedos
-    from seasonscapes.workflows.distillation import DistilOptions, _data_key
+    from seasonscapes.workflows.distillation import DistilOptions, _data_key, near_cameras
     from seasonscapes.workflows.place import MeshOptions, load_place
 
     scene = places.write_place(tmp_path / "scene", places.SCENE.replace('file = "dem.tif"', 'file = "mosaic.vrt"'))
@@ -412,7 +412,8 @@ def test_keys_hold_the_sources_of_a_mosaic_the_world_file_the_sky_the_albedo_and
         return load_place(scene, Workspace(tmp_path / "work"), options=options)
 
     def key(place, sky="hosek", albedo=(), **changed):
-        return _data_key(place, read_sky_model(sky), albedo, DistilOptions(**changed))
+        options = DistilOptions(**changed)
+        return _data_key(place, read_sky_model(sky), albedo, options, near_cameras(place, options))
 
     first = load()
     own = DatedAlbedo(date(2024, 7, 1), "recovered", lambda: None)
