@@ -168,3 +168,17 @@ def test_who_cannot_refine_is_told(hill, told, pictures, capsys):  # noqa: F811
     for flags in (("--views", "0"), ("--picture-steps", "0")):
         assert main(["distill", "alpine_small", "--refine-discs", *flags]) == 2
         assert "--refine-discs" in capsys.readouterr().err
+
+
+def test_fixed_discs_stay_as_they_are(hill):  # noqa: F811
+    _, surfels, *_ = hill
+    fixed = np.arange(len(surfels.means)) % 3 == 0
+    geometry = DiscGeometry(surfels, fixed)
+    with torch.no_grad():
+        for name in CHANGES:
+            getattr(geometry, name).fill_(-100.0)
+    geometry.keep_within_limits()
+    for name, (_, limit) in CHANGES.items():
+        changes = getattr(geometry, name).detach().numpy()
+        assert (changes[fixed] == 0.0).all()
+        assert (changes[~fixed] == -np.float32(limit)).all()

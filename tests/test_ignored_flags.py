@@ -124,7 +124,7 @@ VERBS: dict[str, tuple[list[str], set[str], dict[str, list[str]]]] = {
         | _each(("--points", "--path", "--path-views", "--weights", "--prompt", "--guide-image"), [])
         | _each(("--diffusion-steps", "--paper-steps"), [])
         | _each(
-            ("--steps", "--picture-steps", "--suns", "--views"), ["--appearance", "paper"]
+            ("--steps", "--picture-steps", "--suns", "--views", "--disc-px"), ["--appearance", "paper"]
         ),
     ),
     "relight": (

@@ -91,8 +91,8 @@ def distill_command(
         if own.dates is not None and (files or loaded.synthetic is None):
             whose = "--albedo names them" if files else "the scene's images have them"
             raise InputError("--dates", f"does nothing here: {whose}", got=own.dates)
-        if own.disc_px and not loaded.scene.cameras:
-            raise InputError("--disc-px", "the scene has no camera that discs could follow", got=own.disc_px)
+        if own.disc_px and not (loaded.scene.cameras or loaded.scene.webcams):
+            raise InputError("--disc-px", "the scene has no camera or webcam that discs could follow", got=own.disc_px)
         dated = dated_albedos(loaded, files) if files else ()
         distilled = distillation.distil_with_data(
             loaded, sky=model, albedo=dated, options=how, seed=seed, checkpoint=checkpoint, progress=progress

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from cyclopts import Parameter
 
-from seasonscapes.commands.arguments import parse_names, parse_size
+from seasonscapes.commands.arguments import check_range, parse_names, parse_size
 from seasonscapes.commands.refusals import refuse_without
 
 if TYPE_CHECKING:
@@ -63,6 +63,8 @@ class RunEffort:
 
     discs: int = 160
     """Gaussians along the longer side of the terrain."""
+    disc_px: float | None = None
+    """Largest side of a disc in the pictures [px], default 2, as far as 50,000 discs go; 0: all of one size."""
     steps: int | None = None
     """Training steps on the surface; default 1500."""
     picture_steps: int | None = None
@@ -74,14 +76,17 @@ class RunEffort:
 
     def values(self, *, appearance: str = "physical") -> DistilOptions:
         """The flags as one value; `InputError` for those that the appearance does not use."""
-        from seasonscapes.workflows.distillation import DistilOptions
+        from seasonscapes.workflows.distillation import RUN_DISCS, DistilOptions
 
-        given = {"steps": self.steps, "picture_steps": self.picture_steps, "suns": self.suns, "views": self.views}
+        given = {"disc_px": self.disc_px, "steps": self.steps, "picture_steps": self.picture_steps, "suns": self.suns, "views": self.views}
         refuse_without("--appearance physical", appearance == "physical", **given)
+        check_range("--disc-px", self.disc_px or 0.0, 0, 64)
         # A run's model is smaller than the one that `distill` makes.
         return DistilOptions(
             discs=self.discs,
-            disc_px=0.0,
+            disc_px=2.0 if self.disc_px is None else self.disc_px,
+            most_discs=RUN_DISCS,
+            learn_near=False,
             suns=24 if self.suns is None else self.suns,
             views=3 if self.views is None else self.views,
             steps=1500 if self.steps is None else self.steps,

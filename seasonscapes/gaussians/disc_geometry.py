@@ -28,6 +28,8 @@ class DiscGeometry(nn.Module):
     ----------
     surfels
         The discs as the terrain gives them.
+    fixed
+        ``(N,)`` bool, discs that stay as they are; none if omitted.
 
     Examples
     --------
@@ -39,8 +41,9 @@ class DiscGeometry(nn.Module):
     (3, 0.0)
     """
 
-    def __init__(self, surfels: Surfels) -> None:
+    def __init__(self, surfels: Surfels, fixed: np.ndarray | None = None) -> None:
         super().__init__()
+        self.fixed = None if fixed is None else torch.as_tensor(fixed)
         self.spacing_m = torch.as_tensor(surfels.spacing_m)[:, None]
         self.base = Splats(
             *(
@@ -64,9 +67,12 @@ class DiscGeometry(nn.Module):
 
     @torch.no_grad()
     def keep_within_limits(self) -> None:
-        """Clip the changes to those that `surfels.CHANGES` allows, in place."""
+        """Clip the changes to those that `surfels.CHANGES` allows, and undo those of fixed discs, in place."""
         for name, (_, limit) in CHANGES.items():
-            getattr(self, name).clamp_(-limit, limit)
+            changes = getattr(self, name)
+            changes.clamp_(-limit, limit)
+            if self.fixed is not None:
+                changes[self.fixed] = 0.0
 
 
 def turned(quaternions: torch.Tensor, twist: torch.Tensor) -> torch.Tensor:

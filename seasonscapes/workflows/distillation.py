@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from importlib.util import find_spec
@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 KINDS = ("full", "physical", "sun")
+# Discs that a run makes where its cameras look; about 40 processor seconds.
+RUN_DISCS = 50_000
 _YEAR = 2024
 # A scene with one image has one albedo for the whole year.
 _ONE_DAY = 200.0
@@ -48,15 +50,19 @@ class DistilOptions:
     discs
         Gaussians along the longer side of the terrain.
     disc_px
-        Largest side of a disc in pictures of ``view_px`` from the scene's cameras [px]: where they look, cells of discs are
-        quartered until it holds. 0, or no ``views``, leaves all discs of one size.
+        Largest side of a disc in pictures of ``view_px`` from the scene's cameras and webcams [px]: where they look, cells of discs
+        are quartered until it holds. 0, or for the scene's own cameras no ``views``, leaves all discs of one size.
+    most_discs
+        Largest number of discs: where ``disc_px`` needs more, they are all as much larger as that takes. 0: as many as it needs.
     suns
         Instants to train on, at random hours of the dates' days.
     dates
         Dates of the year whose albedo is stored separately, for scenes that know their albedo of every day.
     views, view_px
-        Cameras around the terrain for training images, and the size of these [px]; 0 trains on the surface alone. Where discs
-        follow the scene's cameras, these are learned from too.
+        Cameras around the terrain for training images, and the size of these [px]; 0 trains on the surface alone.
+    learn_near
+        Whether the cameras that discs follow are learned from too, where there are ``views``. Otherwise discs that are fine
+        because of them keep place, size, direction and opacity.
     steps, picture_steps
         Training steps on the surface, and on images.
     kind
@@ -73,10 +79,12 @@ class DistilOptions:
 
     discs: int = 320
     disc_px: float = 2.0
+    most_discs: int = 0
     suns: int = 32
     dates: int = 4
     views: int = 6
     view_px: int = 256
+    learn_near: bool = True
     steps: int = 2500
     picture_steps: int = 240
     kind: str = "full"
@@ -195,11 +203,12 @@ def distil_with_data(
     sky: str | Path | SkyModel = "clear",
     albedo: Sequence[DatedAlbedo] | DatedAlbedo | None = None,
     options: DistilOptions | None = None,
+    near: Mapping[str, Camera] | None = None,
     seed: int = 0,
     checkpoint: Path | None = None,
     progress: Progress | None = None,
 ) -> Distilled:
-    """`distil`, with the training data and losses."""
+    """`distil`, with the training data and losses; ``near`` are the cameras that discs follow, by name, in place of the scene's."""
     require_torch()
     from seasonscapes.gaussians.appearance import Appearance, fourier_embedding
     from seasonscapes.gaussians.disc_geometry import DiscGeometry
@@ -212,7 +221,8 @@ def distil_with_data(
     set_torch_threads(1)
     dated = [albedo] if isinstance(albedo, DatedAlbedo) else list(albedo or ())
     model = sky_model(sky)
-    data = distillation_data(place, model, dated, options, seed=seed, progress=progress)
+    near = near_cameras(place, options) if near is None else near
+    data = distillation_data(place, model, dated, options, near=near, seed=seed, progress=progress)
     appearance = Appearance(
         options.kind,
         data.albedo,
@@ -223,14 +233,16 @@ def distil_with_data(
         seed=seed,
     )
     if options.refine_discs and data.frames:
-        appearance.refine(DiscGeometry(data.surfels))
+        # Pictures from elsewhere show many discs at once that were made fine for a camera, and cannot tell their changes apart.
+        fixed = None if options.learn_near else data.surfels.level > 0
+        appearance.refine(DiscGeometry(data.surfels, fixed))
     losses = train(
         appearance,
         data.targets,
         data.frames,
         Schedule(options.steps, options.picture_steps),
         seed=seed,
-        checkpoint=checkpoint and Checkpoint(checkpoint, _data_key(place, model, dated, options)),
+        checkpoint=checkpoint and Checkpoint(checkpoint, _data_key(place, model, dated, options, near)),
         progress=task_progress(progress, "distilling"),
     )
     note = {"scene": place.scene.name, "seed": seed, "suns": options.suns, "attribution": place.scene.attribution}
@@ -246,7 +258,9 @@ def distil_with_data(
     return Distilled(distilled, data, losses)
 
 
-def _data_key(place: Place, model: SkyModel, dated: Sequence[DatedAlbedo], options: DistilOptions) -> str:
+def _data_key(
+    place: Place, model: SkyModel, dated: Sequence[DatedAlbedo], options: DistilOptions, near: Mapping[str, Camera]
+) -> str:
     """Identifier of everything that the training data are made from, except the seed."""
     from seasonscapes.workflows.views import camera_values
 
@@ -256,7 +270,7 @@ def _data_key(place: Place, model: SkyModel, dated: Sequence[DatedAlbedo], optio
         "albedo": [[each.day, each.content] for each in dated],
         "images": None if dated else place.scene.image_keys,
         "options": options,
-        "near": [camera_values(camera) for camera in _near_cameras(place, options).values()],
+        "near": [camera_values(camera) for camera in near.values()],
     }
     return artefact_key(inputs, ("workflows.distillation",))
 
@@ -291,6 +305,7 @@ def distillation_data(
     dated: Sequence[DatedAlbedo],
     options: DistilOptions,
     *,
+    near: Mapping[str, Camera] | None = None,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> DistillationData:
@@ -302,10 +317,12 @@ def distillation_data(
         The place, the sky model, and given albedos (empty: the scene's own).
     options, seed
         Size and randomness.
+    near
+        Cameras that discs follow, by name; those of `near_cameras` if omitted.
     progress
         Called with a task and its finished share.
     """
-    from seasonscapes.gaussians.disc_density import footprints, refined_surfels
+    from seasonscapes.gaussians.disc_density import surfels_for
     from seasonscapes.gaussians.disc_transport import (
         light_state,
         neighbourhood_mean,
@@ -323,12 +340,11 @@ def distillation_data(
     days, textures = [day for day, _ in pairs], [texture for _, texture in pairs]
     extent_m = float(np.ptp(place.terrain.vertices[:, :2], axis=0).max())
     surfels = terrain_surfels(place.terrain, extent_m / options.discs)
-    near = _near_cameras(place, options)
-    if near:
+    near = near_cameras(place, options) if near is None else near
+    if near and options.disc_px > 0.0:
         first = mi_mesh(place.terrain, textures[0])
         stage = RenderScene(ray_scene(first).mi_scene, first)
-        place_m, side_m = footprints(stage, list(near.values()))
-        surfels = refined_surfels(place.terrain, surfels, place_m, options.disc_px * side_m)
+        surfels = surfels_for(place.terrain, surfels, stage, list(near.values()), options.disc_px, options.most_discs)
     albedo = np.stack([surfel_albedo(surfels, texture) for texture in textures])
     around = np.stack([neighbourhood_mean(surfels.means, each, surfels.spacing_m) for each in albedo])
     seasons = [number % len(days) for number in range(options.suns)]
@@ -356,14 +372,14 @@ def distillation_data(
         # Images of one date suffice: they determine the splats' shapes, not the season.
         if season == len(days) // 2 and options.views and own:
             wanted = [(number, lights[number], states[number]) for number in own]
-            views = [*near.items(), *((None, camera) for camera in around_all)]
+            views = [*(near if options.learn_near else {}).items(), *((None, camera) for camera in around_all)]
             for name, camera in each_reported(views, len(views), progress, "pictures"):
                 try:
                     frames += relit_frames(scene, surfels, [camera], wanted, seed=seed)
                 except NoTerrainInView as error:
                     if name is None:
                         raise
-                    log.warning("nothing is learned from camera %s: %s", name, error)
+                    log.warning("nothing is learned from %s: %s", name, error)
                 else:
                     cameras.append(camera)
     assert transport is not None, "there is at least one date"
@@ -371,13 +387,13 @@ def distillation_data(
     return DistillationData(surfels, albedo, around, days, transport, targets, times, frames, cameras)
 
 
-def _near_cameras(place: Place, options: DistilOptions) -> dict[str, Camera]:
-    """The scene's cameras, in pictures of the training's size, where the discs are to follow them."""
-    from seasonscapes.workflows.views import scene_cameras
+def near_cameras(place: Place, options: DistilOptions) -> dict[str, Camera]:
+    """The scene's cameras and webcams, in pictures of the training's size, where discs are to follow them."""
+    from seasonscapes.workflows.disc_cameras import scene_disc_cameras
 
-    if options.disc_px <= 0.0 or options.views == 0 or not place.scene.cameras:
+    if options.disc_px <= 0.0 or options.views == 0:
         return {}
-    return scene_cameras(place, size_px=(options.view_px, options.view_px))
+    return scene_disc_cameras(place, (options.view_px, options.view_px))
 
 
 def draw_lights(

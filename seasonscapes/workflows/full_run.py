@@ -15,6 +15,7 @@ from seasonscapes.relighting.frame_file import time_stamp
 from seasonscapes.texturing.painting import PaintOptions
 from seasonscapes.workflows import completion, timelapse
 from seasonscapes.workflows.albedo_sources import dated_albedos
+from seasonscapes.workflows.disc_cameras import calibrated_disc_cameras
 from seasonscapes.workflows.distillation import distil_with_data, distillation_record
 from seasonscapes.workflows.gaussian_views import render_gaussians
 from seasonscapes.workflows.inpainting import InpaintOptions, cloudiness_of, inpaint
@@ -187,8 +188,9 @@ def stages_of(job: RunJob, progress: Progress | None = None) -> list[Stage]:
         stages.append(stage("distil", model, ("film",), ("path_stages",), _distil_frames, "gaussians"))
         stages.append(stage("splat", looks, ("distil",), ("path_stages",), _splat_frames))
     else:
-        distil = {**common, "distil": job.distil}
-        stages.append(stage("distil", distil, final, ("distillation",), _distil, "gaussians"))
+        distil = {**common, "distil": job.distil, "view": looks["view"], "size": job.size_px}
+        code = ("distillation", "disc_cameras")
+        stages.append(stage("distil", distil, (*known, *final), code, _distil, "gaussians"))
         stages.append(stage("splat", looks, ("distil",), ("gaussian_views",), _splat))
     left_out = set() if method.poses == "points" else {"views"}
     left_out |= set() if place.options.mesher == "poisson" else {"cloud"}
@@ -343,11 +345,16 @@ def _distil(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
     own = folder / "gaussians"
     own.mkdir(parents=True, exist_ok=True)
     checkpoint = own / "model.checkpoint.safetensors"
+    # What the pictures show is as fine as they are, and what the webcams saw as fine as in pictures of that size.
+    near = {"the view": camera_for(job.place, job.view, size_px=job.size_px)}
+    records = sorted(sources_of(job, folder).calibrations.glob("*_calibration.json"))
+    near |= calibrated_disc_cameras(job.place, records, job.size_px[0] * job.size_px[1])
     distilled = distil_with_data(
         job.place,
         sky=job.sky,
         albedo=dated_albedos(job.place, final_albedos(job, folder)),
         options=job.distil,
+        near=near,
         seed=job.seed,
         checkpoint=checkpoint,
         progress=progress,
