@@ -78,7 +78,13 @@ class RunEffort:
         """The flags as one value; `InputError` for those that the appearance does not use."""
         from seasonscapes.workflows.distillation import RUN_DISCS, DistilOptions
 
-        given = {"disc_px": self.disc_px, "steps": self.steps, "picture_steps": self.picture_steps, "suns": self.suns, "views": self.views}
+        given = {
+            "disc_px": self.disc_px,
+            "steps": self.steps,
+            "picture_steps": self.picture_steps,
+            "suns": self.suns,
+            "views": self.views,
+        }
         refuse_without("--appearance physical", appearance == "physical", **given)
         check_range("--disc-px", self.disc_px or 0.0, 0, 64)
         # A run's model is smaller than the one that `distill` makes.
