@@ -12,6 +12,7 @@ import sys
 from collections.abc import Sequence
 
 from seasonscapes.commands.interruption import ignore_further_interruptions, interrupted, interruptible
+from seasonscapes.freed_memory import keep_freed_memory
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -38,6 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         # No model here has plugins of Pydantic: it would read the metadata of every installed package in search of some.
         os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
+        keep_freed_memory()
     # After a process's command only the interpreter's own end is left: Ctrl-C there ends it without a traceback.
     with interruptible(afterwards=signal.SIG_DFL if arguments is None else None):
         try:

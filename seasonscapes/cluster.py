@@ -24,6 +24,8 @@ from seasonscapes.errors import InputError
 Item = TypeVar("Item")
 # Deaths of workers that one task survives before the task itself is reported as failed.
 _DEATHS = 10
+# What the workers' memory allocator keeps for itself [bytes]: arrays up to the first size, and that much free memory (mallopt(3)).
+_ALLOCATION = {"MALLOC_MMAP_THRESHOLD_": 1 << 25, "MALLOC_TRIM_THRESHOLD_": 1 << 28}
 # Tasks submitted ahead for each worker.
 _AHEAD = 4
 # Items travel together while they take no longer than this [s], and no more than so many: much longer than a call of Dask
@@ -98,6 +100,9 @@ def connected(cluster: str) -> Iterator[Any]:
         "distributed.worker.daemon": False,
         # Statistics that only Dask's dashboard shows; they cost a worker some percent of a core.
         "distributed.worker.profile.enabled": False,
+        # By Dask's own setting every freed array goes back to the system, and each new one's pages are faulted in again: frames
+        # take twice the processor time.
+        **{f"distributed.nanny.pre-spawn-environ.{name}": value for name, value in _ALLOCATION.items()},
     }
     with dask.config.set(settings):
         if cluster.startswith(("tcp://", "tls://")):

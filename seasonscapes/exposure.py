@@ -11,7 +11,15 @@ from __future__ import annotations
 import numpy as np
 
 from seasonscapes.errors import InputError
-from seasonscapes.images import EXPOSURE_GAIN, METER_CONSTANT, REC709_LUMINANCE, auto_exposure_ev100, expose, tone_curve
+from seasonscapes.images import (
+    EXPOSURE_GAIN,
+    METER_CONSTANT,
+    REC709_LUMINANCE,
+    auto_exposure_ev100,
+    expose,
+    image_luminance,
+    tone_curve,
+)
 from seasonscapes.photo_look import balanced, highlight_stops, photo_curve
 
 # Below this metered EV the scene is under-exposed by a quarter stop for each stop below it, by at most three stops.
@@ -97,7 +105,9 @@ def exposure_ev100(image: np.ndarray, exposure: str | float = "auto", *, look: s
 
 def photo_ev100(image: np.ndarray, neutral_ev100: float) -> float:
     """The EV100 of the look ``photo``, from that of the mode ``auto``: it brings the highlights near white."""
-    return neutral_ev100 - highlight_stops(expose(image, neutral_ev100) * EXPOSURE_GAIN, neutral_ev100)
+    exposed = expose(image_luminance(image), neutral_ev100)
+    exposed *= EXPOSURE_GAIN
+    return neutral_ev100 - highlight_stops(exposed, neutral_ev100)
 
 
 def _adaptation_stops(luminance: float) -> float:
@@ -153,7 +163,9 @@ def develop(
         # A moonless sky is green of airglow; cameras' night modes, like the eye, show it grey-blue.
         image = image if eye else _blend_rod_vision(np.asarray(image), _MOONLESS)
         image = image if white is None else balanced(image, white)
-        return photo_curve(expose(image, ev100) * EXPOSURE_GAIN)
+        exposed = expose(image, ev100)
+        exposed *= EXPOSURE_GAIN
+        return photo_curve(exposed)
     return tone_curve(expose(image, ev100))
 
 
@@ -161,7 +173,7 @@ def _blend_rod_vision(image: np.ndarray, mesopic: tuple[float, float] = _MESOPIC
     """Blend an image with its scotopic grey by the position of each pixel's luminance in the mesopic range."""
     if not np.issubdtype(image.dtype, np.floating):
         image = image.astype(np.float64)
-    luminance = np.maximum(image @ REC709_LUMINANCE.astype(image.dtype), 1e-9)
+    luminance = np.maximum(image_luminance(image), 1e-9)
     low, high = np.log10(mesopic)
     # By day no pixel is so dim that rods see it; by night most are, and all are as quickly done.
     dim = luminance < mesopic[1]

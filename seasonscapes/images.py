@@ -171,6 +171,14 @@ def linear_from_srgb(encoded: ArrayLike) -> np.ndarray:
     return np.where(encoded <= 0.04045, encoded / 12.92, np.power((encoded + 0.055) / 1.055, 2.4)).astype(np.float32)
 
 
+def image_luminance(image: np.ndarray) -> np.ndarray:
+    """Luminance of linear Rec.709 ``(..., 3)``, in the precision of the image."""
+    image = np.asarray(image)
+    if not np.issubdtype(image.dtype, np.floating):
+        image = image.astype(np.float64)
+    return image @ REC709_LUMINANCE.astype(image.dtype)
+
+
 def auto_exposure_ev100(image: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Compute the EV100 that places the log-average luminance of an image at middle grey.
 
@@ -194,8 +202,8 @@ def auto_exposure_ev100(image: np.ndarray, mask: np.ndarray | None = None) -> fl
     NoUsablePixels
         If no metered pixel has a finite, positive luminance.
     """
-    values = (np.asarray(image, np.float64) @ REC709_LUMINANCE)[... if mask is None else mask].ravel()
-    values = values[np.isfinite(values) & (values > 0.0)]
+    values = image_luminance(image)[... if mask is None else mask].ravel()
+    values = values[np.isfinite(values) & (values > 0.0)].astype(np.float64)
     if values.size == 0:
         raise NoUsablePixels("auto exposure: the image has no positive luminance; give an EV100")
     low, high = np.percentile(values, [2.0, 98.0])
@@ -219,6 +227,11 @@ def expose(image: np.ndarray, ev100: float) -> np.ndarray:
         Exposed linear values ``(..., 3)``; 1 is the luminance that saturates a sensor.
     """
     return np.asarray(image) / (SATURATION_LUMINANCE * 2.0**ev100)
+
+
+def largest_channel(image: np.ndarray) -> np.ndarray:
+    """The largest of three channels ``(..., 3)``, as ``(..., 1)``: an order of magnitude quicker than along the last axis."""
+    return np.maximum(np.maximum(image[..., :1], image[..., 1:2]), image[..., 2:])
 
 
 # Shape of the tone curve: a constant gain, linear (no toe) up to the start of the shoulder, then a long soft shoulder.
@@ -245,7 +258,7 @@ def tone_curve(exposed: np.ndarray) -> np.ndarray:
         Display-linear values in [0, 1] ``(..., 3)``, float32.
     """
     colour = np.maximum(np.asarray(exposed, np.float32) * EXPOSURE_GAIN, 0.0)
-    peak = colour.max(axis=-1, keepdims=True)
+    peak = largest_channel(colour)
     compressed = _compressed_peak(peak)
     scaled = colour * (compressed / np.maximum(peak, 1e-12))
     whiten = _whitening(peak, compressed)
@@ -540,6 +553,7 @@ def write_exr(
     *,
     header: Mapping[str, Any] | None = None,
     half: bool = False,
+    quick: bool = False,
 ) -> None:
     """Write named layers to one OpenEXR file, atomically.
 
@@ -556,6 +570,8 @@ def write_exr(
         Attributes. Strings and floats are stored as such, everything else as JSON text.
     half
         Store half precision (largest value 65504, three significant digits) in place of single precision.
+    quick
+        Compress runs of equal bytes alone: half the time of writing, and pictures half as large again.
     """
     import OpenEXR
 
@@ -569,7 +585,10 @@ def write_exr(
         axes = {"normal": "XYZ", "position": "XYZ", "uv": "UV"}.get(name, "RGB")
         for index, axis in enumerate(axes[: values.shape[2]]):
             channels[prefix + axis] = np.ascontiguousarray(values[..., index])
-    attributes: dict[str, Any] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    attributes: dict[str, Any] = {
+        "compression": OpenEXR.RLE_COMPRESSION if quick else OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+    }
     for key, value in (header or {}).items():
         attributes[key] = value if isinstance(value, (str, float)) else json.dumps(value)
     with atomic_path(path) as temporary:

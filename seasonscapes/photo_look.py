@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from seasonscapes.images import REC709_LUMINANCE, XYZ_FROM_REC709
+from seasonscapes.images import REC709_LUMINANCE, XYZ_FROM_REC709, largest_channel
 
 # CIE daylight of 5,500 K in linear Rec.709, the balance of daylight film.
 DAYLIGHT_RGB = (1.1038901, 0.9870861, 0.8219280)
@@ -58,7 +58,8 @@ def balanced(image: np.ndarray, white: tuple[float, float, float]) -> np.ndarray
     """
     gains = (_CONES @ np.ones(3)) / (_CONES @ np.asarray(white, float))
     matrix = np.linalg.inv(_CONES) @ np.diag(gains) @ _CONES
-    return np.maximum(np.asarray(image) @ matrix.T.astype(np.float32), 0.0)
+    adapted = np.asarray(image) @ matrix.T.astype(np.float32)
+    return np.maximum(adapted, 0.0, out=adapted)
 
 
 def highlight_stops(exposed: np.ndarray, ev100: float) -> float:
@@ -67,14 +68,14 @@ def highlight_stops(exposed: np.ndarray, ev100: float) -> float:
     Parameters
     ----------
     exposed
-        ``(H, W, 3)`` exposed linear values.
+        ``(H, W, 3)`` exposed linear values, or their luminance ``(H, W)``.
     ev100
         Of that exposure; nights are brightened by at most 0.6 stops, whatever their highlights.
     """
     if ev100 < _DIM_EV:
         # The curve darkens shadows, and a night is all shadows.
         return float(np.clip((_DIM_EV - ev100) / 13.0, 0.0, 0.6))
-    luminance = np.asarray(exposed, np.float64) @ REC709_LUMINANCE
+    luminance = exposed if np.ndim(exposed) == 2 else np.asarray(exposed, np.float64) @ REC709_LUMINANCE
     highlight = max(float(np.percentile(luminance[np.isfinite(luminance)], _HIGHLIGHT_PERCENTILE)), 1e-6)
     return float(np.clip(np.log2(_HIGHLIGHT / highlight), *_STOPS))
 
@@ -92,13 +93,20 @@ def photo_curve(exposed: np.ndarray) -> np.ndarray:
     numpy.ndarray
         ``(..., 3)`` float32 display-linear values in [0, 1).
     """
-    colour = np.maximum(np.asarray(exposed, np.float32), 0.0)
+    import cv2  # slow to load; its power of an array takes a quarter of NumPy's time
+
+    colour = np.maximum(np.asarray(exposed, np.float32), 0.0).reshape(-1, 3)
     half = np.float32(_GREY**_CONTRAST * (1.0 / _GREY - 1.0))
 
     def curve(values: np.ndarray) -> np.ndarray:
-        power = values ** np.float32(_CONTRAST)
-        return power / (power + half)
+        power = np.asarray(cv2.pow(values, _CONTRAST)).reshape(values.shape)
+        power /= power + half
+        return power
 
-    peak = colour.max(axis=-1, keepdims=True)
-    kept_hue = colour * (curve(peak) / np.maximum(peak, np.float32(1e-12)))
-    return np.float32(_PER_CHANNEL) * curve(colour) + np.float32(1.0 - _PER_CHANNEL) * kept_hue
+    peak = largest_channel(colour)
+    scale = curve(peak) / np.maximum(peak, np.float32(1e-12)) * np.float32(1.0 - _PER_CHANNEL)
+    shown = curve(colour)
+    shown *= np.float32(_PER_CHANNEL)
+    colour *= scale
+    shown += colour
+    return shown.reshape(np.shape(exposed))

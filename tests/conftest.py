@@ -10,6 +10,29 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 
+@pytest.fixture(scope="module")
+def few_rays():
+    """Light transport with few rays for a module's tests; see `few_rays.py`."""
+    from few_rays import trace_few_rays
+
+    take_back = trace_few_rays()
+    yield
+    take_back()
+
+
+@pytest.fixture(scope="module")
+def coarse_viewer():
+    """Coarse pages of `view`, which has no flag for it, for a module's tests."""
+    from dataclasses import astuple
+
+    from seasonscapes.workflows.viewer_scene import ViewerDetail
+
+    coarse = ViewerDetail(160, 256, 160, 48, 24, 8, 256, 16, 64)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ViewerDetail.__init__, "__defaults__", astuple(coarse))
+        yield
+
+
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """The optional folder of real rasters and photographs; tests that ask for it skip where it is absent."""

@@ -1,7 +1,7 @@
 """Runs commands in forks of one process that has imported everything already, and kills them when asked to.
 
 Reads lines of JSON (``arguments``, ``kill_after_s`` or null, ``log``) on stdin, answers each with a line (``code``,
-``seconds``); -9 is a killed one. Light transport is traced with fewer rays: the same code, a fraction of the time.
+``seconds``); -9 is a killed one. Light transport is traced with few rays.
 """
 
 import json
@@ -46,15 +46,12 @@ if __name__ == "__main__":
     import scipy.ndimage
     import scipy.sparse.linalg  # noqa: F401
     import skyfield.api  # noqa: F401
+    from few_rays import trace_few_rays
 
     from seasonscapes.cli import main
-    from seasonscapes.evaluation import synthetic_webcams
-    from seasonscapes.rendering import transport
     from seasonscapes.workflows import timelapse, view_rendering  # noqa: F401
 
-    transport.SamplingOptions.__init__.__defaults__ = (4, 16, 64, 4, 512, 32, 16, "reinhart")
-    transport._PILOTS = 1 << 14
-    synthetic_webcams.QUICK = transport.SamplingOptions()
+    trace_few_rays()
     print(json.dumps({"ready": True}), flush=True)
     for line in sys.stdin:
         print(json.dumps(run(json.loads(line))), flush=True)

@@ -346,19 +346,15 @@ def test_a_model_of_gaussians_is_compared_with_what_was_written(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_workspace_whose_every_file_is_damaged_is_built_again(tmp_path, capsys, monkeypatch):
+def test_a_workspace_whose_every_file_is_damaged_is_built_again(tmp_path, capsys, request):
     """The same picture from a workspace of which all files were changed or cut short."""
     import places
+    from few_rays import trace_few_rays
 
     from seasonscapes.cli import main
     from seasonscapes.images import read_exr
-    from seasonscapes.rendering import transport
 
-    # Fewer rays: the same code, a fraction of the time.
-    few = (4, 16, 64, 4, 512, 32, 16, "reinhart")
-    monkeypatch.setattr(transport.SamplingOptions.__init__, "__defaults__", few)
-    monkeypatch.setattr(transport, "_PILOTS", 1 << 14)
-
+    request.addfinalizer(trace_few_rays())
     scene = places.write_place(tmp_path / "scene")
     arguments = ["render", str(scene), "--time", "2024-07-20T13:00", "--sky", "hosek", "--size", "32x24"]
     arguments += ["--texel-m", "100", "--refine", "1", "--workspace", str(tmp_path / "work")]

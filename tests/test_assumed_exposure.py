@@ -9,8 +9,11 @@ import pytest
 import seasonscapes as ss
 from seasonscapes.albedo import tone_curve
 from seasonscapes.albedo.assumed_exposure import with_assumed_exposure
-from seasonscapes.albedo.closed_form import solve_albedo
+from seasonscapes.albedo.closed_form import AlbedoFit, solve_albedo
+from seasonscapes.albedo.forward_model import aerial_perspective_of
+from seasonscapes.albedo.natural_colours import with_natural_colours
 from seasonscapes.albedo.photographs import EIGHT_BIT, prepare_photographs
+from seasonscapes.albedo.standard_error import observed_sigma
 from seasonscapes.cameras.observation import Observation
 from seasonscapes.images import linear_from_srgb, srgb_from_linear
 from seasonscapes.workflows.albedo_recovery import RecoveryOptions, _prepared, photographs_of_ground, texel_transport
@@ -108,3 +111,87 @@ def test_the_tone_curve_of_one_such_photograph_is_not_guessed(taken, monkeypatch
     assert "curve_strength" not in one
     assert one["exposure"].startswith("assumed")
     assert two["curve_strength"] == 0.4
+
+
+def _of_noon(taken, picture_of):
+    """The noon photograph without sky, prepared, its picture changed by ``picture_of(picture, photograph)``."""
+    place, transport, _, without = taken
+    light = illumination_for_camera(place, without[1].camera, sky_model("clear"), without[1].time)[0]
+    first = with_assumed_exposure(prepare_photographs(transport, [without[1]], [light]))[0]
+    changed = replace(first.observation, image=picture_of(first.observation.image, first).astype(np.float32))
+    return transport, replace(first, observation=changed)
+
+
+def test_land_bluer_than_land_is_told_as_the_cameras_balance(taken):
+    def near(picture, photograph):
+        """The picture without the kilometres of air before all of its ground."""
+        count = len(photograph.footprints.pixel)
+        transmittance, air = aerial_perspective_of(photograph.atmosphere, photograph.light, count)
+        bare = picture.reshape(-1, 3).copy()
+        seen = photograph.footprints.pixel
+        bare[seen] = np.clip((bare[seen] - photograph.gain * air) / transmittance, 0.002, 0.95)
+        return bare.reshape(picture.shape)
+
+    transport, as_it_was = _of_noon(taken, near)
+    _, blue = _of_noon(taken, lambda picture, photograph: np.minimum(near(picture, photograph) * [0.8, 0.9, 1.7], 0.95))
+    as_it_was, blue = (replace(each, light=replace(each.light, aerial_perspective=None)) for each in (as_it_was, blue))
+    kept = with_natural_colours(transport, [as_it_was])[0]
+    balanced = with_natural_colours(transport, [blue])[0]
+    before, after = kept.gain / as_it_was.gain, balanced.gain / blue.gain
+    np.testing.assert_array_equal(before, 1.0)
+    # Shaded snow of this place is bluer than neutral by less than a white balance is known; beyond that it is made neutral.
+    assert 1.7 / 0.8 < after[2] / after[0] < 1.35 * 1.7 / 0.8
+    # The corrected photograph has nothing left to correct, and others are not touched.
+    np.testing.assert_allclose(with_natural_colours(transport, [balanced])[0].gain, balanced.gain)
+    assert with_natural_colours(transport, [replace(blue, gain=None)])[0].gain is None
+
+
+def test_blue_air_before_far_land_is_not_the_lands_colour(taken):
+    def bluer(picture, photograph):
+        air = aerial_perspective_of(photograph.atmosphere, photograph.light, len(photograph.footprints.pixel))[1]
+        more = np.zeros_like(picture).reshape(-1, 3)
+        more[photograph.footprints.pixel, 2] = photograph.gain[2] * 3.0 * air[:, 2]
+        return np.minimum(picture + more.reshape(picture.shape), 0.95)
+
+    transport, plain = _of_noon(taken, lambda picture, _: picture)
+    _, hazy = _of_noon(taken, bluer)
+    true = closed_fit(transport, [plain])
+    far = true.pixel_count > 0.5
+    errors = []
+    for photograph in (hazy, with_natural_colours(transport, [hazy])[0]):
+        fit = closed_fit(transport, [photograph])
+        ratio = fit.albedo[far].mean(axis=0) / true.albedo[far].mean(axis=0)
+        errors.append(float(np.log(ratio[2] / ratio[0])))
+    assert errors[0] > 0.1
+    assert abs(errors[1]) < 0.6 * errors[0]
+
+
+def test_pixels_that_a_mask_leaves_out_measure_no_texel(taken):
+    place, transport, _, without = taken
+    light = illumination_for_camera(place, without[1].camera, sky_model("clear"), without[1].time)[0]
+    mask = without[1].mask.copy()
+    mask[:, : mask.shape[1] // 2] = False
+    half, whole = (
+        closed_fit(transport, with_assumed_exposure(prepare_photographs(transport, [each], [light])))
+        for each in (replace(without[1], mask=mask), without[1])
+    )
+    seen, all_seen = half.pixel_count > 0.0, whole.pixel_count > 0.0
+    assert 0.2 < seen.sum() / all_seen.sum() < 0.8
+    assert not (half.information > 0.0)[~seen].any()
+
+
+def test_texels_cut_by_the_border_of_a_picture_are_not_measured():
+    count = np.zeros((6, 6), np.float32)
+    count[:, :3] = 20.0
+    count[:, 3] = 5.0
+    ridge = np.full((6, 6), 20.0, np.float32)
+    ridge[:, 3] = 5.0
+    known = []
+    for pixels in (count, ridge):
+        shape = pixels.shape
+        fit = AlbedoFit(np.full((*shape, 3), 0.3), pixels, 1e6 * pixels, np.ones((1, 3)), np.array([0.01]), 0.0)
+        known.append(np.isfinite(observed_sigma(fit)))
+    assert known[0][:, :3].all()
+    assert not known[0][:, 3].any()
+    # Amid others that are seen, foreshortened texels are measured.
+    assert known[1].all()

@@ -1,6 +1,7 @@
 """Completion: exact laws of the fills, recovery of a known truth, controls that must fail, and the verb."""
 
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -18,7 +19,7 @@ from seasonscapes.texturing.completion import INPAINTERS, CompletionOptions, com
 from seasonscapes.texturing.predictors import predictors_for, stack_predictors
 from seasonscapes.texturing.smooth_fill import membrane_fill, propagate, push_pull, telea_fill
 from seasonscapes.texturing.terrain_features import horizon_tangent, sun_margin_deg, terrain_features
-from seasonscapes.texturing.top_down_grid import from_grid, to_grid
+from seasonscapes.texturing.top_down_grid import from_grid, grid_heights, to_grid
 from seasonscapes.workflows.albedo_sources import scene_albedo
 from seasonscapes.workflows.place import MeshOptions, load_place
 from seasonscapes.workspace import Workspace
@@ -122,6 +123,36 @@ def test_a_residual_fades_with_its_reach():
     carried = propagate(np.ones((9, 101, 1)), seen, reach_px=12.0)[4, :, 0]
     np.testing.assert_allclose(carried[[1, 13, 25]], np.exp([0.0, -1.0, -2.0]), rtol=0.03)
     assert not propagate(np.ones((9, 9, 1)), np.zeros((9, 9), bool)).any()
+
+
+def test_a_single_odd_pixel_leaves_no_blot_beside_it():
+    seen = np.zeros((41, 41), bool)
+    seen[:, :20] = True
+    residual = np.zeros((41, 41, 3))
+    residual[20, 19] = 1.0
+    carried = propagate(residual, seen)
+    assert np.abs(carried[:, 20:]).max() < 0.15
+    np.testing.assert_array_equal(carried[seen], residual[seen])
+
+
+def test_relief_of_a_terrain_is_that_of_its_heights_and_not_of_its_triangles():
+    place = load_place("alpine_small", options=MeshOptions(max_error_m=40.0))
+    heights, spacing_m = grid_heights(place.terrain, 60.0)
+    bare = replace(place.terrain, surface=None)
+    facets, _ = grid_heights(bare, 60.0)
+    low, high = place.terrain.vertices[:, :2].min(axis=0), place.terrain.vertices[:, :2].max(axis=0)
+    rows, columns = np.mgrid[5:15, 5:15]
+    position = np.stack(
+        [
+            low[0] + (columns + 0.5) * spacing_m,
+            high[1] - (rows + 0.5) * (high - low)[1] / heights.shape[0],
+            heights[5:15, 5:15],
+        ],
+        -1,
+    ).reshape(-1, 3)
+    true = place.terrain.surface.up_at(position)
+    np.testing.assert_allclose(heights[5:15, 5:15].ravel(), true, atol=0.5)
+    assert np.abs(facets[5:15, 5:15].ravel() - true).max() > 2.0
 
 
 def test_the_membrane_solves_laplace():

@@ -85,7 +85,7 @@ def test_footprints_are_the_pixels_of_the_camera(slope):
     np.testing.assert_allclose(np.median(gaps / side_m[:79]), 0.5, rtol=0.1)
 
 
-def test_a_camera_that_sees_hardly_any_ground_is_told_and_left_out(tmp_path, caplog):
+def test_a_camera_that_sees_hardly_any_ground_is_told_and_left_out(tmp_path, caplog, few_rays):
     """Its picture has a few rays that meet the ground, and no pixel that they fill."""
     scene = places.SCENE.replace("pitch_deg = -8.0", "pitch_deg = 45.5")
     place = load_place(places.write_place(tmp_path / "scene", scene), Workspace(tmp_path / "work"))

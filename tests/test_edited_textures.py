@@ -18,6 +18,8 @@ from seasonscapes.terrain.surface import Texture, save_texture
 from seasonscapes.workflows.albedo_recovery import save_albedo_figures
 from seasonscapes.workflows.edited_textures import albedo_date, read_albedo
 
+pytestmark = pytest.mark.usefixtures("few_rays")
+
 TIME = "2024-07-20T13:30"
 
 

@@ -12,6 +12,8 @@ from seasonscapes.cli import main
 from seasonscapes.errors import InputError
 from seasonscapes.workflows.path_films import hours_of_views
 
+pytestmark = pytest.mark.usefixtures("few_rays")
+
 NOON = datetime(2024, 7, 20, 10, tzinfo=UTC)
 
 

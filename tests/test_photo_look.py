@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 import seasonscapes as ss
-from seasonscapes.exposure import develop, exposure_ev100
-from seasonscapes.images import REC709_LUMINANCE
+from seasonscapes.exposure import develop, exposure_ev100, photo_ev100
+from seasonscapes.images import EXPOSURE_GAIN, REC709_LUMINANCE, expose, image_luminance, srgb_from_linear
 from seasonscapes.photo_look import DAYLIGHT_RGB, balanced, highlight_stops, photo_curve, white_point
+from seasonscapes.relighting.film import _levels as levels_of
 
 
 def test_white_becomes_neutral_and_keeps_its_luminance():
@@ -73,3 +74,29 @@ def test_a_fixed_exposure_is_left_alone():
     picture = np.full((4, 6, 3), 3000.0)
     assert exposure_ev100(picture, 12.5, look="photo") == 12.5
     np.testing.assert_array_equal(develop(picture, 12.5), develop(picture, 12.5, look="neutral"))
+
+
+def test_pictures_in_single_precision_are_those_of_the_formulas():
+    """The quick powers of the curve and of a film's levels: within 1e-5, and of a level where noise decides."""
+    rng = np.random.default_rng(5)
+    exposed = rng.random((40, 30, 3)).astype(np.float32) ** 6 * 30.0
+    exposed[0, 0] = 0.0
+    power = exposed.astype(np.float64) ** 1.6
+    half = 0.18**1.6 * (1.0 / 0.18 - 1.0)
+    peak = exposed.max(axis=-1, keepdims=True).astype(np.float64)
+    kept_hue = exposed * (peak**1.6 / (peak**1.6 + half)) / np.maximum(peak, 1e-12)
+    shown = photo_curve(exposed)
+    np.testing.assert_allclose(shown, 0.6 * power / (power + half) + 0.4 * kept_hue, rtol=1e-5, atol=1e-7)
+    noise = rng.random((40, 30, 1)).astype(np.float32)
+    shown[1, 1] = [1.2, -0.1, 0.001]
+    levels = levels_of(shown, noise).astype(int)
+    exact = srgb_from_linear(shown.astype(np.float64)) * 255.0 + noise
+    assert ((levels <= exact + 1e-3) & (levels > np.minimum(exact, 255.0) - 1.001)).all()
+    assert levels.max() == 255
+
+
+def test_the_stops_of_a_picture_follow_its_luminance():
+    image = np.random.default_rng(6).random((30, 40, 3)).astype(np.float32) * [900.0, 700.0, 400.0]
+    exposed = expose(image, 12.0) * EXPOSURE_GAIN
+    assert highlight_stops(exposed, 12.0) == pytest.approx(highlight_stops(image_luminance(exposed), 12.0), abs=1e-6)
+    assert photo_ev100(image, 12.0) == pytest.approx(12.0 - highlight_stops(exposed, 12.0), abs=1e-6)

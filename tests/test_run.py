@@ -18,13 +18,11 @@ from seasonscapes.workspace import file_hash
 
 STAGES = ("pictures", "calibrate", "albedo", "paint", "inpaint", "relight", "distil", "splat")
 
-# The program with less light transport: the same code, a fifth of the time.
-LAUNCHER = """import sys
-from seasonscapes.evaluation import synthetic_webcams
-from seasonscapes.rendering import transport
-transport.SamplingOptions.__init__.__defaults__ = (4, 16, 64, 4, 512, 32, 16, "reinhart")
-transport._PILOTS = 1 << 14
-synthetic_webcams.QUICK = transport.SamplingOptions()
+# The program with few rays.
+LAUNCHER = f"""import sys
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+from few_rays import trace_few_rays
+trace_few_rays()
 from seasonscapes.cli import main
 sys.exit(main(sys.argv[1:]))
 """

@@ -10,7 +10,7 @@ from atmosphere_cases import tables_of
 
 from seasonscapes.frames import direction_from_angles
 from seasonscapes.sky.atmosphere import delta_scaled, gas_moments, optics
-from seasonscapes.sky.clear_sky import LuminarySource, illumination_from_atmosphere
+from seasonscapes.sky.clear_sky import LuminarySource, illumination_from_atmosphere, sky_radiance_map
 from seasonscapes.sky.elevation_table import (
     KNOTS_DEG,
     PART_KNOTS,
@@ -23,6 +23,7 @@ from seasonscapes.sky.elevation_table import (
 )
 from seasonscapes.sky.illumination import luminance
 from seasonscapes.sky.models import atmosphere_from_model, read_sky_model
+from seasonscapes.sky.night import night_sky_radiance
 from seasonscapes.sky.observer_radiance import (
     diffuse_by_elevation,
     observed_sky,
@@ -82,6 +83,43 @@ def test_a_film_s_sky_is_the_picture_s(looked_up, low_deg, high_deg, bound):
             np.testing.assert_array_equal(through, exact_through)
         if exact.sun is not None:
             np.testing.assert_array_equal(quick.sun.normal_illuminance_lx, exact.sun.normal_illuminance_lx)
+
+
+@pytest.mark.parametrize("sun_deg", [-8.0, 0.2, 35.0])
+def test_distances_along_the_same_rays_are_the_same_air(looked_up, sun_deg):
+    """Aerial perspective on a grid of distances × directions, and at one distance for all, against one ray after another."""
+    rng = np.random.default_rng(3)
+    direction = rng.normal(size=(9, 11, 3)) * [1.0, 1.0, 0.3]
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    moon = LuminarySource(direction_from_angles(120.0, 17.3), 1e-6, 0.26)
+    sun = direction_from_angles(210.0, sun_deg)
+    air = illumination_from_atmosphere(looked_up, sun, HEIGHT_M, moon=moon, shape=(8, 16)).aerial_perspective
+    distances_m = np.array([0.0, 35.0, 1.7e4, 2.9e5, 1.3e6, 5e6, np.inf])
+    grid = air(distances_m[:, None, None], direction)
+    for number, distance_m in enumerate(distances_m):
+        each = air(np.full((9, 11), distance_m), direction)
+        alone = air(float(distance_m), direction)
+        for on_grid, single, expected in zip(grid, alone, each, strict=True):
+            assert on_grid.shape == (7, 9, 11, 3)
+            np.testing.assert_allclose(on_grid[number], expected, rtol=2e-6, atol=1e-9 * expected.max())
+            np.testing.assert_array_equal(single, on_grid[number])
+
+
+def test_a_sun_deep_below_the_horizon_lights_no_air(looked_up):
+    """What is left out is less than 0.1 % of the natural night sky's radiance in every direction."""
+    shape = (16, 32)
+    for azimuth_deg in (0.0, 130.0):
+        direction = direction_from_angles(azimuth_deg, -25.0)
+        left_out = sky_radiance_map(looked_up, direction, HEIGHT_M, shape=shape)[:8]
+        night = night_sky_radiance(*shape, height_m=HEIGHT_M)[:8]
+        assert luminance(left_out).max() > 0.0
+        assert (luminance(left_out) < 1e-3 * luminance(night)).all()
+    dark, dim = (
+        illumination_from_atmosphere(looked_up, direction_from_angles(130.0, deg), HEIGHT_M, shape=shape)
+        for deg in (-25.1, -24.9)
+    )
+    assert dark.sky_radiance.max() == 0.0 < dim.sky_radiance.max()
+    np.testing.assert_array_equal(dark.aerial_perspective(5e3, direction_from_angles(0.0, 1.0))[1], 0.0)
 
 
 def test_the_moon_s_colour_is_kept(looked_up):
@@ -251,7 +289,10 @@ def test_light_for_a_film_takes_its_tables_from_the_workspace(tmp_path, looked_u
     moonlit = datetime(2024, 9, 18, 23, tzinfo=UTC)
     illumination_module.tabulate_illumination(place, camera, model, [moonlit])
     built = len(asked)
-    illumination_module.illumination_for_camera(place, camera, model, moonlit, map_height=4, by_elevation=True)
+    _, in_film = illumination_module.illumination_for_camera(
+        place, camera, model, moonlit, map_height=4, by_elevation=True
+    )
+    assert in_film == illumination_module.position_at(place, moonlit)
     assert len(asked) == built, "those of the sun and of the moon"
     exact, moment = illumination_module.illumination_for_camera(place, camera, model, when, map_height=16)
     assert -3.0 < moment.sun.elevation_deg < 3.0

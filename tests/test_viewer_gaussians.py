@@ -101,7 +101,7 @@ def test_more_gaussians_than_a_page_draws_are_refused(model):
         viewer_layer(Many())
 
 
-def test_the_command_writes_them(place, model, tmp_path):
+def test_the_command_writes_them(place, model, tmp_path, coarse_viewer):
     save_model(model, tmp_path / "model.safetensors")
     common = {"gaussians": tmp_path / "model.safetensors", "workspace": place.workspace.folder}
     command("view", place.path, output=tmp_path / "page", **common)

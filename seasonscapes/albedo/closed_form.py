@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TypeVar
 
 import numpy as np
 
@@ -30,14 +29,13 @@ from seasonscapes.albedo.equations import (
     reweight,
     squared_adjoint,
 )
-from seasonscapes.albedo.footprints import texel_pixel_count
+from seasonscapes.albedo.footprints import Footprints, texel_pixel_count
 from seasonscapes.albedo.forward_model import TexelTransport, ambient_on_texels
 from seasonscapes.albedo.ground_pixels import ground_pixels
 from seasonscapes.albedo.photographs import LINEAR, AlbedoPhotograph, NoiseModel
 from seasonscapes.errors import NotEnoughEvidence, NoUsablePixels
 
 Progress = Callable[[float], None]
-_Item = TypeVar("_Item")
 # Bounds of natural albedos: fresh snow reflects 95 % at most, lakes and conifers 2 %.
 LOWEST, HIGHEST = 0.004, 0.98
 
@@ -70,7 +68,7 @@ class AlbedoFit:
     albedo
         ``(R, S, 3)`` float32; where ``pixel_count`` is 0, copied from the nearest observed texel (no measurement).
     pixel_count
-        ``(R, S)`` float32 number of pixels that each texel covers, summed over cameras.
+        ``(R, S)`` float32 number of usable pixels that each texel covers, summed over cameras.
     information
         ``(R, S)`` float32 diagonal of the information matrix, in 1/variance of albedo (green).
     gains
@@ -163,7 +161,7 @@ def solve_albedo(
     size = transport.shape[0] * transport.shape[1]
     systems = [equations_of(photograph, noise_model, size) for photograph in photographs]
     _require_usable(systems)
-    pixel_count = texel_pixel_count(_unique([photograph.footprints for photograph in photographs]))
+    pixel_count = _usable_pixel_count(systems)
     albedo = np.full((size, 3), 0.25, np.float32) if start is None else start.reshape(size, 3).astype(np.float32)
     observed = pixel_count.ravel() > 0.0
     grounds = [ground_pixels(transport, photograph) for photograph in photographs]
@@ -185,8 +183,15 @@ def solve_albedo(
     return AlbedoFit(albedo, pixel_count, information, gains, residual, cost, history, noise_model)
 
 
-def _unique(items: Sequence[_Item]) -> list[_Item]:
-    return list({id(item): item for item in items}.values())
+def _usable_pixel_count(systems: list[PhotographEquations]) -> np.ndarray:
+    """Pixels ``(R, S)`` that each texel covers, summed over cameras; those that no photograph of a camera can use do not count."""
+    usable: dict[int, np.ndarray] = {}
+    footprints: dict[int, Footprints] = {}
+    for equations in systems:
+        own, chosen = equations.photograph.footprints, np.asarray(equations.usable.any(axis=1))
+        footprints[id(own)] = own
+        usable[id(own)] = chosen | usable[id(own)] if id(own) in usable else chosen
+    return texel_pixel_count([footprints[key] for key in usable], list(usable.values()))
 
 
 def update_ambient(systems: list[PhotographEquations], transport: TexelTransport, albedo: np.ndarray) -> None:

@@ -260,13 +260,15 @@ def _merged(row: np.ndarray, texel: np.ndarray, rows: int, texels: int) -> tuple
     return entry, start, unique % texels
 
 
-def texel_pixel_count(footprints: Sequence[Footprints]) -> np.ndarray:
+def texel_pixel_count(footprints: Sequence[Footprints], counted: Sequence[np.ndarray] | None = None) -> np.ndarray:
     """Count the pixels that each texel covers, summed over cameras.
 
     Parameters
     ----------
     footprints
         Footprints of each camera, all of one texture shape.
+    counted
+        ``(n,)`` bool of each camera: which of its terrain pixels count; ``None`` for all.
 
     Returns
     -------
@@ -274,8 +276,11 @@ def texel_pixel_count(footprints: Sequence[Footprints]) -> np.ndarray:
         ``(R, S)`` float32 fractional pixel counts; 0 where no pixel contains the texel.
     """
     total = np.zeros(footprints[0].shape[0] * footprints[0].shape[1])
-    for camera_footprints in footprints:
-        total += np.bincount(camera_footprints.texel, camera_footprints.share, len(total))
+    for number, camera in enumerate(footprints):
+        share = camera.share
+        if counted is not None:
+            share = share * np.repeat(counted[number], np.diff(camera.start))
+        total += np.bincount(camera.texel, share, len(total))
     return total.reshape(footprints[0].shape).astype(np.float32)
 
 

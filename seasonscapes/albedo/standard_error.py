@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from seasonscapes.albedo.closed_form import AlbedoFit
@@ -22,6 +23,8 @@ _COMMON = 0.01
 # A texel counts as measured if its standard deviation is below this fraction of its albedo (plus 0.02) and it covers at
 # least this many pixels.
 _POOR, _FEWEST_PIXELS = 0.35, 0.5
+# At the border of what is seen, a texel that covers less than this share of the pixels of a neighbour is seen in part.
+_SEEN_IN_PART = 0.4
 
 
 @dataclass(frozen=True)
@@ -83,9 +86,15 @@ def observed_sigma(fit: AlbedoFit) -> np.ndarray:
     Returns
     -------
     numpy.ndarray
-        ``(R, S)`` float32 (green); infinite for texels that cover less than half a pixel.
+        ``(R, S)`` float32 (green); infinite for texels that cover less than half a pixel, and for those that the border of a
+        picture or a ridge cuts: the little that pixels show of them takes up what their other texels leave unexplained, and comes
+        out in any colour.
     """
-    return np.where(fit.pixel_count >= _FEWEST_PIXELS, texel_sigma(fit), np.inf).astype(np.float32)
+    count = fit.pixel_count.astype(np.float32)
+    around = np.ones((3, 3), np.uint8)
+    at_border = cv2.erode(count, around) < _FEWEST_PIXELS
+    cut = at_border & (count < _SEEN_IN_PART * cv2.dilate(count, around))
+    return np.where((count >= _FEWEST_PIXELS) & ~cut, texel_sigma(fit), np.inf).astype(np.float32)
 
 
 def times_sunlit(photographs: Sequence[AlbedoPhotograph]) -> np.ndarray:

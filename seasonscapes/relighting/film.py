@@ -12,7 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from seasonscapes.errors import InputError
-from seasonscapes.images import atomic_path, srgb_from_linear
+from seasonscapes.images import atomic_path
+
+# Of x264's: at this quality the files are as large as those of its default, in a third of the time and with 3 dB more
+# deviation from the pictures, of which none is visible (49 dB).
+_PRESET = "veryfast"
 
 
 def write_video(
@@ -64,9 +68,8 @@ def write_video(
                     )
                 # Dithering against banding in smooth skies; enough of it remains after compression.
                 noise = np.random.default_rng(count).random((height, width, 1), np.float32)
-                encoded = srgb_from_linear(image[:height, :width]) * 255.0 + noise
                 assert encoder.stdin is not None
-                encoder.stdin.write(np.clip(encoded, 0.0, 255.0).astype(np.uint8).tobytes())
+                encoder.stdin.write(_levels(image[:height, :width], noise).tobytes())
                 count += 1
             if encoder is None:
                 raise ValueError("write_video: got no images, expected at least one")
@@ -94,6 +97,19 @@ def write_video(
     return count
 
 
+def _levels(image: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """sRGB levels ``(H, W, 3)``, uint8, of display-linear values with dithering noise ``(H, W, 1)`` in [0, 1)."""
+    import cv2  # slow to load; its power of an array takes a quarter of NumPy's time
+
+    linear = np.clip(np.asarray(image, np.float32), 0.0, 1.0)
+    levels = np.asarray(cv2.pow(linear, 1.0 / 2.4)).reshape(linear.shape)
+    levels *= 1.055 * 255.0
+    levels -= 0.055 * 255.0
+    np.copyto(levels, linear * (12.92 * 255.0), where=linear <= 0.0031308)
+    levels += noise
+    return np.minimum(levels, 255.0, out=levels).astype(np.uint8)
+
+
 def _command(output: Path, size: tuple[int, int], fps: float, quality: int, comment: str) -> list[str]:
     import imageio_ffmpeg
 
@@ -103,7 +119,7 @@ def _command(output: Path, size: tuple[int, int], fps: float, quality: int, comm
         *(imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error"),
         *("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}"),
         *("-r", str(Fraction(fps).limit_denominator()), "-i", "-"),
-        *("-an", "-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", str(rate_factor)),
+        *("-an", "-c:v", "libx264", "-preset", _PRESET, "-pix_fmt", "yuv420p", "-crf", str(rate_factor)),
         *("-movflags", "+faststart", "-metadata", f"comment={comment}", str(output)),
     ]
 

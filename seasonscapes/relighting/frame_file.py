@@ -46,7 +46,7 @@ def save_frame(path: Path, radiance: np.ndarray, *, metered_ev100: float, proven
         "seasonscapes:provenance": provenance,
         "seasonscapes:sha256": _digest(pixels),
     }
-    write_exr(path, {"": pixels}, header=header, half=True)
+    write_exr(path, {"": pixels}, header=header, half=True, quick=True)
 
 
 def load_frame(path: Path) -> tuple[np.ndarray, float]:

@@ -140,8 +140,7 @@ def interpolate_air(grid: AirGrid, air: AerialPerspective) -> tuple[np.ndarray, 
     import mitsuba as mi
 
     shape = (_SLICES, *grid.direction.shape[:2])
-    depth = np.broadcast_to(grid.depth_m[:, None, None], shape)
-    parts = air(depth, np.broadcast_to(grid.direction, (*shape, 3)))
+    parts = air(grid.depth_m[:, None, None], grid.direction)
     nodes = np.concatenate([np.broadcast_to(part, (*shape, 3)) for part in parts], axis=-1).astype(np.float32)
     # The stub of Dr.Jit gives the texture types as `object`.
     texture: Any = mi.Texture3f(  # pyright: ignore[reportCallIssue]

@@ -296,13 +296,13 @@ def sky_radiance_towards(illumination: Illumination, direction: np.ndarray, pixe
     else:
         height, width = sky_map.shape[:2]
         grid = equirectangular_directions(height, width)
-        residual = sky_map - air(np.full((height, width), np.inf), grid)[1]
         # Near the horizon the map undersamples a steep profile: the residual at 4° elevation is used down to it.
         # Below the horizon the ground is part of the airlight, and the residual fades out.
         lowest = height // 2 - 1 - int(np.ceil(4.0 * height / 180.0))
-        residual[lowest + 1 :] = residual[lowest]
+        upper = sky_map[: lowest + 1] - air(np.inf, grid[: lowest + 1])[1]
+        residual = np.concatenate([upper, np.broadcast_to(upper[-1], (height - len(upper), width, 3))])
         fade = np.clip(1.0 + np.degrees(np.arcsin(np.clip(direction[..., 2:], -1.0, 1.0))) / 2.0, 0.0, 1.0)
-        sky = air(np.full(direction.shape[:-1], np.inf), direction)[1]
+        sky = air(np.inf, direction)[1]
         sky = sky + fade * sample_equirectangular(residual, direction)
         sky = np.maximum(sky, 0.0)
     for luminary in (illumination.sun, illumination.moon):

@@ -42,7 +42,7 @@ from seasonscapes.sky.illumination import Illumination, Luminary
 _DEPTH_RATIO = 1.05
 # and above which its aerial perspective is averaged over its samples.
 _AIR_RATIO = 1.1
-# Below this cosine of incidence the samples of a pixel may face the sun or not, or shadow each other.
+# Below this cosine of incidence the samples of a pixel may face the sun or not.
 _GRAZING = 0.25
 # Interreflected light varies slowly; its noise is averaged over neighbouring pixels of one surface, at these strides,
 _BOUNCE_STRIDES, _BOUNCE_SHARPNESS = (1,), 64.0
@@ -315,8 +315,8 @@ class _GroundPixels:
 def sun_cosine(view: RelightableView, luminary: Luminary) -> np.ndarray:
     """Average cos(angle of incidence) × visible fraction of the luminary's disc over each terrain pixel.
 
-    One shadow ray per pixel is traced first. All samples of a pixel are traced where neighbouring pixels differ, on
-    silhouettes and at grazing incidence.
+    One shadow ray per pixel is traced first. All samples of a pixel are traced where neighbouring pixels differ and on
+    silhouettes. At grazing incidence elsewhere, the samples that face the luminary are lit.
 
     Parameters
     ----------
@@ -332,8 +332,12 @@ def sun_cosine(view: RelightableView, luminary: Luminary) -> np.ndarray:
     """
     cosine = np.maximum(view.coefficients.normal @ np.asarray(luminary.direction, np.float32), 0.0)
     visible = first_sample_visible(view.rays, luminary)
-    mixed = np.flatnonzero(_differs_nearby(view, visible) | view.silhouette | (visible & (cosine < _GRAZING)))
+    traced = _differs_nearby(view, visible) | view.silhouette
     result = np.where(visible, cosine, 0.0)
+    # The light reaches all nine pixels around: what matters on slopes that it grazes is which samples face it.
+    grazed = np.flatnonzero(visible & (cosine < _GRAZING) & ~traced)
+    result[grazed] = sum_incidence(view.rays, luminary, grazed, traced=False)[0]
+    mixed = np.flatnonzero(traced)
     sunlit, unoccluded = sum_incidence(view.rays, luminary, mixed)
     # The mean normal averages many more samples than the shadow rays: these only determine the sunlit fraction.
     reliable = (cosine[mixed] > _GRAZING) & (unoccluded > _GRAZING)

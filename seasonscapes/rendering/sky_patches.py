@@ -155,24 +155,20 @@ def mi_patch_of(patches: SkyPatches, direction: Any) -> Any:
 
 
 @cache
-def _averaging(name: str, height: int, width: int) -> Any:
-    """Sparse matrix ``(P, H W)`` that averages a map of constant pixels over each patch, by exact overlap."""
-    from scipy import sparse
-
+def _averaging(name: str, height: int, width: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Weights ``(H,)`` and ``(count, W)`` that average a map of constant pixels over each row of patches, by exact overlap."""
     patches = sky_patches(name)
     map_edges = 90.0 - np.arange(height + 1) * (180.0 / height)
-    blocks = []
+    column = np.arange(width) / width
+    weights = []
     for row, count in enumerate(patches.counts):
         top = np.minimum(map_edges[:-1], patches.edges_deg[row])
         bottom = np.maximum(map_edges[1:], patches.edges_deg[row + 1])
-        weight = np.maximum(np.sin(np.radians(top)) - np.sin(np.radians(bottom)), 0.0) * (top > bottom)
+        down = np.maximum(np.sin(np.radians(top)) - np.sin(np.radians(bottom)), 0.0) * (top > bottom)
         left, right = np.arange(count)[:, None] / count, np.arange(1, count + 1)[:, None] / count
-        column = np.arange(width) / width
         across = np.clip(np.minimum(right, column + 1.0 / width) - np.maximum(left, column), 0.0, None)
-        blocks.append(
-            sparse.csr_array(np.einsum("h,aw->ahw", weight / weight.sum(), across * count).reshape(count, -1))
-        )
-    return sparse.vstack(blocks).tocsr()
+        weights.append((down / down.sum(), across * count))
+    return weights
 
 
 def patch_radiance(patches: SkyPatches, sky_radiance: np.ndarray) -> np.ndarray:
@@ -191,7 +187,9 @@ def patch_radiance(patches: SkyPatches, sky_radiance: np.ndarray) -> np.ndarray:
         ``(P, 3)`` float64, in the unit of the map.
     """
     height, width = sky_radiance.shape[:2]
-    return _averaging(patches.name, height, width) @ np.asarray(sky_radiance, np.float64).reshape(height * width, -1)
+    radiance = np.asarray(sky_radiance, np.float64)
+    weights = _averaging(patches.name, height, width)
+    return np.concatenate([across @ np.tensordot(down, radiance, 1) for down, across in weights])
 
 
 def patch_sums(index: np.ndarray, weight: np.ndarray, table: np.ndarray) -> np.ndarray:

@@ -212,7 +212,9 @@ def first_sample_visible(rays: SunRays, luminary: Luminary) -> np.ndarray:
     return result
 
 
-def sum_incidence(rays: SunRays, luminary: Luminary, receiver: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def sum_incidence(
+    rays: SunRays, luminary: Luminary, receiver: np.ndarray, *, traced: bool = True
+) -> tuple[np.ndarray, np.ndarray]:
     """Sum the cosine of incidence over the samples of receivers, with and without occlusion.
 
     Parameters
@@ -223,6 +225,9 @@ def sum_incidence(rays: SunRays, luminary: Luminary, receiver: np.ndarray) -> tu
         Sun or moon.
     receiver
         ``(K,)`` indices of the receivers to evaluate.
+    traced
+        Trace shadow rays. Otherwise samples are dark only where they face away from the luminary, which takes a tenth of
+        the time.
 
     Returns
     -------
@@ -242,7 +247,10 @@ def sum_incidence(rays: SunRays, luminary: Luminary, receiver: np.ndarray) -> tu
         index = dr.arange(mi.UInt32, dr.width(chosen) * rays.samples)
         samples = dr.opaque(mi.UInt32, rays.samples)
         lane = dr.gather(mi.UInt32, chosen, index // samples) * samples + index % samples
-        visible, cosine, weight = _visible(rays, disc, lane, coherent=True)
+        if traced:
+            visible, cosine, weight = _visible(rays, disc, lane, coherent=True)
+        else:
+            visible, cosine, _, weight = _facing(rays, disc, lane)
         weighted = dr.fmax(cosine, 0.0) * weight
         lanes = [dr.select(visible, weighted, 0.0), weighted]
         dr.eval(lanes)
@@ -306,15 +314,7 @@ def _visible(rays: SunRays, disc: _Disc, lane: Any, shift: Any = 0, *, coherent:
     import drjit as dr
     import mitsuba as mi
 
-    cosine, geometric_cosine = (
-        sum(
-            mi.Float(dr.gather(mi.Float16, column, lane)) * axis
-            for column, axis in zip(columns, disc.mi_centre, strict=True)
-        )
-        for columns in (rays.mi_normal, rays.mi_geometric_normal)
-    )
-    weight = mi.Float(dr.gather(mi.Float16, rays.mi_weight, lane))
-    active = (cosine > 0.0) & (geometric_cosine > 0.0) & (weight > 0.0)
+    active, cosine, geometric_cosine, weight = _facing(rays, disc, lane)
     samples = dr.opaque(mi.UInt32, rays.samples)
     receiver = lane // samples
     disc_point = lane - receiver * samples + dr.gather(mi.UInt32, rays.mi_disc_offset, receiver) + shift
@@ -323,3 +323,19 @@ def _visible(rays: SunRays, disc: _Disc, lane: Any, shift: Any = 0, *, coherent:
     material = rays.terrain.mi_terrain.bsdf()
     ray = mi.Ray3f(origin + direction * shadow_ray_start(material, geometric_cosine, origin), direction)
     return active & ~rays.terrain.mi_scene.ray_test(ray, coherent=coherent, active=active), cosine, weight
+
+
+def _facing(rays: SunRays, disc: _Disc, lane: Any) -> tuple[Any, Any, Any, Any]:
+    """Whether samples face the centre of the luminary, the cosines of their shading and geometric normals, and weight."""
+    import drjit as dr
+    import mitsuba as mi
+
+    cosine, geometric_cosine = (
+        sum(
+            mi.Float(dr.gather(mi.Float16, column, lane)) * axis
+            for column, axis in zip(columns, disc.mi_centre, strict=True)
+        )
+        for columns in (rays.mi_normal, rays.mi_geometric_normal)
+    )
+    weight = mi.Float(dr.gather(mi.Float16, rays.mi_weight, lane))
+    return (cosine > 0.0) & (geometric_cosine > 0.0) & (weight > 0.0), cosine, geometric_cosine, weight

@@ -44,7 +44,7 @@ class TabulatedAerialPerspective:
     depth_rgb: np.ndarray
     lights: tuple[tuple[ScatteredRadiance, np.ndarray], ...]
 
-    def __call__(self, depth_m: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def __call__(self, depth_m: np.ndarray | float, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Evaluate transmittance and airlight up to a distance along directions.
 
         The transmittance of an RGB channel is the mean over the bands, weighted by the radiance of a grey surface near
@@ -53,20 +53,26 @@ class TabulatedAerialPerspective:
         Parameters
         ----------
         depth_m
-            Distance from the observer along the ray ``(...)`` [m]; infinite for a ray without surface.
+            Distance from the observer along the ray ``(...)`` [m]; infinite for a ray without surface. One number for
+            all directions, and D distances ``(D, 1, ..., 1)`` along each of them, are evaluated several times quicker.
         direction
             Unit viewing directions ``(..., 3)``.
 
         Returns
         -------
         transmittance
-            ``(..., 3)`` in [0, 1].
+            ``(..., 3)``, or ``(D, ..., 3)``, in [0, 1].
         airlight
-            ``(..., 3)`` [cd/m²]; at infinite distance the sky radiance, or below the horizon the radiance of the
+            Of that shape [cd/m²]; at infinite distance the sky radiance, or below the horizon the radiance of the
             model's ground through the air.
         """
-        direction = np.asarray(direction, float)
-        depth = np.broadcast_to(np.asarray(depth_m, float), direction.shape[:-1])
+        direction, depth = np.asarray(direction, float), np.asarray(depth_m, float)
+        if depth.ndim == 0:
+            transmittance, airlight = self._along(depth[None], direction)
+            return transmittance[0], airlight[0]
+        if depth.ndim == direction.ndim and depth.size == len(depth):
+            return self._along(depth.ravel(), direction)
+        depth = np.broadcast_to(depth, direction.shape[:-1])
         flat, flat_depth = direction.reshape(-1, 3), depth.ravel()
         transmittance, airlight = np.empty(flat.shape), np.empty(flat.shape)
         for start in range(0, len(flat), _CHUNK):
@@ -74,12 +80,43 @@ class TabulatedAerialPerspective:
             transmittance[chunk], airlight[chunk] = self._evaluate(flat_depth[chunk], flat[chunk])
         return transmittance.reshape(direction.shape), airlight.reshape(direction.shape)
 
+    def _along(self, depth_m: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Evaluate up to each of D distances along the same directions ``(..., 3)``: ``(D, ..., 3)`` float32 each.
+
+        The tables are interpolated in distance first: that is done once for all directions.
+        """
+        flat = direction.reshape(-1, 3)
+        azimuth_deg, elevation_deg = angles_from_direction(flat)
+        row, fr = elevation_index(np.radians(elevation_deg), self.horizon_rad)
+        # A view's directions lie in few rows.
+        first, rows = int(row.min()), slice(int(row.min()), int(row.max()) + 2)
+        cell, fd = _distance_index(depth_m)
+        fd = fd.astype(np.float32)[:, None]
+
+        def at_distances(table: np.ndarray) -> np.ndarray:
+            return table[..., cell, :] * (1.0 - fd) + table[..., cell + 1, :] * fd
+
+        depth = interpolate_multilinear(at_distances(self.depth_rgb[rows]), ((row - first, fr),))
+        airlight, to_infinity = np.zeros((len(flat), len(depth_m), 3), np.float32), np.isinf(depth_m)
+        for light, near in self.lights:
+            cosine = flat @ light.luminary_direction
+            if to_infinity.any():
+                airlight[:, to_infinity] += sky_radiance(light, flat)[:, None].astype(np.float32)
+            if not to_infinity.all():
+                column, fa = azimuth_index(azimuth_deg, light.luminary_direction)
+                components = interpolate_multilinear(at_distances(near[rows]), ((row - first, fr), (column, fa)))
+                to_surface = apply_phase_functions(light, components, cosine[:, None])
+                airlight[:, ~to_infinity] += to_surface[:, ~to_infinity]
+        shape = (len(depth_m), *direction.shape)
+        # As below, a negative channel is clipped.
+        parts = (np.exp(-depth), np.maximum(airlight, 0.0))
+        transmittance, airlight = (part.swapaxes(0, 1).reshape(shape) for part in parts)
+        return transmittance, airlight
+
     def _evaluate(self, depth_m: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         azimuth_deg, elevation_deg = angles_from_direction(direction)
         row, fr = elevation_index(np.radians(elevation_deg), self.horizon_rad)
-        finite = np.minimum(depth_m, DISTANCE_EDGES_M[-1])
-        cell = np.clip(np.searchsorted(DISTANCE_EDGES_M, finite, side="right") - 1, 0, len(DISTANCE_EDGES_M) - 2)
-        fd = (finite - DISTANCE_EDGES_M[cell]) / (DISTANCE_EDGES_M[cell + 1] - DISTANCE_EDGES_M[cell])
+        cell, fd = _distance_index(depth_m)
         transmittance = np.exp(-interpolate_multilinear(self.depth_rgb, ((row, fr), (cell, fd))))
         airlight, to_infinity = np.zeros(direction.shape), np.isinf(depth_m)
         to_surface = ~to_infinity
@@ -94,6 +131,13 @@ class TabulatedAerialPerspective:
             )
         # Colours outside the Rec.709 gamut have a negative channel; clip, as images must not be negative.
         return transmittance, np.maximum(airlight, 0.0)
+
+
+def _distance_index(depth_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Interpolation index and fraction of distances ``(...)`` [m] among `DISTANCE_EDGES_M`; farther ones are its last."""
+    finite = np.minimum(depth_m, DISTANCE_EDGES_M[-1])
+    cell = np.clip(np.searchsorted(DISTANCE_EDGES_M, finite, side="right") - 1, 0, len(DISTANCE_EDGES_M) - 2)
+    return cell, (finite - DISTANCE_EDGES_M[cell]) / (DISTANCE_EDGES_M[cell + 1] - DISTANCE_EDGES_M[cell])
 
 
 def tabulate_aerial_perspective(

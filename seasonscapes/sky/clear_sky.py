@@ -11,7 +11,6 @@ and so is absorption by water vapour and oxygen, whose lines lie at wavelengths 
 from __future__ import annotations
 
 import json
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from os import PathLike
 
@@ -48,6 +47,9 @@ __all__ = [
 TABLES_REVISION = 5
 # A luminary of less normal illuminance is omitted [lx].
 _MIN_NORMAL_LX = 1e-6
+# Nor does it light the air from below this true elevation [deg]: the sun's light is then less than 6e-4 of the night sky's
+# in any direction, and 2e-5 of its mean.
+LOWEST_SHINING_DEG = -25.0
 
 
 @dataclass(frozen=True)
@@ -225,20 +227,14 @@ def illumination_from_atmosphere(
     irradiances = [_bands(source.irradiance) for source in sources]
     view = observer_view(tables, observer_height_m)
     true_rad = [_true_rad(tables.atmosphere, direction, observer_height_m) for direction in directions]
-    # numpy releases the interpreter lock, so sky and airlight of the luminaries are computed in parallel.
-    with ThreadPoolExecutor(2) as pool:
-        skies = [
-            pool.submit(observed_sky, tables, view, direction, true, irradiance)
-            for direction, irradiance, true in zip(directions, irradiances, true_rad, strict=True)
-        ]
-        airlights = [
-            pool.submit(airlight, tables, view, true, irradiance)
-            for irradiance, true in zip(irradiances, true_rad, strict=True)
-            if with_aerial_perspective
-        ]
-        lights = tuple(future.result() for future in skies)
-        radiance = _radiance_map(lights, shape)
-        components = tuple(future.result() for future in airlights)
+    # Those that light the air.
+    shining = [
+        (direction, true, irradiance)
+        for direction, true, irradiance in zip(directions, true_rad, irradiances, strict=True)
+        if true > np.radians(LOWEST_SHINING_DEG)
+    ]
+    lights = tuple(observed_sky(tables, view, *each) for each in shining)
+    radiance = _radiance_map(lights, shape)
     luminaries = [
         sun_luminary(
             tables,
@@ -257,6 +253,7 @@ def illumination_from_atmosphere(
                 for direction, irradiance, true in zip(directions, irradiances, true_rad, strict=True)
             )
         )
+        components = [airlight(tables, view, true, irradiance) for _, true, irradiance in shining]
         aerial_perspective = tabulate_aerial_perspective(
             view, tuple(zip(lights, components, strict=True)), illuminant + 1e-12
         )
@@ -344,7 +341,9 @@ def _radiance_map(lights: tuple[ScatteredRadiance, ...], shape: tuple[int, int])
     height, width = shape
     elevation_deg = 90.0 - (np.arange(2 * height) + 0.5) * (90.0 / height)
     azimuth_deg = (np.arange(2 * width) + 0.5) * (180.0 / width)
-    radiance = np.asarray(sum(sky_radiance_grid(light, elevation_deg, azimuth_deg) for light in lights))
+    radiance = np.zeros((2 * height, 2 * width, 3), np.float32)
+    for light in lights:
+        radiance += sky_radiance_grid(light, elevation_deg, azimuth_deg)
     # Colours outside the Rec.709 gamut have a negative channel; clip, as radiance must not be negative.
     return np.maximum(radiance.reshape(height, 2, width, 2, 3).mean(axis=(1, 3)), 0.0).astype(np.float32)
 

@@ -33,7 +33,7 @@ class _CloudyAerialPerspective:
     clear_fraction: float
     cloud_radiance: np.ndarray
 
-    def __call__(self, depth_m: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def __call__(self, depth_m: np.ndarray | float, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         transmittance, airlight = self.clear(depth_m, direction)
         return transmittance, self.clear_fraction * airlight + (1.0 - transmittance) * self.cloud_radiance
 

@@ -216,6 +216,6 @@ class _DimmedAir:
     air: AerialPerspective
     scale: np.ndarray
 
-    def __call__(self, depth_m: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def __call__(self, depth_m: np.ndarray | float, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         transmittance, airlight = self.air(depth_m, direction)
         return transmittance, airlight * self.scale

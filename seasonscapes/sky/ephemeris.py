@@ -277,10 +277,12 @@ def moon_position(
     when = _skyfield_time(time, None)
     kernel, observer = _kernel(), _observer(latitude_deg, longitude_deg, height_m).at(when)
     moon = observer.observe(kernel["moon"])
-    elevation, azimuth, distance = moon.apparent().altaz()
+    apparent = moon.apparent()
+    elevation, azimuth, distance = apparent.altaz()
     lift = _lift(elevation.degrees, height_m, pressure_hpa, temperature_c)
+    sun = observer.observe(kernel["sun"])
     # Both astrometric positions are corrected for light time to the observer, which suffices for the phase.
-    to_sun = observer.observe(kernel["sun"]).position.km - moon.position.km
+    to_sun = sun.position.km - moon.position.km
     to_observer = -moon.position.km
     cosine = np.sum(to_sun * to_observer, axis=0) / np.linalg.norm(to_sun, axis=0) / np.linalg.norm(to_observer, axis=0)
     cosine = np.clip(cosine, -1.0, 1.0)
@@ -288,9 +290,7 @@ def moon_position(
     from_earth = [values + geocentric for values in (moon.position.km, to_sun + moon.position.km)]
     shadow = _angle_deg(from_earth[0], -from_earth[1])
     # The moon is waxing while it is east of the sun in ecliptic longitude.
-    longitudes = [
-        observer.observe(kernel[body]).apparent().ecliptic_latlon("date")[1].degrees for body in ("moon", "sun")
-    ]
+    longitudes = [body.ecliptic_latlon("date")[1].degrees for body in (apparent, sun.apparent())]
     return LunarPosition(
         azimuth_deg=_scalar_or_array(azimuth.degrees, time),
         elevation_deg=_scalar_or_array(elevation.degrees + lift, time),

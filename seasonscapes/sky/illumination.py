@@ -49,22 +49,23 @@ class Luminary:
 class AerialPerspective(Protocol):
     """Transmittance and airlight of the air between a viewer and a surface."""
 
-    def __call__(self, depth_m: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def __call__(self, depth_m: np.ndarray | float, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Evaluate transmittance and airlight along rays from the viewer.
 
         Parameters
         ----------
         depth_m
-            Distance from the viewer along the ray ``(...)`` [m]; infinite for a ray without surface.
+            Distance from the viewer along the ray ``(...)`` [m], infinite for a ray without surface; or one number for all
+            rays, or D distances ``(D, 1, ..., 1)`` along each of them.
         direction
             Unit viewing directions, away from the viewer, ``(..., 3)`` east-north-up.
 
         Returns
         -------
         transmittance
-            ``(..., 3)`` in [0, 1].
+            In [0, 1], of a shape that broadcasts to ``(..., 3)``, or to ``(D, ..., 3)``.
         airlight
-            Radiance scattered into the ray ``(..., 3)`` [cd/m²].
+            Radiance scattered into the ray [cd/m²], likewise.
         """
         ...
 

@@ -347,7 +347,7 @@ def apply_phase_functions(light: ScatteredRadiance, components: np.ndarray, cosi
     components
         Interpolated components ``(..., 10)``.
     cosine
-        Cosine of the angle from the luminary ``(...)``.
+        Cosine of the angle from the luminary, of a shape that broadcasts to ``(...)``.
 
     Returns
     -------

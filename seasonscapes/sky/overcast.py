@@ -198,7 +198,7 @@ class GreyAir:
     scale_height_m: np.ndarray
     airlight: np.ndarray
 
-    def __call__(self, depth_m: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def __call__(self, depth_m: np.ndarray | float, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Evaluate transmittance and airlight; see `AerialPerspective`."""
         depth, rise = np.asarray(depth_m, float), np.asarray(direction, float)[..., 2]
         optical = np.zeros((*np.broadcast_shapes(depth.shape, rise.shape), 3))

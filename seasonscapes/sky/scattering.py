@@ -17,15 +17,14 @@ All radiances are transfers, relative to the extraterrestrial solar spectral irr
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, fields
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from seasonscapes.sky.atmosphere import Atmosphere, Optics, delta_scaled, gas_moments, optics
 from seasonscapes.sky.curved_rays import (
+    CurvedRays,
     SunColumns,
     cell_edges_m,
     horizon_elevation_rad,
@@ -53,7 +52,7 @@ from seasonscapes.sky.sh_moments import (
 from seasonscapes.sky.spectrum import WAVELENGTHS_NM
 
 # Azimuths of the first two orders, and of the later ones, which have harmonics up to `LATER_ORDER` only.
-_AZIMUTHS, _LATER_AZIMUTHS, _CELLS, _THREADS = 11, 6, 24, 4
+_AZIMUTHS, _LATER_AZIMUTHS, _CELLS = 11, 6, 24
 
 
 @dataclass(frozen=True)
@@ -106,12 +105,22 @@ class _Level:
     end_fraction: np.ndarray
 
 
-def _build_levels(atmosphere: Atmosphere, scaled: Optics, height_m: float) -> tuple[_Level, _Level]:
-    """Rays from one table height with the azimuths of the first two orders, and with those of the later orders."""
-    elevation, weight = _directions(float(horizon_elevation_rad(atmosphere, height_m)))
-    rays = trace_curved_rays(atmosphere, height_m, elevation)
-    samples = sample_cells(atmosphere, scaled, rays, cell_edges_m(atmosphere, rays, _CELLS))
-    return (_level(samples, elevation, weight, _AZIMUTHS), _level(samples, elevation, weight, _LATER_AZIMUTHS))
+def _build_levels(atmosphere: Atmosphere, scaled: Optics) -> tuple[list[_Level], list[_Level]]:
+    """Rays from all table heights with the azimuths of the first two orders, and with those of the later orders."""
+    heights = table_heights_m(atmosphere)
+    directions = [_directions(float(horizon_elevation_rad(atmosphere, height))) for height in heights]
+    elevations = np.stack([elevation for elevation, _ in directions])
+    count = elevations.shape[1]
+    # All of them at once: each step along the rays is many operations on short arrays.
+    rays = trace_curved_rays(atmosphere, np.repeat(heights, count), elevations.ravel())
+    levels, later_levels = [], []
+    for number, (elevation, weight) in enumerate(directions):
+        part = slice(number * count, (number + 1) * count)
+        of_height = CurvedRays(*(getattr(rays, field.name)[part] for field in fields(CurvedRays)))
+        samples = sample_cells(atmosphere, scaled, of_height, cell_edges_m(atmosphere, of_height, _CELLS))
+        levels.append(_level(samples, elevation, weight, _AZIMUTHS))
+        later_levels.append(_level(samples, elevation, weight, _LATER_AZIMUTHS))
+    return levels, later_levels
 
 
 def _level(samples: CellSamples, elevation: np.ndarray, weight: np.ndarray, azimuth_count: int) -> _Level:
@@ -190,19 +199,14 @@ def atmosphere_tables(atmosphere: Atmosphere, *, tolerance: float = 0.1, max_ord
     albedo = np.broadcast_to(np.asarray(atmosphere.ground_albedo, float), WAVELENGTHS_NM.shape) / np.pi
     sun = np.radians(SUN_ELEVATION_KNOTS_DEG)
     direct = sun_transfer(atmosphere, columns, scaled, np.full(sun.shape, atmosphere.ground_height_m), sun)
-    # Levels are independent within an order, and numpy releases the interpreter lock, so threads run in parallel. Their
-    # matrices are small: threads of BLAS within each would wait for one another most of the time.
-    with threadpool_limits(1, "blas"), ThreadPoolExecutor(_THREADS) as pool:
-        pairs = pool.map(lambda height: _build_levels(atmosphere, scaled, height), table_heights_m(atmosphere))
-        levels, later_levels = zip(*pairs, strict=True)
+    # The matrices are small: threads of BLAS within each would wait for one another most of the time, and threads that work
+    # on several levels at once take half as much processor time again, for memory and the interpreter's lock.
+    with threadpool_limits(1, "blas"):
+        levels, later_levels = _build_levels(atmosphere, scaled)
         ground_radiance = direct * np.maximum(np.sin(sun), 0.0)[:, None] * albedo
         values, ground = _stack_levels(
-            pool.map(
-                lambda level: _moments_and_irradiance(
-                    level, _first_radiance(atmosphere, scaled, columns, level), ground_radiance
-                ),
-                levels,
-            )
+            _moments_and_irradiance(level, _first_radiance(atmosphere, scaled, columns, level), ground_radiance)
+            for level in levels
         )
         total, total_ground = values, ground
         remainder = np.zeros_like(values[:, :, 0, 0])
@@ -210,8 +214,10 @@ def atmosphere_tables(atmosphere: Atmosphere, *, tolerance: float = 0.1, max_ord
             # Radiance scattered at least twice is smooth enough for fewer harmonics.
             source = values if order == 2 else values[:, :, : LATER_ORDER + 1, : LATER_ORDER + 1]
             previous, moments, ground_radiance = values[:, :, 0, 0], as_sh_moments(source, ground), ground * albedo
-            next_order = partial(_next_order, atmosphere, scaled, moments, ground_radiance)
-            values, ground = _stack_levels(pool.map(next_order, levels if order == 2 else later_levels))
+            values, ground = _stack_levels(
+                _next_order(atmosphere, scaled, moments, ground_radiance, level)
+                for level in (levels if order == 2 else later_levels)
+            )
             total, total_ground = total + values, total_ground + ground
             # Higher orders keep their angular shape and decay geometrically in each band.
             decay = np.clip(values[:, :, 0, 0] / np.maximum(previous, MIN_MEAN), 0.0, 0.98)

@@ -25,6 +25,8 @@ SUN_ELEVATION_KNOTS_DEG = np.concatenate(
         [3.0, 4.5, 6.0, 8.0, 11.0, 15.0, 20.0, 27.0, 36.0, 47.0, 60.0, 74.0, 90.0],
     ]
 )
+# Numbers that are interpolated at once: a processor's cache holds them.
+_BLOCK = 1 << 19
 MIN_MEAN = 1e-30  # lower bound of Φ_00, for its logarithm
 
 
@@ -147,22 +149,32 @@ def diffuse_source(
     cells = samples.height_m.size
     # Restrict the table to the range of solar elevations of the samples.
     first, last = int(index.min()), int(index.max()) + 2
+    knots = last - first
     order, columns = _source_by_cell(atmosphere, scaled, moments, samples, (first, last))
-    knot_weights = _interpolation_matrix(
-        index.reshape(cells, -1)[order] - first, geometry.knot_fraction.reshape(cells, -1)[order], last - first
-    )
-    by_order = (knot_weights @ columns.swapaxes(1, 2)).reshape(*knot_weights.shape[:2], orders + 1, bands)
+    columns = columns.reshape(cells * knots, -1)
+    below = index.reshape(cells, -1)[order] - first + (np.arange(cells, dtype=np.intp) * knots)[:, None]
+    fraction = geometry.knot_fraction.reshape(cells, -1)[order]
     cosines = cosines.reshape(cells, -1, cosines.shape[-1])[order, :, :orders]
-    relative = (cosines[..., None, :] @ by_order[..., 1:, :])[..., 0, :]
-    source = np.empty_like(relative)
-    source[order] = np.maximum(relative, 0.0) * np.exp(by_order[..., 0, :])
+    source = np.empty((*below.shape, bands), np.float32)
+    step = max(1, _BLOCK // (below.shape[1] * columns.shape[1]))
+    for start in range(0, cells, step):
+        part = slice(start, start + step)
+        rows = below[part].ravel()
+        by_order = np.take(columns, rows, axis=0)
+        above = np.take(columns, rows + 1, axis=0)
+        above -= by_order
+        above *= fraction[part].reshape(-1, 1)
+        by_order += above
+        by_order = by_order.reshape(*below[part].shape, orders + 1, bands)
+        relative = np.einsum("xqm,xqmb->xqb", cosines[part], by_order[:, :, 1:])
+        source[order[part]] = np.maximum(relative, 0.0) * np.exp(by_order[:, :, 0])
     return source.reshape(*index.shape, bands)
 
 
 def _source_by_cell(
     atmosphere: Atmosphere, scaled: Optics, moments: ShMoments, samples: CellSamples, knots: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of the cells sorted by height ``(X,)`` and their azimuth-independent source terms ``(X, (1 + L) B, J)``.
+    """Indices of the cells sorted by height ``(X,)`` and their azimuth-independent source terms ``(X, J, 1 + L, B)``.
 
     The terms, for a range of solar-elevation knots, are the logarithm of Φ_00 and, for each m, the sum over l of the
     source relative to Φ_00.
@@ -177,31 +189,20 @@ def _source_by_cell(
     order = np.argsort(row, kind="stable")
     height_weights = np.stack([1.0 - fraction, fraction], axis=-1).astype(np.float32)[order]
     weight, legendre = weight[:, order], legendre[order]
-    columns = np.empty((cells, (orders + 1) * bands, last - first), np.float32)
+    columns = np.empty((cells, last - first, orders + 1, bands), np.float32)
     ends = np.searchsorted(row[order], np.arange(len(moments.log_mean)))
     # Cells between the same two table heights share one batched matrix product for each m, with the bands as batch.
     for p in np.flatnonzero(ends[1:] > ends[:-1]):
         start, stop = ends[p], ends[p + 1]
         group = slice(start, stop)
-        block = columns[group].reshape(stop - start, orders + 1, bands, -1)
-        np.einsum("xp,pjb->xbj", height_weights[group], moments.log_mean[p : p + 2, first:last], out=block[:, 0])
+        block = columns[group]
+        np.einsum("xp,pjb->xjb", height_weights[group], moments.log_mean[p : p + 2, first:last], out=block[:, :, 0])
         for m in range(orders):
             factor = weight[:, group, None, m:] * legendre[group, None, m:, m] * height_weights[group, :, None]
             table = moments.ratio[p : p + 2, first:last, m:, m].transpose(3, 0, 2, 1)
-            np.matmul(
-                factor.reshape(bands, stop - start, -1),
-                table.reshape(bands, -1, last - first),
-                out=block[:, 1 + m].swapaxes(0, 1),
-            )
+            product = factor.reshape(bands, stop - start, -1) @ table.reshape(bands, -1, last - first)
+            block[:, :, 1 + m] = product.transpose(1, 2, 0)
     return order, columns
-
-
-def _interpolation_matrix(index: np.ndarray, fraction: np.ndarray, count: int) -> np.ndarray:
-    """Linear interpolation weights ``(..., count)``: ``1 - fraction`` at ``index`` and ``fraction`` at the next."""
-    matrix = np.zeros((*index.shape, count), np.float32)
-    np.put_along_axis(matrix, index[..., None], 1.0 - fraction[..., None], axis=-1)
-    np.put_along_axis(matrix, index[..., None] + 1, fraction[..., None], axis=-1)
-    return matrix
 
 
 def sun_geometry(

@@ -200,11 +200,11 @@ def _check_noise(heights: np.ndarray, spacing_m: float, where: str | os.PathLike
 
 def _check_zeros(heights: np.ndarray, known: np.ndarray, spacing_m: float, where: str | os.PathLike[str]) -> None:
     """Exact zeros whose whole rim is high above them are no lowland or sea but missing data."""
-    from scipy import ndimage
-
     zero = heights == 0.0
     if not zero.any() or zero[known].all():
         return
+    from scipy import ndimage
+
     labels, count = ndimage.label(zero, structure=np.ones((3, 3), int))  # pyright: ignore[reportGeneralTypeIssues]
     grown = ndimage.maximum_filter(labels, 3)
     rim = (grown > 0) & ~zero & known

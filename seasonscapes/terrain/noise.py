@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import ndimage, sparse
+from scipy import sparse
 
 # Standard deviation of a cubic B-spline sum of unit white noise in two dimensions, averaged over position: ∫ B3².
 _SPLINE_DEVIATION = 151.0 / 315.0
@@ -54,6 +54,8 @@ def warped_noise(seed: int, wavelength_m: float, east_m: np.ndarray, north_m: np
     numpy.ndarray
         Noise of that shape, float64.
     """
+    from scipy import ndimage
+
     step = 0.5 * wavelength_m
     row, column = north_m / step, east_m / step
     first_row, first_column = int(np.floor(row.min())) - _LATTICE_MARGIN, int(np.floor(column.min())) - _LATTICE_MARGIN

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from affine import Affine
 
+from seasonscapes.terrain.interpolation import monotone_cubic
 from seasonscapes.terrain.surface import Raster
 
 
@@ -34,22 +35,21 @@ def refine_raster(raster: Raster, factor: int) -> Raster:
     ValueError
         ``factor`` is less than 1.
     """
-    from scipy.interpolate import PchipInterpolator
-
     if factor < 1:
         raise ValueError(f"factor: got {factor}, expected at least 1")
     if factor == 1:
         return raster
     values = raster.values
-    for axis in (0, 1):
-        count = values.shape[axis]
+    for _ in range(2):
+        # Along the rows of the transposed raster; twice transposed it is the raster again.
+        count = len(values)
         fine = np.arange((count - 1) * factor + 1) / factor
-        values = PchipInterpolator(np.arange(count), values, axis=axis)(fine).astype(np.float32)
+        values = monotone_cubic(np.arange(count), values, fine).astype(np.float32).swapaxes(0, 1)
     # The first sample's centre stays at (0.5, 0.5) of the original grid.
     transform = (
         raster.transform * Affine.translation(0.5, 0.5) * Affine.scale(1.0 / factor) * Affine.translation(-0.5, -0.5)
     )
-    return replace(raster, values=values, transform=transform)
+    return replace(raster, values=np.ascontiguousarray(values), transform=transform)
 
 
 def refinement_factor(

@@ -15,6 +15,7 @@ from affine import Affine
 from seasonscapes.array_files import read_arrays
 from seasonscapes.errors import AtlasMismatch, InputError
 from seasonscapes.frames import MEAN_RADIUS_M, LocalFrame
+from seasonscapes.terrain.interpolation import bilinear
 from seasonscapes.terrain.surface_classes import AlbedoDetail, ImageDetail, Snow, Water
 
 
@@ -131,14 +132,8 @@ class SurfaceGrid:
         return np.clip(inside / self.rim_nodes, 0.0, 1.0)
 
     def _interpolated(self, position_m: np.ndarray, channels: tuple[int, ...]) -> list[np.ndarray]:
-        from scipy.ndimage import map_coordinates
-
         position_m = np.asarray(position_m, np.float64)
-        column, row = self.nodes_at(position_m).T
-        values = [
-            map_coordinates(self.nodes[..., k], [row, column], order=1, mode="nearest", output=np.float64)
-            for k in channels
-        ]
+        values = list(bilinear(self.nodes, *self.nodes_at(position_m).T)[:, list(channels)].T)
         for part in self.parts:
             share = part.share_at(position_m)
             near = np.flatnonzero(share > 0.0)

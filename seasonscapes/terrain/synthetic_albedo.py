@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
+from seasonscapes.terrain.interpolation import monotone_cubic
 from seasonscapes.terrain.noise import fractal_noise, spline_noise
 from seasonscapes.terrain.synthetic_cover import FOREST, Cover
 from seasonscapes.terrain.synthetic_layout import LEDGES_M, strata_level_m
@@ -105,15 +106,13 @@ def snow_line_m(day_of_year: float) -> float:
 
 def _periodic(day: ArrayLike, knots: Sequence[tuple[int, tuple[float, ...]]]) -> np.ndarray:
     """Periodic monotone cubic interpolation (PCHIP) over the year: ``day`` ``(...)`` → ``(..., C)`` float32."""
-    from scipy.interpolate import PchipInterpolator
-
     days = np.array([d for d, _ in knots], float)
     values = np.array([v for _, v in knots], float)
     days = np.concatenate([days[-3:] - _YEAR, days, days[:3] + _YEAR])
     values = np.concatenate([values[-3:], values, values[:3]])
     # Linear interpolation in a table of quarter days is accurate enough and much faster than splines per pixel.
     table_days = np.arange(-0.25, _YEAR + 0.5, 0.25)
-    table = PchipInterpolator(days, values)(table_days)
+    table = monotone_cubic(days, values, table_days)
     day = np.mod(np.asarray(day, float), _YEAR)
     return np.stack([np.interp(day, table_days, column) for column in table.T], -1).astype(np.float32)
 

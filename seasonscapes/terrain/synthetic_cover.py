@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from enum import IntEnum
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
 from seasonscapes.terrain.noise import fractal_noise
 from seasonscapes.terrain.synthetic_massif import slope_and_northness
-from seasonscapes.terrain.synthetic_relief import Relief
+
+if TYPE_CHECKING:
+    # Its erosion and flow import a third of scipy, which the albedo of a massif does not need.
+    from seasonscapes.terrain.synthetic_relief import Relief
 
 
 class Cover(IntEnum):

@@ -7,6 +7,8 @@ import numpy as np
 
 _SWEEPS = 40
 _OVER_RELAXATION = 1.4
+# Radius of the mean over known pixels that `propagate` extrapolates [px].
+_MEAN_PX = 2.0
 
 
 def telea_fill(
@@ -158,7 +160,9 @@ def _push_pull_level(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
 def propagate(residual: np.ndarray, known: np.ndarray, *, reach_px: float = 12.0) -> np.ndarray:
     """Extrapolate a residual into holes, decaying with the distance d to the nearest known pixel as exp(−d / reach).
 
-    Added to a model's prediction, it removes the seam at the rim of a hole and leaves the interior to the model.
+    Added to a model's prediction, it removes the seam at the rim of a hole and leaves the interior to the model. What is
+    extrapolated is the residual's mean over a few known pixels: a single one, such as a boulder or a pixel that is half a roof,
+    says nothing of the hole beside it, and would become a blot of its colour there.
 
     Parameters
     ----------
@@ -177,5 +181,10 @@ def propagate(residual: np.ndarray, known: np.ndarray, *, reach_px: float = 12.0
     if known.all() or not known.any():
         return np.where(known[..., None], residual, 0.0).astype(np.float32)
     distance = cv2.distanceTransform((~known).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
-    decay = np.exp(-np.maximum(distance - 1.0, 0.0) / reach_px)
-    return push_pull(residual, known.astype(np.float32)) * decay[..., None]
+    decay = np.exp(-np.maximum(distance - 1.0, 0.0) / reach_px)[..., None]
+    share = cv2.GaussianBlur(known.astype(np.float32), (0, 0), _MEAN_PX)
+    sums = np.where(known[..., None], residual, 0.0).astype(np.float32)
+    # One channel at a time: OpenCV drops the axis of a single one, and takes four at most.
+    means = np.stack([cv2.GaussianBlur(channel, (0, 0), _MEAN_PX) for channel in np.moveaxis(sums, -1, 0)], -1)
+    means /= np.maximum(share, 1e-6)[..., None]
+    return np.where(known[..., None], residual, push_pull(means, known.astype(np.float32)) * decay).astype(np.float32)

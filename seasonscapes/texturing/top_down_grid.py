@@ -11,6 +11,9 @@ from seasonscapes.terrain.atlas import planar_uv
 from seasonscapes.terrain.surface import Terrain
 from seasonscapes.terrain.texels import texel_positions
 
+# Cells whose heights are interpolated at once.
+_BLOCK = 1_000_000
+
 
 @dataclass(frozen=True)
 class TopDownGrid:
@@ -32,6 +35,9 @@ class TopDownGrid:
 def grid_heights(terrain: Terrain, spacing_m: float) -> tuple[np.ndarray, float]:
     """Sample the heights of a terrain on a top-down grid.
 
+    They are those of the smooth surface that the triangles approximate, where the terrain has one: the slopes and curvatures of
+    large triangles in a plain are the mesh's, and a regression on them would complete the plain in facets.
+
     Parameters
     ----------
     terrain
@@ -50,7 +56,13 @@ def grid_heights(terrain: Terrain, spacing_m: float) -> tuple[np.ndarray, float]
     width, height = (max(2, int(np.ceil(side / spacing_m - 1e-6))) for side in extent)
     planar = Terrain(terrain.vertices, terrain.faces, planar_uv(terrain.vertices), terrain.frame)
     positions, _ = texel_positions(planar, width, height)
-    return positions[..., 2], float(extent[0] / width)
+    heights_m = positions[..., 2].copy()
+    if terrain.surface is not None:
+        known = np.flatnonzero(np.isfinite(heights_m.ravel()))
+        for start in range(0, len(known), _BLOCK):
+            part = known[start : start + _BLOCK]
+            heights_m.ravel()[part] = terrain.surface.up_at(positions.reshape(-1, 3)[part])
+    return heights_m, float(extent[0] / width)
 
 
 def top_down_grid(terrain: Terrain, positions: np.ndarray, width_px: int, height_px: int) -> TopDownGrid:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from functools import lru_cache, partial
 from pathlib import Path
 from threading import Lock
@@ -21,9 +21,16 @@ from seasonscapes.errors import InputError
 from seasonscapes.frames import LocalFrame
 from seasonscapes.progress import TaskProgress
 from seasonscapes.sky.atmosphere import Atmosphere
-from seasonscapes.sky.clear_sky import AtmosphereTables, atmosphere_tables, load_tables, save_tables, true_elevation_deg
+from seasonscapes.sky.clear_sky import (
+    LOWEST_SHINING_DEG,
+    AtmosphereTables,
+    atmosphere_tables,
+    load_tables,
+    save_tables,
+    true_elevation_deg,
+)
 from seasonscapes.sky.elevation_table import PartedTable, load_table, parts_at, save_table
-from seasonscapes.sky.ephemeris import LunarPosition, SolarPosition, moon_position, sun_position
+from seasonscapes.sky.ephemeris import LunarPosition, SolarPosition, at_index, moon_position, sun_position
 from seasonscapes.sky.illuminate import SkyEvaluators, illuminate, significant_moon
 from seasonscapes.sky.illumination import Illumination
 from seasonscapes.sky.models import AtmosphereModel, SkyModel, atmosphere_from_model, read_sky_model, with_overrides
@@ -217,7 +224,7 @@ def atmosphere_tables_in(
 
 def _diffuse_in(workspace: Workspace, tables: AtmosphereTables) -> Callable[[float, bool], PartedTable]:
     cached: dict[tuple[float, bool], PartedTable] = {}
-    lock = Lock()  # the skies of sun and moon are computed in two threads
+    lock = Lock()
 
     def part_of(height_m: float, near: bool, part: int) -> np.ndarray:
         with lock:
@@ -310,7 +317,7 @@ def illumination_for_camera(
     """
     from seasonscapes.workflows.views import camera_geodetic
 
-    position = position_at(place, time)
+    position = _position_in_film(place, time) if by_elevation else position_at(place, time)
     on_terrain = illumination_at(
         model,
         position,
@@ -351,6 +358,24 @@ def position_at(place: Place, time: datetime) -> SunMoonPosition:
     return sun_moon_position(time, place.frame.latitude_deg, place.frame.longitude_deg, place.median_height_m)
 
 
+def _position_in_film(place: Place, time: datetime) -> SunMoonPosition:
+    """`position_at` for an instant of many: those of its day at the same minute are computed with it, for the price of one."""
+    utc = time.astimezone(UTC)
+    where = (place.frame.latitude_deg, place.frame.longitude_deg, place.median_height_m)
+    suns, moons = _positions_of_day(utc.replace(hour=0), *where)
+    return SunMoonPosition(time, at_index(suns, utc.hour), at_index(moons, utc.hour))
+
+
+@lru_cache(maxsize=4)
+def _positions_of_day(
+    midnight: datetime, latitude_deg: float, longitude_deg: float, height_m: float
+) -> tuple[SolarPosition, LunarPosition]:
+    """Sun and moon at the 24 hours of a day from an aware instant in its first hour on."""
+    times = [midnight + timedelta(hours=hour) for hour in range(24)]
+    where = (latitude_deg, longitude_deg, height_m)
+    return sun_position(times, *where), moon_position(times, *where)
+
+
 def given_sun_position(place: Place, azimuth_deg: float, elevation_deg: float) -> SunMoonPosition:
     """A sun at stated angles over a place; see `given_sun_in_frame`."""
     return given_sun_in_frame(place.frame, azimuth_deg, elevation_deg)
@@ -388,16 +413,21 @@ def tabulate_illumination(
         return
     tables = atmosphere_tables_in(place.workspace, by_elevation=True)(atmosphere_from_model(model))
     assert tables.diffuse_of is not None
+    where = (place.frame.latitude_deg, place.frame.longitude_deg, place.median_height_m)
+    # All instants at once: one by one, those of a year take minutes.
+    suns, moons = sun_position(times, *where), moon_position(times, *where)
     apparent_deg = []
-    for position in (position_at(place, time) for time in times):
-        moon = significant_moon(position.sun, position.moon)
-        apparent_deg += [body.elevation_deg for body in (position.sun, moon) if body is not None]
+    for index in range(len(times)):
+        sun = at_index(suns, index)
+        moon = significant_moon(sun, at_index(moons, index))
+        apparent_deg += [body.elevation_deg for body in (sun, moon) if body is not None]
     camera_m, wanted = camera_geodetic(place, camera)[2], []
     for height_m, near in ((place.median_height_m, False), (camera_m, False), (camera_m, True)):
         true_rad = np.radians(true_elevation_deg(tables.atmosphere, np.array(apparent_deg), height_m))
         table = tables.diffuse_of(observer_view(tables, height_m).height_m, near)
         assert isinstance(table, PartedTable)
-        wanted += [(table, part) for part in sorted({part for each in true_rad for part in parts_at(each)})]
+        shining = true_rad[true_rad > np.radians(LOWEST_SHINING_DEG)]
+        wanted += [(table, part) for part in sorted({part for each in shining for part in parts_at(each)})]
     for number, (table, part) in enumerate(wanted):
         table.part(part)
         if progress is not None:

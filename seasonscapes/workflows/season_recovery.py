@@ -127,6 +127,7 @@ def _grouped_days(
 ) -> list[list[date]]:
     """UTC dates of the photographs by season; days that lie within one season by the albedo that each gives alone."""
     from seasonscapes.albedo.assumed_exposure import with_assumed_exposure
+    from seasonscapes.albedo.natural_colours import with_natural_colours
     from seasonscapes.albedo.season_grouping import group_dates
     from seasonscapes.albedo.standard_error import albedo_estimate
 
@@ -142,6 +143,7 @@ def _grouped_days(
     for day in each_reported(days, len(days), progress, "albedo of each day"):
         # Alone a day without sky has nothing but its cameras' own exposure, whatever the others show.
         own = with_assumed_exposure([each for each in prepared if each.observation.time.date() == day])
+        own = with_natural_colours(transport, own)
         if not own:
             doubts[day] = "it shows no ground"
             continue

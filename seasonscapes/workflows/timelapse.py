@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
 from functools import partial
@@ -214,7 +215,8 @@ def render_frames(
         to_render = set(missing)
         # Those that are there are checked last: every worker renders first, and no long task follows many short ones.
         results = run_on_cluster(cluster, task, [*missing, *(time for time in times if time not in to_render)])
-    return sum(record["rendered"] for record in each_reported(results, len(times), progress, "frames"))
+    with _one_blas_thread():
+        return sum(record["rendered"] for record in each_reported(results, len(times), progress, "frames"))
 
 
 def make_film(
@@ -323,15 +325,23 @@ def develop_frames(
     from seasonscapes.relighting.film import write_video
 
     pictures = each_reported(developed(folder, times, look), len(times), progress, "developing")
-    if output.suffix.lower() == ".mp4":
-        span = {"from_utc": times[0].isoformat(), "to_utc": times[-1].isoformat()}
-        write_video(output, pictures, fps=look.fps, comment=json.dumps(about | span))
-        return [output]
-    paths = [output / f"{time_stamp(time)}.png" for time in times]
-    for time, path, picture in zip(times, paths, pictures, strict=True):
-        metadata = {"seasonscapes": json.dumps(about | {"time_utc": time.isoformat()})}
-        write_png(path, picture, metadata=metadata)
-    return paths
+    with _one_blas_thread():
+        if output.suffix.lower() == ".mp4":
+            span = {"from_utc": times[0].isoformat(), "to_utc": times[-1].isoformat()}
+            write_video(output, pictures, fps=look.fps, comment=json.dumps(about | span))
+            return [output]
+        paths = [output / f"{time_stamp(time)}.png" for time in times]
+        for time, path, picture in zip(times, paths, pictures, strict=True):
+            metadata = {"seasonscapes": json.dumps(about | {"time_utc": time.isoformat()})}
+            write_png(path, picture, metadata=metadata)
+        return paths
+
+
+def _one_blas_thread() -> AbstractContextManager[object]:
+    """A frame's matrix products are small: more threads wait for them, spinning, than work on them."""
+    from threadpoolctl import threadpool_limits
+
+    return threadpool_limits(1, "blas")
 
 
 def developed(folder: Path, times: Sequence[datetime], look: FilmLook) -> Iterator[np.ndarray]:
@@ -407,8 +417,9 @@ def timelapse(
         raise InputError("times", "no time in it", got=str(times))
     folder = frames_folder(session)
     with frames_claimed(folder, [frame_name(time) for time in utc]):
-        for time in each_reported(utc, len(utc), progress, "frames"):
-            session_frame(session, folder, time)
+        with _one_blas_thread():
+            for time in each_reported(utc, len(utc), progress, "frames"):
+                session_frame(session, folder, time)
         return develop_frames(folder, utc, Path(output), look or FilmLook(), _about(session, ""), progress=progress)
 
 
