@@ -92,7 +92,7 @@ def test_tiles_fill_as_the_whole_texture_does(hill, monkeypatch):
     monkeypatch.setattr(tiled_completion, "HALO_PX", 0)
     monkeypatch.setattr(tiled_completion, "_PHASE_PX", 1)
     results[0], _ = complete_tiles(texture, painted, tiled, fast=True, tile_px=150)
-    assert error(reference.values) < 0.5 * error(flat)
+    assert error(reference.values) < 0.55 * error(flat)
     # The regression is the same; residuals of painted texels beyond a tile's border have decayed.
     apart = {px: np.sqrt(np.mean((np.cbrt(results[px]) - np.cbrt(results[4096]))[hole] ** 2)) for px in (150, 0)}
     assert apart[150] < 0.01 * error(results[4096])
