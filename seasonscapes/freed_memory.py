@@ -16,7 +16,7 @@ def keep_freed_memory() -> bool:
     """Let glibc keep freed memory for the arrays that come next.
 
     By default each array above 32 MB, and each end of the heap above 64 MB, goes back to the system when it is freed, and
-    the next one of its size takes a page fault for each of its pages again: a tenth of the processor time of a first
+    the next one of its size takes a page fault for each of its pages again: some 7 % of the processor time of a first
     picture.
 
     Returns

@@ -309,7 +309,7 @@ def test_gaps_are_completed_and_marked(place, photographs, clean):
     image = np.maximum(image, 0.01).astype(np.float32)
     corrected = completed_estimate(known, clean, image, predictors)
     assert error(corrected.albedo) < 0.6 * min(error(bare.albedo), error(image))
-    seen = clean.pixel_count >= 0.5
+    seen = np.isfinite(observed_sigma(clean))
     poor = seen & (observed_sigma(clean) > np.quantile(observed_sigma(clean)[seen], 0.9))
     well = seen & (observed_sigma(clean) < np.median(observed_sigma(clean)[seen]))
     before, after = (np.abs(values - place.albedo).mean(axis=2) for values in (clean.albedo, corrected.albedo))

@@ -34,14 +34,14 @@ PARSING = {
     *("annotated_types", "attr", "attrs", "cyclopts", "numpy", "pydantic", "pydantic_core", "seasonscapes"),
     *("typing_extensions", "typing_inspection"),
 }
-_LAND = {"rasterio", "pyproj", "cv2", "scipy"}
+_LAND = {"rasterio", "pyproj", "cv2"}
 # Verb, flags besides those of `fault_verbs.BASE`, and the heavy packages of a whole call.
 WORK = [
     ("sky", ["--at", "46.5,8,1500", "--time", "2024-07-20T12:00Z"], {"skyfield"}),
     ("render", [*BASE["render"], "--sky", "hosek"], {*_LAND, "PIL", "skyfield", "mitsuba"}),
-    ("irradiance", [*BASE["irradiance"], "--sky", "hosek"], {*_LAND, "skyfield", "mitsuba"}),
+    ("irradiance", [*BASE["irradiance"], "--sky", "hosek"], {*_LAND, "scipy", "skyfield", "mitsuba"}),
     ("webcams", BASE["webcams"], {*_LAND, "PIL"}),
-    ("path", BASE["path"], _LAND),
+    ("path", BASE["path"], {*_LAND, "scipy"}),
     ("terrain", BASE["terrain"], _LAND),
     ("evaluate", BASE["evaluate"], {"cv2", "PIL", "scipy", "skimage", "colour"}),
     ("info", BASE["info"], {"PIL"}),

@@ -19,8 +19,8 @@ from numpy.typing import ArrayLike
 from seasonscapes.terrain.interpolation import monotone_cubic
 from seasonscapes.terrain.noise import fractal_noise, spline_noise
 from seasonscapes.terrain.synthetic_cover import FOREST, Cover
-from seasonscapes.terrain.synthetic_layout import LEDGES_M, strata_level_m
 from seasonscapes.terrain.synthetic_massif import SyntheticMassif
+from seasonscapes.terrain.synthetic_strata import LEDGES_M, strata_level_m
 
 SEASONS = {"winter": 32, "spring": 135, "summer": 205, "autumn": 288}
 _YEAR = 365.25

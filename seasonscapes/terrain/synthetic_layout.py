@@ -15,10 +15,9 @@ from scipy import ndimage
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from seasonscapes.terrain.flow import Lattice
-from seasonscapes.terrain.noise import fractal_noise, spline_noise, warped_noise
+from seasonscapes.terrain.noise import warped_noise
 
 LAKE_LEVEL_M = 566.0
-LEDGES_M = (190.0, 92.0)  # vertical periods of the ledges along strata
 
 # Polylines of (east [km], north [km], elevation [m]) about the massif's centre.
 _Polyline = tuple[tuple[float, float, float], ...]
@@ -214,28 +213,6 @@ def height_correction(z: np.ndarray, lattice: Lattice, layout: MassifLayout) -> 
     fraction = to_valley / (to_valley + to_crest + 1e-3)
     correction = (low + (high - low) * fraction).astype(np.float32)
     return cv2.GaussianBlur(correction, (0, 0), 1.0, borderType=cv2.BORDER_REPLICATE)
-
-
-def strata_level_m(z: np.ndarray, east_m: np.ndarray, north_m: np.ndarray, seed: int) -> np.ndarray:
-    """Compute the stratigraphic height within folded, gently dipping strata, which ledges and rock bands follow.
-
-    Parameters
-    ----------
-    z
-        Heights ``(H, W)`` [m].
-    east_m, north_m
-        Axes ``(W,)`` and ``(H,)`` of the grid about its centre [m].
-    seed
-        Seed of the folds.
-
-    Returns
-    -------
-    numpy.ndarray
-        ``(H, W)`` [m]; constant within a stratum.
-    """
-    fold = 70.0 * spline_noise(seed + 51, 4000.0, east_m, north_m)
-    fold += 26.0 * fractal_noise(seed + 52, 900.0, east_m, north_m, octaves=3)
-    return z + fold + 0.13 * east_m[None, :] - 0.09 * north_m[:, None]
 
 
 @dataclass(frozen=True)

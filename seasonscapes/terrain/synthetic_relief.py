@@ -27,15 +27,14 @@ from seasonscapes.terrain.noise import fractal_noise, spline_noise, warped_noise
 from seasonscapes.terrain.synthetic_ice import grow_ice
 from seasonscapes.terrain.synthetic_layout import (
     LAKE_LEVEL_M,
-    LEDGES_M,
     MassifLayout,
     ValleyFloor,
     height_correction,
     initial_heights,
     massif_layout,
-    strata_level_m,
     valley_floor,
 )
+from seasonscapes.terrain.synthetic_strata import LEDGES_M, strata_level_m
 
 
 @dataclass(frozen=True)
