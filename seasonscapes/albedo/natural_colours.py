@@ -18,12 +18,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from datetime import date, datetime
 
 import numpy as np
 
-from seasonscapes.albedo.assumed_exposure import ASSUMED_SIGMA
+from seasonscapes.albedo.assumed_exposure import ASSUMED_SIGMA, with_assumed_exposure
 from seasonscapes.albedo.equations import usable_pixels
 from seasonscapes.albedo.forward_model import (
     TexelTransport,
@@ -33,7 +33,7 @@ from seasonscapes.albedo.forward_model import (
 )
 from seasonscapes.albedo.photographs import EIGHT_BIT, AlbedoPhotograph, NoiseModel
 from seasonscapes.cameras.observation import webcam_of
-from seasonscapes.sky.illumination import AerialPerspective, luminance
+from seasonscapes.sky.illumination import ScaledAir, luminance
 
 log = logging.getLogger(__name__)
 
@@ -54,27 +54,6 @@ _TINY = 1e-3
 
 
 @dataclass(frozen=True)
-class TintedAir:
-    """Aerial perspective whose airlight has another strength in each channel.
-
-    Parameters
-    ----------
-    air
-        As the sky model has it.
-    factor
-        ``(3,)`` of its airlight.
-    """
-
-    air: AerialPerspective
-    factor: np.ndarray
-
-    def __call__(self, depth_m: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return transmittance and airlight; see `AerialPerspective`."""
-        transmittance, airlight = self.air(depth_m, direction)
-        return transmittance, airlight * self.factor.astype(np.asarray(airlight).dtype)
-
-
-@dataclass(frozen=True)
 class _Ground:
     """Usable terrain pixels of an hour's views: values over gain, light of white ground, transmittance, airlight, ``(n, 3)`` each."""
 
@@ -87,7 +66,34 @@ class _Ground:
         return (self.radiance - factor * self.airlight) / (self.transmittance * self.white)
 
     def part(self, chosen: np.ndarray) -> _Ground:
-        return _Ground(*(each[chosen] for each in (self.radiance, self.white, self.transmittance, self.airlight)))
+        return _Ground(*(getattr(self, field.name)[chosen] for field in fields(self)))
+
+
+def with_assumed_colours(transport: TexelTransport, photographs: Sequence[AlbedoPhotograph]) -> list[AlbedoPhotograph]:
+    """Assume exposures where no photograph tells one, and correct their colours as far as land cannot have them.
+
+    Parameters
+    ----------
+    transport
+        Daylight coefficients of the texels.
+    photographs
+        Of one or of several days, with their lights.
+
+    Returns
+    -------
+    list of AlbedoPhotograph
+        In the same order; the same photographs where one of them shows sky or has a known gain. See
+        `assumed_exposure.with_assumed_exposure` and `with_natural_colours`.
+
+    Examples
+    --------
+    >>> with_assumed_colours(None, [])
+    []
+    """
+    exposed = with_assumed_exposure(photographs)
+    if all(after is before for after, before in zip(exposed, photographs, strict=True)):
+        return exposed
+    return with_natural_colours(transport, exposed)
 
 
 def with_natural_colours(
@@ -116,8 +122,7 @@ def with_natural_colours(
     """
     hours: dict[tuple[str, datetime], list[AlbedoPhotograph]] = {}
     for each in photographs:
-        assumed = each.gain is not None and each.gain_sigma > 0.0
-        if assumed and not isinstance(each.light.aerial_perspective, TintedAir):
+        if each.gain is not None and each.gain_sigma > 0.0:
             hours.setdefault((webcam_of(each.observation.webcam), each.observation.time), []).append(each)
     balance: dict[tuple[str, datetime], np.ndarray] = {}
     airlight: dict[tuple[str, date], np.ndarray] = {}
@@ -135,8 +140,8 @@ def with_natural_colours(
     for each in photographs:
         webcam, time = webcam_of(each.observation.webcam), each.observation.time
         air, factor = each.light.aerial_perspective, airlight.get((webcam, time.date()))
-        if air is not None and factor is not None and not isinstance(air, TintedAir):
-            each = replace(each, light=replace(each.light, aerial_perspective=TintedAir(air, factor)))
+        if air is not None and factor is not None:
+            each = replace(each, light=replace(each.light, aerial_perspective=ScaledAir(air, factor)))
         if each.gain is not None and (webcam, time) in balance:
             each = replace(each, gain=each.gain * balance[webcam, time])
         result.append(each)
@@ -148,8 +153,7 @@ def _correction(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Factors ``(3,)`` of the gain and of the airlight, of the views of one hour."""
     pieces = [_ground(transport, each, noise_model) for each in views]
-    fields = ("radiance", "white", "transmittance", "airlight")
-    ground = _Ground(*(np.concatenate([getattr(each, name) for each in pieces]) for name in fields))
+    ground = _Ground(*(np.concatenate([getattr(each, field.name) for each in pieces]) for field in fields(_Ground)))
     is_near = ground.transmittance[:, 2] >= _NEAR
     gain, airlight, allowed = np.ones(3), np.ones(3), 0.0
     if is_near.sum() >= _FEWEST_PX:

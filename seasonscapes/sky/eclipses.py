@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from seasonscapes.sky.ephemeris import MOON_RADIUS_KM, SUN_RADIUS_KM, LunarPosition, SolarPosition
-from seasonscapes.sky.illumination import AerialPerspective, Illumination
+from seasonscapes.sky.illumination import Illumination, ScaledAir
 
 # Limb darkening I(µ) = µ^α of the sun, α = -0.023 + 0.292 µm / λ (Hestroffer & Magnan 1998, A&A 333, 338), at the
 # dominant wavelengths of Rec.709's primaries [µm].
@@ -205,17 +205,5 @@ def eclipsed_sun(illumination: Illumination, eclipse: SolarEclipse) -> Illuminat
         sun=None
         if sun is None
         else replace(sun, normal_illuminance_lx=np.asarray(sun.normal_illuminance_lx) * eclipse.visible_rgb),
-        aerial_perspective=None if air is None else _DimmedAir(air, sky),
+        aerial_perspective=None if air is None else ScaledAir(air, sky),
     )
-
-
-@dataclass(frozen=True)
-class _DimmedAir:
-    """Aerial perspective whose airlight is scaled."""
-
-    air: AerialPerspective
-    scale: np.ndarray
-
-    def __call__(self, depth_m: np.ndarray | float, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        transmittance, airlight = self.air(depth_m, direction)
-        return transmittance, airlight * self.scale

@@ -71,6 +71,27 @@ class AerialPerspective(Protocol):
 
 
 @dataclass(frozen=True)
+class ScaledAir:
+    """Aerial perspective with airlight of another strength.
+
+    Parameters
+    ----------
+    air
+        The unchanged one.
+    factor
+        Of its airlight: ``(3,)``, or any shape that broadcasts to it.
+    """
+
+    air: AerialPerspective
+    factor: np.ndarray
+
+    def __call__(self, depth_m: np.ndarray | float, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return transmittance and airlight; see `AerialPerspective`."""
+        transmittance, airlight = self.air(depth_m, direction)
+        return transmittance, airlight * self.factor
+
+
+@dataclass(frozen=True)
 class Illumination:
     """Illumination of a scene at one instant and place, in absolute photometric units.
 

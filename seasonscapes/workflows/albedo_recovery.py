@@ -362,9 +362,9 @@ def photographs_of_ground(
     NoUsablePixels
         Where all that they show is water.
     """
-    from seasonscapes.albedo.assumed_exposure import tells_gain, with_assumed_exposure
+    from seasonscapes.albedo.assumed_exposure import tells_gain
     from seasonscapes.albedo.ground_pixels import without_water
-    from seasonscapes.albedo.natural_colours import with_natural_colours
+    from seasonscapes.albedo.natural_colours import with_assumed_colours
     from seasonscapes.albedo.photographs import prepare_photographs
 
     seen = without_land_beyond(place, with_terrain(transport, photographs))
@@ -376,13 +376,12 @@ def photographs_of_ground(
         sky_of = {id(each): sky for each, sky in zip(seen, skies, strict=True)}
         prepared, share = without_water(prepared, place.terrain.water.mask)
         skies = [sky_of[id(each.observation)] for each in prepared]
-    exposed = with_assumed_exposure(prepared)
+    exposed = with_assumed_colours(transport, prepared)
     if any(after is not before for after, before in zip(exposed, prepared, strict=True)):
         log.warning(
             "no photograph shows enough sky to tell its exposure and white balance: they are taken as set for level ground, "
             "so that brightness and colours of the albedo are the camera's own, as far as land can have them"
         )
-        exposed = with_natural_colours(transport, exposed)
     if not any(tells_gain(each) for each in prepared):
         _tell_nights(exposed)
     return exposed, skies, share
@@ -409,9 +408,8 @@ def _prepared(
     progress: Progress | None,
 ) -> tuple[list[AlbedoPhotograph], list[SkyModel], dict[str, Any]]:
     """Photographs with their light, and their skies; tone curve and visibility fitted where asked for."""
-    from seasonscapes.albedo.assumed_exposure import with_assumed_exposure
     from seasonscapes.albedo.haze import fit_visibility
-    from seasonscapes.albedo.natural_colours import with_natural_colours
+    from seasonscapes.albedo.natural_colours import with_assumed_colours
     from seasonscapes.albedo.photographs import EIGHT_BIT
     from seasonscapes.albedo.tone_curve import fit_tone_curve, with_tone_curve
 
@@ -448,7 +446,7 @@ def _prepared(
         hazy = lights_of(found.visibility_km)
         # An assumed exposure is that under the light: here no other gain is known.
         lit = [replace(each, light=light, gain=None) for each, light in zip(prepared, hazy, strict=True)]
-        prepared = with_natural_colours(transport, with_assumed_exposure(lit))
+        prepared = with_assumed_colours(transport, lit)
     if any(each.gain is not None for each in prepared):
         facts["exposure"] = "assumed: no photograph shows enough sky"
     return prepared, skies, facts

@@ -126,8 +126,7 @@ def _grouped_days(
     place: Place, transport: TexelTransport, photographs: list[Observation], model: SkyModel, progress: Progress | None
 ) -> list[list[date]]:
     """UTC dates of the photographs by season; days that lie within one season by the albedo that each gives alone."""
-    from seasonscapes.albedo.assumed_exposure import with_assumed_exposure
-    from seasonscapes.albedo.natural_colours import with_natural_colours
+    from seasonscapes.albedo.natural_colours import with_assumed_colours
     from seasonscapes.albedo.season_grouping import group_dates
     from seasonscapes.albedo.standard_error import albedo_estimate
 
@@ -142,8 +141,7 @@ def _grouped_days(
     doubts: dict[date, str] = {}
     for day in each_reported(days, len(days), progress, "albedo of each day"):
         # Alone a day without sky has nothing but its cameras' own exposure, whatever the others show.
-        own = with_assumed_exposure([each for each in prepared if each.observation.time.date() == day])
-        own = with_natural_colours(transport, own)
+        own = with_assumed_colours(transport, [each for each in prepared if each.observation.time.date() == day])
         if not own:
             doubts[day] = "it shows no ground"
             continue
