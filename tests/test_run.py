@@ -47,7 +47,7 @@ class Runs:
             "--at-hours",
             "2024-07-20T18:00",
             "--photo-size",
-            "960x160",
+            "764x128",
             "--size",
             "96x64",
             "--texel-m",
@@ -98,7 +98,7 @@ def test_panoramas_to_gaussians(runs, capsys):
     whole = runs.folder / "whole"
     assert list(ledger_of(whole)) == list(STAGES)
     photographs = sorted((whole / "pictures").glob("aerial_*.png"))
-    assert [Image.open(path).size for path in photographs] == [(960, 160)] * 2
+    assert [Image.open(path).size for path in photographs] == [(764, 128)] * 2
     true, found = (
         json.loads((whole / name / "aerial_calibration.json").read_text()) for name in ("pictures", "calibration")
     )
