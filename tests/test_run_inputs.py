@@ -148,8 +148,12 @@ def test_a_changed_scene_is_noticed(real):
     real.scene.write_text("# a remark\n" + text)
     assert real.made() == []
     real.scene.write_text(text.replace("heading_deg = 0.0", "heading_deg = 3.0"))
-    assert real.made() == ["relight", "splat"]
-    assert real.made(size_px=(24, 16)) == ["relight", "splat"]
+    # Discs follow the view; those of one size do not.
+    assert real.made() == ["relight", "distil", "splat"]
+    assert real.made(size_px=(24, 16)) == ["relight", "distil", "splat"]
+    one_size = DistilOptions(disc_px=0.0)
+    assert real.made(size_px=(24, 16), distil=one_size) == ["distil", "splat"]
+    assert real.made(distil=one_size) == ["relight", "splat"]
     real.scene.write_text(SCENE + "[origin]\nlatitude_deg = 46.552\nlongitude_deg = 7.98\n")
     assert real.made() == ALL
 

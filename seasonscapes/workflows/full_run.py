@@ -188,7 +188,9 @@ def stages_of(job: RunJob, progress: Progress | None = None) -> list[Stage]:
         stages.append(stage("distil", model, ("film",), ("path_stages",), _distil_frames, "gaussians"))
         stages.append(stage("splat", looks, ("distil",), ("path_stages",), _splat_frames))
     else:
-        distil = {**common, "distil": job.distil, "view": looks["view"], "size": job.size_px}
+        # Discs of one size do not follow the view.
+        followed = {"view": looks["view"], "size": job.size_px} if job.distil.disc_px > 0.0 else {}
+        distil = {**common, "distil": job.distil, **followed}
         code = ("distillation", "disc_cameras")
         stages.append(stage("distil", distil, (*known, *final), code, _distil, "gaussians"))
         stages.append(stage("splat", looks, ("distil",), ("gaussian_views",), _splat))
