@@ -17,6 +17,7 @@ import pytest
 from seasonscapes.albedo.seasons import season_weights
 from seasonscapes.cli import main
 from seasonscapes.errors import AtlasMismatch, InputError
+from seasonscapes.images import read_exr
 from seasonscapes.relighting.exposure_smoothing import smoothed_ev100
 from seasonscapes.relighting.film import write_video
 from seasonscapes.relighting.frame_file import frame_header, load_frame, save_frame
@@ -103,6 +104,12 @@ def test_frame_files_hold_night_and_day(tmp_path, level):
     np.testing.assert_allclose(back[1:], radiance[1:], rtol=1e-3)
     assert ev100 == frame_header(tmp_path / "a.exr")[0] == pytest.approx(metered, abs=1e-5)
     assert np.isfinite(back).all()
+    # The same to other programs, which read it by the library.
+    layers, header = read_exr(tmp_path / "a.exr")
+    saturation = np.float32(1.2 * 2.0**metered)
+    np.testing.assert_array_equal(layers[""].astype(np.float32) * np.float32(1.2 * 2.0**ev100), back)
+    np.testing.assert_allclose(layers[""][1:].astype(np.float32) * saturation, radiance[1:], rtol=1e-3)
+    assert json.loads(header["seasonscapes:provenance"]) == {"scene": "x"}
 
 
 def test_a_film_plays(tmp_path):
