@@ -234,6 +234,15 @@ def largest_channel(image: np.ndarray) -> np.ndarray:
     return np.maximum(np.maximum(image[..., :1], image[..., 1:2]), image[..., 2:])
 
 
+def scaled_pixels(image: np.ndarray, factor: np.ndarray) -> np.ndarray:
+    """Pixels ``(..., 3)`` times a factor ``(...)`` of each, float32: several times quicker than by broadcasting along the last axis."""
+    import cv2  # slow to load
+
+    values = np.ascontiguousarray(factor, np.float32).reshape(1, -1)
+    scaled = np.asarray(cv2.merge([values, values, values])).reshape(*np.shape(factor), 3)
+    return np.multiply(scaled, image, out=scaled)
+
+
 # Shape of the tone curve: a constant gain, linear (no toe) up to the start of the shoulder, then a long soft shoulder.
 _SHOULDER_START, _WHITE = 0.30, 8.0
 EXPOSURE_GAIN = 1.6

@@ -15,6 +15,7 @@ import numpy as np
 
 from seasonscapes.cameras.panorama import Panorama, view_directions
 from seasonscapes.cameras.pinhole import Camera
+from seasonscapes.images import scaled_pixels
 from seasonscapes.rendering.backend import aligned, to_numpy
 from seasonscapes.rendering.mitsuba_scene import sky_radiance_towards
 from seasonscapes.sky.illumination import AerialPerspective, Illumination
@@ -146,11 +147,14 @@ def interpolate_air(grid: AirGrid, air: AerialPerspective) -> tuple[np.ndarray, 
     texture: Any = mi.Texture3f(  # pyright: ignore[reportCallIssue]
         mi.TensorXf(aligned(nodes)), wrap_mode=dr.WrapMode.Clamp
     )
-    values = to_numpy(texture.eval(grid.mi_coordinate))
+    channels = texture.eval(grid.mi_coordinate)
+    # Apart, since what is computed with either takes several times as long with both side by side.
+    transmittance, airlight = (to_numpy(mi.Vector3f(*channels[k : k + 3])) for k in (0, 3))
     if len(grid.mixed):
         samples = to_numpy(texture.eval(grid.mi_sample_coordinate)).reshape(*grid.sample_weight.shape, 6)
-        values[grid.mixed] = np.einsum("ks,ksc->kc", grid.sample_weight, samples)
-    return values[:, :3], values[:, 3:]
+        mean = np.einsum("ks,ksc->kc", grid.sample_weight, samples)
+        transmittance[grid.mixed], airlight[grid.mixed] = mean[:, :3], mean[:, 3:]
+    return transmittance, airlight
 
 
 @dataclass(frozen=True)
@@ -235,7 +239,7 @@ def sky_pixel_radiance(grid: SkyGrid, illumination: Illumination, pixel_angle_de
     )
     sky = np.zeros((len(grid.direction), 3), np.float32)
     for corner, weight in zip(grid.corner, grid.weight, strict=True):
-        sky += at_nodes[corner] * weight[:, None]
+        sky += scaled_pixels(at_nodes.take(corner, axis=0), weight)
     in_aureole = np.zeros(len(sky), bool)
     for body in (illumination.sun, illumination.moon):
         if body is not None:

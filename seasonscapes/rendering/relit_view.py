@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from seasonscapes.images import scaled_pixels
 from seasonscapes.rendering.air_grid import AirGrid, SkyGrid, air_grid, interpolate_air, sky_grid, sky_pixel_radiance
 from seasonscapes.rendering.coefficients import ViewCoefficients
 from seasonscapes.rendering.gbuffer import GBuffer, trace_gbuffer
@@ -31,6 +32,7 @@ from seasonscapes.rendering.sun_visibility import (
     SunRays,
     bayer_disc_offset,
     first_sample_visible,
+    first_samples,
     sum_incidence,
     sun_rays,
 )
@@ -48,6 +50,8 @@ _GRAZING = 0.25
 _BOUNCE_STRIDES, _BOUNCE_SHARPNESS = (1,), 64.0
 # and over wider surroundings in pictures with fewer rays than these, where noise is what errs most.
 _MANY_RAYS, _WIDE_STRIDES = 256, (1, 2)
+# Mean length of runs of terrain pixels above which they are copied run by run [px], chosen.
+_LEAST_RUN = 32
 # Pixels per block of the distance computation; bounds the memory.
 _BLOCK = 1 << 17
 
@@ -62,8 +66,8 @@ class RelightableView:
     ----------
     coefficients
         Coefficients of the view, in host memory.
-    rays
-        Shadow rays from all samples.
+    rays, first_rays
+        Shadow rays from all samples, and from the first of each pixel.
     receivers, clusters
         Light transport coefficients of the pixels, and the clusters of faces, on the device.
     silhouette
@@ -84,6 +88,7 @@ class RelightableView:
 
     coefficients: ViewCoefficients
     rays: SunRays
+    first_rays: SunRays
     receivers: DeviceReceivers
     clusters: DeviceClusters
     silhouette: np.ndarray
@@ -134,6 +139,7 @@ def relightable_view(terrain: RayScene, coefficients: ViewCoefficients) -> Relig
     return RelightableView(
         coefficients,
         rays,
+        first_samples(rays),
         upload_receivers(coefficients.receivers, passes),
         upload_clusters(terrain, coefficients.clusters),
         silhouette,
@@ -250,11 +256,26 @@ def relight_view(view: RelightableView, illumination: Illumination) -> RenderedV
     RenderedView
         Radiance at the camera, radiance of the surface, coverage and G-buffer.
     """
-    coefficients = view.coefficients
     pixel_radiance = relit_surface_radiance(view, illumination)
-    surface = np.zeros((*view.coverage.shape, 3), np.float32)
-    surface.reshape(-1, 3)[coefficients.pixel] = pixel_radiance
+    surface = _image(view, pixel_radiance)
     return RenderedView(_at_camera(view, illumination, pixel_radiance), surface, view.coverage, view.gbuffer)
+
+
+def _image(view: RelightableView, values: np.ndarray) -> np.ndarray:
+    """Image ``(H, W, 3)`` of the values ``(n, 3)`` of the terrain pixels, zero elsewhere."""
+    image = np.zeros((*view.coverage.shape, 3), np.float32)
+    rows, pixel = image.reshape(-1, 3), view.coefficients.pixel
+    ends = np.append(np.flatnonzero(np.diff(pixel) != 1) + 1, len(pixel))
+    if len(ends) * _LEAST_RUN > len(pixel):
+        rows[pixel] = values
+        return image
+    # Terrain pixels are long runs, and copying each is several times quicker than picking every pixel.
+    start = 0
+    for end in ends.tolist():
+        first = int(pixel[start])
+        rows[first : first + end - start] = values[start:end]
+        start = end
+    return image
 
 
 def relit_surface_radiance(view: RelightableView, illumination: Illumination) -> np.ndarray:
@@ -280,7 +301,7 @@ def relit_surface_radiance(view: RelightableView, illumination: Illumination) ->
     for body in luminaries(illumination):
         light = np.asarray(body.normal_illuminance_lx, np.float32) / np.float32(np.pi)
         cosine = sun_cosine(view, body)
-        lit = cosine[:, None] * light
+        lit = np.stack([cosine * channel for channel in light], axis=-1)
         total += lit if ground is None else lit * ground.of_luminary(body, cosine)
     radiance = total * view.coefficients.albedo
     if view.mirror is not None:
@@ -331,7 +352,7 @@ def sun_cosine(view: RelightableView, luminary: Luminary) -> np.ndarray:
         ``(n,)``.
     """
     cosine = np.maximum(view.coefficients.normal @ np.asarray(luminary.direction, np.float32), 0.0)
-    visible = first_sample_visible(view.rays, luminary)
+    visible = first_sample_visible(view.first_rays, luminary)
     traced = _differs_nearby(view, visible) | view.silhouette
     result = np.where(visible, cosine, 0.0)
     # The light reaches all nine pixels around: what matters on slopes that it grazes is which samples face it.
@@ -359,13 +380,14 @@ def _differs_nearby(view: RelightableView, visible: np.ndarray) -> np.ndarray:
 
 def _at_camera(view: RelightableView, illumination: Illumination, surface: np.ndarray) -> np.ndarray:
     """Radiance ``(H, W, 3)`` at the camera, from the air grid; see `radiance.apply_aerial_perspective`."""
-    camera, pixel = view.coefficients.camera, view.coefficients.pixel
+    camera = view.coefficients.camera
     if illumination.aerial_perspective is not None:
         transmittance, airlight = interpolate_air(view.air, illumination.aerial_perspective)
-        surface = surface * transmittance + airlight * view.coefficients.coverage[:, None]
-    image = np.zeros((camera.height_px * camera.width_px, 3), np.float32)
-    image[pixel] = surface
+        surface = surface * transmittance
+        surface += scaled_pixels(airlight, view.coefficients.coverage)
+    image = _image(view, surface)
     if len(view.sky.pixel):
         sky = sky_pixel_radiance(view.sky, illumination, float(np.degrees(1.0 / camera.fx)))
-        image[view.sky.pixel] += (1.0 - view.coverage.reshape(-1)[view.sky.pixel])[:, None] * sky
-    return image.reshape(*view.coverage.shape, 3)
+        share = 1.0 - view.coverage.reshape(-1)[view.sky.pixel]
+        image.reshape(-1, 3)[view.sky.pixel] += scaled_pixels(sky, share)
+    return image

@@ -44,6 +44,8 @@ class SunRays:
         ``mi.UInt32`` of N lanes: index of the disc point that the first sample of each receiver uses.
     samples
         Number S of samples per receiver.
+    disc_points
+        Number of points of the disc, of which those of a receiver's samples are some.
     """
 
     terrain: RayScene
@@ -53,6 +55,7 @@ class SunRays:
     mi_weight: Any
     mi_disc_offset: Any
     samples: int
+    disc_points: int
 
     @property
     def receivers(self) -> int:
@@ -104,7 +107,26 @@ def sun_rays(
     mi_weight = mi.Float16(aligned(weight, np.float16).ravel())
     mi_disc_offset = mi.UInt32(aligned(np.asarray(disc_offset, np.int64) % 256, np.uint32))
     dr.eval(mi_origin, mi_normal, mi_geometric_normal, mi_weight, mi_disc_offset)
-    return SunRays(terrain, mi_origin, mi_normal, mi_geometric_normal, mi_weight, mi_disc_offset, weight.shape[1])
+    samples = weight.shape[1]
+    return SunRays(terrain, mi_origin, mi_normal, mi_geometric_normal, mi_weight, mi_disc_offset, samples, samples)
+
+
+def first_samples(rays: SunRays) -> SunRays:
+    """Shadow rays of the first sample of each receiver, side by side: among the others each takes cache lines of its own."""
+    import drjit as dr
+    import mitsuba as mi
+
+    lane = dr.arange(mi.UInt32, rays.receivers) * dr.opaque(mi.UInt32, rays.samples)
+    origin = dr.gather(mi.Point3f, rays.mi_origin, lane)
+    normal, geometric_normal = (
+        [dr.gather(mi.Float16, column, lane) for column in columns]
+        for columns in (rays.mi_normal, rays.mi_geometric_normal)
+    )
+    weight = dr.gather(mi.Float16, rays.mi_weight, lane)
+    dr.eval(origin, normal, geometric_normal, weight)
+    return replace(
+        rays, mi_origin=origin, mi_normal=normal, mi_geometric_normal=geometric_normal, mi_weight=weight, samples=1
+    )
 
 
 def raised_rays(rays: SunRays, height_m: float) -> SunRays:
@@ -189,7 +211,7 @@ def first_sample_visible(rays: SunRays, luminary: Luminary) -> np.ndarray:
     Parameters
     ----------
     rays
-        Shadow rays of N receivers.
+        Shadow rays of N receivers; quickest of `first_samples`.
     luminary
         Sun or moon.
 
@@ -202,7 +224,7 @@ def first_sample_visible(rays: SunRays, luminary: Luminary) -> np.ndarray:
     import mitsuba as mi
 
     result = np.empty(rays.receivers, bool)
-    disc = _mi_disc(luminary, rays.samples)
+    disc = _mi_disc(luminary, rays.disc_points)
     for start in range(0, len(result), LANES):
         count = min(LANES, len(result) - start)
         lane = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, start)
@@ -240,7 +262,7 @@ def sum_incidence(
     import mitsuba as mi
 
     sums = np.empty((2, len(receiver)), np.float32)
-    disc = _mi_disc(luminary, rays.samples)
+    disc = _mi_disc(luminary, rays.disc_points)
     step = max(1, LANES // rays.samples)
     for start in range(0, len(receiver), step):
         chosen = mi.UInt32(aligned(receiver[start : start + step], np.uint32))
@@ -280,7 +302,7 @@ def visible_cosine(rays: SunRays, luminary: Luminary, *, rays_per_sample: int = 
     import drjit as dr
     import mitsuba as mi
 
-    disc = _mi_disc(luminary, rays.samples * rays_per_sample)
+    disc = _mi_disc(luminary, rays.disc_points * rays_per_sample)
     result = np.empty(rays.receivers * rays.samples, np.float32)
     step = max(1, LANES // rays_per_sample)
     for start in range(0, len(result), step):
