@@ -18,6 +18,7 @@ from seasonscapes.images import (
     auto_exposure_ev100,
     expose,
     image_luminance,
+    scaled_pixels,
     tone_curve,
 )
 from seasonscapes.photo_look import balanced, highlight_stops, photo_curve
@@ -174,16 +175,19 @@ def _blend_rod_vision(image: np.ndarray, mesopic: tuple[float, float] = _MESOPIC
     if not np.issubdtype(image.dtype, np.floating):
         image = image.astype(np.float64)
     luminance = np.maximum(image_luminance(image), 1e-9)
-    low, high = np.log10(mesopic)
+    low, high = np.log10(mesopic).tolist()
     # By day no pixel is so dim that rods see it; by night most are, and all are as quickly done.
     dim = luminance < mesopic[1]
     if not dim.any():
         return image
     chosen = dim if dim.mean() < 0.2 else np.s_[...]
-    cones = image[chosen].astype(np.float64)
-    rod_weight = np.clip((high - np.log10(luminance[chosen])) / (high - low), 0.0, 1.0)[..., None]
+    cones = image[chosen]
+    rod_weight = np.clip((high - np.log10(luminance[chosen])) / (high - low), 0.0, 1.0)
     tint = _NIGHT_TINT / (_NIGHT_TINT @ REC709_LUMINANCE)
-    grey = np.maximum(cones @ _SCOTOPIC, 0.0)[..., None] * tint
+    rods = rod_weight * np.maximum(cones @ _SCOTOPIC.astype(image.dtype), 0.0)
+    blended = scaled_pixels(cones, 1.0 - rod_weight)
+    for channel, share in enumerate(tint.tolist()):
+        blended[..., channel] += share * rods
     result = image.copy()
-    result[chosen] = (1.0 - rod_weight) * cones + rod_weight * grey
+    result[chosen] = blended
     return result

@@ -203,11 +203,11 @@ def auto_exposure_ev100(image: np.ndarray, mask: np.ndarray | None = None) -> fl
         If no metered pixel has a finite, positive luminance.
     """
     values = image_luminance(image)[... if mask is None else mask].ravel()
-    values = values[np.isfinite(values) & (values > 0.0)].astype(np.float64)
+    values = values[np.isfinite(values) & (values > 0.0)]
     if values.size == 0:
         raise NoUsablePixels("auto exposure: the image has no positive luminance; give an EV100")
     low, high = np.percentile(values, [2.0, 98.0])
-    metered = np.exp(np.mean(np.log(values[(values >= low) & (values <= high)])))
+    metered = np.exp(np.mean(np.log(values[(values >= low) & (values <= high)]), dtype=np.float64))
     return float(np.log2(metered / METER_CONSTANT))
 
 
