@@ -15,6 +15,7 @@ from seasonscapes.images import (
     linear_from_srgb,
     read_exr,
     read_image_linear,
+    scaled_pixels,
     srgb_from_linear,
     tone_curve,
     write_exr,
@@ -27,6 +28,13 @@ def test_srgb_agrees_with_colour_science():
     values = np.linspace(0, 1, 1001)
     np.testing.assert_allclose(srgb_from_linear(values), colour.models.eotf_inverse_sRGB(values), atol=1e-7)
     np.testing.assert_allclose(linear_from_srgb(srgb_from_linear(values)), values, atol=2e-6)
+
+
+@pytest.mark.parametrize("shape", [(), (7,), (5, 4), (2, 3, 4)])
+def test_scaled_pixels_are_those_of_broadcasting(shape):
+    rng = np.random.default_rng(0)
+    image, factor = rng.random((*shape, 3), np.float32), rng.random(shape, np.float32)
+    np.testing.assert_array_equal(scaled_pixels(image, factor), image * factor[..., None])
 
 
 def test_exr_round_trip(tmp_path):

@@ -1,6 +1,7 @@
 """Daylight coefficients light views and places as path tracing does, and as closed forms say."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from seasonscapes.rendering.irradiance import irradiance, irradiance_blocks, sur
 from seasonscapes.rendering.light_clusters import cluster_lists
 from seasonscapes.rendering.mitsuba_scene import mi_mesh, relight, set_albedo
 from seasonscapes.rendering.radiance import path_trace, render_view
-from seasonscapes.rendering.relit_view import relight_view, relightable_view, sun_cosine
+from seasonscapes.rendering.relit_view import relight_view, relightable_view, sun_cosine, terrain_image
 from seasonscapes.rendering.sky_patches import (
     SUBDIVISIONS,
     direction_weights,
@@ -26,7 +27,7 @@ from seasonscapes.rendering.sky_patches import (
     sky_patches,
     sky_second_moments,
 )
-from seasonscapes.rendering.sun_visibility import sum_incidence, visible_cosine
+from seasonscapes.rendering.sun_visibility import first_sample_visible, sum_incidence, visible_cosine
 from seasonscapes.rendering.transport import trace_points, trace_view, view_albedo
 from seasonscapes.rendering.view_samples import pixel_moments, sample_moments, view_samples
 from seasonscapes.sky.illumination import Illumination, uniform_sky
@@ -86,7 +87,24 @@ def test_few_shadow_rays_say_what_all_do(valley, azimuth_deg, elevation_deg):
     assert (facing <= unoccluded).all()
     assert facing.mean() > all_rays.mean()
     weight = np.array(ready.rays.mi_weight, np.float32).reshape(len(every), -1)
-    np.testing.assert_allclose(all_rays, (visible_cosine(ready.rays, sun) * weight).sum(axis=1), atol=1e-5)
+    by_sample = visible_cosine(ready.rays, sun)
+    np.testing.assert_allclose(all_rays, (by_sample * weight).sum(axis=1), atol=1e-5)
+    # First samples by themselves meet the same points of the disc as among the others.
+    np.testing.assert_array_equal(first_sample_visible(ready.first_rays, sun), (by_sample * weight)[:, 0] > 0.0)
+
+
+def test_an_image_of_terrain_pixels_in_runs_or_one_by_one(valley):
+    _, _, ready = valley
+    random = np.random.default_rng(5)
+    count = len(ready.coefficients.pixel)
+    for kept in (np.arange(count), np.flatnonzero(random.random(count) < 0.5)):
+        part = replace(
+            ready, coefficients=replace(ready.coefficients, pixel=np.asarray(ready.coefficients.pixel)[kept])
+        )
+        values = random.random((len(kept), 3), np.float32)
+        expected = np.zeros((ready.coverage.size, 3), np.float32)
+        expected[part.coefficients.pixel] = values
+        np.testing.assert_array_equal(terrain_image(part, values).reshape(-1, 3), expected)
 
 
 def test_moments_of_traced_samples_are_those_of_their_pixels(valley):

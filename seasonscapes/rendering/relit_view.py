@@ -257,12 +257,12 @@ def relight_view(view: RelightableView, illumination: Illumination) -> RenderedV
         Radiance at the camera, radiance of the surface, coverage and G-buffer.
     """
     pixel_radiance = relit_surface_radiance(view, illumination)
-    surface = _image(view, pixel_radiance)
+    surface = terrain_image(view, pixel_radiance)
     return RenderedView(_at_camera(view, illumination, pixel_radiance), surface, view.coverage, view.gbuffer)
 
 
-def _image(view: RelightableView, values: np.ndarray) -> np.ndarray:
-    """Image ``(H, W, 3)`` of the values ``(n, 3)`` of the terrain pixels, zero elsewhere."""
+def terrain_image(view: RelightableView, values: np.ndarray) -> np.ndarray:
+    """Return an image ``(H, W, 3)`` of the values ``(n, 3)`` of a view's terrain pixels, zero elsewhere."""
     image = np.zeros((*view.coverage.shape, 3), np.float32)
     rows, pixel = image.reshape(-1, 3), view.coefficients.pixel
     ends = np.append(np.flatnonzero(np.diff(pixel) != 1) + 1, len(pixel))
@@ -385,7 +385,7 @@ def _at_camera(view: RelightableView, illumination: Illumination, surface: np.nd
         transmittance, airlight = interpolate_air(view.air, illumination.aerial_perspective)
         surface = surface * transmittance
         surface += scaled_pixels(airlight, view.coefficients.coverage)
-    image = _image(view, surface)
+    image = terrain_image(view, surface)
     if len(view.sky.pixel):
         sky = sky_pixel_radiance(view.sky, illumination, float(np.degrees(1.0 / camera.fx)))
         share = 1.0 - view.coverage.reshape(-1)[view.sky.pixel]
