@@ -23,8 +23,10 @@ from seasonscapes.rendering.terrain_material import device_surface
 # Spacings of the table, which a processor's cache holds: its azimuths are means of three, between which all borders of
 # patches lie.
 _AZIMUTH_DEG, _ELEVATION_DEG = 1.5, 2.0
-# Bisections of the range between the surface's own plane and the zenith: cells of some 3°, shifted at random.
-_STEPS = 5
+# Cells of the range between the surface's own plane and the zenith: some 3°, shifted at random.
+_CELLS = 32
+# Of each eighth receiver the horizons are searched by bisection, those of the others near them.
+_STRIDE = 8
 _GOLDEN = 0.618034
 # Key of the random number stream, mixed into its hashes.
 _HORIZON = 107
@@ -190,12 +192,14 @@ class _HorizonLanes:
         import drjit as dr
         import mitsuba as mi
 
-        self._azimuths = azimuths
-        receivers = dr.opaque(mi.UInt32, len(turn))
+        self._azimuths, self._count = azimuths, len(turn)
+        # No literal, for which kernels would be compiled anew.
+        self._receivers = dr.opaque(mi.UInt32, self._count)
         lane = dr.arange(mi.UInt32, len(points.origin))
-        number = lane // receivers
-        receiver = lane - number * receivers
-        turned = dr.gather(mi.Float, mi.Float(aligned(turn % 1.0)), receiver)
+        number = lane // self._receivers
+        receiver = lane - number * self._receivers
+        self._turn = mi.Float(aligned(turn % 1.0))
+        turned = dr.gather(mi.Float, self._turn, receiver)
         mi_key = hashed(hashed(dr.gather(mi.UInt32, mi.UInt32(aligned(key, np.uint32)), receiver), _HORIZON), number)
         self.azimuth = (mi.Float(number) + turned) * dr.opaque(mi.Float, 2.0 * np.pi / azimuths)
         self._north_east = dr.sincos(self.azimuth)[::-1]
@@ -220,24 +224,90 @@ class _HorizonLanes:
     def horizon(self, terrain: RayScene) -> tuple[Any, Any]:
         """Elevation of the horizon [rad], or of the point's own plane where that is higher, and what no land rises above."""
         import drjit as dr
-        import mitsuba as mi
 
-        # Cells of equal height from the plane to the zenith, shifted by a random part of a cell: without it, all horizons
-        # of a slope would be rounded to the same ones.
-        cell = (0.5 * np.pi - self._plane) / (2**_STEPS - 1)
-        below = mi.Float(0.0)
-        for bit in reversed(range(_STEPS)):
-            border = below + float(2**bit)
-            elevation = self._plane + (border - self._shift) * cell
-            inside = (elevation > self._plane) & (elevation < 0.5 * np.pi)
-            hidden = terrain.mi_scene.ray_test(self._ray(elevation), active=inside) | (elevation <= self._plane)
-            below = dr.select(hidden, border, below)
-        horizon, bound = (
-            dr.clip(self._plane + (below + place - self._shift) * cell, self._plane, 0.5 * np.pi)
-            for place in (0.5, 1.0)
-        )
+        # The horizon of the nearest of a few receivers is a guess from which that of the others is found with half of the rays.
+        some = self._searched(terrain, _STRIDE, None)
+        below = self._searched(terrain, 1, some)
+        horizon, bound = (self._elevation(below, place) for place in (0.5, 1.0))
         dr.eval(horizon, bound)
         return horizon, bound
+
+    def _elevation(self, cell: Any, place: float, lane: Any = None) -> Any:
+        """Elevation [rad] of a place in cells of equal height from the plane to the zenith, above the plane at least."""
+        import drjit as dr
+        import mitsuba as mi
+
+        plane, shift = (v if lane is None else dr.gather(mi.Float, v, lane) for v in (self._plane, self._shift))
+        return dr.clip(plane + (cell + place - shift) * _cell_height(plane), plane, 0.5 * np.pi)
+
+    def _searched(self, terrain: RayScene, stride: int, known: Any) -> Any:
+        """Cells ``mi.Int32`` in which the horizons of each ``stride``-th receiver lie.
+
+        ``known``: those of each `_STRIDE`-th, near which they are searched; ``None``: by bisection.
+        """
+        import drjit as dr
+        import mitsuba as mi
+
+        some = -(-self._count // stride)
+        lane = dr.arange(mi.UInt32, self._azimuths * some)
+        number = lane // dr.opaque(mi.UInt32, some)
+        receiver = (lane - number * dr.opaque(mi.UInt32, some)) * dr.opaque(mi.UInt32, stride)
+        lane = number * self._receivers + receiver
+        plane, shift, *north_east = (
+            dr.gather(mi.Float, v, lane) for v in (self._plane, self._shift, *self._north_east)
+        )
+        origin, height = dr.gather(mi.Point3f, self._origin, lane), _cell_height(plane)
+        # Cells are shifted by a random part of one: without it, all horizons of a slope would be rounded to the same ones.
+        # The border `low` is hidden, `high` is not. Steps from the first border double until they pass the horizon.
+        low, high = (dr.full(mi.Int32, value, dr.width(lane)) for value in (0, _CELLS))
+        if known is None:
+            border, step = dr.full(mi.Int32, _CELLS // 2, dr.width(lane)), _CELLS
+        else:
+            guess = (self._guess(known, number, receiver) - plane) / height + shift
+            border, step = dr.clip(mi.Int32(dr.round(guess)), 1, _CELLS - 1), 1
+            found = receiver % _STRIDE == 0
+            cell = dr.gather(
+                mi.Int32, known, number * dr.opaque(mi.UInt32, -(-self._count // _STRIDE)) + receiver // _STRIDE, found
+            )
+            low, high = dr.select(found, cell, low), dr.select(found, cell + 1, high)
+        step = dr.full(mi.Int32, step, dr.width(lane))
+
+        def searching(low: Any, high: Any, border: Any, step: Any) -> Any:
+            return high - low > 1
+
+        def narrowed(low: Any, high: Any, border: Any, step: Any) -> tuple[Any, Any, Any, Any]:
+            elevation = plane + (border - shift) * height
+            inside = (elevation > plane) & (elevation < 0.5 * np.pi)
+            ray = _ray(origin, *north_east, elevation)
+            hidden = terrain.mi_scene.ray_test(ray, active=inside) | (elevation <= plane)
+            low, high = dr.select(hidden, border, low), dr.select(hidden, high, border)
+            stepped = border + dr.select(hidden, step, -step)
+            return low, high, dr.select((stepped > low) & (stepped < high), stepped, (low + high) // 2), 2 * step
+
+        low, *_ = dr.while_loop((low, high, border, step), searching, narrowed)
+        dr.eval(low)
+        return low
+
+    def _guess(self, known: Any, number: Any, receiver: Any) -> Any:
+        """Elevation [rad] of the horizon of the nearest receiver of the known ones, at azimuth ``number`` of ``receiver``."""
+        import drjit as dr
+        import mitsuba as mi
+
+        some = -(-self._count // _STRIDE)
+        nearest = dr.minimum((receiver + _STRIDE // 2) // _STRIDE, dr.opaque(mi.UInt32, some - 1))
+        # Its azimuths are turned against those here; between two of them the elevation is linear.
+        turn, turned = (dr.gather(mi.Float, self._turn, index) for index in (receiver, nearest * _STRIDE))
+        place = mi.Float(number) + (turn - turned)
+        first = dr.floor(place)
+        azimuths = dr.opaque(mi.Int32, self._azimuths)
+
+        def elevation(azimuth: Any) -> Any:
+            azimuth = mi.UInt32((azimuth + azimuths) % azimuths)
+            cell = dr.gather(mi.Int32, known, azimuth * dr.opaque(mi.UInt32, some) + nearest)
+            return self._elevation(cell, 0.5, azimuth * self._receivers + nearest * _STRIDE)
+
+        before, after = (elevation(mi.Int32(first) + add) for add in (0, 1))
+        return before + (place - first) * (after - before)
 
     def towards_land(self, bound: Any, count: int) -> tuple[list[Any], Any]:
         """Elevations of rays between plane and bound, distributed by the cosine of incidence, and the integral of that."""
@@ -269,12 +339,7 @@ class _HorizonLanes:
         return dr.select(found.is_valid(), dr.select(front, cluster, ABSORBED), ESCAPED)
 
     def _ray(self, elevation: Any) -> Any:
-        import drjit as dr
-        import mitsuba as mi
-
-        sine, cosine = dr.sincos(elevation)
-        north, east = self._north_east
-        return mi.Ray3f(self._origin, mi.Vector3f(east * cosine, north * cosine, sine))
+        return _ray(self._origin, *self._north_east, elevation)
 
     def _integral(self, elevation: Any) -> Any:
         """Antiderivative over elevation of cosine of incidence × cosine of elevation."""
@@ -282,6 +347,19 @@ class _HorizonLanes:
 
         sine, cosine = dr.sincos(elevation)
         return self.along * 0.5 * (elevation + sine * cosine) + self.upward * 0.5 * sine * sine
+
+
+def _cell_height(plane: Any) -> Any:
+    """Height [rad] of the cells between a plane's elevation and the zenith."""
+    return (0.5 * np.pi - plane) / (_CELLS - 1)
+
+
+def _ray(origin: Any, north: Any, east: Any, elevation: Any) -> Any:
+    import drjit as dr
+    import mitsuba as mi
+
+    sine, cosine = dr.sincos(elevation)
+    return mi.Ray3f(origin, mi.Vector3f(east * cosine, north * cosine, sine))
 
 
 def _integrals(
