@@ -28,8 +28,8 @@ _CELLS = 32
 # Of each eighth receiver the horizons are searched by bisection, those of the others near them.
 _STRIDE = 8
 _GOLDEN = 0.618034
-# Key of the random number stream, mixed into its hashes.
-_HORIZON = 107
+# Keys of the random number streams, mixed into their hashes.
+_HORIZON, _LAND = 107, 109
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def trace_horizons(
         Number of azimuths at which the horizon is searched, a power of two: evenly spaced, each from a point that is drawn in
         proportion to its weight.
     land_rays
-        Rays below the horizon at each azimuth.
+        Rays below the horizon, divided by the number of azimuths: more of them at azimuths with more land.
     turn
         ``(N,)`` float32 offset of each receiver's azimuths, in spaces between them.
     key
@@ -158,12 +158,13 @@ def trace_horizons(
         flat = points[part].reshape(-1)[(np.arange(len(chosen)) * samples + chosen.T).ravel()]
         lanes = _HorizonLanes(flat, azimuths, turn[part], key[part])
         horizon, bound = lanes.horizon(terrain)
-        elevations, measure = lanes.towards_land(bound, land_rays)
+        measure = lanes.land(bound)
         rows = lanes.by_receiver([lanes.azimuth, horizon, lanes.along, lanes.upward, measure])
         sums[part] = _integrals(table, azimuths, *(values.ravel() for values in rows[:4]))
-        land = [lanes.clusters(terrain, elevation, mi_face_cluster, measure > 0.0) for elevation in elevations]
-        hit[part] = np.stack(lanes.by_receiver(land), axis=-1).reshape(len(chosen), -1)
-        ray_weight[part] = np.repeat(rows[4] / np.float32(land_rays), land_rays, axis=1)
+        lane, number = _divided(rows[4], hit.shape[1], hash_to_unit(key[part], _LAND))
+        hit[part][lane % len(chosen), number] = lanes.clusters(terrain, bound, measure, lane, number, mi_face_cluster)
+        ray_weight[part] = rows[4].mean(axis=1, keepdims=True)
+    ray_weight /= np.float32(land_rays)
     scale = weight.sum(axis=1, keepdims=True) * np.float32(2.0 / azimuths)
     sums *= scale
     ray_weight *= scale
@@ -183,6 +184,24 @@ def _drawn(weight: np.ndarray, azimuths: int, key: np.ndarray) -> np.ndarray:
     for column in total[:, :-1].T:
         index += place >= column[:, None]
     return index
+
+
+def _divided(measure: np.ndarray, rays: int, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Divide rays of equal weight among azimuths, in proportion to measures ``(N, azimuths)``.
+
+    A systematic sample, shifted by ``place`` ``(N,)`` in [0, 1): the lane of each of the ``N rays`` rays, as in `_HorizonLanes`
+    and sorted, since neighbouring rays of one azimuth cost less; and its number among those of its receiver.
+    """
+    count, azimuths = measure.shape
+    total = np.cumsum(measure, axis=1, dtype=np.float32)
+    edge = np.zeros((azimuths + 1, count), np.int32)
+    edge[1:] = np.ceil(total.T * (rays / np.maximum(total[:, -1], 1e-20)) - place)
+    edge[-1] = rays
+    np.clip(edge, 0, rays, out=edge)
+    of_lane = np.diff(edge, axis=0).ravel()
+    lane = np.repeat(np.arange(len(of_lane)), of_lane)
+    first = np.repeat(edge[:-1].ravel() - (np.cumsum(of_lane) - of_lane), of_lane)
+    return lane, first + np.arange(len(lane))
 
 
 class _HorizonLanes:
@@ -208,11 +227,6 @@ class _HorizonLanes:
         self.along, self.upward = normal.x * east + normal.y * north, dr.maximum(normal.z, 1e-3)
         self._plane = dr.atan2(-self.along, self.upward)
         self._shift = uniform(mi_key)
-        # A lattice of place in the interval by azimuth (steps of the golden ratio) and by receiver: those whose azimuths are
-        # turned against each other have different elevations at them, too.
-        place = dr.gather(mi.Float, mi.Float(aligned(5.0 * turn % 1.0)), receiver)
-        place += mi.Float(number) * _GOLDEN
-        self._place = place - dr.floor(place)
 
     def by_receiver(self, lanes: list[Any]) -> list[np.ndarray]:
         """Values of lanes as arrays ``(N, azimuths)``."""
@@ -253,24 +267,22 @@ class _HorizonLanes:
         number = lane // dr.opaque(mi.UInt32, some)
         receiver = (lane - number * dr.opaque(mi.UInt32, some)) * dr.opaque(mi.UInt32, stride)
         lane = number * self._receivers + receiver
-        plane, shift, *north_east = (
+        plane, shift, north, east = (
             dr.gather(mi.Float, v, lane) for v in (self._plane, self._shift, *self._north_east)
         )
         origin, height = dr.gather(mi.Point3f, self._origin, lane), _cell_height(plane)
         # Cells are shifted by a random part of one: without it, all horizons of a slope would be rounded to the same ones.
         # The border `low` is hidden, `high` is not. Steps from the first border double until they pass the horizon.
-        low, high = (dr.full(mi.Int32, value, dr.width(lane)) for value in (0, _CELLS))
-        if known is None:
-            border, step = dr.full(mi.Int32, _CELLS // 2, dr.width(lane)), _CELLS
-        else:
+        low, high, border, step = (
+            dr.full(mi.Int32, value, dr.width(lane))
+            for value in (0, _CELLS, _CELLS // 2, _CELLS if known is None else 1)
+        )
+        if known is not None:
             guess = (self._guess(known, number, receiver) - plane) / height + shift
-            border, step = dr.clip(mi.Int32(dr.round(guess)), 1, _CELLS - 1), 1
-            found = receiver % _STRIDE == 0
-            cell = dr.gather(
-                mi.Int32, known, number * dr.opaque(mi.UInt32, -(-self._count // _STRIDE)) + receiver // _STRIDE, found
-            )
+            border = dr.clip(mi.Int32(dr.round(guess)), 1, _CELLS - 1)
+            found, some = receiver % _STRIDE == 0, dr.opaque(mi.UInt32, -(-self._count // _STRIDE))
+            cell = dr.gather(mi.Int32, known, number * some + receiver // _STRIDE, found)
             low, high = dr.select(found, cell, low), dr.select(found, cell + 1, high)
-        step = dr.full(mi.Int32, step, dr.width(lane))
 
         def searching(low: Any, high: Any, border: Any, step: Any) -> Any:
             return high - low > 1
@@ -278,7 +290,7 @@ class _HorizonLanes:
         def narrowed(low: Any, high: Any, border: Any, step: Any) -> tuple[Any, Any, Any, Any]:
             elevation = plane + (border - shift) * height
             inside = (elevation > plane) & (elevation < 0.5 * np.pi)
-            ray = _ray(origin, *north_east, elevation)
+            ray = _ray(origin, north, east, elevation)
             hidden = terrain.mi_scene.ray_test(ray, active=inside) | (elevation <= plane)
             low, high = dr.select(hidden, border, low), dr.select(hidden, high, border)
             stepped = border + dr.select(hidden, step, -step)
@@ -309,49 +321,58 @@ class _HorizonLanes:
         before, after = (elevation(mi.Int32(first) + add) for add in (0, 1))
         return before + (place - first) * (after - before)
 
-    def towards_land(self, bound: Any, count: int) -> tuple[list[Any], Any]:
-        """Elevations of rays between plane and bound, distributed by the cosine of incidence, and the integral of that."""
+    def land(self, bound: Any) -> Any:
+        """Integral of the cosine of incidence between plane and bound."""
         import drjit as dr
 
-        start = self._integral(self._plane)
-        measure = dr.maximum(self._integral(bound) - start, 0.0)
-        elevations = []
-        for number in range(count):
-            wanted = start + measure * ((number + self._place) / count)
-            low, high = self._plane, bound
-            for _ in range(8):
-                middle = 0.5 * (low + high)
-                beyond = self._integral(middle) > wanted
-                low, high = dr.select(beyond, low, middle), dr.select(beyond, middle, high)
-            elevations.append(0.5 * (low + high))
-        return elevations, measure
+        below, above = (_cosine_integral(self.along, self.upward, elevation) for elevation in (self._plane, bound))
+        return dr.maximum(above - below, 0.0)
 
-    def clusters(self, terrain: RayScene, elevation: Any, mi_face_cluster: Any, active: Any) -> Any:
-        """Cluster ``mi.Int32`` that rays at elevations hit; `ESCAPED` or `ABSORBED` for none."""
+    def clusters(
+        self, terrain: RayScene, bound: Any, measure: Any, lane: np.ndarray, number: np.ndarray, mi_face_cluster: Any
+    ) -> np.ndarray:
+        """Clusters that rays between plane and bound hit; `ESCAPED` or `ABSORBED` for none.
+
+        ``lane`` is that of each ray, ``number`` its number among those of its receiver.
+        """
         import drjit as dr
         import mitsuba as mi
 
-        ray = self._ray(elevation)
+        mi_lane, mi_number = (mi.UInt32(aligned(values, np.uint32)) for values in (lane, number))
+        receiver = mi_lane % self._receivers
+        # A lattice of place in the interval by ray (steps of the golden ratio) and by receiver: those whose azimuths are
+        # turned against each other have different elevations at them, too.
+        place = 5.0 * dr.gather(mi.Float, self._turn, receiver) + mi.Float(mi_number) * _GOLDEN
+        place -= dr.floor(place)
+        along, upward, low, high, whole, north, east = (
+            dr.gather(mi.Float, values, mi_lane)
+            for values in (self.along, self.upward, self._plane, bound, measure, *self._north_east)
+        )
+        # Elevations are distributed by the cosine of incidence.
+        wanted = _cosine_integral(along, upward, low) + whole * place
+        for _ in range(8):
+            middle = 0.5 * (low + high)
+            beyond = _cosine_integral(along, upward, middle) > wanted
+            low, high = dr.select(beyond, low, middle), dr.select(beyond, middle, high)
+        ray, active = _ray(dr.gather(mi.Point3f, self._origin, mi_lane), north, east, 0.5 * (low + high)), whole > 0.0
         found = terrain.mi_scene.ray_intersect_preliminary(ray, active=active)
         interaction = found.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
         cluster = mi.Int32(dr.gather(mi.UInt32, mi_face_cluster, found.prim_index, found.is_valid()))
         front = dr.dot(interaction.n, ray.d) < 0.0
-        return dr.select(found.is_valid(), dr.select(front, cluster, ABSORBED), ESCAPED)
-
-    def _ray(self, elevation: Any) -> Any:
-        return _ray(self._origin, *self._north_east, elevation)
-
-    def _integral(self, elevation: Any) -> Any:
-        """Antiderivative over elevation of cosine of incidence × cosine of elevation."""
-        import drjit as dr
-
-        sine, cosine = dr.sincos(elevation)
-        return self.along * 0.5 * (elevation + sine * cosine) + self.upward * 0.5 * sine * sine
+        return np.array(dr.select(found.is_valid(), dr.select(front, cluster, ABSORBED), ESCAPED))
 
 
 def _cell_height(plane: Any) -> Any:
     """Height [rad] of the cells between a plane's elevation and the zenith."""
     return (0.5 * np.pi - plane) / (_CELLS - 1)
+
+
+def _cosine_integral(along: Any, upward: Any, elevation: Any) -> Any:
+    """Antiderivative over elevation of cosine of incidence × cosine of elevation."""
+    import drjit as dr
+
+    sine, cosine = dr.sincos(elevation)
+    return along * 0.5 * (elevation + sine * cosine) + upward * 0.5 * sine * sine
 
 
 def _ray(origin: Any, north: Any, east: Any, elevation: Any) -> Any:
