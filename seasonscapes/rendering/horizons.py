@@ -23,11 +23,13 @@ from seasonscapes.rendering.terrain_material import device_surface
 # Spacings of the table, which a processor's cache holds: its azimuths are means of three, between which all borders of
 # patches lie.
 _AZIMUTH_DEG, _ELEVATION_DEG = 1.5, 2.0
-# Bisections of the range between the surface's own plane and the zenith: cells of some 3°, shifted at random.
-_STEPS = 5
+# Cells of the range between the surface's own plane and the zenith: some 3°, shifted at random.
+_CELLS = 32
+# Of each eighth receiver the horizons are searched by bisection, those of the others near them.
+_STRIDE = 8
 _GOLDEN = 0.618034
-# Key of the random number stream, mixed into its hashes.
-_HORIZON = 107
+# Keys of the random number streams, mixed into their hashes.
+_HORIZON, _LAND = 107, 109
 
 
 @dataclass(frozen=True)
@@ -129,7 +131,7 @@ def trace_horizons(
         Number of azimuths at which the horizon is searched, a power of two: evenly spaced, each from a point that is drawn in
         proportion to its weight.
     land_rays
-        Rays below the horizon at each azimuth.
+        Rays below the horizon, divided by the number of azimuths: more of them at azimuths with more land.
     turn
         ``(N,)`` float32 offset of each receiver's azimuths, in spaces between them.
     key
@@ -156,12 +158,13 @@ def trace_horizons(
         flat = points[part].reshape(-1)[(np.arange(len(chosen)) * samples + chosen.T).ravel()]
         lanes = _HorizonLanes(flat, azimuths, turn[part], key[part])
         horizon, bound = lanes.horizon(terrain)
-        elevations, measure = lanes.towards_land(bound, land_rays)
+        measure = lanes.land(bound)
         rows = lanes.by_receiver([lanes.azimuth, horizon, lanes.along, lanes.upward, measure])
         sums[part] = _integrals(table, azimuths, *(values.ravel() for values in rows[:4]))
-        land = [lanes.clusters(terrain, elevation, mi_face_cluster, measure > 0.0) for elevation in elevations]
-        hit[part] = np.stack(lanes.by_receiver(land), axis=-1).reshape(len(chosen), -1)
-        ray_weight[part] = np.repeat(rows[4] / np.float32(land_rays), land_rays, axis=1)
+        lane, number = _divided(rows[4], hit.shape[1], hash_to_unit(key[part], _LAND))
+        hit[part][lane % len(chosen), number] = lanes.clusters(terrain, bound, measure, lane, number, mi_face_cluster)
+        ray_weight[part] = rows[4].mean(axis=1, keepdims=True)
+    ray_weight /= np.float32(land_rays)
     scale = weight.sum(axis=1, keepdims=True) * np.float32(2.0 / azimuths)
     sums *= scale
     ray_weight *= scale
@@ -183,6 +186,24 @@ def _drawn(weight: np.ndarray, azimuths: int, key: np.ndarray) -> np.ndarray:
     return index
 
 
+def _divided(measure: np.ndarray, rays: int, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Divide rays of equal weight among azimuths, in proportion to measures ``(N, azimuths)``.
+
+    A systematic sample, shifted by ``place`` ``(N,)`` in [0, 1): the lane of each of the ``N rays`` rays, as in `_HorizonLanes`
+    and sorted, since neighbouring rays of one azimuth cost less; and its number among those of its receiver.
+    """
+    count, azimuths = measure.shape
+    total = np.cumsum(measure, axis=1, dtype=np.float32)
+    edge = np.zeros((azimuths + 1, count), np.int32)
+    edge[1:] = np.ceil(total.T * (rays / np.maximum(total[:, -1], 1e-20)) - place)
+    edge[-1] = rays
+    np.clip(edge, 0, rays, out=edge)
+    of_lane = np.diff(edge, axis=0).ravel()
+    lane = np.repeat(np.arange(len(of_lane)), of_lane)
+    first = np.repeat(edge[:-1].ravel() - (np.cumsum(of_lane) - of_lane), of_lane)
+    return lane, first + np.arange(len(lane))
+
+
 class _HorizonLanes:
     """Lanes on the device, one for each azimuth of each receiver, with a surface point ``points`` for each."""
 
@@ -190,12 +211,14 @@ class _HorizonLanes:
         import drjit as dr
         import mitsuba as mi
 
-        self._azimuths = azimuths
-        receivers = dr.opaque(mi.UInt32, len(turn))
+        self._azimuths, self._count = azimuths, len(turn)
+        # No literal, for which kernels would be compiled anew.
+        self._receivers = dr.opaque(mi.UInt32, self._count)
         lane = dr.arange(mi.UInt32, len(points.origin))
-        number = lane // receivers
-        receiver = lane - number * receivers
-        turned = dr.gather(mi.Float, mi.Float(aligned(turn % 1.0)), receiver)
+        number = lane // self._receivers
+        receiver = lane - number * self._receivers
+        self._turn = mi.Float(aligned(turn % 1.0))
+        turned = dr.gather(mi.Float, self._turn, receiver)
         mi_key = hashed(hashed(dr.gather(mi.UInt32, mi.UInt32(aligned(key, np.uint32)), receiver), _HORIZON), number)
         self.azimuth = (mi.Float(number) + turned) * dr.opaque(mi.Float, 2.0 * np.pi / azimuths)
         self._north_east = dr.sincos(self.azimuth)[::-1]
@@ -204,11 +227,6 @@ class _HorizonLanes:
         self.along, self.upward = normal.x * east + normal.y * north, dr.maximum(normal.z, 1e-3)
         self._plane = dr.atan2(-self.along, self.upward)
         self._shift = uniform(mi_key)
-        # A lattice of place in the interval by azimuth (steps of the golden ratio) and by receiver: those whose azimuths are
-        # turned against each other have different elevations at them, too.
-        place = dr.gather(mi.Float, mi.Float(aligned(5.0 * turn % 1.0)), receiver)
-        place += mi.Float(number) * _GOLDEN
-        self._place = place - dr.floor(place)
 
     def by_receiver(self, lanes: list[Any]) -> list[np.ndarray]:
         """Values of lanes as arrays ``(N, azimuths)``."""
@@ -220,68 +238,149 @@ class _HorizonLanes:
     def horizon(self, terrain: RayScene) -> tuple[Any, Any]:
         """Elevation of the horizon [rad], or of the point's own plane where that is higher, and what no land rises above."""
         import drjit as dr
-        import mitsuba as mi
 
-        # Cells of equal height from the plane to the zenith, shifted by a random part of a cell: without it, all horizons
-        # of a slope would be rounded to the same ones.
-        cell = (0.5 * np.pi - self._plane) / (2**_STEPS - 1)
-        below = mi.Float(0.0)
-        for bit in reversed(range(_STEPS)):
-            border = below + float(2**bit)
-            elevation = self._plane + (border - self._shift) * cell
-            inside = (elevation > self._plane) & (elevation < 0.5 * np.pi)
-            hidden = terrain.mi_scene.ray_test(self._ray(elevation), active=inside) | (elevation <= self._plane)
-            below = dr.select(hidden, border, below)
-        horizon, bound = (
-            dr.clip(self._plane + (below + place - self._shift) * cell, self._plane, 0.5 * np.pi)
-            for place in (0.5, 1.0)
-        )
+        # The horizon of the nearest of a few receivers is a guess from which that of the others is found with half of the rays.
+        some = self._searched(terrain, _STRIDE, None)
+        below = self._searched(terrain, 1, some)
+        horizon, bound = (self._elevation(below, place) for place in (0.5, 1.0))
         dr.eval(horizon, bound)
         return horizon, bound
 
-    def towards_land(self, bound: Any, count: int) -> tuple[list[Any], Any]:
-        """Elevations of rays between plane and bound, distributed by the cosine of incidence, and the integral of that."""
-        import drjit as dr
-
-        start = self._integral(self._plane)
-        measure = dr.maximum(self._integral(bound) - start, 0.0)
-        elevations = []
-        for number in range(count):
-            wanted = start + measure * ((number + self._place) / count)
-            low, high = self._plane, bound
-            for _ in range(8):
-                middle = 0.5 * (low + high)
-                beyond = self._integral(middle) > wanted
-                low, high = dr.select(beyond, low, middle), dr.select(beyond, middle, high)
-            elevations.append(0.5 * (low + high))
-        return elevations, measure
-
-    def clusters(self, terrain: RayScene, elevation: Any, mi_face_cluster: Any, active: Any) -> Any:
-        """Cluster ``mi.Int32`` that rays at elevations hit; `ESCAPED` or `ABSORBED` for none."""
+    def _elevation(self, cell: Any, place: float, lane: Any = None) -> Any:
+        """Elevation [rad] of a place in cells of equal height from the plane to the zenith, above the plane at least."""
         import drjit as dr
         import mitsuba as mi
 
-        ray = self._ray(elevation)
+        plane, shift = (v if lane is None else dr.gather(mi.Float, v, lane) for v in (self._plane, self._shift))
+        return dr.clip(plane + (cell + place - shift) * _cell_height(plane), plane, 0.5 * np.pi)
+
+    def _searched(self, terrain: RayScene, stride: int, known: Any) -> Any:
+        """Cells ``mi.Int32`` in which the horizons of each ``stride``-th receiver lie.
+
+        ``known``: those of each `_STRIDE`-th, near which they are searched; ``None``: by bisection.
+        """
+        import drjit as dr
+        import mitsuba as mi
+
+        some = -(-self._count // stride)
+        lane = dr.arange(mi.UInt32, self._azimuths * some)
+        number = lane // dr.opaque(mi.UInt32, some)
+        receiver = (lane - number * dr.opaque(mi.UInt32, some)) * dr.opaque(mi.UInt32, stride)
+        lane = number * self._receivers + receiver
+        plane, shift, north, east = (
+            dr.gather(mi.Float, v, lane) for v in (self._plane, self._shift, *self._north_east)
+        )
+        origin, height = dr.gather(mi.Point3f, self._origin, lane), _cell_height(plane)
+        # Cells are shifted by a random part of one: without it, all horizons of a slope would be rounded to the same ones.
+        # The border `low` is hidden, `high` is not. Steps from the first border double until they pass the horizon.
+        low, high, border, step = (
+            dr.full(mi.Int32, value, dr.width(lane))
+            for value in (0, _CELLS, _CELLS // 2, _CELLS if known is None else 1)
+        )
+        if known is not None:
+            guess = (self._guess(known, number, receiver) - plane) / height + shift
+            border = dr.clip(mi.Int32(dr.round(guess)), 1, _CELLS - 1)
+            found, some = receiver % _STRIDE == 0, dr.opaque(mi.UInt32, -(-self._count // _STRIDE))
+            cell = dr.gather(mi.Int32, known, number * some + receiver // _STRIDE, found)
+            low, high = dr.select(found, cell, low), dr.select(found, cell + 1, high)
+
+        def searching(low: Any, high: Any, border: Any, step: Any) -> Any:
+            return high - low > 1
+
+        def narrowed(low: Any, high: Any, border: Any, step: Any) -> tuple[Any, Any, Any, Any]:
+            elevation = plane + (border - shift) * height
+            inside = (elevation > plane) & (elevation < 0.5 * np.pi)
+            ray = _ray(origin, north, east, elevation)
+            hidden = terrain.mi_scene.ray_test(ray, active=inside) | (elevation <= plane)
+            low, high = dr.select(hidden, border, low), dr.select(hidden, high, border)
+            stepped = border + dr.select(hidden, step, -step)
+            return low, high, dr.select((stepped > low) & (stepped < high), stepped, (low + high) // 2), 2 * step
+
+        low, *_ = dr.while_loop((low, high, border, step), searching, narrowed)
+        dr.eval(low)
+        return low
+
+    def _guess(self, known: Any, number: Any, receiver: Any) -> Any:
+        """Elevation [rad] of the horizon of the nearest receiver of the known ones, at azimuth ``number`` of ``receiver``."""
+        import drjit as dr
+        import mitsuba as mi
+
+        some = -(-self._count // _STRIDE)
+        nearest = dr.minimum((receiver + _STRIDE // 2) // _STRIDE, dr.opaque(mi.UInt32, some - 1))
+        # Its azimuths are turned against those here; between two of them the elevation is linear.
+        turn, turned = (dr.gather(mi.Float, self._turn, index) for index in (receiver, nearest * _STRIDE))
+        place = mi.Float(number) + (turn - turned)
+        first = dr.floor(place)
+        azimuths = dr.opaque(mi.Int32, self._azimuths)
+
+        def elevation(azimuth: Any) -> Any:
+            azimuth = mi.UInt32((azimuth + azimuths) % azimuths)
+            cell = dr.gather(mi.Int32, known, azimuth * dr.opaque(mi.UInt32, some) + nearest)
+            return self._elevation(cell, 0.5, azimuth * self._receivers + nearest * _STRIDE)
+
+        before, after = (elevation(mi.Int32(first) + add) for add in (0, 1))
+        return before + (place - first) * (after - before)
+
+    def land(self, bound: Any) -> Any:
+        """Integral of the cosine of incidence between plane and bound."""
+        import drjit as dr
+
+        below, above = (_cosine_integral(self.along, self.upward, elevation) for elevation in (self._plane, bound))
+        return dr.maximum(above - below, 0.0)
+
+    def clusters(
+        self, terrain: RayScene, bound: Any, measure: Any, lane: np.ndarray, number: np.ndarray, mi_face_cluster: Any
+    ) -> np.ndarray:
+        """Clusters that rays between plane and bound hit; `ESCAPED` or `ABSORBED` for none.
+
+        ``lane`` is that of each ray, ``number`` its number among those of its receiver.
+        """
+        import drjit as dr
+        import mitsuba as mi
+
+        mi_lane, mi_number = (mi.UInt32(aligned(values, np.uint32)) for values in (lane, number))
+        receiver = mi_lane % self._receivers
+        # A lattice of place in the interval by ray (steps of the golden ratio) and by receiver: those whose azimuths are
+        # turned against each other have different elevations at them, too.
+        place = 5.0 * dr.gather(mi.Float, self._turn, receiver) + mi.Float(mi_number) * _GOLDEN
+        place -= dr.floor(place)
+        along, upward, low, high, whole, north, east = (
+            dr.gather(mi.Float, values, mi_lane)
+            for values in (self.along, self.upward, self._plane, bound, measure, *self._north_east)
+        )
+        # Elevations are distributed by the cosine of incidence.
+        wanted = _cosine_integral(along, upward, low) + whole * place
+        for _ in range(8):
+            middle = 0.5 * (low + high)
+            beyond = _cosine_integral(along, upward, middle) > wanted
+            low, high = dr.select(beyond, low, middle), dr.select(beyond, middle, high)
+        ray, active = _ray(dr.gather(mi.Point3f, self._origin, mi_lane), north, east, 0.5 * (low + high)), whole > 0.0
         found = terrain.mi_scene.ray_intersect_preliminary(ray, active=active)
         interaction = found.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
         cluster = mi.Int32(dr.gather(mi.UInt32, mi_face_cluster, found.prim_index, found.is_valid()))
         front = dr.dot(interaction.n, ray.d) < 0.0
-        return dr.select(found.is_valid(), dr.select(front, cluster, ABSORBED), ESCAPED)
+        return np.array(dr.select(found.is_valid(), dr.select(front, cluster, ABSORBED), ESCAPED))
 
-    def _ray(self, elevation: Any) -> Any:
-        import drjit as dr
-        import mitsuba as mi
 
-        sine, cosine = dr.sincos(elevation)
-        north, east = self._north_east
-        return mi.Ray3f(self._origin, mi.Vector3f(east * cosine, north * cosine, sine))
+def _cell_height(plane: Any) -> Any:
+    """Height [rad] of the cells between a plane's elevation and the zenith."""
+    return (0.5 * np.pi - plane) / (_CELLS - 1)
 
-    def _integral(self, elevation: Any) -> Any:
-        """Antiderivative over elevation of cosine of incidence × cosine of elevation."""
-        import drjit as dr
 
-        sine, cosine = dr.sincos(elevation)
-        return self.along * 0.5 * (elevation + sine * cosine) + self.upward * 0.5 * sine * sine
+def _cosine_integral(along: Any, upward: Any, elevation: Any) -> Any:
+    """Antiderivative over elevation of cosine of incidence × cosine of elevation."""
+    import drjit as dr
+
+    sine, cosine = dr.sincos(elevation)
+    return along * 0.5 * (elevation + sine * cosine) + upward * 0.5 * sine * sine
+
+
+def _ray(origin: Any, north: Any, east: Any, elevation: Any) -> Any:
+    import drjit as dr
+    import mitsuba as mi
+
+    sine, cosine = dr.sincos(elevation)
+    return mi.Ray3f(origin, mi.Vector3f(east * cosine, north * cosine, sine))
 
 
 def _integrals(

@@ -67,8 +67,8 @@ BLOCK_RAYS = 1 << 23
 _DIRECT_SHARPNESS = 64.0
 # Paths that are traced to place the clusters.
 _PILOTS = 1 << 18
-# Rays below the horizon at each azimuth of a receiver on a height field.
-_LAND_RAYS = 2
+# Rays below the horizon of a receiver on a height field, divided by the number of azimuths.
+_LAND_RAYS = 1
 # Distinguishes the random numbers of what a pixel mirrors from its own.
 _MIRRORED = np.uint32(1 << 31)
 # Number of receivers, and rays of each, from which the directional basis is computed.
