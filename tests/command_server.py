@@ -125,6 +125,7 @@ if __name__ == "__main__":
     import scipy.sparse.linalg  # noqa: F401
     import skyfield.api  # noqa: F401
     from few_rays import trace_few_rays
+    from kept_tables import keep_tables
 
     from seasonscapes.cli import main
     from seasonscapes.workflows import timelapse, view_rendering  # noqa: F401
@@ -132,6 +133,7 @@ if __name__ == "__main__":
     for each in sys.argv[1:]:
         _import(each)
     trace_few_rays()
+    keep_tables()
     print(json.dumps({"ready": True}), flush=True)
     for line in sys.stdin:
         print(json.dumps(run(json.loads(line))), flush=True)

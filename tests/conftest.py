@@ -10,6 +10,22 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 
+@pytest.fixture(scope="session", autouse=True)
+def kept_tables(request, tmp_path_factory):
+    """Atmosphere tables are computed once for all workers and what they start; see `kept_tables.py`."""
+    # What takes milliseconds asks for none, and would wait for the import.
+    if request.config.option.markexpr == "fast":
+        yield
+        return
+    from kept_tables import VARIABLE, keep_tables
+
+    base = tmp_path_factory.getbasetemp()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(VARIABLE, str((base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "tables"))
+        keep_tables()
+        yield
+
+
 @pytest.fixture(scope="module")
 def few_rays():
     """Light transport with few rays for a module's tests; see `few_rays.py`."""
