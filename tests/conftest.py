@@ -43,7 +43,7 @@ def coarse_viewer():
 
     from seasonscapes.workflows.viewer_scene import ViewerDetail
 
-    coarse = ViewerDetail(160, 256, 160, 48, 24, 8, 256, 16, 64)
+    coarse = ViewerDetail(160, 256, 160, 48, 24, 8, 256, 16, 64, light_heights=2)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ViewerDetail.__init__, "__defaults__", astuple(coarse))
         yield
