@@ -166,6 +166,36 @@ def test_blue_air_before_far_land_is_not_the_lands_colour(taken):
     assert abs(errors[1]) < 0.6 * errors[0]
 
 
+def test_green_of_the_air_changes_with_its_blue(taken):
+    factor = np.array([1.0, 4.0**0.38, 4.0])
+
+    def hazier(picture, photograph):
+        air = aerial_perspective_of(photograph.atmosphere, photograph.light, len(photograph.footprints.pixel))[1]
+        more = np.zeros_like(picture).reshape(-1, 3)
+        more[photograph.footprints.pixel] = photograph.gain * (factor - 1.0) * air
+        return np.minimum(picture + more.reshape(picture.shape), 0.95)
+
+    transport, hazy = _of_noon(taken, hazier)
+    corrected = with_natural_colours(transport, [hazy])[0]
+    count = len(hazy.footprints.pixel)
+    before, after = (aerial_perspective_of(each.atmosphere, each.light, count)[1] for each in (hazy, corrected))
+    found = np.median(after / before, axis=0)
+    assert found[2] > 2.0
+    assert found[1] == pytest.approx(found[2] ** 0.38, rel=0.1)
+
+
+def test_noise_of_single_pixels_is_not_blue_land(taken):
+    random = np.random.default_rng(3)
+    transport, plain = _of_noon(taken, lambda picture, _: picture)
+    noise = random.normal(0.0, 0.06, plain.observation.image.shape[:2])[..., None] * [0.0, 0.0, 1.0]
+    _, noisy = _of_noon(taken, lambda picture, _: np.clip(picture + noise, 0.01, 0.95))
+    kept, corrected = (with_natural_colours(transport, [each])[0] for each in (plain, noisy))
+    np.testing.assert_allclose(corrected.gain, kept.gain, rtol=0.02)
+    count = len(plain.footprints.pixel)
+    before, after = (aerial_perspective_of(each.atmosphere, each.light, count)[1] for each in (kept, corrected))
+    assert (np.abs(np.median(after / before, axis=0) - 1.0) < 0.2).all()
+
+
 def test_pixels_that_a_mask_leaves_out_measure_no_texel(taken):
     place, transport, _, without = taken
     light = illumination_for_camera(place, without[1].camera, sky_model("clear"), without[1].time)[0]

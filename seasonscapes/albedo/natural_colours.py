@@ -6,10 +6,12 @@ mountains are recovered in deep blue, and whatever is completed in their likenes
 neutral. Soil, rock and plants reflect less blue than red (Bowker et al. 1985, NASA RP-1139), snow, gravel and water about as
 much; nor is land black. Therefore
 
-- the bluest of the near ground, where it is bluer than the uncertainty of a white balance allows, is made neutral by it;
-- the airlight is increased in blue until the bluest of the far ground is neutral as well, or like the bluest near by, and
-  decreased in each channel as far as some far ground would otherwise reflect less than the darkest land (dark-object
-  subtraction, Chavez 1988, doi:10.1016/0034-4257(88)90019-3).
+- the bluest of the brightest near ground, where it is bluer than the uncertainty of a white balance allows, is made neutral by it;
+- the airlight is decreased as far as some far ground would otherwise reflect less than the darkest land (dark-object
+  subtraction, Chavez 1988, doi:10.1016/0034-4257(88)90019-3), and increased in blue until the bluest of the bright far ground
+  is neutral as well, or like the bluest near by. Its spectrum stays smooth: green changes with blue by a power of the wavelength.
+
+Extended land is what covers some pixels each way: single pixels are bluer by noise and by the lens.
 
 What already has possible colours stays as it is.
 """
@@ -39,15 +41,22 @@ log = logging.getLogger(__name__)
 
 # Where the air lets through more of the blue than this, ground is near: its colours are the camera's.
 _NEAR = 0.85
-# Of the brighter half, this share is the bluest ground. Of all, this share may be darker than the darkest land.
-_BLUEST, _DARKER = 0.1, 0.05
-_DARKEST_LAND = 0.01
+# White balances come from this share of the brightest near ground, and of that from the bluest share: snow, gravel, wet ground.
+_BRIGHTEST_NEAR, _BLUEST_NEAR = 0.1, 0.1
+# Airlight comes from more of the ground, since what is noise near by is noise over transmittance far off.
+_BRIGHTEST_FAR, _BLUEST_FAR = 0.2, 0.25
+# Snow, and shade that the sky lights, may be bluer than red by so much (of the logarithm).
+_NEUTRAL = 0.1
+# Of all, this share may be darker than the darkest land.
+_DARKER, _DARKEST_LAND = 0.05, 0.01
 # Far ground is looked at in so many layers of the air before it, of equally many pixels.
 _LAYERS = 4
 # White balances lie within a factor of two, also of blue against red in the shade; airlight within four of the model's.
 _BALANCE, _AIRLIGHT = 2.0, 4.0
-# Fewer pixels have no distribution.
-_FEWEST_PX = 500
+# Pixels are averaged over blocks of so many each way. Fewer blocks have no distribution.
+_BLOCK_PX, _FEWEST_BLOCKS = 4, 32
+# Where green lies between red and blue in the logarithm of the wavelength: 550 between 610 and 465 nm.
+_GREEN = 0.38
 # Land that reflects light onto other land; its colour is not known yet.
 _REFLECTING = 0.2
 _TINY = 1e-3
@@ -55,7 +64,7 @@ _TINY = 1e-3
 
 @dataclass(frozen=True)
 class _Ground:
-    """Usable terrain pixels of an hour's views: values over gain, light of white ground, transmittance, airlight, ``(n, 3)`` each."""
+    """Usable terrain of an hour's views, by blocks of pixels: values over gain, light of white ground, transmittance, airlight, ``(n, 3)`` each."""
 
     radiance: np.ndarray
     white: np.ndarray
@@ -155,53 +164,56 @@ def _correction(
     pieces = [_ground(transport, each, noise_model) for each in views]
     ground = _Ground(*(np.concatenate([getattr(each, field.name) for each in pieces]) for field in fields(_Ground)))
     is_near = ground.transmittance[:, 2] >= _NEAR
-    gain, airlight, allowed = np.ones(3), np.ones(3), 0.0
-    if is_near.sum() >= _FEWEST_PX:
-        near = ground.part(is_near).albedo()
-        bright, excess = _blue_excess(near)
-        bluest = np.median(bright[excess >= np.quantile(excess, 1.0 - _BLUEST)], axis=0)
+    gain, airlight, allowed = np.ones(3), np.ones(3), _NEUTRAL
+    if is_near.sum() >= _FEWEST_BLOCKS:
+        bright, excess = _blue_excess(ground.part(is_near).albedo(), _BRIGHTEST_NEAR)
+        bluest = np.median(bright[excess >= np.quantile(excess, 1.0 - _BLUEST_NEAR)], axis=0)
         by = float(np.log(np.maximum(bluest[2], _TINY) / np.maximum(bluest[0], _TINY)))
         if by > ASSUMED_SIGMA:
             gain = np.clip(bluest / luminance(bluest), 1.0 / _BALANCE, _BALANCE)
         else:
-            allowed = max(0.0, by)
-    if (~is_near).sum() >= _FEWEST_PX:
+            allowed = max(allowed, by)
+    if (~is_near).sum() >= _FEWEST_BLOCKS:
         far = ground.part(~is_near)
         airlight = _airlight_factor(replace(far, radiance=far.radiance / gain), allowed)
     return gain, airlight
 
 
 def _airlight_factor(far: _Ground, allowed: float) -> np.ndarray:
-    """Factors of the airlight, nearest to 1, with which far ground is not bluer than ``allowed``, nor, which comes first, black."""
+    """Factors of the airlight, nearest to 1, with which bright far ground is not bluer than allowed, nor any, which comes first, black."""
     # What holds on the whole need not hold for the farthest: each layer of air has its own distribution.
     edges = np.quantile(far.transmittance[:, 2], np.linspace(0.0, 1.0, _LAYERS + 1)[1:-1])
     layer = np.searchsorted(edges, far.transmittance[:, 2])
     layers = [far.part(layer == number) for number in range(_LAYERS)]
-    layers = [each for each in layers if len(each.radiance) >= _FEWEST_PX]
-    factor = np.ones(3)
-
-    def too_dark(value: float, channel: int) -> float:
-        tried = np.where(np.arange(3) == channel, value, factor)
-        return max(_DARKEST_LAND - float(np.quantile(each.albedo(tried)[:, channel], _DARKER)) for each in layers)
-
-    def too_blue(value: float) -> float:
-        tried = np.array([factor[0], factor[1], value])
-        return max(float(np.quantile(_blue_excess(each.albedo(tried))[1], 1.0 - _BLUEST)) for each in layers) - allowed
-
+    layers = [each for each in layers if len(each.radiance) >= _FEWEST_BLOCKS]
     if not layers:
-        return factor
-    for channel in (0, 1):
-        factor[channel] = 1.0 - _least(lambda less, channel=channel: too_dark(1.0 - less, channel), 0.0, 1.0)
-    bluest = _least(too_blue, 0.0, _AIRLIGHT)
-    wanted = max(1.0, bluest)
-    factor[2] = wanted - _least(lambda less: too_dark(wanted - less, 2), 0.0, wanted)
-    return factor
+        return np.ones(3)
+
+    def too_dark(factor: np.ndarray, channel: int) -> float:
+        return _DARKEST_LAND - min(float(np.quantile(each.albedo(factor)[:, channel], _DARKER)) for each in layers)
+
+    def too_blue(factor: np.ndarray) -> float:
+        excess = (_blue_excess(each.albedo(factor), _BRIGHTEST_FAR)[1] for each in layers)
+        return max(float(np.quantile(each, 1.0 - _BLUEST_FAR)) for each in excess) - allowed
+
+    def not_dark(wanted: float, least: float, channel: int) -> float:
+        """The factor nearest to a wanted one, but not below the least, at which this channel is not too dark."""
+        return wanted - _least(lambda less: too_dark(np.full(3, wanted - less), channel), 0.0, wanted - least)
+
+    least = min(not_dark(1.0, _TINY, channel) for channel in range(3))
+    wanted = _spectrum(least, _least(lambda blue: too_blue(_spectrum(least, blue)), least, _AIRLIGHT))
+    return np.array([not_dark(value, least, channel) for channel, value in enumerate(wanted)])
 
 
-def _blue_excess(albedo: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The brighter half of some ground ``(n, 3)``, and by how much it is bluer than neutral: the logarithm of blue over red."""
+def _spectrum(red: float, blue: float) -> np.ndarray:
+    """Red, green and blue factor of an airlight that changes by a power of the wavelength."""
+    return np.array([red, red ** (1.0 - _GREEN) * blue**_GREEN, blue])
+
+
+def _blue_excess(albedo: np.ndarray, brightest: float) -> tuple[np.ndarray, np.ndarray]:
+    """The brightest share of some ground ``(n, 3)``, and by how much it is bluer than neutral: the logarithm of blue over red."""
     light = luminance(albedo)
-    bright = albedo[light >= np.median(light)]
+    bright = albedo[light >= np.quantile(light, 1.0 - brightest)]
     return bright, np.log(np.maximum(bright[:, 2], _TINY) / np.maximum(bright[:, 0], _TINY))
 
 
@@ -216,7 +228,7 @@ def _least(excess: Callable[[float], float], low: float, high: float) -> float:
 
 
 def _ground(transport: TexelTransport, photograph: AlbedoPhotograph, noise_model: NoiseModel) -> _Ground:
-    """Usable terrain pixels of a photograph with a gain."""
+    """Usable terrain of a photograph with a gain, averaged over blocks of pixels that are at least half of it."""
     observation, footprints = photograph.observation, photograph.footprints
     assert photograph.gain is not None
     reflecting = np.full((*transport.shape, 3), _REFLECTING, np.float32)
@@ -228,4 +240,15 @@ def _ground(transport: TexelTransport, photograph: AlbedoPhotograph, noise_model
     usable = usable_pixels(observation, photograph.noise(noise_model)).ravel()[footprints.pixel]
     usable &= (white > 0.0).all(axis=1)
     values = observation.image.reshape(-1, 3)[footprints.pixel]
-    return _Ground(values / photograph.gain, white, transmittance, airlight).part(usable)
+    width = observation.image.shape[1]
+    row, column = np.divmod(footprints.pixel[usable], width)
+    _, block, count = np.unique(
+        (row // _BLOCK_PX) * width + column // _BLOCK_PX, return_inverse=True, return_counts=True
+    )
+    whole = count >= _BLOCK_PX**2 // 2
+
+    def averaged(each: np.ndarray) -> np.ndarray:
+        sums = [np.bincount(block, each[usable, channel]) for channel in range(3)]
+        return (np.stack(sums, axis=1) / count[:, None])[whole]
+
+    return _Ground(*map(averaged, (values / photograph.gain, white, transmittance, airlight)))
