@@ -10,6 +10,22 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 
+@pytest.fixture(scope="session", autouse=True)
+def kept_tables(request, tmp_path_factory):
+    """Atmosphere tables are computed once for all workers and what they start; see `kept_tables.py`."""
+    # What takes milliseconds asks for none, and would wait for the import.
+    if request.config.option.markexpr == "fast":
+        yield
+        return
+    from kept_tables import VARIABLE, keep_tables
+
+    base = tmp_path_factory.getbasetemp()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(VARIABLE, str((base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "tables"))
+        keep_tables()
+        yield
+
+
 @pytest.fixture(scope="module")
 def few_rays():
     """Light transport with few rays for a module's tests; see `few_rays.py`."""
@@ -27,7 +43,7 @@ def coarse_viewer():
 
     from seasonscapes.workflows.viewer_scene import ViewerDetail
 
-    coarse = ViewerDetail(160, 256, 160, 48, 24, 8, 256, 16, 64)
+    coarse = ViewerDetail(160, 256, 160, 48, 24, 8, 256, 16, 64, light_heights=2)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ViewerDetail.__init__, "__defaults__", astuple(coarse))
         yield

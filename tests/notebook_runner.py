@@ -38,7 +38,9 @@ if __name__ == "__main__":
     import scipy.sparse.linalg  # noqa: F401
     import skyfield.api  # noqa: F401
     from few_rays import trace_few_rays
+    from kept_tables import keep_tables
 
     trace_few_rays()
+    keep_tables()
     for each in sys.argv[1:]:
         print(json.dumps(execute(each)), flush=True)

@@ -4,16 +4,14 @@
 commands below (over the first two where there are fewer than 20). ``SEASONSCAPES_KILL_SEED`` repeats a sequence.
 """
 
-import json
 import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import places
 import pytest
+from command_server import CommandServer
 from file_contents import contents
 
 KILLS = int(os.environ.get("SEASONSCAPES_KILLS", "4"))
@@ -88,18 +86,10 @@ class Killer:
         self.folder = folder
         places.write_place(folder)
         (folder / "little.toml").write_text(places.MASSIF)
-        server = [sys.executable, str(Path(__file__).with_name("kill_server.py"))]
-        environment = {**os.environ, "SEASONSCAPES_WORKSPACE": "work"}
-        self.server = subprocess.Popen(
-            server, cwd=folder, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-        )
-        assert json.loads(self.server.stdout.readline())["ready"]
+        self.server = CommandServer(folder, environment={"SEASONSCAPES_WORKSPACE": "work"})
 
     def run(self, name: str, kill_after_s: float | None = None) -> dict:
-        order = {"arguments": list(COMMANDS[name]), "kill_after_s": kill_after_s, "log": "log.txt"}
-        self.server.stdin.write(json.dumps(order) + "\n")
-        self.server.stdin.flush()
-        return json.loads(self.server.stdout.readline())
+        return self.server.run(COMMANDS[name], "log.txt", kill_after_s=kill_after_s)
 
     def reset(self) -> None:
         for name in ("out", "work"):
@@ -108,16 +98,12 @@ class Killer:
     def told(self) -> str:
         return (self.folder / "log.txt").read_text()[-3000:]
 
-    def close(self) -> None:
-        self.server.stdin.close()
-        self.server.wait()
-
 
 @pytest.fixture(scope="module")
 def killer(tmp_path_factory):
     killer = Killer(tmp_path_factory.mktemp("killed"))
     yield killer
-    killer.close()
+    killer.server.close()
 
 
 def kills_of(number: int) -> int:

@@ -2,13 +2,12 @@
 
 import json
 import signal
-import subprocess
-import sys
-import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from command_server import CommandServer
 from file_contents import contents
 from PIL import Image
 from places import MASSIF
@@ -18,15 +17,6 @@ from seasonscapes.workspace import file_hash
 
 STAGES = ("pictures", "calibrate", "albedo", "paint", "inpaint", "relight", "distil", "splat")
 
-# The program with few rays.
-LAUNCHER = f"""import sys
-sys.path.insert(0, {str(Path(__file__).parent)!r})
-from few_rays import trace_few_rays
-trace_few_rays()
-from seasonscapes.cli import main
-sys.exit(main(sys.argv[1:]))
-"""
-
 
 class Runs:
     """Runs of one and the same job as processes of their own, each in its own folder and workspace."""
@@ -34,7 +24,7 @@ class Runs:
     def __init__(self, folder: Path):
         self.folder = folder
         (folder / "little.toml").write_text(MASSIF)
-        (folder / "launch.py").write_text(LAUNCHER)
+        self.server = CommandServer(folder, imports=["torch", "seasonscapes.workflows.full_run"])
 
     def arguments(self, name: str) -> list[str]:
         return [
@@ -72,20 +62,20 @@ class Runs:
             str(self.folder / name),
         ]
 
-    def start(self, name: str) -> subprocess.Popen:
-        command = [sys.executable, str(self.folder / "launch.py"), *self.arguments(name)]
-        return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    def run(self, name: str, log: str, **kill) -> tuple[int, str]:
+        """Exit code of a run, and all that it said, which stays in a file."""
+        code = self.server.run(self.arguments(name), log, **kill)["code"]
+        return code, (self.folder / log).read_text()
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory) -> Runs:
+def runs(tmp_path_factory) -> Iterator[Runs]:
     """With one run that nothing disturbed, ``whole``."""
     runs = Runs(tmp_path_factory.mktemp("runs"))
-    process = runs.start("whole")
-    told = process.stderr.read()
-    assert process.wait() == 0, told
-    (runs.folder / "whole.log").write_text(told)
-    return runs
+    code, told = runs.run("whole", "whole.log")
+    assert code == 0, told
+    yield runs
+    runs.server.close()
 
 
 def ledger_of(folder: Path) -> dict:
@@ -136,17 +126,9 @@ def test_panoramas_to_gaussians(runs, capsys):
 
 def killed_in(runs: Runs, name: str, stage: str, delay_s: float) -> list[str]:
     """Start a run, kill it so long after it says that it begins a stage; all that it said."""
-    process, told = runs.start(name), []
-    for line in process.stderr:
-        told.append(line.strip())
-        if line.startswith(f"run: {stage}: …"):
-            time.sleep(delay_s)
-            process.kill()
-            break
-    process.stderr.close()
-    code = process.wait()
+    code, told = runs.run(name, f"{name}-{stage}.log", kill_after_s=delay_s, said=[f"run: {stage}: …"])
     assert code == -signal.SIGKILL or stage == "splat", (stage, code, told)
-    return told
+    return [line.strip() for line in told.splitlines()]
 
 
 @pytest.mark.slow
@@ -166,9 +148,8 @@ def test_a_run_killed_in_every_stage_ends_as_one_that_nothing_disturbed(runs):
         for entry in ledger.values():
             for name, digest in entry["files"].items():
                 assert file_hash(killed / name) == digest, (stage, delay_s, name)
-    process = runs.start("killed")
-    told = process.stderr.read()
-    assert process.wait() == 0, told
+    code, told = runs.run("killed", "killed.log")
+    assert code == 0, told
     files = {name for entry in ledger_of(whole).values() for name in entry["files"]}
     assert {name for entry in ledger_of(killed).values() for name in entry["files"]} == files
     for name in sorted(files):

@@ -2,17 +2,15 @@
 
 import json
 import signal
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 import trimesh
+from command_server import CommandServer
 from file_contents import contents
 from PIL import Image
 from places import MASSIF
 from plyfile import PlyData
-from test_run import LAUNCHER
 from tiny_diffusion import write_tiny_weights
 
 from seasonscapes.calibration.calibration_file import read_calibration
@@ -26,6 +24,15 @@ pytest.importorskip("diffusers")
 
 STAGES = ("cloud", "pictures", "calibrate", "views", "paint", "path", "inpaint", "film", "distil", "splat")
 
+# All runs do with one import of what takes the longest.
+IMPORTS = (
+    "torch",
+    "transformers:CLIPTextModel",
+    "transformers:CLIPTokenizer",
+    "diffusers:StableDiffusionControlNetInpaintPipeline",
+    "seasonscapes.workflows.full_run",
+)
+
 
 class PaperRuns:
     """Runs of one job in processes of their own, each in its own folder and workspace."""
@@ -33,7 +40,7 @@ class PaperRuns:
     def __init__(self, folder):
         self.folder = folder
         (folder / "little.toml").write_text(MASSIF)
-        (folder / "launch.py").write_text(LAUNCHER)
+        self.server = CommandServer(folder, IMPORTS)
         write_tiny_weights(folder / "weights")
 
     def arguments(self, name):
@@ -57,18 +64,19 @@ class PaperRuns:
         }
         return ["run", str(self.folder / "little.toml"), *(str(part) for pair in flags.items() for part in pair)]
 
-    def start(self, name):
-        command = [sys.executable, str(self.folder / "launch.py"), *self.arguments(name)]
-        return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    def run(self, name, log, **kill):
+        """Exit code of a run, and all that it said."""
+        code = self.server.run(self.arguments(name), log, **kill)["code"]
+        return code, (self.folder / log).read_text()
 
 
 @pytest.fixture(scope="module")
 def paper_runs(tmp_path_factory):
     runs = PaperRuns(tmp_path_factory.mktemp("paper"))
-    process = runs.start("whole")
-    told = process.stderr.read()
-    assert process.wait() == 0, told
-    return runs
+    code, told = runs.run("whole", "whole.log")
+    assert code == 0, told
+    yield runs
+    runs.server.close()
 
 
 @pytest.mark.slow
@@ -131,19 +139,14 @@ def test_panoramas_to_gaussians_and_film(paper_runs):
 
 @pytest.mark.slow
 def test_killed_while_it_inpaints_it_goes_on_to_the_same_result(paper_runs):
-    process = paper_runs.start("killed")
-    for line in process.stderr:
-        if line.startswith("painting 3 views") or line.startswith("run: inpaint: …"):
-            process.kill()
-            break
-    process.stderr.close()
-    assert process.wait() == -signal.SIGKILL
+    at = ("painting 3 views", "run: inpaint: …")
+    code, told = paper_runs.run("killed", "kill.log", kill_after_s=0.0, said=at)
+    assert code == -signal.SIGKILL, told
     done = json.loads((paper_runs.folder / "killed" / "run.json").read_text())
     assert "path" in done
     assert "inpaint" not in done
-    process = paper_runs.start("killed")
-    told = process.stderr.read()
-    assert process.wait() == 0, told
+    code, told = paper_runs.run("killed", "again.log")
+    assert code == 0, told
     assert "run: paint: up to date" in told
     for name in ("cloud", "calibration", "views", "paint", "inpaint", "film", "gaussians", "splat"):
         files = [

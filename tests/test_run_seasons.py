@@ -1,17 +1,15 @@
 """Photographs of two seasons in one run: grouped by what they show, an albedo of each, refined, and pictures between them."""
 
 import json
-import subprocess
-import sys
 from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from command_server import CommandServer
 from PIL import Image
 from places import MASSIF
-from test_run import LAUNCHER
 
 from seasonscapes.cli import main
 from seasonscapes.sky.models import read_sky_model, with_overrides
@@ -27,7 +25,6 @@ def run(tmp_path_factory) -> Path:
     """Three days at an hour each, to the pictures of a summer's, a winter's and a day between."""
     folder = tmp_path_factory.mktemp("seasons")
     (folder / "little.toml").write_text(MASSIF)
-    (folder / "launch.py").write_text(LAUNCHER)
     times = [f"{day}T13:00" for days in DAYS.values() for day in days]
     arguments = [
         *("run", str(folder / "little.toml"), "--workspace", str(folder / "work"), "--times", ",".join(times)),
@@ -35,10 +32,10 @@ def run(tmp_path_factory) -> Path:
         *("--photo-size", "720x120", "--size", "96x64", "--texel-m", "120", "--refine", "1", "--max-error-m", "6"),
         *("--sky", "hosek", "--use-painted", "--use-inpainted", "--until", "relight", "-o", str(folder / "run")),
     ]
-    made = subprocess.run(
-        [sys.executable, str(folder / "launch.py"), *arguments], capture_output=True, text=True, check=False
-    )
-    assert made.returncode == 0, made.stderr
+    server = CommandServer(folder)
+    made = server.run(arguments, "log.txt")
+    server.close()
+    assert made["code"] == 0, (folder / "log.txt").read_text()
     return folder / "run"
 
 

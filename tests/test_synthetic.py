@@ -1,6 +1,7 @@
 """The embedded massif: seeded, shaped like mountains, and coloured by a calendar that can be trusted."""
 
 import dataclasses
+from functools import cache
 
 import numpy as np
 import pytest
@@ -23,14 +24,19 @@ from seasonscapes.terrain.synthetic_ice import grow_ice, mass_balance_m
 from seasonscapes.terrain.synthetic_layout import LAKE_LEVEL_M
 
 
+@cache
+def massif_of(spacing_m):
+    return alpine_massif(spacing_m=spacing_m)
+
+
 @pytest.fixture(scope="module")
 def place():
-    return alpine_massif(spacing_m=60.0)
+    return massif_of(60.0)
 
 
 @pytest.fixture(scope="module")
 def fine():
-    return alpine_massif(spacing_m=30.0)
+    return massif_of(30.0)
 
 
 @pytest.fixture(scope="module")
@@ -349,7 +355,7 @@ def test_the_shipped_massif_is_that_of_the_present_generator(spacing_m):
     from seasonscapes.terrain.shipped_massif import _packed, _unpacked, shipped_massif
 
     shipped = shipped_massif(seed=1912, size_m=12000.0, spacing_m=spacing_m)
-    fresh = alpine_massif(spacing_m=spacing_m)
+    fresh = massif_of(spacing_m)
     assert shipped is not None, "run make massif"
     assert shipped.elevation.transform == fresh.elevation.transform
     for name in ("slope_deg", "northness", "concavity_m", "debris", "shore_m"):

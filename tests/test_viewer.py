@@ -253,7 +253,7 @@ class TestPlaces:
                 viewer_scene(place, sky=sky)
 
     def test_a_large_raster_is_thinned_and_said_to_be(self, place, caplog):
-        detail = ViewerDetail(40, 64, 64, 24, 12, 4, 256, 4, 16)
+        detail = ViewerDetail(40, 64, 64, 24, 12, 4, 256, 4, 16, light_heights=2)
         scene = viewer_scene(place, sky=ss.sky_model("clear"), detail=detail)
         assert max(scene.arrays["heights"].shape) <= 41
         assert "heights every 77.9 m of the raster's 12.5 m" in caplog.text
@@ -266,7 +266,7 @@ class TestPlaces:
         (tmp_path / "pole.toml").write_text(text)
         write_raster(tmp_path / "dem.tif", hill_heights(), spacing_m=50.0, crs="EPSG:3995", origin=(-500.0, 2500.0))
         pole = ss.load_place(tmp_path / "pole.toml", place.workspace)
-        detail = ViewerDetail(40, 64, 64, 24, 12, 4, 256, 4, 16)
+        detail = ViewerDetail(40, 64, 64, 24, 12, 4, 256, 4, 16, light_heights=2)
         scene = viewer_scene(pole, sky=ss.sky_model("clear"), detail=detail)
         assert (scene.arrays["heights"] > 0).mean() > 0.4
         assert len(scene.albedo) == 1

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.signal import fftconvolve
 
 # Sums of a · exp(-b · distance): the share of light from beyond a distance [km], seen from space.
 _MOLECULES = ((0.930, 0.08), (0.070, 1.10))
@@ -111,6 +110,9 @@ def _mean_around(
     known: np.ndarray, molecules: np.ndarray, haze: np.ndarray, texel_m: float
 ) -> Callable[[np.ndarray], np.ndarray]:
     """Mean of the known land's values ``(R, S, 3)`` around each texel, as molecules and haze of these shares weigh it."""
+    # It loads all of scipy.stats, and most images are delit without the light of the land around.
+    from scipy.signal import fftconvolve
+
     rows, columns = known.shape
     every = max(1, -(-max(rows, columns) // _CELLS))
     size = (-(-columns // every), -(-rows // every))

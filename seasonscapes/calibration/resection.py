@@ -429,9 +429,10 @@ def _outlier_threshold(degrees_of_freedom: float, noise_is_estimated: bool) -> f
     """Residual in standard deviations that an inlier exceeds with probability 0.001 (χ², or F if σ is estimated)."""
     if not noise_is_estimated:
         return OUTLIER_SIGMAS
-    from scipy.stats import f
+    # Not by scipy.stats, which takes half a second to import.
+    from scipy.special import fdtri
 
-    return float(np.sqrt(2.0 * f.ppf(0.999, 2, max(degrees_of_freedom, 2.0))))
+    return float(np.sqrt(2.0 * fdtri(2.0, max(degrees_of_freedom, 2.0), 0.999)))
 
 
 def _effective_parameters(problem: ResectionProblem, jacobian: np.ndarray) -> float:
@@ -522,11 +523,11 @@ def _calibration(
     _, jacobian = _minimise(problem, parameters, noise, None, ~outlier)
     covariance = _covariance(problem, jacobian)
     if widen and len(residual):
-        from scipy.stats import t
+        from scipy.special import stdtrit
 
         degrees_of_freedom = max(2.0 * (~outlier).sum() - _effective_parameters(problem, jacobian), 1.0)
         # ± 2 sigma then covers 95.45 % although sigma itself is estimated.
-        covariance = covariance * (t.ppf(0.97725, degrees_of_freedom) / 2.0) ** 2
+        covariance = covariance * (stdtrit(degrees_of_freedom, 0.97725) / 2.0) ** 2
     skyline_rms = float("nan")
     if problem.skyline is not None:
         skyline_residual = problem.skyline.residuals(view, k1)

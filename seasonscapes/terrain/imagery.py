@@ -155,7 +155,11 @@ def bake_imagery(terrain: Terrain, atlas: Atlas, image: Raster, *, gutter_px: in
     if not weight.any():
         raise InputError("imagery", "the image covers none of the terrain", cure="check the CRS of both files")
     atlas_id = atlas_identity(terrain, atlas.width_px, atlas.height_px)
-    return filled_gutters(dilate(Texture(values, weight, atlas_id), face_id >= 0, gutter_px), face_id >= 0, gutter_px)
+    covered = face_id >= 0
+    # In place: copies of the arrays cost more than what is done to the few texels at their rims.
+    _dilate(values, weight, covered, gutter_px)
+    _fill_gutters(values, weight, covered, gutter_px)
+    return Texture(values, weight, atlas_id)
 
 
 def image_pixels(frame: LocalFrame, image: Raster, positions: np.ndarray) -> np.ndarray:
@@ -363,7 +367,14 @@ def dilate(texture: Texture, covered: np.ndarray, gutter_px: int) -> Texture:
     Texture
         The extended texture of the same atlas.
     """
-    values, weight, known = texture.values.copy(), texture.weight.copy(), covered.copy()
+    values, weight = texture.values.copy(), texture.weight.copy()
+    _dilate(values, weight, covered, gutter_px)
+    return replace(texture, values=values, weight=weight)
+
+
+def _dilate(values: np.ndarray, weight: np.ndarray, covered: np.ndarray, gutter_px: int) -> None:
+    """`dilate` of values ``(H, W, 3)`` and weights ``(H, W)`` in place."""
+    known = covered.copy()
     rim_row, rim_column = np.nonzero(_widened(known, 1) & ~known)
     for _ in range(gutter_px):
         if not len(rim_row):
@@ -382,7 +393,6 @@ def dilate(texture: Texture, covered: np.ndarray, gutter_px: int) -> Texture:
         known[rim_row, rim_column] = True
         # The next ring lies beside this one.
         rim_row, rim_column = _unknown_beside(known, rim_row, rim_column)
-    return replace(texture, values=values, weight=weight)
 
 
 def _unknown_beside(known: np.ndarray, row: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -395,40 +405,27 @@ def _unknown_beside(known: np.ndarray, row: np.ndarray, column: np.ndarray) -> t
     return np.divmod(cell[~known.ravel()[cell]], width)
 
 
-def filled_gutters(texture: Texture, covered: np.ndarray, gutter_px: int) -> Texture:
-    """Give texels farther from every chart than its gutter the colour and weight of the nearest that has one.
+def _fill_gutters(values: np.ndarray, weight: np.ndarray, covered: np.ndarray, gutter_px: int) -> None:
+    """Give texels farther from every chart than its gutter the colour and weight of the nearest that has one, in place.
 
     Nothing on the surface reads them at full resolution; coarser copies of the texture, made by other programs, do.
-
-    Parameters
-    ----------
-    texture
-        What `dilate` returns.
-    covered
-        ``(H, W)`` bool, True where a chart lies.
-    gutter_px
-        Number of rings that `dilate` has added [texels].
-
-    Returns
-    -------
-    Texture
-        A texture of the same atlas without empty texels between charts.
+    ``covered`` ``(H, W)`` is True where a chart lies, ``gutter_px`` the number of rings that `_dilate` has added [texels].
     """
     known = _widened(covered, gutter_px) if gutter_px else covered
     if known.all() or not known.any():
-        return texture
+        return
     empty = ~known
     # Distances are those of steps on the grid of texels, a few percent off.
     _, labelled = cv2.distanceTransformWithLabels(
         empty.view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
     label = labelled.astype(np.int32, copy=False)
+    # The nearest known texel lies beside an unknown one.
+    rim = np.flatnonzero(_widened(empty, 1) & known)
     source = np.empty(int(label.max()) + 1, np.intp)
-    source[label[known]] = np.flatnonzero(known)
+    source[label.ravel()[rim]] = rim
     nearest = source[label[empty]]
-    values, weight = texture.values.copy(), texture.weight.copy()
-    values[empty], weight[empty] = texture.values.reshape(-1, 3)[nearest], texture.weight.ravel()[nearest]
-    return replace(texture, values=values, weight=weight)
+    values[empty], weight[empty] = values.reshape(-1, 3)[nearest], weight.ravel()[nearest]
 
 
 def _widened(mask: np.ndarray, rings: int) -> np.ndarray:

@@ -25,6 +25,7 @@ from seasonscapes.workspace import build_once
 
 if TYPE_CHECKING:
     from seasonscapes.export.viewer_files import AlbedoPicture, ViewerScene
+    from seasonscapes.rendering.hemisphere_rays import RayScene
     from seasonscapes.sky.light_tables import LightTables
 
 log = logging.getLogger(__name__)
@@ -69,6 +70,8 @@ class ViewerDetail:
         Hemisphere rays of each point, a power of two.
     tile_levels
         Times that the grid of heights is halved into tiles at most, which the page loads near its viewer.
+    light_heights
+        Heights of the viewer at which sky and air are tabulated, 2 to 5; between them the page interpolates.
     """
 
     most_nodes: int = 1280
@@ -81,6 +84,7 @@ class ViewerDetail:
     clusters_per_point: int = 32
     rays: int = 256
     tile_levels: int = 0
+    light_heights: int = 5
 
 
 SMALL = ViewerDetail(640, 1024, 640, 224, 112, 8, 1024, 16, 128)
@@ -162,18 +166,23 @@ def _build(
     place: Place, dated: Sequence[DatedAlbedo], sky: AtmosphereModel, detail: ViewerDetail, progress: Progress | None
 ) -> ViewerScene:
     from seasonscapes.export.viewer_files import ViewerScene
+    from seasonscapes.rendering.hemisphere_rays import ray_scene
+    from seasonscapes.rendering.mitsuba_scene import mi_mesh
 
     grid, up, known = grid_heights(place, detail.most_nodes)
     detail = _fitting(detail, max(grid.columns, grid.rows))
     low, high = float(up[known].min()), float(up[known].max())
     scale = max(high - low, 1.0) / 65534.0
     heights = np.where(known, 1 + np.rint((up - low) / scale), 0).astype(np.uint16)
-    light = _light(place, sky, task_progress(progress, "light", end=0.3))
+    light = _light(place, sky, detail.light_heights, task_progress(progress, "light", end=0.3))
     arrays: dict[str, np.ndarray] = {"heights": heights}
-    pictures, order = _albedo(place, grid, dated, detail, progress)
+    # Where reflected light matters does not depend much on the date: the brightest one decides.
+    base = max(dated, key=lambda each: float(each.load().values.mean()))
+    rays = ray_scene(mi_mesh(place.terrain, base.load().values))
+    pictures, order = _albedo(place, grid, rays, dated, detail, progress)
     if order is not None:
         arrays["snow_order"] = order
-    arrays |= _transport(place, grid, dated, detail, task_progress(progress, "light", start=0.3))
+    arrays |= _transport(place, grid, rays, detail, task_progress(progress, "light", start=0.3))
     arrays |= _light_arrays(light)
     about = {
         "name": place.scene.name,
@@ -230,7 +239,12 @@ def _zone(place: Place) -> str:
 
 
 def _albedo(
-    place: Place, grid: ViewerGrid, dated: Sequence[DatedAlbedo], detail: ViewerDetail, progress: Progress | None
+    place: Place,
+    grid: ViewerGrid,
+    rays: RayScene,
+    dated: Sequence[DatedAlbedo],
+    detail: ViewerDetail,
+    progress: Progress | None,
 ) -> tuple[list[AlbedoPicture], np.ndarray | None]:
     """Pictures of the albedos, and in which order places lose their snow, where there are several dates."""
     from seasonscapes.export.viewer_files import albedo_picture
@@ -244,7 +258,7 @@ def _albedo(
     for index, each in enumerate(dated):
         longest = detail.albedo_px if index in sharp else detail.other_albedo_px
         if longest not in lookups:
-            lookups[longest] = _uv(place, grid, longest)
+            lookups[longest] = _uv(place, grid, rays, longest)
         uv, nearest, shape = lookups[longest]
         pictures.append(albedo_picture(each.day, _seen(each.load().values, uv, nearest, shape)))
         report((index + 1) / len(dated))
@@ -254,20 +268,17 @@ def _albedo(
         first, last = dated
     else:
         first, last = dated[int(np.argmax(means))], dated[int(np.argmin(means))]
-    uv, nearest, shape = _uv(place, grid, detail.sky_px)
+    uv, nearest, shape = _uv(place, grid, rays, detail.sky_px)
     order = _seen(snow_transition_between(place, first, last).values, uv, nearest, shape)[::-1, :, 0]
     return pictures, np.rint(np.clip(order, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
-def _uv(place: Place, grid: ViewerGrid, longest: int) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
+def _uv(place: Place, grid: ViewerGrid, rays: RayScene, longest: int) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
     """Texture coordinates ``(K, 2)`` seen from above, which of them each of N texels shows, rows and columns."""
     from scipy.ndimage import distance_transform_edt
 
-    from seasonscapes.rendering.hemisphere_rays import ray_scene
     from seasonscapes.rendering.irradiance import surface_at
-    from seasonscapes.rendering.mitsuba_scene import mi_mesh
 
-    rays = ray_scene(mi_mesh(place.terrain, np.full((2, 2, 3), 0.5, np.float32)))
     positions, shape = surface_positions(place, grid, longest)
     found, index = surface_at(rays, positions, search_m=_SEARCH_M)
     number = np.full(len(positions), -1)
@@ -292,13 +303,9 @@ def _seen(values: np.ndarray, uv: np.ndarray, nearest: np.ndarray, shape: tuple[
     return sample_texture(values, uv)[nearest][::-1]
 
 
-def _transport(
-    place: Place, grid: ViewerGrid, dated: Sequence[DatedAlbedo], detail: ViewerDetail, report
-) -> dict[str, Any]:
+def _transport(place: Place, grid: ViewerGrid, rays: RayScene, detail: ViewerDetail, report) -> dict[str, Any]:
     from seasonscapes.rendering.coefficients import SamplingOptions
     from seasonscapes.rendering.grid_transport import grid_transport
-    from seasonscapes.rendering.hemisphere_rays import ray_scene
-    from seasonscapes.rendering.mitsuba_scene import mi_mesh
 
     sampling = SamplingOptions(
         shadow_samples=1,
@@ -307,12 +314,9 @@ def _transport(
         clusters_per_receiver=detail.clusters_per_point,
         rank=detail.rank,
     )
-    # Where reflected light matters does not depend much on the date: the brightest one decides.
-    base = max(dated, key=lambda each: float(each.load().values.mean()))
-    scene = ray_scene(mi_mesh(place.terrain, base.load().values))
     sky_m, sky_shape = surface_positions(place, grid, detail.sky_px)
     bounce_m, bounce_shape = surface_positions(place, grid, detail.bounce_px)
-    traced = grid_transport(scene, sky_m, bounce_m, sampling, search_m=_SEARCH_M, progress=report)
+    traced = grid_transport(rays, sky_m, bounce_m, sampling, search_m=_SEARCH_M, progress=report)
     clusters = traced.clusters
     width, height = (grid.columns - 1) * grid.step_m, (grid.rows - 1) * grid.step_m
     origin = clusters.points.origin[..., :2]
@@ -336,13 +340,15 @@ def _transport(
     }
 
 
-def _light(place: Place, sky: AtmosphereModel, report) -> LightTables:
+def _light(place: Place, sky: AtmosphereModel, count: int, report) -> LightTables:
     from seasonscapes.sky.light_tables import light_tables
 
     heights = place.elevation.values
     low, high = float(heights.min()), float(heights.max()) + _ABOVE_M
     middle = place.median_height_m
-    knots = sorted({low + 2.0, middle, 0.5 * (middle + high - _ABOVE_M), high - _ABOVE_M, high})
+    # The surface's own and the highest are always among them.
+    by_importance = (middle, high, low + 2.0, high - _ABOVE_M, 0.5 * (middle + high - _ABOVE_M))
+    knots = sorted(set(by_importance[:count]))
     highest = min(
         90.0, 90.0 - abs(abs(place.frame.latitude_deg) - 28.7) if abs(place.frame.latitude_deg) > 28.7 else 90.0
     )
