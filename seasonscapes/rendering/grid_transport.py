@@ -11,7 +11,7 @@ from seasonscapes.rendering.coefficients import SamplingOptions
 from seasonscapes.rendering.hemisphere_rays import RayScene
 from seasonscapes.rendering.irradiance import surface_at
 from seasonscapes.rendering.light_clusters import LightClusters
-from seasonscapes.rendering.transport import prepare_transport, trace_points
+from seasonscapes.rendering.transport import listed_clusters, prepare_transport, trace_points
 
 _PILOTS = 1 << 17
 _BLOCK = 1 << 17
@@ -82,7 +82,7 @@ def grid_transport(
     shared = prepare_transport(terrain, pilot, sampling, seed=seed)
     report(0.2)
     sky = np.zeros((len(sky_m), sampling.rank), np.float32)
-    cluster = np.zeros((len(bounce_m), sampling.clusters_per_receiver), np.uint16)
+    cluster = np.zeros((len(bounce_m), listed_clusters(sampling, shared)), np.uint16)
     share = np.zeros(len(bounce_m), np.float32)
     total = len(sky_m) + len(bounce_m)
     done = 0

@@ -338,6 +338,13 @@ def prepare_transport(
     return replace(shared, clusters=replace(clusters, receivers=_concatenate_receivers(blocks)))
 
 
+def listed_clusters(sampling: SamplingOptions, shared: SharedTransport) -> int:
+    """Length of a receiver's list of clusters: on a height field no longer than the rays of equal weight that find them."""
+    if shared.above is None:
+        return sampling.clusters_per_receiver
+    return min(sampling.clusters_per_receiver, sampling.horizon_azimuths * _LAND_RAYS)
+
+
 def _zero_receivers(basis: DirectionBasis, sampling: SamplingOptions) -> ReceiverCoefficients:
     """A single receiver that receives no light."""
     return ReceiverCoefficients(
@@ -465,7 +472,7 @@ def _trace_receivers(
             key=identity ^ key,
             mi_face_cluster=shared.mi_face_cluster,
         )
-        cluster, hits = cluster_lists(seen.hit, seen.ray_weight, sampling.clusters_per_receiver, start=start)
+        cluster, hits = cluster_lists(seen.hit, seen.ray_weight, listed_clusters(sampling, shared), start=start)
         # The horizon tells better than the rays how much of the hemisphere is land.
         share = np.where(hits > 0.0, np.maximum(weight.sum(axis=1) - seen.sky_share, 0.0), 0.0)
         return ReceiverCoefficients(seen.coefficients.astype(np.float16), cluster, share.astype(np.float16))
