@@ -239,6 +239,8 @@ def scaled_pixels(image: np.ndarray, factor: np.ndarray) -> np.ndarray:
     import cv2  # slow to load
 
     values = np.ascontiguousarray(factor, np.float32).reshape(1, -1)
+    if values.size == 0:
+        return np.zeros((*np.shape(factor), 3), np.float32)
     scaled = np.asarray(cv2.merge([values, values, values])).reshape(*np.shape(factor), 3)
     return np.multiply(scaled, image, out=scaled)
 

@@ -61,6 +61,10 @@ def balanced(image: np.ndarray, white: tuple[float, float, float]) -> np.ndarray
     import cv2  # slow to load; as a matrix product it takes ten times as long
 
     values = np.ascontiguousarray(image)
+    if values.dtype not in (np.float32, np.float64):
+        values = values.astype(np.float32)
+    if values.size == 0:
+        return values
     adapted = np.asarray(cv2.transform(values.reshape(1, -1, 3), matrix.astype(np.float32))).reshape(values.shape)
     return np.maximum(adapted, 0.0, out=adapted)
 

@@ -30,7 +30,7 @@ def test_srgb_agrees_with_colour_science():
     np.testing.assert_allclose(linear_from_srgb(srgb_from_linear(values)), values, atol=2e-6)
 
 
-@pytest.mark.parametrize("shape", [(), (7,), (5, 4), (2, 3, 4)])
+@pytest.mark.parametrize("shape", [(), (7,), (5, 4), (2, 3, 4), (0,), (3, 0)])
 def test_scaled_pixels_are_those_of_broadcasting(shape):
     rng = np.random.default_rng(0)
     image, factor = rng.random((*shape, 3), np.float32), rng.random(shape, np.float32)

@@ -18,6 +18,14 @@ def test_white_becomes_neutral_and_keeps_its_luminance():
     assert neutral.mean() == pytest.approx(1.0, abs=0.02)
 
 
+@pytest.mark.parametrize("kind", [np.float16, np.float64, np.uint8])
+def test_pictures_of_other_types_are_balanced_alike(kind):
+    picture = np.array([[[2.0, 3.0, 5.0], [7.0, 1.0, 0.0]]])
+    expected = balanced(picture.astype(np.float32), DAYLIGHT_RGB)
+    np.testing.assert_allclose(balanced(picture.astype(kind), DAYLIGHT_RGB), expected, rtol=1e-5)
+    assert balanced(np.zeros((0, 3), kind), DAYLIGHT_RGB).shape == (0, 3)
+
+
 def test_a_low_sun_stays_warm_and_no_sun_is_neutral():
     noon, low = white_point(np.array([1.16, 1.0, 0.87])), white_point(np.array([1.8, 1.0, 0.3]))
     sunset = balanced(np.array([[1.8, 1.0, 0.3]]), low)[0]

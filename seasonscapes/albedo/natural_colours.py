@@ -7,7 +7,7 @@ neutral. Soil, rock and plants reflect less blue than red (Bowker et al. 1985, N
 much; nor is land black. Therefore
 
 - the bluest of the brightest near ground, where it is bluer than the uncertainty of a white balance allows, is made neutral by it;
-- the airlight is decreased as far as some far ground would otherwise reflect less than the darkest land (dark-object
+- the airlight is decreased, of all colours alike, as far as some far ground would otherwise reflect less than the darkest land (dark-object
   subtraction, Chavez 1988, doi:10.1016/0034-4257(88)90019-3), and increased in blue until the bluest of the bright far ground
   is neutral as well, or like the bluest near by. Its spectrum stays smooth: green changes with blue by a power of the wavelength.
 
@@ -180,7 +180,10 @@ def _correction(
 
 
 def _airlight_factor(far: _Ground, allowed: float) -> np.ndarray:
-    """Factors of the airlight, nearest to 1, with which bright far ground is not bluer than allowed, nor any, which comes first, black."""
+    """Factors of the airlight with which bright far ground is not bluer than allowed, nor any, which comes first, black.
+
+    The amount of air is decreased as the darkest channel wants it, of all colours alike; then blue and green are increased.
+    """
     # What holds on the whole need not hold for the farthest: each layer of air has its own distribution.
     edges = np.quantile(far.transmittance[:, 2], np.linspace(0.0, 1.0, _LAYERS + 1)[1:-1])
     layer = np.searchsorted(edges, far.transmittance[:, 2])

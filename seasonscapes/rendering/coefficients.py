@@ -30,7 +30,7 @@ class SamplingOptions:
     clusters
         Number M of clusters of faces, a power of two up to 65,536.
     clusters_per_receiver
-        Number K of clusters stored per receiver, even; on height fields at most as many as there are rays that find them.
+        Number K of clusters stored per receiver, even; on height fields at most as many as azimuths.
     rank
         Number r of daylight coefficients stored per receiver.
     patches

@@ -82,7 +82,7 @@ def grid_transport(
     shared = prepare_transport(terrain, pilot, sampling, seed=seed)
     report(0.2)
     sky = np.zeros((len(sky_m), sampling.rank), np.float32)
-    cluster = np.zeros((len(bounce_m), listed_clusters(sampling, shared)), np.uint16)
+    cluster = np.zeros((len(bounce_m), listed_clusters(sampling, shared.above)), np.uint16)
     share = np.zeros(len(bounce_m), np.float32)
     total = len(sky_m) + len(bounce_m)
     done = 0

@@ -1,7 +1,7 @@
 """Light that land receives which is a height field, from its horizon: above it there is sky in every direction, below it land.
 
 From a point on a height field a direction that is free stays free when it is raised (Max 1988, doi:10.1007/BF01905562).
-What the point receives of the sky follows from its horizon at some azimuths, which bisection with few rays finds, and from
+What the point receives of the sky follows from its horizon at some azimuths, which few rays find near that of a neighbour, and from
 integrals over elevation that are tabulated (cf. Dozier & Frew 1990, doi:10.1109/36.58986). What land it sees is told by
 rays below the horizon. Of as many rays distributed over the hemisphere most would tell nothing: they reach the sky far
 above the horizon.
@@ -131,7 +131,7 @@ def trace_horizons(
         Number of azimuths at which the horizon is searched, a power of two: evenly spaced, each from a point that is drawn in
         proportion to its weight.
     land_rays
-        Rays below the horizon, divided by the number of azimuths: more of them at azimuths with more land.
+        Rays below the horizon per azimuth in the mean: more of them at azimuths with more land.
     turn
         ``(N,)`` float32 offset of each receiver's azimuths, in spaces between them.
     key

@@ -67,7 +67,7 @@ BLOCK_RAYS = 1 << 23
 _DIRECT_SHARPNESS = 64.0
 # Paths that are traced to place the clusters.
 _PILOTS = 1 << 18
-# Rays below the horizon of a receiver on a height field, divided by the number of azimuths.
+# Rays below the horizon of a receiver on a height field, per azimuth in the mean.
 _LAND_RAYS = 1
 # Distinguishes the random numbers of what a pixel mirrors from its own.
 _MIRRORED = np.uint32(1 << 31)
@@ -312,13 +312,21 @@ def prepare_transport(
     above = sky_above(patches, basis.projection) if is_height_field(terrain) else None
     if sampling.bounces == 0 or hit_count == 0:
         unlit = LightClusters(
-            pilot[:1].reshape(1, 1), _zero_receivers(basis, sampling), basis.from_sky, sampling.patches, 0
+            pilot[:1].reshape(1, 1),
+            _zero_receivers(basis, listed_clusters(sampling, above)),
+            basis.from_sky,
+            sampling.patches,
+            0,
         )
         return SharedTransport(unclustered, basis, unlit, above)
     points, face_cluster = cluster_faces(hits, faces, sampling.clusters, seed=seed)
     size = len(points.origin)
     clusters = LightClusters(
-        points, _zero_receivers(basis, sampling), basis.from_sky, sampling.patches, sampling.bounces
+        points,
+        _zero_receivers(basis, listed_clusters(sampling, above)),
+        basis.from_sky,
+        sampling.patches,
+        sampling.bounces,
     )
     shared = SharedTransport(mi.UInt32(aligned(face_cluster, np.uint32)), basis, clusters, above)
     step = max(1, BLOCK_RAYS // sampling.rays)
@@ -338,19 +346,17 @@ def prepare_transport(
     return replace(shared, clusters=replace(clusters, receivers=_concatenate_receivers(blocks)))
 
 
-def listed_clusters(sampling: SamplingOptions, shared: SharedTransport) -> int:
+def listed_clusters(sampling: SamplingOptions, above: SkyAbove | None) -> int:
     """Length of a receiver's list of clusters: on a height field no longer than the rays of equal weight that find them."""
-    if shared.above is None:
+    if above is None:
         return sampling.clusters_per_receiver
     return min(sampling.clusters_per_receiver, sampling.horizon_azimuths * _LAND_RAYS)
 
 
-def _zero_receivers(basis: DirectionBasis, sampling: SamplingOptions) -> ReceiverCoefficients:
+def _zero_receivers(basis: DirectionBasis, listed: int) -> ReceiverCoefficients:
     """A single receiver that receives no light."""
     return ReceiverCoefficients(
-        np.zeros((1, basis.projection.shape[1]), np.float16),
-        np.zeros((1, sampling.clusters_per_receiver), np.uint16),
-        np.zeros(1, np.float16),
+        np.zeros((1, basis.projection.shape[1]), np.float16), np.zeros((1, listed), np.uint16), np.zeros(1, np.float16)
     )
 
 
@@ -472,7 +478,7 @@ def _trace_receivers(
             key=identity ^ key,
             mi_face_cluster=shared.mi_face_cluster,
         )
-        cluster, hits = cluster_lists(seen.hit, seen.ray_weight, listed_clusters(sampling, shared), start=start)
+        cluster, hits = cluster_lists(seen.hit, seen.ray_weight, listed_clusters(sampling, shared.above), start=start)
         # The horizon tells better than the rays how much of the hemisphere is land.
         share = np.where(hits > 0.0, np.maximum(weight.sum(axis=1) - seen.sky_share, 0.0), 0.0)
         return ReceiverCoefficients(seen.coefficients.astype(np.float16), cluster, share.astype(np.float16))

@@ -65,7 +65,7 @@ class ViewerDetail:
     clusters
         Groups of faces that reflect light, at most; a power of two.
     clusters_per_point
-        Groups that each point sees, a multiple of 4.
+        Groups that each point sees, a multiple of 4, at most a sixteenth of the rays.
     rays
         Hemisphere rays of each point, a power of two.
     tile_levels
@@ -81,15 +81,19 @@ class ViewerDetail:
     bounce_px: int = 192
     rank: int = 12
     clusters: int = 4096
-    clusters_per_point: int = 32
+    clusters_per_point: int = 16
     rays: int = 256
     tile_levels: int = 0
     light_heights: int = 5
 
+    def __post_init__(self):
+        if not 2 <= self.light_heights <= 5:
+            raise ValueError(f"ViewerDetail: got {self.light_heights} light_heights, expected 2 to 5")
 
-SMALL = ViewerDetail(640, 1024, 640, 224, 112, 8, 1024, 16, 128)
+
+SMALL = ViewerDetail(640, 1024, 640, 224, 112, 8, 1024, 8, 128)
 # Of places with more heights along a side than the default shows: what the first picture needs stays below 60 MB.
-LARGE = ViewerDetail(2560, 4096, 2048, 640, 320, 12, 16384, 32, 128, tile_levels=3)
+LARGE = ViewerDetail(2560, 4096, 2048, 640, 320, 12, 16384, 8, 128, tile_levels=3)
 
 
 def viewer_scene(
