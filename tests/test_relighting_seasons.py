@@ -1,6 +1,7 @@
 """Days between dated albedos: snow goes up and comes down the mountain and does not fade."""
 
 import json
+import logging
 from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from seasonscapes.albedo.seasons import (
     snow_share,
     snow_transition,
     snowline_fraction,
+    warn_of_unseen_seasons,
 )
 from seasonscapes.cli import main
 from seasonscapes.scene import read_scene
@@ -368,3 +370,15 @@ def test_distill_takes_dates_of_any_years(mountain):
     np.testing.assert_array_equal(found[0][1], load_texture(snowy).values)
     with pytest.raises(InputError, match="twice"):
         dated_textures(place, dated(("2022-07-19", green), ("2023-07-19", snowy)), 4)
+
+
+def test_seasons_that_no_picture_shows_are_told(caplog):
+    photographed = [date(2019, 12, 28), date(2021, 6, 20)]
+    with caplog.at_level(logging.WARNING):
+        warn_of_unseen_seasons([date(2024, 1, 30), date(2024, 7, 1)], photographed)
+    assert not caplog.records
+    with caplog.at_level(logging.WARNING):
+        warn_of_unseen_seasons([date(2024, 9, 1), date(2024, 9, 1), date(2024, 7, 1)], photographed)
+    assert [each.getMessage() for each in caplog.records] == [
+        "2024-09-01 lies 74 days of the year from every picture: snow and leaves of that season were never seen"
+    ]

@@ -10,7 +10,8 @@ All functions apply to N points of any kind: texels, pixels of a view, Gaussians
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import logging
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from datetime import date
 
@@ -19,6 +20,10 @@ import numpy as np
 from seasonscapes.terrain.attributes import TerrainAttributes
 from seasonscapes.terrain.surface import Texture
 
+log = logging.getLogger(__name__)
+
+# Photographs of another time of the year show other snow and leaves [days].
+SEASON_DAYS = 45
 SEASONS = ("blended", "nearest", "snow-line")
 # A tropical year [days]; dates are compared by their position within it, whatever the year of the photograph.
 YEAR_DAYS = 365.2422
@@ -139,6 +144,32 @@ def day_number(day: date) -> float:
         Day number, from 1 to 366.
     """
     return float(day.timetuple().tm_yday)
+
+
+def warn_of_unseen_seasons(days: Collection[date], photographed: Collection[date]) -> None:
+    """Warn of days that are too far in the year from every photographed one to show the same snow and leaves.
+
+    Parameters
+    ----------
+    days
+        Days that are asked for.
+    photographed
+        Days of the photographs, of any year; at least one.
+
+    Examples
+    --------
+    >>> from datetime import date
+    >>> warn_of_unseen_seasons([date(2024, 7, 1)], [date(2019, 6, 20)])
+    """
+    seen = [each.timetuple().tm_yday for each in photographed]
+    for day in sorted(set(days)):
+        away = min(abs((each - day.timetuple().tm_yday + 182) % 365 - 182) for each in seen)
+        if away > SEASON_DAYS:
+            log.warning(
+                "%s lies %d days of the year from every picture: snow and leaves of that season were never seen",
+                day,
+                away,
+            )
 
 
 def season_weights(dates: Sequence[date], day: date, *, season: str = "blended") -> list[tuple[int, float]]:

@@ -8,6 +8,7 @@ from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
+from seasonscapes.albedo.seasons import warn_of_unseen_seasons
 from seasonscapes.exposure import exposure_ev100
 from seasonscapes.images import atomic_path, write_png
 from seasonscapes.progress import Progress
@@ -324,6 +325,7 @@ def _film(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
 def _relight(job: RunJob, folder: Path, progress: Progress | None) -> list[Path]:
     place = job.place
     hours = list(job.hours)
+    warn_of_unseen_seasons([each.date() for each in hours], [each.date() for each in job.times])
     render_job = RenderJob(
         place.path.resolve(),
         place.workspace.folder.resolve(),

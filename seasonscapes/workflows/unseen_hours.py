@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from seasonscapes.albedo.picture_conditions import ViewLight
+from seasonscapes.albedo.seasons import warn_of_unseen_seasons
 from seasonscapes.cameras.pinhole import Camera, view_in_frame
 from seasonscapes.errors import InputError
 from seasonscapes.progress import Progress, task_progress
@@ -35,8 +36,6 @@ _STANDS_STILL_PX = 0.5
 _LEAST_SHOWN = 0.02
 # A picture is meant by a time within so many seconds.
 _SAME_PICTURE_S = 60.0
-# Pictures of another time of the year show other snow and leaves [days].
-SEASON_DAYS = 45
 # Suns this far apart [deg] light slopes alike: the width of the weights of pictures.
 _ALIKE_DEG = 30.0
 Sky = Literal["any", "sun", "no sun"]
@@ -249,7 +248,7 @@ class CameraHours:
         from seasonscapes.albedo.fixed_camera import SUN_SHONE, relit_at
 
         utc = utc_at(self.view.place, time)
-        self._warn_of_season(utc)
+        warn_of_unseen_seasons([utc.date()], [each.date() for each in self.times])
         light = light_on_view(self.view, utc)
         lit = (self.fitted.direct > SUN_SHONE) & ~self.closed
         alike = {"any": np.ones_like(lit), "sun": lit, "no sun": ~self.shone}[sky]
@@ -263,16 +262,6 @@ class CameraHours:
         image = self.background.copy()
         image.reshape(-1, 3)[self.view.pixel[self.shown]] = values[self.shown]
         return image
-
-    def _warn_of_season(self, time: datetime) -> None:
-        day = time.timetuple().tm_yday
-        away = min(abs((each.timetuple().tm_yday - day + 182) % 365 - 182) for each in self.times)
-        if away > SEASON_DAYS:
-            log.warning(
-                "%s lies %d days of the year from every picture: snow and leaves of that season were never seen",
-                time.date().isoformat(),
-                away,
-            )
 
 
 def camera_hours(place: Place, photographs: Sequence[Observation], *, progress: Progress | None = None) -> CameraHours:
