@@ -171,25 +171,30 @@ name = "bolternosa"
 attribution = "Norwegian Polar Institute, CC BY 4.0"
 
 [elevation]
-file = "dem.tif"
+file = "dem_20m.tif"
+
+[[elevation.finer]]
+file = "dem_2_5m.tif"
 
 [[webcam]]
 id = "bolternosa"
 latitude_deg = {latitude_deg}
 longitude_deg = {longitude_deg}
 height_m = {height_m}
-position_sigma_m = 30.0
+position_sigma_m = 50.0
 projection = "perspective"
 heading_deg = 8.0
 horizontal_fov_deg = 44.5
 width_px = 5752
 height_px = 3592
-time_zone = "UTC"
+time_zone = "Arctic/Longyearbyen"
 """
 
 
 def _albedo_inputs(data: Path, folder: Path) -> None:
-    """Scene, points and pictures as a user has them; the camera's start values are those of the data set."""
+    """Scene, points, pictures and their mask as a user has them; the camera's start values are those of the data set."""
+    import cv2
+    import numpy as np
     import rasterio.warp
 
     def degrees(east: float, north: float) -> tuple[float, float]:
@@ -200,7 +205,8 @@ def _albedo_inputs(data: Path, folder: Path) -> None:
     latitude, longitude = degrees(start["X_ini"], start["Y_ini"])
     text = _SCENE.format(latitude_deg=latitude, longitude_deg=longitude, height_m=start["Z_ini"])
     (folder / "scene.toml").write_text(text)
-    (folder / "dem.tif").write_bytes((data / "dem_2_5m.tif").read_bytes())
+    for heights in ("dem_20m.tif", "dem_2_5m.tif"):
+        (folder / heights).write_bytes((data / heights).read_bytes())
     with open(data / "gcps.csv") as file, open(folder / "points.csv", "w") as out:
         out.write("name,x_px,y_px,latitude_deg,longitude_deg,height_m\n")
         for row in csv.DictReader(file, skipinitialspace=True):
@@ -210,6 +216,12 @@ def _albedo_inputs(data: Path, folder: Path) -> None:
     pictures.mkdir()
     for path in data.glob("*.jpg"):
         (pictures / path.name).write_bytes(path.read_bytes())
+    # The pictures lie on a larger black canvas, above a clock, and with a logo in their corner.
+    mask = np.zeros((3592, 5752), np.uint8)
+    mask[356:3137, 381:5425] = 255
+    mask[3083:, 4180:] = mask[3000:, 4718:] = 0
+    (folder / "masks").mkdir()
+    cv2.imwrite(str(folder / "masks" / "bolternosa.png"), mask)
 
 
 def albedo(job: Job) -> dict[str, float]:
@@ -223,8 +235,9 @@ def albedo(job: Job) -> dict[str, float]:
     first = str(folder / "bolternosa" / "2018-05-12_12-25.jpg")
     run(["webcams", scene, "--pictures", str(folder), "--manifest", manifest], folder)
     calibrate = ["calibrate", scene, "--picture", first, "--points", str(folder / "points.csv"), "--series", manifest]
-    run([*calibrate, "-o", str(folder / "calibration")], folder)
-    times = "2018-05-12T12:25Z,2018-09-08T09:25Z"
+    masks = ["--mask", str(folder / "masks" / "bolternosa.png")]
+    run([*calibrate, "--radial", *masks, "-o", str(folder / "calibration")], folder)
+    times = "2018-05-12T12:25,2018-09-08T09:25"
     arguments = [
         "albedo",
         scene,
@@ -232,10 +245,16 @@ def albedo(job: Job) -> dict[str, float]:
         manifest,
         "--calibrations",
         str(folder / "calibration"),
+        "--masks",
+        str(folder / "masks"),
+        "--sky",
+        "overcast",
+        "--visibility-km",
+        "90",
         "--times",
         times,
     ]
-    cost = run([*arguments, "--doubtful-poses", "-o", str(folder / "albedo.npz")], folder)
+    cost = run([*arguments, "-o", str(folder / "albedo.npz")], folder)
     return {"albedo_s": cost[0], "albedo_peak_gb": cost[1]}
 
 
