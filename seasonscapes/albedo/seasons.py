@@ -146,6 +146,19 @@ def day_number(day: date) -> float:
     return float(day.timetuple().tm_yday)
 
 
+def days_apart(first: date, second: date) -> float:
+    """Days between two dates within the year, which is a circle: 20 December and 10 January are three weeks apart.
+
+    Examples
+    --------
+    >>> from datetime import date
+    >>> round(days_apart(date(2023, 12, 20), date(2025, 1, 10)))
+    21
+    """
+    apart = abs(day_number(first) - day_number(second)) % YEAR_DAYS
+    return float(min(apart, YEAR_DAYS - apart))
+
+
 def warn_of_unseen_seasons(days: Collection[date], photographed: Collection[date]) -> None:
     """Warn of days that are too far in the year from every photographed one to show the same snow and leaves.
 
@@ -161,9 +174,8 @@ def warn_of_unseen_seasons(days: Collection[date], photographed: Collection[date
     >>> from datetime import date
     >>> warn_of_unseen_seasons([date(2024, 7, 1)], [date(2019, 6, 20)])
     """
-    seen = [each.timetuple().tm_yday for each in photographed]
     for day in sorted(set(days)):
-        away = min(abs((each - day.timetuple().tm_yday + 182) % 365 - 182) for each in seen)
+        away = round(min(days_apart(day, each) for each in photographed))
         if away > SEASON_DAYS:
             log.warning(
                 "%s lies %d days of the year from every picture: snow and leaves of that season were never seen",

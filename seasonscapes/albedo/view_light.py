@@ -9,7 +9,7 @@ import numpy as np
 from seasonscapes.albedo.picture_conditions import ViewLight
 from seasonscapes.rendering.receivers import incident_light, light_clusters
 from seasonscapes.rendering.relit_view import RelightableView, sun_cosine
-from seasonscapes.rendering.sun_visibility import first_samples, raised_rays
+from seasonscapes.rendering.sun_visibility import raised_rays
 from seasonscapes.sky.illumination import Illumination, Luminary
 
 # Below this cosine of incidence, visibility is that of ground rougher than the heights: this share of it sees the sun.
@@ -70,8 +70,7 @@ def _visible_share(view: RelightableView, lit: np.ndarray, direction: np.ndarray
 
 def view_raised(view: RelightableView, height_m: float) -> RelightableView:
     """A view whose ground receives sunlight as if it lay higher by ``height_m`` [m] below the same ridges."""
-    rays = raised_rays(view.rays, height_m)
-    return replace(view, rays=rays, first_rays=first_samples(rays))
+    return replace(view, rays=raised_rays(view.rays, height_m))
 
 
 def view_normals(view: RelightableView) -> np.ndarray:

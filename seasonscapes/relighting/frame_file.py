@@ -88,7 +88,7 @@ def is_whole_frame(path: Path) -> bool:
         return False
     try:
         pixels, header = _read(path)
-        frame_header(path)
+        _metering_and_provenance(header)
         return header["seasonscapes:sha256"] == _digest(pixels)
     except (RuntimeError, OSError, ValueError, KeyError, TypeError):
         # What OpenEXR and its readers raise for damaged files; the frame is rendered again.
@@ -115,7 +115,10 @@ def frame_header(path: Path) -> tuple[float, dict[str, Any]]:
     provenance
         As given to `save_frame`.
     """
-    header = _header(path)
+    return _metering_and_provenance(_header(path))
+
+
+def _metering_and_provenance(header: Mapping[str, Any]) -> tuple[float, dict[str, Any]]:
     provenance = header["seasonscapes:provenance"]
     provenance = json.loads(provenance) if isinstance(provenance, str) else provenance
     return float(header["seasonscapes:metered_ev100"]), provenance

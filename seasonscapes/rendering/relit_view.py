@@ -32,7 +32,6 @@ from seasonscapes.rendering.sun_visibility import (
     SunRays,
     bayer_disc_offset,
     first_sample_visible,
-    first_samples,
     sum_incidence,
     sun_rays,
 )
@@ -66,8 +65,8 @@ class RelightableView:
     ----------
     coefficients
         Coefficients of the view, in host memory.
-    rays, first_rays
-        Shadow rays from all samples, and from the first of each pixel.
+    rays
+        Shadow rays from all samples.
     receivers, clusters
         Light transport coefficients of the pixels, and the clusters of faces, on the device.
     silhouette
@@ -88,7 +87,6 @@ class RelightableView:
 
     coefficients: ViewCoefficients
     rays: SunRays
-    first_rays: SunRays
     receivers: DeviceReceivers
     clusters: DeviceClusters
     silhouette: np.ndarray
@@ -139,7 +137,6 @@ def relightable_view(terrain: RayScene, coefficients: ViewCoefficients) -> Relig
     return RelightableView(
         coefficients,
         rays,
-        first_samples(rays),
         upload_receivers(coefficients.receivers, passes),
         upload_clusters(terrain, coefficients.clusters),
         silhouette,
@@ -352,7 +349,7 @@ def sun_cosine(view: RelightableView, luminary: Luminary) -> np.ndarray:
         ``(n,)``.
     """
     cosine = np.maximum(view.coefficients.normal @ np.asarray(luminary.direction, np.float32), 0.0)
-    visible = first_sample_visible(view.first_rays, luminary)
+    visible = first_sample_visible(view.rays, luminary)
     traced = _differs_nearby(view, visible) | view.silhouette
     result = np.where(visible, cosine, 0.0)
     # The light reaches all nine pixels around: what matters on slopes that it grazes is which samples face it.

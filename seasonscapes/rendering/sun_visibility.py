@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -64,6 +65,24 @@ class SunRays:
 
         return dr.width(self.mi_weight) // self.samples
 
+    @cached_property
+    def first(self) -> SunRays:
+        """Rays of the first sample of each receiver, side by side: among the others each takes cache lines of its own."""
+        import drjit as dr
+        import mitsuba as mi
+
+        lane = dr.arange(mi.UInt32, self.receivers) * dr.opaque(mi.UInt32, self.samples)
+        origin = dr.gather(mi.Point3f, self.mi_origin, lane)
+        normal, geometric_normal = (
+            [dr.gather(mi.Float16, column, lane) for column in columns]
+            for columns in (self.mi_normal, self.mi_geometric_normal)
+        )
+        weight = dr.gather(mi.Float16, self.mi_weight, lane)
+        dr.eval(origin, normal, geometric_normal, weight)
+        return replace(
+            self, mi_origin=origin, mi_normal=normal, mi_geometric_normal=geometric_normal, mi_weight=weight, samples=1
+        )
+
 
 def sun_rays(
     terrain: RayScene,
@@ -109,24 +128,6 @@ def sun_rays(
     dr.eval(mi_origin, mi_normal, mi_geometric_normal, mi_weight, mi_disc_offset)
     samples = weight.shape[1]
     return SunRays(terrain, mi_origin, mi_normal, mi_geometric_normal, mi_weight, mi_disc_offset, samples, samples)
-
-
-def first_samples(rays: SunRays) -> SunRays:
-    """Shadow rays of the first sample of each receiver, side by side: among the others each takes cache lines of its own."""
-    import drjit as dr
-    import mitsuba as mi
-
-    lane = dr.arange(mi.UInt32, rays.receivers) * dr.opaque(mi.UInt32, rays.samples)
-    origin = dr.gather(mi.Point3f, rays.mi_origin, lane)
-    normal, geometric_normal = (
-        [dr.gather(mi.Float16, column, lane) for column in columns]
-        for columns in (rays.mi_normal, rays.mi_geometric_normal)
-    )
-    weight = dr.gather(mi.Float16, rays.mi_weight, lane)
-    dr.eval(origin, normal, geometric_normal, weight)
-    return replace(
-        rays, mi_origin=origin, mi_normal=normal, mi_geometric_normal=geometric_normal, mi_weight=weight, samples=1
-    )
 
 
 def raised_rays(rays: SunRays, height_m: float) -> SunRays:
@@ -211,7 +212,7 @@ def first_sample_visible(rays: SunRays, luminary: Luminary) -> np.ndarray:
     Parameters
     ----------
     rays
-        Shadow rays of N receivers; quickest of `first_samples`.
+        Shadow rays of N receivers.
     luminary
         Sun or moon.
 
@@ -228,7 +229,7 @@ def first_sample_visible(rays: SunRays, luminary: Luminary) -> np.ndarray:
     for start in range(0, len(result), LANES):
         count = min(LANES, len(result) - start)
         lane = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, start)
-        visible, _, _ = _visible(rays, disc, lane * dr.opaque(mi.UInt32, rays.samples))
+        visible, _, _ = _visible(rays.first, disc, lane)
         dr.eval(visible)
         result[start : start + count] = np.array(visible)
     return result

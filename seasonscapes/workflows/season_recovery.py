@@ -128,6 +128,7 @@ def _grouped_days(
     """UTC dates of the photographs by season; days that lie within one season by the albedo that each gives alone."""
     from seasonscapes.albedo.natural_colours import with_assumed_colours
     from seasonscapes.albedo.season_grouping import group_dates
+    from seasonscapes.albedo.seasons import days_apart
     from seasonscapes.albedo.standard_error import albedo_estimate
 
     days = sorted({each.time.date() for each in photographs})
@@ -163,21 +164,6 @@ def _grouped_days(
             log.warning("%s is left out of the albedo: alone it gives none (%s), and no day is near", day, doubts[day])
     log.info("seasons: %s", "; ".join(", ".join(map(str, sorted(group))) for group in groups))
     return groups
-
-
-def days_apart(first: date, second: date) -> float:
-    """Days between two dates within the year, which is a circle: 20 December and 10 January are three weeks apart.
-
-    Examples
-    --------
-    >>> from datetime import date
-    >>> round(days_apart(date(2023, 12, 20), date(2025, 1, 10)))
-    21
-    """
-    from seasonscapes.albedo.seasons import YEAR_DAYS, day_number
-
-    apart = abs(day_number(first) - day_number(second)) % YEAR_DAYS
-    return float(min(apart, YEAR_DAYS - apart))
 
 
 def group_of(seasons: Sequence[dict[str, Any]], time: datetime) -> int:

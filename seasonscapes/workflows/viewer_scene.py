@@ -425,10 +425,6 @@ def _overview(place: Place) -> Viewpoint:
 
 def nearest_date(scene: ViewerScene, day: date) -> date:
     """The date among a scene's albedos that is nearest in the year to a day."""
-    from seasonscapes.albedo.seasons import day_number
+    from seasonscapes.albedo.seasons import days_apart
 
-    def distance(other: date) -> float:
-        gap = abs(day_number(other) - day_number(day)) % 365.25
-        return min(gap, 365.25 - gap)
-
-    return min((picture.day for picture in scene.albedo), key=distance)
+    return min((picture.day for picture in scene.albedo), key=lambda other: days_apart(day, other))
