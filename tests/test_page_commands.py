@@ -31,7 +31,7 @@ NOT_RUN = {
     r"^seasonscapes render alpine_lake|--engine path -o view.png": "a large picture, for minutes; tests/test_water.py renders small ones",
     r"--turntable 36": "traces the light of 36 views; tests/test_meshes.py turns through fewer",
     r"^seasonscapes (albedo|paint|inpaint) my-valley": "needs panoramas large enough for a pose; tests/test_run.py runs these stages",
-    r"^seasonscapes webcams bolternosa.toml": "photographs that are not distributed",
+    r"^seasonscapes (webcams|render) bolternosa.toml": "photographs that are not distributed",
     r"--picture noon.jpg": "as on the page of webcams",
     r"^seasonscapes timelapse|^seasonscapes relight .*--every": "a film of many frames; tests/test_relighting.py films fewer",
     r"^seasonscapes irradiance my-valley.toml --from": "48 half-hours; that of the small scene runs",
