@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+from threadpoolctl import threadpool_limits
 
-if TYPE_CHECKING:
-    from sklearn.ensemble import HistGradientBoostingRegressor
+from seasonscapes.texturing.small_trees import SmallTrees, small_trees
 
 FOLDS = 4
 # Side of the blocks that share a fold, in multiples of the depth of the holes, and its lower limit [px].
@@ -31,13 +30,13 @@ class ErrorModel:
 
     Parameters
     ----------
-    model
-        Predicts the squared error, in units of ``size``, from predictors, predicted colour and spread.
+    trees
+        Logarithm of the squared error, in units of ``size``, from predictors, predicted colour and spread.
     size
         Mean squared error.
     """
 
-    model: HistGradientBoostingRegressor
+    trees: SmallTrees
     size: float
 
     def sigma(self, predictor: np.ndarray, colour: np.ndarray, spread: np.ndarray) -> np.ndarray:
@@ -57,11 +56,17 @@ class ErrorModel:
         ndarray
             ``(n,)`` float32.
         """
-        return np.sqrt(self.size * self.model.predict(_features(predictor, colour, spread))).astype(np.float32)
+        square = self.size * np.exp(self.trees(_features(predictor, colour, spread)))
+        return np.sqrt(square).astype(np.float32)
 
 
 def _features(predictor: np.ndarray, colour: np.ndarray, spread: np.ndarray) -> np.ndarray:
-    return np.column_stack([predictor, colour, spread]).astype(np.float32)
+    """``(G + 4, n)`` float32, each feature contiguous."""
+    features = np.empty((predictor.shape[1] + colour.shape[1] + 1, len(predictor)), np.float32)
+    features[: predictor.shape[1]] = predictor.T
+    features[predictor.shape[1] : -1] = colour.T
+    features[-1] = spread
+    return features
 
 
 def spatial_folds(position: np.ndarray, painted: np.ndarray, hole: np.ndarray, seed: int) -> np.ndarray:
@@ -146,7 +151,10 @@ def fit_error_model(
         early_stopping=False,  # pyright: ignore[reportArgumentType]
         random_state=seed,
     )
-    return ErrorModel(model.fit(_features(predictor, colour, spread), square / size), size)
+    # On some ten thousand rows threads wait for each other longer than they work.
+    with threadpool_limits(1, "openmp"):
+        model.fit(_features(predictor, colour, spread).T, square / size)
+    return ErrorModel(small_trees(model), size)
 
 
 def sigma_by_distance(fill: Fill, values: np.ndarray, known: np.ndarray, *, seed: int = 0) -> np.ndarray:
