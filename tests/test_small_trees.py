@@ -38,7 +38,7 @@ def test_sums_are_those_of_the_model(monkeypatch, missing_share):
 
 
 def test_a_missing_value_follows_its_own_branch():
-    model, rows = fitted(4, 4)
+    model, _ = fitted(4, 4)
     trees, empty = small_trees(model), np.full((5, 1), np.nan, np.float32)
     with threadpool_limits(1, "openmp"):
         assert np.exp(trees(empty))[0] == model.predict(empty.T)[0]

@@ -139,22 +139,43 @@ def push_pull(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
         ``(H, W, C)`` float32, finite everywhere if any weight is positive, 0 if none is.
     """
     weight = np.clip(np.asarray(weight, np.float32), 0.0, 1.0)
-    return _push_pull_level(np.where(weight[..., None] > 0.0, values, 0.0).astype(np.float32), weight)
+    known = weight > 0.0
+    return _merged(_push_pull_level([np.where(known, plane, np.float32(0.0)) for plane in _planes(values)], weight))
 
 
-def _push_pull_level(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+def _planes(values: np.ndarray) -> list[np.ndarray]:
+    """The channels of ``(H, W, C)`` float32, each contiguous: three channels side by side would be added three numbers at a time."""
+    return list(cv2.split(np.ascontiguousarray(values, np.float32)))
+
+
+def _merged(planes: list[np.ndarray]) -> np.ndarray:
+    return cv2.merge(planes).reshape(*planes[0].shape, len(planes))
+
+
+def _push_pull_level(planes: list[np.ndarray], weight: np.ndarray) -> list[np.ndarray]:
     if weight.min() >= 1.0 or max(weight.shape) <= 1:
-        return values
+        return planes
     height, width = weight.shape
-    edge = ((0, height % 2), (0, width % 2))
-    padded, padded_weight = np.pad(values * weight[..., None], (*edge, (0, 0))), np.pad(weight, edge)
-    shape = (padded.shape[0] // 2, 2, padded.shape[1] // 2, 2)
-    sums, total = padded.reshape(*shape, -1).sum(axis=(1, 3)), padded_weight.reshape(shape).sum(axis=(1, 3))
-    coarse = sums / np.maximum(total, 1e-6)[..., None]
-    coarse = _push_pull_level(coarse, np.minimum(total, 1.0))
-    up = cv2.resize(coarse, (2 * coarse.shape[1], 2 * coarse.shape[0]), interpolation=cv2.INTER_LINEAR)
-    up = up.reshape(*padded.shape)[:height, :width]
-    return values * weight[..., None] + up * (1.0 - weight[..., None])
+    held = [plane * weight for plane in planes]
+    share = _halved(weight)
+    norm = np.maximum(share, np.float32(0.25e-6))
+    coarse = _push_pull_level([_halved(plane) / norm for plane in held], np.minimum(4.0 * share, 1.0))
+    size, missing = (2 * share.shape[1], 2 * share.shape[0]), 1.0 - weight
+    filled = []
+    for small, plane in zip(coarse, held, strict=True):
+        up = cv2.resize(small, size, interpolation=cv2.INTER_LINEAR)[:height, :width]
+        up *= missing
+        up += plane
+        filled.append(up)
+    return filled
+
+
+def _halved(plane: np.ndarray) -> np.ndarray:
+    """Means over 2 × 2 pixels, with zeros beyond the last row and column of an odd side."""
+    height, width = plane.shape
+    if height % 2 or width % 2:
+        plane = cv2.copyMakeBorder(plane, 0, height % 2, 0, width % 2, cv2.BORDER_CONSTANT, value=0.0)
+    return cv2.resize(plane, (plane.shape[1] // 2, plane.shape[0] // 2), interpolation=cv2.INTER_AREA)
 
 
 def propagate(residual: np.ndarray, known: np.ndarray, *, reach_px: float = 12.0) -> np.ndarray:
@@ -181,10 +202,12 @@ def propagate(residual: np.ndarray, known: np.ndarray, *, reach_px: float = 12.0
     if known.all() or not known.any():
         return np.where(known[..., None], residual, 0.0).astype(np.float32)
     distance = cv2.distanceTransform((~known).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
-    decay = np.exp(-np.maximum(distance - 1.0, 0.0) / reach_px)[..., None]
-    share = cv2.GaussianBlur(known.astype(np.float32), (0, 0), _MEAN_PX)
-    sums = np.where(known[..., None], residual, 0.0).astype(np.float32)
-    # One channel at a time: OpenCV drops the axis of a single one, and takes four at most.
-    means = np.stack([cv2.GaussianBlur(channel, (0, 0), _MEAN_PX) for channel in np.moveaxis(sums, -1, 0)], -1)
-    means /= np.maximum(share, 1e-6)[..., None]
-    return np.where(known[..., None], residual, push_pull(means, known.astype(np.float32)) * decay).astype(np.float32)
+    decay = np.exp(-np.maximum(distance - 1.0, 0.0) / np.float32(reach_px))
+    weight = known.astype(np.float32)
+    share = np.maximum(cv2.GaussianBlur(weight, (0, 0), _MEAN_PX), 1e-6)
+    planes = [np.where(known, plane, np.float32(0.0)) for plane in _planes(residual)]
+    spread = _push_pull_level([cv2.GaussianBlur(plane, (0, 0), _MEAN_PX) / share for plane in planes], weight)
+    for plane, filled in zip(planes, spread, strict=True):
+        filled *= decay
+        np.copyto(filled, plane, where=known)
+    return _merged(spread)
