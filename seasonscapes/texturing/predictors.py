@@ -50,6 +50,10 @@ class Predictors:
         if self.values.shape[:2] != self.surface.shape:
             raise ValueError(f"Predictors: values {self.values.shape} and surface {self.surface.shape} differ in size")
 
+    def at(self, texel: np.ndarray) -> np.ndarray:
+        """Return the values ``(n, G)`` of flat indices ``(n,)`` of texels."""
+        return self.values.reshape(-1, self.values.shape[2])[texel]
+
 
 def stack_predictors(
     layers: Mapping[str, np.ndarray],
@@ -57,7 +61,6 @@ def stack_predictors(
     *,
     grid: TopDownGrid | None = None,
     surface: np.ndarray | None = None,
-    empty_images: bool = False,
 ) -> Predictors:
     """Stack layers and a satellite image in the same atlas.
 
@@ -71,8 +74,6 @@ def stack_predictors(
         As in `Predictors`.
     surface
         As in `Predictors`; ``None`` for the texels where every layer is finite.
-    empty_images
-        Keep a satellite image of which no texel has a value.
 
     Returns
     -------
@@ -92,7 +93,7 @@ def stack_predictors(
         surface = np.asarray(np.isfinite(columns).all(axis=0))
     if satellite is not None:
         imaged = (satellite.weight > 0.0) & np.isfinite(satellite.values).all(axis=2)
-        if empty_images or imaged.any():
+        if imaged.any():
             for channel in range(satellite.values.shape[2]):
                 columns.append(np.where(imaged, satellite.values[..., channel], np.nan).astype(np.float32))
                 names.append(f"satellite_{channel + 1}")

@@ -18,6 +18,7 @@ from seasonscapes.texturing.colour_regression import Regression, fit_extrapolati
 from seasonscapes.texturing.completion_error import ErrorModel, Predict, fit_error_model, spatial_folds
 from seasonscapes.texturing.predictors import Predictors
 from seasonscapes.texturing.smooth_fill import propagate
+from seasonscapes.texturing.tiled_predictors import WindowPredictors
 from seasonscapes.texturing.top_down_grid import from_grid, to_grid
 
 Progress = Callable[[float], None]
@@ -67,14 +68,16 @@ def regression_fill(
     report = progress or (lambda fraction: None)
     rng = np.random.default_rng(seed)
     known = np.flatnonzero(painted & predictors.surface)
-    table, flat = predictors.values.reshape(-1, predictors.values.shape[2]), values.reshape(-1, 3)
     sample = rng.choice(known, min(FAST_SAMPLES if fast else SAMPLES, len(known)), replace=False)
-    predictor, encoded = mask_imagery(table[sample], predictors, painted, rng), flat[sample].astype(np.float64)
+    predictor = mask_imagery(predictors.at(sample), predictors, painted, rng)
+    encoded = values.reshape(-1, 3)[sample].astype(np.float64)
     fold = texel_folds(sample, painted, predictors, seed)
     fitted = fit_completion(
         predictor, encoded, predictors.names, fold, fast=fast, seed=seed, progress=lambda done: report(0.35 * done)
     )
-    return completion_of(fitted, values, painted, predictors, progress=lambda done: report(0.35 + 0.6 * done))
+    hole = predictors.surface & ~painted
+    rim = rim_of(hole, painted & predictors.surface, predictors)
+    return completion_of(fitted, values, hole, rim, predictors, progress=lambda done: report(0.35 + 0.6 * done))
 
 
 @dataclass(frozen=True)
@@ -122,46 +125,49 @@ def fit_completion(
 def completion_of(
     fitted: FittedCompletion,
     values: np.ndarray,
-    painted: np.ndarray,
-    predictors: Predictors,
+    hole: np.ndarray,
+    rim: np.ndarray,
+    predictors: Predictors | WindowPredictors,
     *,
-    inside: np.ndarray | None = None,
     progress: Progress | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fill unpainted texels by a fitted regression, and propagate its residual at painted texels into them.
+    """Fill texels by a fitted regression, and propagate its residual at painted texels into them.
 
     Parameters
     ----------
     fitted
         From `fit_completion`.
-    values, painted, predictors, progress
+    values, predictors, progress
         As in `regression_fill`.
-    inside
-        ``(R, S)`` bool: texels whose filling is wanted; ``None`` for all. Painted texels outside of it give residuals.
+    hole
+        ``(R, S)`` bool: texels to fill.
+    rim
+        ``(R, S)`` bool: painted texels whose residual is propagated, from `rim_of`.
 
     Returns
     -------
     filled, sigma
-        As `regression_fill`; where not wanted, without meaning.
+        As `regression_fill`.
     """
     report = progress or (lambda fraction: None)
-    table = predictors.values.reshape(-1, predictors.values.shape[2])
-    hole = predictors.surface & ~painted
-    rim = _rim(hole, painted & predictors.surface, int(REACH_PX), predictors)
-    hole = hole if inside is None else hole & inside
-    predicted = np.zeros_like(values, dtype=np.float32)
-    sigma = np.zeros(painted.shape, np.float32)
+    filled, residual = values.astype(np.float32), np.zeros(values.shape, np.float32)
+    sigma = np.zeros(hole.shape, np.float32)
+    colours, residuals = filled.reshape(-1, 3), residual.reshape(-1, 3)
     target = np.flatnonzero(hole | rim)
     for start in range(0, len(target), BLOCK):
         part = target[start : start + BLOCK]
-        colour, spread = predict(fitted.regression, table[part])
-        predicted.reshape(-1, 3)[part] = colour
+        rows = predictors.at(part)
+        colour, spread = predict(fitted.regression, rows)
         wanted = hole.ravel()[part]
-        sigma.ravel()[part[wanted]] = fitted.error_model.sigma(table[part[wanted]], colour[wanted], spread[wanted])
+        open_, seen = part[wanted], part[~wanted]
+        residuals[seen] = colours[seen] - colour[~wanted]
+        colours[open_] = colour[wanted]
+        sigma.ravel()[open_] = fitted.error_model.sigma(rows[wanted], colour[wanted], spread[wanted])
         report(min(1.0, (start + BLOCK) / len(target)))
-    residual = np.where(rim[..., None], values - predicted, 0.0)
-    filled = np.where(hole[..., None], predicted + propagate_residual(residual, rim, predictors), values)
-    return filled.astype(np.float32), sigma
+    spread_residual = propagate_residual(residual, rim, predictors)
+    texel = np.flatnonzero(hole)
+    colours[texel] += spread_residual.reshape(-1, 3)[texel]
+    return filled, sigma
 
 
 def mask_imagery(
@@ -256,17 +262,19 @@ def texel_folds(texel: np.ndarray, painted: np.ndarray, predictors: Predictors, 
     return spatial_folds(position, painted, predictors.surface & ~painted, seed)
 
 
-def _rim(hole: np.ndarray, known: np.ndarray, reach_px: int, predictors: Predictors) -> np.ndarray:
-    """Known texels within reach of a hole; with several charts, all known texels."""
+def rim_of(hole: np.ndarray, known: np.ndarray, predictors: Predictors | WindowPredictors) -> np.ndarray:
+    """Known texels ``(R, S)`` within `REACH_PX` of a hole; with several charts, all known texels."""
     import cv2
 
     if predictors.grid is not None or not hole.any():
         return known
-    side = 2 * reach_px + 1
+    side = 2 * int(REACH_PX) + 1
     return known & (cv2.dilate(hole.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
 
 
-def propagate_residual(residual: np.ndarray, known: np.ndarray, predictors: Predictors) -> np.ndarray:
+def propagate_residual(
+    residual: np.ndarray, known: np.ndarray, predictors: Predictors | WindowPredictors
+) -> np.ndarray:
     """Propagate a residual into the holes, with several charts on the top-down grid; see `smooth_fill.propagate`.
 
     Parameters

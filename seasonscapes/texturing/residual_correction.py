@@ -119,8 +119,7 @@ def _fill_gaps(
 
 def _with_base(predictors: Predictors, base: np.ndarray, texel: np.ndarray) -> np.ndarray:
     """Predictors of flat texels with the base in the last three columns, ``(n, G + 3)``."""
-    table = predictors.values.reshape(-1, predictors.values.shape[2])[texel]
-    return np.concatenate([table, base.reshape(-1, 3)[texel]], axis=1)
+    return np.concatenate([predictors.at(texel), base.reshape(-1, 3)[texel]], axis=1)
 
 
 def _fit_correction(

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from seasonscapes.errors import NotEnoughEvidence
@@ -21,6 +22,7 @@ from seasonscapes.texturing.regression_fill import (
     FittedCompletion,
     completion_of,
     fit_completion,
+    rim_of,
     without_images,
 )
 from seasonscapes.texturing.smooth_fill import push_pull
@@ -142,9 +144,12 @@ def _brightest(texture: Texture, painted: np.ndarray, known: np.ndarray, tile_px
     """The greatest value of a known texel; refuses negative painted ones."""
     brightest = 0.0
     for tile in _windows(painted.shape, tile_px):
-        if texture.values[tile][painted[tile]].min(initial=0.0) < 0.0:
-            raise ValueError("complete: negative values among the painted texels")
-        brightest = max(brightest, float(texture.values[tile][known[tile]].max(initial=0.0)))
+        masks = [np.ascontiguousarray(mask[tile]).view(np.uint8) for mask in (painted, known)]
+        for plane in cv2.split(np.ascontiguousarray(texture.values[tile], np.float32)):
+            # Both are 0 where a mask is empty.
+            if cv2.minMaxLoc(plane, masks[0])[0] < 0.0:
+                raise ValueError("complete: negative values among the painted texels")
+            brightest = max(brightest, cv2.minMaxLoc(plane, masks[1])[1])
     return brightest
 
 
@@ -169,7 +174,7 @@ def _rows_of(predictors: TiledPredictors, texel: np.ndarray, tile_px: int) -> np
     for tile in _windows(predictors.surface.shape, tile_px):
         here = (row >= tile[0].start) & (row < tile[0].stop) & (column >= tile[1].start) & (column < tile[1].stop)
         if here.any():
-            rows[here] = predictors.window(tile).values[row[here] - tile[0].start, column[here] - tile[1].start]
+            rows[here] = predictors.at(row[here], column[here])
     return rows
 
 
@@ -189,20 +194,25 @@ def _filled(
     )
     core = tuple(slice(t.start - o.start, t.stop - o.start) for t, o in zip(tile, outer, strict=True))
     surface, known = predictors.surface[outer], painted[outer]
-    values = np.where(known[..., None], texture.values[outer], 0.0).astype(np.float32)
-    sigma = np.zeros(known.shape, np.float32)
+    values, sigma = np.array(texture.values[outer], np.float32), np.zeros(known.shape, np.float32)
+    values[~known] = 0.0
     inside = np.zeros(known.shape, bool)
     inside[core] = True
     off_surface = ~surface & ~known
     if (off_surface & inside).any():
         # What lies between charts is filled from the surface about it, which has to be complete first.
         inside[:] = True
-    hole = surface & ~known & inside
+    every_hole = surface & ~known
+    hole = every_hole & inside
     if fitted is not None and hole.any():
-        encoded = np.cbrt(values / np.float32(scale.unit))
-        filled, error = completion_of(fitted, encoded, known & surface, predictors.window(outer), inside=inside)
+        window = predictors.window(outer)
+        rim = rim_of(every_hole, known & surface, window)
+        encoded = np.zeros_like(values)
+        encoded[rim] = np.cbrt(values[rim] / np.float32(scale.unit))
+        filled, error = completion_of(fitted, encoded, hole, rim, window)
         # Cubing amplifies small errors of bright texels; no filled texel may be brighter than all known ones.
-        values[hole] = np.float32(scale.unit) * np.clip(filled[hole], 0.0, scale.brightest) ** 3
+        root = np.clip(filled[hole], 0.0, np.float32(scale.brightest))
+        values[hole] = np.float32(scale.unit) * root * root * root
         sigma[hole] = np.float32(scale.unit) * error[hole]
     if (off_surface & inside).any():
         extended = push_pull(np.concatenate([values, sigma[..., None]], -1), (~off_surface).astype(np.float32))

@@ -14,13 +14,16 @@ from numpy.typing import ArrayLike
 from seasonscapes.terrain.atlas import Atlas
 from seasonscapes.terrain.surface import Terrain, Texture
 from seasonscapes.terrain.texels import covering_faces, texel_coordinates
-from seasonscapes.texturing.predictors import Predictors, require_atlas_size, stack_predictors
+from seasonscapes.texturing.predictors import Predictors, require_atlas_size
 from seasonscapes.texturing.terrain_features import terrain_features
 from seasonscapes.texturing.top_down_grid import grid_heights
 
 # Terrain attributes are computed on at most this many cells; finer texels interpolate between them.
 MOST_CELLS = 12_000_000
 _BLOCK_PX = 2048
+# Texels of a window that are computed at once, in rows of some of them.
+_BLOCK = 1_000_000
+_ROW = 4096
 Window = tuple[slice, slice]
 
 
@@ -54,7 +57,8 @@ class TiledPredictors:
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the layers; see `predictors.Predictors`."""
-        return self.window((slice(0, 1), slice(0, 1))).names
+        channels = 0 if self._image is None else self._image.values.shape[2]
+        return (*self.features, *self.layers, *(f"satellite_{channel + 1}" for channel in range(channels)))
 
     def whole(self) -> Predictors:
         """Predictors of all texels at once, in as much memory as they take."""
@@ -66,38 +70,56 @@ class TiledPredictors:
             values[part] = self.window(part).values
         return Predictors(values, self.names, self.surface)
 
-    def window(self, window: Window) -> Predictors:
-        """Predictors of a rectangle of texels.
+    def window(self, window: Window) -> WindowPredictors:
+        """Predictors of a rectangle of texels, each computed when it is asked for.
 
         Parameters
         ----------
         window
             Slices of rows and columns with their starts and stops.
         """
-        (rows, columns), (height, width) = self.surface.shape, self.coverage.shape
-        top, bottom, left, right = window[0].start, window[0].stop, window[1].start, window[1].stop
-        u, v = (np.arange(left, right) + 0.5) / columns, 1.0 - (np.arange(top, bottom) + 0.5) / rows
-        x = (u / self.largest_uv[0] * width - 0.5).astype(np.float32)
-        y = ((1.0 - v / self.largest_uv[1]) * height - 0.5).astype(np.float32)
-        # Of the grid only what the window needs: remap takes no more than 32,767 cells along a side.
-        first = tuple(min(max(0, int(at[0]) - 1), size - 1) for at, size in ((y, height), (x, width)))
-        part = np.s_[first[0] : int(y[-1]) + 3, first[1] : int(x[-1]) + 3]
-        map_x, map_y = np.meshgrid(x - np.float32(first[1]), y - np.float32(first[0]))
+        return WindowPredictors(self, window)
+
+    def at(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+        """Predictors ``(n, G)`` float32 of texels ``(n,)`` that lie within some thousand rows and columns.
+
+        Parameters
+        ----------
+        row, column
+            ``(n,)`` of the atlas.
+        """
+        (rows, columns), (height, width), count = self.surface.shape, self.coverage.shape, len(row)
+        if not count:
+            return np.empty((0, len(self.names)), np.float32)
+        # Rounded before what depends on the other texels is subtracted, which is exact: each texel is the same in any window.
+        x = ((column + 0.5) / columns / self.largest_uv[0] * width - 0.5).astype(np.float32)
+        y = ((1.0 - (1.0 - (row + 0.5) / rows) / self.largest_uv[1]) * height - 0.5).astype(np.float32)
+        # Of the grid only what the texels need: remap takes no more than 32,767 cells along a side, nor texels.
+        first = tuple(min(max(0, int(at.min()) - 1), size - 1) for at, size in ((y, height), (x, width)))
+        part = np.s_[first[0] : int(y.max()) + 3, first[1] : int(x.max()) + 3]
+        padded = np.zeros((2, -(-count // _ROW), _ROW), np.float32)
+        padded.reshape(2, -1)[:, :count] = x - np.float32(first[1]), y - np.float32(first[0])
+        map_x, map_y = padded
 
         def sampled(layer: np.ndarray) -> np.ndarray:
-            return cv2.remap(
-                np.ascontiguousarray(layer[part]), map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-            )
+            found = cv2.remap(layer[part], map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            return found.ravel()[:count]
 
+        values = np.empty((count, len(self.names)), np.float32)
         coverage = sampled(self.coverage)
+        for number, layer in enumerate(self.features.values()):
+            values[:, number] = sampled(layer)
         # At the border of the terrain, the mean is over cells with a height alone.
-        found = {
-            name: np.where(coverage > 0.0, sampled(layer) / np.maximum(coverage, 1e-6), np.nan)
-            for name, layer in self.features.items()
-        }
-        found |= {name: layer[window] for name, layer in self.layers.items()}
-        image = None if self._image is None else Texture(self._image.values[window], self._image.weight[window])
-        return stack_predictors(found, image, surface=self.surface[window], empty_images=True)
+        border = np.flatnonzero(coverage < 1.0)
+        share = np.where(coverage[border] > 0.0, np.maximum(coverage[border], 1e-6), np.nan)
+        values[border, : len(self.features)] /= share[:, None]
+        for number, layer in enumerate(self.layers.values(), len(self.features)):
+            values[:, number] = layer[row, column]
+        if self._image is not None:
+            colour = self._image.values[row, column]
+            imaged = (self._image.weight[row, column] > 0.0) & np.isfinite(colour).all(axis=1)
+            values[:, -colour.shape[1] :] = np.where(imaged[:, None], colour, np.nan)
+        return values
 
     @cached_property
     def _image(self) -> Texture | None:
@@ -106,6 +128,48 @@ class TiledPredictors:
         if image is None or not any((weights > 0.0).any() for weights in image.weight):
             return None
         return image
+
+
+@dataclass(frozen=True)
+class WindowPredictors:
+    """Predictors of a rectangle of texels, computed where they are asked for; used as `predictors.Predictors` are.
+
+    Parameters
+    ----------
+    atlas
+        Those of the whole atlas.
+    window
+        Slices of rows and columns with their starts and stops.
+    """
+
+    atlas: TiledPredictors
+    window: Window
+    grid: None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """As in `predictors.Predictors`."""
+        return self.atlas.names
+
+    @property
+    def surface(self) -> np.ndarray:
+        """As in `predictors.Predictors`."""
+        return self.atlas.surface[self.window]
+
+    @property
+    def values(self) -> np.ndarray:
+        """As in `predictors.Predictors`; computed anew each time."""
+        values = np.empty((*self.surface.shape, len(self.names)), np.float32)
+        flat = values.reshape(-1, len(self.names))
+        for start in range(0, len(flat), _BLOCK):
+            flat[start : start + _BLOCK] = self.at(np.arange(start, min(start + _BLOCK, len(flat))))
+        return values
+
+    def at(self, texel: np.ndarray) -> np.ndarray:
+        """Predictors ``(n, G)`` float32 of flat indices ``(n,)`` in the window."""
+        rows, columns = self.window
+        row, column = np.divmod(texel, columns.stop - columns.start)
+        return self.atlas.at(row + rows.start, column + columns.start)
 
 
 def tiled_predictors(
