@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 if TYPE_CHECKING:
     from sklearn.ensemble import ExtraTreesRegressor, HistGradientBoostingRegressor
@@ -178,7 +179,9 @@ def fit_regression(
             early_stopping=False,  # pyright: ignore[reportArgumentType]
             random_state=seed + channel,
         )
-        boosted.append(model.fit(predictor, target))
+        # On some ten thousand rows threads wait for each other longer than they work.
+        with threadpool_limits(1, "openmp"):
+            boosted.append(model.fit(predictor, target))
     return Regression(extrapolation, tuple(boosted), forest)
 
 
