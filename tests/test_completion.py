@@ -117,6 +117,30 @@ def test_push_pull_keeps_what_is_known_and_fills_a_constant():
     np.testing.assert_array_equal(odd[..., 0], np.arange(35.0).reshape(5, 7))
 
 
+@pytest.mark.parametrize("shape", [(37, 52), (1, 9), (64, 3)])
+def test_push_pull_blends_weighted_means_of_four(shape):
+    """Against sums over blocks of the array, level by level, with weights between 0 and 1."""
+    rng = np.random.default_rng(2)
+    values, seen = rng.normal(size=(*shape, 2)).astype(np.float32), rng.random(shape) > 0.6
+    weight = (seen * rng.random(shape)).astype(np.float32)
+
+    def level(values, weight):
+        if max(weight.shape) <= 1:
+            return values
+        rows, columns = (-(-side // 2) for side in weight.shape)
+        sums, total = np.zeros((rows, columns, 2), np.float32), np.zeros((rows, columns), np.float32)
+        for r, c in np.ndindex(weight.shape):
+            sums[r // 2, c // 2] += values[r, c] * weight[r, c]
+            total[r // 2, c // 2] += weight[r, c]
+        coarse = level(sums / np.maximum(total, 1e-6)[..., None], np.minimum(total, 1.0))
+        up = cv2.resize(coarse, (2 * columns, 2 * rows), interpolation=cv2.INTER_LINEAR)
+        return weight[..., None] * values + (1.0 - weight[..., None]) * up[: weight.shape[0], : weight.shape[1]]
+
+    expected = level(values, weight)
+    values[weight == 0.0] = np.nan
+    np.testing.assert_allclose(push_pull(values, weight), expected, atol=1e-5)
+
+
 def test_a_residual_fades_with_its_reach():
     seen = np.zeros((9, 101), bool)
     seen[:, 0] = True

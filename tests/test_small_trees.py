@@ -16,7 +16,11 @@ def fitted(seed: int, leaves: int, *, missing_share: float = 0.1):
     rows[rng.random(rows.shape) < missing_share] = np.nan
     target = rng.gamma(1.0, np.exp(np.nan_to_num(rows[:, 0], nan=1.5)) + np.nan_to_num(rows[:, 1]) ** 2)
     model = HistGradientBoostingRegressor(
-        loss="poisson", max_iter=15, max_leaf_nodes=leaves, early_stopping=False, random_state=seed
+        loss="poisson",
+        max_iter=15,
+        max_leaf_nodes=leaves,
+        early_stopping=False,  # pyright: ignore[reportArgumentType]
+        random_state=seed,
     )
     with threadpool_limits(1, "openmp"):
         model.fit(rows[:3000], target[:3000])

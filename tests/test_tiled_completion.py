@@ -57,6 +57,24 @@ def test_windows_of_predictors_are_those_of_the_whole_atlas(hill):
     np.testing.assert_array_equal(np.isnan(part.values), np.isnan(whole.values[window]) | ~inner[..., None])
 
 
+def test_predictors_of_a_texel_do_not_depend_on_what_else_is_asked_for(hill, monkeypatch):
+    terrain, atlas, satellite, whole, _ = hill
+    layers = {"light": np.random.default_rng(5).uniform(size=whole.surface.shape).astype(np.float32)}
+    # Cells of a size that no binary number has, so that positions on them are rounded.
+    tiled = tiled_predictors(terrain, atlas, satellite=satellite, layers=layers, sun_direction=SUN, most_cells=30_000)
+    monkeypatch.setattr(tiled_predictors_module, "_BLOCK", 5000)
+    together = tiled.window((slice(0, whole.surface.shape[0]), slice(0, whole.surface.shape[1]))).values
+    row, column = np.random.default_rng(6).integers(0, whole.surface.shape, (300, 2)).T
+    np.testing.assert_array_equal(tiled.at(row, column), together[row, column])
+    for one in range(0, 300, 30):
+        alone = tiled.at(row[one : one + 1], column[one : one + 1])[0]
+        np.testing.assert_array_equal(alone, together[row[one], column[one]])
+    np.testing.assert_array_equal(together[..., tiled.names.index("light")], layers["light"])
+    assert np.isnan(together[:, : satellite.weight.shape[1] // 8, -1]).all()
+    assert np.isfinite(together[..., tiled.names.index("slope")][whole.surface]).all()
+    assert tiled.at(row[:0], column[:0]).shape == (0, len(tiled.names))
+
+
 def test_coarser_attributes_stay_close_to_the_fine_ones(hill):
     terrain, atlas, _, whole, _ = hill
     tiled = tiled_predictors(terrain, atlas, sun_direction=SUN, most_cells=whole.surface.size // 9)

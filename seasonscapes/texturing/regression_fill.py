@@ -263,7 +263,20 @@ def texel_folds(texel: np.ndarray, painted: np.ndarray, predictors: Predictors, 
 
 
 def rim_of(hole: np.ndarray, known: np.ndarray, predictors: Predictors | WindowPredictors) -> np.ndarray:
-    """Known texels ``(R, S)`` within `REACH_PX` of a hole; with several charts, all known texels."""
+    """Find the known texels whose residual reaches into a hole.
+
+    Parameters
+    ----------
+    hole, known
+        ``(R, S)`` bool.
+    predictors
+        With the top-down grid, if any.
+
+    Returns
+    -------
+    ndarray
+        ``(R, S)`` bool: known texels within `REACH_PX` of a hole; with several charts, all known texels.
+    """
     import cv2
 
     if predictors.grid is not None or not hole.any():

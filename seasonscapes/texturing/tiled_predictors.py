@@ -81,21 +81,26 @@ class TiledPredictors:
         return WindowPredictors(self, window)
 
     def at(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-        """Predictors ``(n, G)`` float32 of texels ``(n,)`` that lie within some thousand rows and columns.
+        """Predictors of texels that lie within some thousand rows and columns.
 
         Parameters
         ----------
         row, column
             ``(n,)`` of the atlas.
+
+        Returns
+        -------
+        ndarray
+            ``(n, G)`` float32, the same numbers whichever other texels are asked for.
         """
         (rows, columns), (height, width), count = self.surface.shape, self.coverage.shape, len(row)
         if not count:
             return np.empty((0, len(self.names)), np.float32)
-        # Rounded before what depends on the other texels is subtracted, which is exact: each texel is the same in any window.
+        # Rounded first: what depends on the other texels is then subtracted without an error.
         x = ((column + 0.5) / columns / self.largest_uv[0] * width - 0.5).astype(np.float32)
         y = ((1.0 - (1.0 - (row + 0.5) / rows) / self.largest_uv[1]) * height - 0.5).astype(np.float32)
         # Of the grid only what the texels need: remap takes no more than 32,767 cells along a side, nor texels.
-        first = tuple(min(max(0, int(at.min()) - 1), size - 1) for at, size in ((y, height), (x, width)))
+        first = tuple(min(max(0, int(cell.min()) - 1), size - 1) for cell, size in ((y, height), (x, width)))
         part = np.s_[first[0] : int(y.max()) + 3, first[1] : int(x.max()) + 3]
         padded = np.zeros((2, -(-count // _ROW), _ROW), np.float32)
         padded.reshape(2, -1)[:, :count] = x - np.float32(first[1]), y - np.float32(first[0])
