@@ -161,7 +161,9 @@ def solve_albedo(
     size = transport.shape[0] * transport.shape[1]
     systems = [equations_of(photograph, noise_model, size) for photograph in photographs]
     _require_usable(systems)
-    pixel_count = texel_pixel_count((each.photograph.footprints, each.usable.any(axis=1)) for each in systems)
+    pixel_count = texel_pixel_count(
+        (each.photograph.footprints, np.asarray(each.usable.any(axis=1))) for each in systems
+    )
     albedo = np.full((size, 3), 0.25, np.float32) if start is None else start.reshape(size, 3).astype(np.float32)
     observed = pixel_count.ravel() > 0.0
     grounds = [ground_pixels(transport, photograph) for photograph in photographs]

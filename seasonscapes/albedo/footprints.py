@@ -277,8 +277,8 @@ def texel_pixel_count(used: Iterable[tuple[Footprints, np.ndarray]]) -> np.ndarr
     """
     cameras: dict[int, tuple[Footprints, np.ndarray]] = {}
     for footprints, pixels in used:
-        _, before = cameras.get(id(footprints), (footprints, np.zeros_like(pixels)))
-        cameras[id(footprints)] = (footprints, pixels | before)
+        _, before = cameras.get(id(footprints), (footprints, pixels))
+        cameras[id(footprints)] = (footprints, np.logical_or(pixels, before))
     shape = next(iter(cameras.values()))[0].shape
     total = np.zeros(shape[0] * shape[1])
     for footprints, pixels in cameras.values():
