@@ -19,11 +19,14 @@ from seasonscapes.albedo.picture_conditions import (
     Ground,
     ViewLight,
     picture_under,
+    slopes_under,
 )
 from seasonscapes.albedo.residual_kriging import gram, kriged, kriging_weights
 from seasonscapes.errors import NoUsablePixels
 
 PIXELS = 900
+# What is clipped is this bright, but for rounding.
+WHITE = 1.0 - 1e-9
 
 
 def _ground(rng: np.random.Generator) -> tuple[Ground, np.ndarray]:
@@ -83,6 +86,27 @@ def _fit(pictures, **options):
 @pytest.fixture(scope="module")
 def fitted(pictures):
     return _fit(pictures)
+
+
+def test_slopes_are_those_of_the_pictures(pictures):
+    ground, _, lights, conditions, _ = pictures
+    # A bright exposure clips some pixels, which have no slope.
+    values = conditions[0].values.copy()
+    values[GAIN] += 2.5
+    slopes, step = slopes_under(ground, lights[0], values), 1e-6
+    for number in range(len(values)):
+        ahead, behind = (
+            picture_under(ground, lights[0], values + sign * step * (np.arange(len(values)) == number))
+            for sign in (1.0, -1.0)
+        )
+        expected = (ahead - behind) / (2.0 * step)
+        # At the edge of clipping one side of the difference is flat.
+        edge = (np.maximum(ahead, behind) >= WHITE) & (np.minimum(ahead, behind) < WHITE)
+        np.testing.assert_allclose(slopes[..., number][~edge], expected[~edge], atol=1e-7, rtol=1e-5)
+        assert np.abs(slopes[..., number]).max() > 1e-3
+    clipped = picture_under(ground, lights[0], values) >= WHITE
+    assert 0.01 < clipped.mean() < 0.9
+    assert (slopes[clipped] == 0.0).all()
 
 
 def test_an_unseen_hour_is_predicted_from_half_of_its_pixels_and_better_than_by_any_picture(pictures, fitted):
