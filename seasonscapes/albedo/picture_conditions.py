@@ -245,12 +245,14 @@ def fit_conditions(
         misfit = slopes_under(ground, light, values)[..., free].reshape(-1, len(searched)) / RESIDUAL_SCALE
         return np.concatenate([misfit, np.diag(1.0 / _PRIOR_SIGMA[free])])
 
+    # The exact solver factorises all residuals by singular values: five times the time, to the same cost.
     found = least_squares(
         residuals,
         np.clip(start[free], low + 1e-3, high - 1e-3),
         jac=slopes,  # pyright: ignore[reportArgumentType]
         bounds=(low, high),
         loss="soft_l1",
+        tr_solver="lsmr",
         max_nfev=_FIT_EVALUATIONS,
     )
     values, sigma = start.copy(), np.zeros(COUNT)
