@@ -127,9 +127,15 @@ if __name__ == "__main__":
     from few_rays import trace_few_rays
     from kept_tables import keep_tables
 
+    import seasonscapes as ss
     from seasonscapes.cli import main
+    from seasonscapes.rendering.backend import use_backend
     from seasonscapes.workflows import timelapse, view_rendering  # noqa: F401
 
+    for each in ss.__all__:
+        getattr(ss, each)
+    # Sets the renderer up, which starts no threads: these begin with the first kernel, in a command's own process.
+    use_backend()
     for each in sys.argv[1:]:
         _import(each)
     trace_few_rays()

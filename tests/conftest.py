@@ -38,14 +38,18 @@ def few_rays():
 
 @pytest.fixture(scope="module")
 def coarse_viewer():
-    """Coarse pages of `view`, which has no flag for it, for a module's tests."""
+    """Coarse pages of `view` and `show`, which have no flag for it, for a module's tests."""
     from dataclasses import astuple
 
+    from seasonscapes.workflows import viewer, viewer_scene
     from seasonscapes.workflows.viewer_scene import ViewerDetail
 
     coarse = ViewerDetail(160, 256, 160, 48, 24, 8, 256, 16, 64, light_heights=2)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ViewerDetail.__init__, "__defaults__", astuple(coarse))
+        patch.setattr(viewer, "SMALL", coarse)
+        # Of the dates of a place that is known all year, each baked: one with snow and one without.
+        patch.setattr(viewer_scene, "_SHOWN", ((1, 16), (7, 16)))
         yield
 
 

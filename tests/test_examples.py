@@ -13,7 +13,7 @@ OPTIONS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 
 
 @pytest.fixture(scope="module")
-def workspace(tmp_path_factory):
+def workspace(tmp_path_factory, few_rays, coarse_viewer):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SEASONSCAPES_WORKSPACE", str(tmp_path_factory.mktemp("workspace")))
         yield

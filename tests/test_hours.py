@@ -18,7 +18,7 @@ MASKED_ROWS = 6
 
 
 @pytest.fixture(scope="module")
-def valley(tmp_path_factory) -> Path:
+def valley(tmp_path_factory, few_rays) -> Path:
     """A folder with photographs, manifest.csv and calibrations of one webcam."""
     folder = tmp_path_factory.mktemp("valley")
     place = ss.load_place("alpine_small")

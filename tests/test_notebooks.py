@@ -17,13 +17,35 @@ NAMES = sorted(path.stem for path in FOLDER.glob("*.py"))
 
 # What the tests run with less of: texels, pixels, samples, hours, steps. A text that a file does not hold is stale and fails.
 LESS = {
-    "small.toml": {"detail_m = 15.0": "detail_m = 30.0"},
-    "02_sky.py": {"np.arange(11.0, 24.0, 0.5)": "np.arange(11.0, 24.0, 2.0)"},
-    "04_texture.py": {"texel_m=25.0": "texel_m=50.0", "(210, 140)": "(105, 70)", "spp=32": "spp=4"},
-    "05_albedo.py": {"texel_m=40.0": "texel_m=80.0", "(180, 120)": "(90, 60)"},
-    "06_relight.py": {"(270, 180)": "(135, 90)", "spp=64": "spp=4", "range(5, 19)": "range(5, 19, 4)"},
-    "07_gaussians.py": {"suns=8, dates=2": "suns=3, dates=1", "steps=250": "steps=40", "spp=32": "spp=4"},
-    "08_inverse_rendering_experiment.py": {"range(60)": "range(6)", "spp=256": "spp=32"},
+    "small.toml": {"spacing_m = 30.0": "spacing_m = 60.0", "detail_m = 15.0": "detail_m = 60.0"},
+    "00_tour.py": {"(384, 256)": "(96, 64)", "spp=16": "spp=4", "dome_picture(light, 400)": "dome_picture(light, 64)"},
+    "01_terrain.py": {"[20.0, 10.0, 5.0, 2.0]": "[20.0, 10.0]", "(420, 280)": "(105, 70)"},
+    "02_sky.py": {
+        "np.arange(11.0, 24.0, 0.5)": "np.arange(11.0, 24.0, 2.0)",
+        "dome_picture(light, 300)": "dome_picture(light, 64)",
+    },
+    "03_webcams.py": {
+        "(300, 200)": "(150, 100)",
+        "spp=8": "spp=2",
+        "(7, 9, 12, 15)": "(7, 9)",
+        "subplots(1, 4,": "subplots(1, 2,",
+    },
+    "04_texture.py": {"texel_m=25.0": "texel_m=60.0", "(210, 140)": "(84, 56)", "spp=32": "spp=4"},
+    "05_albedo.py": {
+        "texel_m=40.0": "texel_m=120.0",
+        "(180, 120)": "(60, 40)",
+        "(7, 10, 13, 15)": "(10, 13)",
+        "subplots(2, 4,": "subplots(2, 2,",
+    },
+    "06_relight.py": {
+        '"06:00", "08:00", "11:00", "14:00", "16:30", "17:36"': '"08:00", "11:00", "14:00"',
+        "subplots(2, 3,": "subplots(1, 3,",
+        "(270, 180)": "(90, 60)",
+        "spp=64": "spp=4",
+        "range(5, 19)": "range(5, 19, 6)",
+    },
+    "07_gaussians.py": {"suns=8, dates=2": "suns=3, dates=1", "steps=250": "steps=20", "spp=32": "spp=4"},
+    "08_inverse_rendering_experiment.py": {"range(60)": "range(4)", "spp=256": "spp=16"},
 }
 
 

@@ -16,6 +16,7 @@ TIME = "2024-07-20T13:30"
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_rays")
 def test_what_stands_before_the_landscape_is_not_painted():
     place, model = ss.load_place("alpine_small"), read_sky_model("hosek")
     clean = synthetic_observations(place, [utc_at(place, TIME)], model, size_px=(240, 160))

@@ -20,7 +20,7 @@ from seasonscapes.workflows.recovery_methods import PaintedTexture
 
 
 @pytest.fixture(scope="module")
-def taken(tmp_path_factory):
+def taken(tmp_path_factory, few_rays):
     """A small place, its texels' transport, and one photograph of it under a clear sky and one under clouds."""
     place = ss.load_place("alpine_small")
     times = ["2024-07-20T16:00"]

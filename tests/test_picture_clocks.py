@@ -15,7 +15,7 @@ OVERCAST, SLOW_MIN = "2024-07-20T06:10Z", 17.0
 
 
 @pytest.fixture(scope="module")
-def photographs(tmp_path_factory):
+def photographs(tmp_path_factory, few_rays):
     """A place, four clear photographs and an overcast one of its aerial camera."""
     place = ss.load_place("alpine_small")
     camera = ss.camera(place, "aerial", size_px=(96, 64))

@@ -164,6 +164,42 @@ def picture_under(ground: Ground, light: ViewLight, values: np.ndarray) -> np.nd
     return encoded(ground.reflectance * factor + addend, float(np.exp(values[CONTRAST])))
 
 
+def slopes_under(ground: Ground, light: ViewLight, values: np.ndarray) -> np.ndarray:
+    """Derivatives of `picture_under` by each of the values ``(n, 3, 13)``; zero where the picture is clipped.
+
+    Parameters
+    ----------
+    ground, light, values
+        As in `picture_under`.
+    """
+    factor, _, addend = linear_parts(light, ground, values)
+    reflected, contrast = ground.reflectance * factor, np.exp(values[CONTRAST])
+    depth = np.exp(values[EXTINCTION]) * ground.distance_km[:, None]
+    transmitted = np.exp(-depth)
+    airlight, flare = np.exp(values[AIRLIGHT]), np.exp(values[FLARE])
+    linear = np.maximum(reflected + addend, _SMALLEST)
+    curved = linear**contrast
+    by_linear = np.where(
+        curved <= 0.0031308, 12.92, 1.055 / 2.4 * np.clip(curved, 0.0031308, 1.0) ** (1.0 / 2.4 - 1.0)
+    ) * (curved * contrast)
+    by_linear[curved >= 1.0] = 0.0
+    # Light of the sun as `linear_parts` has it, for a sun of 1.
+    exposed = ground.reflectance * np.exp(values[GAIN]) * transmitted
+    facing = (light.sun_visible * np.maximum(incidence(light, ground.shading), 0.0))[:, None]
+    for_linear = np.where(reflected + addend > _SMALLEST, by_linear / linear, 0.0)
+    slopes = np.zeros((*reflected.shape, COUNT))
+    slopes[..., SUN] = exposed * light.sun * facing
+    slopes[..., OVERCAST] = exposed * (light.clouds - light.sky)
+    slopes[..., EXTINCTION] = depth * (airlight * transmitted - reflected)
+    for channel in range(3):
+        slopes[:, channel, GAIN.start + channel] = reflected[:, channel]
+        slopes[:, channel, AIRLIGHT.start + channel] = (airlight * (1.0 - transmitted))[:, channel]
+        slopes[:, channel, FLARE.start + channel] = flare[channel]
+    slopes *= for_linear[..., None]
+    slopes[..., CONTRAST] = by_linear * np.log(linear)
+    return slopes
+
+
 def fit_conditions(
     picture: np.ndarray,
     ground: Ground,
@@ -203,10 +239,17 @@ def fit_conditions(
         prior = (values - _PRIOR_MEAN) / _PRIOR_SIGMA
         return np.concatenate([misfit.ravel(), prior[free]])
 
+    def slopes(searched: np.ndarray) -> np.ndarray:
+        values = start.copy()
+        values[free] = searched
+        misfit = slopes_under(ground, light, values)[..., free].reshape(-1, len(searched)) / RESIDUAL_SCALE
+        return np.concatenate([misfit, np.diag(1.0 / _PRIOR_SIGMA[free])])
+
     # The exact solver factorises all residuals by singular values: five times the time, to the same cost.
     found = least_squares(
         residuals,
         np.clip(start[free], low + 1e-3, high - 1e-3),
+        jac=slopes,  # pyright: ignore[reportArgumentType]
         bounds=(low, high),
         loss="soft_l1",
         tr_solver="lsmr",
