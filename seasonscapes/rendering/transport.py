@@ -54,6 +54,7 @@ from seasonscapes.rendering.sobol import hash_to_unit
 from seasonscapes.rendering.view_samples import (
     TILE,
     camera_points,
+    pixel_albedo,
     pixel_moments,
     pixel_tiles,
     sample_moments,
@@ -441,10 +442,10 @@ def view_albedo(terrain: RayScene, coefficients: ViewCoefficients) -> np.ndarray
     numpy.ndarray
         ``(n, 3)`` float32; the sky counts as black.
     """
-    camera, sampling = coefficients.camera, coefficients.sampling
-    return pixel_moments(terrain, camera, range(camera.height_px), sampling.albedo_samples, coefficients.seed)[0][
-        coefficients.pixel
-    ]
+    camera, sampling, pixel = coefficients.camera, coefficients.sampling, coefficients.pixel
+    top, bottom = (int(end) // camera.width_px for end in (pixel.min(), pixel.max()))
+    albedo = pixel_albedo(terrain, camera, range(top, bottom + 1), sampling.albedo_samples, coefficients.seed)
+    return albedo[pixel - top * camera.width_px]
 
 
 def _trace_receivers(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -28,14 +28,14 @@ def _spans(x: np.ndarray, y: np.ndarray, width: int, height: int) -> tuple[np.nd
     # Of the two short edges a row meets the one on its side of the middle corner.
     second = (row >= y1[triangle]) * np.intp(len(x)) + triangle
 
-    def crossing(xi: np.ndarray, yi: np.ndarray, xj: np.ndarray, yj: np.ndarray, edge: np.ndarray) -> np.ndarray:
+    def crossing(ends: Sequence[np.ndarray], edge: np.ndarray) -> np.ndarray:
         # Rows intersect only edges with y_i <= row < y_j: results of a division by zero are never used.
-        xi, yi, xj, yj = (each[edge] for each in (xi, yi, xj, yj))
+        xi, yi, xj, yj = (each[edge] for each in ends)
         with np.errstate(divide="ignore", invalid="ignore"):
             return xi + (row - yi) / (yj - yi) * (xj - xi)
 
-    short = crossing(*(np.concatenate(pair) for pair in ((x0, x1), (y0, y1), (x1, x2), (y1, y2))), second)
-    long = crossing(x0, y0, x2, y2, triangle)
+    short = crossing([np.concatenate(ends) for ends in ((x0, x1), (y0, y1), (x1, x2), (y1, y2))], second)
+    long = crossing((x0, y0, x2, y2), triangle)
     left = np.clip(np.ceil(np.minimum(short, long)), 0, width).astype(np.int64)
     right = np.clip(np.ceil(np.maximum(short, long)), 0, width).astype(np.int64)
     keep = right > left
