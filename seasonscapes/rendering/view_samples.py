@@ -154,8 +154,12 @@ def camera_points(
     hit
         ``(len(rows) W count,)`` bool: rays that hit terrain.
     """
+    import drjit as dr
+
     interaction, _ = _mi_camera_rays(terrain, camera, rows, count, seed)
     valid = interaction.is_valid()
+    # Evaluated with the points: by itself it would trace all rays again.
+    dr.schedule(valid)
     return surface_points(terrain, interaction, valid), np.array(valid)
 
 
