@@ -167,9 +167,8 @@ def trace_view(
             blocks.append(block[0])
             receivers.append(block[1])
         report(0.1 + 0.9 * min(1.0, (top + rows) / camera.height_px))
-    arrays = {
-        field.name: np.concatenate([getattr(block, field.name) for block in blocks]) for field in fields(_PixelArrays)
-    }
+    names = [each.name for each in fields(_PixelArrays)]
+    arrays = {name: np.concatenate([getattr(block, name) for block in blocks]) for name in names}
     view = ViewCoefficients(
         camera=camera,
         receivers=_concatenate_receivers(receivers),
