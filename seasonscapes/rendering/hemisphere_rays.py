@@ -354,5 +354,7 @@ def trace_bounce(terrain: RayScene, points: SurfacePoints, seed: int) -> tuple[S
     outside = dr.dot(direction, mi_geometric_normal) > 0.0
     interaction = terrain.mi_scene.ray_intersect(mi.Ray3f(point3(points.origin), direction), active=outside)
     valid = interaction.is_valid() & (dr.dot(interaction.n, direction) < 0.0)
-    hit = np.array(valid)
-    return surface_points(terrain, interaction, valid)[hit], np.array(interaction.prim_index)[hit], hit
+    # Evaluated with the points: each by itself would trace all rays again.
+    dr.schedule(valid, interaction.prim_index)
+    found, hit = surface_points(terrain, interaction, valid), np.array(valid)
+    return found[hit], np.array(interaction.prim_index)[hit], hit

@@ -155,8 +155,9 @@ def trace_horizons(
         part = slice(start, start + step)
         chosen = _drawn(weight[part], azimuths, key[part])
         # All receivers at one azimuth after those at another: neighbouring rays are almost parallel.
-        flat = points[part].reshape(-1)[(np.arange(len(chosen)) * samples + chosen.T).ravel()]
-        lanes = _HorizonLanes(flat, azimuths, turn[part], key[part])
+        index = (np.arange(len(chosen)) * samples + chosen.T).ravel()
+        origin, normal = (np.take(each[part].reshape(-1, 3), index, axis=0) for each in (points.origin, points.normal))
+        lanes = _HorizonLanes(origin, normal, azimuths, turn[part], key[part])
         horizon, bound = lanes.horizon(terrain)
         measure = lanes.land(bound)
         rows = lanes.by_receiver([lanes.azimuth, horizon, lanes.along, lanes.upward, measure])
@@ -205,16 +206,18 @@ def _divided(measure: np.ndarray, rays: int, place: np.ndarray) -> tuple[np.ndar
 
 
 class _HorizonLanes:
-    """Lanes on the device, one for each azimuth of each receiver, with a surface point ``points`` for each."""
+    """Lanes on the device, one for each azimuth of each receiver, with a surface point for each: ``origin`` and ``normal``."""
 
-    def __init__(self, points: SurfacePoints, azimuths: int, turn: np.ndarray, key: np.ndarray) -> None:
+    def __init__(
+        self, origin: np.ndarray, normal: np.ndarray, azimuths: int, turn: np.ndarray, key: np.ndarray
+    ) -> None:
         import drjit as dr
         import mitsuba as mi
 
         self._azimuths, self._count = azimuths, len(turn)
         # No literal, for which kernels would be compiled anew.
         self._receivers = dr.opaque(mi.UInt32, self._count)
-        lane = dr.arange(mi.UInt32, len(points.origin))
+        lane = dr.arange(mi.UInt32, len(origin))
         number = lane // self._receivers
         receiver = lane - number * self._receivers
         self._turn = mi.Float(aligned(turn % 1.0))
@@ -222,9 +225,9 @@ class _HorizonLanes:
         mi_key = hashed(hashed(dr.gather(mi.UInt32, mi.UInt32(aligned(key, np.uint32)), receiver), _HORIZON), number)
         self.azimuth = (mi.Float(number) + turned) * dr.opaque(mi.Float, 2.0 * np.pi / azimuths)
         self._north_east = dr.sincos(self.azimuth)[::-1]
-        self._origin, normal = point3(points.origin), point3(points.normal)
+        self._origin, mi_normal = point3(origin), point3(normal)
         north, east = self._north_east
-        self.along, self.upward = normal.x * east + normal.y * north, dr.maximum(normal.z, 1e-3)
+        self.along, self.upward = mi_normal.x * east + mi_normal.y * north, dr.maximum(mi_normal.z, 1e-3)
         self._plane = dr.atan2(-self.along, self.upward)
         self._shift = uniform(mi_key)
 

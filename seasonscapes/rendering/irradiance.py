@@ -114,11 +114,14 @@ def surface_at(terrain: RayScene, position_m: np.ndarray, *, search_m: float = 2
 
 
 def _surface_below(terrain: RayScene, start_m: np.ndarray, search_m: float) -> tuple[SurfacePoints, np.ndarray]:
+    import drjit as dr
     import mitsuba as mi
 
     ray = mi.Ray3f(point3(start_m.astype(np.float32)), mi.Vector3f(0.0, 0.0, -1.0))
     interaction = terrain.mi_scene.ray_intersect(ray)
     found: Any = interaction.is_valid() & (interaction.t < 2.0 * search_m)
+    # Evaluated with the points: by itself it would trace all rays again.
+    dr.schedule(found)
     return surface_points(terrain, interaction, found), np.array(found)
 
 

@@ -114,6 +114,8 @@ def mirror_samples(
     direction, reflectance = water.mirrored(normal, mi_viewer, sobol_pair(key, mi.UInt32(aligned(number, np.uint32))))
     interaction = terrain.mi_scene.ray_intersect(mi.Ray3f(point3(from_water.origin), direction))
     valid = interaction.is_valid()
+    # Evaluated with the points: by themselves they would trace all rays again.
+    dr.schedule(valid, reflectance, direction)
     found = surface_points(terrain, interaction, valid)
     hit = np.zeros(on_water.shape, bool)
     hit[on_water] = np.array(valid)

@@ -90,6 +90,7 @@ def visible_faces(terrain: RayScene, camera: Camera | Panorama) -> np.ndarray:
     numpy.ndarray
         ``(H, W)`` int64 face indices, −1 in the sky.
     """
+    import drjit as dr
     import mitsuba as mi
 
     direction = view_directions(camera).reshape(-1, 3).astype(np.float32)
@@ -98,5 +99,8 @@ def visible_faces(terrain: RayScene, camera: Camera | Panorama) -> np.ndarray:
         part = direction[start : start + LANES]
         origin = camera.position_m.astype(np.float32) + np.float32(NEAR_M) * part
         hit = terrain.mi_scene.ray_intersect_preliminary(mi.Ray3f(point3(origin), mi.Vector3f(point3(part))))
-        face[start : start + LANES] = np.where(np.array(hit.is_valid()), np.array(hit.prim_index).astype(np.int64), -1)
+        # Evaluated together: each by itself would trace all rays again.
+        valid = hit.is_valid()
+        dr.eval(valid, hit.prim_index)
+        face[start : start + LANES] = np.where(np.array(valid), np.array(hit.prim_index).astype(np.int64), -1)
     return face.reshape(camera.height_px, camera.width_px)

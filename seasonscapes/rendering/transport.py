@@ -54,6 +54,7 @@ from seasonscapes.rendering.sobol import hash_to_unit
 from seasonscapes.rendering.view_samples import (
     TILE,
     camera_points,
+    pixel_albedo,
     pixel_moments,
     pixel_tiles,
     sample_moments,
@@ -166,9 +167,8 @@ def trace_view(
             blocks.append(block[0])
             receivers.append(block[1])
         report(0.1 + 0.9 * min(1.0, (top + rows) / camera.height_px))
-    arrays = {
-        field.name: np.concatenate([getattr(block, field.name) for block in blocks]) for field in fields(_PixelArrays)
-    }
+    names = [each.name for each in fields(_PixelArrays)]
+    arrays = {name: np.concatenate([getattr(block, name) for block in blocks]) for name in names}
     view = ViewCoefficients(
         camera=camera,
         receivers=_concatenate_receivers(receivers),
@@ -441,10 +441,10 @@ def view_albedo(terrain: RayScene, coefficients: ViewCoefficients) -> np.ndarray
     numpy.ndarray
         ``(n, 3)`` float32; the sky counts as black.
     """
-    camera, sampling = coefficients.camera, coefficients.sampling
-    return pixel_moments(terrain, camera, range(camera.height_px), sampling.albedo_samples, coefficients.seed)[0][
-        coefficients.pixel
-    ]
+    camera, sampling, pixel = coefficients.camera, coefficients.sampling, coefficients.pixel
+    top, bottom = (int(end) // camera.width_px for end in (pixel.min(), pixel.max()))
+    albedo = pixel_albedo(terrain, camera, range(top, bottom + 1), sampling.albedo_samples, coefficients.seed)
+    return albedo[pixel - top * camera.width_px]
 
 
 def _trace_receivers(

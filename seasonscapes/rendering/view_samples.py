@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -153,8 +154,12 @@ def camera_points(
     hit
         ``(len(rows) W count,)`` bool: rays that hit terrain.
     """
+    import drjit as dr
+
     interaction, _ = _mi_camera_rays(terrain, camera, rows, count, seed)
     valid = interaction.is_valid()
+    # Evaluated with the points: by itself it would trace all rays again.
+    dr.schedule(valid)
     return surface_points(terrain, interaction, valid), np.array(valid)
 
 
@@ -215,36 +220,66 @@ def pixel_moments(
     import drjit as dr
     import mitsuba as mi
 
+    def moments(interaction: Any, facet: Any) -> list[Any]:
+        valid = interaction.is_valid()
+        albedo = _seen_albedo(terrain, interaction, facet)
+        # A small constant weight defines the normal of black pixels too.
+        weight = dr.dot(albedo, mi.Color3f(*REC709_LUMINANCE.tolist())) + dr.select(valid, mi.Float(1e-6), 0.0)
+        normal = shading_normal(terrain.mi_terrain.bsdf(), interaction, valid)
+        return [*albedo, *(weight * normal), weight, dr.select(valid, mi.Float(1.0), 0.0)]
+
+    total = _pixel_sums(terrain, camera, rows, count, seed, moments)
+    normal = total[:, 3:6] / np.maximum(total[:, 6:7], 1e-20)
+    return total[:, :3] / count, normal, total[:, 7] / count
+
+
+def pixel_albedo(terrain: RayScene, camera: Camera | Panorama, rows: range, count: int, seed: int) -> np.ndarray:
+    """The albedo ``(N, 3)`` of `pixel_moments` alone, without the normals, which cost as much as the rays."""
+    return (
+        _pixel_sums(
+            terrain, camera, rows, count, seed, lambda interaction, facet: [*_seen_albedo(terrain, interaction, facet)]
+        )
+        / count
+    )
+
+
+def _seen_albedo(terrain: RayScene, interaction: Any, facet: Any) -> Any:
+    """Albedo ``mi.Color3f`` of what camera rays hit; see `_mi_camera_rays` and `pixel_moments`."""
+    import drjit as dr
+    import mitsuba as mi
+
+    front = front_side(interaction, interaction.is_valid())
+    material = terrain.mi_terrain.bsdf()
+    albedo = material.eval_diffuse_reflectance(interaction, front)
+    water = device_water(material)
+    if water is not None:
+        # Of water, the body is seen through facets that do not mirror.
+        viewer = interaction.to_world(interaction.wi)
+        _, mirrored = water.mirrored(water.vertical(interaction.p), viewer, facet)
+        body = material.body(interaction, front) * (1.0 - mirrored)
+        albedo = dr.select(water.covers(interaction.uv, front), body, albedo)
+    return dr.select(front, albedo, mi.Color3f(0.0))
+
+
+def _pixel_sums(
+    terrain: RayScene,
+    camera: Camera | Panorama,
+    rows: range,
+    count: int,
+    seed: int,
+    lanes_of: Callable[[Any, Any], list[Any]],
+) -> np.ndarray:
+    """Sums ``(N, C)`` over the samples of each pixel of what ``lanes_of`` returns for the results of `_mi_camera_rays`."""
+    import drjit as dr
+
     step = max(1, LANES // (camera.width_px * count))
     parts = []
     for top in range(rows.start, rows.stop, step):
         block = range(top, min(top + step, rows.stop))
-        interaction, facet = _mi_camera_rays(terrain, camera, block, count, seed)
-        valid = interaction.is_valid()
-        front = front_side(interaction, valid)
-        material = terrain.mi_terrain.bsdf()
-        albedo = material.eval_diffuse_reflectance(interaction, front)
-        water = device_water(material)
-        if water is not None:
-            # Of water, the body is seen through facets that do not mirror.
-            viewer = interaction.to_world(interaction.wi)
-            _, mirrored = water.mirrored(water.vertical(interaction.p), viewer, facet)
-            body = material.body(interaction, front) * (1.0 - mirrored)
-            albedo = dr.select(water.covers(interaction.uv, front), body, albedo)
-        albedo = dr.select(front, albedo, mi.Color3f(0.0))
-        # A small constant weight defines the normal of black pixels too.
-        weight = dr.dot(albedo, mi.Color3f(*REC709_LUMINANCE.tolist())) + dr.select(valid, mi.Float(1e-6), 0.0)
-        lanes = [
-            *albedo,
-            *(weight * shading_normal(material, interaction, valid)),
-            weight,
-            dr.select(valid, mi.Float(1.0), 0.0),
-        ]
-        # Evaluated together: summing an unevaluated channel would trace all rays again for each of the eight channels.
+        lanes = lanes_of(*_mi_camera_rays(terrain, camera, block, count, seed))
+        # Evaluated together: summing an unevaluated channel would trace all rays again for each of the channels.
         dr.eval(lanes)
         sums = [dr.block_sum(values, count) for values in lanes]
         dr.eval(sums)
         parts.append(np.stack([np.array(values) for values in sums], axis=-1))
-    total = np.concatenate(parts)
-    normal = total[:, 3:6] / np.maximum(total[:, 6:7], 1e-20)
-    return total[:, :3] / count, normal, total[:, 7] / count
+    return np.concatenate(parts)

@@ -186,19 +186,31 @@ def singular_values(terrain: Terrain, width_px: int, height_px: int) -> tuple[np
     for start in range(0, len(terrain.faces), _CHUNK_FACES):
         part = slice(start, start + _CHUNK_FACES)
         faces = terrain.faces[part]
-        p = terrain.vertices[faces].astype(np.float64)
-        t = terrain.uv[faces].astype(np.float64) * scale
-        e1, e2, t1, t2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0], t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]
-        determinant = t1[:, 0] * t2[:, 1] - t1[:, 1] * t2[:, 0]
-        area[part] = 0.5 * np.linalg.norm(np.cross(e1, e2), axis=1)
+        corners = [np.ascontiguousarray(faces[:, k]) for k in range(3)]
+
+        # A coordinate after the other: rows of two or three numbers cost several times as much.
+        (x1, x2), (y1, y2), (z1, z2) = space = [_edges(axis, corners) for axis in terrain.vertices.T]
+        (u1, u2), (v1, v2) = (
+            (first * side, second * side)
+            for (first, second), side in zip((_edges(axis, corners) for axis in terrain.uv.T), scale, strict=True)
+        )
+        determinant = u1 * v2 - v1 * u2
+        area[part] = 0.5 * np.sqrt((y1 * z2 - z1 * y2) ** 2 + (z1 * x2 - x1 * z2) ** 2 + (x1 * y2 - y1 * x2) ** 2)
         with np.errstate(divide="ignore", invalid="ignore"):
-            s = (e1 * t2[:, 1:] - e2 * t1[:, 1:]) / determinant[:, None]
-            t = (e2 * t1[:, :1] - e1 * t2[:, :1]) / determinant[:, None]
-            a, b, c = (s * s).sum(1), (s * t).sum(1), (t * t).sum(1)
+            a = b = c = np.zeros(len(faces))
+            for e1, e2 in space:
+                s, t = (e1 * v2 - e2 * v1) / determinant, (e2 * u1 - e1 * u2) / determinant
+                a, b, c = a + s * s, b + s * t, c + t * t
             root = np.sqrt((a - c) ** 2 + 4.0 * b * b)
             longer[part] = np.sqrt((a + c + root) / 2.0)
             shorter[part] = 2.0 * area[part] / np.abs(determinant) / longer[part]
     return longer, shorter, area
+
+
+def _edges(column: np.ndarray, corners: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Changes ``(F,)`` of a coordinate of vertices from the first corner of faces to the two others."""
+    first, second, third = (column[corner].astype(np.float64) for corner in corners)
+    return second - first, third - first
 
 
 def _weighted_percentiles(values: np.ndarray, weights: np.ndarray, percents: tuple[float, ...]) -> tuple[float, ...]:

@@ -100,17 +100,28 @@ def vertex_normals(terrain: Terrain) -> np.ndarray:
     numpy.ndarray
         Unit normals ``(V, 3)`` float32, east-north-up.
     """
-    corner = terrain.vertices[terrain.faces].astype(np.float64)
-    face = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    face /= np.maximum(np.linalg.norm(face, axis=1, keepdims=True), 1e-30)
+    corners = [np.ascontiguousarray(terrain.faces[:, k]) for k in range(3)]
+    # A coordinate after the other, ``(F,)`` each: rows of three numbers cost several times as much.
+    place = [[np.take(axis, corner) for axis in terrain.vertices.T.astype(np.float64)] for corner in corners]
+    # Edge k leads from corner k to the next one.
+    edges = [[b - a for a, b in zip(place[k], place[(k + 1) % 3], strict=True)] for k in range(3)]
+    lengths = [np.sqrt(_dot(edge, edge)) for edge in edges]
+    (x0, y0, z0), (x1, y1, z1) = edges[0], edges[1]
+    face = [y0 * z1 - z0 * y1, z0 * x1 - x0 * z1, x0 * y1 - y0 * x1]
+    length = np.maximum(np.sqrt(_dot(face, face)), 1e-30)
+    face = [axis / length for axis in face]
     total = np.zeros((len(terrain.vertices), 3))
     for k in range(3):
-        a, b = corner[:, (k + 1) % 3] - corner[:, k], corner[:, (k + 2) % 3] - corner[:, k]
-        cosine = np.einsum("nc,nc->n", a, b) / np.maximum(np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1), 1e-30)
+        cosine = -_dot(edges[k], edges[k - 1]) / np.maximum(lengths[k] * lengths[k - 1], 1e-30)
         angle = np.arccos(np.clip(cosine, -1.0, 1.0))
         for axis in range(3):
-            total[:, axis] += np.bincount(terrain.faces[:, k], angle * face[:, axis], minlength=len(total))
+            total[:, axis] += np.bincount(corners[k], angle * face[axis], minlength=len(total))
     return (total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)).astype(np.float32)
+
+
+def _dot(a: list[np.ndarray], b: list[np.ndarray]) -> np.ndarray:
+    """Dot products ``(F,)`` of vectors given as three columns."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def horizontal_gaussian_mean(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import product
 
 import cv2
@@ -24,7 +24,8 @@ from seasonscapes.terrain.tile_files import path_list, read_tiles
 ENCODINGS = ("srgb", "linear")
 # Largest number of samples along a footprint; more elongated footprints use a coarser mip level.
 _MAX_ANISOTROPY = 8
-_CHUNK = 250_000
+# Texels that are filtered together: what is made for them stays in a processor's cache.
+_CHUNK = 1 << 15
 # Exponents of east, north and up in the polynomial from the local frame to image pixels.
 _DEGREE = 6
 _EXPONENTS = [(i, j, k) for k, top in ((0, _DEGREE), (1, 3)) for i in range(top + 1) for j in range(top + 1 - i)]
@@ -139,19 +140,17 @@ def bake_imagery(terrain: Terrain, atlas: Atlas, image: Raster, *, gutter_px: in
     side = _footprint_side(footprint)
     pyramid = _pyramid(image.values, 1 + int(np.ceil(np.log2(side).max())))
     # How to filter follows from the face, of which there are far fewer than texels.
-    major = footprint[:, :2]
-    taps = np.ceil(np.maximum(footprint[:, 2], 1.0) / side - 1e-3).astype(np.int16)
-    level = np.clip(np.log2(side), 0.0, len(pyramid) - 1.0)
-    of_face = np.concatenate(gradients, axis=1)
+    filters = _FaceFilters.of(footprint, side, len(pyramid))
+    # Columns that lie together in memory: rows of two or three numbers cost several times as much.
+    columns = [np.ascontiguousarray(column) for column in np.concatenate(gradients, axis=1).T]
     texel = np.flatnonzero(face_id >= 0)
     for start in range(0, len(texel), _CHUNK):
         part = texel[start : start + _CHUNK]
-        face, (row, column) = face_id.ravel()[part], np.divmod(part, atlas.width_px)
-        origin, across, down = np.split(np.take(of_face, face, axis=0), 3, axis=1)
-        place = origin + across * (column + 0.5)[:, None] + down * (row + 0.5)[:, None]
-        where = place if linear else pixels_of(place)
-        rgb, coverage = _filtered(pyramid, where, face, major, taps, level)
-        values.reshape(-1, 3)[part], weight.ravel()[part] = rgb, coverage
+        face, row = face_id.ravel()[part].astype(np.intp), part // atlas.width_px
+        across, down = part - row * atlas.width_px + 0.5, row + 0.5
+        place = [_on_faces(columns[axis :: len(columns) // 3], face, across, down) for axis in range(len(columns) // 3)]
+        where = place if linear else list(pixels_of(np.stack(place, axis=-1)).T)
+        values.reshape(-1, 3)[part], weight.ravel()[part] = _filtered(pyramid, where, face, filters)
     if not weight.any():
         raise InputError("imagery", "the image covers none of the terrain", cure="check the CRS of both files")
     atlas_id = atlas_identity(terrain, atlas.width_px, atlas.height_px)
@@ -237,9 +236,12 @@ def _polynomial(coefficients: np.ndarray, e: np.ndarray, n: np.ndarray, u: np.nd
 
 def _linear_on_faces(terrain: Terrain, vertex_px: np.ndarray, pixels_of: Callable[[np.ndarray], np.ndarray]) -> bool:
     """Whether image pixels are linear over the faces: they are, unless faces are many kilometres wide."""
-    corners = terrain.vertices[terrain.faces]
-    widest = np.argsort(np.ptp(corners[..., :2], axis=1).max(axis=1))[-1000:]
-    exact = pixels_of(corners[widest].mean(axis=1, dtype=np.float64))
+    width = np.zeros(len(terrain.faces), np.float32)
+    for axis in (0, 1):
+        a, b, c = (np.take(terrain.vertices[:, axis], terrain.faces[:, corner]) for corner in range(3))
+        np.maximum(width, np.maximum(np.maximum(a, b), c) - np.minimum(np.minimum(a, b), c), out=width)
+    widest = np.argpartition(width, -min(1000, len(width)))[-1000:]
+    exact = pixels_of(terrain.vertices[terrain.faces[widest]].mean(axis=1, dtype=np.float64))
     error_px = np.abs(exact - vertex_px[terrain.faces[widest]].mean(axis=1))
     return bool(error_px.max(initial=0.0) <= _MAX_FIT_ERROR_PX)
 
@@ -277,7 +279,8 @@ def _pyramid(values: np.ndarray, most: int) -> list[np.ndarray]:
     A level is the 2 × 2 box mean of the previous one.
     """
     height, width, channels = values.shape
-    known = np.asarray(np.isfinite(values).all(axis=2))
+    finite = np.isfinite(values)
+    known = np.logical_and.reduce([finite[..., channel] for channel in range(channels)])
     finest = np.zeros((height + 2 * _RIM_PX, width + 2 * _RIM_PX, channels + 1), np.float32)
     inside = np.s_[_RIM_PX : _RIM_PX + height, _RIM_PX : _RIM_PX + width]
     finest[inside][..., :-1] = values if known.all() else np.where(known[..., None], values, 0.0)
@@ -292,51 +295,94 @@ def _pyramid(values: np.ndarray, most: int) -> list[np.ndarray]:
     return levels
 
 
-def _filtered(
-    pyramid: list[np.ndarray],
-    pixel: np.ndarray,
-    face: np.ndarray,
-    major: np.ndarray,
-    taps: np.ndarray,
-    level: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Mean colour ``(N, 3)`` and coverage ``(N,)`` over the footprints of N texels at pixels ``(N, 2)``.
+@dataclass(frozen=True)
+class _FaceFilters:
+    """How texels of each of F faces are filtered.
 
-    ``face`` ``(N,)`` are their faces, ``major`` ``(F, 2)``, ``taps`` and ``level`` ``(F,)`` those of the faces: the major axis
-    of the footprint, the samples along it, and their level of the pyramid.
+    ``major`` are columns and rows ``(F,)`` of the footprint's major axis [image pixels], ``taps`` ``(F,)`` the samples along it
+    and ``level`` ``(F,)`` their level of the pyramid. ``kind`` ``(F,)`` is one number for ``taps`` and the whole part of ``level``.
     """
-    result = np.zeros((len(pixel), pyramid[0].shape[2]), np.float32)
-    count_of, level_of = taps[face], level[face]
-    base = level_of.astype(np.int16)
-    for count, lower in product(range(1, count_of.max() + 1), range(base.min(), base.max() + 1)):
-        chosen = np.flatnonzero((count_of == count) & (base == lower))
-        if not len(chosen):
-            continue
-        blend = (level_of[chosen] - lower)[:, None].astype(np.float32)
-        centre = pixel[chosen]
-        for tap in range(count):
-            at = centre
-            if count > 1:
-                at = at + ((tap + 0.5) / count - 0.5) * major[face[chosen]]
-            sample = _bilinear(pyramid[lower], at / 2.0**lower)
-            if blend.any():
-                coarser = _bilinear(pyramid[lower + 1], at / 2.0 ** (lower + 1))
-                sample = sample * (1.0 - blend) + coarser * blend
-            result[chosen] += sample / count
+
+    major: tuple[np.ndarray, np.ndarray]
+    taps: np.ndarray
+    level: np.ndarray
+    kind: np.ndarray
+
+    @classmethod
+    def of(cls, footprint: np.ndarray, side: np.ndarray, levels: int) -> _FaceFilters:
+        """Filters of footprints ``(F, 4)`` whose samples have sides ``(F,)`` [image pixels], with a pyramid of ``levels``."""
+        taps = np.ceil(np.maximum(footprint[:, 2], 1.0) / side - 1e-3).astype(np.intp)
+        level = np.clip(np.log2(side), 0.0, levels - 1.0)
+        major = (np.ascontiguousarray(footprint[:, 0]), np.ascontiguousarray(footprint[:, 1]))
+        return cls(major, taps, level, taps * levels + level.astype(np.intp))
+
+
+def _on_faces(columns: Sequence[np.ndarray], face: np.ndarray, across: np.ndarray, down: np.ndarray) -> np.ndarray:
+    """A quantity ``(N,)`` at texels of N faces, from its start and gradients ``(F,)`` on the faces; see `face_gradients`."""
+    start, by_column, by_row = (column[face] for column in columns)
+    by_column *= across
+    start += by_column
+    by_row *= down
+    start += by_row
+    return start
+
+
+def _filtered(
+    pyramid: list[np.ndarray], pixel: list[np.ndarray], face: np.ndarray, filters: _FaceFilters
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean colour ``(N, 3)`` and coverage ``(N,)`` over the footprints of N texels.
+
+    ``pixel`` are their columns and rows in the image, ``(N,)`` each, ``face`` ``(N,)`` their faces.
+    """
+    kind_of = filters.kind[face]
+    kinds = np.flatnonzero(np.bincount(kind_of))
+    if len(kinds) == 1:
+        result = _sampled(pyramid, pixel, face, filters)
+    else:
+        result = np.empty((len(face), pyramid[0].shape[2]), np.float32)
+        for kind in kinds:
+            chosen = np.flatnonzero(kind_of == kind)
+            result[chosen] = _sampled(pyramid, [axis[chosen] for axis in pixel], face[chosen], filters)
     coverage = result[:, -1]
+    if (coverage == 1.0).all():
+        return result[:, :-1], coverage
     rgb = np.where(coverage[:, None] > 1e-6, result[:, :-1] / np.maximum(coverage, 1e-6)[:, None], 0.0)
     return rgb.astype(np.float32), np.where(coverage > 1e-6, np.minimum(coverage, 1.0), 0.0)
 
 
-def _bilinear(level: np.ndarray, pixel: np.ndarray) -> np.ndarray:
-    """Bilinear interpolation ``(N, C)`` at pixels ``(N, 2)`` of a level within its rim, with zeros outside the image."""
+def _sampled(
+    pyramid: list[np.ndarray], pixel: Sequence[np.ndarray], face: np.ndarray, filters: _FaceFilters
+) -> np.ndarray:
+    """Mean of premultiplied colour and coverage ``(N, C + 1)`` over the footprints of texels, all of one `kind`."""
+    count, lower = filters.taps[face[0]], int(filters.level[face[0]])
+    blend = (filters.level[face] - lower).astype(np.float32)[:, None]
+    total: np.ndarray | None = None
+    for tap in range(count):
+        at = pixel
+        if count > 1:
+            share = (tap + 0.5) / count - 0.5
+            at = [axis + share * major[face] for axis, major in zip(pixel, filters.major, strict=True)]
+        sample = _bilinear(pyramid[lower], *(axis / 2.0**lower for axis in at) if lower else at)
+        if blend.any():
+            coarser = _bilinear(pyramid[lower + 1], *(axis / 2.0 ** (lower + 1) for axis in at))
+            sample = sample * (1.0 - blend) + coarser * blend
+        total = sample if total is None else total + sample
+    assert total is not None
+    return total / np.float32(count) if count > 1 else total
+
+
+def _bilinear(level: np.ndarray, column: np.ndarray, row: np.ndarray) -> np.ndarray:
+    """Bilinear interpolation ``(N, C)`` at pixels of a level within its rim, with zeros outside the image."""
     height, width = level.shape[:2]
-    # Columns and rows of the level with its rim; what lies outside reads two zeros.
-    last = np.array([width - 2.0, height - 2.0])
-    place = np.clip(np.nan_to_num(pixel, nan=-9.0, posinf=-9.0, neginf=-9.0) + (_RIM_PX - 0.5), 0.0, last)
-    first = place.astype(np.int64)
-    fx, fy = (place - first).astype(np.float32).T[..., None]
-    flat, index = level.reshape(-1, level.shape[2]), first[:, 1] * width + first[:, 0]
+    # Columns and rows of the level with its rim; what lies outside, or nowhere (NaN), reads two zeros.
+    x, y = (
+        np.fmin(np.fmax(place + (_RIM_PX - 0.5), 0.0), side - 2.0) for place, side in ((column, width), (row, height))
+    )
+    first_x, first_y = x.astype(np.intp), y.astype(np.intp)
+    x -= first_x
+    y -= first_y
+    fx, fy = x.astype(np.float32)[:, None], y.astype(np.float32)[:, None]
+    flat, index = level.reshape(-1, level.shape[2]), first_y * width + first_x
     rows = []
     for corner in (index, index + width):
         left, right = np.take(flat, corner, axis=0), np.take(flat, corner + 1, axis=0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from scipy import sparse
 
@@ -31,7 +33,10 @@ def spline_noise(seed: int, wavelength_m: float, east_m: np.ndarray, north_m: np
         ``(H, W)`` float32.
     """
     step = 0.5 * wavelength_m
-    rows, columns = _spline_basis(north_m / step), _spline_basis(east_m / step)
+    rows, columns = (
+        _spline_basis(north_m / step),
+        _kept_basis((east_m / step).tobytes(), np.result_type(east_m, step).str),
+    )
     lattice = (_lattice(seed, rows[1], columns[1]) / _SPLINE_DEVIATION).astype(np.float32)
     across = np.ascontiguousarray((columns[0] @ lattice.T).T)
     return rows[0] @ across
@@ -98,8 +103,17 @@ def fractal_noise(
     total = np.zeros((len(north_m), len(east_m)), np.float32)
     for k, weight in enumerate(weights):
         if wavelength_m / 2**k >= finest:
-            total += weight * spline_noise(seed + 101 * k, wavelength_m / 2**k, east_m, north_m)
-    return total / np.float32(np.sqrt(np.sum(weights**2)))
+            octave = spline_noise(seed + 101 * k, wavelength_m / 2**k, east_m, north_m)
+            octave *= weight
+            total += octave
+    total /= np.float32(np.sqrt(np.sum(weights**2)))
+    return total
+
+
+@lru_cache(maxsize=64)
+def _kept_basis(position: bytes, dtype: str) -> tuple[sparse.csr_array, range]:
+    """`_spline_basis` of the bytes of an array: strips of one map, and all its fields of a wavelength, share it."""
+    return _spline_basis(np.frombuffer(position, dtype))
 
 
 def _spline_basis(position: np.ndarray) -> tuple[sparse.csr_array, range]:
@@ -110,10 +124,10 @@ def _spline_basis(position: np.ndarray) -> tuple[sparse.csr_array, range]:
     t = position - cell
     weights = np.stack([(1 - t) ** 3, 3 * t**3 - 6 * t**2 + 4, -3 * t**3 + 3 * t**2 + 3 * t + 1, t**3], -1) / 6.0
     columns = (cell - 1 - first)[:, None] + np.arange(4)
-    rows = np.repeat(np.arange(len(position)), 4)
     count = int(cell.max()) + 3 - first
     basis = sparse.csr_array(
-        (weights.ravel().astype(np.float32), (rows, columns.ravel())), shape=(len(position), count)
+        (weights.ravel().astype(np.float32), columns.ravel(), np.arange(0, 4 * len(position) + 1, 4)),
+        shape=(len(position), count),
     )
     return basis, range(first, first + count)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from math import cos, pi, sin
 
 import cv2
@@ -85,6 +85,7 @@ _CONSTANT_ALBEDO = {
 }
 # Fraction of the snow cover that is visible from above; tree crowns shed and cover snow.
 _VISIBLE_SNOW = {Cover.CONIFER: 0.24, Cover.LARCH: 0.45, Cover.BROADLEAF: 0.55, Cover.SHRUB: 0.85, Cover.WATER: 0.0}
+# Rows of the map that is made, four of which a processor's cache holds with all that they are made of.
 _STRIP_ROWS = 160
 
 
@@ -106,15 +107,21 @@ def snow_line_m(day_of_year: float) -> float:
 
 def _periodic(day: ArrayLike, knots: Sequence[tuple[int, tuple[float, ...]]]) -> np.ndarray:
     """Periodic monotone cubic interpolation (PCHIP) over the year: ``day`` ``(...)`` → ``(..., C)`` float32."""
+    table_days, table = _year_table(tuple(knots))
+    day = np.mod(np.asarray(day, float), _YEAR)
+    return np.stack([np.interp(day, table_days, column) for column in table], -1).astype(np.float32)
+
+
+@lru_cache(maxsize=16)
+def _year_table(knots: tuple[tuple[int, tuple[float, ...]], ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Days ``(T,)`` of the year and the values ``(C, T)`` between knots."""
     days = np.array([d for d, _ in knots], float)
     values = np.array([v for _, v in knots], float)
     days = np.concatenate([days[-3:] - _YEAR, days, days[:3] + _YEAR])
     values = np.concatenate([values[-3:], values, values[:3]])
     # Linear interpolation in a table of quarter days is accurate enough and much faster than splines per pixel.
     table_days = np.arange(-0.25, _YEAR + 0.5, 0.25)
-    table = monotone_cubic(days, values, table_days)
-    day = np.mod(np.asarray(day, float), _YEAR)
-    return np.stack([np.interp(day, table_days, column) for column in table.T], -1).astype(np.float32)
+    return table_days, np.ascontiguousarray(monotone_cubic(days, values, table_days).T)
 
 
 def _smoothstep(low: float, high: float, x: np.ndarray) -> np.ndarray:
@@ -142,20 +149,39 @@ def _axes(massif: SyntheticMassif, rows: slice, upsample: int) -> tuple[np.ndarr
     return east.astype(np.float32), north.astype(np.float32)
 
 
-def _snow(massif: SyntheticMassif, day: float, rows: slice, upsample: int) -> np.ndarray:
-    """Fraction of the ground under seasonal snow, ``(h, w)`` float32 in [0, 1]."""
+@dataclass(frozen=True)
+class _Strip:
+    """Rows of a massif's maps with ``upsample`` texels per cell, w columns and h rows of them.
+
+    Axes ``(w,)`` and ``(h,)``, heights ``(h, w)`` and heights within the strata ``(h, w)`` [m].
+    """
+
+    rows: slice
+    upsample: int
+    east_m: np.ndarray
+    north_m: np.ndarray
+    height_m: np.ndarray
+    level_m: np.ndarray
+
+
+def _strip(massif: SyntheticMassif, rows: slice, upsample: int) -> _Strip:
     east, north = _axes(massif, rows, upsample)
     z = _upsampled(massif.elevation.values[..., 0], rows, upsample)
+    return _Strip(rows, upsample, east, north, z, strata_level_m(z, east, north, massif.seed))
+
+
+def _snow(massif: SyntheticMassif, day: float, strip: _Strip) -> np.ndarray:
+    """Fraction of the ground under seasonal snow, ``(h, w)`` float32 in [0, 1]."""
+    rows, upsample, east, north = strip.rows, strip.upsample, strip.east_m, strip.north_m
     slope, northness = (_upsampled(f, rows, upsample, cv2.INTER_LINEAR) for f in (massif.slope_deg, massif.northness))
     patches = fractal_noise(massif.seed + 301, 420.0, east, north, octaves=7, gain=0.7)
     concavity = _upsampled(massif.concavity_m, rows, upsample, cv2.INTER_LINEAR)
     # The dependence of the snow line on aspect is largest in early summer and smallest in early winter.
     contrast = 330.0 + 130.0 * sin(2.0 * pi * (day - 60.0) / _YEAR)
     line = snow_line_m(day) - contrast * northness - 10.0 * np.clip(concavity, -12.0, 12.0) + 95.0 * patches
-    accumulated = _smoothstep(-90.0, 130.0, z - line)
+    accumulated = _smoothstep(-90.0, 130.0, strip.height_m - line)
     # Slopes above about 55° shed snow, except on ledges; unresolved ledges retain 6 %.
-    level = strata_level_m(z, east, north, massif.seed)
-    ledge = np.cos(level * np.float32(2.0 * pi / LEDGES_M[1]))
+    ledge = np.cos(strip.level_m * np.float32(2.0 * pi / LEDGES_M[1]))
     retained = 1.0 - _smoothstep(
         44.0,
         60.0,
@@ -180,76 +206,88 @@ def snow_fraction(massif: SyntheticMassif, day_of_year: float) -> np.ndarray:
         Fraction of each cell under snow, ``(H, W)`` float32 in [0, 1].
     """
     height = massif.cover.shape[0]
-    return np.concatenate([_snow(massif, day_of_year, rows, 1) for rows in _strips(height)])
+    return np.concatenate([_snow(massif, day_of_year, _strip(massif, rows, 1)) for rows in _strips(height, 1)])
 
 
-def _strips(height: int) -> list[slice]:
-    return [slice(start, min(start + _STRIP_ROWS, height)) for start in range(0, height, _STRIP_ROWS)]
+def _strips(height: int, upsample: int) -> list[slice]:
+    step = max(1, _STRIP_ROWS // upsample)
+    return [slice(start, min(start + step, height)) for start in range(0, height, step)]
 
 
 def _upsampled_cover(massif: SyntheticMassif, rows: slice, upsample: int, grain: np.ndarray) -> np.ndarray:
     """Cover classes at the finer resolution, with class borders perturbed by noise."""
     if upsample == 1:
         return massif.cover[rows]
-    # Lake cells are replaced by meadow here: the lake's outline follows from the shore distance below.
-    cover = np.where(massif.shore_m < 0.0, np.uint8(Cover.MEADOW), massif.cover)
     shore = _upsampled(massif.shore_m, rows, upsample, cv2.INTER_LINEAR)
+    # The rows, and those beside them that interpolation reads.
+    around = slice(max(rows.start - 4, 0), rows.stop + 4)
+    rows = slice(rows.start - around.start, rows.stop - around.start)
+    # Lake cells are replaced by meadow here: the lake's outline follows from the shore distance below.
+    cover = np.where(massif.shore_m[around] < 0.0, np.uint8(Cover.MEADOW), massif.cover[around])
     best, chosen = np.full(grain.shape, -np.inf, np.float32), np.zeros(grain.shape, np.uint8)
     for k, kind in enumerate(Cover):
-        if not (cover[rows] == kind).any():
+        cells = cover == kind
+        if not cells[rows].any():
             continue
-        fraction = _upsampled((cover == kind).astype(np.float32), rows, upsample, cv2.INTER_LINEAR)
-        perturbation = np.roll(grain, 37 * k, axis=1) if kind != Cover.WATER else 0.0
-        score = np.where(fraction > 0.02, fraction + 0.16 * perturbation, -1.0).astype(np.float32)
-        better = score > best
-        best, chosen = np.where(better, score, best), np.where(better, np.uint8(kind), chosen)
+        fraction = _upsampled(cells, rows, upsample, cv2.INTER_LINEAR)
+        score = np.zeros_like(grain) if kind == Cover.WATER else np.roll(grain, 37 * k, axis=1)
+        score *= 0.16
+        score += fraction
+        np.putmask(score, fraction <= 0.02, -1.0)
+        np.putmask(chosen, score > best, np.uint8(kind))
+        np.maximum(best, score, out=best)
     # The shore distance resolves the lake's outline below the cell size.
     return np.where(shore < 0.0, np.uint8(Cover.WATER), chosen)
 
 
 @dataclass(frozen=True)
-class _Strip:
-    """Fields on a strip of rows: cover class, height [m], short- and long-wave noise, each ``(h, w)``; its axes [m]."""
+class _Ground:
+    """Fields of the ground on a strip: cover class, short- and long-wave noise, each ``(h, w)``."""
 
     cover: np.ndarray
-    height_m: np.ndarray
     grain: np.ndarray
     broad: np.ndarray
-    east_m: np.ndarray
-    north_m: np.ndarray
 
 
-def _ground(massif: SyntheticMassif, day: float, rows: slice, upsample: int) -> tuple[np.ndarray, np.ndarray]:
-    """Albedo ``(h, w, 3)`` without seasonal snow, and cover classes ``(h, w)``."""
-    east, north = _axes(massif, rows, upsample)
-    seed = massif.seed
-    grain = fractal_noise(seed + 401, 60.0, east, north, octaves=3 + upsample.bit_length(), gain=0.8)
-    broad = fractal_noise(seed + 411, 900.0, east, north, octaves=5, gain=0.6)
-    z = _upsampled(massif.elevation.values[..., 0], rows, upsample)
-    cover = _upsampled_cover(massif, rows, upsample, grain)
-    albedo = np.empty((*cover.shape, 3), np.float32)
+def _ground(massif: SyntheticMassif, strip: _Strip) -> _Ground:
+    upsample = strip.upsample
+    octaves = 3 + upsample.bit_length()
+    grain = fractal_noise(massif.seed + 401, 60.0, strip.east_m, strip.north_m, octaves=octaves, gain=0.8)
+    broad = fractal_noise(massif.seed + 411, 900.0, strip.east_m, strip.north_m, octaves=5, gain=0.6)
+    return _Ground(_upsampled_cover(massif, strip.rows, upsample, grain), grain, broad)
+
+
+def _bare_albedo(massif: SyntheticMassif, day: float, strip: _Strip, ground: _Ground) -> np.ndarray:
+    """Albedo ``(3, h, w)`` without seasonal snow."""
+    cover, z, grain, broad = ground.cover, strip.height_m, ground.grain, ground.broad
     # Spring is later and autumn earlier by about 3 days per 100 m of height (Hopkins 1918: four days in 400 feet).
     delay_days = np.clip((z - 1500.0) * 0.030, -25.0, 30.0) + 4.0 * broad
     spring_weight = 0.5 + 0.5 * cos(2.0 * pi * (day - 120.0) / _YEAR)
     local_day = day + delay_days * (1.0 - 2.0 * spring_weight)
-    constant = np.array([_CONSTANT_ALBEDO.get(kind, (0.0, 0.0, 0.0)) for kind in Cover], np.float32)
-    np.take(constant, cover, axis=0, out=albedo)
+    # A channel after the other: triples of numbers cost several times as much.
+    albedo = np.stack(
+        [
+            _by_class(cover, {kind: constant[channel] for kind, constant in _CONSTANT_ALBEDO.items()})
+            for channel in range(3)
+        ]
+    )
     for kind, knots in _SEASONAL_ALBEDO.items():
-        cells = cover == kind
-        if cells.any():
-            albedo[cells] = _periodic(local_day[cells], knots)
-    ice = cover == Cover.ICE
-    if ice.any():
-        debris = _upsampled(massif.debris, rows, upsample, cv2.INTER_LINEAR)[ice]
-        height_m, fine, coarse = z[ice], grain[ice], broad[ice]
+        cells = np.flatnonzero(cover == kind)
+        if len(cells):
+            for plane, values in zip(albedo, _periodic(local_day.ravel()[cells], knots).T, strict=True):
+                plane.ravel()[cells] = values
+    ice = np.flatnonzero(cover == Cover.ICE)
+    if len(ice):
+        debris = _upsampled(massif.debris, strip.rows, strip.upsample, cv2.INTER_LINEAR)
+        debris, height_m, fine, coarse = (field.ravel()[ice] for field in (debris, z, grain, broad))
         dirt = np.clip(debris + 0.30 * fine + 0.45 * coarse - 0.65, 0.0, 0.75)
-        dirt = np.clip(dirt + 0.30 * _smoothstep(2700.0, 1500.0, height_m), 0.0, 0.92)[:, None]
+        dirt = np.clip(dirt + 0.30 * _smoothstep(2700.0, 1500.0, height_m), 0.0, 0.92)
         # Crevasses and ogives are transverse to the flow, along contour lines.
-        crevasse = np.sin(height_m * (2.0 * pi / 11.0) + 2.5 * fine + 3.0 * coarse)[:, None]
-        scree = np.array(_CONSTANT_ALBEDO[Cover.SCREE], np.float32)
-        albedo[ice] = (albedo[ice] + dirt * (0.8 * scree - albedo[ice])) * (1.0 + 0.07 * crevasse)
-    _add_texture(albedo, _Strip(cover, z, grain, broad, east, north), seed)
-    return albedo, cover
+        crevasse = np.sin(height_m * (2.0 * pi / 11.0) + 2.5 * fine + 3.0 * coarse)
+        for plane, clean, scree in zip(albedo, _CONSTANT_ALBEDO[Cover.ICE], _CONSTANT_ALBEDO[Cover.SCREE], strict=True):
+            plane.ravel()[ice] = (clean + dirt * (0.8 * scree - clean)) * (1.0 + 0.07 * crevasse)
+    _add_texture(albedo, strip, ground, massif.seed)
+    return albedo
 
 
 def _by_class(cover: np.ndarray, values: dict[Cover, float], *, otherwise: float = 0.0) -> np.ndarray:
@@ -257,9 +295,9 @@ def _by_class(cover: np.ndarray, values: dict[Cover, float], *, otherwise: float
     return np.array([values.get(kind, otherwise) for kind in Cover], np.float32)[cover]
 
 
-def _add_texture(albedo: np.ndarray, strip: _Strip, seed: int) -> None:
-    """Multiply an albedo ``(h, w, 3)`` by within-class variation (crowns, tufts, strata, field plots), in massif."""
-    cover, grain, broad = strip.cover, strip.grain, strip.broad
+def _add_texture(albedo: np.ndarray, strip: _Strip, ground: _Ground, seed: int) -> None:
+    """Multiply an albedo ``(3, h, w)`` by within-class variation (crowns, tufts, strata, field plots), in place."""
+    cover, grain, broad = ground.cover, ground.grain, ground.broad
     contrast = {
         Cover.MEADOW: 0.16,
         Cover.CONIFER: 0.42,
@@ -274,19 +312,21 @@ def _add_texture(albedo: np.ndarray, strip: _Strip, seed: int) -> None:
     }
     of_class = partial(_by_class, cover)
     exponent = of_class(contrast) * grain + of_class({Cover.FIRN: 0.02, Cover.ICE: 0.02}, otherwise=0.10) * broad
-    rock = cover == Cover.ROCK
-    level = (strata_level_m(strip.height_m, strip.east_m, strip.north_m, seed) + 8.0 * grain)[rock]
-    exponent[rock] += 0.13 * sum(np.sin(level * np.float32(2.0 * pi / period) + np.float32(0.8)) for period in LEDGES_M)
-    albedo *= np.exp(exponent)[..., None]
+    rock = np.flatnonzero(cover == Cover.ROCK)
+    level = strip.level_m.ravel()[rock] + 8.0 * grain.ravel()[rock]
+    exponent.ravel()[rock] += 0.13 * sum(
+        np.sin(level * np.float32(2.0 * pi / period) + np.float32(0.8)) for period in LEDGES_M
+    )
+    albedo *= np.exp(exponent)
     rusty = np.exp(of_class({Cover.ROCK: 0.06, Cover.SCREE: 0.06}) * broad)
-    albedo[..., 0] *= rusty
-    albedo[..., 2] /= rusty
+    albedo[0] *= rusty
+    albedo[2] /= rusty
     field = cover == Cover.FIELD
     if field.any():
         plots = np.sign(spline_noise(seed + 421, 260.0, strip.east_m, strip.north_m)) + np.sign(
             spline_noise(seed + 422, 190.0, strip.east_m, strip.north_m)
         )
-        albedo[field] *= np.exp(0.16 * plots[field])[:, None]
+        albedo *= np.where(field, np.exp(0.16 * plots), np.float32(1.0))
 
 
 def alpine_albedo(massif: SyntheticMassif, day_of_year: float, *, upsample: int = 1) -> np.ndarray:
@@ -316,31 +356,35 @@ def alpine_albedo(massif: SyntheticMassif, day_of_year: float, *, upsample: int 
         raise ValueError(f"upsample: got {upsample}, expected 1, 2, 4 or 8")
     height, width = massif.cover.shape
     result = np.empty((height * upsample, width * upsample, 3), np.float32)
-    for rows in _strips(height):
-        albedo, cover = _ground(massif, day_of_year, rows, upsample)
-        snow = _snow(massif, day_of_year, rows, upsample)
-        visible = _by_class(cover, _VISIBLE_SNOW, otherwise=1.0)
-        east, north = _axes(massif, rows, upsample)
-        ageing = 0.014 * fractal_noise(massif.seed + 501, 200.0, east, north, octaves=3)
-        snow_albedo = _snow_albedo(day_of_year) + ageing[..., None]
-        weight = (snow * visible)[..., None]
-        snow_albedo -= albedo
-        snow_albedo *= weight
-        np.add(albedo, snow_albedo, out=result[rows.start * upsample : rows.stop * upsample])
-    return np.clip(result, 0.01, 0.93, out=result)
+    for rows in _strips(height, upsample):
+        strip = _strip(massif, rows, upsample)
+        ground = _ground(massif, strip)
+        albedo = _bare_albedo(massif, day_of_year, strip, ground)
+        weight = _snow(massif, day_of_year, strip)
+        weight *= _by_class(ground.cover, _VISIBLE_SNOW, otherwise=1.0)
+        ageing = fractal_noise(massif.seed + 501, 200.0, strip.east_m, strip.north_m, octaves=3)
+        ageing *= 0.014
+        part = result[rows.start * upsample : rows.stop * upsample]
+        for channel, snow in enumerate(_snow_albedo(day_of_year)):
+            covered = ageing + snow
+            covered -= albedo[channel]
+            covered *= weight
+            covered += albedo[channel]
+            np.clip(covered, 0.01, 0.93, out=part[..., channel])
+    return result
 
 
 def _snow_albedo(day: float) -> np.ndarray:
     """Albedo ``(3,)`` of seasonal snow: fresh snow in midwinter, coarse-grained snow with dust in July."""
     return _periodic(
         day,
-        [
+        (
             (20, (0.86, 0.87, 0.88)),
             (100, (0.80, 0.81, 0.82)),
             (190, (0.66, 0.67, 0.68)),
             (250, (0.70, 0.71, 0.72)),
             (300, (0.84, 0.85, 0.86)),
-        ],
+        ),
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -19,26 +19,38 @@ def _spans(x: np.ndarray, y: np.ndarray, width: int, height: int) -> tuple[np.nd
     a row from the same end points in the same order, and spans are half open: every texel centre inside a mesh belongs
     to exactly one of its triangles.
     """
-    order = np.lexsort((x, y), axis=1)
-    x, y = np.take_along_axis(x, order, 1), np.take_along_axis(y, order, 1)
-    first = np.clip(np.ceil(y[:, 0]), 0, height).astype(np.int64)
-    end = np.clip(np.ceil(y[:, 2]), 0, height).astype(np.int64)
+    (x0, y0), (x1, y1), (x2, y2) = _upwards(x, y)
+    first = np.clip(np.ceil(y0), 0, height).astype(np.int64)
+    end = np.clip(np.ceil(y2), 0, height).astype(np.int64)
     count = np.maximum(end - first, 0)
     triangle = np.repeat(np.arange(len(x)), count)
-    row = np.arange(len(triangle)) - np.repeat(np.cumsum(count) - count, count) + first[triangle]
+    row = np.arange(len(triangle)) + np.repeat(first - (np.cumsum(count) - count), count)
+    # Of the two short edges a row meets the one on its side of the middle corner.
+    second = (row >= y1[triangle]) * np.intp(len(x)) + triangle
 
-    def crossing(i: int, j: int) -> np.ndarray:
+    def crossing(ends: Sequence[np.ndarray], edge: np.ndarray) -> np.ndarray:
         # Rows intersect only edges with y_i <= row < y_j: results of a division by zero are never used.
-        xi, yi, xj, yj = x[triangle, i], y[triangle, i], x[triangle, j], y[triangle, j]
+        xi, yi, xj, yj = (each[edge] for each in ends)
         with np.errstate(divide="ignore", invalid="ignore"):
             return xi + (row - yi) / (yj - yi) * (xj - xi)
 
-    short = np.where(row < y[triangle, 1], crossing(0, 1), crossing(1, 2))
-    long = crossing(0, 2)
+    short = crossing([np.concatenate(ends) for ends in ((x0, x1), (y0, y1), (x1, x2), (y1, y2))], second)
+    long = crossing((x0, y0, x2, y2), triangle)
     left = np.clip(np.ceil(np.minimum(short, long)), 0, width).astype(np.int64)
     right = np.clip(np.ceil(np.maximum(short, long)), 0, width).astype(np.int64)
     keep = right > left
     return triangle[keep], row[keep], left[keep], right[keep]
+
+
+def _upwards(x: np.ndarray, y: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The corners of triangles ``(N, 3)`` by increasing y, those of equal y by x: three pairs ``(N,)``."""
+    corners = [(np.ascontiguousarray(x[:, k]), np.ascontiguousarray(y[:, k])) for k in range(3)]
+    for i, j in ((0, 1), (1, 2), (0, 1)):
+        (xi, yi), (xj, yj) = corners[i], corners[j]
+        swap = (yi > yj) | ((yi == yj) & (xi > xj))
+        corners[i] = np.where(swap, xj, xi), np.where(swap, yj, yi)
+        corners[j] = np.where(swap, xi, xj), np.where(swap, yi, yj)
+    return corners
 
 
 def _covered(xy: np.ndarray, faces: np.ndarray, width: int, height: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -163,16 +175,24 @@ def face_gradients(values: np.ndarray, faces: np.ndarray, xy: np.ndarray) -> tup
     start, across, down
         ``(F, C)`` float64 each: the value at texel coordinates 0, and its change by column and by row.
     """
-    values = np.asarray(values, np.float64)
-    (t1, t2), (p1, p2) = (
-        [array[faces[:, k]] - array[faces[:, 0]] for k in (1, 2)] for array in (np.asarray(xy, np.float64), values)
-    )
-    determinant = _cross(t1, t2)[:, None]
+    # By columns, which costs half of what rows of two or three numbers do.
+    corners = [np.ascontiguousarray(faces[:, k]) for k in range(3)]
+
+    def at_corners(column: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Values ``(F,)`` at the first corners, and the change from there to the two others."""
+        first, second, third = (np.asarray(column, np.float64)[corner] for corner in corners)
+        return first, second - first, third - first
+
+    (x0, x1, x2), (y0, y1, y2) = (at_corners(xy[:, axis]) for axis in (0, 1))
+    determinant = x1 * y2 - y1 * x2
     # Faces of zero UV area cover no texel.
-    determinant = np.where(determinant == 0.0, np.inf, determinant)
-    across, down = (p1 * t2[:, 1:] - p2 * t1[:, 1:]) / determinant, (p2 * t1[:, :1] - p1 * t2[:, :1]) / determinant
-    corner = xy[faces[:, 0]]
-    start = values[faces[:, 0]] - across * corner[:, :1] - down * corner[:, 1:]
+    determinant[determinant == 0.0] = np.inf
+    start, across, down = (np.empty((len(faces), values.shape[1])) for _ in range(3))
+    for channel in range(values.shape[1]):
+        v0, v1, v2 = at_corners(values[:, channel])
+        by_column, by_row = (v1 * y2 - v2 * y1) / determinant, (v2 * x1 - v1 * x2) / determinant
+        across[:, channel], down[:, channel] = by_column, by_row
+        start[:, channel] = v0 - by_column * x0 - by_row * y0
     return start, across, down
 
 
