@@ -28,6 +28,9 @@ from seasonscapes.sky.spectrum import WAVELENGTHS_NM, rgb_from_transfer
 _ROWS_ABOVE, _ROWS_BELOW, _TABLE_AZIMUTHS, _CELLS = 44, 20, 49, 36
 # Exponents of the row spacing in elevation above and below the horizon.
 _EXPONENT_ABOVE, _EXPONENT_BELOW = 2.5, 3.0
+# From this true elevation of the sun on, its light scattered once is as smooth between the knots of `elevation_table`
+# as all other light: below, the Earth's shadow rises through the air.
+LOWEST_DAY_DEG = 0.0
 # Aerial perspective is tabulated at these distances, and down to this depth below the model's ground.
 DISTANCE_EDGES_M = np.concatenate([400e3 * np.linspace(0.0, 1.0, 41) ** 3, [520e3, 700e3, 950e3, 1300e3]])
 _DEPTH_BELOW_GROUND_M = 2000.0
@@ -180,11 +183,7 @@ def observed_sky(
     ScatteredRadiance
         Table for `sky_radiance`.
     """
-    rgb_matrix = rgb_from_transfer() * irradiance
-    if diffuse is None:
-        diffuse = diffuse_at_observer(tables, view, true_elevation_rad)
-    components = radiance_components(tables, view.sky, true_elevation_rad, rgb_matrix, diffuse)[:, :, 0]
-    components[:, :, 6:9] += (ground_along(tables, view.sky, true_elevation_rad) @ rgb_matrix.T).astype(np.float32)
+    components = components_at_observer(tables, view, true_elevation_rad, irradiance, diffuse)[:, :, 0]
     return ScatteredRadiance(
         np.asarray(luminary_direction, float),
         _rgb_aerosol_depth(tables.atmosphere),
@@ -192,6 +191,82 @@ def observed_sky(
         view.horizon_rad,
         interpolate_azimuths(components),
     )
+
+
+def components_at_observer(
+    tables: AtmosphereTables,
+    view: ObserverView,
+    true_elevation_rad: float,
+    irradiance: np.ndarray,
+    diffuse: np.ndarray | None = None,
+    *,
+    near: bool = False,
+) -> np.ndarray:
+    """Compute the components of a luminary's radiance along an observer's rays, or interpolate those of the sun by day.
+
+    Parameters
+    ----------
+    tables
+        Tables of the atmosphere.
+    view
+        Rays of the observer.
+    true_elevation_rad
+        True elevation of the luminary [rad].
+    irradiance
+        Extraterrestrial spectral irradiance over that of the sun at 1 au ``(B,)``.
+    diffuse
+        What `diffuse_at_observer` gives, where it is known already; nothing is interpolated then.
+    near
+        As in `diffuse_at_observer`; without it the ground at the end of the rays is included.
+
+    Returns
+    -------
+    ndarray
+        ``(K, A, M or 1, 10)`` float32, as of `along_rays.radiance_components`.
+    """
+    day = true_elevation_rad >= np.radians(LOWEST_DAY_DEG) and tables.day_of is not None
+    # Light of another colour than the sun's, as the moon's, has other components.
+    if diffuse is None and day and np.ptp(irradiance) == 0.0:
+        assert tables.day_of is not None
+        components = interpolate_at_elevation(tables.day_of(view.height_m, near), true_elevation_rad, positive=False)
+        components[..., :9] *= np.float32(irradiance[0])
+        return components
+    if diffuse is None:
+        diffuse = diffuse_at_observer(tables, view, true_elevation_rad, near=near)
+    rgb_matrix = rgb_from_transfer() * irradiance
+    samples = view.near if near else view.sky
+    components = radiance_components(tables, samples, true_elevation_rad, rgb_matrix, diffuse, cumulative=near)
+    if not near:
+        ground = ground_along(tables, samples, true_elevation_rad) @ rgb_matrix.T
+        components[:, :, 0, 6:9] += ground.astype(np.float32)
+    return components
+
+
+def day_by_elevation(tables: AtmosphereTables, height_m: float, near: bool, *, part: int | None = None) -> np.ndarray:
+    """Tabulate `components_at_observer` of the sun at 1 au by solar elevation.
+
+    Parameters
+    ----------
+    tables, height_m, near, part
+        As in `diffuse_by_elevation`.
+
+    Returns
+    -------
+    ndarray
+        Table of `elevation_table.tabulate_by_elevation`, for true elevations from `LOWEST_DAY_DEG` on.
+    """
+    view = observer_view(tables, height_m)
+    samples, unit = (view.near if near else view.sky), np.ones(len(WAVELENGTHS_NM))
+
+    def components_of(suns_rad: np.ndarray) -> np.ndarray:
+        diffuse = diffuse_along(tables, samples, view.elevation_rad, suns_rad, cumulative=near)
+        each = [
+            components_at_observer(tables, view, float(sun), unit, light, near=near)
+            for sun, light in zip(suns_rad, diffuse, strict=True)
+        ]
+        return np.stack(each)
+
+    return tabulate_by_elevation(components_of, part=part)
 
 
 def diffuse_at_observer(

@@ -34,7 +34,7 @@ from seasonscapes.sky.ephemeris import LunarPosition, SolarPosition, at_index, m
 from seasonscapes.sky.illuminate import SkyEvaluators, illuminate, significant_moon
 from seasonscapes.sky.illumination import Illumination
 from seasonscapes.sky.models import AtmosphereModel, SkyModel, atmosphere_from_model, read_sky_model, with_overrides
-from seasonscapes.sky.observer_radiance import diffuse_by_elevation, observer_view
+from seasonscapes.sky.observer_radiance import LOWEST_DAY_DEG, day_by_elevation, diffuse_by_elevation, observer_view
 from seasonscapes.sky.shipped_tables import shipped_tables
 from seasonscapes.workspace import Workspace, build_once
 
@@ -216,13 +216,22 @@ def atmosphere_tables_in(
                 save=lambda tables, path: save_tables(path, tables),
                 load=load_tables,
             )
-            tables[atmosphere] = replace(built, diffuse_of=_diffuse_in(workspace, built)) if by_elevation else built
+            if by_elevation:
+                diffuse, day = (
+                    _parted_in(workspace, built, *kind)
+                    for kind in (("sky/diffuse", diffuse_by_elevation), ("sky/day", day_by_elevation))
+                )
+                built = replace(built, diffuse_of=diffuse, day_of=day)
+            tables[atmosphere] = built
         return tables[atmosphere]
 
     return tables_of
 
 
-def _diffuse_in(workspace: Workspace, tables: AtmosphereTables) -> Callable[[float, bool], PartedTable]:
+def _parted_in(
+    workspace: Workspace, tables: AtmosphereTables, folder: str, tabulate: Callable[..., np.ndarray]
+) -> Callable[[float, bool], PartedTable]:
+    """Tables by elevation of every height of an observer, kept in the workspace part by part."""
     cached: dict[tuple[float, bool], PartedTable] = {}
     lock = Lock()
 
@@ -230,19 +239,19 @@ def _diffuse_in(workspace: Workspace, tables: AtmosphereTables) -> Callable[[flo
         with lock:
             return build_once(
                 workspace,
-                "sky/diffuse",
+                folder,
                 {"atmosphere": tables.atmosphere, "height_m": height_m, "near": near, "part": part},
                 code=_DIFFUSE_CODE,
                 suffix=".npy",
-                build=lambda: diffuse_by_elevation(tables, height_m, near, part=part),
+                build=lambda: tabulate(tables, height_m, near, part=part),
                 save=save_table,
                 load=load_table,
             )
 
-    def diffuse_of(height_m: float, near: bool) -> PartedTable:
+    def table_of(height_m: float, near: bool) -> PartedTable:
         return cached.setdefault((height_m, near), PartedTable(partial(part_of, height_m, near)))
 
-    return diffuse_of
+    return table_of
 
 
 def illumination_at(
@@ -413,21 +422,31 @@ def tabulate_illumination(
         return
     tables = atmosphere_tables_in(place.workspace, by_elevation=True)(atmosphere_from_model(model))
     assert tables.diffuse_of is not None
+    assert tables.day_of is not None
     where = (place.frame.latitude_deg, place.frame.longitude_deg, place.median_height_m)
     # All instants at once: one by one, those of a year take minutes.
     suns, moons = sun_position(times, *where), moon_position(times, *where)
-    apparent_deg = []
+    sun_deg, moon_deg = [], []
     for index in range(len(times)):
         sun = at_index(suns, index)
         moon = significant_moon(sun, at_index(moons, index))
-        apparent_deg += [body.elevation_deg for body in (sun, moon) if body is not None]
+        sun_deg.append(sun.elevation_deg)
+        moon_deg += [] if moon is None else [moon.elevation_deg]
     camera_m, wanted = camera_geodetic(place, camera)[2], []
     for height_m, near in ((place.median_height_m, False), (camera_m, False), (camera_m, True)):
-        true_rad = np.radians(true_elevation_deg(tables.atmosphere, np.array(apparent_deg), height_m))
-        table = tables.diffuse_of(observer_view(tables, height_m).height_m, near)
-        assert isinstance(table, PartedTable)
-        shining = true_rad[true_rad > np.radians(LOWEST_SHINING_DEG)]
-        wanted += [(table, part) for part in sorted({part for each in shining for part in parts_at(each)})]
+        sun_rad, moon_rad = (
+            np.radians(true_elevation_deg(tables.atmosphere, np.array(each, float), height_m))
+            for each in (sun_deg, moon_deg)
+        )
+        by_day = sun_rad >= np.radians(LOWEST_DAY_DEG)
+        for table_of, true_rad in (
+            (tables.day_of, sun_rad[by_day]),
+            (tables.diffuse_of, np.concatenate([sun_rad[~by_day], moon_rad])),
+        ):
+            table = table_of(observer_view(tables, height_m).height_m, near)
+            assert isinstance(table, PartedTable)
+            shining = true_rad[true_rad > np.radians(LOWEST_SHINING_DEG)]
+            wanted += [(table, part) for part in sorted({part for each in shining for part in parts_at(each)})]
     for number, (table, part) in enumerate(wanted):
         table.part(part)
         if progress is not None:
