@@ -44,6 +44,8 @@ if TYPE_CHECKING:
     from seasonscapes.workflows.place import Place
 
 _TABLES_CODE = ("sky.clear_sky",)
+# With the sun above this elevation [deg] the night sky's own light is less than a millionth of the sky's.
+_NO_STAR_DEG = 1.0
 _DIFFUSE_CODE = ("sky.observer_radiance", "sky.elevation_table")
 
 
@@ -336,12 +338,15 @@ def illumination_for_camera(
         with_aerial_perspective=False,
         by_elevation=by_elevation,
     )
+    # By day no star is seen, and the aerial perspective knows the sky in more detail than a map.
+    cloudless = isinstance(model, AtmosphereModel) and model.cloudiness == 0.0
+    all_in_air = by_elevation and cloudless and position.sun.elevation_deg > _NO_STAR_DEG
     at_camera = illumination_at(
         model,
         position,
         camera_geodetic(place, camera)[2],
         workspace=place.workspace,
-        map_height=map_height,
+        map_height=0 if all_in_air else map_height,
         by_elevation=by_elevation,
     )
     light = replace(
