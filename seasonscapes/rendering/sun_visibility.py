@@ -235,9 +235,27 @@ def first_sample_visible(rays: SunRays, luminary: Luminary) -> np.ndarray:
     return result
 
 
-def sum_incidence(
-    rays: SunRays, luminary: Luminary, receiver: np.ndarray, *, traced: bool = True
-) -> tuple[np.ndarray, np.ndarray]:
+def sum_facing(rays: SunRays, luminary: Luminary, receiver: np.ndarray) -> np.ndarray:
+    """Sum the cosine of incidence over those samples of receivers that face the luminary, without shadow rays.
+
+    Parameters
+    ----------
+    rays
+        Shadow rays of N receivers.
+    luminary
+        Sun or moon.
+    receiver
+        ``(K,)`` indices of the receivers to evaluate.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(K,)`` float32 weighted sums of the cosine: `sum_incidence` where nothing occludes the luminary.
+    """
+    return _sums(rays, luminary, receiver, traced=False)[0]
+
+
+def sum_incidence(rays: SunRays, luminary: Luminary, receiver: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Sum the cosine of incidence over the samples of receivers, with and without occlusion.
 
     Parameters
@@ -248,9 +266,6 @@ def sum_incidence(
         Sun or moon.
     receiver
         ``(K,)`` indices of the receivers to evaluate.
-    traced
-        Trace shadow rays. Otherwise samples are dark only where they face away from the luminary, which takes a tenth of
-        the time.
 
     Returns
     -------
@@ -259,10 +274,16 @@ def sum_incidence(
     unoccluded
         ``(K,)`` float32 weighted sums of the cosine.
     """
+    visible, unoccluded = _sums(rays, luminary, receiver, traced=True)
+    return visible, unoccluded
+
+
+def _sums(rays: SunRays, luminary: Luminary, receiver: np.ndarray, *, traced: bool) -> np.ndarray:
+    """What `sum_incidence` returns, ``(2, K)``; without shadow rays what `sum_facing` returns, ``(1, K)``."""
     import drjit as dr
     import mitsuba as mi
 
-    sums = np.empty((2, len(receiver)), np.float32)
+    sums = np.empty((1 + traced, len(receiver)), np.float32)
     disc = _mi_disc(luminary, rays.disc_points)
     step = max(1, LANES // rays.samples)
     for start in range(0, len(receiver), step):
@@ -276,12 +297,12 @@ def sum_incidence(
         else:
             visible, cosine, _, weight = _facing(rays, disc, lane)
         weighted = dr.fmax(cosine, 0.0) * weight
-        lanes = [dr.select(visible, weighted, 0.0), weighted]
+        lanes = [dr.select(visible, weighted, 0.0), *([weighted] if traced else [])]
         dr.eval(lanes)
         blocks = [dr.block_sum(values, rays.samples) for values in lanes]
         dr.eval(blocks)
         sums[:, start : start + dr.width(chosen)] = [np.array(values) for values in blocks]
-    return sums[0], sums[1]
+    return sums
 
 
 def visible_cosine(rays: SunRays, luminary: Luminary, *, rays_per_sample: int = 1) -> np.ndarray:

@@ -430,10 +430,14 @@ def apply_phase_functions(light: ScatteredRadiance, components: np.ndarray, cosi
         Radiance ``(..., 3)`` [cd/m²].
     """
     cosine = np.clip(cosine, -1.0, 1.0)
-    depth = components[..., 9:] * light.aerosol_depth.astype(np.float32)
-    aerosol = spread_aerosol_phase(cosine, depth, light.asymmetry, HARMONIC_ORDER)
-    gas = gas_phase(cosine)[..., None].astype(np.float32)
-    return components[..., :3] * gas + components[..., 3:6] * aerosol + components[..., 6:9]
+    depth = np.multiply.outer(light.aerosol_depth.astype(np.float32), components[..., 9])
+    aerosol = spread_aerosol_phase(cosine, np.moveaxis(depth, 0, -1), light.asymmetry, HARMONIC_ORDER)
+    gas = gas_phase(cosine).astype(np.float32)
+    radiance = np.empty((*components.shape[:-1], 3), np.result_type(components, aerosol))
+    for channel in range(3):
+        once_by_gas, once_by_aerosol, other = (components[..., k + channel] for k in (0, 3, 6))
+        radiance[..., channel] = once_by_gas * gas + once_by_aerosol * aerosol[..., channel] + other
+    return radiance
 
 
 def _rgb_aerosol_depth(atmosphere: Atmosphere) -> np.ndarray:
