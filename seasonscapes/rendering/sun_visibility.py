@@ -339,7 +339,9 @@ def visible_cosine(rays: SunRays, luminary: Luminary, *, rays_per_sample: int = 
         visible, cosine, _ = _visible(rays, disc, lane, receiver, disc_point, coherent=True)
         lanes = dr.select(visible, cosine, 0.0)
         dr.eval(lanes)
-        result[start : start + count] = np.array(dr.block_sum(lanes, rays_per_sample)) / rays_per_sample
+        if rays_per_sample > 1:
+            lanes = dr.block_sum(lanes, rays_per_sample) / dr.opaque(mi.Float, rays_per_sample)
+        result[start : start + count] = np.array(lanes)
     return result.reshape(-1, rays.samples)
 
 
