@@ -228,8 +228,8 @@ def first_sample_visible(rays: SunRays, luminary: Luminary) -> np.ndarray:
     disc = _mi_disc(luminary, rays.disc_points)
     for start in range(0, len(result), LANES):
         count = min(LANES, len(result) - start)
-        lane = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, start)
-        visible, _, _ = _visible(rays.first, disc, lane, lane)
+        receiver = None if count == len(result) else dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, start)
+        visible, _, _ = _visible(rays.first, disc, receiver, receiver)
         dr.eval(visible)
         result[start : start + count] = np.array(visible)
     return result
@@ -333,7 +333,7 @@ def visible_cosine(rays: SunRays, luminary: Luminary, *, rays_per_sample: int = 
         count = min(step, len(result) - start)
         lane, ray = _divided(dr.arange(mi.UInt32, count * rays_per_sample), rays_per_sample)
         receiver, sample = _divided(lane, rays.samples)
-        lane += dr.opaque(mi.UInt32, start)
+        lane = None if count * rays_per_sample == len(result) else lane + dr.opaque(mi.UInt32, start)
         receiver += dr.opaque(mi.UInt32, start // rays.samples)
         disc_point = sample + ray * dr.opaque(mi.UInt32, rays.samples)
         visible, cosine, _ = _visible(rays, disc, lane, receiver, disc_point, coherent=True)
@@ -378,6 +378,8 @@ def _visible(
 ) -> tuple[Any, Any, Any]:
     """Visibility of the luminary from samples (``lane`` of `SunRays`), cosine of incidence of its centre, and weight.
 
+    Without ``lane`` from all samples, and without ``receiver`` each is one of its own.
+
     ``point`` counts the points of the disc from the first of the receiver on; ``coherent`` traces packets, which pays where
     all samples of a receiver lie side by side. Samples whose facet faces away from the luminary are dark, as in a path
     tracer, whose shadow ray would start inside the terrain.
@@ -386,25 +388,31 @@ def _visible(
     import mitsuba as mi
 
     active, cosine, geometric_cosine, weight = _facing(rays, disc, lane)
-    _, disc_point = _divided(dr.gather(mi.UInt32, rays.mi_disc_offset, receiver) + point, disc.count)
+    _, disc_point = _divided(_chosen(mi.UInt32, rays.mi_disc_offset, receiver) + point, disc.count)
     direction = dr.gather(mi.Vector3f, disc.mi_directions, disc_point)
-    origin = dr.gather(mi.Point3f, rays.mi_origin, lane, active)
+    origin = _chosen(mi.Point3f, rays.mi_origin, lane)
     material = rays.terrain.mi_terrain.bsdf()
     ray = mi.Ray3f(origin + direction * shadow_ray_start(material, geometric_cosine, origin), direction)
     return active & ~rays.terrain.mi_scene.ray_test(ray, coherent=coherent, active=active), cosine, weight
 
 
+def _chosen(kind: Any, values: Any, lane: Any) -> Any:
+    """Lanes of an array; the array itself without ``lane``: kernels read it in order, several times quicker than by index."""
+    import drjit as dr
+
+    return values if lane is None else dr.gather(kind, values, lane)
+
+
 def _facing(rays: SunRays, disc: _Disc, lane: Any) -> tuple[Any, Any, Any, Any]:
     """Whether samples face the centre of the luminary, the cosines of their shading and geometric normals, and weight."""
-    import drjit as dr
     import mitsuba as mi
 
     cosine, geometric_cosine = (
         sum(
-            mi.Float(dr.gather(mi.Float16, column, lane)) * axis
+            mi.Float(_chosen(mi.Float16, column, lane)) * axis
             for column, axis in zip(columns, disc.mi_centre, strict=True)
         )
         for columns in (rays.mi_normal, rays.mi_geometric_normal)
     )
-    weight = mi.Float(dr.gather(mi.Float16, rays.mi_weight, lane))
+    weight = mi.Float(_chosen(mi.Float16, rays.mi_weight, lane))
     return (cosine > 0.0) & (geometric_cosine > 0.0) & (weight > 0.0), cosine, geometric_cosine, weight
