@@ -12,7 +12,7 @@ half
 known
     Its time, whether the sun shone, colour and brightness of its own sky: ``ours_known``, ``blend`` (by the same numbers).
 time
-    ``ours_blind`` (weather of the nearest sun), ``nearest`` (the picture of the nearest sun), ``mean`` of the others.
+    ``ours_blind`` (the other pictures relit, weighted by sun and day, as `hours` does), ``nearest`` (the picture of the nearest sun), ``mean`` of the others.
 
 ``oracle_blend`` sees what is scored. ``mean_psnr_db``, ``margin_over_best_rival_db`` and ``share_better`` hold ``ours`` against
 the best of all rivals but ``half_layers``, which is printed beside. Scores are of terrain without near ground and clouds before
@@ -37,6 +37,7 @@ from typing import Any
 import cv2
 import numpy as np
 from realbench_cameras import SKYLINE_PX, FixedCase, cameras_not_scored, chamonix, kronebreen
+from realbench_kriging import kriged
 from realbench_rivals import equally_exposed, rival_pictures, seeing_pictures
 from realbench_shadows import shadow_figures
 from record import write_record
@@ -48,12 +49,11 @@ from seasonscapes.albedo.fixed_camera import (
     conditions_of,
     direct_share,
     fit_fixed_camera,
-    picture_at,
     relit_at,
+    relit_mean,
 )
 from seasonscapes.albedo.picture_completion import SeenPart, completed_picture, ground_layers
 from seasonscapes.albedo.picture_conditions import Conditions, Ground, ViewLight, picture_under
-from seasonscapes.albedo.residual_kriging import kriged
 from seasonscapes.albedo.sunlit_patches import sun_shone
 from seasonscapes.evaluation.metrics import score
 from seasonscapes.images import linear_from_srgb, srgb_from_linear, write_png8
@@ -65,7 +65,8 @@ QUICK_WIDTH_PX, WIDTH_PX = 352, 704
 # Side of the blocks [of the full width] of which every other one tells the conditions.
 BLOCKS_ACROSS = 20
 RIVALS = ("nearest", "mean", "blend", "grey", "half_blend", "half_embedding")
-RIVALS_BY_KNOWLEDGE = ("nearest", "mean", "blend")
+RIVALS_BY_TIME = ("nearest", "mean")
+RIVALS_BY_KNOWLEDGE = (*RIVALS_BY_TIME, "blend")
 
 
 @dataclass(frozen=True)
@@ -194,7 +195,7 @@ def predictions(stack: Stack, k: int, options: FitOptions) -> tuple[dict[str, np
         "ours": ours(stack, camera, k, equal, found),
         "ours_conditions": crossed(stack, *[picture_under(camera.ground, light, each.values) for each in found]),
         "ours_known": relit_blend(stack, camera, others, k),
-        "ours_blind": picture_at(camera, light, camera.conditions[int(np.argmax(stack.sun[others] @ stack.sun[k]))]),
+        "ours_blind": relit_mean(camera, light, range(len(others))),
         "grey": crossed(
             stack, *[picture_under(grey.ground, light, each.values) for each in half_conditions(stack, grey, k)]
         ),
@@ -326,6 +327,7 @@ def figures_of(rows: list[dict[str, Any]]) -> dict[str, float]:
     names = rows[0]["scores"]
     known, better_known = margin(rows, "ours_known", RIVALS_BY_KNOWLEDGE)
     gained, better = margin(rows, "ours", RIVALS)
+    blind, better_blind = margin(rows, "ours_blind", RIVALS_BY_TIME)
     figures = {
         "mean_psnr_db": float(np.mean([row["scores"]["ours"]["psnr_db"] for row in rows])),
         "mean_ssim": float(np.mean([row["scores"]["ours"]["ssim"] for row in rows])),
@@ -334,6 +336,8 @@ def figures_of(rows: list[dict[str, Any]]) -> dict[str, float]:
         "margin_over_layered_blend_db": margin(rows, "ours", ("half_layers",))[0],
         "known_margin_over_best_rival_db": known,
         "known_share_better": better_known,
+        "time_margin_over_best_rival_db": blind,
+        "time_share_better": better_blind,
         "sun_visible_accuracy": float(np.mean([row["sun_visible_seen"] == row["sun_visible_found"] for row in rows])),
     }
     for season in sorted({row["season"] for row in rows}):

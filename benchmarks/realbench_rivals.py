@@ -7,8 +7,8 @@ asked picture says so by its name: ``half_…`` are fitted on the half that is n
 from __future__ import annotations
 
 import numpy as np
+from realbench_kriging import kriged
 
-from seasonscapes.albedo.residual_kriging import kriged
 from seasonscapes.images import linear_from_srgb, srgb_from_linear
 
 

@@ -141,7 +141,8 @@ def test_water_tells_no_albedo(case, photographs):
 def pixel_counts(photographs):
     from seasonscapes.albedo.footprints import texel_pixel_count
 
-    return texel_pixel_count([each.footprints for each in photographs[:3]])
+    every = [(each.footprints, np.ones(len(each.footprints.pixel), bool)) for each in photographs[:3]]
+    return texel_pixel_count(every)
 
 
 # A camera above the lake that sees nothing else.

@@ -1,11 +1,12 @@
 """A fixed camera's ground and its pictures' conditions, recovered from pictures made by the model itself or slightly not."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from seasonscapes.albedo.fixed_camera import FitOptions, conditions_of, fit_fixed_camera, picture_at
+from seasonscapes.albedo.fixed_camera import FitOptions, conditions_of, fit_fixed_camera, relit_at, relit_mean
 from seasonscapes.albedo.picture_conditions import (
     AIRLIGHT,
     CONTRAST,
@@ -20,7 +21,6 @@ from seasonscapes.albedo.picture_conditions import (
     ViewLight,
     picture_under,
 )
-from seasonscapes.albedo.residual_kriging import gram, kriged, kriging_weights
 from seasonscapes.errors import NoUsablePixels
 
 PIXELS = 900
@@ -89,7 +89,7 @@ def test_an_unseen_hour_is_predicted_from_half_of_its_pixels_and_better_than_by_
     _, _, lights, _, values = pictures
     seen = np.arange(PIXELS) % 2 == 0
     found = conditions_of(fitted, values[6], seen, lights[6])
-    predicted = picture_at(fitted, lights[6], found)[~seen]
+    predicted = picture_under(fitted.ground, lights[6], found.values)[~seen]
     best = max(_psnr(each[~seen], values[6][~seen]) for each in values[:6])
     assert _psnr(predicted, values[6][~seen]) > 33.0
     assert _psnr(predicted, values[6][~seen]) > best + 4.0
@@ -143,7 +143,24 @@ def test_one_picture_or_a_hidden_one_is_refused(pictures, fitted):
         conditions_of(fitted, values[6], nothing, lights[6])
 
 
-def test_kriging_leaves_out_what_is_unlike_and_equals_the_definition_of_leave_one_out():
+def test_relit_means_take_pictures_of_like_suns_and_near_days(fitted, pictures):
+    *_, lights, _, _ = pictures
+    asked = replace(lights[1], day=3)
+    suns = np.stack([asked.sun_direction] * 5 + [-asked.sun_direction])
+    year = replace(fitted, sun_direction=suns, day=np.array([180, 120, 240, 150, 362, 3]))
+    # The year is a circle: of pictures under one sun, that of 28 December alone is near 3 January.
+    near = relit_at(year, asked, 4)
+    np.testing.assert_allclose(relit_mean(year, asked, range(6)), near, atol=1e-3)
+    np.testing.assert_array_equal(relit_mean(year, asked, [2]), relit_at(year, asked, 2))
+    alike = replace(year, day=np.full(6, 3), sun_direction=np.stack([asked.sun_direction] * 6))
+    mean = np.mean([relit_at(alike, asked, k) for k in (1, 2)], axis=0)
+    np.testing.assert_allclose(relit_mean(alike, asked, [1, 2]), mean)
+
+
+def test_kriging_leaves_out_what_is_unlike_and_equals_the_definition_of_leave_one_out(monkeypatch):
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "benchmarks")
+    from realbench_kriging import gram, kriged, kriging_weights
+
     rng = np.random.default_rng(2)
     known = rng.normal(size=(9, 2))
     residual = np.outer(np.sin(2.0 * known[:, 0]), np.ones(50)) + rng.normal(0.0, 0.05, (9, 50))

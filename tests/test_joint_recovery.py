@@ -77,6 +77,22 @@ def problem(place):
     )
 
 
+def test_masked_pixels_measure_no_texel(place):
+    observations, lights = webcam_pictures(place)
+    shape = observations[0].mask.shape
+    left = np.indices(shape)[1] < shape[1] // 2
+    masked = [replace(each, mask=each.mask & left) for each in observations]
+    counts = []
+    for each in (observations, masked):
+        photographs = prepare_photographs(place.transport, each, lights)
+        fit = solve_albedo(place.transport, photographs, noise_model=EIGHT_BIT, solver=QUICK)
+        haze = HazeLights((1.0,), [lights], 1.0)
+        made = make_problem(place.transport, photographs, haze, EIGHT_BIT, fit.gains, JointOptions(sun_grid=4))
+        np.testing.assert_array_equal(made.pixel_count, fit.pixel_count)
+        counts.append(made.pixel_count)
+    assert (counts[1] > 0.0).sum() < 0.8 * (counts[0] > 0.0).sum()
+
+
 @pytest.mark.parametrize(
     ("name", "column", "step"), [(GAIN, 0, 1e-3), (CURVE, 1, 1e-3), (HAZE, 6, 2e-2), (SKY, 7, 1e-3), (SUN, None, 1e-3)]
 )

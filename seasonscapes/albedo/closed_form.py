@@ -29,7 +29,7 @@ from seasonscapes.albedo.equations import (
     reweight,
     squared_adjoint,
 )
-from seasonscapes.albedo.footprints import Footprints, texel_pixel_count
+from seasonscapes.albedo.footprints import texel_pixel_count
 from seasonscapes.albedo.forward_model import TexelTransport, ambient_on_texels
 from seasonscapes.albedo.ground_pixels import ground_pixels
 from seasonscapes.albedo.photographs import LINEAR, AlbedoPhotograph, NoiseModel
@@ -161,7 +161,9 @@ def solve_albedo(
     size = transport.shape[0] * transport.shape[1]
     systems = [equations_of(photograph, noise_model, size) for photograph in photographs]
     _require_usable(systems)
-    pixel_count = _usable_pixel_count(systems)
+    pixel_count = texel_pixel_count(
+        (each.photograph.footprints, np.asarray(each.usable.any(axis=1))) for each in systems
+    )
     albedo = np.full((size, 3), 0.25, np.float32) if start is None else start.reshape(size, 3).astype(np.float32)
     observed = pixel_count.ravel() > 0.0
     grounds = [ground_pixels(transport, photograph) for photograph in photographs]
@@ -181,17 +183,6 @@ def solve_albedo(
     gains = np.stack([1.0 / equations.inverse_gain for equations in systems])
     information = np.where(observed, diagonal[:, 1], 0.0).reshape(transport.shape).astype(np.float32)
     return AlbedoFit(albedo, pixel_count, information, gains, residual, cost, history, noise_model)
-
-
-def _usable_pixel_count(systems: list[PhotographEquations]) -> np.ndarray:
-    """Pixels ``(R, S)`` that each texel covers, summed over cameras; those that no photograph of a camera can use do not count."""
-    usable: dict[int, np.ndarray] = {}
-    footprints: dict[int, Footprints] = {}
-    for equations in systems:
-        own, chosen = equations.photograph.footprints, np.asarray(equations.usable.any(axis=1))
-        footprints[id(own)] = own
-        usable[id(own)] = chosen | usable[id(own)] if id(own) in usable else chosen
-    return texel_pixel_count([footprints[key] for key in usable], list(usable.values()))
 
 
 def update_ambient(systems: list[PhotographEquations], transport: TexelTransport, albedo: np.ndarray) -> None:

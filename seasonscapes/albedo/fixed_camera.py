@@ -18,9 +18,7 @@ import numpy as np
 from seasonscapes.albedo.picture_conditions import (
     CONTRAST,
     COUNT,
-    EXTINCTION,
     GAIN,
-    OVERCAST,
     RESIDUAL_SCALE,
     START,
     SUN,
@@ -33,7 +31,7 @@ from seasonscapes.albedo.picture_conditions import (
     linear_parts,
     picture_under,
 )
-from seasonscapes.albedo.residual_kriging import kriged
+from seasonscapes.albedo.seasons import circular_days
 from seasonscapes.errors import NoUsablePixels
 from seasonscapes.images import linear_from_srgb
 
@@ -53,6 +51,8 @@ _BARELY_TURNED = -0.05
 _MEAN_REFLECTANCE = 0.15
 # A smaller share of direct light on the best lit fiftieth of the ground throws no shadow that a picture shows.
 SUN_SHONE, _BEST_LIT = 0.25, 98.0
+# Suns this far apart light slopes alike, and the ground looks alike over so many days: widths of the weights of pictures.
+_ALIKE_DEG, _ALIKE_DAYS = 30.0, 30.0
 # A picture is not explained where its residual is so many times the median of all pictures'.
 _UNEXPLAINED = 3.0
 
@@ -86,8 +86,8 @@ class FixedCamera:
         Of its n terrain pixels.
     conditions
         Of each of the K pictures.
-    kinship
-        ``(K, f)`` what makes the K pictures alike: sun, season, weather, the camera's contrast.
+    sun_direction, day
+        ``(K, 3)`` and ``(K,)`` of each picture, as in `picture_conditions.ViewLight`.
     misfit
         ``(K, n, 3)`` float32 picture - model, encoded values; 0 where something stood before the terrain.
     residual
@@ -100,7 +100,8 @@ class FixedCamera:
 
     ground: Ground
     conditions: list[Conditions]
-    kinship: np.ndarray
+    sun_direction: np.ndarray
+    day: np.ndarray
     misfit: np.ndarray
     residual: np.ndarray
     direct: np.ndarray
@@ -139,7 +140,7 @@ def fit_fixed_camera(
     Returns
     -------
     FixedCamera
-        For `conditions_of` and `picture_at`.
+        For `conditions_of` and `relit_mean`.
 
     Raises
     ------
@@ -187,9 +188,9 @@ def fit_fixed_camera(
     )
     residual = _residuals(ground, whole, conditions)
     report(1.0)
-    kinship = np.stack([_kinship(*each) for each in zip(lights, conditions, strict=True)])
+    suns, days = np.stack([light.sun_direction for light in lights]), np.array([light.day for light in lights])
     direct = np.array([direct_share(ground, *each) for each in zip(lights, conditions, strict=True)])
-    return FixedCamera(ground, conditions, kinship, misfit, residual, direct, options.block)
+    return FixedCamera(ground, conditions, suns, days, misfit, residual, direct, options.block)
 
 
 def _first_ground(pictures: Sequence[np.ndarray], distance_km: np.ndarray, normal: np.ndarray) -> Ground:
@@ -333,24 +334,29 @@ def conditions_of(
     return found
 
 
-def picture_at(camera: FixedCamera, light: ViewLight, conditions: Conditions) -> np.ndarray:
-    """Values ``(n, 3)`` of the terrain pixels at another instant, sRGB-encoded.
-
-    The model's picture, and what the model leaves in pictures of like sun, season and weather (`residual_kriging`).
-    """
-    left = kriged(camera.kinship, _kinship(light, conditions), camera.misfit)
-    return np.clip(picture_under(camera.ground, light, conditions.values) + left, 0.0, 1.0)
-
-
 def relit_at(camera: FixedCamera, light: ViewLight, number: int) -> np.ndarray:
     """One of the camera's pictures ``(n, 3)`` in the light of another instant, under its own conditions and misfit."""
     relit = picture_under(camera.ground, light, camera.conditions[number].values)
     return np.clip(relit + camera.misfit[number], 0.0, 1.0)
 
 
-def _kinship(light: ViewLight, conditions: Conditions) -> np.ndarray:
-    """See `FixedCamera.kinship`."""
-    values = conditions.values
-    return np.array(
-        [*light.sun_direction, light.day / 60.0, values[SUN], values[OVERCAST], values[EXTINCTION], values[CONTRAST]]
-    )
+def relit_mean(camera: FixedCamera, light: ViewLight, taken: Sequence[int]) -> np.ndarray:
+    """Mean ``(n, 3)`` of some of the camera's pictures, relit to another instant: what is probable while its weather is unknown.
+
+    Pictures of like suns and of near days of the year weigh most: slopes err alike, and snow and leaves are as they were.
+
+    Parameters
+    ----------
+    camera
+        From `fit_fixed_camera`.
+    light
+        Light of the instant.
+    taken
+        Numbers of the pictures, at least one.
+    """
+    chosen = np.asarray(taken)
+    angle_deg = np.degrees(np.arccos(np.clip(camera.sun_direction[chosen] @ light.sun_direction, -1.0, 1.0)))
+    days = circular_days(camera.day[chosen] - light.day)
+    squared = (angle_deg / _ALIKE_DEG) ** 2 + (days / _ALIKE_DAYS) ** 2
+    weight = np.exp(-0.5 * (squared - squared.min()))
+    return np.tensordot(weight / weight.sum(), np.stack([relit_at(camera, light, number) for number in taken]), 1)

@@ -8,7 +8,7 @@ many pixels (`benchmarks/albedo.py` compares both).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -260,28 +260,31 @@ def _merged(row: np.ndarray, texel: np.ndarray, rows: int, texels: int) -> tuple
     return entry, start, unique % texels
 
 
-def texel_pixel_count(footprints: Sequence[Footprints], counted: Sequence[np.ndarray] | None = None) -> np.ndarray:
+def texel_pixel_count(used: Iterable[tuple[Footprints, np.ndarray]]) -> np.ndarray:
     """Count the pixels that each texel covers, summed over cameras.
+
+    A pixel of a camera counts once, however many of the camera's photographs use it.
 
     Parameters
     ----------
-    footprints
-        Footprints of each camera, all of one texture shape.
-    counted
-        ``(n,)`` bool of each camera: which of its terrain pixels count; ``None`` for all.
+    used
+        Footprints of each photograph, all of one texture shape, and which of their terrain pixels it uses, ``(n,)`` bool.
 
     Returns
     -------
     numpy.ndarray
-        ``(R, S)`` float32 fractional pixel counts; 0 where no pixel contains the texel.
+        ``(R, S)`` float32 fractional pixel counts; 0 where no used pixel contains the texel.
     """
-    total = np.zeros(footprints[0].shape[0] * footprints[0].shape[1])
-    for number, camera in enumerate(footprints):
-        share = camera.share
-        if counted is not None:
-            share = share * np.repeat(counted[number], np.diff(camera.start))
-        total += np.bincount(camera.texel, share, len(total))
-    return total.reshape(footprints[0].shape).astype(np.float32)
+    cameras: dict[int, tuple[Footprints, np.ndarray]] = {}
+    for footprints, pixels in used:
+        _, before = cameras.get(id(footprints), (footprints, pixels))
+        cameras[id(footprints)] = (footprints, np.logical_or(pixels, before))
+    shape = next(iter(cameras.values()))[0].shape
+    total = np.zeros(shape[0] * shape[1])
+    for footprints, pixels in cameras.values():
+        share = footprints.share * np.repeat(pixels, np.diff(footprints.start))
+        total += np.bincount(footprints.texel, share, len(total))
+    return total.reshape(shape).astype(np.float32)
 
 
 def whole_pixels(footprints: Footprints, *, full: float = 0.999) -> np.ndarray:

@@ -203,11 +203,13 @@ def fit_conditions(
         prior = (values - _PRIOR_MEAN) / _PRIOR_SIGMA
         return np.concatenate([misfit.ravel(), prior[free]])
 
+    # The exact solver factorises all residuals by singular values: five times the time, to the same cost.
     found = least_squares(
         residuals,
         np.clip(start[free], low + 1e-3, high - 1e-3),
         bounds=(low, high),
         loss="soft_l1",
+        tr_solver="lsmr",
         max_nfev=_FIT_EVALUATIONS,
     )
     values, sigma = start.copy(), np.zeros(COUNT)

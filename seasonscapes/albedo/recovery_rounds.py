@@ -10,7 +10,8 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array
 
 from seasonscapes.albedo.closed_form import HIGHEST, LOWEST, fill_nearest
-from seasonscapes.albedo.footprints import texel_pixel_count
+from seasonscapes.albedo.equations import usable_pixels
+from seasonscapes.albedo.footprints import texel_pixel_count, whole_pixels
 from seasonscapes.albedo.forward_model import TexelTransport
 from seasonscapes.albedo.photographs import AlbedoPhotograph, NoiseModel
 from seasonscapes.albedo.recovery_pictures import HazeLights, RecoveryPicture, recovery_picture
@@ -126,7 +127,7 @@ def make_problem(
     # An unknown that is exact keeps its start.
     precision = np.where(sigma > 0.0, priors.block / np.maximum(sigma, 1e-12) ** 2, 1e12)
     precision[layout.offset(SUN) :] = 0.0
-    pixel_count = texel_pixel_count(list({id(p.footprints): p.footprints for p in photographs}.values()))
+    pixel_count = texel_pixel_count((each.footprints, _used_pixels(each, noise_model)) for each in photographs)
     weights = sun_weights(transport, photographs, pixel_count, options.sun_grid)
     pictures = [
         recovery_picture(
@@ -142,6 +143,11 @@ def make_problem(
     sky = [sky_on_land(transport, [lights[k] for lights in haze.lights]) for k in first]
     frame = RecoveryFrame(layout, haze, noise_model, np.asarray(layout.view(sigma, TURN).any(axis=1)))
     return RecoveryProblem(transport, pictures, frame, start, precision, sky, pixel_count, options)
+
+
+def _used_pixels(photograph: AlbedoPhotograph, noise_model: NoiseModel) -> np.ndarray:
+    usable = usable_pixels(photograph.observation, photograph.noise(noise_model)).ravel()
+    return whole_pixels(photograph.footprints) & usable[photograph.footprints.pixel]
 
 
 def _numbers(keys: Sequence[Any]) -> list[int]:

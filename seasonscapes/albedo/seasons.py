@@ -146,6 +146,18 @@ def day_number(day: date) -> float:
     return float(day.timetuple().tm_yday)
 
 
+def circular_days(difference: float | np.ndarray) -> np.ndarray:
+    """Days between two days of the year that differ by ``(...)`` in their numbers; the year is a circle.
+
+    Examples
+    --------
+    >>> circular_days(360.0).round()
+    np.float64(5.0)
+    """
+    apart = np.abs(difference) % YEAR_DAYS
+    return np.minimum(apart, YEAR_DAYS - apart)
+
+
 def days_apart(first: date, second: date) -> float:
     """Days between two dates within the year, which is a circle: 20 December and 10 January are three weeks apart.
 
@@ -155,8 +167,7 @@ def days_apart(first: date, second: date) -> float:
     >>> round(days_apart(date(2023, 12, 20), date(2025, 1, 10)))
     21
     """
-    apart = abs(day_number(first) - day_number(second)) % YEAR_DAYS
-    return float(min(apart, YEAR_DAYS - apart))
+    return float(circular_days(day_number(first) - day_number(second)))
 
 
 def warn_of_unseen_seasons(days: Collection[date], photographed: Collection[date]) -> None:

@@ -36,8 +36,6 @@ _STANDS_STILL_PX = 0.5
 _LEAST_SHOWN = 0.02
 # A picture is meant by a time within so many seconds.
 _SAME_PICTURE_S = 60.0
-# Suns this far apart [deg] light slopes alike: the width of the weights of pictures.
-_ALIKE_DEG = 30.0
 Sky = Literal["any", "sun", "no sun"]
 
 
@@ -163,8 +161,6 @@ class CameraHours:
         Of the pictures, aware UTC.
     fitted
         Ground of each pixel and conditions of each picture.
-    suns
-        ``(K, 3)`` directions of the sun in the pictures.
     shown
         ``(n,)`` terrain pixels that a picture shows: what stands before the landscape in all of them is no terrain.
     background
@@ -193,7 +189,6 @@ class CameraHours:
     view: FixedView
     times: list[datetime]
     fitted: FixedCamera = field(repr=False)
-    suns: np.ndarray = field(repr=False)
     shown: np.ndarray = field(repr=False)
     background: np.ndarray = field(repr=False)
     closed: np.ndarray = field(repr=False)
@@ -217,7 +212,13 @@ class CameraHours:
                 not strange,
             )
             for time, each, sun, shone, residual, strange in zip(
-                self.times, self.fitted.conditions, self.suns, self.shone, self.fitted.residual, odd, strict=True
+                self.times,
+                self.fitted.conditions,
+                self.fitted.sun_direction,
+                self.shone,
+                self.fitted.residual,
+                odd,
+                strict=True,
             )
         ]
 
@@ -225,7 +226,7 @@ class CameraHours:
         """The view at another instant.
 
         Each picture of the stated sky is relit to the instant, under its own haze and exposure; the result is their
-        mean, weighted by how near their sun stands to the instant's.
+        mean, weighted by how near their sun and their day of the year are to the instant's.
 
         Parameters
         ----------
@@ -245,7 +246,7 @@ class CameraHours:
         InputError
             Where no picture has the stated sky.
         """
-        from seasonscapes.albedo.fixed_camera import SUN_SHONE, relit_at
+        from seasonscapes.albedo.fixed_camera import SUN_SHONE, relit_mean
 
         utc = utc_at(self.view.place, time)
         warn_of_unseen_seasons([utc.date()], [each.date() for each in self.times])
@@ -255,10 +256,7 @@ class CameraHours:
         taken = [k for k, each in enumerate(alike) if each]
         if not taken:
             raise InputError("--sky", "no picture has this sky", got=sky, cure="give --sky any")
-        angle = np.degrees(np.arccos(np.clip(self.suns[taken] @ light.sun_direction, -1.0, 1.0)))
-        weight = np.exp(-0.5 * ((angle - angle.min()) / _ALIKE_DEG) ** 2)
-        relit = np.stack([relit_at(self.fitted, light, k) for k in taken])
-        values = np.tensordot(weight / weight.sum(), relit, 1)
+        values = relit_mean(self.fitted, light, taken)
         image = self.background.copy()
         image.reshape(-1, 3)[self.view.pixel[self.shown]] = values[self.shown]
         return image
@@ -339,7 +337,6 @@ def camera_hours(place: Place, photographs: Sequence[Observation], *, progress: 
         view,
         [each.time for each in photographs],
         fitted,
-        np.stack([each.sun_direction for each in lights]),
         np.any(usable, axis=0),
         np.median(encoded, axis=0),
         np.array(closed),
