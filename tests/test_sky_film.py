@@ -25,16 +25,10 @@ from seasonscapes.sky.elevation_table import (
 from seasonscapes.sky.illumination import luminance
 from seasonscapes.sky.models import atmosphere_from_model, read_sky_model
 from seasonscapes.sky.night import night_sky_radiance
-from seasonscapes.sky.observer_radiance import (
-    day_by_elevation,
-    diffuse_by_elevation,
-    observed_sky,
-    observer_view,
-    sky_radiance,
-    sky_radiance_grid,
-)
+from seasonscapes.sky.observer_radiance import observed_sky, observer_view, sky_radiance, sky_radiance_grid
 from seasonscapes.sky.ray_cells import scattering_per_m
 from seasonscapes.sky.sh_moments import HARMONIC_ORDER, diffuse_source, height_index, sun_geometry, zonal
+from seasonscapes.sky.tables_by_elevation import day_by_elevation, diffuse_by_elevation
 from seasonscapes.workflows import illumination as illumination_module
 from seasonscapes.workspace import Workspace
 

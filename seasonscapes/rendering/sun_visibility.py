@@ -366,6 +366,7 @@ def _divided(number: Any, divisor: int) -> tuple[Any, Any]:
     if divisor == 1:
         return number, mi.UInt32(0)
     by = dr.opaque(mi.UInt32, divisor)
+    quotient: Any
     if divisor * LANES > 1 << 32:
         quotient = number // by
     else:

@@ -206,7 +206,7 @@ def illumination_from_atmosphere(
     moon
         The moon as a source above the atmosphere, or ``None``.
     shape
-        Rows and columns of the sky map; none, where the map is not wanted.
+        Rows and columns of the sky map; ``(0, 0)`` where the map is not wanted.
     with_aerial_perspective
         Whether to compute the aerial perspective, which takes most of the time; otherwise it is ``None``.
 
@@ -340,7 +340,7 @@ def _radiance_map(lights: tuple[ScatteredRadiance, ...], shape: tuple[int, int])
     """Sky map of 2 × 2 samples per pixel, which antialiases the row at the horizon and the solar aureole."""
     height, width = shape
     if not height:
-        return np.zeros((*shape, 3), np.float32)
+        return np.zeros((0, 0, 3), np.float32)
     elevation_deg = 90.0 - (np.arange(2 * height) + 0.5) * (90.0 / height)
     azimuth_deg = (np.arange(2 * width) + 0.5) * (180.0 / width)
     radiance = np.zeros((2 * height, 2 * width, 3), np.float32)

@@ -8,7 +8,6 @@ direction.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -19,7 +18,7 @@ from seasonscapes.sky.along_rays import AZIMUTHS, AZIMUTHS_RAD, diffuse_along, g
 from seasonscapes.sky.atmosphere import TOP_HEIGHT_M, Atmosphere, delta_scaled, gas_phase, optics
 from seasonscapes.sky.aureole import spread_aerosol_phase
 from seasonscapes.sky.curved_rays import cell_edges_m, horizon_elevation_rad, resample_rays, trace_curved_rays
-from seasonscapes.sky.elevation_table import interpolate_at_elevation, tabulate_by_elevation
+from seasonscapes.sky.elevation_table import interpolate_at_elevation
 from seasonscapes.sky.ray_cells import CellSamples, cell_columns, sample_cells
 from seasonscapes.sky.scattering import AtmosphereTables
 from seasonscapes.sky.sh_moments import HARMONIC_ORDER
@@ -242,33 +241,6 @@ def components_at_observer(
     return components
 
 
-def day_by_elevation(tables: AtmosphereTables, height_m: float, near: bool, *, part: int | None = None) -> np.ndarray:
-    """Tabulate `components_at_observer` of the sun at 1 au by solar elevation.
-
-    Parameters
-    ----------
-    tables, height_m, near, part
-        As in `diffuse_by_elevation`.
-
-    Returns
-    -------
-    ndarray
-        Table of `elevation_table.tabulate_by_elevation`, for true elevations from `LOWEST_DAY_DEG` on.
-    """
-    view = observer_view(tables, height_m)
-    samples, unit = (view.near if near else view.sky), np.ones(len(WAVELENGTHS_NM))
-
-    def components_of(suns_rad: np.ndarray) -> np.ndarray:
-        diffuse = diffuse_along(tables, samples, view.elevation_rad, suns_rad, cumulative=near)
-        each = [
-            components_at_observer(tables, view, float(sun), unit, light, near=near)
-            for sun, light in zip(suns_rad, diffuse, strict=True)
-        ]
-        return np.stack(each)
-
-    return tabulate_by_elevation(components_of, part=part)
-
-
 def diffuse_at_observer(
     tables: AtmosphereTables, view: ObserverView, true_elevation_rad: float, *, near: bool = False
 ) -> np.ndarray:
@@ -294,43 +266,6 @@ def diffuse_at_observer(
         return interpolate_at_elevation(tables.diffuse_of(view.height_m, near), true_elevation_rad)
     samples = view.near if near else view.sky
     return diffuse_along(tables, samples, view.elevation_rad, np.array([true_elevation_rad]), cumulative=near)[0]
-
-
-def diffuse_by_elevation(
-    tables: AtmosphereTables,
-    height_m: float,
-    near: bool,
-    *,
-    part: int | None = None,
-    progress: Callable[[float], None] | None = None,
-) -> np.ndarray:
-    """Tabulate `diffuse_at_observer` by solar elevation; takes some seconds, a part a fraction of one.
-
-    Parameters
-    ----------
-    tables
-        Tables of the atmosphere.
-    height_m
-        Height of the observer [m].
-    near
-        As in `diffuse_at_observer`.
-    part
-        A part of the table, see `elevation_table.PartedTable`.
-    progress
-        Called with the completed fraction.
-
-    Returns
-    -------
-    ndarray
-        Table of `elevation_table.tabulate_by_elevation`.
-    """
-    view = observer_view(tables, height_m)
-    samples = view.near if near else view.sky
-    return tabulate_by_elevation(
-        lambda suns: diffuse_along(tables, samples, view.elevation_rad, suns, cumulative=near),
-        part=part,
-        progress=progress,
-    )
 
 
 def sky_radiance(light: ScatteredRadiance, direction: np.ndarray) -> np.ndarray:

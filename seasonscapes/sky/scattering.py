@@ -68,10 +68,10 @@ class AtmosphereTables:
     moments
         Moments of the radiance scattered at least once, summed over all orders.
     diffuse_of
-        Function ``(height_m, near)`` that returns the table `observer_radiance.diffuse_by_elevation` of an observer's
+        Function ``(height_m, near)`` that returns the table `tables_by_elevation.diffuse_by_elevation` of an observer's
         height, which is fast for many solar positions. Without it diffuse light is computed for each solar position.
     day_of
-        Likewise of `observer_radiance.day_by_elevation`.
+        Likewise of `tables_by_elevation.day_by_elevation`.
     """
 
     atmosphere: Atmosphere

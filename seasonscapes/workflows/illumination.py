@@ -34,8 +34,9 @@ from seasonscapes.sky.ephemeris import LunarPosition, SolarPosition, at_index, m
 from seasonscapes.sky.illuminate import SkyEvaluators, illuminate, significant_moon
 from seasonscapes.sky.illumination import Illumination
 from seasonscapes.sky.models import AtmosphereModel, SkyModel, atmosphere_from_model, read_sky_model, with_overrides
-from seasonscapes.sky.observer_radiance import LOWEST_DAY_DEG, day_by_elevation, diffuse_by_elevation, observer_view
+from seasonscapes.sky.observer_radiance import LOWEST_DAY_DEG, observer_view
 from seasonscapes.sky.shipped_tables import shipped_tables
+from seasonscapes.sky.tables_by_elevation import day_by_elevation, diffuse_by_elevation
 from seasonscapes.workspace import Workspace, build_once
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ if TYPE_CHECKING:
 _TABLES_CODE = ("sky.clear_sky",)
 # With the sun above this elevation [deg] the night sky's own light is less than a millionth of the sky's.
 _NO_STAR_DEG = 1.0
-_DIFFUSE_CODE = ("sky.observer_radiance", "sky.elevation_table")
+_DIFFUSE_CODE = ("sky.tables_by_elevation",)
 
 
 @dataclass(frozen=True)
