@@ -9,6 +9,7 @@ import pytest
 from atmosphere_cases import tables_of
 
 from seasonscapes.frames import direction_from_angles
+from seasonscapes.rendering.mitsuba_scene import sky_radiance_towards
 from seasonscapes.sky.atmosphere import delta_scaled, gas_moments, optics
 from seasonscapes.sky.clear_sky import LuminarySource, illumination_from_atmosphere, sky_radiance_map
 from seasonscapes.sky.elevation_table import (
@@ -24,15 +25,10 @@ from seasonscapes.sky.elevation_table import (
 from seasonscapes.sky.illumination import luminance
 from seasonscapes.sky.models import atmosphere_from_model, read_sky_model
 from seasonscapes.sky.night import night_sky_radiance
-from seasonscapes.sky.observer_radiance import (
-    diffuse_by_elevation,
-    observed_sky,
-    observer_view,
-    sky_radiance,
-    sky_radiance_grid,
-)
+from seasonscapes.sky.observer_radiance import observed_sky, observer_view, sky_radiance, sky_radiance_grid
 from seasonscapes.sky.ray_cells import scattering_per_m
 from seasonscapes.sky.sh_moments import HARMONIC_ORDER, diffuse_source, height_index, sun_geometry, zonal
+from seasonscapes.sky.tables_by_elevation import day_by_elevation, diffuse_by_elevation
 from seasonscapes.workflows import illumination as illumination_module
 from seasonscapes.workspace import Workspace
 
@@ -41,16 +37,20 @@ HEIGHT_M = 2800.0
 
 @pytest.fixture(scope="module")
 def looked_up():
-    """Tables that come with diffuse light for an observer at `HEIGHT_M`."""
+    """Tables that come with diffuse light, and all light of the day, for an observer at `HEIGHT_M`."""
     tables = tables_of()
-    diffuse = {near: diffuse_by_elevation(tables, HEIGHT_M, near) for near in (False, True)}
 
-    def diffuse_of(height_m: float, near: bool) -> np.ndarray:
-        assert height_m == HEIGHT_M
-        return diffuse[near]
+    def looked_up_in(tabulate):
+        by_distance = {near: tabulate(tables, HEIGHT_M, near) for near in (False, True)}
+        assert sum(table.nbytes for table in by_distance.values()) < 120e6
 
-    assert sum(table.nbytes for table in diffuse.values()) < 120e6
-    return replace(tables, diffuse_of=diffuse_of)
+        def table_of(height_m: float, near: bool) -> np.ndarray:
+            assert height_m == HEIGHT_M
+            return by_distance[near]
+
+        return table_of
+
+    return replace(tables, diffuse_of=looked_up_in(diffuse_by_elevation), day_of=looked_up_in(day_by_elevation))
 
 
 def worst(table_light: np.ndarray, exact_light: np.ndarray) -> float:
@@ -61,7 +61,10 @@ def worst(table_light: np.ndarray, exact_light: np.ndarray) -> float:
 
 @pytest.mark.parametrize(
     ("low_deg", "high_deg", "bound"),
-    [(-18.0, -12.0, 1e-2), (-12.0, -6.0, 3e-3), (-6.0, -2.0, 3e-3), (-2.0, 3.0, 3e-3), (3.0, 65.0, 3e-3)],
+    [
+        *((-18.0, -12.0, 1e-2), (-12.0, -6.0, 3e-3), (-6.0, -2.0, 3e-3), (-2.0, 0.0, 3e-3)),
+        *((0.0, 1.0, 3e-3), (1.0, 3.0, 3e-3), (3.0, 65.0, 3e-3)),
+    ],
 )
 def test_a_film_s_sky_is_the_picture_s(looked_up, low_deg, high_deg, bound):
     """Random suns between the knots, random lines of sight: sky and airlight within 0.3 % through civil twilight."""
@@ -212,7 +215,7 @@ def test_a_grid_of_directions_is_the_same_sky():
     )
 
 
-def test_film_tables_are_built_once_and_whole(tmp_path, monkeypatch):
+def test_film_tables_are_built_once_and_whole(tmp_path):
     """A table that has no manifest, as an interrupted run leaves it, is built anew; a finished one is read."""
     workspace, built = Workspace(tmp_path), []
     sun_rad = np.radians(KNOTS_DEG[PART_KNOTS + 4])  # whose neighbours are of the same part
@@ -221,19 +224,20 @@ def test_film_tables_are_built_once_and_whole(tmp_path, monkeypatch):
         built.append((height_m, near))
         return tabulate_by_elevation(lambda suns: np.full((len(suns), 2), 1.0 + near), part=part)
 
-    monkeypatch.setattr(illumination_module, "diffuse_by_elevation", build)
     tables = tables_of()
+
+    def table_of():
+        return illumination_module._parted_in(workspace, tables, "sky/some", build)
+
     for _ in range(2):
-        diffuse_of = illumination_module._diffuse_in(workspace, tables)
+        diffuse_of = table_of()
         for _ in range(2):
             assert interpolate_at_elevation(diffuse_of(900.0, True), sun_rad) == pytest.approx(2.0, rel=1e-3)
     assert built == [(900.0, True)]
     (manifest,) = tmp_path.rglob("*.npy.json")
     manifest.unlink()
-    assert interpolate_at_elevation(
-        illumination_module._diffuse_in(workspace, tables)(900.0, True), sun_rad
-    ) == pytest.approx(2.0, rel=1e-3)
-    other = illumination_module._diffuse_in(workspace, tables)(901.0, True)
+    assert interpolate_at_elevation(table_of()(900.0, True), sun_rad) == pytest.approx(2.0, rel=1e-3)
+    other = table_of()(901.0, True)
     assert len(built) == 2, "a table is built where it is needed"
     assert interpolate_at_elevation(other, sun_rad) == pytest.approx(2.0, rel=1e-3)
     assert built == [(900.0, True), (900.0, True), (901.0, True)]
@@ -263,20 +267,25 @@ def test_light_for_a_film_takes_its_tables_from_the_workspace(tmp_path, looked_u
     from seasonscapes.workflows.place import load_place
     from seasonscapes.workflows.views import camera_for
 
-    asked = []
+    asked, by_day = [], []
 
-    def build(tables, height_m, near, *, part):
-        asked.append((height_m, near, part))
-        # The land's own sky is not compared here, so the camera's table will do for its height too.
-        return looked_up.diffuse_of(HEIGHT_M, near)[part * PART_KNOTS : (part + 1) * PART_KNOTS]
+    def builder_of(table_of, asked):
+        def build(tables, height_m, near, *, part):
+            asked.append((height_m, near, part))
+            # The land's own sky is not compared here, so the camera's table will do for its height too.
+            return table_of(HEIGHT_M, near)[part * PART_KNOTS : (part + 1) * PART_KNOTS]
+
+        return build
 
     assert atmosphere_from_model(read_sky_model("clear")) == tables_of().atmosphere
     monkeypatch.setattr(illumination_module, "atmosphere_tables", lambda _: tables_of())
-    monkeypatch.setattr(illumination_module, "diffuse_by_elevation", build)
+    for kind in ("diffuse", "day"):
+        build = builder_of(getattr(looked_up, f"{kind}_of"), by_day if kind == "day" else asked)
+        monkeypatch.setattr(illumination_module, f"{kind}_by_elevation", build)
     place = load_place(places.write_place(tmp_path), Workspace(tmp_path / "work"))
     view = place.scene.camera(None).model_copy(update={"above_ground_m": None, "height_m": HEIGHT_M})
     camera, model = camera_for(place, view, size_px=(32, 24)), read_sky_model("clear")
-    when, told = datetime(2024, 9, 1, 17, 50, tzinfo=UTC), []
+    when, told = datetime(2024, 9, 1, 18, 3, tzinfo=UTC), []
     illumination_module.tabulate_illumination(place, camera, model, [])
     assert not asked
     illumination_module.tabulate_illumination(place, camera, model, [when], progress=told.append)
@@ -303,6 +312,25 @@ def test_light_for_a_film_takes_its_tables_from_the_workspace(tmp_path, looked_u
     assert 0.0 < worst(quick.visible_sky, exact.visible_sky) < 3e-3
     np.testing.assert_array_equal(again.visible_sky, quick.visible_sky)
     np.testing.assert_array_equal(again.sky_radiance, quick.sky_radiance)
+    assert not by_day, "the sun is on the horizon"
+    noon = datetime(2024, 9, 1, 11, 20, tzinfo=UTC)
+    illumination_module.tabulate_illumination(place, camera, model, [noon])
+    built_by_day = len(by_day)
+    exact, quick = (
+        illumination_module.illumination_for_camera(place, camera, model, noon, map_height=64, by_elevation=film)[0]
+        for film in (False, True)
+    )
+    assert quick.visible_sky.size == 0, "the airlight is all of the sky"
+    direction = np.random.default_rng(11).normal(size=(2000, 3))
+    direction[:, 2] = np.abs(direction[:, 2])
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    seen = sky_radiance_towards(replace(quick, sun=None), direction, 0.1)
+    assert 0.0 < worst(seen, exact.aerial_perspective(np.inf, direction)[1]) < 3e-3
+    # The picture's map is coarse here, and blurs the sky around the sun.
+    far = direction @ exact.sun.direction < np.cos(np.radians(25.0))
+    assert worst(seen[far], sky_radiance_towards(replace(exact, sun=None), direction[far], 0.1)) < 1e-2
+    assert 0 < built_by_day == len(by_day)
+    assert len(asked) == built, "by day all light comes from the tables of the day"
 
 
 def test_median_height_is_computed_once(tmp_path, monkeypatch):

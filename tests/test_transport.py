@@ -28,7 +28,7 @@ from seasonscapes.rendering.sky_patches import (
     sky_patches,
     sky_second_moments,
 )
-from seasonscapes.rendering.sun_visibility import first_sample_visible, sum_incidence, visible_cosine
+from seasonscapes.rendering.sun_visibility import first_sample_visible, sum_facing, sum_incidence, visible_cosine
 from seasonscapes.rendering.transport import trace_points, trace_view, view_albedo
 from seasonscapes.rendering.view_samples import pixel_moments, sample_moments, view_samples
 from seasonscapes.sky.illumination import Illumination, uniform_sky
@@ -78,12 +78,12 @@ def test_few_shadow_rays_say_what_all_do(valley, azimuth_deg, elevation_deg):
     """Slopes that the sun grazes are lit without rays: within 3 % of the mean of rays from every sample, and unbiased."""
     _, _, ready = valley
     sun, every = sun_at(azimuth_deg, elevation_deg).sun, np.arange(ready.rays.receivers)
-    all_rays, _ = sum_incidence(ready.rays, sun, every)
+    all_rays, unoccluded = sum_incidence(ready.rays, sun, every)
     quick = sun_cosine(ready, sun)
     assert np.sqrt(np.mean((quick - all_rays) ** 2)) < 0.03 * all_rays.mean()
     assert quick.mean() == pytest.approx(all_rays.mean(), rel=0.005)
     # Without rays samples are dark where they face away alone, so that there is no less light.
-    facing, unoccluded = sum_incidence(ready.rays, sun, every, traced=False)
+    facing = sum_facing(ready.rays, sun, every)
     assert (facing >= all_rays).all()
     assert (facing <= unoccluded).all()
     assert facing.mean() > all_rays.mean()

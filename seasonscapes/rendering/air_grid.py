@@ -148,6 +148,8 @@ def interpolate_air(grid: AirGrid, air: AerialPerspective) -> tuple[np.ndarray, 
         mi.TensorXf(aligned(nodes)), wrap_mode=dr.WrapMode.Clamp
     )
     channels = texture.eval(grid.mi_coordinate)
+    # Together: all are read at once.
+    dr.eval(channels)
     # Apart, since what is computed with either takes several times as long with both side by side.
     transmittance, airlight = (to_numpy(mi.Vector3f(*channels[k : k + 3])) for k in (0, 3))
     if len(grid.mixed):

@@ -16,7 +16,13 @@ from seasonscapes.rendering.backend import point3, to_numpy
 from seasonscapes.rendering.coefficients import MirrorCoefficients, ViewCoefficients
 from seasonscapes.rendering.hemisphere_rays import RayScene
 from seasonscapes.rendering.mitsuba_scene import mi_sky
-from seasonscapes.rendering.receivers import ClusterLight, DeviceReceivers, incident_light, luminaries, upload_receivers
+from seasonscapes.rendering.receivers import (
+    ClusterLight,
+    DeviceReceivers,
+    luminaries,
+    total_incident_light,
+    upload_receivers,
+)
 from seasonscapes.rendering.sun_visibility import SunRays, bayer_disc_offset, sum_incidence, sun_rays
 from seasonscapes.rendering.terrain_material import device_water
 from seasonscapes.rendering.water_surface import DeviceWater
@@ -188,7 +194,7 @@ def mirrored_radiance(mirror: DeviceMirror, illumination: Illumination, light: C
     numpy.ndarray
         ``(m, 3)`` float32 [cd/m²], averaged over the pixel; its other ground and sky count as black.
     """
-    irradiance = np.add(*incident_light(mirror.receivers, light))
+    irradiance = total_incident_light(mirror.receivers, light)
     glitter = np.zeros_like(irradiance)
     pixels = np.arange(len(irradiance))
     for body in luminaries(illumination):

@@ -293,6 +293,8 @@ def sky_radiance_towards(illumination: Illumination, direction: np.ndarray, pixe
     air = illumination.aerial_perspective
     if air is None:
         sky = sample_equirectangular(sky_map, direction)
+    elif not sky_map.size:
+        sky = air(np.inf, direction)[1]
     else:
         height, width = sky_map.shape[:2]
         grid = equirectangular_directions(height, width)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from seasonscapes.rendering.backend import aligned
+from seasonscapes.rendering.backend import aligned, to_numpy
 from seasonscapes.rendering.hemisphere_rays import RayScene
 from seasonscapes.rendering.light_clusters import LightClusters, ReceiverCoefficients
 from seasonscapes.rendering.sky_patches import patch_radiance, sky_patches
@@ -158,6 +158,14 @@ def incident_light(device: DeviceReceivers, light: ClusterLight) -> tuple[np.nda
     dr.eval(direct, reflected)
     first, second = (np.stack([np.array(channel) for channel in part], axis=-1) for part in (direct, reflected))
     return first, second
+
+
+def total_incident_light(device: DeviceReceivers, light: ClusterLight) -> np.ndarray:
+    """Both parts of `incident_light` together, ``(N, 3)`` float32: they are added before they leave the device."""
+    import mitsuba as mi
+
+    sky, reflected = _sky_irradiance(device, light.mi_sky), _reflected_irradiance(device, light.mi_cluster_radiance)
+    return to_numpy(mi.Vector3f(*(first + second for first, second in zip(sky, reflected, strict=True))))
 
 
 def _sky_irradiance(device: DeviceReceivers, mi_sky: Any) -> list[Any]:

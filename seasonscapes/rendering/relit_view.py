@@ -22,9 +22,9 @@ from seasonscapes.rendering.radiance import RenderedView
 from seasonscapes.rendering.receivers import (
     DeviceClusters,
     DeviceReceivers,
-    incident_light,
     light_clusters,
     luminaries,
+    total_incident_light,
     upload_clusters,
     upload_receivers,
 )
@@ -32,6 +32,7 @@ from seasonscapes.rendering.sun_visibility import (
     SunRays,
     bayer_disc_offset,
     first_sample_visible,
+    sum_facing,
     sum_incidence,
     sun_rays,
 )
@@ -291,7 +292,7 @@ def relit_surface_radiance(view: RelightableView, illumination: Illumination) ->
         ``(n, 3)`` float32 [cd/m²], averaged over the pixel with the sky counted as black.
     """
     clusters = light_clusters(view.clusters, illumination)
-    total = np.add(*incident_light(view.receivers, clusters))
+    total = total_incident_light(view.receivers, clusters)
     ground = None if view.optics is None else _GroundPixels(view, view.optics)
     if ground is not None:
         total *= ground.of_diffuse_light()
@@ -354,7 +355,7 @@ def sun_cosine(view: RelightableView, luminary: Luminary) -> np.ndarray:
     result = np.where(visible, cosine, 0.0)
     # The light reaches all nine pixels around: what matters on slopes that it grazes is which samples face it.
     grazed = np.flatnonzero(visible & (cosine < _GRAZING) & ~traced)
-    result[grazed] = sum_incidence(view.rays, luminary, grazed, traced=False)[0]
+    result[grazed] = sum_facing(view.rays, luminary, grazed)
     mixed = np.flatnonzero(traced)
     sunlit, unoccluded = sum_incidence(view.rays, luminary, mixed)
     # The mean normal averages many more samples than the shadow rays: these only determine the sunlit fraction.

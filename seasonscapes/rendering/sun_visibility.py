@@ -23,7 +23,7 @@ class _Disc:
     """Points of a luminary's disc on the device: their directions and number, and the direction to the centre."""
 
     mi_directions: Any
-    mi_count: Any
+    count: int
     mi_centre: Any
 
 
@@ -228,16 +228,34 @@ def first_sample_visible(rays: SunRays, luminary: Luminary) -> np.ndarray:
     disc = _mi_disc(luminary, rays.disc_points)
     for start in range(0, len(result), LANES):
         count = min(LANES, len(result) - start)
-        lane = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, start)
-        visible, _, _ = _visible(rays.first, disc, lane)
+        receiver = None if count == len(result) else dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, start)
+        visible, _, _ = _visible(rays.first, disc, receiver, receiver)
         dr.eval(visible)
         result[start : start + count] = np.array(visible)
     return result
 
 
-def sum_incidence(
-    rays: SunRays, luminary: Luminary, receiver: np.ndarray, *, traced: bool = True
-) -> tuple[np.ndarray, np.ndarray]:
+def sum_facing(rays: SunRays, luminary: Luminary, receiver: np.ndarray) -> np.ndarray:
+    """Sum the cosine of incidence over those samples of receivers that face the luminary, without shadow rays.
+
+    Parameters
+    ----------
+    rays
+        Shadow rays of N receivers.
+    luminary
+        Sun or moon.
+    receiver
+        ``(K,)`` indices of the receivers to evaluate.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(K,)`` float32 weighted sums of the cosine: `sum_incidence` where nothing occludes the luminary.
+    """
+    return _sums(rays, luminary, receiver, traced=False)[0]
+
+
+def sum_incidence(rays: SunRays, luminary: Luminary, receiver: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Sum the cosine of incidence over the samples of receivers, with and without occlusion.
 
     Parameters
@@ -248,9 +266,6 @@ def sum_incidence(
         Sun or moon.
     receiver
         ``(K,)`` indices of the receivers to evaluate.
-    traced
-        Trace shadow rays. Otherwise samples are dark only where they face away from the luminary, which takes a tenth of
-        the time.
 
     Returns
     -------
@@ -259,28 +274,35 @@ def sum_incidence(
     unoccluded
         ``(K,)`` float32 weighted sums of the cosine.
     """
+    visible, unoccluded = _sums(rays, luminary, receiver, traced=True)
+    return visible, unoccluded
+
+
+def _sums(rays: SunRays, luminary: Luminary, receiver: np.ndarray, *, traced: bool) -> np.ndarray:
+    """What `sum_incidence` returns, ``(2, K)``; without shadow rays what `sum_facing` returns, ``(1, K)``."""
     import drjit as dr
     import mitsuba as mi
 
-    sums = np.empty((2, len(receiver)), np.float32)
+    sums = np.empty((1 + traced, len(receiver)), np.float32)
     disc = _mi_disc(luminary, rays.disc_points)
     step = max(1, LANES // rays.samples)
     for start in range(0, len(receiver), step):
         chosen = mi.UInt32(aligned(receiver[start : start + step], np.uint32))
         index = dr.arange(mi.UInt32, dr.width(chosen) * rays.samples)
-        samples = dr.opaque(mi.UInt32, rays.samples)
-        lane = dr.gather(mi.UInt32, chosen, index // samples) * samples + index % samples
+        number, sample = _divided(index, rays.samples)
+        each = dr.gather(mi.UInt32, chosen, number)
+        lane = each * dr.opaque(mi.UInt32, rays.samples) + sample
         if traced:
-            visible, cosine, weight = _visible(rays, disc, lane, coherent=True)
+            visible, cosine, weight = _visible(rays, disc, lane, each, sample, coherent=True)
         else:
             visible, cosine, _, weight = _facing(rays, disc, lane)
         weighted = dr.fmax(cosine, 0.0) * weight
-        lanes = [dr.select(visible, weighted, 0.0), weighted]
+        lanes = [dr.select(visible, weighted, 0.0), *([weighted] if traced else [])]
         dr.eval(lanes)
         blocks = [dr.block_sum(values, rays.samples) for values in lanes]
         dr.eval(blocks)
         sums[:, start : start + dr.width(chosen)] = [np.array(values) for values in blocks]
-    return sums[0], sums[1]
+    return sums
 
 
 def visible_cosine(rays: SunRays, luminary: Luminary, *, rays_per_sample: int = 1) -> np.ndarray:
@@ -305,16 +327,21 @@ def visible_cosine(rays: SunRays, luminary: Luminary, *, rays_per_sample: int = 
 
     disc = _mi_disc(luminary, rays.disc_points * rays_per_sample)
     result = np.empty(rays.receivers * rays.samples, np.float32)
-    step = max(1, LANES // rays_per_sample)
+    # Whole receivers.
+    step = max(1, LANES // (rays.samples * rays_per_sample)) * rays.samples
     for start in range(0, len(result), step):
         count = min(step, len(result) - start)
-        index = dr.arange(mi.UInt32, count * rays_per_sample)
-        sample = index // dr.opaque(mi.UInt32, rays_per_sample)
-        shift = (index - sample * dr.opaque(mi.UInt32, rays_per_sample)) * dr.opaque(mi.UInt32, rays.samples)
-        visible, cosine, _ = _visible(rays, disc, sample + dr.opaque(mi.UInt32, start), shift, coherent=True)
+        lane, ray = _divided(dr.arange(mi.UInt32, count * rays_per_sample), rays_per_sample)
+        receiver, sample = _divided(lane, rays.samples)
+        lane = None if count * rays_per_sample == len(result) else lane + dr.opaque(mi.UInt32, start)
+        receiver += dr.opaque(mi.UInt32, start // rays.samples)
+        disc_point = sample + ray * dr.opaque(mi.UInt32, rays.samples)
+        visible, cosine, _ = _visible(rays, disc, lane, receiver, disc_point, coherent=True)
         lanes = dr.select(visible, cosine, 0.0)
         dr.eval(lanes)
-        result[start : start + count] = np.array(dr.block_sum(lanes, rays_per_sample)) / rays_per_sample
+        if rays_per_sample > 1:
+            lanes = dr.block_sum(lanes, rays_per_sample) / dr.opaque(mi.Float, rays_per_sample)
+        result[start : start + count] = np.array(lanes)
     return result.reshape(-1, rays.samples)
 
 
@@ -322,43 +349,71 @@ def _mi_disc(luminary: Luminary, points: int) -> _Disc:
     import drjit as dr
     import mitsuba as mi
 
-    count = max(points, 16)
     centre = mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in luminary.direction))
-    return _Disc(mi.Vector3f(point3(disc_directions(luminary, count))), dr.opaque(mi.UInt32, count), centre)
+    count = max(points, 16)
+    return _Disc(mi.Vector3f(point3(disc_directions(luminary, count))), count, centre)
 
 
-def _visible(rays: SunRays, disc: _Disc, lane: Any, shift: Any = 0, *, coherent: bool = False) -> tuple[Any, Any, Any]:
+def _divided(number: Any, divisor: int) -> tuple[Any, Any]:
+    """Quotient and remainder of ``mi.UInt32`` below `LANES` and an integer that kernels need not be compiled for.
+
+    Processors divide no vectors of integers, and four divisions took as long as all else before a shadow ray. Granlund and
+    Montgomery 1994's multiplication by a reciprocal is exact while the product of both numbers is below 2³².
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    if divisor == 1:
+        return number, mi.UInt32(0)
+    by = dr.opaque(mi.UInt32, divisor)
+    quotient: Any
+    if divisor * LANES > 1 << 32:
+        quotient = number // by
+    else:
+        quotient = dr.mul_hi(number, dr.opaque(mi.UInt32, -(-(1 << 32) // divisor)))
+    return quotient, number - quotient * by
+
+
+def _visible(
+    rays: SunRays, disc: _Disc, lane: Any, receiver: Any, point: Any = 0, *, coherent: bool = False
+) -> tuple[Any, Any, Any]:
     """Visibility of the luminary from samples (``lane`` of `SunRays`), cosine of incidence of its centre, and weight.
 
-    ``shift`` selects other points of the disc; ``coherent`` traces packets, which pays where all samples of a receiver lie side
-    by side. Samples whose facet faces away from the luminary are dark, as in a path
+    Without ``lane`` from all samples, and without ``receiver`` each is one of its own.
+
+    ``point`` counts the points of the disc from the first of the receiver on; ``coherent`` traces packets, which pays where
+    all samples of a receiver lie side by side. Samples whose facet faces away from the luminary are dark, as in a path
     tracer, whose shadow ray would start inside the terrain.
     """
     import drjit as dr
     import mitsuba as mi
 
     active, cosine, geometric_cosine, weight = _facing(rays, disc, lane)
-    samples = dr.opaque(mi.UInt32, rays.samples)
-    receiver = lane // samples
-    disc_point = lane - receiver * samples + dr.gather(mi.UInt32, rays.mi_disc_offset, receiver) + shift
-    direction = dr.gather(mi.Vector3f, disc.mi_directions, disc_point % disc.mi_count)
-    origin = dr.gather(mi.Point3f, rays.mi_origin, lane, active)
+    _, disc_point = _divided(_chosen(mi.UInt32, rays.mi_disc_offset, receiver) + point, disc.count)
+    direction = dr.gather(mi.Vector3f, disc.mi_directions, disc_point)
+    origin = _chosen(mi.Point3f, rays.mi_origin, lane)
     material = rays.terrain.mi_terrain.bsdf()
     ray = mi.Ray3f(origin + direction * shadow_ray_start(material, geometric_cosine, origin), direction)
     return active & ~rays.terrain.mi_scene.ray_test(ray, coherent=coherent, active=active), cosine, weight
 
 
+def _chosen(kind: Any, values: Any, lane: Any) -> Any:
+    """Lanes of an array; the array itself without ``lane``: kernels read it in order, several times quicker than by index."""
+    import drjit as dr
+
+    return values if lane is None else dr.gather(kind, values, lane)
+
+
 def _facing(rays: SunRays, disc: _Disc, lane: Any) -> tuple[Any, Any, Any, Any]:
     """Whether samples face the centre of the luminary, the cosines of their shading and geometric normals, and weight."""
-    import drjit as dr
     import mitsuba as mi
 
     cosine, geometric_cosine = (
         sum(
-            mi.Float(dr.gather(mi.Float16, column, lane)) * axis
+            mi.Float(_chosen(mi.Float16, column, lane)) * axis
             for column, axis in zip(columns, disc.mi_centre, strict=True)
         )
         for columns in (rays.mi_normal, rays.mi_geometric_normal)
     )
-    weight = mi.Float(dr.gather(mi.Float16, rays.mi_weight, lane))
+    weight = mi.Float(_chosen(mi.Float16, rays.mi_weight, lane))
     return (cosine > 0.0) & (geometric_cosine > 0.0) & (weight > 0.0), cosine, geometric_cosine, weight

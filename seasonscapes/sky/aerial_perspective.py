@@ -7,14 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from seasonscapes.frames import angles_from_direction
-from seasonscapes.sky.along_rays import radiance_components
 from seasonscapes.sky.observer_radiance import (
     DISTANCE_EDGES_M,
     ObserverView,
     ScatteredRadiance,
     apply_phase_functions,
     azimuth_index,
-    diffuse_at_observer,
+    components_at_observer,
     elevation_index,
     interpolate_azimuths,
     interpolate_multilinear,
@@ -195,9 +194,6 @@ def airlight(
     ndarray
         Components ``(K, A, M, 10)`` as in `ScatteredRadiance`.
     """
-    rgb_matrix = rgb_from_transfer() * irradiance
-    if diffuse is None:
-        diffuse = diffuse_at_observer(tables, view, true_elevation_rad, near=True)
-    components = radiance_components(tables, view.near, true_elevation_rad, rgb_matrix, diffuse, cumulative=True)
+    components = components_at_observer(tables, view, true_elevation_rad, irradiance, diffuse, near=True)
     components = interpolate_azimuths(components)
     return np.concatenate([np.zeros_like(components[:, :, :1]), components], axis=2)

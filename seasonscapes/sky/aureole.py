@@ -46,15 +46,17 @@ def spread_aerosol_phase(cosine: np.ndarray, depth: np.ndarray, asymmetry: float
     table = _phase_reduction(asymmetry, order).ravel()
     column = np.sqrt(np.arccos(np.clip(cosine, -1.0, 1.0)) / np.pi) * (_ANGLES - 1)
     column0 = np.minimum(column.astype(np.int32), _ANGLES - 2)
-    fc = (column - column0).astype(np.float32)[..., None]
-    row = np.sqrt(np.clip(depth / _MAX_DEPTH, 0.0, 1.0)) * (_DEPTHS - 1)
+    fc = (column - column0).astype(np.float32)
+    # Channels first: numpy takes several times as long where the last axis has three elements.
+    depth = np.ascontiguousarray(np.moveaxis(depth, -1, 0))
+    row = np.sqrt(np.clip(depth / depth.dtype.type(_MAX_DEPTH), 0.0, 1.0)) * depth.dtype.type(_DEPTHS - 1)
     row0 = np.minimum(row.astype(np.int32), _DEPTHS - 2)
-    fr, index = (row - row0).astype(np.float32), row0 * _ANGLES + column0[..., None]
+    fr, index = (row - row0).astype(np.float32), row0 * _ANGLES + column0
     reduction, next_row = table.take(index), table.take(index + _ANGLES)
     reduction += (table.take(index + 1) - reduction) * fc
     next_row += (table.take(index + (_ANGLES + 1)) - next_row) * fc
     reduction += (next_row - reduction) * fr
-    return aerosol_phase(cosine, asymmetry)[..., None] - reduction
+    return np.moveaxis(aerosol_phase(cosine, asymmetry) - reduction, 0, -1)
 
 
 @lru_cache(maxsize=8)

@@ -206,7 +206,7 @@ def illumination_from_atmosphere(
     moon
         The moon as a source above the atmosphere, or ``None``.
     shape
-        Rows and columns of the sky map.
+        Rows and columns of the sky map; ``(0, 0)`` where the map is not wanted.
     with_aerial_perspective
         Whether to compute the aerial perspective, which takes most of the time; otherwise it is ``None``.
 
@@ -267,7 +267,7 @@ def illumination_from_atmosphere(
 
 
 def save_tables(path: str | PathLike[str], tables: AtmosphereTables) -> None:
-    """Write tables to one ``.npz`` file, atomically; ``diffuse_of`` is not stored.
+    """Write tables to one ``.npz`` file, atomically; ``diffuse_of`` and ``day_of`` are not stored.
 
     Parameters
     ----------
@@ -300,7 +300,7 @@ def load_tables(path: str | PathLike[str]) -> AtmosphereTables:
     Returns
     -------
     AtmosphereTables
-        Tables without ``diffuse_of``.
+        Tables without ``diffuse_of`` and ``day_of``.
 
     Raises
     ------
@@ -339,6 +339,8 @@ def _true_rad(atmosphere: Atmosphere, direction: np.ndarray, height_m: float) ->
 def _radiance_map(lights: tuple[ScatteredRadiance, ...], shape: tuple[int, int]) -> np.ndarray:
     """Sky map of 2 × 2 samples per pixel, which antialiases the row at the horizon and the solar aureole."""
     height, width = shape
+    if not height:
+        return np.zeros((0, 0, 3), np.float32)
     elevation_deg = 90.0 - (np.arange(2 * height) + 0.5) * (90.0 / height)
     azimuth_deg = (np.arange(2 * width) + 0.5) * (180.0 / width)
     radiance = np.zeros((2 * height, 2 * width, 3), np.float32)

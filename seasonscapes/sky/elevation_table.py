@@ -83,12 +83,12 @@ def _parts_between(first: int, last: int) -> range:
 def tabulate_by_elevation(
     values_of: Callable[[np.ndarray], np.ndarray], *, part: int | None = None, progress: Progress | None = None
 ) -> np.ndarray:
-    """Tabulate a positive array-valued function of solar elevation.
+    """Tabulate an array-valued function of solar elevation.
 
     Parameters
     ----------
     values_of
-        Function from true elevations ``(N,)`` [rad] to positive values ``(N, ...)``.
+        Function from true elevations ``(N,)`` [rad] to values ``(N, ...)``, of which the largest are positive.
     part
         Only the knots of this part, see `PartedTable`.
     progress
@@ -116,7 +116,9 @@ def tabulate_by_elevation(
     return table
 
 
-def interpolate_at_elevation(table: np.ndarray | PartedTable, elevation_rad: float) -> np.ndarray:
+def interpolate_at_elevation(
+    table: np.ndarray | PartedTable, elevation_rad: float, *, positive: bool = True
+) -> np.ndarray:
     """Interpolate a table at a solar elevation.
 
     Parameters
@@ -125,6 +127,8 @@ def interpolate_at_elevation(table: np.ndarray | PartedTable, elevation_rad: flo
         Table of `tabulate_by_elevation`.
     elevation_rad
         True elevation [rad]; clamped to the range of the knots.
+    positive
+        Whether what is tabulated has no negative values.
 
     Returns
     -------
@@ -138,7 +142,7 @@ def interpolate_at_elevation(table: np.ndarray | PartedTable, elevation_rad: flo
         if weight != 0.0:
             values += record["values"].astype(np.float32) * np.float32(weight * record["scale"])
     # The cubic undershoots zero beside steep onsets.
-    return np.maximum(values, 0.0, out=values)
+    return np.maximum(values, 0.0, out=values) if positive else values
 
 
 def _lagrange_weights(elevation_deg: float) -> tuple[int, np.ndarray]:

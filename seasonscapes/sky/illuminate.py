@@ -109,7 +109,7 @@ def illuminate(
     height_m
         Height of the observer [m].
     map_height
-        Rows of the sky map; it has twice as many columns.
+        Rows of the sky map; it has twice as many columns. Models of kind ``atmosphere`` without clouds may have none.
     with_aerial_perspective
         Whether atmosphere models compute the aerial perspective, which takes most of their time.
     evaluators
@@ -220,6 +220,10 @@ def _clear_illumination(
         shape=(map_height, 2 * map_height),
         with_aerial_perspective=with_aerial_perspective,
     )
+    efficacy = clear_efficacies_lm_w(atmosphere, float(sun.elevation_deg), height_m, water_cm=model.water_cm)
+    clear = replace(clear, efficacy_lm_w=efficacy)
+    if not map_height:
+        return clear
     haze = model.aerosol.optical_depth_500nm * float(angstrom_ratio(model.aerosol.angstrom_exponent, 500.0, 550.0))
     night = night_sky_radiance(
         map_height,
@@ -228,8 +232,7 @@ def _clear_illumination(
         ground_albedo=model.ground.albedo,
         optical_depth=haze + float(rayleigh_optical_depth(550.0)),
     )
-    efficacy = clear_efficacies_lm_w(atmosphere, float(sun.elevation_deg), height_m, water_cm=model.water_cm)
-    return replace(clear, sky_radiance=(clear.sky_radiance + night).astype(np.float32), efficacy_lm_w=efficacy)
+    return replace(clear, sky_radiance=(clear.sky_radiance + night).astype(np.float32))
 
 
 def _overcast_illumination(

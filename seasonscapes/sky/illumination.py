@@ -107,7 +107,8 @@ class Illumination:
         Air between viewer and surface, or ``None`` for a vacuum.
     visible_sky
         Map of the sky behind the terrain as observed by the camera, where it differs from ``sky_radiance``: the sky
-        observed from a summit differs from the sky that illuminates the valley.
+        observed from a summit differs from the sky that illuminates the valley. Without rows, ``(0, 0, 3)``, where the
+        airlight at infinite distance is all of it.
     efficacy_lm_w
         Luminous efficacies of sunlight and of skylight [lm/W], where the sky model knows the infrared.
     model

@@ -8,7 +8,6 @@ direction.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -19,7 +18,7 @@ from seasonscapes.sky.along_rays import AZIMUTHS, AZIMUTHS_RAD, diffuse_along, g
 from seasonscapes.sky.atmosphere import TOP_HEIGHT_M, Atmosphere, delta_scaled, gas_phase, optics
 from seasonscapes.sky.aureole import spread_aerosol_phase
 from seasonscapes.sky.curved_rays import cell_edges_m, horizon_elevation_rad, resample_rays, trace_curved_rays
-from seasonscapes.sky.elevation_table import interpolate_at_elevation, tabulate_by_elevation
+from seasonscapes.sky.elevation_table import interpolate_at_elevation
 from seasonscapes.sky.ray_cells import CellSamples, cell_columns, sample_cells
 from seasonscapes.sky.scattering import AtmosphereTables
 from seasonscapes.sky.sh_moments import HARMONIC_ORDER
@@ -28,6 +27,9 @@ from seasonscapes.sky.spectrum import WAVELENGTHS_NM, rgb_from_transfer
 _ROWS_ABOVE, _ROWS_BELOW, _TABLE_AZIMUTHS, _CELLS = 44, 20, 49, 36
 # Exponents of the row spacing in elevation above and below the horizon.
 _EXPONENT_ABOVE, _EXPONENT_BELOW = 2.5, 3.0
+# From this true elevation of the sun on, its light scattered once is as smooth between the knots of `elevation_table`
+# as all other light: below, the Earth's shadow rises through the air.
+LOWEST_DAY_DEG = 0.0
 # Aerial perspective is tabulated at these distances, and down to this depth below the model's ground.
 DISTANCE_EDGES_M = np.concatenate([400e3 * np.linspace(0.0, 1.0, 41) ** 3, [520e3, 700e3, 950e3, 1300e3]])
 _DEPTH_BELOW_GROUND_M = 2000.0
@@ -180,11 +182,7 @@ def observed_sky(
     ScatteredRadiance
         Table for `sky_radiance`.
     """
-    rgb_matrix = rgb_from_transfer() * irradiance
-    if diffuse is None:
-        diffuse = diffuse_at_observer(tables, view, true_elevation_rad)
-    components = radiance_components(tables, view.sky, true_elevation_rad, rgb_matrix, diffuse)[:, :, 0]
-    components[:, :, 6:9] += (ground_along(tables, view.sky, true_elevation_rad) @ rgb_matrix.T).astype(np.float32)
+    components = components_at_observer(tables, view, true_elevation_rad, irradiance, diffuse)[:, :, 0]
     return ScatteredRadiance(
         np.asarray(luminary_direction, float),
         _rgb_aerosol_depth(tables.atmosphere),
@@ -192,6 +190,55 @@ def observed_sky(
         view.horizon_rad,
         interpolate_azimuths(components),
     )
+
+
+def components_at_observer(
+    tables: AtmosphereTables,
+    view: ObserverView,
+    true_elevation_rad: float,
+    irradiance: np.ndarray,
+    diffuse: np.ndarray | None = None,
+    *,
+    near: bool = False,
+) -> np.ndarray:
+    """Compute the components of a luminary's radiance along an observer's rays, or interpolate those of the sun by day.
+
+    Parameters
+    ----------
+    tables
+        Tables of the atmosphere.
+    view
+        Rays of the observer.
+    true_elevation_rad
+        True elevation of the luminary [rad].
+    irradiance
+        Extraterrestrial spectral irradiance over that of the sun at 1 au ``(B,)``.
+    diffuse
+        What `diffuse_at_observer` gives, where it is known already; nothing is interpolated then.
+    near
+        As in `diffuse_at_observer`; without it the ground at the end of the rays is included.
+
+    Returns
+    -------
+    ndarray
+        ``(K, A, M or 1, 10)`` float32, as of `along_rays.radiance_components`.
+    """
+    day = true_elevation_rad >= np.radians(LOWEST_DAY_DEG) and tables.day_of is not None
+    # Light of another colour than the sun's, as the moon's, has other components.
+    if diffuse is None and day and np.ptp(irradiance) == 0.0:
+        assert tables.day_of is not None
+        components = interpolate_at_elevation(tables.day_of(view.height_m, near), true_elevation_rad, positive=False)
+        components[..., :9] *= np.float32(irradiance[0])
+        return components
+    if diffuse is None:
+        diffuse = diffuse_at_observer(tables, view, true_elevation_rad, near=near)
+    rgb_matrix = rgb_from_transfer() * irradiance
+    samples = view.near if near else view.sky
+    components = radiance_components(tables, samples, true_elevation_rad, rgb_matrix, diffuse, cumulative=near)
+    if not near:
+        ground = ground_along(tables, samples, true_elevation_rad) @ rgb_matrix.T
+        components[:, :, 0, 6:9] += ground.astype(np.float32)
+    return components
 
 
 def diffuse_at_observer(
@@ -219,43 +266,6 @@ def diffuse_at_observer(
         return interpolate_at_elevation(tables.diffuse_of(view.height_m, near), true_elevation_rad)
     samples = view.near if near else view.sky
     return diffuse_along(tables, samples, view.elevation_rad, np.array([true_elevation_rad]), cumulative=near)[0]
-
-
-def diffuse_by_elevation(
-    tables: AtmosphereTables,
-    height_m: float,
-    near: bool,
-    *,
-    part: int | None = None,
-    progress: Callable[[float], None] | None = None,
-) -> np.ndarray:
-    """Tabulate `diffuse_at_observer` by solar elevation; takes some seconds, a part a fraction of one.
-
-    Parameters
-    ----------
-    tables
-        Tables of the atmosphere.
-    height_m
-        Height of the observer [m].
-    near
-        As in `diffuse_at_observer`.
-    part
-        A part of the table, see `elevation_table.PartedTable`.
-    progress
-        Called with the completed fraction.
-
-    Returns
-    -------
-    ndarray
-        Table of `elevation_table.tabulate_by_elevation`.
-    """
-    view = observer_view(tables, height_m)
-    samples = view.near if near else view.sky
-    return tabulate_by_elevation(
-        lambda suns: diffuse_along(tables, samples, view.elevation_rad, suns, cumulative=near),
-        part=part,
-        progress=progress,
-    )
 
 
 def sky_radiance(light: ScatteredRadiance, direction: np.ndarray) -> np.ndarray:
@@ -355,10 +365,14 @@ def apply_phase_functions(light: ScatteredRadiance, components: np.ndarray, cosi
         Radiance ``(..., 3)`` [cd/m²].
     """
     cosine = np.clip(cosine, -1.0, 1.0)
-    depth = components[..., 9:] * light.aerosol_depth.astype(np.float32)
-    aerosol = spread_aerosol_phase(cosine, depth, light.asymmetry, HARMONIC_ORDER)
-    gas = gas_phase(cosine)[..., None].astype(np.float32)
-    return components[..., :3] * gas + components[..., 3:6] * aerosol + components[..., 6:9]
+    depth = np.multiply.outer(light.aerosol_depth.astype(np.float32), components[..., 9])
+    aerosol = spread_aerosol_phase(cosine, np.moveaxis(depth, 0, -1), light.asymmetry, HARMONIC_ORDER)
+    gas = gas_phase(cosine).astype(np.float32)
+    radiance = np.empty((*components.shape[:-1], 3), np.result_type(components, aerosol))
+    for channel in range(3):
+        once_by_gas, once_by_aerosol, other = (components[..., k + channel] for k in (0, 3, 6))
+        radiance[..., channel] = once_by_gas * gas + once_by_aerosol * aerosol[..., channel] + other
+    return radiance
 
 
 def _rgb_aerosol_depth(atmosphere: Atmosphere) -> np.ndarray:

@@ -68,14 +68,17 @@ class AtmosphereTables:
     moments
         Moments of the radiance scattered at least once, summed over all orders.
     diffuse_of
-        Function ``(height_m, near)`` that returns the table `observer_radiance.diffuse_by_elevation` of an observer's
+        Function ``(height_m, near)`` that returns the table `tables_by_elevation.diffuse_by_elevation` of an observer's
         height, which is fast for many solar positions. Without it diffuse light is computed for each solar position.
+    day_of
+        Likewise of `tables_by_elevation.day_by_elevation`.
     """
 
     atmosphere: Atmosphere
     sun_columns: SunColumns
     moments: ShMoments
     diffuse_of: Callable[[float, bool], np.ndarray | PartedTable] | None = None
+    day_of: Callable[[float, bool], np.ndarray | PartedTable] | None = None
 
 
 def _directions(horizon_rad: float) -> tuple[np.ndarray, np.ndarray]:
@@ -192,7 +195,7 @@ def atmosphere_tables(atmosphere: Atmosphere, *, tolerance: float = 0.1, max_ord
     Returns
     -------
     AtmosphereTables
-        Tables without ``diffuse_of``.
+        Tables without ``diffuse_of`` and ``day_of``.
     """
     scaled = delta_scaled(optics(atmosphere), HARMONIC_ORDER)
     columns = sun_columns(atmosphere)

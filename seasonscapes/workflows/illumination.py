@@ -34,8 +34,9 @@ from seasonscapes.sky.ephemeris import LunarPosition, SolarPosition, at_index, m
 from seasonscapes.sky.illuminate import SkyEvaluators, illuminate, significant_moon
 from seasonscapes.sky.illumination import Illumination
 from seasonscapes.sky.models import AtmosphereModel, SkyModel, atmosphere_from_model, read_sky_model, with_overrides
-from seasonscapes.sky.observer_radiance import diffuse_by_elevation, observer_view
+from seasonscapes.sky.observer_radiance import LOWEST_DAY_DEG, observer_view
 from seasonscapes.sky.shipped_tables import shipped_tables
+from seasonscapes.sky.tables_by_elevation import day_by_elevation, diffuse_by_elevation
 from seasonscapes.workspace import Workspace, build_once
 
 if TYPE_CHECKING:
@@ -44,7 +45,9 @@ if TYPE_CHECKING:
     from seasonscapes.workflows.place import Place
 
 _TABLES_CODE = ("sky.clear_sky",)
-_DIFFUSE_CODE = ("sky.observer_radiance", "sky.elevation_table")
+# With the sun above this elevation [deg] the night sky's own light is less than a millionth of the sky's.
+_NO_STAR_DEG = 1.0
+_DIFFUSE_CODE = ("sky.tables_by_elevation",)
 
 
 @dataclass(frozen=True)
@@ -216,13 +219,22 @@ def atmosphere_tables_in(
                 save=lambda tables, path: save_tables(path, tables),
                 load=load_tables,
             )
-            tables[atmosphere] = replace(built, diffuse_of=_diffuse_in(workspace, built)) if by_elevation else built
+            if by_elevation:
+                diffuse, day = (
+                    _parted_in(workspace, built, *kind)
+                    for kind in (("sky/diffuse", diffuse_by_elevation), ("sky/day", day_by_elevation))
+                )
+                built = replace(built, diffuse_of=diffuse, day_of=day)
+            tables[atmosphere] = built
         return tables[atmosphere]
 
     return tables_of
 
 
-def _diffuse_in(workspace: Workspace, tables: AtmosphereTables) -> Callable[[float, bool], PartedTable]:
+def _parted_in(
+    workspace: Workspace, tables: AtmosphereTables, folder: str, tabulate: Callable[..., np.ndarray]
+) -> Callable[[float, bool], PartedTable]:
+    """Tables by elevation of every height of an observer, kept in the workspace part by part."""
     cached: dict[tuple[float, bool], PartedTable] = {}
     lock = Lock()
 
@@ -230,19 +242,19 @@ def _diffuse_in(workspace: Workspace, tables: AtmosphereTables) -> Callable[[flo
         with lock:
             return build_once(
                 workspace,
-                "sky/diffuse",
+                folder,
                 {"atmosphere": tables.atmosphere, "height_m": height_m, "near": near, "part": part},
                 code=_DIFFUSE_CODE,
                 suffix=".npy",
-                build=lambda: diffuse_by_elevation(tables, height_m, near, part=part),
+                build=lambda: tabulate(tables, height_m, near, part=part),
                 save=save_table,
                 load=load_table,
             )
 
-    def diffuse_of(height_m: float, near: bool) -> PartedTable:
+    def table_of(height_m: float, near: bool) -> PartedTable:
         return cached.setdefault((height_m, near), PartedTable(partial(part_of, height_m, near)))
 
-    return diffuse_of
+    return table_of
 
 
 def illumination_at(
@@ -327,12 +339,15 @@ def illumination_for_camera(
         with_aerial_perspective=False,
         by_elevation=by_elevation,
     )
+    # By day no star is seen, and the aerial perspective knows the sky in more detail than a map.
+    cloudless = isinstance(model, AtmosphereModel) and model.cloudiness == 0.0
+    all_in_air = by_elevation and cloudless and position.sun.elevation_deg > _NO_STAR_DEG
     at_camera = illumination_at(
         model,
         position,
         camera_geodetic(place, camera)[2],
         workspace=place.workspace,
-        map_height=map_height,
+        map_height=0 if all_in_air else map_height,
         by_elevation=by_elevation,
     )
     light = replace(
@@ -413,21 +428,31 @@ def tabulate_illumination(
         return
     tables = atmosphere_tables_in(place.workspace, by_elevation=True)(atmosphere_from_model(model))
     assert tables.diffuse_of is not None
+    assert tables.day_of is not None
     where = (place.frame.latitude_deg, place.frame.longitude_deg, place.median_height_m)
     # All instants at once: one by one, those of a year take minutes.
     suns, moons = sun_position(times, *where), moon_position(times, *where)
-    apparent_deg = []
+    sun_deg, moon_deg = [], []
     for index in range(len(times)):
         sun = at_index(suns, index)
         moon = significant_moon(sun, at_index(moons, index))
-        apparent_deg += [body.elevation_deg for body in (sun, moon) if body is not None]
+        sun_deg.append(sun.elevation_deg)
+        moon_deg += [] if moon is None else [moon.elevation_deg]
     camera_m, wanted = camera_geodetic(place, camera)[2], []
     for height_m, near in ((place.median_height_m, False), (camera_m, False), (camera_m, True)):
-        true_rad = np.radians(true_elevation_deg(tables.atmosphere, np.array(apparent_deg), height_m))
-        table = tables.diffuse_of(observer_view(tables, height_m).height_m, near)
-        assert isinstance(table, PartedTable)
-        shining = true_rad[true_rad > np.radians(LOWEST_SHINING_DEG)]
-        wanted += [(table, part) for part in sorted({part for each in shining for part in parts_at(each)})]
+        sun_rad, moon_rad = (
+            np.radians(true_elevation_deg(tables.atmosphere, np.array(each, float), height_m))
+            for each in (sun_deg, moon_deg)
+        )
+        by_day = sun_rad >= np.radians(LOWEST_DAY_DEG)
+        for table_of, true_rad in (
+            (tables.day_of, sun_rad[by_day]),
+            (tables.diffuse_of, np.concatenate([sun_rad[~by_day], moon_rad])),
+        ):
+            table = table_of(observer_view(tables, height_m).height_m, near)
+            assert isinstance(table, PartedTable)
+            shining = true_rad[true_rad > np.radians(LOWEST_SHINING_DEG)]
+            wanted += [(table, part) for part in sorted({part for each in shining for part in parts_at(each)})]
     for number, (table, part) in enumerate(wanted):
         table.part(part)
         if progress is not None:
