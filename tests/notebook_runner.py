@@ -1,6 +1,7 @@
 """Executes scripts of notebooks one after the other in one process, each in a namespace of its own, with few rays.
 
-Libraries are loaded, kernels read and the renderer set up once for all. Prints a line of JSON for each: ``name``, exit
+Libraries are loaded, kernels read and the renderer set up once for all; each notebook sets what it needs itself, and what one
+leaves in a library is there for the next. Prints a line of JSON for each: ``name``, exit
 ``code`` and what it wrote to ``stderr``.
 """
 

@@ -62,7 +62,7 @@ def test_a_fitted_code_shows_the_other_half_better_than_the_nearest_learned_one(
     assert len(pictures) == 2
     for camera, file in pictures:
         code, facts = look_of_photograph(place, model, camera, file)
-        assert facts["psnr_fitted_db"] > facts["psnr_nearest_db"] + 2.0
+        assert facts["psnr_fitted_db"] > facts["psnr_nearest_db"] + 4.0
         again, _ = look_of_photograph(place, model, camera, file)
         assert torch.equal(code, again)
     for name, value in model.appearance.state_dict().items():

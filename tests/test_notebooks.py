@@ -104,9 +104,11 @@ def executed(tmp_path_factory):
         (folder / name).write_text(text)
     own = {"MPLBACKEND": "Agg"}
     runner = [sys.executable, str(Path(__file__).with_name("notebook_runner.py")), *NAMES]
-    done = subprocess.run(runner, cwd=folder, env=os.environ | own, stdout=subprocess.PIPE, text=True, check=True)
+    done = subprocess.run(runner, cwd=folder, env=os.environ | own, capture_output=True, text=True)
     records = [json.loads(line) for line in done.stdout.splitlines()]
-    return {record["name"]: (record["code"], record["stderr"]) for record in records}
+    # A runner that was killed has no record of the notebook that it was at, nor of those after it.
+    killed = dict.fromkeys(NAMES, (done.returncode, done.stderr[-2000:]))
+    return killed | {record["name"]: (record["code"], record["stderr"]) for record in records}
 
 
 @pytest.mark.slow

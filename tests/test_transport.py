@@ -10,6 +10,8 @@ from test_rendering import PLANE, heightfield, looking_down, sun_at
 from seasonscapes.albedo.view_light import view_raised
 from seasonscapes.cameras.pinhole import Camera, rotation_from_angles
 from seasonscapes.frames import direction_from_angles, equirectangular_directions
+from seasonscapes.rendering import sun_visibility
+from seasonscapes.rendering.backend import use_backend
 from seasonscapes.rendering.coefficients import SamplingOptions
 from seasonscapes.rendering.coefficients_file import load_coefficients, save_coefficients
 from seasonscapes.rendering.direction_basis import direction_basis
@@ -97,6 +99,34 @@ def test_few_shadow_rays_say_what_all_do(valley, azimuth_deg, elevation_deg):
     again = first_sample_visible(raised.rays, sun)
     np.testing.assert_array_equal(again, (visible_cosine(raised.rays, sun).reshape(weight.shape) * weight)[:, 0] > 0.0)
     assert again.sum() > first_sample_visible(ready.rays, sun).sum()
+
+
+def test_parts_of_shadow_rays_say_what_all_at_once_do(valley, monkeypatch):
+    """Parts of any length, one of which may hold as many rays as there are samples in all."""
+    _, _, ready = valley
+    sun, every = sun_at(110.0, 35.0).sun, np.arange(ready.rays.receivers)
+    samples = ready.rays.receivers * ready.rays.samples
+    whole = {rays: visible_cosine(ready.rays, sun, rays_per_sample=rays) for rays in (1, 4)}
+    sums, first = sum_incidence(ready.rays, sun, every), first_sample_visible(ready.rays, sun)
+    assert np.abs(whole[1] - whole[4]).max() > 0.0
+    for lanes in (samples, samples // 3 + 1):
+        monkeypatch.setattr(sun_visibility, "LANES", lanes)
+        for rays, values in whole.items():
+            np.testing.assert_array_equal(visible_cosine(ready.rays, sun, rays_per_sample=rays), values)
+        np.testing.assert_allclose(sum_incidence(ready.rays, sun, every), sums, atol=1e-5)
+        np.testing.assert_array_equal(first_sample_visible(ready.rays, sun), first)
+
+
+@pytest.mark.parametrize("divisor", [1, 3, 16, 255, 1024, 4099])
+def test_quotients_by_multiplication_are_exact(divisor):
+    use_backend()
+    import mitsuba as mi
+
+    ends = [np.arange(3000), divisor * np.arange(900), sun_visibility.LANES - 1 - np.arange(3000)]
+    number = np.concatenate(ends).astype(np.uint32)
+    quotient, remainder = sun_visibility._quotient_and_remainder(mi.UInt32(number), divisor)
+    np.testing.assert_array_equal(np.array(quotient), number // divisor)
+    np.testing.assert_array_equal(np.array(remainder) + np.zeros_like(number), number % divisor)
 
 
 def test_an_image_of_terrain_pixels_in_runs_or_one_by_one(valley):

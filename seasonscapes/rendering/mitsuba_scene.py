@@ -273,7 +273,7 @@ def sky_radiance_towards(illumination: Illumination, direction: np.ndarray, pixe
 
     The edges of the discs are blurred over one pixel against aliasing. With aerial perspective the sky is its airlight
     at infinite distance, which has more detail than the map, plus the part of the map that this airlight lacks (stars,
-    clouds).
+    clouds); nothing is added where the visible sky is an empty map.
 
     Parameters
     ----------

@@ -289,7 +289,7 @@ def _sums(rays: SunRays, luminary: Luminary, receiver: np.ndarray, *, traced: bo
     for start in range(0, len(receiver), step):
         chosen = mi.UInt32(aligned(receiver[start : start + step], np.uint32))
         index = dr.arange(mi.UInt32, dr.width(chosen) * rays.samples)
-        number, sample = _divided(index, rays.samples)
+        number, sample = _quotient_and_remainder(index, rays.samples)
         each = dr.gather(mi.UInt32, chosen, number)
         lane = each * dr.opaque(mi.UInt32, rays.samples) + sample
         if traced:
@@ -327,13 +327,14 @@ def visible_cosine(rays: SunRays, luminary: Luminary, *, rays_per_sample: int = 
 
     disc = _mi_disc(luminary, rays.disc_points * rays_per_sample)
     result = np.empty(rays.receivers * rays.samples, np.float32)
-    # Whole receivers.
+    # A receiver's points of the disc are counted from its first sample on.
     step = max(1, LANES // (rays.samples * rays_per_sample)) * rays.samples
     for start in range(0, len(result), step):
         count = min(step, len(result) - start)
-        lane, ray = _divided(dr.arange(mi.UInt32, count * rays_per_sample), rays_per_sample)
-        receiver, sample = _divided(lane, rays.samples)
-        lane = None if count * rays_per_sample == len(result) else lane + dr.opaque(mi.UInt32, start)
+        lane, ray = _quotient_and_remainder(dr.arange(mi.UInt32, count * rays_per_sample), rays_per_sample)
+        receiver, sample = _quotient_and_remainder(lane, rays.samples)
+        whole = rays_per_sample == 1 and count == len(result)
+        lane = None if whole else lane + dr.opaque(mi.UInt32, start)
         receiver += dr.opaque(mi.UInt32, start // rays.samples)
         disc_point = sample + ray * dr.opaque(mi.UInt32, rays.samples)
         visible, cosine, _ = _visible(rays, disc, lane, receiver, disc_point, coherent=True)
@@ -354,7 +355,7 @@ def _mi_disc(luminary: Luminary, points: int) -> _Disc:
     return _Disc(mi.Vector3f(point3(disc_directions(luminary, count))), count, centre)
 
 
-def _divided(number: Any, divisor: int) -> tuple[Any, Any]:
+def _quotient_and_remainder(number: Any, divisor: int) -> tuple[Any, Any]:
     """Quotient and remainder of ``mi.UInt32`` below `LANES` and an integer that kernels need not be compiled for.
 
     Processors divide no vectors of integers, and four divisions took as long as all else before a shadow ray. Granlund and
@@ -389,7 +390,7 @@ def _visible(
     import mitsuba as mi
 
     active, cosine, geometric_cosine, weight = _facing(rays, disc, lane)
-    _, disc_point = _divided(_chosen(mi.UInt32, rays.mi_disc_offset, receiver) + point, disc.count)
+    _, disc_point = _quotient_and_remainder(_chosen(mi.UInt32, rays.mi_disc_offset, receiver) + point, disc.count)
     direction = dr.gather(mi.Vector3f, disc.mi_directions, disc_point)
     origin = _chosen(mi.Point3f, rays.mi_origin, lane)
     material = rays.terrain.mi_terrain.bsdf()

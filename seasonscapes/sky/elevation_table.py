@@ -16,8 +16,6 @@ import numpy as np
 from seasonscapes.images import atomic_path
 from seasonscapes.sky.sh_moments import SUN_ELEVATION_KNOTS_DEG
 
-# Increment whenever the tables of an unchanged atmosphere and observer change.
-TABLE_REVISION = 3
 _BATCH = 4
 
 

@@ -126,7 +126,11 @@ def _spline_basis(position: np.ndarray) -> tuple[sparse.csr_array, range]:
     columns = (cell - 1 - first)[:, None] + np.arange(4)
     count = int(cell.max()) + 3 - first
     basis = sparse.csr_array(
-        (weights.ravel().astype(np.float32), columns.ravel(), np.arange(0, 4 * len(position) + 1, 4)),
+        (
+            weights.ravel().astype(np.float32),
+            columns.ravel().astype(np.int32),
+            np.arange(0, 4 * len(position) + 1, 4, dtype=np.int32),
+        ),
         shape=(len(position), count),
     )
     return basis, range(first, first + count)

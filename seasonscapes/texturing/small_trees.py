@@ -95,7 +95,7 @@ def small_trees(model: HistGradientBoostingRegressor) -> SmallTrees:
     ValueError
         A tree of more than nine leaves.
     """
-    # scikit-learn has no public access to these trees; the names are those of versions 1.5 to 1.9.
+    # scikit-learn has no public access to these trees: pyproject.toml admits the versions that have these names.
     start = float(model._baseline_prediction.item())  # pyright: ignore[reportAttributeAccessIssue]
     return SmallTrees(start, tuple(_taken(tree.nodes) for (tree,) in model._predictors))
 

@@ -141,25 +141,25 @@ class WindowPredictors:
 
     Parameters
     ----------
-    atlas
+    tiled
         Those of the whole atlas.
     window
         Slices of rows and columns with their starts and stops.
     """
 
-    atlas: TiledPredictors
+    tiled: TiledPredictors
     window: Window
     grid: None = None
 
     @property
     def names(self) -> tuple[str, ...]:
         """As in `predictors.Predictors`."""
-        return self.atlas.names
+        return self.tiled.names
 
     @property
     def surface(self) -> np.ndarray:
         """As in `predictors.Predictors`."""
-        return self.atlas.surface[self.window]
+        return self.tiled.surface[self.window]
 
     @property
     def values(self) -> np.ndarray:
@@ -174,7 +174,7 @@ class WindowPredictors:
         """Predictors ``(n, G)`` float32 of flat indices ``(n,)`` in the window."""
         rows, columns = self.window
         row, column = np.divmod(texel, columns.stop - columns.start)
-        return self.atlas.at(row + rows.start, column + columns.start)
+        return self.tiled.at(row + rows.start, column + columns.start)
 
 
 def tiled_predictors(

@@ -44,10 +44,9 @@ if TYPE_CHECKING:
     from seasonscapes.cameras.pinhole import Camera
     from seasonscapes.workflows.place import Place
 
-_TABLES_CODE = ("sky.clear_sky",)
+_TABLES_CODE, _BY_ELEVATION_CODE = ("sky.clear_sky",), ("sky.tables_by_elevation",)
 # With the sun above this elevation [deg] the night sky's own light is less than a millionth of the sky's.
 _NO_STAR_DEG = 1.0
-_DIFFUSE_CODE = ("sky.tables_by_elevation",)
 
 
 @dataclass(frozen=True)
@@ -202,8 +201,9 @@ def atmosphere_tables_in(
     workspace
         Where tables are kept.
     by_elevation
-        Also tabulate diffuse light over the sun's elevation for each observer height, by parts as they are needed, which costs
-        time and space once and makes the sky of an instant quicker. Radiances differ by less than 0.3 % while the sun is above -12°.
+        Also tabulate diffuse light, and by day all light of sky and air, over the sun's elevation for each observer height, by
+        parts as they are needed, which costs time and space once and makes the sky of an instant quicker. Radiances differ by
+        less than 0.3 % while the sun is above -12°; in the haze of ``hazy`` by up to 0.5 % where it is above 70°.
     """
     tables: dict[Atmosphere, AtmosphereTables] = {}
 
@@ -244,7 +244,7 @@ def _parted_in(
                 workspace,
                 folder,
                 {"atmosphere": tables.atmosphere, "height_m": height_m, "near": near, "part": part},
-                code=_DIFFUSE_CODE,
+                code=_BY_ELEVATION_CODE,
                 suffix=".npy",
                 build=lambda: tabulate(tables, height_m, near, part=part),
                 save=save_table,
@@ -323,7 +323,7 @@ def illumination_for_camera(
     time
         Aware.
     map_height
-        Rows of both sky maps.
+        Rows of both sky maps; with ``by_elevation`` the visible one is empty by day, where the aerial perspective holds all of it.
     by_elevation
         For many instants of one camera; see `atmosphere_tables_in`.
     """
