@@ -85,7 +85,7 @@ def test_a_fixed_exposure_is_left_alone():
 
 
 def test_pictures_in_single_precision_are_those_of_the_formulas():
-    """The quick powers of the curve and of a film's levels: within 1e-5, and of a level where noise decides."""
+    """The quick powers of the curve within 1e-5; a film's levels within half a step of their table where noise decides."""
     rng = np.random.default_rng(5)
     exposed = rng.random((40, 30, 3)).astype(np.float32) ** 6 * 30.0
     exposed[0, 0] = 0.0
@@ -99,7 +99,7 @@ def test_pictures_in_single_precision_are_those_of_the_formulas():
     shown[1, 1] = [1.2, -0.1, 0.001]
     levels = levels_of(shown, noise).astype(int)
     exact = srgb_from_linear(shown.astype(np.float64)) * 255.0 + noise
-    assert ((levels <= exact + 1e-3) & (levels > np.minimum(exact, 255.0) - 1.001)).all()
+    assert ((levels <= exact + 0.026) & (levels > np.minimum(exact, 255.0) - 1.026)).all()
     assert levels.max() == 255
 
 

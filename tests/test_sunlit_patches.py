@@ -26,7 +26,7 @@ def camera() -> FixedCamera:
     reflectance = crowns * np.array([0.08, 0.1, 0.05]) * np.exp(rng.normal(0.0, 0.05, (COUNT, 3)))
     shading = np.column_stack([rng.normal(0.0, 0.1, (COUNT, 2)), np.ones(COUNT), np.full(COUNT, 0.05)])
     ground = Ground(reflectance, shading, 1.0 + 5.0 * (HEIGHT - ROWS) / HEIGHT)
-    return FixedCamera(ground, [], np.empty((0, 7)), np.empty((0, COUNT, 3)), np.empty(0), np.empty(0), 64)
+    return FixedCamera(ground, [], np.empty((0, 3)), np.empty(0), np.empty((0, COUNT, 3)), np.empty(0), np.empty(0), 64)
 
 
 def _light() -> ViewLight:
