@@ -87,6 +87,7 @@ results: $(DEV)
 	$(BIN)/python benchmarks/realbench.py --json benchmarks/results/realbench.json
 	$(BIN)/python benchmarks/viewer.py --json benchmarks/results/viewer.json
 	$(BIN)/python benchmarks/everyday.py --json benchmarks/results/everyday.json
+	$(BIN)/python benchmarks/everyday.py --quick --json benchmarks/results/everyday-quick.json
 	$(BIN)/python benchmarks/scale.py --only costs --json benchmarks/results/scale.json
 	$(BIN)/python benchmarks/scale.py --only scheduling --json benchmarks/results/scale-scheduling.json
 	$(BIN)/python benchmarks/large.py --quick --json benchmarks/results/large-quick.json
