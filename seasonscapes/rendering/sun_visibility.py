@@ -240,12 +240,8 @@ def sum_facing(rays: SunRays, luminary: Luminary, receiver: np.ndarray) -> np.nd
 
     Parameters
     ----------
-    rays
-        Shadow rays of N receivers.
-    luminary
-        Sun or moon.
-    receiver
-        ``(K,)`` indices of the receivers to evaluate.
+    rays, luminary, receiver
+        As in `sum_incidence`.
 
     Returns
     -------

@@ -235,12 +235,11 @@ def pixel_moments(
 
 def pixel_albedo(terrain: RayScene, camera: Camera | Panorama, rows: range, count: int, seed: int) -> np.ndarray:
     """The albedo ``(N, 3)`` of `pixel_moments` alone, without the normals, which cost as much as the rays."""
-    return (
-        _pixel_sums(
-            terrain, camera, rows, count, seed, lambda interaction, facet: [*_seen_albedo(terrain, interaction, facet)]
-        )
-        / count
-    )
+
+    def albedo(interaction: Any, facet: Any) -> list[Any]:
+        return [*_seen_albedo(terrain, interaction, facet)]
+
+    return _pixel_sums(terrain, camera, rows, count, seed, albedo) / count
 
 
 def _seen_albedo(terrain: RayScene, interaction: Any, facet: Any) -> Any:

@@ -8,6 +8,7 @@ import numpy as np
 
 from seasonscapes.declaration import InputError
 from seasonscapes.terrain.surface import Terrain
+from seasonscapes.terrain.texels import changes_on_faces, face_corners
 
 _CHUNK_FACES = 500_000
 
@@ -186,14 +187,10 @@ def singular_values(terrain: Terrain, width_px: int, height_px: int) -> tuple[np
     for start in range(0, len(terrain.faces), _CHUNK_FACES):
         part = slice(start, start + _CHUNK_FACES)
         faces = terrain.faces[part]
-        corners = [np.ascontiguousarray(faces[:, k]) for k in range(3)]
-
-        # A coordinate after the other: rows of two or three numbers cost several times as much.
-        (x1, x2), (y1, y2), (z1, z2) = space = [_edges(axis, corners) for axis in terrain.vertices.T]
-        (u1, u2), (v1, v2) = (
-            (first * side, second * side)
-            for (first, second), side in zip((_edges(axis, corners) for axis in terrain.uv.T), scale, strict=True)
-        )
+        corners = face_corners(faces)
+        (x1, x2), (y1, y2), (z1, z2) = space = [changes_on_faces(axis, corners)[1:] for axis in terrain.vertices.T]
+        (_, u1, u2), (_, v1, v2) = (changes_on_faces(axis, corners) for axis in terrain.uv.T)
+        u1, u2, v1, v2 = u1 * scale[0], u2 * scale[0], v1 * scale[1], v2 * scale[1]
         determinant = u1 * v2 - v1 * u2
         area[part] = 0.5 * np.sqrt((y1 * z2 - z1 * y2) ** 2 + (z1 * x2 - x1 * z2) ** 2 + (x1 * y2 - y1 * x2) ** 2)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -205,12 +202,6 @@ def singular_values(terrain: Terrain, width_px: int, height_px: int) -> tuple[np
             longer[part] = np.sqrt((a + c + root) / 2.0)
             shorter[part] = 2.0 * area[part] / np.abs(determinant) / longer[part]
     return longer, shorter, area
-
-
-def _edges(column: np.ndarray, corners: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Changes ``(F,)`` of a coordinate of vertices from the first corner of faces to the two others."""
-    first, second, third = (column[corner].astype(np.float64) for corner in corners)
-    return second - first, third - first
 
 
 def _weighted_percentiles(values: np.ndarray, weights: np.ndarray, percents: tuple[float, ...]) -> tuple[float, ...]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from seasonscapes.terrain.surface import Terrain
-from seasonscapes.terrain.texels import barycentric, texel_coordinates, texel_positions
+from seasonscapes.terrain.texels import barycentric, face_corners, texel_coordinates, texel_positions
 
 # Standard deviation of the Gaussian mean height that concavity refers to, and smallest cell of its grid [m].
 _CONCAVITY_SIGMA_M, _MIN_SPACING_M = 90.0, 15.0
@@ -100,8 +100,7 @@ def vertex_normals(terrain: Terrain) -> np.ndarray:
     numpy.ndarray
         Unit normals ``(V, 3)`` float32, east-north-up.
     """
-    corners = [np.ascontiguousarray(terrain.faces[:, k]) for k in range(3)]
-    # A coordinate after the other, ``(F,)`` each: rows of three numbers cost several times as much.
+    corners = face_corners(terrain.faces)
     place = [[np.take(axis, corner) for axis in terrain.vertices.T.astype(np.float64)] for corner in corners]
     # Edge k leads from corner k to the next one.
     edges = [[b - a for a, b in zip(place[k], place[(k + 1) % 3], strict=True)] for k in range(3)]

@@ -158,6 +158,30 @@ def texel_positions(terrain: Terrain, width: int, height: int) -> tuple[np.ndarr
     return positions, face_id
 
 
+def face_corners(faces: np.ndarray) -> list[np.ndarray]:
+    """The columns ``(F,)`` of faces ``(F, 3)``, each contiguous: work on rows of two or three numbers costs several times as much."""
+    return [np.ascontiguousarray(faces[:, k]) for k in range(3)]
+
+
+def changes_on_faces(column: np.ndarray, corners: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A quantity ``(V,)`` of vertices at the first corners of faces, and its changes from there to the two others.
+
+    Parameters
+    ----------
+    column
+        ``(V,)``.
+    corners
+        From `face_corners`.
+
+    Returns
+    -------
+    first, to_second, to_third
+        ``(F,)`` float64 each.
+    """
+    first, second, third = (np.asarray(column[corner], np.float64) for corner in corners)
+    return first, second - first, third - first
+
+
 def face_gradients(values: np.ndarray, faces: np.ndarray, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Express a quantity that is linear over each face as a function of the texel.
 
@@ -175,21 +199,14 @@ def face_gradients(values: np.ndarray, faces: np.ndarray, xy: np.ndarray) -> tup
     start, across, down
         ``(F, C)`` float64 each: the value at texel coordinates 0, and its change by column and by row.
     """
-    # By columns, which costs half of what rows of two or three numbers do.
-    corners = [np.ascontiguousarray(faces[:, k]) for k in range(3)]
-
-    def at_corners(column: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Values ``(F,)`` at the first corners, and the change from there to the two others."""
-        first, second, third = (np.asarray(column, np.float64)[corner] for corner in corners)
-        return first, second - first, third - first
-
-    (x0, x1, x2), (y0, y1, y2) = (at_corners(xy[:, axis]) for axis in (0, 1))
+    corners = face_corners(faces)
+    (x0, x1, x2), (y0, y1, y2) = (changes_on_faces(xy[:, axis], corners) for axis in (0, 1))
     determinant = x1 * y2 - y1 * x2
     # Faces of zero UV area cover no texel.
     determinant[determinant == 0.0] = np.inf
     start, across, down = (np.empty((len(faces), values.shape[1])) for _ in range(3))
     for channel in range(values.shape[1]):
-        v0, v1, v2 = at_corners(values[:, channel])
+        v0, v1, v2 = changes_on_faces(values[:, channel], corners)
         by_column, by_row = (v1 * y2 - v2 * y1) / determinant, (v2 * x1 - v1 * x2) / determinant
         across[:, channel], down[:, channel] = by_column, by_row
         start[:, channel] = v0 - by_column * x0 - by_row * y0

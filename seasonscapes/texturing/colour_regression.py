@@ -135,6 +135,14 @@ def from_opponent_colour(opponent: np.ndarray) -> np.ndarray:
     return np.stack([rg + g, g, bg + g], -1)
 
 
+def fit_on_one_thread(
+    model: HistGradientBoostingRegressor, predictor: np.ndarray, target: np.ndarray
+) -> HistGradientBoostingRegressor:
+    """Fit boosted trees to ``(n, G)`` and ``(n,)``: on some ten thousand rows threads wait for each other longer than they work."""
+    with threadpool_limits(1, "openmp"):
+        return model.fit(predictor, target)
+
+
 def fit_regression(
     predictor: np.ndarray, encoded: np.ndarray, images: np.ndarray | None = None, *, fast: bool = False, seed: int = 0
 ) -> Regression:
@@ -179,9 +187,7 @@ def fit_regression(
             early_stopping=False,  # pyright: ignore[reportArgumentType]
             random_state=seed + channel,
         )
-        # On some ten thousand rows threads wait for each other longer than they work.
-        with threadpool_limits(1, "openmp"):
-            boosted.append(model.fit(predictor, target))
+        boosted.append(fit_on_one_thread(model, predictor, target))
     return Regression(extrapolation, tuple(boosted), forest)
 
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from threadpoolctl import threadpool_limits
 
+from seasonscapes.texturing.colour_regression import fit_on_one_thread
 from seasonscapes.texturing.small_trees import SmallTrees, small_trees
 
 FOLDS = 4
@@ -151,9 +151,7 @@ def fit_error_model(
         early_stopping=False,  # pyright: ignore[reportArgumentType]
         random_state=seed,
     )
-    # On some ten thousand rows threads wait for each other longer than they work.
-    with threadpool_limits(1, "openmp"):
-        model.fit(_features(predictor, colour, spread).T, square / size)
+    fit_on_one_thread(model, _features(predictor, colour, spread).T, square / size)
     return ErrorModel(small_trees(model), size)
 
 
