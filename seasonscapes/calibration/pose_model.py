@@ -66,25 +66,39 @@ def parameters_of_view(view: View, axes: np.ndarray, k1: float = 0.0) -> np.ndar
 
 
 def _rotation(axes: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-    """``world_from_camera`` rotation ``(3, 3)``: as `rotation_from_angles` about ``axes``.
-
-    Scalar arithmetic, because solvers call this function for every residual evaluation.
-    """
-    sin_h, cos_h = math.sin(math.radians(parameters[0])), math.cos(math.radians(parameters[0]))
-    sin_p, cos_p = math.sin(math.radians(parameters[1])), math.cos(math.radians(parameters[1]))
-    sin_r, cos_r = math.sin(math.radians(parameters[2])), math.cos(math.radians(parameters[2]))
+    """``world_from_camera`` rotation ``(..., 3, 3)`` of parameters ``(..., 9)``: as `rotation_from_angles` about ``axes``."""
+    angle = np.radians(parameters[..., :3])
+    (sin_h, sin_p, sin_r), (cos_h, cos_p, cos_r) = np.moveaxis(np.sin(angle), -1, 0), np.moveaxis(np.cos(angle), -1, 0)
     right, down = (cos_h, -sin_h, 0.0), (sin_p * sin_h, sin_p * cos_h, -cos_p)
-    rolled = [(cos_r * r + sin_r * d, cos_r * d - sin_r * r) for r, d in zip(right, down, strict=True)]
-    forward = (sin_h * cos_p, cos_h * cos_p, sin_p)
-    return axes.T @ np.array([[*pair, ahead] for pair, ahead in zip(rolled, forward, strict=True)])
+    rotation = np.empty((*parameters.shape[:-1], 3, 3))
+    rotation[..., 2] = np.stack([sin_h * cos_p, cos_h * cos_p, sin_p], axis=-1)
+    for row in range(3):
+        rotation[..., row, 0] = cos_r * right[row] + sin_r * down[row]
+        rotation[..., row, 1] = cos_r * down[row] - sin_r * right[row]
+    return axes.T @ rotation
 
 
-def _focal_scales(start: View, log_scale: float) -> tuple[float, float]:
-    """Factors of ``fx`` and ``fy``. A full circle keeps its width, and no panorama exceeds a full circle."""
-    scale = math.exp(log_scale)
-    if not isinstance(start, Panorama):
-        return scale, scale
-    return (1.0 if start.full_circle else max(scale, start.width_px / (2.0 * math.pi * start.fx))), scale
+def focal_scales(start: View, parameters: np.ndarray) -> np.ndarray:
+    """Return the factors of the focal lengths; a full circle keeps its width, and no panorama exceeds a full circle.
+
+    Parameters
+    ----------
+    start
+        View that the field-of-view scale refers to.
+    parameters
+        Parameters ``(..., 9)``.
+
+    Returns
+    -------
+    ndarray
+        Factors ``(..., 2)`` of ``fx`` and ``fy``.
+    """
+    scale = np.exp(parameters[..., 6])
+    across = scale
+    if isinstance(start, Panorama):
+        least = start.width_px / (2.0 * math.pi * start.fx)
+        across = np.ones_like(scale) if start.full_circle else np.maximum(scale, least)
+    return np.stack([across, scale], axis=-1)
 
 
 def view_from_parameters(start: View, axes: np.ndarray, parameters: np.ndarray) -> View:
@@ -107,7 +121,7 @@ def view_from_parameters(start: View, axes: np.ndarray, parameters: np.ndarray) 
     pose = np.eye(4)
     pose[:3, :3] = _rotation(axes, parameters)
     pose[:3, 3] = parameters[3:6]
-    scale_x, scale_y = _focal_scales(start, parameters[6])
+    scale_x, scale_y = focal_scales(start, parameters).tolist()
     return replace(
         start, fx=start.fx * scale_x, fy=start.fy * scale_y, cy=start.cy + parameters[8], world_from_camera=pose
     )
@@ -128,37 +142,39 @@ def project_with_parameters(
     axes
         East, north and up at the camera, rows ``(3, 3)``.
     parameters
-        Parameters ``(9,)``.
+        Parameters ``(9,)``, or ``(P, 9)`` for P poses at once.
     position_m
         World points ``(N, 3)`` [m].
 
     Returns
     -------
     pixel : ndarray
-        Lens pixels ``(N, 2)`` (with radial distortion).
+        Lens pixels ``(N, 2)`` or ``(P, N, 2)`` (with radial distortion).
     in_front : ndarray
-        ``(N,)`` bool, True where the point lies in front of the camera.
+        ``(N,)`` or ``(P, N)`` bool, True where the point lies in front of the camera.
     """
-    local = (position_m - parameters[3:6]) @ _rotation(axes, parameters)
-    scale_x, scale_y = _focal_scales(start, parameters[6])
+    local = (position_m - parameters[..., None, 3:6]) @ _rotation(axes, parameters)
+    scale = focal_scales(start, parameters)[..., None, :]
     centre = np.array([start.cx, start.cy])
+    moved = centre + np.stack([np.zeros_like(parameters[..., 8]), parameters[..., 8]], axis=-1)[..., None, :]
     if isinstance(start, Panorama):
         pixel, distance = project_local(start, local)
-        return (pixel - centre) * [scale_x, scale_y] + centre + [0.0, parameters[8]], distance > 0
-    depth = local[:, 2]
-    normalised = local[:, :2] / np.maximum(depth, 0.02 * np.sqrt(np.sum(local**2, axis=1)))[:, None]
-    if parameters[7]:
-        radius = np.sqrt(np.sum(normalised**2, axis=1, keepdims=True))
-        normalised = normalised * _distortion_factor(radius, parameters[7])
-    return normalised * [start.fx * scale_x, start.fy * scale_y] + centre + [0.0, parameters[8]], depth > 0
+        return (pixel - centre) * scale + moved, distance > 0
+    depth = local[..., 2]
+    normalised = local[..., :2] / np.maximum(depth, 0.02 * np.sqrt(np.einsum("...i,...i", local, local)))[..., None]
+    if np.any(parameters[..., 7]):
+        radius = np.sqrt(np.sum(normalised**2, axis=-1, keepdims=True))
+        normalised = normalised * _distortion_factor(radius, parameters[..., None, None, 7])
+    return normalised * (scale * [start.fx, start.fy]) + moved, depth > 0
 
 
-def _distortion_factor(radius: np.ndarray, k1: float) -> np.ndarray:
+def _distortion_factor(radius: np.ndarray, k1: np.ndarray) -> np.ndarray:
     """Distorted over ideal radius.
 
     The polynomial of a barrel distortion decreases beyond its maximum; it is extrapolated linearly from just before it.
     """
-    limit = np.minimum(radius, math.sqrt(0.98 / (-3.0 * k1)) if k1 < 0 else np.inf)
+    barrel = np.where(k1 < 0.0, -k1, 1.0)
+    limit = np.minimum(radius, np.where(k1 < 0.0, np.sqrt(0.98 / (3.0 * barrel)), np.inf))
     distorted = limit * (1.0 + k1 * limit**2) + (1.0 + 3.0 * k1 * limit**2) * (radius - limit)
     return np.divide(distorted, radius, out=np.ones_like(radius), where=radius > 1e-12)
 
@@ -178,15 +194,16 @@ def pixel_error(
     Returns
     -------
     error : ndarray
-        Projected minus observed pixel ``(N, 2)`` [px]; column differences of a panorama are wrapped to half a circle.
+        Projected minus observed pixel ``(N, 2)`` or ``(P, N, 2)`` [px]; column differences of a panorama are wrapped to
+        half a circle.
     in_front : ndarray
-        ``(N,)`` bool, True where the point lies in front of the camera.
+        ``(N,)`` or ``(P, N)`` bool, True where the point lies in front of the camera.
     """
     pixel, in_front = project_with_parameters(start, axes, parameters, points.position_m)
     error = pixel - points.pixel
     if isinstance(start, Panorama):
         circle = 2.0 * np.pi * start.fx
-        error[:, 0] -= circle * np.round(error[:, 0] / circle)
+        error[..., 0] -= circle * np.round(error[..., 0] / circle)
     return error, in_front
 
 

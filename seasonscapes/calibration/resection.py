@@ -26,7 +26,7 @@ Loss = Literal["cauchy", "l1", "squares"]
 # Threshold on the residual of an inlier [standard deviations]: probability 0.999 of two pixel coordinates (χ², 2 dof).
 OUTLIER_SIGMAS = 3.717
 
-# Maps whitened residual vectors (N, D) to vectors whose squared length is the robust loss.
+# Maps whitened residual vectors (..., D) to vectors whose squared length is the robust loss.
 _RobustLoss = Callable[[np.ndarray], np.ndarray]
 
 
@@ -98,12 +98,12 @@ class SkylineEvidence:
     Parameters
     ----------
     residuals
-        Function of a view and ``k1`` that returns signed residuals ``(M,)`` [px].
+        Function of parameters ``(9,)`` or ``(P, 9)`` that returns signed residuals ``(M,)`` or ``(P, M)`` [px].
     sigma_px
         Standard deviation of one residual [px], enlarged for the correlation of neighbouring residuals.
     """
 
-    residuals: Callable[[View, float], np.ndarray]
+    residuals: Callable[[np.ndarray], np.ndarray]
     sigma_px: float = 1.0
 
 
@@ -314,36 +314,48 @@ def _depth_m(known: ResectionOptions | ResectionProblem, parameters: np.ndarray,
 def _residual_rows(
     problem: ResectionProblem, parameters: np.ndarray, noise: float, robust_loss: _RobustLoss | None, inlier: np.ndarray
 ) -> np.ndarray:
-    """Whitened residuals of inlier points (with a robust loss or none), skyline and priors, concatenated."""
+    """Whitened residuals ``(P, R)`` of parameters ``(P, 9)``: of inlier points (with a robust loss or none), skyline, priors."""
     rows = []
     if len(problem.points):
-        error = _errors(problem, parameters)[inlier] / noise
-        rows.append((error if robust_loss is None else robust_loss(error)).ravel())
+        error = _errors(problem, parameters)[:, inlier] / noise
+        rows.append((error if robust_loss is None else robust_loss(error)).reshape(len(parameters), -1))
     if problem.skyline is not None:
-        view = view_from_parameters(problem.start, problem.axes, parameters)
-        residual = problem.skyline.residuals(view, parameters[7])
-        rows.append(_cauchy(residual[:, None] / problem.skyline.sigma_px, 2.0).ravel())
+        rows.append(_cauchy(problem.skyline.residuals(parameters)[..., None] / problem.skyline.sigma_px, 2.0)[..., 0])
     has_prior = problem.free & np.isfinite(problem.sigmas)
     offset = parameters - problem.origin
-    offset[0] = (offset[0] + 180.0) % 360.0 - 180.0
-    rows.append(offset[has_prior] / problem.sigmas[has_prior])
+    offset[:, 0] = (offset[:, 0] + 180.0) % 360.0 - 180.0
+    rows.append(offset[:, has_prior] / problem.sigmas[has_prior])
     if problem.ground_m is not None:
-        rows.append(np.array([_depth_m(problem, parameters, LEAST_ABOVE_GROUND_M) / problem.ground_sigma_m]))
-    return np.concatenate(rows)
+        depth_m = [_depth_m(problem, each, LEAST_ABOVE_GROUND_M) for each in parameters]
+        rows.append(np.array(depth_m)[:, None] / problem.ground_sigma_m)
+    return np.concatenate(rows, axis=1)
 
 
 def _cauchy(error: np.ndarray, scale: float) -> np.ndarray:
-    """Cauchy loss: vectors ``(N, D)`` whose squared length is ``c² log(1 + |e|²/c²)``."""
-    squared = np.sum(error**2, axis=1, keepdims=True)
+    """Cauchy loss: vectors ``(..., D)`` whose squared length is ``c² log(1 + |e|²/c²)``."""
+    squared = np.sum(error**2, axis=-1, keepdims=True)
     loss = scale**2 * np.log1p(squared / scale**2)
     return error * np.sqrt(np.divide(loss, squared, out=np.ones_like(squared), where=squared > 1e-20))
 
 
 def _soft_l1(error: np.ndarray, scale: float) -> np.ndarray:
-    """Soft L1 loss: vectors ``(N, D)`` whose squared length is ``2c² (√(1 + |e|²/c²) - 1)``."""
-    squared = np.sum(error**2, axis=1, keepdims=True)
+    """Soft L1 loss: vectors ``(..., D)`` whose squared length is ``2c² (√(1 + |e|²/c²) - 1)``."""
+    squared = np.sum(error**2, axis=-1, keepdims=True)
     loss = 2.0 * scale**2 * (np.sqrt(1.0 + squared / scale**2) - 1.0)
     return error * np.sqrt(np.divide(loss, squared, out=np.ones_like(squared), where=squared > 1e-20))
+
+
+def _jacobian(
+    problem: ResectionProblem, parameters: np.ndarray, noise: float, robust_loss: _RobustLoss | None, inlier: np.ndarray
+) -> np.ndarray:
+    """Jacobian ``(R, F)`` of the residuals for the free parameters: forward differences, all in one evaluation."""
+    free = np.flatnonzero(problem.free)
+    size = np.sqrt(np.finfo(float).eps) * np.maximum(np.abs(parameters[free]), 1.0)
+    trials = np.tile(parameters, (len(free) + 1, 1))
+    trials[np.arange(len(free)), free] += np.where(parameters[free] < 0.0, -size, size)
+    rows = _residual_rows(problem, trials, noise, robust_loss, inlier)
+    # The steps as they are after rounding.
+    return ((rows[:-1] - rows[-1]) / (trials[np.arange(len(free)), free] - parameters[free])[:, None]).T
 
 
 def _minimise(
@@ -360,15 +372,27 @@ def _minimise(
 
     free = problem.free
 
-    def residual_rows(free_parameters: np.ndarray) -> np.ndarray:
+    def residual_rows(values: np.ndarray) -> np.ndarray:
         trial = parameters.copy()
-        trial[free] = free_parameters
-        return _residual_rows(problem, trial, noise, robust_loss, inlier)
+        trial[free] = values
+        return _residual_rows(problem, trial[None], noise, robust_loss, inlier)[0]
+
+    def jacobian(values: np.ndarray) -> np.ndarray:
+        trial = parameters.copy()
+        trial[free] = values
+        return _jacobian(problem, trial, noise, robust_loss, inlier)
 
     # Characteristic steps of comparable effect on the residuals: [deg], [m], relative, k1, [px].
     scale = np.array([0.1, 0.1, 0.1, 10.0, 10.0, 10.0, 0.01, 0.02, 5.0])[free]
     solution = least_squares(
-        residual_rows, parameters[free], x_scale=scale, xtol=tolerance, ftol=tolerance, gtol=tolerance, max_nfev=200
+        residual_rows,
+        parameters[free],
+        jacobian,  # pyright: ignore[reportArgumentType]
+        x_scale=scale,
+        xtol=tolerance,
+        ftol=tolerance,
+        gtol=tolerance,
+        max_nfev=200,
     )
     result = parameters.copy()
     result[free] = solution.x
@@ -383,9 +407,7 @@ def _solve(
     all_points = np.ones(count, bool)
     noise = noise_px or 1.0
     if not count:
-        for _ in range(3):
-            parameters, _ = _minimise(problem, parameters, noise, None, all_points)
-        return parameters, ~all_points, noise
+        return _minimise(problem, parameters, noise, None, all_points)[0], ~all_points, noise
     if loss == "squares":
         for _ in range(2 if noise_px is None else 1):
             parameters, jacobian = _minimise(problem, parameters, noise, None, all_points)
@@ -454,7 +476,7 @@ def _test_influential_points(
     """
     if inlier.sum() > 40 or inlier.sum() <= 4:
         return parameters, ~inlier, noise
-    _, jacobian = _minimise(problem, parameters, noise, None, inlier)
+    jacobian = _jacobian(problem, parameters, noise, None, inlier)
     threshold = _outlier_threshold(2 * int(inlier.sum()) - _effective_parameters(problem, jacobian), noise_px is None)
     # The first rows of the Jacobian are the x and y residuals of the inliers, alternating.
     hat = np.einsum("ij,jk,ik->i", jacobian, np.linalg.pinv(jacobian.T @ jacobian), jacobian)
@@ -462,7 +484,7 @@ def _test_influential_points(
 
     def cost(trial: np.ndarray) -> float:
         error = np.linalg.norm(_errors(problem, trial), axis=1) / noise
-        other_rows = _residual_rows(problem, trial, noise, None, np.zeros(len(problem.points), bool))
+        other_rows = _residual_rows(problem, trial[None], noise, None, np.zeros(len(problem.points), bool))
         return float(np.sum(np.minimum(error, threshold) ** 2) + np.sum(other_rows**2))
 
     best, best_cost = parameters, cost(parameters)
@@ -520,7 +542,7 @@ def _calibration(
         raise NotEnoughEvidence(
             f"behind the camera: {names}; a correspondence is wrong, or the camera faces another direction"
         )
-    _, jacobian = _minimise(problem, parameters, noise, None, ~outlier)
+    jacobian = _jacobian(problem, parameters, noise, None, ~outlier)
     covariance = _covariance(problem, jacobian)
     if widen and len(residual):
         from scipy.special import stdtrit
@@ -530,7 +552,7 @@ def _calibration(
         covariance = covariance * (stdtrit(degrees_of_freedom, 0.97725) / 2.0) ** 2
     skyline_rms = float("nan")
     if problem.skyline is not None:
-        skyline_residual = problem.skyline.residuals(view, k1)
+        skyline_residual = problem.skyline.residuals(parameters)
         agrees = np.abs(skyline_residual) < 3.0 * problem.skyline.sigma_px
         skyline_rms = float(np.sqrt(np.mean(skyline_residual[agrees] ** 2))) if agrees.any() else float("nan")
     parameters = parameters.copy()

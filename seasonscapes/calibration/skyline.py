@@ -15,7 +15,7 @@ import numpy as np
 
 from seasonscapes.calibration.boundary_map import BoundaryMap, boundary_map, edge_near
 from seasonscapes.calibration.evidence import Correspondences, Priors
-from seasonscapes.calibration.pose_model import View, parameters_of_view, project_with_parameters, view_from_parameters
+from seasonscapes.calibration.pose_model import View, focal_scales, parameters_of_view, project_with_parameters
 from seasonscapes.calibration.resection import Calibration, ResectionOptions, SkylineEvidence, resect
 from seasonscapes.calibration.terrain_horizon import Horizon, HorizonOptions, cell_size_m, horizon_from
 from seasonscapes.cameras.panorama import Panorama
@@ -402,15 +402,14 @@ def _skyline_evidence(problem: _SkylineProblem, parameters: np.ndarray, reach: f
         return None
     points, target, normal, weight = (np.concatenate(part) for part in (points, target, normal, weight))
 
-    def residuals(view: View, k1: float) -> np.ndarray:
-        pixel, _ = project_with_parameters(view, axes, parameters_of_view(view, axes, k1), points)
-        error = pixel - target
-        if isinstance(view, Panorama):
-            circle = 2.0 * np.pi * view.fx
-            error[:, 0] -= circle * np.round(error[:, 0] / circle)
-        return np.sum(error * normal, axis=1) * weight
+    def residuals(trial: np.ndarray) -> np.ndarray:
+        error = project_with_parameters(start, axes, trial, points)[0] - target
+        if isinstance(start, Panorama):
+            circle = 2.0 * np.pi * start.fx * focal_scales(start, trial)[..., :1]
+            error[..., 0] -= circle * np.round(error[..., 0] / circle)
+        return np.einsum("...i,...i", error, normal) * weight
 
-    initial = residuals(view_from_parameters(start, axes, parameters), parameters[7])
+    initial = residuals(parameters)
     spread = max(1.4826 * float(np.median(np.abs(initial - np.median(initial)))), 0.5)
     # Errors of neighbouring columns are correlated: one independent residual per correlation length.
     return SkylineEvidence(residuals, spread * np.sqrt(_correlation_length(initial)))
