@@ -105,9 +105,9 @@ def test_a_camera_near_the_ground_keeps_its_height_above_it(monkeypatch):
         height = moved.position_m[2] - float(below.up_at(moved.position_m[None])[0])
         assert height == pytest.approx(2.0, abs=0.4)
         changes.append(moved.position_m[2] - pose[2, 3])
-        pose[2, 3] = ground + 150.0
-        free = replace(south, world_from_camera=pose)
-        assert view_with_terrain(place, free, amplify=True)[0] is free
+    pose[2, 3] = ground + 150.0
+    free = replace(south, world_from_camera=pose)
+    assert view_with_terrain(place, free, amplify=True)[0] is free
     assert max(np.abs(changes)) > 0.3
 
 

@@ -33,7 +33,7 @@ LATITUDE_DEG, LONGITUDE_DEG = 46.57326, 7.97552
 
 
 @pytest.fixture(scope="module")
-def taken(tmp_path_factory):
+def taken(tmp_path_factory, few_rays):
     """A small place and the sources of a photograph from 3 m above its ground."""
     place = ss.load_place("alpine_small")
     view = ss.Viewpoint(latitude_deg=LATITUDE_DEG, longitude_deg=LONGITUDE_DEG, above_ground_m=3.0, heading_deg=180.0)

@@ -6,11 +6,13 @@ import resource
 import sys
 import time
 from collections import Counter
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
 
-pytest.importorskip("distributed")
+# Not imported here: that takes seconds in each process that collects this file.
+pytestmark = pytest.mark.skipif(find_spec("distributed") is None, reason="the extra 'cluster' is not installed")
 
 
 @pytest.fixture(scope="module")

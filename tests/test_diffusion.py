@@ -5,6 +5,7 @@ import shutil
 import sys
 from dataclasses import replace
 from datetime import UTC, datetime
+from importlib.util import find_spec
 from itertools import pairwise
 
 import numpy as np
@@ -12,6 +13,7 @@ import places
 import pytest
 from command_line import command
 from PIL import Image
+from tiny_diffusion import ADAPTER, BASE, DEPTH, INPAINT, write_tiny_weights
 
 from seasonscapes.cameras.path_file import save_path
 from seasonscapes.cameras.pinhole import camera_at
@@ -22,6 +24,14 @@ from seasonscapes.rendering.hemisphere_rays import ray_scene
 from seasonscapes.rendering.mitsuba_scene import RenderScene, mi_mesh
 from seasonscapes.terrain.surface import Texture, load_texture, save_texture
 from seasonscapes.texturing.atlas_tiles import tiling
+from seasonscapes.texturing.diffusion import (
+    DeviceSettings,
+    DiffusionSettings,
+    load_inpainter,
+    required_parts,
+    whole_cells,
+)
+from seasonscapes.texturing.model_weights import WeightNames, find_weights, weights_fingerprint
 from seasonscapes.texturing.path_inpainting import (
     InpaintingState,
     PathInpaintingInputs,
@@ -44,19 +54,9 @@ from seasonscapes.workflows import path_completion
 from seasonscapes.workflows.place import MeshOptions, load_place
 from seasonscapes.workspace import Workspace
 
-pytest.importorskip("diffusers", reason="the extra 'diffusion' is not installed")
-
-import torch
-from tiny_diffusion import ADAPTER, BASE, DEPTH, INPAINT, write_tiny_weights
-
-from seasonscapes.texturing.diffusion import (
-    DeviceSettings,
-    DiffusionSettings,
-    load_inpainter,
-    required_parts,
-    whole_cells,
-)
-from seasonscapes.texturing.model_weights import WeightNames, find_weights, weights_fingerprint
+torch = pytest.importorskip("torch", reason="the extra 'diffusion' is not installed")
+# Not imported here: that takes seconds in each process that collects this file.
+pytestmark = pytest.mark.skipif(find_spec("diffusers") is None, reason="the extra 'diffusion' is not installed")
 
 HEIGHT, WIDTH = 50, 70  # not divisible by 8
 
