@@ -1,6 +1,7 @@
 """The sky of every hour against independent sources, and what must hold of it in any case."""
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from atmosphere_cases import (
 )
 
 from seasonscapes.frames import direction_from_angles, equirectangular_directions
+from seasonscapes.sky import curved_rays
 from seasonscapes.sky.atmosphere import Atmosphere, optics
 from seasonscapes.sky.clear_sky import (
     LuminarySource,
@@ -48,6 +50,27 @@ def test_direct_beam_is_spectrl2s(height_m):
             transfer = sun_transfer(air, columns, optics(air), np.array(height_m), true_rad)
             expected, _ = spectrl2_illuminance_lx(elevation, depth, height_m)
             assert luminance(rgb_from_transfer() @ transfer) == pytest.approx(expected, rel=0.05)
+
+
+def test_columns_to_the_sun_are_shared_by_atmospheres_of_one_profile_alone(monkeypatch):
+    monkeypatch.setattr(curved_rays, "SUN_HEIGHTS", 4)
+    monkeypatch.setattr(curved_rays, "SUN_ELEVATIONS", 12)
+    # Past the tables that are kept.
+    traced = curved_rays._unit_sun_columns.__wrapped__
+    monkeypatch.setattr(curved_rays, "_unit_sun_columns", traced)
+    bare = Atmosphere(ground_height_m=900.0)
+    hazy = Atmosphere(0.6, 0.4, 2000.0, 0.8, 0.5, 250.0, (0.1,) * 9, ground_height_m=900.0)
+    expected = sun_columns(bare).log_columns
+    np.testing.assert_array_equal(traced(hazy).log_columns, expected)
+    np.testing.assert_array_equal(sun_columns(hazy).log_columns, expected)
+    for other in (
+        replace(hazy, aerosol_scale_height_m=1000.0),
+        replace(hazy, ground_height_m=100.0),
+        replace(hazy, pressure_hpa=950.0),
+        replace(hazy, refraction=False),
+    ):
+        assert np.abs(sun_columns(other).log_columns - expected).max() > 1e-4
+        np.testing.assert_array_equal(sun_columns(other).log_columns, traced(other).log_columns)
 
 
 @pytest.mark.parametrize("elevation_deg", [10.0, 20.0, 45.0, 75.0])

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,6 +13,11 @@ from seasonscapes.sky.atmosphere import TOP_HEIGHT_M, Atmosphere, Optics, consti
 SUN_RADIUS_DEG = 0.26656  # at 1 au
 SUN_HEIGHTS, SUN_ELEVATIONS = 56, 160
 _MIN_COLUMN = 1e-12
+# What an atmosphere states that normalised density profiles and the refraction of rays do not depend on.
+_NOT_IN_UNIT_COLUMNS = {
+    *("aerosol_optical_depth_500nm", "angstrom_exponent", "single_scattering_albedo", "asymmetry"),
+    *("ozone_du", "ground_albedo"),
+}
 
 
 @dataclass(frozen=True)
@@ -153,12 +159,12 @@ def resample_rays(rays: CurvedRays, distance_m: np.ndarray) -> CurvedRays:
     CurvedRays
         The rays with M samples each.
     """
-    fields = (rays.height_m, rays.central_angle_rad, rays.elevation_rad)
-    height, central_angle, elevation = (np.empty(distance_m.shape) for _ in fields)
+    quantities = (rays.height_m, rays.central_angle_rad, rays.elevation_rad)
+    height, central_angle, elevation = (np.empty(distance_m.shape) for _ in quantities)
     for k, distances in enumerate(distance_m):
         # Samples beyond the end of a ray repeat its last distance; exclude them from the interpolation.
         distinct = np.r_[True, np.diff(rays.distance_m[k]) > 0.0]
-        for target, source in zip((height, central_angle, elevation), fields, strict=True):
+        for target, source in zip((height, central_angle, elevation), quantities, strict=True):
             target[k] = np.interp(distances, rays.distance_m[k][distinct], source[k][distinct])
     clamped = np.minimum(distance_m, rays.distance_m[:, -1:])
     return CurvedRays(clamped, height, central_angle, elevation, rays.ends_on_ground)
@@ -210,8 +216,17 @@ def sun_columns(atmosphere: Atmosphere) -> SunColumns:
     Returns
     -------
     SunColumns
-        Table of `SUN_HEIGHTS` heights and `SUN_ELEVATIONS` solar elevations.
+        Table of `SUN_HEIGHTS` heights and `SUN_ELEVATIONS` solar elevations; read-only, since atmospheres of one profile
+        share it.
     """
+    # In units of the vertical columns: how much of each constituent there is, and what it does to light, does not matter.
+    unit = {field.name: field.default for field in fields(Atmosphere) if field.name in _NOT_IN_UNIT_COLUMNS}
+    return _unit_sun_columns(replace(atmosphere, **unit))
+
+
+@lru_cache(maxsize=16)
+def _unit_sun_columns(atmosphere: Atmosphere) -> SunColumns:
+    """`sun_columns`, once for each profile."""
     heights = atmosphere.ground_height_m + _thickness_m(atmosphere) * np.linspace(0.0, 1.0, SUN_HEIGHTS) ** 3
     fraction = np.linspace(0.0, 1.0, SUN_ELEVATIONS)
     horizon = horizon_elevation_rad(atmosphere, heights)
@@ -230,7 +245,9 @@ def sun_columns(atmosphere: Atmosphere) -> SunColumns:
         grid = low + (np.pi / 2 - low) * fraction**3
         for q, values in enumerate((*columns[:, p], magnification[p])):
             table[p, :, q] = np.interp(grid, e, np.log(np.maximum(values, _MIN_COLUMN)))
-    return SunColumns(true[:, 0], table)
+    found = SunColumns(true[:, 0].copy(), table)
+    found.lowest_rad.flags.writeable = found.log_columns.flags.writeable = False
+    return found
 
 
 def slant_columns_to_sun(
