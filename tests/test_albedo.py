@@ -162,7 +162,7 @@ def test_wrong_light_is_clearly_worse(place, clean, wrong):
 
 def test_response_curve_is_found(place, photographs):
     bent = webcam_shots(place, photographs, WebcamFaults(tone_strength=0.4, exposure_sigma_ev=0.2))
-    found = tone_curve.fit_tone_curve(place.transport, bent, search=SearchOptions(fraction=0.25))
+    found = tone_curve.fit_tone_curve(place.transport, bent, search=SearchOptions(fraction=0.5))
     assert found.strength == pytest.approx(0.4, abs=0.15)
     levels = np.linspace(0.0, 1.0, 50)
     curve = 0.6 * levels + 0.4 * levels**2 * (3.0 - 2.0 * levels)
@@ -198,7 +198,7 @@ def test_visibility_is_found(place, photographs):
         return [replace(photograph.light, aerial_perspective=Fog(visibility_km)) for photograph in photographs]
 
     found = haze.fit_visibility(
-        place.transport, hazy, lights_of, visibilities_km=(2.5, 4.0, 8.0, 16.0), search=SearchOptions(fraction=0.25)
+        place.transport, hazy, lights_of, visibilities_km=(2.5, 4.0, 8.0, 16.0), search=SearchOptions(fraction=0.5)
     )
     assert found.visibility_km == pytest.approx(true_km, rel=0.15)
     mixed = haze.mixed_light(lights_of(4.0)[0], lights_of(8.0)[0], 0.5).aerial_perspective
