@@ -45,9 +45,9 @@ from seasonscapes.rendering.mirror_samples import (
     mirror_coefficients,
     mirror_samples,
     mirror_weights,
-    morton_order,
     water_samples,
 )
+from seasonscapes.rendering.morton import morton_order
 from seasonscapes.rendering.sky_patches import patch_sums, sky_patches
 from seasonscapes.rendering.smoothing import Neighbours, edge_aware_neighbours, smoothed
 from seasonscapes.rendering.sobol import hash_to_unit
