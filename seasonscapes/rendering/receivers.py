@@ -253,8 +253,10 @@ def start_clusters(
 
     Other threads trace while the caller computes something else.
     """
-    rays = device.rays
-    begun = [(body, start_visible_cosine(rays, body)) for body in bodies] if device.clusters.bounces else []
+    # The points of a cluster lie on faces here and there.
+    begun = [
+        (body, start_visible_cosine(device.rays, body, coherent=False)) for body in bodies if device.clusters.bounces
+    ]
 
     def sunlit() -> np.ndarray:
         albedo = device.clusters.points.albedo

@@ -350,9 +350,12 @@ def visible_cosine(rays: SunRays, luminary: Luminary, *, rays_per_sample: int = 
     return _read_cosines(rays, _cosines(rays, luminary, rays_per_sample))
 
 
-def start_visible_cosine(rays: SunRays, luminary: Luminary) -> Callable[[], np.ndarray]:
-    """Start `visible_cosine`, and return the function that gives its result; see `start_first_samples`."""
-    parts = list(_cosines(rays, luminary, 1))
+def start_visible_cosine(rays: SunRays, luminary: Luminary, *, coherent: bool = True) -> Callable[[], np.ndarray]:
+    """Start `visible_cosine`, and return the function that gives its result; see `start_first_samples`.
+
+    ``coherent``: the samples of a receiver lie so close together that tracing them in packets pays.
+    """
+    parts = list(_cosines(rays, luminary, 1, coherent=coherent))
     return lambda: _read_cosines(rays, parts)
 
 
@@ -366,7 +369,7 @@ def _read_cosines(rays: SunRays, parts: Iterable[Any]) -> np.ndarray:
     return result.reshape(-1, rays.samples)
 
 
-def _cosines(rays: SunRays, luminary: Luminary, rays_per_sample: int) -> Iterator[Any]:
+def _cosines(rays: SunRays, luminary: Luminary, rays_per_sample: int, *, coherent: bool = True) -> Iterator[Any]:
     """What `visible_cosine` computes, launched part by part: ``mi.Float`` of some successive samples."""
     import drjit as dr
     import mitsuba as mi
@@ -383,7 +386,7 @@ def _cosines(rays: SunRays, luminary: Luminary, rays_per_sample: int) -> Iterato
         lane = None if whole else lane + dr.opaque(mi.UInt32, start)
         receiver += dr.opaque(mi.UInt32, start // rays.samples)
         disc_point = sample + ray * dr.opaque(mi.UInt32, rays.samples)
-        visible, cosine, _ = _visible(rays, disc, lane, receiver, disc_point, coherent=True)
+        visible, cosine, _ = _visible(rays, disc, lane, receiver, disc_point, coherent=coherent)
         lanes = dr.select(visible, cosine, 0.0)
         dr.eval(lanes)
         if rays_per_sample > 1:
