@@ -278,8 +278,8 @@ def slant_columns_to_sun(
     dark, _ = _columns_above(columns, row0, fr, lowest, np.full(row0.shape, -np.inf), radius_rad)
     column = np.broadcast_to(dark, (*lit.shape, 3)).copy()
     visible = np.zeros(lit.shape)
-    at_lit = (np.broadcast_to(each, lit.shape)[lit] for each in (row0, fr, lowest))
-    column[lit], visible[lit] = _columns_above(columns, *at_lit, above_lowest[lit], radius_rad)
+    rows, fractions, lows = (np.broadcast_to(each, lit.shape)[lit] for each in (row0, fr, lowest))
+    column[lit], visible[lit] = _columns_above(columns, rows, fractions, lows, above_lowest[lit], radius_rad)
     return column, visible
 
 
