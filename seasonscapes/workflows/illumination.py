@@ -309,6 +309,7 @@ def illumination_for_camera(
     *,
     map_height: int = 128,
     by_elevation: bool = False,
+    of_another_camera: Illumination | None = None,
 ) -> tuple[Illumination, SunMoonPosition]:
     """Compute the light on a place as seen by a camera, and the positions of sun and moon.
 
@@ -327,11 +328,13 @@ def illumination_for_camera(
         Rows of both sky maps; with ``by_elevation`` the visible one is empty by day, where the aerial perspective holds all of it.
     by_elevation
         For many instants of one camera; see `atmosphere_tables_in`.
+    of_another_camera
+        What this function found for another camera at the same instant under the same model: its light on the terrain is taken.
     """
     from seasonscapes.workflows.views import camera_geodetic
 
     position = _position_in_film(place, time) if by_elevation else position_at(place, time)
-    on_terrain = illumination_at(
+    on_terrain = of_another_camera or illumination_at(
         model,
         position,
         place.median_height_m,
