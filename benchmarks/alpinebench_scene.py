@@ -102,9 +102,9 @@ SIZES = {
         (8.5, 10.0, 14.0),
         _WEB,
         60.0,
-        steps=(150, 16),
+        steps=(50, 8),
         overviews=1,
-        day_step_h=1.0,
+        day_step_h=2.0,
     ),
     "quick": Size((5400.0, 5400.0), 30.0, 18.0, 2, 75.0, 200, 1, (300, 200), _QUICK_HOURS, _WEB, 36.0),
     "small": Size(

@@ -2,7 +2,7 @@
 
 Every command runs as a process of its own (``python -m seasonscapes``), in a workspace of this run. *Cold* is the first
 command of its kind in an empty workspace, *warm* the next one with another hour. Compiled kernels of Dr.Jit stay in the
-user's cache from run to run, as they do for a user. Keys that end in ``_s`` are processor seconds of all threads, those
+user's cache from run to run, and compiled modules with their hashes in `__pycache__`, as they do for a user. Keys that end in ``_s`` are processor seconds of all threads, those
 of ``demo_…`` wall seconds; ``…_wall_s`` stand beside them.
 
     python benchmarks/everyday.py            # all, an hourly year of one view whole: an hour

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import hashlib
+import importlib.util
+import json
 import marshal
+import os
 import re
+import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import cache, lru_cache
 from pathlib import Path
 from types import CodeType
+from typing import Any
 
 _PACKAGE = Path(__file__).parent
 _ROOT = _PACKAGE.name
@@ -45,7 +51,8 @@ def source_hash(*modules: str) -> str:
     """
     digest = hashlib.sha256()
     for module in sorted(imported_modules(*modules)):
-        digest.update(f"{module}:{_code_hash(module)}\n".encode())
+        digest.update(f"{module}:{_facts(module)[0]}\n".encode())
+    _keep_facts()
     return digest.hexdigest()[:16]
 
 
@@ -57,7 +64,7 @@ def imported_modules(*modules: str) -> frozenset[str]:
         module = pending.pop()
         if module not in found:
             found.add(module)
-            pending += _imports(module)
+            pending += _facts(module)[1]
     return frozenset(found)
 
 
@@ -73,16 +80,74 @@ _TYPE_CHECKING = re.compile(r"^if TYPE_CHECKING:\n(?:[ \t]+.*\n|\n)+", re.MULTIL
 
 
 @cache
+def _facts(module: str) -> tuple[str, tuple[str, ...]]:
+    """Hash of a module's code, and the modules of the package that it imports anywhere in it.
+
+    Compiling two hundred modules takes most of a second. What they gave is kept beside the interpreter's own compiled modules, and
+    taken from there while the file has the size, times and inode that it had then.
+    """
+    about = _path(module).stat()
+    state = [about.st_size, about.st_mtime_ns, about.st_ctime_ns, about.st_ino]
+    kept = _kept().get(module)
+    if kept is None or kept[0] != state:
+        code = _code(module)
+        kept = [state, _code_hash(code), list(_imports(code))]
+        _kept()[module] = kept
+        _new.append(module)
+    return kept[1], tuple(kept[2])
+
+
+# Modules whose facts are not in the file yet.
+_new: list[str] = []
+
+
+def _facts_path() -> Path:
+    """Where facts are kept; another interpreter has another file."""
+    return Path(importlib.util.cache_from_source(str(_PACKAGE / "source_hash.py"))).with_suffix(".json")
+
+
+@cache
+def _made_by() -> str:
+    """Name of everything but a module's own file that its facts depend on: this file, the interpreter, and which modules there are."""
+    about = (sys.version, Path(__file__).read_text(encoding="utf-8"), sorted(_modules()))
+    return hashlib.sha256(repr(about).encode()).hexdigest()
+
+
+@cache
+def _kept() -> dict[str, list[Any]]:
+    """State of the file, hash and imports by module, as they were kept; nothing where they are of other code, or damaged."""
+    try:
+        stored = json.loads(_facts_path().read_text(encoding="utf-8"))
+        return dict(stored["modules"]) if stored["made_by"] == _made_by() else {}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+
+
+def _keep_facts() -> None:
+    if not _new or sys.dont_write_bytecode:
+        return
+    _new.clear()
+    path = _facts_path()
+    temporary = path.with_suffix(f".{os.getpid()}.part")
+    # As the interpreter does with compiled modules: where it may not write, they are compiled again next time.
+    with suppress(OSError):
+        try:
+            path.parent.mkdir(exist_ok=True)
+            temporary.write_text(json.dumps({"made_by": _made_by(), "modules": _kept()}), encoding="utf-8")
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
 def _code(module: str) -> CodeType:
     """The module compiled without docstrings and without its imports for type checking; three times quicker than `ast`."""
     source = _TYPE_CHECKING.sub("", _path(module).read_text(encoding="utf-8"))
     return compile(source, module, "exec", dont_inherit=True, optimize=2)
 
 
-@cache
-def _code_hash(module: str) -> str:
+def _code_hash(code: CodeType) -> str:
     # Version 2 of the format has no back references, whose use depends on reference counts.
-    return hashlib.sha256(marshal.dumps(_without_positions(_code(module)), 2)).hexdigest()
+    return hashlib.sha256(marshal.dumps(_without_positions(code), 2)).hexdigest()
 
 
 def _without_positions(code: CodeType) -> CodeType:
@@ -90,10 +155,9 @@ def _without_positions(code: CodeType) -> CodeType:
     return code.replace(co_linetable=b"", co_firstlineno=1, co_filename="", co_consts=constants)
 
 
-@cache
-def _imports(module: str) -> tuple[str, ...]:
-    """Modules of the package that one module imports, anywhere in its code."""
-    names = set(_names(_code(module)))
+def _imports(code: CodeType) -> tuple[str, ...]:
+    """Modules of the package that a module imports, anywhere in its code."""
+    names = set(_names(code))
     packages = {name for name in names if name == _ROOT or name.startswith(f"{_ROOT}.")}
     # In ``from package import module`` both names stand apart in the bytecode.
     dotted = packages | {f"{package}.{name}" for package in packages for name in names if "." not in name}

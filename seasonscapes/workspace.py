@@ -154,8 +154,7 @@ def build_once(
     Two processes that build the same artefact at once both succeed: each renames a whole file onto the same name.
     """
     key = artefact_key(inputs, code)
-    path = workspace.folder / f"{name}-{key}{suffix}"
-    manifest = path.with_name(path.name + ".json")
+    path, manifest = _files(workspace, name, key, suffix)
     for file in (path, manifest):
         if file.is_dir():
             cure = "remove it, or choose another --workspace"
@@ -181,10 +180,22 @@ def build_once(
     }
     with atomic_path(manifest) as temporary:
         temporary.write_text(json.dumps(record, indent=1, sort_keys=True, default=plain_value) + "\n")
+    _compared[path] = _state(path, digest)
     return value
 
 
-# Artefacts whose content this process has compared already: size, time of change [ns] and inode then.
+def is_built(workspace: Workspace, name: str, inputs: dict, *, code: tuple[str, ...], suffix: str) -> bool:
+    """Whether the workspace has the artefact of `build_once`; not whether it is whole, which loading finds out."""
+    return all(file.is_file() for file in _files(workspace, name, artefact_key(inputs, code), suffix))
+
+
+def _files(workspace: Workspace, name: str, key: str, suffix: str) -> tuple[Path, Path]:
+    """An artefact and its manifest."""
+    path = workspace.folder / f"{name}-{key}{suffix}"
+    return path, path.with_name(path.name + ".json")
+
+
+# Artefacts whose content this process has written, or compared already: size, time of change [ns] and inode then.
 _compared: dict[Path, tuple[str, int, int, int]] = {}
 
 
@@ -197,11 +208,15 @@ def _doubt(path: Path, manifest: Path, key: str) -> str | None:
         return "its manifest is damaged, or of an older version"
     if stated[0] != key:
         return "its manifest is another artefact's"
-    about = path.stat()
-    state = (str(stated[1]), about.st_size, about.st_mtime_ns, about.st_ino)
+    state = _state(path, str(stated[1]))
     if _compared.get(path) == state:
         return None
     if file_hash(path) != stated[1]:
         return "its content is not what was written"
     _compared[path] = state
     return None
+
+
+def _state(path: Path, digest: str) -> tuple[str, int, int, int]:
+    about = path.stat()
+    return digest, about.st_size, about.st_mtime_ns, about.st_ino

@@ -130,13 +130,10 @@ if __name__ == "__main__":
     import seasonscapes as ss
     from seasonscapes.cli import main
     from seasonscapes.rendering.backend import use_backend
-    from seasonscapes.source_hash import source_hash
     from seasonscapes.workflows import timelapse, view_rendering  # noqa: F401
 
     for each in ss.__all__:
         getattr(ss, each)
-    # Each process hashes the code of what it makes, once; here the modules are read and compiled for all of them.
-    source_hash("workflows.full_run", "workflows.timelapse")
     # Sets the renderer up, which starts no threads: these begin with the first kernel, in a command's own process.
     use_backend()
     for each in sys.argv[1:]:

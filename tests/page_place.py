@@ -1,6 +1,6 @@
 """The place that the how-to pages speak of: ``my-valley.toml`` as the page of scene files prints it, and what lies beside it.
 
-Heights are a made-up valley of 14 km at 50 m that covers the page's coordinates, the image a picture of grass, rock and snow
+Heights are a made-up valley of 14 km at 100 m that covers the page's coordinates, the image a picture of grass, rock and snow
 under the light of the hour that the scene file states, the mesh two boxes with a texture each.
 """
 
@@ -15,7 +15,7 @@ import rasterio
 from affine import Affine
 
 HOWTO = Path(__file__).parents[1] / "docs" / "howto"
-SPACING_M, COUNT = 50.0, 280
+SPACING_M, COUNT = 100.0, 140
 WEST_M, NORTH_M = 415_000.0, 5_168_500.0  # UTM 32 N; its middle is 46.602° N, 7.980° E
 
 
@@ -31,7 +31,7 @@ def page_scene(page: str = "scene-file.md") -> str:
 
 
 def valley_heights() -> np.ndarray:
-    """Heights ``(280, 280)`` [m]: a valley between two ranges with side valleys, steeper than snow lies."""
+    """Heights ``(140, 140)`` [m]: a valley between two ranges with side valleys, steeper than snow lies."""
     x, y = np.meshgrid(np.linspace(-1, 1, COUNT), np.linspace(1, -1, COUNT))
     ranges = 1500.0 * np.abs(np.sin(1.6 * (x - 0.25 * y))) ** 1.5
     spurs = 350.0 * np.sin(9.0 * y + 2.0 * x) * np.abs(x) + 120.0 * np.sin(17.0 * x) * np.sin(15.0 * y + 1.0)
@@ -39,7 +39,7 @@ def valley_heights() -> np.ndarray:
 
 
 def valley_colours(heights: np.ndarray) -> np.ndarray:
-    """sRGB ``(280, 280, 3)`` of meadow, rock and snow by height and slope, shaded as at a forenoon."""
+    """sRGB ``(140, 140, 3)`` of meadow, rock and snow by height and slope, shaded as at a forenoon."""
     north, east = np.gradient(heights, -SPACING_M, SPACING_M)
     slope = np.hypot(north, east)
     colours = np.full((*heights.shape, 3), (88, 104, 62), float)

@@ -61,3 +61,24 @@ def test_light_of_a_place_is_lit_below_and_seen_from_the_camera(tmp_path, worksp
     np.testing.assert_allclose(light.sun.direction, moment.sun.direction, atol=1e-12)
     zenith = luminance(light.sky_radiance[0].mean(axis=0)), luminance(light.visible_sky[0].mean(axis=0))
     assert zenith[1] < 0.8 * zenith[0], "the zenith over a high camera is darker than over the land"
+
+
+def test_another_cameras_light_on_the_terrain_is_this_ones(tmp_path, workspace):
+    """Given what another camera found, a camera has the light it would have found alone, to the bit; air and sky are its own."""
+    place = load_place(places.write_place(tmp_path), workspace)
+    view = place.scene.camera(None).model_copy(update={"above_ground_m": None, "height_m": 4500.0})
+    high, low = (
+        camera_for(place, view.model_copy(update={"height_m": height_m}), size_px=(32, 24))
+        for height_m in (4500.0, 3000.0)
+    )
+    model, time = with_overrides(read_sky_model("clear"), turbidity=3.0), datetime(2024, 9, 1, 10, 0, tzinfo=UTC)
+    other, _ = illumination_for_camera(place, low, model, time)
+    alone, _ = illumination_for_camera(place, high, model, time)
+    given, _ = illumination_for_camera(place, high, model, time, of_another_camera=other)
+    np.testing.assert_array_equal(given.sky_radiance, alone.sky_radiance)
+    np.testing.assert_array_equal(given.visible_sky, alone.visible_sky)
+    assert not np.array_equal(given.visible_sky, other.visible_sky)
+    depth_m, direction = np.array([4000.0]), np.array([[0.0, 1.0, 0.0]])
+    air = [each.aerial_perspective(depth_m, direction)[0] for each in (given, alone, other)]
+    np.testing.assert_array_equal(air[0], air[1])
+    assert not np.array_equal(air[0], air[2])

@@ -90,6 +90,40 @@ def test_a_slope_under_an_open_sky_sees_half_of_one_plus_its_cosine(alpine):
     assert seen.coefficients[:, 0] == pytest.approx(0.5 * (1.0 + np.cos(slope)), abs=2e-3)
 
 
+def test_horizons_do_not_depend_on_the_order_of_receivers(alpine):
+    """Receivers are traced along a curve over the ground; whose horizon another one's search begins at changes where it ends only
+    where what is free is not free above, at the rim of the land and by rounding."""
+    import mitsuba as mi
+
+    place, terrain = alpine
+    rng, patches, count = np.random.default_rng(11), sky_patches("reinhart"), 3000
+    points, _ = surface_at(terrain, place.terrain.vertices[rng.integers(0, len(place.terrain.vertices), count)])
+    count = len(points.origin)
+    above = sky_above(patches, np.stack([patches.directions[:, 0], patches.directions[:, 2]], axis=1))
+    turn, key = rng.random(count, np.float32), np.arange(count, dtype=np.uint32)
+    face_cluster = mi.UInt32(np.arange(len(place.terrain.faces), dtype=np.uint32) % 4096)
+    mixed = rng.permutation(count)
+
+    def seen(chosen):
+        return trace_horizons(
+            terrain,
+            above,
+            points[chosen].reshape(-1, 1),
+            np.ones((count, 1), np.float32),
+            azimuths=16,
+            land_rays=1,
+            turn=turn[chosen],
+            key=key[chosen],
+            mi_face_cluster=face_cluster,
+        )
+
+    straight, other = seen(np.arange(count)), seen(mixed)
+    equal = straight.sky_share[mixed] == other.sky_share
+    assert equal.mean() > 0.99
+    assert (straight.hit[mixed] == other.hit).all(axis=1)[equal].mean() > 0.99
+    assert straight.sky_share.std() > 0.02
+
+
 def test_points_are_drawn_in_proportion_to_their_weights():
     weight = np.tile(np.float32([0.5, 0.0, 0.125, 0.375]), (50, 1))
     drawn = _drawn(weight, 16, np.arange(50, dtype=np.uint32))

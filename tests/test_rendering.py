@@ -1,5 +1,7 @@
 """Rendering against closed forms: Lambert, the furnace, shadows, projection, orientation."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ from seasonscapes.frames import LocalFrame, direction_from_angles, equirectangul
 from seasonscapes.rendering import backend
 from seasonscapes.rendering.gbuffer import occluded, trace_gbuffer
 from seasonscapes.rendering.hosek import hosek_illumination
-from seasonscapes.rendering.mitsuba_scene import build_scene, relight, set_albedo
+from seasonscapes.rendering.mitsuba_scene import build_scene, mi_mesh, relight, set_albedo
 from seasonscapes.rendering.radiance import path_trace, render_view
 from seasonscapes.sky.illumination import (
     Illumination,
@@ -19,6 +21,7 @@ from seasonscapes.sky.illumination import (
     luminance,
     uniform_sky,
 )
+from seasonscapes.terrain.attributes import vertex_normals
 from seasonscapes.terrain.surface import Terrain
 
 FRAME = LocalFrame(46.55, 7.98)
@@ -51,6 +54,18 @@ def sun_at(azimuth_deg, elevation_deg, illuminance_lx=1.0e5, radius_deg=0.2666) 
 
 
 PLANE = heightfield(lambda e, n: 0.0 * e, count=3)
+
+
+def test_a_mesh_has_the_normals_that_it_was_given():
+    """Mitsuba would sum its own, in an order that varies between runs."""
+    import mitsuba as mi
+
+    land = heightfield(lambda east, north: 40.0 * np.sin(east / 60.0) * np.cos(north / 45.0))
+    given = np.random.default_rng(4).normal(size=land.vertices.shape).astype(np.float32)
+    given /= np.linalg.norm(given, axis=1, keepdims=True)
+    for terrain, expected in ((land, vertex_normals(land)), (replace(land, normals=given), given)):
+        normals = mi.traverse(mi_mesh(terrain, np.full(3, 0.3)))["vertex_normals"]
+        assert np.array(normals).reshape(-1, 3).tobytes() == expected.astype(np.float32).tobytes()
 
 
 def test_lambert_under_the_sun():

@@ -24,7 +24,7 @@ class Runs:
     def __init__(self, folder: Path):
         self.folder = folder
         (folder / "little.toml").write_text(MASSIF)
-        self.server = CommandServer(folder, imports=["torch", "seasonscapes.workflows.full_run"])
+        self.server = CommandServer(folder, imports=["torch._dynamo", "seasonscapes.workflows.full_run"])
 
     def arguments(self, name: str) -> list[str]:
         return [

@@ -10,6 +10,7 @@ from atmosphere_cases import tables_of
 
 from seasonscapes.frames import direction_from_angles
 from seasonscapes.rendering.mitsuba_scene import sky_radiance_towards
+from seasonscapes.sky import observer_radiance
 from seasonscapes.sky.atmosphere import delta_scaled, gas_moments, optics
 from seasonscapes.sky.clear_sky import LuminarySource, illumination_from_atmosphere, sky_radiance_map
 from seasonscapes.sky.elevation_table import (
@@ -22,13 +23,15 @@ from seasonscapes.sky.elevation_table import (
     save_table,
     tabulate_by_elevation,
 )
+from seasonscapes.sky.ephemeris import LunarPosition
 from seasonscapes.sky.illumination import luminance
 from seasonscapes.sky.models import atmosphere_from_model, read_sky_model
-from seasonscapes.sky.night import night_sky_radiance
+from seasonscapes.sky.night import moon_to_sun_ratio, night_sky_radiance
 from seasonscapes.sky.observer_radiance import observed_sky, observer_view, sky_radiance, sky_radiance_grid
 from seasonscapes.sky.ray_cells import scattering_per_m
 from seasonscapes.sky.sh_moments import HARMONIC_ORDER, diffuse_source, height_index, sun_geometry, zonal
-from seasonscapes.sky.tables_by_elevation import day_by_elevation, diffuse_by_elevation
+from seasonscapes.sky.spectrum import WAVELENGTHS_NM
+from seasonscapes.sky.tables_by_elevation import day_by_elevation, diffuse_by_elevation, moon_by_elevation
 from seasonscapes.workflows import illumination as illumination_module
 from seasonscapes.workspace import Workspace
 
@@ -37,7 +40,7 @@ HEIGHT_M = 2800.0
 
 @pytest.fixture(scope="module")
 def looked_up():
-    """Tables that come with diffuse light, and all light of the day, for an observer at `HEIGHT_M`."""
+    """Tables that come with diffuse light, and all light of the day and of the moon, for an observer at `HEIGHT_M`."""
     tables = tables_of()
 
     def looked_up_in(tabulate):
@@ -50,7 +53,12 @@ def looked_up():
 
         return table_of
 
-    return replace(tables, diffuse_of=looked_up_in(diffuse_by_elevation), day_of=looked_up_in(day_by_elevation))
+    return replace(
+        tables,
+        diffuse_of=looked_up_in(diffuse_by_elevation),
+        day_of=looked_up_in(day_by_elevation),
+        moon_of=looked_up_in(moon_by_elevation),
+    )
 
 
 def worst(table_light: np.ndarray, exact_light: np.ndarray) -> float:
@@ -123,6 +131,30 @@ def test_a_sun_deep_below_the_horizon_lights_no_air(looked_up):
     )
     assert dark.sky_radiance.max() == 0.0 < dim.sky_radiance.max()
     np.testing.assert_array_equal(dark.aerial_perspective(5e3, direction_from_angles(0.0, 1.0))[1], 0.0)
+
+
+@pytest.mark.parametrize("moon_deg", [0.4, 2.3, 31.0])
+def test_a_moonlit_film_s_sky_is_the_picture_s(looked_up, moon_deg, monkeypatch):
+    """Each channel of sky and airlight within 0.3 % of the brightest, at two phases, without integrals along rays."""
+    rng = np.random.default_rng(int(10 * moon_deg))
+    direction = rng.normal(size=(2000, 3)) * [1.0, 1.0, 0.4]
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    depth_m = 10.0 ** rng.uniform(1.0, 5.3, 2000)
+    sun = direction_from_angles(rng.uniform(0.0, 360.0), -40.0)
+    for phase_deg in (3.0, 95.0):
+        seen = LunarPosition(rng.uniform(0.0, 360.0), moon_deg, moon_deg, 385_000.0, 1.0, phase_deg, 0.5, True)
+        moon = LuminarySource(seen.direction, moon_to_sun_ratio(seen, WAVELENGTHS_NM), 0.26)
+        exact = illumination_from_atmosphere(tables_of(), sun, HEIGHT_M, moon=moon, shape=(32, 64))
+        with monkeypatch.context() as patched:
+            patched.setattr(observer_radiance, "radiance_components", None)
+            quick = illumination_from_atmosphere(looked_up, sun, HEIGHT_M, moon=moon, shape=(32, 64))
+        pairs = [(quick.sky_radiance, exact.sky_radiance)]
+        pairs += [
+            (quick.aerial_perspective(depth, direction)[1], exact.aerial_perspective(depth, direction)[1])
+            for depth in (depth_m, np.full(2000, np.inf))
+        ]
+        for found, expected in pairs:
+            assert 0.0 < (np.abs(found - expected) / expected.max(axis=-1, keepdims=True)).max() < 3e-3
 
 
 def test_the_moon_s_colour_is_kept(looked_up):
@@ -279,7 +311,7 @@ def test_light_for_a_film_takes_its_tables_from_the_workspace(tmp_path, looked_u
 
     assert atmosphere_from_model(read_sky_model("clear")) == tables_of().atmosphere
     monkeypatch.setattr(illumination_module, "atmosphere_tables", lambda _: tables_of())
-    for kind in ("diffuse", "day"):
+    for kind in ("diffuse", "day", "moon"):
         build = builder_of(getattr(looked_up, f"{kind}_of"), by_day if kind == "day" else asked)
         monkeypatch.setattr(illumination_module, f"{kind}_by_elevation", build)
     place = load_place(places.write_place(tmp_path), Workspace(tmp_path / "work"))

@@ -1,6 +1,8 @@
 """Artefacts are rebuilt after an edit of the code that makes them, and kept after an edit of anything else."""
 
+import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -49,6 +51,52 @@ def test_an_edit_of_the_mesher_rebuilds_the_terrain(copied):
     console = copied / "seasonscapes" / "commands" / "console.py"
     console.write_text(console.read_text() + "\n_ANOTHER_CONSTANT = 3\n")
     assert len(terrains(copied)) == 2
+
+
+HASH = "from seasonscapes.source_hash import source_hash; print(source_hash('terrain.mesh', 'sky.models'))"
+
+
+def hash_of(copied: Path, **more: str) -> str:
+    """The hash of two modules by a new process of the copied package."""
+    environment = os.environ | {"PYTHONPATH": str(copied)} | more
+    if not more:
+        environment.pop("PYTHONDONTWRITEBYTECODE", None)
+    environment.pop("PYTHONPYCACHEPREFIX", None)
+    done = subprocess.run(
+        [sys.executable, "-c", HASH], cwd=copied, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout.strip()
+
+
+def test_what_is_kept_of_modules_is_that_of_their_files(copied):
+    """Kept facts are used, and only as long as file, program and the file of facts itself are what they were."""
+    package = copied / "seasonscapes"
+    first = hash_of(copied, PYTHONDONTWRITEBYTECODE="1")
+    assert list(package.glob("__pycache__/source_hash*.json")) == [], (
+        "as compiled modules, nothing is kept against the user's will"
+    )
+    assert hash_of(copied) == first
+    (kept,) = package.glob("__pycache__/source_hash*.json")
+    assert list(package.glob("__pycache__/source_hash*.part")) == []
+    facts = json.loads(kept.read_text())
+    facts["modules"]["terrain.mesh"][1] = "0" * 64
+    kept.write_text(json.dumps(facts))
+    assert hash_of(copied) != first, "kept facts are used"
+    (package / "terrain" / "a_new_module.py").write_text("")
+    assert hash_of(copied) == first, "imports depend on which modules there are"
+    kept.write_text(kept.read_text()[:-40])
+    assert hash_of(copied) == first
+    # A change that leaves the size as it was, and sets the old time again.
+    mesher = package / "terrain" / "mesh.py"
+    about, source = mesher.stat(), mesher.read_text()
+    number = re.search(r"= (\d)", source)
+    mesher.write_text(source[: number.start(1)] + str(9 - int(number[1])) + source[number.end(1) :])
+    os.utime(mesher, ns=(about.st_atime_ns, about.st_mtime_ns))
+    assert mesher.stat().st_size == about.st_size
+    assert hash_of(copied) != first
+    mesher.write_text(source)
+    assert hash_of(copied) == first
 
 
 def test_imports_inside_functions_count():

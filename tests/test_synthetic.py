@@ -13,6 +13,7 @@ from seasonscapes.terrain.synthetic import (
     SEASONS,
     Cover,
     alpine_albedo,
+    alpine_albedos,
     alpine_massif,
     load_massif,
     save_massif,
@@ -226,6 +227,14 @@ def test_strips_leave_no_seam(small, monkeypatch):
     whole = alpine_albedo(small, 130, upsample=2)
     monkeypatch.setattr(synthetic_albedo, "_STRIP_ROWS", 37)
     assert alpine_albedo(small, 130, upsample=2) == pytest.approx(whole, abs=2e-3)
+
+
+def test_days_made_together_are_those_made_alone(small):
+    days = (20.0, 160.0, 290.0)
+    together = alpine_albedos(small, days, upsample=2)
+    for number, day in enumerate(days):
+        alone = alpine_albedo(small, day, upsample=2)
+        assert together[..., 3 * number : 3 * number + 3].tobytes() == alone.tobytes()
 
 
 def test_save_and_load(place, tmp_path):

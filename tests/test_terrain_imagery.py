@@ -1,5 +1,7 @@
 """Imagery in the atlas: registered to a fraction of a texel, free of aliasing, and silent where there is no image."""
 
+from dataclasses import replace
+
 import numpy as np
 import pyproj
 import pytest
@@ -120,6 +122,21 @@ def test_anisotropic_footprints_keep_what_the_short_side_can_see():
     averaged = bake_imagery(terrain, tall, along).values[inner][..., 0]
     assert averaged.std() < 0.08
     assert abs(averaged.mean() - 0.5) < 0.02
+
+
+def test_channels_baked_together_are_those_baked_alone(terrain):
+    rng = np.random.default_rng(3)
+    image = utm_board(20.0, lambda latitude, longitude: np.full_like(latitude, 0.7))
+    height, width = image.values.shape[:2]
+    six = replace(image, values=rng.random((height, width, 6), np.float32))
+    six.values[:, :140] = np.nan
+    terrain, atlas = unwrap(terrain, texel_m=30.0)
+    together = bake_imagery(terrain, atlas, six)
+    for channels in (np.s_[..., :3], np.s_[..., 3:]):
+        alone = bake_imagery(terrain, atlas, replace(six, values=six.values[channels]))
+        assert together.values[channels].tobytes() == alone.values.tobytes()
+        assert together.weight.tobytes() == alone.weight.tobytes()
+    assert together.values.std() > 0.1
 
 
 def test_weight_is_zero_where_there_is_no_image_and_colour_is_not_diluted(terrain):

@@ -12,9 +12,9 @@ from seasonscapes.rendering.backend import use_backend
 from seasonscapes.rendering.coefficients import SamplingOptions
 from seasonscapes.rendering.coefficients_file import load_coefficients, save_coefficients
 from seasonscapes.rendering.hemisphere_rays import ray_scene
-from seasonscapes.rendering.mirror_samples import morton_order
 from seasonscapes.rendering.mirrored_light import WaveBlur
 from seasonscapes.rendering.mitsuba_scene import mi_mesh, relight, set_albedo
+from seasonscapes.rendering.morton import morton_order
 from seasonscapes.rendering.radiance import path_trace
 from seasonscapes.rendering.relit_view import (
     cluster_albedo,

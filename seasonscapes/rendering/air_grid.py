@@ -8,6 +8,7 @@ interpolated bilinearly, but at every pixel around sun and moon.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -137,6 +138,11 @@ def interpolate_air(grid: AirGrid, air: AerialPerspective) -> tuple[np.ndarray, 
     airlight
         ``(n, 3)`` radiance scattered into the view ray [cd/m²].
     """
+    return start_air(grid, air)()
+
+
+def start_air(grid: AirGrid, air: AerialPerspective) -> Callable[[], tuple[np.ndarray, np.ndarray]]:
+    """Start `interpolate_air`, and return the function that gives its result: other threads interpolate meanwhile."""
     import drjit as dr
     import mitsuba as mi
 
@@ -148,15 +154,21 @@ def interpolate_air(grid: AirGrid, air: AerialPerspective) -> tuple[np.ndarray, 
         mi.TensorXf(aligned(nodes)), wrap_mode=dr.WrapMode.Clamp
     )
     channels = texture.eval(grid.mi_coordinate)
+    of_samples = texture.eval(grid.mi_sample_coordinate) if len(grid.mixed) else []
     # Together: all are read at once.
     dr.eval(channels)
-    # Apart, since what is computed with either takes several times as long with both side by side.
-    transmittance, airlight = (to_numpy(mi.Vector3f(*channels[k : k + 3])) for k in (0, 3))
-    if len(grid.mixed):
-        samples = to_numpy(texture.eval(grid.mi_sample_coordinate)).reshape(*grid.sample_weight.shape, 6)
-        mean = np.einsum("ks,ksc->kc", grid.sample_weight, samples)
-        transmittance[grid.mixed], airlight[grid.mixed] = mean[:, :3], mean[:, 3:]
-    return transmittance, airlight
+    dr.eval(of_samples)
+
+    def read() -> tuple[np.ndarray, np.ndarray]:
+        # Apart, since what is computed with either takes several times as long with both side by side.
+        transmittance, airlight = (to_numpy(mi.Vector3f(*channels[k : k + 3])) for k in (0, 3))
+        if len(grid.mixed):
+            samples = np.stack([np.array(channel) for channel in of_samples], axis=-1)
+            mean = np.einsum("ks,ksc->kc", grid.sample_weight, samples.reshape(*grid.sample_weight.shape, 6))
+            transmittance[grid.mixed], airlight[grid.mixed] = mean[:, :3], mean[:, 3:]
+        return transmittance, airlight
+
+    return read
 
 
 @dataclass(frozen=True)

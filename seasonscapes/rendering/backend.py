@@ -274,7 +274,8 @@ def to_numpy(values: Any) -> np.ndarray:
     # Component by component: Dr.Jit would compile a kernel that joins them for each number of lanes.
     components = list(values)
     dr.eval(components)
-    return np.stack(np.broadcast_arrays(*map(np.array, components)), axis=-1)
+    # As they lie in Dr.Jit's memory: joining them is the only copy.
+    return np.stack(np.broadcast_arrays(*map(np.asarray, components)), axis=-1)
 
 
 def aligned(values: np.ndarray, dtype: Any = np.float32) -> np.ndarray:

@@ -16,6 +16,7 @@ import numpy as np
 
 from seasonscapes.rendering.backend import aligned, point3
 from seasonscapes.rendering.hemisphere_rays import ABSORBED, ESCAPED, LANES, RayScene, SurfacePoints, diffuse_points
+from seasonscapes.rendering.morton import ground_order
 from seasonscapes.rendering.sky_patches import SkyPatches, patch_sums
 from seasonscapes.rendering.sobol import hash_to_unit, hashed, uniform
 from seasonscapes.rendering.terrain_material import device_surface
@@ -151,19 +152,21 @@ def trace_horizons(
     hit = np.empty((count, azimuths * land_rays), np.int32)
     ray_weight = np.empty(hit.shape, np.float32)
     step = max(1, LANES // azimuths)
+    # Neighbours on the ground one after the other: their rays visit the same nodes of the tree, and one's horizon tells the next one's.
+    order = ground_order(points.origin[:, 0])
     for start in range(0, count, step):
-        part = slice(start, start + step)
+        part = order[start : start + step]
         chosen = _drawn(weight[part], azimuths, key[part])
         # All receivers at one azimuth after those at another: neighbouring rays are almost parallel.
-        index = (np.arange(len(chosen)) * samples + chosen.T).ravel()
-        origin, normal = (np.take(each[part].reshape(-1, 3), index, axis=0) for each in (points.origin, points.normal))
+        index = (part * samples + chosen.T).ravel()
+        origin, normal = (np.take(each.reshape(-1, 3), index, axis=0) for each in (points.origin, points.normal))
         lanes = _HorizonLanes(origin, normal, azimuths, turn[part], key[part])
         horizon, bound = lanes.horizon(terrain)
         measure = lanes.land(bound)
         rows = lanes.by_receiver([lanes.azimuth, horizon, lanes.along, lanes.upward, measure])
         sums[part] = _integrals(table, azimuths, *(values.ravel() for values in rows[:4]))
         lane, number = _divided(rows[4], hit.shape[1], hash_to_unit(key[part], _LAND))
-        hit[part][lane % len(chosen), number] = lanes.clusters(terrain, bound, measure, lane, number, mi_face_cluster)
+        hit[part[lane % len(chosen)], number] = lanes.clusters(terrain, bound, measure, lane, number, mi_face_cluster)
         ray_weight[part] = rows[4].mean(axis=1, keepdims=True)
     ray_weight /= np.float32(land_rays)
     scale = weight.sum(axis=1, keepdims=True) * np.float32(2.0 / azimuths)

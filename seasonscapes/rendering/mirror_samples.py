@@ -133,23 +133,6 @@ def mirror_samples(
     return MirrorSamples(pixel, on_water, shares, directions, repeated, hit)
 
 
-def morton_order(column: np.ndarray, row: np.ndarray) -> np.ndarray:
-    """Number ``(n,)`` int64 of pixels along a Morton curve, which goes through aligned squares one after the other."""
-
-    def spread(bits: np.ndarray) -> np.ndarray:
-        bits = np.asarray(bits, np.int64)
-        for shift, mask in (
-            (16, 0x0000FFFF0000FFFF),
-            (8, 0x00FF00FF00FF00FF),
-            (4, 0x0F0F0F0F0F0F0F0F),
-            (2, 0x3333333333333333),
-        ):
-            bits = (bits | bits << shift) & mask
-        return (bits | bits << 1) & 0x5555555555555555
-
-    return spread(column) | spread(row) << 1
-
-
 def mirror_weights(samples: MirrorSamples) -> np.ndarray:
     """Weight of each sample in the light that its pixel mirrors from ground: ``(m, S)``, sum 1, or 0 without ground."""
     luminous = samples.reflectance * (samples.points.albedo @ REC709_LUMINANCE.astype(np.float32))

@@ -96,12 +96,12 @@ def mi_mesh(terrain: Terrain, albedo: np.ndarray, *, smooth: bool = True) -> Any
     parameters["vertex_positions"] = aligned(terrain.vertices).ravel()
     parameters["faces"] = aligned(terrain.faces, np.uint32).ravel()
     parameters["vertex_texcoords"] = aligned(uv).ravel()
-    parameters.update()
     if smooth:
-        # Mitsuba sums vertex normals in parallel; their last bits, and those of images, would vary between runs.
+        # Mitsuba sums vertex normals in parallel; their last bits, and those of images, would vary between runs. Those that are
+        # set together with the positions it leaves as they are.
         normals = vertex_normals(terrain) if terrain.normals is None else terrain.normals
         parameters["vertex_normals"] = aligned(normals).ravel()
-        parameters.update()
+    parameters.update()
     return mesh
 
 

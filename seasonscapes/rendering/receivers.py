@@ -6,6 +6,7 @@ clusters that the receiver's rays hit. Computed on the Dr.Jit device.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +17,7 @@ from seasonscapes.rendering.hemisphere_rays import RayScene
 from seasonscapes.rendering.light_clusters import LightClusters, ReceiverCoefficients
 from seasonscapes.rendering.sky_patches import patch_radiance, sky_patches
 from seasonscapes.rendering.smoothing import DeviceNeighbours, Neighbours, mi_smoothed, upload_neighbours
-from seasonscapes.rendering.sun_visibility import SunRays, hashed_disc_offset, sun_rays, visible_cosine
+from seasonscapes.rendering.sun_visibility import SunRays, hashed_disc_offset, start_visible_cosine, sun_rays
 from seasonscapes.sky.illumination import Illumination, Luminary, luminance
 
 # A moon (or setting sun) whose illuminance is less than this fraction of the sky's casts no visible shadow.
@@ -162,10 +163,18 @@ def incident_light(device: DeviceReceivers, light: ClusterLight) -> tuple[np.nda
 
 def total_incident_light(device: DeviceReceivers, light: ClusterLight) -> np.ndarray:
     """Both parts of `incident_light` together, ``(N, 3)`` float32: they are added before they leave the device."""
+    return start_incident_light(device, light)()
+
+
+def start_incident_light(device: DeviceReceivers, light: ClusterLight) -> Callable[[], np.ndarray]:
+    """Start `total_incident_light`, and return the function that gives its result: other threads compute it meanwhile."""
+    import drjit as dr
     import mitsuba as mi
 
     sky, reflected = _sky_irradiance(device, light.mi_sky), _reflected_irradiance(device, light.mi_cluster_radiance)
-    return to_numpy(mi.Vector3f(*(first + second for first, second in zip(sky, reflected, strict=True))))
+    total = mi.Vector3f(*(first + second for first, second in zip(sky, reflected, strict=True)))
+    dr.eval(total)
+    return lambda: to_numpy(total)
 
 
 def _sky_irradiance(device: DeviceReceivers, mi_sky: Any) -> list[Any]:
@@ -234,6 +243,34 @@ def light_clusters(device: DeviceClusters, illumination: Illumination) -> Cluste
     ClusterLight
         Sky in the directional basis and radiance of the clusters, for `incident_light`.
     """
+    return start_clusters(device, illumination, luminaries(illumination))()
+
+
+def start_clusters(
+    device: DeviceClusters, illumination: Illumination, bodies: Sequence[Luminary]
+) -> Callable[[], ClusterLight]:
+    """Start the shadow rays of `light_clusters` to its `luminaries`, and return the function that gives its result.
+
+    Other threads trace while the caller computes something else.
+    """
+    # The points of a cluster lie on faces here and there.
+    begun = [
+        (body, start_visible_cosine(device.rays, body, coherent=False)) for body in bodies if device.clusters.bounces
+    ]
+
+    def sunlit() -> np.ndarray:
+        albedo = device.clusters.points.albedo
+        total = np.zeros((len(albedo), 3), np.float32)
+        for body, cosine in begun:
+            mean = (cosine()[..., None] * albedo).mean(axis=1)
+            total += mean * (np.asarray(body.normal_illuminance_lx, np.float32) / np.pi)
+        return total
+
+    return lambda: _exchanged(device, illumination, sunlit)
+
+
+def _exchanged(device: DeviceClusters, illumination: Illumination, sunlit: Callable[[], np.ndarray]) -> ClusterLight:
+    """`light_clusters` by what the clusters reflect of sun and moon, ``(M, 3)``."""
     import drjit as dr
     import mitsuba as mi
 
@@ -243,12 +280,8 @@ def light_clusters(device: DeviceClusters, illumination: Illumination) -> Cluste
     if clusters.bounces == 0:
         return ClusterLight(mi_sky, mi.Float(aligned(np.zeros(4))))
     albedo = clusters.points.albedo
-    sunlit = np.zeros((len(albedo), 3), np.float32)
-    for body in luminaries(illumination):
-        cosine = visible_cosine(device.rays, body)[..., None]
-        sunlit += (cosine * albedo).mean(axis=1) * (np.asarray(body.normal_illuminance_lx, np.float32) / np.pi)
     mean_albedo = [mi.Float(aligned(column)) for column in albedo.mean(axis=1).T]
-    from_sun = [mi.Float(aligned(column)) for column in sunlit.T]
+    from_sun = [mi.Float(aligned(column)) for column in sunlit().T]
     first_bounce = [
         sun + reflectance * incident
         for sun, reflectance, incident in zip(

@@ -5,13 +5,14 @@ Equals path tracing in expectation; per illumination it costs some shadow rays a
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from seasonscapes.images import scaled_pixels
-from seasonscapes.rendering.air_grid import AirGrid, SkyGrid, air_grid, interpolate_air, sky_grid, sky_pixel_radiance
+from seasonscapes.rendering.air_grid import AirGrid, SkyGrid, air_grid, sky_grid, sky_pixel_radiance, start_air
 from seasonscapes.rendering.coefficients import ViewCoefficients
 from seasonscapes.rendering.gbuffer import GBuffer, trace_gbuffer
 from seasonscapes.rendering.ground_optics import GroundOptics
@@ -20,20 +21,21 @@ from seasonscapes.rendering.mirrored_light import DeviceMirror, mirrored_radianc
 from seasonscapes.rendering.mitsuba_scene import RenderScene
 from seasonscapes.rendering.radiance import RenderedView
 from seasonscapes.rendering.receivers import (
+    ClusterLight,
     DeviceClusters,
     DeviceReceivers,
-    light_clusters,
     luminaries,
-    total_incident_light,
+    start_clusters,
+    start_incident_light,
     upload_clusters,
     upload_receivers,
 )
 from seasonscapes.rendering.sun_visibility import (
     SunRays,
     bayer_disc_offset,
-    first_sample_visible,
-    sum_facing,
-    sum_incidence,
+    start_first_samples,
+    start_sum_facing,
+    start_sum_incidence,
     sun_rays,
 )
 from seasonscapes.rendering.terrain_material import ground_optics
@@ -254,9 +256,17 @@ def relight_view(view: RelightableView, illumination: Illumination) -> RenderedV
     RenderedView
         Radiance at the camera, radiance of the surface, coverage and G-buffer.
     """
-    pixel_radiance = relit_surface_radiance(view, illumination)
-    surface = terrain_image(view, pixel_radiance)
-    return RenderedView(_at_camera(view, illumination, pixel_radiance), surface, view.coverage, view.gbuffer)
+    # Rays are traced by other threads while air and sky are evaluated here.
+    surface_radiance = _start_surface_radiance(view, illumination)
+    air = illumination.aerial_perspective
+    read_air = None if air is None else start_air(view.air, air)
+    sky = None
+    if len(view.sky.pixel):
+        pixel_angle_deg = float(np.degrees(1.0 / view.coefficients.camera.fx))
+        sky = sky_pixel_radiance(view.sky, illumination, pixel_angle_deg)
+    pixel_radiance = surface_radiance()
+    image = _at_camera(view, pixel_radiance, None if read_air is None else read_air(), sky)
+    return RenderedView(image, terrain_image(view, pixel_radiance), view.coverage, view.gbuffer)
 
 
 def terrain_image(view: RelightableView, values: np.ndarray) -> np.ndarray:
@@ -291,14 +301,34 @@ def relit_surface_radiance(view: RelightableView, illumination: Illumination) ->
     numpy.ndarray
         ``(n, 3)`` float32 [cd/m²], averaged over the pixel with the sky counted as black.
     """
-    clusters = light_clusters(view.clusters, illumination)
-    total = total_incident_light(view.receivers, clusters)
+    return _start_surface_radiance(view, illumination)()
+
+
+def _start_surface_radiance(view: RelightableView, illumination: Illumination) -> Callable[[], np.ndarray]:
+    """Start the shadow rays of `relit_surface_radiance`, and return the function that gives its result."""
+    bodies = luminaries(illumination)
+    clusters = start_clusters(view.clusters, illumination, bodies)
+    sunlight = [(body, _SunCosine(view, body)) for body in bodies]
+    return lambda: _lit_surface(view, illumination, clusters(), sunlight)
+
+
+def _lit_surface(
+    view: RelightableView,
+    illumination: Illumination,
+    clusters: ClusterLight,
+    sunlight: list[tuple[Luminary, _SunCosine]],
+) -> np.ndarray:
+    """`relit_surface_radiance` by the light of its clusters and the begun cosines of sun and moon."""
+    incident = start_incident_light(view.receivers, clusters)
+    for _, cosine in sunlight:
+        cosine.trace_borders()
+    total = incident()
     ground = None if view.optics is None else _GroundPixels(view, view.optics)
     if ground is not None:
         total *= ground.of_diffuse_light()
-    for body in luminaries(illumination):
+    for body, begun in sunlight:
         light = np.asarray(body.normal_illuminance_lx, np.float32) / np.float32(np.pi)
-        cosine = sun_cosine(view, body)
+        cosine = begun.read()
         lit = np.stack([cosine * channel for channel in light], axis=-1)
         total += lit if ground is None else lit * ground.of_luminary(body, cosine)
     radiance = total * view.coefficients.albedo
@@ -349,20 +379,40 @@ def sun_cosine(view: RelightableView, luminary: Luminary) -> np.ndarray:
     numpy.ndarray
         ``(n,)``.
     """
-    cosine = np.maximum(view.coefficients.normal @ np.asarray(luminary.direction, np.float32), 0.0)
-    visible = first_sample_visible(view.rays, luminary)
-    traced = _differs_nearby(view, visible) | view.silhouette
-    result = np.where(visible, cosine, 0.0)
-    # The light reaches all nine pixels around: what matters on slopes that it grazes is which samples face it.
-    grazed = np.flatnonzero(visible & (cosine < _GRAZING) & ~traced)
-    result[grazed] = sum_facing(view.rays, luminary, grazed)
-    mixed = np.flatnonzero(traced)
-    sunlit, unoccluded = sum_incidence(view.rays, luminary, mixed)
-    # The mean normal averages many more samples than the shadow rays: these only determine the sunlit fraction.
-    reliable = (cosine[mixed] > _GRAZING) & (unoccluded > _GRAZING)
-    ratio = np.where(reliable, cosine[mixed] / np.where(reliable, unoccluded, 1.0), 1.0)
-    result[mixed] = sunlit * np.clip(ratio, 0.5, 2.0)
-    return result
+    begun = _SunCosine(view, luminary)
+    begun.trace_borders()
+    return begun.read()
+
+
+class _SunCosine:
+    """`sun_cosine` in steps, each of which starts rays that other threads trace until the next one reads them."""
+
+    def __init__(self, view: RelightableView, luminary: Luminary) -> None:
+        self._view, self._luminary = view, luminary
+        self._first = start_first_samples(view.rays, luminary)
+        self._cosine = np.maximum(view.coefficients.normal @ np.asarray(luminary.direction, np.float32), 0.0)
+
+    def trace_borders(self) -> None:
+        view, luminary = self._view, self._luminary
+        visible = self._first()
+        traced = _differs_nearby(view, visible) | view.silhouette
+        self._mixed = np.flatnonzero(traced)
+        self._of_mixed = start_sum_incidence(view.rays, luminary, self._mixed)
+        # The light reaches all nine pixels around: what matters on slopes that it grazes is which samples face it.
+        self._grazed = np.flatnonzero(visible & (self._cosine < _GRAZING) & ~traced)
+        self._of_grazed = start_sum_facing(view.rays, luminary, self._grazed)
+        self._visible = visible
+
+    def read(self) -> np.ndarray:
+        cosine, mixed = self._cosine, self._mixed
+        result = np.where(self._visible, cosine, 0.0)
+        sunlit, unoccluded = self._of_mixed()
+        result[self._grazed] = self._of_grazed()
+        # The mean normal averages many more samples than the shadow rays: these only determine the sunlit fraction.
+        reliable = (cosine[mixed] > _GRAZING) & (unoccluded > _GRAZING)
+        ratio = np.where(reliable, cosine[mixed] / np.where(reliable, unoccluded, 1.0), 1.0)
+        result[mixed] = sunlit * np.clip(ratio, 0.5, 2.0)
+        return result
 
 
 def _differs_nearby(view: RelightableView, visible: np.ndarray) -> np.ndarray:
@@ -376,16 +426,16 @@ def _differs_nearby(view: RelightableView, visible: np.ndarray) -> np.ndarray:
     return (brightest != darkest).reshape(-1)[pixel]
 
 
-def _at_camera(view: RelightableView, illumination: Illumination, surface: np.ndarray) -> np.ndarray:
-    """Radiance ``(H, W, 3)`` at the camera, from the air grid; see `radiance.apply_aerial_perspective`."""
-    camera = view.coefficients.camera
-    if illumination.aerial_perspective is not None:
-        transmittance, airlight = interpolate_air(view.air, illumination.aerial_perspective)
+def _at_camera(
+    view: RelightableView, surface: np.ndarray, air: tuple[np.ndarray, np.ndarray] | None, sky: np.ndarray | None
+) -> np.ndarray:
+    """Radiance ``(H, W, 3)`` at the camera from that of surface, air and sky; see `radiance.apply_aerial_perspective`."""
+    if air is not None:
+        transmittance, airlight = air
         surface = surface * transmittance
         surface += scaled_pixels(airlight, view.coefficients.coverage)
     image = terrain_image(view, surface)
-    if len(view.sky.pixel):
-        sky = sky_pixel_radiance(view.sky, illumination, float(np.degrees(1.0 / camera.fx)))
+    if sky is not None:
         share = 1.0 - view.coverage.reshape(-1)[view.sky.pixel]
         image.reshape(-1, 3)[view.sky.pixel] += scaled_pixels(sky, share)
     return image

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -221,18 +222,27 @@ def first_sample_visible(rays: SunRays, luminary: Luminary) -> np.ndarray:
     numpy.ndarray
         ``(N,)`` bool: the sample faces the luminary, and its point of the disc is not occluded.
     """
+    return start_first_samples(rays, luminary)()
+
+
+def start_first_samples(rays: SunRays, luminary: Luminary) -> Callable[[], np.ndarray]:
+    """Start `first_sample_visible`, and return the function that gives its result.
+
+    Other threads trace while the caller computes something else; between kernels that are read one by one they would wait,
+    which takes the processor's time as much as work does.
+    """
     import drjit as dr
     import mitsuba as mi
 
-    result = np.empty(rays.receivers, bool)
+    parts = []
     disc = _mi_disc(luminary, rays.disc_points)
-    for start in range(0, len(result), LANES):
-        count = min(LANES, len(result) - start)
-        receiver = None if count == len(result) else dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, start)
+    for start in range(0, rays.receivers, LANES):
+        count = min(LANES, rays.receivers - start)
+        receiver = None if count == rays.receivers else dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, start)
         visible, _, _ = _visible(rays.first, disc, receiver, receiver)
         dr.eval(visible)
-        result[start : start + count] = np.array(visible)
-    return result
+        parts.append(visible)
+    return lambda: np.concatenate([np.empty(0, bool), *(np.array(part) for part in parts)])
 
 
 def sum_facing(rays: SunRays, luminary: Luminary, receiver: np.ndarray) -> np.ndarray:
@@ -248,7 +258,13 @@ def sum_facing(rays: SunRays, luminary: Luminary, receiver: np.ndarray) -> np.nd
     numpy.ndarray
         ``(K,)`` float32 weighted sums of the cosine: `sum_incidence` where nothing occludes the luminary.
     """
-    return _sums(rays, luminary, receiver, traced=False)[0]
+    return start_sum_facing(rays, luminary, receiver)()
+
+
+def start_sum_facing(rays: SunRays, luminary: Luminary, receiver: np.ndarray) -> Callable[[], np.ndarray]:
+    """Start `sum_facing`, and return the function that gives its result; see `start_first_samples`."""
+    read = _start_sums(rays, luminary, receiver, traced=False)
+    return lambda: read()[0]
 
 
 def sum_incidence(rays: SunRays, luminary: Luminary, receiver: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -270,16 +286,28 @@ def sum_incidence(rays: SunRays, luminary: Luminary, receiver: np.ndarray) -> tu
     unoccluded
         ``(K,)`` float32 weighted sums of the cosine.
     """
-    visible, unoccluded = _sums(rays, luminary, receiver, traced=True)
-    return visible, unoccluded
+    return start_sum_incidence(rays, luminary, receiver)()
 
 
-def _sums(rays: SunRays, luminary: Luminary, receiver: np.ndarray, *, traced: bool) -> np.ndarray:
-    """What `sum_incidence` returns, ``(2, K)``; without shadow rays what `sum_facing` returns, ``(1, K)``."""
+def start_sum_incidence(
+    rays: SunRays, luminary: Luminary, receiver: np.ndarray
+) -> Callable[[], tuple[np.ndarray, np.ndarray]]:
+    """Start `sum_incidence`, and return the function that gives its result; see `start_first_samples`."""
+    read = _start_sums(rays, luminary, receiver, traced=True)
+
+    def visible_and_unoccluded() -> tuple[np.ndarray, np.ndarray]:
+        visible, unoccluded = read()
+        return visible, unoccluded
+
+    return visible_and_unoccluded
+
+
+def _start_sums(rays: SunRays, luminary: Luminary, receiver: np.ndarray, *, traced: bool) -> Callable[[], np.ndarray]:
+    """Reader of what `sum_incidence` returns, ``(2, K)``; without shadow rays of what `sum_facing` returns, ``(1, K)``."""
     import drjit as dr
     import mitsuba as mi
 
-    sums = np.empty((1 + traced, len(receiver)), np.float32)
+    parts = []
     disc = _mi_disc(luminary, rays.disc_points)
     step = max(1, LANES // rays.samples)
     for start in range(0, len(receiver), step):
@@ -297,8 +325,9 @@ def _sums(rays: SunRays, luminary: Luminary, receiver: np.ndarray, *, traced: bo
         dr.eval(lanes)
         blocks = [dr.block_sum(values, rays.samples) for values in lanes]
         dr.eval(blocks)
-        sums[:, start : start + dr.width(chosen)] = [np.array(values) for values in blocks]
-    return sums
+        parts.append(blocks)
+    nothing = np.empty((1 + traced, 0), np.float32)
+    return lambda: np.concatenate([nothing, *([np.array(values) for values in blocks] for blocks in parts)], axis=1)
 
 
 def visible_cosine(rays: SunRays, luminary: Luminary, *, rays_per_sample: int = 1) -> np.ndarray:
@@ -318,28 +347,51 @@ def visible_cosine(rays: SunRays, luminary: Luminary, *, rays_per_sample: int = 
     numpy.ndarray
         ``(N, S)`` float32, zero where the luminary is not visible.
     """
+    return _read_cosines(rays, _cosines(rays, luminary, rays_per_sample))
+
+
+def start_visible_cosine(rays: SunRays, luminary: Luminary, *, coherent: bool = True) -> Callable[[], np.ndarray]:
+    """Start `visible_cosine`, and return the function that gives its result; see `start_first_samples`.
+
+    ``coherent``: the samples of a receiver lie so close together that tracing them in packets pays.
+    """
+    parts = list(_cosines(rays, luminary, 1, coherent=coherent))
+    return lambda: _read_cosines(rays, parts)
+
+
+def _read_cosines(rays: SunRays, parts: Iterable[Any]) -> np.ndarray:
+    """Join what `_cosines` gives: ``(N, S)``."""
+    result, start = np.empty(rays.receivers * rays.samples, np.float32), 0
+    for part in parts:
+        values = np.array(part)
+        result[start : start + len(values)] = values
+        start += len(values)
+    return result.reshape(-1, rays.samples)
+
+
+def _cosines(rays: SunRays, luminary: Luminary, rays_per_sample: int, *, coherent: bool = True) -> Iterator[Any]:
+    """What `visible_cosine` computes, launched part by part: ``mi.Float`` of some successive samples."""
     import drjit as dr
     import mitsuba as mi
 
     disc = _mi_disc(luminary, rays.disc_points * rays_per_sample)
-    result = np.empty(rays.receivers * rays.samples, np.float32)
+    total = rays.receivers * rays.samples
     # A receiver's points of the disc are counted from its first sample on.
     step = max(1, LANES // (rays.samples * rays_per_sample)) * rays.samples
-    for start in range(0, len(result), step):
-        count = min(step, len(result) - start)
+    for start in range(0, total, step):
+        count = min(step, total - start)
         lane, ray = _quotient_and_remainder(dr.arange(mi.UInt32, count * rays_per_sample), rays_per_sample)
         receiver, sample = _quotient_and_remainder(lane, rays.samples)
-        whole = rays_per_sample == 1 and count == len(result)
+        whole = rays_per_sample == 1 and count == total
         lane = None if whole else lane + dr.opaque(mi.UInt32, start)
         receiver += dr.opaque(mi.UInt32, start // rays.samples)
         disc_point = sample + ray * dr.opaque(mi.UInt32, rays.samples)
-        visible, cosine, _ = _visible(rays, disc, lane, receiver, disc_point, coherent=True)
+        visible, cosine, _ = _visible(rays, disc, lane, receiver, disc_point, coherent=coherent)
         lanes = dr.select(visible, cosine, 0.0)
         dr.eval(lanes)
         if rays_per_sample > 1:
             lanes = dr.block_sum(lanes, rays_per_sample) / dr.opaque(mi.Float, rays_per_sample)
-        result[start : start + count] = np.array(lanes)
-    return result.reshape(-1, rays.samples)
+        yield lanes
 
 
 def _mi_disc(luminary: Luminary, points: int) -> _Disc:

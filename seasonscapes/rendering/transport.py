@@ -45,9 +45,9 @@ from seasonscapes.rendering.mirror_samples import (
     mirror_coefficients,
     mirror_samples,
     mirror_weights,
-    morton_order,
     water_samples,
 )
+from seasonscapes.rendering.morton import morton_order
 from seasonscapes.rendering.sky_patches import patch_sums, sky_patches
 from seasonscapes.rendering.smoothing import Neighbours, edge_aware_neighbours, smoothed
 from seasonscapes.rendering.sobol import hash_to_unit
@@ -72,8 +72,9 @@ _PILOTS = 1 << 18
 _LAND_RAYS = 1
 # Distinguishes the random numbers of what a pixel mirrors from its own.
 _MIRRORED = np.uint32(1 << 31)
-# Number of receivers, and rays of each, from which the directional basis is computed.
-_EXAMPLES, _EXAMPLE_RAYS = 4096, 512
+# Number of receivers, and rays of each, from which the directional basis is computed. Twice as many receivers leave 0.62 % of
+# the light of other receivers, these 0.64 %, half of the rays 0.69 % (root mean square over skies; `alpine`).
+_EXAMPLES, _EXAMPLE_RAYS = 2048, 512
 Progress = Callable[[float], None]
 
 

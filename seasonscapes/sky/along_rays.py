@@ -11,7 +11,7 @@ import numpy as np
 
 from seasonscapes.images import REC709_LUMINANCE
 from seasonscapes.sky.atmosphere import delta_scaled, optics
-from seasonscapes.sky.curved_rays import slant_columns_to_sun, sun_transfer
+from seasonscapes.sky.curved_rays import MANY_LIT, slant_columns_to_sun, sun_transfer
 from seasonscapes.sky.ray_cells import CellSamples, local_sun_sine, scattering_per_m
 from seasonscapes.sky.scattering import AtmosphereTables
 from seasonscapes.sky.sh_moments import HARMONIC_ORDER, diffuse_source, sun_geometry, sun_index
@@ -60,7 +60,12 @@ def radiance_components(
     scaled = delta_scaled(unscaled, HARMONIC_ORDER)
     sine = local_sun_sine(samples.central_angle_rad[..., None], sun_elevation_rad, np.cos(AZIMUTHS_RAD))
     column, visible = slant_columns_to_sun(atmosphere, tables.sun_columns, samples.height_m[..., None], np.arcsin(sine))
-    arriving = np.exp((column @ -scaled.extinction).astype(np.float32)) * visible[..., None].astype(np.float32)
+    # By night most of the air is in the Earth's shadow.
+    lit = visible > 0.0
+    arriving = np.zeros((*lit.shape, len(WAVELENGTHS_NM)), np.float32)
+    at_lit = ... if lit.mean() > MANY_LIT else lit
+    direct = np.exp((column[at_lit] @ -scaled.extinction).astype(np.float32))
+    arriving[at_lit] = direct * visible[at_lit][..., None].astype(np.float32)
     # TMS method: scattering with the unscaled coefficient, attenuation with the scaled one.
     gas, aerosol = scattering_per_m(atmosphere, unscaled, samples.height_m) * samples.weight
     # The mean aerosol column is weighted by the luminance scattered in each cell.

@@ -267,7 +267,7 @@ def illumination_from_atmosphere(
 
 
 def save_tables(path: str | PathLike[str], tables: AtmosphereTables) -> None:
-    """Write tables to one ``.npz`` file, atomically; ``diffuse_of`` and ``day_of`` are not stored.
+    """Write tables to one ``.npz`` file, atomically; ``diffuse_of``, ``day_of`` and ``moon_of`` are not stored.
 
     Parameters
     ----------
@@ -300,7 +300,7 @@ def load_tables(path: str | PathLike[str]) -> AtmosphereTables:
     Returns
     -------
     AtmosphereTables
-        Tables without ``diffuse_of`` and ``day_of``.
+        Tables without ``diffuse_of``, ``day_of`` and ``moon_of``.
 
     Raises
     ------

@@ -18,6 +18,8 @@ _NOT_IN_UNIT_COLUMNS = {
     *("aerosol_optical_depth_500nm", "angstrom_exponent", "single_scattering_albedo", "asymmetry"),
     *("ozone_du", "ground_albedo"),
 }
+# Share of points in sunlight above which those in shadow are not worth setting apart.
+MANY_LIT = 0.5
 
 
 @dataclass(frozen=True)
@@ -279,14 +281,37 @@ def slant_columns_to_sun(
     visible_fraction
         Fraction of the disc above the horizon of the ground, times the magnification by refraction ``(...)``.
     """
-    heights, elevations = columns.log_columns.shape[:2]
+    heights = columns.log_columns.shape[0]
     above = np.clip((np.asarray(height_m) - atmosphere.ground_height_m) / _thickness_m(atmosphere), 0.0, 1.0)
     row = np.cbrt(above) * (heights - 1)
     row0 = np.minimum(row.astype(np.int32), heights - 2)
     fr = row - row0
     lowest = columns.lowest_rad[row0] * (1.0 - fr) + columns.lowest_rad[row0 + 1] * fr
-    visible, centre = _disc_above(np.asarray(elevation_rad) - lowest, np.radians(radius_deg))
-    column = np.cbrt(np.clip(centre / (np.pi / 2 - lowest), 0.0, 1.0)) * (elevations - 1)
+    radius_rad, above_lowest = np.radians(radius_deg), np.asarray(elevation_rad) - lowest
+    lit = above_lowest > -radius_rad
+    if lit.mean() > MANY_LIT:
+        return _columns_above(columns, row0, fr, lowest, above_lowest, radius_rad)
+    # In the Earth's shadow the columns are those of the lowest ray at the height, whatever the azimuth is.
+    dark, _ = _columns_above(columns, row0, fr, lowest, np.full(row0.shape, -np.inf), radius_rad)
+    column = np.broadcast_to(dark, (*lit.shape, 3)).copy()
+    visible = np.zeros(lit.shape)
+    rows, fractions, lows = (np.broadcast_to(each, lit.shape)[lit] for each in (row0, fr, lowest))
+    column[lit], visible[lit] = _columns_above(columns, rows, fractions, lows, above_lowest[lit], radius_rad)
+    return column, visible
+
+
+def _columns_above(
+    columns: SunColumns,
+    row0: np.ndarray,
+    fr: np.ndarray,
+    lowest_rad: np.ndarray,
+    above_lowest_rad: np.ndarray,
+    radius_rad: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """`slant_columns_to_sun` by rows of the table of columns and the elevation above the lowest ray [rad]."""
+    elevations = columns.log_columns.shape[1]
+    visible, centre = _disc_above(above_lowest_rad, radius_rad)
+    column = np.cbrt(np.clip(centre / (np.pi / 2 - lowest_rad), 0.0, 1.0)) * (elevations - 1)
     column0 = np.minimum(column.astype(np.int32), elevations - 2)
     fc = (column - column0)[..., None]
     table, index = columns.log_columns.reshape(-1, 4), row0 * elevations + column0

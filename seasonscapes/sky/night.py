@@ -99,7 +99,12 @@ def moon_to_sun_ratio(moon: LunarPosition, wavelength_nm: ArrayLike) -> np.ndarr
     """
     wavelength = np.asarray(wavelength_nm, float)
     visual = 10.0 ** (-0.4 * (moon_magnitude(moon) - SUN_MAGNITUDE_V))
-    return visual * (1.0 + _MOON_SLOPE * (wavelength / 550.0 - 1.0)) * moonlight_fraction(moon, wavelength)
+    return visual * moonlight_spectrum(wavelength) * moonlight_fraction(moon, wavelength)
+
+
+def moonlight_spectrum(wavelength_nm: np.ndarray) -> np.ndarray:
+    """Spectral irradiance of the moon over that of the sun, relative to 550 nm: the same at all phases, ``(B,)``."""
+    return 1.0 + _MOON_SLOPE * (wavelength_nm / 550.0 - 1.0)
 
 
 def van_rhijn(elevation_deg: ArrayLike) -> np.ndarray:

@@ -19,6 +19,7 @@ from seasonscapes.sky.atmosphere import TOP_HEIGHT_M, Atmosphere, delta_scaled, 
 from seasonscapes.sky.aureole import spread_aerosol_phase
 from seasonscapes.sky.curved_rays import cell_edges_m, horizon_elevation_rad, resample_rays, trace_curved_rays
 from seasonscapes.sky.elevation_table import interpolate_at_elevation
+from seasonscapes.sky.night import moonlight_spectrum
 from seasonscapes.sky.ray_cells import CellSamples, cell_columns, sample_cells
 from seasonscapes.sky.scattering import AtmosphereTables
 from seasonscapes.sky.sh_moments import HARMONIC_ORDER
@@ -201,7 +202,7 @@ def components_at_observer(
     *,
     near: bool = False,
 ) -> np.ndarray:
-    """Compute the components of a luminary's radiance along an observer's rays, or interpolate those of the sun by day.
+    """Compute the components of a luminary's radiance along an observer's rays, or interpolate those of a sun or moon that is up.
 
     Parameters
     ----------
@@ -223,13 +224,17 @@ def components_at_observer(
     ndarray
         ``(K, A, M or 1, 10)`` float32, as of `along_rays.radiance_components`.
     """
-    day = true_elevation_rad >= np.radians(LOWEST_DAY_DEG) and tables.day_of is not None
-    # Light of another colour than the sun's, as the moon's, has other components.
-    if diffuse is None and day and np.ptp(irradiance) == 0.0:
-        assert tables.day_of is not None
-        components = interpolate_at_elevation(tables.day_of(view.height_m, near), true_elevation_rad, positive=False)
-        components[..., :9] *= np.float32(irradiance[0])
-        return components
+    if diffuse is None and true_elevation_rad >= np.radians(LOWEST_DAY_DEG):
+        # Light of another colour, as of an eclipsed moon, has other components.
+        for table_of, spectrum in (
+            (tables.day_of, np.ones_like(irradiance)),
+            (tables.moon_of, moonlight_spectrum(WAVELENGTHS_NM)),
+        ):
+            ratio = irradiance / spectrum
+            if table_of is not None and np.ptp(ratio) <= 1e-9 * ratio[0]:
+                components = interpolate_at_elevation(table_of(view.height_m, near), true_elevation_rad, positive=False)
+                components[..., :9] *= np.float32(ratio[0])
+                return components
     if diffuse is None:
         diffuse = diffuse_at_observer(tables, view, true_elevation_rad, near=near)
     rgb_matrix = rgb_from_transfer() * irradiance

@@ -72,6 +72,8 @@ class AtmosphereTables:
         height, which is fast for many solar positions. Without it diffuse light is computed for each solar position.
     day_of
         Likewise of `tables_by_elevation.day_by_elevation`.
+    moon_of
+        Likewise of `tables_by_elevation.moon_by_elevation`.
     """
 
     atmosphere: Atmosphere
@@ -79,6 +81,7 @@ class AtmosphereTables:
     moments: ShMoments
     diffuse_of: Callable[[float, bool], np.ndarray | PartedTable] | None = None
     day_of: Callable[[float, bool], np.ndarray | PartedTable] | None = None
+    moon_of: Callable[[float, bool], np.ndarray | PartedTable] | None = None
 
 
 def _directions(horizon_rad: float) -> tuple[np.ndarray, np.ndarray]:

@@ -24,8 +24,8 @@ from seasonscapes.terrain.tile_files import path_list, read_tiles
 ENCODINGS = ("srgb", "linear")
 # Largest number of samples along a footprint; more elongated footprints use a coarser mip level.
 _MAX_ANISOTROPY = 8
-# Texels that are filtered together: what is made for them stays in a processor's cache.
-_CHUNK = 1 << 15
+# Numbers of an image that are filtered together, coverage among them: what is made for them stays in a processor's cache.
+_CHUNK = 1 << 17
 # Exponents of east, north and up in the polynomial from the local frame to image pixels.
 _DEGREE = 6
 _EXPONENTS = [(i, j, k) for k, top in ((0, _DEGREE), (1, 3)) for i in range(top + 1) for j in range(top + 1 - i)]
@@ -111,15 +111,15 @@ def bake_imagery(terrain: Terrain, atlas: Atlas, image: Raster, *, gutter_px: in
     atlas
         Size of the texture.
     image
-        ``values`` ``(H, W, 3)``, scene-linear; NaN has zero weight.
+        ``values`` ``(H, W, C)``, scene-linear; NaN in one of the channels has zero weight.
     gutter_px
         Width of the dilated border around each chart, for bilinear look-ups at chart borders [texels].
 
     Returns
     -------
     Texture
-        ``weight`` is the fraction of the footprint that the image covers; 0 outside the image and outside the charts.
-        ``atlas_id`` is that of the terrain's atlas.
+        ``values`` of as many channels as the image. ``weight`` is the fraction of the footprint that the image covers; 0 outside
+        the image and outside the charts. ``atlas_id`` is that of the terrain's atlas.
 
     Raises
     ------
@@ -128,7 +128,8 @@ def bake_imagery(terrain: Terrain, atlas: Atlas, image: Raster, *, gutter_px: in
     """
     xy = texel_coordinates(terrain.uv, atlas.width_px, atlas.height_px)
     face_id = covering_faces(xy, terrain.faces, atlas.width_px, atlas.height_px)
-    values = np.zeros((atlas.height_px, atlas.width_px, 3), np.float32)
+    channels = image.values.shape[2]
+    values = np.zeros((atlas.height_px, atlas.width_px, channels), np.float32)
     weight = np.zeros((atlas.height_px, atlas.width_px), np.float32)
     pixels_of = pixel_map(terrain, image)
     vertex_px = pixels_of(terrain.vertices)
@@ -144,13 +145,14 @@ def bake_imagery(terrain: Terrain, atlas: Atlas, image: Raster, *, gutter_px: in
     # Columns that lie together in memory: rows of two or three numbers cost several times as much.
     columns = [np.ascontiguousarray(column) for column in np.concatenate(gradients, axis=1).T]
     texel = np.flatnonzero(face_id >= 0)
-    for start in range(0, len(texel), _CHUNK):
-        part = texel[start : start + _CHUNK]
+    step = _CHUNK // (channels + 1)
+    for start in range(0, len(texel), step):
+        part = texel[start : start + step]
         face, row = face_id.ravel()[part].astype(np.intp), part // atlas.width_px
         across, down = part - row * atlas.width_px + 0.5, row + 0.5
         place = [_on_faces(columns[axis :: len(columns) // 3], face, across, down) for axis in range(len(columns) // 3)]
         where = place if linear else list(pixels_of(np.stack(place, axis=-1)).T)
-        values.reshape(-1, 3)[part], weight.ravel()[part] = _filtered(pyramid, where, face, filters)
+        values.reshape(-1, channels)[part], weight.ravel()[part] = _filtered(pyramid, where, face, filters)
     if not weight.any():
         raise InputError("imagery", "the image covers none of the terrain", cure="check the CRS of both files")
     atlas_id = atlas_identity(terrain, atlas.width_px, atlas.height_px)
@@ -330,7 +332,7 @@ def _on_faces(columns: Sequence[np.ndarray], face: np.ndarray, across: np.ndarra
 def _filtered(
     pyramid: list[np.ndarray], pixel: list[np.ndarray], face: np.ndarray, filters: _FaceFilters
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean colour ``(N, 3)`` and coverage ``(N,)`` over the footprints of N texels.
+    """Mean colour ``(N, C)`` and coverage ``(N,)`` over the footprints of N texels.
 
     ``pixel`` are their columns and rows in the image, ``(N,)`` each, ``face`` ``(N,)`` their faces.
     """
@@ -419,13 +421,17 @@ def dilate(texture: Texture, covered: np.ndarray, gutter_px: int) -> Texture:
 
 
 def _dilate(values: np.ndarray, weight: np.ndarray, covered: np.ndarray, gutter_px: int) -> None:
-    """`dilate` of values ``(H, W, 3)`` and weights ``(H, W)`` in place."""
+    """`dilate` of values ``(H, W, C)`` and weights ``(H, W)`` in place."""
     known = covered.copy()
     rim_row, rim_column = np.nonzero(_widened(known, 1) & ~known)
     for _ in range(gutter_px):
         if not len(rim_row):
             break
-        total, total_weight, count = np.zeros((len(rim_row), 3)), np.zeros(len(rim_row)), np.zeros(len(rim_row))
+        total, total_weight, count = (
+            np.zeros((len(rim_row), values.shape[2])),
+            np.zeros(len(rim_row)),
+            np.zeros(len(rim_row)),
+        )
         for d_row, d_column in product((-1, 0, 1), repeat=2):
             r, c = rim_row + d_row, rim_column + d_column
             inside = (r >= 0) & (r < known.shape[0]) & (c >= 0) & (c < known.shape[1])
@@ -471,7 +477,7 @@ def _fill_gutters(values: np.ndarray, weight: np.ndarray, covered: np.ndarray, g
     source = np.empty(int(label.max()) + 1, np.intp)
     source[label.ravel()[rim]] = rim
     nearest = source[label[empty]]
-    values[empty], weight[empty] = values.reshape(-1, 3)[nearest], weight.ravel()[nearest]
+    values[empty], weight[empty] = values.reshape(-1, values.shape[2])[nearest], weight.ravel()[nearest]
 
 
 def _widened(mask: np.ndarray, rings: int) -> np.ndarray:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from seasonscapes.terrain.synthetic_albedo import SEASONS, alpine_albedo, snow_fraction, snow_line_m
+from seasonscapes.terrain.synthetic_albedo import SEASONS, alpine_albedo, alpine_albedos, snow_fraction, snow_line_m
 from seasonscapes.terrain.synthetic_cover import Cover, ground_cover
 from seasonscapes.terrain.synthetic_massif import (
     CENTRE_LATITUDE_DEG,
@@ -69,6 +69,7 @@ __all__ = [
     "Cover",
     "SyntheticMassif",
     "alpine_albedo",
+    "alpine_albedos",
     "alpine_massif",
     "load_massif",
     "massif_of",

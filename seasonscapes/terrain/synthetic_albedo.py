@@ -170,16 +170,24 @@ def _strip(massif: SyntheticMassif, rows: slice, upsample: int) -> _Strip:
     return _Strip(rows, upsample, east, north, z, strata_level_m(z, east, north, massif.seed))
 
 
-def _snow(massif: SyntheticMassif, day: float, strip: _Strip) -> np.ndarray:
-    """Fraction of the ground under seasonal snow, ``(h, w)`` float32 in [0, 1]."""
+@dataclass(frozen=True)
+class _Shedding:
+    """What decides where snow lies on a strip, whatever the day.
+
+    ``northness`` and ``patches`` ``(h, w)``, concavity ``(h, w)`` [m], and the share of the snow ``(h, w)`` that the slope retains.
+    """
+
+    northness: np.ndarray
+    concavity_m: np.ndarray
+    patches: np.ndarray
+    retained: np.ndarray
+
+
+def _shedding(massif: SyntheticMassif, strip: _Strip) -> _Shedding:
     rows, upsample, east, north = strip.rows, strip.upsample, strip.east_m, strip.north_m
     slope, northness = (_upsampled(f, rows, upsample, cv2.INTER_LINEAR) for f in (massif.slope_deg, massif.northness))
     patches = fractal_noise(massif.seed + 301, 420.0, east, north, octaves=7, gain=0.7)
     concavity = _upsampled(massif.concavity_m, rows, upsample, cv2.INTER_LINEAR)
-    # The dependence of the snow line on aspect is largest in early summer and smallest in early winter.
-    contrast = 330.0 + 130.0 * sin(2.0 * pi * (day - 60.0) / _YEAR)
-    line = snow_line_m(day) - contrast * northness - 10.0 * np.clip(concavity, -12.0, 12.0) + 95.0 * patches
-    accumulated = _smoothstep(-90.0, 130.0, strip.height_m - line)
     # Slopes above about 55° shed snow, except on ledges; unresolved ledges retain 6 %.
     ledge = np.cos(strip.level_m * np.float32(2.0 * pi / LEDGES_M[1]))
     retained = 1.0 - _smoothstep(
@@ -187,7 +195,16 @@ def _snow(massif: SyntheticMassif, day: float, strip: _Strip) -> np.ndarray:
         60.0,
         slope - 5.0 * patches - (1.2 + 2.2 * fractal_noise(massif.seed + 311, 700.0, east, north, octaves=3)) * ledge,
     )
-    return accumulated * (0.06 + 0.94 * retained)
+    return _Shedding(northness, concavity, patches, retained)
+
+
+def _snow(day: float, strip: _Strip, shedding: _Shedding) -> np.ndarray:
+    """Fraction of the ground under seasonal snow, ``(h, w)`` float32 in [0, 1]."""
+    # The dependence of the snow line on aspect is largest in early summer and smallest in early winter.
+    contrast = 330.0 + 130.0 * sin(2.0 * pi * (day - 60.0) / _YEAR)
+    hollows = 10.0 * np.clip(shedding.concavity_m, -12.0, 12.0)
+    line = snow_line_m(day) - contrast * shedding.northness - hollows + 95.0 * shedding.patches
+    return _smoothstep(-90.0, 130.0, strip.height_m - line) * (0.06 + 0.94 * shedding.retained)
 
 
 def snow_fraction(massif: SyntheticMassif, day_of_year: float) -> np.ndarray:
@@ -205,8 +222,8 @@ def snow_fraction(massif: SyntheticMassif, day_of_year: float) -> np.ndarray:
     numpy.ndarray
         Fraction of each cell under snow, ``(H, W)`` float32 in [0, 1].
     """
-    height = massif.cover.shape[0]
-    return np.concatenate([_snow(massif, day_of_year, _strip(massif, rows, 1)) for rows in _strips(height, 1)])
+    strips = (_strip(massif, rows, 1) for rows in _strips(massif.cover.shape[0], 1))
+    return np.concatenate([_snow(day_of_year, strip, _shedding(massif, strip)) for strip in strips])
 
 
 def _strips(height: int, upsample: int) -> list[slice]:
@@ -258,7 +275,7 @@ def _ground(massif: SyntheticMassif, strip: _Strip) -> _Ground:
 
 
 def _bare_albedo(massif: SyntheticMassif, day: float, strip: _Strip, ground: _Ground) -> np.ndarray:
-    """Albedo ``(3, h, w)`` without seasonal snow."""
+    """Albedo ``(3, h, w)`` of the classes, without what varies within them and without seasonal snow."""
     cover, z, grain, broad = ground.cover, strip.height_m, ground.grain, ground.broad
     # Spring is later and autumn earlier by about 3 days per 100 m of height (Hopkins 1918: four days in 400 feet).
     delay_days = np.clip((z - 1500.0) * 0.030, -25.0, 30.0) + 4.0 * broad
@@ -286,7 +303,6 @@ def _bare_albedo(massif: SyntheticMassif, day: float, strip: _Strip, ground: _Gr
         crevasse = np.sin(height_m * (2.0 * pi / 11.0) + 2.5 * fine + 3.0 * coarse)
         for plane, clean, scree in zip(albedo, _CONSTANT_ALBEDO[Cover.ICE], _CONSTANT_ALBEDO[Cover.SCREE], strict=True):
             plane.ravel()[ice] = (clean + dirt * (0.8 * scree - clean)) * (1.0 + 0.07 * crevasse)
-    _add_texture(albedo, strip, ground, massif.seed)
     return albedo
 
 
@@ -295,8 +311,24 @@ def _by_class(cover: np.ndarray, values: dict[Cover, float], *, otherwise: float
     return np.array([values.get(kind, otherwise) for kind in Cover], np.float32)[cover]
 
 
-def _add_texture(albedo: np.ndarray, strip: _Strip, ground: _Ground, seed: int) -> None:
-    """Multiply an albedo ``(3, h, w)`` by within-class variation (crowns, tufts, strata, field plots), in place."""
+@dataclass(frozen=True)
+class _Variation:
+    """Factors ``(h, w)`` of the albedo within classes: of crowns, tufts and strata, of rust, and of plots where there are fields."""
+
+    crowns: np.ndarray
+    rust: np.ndarray
+    plots: np.ndarray | None
+
+    def apply(self, albedo: np.ndarray) -> None:
+        """Multiply an albedo ``(3, h, w)`` by them, in place."""
+        albedo *= self.crowns
+        albedo[0] *= self.rust
+        albedo[2] /= self.rust
+        if self.plots is not None:
+            albedo *= self.plots
+
+
+def _variation(strip: _Strip, ground: _Ground, seed: int) -> _Variation:
     cover, grain, broad = ground.cover, ground.grain, ground.broad
     contrast = {
         Cover.MEADOW: 0.16,
@@ -317,16 +349,14 @@ def _add_texture(albedo: np.ndarray, strip: _Strip, ground: _Ground, seed: int) 
     exponent.ravel()[rock] += 0.13 * sum(
         np.sin(level * np.float32(2.0 * pi / period) + np.float32(0.8)) for period in LEDGES_M
     )
-    albedo *= np.exp(exponent)
-    rusty = np.exp(of_class({Cover.ROCK: 0.06, Cover.SCREE: 0.06}) * broad)
-    albedo[0] *= rusty
-    albedo[2] /= rusty
-    field = cover == Cover.FIELD
+    rust = np.exp(of_class({Cover.ROCK: 0.06, Cover.SCREE: 0.06}) * broad)
+    field, factor = cover == Cover.FIELD, None
     if field.any():
         plots = np.sign(spline_noise(seed + 421, 260.0, strip.east_m, strip.north_m)) + np.sign(
             spline_noise(seed + 422, 190.0, strip.east_m, strip.north_m)
         )
-        albedo *= np.where(field, np.exp(0.16 * plots), np.float32(1.0))
+        factor = np.where(field, np.exp(0.16 * plots), np.float32(1.0))
+    return _Variation(np.exp(exponent), rust, factor)
 
 
 def alpine_albedo(massif: SyntheticMassif, day_of_year: float, *, upsample: int = 1) -> np.ndarray:
@@ -352,25 +382,34 @@ def alpine_albedo(massif: SyntheticMassif, day_of_year: float, *, upsample: int 
     ValueError
         ``upsample`` is not 1, 2, 4 or 8.
     """
+    return alpine_albedos(massif, [day_of_year], upsample=upsample)
+
+
+def alpine_albedos(massif: SyntheticMassif, days: Sequence[float], *, upsample: int = 1) -> np.ndarray:
+    """`alpine_albedo` of D days side by side, ``(H·upsample, W·upsample, 3 D)``: what no day changes is computed once."""
     if upsample not in (1, 2, 4, 8):
         raise ValueError(f"upsample: got {upsample}, expected 1, 2, 4 or 8")
     height, width = massif.cover.shape
-    result = np.empty((height * upsample, width * upsample, 3), np.float32)
+    result = np.empty((height * upsample, width * upsample, 3 * len(days)), np.float32)
     for rows in _strips(height, upsample):
         strip = _strip(massif, rows, upsample)
-        ground = _ground(massif, strip)
-        albedo = _bare_albedo(massif, day_of_year, strip, ground)
-        weight = _snow(massif, day_of_year, strip)
-        weight *= _by_class(ground.cover, _VISIBLE_SNOW, otherwise=1.0)
+        ground, shedding = _ground(massif, strip), _shedding(massif, strip)
+        variation = _variation(strip, ground, massif.seed)
+        visible = _by_class(ground.cover, _VISIBLE_SNOW, otherwise=1.0)
         ageing = fractal_noise(massif.seed + 501, 200.0, strip.east_m, strip.north_m, octaves=3)
         ageing *= 0.014
         part = result[rows.start * upsample : rows.stop * upsample]
-        for channel, snow in enumerate(_snow_albedo(day_of_year)):
-            covered = ageing + snow
-            covered -= albedo[channel]
-            covered *= weight
-            covered += albedo[channel]
-            np.clip(covered, 0.01, 0.93, out=part[..., channel])
+        for number, day in enumerate(days):
+            albedo = _bare_albedo(massif, day, strip, ground)
+            variation.apply(albedo)
+            weight = _snow(day, strip, shedding)
+            weight *= visible
+            for channel, snow in enumerate(_snow_albedo(day)):
+                covered = ageing + snow
+                covered -= albedo[channel]
+                covered *= weight
+                covered += albedo[channel]
+                np.clip(covered, 0.01, 0.93, out=part[..., 3 * number + channel])
     return result
 
 
@@ -388,4 +427,4 @@ def _snow_albedo(day: float) -> np.ndarray:
     )
 
 
-__all__ = ["FOREST", "SEASONS", "alpine_albedo", "snow_fraction", "snow_line_m"]
+__all__ = ["FOREST", "SEASONS", "alpine_albedo", "alpine_albedos", "snow_fraction", "snow_line_m"]

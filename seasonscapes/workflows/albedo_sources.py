@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date, datetime, timedelta
 from functools import lru_cache, partial
 from pathlib import Path
@@ -31,7 +31,7 @@ from seasonscapes.workflows.delighting import delit_imagery, imagery_time
 from seasonscapes.workflows.edited_textures import albedo_date, read_albedo, require_albedo_file
 from seasonscapes.workflows.place import Place
 from seasonscapes.workflows.scene_imagery import atlas_image
-from seasonscapes.workspace import build_once, file_hash
+from seasonscapes.workspace import build_once, file_hash, is_built
 
 # What workflows accept as ``albedo``: a texture of the place's atlas, an albedo of one date, albedos of several dates
 # with their interpolation, or ``None`` for the scene's own.
@@ -103,13 +103,10 @@ def scene_albedo(place: Place, day: date | str, *, progress: Progress | None = N
     day = date.fromisoformat(day) if isinstance(day, str) else day
     inputs: dict[str, Any] = {"terrain": place.key}
     if place.synthetic is not None:
-        day_of_year = day.timetuple().tm_yday
+        name, inputs = _synthetic_day(place, day)
+        image = partial(synthetic_image, place, day.timetuple().tm_yday)
         return texture_once(
-            place,
-            f"albedo-day{day_of_year:03d}",
-            inputs | {"day_of_year": day_of_year},
-            code=_SYNTHETIC_CODE,
-            build=lambda: bake_imagery(place.terrain, place.atlas, synthetic_image(place, day_of_year)),
+            place, name, inputs, code=_SYNTHETIC_CODE, build=lambda: bake_imagery(place.terrain, place.atlas, image())
         )
     images = place.scene.images
     if len(images) > 1:
@@ -119,6 +116,44 @@ def scene_albedo(place: Place, day: date | str, *, progress: Progress | None = N
         values = np.full((*place.texture_shape, 3), GREY_ALBEDO, np.float32)
         return Texture(values, np.zeros(place.texture_shape, np.float32), place.atlas_id)
     return _image_albedo(place, 0, progress)
+
+
+def _synthetic_day(place: Place, day: date) -> tuple[str, dict[str, Any]]:
+    """Name and inputs of the albedo of a day, as an artefact of a synthetic place."""
+    day_of_year = day.timetuple().tm_yday
+    return f"albedo-day{day_of_year:03d}", {"terrain": place.key, "day_of_year": day_of_year}
+
+
+def keep_synthetic_albedos(place: Place, days: Sequence[date]) -> None:
+    """Make the albedos of several days that a synthetic place's workspace lacks, together.
+
+    What no day changes (noise, the faces under the texels, and where these lie in the image) is computed once for all. Nothing is
+    made where one albedo alone is missing, since `scene_albedo` makes it where it is asked for.
+
+    Parameters
+    ----------
+    place
+        The place; without a synthetic massif nothing is done.
+    days
+        The dates; all of their textures are in memory at once.
+    """
+    from seasonscapes.terrain.imagery import bake_imagery
+
+    artefacts = {day: _synthetic_day(place, day) for day in days} if place.synthetic is not None else {}
+
+    def is_kept(name: str, inputs: dict[str, Any]) -> bool:
+        return is_built(place.workspace, f"{place.scene.name}/{name}", inputs, code=_SYNTHETIC_CODE, suffix=".npz")
+
+    missing = [day for day, artefact in artefacts.items() if not is_kept(*artefact)]
+    if len(missing) < 2:
+        return
+    image = synthetic_image(place, *(day.timetuple().tm_yday for day in missing))
+    baked = bake_imagery(place.terrain, place.atlas, image)
+    for number, day in enumerate(missing):
+        name, inputs = artefacts[day]
+        values = np.ascontiguousarray(baked.values[..., 3 * number : 3 * number + 3])
+        texture = replace(baked, values=values)
+        texture_once(place, name, inputs, code=_SYNTHETIC_CODE, build=lambda texture=texture: texture)
 
 
 def _image_albedo(place: Place, number: int, progress: Progress | None = None) -> Texture:
@@ -412,11 +447,11 @@ def chosen_albedo(place: Place, day: date, albedo: AlbedoSource = None, *, progr
     return albedo_of_day(place, AlbedoSeries((albedo,)) if isinstance(albedo, DatedAlbedo) else albedo, day)
 
 
-def synthetic_image(place: Place, day_of_year: int) -> Raster:
-    """The true albedo of a synthetic place on its own finer grid."""
+def synthetic_image(place: Place, *days_of_year: int) -> Raster:
+    """The true albedo of a synthetic place on its own finer grid: three channels of each day."""
     from affine import Affine
 
-    from seasonscapes.terrain.synthetic_albedo import alpine_albedo
+    from seasonscapes.terrain.synthetic_albedo import alpine_albedos
 
     assert place.synthetic is not None
     assert place.scene.elevation is not None
@@ -425,7 +460,7 @@ def synthetic_image(place: Place, day_of_year: int) -> Raster:
     # The albedo's own detail comes in powers of two of the massif's cells.
     ratio = place.synthetic.spacing_m / declared.detail_m
     upsample = 2 ** int(np.clip(round(np.log2(ratio)), 0, 3))
-    values = alpine_albedo(place.synthetic, day_of_year, upsample=upsample)
+    values = alpine_albedos(place.synthetic, days_of_year, upsample=upsample)
     elevation = place.synthetic.elevation
     return Raster(values, elevation.transform * Affine.scale(1.0 / upsample), elevation.crs)
 

@@ -36,7 +36,7 @@ from seasonscapes.sky.illumination import Illumination
 from seasonscapes.sky.models import AtmosphereModel, SkyModel, atmosphere_from_model, read_sky_model, with_overrides
 from seasonscapes.sky.observer_radiance import LOWEST_DAY_DEG, observer_view
 from seasonscapes.sky.shipped_tables import shipped_tables
-from seasonscapes.sky.tables_by_elevation import day_by_elevation, diffuse_by_elevation
+from seasonscapes.sky.tables_by_elevation import day_by_elevation, diffuse_by_elevation, moon_by_elevation
 from seasonscapes.workspace import Workspace, build_once
 
 if TYPE_CHECKING:
@@ -201,7 +201,7 @@ def atmosphere_tables_in(
     workspace
         Where tables are kept.
     by_elevation
-        Also tabulate diffuse light, and by day all light of sky and air, over the sun's elevation for each observer height, by
+        Also tabulate diffuse light, and all light of sky and air from a sun or moon that is up, over the sun's elevation for each observer height, by
         parts as they are needed, which costs time and space once and makes the sky of an instant quicker. Radiances differ by
         less than 0.3 % while the sun is above -12°; in the haze of ``hazy`` by up to 0.5 % where it is above 70°.
     """
@@ -220,11 +220,12 @@ def atmosphere_tables_in(
                 load=load_tables,
             )
             if by_elevation:
-                diffuse, day = (
-                    _parted_in(workspace, built, *kind)
-                    for kind in (("sky/diffuse", diffuse_by_elevation), ("sky/day", day_by_elevation))
+                built = replace(
+                    built,
+                    diffuse_of=_parted_in(workspace, built, "sky/diffuse", diffuse_by_elevation),
+                    day_of=_parted_in(workspace, built, "sky/day", day_by_elevation),
+                    moon_of=_parted_in(workspace, built, "sky/moon", moon_by_elevation),
                 )
-                built = replace(built, diffuse_of=diffuse, day_of=day)
             tables[atmosphere] = built
         return tables[atmosphere]
 
@@ -308,6 +309,7 @@ def illumination_for_camera(
     *,
     map_height: int = 128,
     by_elevation: bool = False,
+    of_another_camera: Illumination | None = None,
 ) -> tuple[Illumination, SunMoonPosition]:
     """Compute the light on a place as seen by a camera, and the positions of sun and moon.
 
@@ -326,11 +328,13 @@ def illumination_for_camera(
         Rows of both sky maps; with ``by_elevation`` the visible one is empty by day, where the aerial perspective holds all of it.
     by_elevation
         For many instants of one camera; see `atmosphere_tables_in`.
+    of_another_camera
+        What this function found for another camera at the same instant under the same model: its light on the terrain is taken.
     """
     from seasonscapes.workflows.views import camera_geodetic
 
     position = _position_in_film(place, time) if by_elevation else position_at(place, time)
-    on_terrain = illumination_at(
+    on_terrain = of_another_camera or illumination_at(
         model,
         position,
         place.median_height_m,
@@ -429,6 +433,7 @@ def tabulate_illumination(
     tables = atmosphere_tables_in(place.workspace, by_elevation=True)(atmosphere_from_model(model))
     assert tables.diffuse_of is not None
     assert tables.day_of is not None
+    assert tables.moon_of is not None
     where = (place.frame.latitude_deg, place.frame.longitude_deg, place.median_height_m)
     # All instants at once: one by one, those of a year take minutes.
     suns, moons = sun_position(times, *where), moon_position(times, *where)
@@ -444,10 +449,11 @@ def tabulate_illumination(
             np.radians(true_elevation_deg(tables.atmosphere, np.array(each, float), height_m))
             for each in (sun_deg, moon_deg)
         )
-        by_day = sun_rad >= np.radians(LOWEST_DAY_DEG)
+        sun_up, moon_up = (each >= np.radians(LOWEST_DAY_DEG) for each in (sun_rad, moon_rad))
         for table_of, true_rad in (
-            (tables.day_of, sun_rad[by_day]),
-            (tables.diffuse_of, np.concatenate([sun_rad[~by_day], moon_rad])),
+            (tables.day_of, sun_rad[sun_up]),
+            (tables.moon_of, moon_rad[moon_up]),
+            (tables.diffuse_of, np.concatenate([sun_rad[~sun_up], moon_rad[~moon_up]])),
         ):
             table = table_of(observer_view(tables, height_m).height_m, near)
             assert isinstance(table, PartedTable)

@@ -18,9 +18,10 @@ from seasonscapes.progress import Progress, task_progress
 from seasonscapes.sky.models import SkyModel
 from seasonscapes.texturing.painting import Painting, PaintOptions
 from seasonscapes.workflows.foreground import foreground_masks
-from seasonscapes.workflows.illumination import illumination_for_camera, sky_model
+from seasonscapes.workflows.illumination import illumination_at, position_at, sky_model
 from seasonscapes.workflows.photograph_files import PhotographSources, observations, rows_at
 from seasonscapes.workflows.place import Place
+from seasonscapes.workflows.views import camera_geodetic
 from seasonscapes.workspace import artefact_key, build_once, file_hash
 
 if TYPE_CHECKING:
@@ -130,7 +131,8 @@ def painting_inputs(place: Place, photographs: Sequence[Observation], model: Sky
         camera = view_in_frame(photograph.camera, place.frame)
         key = (photograph.time, camera.position_m.tobytes())
         if key not in airs:
-            light, _ = illumination_for_camera(place, camera, model, photograph.time)
+            position, height_m = position_at(place, photograph.time), camera_geodetic(place, camera)[2]
+            light = illumination_at(model, position, height_m, workspace=place.workspace)
             airs[key] = light.aerial_perspective
         inputs.append(PaintingInput(replace(photograph, camera=camera), airs[key]))
     return inputs

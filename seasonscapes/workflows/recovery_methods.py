@@ -73,10 +73,13 @@ def illuminations(place: Place, photographs: Sequence[Observation], models: Sequ
     lights: dict = {}
     found = []
     for photograph, model in zip(photographs, models, strict=True):
-        key = (photograph.time, photograph.camera.position_m.tobytes(), model.model_dump_json())
-        if key not in lights:
-            lights[key] = illumination_for_camera(place, photograph.camera, model, photograph.time)[0]
-        found.append(lights[key])
+        camera, instant = photograph.camera, (photograph.time, model.model_dump_json())
+        of_cameras = lights.setdefault(instant, {})
+        if camera.position_m.tobytes() not in of_cameras:
+            other = next(iter(of_cameras.values()), None)
+            light, _ = illumination_for_camera(place, camera, model, photograph.time, of_another_camera=other)
+            of_cameras[camera.position_m.tobytes()] = light
+        found.append(of_cameras[camera.position_m.tobytes()])
     return found
 
 

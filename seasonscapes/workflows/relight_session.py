@@ -32,6 +32,7 @@ from seasonscapes.scene import NamedCamera
 from seasonscapes.sky.illumination import Illumination
 from seasonscapes.sky.models import SkyModel
 from seasonscapes.terrain.surface import Texture
+from seasonscapes.workflows import albedo_sources
 from seasonscapes.workflows.albedo_sources import AlbedoFile, AlbedoSource, dated_albedos, snow_transition_between
 from seasonscapes.workflows.illumination import SunMoonPosition, illumination_for_camera, sky_model
 from seasonscapes.workflows.place import MeshOptions, Place, load_place, utc_at
@@ -324,11 +325,18 @@ def session_of(job: RenderJob, place: Place, *, progress: Progress | None = None
     from seasonscapes.rendering.backend import use_backend
 
     use_backend(job.device)
+    albedo = AlbedoSeries(tuple(dated_albedos(place, job.albedo, progress=progress)), job.season)
+    if not job.albedo:
+        # The first frame needs the dates before and after the base's.
+        days = [dated.day for dated in albedo.dated]
+        albedo_sources.keep_synthetic_albedos(
+            place, [days[k] for k, _ in season_weights(days, job.base_day, season=job.season)]
+        )
     return relight_session(
         place,
         camera_for(place, job.view, size_px=job.size_px),
         sky=job.sky,
-        albedo=AlbedoSeries(tuple(dated_albedos(place, job.albedo, progress=progress)), job.season),
+        albedo=albedo,
         base_day=job.base_day,
         seed=job.seed,
         amplify=job.amplify,

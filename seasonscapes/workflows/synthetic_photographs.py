@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from seasonscapes.evaluation.synthetic_webcams import SyntheticPicture
     from seasonscapes.evaluation.webcam_faults import PoseSigmas
     from seasonscapes.frames import LocalFrame
+    from seasonscapes.sky.illumination import Illumination
 
 log = logging.getLogger(__name__)
 
@@ -163,6 +164,7 @@ def photograph_each(
     from seasonscapes.evaluation.synthetic_webcams import WebcamInstant, WebcamOptions, webcam_series
 
     albedos: dict[int, np.ndarray] = {}
+    lights: dict[datetime, Illumination] = {}
     options = WebcamOptions(poses=poses)
     task = f"photographing from {len(cameras)} webcams"
     for number, (name, camera) in enumerate(cameras.items()):
@@ -171,7 +173,8 @@ def photograph_each(
             day = time.timetuple().tm_yday
             if day not in albedos:
                 albedos[day] = scene_albedo(place, time).values
-            light = illumination_for_camera(place, camera, model, time)[0]
+            light = illumination_for_camera(place, camera, model, time, of_another_camera=lights.get(time))[0]
+            lights.setdefault(time, light)
             instants.append(WebcamInstant(time, light, albedos[day]))
         report = task_progress(progress, task, start=number / len(cameras), end=(number + 1) / len(cameras))
         try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -47,6 +48,7 @@ SCENE_VERBS = [verb for verb, tokens in BASE.items() if tokens[:1] in (["s.toml"
 JSON_VERBS = [verb for verb in BASE if verb != "annotate"]
 
 
+@cache
 def flags_of(verb: str) -> dict[str, str]:
     """The flags of a verb and the kind of their values: INT, FLOAT, STR, PATH, or nothing for a switch."""
     text = call([verb, "--help"]).out
