@@ -33,7 +33,7 @@ CRS, EAST, NORTH = "EPSG:25832", 500_000.0, 5_160_000.0
 TRIAL_SEARCH = SearchRange(priors=Priors(tilt_deg=2.0, roll_deg=1.0, horizontal_m=3.0, vertical_m=2.0, focal=0.0))
 
 
-SIZE = (800, 534)
+SIZE = (640, 427)
 
 
 def raster_of(height_of, cells=400, cell=100.0) -> Raster:
@@ -254,9 +254,9 @@ def test_points_and_skyline_together(trial, fit):
 
 
 def test_a_picture_of_another_size_is_refused(trial, fit):
-    with pytest.raises(ImageSizeMismatch, match="the image is 799 x 534 px"):
+    with pytest.raises(ImageSizeMismatch, match="the image is 639 x 427 px"):
         align_to_skyline(trial.image[:, 1:], trial.start, trial.rasters, trial.frame)
-    with pytest.raises(ImageSizeMismatch, match="the image is 799 x 534 px"):
+    with pytest.raises(ImageSizeMismatch, match="the image is 639 x 427 px"):
         draw_overlay(trial.image[:, 1:], fit.calibration)
     with pytest.raises(ValueError, match="expected \\(H, W, 3\\) uint8"):
         boundary_map(trial.image.astype(float), None, 10.0)
