@@ -15,9 +15,20 @@ from typing import Literal
 import numpy as np
 
 from seasonscapes.calibration.evidence import PARAMETERS, Correspondences, Priors, select_points
-from seasonscapes.calibration.ground_clearance import LEAST_ABOVE_GROUND_M, TOLERANCE_SIGMAS
+from seasonscapes.calibration.ground_clearance import TOLERANCE_SIGMAS
 from seasonscapes.calibration.initial_rotation import check_orientation, rotation_among_pairs
 from seasonscapes.calibration.pose_model import View, parameters_of_view, pixel_error, view_from_parameters
+from seasonscapes.calibration.pose_residuals import (
+    ResectionProblem,
+    SkylineEvidence,
+    cauchy,
+    depth_below_m,
+    jacobian_at,
+    minimise,
+    point_errors,
+    residual_rows,
+    soft_l1,
+)
 from seasonscapes.cameras.lens import Lens
 from seasonscapes.cameras.pinhole import Camera
 from seasonscapes.errors import CameraBelowGround, NotEnoughEvidence
@@ -25,9 +36,6 @@ from seasonscapes.errors import CameraBelowGround, NotEnoughEvidence
 Loss = Literal["cauchy", "l1", "squares"]
 # Threshold on the residual of an inlier [standard deviations]: probability 0.999 of two pixel coordinates (χ², 2 dof).
 OUTLIER_SIGMAS = 3.717
-
-# Maps whitened residual vectors (..., D) to vectors whose squared length is the robust loss.
-_RobustLoss = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -89,57 +97,6 @@ class Calibration:
     def outlier_names(self) -> tuple[str, ...]:
         """Names of the outliers."""
         return tuple(name for name, is_outlier in zip(self.names, self.outlier, strict=True) if is_outlier)
-
-
-@dataclass(frozen=True)
-class SkylineEvidence:
-    """Residuals between the skyline in the image and the projected terrain horizon.
-
-    Parameters
-    ----------
-    residuals
-        Function of parameters ``(9,)`` or ``(P, 9)`` that returns signed residuals ``(M,)`` or ``(P, M)`` [px].
-    sigma_px
-        Standard deviation of one residual [px], enlarged for the correlation of neighbouring residuals.
-    """
-
-    residuals: Callable[[np.ndarray], np.ndarray]
-    sigma_px: float = 1.0
-
-
-@dataclass(frozen=True)
-class ResectionProblem:
-    """Inputs of one minimisation.
-
-    Parameters
-    ----------
-    start
-        View that the parameters refer to.
-    axes
-        East, north and up at the camera, rows ``(3, 3)``.
-    origin, sigmas
-        Means ``(9,)`` and standard deviations ``(9,)`` of the priors; 0 fixes a parameter, infinity omits its prior.
-    points
-        Correspondences; may be empty.
-    skyline
-        Skyline residuals, or ``None``.
-    ground_m, ground_sigma_m
-        See `ResectionOptions`.
-    """
-
-    start: View
-    axes: np.ndarray
-    origin: np.ndarray
-    sigmas: np.ndarray
-    points: Correspondences
-    skyline: SkylineEvidence | None
-    ground_m: Callable[[float, float], float] | None = None
-    ground_sigma_m: float = 1.0
-
-    @property
-    def free(self) -> np.ndarray:
-        """Mask ``(9,)`` of the parameters that are not fixed."""
-        return self.sigmas > 0
 
 
 @dataclass(frozen=True)
@@ -296,107 +253,11 @@ def _check_point_count(count: int, sigmas: np.ndarray, has_skyline: bool) -> Non
 
 
 def _check_above_ground(parameters: np.ndarray, options: ResectionOptions, what: str, *, sigma_m: float) -> None:
-    below = _depth_m(options, parameters)
+    below = depth_below_m(options.ground_m, parameters)
     if below > TOLERANCE_SIGMAS * sigma_m:
         raise CameraBelowGround(
             f"{what} puts the camera {below:.0f} m below ground; check its height and vertical datum"
         )
-
-
-def _depth_m(known: ResectionOptions | ResectionProblem, parameters: np.ndarray, clearance_m: float = 0.0) -> float:
-    """How far below the ground, or below a clearance above it, the camera stands [m]; 0 where the ground is unknown."""
-    if known.ground_m is None:
-        return 0.0
-    below = float(known.ground_m(parameters[3], parameters[4])) + clearance_m - parameters[5]
-    return max(below, 0.0) if np.isfinite(below) else 0.0
-
-
-def _residual_rows(
-    problem: ResectionProblem, parameters: np.ndarray, noise: float, robust_loss: _RobustLoss | None, inlier: np.ndarray
-) -> np.ndarray:
-    """Whitened residuals ``(P, R)`` of parameters ``(P, 9)``: of inlier points (with a robust loss or none), skyline, priors."""
-    rows = []
-    if len(problem.points):
-        error = _errors(problem, parameters)[:, inlier] / noise
-        rows.append((error if robust_loss is None else robust_loss(error)).reshape(len(parameters), -1))
-    if problem.skyline is not None:
-        rows.append(_cauchy(problem.skyline.residuals(parameters)[..., None] / problem.skyline.sigma_px, 2.0)[..., 0])
-    has_prior = problem.free & np.isfinite(problem.sigmas)
-    offset = parameters - problem.origin
-    offset[:, 0] = (offset[:, 0] + 180.0) % 360.0 - 180.0
-    rows.append(offset[:, has_prior] / problem.sigmas[has_prior])
-    if problem.ground_m is not None:
-        depth_m = [_depth_m(problem, each, LEAST_ABOVE_GROUND_M) for each in parameters]
-        rows.append(np.array(depth_m)[:, None] / problem.ground_sigma_m)
-    return np.concatenate(rows, axis=1)
-
-
-def _cauchy(error: np.ndarray, scale: float) -> np.ndarray:
-    """Cauchy loss: vectors ``(..., D)`` whose squared length is ``c² log(1 + |e|²/c²)``."""
-    squared = np.sum(error**2, axis=-1, keepdims=True)
-    loss = scale**2 * np.log1p(squared / scale**2)
-    return error * np.sqrt(np.divide(loss, squared, out=np.ones_like(squared), where=squared > 1e-20))
-
-
-def _soft_l1(error: np.ndarray, scale: float) -> np.ndarray:
-    """Soft L1 loss: vectors ``(..., D)`` whose squared length is ``2c² (√(1 + |e|²/c²) - 1)``."""
-    squared = np.sum(error**2, axis=-1, keepdims=True)
-    loss = 2.0 * scale**2 * (np.sqrt(1.0 + squared / scale**2) - 1.0)
-    return error * np.sqrt(np.divide(loss, squared, out=np.ones_like(squared), where=squared > 1e-20))
-
-
-def _jacobian(
-    problem: ResectionProblem, parameters: np.ndarray, noise: float, robust_loss: _RobustLoss | None, inlier: np.ndarray
-) -> np.ndarray:
-    """Jacobian ``(R, F)`` of the residuals for the free parameters: forward differences, all in one evaluation."""
-    free = np.flatnonzero(problem.free)
-    size = np.sqrt(np.finfo(float).eps) * np.maximum(np.abs(parameters[free]), 1.0)
-    trials = np.tile(parameters, (len(free) + 1, 1))
-    trials[np.arange(len(free)), free] += np.where(parameters[free] < 0.0, -size, size)
-    rows = _residual_rows(problem, trials, noise, robust_loss, inlier)
-    # The steps as they are after rounding.
-    return ((rows[:-1] - rows[-1]) / (trials[np.arange(len(free)), free] - parameters[free])[:, None]).T
-
-
-def _minimise(
-    problem: ResectionProblem,
-    parameters: np.ndarray,
-    noise: float,
-    robust_loss: _RobustLoss | None,
-    inlier: np.ndarray,
-    *,
-    tolerance: float = 1e-10,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Parameters ``(9,)`` of the least sum of squared residuals, and the Jacobian there for the free parameters."""
-    from scipy.optimize import least_squares
-
-    free = problem.free
-
-    def residual_rows(values: np.ndarray) -> np.ndarray:
-        trial = parameters.copy()
-        trial[free] = values
-        return _residual_rows(problem, trial[None], noise, robust_loss, inlier)[0]
-
-    def jacobian(values: np.ndarray) -> np.ndarray:
-        trial = parameters.copy()
-        trial[free] = values
-        return _jacobian(problem, trial, noise, robust_loss, inlier)
-
-    # Characteristic steps of comparable effect on the residuals: [deg], [m], relative, k1, [px].
-    scale = np.array([0.1, 0.1, 0.1, 10.0, 10.0, 10.0, 0.01, 0.02, 5.0])[free]
-    solution = least_squares(
-        residual_rows,
-        parameters[free],
-        jacobian,  # pyright: ignore[reportArgumentType]
-        x_scale=scale,
-        xtol=tolerance,
-        ftol=tolerance,
-        gtol=tolerance,
-        max_nfev=200,
-    )
-    result = parameters.copy()
-    result[free] = solution.x
-    return result, solution.jac
 
 
 def _solve(
@@ -407,22 +268,22 @@ def _solve(
     all_points = np.ones(count, bool)
     noise = noise_px or 1.0
     if not count:
-        return _minimise(problem, parameters, noise, None, all_points)[0], ~all_points, noise
+        return minimise(problem, parameters, noise, None, all_points)[0], ~all_points, noise
     if loss == "squares":
         for _ in range(2 if noise_px is None else 1):
-            parameters, jacobian = _minimise(problem, parameters, noise, None, all_points)
+            parameters, jacobian = minimise(problem, parameters, noise, None, all_points)
             noise = noise_px or _rms_noise(problem, parameters, all_points, _effective_parameters(problem, jacobian))
         return parameters, ~all_points, noise
     widest = max(0.005 * problem.start.width_px / noise, 3.0)
     for scale in (widest, widest / 5.0, 1.0):
-        parameters, _ = _minimise(
-            problem, parameters, noise, lambda e, c=scale: _soft_l1(e, c), all_points, tolerance=1e-4
+        parameters, _ = minimise(
+            problem, parameters, noise, lambda e, c=scale: soft_l1(e, c), all_points, tolerance=1e-4
         )
-    robust_loss = _cauchy if loss == "cauchy" else _soft_l1
+    robust_loss = cauchy if loss == "cauchy" else soft_l1
     for _ in range(3):
         if noise_px is None:
             noise = _median_noise(problem, parameters)
-        parameters, _ = _minimise(problem, parameters, noise, lambda e: robust_loss(e, 2.0), all_points, tolerance=1e-6)
+        parameters, _ = minimise(problem, parameters, noise, lambda e: robust_loss(e, 2.0), all_points, tolerance=1e-6)
     parameters, inlier, noise = _refine_inliers(problem, parameters, all_points, noise, noise_px)
     return _test_influential_points(problem, parameters, inlier, noise, noise_px)
 
@@ -433,10 +294,10 @@ def _refine_inliers(
     """Alternate least squares over the inliers and their classification until the inliers no longer change."""
     parameter_count = float(problem.free.sum())
     for _ in range(8):
-        error = np.linalg.norm(_errors(problem, parameters), axis=1)
+        error = np.linalg.norm(point_errors(problem, parameters), axis=1)
         selected = error <= _outlier_threshold(2 * int(inlier.sum()) - parameter_count, noise_px is None) * noise
         _check_agreement(problem, selected, error)
-        parameters, jacobian = _minimise(problem, parameters, noise, None, selected)
+        parameters, jacobian = minimise(problem, parameters, noise, None, selected)
         parameter_count = _effective_parameters(problem, jacobian)
         if noise_px is None:
             noise = _rms_noise(problem, parameters, selected, parameter_count)
@@ -476,23 +337,23 @@ def _test_influential_points(
     """
     if inlier.sum() > 40 or inlier.sum() <= 4:
         return parameters, ~inlier, noise
-    jacobian = _jacobian(problem, parameters, noise, None, inlier)
+    jacobian = jacobian_at(problem, parameters, noise, None, inlier)
     threshold = _outlier_threshold(2 * int(inlier.sum()) - _effective_parameters(problem, jacobian), noise_px is None)
     # The first rows of the Jacobian are the x and y residuals of the inliers, alternating.
     hat = np.einsum("ij,jk,ik->i", jacobian, np.linalg.pinv(jacobian.T @ jacobian), jacobian)
     leverage = hat[: 2 * int(inlier.sum())].reshape(-1, 2).max(axis=1)
 
     def cost(trial: np.ndarray) -> float:
-        error = np.linalg.norm(_errors(problem, trial), axis=1) / noise
-        other_rows = _residual_rows(problem, trial[None], noise, None, np.zeros(len(problem.points), bool))
+        error = np.linalg.norm(point_errors(problem, trial), axis=1) / noise
+        other_rows = residual_rows(problem, trial[None], noise, None, np.zeros(len(problem.points), bool))
         return float(np.sum(np.minimum(error, threshold) ** 2) + np.sum(other_rows**2))
 
     best, best_cost = parameters, cost(parameters)
     for index in np.flatnonzero(inlier)[leverage > 0.5]:
         remaining = inlier.copy()
         remaining[index] = False
-        trial, _ = _minimise(problem, parameters, noise, lambda e: _cauchy(e, 2.0), remaining, tolerance=1e-6)
-        trial, _ = _minimise(problem, trial, noise, lambda e: _cauchy(e, 2.0), np.ones_like(inlier), tolerance=1e-6)
+        trial, _ = minimise(problem, parameters, noise, lambda e: cauchy(e, 2.0), remaining, tolerance=1e-6)
+        trial, _ = minimise(problem, trial, noise, lambda e: cauchy(e, 2.0), np.ones_like(inlier), tolerance=1e-6)
         trial_cost = cost(trial)
         if trial_cost < best_cost - 1.0:
             best, best_cost = trial, trial_cost
@@ -501,23 +362,19 @@ def _test_influential_points(
     return parameters, ~inlier, noise
 
 
-def _errors(problem: ResectionProblem, parameters: np.ndarray) -> np.ndarray:
-    return pixel_error(problem.start, problem.axes, parameters, problem.points)[0]
-
-
 def _median_noise(problem: ResectionProblem, parameters: np.ndarray) -> float:
     """Standard deviation of a pixel coordinate [px] from the median residual, corrected for the fitted parameters."""
     count = len(problem.points)
     unfitted_fraction = max(1.0 - float(problem.free.sum()) / (2.0 * count), 0.2)
     # The median of a Rayleigh distribution is 1.1774 sigma.
-    median = float(np.median(np.linalg.norm(_errors(problem, parameters), axis=1)))
+    median = float(np.median(np.linalg.norm(point_errors(problem, parameters), axis=1)))
     return max(median / 1.1774 / np.sqrt(unfitted_fraction), 1e-3)
 
 
 def _rms_noise(problem: ResectionProblem, parameters: np.ndarray, inlier: np.ndarray, parameter_count: float) -> float:
     """Standard deviation of a pixel coordinate [px] from the squared residuals of the inliers."""
     degrees_of_freedom = max(2.0 * inlier.sum() - parameter_count, 1.0)
-    return max(float(np.sqrt(np.sum(_errors(problem, parameters)[inlier] ** 2) / degrees_of_freedom)), 1e-6)
+    return max(float(np.sqrt(np.sum(point_errors(problem, parameters)[inlier] ** 2) / degrees_of_freedom)), 1e-6)
 
 
 def _check_agreement(problem: ResectionProblem, inlier: np.ndarray, error: np.ndarray) -> None:
@@ -542,7 +399,7 @@ def _calibration(
         raise NotEnoughEvidence(
             f"behind the camera: {names}; a correspondence is wrong, or the camera faces another direction"
         )
-    jacobian = _jacobian(problem, parameters, noise, None, ~outlier)
+    jacobian = jacobian_at(problem, parameters, noise, None, ~outlier)
     covariance = _covariance(problem, jacobian)
     if widen and len(residual):
         from scipy.special import stdtrit

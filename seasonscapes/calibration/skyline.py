@@ -16,7 +16,8 @@ import numpy as np
 from seasonscapes.calibration.boundary_map import BoundaryMap, boundary_map, edge_near
 from seasonscapes.calibration.evidence import Correspondences, Priors
 from seasonscapes.calibration.pose_model import View, focal_scales, parameters_of_view, project_with_parameters
-from seasonscapes.calibration.resection import Calibration, ResectionOptions, SkylineEvidence, resect
+from seasonscapes.calibration.pose_residuals import SkylineEvidence
+from seasonscapes.calibration.resection import Calibration, ResectionOptions, resect
 from seasonscapes.calibration.terrain_horizon import Horizon, HorizonOptions, cell_size_m, horizon_from
 from seasonscapes.cameras.panorama import Panorama
 from seasonscapes.errors import ImageSizeMismatch, NoTerrainInView
