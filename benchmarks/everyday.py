@@ -2,8 +2,8 @@
 
 Every command runs as a process of its own (``python -m seasonscapes``), in a workspace of this run. *Cold* is the first
 command of its kind in an empty workspace, *warm* the next one with another hour. Compiled kernels of Dr.Jit stay in the
-user's cache from run to run, and compiled modules with their hashes in `__pycache__`, as they do for a user. Keys that end in ``_s`` are processor seconds of all threads, those
-of ``demo_…`` wall seconds; ``…_wall_s`` stand beside them.
+user's cache from run to run, hashes of modules too, and compiled modules beside them, as they do for a user. Keys that end
+in ``_s`` are processor seconds of all threads, those of ``demo_…`` wall seconds; ``…_wall_s`` stand beside them.
 
     python benchmarks/everyday.py            # all, an hourly year of one view whole: an hour
     python benchmarks/everyday.py --quick    # the year from the hours of four days: some ten minutes

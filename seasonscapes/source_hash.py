@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.util
 import json
 import marshal
 import os
@@ -16,8 +15,12 @@ from pathlib import Path
 from types import CodeType
 from typing import Any
 
+from seasonscapes.user_cache import user_cache_folder
+
 _PACKAGE = Path(__file__).parent
 _ROOT = _PACKAGE.name
+# Read at once: an upgrade must not lend its name to what the code before it found.
+_OWN_SOURCE = Path(__file__).read_text(encoding="utf-8")
 
 
 @lru_cache(maxsize=64)
@@ -83,8 +86,8 @@ _TYPE_CHECKING = re.compile(r"^if TYPE_CHECKING:\n(?:[ \t]+.*\n|\n)+", re.MULTIL
 def _facts(module: str) -> tuple[str, tuple[str, ...]]:
     """Hash of a module's code, and the modules of the package that it imports anywhere in it.
 
-    Compiling two hundred modules takes most of a second. What they gave is kept beside the interpreter's own compiled modules, and
-    taken from there while the file has the size, times and inode that it had then.
+    Compiling two hundred modules takes most of a second. What they gave is kept in the user's cache, and taken from there
+    while the file has the size, times and inode that it had then.
     """
     about = _path(module).stat()
     state = [about.st_size, about.st_mtime_ns, about.st_ctime_ns, about.st_ino]
@@ -102,14 +105,15 @@ _new: list[str] = []
 
 
 def _facts_path() -> Path:
-    """Where facts are kept; another interpreter has another file."""
-    return Path(importlib.util.cache_from_source(str(_PACKAGE / "source_hash.py"))).with_suffix(".json")
+    """Where facts are kept; another interpreter, and another installation, has another file."""
+    installation = hashlib.sha256(str(_PACKAGE).encode()).hexdigest()[:12]
+    return user_cache_folder() / f"modules-{sys.implementation.cache_tag}-{installation}.json"
 
 
 @cache
 def _made_by() -> str:
     """Name of everything but a module's own file that its facts depend on: this file, the interpreter, and which modules there are."""
-    about = (sys.version, Path(__file__).read_text(encoding="utf-8"), sorted(_modules()))
+    about = (sys.version, _OWN_SOURCE, sorted(_modules()))
     return hashlib.sha256(repr(about).encode()).hexdigest()
 
 
@@ -118,21 +122,23 @@ def _kept() -> dict[str, list[Any]]:
     """State of the file, hash and imports by module, as they were kept; nothing where they are of other code, or damaged."""
     try:
         stored = json.loads(_facts_path().read_text(encoding="utf-8"))
-        return dict(stored["modules"]) if stored["made_by"] == _made_by() else {}
-    except (OSError, ValueError, KeyError, TypeError):
+        if stored["made_by"] != _made_by():
+            return {}
+        return {module: [state, code, imports] for module, (state, code, imports) in stored["modules"].items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError):
         return {}
 
 
 def _keep_facts() -> None:
-    if not _new or sys.dont_write_bytecode:
+    if not _new:
         return
     _new.clear()
-    path = _facts_path()
-    temporary = path.with_suffix(f".{os.getpid()}.part")
-    # As the interpreter does with compiled modules: where it may not write, they are compiled again next time.
-    with suppress(OSError):
+    # Where nothing can be kept, modules are compiled again next time: no result depends on it.
+    with suppress(OSError, RuntimeError):
+        path = _facts_path()
+        temporary = path.with_suffix(f".{os.getpid()}.part")
         try:
-            path.parent.mkdir(exist_ok=True)
+            path.parent.mkdir(parents=True, exist_ok=True)
             temporary.write_text(json.dumps({"made_by": _made_by(), "modules": _kept()}), encoding="utf-8")
             os.replace(temporary, path)
         finally:

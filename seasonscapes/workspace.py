@@ -13,7 +13,6 @@ import hashlib
 import json
 import logging
 import os
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,6 +24,7 @@ from seasonscapes import __version__
 from seasonscapes.errors import InputError
 from seasonscapes.images import atomic_path
 from seasonscapes.source_hash import source_hash
+from seasonscapes.user_cache import user_cache_folder
 
 Value = TypeVar("Value")
 log = logging.getLogger(__name__)
@@ -56,12 +56,7 @@ class Workspace:
 def default_workspace() -> Workspace:
     """Return the workspace in ``SEASONSCAPES_WORKSPACE``, or else in the user's cache folder of this platform."""
     given = os.environ.get("SEASONSCAPES_WORKSPACE")
-    if given:
-        return Workspace(Path(given))
-    if sys.platform == "darwin":
-        return Workspace(Path.home() / "Library" / "Caches" / "seasonscapes")
-    base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or Path.home() / ".cache"
-    return Workspace(Path(base) / "seasonscapes")
+    return Workspace(Path(given) if given else user_cache_folder())
 
 
 def file_hash(path: str | os.PathLike) -> str:

@@ -46,5 +46,7 @@ def morton_order(column: np.ndarray, row: np.ndarray) -> np.ndarray:
 
 def ground_order(position_m: np.ndarray) -> np.ndarray:
     """Indices ``(n,)`` of positions ``(n, 3)`` [m] along a Morton curve over the ground, in cells of a few metres."""
+    if not len(position_m):
+        return np.empty(0, np.int64)
     cell = ((position_m[:, :2] - position_m[:, :2].min(axis=0)) / _CELL_M).astype(np.int64)
     return np.argsort(morton_order(cell[:, 0], cell[:, 1]), kind="stable")

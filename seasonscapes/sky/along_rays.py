@@ -63,7 +63,7 @@ def radiance_components(
     # By night most of the air is in the Earth's shadow.
     lit = visible > 0.0
     arriving = np.zeros((*lit.shape, len(WAVELENGTHS_NM)), np.float32)
-    at_lit = ... if lit.mean() > MANY_LIT else lit
+    at_lit = ... if np.count_nonzero(lit) > MANY_LIT * lit.size else lit
     direct = np.exp((column[at_lit] @ -scaled.extinction).astype(np.float32))
     arriving[at_lit] = direct * visible[at_lit][..., None].astype(np.float32)
     # TMS method: scattering with the unscaled coefficient, attenuation with the scaled one.

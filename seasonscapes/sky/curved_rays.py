@@ -289,7 +289,7 @@ def slant_columns_to_sun(
     lowest = columns.lowest_rad[row0] * (1.0 - fr) + columns.lowest_rad[row0 + 1] * fr
     radius_rad, above_lowest = np.radians(radius_deg), np.asarray(elevation_rad) - lowest
     lit = above_lowest > -radius_rad
-    if lit.mean() > MANY_LIT:
+    if np.count_nonzero(lit) >= MANY_LIT * lit.size:
         return _columns_above(columns, row0, fr, lowest, above_lowest, radius_rad)
     # In the Earth's shadow the columns are those of the lowest ray at the height, whatever the azimuth is.
     dark, _ = _columns_above(columns, row0, fr, lowest, np.full(row0.shape, -np.inf), radius_rad)

@@ -29,6 +29,7 @@ from seasonscapes.sky.clear_sky import (
     save_tables,
     true_elevation_deg,
 )
+from seasonscapes.sky.eclipses import lunar_eclipse
 from seasonscapes.sky.elevation_table import PartedTable, load_table, parts_at, save_table
 from seasonscapes.sky.ephemeris import LunarPosition, SolarPosition, at_index, moon_position, sun_position
 from seasonscapes.sky.illuminate import SkyEvaluators, illuminate, significant_moon
@@ -201,9 +202,10 @@ def atmosphere_tables_in(
     workspace
         Where tables are kept.
     by_elevation
-        Also tabulate diffuse light, and all light of sky and air from a sun or moon that is up, over the sun's elevation for each observer height, by
-        parts as they are needed, which costs time and space once and makes the sky of an instant quicker. Radiances differ by
-        less than 0.3 % while the sun is above -12°; in the haze of ``hazy`` by up to 0.5 % where it is above 70°.
+        Also tabulate diffuse light, and all light of sky and air from a sun or moon that is up, over the elevation of sun or
+        moon for each observer height, by parts as they are needed, which costs time and space once and makes the sky of an
+        instant quicker. Radiances differ by less than 0.3 % while the sun is above -12°; in the haze of ``hazy`` by up to
+        0.5 % where it is above 70°.
     """
     tables: dict[Atmosphere, AtmosphereTables] = {}
 
@@ -330,9 +332,16 @@ def illumination_for_camera(
         For many instants of one camera; see `atmosphere_tables_in`.
     of_another_camera
         What this function found for another camera at the same instant under the same model: its light on the terrain is taken.
+
+    Raises
+    ------
+    ValueError
+        Where the light of the other camera is of another instant.
     """
     from seasonscapes.workflows.views import camera_geodetic
 
+    if of_another_camera is not None and of_another_camera.time != time:
+        raise ValueError(f"illumination_for_camera: got the light of {of_another_camera.time}, expected that of {time}")
     position = _position_in_film(place, time) if by_elevation else position_at(place, time)
     on_terrain = of_another_camera or illumination_at(
         model,
@@ -437,12 +446,15 @@ def tabulate_illumination(
     where = (place.frame.latitude_deg, place.frame.longitude_deg, place.median_height_m)
     # All instants at once: one by one, those of a year take minutes.
     suns, moons = sun_position(times, *where), moon_position(times, *where)
-    sun_deg, moon_deg = [], []
+    sun_deg, moon_deg, eclipsed = [], [], []
     for index in range(len(times)):
         sun = at_index(suns, index)
         moon = significant_moon(sun, at_index(moons, index))
         sun_deg.append(sun.elevation_deg)
-        moon_deg += [] if moon is None else [moon.elevation_deg]
+        if moon is not None:
+            moon_deg.append(moon.elevation_deg)
+            # Its light has another colour, for which there is no table.
+            eclipsed.append(lunar_eclipse(moon) is not None)
     camera_m, wanted = camera_geodetic(place, camera)[2], []
     for height_m, near in ((place.median_height_m, False), (camera_m, False), (camera_m, True)):
         sun_rad, moon_rad = (
@@ -450,6 +462,7 @@ def tabulate_illumination(
             for each in (sun_deg, moon_deg)
         )
         sun_up, moon_up = (each >= np.radians(LOWEST_DAY_DEG) for each in (sun_rad, moon_rad))
+        moon_up &= ~np.array(eclipsed, bool)
         for table_of, true_rad in (
             (tables.day_of, sun_rad[sun_up]),
             (tables.moon_of, moon_rad[moon_up]),

@@ -32,8 +32,13 @@ from seasonscapes.scene import NamedCamera
 from seasonscapes.sky.illumination import Illumination
 from seasonscapes.sky.models import SkyModel
 from seasonscapes.terrain.surface import Texture
-from seasonscapes.workflows import albedo_sources
-from seasonscapes.workflows.albedo_sources import AlbedoFile, AlbedoSource, dated_albedos, snow_transition_between
+from seasonscapes.workflows.albedo_sources import (
+    AlbedoFile,
+    AlbedoSource,
+    dated_albedos,
+    keep_synthetic_albedos,
+    snow_transition_between,
+)
 from seasonscapes.workflows.illumination import SunMoonPosition, illumination_for_camera, sky_model
 from seasonscapes.workflows.place import MeshOptions, Place, load_place, utc_at
 from seasonscapes.workflows.views import camera_for, camera_values, tilted_terrain, view_with_terrain
@@ -329,9 +334,7 @@ def session_of(job: RenderJob, place: Place, *, progress: Progress | None = None
     if not job.albedo:
         # The first frame needs the dates before and after the base's.
         days = [dated.day for dated in albedo.dated]
-        albedo_sources.keep_synthetic_albedos(
-            place, [days[k] for k, _ in season_weights(days, job.base_day, season=job.season)]
-        )
+        keep_synthetic_albedos(place, [days[k] for k, _ in season_weights(days, job.base_day, season=job.season)])
     return relight_session(
         place,
         camera_for(place, job.view, size_px=job.size_px),

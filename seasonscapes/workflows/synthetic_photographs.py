@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -174,7 +175,8 @@ def photograph_each(
             if day not in albedos:
                 albedos[day] = scene_albedo(place, time).values
             light = illumination_for_camera(place, camera, model, time, of_another_camera=lights.get(time))[0]
-            lights.setdefault(time, light)
+            # What it has of its camera alone takes ten times as much memory, and is not shared.
+            lights.setdefault(time, replace(light, aerial_perspective=None, visible_sky=None))
             instants.append(WebcamInstant(time, light, albedos[day]))
         report = task_progress(progress, task, start=number / len(cameras), end=(number + 1) / len(cameras))
         try:
