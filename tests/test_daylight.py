@@ -75,6 +75,8 @@ def test_another_cameras_light_on_the_terrain_is_this_ones(tmp_path, workspace):
     other, _ = illumination_for_camera(place, low, model, time)
     alone, _ = illumination_for_camera(place, high, model, time)
     given, _ = illumination_for_camera(place, high, model, time, of_another_camera=other)
+    with pytest.raises(ValueError, match="expected that of 2024-09-01 11:00"):
+        illumination_for_camera(place, high, model, time.replace(hour=11), of_another_camera=other)
     np.testing.assert_array_equal(given.sky_radiance, alone.sky_radiance)
     np.testing.assert_array_equal(given.visible_sky, alone.visible_sky)
     assert not np.array_equal(given.visible_sky, other.visible_sky)

@@ -311,8 +311,9 @@ def test_light_for_a_film_takes_its_tables_from_the_workspace(tmp_path, looked_u
 
     assert atmosphere_from_model(read_sky_model("clear")) == tables_of().atmosphere
     monkeypatch.setattr(illumination_module, "atmosphere_tables", lambda _: tables_of())
-    for kind in ("diffuse", "day", "moon"):
-        build = builder_of(getattr(looked_up, f"{kind}_of"), by_day if kind == "day" else asked)
+    moons: list[tuple] = []
+    for kind, of_kind in (("diffuse", asked), ("day", by_day), ("moon", moons)):
+        build = builder_of(getattr(looked_up, f"{kind}_of"), of_kind)
         monkeypatch.setattr(illumination_module, f"{kind}_by_elevation", build)
     place = load_place(places.write_place(tmp_path), Workspace(tmp_path / "work"))
     view = place.scene.camera(None).model_copy(update={"above_ground_m": None, "height_m": HEIGHT_M})
@@ -327,14 +328,25 @@ def test_light_for_a_film_takes_its_tables_from_the_workspace(tmp_path, looked_u
     heights = [place.median_height_m, HEIGHT_M, HEIGHT_M]
     np.testing.assert_allclose([height_m for height_m, _ in tables], heights, atol=1e-3)
     assert len(asked) <= 2 * len(tables), "the sun's neighbourhood alone; the moon has set"
-    moonlit = datetime(2024, 9, 18, 23, tzinfo=UTC)
-    illumination_module.tabulate_illumination(place, camera, model, [moonlit])
+    # A moon as ever, and one in the Earth's shadow, whose colour is in no table of the moon.
+    for moonlit, eclipsed in (
+        (datetime(2024, 9, 18, 23, tzinfo=UTC), False),
+        (datetime(2025, 9, 7, 18, 30, tzinfo=UTC), True),
+    ):
+        before = len(moons)
+        illumination_module.tabulate_illumination(place, camera, model, [moonlit])
+        built = len(asked), len(moons)
+        assert eclipsed == (len(moons) == before)
+        _, in_film = illumination_module.illumination_for_camera(
+            place, camera, model, moonlit, map_height=4, by_elevation=True
+        )
+        alone = illumination_module.position_at(place, moonlit)
+        for body in ("sun", "moon"):
+            np.testing.assert_allclose(
+                getattr(in_film, body).direction, getattr(alone, body).direction, rtol=0.0, atol=1e-12
+            )
+        assert (len(asked), len(moons)) == built, "those of the sun and of the moon"
     built = len(asked)
-    _, in_film = illumination_module.illumination_for_camera(
-        place, camera, model, moonlit, map_height=4, by_elevation=True
-    )
-    assert in_film == illumination_module.position_at(place, moonlit)
-    assert len(asked) == built, "those of the sun and of the moon"
     exact, moment = illumination_module.illumination_for_camera(place, camera, model, when, map_height=16)
     assert -3.0 < moment.sun.elevation_deg < 3.0
     quick, _ = illumination_module.illumination_for_camera(place, camera, model, when, map_height=16, by_elevation=True)
