@@ -48,6 +48,8 @@ _DEPTH_RATIO = 1.05
 _AIR_RATIO = 1.1
 # Below this cosine of incidence the samples of a pixel may face the sun or not.
 _GRAZING = 0.25
+# Below this one, where no shadow falls nearby, samples that face the sun are lit: no ray is traced for so little light.
+_TURNING = 0.15
 # Interreflected light varies slowly; its noise is averaged over neighbouring pixels of one surface, at these strides,
 _BOUNCE_STRIDES, _BOUNCE_SHARPNESS = (1,), 64.0
 # and over wider surroundings in pictures with fewer rays than these, where noise is what errs most.
@@ -308,7 +310,7 @@ def _start_surface_radiance(view: RelightableView, illumination: Illumination) -
     """Start the shadow rays of `relit_surface_radiance`, and return the function that gives its result."""
     bodies = luminaries(illumination)
     clusters = start_clusters(view.clusters, illumination, bodies)
-    sunlight = [(body, _SunCosine(view, body)) for body in bodies]
+    sunlight = [(body, _start_sun_cosine(view, body)) for body in bodies]
     return lambda: _lit_surface(view, illumination, clusters(), sunlight)
 
 
@@ -316,19 +318,18 @@ def _lit_surface(
     view: RelightableView,
     illumination: Illumination,
     clusters: ClusterLight,
-    sunlight: list[tuple[Luminary, _SunCosine]],
+    sunlight: list[tuple[Luminary, Callable[[], Callable[[], np.ndarray]]]],
 ) -> np.ndarray:
     """`relit_surface_radiance` by the light of its clusters and the begun cosines of sun and moon."""
     incident = start_incident_light(view.receivers, clusters)
-    for _, cosine in sunlight:
-        cosine.trace_borders()
+    cosines = [(body, trace_borders()) for body, trace_borders in sunlight]
     total = incident()
     ground = None if view.optics is None else _GroundPixels(view, view.optics)
     if ground is not None:
         total *= ground.of_diffuse_light()
-    for body, begun in sunlight:
+    for body, read_cosine in cosines:
         light = np.asarray(body.normal_illuminance_lx, np.float32) / np.float32(np.pi)
-        cosine = begun.read()
+        cosine = read_cosine()
         lit = np.stack([cosine * channel for channel in light], axis=-1)
         total += lit if ground is None else lit * ground.of_luminary(body, cosine)
     radiance = total * view.coefficients.albedo
@@ -365,7 +366,8 @@ def sun_cosine(view: RelightableView, luminary: Luminary) -> np.ndarray:
     """Average cos(angle of incidence) × visible fraction of the luminary's disc over each terrain pixel.
 
     One shadow ray per pixel is traced first. All samples of a pixel are traced where neighbouring pixels differ and on
-    silhouettes. At grazing incidence elsewhere, the samples that face the luminary are lit.
+    silhouettes. At grazing incidence elsewhere, and where neighbours differ in that they face the luminary or not, the samples
+    that face it are lit.
 
     Parameters
     ----------
@@ -379,51 +381,53 @@ def sun_cosine(view: RelightableView, luminary: Luminary) -> np.ndarray:
     numpy.ndarray
         ``(n,)``.
     """
-    begun = _SunCosine(view, luminary)
-    begun.trace_borders()
-    return begun.read()
+    return _start_sun_cosine(view, luminary)()()
 
 
-class _SunCosine:
-    """`sun_cosine` in steps, each of which starts rays that other threads trace until the next one reads them."""
+def _start_sun_cosine(view: RelightableView, luminary: Luminary) -> Callable[[], Callable[[], np.ndarray]]:
+    """Start the first rays of `sun_cosine`; what is returned starts those at borders, and returns what gives the result.
 
-    def __init__(self, view: RelightableView, luminary: Luminary) -> None:
-        self._view, self._luminary = view, luminary
-        self._first = start_first_samples(view.rays, luminary)
-        self._cosine = np.maximum(view.coefficients.normal @ np.asarray(luminary.direction, np.float32), 0.0)
+    Other threads trace each of them while the caller computes something else.
+    """
+    read_first = start_first_samples(view.rays, luminary)
+    cosine = np.maximum(view.coefficients.normal @ np.asarray(luminary.direction, np.float32), 0.0)
 
-    def trace_borders(self) -> None:
-        view, luminary = self._view, self._luminary
-        visible = self._first()
-        traced = _differs_nearby(view, visible) | view.silhouette
-        self._mixed = np.flatnonzero(traced)
-        self._of_mixed = start_sum_incidence(view.rays, luminary, self._mixed)
-        # The light reaches all nine pixels around: what matters on slopes that it grazes is which samples face it.
-        self._grazed = np.flatnonzero(visible & (self._cosine < _GRAZING) & ~traced)
-        self._of_grazed = start_sum_facing(view.rays, luminary, self._grazed)
-        self._visible = visible
+    def trace_borders() -> Callable[[], np.ndarray]:
+        visible, facing = read_first()
+        near_visible, near_dark, near_occluded = (
+            _nearby(view, each) for each in (visible, ~visible, facing & ~visible)
+        )
+        differs = near_visible & near_dark
+        # Where slopes turn away and no shadow falls, samples that face the luminary are lit; what a shadow might hide of them is
+        # worth rays where they are not all grazed.
+        traced = (differs & (near_occluded | (cosine >= _TURNING))) | view.silhouette
+        mixed = np.flatnonzero(traced)
+        of_mixed = start_sum_incidence(view.rays, luminary, mixed)
+        # The light reaches all nine pixels around, or all that face it: what matters where it grazes is which samples face it.
+        grazed = np.flatnonzero(((visible & (cosine < _GRAZING)) | differs) & ~traced)
+        of_grazed = start_sum_facing(view.rays, luminary, grazed)
 
-    def read(self) -> np.ndarray:
-        cosine, mixed = self._cosine, self._mixed
-        result = np.where(self._visible, cosine, 0.0)
-        sunlit, unoccluded = self._of_mixed()
-        result[self._grazed] = self._of_grazed()
-        # The mean normal averages many more samples than the shadow rays: these only determine the sunlit fraction.
-        reliable = (cosine[mixed] > _GRAZING) & (unoccluded > _GRAZING)
-        ratio = np.where(reliable, cosine[mixed] / np.where(reliable, unoccluded, 1.0), 1.0)
-        result[mixed] = sunlit * np.clip(ratio, 0.5, 2.0)
-        return result
+        def read() -> np.ndarray:
+            result = np.where(visible, cosine, 0.0)
+            sunlit, unoccluded = of_mixed()
+            result[grazed] = of_grazed()
+            # The mean normal averages many more samples than the shadow rays: these only determine the sunlit fraction.
+            reliable = (cosine[mixed] > _GRAZING) & (unoccluded > _GRAZING)
+            ratio = np.where(reliable, cosine[mixed] / np.where(reliable, unoccluded, 1.0), 1.0)
+            result[mixed] = sunlit * np.clip(ratio, 0.5, 2.0)
+            return result
+
+        return read
+
+    return trace_borders
 
 
-def _differs_nearby(view: RelightableView, visible: np.ndarray) -> np.ndarray:
-    """Pixels ``(n,)`` within whose 3 × 3 neighbourhood on terrain the luminary is visible from some pixels only."""
+def _nearby(view: RelightableView, chosen: np.ndarray) -> np.ndarray:
+    """Pixels ``(n,)`` within whose 3 × 3 neighbourhood on terrain at least one is chosen."""
     camera, pixel = view.coefficients.camera, view.coefficients.pixel
-    image = np.full((camera.height_px, camera.width_px), 127, np.uint8)
-    image.reshape(-1)[pixel] = np.where(visible, 255, 0)
-    square = np.ones((3, 3), np.uint8)
-    brightest = cv2.dilate(np.where(image == 127, 0, image).astype(np.uint8), square)
-    darkest = cv2.erode(np.where(image == 127, 255, image).astype(np.uint8), square)
-    return (brightest != darkest).reshape(-1)[pixel]
+    image = np.zeros((camera.height_px, camera.width_px), np.uint8)
+    image.reshape(-1)[pixel] = chosen
+    return cv2.dilate(image, np.ones((3, 3), np.uint8)).reshape(-1)[pixel] > 0
 
 
 def _at_camera(
