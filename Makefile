@@ -15,6 +15,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 BASE := $(VENV)/.installed
 DEV := $(VENV)/.installed-dev
+# Tests, site and commands start many processes: each would compile the program anew where none of them may keep it.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo gallery test check docs docs-notebooks sky-tables massif tables results lint venv dev llvm clean help
 help:
