@@ -48,8 +48,6 @@ _DEPTH_RATIO = 1.05
 _AIR_RATIO = 1.1
 # Below this cosine of incidence the samples of a pixel may face the sun or not.
 _GRAZING = 0.25
-# Below this one, where no shadow falls nearby, samples that face the sun are lit: no ray is traced for so little light.
-_TURNING = 0.15
 # Interreflected light varies slowly; its noise is averaged over neighbouring pixels of one surface, at these strides,
 _BOUNCE_STRIDES, _BOUNCE_SHARPNESS = (1,), 64.0
 # and over wider surroundings in pictures with fewer rays than these, where noise is what errs most.
@@ -366,8 +364,7 @@ def sun_cosine(view: RelightableView, luminary: Luminary) -> np.ndarray:
     """Average cos(angle of incidence) × visible fraction of the luminary's disc over each terrain pixel.
 
     One shadow ray per pixel is traced first. All samples of a pixel are traced where neighbouring pixels differ and on
-    silhouettes. At grazing incidence elsewhere, and where neighbours differ in that they face the luminary or not, the samples
-    that face it are lit.
+    silhouettes. At grazing incidence elsewhere, the samples that face the luminary are lit.
 
     Parameters
     ----------
@@ -393,18 +390,12 @@ def _start_sun_cosine(view: RelightableView, luminary: Luminary) -> Callable[[],
     cosine = np.maximum(view.coefficients.normal @ np.asarray(luminary.direction, np.float32), 0.0)
 
     def trace_borders() -> Callable[[], np.ndarray]:
-        visible, facing = read_first()
-        near_visible, near_dark, near_occluded = (
-            _nearby(view, each) for each in (visible, ~visible, facing & ~visible)
-        )
-        differs = near_visible & near_dark
-        # Where slopes turn away and no shadow falls, samples that face the luminary are lit; what a shadow might hide of them is
-        # worth rays where they are not all grazed.
-        traced = (differs & (near_occluded | (cosine >= _TURNING))) | view.silhouette
+        visible = read_first()
+        traced = (_nearby(view, visible) & _nearby(view, ~visible)) | view.silhouette
         mixed = np.flatnonzero(traced)
         of_mixed = start_sum_incidence(view.rays, luminary, mixed)
-        # The light reaches all nine pixels around, or all that face it: what matters where it grazes is which samples face it.
-        grazed = np.flatnonzero(((visible & (cosine < _GRAZING)) | differs) & ~traced)
+        # The light reaches all nine pixels around: what matters on slopes that it grazes is which samples face it.
+        grazed = np.flatnonzero(visible & (cosine < _GRAZING) & ~traced)
         of_grazed = start_sum_facing(view.rays, luminary, grazed)
 
         def read() -> np.ndarray:

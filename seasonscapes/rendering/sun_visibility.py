@@ -222,11 +222,11 @@ def first_sample_visible(rays: SunRays, luminary: Luminary) -> np.ndarray:
     numpy.ndarray
         ``(N,)`` bool: the sample faces the luminary, and its point of the disc is not occluded.
     """
-    return start_first_samples(rays, luminary)()[0]
+    return start_first_samples(rays, luminary)()
 
 
-def start_first_samples(rays: SunRays, luminary: Luminary) -> Callable[[], tuple[np.ndarray, np.ndarray]]:
-    """Start `first_sample_visible`, and return the function that gives its result, and which of the samples face the luminary.
+def start_first_samples(rays: SunRays, luminary: Luminary) -> Callable[[], np.ndarray]:
+    """Start `first_sample_visible`, and return the function that gives its result.
 
     Other threads trace while the caller computes something else; between kernels that are read one by one they would wait,
     which takes the processor's time as much as work does.
@@ -239,17 +239,10 @@ def start_first_samples(rays: SunRays, luminary: Luminary) -> Callable[[], tuple
     for start in range(0, rays.receivers, LANES):
         count = min(LANES, rays.receivers - start)
         receiver = None if count == rays.receivers else dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, start)
-        lanes = _visible(rays.first, disc, receiver, receiver)[:2]
-        dr.eval(lanes)
-        parts.append(lanes)
-
-    def visible_and_facing() -> tuple[np.ndarray, np.ndarray]:
-        visible, facing = (
-            np.concatenate([np.empty(0, bool), *(np.array(part[number]) for part in parts)]) for number in range(2)
-        )
-        return visible, facing
-
-    return visible_and_facing
+        visible, _, _ = _visible(rays.first, disc, receiver, receiver)
+        dr.eval(visible)
+        parts.append(visible)
+    return lambda: np.concatenate([np.empty(0, bool), *(np.array(part) for part in parts)])
 
 
 def sum_facing(rays: SunRays, luminary: Luminary, receiver: np.ndarray) -> np.ndarray:
@@ -324,7 +317,7 @@ def _start_sums(rays: SunRays, luminary: Luminary, receiver: np.ndarray, *, trac
         each = dr.gather(mi.UInt32, chosen, number)
         lane = each * dr.opaque(mi.UInt32, rays.samples) + sample
         if traced:
-            visible, _, cosine, weight = _visible(rays, disc, lane, each, sample, coherent=True)
+            visible, cosine, weight = _visible(rays, disc, lane, each, sample, coherent=True)
         else:
             visible, cosine, _, weight = _facing(rays, disc, lane)
         weighted = dr.fmax(cosine, 0.0) * weight
@@ -393,7 +386,7 @@ def _cosines(rays: SunRays, luminary: Luminary, rays_per_sample: int, *, coheren
         lane = None if whole else lane + dr.opaque(mi.UInt32, start)
         receiver += dr.opaque(mi.UInt32, start // rays.samples)
         disc_point = sample + ray * dr.opaque(mi.UInt32, rays.samples)
-        visible, _, cosine, _ = _visible(rays, disc, lane, receiver, disc_point, coherent=coherent)
+        visible, cosine, _ = _visible(rays, disc, lane, receiver, disc_point, coherent=coherent)
         lanes = dr.select(visible, cosine, 0.0)
         dr.eval(lanes)
         if rays_per_sample > 1:
@@ -432,8 +425,8 @@ def _quotient_and_remainder(number: Any, divisor: int) -> tuple[Any, Any]:
 
 def _visible(
     rays: SunRays, disc: _Disc, lane: Any, receiver: Any, point: Any = 0, *, coherent: bool = False
-) -> tuple[Any, Any, Any, Any]:
-    """Whether samples (``lane`` of `SunRays`) see the luminary, and face it; cosine of incidence of its centre, and weight.
+) -> tuple[Any, Any, Any]:
+    """Visibility of the luminary from samples (``lane`` of `SunRays`), cosine of incidence of its centre, and weight.
 
     Without ``lane`` from all samples, and without ``receiver`` each is one of its own.
 
@@ -450,8 +443,7 @@ def _visible(
     origin = _chosen(mi.Point3f, rays.mi_origin, lane)
     material = rays.terrain.mi_terrain.bsdf()
     ray = mi.Ray3f(origin + direction * shadow_ray_start(material, geometric_cosine, origin), direction)
-    occluded = rays.terrain.mi_scene.ray_test(ray, coherent=coherent, active=active)
-    return active & ~occluded, active, cosine, weight
+    return active & ~rays.terrain.mi_scene.ray_test(ray, coherent=coherent, active=active), cosine, weight
 
 
 def _chosen(kind: Any, values: Any, lane: Any) -> Any:
